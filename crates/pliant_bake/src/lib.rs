@@ -1,0 +1,1 @@
+//! From a mesh to a modal model: finite elements, sparse factorisation and vibration modes.

@@ -1,0 +1,1 @@
+//! Bevy plugin for modal soft bodies: components, assets, fixed-step systems, pointer grabs, deformation.

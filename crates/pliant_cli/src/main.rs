@@ -1,0 +1,3 @@
+//! The `pliant` program: mesh, bake, inspect.
+//! The pliant program: mesh, bake, inspect.
+fn main() {}

@@ -1,0 +1,1 @@
+//! Surfaces, signed distance fields and tetrahedra for Pliant: import, export, isosurface stuffing.

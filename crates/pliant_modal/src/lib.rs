@@ -1,0 +1,1 @@
+//! Modal soft bodies: the model, its file, the step, grabs, warping and reconstruction.

@@ -1,0 +1,1 @@
+//! Bevy plugin that carries Pliant's streaming sessions over QUIC.

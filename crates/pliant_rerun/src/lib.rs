@@ -1,0 +1,1 @@
+//! Bevy plugin that streams Pliant's diagnostics to the rerun viewer or to a file.
