@@ -1,1 +1,16 @@
 //! Surfaces, signed distance fields and tetrahedra for Pliant: import, export, isosurface stuffing.
+//!
+//! Lengths are in metres, coordinates are `f64`, indices are `u32` and count from 0.
+#![cfg_attr(
+    test,
+    allow(clippy::unwrap_used, clippy::expect_used, clippy::panic, reason = "a failed test should panic")
+)]
+
+mod error;
+pub mod shapes;
+mod surface;
+mod tets;
+
+pub use error::{MeshError, Place};
+pub use surface::Surface;
+pub use tets::{Quality, TetMesh};
