@@ -7,6 +7,7 @@
 )]
 
 mod error;
+pub mod io;
 pub mod shapes;
 mod surface;
 mod tets;

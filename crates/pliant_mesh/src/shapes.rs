@@ -143,14 +143,14 @@ mod tests {
         mesh.check().unwrap();
         assert_eq!(mesh.tets.len(), 1080);
         assert_eq!(mesh.nodes.len(), 21 * 4 * 4);
-        assert!((mesh.volume() - 0.24).abs() < 1e-15, "{}", mesh.volume());
+        assert!((mesh.volume() - 0.24).abs() < 1e-13, "{}", mesh.volume());
         let (surface, nodes) = mesh.boundary();
         surface.check().unwrap();
         // Two triangles to a cell's face.
         assert_eq!(surface.triangles.len(), 2 * (4 * 20 * 3 + 2 * 3 * 3));
         assert_eq!(surface.euler_characteristic(), 2);
         assert!((surface.area() - 2.0 * (0.6 + 0.8 + 0.12)).abs() < 1e-12);
-        assert!((surface.volume() - 0.24).abs() < 1e-15, "outward and closed");
+        assert!((surface.volume() - 0.24).abs() < 1e-13, "outward and closed");
         assert!(nodes.iter().zip(&surface.positions).all(|(&n, p)| mesh.nodes[n as usize] == *p));
     }
 

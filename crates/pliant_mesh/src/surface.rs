@@ -6,8 +6,8 @@ use crate::MeshError;
 
 /// Triangles in space: the skin of a body, or the shape that is to be filled with tetrahedra.
 ///
-/// Triangles are counter-clockwise seen from outside. The fields are open; whoever needs them to be
-/// consistent calls [`Surface::check`] first.
+/// Triangles are counter-clockwise seen from outside. The fields are open; whoever is not sure that they are consistent
+/// calls [`Surface::check`] first: the other methods panic on a vertex index that is out of range.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct Surface {
     /// Vertex positions in m.

@@ -12,7 +12,8 @@ const FLAT: f64 = 1e-12;
 
 /// Linear tetrahedra. Nodes a, b, c, d of each are positively oriented: (b - a) x (c - a) . (d - a) > 0.
 ///
-/// The fields are open; whoever needs them to be consistent calls [`TetMesh::check`] first.
+/// The fields are open; whoever is not sure that they are consistent calls [`TetMesh::check`] first: the other methods
+/// panic on a node index that is out of range.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct TetMesh {
     /// Node positions in m.
@@ -49,8 +50,9 @@ impl TetMesh {
         for (tet, &nodes) in self.tets.iter().enumerate() {
             let corners = self.corners(nodes);
             let volume = signed_volume(corners);
-            // Not `volume <= ...`: an overflow to NaN must not pass.
-            if !(6.0 * volume > FLAT * longest_edge(corners).powi(3)) || !volume.is_finite() {
+            // Asked this way round an overflow to infinity or NaN is refused too.
+            let sound = volume.is_finite() && 6.0 * volume > FLAT * longest_edge(corners).powi(3);
+            if !sound {
                 return Err(MeshError::FlatTet {
                     tet,
                     nodes,

@@ -1,0 +1,274 @@
+//! Files of surfaces, tetrahedra and descriptions of shapes.
+//!
+//! A file's kind is told by its extension:
+//!
+//! | Extension | Format | Read as | Written |
+//! | --- | --- | --- | --- |
+//! | `.obj` | Wavefront OBJ | surface | |
+//! | `.msh` | Gmsh MSH 2.2 and 4.1, text and binary | tetrahedra | text |
+//!
+//! Whatever bytes a file holds, reading gives a mesh or an error, and takes memory in proportion to the file.
+
+mod cursor;
+mod msh;
+mod obj;
+
+use std::{
+    fs,
+    io::{Read as _, Write as _},
+    path::Path,
+};
+
+use crate::{MeshError, Surface, TetMesh};
+
+pub use msh::MshVersion;
+
+/// Larger files are refused, in bytes.
+const MAX_FILE: u64 = 1 << 30;
+
+const SURFACES: &str = ".obj";
+const TETS: &str = ".msh";
+const ALL: &str = ".obj (a surface) or .msh (tetrahedra)";
+
+/// What a file holds.
+#[derive(Clone, Debug)]
+#[non_exhaustive]
+pub enum Input {
+    /// Triangles.
+    Surface(Surface),
+    /// Tetrahedra, ready to be baked.
+    Tets(TetMesh),
+}
+
+/// Reads a file of any known kind; the extension decides.
+///
+/// # Errors
+/// [`MeshError::UnknownFormat`] for an extension that is not in the table above, else as [`read_surface`] and
+/// [`read_tets`].
+pub fn read(path: impl AsRef<Path>) -> Result<Input, MeshError> {
+    let path = path.as_ref();
+    match extension(path).as_str() {
+        "obj" => read_surface(path).map(Input::Surface),
+        "msh" => read_tets(path).map(Input::Tets),
+        _ => Err(unknown(path, ALL)),
+    }
+}
+
+/// Reads a triangle surface: finite, with valid indices, but perhaps open or crossing itself (a visible skin may be;
+/// what is to be filled with tetrahedra may not).
+///
+/// Polygons are cut into fans. Where a vertex has several texture coordinates it is split, one copy for each.
+///
+/// # Errors
+/// [`MeshError::UnknownFormat`], [`MeshError::Read`], or [`MeshError::InFile`] around what is wrong in the file.
+pub fn read_surface(path: impl AsRef<Path>) -> Result<Surface, MeshError> {
+    let path = path.as_ref();
+    let parse = match extension(path).as_str() {
+        "obj" => obj::parse,
+        _ => return Err(unknown(path, SURFACES)),
+    };
+    let bytes = bytes(path)?;
+    in_file(path, || {
+        let surface = parse(&bytes)?;
+        surface.check()?;
+        Ok(surface)
+    })
+}
+
+/// Reads a tetrahedral mesh. Of 10-node tetrahedra the corners are kept; elements of other kinds and nodes that no
+/// tetrahedron uses are passed over; tetrahedra that are inside out are turned. The result passes
+/// [`TetMesh::check`].
+///
+/// # Errors
+/// [`MeshError::UnknownFormat`], [`MeshError::Read`], or [`MeshError::InFile`] around what is wrong in the file.
+pub fn read_tets(path: impl AsRef<Path>) -> Result<TetMesh, MeshError> {
+    let path = path.as_ref();
+    let parse = match extension(path).as_str() {
+        "msh" => msh::parse,
+        _ => return Err(unknown(path, TETS)),
+    };
+    let bytes = bytes(path)?;
+    in_file(path, || {
+        let mut mesh = parse(&bytes)?;
+        mesh.drop_unused_nodes();
+        mesh.orient();
+        mesh.check()?;
+        Ok(mesh)
+    })
+}
+
+/// Writes Gmsh MSH 4.1 as text. Reading it back gives the same mesh to the last bit.
+///
+/// The file appears under its name when it is complete: an error leaves nothing, or what was there before.
+///
+/// # Errors
+/// What [`TetMesh::check`] says, or [`MeshError::Write`].
+pub fn write_msh(path: impl AsRef<Path>, mesh: &TetMesh) -> Result<(), MeshError> {
+    write_msh_version(path, mesh, MshVersion::V4_1)
+}
+
+/// Writes Gmsh MSH as text in the wanted version, otherwise as [`write_msh`].
+///
+/// # Errors
+/// As [`write_msh`].
+pub fn write_msh_version(
+    path: impl AsRef<Path>,
+    mesh: &TetMesh,
+    version: MshVersion,
+) -> Result<(), MeshError> {
+    mesh.check()?;
+    write_whole(path.as_ref(), msh::format(mesh, version).as_bytes())
+}
+
+fn extension(path: &Path) -> String {
+    path.extension().and_then(|e| e.to_str()).unwrap_or_default().to_ascii_lowercase()
+}
+
+fn unknown(path: &Path, expected: &'static str) -> MeshError {
+    MeshError::UnknownFormat { path: path.to_owned(), expected }
+}
+
+fn in_file<T>(path: &Path, parse: impl FnOnce() -> Result<T, MeshError>) -> Result<T, MeshError> {
+    parse().map_err(|source| MeshError::InFile { path: path.to_owned(), source: Box::new(source) })
+}
+
+fn bytes(path: &Path) -> Result<Vec<u8>, MeshError> {
+    let failed = |source| MeshError::Read { path: path.to_owned(), source };
+    let mut bytes = Vec::new();
+    fs::File::open(path).and_then(|f| f.take(MAX_FILE + 1).read_to_end(&mut bytes)).map_err(failed)?;
+    if bytes.len() as u64 > MAX_FILE {
+        return Err(MeshError::parameter("size of the file", format!("at most {MAX_FILE} bytes"), "more"));
+    }
+    Ok(bytes)
+}
+
+/// Writes beside the goal, then renames: no reader ever sees half a file.
+fn write_whole(path: &Path, bytes: &[u8]) -> Result<(), MeshError> {
+    let failed = |source| MeshError::Write { path: path.to_owned(), source };
+    let Some(name) = path.file_name() else {
+        return Err(failed(std::io::Error::other("the path names no file")));
+    };
+    let mut part = name.to_owned();
+    part.push(format!(".{}.part", std::process::id()));
+    let part = path.with_file_name(part);
+    let written = fs::File::create(&part)
+        .and_then(|mut file| {
+            file.write_all(bytes)?;
+            file.sync_all()
+        })
+        .and_then(|()| fs::rename(&part, path));
+    written.map_err(|source| {
+        // The first error is the one to tell; the part may not even exist.
+        let _ = fs::remove_file(&part);
+        failed(source)
+    })
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::shapes;
+
+    fn folder(name: &str) -> std::path::PathBuf {
+        let folder = std::env::temp_dir().join(format!("pliant_mesh-{name}-{}", std::process::id()));
+        fs::create_dir_all(&folder).unwrap();
+        folder
+    }
+
+    #[test]
+    fn a_written_mesh_is_read_back_and_nothing_else_is_left() {
+        let folder = folder("round-trip");
+        let path = folder.join("ball.msh");
+        let mesh = shapes::sphere(4, 0.1).unwrap();
+        fs::write(&path, "something old").unwrap();
+        write_msh(&path, &mesh).unwrap();
+        assert_eq!(read_tets(&path).unwrap(), mesh);
+        assert!(matches!(read(&path), Ok(Input::Tets(read)) if read == mesh));
+        assert_eq!(fs::read_dir(&folder).unwrap().count(), 1);
+        fs::remove_dir_all(folder).unwrap();
+    }
+
+    #[test]
+    fn a_failed_write_leaves_what_was_there() {
+        let folder = folder("failed-write");
+        let path = folder.join("bad.msh");
+        fs::write(&path, "something old").unwrap();
+        let mut mesh = shapes::cube(1, 1.0).unwrap();
+        mesh.nodes[0][0] = f64::NAN;
+        assert!(matches!(write_msh(&path, &mesh), Err(MeshError::NotFinite { .. })));
+        assert_eq!(fs::read_to_string(&path).unwrap(), "something old");
+        let nowhere = folder.join("no/such/folder.msh");
+        mesh.nodes[0][0] = 0.0;
+        assert!(matches!(write_msh(&nowhere, &mesh), Err(MeshError::Write { .. })));
+        // A folder stands where the file should go: the part must not stay behind.
+        fs::create_dir(folder.join("taken.msh")).unwrap();
+        assert!(matches!(write_msh(folder.join("taken.msh"), &mesh), Err(MeshError::Write { .. })));
+        assert_eq!(fs::read_dir(&folder).unwrap().count(), 2);
+        fs::remove_dir_all(folder).unwrap();
+    }
+
+    #[test]
+    fn what_cannot_be_read_is_named_with_its_path() {
+        let folder = folder("bad-input");
+        let message = |name: &str, content: &[u8]| {
+            let path = folder.join(name);
+            fs::write(&path, content).unwrap();
+            read(&path).unwrap_err().to_string()
+        };
+        assert!(message("a.xyz", b"").contains("a.xyz: the extension names no known format"));
+        assert!(message("a.obj", b"").contains("a.obj: expected at least one triangle"));
+        assert!(
+            message("a.msh", b"")
+                .contains("a.msh: MSH, line 1: expected $MeshFormat, found the end of the file")
+        );
+        assert!(message("b.msh", b"\x7fELF\xff\xfe\0\0").contains("expected $MeshFormat"));
+        assert!(matches!(read(folder.join("none.obj")), Err(MeshError::Read { .. })));
+        assert!(matches!(read_tets(folder.join("a.obj")), Err(MeshError::UnknownFormat { .. })));
+        fs::remove_dir_all(folder).unwrap();
+    }
+
+    mod any_bytes {
+        use super::*;
+        use proptest::prelude::*;
+
+        /// A real file with a few bytes replaced finds more than noise does.
+        fn altered(text: String) -> impl Strategy<Value = Vec<u8>> {
+            let length = text.len();
+            proptest::collection::vec((0..length, any::<u8>()), 1..6).prop_map(move |changes| {
+                let mut bytes = text.clone().into_bytes();
+                for (at, byte) in changes {
+                    bytes[at] = byte;
+                }
+                bytes
+            })
+        }
+
+        fn any_reader(bytes: &[u8]) {
+            let _ = obj::parse(bytes).map(|s| s.check());
+            let _ = msh::parse(bytes).map(|mut m| {
+                m.drop_unused_nodes();
+                m.orient();
+                m.check()
+            });
+        }
+
+        proptest! {
+            #[test]
+            fn never_panic(bytes in proptest::collection::vec(any::<u8>(), 0..300)) {
+                any_reader(&bytes);
+            }
+
+            #[test]
+            fn in_an_altered_msh_never_panic(
+                bytes in altered(msh::format(&shapes::cube(1, 1.0).unwrap(), MshVersion::V4_1))
+            ) {
+                any_reader(&bytes);
+            }
+
+            #[test]
+            fn in_an_altered_obj_never_panic(bytes in altered("v 0 0 0\nv 1 0 0\nvt 0 1\nv 0 1 0\nf 1/1 2/1 -1/-1\n".into())) {
+                any_reader(&bytes);
+            }
+        }
+    }
+}
