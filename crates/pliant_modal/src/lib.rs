@@ -1,1 +1,53 @@
-//! Modal soft bodies: the model, its file, the step, grabs, warping and reconstruction.
+//! Modal soft bodies without an engine: the baked [`ModalModel`] and its `.modal` file, and the [`Body`] that steps it,
+//! is grabbed, reports its reaction in newtons, bends by modal warping and writes its surface.
+//!
+//! A body is baked once into a few vibration modes; at run time only the modal coordinates `q` move:
+//!
+//! ```text
+//! q'' + c q' + omega^2 q = f        one scalar equation a mode, mass-normalised (phi^T M phi = 1)
+//! u(x) = R~(Psi(x) q) Phi(x) q      the displacement, warped (Choi and Ko 2005)
+//! ```
+//!
+//! ```no_run
+//! use std::sync::Arc;
+//! use pliant_modal::{Body, BodyConfig, GrabConfig, ModalModel, Patch};
+//!
+//! # fn main() -> Result<(), Box<dyn std::error::Error>> {
+//! let model = Arc::new(ModalModel::read("assets/pip.modal")?);
+//! let mut body = Body::new(model.clone(), BodyConfig { step: 1.0 / 240.0, ..Default::default() })?;
+//! let grab = body.grab(&Patch::around(model.surface(), 0, 0.02)?, GrabConfig::default())?;
+//! let start = body.grab_position(grab)?;
+//! for _ in 0..240 {
+//!     body.set_target(grab, [start[0] + 0.05, start[1], start[2]])?;
+//!     body.step()?;
+//! }
+//! println!("the hand feels {:?} N", body.reaction(grab)?);
+//! # Ok(())
+//! # }
+//! ```
+//!
+//! The crate knows no engine, no clock and no network; a step allocates nothing.
+#![cfg_attr(
+    test,
+    allow(clippy::unwrap_used, clippy::expect_used, clippy::panic, reason = "a failed test should panic")
+)]
+
+mod basis;
+mod body;
+mod error;
+mod file;
+mod integrator;
+mod model;
+mod patch;
+mod surface;
+mod warp;
+
+pub use basis::{BLOCK, Basis, ROWS};
+pub use body::{Body, BodyConfig, Frame, GrabConfig, GrabId, State, StepReport};
+pub use error::{FileError, ModelError, StepError};
+pub use file::{FORMAT_VERSION, MAGIC};
+pub use integrator::{Coefficients, Integrator};
+pub use model::{BakeInfo, Damping, Element, FlexibilitySite, ModalModel, ModelHash, ModelParts};
+pub use patch::Patch;
+pub use surface::SurfaceMesh;
+pub use warp::{warp, warp_jacobian};

@@ -1,0 +1,205 @@
+//! Where a body is. An anchored body's frame stays where it is put; a free body's frame is its rigid motion.
+
+use nalgebra::{Matrix3, Quaternion, UnitQuaternion, Vector3};
+
+use crate::{ModalModel, StepError, error::finite};
+
+/// Pose and momentum of a body. The point that it carries is the centre of mass at rest.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Frame {
+    /// Centre of mass at rest, in body axes, m: what `position` is the image of.
+    pivot: Vector3<f64>,
+    position: Vector3<f64>,
+    rotation: UnitQuaternion<f64>,
+    velocity: Vector3<f64>,
+    /// About the centre of mass, world axes, kg m^2/s: kept instead of the angular velocity, so that flight conserves it to rounding.
+    spin: Vector3<f64>,
+}
+
+impl Default for Frame {
+    fn default() -> Self {
+        let zero = Vector3::zeros();
+        Self { pivot: zero, position: zero, rotation: UnitQuaternion::identity(), velocity: zero, spin: zero }
+    }
+}
+
+impl Frame {
+    /// The frame in which the body stands as its model was baked.
+    pub fn at_rest(model: &ModalModel) -> Self {
+        let pivot = Vector3::from(model.center_of_mass());
+        Self { pivot, position: pivot, ..Self::default() }
+    }
+
+    /// World position of the model's origin, m.
+    pub fn origin(&self) -> [f64; 3] {
+        (self.position - self.rotation * self.pivot).into()
+    }
+
+    /// World position of the centre of mass, m.
+    pub fn center(&self) -> [f64; 3] {
+        self.position.into()
+    }
+
+    /// Rotation from body to world axes as a unit quaternion x, y, z, w.
+    pub fn orientation(&self) -> [f64; 4] {
+        let q = self.rotation.quaternion();
+        [q.i, q.j, q.k, q.w]
+    }
+
+    /// Velocity of the centre of mass, m/s, world axes.
+    pub fn velocity(&self) -> [f64; 3] {
+        self.velocity.into()
+    }
+
+    /// Angular momentum about the centre of mass, kg m^2/s, world axes.
+    pub fn spin(&self) -> [f64; 3] {
+        self.spin.into()
+    }
+
+    /// A frame from its parts: centre of mass (m), orientation (x, y, z, w), velocity (m/s), spin (kg m^2/s), all in world axes.
+    ///
+    /// # Errors
+    /// A number that is not finite, a quaternion of length zero.
+    pub fn from_motion(
+        model: &ModalModel,
+        center: [f64; 3],
+        orientation: [f64; 4],
+        velocity: [f64; 3],
+        spin: [f64; 3],
+    ) -> Result<Self, StepError> {
+        finite("frame position", &center)?;
+        finite("frame velocity", &velocity)?;
+        finite("frame spin", &spin)?;
+        Ok(Self {
+            pivot: model.center_of_mass().into(),
+            position: center.into(),
+            rotation: unit(orientation)?,
+            velocity: velocity.into(),
+            spin: spin.into(),
+        })
+    }
+
+    pub(crate) fn set_pose(
+        &mut self,
+        model: &ModalModel,
+        origin: [f64; 3],
+        orientation: [f64; 4],
+    ) -> Result<(), StepError> {
+        finite("position", &origin)?;
+        self.rotation = unit(orientation)?;
+        self.pivot = model.center_of_mass().into();
+        self.position = Vector3::from(origin) + self.rotation * self.pivot;
+        Ok(())
+    }
+
+    pub(crate) fn check(&self) -> Result<(), StepError> {
+        finite("frame position", self.position.as_slice())?;
+        finite("frame rotation", self.rotation.coords.as_slice())?;
+        finite("frame velocity", self.velocity.as_slice())?;
+        finite("frame spin", self.spin.as_slice())
+    }
+
+    pub(crate) fn rotation(&self) -> &UnitQuaternion<f64> {
+        &self.rotation
+    }
+
+    /// World position of a point of the body, m.
+    pub(crate) fn to_world(self, local: Vector3<f64>) -> Vector3<f64> {
+        self.position + self.rotation * (local - self.pivot)
+    }
+
+    pub(crate) fn velocity_at(&self, model: &ModalModel, local: Vector3<f64>) -> Vector3<f64> {
+        self.velocity + self.angular_velocity(model).cross(&(self.rotation * (local - self.pivot)))
+    }
+
+    fn angular_velocity(&self, model: &ModalModel) -> Vector3<f64> {
+        self.rotation * (inverse_inertia(model) * (self.rotation.inverse() * self.spin))
+    }
+
+    pub(crate) fn add_momentum(&mut self, model: &ModalModel, linear: Vector3<f64>, angular: Vector3<f64>) {
+        self.velocity += linear / model.mass();
+        self.spin += angular;
+    }
+
+    pub(crate) fn kinetic_energy(&self, model: &ModalModel) -> f64 {
+        0.5 * model.mass() * self.velocity.norm_squared() + 0.5 * self.spin.dot(&self.angular_velocity(model))
+    }
+
+    pub(crate) fn momentum(&self, model: &ModalModel) -> ([f64; 3], [f64; 3]) {
+        let linear = model.mass() * self.velocity;
+        (linear.into(), (self.spin + self.position.cross(&linear)).into())
+    }
+}
+
+fn unit(orientation: [f64; 4]) -> Result<UnitQuaternion<f64>, StepError> {
+    finite("rotation", &orientation)?;
+    let [x, y, z, w] = orientation;
+    UnitQuaternion::try_new(Quaternion::new(w, x, y, z), 1e-9).ok_or(StepError::Input {
+        what: "rotation",
+        expected: "a quaternion of non-zero length",
+        got: 0.0,
+    })
+}
+
+fn inverse_inertia(model: &ModalModel) -> Matrix3<f64> {
+    let i = model.inertia();
+    // The model was refused unless this is positive definite.
+    Matrix3::from_fn(|r, c| i[r][c]).try_inverse().unwrap_or_else(Matrix3::zeros)
+}
+
+/// What a pull does to the rigid motion within one step.
+///
+/// Velocities first, then positions with the new velocities (symplectic Euler): a stiff hand on a light body is then critically damped, where the
+/// average-acceleration rule would ring for ever. Constant forces are integrated exactly.
+#[derive(Debug, Clone, Copy)]
+pub(crate) struct RigidMotion {
+    step: f64,
+    inverse_mass: f64,
+    /// Body axes.
+    inverse_inertia: Matrix3<f64>,
+}
+
+impl RigidMotion {
+    /// Advances the frame as if no hand held it.
+    pub(crate) fn predict(
+        frame: &mut Frame,
+        model: &ModalModel,
+        h: f64,
+        gravity: Vector3<f64>,
+        force: Vector3<f64>,
+        torque: Vector3<f64>,
+    ) -> Self {
+        let acceleration = gravity + force / model.mass();
+        frame.position += h * frame.velocity + 0.5 * h * h * acceleration;
+        frame.velocity += h * acceleration;
+        frame.spin += h * torque;
+        // Explicit midpoint on the rotation with the spin held: second order, and the spin is untouched.
+        let half = UnitQuaternion::from_scaled_axis(0.5 * h * frame.angular_velocity(model)) * frame.rotation;
+        let middle = Frame { rotation: half, ..*frame }.angular_velocity(model);
+        frame.rotation = UnitQuaternion::from_scaled_axis(h * middle) * frame.rotation;
+        frame.rotation.renormalize_fast();
+        Self { step: h, inverse_mass: 1.0 / model.mass(), inverse_inertia: inverse_inertia(model) }
+    }
+
+    /// How far a unit pull at arm `b` moves the point at arm `a` (3x3, m/N, body axes).
+    pub(crate) fn response(&self, a: &Vector3<f64>, b: &Vector3<f64>, relaxation: f64) -> Matrix3<f64> {
+        let turning = a.cross_matrix() * self.inverse_inertia * b.cross_matrix().transpose();
+        (self.step * (self.step + relaxation)) * (Matrix3::identity() * self.inverse_mass + turning)
+    }
+
+    /// Adds the pulls' total force and torque (world axes) to the predicted frame.
+    pub(crate) fn apply(
+        frame: &mut Frame,
+        model: &ModalModel,
+        h: f64,
+        force: Vector3<f64>,
+        torque: Vector3<f64>,
+    ) {
+        frame.velocity += h * force / model.mass();
+        frame.position += h * h * force / model.mass();
+        frame.spin += h * torque;
+        let turned = frame.rotation * (inverse_inertia(model) * (frame.rotation.inverse() * torque));
+        frame.rotation = UnitQuaternion::from_scaled_axis(h * h * turned) * frame.rotation;
+        frame.rotation.renormalize_fast();
+    }
+}

@@ -1,0 +1,146 @@
+//! A grab: a patch of the surface tied to a target.
+
+use nalgebra::{Matrix3, Vector3};
+
+use super::patch_position;
+use crate::{ModalModel, Patch, StepError};
+
+/// Names a grab on its body. Never used twice by the same body.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, PartialOrd, Ord)]
+pub struct GrabId(pub(crate) u64);
+
+/// How a hand holds.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct GrabConfig {
+    /// Stiffness of the hand's own spring (the device's coupling), N/m, in series with the patch's residual flexibility.
+    /// `None`: the hand is as stiff as the patch it holds allows. Default: `None`.
+    pub stiffness: Option<f64>,
+    /// Relaxation time of the coupling's damper, s: the coupling is `lambda = C^-1 (gap + relaxation d(gap)/dt)`. 0 or more. Default: 0.
+    pub relaxation: f64,
+}
+
+impl Default for GrabConfig {
+    fn default() -> Self {
+        Self { stiffness: None, relaxation: 0.0 }
+    }
+}
+
+impl GrabConfig {
+    fn check(&self) -> Result<(), StepError> {
+        if let Some(k) = self.stiffness {
+            StepError::check("grab stiffness", "finite N/m above 0", k.is_finite() && k > 0.0, k)?;
+        }
+        let r = self.relaxation;
+        StepError::check("grab relaxation", "finite seconds, 0 or more", r.is_finite() && r >= 0.0, r)
+    }
+}
+
+#[derive(Debug, Clone)]
+pub(crate) struct Grab {
+    pub(crate) id: GrabId,
+    pub(crate) config: GrabConfig,
+    /// World axes, m.
+    pub(crate) target: Vector3<f64>,
+    pub(crate) last_target: Vector3<f64>,
+    /// Residual flexibility and hand in series, m/N, body axes.
+    pub(crate) compliance: Matrix3<f64>,
+    /// Force on the body: body axes while a step is solved, world axes (N) between steps.
+    pub(crate) pull: Vector3<f64>,
+    /// Target minus where the patch would be without hands, m, body axes.
+    pub(crate) gap: Vector3<f64>,
+    /// Patch from the centre of mass, m, body axes.
+    pub(crate) arm: Vector3<f64>,
+    rest: Vector3<f64>,
+    displacement: Vec<Vector3<f64>>,
+    rotation: Vec<Vector3<f64>>,
+    rows: Vec<Vector3<f64>>,
+    at: Vector3<f64>,
+}
+
+impl Grab {
+    pub(crate) fn new(
+        id: GrabId,
+        model: &ModalModel,
+        patch: &Patch,
+        config: GrabConfig,
+        modes: usize,
+    ) -> Result<Self, StepError> {
+        config.check()?;
+        let surface = model.surface();
+        let count = surface.positions().len();
+        if let Some(&(vertex, _)) = patch.entries().iter().find(|&&(v, _)| v as usize >= count) {
+            return Err(StepError::Vertex { vertex, count });
+        }
+        let mut rest = Vector3::zeros();
+        let mut displacement = vec![Vector3::zeros(); modes];
+        let mut rotation = vec![Vector3::zeros(); modes];
+        for &(vertex, weight) in patch.entries() {
+            rest += weight * Vector3::from(surface.positions()[vertex as usize].map(f64::from));
+            for mode in 0..modes {
+                for axis in 0..3 {
+                    displacement[mode][axis] +=
+                        weight * f64::from(model.displacement_row(vertex, axis, mode));
+                    rotation[mode][axis] += weight * f64::from(model.rotation_row(vertex, axis, mode));
+                }
+            }
+        }
+        let residual = model.residual_flexibility(patch, modes);
+        let residual = Matrix3::from_fn(|i, j| residual[i][j]);
+        // A patch on an anchor has no flexibility at all, and a hand on it would pull with an infinite force: skin and fingertip give a
+        // hundredth of the patch's own contact compliance.
+        let info = model.info();
+        let radius = patch.radius().max(1e-2 * model.size());
+        let contact = 1e-2 * (1.0 - info.poisson * info.poisson) / (2.0 * info.young * radius);
+        let hand = config.stiffness.map_or(0.0, |k| 1.0 / k);
+        let compliance = 0.5 * (residual + residual.transpose())
+            + Matrix3::identity() * (hand + contact.max(f64::MIN_POSITIVE));
+        let zero = Vector3::zeros();
+        Ok(Self {
+            id,
+            config,
+            target: zero,
+            last_target: Vector3::repeat(f64::NAN),
+            compliance,
+            pull: zero,
+            gap: zero,
+            arm: zero,
+            rest,
+            rows: vec![zero; modes],
+            displacement,
+            rotation,
+            at: zero,
+        })
+    }
+
+    pub(crate) fn local_position(&self, q: &[f64], warped: bool) -> Vector3<f64> {
+        patch_position(self.rest, &self.displacement, &self.rotation, q, warped, None)
+    }
+
+    /// Takes position and rows at `q`.
+    pub(crate) fn linearise(&mut self, q: &[f64], warped: bool) {
+        self.at =
+            patch_position(self.rest, &self.displacement, &self.rotation, q, warped, Some(&mut self.rows));
+    }
+
+    /// Where the patch would be at `q`, on the tangent taken at `from`.
+    pub(crate) fn ahead(&self, from: &[f64], q: &[f64]) -> Vector3<f64> {
+        self.rows.iter().zip(from.iter().zip(q)).fold(self.at, |p, (row, (f, q))| p + row * (q - f))
+    }
+
+    pub(crate) fn row(&self, mode: usize) -> Vector3<f64> {
+        self.rows[mode]
+    }
+
+    pub(crate) fn rows(&self) -> &[Vector3<f64>] {
+        &self.rows
+    }
+
+    pub(crate) fn rows_times(&self, v: &[f64]) -> Vector3<f64> {
+        self.rows.iter().zip(v).fold(Vector3::zeros(), |s, (row, v)| s + row * *v)
+    }
+
+    /// How fast the target moved since the last step, m/s; a fresh grab's has not.
+    pub(crate) fn target_velocity(&self, step: f64) -> Vector3<f64> {
+        if self.last_target.x.is_nan() { Vector3::zeros() } else { (self.target - self.last_target) / step }
+    }
+}

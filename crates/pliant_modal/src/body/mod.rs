@@ -1,0 +1,568 @@
+//! A body in motion: its modal coordinates, its frame, its grabs, and one step of all of them.
+
+mod frame;
+mod grab;
+mod solve;
+
+use std::sync::Arc;
+
+use nalgebra::{Matrix3, Vector3};
+
+pub use frame::Frame;
+pub use grab::{GrabConfig, GrabId};
+
+use crate::{
+    Coefficients, Integrator, ModalModel, Patch, StepError, error::finite, warp::warp_with_jacobian,
+};
+use frame::RigidMotion;
+use grab::Grab;
+use solve::Schur;
+
+/// How a body is stepped.
+#[derive(Debug, Clone, PartialEq)]
+pub struct BodyConfig {
+    /// Seconds a step. Default: 1/60.
+    pub step: f64,
+    /// Default: [`Integrator::Exact`].
+    pub integrator: Integrator,
+    /// Bend by modal warping; off, displacements stay linear and grow when the body turns. Default: `true`.
+    pub warp: bool,
+    /// Keep only the first so many modes; `None` keeps all. Modes are ordered, so this is the level of detail. Default: `None`.
+    pub modes: Option<usize>,
+    /// Uniform acceleration, m/s^2, world axes. Default: none.
+    pub gravity: [f64; 3],
+    /// Factor on all damping coefficients, 0 or more. Default: 1.
+    pub damping_scale: f64,
+    /// Newton corrections of the grabs under warp in one step, 1 to 8. Default: 2.
+    pub corrections: usize,
+}
+
+impl Default for BodyConfig {
+    fn default() -> Self {
+        Self {
+            step: 1.0 / 60.0,
+            integrator: Integrator::default(),
+            warp: true,
+            modes: None,
+            gravity: [0.0; 3],
+            damping_scale: 1.0,
+            corrections: 2,
+        }
+    }
+}
+
+/// What moves: the modal coordinates of one tick. All slices have one entry a kept mode.
+#[derive(Debug, Clone, PartialEq, Default)]
+pub struct State {
+    /// Modal coordinates, kg^1/2 m.
+    pub q: Vec<f64>,
+    /// Modal velocities, kg^1/2 m/s.
+    pub v: Vec<f64>,
+    /// Modal accelerations as the integrator defines them, kg^1/2 m/s^2.
+    pub a: Vec<f64>,
+    /// Modal forces of the last step, kg^1/2 m/s^2 (generalized-alpha remembers them).
+    pub f: Vec<f64>,
+    /// Where the body is.
+    pub frame: Frame,
+}
+
+/// What one step did.
+#[derive(Debug, Clone, Copy, PartialEq, Default)]
+pub struct StepReport {
+    /// Distance that the last Newton correction still moved a grab by, m; 0 without grabs or warp.
+    pub last_correction: f64,
+    /// Directions in which grabs were linearly dependent and had to be regularised.
+    pub regularised: usize,
+}
+
+/// A deformable body: an [`Arc`] to its model, its state, and the hands on it.
+///
+/// A step costs a few operations a mode and 3 rows a grab, allocates nothing, and leaves the body in its last good state when it fails.
+#[derive(Debug, Clone)]
+pub struct Body {
+    model: Arc<ModalModel>,
+    config: BodyConfig,
+    coefficients: Vec<Coefficients>,
+    state: State,
+    before: State,
+    /// Modal force of everything but grabs, held for one step.
+    pushes: Vec<f64>,
+    push_force: Vector3<f64>,
+    push_torque: Vector3<f64>,
+    grabs: Vec<Grab>,
+    next_grab: u64,
+    schur: Schur,
+    /// Scratch, one entry a mode.
+    force: Vec<f64>,
+    linear: Vec<f64>,
+    single: Vec<f32>,
+}
+
+impl Body {
+    /// Most grabs that one body takes.
+    pub const MAX_GRABS: usize = 32;
+
+    /// A body at rest, in its model's own place.
+    ///
+    /// # Errors
+    /// A configuration value that is not finite or not in its range.
+    pub fn new(model: Arc<ModalModel>, config: BodyConfig) -> Result<Self, StepError> {
+        let modes = config.modes.unwrap_or(usize::MAX).min(model.mode_count());
+        let coefficients = coefficients(&model, &config, modes)?;
+        finite("gravity", &config.gravity)?;
+        let zero = vec![0.0; modes];
+        let frame = Frame::at_rest(&model);
+        let state = State { q: zero.clone(), v: zero.clone(), a: zero.clone(), f: zero.clone(), frame };
+        Ok(Self {
+            coefficients,
+            before: state.clone(),
+            state,
+            pushes: zero.clone(),
+            push_force: Vector3::zeros(),
+            push_torque: Vector3::zeros(),
+            grabs: Vec::new(),
+            next_grab: 1,
+            schur: Schur::default(),
+            force: zero.clone(),
+            linear: zero,
+            single: vec![0.0; modes],
+            model,
+            config,
+        })
+    }
+
+    /// The model it is made of.
+    pub fn model(&self) -> &Arc<ModalModel> {
+        &self.model
+    }
+
+    /// How it is stepped.
+    pub fn config(&self) -> &BodyConfig {
+        &self.config
+    }
+
+    /// The recurrences of the kept modes.
+    pub fn coefficients(&self) -> &[Coefficients] {
+        &self.coefficients
+    }
+
+    /// Number of modes kept.
+    pub fn mode_count(&self) -> usize {
+        self.state.q.len()
+    }
+
+    /// Changes step size, integrator, warp, gravity or damping; the state goes on. The number of modes stays as it was made.
+    ///
+    /// # Errors
+    /// As [`Body::new`]; the old configuration then stays.
+    pub fn reconfigure(&mut self, config: BodyConfig) -> Result<(), StepError> {
+        finite("gravity", &config.gravity)?;
+        self.coefficients = coefficients(&self.model, &config, self.mode_count())?;
+        self.config = BodyConfig { modes: self.config.modes, ..config };
+        Ok(())
+    }
+
+    /// Modal coordinates, kg^1/2 m.
+    pub fn q(&self) -> &[f64] {
+        &self.state.q
+    }
+
+    /// Modal velocities, kg^1/2 m/s.
+    pub fn v(&self) -> &[f64] {
+        &self.state.v
+    }
+
+    /// Modal accelerations, kg^1/2 m/s^2.
+    pub fn a(&self) -> &[f64] {
+        &self.state.a
+    }
+
+    /// The whole state.
+    pub fn state(&self) -> &State {
+        &self.state
+    }
+
+    /// Where the body is.
+    pub fn frame(&self) -> &Frame {
+        &self.state.frame
+    }
+
+    /// Puts the body into a state of the same number of modes.
+    ///
+    /// # Errors
+    /// A slice of another length, a number that is not finite; the body then stays as it was.
+    pub fn set_state(&mut self, state: &State) -> Result<(), StepError> {
+        for (what, slice) in [("q", &state.q), ("v", &state.v), ("a", &state.a), ("f", &state.f)] {
+            if slice.len() != self.mode_count() {
+                return Err(StepError::Length { what, expected: self.mode_count(), got: slice.len() });
+            }
+            finite(what, slice)?;
+        }
+        state.frame.check()?;
+        self.state.clone_from(state);
+        Ok(())
+    }
+
+    /// Places the body: position of the model's origin (m) and rotation (unit quaternion x, y, z, w; normalised here), world axes.
+    /// Modal coordinates and velocities stay.
+    ///
+    /// # Errors
+    /// A number that is not finite, a quaternion of length zero.
+    pub fn set_pose(&mut self, position: [f64; 3], rotation: [f64; 4]) -> Result<(), StepError> {
+        self.state.frame.set_pose(&self.model, position, rotation)
+    }
+
+    /// Holds a patch of the body; its target begins where the patch is now, so that grabbing moves nothing.
+    ///
+    /// # Errors
+    /// A vertex that is not on the surface, a configuration out of range, too many grabs.
+    pub fn grab(&mut self, patch: &Patch, config: GrabConfig) -> Result<GrabId, StepError> {
+        if self.grabs.len() >= Self::MAX_GRABS {
+            return Err(StepError::TooManyGrabs { limit: Self::MAX_GRABS });
+        }
+        let id = GrabId(self.next_grab);
+        let mut grab = Grab::new(id, &self.model, patch, config, self.mode_count())?;
+        let local = grab.local_position(&self.state.q, self.config.warp);
+        grab.target = self.state.frame.to_world(local);
+        self.next_grab += 1;
+        self.grabs.push(grab);
+        self.schur.reserve(self.grabs.len());
+        Ok(id)
+    }
+
+    /// Lets go. Letting go twice is no error.
+    pub fn release(&mut self, id: GrabId) {
+        self.grabs.retain(|g| g.id != id);
+    }
+
+    /// The grabs on the body, oldest first.
+    pub fn grabs(&self) -> impl Iterator<Item = GrabId> + '_ {
+        self.grabs.iter().map(|g| g.id)
+    }
+
+    /// Moves a grab's target (m, world axes).
+    ///
+    /// # Errors
+    /// A target that is not finite (the old one stays), or no such grab.
+    pub fn set_target(&mut self, id: GrabId, target: [f64; 3]) -> Result<(), StepError> {
+        finite("grab target", &target)?;
+        self.find_mut(id)?.target = target.into();
+        Ok(())
+    }
+
+    /// Where the grab is being pulled to, m, world axes.
+    ///
+    /// # Errors
+    /// No such grab.
+    pub fn target(&self, id: GrabId) -> Result<[f64; 3], StepError> {
+        Ok(self.find(id)?.target.into())
+    }
+
+    /// Where the held patch is now, m, world axes.
+    ///
+    /// # Errors
+    /// No such grab.
+    pub fn grab_position(&self, id: GrabId) -> Result<[f64; 3], StepError> {
+        let local = self.find(id)?.local_position(&self.state.q, self.config.warp);
+        Ok(self.state.frame.to_world(local).into())
+    }
+
+    /// The reaction: the force that the body exerts on the hand, N, world axes, as of the last step.
+    ///
+    /// # Errors
+    /// No such grab.
+    pub fn reaction(&self, id: GrabId) -> Result<[f64; 3], StepError> {
+        Ok((-self.find(id)?.pull).into())
+    }
+
+    /// The compliance of a grab (3x3, m/N, body axes): residual flexibility of the patch plus the hand's own spring.
+    ///
+    /// # Errors
+    /// No such grab.
+    pub fn compliance(&self, id: GrabId) -> Result<[[f64; 3]; 3], StepError> {
+        let c = self.find(id)?.compliance;
+        Ok(std::array::from_fn(|i| std::array::from_fn(|j| c[(i, j)])))
+    }
+
+    /// Pushes a surface vertex with `force` (N, world axes) during the next step only.
+    ///
+    /// # Errors
+    /// A force that is not finite, a vertex that is not on the surface.
+    pub fn push(&mut self, vertex: u32, force: [f64; 3]) -> Result<(), StepError> {
+        finite("force", &force)?;
+        let (rows, arm) = self.vertex_rows(vertex)?;
+        let force = Vector3::from(force);
+        let local = self.state.frame.rotation().inverse() * force;
+        for (mode, p) in self.pushes.iter_mut().enumerate() {
+            *p += rows(mode).dot(&local);
+        }
+        self.push_force += force;
+        self.push_torque += arm.cross(&force);
+        Ok(())
+    }
+
+    /// Strikes a surface vertex with `impulse` (N s, world axes): velocities change at once.
+    ///
+    /// # Errors
+    /// An impulse that is not finite, a vertex that is not on the surface.
+    pub fn strike(&mut self, vertex: u32, impulse: [f64; 3]) -> Result<(), StepError> {
+        finite("impulse", &impulse)?;
+        let (rows, arm) = self.vertex_rows(vertex)?;
+        let impulse = Vector3::from(impulse);
+        let local = self.state.frame.rotation().inverse() * impulse;
+        let change: Vec<f64> = (0..self.mode_count()).map(|mode| rows(mode).dot(&local)).collect();
+        for (v, dv) in self.state.v.iter_mut().zip(change) {
+            *v += dv;
+        }
+        if self.model.is_free() {
+            self.state.frame.add_momentum(&self.model, impulse, arm.cross(&impulse));
+        }
+        Ok(())
+    }
+
+    /// For a vertex: its (unwarped) displacement rows by mode, and its arm from the centre of mass in world axes.
+    fn vertex_rows(
+        &self,
+        vertex: u32,
+    ) -> Result<(impl Fn(usize) -> Vector3<f64> + use<>, Vector3<f64>), StepError> {
+        let surface = self.model.surface().positions();
+        let count = surface.len();
+        let Some(rest) = surface.get(vertex as usize) else {
+            return Err(StepError::Vertex { vertex, count });
+        };
+        let arm = self.state.frame.rotation()
+            * (Vector3::from(rest.map(f64::from)) - Vector3::from(self.model.center_of_mass()));
+        let model = self.model.clone();
+        let rows =
+            move |mode| Vector3::from_fn(|axis, _| f64::from(model.displacement_row(vertex, axis, mode)));
+        Ok((rows, arm))
+    }
+
+    /// Kinetic plus elastic energy of the modes, and of the rigid motion of a free body, J. Potential energy in gravity is not in it.
+    pub fn energy(&self) -> f64 {
+        let modes: f64 = (0..self.mode_count())
+            .map(|i| {
+                let stretch = self.model.omega()[i] * self.state.q[i];
+                0.5 * (self.state.v[i] * self.state.v[i] + stretch * stretch)
+            })
+            .sum();
+        modes + if self.model.is_free() { self.state.frame.kinetic_energy(&self.model) } else { 0.0 }
+    }
+
+    /// Linear (kg m/s) and angular momentum about the world's origin (kg m^2/s) of a free body's rigid motion; zero for an anchored one.
+    pub fn momentum(&self) -> ([f64; 3], [f64; 3]) {
+        if self.model.is_free() { self.state.frame.momentum(&self.model) } else { ([0.0; 3], [0.0; 3]) }
+    }
+
+    /// One step of the configured length.
+    ///
+    /// Grabs are compliant and implicit: with `x = x* + A lambda` the patch's position after the step, the pull `lambda` (N) solves
+    /// `(A + C) lambda = target - x*`, `C` the grab's compliance; the reaction is `-lambda`. Under warp the rows are corrected
+    /// `corrections` times (Newton).
+    ///
+    /// # Errors
+    /// [`StepError::Diverged`] when the result would not be finite; the body is then in the state it had before.
+    pub fn step(&mut self) -> Result<StepReport, StepError> {
+        self.before.clone_from(&self.state);
+        let report = self.advance();
+        self.pushes.fill(0.0);
+        self.push_force = Vector3::zeros();
+        self.push_torque = Vector3::zeros();
+        match self.first_non_finite() {
+            None => Ok(report),
+            Some(what) => {
+                self.state.clone_from(&self.before);
+                for grab in &mut self.grabs {
+                    grab.pull = Vector3::zeros();
+                }
+                Err(StepError::Diverged { what })
+            }
+        }
+    }
+
+    fn first_non_finite(&self) -> Option<&'static str> {
+        let bad = |slice: &[f64]| slice.iter().any(|x| !x.is_finite());
+        if bad(&self.state.q) {
+            Some("modal coordinates")
+        } else if bad(&self.state.v) {
+            Some("modal velocities")
+        } else if bad(&self.state.a) {
+            Some("modal accelerations")
+        } else if self.state.frame.check().is_err() {
+            Some("the frame")
+        } else if self.grabs.iter().any(|g| !g.pull.iter().all(|x| x.is_finite())) {
+            Some("a reaction")
+        } else {
+            None
+        }
+    }
+
+    fn advance(&mut self) -> StepReport {
+        let h = self.config.step;
+        let gravity = Vector3::from(self.config.gravity);
+        let gravity_local = self.state.frame.rotation().inverse() * gravity;
+        let participation = self.model.participation();
+        for (i, f) in self.force.iter_mut().enumerate() {
+            *f = self.pushes[i]
+                + if self.model.is_free() {
+                    0.0
+                } else {
+                    gravity_local.dot(&Vector3::from(participation[i]))
+                };
+        }
+        // The step without hands.
+        self.linear.copy_from_slice(&self.state.q); // rows are first taken where the body is
+        for (i, c) in self.coefficients.iter().enumerate() {
+            let old = [self.state.q[i], self.state.v[i], self.state.a[i]];
+            let [q, v, a] = c.step(old, self.state.f[i], self.force[i]);
+            (self.state.q[i], self.state.v[i], self.state.a[i]) = (q, v, a);
+        }
+        let rigid = if self.model.is_free() {
+            Some(RigidMotion::predict(
+                &mut self.state.frame,
+                &self.model,
+                h,
+                gravity,
+                self.push_force,
+                self.push_torque,
+            ))
+        } else {
+            None
+        };
+        let mut report = StepReport::default();
+        if !self.grabs.is_empty() {
+            report = self.hold(rigid.as_ref());
+        }
+        self.state.f.copy_from_slice(&self.force);
+        report
+    }
+
+    /// Solves for the pulls of all grabs and adds what they do to the state.
+    fn hold(&mut self, rigid: Option<&RigidMotion>) -> StepReport {
+        let corrections = if self.config.warp { self.config.corrections.clamp(1, 8) } else { 1 };
+        let reach = self.model.size();
+        let turn: Matrix3<f64> = *self.state.frame.rotation().to_rotation_matrix().matrix();
+        let back = turn.transpose();
+        let mut report = StepReport::default();
+        for round in 0..corrections {
+            let last = round + 1 == corrections;
+            for grab in &mut self.grabs {
+                // Linearise where the last round ended; project the unheld step onto that plane.
+                grab.linearise(&self.linear, self.config.warp);
+                let ahead = grab.ahead(&self.linear, &self.state.q);
+                let free_position = self.state.frame.to_world(ahead);
+                let mut gap = grab.target - free_position;
+                if grab.config.relaxation > 0.0 {
+                    let speed = turn * grab.rows_times(&self.state.v)
+                        + rigid.map_or_else(Vector3::zeros, |_| {
+                            self.state.frame.velocity_at(&self.model, ahead)
+                        });
+                    gap += grab.config.relaxation * (grab.target_velocity(self.config.step) - speed);
+                }
+                // A hand that is a body's length away pulls no harder than from there: targets may teleport.
+                let distance = gap.norm();
+                if distance > reach {
+                    gap *= reach / distance;
+                }
+                grab.gap = back * gap;
+                grab.arm = ahead - Vector3::from(self.model.center_of_mass());
+            }
+            report.regularised = self.schur.solve(&mut self.grabs, &self.coefficients, rigid);
+            let mut moved = 0.0f64;
+            for (i, q) in self.linear.iter_mut().enumerate() {
+                let pull: f64 = self.grabs.iter().map(|g| g.row(i).dot(&g.pull)).sum();
+                let next = self.state.q[i] + self.coefficients[i].response[0] * pull;
+                if last {
+                    moved = moved.max((next - *q).abs());
+                }
+                *q = next;
+            }
+            if last {
+                report.last_correction = moved;
+            }
+        }
+        for (i, c) in self.coefficients.iter().enumerate() {
+            let pull: f64 = self.grabs.iter().map(|g| g.row(i).dot(&g.pull)).sum();
+            self.force[i] += pull;
+            self.state.q[i] += c.response[0] * pull;
+            self.state.v[i] += c.response[1] * pull;
+            self.state.a[i] += c.response[2] * pull;
+        }
+        let (mut force, mut torque) = (Vector3::zeros(), Vector3::zeros());
+        for grab in &mut self.grabs {
+            // Solved in body axes; hands live in the world's.
+            grab.pull = turn * grab.pull;
+            force += grab.pull;
+            torque += (turn * grab.arm).cross(&grab.pull);
+            grab.last_target = grab.target;
+        }
+        if rigid.is_some() {
+            RigidMotion::apply(&mut self.state.frame, &self.model, self.config.step, force, torque);
+        }
+        report
+    }
+
+    /// Writes the deformed surface (m, body axes): multiply by the frame, or by an engine's transform, to place it.
+    ///
+    /// # Errors
+    /// `out` is shorter than the surface.
+    pub fn reconstruct(&mut self, out: &mut [[f32; 3]]) -> Result<(), StepError> {
+        let expected = self.model.surface().positions().len();
+        if out.len() < expected {
+            return Err(StepError::Length { what: "positions", expected, got: out.len() });
+        }
+        for (s, q) in self.single.iter_mut().zip(&self.state.q) {
+            *s = *q as f32;
+        }
+        self.model.basis().reconstruct(&self.single, self.config.warp, out);
+        Ok(())
+    }
+
+    fn find(&self, id: GrabId) -> Result<&Grab, StepError> {
+        self.grabs.iter().find(|g| g.id == id).ok_or(StepError::NoGrab)
+    }
+
+    fn find_mut(&mut self, id: GrabId) -> Result<&mut Grab, StepError> {
+        self.grabs.iter_mut().find(|g| g.id == id).ok_or(StepError::NoGrab)
+    }
+}
+
+fn coefficients(
+    model: &ModalModel,
+    config: &BodyConfig,
+    modes: usize,
+) -> Result<Vec<Coefficients>, StepError> {
+    let scale = config.damping_scale;
+    StepError::check("damping_scale", "finite, 0 or more", scale.is_finite() && scale >= 0.0, scale)?;
+    (0..modes)
+        .map(|i| {
+            Coefficients::new(config.integrator, model.omega()[i], model.damping()[i] * scale, config.step)
+        })
+        .collect()
+}
+
+/// The position of a patch (m, body axes) and, when wanted, its derivative by each modal coordinate.
+fn patch_position(
+    rest: Vector3<f64>,
+    displacement: &[Vector3<f64>],
+    rotation: &[Vector3<f64>],
+    q: &[f64],
+    warped: bool,
+    rows: Option<&mut [Vector3<f64>]>,
+) -> Vector3<f64> {
+    let sum = |columns: &[Vector3<f64>]| columns.iter().zip(q).fold(Vector3::zeros(), |s, (c, q)| s + c * *q);
+    let d = sum(displacement);
+    if !warped {
+        if let Some(rows) = rows {
+            rows.copy_from_slice(displacement);
+        }
+        return rest + d;
+    }
+    let (u, by_d, by_w) = warp_with_jacobian(sum(rotation), d);
+    if let Some(rows) = rows {
+        for ((row, phi), psi) in rows.iter_mut().zip(displacement).zip(rotation) {
+            *row = by_d * phi + by_w * psi;
+        }
+    }
+    rest + u
+}

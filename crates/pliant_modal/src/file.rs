@@ -1,0 +1,249 @@
+//! The `.modal` file.
+//!
+//! ```text
+//! 8   magic "PLIANTMB"
+//! 4   format version, u32
+//! 8   payload length, u64
+//! 32  BLAKE3 of the payload: the model's content hash
+//! payload:
+//!   4   length of the description, u32
+//!   ..  description (postcard): counts and everything small
+//!   ..  surface positions f32 x 3 n, triangles u32 x 3 t, texture coordinates f32 x 2 n (when there), anchored u8 x n
+//!   ..  displacement f32 x 3 n m, rotation f32 x 3 n m, both [mode][vertex][axis]
+//! ```
+//! All numbers little-endian. A reader checks magic, version, length and hash before it looks at anything inside.
+
+use std::{
+    io::Write,
+    path::{Path, PathBuf},
+};
+
+use serde::{Deserialize, Serialize};
+
+use crate::{BakeInfo, FileError, FlexibilitySite, ModalModel, ModelError, ModelParts, SurfaceMesh};
+
+/// First bytes of a `.modal` file.
+pub const MAGIC: [u8; 8] = *b"PLIANTMB";
+
+/// Version of the format that this build reads and writes.
+pub const FORMAT_VERSION: u32 = 1;
+
+const HEADER: usize = 8 + 4 + 8 + 32;
+
+#[derive(Serialize, Deserialize)]
+struct Description {
+    info: BakeInfo,
+    vertices: u32,
+    triangles: u32,
+    modes: u32,
+    textured: bool,
+    free: bool,
+    omega: Vec<f64>,
+    damping: Vec<f64>,
+    participation: Vec<[f64; 3]>,
+    mass: f64,
+    center_of_mass: [f64; 3],
+    inertia: [[f64; 3]; 3],
+    sites: Vec<FlexibilitySite>,
+}
+
+pub(crate) fn encode(parts: &ModelParts) -> Vec<u8> {
+    let surface = &parts.surface;
+    let description = Description {
+        info: parts.info.clone(),
+        vertices: surface.positions().len() as u32,
+        triangles: surface.triangles().len() as u32,
+        modes: parts.omega.len() as u32,
+        textured: surface.uvs().is_some(),
+        free: parts.free,
+        omega: parts.omega.clone(),
+        damping: parts.damping.clone(),
+        participation: parts.participation.clone(),
+        mass: parts.mass,
+        center_of_mass: parts.center_of_mass,
+        inertia: parts.inertia,
+        sites: parts.sites.clone(),
+    };
+    // Writing plain data to memory cannot fail; an empty description would be refused by every reader.
+    let description = postcard::to_stdvec(&description).unwrap_or_default();
+    let mut bytes = vec![0; HEADER];
+    bytes.extend((description.len() as u32).to_le_bytes());
+    bytes.extend(description);
+    let mut floats = |values: &[f32]| bytes.extend(values.iter().flat_map(|x| x.to_le_bytes()));
+    floats(surface.positions().as_flattened());
+    bytes.extend(surface.triangles().as_flattened().iter().flat_map(|x| x.to_le_bytes()));
+    let mut floats = |values: &[f32]| bytes.extend(values.iter().flat_map(|x| x.to_le_bytes()));
+    floats(surface.uvs().unwrap_or_default().as_flattened());
+    bytes.extend(surface.anchored().iter().map(|&a| u8::from(a)));
+    let mut floats = |values: &[f32]| bytes.extend(values.iter().flat_map(|x| x.to_le_bytes()));
+    floats(&parts.displacement);
+    floats(&parts.rotation);
+
+    let hash = blake3::hash(&bytes[HEADER..]);
+    let length = (bytes.len() - HEADER) as u64;
+    bytes[..8].copy_from_slice(&MAGIC);
+    bytes[8..12].copy_from_slice(&FORMAT_VERSION.to_le_bytes());
+    bytes[12..20].copy_from_slice(&length.to_le_bytes());
+    bytes[20..HEADER].copy_from_slice(hash.as_bytes());
+    bytes
+}
+
+pub(crate) fn stored_hash(bytes: &[u8]) -> crate::ModelHash {
+    let mut hash = [0; 32];
+    if let Some(stored) = bytes.get(20..HEADER) {
+        hash.copy_from_slice(stored);
+    }
+    crate::ModelHash(hash)
+}
+
+/// Takes `count` little-endian words off the front of `bytes`.
+fn words<'a, const N: usize>(
+    what: &'static str,
+    bytes: &mut &'a [u8],
+    count: usize,
+) -> Result<impl Iterator<Item = [u8; N]> + use<'a, N>, FileError> {
+    let need = count.checked_mul(N).unwrap_or(usize::MAX);
+    if bytes.len() < need {
+        return Err(FileError::Truncated { what, expected: need as u64, got: bytes.len() as u64 });
+    }
+    let (head, rest) = bytes.split_at(need);
+    *bytes = rest;
+    Ok(head.chunks_exact(N).map(|c| std::array::from_fn(|i| c[i])))
+}
+
+fn triples<T: Copy + Default>(flat: impl Iterator<Item = T>) -> Vec<[T; 3]> {
+    let flat: Vec<T> = flat.collect();
+    flat.chunks_exact(3).map(|c| [c[0], c[1], c[2]]).collect()
+}
+
+impl ModalModel {
+    /// The model as the content of a `.modal` file.
+    pub fn to_bytes(&self) -> Vec<u8> {
+        encode(self.parts())
+    }
+
+    /// Reads the content of a `.modal` file.
+    ///
+    /// # Errors
+    /// Another kind of file, another version, cut short, padded, altered, or inconsistent inside: each by name. Never panics,
+    /// and allocates no more than a small multiple of `bytes`.
+    pub fn from_bytes(bytes: &[u8]) -> Result<Self, FileError> {
+        let magic = bytes.get(..8).unwrap_or(bytes);
+        if magic != MAGIC {
+            return Err(FileError::Magic(magic.to_vec()));
+        }
+        let Some(header) = bytes.get(..HEADER) else {
+            return Err(FileError::Truncated {
+                what: "header",
+                expected: HEADER as u64,
+                got: bytes.len() as u64,
+            });
+        };
+        let version = u32::from_le_bytes(std::array::from_fn(|i| header[8 + i]));
+        if version != FORMAT_VERSION {
+            return Err(FileError::Version { expected: FORMAT_VERSION, got: version });
+        }
+        let length = u64::from_le_bytes(std::array::from_fn(|i| header[12 + i]));
+        let payload = &bytes[HEADER..];
+        if payload.len() as u64 != length {
+            return Err(FileError::Truncated {
+                what: "payload",
+                expected: length,
+                got: payload.len() as u64,
+            });
+        }
+        let hash = blake3::hash(payload);
+        if hash.as_bytes() != &header[20..HEADER] {
+            let expected = stored_hash(bytes).to_string();
+            return Err(FileError::Hash { expected, got: hash.to_hex().to_string() });
+        }
+        Ok(Self::from_checked_bytes(decode(payload)?, bytes)?)
+    }
+
+    /// Reads a `.modal` file.
+    ///
+    /// # Errors
+    /// The file cannot be opened, or as [`ModalModel::from_bytes`].
+    pub fn read(path: impl AsRef<Path>) -> Result<Self, FileError> {
+        let path = path.as_ref();
+        let bytes = std::fs::read(path)
+            .map_err(|source| FileError::Io { path: path.display().to_string(), source })?;
+        Self::from_bytes(&bytes)
+    }
+
+    /// Writes a `.modal` file: to a neighbour first, which is then renamed, so that a reader never finds half of it.
+    ///
+    /// # Errors
+    /// The operating system refused.
+    pub fn write(&self, path: impl AsRef<Path>) -> Result<(), FileError> {
+        let path = path.as_ref();
+        let mut partial = path.as_os_str().to_owned();
+        partial.push(format!(".{}.partial", std::process::id()));
+        let partial = PathBuf::from(partial);
+        let io = |source| FileError::Io { path: path.display().to_string(), source };
+        let written = std::fs::File::create(&partial)
+            .and_then(|mut file| file.write_all(&self.to_bytes()).and_then(|()| file.sync_all()))
+            .and_then(|()| std::fs::rename(&partial, path));
+        written.map_err(|source| {
+            // The first error is the one to report; a leftover that cannot be removed says nothing more.
+            let _ = std::fs::remove_file(&partial);
+            io(source)
+        })
+    }
+}
+
+fn decode(payload: &[u8]) -> Result<ModelParts, FileError> {
+    let mut rest = payload;
+    let length =
+        words::<4>("description length", &mut rest, 1)?.next().map_or(0, u32::from_le_bytes) as usize;
+    if rest.len() < length {
+        return Err(FileError::Truncated {
+            what: "description",
+            expected: length as u64,
+            got: rest.len() as u64,
+        });
+    }
+    let (description, mut rest) = rest.split_at(length);
+    let d: Description = postcard::from_bytes(description).map_err(|e| FileError::Decode(e.to_string()))?;
+    let (n, t, m) = (d.vertices as usize, d.triangles as usize, d.modes as usize);
+    for (what, got) in
+        [("omega", d.omega.len()), ("damping", d.damping.len()), ("participation", d.participation.len())]
+    {
+        if got != m {
+            return Err(ModelError::Length { what, expected: m, got }.into());
+        }
+    }
+    let shape = n.saturating_mul(3).saturating_mul(m);
+    let positions =
+        triples(words::<4>("surface positions", &mut rest, n.saturating_mul(3))?.map(f32::from_le_bytes));
+    let triangles =
+        triples(words::<4>("surface triangles", &mut rest, t.saturating_mul(3))?.map(u32::from_le_bytes));
+    let uvs = if d.textured {
+        let flat: Vec<f32> = words::<4>("texture coordinates", &mut rest, n.saturating_mul(2))?
+            .map(f32::from_le_bytes)
+            .collect();
+        Some(flat.chunks_exact(2).map(|c| [c[0], c[1]]).collect())
+    } else {
+        None
+    };
+    let anchored = words::<1>("anchored flags", &mut rest, n)?.map(|[b]| b != 0).collect();
+    let displacement = words::<4>("displacement", &mut rest, shape)?.map(f32::from_le_bytes).collect();
+    let rotation = words::<4>("rotation", &mut rest, shape)?.map(f32::from_le_bytes).collect();
+    if !rest.is_empty() {
+        return Err(FileError::Truncated { what: "nothing more", expected: 0, got: rest.len() as u64 });
+    }
+    Ok(ModelParts {
+        info: d.info,
+        surface: SurfaceMesh::new(positions, triangles, uvs, anchored)?,
+        omega: d.omega,
+        damping: d.damping,
+        displacement,
+        rotation,
+        participation: d.participation,
+        free: d.free,
+        mass: d.mass,
+        center_of_mass: d.center_of_mass,
+        inertia: d.inertia,
+        sites: d.sites,
+    })
+}

@@ -1,0 +1,425 @@
+//! The baked model: what a body is, independent of where it is and how it moves.
+
+use serde::{Deserialize, Serialize};
+
+use crate::{Basis, ModelError, SurfaceMesh};
+
+/// The finite element that a body was baked with.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "lowercase")]
+#[non_exhaustive]
+pub enum Element {
+    /// 4-node (linear) tetrahedra: the paper's. 20-40 % too stiff in bending on coarse meshes.
+    Tet4,
+    /// 10-node (quadratic) tetrahedra: the default.
+    Tet10,
+}
+
+impl std::fmt::Display for Element {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        f.write_str(match self {
+            Self::Tet4 => "tet4",
+            Self::Tet10 => "tet10",
+        })
+    }
+}
+
+/// How the modes lose energy. Mode `i` has the damping coefficient `c_i` of `q'' + c q' + omega^2 q = f`.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+#[non_exhaustive]
+pub enum Damping {
+    /// `c = alpha + beta omega^2` (`C = alpha M + beta K`).
+    Rayleigh {
+        /// Mass-proportional part, 1/s.
+        alpha: f64,
+        /// Stiffness-proportional part, s.
+        beta: f64,
+    },
+    /// `c = 2 zeta omega`: the same fraction of critical damping in every mode.
+    Ratio(f64),
+}
+
+impl Damping {
+    /// `c_i` in 1/s for a mode of angular frequency `omega` (rad/s).
+    pub fn coefficient(self, omega: f64) -> f64 {
+        match self {
+            Self::Rayleigh { alpha, beta } => alpha + beta * omega * omega,
+            Self::Ratio(zeta) => 2.0 * zeta * omega,
+        }
+    }
+}
+
+/// Where a model came from, and how good its bake was.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub struct BakeInfo {
+    /// A name for people: the file it was made from.
+    pub name: String,
+    /// Tetrahedra of the simulation mesh.
+    pub tets: usize,
+    /// Nodes of the simulation mesh, mid-edge nodes counted.
+    pub nodes: usize,
+    /// The element used.
+    pub element: Element,
+    /// Young's modulus, Pa.
+    pub young: f64,
+    /// Poisson ratio, -1 < nu < 0.5.
+    pub poisson: f64,
+    /// Density, kg/m^3.
+    pub density: f64,
+    /// Damping law.
+    pub damping: Damping,
+    /// The anchors as they were given (`x<0.01`); empty for a free body.
+    pub anchors: Vec<String>,
+    /// Largest `|K phi - lambda M phi| / |K phi|` over the modes.
+    pub residual_max: f64,
+    /// Largest entry of `|Phi^T M Phi - I|`.
+    pub orthonormality_max: f64,
+}
+
+/// The residual flexibility of one patch: what the kept modes leave out of its static compliance,
+/// `W^T (K^-1 - Phi Lambda^-1 Phi^T) W` (m/N, body axes, symmetric and positive semi-definite).
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
+pub struct FlexibilitySite {
+    /// Surface vertex in the middle of the patch.
+    pub vertex: u32,
+    /// Patch radius, m.
+    pub radius: f64,
+    /// 3x3, m/N.
+    pub flexibility: [[f64; 3]; 3],
+}
+
+/// Content hash of a model (BLAKE3 of its `.modal` payload): two machines with the same hash have the same body, bit for bit.
+#[derive(Clone, Copy, PartialEq, Eq, Hash, PartialOrd, Ord, Serialize, Deserialize)]
+pub struct ModelHash(pub [u8; 32]);
+
+impl std::fmt::Display for ModelHash {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        self.0.iter().try_for_each(|b| write!(f, "{b:02x}"))
+    }
+}
+
+impl std::fmt::Debug for ModelHash {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        write!(f, "ModelHash({self})")
+    }
+}
+
+/// Everything that a bake hands over. `m` modes, `n` surface vertices.
+#[derive(Debug, Clone, PartialEq)]
+pub struct ModelParts {
+    /// Where it came from.
+    pub info: BakeInfo,
+    /// The visible surface at rest.
+    pub surface: SurfaceMesh,
+    /// Angular frequencies of the elastic modes, rad/s, ascending, positive; `m` entries.
+    pub omega: Vec<f64>,
+    /// Damping coefficients `c_i`, 1/s, not negative; `m` entries.
+    pub damping: Vec<f64>,
+    /// Mass-normalised mode shapes at the surface, `[mode][vertex][axis]`, kg^-1/2; `3 n m` entries.
+    pub displacement: Vec<f32>,
+    /// Half the curl of each mode at the surface, `[mode][vertex][axis]`, kg^-1/2 m^-1; `3 n m` entries.
+    pub rotation: Vec<f32>,
+    /// `Phi^T M 1_axis`, kg^1/2: how a uniform acceleration (gravity) drives each mode; `m` entries. Zero for a free body's elastic modes.
+    pub participation: Vec<[f64; 3]>,
+    /// No anchors: the body also has the six rigid modes, which a [`Frame`](crate::Frame) carries.
+    pub free: bool,
+    /// Total mass, kg.
+    pub mass: f64,
+    /// Centre of mass at rest, m.
+    pub center_of_mass: [f64; 3],
+    /// Inertia about the centre of mass at rest, kg m^2, symmetric.
+    pub inertia: [[f64; 3]; 3],
+    /// Residual flexibility of patches spread over the surface; may be empty (the grab then falls back on a contact estimate).
+    pub sites: Vec<FlexibilitySite>,
+}
+
+/// A baked body, immutable; share it as `Arc<ModalModel>` between all bodies that look alike.
+#[derive(Debug, Clone, PartialEq)]
+pub struct ModalModel {
+    parts: ModelParts,
+    basis: Basis,
+    size: f64,
+    hash: ModelHash,
+    bytes: usize,
+}
+
+impl ModalModel {
+    /// Most modes that a model may have.
+    pub const MAX_MODES: usize = 4096;
+
+    /// Checks the parts and builds the run-time layout.
+    ///
+    /// # Errors
+    /// A length that does not fit the counts, a number that is not finite or not in its range, a vertex that is not there.
+    pub fn from_parts(parts: ModelParts) -> Result<Self, ModelError> {
+        check_parts(&parts)?;
+        let bytes = crate::file::encode(&parts);
+        Ok(Self::assemble(parts, &bytes))
+    }
+
+    pub(crate) fn from_checked_bytes(parts: ModelParts, bytes: &[u8]) -> Result<Self, ModelError> {
+        check_parts(&parts)?;
+        Ok(Self::assemble(parts, bytes))
+    }
+
+    fn assemble(parts: ModelParts, bytes: &[u8]) -> Self {
+        let basis =
+            Basis::new(parts.surface.positions(), parts.omega.len(), &parts.displacement, &parts.rotation);
+        let size = parts.surface.size();
+        let hash = crate::file::stored_hash(bytes);
+        Self { parts, basis, size, hash, bytes: bytes.len() }
+    }
+
+    /// The parts it was made from.
+    pub fn parts(&self) -> &ModelParts {
+        &self.parts
+    }
+
+    /// Number of elastic modes.
+    pub fn mode_count(&self) -> usize {
+        self.parts.omega.len()
+    }
+
+    /// Angular frequencies of the elastic modes, rad/s, ascending.
+    pub fn omega(&self) -> &[f64] {
+        &self.parts.omega
+    }
+
+    /// Damping coefficients `c_i` of `q'' + c q' + omega^2 q = f`, 1/s.
+    pub fn damping(&self) -> &[f64] {
+        &self.parts.damping
+    }
+
+    /// 6 for a free body, 0 for an anchored one.
+    pub fn rigid_modes(&self) -> usize {
+        if self.parts.free { 6 } else { 0 }
+    }
+
+    /// Is the body without anchors?
+    pub fn is_free(&self) -> bool {
+        self.parts.free
+    }
+
+    /// Total mass, kg.
+    pub fn mass(&self) -> f64 {
+        self.parts.mass
+    }
+
+    /// Centre of mass at rest, m, body axes.
+    pub fn center_of_mass(&self) -> [f64; 3] {
+        self.parts.center_of_mass
+    }
+
+    /// Inertia about the centre of mass at rest, kg m^2, body axes.
+    pub fn inertia(&self) -> [[f64; 3]; 3] {
+        self.parts.inertia
+    }
+
+    /// How a uniform acceleration drives each mode, kg^1/2.
+    pub fn participation(&self) -> &[[f64; 3]] {
+        &self.parts.participation
+    }
+
+    /// The visible surface at rest.
+    pub fn surface(&self) -> &SurfaceMesh {
+        &self.parts.surface
+    }
+
+    /// Modes at the surface in the layout that reconstruction reads.
+    pub fn basis(&self) -> &Basis {
+        &self.basis
+    }
+
+    /// Largest extent of the rest shape's bounds, m: what errors are measured against.
+    pub fn size(&self) -> f64 {
+        self.size
+    }
+
+    /// Content hash.
+    pub fn hash(&self) -> ModelHash {
+        self.hash
+    }
+
+    /// Size as a `.modal` file, bytes.
+    pub fn file_bytes(&self) -> usize {
+        self.bytes
+    }
+
+    /// Where it came from.
+    pub fn info(&self) -> &BakeInfo {
+        &self.parts.info
+    }
+
+    /// Mode shape `mode` at `vertex` along `axis`, kg^-1/2; zero outside the model.
+    pub fn displacement_row(&self, vertex: u32, axis: usize, mode: usize) -> f32 {
+        self.parts.displacement.get(self.row(vertex, axis, mode)).copied().unwrap_or(0.0)
+    }
+
+    /// Half the curl of mode `mode` at `vertex` about `axis`, kg^-1/2 m^-1; zero outside the model.
+    pub fn rotation_row(&self, vertex: u32, axis: usize, mode: usize) -> f32 {
+        self.parts.rotation.get(self.row(vertex, axis, mode)).copied().unwrap_or(0.0)
+    }
+
+    fn row(&self, vertex: u32, axis: usize, mode: usize) -> usize {
+        let count = self.parts.surface.positions().len();
+        if axis > 2 || vertex as usize >= count || mode >= self.mode_count() {
+            return usize::MAX;
+        }
+        (mode * count + vertex as usize) * 3 + axis
+    }
+
+    /// Residual flexibility (3x3, m/N, body axes) of a patch of `radius` around `vertex`, with `kept` of the modes kept.
+    ///
+    /// The nearest baked sites are blended by inverse squared distance at each baked radius, and the radii by a power law between them
+    /// (the compliance of a loaded patch goes as 1 / (E r), Boussinesq). What modes beyond `kept` would have given is added.
+    /// A model without sites gets the half-space estimate `(1 - nu^2) / (2 E r)`.
+    pub fn residual_flexibility(&self, patch: &crate::Patch, kept: usize) -> [[f64; 3]; 3] {
+        let mut flexibility = self.baked_flexibility(patch);
+        for mode in kept..self.mode_count() {
+            let mut phi = [0.0f64; 3];
+            for &(v, w) in patch.entries() {
+                for (axis, p) in phi.iter_mut().enumerate() {
+                    *p += w * f64::from(self.displacement_row(v, axis, mode));
+                }
+            }
+            let stiffness = self.parts.omega[mode].powi(2);
+            for i in 0..3 {
+                for j in 0..3 {
+                    flexibility[i][j] += phi[i] * phi[j] / stiffness;
+                }
+            }
+        }
+        flexibility
+    }
+
+    fn baked_flexibility(&self, patch: &crate::Patch) -> [[f64; 3]; 3] {
+        let info = &self.parts.info;
+        let radius = patch.radius().max(1e-3 * self.size).max(f64::MIN_POSITIVE);
+        if self.parts.sites.is_empty() {
+            let c = (1.0 - info.poisson * info.poisson) / (2.0 * info.young * radius);
+            return [[c, 0.0, 0.0], [0.0, c, 0.0], [0.0, 0.0, c]];
+        }
+        let mut radii: Vec<f64> = self.parts.sites.iter().map(|s| s.radius).collect();
+        radii.sort_by(f64::total_cmp);
+        radii.dedup();
+        let below = radii.iter().rev().find(|&&r| r <= radius).copied();
+        let above = radii.iter().find(|&&r| r >= radius).copied();
+        match (below, above) {
+            (Some(a), Some(b)) if a < b => {
+                let (fa, fb) =
+                    (self.flexibility_at(patch.center(), a), self.flexibility_at(patch.center(), b));
+                // Linear in 1/r: exact for the Boussinesq law, and keeps a blend of two PSD matrices PSD.
+                let t = ((1.0 / radius - 1.0 / b) / (1.0 / a - 1.0 / b)).clamp(0.0, 1.0);
+                combine(&fa, t, &fb, 1.0 - t)
+            }
+            (Some(a), _) | (None, Some(a)) => {
+                let f = self.flexibility_at(patch.center(), a);
+                combine(&f, (a / radius).min(8.0), &f, 0.0)
+            }
+            (None, None) => [[0.0; 3]; 3],
+        }
+    }
+
+    fn flexibility_at(&self, vertex: u32, radius: f64) -> [[f64; 3]; 3] {
+        const NEAREST: usize = 4;
+        let positions = self.parts.surface.positions();
+        let center = positions[vertex as usize];
+        let mut nearest = [(f64::INFINITY, usize::MAX); NEAREST];
+        for (index, site) in self.parts.sites.iter().enumerate().filter(|(_, s)| s.radius == radius) {
+            let p = positions[site.vertex as usize];
+            let d2: f64 = (0..3).map(|k| f64::from(p[k] - center[k]).powi(2)).sum();
+            if d2 < nearest[NEAREST - 1].0 {
+                nearest[NEAREST - 1] = (d2, index);
+                nearest.sort_by(|a, b| a.0.total_cmp(&b.0));
+            }
+        }
+        let mut sum = [[0.0; 3]; 3];
+        let mut total = 0.0;
+        for &(d2, index) in nearest.iter().filter(|(d2, _)| d2.is_finite()) {
+            let weight = 1.0 / (d2 + (1e-6 * self.size).powi(2)).max(f64::MIN_POSITIVE);
+            let f = &self.parts.sites[index].flexibility;
+            for i in 0..3 {
+                for j in 0..3 {
+                    sum[i][j] += weight * f[i][j];
+                }
+            }
+            total += weight;
+        }
+        if total > 0.0 {
+            sum.iter_mut().flatten().for_each(|x| *x /= total);
+        }
+        sum
+    }
+}
+
+fn combine(a: &[[f64; 3]; 3], s: f64, b: &[[f64; 3]; 3], t: f64) -> [[f64; 3]; 3] {
+    std::array::from_fn(|i| std::array::from_fn(|j| s * a[i][j] + t * b[i][j]))
+}
+
+fn check_parts(parts: &ModelParts) -> Result<(), ModelError> {
+    let modes = parts.omega.len();
+    let vertices = parts.surface.positions().len();
+    if modes == 0 {
+        return Err(ModelError::Empty("mode"));
+    }
+    let length = |what, expected: usize, got: usize| {
+        if expected == got { Ok(()) } else { Err(ModelError::Length { what, expected, got }) }
+    };
+    if modes > ModalModel::MAX_MODES {
+        return Err(ModelError::Length { what: "omega", expected: ModalModel::MAX_MODES, got: modes });
+    }
+    length("damping", modes, parts.damping.len())?;
+    length("participation", modes, parts.participation.len())?;
+    length("displacement", modes * vertices * 3, parts.displacement.len())?;
+    length("rotation", modes * vertices * 3, parts.rotation.len())?;
+
+    let each = |what, expected, values: &mut dyn Iterator<Item = f64>, ok: &dyn Fn(f64) -> bool| match values
+        .enumerate()
+        .find(|&(_, x)| !(x.is_finite() && ok(x)))
+    {
+        None => Ok(()),
+        Some((index, got)) => Err(ModelError::Value { what, index, expected, got }),
+    };
+    let any = |_: f64| true;
+    let positive = |x: f64| x > 0.0;
+    let not_negative = |x: f64| x >= 0.0;
+    let info = &parts.info;
+    each("omega", "rad/s above 0", &mut parts.omega.iter().copied(), &positive)?;
+    each("omega", "ascending", &mut parts.omega.windows(2).map(|w| w[1] - w[0]), &not_negative)?;
+    each("damping", "1/s, 0 or more", &mut parts.damping.iter().copied(), &not_negative)?;
+    each("displacement", "finite", &mut parts.displacement.iter().map(|&x| f64::from(x)), &any)?;
+    each("rotation", "finite", &mut parts.rotation.iter().map(|&x| f64::from(x)), &any)?;
+    each("participation", "finite", &mut parts.participation.iter().flatten().copied(), &any)?;
+    each("mass", "kg above 0", &mut [parts.mass].into_iter(), &positive)?;
+    each("center_of_mass", "finite metres", &mut parts.center_of_mass.into_iter(), &any)?;
+    each("inertia", "finite", &mut parts.inertia.into_iter().flatten(), &any)?;
+    if nalgebra::Matrix3::from_fn(|i, j| parts.inertia[i][j]).cholesky().is_none() {
+        let got = parts.inertia[0][0];
+        return Err(ModelError::Value {
+            what: "inertia",
+            index: 0,
+            expected: "a positive definite matrix",
+            got,
+        });
+    }
+    each("young", "Pa above 0", &mut [info.young].into_iter(), &positive)?;
+    each("poisson", "-1 < nu < 0.5", &mut [info.poisson].into_iter(), &|x| x > -1.0 && x < 0.5)?;
+    each("density", "kg/m^3 above 0", &mut [info.density].into_iter(), &positive)?;
+    for (index, site) in parts.sites.iter().enumerate() {
+        if site.vertex as usize >= vertices {
+            return Err(ModelError::Vertex { what: "sites", index, vertex: site.vertex, count: vertices });
+        }
+        each("site radius", "m above 0", &mut [site.radius].into_iter(), &positive)?;
+        each("site flexibility", "finite", &mut site.flexibility.into_iter().flatten(), &any)?;
+        for k in 0..3 {
+            each(
+                "site flexibility diagonal",
+                "0 or more",
+                &mut [site.flexibility[k][k]].into_iter(),
+                &not_negative,
+            )?;
+        }
+    }
+    Ok(())
+}

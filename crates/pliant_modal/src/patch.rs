@@ -1,0 +1,101 @@
+//! A patch: the bit of surface that a hand holds.
+//!
+//! Never one vertex: the compliance at a point of an elastic body is infinite in the continuum, so on a mesh it measures the mesh.
+
+use std::collections::VecDeque;
+
+use crate::{ModelError, SurfaceMesh};
+
+/// Weighted surface vertices around a centre; the weights are positive and sum to one.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Patch {
+    center: u32,
+    radius: f64,
+    entries: Vec<(u32, f64)>,
+}
+
+impl Patch {
+    /// The patch of `radius` (m) around surface vertex `vertex`, at rest.
+    ///
+    /// Weight = area around the vertex x `(1 - d^2 / r^2)^2`, `d` its distance from the centre. Only vertices that are reached over edges
+    /// within the radius count, so that two fingers that touch at rest stay two fingers. A radius below the edge length leaves the centre alone.
+    ///
+    /// # Errors
+    /// A vertex that the surface does not have; a radius that is not finite or is negative.
+    pub fn around(surface: &SurfaceMesh, vertex: u32, radius: f64) -> Result<Self, ModelError> {
+        let count = surface.positions().len();
+        if vertex as usize >= count {
+            return Err(ModelError::Vertex { what: "patch", index: 0, vertex, count });
+        }
+        if !(radius.is_finite() && radius >= 0.0) {
+            return Err(ModelError::Value {
+                what: "patch radius",
+                index: 0,
+                expected: "finite metres, 0 or more",
+                got: radius,
+            });
+        }
+        let at = |v: u32| surface.positions()[v as usize].map(f64::from);
+        let center = at(vertex);
+        let distance2 = |v: u32| {
+            let p = at(v);
+            (0..3).map(|k| (p[k] - center[k]).powi(2)).sum::<f64>()
+        };
+        let r2 = radius * radius;
+        let mut reached = vec![false; surface.welded_count()];
+        let mut queue = VecDeque::from([vertex]);
+        reached[surface.welded()[vertex as usize] as usize] = true;
+        let mut entries = Vec::new();
+        while let Some(v) = queue.pop_front() {
+            let w = surface.welded()[v as usize];
+            let d2 = distance2(v);
+            let kernel = if r2 > 0.0 { (1.0 - (d2 / r2).min(1.0)).powi(2) } else { 0.0 };
+            let area: f64 = surface.ring(w).iter().map(|&t| triangle_area(surface, t)).sum::<f64>() / 3.0;
+            let weight = kernel * area;
+            if v == vertex || weight > 0.0 {
+                entries.push((v, weight));
+            }
+            for &t in surface.ring(w) {
+                for &n in &surface.triangles()[t as usize] {
+                    let wn = surface.welded()[n as usize] as usize;
+                    if !reached[wn] && distance2(n) < r2 {
+                        reached[wn] = true;
+                        queue.push_back(n);
+                    }
+                }
+            }
+        }
+        entries.sort_by_key(|&(v, _)| v);
+        let total: f64 = entries.iter().map(|&(_, w)| w).sum();
+        if total > 0.0 && total.is_finite() {
+            entries.iter_mut().for_each(|(_, w)| *w /= total);
+        } else {
+            entries = vec![(vertex, 1.0)];
+        }
+        Ok(Self { center: vertex, radius, entries })
+    }
+
+    /// The vertex in the middle.
+    pub fn center(&self) -> u32 {
+        self.center
+    }
+
+    /// The radius asked for, m.
+    pub fn radius(&self) -> f64 {
+        self.radius
+    }
+
+    /// Surface vertices and their weights, by rising vertex; the weights sum to one.
+    pub fn entries(&self) -> &[(u32, f64)] {
+        &self.entries
+    }
+}
+
+fn triangle_area(surface: &SurfaceMesh, triangle: u32) -> f64 {
+    let [a, b, c] =
+        surface.triangles()[triangle as usize].map(|v| surface.positions()[v as usize].map(f64::from));
+    let u = [b[0] - a[0], b[1] - a[1], b[2] - a[2]];
+    let v = [c[0] - a[0], c[1] - a[1], c[2] - a[2]];
+    let n = [u[1] * v[2] - u[2] * v[1], u[2] * v[0] - u[0] * v[2], u[0] * v[1] - u[1] * v[0]];
+    0.5 * (n[0] * n[0] + n[1] * n[1] + n[2] * n[2]).sqrt()
+}

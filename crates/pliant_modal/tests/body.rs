@@ -1,0 +1,237 @@
+//! A body held, pulled, thrown and mistreated, against a rod that is known in closed form.
+#![allow(clippy::unwrap_used, clippy::expect_used, reason = "a failed test should panic")]
+
+mod rod;
+
+use std::sync::Arc;
+
+use pliant_modal::{Body, BodyConfig, GrabConfig, Integrator, ModalModel, Patch, State, StepError};
+use rod::{AREA, DENSITY, LENGTH, rod, tip};
+
+fn tip_patch(model: &ModalModel) -> Patch {
+    Patch::around(model.surface(), tip(), 0.01).unwrap()
+}
+
+/// max |second difference of F| / max |F|: 4 for a sign flip each step.
+fn ringing(force: &[f64]) -> f64 {
+    let largest = force.iter().fold(0.0f64, |m, f| m.max(f.abs()));
+    force.windows(3).map(|w| (w[2] - 2.0 * w[1] + w[0]).abs()).fold(0.0, f64::max) / largest
+}
+
+fn smooth(t: f64) -> f64 {
+    let t = t.clamp(0.0, 1.0);
+    t * t * t * (10.0 - 15.0 * t + 6.0 * t * t)
+}
+
+#[test]
+fn reaction_reaches_the_static_value() {
+    // Pulled by d, the rod answers with -E A d / L whatever the number of modes: the residual flexibility makes up for the rest.
+    for modes in [1, 3, 12] {
+        for integrator in
+            [Integrator::Exact, Integrator::Newmark, Integrator::GeneralizedAlpha { rho_inf: 0.5 }]
+        {
+            let model = Arc::new(rod(2e5, modes, 0.3, false));
+            let config = BodyConfig { step: 1.0 / 40.0, integrator, ..Default::default() };
+            let mut body = Body::new(model.clone(), config).unwrap();
+            let grab = body.grab(&tip_patch(&model), GrabConfig::default()).unwrap();
+            let start = body.grab_position(grab).unwrap();
+            body.set_target(grab, [start[0] + 0.02, start[1], start[2]]).unwrap();
+            for _ in 0..2_000 {
+                body.step().unwrap();
+            }
+            let want = -2e5 * AREA * 0.02 / LENGTH;
+            let got = body.reaction(grab).unwrap();
+            // The contact floor of a grab is a hundredth of the patch's own, here 1e-2 x 0.91 / (2 E 0.01) of 1 / (E A / L): 0.5 %.
+            assert!(
+                (got[0] / want - 1.0).abs() < 0.006,
+                "{integrator:?}, {modes} modes: {got:?}, wanted {want}"
+            );
+            assert!(got[1].abs() < 1e-9 && got[2].abs() < 1e-9);
+        }
+    }
+}
+
+#[test]
+fn a_dragged_reaction_does_not_ring_at_any_stiffness_or_step() {
+    for young in [1e3, 1e5, 2e6, 1e9, 1e11] {
+        for step in [1.0 / 40.0, 1.0 / 240.0, 1.0 / 1000.0] {
+            for integrator in [Integrator::Exact, Integrator::GeneralizedAlpha { rho_inf: 0.5 }] {
+                let model = Arc::new(rod(young, 20, 0.02, false));
+                let mut body =
+                    Body::new(model.clone(), BodyConfig { step, integrator, ..Default::default() }).unwrap();
+                let grab = body.grab(&tip_patch(&model), GrabConfig::default()).unwrap();
+                let start = body.grab_position(grab).unwrap();
+                let mut force = Vec::new();
+                for i in 0..(2.0 / step) as usize {
+                    let t = (i + 1) as f64 * step;
+                    body.set_target(grab, [start[0] + 0.05 * smooth(t), start[1], start[2]]).unwrap();
+                    body.step().unwrap();
+                    force.push(body.reaction(grab).unwrap()[0]);
+                }
+                // A body slower than the step cannot answer a step smoothly: only bodies that live within it are held to the bound.
+                let bound = if model.omega()[0] * step > 0.05 { 0.1 } else { 0.5 };
+                let got = ringing(&force);
+                assert!(got < bound, "E {young}, h {step}, {integrator:?}: ringing {got}");
+            }
+        }
+    }
+}
+
+#[test]
+fn unforced_energy_never_grows() {
+    for integrator in [Integrator::Exact, Integrator::Newmark, Integrator::GeneralizedAlpha { rho_inf: 0.8 }]
+    {
+        let model = Arc::new(rod(1e7, 30, 0.01, false));
+        let mut body =
+            Body::new(model, BodyConfig { step: 1.0 / 60.0, integrator, ..Default::default() }).unwrap();
+        body.strike(tip(), [3.0, 0.0, 0.0]).unwrap();
+        let start = body.energy();
+        for _ in 0..5_000 {
+            body.step().unwrap();
+            assert!(body.energy() < 1.5 * start, "{integrator:?}");
+        }
+        assert!(body.energy() < 1e-3 * start, "{integrator:?}: {} of {start}", body.energy());
+    }
+}
+
+#[test]
+fn hanging_rod_stretches_as_the_textbook_says() {
+    // rho g L^2 / (2 E); 60 modes leave out sum_{k > 60} of a series that falls as k^-3.
+    let young = 1e6;
+    let model = Arc::new(rod(young, 60, 1.0, false));
+    let mut body =
+        Body::new(model.clone(), BodyConfig { gravity: [9.81, 0.0, 0.0], ..Default::default() }).unwrap();
+    for _ in 0..600 {
+        body.step().unwrap();
+    }
+    let mut positions = vec![[0.0; 3]; model.surface().positions().len()];
+    body.reconstruct(&mut positions).unwrap();
+    let got = f64::from(positions[tip() as usize][0]) - LENGTH;
+    let want = DENSITY * 9.81 * LENGTH * LENGTH / (2.0 * young);
+    assert!((got / want - 1.0).abs() < 1e-3, "{got} and {want}");
+}
+
+#[test]
+fn bad_numbers_are_refused_and_change_nothing() {
+    let model = Arc::new(rod(1e5, 5, 0.1, false));
+    let mut body = Body::new(model.clone(), BodyConfig::default()).unwrap();
+    let grab = body.grab(&tip_patch(&model), GrabConfig::default()).unwrap();
+    let target = body.target(grab).unwrap();
+    assert!(matches!(body.set_target(grab, [f64::NAN, 0.0, 0.0]), Err(StepError::Input { .. })));
+    assert_eq!(body.target(grab).unwrap(), target);
+    assert!(body.push(0, [f64::INFINITY, 0.0, 0.0]).is_err());
+    assert!(matches!(body.push(9_999, [0.0; 3]), Err(StepError::Vertex { .. })));
+    assert!(body.strike(0, [0.0, f64::NAN, 0.0]).is_err());
+    let mut state = body.state().clone();
+    state.q[0] = f64::NAN;
+    assert!(body.set_state(&state).is_err());
+    assert!(body.set_state(&State::default()).is_err());
+    assert!(body.set_pose([0.0; 3], [0.0; 4]).is_err());
+    for step in [0.0, -1.0, f64::NAN] {
+        assert!(Body::new(model.clone(), BodyConfig { step, ..Default::default() }).is_err());
+    }
+    body.step().unwrap();
+    assert!(body.q().iter().all(|q| *q == 0.0));
+    body.release(grab);
+    body.release(grab);
+    assert!(matches!(body.reaction(grab), Err(StepError::NoGrab)));
+}
+
+#[test]
+fn a_step_that_would_overflow_is_taken_back() {
+    let model = Arc::new(rod(1e5, 5, 0.0, false));
+    let mut body =
+        Body::new(model, BodyConfig { integrator: Integrator::Newmark, ..Default::default() }).unwrap();
+    body.push(tip(), [f64::MAX, 0.0, 0.0]).unwrap();
+    body.push(tip(), [f64::MAX, 0.0, 0.0]).unwrap();
+    assert!(matches!(body.step(), Err(StepError::Diverged { .. })));
+    assert!(body.q().iter().all(|q| *q == 0.0));
+    body.step().unwrap();
+}
+
+#[test]
+fn teleporting_targets_coincident_hands_and_hands_on_anchors() {
+    let model = Arc::new(rod(2e6, 2, 0.05, false));
+    let mut body = Body::new(model.clone(), BodyConfig { step: 1.0 / 40.0, ..Default::default() }).unwrap();
+    let patch = tip_patch(&model);
+    let hands: Vec<_> = (0..6).map(|_| body.grab(&patch, GrabConfig::default()).unwrap()).collect();
+    let anchor = body.grab(&Patch::around(model.surface(), 0, 0.0).unwrap(), GrabConfig::default()).unwrap();
+    for i in 0..400 {
+        let far = if i % 7 == 0 { 100.0 } else { -100.0 };
+        for (k, hand) in hands.iter().enumerate() {
+            let sign = if k % 2 == 0 { 1.0 } else { -1.0 };
+            body.set_target(*hand, [sign * far, far, -far]).unwrap();
+        }
+        body.set_target(anchor, [0.3, 0.0, 0.0]).unwrap();
+        body.step().unwrap();
+    }
+    for hand in hands {
+        body.release(hand);
+    }
+    body.release(anchor);
+    for _ in 0..4_000 {
+        body.step().unwrap();
+    }
+    assert!(body.energy() < 1e-6, "{} J left", body.energy());
+}
+
+#[test]
+fn free_flight_keeps_its_momenta_and_two_hands_account_for_every_newton() {
+    let model = Arc::new(rod(1e6, 8, 0.01, true));
+    let config = BodyConfig { step: 1.0 / 240.0, ..Default::default() };
+    let mut body = Body::new(model.clone(), config).unwrap();
+    body.strike(tip(), [3.0, 20.0, -7.0]).unwrap();
+    body.strike(2, [-1.0, 4.0, 9.0]).unwrap();
+    let (p0, l0) = body.momentum();
+    for _ in 0..240 * 60 {
+        body.step().unwrap();
+    }
+    let (p1, l1) = body.momentum();
+    let norm = |a: [f64; 3]| a.iter().map(|x| x * x).sum::<f64>().sqrt();
+    for k in 0..3 {
+        assert!((p1[k] - p0[k]).abs() < 1e-9 * norm(p0));
+        assert!((l1[k] - l0[k]).abs() < 1e-6 * norm(l0), "{l0:?} became {l1:?}");
+    }
+
+    let a = body.grab(&tip_patch(&model), GrabConfig::default()).unwrap();
+    let b = body.grab(&Patch::around(model.surface(), 1, 0.0).unwrap(), GrabConfig::default()).unwrap();
+    for i in 0..480 {
+        let t = f64::from(i) / 240.0;
+        body.set_target(a, [0.5 + t.sin(), 0.3, 0.1 * t]).unwrap();
+        body.set_target(b, [-0.5, 0.2 * t.cos(), 0.0]).unwrap();
+        let before = body.momentum().0;
+        body.step().unwrap();
+        let after = body.momentum().0;
+        let (ra, rb) = (body.reaction(a).unwrap(), body.reaction(b).unwrap());
+        let scale = norm(ra) + norm(rb) + 1e-9;
+        for k in 0..3 {
+            let change = (after[k] - before[k]) * 240.0;
+            assert!(
+                (change + ra[k] + rb[k]).abs() < 1e-6 * scale,
+                "axis {k}: {change} against {ra:?} and {rb:?}"
+            );
+        }
+    }
+    assert!(body.energy().is_finite());
+}
+
+#[test]
+fn reconstruction_equals_the_sum_over_modes() {
+    let model = Arc::new(rod(1e6, 13, 0.0, false));
+    let mut body = Body::new(model.clone(), BodyConfig { warp: false, ..Default::default() }).unwrap();
+    let mut state = body.state().clone();
+    for (i, q) in state.q.iter_mut().enumerate() {
+        *q = 0.01 * ((i * 7 + 3) % 5) as f64 - 0.02;
+    }
+    body.set_state(&state).unwrap();
+    let mut out = vec![[0.0; 3]; model.surface().positions().len()];
+    body.reconstruct(&mut out).unwrap();
+    for (v, (rest, got)) in model.surface().positions().iter().zip(&out).enumerate() {
+        let mut want = f64::from(rest[0]);
+        for (mode, q) in state.q.iter().enumerate() {
+            want += f64::from(model.displacement_row(v as u32, 0, mode)) * q;
+        }
+        assert!((f64::from(got[0]) - want).abs() < 1e-6, "vertex {v}");
+    }
+    assert!(body.reconstruct(&mut out[1..]).is_err());
+}
