@@ -102,7 +102,7 @@ fn words<'a, const N: usize>(
     bytes: &mut &'a [u8],
     count: usize,
 ) -> Result<impl Iterator<Item = [u8; N]> + use<'a, N>, FileError> {
-    let need = count.checked_mul(N).unwrap_or(usize::MAX);
+    let need = count.saturating_mul(N);
     if bytes.len() < need {
         return Err(FileError::Truncated { what, expected: need as u64, got: bytes.len() as u64 });
     }

@@ -294,7 +294,7 @@ impl Body {
         let force = Vector3::from(force);
         let local = self.state.frame.rotation().inverse() * force;
         for (mode, p) in self.pushes.iter_mut().enumerate() {
-            *p += rows(mode).dot(&local);
+            *p += rows.at(mode).dot(&local);
         }
         self.push_force += force;
         self.push_torque += arm.cross(&force);
@@ -310,9 +310,11 @@ impl Body {
         let (rows, arm) = self.vertex_rows(vertex)?;
         let impulse = Vector3::from(impulse);
         let local = self.state.frame.rotation().inverse() * impulse;
-        let change: Vec<f64> = (0..self.mode_count()).map(|mode| rows(mode).dot(&local)).collect();
-        for (v, dv) in self.state.v.iter_mut().zip(change) {
-            *v += dv;
+        let change: Vec<f64> = (0..self.mode_count()).map(|mode| rows.at(mode).dot(&local)).collect();
+        for (i, dv) in change.into_iter().enumerate() {
+            self.state.v[i] += dv;
+            // The acceleration belongs to the state: damping answers the new velocity.
+            self.state.a[i] -= self.model.damping()[i] * self.config.damping_scale * dv;
         }
         if self.model.is_free() {
             self.state.frame.add_momentum(&self.model, impulse, arm.cross(&impulse));
@@ -321,10 +323,7 @@ impl Body {
     }
 
     /// For a vertex: its (unwarped) displacement rows by mode, and its arm from the centre of mass in world axes.
-    fn vertex_rows(
-        &self,
-        vertex: u32,
-    ) -> Result<(impl Fn(usize) -> Vector3<f64> + use<>, Vector3<f64>), StepError> {
+    fn vertex_rows(&self, vertex: u32) -> Result<(VertexRows, Vector3<f64>), StepError> {
         let surface = self.model.surface().positions();
         let count = surface.len();
         let Some(rest) = surface.get(vertex as usize) else {
@@ -332,9 +331,7 @@ impl Body {
         };
         let arm = self.state.frame.rotation()
             * (Vector3::from(rest.map(f64::from)) - Vector3::from(self.model.center_of_mass()));
-        let model = self.model.clone();
-        let rows =
-            move |mode| Vector3::from_fn(|axis, _| f64::from(model.displacement_row(vertex, axis, mode)));
+        let rows = VertexRows { model: self.model.clone(), vertex };
         Ok((rows, arm))
     }
 
@@ -524,6 +521,18 @@ impl Body {
 
     fn find_mut(&mut self, id: GrabId) -> Result<&mut Grab, StepError> {
         self.grabs.iter_mut().find(|g| g.id == id).ok_or(StepError::NoGrab)
+    }
+}
+
+/// The (unwarped) displacement rows of one vertex.
+struct VertexRows {
+    model: Arc<ModalModel>,
+    vertex: u32,
+}
+
+impl VertexRows {
+    fn at(&self, mode: usize) -> Vector3<f64> {
+        Vector3::from_fn(|axis, _| f64::from(self.model.displacement_row(self.vertex, axis, mode)))
     }
 }
 

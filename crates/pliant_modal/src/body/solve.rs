@@ -74,7 +74,8 @@ fn cholesky_in_place(m: &mut [f64], n: usize) -> usize {
         for k in 0..j {
             pivot -= m[j * n + k] * m[j * n + k];
         }
-        if !(pivot > 1e-13 * diagonal.abs()) {
+        let sound = pivot > 1e-13 * diagonal.abs();
+        if !sound {
             lost += 1;
             // The direction is a combination of earlier ones: dropping it leaves their solution standing.
             pivot = f64::MAX.sqrt();
