@@ -1,0 +1,478 @@
+//! The network's side of an endpoint: what runs on its thread.
+
+use std::future::{Future, poll_fn};
+use std::net::{IpAddr, Ipv4Addr, Ipv6Addr, SocketAddr, UdpSocket};
+use std::pin::pin;
+use std::sync::atomic::{AtomicUsize, Ordering};
+use std::sync::mpsc::SyncSender;
+use std::sync::{Arc, Mutex};
+use std::task::Poll;
+use std::time::{Duration, Instant, SystemTime};
+
+use bytes::Bytes;
+use quinn::{
+    ClientConfig, Connection, ConnectionError, EndpointConfig, Incoming, RecvStream, Runtime,
+    SendDatagramError, SendStream, ServerConfig, TokioRuntime, TransportErrorCode, VarInt,
+};
+use rustls::pki_types::CertificateDer;
+use tokio::sync::Notify;
+use tokio::time::{sleep, timeout};
+use tracing::debug;
+
+use super::config::Access;
+use super::congestion::Bucket;
+use super::emulated::{Emulated, Emulation};
+use super::endpoint::{CloseReason, Event, Peer, PeerId, Shared, TransportError};
+use super::identity::{Fingerprint, SERVER_NAME, shortened};
+use super::invite::Invite;
+use super::queue::{Next, lock};
+use super::stats::PeerStats;
+use super::wire::{self, ReadMessageError, TOKEN_MESSAGE};
+
+/// An ordinary end.
+pub(super) const GOODBYE: u32 = 0;
+/// The host does not let the guest in.
+const REFUSED: u32 = 1;
+/// The other end broke the rules.
+const PROTOCOL: u32 = 2;
+
+/// What this endpoint is for.
+#[derive(Debug)]
+pub(super) enum Role {
+    Host { server: ServerConfig, access: Access },
+    Guest { client: ClientConfig, invite: Invite, refused: Arc<Mutex<Option<Fingerprint>>> },
+}
+
+/// Runs until the application drops its side.
+pub(super) async fn run(
+    shared: Arc<Shared>,
+    socket: UdpSocket,
+    emulation: Option<Emulation>,
+    role: Role,
+    ready: SyncSender<Result<(), TransportError>>,
+) {
+    let server = match &role {
+        Role::Host { server, .. } => Some(server.clone()),
+        Role::Guest { .. } => None,
+    };
+    let endpoint = match open(socket, emulation, server) {
+        Ok(endpoint) => endpoint,
+        Err(error) => {
+            // Nobody to tell means that the application is gone as well.
+            let _ = ready.send(Err(error));
+            return;
+        }
+    };
+    let _ = ready.send(Ok(()));
+    match role {
+        Role::Host { access, .. } => accept(&shared, &endpoint, access).await,
+        Role::Guest { client, invite, refused } => {
+            let joined = join(Arc::clone(&shared), endpoint.clone(), client, invite, refused);
+            let joined = tokio::spawn(joined);
+            shared.stop.notified().await;
+            endpoint.close(VarInt::from_u32(GOODBYE), b"goodbye");
+            joined.abort();
+        }
+    }
+    // Close packets are repeated while the other end still sends. It must not hold up an application that ends.
+    let _ = timeout(Duration::from_secs(1), endpoint.wait_idle()).await;
+}
+
+fn open(
+    socket: UdpSocket,
+    emulation: Option<Emulation>,
+    server: Option<ServerConfig>,
+) -> Result<quinn::Endpoint, TransportError> {
+    let runtime = Arc::new(TokioRuntime);
+    let mut socket = runtime.wrap_udp_socket(socket)?;
+    if let Some(emulation) = emulation {
+        socket = Emulated::under(socket, emulation)?;
+    }
+    Ok(quinn::Endpoint::new_with_abstract_socket(EndpointConfig::default(), server, socket, runtime)?)
+}
+
+/// With so many handshakes open, a newcomer must first prove that its address is its own.
+const HANDSHAKES_BEFORE_RETRY: usize = 16;
+
+async fn accept(shared: &Arc<Shared>, endpoint: &quinn::Endpoint, access: Access) {
+    let access = Arc::new(access);
+    let handshakes = Arc::new(AtomicUsize::new(0));
+    loop {
+        let incoming = tokio::select! {
+            () = shared.stop.notified() => break,
+            incoming = endpoint.accept() => match incoming {
+                Some(incoming) => incoming,
+                None => break,
+            },
+        };
+        let open = handshakes.load(Ordering::Relaxed);
+        let address = incoming.remote_address();
+        if lock(&shared.peers).len() + open >= shared.limits.peers || shared.inbox.crowded() {
+            debug!(%address, "refused a guest: no room");
+            incoming.refuse();
+        } else if open >= HANDSHAKES_BEFORE_RETRY
+            && incoming.may_retry()
+            && !incoming.remote_address_validated()
+        {
+            if let Err(error) = incoming.retry() {
+                debug!(%address, %error, "could not ask a guest to prove its address");
+            }
+        } else {
+            handshakes.fetch_add(1, Ordering::Relaxed);
+            let (shared, access, handshakes) =
+                (Arc::clone(shared), Arc::clone(&access), Arc::clone(&handshakes));
+            tokio::spawn(async move {
+                let welcomed = timeout(shared.limits.handshake, welcome(&shared, incoming, &access)).await;
+                handshakes.fetch_sub(1, Ordering::Relaxed);
+                match welcomed {
+                    Ok(Ok(guest)) => guest.serve(&shared).await,
+                    Ok(Err(why)) => debug!(%address, %why, "a guest did not get in"),
+                    Err(_) => debug!(%address, "a guest did not finish its handshake in time"),
+                }
+            });
+        }
+    }
+    endpoint.close(VarInt::from_u32(GOODBYE), b"the host has left");
+}
+
+/// An open connection that both ends have agreed to.
+struct Open {
+    peer: PeerId,
+    fingerprint: Fingerprint,
+    connection: Connection,
+    send: SendStream,
+    recv: RecvStream,
+}
+
+/// The host's half of the handshake.
+async fn welcome(shared: &Shared, incoming: Incoming, access: &Access) -> Result<Open, CloseReason> {
+    let connection =
+        incoming.accept().map_err(|error| reason_of(error, None))?.await.map_err(|e| reason_of(e, None))?;
+    let refuse = |words: &str| {
+        connection.close(VarInt::from_u32(REFUSED), words.as_bytes());
+        CloseReason::Refused { words: words.to_owned() }
+    };
+    let fingerprint = fingerprint_of(&connection).ok_or_else(|| refuse("no key shown"))?;
+    let (mut send, mut recv) = connection.accept_bi().await.map_err(|e| reason_of(e, None))?;
+    let first = wire::read_message(&mut recv, TOKEN_MESSAGE).await;
+    let token = first.ok().and_then(|first| wire::token_from_message(&first).ok());
+    let Some(token) = token else {
+        return Err(refuse("the first message is no token"));
+    };
+    if let Some(words) = access.refusal(token, SystemTime::now()) {
+        return Err(refuse(words));
+    }
+    if shared.is_stopping() {
+        return Err(refuse("the host is leaving"));
+    }
+    discard_early(&connection).await;
+    if wire::write_prefix(&mut send, 0).await.is_err() {
+        return Err(CloseReason::Failed { words: "the guest closed its stream".into() });
+    }
+    let peer = PeerId(shared.next_peer.fetch_add(1, Ordering::Relaxed));
+    Ok(Open { peer, fingerprint, connection, send, recv })
+}
+
+/// The guest's half: one attempt, told as an event either way.
+async fn join(
+    shared: Arc<Shared>,
+    endpoint: quinn::Endpoint,
+    client: ClientConfig,
+    invite: Invite,
+    refused: Arc<Mutex<Option<Fingerprint>>>,
+) {
+    let entered = timeout(shared.limits.handshake, enter(&endpoint, client, &invite, &refused)).await;
+    match entered.unwrap_or(Err(CloseReason::TimedOut)) {
+        Ok(host) => host.serve(&shared).await,
+        Err(reason) => shared.inbox.close(PeerId::HOST, reason),
+    }
+}
+
+async fn enter(
+    endpoint: &quinn::Endpoint,
+    client: ClientConfig,
+    invite: &Invite,
+    refused: &Mutex<Option<Fingerprint>>,
+) -> Result<Open, CloseReason> {
+    let failed = |words: String| CloseReason::Failed { words };
+    let resolved = tokio::net::lookup_host((invite.host.as_str(), invite.port)).await;
+    let address = resolved
+        .map_err(|error| failed(format!("`{}` does not resolve: {error}", invite.host)))?
+        .next()
+        .ok_or_else(|| failed(format!("`{}` has no address", invite.host)))?;
+    // The socket was bound before the name was known: an IPv4 address goes over an IPv6 socket in its mapped form.
+    let address = match (address, endpoint.local_addr()) {
+        (SocketAddr::V4(v4), Ok(SocketAddr::V6(_))) => {
+            SocketAddr::from((v4.ip().to_ipv6_mapped(), v4.port()))
+        }
+        (address, _) => address,
+    };
+    let reason = |error| {
+        let found = *lock(refused);
+        reason_of(
+            error,
+            found.map(|found| CloseReason::WrongFingerprint { expected: invite.fingerprint, found }),
+        )
+    };
+    let connecting =
+        endpoint.connect_with(client, address, SERVER_NAME).map_err(|error| failed(error.to_string()))?;
+    let connection = connecting.await.map_err(reason)?;
+    let (mut send, mut recv) = connection.open_bi().await.map_err(reason)?;
+    let token = wire::token_to_message(invite.token);
+    let written = async {
+        wire::write_prefix(&mut send, token.len()).await?;
+        send.write_all(&token).await
+    };
+    let welcomed = match written.await {
+        Ok(()) => wire::read_message(&mut recv, 0).await.map_err(|error| error.to_string()),
+        Err(error) => Err(error.to_string()),
+    };
+    match welcomed {
+        Ok(_) => {}
+        // A refusal closes the connection, and it has the words.
+        Err(words) => {
+            let closed = timeout(Duration::from_millis(200), connection.closed()).await;
+            return Err(closed.map_or(failed(words), reason));
+        }
+    }
+    Ok(Open { peer: PeerId::HOST, fingerprint: invite.fingerprint, connection, send, recv })
+}
+
+/// Where to bind a socket that will talk to the host of `invite`.
+pub(super) fn address_for_joining(invite: &Invite) -> SocketAddr {
+    match invite.host.parse::<IpAddr>() {
+        Ok(IpAddr::V4(host)) if host.is_loopback() => (Ipv4Addr::LOCALHOST, 0).into(),
+        Ok(IpAddr::V6(host)) if host.is_loopback() => (Ipv6Addr::LOCALHOST, 0).into(),
+        Ok(IpAddr::V6(_)) => (Ipv6Addr::UNSPECIFIED, 0).into(),
+        _ => (Ipv4Addr::UNSPECIFIED, 0).into(),
+    }
+}
+
+fn fingerprint_of(connection: &Connection) -> Option<Fingerprint> {
+    let chain = connection.peer_identity()?.downcast::<Vec<CertificateDer<'static>>>().ok()?;
+    Fingerprint::of_certificate(chain.first()?).ok()
+}
+
+/// Words from outside, fit for a log and a screen.
+fn clean(words: &[u8]) -> String {
+    let words: String = String::from_utf8_lossy(words).chars().filter(|c| !c.is_control()).collect();
+    shortened(&words)
+}
+
+/// The alert of a host that knows no protocol in common (RFC 7301).
+const NO_APPLICATION_PROTOCOL: u8 = 120;
+
+fn reason_of(error: ConnectionError, refused: Option<CloseReason>) -> CloseReason {
+    match error {
+        ConnectionError::LocallyClosed => CloseReason::ByUs,
+        ConnectionError::TimedOut => CloseReason::TimedOut,
+        ConnectionError::ApplicationClosed(close) => {
+            let words = clean(&close.reason);
+            match u32::try_from(close.error_code.into_inner()) {
+                Ok(REFUSED) => CloseReason::Refused { words },
+                Ok(PROTOCOL) => CloseReason::Failed { words: format!("the other end says: {words}") },
+                _ => CloseReason::ByPeer { words },
+            }
+        }
+        ConnectionError::ConnectionClosed(close)
+            if close.error_code == TransportErrorCode::CONNECTION_REFUSED =>
+        {
+            CloseReason::Refused { words: "it has no room".into() }
+        }
+        ConnectionError::ConnectionClosed(close)
+            if close.error_code == TransportErrorCode::crypto(NO_APPLICATION_PROTOCOL) =>
+        {
+            CloseReason::Failed { words: "the host speaks another version of the protocol".into() }
+        }
+        other => {
+            refused.unwrap_or_else(|| CloseReason::Failed { words: clean(other.to_string().as_bytes()) })
+        }
+    }
+}
+
+impl Open {
+    /// Carries the connection's traffic until it ends, and tells the application of its beginning and end.
+    async fn serve(self, shared: &Shared) {
+        let Self { peer: id, fingerprint, connection, mut send, mut recv } = self;
+        let peer = Arc::new(Peer::default());
+        refresh(&connection, &peer);
+        lock(&shared.peers).insert(id, Arc::clone(&peer));
+        let address = connection.remote_address();
+        let room = shared.inbox.open(id, Event::Connected { peer: id, fingerprint, address });
+        let bucket = Mutex::new(Bucket::new(shared.limits.rate, Instant::now()));
+        let reason = {
+            let messages_in = pin!(read_messages(shared, id, &connection, &mut recv, &room));
+            let datagrams_in = pin!(read_datagrams(shared, id, &connection, &peer));
+            let messages_out = pin!(write_messages(&connection, &peer, &bucket, &mut send));
+            let datagrams_out = pin!(write_datagrams(&connection, &peer, &bucket));
+            let figures = pin!(keep_figures(&connection, &peer));
+            tokio::select! {
+                reason = messages_in => reason,
+                reason = messages_out => reason,
+                error = connection.closed() => reason_of(error, None),
+                () = datagrams_in => unreachable_end(),
+                () = datagrams_out => unreachable_end(),
+                () = figures => unreachable_end(),
+            }
+        };
+        debug!(peer = id.0, %reason, "connection closed");
+        lock(&shared.peers).remove(&id);
+        shared.inbox.close(id, reason);
+    }
+}
+
+/// The three tasks without a result run until the connection is closed, which another arm reports.
+fn unreachable_end() -> CloseReason {
+    CloseReason::Failed { words: "the connection's task ended".into() }
+}
+
+/// Nothing that came before the welcome counts. Takes what is there and does not wait for more.
+async fn discard_early(connection: &Connection) {
+    loop {
+        let mut read = pin!(connection.read_datagram());
+        let came =
+            poll_fn(|context| Poll::Ready(matches!(read.as_mut().poll(context), Poll::Ready(Ok(_))))).await;
+        if !came {
+            return;
+        }
+    }
+}
+
+fn refresh(connection: &Connection, peer: &Peer) {
+    let stats = connection.stats();
+    peer.max_datagram.store(connection.max_datagram_size().unwrap_or(0), Ordering::Relaxed);
+    *lock(&peer.stats) = PeerStats {
+        round_trip: stats.path.rtt,
+        min_round_trip: stats.path.min_rtt,
+        sent_packets: stats.path.sent_packets,
+        received_packets: stats.udp_rx.datagrams,
+        lost_packets: stats.path.lost_packets,
+        sent_bytes: stats.udp_tx.bytes,
+        received_bytes: stats.udp_rx.bytes,
+        sent_datagrams: stats.frame_tx.datagram,
+        received_datagrams: stats.frame_rx.datagram,
+        window: stats.path.cwnd,
+        ..PeerStats::default()
+    };
+}
+
+async fn keep_figures(connection: &Connection, peer: &Peer) {
+    loop {
+        sleep(Duration::from_millis(100)).await;
+        refresh(connection, peer);
+    }
+}
+
+async fn read_messages(
+    shared: &Shared,
+    id: PeerId,
+    connection: &Connection,
+    recv: &mut RecvStream,
+    room: &Notify,
+) -> CloseReason {
+    loop {
+        match wire::read_message(recv, shared.limits.message).await {
+            Ok(message) => {
+                let mut message = message;
+                while let Err(back) = shared.inbox.push_message(id, message, shared.limits.queued_messages) {
+                    message = back;
+                    room.notified().await;
+                }
+            }
+            Err(error @ ReadMessageError::TooLong { .. }) => {
+                let words = error.to_string();
+                connection.close(VarInt::from_u32(PROTOCOL), words.as_bytes());
+                return CloseReason::Protocol { words };
+            }
+            // The other end has said all it will say, or the connection is gone: the end of the connection has the reason.
+            Err(ReadMessageError::Ended(_)) => std::future::pending().await,
+        }
+    }
+}
+
+async fn read_datagrams(shared: &Shared, id: PeerId, connection: &Connection, peer: &Peer) {
+    while let Ok(bytes) = connection.read_datagram().await {
+        let dropped = shared.inbox.push_datagram(id, Instant::now(), bytes, shared.limits.queued_datagrams);
+        if dropped > 0 {
+            lock(&peer.dropped).receive_queue_full += dropped;
+        }
+    }
+    std::future::pending().await
+}
+
+/// Messages go in parts, so that the rate cap applies within a long one.
+const MESSAGE_PART: usize = 2048;
+
+async fn write_messages(
+    connection: &Connection,
+    peer: &Peer,
+    bucket: &Mutex<Bucket>,
+    send: &mut SendStream,
+) -> CloseReason {
+    loop {
+        match peer.outbox.next() {
+            Some(Next::Message(bytes)) => {
+                if write_message(bucket, send, bytes).await.is_err() {
+                    std::future::pending::<()>().await;
+                }
+            }
+            Some(Next::Close(code, words)) => {
+                // Already closed streams and connections need no goodbye.
+                let _ = send.finish();
+                let _ = timeout(Duration::from_secs(1), send.stopped()).await;
+                connection.close(VarInt::from_u32(code), words.as_bytes());
+                return CloseReason::ByUs;
+            }
+            None => peer.outbox.message_waits.notified().await,
+        }
+    }
+}
+
+async fn write_message(
+    bucket: &Mutex<Bucket>,
+    send: &mut SendStream,
+    bytes: Bytes,
+) -> Result<(), quinn::WriteError> {
+    wire::write_prefix(send, bytes.len()).await?;
+    for part in bytes.chunks(MESSAGE_PART) {
+        while let Err(wait) = take_message(bucket, part.len()) {
+            sleep(wait).await;
+        }
+        send.write_all(part).await?;
+    }
+    Ok(())
+}
+
+fn take_message(bucket: &Mutex<Bucket>, len: usize) -> Result<(), Duration> {
+    lock(bucket).take_message(len, Instant::now())
+}
+
+fn take_datagram(bucket: &Mutex<Bucket>, len: usize) -> Result<(), Duration> {
+    lock(bucket).take_datagram(len, Instant::now())
+}
+
+async fn write_datagrams(connection: &Connection, peer: &Peer, bucket: &Mutex<Bucket>) {
+    loop {
+        let Some(len) = peer.outbox.first_datagram_len() else {
+            peer.outbox.datagram_waits.notified().await;
+            continue;
+        };
+        if let Err(wait) = take_datagram(bucket, len) {
+            sleep(wait).await;
+            continue;
+        }
+        let Some(bytes) = peer.outbox.pop_datagram() else { continue };
+        // Waits for room in quinn's small buffer, so that what must go goes from our queue, oldest first, and is counted.
+        match connection.send_datagram_wait(bytes).await {
+            Ok(()) => {}
+            Err(SendDatagramError::TooLarge) => {
+                refresh(connection, peer);
+                lock(&peer.dropped).too_large += 1;
+            }
+            Err(SendDatagramError::ConnectionLost(_)) => std::future::pending::<()>().await,
+            Err(SendDatagramError::UnsupportedByPeer | SendDatagramError::Disabled) => {
+                lock(&peer.dropped).not_connected += 1;
+            }
+        }
+    }
+}

@@ -1,0 +1,294 @@
+//! Who is who: Ed25519 keys, their fingerprints, and the checks made in the TLS handshake.
+
+use std::fmt;
+use std::str::FromStr;
+use std::sync::{Arc, Mutex, PoisonError};
+
+use rcgen::{CertificateParams, KeyPair, PKCS_ED25519, PublicKeyData};
+use rustls::client::danger::{HandshakeSignatureValid, ServerCertVerified, ServerCertVerifier};
+use rustls::crypto::{
+    CryptoProvider, WebPkiSupportedAlgorithms, verify_tls12_signature, verify_tls13_signature,
+};
+use rustls::pki_types::{CertificateDer, PrivateKeyDer, PrivatePkcs8KeyDer, ServerName, UnixTime};
+use rustls::server::ParsedCertificate;
+use rustls::server::danger::{ClientCertVerified, ClientCertVerifier};
+use rustls::{
+    CertificateError, DigitallySignedStruct, DistinguishedName, Error as TlsError, SignatureScheme,
+};
+use thiserror::Error;
+
+/// The SHA-256 hash of a public key (its X.509 `SubjectPublicKeyInfo`), 32 bytes, written as 64 lower-case hexadecimal digits.
+///
+/// The same number as `openssl x509 -pubkey | openssl pkey -pubin -outform der | sha256sum` gives.
+#[derive(Clone, Copy, PartialEq, Eq, Hash, PartialOrd, Ord)]
+pub struct Fingerprint(pub [u8; 32]);
+
+impl Fingerprint {
+    pub(super) fn of_public_key(spki: &[u8]) -> Self {
+        let digest = ring::digest::digest(&ring::digest::SHA256, spki);
+        let mut bytes = [0; 32];
+        for (to, from) in bytes.iter_mut().zip(digest.as_ref()) {
+            *to = *from;
+        }
+        Self(bytes)
+    }
+
+    pub(super) fn of_certificate(certificate: &CertificateDer<'_>) -> Result<Self, TlsError> {
+        let parsed = ParsedCertificate::try_from(certificate)?;
+        Ok(Self::of_public_key(parsed.subject_public_key_info().as_ref()))
+    }
+}
+
+impl fmt::Display for Fingerprint {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        write_hex(f, &self.0)
+    }
+}
+
+impl fmt::Debug for Fingerprint {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        write!(f, "Fingerprint({self})")
+    }
+}
+
+impl FromStr for Fingerprint {
+    type Err = IdentityError;
+
+    fn from_str(text: &str) -> Result<Self, Self::Err> {
+        parse_hex(text).map(Self).ok_or_else(|| IdentityError::Fingerprint { found: shortened(text) })
+    }
+}
+
+pub(super) fn write_hex(f: &mut fmt::Formatter<'_>, bytes: &[u8]) -> fmt::Result {
+    bytes.iter().try_for_each(|byte| write!(f, "{byte:02x}"))
+}
+
+pub(super) fn parse_hex<const N: usize>(text: &str) -> Option<[u8; N]> {
+    let digits = text.as_bytes();
+    if digits.len() != 2 * N {
+        return None;
+    }
+    let mut bytes = [0; N];
+    for (byte, pair) in bytes.iter_mut().zip(digits.chunks_exact(2)) {
+        let [high, low] = [*pair.first()?, *pair.get(1)?].map(|digit| char::from(digit).to_digit(16));
+        *byte = u8::try_from(high? * 16 + low?).ok()?;
+    }
+    Some(bytes)
+}
+
+/// The first characters of something from outside, for an error message that stays short whatever came.
+pub(super) fn shortened(text: &str) -> String {
+    const MOST: usize = 80;
+    match text.char_indices().nth(MOST) {
+        Some((end, _)) => format!("{}… ({} bytes)", &text[..end], text.len()),
+        None => text.to_owned(),
+    }
+}
+
+/// Why an identity or a fingerprint could not be made or read.
+#[derive(Debug, Error)]
+#[non_exhaustive]
+pub enum IdentityError {
+    /// The system's random source or the key generator failed.
+    #[error("could not make an Ed25519 key: {0}")]
+    Generate(String),
+    /// The given private key is not an Ed25519 key in PKCS #8 form.
+    #[error("expected an Ed25519 private key in PKCS #8 form: {0}")]
+    Key(String),
+    /// The given text is not a fingerprint.
+    #[error("expected a fingerprint of 64 hexadecimal digits, found `{found}`")]
+    Fingerprint {
+        /// What was there instead, shortened.
+        found: String,
+    },
+}
+
+/// An Ed25519 key and the self-signed certificate that presents it in the handshake.
+///
+/// Keep [`Identity::to_pkcs8`] to be the same user, or the same host behind the same invite, tomorrow.
+pub struct Identity {
+    certificate: CertificateDer<'static>,
+    key: KeyPair,
+    fingerprint: Fingerprint,
+}
+
+impl fmt::Debug for Identity {
+    /// Without the private key.
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.debug_struct("Identity").field("fingerprint", &self.fingerprint).finish_non_exhaustive()
+    }
+}
+
+impl Identity {
+    /// A new key from the system's random source.
+    pub fn generate() -> Result<Self, IdentityError> {
+        let key = KeyPair::generate_for(&PKCS_ED25519)
+            .map_err(|error| IdentityError::Generate(error.to_string()))?;
+        Self::from_key(key)
+    }
+
+    /// The identity kept by [`Identity::to_pkcs8`].
+    pub fn from_pkcs8(der: &[u8]) -> Result<Self, IdentityError> {
+        let key = KeyPair::from_pkcs8_der_and_sign_algo(&PrivatePkcs8KeyDer::from(der), &PKCS_ED25519)
+            .map_err(|error| IdentityError::Key(error.to_string()))?;
+        Self::from_key(key)
+    }
+
+    /// The private key in PKCS #8 form (DER). A secret: who has it is this user.
+    pub fn to_pkcs8(&self) -> Vec<u8> {
+        self.key.serialize_der()
+    }
+
+    /// The hash of the public key, which an [`Invite`](super::Invite) pins.
+    pub fn fingerprint(&self) -> Fingerprint {
+        self.fingerprint
+    }
+
+    fn from_key(key: KeyPair) -> Result<Self, IdentityError> {
+        let certificate = CertificateParams::new(vec![SERVER_NAME.to_owned()])
+            .and_then(|params| params.self_signed(&key))
+            .map_err(|error| IdentityError::Generate(error.to_string()))?;
+        let fingerprint = Fingerprint::of_public_key(&key.subject_public_key_info());
+        Ok(Self { certificate: certificate.der().clone(), key, fingerprint })
+    }
+
+    pub(super) fn chain(&self) -> (Vec<CertificateDer<'static>>, PrivateKeyDer<'static>) {
+        (vec![self.certificate.clone()], PrivatePkcs8KeyDer::from(self.key.serialize_der()).into())
+    }
+}
+
+/// The name in every certificate and handshake. Trust comes from the pinned key, not from a name.
+pub(super) const SERVER_NAME: &str = "pliant";
+
+/// Checks the host's key against the one pinned by the invite, and its signature over the handshake.
+#[derive(Debug)]
+pub(super) struct PinnedHost {
+    pub(super) pinned: Fingerprint,
+    /// The key that came, if it was another one: for the error message.
+    pub(super) refused: Arc<Mutex<Option<Fingerprint>>>,
+    pub(super) algorithms: WebPkiSupportedAlgorithms,
+}
+
+impl PinnedHost {
+    pub(super) fn new(pinned: Fingerprint, provider: &CryptoProvider) -> Self {
+        Self { pinned, refused: Arc::default(), algorithms: provider.signature_verification_algorithms }
+    }
+}
+
+impl ServerCertVerifier for PinnedHost {
+    fn verify_server_cert(
+        &self,
+        end_entity: &CertificateDer<'_>,
+        _intermediates: &[CertificateDer<'_>],
+        _server_name: &ServerName<'_>,
+        _ocsp_response: &[u8],
+        _now: UnixTime,
+    ) -> Result<ServerCertVerified, TlsError> {
+        let found = Fingerprint::of_certificate(end_entity)?;
+        if found == self.pinned {
+            return Ok(ServerCertVerified::assertion());
+        }
+        *self.refused.lock().unwrap_or_else(PoisonError::into_inner) = Some(found);
+        Err(TlsError::InvalidCertificate(CertificateError::ApplicationVerificationFailure))
+    }
+
+    fn verify_tls12_signature(
+        &self,
+        message: &[u8],
+        certificate: &CertificateDer<'_>,
+        signature: &DigitallySignedStruct,
+    ) -> Result<HandshakeSignatureValid, TlsError> {
+        verify_tls12_signature(message, certificate, signature, &self.algorithms)
+    }
+
+    fn verify_tls13_signature(
+        &self,
+        message: &[u8],
+        certificate: &CertificateDer<'_>,
+        signature: &DigitallySignedStruct,
+    ) -> Result<HandshakeSignatureValid, TlsError> {
+        verify_tls13_signature(message, certificate, signature, &self.algorithms)
+    }
+
+    fn supported_verify_schemes(&self) -> Vec<SignatureScheme> {
+        vec![SignatureScheme::ED25519]
+    }
+}
+
+/// Lets in any guest that proves it owns the key it shows. Who may join is the token's matter; the key is the guest's lasting name.
+#[derive(Debug)]
+pub(super) struct AnyGuest {
+    pub(super) algorithms: WebPkiSupportedAlgorithms,
+}
+
+impl ClientCertVerifier for AnyGuest {
+    fn root_hint_subjects(&self) -> &[DistinguishedName] {
+        &[]
+    }
+
+    fn verify_client_cert(
+        &self,
+        end_entity: &CertificateDer<'_>,
+        _intermediates: &[CertificateDer<'_>],
+        _now: UnixTime,
+    ) -> Result<ClientCertVerified, TlsError> {
+        Fingerprint::of_certificate(end_entity).map(|_| ClientCertVerified::assertion())
+    }
+
+    fn verify_tls12_signature(
+        &self,
+        message: &[u8],
+        certificate: &CertificateDer<'_>,
+        signature: &DigitallySignedStruct,
+    ) -> Result<HandshakeSignatureValid, TlsError> {
+        verify_tls12_signature(message, certificate, signature, &self.algorithms)
+    }
+
+    fn verify_tls13_signature(
+        &self,
+        message: &[u8],
+        certificate: &CertificateDer<'_>,
+        signature: &DigitallySignedStruct,
+    ) -> Result<HandshakeSignatureValid, TlsError> {
+        verify_tls13_signature(message, certificate, signature, &self.algorithms)
+    }
+
+    fn supported_verify_schemes(&self) -> Vec<SignatureScheme> {
+        vec![SignatureScheme::ED25519]
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn an_identity_survives_being_kept() {
+        let identity = Identity::generate().unwrap();
+        let again = Identity::from_pkcs8(&identity.to_pkcs8()).unwrap();
+        assert_eq!(identity.fingerprint(), again.fingerprint());
+        assert_ne!(identity.fingerprint(), Identity::generate().unwrap().fingerprint());
+        assert!(matches!(Identity::from_pkcs8(b"not a key"), Err(IdentityError::Key(_))));
+    }
+
+    #[test]
+    fn the_fingerprint_is_the_hash_of_the_certificates_public_key() {
+        let identity = Identity::generate().unwrap();
+        assert_eq!(Fingerprint::of_certificate(&identity.certificate).unwrap(), identity.fingerprint());
+        // RFC 8410: an Ed25519 SubjectPublicKeyInfo is these 12 bytes and the 32 of the key.
+        let mut spki = vec![0x30, 0x2a, 0x30, 0x05, 0x06, 0x03, 0x2b, 0x65, 0x70, 0x03, 0x21, 0x00];
+        spki.extend_from_slice(identity.key.public_key_raw());
+        assert_eq!(Fingerprint::of_public_key(&spki), identity.fingerprint());
+    }
+
+    #[test]
+    fn fingerprints_are_written_and_read() {
+        let fingerprint = Fingerprint(std::array::from_fn(|i| i as u8 * 7));
+        assert_eq!(fingerprint.to_string().parse::<Fingerprint>().unwrap(), fingerprint);
+        for wrong in ["", "00", &"g".repeat(64), &"é".repeat(32), &"0".repeat(65)] {
+            assert!(wrong.parse::<Fingerprint>().is_err(), "{wrong}");
+        }
+        let message = "x".repeat(1000).parse::<Fingerprint>().unwrap_err().to_string();
+        assert!(message.len() < 200, "{message}");
+    }
+}

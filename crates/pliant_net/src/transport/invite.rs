@@ -1,0 +1,191 @@
+//! The line a host prints and a guest pastes.
+
+use std::fmt;
+use std::net::{Ipv6Addr, SocketAddr};
+use std::str::FromStr;
+
+use ring::rand::{SecureRandom, SystemRandom};
+use thiserror::Error;
+
+use super::identity::{Fingerprint, parse_hex, shortened, write_hex};
+
+/// A secret of 16 random bytes that a guest shows to be let in, written as 32 hexadecimal digits.
+#[derive(Clone, Copy)]
+pub struct Token(pub [u8; 16]);
+
+impl Token {
+    /// A token from the system's random source.
+    pub fn generate() -> Result<Self, InviteError> {
+        let mut bytes = [0; 16];
+        SystemRandom::new().fill(&mut bytes).map_err(|_| InviteError::NoRandomness)?;
+        Ok(Self(bytes))
+    }
+}
+
+impl PartialEq for Token {
+    /// Takes the same time wherever the two differ, so that a guess learns nothing from the clock.
+    fn eq(&self, other: &Self) -> bool {
+        self.0.iter().zip(&other.0).fold(0, |differ, (a, b)| differ | (a ^ b)) == 0
+    }
+}
+
+impl Eq for Token {}
+
+impl fmt::Debug for Token {
+    /// Without the secret: tokens must not reach the log.
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.write_str("Token(…)")
+    }
+}
+
+/// Where a host is, which key it must show, and the token that it asks for: `pliant://host:port#fingerprint` or, with a token,
+/// `pliant://host:port/token#fingerprint`.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct Invite {
+    /// Name or address of the host, without brackets.
+    pub host: String,
+    /// UDP port.
+    pub port: u16,
+    /// The host's key.
+    pub fingerprint: Fingerprint,
+    /// What the host asks for, if it does not let in anyone.
+    pub token: Option<Token>,
+}
+
+impl Invite {
+    /// An invite to the host at `address` that shows the key `fingerprint` and lets in anyone.
+    pub fn new(address: SocketAddr, fingerprint: Fingerprint) -> Self {
+        Self { host: address.ip().to_string(), port: address.port(), fingerprint, token: None }
+    }
+
+    /// The same with a token.
+    pub fn with_token(mut self, token: Token) -> Self {
+        self.token = Some(token);
+        self
+    }
+}
+
+impl fmt::Display for Invite {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.write_str(SCHEME)?;
+        match self.host.parse::<Ipv6Addr>() {
+            Ok(address) => write!(f, "[{address}]")?,
+            Err(_) => f.write_str(&self.host)?,
+        }
+        write!(f, ":{}", self.port)?;
+        if let Some(token) = self.token {
+            f.write_str("/")?;
+            write_hex(f, &token.0)?;
+        }
+        write!(f, "#{}", self.fingerprint)
+    }
+}
+
+impl FromStr for Invite {
+    type Err = InviteError;
+
+    fn from_str(text: &str) -> Result<Self, Self::Err> {
+        let text = text.trim();
+        let wrong = |expected| InviteError::Malformed { expected, found: shortened(text) };
+        let rest = text.strip_prefix(SCHEME).ok_or_else(|| wrong("`pliant://` at the start"))?;
+        let (place, fingerprint) =
+            rest.rsplit_once('#').ok_or_else(|| wrong("`#` and the host's fingerprint"))?;
+        let fingerprint = parse_hex(fingerprint)
+            .map(Fingerprint)
+            .ok_or_else(|| wrong("64 hexadecimal digits after `#`"))?;
+        let (address, token) = match place.split_once('/') {
+            None => (place, None),
+            Some((address, token)) => {
+                let token =
+                    parse_hex(token).ok_or_else(|| wrong("a token of 32 hexadecimal digits after `/`"))?;
+                (address, Some(Token(token)))
+            }
+        };
+        let (host, port) = address.rsplit_once(':').ok_or_else(|| wrong("`host:port`"))?;
+        let port =
+            port.parse().ok().filter(|&port| port != 0).ok_or_else(|| wrong("a port from 1 to 65535"))?;
+        let host = match host.strip_prefix('[') {
+            None => host,
+            Some(bracketed) => bracketed
+                .strip_suffix(']')
+                .filter(|inner| inner.parse::<Ipv6Addr>().is_ok())
+                .ok_or_else(|| wrong("an IPv6 address between the brackets"))?,
+        };
+        let printable = !host.is_empty() && host.len() <= 253 && host.chars().all(|c| c.is_ascii_graphic());
+        if !printable {
+            return Err(wrong("a host name or address"));
+        }
+        Ok(Self { host: host.to_owned(), port, fingerprint, token })
+    }
+}
+
+const SCHEME: &str = "pliant://";
+
+/// Why an invite could not be read or made.
+#[derive(Debug, Error, PartialEq, Eq)]
+#[non_exhaustive]
+pub enum InviteError {
+    /// The text is not an invite.
+    #[error("not an invite: expected {expected}, as in `pliant://host:port#fingerprint`, found `{found}`")]
+    Malformed {
+        /// The part that is missing or wrong.
+        expected: &'static str,
+        /// What was there, shortened.
+        found: String,
+    },
+    /// The system's random source failed.
+    #[error("the system's random source failed")]
+    NoRandomness,
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn invites_are_written_and_read() {
+        let fingerprint = Fingerprint([0xab; 32]);
+        for (address, text) in [("192.0.2.7:4433", "192.0.2.7:4433"), ("[2001:db8::1]:9", "[2001:db8::1]:9")]
+        {
+            let invite = Invite::new(address.parse().unwrap(), fingerprint);
+            assert_eq!(invite.to_string(), format!("pliant://{text}#{}", "ab".repeat(32)));
+            assert_eq!(invite.to_string().parse::<Invite>().unwrap(), invite);
+            let invite = invite.with_token(Token([0x0c; 16]));
+            assert_eq!(
+                invite.to_string(),
+                format!("pliant://{text}/{}#{}", "0c".repeat(16), "ab".repeat(32))
+            );
+            assert_eq!(invite.to_string().parse::<Invite>().unwrap(), invite);
+        }
+        let named: Invite = format!(" pliant://play.example.org:4433#{fingerprint}\n").parse().unwrap();
+        assert_eq!((named.host.as_str(), named.port), ("play.example.org", 4433));
+    }
+
+    #[test]
+    fn what_is_no_invite_is_refused_with_what_was_expected() {
+        let key = "ab".repeat(32);
+        for (text, expected) in [
+            (String::new(), "pliant://"),
+            (format!("https://host:1#{key}"), "pliant://"),
+            ("pliant://host:1".into(), "fingerprint"),
+            (format!("pliant://host:1#{}", &key[1..]), "64 hexadecimal digits"),
+            (format!("pliant://host#{key}"), "host:port"),
+            (format!("pliant://host:0#{key}"), "a port"),
+            (format!("pliant://host:65536#{key}"), "a port"),
+            (format!("pliant://:1#{key}"), "a host name"),
+            (format!("pliant://a b:1#{key}"), "a host name"),
+            (format!("pliant://[::1:1#{key}"), "brackets"),
+            (format!("pliant://host:1/abc#{key}"), "a token"),
+        ] {
+            let error = text.parse::<Invite>().unwrap_err().to_string();
+            assert!(error.contains(expected), "{text}: {error}");
+        }
+    }
+
+    #[test]
+    fn tokens_differ_and_do_not_show() {
+        let (a, b) = (Token::generate().unwrap(), Token::generate().unwrap());
+        assert_ne!(a, b);
+        assert_eq!(format!("{a:?}"), "Token(…)");
+    }
+}

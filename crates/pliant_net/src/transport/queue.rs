@@ -1,0 +1,254 @@
+//! The bounded queues between the application and the network's thread.
+
+use std::collections::{BTreeMap, VecDeque};
+use std::ops::Bound;
+use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
+use std::time::Instant;
+
+use bytes::Bytes;
+use tokio::sync::Notify;
+
+use super::endpoint::{CloseReason, Event, PeerId};
+
+/// A lock that a panic elsewhere does not poison: the queues hold plain data that is whole between calls.
+pub(super) fn lock<T>(mutex: &Mutex<T>) -> MutexGuard<'_, T> {
+    mutex.lock().unwrap_or_else(PoisonError::into_inner)
+}
+
+/// Everything that waits for the application.
+#[derive(Debug, Default)]
+pub(super) struct Inbox(Mutex<InboxState>);
+
+#[derive(Debug, Default)]
+struct InboxState {
+    /// Arrivals, messages and departures, in order. Bounded: messages by each peer's share, the rest by [`Inbox::crowded`].
+    events: VecDeque<Event>,
+    peers: BTreeMap<PeerId, FromPeer>,
+    /// The peer whose datagram was read last: the next read begins after it, so that a flood from one does not hide the others.
+    last: Option<PeerId>,
+}
+
+#[derive(Debug)]
+struct FromPeer {
+    datagrams: VecDeque<(Instant, Bytes)>,
+    message_bytes: usize,
+    room: Arc<Notify>,
+}
+
+/// Departures and arrivals that may wait unread before new guests are turned away.
+const MOST_EVENTS: usize = 4096;
+/// What a queued message costs beside its bytes: bounds the number of empty ones.
+const MESSAGE_COST: usize = 64;
+
+impl Inbox {
+    pub(super) fn open(&self, peer: PeerId, connected: Event) -> Arc<Notify> {
+        let mut state = lock(&self.0);
+        let room = Arc::new(Notify::new());
+        let queue = FromPeer { datagrams: VecDeque::new(), message_bytes: 0, room: Arc::clone(&room) };
+        state.peers.insert(peer, queue);
+        state.events.push_back(connected);
+        room
+    }
+
+    pub(super) fn close(&self, peer: PeerId, reason: CloseReason) {
+        let mut state = lock(&self.0);
+        state.peers.remove(&peer);
+        state.events.push_back(Event::Closed { peer, reason });
+    }
+
+    pub(super) fn crowded(&self) -> bool {
+        lock(&self.0).events.len() >= MOST_EVENTS
+    }
+
+    /// Queues a datagram. Returns how many older ones had to go.
+    pub(super) fn push_datagram(&self, peer: PeerId, at: Instant, bytes: Bytes, most: usize) -> u64 {
+        let mut state = lock(&self.0);
+        let Some(queue) = state.peers.get_mut(&peer) else { return 1 };
+        queue.datagrams.push_back((at, bytes));
+        let mut dropped = 0;
+        while queue.datagrams.len() > most.max(1) {
+            queue.datagrams.pop_front();
+            dropped += 1;
+        }
+        dropped
+    }
+
+    /// Queues a message, or gives it back when the peer's share is full.
+    pub(super) fn push_message(&self, peer: PeerId, bytes: Bytes, most: usize) -> Result<(), Bytes> {
+        let mut state = lock(&self.0);
+        let Some(queue) = state.peers.get_mut(&peer) else { return Ok(()) };
+        let cost = bytes.len() + MESSAGE_COST;
+        if queue.message_bytes > 0 && queue.message_bytes + cost > most {
+            return Err(bytes);
+        }
+        queue.message_bytes += cost;
+        state.events.push_back(Event::Message { peer, bytes });
+        Ok(())
+    }
+
+    pub(super) fn pop(&self) -> Option<Event> {
+        let mut state = lock(&self.0);
+        if let Some(event) = state.events.pop_front() {
+            if let Event::Message { peer, bytes } = &event
+                && let Some(queue) = state.peers.get_mut(peer)
+            {
+                queue.message_bytes = queue.message_bytes.saturating_sub(bytes.len() + MESSAGE_COST);
+                queue.room.notify_one();
+            }
+            return Some(event);
+        }
+        let after = state.last.map_or(Bound::Unbounded, Bound::Excluded);
+        let waiting = |(_, queue): &(&PeerId, &FromPeer)| !queue.datagrams.is_empty();
+        let peer = state
+            .peers
+            .range((after, Bound::Unbounded))
+            .find(waiting)
+            .or_else(|| state.peers.iter().find(waiting))
+            .map(|(&peer, _)| peer)?;
+        state.last = Some(peer);
+        let (at, bytes) = state.peers.get_mut(&peer)?.datagrams.pop_front()?;
+        Some(Event::Datagram { peer, at, bytes })
+    }
+}
+
+/// Everything that waits to be sent to one peer.
+#[derive(Debug, Default)]
+pub(super) struct Outbox {
+    state: Mutex<OutboxState>,
+    pub(super) datagram_waits: Notify,
+    pub(super) message_waits: Notify,
+}
+
+#[derive(Debug, Default)]
+struct OutboxState {
+    datagrams: VecDeque<Bytes>,
+    messages: VecDeque<Bytes>,
+    message_bytes: usize,
+    /// Code and words to close with, once the messages are out.
+    closing: Option<(u32, String)>,
+}
+
+/// What the message writer does next.
+#[derive(Debug)]
+pub(super) enum Next {
+    Message(Bytes),
+    Close(u32, String),
+}
+
+impl Outbox {
+    /// Queues a datagram. Returns how many older ones had to go.
+    pub(super) fn push_datagram(&self, bytes: Bytes, most: usize) -> u64 {
+        let mut state = lock(&self.state);
+        state.datagrams.push_back(bytes);
+        let mut dropped = 0;
+        while state.datagrams.len() > most.max(1) {
+            state.datagrams.pop_front();
+            dropped += 1;
+        }
+        drop(state);
+        self.datagram_waits.notify_one();
+        dropped
+    }
+
+    /// Queues a message. Returns false, and takes nothing, when there is no room.
+    pub(super) fn push_message(&self, bytes: Bytes, most: usize) -> bool {
+        let mut state = lock(&self.state);
+        let cost = bytes.len() + MESSAGE_COST;
+        if state.closing.is_some() || (state.message_bytes > 0 && state.message_bytes + cost > most) {
+            return false;
+        }
+        state.message_bytes += cost;
+        state.messages.push_back(bytes);
+        drop(state);
+        self.message_waits.notify_one();
+        true
+    }
+
+    pub(super) fn close(&self, code: u32, words: String) {
+        lock(&self.state).closing.get_or_insert((code, words));
+        self.message_waits.notify_one();
+    }
+
+    pub(super) fn pop_datagram(&self) -> Option<Bytes> {
+        lock(&self.state).datagrams.pop_front()
+    }
+
+    pub(super) fn first_datagram_len(&self) -> Option<usize> {
+        lock(&self.state).datagrams.front().map(Bytes::len)
+    }
+
+    pub(super) fn next(&self) -> Option<Next> {
+        let mut state = lock(&self.state);
+        if let Some(bytes) = state.messages.pop_front() {
+            state.message_bytes = state.message_bytes.saturating_sub(bytes.len() + MESSAGE_COST);
+            return Some(Next::Message(bytes));
+        }
+        state.closing.take().map(|(code, words)| Next::Close(code, words))
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn bytes(n: u8) -> Bytes {
+        Bytes::copy_from_slice(&[n])
+    }
+
+    fn left(peer: PeerId) -> Event {
+        Event::Closed { peer, reason: CloseReason::TimedOut }
+    }
+
+    #[test]
+    fn a_full_queue_lets_the_oldest_datagram_go_and_says_so() {
+        let outbox = Outbox::default();
+        let dropped: u64 = (0..10).map(|n| outbox.push_datagram(bytes(n), 4)).sum();
+        assert_eq!(dropped, 6);
+        let kept: Vec<_> = std::iter::from_fn(|| outbox.pop_datagram()).map(|b| b[0]).collect();
+        assert_eq!(kept, [6, 7, 8, 9]);
+    }
+
+    #[test]
+    fn a_flood_from_one_peer_does_not_hide_another() {
+        let inbox = Inbox::default();
+        let now = Instant::now();
+        for peer in [PeerId(1), PeerId(2)] {
+            inbox.open(peer, left(peer));
+            inbox.pop().unwrap();
+        }
+        let dropped: u64 = (0..1000).map(|n| inbox.push_datagram(PeerId(1), now, bytes(n as u8), 64)).sum();
+        assert_eq!(dropped, 1000 - 64);
+        inbox.push_datagram(PeerId(2), now, bytes(7), 64);
+        let first_two: Vec<_> = (0..2)
+            .map(|_| match inbox.pop() {
+                Some(Event::Datagram { peer, .. }) => peer.0,
+                other => panic!("{other:?}"),
+            })
+            .collect();
+        assert!(first_two.contains(&2), "{first_two:?}");
+    }
+
+    #[test]
+    fn messages_are_given_back_rather_than_dropped() {
+        let inbox = Inbox::default();
+        let peer = PeerId(3);
+        inbox.open(peer, left(peer));
+        let large = Bytes::from(vec![0; 5000]);
+        // The first goes through however long it is; the second waits for room.
+        assert!(inbox.push_message(peer, large.clone(), 1000).is_ok());
+        assert_eq!(inbox.push_message(peer, large.clone(), 1000).unwrap_err().len(), 5000);
+        while inbox.pop().is_some() {}
+        assert!(inbox.push_message(peer, large.clone(), 1000).is_ok());
+        let outbox = Outbox::default();
+        assert!(outbox.push_message(large.clone(), 1000));
+        assert!(!outbox.push_message(large.clone(), 1000));
+        assert!(matches!(outbox.next(), Some(Next::Message(_))));
+        assert!(outbox.push_message(large, 1000));
+        // What was queued goes out before the close; nothing is taken after it.
+        outbox.close(0, "bye".into());
+        assert!(!outbox.push_message(bytes(0), 1000));
+        assert!(matches!(outbox.next(), Some(Next::Message(_))));
+        assert!(matches!(outbox.next(), Some(Next::Close(0, words)) if words == "bye"));
+        assert!(outbox.next().is_none());
+    }
+}

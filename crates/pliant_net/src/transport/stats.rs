@@ -1,0 +1,58 @@
+//! What a connection has done, for people and for diagnostics.
+
+use std::time::Duration;
+
+/// Datagrams that never reached the other application because this end let them go, and why. What the network lost is
+/// [`PeerStats::lost_packets`].
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+#[non_exhaustive]
+pub struct DropCounts {
+    /// To the peer: the queue was full (the rate cap, or a link slower than the application) and the oldest went.
+    pub send_queue_full: u64,
+    /// To the peer: larger than the path carries.
+    pub too_large: u64,
+    /// To the peer: it takes no datagrams or is gone.
+    pub not_connected: u64,
+    /// From the peer: the application did not read in time and the oldest went.
+    pub receive_queue_full: u64,
+}
+
+/// A connection's figures, refreshed ten times a second.
+#[derive(Clone, Copy, Debug, Default, PartialEq)]
+#[non_exhaustive]
+pub struct PeerStats {
+    /// Smoothed round trip of packets.
+    pub round_trip: Duration,
+    /// Smallest round trip seen.
+    pub min_round_trip: Duration,
+    /// UDP packets sent.
+    pub sent_packets: u64,
+    /// UDP packets received.
+    pub received_packets: u64,
+    /// Packets sent and declared lost.
+    pub lost_packets: u64,
+    /// UDP payload sent, bytes.
+    pub sent_bytes: u64,
+    /// UDP payload received, bytes.
+    pub received_bytes: u64,
+    /// Datagrams of the application sent.
+    pub sent_datagrams: u64,
+    /// Datagrams of the application received.
+    pub received_datagrams: u64,
+    /// Bytes that may be in flight.
+    pub window: u64,
+    /// Datagrams let go by this end.
+    pub dropped: DropCounts,
+}
+
+impl PeerStats {
+    /// Part of the sent packets that were lost, 0 to 1, over the whole connection. 0 before anything was sent.
+    pub fn loss(&self) -> f64 {
+        if self.sent_packets == 0 { 0.0 } else { self.lost_packets as f64 / self.sent_packets as f64 }
+    }
+
+    /// The round trip is more than 50 ms above its smallest: packets wait in a queue somewhere, and the application should send less.
+    pub fn queueing(&self) -> bool {
+        self.round_trip > self.min_round_trip + Duration::from_millis(50)
+    }
+}

@@ -1,0 +1,434 @@
+//! Endpoints on loopback: what arrives, what is refused, and who notices when someone is gone.
+#![allow(clippy::unwrap_used, clippy::expect_used, clippy::panic, reason = "a failed test should panic")]
+
+use std::net::{SocketAddr, UdpSocket};
+use std::sync::Arc;
+use std::time::{Duration, Instant, SystemTime};
+
+use bytes::Bytes;
+use pliant_net::transport::{
+    ALPN, Access, CloseReason, Endpoint, Event, Fingerprint, HostOptions, Identity, Invite, JoinOptions,
+    Limits, PeerId, SendError, Token,
+};
+
+const PATIENCE: Duration = Duration::from_secs(5);
+
+/// The next event that `wanted` accepts; others are passed over.
+fn next<T>(endpoint: &Endpoint, mut wanted: impl FnMut(Event) -> Option<T>) -> T {
+    let start = Instant::now();
+    while start.elapsed() < PATIENCE {
+        match endpoint.poll().map(&mut wanted) {
+            Some(Some(found)) => return found,
+            Some(None) => {}
+            None => std::thread::sleep(Duration::from_millis(1)),
+        }
+    }
+    panic!("nothing of the kind within {PATIENCE:?}");
+}
+
+fn connected(endpoint: &Endpoint) -> (PeerId, Fingerprint) {
+    next(endpoint, |event| match event {
+        Event::Connected { peer, fingerprint, .. } => Some((peer, fingerprint)),
+        Event::Closed { reason, .. } => panic!("closed: {reason}"),
+        _ => None,
+    })
+}
+
+fn closed(endpoint: &Endpoint) -> CloseReason {
+    next(endpoint, |event| match event {
+        Event::Closed { reason, .. } => Some(reason),
+        _ => None,
+    })
+}
+
+fn message(endpoint: &Endpoint) -> Bytes {
+    next(endpoint, |event| match event {
+        Event::Message { bytes, .. } => Some(bytes),
+        Event::Closed { reason, .. } => panic!("closed: {reason}"),
+        _ => None,
+    })
+}
+
+fn datagram(endpoint: &Endpoint) -> Bytes {
+    next(endpoint, |event| match event {
+        Event::Datagram { bytes, .. } => Some(bytes),
+        Event::Closed { reason, .. } => panic!("closed: {reason}"),
+        _ => None,
+    })
+}
+
+fn quick(limits: Limits) -> Limits {
+    Limits { idle_timeout: Duration::from_secs(1), keep_alive: Duration::from_millis(200), ..limits }
+}
+
+fn host() -> Endpoint {
+    Endpoint::host(HostOptions { limits: quick(Limits::host()), ..HostOptions::default() }).unwrap()
+}
+
+fn guest(invite: &Invite) -> Endpoint {
+    Endpoint::join(invite, JoinOptions { limits: quick(Limits::guest()), ..JoinOptions::default() }).unwrap()
+}
+
+#[test]
+fn datagrams_and_messages_cross_both_ways_and_a_goodbye_is_heard() {
+    let host = host();
+    let invite: Invite = host.invite().to_string().parse().unwrap();
+    let guest = guest(&invite);
+    let (at_guest, host_key) = connected(&guest);
+    let (at_host, guest_key) = connected(&host);
+    assert_eq!(at_guest, PeerId::HOST);
+    assert_eq!((host_key, guest_key), (host.fingerprint(), guest.fingerprint()));
+
+    host.send_datagram(at_host, Bytes::from_static(b"frame")).unwrap();
+    assert_eq!(datagram(&guest), "frame");
+    guest.send_datagram(at_guest, Bytes::from_static(b"target")).unwrap();
+    assert_eq!(datagram(&host), "target");
+
+    // Three megabytes at 8 Mbit/s take three seconds; half of one is enough to see order and wholeness.
+    let model: Bytes = (0..500_000u32).map(|i| (i.wrapping_mul(2_654_435_761) >> 24) as u8).collect();
+    host.send_message(at_host, model.clone()).unwrap();
+    host.send_message(at_host, Bytes::new()).unwrap();
+    host.send_message(at_host, Bytes::from_static(b"last")).unwrap();
+    let start = Instant::now();
+    assert_eq!(message(&guest), model);
+    let seconds = start.elapsed().as_secs_f64();
+    assert!(seconds > 0.4, "500 kB in {seconds} s is above the cap of 8 Mbit/s");
+    assert_eq!(message(&guest), "");
+    assert_eq!(message(&guest), "last");
+    guest.send_message(at_guest, Bytes::from_static(b"thanks")).unwrap();
+    assert_eq!(message(&host), "thanks");
+
+    let most = host.max_datagram_size(at_host).unwrap();
+    assert!((1100..1200).contains(&most), "QUIC's smallest packet less its headers, not {most}");
+    let large = Bytes::from(vec![0; most + 1]);
+    assert_eq!(host.send_datagram(at_host, large), Err(SendError::TooLarge { len: most + 1, most }));
+    host.send_datagram(at_host, Bytes::from(vec![7; most])).unwrap();
+    assert_eq!(datagram(&guest).len(), most);
+
+    std::thread::sleep(Duration::from_millis(150));
+    let stats = host.stats(at_host).unwrap();
+    assert_eq!((stats.sent_datagrams, stats.received_datagrams, stats.dropped.too_large), (2, 1, 1));
+    assert!(stats.round_trip < Duration::from_millis(100) && stats.loss() == 0.0, "{stats:?}");
+
+    guest.send_message(at_guest, Bytes::from_static(b"said before leaving")).unwrap();
+    guest.close(at_guest, "bye\n\u{7}now");
+    assert_eq!(message(&host), "said before leaving");
+    assert_eq!(closed(&host), CloseReason::ByPeer { words: "byenow".into() });
+    assert_eq!(closed(&guest), CloseReason::ByUs);
+    assert_eq!(host.send_datagram(at_host, Bytes::new()), Err(SendError::NotConnected));
+    assert!(host.peers().is_empty());
+}
+
+#[test]
+fn dropping_an_endpoint_says_goodbye() {
+    let host = host();
+    let guest = guest(&host.invite());
+    connected(&guest);
+    connected(&host);
+    let start = Instant::now();
+    drop(guest);
+    assert!(matches!(closed(&host), CloseReason::ByPeer { .. }));
+    assert!(start.elapsed() < Duration::from_millis(900), "sooner than any timeout: {:?}", start.elapsed());
+    let guest = self::guest(&host.invite());
+    connected(&guest);
+    drop(host);
+    assert!(matches!(closed(&guest), CloseReason::ByPeer { words } if words.contains("host")));
+}
+
+#[test]
+fn another_key_than_the_invites_is_refused() {
+    let host = host();
+    let mut invite = host.invite();
+    invite.fingerprint = Fingerprint([1; 32]);
+    let guest = guest(&invite);
+    let expected = CloseReason::WrongFingerprint { expected: invite.fingerprint, found: host.fingerprint() };
+    assert_eq!(closed(&guest), expected);
+    assert!(host.poll().is_none(), "the host's application never hears of it");
+}
+
+#[test]
+fn tokens_are_asked_for() {
+    let token = Token::generate().unwrap();
+    let options =
+        |expires| HostOptions { access: Access::Token { token, expires }, ..HostOptions::default() };
+    let host = Endpoint::host(options(None)).unwrap();
+    let invite = host.invite();
+    connected(&guest(&invite));
+    for wrong in [None, Some(Token([0; 16]))] {
+        let guest = guest(&Invite { token: wrong, ..invite.clone() });
+        assert!(matches!(closed(&guest), CloseReason::Refused { words } if words.contains("token")));
+    }
+    let expired = Endpoint::host(options(Some(SystemTime::now()))).unwrap();
+    let reason = closed(&guest(&expired.invite()));
+    assert_eq!(reason, CloseReason::Refused { words: "the token has expired".into() });
+}
+
+#[test]
+fn a_host_that_is_not_there_is_reported() {
+    let silent = UdpSocket::bind("127.0.0.1:0").unwrap();
+    let limits = Limits { handshake: Duration::from_millis(700), ..Limits::guest() };
+    let invite = Invite::new(silent.local_addr().unwrap(), Fingerprint([0; 32]));
+    let guest = Endpoint::join(&invite, JoinOptions { limits, ..JoinOptions::default() }).unwrap();
+    assert_eq!(closed(&guest), CloseReason::TimedOut);
+    let nowhere = Invite { host: "no-such-host.invalid".into(), ..invite };
+    let guest = self::guest(&nowhere);
+    assert!(matches!(closed(&guest), CloseReason::Failed { words } if words.contains("no-such-host")));
+}
+
+#[test]
+fn a_full_host_refuses_the_next_guest() {
+    let limits = Limits { peers: 1, ..Limits::host() };
+    let host = Endpoint::host(HostOptions { limits, ..HostOptions::default() }).unwrap();
+    let first = guest(&host.invite());
+    connected(&first);
+    connected(&host);
+    assert!(matches!(closed(&guest(&host.invite())), CloseReason::Refused { .. }));
+    drop(first);
+    closed(&host);
+    connected(&guest(&host.invite()));
+}
+
+#[test]
+fn a_message_over_the_limit_ends_the_connection_of_its_sender_only() {
+    let limits = Limits { message: 1000, ..Limits::host() };
+    let host = Endpoint::host(HostOptions { limits, ..HostOptions::default() }).unwrap();
+    let (bad, good) = (guest(&host.invite()), guest(&host.invite()));
+    connected(&bad);
+    connected(&good);
+    bad.send_message(PeerId::HOST, Bytes::from(vec![0; 1000])).unwrap();
+    assert_eq!(message(&host).len(), 1000);
+    bad.send_message(PeerId::HOST, Bytes::from(vec![0; 1001])).unwrap();
+    assert!(
+        matches!(closed(&host), CloseReason::Protocol { words } if words.contains("1001") && words.contains("1000"))
+    );
+    assert!(matches!(closed(&bad), CloseReason::Failed { words } if words.contains("1001")));
+    good.send_message(PeerId::HOST, Bytes::from_static(b"still here")).unwrap();
+    assert_eq!(message(&host), "still here");
+}
+
+#[test]
+fn garbage_on_the_port_disturbs_nobody() {
+    let host = host();
+    let guest = guest(&host.invite());
+    connected(&guest);
+    let (peer, _) = connected(&host);
+    let socket = UdpSocket::bind("127.0.0.1:0").unwrap();
+    let mut state = 0x2545_f491_4f6c_dd1d_u64;
+    for i in 0..2000usize {
+        let bytes: Vec<u8> = (0..i % 1300)
+            .map(|_| {
+                state ^= state << 13;
+                state ^= state >> 7;
+                state ^= state << 17;
+                state as u8
+            })
+            .collect();
+        socket.send_to(&bytes, host.local_address()).unwrap();
+    }
+    guest.send_datagram(PeerId::HOST, Bytes::from_static(b"through")).unwrap();
+    assert_eq!(datagram(&host), "through");
+    host.send_datagram(peer, Bytes::from_static(b"and back")).unwrap();
+    assert_eq!(datagram(&guest), "and back");
+}
+
+/// A guest made of bare quinn, which can do what ours never does.
+struct Stranger {
+    runtime: tokio::runtime::Runtime,
+    endpoint: quinn::Endpoint,
+}
+
+/// Trusts any host, as only a test may.
+#[derive(Debug)]
+struct AnyHost(rustls::crypto::WebPkiSupportedAlgorithms);
+
+impl rustls::client::danger::ServerCertVerifier for AnyHost {
+    fn verify_server_cert(
+        &self,
+        _: &rustls::pki_types::CertificateDer<'_>,
+        _: &[rustls::pki_types::CertificateDer<'_>],
+        _: &rustls::pki_types::ServerName<'_>,
+        _: &[u8],
+        _: rustls::pki_types::UnixTime,
+    ) -> Result<rustls::client::danger::ServerCertVerified, rustls::Error> {
+        Ok(rustls::client::danger::ServerCertVerified::assertion())
+    }
+
+    fn verify_tls12_signature(
+        &self,
+        message: &[u8],
+        cert: &rustls::pki_types::CertificateDer<'_>,
+        dss: &rustls::DigitallySignedStruct,
+    ) -> Result<rustls::client::danger::HandshakeSignatureValid, rustls::Error> {
+        rustls::crypto::verify_tls12_signature(message, cert, dss, &self.0)
+    }
+
+    fn verify_tls13_signature(
+        &self,
+        message: &[u8],
+        cert: &rustls::pki_types::CertificateDer<'_>,
+        dss: &rustls::DigitallySignedStruct,
+    ) -> Result<rustls::client::danger::HandshakeSignatureValid, rustls::Error> {
+        rustls::crypto::verify_tls13_signature(message, cert, dss, &self.0)
+    }
+
+    fn supported_verify_schemes(&self) -> Vec<rustls::SignatureScheme> {
+        self.0.supported_schemes()
+    }
+}
+
+impl Stranger {
+    fn new(alpn: &[u8], key: bool) -> Self {
+        let runtime = tokio::runtime::Builder::new_current_thread().enable_all().build().unwrap();
+        let provider = Arc::new(rustls::crypto::ring::default_provider());
+        let algorithms = provider.signature_verification_algorithms;
+        let builder = rustls::ClientConfig::builder_with_provider(provider)
+            .with_protocol_versions(&[&rustls::version::TLS13])
+            .unwrap()
+            .dangerous()
+            .with_custom_certificate_verifier(Arc::new(AnyHost(algorithms)));
+        let mut tls = if key {
+            let pair = rcgen::KeyPair::generate_for(&rcgen::PKCS_ED25519).unwrap();
+            let certificate =
+                rcgen::CertificateParams::new(vec!["x".into()]).unwrap().self_signed(&pair).unwrap();
+            let der = rustls::pki_types::PrivatePkcs8KeyDer::from(pair.serialize_der());
+            builder.with_client_auth_cert(vec![certificate.der().clone()], der.into()).unwrap()
+        } else {
+            builder.with_no_client_auth()
+        };
+        tls.alpn_protocols = vec![alpn.to_vec()];
+        let crypto = quinn::crypto::rustls::QuicClientConfig::try_from(tls).unwrap();
+        let endpoint = runtime.block_on(async {
+            let mut endpoint = quinn::Endpoint::client(SocketAddr::from(([127, 0, 0, 1], 0))).unwrap();
+            endpoint.set_default_client_config(quinn::ClientConfig::new(Arc::new(crypto)));
+            endpoint
+        });
+        Self { runtime, endpoint }
+    }
+
+    fn connect(&self, host: &Endpoint) -> Result<quinn::Connection, quinn::ConnectionError> {
+        self.runtime.block_on(async { self.endpoint.connect(host.local_address(), "pliant").unwrap().await })
+    }
+}
+
+#[test]
+fn another_version_is_refused_in_the_handshake() {
+    let host = host();
+    let error = Stranger::new(b"pliant/0", true).connect(&host).unwrap_err();
+    assert!(error.to_string().contains("120"), "no_application_protocol is alert 120: {error}");
+    assert!(host.poll().is_none());
+}
+
+#[test]
+fn a_guest_without_a_key_is_refused() {
+    let host = host();
+    let stranger = Stranger::new(ALPN, false);
+    // The client's side of the handshake is over before the host refuses.
+    if let Ok(connection) = stranger.connect(&host) {
+        let error = stranger.runtime.block_on(connection.closed()).to_string();
+        assert!(
+            error.contains("116") || error.contains("certificate"),
+            "certificate_required is alert 116: {error}"
+        );
+    }
+    assert!(host.poll().is_none());
+}
+
+#[test]
+fn datagrams_before_the_token_do_not_count_and_garbage_after_it_is_the_applications() {
+    let host = host();
+    let stranger = Stranger::new(ALPN, true);
+    let connection = stranger.connect(&host).unwrap();
+    stranger.runtime.block_on(async {
+        connection.send_datagram(Bytes::from_static(b"early")).unwrap();
+        tokio::time::sleep(Duration::from_millis(100)).await;
+    });
+    assert!(host.poll().is_none(), "not let in before its token");
+    stranger.runtime.block_on(async {
+        let (mut send, mut recv) = connection.open_bi().await.unwrap();
+        send.write_all(&0u32.to_le_bytes()).await.unwrap();
+        let mut welcome = [9; 4];
+        recv.read_exact(&mut welcome).await.unwrap();
+        assert_eq!(welcome, [0; 4]);
+        connection.send_datagram(Bytes::from_static(b"\xff\x00garbage")).unwrap();
+        tokio::time::sleep(Duration::from_millis(50)).await;
+    });
+    connected(&host);
+    assert_eq!(datagram(&host), &b"\xff\x00garbage"[..], "the first that counts");
+
+    // A first message that is no token.
+    let second = stranger.connect(&host).unwrap();
+    let error = stranger.runtime.block_on(async {
+        let (mut send, _recv) = second.open_bi().await.unwrap();
+        send.write_all(b"\x05\x00\x00\x00hello").await.unwrap();
+        second.closed().await
+    });
+    assert!(error.to_string().contains("no token"), "{error}");
+}
+
+#[test]
+fn a_guest_that_dies_without_a_word_is_noticed_after_the_idle_timeout() {
+    let host = host();
+    let stranger = Stranger::new(ALPN, true);
+    let connection = stranger.connect(&host).unwrap();
+    stranger.runtime.block_on(async {
+        let (mut send, mut recv) = connection.open_bi().await.unwrap();
+        send.write_all(&0u32.to_le_bytes()).await.unwrap();
+        let mut welcome = [9; 4];
+        recv.read_exact(&mut welcome).await.unwrap();
+        std::mem::forget((send, recv));
+    });
+    let (peer, _) = connected(&host);
+    // From here on nobody drives the stranger's side: as if its process had been killed.
+    let start = Instant::now();
+    assert_eq!(closed(&host), CloseReason::TimedOut);
+    let after = start.elapsed().as_secs_f64();
+    assert!((0.5..3.0).contains(&after), "the idle timeout is 1 s, noticed after {after} s");
+    assert!(host.stats(peer).is_none());
+    std::mem::forget(connection);
+}
+
+#[test]
+fn a_guest_that_never_reads_costs_a_bounded_queue() {
+    let limits = Limits { queued_messages: 1 << 20, ..quick(Limits::host()) };
+    let host = Endpoint::host(HostOptions { limits, ..HostOptions::default() }).unwrap();
+    let guest_limits = Limits { queued_messages: 1 << 16, ..quick(Limits::guest()) };
+    let options = JoinOptions {
+        limits: guest_limits,
+        identity: Some(Identity::generate().unwrap()),
+        ..JoinOptions::default()
+    };
+    let guest = Endpoint::join(&host.invite(), options).unwrap();
+    let (peer, _) = connected(&host);
+    let part = Bytes::from(vec![0; 100_000]);
+    let mut taken = 0;
+    let error = loop {
+        match host.send_message(peer, part.clone()) {
+            Ok(()) => taken += 1,
+            Err(error) => break error,
+        }
+        assert!(taken < 200, "20 MB queued for a guest that reads nothing");
+    };
+    assert_eq!(error, SendError::QueueFull { len: part.len() });
+    // Datagrams are not held up by the messages that wait, and the oldest make room for the newest.
+    for i in 0..200u8 {
+        host.send_datagram(peer, Bytes::copy_from_slice(&[i])).unwrap();
+    }
+    std::thread::sleep(Duration::from_millis(300));
+    connected(&guest);
+    let mut got = Vec::new();
+    let start = Instant::now();
+    while start.elapsed() < Duration::from_millis(300) {
+        if let Some(Event::Datagram { bytes, .. }) = guest.poll() {
+            got.push(bytes[0]);
+        }
+    }
+    assert_eq!(got.last(), Some(&199));
+    let dropped = host.stats(peer).unwrap().dropped.send_queue_full as usize;
+    let unread = guest.stats(PeerId::HOST).unwrap().dropped.receive_queue_full as usize;
+    assert_eq!(
+        got.len() + dropped + unread,
+        200,
+        "{} read, {dropped} not sent, {unread} not read",
+        got.len()
+    );
+}
