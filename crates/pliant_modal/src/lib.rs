@@ -39,6 +39,7 @@ mod file;
 mod integrator;
 mod model;
 mod patch;
+mod simd;
 mod surface;
 mod warp;
 

@@ -66,40 +66,36 @@ pub(crate) fn warp_with_jacobian(
     (d + a * c + b * cc, by_d, by_w)
 }
 
-/// `A` and `B` in single precision for `s <= WARP_SERIES_LIMIT`: a fixed polynomial, so that a block of vertices vectorises.
-#[inline(always)]
-pub(crate) fn series_f32(s: f32) -> (f32, f32) {
-    const A: [f32; 9] = [
-        1.0 / 2.0,
-        -1.0 / 24.0,
-        1.0 / 720.0,
-        -1.0 / 40_320.0,
-        1.0 / 3_628_800.0,
-        -1.0 / 479_001_600.0,
-        1.0 / 87_178_291_200.0,
-        -1.0 / 20_922_789_888_000.0,
-        1.0 / 6_402_373_705_728_000.0,
-    ];
-    const B: [f32; 9] = [
-        1.0 / 6.0,
-        -1.0 / 120.0,
-        1.0 / 5_040.0,
-        -1.0 / 362_880.0,
-        1.0 / 39_916_800.0,
-        -1.0 / 6_227_020_800.0,
-        1.0 / 1_307_674_368_000.0,
-        -1.0 / 355_687_428_096_000.0,
-        1.0 / 121_645_100_408_832_000.0,
-    ];
-    let (mut a, mut b) = (A[8], B[8]);
-    for k in (0..8).rev() {
-        a = a * s + A[k];
-        b = b * s + B[k];
-    }
-    (a, b)
-}
+/// Terms of the series of `A` and `B` in `s`: single precision up to [`WARP_SERIES_LIMIT`].
+pub(crate) const SERIES_TERMS: usize = 9;
 
-/// Up to one half turn the nine-term series of [`series_f32`] is exact to single precision.
+/// `A = sum (-s)^k / (2k+2)!`
+pub(crate) const SERIES_A: [f32; SERIES_TERMS] = [
+    1.0 / 2.0,
+    -1.0 / 24.0,
+    1.0 / 720.0,
+    -1.0 / 40_320.0,
+    1.0 / 3_628_800.0,
+    -1.0 / 479_001_600.0,
+    1.0 / 87_178_291_200.0,
+    -1.0 / 20_922_789_888_000.0,
+    1.0 / 6_402_373_705_728_000.0,
+];
+
+/// `B = sum (-s)^k / (2k+3)!`
+pub(crate) const SERIES_B: [f32; SERIES_TERMS] = [
+    1.0 / 6.0,
+    -1.0 / 120.0,
+    1.0 / 5_040.0,
+    -1.0 / 362_880.0,
+    1.0 / 39_916_800.0,
+    -1.0 / 6_227_020_800.0,
+    1.0 / 1_307_674_368_000.0,
+    -1.0 / 355_687_428_096_000.0,
+    1.0 / 121_645_100_408_832_000.0,
+];
+
+/// Half a turn, squared: up to here nine terms are exact to single precision.
 pub(crate) const WARP_SERIES_LIMIT: f32 = 9.87;
 
 /// `A` and `B` for any `s`, in single precision.
@@ -140,7 +136,8 @@ mod tests {
             assert!((below[k] - above[k]).abs() < 1e-11, "coefficient {k}: {} and {}", below[k], above[k]);
         }
         for s in [0.0f32, 1e-6, 0.3, 2.0, 9.8] {
-            let (series, closed) = (series_f32(s), closed_f32(s));
+            let horner = |c: &[f32]| c.iter().rev().fold(0.0, |sum, c| sum * s + c);
+            let (series, closed) = ((horner(&SERIES_A), horner(&SERIES_B)), closed_f32(s));
             assert!((series.0 - closed.0).abs() < 2e-7 && (series.1 - closed.1).abs() < 2e-7, "s = {s}");
         }
     }

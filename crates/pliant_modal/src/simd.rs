@@ -1,0 +1,155 @@
+//! Sixteen single-precision numbers at once, in whatever the processor has.
+//!
+//! The compiler turns plain loops over `[[f32; 16]; 6]` accumulators into scalar code; naming the registers keeps them in registers. One kernel is
+//! written over [`Lanes`]; the instruction set is chosen at run time.
+
+use crate::basis::BLOCK;
+
+/// A register (or two, or an array) of [`BLOCK`] numbers.
+///
+/// # Safety
+/// The methods of an implementation may only be called where its instruction set is known to be there.
+pub(crate) trait Lanes: Copy {
+    unsafe fn splat(x: f32) -> Self;
+    unsafe fn load(from: &[f32; BLOCK]) -> Self;
+    unsafe fn store(self, to: &mut [f32; BLOCK]);
+    /// `self * by + plus`
+    unsafe fn mul_add(self, by: Self, plus: Self) -> Self;
+    /// `minus - self * by`
+    unsafe fn neg_mul_add(self, by: Self, minus: Self) -> Self;
+    unsafe fn mul(self, by: Self) -> Self;
+    /// Are all lanes at most `limit`? NaN lanes may answer either way.
+    unsafe fn all_at_most(self, limit: f32) -> bool;
+}
+
+/// Any processor: an array that the compiler vectorises as far as it can.
+#[derive(Clone, Copy)]
+pub(crate) struct Portable([f32; BLOCK]);
+
+impl Lanes for Portable {
+    #[inline(always)]
+    unsafe fn splat(x: f32) -> Self {
+        Self([x; BLOCK])
+    }
+    #[inline(always)]
+    unsafe fn load(from: &[f32; BLOCK]) -> Self {
+        Self(*from)
+    }
+    #[inline(always)]
+    unsafe fn store(self, to: &mut [f32; BLOCK]) {
+        *to = self.0;
+    }
+    #[inline(always)]
+    unsafe fn mul_add(self, by: Self, plus: Self) -> Self {
+        Self(std::array::from_fn(|l| self.0[l] * by.0[l] + plus.0[l]))
+    }
+    #[inline(always)]
+    unsafe fn neg_mul_add(self, by: Self, minus: Self) -> Self {
+        Self(std::array::from_fn(|l| minus.0[l] - self.0[l] * by.0[l]))
+    }
+    #[inline(always)]
+    unsafe fn mul(self, by: Self) -> Self {
+        Self(std::array::from_fn(|l| self.0[l] * by.0[l]))
+    }
+    #[inline(always)]
+    unsafe fn all_at_most(self, limit: f32) -> bool {
+        self.0.iter().all(|x| *x <= limit)
+    }
+}
+
+#[cfg(target_arch = "x86_64")]
+pub(crate) mod x86 {
+    use std::arch::x86_64::{
+        __m256, __m512, _CMP_LE_OQ, _mm256_and_ps, _mm256_cmp_ps, _mm256_fmadd_ps, _mm256_fnmadd_ps,
+        _mm256_loadu_ps, _mm256_movemask_ps, _mm256_mul_ps, _mm256_set1_ps, _mm256_storeu_ps,
+        _mm512_cmp_ps_mask, _mm512_fmadd_ps, _mm512_fnmadd_ps, _mm512_loadu_ps, _mm512_mul_ps,
+        _mm512_set1_ps, _mm512_storeu_ps,
+    };
+
+    use super::{BLOCK, Lanes};
+
+    /// One AVX-512 register.
+    #[derive(Clone, Copy)]
+    pub(crate) struct Avx512(__m512);
+
+    // SAFETY of the bodies: the trait's contract is that AVX-512F is there; loads and stores go through references to 16 numbers.
+    impl Lanes for Avx512 {
+        #[inline(always)]
+        unsafe fn splat(x: f32) -> Self {
+            Self(unsafe { _mm512_set1_ps(x) })
+        }
+        #[inline(always)]
+        unsafe fn load(from: &[f32; BLOCK]) -> Self {
+            Self(unsafe { _mm512_loadu_ps(from.as_ptr()) })
+        }
+        #[inline(always)]
+        unsafe fn store(self, to: &mut [f32; BLOCK]) {
+            unsafe { _mm512_storeu_ps(to.as_mut_ptr(), self.0) }
+        }
+        #[inline(always)]
+        unsafe fn mul_add(self, by: Self, plus: Self) -> Self {
+            Self(unsafe { _mm512_fmadd_ps(self.0, by.0, plus.0) })
+        }
+        #[inline(always)]
+        unsafe fn neg_mul_add(self, by: Self, minus: Self) -> Self {
+            Self(unsafe { _mm512_fnmadd_ps(self.0, by.0, minus.0) })
+        }
+        #[inline(always)]
+        unsafe fn mul(self, by: Self) -> Self {
+            Self(unsafe { _mm512_mul_ps(self.0, by.0) })
+        }
+        #[inline(always)]
+        unsafe fn all_at_most(self, limit: f32) -> bool {
+            unsafe { _mm512_cmp_ps_mask::<_CMP_LE_OQ>(self.0, _mm512_set1_ps(limit)) == u16::MAX }
+        }
+    }
+
+    /// Two AVX registers, with FMA.
+    #[derive(Clone, Copy)]
+    pub(crate) struct Avx2(__m256, __m256);
+
+    // SAFETY of the bodies: the trait's contract is that AVX2 and FMA are there; both halves of a reference to 16 numbers lie inside it.
+    impl Lanes for Avx2 {
+        #[inline(always)]
+        unsafe fn splat(x: f32) -> Self {
+            let x = unsafe { _mm256_set1_ps(x) };
+            Self(x, x)
+        }
+        #[inline(always)]
+        unsafe fn load(from: &[f32; BLOCK]) -> Self {
+            let p = from.as_ptr();
+            unsafe { Self(_mm256_loadu_ps(p), _mm256_loadu_ps(p.add(8))) }
+        }
+        #[inline(always)]
+        unsafe fn store(self, to: &mut [f32; BLOCK]) {
+            let p = to.as_mut_ptr();
+            unsafe {
+                _mm256_storeu_ps(p, self.0);
+                _mm256_storeu_ps(p.add(8), self.1);
+            }
+        }
+        #[inline(always)]
+        unsafe fn mul_add(self, by: Self, plus: Self) -> Self {
+            unsafe { Self(_mm256_fmadd_ps(self.0, by.0, plus.0), _mm256_fmadd_ps(self.1, by.1, plus.1)) }
+        }
+        #[inline(always)]
+        unsafe fn neg_mul_add(self, by: Self, minus: Self) -> Self {
+            unsafe { Self(_mm256_fnmadd_ps(self.0, by.0, minus.0), _mm256_fnmadd_ps(self.1, by.1, minus.1)) }
+        }
+        #[inline(always)]
+        unsafe fn mul(self, by: Self) -> Self {
+            unsafe { Self(_mm256_mul_ps(self.0, by.0), _mm256_mul_ps(self.1, by.1)) }
+        }
+        #[inline(always)]
+        unsafe fn all_at_most(self, limit: f32) -> bool {
+            unsafe {
+                let limit = _mm256_set1_ps(limit);
+                let both = _mm256_and_ps(
+                    _mm256_cmp_ps::<_CMP_LE_OQ>(self.0, limit),
+                    _mm256_cmp_ps::<_CMP_LE_OQ>(self.1, limit),
+                );
+                _mm256_movemask_ps(both) == 0xff
+            }
+        }
+    }
+}
