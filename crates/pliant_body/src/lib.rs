@@ -1,1 +1,170 @@
-//! Bevy plugin for modal soft bodies: components, assets, fixed-step systems, pointer grabs, deformation.
+//! The Bevy plugin for modal soft bodies: assets, components, fixed-step systems, grabs, the pointer, and the deformed surface.
+//!
+//! ```no_run
+//! use bevy::prelude::*;
+//! use pliant_body::{ModalBody, PliantBodyPlugin};
+//!
+//! fn main() {
+//!     App::new().add_plugins((DefaultPlugins, PliantBodyPlugin::default())).add_systems(Startup, setup).run();
+//! }
+//!
+//! fn setup(mut commands: Commands, assets: Res<AssetServer>) {
+//!     commands.spawn(ModalBody::new(assets.load("pip.modal")));
+//! }
+//! ```
+//!
+//! | Written by you | Read by you |
+//! | --- | --- |
+//! | [`ModalBody`]: the model and how it is stepped | [`BodyState`]: the simulated body |
+//! | `Transform`: where it is | [`ShownState`]: what is on screen |
+//! | [`Grab`] and [`GrabOf`] on an entity of their own: a hold on a patch | [`GrabForce`]: the reaction, N; [`Grabs`] on the body |
+//! | [`Driven::Remote`]: somebody else moves it | [`PliantTick`]: the number of the step |
+//! | `SurfaceShading`: sharp and smooth edges (feature `render`) | [`BodyRefused`]: what was refused, and why |
+//!
+//! The crate knows no network, device, viewer or panel; they stand on it. Time is Bevy's: pausing `Time<Virtual>` pauses the bodies, and
+//! a `Time<Fixed>` advanced by hand single-steps them.
+//!
+//! # Features
+//!
+//! `render`: the deformed surface as a mesh with normals, and the pointer's target drawn. Without it no renderer is compiled.
+#![cfg_attr(
+    test,
+    allow(clippy::unwrap_used, clippy::expect_used, clippy::panic, reason = "a failed test should panic")
+)]
+
+mod asset;
+mod body;
+#[cfg(feature = "render")]
+mod deform;
+mod error;
+mod grab;
+mod pick;
+mod pointer;
+mod shown;
+mod step;
+
+use bevy::{
+    asset::AssetEventSystems,
+    diagnostic::{Diagnostic, DiagnosticPath, RegisterDiagnostic},
+    ecs::schedule::{InternedScheduleLabel, ScheduleLabel},
+    prelude::*,
+};
+
+pub use asset::{ModalAsset, ModalAssetError, ModalAssetLoader};
+pub use body::{BodyState, Driven, Integration, ModalBody, NoPointerGrab};
+#[cfg(feature = "render")]
+pub use deform::{DrawnSurface, SurfaceShading};
+pub use error::{BodyError, BodyRefused};
+pub use grab::{Grab, GrabForce, GrabOf, Grabs};
+pub use pick::{SurfaceHit, pick_surface};
+pub use pointer::{PointerGrab, PointerGrabPlugin, PointerGrabSystems, PointerHeld};
+pub use shown::{Pose, ShownState};
+pub use step::PliantTick;
+
+/// Diagnostic: time of one tick's steps of all bodies that are awake, ms.
+pub const STEP_TIME: DiagnosticPath = DiagnosticPath::const_new("pliant/step");
+
+/// Diagnostic: time of writing the surfaces that changed in a frame, ms (feature `render`).
+pub const DEFORM_TIME: DiagnosticPath = DiagnosticPath::const_new("pliant/deform");
+
+/// A tick, in this order, in the schedule that [`PliantBodyPlugin`] was given. None of it runs while the schedule's time stands still.
+#[derive(SystemSet, Debug, Clone, PartialEq, Eq, Hash)]
+pub enum PliantSystems {
+    /// Places and grabs are taken over. Whoever moves a [`Grab`] once a tick (a script, a session) does so before this set.
+    Input,
+    /// Local bodies are stepped.
+    Step,
+    /// [`ShownState`] and [`GrabForce`] are written. Sources of remote bodies call [`ShownState::push`] in this set; readers run after it.
+    Publish,
+}
+
+/// A frame, in this order, in `PostUpdate`.
+#[derive(SystemSet, Debug, Clone, PartialEq, Eq, Hash)]
+pub enum PliantDisplaySystems {
+    /// Shown states move to where this frame falls between two ticks.
+    Interpolate,
+    /// Surfaces are written from them.
+    Deform,
+}
+
+/// Bodies, grabs and, with the feature `render`, their surfaces.
+///
+/// Needs Bevy's asset, time and transform plugins (`DefaultPlugins` has them; headless: `MinimalPlugins`, `AssetPlugin`,
+/// `TransformPlugin`).
+pub struct PliantBodyPlugin {
+    schedule: InternedScheduleLabel,
+}
+
+impl PliantBodyPlugin {
+    /// Steps the bodies in `schedule`, by the time that runs there. In a schedule of the fixed loop (`FixedUpdate` and its neighbours) the
+    /// picture is interpolated between steps; in any other one (`Update`) the step is as long as the frame.
+    pub fn new(schedule: impl ScheduleLabel) -> Self {
+        Self { schedule: schedule.intern() }
+    }
+}
+
+impl Default for PliantBodyPlugin {
+    /// In `FixedUpdate`.
+    fn default() -> Self {
+        Self::new(FixedUpdate)
+    }
+}
+
+impl Plugin for PliantBodyPlugin {
+    fn build(&self, app: &mut App) {
+        let fixed = [
+            FixedFirst.intern(),
+            FixedPreUpdate.intern(),
+            FixedUpdate.intern(),
+            FixedPostUpdate.intern(),
+            FixedLast.intern(),
+        ]
+        .contains(&self.schedule);
+
+        app.init_asset::<ModalAsset>()
+            .init_asset_loader::<ModalAssetLoader>()
+            .register_type::<ModalBody>()
+            .register_type::<Driven>()
+            .register_type::<NoPointerGrab>()
+            .register_type::<Grab>()
+            .register_type::<GrabOf>()
+            .register_type::<Grabs>()
+            .register_type::<GrabForce>()
+            .register_type::<Pose>()
+            .register_type::<PliantTick>()
+            .add_message::<BodyRefused>()
+            .init_resource::<PliantTick>()
+            .insert_resource(step::Stepping { fixed })
+            .register_diagnostic(Diagnostic::new(STEP_TIME).with_suffix(" ms"))
+            .register_diagnostic(Diagnostic::new(DEFORM_TIME).with_suffix(" ms"))
+            .add_observer(step::drop_states)
+            .configure_sets(
+                self.schedule,
+                (PliantSystems::Input, PliantSystems::Step, PliantSystems::Publish)
+                    .chain()
+                    .run_if(|time: Res<Time>| !time.delta().is_zero()),
+            )
+            .configure_sets(
+                PostUpdate,
+                (
+                    PliantDisplaySystems::Interpolate.before(TransformSystems::Propagate),
+                    PliantDisplaySystems::Deform.before(AssetEventSystems),
+                )
+                    .chain(),
+            )
+            .add_systems(PreUpdate, step::build_bodies)
+            .add_systems(
+                self.schedule,
+                (
+                    (step::count_tick, shown::begin_tick, step::place_bodies, step::hold_bodies)
+                        .chain()
+                        .in_set(PliantSystems::Input),
+                    step::step_bodies.in_set(PliantSystems::Step),
+                    step::publish.in_set(PliantSystems::Publish),
+                ),
+            )
+            .add_systems(PostUpdate, shown::interpolate.in_set(PliantDisplaySystems::Interpolate));
+        #[cfg(feature = "render")]
+        deform::build(app);
+    }
+}

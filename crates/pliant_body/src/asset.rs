@@ -1,0 +1,66 @@
+//! The baked body as a Bevy asset, and the loader of `.modal` files.
+
+use std::sync::Arc;
+
+use bevy::{
+    asset::{Asset, AssetLoader, LoadContext, io::Reader},
+    reflect::TypePath,
+};
+use pliant_modal::{FileError, ModalModel};
+use thiserror::Error;
+
+/// A baked body: the modes, the surface and what the bake measured, shared by every [`ModalBody`](crate::ModalBody) that shows it.
+///
+/// Made by the loader from a `.modal` file (`asset_server.load("bodies/imp.modal")`), or in code from a model that was
+/// baked or received: `assets.add(ModalAsset::from(model))`.
+#[derive(Asset, TypePath, Clone, Debug)]
+pub struct ModalAsset(pub Arc<ModalModel>);
+
+impl From<ModalModel> for ModalAsset {
+    fn from(model: ModalModel) -> Self {
+        Self(Arc::new(model))
+    }
+}
+
+impl From<Arc<ModalModel>> for ModalAsset {
+    fn from(model: Arc<ModalModel>) -> Self {
+        Self(model)
+    }
+}
+
+/// Loads `.modal` files: version, hash and every number are checked by [`ModalModel::from_bytes`].
+#[derive(Default, TypePath)]
+pub struct ModalAssetLoader;
+
+/// Why a `.modal` file did not become a [`ModalAsset`].
+#[derive(Debug, Error)]
+#[non_exhaustive]
+pub enum ModalAssetError {
+    /// The bytes could not be read.
+    #[error("the file could not be read: {0}")]
+    Read(#[from] std::io::Error),
+    /// The bytes are not a model of this version, are cut, or were altered.
+    #[error("not a usable .modal file: {0}")]
+    Model(#[from] FileError),
+}
+
+impl AssetLoader for ModalAssetLoader {
+    type Asset = ModalAsset;
+    type Settings = ();
+    type Error = ModalAssetError;
+
+    async fn load(
+        &self,
+        reader: &mut dyn Reader,
+        _settings: &Self::Settings,
+        _load_context: &mut LoadContext<'_>,
+    ) -> Result<Self::Asset, Self::Error> {
+        let mut bytes = Vec::new();
+        reader.read_to_end(&mut bytes).await?;
+        Ok(ModalModel::from_bytes(&bytes)?.into())
+    }
+
+    fn extensions(&self) -> &[&str] {
+        &["modal"]
+    }
+}

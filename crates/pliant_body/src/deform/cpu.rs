@@ -1,0 +1,67 @@
+//! Writes the deformed surface into the mesh asset on the processor. It allocates nothing once its buffers have grown; Bevy then copies
+//! the mesh for its render world.
+
+use bevy::{camera::primitives::Aabb, mesh::VertexAttributeValues, prelude::*};
+use pliant_modal::ModalModel;
+
+use super::topology::Topology;
+
+/// Buffers that are kept from body to body and frame to frame.
+#[derive(Default)]
+pub(super) struct Scratch {
+    q: Vec<f32>,
+    positions: Vec<[f32; 3]>,
+    normals: Vec<Vec3>,
+}
+
+/// Writes positions (m, body axes) and area-weighted normals at modal coordinates `q` into `mesh`, which was made for `topology`;
+/// returns the bounds, or `None` when the mesh is not of this topology (somebody replaced it), which is then left alone.
+pub(super) fn write(
+    model: &ModalModel,
+    topology: &Topology,
+    q: &[f64],
+    warped: bool,
+    mesh: &mut Mesh,
+    scratch: &mut Scratch,
+) -> Option<Aabb> {
+    let Scratch { q: coordinates, positions, normals } = scratch;
+    coordinates.clear();
+    coordinates.extend(q.iter().map(|&q| q as f32));
+    positions.resize(model.surface().positions().len(), [0.0; 3]);
+    model.basis().reconstruct(coordinates, warped, positions);
+
+    let drawn = float3(mesh, Mesh::ATTRIBUTE_POSITION.id, topology.source.len())?;
+    let (mut low, mut high) = (Vec3::INFINITY, Vec3::NEG_INFINITY);
+    for (drawn, &source) in drawn.iter_mut().zip(&topology.source) {
+        *drawn = positions[source as usize];
+        low = low.min(Vec3::from(*drawn));
+        high = high.max(Vec3::from(*drawn));
+    }
+
+    // The cross product of two edges is the face normal times twice the area: summing it weights by area.
+    normals.clear();
+    normals.resize(topology.normals, Vec3::ZERO);
+    for triangle in &topology.triangles {
+        let [a, b, c] = triangle.map(|v| Vec3::from(drawn[v as usize]));
+        let face = (b - a).cross(c - a);
+        for &v in triangle {
+            normals[topology.normal[v as usize] as usize] += face;
+        }
+    }
+    for normal in normals.iter_mut() {
+        // Scaled by the largest part first: the square of a tiny triangle's area would vanish in single precision.
+        *normal = (*normal / normal.abs().max_element()).normalize_or(Vec3::Y);
+    }
+    let drawn = float3(mesh, Mesh::ATTRIBUTE_NORMAL.id, topology.source.len())?;
+    for (drawn, &normal) in drawn.iter_mut().zip(&topology.normal) {
+        *drawn = normals[normal as usize].into();
+    }
+    Some(Aabb::from_min_max(low, high))
+}
+
+fn float3(mesh: &mut Mesh, id: bevy::mesh::MeshVertexAttributeId, length: usize) -> Option<&mut Vec<[f32; 3]>> {
+    match mesh.try_attribute_mut(id) {
+        Ok(VertexAttributeValues::Float32x3(values)) if values.len() == length => Some(values),
+        _ => None,
+    }
+}

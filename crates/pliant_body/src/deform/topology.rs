@@ -1,0 +1,137 @@
+//! How a surface is cut up for drawing: which vertices are one in the picture, and which share a normal.
+
+use std::collections::HashMap;
+
+use pliant_modal::SurfaceMesh;
+
+/// The drawn mesh of a surface. A vertex of the surface is drawn once for every smooth side of it: twice on the edge of a box, once on
+/// a sphere. Its copies have one position, so that there is never a crack.
+#[derive(Debug)]
+pub(super) struct Topology {
+    /// For each drawn vertex: the vertex of the surface that it shows.
+    pub source: Vec<u32>,
+    /// For each drawn vertex: the normal that it has.
+    pub normal: Vec<u32>,
+    /// How many normals there are.
+    pub normals: usize,
+    /// Drawn triangles.
+    pub triangles: Vec<[u32; 3]>,
+}
+
+impl Topology {
+    /// Cuts `surface` along the edges where the rest shape bends by more than `crease` (rad). Texture seams stay smooth.
+    pub fn new(surface: &SurfaceMesh, crease: f32) -> Self {
+        let triangles = surface.triangles();
+        let welded = surface.welded();
+        let face_normals: Vec<[f32; 3]> = triangles.iter().map(|t| face_normal(surface.positions(), t)).collect();
+        let flattest = crease.cos();
+
+        // A corner is a triangle at one of its vertices. Corners that meet across a smooth edge share a normal.
+        let mut sets = DisjointSets::new(triangles.len() * 3);
+        let mut edges: HashMap<[u32; 2], (usize, usize, usize)> = HashMap::with_capacity(triangles.len() * 2);
+        for (index, triangle) in triangles.iter().enumerate() {
+            for k in 0..3 {
+                let (from, to) = (index * 3 + k, index * 3 + (k + 1) % 3);
+                let ends = [welded[triangle[k] as usize], welded[triangle[(k + 1) % 3] as usize]];
+                let key = if ends[0] < ends[1] { ends } else { [ends[1], ends[0]] };
+                let here = if ends == key { (index, from, to) } else { (index, to, from) };
+                match edges.get(&key) {
+                    None => {
+                        edges.insert(key, here);
+                    }
+                    Some(&(other, low, high)) => {
+                        let [a, b] = [face_normals[other], face_normals[index]];
+                        if a[0] * b[0] + a[1] * b[1] + a[2] * b[2] >= flattest {
+                            sets.join(low, here.1);
+                            sets.join(high, here.2);
+                        }
+                    }
+                }
+            }
+        }
+
+        let mut normal_of_set: HashMap<usize, u32> = HashMap::new();
+        let mut drawn: HashMap<(u32, u32), u32> = HashMap::with_capacity(surface.positions().len());
+        let (mut source, mut normal) = (Vec::new(), Vec::new());
+        let mut drawn_triangles = Vec::with_capacity(triangles.len());
+        for (index, triangle) in triangles.iter().enumerate() {
+            drawn_triangles.push(std::array::from_fn(|k| {
+                let set = sets.find(index * 3 + k);
+                let next = normal_of_set.len() as u32;
+                let group = *normal_of_set.entry(set).or_insert(next);
+                *drawn.entry((triangle[k], group)).or_insert_with(|| {
+                    source.push(triangle[k]);
+                    normal.push(group);
+                    source.len() as u32 - 1
+                })
+            }));
+        }
+        Self { source, normal, normals: normal_of_set.len(), triangles: drawn_triangles }
+    }
+}
+
+fn face_normal(positions: &[[f32; 3]], triangle: &[u32; 3]) -> [f32; 3] {
+    let [a, b, c] = triangle.map(|v| bevy::math::Vec3::from(positions[v as usize]));
+    (b - a).cross(c - a).normalize_or_zero().into()
+}
+
+struct DisjointSets(Vec<usize>);
+
+impl DisjointSets {
+    fn new(count: usize) -> Self {
+        Self((0..count).collect())
+    }
+
+    fn find(&mut self, mut item: usize) -> usize {
+        while self.0[item] != item {
+            self.0[item] = self.0[self.0[item]];
+            item = self.0[item];
+        }
+        item
+    }
+
+    fn join(&mut self, a: usize, b: usize) {
+        let (a, b) = (self.find(a), self.find(b));
+        self.0[a.max(b)] = a.min(b);
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use std::f32::consts::{FRAC_PI_2, PI};
+
+    fn cube() -> SurfaceMesh {
+        let positions = (0..8).map(|i| [(i & 1) as f32, (i >> 1 & 1) as f32, (i >> 2) as f32]).collect();
+        let quads = [[0, 4, 6, 2], [1, 3, 7, 5], [0, 1, 5, 4], [2, 6, 7, 3], [0, 2, 3, 1], [4, 5, 7, 6]];
+        let triangles = quads.iter().flat_map(|&[a, b, c, d]| [[a, b, c], [a, c, d]]).collect();
+        SurfaceMesh::new(positions, triangles, None, Vec::new()).unwrap()
+    }
+
+    #[test]
+    fn a_cube_has_three_sides_at_each_corner_and_one_normal_a_face() {
+        let topology = Topology::new(&cube(), FRAC_PI_2 * 0.9);
+        assert_eq!((topology.source.len(), topology.triangles.len()), (24, 12));
+        // One normal for each face at each of its corners.
+        assert_eq!(topology.normals, 24);
+        for (drawn, plain) in topology.triangles.iter().zip(cube().triangles()) {
+            assert_eq!(&drawn.map(|v| topology.source[v as usize]), plain);
+        }
+    }
+
+    #[test]
+    fn a_cube_smoothed_over_keeps_its_eight_vertices() {
+        let topology = Topology::new(&cube(), PI);
+        assert_eq!((topology.source.len(), topology.normals), (8, 8));
+    }
+
+    #[test]
+    fn a_texture_seam_is_two_vertices_with_one_normal() {
+        let positions = vec![[0.0, 0.0, 0.0], [1.0, 0.0, 0.0], [1.0, 1.0, 0.0], [0.0, 0.0, 0.0], [1.0, 1.0, 0.0], [0.0, 1.0, 0.0]];
+        let surface = SurfaceMesh::new(positions, vec![[0, 1, 2], [3, 4, 5]], None, Vec::new()).unwrap();
+        let topology = Topology::new(&surface, 0.5);
+        assert_eq!(topology.source.len(), 6);
+        assert_eq!(topology.normals, 4);
+        assert_eq!(topology.normal[topology.triangles[0][0] as usize], topology.normal[topology.triangles[1][0] as usize]);
+    }
+}

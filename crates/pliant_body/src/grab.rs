@@ -1,0 +1,85 @@
+//! Grabs: what ties a patch of a body's surface to a target in the world, and the force that is felt there.
+
+use bevy::{math::DVec3, prelude::*};
+
+/// A hold on a patch of a body's surface. Spawn it on an entity of its own, related to the body by [`GrabOf`]:
+///
+/// ```
+/// # use bevy::{math::DVec3, prelude::*};
+/// # use pliant_body::{Grab, GrabOf};
+/// # fn pull(mut commands: Commands, body: Entity) {
+/// commands.spawn((Grab::new(17, 0.02, DVec3::new(0.1, 0.4, 0.0)), GrabOf(body)));
+/// # }
+/// ```
+///
+/// The hand is compliant and implicit: it follows the target as far as the body's stiffness and the patch's own compliance
+/// let it, at any stiffness and step. Despawning the entity (or removing [`GrabOf`]) lets go. The force is in [`GrabForce`].
+///
+/// A grab on a [`Driven::Remote`](crate::Driven::Remote) body is not acted on here: whoever drives the body reads it, and writes the force.
+#[derive(Component, Reflect, Debug, Clone, Copy, PartialEq)]
+#[reflect(Component, Clone, PartialEq)]
+#[require(GrabForce)]
+pub struct Grab {
+    /// Surface vertex at the middle of the patch: an index into the model's surface positions.
+    pub vertex: u32,
+    /// Radius of the patch around that vertex, measured on the rest shape, m (of the model, before the entity's scale).
+    /// Zero is the vertex alone; a patch is better, as the compliance of a point depends on the mesh.
+    pub radius: f64,
+    /// Where the patch is wanted, m, in world axes. A value that is not finite is refused: the last good one stays.
+    pub target: DVec3,
+    /// Stiffness of the hand's own spring (a device's coupling), N/m above 0, in series with the patch's compliance.
+    /// Default: `None`, as stiff as the patch allows.
+    pub stiffness: Option<f64>,
+    /// Relaxation time of the coupling's damper, s, 0 or more. Default: `0.0`.
+    pub relaxation: f64,
+}
+
+impl Grab {
+    /// A grab of the patch within `radius` (m, of the model) of surface vertex `vertex`, pulled to `target` (m, world).
+    pub fn new(vertex: u32, radius: f64, target: DVec3) -> Self {
+        Self { vertex, radius, target, stiffness: None, relaxation: 0.0 }
+    }
+
+    /// What the solver is told about the hold; a change of any of it makes the hold anew.
+    pub(crate) fn hold(&self) -> Hold {
+        Hold { vertex: self.vertex, radius: self.radius, stiffness: self.stiffness, relaxation: self.relaxation }
+    }
+}
+
+/// A [`Grab`] without its target.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub(crate) struct Hold {
+    pub vertex: u32,
+    pub radius: f64,
+    pub stiffness: Option<f64>,
+    pub relaxation: f64,
+}
+
+/// The body that a grab holds.
+#[derive(Component, Reflect, Debug, Clone, Copy, PartialEq, Eq)]
+#[reflect(Component, Clone, PartialEq)]
+#[relationship(relationship_target = Grabs)]
+pub struct GrabOf(#[entities] pub Entity);
+
+/// The grabs on a body, oldest first. They are despawned with it.
+#[derive(Component, Reflect, Debug, Default)]
+#[reflect(Component)]
+#[relationship_target(relationship = GrabOf, linked_spawn)]
+pub struct Grabs(Vec<Entity>);
+
+impl Grabs {
+    /// The grabs' entities, oldest first.
+    pub fn entities(&self) -> &[Entity] {
+        &self.0
+    }
+}
+
+/// What a hand feels: published every tick for every [`Grab`], zero while the body is not there yet.
+#[derive(Component, Reflect, Debug, Default, Clone, Copy, PartialEq)]
+#[reflect(Component, Default, Clone, PartialEq)]
+pub struct GrabForce {
+    /// The reaction: the force that the body exerts on the hand, N, in world axes. Default: zero.
+    pub force: DVec3,
+    /// Where the middle of the patch is now (the weighted mean of its vertices), m, in world axes. Default: the origin.
+    pub point: DVec3,
+}

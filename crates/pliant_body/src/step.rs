@@ -1,0 +1,303 @@
+//! The fixed step: bodies are made, placed, held, stepped, and what came of it is published.
+
+use std::{sync::Arc, time::Instant};
+
+use bevy::{
+    diagnostic::Diagnostics,
+    ecs::system::SystemParam,
+    math::{DQuat, DVec3},
+    prelude::*,
+};
+use pliant_modal::{Body, GrabConfig, Patch};
+
+use crate::{
+    BodyError, BodyRefused, BodyState, Driven, Grab, GrabForce, Grabs, ModalAsset, ModalBody, Pose, STEP_TIME, ShownState,
+    body::Held,
+};
+
+/// The tick: how many steps the schedule of the bodies has made. It counts on while bodies rest, and stands while time is paused.
+#[derive(Resource, Reflect, Debug, Default, Clone, Copy, PartialEq, Eq)]
+#[reflect(Resource, Default, Clone, PartialEq)]
+pub struct PliantTick(pub u64);
+
+/// How the bodies' schedule runs.
+#[derive(Resource, Debug, Clone, Copy)]
+pub(crate) struct Stepping {
+    /// By `Time<Fixed>`, so that frames fall between steps.
+    pub fixed: bool,
+}
+
+/// The body of this entity was refused; it is tried again when its [`ModalBody`] changes.
+#[derive(Component)]
+pub(crate) struct BuildRefused;
+
+/// Seconds for which a body must be slow before it rests.
+const REST_AFTER: f64 = 0.5;
+
+#[derive(SystemParam)]
+pub(crate) struct Refusals<'w> {
+    messages: MessageWriter<'w, BodyRefused>,
+}
+
+impl Refusals<'_> {
+    fn tell(&mut self, name: &impl std::fmt::Display, entity: Entity, error: BodyError) {
+        warn!("{name}: {error}");
+        self.messages.write(BodyRefused { entity, error });
+    }
+}
+
+pub(crate) fn build_bodies(
+    mut commands: Commands,
+    models: Res<Assets<ModalAsset>>,
+    stepping: Res<Stepping>,
+    fixed: Option<Res<Time<Fixed>>>,
+    mut refusals: Refusals,
+    mut bodies: Query<(NameOrEntity, Ref<ModalBody>, Option<&mut BodyState>, Has<BuildRefused>)>,
+) {
+    let step = match fixed {
+        Some(fixed) if stepping.fixed => fixed.timestep().as_secs_f64(),
+        _ => 1.0 / 60.0,
+    };
+    for (name, body, state, refused) in &mut bodies {
+        // A handle whose asset is not there yet leaves the old body, if there is one.
+        let Some(ModalAsset(model)) = models.get(&body.model) else { continue };
+        let modes = body.modes.unwrap_or(usize::MAX).min(model.mode_count());
+        match state {
+            Some(state) if Arc::ptr_eq(state.model(), model) && state.body.mode_count() == modes => {
+                if body.is_changed() {
+                    let mut state = state;
+                    let config = body.config(state.body.config().step, state.scale);
+                    if let Err(error) = state.body_mut().reconfigure(config) {
+                        refusals.tell(&name, name.entity, BodyError::Build(error));
+                    }
+                }
+            }
+            state => {
+                if refused && !body.is_changed() {
+                    continue;
+                }
+                match Body::new(model.clone(), body.config(step, 1.0)) {
+                    Ok(new) => {
+                        // Fewer or more modes of one model: the motion of those that stay goes on.
+                        let new = match state {
+                            Some(old) if Arc::ptr_eq(old.model(), model) => carry_over(&old.body, new),
+                            _ => new,
+                        };
+                        let shown = ShownState::new(new.q());
+                        commands
+                            .entity(name.entity)
+                            .insert((BodyState::new(new), shown))
+                            .remove::<BuildRefused>();
+                    }
+                    Err(error) => {
+                        refusals.tell(&name, name.entity, BodyError::Build(error));
+                        commands.entity(name.entity).insert(BuildRefused);
+                    }
+                }
+            }
+        }
+    }
+}
+
+fn carry_over(old: &Body, mut new: Body) -> Body {
+    let mut state = new.state().clone();
+    let from = old.state();
+    for (to, from) in
+        [(&mut state.q, &from.q), (&mut state.v, &from.v), (&mut state.a, &from.a), (&mut state.f, &from.f)]
+    {
+        for (to, from) in to.iter_mut().zip(from) {
+            *to = *from;
+        }
+    }
+    state.frame = from.frame;
+    // A state that the old body had is finite; were it not, the new one stays at rest.
+    if let Err(error) = new.set_state(&state) {
+        warn!("the motion of a body was not carried over: {error}");
+    }
+    new
+}
+
+/// An asset that was removed with its body taken away leaves no state behind.
+pub(crate) fn drop_states(removed: On<Remove, ModalBody>, mut commands: Commands) {
+    if let Ok(mut entity) = commands.get_entity(removed.entity) {
+        entity.try_remove::<(BodyState, ShownState, BuildRefused)>();
+    }
+}
+
+pub(crate) fn count_tick(mut tick: ResMut<PliantTick>) {
+    tick.0 += 1;
+}
+
+/// Takes the place of every body whose transform changed.
+pub(crate) fn place_bodies(
+    mut refusals: Refusals,
+    mut bodies: Query<(NameOrEntity, &ModalBody, &GlobalTransform, &mut BodyState)>,
+) {
+    for (name, body, transform, mut state) in &mut bodies {
+        let affine = transform.affine();
+        if state.placed == Some(affine) {
+            continue;
+        }
+        state.placed = Some(affine);
+        let (scale, rotation, translation) = transform.to_scale_rotation_translation();
+        let uniform = (scale - scale.x).abs().max_element() <= 1e-3 * scale.x;
+        if !(affine.is_finite() && scale.x > 0.0 && scale.is_finite() && rotation.is_finite() && uniform) {
+            refusals.tell(&name, name.entity, BodyError::Placement { translation, scale });
+            continue;
+        }
+        let scale = f64::from(scale.x);
+        let step = state.body.config().step;
+        if scale != state.scale {
+            state.scale = scale;
+            if let Err(error) = state.body_mut().reconfigure(body.config(step, scale)) {
+                refusals.tell(&name, name.entity, BodyError::Build(error));
+            }
+        }
+        let origin = translation.as_dvec3() / scale;
+        let rotation = rotation.as_dquat().normalize();
+        if let Err(error) = state.body_mut().set_pose(origin.into(), rotation.into()) {
+            refusals.tell(&name, name.entity, BodyError::Step(error));
+        }
+    }
+}
+
+/// Makes the solver's grabs those of the entities: new ones are held, gone ones are let go, targets are handed over.
+pub(crate) fn hold_bodies(
+    mut refusals: Refusals,
+    mut bodies: Query<(&mut BodyState, &Driven, Option<&Grabs>)>,
+    grabs: Query<(NameOrEntity, &Grab)>,
+) {
+    for (mut state, driven, list) in &mut bodies {
+        let wanted = match (driven, list) {
+            (Driven::Local, Some(list)) => list.entities(),
+            _ => &[],
+        };
+        if wanted.is_empty() && state.held.is_empty() {
+            continue;
+        }
+        let BodyState { body, held, scale, quiet, resting, .. } = &mut *state;
+        (*quiet, *resting) = (0.0, false);
+        held.retain(|held| {
+            let stays = wanted.contains(&held.entity)
+                && grabs.get(held.entity).is_ok_and(|(_, grab)| grab.hold() == held.hold);
+            if let (false, Some(id)) = (stays, held.id) {
+                body.release(id);
+            }
+            stays
+        });
+        for &entity in wanted {
+            let Ok((name, grab)) = grabs.get(entity) else { continue };
+            let index = held.iter().position(|held| held.entity == entity).unwrap_or_else(|| {
+                let id = take_hold(body, grab).map_err(|error| refusals.tell(&name, entity, error)).ok();
+                held.push(Held { entity, id, hold: grab.hold(), refusing: false });
+                held.len() - 1
+            });
+            let held = &mut held[index];
+            let Some(id) = held.id else { continue };
+            // Not finite is the only way in which a target can be wrong.
+            let refused = body.set_target(id, (grab.target / *scale).into()).is_err();
+            if refused && !held.refusing {
+                refusals.tell(&name, entity, BodyError::TargetNotFinite { target: grab.target.into() });
+            }
+            held.refusing = refused;
+        }
+    }
+}
+
+fn take_hold(body: &mut Body, grab: &Grab) -> Result<pliant_modal::GrabId, BodyError> {
+    let patch = Patch::around(body.model().surface(), grab.vertex, grab.radius).map_err(BodyError::Patch)?;
+    let config = GrabConfig { stiffness: grab.stiffness, relaxation: grab.relaxation };
+    body.grab(&patch, config).map_err(BodyError::Grab)
+}
+
+pub(crate) fn step_bodies(
+    time: Res<Time>,
+    mut diagnostics: Diagnostics,
+    mut refusals: Refusals,
+    mut bodies: Query<(NameOrEntity, &ModalBody, &Driven, &mut BodyState)>,
+) {
+    let start = Instant::now();
+    let step = time.delta_secs_f64();
+    let mut stepped = false;
+    for (name, body, driven, mut state) in &mut bodies {
+        if *driven == Driven::Remote || state.resting {
+            continue;
+        }
+        stepped = true;
+        let state = &mut *state;
+        if state.body.config().step != step
+            && let Err(error) = state.body.reconfigure(body.config(step, state.scale))
+        {
+            refusals.tell(&name, name.entity, BodyError::Step(error));
+            continue;
+        }
+        match state.body.step() {
+            Ok(_) => state.faulted = false,
+            Err(error) => {
+                if !state.faulted {
+                    refusals.tell(&name, name.entity, BodyError::Step(error));
+                }
+                state.faulted = true;
+            }
+        }
+        let slow = is_slow(&state.body, body.rest_speed);
+        state.quiet = if slow && state.held.is_empty() { state.quiet + step } else { 0.0 };
+        state.resting = state.quiet >= REST_AFTER;
+    }
+    if stepped {
+        diagnostics.add_measurement(&STEP_TIME, || start.elapsed().as_secs_f64() * 1e3);
+    }
+}
+
+/// Whether the root mean square speed of the mass is below `limit` (m/s). Modes are mass-normalised: twice their kinetic energy is `sum v^2`.
+fn is_slow(body: &Body, limit: f64) -> bool {
+    let mass = body.model().mass();
+    let modes: f64 = body.v().iter().map(|v| v * v).sum();
+    if modes >= limit * limit * mass {
+        return false;
+    }
+    if !body.model().is_free() {
+        return true;
+    }
+    let frame = body.frame();
+    let velocity = DVec3::from(frame.velocity());
+    let spin = DVec3::from(frame.spin());
+    velocity.length() < limit && spin.length() < limit * mass * body.model().size()
+}
+
+pub(crate) fn publish(
+    mut bodies: Query<(&BodyState, &Driven, &mut ShownState)>,
+    mut forces: Query<&mut GrabForce>,
+) {
+    for (state, driven, mut shown) in &mut bodies {
+        if *driven == Driven::Remote || (state.resting && shown.is_settled()) {
+            continue;
+        }
+        let body = state.body();
+        let pushed = if body.model().is_free() {
+            let frame = body.frame();
+            let pose = Pose {
+                origin: DVec3::from(frame.origin()) * state.scale,
+                orientation: DQuat::from_array(frame.orientation()),
+            };
+            shown.push_at(body.q(), pose)
+        } else {
+            shown.push(body.q())
+        };
+        if let Err(error) = pushed {
+            warn!("a step was not shown: {error}");
+        }
+        for held in &state.held {
+            let Ok(mut force) = forces.get_mut(held.entity) else { continue };
+            let felt = held.id.and_then(|id| {
+                let reaction = body.reaction(id).ok()?;
+                let point = body.grab_position(id).ok()?;
+                Some(GrabForce {
+                    force: DVec3::from(reaction) * state.scale,
+                    point: DVec3::from(point) * state.scale,
+                })
+            });
+            force.set_if_neq(felt.unwrap_or_default());
+        }
+    }
+}
