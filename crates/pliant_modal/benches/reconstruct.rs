@@ -61,8 +61,17 @@ fn time(mut work: impl FnMut()) -> [f64; 2] {
 
 fn main() {
     println!(
-        "{:>9} {:>6} {:>12} {:>12} {:>10} {:>8} {:>10} {:>10}",
-        "vertices", "modes", "limit us", "warped us", "p99 us", "of limit", "linear us", "step us"
+        "{:>9} {:>6} {:>12} {:>12} {:>10} {:>8} {:>8} {:>8} {:>10} {:>10}",
+        "vertices",
+        "modes",
+        "limit us",
+        "warped us",
+        "p99 us",
+        "of limit",
+        "half us",
+        "of 8 us",
+        "linear us",
+        "step us"
     );
     for (vertices, modes) in [(1_036, 20), (3_500, 60), (12_000, 120), (25_000, 100), (50_000, 120)] {
         let model = Arc::new(model(vertices, modes));
@@ -82,6 +91,14 @@ fn main() {
             black_box(lanes);
         })[0];
         let [warped, p99] = time(|| model.basis().reconstruct(black_box(&q), true, black_box(&mut out)));
+        let half = model.basis().to_half();
+        let half = time(|| half.reconstruct(black_box(&q), true, black_box(&mut out)))[0];
+        let mut others = vec![vec![[0.0f32; 3]; vertices]; 8];
+        let eight = time(|| {
+            let mut bodies: Vec<_> = others.iter_mut().map(|out| (&q[..], &mut out[..])).collect();
+            model.basis().reconstruct_all(true, black_box(&mut bodies));
+        })[0]
+            / 8.0;
         let linear = time(|| model.basis().reconstruct(black_box(&q), false, black_box(&mut out)))[0];
         let mut body = Body::new(model.clone(), BodyConfig::default()).unwrap();
         let patch = Patch::around(model.surface(), vertices as u32 / 2, 0.01).unwrap();
@@ -92,7 +109,7 @@ fn main() {
             body.step().unwrap();
         })[0];
         println!(
-            "{vertices:>9} {modes:>6} {limit:>12.1} {warped:>12.1} {p99:>10.1} {:>8.2} {linear:>10.1} {step:>10.2}",
+            "{vertices:>9} {modes:>6} {limit:>12.1} {warped:>12.1} {p99:>10.1} {:>8.2} {half:>8.1} {eight:>8.1} {linear:>10.1} {step:>10.2}",
             limit / warped
         );
     }

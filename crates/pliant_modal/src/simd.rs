@@ -3,6 +3,8 @@
 //! The compiler turns plain loops over `[[f32; 16]; 6]` accumulators into scalar code; naming the registers keeps them in registers. One kernel is
 //! written over [`Lanes`]; the instruction set is chosen at run time.
 
+use half::f16;
+
 use crate::basis::BLOCK;
 
 /// A register (or two, or an array) of [`BLOCK`] numbers.
@@ -12,6 +14,7 @@ use crate::basis::BLOCK;
 pub(crate) trait Lanes: Copy {
     unsafe fn splat(x: f32) -> Self;
     unsafe fn load(from: &[f32; BLOCK]) -> Self;
+    unsafe fn load_half(from: &[f16; BLOCK]) -> Self;
     unsafe fn store(self, to: &mut [f32; BLOCK]);
     /// `self * by + plus`
     unsafe fn mul_add(self, by: Self, plus: Self) -> Self;
@@ -34,6 +37,10 @@ impl Lanes for Portable {
     #[inline(always)]
     unsafe fn load(from: &[f32; BLOCK]) -> Self {
         Self(*from)
+    }
+    #[inline(always)]
+    unsafe fn load_half(from: &[f16; BLOCK]) -> Self {
+        Self(from.map(f16::to_f32))
     }
     #[inline(always)]
     unsafe fn store(self, to: &mut [f32; BLOCK]) {
@@ -60,11 +67,13 @@ impl Lanes for Portable {
 #[cfg(target_arch = "x86_64")]
 pub(crate) mod x86 {
     use std::arch::x86_64::{
-        __m256, __m512, _CMP_LE_OQ, _mm256_and_ps, _mm256_cmp_ps, _mm256_fmadd_ps, _mm256_fnmadd_ps,
-        _mm256_loadu_ps, _mm256_movemask_ps, _mm256_mul_ps, _mm256_set1_ps, _mm256_storeu_ps,
-        _mm512_cmp_ps_mask, _mm512_fmadd_ps, _mm512_fnmadd_ps, _mm512_loadu_ps, _mm512_mul_ps,
-        _mm512_set1_ps, _mm512_storeu_ps,
+        __m256, __m512, _CMP_LE_OQ, _mm_loadu_si128, _mm256_and_ps, _mm256_cmp_ps, _mm256_cvtph_ps,
+        _mm256_fmadd_ps, _mm256_fnmadd_ps, _mm256_loadu_ps, _mm256_loadu_si256, _mm256_movemask_ps,
+        _mm256_mul_ps, _mm256_set1_ps, _mm256_storeu_ps, _mm512_cmp_ps_mask, _mm512_cvtph_ps,
+        _mm512_fmadd_ps, _mm512_fnmadd_ps, _mm512_loadu_ps, _mm512_mul_ps, _mm512_set1_ps, _mm512_storeu_ps,
     };
+
+    use half::f16;
 
     use super::{BLOCK, Lanes};
 
@@ -81,6 +90,10 @@ pub(crate) mod x86 {
         #[inline(always)]
         unsafe fn load(from: &[f32; BLOCK]) -> Self {
             Self(unsafe { _mm512_loadu_ps(from.as_ptr()) })
+        }
+        #[inline(always)]
+        unsafe fn load_half(from: &[f16; BLOCK]) -> Self {
+            Self(unsafe { _mm512_cvtph_ps(_mm256_loadu_si256(from.as_ptr().cast())) })
         }
         #[inline(always)]
         unsafe fn store(self, to: &mut [f32; BLOCK]) {
@@ -108,7 +121,7 @@ pub(crate) mod x86 {
     #[derive(Clone, Copy)]
     pub(crate) struct Avx2(__m256, __m256);
 
-    // SAFETY of the bodies: the trait's contract is that AVX2 and FMA are there; both halves of a reference to 16 numbers lie inside it.
+    // SAFETY of the bodies: the trait's contract is that AVX2, FMA and F16C are there; both halves of a reference to 16 numbers lie inside it.
     impl Lanes for Avx2 {
         #[inline(always)]
         unsafe fn splat(x: f32) -> Self {
@@ -119,6 +132,16 @@ pub(crate) mod x86 {
         unsafe fn load(from: &[f32; BLOCK]) -> Self {
             let p = from.as_ptr();
             unsafe { Self(_mm256_loadu_ps(p), _mm256_loadu_ps(p.add(8))) }
+        }
+        #[inline(always)]
+        unsafe fn load_half(from: &[f16; BLOCK]) -> Self {
+            let p = from.as_ptr();
+            unsafe {
+                Self(
+                    _mm256_cvtph_ps(_mm_loadu_si128(p.cast())),
+                    _mm256_cvtph_ps(_mm_loadu_si128(p.add(8).cast())),
+                )
+            }
         }
         #[inline(always)]
         unsafe fn store(self, to: &mut [f32; BLOCK]) {
