@@ -1,1 +1,44 @@
-//! What crosses the network and what repairs it: frames, loss, prediction, compensation, sessions, link emulator.
+//! What crosses the network, and what repairs it when some of it does not arrive.
+//!
+//! A host steps soft bodies and streams them; guests follow, hold on to them and feel them. Everything here is a state
+//! machine: no socket, no clock, no thread, no randomness without a seed. `(now, datagrams in) -> (datagrams out, state)`.
+//!
+//! | module | what it holds |
+//! | --- | --- |
+//! | [`session`] | [`HostSession`] and [`GuestSession`]: hello, models by hash, snapshot, streaming, resync, goodbye |
+//! | [`recovery`] | what a receiver does about loss: the paper's prediction and compensation, and the force-driven way |
+//! | [`encoder`] | frames in a closed loop: rounding does not add up |
+//! | [`wire`] | the bytes; every parser takes anything |
+//! | [`emulator`] | a seeded bad network |
+//! | [`newmark`] | the identities that make compensation exact |
+
+#![cfg_attr(
+    test,
+    allow(clippy::unwrap_used, clippy::expect_used, clippy::panic, reason = "a failed test should panic")
+)]
+
+pub mod check;
+pub mod clock;
+pub mod emulator;
+pub mod encoder;
+mod error;
+pub mod newmark;
+pub mod playout;
+pub mod recovery;
+pub mod session;
+mod state;
+pub mod stepper;
+pub mod wire;
+
+pub use error::StreamError;
+pub use newmark::Newmark;
+pub use recovery::{Playout, Policy, Predict, RecoveryConfig, RepairCounts};
+pub use session::{
+    BodyView, Channel, EndReason, GuestConfig, GuestEvent, GuestSession, HostConfig, HostEvent, HostSession,
+    LinkStats, MAX_MESSAGE, MIN_DATAGRAM, Output,
+};
+pub use state::{
+    BodyId, GrabKey, GrabState, MAGNITUDE_LIMIT, MAX_GRABS, MAX_MODES, ModalState, PeerId, Pose, TICK_LIMIT,
+    Tick, TickState, UserId,
+};
+pub use stepper::BodySetup;

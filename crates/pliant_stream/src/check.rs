@@ -1,0 +1,23 @@
+//! The state's checksum: a projection that any lasting error shows in, and rounding does not upset.
+
+use crate::state::Tick;
+
+/// Sum of all coordinates with signs drawn from the tick (SplitMix64). A hash would cry at the last bit; this is compared
+/// with a tolerance, and an error that one tick's signs hide the next tick's show.
+pub fn projection(tick: Tick, q: &[f64]) -> f64 {
+    let mut sum = 0.0;
+    let mut bits = 0;
+    for (k, q) in q.iter().enumerate() {
+        if k % 64 == 0 {
+            bits = mix(tick.wrapping_mul(0x9E37_79B9_7F4A_7C15) ^ (k as u64 / 64));
+        }
+        sum += if bits >> (k % 64) & 1 == 0 { *q } else { -*q };
+    }
+    sum
+}
+
+fn mix(mut x: u64) -> u64 {
+    x = (x ^ (x >> 30)).wrapping_mul(0xBF58_476D_1CE4_E5B9);
+    x = (x ^ (x >> 27)).wrapping_mul(0x94D0_49BB_1331_11EB);
+    x ^ (x >> 31)
+}

@@ -1,0 +1,86 @@
+//! Newmark's method read as a linear filter of the acceleration stream.
+//!
+//! ```text
+//! v_{n+1} = v_n + h ((1 - gamma) a_n + gamma a_{n+1})
+//! q_{n+1} = q_n + h v_n + h^2 ((1/2 - beta) a_n + beta a_{n+1})
+//! ```
+//!
+//! The filter is linear, so an acceleration that was wrong by `da` at tick `i` leaves, at tick `j`, exactly
+//!
+//! ```text
+//! j = i:  dv = gamma h da,   dq = beta h^2 da
+//! j > i:  dv = h da,         dq = (j - i + gamma - 1/2) h^2 da
+//! ```
+//!
+//! (equations (8) and (9) of Tang et al. 2013 for beta = 1/4, gamma = 1/2, here for any pair). Proof: a wrong `a_i` enters
+//! `v_i` with weight `gamma h` and `v_{i+1}` with `(1 - gamma) h` more, `h` in all, and is never touched again; `q_i` gets
+//! `beta h^2`, `q_{i+1}` gets `h v_i` = `gamma h^2` and `(1/2 - beta) h^2` more, `(gamma + 1/2) h^2` in all, and every later
+//! step adds `h dv = h^2`.
+
+use crate::StreamError;
+use crate::state::ModalState;
+
+/// A member of Newmark's family and its step.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Newmark {
+    /// Length of a step, s.
+    pub h: f64,
+    /// Weight of the new acceleration in the displacement. Default of the sessions: 1/4 (average acceleration).
+    pub beta: f64,
+    /// Weight of the new acceleration in the velocity. Default of the sessions: 1/2.
+    pub gamma: f64,
+}
+
+impl Newmark {
+    /// Average acceleration (beta = 1/4, gamma = 1/2): the paper's.
+    pub fn average(h: f64) -> Self {
+        Self { h, beta: 0.25, gamma: 0.5 }
+    }
+
+    /// Checks the ranges: `h` 10 us to 1 s, `beta` and `gamma` 0 to 1.
+    ///
+    /// # Errors
+    /// [`StreamError::Config`].
+    pub fn check(&self) -> Result<(), StreamError> {
+        let fail = |what, found: f64, expected| {
+            Err(StreamError::Config { what, found: found.to_string(), expected })
+        };
+        if !(1e-5..=1.0).contains(&self.h) {
+            return fail("step", self.h, "1e-5 to 1 s");
+        }
+        if !(0.0..=1.0).contains(&self.beta) {
+            return fail("beta", self.beta, "0..=1");
+        }
+        if !(0.0..=1.0).contains(&self.gamma) {
+            return fail("gamma", self.gamma, "0..=1");
+        }
+        Ok(())
+    }
+
+    /// One step of one coordinate: `(q, v)` after it.
+    pub fn step(&self, q: f64, v: f64, a_old: f64, a_new: f64) -> (f64, f64) {
+        let h = self.h;
+        (
+            q + h * v + h * h * ((0.5 - self.beta) * a_old + self.beta * a_new),
+            v + h * ((1.0 - self.gamma) * a_old + self.gamma * a_new),
+        )
+    }
+
+    /// Steps all coordinates of a state to the new accelerations.
+    pub fn advance(&self, state: &mut ModalState, a_new: &[f64]) {
+        for (((q, v), a), &a_new) in state.q.iter_mut().zip(&mut state.v).zip(&mut state.a).zip(a_new) {
+            (*q, *v) = self.step(*q, *v, *a, a_new);
+            *a = a_new;
+        }
+    }
+
+    /// Displacement and velocity that an acceleration wrong by 1 leaves `age` = j - i ticks later: the equations above.
+    pub fn response(&self, age: u64) -> (f64, f64) {
+        let h = self.h;
+        if age == 0 {
+            (self.beta * h * h, self.gamma * h)
+        } else {
+            ((age as f64 + self.gamma - 0.5) * h * h, h)
+        }
+    }
+}

@@ -1,0 +1,135 @@
+//! Policies that integrate a stream of accelerations: [`super::Policy::None`] and the paper's.
+
+use super::{HISTORY, History, Predict, Recovery};
+use crate::newmark::Newmark;
+use crate::state::{ModalState, Tick};
+
+/// Integrates the accelerations; predicts those that are missing; takes their error out exactly when they come.
+#[derive(Debug)]
+pub struct AccelerationDriven {
+    newmark: Newmark,
+    predict: Predict,
+    compensate: bool,
+    tick: Tick,
+    first: Tick,
+    state: ModalState,
+    /// The accelerations that each tick was stepped with.
+    used: Vec<Vec<f64>>,
+    /// Per mode: the tick at which its absolute state was last taken over. What was wrong up to then is gone with it.
+    anchored: Vec<Tick>,
+    next: Vec<f64>,
+}
+
+impl AccelerationDriven {
+    /// At rest at tick 0. With `compensate` false what is late is ignored.
+    pub fn new(newmark: Newmark, predict: Predict, compensate: bool, modes: usize) -> Self {
+        Self {
+            newmark,
+            predict,
+            compensate,
+            tick: 0,
+            first: 0,
+            state: ModalState::zero(modes),
+            used: vec![Vec::new(); HISTORY],
+            anchored: vec![0; modes],
+            next: vec![0.0; modes],
+        }
+    }
+
+    fn used(&self, tick: Tick) -> Option<&Vec<f64>> {
+        (tick >= self.first && tick <= self.tick && tick + (HISTORY as u64) > self.tick)
+            .then(|| &self.used[(tick % HISTORY as u64) as usize])
+            .filter(|a| a.len() == self.state.modes())
+    }
+
+    /// Fills `next` with the stand-in for `tick`, from what the two ticks before were stepped with.
+    fn predict(&mut self, tick: Tick) {
+        let last = tick.checked_sub(1).and_then(|t| self.used(t)).cloned();
+        let before = tick.checked_sub(2).and_then(|t| self.used(t)).cloned();
+        match (self.predict, last, before) {
+            (Predict::Linear, Some(a1), Some(a0)) => {
+                for ((n, a1), a0) in self.next.iter_mut().zip(&a1).zip(&a0) {
+                    *n = 2.0 * a1 - a0;
+                }
+            }
+            (Predict::Hold | Predict::Linear, Some(a1), _) => self.next.copy_from_slice(&a1),
+            _ => self.next.fill(0.0),
+        }
+    }
+}
+
+impl Recovery for AccelerationDriven {
+    fn restart(&mut self, tick: Tick, state: &ModalState, _load: &[f64]) {
+        let modes = self.state.modes();
+        for (mine, theirs) in
+            [(&mut self.state.q, &state.q), (&mut self.state.v, &state.v), (&mut self.state.a, &state.a)]
+        {
+            mine.clear();
+            mine.extend(theirs.iter().copied().chain(std::iter::repeat(0.0)).take(modes));
+        }
+        self.tick = tick;
+        self.first = tick;
+        self.anchored.fill(tick);
+        let slot = &mut self.used[(tick % HISTORY as u64) as usize];
+        slot.clone_from(&self.state.a);
+    }
+
+    fn advance(&mut self, tick: Tick, history: &History) {
+        match history.known(tick).filter(|d| d.accelerations.len() == self.state.modes()) {
+            Some(data) => self.next.copy_from_slice(&data.accelerations),
+            None => self.predict(tick),
+        }
+        self.newmark.advance(&mut self.state, &self.next);
+        self.tick = tick;
+        self.used[(tick % HISTORY as u64) as usize].clone_from(&self.next);
+    }
+
+    fn correct(&mut self, from: Tick, history: &History) -> bool {
+        if !self.compensate {
+            return false;
+        }
+        let Some(data) = history.known(from).filter(|d| d.accelerations.len() == self.state.modes()) else {
+            return false;
+        };
+        if self.used(from).is_none() || from == self.first {
+            return false;
+        }
+        let (to_q, to_v) = self.newmark.response(self.tick - from);
+        let used = &mut self.used[(from % HISTORY as u64) as usize];
+        for k in 0..used.len() {
+            if from <= self.anchored[k] {
+                continue;
+            }
+            let da = data.accelerations[k] - used[k];
+            self.state.q[k] += to_q * da;
+            self.state.v[k] += to_v * da;
+            if from == self.tick {
+                self.state.a[k] += da;
+            }
+            used[k] = data.accelerations[k];
+        }
+        true
+    }
+
+    fn refresh(&mut self, tick: Tick, history: &History) {
+        if tick != self.tick {
+            // An absolute value of the past cannot be carried to the present by a stream of accelerations with gaps.
+            return;
+        }
+        let Some(slice) = history.known(tick).and_then(|d| d.slice.as_ref()) else { return };
+        let modes = self.anchored.len();
+        for e in slice.entries().filter(|e| e.mode < modes) {
+            self.state.q[e.mode] = e.q;
+            self.state.v[e.mode] = e.v;
+            self.anchored[e.mode] = tick;
+        }
+    }
+
+    fn hidden(&self) -> &ModalState {
+        &self.state
+    }
+
+    fn driven_by_reactions(&self) -> bool {
+        false
+    }
+}

@@ -1,0 +1,155 @@
+//! What has arrived, tick by tick: a ring of fixed length.
+
+use crate::state::{GrabKey, GrabState, MAX_GRABS, Pose, Tick};
+use crate::wire::{Frame, Slice};
+
+/// Ticks that a receiver remembers. Older data is not used any more.
+pub const HISTORY: usize = 256;
+
+/// What is known of one tick.
+#[derive(Debug, Clone, Default)]
+pub struct TickData {
+    /// Which tick this slot holds.
+    pub tick: Tick,
+    /// The part that drives the state (accelerations or reactions) is here.
+    pub known: bool,
+    /// The frame of this tick itself is here, not only a repeat.
+    pub head: bool,
+    /// Modal accelerations; empty where the stream carries none.
+    pub accelerations: Vec<f64>,
+    /// The grabs that held, with their reactions.
+    pub grabs: Vec<GrabState>,
+    /// Rigid frame of a free body.
+    pub pose: Option<Pose>,
+    /// A part of the absolute state.
+    pub slice: Option<Slice>,
+    /// Checksum of the state.
+    pub check: Option<f32>,
+}
+
+/// The last [`HISTORY`] ticks.
+#[derive(Debug, Clone)]
+pub struct History {
+    slots: Vec<TickData>,
+    highest: Tick,
+}
+
+impl History {
+    /// Nothing known; `tick` is the last one that is not of interest any more.
+    pub fn new(tick: Tick) -> Self {
+        Self { slots: vec![TickData::default(); HISTORY], highest: tick }
+    }
+
+    /// The newest tick for which something arrived.
+    pub fn highest(&self) -> Tick {
+        self.highest
+    }
+
+    /// What is known of a tick, if its driving part is.
+    pub fn known(&self, tick: Tick) -> Option<&TickData> {
+        let slot = &self.slots[(tick % HISTORY as u64) as usize];
+        (slot.tick == tick && slot.known).then_some(slot)
+    }
+
+    /// The state of a tick as far as the frame itself has come.
+    pub fn head(&self, tick: Tick) -> Option<&TickData> {
+        self.known(tick).filter(|d| d.head)
+    }
+
+    /// The newest known tick at or before `tick` and after `tick - HISTORY`.
+    pub fn last_known(&self, tick: Tick) -> Option<&TickData> {
+        (0..HISTORY as u64).map_while(|back| tick.checked_sub(back)).find_map(|t| self.known(t))
+    }
+
+    fn slot(&mut self, tick: Tick) -> &mut TickData {
+        let slot = &mut self.slots[(tick % HISTORY as u64) as usize];
+        if slot.tick != tick {
+            slot.tick = tick;
+            slot.known = false;
+            slot.head = false;
+            slot.accelerations.clear();
+            slot.grabs.clear();
+            slot.pose = None;
+            slot.slice = None;
+            slot.check = None;
+        }
+        slot
+    }
+
+    fn accepts(&self, tick: Tick) -> bool {
+        tick > 0 && tick + (HISTORY as u64) > self.highest
+    }
+
+    /// Takes a frame and what it repeats. Calls `new(tick, head)` for each tick that was not known before (`head` false
+    /// for a repeat) and for a head that completes a tick known from a repeat.
+    pub fn take(&mut self, frame: &Frame, modes: usize, mut new: impl FnMut(Tick, bool)) {
+        self.highest = self.highest.max(frame.tick);
+        for repeat in &frame.repeats {
+            let Some(tick) = frame.tick.checked_sub(u64::from(repeat.back)) else { continue };
+            if !self.accepts(tick) || self.known(tick).is_some() {
+                continue;
+            }
+            let slot = self.slot(tick);
+            slot.grabs.extend(repeat.reactions.iter().filter_map(|(index, reaction)| {
+                let grab = frame.grabs.get(usize::from(*index))?;
+                Some(GrabState { reaction: *reaction, ..grab.state })
+            }));
+            slot.grabs.truncate(MAX_GRABS);
+            if let Some(a) = &repeat.accelerations {
+                slot.accelerations.extend((0..modes).map(|k| a.get(k)));
+            }
+            slot.known = true;
+            new(tick, false);
+        }
+        if !self.accepts(frame.tick) || self.head(frame.tick).is_some() {
+            return;
+        }
+        let slot = self.slot(frame.tick);
+        slot.grabs.clear();
+        slot.grabs.extend(frame.grabs.iter().filter(|g| g.held).map(|g| g.state));
+        slot.accelerations.clear();
+        if let Some(a) = &frame.accelerations {
+            slot.accelerations.extend((0..modes).map(|k| a.get(k)));
+        }
+        slot.pose = frame.pose;
+        slot.slice.clone_from(&frame.slice);
+        slot.check = frame.check;
+        slot.known = true;
+        slot.head = true;
+        new(frame.tick, true);
+    }
+
+    /// The reaction of one grab at a tick: as it arrived, or between its neighbours, or going on from the last with a
+    /// slope that halves every tick. `None` when nothing near the tick knows the grab.
+    pub fn reaction(&self, key: GrabKey, tick: Tick) -> Option<[f64; 3]> {
+        let at =
+            |t: Tick| self.known(t).and_then(|d| d.grabs.iter().find(|g| g.key == key)).map(|g| g.reaction);
+        if self.known(tick).is_some() {
+            return at(tick);
+        }
+        const NEAR: u64 = 40;
+        let before = (1..NEAR).map_while(|b| tick.checked_sub(b)).find(|&t| self.known(t).is_some());
+        let after =
+            (1..NEAR).map(|b| tick + b).take_while(|&t| t <= self.highest).find(|&t| self.known(t).is_some());
+        match (before.and_then(|t| at(t).map(|x| (t, x))), after.and_then(|t| at(t).map(|x| (t, x)))) {
+            (Some((t0, x0)), Some((t1, x1))) => {
+                let s = (tick - t0) as f64 / (t1 - t0) as f64;
+                Some(std::array::from_fn(|k| x0[k] + s * (x1[k] - x0[k])))
+            }
+            (None, Some((_, x1))) => Some(x1),
+            (Some((t0, x0)), None) => {
+                // A grab that a later frame no longer lists has ended somewhere in between.
+                if after.is_some() {
+                    return None;
+                }
+                let slope = t0
+                    .checked_sub(1)
+                    .and_then(at)
+                    .map_or([0.0; 3], |x| std::array::from_fn(|k| x0[k] - x[k]));
+                let gone = 1.0 - 0.5_f64.powi((tick - t0).min(60) as i32);
+                Some(std::array::from_fn(|k| x0[k] + slope[k] * gone))
+            }
+            (None, None) => None,
+        }
+    }
+}

@@ -1,0 +1,42 @@
+//! What the receiver does about loss: policies behind one trait, over one store of what has arrived.
+
+mod acceleration;
+mod blend;
+mod config;
+mod force_driven;
+mod history;
+mod receiver;
+
+pub use acceleration::AccelerationDriven;
+pub use blend::Blend;
+pub use config::{Playout, Policy, Predict, RecoveryConfig};
+pub use force_driven::ForceDriven;
+pub use history::{HISTORY, History, TickData};
+pub use receiver::{Arrival, Receiver, RepairCounts, ShownGrab};
+
+use crate::state::{ModalState, Tick};
+
+/// How a receiver turns what arrived into its best estimate of the host's state.
+///
+/// The [`Receiver`] calls it: [`Recovery::advance`] once per tick in order, [`Recovery::correct`] when data for ticks
+/// that were already stepped arrived late, and blends the difference away from what is shown.
+pub trait Recovery: Send {
+    /// Takes a state over as true after `tick`.
+    fn restart(&mut self, tick: Tick, state: &ModalState, load: &[f64]);
+
+    /// Steps to `tick`, one beyond the last, with its data where `history` has it and a prediction where not.
+    fn advance(&mut self, tick: Tick, history: &History);
+
+    /// Puts right what data for `from` and possibly later ticks changes, up to the tick reached. Returns false when it
+    /// came too late to be used.
+    fn correct(&mut self, from: Tick, history: &History) -> bool;
+
+    /// Takes over the absolute part that the frame of `tick` carried, once that tick has been reached.
+    fn refresh(&mut self, tick: Tick, history: &History);
+
+    /// The best estimate of the truth at the tick reached.
+    fn hidden(&self) -> &ModalState;
+
+    /// True when the reactions shown are those that drive the state; false when they are to be computed from it.
+    fn driven_by_reactions(&self) -> bool;
+}

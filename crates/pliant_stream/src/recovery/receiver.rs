@@ -1,0 +1,363 @@
+//! One body at a receiver: what has arrived, the hidden state, and what is shown of it.
+
+use std::sync::Arc;
+
+use pliant_modal::ModalModel;
+
+use super::{
+    AccelerationDriven, Blend, ForceDriven, HISTORY, History, Policy, Predict, Recovery, RecoveryConfig,
+};
+use crate::StreamError;
+use crate::check::projection;
+use crate::newmark::Newmark;
+use crate::state::{GrabState, ModalState, Pose, Tick};
+use crate::stepper::{BodySetup, ForceStepper};
+use crate::wire::{Frame, SnapshotBytes};
+
+/// Disagreeing checksums in a row before a snapshot is wanted: a slice or a repair may be under way.
+const CHECKS: u32 = 3;
+/// Share of the state's size by which a checksum may differ.
+const CHECK_TOLERANCE: f64 = 2e-3;
+
+/// A grab as it is shown: its reaction belongs to the shape that is shown with it.
+pub type ShownGrab = GrabState;
+
+/// What a frame brought.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
+pub struct Arrival {
+    /// Ticks that were not known before and had not been stepped yet.
+    pub in_time: u32,
+    /// Ticks that had been stepped on a guess and are right now.
+    pub repaired: u32,
+    /// Ticks that came too late to be used.
+    pub too_late: u32,
+}
+
+/// What became of the ticks since the receiver began.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
+pub struct RepairCounts {
+    /// Ticks stepped.
+    pub stepped: u64,
+    /// Of these with their data there in time.
+    pub in_time: u64,
+    /// Of these on a guess.
+    pub guessed: u64,
+    /// Guessed ticks whose data came later and was used.
+    pub repaired: u64,
+    /// Data that came too late.
+    pub too_late: u64,
+    /// States taken over from a snapshot.
+    pub snapshots: u64,
+    /// Checksums that disagreed.
+    pub mismatches: u64,
+}
+
+/// A body at a receiver.
+pub struct Receiver {
+    setup: BodySetup,
+    stepper: ForceStepper,
+    history: History,
+    policy: Box<dyn Recovery>,
+    blend: Blend,
+    tick: Tick,
+    shown: ModalState,
+    grabs: Vec<ShownGrab>,
+    pose: Option<Pose>,
+    counts: RepairCounts,
+    mismatched: u32,
+    before: ModalState,
+    h: f64,
+    blend_ticks: u16,
+}
+
+impl std::fmt::Debug for Receiver {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        f.debug_struct("Receiver")
+            .field("tick", &self.tick)
+            .field("counts", &self.counts)
+            .finish_non_exhaustive()
+    }
+}
+
+impl Receiver {
+    /// For the first `modes` of a model, stepped with `newmark.h`, from a snapshot.
+    ///
+    /// # Errors
+    /// [`StreamError::Config`], [`StreamError::Model`], [`StreamError::Length`] when the snapshot has other modes.
+    pub fn new(
+        model: Arc<ModalModel>,
+        setup: BodySetup,
+        modes: usize,
+        newmark: Newmark,
+        config: &RecoveryConfig,
+        snapshot: &SnapshotBytes,
+    ) -> Result<Self, StreamError> {
+        config.check()?;
+        newmark.check()?;
+        let modes = modes.min(model.mode_count());
+        if snapshot.q.len() != modes {
+            return Err(StreamError::Length { what: "snapshot", found: snapshot.q.len(), expected: modes });
+        }
+        let stepper = || ForceStepper::new(model.clone(), &setup, modes, newmark.h);
+        let (policy, blend_ticks): (Box<dyn Recovery>, u16) = match config.policy {
+            Policy::None => (Box::new(AccelerationDriven::new(newmark, Predict::Zero, false, modes)), 1),
+            Policy::Paper { predict, blend_ticks } => {
+                (Box::new(AccelerationDriven::new(newmark, predict, true, modes)), blend_ticks)
+            }
+            Policy::ForceDriven { blend_ticks } => (Box::new(ForceDriven::new(stepper()?)), blend_ticks),
+        };
+        let mut receiver = Self {
+            setup,
+            stepper: stepper()?,
+            history: History::new(snapshot.tick),
+            policy,
+            blend: Blend::new(newmark.h, blend_ticks),
+            tick: snapshot.tick,
+            shown: ModalState::zero(modes),
+            grabs: Vec::new(),
+            pose: None,
+            counts: RepairCounts::default(),
+            mismatched: 0,
+            before: ModalState::zero(modes),
+            h: newmark.h,
+            blend_ticks,
+        };
+        receiver.policy.restart(snapshot.tick, &state_of(snapshot), &snapshot.load);
+        receiver.shown.copy_from(receiver.policy.hidden());
+        Ok(receiver)
+    }
+
+    /// The tick that is shown.
+    pub fn tick(&self) -> Tick {
+        self.tick
+    }
+
+    /// What has arrived.
+    pub fn history(&self) -> &History {
+        &self.history
+    }
+
+    /// Best estimate of the truth.
+    pub fn hidden(&self) -> &ModalState {
+        self.policy.hidden()
+    }
+
+    /// What the eye and the hand get.
+    pub fn shown(&self) -> &ModalState {
+        &self.shown
+    }
+
+    /// The grabs at the shown tick with their reactions.
+    pub fn grabs(&self) -> &[ShownGrab] {
+        &self.grabs
+    }
+
+    /// The rigid frame at the shown tick, where the body is free.
+    pub fn pose(&self) -> Option<Pose> {
+        self.pose
+    }
+
+    /// What became of the ticks.
+    pub fn counts(&self) -> RepairCounts {
+        self.counts
+    }
+
+    /// Checksums disagree lastingly: a snapshot would help.
+    pub fn wants_snapshot(&self) -> bool {
+        self.mismatched >= CHECKS
+    }
+
+    /// How the host steps the body.
+    pub fn setup(&self) -> &BodySetup {
+        &self.setup
+    }
+
+    /// Takes a frame in. What it says of ticks that were already stepped is put right at once in the hidden state; the
+    /// shown one stays where it is and fades over.
+    pub fn accept(&mut self, frame: &Frame) -> Arrival {
+        let mut arrival = Arrival::default();
+        let (mut earliest, mut late) = (Tick::MAX, [0; 8]);
+        let mut late_count = 0;
+        let tick = self.tick;
+        let modes = self.shown.modes();
+        self.history.take(frame, modes, |t, _| {
+            if t > tick {
+                arrival.in_time += 1;
+            } else {
+                earliest = earliest.min(t);
+                if late_count < late.len() {
+                    late[late_count] = t;
+                    late_count += 1;
+                }
+            }
+        });
+        if late_count > 0 {
+            self.remember_before();
+            let late = &mut late[..late_count];
+            late.sort_unstable();
+            let whole = self.policy.driven_by_reactions();
+            for &t in late.iter() {
+                // Re-stepping from the earliest tick takes all later ones with it.
+                let done = if whole && t != earliest { true } else { self.policy.correct(t, &self.history) };
+                if done {
+                    arrival.repaired += 1;
+                } else {
+                    arrival.too_late += 1;
+                }
+            }
+            if late.contains(&tick) {
+                self.policy.refresh(tick, &self.history);
+            }
+            self.blend_from_before();
+            self.counts.repaired += u64::from(arrival.repaired);
+            self.counts.too_late += u64::from(arrival.too_late);
+        }
+        arrival
+    }
+
+    /// Steps to the next tick, with its data or without.
+    pub fn advance(&mut self) {
+        let tick = self.tick + 1;
+        self.tick = tick;
+        self.counts.stepped += 1;
+        if self.history.known(tick).is_some() {
+            self.counts.in_time += 1;
+        } else {
+            self.counts.guessed += 1;
+        }
+        self.policy.advance(tick, &self.history);
+        self.blend.advance();
+        if !self.policy.driven_by_reactions() && self.history.head(tick).is_some_and(|d| d.slice.is_some()) {
+            self.remember_before();
+            self.policy.refresh(tick, &self.history);
+            self.blend_from_before();
+        }
+        self.show();
+        self.compare_check();
+    }
+
+    /// Takes the state of a snapshot over and steps again from its tick with all that has arrived since; the shown state
+    /// fades over. A snapshot of the future moves the receiver there.
+    pub fn restart(&mut self, snapshot: &SnapshotBytes) {
+        if snapshot.q.len() != self.shown.modes() {
+            return;
+        }
+        self.remember_before();
+        self.policy.restart(snapshot.tick, &state_of(snapshot), &snapshot.load);
+        let distance = self.tick.abs_diff(snapshot.tick);
+        if snapshot.tick >= self.tick || distance >= HISTORY as u64 {
+            self.tick = snapshot.tick;
+        } else {
+            for tick in snapshot.tick + 1..=self.tick {
+                self.policy.advance(tick, &self.history);
+                self.policy.refresh(tick, &self.history);
+            }
+        }
+        self.blend_from_before();
+        self.show();
+        self.mismatched = 0;
+        self.counts.snapshots += 1;
+    }
+
+    /// Moves a resting body to a later tick without stepping it.
+    pub fn skip_to(&mut self, tick: Tick) {
+        if tick <= self.tick {
+            return;
+        }
+        self.before.copy_from(self.policy.hidden());
+        let rest = ModalState { q: self.before.q.clone(), ..ModalState::zero(self.before.modes()) };
+        self.policy.restart(tick, &rest, &[]);
+        self.tick = tick;
+        self.show();
+    }
+
+    fn remember_before(&mut self) {
+        self.before.copy_from(self.policy.hidden());
+    }
+
+    fn blend_from_before(&mut self) {
+        let now = self.policy.hidden();
+        self.blend.add(
+            self.before.q.iter().zip(&now.q).map(|(b, n)| b - n),
+            self.before.v.iter().zip(&now.v).map(|(b, n)| b - n),
+        );
+    }
+
+    fn show(&mut self) {
+        self.shown.copy_from(self.policy.hidden());
+        self.blend.apply(&mut self.shown.q, &mut self.shown.v);
+        let previous = std::mem::take(&mut self.grabs);
+        match self.history.known(self.tick) {
+            Some(data) => self.grabs.extend_from_slice(&data.grabs),
+            None => {
+                if let Some(near) = self.history.last_known(self.tick) {
+                    self.grabs.extend_from_slice(&near.grabs);
+                }
+            }
+        }
+        self.pose = self.history.last_known(self.tick).and_then(|d| {
+            d.pose.map(|p| extrapolate(&p, (self.tick.saturating_sub(d.tick)) as f64 * self.h))
+        });
+        if self.policy.driven_by_reactions() {
+            for g in &mut self.grabs {
+                if let Some(r) = self.history.reaction(g.key, self.tick) {
+                    g.reaction = r;
+                }
+            }
+            self.blend_reactions(&previous);
+        } else {
+            let rotation = self.pose.map_or([0.0, 0.0, 0.0, 1.0], |p| p.rotation);
+            self.stepper.reactions(&self.shown, &mut self.grabs, rotation);
+        }
+    }
+
+    /// A reaction shown on a guess was off by what is known of that tick now; the offset fades, so the force does not jump.
+    fn blend_reactions(&mut self, previous: &[ShownGrab]) {
+        let keep = (-3.0 / f64::from(self.blend_ticks)).exp();
+        for g in &mut self.grabs {
+            let Some(shown) = previous.iter().find(|p| p.key == g.key) else { continue };
+            let known = self.tick.checked_sub(1).and_then(|t| self.history.reaction(g.key, t));
+            let Some(known) = known else { continue };
+            for k in 0..3 {
+                let offset = keep * (shown.reaction[k] - known[k]);
+                if offset.abs() > 1e-7 * g.reaction[k].abs() {
+                    g.reaction[k] += offset;
+                }
+            }
+        }
+    }
+
+    fn compare_check(&mut self) {
+        let Some(told) = self.history.head(self.tick).and_then(|d| d.check) else { return };
+        let state = self.policy.hidden();
+        let size = state.q.iter().map(|q| q * q).sum::<f64>().sqrt();
+        let own = projection(self.tick, &state.q);
+        if (own - f64::from(told)).abs() <= CHECK_TOLERANCE * size + 1e-7 {
+            self.mismatched = 0;
+        } else {
+            self.mismatched += 1;
+            self.counts.mismatches += 1;
+        }
+    }
+}
+
+fn state_of(snapshot: &SnapshotBytes) -> ModalState {
+    ModalState { q: snapshot.q.clone(), v: snapshot.v.clone(), a: snapshot.a.clone() }
+}
+
+/// A pose some seconds later on the same twist.
+fn extrapolate(pose: &Pose, seconds: f64) -> Pose {
+    use nalgebra::{Quaternion, UnitQuaternion, Vector3};
+    if seconds == 0.0 {
+        return *pose;
+    }
+    let [x, y, z, w] = pose.rotation;
+    let Some(turn) = UnitQuaternion::try_new(Quaternion::new(w, x, y, z), 1e-12) else { return *pose };
+    let turned = UnitQuaternion::from_scaled_axis(Vector3::from(pose.angular) * seconds) * turn;
+    let q = turned.quaternion();
+    Pose {
+        position: std::array::from_fn(|k| pose.position[k] + pose.linear[k] * seconds),
+        rotation: [q.i, q.j, q.k, q.w],
+        ..*pose
+    }
+}

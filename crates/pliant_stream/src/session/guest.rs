@@ -1,0 +1,687 @@
+//! A guest's side: it follows the host and moves its own hands.
+
+use std::collections::{BTreeMap, BTreeSet, VecDeque};
+use std::sync::Arc;
+use std::time::Duration;
+
+use pliant_modal::ModalModel;
+
+use super::guest_body::BodyView;
+use super::host_peer::micros;
+use super::outbox::{RoundTrip, Tally, loss_of};
+use super::{Channel, EndReason, LinkStats, MIN_DATAGRAM, Output};
+use crate::StreamError;
+use crate::clock::ClockEstimate;
+use crate::newmark::Newmark;
+use crate::recovery::RecoveryConfig;
+use crate::state::{BodyId, PeerId, UserId, in_range};
+use crate::wire::{
+    Clock, Datagram, GuestMessage, HostMessage, MAX_BODIES, MAX_CACHED, MAX_NAME, MAX_TARGETS, MAX_TOKEN,
+    PROTOCOL_VERSION, TargetEntry, Targets,
+};
+
+/// Clock requests come this far apart once the first eight have been answered.
+const PING_EVERY: Duration = Duration::from_millis(500);
+/// The first clock requests.
+const PING_SOON: Duration = Duration::from_millis(100);
+/// A held target that does not move is said again this often.
+const TARGET_EVERY: Duration = Duration::from_millis(250);
+/// A model larger than this is refused, bytes.
+const MAX_MODEL: u64 = 1 << 30;
+/// Most events that wait for the application; the oldest are dropped.
+const MAX_EVENTS: usize = 4096;
+/// Each datagram says the last so many targets of a grab.
+const TARGET_REPEATS: usize = 3;
+
+/// Settings of a guest.
+#[derive(Debug, Clone, PartialEq)]
+pub struct GuestConfig {
+    /// A name for people, at most 64 bytes.
+    pub name: String,
+    /// Shown to the host's application, at most 1 KiB. Default: empty.
+    pub token: Vec<u8>,
+    /// How loss is repaired. Default: [`RecoveryConfig::default`].
+    pub recovery: RecoveryConfig,
+    /// Take at most so many modes of each body: for weak machines and thin links. Default: all.
+    pub modes: Option<u16>,
+    /// A host that is silent for so long is gone. Default: 10 s.
+    pub idle_timeout: Duration,
+}
+
+impl Default for GuestConfig {
+    fn default() -> Self {
+        Self {
+            name: "guest".to_owned(),
+            token: Vec::new(),
+            recovery: RecoveryConfig::default(),
+            modes: None,
+            idle_timeout: Duration::from_secs(10),
+        }
+    }
+}
+
+/// What happened at a guest.
+#[derive(Debug, Clone, PartialEq)]
+#[non_exhaustive]
+pub enum GuestEvent {
+    /// The host let us in.
+    Welcomed {
+        /// Our number.
+        user: UserId,
+    },
+    /// The host announced a body; its model may still be on the way.
+    BodyAnnounced {
+        /// Which.
+        body: BodyId,
+        /// Its name.
+        name: String,
+    },
+    /// Bytes of a model arrived.
+    ModelProgress {
+        /// Which model.
+        hash: [u8; 32],
+        /// Bytes that are here.
+        received: u64,
+        /// Bytes in all.
+        total: u64,
+    },
+    /// Model and state of a body are here: it can be shown.
+    BodyReady {
+        /// Which.
+        body: BodyId,
+        /// Its model, for the caller's cache too.
+        model: Arc<ModalModel>,
+    },
+    /// A body left the session.
+    BodyGone {
+        /// Which.
+        body: BodyId,
+    },
+    /// The state of a body was taken over anew.
+    Resynced {
+        /// Which.
+        body: BodyId,
+    },
+    /// Frames of a body fail: it stands still until they come again.
+    Stalled {
+        /// Which.
+        body: BodyId,
+    },
+    /// Somebody else came.
+    UserJoined {
+        /// Number.
+        user: UserId,
+        /// Name.
+        name: String,
+    },
+    /// Somebody else left.
+    UserLeft {
+        /// Number.
+        user: UserId,
+    },
+    /// The host did not accept one of our grabs, or ended it.
+    GrabRefused {
+        /// Our number for it.
+        grab: u16,
+    },
+    /// The session is over.
+    Closed {
+        /// Why.
+        reason: EndReason,
+    },
+}
+
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+enum Standing {
+    New,
+    Greeted,
+    In(UserId),
+    Closed,
+}
+
+#[derive(Debug)]
+struct OwnGrab {
+    body: BodyId,
+    /// The newest last; at most three.
+    targets: VecDeque<TargetEntry>,
+    fresh: bool,
+    said: Duration,
+}
+
+#[derive(Debug, Default)]
+struct Download {
+    bytes: Vec<u8>,
+    total: u64,
+}
+
+/// A guest of a session: a state machine without sockets or clock; see [`super`].
+#[derive(Debug)]
+pub struct GuestSession {
+    config: GuestConfig,
+    max_datagram: usize,
+    standing: Standing,
+    newmark: Newmark,
+    models: BTreeMap<[u8; 32], Arc<ModalModel>>,
+    downloads: BTreeMap<[u8; 32], Download>,
+    bodies: BTreeMap<BodyId, BodyView>,
+    stalled: BTreeSet<BodyId>,
+    users: BTreeMap<UserId, String>,
+    grabs: BTreeMap<u16, OwnGrab>,
+    next_grab: u16,
+    input: u32,
+    out: VecDeque<Output>,
+    events: VecDeque<GuestEvent>,
+    sequence: u16,
+    tally: Tally,
+    stats: LinkStats,
+    round_trip: RoundTrip,
+    clock: ClockEstimate,
+    next_ping: Duration,
+    pings: u64,
+    heard: Duration,
+}
+
+impl GuestSession {
+    /// A guest whose path carries datagrams of so many bytes.
+    ///
+    /// # Errors
+    /// [`StreamError::Config`] for a name, token, path or repair out of range.
+    pub fn new(config: GuestConfig, max_datagram: usize) -> Result<Self, StreamError> {
+        let fail = |what, found: String, expected| Err(StreamError::Config { what, found, expected });
+        config.recovery.check()?;
+        if config.name.len() > MAX_NAME {
+            return fail("name", config.name, "at most 64 bytes");
+        }
+        if config.token.len() > MAX_TOKEN {
+            return fail("token", format!("{} bytes", config.token.len()), "at most 1024 bytes");
+        }
+        if max_datagram < MIN_DATAGRAM {
+            return fail("datagram size", max_datagram.to_string(), "at least 256 bytes");
+        }
+        Ok(Self {
+            config,
+            max_datagram,
+            standing: Standing::New,
+            newmark: Newmark::average(1.0 / 40.0),
+            models: BTreeMap::new(),
+            downloads: BTreeMap::new(),
+            bodies: BTreeMap::new(),
+            stalled: BTreeSet::new(),
+            users: BTreeMap::new(),
+            grabs: BTreeMap::new(),
+            next_grab: 0,
+            input: 0,
+            out: VecDeque::new(),
+            events: VecDeque::new(),
+            sequence: 0,
+            tally: Tally::default(),
+            stats: LinkStats::default(),
+            round_trip: RoundTrip::default(),
+            clock: ClockEstimate::default(),
+            next_ping: Duration::ZERO,
+            pings: 0,
+            heard: Duration::ZERO,
+        })
+    }
+
+    /// Names a model that need not be sent. Before [`GuestSession::connect`]; at most 256.
+    pub fn add_cached_model(&mut self, model: Arc<ModalModel>) {
+        if self.models.len() < MAX_CACHED {
+            self.models.insert(model.hash().0, model);
+        }
+    }
+
+    /// The connection is open: says hello.
+    ///
+    /// # Errors
+    /// [`StreamError::State`] when hello was said before.
+    pub fn connect(&mut self, now: Duration) -> Result<(), StreamError> {
+        if self.standing != Standing::New {
+            let (what, state) = ("connect", "not new");
+            return Err(StreamError::State { what, state, needed: "a new session" });
+        }
+        self.standing = Standing::Greeted;
+        self.heard = now;
+        let hello = GuestMessage::Hello {
+            version: PROTOCOL_VERSION,
+            name: self.config.name.clone(),
+            token: self.config.token.clone(),
+            wish: self.config.recovery.wish(self.config.modes),
+            cached: self.models.keys().copied().collect(),
+        };
+        self.message(&hello);
+        Ok(())
+    }
+
+    /// The path's datagrams have another size now. (Everything a guest sends fits the smallest.)
+    pub fn set_max_datagram(&mut self, bytes: usize) {
+        self.max_datagram = bytes;
+    }
+
+    /// Says goodbye. The session is closed.
+    pub fn leave(&mut self) {
+        if self.standing != Standing::Closed {
+            self.message(&GuestMessage::Goodbye { reason: EndReason::Left });
+            self.close(EndReason::Left);
+        }
+    }
+
+    /// The transport lost the connection.
+    pub fn disconnected(&mut self) {
+        self.close(EndReason::Lost);
+    }
+
+    /// Our number, once the host has let us in.
+    pub fn user(&self) -> Option<UserId> {
+        match self.standing {
+            Standing::In(user) => Some(user),
+            Standing::New | Standing::Greeted | Standing::Closed => None,
+        }
+    }
+
+    /// True after the end.
+    pub fn is_closed(&self) -> bool {
+        self.standing == Standing::Closed
+    }
+
+    /// The host's step, s; 1/40 before the host has said.
+    pub fn step(&self) -> f64 {
+        self.newmark.h
+    }
+
+    /// A body.
+    pub fn body(&self, body: BodyId) -> Option<&BodyView> {
+        self.bodies.get(&body)
+    }
+
+    /// All bodies.
+    pub fn bodies(&self) -> impl Iterator<Item = &BodyView> {
+        self.bodies.values()
+    }
+
+    /// The others in the session.
+    pub fn users(&self) -> impl Iterator<Item = (UserId, &str)> {
+        self.users.iter().map(|(u, n)| (*u, n.as_str()))
+    }
+
+    /// How the path does.
+    pub fn stats(&self) -> LinkStats {
+        let mut stats = self.stats;
+        stats.loss_in = self.tally.loss();
+        self.round_trip.write(&mut stats);
+        stats
+    }
+
+    /// Host clock minus own clock, s.
+    pub fn clock_offset(&self) -> Option<f64> {
+        self.clock.offset()
+    }
+
+    /// Takes hold of a body. The number names the grab to the other calls; the host may answer
+    /// [`GuestEvent::GrabRefused`].
+    ///
+    /// # Errors
+    /// [`StreamError::State`] before the welcome, [`StreamError::UnknownBody`], [`StreamError::NotFinite`],
+    /// [`StreamError::Full`] beyond 16 grabs.
+    pub fn begin_grab(
+        &mut self,
+        now: Duration,
+        body: BodyId,
+        vertex: u32,
+        radius: f64,
+        target: [f64; 3],
+    ) -> Result<u16, StreamError> {
+        if self.user().is_none() {
+            let (what, state) = ("begin_grab", "not in");
+            return Err(StreamError::State { what, state, needed: "the host's welcome" });
+        }
+        if !self.bodies.contains_key(&body) {
+            return Err(StreamError::UnknownBody(body));
+        }
+        if !in_range(&target) || !(0.0..=1e9).contains(&radius) {
+            return Err(StreamError::NotFinite { what: "grab" });
+        }
+        let limit = super::host_peer::MAX_GUEST_GRABS;
+        if self.grabs.len() >= limit {
+            return Err(StreamError::Full { what: "grabs", limit });
+        }
+        while self.grabs.contains_key(&self.next_grab) {
+            self.next_grab = self.next_grab.wrapping_add(1);
+        }
+        let grab = self.next_grab;
+        self.next_grab = grab.wrapping_add(1);
+        self.grabs.insert(grab, OwnGrab { body, targets: VecDeque::new(), fresh: false, said: now });
+        self.message(&GuestMessage::GrabBegin { grab, body: body.0, vertex, radius, target });
+        Ok(grab)
+    }
+
+    /// Moves a hand. Sent with the next [`GuestSession::update`], and twice more with the targets after it.
+    ///
+    /// # Errors
+    /// [`StreamError::UnknownGrab`], [`StreamError::NotFinite`] (the old target stays).
+    pub fn set_target(&mut self, grab: u16, target: [f64; 3]) -> Result<(), StreamError> {
+        if !in_range(&target) {
+            return Err(StreamError::NotFinite { what: "target" });
+        }
+        let own = self.grabs.get_mut(&grab).ok_or(StreamError::UnknownGrab(grab))?;
+        if own.targets.len() >= TARGET_REPEATS {
+            own.targets.pop_front();
+        }
+        self.input = self.input.wrapping_add(1);
+        own.targets.push_back(TargetEntry { grab, input: self.input, target });
+        own.fresh = true;
+        Ok(())
+    }
+
+    /// Lets go. Letting go twice is no error.
+    pub fn end_grab(&mut self, grab: u16) {
+        if self.grabs.remove(&grab).is_some() {
+            self.message(&GuestMessage::GrabEnd { grab });
+        }
+    }
+
+    /// Our grabs: number and body.
+    pub fn grabs(&self) -> impl Iterator<Item = (u16, BodyId)> {
+        self.grabs.iter().map(|(k, g)| (*k, g.body))
+    }
+
+    /// Something arrived unreliably. Any bytes will do: what makes no sense is counted and forgotten.
+    pub fn on_datagram(&mut self, now: Duration, bytes: &[u8]) {
+        if self.user().is_none() {
+            return;
+        }
+        let (sequence, datagram) = match Datagram::decode(bytes) {
+            Ok(x) => x,
+            Err(_) => {
+                self.stats.rejected += 1;
+                return;
+            }
+        };
+        self.heard = now;
+        if !self.tally.take(sequence) {
+            return;
+        }
+        self.stats.datagrams_in += 1;
+        self.stats.bytes_in += bytes.len() as u64;
+        match datagram {
+            Datagram::Frame(frame) => {
+                let body = frame.body;
+                let Some(view) = self.bodies.get_mut(&body) else { return };
+                view.take_frame(now, frame);
+                self.ask(now, body);
+            }
+            Datagram::Pong(clock) => {
+                self.stats.loss_out = loss_of(clock.report);
+                if let Some(rtt) = self.clock.sample(clock.t1, clock.t2, clock.t3, micros(now)) {
+                    self.round_trip.sample(rtt);
+                }
+            }
+            Datagram::Targets(_) | Datagram::Nack(_) | Datagram::Ping(_) => self.stats.rejected += 1,
+        }
+    }
+
+    /// Something arrived reliably. A message that breaks the protocol ends the session.
+    pub fn on_message(&mut self, now: Duration, bytes: &[u8]) {
+        if self.standing == Standing::Closed {
+            return;
+        }
+        self.heard = now;
+        self.stats.message_bytes_in += bytes.len() as u64;
+        let Ok(message) = HostMessage::decode(bytes) else {
+            self.stats.rejected += 1;
+            return self.break_off();
+        };
+        match (message, self.standing) {
+            (HostMessage::Welcome { version, user, step_ns, beta, gamma, users }, Standing::Greeted) => {
+                if version != PROTOCOL_VERSION {
+                    return self.close(EndReason::Version);
+                }
+                self.newmark = Newmark { h: step_ns as f64 * 1e-9, beta, gamma };
+                self.standing = Standing::In(UserId(user));
+                self.users = users.into_iter().map(|(u, n)| (UserId(u), n)).collect();
+                self.next_ping = now;
+                self.event(GuestEvent::Welcomed { user: UserId(user) });
+            }
+            (HostMessage::Goodbye { reason }, _) => self.close(reason),
+            (message, Standing::In(_)) => self.in_session(now, message),
+            _ => self.break_off(),
+        }
+    }
+
+    fn in_session(&mut self, now: Duration, message: HostMessage) {
+        match message {
+            HostMessage::BodyAdded(info) => {
+                let body = BodyId(info.body);
+                if self.bodies.len() >= MAX_BODIES || self.bodies.contains_key(&body) {
+                    return self.break_off();
+                }
+                let name = info.name.clone();
+                let model = self.models.get(&info.hash).cloned();
+                let mut view = BodyView::new(info, self.newmark, self.config.recovery);
+                if let Some(model) = model {
+                    view.set_model(model);
+                }
+                self.bodies.insert(body, view);
+                self.event(GuestEvent::BodyAnnounced { body, name });
+            }
+            HostMessage::BodyRemoved { body } => {
+                let body = BodyId(body);
+                self.grabs.retain(|_, g| g.body != body);
+                if self.bodies.remove(&body).is_some() {
+                    self.event(GuestEvent::BodyGone { body });
+                }
+            }
+            HostMessage::ModelChunk { hash, offset, total, bytes } => {
+                self.model_chunk(hash, offset, total, &bytes);
+            }
+            HostMessage::Snapshot(snapshot) => {
+                let body = BodyId(snapshot.body);
+                let Some(view) = self.bodies.get_mut(&body) else { return };
+                let ready = view.take_snapshot(now, snapshot);
+                let resynced = std::mem::take(&mut view.resynced);
+                if ready && let Some(model) = view.model().cloned() {
+                    self.event(GuestEvent::BodyReady { body, model });
+                } else if resynced {
+                    self.event(GuestEvent::Resynced { body });
+                }
+                self.ask(now, body);
+            }
+            HostMessage::UserJoined { user, name } => {
+                self.users.insert(UserId(user), name.clone());
+                self.event(GuestEvent::UserJoined { user: UserId(user), name });
+            }
+            HostMessage::UserLeft { user } => {
+                self.users.remove(&UserId(user));
+                self.event(GuestEvent::UserLeft { user: UserId(user) });
+            }
+            HostMessage::GrabRefused { grab } => {
+                if self.grabs.remove(&grab).is_some() {
+                    self.event(GuestEvent::GrabRefused { grab });
+                }
+            }
+            HostMessage::Welcome { .. } | HostMessage::Goodbye { .. } => self.break_off(),
+        }
+    }
+
+    fn model_chunk(&mut self, hash: [u8; 32], offset: u64, total: u64, bytes: &[u8]) {
+        let wanted = self.bodies.values().any(|b| b.info().hash == hash && b.model().is_none());
+        let download = self.downloads.entry(hash).or_default();
+        let received = download.bytes.len() as u64;
+        let fits = wanted
+            && (1..=MAX_MODEL).contains(&total)
+            && offset == received
+            && (received == 0 || download.total == total)
+            && received + bytes.len() as u64 <= total
+            && !bytes.is_empty();
+        if !fits {
+            return self.break_off();
+        }
+        download.total = total;
+        // Grows with what has arrived: a false total reserves nothing.
+        download.bytes.extend_from_slice(bytes);
+        let received = download.bytes.len() as u64;
+        self.event(GuestEvent::ModelProgress { hash, received, total });
+        if received < total {
+            return;
+        }
+        let Some(done) = self.downloads.remove(&hash) else { return };
+        match ModalModel::from_bytes(&done.bytes) {
+            Ok(model) if model.hash().0 == hash => {
+                let model = Arc::new(model);
+                self.models.insert(hash, model.clone());
+                let mut ready = Vec::new();
+                for view in self.bodies.values_mut().filter(|b| b.info().hash == hash) {
+                    view.set_model(model.clone());
+                    if view.is_ready() {
+                        ready.push(view.id());
+                    }
+                }
+                for body in ready {
+                    self.event(GuestEvent::BodyReady { body, model: model.clone() });
+                }
+            }
+            _ => self.break_off(),
+        }
+    }
+
+    /// Steps all bodies to what is due by now, and sends what is due: targets, questions, clock requests. Call once a
+    /// frame and at [`GuestSession::next_wakeup`]. Returns how many ticks all bodies took together.
+    pub fn update(&mut self, now: Duration) -> u64 {
+        if self.user().is_none() {
+            let waits = self.standing == Standing::Greeted;
+            if waits && now.saturating_sub(self.heard) > self.config.idle_timeout {
+                self.close(EndReason::Silent);
+            }
+            return 0;
+        }
+        if now.saturating_sub(self.heard) > self.config.idle_timeout {
+            self.message(&GuestMessage::Goodbye { reason: EndReason::Silent });
+            self.close(EndReason::Silent);
+            return 0;
+        }
+        let mut stepped = 0;
+        let ids: Vec<BodyId> = self.bodies.keys().copied().collect();
+        for id in ids {
+            if let Some(view) = self.bodies.get_mut(&id) {
+                stepped += view.advance(now);
+                if view.is_stalled() {
+                    if self.stalled.insert(id) {
+                        self.event(GuestEvent::Stalled { body: id });
+                    }
+                } else {
+                    self.stalled.remove(&id);
+                }
+            }
+            self.ask(now, id);
+        }
+        self.say_targets(now);
+        if now >= self.next_ping {
+            self.pings += 1;
+            self.next_ping = now + if self.pings < 8 { PING_SOON } else { PING_EVERY };
+            let clock = Clock { t1: micros(now), report: self.tally.report(), ..Clock::default() };
+            self.datagram(&Datagram::Ping(clock));
+        }
+        stepped
+    }
+
+    /// When to call [`GuestSession::update`] at the latest, if nothing happens before: the next tick of a body, a
+    /// question to repeat, a clock request, the idle timeout.
+    pub fn next_wakeup(&self, now: Duration) -> Option<Duration> {
+        if matches!(self.standing, Standing::New | Standing::Closed) {
+            return None;
+        }
+        let mut next = self.heard + self.config.idle_timeout + Duration::from_millis(1);
+        if self.user().is_some() {
+            next = next.min(self.next_ping);
+            for view in self.bodies.values() {
+                next = view.next_tick_due(now).map_or(next, |t| next.min(t));
+                next = view.next_ask().map_or(next, |t| next.min(t));
+            }
+            for g in self.grabs.values() {
+                let due = if g.fresh { now } else { g.said + TARGET_EVERY };
+                next = if g.targets.is_empty() { next } else { next.min(due) };
+            }
+        }
+        Some(next.max(now))
+    }
+
+    /// The next thing to send.
+    pub fn poll_output(&mut self) -> Option<Output> {
+        self.out.pop_front()
+    }
+
+    /// The next thing that happened.
+    pub fn poll_event(&mut self) -> Option<GuestEvent> {
+        self.events.pop_front()
+    }
+
+    fn ask(&mut self, now: Duration, body: BodyId) {
+        let round_trip =
+            if self.round_trip.is_known() { self.round_trip.smooth() } else { Duration::from_millis(200) };
+        let Some(view) = self.bodies.get_mut(&body) else { return };
+        let nack = view.missing(now, round_trip);
+        let snapshot = view.ask_snapshot(now);
+        if let Some(nack) = nack {
+            self.stats.nacks += 1;
+            self.datagram(&Datagram::Nack(nack));
+        }
+        if snapshot {
+            self.message(&GuestMessage::SnapshotRequest { body: body.0 });
+        }
+    }
+
+    fn say_targets(&mut self, now: Duration) {
+        let mut entries = Vec::new();
+        let room = ((self.max_datagram.max(MIN_DATAGRAM) - 4) / 18).min(MAX_TARGETS);
+        for g in self.grabs.values_mut() {
+            let again = now.saturating_sub(g.said) >= TARGET_EVERY;
+            if g.targets.is_empty() || !(g.fresh || again) {
+                continue;
+            }
+            let first = if g.fresh { 0 } else { g.targets.len() - 1 };
+            if entries.len() + g.targets.len() - first > room {
+                continue;
+            }
+            entries.extend(g.targets.iter().skip(first));
+            g.fresh = false;
+            g.said = now;
+        }
+        if !entries.is_empty() {
+            self.datagram(&Datagram::Targets(Targets { entries }));
+        }
+    }
+
+    fn datagram(&mut self, datagram: &Datagram) {
+        let bytes = datagram.encode(self.sequence);
+        self.sequence = self.sequence.wrapping_add(1);
+        self.stats.datagrams_out += 1;
+        self.stats.bytes_out += bytes.len() as u64;
+        self.out.push_back(Output { peer: PeerId::HOST, channel: Channel::Datagram, bytes: bytes.into() });
+    }
+
+    fn message(&mut self, message: &GuestMessage) {
+        let bytes = message.encode();
+        self.stats.message_bytes_out += bytes.len() as u64;
+        self.out.push_back(Output { peer: PeerId::HOST, channel: Channel::Message, bytes: bytes.into() });
+    }
+
+    fn event(&mut self, event: GuestEvent) {
+        if self.events.len() >= MAX_EVENTS {
+            self.events.pop_front();
+        }
+        self.events.push_back(event);
+    }
+
+    fn break_off(&mut self) {
+        self.message(&GuestMessage::Goodbye { reason: EndReason::Protocol });
+        self.close(EndReason::Protocol);
+    }
+
+    fn close(&mut self, reason: EndReason) {
+        if self.standing != Standing::Closed {
+            self.standing = Standing::Closed;
+            self.grabs.clear();
+            self.event(GuestEvent::Closed { reason });
+        }
+    }
+}

@@ -1,0 +1,739 @@
+//! The host's side: it steps the bodies, and every guest follows.
+
+use std::collections::{BTreeMap, BTreeSet, VecDeque};
+use std::sync::Arc;
+use std::time::Duration;
+
+use pliant_modal::ModalModel;
+
+use super::host_peer::{HeldGrab, MAX_GUEST_GRABS, Peer, Standing, Transfer};
+use super::outbox::loss_of;
+use super::{EndReason, LinkStats, MIN_DATAGRAM, Output};
+use crate::StreamError;
+use crate::encoder::Encoder;
+use crate::newmark::Newmark;
+use crate::state::{
+    BodyId, GrabKey, MAX_GRABS, MAX_MODES, PeerId, TICK_LIMIT, Tick, TickState, UserId, in_range,
+};
+use crate::stepper::BodySetup;
+use crate::wire::{BodyInfo, Datagram, GuestMessage, HostMessage, PROTOCOL_VERSION, StreamWish, WIDE_LIMIT};
+
+/// Bytes of a model in one message.
+const CHUNK: usize = 16 * 1024;
+/// Most events that wait for the application; the oldest are dropped.
+const MAX_EVENTS: usize = 4096;
+/// A resting body is recalled to its guests this often.
+const REMINDER: Duration = Duration::from_secs(1);
+
+/// Settings of a host.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct HostConfig {
+    /// The step and the filter by which acceleration streams are read. Default: 1/40 s, and beta 4/9, gamma 5/6
+    /// (generalized-alpha with 0.5), which follows any host integrator without ringing. For the paper's own method with a
+    /// host that steps by average acceleration: [`Newmark::average`].
+    pub newmark: Newmark,
+    /// Most guests. Default: 256.
+    pub max_guests: usize,
+    /// A guest that is silent for so long is gone. Default: 10 s.
+    pub idle_timeout: Duration,
+    /// Bytes a second at which models are sent to one guest. Default: 1 MB/s.
+    pub model_rate: f64,
+    /// Answer a NACK only so much later: for remaking the paper's figures. Default: at once.
+    pub resend_after: Duration,
+    /// Take in everybody who says hello; else [`HostEvent::Knock`] asks and [`HostSession::accept`] answers. Default: true.
+    pub open: bool,
+}
+
+impl Default for HostConfig {
+    fn default() -> Self {
+        Self {
+            newmark: Newmark { h: 1.0 / 40.0, beta: 4.0 / 9.0, gamma: 5.0 / 6.0 },
+            max_guests: 256,
+            idle_timeout: Duration::from_secs(10),
+            model_rate: 1e6,
+            resend_after: Duration::ZERO,
+            open: true,
+        }
+    }
+}
+
+/// What happened at the host.
+#[derive(Debug, Clone, PartialEq)]
+#[non_exhaustive]
+pub enum HostEvent {
+    /// Somebody asks to come in; answer with [`HostSession::accept`] or [`HostSession::refuse`]. Not with `open`.
+    Knock {
+        /// Who.
+        peer: PeerId,
+        /// Their name.
+        name: String,
+        /// What they show.
+        token: Vec<u8>,
+    },
+    /// A guest is in.
+    Joined {
+        /// The connection.
+        peer: PeerId,
+        /// Their number.
+        user: UserId,
+        /// Their name.
+        name: String,
+        /// What they showed.
+        token: Vec<u8>,
+    },
+    /// A guest is gone; their grabs have ended ([`HostEvent::GrabEnded`] came before this).
+    Left {
+        /// The connection.
+        peer: PeerId,
+        /// Their number, if they had joined.
+        user: Option<UserId>,
+        /// Why.
+        reason: EndReason,
+    },
+    /// A hand takes hold: the application grabs its body, or says [`HostSession::refuse_grab`].
+    GrabBegan {
+        /// Whose and which.
+        key: GrabKey,
+        /// The body.
+        body: BodyId,
+        /// Centre of the patch.
+        vertex: u32,
+        /// Radius of the patch, m.
+        radius: f64,
+        /// Where the hand is, world, m.
+        target: [f64; 3],
+    },
+    /// A hand moves.
+    GrabMoved {
+        /// Whose and which.
+        key: GrabKey,
+        /// The body.
+        body: BodyId,
+        /// The guest's input counter; ascends.
+        input: u32,
+        /// Where the hand is, world, m.
+        target: [f64; 3],
+    },
+    /// A hand lets go.
+    GrabEnded {
+        /// Whose and which.
+        key: GrabKey,
+        /// The body.
+        body: BodyId,
+    },
+}
+
+#[derive(Debug)]
+struct HostBody {
+    name: String,
+    model: Arc<ModalModel>,
+    bytes: Arc<[u8]>,
+    hash: [u8; 32],
+    setup: BodySetup,
+    last: Option<Tick>,
+    resting: bool,
+    reminded: Duration,
+    /// One encoder per kind of receiver and room in the datagram.
+    streams: BTreeMap<(StreamWish, usize), Encoder>,
+}
+
+/// The host of a session: a state machine without sockets or clock; see [`super`].
+#[derive(Debug)]
+pub struct HostSession {
+    config: HostConfig,
+    peers: BTreeMap<PeerId, Peer>,
+    bodies: BTreeMap<BodyId, HostBody>,
+    out: VecDeque<Output>,
+    events: VecDeque<HostEvent>,
+    next_user: u16,
+    dropped_events: u64,
+}
+
+impl HostSession {
+    /// A session without bodies or guests.
+    ///
+    /// # Errors
+    /// [`StreamError::Config`] for a setting out of range.
+    pub fn new(config: HostConfig) -> Result<Self, StreamError> {
+        config.newmark.check()?;
+        if !(config.model_rate.is_finite() && config.model_rate >= 1.0) {
+            return Err(StreamError::Config {
+                what: "model_rate",
+                found: config.model_rate.to_string(),
+                expected: "at least 1 byte a second",
+            });
+        }
+        Ok(Self {
+            config,
+            peers: BTreeMap::new(),
+            bodies: BTreeMap::new(),
+            out: VecDeque::new(),
+            events: VecDeque::new(),
+            next_user: 1,
+            dropped_events: 0,
+        })
+    }
+
+    /// The settings.
+    pub fn config(&self) -> &HostConfig {
+        &self.config
+    }
+
+    /// Adds a body to the session; guests learn of it at once.
+    ///
+    /// # Errors
+    /// [`StreamError::Full`] beyond 1,024 bodies; [`StreamError::Config`] for a name over 64 bytes or a number in use.
+    pub fn add_body(
+        &mut self,
+        body: BodyId,
+        name: &str,
+        model: Arc<ModalModel>,
+        setup: BodySetup,
+    ) -> Result<(), StreamError> {
+        if self.bodies.len() >= crate::wire::MAX_BODIES {
+            return Err(StreamError::Full { what: "bodies", limit: crate::wire::MAX_BODIES });
+        }
+        let fail = |what, found: String, expected| Err(StreamError::Config { what, found, expected });
+        if name.len() > crate::wire::MAX_NAME {
+            return fail("body name", name.to_owned(), "at most 64 bytes");
+        }
+        if self.bodies.contains_key(&body) {
+            return fail("body", body.to_string(), "a number that is not in use");
+        }
+        if model.mode_count() > MAX_MODES {
+            return fail("modes", model.mode_count().to_string(), "at most 4096");
+        }
+        let entry = HostBody {
+            name: name.to_owned(),
+            bytes: model.to_bytes().into(),
+            hash: model.hash().0,
+            model,
+            setup,
+            last: None,
+            resting: false,
+            reminded: Duration::ZERO,
+            streams: BTreeMap::new(),
+        };
+        self.bodies.insert(body, entry);
+        let joined: Vec<PeerId> = self.peers.values().filter(|p| p.user().is_some()).map(|p| p.id).collect();
+        for peer in joined {
+            self.announce(peer, body);
+        }
+        Ok(())
+    }
+
+    /// Takes a body out of the session. Grabs on it end.
+    pub fn remove_body(&mut self, body: BodyId) {
+        if self.bodies.remove(&body).is_none() {
+            return;
+        }
+        let mut ended = Vec::new();
+        for peer in self.peers.values_mut() {
+            peer.due.remove(&body);
+            peer.flowing.remove(&body);
+            peer.resends.retain(|r| r.1 != body);
+            let Some(user) = peer.user() else { continue };
+            let gone: Vec<u16> = peer.grabs.iter().filter(|(_, g)| g.body == body).map(|(k, _)| *k).collect();
+            for grab in gone {
+                peer.grabs.remove(&grab);
+                ended.push(HostEvent::GrabEnded { key: GrabKey { user, grab }, body });
+            }
+            if peer.announced.remove(&body) {
+                peer.send_message(&HostMessage::BodyRemoved { body: body.0 }, &mut self.out);
+            }
+        }
+        ended.into_iter().for_each(|e| self.event(e));
+    }
+
+    /// A connection opened; its datagrams carry at most so many bytes.
+    ///
+    /// # Errors
+    /// [`StreamError::Full`] when there is no place; the caller closes the connection.
+    pub fn connect(&mut self, now: Duration, peer: PeerId, max_datagram: usize) -> Result<(), StreamError> {
+        if self.peers.len() >= self.config.max_guests {
+            return Err(StreamError::Full { what: "guests", limit: self.config.max_guests });
+        }
+        self.peers.insert(peer, Peer::new(peer, now, max_datagram, self.config.model_rate));
+        Ok(())
+    }
+
+    /// A connection closed.
+    pub fn disconnect(&mut self, peer: PeerId, reason: EndReason) {
+        self.drop_peer(peer, reason, false);
+    }
+
+    /// Ends a guest's session with a reason that they are told.
+    pub fn expel(&mut self, peer: PeerId, reason: EndReason) {
+        self.drop_peer(peer, reason, true);
+    }
+
+    /// The path's datagrams have another size now.
+    pub fn set_max_datagram(&mut self, peer: PeerId, bytes: usize) {
+        let Some(p) = self.peers.get_mut(&peer) else { return };
+        if p.max_datagram == bytes {
+            return;
+        }
+        p.max_datagram = bytes;
+        // A new size is another encoder: its receivers begin from a snapshot.
+        let flowing = std::mem::take(&mut p.flowing);
+        p.due.extend(flowing);
+        if bytes < MIN_DATAGRAM && p.user().is_some() {
+            self.drop_peer(peer, EndReason::Path, true);
+        }
+    }
+
+    /// Lets a guest in that knocked.
+    ///
+    /// # Errors
+    /// [`StreamError::UnknownPeer`]; [`StreamError::State`] when they have not knocked.
+    pub fn accept(&mut self, now: Duration, peer: PeerId) -> Result<UserId, StreamError> {
+        let p = self.peers.get(&peer).ok_or(StreamError::UnknownPeer(peer))?;
+        if p.standing != Standing::Knocking {
+            return Err(StreamError::State {
+                what: "accept",
+                state: "not knocking",
+                needed: "a knocking peer",
+            });
+        }
+        self.admit(now, peer, Vec::new());
+        self.peers.get(&peer).and_then(Peer::user).ok_or(StreamError::UnknownPeer(peer))
+    }
+
+    /// Turns a guest away that knocked.
+    pub fn refuse(&mut self, peer: PeerId) {
+        self.drop_peer(peer, EndReason::Refused, true);
+    }
+
+    /// Does not accept a guest's grab, or ends it: the guest is told. No event follows.
+    pub fn refuse_grab(&mut self, key: GrabKey) {
+        for peer in self.peers.values_mut().filter(|p| p.user() == Some(key.user)) {
+            if peer.grabs.remove(&key.grab).is_some() {
+                peer.send_message(&HostMessage::GrabRefused { grab: key.grab }, &mut self.out);
+            }
+        }
+    }
+
+    /// The guests that are in.
+    pub fn users(&self) -> impl Iterator<Item = (PeerId, UserId, &str)> {
+        self.peers.values().filter_map(|p| p.user().map(|u| (p.id, u, p.name.as_str())))
+    }
+
+    /// How a guest's path does.
+    pub fn stats(&self, peer: PeerId) -> Option<LinkStats> {
+        self.peers.get(&peer).map(|p| p.stats)
+    }
+
+    /// Something arrived unreliably. Any bytes will do: what makes no sense is counted and forgotten.
+    pub fn on_datagram(&mut self, now: Duration, peer: PeerId, bytes: &[u8]) {
+        let Some(p) = self.peers.get_mut(&peer) else { return };
+        let Ok((sequence, datagram)) = Datagram::decode(bytes) else {
+            p.stats.rejected += 1;
+            return;
+        };
+        // Nothing counts before the guest has been let in.
+        let Some(user) = p.user() else {
+            p.stats.rejected += 1;
+            return;
+        };
+        if !p.count_in(now, sequence, bytes.len()) {
+            return;
+        }
+        match datagram {
+            Datagram::Targets(targets) => {
+                let mut moved = Vec::new();
+                let mut entries = targets.entries;
+                entries.sort_by_key(|e| (e.grab, e.input));
+                for e in entries {
+                    let Some(held) = p.grabs.get_mut(&e.grab) else { continue };
+                    // Newer than the last by less than half the range: the counter may wrap.
+                    let newer = held.input.is_none_or(|last| (e.input.wrapping_sub(last) as i32) > 0);
+                    if newer {
+                        held.input = Some(e.input);
+                        let key = GrabKey { user, grab: e.grab };
+                        moved.push(HostEvent::GrabMoved {
+                            key,
+                            body: held.body,
+                            input: e.input,
+                            target: e.target,
+                        });
+                    }
+                }
+                moved.into_iter().for_each(|e| self.event(e));
+            }
+            Datagram::Nack(nack) => {
+                p.stats.nacks += 1;
+                for run in nack.runs {
+                    for tick in run.first..run.first + u64::from(run.count) {
+                        if p.flowing.contains(&nack.body) && p.nack_budget.spend(now, 1.0) {
+                            p.queue_resend(now + self.config.resend_after, nack.body, tick);
+                        }
+                    }
+                }
+                self.resend_due(now, peer);
+            }
+            Datagram::Ping(clock) => {
+                p.stats.loss_out = loss_of(clock.report);
+                p.send_pong(now, clock.t1, now, &mut self.out);
+            }
+            Datagram::Frame(_) | Datagram::Pong(_) => p.stats.rejected += 1,
+        }
+    }
+
+    /// Something arrived reliably. A message that breaks the protocol ends the guest's session.
+    pub fn on_message(&mut self, now: Duration, peer: PeerId, bytes: &[u8]) {
+        let Some(p) = self.peers.get_mut(&peer) else { return };
+        p.heard = now;
+        p.stats.message_bytes_in += bytes.len() as u64;
+        let message = match GuestMessage::decode(bytes) {
+            Ok(m) if p.message_budget.spend(now, 1.0) => m,
+            _ => {
+                p.stats.rejected += 1;
+                return self.drop_peer(peer, EndReason::Protocol, true);
+            }
+        };
+        match (message, p.user()) {
+            (GuestMessage::Hello { version, name, token, wish, cached }, None)
+                if p.standing == Standing::Silent =>
+            {
+                if version != PROTOCOL_VERSION {
+                    return self.drop_peer(peer, EndReason::Version, true);
+                }
+                if p.max_datagram < MIN_DATAGRAM {
+                    return self.drop_peer(peer, EndReason::Path, true);
+                }
+                p.name = name;
+                p.wish = Some(wish);
+                p.cached = cached.into_iter().collect();
+                p.standing = Standing::Knocking;
+                if self.config.open {
+                    self.admit(now, peer, token);
+                } else {
+                    let name = p.name.clone();
+                    self.event(HostEvent::Knock { peer, name, token });
+                }
+            }
+            (GuestMessage::Goodbye { reason }, _) => self.drop_peer(peer, reason, false),
+            (GuestMessage::GrabBegin { grab, body, vertex, radius, target }, Some(user)) => {
+                let body = BodyId(body);
+                let vertices = self.bodies.get(&body).map_or(0, |b| b.model.surface().positions().len());
+                let fits = (vertex as usize) < vertices
+                    && p.grabs.len() < MAX_GUEST_GRABS
+                    && !p.grabs.contains_key(&grab);
+                if fits {
+                    p.grabs.insert(grab, HeldGrab { body, input: None });
+                    let key = GrabKey { user, grab };
+                    self.event(HostEvent::GrabBegan { key, body, vertex, radius, target });
+                } else {
+                    p.send_message(&HostMessage::GrabRefused { grab }, &mut self.out);
+                }
+            }
+            (GuestMessage::GrabEnd { grab }, Some(user)) => {
+                if let Some(held) = p.grabs.remove(&grab) {
+                    self.event(HostEvent::GrabEnded { key: GrabKey { user, grab }, body: held.body });
+                }
+            }
+            (GuestMessage::SnapshotRequest { body }, Some(_)) => {
+                let body = BodyId(body);
+                if p.flowing.contains(&body) && p.snapshot_budget.spend(now, 1.0) {
+                    self.send_snapshot(peer, body);
+                }
+            }
+            _ => {
+                p.stats.rejected += 1;
+                self.drop_peer(peer, EndReason::Protocol, true);
+            }
+        }
+    }
+
+    /// Streams one step of a body to all guests.
+    ///
+    /// # Errors
+    /// [`StreamError::UnknownBody`], [`StreamError::TickOrder`], [`StreamError::NotFinite`] (also for numbers that are
+    /// absurdly large), [`StreamError::Length`], [`StreamError::Full`]; nothing is sent then.
+    pub fn publish(&mut self, now: Duration, body: BodyId, state: &TickState<'_>) -> Result<(), StreamError> {
+        let entry = self.bodies.get_mut(&body).ok_or(StreamError::UnknownBody(body))?;
+        check_state(entry, state)?;
+        let follows = entry.last.is_some_and(|last| last + 1 == state.tick);
+        let woke = entry.resting && !state.resting;
+        let slept = !entry.resting && state.resting;
+        let stays = entry.resting && state.resting;
+        entry.last = Some(state.tick);
+        entry.resting = state.resting;
+        if stays {
+            if now.saturating_sub(entry.reminded) < REMINDER && self.peers.values().all(|p| p.due.is_empty())
+            {
+                return Ok(());
+            }
+            entry.reminded = now;
+        }
+        // A pause in the ticks, or falling asleep: everybody takes the truth over anew. Waking up goes on from the state
+        // that all have, so nothing but a new run begins.
+        let anew = slept || (!follows && !woke && !stays);
+        if slept {
+            entry.reminded = now;
+        }
+
+        let mut keys: BTreeSet<(StreamWish, usize)> = BTreeSet::new();
+        let mut takers: Vec<(PeerId, (StreamWish, usize), bool)> = Vec::new();
+        for p in self.peers.values_mut() {
+            let Some(key) = p.wish.map(|w| stream_key(w, entry, p.max_datagram)) else { continue };
+            let due = p.due.contains(&body) && !p.transfers.iter().any(|t| t.hash == entry.hash);
+            if p.flowing.contains(&body) || due {
+                keys.insert(key);
+                takers.push((p.id, key, due));
+            }
+        }
+        entry.streams.retain(|key, _| keys.contains(key));
+        let mut frames: BTreeMap<(StreamWish, usize), (Option<Arc<[u8]>>, bool)> = BTreeMap::new();
+        for key in keys {
+            let encoder = match entry.streams.entry(key) {
+                std::collections::btree_map::Entry::Occupied(e) => e.into_mut(),
+                std::collections::btree_map::Entry::Vacant(e) => {
+                    let made = Encoder::new(
+                        body,
+                        entry.model.clone(),
+                        &entry.setup,
+                        self.config.newmark,
+                        key.0,
+                        key.1,
+                    );
+                    match made {
+                        Ok(encoder) => e.insert(encoder),
+                        Err(_) => continue,
+                    }
+                }
+            };
+            let fresh = encoder.is_fresh() || anew;
+            if fresh || stays {
+                encoder.restart(state);
+                frames.insert(key, (None, fresh));
+            } else {
+                if woke {
+                    encoder.begin_run(state.tick - 1);
+                }
+                frames.insert(key, (Some(encoder.encode(state)), false));
+            }
+        }
+        for (peer, key, due) in takers {
+            let Some((frame, fresh)) = frames.get(&key) else {
+                self.drop_peer(peer, EndReason::Path, true);
+                continue;
+            };
+            let Some(p) = self.peers.get_mut(&peer) else { continue };
+            if let Some(bytes) = frame
+                && p.flowing.contains(&body)
+                && !p.send_frame(bytes, &mut self.out)
+            {
+                // The path shrank since the key was taken; the next tick has the new size.
+                p.due.insert(body);
+            }
+            if due || *fresh || (stays && p.flowing.contains(&body)) {
+                p.due.remove(&body);
+                p.flowing.insert(body);
+                self.send_snapshot(peer, body);
+            }
+        }
+        Ok(())
+    }
+
+    /// Sends what is due by now, and lets go of guests that are silent. Call once a frame and at
+    /// [`HostSession::next_wakeup`].
+    pub fn update(&mut self, now: Duration) {
+        let ids: Vec<PeerId> = self.peers.keys().copied().collect();
+        for id in ids {
+            self.resend_due(now, id);
+            let Some(p) = self.peers.get_mut(&id) else { continue };
+            if now.saturating_sub(p.heard) > self.config.idle_timeout {
+                self.drop_peer(id, EndReason::Silent, true);
+                continue;
+            }
+            while let Some(t) = p.transfers.front_mut() {
+                let end = (t.offset + CHUNK).min(t.bytes.len());
+                if !p.model_budget.spend(now, (end - t.offset) as f64) {
+                    break;
+                }
+                let chunk = HostMessage::ModelChunk {
+                    hash: t.hash,
+                    offset: t.offset as u64,
+                    total: t.bytes.len() as u64,
+                    bytes: t.bytes[t.offset..end].to_vec(),
+                };
+                t.offset = end;
+                if end == t.bytes.len() {
+                    let hash = t.hash;
+                    p.transfers.pop_front();
+                    p.cached.insert(hash);
+                }
+                p.send_message(&chunk, &mut self.out);
+            }
+        }
+    }
+
+    /// When to call [`HostSession::update`] at the latest, if nothing happens before.
+    pub fn next_wakeup(&self) -> Option<Duration> {
+        let each = self.peers.values().flat_map(|p| {
+            let model = p
+                .transfers
+                .front()
+                .map(|t| p.model_budget.ready_at((t.bytes.len() - t.offset).min(CHUNK) as f64));
+            let resend = p.resends.iter().map(|r| r.0).min();
+            [Some(p.heard + self.config.idle_timeout + Duration::from_millis(1)), model, resend]
+        });
+        each.flatten().min()
+    }
+
+    /// The next thing to send.
+    pub fn poll_output(&mut self) -> Option<Output> {
+        self.out.pop_front()
+    }
+
+    /// The next thing that happened.
+    pub fn poll_event(&mut self) -> Option<HostEvent> {
+        self.events.pop_front()
+    }
+
+    /// Events that nobody fetched and that were dropped.
+    pub fn dropped_events(&self) -> u64 {
+        self.dropped_events
+    }
+
+    fn event(&mut self, event: HostEvent) {
+        if self.events.len() >= MAX_EVENTS {
+            self.events.pop_front();
+            self.dropped_events += 1;
+        }
+        self.events.push_back(event);
+    }
+
+    fn admit(&mut self, now: Duration, peer: PeerId, token: Vec<u8>) {
+        let taken: BTreeSet<u16> = self.peers.values().filter_map(|p| p.user().map(|u| u.0)).collect();
+        // At most 256 guests by default, 65,535 numbers: the search ends.
+        let mut number = self.next_user;
+        while number == 0 || taken.contains(&number) {
+            number = number.wrapping_add(1);
+        }
+        self.next_user = number.wrapping_add(1);
+        let user = UserId(number);
+        let users: Vec<(u16, String)> =
+            self.peers.values().filter_map(|p| p.user().map(|u| (u.0, p.name.clone()))).collect();
+        let Some(p) = self.peers.get_mut(&peer) else { return };
+        p.standing = Standing::Joined(user);
+        p.heard = now;
+        let Newmark { h, beta, gamma } = self.config.newmark;
+        let step_ns = (h * 1e9).round() as u64;
+        let welcome =
+            HostMessage::Welcome { version: PROTOCOL_VERSION, user: number, step_ns, beta, gamma, users };
+        p.send_message(&welcome, &mut self.out);
+        let name = p.name.clone();
+        for other in self.peers.values_mut().filter(|p| p.id != peer && p.user().is_some()) {
+            let told = HostMessage::UserJoined { user: number, name: name.clone() };
+            other.send_message(&told, &mut self.out);
+        }
+        self.event(HostEvent::Joined { peer, user, name, token });
+        let bodies: Vec<BodyId> = self.bodies.keys().copied().collect();
+        for body in bodies {
+            self.announce(peer, body);
+        }
+    }
+
+    fn announce(&mut self, peer: PeerId, body: BodyId) {
+        let (Some(p), Some(b)) = (self.peers.get_mut(&peer), self.bodies.get(&body)) else { return };
+        let Some(wish) = p.wish else { return };
+        let info = BodyInfo {
+            body: body.0,
+            name: b.name.clone(),
+            hash: b.hash,
+            modes: Encoder::modes_for(&wish, b.model.mode_count(), p.max_datagram) as u16,
+            rho_inf: BodyInfo::rho_inf_of(b.setup.integrator),
+            warp: b.setup.warp,
+            damping_scale: b.setup.damping_scale,
+        };
+        p.send_message(&HostMessage::BodyAdded(info), &mut self.out);
+        if !p.cached.contains(&b.hash) && !p.transfers.iter().any(|t| t.hash == b.hash) {
+            p.transfers.push_back(Transfer { hash: b.hash, bytes: b.bytes.clone(), offset: 0 });
+        }
+        p.announced.insert(body);
+        p.due.insert(body);
+    }
+
+    fn send_snapshot(&mut self, peer: PeerId, body: BodyId) {
+        let (Some(p), Some(b)) = (self.peers.get_mut(&peer), self.bodies.get(&body)) else { return };
+        let Some(key) = p.wish.map(|w| stream_key(w, b, p.max_datagram)) else { return };
+        if let Some(encoder) = b.streams.get(&key) {
+            p.send_message(&HostMessage::Snapshot(encoder.snapshot(b.resting)), &mut self.out);
+        }
+    }
+
+    fn resend_due(&mut self, now: Duration, peer: PeerId) {
+        let Some(p) = self.peers.get_mut(&peer) else { return };
+        while let Some(&(due, body, tick)) = p.resends.front() {
+            if due > now {
+                return;
+            }
+            p.resends.pop_front();
+            let Some(b) = self.bodies.get(&body) else { continue };
+            let Some(key) = p.wish.map(|w| stream_key(w, b, p.max_datagram)) else { continue };
+            if let Some(bytes) = b.streams.get(&key).and_then(|e| e.resend(tick)) {
+                p.send_frame(&bytes, &mut self.out);
+            }
+        }
+    }
+
+    fn drop_peer(&mut self, peer: PeerId, reason: EndReason, tell: bool) {
+        let Some(mut p) = self.peers.remove(&peer) else { return };
+        if tell {
+            p.say_goodbye(reason, &mut self.out);
+        }
+        let user = p.user();
+        if let Some(user) = user {
+            for (grab, held) in &p.grabs {
+                self.event(HostEvent::GrabEnded { key: GrabKey { user, grab: *grab }, body: held.body });
+            }
+            for other in self.peers.values_mut().filter(|p| p.user().is_some()) {
+                other.send_message(&HostMessage::UserLeft { user: user.0 }, &mut self.out);
+            }
+        }
+        self.event(HostEvent::Left { peer, user, reason });
+    }
+}
+
+fn stream_key(mut wish: StreamWish, body: &HostBody, limit: usize) -> (StreamWish, usize) {
+    wish.modes = Encoder::modes_for(&wish, body.model.mode_count(), limit) as u16;
+    (wish, limit)
+}
+
+fn check_state(body: &HostBody, state: &TickState<'_>) -> Result<(), StreamError> {
+    if let Some(last) = body.last
+        && state.tick <= last
+    {
+        return Err(StreamError::TickOrder { last, found: state.tick });
+    }
+    if state.tick == 0 || state.tick >= TICK_LIMIT {
+        return Err(StreamError::TickOrder { last: 0, found: state.tick });
+    }
+    let modes = body.model.mode_count();
+    for (what, slice) in [("q", state.q), ("v", state.v), ("a", state.a)] {
+        if slice.is_empty() || slice.len() > modes {
+            return Err(StreamError::Length { what, found: slice.len(), expected: modes });
+        }
+    }
+    if !in_range(state.q) {
+        return Err(StreamError::NotFinite { what: "q" });
+    }
+    if !in_range(state.v) {
+        return Err(StreamError::NotFinite { what: "v" });
+    }
+    if !state.a.iter().all(|x| x.abs() <= WIDE_LIMIT) {
+        return Err(StreamError::NotFinite { what: "a" });
+    }
+    if state.grabs.len() > MAX_GRABS {
+        return Err(StreamError::Full { what: "grabs", limit: MAX_GRABS });
+    }
+    if !state.grabs.iter().all(crate::state::GrabState::is_valid) {
+        return Err(StreamError::NotFinite { what: "grab" });
+    }
+    if state.pose.is_some_and(|p| !p.is_valid()) {
+        return Err(StreamError::NotFinite { what: "pose" });
+    }
+    Ok(())
+}

@@ -1,0 +1,172 @@
+//! What the host knows of one guest.
+
+use std::collections::{BTreeMap, BTreeSet, VecDeque};
+use std::sync::Arc;
+use std::time::Duration;
+
+use super::outbox::{Budget, RoundTrip, Tally};
+use super::{Channel, EndReason, LinkStats, Output};
+use crate::state::{BodyId, PeerId, Tick, UserId};
+use crate::wire::{Clock, Datagram, HostMessage, Report, StreamWish};
+
+/// Most grabs that one guest may hold.
+pub(crate) const MAX_GUEST_GRABS: usize = 16;
+/// Most resends waiting for one guest.
+const MAX_RESENDS: usize = 512;
+
+/// Where a guest stands.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(crate) enum Standing {
+    /// Connected, has not said hello.
+    Silent,
+    /// Has said hello and waits for the application's word.
+    Knocking,
+    /// In the session.
+    Joined(UserId),
+}
+
+/// A model on its way.
+#[derive(Debug, Clone)]
+pub(crate) struct Transfer {
+    pub(crate) hash: [u8; 32],
+    pub(crate) bytes: Arc<[u8]>,
+    pub(crate) offset: usize,
+}
+
+/// A grab as the guest announced it.
+#[derive(Debug, Clone, Copy)]
+pub(crate) struct HeldGrab {
+    pub(crate) body: BodyId,
+    /// The newest input seen.
+    pub(crate) input: Option<u32>,
+}
+
+#[derive(Debug)]
+pub(crate) struct Peer {
+    pub(crate) id: PeerId,
+    pub(crate) standing: Standing,
+    pub(crate) name: String,
+    pub(crate) wish: Option<StreamWish>,
+    pub(crate) max_datagram: usize,
+    pub(crate) cached: BTreeSet<[u8; 32]>,
+    pub(crate) transfers: VecDeque<Transfer>,
+    /// Bodies announced to the guest.
+    pub(crate) announced: BTreeSet<BodyId>,
+    /// Bodies whose snapshot is due at their next tick.
+    pub(crate) due: BTreeSet<BodyId>,
+    /// Bodies whose snapshot was sent: frames flow.
+    pub(crate) flowing: BTreeSet<BodyId>,
+    pub(crate) grabs: BTreeMap<u16, HeldGrab>,
+    pub(crate) resends: VecDeque<(Duration, BodyId, Tick)>,
+    pub(crate) heard: Duration,
+    pub(crate) model_budget: Budget,
+    pub(crate) nack_budget: Budget,
+    pub(crate) snapshot_budget: Budget,
+    pub(crate) message_budget: Budget,
+    sequence: u16,
+    tally: Tally,
+    pub(crate) stats: LinkStats,
+    pub(crate) round_trip: RoundTrip,
+}
+
+impl Peer {
+    pub(crate) fn new(id: PeerId, now: Duration, max_datagram: usize, model_rate: f64) -> Self {
+        Self {
+            id,
+            standing: Standing::Silent,
+            name: String::new(),
+            wish: None,
+            max_datagram,
+            cached: BTreeSet::new(),
+            transfers: VecDeque::new(),
+            announced: BTreeSet::new(),
+            due: BTreeSet::new(),
+            flowing: BTreeSet::new(),
+            grabs: BTreeMap::new(),
+            resends: VecDeque::new(),
+            heard: now,
+            model_budget: Budget::new(model_rate, 64.0 * 1024.0),
+            // A guest may ask for 4,000 ticks a second: 60 Hz at full loss with every tick asked for eight times, and
+            // some bodies at once.
+            nack_budget: Budget::new(4000.0, 4000.0),
+            snapshot_budget: Budget::new(2.0, 16.0),
+            message_budget: Budget::new(200.0, 400.0),
+            sequence: 0,
+            tally: Tally::default(),
+            stats: LinkStats::default(),
+            round_trip: RoundTrip::default(),
+        }
+    }
+
+    pub(crate) fn user(&self) -> Option<UserId> {
+        match self.standing {
+            Standing::Joined(user) => Some(user),
+            Standing::Silent | Standing::Knocking => None,
+        }
+    }
+
+    /// Counts an arriving datagram; false for a copy.
+    pub(crate) fn count_in(&mut self, now: Duration, sequence: u16, bytes: usize) -> bool {
+        self.heard = now;
+        let fresh = self.tally.take(sequence);
+        if fresh {
+            self.stats.datagrams_in += 1;
+            self.stats.bytes_in += bytes as u64;
+        }
+        self.stats.loss_in = self.tally.loss();
+        fresh
+    }
+
+    fn next_sequence(&mut self) -> u16 {
+        let s = self.sequence;
+        self.sequence = s.wrapping_add(1);
+        s
+    }
+
+    fn datagram(&mut self, bytes: Vec<u8>, out: &mut VecDeque<Output>) {
+        self.stats.datagrams_out += 1;
+        self.stats.bytes_out += bytes.len() as u64;
+        out.push_back(Output { peer: self.id, channel: Channel::Datagram, bytes: bytes.into() });
+    }
+
+    /// Sends a frame that was encoded for several; false when it is longer than the path carries by now.
+    pub(crate) fn send_frame(&mut self, body: &[u8], out: &mut VecDeque<Output>) -> bool {
+        if body.len() + 3 > self.max_datagram {
+            return false;
+        }
+        let sequence = self.next_sequence();
+        self.datagram(Datagram::wrap_frame(sequence, body), out);
+        true
+    }
+
+    pub(crate) fn send_pong(&mut self, now: Duration, t1: u64, t2: Duration, out: &mut VecDeque<Output>) {
+        let clock = Clock { t1, t2: micros(t2), t3: micros(now), report: self.report() };
+        let sequence = self.next_sequence();
+        self.datagram(Datagram::Pong(clock).encode(sequence), out);
+    }
+
+    pub(crate) fn report(&self) -> Report {
+        self.tally.report()
+    }
+
+    pub(crate) fn send_message(&mut self, message: &HostMessage, out: &mut VecDeque<Output>) {
+        let bytes = message.encode();
+        self.stats.message_bytes_out += bytes.len() as u64;
+        out.push_back(Output { peer: self.id, channel: Channel::Message, bytes: bytes.into() });
+    }
+
+    pub(crate) fn say_goodbye(&mut self, reason: EndReason, out: &mut VecDeque<Output>) {
+        self.send_message(&HostMessage::Goodbye { reason }, out);
+    }
+
+    /// Queues a resend, unless it waits already.
+    pub(crate) fn queue_resend(&mut self, due: Duration, body: BodyId, tick: Tick) {
+        if self.resends.len() < MAX_RESENDS && !self.resends.iter().any(|r| r.1 == body && r.2 == tick) {
+            self.resends.push_back((due, body, tick));
+        }
+    }
+}
+
+pub(crate) fn micros(t: Duration) -> u64 {
+    u64::try_from(t.as_micros()).unwrap_or(u64::MAX)
+}

@@ -1,0 +1,227 @@
+//! The kinds of datagram.
+
+use super::{Frame, Reader, Writer};
+use crate::StreamError;
+use crate::state::{BodyId, Tick};
+
+const FRAME: u8 = 1;
+const TARGETS: u8 = 2;
+const NACK: u8 = 3;
+const PING: u8 = 4;
+const PONG: u8 = 5;
+
+/// Most runs in one NACK.
+pub(crate) const MAX_NACK_RUNS: usize = 32;
+/// Most target entries in one datagram.
+pub(crate) const MAX_TARGETS: usize = 64;
+/// Longest run of one NACK, ticks.
+pub(crate) const MAX_NACK_RUN: u8 = 64;
+
+/// A run of ticks that are missing.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct NackRun {
+    /// The first missing tick.
+    pub first: Tick,
+    /// How many from there, 1..=64.
+    pub count: u8,
+}
+
+/// Ticks of one body that a guest asks for again.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct Nack {
+    /// Whose frames.
+    pub body: BodyId,
+    /// At most 32 runs.
+    pub runs: Vec<NackRun>,
+}
+
+/// Where one hand of a guest was at one of the guest's input ticks.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct TargetEntry {
+    /// Which of the guest's grabs.
+    pub grab: u16,
+    /// The guest's input counter; ascends by one for each `set_target` round.
+    pub input: u32,
+    /// World, m.
+    pub target: [f64; 3],
+}
+
+/// Targets of a guest's grabs, the newest and the two before it.
+#[derive(Debug, Clone, PartialEq, Default)]
+pub struct Targets {
+    /// At most 64 entries.
+    pub entries: Vec<TargetEntry>,
+}
+
+/// One side's account of what it received, so that the other knows its outgoing loss.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
+pub struct Report {
+    /// Datagrams received since the session began (low 32 bits).
+    pub received: u32,
+    /// Highest extended sequence number seen (low 32 bits).
+    pub highest: u32,
+}
+
+/// Clock exchange with four timestamps (NTP): `t1` guest sends, `t2` host receives, `t3` host sends, `t4` guest receives.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
+pub struct Clock {
+    /// Guest's clock at sending, us.
+    pub t1: u64,
+    /// Host's clock at receiving, us.
+    pub t2: u64,
+    /// Host's clock at sending, us.
+    pub t3: u64,
+    /// What the sender of this datagram has received.
+    pub report: Report,
+}
+
+/// Everything that crosses the link unreliably. The sequence number counts all datagrams from this sender to this receiver.
+#[derive(Debug, Clone, PartialEq)]
+pub enum Datagram {
+    /// Host to guest: a tick of a body.
+    Frame(Frame),
+    /// Guest to host: where the hands are.
+    Targets(Targets),
+    /// Guest to host: ticks to send again.
+    Nack(Nack),
+    /// Guest to host: clock request with `t1`, and the guest's report.
+    Ping(Clock),
+    /// Host to guest: clock answer, and the host's report.
+    Pong(Clock),
+}
+
+impl Datagram {
+    /// Kind and sequence number, 3 bytes: what precedes every body.
+    pub(crate) fn header(kind: u8, sequence: u16) -> [u8; 3] {
+        let [a, b] = sequence.to_le_bytes();
+        [kind, a, b]
+    }
+
+    /// Puts a header before frame bytes that were encoded once for all peers.
+    pub(crate) fn wrap_frame(sequence: u16, body: &[u8]) -> Vec<u8> {
+        let mut out = Vec::with_capacity(body.len() + 3);
+        out.extend_from_slice(&Self::header(FRAME, sequence));
+        out.extend_from_slice(body);
+        out
+    }
+
+    /// The bytes of this datagram.
+    pub fn encode(&self, sequence: u16) -> Vec<u8> {
+        let mut w = Writer::with_capacity(64);
+        match self {
+            Self::Frame(frame) => {
+                w.raw(&Self::header(FRAME, sequence));
+                frame.encode(&mut w);
+            }
+            Self::Targets(targets) => {
+                w.raw(&Self::header(TARGETS, sequence));
+                let entries = &targets.entries[..targets.entries.len().min(MAX_TARGETS)];
+                w.u8(entries.len() as u8);
+                for e in entries {
+                    w.u16(e.grab);
+                    w.u32(e.input);
+                    w.vector(e.target);
+                }
+            }
+            Self::Nack(nack) => {
+                w.raw(&Self::header(NACK, sequence));
+                w.u16(nack.body.0);
+                let runs = &nack.runs[..nack.runs.len().min(MAX_NACK_RUNS)];
+                w.u8(runs.len() as u8);
+                for run in runs {
+                    w.tick(run.first);
+                    w.u8(run.count);
+                }
+            }
+            Self::Ping(clock) => {
+                w.raw(&Self::header(PING, sequence));
+                w.u64(clock.t1);
+                w.u32(clock.report.received);
+                w.u32(clock.report.highest);
+            }
+            Self::Pong(clock) => {
+                w.raw(&Self::header(PONG, sequence));
+                w.u64(clock.t1);
+                w.u64(clock.t2);
+                w.u64(clock.t3);
+                w.u32(clock.report.received);
+                w.u32(clock.report.highest);
+            }
+        }
+        w.into_bytes()
+    }
+
+    /// Reads any bytes: sequence number and content, or what is wrong with them.
+    ///
+    /// # Errors
+    /// [`StreamError::Truncated`], [`StreamError::Invalid`] and [`StreamError::NotFinite`], naming the field.
+    pub fn decode(bytes: &[u8]) -> Result<(u16, Self), StreamError> {
+        let mut r = Reader::new(bytes);
+        let kind = r.u8("datagram kind")?;
+        let sequence = r.u16("sequence")?;
+        let datagram = match kind {
+            FRAME => Self::Frame(Frame::decode(&mut r)?),
+            TARGETS => {
+                let count = r.u8("target count")?;
+                bounded("target count", count, MAX_TARGETS, "at most 64")?;
+                let mut entries = Vec::with_capacity(usize::from(count).min(r.left() / 18));
+                for _ in 0..count {
+                    entries.push(TargetEntry {
+                        grab: r.u16("target grab")?,
+                        input: r.u32("target input")?,
+                        target: r.vector("target")?,
+                    });
+                }
+                Self::Targets(Targets { entries })
+            }
+            NACK => {
+                let body = BodyId(r.u16("nack body")?);
+                let count = r.u8("nack runs")?;
+                bounded("nack runs", count, MAX_NACK_RUNS, "at most 32")?;
+                let mut runs = Vec::with_capacity(usize::from(count).min(r.left() / 7));
+                for _ in 0..count {
+                    let first = r.tick("nack tick")?;
+                    let count = r.u8("nack run length")?;
+                    if count == 0 || count > MAX_NACK_RUN {
+                        return Err(StreamError::Invalid {
+                            what: "nack run length",
+                            found: count.to_string(),
+                            expected: "1..=64",
+                        });
+                    }
+                    runs.push(NackRun { first, count });
+                }
+                Self::Nack(Nack { body, runs })
+            }
+            PING => {
+                let t1 = r.u64("t1")?;
+                Self::Ping(Clock { t1, t2: 0, t3: 0, report: report(&mut r)? })
+            }
+            PONG => {
+                let (t1, t2, t3) = (r.u64("t1")?, r.u64("t2")?, r.u64("t3")?);
+                Self::Pong(Clock { t1, t2, t3, report: report(&mut r)? })
+            }
+            other => {
+                return Err(StreamError::Invalid {
+                    what: "datagram kind",
+                    found: other.to_string(),
+                    expected: "1..=5",
+                });
+            }
+        };
+        r.finish("datagram")?;
+        Ok((sequence, datagram))
+    }
+}
+
+fn report(r: &mut Reader<'_>) -> Result<Report, StreamError> {
+    Ok(Report { received: r.u32("report received")?, highest: r.u32("report highest")? })
+}
+
+fn bounded(what: &'static str, found: u8, limit: usize, expected: &'static str) -> Result<(), StreamError> {
+    if usize::from(found) <= limit {
+        Ok(())
+    } else {
+        Err(StreamError::Invalid { what, found: found.to_string(), expected })
+    }
+}

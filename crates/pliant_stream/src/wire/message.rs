@@ -1,0 +1,322 @@
+//! Reliable messages: postcard bodies, checked after decoding.
+
+use pliant_modal::Integrator;
+use serde::{Deserialize, Serialize};
+
+use super::AccelerationCoding;
+use crate::StreamError;
+use crate::session::{EndReason, MAX_MESSAGE};
+use crate::state::{MAX_MODES, TICK_LIMIT, in_range};
+use crate::stepper::BodySetup;
+
+/// Longest name of a user or a body, bytes of UTF-8.
+pub(crate) const MAX_NAME: usize = 64;
+/// Longest token that a guest may show, bytes.
+pub(crate) const MAX_TOKEN: usize = 1024;
+/// Most models that a guest may name as cached.
+pub(crate) const MAX_CACHED: usize = 256;
+/// Most bodies of a session.
+pub(crate) const MAX_BODIES: usize = 1024;
+
+/// What the frames of a stream carry.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, PartialOrd, Ord, Serialize, Deserialize)]
+pub enum Payload {
+    /// The modal accelerations: the paper's stream.
+    Accelerations(AccelerationCoding),
+    /// The grabs' reactions only: the receiver owns the model and steps it.
+    Forces,
+}
+
+/// What a guest asks of the host's encoder.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, PartialOrd, Ord, Serialize, Deserialize)]
+pub struct StreamWish {
+    /// What the frames carry.
+    pub payload: Payload,
+    /// At most so many modes (the first ones); the host lowers it to what the model has and the path carries.
+    pub modes: u16,
+    /// How many earlier ticks each frame repeats, 0..=7.
+    pub repeats: u8,
+    /// A full refresh of (q, v) every so many frames, 0 for never.
+    pub refresh: u8,
+}
+
+/// A body as the host announces it.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub struct BodyInfo {
+    /// Its number.
+    pub body: u16,
+    /// A name for people, at most 64 bytes.
+    pub name: String,
+    /// Hash of the model.
+    pub hash: [u8; 32],
+    /// Modes that this guest's frames carry.
+    pub modes: u16,
+    /// The host's integrator: negative for the exact step, else generalized-alpha with this spectral radius at infinity
+    /// (2 for Newmark's average acceleration).
+    pub rho_inf: f64,
+    /// Does the body bend by modal warping?
+    pub warp: bool,
+    /// Factor on all damping coefficients.
+    pub damping_scale: f64,
+}
+
+impl BodyInfo {
+    /// How the host steps the body.
+    pub fn setup(&self) -> BodySetup {
+        let integrator = match self.rho_inf {
+            r if r < 0.0 => Integrator::Exact,
+            r if r > 1.0 => Integrator::Newmark,
+            rho_inf => Integrator::GeneralizedAlpha { rho_inf },
+        };
+        BodySetup { integrator, warp: self.warp, damping_scale: self.damping_scale }
+    }
+
+    /// [`BodyInfo::rho_inf`] of an integrator.
+    pub fn rho_inf_of(integrator: Integrator) -> f64 {
+        match integrator {
+            Integrator::Newmark => 2.0,
+            Integrator::GeneralizedAlpha { rho_inf } => rho_inf,
+            _ => -1.0,
+        }
+    }
+}
+
+/// The encoder's own image of the receiver at a tick: a receiver that takes it over has no error against the stream.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub struct SnapshotBytes {
+    /// Which body.
+    pub body: u16,
+    /// After which tick.
+    pub tick: u64,
+    /// Modal coordinates, kg^1/2 m.
+    pub q: Vec<f64>,
+    /// Velocities.
+    pub v: Vec<f64>,
+    /// Accelerations.
+    pub a: Vec<f64>,
+    /// Forces per mode that the streamed reactions do not explain (gravity, contacts); empty when they explain all.
+    pub load: Vec<f64>,
+    /// The body sleeps from this tick on.
+    pub resting: bool,
+}
+
+/// Guest to host.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub enum GuestMessage {
+    /// The first message.
+    Hello {
+        /// [`super::PROTOCOL_VERSION`].
+        version: u16,
+        /// At most 64 bytes.
+        name: String,
+        /// Opaque to the session; the host's application judges it. At most 1 KiB.
+        token: Vec<u8>,
+        /// What to stream.
+        wish: StreamWish,
+        /// Models that need not be sent.
+        cached: Vec<[u8; 32]>,
+    },
+    /// A hand takes hold.
+    GrabBegin {
+        /// The guest's number for the grab.
+        grab: u16,
+        /// Of which body.
+        body: u16,
+        /// Centre of the patch.
+        vertex: u32,
+        /// Radius of the patch, m.
+        radius: f64,
+        /// First target, world, m.
+        target: [f64; 3],
+    },
+    /// A hand lets go.
+    GrabEnd {
+        /// The guest's number for the grab.
+        grab: u16,
+    },
+    /// Send the state of a body anew.
+    SnapshotRequest {
+        /// Which body.
+        body: u16,
+    },
+    /// The last message.
+    Goodbye {
+        /// Why.
+        reason: EndReason,
+    },
+}
+
+/// Host to guest.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub enum HostMessage {
+    /// The answer to Hello.
+    Welcome {
+        /// [`super::PROTOCOL_VERSION`].
+        version: u16,
+        /// The guest's number.
+        user: u16,
+        /// Length of a step, ns.
+        step_ns: u64,
+        /// Newmark's beta of the acceleration streams.
+        beta: f64,
+        /// Newmark's gamma.
+        gamma: f64,
+        /// Users already here: number and name.
+        users: Vec<(u16, String)>,
+    },
+    /// A body joins the session; its model follows if the guest has not got it, then a snapshot.
+    BodyAdded(BodyInfo),
+    /// A body leaves.
+    BodyRemoved {
+        /// Which.
+        body: u16,
+    },
+    /// A piece of a model's bytes, in order.
+    ModelChunk {
+        /// Of which model.
+        hash: [u8; 32],
+        /// Where in the model's bytes it belongs.
+        offset: u64,
+        /// Length of the whole.
+        total: u64,
+        /// The piece.
+        bytes: Vec<u8>,
+    },
+    /// The state of a body.
+    Snapshot(SnapshotBytes),
+    /// Somebody came.
+    UserJoined {
+        /// Number.
+        user: u16,
+        /// Name.
+        name: String,
+    },
+    /// Somebody left.
+    UserLeft {
+        /// Number.
+        user: u16,
+    },
+    /// The host did not accept a grab, or ended it.
+    GrabRefused {
+        /// The guest's number for the grab.
+        grab: u16,
+    },
+    /// The last message.
+    Goodbye {
+        /// Why.
+        reason: EndReason,
+    },
+}
+
+fn decode<'a, M: Deserialize<'a>>(what: &'static str, bytes: &'a [u8]) -> Result<M, StreamError> {
+    if bytes.len() > MAX_MESSAGE {
+        return Err(StreamError::Invalid {
+            what,
+            found: format!("{} bytes", bytes.len()),
+            expected: "at most MAX_MESSAGE bytes",
+        });
+    }
+    let invalid = |found: String, expected| StreamError::Invalid { what, found, expected };
+    match postcard::take_from_bytes(bytes) {
+        Ok((message, [])) => Ok(message),
+        Ok((_, rest)) => Err(invalid(format!("{} bytes too many", rest.len()), "one message")),
+        Err(e) => Err(invalid(e.to_string(), "a postcard message of this version")),
+    }
+}
+
+fn encode<M: Serialize>(message: &M) -> Vec<u8> {
+    // Every message is plain data: serialising it to a growing buffer cannot fail.
+    postcard::to_stdvec(message).unwrap_or_default()
+}
+
+fn check(
+    what: &'static str,
+    ok: bool,
+    found: impl ToString,
+    expected: &'static str,
+) -> Result<(), StreamError> {
+    if ok { Ok(()) } else { Err(StreamError::Invalid { what, found: found.to_string(), expected }) }
+}
+
+impl GuestMessage {
+    /// The bytes of this message.
+    pub fn encode(&self) -> Vec<u8> {
+        encode(self)
+    }
+
+    /// Reads any bytes and checks every bound.
+    ///
+    /// # Errors
+    /// [`StreamError::Invalid`], naming the field.
+    pub fn decode(bytes: &[u8]) -> Result<Self, StreamError> {
+        let message: Self = decode("guest message", bytes)?;
+        match &message {
+            Self::Hello { name, token, wish, cached, .. } => {
+                check("name", name.len() <= MAX_NAME, name.len(), "at most 64 bytes")?;
+                check("token", token.len() <= MAX_TOKEN, token.len(), "at most 1024 bytes")?;
+                check("cached models", cached.len() <= MAX_CACHED, cached.len(), "at most 256")?;
+                check("repeats", wish.repeats <= 7, wish.repeats, "0..=7")?;
+                check("modes", wish.modes >= 1, wish.modes, "at least 1")?;
+            }
+            Self::GrabBegin { radius, target, .. } => {
+                check("radius", *radius >= 0.0 && in_range(&[*radius]), radius, "0..=1e9 m")?;
+                check("target", in_range(target), format!("{target:?}"), "finite metres")?;
+            }
+            Self::GrabEnd { .. } | Self::SnapshotRequest { .. } | Self::Goodbye { .. } => {}
+        }
+        Ok(message)
+    }
+}
+
+impl HostMessage {
+    /// The bytes of this message.
+    pub fn encode(&self) -> Vec<u8> {
+        encode(self)
+    }
+
+    /// Reads any bytes and checks every bound.
+    ///
+    /// # Errors
+    /// [`StreamError::Invalid`], naming the field.
+    pub fn decode(bytes: &[u8]) -> Result<Self, StreamError> {
+        let message: Self = decode("host message", bytes)?;
+        match &message {
+            Self::Welcome { step_ns, beta, gamma, users, .. } => {
+                check("step", (10_000..=1_000_000_000).contains(step_ns), step_ns, "10 us to 1 s")?;
+                check("beta", (0.0..=1.0).contains(beta), beta, "0..=1")?;
+                check("gamma", (0.0..=1.0).contains(gamma), gamma, "0..=1")?;
+                for (_, name) in users {
+                    check("name", name.len() <= MAX_NAME, name.len(), "at most 64 bytes")?;
+                }
+            }
+            Self::BodyAdded(info) => {
+                check("name", info.name.len() <= MAX_NAME, info.name.len(), "at most 64 bytes")?;
+                let modes = usize::from(info.modes);
+                check("modes", (1..=MAX_MODES).contains(&modes), modes, "1..=4096")?;
+                check("rho_inf", (-1.0..=2.0).contains(&info.rho_inf), info.rho_inf, "-1..=2")?;
+                let scale = info.damping_scale;
+                check("damping_scale", (0.0..=1e6).contains(&scale), scale, "0..=1e6")?;
+            }
+            Self::Snapshot(s) => {
+                check("snapshot tick", s.tick < TICK_LIMIT, s.tick, "below 2^48")?;
+                let modes = s.q.len();
+                check("snapshot modes", (1..=MAX_MODES).contains(&modes), modes, "1..=4096")?;
+                let equal =
+                    s.v.len() == modes && s.a.len() == modes && (s.load.is_empty() || s.load.len() == modes);
+                check("snapshot lengths", equal, s.v.len(), "the same for q, v, a and load")?;
+                let finite = in_range(&s.q) && in_range(&s.v);
+                let finite = finite && s.a.iter().chain(&s.load).all(|x| x.is_finite() && x.abs() < 1e15);
+                check("snapshot", finite, "a number out of range", "finite numbers")?;
+            }
+            Self::UserJoined { name, .. } => {
+                check("name", name.len() <= MAX_NAME, name.len(), "at most 64 bytes")?;
+            }
+            Self::BodyRemoved { .. }
+            | Self::ModelChunk { .. }
+            | Self::UserLeft { .. }
+            | Self::GrabRefused { .. }
+            | Self::Goodbye { .. } => {}
+        }
+        Ok(message)
+    }
+}
