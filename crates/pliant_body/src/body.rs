@@ -27,7 +27,7 @@ use crate::{ModalAsset, grab::Hold};
 /// anchors without inertia (quasi-static). A free body writes its own motion into its `Transform` each frame and must have no
 /// parent; writing the transform puts it elsewhere with its velocity kept.
 ///
-/// A change of a field takes effect before the next step; the shape and its motion are kept where the model is the same.
+/// A change of a field takes effect at the end of the frame; the shape and its motion are kept where the model is the same.
 #[derive(Component, Reflect, Debug, Clone, PartialEq)]
 #[reflect(Component, Clone, PartialEq)]
 #[require(Transform, Visibility, Driven)]
@@ -134,6 +134,8 @@ pub struct BodyState {
     /// Seconds for which it has been slower than the rest speed.
     pub(crate) quiet: f64,
     pub(crate) resting: bool,
+    /// There is a new state to publish.
+    pub(crate) stepped: bool,
 }
 
 /// A grab as the solver has it.
@@ -157,7 +159,14 @@ impl BodyState {
             faulted: false,
             quiet: 0.0,
             resting: false,
+            stepped: false,
         }
+    }
+
+    /// Whether this transform was looked at before (one with NaN in it, too).
+    pub(crate) fn is_placed(&self, affine: &Affine3A) -> bool {
+        let bits = |affine: &Affine3A| affine.to_cols_array().map(f32::to_bits);
+        self.placed.is_some_and(|placed| bits(&placed) == bits(affine))
     }
 
     /// The simulated body: its modal state, its frame, its grabs.

@@ -42,17 +42,32 @@ impl Grab {
 
     /// What the solver is told about the hold; a change of any of it makes the hold anew.
     pub(crate) fn hold(&self) -> Hold {
-        Hold { vertex: self.vertex, radius: self.radius, stiffness: self.stiffness, relaxation: self.relaxation }
+        Hold {
+            vertex: self.vertex,
+            radius: self.radius,
+            stiffness: self.stiffness,
+            relaxation: self.relaxation,
+        }
     }
 }
 
 /// A [`Grab`] without its target.
-#[derive(Debug, Clone, Copy, PartialEq)]
+#[derive(Debug, Clone, Copy)]
 pub(crate) struct Hold {
     pub vertex: u32,
     pub radius: f64,
     pub stiffness: Option<f64>,
     pub relaxation: f64,
+}
+
+impl Hold {
+    /// Equality by bits: a NaN that was refused once is the same NaN in the next tick.
+    pub fn is(&self, other: &Self) -> bool {
+        let bits = |hold: &Self| {
+            (hold.vertex, hold.radius.to_bits(), hold.stiffness.map(f64::to_bits), hold.relaxation.to_bits())
+        };
+        bits(self) == bits(other)
+    }
 }
 
 /// The body that a grab holds.

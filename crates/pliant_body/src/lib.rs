@@ -42,6 +42,8 @@ mod pick;
 mod pointer;
 mod shown;
 mod step;
+#[cfg(test)]
+mod tests;
 
 use bevy::{
     asset::AssetEventSystems,
@@ -152,7 +154,6 @@ impl Plugin for PliantBodyPlugin {
                 )
                     .chain(),
             )
-            .add_systems(PreUpdate, step::build_bodies)
             .add_systems(
                 self.schedule,
                 (
@@ -163,7 +164,16 @@ impl Plugin for PliantBodyPlugin {
                     step::publish.in_set(PliantSystems::Publish),
                 ),
             )
-            .add_systems(PostUpdate, shown::interpolate.in_set(PliantDisplaySystems::Interpolate));
+            .add_systems(
+                PostUpdate,
+                (
+                    shown::interpolate.in_set(PliantDisplaySystems::Interpolate),
+                    // After the transforms are known, so that no body is ever stepped where it is not.
+                    step::build_bodies
+                        .after(TransformSystems::Propagate)
+                        .before(PliantDisplaySystems::Deform),
+                ),
+            );
         #[cfg(feature = "render")]
         deform::build(app);
     }

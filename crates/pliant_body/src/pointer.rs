@@ -103,7 +103,9 @@ struct PointerRays<'w, 's> {
 impl PointerRays<'_, '_> {
     fn through(&self, camera: Entity) -> Option<(Ray3d, &GlobalTransform)> {
         let (_, camera, target, transform) = self.cameras.get(camera).ok()?;
-        let NormalizedRenderTarget::Window(window) = target.normalize(self.primary.single().ok())? else { return None };
+        let NormalizedRenderTarget::Window(window) = target.normalize(self.primary.single().ok())? else {
+            return None;
+        };
         let cursor = self.windows.get(window.entity()).ok()?.cursor_position()?;
         let ray = camera.viewport_to_world(transform, cursor).ok()?;
         Some((ray, transform))
@@ -129,7 +131,10 @@ fn press(
     settings: Res<PointerGrab>,
     buttons: Option<Res<ButtonInput<MouseButton>>>,
     rays: PointerRays,
-    bodies: Query<(Entity, &BodyState, &ShownState, &GlobalTransform, Option<&InheritedVisibility>), Without<NoPointerGrab>>,
+    bodies: Query<
+        (Entity, &BodyState, &ShownState, &GlobalTransform, Option<&InheritedVisibility>),
+        Without<NoPointerGrab>,
+    >,
     held: Query<(), With<PointerHeld>>,
 ) {
     let pressed = buttons.is_some_and(|buttons| buttons.just_pressed(settings.button));

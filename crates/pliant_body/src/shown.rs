@@ -38,7 +38,15 @@ pub struct ShownState {
 
 impl ShownState {
     pub(crate) fn new(q: &[f64]) -> Self {
-        Self { previous: q.to_vec(), current: q.to_vec(), shown: q.to_vec(), age: 1, settled: true, version: 1, poses: None }
+        Self {
+            previous: q.to_vec(),
+            current: q.to_vec(),
+            shown: q.to_vec(),
+            age: 1,
+            settled: true,
+            version: 1,
+            poses: None,
+        }
     }
 
     /// Makes `q` the newest state; the picture moves from the one before to it during the coming tick.
@@ -76,7 +84,10 @@ impl ShownState {
     /// As [`push`](Self::push); [`BodyError::PoseNotFinite`] for a pose with NaN or infinity.
     pub fn push_at(&mut self, q: &[f64], pose: Pose) -> Result<(), BodyError> {
         if !pose.origin.is_finite() || !pose.orientation.is_finite() {
-            return Err(BodyError::PoseNotFinite { origin: pose.origin.into(), orientation: pose.orientation.into() });
+            return Err(BodyError::PoseNotFinite {
+                origin: pose.origin.into(),
+                orientation: pose.orientation.into(),
+            });
         }
         self.push(q)?;
         self.poses = Some([self.poses.map_or(pose, |[_, current]| current), pose]);
@@ -159,7 +170,10 @@ pub(crate) fn interpolate(
             continue;
         }
         shown.interpolate(fraction);
-        if let Some([from, to]) = shown.poses {
+        if let Some([from, to]) = shown.poses
+            // Somebody has put it elsewhere since: the next tick takes that.
+            && state.is_placed(&transform.compute_affine())
+        {
             transform.translation = from.origin.lerp(to.origin, fraction).as_vec3();
             transform.rotation = from.orientation.slerp(to.orientation, fraction).normalize().as_quat();
             // So that the body does not take its own writing for somebody else's.

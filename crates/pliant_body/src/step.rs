@@ -11,8 +11,8 @@ use bevy::{
 use pliant_modal::{Body, GrabConfig, Patch};
 
 use crate::{
-    BodyError, BodyRefused, BodyState, Driven, Grab, GrabForce, Grabs, ModalAsset, ModalBody, Pose, STEP_TIME, ShownState,
-    body::Held,
+    BodyError, BodyRefused, BodyState, Driven, Grab, GrabForce, Grabs, ModalAsset, ModalBody, Pose,
+    STEP_TIME, ShownState, body::Held,
 };
 
 /// The tick: how many steps the schedule of the bodies has made. It counts on while bodies rest, and stands while time is paused.
@@ -131,11 +131,13 @@ pub(crate) fn count_tick(mut tick: ResMut<PliantTick>) {
 /// Takes the place of every body whose transform changed.
 pub(crate) fn place_bodies(
     mut refusals: Refusals,
-    mut bodies: Query<(NameOrEntity, &ModalBody, &GlobalTransform, &mut BodyState)>,
+    mut bodies: Query<(NameOrEntity, &ModalBody, &Transform, &GlobalTransform, &mut BodyState)>,
 ) {
-    for (name, body, transform, mut state) in &mut bodies {
+    for (name, body, local, global, mut state) in &mut bodies {
+        // A free body has no parent; what was written into its transform since the last frame is not in the global one yet.
+        let transform = if state.model().is_free() { GlobalTransform::from(*local) } else { *global };
         let affine = transform.affine();
-        if state.placed == Some(affine) {
+        if state.is_placed(&affine) {
             continue;
         }
         state.placed = Some(affine);
@@ -179,7 +181,7 @@ pub(crate) fn hold_bodies(
         (*quiet, *resting) = (0.0, false);
         held.retain(|held| {
             let stays = wanted.contains(&held.entity)
-                && grabs.get(held.entity).is_ok_and(|(_, grab)| grab.hold() == held.hold);
+                && grabs.get(held.entity).is_ok_and(|(_, grab)| grab.hold().is(&held.hold));
             if let (false, Some(id)) = (stays, held.id) {
                 body.release(id);
             }
@@ -220,7 +222,11 @@ pub(crate) fn step_bodies(
     let step = time.delta_secs_f64();
     let mut stepped = false;
     for (name, body, driven, mut state) in &mut bodies {
-        if *driven == Driven::Remote || state.resting {
+        let steps = *driven == Driven::Local && !state.resting;
+        if state.stepped != steps {
+            state.stepped = steps;
+        }
+        if !steps {
             continue;
         }
         stepped = true;
@@ -265,12 +271,9 @@ fn is_slow(body: &Body, limit: f64) -> bool {
     velocity.length() < limit && spin.length() < limit * mass * body.model().size()
 }
 
-pub(crate) fn publish(
-    mut bodies: Query<(&BodyState, &Driven, &mut ShownState)>,
-    mut forces: Query<&mut GrabForce>,
-) {
-    for (state, driven, mut shown) in &mut bodies {
-        if *driven == Driven::Remote || (state.resting && shown.is_settled()) {
+pub(crate) fn publish(mut bodies: Query<(&BodyState, &mut ShownState)>, mut forces: Query<&mut GrabForce>) {
+    for (state, mut shown) in &mut bodies {
+        if !state.stepped {
             continue;
         }
         let body = state.body();

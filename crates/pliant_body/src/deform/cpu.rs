@@ -59,7 +59,11 @@ pub(super) fn write(
     Some(Aabb::from_min_max(low, high))
 }
 
-fn float3(mesh: &mut Mesh, id: bevy::mesh::MeshVertexAttributeId, length: usize) -> Option<&mut Vec<[f32; 3]>> {
+fn float3(
+    mesh: &mut Mesh,
+    id: bevy::mesh::MeshVertexAttributeId,
+    length: usize,
+) -> Option<&mut Vec<[f32; 3]>> {
     match mesh.try_attribute_mut(id) {
         Ok(VertexAttributeValues::Float32x3(values)) if values.len() == length => Some(values),
         _ => None,

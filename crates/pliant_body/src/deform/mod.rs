@@ -13,7 +13,7 @@ use std::{
 };
 
 use bevy::{
-    asset::{AssetEventSystems, RenderAssetUsages},
+    asset::RenderAssetUsages,
     camera::{
         primitives::Aabb,
         visibility::{NoAutoAabb, VisibilitySystems},
@@ -59,7 +59,12 @@ impl Drawing {
             .parts()
             .displacement
             .chunks_exact(3 * vertices)
-            .map(|mode| mode.chunks_exact(3).map(|u| u[0] * u[0] + u[1] * u[1] + u[2] * u[2]).fold(0.0, f32::max).sqrt())
+            .map(|mode| {
+                mode.chunks_exact(3)
+                    .map(|u| u[0] * u[0] + u[1] * u[1] + u[2] * u[2])
+                    .fold(0.0, f32::max)
+                    .sqrt()
+            })
             .collect();
         let [low, high] = model.surface().bounds();
         Self {
@@ -110,8 +115,9 @@ pub(crate) fn build(app: &mut App) {
             PostUpdate,
             (make_meshes, deform_surfaces)
                 .chain()
+                // A server is built with this feature when its neighbour in the workspace draws: it has no meshes.
+                .run_if(resource_exists::<Assets<Mesh>>)
                 .in_set(PliantDisplaySystems::Deform)
-                .before(AssetEventSystems)
                 .before(VisibilitySystems::CalculateBounds),
         );
 }
@@ -182,8 +188,14 @@ fn deform_surfaces(
             continue;
         }
         let Some(mut mesh) = meshes.get_mut(&mesh.0) else { continue };
-        let bounds =
-            cpu::write(&drawn.model, &drawn.drawing.topology, shown.q(), state.warps(), &mut mesh, &mut scratch);
+        let bounds = cpu::write(
+            &drawn.model,
+            &drawn.drawing.topology,
+            shown.q(),
+            state.warps(),
+            &mut mesh,
+            &mut scratch,
+        );
         if let Some(bounds) = bounds {
             aabb.set_if_neq(bounds);
         }

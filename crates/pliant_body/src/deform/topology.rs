@@ -23,7 +23,8 @@ impl Topology {
     pub fn new(surface: &SurfaceMesh, crease: f32) -> Self {
         let triangles = surface.triangles();
         let welded = surface.welded();
-        let face_normals: Vec<[f32; 3]> = triangles.iter().map(|t| face_normal(surface.positions(), t)).collect();
+        let face_normals: Vec<[f32; 3]> =
+            triangles.iter().map(|t| face_normal(surface.positions(), t)).collect();
         let flattest = crease.cos();
 
         // A corner is a triangle at one of its vertices. Corners that meet across a smooth edge share a normal.
@@ -127,11 +128,21 @@ mod tests {
 
     #[test]
     fn a_texture_seam_is_two_vertices_with_one_normal() {
-        let positions = vec![[0.0, 0.0, 0.0], [1.0, 0.0, 0.0], [1.0, 1.0, 0.0], [0.0, 0.0, 0.0], [1.0, 1.0, 0.0], [0.0, 1.0, 0.0]];
+        let positions = vec![
+            [0.0, 0.0, 0.0],
+            [1.0, 0.0, 0.0],
+            [1.0, 1.0, 0.0],
+            [0.0, 0.0, 0.0],
+            [1.0, 1.0, 0.0],
+            [0.0, 1.0, 0.0],
+        ];
         let surface = SurfaceMesh::new(positions, vec![[0, 1, 2], [3, 4, 5]], None, Vec::new()).unwrap();
         let topology = Topology::new(&surface, 0.5);
         assert_eq!(topology.source.len(), 6);
         assert_eq!(topology.normals, 4);
-        assert_eq!(topology.normal[topology.triangles[0][0] as usize], topology.normal[topology.triangles[1][0] as usize]);
+        assert_eq!(
+            topology.normal[topology.triangles[0][0] as usize],
+            topology.normal[topology.triangles[1][0] as usize]
+        );
     }
 }

@@ -1,0 +1,194 @@
+use bevy::{math::DVec3, prelude::*};
+
+use super::{app, model, refusals, spawn, spawn_with, state, steps};
+use crate::{BodyState, Driven, Grab, GrabForce, GrabOf, Grabs, ModalAsset, ModalBody};
+
+fn linear(body: &mut ModalBody) {
+    body.warp = false;
+}
+
+fn grab(app: &mut App, body: Entity, target: DVec3) -> Entity {
+    app.world_mut().spawn((Grab::new(model::tip(), 0.0, target), GrabOf(body))).id()
+}
+
+fn force(app: &App, grab: Entity) -> GrabForce {
+    *app.world().get::<GrabForce>(grab).unwrap()
+}
+
+/// Pull over displacement at the tip, N/m, with a hand of compliance `c`: the modes are springs in series.
+fn tip_stiffness(axis: usize, c: f64) -> f64 {
+    let (mode, phi) =
+        [(3, (3.0 / model::MASS).sqrt()), (0, (5.0 / model::MASS).sqrt()), (1, (5.0 / model::MASS).sqrt())]
+            [axis];
+    let omega = std::f64::consts::TAU * model::FREQUENCIES[mode];
+    1.0 / ((phi / omega).powi(2) + c)
+}
+
+#[test]
+fn a_held_tip_pushes_back_with_its_static_stiffness() {
+    let mut app = app();
+    let body = spawn_with(&mut app, model::bar(), linear, ());
+    let hand = grab(&mut app, body, DVec3::new(1.0, 0.05, 0.0));
+    steps(&mut app, 400);
+    let held = state(&app, body).body().grabs().next().unwrap();
+    let c = state(&app, body).body().compliance(held).unwrap()[1][1];
+    let expected = -0.05 * tip_stiffness(1, c);
+    let felt = force(&app, hand);
+    assert!(
+        (felt.force.y - expected).abs() < 1e-6 * expected.abs(),
+        "{} N, expected {expected} N",
+        felt.force.y
+    );
+    assert!(felt.force.x.abs() < 1e-9 && felt.force.z.abs() < 1e-9);
+    // The patch is where target and pull leave it.
+    assert!((felt.point - DVec3::new(1.0, 0.05 + c * felt.force.y, 0.0)).length() < 1e-7, "{}", felt.point);
+}
+
+#[test]
+fn turning_moving_and_scaling_the_entity_turns_moves_and_scales_what_is_felt() {
+    let felt = |transform: Transform| {
+        let mut app = app();
+        let body = spawn_with(&mut app, model::bar(), linear, transform);
+        let target = transform.transform_point(Vec3::new(1.0, 0.05, 0.0)).as_dvec3();
+        let hand = grab(&mut app, body, target);
+        steps(&mut app, 400);
+        force(&app, hand)
+    };
+    let plain = felt(Transform::IDENTITY);
+    let placed = Transform::from_xyz(3.0, -1.0, 2.0)
+        .with_rotation(Quat::from_rotation_z(0.7))
+        .with_scale(Vec3::splat(2.0));
+    let moved = felt(placed);
+    // Transforms are in single precision. Twice the size at the same stiffness: twice the way, twice the force.
+    let expected = placed.rotation.as_dquat() * plain.force * 2.0;
+    assert!(
+        (moved.force - expected).length() < 1e-4 * expected.length(),
+        "{} against {expected}",
+        moved.force
+    );
+    let point = placed.transform_point(plain.point.as_vec3()).as_dvec3();
+    assert!((moved.point - point).length() < 1e-5);
+}
+
+#[test]
+fn a_grab_moves_nothing_until_its_target_does() {
+    let mut app = app();
+    let body = spawn(&mut app, model::bar(), ());
+    grab(&mut app, body, DVec3::new(1.0, 0.0, 0.0));
+    steps(&mut app, 20);
+    assert!(state(&app, body).body().q().iter().all(|q| q.abs() < 1e-9));
+}
+
+#[test]
+fn a_target_that_is_not_finite_is_refused_and_the_last_good_one_stays() {
+    let mut app = app();
+    let body = spawn(&mut app, model::bar(), ());
+    let good = DVec3::new(1.0, 0.05, 0.0);
+    let hand = grab(&mut app, body, good);
+    app.world_mut().entity_mut(hand).insert(Name::new("left hand"));
+    steps(&mut app, 100);
+    let before = force(&app, hand);
+    for (bad, word) in [(f64::NAN, "NaN"), (f64::INFINITY, "inf")] {
+        app.world_mut().get_mut::<Grab>(hand).unwrap().target.z = bad;
+        steps(&mut app, 30);
+        let told = refusals(&mut app);
+        assert_eq!(told.len(), 1, "once: {told:?}");
+        assert!(told[0].0 == hand && told[0].1.contains(word), "{told:?}");
+        let held = state(&app, body).body().grabs().next().unwrap();
+        assert_eq!(state(&app, body).body().target(held).unwrap(), <[f64; 3]>::from(good));
+        assert!((force(&app, hand).force - before.force).length() < 0.02 * before.force.length());
+        app.world_mut().get_mut::<Grab>(hand).unwrap().target = good;
+        steps(&mut app, 1);
+    }
+}
+
+#[test]
+fn a_grab_of_nothing_is_refused_and_the_body_goes_on() {
+    let mut app = app();
+    let body = spawn_with(&mut app, model::bar(), |body| body.gravity = DVec3::NEG_Y, ());
+    for (vertex, radius) in [(1_000_000, 0.01), (0, f64::NAN), (0, -1.0)] {
+        let hand = app.world_mut().spawn((Grab::new(vertex, radius, DVec3::ZERO), GrabOf(body))).id();
+        let before = state(&app, body).body().q()[0];
+        steps(&mut app, 3);
+        let told = refusals(&mut app);
+        assert!(told.len() == 1 && told[0].0 == hand, "{told:?}");
+        assert_ne!(state(&app, body).body().q()[0], before);
+        assert_eq!(force(&app, hand), GrabForce::default());
+    }
+}
+
+#[test]
+fn despawning_a_grab_or_unrelating_it_lets_go() {
+    let mut app = app();
+    let body = spawn(&mut app, model::bar(), ());
+    let (a, b) =
+        (grab(&mut app, body, DVec3::new(1.0, 0.1, 0.0)), grab(&mut app, body, DVec3::new(1.0, 0.0, 0.1)));
+    steps(&mut app, 5);
+    assert_eq!(state(&app, body).body().grabs().count(), 2);
+    assert_eq!(app.world().get::<Grabs>(body).unwrap().entities(), [a, b]);
+    app.world_mut().despawn(a);
+    steps(&mut app, 1);
+    assert_eq!(state(&app, body).body().grabs().count(), 1);
+    app.world_mut().entity_mut(b).remove::<GrabOf>();
+    steps(&mut app, 400);
+    assert_eq!(state(&app, body).body().grabs().count(), 0);
+    assert!(state(&app, body).is_resting(), "let go, it swings back and rests");
+}
+
+#[test]
+fn despawning_a_body_despawns_the_hands_on_it() {
+    let mut app = app();
+    let body = spawn(&mut app, model::bar(), ());
+    let hand = grab(&mut app, body, DVec3::new(1.0, 0.1, 0.0));
+    steps(&mut app, 5);
+    app.world_mut().despawn(body);
+    steps(&mut app, 3);
+    assert!(app.world().get_entity(hand).is_err());
+}
+
+#[test]
+fn a_body_swapped_while_held_is_held_on_in_its_new_shape() {
+    let mut app = app();
+    let body = spawn(&mut app, model::bar(), ());
+    let hand = grab(&mut app, body, DVec3::new(1.0, 0.1, 0.0));
+    steps(&mut app, 50);
+    let other = app.world_mut().resource_mut::<Assets<ModalAsset>>().add(ModalAsset::from(model::free_bar()));
+    app.world_mut().get_mut::<ModalBody>(body).unwrap().model = other;
+    steps(&mut app, 3);
+    assert!(state(&app, body).model().is_free());
+    assert_eq!(state(&app, body).body().grabs().count(), 1);
+    assert!(force(&app, hand).force.length() > 0.0);
+
+    // Removing the component while held leaves nothing behind that could be stepped.
+    app.world_mut().entity_mut(body).remove::<ModalBody>();
+    steps(&mut app, 3);
+    assert!(app.world().get::<BodyState>(body).is_none());
+}
+
+#[test]
+fn changing_the_number_of_modes_keeps_the_motion_of_those_that_stay() {
+    let mut app = app();
+    let body = spawn_with(&mut app, model::bar(), |body| body.gravity = DVec3::new(1.0, -9.0, 0.0), ());
+    steps(&mut app, 400);
+    let before = state(&app, body).body().q().to_vec();
+    app.world_mut().get_mut::<ModalBody>(body).unwrap().modes = Some(2);
+    steps(&mut app, 1);
+    let after = state(&app, body).body().q();
+    assert_eq!(after.len(), 2);
+    assert!((after[0] - before[0]).abs() < 1e-4 * before[0].abs(), "{after:?} against {before:?}");
+}
+
+#[test]
+fn a_remote_body_leaves_its_grabs_to_its_driver() {
+    let mut app = app();
+    let body = spawn(&mut app, model::bar(), ());
+    let hand = grab(&mut app, body, DVec3::new(1.0, 0.1, 0.0));
+    steps(&mut app, 5);
+    app.world_mut().entity_mut(body).insert(Driven::Remote);
+    steps(&mut app, 1);
+    assert_eq!(state(&app, body).body().grabs().count(), 0);
+    let given = GrabForce { force: DVec3::X, point: DVec3::Y };
+    app.world_mut().entity_mut(hand).insert(given);
+    steps(&mut app, 5);
+    assert_eq!(force(&app, hand), given);
+}

@@ -1,0 +1,79 @@
+//! Apps with time by hand and a bar whose modes are written down, so that every number has an outside value.
+
+mod display;
+mod grabs;
+mod model;
+mod pointer;
+mod stepping;
+
+use std::{sync::Arc, time::Duration};
+
+use bevy::{prelude::*, time::TimeUpdateStrategy, transform::TransformPlugin};
+use pliant_modal::ModalModel;
+
+use crate::{BodyRefused, BodyState, ModalAsset, ModalBody, PliantBodyPlugin, PliantTick};
+
+/// Seconds a step.
+pub const STEP: f64 = 1.0 / 40.0;
+
+/// An app without a renderer whose every update is one step.
+pub fn app() -> App {
+    let mut app = App::new();
+    app.add_plugins((MinimalPlugins, AssetPlugin::default(), TransformPlugin))
+        .insert_resource(Time::<Fixed>::from_seconds(STEP))
+        .insert_resource(TimeUpdateStrategy::FixedTimesteps(1))
+        .add_plugins(PliantBodyPlugin::default())
+        .init_resource::<Told>()
+        .add_systems(Last, |mut refused: MessageReader<BodyRefused>, mut told: ResMut<Told>| {
+            told.0.extend(refused.read().map(|refused| (refused.entity, refused.error.to_string())));
+        });
+    app.update();
+    app
+}
+
+#[derive(Resource, Default)]
+struct Told(Vec<(Entity, String)>);
+
+/// Spawns a body with the rest of `bundle`; its first step is the next update's.
+pub fn spawn(app: &mut App, model: ModalModel, bundle: impl Bundle) -> Entity {
+    spawn_with(app, model, |_| {}, bundle)
+}
+
+pub fn spawn_with(
+    app: &mut App,
+    model: ModalModel,
+    settings: impl FnOnce(&mut ModalBody),
+    bundle: impl Bundle,
+) -> Entity {
+    let handle = app.world_mut().resource_mut::<Assets<ModalAsset>>().add(ModalAsset(Arc::new(model)));
+    let mut body = ModalBody::new(handle);
+    settings(&mut body);
+    let entity = app.world_mut().spawn((body, bundle)).id();
+    app.update();
+    entity
+}
+
+pub fn steps(app: &mut App, count: usize) {
+    for _ in 0..count {
+        app.update();
+    }
+}
+
+/// Whole steps of time a frame, as a fraction: 0.5 is two frames a step.
+pub fn frames_of(app: &mut App, fraction: f64) {
+    let frame = Duration::from_secs_f64(STEP * fraction);
+    app.insert_resource(TimeUpdateStrategy::ManualDuration(frame));
+}
+
+pub fn state(app: &App, body: Entity) -> &BodyState {
+    app.world().get::<BodyState>(body).expect("the body was made")
+}
+
+pub fn tick(app: &App) -> u64 {
+    app.world().resource::<PliantTick>().0
+}
+
+/// What was refused since the last call, as text.
+pub fn refusals(app: &mut App) -> Vec<(Entity, String)> {
+    std::mem::take(&mut app.world_mut().resource_mut::<Told>().0)
+}

@@ -1,0 +1,116 @@
+use bevy::{
+    camera::{ComputedCameraValues, RenderTargetInfo},
+    math::DVec3,
+    prelude::*,
+    window::PrimaryWindow,
+};
+
+use super::{app, model, spawn_with, state, steps};
+use crate::{Driven, Grab, GrabOf, NoPointerGrab, PointerGrab, PointerGrabPlugin, PointerHeld, ShownState};
+
+/// A camera two metres from the tip of the bar, looking along -z at a window of 800 x 600, and the bar, driven by hand.
+fn scene() -> (App, Entity, Entity) {
+    let mut app = app();
+    app.add_plugins(PointerGrabPlugin).init_resource::<ButtonInput<MouseButton>>();
+    let window = Window { resolution: (800, 600).into(), ..Default::default() };
+    let window = app.world_mut().spawn((window, PrimaryWindow)).id();
+    let size = RenderTargetInfo { physical_size: UVec2::new(800, 600), scale_factor: 1.0 };
+    let clip_from_view = Mat4::perspective_infinite_reverse_rh(1.0, 800.0 / 600.0, 0.1);
+    let computed = ComputedCameraValues { clip_from_view, target_info: Some(size), ..Default::default() };
+    app.world_mut().spawn((Camera { computed, ..Default::default() }, Transform::from_xyz(1.0, 0.0, 2.1)));
+    let body = spawn_with(
+        &mut app,
+        model::bar(),
+        |body| body.warp = false,
+        (Driven::Remote, InheritedVisibility::VISIBLE),
+    );
+    (app, window, body)
+}
+
+/// Presses or releases the left button with the pointer at `at` (m from the middle of the view in the plane z = 0.1, in front of which
+/// the camera stands by two metres).
+fn point(app: &mut App, window: Entity, at: Vec2, down: bool) {
+    let pixels_a_metre = 300.0 / (2.0 * 0.5f32.tan());
+    let cursor = Vec2::new(400.0, 300.0) + Vec2::new(at.x, -at.y) * pixels_a_metre;
+    app.world_mut().get_mut::<Window>(window).unwrap().set_cursor_position(Some(cursor));
+    let mut buttons = app.world_mut().resource_mut::<ButtonInput<MouseButton>>();
+    buttons.clear();
+    if down {
+        buttons.press(MouseButton::Left)
+    } else {
+        buttons.release(MouseButton::Left)
+    }
+    app.update();
+}
+
+fn held(app: &mut App) -> Option<(Entity, Grab, GrabOf)> {
+    let mut query = app.world_mut().query_filtered::<(Entity, &Grab, &GrabOf), With<PointerHeld>>();
+    query.single(app.world()).ok().map(|(entity, grab, of)| (entity, *grab, *of))
+}
+
+#[test]
+fn the_pointer_takes_the_surface_where_it_is_now_and_drags_it_in_the_plane_that_faces_the_camera() {
+    let (mut app, window, body) = scene();
+    // Bent up until the tip is half a metre higher: where the rest shape was, there is nothing to take.
+    let q = 0.5 / (5.0 / model::MASS).sqrt();
+    app.world_mut().get_mut::<ShownState>(body).unwrap().snap(&[q, 0.0, 0.0, 0.0]).unwrap();
+    point(&mut app, window, Vec2::new(-0.02, 0.0), true);
+    assert_eq!(held(&mut app), None);
+    point(&mut app, window, Vec2::new(-0.02, 0.0), false);
+
+    point(&mut app, window, Vec2::new(-0.1, 0.42), true);
+    let (_, grab, of) = held(&mut app).expect("the bent bar is there");
+    assert_eq!(of, GrabOf(body));
+    assert_eq!(grab.radius, 0.06 * state(&app, body).model().size());
+    let at = state(&app, body).model().surface().positions()[grab.vertex as usize];
+    assert!(at[0] > 0.8 && at[2] == 0.1, "the nearest vertex is on the side that faces the camera: {at:?}");
+
+    // The target starts at the patch, not at the pointer, and follows by as much as the pointer goes.
+    let start = grab.target;
+    point(&mut app, window, Vec2::new(0.1, 0.52), true);
+    let (_, moved, _) = held(&mut app).unwrap();
+    assert!(
+        (moved.target - start - DVec3::new(0.2, 0.1, 0.0)).length() < 1e-3,
+        "{} from {start}",
+        moved.target
+    );
+
+    point(&mut app, window, Vec2::new(0.1, 0.52), false);
+    assert_eq!(held(&mut app), None);
+}
+
+#[test]
+fn what_is_beside_hidden_from_the_pointer_or_switched_off_is_not_taken() {
+    let (mut app, window, body) = scene();
+    point(&mut app, window, Vec2::new(0.5, 0.5), true);
+    assert_eq!(held(&mut app), None, "beside");
+    point(&mut app, window, Vec2::ZERO, false);
+
+    app.world_mut().entity_mut(body).insert(NoPointerGrab);
+    point(&mut app, window, Vec2::new(-0.05, 0.0), true);
+    assert_eq!(held(&mut app), None, "a ghost");
+    point(&mut app, window, Vec2::ZERO, false);
+
+    app.world_mut().entity_mut(body).remove::<NoPointerGrab>();
+    app.world_mut().resource_mut::<PointerGrab>().enabled = false;
+    point(&mut app, window, Vec2::new(-0.05, 0.0), true);
+    assert_eq!(held(&mut app), None, "switched off");
+    point(&mut app, window, Vec2::ZERO, false);
+
+    app.world_mut().resource_mut::<PointerGrab>().enabled = true;
+    point(&mut app, window, Vec2::new(-0.05, 0.0), true);
+    assert!(held(&mut app).is_some());
+    app.world_mut().resource_mut::<PointerGrab>().enabled = false;
+    steps(&mut app, 1);
+    assert_eq!(held(&mut app), None, "switching off lets go");
+}
+
+#[test]
+fn a_body_that_goes_while_it_is_dragged_takes_the_grab_along() {
+    let (mut app, window, body) = scene();
+    point(&mut app, window, Vec2::new(-0.05, 0.0), true);
+    assert!(held(&mut app).is_some());
+    app.world_mut().despawn(body);
+    point(&mut app, window, Vec2::new(0.0, 0.1), true);
+    assert_eq!(held(&mut app), None);
+}

@@ -1,0 +1,224 @@
+use bevy::{asset::LoadState, math::DVec3, prelude::*};
+
+use super::{app, frames_of, model, refusals, spawn, spawn_with, state, steps, tick};
+use crate::{Driven, ModalAsset, ModalBody, PliantBodyPlugin, PliantSystems, Pose, ShownState};
+
+#[test]
+fn a_body_under_its_own_weight_hangs_by_participation_over_stiffness() {
+    let mut app = app();
+    let body = spawn_with(&mut app, model::bar(), |body| body.gravity = DVec3::new(0.0, -9.81, 0.0), ());
+    steps(&mut app, 400);
+    // One mode of bending along y, phi = sqrt(5/m) x^2: q = g Gamma / omega^2, and the tip sinks by phi(1) q = 5/3 g / omega^2.
+    let expected = 5.0 / 3.0 * 9.81 / (2.0 * std::f64::consts::PI * model::FREQUENCIES[0]).powi(2);
+    let tip = (5.0 / model::MASS).sqrt() * state(&app, body).body().q()[0];
+    assert!((tip + expected).abs() < 1e-4 * expected, "sank {tip} m, expected -{expected} m");
+}
+
+#[test]
+fn the_shape_is_the_same_to_the_bit_whatever_the_order_of_spawning() {
+    let run = |first: usize| {
+        let mut app = app();
+        let spawn_one = |app: &mut App, gravity: f64| {
+            spawn_with(app, model::bar(), |body| body.gravity = DVec3::new(0.3, -gravity, 0.1), ())
+        };
+        let gravities = [9.81, 1.62];
+        let (a, b) = (spawn_one(&mut app, gravities[first]), spawn_one(&mut app, gravities[1 - first]));
+        let start = tick(&app);
+        steps(&mut app, 60 - start as usize);
+        [a, b].map(|body| state(&app, body).body().q().to_vec())
+    };
+    let ([a, b], [d, c]) = (run(0), run(1));
+    // The second body of each app began a tick later: compare the bodies that began alike.
+    assert_ne!(a, d);
+    assert_eq!(run(0), [a, b]);
+    assert_eq!(run(1), [d, c]);
+}
+
+#[test]
+fn pausing_virtual_time_stops_the_tick_and_the_state() {
+    let mut app = app();
+    let body = spawn_with(&mut app, model::bar(), |body| body.gravity = DVec3::NEG_Y, ());
+    frames_of(&mut app, 1.0);
+    steps(&mut app, 5);
+    app.world_mut().resource_mut::<Time<Virtual>>().pause();
+    let (before, at) = (state(&app, body).body().q().to_vec(), tick(&app));
+    steps(&mut app, 10);
+    assert_eq!((state(&app, body).body().q(), tick(&app)), (&before[..], at));
+    app.world_mut().resource_mut::<Time<Virtual>>().unpause();
+    steps(&mut app, 2);
+    assert_eq!(tick(&app), at + 2);
+    assert_ne!(state(&app, body).body().q(), before);
+}
+
+#[test]
+fn a_still_body_rests_after_half_a_second_and_a_touch_wakes_it() {
+    let mut app = app();
+    let body = spawn(&mut app, model::bar(), ());
+    steps(&mut app, 19);
+    assert!(!state(&app, body).is_resting());
+    steps(&mut app, 2);
+    assert!(state(&app, body).is_resting(), "0.5 s are 20 steps");
+    let version = app.world().get::<ShownState>(body).unwrap().version();
+    steps(&mut app, 50);
+    // No step and nothing for the picture to do.
+    assert_eq!(app.world().get::<ShownState>(body).unwrap().version(), version);
+
+    app.world_mut()
+        .get_mut::<crate::BodyState>(body)
+        .unwrap()
+        .body_mut()
+        .strike(model::tip(), [0.0, 1.0, 0.0])
+        .unwrap();
+    steps(&mut app, 1);
+    assert!(state(&app, body).body().q()[0] > 0.0);
+    assert!(app.world().get::<ShownState>(body).unwrap().version() > version);
+}
+
+#[test]
+fn the_picture_stands_between_the_last_two_steps() {
+    let mut app = app();
+    let body = spawn_with(&mut app, model::bar(), |body| body.gravity = DVec3::NEG_Y, ());
+    steps(&mut app, 3);
+    frames_of(&mut app, 0.25);
+    let mut seen = Vec::new();
+    for _ in 0..8 {
+        app.update();
+        let shown = app.world().get::<ShownState>(body).unwrap();
+        let fraction = app.world().resource::<Time<Fixed>>().overstep_fraction_f64();
+        let expected = shown.previous()[0] + (shown.current()[0] - shown.previous()[0]) * fraction;
+        assert_eq!(shown.q()[0], expected, "at {fraction} of a step");
+        assert_eq!(shown.current(), state(&app, body).body().q());
+        seen.push(shown.q()[0]);
+    }
+    assert!(seen.windows(2).all(|w| w[1] < w[0]), "it falls in every frame: {seen:?}");
+}
+
+#[test]
+fn a_remote_body_shows_what_is_pushed_and_is_not_stepped() {
+    let mut app = app();
+    let body = spawn_with(&mut app, model::bar(), |body| body.gravity = DVec3::NEG_Y, Driven::Remote);
+    steps(&mut app, 10);
+    assert_eq!(state(&app, body).body().q(), [0.0; 4]);
+
+    app.add_systems(
+        FixedUpdate,
+        (|mut shown: Single<&mut ShownState>, tick: Res<crate::PliantTick>| {
+            shown.push(&[tick.0 as f64, 0.0, 0.0, 0.0]).unwrap();
+        })
+        .in_set(PliantSystems::Publish),
+    );
+    frames_of(&mut app, 0.5);
+    steps(&mut app, 9);
+    let shown = app.world().get::<ShownState>(body).unwrap();
+    let fraction = app.world().resource::<Time<Fixed>>().overstep_fraction_f64();
+    assert_eq!(shown.q()[0], (tick(&app) - 1) as f64 + fraction);
+
+    let mut shown = app.world_mut().get_mut::<ShownState>(body).unwrap();
+    assert!(shown.push(&[0.0; 3]).unwrap_err().to_string().contains("needs 4 modal coordinates, got 3"));
+    assert!(shown.push(&[0.0, f64::NAN, 0.0, 0.0]).unwrap_err().to_string().contains("modal coordinate 1"));
+    assert!(shown.push_at(&[0.0; 4], Pose { origin: DVec3::NAN, orientation: Default::default() }).is_err());
+    assert!(shown.current()[0] > 0.0, "what was refused changed nothing");
+}
+
+#[test]
+fn in_another_schedule_the_step_is_the_frame() {
+    let mut app = App::new();
+    app.add_plugins((MinimalPlugins, AssetPlugin::default(), TransformPlugin))
+        .insert_resource(bevy::time::TimeUpdateStrategy::ManualDuration(std::time::Duration::from_millis(5)))
+        .add_plugins(PliantBodyPlugin::new(Update));
+    app.update();
+    let body = spawn_with(&mut app, model::bar(), |body| body.gravity = DVec3::NEG_Y, ());
+    steps(&mut app, 9);
+    assert_eq!(tick(&app), 10, "the first update of an app has no time in it");
+    assert_eq!(state(&app, body).body().config().step, 0.005);
+    let shown = app.world().get::<ShownState>(body).unwrap();
+    assert_eq!(shown.q(), state(&app, body).body().q());
+}
+
+#[test]
+fn settings_that_make_no_body_are_refused_by_name_and_may_be_mended() {
+    let mut app = app();
+    let body = spawn_with(&mut app, model::bar(), |body| body.damping_scale = f64::NAN, Name::new("jelly"));
+    steps(&mut app, 3);
+    assert!(app.world().get::<crate::BodyState>(body).is_none());
+    let told = refusals(&mut app);
+    assert_eq!(told.len(), 1, "once, not every frame: {told:?}");
+    assert!(told[0].0 == body && told[0].1.contains("damping_scale"), "{told:?}");
+
+    app.world_mut().get_mut::<ModalBody>(body).unwrap().damping_scale = 1.0;
+    steps(&mut app, 1);
+    assert!(app.world().get::<crate::BodyState>(body).is_some());
+    // A change for the worse leaves the running body as it was.
+    app.world_mut().get_mut::<ModalBody>(body).unwrap().damping_scale = -1.0;
+    steps(&mut app, 1);
+    assert_eq!(state(&app, body).body().config().damping_scale, 1.0);
+    assert_eq!(refusals(&mut app).len(), 1);
+}
+
+#[test]
+fn a_transform_that_cannot_place_a_body_is_refused_and_the_body_stays() {
+    let mut app = app();
+    let body = spawn(&mut app, model::bar(), Transform::from_xyz(1.0, 2.0, 3.0));
+    steps(&mut app, 1);
+    assert_eq!(state(&app, body).body().frame().origin(), [1.0, 2.0, 3.0]);
+    let wrong = [
+        Transform::from_scale(Vec3::new(1.0, 2.0, 1.0)),
+        Transform::from_scale(Vec3::ZERO),
+        Transform::from_scale(Vec3::new(-1.0, 1.0, 1.0)),
+        Transform::from_xyz(f32::NAN, 0.0, 0.0),
+    ];
+    for transform in wrong {
+        app.world_mut().entity_mut(body).insert(transform);
+        steps(&mut app, 3);
+        let told = refusals(&mut app);
+        assert!(told.len() == 1 && told[0].1.contains("positive, uniform scale"), "{transform:?}: {told:?}");
+        assert_eq!(state(&app, body).body().frame().origin(), [1.0, 2.0, 3.0]);
+    }
+}
+
+#[test]
+fn a_free_body_falls_by_its_own_transform_and_can_be_put_elsewhere() {
+    let mut app = app();
+    let start = Transform::from_xyz(0.0, 10.0, 0.0);
+    let body =
+        spawn_with(&mut app, model::free_bar(), |body| body.gravity = DVec3::new(0.0, -10.0, 0.0), start);
+    steps(&mut app, 40);
+    // One second, and as every update is a whole step, the picture is one step behind: s = g t^2 / 2.
+    let t = 39.0 * super::STEP;
+    let y = app.world().get::<Transform>(body).unwrap().translation.y;
+    assert!((f64::from(y) - (10.0 - 5.0 * t * t)).abs() < 1e-4, "{y}");
+    assert!((state(&app, body).body().frame().velocity()[1] + 10.0).abs() < 1e-9);
+
+    app.world_mut().get_mut::<Transform>(body).unwrap().translation = Vec3::new(5.0, 100.0, 0.0);
+    steps(&mut app, 2);
+    let frame = state(&app, body).body().frame();
+    assert!((frame.origin()[0] - 5.0).abs() < 1e-6 && frame.origin()[1] > 99.0, "{frame:?}");
+    assert!(frame.velocity()[1] < -10.0, "its velocity is kept");
+}
+
+#[test]
+fn a_modal_file_loads_and_a_cut_one_says_why() {
+    let folder = std::env::temp_dir().join(format!("pliant_body_test_{}", std::process::id()));
+    std::fs::create_dir_all(&folder).unwrap();
+    let bytes = model::bar().to_bytes();
+    std::fs::write(folder.join("bar.modal"), &bytes).unwrap();
+    std::fs::write(folder.join("cut.modal"), &bytes[..bytes.len() / 2]).unwrap();
+
+    let mut app = App::new();
+    let assets = AssetPlugin { file_path: folder.display().to_string(), ..Default::default() };
+    app.add_plugins((MinimalPlugins, assets, TransformPlugin, PliantBodyPlugin::default()));
+    let server = app.world().resource::<AssetServer>().clone();
+    let (whole, cut): (Handle<ModalAsset>, Handle<ModalAsset>) =
+        (server.load("bar.modal"), server.load("cut.modal"));
+    let body = app.world_mut().spawn(ModalBody::new(whole)).id();
+    let deadline = std::time::Instant::now() + std::time::Duration::from_secs(20);
+    while app.world().get::<crate::BodyState>(body).is_none() || !server.load_state(&cut).is_failed() {
+        assert!(std::time::Instant::now() < deadline, "not loaded in 20 s");
+        app.update();
+        std::thread::sleep(std::time::Duration::from_millis(1));
+    }
+    assert_eq!(state(&app, body).model().hash(), model::bar().hash());
+    let LoadState::Failed(error) = server.load_state(&cut) else { panic!("loaded half a file") };
+    assert!(error.to_string().contains("cut or padded .modal file"), "{error}");
+    std::fs::remove_dir_all(folder).unwrap();
+}
