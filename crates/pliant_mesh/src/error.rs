@@ -150,6 +150,24 @@ pub enum MeshError {
         /// Where, in m.
         at: [f64; 3],
     },
+    /// No lattice gave the wanted number of tetrahedra.
+    #[error(
+        "number of tetrahedra: expected a mesh of {wanted} within 5 %, the nearest has {nearest}; ask for that or for more"
+    )]
+    TetCount {
+        /// The wanted number.
+        wanted: usize,
+        /// The nearest number that was reached.
+        nearest: usize,
+    },
+    /// A mesh that was made here has angles that it should not have.
+    #[error("dihedral angles: expected {expected:?} degrees, found {found:?}")]
+    Dihedral {
+        /// Smallest and largest allowed angle, degrees.
+        expected: [f64; 2],
+        /// Smallest and largest angle, degrees.
+        found: [f64; 2],
+    },
     /// A parameter is out of its range.
     #[error("{name}: expected {expected}, found {found}")]
     Parameter {

@@ -6,12 +6,17 @@
     allow(clippy::unwrap_used, clippy::expect_used, clippy::panic, reason = "a failed test should panic")
 )]
 
+mod bvh;
 mod error;
 pub mod io;
+pub mod sdf;
 pub mod shapes;
+mod solid;
+pub mod stuffing;
 mod surface;
 mod tets;
 
 pub use error::{MeshError, Place};
+pub use stuffing::{Parts, StuffOptions, stuff};
 pub use surface::Surface;
 pub use tets::{Quality, TetMesh};

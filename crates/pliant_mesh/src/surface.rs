@@ -82,8 +82,46 @@ impl Surface {
         vertices.len() as i64 - edges.len() as i64 + self.triangles.len() as i64
     }
 
-    fn corners(&self) -> impl Iterator<Item = [Vector3<f64>; 3]> + '_ {
+    /// How many pieces there are that have no vertex in common.
+    pub(crate) fn part_count(&self) -> usize {
+        let mut parts = Connected::new(self.positions.len());
+        for t in &self.triangles {
+            parts.join(t[0], t[1]);
+            parts.join(t[0], t[2]);
+        }
+        let mut roots: Vec<u32> = self.triangles.iter().map(|t| parts.of(t[0])).collect();
+        roots.sort_unstable();
+        roots.dedup();
+        roots.len()
+    }
+
+    pub(crate) fn corners(&self) -> impl Iterator<Item = [Vector3<f64>; 3]> + '_ {
         self.triangles.iter().map(|t| t.map(|v| Vector3::from(self.positions[v as usize])))
+    }
+}
+
+/// Which nodes hang together, as trees that point to a node of the part.
+pub(crate) struct Connected(Vec<u32>);
+
+impl Connected {
+    pub(crate) fn new(nodes: usize) -> Self {
+        Self((0..nodes as u32).collect())
+    }
+
+    pub(crate) fn join(&mut self, a: u32, b: u32) {
+        let (a, b) = (self.of(a), self.of(b));
+        // The lower number leads, so that the result depends on the mesh only.
+        self.0[a.max(b) as usize] = a.min(b);
+    }
+
+    /// The node that stands for the part of `node`.
+    pub(crate) fn of(&mut self, mut node: u32) -> u32 {
+        while self.0[node as usize] != node {
+            let above = self.0[node as usize];
+            self.0[node as usize] = self.0[above as usize];
+            node = above;
+        }
+        node
     }
 }
 

@@ -19,7 +19,7 @@ use std::{
     path::Path,
 };
 
-use crate::{MeshError, Surface, TetMesh};
+use crate::{MeshError, StuffOptions, Surface, TetMesh, sdf::SurfaceDistance, stuff};
 
 pub use msh::MshVersion;
 
@@ -40,6 +40,23 @@ pub enum Input {
     Tets(TetMesh),
 }
 
+impl Input {
+    /// The tetrahedra themselves, or what [`stuff`] makes of the shape.
+    ///
+    /// # Errors
+    /// What [`SurfaceDistance::new`] and [`stuff`] say.
+    pub fn into_tets(
+        self,
+        options: &StuffOptions,
+        progress: &mut dyn FnMut(f32),
+    ) -> Result<TetMesh, MeshError> {
+        match self {
+            Self::Surface(surface) => stuff(&SurfaceDistance::new(&surface)?, options, progress),
+            Self::Tets(mesh) => Ok(mesh),
+        }
+    }
+}
+
 /// Reads a file of any known kind; the extension decides.
 ///
 /// # Errors
@@ -55,7 +72,7 @@ pub fn read(path: impl AsRef<Path>) -> Result<Input, MeshError> {
 }
 
 /// Reads a triangle surface: finite, with valid indices, but perhaps open or crossing itself (a visible skin may be;
-/// what is to be filled with tetrahedra may not).
+/// what is to be filled with tetrahedra may not, see [`Surface::closed`]).
 ///
 /// Polygons are cut into fans. Where a vertex has several texture coordinates it is split, one copy for each.
 ///

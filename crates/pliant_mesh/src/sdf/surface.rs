@@ -1,0 +1,150 @@
+//! The distance from a triangle surface.
+
+use std::collections::HashMap;
+
+use nalgebra::Vector3;
+
+use super::SignedDistance;
+use crate::{
+    MeshError, Surface,
+    bvh::{Bvh, Feature},
+};
+
+/// The solid inside a closed triangle surface.
+///
+/// The size of the distance is exact. The sign comes from the normal at the closest point (of the face, else the
+/// angle-weighted mean of the faces around the edge or vertex: Baerentzen and Aanaes 2005), which is exact for one
+/// closed surface; where the surface has several parts it comes from the winding number, so that parts inside
+/// of others are what their winding says: hollows if they face inwards, of no effect if they face outwards.
+#[derive(Debug)]
+pub struct SurfaceDistance {
+    bvh: Bvh,
+    bounds: [[f64; 3]; 2],
+    sign: Sign,
+}
+
+#[derive(Debug)]
+enum Sign {
+    /// For each triangle the normals of its face, its three edges and its three corners, of any length.
+    Normals(Vec<[Vector3<f64>; 7]>),
+    Winding,
+}
+
+impl SurfaceDistance {
+    /// Prepares a surface that [`Surface::closed`] accepts.
+    ///
+    /// # Errors
+    /// What [`Surface::closed`] says.
+    pub fn new(surface: &Surface) -> Result<Self, MeshError> {
+        let solid = surface.closed()?;
+        let corners: Vec<[Vector3<f64>; 3]> = solid.corners().collect();
+        let sign =
+            if solid.part_count() == 1 { Sign::Normals(normals(&solid, &corners)) } else { Sign::Winding };
+        Ok(Self { bvh: Bvh::new(&corners), bounds: solid.bounds(), sign })
+    }
+
+    /// How often the surface winds around `p`: 1 inside, 0 outside.
+    pub fn winding_number(&self, p: [f64; 3]) -> f64 {
+        self.bvh.winding_number(p.into())
+    }
+}
+
+impl SignedDistance for SurfaceDistance {
+    fn distance(&self, p: [f64; 3]) -> f64 {
+        let p = Vector3::from(p);
+        let closest = self.bvh.closest(p);
+        let inside = match &self.sign {
+            Sign::Winding => self.bvh.winding_number(p) > 0.5,
+            Sign::Normals(normals) => {
+                let normal = normals[closest.triangle as usize][match closest.feature {
+                    Feature::Face => 0,
+                    Feature::Edge(i) => 1 + i,
+                    Feature::Corner(i) => 4 + i,
+                }];
+                normal.dot(&(p - closest.point)) < 0.0
+            }
+        };
+        if inside { -closest.distance } else { closest.distance }
+    }
+
+    fn bounds(&self) -> [[f64; 3]; 2] {
+        self.bounds
+    }
+}
+
+fn normals(solid: &Surface, corners: &[[Vector3<f64>; 3]]) -> Vec<[Vector3<f64>; 7]> {
+    let faces: Vec<Vector3<f64>> =
+        corners.iter().map(|[a, b, c]| (b - a).cross(&(c - a)).normalize()).collect();
+    let mut at_vertex = vec![Vector3::zeros(); solid.positions.len()];
+    let mut at_edge: HashMap<[u32; 2], Vector3<f64>> = HashMap::new();
+    let edge = |t: &[u32; 3], i: usize| {
+        let (a, b) = (t[i], t[(i + 1) % 3]);
+        [a.min(b), a.max(b)]
+    };
+    for ((t, c), face) in solid.triangles.iter().zip(corners).zip(&faces) {
+        for i in 0..3 {
+            let (u, v) = (c[(i + 1) % 3] - c[i], c[(i + 2) % 3] - c[i]);
+            at_vertex[t[i] as usize] += u.angle(&v) * face;
+            *at_edge.entry(edge(t, i)).or_insert_with(Vector3::zeros) += face;
+        }
+    }
+    let all = solid.triangles.iter().zip(&faces).map(|(t, face)| {
+        let edges: [Vector3<f64>; 3] =
+            std::array::from_fn(|i| at_edge.get(&edge(t, i)).copied().unwrap_or_else(Vector3::zeros));
+        let vertices = t.map(|v| at_vertex[v as usize]);
+        [*face, edges[0], edges[1], edges[2], vertices[0], vertices[1], vertices[2]]
+    });
+    all.collect()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::shapes;
+
+    #[test]
+    fn the_distance_from_a_cube_is_exact_in_all_its_regions() {
+        let (cube, _) = shapes::cube(3, 2.0).unwrap().boundary();
+        let sdf = SurfaceDistance::new(&cube).unwrap();
+        for (p, distance) in [
+            ([1.0, 1.0, 1.0], -1.0),
+            ([1.0, 0.25, 0.9], -0.25),
+            ([1.2, 3.0, 0.7], 1.0),
+            ([1.2, 3.0, 4.0], 5.0_f64.sqrt()),
+            ([-1.0, 3.0, 4.0], 6.0_f64.sqrt()),
+            ([1.0, 2.0, 1.0], 0.0),
+        ] {
+            assert!((sdf.distance(p) - distance).abs() < 1e-14, "{p:?}: {}", sdf.distance(p));
+        }
+    }
+
+    #[test]
+    fn normals_and_winding_numbers_give_the_same_sign() {
+        let (ball, _) = shapes::sphere(7, 1.0).unwrap().boundary();
+        let sdf = SurfaceDistance::new(&ball).unwrap();
+        for n in 0..2000 {
+            let x = |a: f64| (f64::from(n) * a).fract() * 2.4 - 1.2;
+            let p = [x(0.819_172_513), x(0.671_043_606), x(0.549_700_478)];
+            assert_eq!(sdf.distance(p) < 0.0, sdf.winding_number(p) > 0.5, "{p:?}");
+        }
+    }
+
+    #[test]
+    fn a_ball_turned_inwards_is_a_hollow_and_one_turned_outwards_is_nothing() {
+        let (outer, _) = shapes::sphere(6, 1.0).unwrap().boundary();
+        for (inwards, distance) in [(true, 1.0), (false, -1.0)] {
+            let (inner, _) = shapes::sphere(6, 0.4).unwrap().boundary();
+            let mut both = outer.clone();
+            let offset = both.positions.len() as u32;
+            both.positions.extend(inner.positions);
+            both.triangles.extend(inner.triangles.iter().map(|t| {
+                let [a, b, c] = t.map(|v| v + offset);
+                if inwards { [a, c, b] } else { [a, b, c] }
+            }));
+            let sdf = SurfaceDistance::new(&both).unwrap();
+            assert_eq!(sdf.distance([0.0, 0.1, 0.0]).signum(), distance);
+            assert!(sdf.distance([0.0, 0.7, 0.0]) < 0.0);
+            assert!(sdf.distance([0.0, 1.7, 0.0]) > 0.0);
+        }
+    }
+}

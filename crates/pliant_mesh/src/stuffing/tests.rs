@@ -1,0 +1,207 @@
+use super::*;
+use crate::Surface;
+
+struct Ball(f64);
+
+impl SignedDistance for Ball {
+    fn distance(&self, p: [f64; 3]) -> f64 {
+        Vector3::from(p).norm() - self.0
+    }
+    fn bounds(&self) -> [[f64; 3]; 2] {
+        [[-self.0; 3], [self.0; 3]]
+    }
+}
+
+struct Torus {
+    ring: f64,
+    tube: f64,
+}
+
+impl SignedDistance for Torus {
+    fn distance(&self, [x, y, z]: [f64; 3]) -> f64 {
+        (x.hypot(y) - self.ring).hypot(z) - self.tube
+    }
+    fn bounds(&self) -> [[f64; 3]; 2] {
+        let r = self.ring + self.tube;
+        [[-r, -r, -self.tube], [r, r, self.tube]]
+    }
+}
+
+/// A box, by its half sizes.
+struct Cuboid([f64; 3]);
+
+impl SignedDistance for Cuboid {
+    fn distance(&self, p: [f64; 3]) -> f64 {
+        let q = Vector3::from(p).abs() - Vector3::from(self.0);
+        q.sup(&Vector3::zeros()).norm() + q.max().min(0.0)
+    }
+    fn bounds(&self) -> [[f64; 3]; 2] {
+        [self.0.map(|x| -x), self.0]
+    }
+}
+
+/// Many balls that touch, overlap and miss each other: thin necks, crumbs and hollows.
+struct Foam(Vec<(Vector3<f64>, f64)>);
+
+impl Foam {
+    fn new(seed: u32) -> Self {
+        // Weyl sequences: even, and different for each seed.
+        let x = |n: u32, a: f64| (f64::from(n + 100 * seed) * a).fract();
+        let ball = |n| {
+            let centre = Vector3::new(x(n, 0.819_172_513), x(n, 0.671_043_606), x(n, 0.549_700_478));
+            (centre, 0.04 + 0.12 * x(n, 0.754_877_666))
+        };
+        Self((1..60).map(ball).collect())
+    }
+}
+
+impl SignedDistance for Foam {
+    fn distance(&self, p: [f64; 3]) -> f64 {
+        self.0.iter().map(|(c, r)| (Vector3::from(p) - c).norm() - r).fold(f64::INFINITY, f64::min)
+    }
+    fn bounds(&self) -> [[f64; 3]; 2] {
+        [[-0.2; 3], [1.2; 3]]
+    }
+}
+
+fn stuffed(sdf: &dyn SignedDistance, target: usize) -> TetMesh {
+    stuff(sdf, &StuffOptions::with_target(target), &mut |_| ()).unwrap()
+}
+
+/// What the module promises of every mesh. Gives back the boundary.
+fn assert_sound(mesh: &TetMesh, sdf: &dyn SignedDistance, target: usize) -> Surface {
+    mesh.check().unwrap();
+    let count = mesh.tets.len();
+    assert!(count.abs_diff(target) as f64 <= 0.05 * target as f64, "{count} tetrahedra, wanted {target}");
+    // Labelle and Shewchuk 2007 prove 10.78 and 164.83 degrees.
+    let quality = mesh.quality();
+    assert!(quality.min_dihedral_deg > 10.7, "{quality:?}");
+    assert!(quality.max_dihedral_deg < 164.85, "{quality:?}");
+    let (surface, _) = mesh.boundary();
+    // Not `closed`, which merges the nodes of pieces that were parted where they touched.
+    surface.check_edges().unwrap();
+    assert!((surface.volume() / mesh.volume() - 1.0).abs() < 1e-9, "the boundary bounds what is filled");
+    assert_one_fan_at_each_vertex(&surface);
+    let [low, high] = sdf.bounds().map(Vector3::from);
+    for &p in &surface.positions {
+        assert!(sdf.distance(p).abs() < 1e-8 * (high - low).norm(), "{p:?} is {} m off", sdf.distance(p));
+    }
+    surface
+}
+
+fn assert_one_fan_at_each_vertex(surface: &Surface) {
+    let mut fans = vec![Vec::new(); surface.positions.len()];
+    for &[a, b, c] in &surface.triangles {
+        for (v, from, to) in [(a, b, c), (b, c, a), (c, a, b)] {
+            fans[v as usize].push((from, to));
+        }
+    }
+    for (vertex, fan) in fans.iter().enumerate() {
+        let start = fan[0].0;
+        let mut at = start;
+        for turn in 1.. {
+            at = fan.iter().find(|f| f.0 == at).unwrap().1;
+            if at == start {
+                assert_eq!(turn, fan.len(), "vertex {vertex} has several fans");
+                break;
+            }
+        }
+    }
+}
+
+#[test]
+fn balls_are_filled_to_their_volume_with_the_wanted_count() {
+    for target in [500, 2000, 10_000, 40_000] {
+        let ball = Ball(1.3);
+        let mesh = stuffed(&ball, target);
+        assert_eq!(assert_sound(&mesh, &ball, target).euler_characteristic(), 2);
+        let volume = 4.0 / 3.0 * std::f64::consts::PI * 1.3_f64.powi(3);
+        // Chords of a sphere: the missing share falls with the square of the cell, count^(-2/3).
+        let missing = 1.0 - mesh.volume() / volume;
+        assert!(missing > 0.0 && missing < 6.0 * (target as f64).powf(-2.0 / 3.0), "{target}: {missing}");
+    }
+}
+
+#[test]
+fn a_torus_keeps_its_hole() {
+    let torus = Torus { ring: 1.0, tube: 0.3 };
+    let mesh = stuffed(&torus, 12_000);
+    assert_eq!(assert_sound(&mesh, &torus, 12_000).euler_characteristic(), 0);
+}
+
+#[test]
+fn a_cuboid_whose_faces_may_lie_in_the_lattice_is_sound() {
+    for (size, target) in [([0.5; 3], 3000), ([1.0, 0.25, 0.5], 8000), ([2.0, 0.2, 0.2], 5000)] {
+        let cuboid = Cuboid(size);
+        let mesh = stuffed(&cuboid, target);
+        assert_eq!(assert_sound(&mesh, &cuboid, target).euler_characteristic(), 2);
+    }
+}
+
+#[test]
+fn foams_with_thin_necks_and_crumbs_stay_manifold() {
+    for seed in 0..12 {
+        let foam = Foam::new(seed);
+        for target in [2500, 15_000] {
+            // All parts: which one is the largest changes with the cell.
+            let options = StuffOptions { target_tets: target, parts: Parts::All };
+            assert_sound(&stuff(&foam, &options, &mut |_| ()).unwrap(), &foam, target);
+        }
+    }
+}
+
+#[test]
+fn the_largest_part_is_kept_unless_all_are_wanted() {
+    let pair = Foam(vec![(Vector3::repeat(0.1), 0.25), (Vector3::repeat(0.9), 0.15)]);
+    let volume = |r: f64| 4.0 / 3.0 * std::f64::consts::PI * r.powi(3);
+    let one = stuffed(&pair, 8000);
+    assert!((one.volume() / volume(0.25) - 1.0).abs() < 0.02, "{}", one.volume());
+    let all = StuffOptions { target_tets: 8000, parts: Parts::All };
+    let all = stuff(&pair, &all, &mut |_| ()).unwrap();
+    assert!((all.volume() / (volume(0.25) + volume(0.15)) - 1.0).abs() < 0.02, "{}", all.volume());
+}
+
+#[test]
+fn the_mesh_does_not_depend_on_the_number_of_threads() {
+    let torus = Torus { ring: 1.0, tube: 0.4 };
+    let with = |threads| {
+        let pool = rayon::ThreadPoolBuilder::new().num_threads(threads).build().unwrap();
+        pool.install(|| stuffed(&torus, 5000))
+    };
+    assert_eq!(with(1), with(3));
+}
+
+#[test]
+fn progress_starts_at_0_ends_at_1_and_does_not_go_back() {
+    let mut told = Vec::new();
+    stuff(&Ball(1.0), &StuffOptions::with_target(3000), &mut |share| told.push(share)).unwrap();
+    assert_eq!(told.first(), Some(&0.0));
+    assert_eq!(told.last(), Some(&1.0));
+    assert!(told.is_sorted());
+}
+
+#[test]
+fn what_cannot_be_filled_is_refused_by_name() {
+    struct Nothing([[f64; 3]; 2]);
+    impl SignedDistance for Nothing {
+        fn distance(&self, _: [f64; 3]) -> f64 {
+            1.0
+        }
+        fn bounds(&self) -> [[f64; 3]; 2] {
+            self.0
+        }
+    }
+    let error = |bounds, target| {
+        stuff(&Nothing(bounds), &StuffOptions::with_target(target), &mut |_| ()).unwrap_err()
+    };
+    let unit = [[0.0; 3], [1.0; 3]];
+    assert!(matches!(error(unit, 1000), MeshError::Empty { .. }));
+    assert!(matches!(error(unit, 0), MeshError::Parameter { name: "number of tetrahedra", .. }));
+    assert!(matches!(error(unit, usize::MAX), MeshError::Parameter { name: "number of tetrahedra", .. }));
+    for high in [f64::NAN, f64::INFINITY, 0.0, -1.0] {
+        let flat = [[0.0; 3], [1.0, high, 1.0]];
+        assert!(matches!(error(flat, 1000), MeshError::Parameter { name: "box around the shape", .. }));
+    }
+    let too_few = stuff(&Torus { ring: 1.0, tube: 0.1 }, &StuffOptions::with_target(1), &mut |_| ());
+    assert!(matches!(too_few, Err(MeshError::TetCount { wanted: 1, .. })), "{too_few:?}");
+}
