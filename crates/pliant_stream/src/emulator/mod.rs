@@ -1,1 +1,25 @@
-//! A seeded bad network.
+//! A seeded bad network: one direction of a path, in virtual time.
+//!
+//! A [`Link`] takes payloads with the time at which they are sent and gives them back at the time at which they arrive, or
+//! never. It owns no clock: the same calls with the same seed give the same result, to the microsecond, and the same
+//! [`Link::hash`]. A path has two links, one a direction, each with its own seed.
+//!
+//! ```
+//! use std::time::Duration;
+//! use pliant_stream::emulator::{Link, LinkConfig, Preset};
+//!
+//! let mut link = Link::new(LinkConfig::preset(Preset::Paper1), 7);
+//! link.send(Duration::ZERO, b"hello".to_vec(), 5);
+//! if let Some(at) = link.next_wakeup() {
+//!     assert!(at >= Duration::from_millis(98));
+//!     assert_eq!(link.poll(at), Some(b"hello".to_vec()));
+//! }
+//! ```
+
+mod link;
+mod loss;
+mod preset;
+
+pub use link::{Link, LinkConfig, LinkCounts};
+pub use loss::{Loss, Trace, TraceEntry};
+pub use preset::Preset;

@@ -578,7 +578,9 @@ impl GuestSession {
         if now >= self.next_ping {
             self.pings += 1;
             self.next_ping = now + if self.pings < 8 { PING_SOON } else { PING_EVERY };
-            let clock = Clock { t1: micros(now), report: self.tally.report(), ..Clock::default() };
+            let round_trip = u32::try_from(micros(self.round_trip.smooth())).unwrap_or(u32::MAX);
+            let report = self.tally.report();
+            let clock = Clock { t1: micros(now), report, round_trip, ..Clock::default() };
             self.datagram(&Datagram::Ping(clock));
         }
         stepped

@@ -373,6 +373,7 @@ impl HostSession {
             }
             Datagram::Ping(clock) => {
                 p.stats.loss_out = loss_of(clock.report);
+                p.stats.round_trip = Duration::from_micros(u64::from(clock.round_trip));
                 p.send_pong(now, clock.t1, now, &mut self.out);
             }
             Datagram::Frame(_) | Datagram::Pong(_) => p.stats.rejected += 1,

@@ -4,7 +4,7 @@ use std::collections::{BTreeMap, BTreeSet, VecDeque};
 use std::sync::Arc;
 use std::time::Duration;
 
-use super::outbox::{Budget, RoundTrip, Tally};
+use super::outbox::{Budget, Tally};
 use super::{Channel, EndReason, LinkStats, Output};
 use crate::state::{BodyId, PeerId, Tick, UserId};
 use crate::wire::{Clock, Datagram, HostMessage, Report, StreamWish};
@@ -66,7 +66,6 @@ pub(crate) struct Peer {
     sequence: u16,
     tally: Tally,
     pub(crate) stats: LinkStats,
-    pub(crate) round_trip: RoundTrip,
 }
 
 impl Peer {
@@ -94,7 +93,6 @@ impl Peer {
             sequence: 0,
             tally: Tally::default(),
             stats: LinkStats::default(),
-            round_trip: RoundTrip::default(),
         }
     }
 
@@ -140,7 +138,7 @@ impl Peer {
     }
 
     pub(crate) fn send_pong(&mut self, now: Duration, t1: u64, t2: Duration, out: &mut VecDeque<Output>) {
-        let clock = Clock { t1, t2: micros(t2), t3: micros(now), report: self.report() };
+        let clock = Clock { t1, t2: micros(t2), t3: micros(now), report: self.report(), round_trip: 0 };
         let sequence = self.next_sequence();
         self.datagram(Datagram::Pong(clock).encode(sequence), out);
     }

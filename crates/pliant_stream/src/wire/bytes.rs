@@ -14,10 +14,6 @@ impl Writer {
         Self { bytes: Vec::with_capacity(capacity) }
     }
 
-    pub(crate) fn len(&self) -> usize {
-        self.bytes.len()
-    }
-
     pub(crate) fn into_bytes(self) -> Vec<u8> {
         self.bytes
     }
@@ -75,13 +71,6 @@ impl Writer {
     /// A tick in 6 bytes.
     pub(crate) fn tick(&mut self, tick: Tick) {
         self.raw(&tick.to_le_bytes()[..6]);
-    }
-
-    /// Overwrites a byte written before.
-    pub(crate) fn patch_u8(&mut self, at: usize, x: u8) {
-        if let Some(slot) = self.bytes.get_mut(at) {
-            *slot = x;
-        }
     }
 }
 

@@ -73,6 +73,8 @@ pub struct Clock {
     pub t3: u64,
     /// What the sender of this datagram has received.
     pub report: Report,
+    /// The guest's smoothed round trip, us; 0 when not known yet.
+    pub round_trip: u32,
 }
 
 /// Everything that crosses the link unreliably. The sequence number counts all datagrams from this sender to this receiver.
@@ -138,6 +140,7 @@ impl Datagram {
                 w.u64(clock.t1);
                 w.u32(clock.report.received);
                 w.u32(clock.report.highest);
+                w.u32(clock.round_trip);
             }
             Self::Pong(clock) => {
                 w.raw(&Self::header(PONG, sequence));
@@ -195,11 +198,12 @@ impl Datagram {
             }
             PING => {
                 let t1 = r.u64("t1")?;
-                Self::Ping(Clock { t1, t2: 0, t3: 0, report: report(&mut r)? })
+                let report = report(&mut r)?;
+                Self::Ping(Clock { t1, report, round_trip: r.u32("round trip")?, ..Clock::default() })
             }
             PONG => {
                 let (t1, t2, t3) = (r.u64("t1")?, r.u64("t2")?, r.u64("t3")?);
-                Self::Pong(Clock { t1, t2, t3, report: report(&mut r)? })
+                Self::Pong(Clock { t1, t2, t3, report: report(&mut r)?, round_trip: 0 })
             }
             other => {
                 return Err(StreamError::Invalid {

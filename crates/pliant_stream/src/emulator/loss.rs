@@ -1,0 +1,155 @@
+//! Which packets are lost.
+
+use std::sync::Arc;
+use std::time::Duration;
+
+use crate::StreamError;
+
+/// How a link loses packets. Packets are numbered from 0 in the order in which they are sent.
+#[derive(Debug, Clone, PartialEq, Default)]
+pub enum Loss {
+    /// Nothing is lost.
+    #[default]
+    None,
+    /// Each packet with this probability, independently.
+    Random(f64),
+    /// All packets numbered `first .. first + count`.
+    Burst {
+        /// The first one lost.
+        first: u64,
+        /// How many.
+        count: u64,
+    },
+    /// Packets `first`, `first + every`, `first + 2 every` and so on: one in `every`.
+    Every {
+        /// The first one lost.
+        first: u64,
+        /// The distance to the next.
+        every: u64,
+    },
+    /// Exactly these packets, ascending.
+    Listed(Vec<u64>),
+    /// Everything sent within these times.
+    Outage {
+        /// Since the link's time zero.
+        from: Duration,
+        /// The first moment at which packets pass again.
+        to: Duration,
+    },
+    /// Gilbert and Elliott's two states. The stays in each are exponential in *time*, so that bursts do not get shorter
+    /// when packets get rarer.
+    GilbertElliott {
+        /// Mean stay in the good state.
+        good: Duration,
+        /// Mean stay in the bad state.
+        bad: Duration,
+        /// Loss in the good state, 0 to 1.
+        loss_good: f64,
+        /// Loss in the bad state, 0 to 1.
+        loss_bad: f64,
+    },
+}
+
+impl Loss {
+    /// Gilbert's loss by what a sender of a packet every `interval` sees: mean loss `loss`, mean burst of `burst` packets.
+    /// The bad state loses everything and lasts `burst` intervals on average, the good one `burst (1 - loss) / loss`.
+    pub fn gilbert(loss: f64, burst: f64, interval: Duration) -> Self {
+        let loss = loss.clamp(1e-9, 1.0 - 1e-9);
+        let bad = interval.mul_f64(burst.clamp(1e-3, 1e6));
+        Self::GilbertElliott { good: bad.mul_f64((1.0 - loss) / loss), bad, loss_good: 0.0, loss_bad: 1.0 }
+    }
+
+    /// Checks the ranges.
+    ///
+    /// # Errors
+    /// [`StreamError::Config`].
+    pub fn check(&self) -> Result<(), StreamError> {
+        let share = |what, p: f64| {
+            if (0.0..=1.0).contains(&p) {
+                Ok(())
+            } else {
+                Err(StreamError::Config { what, found: p.to_string(), expected: "0..=1" })
+            }
+        };
+        match self {
+            Self::Random(p) => share("loss", *p),
+            Self::GilbertElliott { good, bad, loss_good, loss_bad } => {
+                share("loss_good", *loss_good)?;
+                share("loss_bad", *loss_bad)?;
+                let least = Duration::from_micros(1);
+                if *good < least || *bad < least {
+                    let found = format!("{good:?}, {bad:?}");
+                    return Err(StreamError::Config { what: "mean stays", found, expected: "1 us or more" });
+                }
+                Ok(())
+            }
+            Self::Every { every: 0, .. } => {
+                Err(StreamError::Config { what: "every", found: "0".into(), expected: "1 or more" })
+            }
+            Self::None | Self::Burst { .. } | Self::Every { .. } | Self::Listed(_) | Self::Outage { .. } => {
+                Ok(())
+            }
+        }
+    }
+}
+
+/// What happened to one packet of a recorded path.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct TraceEntry {
+    /// Time on the way; `None` for a lost packet.
+    pub delay: Option<Duration>,
+}
+
+/// A recorded path, played packet by packet and then from the start again.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct Trace {
+    entries: Arc<[TraceEntry]>,
+}
+
+impl Trace {
+    /// From entries; at least one.
+    ///
+    /// # Errors
+    /// [`StreamError::Config`] for none.
+    pub fn new(entries: Vec<TraceEntry>) -> Result<Self, StreamError> {
+        if entries.is_empty() {
+            return Err(StreamError::Config {
+                what: "trace",
+                found: "empty".into(),
+                expected: "one packet or more",
+            });
+        }
+        Ok(Self { entries: entries.into() })
+    }
+
+    /// From text: one packet a line, its delay in milliseconds or the word `lost`; `#` begins a comment.
+    ///
+    /// # Errors
+    /// [`StreamError::Invalid`], naming the line.
+    pub fn parse(text: &str) -> Result<Self, StreamError> {
+        let mut entries = Vec::new();
+        for (number, line) in text.lines().enumerate() {
+            let line = line.split('#').next().unwrap_or("").trim();
+            if line.is_empty() {
+                continue;
+            }
+            let delay = if line == "lost" {
+                None
+            } else {
+                let ms: Option<f64> = line.parse().ok().filter(|x: &f64| (0.0..=60_000.0).contains(x));
+                let Some(ms) = ms else {
+                    let found = format!("line {}: {line:?}", number + 1);
+                    let expected = "milliseconds (0 to 60,000) or `lost`";
+                    return Err(StreamError::Invalid { what: "trace", found, expected });
+                };
+                Some(Duration::from_secs_f64(ms * 1e-3))
+            };
+            entries.push(TraceEntry { delay });
+        }
+        Self::new(entries)
+    }
+
+    pub(crate) fn entry(&self, packet: u64) -> TraceEntry {
+        self.entries[(packet % self.entries.len() as u64) as usize]
+    }
+}
