@@ -10,6 +10,8 @@
 //! | [`encoder`] | frames in a closed loop: rounding does not add up |
 //! | [`wire`] | the bytes; every parser takes anything |
 //! | [`emulator`] | a seeded bad network |
+//! | [`pair`] | host and guests joined by emulated links in virtual time: for tests |
+//! | [`experiment`] | a session measured: errors, forces, bytes |
 //! | [`newmark`] | the identities that make compensation exact |
 
 #![cfg_attr(
@@ -22,7 +24,9 @@ pub mod clock;
 pub mod emulator;
 pub mod encoder;
 mod error;
+pub mod experiment;
 pub mod newmark;
+pub mod pair;
 pub mod playout;
 pub mod recovery;
 pub mod session;

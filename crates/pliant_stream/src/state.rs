@@ -81,6 +81,27 @@ impl Default for Pose {
 }
 
 impl Pose {
+    /// The frame of a body: the model's origin, and how it moves.
+    pub fn of(body: &pliant_modal::Body) -> Self {
+        use nalgebra::{Matrix3, Quaternion, UnitQuaternion, Vector3};
+        let frame = body.frame();
+        let [x, y, z, w] = frame.orientation();
+        let turn = UnitQuaternion::from_quaternion(Quaternion::new(w, x, y, z));
+        let inertia = body.model().inertia();
+        let spin = turn.inverse() * Vector3::from(frame.spin());
+        let inverse = Matrix3::from_fn(|i, j| inertia[i][j]).try_inverse().unwrap_or_else(Matrix3::zeros);
+        let angular = turn * (inverse * spin);
+        let origin = Vector3::from(frame.origin());
+        let arm = origin - Vector3::from(frame.center());
+        let linear = Vector3::from(frame.velocity()) + angular.cross(&arm);
+        Self {
+            position: origin.into(),
+            rotation: [x, y, z, w],
+            linear: linear.into(),
+            angular: angular.into(),
+        }
+    }
+
     /// True when every number is finite and within [`MAGNITUDE_LIMIT`] and the quaternion is not zero.
     pub fn is_valid(&self) -> bool {
         let norm: f64 = self.rotation.iter().map(|x| x * x).sum();

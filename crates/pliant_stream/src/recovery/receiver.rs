@@ -34,7 +34,7 @@ pub struct Arrival {
 }
 
 /// What became of the ticks since the receiver began.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, serde::Serialize)]
 pub struct RepairCounts {
     /// Ticks stepped.
     pub stepped: u64,
