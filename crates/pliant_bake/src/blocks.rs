@@ -1,0 +1,103 @@
+//! Products of tall blocks of vectors, stored row by row: entry (dof, column) at `dof * stride + column`.
+//!
+//! Rows are cut into chunks of fixed size and partial sums are added in order: the same bits for any number of threads.
+
+use faer::linalg::matmul::matmul;
+use faer::{Accum, Mat, MatMut, MatRef, Par};
+use rayon::prelude::*;
+
+/// Rows per parallel task.
+const CHUNK: usize = 768;
+
+/// A read-only view of the first columns of a tall block.
+#[derive(Clone, Copy, Debug)]
+pub(crate) struct Tall<'a> {
+    pub(crate) data: &'a [f64],
+    pub(crate) stride: usize,
+    pub(crate) columns: usize,
+}
+
+impl<'a> Tall<'a> {
+    /// A block whose rows follow one another without gaps.
+    pub(crate) fn new(data: &'a [f64], columns: usize) -> Self {
+        Self { data, stride: columns, columns }
+    }
+
+    fn chunk(&self, index: usize) -> MatRef<'a, f64> {
+        let rows = self.data.len() / self.stride;
+        let (start, end) = (index * CHUNK, rows.min((index + 1) * CHUNK));
+        let data = &self.data[start * self.stride..end * self.stride];
+        MatRef::from_row_major_slice(data, end - start, self.stride).subcols(0, self.columns)
+    }
+}
+
+/// `a^T b`.
+pub(crate) fn gram(a: Tall<'_>, b: Tall<'_>) -> Mat<f64> {
+    let rows = a.data.len() / a.stride.max(1);
+    let parts: Vec<Mat<f64>> = (0..rows.div_ceil(CHUNK))
+        .into_par_iter()
+        .map(|index| {
+            let mut part = Mat::zeros(a.columns, b.columns);
+            matmul(&mut part, Accum::Replace, a.chunk(index).transpose(), b.chunk(index), 1.0, Par::Seq);
+            part
+        })
+        .collect();
+    let mut sum = Mat::zeros(a.columns, b.columns);
+    for part in parts {
+        sum += part;
+    }
+    sum
+}
+
+/// `out += alpha a c`; `out` has `c.ncols()` columns.
+pub(crate) fn add_product(out: &mut [f64], a: Tall<'_>, c: MatRef<'_, f64>, alpha: f64) {
+    let columns = c.ncols();
+    if columns == 0 || a.columns == 0 {
+        return;
+    }
+    out.par_chunks_mut(CHUNK * columns).enumerate().for_each(|(index, out)| {
+        let rows = out.len() / columns;
+        let out = MatMut::from_row_major_slice_mut(out, rows, columns);
+        matmul(out, Accum::Add, a.chunk(index), c, alpha, Par::Seq);
+    });
+}
+
+/// `a c` as a new block.
+pub(crate) fn product(a: Tall<'_>, c: MatRef<'_, f64>) -> Vec<f64> {
+    let mut out = vec![0.0; a.data.len() / a.stride.max(1) * c.ncols()];
+    add_product(&mut out, a, c, 1.0);
+    out
+}
+
+/// Copies a block into the columns `at..` of a wider one.
+pub(crate) fn put(wide: &mut [f64], stride: usize, at: usize, block: &[f64], columns: usize) {
+    wide.par_chunks_mut(stride * CHUNK).zip(block.par_chunks(columns * CHUNK)).for_each(|(wide, block)| {
+        for (to, from) in wide.chunks_exact_mut(stride).zip(block.chunks_exact(columns)) {
+            to[at..at + columns].copy_from_slice(from);
+        }
+    });
+}
+
+/// Eigenvalues (ascending) and eigenvectors (columns) of a small symmetric matrix; `None` when the iteration fails.
+pub(crate) fn symmetric_eigen(a: MatRef<'_, f64>) -> Option<(Vec<f64>, Mat<f64>)> {
+    use faer::diag::Diag;
+    use faer::dyn_stack::{MemBuffer, MemStack};
+    use faer::linalg::evd;
+    let n = a.nrows();
+    let mut values = Diag::<f64>::zeros(n);
+    let mut vectors = Mat::zeros(n, n);
+    let scratch =
+        evd::self_adjoint_evd_scratch::<f64>(n, evd::ComputeEigenvectors::Yes, Par::Seq, Default::default());
+    let mut buffer = MemBuffer::new(scratch);
+    evd::self_adjoint_evd(
+        a,
+        values.as_mut(),
+        Some(vectors.as_mut()),
+        Par::Seq,
+        MemStack::new(&mut buffer),
+        Default::default(),
+    )
+    .ok()?;
+    let values: Vec<f64> = (0..n).map(|i| values[i]).collect();
+    values.iter().all(|v| v.is_finite()).then_some((values, vectors))
+}

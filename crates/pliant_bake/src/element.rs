@@ -1,0 +1,298 @@
+//! Element matrices of straight-sided 4-node and 10-node tetrahedra, linear elasticity.
+//!
+//! Both elements are affine, so the barycentric gradients are constant and every integral below is exact:
+//! the stiffness integrand is at most quadratic (4-point rule of degree 2), the mass integrand is a polynomial
+//! in the barycentric coordinates, integrated in closed form by
+//! `int L1^a L2^b L3^c L4^d dV = 6 V a! b! c! d! / (a+b+c+d+3)!`.
+
+/// Which tetrahedron the displacement is interpolated on.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(crate) enum Element {
+    /// 4 nodes, linear displacement.
+    Tet4,
+    /// 10 nodes, quadratic displacement: the four corners and the middles of the six edges, straight-sided.
+    Tet10,
+}
+
+impl Element {
+    /// Nodes of one element: 4 or 10.
+    pub(crate) const fn node_count(self) -> usize {
+        match self {
+            Self::Tet4 => 4,
+            Self::Tet10 => 10,
+        }
+    }
+}
+
+/// Corner pairs of the six mid-edge nodes, in the order of nodes 4 to 9 of a 10-node element.
+pub(crate) const EDGES: [[usize; 2]; 6] = [[0, 1], [1, 2], [0, 2], [0, 3], [1, 3], [2, 3]];
+
+/// Largest number of nodes an element has.
+pub(crate) const MAX_NODES: usize = 10;
+
+/// One affine tetrahedron: its volume (m^3) and the gradients of its barycentric coordinates (1/m).
+#[derive(Clone, Copy, Debug)]
+pub(crate) struct Affine {
+    pub(crate) volume: f64,
+    pub(crate) gradients: [[f64; 3]; 4],
+}
+
+impl Affine {
+    /// From the four corners. The volume is signed: positive when `(b-a) x (c-a) . (d-a) > 0`.
+    pub(crate) fn new(corners: [[f64; 3]; 4]) -> Self {
+        let [a, b, c, d] = corners;
+        let (u, v, w) = (sub(b, a), sub(c, a), sub(d, a));
+        let six_volume = dot(cross(u, v), w);
+        let scale = 1.0 / six_volume;
+        let g1 = cross(v, w).map(|x| x * scale);
+        let g2 = cross(w, u).map(|x| x * scale);
+        let g3 = cross(u, v).map(|x| x * scale);
+        let g0 = [0, 1, 2].map(|k| -(g1[k] + g2[k] + g3[k]));
+        Self { volume: six_volume / 6.0, gradients: [g0, g1, g2, g3] }
+    }
+
+    /// Gradients of the element's shape functions at barycentric coordinates `l`, 1/m.
+    pub(crate) fn shape_gradients(&self, element: Element, l: [f64; 4]) -> [[f64; 3]; MAX_NODES] {
+        let g = &self.gradients;
+        let mut out = [[0.0; 3]; MAX_NODES];
+        match element {
+            Element::Tet4 => out[..4].copy_from_slice(g),
+            Element::Tet10 => {
+                for a in 0..4 {
+                    out[a] = g[a].map(|x| (4.0 * l[a] - 1.0) * x);
+                }
+                for (e, &[a, b]) in EDGES.iter().enumerate() {
+                    out[4 + e] = [0, 1, 2].map(|k| 4.0 * (l[a] * g[b][k] + l[b] * g[a][k]));
+                }
+            }
+        }
+        out
+    }
+}
+
+/// Shape functions of the element at barycentric coordinates `l`.
+pub(crate) fn shape(element: Element, l: [f64; 4]) -> [f64; MAX_NODES] {
+    let mut out = [0.0; MAX_NODES];
+    match element {
+        Element::Tet4 => out[..4].copy_from_slice(&l),
+        Element::Tet10 => {
+            for a in 0..4 {
+                out[a] = l[a] * (2.0 * l[a] - 1.0);
+            }
+            for (e, &[a, b]) in EDGES.iter().enumerate() {
+                out[4 + e] = 4.0 * l[a] * l[b];
+            }
+        }
+    }
+    out
+}
+
+/// Points of the quadrature that integrates the stiffness exactly, and their common weight as a share of the volume.
+fn stiffness_points(element: Element) -> (&'static [[f64; 4]], f64) {
+    const CENTRE: [[f64; 4]; 1] = [[0.25; 4]];
+    // Degree 2: a = (5 + 3 sqrt 5) / 20, b = (5 - sqrt 5) / 20.
+    const A: f64 = 0.585_410_196_624_968_5;
+    const B: f64 = 0.138_196_601_125_010_5;
+    const FOUR: [[f64; 4]; 4] = [[A, B, B, B], [B, A, B, B], [B, B, A, B], [B, B, B, A]];
+    match element {
+        Element::Tet4 => (&CENTRE, 1.0),
+        Element::Tet10 => (&FOUR, 0.25),
+    }
+}
+
+/// One element's stiffness as 3x3 blocks, row by row: block (i, j) at `(i * MAX_NODES + j) * 9`.
+pub(crate) type Stiffness = [f64; MAX_NODES * MAX_NODES * 9];
+
+/// Stiffness with Lame constants `lambda` and `mu` (Pa):
+/// `K_ij[k][l] = int lambda d_k N_i d_l N_j + mu (d_l N_i d_k N_j + delta_kl grad N_i . grad N_j) dV`, N/m.
+pub(crate) fn stiffness(element: Element, affine: &Affine, lambda: f64, mu: f64, out: &mut Stiffness) {
+    let nodes = element.node_count();
+    out.fill(0.0);
+    let (points, weight) = stiffness_points(element);
+    for &point in points {
+        let g = affine.shape_gradients(element, point);
+        let w = weight * affine.volume;
+        for i in 0..nodes {
+            for j in i..nodes {
+                let block = &mut out[(i * MAX_NODES + j) * 9..][..9];
+                let shear = mu * w * dot(g[i], g[j]);
+                for k in 0..3 {
+                    for l in 0..3 {
+                        block[3 * k + l] += w * (lambda * g[i][k] * g[j][l] + mu * g[i][l] * g[j][k]);
+                    }
+                    block[4 * k] += shear;
+                }
+            }
+        }
+    }
+    for i in 0..nodes {
+        for j in 0..i {
+            for k in 0..3 {
+                for l in 0..3 {
+                    out[(i * MAX_NODES + j) * 9 + 3 * k + l] = out[(j * MAX_NODES + i) * 9 + 3 * l + k];
+                }
+            }
+        }
+    }
+}
+
+/// `int N_a^lin grad N_i dV` for the four corners `a`: what the nodal-averaged pressure needs, m^2.
+pub(crate) fn pressure_gradients(element: Element, affine: &Affine) -> [[[f64; 3]; MAX_NODES]; 4] {
+    let mut out = [[[0.0; 3]; MAX_NODES]; 4];
+    let (points, weight) = stiffness_points(element);
+    for &point in points {
+        let g = affine.shape_gradients(element, point);
+        for a in 0..4 {
+            let w = weight * affine.volume * point[a];
+            for i in 0..element.node_count() {
+                for k in 0..3 {
+                    out[a][i][k] += w * g[i][k];
+                }
+            }
+        }
+    }
+    out
+}
+
+/// Consistent mass of a unit-density, unit-volume element: entry (i, j) at `i * MAX_NODES + j`. It is the same for
+/// every affine element up to the factor density x volume, and acts on each axis alike.
+pub(crate) fn unit_mass(element: Element) -> [f64; MAX_NODES * MAX_NODES] {
+    let mut out = [0.0; MAX_NODES * MAX_NODES];
+    for i in 0..element.node_count() {
+        for j in 0..element.node_count() {
+            let mut sum = 0.0;
+            for (ci, ei) in monomials(element, i) {
+                for (cj, ej) in monomials(element, j) {
+                    let e: [usize; 4] = [0, 1, 2, 3].map(|k| ei[k] + ej[k]);
+                    let numerator: f64 = e.iter().map(|&k| factorial(k)).product();
+                    sum += ci * cj * 6.0 * numerator / factorial(e.iter().sum::<usize>() + 3);
+                }
+            }
+            out[i * MAX_NODES + j] = sum;
+        }
+    }
+    out
+}
+
+/// A shape function as (coefficient, exponents of the barycentric coordinates).
+fn monomials(element: Element, node: usize) -> Vec<(f64, [usize; 4])> {
+    let power = |a: usize, n: usize| {
+        let mut e = [0; 4];
+        e[a] = n;
+        e
+    };
+    match element {
+        Element::Tet4 => vec![(1.0, power(node, 1))],
+        Element::Tet10 if node < 4 => vec![(2.0, power(node, 2)), (-1.0, power(node, 1))],
+        Element::Tet10 => {
+            let [a, b] = EDGES[node - 4];
+            let mut e = power(a, 1);
+            e[b] = 1;
+            vec![(4.0, e)]
+        }
+    }
+}
+
+fn factorial(n: usize) -> f64 {
+    (1..=n).map(|k| k as f64).product()
+}
+
+pub(crate) fn sub(a: [f64; 3], b: [f64; 3]) -> [f64; 3] {
+    [a[0] - b[0], a[1] - b[1], a[2] - b[2]]
+}
+
+pub(crate) fn cross(a: [f64; 3], b: [f64; 3]) -> [f64; 3] {
+    [a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]]
+}
+
+pub(crate) fn dot(a: [f64; 3], b: [f64; 3]) -> f64 {
+    a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    const SKEW: [[f64; 3]; 4] = [[0.1, 0.0, -0.2], [1.3, 0.2, 0.1], [0.3, 0.9, 0.0], [0.2, 0.1, 1.1]];
+
+    #[test]
+    fn mass_of_the_linear_element_is_v_over_20_times_one_plus_delta() {
+        let m = unit_mass(Element::Tet4);
+        for i in 0..4 {
+            for j in 0..4 {
+                let expected = if i == j { 0.1 } else { 0.05 };
+                assert!((m[i * MAX_NODES + j] - expected).abs() < 1e-15);
+            }
+        }
+    }
+
+    #[test]
+    fn mass_sums_to_one_and_gives_linear_fields_their_exact_second_moment() {
+        for element in [Element::Tet4, Element::Tet10] {
+            let m = unit_mass(element);
+            let affine = Affine::new(SKEW);
+            let position = |i: usize| {
+                if i < 4 {
+                    SKEW[i]
+                } else {
+                    let [a, b] = EDGES[i - 4];
+                    [0, 1, 2].map(|k| 0.5 * (SKEW[a][k] + SKEW[b][k]))
+                }
+            };
+            let n = element.node_count();
+            let (mut total, mut xx) = (0.0, 0.0);
+            for i in 0..n {
+                for j in 0..n {
+                    total += m[i * MAX_NODES + j];
+                    xx += m[i * MAX_NODES + j] * position(i)[0] * position(j)[0];
+                }
+            }
+            // int x^2 over a simplex = V/20 (sum x_i^2 + (sum x_i)^2).
+            let s: f64 = SKEW.iter().map(|p| p[0]).sum();
+            let s2: f64 = SKEW.iter().map(|p| p[0] * p[0]).sum();
+            assert!((total - 1.0).abs() < 1e-14, "{element:?}");
+            assert!((xx - (s2 + s * s) / 20.0).abs() < 1e-14, "{element:?}");
+            assert!(affine.volume > 0.0);
+        }
+    }
+
+    #[test]
+    fn stiffness_is_symmetric_kills_rigid_motion_and_gives_the_energy_of_uniform_strain() {
+        let affine = Affine::new(SKEW);
+        let (lambda, mu) = (1.7, 0.9);
+        for element in [Element::Tet4, Element::Tet10] {
+            let n = element.node_count();
+            let mut k = [0.0; MAX_NODES * MAX_NODES * 9];
+            stiffness(element, &affine, lambda, mu, &mut k);
+            let position = |i: usize| {
+                if i < 4 {
+                    SKEW[i]
+                } else {
+                    let [a, b] = EDGES[i - 4];
+                    [0, 1, 2].map(|k| 0.5 * (SKEW[a][k] + SKEW[b][k]))
+                }
+            };
+            let energy = |field: &dyn Fn([f64; 3]) -> [f64; 3]| {
+                let mut sum = 0.0;
+                for i in 0..n {
+                    for j in 0..n {
+                        let (u, v) = (field(position(i)), field(position(j)));
+                        for a in 0..3 {
+                            for b in 0..3 {
+                                sum += u[a] * k[(i * MAX_NODES + j) * 9 + 3 * a + b] * v[b];
+                            }
+                        }
+                    }
+                }
+                sum
+            };
+            assert!(energy(&|_| [1.0, 2.0, 3.0]).abs() < 1e-12, "translation, {element:?}");
+            assert!(energy(&|p| cross([0.3, -0.7, 0.2], p)).abs() < 1e-12, "rotation, {element:?}");
+            // u = (x, 0, 0): energy density lambda + 2 mu; u = (y, 0, 0): mu.
+            let stretch = energy(&|p| [p[0], 0.0, 0.0]) / affine.volume;
+            let shear = energy(&|p| [p[1], 0.0, 0.0]) / affine.volume;
+            assert!((stretch - (lambda + 2.0 * mu)).abs() < 1e-12, "{stretch}, {element:?}");
+            assert!((shear - mu).abs() < 1e-12, "{shear}, {element:?}");
+        }
+    }
+}

@@ -1,0 +1,308 @@
+//! The finite element mesh, its graph, and the assembly of stiffness and mass.
+//!
+//! Assembly is deterministic: element matrices are made in parallel, batch by batch, and added in element order.
+
+use pliant_mesh::TetMesh;
+use rayon::prelude::*;
+
+use crate::element::{self, Affine, EDGES, Element, MAX_NODES};
+use crate::sparse::BlockCsr;
+
+/// Marks an anchored node in a numbering.
+pub(crate) const ANCHORED: u32 = u32::MAX;
+
+/// Above this Poisson ratio the pressure is averaged over each node's neighbourhood.
+pub(crate) const LOCKING_POISSON: f64 = 0.45;
+
+/// Nodes and elements of the chosen order. The corners keep the numbers of the tetrahedral mesh; mid-edge nodes follow.
+#[derive(Clone, Debug)]
+pub(crate) struct FeMesh {
+    pub(crate) element: Element,
+    pub(crate) nodes: Vec<[f64; 3]>,
+    /// How many of `nodes` are corners.
+    pub(crate) corners: usize,
+    /// `element.node_count()` node numbers per element.
+    pub(crate) connectivity: Vec<u32>,
+    /// Volume and barycentric gradients of each element.
+    pub(crate) affine: Vec<Affine>,
+}
+
+impl FeMesh {
+    /// The mesh must have passed `TetMesh::check`.
+    pub(crate) fn new(mesh: &TetMesh, element: Element) -> Self {
+        let corner = |i: u32| mesh.nodes[i as usize];
+        let affine = mesh.tets.par_iter().map(|t| Affine::new(t.map(corner))).collect();
+        let mut nodes = mesh.nodes.clone();
+        let corners = nodes.len();
+        let connectivity = match element {
+            Element::Tet4 => mesh.tets.iter().flatten().copied().collect(),
+            Element::Tet10 => {
+                let key = |t: &[u32; 4], [a, b]: [usize; 2]| {
+                    let (low, high) = (t[a].min(t[b]), t[a].max(t[b]));
+                    (u64::from(low) << 32) | u64::from(high)
+                };
+                let mut edges: Vec<u64> =
+                    mesh.tets.iter().flat_map(|t| EDGES.map(|edge| key(t, edge))).collect();
+                edges.par_sort_unstable();
+                edges.dedup();
+                nodes.extend(edges.iter().map(|&edge| {
+                    let (a, b) = (corner((edge >> 32) as u32), corner(edge as u32));
+                    [0, 1, 2].map(|k| 0.5 * (a[k] + b[k]))
+                }));
+                let number = |edge: u64| (corners + edges.partition_point(|&e| e < edge)) as u32;
+                mesh.tets
+                    .par_iter()
+                    .flat_map_iter(|t| t.iter().copied().chain(EDGES.map(|edge| number(key(t, edge)))))
+                    .collect()
+            }
+        };
+        Self { element, nodes, corners, connectivity, affine }
+    }
+
+    /// Node numbers of each element.
+    pub(crate) fn elements(&self) -> std::slice::ChunksExact<'_, u32> {
+        self.connectivity.chunks_exact(self.element.node_count())
+    }
+
+    /// For each node the elements it belongs to, ascending, as offsets and a flat list.
+    pub(crate) fn elements_of_nodes(&self) -> Lists {
+        Lists::invert(self.elements().map(|nodes| nodes.iter().copied()), self.nodes.len())
+    }
+
+    /// The graph of the stiffness matrix: for each node the nodes it couples with, itself included, ascending.
+    /// With `wide`, nodes couple through each corner's whole neighbourhood, as nodal-averaged pressure needs.
+    pub(crate) fn graph(&self, wide: bool) -> Lists {
+        let around = self.elements_of_nodes();
+        let per = self.element.node_count();
+        let element = |e: u32| &self.connectivity[e as usize * per..][..per];
+        let n = self.nodes.len();
+        if !wide {
+            return Lists::unions(n, |i, visit| {
+                for &e in around.of(i) {
+                    visit(element(e));
+                }
+            });
+        }
+        let patches = Lists::unions(self.corners, |a, visit| {
+            for &e in around.of(a) {
+                visit(element(e));
+            }
+        });
+        Lists::unions(n, |i, visit| {
+            for &e in around.of(i) {
+                for &corner in &element(e)[..4] {
+                    visit(patches.of(corner as usize));
+                }
+            }
+        })
+    }
+
+    /// Assembles stiffness (N/m) and consistent mass (kg) of the nodes that `number` does not mark as anchored; `graph`
+    /// is the pattern in that numbering.
+    pub(crate) fn assemble(&self, law: &Law, number: &[u32], graph: &Lists) -> BlockCsr {
+        const BATCH: usize = 512;
+        let per = self.element.node_count();
+        let mut out = BlockCsr::zeros(graph);
+        let unit_mass = element::unit_mass(self.element);
+        let lambda = if law.average_pressure { 0.0 } else { law.lambda };
+        let mut batch = vec![[0.0; MAX_NODES * MAX_NODES * 9]; BATCH.min(self.affine.len())];
+        for (index, affine) in self.affine.chunks(BATCH).enumerate() {
+            batch[..affine.len()]
+                .par_iter_mut()
+                .zip(affine)
+                .for_each(|(k, affine)| element::stiffness(self.element, affine, lambda, law.mu, k));
+            for (local, (k, affine)) in batch.iter().zip(affine).enumerate() {
+                let nodes = &self.connectivity[(index * BATCH + local) * per..][..per];
+                let mass = law.density * affine.volume;
+                for (i, &a) in nodes.iter().enumerate() {
+                    let row = number[a as usize];
+                    if row == ANCHORED {
+                        continue;
+                    }
+                    for (j, &b) in nodes.iter().enumerate() {
+                        let column = number[b as usize];
+                        if column != ANCHORED {
+                            let at = out.position(row, column);
+                            out.mass[at] += mass * unit_mass[i * MAX_NODES + j];
+                            let block = &k[(i * MAX_NODES + j) * 9..][..9];
+                            for (to, from) in out.stiffness[9 * at..][..9].iter_mut().zip(block) {
+                                *to += from;
+                            }
+                        }
+                    }
+                }
+            }
+        }
+        if law.average_pressure {
+            self.add_averaged_pressure(law.lambda, number, &mut out);
+        }
+        out
+    }
+
+    /// Volumetric stiffness with nodal-averaged pressure: `sum_a lambda / V_a d_a d_a^T`, where
+    /// `d_a . u = int N_a div u dV` and `V_a = int N_a dV` over the elements around corner `a`.
+    /// (Bonet and Burton 1998 for linear tetrahedra; for quadratic ones this is the Taylor-Hood pair with a lumped
+    /// pressure mass, so neither locks as the Poisson ratio goes to 1/2.)
+    fn add_averaged_pressure(&self, lambda: f64, number: &[u32], out: &mut BlockCsr) {
+        let around = self.elements_of_nodes();
+        let per = self.element.node_count();
+        let gradients: Vec<_> =
+            self.affine.par_iter().map(|affine| element::pressure_gradients(self.element, affine)).collect();
+        let mut slot = vec![usize::MAX; self.nodes.len()];
+        let mut patch: Vec<(u32, [f64; 3])> = Vec::new();
+        for corner in 0..self.corners {
+            patch.clear();
+            let mut volume = 0.0;
+            for &e in around.of(corner) {
+                let nodes = &self.connectivity[e as usize * per..][..per];
+                let local = nodes[..4].iter().position(|&n| n as usize == corner).unwrap_or(0);
+                volume += self.affine[e as usize].volume / 4.0;
+                for (&node, gradient) in nodes.iter().zip(&gradients[e as usize][local]) {
+                    let at = &mut slot[node as usize];
+                    if *at == usize::MAX {
+                        *at = patch.len();
+                        patch.push((node, [0.0; 3]));
+                    }
+                    for k in 0..3 {
+                        patch[*at].1[k] += gradient[k];
+                    }
+                }
+            }
+            for &(node, _) in &patch {
+                slot[node as usize] = usize::MAX;
+            }
+            patch.retain(|&(node, _)| number[node as usize] != ANCHORED);
+            for &(a, da) in &patch {
+                for &(b, db) in &patch {
+                    let at = out.position(number[a as usize], number[b as usize]);
+                    for k in 0..3 {
+                        for l in 0..3 {
+                            out.stiffness[9 * at + 3 * k + l] += lambda / volume * (da[k] * db[l]);
+                        }
+                    }
+                }
+            }
+        }
+    }
+
+    /// `M 1` per node over all nodes, anchored ones included: the mass that a uniform field moves at each node, kg.
+    pub(crate) fn nodal_mass(&self, density: f64) -> Vec<f64> {
+        let unit_mass = element::unit_mass(self.element);
+        let mut out = vec![0.0; self.nodes.len()];
+        for (nodes, affine) in self.elements().zip(&self.affine) {
+            for (i, &node) in nodes.iter().enumerate() {
+                let row: f64 = unit_mass[i * MAX_NODES..][..nodes.len()].iter().sum();
+                out[node as usize] += density * affine.volume * row;
+            }
+        }
+        out
+    }
+
+    /// Volume of the mesh, m^3.
+    pub(crate) fn volume(&self) -> f64 {
+        self.affine.iter().map(|a| a.volume).sum()
+    }
+}
+
+/// What the assembly needs of the material.
+#[derive(Clone, Copy, Debug)]
+pub(crate) struct Law {
+    /// First Lame constant, Pa.
+    pub(crate) lambda: f64,
+    /// Shear modulus, Pa.
+    pub(crate) mu: f64,
+    /// kg/m^3.
+    pub(crate) density: f64,
+    /// Use nodal-averaged pressure.
+    pub(crate) average_pressure: bool,
+}
+
+/// Lists of numbers in one array: list `i` is `items[offsets[i]..offsets[i + 1]]`.
+#[derive(Clone, Debug, Default, PartialEq, Eq)]
+pub(crate) struct Lists {
+    pub(crate) offsets: Vec<usize>,
+    pub(crate) items: Vec<u32>,
+}
+
+impl Lists {
+    /// How many lists.
+    pub(crate) fn len(&self) -> usize {
+        self.offsets.len() - 1
+    }
+
+    /// List `i`.
+    pub(crate) fn of(&self, i: usize) -> &[u32] {
+        &self.items[self.offsets[i]..self.offsets[i + 1]]
+    }
+
+    /// For each member below `members`, the numbers of the groups that hold it, ascending.
+    fn invert<G: Iterator<Item = u32>>(groups: impl Iterator<Item = G> + Clone, members: usize) -> Self {
+        let mut offsets = vec![0; members + 1];
+        for group in groups.clone() {
+            for member in group {
+                offsets[member as usize + 1] += 1;
+            }
+        }
+        for i in 0..members {
+            offsets[i + 1] += offsets[i];
+        }
+        let mut next = offsets.clone();
+        let mut items = vec![0; offsets[members]];
+        for (number, group) in groups.enumerate() {
+            for member in group {
+                items[next[member as usize]] = number as u32;
+                next[member as usize] += 1;
+            }
+        }
+        Self { offsets, items }
+    }
+
+    /// List `i` is the sorted union of the slices that `each(i, visit)` visits.
+    fn unions(count: usize, each: impl Fn(usize, &mut dyn FnMut(&[u32])) + Sync) -> Self {
+        const CHUNK: usize = 1024;
+        let chunks: Vec<(Vec<usize>, Vec<u32>)> = (0..count.div_ceil(CHUNK))
+            .into_par_iter()
+            .map(|chunk| {
+                let (mut lengths, mut items) = (Vec::with_capacity(CHUNK), Vec::new());
+                let mut list: Vec<u32> = Vec::new();
+                for i in chunk * CHUNK..count.min((chunk + 1) * CHUNK) {
+                    list.clear();
+                    each(i, &mut |slice| list.extend_from_slice(slice));
+                    list.sort_unstable();
+                    list.dedup();
+                    lengths.push(list.len());
+                    items.extend_from_slice(&list);
+                }
+                (lengths, items)
+            })
+            .collect();
+        let mut out = Self { offsets: vec![0], items: Vec::new() };
+        let mut end = 0;
+        for (lengths, items) in chunks {
+            for length in lengths {
+                end += length;
+                out.offsets.push(end);
+            }
+            out.items.extend_from_slice(&items);
+        }
+        out
+    }
+
+    /// The graph restricted to the nodes that `number` keeps, in the new numbering (`kept` nodes).
+    pub(crate) fn renumber(&self, number: &[u32], kept: usize) -> Self {
+        let mut old = vec![0usize; kept];
+        for (i, &new) in number.iter().enumerate() {
+            if new != ANCHORED {
+                old[new as usize] = i;
+            }
+        }
+        let mut out = Self { offsets: vec![0], items: Vec::new() };
+        for &i in &old {
+            let start = out.items.len();
+            out.items.extend(self.of(i).iter().map(|&j| number[j as usize]).filter(|&j| j != ANCHORED));
+            out.items[start..].sort_unstable();
+            out.offsets.push(out.items.len());
+        }
+        out
+    }
+}

@@ -1,0 +1,320 @@
+//! The lowest modes of `K phi = lambda M phi`: shift-invert block Lanczos with the M-inner product, full
+//! reorthogonalisation and thick restart (Grimes, Lewis and Simon 1994; Wu and Simon 2000).
+//!
+//! The operator is `K^-1 M`, whose largest eigenvalues are `1 / lambda`. For a free body K is singular: `K^-1` is the
+//! inertia-relief pseudo-inverse of [`Solver`], and the rigid modes are deflated, so only elastic modes come out.
+
+use faer::Mat;
+
+use crate::blocks::{self, Tall};
+use crate::solver::Solver;
+
+/// Stop when every wanted Ritz pair has this residual, relative to its own eigenvalue, in the M-norm.
+const TOLERANCE: f64 = 4e-9;
+
+/// Problems of at most this many degrees of freedom, or of fewer than three for each wanted mode, are solved densely.
+const DENSE: usize = 300;
+
+/// Eigenpairs: eigenvalues ascending ((rad/s)^2), and M-orthonormal vectors as a block of that many columns.
+#[derive(Clone, Debug)]
+pub(crate) struct Modes {
+    pub(crate) lambda: Vec<f64>,
+    pub(crate) phi: Vec<f64>,
+}
+
+/// The iteration did not converge, or a small eigenproblem failed.
+#[derive(Clone, Copy, Debug)]
+pub(crate) struct NoConvergence;
+
+/// The `wanted` lowest elastic modes. `report` hears how far the iteration is, 0 to 1.
+pub(crate) fn lowest(
+    solver: &Solver,
+    wanted: usize,
+    report: &mut dyn FnMut(f64),
+) -> Result<Modes, NoConvergence> {
+    let n = solver.dofs();
+    if n <= DENSE || n < 3 * wanted + 6 {
+        return dense(solver, wanted);
+    }
+    let phi = Lanczos::new(solver, wanted).run(report)?;
+    polish(solver, phi, wanted)
+}
+
+struct Lanczos<'a> {
+    solver: &'a Solver<'a>,
+    wanted: usize,
+    /// Basis vectors, `stride` columns reserved.
+    basis: Vec<f64>,
+    stride: usize,
+    /// Filled columns whose images are known.
+    done: usize,
+    /// Projected operator.
+    projected: Mat<f64>,
+    /// The next block, M-orthonormal to the basis, and its width.
+    next: Vec<f64>,
+    width: usize,
+    seed: u64,
+}
+
+/// What one expansion leaves: the remainder's coefficients, `next = remainder coefficients^-1`.
+struct Remainder {
+    coefficients: Mat<f64>,
+    width: usize,
+}
+
+impl<'a> Lanczos<'a> {
+    fn new(solver: &'a Solver<'a>, wanted: usize) -> Self {
+        let n = solver.dofs();
+        let block = if wanted < 16 { 8 } else { 16 };
+        let stride = (6 * wanted + 4 * block).min(n - 6);
+        Self {
+            solver,
+            wanted,
+            basis: vec![0.0; n * stride],
+            stride,
+            done: 0,
+            projected: Mat::zeros(stride, stride),
+            next: Vec::new(),
+            width: block,
+            seed: 0x9E37_79B9_7F4A_7C15,
+        }
+    }
+
+    fn run(mut self, report: &mut dyn FnMut(f64)) -> Result<Vec<f64>, NoConvergence> {
+        // Each restart improves; a hundred expansions of the space per mode means that something is wrong.
+        let most_blocks = 100 + 100 * self.wanted / self.width.max(1);
+        self.start()?;
+        let mut check_at = 3 * self.wanted;
+        for _ in 0..most_blocks {
+            let remainder = self.expand()?;
+            let full = self.done + self.width > self.stride;
+            if self.done < check_at.min(self.stride - self.width) && !full {
+                report(0.7 * self.done as f64 / check_at as f64);
+                continue;
+            }
+            check_at = self.done + self.width;
+            let (values, vectors) = self.ritz()?;
+            let converged = self.converged(&values, &vectors, &remainder);
+            report(0.7 + 0.3 * converged as f64 / self.wanted as f64);
+            if converged >= self.wanted {
+                return Ok(self.combine(&vectors, self.wanted));
+            }
+            if full {
+                let keep = (self.wanted + self.width + (self.stride - self.wanted) / 4)
+                    .min(self.stride.saturating_sub(2 * self.width));
+                if keep < self.wanted {
+                    return Err(NoConvergence);
+                }
+                self.restart(&values, &vectors, keep);
+            }
+        }
+        Err(NoConvergence)
+    }
+
+    fn start(&mut self) -> Result<(), NoConvergence> {
+        let mut block = vec![0.0; self.solver.dofs() * self.width];
+        for x in &mut block {
+            // splitmix64: the same start in every run.
+            self.seed = self.seed.wrapping_add(0x9E37_79B9_7F4A_7C15);
+            let mut z = self.seed;
+            z = (z ^ (z >> 30)).wrapping_mul(0xBF58_476D_1CE4_E5B9);
+            z = (z ^ (z >> 27)).wrapping_mul(0x94D0_49BB_1331_11EB);
+            z ^= z >> 31;
+            *x = (z >> 11) as f64 / (1u64 << 53) as f64 - 0.5;
+        }
+        self.solver.remove_rigid(&mut block, self.width);
+        self.orthogonalise(&mut block, self.width);
+        let (next, remainder) = normalise(self.solver, block, self.width).ok_or(NoConvergence)?;
+        self.next = next;
+        self.width = remainder.width;
+        if self.width == 0 { Err(NoConvergence) } else { Ok(()) }
+    }
+
+    /// Takes the next block into the basis, applies the operator to it and orthogonalises the image.
+    fn expand(&mut self) -> Result<Remainder, NoConvergence> {
+        let width = self.width;
+        let at = self.done;
+        blocks::put(&mut self.basis, self.stride, at, &self.next, width);
+        self.done += width;
+        let mut image = self.solver.operator(&self.next, width);
+        let scale = image.iter().map(|x| x * x).sum::<f64>();
+        let h = self.orthogonalise(&mut image, width);
+        for j in 0..width {
+            for i in 0..self.done {
+                self.projected[(i, at + j)] = h[(i, j)];
+                self.projected[(at + j, i)] = h[(i, j)];
+            }
+        }
+        for j in 0..width {
+            for i in 0..j {
+                let mean = 0.5 * (h[(at + i, j)] + h[(at + j, i)]);
+                self.projected[(at + i, at + j)] = mean;
+                self.projected[(at + j, at + i)] = mean;
+            }
+        }
+        if !scale.is_finite() {
+            return Err(NoConvergence);
+        }
+        let (next, remainder) = normalise(self.solver, image, width).ok_or(NoConvergence)?;
+        if remainder.width == 0 {
+            // The space is invariant: go on with new directions.
+            self.width = width;
+            self.start()?;
+            return Ok(Remainder { coefficients: Mat::zeros(self.width, width), width: self.width });
+        }
+        self.next = next;
+        self.width = remainder.width;
+        Ok(remainder)
+    }
+
+    /// Makes the block M-orthogonal to the basis, twice; returns the coefficients taken out.
+    fn orthogonalise(&self, block: &mut [f64], width: usize) -> Mat<f64> {
+        let mut sum = Mat::zeros(self.done, width);
+        if self.done == 0 {
+            return sum;
+        }
+        let basis = Tall { data: &self.basis, stride: self.stride, columns: self.done };
+        let mut mass = vec![0.0; block.len()];
+        for _ in 0..2 {
+            self.solver.matrix.mass_times(block, width, &mut mass);
+            let h = blocks::gram(basis, Tall::new(&mass, width));
+            blocks::add_product(block, basis, h.as_ref(), -1.0);
+            sum += h;
+        }
+        sum
+    }
+
+    /// Ritz values, descending, and their vectors in basis coordinates.
+    fn ritz(&self) -> Result<(Vec<f64>, Mat<f64>), NoConvergence> {
+        let projected = self.projected.as_ref().submatrix(0, 0, self.done, self.done);
+        let (mut values, vectors) = blocks::symmetric_eigen(projected).ok_or(NoConvergence)?;
+        values.reverse();
+        let vectors = Mat::from_fn(self.done, self.done, |i, j| vectors[(i, self.done - 1 - j)]);
+        Ok((values, vectors))
+    }
+
+    /// How many of the leading wanted Ritz pairs have converged.
+    fn converged(&self, values: &[f64], vectors: &Mat<f64>, remainder: &Remainder) -> usize {
+        let c = &remainder.coefficients;
+        let first = self.done - c.ncols();
+        (0..self.wanted.min(self.done))
+            .take_while(|&k| {
+                let mut norm2 = 0.0;
+                for i in 0..c.nrows() {
+                    let entry: f64 = (0..c.ncols()).map(|j| c[(i, j)] * vectors[(first + j, k)]).sum();
+                    norm2 += entry * entry;
+                }
+                values[k] > 0.0 && norm2.sqrt() <= TOLERANCE * values[k]
+            })
+            .count()
+    }
+
+    fn combine(&self, vectors: &Mat<f64>, count: usize) -> Vec<f64> {
+        let basis = Tall { data: &self.basis, stride: self.stride, columns: self.done };
+        blocks::product(basis, vectors.as_ref().subcols(0, count))
+    }
+
+    /// Keeps the leading Ritz vectors as the new basis. Their coupling with the next block comes out of its
+    /// full orthogonalisation.
+    fn restart(&mut self, values: &[f64], vectors: &Mat<f64>, keep: usize) {
+        let kept = self.combine(vectors, keep);
+        blocks::put(&mut self.basis, self.stride, 0, &kept, keep);
+        self.projected.fill(0.0);
+        for (i, value) in values.iter().enumerate().take(keep) {
+            self.projected[(i, i)] = *value;
+        }
+        self.done = keep;
+    }
+}
+
+/// M-orthonormalises the columns of a block among themselves, dropping those that are combinations of the others.
+/// `block = result coefficients`. `None` when the small eigenproblem fails.
+fn normalise(solver: &Solver, mut block: Vec<f64>, width: usize) -> Option<(Vec<f64>, Remainder)> {
+    let mut coefficients = Mat::<f64>::identity(width, width);
+    let mut columns = width;
+    for _ in 0..2 {
+        let mut mass = vec![0.0; block.len()];
+        solver.matrix.mass_times(&block, columns, &mut mass);
+        let gram = blocks::gram(Tall::new(&block, columns), Tall::new(&mass, columns));
+        let (values, vectors) = blocks::symmetric_eigen(gram.as_ref())?;
+        let largest = values.last().copied().unwrap_or(0.0);
+        let keep: Vec<usize> = (0..columns).filter(|&i| values[i] > 1e-26 * largest && values[i] > 0.0).collect();
+        let turn = Mat::from_fn(columns, keep.len(), |i, j| vectors[(i, keep[j])] / values[keep[j]].sqrt());
+        let back = Mat::from_fn(keep.len(), columns, |i, j| vectors[(j, keep[i])] * values[keep[i]].sqrt());
+        block = blocks::product(Tall::new(&block, columns), turn.as_ref());
+        coefficients = back * coefficients;
+        columns = keep.len();
+        if columns == 0 {
+            break;
+        }
+    }
+    Some((block, Remainder { coefficients, width: columns }))
+}
+
+/// One step of inverse subspace iteration and Rayleigh-Ritz. It damps what is left of the high modes, which the
+/// stiffness would blow up in the residual `K phi - lambda M phi`.
+fn polish(solver: &Solver, phi: Vec<f64>, wanted: usize) -> Result<Modes, NoConvergence> {
+    const GROUP: usize = 16;
+    let n = solver.dofs();
+    let mut loads = vec![0.0; phi.len()];
+    solver.matrix.mass_times(&phi, wanted, &mut loads);
+    let mut x = vec![0.0; phi.len()];
+    for start in (0..wanted).step_by(GROUP) {
+        let width = GROUP.min(wanted - start);
+        let mut part: Vec<f64> =
+            (0..n).flat_map(|dof| loads[dof * wanted + start..][..width].iter().copied()).collect();
+        solver.solve(&mut part, width);
+        blocks::put(&mut x, wanted, start, &part, width);
+    }
+    // K x = M phi, so x^T K x = x^T M phi needs no product with the stiffness.
+    let tall = Tall::new(&x, wanted);
+    let stiffness = blocks::gram(tall, Tall::new(&loads, wanted));
+    let mut mass_x = vec![0.0; x.len()];
+    solver.matrix.mass_times(&x, wanted, &mut mass_x);
+    let mass = blocks::gram(tall, Tall::new(&mass_x, wanted));
+    let (lambda, turn) = generalised(stiffness, mass).ok_or(NoConvergence)?;
+    Ok(Modes { lambda, phi: blocks::product(tall, turn.as_ref()) })
+}
+
+/// `A y = lambda B y` for small symmetric A and positive definite B: ascending, `Y^T B Y = I`.
+fn generalised(a: Mat<f64>, b: Mat<f64>) -> Option<(Vec<f64>, Mat<f64>)> {
+    let n = a.nrows();
+    // Scaling first: the columns of inverse iteration differ in length as 1 / lambda.
+    let scale: Vec<f64> = (0..n).map(|i| 1.0 / b[(i, i)].sqrt()).collect();
+    let scaled = |m: &Mat<f64>| {
+        Mat::from_fn(n, n, |i, j| 0.5 * (m[(i, j)] + m[(j, i)]) * scale[i] * scale[j])
+    };
+    let (values, vectors) = blocks::symmetric_eigen(scaled(&b).as_ref())?;
+    if !values.iter().all(|&v| v > 0.0) {
+        return None;
+    }
+    let root = Mat::from_fn(n, n, |i, j| vectors[(i, j)] / values[j].sqrt());
+    let reduced = root.transpose() * scaled(&a) * &root;
+    let symmetric = Mat::from_fn(n, n, |i, j| 0.5 * (reduced[(i, j)] + reduced[(j, i)]));
+    let (lambda, y) = blocks::symmetric_eigen(symmetric.as_ref())?;
+    let turned = root * y;
+    Some((lambda, Mat::from_fn(n, n, |i, j| scale[i] * turned[(i, j)])))
+}
+
+/// All modes of a small problem, the lowest elastic ones kept: the rigid modes of a free body come first and go.
+fn dense(solver: &Solver, wanted: usize) -> Result<Modes, NoConvergence> {
+    let n = solver.dofs();
+    let mut identity = vec![0.0; n * n];
+    identity.iter_mut().step_by(n + 1).for_each(|x| *x = 1.0);
+    let (mut k, mut m) = (vec![0.0; n * n], vec![0.0; n * n]);
+    solver.matrix.stiffness_times(&identity, n, &mut k);
+    solver.matrix.mass_times(&identity, n, &mut m);
+    let stiffness = Mat::from_fn(n, n, |i, j| k[i * n + j]);
+    let mass = Mat::from_fn(n, n, |i, j| m[i * n + j]);
+    let (lambda, y) = generalised(stiffness, mass).ok_or(NoConvergence)?;
+    let skip = if solver.rigid.is_some() { 6 } else { 0 };
+    let mut phi = Vec::with_capacity(n * wanted);
+    for i in 0..n {
+        phi.extend((skip..skip + wanted).map(|j| y[(i, j)]));
+    }
+    Ok(Modes { lambda: lambda[skip..skip + wanted].to_vec(), phi })
+}
+
+#[cfg(test)]
+#[path = "lanczos_tests.rs"]
+mod tests;
