@@ -168,6 +168,16 @@ pub enum MeshError {
         /// Smallest and largest angle, degrees.
         found: [f64; 2],
     },
+    /// A number in the description of a body is out of range.
+    #[error("part {part:?}: expected {expected}, found {found}")]
+    Part {
+        /// Name of the part.
+        part: String,
+        /// What would do.
+        expected: String,
+        /// What stands there.
+        found: f64,
+    },
     /// A parameter is out of its range.
     #[error("{name}: expected {expected}, found {found}")]
     Parameter {

@@ -5,6 +5,7 @@
 //! | Extension | Format | Read as | Written |
 //! | --- | --- | --- | --- |
 //! | `.obj` | Wavefront OBJ | surface | |
+//! | `.ron` | [`Scene`], the project's own | distance field | |
 //! | `.msh` | Gmsh MSH 2.2 and 4.1, text and binary | tetrahedra | text |
 //!
 //! Whatever bytes a file holds, reading gives a mesh or an error, and takes memory in proportion to the file.
@@ -19,7 +20,11 @@ use std::{
     path::Path,
 };
 
-use crate::{MeshError, StuffOptions, Surface, TetMesh, sdf::SurfaceDistance, stuff};
+use crate::{
+    MeshError, StuffOptions, Surface, TetMesh,
+    sdf::{Scene, SurfaceDistance},
+    stuff,
+};
 
 pub use msh::MshVersion;
 
@@ -27,8 +32,9 @@ pub use msh::MshVersion;
 const MAX_FILE: u64 = 1 << 30;
 
 const SURFACES: &str = ".obj";
+const SCENES: &str = ".ron";
 const TETS: &str = ".msh";
-const ALL: &str = ".obj (a surface) or .msh (tetrahedra)";
+const ALL: &str = ".obj (a surface), .ron (a description) or .msh (tetrahedra)";
 
 /// What a file holds.
 #[derive(Clone, Debug)]
@@ -36,6 +42,8 @@ const ALL: &str = ".obj (a surface) or .msh (tetrahedra)";
 pub enum Input {
     /// Triangles.
     Surface(Surface),
+    /// The description of a body by rounded parts.
+    Sdf(Scene),
     /// Tetrahedra, ready to be baked.
     Tets(TetMesh),
 }
@@ -52,6 +60,7 @@ impl Input {
     ) -> Result<TetMesh, MeshError> {
         match self {
             Self::Surface(surface) => stuff(&SurfaceDistance::new(&surface)?, options, progress),
+            Self::Sdf(scene) => stuff(&scene, options, progress),
             Self::Tets(mesh) => Ok(mesh),
         }
     }
@@ -67,6 +76,7 @@ pub fn read(path: impl AsRef<Path>) -> Result<Input, MeshError> {
     match extension(path).as_str() {
         "obj" => read_surface(path).map(Input::Surface),
         "msh" => read_tets(path).map(Input::Tets),
+        "ron" => read_sdf(path).map(Input::Sdf),
         _ => Err(unknown(path, ALL)),
     }
 }
@@ -112,6 +122,19 @@ pub fn read_tets(path: impl AsRef<Path>) -> Result<TetMesh, MeshError> {
         mesh.check()?;
         Ok(mesh)
     })
+}
+
+/// Reads the description of a body, see [`Scene`].
+///
+/// # Errors
+/// [`MeshError::UnknownFormat`], [`MeshError::Read`], or [`MeshError::InFile`] around what [`Scene::from_ron`] says.
+pub fn read_sdf(path: impl AsRef<Path>) -> Result<Scene, MeshError> {
+    let path = path.as_ref();
+    if extension(path) != "ron" {
+        return Err(unknown(path, SCENES));
+    }
+    let bytes = bytes(path)?;
+    in_file(path, || Scene::from_ron(&String::from_utf8_lossy(&bytes)))
 }
 
 /// Writes Gmsh MSH 4.1 as text. Reading it back gives the same mesh to the last bit.
@@ -261,6 +284,7 @@ mod tests {
         }
 
         fn any_reader(bytes: &[u8]) {
+            let _ = Scene::from_ron(&String::from_utf8_lossy(bytes));
             let _ = obj::parse(bytes).map(|s| s.check());
             let _ = msh::parse(bytes).map(|mut m| {
                 m.drop_unused_nodes();

@@ -1,7 +1,10 @@
 //! Shapes given by their distance.
 
+mod scene;
+mod shapes;
 mod surface;
 
+pub use scene::Scene;
 pub use surface::SurfaceDistance;
 
 /// A solid shape that knows how far any point is from its surface.

