@@ -1,1 +1,106 @@
 //! Soft bodies that several people can hold, feel and watch at once, over networks that lose packets.
+//!
+//! ```no_run
+//! use bevy::prelude::*;
+//! use pliant::prelude::*;
+//!
+//! fn main() {
+//!     App::new().add_plugins((DefaultPlugins, PliantPlugins::default())).add_systems(Startup, setup).run();
+//! }
+//!
+//! fn setup(mut commands: Commands, assets: Res<AssetServer>) {
+//!     commands.spawn((ModalBody::new(assets.load("pip.modal")), Transform::from_xyz(0.0, 0.5, 0.0)));
+//!     commands.spawn((Camera3d::default(), Transform::from_xyz(0.0, 1.0, 3.0).looking_at(Vec3::Y, Vec3::Y)));
+//! }
+//! # #[cfg(not(feature = "render"))] #[derive(Component, Default)] struct Camera3d;
+//! ```
+//!
+//! # Plugins
+//!
+//! [`PliantPlugins`] holds what nearly every scene wants:
+//!
+//! | Plugin | What it does | Without it |
+//! | --- | --- | --- |
+//! | [`PliantBodyPlugin`](body::PliantBodyPlugin) | `.modal` assets, [`ModalBody`](body::ModalBody), grabs, the fixed step, the deformed surface | nothing else runs |
+//! | [`PointerGrabPlugin`](body::PointerGrabPlugin) | the pointer drags bodies | grabs are made by code only |
+//!
+//! These are added where they are wanted, each behind its feature:
+//!
+//! | Plugin | Feature | What it does |
+//! | --- | --- | --- |
+#![cfg_attr(feature = "rerun", doc = "| [`RerunPlugin`](rerun::RerunPlugin) | `rerun` | shapes, forces and figures to the rerun viewer or a file |")]
+#![cfg_attr(feature = "net", doc = "| the plugins of [`net`] | `net` | one body held by several machines, over QUIC |")]
+//!
+//! # Features
+//!
+//! | Feature | Default | What it brings |
+//! | --- | --- | --- |
+//! | `render` | yes | Bevy's renderer; bodies are drawn |
+//! | `window` | yes | what a windowed game usually has: winit on X11, user interface, text, PNG; leave it out to choose Bevy's features yourself |
+//! | `wayland` | no | native Wayland windows (needs the Wayland client headers when building) |
+//! | `net` | yes | sessions over QUIC |
+//! | `rerun` | yes | the rerun viewer's client |
+
+use bevy::{
+    app::{PluginGroup, PluginGroupBuilder},
+    ecs::schedule::{InternedScheduleLabel, ScheduleLabel},
+    prelude::FixedUpdate,
+};
+
+pub use pliant_body as body;
+pub use pliant_modal as modal;
+#[cfg(feature = "net")]
+pub use pliant_net as net;
+#[cfg(feature = "rerun")]
+pub use pliant_rerun as rerun;
+#[cfg(feature = "net")]
+pub use pliant_stream as stream;
+
+/// What a scene with soft bodies needs; see the [crate page](crate#plugins) for what is in it and what may be added.
+///
+/// ```
+/// # use bevy::prelude::*;
+/// # use pliant::prelude::*;
+/// # let mut app = App::new();
+/// # app.add_plugins((MinimalPlugins, AssetPlugin::default(), TransformPlugin));
+/// // Stepped in `FixedPostUpdate`, and nothing for the pointer to hold.
+/// app.add_plugins(PliantPlugins::new(FixedPostUpdate).build().disable::<PointerGrabPlugin>());
+/// ```
+pub struct PliantPlugins {
+    schedule: InternedScheduleLabel,
+}
+
+impl PliantPlugins {
+    /// Bodies are stepped in `schedule`: in the fixed loop by fixed steps and shown in between, elsewhere once by its own time.
+    pub fn new(schedule: impl ScheduleLabel) -> Self {
+        Self { schedule: schedule.intern() }
+    }
+}
+
+impl Default for PliantPlugins {
+    /// In `FixedUpdate`.
+    fn default() -> Self {
+        Self::new(FixedUpdate)
+    }
+}
+
+impl PluginGroup for PliantPlugins {
+    fn build(self) -> PluginGroupBuilder {
+        PluginGroupBuilder::start::<Self>()
+            .add(body::PliantBodyPlugin::new(self.schedule))
+            .add(body::PointerGrabPlugin)
+    }
+}
+
+/// The names that a scene uses.
+pub mod prelude {
+    pub use crate::PliantPlugins;
+    #[cfg(feature = "render")]
+    pub use crate::body::SurfaceShading;
+    pub use crate::body::{
+        BodyRefused, BodyState, Driven, Grab, GrabForce, GrabOf, Grabs, Integration, ModalAsset, ModalBody,
+        NoPointerGrab, PliantBodyPlugin, PliantDisplaySystems, PliantSystems, PliantTick, PointerGrab,
+        PointerGrabPlugin, PointerGrabSystems, PointerHeld, ShownState,
+    };
+    pub use crate::modal::{ModalModel, Patch};
+}

@@ -118,6 +118,8 @@ pub(crate) fn build(app: &mut App) {
                 // A server is built with this feature when its neighbour in the workspace draws: it has no meshes.
                 .run_if(resource_exists::<Assets<Mesh>>)
                 .in_set(PliantDisplaySystems::Deform)
+                // It asks who was seen in the frame before; from here on visibility is found anew.
+                .before(VisibilitySystems::VisibilityPropagate)
                 .before(VisibilitySystems::CalculateBounds),
         );
 }
