@@ -10,6 +10,7 @@ use std::task::Poll;
 use std::time::{Duration, Instant, SystemTime};
 
 use bytes::Bytes;
+use pliant_stream::PeerId;
 use quinn::{
     ClientConfig, Connection, ConnectionError, EndpointConfig, Incoming, RecvStream, Runtime,
     SendDatagramError, SendStream, ServerConfig, TokioRuntime, TransportErrorCode, VarInt,
@@ -22,7 +23,7 @@ use tracing::debug;
 use super::config::Access;
 use super::congestion::Bucket;
 use super::emulated::{Emulated, Emulation};
-use super::endpoint::{CloseReason, Event, Peer, PeerId, Shared, TransportError};
+use super::endpoint::{CloseReason, Event, Peer, Shared, TransportError};
 use super::identity::{Fingerprint, SERVER_NAME, shortened};
 use super::invite::Invite;
 use super::queue::{Next, lock};

@@ -1,15 +1,15 @@
 //! A socket over an emulated link: real QUIC over a network that loses, delays and reorders, on one machine and from a seed.
 
-use std::cmp::Reverse;
-use std::collections::BinaryHeap;
 use std::fmt;
 use std::io::{self, IoSliceMut};
-use std::net::SocketAddr;
+use std::net::{IpAddr, SocketAddr};
 use std::pin::Pin;
 use std::sync::{Arc, Mutex};
 use std::task::{Context, Poll};
-use std::time::{Duration, Instant};
+use std::time::Instant;
 
+use bytes::Bytes;
+use pliant_stream::emulator::{Link, LinkConfig, Preset};
 use quinn::udp::{RecvMeta, Transmit};
 use quinn::{AsyncUdpSocket, UdpPoller};
 use tokio::sync::Notify;
@@ -17,101 +17,59 @@ use tokio::time::{Sleep, sleep_until};
 
 use super::queue::lock;
 
-/// One direction of a link: says when a packet arrives.
-pub trait PacketLink: Send + fmt::Debug {
-    /// A packet of `bytes` (UDP payload) enters at `now` (since the link began). Pushes the times at which it arrives onto `arrivals`: none
-    /// if it is lost, several if it is doubled.
-    fn offer(&mut self, now: Duration, bytes: usize, arrivals: &mut Vec<Duration>);
-}
-
-/// A link for each direction.
-#[derive(Debug)]
+/// A link for each direction of one endpoint, and the seed of their chances.
+#[derive(Debug, Clone, PartialEq)]
 pub struct Emulation {
     /// For what this endpoint sends.
-    pub outgoing: Box<dyn PacketLink>,
+    pub outgoing: LinkConfig,
     /// For what it receives.
-    pub incoming: Box<dyn PacketLink>,
+    pub incoming: LinkConfig,
+    /// Of all chances on the two links. With real sockets the packets' times differ from run to run, and so does what is lost.
+    pub seed: u64,
+}
+
+impl Emulation {
+    /// A named network: both directions alike.
+    pub fn preset(preset: Preset, seed: u64) -> Self {
+        let link = LinkConfig::preset(preset);
+        Self { outgoing: link.clone(), incoming: link, seed }
+    }
 }
 
 /// A packet on its way.
-#[derive(Debug)]
+#[derive(Debug, Clone)]
 struct Packet {
-    due: Instant,
-    /// Breaks ties in the order of entry.
-    number: u64,
     /// Where to, or where from.
     address: SocketAddr,
-    meta: Option<RecvMeta>,
-    bytes: Vec<u8>,
+    /// Which of our addresses it came to.
+    to: Option<IpAddr>,
+    bytes: Bytes,
 }
 
-impl PartialEq for Packet {
-    fn eq(&self, other: &Self) -> bool {
-        self.cmp(other).is_eq()
-    }
-}
-
-impl Eq for Packet {}
-
-impl PartialOrd for Packet {
-    fn partial_cmp(&self, other: &Self) -> Option<std::cmp::Ordering> {
-        Some(self.cmp(other))
-    }
-}
-
-impl Ord for Packet {
-    fn cmp(&self, other: &Self) -> std::cmp::Ordering {
-        (self.due, self.number).cmp(&(other.due, other.number))
-    }
-}
-
-/// What is on its way in one direction.
+/// One direction, in real time.
 #[derive(Debug)]
 struct Direction {
-    link: Box<dyn PacketLink>,
+    link: Link<Packet>,
     began: Instant,
-    packets: BinaryHeap<Reverse<Packet>>,
-    number: u64,
-    arrivals: Vec<Duration>,
 }
 
-/// Packets under way in one direction; more are lost, as in a router's full queue.
-const MOST_UNDER_WAY: usize = 4096;
-
 impl Direction {
-    fn new(link: Box<dyn PacketLink>, began: Instant) -> Self {
-        Self { link, began, packets: BinaryHeap::new(), number: 0, arrivals: Vec::new() }
+    fn new(config: LinkConfig, seed: u64, began: Instant) -> Self {
+        Self { link: Link::new(config, seed), began }
     }
 
-    fn enter(&mut self, now: Instant, address: SocketAddr, meta: Option<RecvMeta>, bytes: &[u8]) {
-        self.arrivals.clear();
-        self.link.offer(now.saturating_duration_since(self.began), bytes.len(), &mut self.arrivals);
-        for &at in &self.arrivals {
-            if self.packets.len() >= MOST_UNDER_WAY {
-                break;
-            }
-            // A time beyond the clock's range never comes.
-            let Some(due) = self.began.checked_add(at) else { continue };
-            self.packets.push(Reverse(Packet {
-                due,
-                number: self.number,
-                address,
-                meta,
-                bytes: bytes.to_vec(),
-            }));
-            self.number += 1;
-        }
+    fn enter(&mut self, now: Instant, address: SocketAddr, to: Option<IpAddr>, bytes: &[u8]) {
+        let packet = Packet { address, to, bytes: Bytes::copy_from_slice(bytes) };
+        self.link.send(now.saturating_duration_since(self.began), packet, bytes.len());
     }
 
+    /// When the next packet arrives. A time beyond the clock's range never comes.
     fn due(&self) -> Option<Instant> {
-        self.packets.peek().map(|Reverse(packet)| packet.due)
+        self.began.checked_add(self.link.next_wakeup()?)
     }
 
     fn leave(&mut self, now: Instant) -> Option<Packet> {
-        if self.due()? > now {
-            return None;
-        }
-        self.packets.pop().map(|Reverse(packet)| packet)
+        self.link.poll(now.saturating_duration_since(self.began))
     }
 }
 
@@ -150,13 +108,13 @@ impl Emulated {
     ) -> io::Result<Arc<dyn AsyncUdpSocket>> {
         let began = Instant::now();
         let outgoing = Arc::new(Outgoing {
-            direction: Mutex::new(Direction::new(emulation.outgoing, began)),
+            direction: Mutex::new(Direction::new(emulation.outgoing, emulation.seed.wrapping_mul(2), began)),
             entered: Notify::new(),
         });
         tokio::spawn(carry(Arc::clone(&socket), Arc::clone(&outgoing)));
         let segments = socket.max_receive_segments().max(1);
         let incoming = Incoming {
-            direction: Direction::new(emulation.incoming, began),
+            direction: Direction::new(emulation.incoming, emulation.seed.wrapping_mul(2) | 1, began),
             alarm: Box::pin(sleep_until(began.into())),
             buffers: vec![vec![0; LARGEST.max(segments * 1500)]; BATCH],
         };
@@ -242,7 +200,7 @@ impl AsyncUdpSocket for Emulated {
                     for (meta, buffer) in metas.iter().zip(buffers.iter()).take(count) {
                         let bytes = buffer.get(..meta.len).unwrap_or_default();
                         for segment in bytes.chunks(meta.stride.max(1)) {
-                            direction.enter(now, meta.addr, Some(*meta), segment);
+                            direction.enter(now, meta.addr, meta.dst_ip, segment);
                         }
                     }
                 }
@@ -255,8 +213,7 @@ impl AsyncUdpSocket for Emulated {
             // What does not fit is not a QUIC packet of ours; it arrives empty and is ignored.
             let len = if packet.bytes.len() <= buffer.len() { packet.bytes.len() } else { 0 };
             buffer[..len].copy_from_slice(&packet.bytes[..len]);
-            let from = packet.meta.unwrap_or_default();
-            *meta = RecvMeta { addr: packet.address, len, stride: len, ecn: None, dst_ip: from.dst_ip };
+            *meta = RecvMeta { addr: packet.address, len, stride: len, ecn: None, dst_ip: packet.to };
             count += 1;
         }
         if count > 0 {

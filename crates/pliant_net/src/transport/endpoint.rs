@@ -9,6 +9,7 @@ use std::thread::JoinHandle;
 use std::time::{Duration, Instant};
 
 use bytes::Bytes;
+use pliant_stream::PeerId;
 use thiserror::Error;
 use tokio::sync::Notify;
 
@@ -18,15 +19,6 @@ use super::identity::{Fingerprint, Identity, IdentityError};
 use super::invite::{Invite, Token};
 use super::queue::{Inbox, Outbox, lock};
 use super::stats::{DropCounts, PeerStats};
-
-/// One peer of one endpoint, for the length of one connection: never used again for another.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Hash)]
-pub struct PeerId(pub u64);
-
-impl PeerId {
-    /// The host, as a guest knows it: a guest has no other peer.
-    pub const HOST: Self = Self(0);
-}
 
 /// What happened, in order for each peer: `Connected`, then its datagrams and messages, then `Closed`.
 #[derive(Clone, Debug)]

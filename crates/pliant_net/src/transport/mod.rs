@@ -24,8 +24,9 @@ mod wire;
 
 pub use config::{ALPN, Access, HostOptions, JoinOptions, Limits};
 pub use congestion::RateCap;
-pub use emulated::{Emulation, PacketLink};
-pub use endpoint::{CloseReason, Endpoint, Event, PeerId, SendError, TransportError};
+pub use emulated::Emulation;
+pub use endpoint::{CloseReason, Endpoint, Event, SendError, TransportError};
 pub use identity::{Fingerprint, Identity, IdentityError};
 pub use invite::{Invite, InviteError, Token};
+pub use pliant_stream::PeerId;
 pub use stats::{DropCounts, PeerStats};

@@ -6,9 +6,10 @@ use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 use std::time::Instant;
 
 use bytes::Bytes;
+use pliant_stream::PeerId;
 use tokio::sync::Notify;
 
-use super::endpoint::{CloseReason, Event, PeerId};
+use super::endpoint::{CloseReason, Event};
 
 /// A lock that a panic elsewhere does not poison: the queues hold plain data that is whole between calls.
 pub(super) fn lock<T>(mutex: &Mutex<T>) -> MutexGuard<'_, T> {

@@ -1,0 +1,89 @@
+//! Session coordinates: where points and forces of a body are said to be when they cross the network.
+//!
+//! An anchored body is streamed in its own axes, so each app may place it anywhere and scale it, and hands meet on the same spot of the
+//! surface. A free body carries its pose in the stream and is streamed in world axes.
+
+use bevy::math::{DQuat, DVec3};
+use bevy::prelude::*;
+use pliant_body::BodyState;
+
+/// The map between an app's world and session coordinates for one body: `world = rotation * session * scale + origin`.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub(crate) struct Place {
+    origin: DVec3,
+    rotation: DQuat,
+    scale: f64,
+}
+
+impl Place {
+    /// Where the body of an entity is, or `None` while its transform cannot place a body (`pliant_body` has refused and told it then).
+    pub(crate) fn of(transform: &GlobalTransform, free: bool) -> Option<Self> {
+        let (scale, rotation, origin) = transform.to_scale_rotation_translation();
+        if !(scale.x > 0.0 && scale.is_finite() && rotation.is_finite() && origin.is_finite()) {
+            return None;
+        }
+        let scale = f64::from(scale.x);
+        Some(match free {
+            true => Self { origin: DVec3::ZERO, rotation: DQuat::IDENTITY, scale },
+            false => Self { origin: origin.as_dvec3(), rotation: rotation.as_dquat().normalize(), scale },
+        })
+    }
+
+    /// The place of a body that is simulated here.
+    pub(crate) fn of_body(transform: &GlobalTransform, state: &BodyState) -> Option<Self> {
+        Self::of(transform, state.model().is_free())
+    }
+
+    pub(crate) fn point_to_session(&self, world: DVec3) -> [f64; 3] {
+        (self.rotation.inverse() * (world - self.origin) / self.scale).into()
+    }
+
+    pub(crate) fn point_to_world(&self, session: [f64; 3]) -> DVec3 {
+        self.rotation * (DVec3::from(session) * self.scale) + self.origin
+    }
+
+    /// Forces scale like lengths: stiffness (N/m) stays as baked.
+    pub(crate) fn force_to_session(&self, world: DVec3) -> [f64; 3] {
+        (self.rotation.inverse() * world / self.scale).into()
+    }
+
+    pub(crate) fn force_to_world(&self, session: [f64; 3]) -> DVec3 {
+        self.rotation * DVec3::from(session) * self.scale
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn points_and_forces_come_back_from_the_session() {
+        let transform = Transform {
+            translation: Vec3::new(1.0, -2.0, 3.0),
+            rotation: Quat::from_euler(EulerRot::XYZ, 0.3, -1.1, 2.0),
+            scale: Vec3::splat(2.5),
+        };
+        let place = Place::of(&GlobalTransform::from(transform), false).unwrap();
+        let point = DVec3::new(0.4, 5.0, -0.6);
+        // f32 transforms: seven digits.
+        assert!(place.point_to_world(place.point_to_session(point)).distance(point) < 1e-6);
+        assert!(place.force_to_world(place.force_to_session(point)).distance(point) < 1e-6);
+        // The body's own origin is where the entity is.
+        assert!(place.point_to_world([0.0; 3]).distance(DVec3::new(1.0, -2.0, 3.0)) < 1e-6);
+        // A force on a body twice as large is twice as large: N/m stays.
+        assert!((place.force_to_world([0.0, 3.0, 0.0]).length() - 7.5).abs() < 1e-6);
+        let free = Place::of(&GlobalTransform::from(transform), true).unwrap();
+        assert_eq!(free.point_to_session(point), (point / 2.5).to_array());
+    }
+
+    #[test]
+    fn no_place_for_what_cannot_be_placed() {
+        for bad in [
+            Transform::from_scale(Vec3::ZERO),
+            Transform::from_xyz(f32::NAN, 0.0, 0.0),
+            Transform::from_scale(Vec3::splat(-1.0)),
+        ] {
+            assert!(Place::of(&GlobalTransform::from(bad), false).is_none_or(|place| place.scale > 0.0));
+        }
+    }
+}

@@ -1,0 +1,142 @@
+//! Apps that share a body over loopback, and a body whose modes are known in closed form.
+#![allow(dead_code, reason = "each test uses its part")]
+
+use std::f64::consts::{FRAC_PI_2, TAU};
+use std::sync::Arc;
+use std::time::{Duration, Instant};
+
+use bevy::prelude::*;
+use bevy::transform::TransformPlugin;
+use pliant_body::{ModalAsset, ModalBody, PliantBodyPlugin};
+use pliant_modal::{BakeInfo, Damping, Element, ModalModel, ModelParts, SurfaceMesh};
+use pliant_net::{HostConfig, Invite, JoinConfig, NetPlugin, SharedBody};
+
+/// Cells along the bar.
+const CELLS: u32 = 16;
+
+/// A vertex at the tip of [`bar`].
+pub const TIP: u32 = 4 * CELLS;
+/// A vertex in the middle of it.
+pub const MIDDLE: u32 = 4 * (CELLS / 2);
+
+/// A square bar of 1 m and 2 kg along x, fixed at x = 0, that shears in y and z with shapes sin((2k - 1) pi x / 2).
+pub fn bar() -> Arc<ModalModel> {
+    let half = 0.08;
+    let mut positions: Vec<[f32; 3]> = Vec::new();
+    for i in 0..=CELLS {
+        for [y, z] in [[-1.0, -1.0], [1.0, -1.0], [1.0, 1.0], [-1.0, 1.0]] {
+            positions.push([i as f32 / CELLS as f32, y * half, z * half]);
+        }
+    }
+    let mut triangles = Vec::new();
+    for i in 0..CELLS {
+        for k in 0..4 {
+            let (a, b) = (4 * i + k, 4 * i + (k + 1) % 4);
+            triangles.extend([[a, b + 4, b], [a, a + 4, b + 4]]);
+        }
+    }
+    triangles.extend([[0, 1, 2], [0, 2, 3], [TIP, TIP + 2, TIP + 1], [TIP, TIP + 3, TIP + 2]]);
+    let anchored = positions.iter().map(|p| p[0] == 0.0).collect();
+    let surface = SurfaceMesh::new(positions.clone(), triangles, None, anchored).unwrap();
+    let modes: Vec<(usize, f64)> = vec![(1, 0.9), (2, 1.1), (1, 2.7), (2, 3.3)];
+    let (mut displacement, mut rotation) = (Vec::new(), Vec::new());
+    for (mode, &(axis, _)) in modes.iter().enumerate() {
+        let wave = (2 * (mode / 2) + 1) as f64 * FRAC_PI_2;
+        for p in &positions {
+            let (s, c) =
+                ((wave * f64::from(p[0])).sin() as f32, (wave * (wave * f64::from(p[0])).cos()) as f32);
+            displacement.extend(if axis == 1 { [0.0, s, 0.0] } else { [0.0, 0.0, s] });
+            rotation.extend(if axis == 1 { [0.0, 0.0, 0.5 * c] } else { [0.0, -0.5 * c, 0.0] });
+        }
+    }
+    let omega: Vec<f64> = modes.iter().map(|mode| TAU * mode.1).collect();
+    let damping = Damping::Ratio(0.2);
+    let parts = ModelParts {
+        info: BakeInfo {
+            name: "bar".into(),
+            tets: 1,
+            nodes: positions.len(),
+            element: Element::Tet4,
+            young: 1e5,
+            poisson: 0.3,
+            density: 1000.0,
+            damping,
+            anchors: vec!["x<0.01".into()],
+            residual_max: 0.0,
+            orthonormality_max: 0.0,
+        },
+        surface,
+        damping: omega.iter().map(|&w| damping.coefficient(w)).collect(),
+        participation: vec![[0.0; 3]; omega.len()],
+        omega,
+        displacement,
+        rotation,
+        free: false,
+        mass: 2.0,
+        center_of_mass: [0.5, 0.0, 0.0],
+        inertia: [[0.01, 0.0, 0.0], [0.0, 0.17, 0.0], [0.0, 0.0, 0.17]],
+        sites: Vec::new(),
+    };
+    Arc::new(ModalModel::from_parts(parts).unwrap())
+}
+
+/// An app without a renderer at 40 steps a second of real time.
+pub fn app(net: NetPlugin) -> App {
+    let mut app = App::new();
+    app.add_plugins((MinimalPlugins, AssetPlugin::default(), TransformPlugin))
+        .insert_resource(Time::<Fixed>::from_hz(40.0))
+        .add_plugins((PliantBodyPlugin::default(), net));
+    app
+}
+
+/// A host that shares `bar` at 1 m above the origin: the app, its invite, the body.
+pub fn host(config: HostConfig) -> (App, Invite, Entity) {
+    let net = NetPlugin::host(config).unwrap();
+    let invite = net.invite().unwrap().clone();
+    let mut app = app(net);
+    let handle = app.world_mut().resource_mut::<Assets<ModalAsset>>().add(ModalAsset(bar()));
+    let place = Transform::from_xyz(0.0, 1.0, 0.0)
+        .with_rotation(Quat::from_rotation_z(0.5))
+        .with_scale(Vec3::splat(2.0));
+    let body = app.world_mut().spawn((ModalBody::new(handle), SharedBody::named("bar"), place)).id();
+    (app, invite, body)
+}
+
+pub fn guest(invite: &Invite, config: JoinConfig) -> App {
+    app(NetPlugin::join(invite, config).unwrap())
+}
+
+/// Runs the apps at some 150 frames a second until `done` says so. Panics, saying what was awaited, after `seconds`.
+pub fn run_until(
+    apps: &mut [&mut App],
+    seconds: f64,
+    awaited: &str,
+    mut done: impl FnMut(&mut [&mut App]) -> bool,
+) {
+    let start = Instant::now();
+    loop {
+        apps.iter_mut().for_each(|app| app.update());
+        if done(apps) {
+            return;
+        }
+        assert!(start.elapsed().as_secs_f64() < seconds, "within {seconds} s: {awaited}");
+        std::thread::sleep(Duration::from_millis(5));
+    }
+}
+
+pub fn run_for(apps: &mut [&mut App], seconds: f64) {
+    let start = Instant::now();
+    run_until(apps, seconds + 10.0, "the time", |_| start.elapsed().as_secs_f64() >= seconds);
+}
+
+/// The messages of a kind so far.
+pub fn messages<M: Message + Clone>(app: &App) -> Vec<M> {
+    let messages = app.world().resource::<Messages<M>>();
+    messages.get_cursor().read(messages).cloned().collect()
+}
+
+/// The only entity with a component.
+pub fn only<C: Component>(app: &mut App) -> Option<Entity> {
+    let mut query = app.world_mut().query_filtered::<Entity, With<C>>();
+    query.iter(app.world()).next()
+}
