@@ -1,0 +1,251 @@
+//! The whole way from tetrahedra to a model.
+
+use std::time::Instant;
+
+use pliant_mesh::{Surface, TetMesh};
+use pliant_modal::{BakeInfo, ModalModel, ModelParts};
+
+use crate::blocks::{self, Tall};
+use crate::element::Element;
+use crate::fem::{ANCHORED, FeMesh, LOCKING_POISSON, Law, Lists};
+use crate::lanczos::{self, Modes, NoConvergence};
+use crate::ordering;
+use crate::rigid::MassProperties;
+use crate::solver::Solver;
+use crate::sparse::BlockCsr;
+use crate::surface::Skin;
+use crate::symbolic::{self, Symbolic};
+use crate::{Bake, BakeConfig, BakeError, BakeTimes, Stage, canonical, flexibility, matrix_market, support};
+
+/// Largest `|K phi - lambda M phi| / |K phi|` that a bake may have.
+const RESIDUAL_LIMIT: f64 = 1e-7;
+
+/// Largest entry of `|Phi^T M Phi - I|` that a bake may have.
+const ORTHONORMALITY_LIMIT: f64 = 1e-9;
+
+/// Bakes a mesh: finite elements, the lowest elastic modes of `K phi = omega^2 M phi`, and what a body needs of them
+/// at its surface.
+///
+/// The visible surface is `skin`, embedded in the tetrahedra with the modes interpolated to its own vertices, or the
+/// tetrahedra's boundary. Without anchors the body is free: its six rigid modes are known and left out.
+/// `progress` is told the stage and how much of it is done, 0 to 1.
+///
+/// The same input gives the same model to the bit, whatever the number of threads. Every bake checks
+/// `|K phi - lambda M phi| / |K phi|` and `|Phi^T M Phi - I|` and stores the largest of each.
+///
+/// # Errors
+/// See [`BakeError`]: every number out of its range, meshes and skins that are not sound, anchors that hold nothing,
+/// everything or too little, more modes than degrees of freedom, files that cannot be written.
+pub fn bake(
+    mesh: &TetMesh,
+    skin: Option<&Surface>,
+    config: &BakeConfig,
+    progress: &mut dyn FnMut(Stage, f64),
+) -> Result<Bake, BakeError> {
+    config.check()?;
+    let element = match config.element {
+        pliant_modal::Element::Tet4 => Element::Tet4,
+        pliant_modal::Element::Tet10 => Element::Tet10,
+        other => return Err(BakeError::Element { got: other.to_string() }),
+    };
+    mesh.check().map_err(BakeError::Mesh)?;
+    let mut mesh = mesh.clone();
+    mesh.drop_unused_nodes();
+    let mut clock = Clock::start();
+    let mut times = BakeTimes::default();
+
+    progress(Stage::Assemble, 0.0);
+    let fe = FeMesh::new(&mesh, element);
+    let held = support::anchored_nodes(&fe, &config.anchors)?;
+    let free_body = config.anchors.is_empty();
+    check_mode_count(config.modes, &held, free_body)?;
+    let law = law(config);
+    let graph = fe.graph(law.average_pressure);
+    support::check_connected(&fe, &graph, &held, &config.anchors)?;
+    let (number, ordered) = elimination_order(&fe, &graph, &held);
+    progress(Stage::Assemble, 0.3);
+    let matrix = fe.assemble(&law, &number, &ordered);
+    let properties = MassProperties::new(&fe, config.density);
+    if let Some(folder) = &config.export_matrices {
+        matrix_market::export(folder, &matrix, &number)?;
+    }
+    times.assemble = clock.lap();
+
+    progress(Stage::Factor, 0.0);
+    let position = by_row(&fe, &number);
+    let rigid = free_body.then(|| properties.rigid_modes(position.iter().copied()));
+    let symbolic = Symbolic::new(&ordered);
+    drop(ordered);
+    let solver = Solver::new(&matrix, symbolic, rigid)
+        .map_err(|failed| BakeError::NotPositive { at: position[failed.node] })?;
+    times.factor = clock.lap();
+
+    progress(Stage::Modes, 0.0);
+    let mut modes = lanczos::lowest(&solver, config.modes, &mut |share| progress(Stage::Modes, share))
+        .map_err(|NoConvergence| BakeError::NoConvergence)?;
+    canonical::settle(&mut modes, &matrix, &number);
+    let (residual_max, orthonormality_max) = accuracy(&matrix, &modes);
+    check_accuracy("|K phi - lambda M phi| / |K phi|", residual_max, RESIDUAL_LIMIT)?;
+    check_accuracy("|Phi^T M Phi - I|", orthonormality_max, ORTHONORMALITY_LIMIT)?;
+    times.modes = clock.lap();
+
+    progress(Stage::Surface, 0.0);
+    let skin = Skin::new(&mesh, &fe, skin, &number)?;
+    let size = skin.mesh.size();
+    let radii: Vec<f64> = config.site_radii.iter().map(|share| share * size).collect();
+    let vertices = flexibility::spread_vertices(&skin.mesh, config.sites);
+    let sites = flexibility::sites(&solver, &modes, &skin, &number, &vertices, &radii, &mut |share| {
+        progress(Stage::Surface, 0.8 * share);
+    })?;
+    let count = config.modes;
+    let omega: Vec<f64> = modes.lambda.iter().map(|lambda| lambda.sqrt()).collect();
+    let parts = ModelParts {
+        info: BakeInfo {
+            name: config.name.clone(),
+            tets: mesh.tets.len(),
+            nodes: fe.nodes.len(),
+            element: config.element,
+            young: config.young,
+            poisson: config.poisson,
+            density: config.density,
+            damping: config.damping,
+            anchors: config.anchors.iter().map(ToString::to_string).collect(),
+            residual_max,
+            orthonormality_max,
+        },
+        displacement: skin.displacements(&modes.phi, count, &number),
+        rotation: skin.rotations(&fe, &modes.phi, count, &number),
+        damping: omega.iter().map(|&omega| config.damping.coefficient(omega)).collect(),
+        omega,
+        participation: participation(&fe, &modes, &number, config.density, free_body),
+        free: free_body,
+        mass: properties.mass,
+        center_of_mass: properties.center,
+        inertia: properties.inertia,
+        sites,
+        surface: skin.mesh,
+    };
+    let model = ModalModel::from_parts(parts)?;
+    times.surface = clock.lap();
+    times.total = times.assemble + times.factor + times.modes + times.surface;
+    progress(Stage::Surface, 1.0);
+    Ok(Bake { model, times })
+}
+
+struct Clock(Instant);
+
+impl Clock {
+    fn start() -> Self {
+        Self(Instant::now())
+    }
+
+    /// Seconds since the last lap.
+    fn lap(&mut self) -> f64 {
+        let now = Instant::now();
+        let seconds = (now - self.0).as_secs_f64();
+        self.0 = now;
+        seconds
+    }
+}
+
+/// Lame's constants: `lambda = E nu / ((1 + nu)(1 - 2 nu))`, `mu = E / (2 (1 + nu))`.
+pub(crate) fn law(config: &BakeConfig) -> Law {
+    let (e, nu) = (config.young, config.poisson);
+    Law {
+        lambda: e * nu / ((1.0 + nu) * (1.0 - 2.0 * nu)),
+        mu: e / (2.0 * (1.0 + nu)),
+        density: config.density,
+        average_pressure: nu > LOCKING_POISSON,
+    }
+}
+
+fn check_mode_count(modes: usize, held: &[bool], free_body: bool) -> Result<(), BakeError> {
+    let dofs = 3 * held.iter().filter(|held| !**held).count();
+    let rigid = if free_body { 6 } else { 0 };
+    let most = dofs.saturating_sub(rigid);
+    if modes > most { Err(BakeError::Modes { got: modes, most, dofs, rigid }) } else { Ok(()) }
+}
+
+/// The row of each node in elimination order (`ANCHORED` for those held), and the graph in that order.
+pub(crate) fn elimination_order(fe: &FeMesh, graph: &Lists, held: &[bool]) -> (Vec<u32>, Lists) {
+    let keep: Vec<bool> = held.iter().map(|held| !held).collect();
+    let dissected = ordering::nested_dissection(graph, &fe.nodes, &keep);
+    let mut number = vec![ANCHORED; fe.nodes.len()];
+    for (row, &node) in dissected.iter().enumerate() {
+        number[node as usize] = row as u32;
+    }
+    let post = symbolic::postorder(&graph.renumber(&number, dissected.len()));
+    for (row, &before) in post.iter().enumerate() {
+        number[dissected[before as usize] as usize] = row as u32;
+    }
+    let ordered = graph.renumber(&number, dissected.len());
+    (number, ordered)
+}
+
+/// Positions of the free nodes in the order of the matrix.
+fn by_row(fe: &FeMesh, number: &[u32]) -> Vec<[f64; 3]> {
+    let free = number.iter().filter(|&&row| row != ANCHORED).count();
+    let mut out = vec![[0.0; 3]; free];
+    for (&row, &p) in number.iter().zip(&fe.nodes) {
+        if row != ANCHORED {
+            out[row as usize] = p;
+        }
+    }
+    out
+}
+
+/// Largest `|K phi - lambda M phi| / |K phi|` and largest entry of `|Phi^T M Phi - I|`.
+pub(crate) fn accuracy(matrix: &BlockCsr, modes: &Modes) -> (f64, f64) {
+    let count = modes.lambda.len();
+    let mut k = vec![0.0; modes.phi.len()];
+    let mut m = vec![0.0; modes.phi.len()];
+    matrix.stiffness_times(&modes.phi, count, &mut k);
+    matrix.mass_times(&modes.phi, count, &mut m);
+    let (mut residual, mut scale) = (vec![0.0; count], vec![0.0; count]);
+    for (k, m) in k.chunks_exact(count).zip(m.chunks_exact(count)) {
+        for j in 0..count {
+            residual[j] += (k[j] - modes.lambda[j] * m[j]).powi(2);
+            scale[j] += k[j] * k[j];
+        }
+    }
+    let worst = residual.iter().zip(&scale).map(|(r, s)| (r / s).sqrt()).fold(0.0, largest);
+    let gram = blocks::gram(Tall::new(&modes.phi, count), Tall::new(&m, count));
+    let mut off = 0.0;
+    for i in 0..count {
+        for j in 0..count {
+            off = largest(off, (gram[(i, j)] - f64::from(u8::from(i == j))).abs());
+        }
+    }
+    (worst, off)
+}
+
+/// The larger number; NaN stays NaN, so that it is noticed.
+fn largest(a: f64, b: f64) -> f64 {
+    if a.is_nan() || a > b { a } else { b }
+}
+
+fn check_accuracy(what: &'static str, got: f64, expected: f64) -> Result<(), BakeError> {
+    if got <= expected { Ok(()) } else { Err(BakeError::Inaccurate { what, got, expected }) }
+}
+
+/// `Phi^T M 1_axis`: how a uniform acceleration drives each mode, kg^1/2. A free body's elastic modes are
+/// M-orthogonal to translations, so it is zero for them.
+fn participation(fe: &FeMesh, modes: &Modes, number: &[u32], density: f64, free_body: bool) -> Vec<[f64; 3]> {
+    let count = modes.lambda.len();
+    let mut out = vec![[0.0; 3]; count];
+    if free_body {
+        return out;
+    }
+    for (&row, mass) in number.iter().zip(fe.nodal_mass(density)) {
+        if row == ANCHORED {
+            continue;
+        }
+        let phi = &modes.phi[3 * row as usize * count..][..3 * count];
+        for axis in 0..3 {
+            for (out, phi) in out.iter_mut().zip(&phi[axis * count..]) {
+                out[axis] += mass * phi;
+            }
+        }
+    }
+    out
+}

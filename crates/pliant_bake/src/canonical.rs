@@ -1,0 +1,71 @@
+//! One choice among the many that an eigenproblem leaves open: bases of degenerate modes, and signs.
+
+use faer::Mat;
+
+use crate::blocks::{self, Tall};
+use crate::fem::ANCHORED;
+use crate::lanczos::Modes;
+use crate::sparse::BlockCsr;
+
+/// Neighbouring eigenvalues that differ by at most this share count as one: turning their vectors within the plane
+/// changes no residual that matters.
+const CLUSTER: f64 = 1e-10;
+
+/// Turns the modes of a degenerate eigenvalue so that they diagonalise the mass weighted 1, 2, 3 along x, y, z (a round
+/// bar's bending modes end up in its axes), then makes the largest entry of each mode positive: the first in
+/// the order of the nodes of those within 1e-6 of the largest.
+pub(crate) fn settle(modes: &mut Modes, matrix: &BlockCsr, number: &[u32]) {
+    let count = modes.lambda.len();
+    let mut start = 0;
+    while start < count {
+        let mut end = start + 1;
+        while end < count && modes.lambda[end] - modes.lambda[end - 1] <= CLUSTER * modes.lambda[end] {
+            end += 1;
+        }
+        if end - start > 1 {
+            turn(modes, matrix, start, end);
+        }
+        start = end;
+    }
+    let mut largest = vec![0.0f64; count];
+    for row in modes.phi.chunks_exact(count) {
+        for (largest, x) in largest.iter_mut().zip(row) {
+            *largest = largest.max(x.abs());
+        }
+    }
+    let mut sign = vec![0.0; count];
+    for &row in number.iter().filter(|&&row| row != ANCHORED) {
+        for entries in modes.phi[3 * row as usize * count..][..3 * count].chunks_exact(count) {
+            for j in 0..count {
+                if sign[j] == 0.0 && entries[j].abs() >= (1.0 - 1e-6) * largest[j] {
+                    sign[j] = entries[j].signum();
+                }
+            }
+        }
+    }
+    for row in modes.phi.chunks_exact_mut(count) {
+        for (x, sign) in row.iter_mut().zip(&sign) {
+            *x *= sign;
+        }
+    }
+}
+
+fn turn(modes: &mut Modes, matrix: &BlockCsr, start: usize, end: usize) {
+    let count = modes.lambda.len();
+    let width = end - start;
+    let block: Vec<f64> =
+        modes.phi.chunks_exact(count).flat_map(|row| row[start..end].iter().copied()).collect();
+    let mut weighted = vec![0.0; block.len()];
+    matrix.mass_times(&block, width, &mut weighted);
+    for (dof, row) in weighted.chunks_exact_mut(width).enumerate() {
+        let weight = (dof % 3 + 1) as f64;
+        row.iter_mut().for_each(|x| *x *= weight);
+    }
+    let gram = blocks::gram(Tall::new(&block, width), Tall::new(&weighted, width));
+    let symmetric = Mat::from_fn(width, width, |i, j| 0.5 * (gram[(i, j)] + gram[(j, i)]));
+    // Should the small problem fail, the modes stay as they are: every basis of the cluster is right.
+    if let Some((_, vectors)) = blocks::symmetric_eigen(symmetric.as_ref()) {
+        let turned = blocks::product(Tall::new(&block, width), vectors.as_ref());
+        blocks::put(&mut modes.phi, count, start, &turned, width);
+    }
+}

@@ -1,0 +1,84 @@
+//! Stiffness and mass as MatrixMarket files, for anyone to check.
+
+use std::fs;
+use std::io::{BufWriter, Write};
+use std::path::{Path, PathBuf};
+
+use crate::BakeError;
+use crate::fem::ANCHORED;
+use crate::sparse::BlockCsr;
+
+/// Writes `K.mtx` (N/m) and `M.mtx` (kg) into `folder`: lower triangles, `coordinate real symmetric`, of the degrees of
+/// freedom that are not anchored, in the order of the nodes: row `3 i + axis + 1` for the `i`-th free node.
+/// Each file appears whole or not at all.
+pub(crate) fn export(folder: &Path, matrix: &BlockCsr, number: &[u32]) -> Result<(), BakeError> {
+    let failed = |path: &Path| {
+        let path = path.to_path_buf();
+        move |source| BakeError::Export { path, source }
+    };
+    fs::create_dir_all(folder).map_err(failed(folder))?;
+    // Rank of each row of the matrix among the free nodes in natural order, and back.
+    let free: Vec<u32> = number.iter().copied().filter(|&n| n != ANCHORED).collect();
+    let mut rank = vec![0usize; free.len()];
+    for (natural, &row) in free.iter().enumerate() {
+        rank[row as usize] = natural;
+    }
+    for name in ["K", "M"] {
+        let path = folder.join(format!("{name}.mtx"));
+        let part = PathBuf::from(format!("{}.part", path.display()));
+        let written = write(&part, name == "K", matrix, &free, &rank)
+            .and_then(|()| fs::rename(&part, &path));
+        if let Err(source) = written {
+            // The error that matters is the first one.
+            let _ = fs::remove_file(&part);
+            return Err(failed(&path)(source));
+        }
+    }
+    Ok(())
+}
+
+fn write(path: &Path, stiffness: bool, matrix: &BlockCsr, free: &[u32], rank: &[usize]) -> std::io::Result<()> {
+    let mut file = BufWriter::with_capacity(1 << 20, fs::File::create(path)?);
+    let n = 3 * free.len();
+    let mut entries = 0usize;
+    each_entry(stiffness, matrix, free, rank, &mut |_, _, _| {
+        entries += 1;
+        Ok(())
+    })?;
+    writeln!(file, "%%MatrixMarket matrix coordinate real symmetric")?;
+    writeln!(file, "{n} {n} {entries}")?;
+    each_entry(stiffness, matrix, free, rank, &mut |row, column, value| {
+        // `{:e}` writes the shortest text that reads back to the same number.
+        writeln!(file, "{} {} {value:e}", row + 1, column + 1)
+    })?;
+    file.flush()?;
+    file.get_ref().sync_all()
+}
+
+fn each_entry(
+    stiffness: bool,
+    matrix: &BlockCsr,
+    free: &[u32],
+    rank: &[usize],
+    visit: &mut dyn FnMut(usize, usize, f64) -> std::io::Result<()>,
+) -> std::io::Result<()> {
+    for (natural, &row) in free.iter().enumerate() {
+        for at in matrix.offsets[row as usize]..matrix.offsets[row as usize + 1] {
+            let other = rank[matrix.columns[at] as usize];
+            if other > natural {
+                continue;
+            }
+            for k in 0..3 {
+                for l in 0..3 {
+                    if 3 * other + l > 3 * natural + k || (!stiffness && k != l) {
+                        continue;
+                    }
+                    let value =
+                        if stiffness { matrix.stiffness[9 * at + 3 * k + l] } else { matrix.mass[at] };
+                    visit(3 * natural + k, 3 * other + l, value)?;
+                }
+            }
+        }
+    }
+    Ok(())
+}
