@@ -18,12 +18,19 @@ pub(super) struct Cursor<'a> {
     bytes: &'a [u8],
     at: usize,
     line: usize,
+    /// Whether `#` starts a comment that runs to the end of the line.
+    comments: bool,
     pub(super) encoding: Encoding,
 }
 
 impl<'a> Cursor<'a> {
     pub(super) fn new(format: &'static str, bytes: &'a [u8]) -> Self {
-        Self { format, bytes, at: 0, line: 1, encoding: Encoding::Text }
+        Self { format, bytes, at: 0, line: 1, comments: false, encoding: Encoding::Text }
+    }
+
+    pub(super) fn with_comments(mut self) -> Self {
+        self.comments = true;
+        self
     }
 
     fn place(&self) -> Place {
@@ -48,14 +55,28 @@ impl<'a> Cursor<'a> {
 
     /// The next word of text, `None` at the end of the file.
     pub(super) fn next_word(&mut self) -> Option<String> {
-        while let Some(&byte) = self.bytes.get(self.at).filter(|b| b.is_ascii_whitespace()) {
-            self.at += 1;
-            self.line += usize::from(byte == b'\n');
+        while let Some(&byte) = self.bytes.get(self.at) {
+            if byte.is_ascii_whitespace() {
+                self.at += 1;
+                self.line += usize::from(byte == b'\n');
+            } else if self.comments && byte == b'#' {
+                self.next_line();
+            } else {
+                break;
+            }
         }
         let rest = &self.bytes[self.at..];
         let length = rest.iter().position(u8::is_ascii_whitespace).unwrap_or(rest.len());
         self.at += length;
         (length > 0).then(|| String::from_utf8_lossy(&rest[..length]).into_owned())
+    }
+
+    /// The next word of text, which stays where it is.
+    pub(super) fn peek_word(&mut self) -> Option<String> {
+        let (at, line) = (self.at, self.line);
+        let word = self.next_word();
+        (self.at, self.line) = (at, line);
+        word
     }
 
     /// The next word of text, an error at the end of the file.
@@ -120,6 +141,20 @@ impl<'a> Cursor<'a> {
         };
         if value.is_finite() {
             Ok(value)
+        } else {
+            Err(self.error(format!("a finite {expected}"), value.to_string()))
+        }
+    }
+
+    /// A finite floating-point number, 4 bytes when binary.
+    pub(super) fn short_real(&mut self, expected: &str) -> Result<f64, MeshError> {
+        let value = match self.encoding {
+            Encoding::Text => return self.real(expected),
+            Encoding::LittleEndian => f32::from_le_bytes(self.raw(expected)?),
+            Encoding::BigEndian => f32::from_be_bytes(self.raw(expected)?),
+        };
+        if value.is_finite() {
+            Ok(f64::from(value))
         } else {
             Err(self.error(format!("a finite {expected}"), value.to_string()))
         }

@@ -5,14 +5,26 @@
 //! | Extension | Format | Read as | Written |
 //! | --- | --- | --- | --- |
 //! | `.obj` | Wavefront OBJ | surface | |
+//! | `.stl` | STL, text and binary | surface | |
+//! | `.ply` | Stanford PLY, text and binary | surface | |
+//! | `.gltf`, `.glb` | glTF 2.0 | surface | |
 //! | `.ron` | [`Scene`], the project's own | distance field | |
 //! | `.msh` | Gmsh MSH 2.2 and 4.1, text and binary | tetrahedra | text |
+//! | `.vtk` | VTK legacy, text and binary | tetrahedra | text |
+//! | `.mesh` | Medit, text | tetrahedra | text |
+//! | `.veg` | Vega FEM, text | tetrahedra | text |
 //!
 //! Whatever bytes a file holds, reading gives a mesh or an error, and takes memory in proportion to the file.
 
 mod cursor;
+mod gltf;
+mod medit;
 mod msh;
 mod obj;
+mod ply;
+mod stl;
+mod vega;
+mod vtk;
 
 use std::{
     fs,
@@ -31,10 +43,10 @@ pub use msh::MshVersion;
 /// Larger files are refused, in bytes.
 const MAX_FILE: u64 = 1 << 30;
 
-const SURFACES: &str = ".obj";
+const SURFACES: &str = ".obj, .stl, .ply, .gltf or .glb";
 const SCENES: &str = ".ron";
-const TETS: &str = ".msh";
-const ALL: &str = ".obj (a surface), .ron (a description) or .msh (tetrahedra)";
+const TETS: &str = ".msh, .vtk, .mesh or .veg";
+const ALL: &str = ".obj, .stl, .ply, .gltf or .glb (a surface), .ron (a description), .msh, .vtk, .mesh or .veg (tetrahedra)";
 
 /// What a file holds.
 #[derive(Clone, Debug)]
@@ -74,8 +86,8 @@ impl Input {
 pub fn read(path: impl AsRef<Path>) -> Result<Input, MeshError> {
     let path = path.as_ref();
     match extension(path).as_str() {
-        "obj" => read_surface(path).map(Input::Surface),
-        "msh" => read_tets(path).map(Input::Tets),
+        "obj" | "stl" | "ply" | "gltf" | "glb" => read_surface(path).map(Input::Surface),
+        "msh" | "vtk" | "mesh" | "veg" => read_tets(path).map(Input::Tets),
         "ron" => read_sdf(path).map(Input::Sdf),
         _ => Err(unknown(path, ALL)),
     }
@@ -90,8 +102,12 @@ pub fn read(path: impl AsRef<Path>) -> Result<Input, MeshError> {
 /// [`MeshError::UnknownFormat`], [`MeshError::Read`], or [`MeshError::InFile`] around what is wrong in the file.
 pub fn read_surface(path: impl AsRef<Path>) -> Result<Surface, MeshError> {
     let path = path.as_ref();
-    let parse = match extension(path).as_str() {
-        "obj" => obj::parse,
+    let folder = path.parent().unwrap_or(Path::new(""));
+    let parse: &dyn Fn(&[u8]) -> Result<Surface, MeshError> = match extension(path).as_str() {
+        "obj" => &obj::parse,
+        "stl" => &stl::parse,
+        "ply" => &ply::parse,
+        "gltf" | "glb" => &|bytes| gltf::parse(bytes, folder),
         _ => return Err(unknown(path, SURFACES)),
     };
     let bytes = bytes(path)?;
@@ -112,6 +128,9 @@ pub fn read_tets(path: impl AsRef<Path>) -> Result<TetMesh, MeshError> {
     let path = path.as_ref();
     let parse = match extension(path).as_str() {
         "msh" => msh::parse,
+        "vtk" => vtk::parse,
+        "mesh" => medit::parse,
+        "veg" => vega::parse,
         _ => return Err(unknown(path, TETS)),
     };
     let bytes = bytes(path)?;
@@ -158,6 +177,23 @@ pub fn write_msh_version(
 ) -> Result<(), MeshError> {
     mesh.check()?;
     write_whole(path.as_ref(), msh::format(mesh, version).as_bytes())
+}
+
+/// Writes tetrahedra in the format that the extension names, otherwise as [`write_msh`].
+///
+/// # Errors
+/// [`MeshError::UnknownFormat`], else as [`write_msh`].
+pub fn write_tets(path: impl AsRef<Path>, mesh: &TetMesh) -> Result<(), MeshError> {
+    let path = path.as_ref();
+    let format: &dyn Fn(&TetMesh) -> String = match extension(path).as_str() {
+        "msh" => &|mesh| msh::format(mesh, MshVersion::V4_1),
+        "vtk" => &vtk::format,
+        "mesh" => &medit::format,
+        "veg" => &vega::format,
+        _ => return Err(unknown(path, TETS)),
+    };
+    mesh.check()?;
+    write_whole(path, format(mesh).as_bytes())
 }
 
 fn extension(path: &Path) -> String {
@@ -225,6 +261,11 @@ mod tests {
         assert_eq!(read_tets(&path).unwrap(), mesh);
         assert!(matches!(read(&path), Ok(Input::Tets(read)) if read == mesh));
         assert_eq!(fs::read_dir(&folder).unwrap().count(), 1);
+        for name in ["ball.vtk", "ball.mesh", "ball.veg", "BALL.MSH"] {
+            write_tets(folder.join(name), &mesh).unwrap();
+            assert_eq!(read_tets(folder.join(name)).unwrap(), mesh, "{name}");
+        }
+        assert!(matches!(write_tets(folder.join("ball.obj"), &mesh), Err(MeshError::UnknownFormat { .. })));
         fs::remove_dir_all(folder).unwrap();
     }
 
@@ -285,12 +326,17 @@ mod tests {
 
         fn any_reader(bytes: &[u8]) {
             let _ = Scene::from_ron(&String::from_utf8_lossy(bytes));
-            let _ = obj::parse(bytes).map(|s| s.check());
-            let _ = msh::parse(bytes).map(|mut m| {
-                m.drop_unused_nodes();
-                m.orient();
-                m.check()
-            });
+            for parse in [obj::parse, ply::parse, stl::parse, |b: &[u8]| gltf::parse(b, Path::new("nowhere"))]
+            {
+                let _ = parse(bytes).map(|s| s.closed());
+            }
+            for parse in [msh::parse, vtk::parse, medit::parse, vega::parse] {
+                let _ = parse(bytes).map(|mut m| {
+                    m.drop_unused_nodes();
+                    m.orient();
+                    m.check()
+                });
+            }
         }
 
         proptest! {
@@ -300,14 +346,19 @@ mod tests {
             }
 
             #[test]
-            fn in_an_altered_msh_never_panic(
-                bytes in altered(msh::format(&shapes::cube(1, 1.0).unwrap(), MshVersion::V4_1))
-            ) {
-                any_reader(&bytes);
-            }
-
-            #[test]
-            fn in_an_altered_obj_never_panic(bytes in altered("v 0 0 0\nv 1 0 0\nvt 0 1\nv 0 1 0\nf 1/1 2/1 -1/-1\n".into())) {
+            fn in_an_altered_file_never_panic(bytes in prop_oneof![
+                altered(msh::format(&shapes::cube(1, 1.0).unwrap(), MshVersion::V4_1)),
+                altered(msh::format(&shapes::cube(1, 1.0).unwrap(), MshVersion::V2_2)),
+                altered(vtk::format(&shapes::cube(1, 1.0).unwrap())),
+                altered(medit::format(&shapes::cube(1, 1.0).unwrap())),
+                altered(vega::format(&shapes::cube(1, 1.0).unwrap())),
+                altered("v 0 0 0\nv 1 0 0\nvt 0 1\nv 0 1 0\nf 1/1 2/1 -1/-1\n".into()),
+                altered("ply\nformat ascii 1.0\nelement vertex 3\nproperty float x\nproperty float y\nproperty float z\n\
+                    element face 1\nproperty list uchar int vertex_indices\nend_header\n0 0 0\n1 0 0\n0 1 0\n3 0 1 2\n".into()),
+                altered("solid a\nfacet normal 0 0 1\nouter loop\nvertex 0 0 0\nvertex 1 0 0\nvertex 0 1 0\nendloop\n\
+                    endfacet\nendsolid a\n".into()),
+                altered(gltf::tests::document(gltf::tests::DATA, "3", gltf::tests::CHILDREN)),
+            ]) {
                 any_reader(&bytes);
             }
         }
