@@ -14,16 +14,16 @@ use crate::newmark::Newmark;
 use crate::state::{BodyId, GrabKey, GrabState, ModalState, Tick, TickState};
 use crate::stepper::{BodySetup, ForceStepper};
 use crate::wire::{
-    AccelerationCoding, Accelerations, Frame, FrameGrab, Payload, Repeat, Slice, SnapshotBytes, StreamWish,
-    Writer, round24,
+    AccelerationCoding, Accelerations, Frame, FrameGrab, Payload, Repeat, RepeatGrab, Slice, SnapshotBytes,
+    StreamWish, Writer, round24,
 };
 
 /// Frames kept for resending.
 pub(crate) const SENT: usize = 256;
 /// Ticks between checksums.
 const CHECK_EVERY: u64 = 8;
-/// Share of the largest load below which a load is not worth sending.
-const LOAD_FLOOR: f64 = 1e-4;
+/// Loads are sent from when their static effect first exceeds this share of the shape.
+const LOAD_FLOOR: f64 = 2e-2;
 /// How fast the estimate of the unexplained load follows: about so many ticks.
 const LOAD_TICKS: f64 = 8.0;
 
@@ -33,7 +33,7 @@ struct Sent {
     tick: Tick,
     /// The frame without repeats, marked as resent.
     bytes: Arc<[u8]>,
-    grabs: Vec<GrabState>,
+    grabs: Vec<FrameGrab>,
     accelerations: Option<Accelerations>,
 }
 
@@ -50,6 +50,7 @@ pub struct Encoder {
     truth: ModalState,
     load: Vec<f64>,
     unexplained: Vec<f64>,
+    loaded: bool,
     next_slice: usize,
     frames: u64,
     started: Option<Tick>,
@@ -91,7 +92,8 @@ impl Encoder {
             mirror: ModalState::zero(modes),
             truth: ModalState::zero(modes),
             load: vec![0.0; modes],
-            unexplained: Vec::new(),
+            unexplained: vec![0.0; modes],
+            loaded: false,
             next_slice: 0,
             frames: 0,
             started: None,
@@ -155,6 +157,8 @@ impl Encoder {
         self.truth.copy_from(&self.mirror);
         self.stepper.restart();
         self.load.fill(0.0);
+        self.unexplained.fill(0.0);
+        self.loaded = false;
         self.sent.clear();
         self.started = Some(state.tick);
         self.last = state.tick;
@@ -175,14 +179,24 @@ impl Encoder {
     /// Encodes the tick after the last one. The bytes have no datagram header yet.
     pub fn encode(&mut self, state: &TickState<'_>) -> Arc<[u8]> {
         let rotation = state.pose.map_or([0.0, 0.0, 0.0, 1.0], |p| p.rotation);
-        let grabs: Vec<GrabState> = state
+        let forces = self.wish.payload == Payload::Forces;
+        let grabs: Vec<FrameGrab> = state
             .grabs
             .iter()
-            .map(|g| GrabState {
-                radius: f64::from(g.radius as f32),
-                target: g.target.map(|x| f64::from(x as f32)),
-                reaction: g.reaction.map(round24),
-                ..*g
+            .map(|g| {
+                let radius = f64::from(g.radius as f32);
+                let displacement = if forces {
+                    self.stepper.displacement(&state.q[..self.modes.min(state.q.len())], g.vertex, radius)
+                } else {
+                    [0.0; 3]
+                };
+                let state = GrabState {
+                    radius,
+                    target: g.target.map(|x| f64::from(x as f32)),
+                    reaction: g.reaction.map(round24),
+                    ..*g
+                };
+                FrameGrab { state, displacement: displacement.map(round24), held: true }
             })
             .collect();
         let accelerations = match self.wish.payload {
@@ -200,7 +214,8 @@ impl Encoder {
             run: u16::try_from(run).unwrap_or(u16::MAX),
             resting: state.resting,
             resent: false,
-            grabs: grabs.iter().map(|&state| FrameGrab { state, held: true }).collect(),
+            displacements: forces,
+            grabs: grabs.clone(),
             pose: state.pose,
             accelerations,
             slice: None,
@@ -220,7 +235,7 @@ impl Encoder {
         bytes
     }
 
-    fn keep(&mut self, mut frame: Frame, grabs: Vec<GrabState>) {
+    fn keep(&mut self, mut frame: Frame, grabs: Vec<FrameGrab>) {
         frame.repeats.clear();
         frame.grabs.retain(|g| g.held);
         frame.resent = true;
@@ -261,60 +276,75 @@ impl Encoder {
     }
 
     /// The mirror's step with the reactions as they cross, and the estimate of what they leave unexplained.
-    fn step_forces(&mut self, grabs: &[GrabState], state: &TickState<'_>, rotation: [f64; 4]) {
-        if state.q.len() >= self.modes && state.v.len() >= self.modes {
-            let (q, v) = (&state.q[..self.modes], &state.v[..self.modes]);
-            self.stepper.unexplained(&self.truth, q, v, grabs, rotation, &mut self.unexplained);
+    fn step_forces(&mut self, grabs: &[FrameGrab], state: &TickState<'_>, rotation: [f64; 4]) {
+        // From the truth of the tick before, as a receiver without error would step.
+        let mut lacking = std::mem::take(&mut self.scratch);
+        self.stepper.lacking(&mut self.truth, [state.q, state.v], grabs, rotation, &self.load, &mut lacking);
+        for ((told, load), lacking) in self.unexplained.iter_mut().zip(&self.load).zip(&lacking) {
+            *told += (load + lacking - *told) / LOAD_TICKS;
         }
+        self.scratch = lacking;
         self.stepper.step(&mut self.mirror, grabs, rotation, &self.load);
+        if !self.loaded {
+            let static_part = |k: usize| self.unexplained[k].abs() / self.stepper.omega(k).powi(2).max(1e-12);
+            let largest = |x: &mut dyn Iterator<Item = f64>| x.fold(0.0_f64, f64::max);
+            let load = largest(&mut (0..self.modes).map(static_part));
+            let shape = largest(&mut state.q.iter().take(self.modes).map(|q| q.abs()));
+            self.loaded = load > LOAD_FLOOR * shape && shape > 0.0;
+        }
     }
 
-    /// Adds the rotating slice and takes it into the mirror.
+    /// Adds absolute state and takes it into the mirror: the modes that are most wrong in the mirror, and some in turn,
+    /// for those receivers that missed what the mirror got.
     fn refresh(&mut self, frame: &mut Frame, state: &TickState<'_>) {
         if self.wish.refresh == 0 {
             return;
         }
-        let load = matches!(self.wish.payload, Payload::Forces) && !self.unexplained.is_empty();
-        let room = self.limit.saturating_sub(3 + frame.bytes() + 4);
+        let load = self.loaded;
         let share = self.modes.div_ceil(usize::from(self.wish.refresh)).min(255);
-        let mut count = share.min(self.modes - self.next_slice);
-        while count > 0 && Slice::bytes_of(count, load) > room {
-            if frame.repeats.pop().is_none() {
+        let mut count = share;
+        while count > 0 && 3 + frame.bytes() + Slice::bytes_of(count, load) > self.limit {
+            // Fewer modes first, then fewer repeats.
+            if count > share.div_ceil(4) {
                 count -= 1;
+            } else if frame.repeats.pop().is_some() {
+                count = share;
             } else {
-                return self.refresh(frame, state);
+                count -= 1;
             }
         }
         if count == 0 {
             return;
         }
-        let first = self.next_slice;
-        let largest = self.unexplained.iter().zip(0..self.modes).fold(0.0_f64, |m, (x, _)| m.max(x.abs()));
-        let values: Vec<[f64; 3]> = (first..first + count)
+        let truth = |slice: &[f64], k: usize| slice.get(k).copied().unwrap_or(0.0);
+        // In turn: a third; the rest by how wrong the mirror is, velocity counted as the displacement it leads to.
+        let turn = count.div_ceil(3);
+        let mut chosen: Vec<u16> = (0..turn).map(|i| ((self.next_slice + i) % self.modes) as u16).collect();
+        let mut wrong: Vec<(f64, u16)> = (0..self.modes)
+            .filter(|k| !chosen.contains(&(*k as u16)))
             .map(|k| {
-                let told = self.unexplained.get(k).copied().unwrap_or(0.0);
-                let told = if load && largest > 0.0 && told.abs() > LOAD_FLOOR * largest {
-                    self.load[k]
-                        + (told - self.load[k]) / LOAD_TICKS * f64::from(self.wish.refresh).min(LOAD_TICKS)
-                } else {
-                    self.load[k]
-                };
-                [
-                    state.q.get(k).copied().unwrap_or(0.0),
-                    state.v.get(k).copied().unwrap_or(0.0),
-                    if load { told } else { 0.0 },
-                ]
+                let eq = (truth(state.q, k) - self.mirror.q[k]).abs();
+                let ev = (truth(state.v, k) - self.mirror.v[k]).abs() / self.stepper.omega(k).max(1e-3);
+                (eq + ev, k as u16)
             })
             .collect();
-        let slice = Slice::quantise(first, &values);
+        wrong.sort_by(|a, b| b.0.total_cmp(&a.0).then(a.1.cmp(&b.1)));
+        chosen.extend(wrong.iter().take(count - turn).map(|w| w.1));
+        self.next_slice = (self.next_slice + turn) % self.modes;
+        let values: Vec<(u16, [f64; 3])> = chosen
+            .iter()
+            .map(|&mode| {
+                let k = usize::from(mode);
+                let told = if load { self.unexplained[k] } else { 0.0 };
+                (mode, [truth(state.q, k), truth(state.v, k), told])
+            })
+            .collect();
+        let slice = Slice::quantise(&values);
         for e in slice.entries() {
             self.mirror.q[e.mode] = e.q;
             self.mirror.v[e.mode] = e.v;
-            if matches!(self.wish.payload, Payload::Forces) {
-                self.load[e.mode] = e.load;
-            }
+            self.load[e.mode] = e.load;
         }
-        self.next_slice = if first + count >= self.modes { 0 } else { first + count };
         frame.slice = Some(slice);
     }
 
@@ -322,22 +352,22 @@ impl Encoder {
     fn repeat(&mut self, frame: &mut Frame) {
         for sent in self.sent.iter().rev().take(usize::from(self.wish.repeats)) {
             let Ok(back) = u8::try_from(frame.tick - sent.tick) else { break };
-            let mut reactions = Vec::with_capacity(sent.grabs.len());
+            let mut grabs = Vec::with_capacity(sent.grabs.len());
             for g in &sent.grabs {
                 let Some(index) = find_or_add(&mut frame.grabs, g) else { continue };
-                reactions.push((index, g.reaction));
+                grabs.push(RepeatGrab { index, reaction: g.state.reaction, displacement: g.displacement });
             }
-            frame.repeats.push(Repeat { back, reactions, accelerations: sent.accelerations.clone() });
+            frame.repeats.push(Repeat { back, grabs, accelerations: sent.accelerations.clone() });
         }
     }
 }
 
-fn find_or_add(grabs: &mut Vec<FrameGrab>, wanted: &GrabState) -> Option<u8> {
-    let key: GrabKey = wanted.key;
+fn find_or_add(grabs: &mut Vec<FrameGrab>, wanted: &FrameGrab) -> Option<u8> {
+    let key: GrabKey = wanted.state.key;
     let index = match grabs.iter().position(|g| g.state.key == key) {
         Some(i) => i,
         None if grabs.len() < crate::state::MAX_GRABS => {
-            grabs.push(FrameGrab { state: *wanted, held: false });
+            grabs.push(FrameGrab { held: false, ..*wanted });
             grabs.len() - 1
         }
         None => return None,

@@ -49,8 +49,8 @@ pub struct Experiment {
     pub newmark: Newmark,
     /// Answer NACKs only so much later. Default: at once.
     pub resend_after: Duration,
-    /// Frames lost at random from tick 135 on, or as `down.loss` says: this many ticks pass before `down` takes effect, so
-    /// that scheduled losses count from the stream's first frame. Default: 0.
+    /// The body moves for so long before the path is let loose on the stream; scheduled losses count from then on.
+    /// Default: 2 s.
     pub warmup: Duration,
     /// Hands, scripted. Default: [`Experiment::default_hands`].
     pub hands: Vec<Hand>,
@@ -89,8 +89,7 @@ impl Hand {
 }
 
 /// What a run showed. Percentages are of the largest true displacement (reactions: of the largest true reaction).
-#[derive(Debug, Clone, PartialEq, Default)]
-#[derive(serde::Serialize)]
+#[derive(Debug, Clone, PartialEq, Default, serde::Serialize)]
 pub struct Figures {
     /// Ticks that the guest was shown.
     pub ticks: u64,
@@ -157,29 +156,39 @@ impl Experiment {
             integrator: Integrator::default(),
             newmark: Newmark { h: 1.0 / 40.0, beta: 4.0 / 9.0, gamma: 5.0 / 6.0 },
             resend_after: Duration::ZERO,
-            warmup: Duration::ZERO,
+            warmup: Duration::from_secs(2),
             cpu_clock: None,
             keep_track: false,
         }
     }
 
-    /// Two hands: one where the first mode moves most, one where the third mode (or the last) does.
+    /// Two hands that drag slowly: one where the first mode moves most, one at least 0.4 of the body's size away from it,
+    /// where the first mode moves most there. The largest speed is about a tenth of the body's size a second.
     pub fn default_hands(model: &ModalModel) -> Vec<Hand> {
-        let most = |mode: usize| {
-            let count = model.surface().positions().len() as u32;
-            let size = |v: u32| (0..3).map(|a| f64::from(model.displacement_row(v, a, mode)).powi(2)).sum::<f64>();
-            (0..count).max_by(|a, b| size(*a).total_cmp(&size(*b))).unwrap_or(0)
-        };
-        let last = model.mode_count().saturating_sub(1);
+        let positions = model.surface().positions();
         let size = model.size();
-        let hand = |vertex, frequency, reach: [f64; 3]| Hand {
-            vertex,
+        let moves =
+            |v: usize| (0..3).map(|a| f64::from(model.displacement_row(v as u32, a, 0)).powi(2)).sum::<f64>();
+        let most = |far_from: Option<usize>| {
+            let distance = |v: usize| {
+                let from = far_from.map_or(positions[v], |f| positions[f]);
+                (0..3).map(|k| f64::from(positions[v][k] - from[k]).powi(2)).sum::<f64>().sqrt()
+            };
+            (0..positions.len())
+                .filter(|v| far_from.is_none() || distance(*v) > 0.4 * size)
+                .max_by(|a, b| moves(*a).total_cmp(&moves(*b)))
+        };
+        let hand = |vertex: usize, frequency, reach: [f64; 3]| Hand {
+            vertex: vertex as u32,
             radius: 0.06 * size,
             reach: reach.map(|r| r * size),
             frequency,
             holds: None,
         };
-        vec![hand(most(0), 0.31, [0.05, 0.15, 0.10]), hand(most(2.min(last)), 0.43, [0.03, 0.05, 0.06])]
+        let first = most(None).unwrap_or(0);
+        let mut hands = vec![hand(first, 0.13, [0.01, 0.15, 0.12])];
+        hands.extend(most(Some(first)).map(|v| hand(v, 0.17, [0.01, 0.05, 0.06])));
+        hands
     }
 
     /// Runs it.
@@ -189,7 +198,8 @@ impl Experiment {
     pub fn run(&self) -> Result<Figures, StreamError> {
         let h = 1.0 / self.rate;
         let newmark = Newmark { h, ..self.newmark };
-        let mut pair = Pair::new(HostConfig { newmark, resend_after: self.resend_after, ..Default::default() })?;
+        let mut pair =
+            Pair::new(HostConfig { newmark, resend_after: self.resend_after, ..Default::default() })?;
         let body = Body::new(
             self.model.clone(),
             BodyConfig { step: h, integrator: self.integrator, ..Default::default() },
@@ -207,7 +217,10 @@ impl Experiment {
         pair.run_until(joined, &mut run);
         run.begin(joined);
         pair.measure_guests(self.cpu_clock);
-        pair.guests[0].down = crate::emulator::Link::new(self.down.clone(), self.seed);
+        let link = &mut pair.guests[0].down;
+        let mut down = self.down.clone();
+        down.loss = down.loss.shifted(link.counts().sent, joined);
+        link.reconfigure(down)?;
         let before = pair.host.stats(crate::state::PeerId(1)).unwrap_or_default();
         let until = joined + Duration::from_secs_f64(self.seconds.clamp(0.1, 1e6));
         pair.run_until(until, &mut run);
@@ -215,8 +228,8 @@ impl Experiment {
         let guest = &pair.guests[0];
         let mut figures = run.figures(&guest.session);
         figures.lost = guest.down.counts().lost;
-        figures.bytes_per_frame =
-            (after.bytes_out - before.bytes_out) as f64 / (after.datagrams_out - before.datagrams_out).max(1) as f64;
+        figures.bytes_per_frame = (after.bytes_out - before.bytes_out) as f64
+            / (after.datagrams_out - before.datagrams_out).max(1) as f64;
         figures.kbit_s = (after.bytes_out - before.bytes_out) as f64 * 8e-3 / self.seconds;
         figures.hash = fold(figures.hash, &guest.down.hash().to_le_bytes());
         figures.cpu_us_per_tick = 1e6 * pair.guests_spent().as_secs_f64() / figures.ticks.max(1) as f64;
@@ -374,13 +387,15 @@ impl Run {
             max_percent: percent(self.largest.sqrt(), self.scale),
             end_percent: percent(self.last.sqrt(), self.scale),
             hidden_end_percent: percent(self.hidden_last.sqrt(), self.scale),
-            force_rms_percent: percent((self.force_sum / self.force_count.max(1) as f64).sqrt(), self.force_scale),
+            force_rms_percent: percent(
+                (self.force_sum / self.force_count.max(1) as f64).sqrt(),
+                self.force_scale,
+            ),
             force_ringing: ratio(self.shown_second, self.force_scale),
             true_ringing: ratio(self.true_second, self.force_scale),
             // A target leaves with the guest's tick, waits for the host's next step (half a step on average), and its
             // reaction comes back and is shown.
-            hand_to_force_ms: 1e3
-                * (session.stats().round_trip.as_secs_f64() * 0.5 + 0.5 * self.h + delay),
+            hand_to_force_ms: 1e3 * (session.stats().round_trip.as_secs_f64() * 0.5 + 0.5 * self.h + delay),
             shown_delay_ms: 1e3 * delay,
             recover_ms: longest.as_secs_f64() * 1e3,
             hash: self.hash,
@@ -400,7 +415,8 @@ impl World for Run {
             let holds = held.hand.holds.is_none_or(|(from, to)| (from..to).contains(&t));
             match (&held.grab, holds) {
                 (None, true) => {
-                    let patch = Patch::around(self.body.model().surface(), held.hand.vertex, held.hand.radius);
+                    let patch =
+                        Patch::around(self.body.model().surface(), held.hand.vertex, held.hand.radius);
                     if let Ok(patch) = patch
                         && let Ok(id) = self.body.grab(&patch, GrabConfig::default())
                         && let Ok(start) = self.body.grab_position(id)

@@ -7,7 +7,9 @@ use std::time::Duration;
 
 use crate::StreamError;
 use crate::emulator::{Link, LinkConfig, Loss};
-use crate::session::{Channel, GuestConfig, GuestEvent, GuestSession, HostConfig, HostEvent, HostSession, Output};
+use crate::session::{
+    Channel, GuestConfig, GuestEvent, GuestSession, HostConfig, HostEvent, HostSession, Output,
+};
 use crate::state::PeerId;
 
 /// What happens around the sessions. All methods may be left as they are but [`World::step`].
@@ -17,7 +19,14 @@ pub trait World {
     /// Something happened at the host.
     fn host_event(&mut self, _now: Duration, _event: HostEvent, _host: &mut HostSession) {}
     /// Something happened at a guest.
-    fn guest_event(&mut self, _now: Duration, _guest: usize, _event: GuestEvent, _session: &mut GuestSession) {}
+    fn guest_event(
+        &mut self,
+        _now: Duration,
+        _guest: usize,
+        _event: GuestEvent,
+        _session: &mut GuestSession,
+    ) {
+    }
     /// A guest's bodies took `stepped` ticks (0 for a wake-up without one).
     fn guest_stepped(&mut self, _now: Duration, _guest: usize, _stepped: u64, _session: &mut GuestSession) {}
 }
@@ -63,6 +72,7 @@ pub struct Pair {
     pub guests: Vec<GuestEnd>,
     now: Duration,
     step: Duration,
+    next_step: Duration,
     tick: u64,
     paused: bool,
     clock: Option<fn() -> Duration>,
@@ -77,7 +87,17 @@ impl Pair {
     pub fn new(config: HostConfig) -> Result<Self, StreamError> {
         let step = Duration::from_secs_f64(config.newmark.h.clamp(1e-5, 1.0));
         let host = HostSession::new(config)?;
-        Ok(Self { host, guests: Vec::new(), now: Duration::ZERO, step, tick: 0, paused: false, clock: None, spent: Duration::ZERO })
+        Ok(Self {
+            host,
+            guests: Vec::new(),
+            now: Duration::ZERO,
+            step,
+            next_step: step,
+            tick: 0,
+            paused: false,
+            clock: None,
+            spent: Duration::ZERO,
+        })
     }
 
     /// The time.
@@ -101,9 +121,10 @@ impl Pair {
         self.spent
     }
 
-    /// The host stops stepping, or goes on; its tick numbers stand still meanwhile.
+    /// The host stops stepping, or goes on; its tick numbers stand still meanwhile and no step is caught up with.
     pub fn pause(&mut self, paused: bool) {
         self.paused = paused;
+        self.next_step = self.next_step.max(self.now);
     }
 
     /// Joins a guest over a path. What goes reliably arrives in order after the path's delay, and later by what resending
@@ -170,21 +191,17 @@ impl Pair {
             self.exchange(world);
             let Some(next) = self.next_time().filter(|t| *t <= until) else { break };
             self.now = self.now.max(next);
-            if !self.paused && self.now >= self.step_time() {
+            if !self.paused && self.now >= self.next_step {
                 self.tick += 1;
+                self.next_step += self.step;
                 world.step(self.now, self.tick, &mut self.host);
             }
         }
         self.now = self.now.max(until);
     }
 
-    fn step_time(&self) -> Duration {
-        // While the host is paused its steps are late, not lost.
-        self.step * u32::try_from(self.tick + 1).unwrap_or(u32::MAX)
-    }
-
     fn next_time(&self) -> Option<Duration> {
-        let mut next = if self.paused { None } else { Some(self.step_time().max(self.now)) };
+        let mut next = if self.paused { None } else { Some(self.next_step.max(self.now)) };
         let mut take = |t: Option<Duration>| {
             next = match (next, t) {
                 (Some(a), Some(b)) => Some(a.min(b)),

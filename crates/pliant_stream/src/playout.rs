@@ -12,6 +12,9 @@ const WINDOW: usize = 128;
 const SLEW: f64 = 0.01;
 /// An estimate farther off than this is taken over at once, s: the path or the host's clock has jumped.
 const JUMP: f64 = 0.25;
+/// So many frames in a row later than `SHIFTED` ticks behind the line mean that the line has moved: the host paused.
+const LATE_ROW: usize = 8;
+const SHIFTED: f64 = 3.0;
 /// Room for arrival jitter on top of the ticks of delay, in ticks.
 const MARGIN: f64 = 0.25;
 /// Share of frames that an adaptive delay lets come too late.
@@ -42,6 +45,12 @@ impl PlayoutClock {
         if self.samples.back().is_some_and(|last| (sample - last).abs() > 10.0 * JUMP) {
             // The host paused, or numbered on from elsewhere: what was learnt is void.
             self.samples.clear();
+        }
+        let earliest = self.samples.iter().copied().fold(f64::INFINITY, f64::min);
+        let row = self.samples.iter().rev().take(LATE_ROW - 1);
+        if self.samples.len() >= LATE_ROW && row.chain([&sample]).all(|s| *s > earliest + SHIFTED * self.h) {
+            let old = self.samples.len() - (LATE_ROW - 1);
+            self.samples.drain(..old);
         }
         if self.samples.len() >= WINDOW {
             self.samples.pop_front();

@@ -8,6 +8,12 @@ use pliant_modal::{Coefficients, Integrator, ModalModel, Patch, warp_jacobian};
 
 use crate::StreamError;
 use crate::state::{GrabState, ModalState};
+use crate::wire::FrameGrab;
+
+/// Share of a patch's static compliance by which the receiver lets it give way. Without any, a held place under an implicit
+/// step flips its force every tick; a few per cent end that and cost nothing, since the streamed reaction already carries
+/// the load.
+const GIVE: f64 = 0.03;
 
 /// Patches remembered at a time; a new one beyond that empties the table.
 const PATCHES: usize = 64;
@@ -36,6 +42,8 @@ struct PatchModes {
     rotation: Vec<Vector3<f64>>,
     /// Derivative of the patch's position by each coordinate at the last linearisation.
     rows: Vec<Vector3<f64>>,
+    /// How far the held patch may give way to its measured place, m/N.
+    compliance: Matrix3<f64>,
 }
 
 impl PatchModes {
@@ -52,22 +60,33 @@ impl PatchModes {
                 }
             }
         }
-        Ok(Self { rows: displacement.clone(), displacement, rotation })
+        let residual = model.residual_flexibility(&patch, modes);
+        let fixed = displacement
+            .iter()
+            .zip(model.omega())
+            .map(|(row, omega)| row.norm_squared() / omega.powi(2).max(1e-12))
+            .sum::<f64>();
+        let compliance = Matrix3::from_fn(|i, j| 0.5 * (residual[i][j] + residual[j][i]))
+            + Matrix3::identity() * (GIVE * fixed / 3.0 + f64::MIN_POSITIVE);
+        Ok(Self { rows: displacement.clone(), displacement, rotation, compliance })
     }
 
-    fn linearise(&mut self, q: &[f64], warp: bool) {
-        if !warp {
-            return;
-        }
+    /// Takes the rows at `q`; returns the patch's displacement there.
+    fn linearise(&mut self, q: &[f64], warp: bool) -> Vector3<f64> {
         let sum = |columns: &[Vector3<f64>]| {
             columns.iter().zip(q).fold(Vector3::<f64>::zeros(), |s, (c, q)| s + c * *q)
         };
-        let (d, w) = (sum(&self.displacement), sum(&self.rotation));
-        let (_, by_d, by_w) = warp_jacobian(w.into(), d.into());
+        let d = sum(&self.displacement);
+        if !warp {
+            return d;
+        }
+        let w = sum(&self.rotation);
+        let (u, by_d, by_w) = warp_jacobian(w.into(), d.into());
         let (by_d, by_w) = (Matrix3::from_fn(|i, j| by_d[i][j]), Matrix3::from_fn(|i, j| by_w[i][j]));
         for ((row, phi), psi) in self.rows.iter_mut().zip(&self.displacement).zip(&self.rotation) {
             *row = by_d * phi + by_w * psi;
         }
+        u.into()
     }
 }
 
@@ -108,6 +127,11 @@ impl ForceStepper {
         })
     }
 
+    /// Angular frequency of a mode, rad/s.
+    pub(crate) fn omega(&self, mode: usize) -> f64 {
+        self.model.omega().get(mode).copied().unwrap_or(1.0)
+    }
+
     /// Number of modes stepped.
     pub fn modes(&self) -> usize {
         self.coefficients.len()
@@ -141,28 +165,49 @@ impl ForceStepper {
         self.patches.get_mut(&key)
     }
 
-    /// One step: `f = load - sum rows^T R^T reaction`, the rows taken where the body's own two Newton rounds take them.
-    /// A grab whose vertex the model has not got pulls nothing.
-    pub fn step(&mut self, state: &mut ModalState, grabs: &[GrabState], rotation: [f64; 4], load: &[f64]) {
+    /// One step with the reactions, drawn to where the host's patches were.
+    ///
+    /// ```text
+    /// f = load - sum rows^T R^T reaction + sum rows^T correction
+    /// (A + C) correction = displacement - (displacement that the step would reach without it)
+    /// ```
+    ///
+    /// The reactions alone are a dead load: a bent body under a load that pushes is unstable (it buckles), although the
+    /// same body held in place is not, and a small error would grow. The correction makes the receiver an observer: it is
+    /// zero when the state is right, and otherwise draws the patches to their places as a compliant grab does, so errors
+    /// die as they would in the held body. The rows are taken where the body's own two Newton rounds take them. A grab
+    /// whose vertex the model has not got pulls nothing.
+    pub fn step(&mut self, state: &mut ModalState, grabs: &[FrameGrab], rotation: [f64; 4], load: &[f64]) {
         let back = inverse_rotation(rotation);
+        let extra = |f: &mut [f64]| {
+            for (f, extra) in f.iter_mut().zip(load) {
+                *f += extra;
+            }
+        };
         if grabs.is_empty() {
             self.force.fill(0.0);
+            extra(&mut self.force);
         } else {
-            self.gather(&state.q, grabs, &back);
-            // The held position that the body's second round linearises at.
-            for (k, c) in self.coefficients.iter().enumerate() {
-                let old = [state.q[k], state.v[k], state.a[k]];
-                let extra = load.get(k).copied().unwrap_or(0.0);
-                self.trial[k] = c.step(old, self.old[k], self.force[k] + extra)[0];
-            }
-            if self.warp {
-                let trial = std::mem::take(&mut self.trial);
-                self.gather(&trial, grabs, &back);
+            let states = || grabs.iter().map(|g| &g.state);
+            self.gather(&state.q, states(), &back);
+            extra(&mut self.force);
+            for round in 0..2 {
+                let mut trial = std::mem::take(&mut self.trial);
+                for (k, c) in self.coefficients.iter().enumerate() {
+                    let old = [state.q[k], state.v[k], state.a[k]];
+                    trial[k] = c.step(old, self.old[k], self.force[k])[0];
+                }
+                if round == 0 && self.warp {
+                    self.gather(&trial, states(), &back);
+                    extra(&mut self.force);
+                    for (k, c) in self.coefficients.iter().enumerate() {
+                        let old = [state.q[k], state.v[k], state.a[k]];
+                        trial[k] = c.step(old, self.old[k], self.force[k])[0];
+                    }
+                }
+                self.correct(&trial, grabs);
                 self.trial = trial;
             }
-        }
-        for (f, extra) in self.force.iter_mut().zip(load) {
-            *f += extra;
         }
         for (k, c) in self.coefficients.iter().enumerate() {
             let old = [state.q[k], state.v[k], state.a[k]];
@@ -171,8 +216,61 @@ impl ForceStepper {
         self.old.copy_from_slice(&self.force);
     }
 
+    /// Adds the correction to the modal forces: what draws the patches from where `trial` has them to their places.
+    fn correct(&mut self, trial: &[f64], grabs: &[FrameGrab]) {
+        let n = 3 * grabs.len();
+        let warp = self.warp;
+        let mut gap = nalgebra::DVector::<f64>::zeros(n);
+        let mut matrix = nalgebra::DMatrix::<f64>::zeros(n, n);
+        let keys: Vec<(u32, u64)> =
+            grabs.iter().map(|g| (g.state.vertex, g.state.radius.to_bits())).collect();
+        for (i, g) in grabs.iter().enumerate() {
+            let Some(patch) = self.patch(g.state.vertex, g.state.radius) else { continue };
+            let u = patch.linearise(trial, warp);
+            for x in 0..3 {
+                gap[3 * i + x] = g.displacement[x] - u[x];
+            }
+        }
+        for (i, key) in keys.iter().enumerate() {
+            for (j, other) in keys.iter().enumerate().take(i + 1) {
+                let mut block = Matrix3::zeros();
+                if let (Some(a), Some(b)) = (self.patches.get(key), self.patches.get(other)) {
+                    for ((a, b), c) in a.rows.iter().zip(&b.rows).zip(&self.coefficients) {
+                        block += c.response[0] * (a * b.transpose());
+                    }
+                    if i == j {
+                        block += a.compliance;
+                    }
+                } else if i == j {
+                    block = Matrix3::identity();
+                }
+                for x in 0..3 {
+                    for y in 0..3 {
+                        matrix[(3 * i + x, 3 * j + y)] = block[(x, y)];
+                        matrix[(3 * j + y, 3 * i + x)] = block[(x, y)];
+                    }
+                }
+            }
+        }
+        let Some(cholesky) = matrix.cholesky() else { return };
+        let pull = cholesky.solve(&gap);
+        for (i, key) in keys.iter().enumerate() {
+            let Some(patch) = self.patches.get(key) else { continue };
+            let pull = Vector3::new(pull[3 * i], pull[3 * i + 1], pull[3 * i + 2]);
+            for (f, row) in self.force.iter_mut().zip(&patch.rows) {
+                *f += row.dot(&pull);
+            }
+        }
+    }
+
+    /// Where a patch is at `q`, as displacement from rest in body axes, m; zero for a vertex that the model has not got.
+    pub fn displacement(&mut self, q: &[f64], vertex: u32, radius: f64) -> [f64; 3] {
+        let warp = self.warp;
+        self.patch(vertex, radius).map_or([0.0; 3], |p| p.linearise(q, warp).into())
+    }
+
     /// Modal forces of the reactions, rows taken at `q`.
-    fn gather(&mut self, q: &[f64], grabs: &[GrabState], back: &Matrix3<f64>) {
+    fn gather<'a>(&mut self, q: &[f64], grabs: impl Iterator<Item = &'a GrabState>, back: &Matrix3<f64>) {
         let warp = self.warp;
         let mut force = std::mem::take(&mut self.force);
         force.fill(0.0);
@@ -187,29 +285,28 @@ impl ForceStepper {
         self.force = force;
     }
 
-    /// The modal force per mode that takes `from` to `to` in one step, by least squares over displacement and velocity
-    /// (in units of the mode's own amplitude), and what of it the grabs do not explain.
-    pub(crate) fn unexplained(
+    /// The modal force per mode that a step from the true state `from` lacks to reach the true state `to`: by least
+    /// squares over displacement and velocity, in units of the mode's own amplitude. Steps `from`.
+    pub(crate) fn lacking(
         &mut self,
-        from: &ModalState,
-        to_q: &[f64],
-        to_v: &[f64],
-        grabs: &[GrabState],
+        from: &mut ModalState,
+        to: [&[f64]; 2],
+        grabs: &[FrameGrab],
         rotation: [f64; 4],
+        load: &[f64],
         out: &mut Vec<f64>,
     ) {
-        let back = inverse_rotation(rotation);
-        // The state after the step is known here: the rows are taken there.
-        self.gather(to_q, grabs, &back);
+        let old = self.old.clone();
+        self.step(from, grabs, rotation, load);
+        self.old = old;
         out.clear();
         for (k, c) in self.coefficients.iter().enumerate() {
-            let free = c.step([from.q[k], from.v[k], from.a[k]], self.old[k], 0.0);
             let weight = 1.0 / self.model.omega()[k].powi(2).max(1e-12);
-            let (rq, rv) = (to_q[k] - free[0], to_v[k] - free[1]);
+            let at = |slice: &[f64]| slice.get(k).copied().unwrap_or(0.0);
+            let (rq, rv) = (at(to[0]) - from.q[k], at(to[1]) - from.v[k]);
             let (bq, bv) = (c.response[0], c.response[1]);
             let scale = bq * bq + bv * bv * weight;
-            let needed = if scale > 0.0 { (bq * rq + bv * rv * weight) / scale } else { 0.0 };
-            out.push(needed - self.force[k]);
+            out.push(if scale > 0.0 { (bq * rq + bv * rv * weight) / scale } else { 0.0 });
         }
     }
 

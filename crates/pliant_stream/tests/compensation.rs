@@ -12,6 +12,7 @@ fn frame(tick: u64, a: &[f64]) -> Frame {
         run: 0,
         resting: false,
         resent: false,
+        displacements: false,
         grabs: Vec::new(),
         pose: None,
         accelerations: Some(Accelerations::F64(a.to_vec())),
@@ -22,7 +23,8 @@ fn frame(tick: u64, a: &[f64]) -> Frame {
 }
 
 /// Newmark pairs from the paper's to generalized-alpha's, and two odd ones.
-const PAIRS: [(f64, f64); 5] = [(0.25, 0.5), (4.0 / 9.0, 5.0 / 6.0), (1.0 / 6.0, 0.5), (0.3, 0.6), (0.0, 0.5)];
+const PAIRS: [(f64, f64); 5] =
+    [(0.25, 0.5), (4.0 / 9.0, 5.0 / 6.0), (1.0 / 6.0, 0.5), (0.3, 0.6), (0.0, 0.5)];
 
 #[test]
 fn equations_8_and_9_hold_to_rounding_for_any_newmark() {
@@ -48,7 +50,10 @@ fn equations_8_and_9_hold_to_rounding_for_any_newmark() {
                     (((n - i) as f64 + gamma - 0.5) * h * h * da, h * da)
                 };
                 let scale = q.0.abs().max(1e-3);
-                assert!((dq - want_q).abs() < 1e-13 * scale, "beta {beta} gamma {gamma} h {h} tick {n}: {dq} {want_q}");
+                assert!(
+                    (dq - want_q).abs() < 1e-13 * scale,
+                    "beta {beta} gamma {gamma} h {h} tick {n}: {dq} {want_q}"
+                );
                 assert!((dv - want_v).abs() < 1e-13 * v.0.abs().max(1.0), "velocity at {n}: {dv} {want_v}");
                 let response = newmark.response(n - i);
                 assert!((response.0 * da - want_q).abs() < 1e-18 && (response.1 * da - want_v).abs() < 1e-18);
@@ -89,7 +94,10 @@ fn every_late_acceleration_takes_its_error_out_exactly() {
                 }
                 for k in 0..2 {
                     let error = (receiver.hidden().q[k] - whole.q[k]).abs() / largest;
-                    assert!(error < 1e-9, "{predict:?} beta {beta}: {error:e} of the scale after the last repair");
+                    assert!(
+                        error < 1e-9,
+                        "{predict:?} beta {beta}: {error:e} of the scale after the last repair"
+                    );
                 }
                 let drift = (drifting.hidden().q[1] - whole.q[1]).abs() / largest;
                 assert!(drift > 1e-5, "without compensation the error stays: {drift:e}");

@@ -59,6 +59,18 @@ impl Loss {
         Self::GilbertElliott { good: bad.mul_f64((1.0 - loss) / loss), bad, loss_good: 0.0, loss_bad: 1.0 }
     }
 
+    /// The same losses with packets counted from `packets` and time from `time` on.
+    #[must_use]
+    pub fn shifted(&self, packets: u64, time: Duration) -> Self {
+        match self.clone() {
+            Self::Burst { first, count } => Self::Burst { first: first + packets, count },
+            Self::Every { first, every } => Self::Every { first: first + packets, every },
+            Self::Listed(list) => Self::Listed(list.into_iter().map(|k| k + packets).collect()),
+            Self::Outage { from, to } => Self::Outage { from: from + time, to: to + time },
+            other @ (Self::None | Self::Random(_) | Self::GilbertElliott { .. }) => other,
+        }
+    }
+
     /// Checks the ranges.
     ///
     /// # Errors

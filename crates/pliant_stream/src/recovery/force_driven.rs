@@ -1,8 +1,17 @@
 //! The better way: the receiver owns the damped model and steps it with the streamed reactions.
 
 use super::{HISTORY, History, Recovery};
-use crate::state::{GrabState, ModalState, Tick};
+use crate::state::{ModalState, Tick};
 use crate::stepper::ForceStepper;
+use crate::wire::FrameGrab;
+
+/// Hands are taken to keep their velocity for about this long, s.
+const HAND_MEMORY: f64 = 0.7;
+
+/// What is left of a hand's velocity after a step of `h` seconds.
+pub(crate) fn keep_of(h: f64) -> f64 {
+    (-h / HAND_MEMORY).exp()
+}
 
 /// A tick as it was stepped.
 #[derive(Debug, Clone, Default)]
@@ -21,12 +30,13 @@ pub struct ForceDriven {
     state: ModalState,
     load: Vec<f64>,
     past: Vec<Stepped>,
-    grabs: Vec<GrabState>,
+    grabs: Vec<FrameGrab>,
+    keep: f64,
 }
 
 impl ForceDriven {
-    /// At rest at tick 0.
-    pub fn new(stepper: ForceStepper) -> Self {
+    /// At rest at tick 0. `keep`: what is left of a hand's velocity a tick later, for guessing; e to the power of minus the step over 0.7 s.
+    pub fn new(stepper: ForceStepper, keep: f64) -> Self {
         let modes = stepper.modes();
         Self {
             stepper,
@@ -36,6 +46,7 @@ impl ForceDriven {
             load: vec![0.0; modes],
             past: vec![Stepped::default(); HISTORY],
             grabs: Vec::new(),
+            keep,
         }
     }
 
@@ -53,11 +64,7 @@ impl ForceDriven {
         if let Some(data) = history.known(tick) {
             self.grabs.extend_from_slice(&data.grabs);
         } else if let Some(near) = history.last_known(tick) {
-            for g in &near.grabs {
-                if let Some(reaction) = history.reaction(g.key, tick) {
-                    self.grabs.push(GrabState { reaction, ..*g });
-                }
-            }
+            self.grabs.extend(near.grabs.iter().filter_map(|g| history.grab(g.state.key, tick, self.keep)));
         }
         if let Some(pose) = history.last_known(tick).and_then(|d| d.pose) {
             rotation = pose.rotation;

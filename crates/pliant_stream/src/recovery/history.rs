@@ -1,7 +1,7 @@
 //! What has arrived, tick by tick: a ring of fixed length.
 
 use crate::state::{GrabKey, GrabState, MAX_GRABS, Pose, Tick};
-use crate::wire::{Frame, Slice};
+use crate::wire::{Frame, FrameGrab, Slice};
 
 /// Ticks that a receiver remembers. Older data is not used any more.
 pub const HISTORY: usize = 256;
@@ -17,8 +17,8 @@ pub struct TickData {
     pub head: bool,
     /// Modal accelerations; empty where the stream carries none.
     pub accelerations: Vec<f64>,
-    /// The grabs that held, with their reactions.
-    pub grabs: Vec<GrabState>,
+    /// The grabs that held, with their reactions and where their patches were.
+    pub grabs: Vec<FrameGrab>,
     /// Rigid frame of a free body.
     pub pose: Option<Pose>,
     /// A part of the absolute state.
@@ -90,9 +90,10 @@ impl History {
                 continue;
             }
             let slot = self.slot(tick);
-            slot.grabs.extend(repeat.reactions.iter().filter_map(|(index, reaction)| {
-                let grab = frame.grabs.get(usize::from(*index))?;
-                Some(GrabState { reaction: *reaction, ..grab.state })
+            slot.grabs.extend(repeat.grabs.iter().filter_map(|r| {
+                let grab = frame.grabs.get(usize::from(r.index))?;
+                let state = GrabState { reaction: r.reaction, ..grab.state };
+                Some(FrameGrab { state, displacement: r.displacement, held: true })
             }));
             slot.grabs.truncate(MAX_GRABS);
             if let Some(a) = &repeat.accelerations {
@@ -106,7 +107,7 @@ impl History {
         }
         let slot = self.slot(frame.tick);
         slot.grabs.clear();
-        slot.grabs.extend(frame.grabs.iter().filter(|g| g.held).map(|g| g.state));
+        slot.grabs.extend(frame.grabs.iter().filter(|g| g.held));
         slot.accelerations.clear();
         if let Some(a) = &frame.accelerations {
             slot.accelerations.extend((0..modes).map(|k| a.get(k)));
@@ -119,11 +120,10 @@ impl History {
         new(frame.tick, true);
     }
 
-    /// The reaction of one grab at a tick: as it arrived, or between its neighbours, or going on from the last with a
-    /// slope that halves every tick. `None` when nothing near the tick knows the grab.
-    pub fn reaction(&self, key: GrabKey, tick: Tick) -> Option<[f64; 3]> {
-        let at =
-            |t: Tick| self.known(t).and_then(|d| d.grabs.iter().find(|g| g.key == key)).map(|g| g.reaction);
+    /// One grab at a tick: as it arrived, or between its neighbours, or going on from the last with a slope that shrinks
+    /// by `keep` every tick. `None` when nothing near the tick knows the grab.
+    pub fn grab(&self, key: GrabKey, tick: Tick, keep: f64) -> Option<FrameGrab> {
+        let at = |t: Tick| self.known(t).and_then(|d| d.grabs.iter().find(|g| g.state.key == key)).copied();
         if self.known(tick).is_some() {
             return at(tick);
         }
@@ -134,7 +134,7 @@ impl History {
         match (before.and_then(|t| at(t).map(|x| (t, x))), after.and_then(|t| at(t).map(|x| (t, x)))) {
             (Some((t0, x0)), Some((t1, x1))) => {
                 let s = (tick - t0) as f64 / (t1 - t0) as f64;
-                Some(std::array::from_fn(|k| x0[k] + s * (x1[k] - x0[k])))
+                Some(between(&x0, &x1, s))
             }
             (None, Some((_, x1))) => Some(x1),
             (Some((t0, x0)), None) => {
@@ -142,14 +142,56 @@ impl History {
                 if after.is_some() {
                     return None;
                 }
-                let slope = t0
-                    .checked_sub(1)
-                    .and_then(at)
-                    .map_or([0.0; 3], |x| std::array::from_fn(|k| x0[k] - x[k]));
-                let gone = 1.0 - 0.5_f64.powi((tick - t0).min(60) as i32);
-                Some(std::array::from_fn(|k| x0[k] + slope[k] * gone))
+                let Some(x1) = t0.checked_sub(1).and_then(at) else { return Some(x0) };
+                let ahead = (tick - t0).min(200) as u32;
+                let (mut s, mut c) = (1.0, 0.0);
+                let x2 = t0.checked_sub(2).and_then(at);
+                // Velocity and acceleration of the hand, both fading, in ticks: x0 + s (x0 - x1) + c (x0 - 2 x1 + x2).
+                let (mut ds, mut dc, mut keep_a) = (0.0, 0.0, 1.0);
+                for n in 0..ahead {
+                    let keep_v = keep.powi(n as i32 + 1);
+                    ds += keep_v;
+                    // The backward difference is the velocity half a tick ago; each tick adds what is left of the
+                    // acceleration.
+                    s += if n == 0 { 0.0 } else { keep_a };
+                    dc += keep_v * (s - 0.5);
+                    keep_a *= keep * keep * keep * keep;
+                    c = dc;
+                }
+                let Some(x2) = x2 else { return Some(between(&x1, &x0, 1.0 + ds)) };
+                Some(along(&x0, &x1, &x2, ds, c))
             }
             (None, None) => None,
         }
+    }
+}
+
+/// `x0 + s (x0 - x1) + c (x0 - 2 x1 + x2)` of a grab's numbers.
+fn along(x0: &FrameGrab, x1: &FrameGrab, x2: &FrameGrab, s: f64, c: f64) -> FrameGrab {
+    let go = |a: [f64; 3], b: [f64; 3], d: [f64; 3]| {
+        std::array::from_fn(|k| a[k] + s * (a[k] - b[k]) + c * (a[k] - 2.0 * b[k] + d[k]))
+    };
+    FrameGrab {
+        state: GrabState {
+            target: go(x0.state.target, x1.state.target, x2.state.target),
+            reaction: go(x0.state.reaction, x1.state.reaction, x2.state.reaction),
+            ..x0.state
+        },
+        displacement: go(x0.displacement, x1.displacement, x2.displacement),
+        held: true,
+    }
+}
+
+/// The grab on the line from `a` (0) through `b` (1).
+fn between(a: &FrameGrab, b: &FrameGrab, s: f64) -> FrameGrab {
+    let mix = |x: [f64; 3], y: [f64; 3]| std::array::from_fn(|k| x[k] + s * (y[k] - x[k]));
+    FrameGrab {
+        state: GrabState {
+            target: mix(a.state.target, b.state.target),
+            reaction: mix(a.state.reaction, b.state.reaction),
+            ..b.state
+        },
+        displacement: mix(a.displacement, b.displacement),
+        held: true,
     }
 }

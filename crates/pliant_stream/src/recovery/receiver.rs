@@ -4,6 +4,7 @@ use std::sync::Arc;
 
 use pliant_modal::ModalModel;
 
+use super::force_driven::keep_of;
 use super::{
     AccelerationDriven, Blend, ForceDriven, HISTORY, History, Policy, Predict, Recovery, RecoveryConfig,
 };
@@ -104,7 +105,9 @@ impl Receiver {
             Policy::Paper { predict, blend_ticks } => {
                 (Box::new(AccelerationDriven::new(newmark, predict, true, modes)), blend_ticks)
             }
-            Policy::ForceDriven { blend_ticks } => (Box::new(ForceDriven::new(stepper()?)), blend_ticks),
+            Policy::ForceDriven { blend_ticks } => {
+                (Box::new(ForceDriven::new(stepper()?, keep_of(newmark.h))), blend_ticks)
+            }
         };
         let mut receiver = Self {
             setup,
@@ -259,6 +262,17 @@ impl Receiver {
         self.counts.snapshots += 1;
     }
 
+    /// What is shown still differs from the hidden state.
+    pub fn is_fading(&self) -> bool {
+        !self.blend.is_empty()
+    }
+
+    /// Lets the shown offset of a resting body fade by one tick's worth.
+    pub fn fade(&mut self) {
+        self.blend.advance();
+        self.show();
+    }
+
     /// Moves a resting body to a later tick without stepping it.
     pub fn skip_to(&mut self, tick: Tick) {
         if tick <= self.tick {
@@ -288,10 +302,10 @@ impl Receiver {
         self.blend.apply(&mut self.shown.q, &mut self.shown.v);
         let previous = std::mem::take(&mut self.grabs);
         match self.history.known(self.tick) {
-            Some(data) => self.grabs.extend_from_slice(&data.grabs),
+            Some(data) => self.grabs.extend(data.grabs.iter().map(|g| g.state)),
             None => {
                 if let Some(near) = self.history.last_known(self.tick) {
-                    self.grabs.extend_from_slice(&near.grabs);
+                    self.grabs.extend(near.grabs.iter().map(|g| g.state));
                 }
             }
         }
@@ -299,9 +313,10 @@ impl Receiver {
             d.pose.map(|p| extrapolate(&p, (self.tick.saturating_sub(d.tick)) as f64 * self.h))
         });
         if self.policy.driven_by_reactions() {
+            let keep = keep_of(self.h);
             for g in &mut self.grabs {
-                if let Some(r) = self.history.reaction(g.key, self.tick) {
-                    g.reaction = r;
+                if let Some(now) = self.history.grab(g.key, self.tick, keep) {
+                    *g = now.state;
                 }
             }
             self.blend_reactions(&previous);
@@ -316,8 +331,8 @@ impl Receiver {
         let keep = (-3.0 / f64::from(self.blend_ticks)).exp();
         for g in &mut self.grabs {
             let Some(shown) = previous.iter().find(|p| p.key == g.key) else { continue };
-            let known = self.tick.checked_sub(1).and_then(|t| self.history.reaction(g.key, t));
-            let Some(known) = known else { continue };
+            let known = self.tick.checked_sub(1).and_then(|t| self.history.grab(g.key, t, keep_of(self.h)));
+            let Some(known) = known.map(|k| k.state.reaction) else { continue };
             for k in 0..3 {
                 let offset = keep * (shown.reaction[k] - known[k]);
                 if offset.abs() > 1e-7 * g.reaction[k].abs() {

@@ -43,6 +43,7 @@ pub struct BodyView {
     /// Ticks up to here need no asking: before the run, or before the snapshot.
     settled: Tick,
     resting: bool,
+    fade_at: Duration,
     stalled: bool,
     heard: Duration,
     snapshot_asked: Option<Duration>,
@@ -65,6 +66,7 @@ impl BodyView {
             asks: vec![Ask::default(); HISTORY],
             settled: 0,
             resting: false,
+            fade_at: Duration::ZERO,
             stalled: false,
             heard: Duration::ZERO,
             snapshot_asked: None,
@@ -223,14 +225,20 @@ impl BodyView {
         let Some(receiver) = &mut self.receiver else { return 0 };
         if self.resting {
             self.stalled = false;
+            if now >= self.fade_at && receiver.is_fading() {
+                receiver.fade();
+                self.fade_at = now + Duration::from_secs_f64(self.newmark.h);
+            }
             return 0;
         }
         let quiet = now.saturating_sub(self.heard) > self.config.stall_after;
         let highest = receiver.history().highest();
         self.stalled = quiet && receiver.tick() >= highest;
+        let guesses = (self.config.stall_after.as_secs_f64() / self.newmark.h) as u64 + 1;
         let mut stepped = 0;
         while let Some(due) = self.playout.due(receiver.tick() + 1) {
-            if due > now || (quiet && receiver.tick() >= highest) {
+            // Never far beyond what has been heard of, whatever the schedule says.
+            if due > now || (quiet && receiver.tick() >= highest) || receiver.tick() >= highest + guesses {
                 break;
             }
             if receiver.tick() + CATCH_UP < highest {
@@ -249,10 +257,13 @@ impl BodyView {
     /// When the next tick is due.
     pub(crate) fn next_tick_due(&self, now: Duration) -> Option<Duration> {
         let receiver = self.receiver.as_ref()?;
-        if self.resting
-            || self.stalled
-            || (self.wants_snapshot && receiver.tick() + CATCH_UP < receiver.history().highest())
-        {
+        if self.resting {
+            return receiver.is_fading().then_some(self.fade_at.max(now));
+        }
+        let highest = receiver.history().highest();
+        let guesses = (self.config.stall_after.as_secs_f64() / self.newmark.h) as u64 + 1;
+        let waits = self.wants_snapshot && receiver.tick() + CATCH_UP < highest;
+        if self.stalled || waits || receiver.tick() >= highest + guesses {
             return None;
         }
         self.playout.due(receiver.tick() + 1).map(|t| t.max(now))

@@ -12,7 +12,8 @@ const SLICE: u8 = 4;
 const RESTING: u8 = 8;
 const CHECK: u8 = 16;
 const RESENT: u8 = 32;
-const KNOWN_FLAGS: u8 = 63;
+const DISPLACEMENTS: u8 = 64;
+const KNOWN_FLAGS: u8 = 127;
 
 /// Bytes of one grab in a frame.
 const GRAB_BYTES: usize = 34;
@@ -198,34 +199,32 @@ pub struct SliceEntry {
     pub load: f64,
 }
 
-/// The rotating part of a frame: the absolute state of some consecutive modes after the frame's tick.
+/// The absolute part of a frame: the state of some modes after the frame's tick.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Slice {
-    /// The first mode.
-    pub first: u16,
-    /// Sizes of a step of q, v and load.
+    /// Sizes of a step of q, v and load; a load of size 0 does not cross.
     pub scales: [f32; 3],
-    /// Whole steps of q, v and load, one triple a mode.
-    pub steps: Vec<[i16; 3]>,
+    /// Mode, and whole steps of q, v and load; at most 255.
+    pub steps: Vec<(u16, [i16; 3])>,
 }
 
 impl Slice {
-    /// Rounds a state to what a slice can carry. `values` are (q, v, load) of the modes from `first`, at most 255.
-    pub fn quantise(first: usize, values: &[[f64; 3]]) -> Self {
+    /// Rounds a state to what a slice can carry: mode and (q, v, load), at most 255.
+    pub fn quantise(values: &[(u16, [f64; 3])]) -> Self {
         let values = &values[..values.len().min(255)];
         let mut scales = [0.0_f32; 3];
         for (k, scale) in scales.iter_mut().enumerate() {
-            *scale = step_size(values.iter().fold(0.0_f64, |m, x| m.max(x[k].abs())));
+            *scale = step_size(values.iter().fold(0.0_f64, |m, x| m.max(x.1[k].abs())));
         }
-        let steps = values.iter().map(|x| std::array::from_fn(|k| to_step(x[k], scales[k]))).collect();
-        Self { first: first as u16, scales, steps }
+        let steps = |x: &[f64; 3]| std::array::from_fn(|k| to_step(x[k], scales[k]));
+        Self { steps: values.iter().map(|(mode, x)| (*mode, steps(x))).collect(), scales }
     }
 
     /// What the receiver reads, mode by mode.
     pub fn entries(&self) -> impl Iterator<Item = SliceEntry> + '_ {
         let value = |k: usize, steps: &[i16; 3]| f64::from(self.scales[k]) * f64::from(steps[k]);
-        self.steps.iter().enumerate().map(move |(i, s)| SliceEntry {
-            mode: usize::from(self.first) + i,
+        self.steps.iter().map(move |(mode, s)| SliceEntry {
+            mode: usize::from(*mode),
             q: value(0, s),
             v: value(1, s),
             load: value(2, s),
@@ -238,22 +237,21 @@ impl Slice {
 
     /// Bytes that a slice of so many modes takes.
     pub(crate) fn bytes_of(modes: usize, load: bool) -> usize {
-        if load { 16 + 6 * modes } else { 12 + 4 * modes }
+        if load { 14 + 8 * modes } else { 10 + 6 * modes }
     }
 
     fn encode(&self, w: &mut Writer) {
-        w.u16(self.first);
         w.u8(self.steps.len() as u8);
         w.u8(u8::from(self.has_load()));
         let parts = if self.has_load() { 3 } else { 2 };
         self.scales[..parts].iter().for_each(|&x| w.f32(x));
-        for s in &self.steps {
+        for (mode, s) in &self.steps {
+            w.u16(*mode);
             s[..parts].iter().for_each(|&x| w.i16(x));
         }
     }
 
     fn decode(r: &mut Reader<'_>) -> Result<Self, StreamError> {
-        let first = r.u16("slice first")?;
         let count = usize::from(r.u8("slice count")?);
         let parts = match r.u8("slice parts")? {
             0 => 2,
@@ -266,26 +264,27 @@ impl Slice {
                 });
             }
         };
-        if usize::from(first) + count > MAX_MODES {
-            return Err(StreamError::Invalid {
-                what: "slice",
-                found: format!("modes {first}+{count}"),
-                expected: "within 4096 modes",
-            });
-        }
         let mut scales = [0.0; 3];
         for scale in &mut scales[..parts] {
             *scale = r.wide32("slice scale")?;
         }
-        let mut steps = Vec::with_capacity(count.min(r.left() / (2 * parts)));
+        let mut steps = Vec::with_capacity(count.min(r.left() / (2 + 2 * parts)));
         for _ in 0..count {
+            let mode = r.u16("slice mode")?;
+            if usize::from(mode) >= MAX_MODES {
+                return Err(StreamError::Invalid {
+                    what: "slice mode",
+                    found: mode.to_string(),
+                    expected: "below 4096",
+                });
+            }
             let mut s = [0; 3];
             for x in &mut s[..parts] {
                 *x = r.i16("slice step")?;
             }
-            steps.push(s);
+            steps.push((mode, s));
         }
-        Ok(Self { first, scales, steps })
+        Ok(Self { scales, steps })
     }
 }
 
@@ -294,8 +293,21 @@ impl Slice {
 pub struct FrameGrab {
     /// The grab.
     pub state: GrabState,
+    /// Where the patch is, as displacement from rest in body axes, m; zero in acceleration streams, which do not carry it.
+    pub displacement: [f64; 3],
     /// Held at the frame's tick. Grabs that ended within the repeated ticks are listed too, with `false`.
     pub held: bool,
+}
+
+/// A grab at a repeated tick.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct RepeatGrab {
+    /// Index into the frame's grabs.
+    pub index: u8,
+    /// Its reaction then, N.
+    pub reaction: [f64; 3],
+    /// Where its patch was then, as in [`FrameGrab`].
+    pub displacement: [f64; 3],
 }
 
 /// An earlier tick said again.
@@ -303,8 +315,8 @@ pub struct FrameGrab {
 pub struct Repeat {
     /// How many ticks before the frame's, 1..=255.
     pub back: u8,
-    /// Index into the frame's grabs, and that grab's reaction then, N.
-    pub reactions: Vec<(u8, [f64; 3])>,
+    /// The grabs that held then.
+    pub grabs: Vec<RepeatGrab>,
     /// The accelerations, where the stream carries them.
     pub accelerations: Option<Accelerations>,
 }
@@ -322,6 +334,8 @@ pub struct Frame {
     pub resting: bool,
     /// Sent again after a NACK.
     pub resent: bool,
+    /// The grabs carry where their patches are: streams without accelerations.
+    pub displacements: bool,
     /// Everything that holds the body, at most 64.
     pub grabs: Vec<FrameGrab>,
     /// Rigid frame of a free body.
@@ -339,10 +353,11 @@ pub struct Frame {
 impl Frame {
     /// Bytes of this frame in a datagram, without the 3 bytes of header.
     pub fn bytes(&self) -> usize {
+        let more = if self.displacements { 9 } else { 0 };
         let repeat = |r: &Repeat| {
-            3 + 10 * r.reactions.len() + r.accelerations.as_ref().map_or(0, Accelerations::bytes)
+            3 + (10 + more) * r.grabs.len() + r.accelerations.as_ref().map_or(0, Accelerations::bytes)
         };
-        12 + GRAB_BYTES * self.grabs.len()
+        12 + (GRAB_BYTES + more) * self.grabs.len()
             + if self.pose.is_some() { 46 } else { 0 }
             + self.accelerations.as_ref().map_or(0, Accelerations::bytes)
             + self.slice.as_ref().map_or(0, |s| Slice::bytes_of(s.steps.len(), s.has_load()))
@@ -362,7 +377,8 @@ impl Frame {
             | flag(self.slice.is_some(), SLICE)
             | flag(self.resting, RESTING)
             | flag(self.check.is_some(), CHECK)
-            | flag(self.resent, RESENT));
+            | flag(self.resent, RESENT)
+            | flag(self.displacements, DISPLACEMENTS));
         let grabs = &self.grabs[..self.grabs.len().min(MAX_GRABS)];
         w.u8(grabs.len() as u8);
         for g in grabs {
@@ -373,6 +389,9 @@ impl Frame {
             w.f32(g.state.radius as f32);
             w.vector(g.state.target);
             w.vector24(g.state.reaction);
+            if self.displacements {
+                w.vector24(g.displacement);
+            }
         }
         if let Some(p) = &self.pose {
             w.vector(p.position);
@@ -394,10 +413,13 @@ impl Frame {
         for repeat in repeats {
             w.u8(repeat.back);
             w.u8(u8::from(repeat.accelerations.is_some()));
-            w.u8(repeat.reactions.len() as u8);
-            for (index, reaction) in &repeat.reactions {
-                w.u8(*index);
-                w.vector24(*reaction);
+            w.u8(repeat.grabs.len() as u8);
+            for g in &repeat.grabs {
+                w.u8(g.index);
+                w.vector24(g.reaction);
+                if self.displacements {
+                    w.vector24(g.displacement);
+                }
             }
             if let Some(a) = &repeat.accelerations {
                 a.encode(w);
@@ -414,11 +436,15 @@ impl Frame {
         let count = usize::from(r.u8("grab count")?);
         let invalid = |what, found: String, expected| Err(StreamError::Invalid { what, found, expected });
         if flags & !KNOWN_FLAGS != 0 {
-            return invalid("frame flags", flags.to_string(), "bits 0..=5 only");
+            return invalid("frame flags", flags.to_string(), "bits 0..=6 only");
         }
         if count > MAX_GRABS {
             return invalid("grab count", count.to_string(), "at most 64");
         }
+        let displacements = flags & DISPLACEMENTS != 0;
+        let displacement = |r: &mut Reader<'_>| -> Result<[f64; 3], StreamError> {
+            if displacements { r.vector24("grab displacement") } else { Ok([0.0; 3]) }
+        };
         let mut grabs = Vec::with_capacity(count.min(r.left() / GRAB_BYTES));
         for _ in 0..count {
             let key = GrabKey { user: UserId(r.u16("grab user")?), grab: r.u16("grab")? };
@@ -433,7 +459,7 @@ impl Frame {
             if state.radius < 0.0 {
                 return invalid("grab radius", state.radius.to_string(), "0 m or more");
             }
-            grabs.push(FrameGrab { state, held });
+            grabs.push(FrameGrab { state, displacement: displacement(r)?, held });
         }
         let pose = if flags & POSE == 0 { None } else { Some(decode_pose(r)?) };
         let accelerations = if flags & ACCELERATIONS == 0 { None } else { Some(Accelerations::decode(r)?) };
@@ -450,20 +476,34 @@ impl Frame {
                 return invalid("repeat offset", back.to_string(), "1..=255");
             }
             let with_accelerations = r.u8("repeat parts")? != 0;
-            let reactions_count = usize::from(r.u8("repeat reactions")?);
-            let mut reactions = Vec::with_capacity(reactions_count.min(r.left() / 10));
-            for _ in 0..reactions_count {
+            let held_count = usize::from(r.u8("repeat grabs")?);
+            let mut held = Vec::with_capacity(held_count.min(r.left() / 10));
+            for _ in 0..held_count {
                 let index = r.u8("repeat grab")?;
                 if usize::from(index) >= grabs.len() {
                     return invalid("repeat grab", index.to_string(), "one of the frame's grabs");
                 }
-                reactions.push((index, r.vector24("repeat reaction")?));
+                let reaction = r.vector24("repeat reaction")?;
+                held.push(RepeatGrab { index, reaction, displacement: displacement(r)? });
             }
             let accelerations = if with_accelerations { Some(Accelerations::decode(r)?) } else { None };
-            repeats.push(Repeat { back, reactions, accelerations });
+            repeats.push(Repeat { back, grabs: held, accelerations });
         }
         let (resting, resent) = (flags & RESTING != 0, flags & RESENT != 0);
-        Ok(Self { body, tick, run, resting, resent, grabs, pose, accelerations, slice, check, repeats })
+        Ok(Self {
+            body,
+            tick,
+            run,
+            resting,
+            resent,
+            displacements,
+            grabs,
+            pose,
+            accelerations,
+            slice,
+            check,
+            repeats,
+        })
     }
 }
 

@@ -11,7 +11,7 @@ mod message;
 pub(crate) use bytes::{Reader, WIDE_LIMIT, Writer, round24};
 pub use datagram::{Clock, Datagram, Nack, NackRun, Report, TargetEntry, Targets};
 pub(crate) use datagram::{MAX_NACK_RUNS, MAX_TARGETS};
-pub use frame::{AccelerationCoding, Accelerations, Frame, FrameGrab, Repeat, Slice, SliceEntry};
+pub use frame::{AccelerationCoding, Accelerations, Frame, FrameGrab, Repeat, RepeatGrab, Slice, SliceEntry};
 pub use message::{BodyInfo, GuestMessage, HostMessage, Payload, SnapshotBytes, StreamWish};
 pub(crate) use message::{MAX_BODIES, MAX_CACHED, MAX_NAME, MAX_TOKEN};
 

@@ -50,7 +50,10 @@ pub fn bar(modes: usize, zeta: f64) -> Arc<ModalModel> {
                 0 => ([0.0, amplitude * s, 0.0], [0.0, 0.0, 0.5 * amplitude * c]),
                 1 => ([0.0, 0.0, amplitude * s], [0.0, -0.5 * amplitude * c, 0.0]),
                 2 => ([amplitude * s, 0.0, 0.0], [0.0; 3]),
-                _ => ([0.0, -twist * s * z, twist * s * y], [twist * s, -0.5 * twist * c * y, -0.5 * twist * c * z]),
+                _ => (
+                    [0.0, -twist * s * z, twist * s * y],
+                    [twist * s, -0.5 * twist * c * y, -0.5 * twist * c * z],
+                ),
             };
             displacement.extend(u.map(|x| x as f32));
             rotation.extend(r.map(|x| x as f32));
