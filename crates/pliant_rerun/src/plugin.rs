@@ -1,0 +1,200 @@
+//! The plugin: sinks, rates, and the systems' place in the app.
+
+use std::path::PathBuf;
+
+use bevy::{
+    ecs::schedule::{InternedScheduleLabel, ScheduleLabel},
+    prelude::*,
+};
+use pliant_body::PliantSystems;
+use thiserror::Error;
+
+use crate::{
+    RerunScalars,
+    blueprint::Plots,
+    collect,
+    worker::{Target, Worker},
+};
+
+/// Records what Pliant does. Add it after `PliantBodyPlugin`.
+pub struct RerunPlugin {
+    application: String,
+    file: Option<PathBuf>,
+    viewer: Option<u16>,
+    spawn: bool,
+    shapes_hz: f64,
+    queue: usize,
+    schedule: InternedScheduleLabel,
+    titles: Vec<(String, String)>,
+}
+
+impl RerunPlugin {
+    /// The port that a viewer listens on by default.
+    pub const VIEWER_PORT: u16 = rerun::DEFAULT_SERVER_PORT;
+
+    /// Records to `path` (`.rrd`), anew.
+    pub fn file(path: impl Into<PathBuf>) -> Self {
+        Self { file: Some(path.into()), ..Self::none() }
+    }
+
+    /// Streams to the viewer on this machine, started if none runs and `rerun` is installed.
+    pub fn viewer() -> Self {
+        Self { viewer: Some(Self::VIEWER_PORT), ..Self::none() }
+    }
+
+    /// Records to `path` and streams to the viewer.
+    pub fn both(path: impl Into<PathBuf>) -> Self {
+        Self { viewer: Some(Self::VIEWER_PORT), ..Self::file(path) }
+    }
+
+    /// Records nothing: the plugin then adds no system, and nothing is collected.
+    pub fn none() -> Self {
+        Self {
+            application: "pliant".into(),
+            file: None,
+            viewer: None,
+            spawn: true,
+            shapes_hz: 20.0,
+            queue: 256,
+            schedule: FixedUpdate.intern(),
+            titles: vec![
+                ("displacement".into(), "Largest displacement".into()),
+                ("net".into(), "Network".into()),
+                ("time".into(), "Time a tick".into()),
+            ],
+        }
+    }
+
+    /// Collects in `schedule`, which has to be that of the bodies. Default: `FixedUpdate`.
+    #[must_use]
+    pub fn in_schedule(mut self, schedule: impl ScheduleLabel) -> Self {
+        self.schedule = schedule.intern();
+        self
+    }
+
+    /// The name under which viewers list the recording. Default: `"pliant"`.
+    #[must_use]
+    pub fn with_application(mut self, name: impl Into<String>) -> Self {
+        self.application = name.into();
+        self
+    }
+
+    /// The viewer's port. Default: [`VIEWER_PORT`](Self::VIEWER_PORT).
+    #[must_use]
+    pub fn with_viewer_port(mut self, port: u16) -> Self {
+        self.viewer = self.viewer.map(|_| port);
+        self
+    }
+
+    /// Whether to start a viewer where none runs. Default: `true`.
+    #[must_use]
+    pub fn with_spawn(mut self, spawn: bool) -> Self {
+        self.spawn = spawn;
+        self
+    }
+
+    /// How often shapes are drawn, Hz of simulated time; figures are recorded every tick. Zero or less draws none.
+    /// Default: `20.0`. A body of 3,500 vertices takes about 100 kB a drawing before compression.
+    #[must_use]
+    pub fn with_shapes_hz(mut self, hz: f64) -> Self {
+        self.shapes_hz = hz;
+        self
+    }
+
+    /// How many ticks may wait for a sink before one is dropped. Default: `256`.
+    #[must_use]
+    pub fn with_queue(mut self, ticks: usize) -> Self {
+        self.queue = ticks;
+        self
+    }
+
+    /// Titles the plot of the figures under `area/`.
+    #[must_use]
+    pub fn with_title(mut self, area: impl Into<String>, title: impl Into<String>) -> Self {
+        self.titles.push((area.into(), title.into()));
+        self
+    }
+}
+
+/// How a body is recorded. Default: [`Surface`](Self::Surface), also without this component.
+#[derive(Component, Reflect, Debug, Default, Clone, Copy, PartialEq, Eq)]
+#[reflect(Component, Default, Clone, PartialEq)]
+pub enum RerunStyle {
+    /// As a shaded surface, coloured by displacement.
+    #[default]
+    Surface,
+    /// As its vertices only: a ghost through which another body is seen.
+    Points,
+    /// Not drawn; its figures are plotted.
+    Hidden,
+}
+
+/// The plugin's place in a tick: after [`PliantSystems::Publish`]. Whoever sets [`RerunScalars`] in the same tick does so before.
+#[derive(SystemSet, Debug, Clone, PartialEq, Eq, Hash)]
+pub struct RerunSystems;
+
+/// What became of the frames.
+#[derive(Resource, Reflect, Debug, Default, Clone, Copy, PartialEq, Eq)]
+#[reflect(Resource, Default, Clone, PartialEq)]
+pub struct RerunStats {
+    /// Ticks collected.
+    pub collected: u64,
+    /// Ticks that a sink had no room for, summed over sinks.
+    pub dropped: u64,
+    /// Sinks that still listen.
+    pub sinks: usize,
+}
+
+/// Why a recording could not be started.
+#[derive(Debug, Error)]
+#[non_exhaustive]
+pub enum RerunError {
+    /// The file cannot be written.
+    #[error("cannot record to {path}: {source}")]
+    File {
+        /// The path that was asked for.
+        path: PathBuf,
+        /// What the system says.
+        source: Box<rerun::RecordingStreamError>,
+    },
+    /// The name of the recording is not one.
+    #[error("a recording's application name must not be empty, got {name:?}")]
+    Application {
+        /// The name that was asked for.
+        name: String,
+    },
+    /// No thread.
+    #[error("cannot start the recording thread: {0}")]
+    Thread(std::io::Error),
+}
+
+impl Plugin for RerunPlugin {
+    fn build(&self, app: &mut App) {
+        app.init_resource::<RerunScalars>().init_resource::<RerunStats>().register_type::<RerunStyle>();
+        let targets = [
+            self.file.clone().map(Target::File),
+            self.viewer.map(|port| Target::Viewer { port, spawn: self.spawn }),
+        ];
+        let plots = Plots::new(self.titles.iter().cloned());
+        let mut workers = Vec::new();
+        for target in targets.into_iter().flatten() {
+            match Worker::start(&self.application, &target, self.queue, plots.clone()) {
+                Ok(worker) => workers.push(worker),
+                // A game without its recording is better than no game.
+                Err(error) => error!("{error}"),
+            }
+        }
+        if workers.is_empty() {
+            return;
+        }
+        app.insert_resource(collect::Collector::new(workers, self.shapes_hz))
+            .add_systems(
+                self.schedule,
+                collect::collect
+                    .in_set(RerunSystems)
+                    .after(PliantSystems::Publish)
+                    .run_if(collect::somebody_listens),
+            )
+            .add_systems(Last, collect::close_at_exit.run_if(on_message::<AppExit>));
+    }
+}

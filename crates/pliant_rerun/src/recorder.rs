@@ -1,0 +1,275 @@
+//! From frames to rerun's archetypes. Runs on a worker; knows nothing of Bevy.
+
+use std::{
+    collections::{HashMap, HashSet},
+    sync::Arc,
+    time::{Duration, Instant},
+};
+
+use rerun::{
+    Arrows3D, Color, EntityPath, EntityPathPart, LineStrips3D, Mesh3D, Points3D, Quaternion, RecordingStream,
+    RecordingStreamError, Scalars, SeriesLines, TextLog, TextLogLevel, Transform3D, ViewCoordinates,
+    archetypes::Clear,
+};
+
+use crate::{
+    RerunStyle, SIM_TIME, TICK, WALL_TIME,
+    blueprint::Plots,
+    frame::{Drawn, Frame, Hand, Place, Shape},
+};
+
+/// A displacement of this part of the body's size has the last colour of the scale.
+const FULL_COLOUR: f32 = 0.3;
+
+/// The longest arrow yet, as a part of the largest body's size.
+const LONGEST_ARROW: f64 = 0.5;
+
+/// A new plot waits this long for others that come with it before the layout is sent again.
+const LAYOUT_PAUSE: Duration = Duration::from_millis(700);
+
+/// Colours of hands and series, told apart also by those who see red and green alike (Okabe and Ito).
+const COLOURS: [[u8; 3]; 7] = [
+    [230, 159, 0],
+    [86, 180, 233],
+    [0, 158, 115],
+    [240, 228, 66],
+    [204, 121, 167],
+    [213, 94, 0],
+    [0, 114, 178],
+];
+
+/// A path from its parts, which may hold any letters.
+pub(crate) fn path(text: &str) -> EntityPath {
+    text.split('/').filter(|part| !part.is_empty()).map(EntityPathPart::new).collect::<Vec<_>>().into()
+}
+
+fn body_path(name: &str) -> EntityPath {
+    EntityPath::from(vec![EntityPathPart::new("world"), EntityPathPart::new(name)])
+}
+
+pub(crate) struct Recorder {
+    stream: RecordingStream,
+    plots: Plots,
+    layout_due: Option<Instant>,
+    bodies: HashMap<Arc<str>, Known>,
+    /// Size of the largest body yet, m, and the largest force yet, N: what arrows are scaled by.
+    size: f64,
+    force: f64,
+    positions: Vec<[f32; 3]>,
+    normals: Vec<[f32; 3]>,
+    sums: Vec<[f32; 3]>,
+    started: bool,
+}
+
+struct Known {
+    body: Arc<Drawn>,
+    place: Option<Place>,
+    meshed: bool,
+}
+
+impl Recorder {
+    pub fn new(stream: RecordingStream, plots: Plots) -> Self {
+        Self {
+            stream,
+            plots,
+            layout_due: None,
+            bodies: HashMap::new(),
+            size: 0.0,
+            force: 0.0,
+            positions: Vec::new(),
+            normals: Vec::new(),
+            sums: Vec::new(),
+            started: false,
+        }
+    }
+
+    /// Logs one tick at its times.
+    pub fn log(&mut self, frame: &Frame) -> Result<(), RecordingStreamError> {
+        if !self.started {
+            self.started = true;
+            // The times are the app's own, not those of the worker.
+            self.stream.set_log_time_enabled(false);
+            self.stream.set_log_tick_enabled(false);
+            self.stream.log_static("world", &ViewCoordinates::RIGHT_HAND_Y_UP())?;
+        }
+        self.stream.set_time_sequence(TICK, i64::try_from(frame.tick).unwrap_or(i64::MAX));
+        self.stream.set_duration_secs(SIM_TIME, frame.time);
+        self.stream.set_timestamp_secs_since_epoch(WALL_TIME, frame.wall);
+
+        for name in &frame.left {
+            if self.bodies.remove(name).is_some() {
+                self.stream.log(body_path(name), &Clear::recursive())?;
+            }
+        }
+        for body in &frame.arrived {
+            let known = self.bodies.get(&body.path).is_some_and(|known| Arc::ptr_eq(&known.body, body));
+            if !known {
+                if self.bodies.contains_key(&body.path) {
+                    self.stream.log(body_path(&body.path), &Clear::recursive())?;
+                }
+                self.size = self.size.max(body.model.size());
+                let known = Known { body: body.clone(), place: None, meshed: false };
+                self.bodies.insert(body.path.clone(), known);
+            }
+        }
+        for shape in &frame.shapes {
+            self.shape(shape)?;
+        }
+        if let Some(hands) = &frame.hands {
+            self.hands(hands)?;
+        }
+        for scalar in &frame.scalars {
+            self.scalar(&scalar.path, &scalar.unit, scalar.value)?;
+        }
+        for line in &frame.lines {
+            self.plots.note_log();
+            let level = if line.warning { TextLogLevel::WARN } else { TextLogLevel::INFO };
+            self.stream.log("log", &TextLog::new(line.text.as_str()).with_level(level))?;
+        }
+        self.lay_out(false)
+    }
+
+    /// Sends the final layout and everything that is buffered.
+    pub fn end(mut self) {
+        let laid_out = self.lay_out(true);
+        let flushed = self.stream.flush_blocking();
+        if let Err(error) = laid_out {
+            bevy::log::warn!("the layout was not recorded: {error}");
+        }
+        if let Err(error) = flushed {
+            bevy::log::warn!("the end of the recording may be missing: {error}");
+        }
+    }
+
+    fn lay_out(&mut self, now: bool) -> Result<(), RecordingStreamError> {
+        if self.plots.take_changed() {
+            self.layout_due.get_or_insert_with(|| Instant::now() + LAYOUT_PAUSE);
+        }
+        if self.layout_due.is_some_and(|due| now || due <= Instant::now()) {
+            self.layout_due = None;
+            self.plots.send(&self.stream)?;
+        }
+        Ok(())
+    }
+
+    fn shape(&mut self, shape: &Shape) -> Result<(), RecordingStreamError> {
+        let Some(known) = self.bodies.get_mut(&shape.body.path) else { return Ok(()) };
+        let model = &shape.body.model;
+        let surface = model.surface();
+        let entity = body_path(&shape.body.path);
+        if known.place != Some(shape.place) && (shape.draw || known.place.is_none()) {
+            known.place = Some(shape.place);
+            let Place { translation, rotation, scale } = shape.place;
+            let place = Transform3D::new()
+                .with_translation(translation)
+                .with_quaternion(Quaternion::from_xyzw(rotation))
+                .with_scale(scale);
+            self.stream.log(entity.clone(), &place)?;
+        }
+
+        self.positions.resize(surface.positions().len(), [0.0; 3]);
+        model.basis().reconstruct(&shape.q, shape.warped, &mut self.positions);
+        let full = FULL_COLOUR * model.size() as f32;
+        let mut largest = 0.0f32;
+        let mut colours = Vec::with_capacity(self.positions.len());
+        for (p, rest) in self.positions.iter().zip(surface.positions()) {
+            let moved = [p[0] - rest[0], p[1] - rest[1], p[2] - rest[2]];
+            let distance = moved.iter().map(|x| x * x).sum::<f32>().sqrt();
+            largest = largest.max(distance);
+            if shape.draw {
+                colours.push(colour(distance / full));
+            }
+        }
+        let largest = f64::from(largest * shape.place.scale);
+        if shape.draw {
+            match shape.body.style {
+                RerunStyle::Surface => {
+                    self.normals.resize(self.positions.len(), [0.0; 3]);
+                    surface.normals(&self.positions, &mut self.normals, &mut self.sums);
+                    let mesh = Mesh3D::update_fields()
+                        .with_vertex_positions(self.positions.iter().copied())
+                        .with_vertex_normals(self.normals.iter().copied())
+                        .with_vertex_colors(colours);
+                    // Who is a neighbour of whom is told once.
+                    let known = self.bodies.get_mut(&shape.body.path);
+                    let first = known.is_some_and(|known| !std::mem::replace(&mut known.meshed, true));
+                    let mesh = if first {
+                        mesh.with_triangle_indices(surface.triangles().iter().copied())
+                    } else {
+                        mesh
+                    };
+                    self.stream.log(entity, &mesh)?;
+                }
+                RerunStyle::Points => {
+                    let radius = 0.004 * model.size() as f32;
+                    let points = Points3D::new(self.positions.iter().copied())
+                        .with_radii([radius])
+                        .with_colors([Color::from_rgb(150, 190, 220)]);
+                    self.stream.log(entity, &points)?;
+                }
+                RerunStyle::Hidden => {}
+            }
+        }
+        self.scalar(&format!("displacement/{}", shape.body.path), "m", largest)
+    }
+
+    fn hands(&mut self, hands: &[Hand]) -> Result<(), RecordingStreamError> {
+        let magnitude = |f: &[f64; 3]| f.iter().map(|x| x * x).sum::<f64>().sqrt();
+        self.force = hands.iter().map(|hand| magnitude(&hand.force)).fold(self.force, f64::max);
+        let metres_a_newton = if self.force > 0.0 { LONGEST_ARROW * self.size / self.force } else { 0.0 };
+        let single = |p: [f64; 3]| p.map(|x| x as f32);
+        let colours: Vec<Color> = (0..hands.len()).map(colour_of).collect();
+        let arrows =
+            Arrows3D::from_vectors(hands.iter().map(|h| single(h.force.map(|f| f * metres_a_newton))))
+                .with_origins(hands.iter().map(|h| single(h.point)))
+                .with_radii([0.008 * self.size as f32])
+                .with_labels(hands.iter().map(|h| format!("{} {:.3} N", h.name, magnitude(&h.force))))
+                .with_colors(colours.clone());
+        self.stream.log("world/hands/reactions", &arrows)?;
+        let targets = Points3D::new(hands.iter().map(|h| single(h.target)))
+            .with_radii([0.012 * self.size as f32])
+            .with_colors(colours.clone());
+        self.stream.log("world/hands/targets", &targets)?;
+        let lines = LineStrips3D::new(hands.iter().map(|h| [single(h.point), single(h.target)]))
+            .with_radii([0.002 * self.size as f32])
+            .with_colors(colours);
+        self.stream.log("world/hands/lines", &lines)?;
+
+        let mut used = HashSet::new();
+        for hand in hands {
+            // Two hands of one name are two lines in the plot.
+            let name = (1..)
+                .map(|n| if n == 1 { hand.name.to_string() } else { format!("{} {n}", hand.name) })
+                .find(|name| !used.contains(name))
+                .unwrap_or_default();
+            self.scalar(&format!("reaction/{name}"), "N", magnitude(&hand.force))?;
+            used.insert(name);
+        }
+        Ok(())
+    }
+
+    fn scalar(&mut self, name: &str, unit: &str, value: f64) -> Result<(), RecordingStreamError> {
+        let entity = path(name);
+        if self.plots.note(name, unit) {
+            let label = name.split_once('/').map_or(name, |(_, rest)| rest);
+            let series = SeriesLines::new().with_names([label]).with_widths([1.5]);
+            self.stream.log_static(entity.clone(), &series)?;
+        }
+        self.stream.log(entity, &Scalars::single(value))
+    }
+}
+
+fn colour_of(index: usize) -> Color {
+    let [r, g, b] = COLOURS[index % COLOURS.len()];
+    Color::from_rgb(r, g, b)
+}
+
+/// Teal at rest over sand to red at a displacement of one.
+fn colour(t: f32) -> Color {
+    const STOPS: [[f32; 3]; 3] = [[58.0, 140.0, 150.0], [235.0, 200.0, 120.0], [215.0, 60.0, 50.0]];
+    let t = if t.is_finite() { t.clamp(0.0, 1.0) * 2.0 } else { 0.0 };
+    let (from, to) = if t < 1.0 { (STOPS[0], STOPS[1]) } else { (STOPS[1], STOPS[2]) };
+    let t = t.fract() + if t >= 2.0 { 1.0 } else { 0.0 };
+    let [r, g, b] = std::array::from_fn(|k| (from[k] + (to[k] - from[k]) * t) as u8);
+    Color::from_rgb(r, g, b)
+}
