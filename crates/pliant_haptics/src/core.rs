@@ -1,0 +1,423 @@
+//! The loop's body without a clock, a thread or a device: a sample and the simulation's last word in, a wrench out.
+
+use nalgebra::{Matrix3, Vector3};
+use thiserror::Error;
+
+use crate::{
+    Coupling, CouplingConfig, DeviceInfo, Fault, InfoError, LocalModel, MAX_CONTACTS, ModalLocal, Port,
+    Safety, SafetyConfig, Sample, ToolMap, Wanted, Wrench,
+    follow::Follow,
+    intake::{Believed, Intake},
+    safety::{Slew, clamp_magnitude},
+    tool::{Tool, masked},
+};
+
+/// A loop that was not run for longer than this has stalled, s.
+const STALL: f64 = 0.02;
+/// For so long after a stall the force stays faded, s.
+const AFTER_STALL: f64 = 0.05;
+
+/// How a loop is run.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct LoopConfig {
+    /// Periods a second, 500 to 8000 Hz. Default: 1000.
+    pub rate: f64,
+    /// Coupling between hand and body. Default: as stiff as the device closes.
+    pub coupling: CouplingConfig,
+    /// Delay of the force beyond what the device itself declares, s. Default: 0.
+    pub delay: f64,
+    /// Stages of the safety pipeline; `None`: all of them, with limits for the device. Default: `None`.
+    pub safety: Option<SafetyConfig>,
+    /// Where the workspace is in the world. Default: its middle at the origin, metre for metre.
+    pub tool: ToolMap,
+}
+
+impl Default for LoopConfig {
+    fn default() -> Self {
+        Self {
+            rate: 1000.0,
+            coupling: CouplingConfig::default(),
+            delay: 0.0,
+            safety: None,
+            tool: ToolMap::default(),
+        }
+    }
+}
+
+/// Why a loop does not start.
+#[derive(Debug, Clone, PartialEq, Error)]
+#[non_exhaustive]
+pub enum StartError {
+    /// A rate outside of what is supported.
+    #[error("the loop's rate must be 500 to 8000 Hz, got {0}")]
+    Rate(f64),
+    /// A delay that is not one.
+    #[error("the loop's delay must be finite seconds, 0 or more, got {0}")]
+    Delay(f64),
+    /// A tool map with a number out of range.
+    #[error("the tool's map has a number that is not finite or a scale that is not positive")]
+    Tool,
+    /// The device says something impossible about itself.
+    #[error(transparent)]
+    Device(#[from] InfoError),
+    /// A device that exerts forces on people is not run without the whole safety pipeline.
+    #[error(
+        "{0} exerts real forces: every stage of the safety pipeline must be there and within the device's limits"
+    )]
+    Unsafe(String),
+    /// The thread could not be made.
+    #[error("the loop's thread could not be started: {0}")]
+    Thread(String),
+}
+
+/// What a tick saw and did.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Tick {
+    /// Loop clock, s.
+    pub now: f64,
+    /// The hand in device axes, m.
+    pub position: [f64; 3],
+    /// Its velocity, m/s, device axes.
+    pub velocity: [f64; 3],
+    /// The tool in the world, m.
+    pub tool: [f64; 3],
+    /// Its velocity, m/s, world axes.
+    pub tool_velocity: [f64; 3],
+    /// Its orientation, unit quaternion x, y, z, w, world axes.
+    pub tool_orientation: [f64; 4],
+    /// The tool is lifted off the world by its clutch.
+    pub clutched: bool,
+    /// Buttons that are believed to be down.
+    pub buttons: u32,
+    /// What was sent to the device.
+    pub wrench: Wrench,
+    /// Force on the hand before safety, N, device axes.
+    pub wanted: [f64; 3],
+    /// Part of the force that is felt, 0 to 1.
+    pub gain: f64,
+    /// Energy at the port.
+    pub port: Port,
+    /// What is wrong now.
+    pub fault: Option<Fault>,
+    /// Time since the simulation's last word, s; 0 while nothing is held.
+    pub silent: f64,
+}
+
+impl Default for Tick {
+    fn default() -> Self {
+        Self {
+            now: 0.0,
+            position: [0.0; 3],
+            velocity: [0.0; 3],
+            tool: [0.0; 3],
+            tool_velocity: [0.0; 3],
+            tool_orientation: [0.0, 0.0, 0.0, 1.0],
+            clutched: false,
+            buttons: 0,
+            wrench: Wrench::ZERO,
+            wanted: [0.0; 3],
+            gain: 0.0,
+            port: Port::default(),
+            fault: None,
+            silent: 0.0,
+        }
+    }
+}
+
+/// The loop's body. Allocates nothing, knows no clock, and is the same in a thread and in a test.
+#[derive(Debug)]
+pub struct LoopCore {
+    info: DeviceInfo,
+    config: LoopConfig,
+    coupling: Coupling,
+    intake: Intake,
+    tool: Tool,
+    safety: Safety,
+    torque: Slew,
+    follow: [Follow; MAX_CONTACTS],
+    modal: Option<Box<ModalLocal>>,
+    /// Last word of the simulation: its tick, when it came, what others had supplied, whether it was finite.
+    heard: u64,
+    heard_at: f64,
+    supplied: f64,
+    good: bool,
+    held: usize,
+    last_position: Vector3<f64>,
+    stalled_until: f64,
+    stall: f64,
+    stop: bool,
+    last: Tick,
+}
+
+impl LoopCore {
+    /// For a device and a configuration.
+    ///
+    /// # Errors
+    /// A number out of range; a device that is not simulated with a stage of the safety pipeline missing.
+    pub fn new(info: DeviceInfo, config: LoopConfig) -> Result<Self, StartError> {
+        info.check()?;
+        if !(500.0..=8000.0).contains(&config.rate) {
+            return Err(StartError::Rate(config.rate));
+        }
+        if !(config.delay.is_finite() && config.delay >= 0.0) {
+            return Err(StartError::Delay(config.delay));
+        }
+        if !config.tool.is_valid() {
+            return Err(StartError::Tool);
+        }
+        let safety = config.safety.unwrap_or_else(|| SafetyConfig::for_device(&info, config.rate));
+        if !info.simulated && !safety.is_complete(&info) {
+            return Err(StartError::Unsafe(info.name));
+        }
+        let coupling = Coupling::clamp(&config.coupling, &info, config.rate, config.delay);
+        Ok(Self {
+            intake: Intake::new(&info),
+            tool: Tool::new(config.tool),
+            safety: Safety::new(safety),
+            torque: Slew::default(),
+            follow: [Follow::default(); MAX_CONTACTS],
+            modal: None,
+            heard: 0,
+            heard_at: 0.0,
+            supplied: 0.0,
+            good: true,
+            held: 0,
+            last_position: Vector3::zeros(),
+            stalled_until: f64::NEG_INFINITY,
+            stall: 0.0,
+            stop: false,
+            last: Tick::default(),
+            coupling,
+            info,
+            config,
+        })
+    }
+
+    /// The device as it was described.
+    pub fn info(&self) -> &DeviceInfo {
+        &self.info
+    }
+
+    /// How it is run.
+    pub fn config(&self) -> &LoopConfig {
+        &self.config
+    }
+
+    /// The coupling in force, and what was wanted.
+    pub fn coupling(&self) -> &Coupling {
+        &self.coupling
+    }
+
+    /// What the last tick saw and did.
+    pub fn last(&self) -> &Tick {
+        &self.last
+    }
+
+    /// Moves the workspace in the world. An invalid map is refused and the old one stays.
+    pub fn set_tool(&mut self, map: ToolMap) -> bool {
+        self.tool.set_map(map)
+    }
+
+    /// Gives the loop a body to step itself, or takes it away; the one before comes back, to be dropped elsewhere.
+    pub fn set_modal(&mut self, modal: Option<Box<ModalLocal>>) -> Option<Box<ModalLocal>> {
+        self.safety.engage();
+        std::mem::replace(&mut self.modal, modal)
+    }
+
+    /// No force from the next tick on, until [`reset_stop`](Self::reset_stop).
+    pub fn emergency_stop(&mut self) {
+        self.stop = true;
+    }
+
+    /// Whether the emergency stop is latched.
+    pub fn is_stopped(&self) -> bool {
+        self.stop || self.safety.is_stopped()
+    }
+
+    /// Unlatches the emergency stop; force comes back by the ramp.
+    pub fn reset_stop(&mut self) {
+        self.stop = false;
+        self.safety.reset_stop();
+    }
+
+    /// The device was lost or came back: nothing of before counts.
+    pub fn forget(&mut self) {
+        self.intake.forget();
+        self.safety.engage();
+    }
+
+    /// One period with a sample from its end. `now`: the loop's clock, s; `dt`: length of the period as measured, s.
+    pub fn tick(&mut self, now: f64, dt: f64, sample: &Sample, model: &LocalModel) -> Wrench {
+        let dt = positive(dt);
+        let force = self.safety.force().norm();
+        let believed = self.intake.take(now, dt, sample, force);
+        self.run(now, dt, believed, model)
+    }
+
+    /// One period without a sample: what the device said instead.
+    pub fn miss(&mut self, now: f64, dt: f64, fault: Fault, model: &LocalModel) -> Wrench {
+        let believed = self.intake.hold(fault);
+        self.run(now, positive(dt), believed, model)
+    }
+
+    fn run(&mut self, now: f64, dt: f64, hand: Believed, model: &LocalModel) -> Wrench {
+        let moved = if hand.jumped { Vector3::zeros() } else { hand.position - self.last_position };
+        self.last_position = hand.position;
+        self.tool.follow(
+            hand.position,
+            hand.velocity,
+            hand.orientation,
+            hand.buttons,
+            hand.jumped && self.last.now > 0.0,
+        );
+
+        let mut fault = hand.fault;
+        if dt > STALL {
+            self.stalled_until = now + AFTER_STALL;
+            self.stall = dt;
+        }
+        if now < self.stalled_until {
+            fault = fault.or(Some(Fault::Stalled(self.stall)));
+        }
+        let supplied = self.hear(now, model);
+        if !self.good {
+            fault = fault.or(Some(Fault::BadModel));
+        }
+        let holding = self.good && self.heard > 0 && model.count > 0;
+        let silent = if holding { (now - self.heard_at).max(0.0) } else { 0.0 };
+
+        let felt = if holding { self.springs(now, dt, &hand, model) } else { Felt::default() };
+        let scale = self.tool.energy_scale();
+        let axes = self.info.force_axes;
+        let allowed = self.safety.tick(&Wanted {
+            // Memory of what came before is not run faster after a stall: a fade takes its ticks.
+            dt: dt.min(2.0 / self.config.rate),
+            moved,
+            velocity: hand.velocity,
+            elastic: masked(self.tool.to_hand(felt.elastic), axes),
+            damping: masked(self.tool.to_hand(felt.damping), axes),
+            weight: masked(self.tool.weight(), axes),
+            stored: scale * felt.stored,
+            supplied: scale * supplied,
+            holding,
+            silent,
+            fault,
+            stop: std::mem::take(&mut self.stop),
+        });
+        let torque = self.torque_to_hand(&felt, dt, allowed.gain);
+        let wrench = Wrench { force: allowed.force.into(), torque: torque.into() };
+        let orientation = self.tool.orientation.quaternion();
+        self.last = Tick {
+            now,
+            position: hand.position.into(),
+            velocity: hand.velocity.into(),
+            tool: self.tool.position.into(),
+            tool_velocity: self.tool.velocity.into(),
+            tool_orientation: [orientation.i, orientation.j, orientation.k, orientation.w],
+            clutched: self.tool.is_clutched(),
+            buttons: hand.buttons,
+            wrench,
+            wanted: self.tool.to_hand(felt.elastic + felt.damping).into(),
+            gain: allowed.gain,
+            port: allowed.port,
+            fault: if self.safety.is_stopped() {
+                Some(Fault::EmergencyStop)
+            } else {
+                fault.or(allowed.fault)
+            },
+            silent,
+        };
+        wrench
+    }
+
+    /// Takes note of a new word. Returns what others have supplied since the last, J of the world.
+    fn hear(&mut self, now: f64, model: &LocalModel) -> f64 {
+        if model.tick == self.heard {
+            return 0.0;
+        }
+        self.good = model.is_finite();
+        let fresh = self.heard == 0 || model.count != self.held;
+        self.heard = model.tick;
+        self.heard_at = now;
+        if !self.good {
+            return 0.0;
+        }
+        let supplied = if fresh { 0.0 } else { model.supplied - self.supplied };
+        self.supplied = model.supplied;
+        if model.count != self.held {
+            if self.held == 0 {
+                self.safety.engage();
+            }
+            self.held = model.count;
+            self.follow.iter_mut().for_each(Follow::reset);
+        }
+        supplied
+    }
+
+    /// The forces of the tool's contacts, world axes.
+    fn springs(&mut self, now: f64, dt: f64, hand: &Believed, model: &LocalModel) -> Felt {
+        let mut felt = Felt { stored: model.stored, ..Felt::default() };
+        let period = 1.0 / self.config.rate;
+        let stepped = match &mut self.modal {
+            Some(modal) if hand.fault.is_none() => {
+                let steps = (dt / period).round().clamp(1.0, 4.0) as usize;
+                modal.advance(now, steps, &self.tool, model)
+            }
+            _ => false,
+        };
+        for (i, contact) in model.contacts().iter().enumerate() {
+            let arm = self.tool.orientation * Vector3::from(contact.offset);
+            let (proxy, speed) = self.follow[i].advance(now, model, contact);
+            let (elastic, damping) = match &self.modal {
+                Some(modal) if stepped => {
+                    felt.stored = modal.energy();
+                    (modal.reaction(i), Vector3::zeros())
+                }
+                _ => {
+                    let stretch = self.tool.position + arm - proxy;
+                    let k = Matrix3::from_fn(|r, c| contact.stiffness[r][c]);
+                    let elastic = -(k * stretch);
+                    felt.stored += 0.5 * stretch.dot(&(k * stretch)).max(0.0);
+                    (elastic, -(self.tool.velocity - speed) * contact.damping)
+                }
+            };
+            felt.elastic += elastic;
+            felt.damping += damping;
+            felt.torque += arm.cross(&(elastic + damping));
+        }
+        if self.tool.is_clutched() {
+            // A tool that is off the world is not dragged by it; what is held stays where it is held.
+            felt.elastic = Vector3::zeros();
+            felt.damping = Vector3::zeros();
+            felt.torque = Vector3::zeros();
+        }
+        felt
+    }
+
+    fn torque_to_hand(&mut self, felt: &Felt, dt: f64, gain: f64) -> Vector3<f64> {
+        let peak = self.info.peak_torque;
+        let torque = masked(self.tool.torque_to_hand(felt.torque), self.info.torque_axes);
+        let torque = if torque.iter().all(|x| x.is_finite()) {
+            clamp_magnitude(&torque, peak)
+        } else {
+            Vector3::zeros()
+        };
+        // The whole torque in 5 ms, as for the force.
+        let torque = self.torque.limit(&torque, peak / 0.005 * dt.min(2.0 / self.config.rate));
+        self.torque.hold(&torque);
+        torque * gain
+    }
+}
+
+/// Forces before safety, world axes.
+#[derive(Debug, Clone, Copy, Default)]
+struct Felt {
+    elastic: Vector3<f64>,
+    damping: Vector3<f64>,
+    torque: Vector3<f64>,
+    stored: f64,
+}
+
+fn positive(dt: f64) -> f64 {
+    if dt.is_finite() && dt > 0.0 { dt } else { f64::MIN_POSITIVE }
+}

@@ -1,0 +1,385 @@
+//! One period of the loop with a device: exchange, tick, bookkeeping, loss and return. The thread runs it in real time, tests in virtual.
+
+use std::time::Instant;
+
+use crate::{
+    Calibration, Coupling, Fault, HapticDevice, Histogram, LocalModel, LoopConfig, LoopCore, ModalLocal,
+    Pace, Sample, StartError, Tick, ToolMap, Wrench,
+};
+
+/// A device whose driver fails for so long counts as lost, s.
+const PATIENCE: f64 = 0.1;
+/// How often a lost device is looked for, s.
+const RETRY: f64 = 1.0;
+
+/// How the loop and its device are doing.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
+#[non_exhaustive]
+pub enum LoopState {
+    /// Forces flow.
+    #[default]
+    Running,
+    /// The device waits for its calibration: no force.
+    Calibrating,
+    /// The device is lost and looked for: no force.
+    Lost,
+    /// The emergency stop is latched: no force.
+    Stopped,
+}
+
+/// What the loop says about itself, once a period.
+#[derive(Debug, Clone, Copy, PartialEq, Default)]
+pub struct LoopReport {
+    /// The newest tick.
+    pub tick: Tick,
+    /// How the loop and its device are doing.
+    pub state: LoopState,
+    /// Periods so far.
+    pub ticks: u64,
+    /// Periods left out so far.
+    pub missed: u64,
+    /// Periods a second over the last half second, Hz; 0 in the first.
+    pub rate: f64,
+    /// How late periods ended.
+    pub lateness: Histogram,
+    /// The loop's own work a period: from the sample to the wrench.
+    pub work: Histogram,
+    /// The thread has a real-time priority.
+    pub realtime: bool,
+    /// How often each kind of fault has begun, by [`Fault::kind`].
+    pub faults: [u32; Fault::KINDS],
+    /// The coupling in force.
+    pub coupling: Option<Coupling>,
+}
+
+/// What happened, in order.
+#[derive(Debug, Clone, Copy, PartialEq)]
+#[non_exhaustive]
+pub enum LoopEvent {
+    /// A button (its bit's number) went down.
+    Pressed(u32),
+    /// A button (its bit's number) came up, or its device was lost.
+    Released(u32),
+    /// A fault began.
+    Fault(Fault),
+    /// The last fault is over; the force ramps up.
+    Clear,
+    /// The device was lost and is looked for.
+    Lost,
+    /// It came back.
+    Returned,
+    /// Something must be done by hand before positions can be trusted: what.
+    Calibrate(&'static str),
+}
+
+/// One period as it is written down.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Record {
+    /// Loop clock, s.
+    pub now: f64,
+    /// Length of the period, s.
+    pub dt: f64,
+    /// What the device said.
+    pub sample: Sample,
+    /// What it was told next.
+    pub wrench: Wrench,
+}
+
+/// Who takes events and records; the thread's queues, or a test's lists.
+pub trait Sink {
+    /// Takes an event. Must not block.
+    fn event(&mut self, event: LoopEvent);
+
+    /// Takes a period's record. Must not block.
+    fn record(&mut self, record: &Record);
+}
+
+impl Sink for () {
+    fn event(&mut self, _: LoopEvent) {}
+    fn record(&mut self, _: &Record) {}
+}
+
+impl Sink for Vec<LoopEvent> {
+    fn event(&mut self, event: LoopEvent) {
+        self.push(event);
+    }
+    fn record(&mut self, _: &Record) {}
+}
+
+/// A loop and its device, driven from outside period by period.
+pub struct Cycle<D> {
+    core: LoopCore,
+    config: LoopConfig,
+    device: D,
+    wrench: Wrench,
+    report: LoopReport,
+    fault: Option<usize>,
+    failing_since: Option<f64>,
+    retry_at: f64,
+    calibrate_at: f64,
+    calibrated: bool,
+    told: Option<&'static str>,
+    stopped: bool,
+    counted_from: (f64, u64),
+}
+
+impl<D: HapticDevice> Cycle<D> {
+    /// For a device and a configuration; nothing is exchanged yet.
+    ///
+    /// # Errors
+    /// As [`LoopCore::new`].
+    pub fn new(device: D, config: LoopConfig) -> Result<Self, StartError> {
+        let core = LoopCore::new(device.info(), config)?;
+        let report = LoopReport { coupling: Some(*core.coupling()), ..LoopReport::default() };
+        Ok(Self {
+            core,
+            config,
+            device,
+            wrench: Wrench::ZERO,
+            report,
+            fault: None,
+            failing_since: None,
+            retry_at: 0.0,
+            calibrate_at: 0.0,
+            calibrated: false,
+            told: None,
+            stopped: false,
+            counted_from: (0.0, 0),
+        })
+    }
+
+    /// The loop's body.
+    pub fn core(&self) -> &LoopCore {
+        &self.core
+    }
+
+    /// The device.
+    pub fn device(&self) -> &D {
+        &self.device
+    }
+
+    /// The device, to play tricks on it in a test.
+    pub fn device_mut(&mut self) -> &mut D {
+        &mut self.device
+    }
+
+    /// What the loop says about itself.
+    pub fn report(&self) -> &LoopReport {
+        &self.report
+    }
+
+    pub(crate) fn set_realtime(&mut self, realtime: bool) {
+        self.report.realtime = realtime;
+    }
+
+    /// Cuts the force, now and until [`reset_stop`](Self::reset_stop).
+    pub fn emergency_stop(&mut self) {
+        self.core.emergency_stop();
+        if !self.stopped {
+            self.stopped = true;
+            self.wrench = Wrench::ZERO;
+            self.device.safe_stop();
+        }
+    }
+
+    /// Unlatches the emergency stop.
+    pub fn reset_stop(&mut self) {
+        self.stopped = false;
+        self.core.reset_stop();
+    }
+
+    /// Moves the workspace in the world. An invalid map is refused and the old one stays.
+    pub fn set_tool(&mut self, map: ToolMap) -> bool {
+        let ok = self.core.set_tool(map);
+        if ok {
+            self.config.tool = map;
+        }
+        ok
+    }
+
+    /// Gives the loop a body to step itself, or takes it away; the one before comes back.
+    pub fn set_modal(&mut self, modal: Option<Box<ModalLocal>>) -> Option<Box<ModalLocal>> {
+        self.core.set_modal(modal)
+    }
+
+    /// One period.
+    pub fn step(&mut self, pace: &mut dyn Pace, model: &LocalModel, sink: &mut dyn Sink) -> &LoopReport {
+        let before = pace.last().now;
+        if self.report.state == LoopState::Lost {
+            pace.wait();
+            self.look_for(pace.last().now, sink);
+            self.finish(pace, Err(Fault::Gone), model, sink, Instant::now());
+            return &self.report;
+        }
+        if !self.calibrated {
+            self.calibrate(before, sink);
+        }
+        let wrench = if self.calibrated { self.wrench } else { Wrench::ZERO };
+        let answer = self.device.exchange(&wrench, pace);
+        let begun = Instant::now();
+        if pace.last().now <= before {
+            // A driver that fails does not wait either; the loop must not spin on it.
+            pace.wait();
+        }
+        let answer = match answer {
+            Ok(sample) if self.calibrated => Ok(sample),
+            Ok(_) => Err(Fault::NotCalibrated),
+            Err(fault) => Err(fault),
+        };
+        self.finish(pace, answer, model, sink, begun);
+        &self.report
+    }
+
+    fn finish(
+        &mut self,
+        pace: &mut dyn Pace,
+        answer: Result<Sample, Fault>,
+        model: &LocalModel,
+        sink: &mut dyn Sink,
+        begun: Instant,
+    ) {
+        let period = pace.last();
+        let (now, dt) = (period.now, period.dt);
+        self.wrench = match &answer {
+            Ok(sample) => {
+                self.failing_since = None;
+                let wrench = self.core.tick(now, dt, sample, model);
+                sink.record(&Record { now, dt, sample: *sample, wrench });
+                wrench
+            }
+            Err(fault) => self.core.miss(now, dt, *fault, model),
+        };
+        if let Err(fault) = answer
+            && self.report.state != LoopState::Lost
+            && fault != Fault::NotCalibrated
+        {
+            let since = *self.failing_since.get_or_insert(now);
+            if fault == Fault::Gone || now - since > PATIENCE {
+                self.lose(now, sink);
+            }
+        }
+        self.report.work.add(begun.elapsed().as_secs_f64());
+        self.report.lateness.add(period.late);
+        self.report.ticks += 1;
+        self.report.missed += u64::from(period.missed);
+        let (from, ticks) = self.counted_from;
+        if now - from >= 0.5 {
+            self.report.rate = (self.report.ticks - ticks) as f64 / (now - from);
+            self.counted_from = (now, self.report.ticks);
+        }
+        self.tell(sink);
+        self.report.tick = *self.core.last();
+        if self.report.state != LoopState::Lost {
+            self.report.state = if self.core.is_stopped() {
+                LoopState::Stopped
+            } else if self.calibrated {
+                LoopState::Running
+            } else {
+                LoopState::Calibrating
+            };
+        }
+    }
+
+    /// Changes of buttons and faults, as events.
+    fn tell(&mut self, sink: &mut dyn Sink) {
+        let tick = *self.core.last();
+        let changed = tick.buttons ^ self.report.tick.buttons;
+        for bit in (0..32).filter(|bit| changed >> bit & 1 == 1) {
+            let down = tick.buttons >> bit & 1 == 1;
+            sink.event(if down { LoopEvent::Pressed(bit) } else { LoopEvent::Released(bit) });
+        }
+        let kind = tick.fault.map(|f| f.kind());
+        if kind != self.fault {
+            self.fault = kind;
+            match tick.fault {
+                Some(fault) => {
+                    let count = &mut self.report.faults[fault.kind()];
+                    *count = count.saturating_add(1);
+                    sink.event(LoopEvent::Fault(fault));
+                }
+                None => sink.event(LoopEvent::Clear),
+            }
+        }
+    }
+
+    fn calibrate(&mut self, now: f64, sink: &mut dyn Sink) {
+        if now < self.calibrate_at {
+            return;
+        }
+        self.calibrate_at = now + 0.25;
+        match self.device.calibration() {
+            Calibration::Ready => {
+                self.calibrated = true;
+                self.told = None;
+                self.core.forget();
+            }
+            Calibration::Needed(what) => {
+                if self.told != Some(what) {
+                    sink.event(LoopEvent::Calibrate(what));
+                }
+                self.told = Some(what);
+            }
+        }
+    }
+
+    fn lose(&mut self, now: f64, sink: &mut dyn Sink) {
+        self.device.safe_stop();
+        self.core.forget();
+        self.report.state = LoopState::Lost;
+        self.failing_since = None;
+        self.retry_at = now + RETRY;
+        sink.event(LoopEvent::Lost);
+    }
+
+    fn look_for(&mut self, now: f64, sink: &mut dyn Sink) {
+        if now < self.retry_at {
+            return;
+        }
+        self.retry_at = now + RETRY;
+        if self.device.reopen().is_err() {
+            return;
+        }
+        let info = self.device.info();
+        if info != *self.core.info() {
+            // Another device on the same plug: its own limits, or it stays lost. A stop stays latched.
+            let Ok(mut core) = LoopCore::new(info, self.config) else { return };
+            if self.core.is_stopped() {
+                core.emergency_stop();
+            }
+            self.core = core;
+            self.report.coupling = Some(*self.core.coupling());
+        }
+        self.core.forget();
+        self.calibrated = false;
+        self.calibrate_at = now;
+        self.report.state = LoopState::Calibrating;
+        sink.event(LoopEvent::Returned);
+    }
+}
+
+impl<D> std::fmt::Debug for Cycle<D> {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        f.debug_struct("Cycle").field("core", &self.core).finish_non_exhaustive()
+    }
+}
+
+impl<D: HapticDevice + ?Sized> HapticDevice for Box<D> {
+    fn info(&self) -> crate::DeviceInfo {
+        (**self).info()
+    }
+    fn pacing(&self) -> crate::Pacing {
+        (**self).pacing()
+    }
+    fn calibration(&mut self) -> Calibration {
+        (**self).calibration()
+    }
+    fn exchange(&mut self, wrench: &Wrench, pace: &mut dyn Pace) -> Result<Sample, Fault> {
+        (**self).exchange(wrench, pace)
+    }
+    fn safe_stop(&mut self) {
+        (**self).safe_stop();
+    }
+    fn reopen(&mut self) -> Result<(), Fault> {
+        (**self).reopen()
+    }
+}

@@ -1,0 +1,87 @@
+//! The proxy between two words of the simulation: carried on with its velocity, and never seen to jump.
+
+use nalgebra::Vector3;
+
+use crate::{Contact, LocalModel};
+
+/// The longest that a proxy is carried on with its last velocity, and the longest that a correction takes, s.
+const LONGEST: f64 = 0.05;
+
+#[derive(Debug, Clone, Copy, Default)]
+pub(crate) struct Follow {
+    tick: u64,
+    /// When the newest word came, on the loop's clock, s.
+    since: f64,
+    /// Shown minus told at that time, m.
+    offset: Vector3<f64>,
+    glide: f64,
+    shown: Vector3<f64>,
+}
+
+impl Follow {
+    /// Where the proxy is now (m) and how fast (m/s).
+    ///
+    /// Told: `p + v t`, for one step and no longer. Shown: the same plus what it was off when the last word came, taken out over one step.
+    pub(crate) fn advance(
+        &mut self,
+        now: f64,
+        model: &LocalModel,
+        contact: &Contact,
+    ) -> (Vector3<f64>, Vector3<f64>) {
+        let reach = if model.period.is_finite() { model.period.clamp(0.0, LONGEST) } else { 0.0 };
+        let proxy = Vector3::from(contact.proxy);
+        if self.tick != model.tick {
+            let fresh = self.tick == 0;
+            self.tick = model.tick;
+            self.since = now;
+            self.glide = reach;
+            self.offset = if fresh { Vector3::zeros() } else { self.shown - proxy };
+        }
+        let age = (now - self.since).max(0.0);
+        let speed = Vector3::from(contact.velocity);
+        let left = if self.glide > 0.0 { (1.0 - age / self.glide).max(0.0) } else { 0.0 };
+        let mut velocity = if age < reach { speed } else { Vector3::zeros() };
+        if left > 0.0 {
+            velocity -= self.offset / self.glide;
+        }
+        self.shown = proxy + speed * age.min(reach) + self.offset * left;
+        (self.shown, velocity)
+    }
+
+    /// Forgets the last contact: the next one begins where it is.
+    pub(crate) fn reset(&mut self) {
+        *self = Self::default();
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn shown_proxy_is_continuous_and_arrives() {
+        let mut follow = Follow::default();
+        let mut model = LocalModel { tick: 1, period: 0.025, count: 1, ..LocalModel::default() };
+        let mut last = None::<f64>;
+        let mut now = 0.0;
+        for tick in 1..=8u64 {
+            model.tick = tick;
+            // A proxy that jumps by a centimetre each word, told with no velocity.
+            model.contacts[0].proxy = [0.01 * tick as f64, 0.0, 0.0];
+            for _ in 0..25 {
+                let (p, _) = follow.advance(now, &model, &model.contacts[0].clone());
+                if let Some(last) = last {
+                    // One centimetre over the 24 periods between the first and the last sight of a word.
+                    assert!((p.x - last).abs() < 0.01 / 24.0 + 1e-12, "{} after {last}", p.x);
+                }
+                last = Some(p.x);
+                now += 1e-3;
+            }
+        }
+        for _ in 0..30 {
+            now += 1e-3;
+            last = Some(follow.advance(now, &model, &model.contacts[0].clone()).0.x);
+        }
+        assert!((last.unwrap() - 0.08).abs() < 1e-12, "at rest where it was told to be: {last:?}");
+    }
+}

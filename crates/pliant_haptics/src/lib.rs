@@ -1,0 +1,41 @@
+//! Feel it: the haptic device layer of Pliant.
+#![cfg_attr(
+    test,
+    allow(clippy::unwrap_used, clippy::expect_used, clippy::panic, reason = "a failed test should panic")
+)]
+
+mod core;
+mod coupling;
+mod cycle;
+mod device;
+mod follow;
+mod hand;
+mod histogram;
+mod intake;
+mod local;
+mod modal_local;
+mod pace;
+mod runner;
+mod safety;
+mod tool;
+mod virtual_device;
+
+pub use core::{LoopConfig, LoopCore, StartError, Tick};
+pub use coupling::{Coupling, CouplingConfig, CouplingLimit};
+pub use cycle::{Cycle, LoopEvent, LoopReport, LoopState, Record, Sink};
+pub use device::{
+    Calibration, DeviceInfo, Fault, HapticDevice, InfoError, Pace, Pacing, Period, Sample, VibrationOutput,
+    Wrench,
+};
+pub use hand::Hand;
+pub use histogram::Histogram;
+pub use local::{Contact, HeldGrab, LocalModel, MAX_CONTACTS, ModelWriter};
+pub use modal_local::ModalLocal;
+pub use pace::{LoopClock, RealPace, VirtualPace};
+pub use runner::{HapticLoop, StopSwitch};
+pub use safety::{
+    Allowed, Gain, Passivity, PassivityConfig, Port, Safety, SafetyConfig, Slew, StaleConfig, Thermal,
+    ThermalConfig, VelocityCutConfig, Wanted, cap_damping, clamp_magnitude, stable_damping,
+};
+pub use tool::ToolMap;
+pub use virtual_device::{Virtual, VirtualConfig, VirtualHandle};

@@ -1,0 +1,173 @@
+//! The modal local model: the loop steps the touched body itself, at device rate.
+//!
+//! The proxy model knows one spring to a place that moves at the simulation's rate; what the body does between two words of the
+//! simulation is guessed. Here the loop has a copy of the body with the tool's grabs, steps it with the hand's position at device rate, and
+//! lets the simulation's word correct it: the copy of *then* is compared with the word about *then*, and the difference is added to the copy of *now*.
+
+use nalgebra::Vector3;
+use pliant_modal::{Body, Frame, State, StepError};
+
+use crate::{HeldGrab, LocalModel, MAX_CONTACTS, tool::Tool};
+
+/// How far back the copy remembers itself, s.
+const MEMORY: f64 = 0.3;
+/// Time in which a difference to the simulation's word is taken out, s.
+const CORRECTION: f64 = 0.03;
+
+/// A copy of a body for the loop. Made on the simulation's side, where memory may be had; stepped on the loop's.
+#[derive(Debug, Clone)]
+pub struct ModalLocal {
+    body: Body,
+    held: [Option<HeldGrab>; MAX_CONTACTS],
+    scale: f64,
+    period: f64,
+    /// Ring of past coordinates, `q` then `v` a slot.
+    past: Vec<f64>,
+    frames: Vec<(f64, Frame)>,
+    head: usize,
+    heard: u64,
+    scratch: State,
+}
+
+impl ModalLocal {
+    /// A copy of `body` with the tool's grabs on it, for a loop of `rate` Hz. `scale`: world metres per metre of the body.
+    ///
+    /// # Errors
+    /// A rate that is not positive, a grab that is not on the body.
+    pub fn new(body: &Body, held: &[HeldGrab], scale: f64, rate: f64) -> Result<Self, StepError> {
+        let period = 1.0 / rate;
+        let mut copy = body.clone();
+        copy.reconfigure(pliant_modal::BodyConfig { step: period, ..body.config().clone() })?;
+        let mut grabs = [None; MAX_CONTACTS];
+        for (slot, grab) in grabs.iter_mut().zip(held) {
+            copy.grab_position(grab.id)?;
+            *slot = Some(*grab);
+        }
+        let slots = (MEMORY / period).ceil() as usize;
+        let modes = copy.mode_count();
+        Ok(Self {
+            past: vec![0.0; slots * 2 * modes],
+            frames: vec![(f64::NEG_INFINITY, *copy.frame()); slots],
+            scratch: copy.state().clone(),
+            body: copy,
+            held: grabs,
+            scale,
+            period,
+            head: 0,
+            heard: 0,
+        })
+    }
+
+    /// Steps the copy with the tool where it is. `false`: it could not be, and the proxy model has to do.
+    pub(crate) fn advance(&mut self, now: f64, steps: usize, tool: &Tool, model: &LocalModel) -> bool {
+        if model.tick != self.heard {
+            self.heard = model.tick;
+            if !self.correct(model) {
+                return false;
+            }
+        }
+        for grab in self.held.iter().flatten() {
+            let target = (tool.position + tool.orientation * Vector3::from(grab.offset)) / self.scale;
+            if !tool.is_clutched() && self.body.set_target(grab.id, target.into()).is_err() {
+                return false;
+            }
+        }
+        for _ in 0..steps {
+            if self.body.step().is_err() {
+                return false;
+            }
+        }
+        self.remember(now);
+        true
+    }
+
+    /// Reaction of the tool's grab `index`, N, world axes.
+    pub(crate) fn reaction(&self, index: usize) -> Vector3<f64> {
+        let grab = self.held.get(index).copied().flatten();
+        let reaction = grab.and_then(|g| self.body.reaction(g.id).ok()).unwrap_or([0.0; 3]);
+        Vector3::from(reaction) * self.scale
+    }
+
+    /// Energy that the copy could give back, J of the world.
+    pub(crate) fn energy(&self) -> f64 {
+        self.body.energy() * self.scale * self.scale
+    }
+
+    fn slots(&self) -> usize {
+        self.frames.len()
+    }
+
+    fn remember(&mut self, now: f64) {
+        self.head = (self.head + 1) % self.slots();
+        let modes = self.body.mode_count();
+        let slot = &mut self.past[self.head * 2 * modes..][..2 * modes];
+        slot[..modes].copy_from_slice(self.body.q());
+        slot[modes..].copy_from_slice(self.body.v());
+        self.frames[self.head] = (now, *self.body.frame());
+    }
+
+    /// Takes the simulation's word about the time of its stamp.
+    fn correct(&mut self, model: &LocalModel) -> bool {
+        let modes = self.body.mode_count();
+        if model.state.q.len() != modes || model.state.v.len() != modes {
+            return false;
+        }
+        // The newest memory that is not younger than the word; none: the word is about the time before the copy, or the first.
+        let slots = self.slots();
+        let age = (self.frames[self.head].0 - model.stamp) / self.period;
+        let Some(back) = (age.is_finite() && age.round() >= 0.0 && (age.round() as usize) < slots)
+            .then_some(age.round() as usize)
+        else {
+            return self.body.set_state(&model.state).is_ok();
+        };
+        let at = (self.head + slots - back) % slots;
+        if self.frames[at].0 == f64::NEG_INFINITY {
+            return self.body.set_state(&model.state).is_ok();
+        }
+        let gain = 1.0 - (-model.period.max(0.0) / CORRECTION).exp();
+        self.scratch.q.copy_from_slice(self.body.q());
+        self.scratch.v.copy_from_slice(self.body.v());
+        self.scratch.a.copy_from_slice(self.body.a());
+        self.scratch.f.copy_from_slice(&self.body.state().f);
+        let then = &self.past[at * 2 * modes..][..2 * modes];
+        for i in 0..modes {
+            self.scratch.q[i] += gain * (model.state.q[i] - then[i]);
+            self.scratch.v[i] += gain * (model.state.v[i] - then[modes + i]);
+        }
+        if self.body.model().is_free() {
+            match self.corrected_frame(&self.frames[at].1, &model.state.frame, gain) {
+                Ok(frame) => self.scratch.frame = frame,
+                Err(_) => return false,
+            }
+        } else {
+            self.scratch.frame = model.state.frame;
+        }
+        // The past is corrected as the present is, so that the same difference is not taken out twice.
+        for slot in 0..slots {
+            let past = &mut self.past[slot * 2 * modes..][..2 * modes];
+            for i in 0..modes {
+                past[i] += self.scratch.q[i] - self.body.q()[i];
+                past[modes + i] += self.scratch.v[i] - self.body.v()[i];
+            }
+        }
+        self.body.set_state(&self.scratch).is_ok()
+    }
+
+    fn corrected_frame(&self, then: &Frame, told: &Frame, gain: f64) -> Result<Frame, StepError> {
+        let now = self.body.frame();
+        let toward = |now: [f64; 3], told: [f64; 3], then: [f64; 3]| -> [f64; 3] {
+            std::array::from_fn(|i| now[i] + gain * (told[i] - then[i]))
+        };
+        let (a, b, c) = (now.orientation(), told.orientation(), then.orientation());
+        // Quaternions of one half of the sphere; for the small differences here the sum is as good as the product.
+        let sign = if (0..4).map(|i| b[i] * c[i]).sum::<f64>() < 0.0 { -1.0 } else { 1.0 };
+        let orientation = std::array::from_fn(|i| a[i] + gain * (sign * b[i] - c[i]));
+        Frame::from_motion(
+            self.body.model(),
+            toward(now.center(), told.center(), then.center()),
+            orientation,
+            toward(now.velocity(), told.velocity(), then.velocity()),
+            toward(now.spin(), told.spin(), then.spin()),
+        )
+    }
+}

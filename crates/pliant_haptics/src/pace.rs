@@ -1,0 +1,209 @@
+//! Time: a clock that threads share, pacing to absolute times, and the virtual kind for tests.
+
+use crate::{Pace, Period};
+
+/// Seconds since it was made, monotonic; copies agree.
+#[derive(Debug, Clone, Copy)]
+pub struct LoopClock {
+    origin: imp::Stamp,
+}
+
+impl LoopClock {
+    /// A clock that starts now.
+    pub fn start() -> Self {
+        Self { origin: imp::now() }
+    }
+
+    /// Seconds since the start.
+    pub fn now(&self) -> f64 {
+        imp::since(self.origin)
+    }
+}
+
+/// Pacing by the machine's clock: sleeps to absolute times, so that lateness does not add up, and leaves out whole periods when it is late by
+/// more than one.
+#[derive(Debug)]
+pub struct RealPace {
+    clock: LoopClock,
+    period: f64,
+    next: f64,
+    last: Period,
+}
+
+impl RealPace {
+    /// Periods of `1 / rate` seconds on `clock`, the first from now.
+    pub fn new(clock: LoopClock, rate: f64) -> Self {
+        let now = clock.now();
+        Self { clock, period: 1.0 / rate, next: now, last: Period { now, ..Period::default() } }
+    }
+}
+
+impl Pace for RealPace {
+    fn wait(&mut self) -> Period {
+        self.next += self.period;
+        let mut now = self.clock.now();
+        let mut missed = 0;
+        if now > self.next + self.period {
+            let behind = ((now - self.next) / self.period).floor();
+            missed = behind.min(f64::from(u32::MAX)) as u32;
+            self.next += behind * self.period;
+        }
+        if now < self.next {
+            imp::sleep_until(self.clock.origin, self.next);
+            now = self.clock.now();
+        }
+        self.last = Period { now, dt: now - self.last.now, late: (now - self.next).max(0.0), missed };
+        self.last
+    }
+
+    fn last(&self) -> Period {
+        self.last
+    }
+
+    fn note(&mut self) -> Period {
+        let now = self.clock.now();
+        let dt = now - self.last.now;
+        let missed = (dt / self.period - 0.5).floor().clamp(0.0, f64::from(u32::MAX)) as u32;
+        self.next = now;
+        self.last = Period { now, dt, late: (dt - self.period).max(0.0), missed };
+        self.last
+    }
+}
+
+/// Pacing in virtual time: every period takes exactly what it should, or what a test says.
+#[derive(Debug, Clone)]
+pub struct VirtualPace {
+    period: f64,
+    gap: f64,
+    last: Period,
+}
+
+impl VirtualPace {
+    /// Periods of `1 / rate` seconds.
+    pub fn new(rate: f64) -> Self {
+        Self { period: 1.0 / rate, gap: 0.0, last: Period::default() }
+    }
+
+    /// Makes the next period longer by `seconds`: a debugger's breakpoint.
+    pub fn stall(&mut self, seconds: f64) {
+        self.gap += seconds;
+    }
+
+    /// Seconds since the start.
+    pub fn now(&self) -> f64 {
+        self.last.now
+    }
+}
+
+impl Pace for VirtualPace {
+    fn wait(&mut self) -> Period {
+        let late = std::mem::take(&mut self.gap);
+        let dt = self.period + late;
+        let missed = (late / self.period) as u32;
+        self.last = Period { now: self.last.now + dt, dt, late, missed };
+        self.last
+    }
+
+    fn last(&self) -> Period {
+        self.last
+    }
+
+    fn note(&mut self) -> Period {
+        self.wait()
+    }
+}
+
+#[cfg(any(target_os = "linux", target_os = "android", target_os = "freebsd"))]
+mod imp {
+    use rustix::{
+        io::Errno,
+        thread::clock_nanosleep_absolute,
+        time::{ClockId, Timespec, clock_gettime},
+    };
+
+    pub(super) type Stamp = Timespec;
+
+    pub(super) fn now() -> Stamp {
+        clock_gettime(ClockId::Monotonic)
+    }
+
+    pub(super) fn since(origin: Stamp) -> f64 {
+        let t = now();
+        (t.tv_sec - origin.tv_sec) as f64 + (t.tv_nsec - origin.tv_nsec) as f64 * 1e-9
+    }
+
+    pub(super) fn sleep_until(origin: Stamp, seconds: f64) {
+        let whole = seconds.floor();
+        let mut at = origin;
+        at.tv_sec += whole as i64;
+        at.tv_nsec += ((seconds - whole) * 1e9) as i64;
+        if at.tv_nsec >= 1_000_000_000 {
+            at.tv_nsec -= 1_000_000_000;
+            at.tv_sec += 1;
+        }
+        // A signal ends the sleep early; an absolute time is simply slept to again.
+        while clock_nanosleep_absolute(ClockId::Monotonic, &at) == Err(Errno::INTR) {}
+    }
+}
+
+#[cfg(not(any(target_os = "linux", target_os = "android", target_os = "freebsd")))]
+mod imp {
+    use std::time::{Duration, Instant};
+
+    pub(super) type Stamp = Instant;
+
+    /// Sleeps are late by up to a timer's tick here: the rest is waited out awake.
+    const AWAKE: Duration = Duration::from_micros(300);
+
+    pub(super) fn now() -> Stamp {
+        Instant::now()
+    }
+
+    pub(super) fn since(origin: Stamp) -> f64 {
+        origin.elapsed().as_secs_f64()
+    }
+
+    pub(super) fn sleep_until(origin: Stamp, seconds: f64) {
+        let at = origin + Duration::from_secs_f64(seconds.max(0.0));
+        if let Some(left) = at.checked_duration_since(Instant::now())
+            && left > AWAKE
+        {
+            std::thread::sleep(left - AWAKE);
+        }
+        while Instant::now() < at {
+            std::hint::spin_loop();
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn real_periods_do_not_drift_and_missed_ones_are_counted() {
+        let clock = LoopClock::start();
+        let mut pace = RealPace::new(clock, 1000.0);
+        let start = pace.last().now;
+        let mut periods = 0;
+        for _ in 0..50 {
+            periods += 1 + pace.wait().missed;
+        }
+        // However late a single wake-up was, the fiftieth is not early, and all of the time is accounted for.
+        let gone = pace.last().now - start;
+        assert!(gone >= 0.05 - 1e-9, "{gone}");
+        assert!((gone - f64::from(periods) * 1e-3 - pace.last().late).abs() < 1e-6, "{gone} for {periods}");
+        std::thread::sleep(std::time::Duration::from_millis(20));
+        assert!(pace.wait().missed >= 18);
+    }
+
+    #[test]
+    fn virtual_time_is_exact() {
+        let mut pace = VirtualPace::new(500.0);
+        pace.stall(0.1);
+        let long = pace.wait();
+        assert_eq!((long.late, long.missed), (0.1, 50));
+        assert!((long.dt - 0.102).abs() < 1e-12 && long.now == long.dt);
+        assert_eq!(pace.wait().dt, 0.002);
+    }
+}

@@ -1,0 +1,129 @@
+//! Stages that scale the force as a whole: engage ramp, velocity cut-out, stale fade, faults, emergency stop.
+//!
+//! One gain for all of them. Each stage names the most that it allows; the gain falls to the smallest at once (each falls at a bounded rate
+//! itself) and rises again only by the ramp. So whatever fades a force, it comes back gently.
+
+use super::SafetyConfig;
+use crate::Fault;
+
+/// When the hand is too fast.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct VelocityCutConfig {
+    /// Speed at which the force begins to fade, m/s. Default: 1.5.
+    pub limit: f64,
+    /// Speed below which it may come back, m/s. Default: 0.75.
+    pub release: f64,
+}
+
+impl Default for VelocityCutConfig {
+    fn default() -> Self {
+        Self { limit: 1.5, release: 0.75 }
+    }
+}
+
+impl VelocityCutConfig {
+    pub(crate) fn is_valid(&self) -> bool {
+        self.limit.is_finite() && self.release > 0.0 && self.release <= self.limit
+    }
+}
+
+/// When the simulation is silent.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct StaleConfig {
+    /// Silence that is taken for granted, s: a step at 40 Hz and its jitter. Default: 0.030.
+    pub patience: f64,
+    /// Silence after which there is no force, s. Default: 0.050.
+    pub limit: f64,
+}
+
+impl Default for StaleConfig {
+    fn default() -> Self {
+        Self { patience: 0.030, limit: 0.050 }
+    }
+}
+
+impl StaleConfig {
+    pub(crate) fn is_valid(&self) -> bool {
+        self.patience >= 0.0 && self.limit.is_finite() && self.limit > self.patience
+    }
+
+    /// 1 while patient, 0 from the limit on, a straight line between.
+    pub fn allows(&self, silent: f64) -> f64 {
+        ((self.limit - silent) / (self.limit - self.patience)).clamp(0.0, 1.0)
+    }
+}
+
+/// Part of the force that is felt.
+#[derive(Debug, Clone, Copy)]
+pub struct Gain {
+    value: f64,
+    /// What faults leave, falling while there is one.
+    fault: f64,
+    /// What the velocity cut-out leaves.
+    cut: f64,
+    cutting: bool,
+    stopped: bool,
+}
+
+impl Gain {
+    pub(crate) fn new(config: &SafetyConfig) -> Self {
+        let value = if config.ramp.is_some() { 0.0 } else { 1.0 };
+        Self { value, fault: 1.0, cut: 1.0, cutting: false, stopped: false }
+    }
+
+    pub(crate) fn is_stopped(&self) -> bool {
+        self.stopped
+    }
+
+    pub(crate) fn reset_stop(&mut self) {
+        self.stopped = false;
+        self.value = 0.0;
+    }
+
+    pub(crate) fn engage(&mut self) {
+        self.value = 0.0;
+    }
+
+    pub(crate) fn tick(
+        &mut self,
+        config: &SafetyConfig,
+        dt: f64,
+        speed: f64,
+        silent: f64,
+        fault: Option<Fault>,
+        stop: bool,
+    ) -> (f64, Option<Fault>) {
+        let mut found = None;
+        let fall = |value: f64| config.fade.map_or(0.0, |fade| (value - dt / fade).max(0.0));
+        self.value = config.ramp.map_or(1.0, |ramp| (self.value + dt / ramp).min(1.0));
+
+        self.fault = if fault.is_some() { fall(self.fault) } else { 1.0 };
+        self.value = self.value.min(self.fault);
+
+        if let Some(limits) = &config.velocity {
+            self.cutting = if self.cutting { speed > limits.release } else { speed > limits.limit };
+            if self.cutting {
+                found = Some(Fault::TooFast(speed));
+            }
+            self.cut = if self.cutting { fall(self.cut) } else { 1.0 };
+            self.value = self.value.min(self.cut);
+        }
+        if let Some(stale) = &config.stale {
+            let allowed = stale.allows(silent);
+            if allowed < 1.0 {
+                found = Some(Fault::Stale(silent));
+            }
+            self.value = self.value.min(allowed);
+        }
+        // Where a fade begins is where the gain is, not at one: otherwise a half-ramped force would stand still while it should fall.
+        self.fault = self.fault.min(if fault.is_some() { self.value } else { 1.0 });
+        self.cut = self.cut.min(if self.cutting { self.value } else { 1.0 });
+
+        self.stopped |= stop;
+        if self.stopped {
+            self.value = 0.0;
+            found = Some(Fault::EmergencyStop);
+        }
+        (self.value, found)
+    }
+}

@@ -1,0 +1,135 @@
+//! Energy at the port between loop and hand: counted exactly, and kept from being made out of nothing.
+
+use nalgebra::Vector3;
+
+/// Settings of [`Passivity`].
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct PassivityConfig {
+    /// Energy that may leave before any has come in, J. Default: 0.005.
+    pub tank: f64,
+    /// Most damping that the controller adds, N s/m. Default: 5.
+    pub max_damping: f64,
+}
+
+impl Default for PassivityConfig {
+    fn default() -> Self {
+        Self { tank: 0.005, max_damping: 5.0 }
+    }
+}
+
+impl PassivityConfig {
+    pub(crate) fn is_valid(&self) -> bool {
+        self.tank.is_finite() && self.tank >= 0.0 && self.max_damping.is_finite() && self.max_damping >= 0.0
+    }
+}
+
+/// Energies at the port, J.
+#[derive(Debug, Clone, Copy, PartialEq, Default)]
+pub struct Port {
+    /// What may still be given to the hand.
+    pub available: f64,
+    /// What the hand has put in since the loop began: sum of all `-F dx` that are positive.
+    pub taken: f64,
+    /// What the hand has been given since: sum of all `F dx` that are positive.
+    pub given: f64,
+    /// What others have put in since, net.
+    pub supplied: f64,
+    /// Force times displacement that the controller has held back or damped away, for diagnosis.
+    pub dissipated: f64,
+}
+
+/// Time-domain passivity observer and controller (Hannaford and Ryu 2002).
+///
+/// A held force does exactly the work `F[k-1] . (x[k] - x[k-1])`, so energy is counted without approximation (Stramigioli et al. 2005):
+/// `E[k] = E[k-1] - F[k-1] . (x[k] - x[k-1])`. What has been absorbed counts only as far as springs and body can store it: a hand that dragged
+/// through honey for a minute has nothing to its credit.
+///
+/// Two remedies. [`dissipate`](Self::dissipate) answers what has leaked out (sampling, delay, a coarse encoder) with damping, as much as pays it back and
+/// no more than the device closes. [`restrain`](Self::restrain) is the hard bound: the part of the force that pushes the hand along is cut so that what is
+/// available is not overdrawn, even if the force then still needs its slew limit's time to go away.
+#[derive(Debug, Clone, Copy)]
+pub struct Passivity {
+    config: PassivityConfig,
+    port: Port,
+    /// What would be available had nothing leaked, J.
+    full: f64,
+}
+
+impl Passivity {
+    /// With a full tank.
+    pub fn new(config: PassivityConfig) -> Self {
+        Self { config, port: Port { available: config.tank, ..Port::default() }, full: config.tank }
+    }
+
+    /// Energies so far.
+    pub fn port(&self) -> Port {
+        self.port
+    }
+
+    /// Counts the work of the `force` (N) held while the hand `moved` (m), and what others `supplied` (J) in that time. `stored`: what springs
+    /// and body could give back (J). Not `holding` anything, the tank is filled up: the next grab begins anew.
+    pub fn observe(
+        &mut self,
+        force: &Vector3<f64>,
+        moved: &Vector3<f64>,
+        supplied: f64,
+        stored: f64,
+        holding: bool,
+    ) {
+        let given = force.dot(moved);
+        if !(given.is_finite() && supplied.is_finite() && stored.is_finite()) {
+            return;
+        }
+        self.port.given += given.max(0.0);
+        self.port.taken += (-given).max(0.0);
+        self.port.supplied += supplied;
+        // What springs and body hold now can have come from nowhere but the hand, the tank or others: anything less available has leaked.
+        self.full = if holding { self.config.tank + stored.max(0.0) } else { self.config.tank };
+        self.port.available =
+            if holding { (self.port.available - given + supplied).min(self.full) } else { self.full };
+    }
+
+    /// The damping force (N) that pays back what has leaked, at `velocity` (m/s) over `dt` (s).
+    pub fn dissipate(&mut self, velocity: &Vector3<f64>, dt: f64) -> Vector3<f64> {
+        let missing = self.full - self.port.available;
+        let v2 = velocity.norm_squared();
+        if missing <= 0.0 || v2 * dt <= 0.0 {
+            return Vector3::zeros();
+        }
+        let damping = (missing / (v2 * dt)).min(self.config.max_damping);
+        self.port.dissipated += damping * v2 * dt;
+        -velocity * damping
+    }
+
+    /// The force with its part along the velocity cut to what the available energy `E` covers: `f v dt + f^2 v / (2 S) <= E`, the second term being the
+    /// work on the way down at the slew limit `S` (N/s).
+    pub fn restrain(
+        &mut self,
+        force: &Vector3<f64>,
+        velocity: &Vector3<f64>,
+        dt: f64,
+        slew: f64,
+    ) -> Vector3<f64> {
+        let speed = velocity.norm();
+        if speed <= 0.0 {
+            return if self.port.available > 0.0 { *force } else { Vector3::zeros() };
+        }
+        let along = velocity / speed;
+        let push = force.dot(&along);
+        if push <= 0.0 {
+            return *force;
+        }
+        let energy = self.port.available.max(0.0);
+        let most = if slew.is_finite() {
+            // The root of f^2 / (2 S) + f dt - E / v = 0.
+            slew * (-dt + (dt * dt + 2.0 * energy / (speed * slew)).sqrt())
+        } else {
+            energy / (speed * dt)
+        };
+        if push <= most {
+            return *force;
+        }
+        self.port.dissipated += (push - most) * speed * dt;
+        force - along * (push - most)
+    }
+}

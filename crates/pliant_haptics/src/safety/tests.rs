@@ -1,0 +1,214 @@
+use nalgebra::Vector3;
+
+use super::*;
+use crate::VirtualConfig;
+
+fn info() -> DeviceInfo {
+    VirtualConfig::touch().info()
+}
+
+fn wanted(force: f64) -> Wanted {
+    Wanted {
+        dt: 1e-3,
+        moved: Vector3::zeros(),
+        velocity: Vector3::zeros(),
+        elastic: Vector3::new(force, 0.0, 0.0),
+        damping: Vector3::zeros(),
+        weight: Vector3::zeros(),
+        stored: 1.0,
+        supplied: 0.0,
+        holding: true,
+        silent: 0.0,
+        fault: None,
+        stop: false,
+    }
+}
+
+/// Runs to where the ramp is over.
+fn engaged(force: f64) -> Safety {
+    let mut safety = Safety::new(SafetyConfig::for_device(&info(), 1000.0));
+    for _ in 0..400 {
+        safety.tick(&wanted(force));
+    }
+    safety
+}
+
+#[test]
+fn complete_means_complete() {
+    let full = SafetyConfig::for_device(&info(), 1000.0);
+    assert!(full.is_complete(&info()));
+    assert!(!SafetyConfig::bare().is_complete(&info()));
+    assert!(!SafetyConfig { slew: None, ..full }.is_complete(&info()));
+    assert!(!SafetyConfig { peak: Some(100.0), ..full }.is_complete(&info()), "above the device's peak");
+    assert!(!SafetyConfig { ramp: Some(f64::NAN), ..full }.is_complete(&info()));
+}
+
+#[test]
+fn magnitude_is_clamped_and_direction_kept() {
+    let mut safety = engaged(0.0);
+    let mut out = safety.tick(&wanted(0.0));
+    for _ in 0..20 {
+        out = safety.tick(&Wanted { elastic: Vector3::new(30.0, 40.0, 0.0), ..wanted(0.0) });
+    }
+    assert!((out.force.norm() - 3.3).abs() < 1e-9, "{}", out.force);
+    assert!((out.force.y / out.force.x - 4.0 / 3.0).abs() < 1e-9);
+}
+
+#[test]
+fn slew_holds_whatever_happens() {
+    // Full force back and forth, a fault, a stale model, a fast hand, all at once: no step above the limit but the emergency stop's.
+    let config = SafetyConfig::for_device(&info(), 1000.0);
+    let most = config.slew.unwrap() * 1e-3;
+    let mut safety = engaged(3.0);
+    let mut last = safety.force();
+    for k in 0..2000u32 {
+        let mut w = wanted(if (k / 3).is_multiple_of(2) { 9.0 } else { -9.0 });
+        w.fault = (k % 97 > 80).then_some(Fault::NotFinite);
+        w.silent = if k % 401 > 340 { f64::from(k % 401 - 340) * 1e-3 } else { 0.0 };
+        w.velocity.y = if k % 211 > 200 { 3.0 } else { 0.0 };
+        let out = safety.tick(&w);
+        assert!((out.force - last).norm() <= most * (1.0 + 1e-12), "tick {k}: {} after {last}", out.force);
+        last = out.force;
+    }
+}
+
+#[test]
+fn not_finite_is_no_force() {
+    let mut safety = engaged(1.0);
+    let before = safety.force().norm();
+    assert!(before > 0.99);
+    let mut last = before;
+    for k in 0..25 {
+        let out = safety.tick(&wanted(f64::NAN));
+        assert_eq!(out.fault, Some(Fault::BadModel));
+        assert!(
+            out.force.norm() <= last && out.force.iter().all(|x| x.is_finite()),
+            "tick {k}: {}",
+            out.force
+        );
+        last = out.force.norm();
+    }
+    assert_eq!(last, 0.0);
+}
+
+#[test]
+fn thermal_budget_ends_at_the_continuous_force() {
+    let config = ThermalConfig { continuous: 1.0, peak_seconds: 5.0 };
+    let mut thermal = Thermal::default();
+    let mut at_peak = 0;
+    let mut last = 3.0;
+    for k in 0..60_000 {
+        let limit = thermal.limit(&config, 3.0);
+        assert!(limit <= last + 1e-12);
+        last = limit;
+        at_peak += i32::from(limit > 3.0 - 1e-9);
+        thermal.heat(&config, 3.0, limit, 1e-3);
+        assert!(
+            k < 59_999 || (limit - 1.0).abs() < 0.01,
+            "a minute of pushing ends at what is borne for ever: {limit}"
+        );
+    }
+    // Half the budget at full force: 2.5 s.
+    assert!((2490..=2510).contains(&at_peak), "{at_peak}");
+    // And it cools: 1 N^2 of margin against 40 N^2 s.
+    for _ in 0..60_000 {
+        thermal.heat(&config, 3.0, 0.0, 1e-3);
+    }
+    assert_eq!(thermal.limit(&config, 3.0), 3.0);
+}
+
+#[test]
+fn ramp_takes_its_time_and_every_fault_ramps_back() {
+    let mut safety = Safety::new(SafetyConfig::for_device(&info(), 1000.0));
+    let out = (0..150).map(|_| safety.tick(&wanted(1.0))).last().unwrap();
+    assert!((out.gain - 0.5).abs() < 0.01, "half of 300 ms: {}", out.gain);
+    let mut safety = engaged(1.0);
+    let faulty = Wanted { fault: Some(Fault::Timeout(0.1)), ..wanted(1.0) };
+    let out = (0..20).map(|_| safety.tick(&faulty)).last().unwrap();
+    assert!(out.gain < 1e-9, "faded within 20 ms: {}", out.gain);
+    let out = safety.tick(&wanted(1.0));
+    assert!(out.gain < 0.01, "no jump back: {}", out.gain);
+    let out = (0..150).map(|_| safety.tick(&wanted(1.0))).last().unwrap();
+    assert!((out.gain - 0.5).abs() < 0.01, "{}", out.gain);
+}
+
+#[test]
+fn stale_model_fades_in_fifty_milliseconds() {
+    let mut safety = engaged(1.0);
+    for k in 0..=60 {
+        let silent = f64::from(k) * 1e-3;
+        let out = safety.tick(&Wanted { silent, ..wanted(1.0) });
+        match k {
+            0..=30 => assert_eq!(out.gain, 1.0, "at {k} ms"),
+            50.. => assert_eq!(out.gain, 0.0, "at {k} ms"),
+            _ => assert!(out.gain < 1.0 && matches!(out.fault, Some(Fault::Stale(_)))),
+        }
+    }
+    let out = safety.tick(&wanted(1.0));
+    assert!(out.gain < 0.01, "comes back by the ramp: {}", out.gain);
+}
+
+#[test]
+fn fast_hands_are_let_go_with_hysteresis() {
+    let mut safety = engaged(1.0);
+    let at = |speed: f64| Wanted { velocity: Vector3::new(0.0, speed, 0.0), ..wanted(1.0) };
+    for _ in 0..30 {
+        safety.tick(&at(2.0));
+    }
+    assert_eq!(safety.force().norm(), 0.0);
+    let out = (0..500).map(|_| safety.tick(&at(1.0))).last().unwrap();
+    assert!(matches!(out.fault, Some(Fault::TooFast(_))) && out.gain == 0.0, "not slow enough yet");
+    let out = (0..500).map(|_| safety.tick(&at(0.5))).last().unwrap();
+    assert_eq!(out.gain, 1.0);
+}
+
+#[test]
+fn emergency_stop_cuts_and_stays() {
+    let mut safety = engaged(3.0);
+    assert!(safety.force().norm() > 2.9);
+    let out = safety.tick(&Wanted { stop: true, ..wanted(3.0) });
+    assert_eq!(out.force, Vector3::zeros(), "in one tick");
+    for _ in 0..5000 {
+        assert_eq!(safety.tick(&wanted(3.0)).force, Vector3::zeros(), "latched");
+    }
+    safety.reset_stop();
+    let out = safety.tick(&wanted(3.0));
+    assert!(out.gain < 0.01 && out.fault.is_none(), "ramps after the reset");
+}
+
+#[test]
+fn energy_of_a_held_force_is_exact() {
+    let mut p = Passivity::new(PassivityConfig { tank: 0.01, max_damping: 5.0 });
+    let mut sum = 0.0;
+    for k in 0..100 {
+        let f = Vector3::new((f64::from(k) * 0.7).sin(), 1.0, -0.5);
+        let dx = Vector3::new(0.001, (f64::from(k) * 0.3).cos() * 1e-3, 0.0);
+        sum += f.dot(&dx);
+        p.observe(&f, &dx, 0.0, 1e9, true);
+    }
+    let port = p.port();
+    assert!((port.available - (0.01 - sum)).abs() < 1e-15);
+    assert!((port.given - port.taken - sum).abs() < 1e-15);
+    // What cannot be stored is not owed: 1 J pushed into honey leaves a tank and the spring's 2 mJ.
+    p.observe(&Vector3::new(-1.0, 0.0, 0.0), &Vector3::new(1.0, 0.0, 0.0), 0.0, 0.002, true);
+    assert!((p.port().available - 0.012).abs() < 1e-15);
+}
+
+#[test]
+fn no_more_comes_out_than_went_in_plus_the_tank() {
+    // A hand carried along at half a metre a second by a force that never ends: it gets the tank and not a microjoule more.
+    let tank = 0.005;
+    let config = SafetyConfig::for_device(&info(), 1000.0);
+    let mut safety = Safety::new(SafetyConfig { ramp: Some(1e-3), ..config });
+    let velocity = Vector3::new(0.5, 0.0, 0.0);
+    let mut given = 0.0;
+    let mut last = Vector3::zeros();
+    for _ in 0..1000 {
+        let moved = velocity * 1e-3;
+        given += last.dot(&moved);
+        let out = safety.tick(&Wanted { moved, velocity, stored: 0.0, ..wanted(3.0) });
+        last = out.force;
+        assert!(given <= tank, "{given} J");
+    }
+    assert!(given > 0.8 * tank, "and most of the tank it does get: {given} J");
+}

@@ -1,0 +1,66 @@
+//! A loop and a virtual device in virtual time.
+#![allow(dead_code, reason = "every test uses its own part of it")]
+
+use pliant_haptics::{
+    Contact, CouplingConfig, Cycle, Hand, LocalModel, LoopConfig, LoopEvent, SafetyConfig, Virtual,
+    VirtualConfig, VirtualPace,
+};
+
+pub struct Rig {
+    pub cycle: Cycle<Virtual>,
+    pub pace: VirtualPace,
+    pub model: LocalModel,
+    pub events: Vec<LoopEvent>,
+}
+
+impl Rig {
+    pub fn new(device: VirtualConfig, hand: Hand, config: LoopConfig) -> Self {
+        let device = Virtual::new(device, hand).unwrap();
+        let rate = config.rate;
+        Self {
+            cycle: Cycle::new(device, config).unwrap(),
+            pace: VirtualPace::new(rate),
+            model: LocalModel::default(),
+            events: Vec::new(),
+        }
+    }
+
+    /// No stage of the safety pipeline at all.
+    pub fn bare(device: VirtualConfig, hand: Hand) -> Self {
+        let config = LoopConfig { safety: Some(SafetyConfig::bare()), ..LoopConfig::default() };
+        Self::new(device, hand, config)
+    }
+
+    /// Without what the whole pipeline takes at the start: ramp and coupling clamp are not what is measured.
+    pub fn with(device: VirtualConfig, hand: Hand, change: impl FnOnce(&mut SafetyConfig)) -> Self {
+        let mut safety = SafetyConfig::for_device(&device.info(), 1000.0);
+        change(&mut safety);
+        let config =
+            LoopConfig { safety: Some(safety), coupling: CouplingConfig::default(), ..LoopConfig::default() };
+        Self::new(device, hand, config)
+    }
+
+    pub fn device(&self) -> &Virtual {
+        self.cycle.device()
+    }
+
+    /// One period in which the simulation says the same again: a spring of `stiffness` to the middle, with `damping`.
+    pub fn spring(&mut self, stiffness: f64, damping: f64) {
+        self.model.tick += 1;
+        self.model.stamp = self.pace.now();
+        self.model.period = 1e-3;
+        self.model.count = 1;
+        let k = stiffness;
+        self.model.contacts[0] = Contact {
+            stiffness: [[k, 0.0, 0.0], [0.0, k, 0.0], [0.0, 0.0, k]],
+            damping,
+            ..Contact::default()
+        };
+        self.step();
+    }
+
+    /// One period in which the simulation says nothing new.
+    pub fn step(&mut self) {
+        self.cycle.step(&mut self.pace, &self.model, &mut self.events);
+    }
+}
