@@ -247,6 +247,11 @@ impl Receiver {
         }
         self.remember_before();
         self.policy.restart(snapshot.tick, &state_of(snapshot), &snapshot.load);
+        if self.history.highest() > snapshot.tick + HISTORY as u64 {
+            // Something claimed to come from the future: what is true now would look too old to be used.
+            self.history = History::new(snapshot.tick);
+            self.tick = self.tick.min(snapshot.tick);
+        }
         let distance = self.tick.abs_diff(snapshot.tick);
         if snapshot.tick >= self.tick || distance >= HISTORY as u64 {
             self.tick = snapshot.tick;

@@ -1,0 +1,401 @@
+//! Any bytes at all: no panic, no large allocation, and the session goes on or ends with a reason.
+#![allow(clippy::unwrap_used, clippy::expect_used, clippy::panic, reason = "a failed test should panic")]
+
+mod support;
+
+use std::time::Duration;
+
+use pliant_stream::wire::{
+    AccelerationCoding, Accelerations, Clock, Datagram, Frame, FrameGrab, GuestMessage, HostMessage, Nack,
+    NackRun, Repeat, RepeatGrab, Report, Slice, TargetEntry, Targets,
+};
+use pliant_stream::{
+    BodyId, BodySetup, Channel, EndReason, GrabKey, GrabState, GuestConfig, GuestEvent, GuestSession,
+    HostConfig, HostEvent, HostSession, PeerId, Pose, RecoveryConfig, StreamError, TickState, UserId,
+};
+use proptest::prelude::*;
+use support::bar;
+
+const BODY: BodyId = BodyId(1);
+
+fn grab(index: u16) -> FrameGrab {
+    FrameGrab {
+        state: GrabState {
+            key: GrabKey { user: UserId(index), grab: 7 },
+            vertex: 5,
+            radius: 0.25,
+            target: [1.0, 2.0, 3.0],
+            reaction: [0.5, -8.0, 1024.0],
+        },
+        displacement: [0.25, 0.0, -0.5],
+        held: index != 2,
+    }
+}
+
+fn samples() -> Vec<Datagram> {
+    let frame = |payload: u8| Frame {
+        body: BODY,
+        tick: 12_345,
+        run: 77,
+        resting: payload == 3,
+        resent: payload == 1,
+        displacements: payload == 0,
+        grabs: if payload == 0 {
+            vec![grab(1), grab(2)]
+        } else {
+            vec![FrameGrab { displacement: [0.0; 3], ..grab(1) }]
+        },
+        pose: (payload == 2).then(|| Pose { position: [1.0, 2.0, 3.0], ..Pose::default() }),
+        accelerations: match payload {
+            1 => Some(Accelerations::quantise(AccelerationCoding::Scaled16, &[1.0, -2.0, 0.25])),
+            2 => Some(Accelerations::quantise(AccelerationCoding::F32, &[1.0, -2.0, 0.25])),
+            3 => Some(Accelerations::quantise(AccelerationCoding::F64, &[1.0, -2.0, 0.25])),
+            _ => None,
+        },
+        slice: (payload != 1).then(|| Slice::quantise(&[(3, [1.0, 2.0, 0.0]), (9, [-0.5, 0.0, 0.0])])),
+        check: (payload < 2).then_some(0.125),
+        repeats: vec![Repeat {
+            back: 1,
+            grabs: vec![RepeatGrab {
+                index: 0,
+                reaction: [1.0, 2.0, 3.0],
+                displacement: if payload == 0 { [0.5, 0.5, 0.5] } else { [0.0; 3] },
+            }],
+            accelerations: (payload == 1)
+                .then(|| Accelerations::quantise(AccelerationCoding::Scaled16, &[1.0, 0.0, 0.0])),
+        }],
+    };
+    let report = Report { received: 10, highest: 12 };
+    vec![
+        Datagram::Frame(frame(0)),
+        Datagram::Frame(frame(1)),
+        Datagram::Frame(frame(2)),
+        Datagram::Frame(frame(3)),
+        Datagram::Targets(Targets {
+            entries: vec![TargetEntry { grab: 1, input: 2, target: [0.5, 0.25, -1.0] }],
+        }),
+        Datagram::Nack(Nack { body: BODY, runs: vec![NackRun { first: 100, count: 3 }] }),
+        Datagram::Ping(Clock { t1: 5, t2: 0, t3: 0, report, round_trip: 200_000 }),
+        Datagram::Pong(Clock { t1: 5, t2: 6, t3: 7, report, round_trip: 0 }),
+    ]
+}
+
+#[test]
+fn every_datagram_reads_back_as_it_was_written() {
+    for (k, d) in samples().into_iter().enumerate() {
+        let bytes = d.encode(k as u16 * 9000);
+        let (sequence, back) = Datagram::decode(&bytes).unwrap();
+        assert_eq!(sequence, k as u16 * 9000);
+        assert_eq!(back, d);
+        if let Datagram::Frame(f) = &d {
+            assert_eq!(f.bytes() + 3, bytes.len(), "the announced size is the size");
+        }
+        for cut in 0..bytes.len() {
+            assert!(Datagram::decode(&bytes[..cut]).is_err(), "datagram {k} cut to {cut}");
+        }
+        let mut long = bytes.clone();
+        long.push(0);
+        assert!(Datagram::decode(&long).is_err(), "a byte too many");
+    }
+}
+
+#[test]
+fn not_a_number_is_refused_by_name() {
+    let d = Datagram::Targets(Targets {
+        entries: vec![TargetEntry { grab: 1, input: 2, target: [0.0, f64::NAN, 0.0] }],
+    });
+    assert_eq!(Datagram::decode(&d.encode(0)).unwrap_err(), StreamError::NotFinite { what: "target" });
+    let huge = Datagram::Targets(Targets {
+        entries: vec![TargetEntry { grab: 1, input: 2, target: [0.0, 1e30, 0.0] }],
+    });
+    assert!(matches!(Datagram::decode(&huge.encode(0)), Err(StreamError::Invalid { what: "target", .. })));
+}
+
+/// A host and a guest in full session, without links: what one says the other hears.
+fn session(name: &str) -> (HostSession, GuestSession, Duration) {
+    let model = bar(12, 0.05);
+    let mut host = HostSession::new(HostConfig::default()).unwrap();
+    host.add_body(BODY, "bar", model.clone(), BodySetup::default()).unwrap();
+    let recovery = RecoveryConfig::by_name(name).unwrap();
+    let mut guest = GuestSession::new(GuestConfig { recovery, ..Default::default() }, 1200).unwrap();
+    guest.add_cached_model(model);
+    let mut now = Duration::ZERO;
+    host.connect(now, PeerId(1), 1200).unwrap();
+    guest.connect(now).unwrap();
+    for tick in 1..60 {
+        now += Duration::from_millis(25);
+        publish(&mut host, now, tick);
+        exchange(&mut host, &mut guest, now);
+        if tick == 10 {
+            guest.begin_grab(now, BODY, 66, 0.05, [1.0, 0.0, 0.0]).unwrap();
+        }
+    }
+    assert!(guest.body(BODY).unwrap().is_ready());
+    (host, guest, now)
+}
+
+fn publish(host: &mut HostSession, now: Duration, tick: u64) {
+    let q: Vec<f64> = (0..12).map(|k| 0.01 * (0.05 * tick as f64 + k as f64).sin()).collect();
+    let v = vec![0.0; 12];
+    let grabs = [grab(1).state];
+    let state = TickState { tick, q: &q, v: &v, a: &v, pose: None, grabs: &grabs, resting: false };
+    host.publish(now, BODY, &state).unwrap();
+}
+
+fn exchange(host: &mut HostSession, guest: &mut GuestSession, now: Duration) {
+    for _ in 0..3 {
+        host.update(now);
+        guest.update(now);
+        while let Some(o) = guest.poll_output() {
+            match o.channel {
+                Channel::Datagram => host.on_datagram(now, PeerId(1), &o.bytes),
+                Channel::Message => host.on_message(now, PeerId(1), &o.bytes),
+            }
+        }
+        while let Some(o) = host.poll_output() {
+            match o.channel {
+                Channel::Datagram => guest.on_datagram(now, &o.bytes),
+                Channel::Message => guest.on_message(now, &o.bytes),
+            }
+        }
+    }
+}
+
+fn finite(guest: &GuestSession) {
+    if let Some(shown) = guest.body(BODY).and_then(|b| b.shown()) {
+        assert!(shown.is_finite());
+    }
+}
+
+proptest! {
+    #![proptest_config(ProptestConfig { cases: 4000, ..ProptestConfig::default() })]
+
+    #[test]
+    fn any_bytes_are_read_without_panic(bytes in proptest::collection::vec(any::<u8>(), 0..1500)) {
+        let _ = Datagram::decode(&bytes);
+        let _ = GuestMessage::decode(&bytes);
+        let _ = HostMessage::decode(&bytes);
+    }
+
+    #[test]
+    fn damaged_datagrams_are_read_without_panic(
+        which in 0_usize..8,
+        damage in proptest::collection::vec((any::<u16>(), any::<u8>()), 1..6),
+        cut in any::<u16>(),
+    ) {
+        let mut bytes = samples()[which].encode(1);
+        for (at, value) in damage {
+            let len = bytes.len();
+            bytes[usize::from(at) % len] = value;
+        }
+        let keep = if cut % 3 == 0 { usize::from(cut) % bytes.len() } else { bytes.len() };
+        let _ = Datagram::decode(&bytes[..keep]);
+    }
+}
+
+#[test]
+fn sessions_survive_a_hundred_thousand_damaged_datagrams() {
+    // Damage of what a real session says, so that most of it gets past the parser; both ways, all policies. The seed is
+    // the loop's counter.
+    for name in RecoveryConfig::NAMES {
+        let (mut host, mut guest, mut now) = session(name);
+        let mut random = 88_172_645_463_325_252_u64;
+        let mut next = || {
+            random ^= random << 13;
+            random ^= random >> 7;
+            random ^= random << 17;
+            random
+        };
+        let base: Vec<Vec<u8>> = samples().iter().map(|d| d.encode(3)).collect();
+        let mut last_frame: Option<Vec<u8>> = None;
+        for round in 0..7_000_u64 {
+            if round % 10 == 0 {
+                now += Duration::from_millis(25);
+                publish(&mut host, now, 60 + round / 10);
+                host.update(now);
+                while let Some(o) = host.poll_output() {
+                    if o.channel == Channel::Datagram {
+                        last_frame = Some(o.bytes.to_vec());
+                        guest.on_datagram(now, &o.bytes);
+                    } else {
+                        guest.on_message(now, &o.bytes);
+                    }
+                }
+                guest.update(now);
+                while let Some(o) = guest.poll_output() {
+                    if o.channel == Channel::Datagram {
+                        host.on_datagram(now, PeerId(1), &o.bytes);
+                    } else {
+                        host.on_message(now, PeerId(1), &o.bytes);
+                    }
+                }
+                while guest.poll_event().is_some() {}
+                while host.poll_event().is_some() {}
+            }
+            let mut bytes = match (&last_frame, next() % 3) {
+                (Some(f), 0 | 1) => f.clone(),
+                _ => base[(next() % 8) as usize].clone(),
+            };
+            for _ in 0..=next() % 3 {
+                let at = (next() as usize) % bytes.len();
+                bytes[at] = next() as u8;
+            }
+            if bytes.len() > 3 {
+                // A sequence number that counts as new.
+                let s = (next() as u16).to_le_bytes();
+                bytes[1] = s[0];
+                bytes[2] = s[1];
+            }
+            guest.on_datagram(now, &bytes);
+            host.on_datagram(now, PeerId(1), &bytes);
+            finite(&guest);
+        }
+        // Whatever a liar put in, a snapshot puts right.
+        assert!(!guest.is_closed(), "{name}");
+    }
+}
+
+#[test]
+fn ticks_of_the_far_future_and_past_do_not_move_a_body() {
+    let (_, mut guest, now) = session("default");
+    let before = guest.body(BODY).unwrap().tick();
+    for tick in [0, 1, (1 << 48) - 1, 1 << 40, before + 2_000_000] {
+        let Datagram::Frame(f) = &samples()[0] else { unreachable!() };
+        let frame = Frame { tick, run: u16::MAX, ..f.clone() };
+        guest.on_datagram(now, &Datagram::Frame(frame).encode(30_000_u16.wrapping_add(tick as u16)));
+        guest.update(now);
+    }
+    let after = guest.body(BODY).unwrap().tick();
+    assert!(after <= before + 3, "{before} {after}");
+    finite(&guest);
+}
+
+#[test]
+fn a_tick_of_the_near_future_costs_a_snapshot_and_no_more() {
+    for name in ["default", "paper"] {
+        let (mut host, mut guest, mut now) = session(name);
+        let Datagram::Frame(f) = &samples()[0] else { unreachable!() };
+        let accelerations =
+            (name == "paper").then(|| Accelerations::quantise(AccelerationCoding::Scaled16, &[1.0; 12]));
+        let frame = Frame { tick: 900_000, accelerations, repeats: Vec::new(), ..f.clone() };
+        guest.on_datagram(now, &Datagram::Frame(frame).encode(120));
+        for tick in 60..160 {
+            now += Duration::from_millis(25);
+            publish(&mut host, now, tick);
+            exchange(&mut host, &mut guest, now);
+        }
+        let view = guest.body(BODY).unwrap();
+        assert!((150..=160).contains(&view.tick()), "{name}: tick {}", view.tick());
+        let q = &view.hidden().unwrap().q;
+        let truth = |k: usize| 0.01 * (0.05 * view.tick() as f64 + k as f64).sin();
+        for (k, q) in q.iter().enumerate() {
+            // What is published here obeys no physics, so the force-driven receiver is off between its refreshes.
+            assert!((q - truth(k)).abs() < 4e-3, "{name} mode {k}: {q} and {}", truth(k));
+        }
+    }
+}
+
+#[test]
+fn nack_flood_is_answered_within_bounds() {
+    let (mut host, _, now) = session("default");
+    while host.poll_output().is_some() {}
+    let runs = vec![NackRun { first: 1, count: 64 }; 32];
+    let flood = Datagram::Nack(Nack { body: BODY, runs });
+    for s in 0..5000_u16 {
+        host.on_datagram(now, PeerId(1), &flood.encode(s.wrapping_add(2000)));
+    }
+    let mut answers = 0;
+    while host.poll_output().is_some() {
+        answers += 1;
+    }
+    // The budget is 4,000 ticks at once; all asked for in one moment.
+    assert!(answers <= 4000, "{answers} answers to ten million questions");
+}
+
+#[test]
+fn a_guest_that_breaks_the_protocol_is_shown_out_with_a_reason() {
+    let (mut host, _, now) = session("default");
+    while host.poll_event().is_some() {}
+    while host.poll_output().is_some() {}
+    host.on_message(now, PeerId(1), &[0xFF; 40]);
+    let mut ended = false;
+    while let Some(e) = host.poll_event() {
+        ended |= matches!(e, HostEvent::Left { reason: EndReason::Protocol, .. });
+    }
+    assert!(ended);
+    let goodbye = host.poll_output().unwrap();
+    let said = HostMessage::decode(&goodbye.bytes).unwrap();
+    assert_eq!(said, HostMessage::Goodbye { reason: EndReason::Protocol });
+}
+
+#[test]
+fn a_host_that_sends_a_false_model_is_left() {
+    let model = bar(12, 0.05);
+    let mut host = HostSession::new(HostConfig::default()).unwrap();
+    host.add_body(BODY, "bar", model, BodySetup::default()).unwrap();
+    let mut guest = GuestSession::new(GuestConfig::default(), 1200).unwrap();
+    let now = Duration::from_secs(1);
+    host.connect(now, PeerId(1), 1200).unwrap();
+    guest.connect(now).unwrap();
+    while let Some(o) = guest.poll_output() {
+        host.on_message(now, PeerId(1), &o.bytes);
+    }
+    host.update(now);
+    while let Some(o) = host.poll_output() {
+        let mut bytes = o.bytes.to_vec();
+        if let Ok(HostMessage::ModelChunk { hash, offset, total, bytes: mut piece }) =
+            HostMessage::decode(&bytes)
+        {
+            piece[100] ^= 1;
+            bytes = HostMessage::ModelChunk { hash, offset, total, bytes: piece }.encode();
+        }
+        guest.on_message(now, &bytes);
+    }
+    let mut reason = None;
+    while let Some(e) = guest.poll_event() {
+        if let GuestEvent::Closed { reason: r } = e {
+            reason = Some(r);
+        }
+    }
+    assert_eq!(reason, Some(EndReason::Protocol));
+}
+
+#[test]
+fn another_version_is_told_so() {
+    let mut host = HostSession::new(HostConfig::default()).unwrap();
+    host.connect(Duration::ZERO, PeerId(1), 1200).unwrap();
+    let hello = GuestMessage::Hello {
+        version: 999,
+        name: "old".into(),
+        token: Vec::new(),
+        wish: RecoveryConfig::default().wish(None),
+        cached: Vec::new(),
+    };
+    host.on_message(Duration::ZERO, PeerId(1), &hello.encode());
+    let said = HostMessage::decode(&host.poll_output().unwrap().bytes).unwrap();
+    assert_eq!(said, HostMessage::Goodbye { reason: EndReason::Version });
+}
+
+#[test]
+fn the_application_cannot_publish_nonsense() {
+    let model = bar(12, 0.05);
+    let mut host = HostSession::new(HostConfig::default()).unwrap();
+    host.add_body(BODY, "bar", model, BodySetup::default()).unwrap();
+    let good = vec![0.0; 12];
+    let bad = vec![f64::NAN; 12];
+    let long = vec![0.0; 13];
+    let at = |tick, q: &[f64]| {
+        let mut h = HostSession::new(HostConfig::default()).unwrap();
+        h.add_body(BODY, "bar", bar(12, 0.05), BodySetup::default()).unwrap();
+        let state = TickState { tick, q, v: &good, a: &good, pose: None, grabs: &[], resting: false };
+        h.publish(Duration::ZERO, BODY, &state)
+    };
+    assert_eq!(at(1, &good), Ok(()));
+    assert_eq!(at(1, &bad), Err(StreamError::NotFinite { what: "q" }));
+    assert_eq!(at(1, &long), Err(StreamError::Length { what: "q", found: 13, expected: 12 }));
+    assert!(matches!(at(0, &good), Err(StreamError::TickOrder { .. })));
+    let state = TickState { tick: 5, q: &good, v: &good, a: &good, pose: None, grabs: &[], resting: false };
+    host.publish(Duration::ZERO, BODY, &state).unwrap();
+    assert_eq!(host.publish(Duration::ZERO, BODY, &state), Err(StreamError::TickOrder { last: 5, found: 5 }));
+    assert_eq!(host.publish(Duration::ZERO, BodyId(7), &state), Err(StreamError::UnknownBody(BodyId(7))));
+}
