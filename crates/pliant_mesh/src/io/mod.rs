@@ -310,7 +310,7 @@ mod tests {
 
     mod any_bytes {
         use super::*;
-        use proptest::prelude::*;
+        use proptest::{prelude::*, test_runner::RngSeed};
 
         /// A real file with a few bytes replaced finds more than noise does.
         fn altered(text: String) -> impl Strategy<Value = Vec<u8>> {
@@ -340,6 +340,8 @@ mod tests {
         }
 
         proptest! {
+            #![proptest_config(ProptestConfig { failure_persistence: None, rng_seed: RngSeed::Fixed(2007), ..ProptestConfig::default() })]
+
             #[test]
             fn never_panic(bytes in proptest::collection::vec(any::<u8>(), 0..300)) {
                 any_reader(&bytes);
