@@ -224,7 +224,7 @@ impl Encoder {
         };
         self.repeat(&mut frame);
         self.refresh(&mut frame, state);
-        if state.tick % CHECK_EVERY == 0 {
+        if state.tick.is_multiple_of(CHECK_EVERY) {
             frame.check = Some(projection(state.tick, &self.mirror.q) as f32);
         }
         while 3 + frame.bytes() > self.limit && frame.repeats.pop().is_some() {}

@@ -150,7 +150,7 @@ impl<T: Clone> Link<T> {
         let share = |p: &mut f64| *p = if p.is_finite() { p.clamp(0.0, 1.0) } else { 0.0 };
         share(&mut config.reorder);
         share(&mut config.duplicate);
-        if config.bits_per_second.is_some_and(|r| !(r >= 1.0)) {
+        if config.bits_per_second.is_some_and(|r| r.is_nan() || r < 1.0) {
             config.bits_per_second = Some(1.0);
         }
         if config.loss.check().is_err() {
@@ -253,7 +253,9 @@ impl<T: Clone> Link<T> {
             Loss::None => false,
             Loss::Random(p) => draw < *p,
             Loss::Burst { first, count } => packet >= *first && packet - first < *count,
-            Loss::Every { first, every } => packet >= *first && (packet - first) % (*every).max(1) == 0,
+            Loss::Every { first, every } => {
+                packet >= *first && (packet - first).is_multiple_of((*every).max(1))
+            }
             Loss::Listed(list) => list.binary_search(&packet).is_ok(),
             Loss::Outage { from, to } => (*from..*to).contains(&now),
             Loss::GilbertElliott { good, bad, loss_good, loss_bad } => {

@@ -96,17 +96,17 @@ impl Recovery for AccelerationDriven {
         }
         let (to_q, to_v) = self.newmark.response(self.tick - from);
         let used = &mut self.used[(from % HISTORY as u64) as usize];
-        for k in 0..used.len() {
+        for (k, (used, told)) in used.iter_mut().zip(&data.accelerations).enumerate() {
             if from <= self.anchored[k] {
                 continue;
             }
-            let da = data.accelerations[k] - used[k];
+            let da = told - *used;
             self.state.q[k] += to_q * da;
             self.state.v[k] += to_v * da;
             if from == self.tick {
                 self.state.a[k] += da;
             }
-            used[k] = data.accelerations[k];
+            *used = *told;
         }
         true
     }

@@ -338,10 +338,10 @@ impl Receiver {
             let Some(shown) = previous.iter().find(|p| p.key == g.key) else { continue };
             let known = self.tick.checked_sub(1).and_then(|t| self.history.grab(g.key, t, keep_of(self.h)));
             let Some(known) = known.map(|k| k.state.reaction) else { continue };
-            for k in 0..3 {
-                let offset = keep * (shown.reaction[k] - known[k]);
-                if offset.abs() > 1e-7 * g.reaction[k].abs() {
-                    g.reaction[k] += offset;
+            for ((reaction, shown), known) in g.reaction.iter_mut().zip(shown.reaction).zip(known) {
+                let offset = keep * (shown - known);
+                if offset.abs() > 1e-7 * reaction.abs() {
+                    *reaction += offset;
                 }
             }
         }

@@ -6,144 +6,46 @@ use std::time::Duration;
 
 use pliant_modal::ModalModel;
 
+use super::host_config::{HostConfig, HostEvent};
 use super::host_peer::{HeldGrab, MAX_GUEST_GRABS, Peer, Standing, Transfer};
 use super::outbox::loss_of;
 use super::{EndReason, LinkStats, MIN_DATAGRAM, Output};
 use crate::StreamError;
 use crate::encoder::Encoder;
 use crate::newmark::Newmark;
-use crate::state::{
-    BodyId, GrabKey, MAX_GRABS, MAX_MODES, PeerId, TICK_LIMIT, Tick, TickState, UserId, in_range,
-};
+use crate::state::{BodyId, GrabKey, MAX_MODES, PeerId, Tick, UserId};
 use crate::stepper::BodySetup;
-use crate::wire::{BodyInfo, Datagram, GuestMessage, HostMessage, PROTOCOL_VERSION, StreamWish, WIDE_LIMIT};
+use crate::wire::{BodyInfo, Datagram, GuestMessage, HostMessage, PROTOCOL_VERSION, StreamWish};
 
 /// Bytes of a model in one message.
 const CHUNK: usize = 16 * 1024;
 /// Most events that wait for the application; the oldest are dropped.
 const MAX_EVENTS: usize = 4096;
-/// A resting body is recalled to its guests this often.
-const REMINDER: Duration = Duration::from_secs(1);
 
-/// Settings of a host.
-#[derive(Debug, Clone, Copy, PartialEq)]
-pub struct HostConfig {
-    /// The step and the filter by which acceleration streams are read. Default: 1/40 s, and beta 4/9, gamma 5/6
-    /// (generalized-alpha with 0.5), which follows any host integrator without ringing. For the paper's own method with a
-    /// host that steps by average acceleration: [`Newmark::average`].
-    pub newmark: Newmark,
-    /// Most guests. Default: 256.
-    pub max_guests: usize,
-    /// A guest that is silent for so long is gone. Default: 10 s.
-    pub idle_timeout: Duration,
-    /// Bytes a second at which models are sent to one guest. Default: 1 MB/s.
-    pub model_rate: f64,
-    /// Answer a NACK only so much later: for remaking the paper's figures. Default: at once.
-    pub resend_after: Duration,
-    /// Take in everybody who says hello; else [`HostEvent::Knock`] asks and [`HostSession::accept`] answers. Default: true.
-    pub open: bool,
-}
-
-impl Default for HostConfig {
-    fn default() -> Self {
-        Self {
-            newmark: Newmark { h: 1.0 / 40.0, beta: 4.0 / 9.0, gamma: 5.0 / 6.0 },
-            max_guests: 256,
-            idle_timeout: Duration::from_secs(10),
-            model_rate: 1e6,
-            resend_after: Duration::ZERO,
-            open: true,
-        }
-    }
-}
-
-/// What happened at the host.
-#[derive(Debug, Clone, PartialEq)]
-#[non_exhaustive]
-pub enum HostEvent {
-    /// Somebody asks to come in; answer with [`HostSession::accept`] or [`HostSession::refuse`]. Not with `open`.
-    Knock {
-        /// Who.
-        peer: PeerId,
-        /// Their name.
-        name: String,
-        /// What they show.
-        token: Vec<u8>,
-    },
-    /// A guest is in.
-    Joined {
-        /// The connection.
-        peer: PeerId,
-        /// Their number.
-        user: UserId,
-        /// Their name.
-        name: String,
-        /// What they showed.
-        token: Vec<u8>,
-    },
-    /// A guest is gone; their grabs have ended ([`HostEvent::GrabEnded`] came before this).
-    Left {
-        /// The connection.
-        peer: PeerId,
-        /// Their number, if they had joined.
-        user: Option<UserId>,
-        /// Why.
-        reason: EndReason,
-    },
-    /// A hand takes hold: the application grabs its body, or says [`HostSession::refuse_grab`].
-    GrabBegan {
-        /// Whose and which.
-        key: GrabKey,
-        /// The body.
-        body: BodyId,
-        /// Centre of the patch.
-        vertex: u32,
-        /// Radius of the patch, m.
-        radius: f64,
-        /// Where the hand is, world, m.
-        target: [f64; 3],
-    },
-    /// A hand moves.
-    GrabMoved {
-        /// Whose and which.
-        key: GrabKey,
-        /// The body.
-        body: BodyId,
-        /// The guest's input counter; ascends.
-        input: u32,
-        /// Where the hand is, world, m.
-        target: [f64; 3],
-    },
-    /// A hand lets go.
-    GrabEnded {
-        /// Whose and which.
-        key: GrabKey,
-        /// The body.
-        body: BodyId,
-    },
-}
+/// A kind of receiver, and how many bytes its datagrams may have.
+pub(super) type StreamKey = (StreamWish, usize);
 
 #[derive(Debug)]
-struct HostBody {
-    name: String,
-    model: Arc<ModalModel>,
-    bytes: Arc<[u8]>,
-    hash: [u8; 32],
-    setup: BodySetup,
-    last: Option<Tick>,
-    resting: bool,
-    reminded: Duration,
+pub(super) struct HostBody {
+    pub(super) name: String,
+    pub(super) model: Arc<ModalModel>,
+    pub(super) bytes: Arc<[u8]>,
+    pub(super) hash: [u8; 32],
+    pub(super) setup: BodySetup,
+    pub(super) last: Option<Tick>,
+    pub(super) resting: bool,
+    pub(super) reminded: Duration,
     /// One encoder per kind of receiver and room in the datagram.
-    streams: BTreeMap<(StreamWish, usize), Encoder>,
+    pub(super) streams: BTreeMap<StreamKey, Encoder>,
 }
 
 /// The host of a session: a state machine without sockets or clock; see [`super`].
 #[derive(Debug)]
 pub struct HostSession {
-    config: HostConfig,
-    peers: BTreeMap<PeerId, Peer>,
-    bodies: BTreeMap<BodyId, HostBody>,
-    out: VecDeque<Output>,
+    pub(super) config: HostConfig,
+    pub(super) peers: BTreeMap<PeerId, Peer>,
+    pub(super) bodies: BTreeMap<BodyId, HostBody>,
+    pub(super) out: VecDeque<Output>,
     events: VecDeque<HostEvent>,
     next_user: u16,
     dropped_events: u64,
@@ -446,97 +348,6 @@ impl HostSession {
         }
     }
 
-    /// Streams one step of a body to all guests.
-    ///
-    /// # Errors
-    /// [`StreamError::UnknownBody`], [`StreamError::TickOrder`], [`StreamError::NotFinite`] (also for numbers that are
-    /// absurdly large), [`StreamError::Length`], [`StreamError::Full`]; nothing is sent then.
-    pub fn publish(&mut self, now: Duration, body: BodyId, state: &TickState<'_>) -> Result<(), StreamError> {
-        let entry = self.bodies.get_mut(&body).ok_or(StreamError::UnknownBody(body))?;
-        check_state(entry, state)?;
-        let follows = entry.last.is_some_and(|last| last + 1 == state.tick);
-        let woke = entry.resting && !state.resting;
-        let slept = !entry.resting && state.resting;
-        let stays = entry.resting && state.resting;
-        entry.last = Some(state.tick);
-        entry.resting = state.resting;
-        if stays {
-            if now.saturating_sub(entry.reminded) < REMINDER && self.peers.values().all(|p| p.due.is_empty())
-            {
-                return Ok(());
-            }
-            entry.reminded = now;
-        }
-        // A pause in the ticks, or falling asleep: everybody takes the truth over anew. Waking up goes on from the state
-        // that all have, so nothing but a new run begins.
-        let anew = slept || (!follows && !woke && !stays);
-        if slept {
-            entry.reminded = now;
-        }
-
-        let mut keys: BTreeSet<(StreamWish, usize)> = BTreeSet::new();
-        let mut takers: Vec<(PeerId, (StreamWish, usize), bool)> = Vec::new();
-        for p in self.peers.values_mut() {
-            let Some(key) = p.wish.map(|w| stream_key(w, entry, p.max_datagram)) else { continue };
-            let due = p.due.contains(&body) && !p.transfers.iter().any(|t| t.hash == entry.hash);
-            if p.flowing.contains(&body) || due {
-                keys.insert(key);
-                takers.push((p.id, key, due));
-            }
-        }
-        entry.streams.retain(|key, _| keys.contains(key));
-        let mut frames: BTreeMap<(StreamWish, usize), (Option<Arc<[u8]>>, bool)> = BTreeMap::new();
-        for key in keys {
-            let encoder = match entry.streams.entry(key) {
-                std::collections::btree_map::Entry::Occupied(e) => e.into_mut(),
-                std::collections::btree_map::Entry::Vacant(e) => {
-                    let made = Encoder::new(
-                        body,
-                        entry.model.clone(),
-                        &entry.setup,
-                        self.config.newmark,
-                        key.0,
-                        key.1,
-                    );
-                    match made {
-                        Ok(encoder) => e.insert(encoder),
-                        Err(_) => continue,
-                    }
-                }
-            };
-            let fresh = encoder.is_fresh() || anew;
-            if fresh || stays {
-                encoder.restart(state);
-                frames.insert(key, (None, fresh));
-            } else {
-                if woke {
-                    encoder.begin_run(state.tick - 1);
-                }
-                frames.insert(key, (Some(encoder.encode(state)), false));
-            }
-        }
-        for (peer, key, due) in takers {
-            let Some((frame, fresh)) = frames.get(&key) else {
-                self.drop_peer(peer, EndReason::Path, true);
-                continue;
-            };
-            let Some(p) = self.peers.get_mut(&peer) else { continue };
-            if let Some(bytes) = frame
-                && p.flowing.contains(&body)
-                && !p.send_frame(bytes, &mut self.out)
-            {
-                // The path shrank since the key was taken; the next tick has the new size.
-                p.due.insert(body);
-            }
-            if due || *fresh || (stays && p.flowing.contains(&body)) {
-                p.due.remove(&body);
-                p.flowing.insert(body);
-                self.send_snapshot(peer, body);
-            }
-        }
-        Ok(())
-    }
-
     /// Sends what is due by now, and lets go of guests that are silent. Call once a frame and at
     /// [`HostSession::next_wakeup`].
     pub fn update(&mut self, now: Duration) {
@@ -657,7 +468,7 @@ impl HostSession {
         p.due.insert(body);
     }
 
-    fn send_snapshot(&mut self, peer: PeerId, body: BodyId) {
+    pub(super) fn send_snapshot(&mut self, peer: PeerId, body: BodyId) {
         let (Some(p), Some(b)) = (self.peers.get_mut(&peer), self.bodies.get(&body)) else { return };
         let Some(key) = p.wish.map(|w| stream_key(w, b, p.max_datagram)) else { return };
         if let Some(encoder) = b.streams.get(&key) {
@@ -680,7 +491,7 @@ impl HostSession {
         }
     }
 
-    fn drop_peer(&mut self, peer: PeerId, reason: EndReason, tell: bool) {
+    pub(super) fn drop_peer(&mut self, peer: PeerId, reason: EndReason, tell: bool) {
         let Some(mut p) = self.peers.remove(&peer) else { return };
         if tell {
             p.say_goodbye(reason, &mut self.out);
@@ -698,43 +509,7 @@ impl HostSession {
     }
 }
 
-fn stream_key(mut wish: StreamWish, body: &HostBody, limit: usize) -> (StreamWish, usize) {
+pub(super) fn stream_key(mut wish: StreamWish, body: &HostBody, limit: usize) -> StreamKey {
     wish.modes = Encoder::modes_for(&wish, body.model.mode_count(), limit) as u16;
     (wish, limit)
-}
-
-fn check_state(body: &HostBody, state: &TickState<'_>) -> Result<(), StreamError> {
-    if let Some(last) = body.last
-        && state.tick <= last
-    {
-        return Err(StreamError::TickOrder { last, found: state.tick });
-    }
-    if state.tick == 0 || state.tick >= TICK_LIMIT {
-        return Err(StreamError::TickOrder { last: 0, found: state.tick });
-    }
-    let modes = body.model.mode_count();
-    for (what, slice) in [("q", state.q), ("v", state.v), ("a", state.a)] {
-        if slice.is_empty() || slice.len() > modes {
-            return Err(StreamError::Length { what, found: slice.len(), expected: modes });
-        }
-    }
-    if !in_range(state.q) {
-        return Err(StreamError::NotFinite { what: "q" });
-    }
-    if !in_range(state.v) {
-        return Err(StreamError::NotFinite { what: "v" });
-    }
-    if !state.a.iter().all(|x| x.abs() <= WIDE_LIMIT) {
-        return Err(StreamError::NotFinite { what: "a" });
-    }
-    if state.grabs.len() > MAX_GRABS {
-        return Err(StreamError::Full { what: "grabs", limit: MAX_GRABS });
-    }
-    if !state.grabs.iter().all(crate::state::GrabState::is_valid) {
-        return Err(StreamError::NotFinite { what: "grab" });
-    }
-    if state.pose.is_some_and(|p| !p.is_valid()) {
-        return Err(StreamError::NotFinite { what: "pose" });
-    }
-    Ok(())
 }

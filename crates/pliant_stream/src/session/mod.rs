@@ -17,13 +17,18 @@
 
 mod guest;
 mod guest_body;
+mod guest_config;
 mod host;
+mod host_config;
 mod host_peer;
 mod outbox;
+mod publish;
 
-pub use guest::{GuestConfig, GuestEvent, GuestSession};
+pub use guest::GuestSession;
 pub use guest_body::BodyView;
-pub use host::{HostConfig, HostEvent, HostSession};
+pub use guest_config::{GuestConfig, GuestEvent};
+pub use host::HostSession;
+pub use host_config::{HostConfig, HostEvent};
 
 use std::time::Duration;
 

@@ -79,6 +79,10 @@ pub struct Clock {
 
 /// Everything that crosses the link unreliably. The sequence number counts all datagrams from this sender to this receiver.
 #[derive(Debug, Clone, PartialEq)]
+#[expect(
+    clippy::large_enum_variant,
+    reason = "lives on the stack between reading and use; a frame is the common case"
+)]
 pub enum Datagram {
     /// Host to guest: a tick of a body.
     Frame(Frame),

@@ -1,0 +1,108 @@
+//! Settings and events of a guest.
+
+use std::sync::Arc;
+use std::time::Duration;
+
+use pliant_modal::ModalModel;
+
+use super::EndReason;
+use crate::recovery::RecoveryConfig;
+use crate::state::{BodyId, UserId};
+
+/// Settings of a guest.
+#[derive(Debug, Clone, PartialEq)]
+pub struct GuestConfig {
+    /// A name for people, at most 64 bytes.
+    pub name: String,
+    /// Shown to the host's application, at most 1 KiB. Default: empty.
+    pub token: Vec<u8>,
+    /// How loss is repaired. Default: [`RecoveryConfig::default`].
+    pub recovery: RecoveryConfig,
+    /// Take at most so many modes of each body: for weak machines and thin links. Default: all.
+    pub modes: Option<u16>,
+    /// A host that is silent for so long is gone. Default: 10 s.
+    pub idle_timeout: Duration,
+}
+
+impl Default for GuestConfig {
+    fn default() -> Self {
+        Self {
+            name: "guest".to_owned(),
+            token: Vec::new(),
+            recovery: RecoveryConfig::default(),
+            modes: None,
+            idle_timeout: Duration::from_secs(10),
+        }
+    }
+}
+
+/// What happened at a guest.
+#[derive(Debug, Clone, PartialEq)]
+#[non_exhaustive]
+pub enum GuestEvent {
+    /// The host let us in.
+    Welcomed {
+        /// Our number.
+        user: UserId,
+    },
+    /// The host announced a body; its model may still be on the way.
+    BodyAnnounced {
+        /// Which.
+        body: BodyId,
+        /// Its name.
+        name: String,
+    },
+    /// Bytes of a model arrived.
+    ModelProgress {
+        /// Which model.
+        hash: [u8; 32],
+        /// Bytes that are here.
+        received: u64,
+        /// Bytes in all.
+        total: u64,
+    },
+    /// Model and state of a body are here: it can be shown.
+    BodyReady {
+        /// Which.
+        body: BodyId,
+        /// Its model, for the caller's cache too.
+        model: Arc<ModalModel>,
+    },
+    /// A body left the session.
+    BodyGone {
+        /// Which.
+        body: BodyId,
+    },
+    /// The state of a body was taken over anew.
+    Resynced {
+        /// Which.
+        body: BodyId,
+    },
+    /// Frames of a body fail: it stands still until they come again.
+    Stalled {
+        /// Which.
+        body: BodyId,
+    },
+    /// Somebody else came.
+    UserJoined {
+        /// Number.
+        user: UserId,
+        /// Name.
+        name: String,
+    },
+    /// Somebody else left.
+    UserLeft {
+        /// Number.
+        user: UserId,
+    },
+    /// The host did not accept one of our grabs, or ended it.
+    GrabRefused {
+        /// Our number for it.
+        grab: u16,
+    },
+    /// The session is over.
+    Closed {
+        /// Why.
+        reason: EndReason,
+    },
+}

@@ -1,0 +1,105 @@
+//! Settings and events of a host.
+
+use std::time::Duration;
+
+use super::EndReason;
+use crate::newmark::Newmark;
+use crate::state::{BodyId, GrabKey, PeerId, UserId};
+
+/// Settings of a host.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct HostConfig {
+    /// The step and the filter by which acceleration streams are read. Default: 1/40 s, and beta 4/9, gamma 5/6
+    /// (generalized-alpha with 0.5), which follows any host integrator without ringing. For the paper's own method with a
+    /// host that steps by average acceleration: [`Newmark::average`].
+    pub newmark: Newmark,
+    /// Most guests. Default: 256.
+    pub max_guests: usize,
+    /// A guest that is silent for so long is gone. Default: 10 s.
+    pub idle_timeout: Duration,
+    /// Bytes a second at which models are sent to one guest. Default: 1 MB/s.
+    pub model_rate: f64,
+    /// Answer a NACK only so much later: for remaking the paper's figures. Default: at once.
+    pub resend_after: Duration,
+    /// Take in everybody who says hello; else [`HostEvent::Knock`] asks and [`HostSession::accept`] answers. Default: true.
+    pub open: bool,
+}
+
+impl Default for HostConfig {
+    fn default() -> Self {
+        Self {
+            newmark: Newmark { h: 1.0 / 40.0, beta: 4.0 / 9.0, gamma: 5.0 / 6.0 },
+            max_guests: 256,
+            idle_timeout: Duration::from_secs(10),
+            model_rate: 1e6,
+            resend_after: Duration::ZERO,
+            open: true,
+        }
+    }
+}
+
+/// What happened at the host.
+#[derive(Debug, Clone, PartialEq)]
+#[non_exhaustive]
+pub enum HostEvent {
+    /// Somebody asks to come in; answer with [`HostSession::accept`] or [`HostSession::refuse`]. Not with `open`.
+    Knock {
+        /// Who.
+        peer: PeerId,
+        /// Their name.
+        name: String,
+        /// What they show.
+        token: Vec<u8>,
+    },
+    /// A guest is in.
+    Joined {
+        /// The connection.
+        peer: PeerId,
+        /// Their number.
+        user: UserId,
+        /// Their name.
+        name: String,
+        /// What they showed.
+        token: Vec<u8>,
+    },
+    /// A guest is gone; their grabs have ended ([`HostEvent::GrabEnded`] came before this).
+    Left {
+        /// The connection.
+        peer: PeerId,
+        /// Their number, if they had joined.
+        user: Option<UserId>,
+        /// Why.
+        reason: EndReason,
+    },
+    /// A hand takes hold: the application grabs its body, or says [`HostSession::refuse_grab`].
+    GrabBegan {
+        /// Whose and which.
+        key: GrabKey,
+        /// The body.
+        body: BodyId,
+        /// Centre of the patch.
+        vertex: u32,
+        /// Radius of the patch, m.
+        radius: f64,
+        /// Where the hand is, world, m.
+        target: [f64; 3],
+    },
+    /// A hand moves.
+    GrabMoved {
+        /// Whose and which.
+        key: GrabKey,
+        /// The body.
+        body: BodyId,
+        /// The guest's input counter; ascends.
+        input: u32,
+        /// Where the hand is, world, m.
+        target: [f64; 3],
+    },
+    /// A hand lets go.
+    GrabEnded {
+        /// Whose and which.
+        key: GrabKey,
+        /// The body.
+        body: BodyId,
+    },
+}

@@ -1,0 +1,152 @@
+//! From a step of the host to the frames of all its guests.
+
+use std::collections::{BTreeMap, BTreeSet};
+use std::sync::Arc;
+use std::time::Duration;
+
+use super::EndReason;
+use super::host::{HostBody, HostSession, StreamKey, stream_key};
+use crate::StreamError;
+use crate::encoder::Encoder;
+use crate::state::{BodyId, MAX_GRABS, PeerId, TICK_LIMIT, TickState, in_range};
+use crate::wire::WIDE_LIMIT;
+
+/// A resting body is recalled to its guests this often.
+const REMINDER: Duration = Duration::from_secs(1);
+
+/// What goes out to all takers of one kind of stream.
+struct Outgoing {
+    /// The frame; none where a snapshot takes its place.
+    frame: Option<Arc<[u8]>>,
+    /// All takers need a snapshot.
+    anew: bool,
+}
+
+impl HostSession {
+    /// Streams one step of a body to all guests.
+    ///
+    /// # Errors
+    /// [`StreamError::UnknownBody`], [`StreamError::TickOrder`], [`StreamError::NotFinite`] (also for numbers that are
+    /// absurdly large), [`StreamError::Length`], [`StreamError::Full`]; nothing is sent then.
+    pub fn publish(&mut self, now: Duration, body: BodyId, state: &TickState<'_>) -> Result<(), StreamError> {
+        let entry = self.bodies.get_mut(&body).ok_or(StreamError::UnknownBody(body))?;
+        check_state(entry, state)?;
+        let follows = entry.last.is_some_and(|last| last + 1 == state.tick);
+        let woke = entry.resting && !state.resting;
+        let slept = !entry.resting && state.resting;
+        let stays = entry.resting && state.resting;
+        entry.last = Some(state.tick);
+        entry.resting = state.resting;
+        if stays {
+            if now.saturating_sub(entry.reminded) < REMINDER && self.peers.values().all(|p| p.due.is_empty())
+            {
+                return Ok(());
+            }
+            entry.reminded = now;
+        }
+        // A pause in the ticks, or falling asleep: everybody takes the truth over anew. Waking up goes on from the state
+        // that all have, so nothing but a new run begins.
+        let anew = slept || (!follows && !woke && !stays);
+        if slept {
+            entry.reminded = now;
+        }
+
+        let mut keys: BTreeSet<StreamKey> = BTreeSet::new();
+        let mut takers: Vec<(PeerId, StreamKey, bool)> = Vec::new();
+        for p in self.peers.values_mut() {
+            let Some(key) = p.wish.map(|w| stream_key(w, entry, p.max_datagram)) else { continue };
+            let due = p.due.contains(&body) && !p.transfers.iter().any(|t| t.hash == entry.hash);
+            if p.flowing.contains(&body) || due {
+                keys.insert(key);
+                takers.push((p.id, key, due));
+            }
+        }
+        entry.streams.retain(|key, _| keys.contains(key));
+        let mut frames: BTreeMap<StreamKey, Outgoing> = BTreeMap::new();
+        for key in keys {
+            let encoder = match entry.streams.entry(key) {
+                std::collections::btree_map::Entry::Occupied(e) => e.into_mut(),
+                std::collections::btree_map::Entry::Vacant(e) => {
+                    let made = Encoder::new(
+                        body,
+                        entry.model.clone(),
+                        &entry.setup,
+                        self.config.newmark,
+                        key.0,
+                        key.1,
+                    );
+                    match made {
+                        Ok(encoder) => e.insert(encoder),
+                        Err(_) => continue,
+                    }
+                }
+            };
+            let fresh = encoder.is_fresh() || anew;
+            if fresh || stays {
+                encoder.restart(state);
+                frames.insert(key, Outgoing { frame: None, anew: fresh });
+            } else {
+                if woke {
+                    encoder.begin_run(state.tick - 1);
+                }
+                frames.insert(key, Outgoing { frame: Some(encoder.encode(state)), anew: false });
+            }
+        }
+        for (peer, key, due) in takers {
+            let Some(Outgoing { frame, anew: fresh }) = frames.get(&key) else {
+                self.drop_peer(peer, EndReason::Path, true);
+                continue;
+            };
+            let Some(p) = self.peers.get_mut(&peer) else { continue };
+            if let Some(bytes) = frame
+                && p.flowing.contains(&body)
+                && !p.send_frame(bytes, &mut self.out)
+            {
+                // The path shrank since the key was taken; the next tick has the new size.
+                p.due.insert(body);
+            }
+            if due || *fresh || (stays && p.flowing.contains(&body)) {
+                p.due.remove(&body);
+                p.flowing.insert(body);
+                self.send_snapshot(peer, body);
+            }
+        }
+        Ok(())
+    }
+}
+
+fn check_state(body: &HostBody, state: &TickState<'_>) -> Result<(), StreamError> {
+    if let Some(last) = body.last
+        && state.tick <= last
+    {
+        return Err(StreamError::TickOrder { last, found: state.tick });
+    }
+    if state.tick == 0 || state.tick >= TICK_LIMIT {
+        return Err(StreamError::TickOrder { last: 0, found: state.tick });
+    }
+    let modes = body.model.mode_count();
+    for (what, slice) in [("q", state.q), ("v", state.v), ("a", state.a)] {
+        if slice.is_empty() || slice.len() > modes {
+            return Err(StreamError::Length { what, found: slice.len(), expected: modes });
+        }
+    }
+    if !in_range(state.q) {
+        return Err(StreamError::NotFinite { what: "q" });
+    }
+    if !in_range(state.v) {
+        return Err(StreamError::NotFinite { what: "v" });
+    }
+    if !state.a.iter().all(|x| x.abs() <= WIDE_LIMIT) {
+        return Err(StreamError::NotFinite { what: "a" });
+    }
+    if state.grabs.len() > MAX_GRABS {
+        return Err(StreamError::Full { what: "grabs", limit: MAX_GRABS });
+    }
+    if !state.grabs.iter().all(crate::state::GrabState::is_valid) {
+        return Err(StreamError::NotFinite { what: "grab" });
+    }
+    if state.pose.is_some_and(|p| !p.is_valid()) {
+        return Err(StreamError::NotFinite { what: "pose" });
+    }
+    Ok(())
+}
