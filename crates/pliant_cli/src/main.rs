@@ -1,3 +1,69 @@
-//! The `pliant` program: mesh, bake, inspect.
-//! The pliant program: mesh, bake, inspect.
-fn main() {}
+//! The `pliant` program: meshes, bakes and inspects soft bodies.
+//!
+//! Whatever is wrong with the input ends in one message on stderr and exit code 2; an output file appears whole or not
+//! at all. Progress bars go to stderr when it is a terminal.
+
+mod bake;
+mod inspect;
+mod mesh;
+mod output;
+mod progress;
+
+use std::process::ExitCode;
+
+use clap::{Parser, Subcommand};
+
+/// Soft bodies from meshes: tetrahedra, vibration modes, models.
+#[derive(Parser, Debug)]
+#[command(name = "pliant", version, about, arg_required_else_help = true)]
+struct Cli {
+    #[command(subcommand)]
+    command: Command,
+}
+
+#[derive(Subcommand, Debug)]
+enum Command {
+    /// Makes tetrahedra: of a simple shape, or of what a surface or a scene encloses
+    Mesh(mesh::MeshArgs),
+    /// Bakes a surface, a scene or tetrahedra into a model
+    Bake(bake::BakeArgs),
+    /// Tells what is in a model
+    Inspect(inspect::InspectArgs),
+}
+
+fn main() -> ExitCode {
+    // Clap itself leaves with code 2 and its message when the arguments are wrong.
+    let done = match Cli::parse().command {
+        Command::Mesh(args) => mesh::run(args),
+        Command::Bake(args) => bake::run(args),
+        Command::Inspect(args) => inspect::run(&args),
+    };
+    match done {
+        Ok(()) => ExitCode::SUCCESS,
+        Err(error) => {
+            eprintln!("pliant: {error}");
+            ExitCode::from(2)
+        }
+    }
+}
+
+/// Why the program stops.
+#[derive(Debug, thiserror::Error)]
+enum CliError {
+    #[error("{0}")]
+    Mesh(#[from] pliant_mesh::MeshError),
+    #[error("{0}")]
+    Bake(#[from] pliant_bake::BakeError),
+    #[error("{0}")]
+    File(#[from] pliant_modal::FileError),
+    #[error("--tets: {0} holds tetrahedra already; expected a surface or a scene, or no --tets")]
+    TetsGiven(std::path::PathBuf),
+    #[error("--threads: expected 1 to {most}, got {got}")]
+    Threads { got: usize, most: usize },
+    #[error("--output: the folder {0} is not there")]
+    NoFolder(std::path::PathBuf),
+    #[error("{input} holds no model: {source}")]
+    NotAModel { input: std::path::PathBuf, source: pliant_modal::FileError },
+    #[error("cannot print: {0}")]
+    Print(#[from] std::io::Error),
+}

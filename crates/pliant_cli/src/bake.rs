@@ -1,0 +1,164 @@
+//! `pliant bake`.
+
+use std::path::PathBuf;
+use std::time::Instant;
+
+use clap::Args;
+use pliant_bake::{Anchor, BakeConfig, Stage};
+use pliant_mesh::io;
+use pliant_modal::{Damping, Element};
+use serde::Serialize;
+
+use crate::output::{self, Summary};
+use crate::progress::Bar;
+use crate::{CliError, mesh};
+
+const MAX_THREADS: usize = 1024;
+
+#[derive(Args, Debug)]
+pub(crate) struct BakeArgs {
+    /// A closed surface (.obj, .stl, .ply, .gltf, .glb), a scene (.ron) or tetrahedra (.msh, .vtk, .mesh, .veg)
+    input: PathBuf,
+    /// About how many tetrahedra to fill a surface or a scene with [default: 10000]
+    #[arg(long)]
+    tets: Option<usize>,
+    /// Finite element: tet4 or tet10
+    #[arg(long, default_value = "tet10", value_parser = element)]
+    element: Element,
+    /// Elastic modes to keep
+    #[arg(long, default_value_t = 60)]
+    modes: usize,
+    /// Young's modulus, Pa
+    #[arg(long, value_name = "PA", default_value_t = 1e5, allow_hyphen_values = true)]
+    young: f64,
+    /// Poisson ratio, above -1 and below 0.5
+    #[arg(long, value_name = "NU", default_value_t = 0.4, allow_hyphen_values = true)]
+    poisson: f64,
+    /// Density, kg/m^3
+    #[arg(long, value_name = "KG_M3", default_value_t = 1000.0, allow_hyphen_values = true)]
+    density: f64,
+    /// Rayleigh damping: c = A + B omega^2, A in 1/s, B in s
+    #[arg(long, value_name = "A,B", value_parser = rayleigh, conflicts_with = "damping_ratio", allow_hyphen_values = true)]
+    rayleigh: Option<[f64; 2]>,
+    /// Fraction of critical damping in every mode [default: 0.03]
+    #[arg(long, value_name = "Z", allow_hyphen_values = true)]
+    damping_ratio: Option<f64>,
+    /// Holds the nodes of a half-space fixed, such as 'x<0.01' (m); may be given several times. None: a free body
+    #[arg(long = "anchor", value_name = "AXIS<NUMBER", allow_hyphen_values = true)]
+    anchors: Vec<Anchor>,
+    /// A surface to wear instead of the tetrahedra's boundary; it moves with them
+    #[arg(long, value_name = "SURFACE")]
+    skin: Option<PathBuf>,
+    /// Writes K.mtx and M.mtx (MatrixMarket) into this folder
+    #[arg(long, value_name = "DIR")]
+    export_matrices: Option<PathBuf>,
+    /// Threads to use [default: one a core]. The result is the same to the bit
+    #[arg(long)]
+    threads: Option<usize>,
+    /// The model to write
+    #[arg(short, long, value_name = "X.modal")]
+    output: PathBuf,
+    /// Prints JSON: what `inspect --json` tells and the seconds spent
+    #[arg(long)]
+    json: bool,
+}
+
+fn element(text: &str) -> Result<Element, String> {
+    match text {
+        "tet4" => Ok(Element::Tet4),
+        "tet10" => Ok(Element::Tet10),
+        _ => Err("expected tet4 or tet10".to_owned()),
+    }
+}
+
+fn rayleigh(text: &str) -> Result<[f64; 2], String> {
+    let expected = "expected two numbers with a comma between them, A in 1/s and B in s";
+    let (a, b) = text.split_once(',').ok_or(expected)?;
+    let number = |text: &str| text.trim().parse().map_err(|_| expected.to_owned());
+    Ok([number(a)?, number(b)?])
+}
+
+#[derive(Serialize)]
+struct Report {
+    #[serde(flatten)]
+    summary: Summary,
+    seconds: Seconds,
+}
+
+#[derive(Serialize)]
+struct Seconds {
+    mesh: f64,
+    assemble: f64,
+    factor: f64,
+    modes: f64,
+    surface: f64,
+    total: f64,
+}
+
+pub(crate) fn run(args: BakeArgs) -> Result<(), CliError> {
+    let start = Instant::now();
+    if let Some(got) = args.threads {
+        let wrong = CliError::Threads { got, most: MAX_THREADS };
+        if !(1..=MAX_THREADS).contains(&got)
+            || rayon::ThreadPoolBuilder::new().num_threads(got).build_global().is_err()
+        {
+            return Err(wrong);
+        }
+    }
+    let name = args.input.file_stem().map(|stem| stem.to_string_lossy().into_owned()).unwrap_or_default();
+    let defaults = BakeConfig::default();
+    let damping = match (args.rayleigh, args.damping_ratio) {
+        (Some([alpha, beta]), _) => Damping::Rayleigh { alpha, beta },
+        (None, Some(zeta)) => Damping::Ratio(zeta),
+        (None, None) => defaults.damping,
+    };
+    let config = BakeConfig {
+        name,
+        element: args.element,
+        modes: args.modes,
+        young: args.young,
+        poisson: args.poisson,
+        density: args.density,
+        damping,
+        anchors: args.anchors,
+        export_matrices: args.export_matrices,
+        ..defaults
+    };
+    // Cheap refusals before the long work.
+    config.check()?;
+    output::check_folder(&args.output)?;
+
+    let mut bar = Bar::new();
+    let skin = args.skin.map(io::read_surface).transpose()?;
+    let mesh = mesh::fill(&args.input, args.tets, &mut bar)?;
+    let mesh_seconds = start.elapsed().as_secs_f64();
+    let baked = pliant_bake::bake(&mesh, skin.as_ref(), &config, &mut |stage, share| {
+        let stage = match stage {
+            Stage::Assemble => "assemble",
+            Stage::Factor => "factor",
+            Stage::Modes => "modes",
+            Stage::Surface => "surface",
+        };
+        bar.report(stage, share);
+    })?;
+    baked.model.write(&args.output)?;
+    drop(bar);
+
+    let times = baked.times;
+    let seconds = Seconds {
+        mesh: mesh_seconds,
+        assemble: times.assemble,
+        factor: times.factor,
+        modes: times.modes,
+        surface: times.surface,
+        total: start.elapsed().as_secs_f64(),
+    };
+    if args.json {
+        return output::print_json(&Report { summary: Summary::new(&baked.model), seconds });
+    }
+    output::print(&output::table(&baked.model))?;
+    output::print(&format!(
+        "seconds          mesh {:.2}, assemble {:.2}, factor {:.2}, modes {:.2}, surface {:.2}, total {:.2}",
+        seconds.mesh, seconds.assemble, seconds.factor, seconds.modes, seconds.surface, seconds.total
+    ))
+}

@@ -1,0 +1,37 @@
+//! A progress bar on stderr where that is a terminal, silence elsewhere.
+
+use indicatif::{ProgressBar, ProgressDrawTarget, ProgressStyle};
+
+const STEPS: u64 = 1000;
+
+/// One bar that goes through the named stages of a job.
+pub(crate) struct Bar {
+    bar: ProgressBar,
+    stage: &'static str,
+}
+
+impl Bar {
+    pub(crate) fn new() -> Self {
+        // indicatif draws nothing when stderr is no terminal.
+        let bar = ProgressBar::with_draw_target(Some(STEPS), ProgressDrawTarget::stderr());
+        if let Ok(style) = ProgressStyle::with_template("{msg:>10} [{bar:40}] {percent:>3} % {elapsed}") {
+            bar.set_style(style.progress_chars("=> "));
+        }
+        Self { bar, stage: "" }
+    }
+
+    /// `share` of the stage is done, 0 to 1.
+    pub(crate) fn report(&mut self, stage: &'static str, share: f64) {
+        if self.stage != stage {
+            self.stage = stage;
+            self.bar.set_message(stage);
+        }
+        self.bar.set_position((share.clamp(0.0, 1.0) * STEPS as f64) as u64);
+    }
+}
+
+impl Drop for Bar {
+    fn drop(&mut self) {
+        self.bar.finish_and_clear();
+    }
+}
