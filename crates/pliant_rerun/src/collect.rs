@@ -30,6 +30,10 @@ pub(crate) struct Collector {
     measured: HashMap<String, Instant>,
 }
 
+/// Hands that are not entities here: those of a session's other users.
+#[derive(Resource, Default)]
+pub(crate) struct OtherHands(pub Vec<Hand>);
+
 struct Followed {
     drawn: Arc<Drawn>,
     version: u64,
@@ -98,6 +102,7 @@ pub(crate) fn collect(
     time: Res<Time>,
     diagnostics: Option<Res<DiagnosticsStore>>,
     mut refused: MessageReader<BodyRefused>,
+    others: Res<OtherHands>,
     bodies: Bodies,
     grabs: Query<(Entity, Option<&Name>, &Grab, &GrabForce)>,
 ) {
@@ -121,9 +126,11 @@ pub(crate) fn collect(
 
     let mut hands: Vec<_> = grabs.iter().collect();
     hands.sort_by_key(|(entity, ..)| *entity);
+    let hands = hands.into_iter().map(|(_, name, grab, force)| hand(name, grab, force));
+    let hands: Vec<Hand> = hands.chain(others.0.iter().cloned()).collect();
     if !hands.is_empty() || collector.had_hands {
         collector.had_hands = !hands.is_empty();
-        frame.hands = Some(hands.into_iter().map(|(_, name, grab, force)| hand(name, grab, force)).collect());
+        frame.hands = Some(hands);
     }
     if let Some(diagnostics) = &diagnostics {
         frame.scalars.extend(measurements(&mut collector.measured, diagnostics));

@@ -20,6 +20,8 @@
 //! | any other | what anybody sets in [`RerunScalars`] |
 //! | `log` | what was refused, and what is written with [`RerunScalars::say`] |
 //!
+//! With the feature `net`, the hands of a session's other users are among the hands, and who comes and goes is in the log.
+//!
 //! A layout comes with the recording: the scene beside a plot for each kind of figure.
 //!
 //! The app never waits: one thread a sink logs from a bounded queue, which drops and counts what it has no room for
@@ -33,6 +35,8 @@
 mod blueprint;
 mod collect;
 mod frame;
+#[cfg(feature = "net")]
+mod net;
 mod plugin;
 mod recorder;
 mod scalars;

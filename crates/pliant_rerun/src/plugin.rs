@@ -188,6 +188,7 @@ impl Plugin for RerunPlugin {
             return;
         }
         app.insert_resource(collect::Collector::new(workers, self.shapes_hz))
+            .init_resource::<collect::OtherHands>()
             .add_systems(
                 self.schedule,
                 collect::collect
@@ -196,5 +197,21 @@ impl Plugin for RerunPlugin {
                     .run_if(collect::somebody_listens),
             )
             .add_systems(Last, collect::close_at_exit.run_if(on_message::<AppExit>));
+        #[cfg(feature = "net")]
+        app.add_systems(
+            self.schedule,
+            (
+                crate::net::say_who_comes_and_goes.run_if(
+                    resource_exists::<Messages<pliant_net::UserJoined>>
+                        .and_then(resource_exists::<Messages<pliant_net::UserLeft>>)
+                        .and_then(resource_exists::<Messages<pliant_net::GrabRefused>>)
+                        .and_then(resource_exists::<Messages<pliant_net::SessionClosed>>),
+                ),
+                crate::net::see_other_hands,
+            )
+                .after(PliantSystems::Publish)
+                .before(RerunSystems)
+                .run_if(collect::somebody_listens),
+        );
     }
 }

@@ -242,17 +242,30 @@ impl Recorder {
                 .map(|n| if n == 1 { hand.name.to_string() } else { format!("{} {n}", hand.name) })
                 .find(|name| !used.contains(name))
                 .unwrap_or_default();
-            self.scalar(&format!("reaction/{name}"), "N", magnitude(&hand.force))?;
+            // The line in the plot has the colour of the arrow.
+            let colour = colour_of(used.len());
+            self.coloured_scalar(&format!("reaction/{name}"), "N", magnitude(&hand.force), Some(colour))?;
             used.insert(name);
         }
         Ok(())
     }
 
     fn scalar(&mut self, name: &str, unit: &str, value: f64) -> Result<(), RecordingStreamError> {
+        self.coloured_scalar(name, unit, value, None)
+    }
+
+    fn coloured_scalar(
+        &mut self,
+        name: &str,
+        unit: &str,
+        value: f64,
+        colour: Option<Color>,
+    ) -> Result<(), RecordingStreamError> {
         let entity = path(name);
         if self.plots.note(name, unit) {
             let label = name.split_once('/').map_or(name, |(_, rest)| rest);
             let series = SeriesLines::new().with_names([label]).with_widths([1.5]);
+            let series = colour.map_or(series.clone(), |colour| series.with_colors([colour]));
             self.stream.log_static(entity.clone(), &series)?;
         }
         self.stream.log(entity, &Scalars::single(value))

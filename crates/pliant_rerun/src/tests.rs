@@ -1,1 +1,338 @@
+use std::{
+    path::{Path, PathBuf},
+    sync::Arc,
+    time::{Duration, Instant},
+};
 
+use bevy::{math::DVec3, prelude::*, time::TimeUpdateStrategy, transform::TransformPlugin};
+use pliant_body::{Driven, Grab, GrabOf, ModalAsset, ModalBody, PliantBodyPlugin, ShownState};
+use pliant_modal::{BakeInfo, Damping, Element, ModalModel, ModelParts, SurfaceMesh};
+use rerun::{
+    RecordingStreamBuilder,
+    log::{Chunk, LogMsg},
+    sink::MemorySinkStorage,
+};
+
+use crate::{
+    RerunPlugin, RerunScalars, RerunStats, RerunStyle,
+    blueprint::Plots,
+    frame::{Drawn, Frame, Hand, Line, Place, Scalar, Shape},
+    recorder::Recorder,
+};
+
+/// A unit square in the plane z = 0 on which one mode lifts the far side (y = 1) by q metres.
+fn square() -> ModalModel {
+    let positions = vec![[0.0, 0.0, 0.0], [1.0, 0.0, 0.0], [1.0, 1.0, 0.0], [0.0, 1.0, 0.0]];
+    let surface = SurfaceMesh::new(positions, vec![[0, 1, 2], [0, 2, 3]], None, Vec::new()).unwrap();
+    ModalModel::from_parts(ModelParts {
+        info: BakeInfo {
+            name: "square".into(),
+            tets: 0,
+            nodes: 0,
+            element: Element::Tet4,
+            young: 1e5,
+            poisson: 0.3,
+            density: 1000.0,
+            damping: Damping::Ratio(0.1),
+            anchors: vec!["y<0.1".into()],
+            residual_max: 0.0,
+            orthonormality_max: 0.0,
+        },
+        surface,
+        omega: vec![6.0],
+        damping: vec![1.2],
+        displacement: vec![0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 1.0],
+        rotation: vec![0.0; 12],
+        participation: vec![[0.0, 0.0, 0.5]],
+        free: false,
+        mass: 1.0,
+        center_of_mass: [0.5, 0.5, 0.0],
+        inertia: [[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]],
+        sites: Vec::new(),
+    })
+    .unwrap()
+}
+
+const HERE: Place = Place { translation: [0.0, 1.0, 0.0], rotation: [0.0, 0.0, 0.0, 1.0], scale: 2.0 };
+
+fn body() -> Arc<Drawn> {
+    Arc::new(Drawn {
+        path: "my/body".replace('/', " ").into(),
+        model: Arc::new(square()),
+        style: RerunStyle::Surface,
+    })
+}
+
+fn frame(tick: u64, body: &Arc<Drawn>, q: f32) -> Frame {
+    let shape = Shape { body: body.clone(), q: vec![q], warped: false, place: HERE, draw: true };
+    Frame {
+        tick,
+        time: tick as f64 / 40.0,
+        wall: 1.7e9 + tick as f64 / 40.0,
+        arrived: if tick == 1 { vec![body.clone()] } else { Vec::new() },
+        shapes: vec![shape],
+        ..Frame::default()
+    }
+}
+
+fn recorder() -> (Recorder, rerun::RecordingStream, MemorySinkStorage) {
+    let (stream, storage) = RecordingStreamBuilder::new("pliant_test").memory().unwrap();
+    (Recorder::new(stream.clone(), Plots::default()), stream, storage)
+}
+
+/// The chunks of the recording itself (not of its layout) for one path, in order.
+fn chunks(messages: &[LogMsg], path: &str) -> Vec<Chunk> {
+    let data = messages.iter().filter_map(|message| match message {
+        LogMsg::ArrowMsg(store, data) if store.is_recording() => Some(Chunk::from_arrow_msg(data).unwrap()),
+        _ => None,
+    });
+    data.filter(|chunk| chunk.entity_path().to_string() == path).collect()
+}
+
+/// How many rows have the component whose name ends so.
+fn rows(messages: &[LogMsg], path: &str, component: &str) -> usize {
+    let of = |chunk: &Chunk| {
+        let found =
+            chunk.components().values().find(|column| column.descriptor.to_string().ends_with(component));
+        found.map_or(0, |column| column.list_array.iter().filter(Option::is_some).count())
+    };
+    chunks(messages, path).iter().map(of).sum()
+}
+
+#[test]
+fn a_body_is_told_once_and_its_positions_every_time() {
+    let (mut recorder, stream, storage) = recorder();
+    let body = body();
+    for tick in 1..=10 {
+        recorder.log(&frame(tick, &body, 0.1 * tick as f32)).unwrap();
+    }
+    recorder.end();
+    drop(stream);
+    let messages = storage.take();
+    let path = "/world/my\\ body";
+    assert_eq!(rows(&messages, path, "triangle_indices"), 1);
+    assert_eq!(rows(&messages, path, "vertex_positions"), 10);
+    assert_eq!(rows(&messages, path, "vertex_normals"), 10);
+    assert_eq!(rows(&messages, path, "translation"), 1, "it did not move");
+    for chunk in chunks(&messages, path) {
+        let mut timelines: Vec<String> = chunk.timelines().keys().map(ToString::to_string).collect();
+        timelines.sort();
+        assert_eq!(timelines, ["sim_time", "tick", "wall_time"]);
+    }
+}
+
+#[test]
+fn figures_have_their_values_and_the_displacement_is_in_the_world() {
+    let (mut recorder, stream, storage) = recorder();
+    let body = body();
+    for tick in 1..=4 {
+        let mut frame = frame(tick, &body, 0.25 * tick as f32);
+        frame.scalars.push(Scalar { path: "net/round trip".into(), unit: "ms".into(), value: 196.0 });
+        recorder.log(&frame).unwrap();
+    }
+    recorder.end();
+    drop(stream);
+    let messages = storage.take();
+    let values = |path: &str| -> Vec<f64> {
+        let mut values = Vec::new();
+        for chunk in chunks(&messages, path) {
+            for column in chunk.components().values() {
+                if column.descriptor.to_string().ends_with("scalars") {
+                    let array = column.list_array.values();
+                    let array = array.as_any().downcast_ref::<rerun::external::arrow::array::Float64Array>();
+                    values.extend(array.unwrap().values().iter().copied());
+                }
+            }
+        }
+        values
+    };
+    // One mode lifts the far side by q; the body is drawn twice as large.
+    assert_eq!(values("/displacement/my\\ body"), [0.5, 1.0, 1.5, 2.0]);
+    assert_eq!(values("/net/round\\ trip"), [196.0; 4]);
+}
+
+#[test]
+fn hands_of_one_name_are_two_lines_and_an_empty_hand_clears_the_arrows() {
+    let (mut recorder, stream, storage) = recorder();
+    let hand = Hand { name: "hand".into(), force: [3.0, 4.0, 0.0], point: [0.0; 3], target: [0.0; 3] };
+    let line = Line { warning: true, text: "watch out".into() };
+    recorder
+        .log(&Frame { tick: 1, hands: Some(vec![hand.clone(), hand]), lines: vec![line], ..Frame::default() })
+        .unwrap();
+    recorder.log(&Frame { tick: 2, hands: Some(Vec::new()), ..Frame::default() }).unwrap();
+    recorder.end();
+    drop(stream);
+    let messages = storage.take();
+    assert_eq!(rows(&messages, "/reaction/hand", "scalars"), 1);
+    assert_eq!(rows(&messages, "/reaction/hand\\ 2", "scalars"), 1);
+    assert_eq!(rows(&messages, "/world/hands/reactions", "vectors"), 2);
+    assert_eq!(rows(&messages, "/log", "text"), 1);
+}
+
+#[test]
+fn the_layout_ships_with_the_recording_and_is_made_active() {
+    let (mut recorder, stream, storage) = recorder();
+    let body = body();
+    recorder.log(&frame(1, &body, 0.1)).unwrap();
+    recorder.end();
+    drop(stream);
+    let messages = storage.take();
+    let activated = messages.iter().any(
+        |message| matches!(message, LogMsg::BlueprintActivationCommand(command) if command.make_active && command.make_default),
+    );
+    assert!(activated);
+    let views = messages.iter().filter(|message| match message {
+        LogMsg::ArrowMsg(store, data) if store.is_blueprint() => {
+            Chunk::from_arrow_msg(data).unwrap().entity_path().to_string().starts_with("/view/")
+        }
+        _ => false,
+    });
+    assert!(views.count() >= 2, "the scene and the plot of the displacement");
+}
+
+#[test]
+fn figures_of_two_units_get_two_plots() {
+    let mut plots = Plots::default();
+    assert!(plots.note("net/loss_in", "%"));
+    assert!(plots.note("net/loss_out", "%"));
+    assert!(plots.note("net/round_trip", "ms"));
+    assert!(!plots.note("net/loss_in", "%"), "known");
+    assert!(plots.take_changed() && !plots.take_changed());
+}
+
+fn app(plugin: RerunPlugin) -> App {
+    let mut app = App::new();
+    app.add_plugins((MinimalPlugins, AssetPlugin::default(), TransformPlugin, PliantBodyPlugin::default()))
+        .insert_resource(Time::<Fixed>::from_seconds(1.0 / 40.0))
+        .insert_resource(TimeUpdateStrategy::FixedTimesteps(1))
+        .add_plugins(plugin);
+    app.update();
+    let model = app.world_mut().resource_mut::<Assets<ModalAsset>>().add(ModalAsset::from(square()));
+    let body = app.world_mut().spawn((ModalBody::new(model), Name::new("square"))).id();
+    app.world_mut().spawn((Grab::new(2, 0.0, DVec3::new(1.0, 1.0, 0.1)), GrabOf(body), Name::new("hand")));
+    app
+}
+
+fn scratch(name: &str) -> PathBuf {
+    std::env::temp_dir().join(format!("pliant_rerun_{}_{name}.rrd", std::process::id()))
+}
+
+/// A whole recording ends with the footer that its encoder writes last.
+fn is_whole(path: &Path) -> bool {
+    let bytes = std::fs::read(path).unwrap();
+    bytes.starts_with(b"RRF2")
+        && bytes.len() > 1000
+        && bytes[bytes.len() - 64..].windows(4).any(|w| w == b"RRF2")
+}
+
+#[test]
+fn a_file_is_whole_when_the_app_says_exit_and_when_it_is_only_dropped() {
+    for (name, exits) in [("exit", true), ("drop", false)] {
+        let path = scratch(name);
+        let mut app = app(RerunPlugin::file(&path));
+        for _ in 0..40 {
+            app.update();
+        }
+        let stats = *app.world().resource::<RerunStats>();
+        assert_eq!((stats.collected, stats.dropped, stats.sinks), (40, 0, 1), "the first update has no tick");
+        if exits {
+            app.world_mut().write_message(AppExit::Success);
+            app.update();
+            assert!(is_whole(&path), "{name}");
+        }
+        drop(app);
+        assert!(is_whole(&path), "{name}");
+        std::fs::remove_file(path).unwrap();
+    }
+}
+
+#[test]
+fn a_file_is_whole_after_a_panic() {
+    let path = scratch("panic");
+    let moved = path.clone();
+    let fell = std::thread::spawn(move || {
+        let mut app = app(RerunPlugin::file(&moved));
+        app.add_systems(Update, |tick: Res<pliant_body::PliantTick>| assert!(tick.0 < 20, "on purpose"));
+        (0..100).for_each(|_| app.update());
+    });
+    assert!(fell.join().is_err());
+    assert!(is_whole(&path));
+    std::fs::remove_file(path).unwrap();
+}
+
+#[test]
+fn without_a_viewer_nothing_is_lost_but_the_recording() {
+    // A port that was free a moment ago, and no viewer started on it.
+    let port = std::net::TcpListener::bind("127.0.0.1:0").unwrap().local_addr().unwrap().port();
+    let mut app = app(RerunPlugin::viewer().with_viewer_port(port).with_spawn(false));
+    let start = Instant::now();
+    while app.world().resource::<RerunStats>().sinks > 0
+        || app.world().resource::<RerunStats>().collected == 0
+    {
+        app.update();
+        assert!(start.elapsed() < Duration::from_secs(10), "still waiting for a viewer");
+        std::thread::sleep(Duration::from_millis(1));
+    }
+    let collected = app.world().resource::<RerunStats>().collected;
+    (0..20).for_each(|_| app.update());
+    assert_eq!(app.world().resource::<RerunStats>().collected, collected, "nothing is collected for nobody");
+    let start = Instant::now();
+    drop(app);
+    assert!(start.elapsed() < Duration::from_secs(2), "the end does not wait for it either");
+}
+
+#[test]
+fn a_viewer_that_does_not_read_drops_ticks_and_never_holds_the_app_up() {
+    // It listens and accepts, and then says nothing: the worst kind.
+    let listener = std::net::TcpListener::bind("127.0.0.1:0").unwrap();
+    let port = listener.local_addr().unwrap().port();
+    let mut app = app(RerunPlugin::viewer().with_viewer_port(port).with_spawn(false).with_queue(4));
+    let mut longest = Duration::ZERO;
+    let start = Instant::now();
+    while app.world().resource::<RerunStats>().dropped == 0 {
+        let one = Instant::now();
+        app.update();
+        longest = longest.max(one.elapsed());
+        assert!(start.elapsed() < Duration::from_secs(60), "the queue never filled");
+    }
+    // A millisecond is usual for this app in an unoptimised build; waiting for the viewer would be seconds.
+    assert!(longest < Duration::from_millis(500), "{longest:?}");
+    drop(listener);
+}
+
+#[test]
+fn a_path_that_cannot_be_written_leaves_the_app_running() {
+    let mut app = app(RerunPlugin::file("/nonexistent/folder/x.rrd"));
+    app.update();
+    assert_eq!(app.world().resource::<RerunStats>().collected, 0);
+    // Figures that nobody takes do not pile up.
+    let mut figures = app.world_mut().resource_mut::<RerunScalars>();
+    for i in 0..10_000 {
+        figures.set(format!("a/{i}"), "", 1.0);
+        figures.say("b");
+    }
+    assert!(figures.scalars.len() <= 4096 && figures.lines.len() <= 4096);
+}
+
+#[test]
+fn a_resting_body_is_not_sent() {
+    let path = scratch("rest");
+    let mut app = app(RerunPlugin::file(&path));
+    let body = app.world_mut().query_filtered::<Entity, With<ModalBody>>().single(app.world()).unwrap();
+    app.world_mut().entity_mut(body).insert(Driven::Remote);
+    (0..40).for_each(|_| app.update());
+    let size = |path: &Path| std::fs::metadata(path).unwrap().len();
+    std::thread::sleep(Duration::from_millis(600));
+    let before = app.world().get::<ShownState>(body).unwrap().version();
+    let bytes = size(&path);
+    (0..400).for_each(|_| app.update());
+    assert_eq!(app.world().get::<ShownState>(body).unwrap().version(), before);
+    std::thread::sleep(Duration::from_millis(600));
+    // 400 ticks of the hand's arrow and figures, and not one of the 200 drawings, each of which has a path of its own in the file.
+    let drawings = std::fs::read(&path).unwrap();
+    let drawings = drawings.windows(16).filter(|w| w == b"vertex_positions").count();
+    assert!(size(&path) > bytes, "figures go on");
+    assert!(drawings <= 8, "{drawings} chunks with positions");
+    drop(app);
+    std::fs::remove_file(path).unwrap();
+}
