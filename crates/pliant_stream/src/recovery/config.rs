@@ -56,7 +56,7 @@ pub struct RecoveryConfig {
     pub coding: AccelerationCoding,
     /// Earlier ticks that each frame repeats, 0..=7. Default: 3.
     pub repeats: u8,
-    /// A full refresh of (q, v) every so many frames; 0 for never. Default: 10.
+    /// Each frame carries the absolute (q, v) of one in so many modes, those most in need first; 0 for never. Default: 12.
     pub refresh: u8,
     /// Ask again for what is missing. Default: true.
     pub nack: bool,
@@ -69,14 +69,14 @@ pub struct RecoveryConfig {
 }
 
 impl Default for RecoveryConfig {
-    /// The better way of the design: force-driven, three repeats, a refresh every 10 frames, NACK, snapshots, one tick of
+    /// The better way of the design: force-driven, three repeats, a refresh every 12 frames, NACK, snapshots, one tick of
     /// playout delay.
     fn default() -> Self {
         Self {
             policy: Policy::ForceDriven { blend_ticks: 6 },
             coding: AccelerationCoding::Scaled16,
             repeats: 3,
-            refresh: 10,
+            refresh: 12,
             nack: true,
             snapshots: true,
             playout: Playout::Fixed(1),

@@ -14,7 +14,7 @@ use crate::wire::{BodyInfo, Frame, MAX_NACK_RUNS, Nack, NackRun, Payload, Snapsh
 /// Frames that wait for the snapshot.
 const WAITING: usize = HISTORY;
 /// A missing tick is asked for at most so often.
-const ASKS: u8 = 8;
+const ASKS: u8 = 12;
 /// Ticks older than this are not asked for any more.
 const ASK_WITHIN: u64 = 200;
 /// More ticks than this are not caught up with in one update: a snapshot is quicker.
@@ -295,6 +295,13 @@ impl BodyView {
         let to = highest.saturating_sub(u64::from(self.config.repeats));
         let step = Duration::from_secs_f64(2.0 * self.newmark.h);
         let again = (round_trip.mul_f64(1.5) + step).max(Duration::from_millis(60));
+        if self.settled + 1 < from {
+            // Ticks that nobody will say again. A stream of accelerations never gets over them.
+            let unknown = (self.settled + 1..from).any(|t| history.known(t).is_none());
+            let integrates = !matches!(self.config.policy, Policy::ForceDriven { .. });
+            self.wants_snapshot |= unknown && integrates && self.config.snapshots;
+            self.settled = from - 1;
+        }
         let mut runs: Vec<NackRun> = Vec::new();
         let mut settled = self.settled;
         for tick in from..to {
@@ -318,7 +325,8 @@ impl BodyView {
                 _ => break,
             }
             ask.times += 1;
-            ask.next = now + again;
+            // Patient after the fourth time: an answer may be slow rather than lost.
+            ask.next = now + again.mul_f64(1.5_f64.powi(i32::from(ask.times.saturating_sub(4))));
         }
         self.settled = settled;
         (!runs.is_empty()).then_some(Nack { body: self.id, runs })
