@@ -34,7 +34,7 @@ impl Surface {
     }
 
     /// Vertices at the same position become one; the order of first use is kept.
-    fn merged(&self) -> Self {
+    pub(crate) fn merged(&self) -> Self {
         let mut vertex_at = HashMap::new();
         let mut merged = Self::default();
         for t in &self.triangles {

@@ -1,21 +1,77 @@
-//! STL, text and binary, read by `stl_io`. Equal corners become one vertex.
+//! STL, text and binary. Equal corners become one vertex.
 
-use std::io::Cursor;
+use super::cursor::{Cursor, Encoding};
+use crate::{MeshError, Surface};
 
-use super::cursor::parse_error;
-use crate::{MeshError, Place, Surface};
+/// A binary file: 80 bytes of anything, the number of triangles, 50 bytes for each.
+const HEADER: usize = 84;
+const TRIANGLE: usize = 50;
 
 pub(super) fn parse(bytes: &[u8]) -> Result<Surface, MeshError> {
-    let mut reader = Cursor::new(bytes);
-    let mesh = stl_io::read_stl(&mut reader).map_err(|error| {
-        let place = Place::Byte(reader.position() as usize);
-        parse_error("STL", place, "triangles as text or in 50 bytes each", error.to_string())
-    })?;
-    Ok(Surface {
-        positions: mesh.vertices.iter().map(|v| v.0.map(f64::from)).collect(),
-        triangles: mesh.faces.iter().map(|f| f.vertices.map(|v| v as u32)).collect(),
-        uvs: None,
-    })
+    let mut cursor = Cursor::new("STL", bytes);
+    // Many binary files start with the word of the text format, so their size decides.
+    let count = bytes.get(80..HEADER).and_then(|b| b.first_chunk()).map(|b| u32::from_le_bytes(*b) as usize);
+    let binary = count.is_some_and(|n| bytes.len() == HEADER + n * TRIANGLE);
+    let corners = if binary || !bytes.trim_ascii_start().starts_with(b"solid") {
+        binary_corners(&mut cursor)?
+    } else {
+        text_corners(&mut cursor)?
+    };
+    let triangles = (0..corners.len() as u32 / 3).map(|t| [3 * t, 3 * t + 1, 3 * t + 2]).collect();
+    Ok(Surface { positions: corners, triangles, uvs: None }.merged())
+}
+
+fn binary_corners(cursor: &mut Cursor<'_>) -> Result<Vec<[f64; 3]>, MeshError> {
+    cursor.encoding = Encoding::LittleEndian;
+    cursor.raw::<80>("a header of 80 bytes")?;
+    let count = cursor.int("the number of triangles")? as u32;
+    let count = cursor.fits(u64::from(count), TRIANGLE, "triangles")?;
+    let mut corners = Vec::with_capacity(3 * count);
+    for _ in 0..count {
+        cursor.raw::<12>("a normal")?;
+        for _ in 0..3 {
+            let mut corner = [0.0; 3];
+            for x in &mut corner {
+                *x = cursor.short_real("coordinate")?;
+            }
+            corners.push(corner);
+        }
+        cursor.raw::<2>("two bytes after a triangle")?;
+    }
+    Ok(corners)
+}
+
+fn text_corners(cursor: &mut Cursor<'_>) -> Result<Vec<[f64; 3]>, MeshError> {
+    let mut corners = Vec::new();
+    // One solid after another, each with any name.
+    while let Some(word) = cursor.next_word() {
+        if word != "solid" {
+            return Err(cursor.error("solid", word));
+        }
+        cursor.next_line();
+        loop {
+            match cursor.word("facet or endsolid")?.as_str() {
+                "facet" => {}
+                "endsolid" => break,
+                other => return Err(cursor.error("facet or endsolid", other)),
+            }
+            cursor.keyword("normal")?;
+            for _ in 0..3 {
+                // Normals follow from the corners; many files hold nonsense here.
+                cursor.word("a normal")?;
+            }
+            cursor.keyword("outer")?;
+            cursor.keyword("loop")?;
+            for _ in 0..3 {
+                cursor.keyword("vertex")?;
+                corners.push(cursor.point()?);
+            }
+            cursor.keyword("endloop")?;
+            cursor.keyword("endfacet")?;
+        }
+        cursor.next_line();
+    }
+    Ok(corners)
 }
 
 #[cfg(test)]
@@ -44,9 +100,19 @@ mod tests {
     }
 
     #[test]
-    fn text_is_read() {
-        let text = "solid one\nfacet normal 0 0 1\nouter loop\nvertex 0 0 0\nvertex 1 0 0\nvertex 0 1 0\nendloop\nendfacet\nendsolid one\n";
-        assert_eq!(parse(text.as_bytes()).unwrap().triangles, [[0, 1, 2]]);
-        assert!(parse(&text.as_bytes()[..60]).is_err());
+    fn text_is_read_with_names_and_without_and_cut_text_is_refused() {
+        let facet =
+            "facet normal 0 0 1\nouter loop\nvertex 0 0 0\nvertex 1 0 0\nvertex 0 1 0\nendloop\nendfacet\n";
+        let text = format!("solid\n{facet}{facet}endsolid\nsolid one more\n{facet}endsolid one more\n");
+        let surface = parse(text.as_bytes()).unwrap();
+        assert_eq!(surface.triangles, [[0, 1, 2]; 3]);
+        assert_eq!(surface.positions.len(), 3);
+        let message = |text: &str| parse(text.as_bytes()).unwrap_err().to_string();
+        assert_eq!(message(&text[..42]), "STL, line 4: expected coordinate x, found the end of the file");
+        assert!(
+            message("solid\nfacet normal 0 0 1\nouter loop\nvertex 0 0 NaN")
+                .contains("a finite coordinate z")
+        );
+        assert!(message("solid\nmesh").contains("facet or endsolid, found mesh"));
     }
 }
