@@ -27,6 +27,7 @@ mod error;
 pub mod experiment;
 pub mod newmark;
 pub mod pair;
+mod patch_rows;
 pub mod playout;
 pub mod recovery;
 pub mod session;

@@ -4,19 +4,15 @@ use std::collections::BTreeMap;
 use std::sync::Arc;
 
 use nalgebra::{Matrix3, Quaternion, UnitQuaternion, Vector3};
-use pliant_modal::{Coefficients, Integrator, ModalModel, Patch, warp_jacobian};
+use pliant_modal::{Coefficients, Integrator, ModalModel};
 
 use crate::StreamError;
+use crate::patch_rows::{PatchRows, Rows, dot, spread};
 use crate::state::{GrabState, ModalState};
 use crate::wire::FrameGrab;
 
-/// Share of a patch's static compliance by which the receiver lets it give way. Without any, a held place under an implicit
-/// step flips its force every tick; a few per cent end that and cost nothing, since the streamed reaction already carries
-/// the load.
-const GIVE: f64 = 0.03;
-
 /// Patches remembered at a time; a new one beyond that empties the table.
-const PATCHES: usize = 64;
+const PATCHES: usize = 256;
 
 /// How the host steps a body: what a receiver needs to know to do the same.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -35,59 +31,18 @@ impl Default for BodySetup {
     }
 }
 
-/// Rows of one patch: weighted mean displacement and rotation by mode.
-#[derive(Debug, Clone)]
-struct PatchModes {
-    displacement: Vec<Vector3<f64>>,
-    rotation: Vec<Vector3<f64>>,
-    /// Derivative of the patch's position by each coordinate at the last linearisation.
-    rows: Vec<Vector3<f64>>,
-    /// How far the held patch may give way to its measured place, m/N.
-    compliance: Matrix3<f64>,
-}
-
-impl PatchModes {
-    fn new(model: &ModalModel, vertex: u32, radius: f64, modes: usize) -> Result<Self, StreamError> {
-        let patch =
-            Patch::around(model.surface(), vertex, radius).map_err(|e| StreamError::Model(e.to_string()))?;
-        let mut displacement = vec![Vector3::zeros(); modes];
-        let mut rotation = vec![Vector3::zeros(); modes];
-        for &(v, weight) in patch.entries() {
-            for mode in 0..modes {
-                for axis in 0..3 {
-                    displacement[mode][axis] += weight * f64::from(model.displacement_row(v, axis, mode));
-                    rotation[mode][axis] += weight * f64::from(model.rotation_row(v, axis, mode));
-                }
-            }
-        }
-        let residual = model.residual_flexibility(&patch, modes);
-        let fixed = displacement
-            .iter()
-            .zip(model.omega())
-            .map(|(row, omega)| row.norm_squared() / omega.powi(2).max(1e-12))
-            .sum::<f64>();
-        let compliance = Matrix3::from_fn(|i, j| 0.5 * (residual[i][j] + residual[j][i]))
-            + Matrix3::identity() * (GIVE * fixed / 3.0 + f64::MIN_POSITIVE);
-        Ok(Self { rows: displacement.clone(), displacement, rotation, compliance })
-    }
-
-    /// Takes the rows at `q`; returns the patch's displacement there.
-    fn linearise(&mut self, q: &[f64], warp: bool) -> Vector3<f64> {
-        let sum = |columns: &[Vector3<f64>]| {
-            columns.iter().zip(q).fold(Vector3::<f64>::zeros(), |s, (c, q)| s + c * *q)
-        };
-        let d = sum(&self.displacement);
-        if !warp {
-            return d;
-        }
-        let w = sum(&self.rotation);
-        let (u, by_d, by_w) = warp_jacobian(w.into(), d.into());
-        let (by_d, by_w) = (Matrix3::from_fn(|i, j| by_d[i][j]), Matrix3::from_fn(|i, j| by_w[i][j]));
-        for ((row, phi), psi) in self.rows.iter_mut().zip(&self.displacement).zip(&self.rotation) {
-            *row = by_d * phi + by_w * psi;
-        }
-        u.into()
-    }
+/// How a patch is held in one step.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub(crate) struct Hold {
+    pub(crate) vertex: u32,
+    pub(crate) radius: f64,
+    /// Force on the body: known, or where to begin looking; body axes, N.
+    pub(crate) pull: Vector3<f64>,
+    /// Where the patch is to be, as displacement from rest in body axes, m.
+    pub(crate) place: Vector3<f64>,
+    /// `place` is a hand's target and the pull follows from the grab's compliance; else `place` was measured, and `pull`
+    /// with it.
+    pub(crate) target: bool,
 }
 
 /// Steps a modal state with given reactions.
@@ -96,11 +51,15 @@ pub struct ForceStepper {
     model: Arc<ModalModel>,
     coefficients: Vec<Coefficients>,
     warp: bool,
-    patches: BTreeMap<(u32, u64), PatchModes>,
+    patches: BTreeMap<(u32, u64), PatchRows>,
+    holds: Vec<Hold>,
     /// Modal force of the last step.
     old: Vec<f64>,
     force: Vec<f64>,
+    free: [Vec<f64>; 3],
     trial: Vec<f64>,
+    ahead: Vec<f64>,
+    scaled: Rows,
 }
 
 impl ForceStepper {
@@ -121,9 +80,13 @@ impl ForceStepper {
             coefficients,
             warp: setup.warp,
             patches: BTreeMap::new(),
+            holds: Vec::new(),
             old: vec![0.0; modes],
             force: vec![0.0; modes],
+            free: std::array::from_fn(|_| vec![0.0; modes]),
             trial: vec![0.0; modes],
+            ahead: Vec::new(),
+            scaled: std::array::from_fn(|_| vec![0.0; modes]),
         })
     }
 
@@ -153,16 +116,32 @@ impl ForceStepper {
         }
     }
 
-    fn patch(&mut self, vertex: u32, radius: f64) -> Option<&mut PatchModes> {
-        let key = (vertex, radius.to_bits());
+    fn patch(&mut self, vertex: u32, radius: f64) -> Option<&mut PatchRows> {
+        let (modes, model) = (self.modes(), self.model.clone());
+        self.patch_of(&model, vertex, radius, modes)
+    }
+
+    fn patch_of(
+        &mut self,
+        model: &Arc<ModalModel>,
+        vertex: u32,
+        radius: f64,
+        modes: usize,
+    ) -> Option<&mut PatchRows> {
+        let key = key(vertex, radius);
         if !self.patches.contains_key(&key) {
-            let made = PatchModes::new(&self.model, vertex, radius, self.modes()).ok()?;
+            let made = PatchRows::new(model, vertex, radius, modes).ok()?;
             if self.patches.len() >= PATCHES {
                 self.patches.clear();
             }
             self.patches.insert(key, made);
         }
         self.patches.get_mut(&key)
+    }
+
+    /// Where a patch is at rest, body axes, m.
+    pub(crate) fn rest(&mut self, vertex: u32, radius: f64) -> Option<Vector3<f64>> {
+        self.patch(vertex, radius).map(|p| p.rest)
     }
 
     /// One step with the reactions, drawn to where the host's patches were.
@@ -179,86 +158,119 @@ impl ForceStepper {
     /// whose vertex the model has not got pulls nothing.
     pub fn step(&mut self, state: &mut ModalState, grabs: &[FrameGrab], rotation: [f64; 4], load: &[f64]) {
         let back = inverse_rotation(rotation);
-        let extra = |f: &mut [f64]| {
-            for (f, extra) in f.iter_mut().zip(load) {
-                *f += extra;
-            }
-        };
-        if grabs.is_empty() {
-            self.force.fill(0.0);
-            extra(&mut self.force);
-        } else {
-            let states = || grabs.iter().map(|g| &g.state);
-            self.gather(&state.q, states(), &back);
-            extra(&mut self.force);
-            for round in 0..2 {
-                let mut trial = std::mem::take(&mut self.trial);
-                for (k, c) in self.coefficients.iter().enumerate() {
-                    let old = [state.q[k], state.v[k], state.a[k]];
-                    trial[k] = c.step(old, self.old[k], self.force[k])[0];
-                }
-                if round == 0 && self.warp {
-                    self.gather(&trial, states(), &back);
-                    extra(&mut self.force);
-                    for (k, c) in self.coefficients.iter().enumerate() {
-                        let old = [state.q[k], state.v[k], state.a[k]];
-                        trial[k] = c.step(old, self.old[k], self.force[k])[0];
-                    }
-                }
-                self.correct(&trial, grabs);
-                self.trial = trial;
-            }
+        let mut holds = std::mem::take(&mut self.holds);
+        holds.clear();
+        holds.extend(grabs.iter().map(|g| Hold::measured(g, &back)));
+        self.step_held(state, &mut holds, load);
+        self.holds = holds;
+    }
+
+    /// One step with patches held in any way; writes the pulls that acted (body axes, N).
+    pub(crate) fn step_held(&mut self, state: &mut ModalState, holds: &mut Vec<Hold>, load: &[f64]) {
+        let old = |k: usize| [state.q[k], state.v[k], state.a[k]];
+        for (k, c) in self.coefficients.iter().enumerate() {
+            let [q, v, a] = c.step(old(k), self.old[k], 0.0);
+            (self.free[0][k], self.free[1][k], self.free[2][k]) = (q, v, a);
+        }
+        let (modes, model) = (self.modes(), self.model.clone());
+        if self.patches.len() + holds.len() > PATCHES {
+            self.patches.clear();
+        }
+        holds.retain(|h| self.patch_of(&model, h.vertex, h.radius, modes).is_some());
+        self.press(&state.q, holds, load);
+        if !holds.is_empty() {
+            let mut trial = std::mem::take(&mut self.trial);
+            self.reach(&mut trial);
+            self.press(&trial, holds, load);
+            self.correct(&trial, holds);
+            self.trial = trial;
         }
         for (k, c) in self.coefficients.iter().enumerate() {
-            let old = [state.q[k], state.v[k], state.a[k]];
-            [state.q[k], state.v[k], state.a[k]] = c.step(old, self.old[k], self.force[k]);
+            let f = self.force[k];
+            state.q[k] = self.free[0][k] + c.response[0] * f;
+            state.v[k] = self.free[1][k] + c.response[1] * f;
+            state.a[k] = self.free[2][k] + c.response[2] * f;
         }
         self.old.copy_from_slice(&self.force);
     }
 
-    /// Adds the correction to the modal forces: what draws the patches from where `trial` has them to their places.
-    fn correct(&mut self, trial: &[f64], grabs: &[FrameGrab]) {
-        let n = 3 * grabs.len();
-        let warp = self.warp;
+    /// The coordinates that the step reaches with the present forces.
+    fn reach(&self, q: &mut Vec<f64>) {
+        q.clear();
+        q.extend(
+            self.free[0]
+                .iter()
+                .zip(&self.coefficients)
+                .zip(&self.force)
+                .map(|((free, c), f)| free + c.response[0] * f),
+        );
+    }
+
+    /// Sets the modal forces: load and pulls, the rows taken at `q`.
+    fn press(&mut self, q: &[f64], holds: &[Hold], load: &[f64]) {
+        self.force.fill(0.0);
+        for (f, load) in self.force.iter_mut().zip(load) {
+            *f = *load;
+        }
+        for h in holds {
+            let Some(patch) = self.patches.get_mut(&key(h.vertex, h.radius)) else { continue };
+            patch.linearise(q, self.warp);
+            spread(&patch.rows, &h.pull, &mut self.force);
+        }
+    }
+
+    /// Adds to the modal forces what draws the patches to their places, on the tangent taken at `from`; see
+    /// [`ForceStepper::step`]. `(A + C) correction = place - reached`, and for a hand's target also less `C pull`.
+    fn correct(&mut self, from: &[f64], holds: &mut [Hold]) {
+        let n = 3 * holds.len();
+        let mut ahead = std::mem::take(&mut self.ahead);
+        ahead.clear();
+        ahead.extend(
+            self.free[0]
+                .iter()
+                .zip(&self.coefficients)
+                .zip(&self.force)
+                .zip(from)
+                .map(|(((free, c), f), from)| free + c.response[0] * f - from),
+        );
         let mut gap = nalgebra::DVector::<f64>::zeros(n);
         let mut matrix = nalgebra::DMatrix::<f64>::zeros(n, n);
-        let keys: Vec<(u32, u64)> =
-            grabs.iter().map(|g| (g.state.vertex, g.state.radius.to_bits())).collect();
-        for (i, g) in grabs.iter().enumerate() {
-            let Some(patch) = self.patch(g.state.vertex, g.state.radius) else { continue };
-            let u = patch.linearise(trial, warp);
+        for (i, h) in holds.iter().enumerate() {
+            let Some(a) = self.patches.get(&key(h.vertex, h.radius)) else { continue };
+            let reached = a.at + dot(&a.rows, &ahead);
+            let softness = if h.target { a.compliance } else { a.give };
+            let mut missing = h.place - reached;
+            if h.target {
+                missing -= softness * h.pull;
+            }
+            for (scaled, row) in self.scaled.iter_mut().zip(&a.rows) {
+                for ((s, r), c) in scaled.iter_mut().zip(row).zip(&self.coefficients) {
+                    *s = r * c.response[0];
+                }
+            }
+            for (j, other) in holds.iter().enumerate().take(i + 1) {
+                let Some(b) = self.patches.get(&key(other.vertex, other.radius)) else { continue };
+                let columns = [0, 1, 2].map(|y| dot(&self.scaled, &b.rows[y]));
+                for (y, column) in columns.iter().enumerate() {
+                    for x in 0..3 {
+                        let soft = if i == j { softness[(x, y)] } else { 0.0 };
+                        matrix[(3 * i + x, 3 * j + y)] = column[x] + soft;
+                        matrix[(3 * j + y, 3 * i + x)] = column[x] + soft;
+                    }
+                }
+            }
             for x in 0..3 {
-                gap[3 * i + x] = g.displacement[x] - u[x];
+                gap[3 * i + x] = missing[x];
             }
         }
-        for (i, key) in keys.iter().enumerate() {
-            for (j, other) in keys.iter().enumerate().take(i + 1) {
-                let mut block = Matrix3::zeros();
-                if let (Some(a), Some(b)) = (self.patches.get(key), self.patches.get(other)) {
-                    for ((a, b), c) in a.rows.iter().zip(&b.rows).zip(&self.coefficients) {
-                        block += c.response[0] * (a * b.transpose());
-                    }
-                    if i == j {
-                        block += a.compliance;
-                    }
-                } else if i == j {
-                    block = Matrix3::identity();
-                }
-                for x in 0..3 {
-                    for y in 0..3 {
-                        matrix[(3 * i + x, 3 * j + y)] = block[(x, y)];
-                        matrix[(3 * j + y, 3 * i + x)] = block[(x, y)];
-                    }
-                }
-            }
-        }
+        self.ahead = ahead;
         let Some(cholesky) = matrix.cholesky() else { return };
-        let pull = cholesky.solve(&gap);
-        for (i, key) in keys.iter().enumerate() {
-            let Some(patch) = self.patches.get(key) else { continue };
-            let pull = Vector3::new(pull[3 * i], pull[3 * i + 1], pull[3 * i + 2]);
-            for (f, row) in self.force.iter_mut().zip(&patch.rows) {
-                *f += row.dot(&pull);
+        let pulls = cholesky.solve(&gap);
+        for (i, h) in holds.iter_mut().enumerate() {
+            let more = Vector3::new(pulls[3 * i], pulls[3 * i + 1], pulls[3 * i + 2]);
+            if let Some(patch) = self.patches.get(&key(h.vertex, h.radius)) {
+                spread(&patch.rows, &more, &mut self.force);
+                h.pull += more;
             }
         }
     }
@@ -266,23 +278,10 @@ impl ForceStepper {
     /// Where a patch is at `q`, as displacement from rest in body axes, m; zero for a vertex that the model has not got.
     pub fn displacement(&mut self, q: &[f64], vertex: u32, radius: f64) -> [f64; 3] {
         let warp = self.warp;
-        self.patch(vertex, radius).map_or([0.0; 3], |p| p.linearise(q, warp).into())
-    }
-
-    /// Modal forces of the reactions, rows taken at `q`.
-    fn gather<'a>(&mut self, q: &[f64], grabs: impl Iterator<Item = &'a GrabState>, back: &Matrix3<f64>) {
-        let warp = self.warp;
-        let mut force = std::mem::take(&mut self.force);
-        force.fill(0.0);
-        for g in grabs {
-            let Some(patch) = self.patch(g.vertex, g.radius) else { continue };
-            patch.linearise(q, warp);
-            let pull = -(back * Vector3::from(g.reaction));
-            for (f, row) in force.iter_mut().zip(&patch.rows) {
-                *f += row.dot(&pull);
-            }
-        }
-        self.force = force;
+        self.patch(vertex, radius).map_or([0.0; 3], |p| {
+            p.linearise(q, warp);
+            p.at.into()
+        })
     }
 
     /// The modal force per mode that a step from the true state `from` lacks to reach the true state `to`: by least
@@ -325,30 +324,33 @@ impl ForceStepper {
                 + self.model.omega()[k].powi(2) * state.q[k];
         }
         // Modes are weighed by their compliance: stiff ones, whose force is least certain, would drown the others.
-        let weight = |model: &ModalModel, k: usize| 1.0 / model.omega()[k].powi(2).max(1e-12);
-        let mut columns: Vec<Vec<Vector3<f64>>> = Vec::with_capacity(grabs.len());
-        let modes = self.modes();
-        let warp = self.warp;
+        let weight: Vec<f64> =
+            self.model.omega()[..self.modes()].iter().map(|w| 1.0 / w.powi(2).max(1e-12)).collect();
+        let mut columns: Vec<Rows> = Vec::with_capacity(grabs.len());
+        let (modes, warp) = (self.modes(), self.warp);
         for g in grabs.iter() {
             match self.patch(g.vertex, g.radius) {
                 Some(p) => {
                     p.linearise(&state.q, warp);
                     columns.push(p.rows.clone());
                 }
-                None => columns.push(vec![Vector3::zeros(); modes]),
+                None => columns.push(std::array::from_fn(|_| vec![0.0; modes])),
             }
         }
         let mut matrix = nalgebra::DMatrix::<f64>::zeros(n, n);
         let mut right = nalgebra::DVector::<f64>::zeros(n);
         for (i, a) in columns.iter().enumerate() {
-            for (k, row) in a.iter().enumerate() {
-                let w = weight(&self.model, k);
-                for x in 0..3 {
-                    right[3 * i + x] -= w * row[x] * self.force[k];
-                    for (j, b) in columns.iter().enumerate() {
-                        for y in 0..3 {
-                            matrix[(3 * i + x, 3 * j + y)] += w * row[x] * b[k][y];
-                        }
+            let weighed: Rows =
+                std::array::from_fn(|x| a[x].iter().zip(&weight).map(|(r, w)| r * w).collect());
+            let along = dot(&weighed, &self.force);
+            for x in 0..3 {
+                right[3 * i + x] = -along[x];
+            }
+            for (j, b) in columns.iter().enumerate() {
+                for y in 0..3 {
+                    let column = dot(&weighed, &b[y]);
+                    for x in 0..3 {
+                        matrix[(3 * i + x, 3 * j + y)] = column[x];
                     }
                 }
             }
@@ -369,8 +371,25 @@ impl ForceStepper {
     }
 }
 
+impl Hold {
+    /// A grab as the stream tells of it.
+    pub(crate) fn measured(g: &FrameGrab, back: &Matrix3<f64>) -> Self {
+        Self {
+            vertex: g.state.vertex,
+            radius: g.state.radius,
+            pull: -(back * Vector3::from(g.state.reaction)),
+            place: g.displacement.into(),
+            target: false,
+        }
+    }
+}
+
+fn key(vertex: u32, radius: f64) -> (u32, u64) {
+    (vertex, radius.to_bits())
+}
+
 /// World to body.
-fn inverse_rotation([x, y, z, w]: [f64; 4]) -> Matrix3<f64> {
+pub(crate) fn inverse_rotation([x, y, z, w]: [f64; 4]) -> Matrix3<f64> {
     UnitQuaternion::try_new(Quaternion::new(w, x, y, z), 1e-12)
         .map_or_else(Matrix3::identity, |q| *q.inverse().to_rotation_matrix().matrix())
 }
