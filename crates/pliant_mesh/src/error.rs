@@ -78,6 +78,12 @@ pub enum MeshError {
         /// How many nodes there are.
         count: usize,
     },
+    /// Much of the surface has no inside on either side: it bounds no body.
+    #[error("surface that bounds no body: winding numbers find no inside along {:.0} % of its area: expected a closed surface or one with small holes", share * 100.0)]
+    Undecided {
+        /// The share of the area, 0 to 1.
+        share: f64,
+    },
     /// A tetrahedron has no volume, or is turned inside out.
     #[error(
         "tetrahedron {tet} with nodes {nodes:?} near {at:?}: expected a positive volume, found {volume:e} m^3"

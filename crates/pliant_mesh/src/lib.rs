@@ -9,6 +9,7 @@
 mod bvh;
 mod error;
 pub mod io;
+mod repair;
 pub mod sdf;
 pub mod shapes;
 mod solid;
@@ -17,6 +18,7 @@ mod surface;
 mod tets;
 
 pub use error::{MeshError, Place};
+pub use repair::Repair;
 pub use stuffing::{Parts, StuffOptions, stuff};
 pub use surface::Surface;
 pub use tets::{Quality, TetMesh};

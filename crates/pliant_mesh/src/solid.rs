@@ -52,11 +52,9 @@ impl Surface {
 
     fn check_areas(&self) -> Result<(), MeshError> {
         for (triangle, corners) in self.corners().enumerate() {
-            let [a, b, c] = corners;
-            let area = 0.5 * (b - a).cross(&(c - a)).norm();
-            let longest = (b - a).norm_squared().max((c - b).norm_squared()).max((a - c).norm_squared());
-            let sound = area.is_finite() && area > FLAT * longest;
-            if !sound {
+            if !has_area(&corners) {
+                let [a, b, c] = corners;
+                let area = 0.5 * (b - a).cross(&(c - a)).norm();
                 return Err(MeshError::FlatTriangle { triangle, area, at: ((a + b + c) / 3.0).into() });
             }
         }
@@ -120,6 +118,13 @@ impl Surface {
             }),
         }
     }
+}
+
+/// Whether a triangle's area is finite and not negligible.
+pub(crate) fn has_area([a, b, c]: &[Vector3<f64>; 3]) -> bool {
+    let area = 0.5 * (b - a).cross(&(c - a)).norm();
+    let longest = (b - a).norm_squared().max((c - b).norm_squared()).max((a - c).norm_squared());
+    area.is_finite() && area > FLAT * longest
 }
 
 /// Where an edge of triangle `a` passes through triangle `b`. Edges with a `shared` corner only touch it.

@@ -328,7 +328,8 @@ mod tests {
             let _ = Scene::from_ron(&String::from_utf8_lossy(bytes));
             for parse in [obj::parse, ply::parse, stl::parse, |b: &[u8]| gltf::parse(b, Path::new("nowhere"))]
             {
-                let _ = parse(bytes).map(|s| s.closed());
+                let _ = parse(bytes).map(|s| s.check().and_then(|()| s.closed()));
+                let _ = parse(bytes).map(|s| s.repaired());
             }
             for parse in [msh::parse, vtk::parse, medit::parse, vega::parse] {
                 let _ = parse(bytes).map(|mut m| {

@@ -6,7 +6,7 @@ use nalgebra::Vector3;
 
 use super::SignedDistance;
 use crate::{
-    MeshError, Surface,
+    MeshError, Repair, Surface,
     bvh::{Bvh, Feature},
 };
 
@@ -41,6 +41,17 @@ impl SurfaceDistance {
         let sign =
             if solid.part_count() == 1 { Sign::Normals(normals(&solid, &corners)) } else { Sign::Winding };
         Ok(Self { bvh: Bvh::new(&corners), bounds: solid.bounds(), sign })
+    }
+
+    /// Prepares a surface that [`Surface::repaired`] can mend, and says what was mended. Inside is where the winding
+    /// number is above 1/2.
+    ///
+    /// # Errors
+    /// What [`Surface::repaired`] says.
+    pub fn repaired(surface: &Surface) -> Result<(Self, Repair), MeshError> {
+        let (solid, repair) = surface.repaired()?;
+        let corners: Vec<[Vector3<f64>; 3]> = solid.corners().collect();
+        Ok((Self { bvh: Bvh::new(&corners), bounds: solid.bounds(), sign: Sign::Winding }, repair))
     }
 
     /// How often the surface winds around `p`: 1 inside, 0 outside.
