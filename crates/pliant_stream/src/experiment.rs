@@ -12,7 +12,7 @@ use crate::StreamError;
 use crate::emulator::LinkConfig;
 use crate::newmark::Newmark;
 use crate::pair::{Pair, PathConfig, World};
-use crate::recovery::{RecoveryConfig, RepairCounts};
+use crate::recovery::{Policy, RecoveryConfig, RepairCounts};
 use crate::session::{GuestConfig, GuestSession, HostConfig, HostEvent, HostSession};
 use crate::state::{BodyId, GrabKey, GrabState, Pose, TickState, UserId};
 use crate::stepper::BodySetup;
@@ -113,7 +113,8 @@ pub struct Figures {
     pub force_ringing: f64,
     /// The same of the true reaction.
     pub true_ringing: f64,
-    /// From a hand's motion to the force that answers it, ms: own hands wait for the round trip.
+    /// From a hand's motion to the force that answers it, ms: one tick where the policy owns the model (see
+    /// [`crate::BodyView::own_hand`]), else the round trip and the delays on the way.
     pub hand_to_force_ms: f64,
     /// How far the shown tick lies behind its step at the host, ms, mean.
     pub shown_delay_ms: f64,
@@ -272,6 +273,7 @@ struct Run {
     samples: Vec<Vec<[f64; 3]>>,
     track_row: Vec<f64>,
     keep_track: bool,
+    own_hand_first: bool,
     measuring: Option<Duration>,
     sum: f64,
     count: u64,
@@ -318,6 +320,7 @@ impl Run {
             samples,
             track_row,
             keep_track: experiment.keep_track,
+            own_hand_first: matches!(experiment.recovery.policy, Policy::ForceDriven { .. }),
             measuring: None,
             sum: 0.0,
             count: 0,
@@ -393,9 +396,15 @@ impl Run {
             ),
             force_ringing: ratio(self.shown_second, self.force_scale),
             true_ringing: ratio(self.true_second, self.force_scale),
-            // A target leaves with the guest's tick, waits for the host's next step (half a step on average), and its
-            // reaction comes back and is shown.
-            hand_to_force_ms: 1e3 * (session.stats().round_trip.as_secs_f64() * 0.5 + 0.5 * self.h + delay),
+            hand_to_force_ms: 1e3
+                * if self.own_hand_first {
+                    // The guest's newer copy answers at its next tick.
+                    self.h
+                } else {
+                    // A target leaves with the guest's tick, waits for the host's next step (half a step on average),
+                    // and its reaction comes back and is shown.
+                    session.stats().round_trip.as_secs_f64() * 0.5 + 0.5 * self.h + delay
+                },
             shown_delay_ms: 1e3 * delay,
             recover_ms: longest.as_secs_f64() * 1e3,
             hash: self.hash,

@@ -40,7 +40,7 @@ pub use newmark::Newmark;
 pub use recovery::{Playout, Policy, Predict, RecoveryConfig, RepairCounts};
 pub use session::{
     BodyView, Channel, EndReason, GuestConfig, GuestEvent, GuestSession, HostConfig, HostEvent, HostSession,
-    LinkStats, MAX_MESSAGE, MIN_DATAGRAM, Output,
+    LinkStats, MAX_MESSAGE, MIN_DATAGRAM, Output, OwnHand,
 };
 pub use state::{
     BodyId, GrabKey, GrabState, MAGNITUDE_LIMIT, MAX_GRABS, MAX_MODES, ModalState, PeerId, Pose, TICK_LIMIT,

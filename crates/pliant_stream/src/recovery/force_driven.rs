@@ -130,6 +130,14 @@ impl Recovery for ForceDriven {
         &self.state
     }
 
+    fn load(&self) -> &[f64] {
+        &self.load
+    }
+
+    fn last_force(&self) -> &[f64] {
+        self.stepper.last_force()
+    }
+
     fn driven_by_reactions(&self) -> bool {
         true
     }

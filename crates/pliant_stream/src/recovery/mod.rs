@@ -11,6 +11,7 @@ pub use acceleration::AccelerationDriven;
 pub use blend::Blend;
 pub use config::{Playout, Policy, Predict, RecoveryConfig};
 pub use force_driven::ForceDriven;
+pub(crate) use force_driven::keep_of;
 pub use history::{HISTORY, History, TickData};
 pub use receiver::{Arrival, Receiver, RepairCounts, ShownGrab};
 
@@ -20,7 +21,7 @@ use crate::state::{ModalState, Tick};
 ///
 /// The [`Receiver`] calls it: [`Recovery::advance`] once per tick in order, [`Recovery::correct`] when data for ticks
 /// that were already stepped arrived late, and blends the difference away from what is shown.
-pub trait Recovery: Send {
+pub trait Recovery: Send + Sync {
     /// Takes a state over as true after `tick`.
     fn restart(&mut self, tick: Tick, state: &ModalState, load: &[f64]);
 
@@ -36,6 +37,16 @@ pub trait Recovery: Send {
 
     /// The best estimate of the truth at the tick reached.
     fn hidden(&self) -> &ModalState;
+
+    /// Modal forces that the reactions do not explain, as far as they are known; empty for none.
+    fn load(&self) -> &[f64] {
+        &[]
+    }
+
+    /// The modal forces of the last step, where the step needs them again; else empty.
+    fn last_force(&self) -> &[f64] {
+        &[]
+    }
 
     /// True when the reactions shown are those that drive the state; false when they are to be computed from it.
     fn driven_by_reactions(&self) -> bool;

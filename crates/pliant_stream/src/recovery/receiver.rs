@@ -4,9 +4,9 @@ use std::sync::Arc;
 
 use pliant_modal::ModalModel;
 
-use super::force_driven::keep_of;
 use super::{
     AccelerationDriven, Blend, ForceDriven, HISTORY, History, Policy, Predict, Recovery, RecoveryConfig,
+    keep_of,
 };
 use crate::StreamError;
 use crate::check::projection;
@@ -143,6 +143,14 @@ impl Receiver {
     /// Best estimate of the truth.
     pub fn hidden(&self) -> &ModalState {
         self.policy.hidden()
+    }
+
+    pub(crate) fn load(&self) -> &[f64] {
+        self.policy.load()
+    }
+
+    pub(crate) fn last_force(&self) -> &[f64] {
+        self.policy.last_force()
     }
 
     /// What the eye and the hand get.

@@ -253,6 +253,9 @@ impl GuestSession {
         let grab = self.next_grab;
         self.next_grab = grab.wrapping_add(1);
         self.grabs.insert(grab, OwnGrab { body, targets: VecDeque::new(), fresh: false, said: now });
+        if let Some(own) = self.bodies.get_mut(&body).and_then(|b| b.own.as_mut()) {
+            own.begin(grab, vertex, radius, target);
+        }
         self.message(&GuestMessage::GrabBegin { grab, body: body.0, vertex, radius, target });
         Ok(grab)
     }
@@ -272,12 +275,17 @@ impl GuestSession {
         self.input = self.input.wrapping_add(1);
         own.targets.push_back(TargetEntry { grab, input: self.input, target });
         own.fresh = true;
+        let body = own.body;
+        if let Some(own) = self.bodies.get_mut(&body).and_then(|b| b.own.as_mut()) {
+            own.set(grab, target);
+        }
         Ok(())
     }
 
     /// Lets go. Letting go twice is no error.
     pub fn end_grab(&mut self, grab: u16) {
-        if self.grabs.remove(&grab).is_some() {
+        if let Some(own) = self.grabs.remove(&grab) {
+            self.forget_own(own.body, grab);
             self.message(&GuestMessage::GrabEnd { grab });
         }
     }
@@ -359,7 +367,8 @@ impl GuestSession {
                 }
                 let name = info.name.clone();
                 let model = self.models.get(&info.hash).cloned();
-                let mut view = BodyView::new(info, self.newmark, self.config.recovery);
+                let mut view =
+                    BodyView::new(info, self.newmark, self.config.recovery, self.config.own_hand_first);
                 if let Some(model) = model {
                     view.set_model(model);
                 }
@@ -397,7 +406,8 @@ impl GuestSession {
                 self.event(GuestEvent::UserLeft { user: UserId(user) });
             }
             HostMessage::GrabRefused { grab } => {
-                if self.grabs.remove(&grab).is_some() {
+                if let Some(own) = self.grabs.remove(&grab) {
+                    self.forget_own(own.body, grab);
                     self.event(GuestEvent::GrabRefused { grab });
                 }
             }
@@ -449,23 +459,24 @@ impl GuestSession {
     /// Steps all bodies to what is due by now, and sends what is due: targets, questions, clock requests. Call once a
     /// frame and at [`GuestSession::next_wakeup`]. Returns how many ticks all bodies took together.
     pub fn update(&mut self, now: Duration) -> u64 {
-        if self.user().is_none() {
+        let Some(user) = self.user() else {
             let waits = self.standing == Standing::Greeted;
             if waits && now.saturating_sub(self.heard) > self.config.idle_timeout {
                 self.close(EndReason::Silent);
             }
             return 0;
-        }
+        };
         if now.saturating_sub(self.heard) > self.config.idle_timeout {
             self.message(&GuestMessage::Goodbye { reason: EndReason::Silent });
             self.close(EndReason::Silent);
             return 0;
         }
+        let round_trip = self.round_trip.smooth();
         let mut stepped = 0;
         let ids: Vec<BodyId> = self.bodies.keys().copied().collect();
         for id in ids {
             if let Some(view) = self.bodies.get_mut(&id) {
-                stepped += view.advance(now);
+                stepped += view.advance(now, user, round_trip);
                 if view.is_stalled() {
                     if self.stalled.insert(id) {
                         self.event(GuestEvent::Stalled { body: id });
@@ -517,6 +528,12 @@ impl GuestSession {
     /// The next thing that happened.
     pub fn poll_event(&mut self) -> Option<GuestEvent> {
         self.events.pop_front()
+    }
+
+    fn forget_own(&mut self, body: BodyId, grab: u16) {
+        if let Some(own) = self.bodies.get_mut(&body).and_then(|b| b.own.as_mut()) {
+            own.end(grab);
+        }
     }
 
     fn ask(&mut self, now: Duration, body: BodyId) {

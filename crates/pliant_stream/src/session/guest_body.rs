@@ -5,10 +5,12 @@ use std::time::Duration;
 
 use pliant_modal::ModalModel;
 
+use super::own_hand::OwnHand;
 use crate::newmark::Newmark;
 use crate::playout::PlayoutClock;
-use crate::recovery::{HISTORY, Policy, Receiver, RecoveryConfig, RepairCounts, ShownGrab};
-use crate::state::{BodyId, ModalState, Pose, Tick};
+use crate::recovery::{HISTORY, Policy, Receiver, RecoveryConfig, RepairCounts, ShownGrab, keep_of};
+use crate::state::{BodyId, ModalState, Pose, Tick, UserId};
+use crate::stepper::ForceStepper;
 use crate::wire::{BodyInfo, Frame, MAX_NACK_RUNS, Nack, NackRun, Payload, SnapshotBytes};
 
 /// Frames that wait for the snapshot.
@@ -35,6 +37,8 @@ pub struct BodyView {
     pub(crate) model: Option<Arc<ModalModel>>,
     pub(crate) receiver: Option<Receiver>,
     pub(crate) playout: PlayoutClock,
+    pub(crate) own: Option<OwnHand>,
+    own_first: bool,
     config: RecoveryConfig,
     newmark: Newmark,
     waiting: Vec<Frame>,
@@ -52,13 +56,15 @@ pub struct BodyView {
 }
 
 impl BodyView {
-    pub(crate) fn new(info: BodyInfo, newmark: Newmark, config: RecoveryConfig) -> Self {
+    pub(crate) fn new(info: BodyInfo, newmark: Newmark, config: RecoveryConfig, own_first: bool) -> Self {
         Self {
             id: BodyId(info.body),
             info,
             model: None,
             receiver: None,
             playout: PlayoutClock::new(newmark.h, config.playout),
+            own: None,
+            own_first,
             config,
             newmark,
             waiting: Vec::new(),
@@ -113,6 +119,12 @@ impl BodyView {
     /// Everything that holds the body at the shown tick, with the reactions that belong to the shape shown.
     pub fn grabs(&self) -> &[ShownGrab] {
         self.receiver.as_ref().map_or(&[], Receiver::grabs)
+    }
+
+    /// The newer copy of the body in which the guest's own hands have arrived already; `None` when it holds nothing, for
+    /// policies that do not own the model, and for free bodies. Show this instead of [`BodyView::shown`] where it is there.
+    pub fn own_hand(&self) -> Option<&OwnHand> {
+        self.own.as_ref().filter(|own| own.is_active())
     }
 
     /// The rigid frame of a free body at the shown tick.
@@ -178,6 +190,12 @@ impl BodyView {
                 receiver.accept(&frame);
             }
         }
+        if let (Policy::ForceDriven { blend_ticks }, true) = (self.config.policy, self.own_first)
+            && let Ok(stepper) = ForceStepper::new(model.clone(), &self.info.setup(), modes, self.newmark.h)
+        {
+            let h = self.newmark.h;
+            self.own = Some(OwnHand::new(stepper, h, keep_of(h), blend_ticks));
+        }
         self.receiver = Some(receiver);
         self.snapshot = None;
         true
@@ -221,7 +239,7 @@ impl BodyView {
     }
 
     /// Steps to whatever is due by now. Returns the number of ticks.
-    pub(crate) fn advance(&mut self, now: Duration) -> u64 {
+    pub(crate) fn advance(&mut self, now: Duration, user: UserId, round_trip: Duration) -> u64 {
         let Some(receiver) = &mut self.receiver else { return 0 };
         if self.resting {
             self.stalled = false;
@@ -247,6 +265,10 @@ impl BodyView {
             }
             receiver.advance();
             stepped += 1;
+            if let Some(own) = &mut self.own {
+                let way = round_trip.as_secs_f64() + self.playout.delay();
+                own.step(receiver, user, (way / self.newmark.h).ceil() as usize);
+            }
         }
         if self.config.snapshots && receiver.wants_snapshot() {
             self.wants_snapshot = true;

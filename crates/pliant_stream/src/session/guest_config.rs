@@ -20,6 +20,9 @@ pub struct GuestConfig {
     pub recovery: RecoveryConfig,
     /// Take at most so many modes of each body: for weak machines and thin links. Default: all.
     pub modes: Option<u16>,
+    /// Step a newer copy of each body that this guest holds, in which its own hands do not wait for the round trip; see
+    /// [`BodyView::own_hand`](super::BodyView::own_hand). Default: true.
+    pub own_hand_first: bool,
     /// A host that is silent for so long is gone. Default: 10 s.
     pub idle_timeout: Duration,
 }
@@ -31,6 +34,7 @@ impl Default for GuestConfig {
             token: Vec::new(),
             recovery: RecoveryConfig::default(),
             modes: None,
+            own_hand_first: true,
             idle_timeout: Duration::from_secs(10),
         }
     }

@@ -22,6 +22,7 @@ mod host;
 mod host_config;
 mod host_peer;
 mod outbox;
+mod own_hand;
 mod publish;
 
 pub use guest::GuestSession;
@@ -29,6 +30,7 @@ pub use guest_body::BodyView;
 pub use guest_config::{GuestConfig, GuestEvent};
 pub use host::HostSession;
 pub use host_config::{HostConfig, HostEvent};
+pub use own_hand::OwnHand;
 
 use std::time::Duration;
 
