@@ -1,5 +1,18 @@
 //! Surfaces, signed distance fields and tetrahedra for Pliant: import, export, isosurface stuffing.
 //!
+//! ```
+//! use pliant_mesh::{StuffOptions, io, sdf::SurfaceDistance, shapes, stuff};
+//!
+//! // Any closed surface will do: io::read_surface("bunny.obj")?
+//! let (surface, _) = shapes::sphere(8, 0.1)?.boundary();
+//! let shape = SurfaceDistance::new(&surface)?;
+//! let mesh = stuff(&shape, &StuffOptions::with_target(5000), &mut |_share| ())?;
+//! assert!(mesh.tets.len().abs_diff(5000) <= 250);
+//! assert!((mesh.volume() / surface.volume() - 1.0).abs() < 0.01);
+//! io::write_msh(std::env::temp_dir().join("pliant_mesh-example.msh"), &mesh)?;
+//! # Ok::<(), pliant_mesh::MeshError>(())
+//! ```
+//!
 //! Lengths are in metres, coordinates are `f64`, indices are `u32` and count from 0.
 #![cfg_attr(
     test,

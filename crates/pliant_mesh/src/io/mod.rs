@@ -308,6 +308,28 @@ mod tests {
         fs::remove_dir_all(folder).unwrap();
     }
 
+    #[test]
+    fn a_surface_that_bounds_nothing_is_refused_when_it_is_to_be_filled() {
+        let folder = folder("open");
+        let (ball, _) = shapes::sphere(4, 0.1).unwrap().boundary();
+        let mut text: String = ball.positions.iter().map(|[x, y, z]| format!("v {x} {y} {z}\n")).collect();
+        let faces: Vec<String> =
+            ball.triangles.iter().map(|t| format!("f {} {} {}\n", t[0] + 1, t[1] + 1, t[2] + 1)).collect();
+        text += &faces.concat();
+        let path = folder.join("ball.obj");
+        let filled = |text: &str| {
+            fs::write(&path, text).unwrap();
+            read(&path)?.into_tets(&StuffOptions::with_target(1000), &mut |_| ())
+        };
+        filled(&text).unwrap().check().unwrap();
+        // Cut within the last line, and after the line before it.
+        let cut = text.len() - 8;
+        assert!(matches!(filled(&text[..cut]), Err(MeshError::InFile { .. })));
+        let cut = text.len() - faces[faces.len() - 1].len();
+        assert!(matches!(filled(&text[..cut]), Err(MeshError::Open { edges: 3, .. })));
+        fs::remove_dir_all(folder).unwrap();
+    }
+
     mod any_bytes {
         use super::*;
         use proptest::{prelude::*, test_runner::RngSeed};
