@@ -8,7 +8,8 @@
 //! let shape = SurfaceDistance::new(&surface)?;
 //! let mesh = stuff(&shape, &StuffOptions::with_target(5000), &mut |_share| ())?;
 //! assert!(mesh.tets.len().abs_diff(5000) <= 250);
-//! assert!((mesh.volume() / surface.volume() - 1.0).abs() < 0.01);
+//! // Corners are rounded by up to a cell, so a little is missing.
+//! assert!((0.97..1.0).contains(&(mesh.volume() / surface.volume())));
 //! io::write_msh(std::env::temp_dir().join("pliant_mesh-example.msh"), &mesh)?;
 //! # Ok::<(), pliant_mesh::MeshError>(())
 //! ```
