@@ -7,7 +7,7 @@ use std::time::Duration;
 const WINDOW: usize = 16;
 /// The offset follows a better estimate by at most this share of the time that passes.
 const SLEW: f64 = 0.01;
-/// Estimates farther off than this are taken over at once, s.
+/// An exchange farther off than this and half its round trip shows that a clock jumped, s.
 const JUMP: f64 = 0.5;
 
 /// Estimates `host clock - own clock`: of the last 16 exchanges the one with the smallest round trip counts, and the
@@ -28,23 +28,25 @@ impl ClockEstimate {
         let round = t4.checked_sub(t1)?.checked_sub(spent)?;
         let difference = |a: u64, b: u64| (i128::from(a) - i128::from(b)) as f64 * 1e-6;
         let offset = 0.5 * (difference(t2, t1) + difference(t3, t4));
+        let round_s = round as f64 * 1e-6;
+        if self.offset.is_some_and(|old| (offset - old).abs() > JUMP + 0.5 * round_s) {
+            // An exchange is never off by more than half its round trip: a clock jumped, and the older exchanges tell of
+            // another one.
+            self.samples.clear();
+            self.offset = None;
+        }
         if self.samples.len() >= WINDOW {
             self.samples.pop_front();
         }
-        self.samples.push_back((round as f64 * 1e-6, offset));
+        self.samples.push_back((round_s, offset));
         let now = t4 as f64 * 1e-6;
         let best = self.samples.iter().min_by(|a, b| a.0.total_cmp(&b.0)).map_or(offset, |s| s.1);
         self.offset = Some(match self.offset {
-            Some(old) if (best - old).abs() < JUMP => {
+            Some(old) => {
                 let room = SLEW * (now - self.at).max(0.0);
                 old + (best - old).clamp(-room, room)
             }
-            Some(_) if (best - offset).abs() >= JUMP => {
-                // The host's clock jumped: the older exchanges tell of another clock.
-                self.samples.retain(|s| (s.1 - offset).abs() < JUMP);
-                offset
-            }
-            _ => best,
+            None => best,
         });
         self.at = now;
         Some(Duration::from_micros(round))

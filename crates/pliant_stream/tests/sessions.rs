@@ -19,6 +19,9 @@ const BODY: BodyId = BodyId(3);
 const S: Duration = Duration::from_secs(1);
 const MS: Duration = Duration::from_millis(1);
 
+/// What a guest's hand does: time, guest, session.
+type HandScript = Box<dyn FnMut(Duration, usize, &mut GuestSession)>;
+
 /// A host with one body that its guests may grab; every event is kept.
 struct Scene {
     body: Body,
@@ -27,7 +30,7 @@ struct Scene {
     host_events: Vec<HostEvent>,
     guest_events: Vec<(usize, GuestEvent)>,
     /// What each guest's hand does, given the time.
-    hand: Box<dyn FnMut(Duration, usize, &mut GuestSession)>,
+    hand: HandScript,
     resting: bool,
     worst: f64,
     settled: Duration,
@@ -128,7 +131,7 @@ impl World for Scene {
 }
 
 /// Guest 0 holds the tip from its first tick on and circles.
-fn circling() -> Box<dyn FnMut(Duration, usize, &mut GuestSession)> {
+fn circling() -> HandScript {
     let mut grab = None;
     Box::new(move |now, guest, session| {
         if guest != 0 || session.user().is_none() {

@@ -90,6 +90,13 @@ impl Blend {
         [y * y * (1.0 + 2.0 * x), t * x * y * y, -6.0 * x * y / t, y * (1.0 - 3.0 * x)]
     }
 
+    /// Keeps a share of all offsets.
+    pub fn scale(&mut self, share: f64) {
+        for x in self.running.iter_mut().flat_map(|c| c.q.iter_mut().chain(&mut c.v)) {
+            *x *= share;
+        }
+    }
+
     /// One tick passes.
     pub fn advance(&mut self) {
         for c in &mut self.running {

@@ -64,6 +64,9 @@ pub struct RecoveryConfig {
     pub snapshots: bool,
     /// Default: [`Playout::Fixed`] with 1 tick.
     pub playout: Playout,
+    /// Cut fading corrections that would put more energy into the shown body than it has lost; see
+    /// [`super::PassivityGuard`]. Default: true.
+    pub passive: bool,
     /// Prediction ends after this long without a frame: the body then stands still until one comes. Default: 0.5 s.
     pub stall_after: Duration,
 }
@@ -80,6 +83,7 @@ impl Default for RecoveryConfig {
             nack: true,
             snapshots: true,
             playout: Playout::Fixed(1),
+            passive: true,
             stall_after: Duration::from_millis(500),
         }
     }
@@ -98,6 +102,7 @@ impl RecoveryConfig {
             repeats: 0,
             refresh: 0,
             snapshots: false,
+            passive: false,
             playout: Playout::Fixed(0),
             ..Self::default()
         }

@@ -5,6 +5,7 @@ mod blend;
 mod config;
 mod force_driven;
 mod history;
+mod passivity;
 mod receiver;
 
 pub use acceleration::AccelerationDriven;
@@ -13,6 +14,7 @@ pub use config::{Playout, Policy, Predict, RecoveryConfig};
 pub use force_driven::ForceDriven;
 pub(crate) use force_driven::keep_of;
 pub use history::{HISTORY, History, TickData};
+pub use passivity::PassivityGuard;
 pub use receiver::{Arrival, Receiver, RepairCounts, ShownGrab};
 
 use crate::state::{ModalState, Tick};

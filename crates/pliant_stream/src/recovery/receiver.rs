@@ -4,6 +4,7 @@ use std::sync::Arc;
 
 use pliant_modal::ModalModel;
 
+use super::PassivityGuard;
 use super::{
     AccelerationDriven, Blend, ForceDriven, HISTORY, History, Policy, Predict, Recovery, RecoveryConfig,
     keep_of,
@@ -60,6 +61,7 @@ pub struct Receiver {
     history: History,
     policy: Box<dyn Recovery>,
     blend: Blend,
+    guard: Option<PassivityGuard>,
     tick: Tick,
     shown: ModalState,
     grabs: Vec<ShownGrab>,
@@ -109,12 +111,18 @@ impl Receiver {
                 (Box::new(ForceDriven::new(stepper()?, keep_of(newmark.h))), blend_ticks)
             }
         };
+        let guard = config.passive.then(|| {
+            let damping: Vec<f64> =
+                model.damping()[..modes].iter().map(|c| c * setup.damping_scale).collect();
+            PassivityGuard::new(&model.omega()[..modes], &damping, newmark.h)
+        });
         let mut receiver = Self {
             setup,
             stepper: stepper()?,
             history: History::new(snapshot.tick),
             policy,
             blend: Blend::new(newmark.h, blend_ticks),
+            guard,
             tick: snapshot.tick,
             shown: ModalState::zero(modes),
             grabs: Vec::new(),
@@ -171,6 +179,11 @@ impl Receiver {
     /// What became of the ticks.
     pub fn counts(&self) -> RepairCounts {
         self.counts
+    }
+
+    /// The passivity guard, where there is one.
+    pub fn guard(&self) -> Option<&PassivityGuard> {
+        self.guard.as_ref()
     }
 
     /// Checksums disagree lastingly: a snapshot would help.
@@ -243,6 +256,15 @@ impl Receiver {
             self.policy.refresh(tick, &self.history);
             self.blend_from_before();
         }
+        if let Some(guard) = &mut self.guard {
+            let hidden = self.policy.hidden();
+            self.shown.copy_from(hidden);
+            self.blend.apply(&mut self.shown.q, &mut self.shown.v);
+            let share = guard.admit(hidden, &self.shown);
+            if share < 1.0 {
+                self.blend.scale(share);
+            }
+        }
         self.show();
         self.compare_check();
     }
@@ -308,6 +330,11 @@ impl Receiver {
             self.before.q.iter().zip(&now.q).map(|(b, n)| b - n),
             self.before.v.iter().zip(&now.v).map(|(b, n)| b - n),
         );
+        if let Some(guard) = &mut self.guard {
+            self.shown.copy_from(now);
+            self.blend.apply(&mut self.shown.q, &mut self.shown.v);
+            guard.corrected(now, &self.shown);
+        }
     }
 
     fn show(&mut self) {

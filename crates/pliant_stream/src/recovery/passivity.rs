@@ -1,0 +1,192 @@
+//! The passivity guard: fading corrections must not feed the shown body more energy than it has lost.
+//!
+//! The shown state is the hidden one plus an offset that fades. While it fades the shown body gains or loses energy that no
+//! hand put in: the change of the excess
+//!
+//! ```text
+//! X(s) = E(hidden + s offset) - E(hidden) = s (v . o_v + sum omega^2 q o_q) + s^2 (o_v . o_v + sum omega^2 o_q^2) / 2
+//! ```
+//!
+//! A tank holds what the body has dissipated, `h sum c v^2` a tick, up to a small share of the largest energy seen. An
+//! excess that grows is paid from the tank, one that shrinks pays into it; where the tank does not suffice the offset is
+//! cut to the largest `s` that it does suffice for. (Time-domain passivity after Hannaford and Ryu 2002, with the
+//! correction as the port.)
+
+use crate::state::ModalState;
+
+/// The tank holds at most this share of the largest energy that the body has had.
+const TANK: f64 = 0.05;
+
+/// Energy that corrections may still put in.
+#[derive(Debug, Clone)]
+pub struct PassivityGuard {
+    stiffness: Vec<f64>,
+    damping: Vec<f64>,
+    h: f64,
+    level: f64,
+    largest: f64,
+    excess: f64,
+    injected: f64,
+    dissipated: f64,
+    cuts: u64,
+}
+
+impl PassivityGuard {
+    /// For modes of stiffness `omega^2` and damping `c` (1/s), stepped by `h` (s).
+    pub fn new(omega: &[f64], damping: &[f64], h: f64) -> Self {
+        Self {
+            stiffness: omega.iter().map(|w| w * w).collect(),
+            damping: damping.to_vec(),
+            h,
+            level: 0.0,
+            largest: 0.0,
+            excess: 0.0,
+            injected: 0.0,
+            dissipated: 0.0,
+            cuts: 0,
+        }
+    }
+
+    /// Kinetic and elastic energy of a modal state, J.
+    pub fn energy(&self, state: &ModalState) -> f64 {
+        let modes = state.q.iter().zip(&state.v).zip(&self.stiffness);
+        0.5 * modes.map(|((q, v), k)| v * v + k * q * q).sum::<f64>()
+    }
+
+    /// A correction moved the hidden state under the shown one: no energy was put in, and the excess is what it is now.
+    pub fn corrected(&mut self, hidden: &ModalState, shown: &ModalState) {
+        self.excess = self.energy(shown) - self.energy(hidden);
+    }
+
+    /// A tick has passed: the share of the offset `shown - hidden` that may stay, 0 to 1.
+    pub fn admit(&mut self, hidden: &ModalState, shown: &ModalState) -> f64 {
+        let lost: f64 = self.h * self.damping.iter().zip(&hidden.v).map(|(c, v)| c * v * v).sum::<f64>();
+        self.dissipated += lost;
+        self.largest = self.largest.max(self.energy(hidden));
+        let cap = TANK * self.largest;
+        self.level = (self.level + lost).min(cap);
+        let (mut linear, mut square) = (0.0, 0.0);
+        for (k, stiffness) in self.stiffness.iter().enumerate().take(hidden.modes()) {
+            let (oq, ov) = (shown.q[k] - hidden.q[k], shown.v[k] - hidden.v[k]);
+            linear += hidden.v[k] * ov + stiffness * hidden.q[k] * oq;
+            square += 0.5 * (ov * ov + stiffness * oq * oq);
+        }
+        let allowed = self.excess + self.level;
+        let mut share = 1.0;
+        if linear + square > allowed {
+            // The largest s in [0, 1] with square s^2 + linear s <= allowed; s = 0, no offset, is always there to go to
+            // when the present excess is not negative.
+            let root = linear * linear + 4.0 * square * allowed;
+            share = if square > 0.0 && root >= 0.0 {
+                ((root.sqrt() - linear) / (2.0 * square)).clamp(0.0, 1.0)
+            } else {
+                0.0
+            };
+            self.cuts += 1;
+        }
+        let excess = share * (linear + share * square);
+        let paid = excess - self.excess;
+        self.injected += paid;
+        self.level = (self.level - paid).clamp(0.0, cap.max(0.0));
+        self.excess = excess;
+        share
+    }
+
+    /// Energy that corrections have put into the shown body so far, net, J.
+    pub fn injected(&self) -> f64 {
+        self.injected
+    }
+
+    /// Energy that the body has dissipated so far, J.
+    pub fn dissipated(&self) -> f64 {
+        self.dissipated
+    }
+
+    /// The most that the tank holds, J.
+    pub fn tank(&self) -> f64 {
+        TANK * self.largest
+    }
+
+    /// How often an offset was cut.
+    pub fn cuts(&self) -> u64 {
+        self.cuts
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn corrections_never_put_in_more_than_was_lost_and_the_tank() {
+        // Two modes swinging; every seventh tick a correction, some of them with the energy to shake the body apart.
+        let (omega, c, h) = ([10.0, 31.0], [0.4, 1.0], 0.01);
+        let mut guard = PassivityGuard::new(&omega, &c, h);
+        let (mut offset_q, mut offset_v) = ([0.0; 2], [0.0; 2]);
+        let mut put_in = 0.0;
+        let mut last_excess = 0.0;
+        for n in 0..4000 {
+            let t = f64::from(n) * h;
+            let hidden = ModalState {
+                q: (0..2).map(|k| 0.1 * (omega[k] * t).sin() * (-0.05 * t).exp()).collect(),
+                v: (0..2).map(|k| 0.1 * omega[k] * (omega[k] * t).cos() * (-0.05 * t).exp()).collect(),
+                a: vec![0.0; 2],
+            };
+            let with = |oq: &[f64; 2], ov: &[f64; 2]| ModalState {
+                q: (0..2).map(|k| hidden.q[k] + oq[k]).collect(),
+                v: (0..2).map(|k| hidden.v[k] + ov[k]).collect(),
+                a: vec![0.0; 2],
+            };
+            if n % 7 == 0 {
+                for k in 0..2 {
+                    offset_q[k] += 0.3 * (f64::from(n) * 0.77 + k as f64).sin();
+                    offset_v[k] += 5.0 * (f64::from(n) * 1.31 + k as f64).cos();
+                }
+                guard.corrected(&hidden, &with(&offset_q, &offset_v));
+                last_excess = guard.excess;
+            }
+            // An ill-behaved fade that grows.
+            for k in 0..2 {
+                offset_q[k] *= 1.05;
+                offset_v[k] *= 1.05;
+            }
+            let share = guard.admit(&hidden, &with(&offset_q, &offset_v));
+            for k in 0..2 {
+                offset_q[k] *= share;
+                offset_v[k] *= share;
+            }
+            let shown = with(&offset_q, &offset_v);
+            let excess = guard.energy(&shown) - guard.energy(&hidden);
+            put_in += excess - last_excess;
+            last_excess = excess;
+            assert!(
+                (put_in - guard.injected()).abs() < 1e-6 * (1.0 + put_in.abs()),
+                "{put_in} {}",
+                guard.injected()
+            );
+            assert!(
+                put_in <= guard.dissipated() + guard.tank() + 1e-9,
+                "tick {n}: {put_in} J put in, {} J lost, tank {} J",
+                guard.dissipated(),
+                guard.tank()
+            );
+        }
+        assert!(guard.cuts() > 100, "the guard must have had work to do");
+    }
+
+    #[test]
+    fn a_fading_offset_at_rest_is_let_pass() {
+        let mut guard = PassivityGuard::new(&[5.0], &[0.1], 0.01);
+        let hidden = ModalState::zero(1);
+        let at = |q: f64| ModalState { q: vec![q], ..ModalState::zero(1) };
+        guard.corrected(&hidden, &at(1.0));
+        for n in 1..100 {
+            assert_eq!(
+                guard.admit(&hidden, &at(1.0 - f64::from(n) * 0.01)),
+                1.0,
+                "losing energy needs no leave"
+            );
+        }
+        assert_eq!(guard.cuts(), 0);
+    }
+}
