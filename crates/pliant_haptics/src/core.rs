@@ -26,6 +26,11 @@ pub struct LoopConfig {
     pub coupling: CouplingConfig,
     /// Delay of the force beyond what the device itself declares, s. Default: 0.
     pub delay: f64,
+    /// Round trip to the simulation and back, s: from the hand's position to the word that has seen it, beyond the simulation's own step.
+    /// Clamps the coupling, unless `modal`. Default: 0.
+    pub round_trip: f64,
+    /// The loop will be given a body to step itself ([`ModalLocal`]): it feels the body at once, whatever the round trip. Default: `false`.
+    pub modal: bool,
     /// Stages of the safety pipeline; `None`: all of them, with limits for the device. Default: `None`.
     pub safety: Option<SafetyConfig>,
     /// Where the workspace is in the world. Default: its middle at the origin, metre for metre.
@@ -38,6 +43,8 @@ impl Default for LoopConfig {
             rate: 1000.0,
             coupling: CouplingConfig::default(),
             delay: 0.0,
+            round_trip: 0.0,
+            modal: false,
             safety: None,
             tool: ToolMap::default(),
         }
@@ -162,6 +169,9 @@ impl LoopCore {
         if !(config.delay.is_finite() && config.delay >= 0.0) {
             return Err(StartError::Delay(config.delay));
         }
+        if !(config.round_trip.is_finite() && config.round_trip >= 0.0) {
+            return Err(StartError::Delay(config.round_trip));
+        }
         if !config.tool.is_valid() {
             return Err(StartError::Tool);
         }
@@ -169,11 +179,14 @@ impl LoopCore {
         if !info.simulated && !safety.is_complete(&info) {
             return Err(StartError::Unsafe(info.name));
         }
-        let coupling = Coupling::clamp(&config.coupling, &info, config.rate, config.delay);
+        let coupling = {
+            let round_trip = if config.modal { 0.0 } else { config.round_trip };
+            Coupling::clamp(&config.coupling, &info, config.rate, config.delay, round_trip)
+        };
         Ok(Self {
             intake: Intake::new(&info),
             tool: Tool::new(config.tool),
-            safety: Safety::new(safety),
+            safety: Safety::new(safety, info.mass),
             torque: Slew::default(),
             follow: [Follow::default(); MAX_CONTACTS],
             modal: None,
@@ -240,8 +253,13 @@ impl LoopCore {
         self.safety.reset_stop();
     }
 
-    /// The device was lost or came back: nothing of before counts.
-    pub fn forget(&mut self) {
+    /// The device was lost: its buttons are up, and where it is next is not a jump. The force fades as for any fault.
+    pub fn lose(&mut self) {
+        self.intake.forget();
+    }
+
+    /// A device is there: the first force comes by the ramp.
+    pub fn engage(&mut self) {
         self.intake.forget();
         self.safety.engage();
     }
@@ -263,13 +281,7 @@ impl LoopCore {
     fn run(&mut self, now: f64, dt: f64, hand: Believed, model: &LocalModel) -> Wrench {
         let moved = if hand.jumped { Vector3::zeros() } else { hand.position - self.last_position };
         self.last_position = hand.position;
-        self.tool.follow(
-            hand.position,
-            hand.velocity,
-            hand.orientation,
-            hand.buttons,
-            hand.jumped && self.last.now > 0.0,
-        );
+        self.tool.follow(hand.position, hand.velocity, hand.orientation, hand.buttons, hand.shifted);
 
         let mut fault = hand.fault;
         if dt > STALL {

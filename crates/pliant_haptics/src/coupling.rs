@@ -27,6 +27,8 @@ pub enum CouplingLimit {
     None,
     /// Damping against the delay of hold and device, `K < (b + B) / (T/2 + d)`.
     Rate,
+    /// Damping against the round trip to the simulation.
+    RoundTrip,
     /// What the maker says.
     Device,
 }
@@ -47,33 +49,47 @@ pub struct Coupling {
 }
 
 impl Coupling {
-    /// The stiffest coupling not above what is wanted that `device` closes at `rate` (Hz) with `delay` (s) beyond the device's own.
+    /// The stiffest coupling not above what is wanted that `device` closes at `rate` (Hz) with `delay` (s) beyond the device's own, to a body that
+    /// answers after `round_trip` (s).
     ///
     /// The limit of a sampled spring with delay, `K < (b + B) / (T/2 + d)` (`2 b / T` when `B = d = 0`); that of a virtual damper whose
     /// velocity is measured, a third of `M / lag` (see [`stable_damping`](crate::stable_damping)); and the
-    /// maker's own numbers. Numbers that are not finite or not in their range count as the default.
-    pub fn clamp(config: &CouplingConfig, device: &DeviceInfo, rate: f64, delay: f64) -> Self {
+    /// maker's own numbers. A body far away that follows the hand entirely is a spring to where the hand was: `M x'' + (b + B) x' + K (x - x(t - t_r)) = 0`
+    /// is stable for any `t_r` if the delayed part is nowhere larger than the rest (small gain), `K < (b + B)^2 / M`, or as a spring with that
+    /// much delay; the larger of the two counts. Numbers that are not finite or not in their range count as the default.
+    pub fn clamp(
+        config: &CouplingConfig,
+        device: &DeviceInfo,
+        rate: f64,
+        delay: f64,
+        round_trip: f64,
+    ) -> Self {
         let default = CouplingConfig::default();
         let or = |value: f64, ok: bool, other: f64| if ok { value } else { other };
         let headroom = or(config.headroom, config.headroom > 0.0 && config.headroom <= 1.0, default.headroom);
-        let wanted_stiffness = or(config.stiffness, config.stiffness > 0.0, default.stiffness);
+        let wanted = or(config.stiffness, config.stiffness > 0.0, default.stiffness);
         let wanted_damping =
             or(config.damping, config.damping.is_finite() && config.damping >= 0.0, default.damping);
-        let period = 1.0 / rate;
-        let lag = device.delay + delay.max(0.0);
+        let lag = 0.5 / rate + device.delay + delay.max(0.0);
 
-        let by_rate = crate::safety::stable_damping(device, rate, delay);
-        let (damping, damping_limit) = tightest(wanted_damping, by_rate, headroom * device.max_damping);
-        let by_rate = headroom * (device.damping + damping) / (0.5 * period + lag);
-        let (stiffness, stiffness_limit) =
-            tightest(wanted_stiffness, by_rate, headroom * device.max_stiffness);
-        Self {
-            stiffness,
-            damping,
-            wanted: [wanted_stiffness, wanted_damping],
-            stiffness_limit,
-            damping_limit,
-        }
+        let limits = [
+            (crate::safety::stable_damping(device, rate, delay), CouplingLimit::Rate),
+            (headroom * device.max_damping, CouplingLimit::Device),
+        ];
+        let (damping, damping_limit) = tightest(wanted_damping, &limits);
+        let calming = device.damping + damping;
+        let far = if round_trip > 0.0 {
+            (calming / (lag + round_trip)).max(calming * calming / device.mass)
+        } else {
+            f64::INFINITY
+        };
+        let limits = [
+            (headroom * calming / lag, CouplingLimit::Rate),
+            (headroom * far, CouplingLimit::RoundTrip),
+            (headroom * device.max_stiffness, CouplingLimit::Device),
+        ];
+        let (stiffness, stiffness_limit) = tightest(wanted, &limits);
+        Self { stiffness, damping, wanted: [wanted, wanted_damping], stiffness_limit, damping_limit }
     }
 
     /// Whether anything had to give.
@@ -103,6 +119,7 @@ impl std::fmt::Display for Coupling {
         let why = |limit| match limit {
             CouplingLimit::None => "as wanted",
             CouplingLimit::Rate => "clamped by rate and delay",
+            CouplingLimit::RoundTrip => "clamped by the round trip to the simulation",
             CouplingLimit::Device => "clamped by the device",
         };
         write!(
@@ -118,14 +135,10 @@ impl std::fmt::Display for Coupling {
     }
 }
 
-fn tightest(wanted: f64, rate: f64, device: f64) -> (f64, CouplingLimit) {
-    if wanted <= rate && wanted <= device {
-        (wanted, CouplingLimit::None)
-    } else if rate <= device {
-        (rate, CouplingLimit::Rate)
-    } else {
-        (device, CouplingLimit::Device)
-    }
+fn tightest(wanted: f64, limits: &[(f64, CouplingLimit)]) -> (f64, CouplingLimit) {
+    limits
+        .iter()
+        .fold((wanted, CouplingLimit::None), |best, &limit| if limit.0 < best.0 { limit } else { best })
 }
 
 #[cfg(test)]
@@ -138,21 +151,28 @@ mod tests {
         let device = VirtualConfig { mass: 0.2, damping: 0.5, ..VirtualConfig::default() }.info();
         let open = CouplingConfig { stiffness: 1e9, damping: 0.0, headroom: 1.0 };
         // 2 b / T of the reference: m = 0.2 kg, b = 0.5 N s/m, T = 1 ms give 1000 N/m.
-        let c = Coupling::clamp(&open, &device, 1000.0, 0.0);
+        let c = Coupling::clamp(&open, &device, 1000.0, 0.0, 0.0);
         assert!((c.stiffness - 1000.0).abs() < 1e-9, "{c}");
         assert_eq!(c.stiffness_limit, CouplingLimit::Rate);
         // (b + B) / (T/2 + d) with B = 0.5, d = 4.5 ms: 1 / 5 ms.
-        let c = Coupling::clamp(&CouplingConfig { damping: 0.5, ..open }, &device, 1000.0, 4.5e-3);
+        let c = Coupling::clamp(&CouplingConfig { damping: 0.5, ..open }, &device, 1000.0, 4.5e-3, 0.0);
         assert!((c.stiffness - 200.0).abs() < 1e-9, "{c}");
         // The maker's word counts where it is the tighter one.
         let touch = VirtualConfig::touch().info();
-        let c = Coupling::clamp(&CouplingConfig { headroom: 1.0, damping: 1.0, ..open }, &touch, 8000.0, 0.0);
+        let c = Coupling::clamp(
+            &CouplingConfig { headroom: 1.0, damping: 1.0, ..open },
+            &touch,
+            8000.0,
+            0.0,
+            0.0,
+        );
         assert_eq!((c.stiffness, c.stiffness_limit), (400.0, CouplingLimit::Device));
         // Nothing to clamp.
         let c = Coupling::clamp(
             &CouplingConfig { stiffness: 50.0, damping: 0.1, headroom: 0.7 },
             &touch,
             1000.0,
+            0.0,
             0.0,
         );
         assert!(!c.is_clamped(), "{c}");
@@ -161,6 +181,7 @@ mod tests {
             &CouplingConfig { stiffness: f64::NAN, damping: -1.0, headroom: 9.0 },
             &touch,
             1000.0,
+            0.0,
             0.0,
         );
         assert!(c.stiffness.is_finite() && c.damping.is_finite());

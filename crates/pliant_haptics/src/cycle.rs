@@ -208,7 +208,8 @@ impl<D: HapticDevice> Cycle<D> {
         if self.report.state == LoopState::Lost {
             pace.wait();
             self.look_for(pace.last().now, sink);
-            self.finish(pace, Err(Fault::Gone), model, sink, Instant::now());
+            let fault = if self.report.state == LoopState::Lost { Fault::Gone } else { Fault::NotCalibrated };
+            self.finish(pace, Err(fault), model, sink, Instant::now());
             return &self.report;
         }
         if !self.calibrated {
@@ -311,7 +312,7 @@ impl<D: HapticDevice> Cycle<D> {
             Calibration::Ready => {
                 self.calibrated = true;
                 self.told = None;
-                self.core.forget();
+                self.core.engage();
             }
             Calibration::Needed(what) => {
                 if self.told != Some(what) {
@@ -324,7 +325,7 @@ impl<D: HapticDevice> Cycle<D> {
 
     fn lose(&mut self, now: f64, sink: &mut dyn Sink) {
         self.device.safe_stop();
-        self.core.forget();
+        self.core.lose();
         self.report.state = LoopState::Lost;
         self.failing_since = None;
         self.retry_at = now + RETRY;
@@ -349,7 +350,6 @@ impl<D: HapticDevice> Cycle<D> {
             self.core = core;
             self.report.coupling = Some(*self.core.coupling());
         }
-        self.core.forget();
         self.calibrated = false;
         self.calibrate_at = now;
         self.report.state = LoopState::Calibrating;

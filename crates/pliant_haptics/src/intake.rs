@@ -27,6 +27,8 @@ pub(crate) struct Believed {
     pub(crate) fault: Option<Fault>,
     /// The position was taken over from a new place: displacement since the last tick means nothing.
     pub(crate) jumped: bool,
+    /// And the tool is not to follow it there: it was the measurement that jumped, not the hand.
+    pub(crate) shifted: bool,
 }
 
 #[derive(Debug, Clone)]
@@ -34,6 +36,8 @@ pub(crate) struct Intake {
     resolution: f64,
     frozen_force: f64,
     last: Option<(Vector3<f64>, UnitQuaternion<f64>)>,
+    /// The next sample is believed wherever it is.
+    fresh: bool,
     raw: Option<Vector3<f64>>,
     settling: f64,
     same: f64,
@@ -52,6 +56,7 @@ impl Intake {
             resolution: info.resolution,
             frozen_force: 0.05 * info.peak_force,
             last: None,
+            fresh: true,
             raw: None,
             settling: 0.0,
             same: 0.0,
@@ -64,9 +69,9 @@ impl Intake {
         }
     }
 
-    /// After a loss: nothing of before counts, and every button must be seen open again.
+    /// After a loss: nothing of before counts but the place to stay at until there is a sample, and every button must be seen open again.
     pub(crate) fn forget(&mut self) {
-        self.last = None;
+        self.fresh = true;
         self.raw = None;
         self.filled = 0;
         self.same = 0.0;
@@ -86,6 +91,7 @@ impl Intake {
             buttons: self.buttons,
             fault: Some(fault),
             jumped: false,
+            shifted: false,
         }
     }
 
@@ -101,8 +107,8 @@ impl Intake {
         let orientation = UnitQuaternion::from_quaternion(Quaternion::new(w, x, y, z));
         let reach = FASTEST * dt + 4.0 * self.resolution;
 
-        let mut jumped = false;
-        if let Some((believed, _)) = self.last {
+        let (mut jumped, mut shifted) = (false, false);
+        if let (Some((believed, _)), false) = (self.last, self.fresh) {
             let leap = (raw - believed).norm();
             if leap > reach {
                 let steady = self.raw.is_some_and(|r| (raw - r).norm() <= reach);
@@ -111,13 +117,14 @@ impl Intake {
                 if self.settling < SETTLE {
                     return self.hold(Fault::Jump(leap));
                 }
-                jumped = true;
+                (jumped, shifted) = (true, true);
                 self.filled = 0;
             }
         } else {
             jumped = true;
         }
         self.settling = 0.0;
+        self.fresh = false;
         self.raw = Some(raw);
         self.last = Some((raw, orientation));
 
@@ -129,7 +136,15 @@ impl Intake {
             Some(v) => v.into(),
             None => self.estimate(now, raw),
         };
-        Believed { position: raw, velocity, orientation, buttons: self.buttons, fault: frozen, jumped }
+        Believed {
+            position: raw,
+            velocity,
+            orientation,
+            buttons: self.buttons,
+            fault: frozen,
+            jumped,
+            shifted,
+        }
     }
 
     fn frozen(&mut self, dt: f64, sample: &Sample, force: f64) -> Option<Fault> {

@@ -30,7 +30,7 @@ pub struct Contact {
 pub struct LocalModel {
     /// Counts the simulation's steps from 1; 0 has never been written.
     pub tick: u64,
-    /// When it was written, on the loop's clock, s.
+    /// Which hand the simulation had seen: the time, on the loop's clock, of the tick whose tool position was the newest target, s.
     pub stamp: f64,
     /// Time that a step of the simulation covers, s.
     pub period: f64,
@@ -97,7 +97,7 @@ impl ModelWriter {
     /// Writes what the loop needs to know of `body` after a step, into `out`.
     ///
     /// `held`: the tool's grabs, the first [`MAX_CONTACTS`] count. `scale`: the body's lengths and forces times this are the world's.
-    /// `now`: the loop's clock, s. The proxy is where the solver has the patch, so at the target of the step the spring gives exactly the
+    /// `stamp`: the [`Tick::now`](crate::Tick::now) of the tool position that the step had for a target. The proxy is where the solver has the patch, so at the target of the step the spring gives exactly the
     /// reaction: `C lambda = target - proxy`.
     ///
     /// # Errors
@@ -108,12 +108,12 @@ impl ModelWriter {
         held: &[HeldGrab],
         coupling: &Coupling,
         scale: f64,
-        now: f64,
+        stamp: f64,
         out: &mut LocalModel,
     ) -> Result<(), StepError> {
         self.tick += 1;
         out.tick = self.tick;
-        out.stamp = now;
+        out.stamp = stamp;
         out.period = body.config().step;
         out.count = 0;
         out.stored = body.energy() * scale * scale;

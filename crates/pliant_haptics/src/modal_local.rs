@@ -2,10 +2,11 @@
 //!
 //! The proxy model knows one spring to a place that moves at the simulation's rate; what the body does between two words of the
 //! simulation is guessed. Here the loop has a copy of the body with the tool's grabs, steps it with the hand's position at device rate, and
-//! lets the simulation's word correct it: the copy of *then* is compared with the word about *then*, and the difference is added to the copy of *now*.
+//! lets the simulation's word correct it: the copy of *then* is compared with the word about *then*, and the difference, swung on, is
+//! taken out of the copy of *now* bit by bit.
 
 use nalgebra::Vector3;
-use pliant_modal::{Body, Frame, State, StepError};
+use pliant_modal::{Body, Coefficients, Frame, Integrator, State, StepError};
 
 use crate::{HeldGrab, LocalModel, MAX_CONTACTS, tool::Tool};
 
@@ -13,6 +14,8 @@ use crate::{HeldGrab, LocalModel, MAX_CONTACTS, tool::Tool};
 const MEMORY: f64 = 0.3;
 /// Time in which a difference to the simulation's word is taken out, s.
 const CORRECTION: f64 = 0.03;
+/// The same at a distance, as its ratio to the age of the word: delay times rate must stay well below 1.
+const PATIENCE: f64 = 0.3;
 
 /// A copy of a body for the loop. Made on the simulation's side, where memory may be had; stepped on the loop's.
 #[derive(Debug, Clone)]
@@ -124,15 +127,25 @@ impl ModalLocal {
         if self.frames[at].0 == f64::NEG_INFINITY {
             return self.body.set_state(&model.state).is_ok();
         }
-        let gain = 1.0 - (-model.period.max(0.0) / CORRECTION).exp();
+        // A difference that is taken out faster than it can be seen to go is taken out twice.
+        let age = back as f64 * self.period;
+        let gain = 1.0 - (-model.period.max(0.0) / CORRECTION.max(age / PATIENCE)).exp();
         self.scratch.q.copy_from_slice(self.body.q());
         self.scratch.v.copy_from_slice(self.body.v());
         self.scratch.a.copy_from_slice(self.body.a());
         self.scratch.f.copy_from_slice(&self.body.state().f);
         let then = &self.past[at * 2 * modes..][..2 * modes];
         for i in 0..modes {
-            self.scratch.q[i] += gain * (model.state.q[i] - then[i]);
-            self.scratch.v[i] += gain * (model.state.v[i] - then[modes + i]);
+            let (eq, ev) = (model.state.q[i] - then[i], model.state.v[i] - then[modes + i]);
+            // The difference of then has swung on since, as a mode does that nobody holds.
+            let (omega, damping) = (self.body.model().omega()[i], self.body.model().damping()[i]);
+            let [eq, ev, _] = match Coefficients::new(Integrator::Exact, omega, damping, age.max(self.period))
+            {
+                Ok(swing) if back > 0 => swing.step([eq, ev, 0.0], 0.0, 0.0),
+                _ => [eq, ev, 0.0],
+            };
+            self.scratch.q[i] += gain * eq;
+            self.scratch.v[i] += gain * ev;
         }
         if self.body.model().is_free() {
             match self.corrected_frame(&self.frames[at].1, &model.state.frame, gain) {
@@ -141,14 +154,6 @@ impl ModalLocal {
             }
         } else {
             self.scratch.frame = model.state.frame;
-        }
-        // The past is corrected as the present is, so that the same difference is not taken out twice.
-        for slot in 0..slots {
-            let past = &mut self.past[slot * 2 * modes..][..2 * modes];
-            for i in 0..modes {
-                past[i] += self.scratch.q[i] - self.body.q()[i];
-                past[modes + i] += self.scratch.v[i] - self.body.v()[i];
-            }
         }
         self.body.set_state(&self.scratch).is_ok()
     }

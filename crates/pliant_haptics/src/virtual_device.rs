@@ -302,7 +302,13 @@ impl Virtual {
         let at = (self.head + self.line.len() - self.config.delay_periods) % self.line.len();
         self.force = crate::clamp_magnitude(&self.line[at], self.config.peak_force);
 
-        let steps = (dt * self.config.integration_rate).ceil().max(1.0);
+        let target = Vector3::from(self.handle.target());
+        let from = self.last_target.unwrap_or(target);
+        self.last_target = Some(target);
+        // Nothing but held forces: the closed form needs no substeps.
+        let exact =
+            self.config.friction == 0.0 && (target == from || self.hand.stiffness + self.hand.damping == 0.0);
+        let steps = if exact { 1.0 } else { (dt * self.config.integration_rate).ceil().max(1.0) };
         let h = dt / steps;
         let mass = self.config.mass + self.hand.mass;
         let coefficients = match &self.coefficients {
@@ -316,9 +322,6 @@ impl Virtual {
                 c
             }
         };
-        let target = Vector3::from(self.handle.target());
-        let from = self.last_target.unwrap_or(target);
-        self.last_target = Some(target);
         let arm_speed = (target - from) / dt;
         let start = self.position;
         let steps = steps as usize;

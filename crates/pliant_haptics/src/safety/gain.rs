@@ -57,10 +57,6 @@ impl StaleConfig {
 #[derive(Debug, Clone, Copy)]
 pub struct Gain {
     value: f64,
-    /// What faults leave, falling while there is one.
-    fault: f64,
-    /// What the velocity cut-out leaves.
-    cut: f64,
     cutting: bool,
     stopped: bool,
 }
@@ -68,7 +64,7 @@ pub struct Gain {
 impl Gain {
     pub(crate) fn new(config: &SafetyConfig) -> Self {
         let value = if config.ramp.is_some() { 0.0 } else { 1.0 };
-        Self { value, fault: 1.0, cut: 1.0, cutting: false, stopped: false }
+        Self { value, cutting: false, stopped: false }
     }
 
     pub(crate) fn is_stopped(&self) -> bool {
@@ -94,20 +90,18 @@ impl Gain {
         stop: bool,
     ) -> (f64, Option<Fault>) {
         let mut found = None;
-        let fall = |value: f64| config.fade.map_or(0.0, |fade| (value - dt / fade).max(0.0));
-        self.value = config.ramp.map_or(1.0, |ramp| (self.value + dt / ramp).min(1.0));
-
-        self.fault = if fault.is_some() { fall(self.fault) } else { 1.0 };
-        self.value = self.value.min(self.fault);
-
         if let Some(limits) = &config.velocity {
             self.cutting = if self.cutting { speed > limits.release } else { speed > limits.limit };
             if self.cutting {
                 found = Some(Fault::TooFast(speed));
             }
-            self.cut = if self.cutting { fall(self.cut) } else { 1.0 };
-            self.value = self.value.min(self.cut);
         }
+        // From where it is, not from one: a fault that comes and goes each tick must fade the force as well.
+        self.value = if fault.is_some() || self.cutting {
+            config.fade.map_or(0.0, |fade| (self.value - dt / fade).max(0.0))
+        } else {
+            config.ramp.map_or(1.0, |ramp| (self.value + dt / ramp).min(1.0))
+        };
         if let Some(stale) = &config.stale {
             let allowed = stale.allows(silent);
             if allowed < 1.0 {
@@ -115,10 +109,6 @@ impl Gain {
             }
             self.value = self.value.min(allowed);
         }
-        // Where a fade begins is where the gain is, not at one: otherwise a half-ramped force would stand still while it should fall.
-        self.fault = self.fault.min(if fault.is_some() { self.value } else { 1.0 });
-        self.cut = self.cut.min(if self.cutting { self.value } else { 1.0 });
-
         self.stopped |= stop;
         if self.stopped {
             self.value = 0.0;

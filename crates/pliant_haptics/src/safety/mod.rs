@@ -155,19 +155,23 @@ pub struct Safety {
     slew: Slew,
     thermal: Thermal,
     gain: Gain,
+    mass: f64,
     last: Vector3<f64>,
     last_weight: Vector3<f64>,
 }
 
 impl Safety {
     /// A pipeline with nothing engaged yet: the first force comes by the ramp.
-    pub fn new(config: SafetyConfig) -> Self {
+    ///
+    /// `mass`: the device's apparent mass, kg.
+    pub fn new(config: SafetyConfig, mass: f64) -> Self {
         Self {
             config,
             passivity: Passivity::new(config.passivity.unwrap_or_default()),
             slew: Slew::default(),
             thermal: Thermal::default(),
             gain: Gain::new(&config),
+            mass,
             last: Vector3::zeros(),
             last_weight: Vector3::zeros(),
         }
@@ -225,7 +229,7 @@ impl Safety {
             if let Some(limit) = self.config.max_damping {
                 damping = cap_damping(&damping, &w.velocity, limit);
             }
-            let total = self.passivity.restrain(&(elastic + damping), &w.velocity, w.dt, slew);
+            let total = self.passivity.restrain(&(elastic + damping), &w.velocity, w.dt, slew, self.mass);
             elastic = total - damping;
         } else if let Some(limit) = self.config.max_damping {
             damping = cap_damping(&damping, &w.velocity, limit);

@@ -45,8 +45,8 @@ pub struct Port {
 /// through honey for a minute has nothing to its credit.
 ///
 /// Two remedies. [`dissipate`](Self::dissipate) answers what has leaked out (sampling, delay, a coarse encoder) with damping, as much as pays it back and
-/// no more than the device closes. [`restrain`](Self::restrain) is the hard bound: the part of the force that pushes the hand along is cut so that what is
-/// available is not overdrawn, even if the force then still needs its slew limit's time to go away.
+/// no more than the device closes. [`restrain`](Self::restrain) is the hard bound: the force is cut so that what is
+/// available is not overdrawn, even while the force still needs its slew limit's time to go away.
 #[derive(Debug, Clone, Copy)]
 pub struct Passivity {
     config: PassivityConfig,
@@ -101,35 +101,37 @@ impl Passivity {
         -velocity * damping
     }
 
-    /// The force with its part along the velocity cut to what the available energy `E` covers: `f v dt + f^2 v / (2 S) <= E`, the second term being the
-    /// work on the way down at the slew limit `S` (N/s).
+    /// The force (N), cut so that what is available covers the work that it can do before it is gone again; its direction is kept.
+    ///
+    /// Held for `dt` and then taken down at the slew limit `S` (N/s), a force `f` has the impulse `I = f dt + f^2 / (2 S)`; on a handle of mass `M` that
+    /// already moves along it at `v` it does at most the work `v I + I^2 / (2 M)`. `M` is the device's alone: a hand on it only makes that less.
     pub fn restrain(
         &mut self,
         force: &Vector3<f64>,
         velocity: &Vector3<f64>,
         dt: f64,
         slew: f64,
+        mass: f64,
     ) -> Vector3<f64> {
-        let speed = velocity.norm();
-        if speed <= 0.0 {
-            return if self.port.available > 0.0 { *force } else { Vector3::zeros() };
-        }
-        let along = velocity / speed;
-        let push = force.dot(&along);
-        if push <= 0.0 {
+        let size = force.norm();
+        if size <= 0.0 {
             return *force;
         }
+        let speed = velocity.dot(force) / size;
         let energy = self.port.available.max(0.0);
+        // The root of I^2 / (2 M) + v I = E, without the cancellation of a fast handle.
+        let root = (speed * speed + 2.0 * energy / mass).sqrt();
+        let impulse = if speed > 0.0 { 2.0 * energy / (root + speed) } else { mass * (root - speed) };
         let most = if slew.is_finite() {
-            // The root of f^2 / (2 S) + f dt - E / v = 0.
-            slew * (-dt + (dt * dt + 2.0 * energy / (speed * slew)).sqrt())
+            // The root of f^2 / (2 S) + f dt = I.
+            2.0 * impulse / (dt + (dt * dt + 2.0 * impulse / slew).sqrt())
         } else {
-            energy / (speed * dt)
+            impulse / dt
         };
-        if push <= most {
+        if size <= most {
             return *force;
         }
-        self.port.dissipated += (push - most) * speed * dt;
-        force - along * (push - most)
+        self.port.dissipated += (size - most) * speed.max(0.0) * dt;
+        force * (most / size)
     }
 }

@@ -1,6 +1,9 @@
 //! A loop and a virtual device in virtual time.
 #![allow(dead_code, reason = "every test uses its own part of it")]
 
+pub mod block;
+pub mod scene;
+
 use pliant_haptics::{
     Contact, CouplingConfig, Cycle, Hand, LocalModel, LoopConfig, LoopEvent, SafetyConfig, Virtual,
     VirtualConfig, VirtualPace,

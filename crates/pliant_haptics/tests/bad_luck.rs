@@ -1,0 +1,277 @@
+//! Everything that goes wrong with a device, a driver, a game or a network. The force fades, never kicks, and comes back by ramp.
+
+mod rig;
+
+use std::cell::Cell;
+
+use pliant_haptics::{
+    Calibration, Cycle, DeviceInfo, Fault, Hand, HapticDevice, LoopConfig, LoopEvent, LoopState, Pace,
+    SafetyConfig, Sample, Virtual, VirtualConfig, VirtualPace, Wrench,
+};
+use rig::{
+    Rig,
+    scene::{Scene, SceneConfig},
+};
+
+/// A light hand that has pulled the block two centimetres to the side and holds it there.
+fn holding() -> Scene {
+    let mut scene =
+        Scene::new(SceneConfig { young: 1e5, modes: 12, hand: Hand::FIRM, ..SceneConfig::default() });
+    scene.run(0.4);
+    for k in 1..=200 {
+        scene.hand.set_target([0.02 * f64::from(k) / 200.0, 0.0, 0.0]);
+        scene.tick();
+    }
+    scene.run(0.3);
+    assert!(scene.force() > 0.8, "there is a force to lose: {} N", scene.force());
+    scene.largest_step = 0.0;
+    scene.events.clear();
+    scene
+}
+
+fn slew_per_tick() -> f64 {
+    SafetyConfig::for_device(&VirtualConfig::touch().info(), 1000.0).slew.unwrap() * 1e-3
+}
+
+fn has(scene: &Scene, wanted: impl Fn(&Fault) -> bool) -> bool {
+    scene.events.iter().any(|e| matches!(e, LoopEvent::Fault(f) if wanted(f)))
+}
+
+#[test]
+fn device_gone_in_the_middle_of_a_grab_and_back() {
+    let mut scene = holding();
+    scene.hand.set_buttons(1);
+    scene.run(0.01);
+    assert!(scene.events.contains(&LoopEvent::Pressed(0)));
+    scene.hand.set_gone(true);
+    scene.run(0.5);
+    assert_eq!(scene.cycle.report().state, LoopState::Lost);
+    assert_eq!(scene.force(), 0.0);
+    assert!(scene.events.contains(&LoopEvent::Lost));
+    assert!(
+        scene.events.contains(&LoopEvent::Released(0)),
+        "nobody presses a button on a device that is gone"
+    );
+    scene.hand.set_gone(false);
+    scene.run(1.0);
+    assert_eq!(scene.cycle.report().state, LoopState::Running);
+    assert!(scene.events.contains(&LoopEvent::Returned));
+    assert_eq!(scene.cycle.core().last().buttons, 0, "held since before it came back: not believed");
+    scene.run(1.0);
+    assert!(scene.force() > 0.5, "and it can be felt again: {:?}", scene.cycle.core().last());
+    assert!(scene.largest_step <= slew_per_tick() * 1.000_001, "and nothing kicks: {}", scene.largest_step);
+}
+
+#[test]
+fn frozen_samples() {
+    let mut scene = holding();
+    scene.hand.set_frozen(true);
+    scene.run(0.1);
+    assert!(has(&scene, |f| matches!(f, Fault::Frozen(_))));
+    assert_eq!(scene.force(), 0.0);
+    scene.hand.set_frozen(false);
+    scene.run(1.0);
+    assert!(scene.force() > 0.5 && scene.largest_step <= slew_per_tick() * 1.000_001);
+}
+
+#[test]
+fn simulation_late_by_a_second() {
+    let mut scene = holding();
+    scene.silent = true;
+    let before = scene.force();
+    // The last word was at most a step (8.3 ms) ago; 30 ms later patience ends, and 50 ms after the word there is nothing.
+    scene.run(0.020);
+    assert!(scene.force() > 0.9 * before);
+    scene.run(0.031);
+    assert_eq!(scene.force(), 0.0, "50 ms after the last word");
+    assert!(has(&scene, |f| matches!(f, Fault::Stale(_))));
+    scene.run(0.95);
+    scene.silent = false;
+    scene.run(0.05);
+    assert!(scene.force() < 0.3 * before, "it comes back by ramp");
+    scene.run(0.5);
+    assert!(scene.force() > 0.9 * before, "and whole: {} of {before}", scene.force());
+    assert!(scene.largest_step <= slew_per_tick() * 1.000_001);
+    assert!(scene.events.contains(&LoopEvent::Clear));
+}
+
+#[test]
+fn breakpoint_in_the_whole_process() {
+    let mut scene = holding();
+    scene.pace.stall(3.0);
+    scene.tick();
+    assert!(has(&scene, |f| matches!(f, Fault::Stalled(t) if *t > 2.9)));
+    scene.run(1.0);
+    assert!(
+        scene.force() > 0.5 && scene.largest_step <= slew_per_tick() * 1.000_001,
+        "{}",
+        scene.largest_step
+    );
+    assert_eq!(scene.cycle.report().missed, 3000);
+}
+
+#[test]
+fn a_word_that_is_not_a_number() {
+    let mut scene = holding();
+    for _ in 0..40 {
+        scene.tick();
+        let mut bad = scene.model.clone();
+        bad.tick += 1_000_000;
+        bad.contacts[0].proxy[1] = f64::NAN;
+        let good = std::mem::replace(&mut scene.model, bad);
+        scene.cycle.step(&mut scene.pace, &scene.model, &mut scene.events);
+        scene.model = good;
+        assert!(scene.cycle.core().last().wrench.force.iter().all(|x| x.is_finite()));
+    }
+    assert!(has(&scene, |f| *f == Fault::BadModel));
+    assert!(scene.force() < 1e-6);
+    scene.run(1.0);
+    assert!(scene.force() > 0.5);
+}
+
+#[test]
+fn emergency_stop_is_latched() {
+    let mut scene = holding();
+    scene.cycle.emergency_stop();
+    scene.tick();
+    assert_eq!(scene.force(), 0.0, "at once");
+    assert_eq!(scene.cycle.report().state, LoopState::Stopped);
+    scene.run(2.0);
+    assert_eq!(scene.force(), 0.0);
+    scene.cycle.reset_stop();
+    scene.largest_step = 0.0;
+    scene.run(1.0);
+    assert!(scene.force() > 0.5 && scene.largest_step <= slew_per_tick() * 1.000_001);
+}
+
+/// A device that lies as the test says.
+struct Liar {
+    inner: Virtual,
+    lie: Cell<Lie>,
+}
+
+#[derive(Clone, Copy, PartialEq)]
+enum Lie {
+    None,
+    NotANumber,
+    Elsewhere,
+    Error,
+    ErrorAtOnce,
+}
+
+impl HapticDevice for Liar {
+    fn info(&self) -> DeviceInfo {
+        self.inner.info()
+    }
+    fn calibration(&mut self) -> Calibration {
+        self.inner.calibration()
+    }
+    fn exchange(&mut self, wrench: &Wrench, pace: &mut dyn Pace) -> Result<Sample, Fault> {
+        if self.lie.get() == Lie::ErrorAtOnce {
+            return Err(Fault::Driver(7));
+        }
+        let sample = self.inner.exchange(wrench, pace)?;
+        match self.lie.get() {
+            Lie::NotANumber => Ok(Sample { position: [f64::NAN; 3], ..sample }),
+            Lie::Elsewhere => {
+                let [x, y, z] = sample.position;
+                Ok(Sample { position: [x + 1.0, y, z], ..sample })
+            }
+            Lie::Error => Err(Fault::Driver(0x301)),
+            _ => Ok(sample),
+        }
+    }
+    fn safe_stop(&mut self) {
+        self.inner.safe_stop();
+    }
+    fn reopen(&mut self) -> Result<(), Fault> {
+        if matches!(self.lie.get(), Lie::Error | Lie::ErrorAtOnce) { Err(Fault::Gone) } else { Ok(()) }
+    }
+}
+
+/// Runs a spring of 200 N/m, 1 cm stretched by a firm hand, into `lie` for `ticks` and out again.
+fn told(lie: Lie, ticks: usize) -> (Cycle<Liar>, Vec<LoopEvent>, f64, f64) {
+    let device = Virtual::new(VirtualConfig::touch(), Hand::FIRM).unwrap();
+    let hand = device.handle();
+    hand.set_target([0.014, 0.0, 0.0]);
+    let mut cycle =
+        Cycle::new(Liar { inner: device, lie: Cell::new(Lie::None) }, LoopConfig::default()).unwrap();
+    let mut rig = Rig::bare(VirtualConfig::default(), Hand::NONE);
+    let mut pace = VirtualPace::new(1000.0);
+    let mut events = Vec::new();
+    let (mut last, mut step) = ([0.0f64; 3], 0.0f64);
+    let mut lowest = f64::INFINITY;
+    for k in 0..4000 + ticks {
+        let lying = (1000..1000 + ticks).contains(&k);
+        cycle.device().lie.set(if lying { lie } else { Lie::None });
+        rig.spring(200.0, 0.0);
+        cycle.step(&mut pace, &rig.model, &mut events);
+        let force = cycle.core().last().wrench.force;
+        step = step.max((0..3).map(|i| (force[i] - last[i]).powi(2)).sum::<f64>().sqrt());
+        last = force;
+        if lying {
+            lowest = lowest.min(force[0].abs());
+        }
+    }
+    (cycle, events, lowest, step)
+}
+
+#[test]
+fn not_a_number_from_the_device() {
+    let (cycle, events, lowest, step) = told(Lie::NotANumber, 60);
+    assert!(events.contains(&LoopEvent::Fault(Fault::NotFinite)));
+    assert_eq!(lowest, 0.0, "faded within 60 ms");
+    assert!(cycle.core().last().wrench.force[0] < -1.0, "and back: {:?}", cycle.core().last().wrench);
+    assert!(step <= slew_per_tick() * 1.000_001, "{step}");
+}
+
+#[test]
+fn a_jump_of_a_metre() {
+    let (cycle, events, lowest, step) = told(Lie::Elsewhere, 500);
+    assert!(events.iter().any(|e| matches!(e, LoopEvent::Fault(Fault::Jump(d)) if (d - 1.0).abs() < 0.01)));
+    assert!(lowest < 1e-9);
+    assert!(step <= slew_per_tick() * 1.000_001, "{step}");
+    // The new place was taken over without the tool moving: the spring never saw a metre.
+    let tool = cycle.core().last().tool;
+    assert!(tool[0].abs() < 0.02, "{tool:?}");
+}
+
+#[test]
+fn a_driver_that_fails_each_tick() {
+    for lie in [Lie::Error, Lie::ErrorAtOnce] {
+        let (cycle, events, lowest, _) = told(lie, 1500);
+        assert!(events.iter().any(|e| matches!(e, LoopEvent::Fault(Fault::Driver(_)))));
+        assert!(events.contains(&LoopEvent::Lost), "after 100 ms it counts as lost");
+        assert!(events.contains(&LoopEvent::Returned));
+        assert_eq!(lowest, 0.0);
+        assert!(cycle.core().last().wrench.force[0] < -1.0);
+        let of_kind = cycle.report().faults[Fault::Driver(0).kind()];
+        assert!(
+            of_kind >= 1 && events.len() < 20,
+            "told when it changes, not each tick: {} events",
+            events.len()
+        );
+    }
+}
+
+#[test]
+fn a_real_device_is_not_run_without_its_safety() {
+    struct Real(Virtual);
+    impl HapticDevice for Real {
+        fn info(&self) -> DeviceInfo {
+            DeviceInfo { simulated: false, ..self.0.info() }
+        }
+        fn exchange(&mut self, wrench: &Wrench, pace: &mut dyn Pace) -> Result<Sample, Fault> {
+            self.0.exchange(wrench, pace)
+        }
+        fn safe_stop(&mut self) {}
+    }
+    let real = || Real(Virtual::new(VirtualConfig::touch(), Hand::NONE).unwrap());
+    let bare = LoopConfig { safety: Some(SafetyConfig::bare()), ..LoopConfig::default() };
+    assert!(matches!(Cycle::new(real(), bare), Err(pliant_haptics::StartError::Unsafe(_))));
+    assert!(Cycle::new(real(), LoopConfig::default()).is_ok());
+    for rate in [100.0, 1e5, f64::NAN] {
+        let config = LoopConfig { rate, ..LoopConfig::default() };
+        assert!(matches!(Cycle::new(real(), config), Err(pliant_haptics::StartError::Rate(_))));
+    }
+}

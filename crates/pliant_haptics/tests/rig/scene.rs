@@ -1,0 +1,224 @@
+//! A body stepped at the game's rate, a network of a fixed delay, and the loop with a virtual device: all in virtual time.
+
+use std::{collections::VecDeque, sync::Arc};
+
+use pliant_haptics::{
+    Cycle, Hand, HeldGrab, LocalModel, LoopConfig, LoopEvent, ModalLocal, ModelWriter, ToolMap, Virtual,
+    VirtualConfig, VirtualHandle, VirtualPace,
+};
+use pliant_modal::{Body, BodyConfig, Patch};
+
+use super::block::{block, tip};
+
+pub struct Scene {
+    pub body: Body,
+    held: HeldGrab,
+    writer: ModelWriter,
+    pub cycle: Cycle<Virtual>,
+    pub hand: VirtualHandle,
+    pub pace: VirtualPace,
+    pub model: LocalModel,
+    pub events: Vec<LoopEvent>,
+    step: f64,
+    one_way: f64,
+    next_step: f64,
+    targets: VecDeque<(f64, f64, [f64; 3])>,
+    seen: f64,
+    models: VecDeque<(f64, LocalModel)>,
+    /// The simulation does nothing: the game is paused, late, or gone.
+    pub silent: bool,
+    /// Largest change of the force in a period, N.
+    pub largest_step: f64,
+    /// Most that the motors have ever done more than was put in, J.
+    pub most_given: f64,
+    last_force: [f64; 3],
+}
+
+pub struct SceneConfig {
+    pub young: f64,
+    pub modes: usize,
+    pub device: VirtualConfig,
+    pub hand: Hand,
+    pub rate: f64,
+    pub simulation: f64,
+    pub round_trip: f64,
+    pub modal: bool,
+}
+
+impl Default for SceneConfig {
+    fn default() -> Self {
+        Self {
+            young: 1e5,
+            modes: 60,
+            device: VirtualConfig::touch(),
+            hand: Hand::LIGHT,
+            rate: 1000.0,
+            simulation: 120.0,
+            round_trip: 0.0,
+            modal: false,
+        }
+    }
+}
+
+impl Scene {
+    pub fn new(c: SceneConfig) -> Self {
+        let model = Arc::new(block(c.young, c.modes));
+        let step = 1.0 / c.simulation;
+        let mut body = Body::new(model.clone(), BodyConfig { step, ..BodyConfig::default() }).unwrap();
+        let device = Virtual::new(c.device, c.hand).unwrap();
+        let hand = device.handle();
+        let patch = Patch::around(model.surface(), tip(), 0.01).unwrap();
+        // The middle of the workspace lies on the patch, so that grabbing moves nothing.
+        let origin = {
+            let mut probe = body.clone();
+            let id = probe.grab(&patch, pliant_modal::GrabConfig::default()).unwrap();
+            probe.grab_position(id).unwrap()
+        };
+        let config = LoopConfig {
+            rate: c.rate,
+            round_trip: c.round_trip,
+            modal: c.modal,
+            tool: ToolMap { origin, ..ToolMap::default() },
+            ..LoopConfig::default()
+        };
+        let mut cycle = Cycle::new(device, config).unwrap();
+        let id = body.grab(&patch, cycle.core().coupling().grab_config(1.0, 1.0)).unwrap();
+        let held = HeldGrab { id, offset: [0.0; 3] };
+        if c.modal {
+            cycle.set_modal(Some(Box::new(ModalLocal::new(&body, &[held], 1.0, c.rate).unwrap())));
+        }
+        Self {
+            body,
+            held,
+            writer: ModelWriter::new(),
+            cycle,
+            hand,
+            pace: VirtualPace::new(c.rate),
+            model: LocalModel::default(),
+            events: Vec::new(),
+            step,
+            one_way: 0.5 * c.round_trip,
+            next_step: 0.0,
+            targets: VecDeque::new(),
+            seen: 0.0,
+            models: VecDeque::new(),
+            silent: false,
+            largest_step: 0.0,
+            most_given: 0.0,
+            last_force: [0.0; 3],
+        }
+    }
+
+    /// One period of the loop, and of everything that falls into it.
+    pub fn tick(&mut self) {
+        let now = self.pace.now();
+        let newest = self.cycle.core().last();
+        self.targets.push_back((now + self.one_way, newest.now, newest.tool));
+        while now >= self.next_step - 1e-12 {
+            self.next_step += self.step;
+            if self.silent {
+                continue;
+            }
+            while let Some(&(_, seen, target)) = self.targets.front().filter(|(at, ..)| *at <= now) {
+                self.seen = seen;
+                self.targets.pop_front();
+                if self.cycle.core().last().now > 0.0 {
+                    self.body.set_target(self.held.id, target).unwrap();
+                }
+            }
+            self.body.step().unwrap();
+            let mut word = LocalModel::default();
+            self.writer
+                .write(&self.body, &[self.held], self.cycle.core().coupling(), 1.0, self.seen, &mut word)
+                .unwrap();
+            self.models.push_back((now + self.one_way, word));
+        }
+        while self.models.front().is_some_and(|(at, _)| *at <= now) {
+            self.model = self.models.pop_front().unwrap().1;
+        }
+        self.cycle.step(&mut self.pace, &self.model, &mut self.events);
+        let force = self.cycle.core().last().wrench.force;
+        let change: f64 = force.iter().zip(self.last_force).map(|(a, b)| (a - b).powi(2)).sum();
+        self.largest_step = self.largest_step.max(change.sqrt());
+        self.last_force = force;
+        let supplied = self.cycle.core().last().port.supplied;
+        self.most_given = self.most_given.max(self.cycle.device().work() - supplied);
+    }
+
+    pub fn run(&mut self, seconds: f64) {
+        for _ in 0..(seconds * self.cycle.core().config().rate) as usize {
+            self.tick();
+        }
+    }
+
+    pub fn speed(&self) -> f64 {
+        self.cycle.device().velocity().iter().map(|v| v * v).sum::<f64>().sqrt()
+    }
+
+    pub fn force(&self) -> f64 {
+        self.cycle.core().last().wrench.force.iter().map(|v| v * v).sum::<f64>().sqrt()
+    }
+
+    /// Largest speed of the hand over `seconds`, m/s.
+    pub fn largest_speed(&mut self, seconds: f64) -> f64 {
+        let mut worst = 0.0f64;
+        for _ in 0..(seconds * self.cycle.core().config().rate) as usize {
+            self.tick();
+            worst = worst.max(self.speed());
+        }
+        worst
+    }
+}
+
+/// What a drag came to.
+pub struct Drag {
+    /// Largest speed in two windows of half a second, 1 and 3 s after the hand stopped, m/s.
+    pub speeds: [f64; 2],
+    /// Most that the motors had done beyond what was put in, J.
+    pub given: f64,
+    /// Largest change of force in a period, N, and the limit.
+    pub step: [f64; 2],
+    /// Force at the end, N.
+    pub force: f64,
+}
+
+impl Drag {
+    /// Sustained: still moving, and no slower than two seconds before.
+    pub fn oscillates(&self) -> bool {
+        self.speeds[1] > 5e-3 && self.speeds[1] > 0.7 * self.speeds[0]
+    }
+}
+
+/// Pulls 3 cm to the side in half a second and stays there; nobody's hand gives the free device a push instead.
+pub fn drag(config: SceneConfig) -> Drag {
+    let free = config.hand == Hand::NONE;
+    let mut scene = Scene::new(config);
+    scene.run(0.5);
+    if free {
+        let at = scene.cycle.device().position();
+        scene.cycle.device_mut().place(at, [0.1, 0.05, 0.0]);
+    } else {
+        for k in 1..=500 {
+            let s = f64::from(k) / 500.0;
+            let smooth = s * s * (3.0 - 2.0 * s);
+            scene.hand.set_target([0.02 * smooth, 0.02 * smooth, -0.01 * smooth]);
+            for _ in 0..(scene.cycle.core().config().rate / 1000.0) as usize {
+                scene.tick();
+            }
+        }
+    }
+    scene.run(1.0);
+    let early = scene.largest_speed(0.5);
+    scene.run(1.5);
+    let late = scene.largest_speed(0.5);
+    let slew =
+        pliant_haptics::SafetyConfig::for_device(scene.cycle.core().info(), scene.cycle.core().config().rate)
+            .slew;
+    let limit = slew.unwrap() / scene.cycle.core().config().rate;
+    Drag {
+        speeds: [early, late],
+        given: scene.most_given,
+        step: [scene.largest_step, limit],
+        force: scene.force(),
+    }
+}
