@@ -61,7 +61,9 @@ impl fmt::Display for Anchor {
 
 /// The text is not an anchor.
 #[derive(Clone, Debug, PartialEq, Eq, thiserror::Error)]
-#[error("anchor `{text}`: expected an axis, a comparison and a finite number of metres, such as `x<0.01`; {problem}")]
+#[error(
+    "anchor `{text}`: expected an axis, a comparison and a finite number of metres, such as `x<0.01`; {problem}"
+)]
 pub struct AnchorSyntax {
     /// What came.
     pub text: String,

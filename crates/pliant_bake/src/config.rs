@@ -82,10 +82,19 @@ impl BakeConfig {
             _ => {}
         }
         for &radius in &self.site_radii {
-            number("site radius", "a share of the size above 0, at most 1", positive(radius) && radius <= 1.0, radius)?;
+            number(
+                "site radius",
+                "a share of the size above 0, at most 1",
+                positive(radius) && radius <= 1.0,
+                radius,
+            )?;
         }
         if self.modes == 0 || self.modes > ModalModel::MAX_MODES {
-            return Err(BakeError::Parameter { name: "modes", expected: "1 to 4096", got: self.modes as f64 });
+            return Err(BakeError::Parameter {
+                name: "modes",
+                expected: "1 to 4096",
+                got: self.modes as f64,
+            });
         }
         Ok(())
     }

@@ -20,7 +20,9 @@ pub enum BakeError {
         got: f64,
     },
     /// The number of modes does not fit the body.
-    #[error("modes: expected 1 to {most} for a body of {dofs} free degrees of freedom ({rigid} of them rigid), got {got}")]
+    #[error(
+        "modes: expected 1 to {most} for a body of {dofs} free degrees of freedom ({rigid} of them rigid), got {got}"
+    )]
     Modes {
         /// What came.
         got: usize,
@@ -44,7 +46,9 @@ pub enum BakeError {
     #[error("the skin: {0}")]
     Skin(#[source] MeshError),
     /// A vertex of the skin lies too far from the tetrahedra to move with them.
-    #[error("skin vertex {vertex} at {at:?} is {distance} m away from the tetrahedra: expected at most {allowed} m")]
+    #[error(
+        "skin vertex {vertex} at {at:?} is {distance} m away from the tetrahedra: expected at most {allowed} m"
+    )]
     SkinFar {
         /// The vertex.
         vertex: usize,
@@ -74,7 +78,9 @@ pub enum BakeError {
         nodes: usize,
     },
     /// The anchored nodes lie in one point or on one line: the body can still turn.
-    #[error("the anchors {anchors} hold only {nodes} nodes, in a point or on a line near {at:?}: the part there can still turn; expected three nodes off a line at least")]
+    #[error(
+        "the anchors {anchors} hold only {nodes} nodes, in a point or on a line near {at:?}: the part there can still turn; expected three nodes off a line at least"
+    )]
     AnchorTooThin {
         /// The anchors.
         anchors: String,
@@ -84,7 +90,9 @@ pub enum BakeError {
         at: [f64; 3],
     },
     /// The mesh falls into parts that are not connected, and a part has no anchor of its own.
-    #[error("the mesh has {parts} parts that do not hang together; the one near {at:?} ({nodes} nodes) has no anchor: expected one part, or an anchor on each")]
+    #[error(
+        "the mesh has {parts} parts that do not hang together; the one near {at:?} ({nodes} nodes) has no anchor: expected one part, or an anchor on each"
+    )]
     LooseParts {
         /// How many parts.
         parts: usize,
@@ -94,7 +102,9 @@ pub enum BakeError {
         nodes: usize,
     },
     /// The stiffness matrix is not positive definite in floating point arithmetic.
-    #[error("the stiffness is not positive definite near {at:?}: tetrahedra there are too thin for the material")]
+    #[error(
+        "the stiffness is not positive definite near {at:?}: tetrahedra there are too thin for the material"
+    )]
     NotPositive {
         /// The node where it was noticed, m.
         at: [f64; 3],

@@ -89,11 +89,6 @@ impl Factor {
         Ok(Self { symbolic, values })
     }
 
-    /// Degrees of freedom.
-    pub(crate) fn dofs(&self) -> usize {
-        self.symbolic.supernodes.last().map_or(0, |s| 3 * (s.first + s.columns))
-    }
-
     fn block(&self, s: &Supernode) -> MatRef<'_, f64> {
         let values = &self.values[s.at..s.at + s.values()];
         MatRef::from_column_major_slice(values, s.width() + s.below(), s.width())
@@ -115,14 +110,26 @@ impl Factor {
                 let mut outside = vec![0.0; self.symbolic.supernodes[root].below() * width];
                 let mut scratch = Vec::new();
                 for s in &self.symbolic.supernodes[task] {
-                    scratch.resize(s.below() * width, 0.0);
                     let at = 3 * (s.first - first) * width;
-                    self.forward_front(s, &mut own[at..at + s.width() * width], &mut scratch, width);
+                    let top = &mut own[at..at + s.width() * width];
+                    // A load on a few nodes leaves most subtrees at rest.
+                    if top.iter().all(|&x| x == 0.0) {
+                        continue;
+                    }
+                    scratch.resize(s.below() * width, 0.0);
+                    self.forward_front(s, top, &mut scratch, width);
                     for (index, &row) in s.rows[..s.inside].iter().enumerate() {
                         add_from_columns(own, row as usize - first, &scratch, index, s.below(), width);
                     }
                     for (index, &place) in s.outside.iter().enumerate() {
-                        add_from_columns(&mut outside, place as usize, &scratch, s.inside + index, s.below(), width);
+                        add_from_columns(
+                            &mut outside,
+                            place as usize,
+                            &scratch,
+                            s.inside + index,
+                            s.below(),
+                            width,
+                        );
                     }
                 }
                 (root, outside)
@@ -291,7 +298,14 @@ fn add_rows(to: &mut [f64], node: usize, from: &[f64], from_node: usize, width: 
 }
 
 /// As [`add_rows`], from a block stored column by column with `height` rows.
-fn add_from_columns(to: &mut [f64], node: usize, from: &[f64], from_node: usize, height: usize, width: usize) {
+fn add_from_columns(
+    to: &mut [f64],
+    node: usize,
+    from: &[f64],
+    from_node: usize,
+    height: usize,
+    width: usize,
+) {
     let to = &mut to[3 * node * width..][..3 * width];
     for column in 0..width {
         let from = &from[column * height + 3 * from_node..][..3];
@@ -436,12 +450,14 @@ fn factor_front(block: &mut [f64], update: &mut [f64], width: usize, below: usiz
         }
         let under = under.into_const();
         // Columns of this front still to come.
-        rest[..(width - end) * height].par_chunks_mut(STRIP * height).enumerate().for_each(|(index, strip)| {
-            let first = index * STRIP;
-            let columns = strip.len() / height;
-            let strip = MatMut::from_column_major_slice_mut(strip, height, columns);
-            subtract_product(strip.split_at_row_mut(end + first).1, under.subrows(first, rows - first));
-        });
+        rest[..(width - end) * height].par_chunks_mut(STRIP * height).enumerate().for_each(
+            |(index, strip)| {
+                let first = index * STRIP;
+                let columns = strip.len() / height;
+                let strip = MatMut::from_column_major_slice_mut(strip, height, columns);
+                subtract_product(strip.split_at_row_mut(end + first).1, under.subrows(first, rows - first));
+            },
+        );
     }
     if below > 0 {
         let bottom = MatRef::from_column_major_slice(&*block, height, width).subrows(width, below);

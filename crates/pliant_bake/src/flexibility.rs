@@ -29,12 +29,16 @@ pub(crate) fn sites(
         }
     }
     let held = Held::new(solver);
-    let mut out = Vec::with_capacity(patches.len());
-    for (index, group) in patches.chunks(GROUP).enumerate() {
+    // Patches that are eliminated close together share a group: its loads rest on few branches of the factor.
+    let mut order: Vec<usize> = (0..patches.len()).collect();
+    order.sort_by_key(|&index| skin.first_row(patches[index].center(), number));
+    let mut out: Vec<Option<FlexibilitySite>> = vec![None; patches.len()];
+    for (index, group) in order.chunks(GROUP).enumerate() {
         report((index * GROUP) as f64 / patches.len() as f64);
         let width = 3 * group.len();
         let mut loads = vec![0.0; solver.dofs() * width];
-        for (place, patch) in group.iter().enumerate() {
+        for (place, &patch) in group.iter().enumerate() {
+            let patch = &patches[patch];
             for &(vertex, weight) in patch.entries() {
                 skin.spread(vertex, weight, &mut |node, weight| {
                     let row = number[node as usize];
@@ -47,7 +51,8 @@ pub(crate) fn sites(
             }
         }
         let full = held.compliance(solver, &mut loads, width, modes);
-        for (place, patch) in group.iter().enumerate() {
+        for (place, &site) in group.iter().enumerate() {
+            let patch = &patches[site];
             let flexibility = std::array::from_fn(|i| {
                 std::array::from_fn(|j| {
                     let entry = |i: usize, j: usize| full[(3 * place + i, j)];
@@ -56,10 +61,10 @@ pub(crate) fn sites(
                     if i == j { residual.max(0.0) } else { residual }
                 })
             });
-            out.push(FlexibilitySite { vertex: patch.center(), radius: patch.radius(), flexibility });
+            out[site] = Some(FlexibilitySite { vertex: patch.center(), radius: patch.radius(), flexibility });
         }
     }
-    Ok(out)
+    Ok(out.into_iter().flatten().collect())
 }
 
 /// What the pseudo-inverse of a free body adds to the factor: `Z = (K + springs)^-1 M R` and `R^T M Z`.
@@ -120,8 +125,8 @@ pub(crate) fn spread_vertices(surface: &SurfaceMesh, count: usize) -> Vec<u32> {
         (0..3).map(|k| (f64::from(positions[v as usize][k]) - q[k]).powi(2)).sum()
     };
     let n = candidates.len().max(1) as f64;
-    let mean = [0, 1, 2]
-        .map(|k| candidates.iter().map(|&v| f64::from(positions[v as usize][k])).sum::<f64>() / n);
+    let mean =
+        [0, 1, 2].map(|k| candidates.iter().map(|&v| f64::from(positions[v as usize][k])).sum::<f64>() / n);
     // The first is the furthest from the middle; ties go to the lower number.
     let mut nearest: Vec<f64> = candidates.iter().map(|&v| distance2(v, mean)).collect();
     let mut out = Vec::with_capacity(count.min(candidates.len()));

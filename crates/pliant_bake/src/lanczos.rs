@@ -238,7 +238,8 @@ fn normalise(solver: &Solver, mut block: Vec<f64>, width: usize) -> Option<(Vec<
         let gram = blocks::gram(Tall::new(&block, columns), Tall::new(&mass, columns));
         let (values, vectors) = blocks::symmetric_eigen(gram.as_ref())?;
         let largest = values.last().copied().unwrap_or(0.0);
-        let keep: Vec<usize> = (0..columns).filter(|&i| values[i] > 1e-26 * largest && values[i] > 0.0).collect();
+        let keep: Vec<usize> =
+            (0..columns).filter(|&i| values[i] > 1e-26 * largest && values[i] > 0.0).collect();
         let turn = Mat::from_fn(columns, keep.len(), |i, j| vectors[(i, keep[j])] / values[keep[j]].sqrt());
         let back = Mat::from_fn(keep.len(), columns, |i, j| vectors[(j, keep[i])] * values[keep[i]].sqrt());
         block = blocks::product(Tall::new(&block, columns), turn.as_ref());
@@ -281,9 +282,8 @@ fn generalised(a: Mat<f64>, b: Mat<f64>) -> Option<(Vec<f64>, Mat<f64>)> {
     let n = a.nrows();
     // Scaling first: the columns of inverse iteration differ in length as 1 / lambda.
     let scale: Vec<f64> = (0..n).map(|i| 1.0 / b[(i, i)].sqrt()).collect();
-    let scaled = |m: &Mat<f64>| {
-        Mat::from_fn(n, n, |i, j| 0.5 * (m[(i, j)] + m[(j, i)]) * scale[i] * scale[j])
-    };
+    let scaled =
+        |m: &Mat<f64>| Mat::from_fn(n, n, |i, j| 0.5 * (m[(i, j)] + m[(j, i)]) * scale[i] * scale[j]);
     let (values, vectors) = blocks::symmetric_eigen(scaled(&b).as_ref())?;
     if !values.iter().all(|&v| v > 0.0) {
         return None;

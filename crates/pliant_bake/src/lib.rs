@@ -49,6 +49,9 @@ mod support;
 mod surface;
 mod symbolic;
 
+#[cfg(test)]
+mod physics_tests;
+
 pub use anchor::{Anchor, AnchorSyntax, Comparison};
 pub use bake::bake;
 pub use config::{Bake, BakeConfig, BakeTimes, Stage};

@@ -26,8 +26,7 @@ pub(crate) fn export(folder: &Path, matrix: &BlockCsr, number: &[u32]) -> Result
     for name in ["K", "M"] {
         let path = folder.join(format!("{name}.mtx"));
         let part = PathBuf::from(format!("{}.part", path.display()));
-        let written = write(&part, name == "K", matrix, &free, &rank)
-            .and_then(|()| fs::rename(&part, &path));
+        let written = write(&part, name == "K", matrix, &free, &rank).and_then(|()| fs::rename(&part, &path));
         if let Err(source) = written {
             // The error that matters is the first one.
             let _ = fs::remove_file(&part);
@@ -37,7 +36,13 @@ pub(crate) fn export(folder: &Path, matrix: &BlockCsr, number: &[u32]) -> Result
     Ok(())
 }
 
-fn write(path: &Path, stiffness: bool, matrix: &BlockCsr, free: &[u32], rank: &[usize]) -> std::io::Result<()> {
+fn write(
+    path: &Path,
+    stiffness: bool,
+    matrix: &BlockCsr,
+    free: &[u32],
+    rank: &[usize],
+) -> std::io::Result<()> {
     let mut file = BufWriter::with_capacity(1 << 20, fs::File::create(path)?);
     let n = 3 * free.len();
     let mut entries = 0usize;

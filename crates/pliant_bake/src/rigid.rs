@@ -30,8 +30,8 @@ impl MassProperties {
         let center = first.map(|x| x / volume);
         let mut second = Matrix3::zeros();
         for (nodes, affine) in mesh.elements().zip(&mesh.affine) {
-            let corners = [0, 1, 2, 3]
-                .map(|a| Vector3::from(mesh.nodes[nodes[a] as usize]) - Vector3::from(center));
+            let corners =
+                [0, 1, 2, 3].map(|a| Vector3::from(mesh.nodes[nodes[a] as usize]) - Vector3::from(center));
             let sum: Vector3<f64> = corners.iter().sum();
             let mut moment = sum * sum.transpose();
             for corner in corners {

@@ -52,9 +52,8 @@ pub(crate) fn check_connected(
         let mut extent: f64 = 0.0;
         for k in 0..3 {
             let along = fe.nodes.iter().map(|p| p[k]);
-            extent = extent.max(
-                along.clone().fold(f64::NEG_INFINITY, f64::max) - along.fold(f64::INFINITY, f64::min),
-            );
+            extent = extent
+                .max(along.clone().fold(f64::NEG_INFINITY, f64::max) - along.fold(f64::INFINITY, f64::min));
         }
         extent
     };

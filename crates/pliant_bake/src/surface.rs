@@ -50,6 +50,12 @@ impl Skin {
         Ok(Self { mesh, displacement, rotation })
     }
 
+    /// The lowest row of the matrix that moves `vertex`; `ANCHORED` when none does.
+    pub(crate) fn first_row(&self, vertex: u32, number: &[u32]) -> u32 {
+        let rows = self.displacement[vertex as usize].iter().map(|&(node, _)| number[node as usize]);
+        rows.min().unwrap_or(ANCHORED)
+    }
+
     /// Adds a load of `weight` at `vertex` to nodal loads: `visit(node, share)`.
     pub(crate) fn spread(&self, vertex: u32, weight: f64, visit: &mut dyn FnMut(u32, f64)) {
         for &(node, share) in &self.displacement[vertex as usize] {
@@ -176,13 +182,13 @@ fn embed(mesh: &FeMesh, skin: &Surface) -> Result<(Rows, Rows), BakeError> {
             }
             let nodes = &mesh.connectivity[place.element * per..][..per];
             let shape = element::shape(mesh.element, place.barycentric);
-            let gradients =
-                mesh.affine[place.element].shape_gradients(mesh.element, place.barycentric);
+            let gradients = mesh.affine[place.element].shape_gradients(mesh.element, place.barycentric);
             let displacement = (0..per)
                 .map(|i| (nodes[i], shape[i] + element::dot(gradients[i], place.offset)))
                 .filter(|(_, w)| *w != 0.0)
                 .collect();
-            let rotation = (0..4).map(|a| (nodes[a], place.barycentric[a])).filter(|(_, w)| *w != 0.0).collect();
+            let rotation =
+                (0..4).map(|a| (nodes[a], place.barycentric[a])).filter(|(_, w)| *w != 0.0).collect();
             Ok((displacement, rotation))
         })
         .collect();

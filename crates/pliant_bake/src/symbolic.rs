@@ -66,8 +66,6 @@ pub(crate) struct Symbolic {
     pub(crate) top: Vec<usize>,
     /// Values of the whole factor.
     pub(crate) values: usize,
-    /// Floating point operations of the factorisation.
-    pub(crate) operations: f64,
 }
 
 /// Parents in the elimination tree (Liu 1990), `ROOT` at the top. `graph` is in elimination order.
@@ -153,8 +151,7 @@ impl Symbolic {
                 supernodes[up].children.push(s);
             }
         }
-        let operations = 2.0 * supernodes.iter().map(Supernode::cost).sum::<f64>();
-        let mut out = Self { supernodes, tasks: Vec::new(), top: Vec::new(), values, operations };
+        let mut out = Self { supernodes, tasks: Vec::new(), top: Vec::new(), values };
         out.cut();
         out
     }
@@ -171,8 +168,9 @@ impl Symbolic {
                 size[up] += size[s];
             }
         }
-        let limit = work.iter().zip(&self.supernodes).filter(|(_, s)| s.parent == ROOT).map(|(w, _)| w).sum::<f64>()
-            / 16.0;
+        let limit =
+            work.iter().zip(&self.supernodes).filter(|(_, s)| s.parent == ROOT).map(|(w, _)| w).sum::<f64>()
+                / 16.0;
         for s in 0..count {
             let up = self.supernodes[s].parent;
             if work[s] > limit {

@@ -76,10 +76,7 @@ pub(crate) fn table(model: &ModalModel) -> String {
         rows.push(("name", info.name.clone()));
     }
     rows.push(("simulation mesh", format!("{} {}, {} nodes", summary.tets, summary.element, summary.nodes)));
-    rows.push((
-        "material",
-        format!("E {} Pa, nu {}, {} kg/m^3", info.young, info.poisson, info.density),
-    ));
+    rows.push(("material", format!("E {} Pa, nu {}, {} kg/m^3", info.young, info.poisson, info.density)));
     rows.push(("damping", damping(info.damping)));
     rows.push((
         "anchors",
