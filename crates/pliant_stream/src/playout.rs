@@ -15,9 +15,10 @@ const JUMP: f64 = 0.25;
 /// So many frames in a row later than `SHIFTED` ticks behind the line mean that the line has moved: the host paused.
 const LATE_ROW: usize = 8;
 const SHIFTED: f64 = 3.0;
-/// Room for arrival jitter on top of the ticks of delay, in ticks.
+/// Least and most room for scattered arrivals on top of a fixed delay, in ticks.
 const MARGIN: f64 = 0.25;
-/// Share of frames that an adaptive delay lets come too late.
+const MOST_SCATTER: f64 = 2.0;
+/// Share of frames that may come too late.
 const LATE_SHARE: f64 = 0.02;
 
 /// Maps ticks to the guest's clock by when their frames arrive: the earliest arrivals of the last 128 frames mark a line
@@ -30,12 +31,20 @@ pub struct PlayoutClock {
     samples: VecDeque<f64>,
     offset: Option<f64>,
     at: f64,
+    scratch: Vec<f64>,
 }
 
 impl PlayoutClock {
     /// For ticks of `h` seconds.
     pub fn new(h: f64, playout: Playout) -> Self {
-        Self { h, playout, samples: VecDeque::with_capacity(WINDOW), offset: None, at: 0.0 }
+        Self {
+            h,
+            playout,
+            samples: VecDeque::with_capacity(WINDOW),
+            offset: None,
+            at: 0.0,
+            scratch: Vec::new(),
+        }
     }
 
     /// A frame that is newer than all before has arrived.
@@ -68,22 +77,22 @@ impl PlayoutClock {
     }
 
     /// Where the line plus the delay should be.
-    fn target(&self) -> f64 {
+    fn target(&mut self) -> f64 {
         let earliest = self.samples.iter().copied().fold(f64::INFINITY, f64::min);
-        earliest + self.delay_ticks(earliest) * self.h
-    }
-
-    fn delay_ticks(&self, earliest: f64) -> f64 {
-        match self.playout {
-            Playout::Fixed(ticks) => f64::from(ticks) + MARGIN,
-            Playout::Adaptive(most) => {
-                let mut late: Vec<f64> = self.samples.iter().map(|s| (s - earliest) / self.h).collect();
-                late.sort_by(f64::total_cmp);
-                let index = ((late.len() as f64) * (1.0 - LATE_SHARE)) as usize;
-                let late = late.get(index.min(late.len().saturating_sub(1))).copied().unwrap_or(0.0);
-                (late - MARGIN).ceil().clamp(0.0, f64::from(most)) + MARGIN
-            }
-        }
+        self.scratch.clear();
+        self.scratch.extend(self.samples.iter().map(|s| (s - earliest) / self.h));
+        // Both sides work frame by frame of their pictures: arrivals scatter by that even on a perfect path.
+        let last = self.scratch.len().saturating_sub(1);
+        let index = ((self.scratch.len() as f64 * (1.0 - LATE_SHARE)) as usize).min(last);
+        let late = match self.scratch.get_mut(..) {
+            Some(all) if !all.is_empty() => *all.select_nth_unstable_by(index, f64::total_cmp).1,
+            _ => 0.0,
+        };
+        let ticks = match self.playout {
+            Playout::Fixed(ticks) => f64::from(ticks) + late.clamp(MARGIN, MOST_SCATTER),
+            Playout::Adaptive(most) => (late + MARGIN).min(f64::from(most) + MARGIN),
+        };
+        earliest + ticks * self.h
     }
 
     /// When a tick is to be shown, on the guest's clock; `None` before the first frame.

@@ -561,3 +561,26 @@ fn own_hand_does_not_wait_for_the_round_trip() {
         assert!(force < bar_force, "{}: reaction {force}", preset.name());
     }
 }
+
+#[test]
+fn frames_that_scatter_like_a_picture_rate_are_shown_evenly_and_without_guessing() {
+    // Both apps work at 60 pictures a second: arrivals scatter by up to 17 ms around the 25 ms of the ticks.
+    for name in ["default", "paper"] {
+        let model = bar(20, 0.05);
+        let (mut pair, mut scene) = start(&model);
+        scene.hand = circling();
+        let link = LinkConfig { delay: 20 * MS, jitter: 4 * MS, keep_order: true, ..Default::default() };
+        let recovery = RecoveryConfig::by_name(name).unwrap();
+        let config = GuestConfig { recovery, ..Default::default() };
+        pair.join_with(config, PathConfig::symmetric(link), 5, cached(&model)).unwrap();
+        pair.run_until(10 * S, &mut scene);
+        let before = pair.guests[0].session.body(BODY).unwrap().counts();
+        pair.run_until(30 * S, &mut scene);
+        let view = pair.guests[0].session.body(BODY).unwrap();
+        let after = view.counts();
+        let (stepped, guessed) = (after.stepped - before.stepped, after.guessed - before.guessed);
+        assert!((795..=805).contains(&stepped), "{name}: {stepped} ticks in 20 s");
+        assert!(guessed as f64 <= 0.04 * stepped as f64, "{name}: {guessed} of {stepped} guessed");
+        assert!(view.shown_delay() < 0.065, "{name}: {} s", view.shown_delay());
+    }
+}

@@ -41,9 +41,9 @@ pub enum Policy {
 /// How far behind the earliest arrivals a guest shows a tick.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
 pub enum Playout {
-    /// So many ticks, always.
+    /// So many ticks, and what 98 of 100 arrivals scatter by (a quarter tick to two).
     Fixed(u8),
-    /// 0 to so many ticks, by how late frames have lately been.
+    /// Only what 98 of 100 arrivals scatter by, at most so many ticks, and a quarter tick.
     Adaptive(u8),
 }
 
