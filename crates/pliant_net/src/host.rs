@@ -41,6 +41,9 @@ pub struct HostConfig {
     pub session: pliant_stream::HostConfig,
     /// Whose hands may be on a body at the same time.
     pub holding: Holding,
+    /// How far a guest's hand is kept behind its targets, s, to move smoothly between them: they come late, unevenly and with gaps, and a
+    /// stiff hold would turn that into force. Zero: not at all. Default: 0.05.
+    pub smoothing: f64,
     /// How far from a body's middle a guest's target may be, in sizes of the body; a target beyond is drawn in to that distance. Default: 4.
     pub reach: f64,
 }
@@ -52,6 +55,7 @@ impl Default for HostConfig {
             transport: HostOptions::default(),
             session: pliant_stream::HostConfig::default(),
             holding: Holding::default(),
+            smoothing: 0.05,
             reach: 4.0,
         }
     }
@@ -65,6 +69,7 @@ pub struct NetHost {
     began: Instant,
     session: HostSession,
     holding: Holding,
+    smoothing: f64,
     reach: f64,
     bodies: BTreeMap<Entity, HostedBody>,
     next_body: u16,
@@ -85,9 +90,15 @@ struct HostedBody {
     faulted: bool,
 }
 
-/// The session's name for a guest's grab on the host.
+/// A guest's grab on the host.
 #[derive(Component, Debug, Clone, Copy)]
-pub(crate) struct GuestGrab(GrabKey);
+pub(crate) struct GuestGrab {
+    key: GrabKey,
+    /// Where the guest has its hand, as last heard; m, world.
+    heard: DVec3,
+    /// Of the hand here, m/s.
+    velocity: DVec3,
+}
 
 impl NetHost {
     pub(crate) fn start(
@@ -110,6 +121,7 @@ impl NetHost {
             began: Instant::now(),
             session,
             holding: config.holding,
+            smoothing: config.smoothing.max(0.0),
             reach,
             bodies: BTreeMap::new(),
             next_body: 1,
@@ -253,9 +265,9 @@ impl NetHost {
             }
             HostEvent::GrabMoved { key, body, target, .. } => {
                 let Some(target) = self.target_in_world(world, body, target) else { return };
-                if let Some(mut grab) = self.grabs.get(&key).and_then(|&entity| world.get_mut::<Grab>(entity))
-                {
-                    grab.target = target;
+                let hand = self.grabs.get(&key).and_then(|&entity| world.get_mut::<GuestGrab>(entity));
+                if let Some(mut hand) = hand {
+                    hand.heard = target;
                 }
             }
             HostEvent::GrabEnded { key, .. } => {
@@ -313,9 +325,49 @@ impl NetHost {
             }
         }
         let grab = Grab::new(vertex, radius, target);
-        let spawned = world.spawn((grab, GrabOf(entity), HandOf(user), GuestGrab(key))).id();
+        let spawned = world
+            .spawn((
+                grab,
+                GrabOf(entity),
+                HandOf(user),
+                GuestGrab { key, heard: target, velocity: DVec3::ZERO },
+            ))
+            .id();
         self.grabs.insert(key, spawned);
         Ok(())
+    }
+}
+
+/// Before the bodies' step: guests' hands move on towards where they were last heard to be, without a jump in position or velocity.
+pub(crate) fn move_hands(
+    host: Option<Res<NetHost>>,
+    time: Res<Time>,
+    mut grabs: Query<(&mut Grab, &mut GuestGrab)>,
+) {
+    let Some(host) = host else { return };
+    let step = time.delta_secs_f64();
+    for (mut grab, mut guest) in &mut grabs {
+        let target = guest.follow(grab.target, step, host.smoothing);
+        if target != grab.target {
+            grab.target = target;
+        }
+    }
+}
+
+impl GuestGrab {
+    /// One step of a critically damped follower, `x" = w^2 (heard - x) - 2 w x'` with `w = 2 / smoothing`, in closed form: it lags behind a
+    /// steady motion by `smoothing`, and never overshoots a standing target from rest.
+    fn follow(&mut self, at: DVec3, step: f64, smoothing: f64) -> DVec3 {
+        if smoothing <= 0.0 {
+            self.velocity = DVec3::ZERO;
+            return self.heard;
+        }
+        let w = 2.0 / smoothing;
+        let off = at - self.heard;
+        let slope = self.velocity + off * w;
+        let decay = (-w * step).exp();
+        self.velocity = (self.velocity - slope * (w * step)) * decay;
+        self.heard + (off + slope * step) * decay
     }
 }
 
@@ -361,7 +413,7 @@ pub(crate) fn publish(
         streamed.clear();
         for grab_entity in list.into_iter().flat_map(|list| list.iter()) {
             let Ok((grab, force, guest)) = grabs.get(grab_entity) else { continue };
-            let key = guest.map_or_else(|| host.own_key(grab_entity), |guest| guest.0);
+            let key = guest.map_or_else(|| host.own_key(grab_entity), |guest| guest.key);
             held.insert(grab_entity);
             let grab = GrabState {
                 key,

@@ -104,7 +104,10 @@ impl Plugin for NetPlugin {
                     .add_systems(PreUpdate, host::receive.in_set(NetSystems::Receive))
                     .add_systems(
                         self.schedule,
-                        host::publish.in_set(NetSystems::Send).after(PliantSystems::Publish),
+                        (
+                            host::move_hands.before(PliantSystems::Input),
+                            host::publish.in_set(NetSystems::Send).after(PliantSystems::Publish),
+                        ),
                     )
                     .add_systems(PostUpdate, host::finish);
             }

@@ -8,7 +8,9 @@ use std::collections::BTreeMap;
 use bevy::math::{DQuat, DVec3};
 use bevy::prelude::*;
 use bytes::Bytes;
-use pliant_body::{BodyState, Driven, Grab, GrabForce, GrabOf, ModalAsset, ShownState};
+use pliant_body::{
+    BodyState, Driven, Grab, GrabForce, GrabOf, ModalAsset, PliantSystems, PliantTick, ShownState,
+};
 use pliant_net::transport::{Emulation, Endpoint, Event, JoinOptions, PeerId};
 use pliant_net::{
     BodyLeft, GrabRefused, GuestState, HandOf, Holding, HostConfig, JoinConfig, NetGuest, NetStats,
@@ -16,7 +18,7 @@ use pliant_net::{
 };
 use pliant_stream::UserId;
 use pliant_stream::emulator::Preset;
-use support::{MIDDLE, TIP, bar, guest, host, messages, only, run_for, run_until};
+use support::{MIDDLE, TIP, bar, guest, host, messages, only, patch_at_rest, run_for, run_until};
 
 /// A place `y` and `z` (m, of the model) beside the middle of the bar's section at `x`, in the world of [`support::host`].
 fn beside(x: f64, y: f64, z: f64) -> DVec3 {
@@ -95,7 +97,7 @@ fn a_guest_sees_holds_and_feels_the_hosts_body() {
     };
     assert_eq!(host.world().get::<User>(user).unwrap().name, "Ann");
     assert_eq!(held, MIDDLE);
-    assert!(hand.distance(beside(0.5, 0.1, -0.2)) < 1e-3, "{hand}");
+    assert!(hand.distance(beside(0.5, 0.1, -0.2)) < 1e-3, "{hand}, not {}", beside(0.5, 0.1, -0.2));
     let own = guest.world().get::<GrabForce>(grab).unwrap();
     assert!(felt.force.length() > 1.0, "the body resists: {felt:?}");
     assert!(own.force.distance(felt.force) < 0.02 * felt.force.length(), "felt {own:?}, true {felt:?}");
@@ -139,14 +141,19 @@ fn over_the_papers_first_network_the_shape_stays_right() {
     let there = arrival(&mut host, &mut guest);
     let remote = *guest.world().get::<RemoteBody>(there).unwrap();
 
-    let grab = host.world_mut().spawn((Grab::new(TIP, 0.3, beside(0.9, 0.0, 0.0)), GrabOf(body))).id();
+    // Around where the patch is at rest: this bar does not stretch.
+    let [x, y, z] = patch_at_rest(TIP, 0.3);
+    host.world_mut().spawn((Grab::new(TIP, 0.3, beside(x, y, z)), GrabOf(body)));
+    // Moved once a tick, as a hand that is read in the fixed loop is.
+    let drag = move |tick: Res<PliantTick>, mut grab: Single<&mut Grab>| {
+        let t = tick.0 as f64 / 40.0;
+        grab.target = beside(x, y + 0.12 * (2.1 * t).sin(), z + 0.1 * (3.3 * t).sin());
+    };
+    host.add_systems(FixedUpdate, drag.before(PliantSystems::Input));
     let (mut truth, mut shown) = (BTreeMap::new(), BTreeMap::new());
     let start = std::time::Instant::now();
     run_until(&mut [&mut host, &mut guest], 20.0, "six seconds of dragging", |apps| {
-        let t = start.elapsed().as_secs_f64();
-        let target = beside(0.9, 0.3 * (2.1 * t).sin(), 0.2 * (3.3 * t).sin());
-        apps[0].world_mut().get_mut::<Grab>(grab).unwrap().target = target;
-        let tick = apps[0].world().resource::<pliant_body::PliantTick>().0;
+        let tick = apps[0].world().resource::<PliantTick>().0;
         truth.insert(tick, state(apps[0], body).body().q().to_vec());
         let net = apps[1].world().resource::<NetGuest>();
         net.read_body(remote, |view| {
@@ -154,7 +161,7 @@ fn over_the_papers_first_network_the_shape_stays_right() {
                 shown.entry(view.tick()).or_insert_with(|| state.q.clone());
             }
         });
-        t > 6.0
+        start.elapsed().as_secs_f64() > 6.0
     });
     let stats = *guest.world().resource::<NetStats>();
     let largest = truth.values().map(|q| size(q)).fold(0.0, f64::max);
@@ -162,14 +169,67 @@ fn over_the_papers_first_network_the_shape_stays_right() {
         shown.iter().filter_map(|(tick, q)| Some(distance(truth.get(tick)?, q) / largest)).collect();
     let rms = (errors.iter().map(|e| e * e).sum::<f64>() / errors.len() as f64).sqrt();
     let max = errors.iter().copied().fold(0.0, f64::max);
-    if std::env::var_os("SHOW").is_some() { for (t, q) in &shown { if let Some(a)=truth.get(t) { println!("{t} {:.4} {:.4} {a:.4?} {q:.4?}", size(a), distance(a,q)/largest); } else { println!("{t} -"); } } }
     println!("{} ticks, rms {:.3} %, max {:.2} %, {stats:?}", errors.len(), 100.0 * rms, 100.0 * max);
     assert!(errors.len() > 150, "{} ticks seen", errors.len());
     // The path as the emulator was told: 9 % and 196 ms.
     assert!((0.03..0.18).contains(&stats.loss_in), "{stats:?}");
     assert!((190..300).contains(&stats.round_trip.as_millis()), "{stats:?}");
-    assert!(rms < 0.01 && max < 0.1, "rms {rms}, max {max}: {stats:?}");
+    // Measured 0.05-0.2 % and 0.3-1 %; a busy machine delays frames, which is loss of another kind.
+    assert!(rms < 0.01 && max < 0.05, "rms {rms}, max {max}: {stats:?}");
     assert_eq!(stats.dropped.send_queue_full, 0);
+}
+
+#[test]
+fn a_guests_hand_over_the_papers_first_network_does_not_jerk() {
+    let smoothing = std::env::var("SM").map_or(0.05, |s| s.parse().unwrap());
+    let (mut host, invite, _) = host(HostConfig { smoothing, ..HostConfig::default() });
+    let transport =
+        JoinOptions { emulation: Some(Emulation::preset(Preset::Paper1, 5)), ..JoinOptions::default() };
+    let mut guest = guest(&invite, JoinConfig { transport, models: vec![bar()], ..JoinConfig::default() });
+    let there = arrival(&mut host, &mut guest);
+    let [x, y, z] = patch_at_rest(TIP, 0.3);
+    let own = guest.world_mut().spawn((Grab::new(TIP, 0.3, beside(x, y, z)), GrabOf(there))).id();
+    let drag = move |time: Res<Time>, mut grab: Single<&mut Grab>| {
+        let t = time.elapsed_secs_f64();
+        grab.target = beside(x, y + 0.12 * (2.1 * t).sin(), z + 0.1 * (3.3 * t).sin());
+    };
+    guest.add_systems(FixedUpdate, drag.before(PliantSystems::Input));
+    run_until(&mut [&mut host, &mut guest], 5.0, "the hand takes hold", |apps| {
+        only::<HandOf>(apps[0]).is_some()
+    });
+    let grab = only::<HandOf>(&mut host).unwrap();
+    run_for(&mut [&mut host, &mut guest], 1.0);
+    let (mut truth, mut felt) = (BTreeMap::new(), Vec::new());
+    let start = std::time::Instant::now();
+    run_until(&mut [&mut host, &mut guest], 20.0, "five seconds of dragging", |apps| {
+        let tick = apps[0].world().resource::<PliantTick>().0;
+        truth.insert(tick, apps[0].world().get::<GrabForce>(grab).unwrap().force);
+        if std::env::var_os("SHOW").is_some() {
+            println!(
+                "F {tick} {:.3} {:.3}",
+                apps[0].world().get::<Grab>(grab).unwrap().target,
+                apps[0].world().get::<GrabForce>(grab).unwrap().force
+            );
+        }
+        let force = apps[1].world().get::<GrabForce>(own).unwrap().force;
+        if felt.last() != Some(&force) {
+            felt.push(force);
+        }
+        start.elapsed().as_secs_f64() > 5.0
+    });
+    // A force that flips its sign at each step gives 4.
+    let ringing = |forces: &[DVec3]| {
+        let most = forces.iter().map(|f| f.length()).fold(0.0, f64::max);
+        forces.windows(3).map(|f| (f[0] - 2.0 * f[1] + f[2]).length()).fold(0.0, f64::max) / most
+    };
+    let truth: Vec<DVec3> = truth.into_values().collect();
+    println!("at the host {:.3}, at the guest {:.3}", ringing(&truth), ringing(&felt));
+    assert!(
+        ringing(&truth) < 1.0 && ringing(&felt) < 1.0,
+        "at the host {}, at the guest {}",
+        ringing(&truth),
+        ringing(&felt)
+    );
 }
 
 #[test]

@@ -8,7 +8,7 @@ use std::time::{Duration, Instant};
 use bevy::prelude::*;
 use bevy::transform::TransformPlugin;
 use pliant_body::{ModalAsset, ModalBody, PliantBodyPlugin};
-use pliant_modal::{BakeInfo, Damping, Element, ModalModel, ModelParts, SurfaceMesh};
+use pliant_modal::{BakeInfo, Damping, Element, FlexibilitySite, ModalModel, ModelParts, Patch, SurfaceMesh};
 use pliant_net::{HostConfig, Invite, JoinConfig, NetPlugin, SharedBody};
 
 /// Cells along the bar.
@@ -18,6 +18,8 @@ const CELLS: u32 = 16;
 pub const TIP: u32 = 4 * CELLS;
 /// A vertex in the middle of it.
 pub const MIDDLE: u32 = 4 * (CELLS / 2);
+
+const GIVE: [[f64; 3]; 3] = [[2e-3, 0.0, 0.0], [0.0, 2e-3, 0.0], [0.0, 0.0, 2e-3]];
 
 /// A square bar of 1 m and 2 kg along x, fixed at x = 0, that shears in y and z with shapes sin((2k - 1) pi x / 2).
 pub fn bar() -> Arc<ModalModel> {
@@ -75,9 +77,24 @@ pub fn bar() -> Arc<ModalModel> {
         mass: 2.0,
         center_of_mass: [0.5, 0.0, 0.0],
         inertia: [[0.01, 0.0, 0.0], [0.0, 0.17, 0.0], [0.0, 0.0, 0.17]],
-        sites: Vec::new(),
+        // What the modes left out give way by, m/N: without it a hold would be stiffer than any body of four modes can bear at 40 Hz.
+        sites: [TIP, MIDDLE]
+            .map(|vertex| FlexibilitySite { vertex, radius: 0.3, flexibility: GIVE })
+            .to_vec(),
     };
     Arc::new(ModalModel::from_parts(parts).unwrap())
+}
+
+/// The middle of a patch of the bar at rest.
+pub fn patch_at_rest(vertex: u32, radius: f64) -> [f64; 3] {
+    let model = bar();
+    let patch = Patch::around(model.surface(), vertex, radius).unwrap();
+    let mut middle = [0.0; 3];
+    for &(vertex, weight) in patch.entries() {
+        let position = model.surface().positions()[vertex as usize];
+        (0..3).for_each(|axis| middle[axis] += weight * f64::from(position[axis]));
+    }
+    middle
 }
 
 /// An app without a renderer at 40 steps a second of real time.
