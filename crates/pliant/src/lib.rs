@@ -28,8 +28,14 @@
 //!
 //! | Plugin | Feature | What it does |
 //! | --- | --- | --- |
-#![cfg_attr(feature = "rerun", doc = "| [`RerunPlugin`](rerun::RerunPlugin) | `rerun` | shapes, forces and figures to the rerun viewer or a file |")]
-#![cfg_attr(feature = "net", doc = "| the plugins of [`net`] | `net` | one body held by several machines, over QUIC |")]
+#![cfg_attr(
+    feature = "rerun",
+    doc = "| [`RerunPlugin`](rerun::RerunPlugin) | `rerun` | shapes, forces and figures to the rerun viewer or a file |"
+)]
+#![cfg_attr(
+    feature = "net",
+    doc = "| the plugins of [`net`] | `net` | one body held by several machines, over QUIC |"
+)]
 //!
 //! # Features
 //!

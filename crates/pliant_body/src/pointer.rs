@@ -126,15 +126,21 @@ impl PointerRays<'_, '_> {
     }
 }
 
+/// A body as the pointer sees it.
+type Touchable = (
+    Entity,
+    &'static BodyState,
+    &'static ShownState,
+    &'static GlobalTransform,
+    Option<&'static InheritedVisibility>,
+);
+
 fn press(
     mut commands: Commands,
     settings: Res<PointerGrab>,
     buttons: Option<Res<ButtonInput<MouseButton>>>,
     rays: PointerRays,
-    bodies: Query<
-        (Entity, &BodyState, &ShownState, &GlobalTransform, Option<&InheritedVisibility>),
-        Without<NoPointerGrab>,
-    >,
+    bodies: Query<Touchable, Without<NoPointerGrab>>,
     held: Query<(), With<PointerHeld>>,
 ) {
     let pressed = buttons.is_some_and(|buttons| buttons.just_pressed(settings.button));

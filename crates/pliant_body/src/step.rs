@@ -46,13 +46,16 @@ impl Refusals<'_> {
     }
 }
 
+/// A body as it is asked for, and as it is.
+type Buildable = (NameOrEntity, Ref<'static, ModalBody>, Option<&'static mut BodyState>, Has<BuildRefused>);
+
 pub(crate) fn build_bodies(
     mut commands: Commands,
     models: Res<Assets<ModalAsset>>,
     stepping: Res<Stepping>,
     fixed: Option<Res<Time<Fixed>>>,
     mut refusals: Refusals,
-    mut bodies: Query<(NameOrEntity, Ref<ModalBody>, Option<&mut BodyState>, Has<BuildRefused>)>,
+    mut bodies: Query<Buildable>,
 ) {
     let step = match fixed {
         Some(fixed) if stepping.fixed => fixed.timestep().as_secs_f64(),

@@ -151,6 +151,7 @@ pub(crate) fn collect(
         collector.bodies.values_mut().for_each(|followed| followed.complete = false);
     }
     stats.collected += 1;
+    stats.shapes += frame.shapes.len() as u64;
     stats.dropped = collector.workers.iter().map(Worker::dropped).sum();
     stats.sinks = collector.workers.iter().filter(|worker| worker.listens()).count();
 }

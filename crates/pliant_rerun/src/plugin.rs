@@ -139,6 +139,8 @@ pub struct RerunSystems;
 pub struct RerunStats {
     /// Ticks collected.
     pub collected: u64,
+    /// Shapes of bodies in them.
+    pub shapes: u64,
     /// Ticks that a sink had no room for, summed over sinks.
     pub dropped: u64,
     /// Sinks that still listen.

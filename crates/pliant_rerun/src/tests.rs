@@ -321,18 +321,15 @@ fn a_resting_body_is_not_sent() {
     let body = app.world_mut().query_filtered::<Entity, With<ModalBody>>().single(app.world()).unwrap();
     app.world_mut().entity_mut(body).insert(Driven::Remote);
     (0..40).for_each(|_| app.update());
-    let size = |path: &Path| std::fs::metadata(path).unwrap().len();
-    std::thread::sleep(Duration::from_millis(600));
-    let before = app.world().get::<ShownState>(body).unwrap().version();
-    let bytes = size(&path);
+    let before = *app.world().resource::<RerunStats>();
     (0..400).for_each(|_| app.update());
-    assert_eq!(app.world().get::<ShownState>(body).unwrap().version(), before);
-    std::thread::sleep(Duration::from_millis(600));
-    // 400 ticks of the hand's arrow and figures, and not one of the 200 drawings, each of which has a path of its own in the file.
-    let drawings = std::fs::read(&path).unwrap();
-    let drawings = drawings.windows(16).filter(|w| w == b"vertex_positions").count();
-    assert!(size(&path) > bytes, "figures go on");
-    assert!(drawings <= 8, "{drawings} chunks with positions");
+    let after = *app.world().resource::<RerunStats>();
+    assert_eq!((after.collected, after.shapes), (before.collected + 400, before.shapes));
+    // One state is one shape: drawn in the next drawing at the latest, and then no more.
+    app.world_mut().get_mut::<ShownState>(body).unwrap().snap(&[0.1]).unwrap();
+    (0..400).for_each(|_| app.update());
+    let shapes = app.world().resource::<RerunStats>().shapes - after.shapes;
+    assert!((1..=3).contains(&shapes), "{shapes} shapes");
     drop(app);
     std::fs::remove_file(path).unwrap();
 }

@@ -56,7 +56,9 @@ impl Worker {
                 info!("recording to {}", path.display());
                 (Opened::Stream(stream), FILE_END)
             }
-            Target::Viewer { port, spawn } => (Opened::Later { builder, port, spawn }, VIEWER_END),
+            Target::Viewer { port, spawn } => {
+                (Opened::Later { builder: Box::new(builder), port, spawn }, VIEWER_END)
+            }
         };
         let thread = std::thread::Builder::new()
             .name("pliant rerun".into())
@@ -140,7 +142,7 @@ fn record(stream: &RecordingStream, inbox: &Receiver<Arc<Frame>>, plots: Plots) 
 
 enum Opened {
     Stream(RecordingStream),
-    Later { builder: RecordingStreamBuilder, port: u16, spawn: bool },
+    Later { builder: Box<RecordingStreamBuilder>, port: u16, spawn: bool },
 }
 
 impl Opened {

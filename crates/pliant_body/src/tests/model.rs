@@ -27,13 +27,16 @@ pub fn free_bar() -> ModalModel {
     bar_with(true)
 }
 
+/// Displacement and rotation of a mode at a point, for its scale.
+type Shape = fn([f64; 3], f64) -> ([f64; 3], [f64; 3]);
+
 fn bar_with(free: bool) -> ModalModel {
     let surface = surface();
     // Mass-normalised: the integral of rho |phi|^2 over the bar is 1, sections staying plane and turning inertia left out.
     let bend = (5.0 / MASS).sqrt();
     let stretch = (3.0 / MASS).sqrt();
     let twist = (18.0 / (MASS * SIDE * SIDE)).sqrt();
-    let shapes: [fn([f64; 3], f64) -> ([f64; 3], [f64; 3]); 4] = [
+    let shapes: [Shape; 4] = [
         |[x, y, _], s| ([-2.0 * s * x * y, s * x * x, 0.0], [0.0, 0.0, 2.0 * s * x]),
         |[x, _, z], s| ([-2.0 * s * x * z, 0.0, s * x * x], [0.0, -2.0 * s * x, 0.0]),
         |[x, y, z], s| ([0.0, -s * x * z, s * x * y], [s * x, -0.5 * s * y, -0.5 * s * z]),
