@@ -60,7 +60,7 @@ pub struct Experiment {
     pub keep_track: bool,
 }
 
-/// A scripted hand: it circles about where it took hold on a path that never repeats and is smooth.
+/// A scripted hand: it circles about where it took hold on a smooth path that never repeats, and trembles a little.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Hand {
     /// Centre of the patch.
@@ -71,6 +71,8 @@ pub struct Hand {
     pub reach: [f64; 3],
     /// Slowest frequency, Hz; the path adds two more at 1.618 and 2.414 times it.
     pub frequency: f64,
+    /// Size of the tremor that every hand has, m: 9.3 and 11.7 Hz on top of the path.
+    pub tremor: f64,
     /// When it takes hold and lets go, s since the start; `None`: all the time.
     pub holds: Option<(f64, f64)>,
 }
@@ -84,7 +86,12 @@ impl Hand {
         let wave = |phase: f64| {
             (0.5 * (w + phase).sin() + 0.3 * (1.618 * w + 2.0 * phase).sin() + 0.2 * (2.414 * w).sin()) * ramp
         };
-        [self.reach[0] * wave(0.0), self.reach[1] * wave(1.1), self.reach[2] * wave(2.3)]
+        let shake = |phase: f64| {
+            let turn = std::f64::consts::TAU * t;
+            self.tremor * ramp * (0.6 * (9.3 * turn + phase).sin() + 0.4 * (11.7 * turn + 2.0 * phase).sin())
+        };
+        let [x, y, z] = self.reach;
+        [x * wave(0.0) + shake(0.0), y * wave(1.1) + shake(1.1), z * wave(2.3) + shake(2.3)]
     }
 }
 
@@ -184,6 +191,7 @@ impl Experiment {
             radius: 0.06 * size,
             reach: reach.map(|r| r * size),
             frequency,
+            tremor: 5e-4 * size,
             holds: None,
         };
         let first = most(None).unwrap_or(0);

@@ -6,10 +6,10 @@
 
 mod support;
 
-use std::sync::OnceLock;
+use std::sync::{Arc, OnceLock};
 use std::time::{Duration, Instant};
 
-use pliant_modal::Integrator;
+use pliant_modal::{Integrator, ModalModel};
 use pliant_stream::emulator::{LinkConfig, Loss, Preset};
 use pliant_stream::experiment::{Experiment, Figures};
 use pliant_stream::wire::AccelerationCoding;
@@ -30,8 +30,18 @@ fn conditions() -> [(&'static str, LinkConfig, f64, f64); 4] {
     ]
 }
 
+/// The bar, or the model that the variable MODEL names.
+fn body() -> Arc<ModalModel> {
+    static BODY: OnceLock<Arc<ModalModel>> = OnceLock::new();
+    let made = || match std::env::var("MODEL") {
+        Ok(path) => Arc::new(ModalModel::read(path).unwrap()),
+        Err(_) => bar(120, 0.05),
+    };
+    BODY.get_or_init(made).clone()
+}
+
 fn run(link: &LinkConfig, policy: &str, seconds: f64, seed: u64) -> Figures {
-    let mut e = Experiment::new(bar(120, 0.05), link.clone(), RecoveryConfig::by_name(policy).unwrap());
+    let mut e = Experiment::new(body(), link.clone(), RecoveryConfig::by_name(policy).unwrap());
     (e.seconds, e.seed) = (seconds, seed);
     e.cpu_clock = Some(clock);
     e.run().unwrap()
@@ -68,8 +78,9 @@ fn hold_bars(name: &str, seed: u64, f: &Figures, rms: f64, max: f64) {
     assert!(f.rms_percent <= rms, "{name}, seed {seed}: rms {} % above {rms} %", f.rms_percent);
     assert!(f.max_percent <= max, "{name}, seed {seed}: max {} % above {max} %", f.max_percent);
     assert!(f.kbit_s <= 100.0, "{name}, seed {seed}: {} kbit/s", f.kbit_s);
-    // A flip of sign in each step would be 4.
-    assert!(f.force_ringing < 0.05, "{name}, seed {seed}: ringing {}", f.force_ringing);
+    // As without loss; a flip of sign in each step would be 4. (The scripted hands tremble: it is not 0 in truth either.)
+    let (shown, real) = (f.force_ringing, f.true_ringing);
+    assert!(shown < 1.1 * real, "{name}, seed {seed}: ringing {shown}, true {real}");
     assert_eq!(f.counts.too_late, 0, "{name}, seed {seed}: data that came too late");
 }
 

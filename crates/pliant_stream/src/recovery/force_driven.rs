@@ -1,17 +1,9 @@
 //! The better way: the receiver owns the damped model and steps it with the streamed reactions.
 
-use super::{HISTORY, History, Recovery};
+use super::{Forecast, HISTORY, History, Recovery};
 use crate::state::{ModalState, Tick};
 use crate::stepper::ForceStepper;
 use crate::wire::FrameGrab;
-
-/// Hands are taken to keep their velocity for about this long, s.
-const HAND_MEMORY: f64 = 0.7;
-
-/// What is left of a hand's velocity after a step of `h` seconds.
-pub(crate) fn keep_of(h: f64) -> f64 {
-    (-h / HAND_MEMORY).exp()
-}
 
 /// A tick as it was stepped.
 #[derive(Debug, Clone, Default)]
@@ -31,12 +23,12 @@ pub struct ForceDriven {
     load: Vec<f64>,
     past: Vec<Stepped>,
     grabs: Vec<FrameGrab>,
-    keep: f64,
+    forecast: Forecast,
 }
 
 impl ForceDriven {
-    /// At rest at tick 0. `keep`: what is left of a hand's velocity a tick later, for guessing; e to the power of minus the step over 0.7 s.
-    pub fn new(stepper: ForceStepper, keep: f64) -> Self {
+    /// At rest at tick 0; hands that are not heard of go where the forecast has them.
+    pub fn new(stepper: ForceStepper, forecast: Forecast) -> Self {
         let modes = stepper.modes();
         Self {
             stepper,
@@ -46,7 +38,7 @@ impl ForceDriven {
             load: vec![0.0; modes],
             past: vec![Stepped::default(); HISTORY],
             grabs: Vec::new(),
-            keep,
+            forecast,
         }
     }
 
@@ -64,7 +56,8 @@ impl ForceDriven {
         if let Some(data) = history.known(tick) {
             self.grabs.extend_from_slice(&data.grabs);
         } else if let Some(near) = history.last_known(tick) {
-            self.grabs.extend(near.grabs.iter().filter_map(|g| history.grab(g.state.key, tick, self.keep)));
+            self.grabs
+                .extend(near.grabs.iter().filter_map(|g| history.grab(g.state.key, tick, &self.forecast)));
         }
         if let Some(pose) = history.last_known(tick).and_then(|d| d.pose) {
             rotation = pose.rotation;

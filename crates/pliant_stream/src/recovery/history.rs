@@ -3,6 +3,8 @@
 use crate::state::{GrabKey, GrabState, MAX_GRABS, Pose, Tick};
 use crate::wire::{Frame, FrameGrab, Slice};
 
+use super::forecast::{CHANNELS, Forecast};
+
 /// Ticks that a receiver remembers. Older data is not used any more.
 pub const HISTORY: usize = 256;
 
@@ -120,9 +122,9 @@ impl History {
         new(frame.tick, true);
     }
 
-    /// One grab at a tick: as it arrived, or between its neighbours, or going on from the last with a slope that shrinks
-    /// by `keep` every tick. `None` when nothing near the tick knows the grab.
-    pub fn grab(&self, key: GrabKey, tick: Tick, keep: f64) -> Option<FrameGrab> {
+    /// One grab at a tick: as it arrived, or between its neighbours, or where the forecast has it. `None` when nothing near
+    /// the tick knows the grab.
+    pub fn grab(&self, key: GrabKey, tick: Tick, forecast: &Forecast) -> Option<FrameGrab> {
         let at = |t: Tick| self.known(t).and_then(|d| d.grabs.iter().find(|g| g.state.key == key)).copied();
         if self.known(tick).is_some() {
             return at(tick);
@@ -134,7 +136,8 @@ impl History {
         match (before.and_then(|t| at(t).map(|x| (t, x))), after.and_then(|t| at(t).map(|x| (t, x)))) {
             (Some((t0, x0)), Some((t1, x1))) => {
                 let s = (tick - t0) as f64 / (t1 - t0) as f64;
-                Some(between(&x0, &x1, s))
+                let (a, b) = (channels(&x0), channels(&x1));
+                Some(with_channels(&x1, std::array::from_fn(|k| a[k] + s * (b[k] - a[k]))))
             }
             (None, Some((_, x1))) => Some(x1),
             (Some((t0, x0)), None) => {
@@ -142,56 +145,26 @@ impl History {
                 if after.is_some() {
                     return None;
                 }
-                let Some(x1) = t0.checked_sub(1).and_then(at) else { return Some(x0) };
-                let ahead = (tick - t0).min(200) as u32;
-                let (mut s, mut c) = (1.0, 0.0);
-                let x2 = t0.checked_sub(2).and_then(at);
-                // Velocity and acceleration of the hand, both fading, in ticks: x0 + s (x0 - x1) + c (x0 - 2 x1 + x2).
-                let (mut ds, mut dc, mut keep_a) = (0.0, 0.0, 1.0);
-                for n in 0..ahead {
-                    let keep_v = keep.powi(n as i32 + 1);
-                    ds += keep_v;
-                    // The backward difference is the velocity half a tick ago; each tick adds what is left of the
-                    // acceleration.
-                    s += if n == 0 { 0.0 } else { keep_a };
-                    dc += keep_v * (s - 0.5);
-                    keep_a *= keep * keep * keep * keep;
-                    c = dc;
-                }
-                let Some(x2) = x2 else { return Some(between(&x1, &x0, 1.0 + ds)) };
-                Some(along(&x0, &x1, &x2, ds, c))
+                let samples: Vec<_> = (0..forecast.window())
+                    .map_while(|back| t0.checked_sub(back).map(|t| (back, t)))
+                    .filter_map(|(back, t)| at(t).map(|g| (back, channels(&g))))
+                    .collect();
+                let ahead = forecast.go_on(&samples, tick - t0)?;
+                Some(with_channels(&x0, ahead))
             }
             (None, None) => None,
         }
     }
 }
 
-/// `x0 + s (x0 - x1) + c (x0 - 2 x1 + x2)` of a grab's numbers.
-fn along(x0: &FrameGrab, x1: &FrameGrab, x2: &FrameGrab, s: f64, c: f64) -> FrameGrab {
-    let go = |a: [f64; 3], b: [f64; 3], d: [f64; 3]| {
-        std::array::from_fn(|k| a[k] + s * (a[k] - b[k]) + c * (a[k] - 2.0 * b[k] + d[k]))
-    };
-    FrameGrab {
-        state: GrabState {
-            target: go(x0.state.target, x1.state.target, x2.state.target),
-            reaction: go(x0.state.reaction, x1.state.reaction, x2.state.reaction),
-            ..x0.state
-        },
-        displacement: go(x0.displacement, x1.displacement, x2.displacement),
-        held: true,
-    }
+fn channels(g: &FrameGrab) -> [f64; CHANNELS] {
+    let [a, b, c] = g.state.target;
+    let [d, e, f] = g.state.reaction;
+    let [x, y, z] = g.displacement;
+    [a, b, c, d, e, f, x, y, z]
 }
 
-/// The grab on the line from `a` (0) through `b` (1).
-fn between(a: &FrameGrab, b: &FrameGrab, s: f64) -> FrameGrab {
-    let mix = |x: [f64; 3], y: [f64; 3]| std::array::from_fn(|k| x[k] + s * (y[k] - x[k]));
-    FrameGrab {
-        state: GrabState {
-            target: mix(a.state.target, b.state.target),
-            reaction: mix(a.state.reaction, b.state.reaction),
-            ..b.state
-        },
-        displacement: mix(a.displacement, b.displacement),
-        held: true,
-    }
+fn with_channels(g: &FrameGrab, [a, b, c, d, e, f, x, y, z]: [f64; CHANNELS]) -> FrameGrab {
+    let state = GrabState { target: [a, b, c], reaction: [d, e, f], ..g.state };
+    FrameGrab { state, displacement: [x, y, z], held: true }
 }

@@ -4,11 +4,10 @@ use std::sync::Arc;
 
 use pliant_modal::ModalModel;
 
-use super::PassivityGuard;
 use super::{
     AccelerationDriven, Blend, ForceDriven, HISTORY, History, Policy, Predict, Recovery, RecoveryConfig,
-    keep_of,
 };
+use super::{Forecast, PassivityGuard};
 use crate::StreamError;
 use crate::check::projection;
 use crate::newmark::Newmark;
@@ -69,6 +68,7 @@ pub struct Receiver {
     counts: RepairCounts,
     mismatched: u32,
     before: ModalState,
+    forecast: Forecast,
     h: f64,
     blend_ticks: u16,
 }
@@ -108,7 +108,7 @@ impl Receiver {
                 (Box::new(AccelerationDriven::new(newmark, predict, true, modes)), blend_ticks)
             }
             Policy::ForceDriven { blend_ticks } => {
-                (Box::new(ForceDriven::new(stepper()?, keep_of(newmark.h))), blend_ticks)
+                (Box::new(ForceDriven::new(stepper()?, Forecast::new(newmark.h))), blend_ticks)
             }
         };
         let guard = config.passive.then(|| {
@@ -130,6 +130,7 @@ impl Receiver {
             counts: RepairCounts::default(),
             mismatched: 0,
             before: ModalState::zero(modes),
+            forecast: Forecast::new(newmark.h),
             h: newmark.h,
             blend_ticks,
         };
@@ -353,9 +354,9 @@ impl Receiver {
             d.pose.map(|p| extrapolate(&p, (self.tick.saturating_sub(d.tick)) as f64 * self.h))
         });
         if self.policy.driven_by_reactions() {
-            let keep = keep_of(self.h);
+            let forecast = self.forecast;
             for g in &mut self.grabs {
-                if let Some(now) = self.history.grab(g.key, self.tick, keep) {
+                if let Some(now) = self.history.grab(g.key, self.tick, &forecast) {
                     *g = now.state;
                 }
             }
@@ -371,7 +372,7 @@ impl Receiver {
         let keep = (-3.0 / f64::from(self.blend_ticks)).exp();
         for g in &mut self.grabs {
             let Some(shown) = previous.iter().find(|p| p.key == g.key) else { continue };
-            let known = self.tick.checked_sub(1).and_then(|t| self.history.grab(g.key, t, keep_of(self.h)));
+            let known = self.tick.checked_sub(1).and_then(|t| self.history.grab(g.key, t, &self.forecast));
             let Some(known) = known.map(|k| k.state.reaction) else { continue };
             for ((reaction, shown), known) in g.reaction.iter_mut().zip(shown.reaction).zip(known) {
                 let offset = keep * (shown - known);

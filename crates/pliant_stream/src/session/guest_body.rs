@@ -8,7 +8,7 @@ use pliant_modal::ModalModel;
 use super::own_hand::OwnHand;
 use crate::newmark::Newmark;
 use crate::playout::PlayoutClock;
-use crate::recovery::{HISTORY, Policy, Receiver, RecoveryConfig, RepairCounts, ShownGrab, keep_of};
+use crate::recovery::{HISTORY, Policy, Receiver, RecoveryConfig, RepairCounts, ShownGrab};
 use crate::state::{BodyId, ModalState, Pose, Tick, UserId};
 use crate::stepper::ForceStepper;
 use crate::wire::{BodyInfo, Frame, MAX_NACK_RUNS, Nack, NackRun, Payload, SnapshotBytes};
@@ -194,7 +194,7 @@ impl BodyView {
             && let Ok(stepper) = ForceStepper::new(model.clone(), &self.info.setup(), modes, self.newmark.h)
         {
             let h = self.newmark.h;
-            self.own = Some(OwnHand::new(stepper, h, keep_of(h), blend_ticks));
+            self.own = Some(OwnHand::new(stepper, h, blend_ticks));
         }
         self.receiver = Some(receiver);
         self.snapshot = None;

@@ -13,7 +13,7 @@ use std::collections::VecDeque;
 
 use nalgebra::Vector3;
 
-use crate::recovery::{Blend, Receiver};
+use crate::recovery::{Blend, Forecast, Receiver};
 use crate::state::{GrabKey, ModalState, Tick, UserId};
 use crate::stepper::{ForceStepper, Hold, inverse_rotation};
 
@@ -48,14 +48,14 @@ pub struct OwnHand {
     expected: ModalState,
     shown: ModalState,
     blend: Blend,
-    keep: f64,
+    forecast: Forecast,
     fade: f64,
     holds: Vec<Hold>,
     h: f64,
 }
 
 impl OwnHand {
-    pub(crate) fn new(stepper: ForceStepper, h: f64, keep: f64, blend_ticks: u16) -> Self {
+    pub(crate) fn new(stepper: ForceStepper, h: f64, blend_ticks: u16) -> Self {
         let modes = stepper.modes();
         Self {
             stepper,
@@ -68,7 +68,7 @@ impl OwnHand {
             expected: ModalState::zero(modes),
             shown: ModalState::zero(modes),
             blend: Blend::new(h, blend_ticks),
-            keep,
+            forecast: Forecast::new(h),
             fade: (-3.0 / f64::from(blend_ticks.max(1))).exp(),
             holds: Vec::new(),
             h,
@@ -199,7 +199,7 @@ impl OwnHand {
         self.holds.clear();
         let mut holds = std::mem::take(&mut self.holds);
         for g in receiver.grabs().iter().filter(|g| g.key.user != user) {
-            if let Some(g) = history.grab(g.key, tick, self.keep) {
+            if let Some(g) = history.grab(g.key, tick, &self.forecast) {
                 holds.push(Hold::measured(&g, &back));
             }
         }

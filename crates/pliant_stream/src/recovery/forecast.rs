@@ -1,0 +1,139 @@
+//! Where a hand goes when nobody says.
+//!
+//! Of the last 0.4 s a parabola is fitted (least squares) and followed, its velocity fading over 1.5 s and its acceleration
+//! over 0.4 s. The window spans some periods of a hand's tremor (8 to 12 Hz) and is short against what a hand does on
+//! purpose (below 2 Hz): following the last two or three values instead multiplies the tremor, by thirty after twelve ticks.
+
+/// Span of the fit, s.
+const WINDOW: f64 = 0.4;
+/// The velocity fades over this time, s.
+const VELOCITY: f64 = 1.5;
+/// The acceleration fades over this time, s.
+const ACCELERATION: f64 = 0.4;
+/// Numbers that are forecast together: target, reaction, displacement.
+pub(crate) const CHANNELS: usize = 9;
+
+/// A forecast's settings at one step size.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Forecast {
+    window: u64,
+    keep_velocity: f64,
+    keep_acceleration: f64,
+}
+
+impl Forecast {
+    /// For steps of `h` seconds.
+    pub fn new(h: f64) -> Self {
+        Self {
+            window: ((WINDOW / h).round() as u64).clamp(4, 96),
+            keep_velocity: (-h / VELOCITY).exp(),
+            keep_acceleration: (-h / ACCELERATION).exp(),
+        }
+    }
+
+    /// How many ticks back values count.
+    pub(crate) fn window(&self) -> u64 {
+        self.window
+    }
+
+    /// The values `ahead` ticks after the newest. `samples`: (ticks before the newest, values), the newest first; `None`
+    /// for none.
+    pub(crate) fn go_on(&self, samples: &[(u64, [f64; CHANNELS])], ahead: u64) -> Option<[f64; CHANNELS]> {
+        let (_, newest) = samples.first()?;
+        if samples.len() < 4 {
+            let Some((back, before)) = samples.get(1) else { return Some(*newest) };
+            let (s, _) = self.paths(ahead);
+            let slope = |k: usize| (newest[k] - before[k]) / (*back).max(1) as f64;
+            return Some(std::array::from_fn(|k| newest[k] + s * slope(k)));
+        }
+        // Normal equations of a parabola in x = -back / window, which lies in [-1, 0].
+        let scale = self.window as f64;
+        let mut m = [0.0; 5];
+        let mut right = [[0.0; CHANNELS]; 3];
+        for (back, values) in samples {
+            let x = -(*back as f64) / scale;
+            let mut power = 1.0;
+            for (d, m) in m.iter_mut().enumerate() {
+                *m += power;
+                if d < 3 {
+                    for (r, v) in right[d].iter_mut().zip(values) {
+                        *r += power * v;
+                    }
+                }
+                power *= x;
+            }
+        }
+        let matrix = nalgebra::Matrix3::new(m[0], m[1], m[2], m[1], m[2], m[3], m[2], m[3], m[4]);
+        let inverse = matrix.try_inverse()?;
+        let (s, c) = self.paths(ahead);
+        // Value + velocity (a tick) s + acceleration (a tick squared) c.
+        let weights = nalgebra::RowVector3::new(1.0, s / scale, 2.0 * c / (scale * scale)) * inverse;
+        let mut out = [0.0; CHANNELS];
+        for (w, right) in weights.iter().zip(&right) {
+            for (o, r) in out.iter_mut().zip(right) {
+                *o += w * r;
+            }
+        }
+        out.iter().all(|x| x.is_finite()).then_some(out)
+    }
+
+    /// How far a unit velocity and a unit acceleration lead in so many ticks, both fading.
+    fn paths(&self, ahead: u64) -> (f64, f64) {
+        let (mut s, mut c, mut gained) = (0.0, 0.0, 0.0);
+        let (mut velocity, mut acceleration) = (1.0, 1.0);
+        for _ in 0..ahead.min(200) {
+            velocity *= self.keep_velocity;
+            gained += acceleration;
+            acceleration *= self.keep_acceleration;
+            s += velocity;
+            c += velocity * (gained - 0.5);
+        }
+        (s, c)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn samples(count: u64, f: impl Fn(f64) -> f64) -> Vec<(u64, [f64; CHANNELS])> {
+        (0..count).map(|back| (back, [f(-(back as f64)); CHANNELS])).collect()
+    }
+
+    #[test]
+    fn a_parabola_is_followed_and_fades() {
+        let forecast = Forecast::new(0.025);
+        let f = |t: f64| 1.0 + 0.02 * t + 0.001 * t * t;
+        let got = forecast.go_on(&samples(16, f), 1).unwrap()[0];
+        // One tick on, little has faded: velocity 1.7 % of 0.021.
+        assert!((got - f(1.0)).abs() < 5e-4, "{got} and {}", f(1.0));
+        let far = forecast.go_on(&samples(16, f), 200).unwrap()[4];
+        // 0.02 a tick fading over 60 ticks: 1.2; 0.002 a tick^2 over 16, then over 60: 1.9. No more, however long.
+        assert!((2.0..5.0).contains(&far), "{far}");
+        let further = forecast.go_on(&samples(16, f), 4000).unwrap()[4];
+        assert!((further - far).abs() < 0.2, "{far} {further}");
+    }
+
+    #[test]
+    fn tremor_is_not_multiplied() {
+        let forecast = Forecast::new(0.025);
+        for phase in 0..40 {
+            let f = |t: f64| (std::f64::consts::TAU * 9.3 * 0.025 * t + f64::from(phase) * 0.157).sin();
+            let worst =
+                (1..=12).map(|n| forecast.go_on(&samples(16, f), n).unwrap()[0].abs()).fold(0.0, f64::max);
+            assert!(worst < 2.5, "phase {phase}: a tremor of 1 becomes {worst}");
+        }
+    }
+
+    #[test]
+    fn few_samples_and_gaps_are_enough() {
+        let forecast = Forecast::new(0.025);
+        assert_eq!(forecast.go_on(&[], 3), None);
+        assert_eq!(forecast.go_on(&[(0, [2.0; CHANNELS])], 3), Some([2.0; CHANNELS]));
+        let two = forecast.go_on(&[(0, [2.0; CHANNELS]), (2, [1.0; CHANNELS])], 1).unwrap();
+        assert!((two[0] - 2.5).abs() < 0.01, "{two:?}");
+        let gaps: Vec<_> = samples(16, |t| 3.0 + 0.1 * t).into_iter().filter(|s| s.0 % 3 != 1).collect();
+        let got = forecast.go_on(&gaps, 2).unwrap()[8];
+        assert!((got - 3.2).abs() < 0.01, "{got}");
+    }
+}
