@@ -41,8 +41,9 @@ pub struct HostConfig {
     pub session: pliant_stream::HostConfig,
     /// Whose hands may be on a body at the same time.
     pub holding: Holding,
-    /// How far a guest's hand is kept behind its targets, s, to move smoothly between them: they come late, unevenly and with gaps, and a
-    /// stiff hold would turn that into force. Zero: not at all. Default: 0.05.
+    /// How far at most a guest's hand is kept behind its targets, s, to move smoothly between them: they come late, unevenly and with gaps,
+    /// and a stiff hold would turn that into force. It is half the guest's round trip, at least a step and at most this. Zero: not at all.
+    /// Default: 0.1.
     pub smoothing: f64,
     /// How far from a body's middle a guest's target may be, in sizes of the body; a target beyond is drawn in to that distance. Default: 4.
     pub reach: f64,
@@ -55,7 +56,7 @@ impl Default for HostConfig {
             transport: HostOptions::default(),
             session: pliant_stream::HostConfig::default(),
             holding: Holding::default(),
-            smoothing: 0.05,
+            smoothing: 0.1,
             reach: 4.0,
         }
     }
@@ -342,12 +343,15 @@ impl NetHost {
 pub(crate) fn move_hands(
     host: Option<Res<NetHost>>,
     time: Res<Time>,
-    mut grabs: Query<(&mut Grab, &mut GuestGrab)>,
+    mut grabs: Query<(&mut Grab, &mut GuestGrab, &HandOf)>,
+    links: Query<&UserLink>,
 ) {
     let Some(host) = host else { return };
     let step = time.delta_secs_f64();
-    for (mut grab, mut guest) in &mut grabs {
-        let target = guest.follow(grab.target, step, host.smoothing);
+    for (mut grab, mut guest, user) in &mut grabs {
+        let round_trip = links.get(user.0).map_or(0.0, |link| link.round_trip.as_secs_f64());
+        let smoothing = (0.5 * round_trip).max(step).min(host.smoothing);
+        let target = guest.follow(grab.target, step, smoothing);
         if target != grab.target {
             grab.target = target;
         }

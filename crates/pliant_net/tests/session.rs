@@ -181,8 +181,7 @@ fn over_the_papers_first_network_the_shape_stays_right() {
 
 #[test]
 fn a_guests_hand_over_the_papers_first_network_does_not_jerk() {
-    let smoothing = std::env::var("SM").map_or(0.05, |s| s.parse().unwrap());
-    let (mut host, invite, _) = host(HostConfig { smoothing, ..HostConfig::default() });
+    let (mut host, invite, _) = host(HostConfig::default());
     let transport =
         JoinOptions { emulation: Some(Emulation::preset(Preset::Paper1, 5)), ..JoinOptions::default() };
     let mut guest = guest(&invite, JoinConfig { transport, models: vec![bar()], ..JoinConfig::default() });
@@ -204,13 +203,6 @@ fn a_guests_hand_over_the_papers_first_network_does_not_jerk() {
     run_until(&mut [&mut host, &mut guest], 20.0, "five seconds of dragging", |apps| {
         let tick = apps[0].world().resource::<PliantTick>().0;
         truth.insert(tick, apps[0].world().get::<GrabForce>(grab).unwrap().force);
-        if std::env::var_os("SHOW").is_some() {
-            println!(
-                "F {tick} {:.3} {:.3}",
-                apps[0].world().get::<Grab>(grab).unwrap().target,
-                apps[0].world().get::<GrabForce>(grab).unwrap().force
-            );
-        }
         let force = apps[1].world().get::<GrabForce>(own).unwrap().force;
         if felt.last() != Some(&force) {
             felt.push(force);
@@ -220,12 +212,15 @@ fn a_guests_hand_over_the_papers_first_network_does_not_jerk() {
     // A force that flips its sign at each step gives 4.
     let ringing = |forces: &[DVec3]| {
         let most = forces.iter().map(|f| f.length()).fold(0.0, f64::max);
-        forces.windows(3).map(|f| (f[0] - 2.0 * f[1] + f[2]).length()).fold(0.0, f64::max) / most
+        let mut jerks: Vec<f64> = forces.windows(3).map(|f| (f[0] - 2.0 * f[1] + f[2]).length()).collect();
+        jerks.sort_by(f64::total_cmp);
+        // Of twenty the largest is left out: on a busy machine an app may miss its time.
+        jerks[jerks.len() * 19 / 20] / most
     };
     let truth: Vec<DVec3> = truth.into_values().collect();
     println!("at the host {:.3}, at the guest {:.3}", ringing(&truth), ringing(&felt));
     assert!(
-        ringing(&truth) < 1.0 && ringing(&felt) < 1.0,
+        ringing(&truth) < 0.4 && ringing(&felt) < 0.4,
         "at the host {}, at the guest {}",
         ringing(&truth),
         ringing(&felt)
