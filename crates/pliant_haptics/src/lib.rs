@@ -12,9 +12,12 @@ mod follow;
 mod hand;
 mod histogram;
 mod intake;
+#[cfg(feature = "inverse")]
+mod inverse;
 mod local;
 mod modal_local;
 mod pace;
+mod record;
 mod runner;
 mod safety;
 mod tool;
@@ -29,9 +32,12 @@ pub use device::{
 };
 pub use hand::Hand;
 pub use histogram::Histogram;
+#[cfg(feature = "inverse")]
+pub use inverse::{Inverse, InverseConfig, InverseError, Spelling};
 pub use local::{Contact, HeldGrab, LocalModel, MAX_CONTACTS, ModelWriter};
 pub use modal_local::ModalLocal;
 pub use pace::{LoopClock, RealPace, VirtualPace};
+pub use record::{RecordError, Recorder, Replay};
 pub use runner::{HapticLoop, StopSwitch};
 pub use safety::{
     Allowed, Gain, Passivity, PassivityConfig, Port, Safety, SafetyConfig, Slew, StaleConfig, Thermal,

@@ -67,6 +67,10 @@ impl Gain {
         Self { value, cutting: false, stopped: false }
     }
 
+    pub(crate) fn value(&self) -> f64 {
+        self.value
+    }
+
     pub(crate) fn is_stopped(&self) -> bool {
         self.stopped
     }

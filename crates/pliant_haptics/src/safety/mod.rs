@@ -222,6 +222,12 @@ impl Safety {
         // Energy first of what was really held since the last tick.
         let interaction = self.last - self.last_weight;
         self.passivity.observe(&interaction, &w.moved, w.supplied, w.stored, w.holding);
+        if self.gain.value() < 1.0 {
+            if self.gain.value() <= 0.0 {
+                self.passivity.refill();
+            }
+            self.passivity.forgive();
+        }
         let (mut elastic, mut damping) = (elastic, damping);
         let slew = self.slew_rate();
         if self.config.passivity.is_some() {

@@ -5,7 +5,7 @@ use nalgebra::Vector3;
 /// Settings of [`Passivity`].
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct PassivityConfig {
-    /// Energy that may leave before any has come in, J. Default: 0.005.
+    /// Energy that may leave before any has come in, J, in each engagement (from no force to the next time that there is none). Default: 0.005.
     pub tank: f64,
     /// Most damping that the controller adds, N s/m. Default: 5.
     pub max_damping: f64,
@@ -53,12 +53,19 @@ pub struct Passivity {
     port: Port,
     /// What would be available had nothing leaked, J.
     full: f64,
+    /// What is missing although nothing has leaked: springs that were stretched while they could not be felt.
+    forgiven: f64,
 }
 
 impl Passivity {
     /// With a full tank.
     pub fn new(config: PassivityConfig) -> Self {
-        Self { config, port: Port { available: config.tank, ..Port::default() }, full: config.tank }
+        Self {
+            config,
+            port: Port { available: config.tank, ..Port::default() },
+            full: config.tank,
+            forgiven: 0.0,
+        }
     }
 
     /// Energies so far.
@@ -89,9 +96,22 @@ impl Passivity {
             if holding { (self.port.available - given + supplied).min(self.full) } else { self.full };
     }
 
+    /// Nothing is felt now: what comes next is a new engagement, and begins with a full tank.
+    pub fn refill(&mut self) {
+        self.port.available = self.port.available.max(self.config.tank);
+    }
+
+    /// What is missing now has not leaked: a spring was stretched while a fade or a ramp kept it from being felt. It is not to be damped away; it
+    /// is not available either.
+    pub fn forgive(&mut self) {
+        self.forgiven = (self.full - self.port.available).max(0.0);
+    }
+
     /// The damping force (N) that pays back what has leaked, at `velocity` (m/s) over `dt` (s).
     pub fn dissipate(&mut self, velocity: &Vector3<f64>, dt: f64) -> Vector3<f64> {
-        let missing = self.full - self.port.available;
+        let gap = self.full - self.port.available;
+        self.forgiven = self.forgiven.min(gap).max(0.0);
+        let missing = gap - self.forgiven;
         let v2 = velocity.norm_squared();
         if missing <= 0.0 || v2 * dt <= 0.0 {
             return Vector3::zeros();

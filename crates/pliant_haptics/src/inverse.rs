@@ -1,0 +1,380 @@
+//! The Haply Inverse3, through the WebSocket of its service (port 10001): JSON, one state for each message sent.
+//!
+//! On connecting the service sends an inventory of what is plugged in; from then on it answers every command with one state. The service's axes are
+//! x right, y away from the user, z up, in metres and newtons; Bevy's are (x, z, -y). Versions of the service differ in the name of the force's field,
+//! `vector` (from 3.5 on) or `values` (before): the one that the inventory suggests is tried first, the other if that is refused.
+//!
+//! JSON and sockets allocate: unlike the loop around it, `exchange` does.
+
+use std::{
+    net::{TcpStream, ToSocketAddrs},
+    time::Duration,
+};
+
+use serde_json::{Value, json};
+use thiserror::Error;
+use tungstenite::{Message, WebSocket, client::client_with_config, protocol::WebSocketConfig};
+
+use crate::{DeviceInfo, Fault, HapticDevice, Pace, Sample, Wrench};
+
+/// Where and which device.
+#[derive(Debug, Clone, PartialEq)]
+pub struct InverseConfig {
+    /// Host and port of the service. Default: `127.0.0.1:10001`.
+    pub address: String,
+    /// The device's id; `None` takes the first. Default: `None`.
+    pub device: Option<String>,
+    /// How long an answer may take, s. Default: 0.1.
+    pub timeout: f64,
+    /// Rate of the loop that it will be used in, Hz: a force waits one period for its turn, and the device declares that. Default: 1000.
+    pub rate: f64,
+    /// What the force's field is called; `None` finds out. Default: `None`.
+    pub spelling: Option<Spelling>,
+}
+
+impl Default for InverseConfig {
+    fn default() -> Self {
+        Self { address: "127.0.0.1:10001".into(), device: None, timeout: 0.1, rate: 1000.0, spelling: None }
+    }
+}
+
+/// Name of the force's field in a command.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Spelling {
+    /// `vector`: services from 3.5 on.
+    Vector,
+    /// `values`: services before.
+    Values,
+}
+
+impl Spelling {
+    fn field(self) -> &'static str {
+        match self {
+            Self::Vector => "vector",
+            Self::Values => "values",
+        }
+    }
+
+    fn other(self) -> Self {
+        match self {
+            Self::Vector => Self::Values,
+            Self::Values => Self::Vector,
+        }
+    }
+}
+
+/// Why there is no Inverse.
+#[derive(Debug, Error)]
+#[non_exhaustive]
+pub enum InverseError {
+    /// Nobody listens.
+    #[error("no Inverse service at {address}: {reason}")]
+    Connect {
+        /// Where.
+        address: String,
+        /// Why.
+        reason: String,
+    },
+    /// It talks, but not as an Inverse service does.
+    #[error("the service at {address} does not speak as an Inverse service does: {reason}")]
+    Protocol {
+        /// Where.
+        address: String,
+        /// What came.
+        reason: String,
+    },
+    /// The service is there, the device is not.
+    #[error("the service at {address} has no Inverse3 {wanted:?}; it has {found:?}")]
+    NoDevice {
+        /// Where.
+        address: String,
+        /// The id asked for, if any.
+        wanted: Option<String>,
+        /// The ids that there are.
+        found: Vec<String>,
+    },
+}
+
+/// An Inverse3, with the grip that may be on it.
+pub struct Inverse {
+    config: InverseConfig,
+    socket: Option<WebSocket<TcpStream>>,
+    id: String,
+    spelling: Spelling,
+    /// The spelling is known to be right: a state has come back for it.
+    confirmed: bool,
+    last: Sample,
+    sequence: u64,
+}
+
+impl Inverse {
+    /// The ids of the Inverse3s at a service: what is plugged in.
+    ///
+    /// # Errors
+    /// No service, or not one that speaks as an Inverse service does.
+    pub fn list(config: &InverseConfig) -> Result<Vec<String>, InverseError> {
+        let (_, inventory) = connect(config)?;
+        Ok(ids(&inventory))
+    }
+
+    /// Connects to the service and picks the device.
+    ///
+    /// # Errors
+    /// No service, not one that speaks as an Inverse service does, or no such device.
+    pub fn open(config: InverseConfig) -> Result<Self, InverseError> {
+        let (socket, inventory) = connect(&config)?;
+        let (id, last) = pick(&config, &inventory)?;
+        // The session's number came with 3.5, as did the field's new name.
+        let guess = if inventory.get("session_id").is_some() { Spelling::Vector } else { Spelling::Values };
+        let spelling = config.spelling.unwrap_or(guess);
+        let confirmed = config.spelling.is_some();
+        Ok(Self { config, socket: Some(socket), id, spelling, confirmed, last, sequence: 0 })
+    }
+
+    /// Name of the force's field that the service takes.
+    pub fn spelling(&self) -> Spelling {
+        self.spelling
+    }
+
+    fn command(&self, force: [f64; 3], first: bool) -> String {
+        let [x, y, z] = to_service(force);
+        let mut message = json!({
+            "inverse3": [{
+                "device_id": self.id,
+                "commands": { "set_cursor_force": { self.spelling.field(): { "x": x, "y": y, "z": z } } },
+            }],
+        });
+        if first && self.spelling == Spelling::Vector {
+            message["session"] = json!({ "configure": { "profile": { "name": "pliant" } } });
+        }
+        message.to_string()
+    }
+
+    /// One command, one answer.
+    fn ask(&mut self, force: [f64; 3]) -> Result<Value, Fault> {
+        let command = self.command(force, self.sequence == 0);
+        let socket = self.socket.as_mut().ok_or(Fault::Gone)?;
+        socket.send(Message::text(command)).map_err(|e| fault(&e, self.config.timeout))?;
+        read(socket).map_err(|e| fault(&e, self.config.timeout))?.ok_or(Fault::Malformed)
+    }
+}
+
+impl HapticDevice for Inverse {
+    fn info(&self) -> DeviceInfo {
+        DeviceInfo {
+            name: "Haply Inverse3".into(),
+            serial: self.id.clone(),
+            // The maker's data sheet: 10 N at the peak. The rest is a cautious estimate, nobody here has measured one.
+            peak_force: 10.0,
+            continuous_force: 3.0,
+            peak_torque: 0.0,
+            force_axes: [true; 3],
+            torque_axes: [false; 3],
+            max_stiffness: f64::INFINITY,
+            max_damping: f64::INFINITY,
+            damping: 0.3,
+            friction: 0.1,
+            mass: 0.1,
+            resolution: 20e-6,
+            delay: 1.0 / self.config.rate,
+            workspace: [[-0.15, -0.1, -0.1], [0.15, 0.1, 0.1]],
+            buttons: 4,
+            simulated: false,
+        }
+    }
+
+    fn exchange(&mut self, wrench: &Wrench, pace: &mut dyn Pace) -> Result<Sample, Fault> {
+        pace.wait();
+        let answer = self.ask(wrench.force);
+        let answer = match answer {
+            // The first command was refused: the service may know the field by its other name.
+            Err(Fault::Gone | Fault::Malformed) if !self.confirmed => {
+                self.spelling = self.spelling.other();
+                self.confirmed = true;
+                self.sequence = 0;
+                self.socket = None;
+                let (socket, _) = connect(&self.config).map_err(|_| Fault::Gone)?;
+                self.socket = Some(socket);
+                self.ask(wrench.force)
+            }
+            other => other,
+        };
+        let answer = match answer {
+            Ok(answer) => answer,
+            Err(fault) => {
+                if fault == Fault::Gone {
+                    self.socket = None;
+                }
+                return Err(fault);
+            }
+        };
+        self.confirmed = true;
+        self.sequence += 1;
+        let device = find(&answer, &self.id).ok_or(Fault::Gone)?;
+        let sample = sample(device, &answer, &self.last).ok_or(Fault::Malformed)?;
+        self.last = sample;
+        Ok(sample)
+    }
+
+    fn safe_stop(&mut self) {
+        if self.socket.is_some() {
+            // The service holds a force only as long as it is renewed; saying zero is for now, closing for ever.
+            let _ = self.ask([0.0; 3]);
+        }
+    }
+
+    fn reopen(&mut self) -> Result<(), Fault> {
+        self.socket = None;
+        let (socket, inventory) = connect(&self.config).map_err(|_| Fault::Gone)?;
+        let (id, last) = pick(&self.config, &inventory).map_err(|_| Fault::Gone)?;
+        (self.socket, self.id, self.last, self.sequence) = (Some(socket), id, last, 0);
+        Ok(())
+    }
+}
+
+impl Drop for Inverse {
+    fn drop(&mut self) {
+        self.safe_stop();
+        if let Some(mut socket) = self.socket.take() {
+            let _ = socket.close(None);
+            let _ = socket.flush();
+        }
+    }
+}
+
+impl std::fmt::Debug for Inverse {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        f.debug_struct("Inverse")
+            .field("id", &self.id)
+            .field("spelling", &self.spelling)
+            .finish_non_exhaustive()
+    }
+}
+
+/// Connects and takes the inventory.
+fn connect(config: &InverseConfig) -> Result<(WebSocket<TcpStream>, Value), InverseError> {
+    let address = || config.address.clone();
+    let refused = |reason: String| InverseError::Connect { address: address(), reason };
+    let timeout =
+        if config.timeout.is_finite() && config.timeout > 0.0 { config.timeout.min(10.0) } else { 0.1 };
+    let timeout = Duration::from_secs_f64(timeout);
+    let mut addresses = config.address.to_socket_addrs().map_err(|e| refused(e.to_string()))?;
+    let at = addresses.next().ok_or_else(|| refused("no such host".into()))?;
+    let stream = TcpStream::connect_timeout(&at, timeout).map_err(|e| refused(e.to_string()))?;
+    let set = |stream: &TcpStream| {
+        stream.set_nodelay(true)?;
+        stream.set_read_timeout(Some(timeout))?;
+        stream.set_write_timeout(Some(timeout))
+    };
+    set(&stream).map_err(|e| refused(e.to_string()))?;
+    // An inventory of a few devices is some kilobytes; a service that sends megabytes is none.
+    let limits = WebSocketConfig::default().max_message_size(Some(1 << 20)).max_frame_size(Some(1 << 20));
+    let (mut socket, _) = client_with_config(format!("ws://{}/", config.address), stream, Some(limits))
+        .map_err(|e| refused(e.to_string()))?;
+    let protocol = |reason: String| InverseError::Protocol { address: address(), reason };
+    match read(&mut socket) {
+        Ok(Some(inventory)) if inventory.get("inverse3").is_some_and(Value::is_array) => {
+            Ok((socket, inventory))
+        }
+        Ok(_) => Err(protocol("its first message is no inventory with `inverse3`".into())),
+        Err(e) => Err(protocol(e.to_string())),
+    }
+}
+
+/// The next message as JSON; `None`: it is none.
+fn read(socket: &mut WebSocket<TcpStream>) -> Result<Option<Value>, tungstenite::Error> {
+    loop {
+        match socket.read()? {
+            Message::Text(text) => return Ok(serde_json::from_str(text.as_str()).ok()),
+            Message::Binary(bytes) => return Ok(serde_json::from_slice(&bytes).ok()),
+            Message::Close(_) => return Err(tungstenite::Error::ConnectionClosed),
+            _ => {}
+        }
+    }
+}
+
+fn fault(error: &tungstenite::Error, timeout: f64) -> Fault {
+    use std::io::ErrorKind;
+    match error {
+        tungstenite::Error::Io(e) if matches!(e.kind(), ErrorKind::WouldBlock | ErrorKind::TimedOut) => {
+            Fault::Timeout(timeout)
+        }
+        tungstenite::Error::Capacity(_) | tungstenite::Error::Utf8(_) => Fault::Malformed,
+        _ => Fault::Gone,
+    }
+}
+
+fn ids(inventory: &Value) -> Vec<String> {
+    let devices = inventory["inverse3"].as_array().map_or(&[][..], Vec::as_slice);
+    devices.iter().filter_map(|d| d["device_id"].as_str()).map(String::from).collect()
+}
+
+fn pick(config: &InverseConfig, inventory: &Value) -> Result<(String, Sample), InverseError> {
+    let found = ids(inventory);
+    let id = match &config.device {
+        Some(wanted) => found.iter().find(|id| *id == wanted),
+        None => found.first(),
+    };
+    let Some(id) = id.cloned() else {
+        return Err(InverseError::NoDevice {
+            address: config.address.clone(),
+            wanted: config.device.clone(),
+            found,
+        });
+    };
+    let last =
+        find(inventory, &id).and_then(|d| sample(d, inventory, &Sample::default())).unwrap_or_default();
+    Ok((id, last))
+}
+
+fn find<'a>(answer: &'a Value, id: &str) -> Option<&'a Value> {
+    answer["inverse3"].as_array()?.iter().find(|d| d["device_id"] == id)
+}
+
+/// A state as a sample. Parts that the service leaves out stay as they were.
+fn sample(device: &Value, answer: &Value, last: &Sample) -> Option<Sample> {
+    let state = &device["state"];
+    let position = from_service(vector(&state["cursor_position"])?);
+    let velocity = vector(&state["cursor_velocity"]).map(from_service);
+    // A grip, wired or not, gives orientation and buttons; without one there are none.
+    let grip =
+        ["wireless_verse_grip", "verse_grip"].iter().find_map(|kind| answer[*kind].as_array()?.first());
+    let grip = grip.map(|g| &g["state"]);
+    let orientation = grip.and_then(|g| quaternion(&g["orientation"])).unwrap_or(last.orientation);
+    let pressed = grip.map(|g| buttons(&g["buttons"]));
+    Some(Sample {
+        position,
+        velocity,
+        orientation,
+        buttons: pressed.unwrap_or(last.buttons),
+        // The service counts nothing that tells a frozen device from a still hand.
+        sequence: None,
+    })
+}
+
+fn vector(value: &Value) -> Option<[f64; 3]> {
+    Some([value["x"].as_f64()?, value["y"].as_f64()?, value["z"].as_f64()?])
+}
+
+fn quaternion(value: &Value) -> Option<[f64; 4]> {
+    let [x, y, z] = from_service(vector(value)?);
+    Some([x, y, z, value["w"].as_f64()?])
+}
+
+/// `a`, `b`, `c` or `button_0` .. in the order of their names.
+fn buttons(value: &Value) -> u32 {
+    let Some(map) = value.as_object() else { return 0 };
+    let mut names: Vec<_> = map.iter().filter(|(_, v)| v.is_boolean()).collect();
+    names.sort_by(|a, b| a.0.cmp(b.0));
+    let down = names.iter().enumerate().take(32).filter(|(_, (_, v))| **v == Value::Bool(true));
+    down.fold(0, |bits, (i, _)| bits | 1 << i)
+}
+
+/// (x right, y away, z up) to (x right, y up, z toward the user).
+fn from_service([x, y, z]: [f64; 3]) -> [f64; 3] {
+    [x, z, -y]
+}
+
+fn to_service([x, y, z]: [f64; 3]) -> [f64; 3] {
+    [x, -z, y]
+}

