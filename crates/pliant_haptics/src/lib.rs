@@ -21,6 +21,8 @@ mod record;
 mod runner;
 mod safety;
 mod tool;
+#[cfg(feature = "vendor")]
+mod vendor;
 mod virtual_device;
 
 pub use core::{LoopConfig, LoopCore, StartError, Tick};
@@ -44,4 +46,6 @@ pub use safety::{
     ThermalConfig, VelocityCutConfig, Wanted, cap_damping, clamp_magnitude, stable_damping,
 };
 pub use tool::ToolMap;
+#[cfg(feature = "vendor")]
+pub use vendor::{ForceDimension, ForceDimensionConfig, OpenHaptics, OpenHapticsConfig, VendorError};
 pub use virtual_device::{Virtual, VirtualConfig, VirtualHandle};

@@ -1,0 +1,390 @@
+//! 3D Systems devices (Touch, Touch X, Omni, Premium) through OpenHaptics' HDAPI, `libHD.so` or `hd.dll`, version 3.
+//!
+//! The library's own servo thread paces the loop: each exchange is one callback, scheduled and waited for. Device axes are Bevy's already (x right,
+//! y up, z toward the user); lengths are millimetres, forces newtons.
+
+use std::{
+    ffi::{CString, c_char, c_int, c_uint, c_ulong, c_ushort, c_void},
+    path::PathBuf,
+    sync::Mutex,
+};
+
+use libloading::Library;
+use nalgebra::{Matrix3, Rotation3, UnitQuaternion};
+
+use super::{VendorError, functions, load, text};
+use crate::{Calibration, DeviceInfo, Fault, HapticDevice, Pace, Pacing, Sample, Wrench};
+
+/// Handle of a device.
+type Handle = c_uint;
+const INVALID: Handle = 0xFFFF_FFFF;
+
+/// `HDErrorInfo`.
+#[repr(C)]
+#[derive(Debug, Clone, Copy, Default)]
+struct ErrorInfo {
+    code: c_uint,
+    internal: c_int,
+    device: Handle,
+}
+
+const _: () = assert!(size_of::<ErrorInfo>() == 12, "HDErrorInfo is three 32-bit words");
+
+// From hdDefines.h.
+const CURRENT_BUTTONS: c_uint = 0x2000;
+const CURRENT_POSITION: c_uint = 0x2050;
+const CURRENT_VELOCITY: c_uint = 0x2051;
+const CURRENT_TRANSFORM: c_uint = 0x2052;
+const VERSION: c_uint = 0x2500;
+const DEVICE_MODEL_TYPE: c_uint = 0x2501;
+const DEVICE_SERIAL_NUMBER: c_uint = 0x2504;
+const USABLE_WORKSPACE_DIMENSIONS: c_uint = 0x2551;
+const CALIBRATION_STYLE: c_uint = 0x2555;
+const NOMINAL_MAX_STIFFNESS: c_uint = 0x2602;
+const NOMINAL_MAX_FORCE: c_uint = 0x2603;
+const NOMINAL_MAX_CONTINUOUS_FORCE: c_uint = 0x2604;
+const NOMINAL_MAX_DAMPING: c_uint = 0x2609;
+const CURRENT_FORCE: c_uint = 0x2700;
+const FORCE_OUTPUT: c_uint = 0x4000;
+const CALIBRATION_OK: c_uint = 0x5000;
+const CALIBRATION_NEEDS_UPDATE: c_uint = 0x5001;
+const CALIBRATION_AUTO: c_int = 1 << 1;
+const CALIBRATION_INKWELL: c_int = 1 << 2;
+const BAD_HANDLE: c_uint = 0x0104;
+const PRIORITY: c_ushort = u16::MAX / 2;
+const CALLBACK_DONE: c_uint = 0;
+
+type Callback = unsafe extern "system" fn(*mut c_void) -> c_uint;
+
+functions! {
+    /// HDAPI, as hd.h, hdDevice.h and hdScheduler.h declare it.
+    struct Api {
+        init = "hdInitDevice": fn(*const c_char) -> Handle;
+        disable = "hdDisableDevice": fn(Handle);
+        make_current = "hdMakeCurrentDevice": fn(Handle);
+        begin = "hdBeginFrame": fn(Handle);
+        end = "hdEndFrame": fn(Handle);
+        enable = "hdEnable": fn(c_uint);
+        get_double = "hdGetDoublev": fn(c_uint, *mut f64);
+        set_double = "hdSetDoublev": fn(c_uint, *const f64);
+        get_integer = "hdGetIntegerv": fn(c_uint, *mut c_int);
+        get_string = "hdGetString": fn(c_uint) -> *const c_char;
+        get_error = "hdGetError": fn() -> ErrorInfo;
+        check_calibration = "hdCheckCalibration": fn() -> c_uint;
+        update_calibration = "hdUpdateCalibration": fn(c_uint);
+        start = "hdStartScheduler": fn();
+        stop = "hdStopScheduler": fn();
+        set_rate = "hdSetSchedulerRate": fn(c_ulong);
+        run = "hdScheduleSynchronous": fn(Callback, *mut c_void, c_ushort);
+    }
+}
+
+/// Devices that are open in this process: there is one scheduler for all of them, started with the first and stopped with the last.
+static OPEN: Mutex<usize> = Mutex::new(0);
+
+/// Which device, and through which library.
+#[derive(Debug, Clone, PartialEq)]
+pub struct OpenHapticsConfig {
+    /// The library's path; `None` looks for it by its usual names. Default: `None`.
+    pub library: Option<PathBuf>,
+    /// The device's name in the maker's setup; `None` takes the default device. Default: `None`.
+    pub device: Option<String>,
+    /// Rate of the library's servo thread, Hz: 500 or 1000 on most devices. Default: 1000.
+    pub rate: f64,
+}
+
+impl Default for OpenHapticsConfig {
+    fn default() -> Self {
+        Self { library: None, device: None, rate: 1000.0 }
+    }
+}
+
+/// A 3D Systems device.
+pub struct OpenHaptics {
+    api: Api,
+    config: OpenHapticsConfig,
+    handle: Option<Handle>,
+    info: DeviceInfo,
+    /// Last, so that it is unloaded after everything that calls into it.
+    _library: Library,
+}
+
+/// What goes into a callback and comes out.
+struct Frame {
+    api: Api,
+    device: Handle,
+    force: [f64; 3],
+    position: [f64; 3],
+    velocity: [f64; 3],
+    /// Column-major, millimetres.
+    transform: [f64; 16],
+    buttons: c_int,
+    error: ErrorInfo,
+}
+
+/// One frame on the library's servo thread: force out, state in.
+///
+/// # Safety
+/// `data` is a `Frame` that nobody else touches until this has returned.
+unsafe extern "system" fn servo(data: *mut c_void) -> c_uint {
+    // SAFETY: `OpenHaptics::frame` passes its own frame and waits.
+    let frame = unsafe { &mut *data.cast::<Frame>() };
+    let api = frame.api;
+    // SAFETY: the calls and the lengths of their arrays are those of the header; between begin and end, as it asks.
+    unsafe {
+        (api.begin)(frame.device);
+        (api.set_double)(CURRENT_FORCE, frame.force.as_ptr());
+        (api.get_double)(CURRENT_POSITION, frame.position.as_mut_ptr());
+        (api.get_double)(CURRENT_VELOCITY, frame.velocity.as_mut_ptr());
+        (api.get_double)(CURRENT_TRANSFORM, frame.transform.as_mut_ptr());
+        (api.get_integer)(CURRENT_BUTTONS, &raw mut frame.buttons);
+        (api.end)(frame.device);
+        frame.error = (api.get_error)();
+    }
+    CALLBACK_DONE
+}
+
+impl OpenHaptics {
+    /// Loads the library and opens the device. Forces are switched on; they are zero until the loop runs.
+    ///
+    /// # Errors
+    /// No library, one without the functions of version 3, or no device.
+    pub fn open(config: OpenHapticsConfig) -> Result<Self, VendorError> {
+        let names =
+            if cfg!(windows) { &["hd.dll"][..] } else { &["libHD.so", "libHD.so.3", "libHD.so.3.4"][..] };
+        let (library, path) = load(config.library.as_ref(), names)?;
+        let api = Api::from(&library, &path)?;
+        let mut device = Self { api, handle: None, info: describe(&config), config, _library: library };
+        device.connect()?;
+        // SAFETY: a static string of the library's.
+        let version = unsafe { text((api.get_string)(VERSION)) };
+        if version.split('.').next().and_then(|n| n.parse::<u32>().ok()).is_some_and(|major| major < 3) {
+            return Err(VendorError::Version { library: path, found: version, needed: "3" });
+        }
+        Ok(device)
+    }
+
+    fn connect(&mut self) -> Result<(), VendorError> {
+        let name = self.config.device.as_deref().map(CString::new).transpose().map_err(|_| {
+            VendorError::Device { what: "the device's name", code: 0, text: "has a zero in it".into() }
+        })?;
+        let api = self.api;
+        let mut open = OPEN.lock().unwrap_or_else(|poisoned| poisoned.into_inner());
+        // SAFETY: a C string or null, which is the default device; the rest follows the order of the maker's examples.
+        unsafe {
+            let handle = (api.init)(name.as_ref().map_or(std::ptr::null(), |n| n.as_ptr()));
+            let error = (api.get_error)();
+            if handle == INVALID || error.code != 0 {
+                return Err(VendorError::Device {
+                    what: "hdInitDevice",
+                    code: error.code.into(),
+                    text: String::new(),
+                });
+            }
+            (api.make_current)(handle);
+            self.handle = Some(handle);
+            self.info = read_info(&api, &self.config);
+            (api.enable)(FORCE_OUTPUT);
+            if *open == 0 {
+                (api.set_rate)(self.config.rate.clamp(100.0, 8000.0) as c_ulong);
+                // A rate that the device does not have is an error that leaves the old one standing.
+                let _ = (api.get_error)();
+                (api.start)();
+            }
+            let error = (api.get_error)();
+            if error.code != 0 {
+                (api.disable)(handle);
+                self.handle = None;
+                let (what, code) = ("hdStartScheduler", error.code.into());
+                return Err(VendorError::Device { what, code, text: String::new() });
+            }
+        }
+        *open += 1;
+        Ok(())
+    }
+
+    fn disconnect(&mut self) {
+        let Some(handle) = self.handle.take() else { return };
+        let mut open = OPEN.lock().unwrap_or_else(|poisoned| poisoned.into_inner());
+        *open = open.saturating_sub(1);
+        // SAFETY: the handle is ours and is not used again.
+        unsafe {
+            if *open == 0 {
+                (self.api.stop)();
+            }
+            (self.api.disable)(handle);
+            let _ = (self.api.get_error)();
+        }
+    }
+
+    fn frame(&mut self, force: [f64; 3]) -> Result<Sample, Fault> {
+        let device = self.handle.ok_or(Fault::Gone)?;
+        let mut frame = Frame {
+            api: self.api,
+            device,
+            force,
+            position: [f64::NAN; 3],
+            velocity: [0.0; 3],
+            transform: [0.0; 16],
+            buttons: 0,
+            error: ErrorInfo::default(),
+        };
+        // SAFETY: the call returns when the callback has; the frame lives that long and nobody else has it.
+        unsafe { (self.api.run)(servo, (&raw mut frame).cast(), PRIORITY) };
+        match frame.error.code {
+            0 => {}
+            BAD_HANDLE => return Err(Fault::Gone),
+            code => return Err(Fault::Driver(code.into())),
+        }
+        let t = frame.transform;
+        let rotation = Matrix3::new(t[0], t[4], t[8], t[1], t[5], t[9], t[2], t[6], t[10]);
+        // A device without a gimbal reports no rotation at all.
+        let turned = UnitQuaternion::from_rotation_matrix(&Rotation3::from_matrix_unchecked(rotation));
+        let q = if rotation.determinant() > 0.5 { turned } else { UnitQuaternion::identity() };
+        Ok(Sample {
+            position: frame.position.map(|x| 1e-3 * x),
+            orientation: [q.i, q.j, q.k, q.w],
+            velocity: Some(frame.velocity.map(|x| 1e-3 * x)),
+            buttons: frame.buttons as u32,
+            sequence: None,
+        })
+    }
+}
+
+/// Before the device has been asked.
+fn describe(config: &OpenHapticsConfig) -> DeviceInfo {
+    DeviceInfo {
+        name: "3D Systems device".into(),
+        serial: String::new(),
+        peak_force: 3.3,
+        continuous_force: 0.88,
+        peak_torque: 0.0,
+        force_axes: [true; 3],
+        torque_axes: [false; 3],
+        max_stiffness: 400.0,
+        max_damping: 4.0,
+        damping: 0.2,
+        friction: 0.2,
+        mass: 0.045,
+        resolution: 55e-6,
+        // The force that answers a measurement goes out with the next servo tick.
+        delay: 1.0 / config.rate,
+        workspace: [[-0.08, -0.06, -0.035], [0.08, 0.06, 0.035]],
+        buttons: 4,
+        simulated: false,
+    }
+}
+
+/// What the current device says of itself, where it says something usable.
+///
+/// # Safety
+/// A device is current, and `api` is that of a loaded library.
+unsafe fn read_info(api: &Api, config: &OpenHapticsConfig) -> DeviceInfo {
+    let mut info = describe(config);
+    let double = |what: c_uint, scale: f64, or: f64| {
+        let mut value = [0.0f64; 16];
+        // SAFETY: no parameter of HDAPI has more than 16 doubles.
+        let error = unsafe {
+            (api.get_double)(what, value.as_mut_ptr());
+            (api.get_error)()
+        };
+        let value = value[0] * scale;
+        if error.code == 0 && value.is_finite() && value > 0.0 { value } else { or }
+    };
+    // Stiffness is in N/mm, damping in N s/mm.
+    info.max_stiffness = double(NOMINAL_MAX_STIFFNESS, 1e3, info.max_stiffness);
+    info.max_damping = double(NOMINAL_MAX_DAMPING, 1e3, info.max_damping);
+    info.peak_force = double(NOMINAL_MAX_FORCE, 1.0, info.peak_force);
+    info.continuous_force =
+        double(NOMINAL_MAX_CONTINUOUS_FORCE, 1.0, info.continuous_force).min(info.peak_force);
+    let mut box_mm = [0.0f64; 16];
+    // SAFETY: six doubles, smallest corner first; strings are the library's own.
+    unsafe {
+        (api.get_double)(USABLE_WORKSPACE_DIMENSIONS, box_mm.as_mut_ptr());
+        let error = (api.get_error)();
+        let [a, b, c, d, e, f, ..] = box_mm.map(|x| 1e-3 * x);
+        if error.code == 0
+            && [a, b, c].into_iter().zip([d, e, f]).all(|(l, h)| l.is_finite() && h.is_finite() && l < h)
+        {
+            info.workspace = [[a, b, c], [d, e, f]];
+        }
+        let name = text((api.get_string)(DEVICE_MODEL_TYPE));
+        if !name.is_empty() {
+            info.name = name;
+        }
+        info.serial = text((api.get_string)(DEVICE_SERIAL_NUMBER));
+        let _ = (api.get_error)();
+    }
+    info
+}
+
+impl HapticDevice for OpenHaptics {
+    fn info(&self) -> DeviceInfo {
+        self.info.clone()
+    }
+
+    fn pacing(&self) -> Pacing {
+        Pacing::Device(self.config.rate)
+    }
+
+    fn calibration(&mut self) -> Calibration {
+        if self.handle.is_none() {
+            return Calibration::Needed("connect the device");
+        }
+        // SAFETY: the device is ours and open.
+        unsafe {
+            match (self.api.check_calibration)() {
+                CALIBRATION_OK => Calibration::Ready,
+                state => {
+                    let mut styles: c_int = 0;
+                    (self.api.get_integer)(CALIBRATION_STYLE, &raw mut styles);
+                    let inkwell = styles & CALIBRATION_INKWELL != 0;
+                    if state == CALIBRATION_NEEDS_UPDATE {
+                        let style = if inkwell { CALIBRATION_INKWELL } else { CALIBRATION_AUTO };
+                        (self.api.update_calibration)(style as c_uint);
+                        if (self.api.check_calibration)() == CALIBRATION_OK {
+                            let _ = (self.api.get_error)();
+                            return Calibration::Ready;
+                        }
+                    }
+                    let _ = (self.api.get_error)();
+                    if inkwell {
+                        Calibration::Needed("put the stylus into its inkwell")
+                    } else {
+                        Calibration::Needed("move the handle through its whole workspace")
+                    }
+                }
+            }
+        }
+    }
+
+    fn exchange(&mut self, wrench: &Wrench, pace: &mut dyn Pace) -> Result<Sample, Fault> {
+        let sample = self.frame(wrench.force);
+        pace.note();
+        sample
+    }
+
+    fn safe_stop(&mut self) {
+        if self.handle.is_some() {
+            let _ = self.frame([0.0; 3]);
+        }
+    }
+
+    fn reopen(&mut self) -> Result<(), Fault> {
+        self.disconnect();
+        self.connect().map_err(|_| Fault::Gone)
+    }
+}
+
+impl Drop for OpenHaptics {
+    fn drop(&mut self) {
+        self.safe_stop();
+        self.disconnect();
+    }
+}
+
+impl std::fmt::Debug for OpenHaptics {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        f.debug_struct("OpenHaptics").field("info", &self.info).finish_non_exhaustive()
+    }
+}

@@ -1,0 +1,236 @@
+//! The vendors' libraries, played by small ones that this test builds with the system's C compiler. Without one it says so and passes.
+#![cfg(all(feature = "vendor", unix))]
+#![allow(unsafe_code, reason = "the fake libraries are steered through C functions")]
+
+use std::{
+    ffi::{CString, c_char, c_int, c_uint, c_ulong},
+    path::{Path, PathBuf},
+    process::Command,
+};
+
+use libloading::Library;
+use pliant_haptics::{
+    Calibration, Cycle, Fault, ForceDimension, ForceDimensionConfig, HapticDevice, LocalModel, LoopClock,
+    LoopConfig, LoopEvent, LoopState, OpenHaptics, OpenHapticsConfig, RealPace, VendorError, Wrench,
+};
+
+/// Builds `tests/fake/<source>.c`; every test has a library, and so a state, of its own. `None`: there is no C compiler.
+fn fake(source: &str, test: &str, options: &[&str]) -> Option<PathBuf> {
+    let from = Path::new(env!("CARGO_MANIFEST_DIR")).join("tests/fake").join(source).with_extension("c");
+    let to = Path::new(env!("CARGO_TARGET_TMPDIR")).join(format!("lib{source}_{test}.so"));
+    for compiler in ["cc", "gcc", "clang"] {
+        let built = Command::new(compiler)
+            .args(["-shared", "-fPIC", "-O1", "-Wall", "-Werror", "-o"])
+            .arg(&to)
+            .arg(&from)
+            .args(options)
+            .status();
+        match built {
+            Ok(status) => {
+                assert!(status.success(), "{compiler} does not build {from:?}");
+                return Some(to);
+            }
+            Err(_) => continue,
+        }
+    }
+    eprintln!("skipped: no C compiler (cc, gcc, clang) to build {source} with");
+    None
+}
+
+/// Calls `symbol` of the same library instance that the device has loaded.
+macro_rules! call {
+    ($library:expr, $symbol:literal, fn($($type:ty),*) $(-> $ret:ty)?, $($arg:expr),*) => {{
+        // SAFETY: the signature is that of tests/fake.
+        unsafe {
+            let f = $library.get::<unsafe extern "C" fn($($type),*) $(-> $ret)?>($symbol).unwrap();
+            f($($arg),*)
+        }
+    }};
+}
+
+fn open_fake(path: &Path) -> Library {
+    // SAFETY: our own library without initialisers.
+    unsafe { Library::new(path).unwrap() }
+}
+
+fn place(library: &Library, p: [f64; 3], vx: f64) {
+    call!(library, "fake_place", fn(f64, f64, f64, f64), p[0], p[1], p[2], vx);
+}
+
+fn force(library: &Library) -> [f64; 3] {
+    let mut out = [0.0f64; 6];
+    call!(library, "fake_force", fn(*mut f64), out.as_mut_ptr());
+    [out[0], out[1], out[2]]
+}
+
+fn pace() -> RealPace {
+    RealPace::new(LoopClock::start(), 1000.0)
+}
+
+fn hd(path: &Path) -> OpenHapticsConfig {
+    OpenHapticsConfig { library: Some(path.to_path_buf()), ..OpenHapticsConfig::default() }
+}
+
+/// One at a time: the scheduler's count is the process's, as the real library's scheduler is.
+static ONE_HD: std::sync::Mutex<()> = std::sync::Mutex::new(());
+
+#[test]
+fn open_haptics_units_axes_and_sizes() {
+    let _one = ONE_HD.lock().unwrap_or_else(|e| e.into_inner());
+    let Some(path) = fake("hd", "units", &[]) else { return };
+    let library = open_fake(&path);
+    assert_eq!(call!(library, "fake_error_size", fn() -> c_ulong,), 12, "HDErrorInfo");
+    assert_eq!(call!(library, "fake_long_size", fn() -> c_ulong,) as usize, size_of::<c_ulong>(), "HDulong");
+    let mut device = OpenHaptics::open(hd(&path)).unwrap();
+    let info = device.info();
+    assert_eq!((info.name.as_str(), info.serial.as_str()), ("Fake Omni", "0042"));
+    // 0.7 N/mm and 0.005 N s/mm.
+    assert!((info.max_stiffness - 700.0).abs() < 1e-9 && (info.max_damping - 5.0).abs() < 1e-9, "{info:?}");
+    assert_eq!((info.peak_force, info.continuous_force), (3.3, 0.88));
+    assert_eq!(info.workspace, [[-0.08, -0.06, -0.035], [0.08, 0.06, 0.035]]);
+    assert!(!info.simulated && info.check().is_ok());
+    assert_eq!(device.calibration(), Calibration::Ready);
+
+    place(&library, [10.0, -20.0, 30.0], 250.0);
+    call!(library, "fake_buttons", fn(c_int), 0b10);
+    call!(library, "fake_quarter_turn", fn(),);
+    let sample = device.exchange(&Wrench { force: [0.5, -1.0, 1.5], ..Wrench::ZERO }, &mut pace()).unwrap();
+    assert_eq!(force(&library), [0.5, -1.0, 1.5]);
+    for (got, want) in sample.position.into_iter().zip([0.01, -0.02, 0.03]) {
+        assert!((got - want).abs() < 1e-15);
+    }
+    assert_eq!(sample.velocity, Some([0.25, 0.0, 0.0]));
+    assert_eq!(sample.buttons, 0b10);
+    let half = std::f64::consts::FRAC_1_SQRT_2;
+    for (got, want) in sample.orientation.into_iter().zip([half, 0.0, 0.0, half]) {
+        assert!((got - want).abs() < 1e-12, "{:?}", sample.orientation);
+    }
+    drop(device);
+    assert_eq!(force(&library), [0.0; 3], "no force is left behind");
+    assert_eq!(call!(library, "fake_running", fn() -> c_int,), 0);
+    assert_eq!(call!(library, "fake_open", fn() -> c_int,), 0);
+}
+
+#[test]
+fn open_haptics_calibration_fault_and_return() {
+    let _one = ONE_HD.lock().unwrap_or_else(|e| e.into_inner());
+    let Some(path) = fake("hd", "faults", &[]) else { return };
+    let library = open_fake(&path);
+    // Needs the hand.
+    call!(library, "fake_calibration", fn(c_int), 0x5002);
+    let device = OpenHaptics::open(hd(&path)).unwrap();
+    let mut cycle = Cycle::new(device, LoopConfig::default()).unwrap();
+    let mut events: Vec<LoopEvent> = Vec::new();
+    let mut pace = pace();
+    let mut model = LocalModel { count: 1, period: 0.01, ..LocalModel::default() };
+    model.contacts[0].stiffness = [[100.0, 0.0, 0.0], [0.0, 100.0, 0.0], [0.0, 0.0, 100.0]];
+    place(&library, [5.0, 0.0, 0.0], 0.0);
+    let mut run = |cycle: &mut Cycle<OpenHaptics>, events: &mut Vec<LoopEvent>, seconds: f64| {
+        use pliant_haptics::Pace;
+        let until = pace.last().now + seconds;
+        while pace.last().now < until {
+            model.tick += 1;
+            cycle.step(&mut pace, &model, events);
+            // The real scheduler waits for its servo tick; the fake does not.
+            std::thread::sleep(std::time::Duration::from_micros(900));
+        }
+    };
+    run(&mut cycle, &mut events, 0.1);
+    assert!(events.contains(&LoopEvent::Calibrate("put the stylus into its inkwell")), "{events:?}");
+    assert_eq!((cycle.report().state, force(&library)), (LoopState::Calibrating, [0.0; 3]));
+    // It only needs to be told.
+    call!(library, "fake_calibration", fn(c_int), 0x5001);
+    run(&mut cycle, &mut events, 1.0);
+    assert_eq!(cycle.report().state, LoopState::Running);
+    assert!((force(&library)[0] + 0.5).abs() < 1e-6, "100 N/m over 5 mm: {:?}", force(&library));
+    // A device fault each frame: the force fades within 20 ms, after 100 ms it counts as lost, then it comes back.
+    call!(library, "fake_error", fn(c_uint), 0x302);
+    run(&mut cycle, &mut events, 0.05);
+    assert!(events.contains(&LoopEvent::Fault(Fault::Driver(0x302))), "{events:?}");
+    assert!(force(&library)[0].abs() < 1e-9, "{:?}", force(&library));
+    run(&mut cycle, &mut events, 0.2);
+    assert!(events.contains(&LoopEvent::Lost));
+    call!(library, "fake_error", fn(c_uint), 0);
+    run(&mut cycle, &mut events, 1.8);
+    assert!(events.contains(&LoopEvent::Returned), "{events:?}");
+    assert!((force(&library)[0] + 0.5).abs() < 1e-6, "{:?}", force(&library));
+}
+
+#[test]
+fn open_haptics_refuses_other_libraries() {
+    let _one = ONE_HD.lock().unwrap_or_else(|e| e.into_inner());
+    let nowhere = OpenHaptics::open(hd(Path::new("/nowhere/libHD.so")));
+    assert!(matches!(nowhere, Err(VendorError::Library { .. })), "{nowhere:?}");
+    let Some(path) = fake("hd", "partial", &["-DWITHOUT_SCHEDULER"]) else { return };
+    let partial = OpenHaptics::open(hd(&path));
+    assert!(
+        matches!(partial, Err(VendorError::Symbol { symbol: "hdScheduleSynchronous", .. })),
+        "{partial:?}"
+    );
+    let Some(path) = fake("hd", "old", &[]) else { return };
+    let library = open_fake(&path);
+    let old = CString::new("2.0.1").unwrap();
+    call!(library, "fake_version", fn(*const c_char), old.as_ptr());
+    let refused = OpenHaptics::open(hd(&path));
+    assert!(matches!(refused, Err(VendorError::Version { .. })), "{refused:?}");
+    assert_eq!(call!(library, "fake_open", fn() -> c_int,), 0, "and closes what it had opened");
+    let unknown = OpenHapticsConfig { device: Some("Right Device".into()), ..hd(&path) };
+    let unknown = OpenHaptics::open(unknown);
+    assert!(matches!(unknown, Err(VendorError::Device { code: 0x300, .. })), "{unknown:?}");
+}
+
+fn dhd(path: &Path) -> ForceDimensionConfig {
+    ForceDimensionConfig { library: Some(path.to_path_buf()), index: 0 }
+}
+
+#[test]
+fn force_dimension_units_and_axes() {
+    let Some(path) = fake("dhd", "units", &[]) else { return };
+    let library = open_fake(&path);
+    assert_eq!(ForceDimension::count(&dhd(&path)).unwrap(), 1);
+    let mut device = ForceDimension::open(dhd(&path)).unwrap();
+    let info = device.info();
+    assert_eq!((info.name.as_str(), info.serial.as_str(), info.peak_force), ("omega.6", "1234", 12.0));
+    assert!(info.check().is_ok());
+    // 1 cm toward the user, 2 cm right, 3 cm up.
+    place(&library, [0.01, 0.02, 0.03], 0.5);
+    call!(library, "fake_turn_up", fn(),);
+    let sample = device.exchange(&Wrench { force: [1.0, 2.0, 3.0], ..Wrench::ZERO }, &mut pace()).unwrap();
+    assert_eq!(sample.position, [0.02, 0.03, 0.01]);
+    assert_eq!(sample.velocity, Some([0.0, 0.0, 0.5]));
+    // 1 N right, 2 N up, 3 N toward the user are (3, 1, 2) of theirs.
+    assert_eq!(force(&library), [3.0, 1.0, 2.0]);
+    // A quarter turn about their z is one about our y.
+    let half = std::f64::consts::FRAC_1_SQRT_2;
+    for (got, want) in sample.orientation.into_iter().zip([0.0, half, 0.0, half]) {
+        assert!((got - want).abs() < 1e-12, "{:?}", sample.orientation);
+    }
+    drop(device);
+    assert_eq!(force(&library), [0.0; 3]);
+    assert_eq!(call!(library, "fake_open", fn() -> c_int,), 0);
+}
+
+#[test]
+fn force_dimension_faults_and_versions() {
+    let Some(path) = fake("dhd", "faults", &[]) else { return };
+    let library = open_fake(&path);
+    let mut device = ForceDimension::open(dhd(&path)).unwrap();
+    call!(library, "fake_reset", fn(c_int), 0);
+    assert!(matches!(device.calibration(), Calibration::Needed(_)));
+    call!(library, "fake_reset", fn(c_int), 1);
+    assert_eq!(device.calibration(), Calibration::Ready);
+    let mut pace = pace();
+    call!(library, "fake_gone", fn(c_int), 1);
+    assert_eq!(device.exchange(&Wrench::ZERO, &mut pace).unwrap_err(), Fault::Driver(1009));
+    assert_eq!(device.reopen().unwrap_err(), Fault::Gone);
+    assert_eq!(device.exchange(&Wrench::ZERO, &mut pace).unwrap_err(), Fault::Gone);
+    call!(library, "fake_gone", fn(c_int), 0);
+    assert!(device.reopen().is_ok());
+    assert!(device.exchange(&Wrench::ZERO, &mut pace).is_ok());
+    drop(device);
+    let absent = ForceDimension::open(ForceDimensionConfig { index: 3, ..dhd(&path) });
+    assert!(matches!(absent, Err(VendorError::Device { code: 1003, .. })), "{absent:?}");
+    call!(library, "fake_major", fn(c_int), 2);
+    let old = ForceDimension::open(dhd(&path));
+    assert!(matches!(old, Err(VendorError::Version { .. })), "{old:?}");
+}
