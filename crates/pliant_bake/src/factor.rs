@@ -59,6 +59,7 @@ impl Factor {
             .into_par_iter()
             .map(|(task, start, own)| {
                 let mut local: Vec<Vec<f64>> = vec![Vec::new(); task.len()];
+                let mut spare = Vec::new();
                 for s in task.clone() {
                     let supernode = &symbolic.supernodes[s];
                     let children: Vec<(usize, Vec<f64>)> = supernode
@@ -68,7 +69,8 @@ impl Factor {
                         .collect();
                     let at = supernode.at - start;
                     let block = &mut own[at..at + supernode.values()];
-                    local[s - task.start] = front(&symbolic, s, block, matrix, springs, &children)?;
+                    local[s - task.start] =
+                        front(&symbolic, s, block, matrix, springs, children, &mut spare)?;
                 }
                 Ok((task.end - 1, local.pop().unwrap_or_default()))
             })
@@ -76,6 +78,7 @@ impl Factor {
         for (root, update) in tops? {
             updates[root] = update;
         }
+        let mut spare = Vec::new();
         for &s in &symbolic.top {
             let supernode = &symbolic.supernodes[s];
             let children: Vec<(usize, Vec<f64>)> = supernode
@@ -84,7 +87,7 @@ impl Factor {
                 .map(|&child| (child, std::mem::take(&mut updates[child])))
                 .collect();
             let block = &mut values[supernode.at..supernode.at + supernode.values()];
-            updates[s] = front(&symbolic, s, block, matrix, springs, &children)?;
+            updates[s] = front(&symbolic, s, block, matrix, springs, children, &mut spare)?;
         }
         Ok(Self { symbolic, values })
     }
@@ -324,14 +327,16 @@ fn value_range(symbolic: &Symbolic, task: &std::ops::Range<usize>) -> (usize, us
     (symbolic.supernodes[task.start].at, last.at + last.values())
 }
 
-/// Assembles and factors one front; returns the update matrix for its parent (column-major, lower triangle).
+/// Assembles and factors one front; returns the update matrix for its parent (column-major, lower triangle). `spare` keeps
+/// the memory of update matrices that have been used up.
 fn front(
     symbolic: &Symbolic,
     s: usize,
     block: &mut [f64],
     matrix: &BlockCsr,
     springs: &[(usize, f64)],
-    children: &[(usize, Vec<f64>)],
+    children: Vec<(usize, Vec<f64>)>,
+    spare: &mut Vec<Vec<f64>>,
 ) -> Result<Vec<f64>, NotPositive> {
     let supernode = &symbolic.supernodes[s];
     let (width, below) = (supernode.width(), supernode.below());
@@ -369,10 +374,15 @@ fn front(
             block[local * height + local] += spring;
         }
     }
-    let mut update = vec![0.0; below * below];
+    let mut update = spare.pop().unwrap_or_default();
+    update.clear();
+    update.resize(below * below, 0.0);
     for (child, child_update) in children {
-        extend_add(supernode, &symbolic.supernodes[*child], child_update, block, &mut update);
+        extend_add(supernode, &symbolic.supernodes[child], &child_update, block, &mut update);
+        spare.push(child_update);
     }
+    // The largest is taken first.
+    spare.sort_by_key(Vec::capacity);
     factor_front(block, &mut update, width, below)
         .map_err(|dof| NotPositive { node: supernode.first + dof / 3 })?;
     Ok(if supernode.parent == ROOT { Vec::new() } else { update })

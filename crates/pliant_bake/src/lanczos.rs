@@ -36,8 +36,8 @@ pub(crate) fn lowest(
     if n <= DENSE || n < 3 * wanted + 6 {
         return dense(solver, wanted);
     }
-    let phi = Lanczos::new(solver, wanted).run(report)?;
-    polish(solver, phi, wanted)
+    let ritz = Lanczos::new(solver, wanted).run(report)?;
+    polish(solver, &ritz, wanted)
 }
 
 struct Lanczos<'a> {
@@ -54,6 +54,12 @@ struct Lanczos<'a> {
     next: Vec<f64>,
     width: usize,
     seed: u64,
+}
+
+/// Converged Ritz vectors and what the operator makes of them, as blocks of the wanted number of columns.
+struct Ritz {
+    vectors: Vec<f64>,
+    images: Vec<f64>,
 }
 
 /// What one expansion leaves: the remainder's coefficients, `next = remainder coefficients^-1`.
@@ -80,7 +86,7 @@ impl<'a> Lanczos<'a> {
         }
     }
 
-    fn run(mut self, report: &mut dyn FnMut(f64)) -> Result<Vec<f64>, NoConvergence> {
+    fn run(mut self, report: &mut dyn FnMut(f64)) -> Result<Ritz, NoConvergence> {
         // Each restart improves; a hundred expansions of the space per mode means that something is wrong.
         let most_blocks = 100 + 100 * self.wanted / self.width.max(1);
         self.start()?;
@@ -92,12 +98,14 @@ impl<'a> Lanczos<'a> {
                 report(0.7 * self.done as f64 / check_at as f64);
                 continue;
             }
-            check_at = self.done + self.width;
             let (values, vectors) = self.ritz()?;
             let converged = self.converged(&values, &vectors, &remainder);
+            // The small eigenproblem is not free: look less often while most pairs are still far off.
+            let blocks = if 4 * converged < self.wanted { 3 } else { 1 };
+            check_at = self.done + blocks * self.width;
             report(0.7 + 0.3 * converged as f64 / self.wanted as f64);
             if converged >= self.wanted {
-                return Ok(self.combine(&vectors, self.wanted));
+                return Ok(self.finish(&values, &vectors, &remainder));
             }
             if full {
                 let keep = (self.wanted + self.width + (self.stride - self.wanted) / 4)
@@ -209,6 +217,21 @@ impl<'a> Lanczos<'a> {
             .count()
     }
 
+    /// The Ritz vectors `V s`, and their images `theta V s + next (coefficients s_last)`, which cost no solution.
+    fn finish(&self, values: &[f64], vectors: &Mat<f64>, remainder: &Remainder) -> Ritz {
+        let wanted = self.wanted;
+        let phi = self.combine(vectors, wanted);
+        let c = &remainder.coefficients;
+        let last = vectors.as_ref().submatrix(self.done - c.ncols(), 0, c.ncols(), wanted);
+        let mut images: Vec<f64> = phi
+            .chunks_exact(wanted)
+            .flat_map(|row| row.iter().zip(values).map(|(x, theta)| theta * x))
+            .collect();
+        let rest = c * last;
+        blocks::add_product(&mut images, Tall::new(&self.next, self.width), rest.as_ref(), 1.0);
+        Ritz { vectors: phi, images }
+    }
+
     fn combine(&self, vectors: &Mat<f64>, count: usize) -> Vec<f64> {
         let basis = Tall { data: &self.basis, stride: self.stride, columns: self.done };
         blocks::product(basis, vectors.as_ref().subcols(0, count))
@@ -252,26 +275,17 @@ fn normalise(solver: &Solver, mut block: Vec<f64>, width: usize) -> Option<(Vec<
     Some((block, Remainder { coefficients, width: columns }))
 }
 
-/// One step of inverse subspace iteration and Rayleigh-Ritz. It damps what is left of the high modes, which the
-/// stiffness would blow up in the residual `K phi - lambda M phi`.
-fn polish(solver: &Solver, phi: Vec<f64>, wanted: usize) -> Result<Modes, NoConvergence> {
-    const GROUP: usize = 16;
-    let n = solver.dofs();
-    let mut loads = vec![0.0; phi.len()];
-    solver.matrix.mass_times(&phi, wanted, &mut loads);
-    let mut x = vec![0.0; phi.len()];
-    for start in (0..wanted).step_by(GROUP) {
-        let width = GROUP.min(wanted - start);
-        let mut part: Vec<f64> =
-            (0..n).flat_map(|dof| loads[dof * wanted + start..][..width].iter().copied()).collect();
-        solver.solve(&mut part, width);
-        blocks::put(&mut x, wanted, start, &part, width);
-    }
+/// One step of inverse subspace iteration, `x = K^-1 M phi`, and Rayleigh-Ritz. It damps what is left of the high modes,
+/// which the stiffness would blow up in the residual `K phi - lambda M phi`. The iteration knows `x` already.
+fn polish(solver: &Solver, ritz: &Ritz, wanted: usize) -> Result<Modes, NoConvergence> {
+    let mut loads = vec![0.0; ritz.vectors.len()];
+    solver.matrix.mass_times(&ritz.vectors, wanted, &mut loads);
+    let x = &ritz.images;
     // K x = M phi, so x^T K x = x^T M phi needs no product with the stiffness.
-    let tall = Tall::new(&x, wanted);
+    let tall = Tall::new(x, wanted);
     let stiffness = blocks::gram(tall, Tall::new(&loads, wanted));
     let mut mass_x = vec![0.0; x.len()];
-    solver.matrix.mass_times(&x, wanted, &mut mass_x);
+    solver.matrix.mass_times(x, wanted, &mut mass_x);
     let mass = blocks::gram(tall, Tall::new(&mass_x, wanted));
     let (lambda, turn) = generalised(stiffness, mass).ok_or(NoConvergence)?;
     Ok(Modes { lambda, phi: blocks::product(tall, turn.as_ref()) })

@@ -24,8 +24,8 @@ fn restarts_when_its_space_is_full() {
     lanczos.stride = 5 * lanczos.width;
     lanczos.basis.truncate(matrix.dofs() * lanczos.stride);
     lanczos.projected = Mat::zeros(lanczos.stride, lanczos.stride);
-    let phi = lanczos.run(&mut |_| ()).unwrap();
-    let modes = polish(&solver, phi, 12).unwrap();
+    let ritz = lanczos.run(&mut |_| ()).unwrap();
+    let modes = polish(&solver, &ritz, 12).unwrap();
     let roomy = lowest(&solver, 12, &mut |_| ()).unwrap();
     for (a, b) in modes.lambda.iter().zip(&roomy.lambda) {
         assert!((a / b - 1.0).abs() < 1e-11, "{a} {b}");

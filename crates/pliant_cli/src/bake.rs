@@ -20,13 +20,13 @@ pub(crate) struct BakeArgs {
     /// A closed surface (.obj, .stl, .ply, .gltf, .glb), a scene (.ron) or tetrahedra (.msh, .vtk, .mesh, .veg)
     input: PathBuf,
     /// About how many tetrahedra to fill a surface or a scene with [default: 10000]
-    #[arg(long)]
+    #[arg(long, allow_negative_numbers = true)]
     tets: Option<usize>,
     /// Finite element: tet4 or tet10
     #[arg(long, default_value = "tet10", value_parser = element)]
     element: Element,
     /// Elastic modes to keep
-    #[arg(long, default_value_t = 60)]
+    #[arg(long, default_value_t = 60, allow_negative_numbers = true)]
     modes: usize,
     /// Young's modulus, Pa
     #[arg(long, value_name = "PA", default_value_t = 1e5, allow_hyphen_values = true)]
@@ -53,7 +53,7 @@ pub(crate) struct BakeArgs {
     #[arg(long, value_name = "DIR")]
     export_matrices: Option<PathBuf>,
     /// Threads to use [default: one a core]. The result is the same to the bit
-    #[arg(long)]
+    #[arg(long, allow_negative_numbers = true)]
     threads: Option<usize>,
     /// The model to write
     #[arg(short, long, value_name = "X.modal")]

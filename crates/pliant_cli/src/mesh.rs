@@ -20,7 +20,7 @@ pub(crate) struct MeshArgs {
     #[arg(required = true)]
     input: Option<PathBuf>,
     /// About how many tetrahedra, met within 5 %
-    #[arg(long, default_value_t = DEFAULT_TETS)]
+    #[arg(long, default_value_t = DEFAULT_TETS, allow_negative_numbers = true)]
     tets: usize,
     /// The file to write: .msh, .vtk, .mesh or .veg
     #[arg(short, long, required = true)]
@@ -44,7 +44,7 @@ enum Shape {
     /// A cube with one corner at the origin
     Cube {
         /// Cells along an edge
-        #[arg(long)]
+        #[arg(long, allow_negative_numbers = true)]
         cells: usize,
         /// Length of an edge, m
         #[arg(long, allow_hyphen_values = true)]
@@ -56,7 +56,7 @@ enum Shape {
     /// A ball around the origin, its boundary nodes on the sphere
     Sphere {
         /// Cells across
-        #[arg(long)]
+        #[arg(long, allow_negative_numbers = true)]
         cells: usize,
         /// Radius, m
         #[arg(long, allow_hyphen_values = true)]

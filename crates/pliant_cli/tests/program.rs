@@ -1,0 +1,304 @@
+//! The program as a user runs it.
+
+#![allow(clippy::unwrap_used, clippy::panic, reason = "a failed test should panic")]
+
+use std::path::{Path, PathBuf};
+use std::process::{Command, Output};
+
+/// A folder of its own for each test, gone at the end.
+struct Folder(PathBuf);
+
+impl Folder {
+    fn new(name: &str) -> Self {
+        let path = std::env::temp_dir().join(format!("pliant-cli-{name}-{}", std::process::id()));
+        std::fs::create_dir_all(&path).unwrap();
+        Self(path)
+    }
+
+    fn file(&self, name: &str) -> String {
+        self.0.join(name).to_string_lossy().into_owned()
+    }
+
+    fn write(&self, name: &str, text: &str) -> String {
+        std::fs::write(self.0.join(name), text).unwrap();
+        self.file(name)
+    }
+
+    /// Names of the files in it.
+    fn names(&self) -> Vec<String> {
+        let mut names: Vec<String> = std::fs::read_dir(&self.0)
+            .unwrap()
+            .map(|entry| entry.unwrap().file_name().to_string_lossy().into_owned())
+            .collect();
+        names.sort();
+        names
+    }
+}
+
+impl Drop for Folder {
+    fn drop(&mut self) {
+        let _ = std::fs::remove_dir_all(&self.0);
+    }
+}
+
+fn pliant(arguments: &[&str]) -> Output {
+    Command::new(env!("CARGO_BIN_EXE_pliant")).args(arguments).output().unwrap()
+}
+
+fn succeeds(arguments: &[&str]) -> String {
+    let output = pliant(arguments);
+    let message = String::from_utf8_lossy(&output.stderr).into_owned();
+    assert!(output.status.success(), "{arguments:?}: {message}");
+    assert!(message.is_empty(), "no progress bar in a pipe: {message}");
+    String::from_utf8(output.stdout).unwrap()
+}
+
+/// Exit code 2, nothing on stdout, the message on stderr.
+fn refused(arguments: &[&str]) -> String {
+    let output = pliant(arguments);
+    let message = String::from_utf8(output.stderr).unwrap();
+    assert_eq!(output.status.code(), Some(2), "{arguments:?}: {message}");
+    assert!(output.stdout.is_empty() && !message.trim().is_empty(), "{arguments:?}");
+    message
+}
+
+fn json(text: &str) -> serde_json::Value {
+    serde_json::from_str(text).unwrap()
+}
+
+/// A closed octahedron of radius 1.
+const OCTAHEDRON: &str = "v 1 0 0\nv -1 0 0\nv 0 1 0\nv 0 -1 0\nv 0 0 1\nv 0 0 -1\n\
+    f 1 3 5\nf 3 2 5\nf 2 4 5\nf 4 1 5\nf 3 1 6\nf 2 3 6\nf 4 2 6\nf 1 4 6\n";
+
+#[test]
+fn a_bar_is_meshed_baked_and_inspected() {
+    let folder = Folder::new("bar");
+    let (mesh, model) = (folder.file("bar.msh"), folder.file("bar.modal"));
+    let told = succeeds(&["mesh", "bar", "--cells", "20,3,3", "--size", "1,0.15,0.15", "-o", &mesh]);
+    assert!(told.contains("1080 tetrahedra"), "{told}");
+    let baked = json(&succeeds(&[
+        "bake",
+        &mesh,
+        "--element",
+        "tet4",
+        "--modes",
+        "12",
+        "--young",
+        "2e6",
+        "--poisson",
+        "0.3",
+        "--density",
+        "1100",
+        "--rayleigh",
+        "0.1,1e-4",
+        "--anchor",
+        "x<0.001",
+        "-o",
+        &model,
+        "--json",
+    ]));
+    let inspected = json(&succeeds(&["inspect", &model, "--json"]));
+    for field in [
+        "tets",
+        "nodes",
+        "element",
+        "modes",
+        "rigid_modes",
+        "frequencies_hz",
+        "mass_kg",
+        "surface_vertices",
+        "bytes",
+        "hash",
+        "residual_max",
+    ] {
+        assert!(!inspected[field].is_null(), "{field}");
+        assert_eq!(baked[field], inspected[field], "{field}");
+    }
+    for stage in ["mesh", "assemble", "factor", "modes", "total"] {
+        assert!(baked["seconds"][stage].as_f64().unwrap() >= 0.0, "{stage}");
+    }
+    assert_eq!(inspected["tets"], 1080);
+    assert_eq!(inspected["nodes"], 21 * 4 * 4);
+    assert_eq!(inspected["element"], "tet4");
+    assert_eq!(inspected["modes"], 12);
+    assert_eq!(inspected["rigid_modes"], 0);
+    assert_eq!(inspected["frequencies_hz"].as_array().unwrap().len(), 12);
+    assert!((inspected["mass_kg"].as_f64().unwrap() - 1100.0 * 0.0225).abs() < 1e-9);
+    assert_eq!(inspected["bytes"].as_u64().unwrap(), std::fs::metadata(&model).unwrap().len());
+    assert!(inspected["residual_max"].as_f64().unwrap() < 1e-8);
+    assert!(succeeds(&["inspect", &model]).contains("x<0.001"));
+    assert_eq!(folder.names(), ["bar.modal", "bar.msh"]);
+
+    // The same again with another number of threads: the same bits.
+    let again = folder.file("again.modal");
+    succeeds(&[
+        "bake",
+        &mesh,
+        "--element",
+        "tet4",
+        "--modes",
+        "12",
+        "--young",
+        "2e6",
+        "--poisson",
+        "0.3",
+        "--density",
+        "1100",
+        "--rayleigh",
+        "0.1,1e-4",
+        "--anchor",
+        "x<0.001",
+        "--threads",
+        "1",
+        "-o",
+        &again,
+    ]);
+    assert_eq!(std::fs::read(&model).unwrap(), std::fs::read(&again).unwrap());
+}
+
+#[test]
+fn a_surface_is_filled_and_wears_a_skin() {
+    let folder = Folder::new("surface");
+    let surface = folder.write("octahedron.obj", OCTAHEDRON);
+    let (mesh, model, matrices) = (folder.file("o.msh"), folder.file("o.modal"), folder.file("matrices"));
+    succeeds(&["mesh", &surface, "--tets", "2000", "-o", &mesh]);
+    let baked = json(&succeeds(&[
+        "bake",
+        &surface,
+        "--tets",
+        "1500",
+        "--element",
+        "tet4",
+        "--modes",
+        "6",
+        "--skin",
+        &surface,
+        "--export-matrices",
+        &matrices,
+        "--damping-ratio",
+        "0.1",
+        "-o",
+        &model,
+        "--json",
+    ]));
+    assert_eq!(baked["surface_vertices"], 6);
+    assert_eq!(baked["rigid_modes"], 6);
+    // Volume 4/3 m^3; so few tetrahedra round its edges and corners.
+    assert!((baked["mass_kg"].as_f64().unwrap() / (4000.0 / 3.0) - 1.0).abs() < 0.1);
+    assert!(Path::new(&matrices).join("K.mtx").exists() && Path::new(&matrices).join("M.mtx").exists());
+}
+
+#[test]
+fn simple_shapes_are_meshed() {
+    let folder = Folder::new("shapes");
+    let path = folder.file("x.msh");
+    assert!(
+        succeeds(&["mesh", "cube", "--cells", "3", "--size", "2", "-o", &path]).contains("162 tetrahedra")
+    );
+    assert!(
+        succeeds(&["mesh", "sphere", "--cells", "4", "--radius", "0.5", "-o", &path])
+            .contains("384 tetrahedra")
+    );
+    let scene = concat!(env!("CARGO_MANIFEST_DIR"), "/../../assets/pip.ron");
+    if Path::new(scene).exists() {
+        succeeds(&["mesh", scene, "--tets", "3000", "-o", &path]);
+    }
+}
+
+#[test]
+fn bad_input_is_refused_and_leaves_no_file() {
+    let folder = Folder::new("bad");
+    let mesh = folder.file("bar.msh");
+    succeeds(&["mesh", "bar", "--cells", "6,2,2", "--size", "0.6,0.2,0.2", "-o", &mesh]);
+    let mesh = mesh.as_str();
+    let open = folder.write("open.obj", &OCTAHEDRON.replace("f 1 4 6\n", ""));
+    let crossing = folder.write("crossing.obj", &OCTAHEDRON.replace("v 0 0 1\n", "v 3 3 -0.5\n"));
+    let truncated = folder.write("cut.obj", "v 1 0 0\nv 0 1");
+    let foreign = folder.write("foreign.msh", "{\"not\": \"a mesh\"}");
+    let text = folder.write("text.txt", "hello");
+    let flat = folder.write(
+        "flat.msh",
+        "$MeshFormat\n2.2 0 8\n$EndMeshFormat\n$Nodes\n4\n1 0 0 0\n2 1 0 0\n3 0 1 0\n4 1 1 0\n$EndNodes\n\
+         $Elements\n1\n1 4 2 0 1 1 2 3 4\n$EndElements\n",
+    );
+    let before = folder.names();
+    let out = folder.file("out.modal");
+    let missing = folder.file("missing.obj");
+    let cases: &[(&[&str], &str)] = &[
+        (&[&missing], "missing.obj"),
+        (&[&truncated], "cut.obj"),
+        (&[&foreign], "foreign.msh"),
+        (&[&text], "extension"),
+        (&[&open], "open"),
+        (&[&crossing], "cross"),
+        (&[&flat], "volume"),
+        (&[mesh, "--anchor", "x<-1"], "holds nothing"),
+        (&[mesh, "--anchor", "x<9"], "hold all"),
+        (&[mesh, "--anchor", "x=1"], "x<0.01"),
+        (&[mesh, "--anchor", "w<1"], "x<0.01"),
+        (&[mesh, "--young", "0"], "Young"),
+        (&[mesh, "--young", "NaN"], "Young"),
+        (&[mesh, "--young", "-5"], "Young"),
+        (&[mesh, "--young", "soft"], "invalid"),
+        (&[mesh, "--poisson", "0.5"], "Poisson"),
+        (&[mesh, "--poisson", "-1"], "Poisson"),
+        (&[mesh, "--density", "0"], "density"),
+        (&[mesh, "--rayleigh", "1"], "two numbers"),
+        (&[mesh, "--rayleigh", "-1,0"], "alpha"),
+        (&[mesh, "--damping-ratio", "inf"], "damping ratio"),
+        (&[mesh, "--rayleigh", "1,0", "--damping-ratio", "0.1"], "cannot be used"),
+        (&[mesh, "--element", "hex8"], "tet4 or tet10"),
+        (&[mesh, "--element", "tet4", "--modes", "190"], "modes"),
+        (&[mesh, "--modes", "0"], "modes"),
+        (&[mesh, "--modes", "-3"], "modes"),
+        (&[mesh, "--modes", "100000"], "modes"),
+        (&[mesh, "--tets", "500"], "tetrahedra already"),
+        (&[mesh, "--threads", "0"], "threads"),
+        (&[mesh, "--skin", &missing], "missing.obj"),
+        (&[&open, "--tets", "0"], "open"),
+    ];
+    for (arguments, expected) in cases {
+        let mut all = vec!["bake"];
+        all.extend(*arguments);
+        all.extend(["-o", &out]);
+        let message = refused(&all);
+        assert!(message.contains(expected), "{arguments:?}: expected `{expected}` in: {message}");
+        assert_eq!(folder.names(), before, "{arguments:?}");
+    }
+    let nowhere = folder.file("no/such/folder.modal");
+    assert!(refused(&["bake", mesh, "-o", &nowhere]).contains("folder"));
+    for arguments in [
+        &["mesh", "bar", "--cells", "0,1,1", "--size", "1,1,1", "-o", &out] as &[&str],
+        &["mesh", "bar", "--cells", "2,2", "--size", "1,1,1", "-o", &out],
+        &["mesh", "bar", "--cells", "2,2,2", "--size", "1,-1,1", "-o", &out],
+        &["mesh", "cube", "--cells", "2", "--size", "nan", "-o", &out],
+        &["mesh", "sphere", "--cells", "2", "--radius", "0", "-o", &out],
+        &["mesh", &open, "--tets", "1000", "-o", &out],
+        &["mesh", "-o", &out],
+        &["mesh", &open],
+        &["bake", "-o", &out],
+        &["frobnicate"],
+    ] {
+        refused(arguments);
+        assert_eq!(folder.names(), before, "{arguments:?}");
+    }
+}
+
+#[test]
+fn models_that_are_cut_or_foreign_are_refused() {
+    let folder = Folder::new("models");
+    let (mesh, model) = (folder.file("bar.msh"), folder.file("bar.modal"));
+    succeeds(&["mesh", "bar", "--cells", "4,1,1", "--size", "0.4,0.1,0.1", "-o", &mesh]);
+    succeeds(&["bake", &mesh, "--modes", "3", "-o", &model]);
+    let bytes = std::fs::read(&model).unwrap();
+    let cut = folder.file("cut.modal");
+    std::fs::write(&cut, &bytes[..bytes.len() - 10]).unwrap();
+    assert!(refused(&["inspect", &cut]).contains("cut.modal"));
+    let mut altered = bytes.clone();
+    let last = altered.len() - 1;
+    altered[last] ^= 1;
+    std::fs::write(&cut, altered).unwrap();
+    assert!(refused(&["inspect", &cut, "--json"]).contains("altered"));
+    assert!(refused(&["inspect", &mesh]).contains("not a .modal file"));
+    assert!(refused(&["inspect", &folder.file("none.modal")]).contains("none.modal"));
+}
