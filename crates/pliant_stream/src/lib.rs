@@ -6,6 +6,7 @@
 //! | module | what it holds |
 //! | --- | --- |
 //! | [`session`] | [`HostSession`] and [`GuestSession`]: hello, models by hash, snapshot, streaming, resync, goodbye |
+//! | [`peer`] | peer to peer: every peer steps, only targets cross, late ones are stepped again |
 //! | [`recovery`] | what a receiver does about loss: the paper's prediction and compensation, and the force-driven way |
 //! | [`encoder`] | frames in a closed loop: rounding does not add up |
 //! | [`wire`] | the bytes; every parser takes anything |
@@ -28,6 +29,7 @@ pub mod experiment;
 pub mod newmark;
 pub mod pair;
 mod patch_rows;
+pub mod peer;
 pub mod playout;
 pub mod recovery;
 pub mod session;

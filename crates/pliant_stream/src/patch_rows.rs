@@ -6,11 +6,6 @@ use std::sync::Arc;
 
 use crate::StreamError;
 
-/// Share of a patch's static compliance by which a measured place may give way. Without any, a held place under an
-/// implicit step flips its force every tick; a few per cent end that and cost nothing, since the streamed reaction already
-/// carries the load.
-const GIVE: f64 = 0.03;
-
 /// Three values a mode, axis by axis.
 pub(crate) type Rows = [Vec<f64>; 3];
 
@@ -49,8 +44,6 @@ pub(crate) struct PatchRows {
     pub(crate) at: Vector3<f64>,
     /// Where the patch is at rest, body axes, m.
     pub(crate) rest: Vector3<f64>,
-    /// How far a measured place may give way, m/N.
-    pub(crate) give: Matrix3<f64>,
     /// Compliance of a grab here, m/N.
     pub(crate) compliance: Matrix3<f64>,
 }
@@ -81,15 +74,9 @@ impl PatchRows {
         let mut body = Body::new(model.clone(), config).map_err(|e| failed(e.to_string()))?;
         let grab = body.grab(&patch, GrabConfig::default()).map_err(|e| failed(e.to_string()))?;
         let compliance = body.compliance(grab).map_err(|e| failed(e.to_string()))?;
-        let fixed: f64 = displacement
-            .iter()
-            .flat_map(|row| row.iter().zip(model.omega()))
-            .map(|(x, omega)| x * x / omega.powi(2).max(1e-12))
-            .sum();
         let compliance = Matrix3::from_fn(|i, j| compliance[i][j]);
-        let give = compliance + Matrix3::identity() * (GIVE * fixed / 3.0);
         let rows = displacement.clone();
-        Ok(Self { displacement, rotation, rows, at: Vector3::zeros(), rest, give, compliance })
+        Ok(Self { displacement, rotation, rows, at: Vector3::zeros(), rest, compliance })
     }
 
     /// Takes displacement and rows at `q`.

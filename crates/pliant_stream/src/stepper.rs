@@ -177,8 +177,18 @@ impl ForceStepper {
             self.patches.clear();
         }
         holds.retain(|h| self.patch_of(&model, h.vertex, h.radius, modes).is_some());
+        for h in holds.iter_mut().filter(|h| !h.target) {
+            // Where the hand must have been: a grab that pulls so from there leaves the patch where it was measured.
+            if let Some(patch) = self.patches.get(&key(h.vertex, h.radius)) {
+                h.place += patch.compliance * h.pull;
+                h.target = true;
+            }
+        }
         self.press(&state.q, holds, load);
         if !holds.is_empty() {
+            // Both of the body's rounds are implicit. Were the first one a dead load, a bent body would buckle under it, and the rows of the
+            // second round would be taken at the wrong place: the error then grows without bound.
+            self.correct(&state.q, holds);
             let mut trial = std::mem::take(&mut self.trial);
             self.reach(&mut trial);
             self.press(&trial, holds, load);
@@ -220,7 +230,7 @@ impl ForceStepper {
     }
 
     /// Adds to the modal forces what draws the patches to their places, on the tangent taken at `from`; see
-    /// [`ForceStepper::step`]. `(A + C) correction = place - reached`, and for a hand's target also less `C pull`.
+    /// [`ForceStepper::step`]. `(A + C) correction = place - reached - C pull`.
     fn correct(&mut self, from: &[f64], holds: &mut [Hold]) {
         let n = 3 * holds.len();
         let mut ahead = std::mem::take(&mut self.ahead);
@@ -238,11 +248,8 @@ impl ForceStepper {
         for (i, h) in holds.iter().enumerate() {
             let Some(a) = self.patches.get(&key(h.vertex, h.radius)) else { continue };
             let reached = a.at + dot(&a.rows, &ahead);
-            let softness = if h.target { a.compliance } else { a.give };
-            let mut missing = h.place - reached;
-            if h.target {
-                missing -= softness * h.pull;
-            }
+            let softness = a.compliance;
+            let missing = h.place - reached - softness * h.pull;
             for (scaled, row) in self.scaled.iter_mut().zip(&a.rows) {
                 for ((s, r), c) in scaled.iter_mut().zip(row).zip(&self.coefficients) {
                     *s = r * c.response[0];

@@ -1,0 +1,120 @@
+//! What all users' hands did, tick by tick.
+
+use std::collections::BTreeMap;
+
+use super::wire::{HeldAt, InputTick};
+use crate::recovery::Forecast;
+use crate::state::{BodyId, Tick, UserId};
+
+/// Ticks remembered.
+pub(crate) const WINDOW: usize = 128;
+
+/// One user's inputs.
+#[derive(Debug)]
+pub(crate) struct UserInputs {
+    slots: Vec<Option<InputTick>>,
+    /// Inputs are expected from here on.
+    pub(crate) first: Tick,
+    /// The newest tick known.
+    pub(crate) highest: Tick,
+    /// All ticks up to here are known.
+    pub(crate) complete: Tick,
+    /// The user has gone: after `highest` nothing is held.
+    pub(crate) gone: bool,
+}
+
+impl UserInputs {
+    fn new(first: Tick) -> Self {
+        let before = first.saturating_sub(1);
+        Self { slots: vec![None; WINDOW], first, highest: before, complete: before, gone: false }
+    }
+
+    pub(crate) fn at(&self, tick: Tick) -> Option<&InputTick> {
+        self.slots[(tick % WINDOW as u64) as usize].as_ref().filter(|i| i.tick == tick)
+    }
+
+    fn put(&mut self, input: InputTick) -> bool {
+        let tick = input.tick;
+        if tick + (WINDOW as u64) <= self.highest || self.at(tick).is_some() {
+            return false;
+        }
+        self.slots[(tick % WINDOW as u64) as usize] = Some(input);
+        self.highest = self.highest.max(tick);
+        self.complete = self.complete.max(self.highest.saturating_sub(WINDOW as u64));
+        while self.at(self.complete + 1).is_some() {
+            self.complete += 1;
+        }
+        true
+    }
+
+    /// What the user held at a tick, known or forecast; the flag is true when it is known.
+    fn held(&self, tick: Tick, forecast: &Forecast, out: &mut Vec<HeldAt>) -> bool {
+        if tick < self.first || (self.gone && tick > self.highest) {
+            return true;
+        }
+        if let Some(input) = self.at(tick) {
+            out.extend_from_slice(&input.held);
+            return true;
+        }
+        let last = (1..WINDOW as u64).map_while(|b| tick.checked_sub(b)).find_map(|t| self.at(t));
+        if let Some(last) = last {
+            for g in &last.held {
+                let samples: Vec<_> = (0..forecast.window())
+                    .map_while(|back| last.tick.checked_sub(back).map(|t| (back, t)))
+                    .filter_map(|(back, t)| {
+                        let held = self.at(t)?.held.iter().find(|x| x.grab == g.grab && x.body == g.body)?;
+                        let [x, y, z] = held.target;
+                        Some((back, [x, y, z, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0]))
+                    })
+                    .collect();
+                let target =
+                    forecast.go_on(&samples, tick - last.tick).map_or(g.target, |f| [f[0], f[1], f[2]]);
+                out.push(HeldAt { target, ..*g });
+            }
+        }
+        false
+    }
+}
+
+/// All users' inputs.
+#[derive(Debug, Default)]
+pub(crate) struct InputLog {
+    pub(crate) users: BTreeMap<UserId, UserInputs>,
+}
+
+impl InputLog {
+    /// Expects inputs of a user from a tick on.
+    pub(crate) fn expect(&mut self, user: UserId, first: Tick) {
+        self.users.insert(user, UserInputs::new(first));
+    }
+
+    /// Takes an input in; true when it is news.
+    pub(crate) fn put(&mut self, user: UserId, input: InputTick) -> bool {
+        self.users.get_mut(&user).is_some_and(|u| u.put(input))
+    }
+
+    /// Everything that holds a body at a tick, by user and grab; true when all of it is known.
+    pub(crate) fn held(
+        &self,
+        tick: Tick,
+        body: BodyId,
+        forecast: &Forecast,
+        out: &mut Vec<(UserId, HeldAt)>,
+    ) -> bool {
+        out.clear();
+        let mut known = true;
+        let mut held = Vec::new();
+        for (user, inputs) in &self.users {
+            held.clear();
+            known &= inputs.held(tick, forecast, &mut held);
+            out.extend(held.iter().filter(|g| g.body == body).map(|g| (*user, *g)));
+        }
+        known
+    }
+
+    /// The newest tick up to which all inputs are known.
+    pub(crate) fn complete(&self) -> Tick {
+        let each = self.users.values().filter(|u| !u.gone).map(|u| u.complete);
+        each.min().unwrap_or(0)
+    }
+}

@@ -1,0 +1,640 @@
+//! The session of one peer with all the others.
+
+use std::collections::{BTreeMap, VecDeque};
+use std::sync::Arc;
+use std::time::Duration;
+
+use pliant_modal::ModalModel;
+
+use super::body::{PeerBody, Repair};
+use super::inputs::{InputLog, WINDOW};
+use super::wire::{HeldAt, InputTick, MAX_HELD, MAX_TICKS, PeerDatagram, PeerMessage, StateCheck};
+use crate::StreamError;
+use crate::check::projection;
+use crate::session::{Channel, EndReason, Output};
+use crate::state::{BodyId, PeerId, Tick, UserId, in_range};
+use crate::stepper::BodySetup;
+use crate::wire::{MAX_NAME, PROTOCOL_VERSION};
+
+/// Most peers beside oneself.
+const MAX_PEERS: usize = 64;
+/// Most events that wait for the application; the oldest are dropped.
+const MAX_EVENTS: usize = 4096;
+/// Ticks between checks.
+const CHECK_EVERY: u64 = 16;
+/// Disagreements in a row before the other's state is taken over.
+const CHECKS: u32 = 3;
+/// Share of the state's size by which checks may differ: peers' machines round differently.
+const CHECK_TOLERANCE: f64 = 1e-3;
+/// A peer's tick is drawn towards the others' at most at this rate.
+const SLEW: f64 = 0.01;
+/// Pause between questions for the same tick.
+const ASK_AGAIN: Duration = Duration::from_millis(150);
+
+/// Settings of a peer.
+#[derive(Debug, Clone, PartialEq)]
+pub struct PeerConfig {
+    /// This peer's number; all have different ones, and the lowest is right when states disagree.
+    pub user: UserId,
+    /// A name for people, at most 64 bytes.
+    pub name: String,
+    /// Length of a step, s. Default: 1/40.
+    pub step: f64,
+    /// Default: [`Repair::Rollback`].
+    pub repair: Repair,
+    /// Ticks over which the shown error fades. Default: 6.
+    pub blend_ticks: u16,
+    /// Earlier ticks that each datagram repeats, at most 15. Default: 4.
+    pub repeats: usize,
+    /// A peer that is silent for so long is gone. Default: 10 s.
+    pub idle_timeout: Duration,
+    /// Begin with a state of one's own (the first peer) or wait for another's. Default: true.
+    pub founds: bool,
+}
+
+impl Default for PeerConfig {
+    fn default() -> Self {
+        Self {
+            user: UserId(1),
+            name: "peer".into(),
+            step: 1.0 / 40.0,
+            repair: Repair::default(),
+            blend_ticks: 6,
+            repeats: 4,
+            idle_timeout: Duration::from_secs(10),
+            founds: true,
+        }
+    }
+}
+
+/// What happened at a peer.
+#[derive(Debug, Clone, PartialEq)]
+#[non_exhaustive]
+pub enum PeerEvent {
+    /// This peer has a state and steps.
+    Started,
+    /// Another peer is here.
+    Joined {
+        /// Number.
+        user: UserId,
+        /// Name.
+        name: String,
+    },
+    /// Another peer is gone.
+    Left {
+        /// Number.
+        user: UserId,
+        /// Why.
+        reason: EndReason,
+    },
+    /// Another peer's state was taken over.
+    Resynced {
+        /// Whose.
+        from: UserId,
+    },
+}
+
+#[derive(Debug)]
+struct Other {
+    user: Option<UserId>,
+    heard: Duration,
+    sequence: u16,
+    /// Running mean of: own tick less theirs at arrival.
+    ahead: Option<f64>,
+    /// The same as they see it.
+    theirs: Option<f64>,
+    asked: BTreeMap<Tick, Duration>,
+    max_datagram: usize,
+    mismatched: u32,
+    wants_state: bool,
+}
+
+/// One of several equal peers: a state machine without sockets or clock.
+#[derive(Debug)]
+pub struct PeerSession {
+    config: PeerConfig,
+    others: BTreeMap<PeerId, Other>,
+    bodies: BTreeMap<BodyId, PeerBody>,
+    inputs: InputLog,
+    own: BTreeMap<u16, HeldAt>,
+    next_grab: u16,
+    tick: Tick,
+    started: bool,
+    next_step: Option<Duration>,
+    dirty: Option<Tick>,
+    out: VecDeque<Output>,
+    events: VecDeque<PeerEvent>,
+    requested: Option<Duration>,
+    last_check: Option<StateCheck>,
+}
+
+impl PeerSession {
+    /// A peer alone.
+    ///
+    /// # Errors
+    /// [`StreamError::Config`].
+    pub fn new(config: PeerConfig) -> Result<Self, StreamError> {
+        let fail = |what, found: String, expected| Err(StreamError::Config { what, found, expected });
+        if !(1e-5..=1.0).contains(&config.step) {
+            return fail("step", config.step.to_string(), "1e-5 to 1 s");
+        }
+        if config.name.len() > MAX_NAME {
+            return fail("name", config.name, "at most 64 bytes");
+        }
+        if config.repeats >= MAX_TICKS {
+            return fail("repeats", config.repeats.to_string(), "at most 15");
+        }
+        let started = config.founds;
+        let mut inputs = InputLog::default();
+        inputs.expect(config.user, 1);
+        Ok(Self {
+            config,
+            others: BTreeMap::new(),
+            bodies: BTreeMap::new(),
+            inputs,
+            own: BTreeMap::new(),
+            next_grab: 0,
+            tick: 0,
+            started,
+            next_step: None,
+            dirty: None,
+            out: VecDeque::new(),
+            events: VecDeque::new(),
+            requested: None,
+            last_check: None,
+        })
+    }
+
+    /// Adds a body; all peers add the same ones under the same numbers, before they start.
+    ///
+    /// # Errors
+    /// [`StreamError::Config`] for a free body or a number in use; [`StreamError::Model`].
+    pub fn add_body(
+        &mut self,
+        id: BodyId,
+        model: Arc<ModalModel>,
+        setup: &BodySetup,
+    ) -> Result<(), StreamError> {
+        if self.bodies.contains_key(&id) {
+            let found = id.to_string();
+            return Err(StreamError::Config { what: "body", found, expected: "a number that is not in use" });
+        }
+        let c = &self.config;
+        let body = PeerBody::new(id, model, setup, c.step, c.repair, c.blend_ticks)?;
+        self.bodies.insert(id, body);
+        Ok(())
+    }
+
+    /// A connection to another peer opened; says hello.
+    ///
+    /// # Errors
+    /// [`StreamError::Full`] beyond 64.
+    pub fn connect(&mut self, now: Duration, peer: PeerId, max_datagram: usize) -> Result<(), StreamError> {
+        if self.others.len() >= MAX_PEERS {
+            return Err(StreamError::Full { what: "peers", limit: MAX_PEERS });
+        }
+        let other = Other {
+            user: None,
+            heard: now,
+            sequence: 0,
+            ahead: None,
+            theirs: None,
+            asked: BTreeMap::new(),
+            max_datagram,
+            mismatched: 0,
+            wants_state: false,
+        };
+        self.others.insert(peer, other);
+        let hello = PeerMessage::Hello {
+            version: PROTOCOL_VERSION,
+            user: self.config.user.0,
+            name: self.config.name.clone(),
+            joining: !self.started,
+        };
+        self.message(peer, &hello);
+        Ok(())
+    }
+
+    /// A connection closed.
+    pub fn disconnect(&mut self, peer: PeerId, reason: EndReason) {
+        let Some(other) = self.others.remove(&peer) else { return };
+        let Some(user) = other.user else { return };
+        if let Some(inputs) = self.inputs.users.get_mut(&user) {
+            // All hear the same last input or forecast the same hands a little on; then the hands let go.
+            inputs.gone = true;
+            self.dirty = Some(self.dirty.map_or(inputs.highest + 1, |d| d.min(inputs.highest + 1)));
+        }
+        self.event(PeerEvent::Left { user, reason });
+    }
+
+    /// Takes hold of a body at the next tick.
+    ///
+    /// # Errors
+    /// [`StreamError::UnknownBody`], [`StreamError::NotFinite`], [`StreamError::Model`] for a vertex that is not there,
+    /// [`StreamError::Full`] beyond 16 grabs.
+    pub fn begin_grab(
+        &mut self,
+        body: BodyId,
+        vertex: u32,
+        radius: f64,
+        target: [f64; 3],
+    ) -> Result<u16, StreamError> {
+        let b = self.bodies.get(&body).ok_or(StreamError::UnknownBody(body))?;
+        if !in_range(&target) || !(0.0..=1e9).contains(&radius) {
+            return Err(StreamError::NotFinite { what: "grab" });
+        }
+        if vertex as usize >= b.model().surface().positions().len() {
+            return Err(StreamError::Model(format!("vertex {vertex} is not on the surface")));
+        }
+        if self.own.len() >= MAX_HELD {
+            return Err(StreamError::Full { what: "grabs", limit: MAX_HELD });
+        }
+        while self.own.contains_key(&self.next_grab) {
+            self.next_grab = self.next_grab.wrapping_add(1);
+        }
+        let grab = self.next_grab;
+        self.next_grab = grab.wrapping_add(1);
+        self.own.insert(grab, HeldAt { body, grab, vertex, radius, target }.rounded());
+        Ok(grab)
+    }
+
+    /// Moves a hand; it is felt at the next tick.
+    ///
+    /// # Errors
+    /// [`StreamError::UnknownGrab`], [`StreamError::NotFinite`].
+    pub fn set_target(&mut self, grab: u16, target: [f64; 3]) -> Result<(), StreamError> {
+        if !in_range(&target) {
+            return Err(StreamError::NotFinite { what: "target" });
+        }
+        let own = self.own.get_mut(&grab).ok_or(StreamError::UnknownGrab(grab))?;
+        *own = HeldAt { target, ..*own }.rounded();
+        Ok(())
+    }
+
+    /// Lets go at the next tick.
+    pub fn end_grab(&mut self, grab: u16) {
+        self.own.remove(&grab);
+    }
+
+    /// A body.
+    pub fn body(&self, id: BodyId) -> Option<&PeerBody> {
+        self.bodies.get(&id)
+    }
+
+    /// The tick reached; 0 before the start.
+    pub fn tick(&self) -> Tick {
+        self.tick
+    }
+
+    /// The newest tick for which all inputs are known: its state does not change any more.
+    pub fn confirmed(&self) -> Tick {
+        self.inputs.complete().min(self.tick)
+    }
+
+    /// The state of a body after a tick of the last 128.
+    pub fn state_at(&self, body: BodyId, tick: Tick) -> Option<&crate::ModalState> {
+        self.bodies.get(&body)?.past(tick)
+    }
+
+    /// Something arrived unreliably; any bytes will do.
+    pub fn on_datagram(&mut self, now: Duration, peer: PeerId, bytes: &[u8]) {
+        let Some(other) = self.others.get_mut(&peer) else { return };
+        let (Some(user), Ok((_, datagram))) = (other.user, PeerDatagram::decode(bytes)) else { return };
+        other.heard = now;
+        match datagram {
+            PeerDatagram::Inputs { now: theirs, ahead: seen, ticks, check } => {
+                other.theirs = seen.or(other.theirs);
+                let sample = self.tick as f64 - theirs as f64;
+                if sample.abs() < WINDOW as f64 {
+                    let ahead = other.ahead.get_or_insert(sample);
+                    *ahead += 0.05 * (sample - *ahead);
+                }
+                for input in ticks {
+                    let tick = input.tick;
+                    // The far future is not remembered: it would push out what is needed.
+                    if tick > self.tick + WINDOW as u64 / 2 {
+                        continue;
+                    }
+                    if self.inputs.put(user, input) && tick <= self.tick {
+                        self.dirty = Some(self.dirty.map_or(tick, |d| d.min(tick)));
+                    }
+                }
+                if let Some(check) = check {
+                    self.compare(peer, user, check);
+                }
+            }
+            PeerDatagram::Ask { runs } => self.answer(peer, &runs),
+        }
+    }
+
+    /// Something arrived reliably. What breaks the protocol ends the connection.
+    pub fn on_message(&mut self, now: Duration, peer: PeerId, bytes: &[u8]) {
+        let Some(other) = self.others.get_mut(&peer) else { return };
+        other.heard = now;
+        match PeerMessage::decode(bytes) {
+            Ok(PeerMessage::Hello { version, user, name, joining }) => {
+                let user = UserId(user);
+                let taken = user == self.config.user || self.inputs.users.get(&user).is_some_and(|u| !u.gone);
+                if version != PROTOCOL_VERSION || other.user.is_some() || taken {
+                    let reason =
+                        if version == PROTOCOL_VERSION { EndReason::Protocol } else { EndReason::Version };
+                    self.message(peer, &PeerMessage::Goodbye { reason });
+                    return self.disconnect(peer, reason);
+                }
+                other.user = Some(user);
+                other.wants_state = joining && self.started;
+                // Founders start together and expect each other from the start; a joiner's hands come later.
+                let first =
+                    if joining { self.tick + 1 } else { 1.max(self.tick.saturating_sub(WINDOW as u64 / 2)) };
+                self.inputs.expect(user, first);
+                self.event(PeerEvent::Joined { user, name });
+            }
+            Ok(PeerMessage::StateRequest) => other.wants_state = true,
+            Ok(PeerMessage::State { tick, now: theirs, bodies }) => {
+                let Some(user) = other.user else { return };
+                self.take_state(now, user, tick, theirs, &bodies);
+            }
+            Ok(PeerMessage::Goodbye { reason }) => self.disconnect(peer, reason),
+            Err(_) => {
+                self.message(peer, &PeerMessage::Goodbye { reason: EndReason::Protocol });
+                self.disconnect(peer, EndReason::Protocol);
+            }
+        }
+    }
+
+    fn take_state(
+        &mut self,
+        now: Duration,
+        from: UserId,
+        tick: Tick,
+        theirs: Tick,
+        bodies: &[super::wire::PeerBodyState],
+    ) {
+        let to = if self.started { self.tick } else { theirs.min(tick + WINDOW as u64 / 2) };
+        if tick > to || to - tick >= WINDOW as u64 {
+            return;
+        }
+        if !self.started {
+            for inputs in self.inputs.users.values_mut() {
+                inputs.first = inputs.first.max(tick + 1);
+                inputs.complete = inputs.complete.max(tick);
+            }
+            // Nothing was held by us in the ticks that we were not there.
+            for t in tick + 1..=to {
+                self.inputs.put(self.config.user, InputTick { tick: t, held: Vec::new() });
+            }
+        }
+        for b in bodies {
+            if let Some(body) = self.bodies.get_mut(&BodyId(b.body)) {
+                body.import(tick, to, b, &self.inputs);
+            }
+        }
+        self.tick = to;
+        if self.started {
+            self.event(PeerEvent::Resynced { from });
+        } else {
+            self.started = true;
+            self.next_step = Some(now + Duration::from_secs_f64(self.config.step));
+            self.event(PeerEvent::Started);
+        }
+        self.others.values_mut().for_each(|o| o.mismatched = 0);
+    }
+
+    /// Steps to what is due by now and sends what is due. Returns the ticks taken.
+    pub fn update(&mut self, now: Duration) -> u64 {
+        let silent: Vec<PeerId> = self
+            .others
+            .iter()
+            .filter(|(_, o)| now.saturating_sub(o.heard) > self.config.idle_timeout)
+            .map(|(p, _)| *p)
+            .collect();
+        for peer in silent {
+            self.disconnect(peer, EndReason::Silent);
+        }
+        if !self.started {
+            return 0;
+        }
+        self.settle();
+        let mut stepped = 0;
+        let due = *self.next_step.get_or_insert(now + Duration::from_secs_f64(self.config.step));
+        let mut due = due;
+        while due <= now && stepped < 8 {
+            self.step();
+            stepped += 1;
+            due += Duration::from_secs_f64(self.config.step * (1.0 + self.drift()));
+            if stepped == 8 && due <= now {
+                // Long asleep: ticks are not caught up with one by one; the others draw this peer on.
+                due = now + Duration::from_secs_f64(self.config.step);
+            }
+        }
+        self.next_step = Some(due);
+        self.ask(now);
+        self.give_states();
+        stepped
+    }
+
+    /// When to call [`PeerSession::update`] at the latest.
+    pub fn next_wakeup(&self) -> Option<Duration> {
+        self.next_step.filter(|_| self.started)
+    }
+
+    /// The next thing to send.
+    pub fn poll_output(&mut self) -> Option<Output> {
+        self.out.pop_front()
+    }
+
+    /// The next thing that happened.
+    pub fn poll_event(&mut self) -> Option<PeerEvent> {
+        self.events.pop_front()
+    }
+
+    /// Goes back to the earliest tick for which something new is known.
+    fn settle(&mut self) {
+        let Some(from) = self.dirty.take() else { return };
+        let mut too_late = false;
+        for body in self.bodies.values_mut() {
+            too_late |= !body.correct(from, &self.inputs);
+        }
+        if too_late {
+            self.request_state();
+        }
+    }
+
+    fn step(&mut self) {
+        self.tick += 1;
+        let held = self.own.values().copied().collect();
+        self.inputs.put(self.config.user, InputTick { tick: self.tick, held });
+        for body in self.bodies.values_mut() {
+            body.advance(&self.inputs);
+        }
+        let confirmed = self.confirmed();
+        let due = confirmed - confirmed % CHECK_EVERY;
+        let mut check = None;
+        if self.last_check.is_none_or(|c| c.tick < due) && due > 0 {
+            // One body a time, in turn.
+            let index = (due / CHECK_EVERY) as usize % self.bodies.len().max(1);
+            check = self.bodies.values().nth(index).and_then(|b| {
+                let q = &b.past(due)?.q;
+                Some(StateCheck { body: b.id(), tick: due, value: projection(due, q) as f32 })
+            });
+            self.last_check = check.or(self.last_check);
+        }
+        let peers: Vec<PeerId> = self.others.keys().copied().collect();
+        for peer in peers {
+            self.say_inputs(peer, check);
+        }
+    }
+
+    fn say_inputs(&mut self, peer: PeerId, check: Option<StateCheck>) {
+        let Some(own) = self.inputs.users.get(&self.config.user) else { return };
+        let Some(other) = self.others.get(&peer) else { return };
+        let mut ticks: Vec<InputTick> = (0..=self.config.repeats as u64)
+            .map_while(|back| self.tick.checked_sub(back))
+            .filter_map(|t| own.at(t).cloned())
+            .collect();
+        let bytes = |t: &[InputTick]| PeerDatagram::bytes_of(t.iter().map(|t| t.held.len()));
+        while ticks.len() > 1 && bytes(&ticks) > other.max_datagram {
+            ticks.pop();
+        }
+        let (now, ahead) = (self.tick, other.ahead);
+        self.datagram(peer, &PeerDatagram::Inputs { now, ahead, ticks, check });
+    }
+
+    fn answer(&mut self, peer: PeerId, runs: &[(Tick, u8)]) {
+        let Some(own) = self.inputs.users.get(&self.config.user) else { return };
+        let wanted = runs.iter().flat_map(|(first, count)| *first..first + u64::from(*count));
+        let mut ticks: Vec<InputTick> = wanted.filter_map(|t| own.at(t).cloned()).take(WINDOW).collect();
+        let limit = self.others.get(&peer).map_or(256, |o| o.max_datagram);
+        while !ticks.is_empty() {
+            let mut count = ticks.len().min(MAX_TICKS);
+            let bytes = |n: usize| PeerDatagram::bytes_of(ticks[..n].iter().map(|t| t.held.len()));
+            while count > 1 && bytes(count) > limit {
+                count -= 1;
+            }
+            let rest = ticks.split_off(count);
+            let (now, ahead) = (self.tick, self.others.get(&peer).and_then(|o| o.ahead));
+            self.datagram(peer, &PeerDatagram::Inputs { now, ahead, ticks, check: None });
+            ticks = rest;
+        }
+    }
+
+    /// Asks each peer for those of its inputs that are missing and that no repeat will bring.
+    fn ask(&mut self, now: Duration) {
+        let mut questions = Vec::new();
+        for (peer, other) in &mut self.others {
+            let Some(inputs) = other.user.and_then(|u| self.inputs.users.get(&u)) else { continue };
+            let to = inputs.highest.saturating_sub(self.config.repeats as u64);
+            let from = (inputs.complete + 1).max(inputs.first);
+            let mut runs: Vec<(Tick, u8)> = Vec::new();
+            for tick in from..to {
+                let again = other.asked.get(&tick).is_some_and(|at| now.saturating_sub(*at) < ASK_AGAIN);
+                if inputs.at(tick).is_some() || again {
+                    continue;
+                }
+                other.asked.insert(tick, now);
+                match runs.last_mut() {
+                    Some((first, count)) if *first + u64::from(*count) == tick && *count < 64 => *count += 1,
+                    _ => runs.push((tick, 1)),
+                }
+            }
+            other.asked.retain(|t, _| *t >= from);
+            runs.truncate(MAX_TICKS);
+            if !runs.is_empty() {
+                questions.push((*peer, PeerDatagram::Ask { runs }));
+            }
+            if inputs.complete + (WINDOW as u64) / 2 < inputs.highest {
+                other.mismatched = CHECKS;
+            }
+        }
+        for (peer, question) in questions {
+            self.datagram(peer, &question);
+        }
+        if self.others.values().any(|o| o.mismatched >= CHECKS) {
+            let due = self.requested.is_none_or(|at| now.saturating_sub(at) > Duration::from_secs(1));
+            if due {
+                self.requested = Some(now);
+                self.request_state();
+            }
+        }
+    }
+
+    /// Only those with a lower number are believed.
+    fn compare(&mut self, peer: PeerId, user: UserId, check: StateCheck) {
+        if user > self.config.user || check.tick > self.confirmed() {
+            return;
+        }
+        let Some(q) = self.bodies.get(&check.body).and_then(|b| b.past(check.tick)).map(|s| &s.q) else {
+            return;
+        };
+        let size = q.iter().map(|q| q * q).sum::<f64>().sqrt();
+        let agrees =
+            (projection(check.tick, q) - f64::from(check.value)).abs() <= CHECK_TOLERANCE * size + 1e-7;
+        if let Some(other) = self.others.get_mut(&peer) {
+            other.mismatched = if agrees { 0 } else { other.mismatched + 1 };
+        }
+    }
+
+    /// Asks the peer with the lowest number, if that is not oneself.
+    fn request_state(&mut self) {
+        let lowest = self.others.iter().filter_map(|(p, o)| o.user.map(|u| (u, *p))).min();
+        if let Some((user, peer)) = lowest
+            && user < self.config.user
+        {
+            self.message(peer, &PeerMessage::StateRequest);
+        }
+    }
+
+    fn give_states(&mut self) {
+        let wanting: Vec<PeerId> =
+            self.others.iter().filter(|(_, o)| o.wants_state && o.user.is_some()).map(|(p, _)| *p).collect();
+        // Who has just come has no inputs yet and must not hold the confirmed tick back.
+        let each = self.inputs.users.values().filter(|u| !u.gone && u.first <= self.tick);
+        let tick = each.map(|u| u.complete).min().unwrap_or(self.tick).min(self.tick);
+        if wanting.is_empty() || tick == 0 {
+            return;
+        }
+        let bodies: Vec<_> = self.bodies.values().filter_map(|b| b.export(tick)).collect();
+        if bodies.len() != self.bodies.len() {
+            return;
+        }
+        let state = PeerMessage::State { tick, now: self.tick, bodies };
+        for peer in wanting {
+            if let Some(other) = self.others.get_mut(&peer) {
+                other.wants_state = false;
+            }
+            self.message(peer, &state);
+        }
+    }
+
+    /// How much longer than `step` a step takes, to stay with the others: positive when this peer is ahead.
+    ///
+    /// Each side sees the other late by the way: with `d` the true lead and `w` the way in ticks this side sees `d + w`
+    /// and the other `w - d`, so half the difference is `d`.
+    fn drift(&self) -> f64 {
+        let leads: Vec<f64> =
+            self.others.values().filter_map(|o| Some(0.5 * (o.ahead? - o.theirs?))).collect();
+        if leads.is_empty() {
+            return 0.0;
+        }
+        let mean = leads.iter().sum::<f64>() / leads.len() as f64;
+        (0.01 * mean).clamp(-SLEW, SLEW)
+    }
+
+    fn datagram(&mut self, peer: PeerId, datagram: &PeerDatagram) {
+        let Some(other) = self.others.get_mut(&peer) else { return };
+        let bytes = datagram.encode(other.sequence);
+        other.sequence = other.sequence.wrapping_add(1);
+        self.out.push_back(Output { peer, channel: Channel::Datagram, bytes: bytes.into() });
+    }
+
+    fn message(&mut self, peer: PeerId, message: &PeerMessage) {
+        self.out.push_back(Output { peer, channel: Channel::Message, bytes: message.encode().into() });
+    }
+
+    fn event(&mut self, event: PeerEvent) {
+        if self.events.len() >= MAX_EVENTS {
+            self.events.pop_front();
+        }
+        self.events.push_back(event);
+    }
+}

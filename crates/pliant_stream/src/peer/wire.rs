@@ -1,0 +1,305 @@
+//! What equal peers say to each other; see `docs/protocol.md`.
+
+use serde::{Deserialize, Serialize};
+
+use crate::StreamError;
+use crate::session::{EndReason, MAX_MESSAGE};
+use crate::state::{BodyId, GrabKey, MAX_MODES, TICK_LIMIT, Tick, UserId, in_range};
+use crate::wire::{Reader, Writer};
+
+const INPUTS: u8 = 6;
+const ASK: u8 = 7;
+/// Most ticks in one datagram.
+pub(crate) const MAX_TICKS: usize = 16;
+/// Most grabs of one user at one tick.
+pub(crate) const MAX_HELD: usize = 16;
+/// Bytes of one grab.
+const HELD_BYTES: usize = 24;
+
+/// A hand at one tick.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct HeldAt {
+    /// Which body.
+    pub body: BodyId,
+    /// The user's number for the grab.
+    pub grab: u16,
+    /// Centre of the patch.
+    pub vertex: u32,
+    /// Radius of the patch, m.
+    pub radius: f64,
+    /// Where the hand is, world, m.
+    pub target: [f64; 3],
+}
+
+impl HeldAt {
+    /// The grab's name among all users'.
+    pub fn key(&self, user: UserId) -> GrabKey {
+        GrabKey { user, grab: self.grab }
+    }
+
+    /// As it will be read at the other end.
+    pub(crate) fn rounded(mut self) -> Self {
+        self.radius = f64::from(self.radius as f32);
+        self.target = self.target.map(|x| f64::from(x as f32));
+        self
+    }
+}
+
+/// Everything that one user's hands do at one tick.
+#[derive(Debug, Clone, PartialEq, Default)]
+pub struct InputTick {
+    /// Which tick.
+    pub tick: Tick,
+    /// At most 16 grabs.
+    pub held: Vec<HeldAt>,
+}
+
+/// A checksum of one body at a tick for which the sender knows all inputs.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct StateCheck {
+    /// Which body.
+    pub body: BodyId,
+    /// Which tick.
+    pub tick: Tick,
+    /// [`crate::check::projection`] of its coordinates.
+    pub value: f32,
+}
+
+/// Unreliable, between peers.
+#[derive(Debug, Clone, PartialEq)]
+pub enum PeerDatagram {
+    /// The sender's own inputs.
+    Inputs {
+        /// The tick that the sender has reached.
+        now: Tick,
+        /// Mean of the sender's tick less the receiver's as it arrived there, where known.
+        ahead: Option<f64>,
+        /// At most 16 ticks.
+        ticks: Vec<InputTick>,
+        /// At most one.
+        check: Option<StateCheck>,
+    },
+    /// Inputs of the receiver that the sender misses: first tick and count.
+    Ask {
+        /// At most 16 runs.
+        runs: Vec<(Tick, u8)>,
+    },
+}
+
+impl PeerDatagram {
+    /// The bytes.
+    pub fn encode(&self, sequence: u16) -> Vec<u8> {
+        let mut w = Writer::with_capacity(128);
+        match self {
+            Self::Inputs { now, ahead, ticks, check } => {
+                w.u8(INPUTS);
+                w.u16(sequence);
+                w.tick(*now);
+                // 1/64 tick; a float-to-int cast saturates.
+                w.i16(ahead.map_or(i16::MIN, |a| ((a * 64.0).round() as i16).max(-i16::MAX)));
+                let ticks = &ticks[..ticks.len().min(MAX_TICKS)];
+                w.u8(ticks.len() as u8);
+                for t in ticks {
+                    w.tick(t.tick);
+                    let held = &t.held[..t.held.len().min(MAX_HELD)];
+                    w.u8(held.len() as u8);
+                    for g in held {
+                        w.u16(g.body.0);
+                        w.u16(g.grab);
+                        w.u32(g.vertex);
+                        w.f32(g.radius as f32);
+                        w.vector(g.target);
+                    }
+                }
+                w.u8(u8::from(check.is_some()));
+                if let Some(c) = check {
+                    w.u16(c.body.0);
+                    w.tick(c.tick);
+                    w.f32(c.value);
+                }
+            }
+            Self::Ask { runs } => {
+                w.u8(ASK);
+                w.u16(sequence);
+                let runs = &runs[..runs.len().min(MAX_TICKS)];
+                w.u8(runs.len() as u8);
+                for (first, count) in runs {
+                    w.tick(*first);
+                    w.u8(*count);
+                }
+            }
+        }
+        w.into_bytes()
+    }
+
+    /// Bytes that inputs of these numbers of grabs take.
+    pub(crate) fn bytes_of(held: impl Iterator<Item = usize>) -> usize {
+        3 + 6 + 2 + 1 + 1 + 12 + held.map(|n| 7 + n * HELD_BYTES).sum::<usize>()
+    }
+
+    /// Reads any bytes.
+    ///
+    /// # Errors
+    /// [`StreamError::Truncated`], [`StreamError::Invalid`] and [`StreamError::NotFinite`], naming the field.
+    pub fn decode(bytes: &[u8]) -> Result<(u16, Self), StreamError> {
+        let mut r = Reader::new(bytes);
+        let kind = r.u8("datagram kind")?;
+        let sequence = r.u16("sequence")?;
+        let invalid = |what, found: String, expected| Err(StreamError::Invalid { what, found, expected });
+        let datagram = match kind {
+            INPUTS => {
+                let now = r.tick("tick")?;
+                let ahead = match r.i16("ahead")? {
+                    i16::MIN => None,
+                    steps => Some(f64::from(steps) / 64.0),
+                };
+                let count = usize::from(r.u8("tick count")?);
+                if count > MAX_TICKS {
+                    return invalid("tick count", count.to_string(), "at most 16");
+                }
+                let mut ticks = Vec::with_capacity(count);
+                for _ in 0..count {
+                    let tick = r.tick("input tick")?;
+                    let count = usize::from(r.u8("held count")?);
+                    if count > MAX_HELD {
+                        return invalid("held count", count.to_string(), "at most 16");
+                    }
+                    let mut held = Vec::with_capacity(count.min(r.left() / HELD_BYTES));
+                    for _ in 0..count {
+                        let g = HeldAt {
+                            body: BodyId(r.u16("held body")?),
+                            grab: r.u16("held grab")?,
+                            vertex: r.u32("held vertex")?,
+                            radius: r.f32("held radius")?,
+                            target: r.vector("held target")?,
+                        };
+                        if g.radius < 0.0 {
+                            return invalid("held radius", g.radius.to_string(), "0 m or more");
+                        }
+                        held.push(g);
+                    }
+                    ticks.push(InputTick { tick, held });
+                }
+                let check = match r.u8("check flag")? {
+                    0 => None,
+                    1 => Some(StateCheck {
+                        body: BodyId(r.u16("check body")?),
+                        tick: r.tick("check tick")?,
+                        value: r.wide32("check")?,
+                    }),
+                    other => return invalid("check flag", other.to_string(), "0 or 1"),
+                };
+                Self::Inputs { now, ahead, ticks, check }
+            }
+            ASK => {
+                let count = usize::from(r.u8("ask runs")?);
+                if count > MAX_TICKS {
+                    return invalid("ask runs", count.to_string(), "at most 16");
+                }
+                let mut runs = Vec::with_capacity(count);
+                for _ in 0..count {
+                    runs.push((r.tick("ask tick")?, r.u8("ask count")?));
+                }
+                Self::Ask { runs }
+            }
+            other => return invalid("datagram kind", other.to_string(), "6 or 7"),
+        };
+        r.finish("datagram")?;
+        Ok((sequence, datagram))
+    }
+}
+
+/// One body's state in a [`PeerMessage::State`].
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub struct PeerBodyState {
+    /// Which body.
+    pub body: u16,
+    /// Modal coordinates, kg^1/2 m.
+    pub q: Vec<f64>,
+    /// Velocities.
+    pub v: Vec<f64>,
+    /// Accelerations.
+    pub a: Vec<f64>,
+    /// Pulls of the last step, which the next one begins with: user, grab, force.
+    pub pulls: Vec<(u16, u16, [f64; 3])>,
+}
+
+/// Reliable, between peers.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub enum PeerMessage {
+    /// The first message each way.
+    Hello {
+        /// [`crate::wire::PROTOCOL_VERSION`].
+        version: u16,
+        /// The sender's number; all peers have different ones.
+        user: u16,
+        /// At most 64 bytes.
+        name: String,
+        /// The sender has no state yet and wants one.
+        joining: bool,
+    },
+    /// Send me your state: checks disagree, or too much is missing.
+    StateRequest,
+    /// The state after a tick for which the sender knows all inputs.
+    State {
+        /// After which tick.
+        tick: u64,
+        /// The tick that the sender has reached.
+        now: u64,
+        /// All bodies.
+        bodies: Vec<PeerBodyState>,
+    },
+    /// The last message.
+    Goodbye {
+        /// Why.
+        reason: EndReason,
+    },
+}
+
+impl PeerMessage {
+    /// The bytes.
+    pub fn encode(&self) -> Vec<u8> {
+        // Plain data: serialising it to a growing buffer cannot fail.
+        postcard::to_stdvec(self).unwrap_or_default()
+    }
+
+    /// Reads any bytes and checks every bound.
+    ///
+    /// # Errors
+    /// [`StreamError::Invalid`], naming the field.
+    pub fn decode(bytes: &[u8]) -> Result<Self, StreamError> {
+        let invalid = |what, found: String, expected| Err(StreamError::Invalid { what, found, expected });
+        if bytes.len() > MAX_MESSAGE {
+            return invalid("peer message", format!("{} bytes", bytes.len()), "at most MAX_MESSAGE bytes");
+        }
+        let message: Self = match postcard::take_from_bytes(bytes) {
+            Ok((message, [])) => message,
+            Ok((_, rest)) => {
+                return invalid("peer message", format!("{} bytes too many", rest.len()), "one message");
+            }
+            Err(e) => return invalid("peer message", e.to_string(), "a postcard message of this version"),
+        };
+        match &message {
+            Self::Hello { name, .. } if name.len() > crate::wire::MAX_NAME => {
+                return invalid("name", name.len().to_string(), "at most 64 bytes");
+            }
+            Self::State { tick, now, bodies } => {
+                if *tick >= TICK_LIMIT || *now >= TICK_LIMIT {
+                    return invalid("state tick", tick.to_string(), "below 2^48");
+                }
+                for b in bodies {
+                    let equal = b.v.len() == b.q.len() && b.a.len() == b.q.len() && b.q.len() <= MAX_MODES;
+                    let sane = in_range(&b.q)
+                        && in_range(&b.v)
+                        && b.a.iter().all(|x| x.abs() < 1e15)
+                        && b.pulls.iter().all(|p| in_range(&p.2));
+                    if !(equal && sane) {
+                        return invalid("state", "a number or length out of range".into(), "finite numbers");
+                    }
+                }
+            }
+            Self::Hello { .. } | Self::StateRequest | Self::Goodbye { .. } => {}
+        }
+        Ok(message)
+    }
+}
