@@ -1,0 +1,279 @@
+//! A guest: it sees the body that the host steps, holds it, and feels it. With a window or without.
+
+use std::{
+    path::PathBuf,
+    sync::{
+        Arc,
+        atomic::{AtomicBool, Ordering},
+    },
+    time::Duration,
+};
+
+use bevy::{
+    app::ScheduleRunnerPlugin,
+    math::DVec3,
+    prelude::*,
+    render::view::screenshot::{Screenshot, save_to_disk},
+    window::{PresentMode, WindowResolution},
+    winit::WinitSettings,
+};
+use pliant::{
+    modal::{ModalModel, warp},
+    net::{GuestState, NetGuest, NetPlugin, NetStats, RemoteBody, SeenHands, SharedBody, User, colour_of},
+    prelude::*,
+    rerun::{RerunPlugin, RerunScalars},
+};
+
+use crate::{
+    BODY, RATE,
+    hand::{self, ScriptedHand},
+    meter::{Meter, Truth},
+    view::{DrawnHand, HeldBy, ViewPlugin},
+};
+
+/// Everything that one guest needs to know.
+pub struct Guest {
+    pub title: String,
+    pub net: NetPlugin,
+    pub truth: Truth,
+    /// What the hand does without a person.
+    pub hand: Option<ScriptedHand>,
+    pub rerun: Option<RerunPlugin>,
+    /// Seconds from the first picture of the body on; `None`: until told to stop, or the window is closed.
+    pub duration: Option<f64>,
+    pub screenshot: Option<PathBuf>,
+    pub stop: Arc<AtomicBool>,
+}
+
+/// What this guest saw, taken out of the app when it has ended.
+#[derive(Default, Clone)]
+pub struct GuestReport {
+    pub meter: Meter,
+    pub stats: NetStats,
+    /// Why the session ended early, if it did.
+    pub failure: Option<String>,
+}
+
+/// The body as this guest has it.
+#[derive(Component)]
+pub struct GuestBody;
+
+/// The newest figures, for the corner of the window and for the recording.
+#[derive(Resource, Default)]
+pub struct Figures {
+    pub title: String,
+    pub joined: bool,
+    pub loss: f64,
+    pub round_trip: f64,
+    /// Magnitude of the own hand's reaction, N.
+    pub reaction: f64,
+    pub kbit_s: f64,
+}
+
+#[derive(Resource)]
+struct Run {
+    duration: Option<f64>,
+    screenshot: Option<PathBuf>,
+    stop: Arc<AtomicBool>,
+    /// When the body was first here, s.
+    since: Option<f64>,
+    pictured: bool,
+    failure: Option<String>,
+}
+
+/// Seconds that a guest waits for the body before it gives up.
+const PATIENCE: f64 = 30.0;
+
+/// Runs a guest with a window on this thread, which must be the main one.
+pub fn run_windowed(guest: Guest) -> GuestReport {
+    let mut app = App::new();
+    app.add_plugins(
+        DefaultPlugins
+            .set(WindowPlugin {
+                primary_window: Some(Window {
+                    title: "Pliant: shared body".into(),
+                    resolution: WindowResolution::new(1280, 720),
+                    present_mode: PresentMode::AutoVsync,
+                    ..default()
+                }),
+                ..default()
+            })
+            .set(AssetPlugin { file_path: crate::ASSETS.into(), ..default() }),
+    )
+    // The session goes on when the window is not looked at.
+    .insert_resource(WinitSettings::continuous())
+    .add_plugins((PointerGrabPlugin, ViewPlugin));
+    run(app, guest)
+}
+
+/// Runs a guest without a window on this thread.
+pub fn run_headless(guest: Guest) -> GuestReport {
+    let mut app = App::new();
+    app.add_plugins((
+        MinimalPlugins.set(ScheduleRunnerPlugin::run_loop(Duration::from_millis(4))),
+        AssetPlugin::default(),
+        TransformPlugin,
+    ));
+    run(app, guest)
+}
+
+fn run(mut app: App, guest: Guest) -> GuestReport {
+    app.add_plugins((PliantBodyPlugin::default(), guest.net))
+        .insert_resource(Time::<Fixed>::from_hz(RATE))
+        .insert_resource(guest.truth)
+        .init_resource::<Meter>()
+        .insert_resource(Figures { title: guest.title, ..default() })
+        .insert_resource(Run {
+            duration: guest.duration,
+            screenshot: guest.screenshot,
+            stop: guest.stop,
+            since: None,
+            pictured: false,
+            failure: None,
+        })
+        .add_systems(Startup, spawn)
+        .add_systems(Last, (measure, gather_hands, finish).chain());
+    if let Some(hand) = guest.hand {
+        app.insert_resource(hand).add_systems(FixedUpdate, hand::play.before(PliantSystems::Input));
+    }
+    if let Some(rerun) = guest.rerun {
+        app.add_plugins(rerun).add_systems(Last, record.after(measure));
+    }
+    let kept = Kept::default();
+    app.insert_resource(kept.clone()).add_systems(Last, keep.after(finish));
+    app.run();
+    kept.take()
+}
+
+/// The body arrives on this entity.
+fn spawn(mut commands: Commands) {
+    commands.spawn((
+        Name::new(BODY),
+        SharedBody::named(BODY),
+        GuestBody,
+        HeldBy::default(),
+        Transform::default(),
+    ));
+}
+
+/// Compares what is shown with the truth of the same tick, and gathers the figures.
+fn measure(
+    guest: Option<Res<NetGuest>>,
+    stats: Res<NetStats>,
+    truth: Res<Truth>,
+    mut meter: ResMut<Meter>,
+    mut figures: ResMut<Figures>,
+    mut run: ResMut<Run>,
+    time: Res<Time<Real>>,
+    bodies: Query<(&RemoteBody, &BodyState), With<GuestBody>>,
+    forces: Query<&GrabForce, With<Grab>>,
+) {
+    let Some(guest) = guest else { return };
+    if let GuestState::Closed { reason } = guest.state() {
+        run.failure.get_or_insert_with(|| reason.clone());
+    }
+    figures.loss = stats.loss_in;
+    figures.round_trip = stats.round_trip.as_secs_f64();
+    figures.kbit_s = stats.bytes_in_per_s * 8e-3;
+    figures.reaction = forces.iter().map(|f| f.force.length()).fold(0.0, f64::max);
+    meter.reaction = meter.reaction.max(figures.reaction);
+    for (remote, state) in &bodies {
+        let shown = guest.read_body(*remote, |view| {
+            view.shown().map(|shown| meter.compare(state.model(), view.tick(), &shown.q, &truth))
+        });
+        if shown.flatten().is_some() {
+            figures.joined = true;
+            run.since.get_or_insert(time.elapsed_secs_f64());
+        }
+    }
+}
+
+/// All hands on the body: the others' from the stream, the own from its entity.
+fn gather_hands(
+    mut bodies: Query<(&SeenHands, &BodyState, &ShownState, &GlobalTransform, &mut HeldBy), With<GuestBody>>,
+    own: Query<(&Grab, &GrabForce), Without<PointerHeld>>,
+    you: Query<&User, With<pliant::net::Yourself>>,
+) {
+    for (seen, state, shown, place, mut held) in &mut bodies {
+        held.0.clear();
+        for hand in &seen.0 {
+            let point =
+                place.transform_point(surface_point(state.model(), hand.vertex, shown.q())).as_dvec3();
+            held.0.push(DrawnHand {
+                target: hand.target,
+                point,
+                force: hand.reaction,
+                colour: colour_of(hand.user),
+            });
+        }
+        let colour = you.iter().next().map_or(Color::WHITE, |user| user.colour);
+        for (grab, force) in &own {
+            held.0.push(DrawnHand { target: grab.target, point: force.point, force: force.force, colour });
+        }
+    }
+}
+
+fn surface_point(model: &ModalModel, vertex: u32, q: &[f64]) -> Vec3 {
+    let Some(rest) = model.surface().positions().get(vertex as usize) else { return Vec3::ZERO };
+    let (mut d, mut w) = ([0.0f64; 3], [0.0f64; 3]);
+    for (mode, q) in q.iter().enumerate() {
+        for axis in 0..3 {
+            d[axis] += q * f64::from(model.displacement_row(vertex, axis, mode));
+            w[axis] += q * f64::from(model.rotation_row(vertex, axis, mode));
+        }
+    }
+    Vec3::from(*rest) + DVec3::from(warp(w, d)).as_vec3()
+}
+
+/// The error, beside the shapes, forces and network figures that the plugin records by itself.
+fn record(figures: Res<Figures>, meter: Res<Meter>, mut scalars: ResMut<RerunScalars>) {
+    if !figures.joined {
+        return;
+    }
+    scalars.set("error/now", "%", meter.percent(meter.now));
+    scalars.set("error/rms", "%", meter.percent(meter.rms()));
+}
+
+fn finish(
+    mut commands: Commands,
+    time: Res<Time<Real>>,
+    mut run: ResMut<Run>,
+    mut exit: MessageWriter<AppExit>,
+) {
+    let now = time.elapsed_secs_f64();
+    if run.since.is_none() && now > PATIENCE {
+        run.failure.get_or_insert_with(|| format!("no body within {PATIENCE} s"));
+    }
+    let shown_for = run.since.map_or(0.0, |since| now - since);
+    if let (Some(path), Some(duration)) = (&run.screenshot, run.duration)
+        && !run.pictured
+        && shown_for > duration - 1.5
+    {
+        commands.spawn(Screenshot::primary_window()).observe(save_to_disk(path.clone()));
+        run.pictured = true;
+    }
+    let over = run.duration.is_some_and(|duration| shown_for >= duration);
+    if over || run.failure.is_some() || run.stop.load(Ordering::Relaxed) {
+        exit.write(AppExit::Success);
+    }
+}
+
+/// What is left when the app is gone.
+#[derive(Resource, Clone, Default)]
+struct Kept(Arc<std::sync::Mutex<GuestReport>>);
+
+impl Kept {
+    fn take(&self) -> GuestReport {
+        std::mem::take(&mut *self.0.lock().unwrap_or_else(std::sync::PoisonError::into_inner))
+    }
+}
+
+fn keep(kept: Res<Kept>, meter: Res<Meter>, stats: Res<NetStats>, run: Res<Run>) {
+    let mut report = kept.0.lock().unwrap_or_else(std::sync::PoisonError::into_inner);
+    report.meter.clone_from(&meter);
+    // When the connection is closed its figures are gone: the last ones count.
+    if stats.peers > 0 {
+        report.stats = *stats;
+    }
+    report.failure.clone_from(&run.failure);
+}

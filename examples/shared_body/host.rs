@@ -1,0 +1,117 @@
+//! The host: it steps the body and streams it. No window.
+
+use std::{
+    sync::{
+        Arc, Mutex, PoisonError,
+        atomic::{AtomicBool, Ordering},
+    },
+    time::Duration,
+};
+
+use bevy::{app::ScheduleRunnerPlugin, diagnostic::DiagnosticsStore, prelude::*};
+use pliant::{
+    body::{Integration, STEP_TIME},
+    modal::ModalModel,
+    net::{NetHost, NetPlugin, NetStats, SharedBody},
+    prelude::*,
+};
+
+use crate::{BODY, RATE, meter::Truth};
+
+/// What the host has to say at the end.
+#[derive(Default, Clone, Debug)]
+pub struct HostReport {
+    /// Ticks stepped while a guest was there.
+    pub ticks: u64,
+    /// Bytes sent to all guests.
+    pub bytes_out: u64,
+    /// Seconds over which they were sent.
+    pub seconds: f64,
+    /// Time of each tick's step, us.
+    pub step_us: Vec<f64>,
+}
+
+/// The report as it grows, and the sign to stop.
+#[derive(Resource, Clone, Default)]
+pub struct Shared {
+    pub report: Arc<Mutex<HostReport>>,
+    pub stop: Arc<AtomicBool>,
+}
+
+impl Shared {
+    pub fn snapshot(&self) -> HostReport {
+        self.report.lock().unwrap_or_else(PoisonError::into_inner).clone()
+    }
+}
+
+#[derive(Resource)]
+struct Model(Arc<ModalModel>);
+
+#[derive(Resource)]
+struct Stepped(Integration);
+
+/// Runs the host's app on this thread until it is told to stop.
+pub fn run(model: Arc<ModalModel>, integrator: Integration, net: NetPlugin, truth: Truth, shared: Shared) {
+    App::new()
+        .add_plugins((
+            MinimalPlugins.set(ScheduleRunnerPlugin::run_loop(Duration::from_millis(2))),
+            AssetPlugin::default(),
+            TransformPlugin,
+            PliantBodyPlugin::default(),
+            net,
+        ))
+        .insert_resource(Time::<Fixed>::from_hz(RATE))
+        .insert_resource(Model(model))
+        .insert_resource(Stepped(integrator))
+        .insert_resource(truth)
+        .insert_resource(shared)
+        .add_systems(Startup, spawn)
+        .add_systems(FixedUpdate, record.after(PliantSystems::Publish))
+        .add_systems(Last, stop)
+        .run();
+}
+
+fn spawn(
+    mut commands: Commands,
+    model: Res<Model>,
+    integrator: Res<Stepped>,
+    mut assets: ResMut<Assets<ModalAsset>>,
+) {
+    let asset = assets.add(ModalAsset::from(model.0.clone()));
+    let body = ModalBody { integrator: integrator.0, ..ModalBody::new(asset) };
+    commands.spawn((body, SharedBody::named(BODY)));
+}
+
+fn record(
+    tick: Res<PliantTick>,
+    host: Option<Res<NetHost>>,
+    stats: Res<NetStats>,
+    time: Res<Time<Real>>,
+    truth: Res<Truth>,
+    shared: Res<Shared>,
+    diagnostics: Res<DiagnosticsStore>,
+    bodies: Query<&BodyState>,
+    mut since: Local<Option<f64>>,
+) {
+    for state in &bodies {
+        truth.push(tick.0, state.body().q());
+    }
+    if host.is_none_or(|host| host.guests().next().is_none()) {
+        return;
+    }
+    let now = time.elapsed_secs_f64();
+    let begun = *since.get_or_insert(now);
+    let mut report = shared.report.lock().unwrap_or_else(PoisonError::into_inner);
+    report.ticks += 1;
+    report.bytes_out = stats.bytes_out;
+    report.seconds = now - begun;
+    if let Some(step) = diagnostics.get_measurement(&STEP_TIME) {
+        report.step_us.push(step.value * 1e3);
+    }
+}
+
+fn stop(shared: Res<Shared>, mut exit: MessageWriter<AppExit>) {
+    if shared.stop.load(Ordering::Relaxed) {
+        exit.write(AppExit::Success);
+    }
+}

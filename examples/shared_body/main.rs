@@ -1,0 +1,199 @@
+//! Two people hold one soft body over a network that loses packets.
+//!
+//! One process, three apps on three threads: a host that steps the body, you, and a scripted second user. They are joined by real QUIC on
+//! loopback; between each guest and the host lies one of the paper's networks (`--network 1..4`), emulated packet by packet.
+//!
+//! What to learn here: how a body is shared (`host.rs`, ten lines), how a guest sees and holds it (`guest.rs`), and what loss does to what you see
+//! and feel: the blue ghost is the host's newest truth.
+//!
+//! ```sh
+//! cargo run --release --example shared_body
+//! cargo run --release --example shared_body -- --headless --seconds 10 --rerun out.rrd
+//! ```
+
+mod guest;
+mod hand;
+mod host;
+mod meter;
+mod options;
+mod table;
+mod view;
+
+use std::{
+    error::Error,
+    path::Path,
+    process::ExitCode,
+    sync::{
+        Arc,
+        atomic::{AtomicBool, Ordering},
+    },
+    thread,
+};
+
+use bevy::math::DVec3;
+use clap::Parser;
+use pliant::{
+    body::Integration,
+    modal::ModalModel,
+    net::{Emulation, HostConfig, Invite, JoinConfig, JoinOptions, NetPlugin},
+    rerun::RerunPlugin,
+    stream::{RecoveryConfig, emulator::Preset},
+};
+
+use guest::{Guest, GuestReport};
+use hand::ScriptedHand;
+use meter::Truth;
+use options::{Options, Recovery};
+
+/// Ticks a second, as in the paper.
+const RATE: f64 = 40.0;
+
+/// The body's name in the session.
+const BODY: &str = "pip";
+
+/// Where the baked bodies are, from the crate that owns this example.
+const ASSETS: &str = concat!(env!("CARGO_MANIFEST_DIR"), "/../../assets");
+
+fn main() -> ExitCode {
+    let options = Options::parse();
+    match run(&options) {
+        Ok(()) => ExitCode::SUCCESS,
+        Err(error) => {
+            eprintln!("shared_body: {error}");
+            ExitCode::from(2)
+        }
+    }
+}
+
+fn run(options: &Options) -> Result<(), Box<dyn Error>> {
+    let mut options = options.clone();
+    if !options.headless && !display() {
+        println!("No display is to be found: running --headless, with a scripted hand in your place.");
+        options.headless = true;
+    }
+    if options.headless && options.screenshot.is_some() {
+        return Err("a screenshot needs a window, and there is none without a display".into());
+    }
+    let path = Path::new(ASSETS).join(&options.body);
+    let model = Arc::new(ModalModel::read(path)?);
+
+    let hosting = NetPlugin::host(HostConfig::default())?;
+    let invite = hosting.invite().cloned().ok_or("the host has no invite")?;
+    let truth = Truth::default();
+    let shared = host::Shared::default();
+    let host_thread = {
+        let (model, truth, shared) = (model.clone(), truth.clone(), shared.clone());
+        // Streamed accelerations are read by Newmark's formulas, so the body is stepped by a method that obeys them; a stream of reactions has no such wish.
+        let integrator = match options.recovery {
+            Recovery::Default => Integration::Exact,
+            Recovery::Paper | Recovery::None => Integration::GeneralizedAlpha { rho_inf: 0.5 },
+        };
+        thread::Builder::new()
+            .name("host".into())
+            .spawn(move || host::run(model, integrator, hosting, truth, shared))?
+    };
+
+    let stop_other = Arc::new(AtomicBool::new(false));
+    let other = Guest {
+        title: String::new(),
+        hand: Some(ScriptedHand {
+            toward: DVec3::new(-1.0, 0.55, 0.0),
+            pull: DVec3::new(-0.17, 0.08, 0.07),
+            wait: 0.0,
+        }),
+        rerun: None,
+        duration: None,
+        screenshot: None,
+        stop: stop_other.clone(),
+        ..guest(&options, "other", 2, &model, &invite, &truth)?
+    };
+    let other_thread =
+        thread::Builder::new().name("other".into()).spawn(move || guest::run_headless(other))?;
+
+    let scripted = options.headless || options.screenshot.is_some();
+    let you = Guest {
+        title: format!("network {} of the paper's", options.network),
+        hand: scripted.then_some(ScriptedHand {
+            toward: DVec3::new(1.0, 0.55, 0.0),
+            pull: DVec3::new(0.18, 0.06, 0.13),
+            wait: 0.7,
+        }),
+        rerun: recorder(&options)?,
+        duration: options.duration(),
+        screenshot: options.screenshot.clone(),
+        ..guest(&options, "you", 1, &model, &invite, &truth)?
+    };
+    let yours = if options.headless { guest::run_headless(you) } else { guest::run_windowed(you) };
+
+    let hosted = shared.snapshot();
+    stop_other.store(true, Ordering::Relaxed);
+    let others = other_thread.join().map_err(|_| "the other guest's thread stopped")?;
+    shared.stop.store(true, Ordering::Relaxed);
+    host_thread.join().map_err(|_| "the host's thread stopped")?;
+
+    table::print(&options, &hosted, &yours, &others);
+    match failure(&yours, &others) {
+        Some(why) => Err(why.into()),
+        None => Ok(()),
+    }
+}
+
+/// A guest with its own link to the host.
+fn guest(
+    options: &Options,
+    name: &str,
+    number: u64,
+    model: &Arc<ModalModel>,
+    invite: &Invite,
+    truth: &Truth,
+) -> Result<Guest, Box<dyn Error>> {
+    let network =
+        [Preset::Paper1, Preset::Paper2, Preset::Paper3, Preset::Paper4][usize::from(options.network - 1)];
+    let seed = options.seed.wrapping_mul(1_000).wrapping_add(number);
+    let config = JoinConfig {
+        name: name.into(),
+        transport: JoinOptions {
+            emulation: Some(Emulation::preset(network, seed)),
+            ..JoinOptions::default()
+        },
+        recovery: RecoveryConfig::by_name(options.recovery.name()).ok_or("no such recovery")?,
+        models: vec![model.clone()],
+        ..JoinConfig::default()
+    };
+    Ok(Guest {
+        title: String::new(),
+        net: NetPlugin::join(invite, config)?,
+        truth: truth.clone(),
+        hand: None,
+        rerun: None,
+        duration: None,
+        screenshot: None,
+        stop: Arc::default(),
+    })
+}
+
+fn recorder(options: &Options) -> Result<Option<RerunPlugin>, Box<dyn Error>> {
+    Ok(match options.rerun.as_deref() {
+        None => None,
+        Some("viewer") => Some(RerunPlugin::viewer()),
+        Some(file) => Some(RerunPlugin::file(file)),
+    })
+}
+
+fn failure(yours: &GuestReport, others: &GuestReport) -> Option<String> {
+    let of = |who: &str, report: &GuestReport| report.failure.as_ref().map(|why| format!("{who}: {why}"));
+    of("your session", yours).or_else(|| {
+        // The other guest is ended by us: its goodbye is no failure, a body that never came is.
+        (others.meter.ticks == 0)
+            .then(|| of("the other session", others).unwrap_or("the other never saw the body".into()))
+    })
+}
+
+/// Is there anything to open a window on?
+fn display() -> bool {
+    if cfg!(any(target_os = "windows", target_os = "macos")) {
+        return true;
+    }
+    let set = |name| std::env::var_os(name).is_some_and(|value| !value.is_empty());
+    set("DISPLAY") || (cfg!(feature = "wayland") && set("WAYLAND_DISPLAY"))
+}

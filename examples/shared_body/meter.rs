@@ -1,0 +1,99 @@
+//! How far what a guest shows is from what the host computed for the same tick. Only a demo in one process can know this.
+
+use std::{
+    collections::VecDeque,
+    sync::{Arc, Mutex, PoisonError},
+};
+
+use bevy::prelude::Resource;
+use pliant::modal::ModalModel;
+
+/// States of the host, by tick, for the last few seconds: written by the host's app, read by the guests'.
+#[derive(Resource, Clone, Default)]
+pub struct Truth(Arc<Mutex<VecDeque<(u64, Arc<[f64]>)>>>);
+
+impl Truth {
+    /// Ticks that are kept: 15 s at 40 Hz, many round trips.
+    const KEPT: usize = 600;
+
+    pub fn push(&self, tick: u64, q: &[f64]) {
+        let mut states = self.0.lock().unwrap_or_else(PoisonError::into_inner);
+        states.push_back((tick, q.into()));
+        while states.len() > Self::KEPT {
+            states.pop_front();
+        }
+    }
+
+    pub fn at(&self, tick: u64) -> Option<Arc<[f64]>> {
+        let states = self.0.lock().unwrap_or_else(PoisonError::into_inner);
+        let first = states.front()?.0;
+        let index = usize::try_from(tick.checked_sub(first)?).ok()?;
+        states.get(index).filter(|(t, _)| *t == tick).map(|(_, q)| q.clone())
+    }
+
+    pub fn newest(&self) -> Option<(u64, Arc<[f64]>)> {
+        self.0.lock().unwrap_or_else(PoisonError::into_inner).back().cloned()
+    }
+}
+
+/// The shown error of one guest so far.
+#[derive(Resource, Default, Clone)]
+pub struct Meter {
+    last_tick: u64,
+    /// Ticks compared.
+    pub ticks: u64,
+    /// Sum over ticks of the mean squared error of the surface, m^2.
+    sum: f64,
+    /// Largest error of any vertex in any tick, m.
+    pub max: f64,
+    /// Error of the newest tick, root mean square over the surface, m.
+    pub now: f64,
+    /// Largest true displacement of any vertex in any tick, m: what percentages are of.
+    pub largest: f64,
+    /// Largest reaction that this guest's own hand felt, N.
+    pub reaction: f64,
+    shown: Vec<[f32; 3]>,
+    truth: Vec<[f32; 3]>,
+}
+
+impl Meter {
+    /// Compares the shape shown for `tick` with the host's shape of the same tick. Each tick counts once.
+    pub fn compare(&mut self, model: &ModalModel, tick: u64, shown: &[f64], truth: &Truth) {
+        if tick <= self.last_tick {
+            return;
+        }
+        let Some(true_q) = truth.at(tick) else { return };
+        self.last_tick = tick;
+        let rest = model.surface().positions();
+        let single = |q: &[f64]| q.iter().map(|x| *x as f32).collect::<Vec<f32>>();
+        self.shown.resize(rest.len(), [0.0; 3]);
+        self.truth.resize(rest.len(), [0.0; 3]);
+        model.basis().reconstruct(&single(shown), true, &mut self.shown);
+        model.basis().reconstruct(&single(&true_q), true, &mut self.truth);
+        let distance2 =
+            |a: &[f32; 3], b: &[f32; 3]| (0..3).map(|k| f64::from(a[k] - b[k]).powi(2)).sum::<f64>();
+        let (mut sum, mut worst, mut moved) = (0.0, 0.0f64, 0.0f64);
+        for ((shown, truth), rest) in self.shown.iter().zip(&self.truth).zip(rest) {
+            let error = distance2(shown, truth);
+            sum += error;
+            worst = worst.max(error);
+            moved = moved.max(distance2(truth, rest));
+        }
+        let mean = sum / rest.len().max(1) as f64;
+        self.ticks += 1;
+        self.sum += mean;
+        self.now = mean.sqrt();
+        self.max = self.max.max(worst.sqrt());
+        self.largest = self.largest.max(moved.sqrt());
+    }
+
+    /// Root mean square over ticks and surface, m.
+    pub fn rms(&self) -> f64 {
+        (self.sum / self.ticks.max(1) as f64).sqrt()
+    }
+
+    /// A length as a percentage of the largest true displacement.
+    pub fn percent(&self, length: f64) -> f64 {
+        if self.largest > 0.0 { 100.0 * length / self.largest } else { 0.0 }
+    }
+}
