@@ -26,7 +26,7 @@ pub struct NetPlugin {
 
 enum Start {
     Host(Box<HostConfig>, Endpoint),
-    Join(JoinConfig, Endpoint),
+    Join(Box<JoinConfig>, Endpoint),
 }
 
 /// The plugin's systems.
@@ -58,7 +58,7 @@ impl NetPlugin {
     /// [`TransportError`] when the socket or the keys cannot be set up.
     pub fn join(invite: &Invite, mut config: JoinConfig) -> Result<Self, TransportError> {
         let endpoint = Endpoint::join(invite, std::mem::take(&mut config.transport))?;
-        Ok(Self::new(Start::Join(config, endpoint), None))
+        Ok(Self::new(Start::Join(Box::new(config), endpoint), None))
     }
 
     fn new(start: Start, invite: Option<Invite>) -> Self {
@@ -116,7 +116,7 @@ impl Plugin for NetPlugin {
                 let mut start = Some((config, endpoint));
                 let begin = move |world: &mut World| {
                     let Some((config, endpoint)) = start.take() else { return };
-                    world.insert_resource(NetGuest::new(config, endpoint));
+                    world.insert_resource(NetGuest::new(*config, endpoint));
                 };
                 app.add_systems(PreStartup, begin)
                     .add_systems(PreUpdate, guest::receive.in_set(NetSystems::Receive))
