@@ -22,7 +22,7 @@ const KEPT: usize = 4096;
 /// Surface vertices at which shapes are compared.
 const SAMPLES: usize = 48;
 /// Shown error above which a body counts as not recovered, share of the largest displacement.
-const RECOVERED: f64 = 0.005;
+pub(crate) const RECOVERED: f64 = 0.005;
 
 /// What to measure.
 #[derive(Debug, Clone)]
@@ -247,17 +247,58 @@ impl Experiment {
     }
 }
 
-const BODY: BodyId = BodyId(1);
+pub(crate) const BODY: BodyId = BodyId(1);
 
 fn model_error(e: impl std::fmt::Display) -> StreamError {
     StreamError::Model(e.to_string())
 }
 
-fn fold(mut hash: u64, bytes: &[u8]) -> u64 {
+pub(crate) fn fold(mut hash: u64, bytes: &[u8]) -> u64 {
     for b in bytes {
         hash = (hash ^ u64::from(*b)).wrapping_mul(0x0000_0100_0000_01B3);
     }
     hash
+}
+
+/// Compares shapes at some surface vertices, evenly chosen; unwarped, so that the same difference of coordinates counts
+/// the same in every shape.
+pub(crate) struct ShapeError {
+    rows: Vec<Vec<[f64; 3]>>,
+}
+
+impl ShapeError {
+    pub(crate) fn new(model: &ModalModel) -> Self {
+        let vertices = model.surface().positions().len();
+        let row = |v: usize, mode: usize| -> [f64; 3] {
+            std::array::from_fn(|a| f64::from(model.displacement_row(v as u32, a, mode)))
+        };
+        let modes = model.mode_count();
+        let step = (vertices / SAMPLES).max(1);
+        Self { rows: (0..vertices).step_by(step).map(|v| (0..modes).map(|m| row(v, m)).collect()).collect() }
+    }
+
+    /// How many places there are.
+    pub(crate) fn places(&self) -> f64 {
+        self.rows.len().max(1) as f64
+    }
+
+    /// Squared differences at the places, m^2: sum and largest. Missing coordinates count as 0.
+    pub(crate) fn compare(&self, a: &[f64], b: &[f64]) -> (f64, f64) {
+        let (mut sum, mut largest) = (0.0, 0.0_f64);
+        for rows in &self.rows {
+            let mut u = [0.0; 3];
+            for (k, row) in rows.iter().enumerate() {
+                let d = a.get(k).copied().unwrap_or(0.0) - b.get(k).copied().unwrap_or(0.0);
+                for x in 0..3 {
+                    u[x] += row[x] * d;
+                }
+            }
+            let s = u.iter().map(|x| x * x).sum::<f64>();
+            sum += s;
+            largest = largest.max(s);
+        }
+        (sum, largest)
+    }
 }
 
 struct Held {
@@ -278,7 +319,7 @@ struct Run {
     h: f64,
     hands: Vec<Held>,
     truth: VecDeque<Truth>,
-    samples: Vec<Vec<[f64; 3]>>,
+    shape: ShapeError,
     track_row: Vec<f64>,
     keep_track: bool,
     own_hand_first: bool,
@@ -306,26 +347,18 @@ struct Run {
 impl Run {
     fn new(experiment: &Experiment, body: Body, h: f64) -> Self {
         let model = &experiment.model;
-        let vertices = model.surface().positions().len();
         let modes = model.mode_count();
-        let row = |v: u32, mode: usize| -> [f64; 3] {
-            std::array::from_fn(|a| f64::from(model.displacement_row(v, a, mode)))
-        };
-        let step = (vertices / SAMPLES).max(1);
-        let samples = (0..vertices)
-            .step_by(step)
-            .map(|v| (0..modes).map(|mode| row(v as u32, mode)).collect())
-            .collect();
+        let shape = ShapeError::new(model);
         let track_row = experiment.hands.first().map_or(Vec::new(), |hand| {
             let axis = (0..3).max_by(|a, b| hand.reach[*a].total_cmp(&hand.reach[*b])).unwrap_or(0);
-            (0..modes).map(|mode| row(hand.vertex, mode)[axis]).collect()
+            (0..modes).map(|mode| f64::from(model.displacement_row(hand.vertex, axis, mode))).collect()
         });
         Self {
             body,
             h,
             hands: experiment.hands.iter().map(|h| Held { hand: *h, grab: None }).collect(),
             truth: VecDeque::with_capacity(KEPT),
-            samples,
+            shape,
             track_row,
             keep_track: experiment.keep_track,
             own_hand_first: matches!(experiment.recovery.policy, Policy::ForceDriven { .. }),
@@ -355,28 +388,10 @@ impl Run {
         self.measuring = Some(now);
     }
 
-    /// Squared differences at the sampled places: (sum, largest).
-    fn compare(&self, a: &[f64], b: &[f64]) -> (f64, f64) {
-        let (mut sum, mut largest) = (0.0, 0.0_f64);
-        for rows in &self.samples {
-            let mut u = [0.0; 3];
-            for (k, row) in rows.iter().enumerate() {
-                let d = a.get(k).copied().unwrap_or(0.0) - b.get(k).copied().unwrap_or(0.0);
-                for x in 0..3 {
-                    u[x] += row[x] * d;
-                }
-            }
-            let s = u.iter().map(|x| x * x).sum::<f64>();
-            sum += s;
-            largest = largest.max(s);
-        }
-        (sum, largest)
-    }
-
     fn figures(&self, session: &GuestSession) -> Figures {
         let percent = |x: f64, scale: f64| if scale > 0.0 { 100.0 * x / scale } else { 0.0 };
         let counts = session.body(BODY).map(|b| b.counts()).unwrap_or_default();
-        let places = self.samples.len().max(1) as f64;
+        let places = self.shape.places();
         let ticks = self.count.max(1) as f64;
         let ratio = |a: f64, b: f64| if b > 0.0 { a / b } else { 0.0 };
         // The longest spell of shown error above the threshold.
@@ -487,7 +502,7 @@ impl World for Run {
             self.truth.pop_front();
         }
         if self.measuring.is_some() {
-            let (_, largest) = self.compare(self.body.q(), &[]);
+            let (_, largest) = self.shape.compare(self.body.q(), &[]);
             self.scale = self.scale.max(largest.sqrt());
             for g in &grabs {
                 self.force_scale = self.force_scale.max(norm(g.reaction));
@@ -514,8 +529,8 @@ impl World for Run {
         let Some(first) = self.truth.front().map(|t| t.tick) else { return };
         let Some(truth) = tick.checked_sub(first).and_then(|i| self.truth.get(i as usize)) else { return };
         let modes = shown.q.len();
-        let (sum, largest) = self.compare(&shown.q, &truth.q[..modes]);
-        let (_, hidden_largest) = self.compare(&hidden.q, &truth.q[..modes]);
+        let (sum, largest) = self.shape.compare(&shown.q, &truth.q[..modes]);
+        let (_, hidden_largest) = self.shape.compare(&hidden.q, &truth.q[..modes]);
         let at = truth.at;
         let (mut force, mut forces) = (0.0, 0);
         self.shown_force.resize(view.grabs().len().max(self.shown_force.len()), ([0.0; 3], [0.0; 3]));
@@ -555,6 +570,6 @@ impl World for Run {
     }
 }
 
-fn norm(v: [f64; 3]) -> f64 {
+pub(crate) fn norm(v: [f64; 3]) -> f64 {
     v.iter().map(|x| x * x).sum::<f64>().sqrt()
 }

@@ -26,6 +26,7 @@ pub mod emulator;
 pub mod encoder;
 mod error;
 pub mod experiment;
+mod experiment_peers;
 pub mod newmark;
 pub mod pair;
 mod patch_rows;

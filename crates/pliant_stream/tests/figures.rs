@@ -23,6 +23,8 @@ fn run(lost: &[u64], mut recovery: RecoveryConfig) -> Figures {
     e.newmark = Newmark::average(0.025);
     e.resend_after = Duration::from_secs_f64(50.0 * 0.025);
     (e.seconds, e.keep_track) = (18.5, true);
+    // The paper's hands do not tremble.
+    e.hands.iter_mut().for_each(|h| h.tremor = 0.0);
     e.run().unwrap()
 }
 

@@ -12,6 +12,7 @@ use std::time::{Duration, Instant};
 use pliant_modal::{Integrator, ModalModel};
 use pliant_stream::emulator::{LinkConfig, Loss, Preset};
 use pliant_stream::experiment::{Experiment, Figures};
+use pliant_stream::peer::Repair;
 use pliant_stream::wire::AccelerationCoding;
 use pliant_stream::{Newmark, Predict, RecoveryConfig};
 use support::bar;
@@ -45,6 +46,13 @@ fn run(link: &LinkConfig, policy: &str, seconds: f64, seed: u64) -> Figures {
     (e.seconds, e.seed) = (seconds, seed);
     e.cpu_clock = Some(clock);
     e.run().unwrap()
+}
+
+fn run_peers(link: &LinkConfig, repair: Repair, seconds: f64) -> Figures {
+    let mut e = Experiment::new(body(), link.clone(), RecoveryConfig::default());
+    e.seconds = seconds;
+    e.cpu_clock = Some(clock);
+    e.run_peers(repair).unwrap()
 }
 
 fn clock() -> Duration {
@@ -111,6 +119,16 @@ fn burst_is_recovered_within_200_ms_of_the_first_arrival() {
     // Twelve ticks are lost; one of playout and three of repeats make nine or fewer of guessing.
     let after = (last - first) as f64 * 25.0 - 12.0 * 25.0;
     assert!(after <= 200.0, "{after} ms after the first arrival: ticks {first} to {last}");
+}
+
+#[test]
+fn peers_see_one_shape_over_the_papers_worst_network() {
+    let link = LinkConfig::preset(Preset::Paper1);
+    let f = run_peers(&link, Repair::Rollback, 30.0);
+    show("p2p rollback", &f);
+    assert!(f.ticks > 1100, "{}", f.ticks);
+    assert!(f.rms_percent < 2.0 && f.end_percent < 10.0, "rms {} %, end {} %", f.rms_percent, f.end_percent);
+    assert_eq!(f.hash, run_peers(&link, Repair::Rollback, 30.0).hash, "same seed, same session");
 }
 
 #[test]
@@ -201,6 +219,9 @@ fn all_policies_side_by_side() {
         println!("== {network}");
         for policy in RecoveryConfig::NAMES {
             show(policy, &run(&link, policy, 60.0, 1));
+        }
+        for (name, repair) in [("p2p rollback", Repair::Rollback), ("p2p compensated", Repair::Compensate)] {
+            show(name, &run_peers(&link, repair, 60.0));
         }
     }
 }

@@ -9,10 +9,12 @@
 //! Anchored bodies only: the rigid frame of a free one is not stepped here.
 
 mod body;
+mod config;
 mod inputs;
 mod session;
 mod wire;
 
 pub use body::{PeerBody, Repair};
-pub use session::{PeerConfig, PeerEvent, PeerSession};
+pub use config::{PeerConfig, PeerEvent};
+pub use session::PeerSession;
 pub use wire::{HeldAt, InputTick, PeerBodyState, PeerDatagram, PeerMessage, StateCheck};

@@ -21,7 +21,7 @@ pub struct HostConfig {
     pub model_rate: f64,
     /// Answer a NACK only so much later: for remaking the paper's figures. Default: at once.
     pub resend_after: Duration,
-    /// Take in everybody who says hello; else [`HostEvent::Knock`] asks and [`HostSession::accept`] answers. Default: true.
+    /// Take in everybody who says hello; else [`HostEvent::Knock`] asks and [`crate::HostSession::accept`] answers. Default: true.
     pub open: bool,
 }
 
@@ -42,7 +42,7 @@ impl Default for HostConfig {
 #[derive(Debug, Clone, PartialEq)]
 #[non_exhaustive]
 pub enum HostEvent {
-    /// Somebody asks to come in; answer with [`HostSession::accept`] or [`HostSession::refuse`]. Not with `open`.
+    /// Somebody asks to come in; answer with [`crate::HostSession::accept`] or [`crate::HostSession::refuse`]. Not with `open`.
     Knock {
         /// Who.
         peer: PeerId,
@@ -71,7 +71,7 @@ pub enum HostEvent {
         /// Why.
         reason: EndReason,
     },
-    /// A hand takes hold: the application grabs its body, or says [`HostSession::refuse_grab`].
+    /// A hand takes hold: the application grabs its body, or says [`crate::HostSession::refuse_grab`].
     GrabBegan {
         /// Whose and which.
         key: GrabKey,
