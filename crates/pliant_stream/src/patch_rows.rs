@@ -1,7 +1,7 @@
 //! One patch of a body as the receiver's step needs it: rows over the modes, kept axis by axis so that loops vectorise.
 
 use nalgebra::{Matrix3, Vector3};
-use pliant_modal::{Body, BodyConfig, GrabConfig, ModalModel, Patch, warp_jacobian};
+use pliant_modal::{Body, BodyConfig, GrabConfig, ModalModel, Patch, warp, warp_jacobian};
 use std::sync::Arc;
 
 use crate::StreamError;
@@ -79,10 +79,16 @@ impl PatchRows {
         Ok(Self { displacement, rotation, rows, at: Vector3::zeros(), rest, compliance })
     }
 
-    /// Takes displacement and rows at `q`.
-    pub(crate) fn linearise(&mut self, q: &[f64], warp: bool) {
+    /// The patch's displacement at `q`, body axes, m.
+    pub(crate) fn displaced(&self, q: &[f64], warped: bool) -> Vector3<f64> {
         let d = dot(&self.displacement, q);
-        if !warp {
+        if warped { warp(dot(&self.rotation, q).into(), d.into()).into() } else { d }
+    }
+
+    /// Takes displacement and rows at `q`.
+    pub(crate) fn linearise(&mut self, q: &[f64], warped: bool) {
+        let d = dot(&self.displacement, q);
+        if !warped {
             self.at = d;
             return;
         }

@@ -59,6 +59,8 @@ pub struct ForceStepper {
     free: [Vec<f64>; 3],
     trial: Vec<f64>,
     ahead: Vec<f64>,
+    gap: Vec<f64>,
+    matrix: Vec<f64>,
     scaled: Rows,
 }
 
@@ -86,6 +88,8 @@ impl ForceStepper {
             free: std::array::from_fn(|_| vec![0.0; modes]),
             trial: vec![0.0; modes],
             ahead: Vec::new(),
+            gap: Vec::new(),
+            matrix: Vec::new(),
             scaled: std::array::from_fn(|_| vec![0.0; modes]),
         })
     }
@@ -243,8 +247,11 @@ impl ForceStepper {
                 .zip(from)
                 .map(|(((free, c), f), from)| free + c.response[0] * f - from),
         );
-        let mut gap = nalgebra::DVector::<f64>::zeros(n);
-        let mut matrix = nalgebra::DMatrix::<f64>::zeros(n, n);
+        let (mut gap, mut matrix) = (std::mem::take(&mut self.gap), std::mem::take(&mut self.matrix));
+        gap.clear();
+        gap.resize(n, 0.0);
+        matrix.clear();
+        matrix.resize(n * n, 0.0);
         for (i, h) in holds.iter().enumerate() {
             let Some(a) = self.patches.get(&key(h.vertex, h.radius)) else { continue };
             let reached = a.at + dot(&a.rows, &ahead);
@@ -261,8 +268,7 @@ impl ForceStepper {
                 for (y, column) in columns.iter().enumerate() {
                     for x in 0..3 {
                         let soft = if i == j { softness[(x, y)] } else { 0.0 };
-                        matrix[(3 * i + x, 3 * j + y)] = column[x] + soft;
-                        matrix[(3 * j + y, 3 * i + x)] = column[x] + soft;
+                        matrix[(3 * i + x) * n + 3 * j + y] = column[x] + soft;
                     }
                 }
             }
@@ -271,8 +277,10 @@ impl ForceStepper {
             }
         }
         self.ahead = ahead;
-        let Some(cholesky) = matrix.cholesky() else { return };
-        let pulls = cholesky.solve(&gap);
+        // A patch without any compliance in some direction gets no correction there.
+        let solved = solve_lower(&mut matrix, &mut gap);
+        let pulls = &gap;
+        let holds = if solved { holds } else { &mut [] };
         for (i, h) in holds.iter_mut().enumerate() {
             let more = Vector3::new(pulls[3 * i], pulls[3 * i + 1], pulls[3 * i + 2]);
             if let Some(patch) = self.patches.get(&key(h.vertex, h.radius)) {
@@ -280,15 +288,14 @@ impl ForceStepper {
                 h.pull += more;
             }
         }
+        self.gap = gap;
+        self.matrix = matrix;
     }
 
     /// Where a patch is at `q`, as displacement from rest in body axes, m; zero for a vertex that the model has not got.
     pub fn displacement(&mut self, q: &[f64], vertex: u32, radius: f64) -> [f64; 3] {
         let warp = self.warp;
-        self.patch(vertex, radius).map_or([0.0; 3], |p| {
-            p.linearise(q, warp);
-            p.at.into()
-        })
+        self.patch(vertex, radius).map_or([0.0; 3], |p| p.displaced(q, warp).into())
     }
 
     /// The modal force per mode that a step from the true state `from` lacks to reach the true state `to`: by least
@@ -391,6 +398,34 @@ impl Hold {
     }
 }
 
+/// Solves `M x = b` for a symmetric positive definite `M`, given by its lower triangle row by row, in place. False when it
+/// is not positive definite.
+fn solve_lower(m: &mut [f64], x: &mut [f64]) -> bool {
+    let n = x.len();
+    for j in 0..n {
+        let (above, rest) = m.split_at_mut(j * n);
+        let row = &mut rest[..n];
+        for k in 0..j {
+            let other = &above[k * n..k * n + k];
+            let sum: f64 = row[..k].iter().zip(other).map(|(a, b)| a * b).sum();
+            row[k] = (row[k] - sum) / above[k * n + k];
+        }
+        let square: f64 = row[..j].iter().map(|a| a * a).sum();
+        let pivot = row[j] - square;
+        if pivot.is_nan() || pivot <= 0.0 {
+            return false;
+        }
+        row[j] = pivot.sqrt();
+        let sum: f64 = row[..j].iter().zip(x.iter()).map(|(a, b)| a * b).sum();
+        x[j] = (x[j] - sum) / row[j];
+    }
+    for j in (0..n).rev() {
+        let sum: f64 = (j + 1..n).map(|k| m[k * n + j] * x[k]).sum();
+        x[j] = (x[j] - sum) / m[j * n + j];
+    }
+    true
+}
+
 fn key(vertex: u32, radius: f64) -> (u32, u64) {
     (vertex, radius.to_bits())
 }
@@ -399,4 +434,23 @@ fn key(vertex: u32, radius: f64) -> (u32, u64) {
 pub(crate) fn inverse_rotation([x, y, z, w]: [f64; 4]) -> Matrix3<f64> {
     UnitQuaternion::try_new(Quaternion::new(w, x, y, z), 1e-12)
         .map_or_else(Matrix3::identity, |q| *q.inverse().to_rotation_matrix().matrix())
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn solves_positive_definite_systems_and_says_when_not() {
+        // M = [[4, 2, 0], [2, 5, 3], [0, 3, 6]], x = (1, -2, 3): M x = (0, 1, 12).
+        let mut m = [4.0, 0.0, 0.0, 2.0, 5.0, 0.0, 0.0, 3.0, 6.0];
+        let mut x = [0.0, 1.0, 12.0];
+        assert!(solve_lower(&mut m, &mut x));
+        for (got, want) in x.iter().zip([1.0, -2.0, 3.0]) {
+            assert!((got - want).abs() < 1e-14, "{x:?}");
+        }
+        assert!(!solve_lower(&mut [1.0, 0.0, 2.0, 1.0], &mut [1.0, 1.0]), "indefinite");
+        assert!(!solve_lower(&mut [f64::NAN], &mut [1.0]));
+        assert!(solve_lower(&mut [], &mut []));
+    }
 }

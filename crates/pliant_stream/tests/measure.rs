@@ -225,3 +225,81 @@ fn all_policies_side_by_side() {
         }
     }
 }
+
+/// What one body costs a tick at 120 modes and two hands: the host's encoder, and a guest's reading, correcting and
+/// stepping. Run with `--release`.
+#[test]
+#[ignore = "a timing: means something with --release only"]
+fn cost_of_a_tick() {
+    use pliant_modal::{Body, BodyConfig, GrabConfig, Patch};
+    use pliant_stream::encoder::Encoder;
+    use pliant_stream::recovery::Receiver;
+    use pliant_stream::wire::Datagram;
+    use pliant_stream::{BodyId, BodySetup, GrabKey, GrabState, TickState, UserId};
+    let model = body();
+    let h = 0.025;
+    let newmark = Newmark { h, beta: 4.0 / 9.0, gamma: 5.0 / 6.0 };
+    for policy in ["default", "paper"] {
+        let recovery = RecoveryConfig::by_name(policy).unwrap();
+        let mut truth = Body::new(model.clone(), BodyConfig { step: h, ..Default::default() }).unwrap();
+        let hands = Experiment::default_hands(&model);
+        let held: Vec<_> = hands
+            .iter()
+            .map(|x| {
+                let patch = Patch::around(model.surface(), x.vertex, x.radius).unwrap();
+                let id = truth.grab(&patch, GrabConfig::default()).unwrap();
+                (id, truth.grab_position(id).unwrap())
+            })
+            .collect();
+        let (id, setup) = (BodyId(1), BodySetup::default());
+        let mut encoder =
+            Encoder::new(id, model.clone(), &setup, newmark, recovery.wish(None), 1200).unwrap();
+        let mut receiver: Option<Receiver> = None;
+        let (mut encode, mut decode) = (Vec::new(), Vec::new());
+        for tick in 1..=2000_u64 {
+            let t = tick as f64 * h;
+            for ((id, start), hand) in held.iter().zip(&hands) {
+                let d = hand.path(t);
+                truth.set_target(*id, std::array::from_fn(|k| start[k] + d[k])).unwrap();
+            }
+            truth.step().unwrap();
+            let grabs: Vec<GrabState> = held
+                .iter()
+                .zip(&hands)
+                .enumerate()
+                .map(|(k, ((id, _), hand))| GrabState {
+                    key: GrabKey { user: UserId(k as u16), grab: 0 },
+                    vertex: hand.vertex,
+                    radius: hand.radius,
+                    target: truth.target(*id).unwrap(),
+                    reaction: truth.reaction(*id).unwrap(),
+                })
+                .collect();
+            let (q, v, a) = (truth.q(), truth.v(), truth.a());
+            let state = TickState { tick, q, v, a, pose: None, grabs: &grabs, resting: false };
+            if receiver.is_none() {
+                encoder.restart(&state);
+                let snapshot = encoder.snapshot(false);
+                let modes = encoder.modes();
+                receiver = Some(Receiver::new(model.clone(), setup, modes, newmark, &recovery, &snapshot).unwrap());
+                continue;
+            }
+            let receiver = receiver.as_mut().unwrap();
+            let began = Instant::now();
+            let body = encoder.encode(&state);
+            encode.push(began.elapsed());
+            let mut bytes = vec![1, 0, 0];
+            bytes.extend_from_slice(&body);
+            let began = Instant::now();
+            let Datagram::Frame(frame) = Datagram::decode(&bytes).unwrap().1 else { unreachable!() };
+            receiver.accept(&frame);
+            receiver.advance();
+            decode.push(began.elapsed());
+        }
+        let median = |times: &mut Vec<Duration>| {
+            times.sort_unstable();
+            times[times.len() / 2].as_secs_f64() * 1e6
+        };
+        println!("{policy}: encode {:.1} us, decode and step {:.1} us a tick", median(&mut encode), median(&mut decode));
+    }
+}
