@@ -9,25 +9,27 @@ use rayon::prelude::*;
 /// Rows per parallel task.
 const CHUNK: usize = 768;
 
-/// A read-only view of the first columns of a tall block.
+/// A read-only view of some columns of a tall block.
 #[derive(Clone, Copy, Debug)]
 pub(crate) struct Tall<'a> {
     pub(crate) data: &'a [f64],
     pub(crate) stride: usize,
+    /// First column.
+    pub(crate) from: usize,
     pub(crate) columns: usize,
 }
 
 impl<'a> Tall<'a> {
     /// A block whose rows follow one another without gaps.
     pub(crate) fn new(data: &'a [f64], columns: usize) -> Self {
-        Self { data, stride: columns, columns }
+        Self { data, stride: columns, from: 0, columns }
     }
 
     fn chunk(&self, index: usize) -> MatRef<'a, f64> {
         let rows = self.data.len() / self.stride;
         let (start, end) = (index * CHUNK, rows.min((index + 1) * CHUNK));
         let data = &self.data[start * self.stride..end * self.stride];
-        MatRef::from_row_major_slice(data, end - start, self.stride).subcols(0, self.columns)
+        MatRef::from_row_major_slice(data, end - start, self.stride).subcols(self.from, self.columns)
     }
 }
 
