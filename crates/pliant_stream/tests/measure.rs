@@ -281,7 +281,8 @@ fn cost_of_a_tick() {
                 encoder.restart(&state);
                 let snapshot = encoder.snapshot(false);
                 let modes = encoder.modes();
-                receiver = Some(Receiver::new(model.clone(), setup, modes, newmark, &recovery, &snapshot).unwrap());
+                receiver =
+                    Some(Receiver::new(model.clone(), setup, modes, newmark, &recovery, &snapshot).unwrap());
                 continue;
             }
             let receiver = receiver.as_mut().unwrap();
@@ -300,6 +301,10 @@ fn cost_of_a_tick() {
             times.sort_unstable();
             times[times.len() / 2].as_secs_f64() * 1e6
         };
-        println!("{policy}: encode {:.1} us, decode and step {:.1} us a tick", median(&mut encode), median(&mut decode));
+        println!(
+            "{policy}: encode {:.1} us, decode and step {:.1} us a tick",
+            median(&mut encode),
+            median(&mut decode)
+        );
     }
 }

@@ -584,3 +584,40 @@ fn frames_that_scatter_like_a_picture_rate_are_shown_evenly_and_without_guessing
         assert!(view.shown_delay() < 0.065, "{name}: {} s", view.shown_delay());
     }
 }
+
+#[test]
+fn a_guest_that_may_cost_little_gets_less_of_everything_but_every_tick() {
+    let model = bar(120, 0.05);
+    for (rate, link) in [
+        (50e3, LinkConfig { delay: 20 * MS, ..Default::default() }),
+        // The line itself is narrow, and the rate is not known: the queue tells.
+        (1e6, LinkConfig { delay: 20 * MS, bits_per_second: Some(70e3), ..Default::default() }),
+    ] {
+        let (mut pair, mut scene) = start_with(&model, HostConfig { guest_rate: rate, ..Default::default() });
+        scene.hand = circling();
+        let path = PathConfig {
+            up: LinkConfig { bits_per_second: None, ..link.clone() },
+            ..PathConfig::symmetric(link)
+        };
+        pair.join_with(GuestConfig::default(), path, 5, cached(&model)).unwrap();
+        pair.run_until(20 * S, &mut scene);
+        let before =
+            (pair.host.stats(PeerId(1)).unwrap(), pair.guests[0].session.body(BODY).unwrap().counts());
+        pair.run_until(40 * S, &mut scene);
+        let session = &pair.guests[0].session;
+        let after = (pair.host.stats(PeerId(1)).unwrap(), session.body(BODY).unwrap().counts());
+        let bits = 8.0 * (after.0.bytes_out - before.0.bytes_out) as f64 / 20.0;
+        println!("level {}, {bits:.0} bit/s", after.0.level);
+        assert!(after.0.level >= 1, "cut down");
+        assert!(bits < rate.min(60e3), "{bits} bit/s");
+        let frames = after.0.datagrams_out - before.0.datagrams_out;
+        assert!(frames >= 800, "{frames} datagrams in 800 ticks: none is dropped");
+        assert!(after.0.round_trip < 90 * MS, "no queue stands: {:?}", after.0.round_trip);
+        let error = scene.error(session) / scene.size();
+        assert!(error < 0.03, "{error}");
+        assert_eq!(
+            scene.guest_events.iter().filter(|e| matches!(e.1, GuestEvent::BodyReady { .. })).count(),
+            1
+        );
+    }
+}

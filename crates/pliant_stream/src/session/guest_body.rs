@@ -171,9 +171,12 @@ impl BodyView {
             self.resynced = true;
             return false;
         }
-        self.receiver = None;
+        // Another number of modes: the receiver is made anew.
+        let again = self.receiver.take().is_some();
         self.snapshot = Some(snapshot);
-        self.begin()
+        let ready = self.begin();
+        self.resynced |= again && ready;
+        ready && !again
     }
 
     fn begin(&mut self) -> bool {
@@ -194,7 +197,11 @@ impl BodyView {
             && let Ok(stepper) = ForceStepper::new(model.clone(), &self.info.setup(), modes, self.newmark.h)
         {
             let h = self.newmark.h;
-            self.own = Some(OwnHand::new(stepper, h, blend_ticks));
+            let mut own = OwnHand::new(stepper, h, blend_ticks);
+            if let Some(before) = self.own.take() {
+                own.take_grabs(before);
+            }
+            self.own = Some(own);
         }
         self.receiver = Some(receiver);
         self.snapshot = None;

@@ -65,6 +65,13 @@ impl HostSession {
                 expected: "at least 1 byte a second",
             });
         }
+        if config.guest_rate.is_nan() || config.guest_rate < 1.0 {
+            return Err(StreamError::Config {
+                what: "guest_rate",
+                found: config.guest_rate.to_string(),
+                expected: "at least 1 bit a second",
+            });
+        }
         Ok(Self {
             config,
             peers: BTreeMap::new(),
@@ -359,6 +366,9 @@ impl HostSession {
                 self.drop_peer(id, EndReason::Silent, true);
                 continue;
             }
+            let (bytes, round_trip) = (p.stats.bytes_out, p.stats.round_trip);
+            p.regulator.judge(now, bytes, round_trip, self.config.guest_rate);
+            p.stats.level = p.regulator.level();
             while let Some(t) = p.transfers.front_mut() {
                 let end = (t.offset + CHUNK).min(t.bytes.len());
                 if !p.model_budget.spend(now, (end - t.offset) as f64) {
@@ -470,7 +480,7 @@ impl HostSession {
 
     pub(super) fn send_snapshot(&mut self, peer: PeerId, body: BodyId) {
         let (Some(p), Some(b)) = (self.peers.get_mut(&peer), self.bodies.get(&body)) else { return };
-        let Some(key) = p.wish.map(|w| stream_key(w, b, p.max_datagram)) else { return };
+        let Some(key) = stream_key(p, b) else { return };
         if let Some(encoder) = b.streams.get(&key) {
             p.send_message(&HostMessage::Snapshot(encoder.snapshot(b.resting)), &mut self.out);
         }
@@ -484,7 +494,7 @@ impl HostSession {
             }
             p.resends.pop_front();
             let Some(b) = self.bodies.get(&body) else { continue };
-            let Some(key) = p.wish.map(|w| stream_key(w, b, p.max_datagram)) else { continue };
+            let Some(key) = stream_key(p, b) else { continue };
             if let Some(bytes) = b.streams.get(&key).and_then(|e| e.resend(tick)) {
                 p.send_frame(&bytes, &mut self.out);
             }
@@ -509,7 +519,10 @@ impl HostSession {
     }
 }
 
-pub(super) fn stream_key(mut wish: StreamWish, body: &HostBody, limit: usize) -> StreamKey {
-    wish.modes = Encoder::modes_for(&wish, body.model.mode_count(), limit) as u16;
-    (wish, limit)
+/// The kind of stream that a guest takes of a body: what it wished, less what its path does not bear.
+pub(super) fn stream_key(peer: &Peer, body: &HostBody) -> Option<StreamKey> {
+    let model_modes = body.model.mode_count();
+    let mut wish = peer.regulator.cut(peer.wish?, model_modes);
+    wish.modes = Encoder::modes_for(&wish, model_modes, peer.max_datagram) as u16;
+    Some((wish, peer.max_datagram))
 }

@@ -19,6 +19,9 @@ pub struct HostConfig {
     pub idle_timeout: Duration,
     /// Bytes a second at which models are sent to one guest. Default: 1 MB/s.
     pub model_rate: f64,
+    /// Bits a second of datagrams that one guest may cost. Beyond it, or when a guest's round trip grows by 50 ms over its
+    /// least, the guest gets fewer repeats, then fewer refreshes, then fewer modes; no tick is dropped. Default: 1 Mbit/s.
+    pub guest_rate: f64,
     /// Answer a NACK only so much later: for remaking the paper's figures. Default: at once.
     pub resend_after: Duration,
     /// Take in everybody who says hello; else [`HostEvent::Knock`] asks and [`crate::HostSession::accept`] answers. Default: true.
@@ -32,6 +35,7 @@ impl Default for HostConfig {
             max_guests: 256,
             idle_timeout: Duration::from_secs(10),
             model_rate: 1e6,
+            guest_rate: 1e6,
             resend_after: Duration::ZERO,
             open: true,
         }

@@ -5,6 +5,7 @@ use std::sync::Arc;
 use std::time::Duration;
 
 use super::outbox::{Budget, Tally};
+use super::regulator::Regulator;
 use super::{Channel, EndReason, LinkStats, Output};
 use crate::state::{BodyId, PeerId, Tick, UserId};
 use crate::wire::{Clock, Datagram, HostMessage, Report, StreamWish};
@@ -66,6 +67,7 @@ pub(crate) struct Peer {
     sequence: u16,
     tally: Tally,
     pub(crate) stats: LinkStats,
+    pub(crate) regulator: Regulator,
 }
 
 impl Peer {
@@ -93,6 +95,7 @@ impl Peer {
             sequence: 0,
             tally: Tally::default(),
             stats: LinkStats::default(),
+            regulator: Regulator::default(),
         }
     }
 

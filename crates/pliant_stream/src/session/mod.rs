@@ -24,6 +24,7 @@ mod host_peer;
 mod outbox;
 mod own_hand;
 mod publish;
+mod regulator;
 
 pub use guest::GuestSession;
 pub use guest_body::BodyView;
@@ -119,4 +120,7 @@ pub struct LinkStats {
     pub nacks: u64,
     /// Datagrams that could not be read or made no sense.
     pub rejected: u64,
+    /// Host only: how far this guest's stream is cut down, 0 (not at all) to 6; see
+    /// [`HostConfig::guest_rate`].
+    pub level: u8,
 }

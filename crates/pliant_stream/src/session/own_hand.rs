@@ -101,6 +101,12 @@ impl OwnHand {
         self.active
     }
 
+    /// Goes on with the grabs of another copy.
+    pub(crate) fn take_grabs(&mut self, other: Self) {
+        self.grabs = other.grabs;
+        self.lead = other.lead;
+    }
+
     pub(crate) fn begin(&mut self, grab: u16, vertex: u32, radius: f64, target: [f64; 3]) {
         self.grabs.retain(|g| g.grab != grab);
         self.grabs.push(OwnGrab {

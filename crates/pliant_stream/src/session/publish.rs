@@ -54,7 +54,7 @@ impl HostSession {
         let mut keys: BTreeSet<StreamKey> = BTreeSet::new();
         let mut takers: Vec<(PeerId, StreamKey, bool)> = Vec::new();
         for p in self.peers.values_mut() {
-            let Some(key) = p.wish.map(|w| stream_key(w, entry, p.max_datagram)) else { continue };
+            let Some(key) = stream_key(p, entry) else { continue };
             let due = p.due.contains(&body) && !p.transfers.iter().any(|t| t.hash == entry.hash);
             if p.flowing.contains(&body) || due {
                 keys.insert(key);
