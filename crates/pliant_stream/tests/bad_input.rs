@@ -137,7 +137,7 @@ fn session(name: &str) -> (HostSession, GuestSession, Duration) {
 fn publish(host: &mut HostSession, now: Duration, tick: u64) {
     let q: Vec<f64> = (0..12).map(|k| 0.01 * (0.002 * tick as f64 + k as f64).sin()).collect();
     let v = vec![0.0; 12];
-    let grabs = [grab(1).state];
+    let grabs = [GrabState { reaction: [0.05, -0.02, 0.1], ..grab(1).state }];
     let state = TickState { tick, q: &q, v: &v, a: &v, pose: None, grabs: &grabs, resting: false };
     host.publish(now, BODY, &state).unwrap();
 }

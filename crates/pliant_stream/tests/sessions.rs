@@ -32,6 +32,8 @@ struct Scene {
     /// What each guest's hand does, given the time.
     hand: HandScript,
     resting: bool,
+    /// A force on a vertex that the stream says nothing of, N.
+    wind: [f64; 3],
     worst: f64,
     settled: Duration,
 }
@@ -47,6 +49,7 @@ impl Scene {
             guest_events: Vec::new(),
             hand: Box::new(|_, _, _| {}),
             resting: false,
+            wind: [0.0; 3],
             worst: 0.0,
             settled: Duration::MAX,
         }
@@ -71,6 +74,7 @@ impl Scene {
 impl World for Scene {
     fn step(&mut self, now: Duration, tick: u64, host: &mut HostSession) {
         if !self.resting {
+            self.body.push(40, self.wind).unwrap();
             self.body.step().unwrap();
         }
         let grabs: Vec<GrabState> = self
@@ -620,4 +624,22 @@ fn a_guest_that_may_cost_little_gets_less_of_everything_but_every_tick() {
             1
         );
     }
+}
+
+#[test]
+fn a_force_that_the_stream_does_not_say_is_learnt() {
+    let model = bar(40, 0.05);
+    let (mut pair, mut scene) = start(&model);
+    scene.hand = circling();
+    pair.join_with(GuestConfig::default(), paper1(), 6, cached(&model)).unwrap();
+    pair.run_until(6 * S, &mut scene);
+    // As strong as the hand itself, from one tick to the next.
+    scene.wind = [0.0, 3.0, -2.0];
+    scene.settled = 12 * S;
+    pair.run_until(30 * S, &mut scene);
+    let worst = scene.worst / scene.size();
+    println!("worst {:.3} %", 100.0 * worst);
+    assert!(worst < 0.05, "{worst}");
+    let counts = pair.guests[0].session.body(BODY).unwrap().counts();
+    assert!(counts.snapshots <= 1, "learnt, not sent again and again: {counts:?}");
 }
