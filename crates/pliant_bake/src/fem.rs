@@ -163,8 +163,8 @@ impl FeMesh {
                         *at = patch.len();
                         patch.push((node, [0.0; 3]));
                     }
-                    for k in 0..3 {
-                        patch[*at].1[k] += gradient[k];
+                    for (to, from) in patch[*at].1.iter_mut().zip(gradient) {
+                        *to += from;
                     }
                 }
             }
@@ -175,9 +175,10 @@ impl FeMesh {
             for &(a, da) in &patch {
                 for &(b, db) in &patch {
                     let at = out.position(number[a as usize], number[b as usize]);
-                    for k in 0..3 {
-                        for l in 0..3 {
-                            out.stiffness[9 * at + 3 * k + l] += lambda / volume * (da[k] * db[l]);
+                    let block = &mut out.stiffness[9 * at..][..9];
+                    for (row, da) in block.chunks_exact_mut(3).zip(da) {
+                        for (to, db) in row.iter_mut().zip(db) {
+                            *to += lambda / volume * (da * db);
                         }
                     }
                 }

@@ -22,9 +22,9 @@ impl MassProperties {
         let volume = mesh.volume();
         let mut first = [0.0; 3];
         for (nodes, affine) in mesh.elements().zip(&mesh.affine) {
-            for k in 0..3 {
+            for (k, first) in first.iter_mut().enumerate() {
                 let sum: f64 = nodes[..4].iter().map(|&n| mesh.nodes[n as usize][k]).sum();
-                first[k] += affine.volume * sum / 4.0;
+                *first += affine.volume * sum / 4.0;
             }
         }
         let center = first.map(|x| x / volume);

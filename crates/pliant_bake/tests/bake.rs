@@ -1,6 +1,6 @@
 //! The bake from outside: what a model holds, what is refused, and that the same input gives the same bits.
 
-#![allow(clippy::unwrap_used, clippy::panic, reason = "a failed test should panic")]
+#![expect(clippy::unwrap_used, reason = "a failed test should panic")]
 
 use pliant_bake::{Anchor, Bake, BakeConfig, BakeError, bake};
 use pliant_mesh::{MeshError, Surface, TetMesh, shapes};
