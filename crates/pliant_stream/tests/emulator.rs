@@ -151,3 +151,31 @@ fn senseless_settings_are_named_and_survived() {
     let (arrived, _) = run(bad, 1, 10, MS, 1);
     assert!(!arrived.is_empty());
 }
+
+#[test]
+fn losses_are_read_from_words() {
+    let parse = |words: &str| Loss::parse(words, 5, 25 * MS);
+    assert_eq!(parse("none"), Ok(Loss::None));
+    assert_eq!(parse("9%"), Ok(Loss::Random(0.09)));
+    assert_eq!(parse("burst:12@140"), Ok(Loss::Burst { first: 140, count: 12 }));
+    assert_eq!(parse("every:50"), Ok(Loss::Every { first: 135, every: 50 }));
+    assert_eq!(parse("gilbert:9%:4"), Ok(Loss::gilbert(0.09, 4.0, 25 * MS)));
+    let Ok(Loss::Listed(list)) = parse("random:22@135") else { panic!("22 numbers") };
+    assert_eq!(list.len(), 22);
+    assert!(list.windows(2).all(|w| w[0] < w[1]) && list.iter().all(|k| (135..635).contains(k)));
+    assert_eq!(parse("random:22@135"), Ok(Loss::Listed(list)));
+    for bad in [
+        "",
+        "9",
+        "-1%",
+        "NaN%",
+        "burst:0",
+        "burst:x@3",
+        "random:501",
+        "gilbert:9%",
+        "gilbert:9%:0",
+        "storm:3",
+    ] {
+        assert!(parse(bad).is_err(), "{bad}");
+    }
+}

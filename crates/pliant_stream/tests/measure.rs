@@ -211,6 +211,17 @@ fn default_policy_holds_its_bars_for_ten_minutes_on_many_seeds() {
 }
 
 #[test]
+#[ignore = "a minute: an hour of streaming"]
+fn an_hour_does_not_drift() {
+    let short = run(&LinkConfig::preset(Preset::Paper1), "default", 120.0, 1);
+    let long = run(&LinkConfig::preset(Preset::Paper1), "default", 3600.0, 1);
+    show("two minutes", &short);
+    show("one hour", &long);
+    assert!(long.rms_percent < 1.5 * short.rms_percent);
+    assert!(long.hidden_end_percent < 0.02, "{} %", long.hidden_end_percent);
+}
+
+#[test]
 #[ignore = "a minute: all policies side by side"]
 fn all_policies_side_by_side() {
     let perfect =

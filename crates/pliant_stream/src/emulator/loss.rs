@@ -3,6 +3,9 @@
 use std::sync::Arc;
 use std::time::Duration;
 
+use rand_core::{Rng, SeedableRng};
+use rand_pcg::Pcg64Mcg;
+
 use crate::StreamError;
 
 /// How a link loses packets. Packets are numbered from 0 in the order in which they are sent.
@@ -57,6 +60,64 @@ impl Loss {
         let loss = loss.clamp(1e-9, 1.0 - 1e-9);
         let bad = interval.mul_f64(burst.clamp(1e-3, 1e6));
         Self::GilbertElliott { good: bad.mul_f64((1.0 - loss) / loss), bad, loss_good: 0.0, loss_bad: 1.0 }
+    }
+
+    /// From words:
+    ///
+    /// | words | meaning |
+    /// | --- | --- |
+    /// | `none` | nothing |
+    /// | `9%` | each packet with probability 0.09 |
+    /// | `random:22@135` | 22 of the 500 packets from number 135 on, drawn from `seed` |
+    /// | `burst:12@140` | 12 in a row from number 140 |
+    /// | `every:50@135` | one in 50 from number 135 |
+    /// | `gilbert:9%:4` | mean loss 9 %, mean burst 4 packets of a sender that sends one every `interval` |
+    ///
+    /// `@135` may be left out.
+    ///
+    /// # Errors
+    /// [`StreamError::Invalid`] with the words.
+    pub fn parse(words: &str, seed: u64, interval: Duration) -> Result<Self, StreamError> {
+        let invalid = || StreamError::Invalid {
+            what: "loss",
+            found: words.to_owned(),
+            expected: "none, 9%, random:22@135, burst:12@140, every:50@135 or gilbert:9%:4",
+        };
+        let share = |text: &str| -> Option<f64> {
+            let percent: f64 = text.strip_suffix('%')?.trim().parse().ok()?;
+            (0.0..=100.0).contains(&percent).then_some(percent / 100.0)
+        };
+        let counted = |text: &str| -> Option<(u64, u64)> {
+            let (count, first) = text.split_once('@').unwrap_or((text, "135"));
+            Some((count.parse().ok().filter(|c| (1..=1_000_000).contains(c))?, first.parse().ok()?))
+        };
+        let words = words.trim();
+        let made = match words.split_once(':') {
+            None if words == "none" => Some(Self::None),
+            None => share(words).map(Self::Random),
+            Some(("random", rest)) => {
+                counted(rest).filter(|(count, _)| *count <= 500).map(|(count, first)| {
+                    let mut rng = Pcg64Mcg::seed_from_u64(seed);
+                    let mut all: Vec<u64> = (first..first + 500).collect();
+                    // The first steps of a Fisher-Yates shuffle.
+                    for k in 0..count as usize {
+                        let other = k + (rng.next_u64() % (all.len() - k) as u64) as usize;
+                        all.swap(k, other);
+                    }
+                    all.truncate(count as usize);
+                    all.sort_unstable();
+                    Self::Listed(all)
+                })
+            }
+            Some(("burst", rest)) => counted(rest).map(|(count, first)| Self::Burst { first, count }),
+            Some(("every", rest)) => counted(rest).map(|(every, first)| Self::Every { first, every }),
+            Some(("gilbert", rest)) => rest.split_once(':').and_then(|(loss, burst)| {
+                let burst: f64 = burst.parse().ok().filter(|b| (1.0..=1e6).contains(b))?;
+                share(loss).map(|loss| Self::gilbert(loss, burst, interval))
+            }),
+            Some(_) => None,
+        };
+        made.ok_or_else(invalid)
     }
 
     /// The same losses with packets counted from `packets` and time from `time` on.
