@@ -150,16 +150,17 @@ impl ForceStepper {
 
     /// One step with the reactions, drawn to where the host's patches were.
     ///
+    /// Reaction and place together say where the hand must have been, `place + C pull` with `C` the grab's compliance and
+    /// `pull = -R^T reaction`; the step is then the body's own, with its two Newton rounds:
+    ///
     /// ```text
-    /// f = load - sum rows^T R^T reaction + sum rows^T correction
-    /// (A + C) correction = displacement - (displacement that the step would reach without it)
+    /// f = load + sum rows^T pull,   (A + C) correction = place + C pull_0 - (place that pull reaches) - C pull
     /// ```
     ///
-    /// The reactions alone are a dead load: a bent body under a load that pushes is unstable (it buckles), although the
-    /// same body held in place is not, and a small error would grow. The correction makes the receiver an observer: it is
-    /// zero when the state is right, and otherwise draws the patches to their places as a compliant grab does, so errors
-    /// die as they would in the held body. The rows are taken where the body's own two Newton rounds take them. A grab
-    /// whose vertex the model has not got pulls nothing.
+    /// The reactions alone would be a dead load: a bent body under a load that pushes is unstable (it buckles), although
+    /// the same body held in place is not, and a small error would grow. This way the receiver is an observer: the
+    /// correction is zero when the state is right, and otherwise draws the patches to their places as the grab does, so
+    /// errors die as they would in the held body. A grab whose vertex the model has not got pulls nothing.
     pub fn step(&mut self, state: &mut ModalState, grabs: &[FrameGrab], rotation: [f64; 4], load: &[f64]) {
         let back = inverse_rotation(rotation);
         let mut holds = std::mem::take(&mut self.holds);
@@ -190,8 +191,8 @@ impl ForceStepper {
         }
         self.press(&state.q, holds, load);
         if !holds.is_empty() {
-            // Both of the body's rounds are implicit. Were the first one a dead load, a bent body would buckle under it, and the rows of the
-            // second round would be taken at the wrong place: the error then grows without bound.
+            // Both of the body's rounds are implicit. Were the first one a dead load, a bent body would buckle under it,
+            // and the rows of the second round would be taken at the wrong place: the error then grows without bound.
             self.correct(&state.q, holds);
             let mut trial = std::mem::take(&mut self.trial);
             self.reach(&mut trial);
