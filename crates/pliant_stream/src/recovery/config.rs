@@ -56,7 +56,7 @@ pub struct RecoveryConfig {
     pub coding: AccelerationCoding,
     /// Earlier ticks that each frame repeats, 0..=7. Default: 3.
     pub repeats: u8,
-    /// Each frame carries the absolute (q, v) of one in so many modes, those most in need first; 0 for never. Default: 12.
+    /// Each frame carries the absolute (q, v) of one in so many modes, those most in need first; 0 for never. Default: 15.
     pub refresh: u8,
     /// Ask again for what is missing. Default: true.
     pub nack: bool,
@@ -72,14 +72,14 @@ pub struct RecoveryConfig {
 }
 
 impl Default for RecoveryConfig {
-    /// The better way of the design: force-driven, three repeats, a refresh every 12 frames, NACK, snapshots, one tick of
+    /// The better way of the design: force-driven, three repeats, the absolute state of one in 15 modes with each, NACK, snapshots, one tick of
     /// playout delay.
     fn default() -> Self {
         Self {
             policy: Policy::ForceDriven { blend_ticks: 6 },
             coding: AccelerationCoding::Scaled16,
             repeats: 3,
-            refresh: 12,
+            refresh: 15,
             nack: true,
             snapshots: true,
             playout: Playout::Fixed(1),
