@@ -595,7 +595,7 @@ fn a_guest_that_may_cost_little_gets_less_of_everything_but_every_tick() {
     for (rate, link) in [
         (50e3, LinkConfig { delay: 20 * MS, ..Default::default() }),
         // The line itself is narrow, and the rate is not known: the queue tells.
-        (1e6, LinkConfig { delay: 20 * MS, bits_per_second: Some(70e3), ..Default::default() }),
+        (1e6, LinkConfig { delay: 20 * MS, bits_per_second: Some(55e3), ..Default::default() }),
     ] {
         let (mut pair, mut scene) = start_with(&model, HostConfig { guest_rate: rate, ..Default::default() });
         scene.hand = circling();
