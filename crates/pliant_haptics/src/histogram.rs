@@ -27,7 +27,7 @@ impl Histogram {
     fn bucket(ns: u64) -> usize {
         let per = Self::PER_OCTAVE as u64;
         if ns < 1 << Self::SHIFT {
-            return (ns * per >> Self::SHIFT) as usize;
+            return ((ns * per) >> Self::SHIFT) as usize;
         }
         let octave = ns.ilog2();
         let within = (ns >> (octave - 3)) & (per - 1);

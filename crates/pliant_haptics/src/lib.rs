@@ -1,4 +1,41 @@
-//! Feel it: the haptic device layer of Pliant.
+//! Feel it: the haptic device layer of Pliant. Whoever owns a device plugs it in and feels the body; whoever owns none has a virtual one.
+//!
+//! The force is closed at device rate, on a thread of its own, from the simulation's last word: a spring from the hand to where the held patch is, in
+//! series with what the patch gives. Between the spring and the hand stands the [`Safety`] pipeline.
+//!
+//! ```
+//! use pliant_haptics::{Hand, HapticLoop, LoopConfig, Virtual, VirtualConfig};
+//!
+//! # fn main() -> Result<(), Box<dyn std::error::Error>> {
+//! let device = Virtual::new(VirtualConfig::touch(), Hand::FIRM)?;
+//! let mut running = HapticLoop::start(device, LoopConfig::default())?;
+//! println!("{}", running.coupling());
+//! let stamp = running.report().tick.now;
+//! running.publish(|model| {
+//!     // In a game: `ModelWriter::write(&body, ..)` after every step.
+//!     model.tick += 1;
+//!     model.stamp = stamp;
+//!     model.period = 0.01;
+//!     model.count = 1;
+//!     model.contacts[0].stiffness = [[200.0, 0.0, 0.0], [0.0, 200.0, 0.0], [0.0, 0.0, 200.0]];
+//! });
+//! println!("{:?} N", running.report().tick.wrench.force);
+//! # Ok(())
+//! # }
+//! ```
+//!
+//! | Layer | What it is |
+//! | --- | --- |
+//! | [`HapticDevice`] | takes a wrench, holds it for a period, says where the hand is: [`Virtual`], [`Positioned`], [`Replay`], `Inverse`, `OpenHaptics`, `ForceDimension` |
+//! | [`LoopCore`] | a sample and a [`LocalModel`] in, a [`Wrench`] out: no clock, no thread, no allocation |
+//! | [`Cycle`] | the core and a device, period by period: loss and return, calibration, buttons, counters; in real or virtual time |
+//! | [`HapticLoop`] | a cycle on its thread, absolute pacing, FIFO priority where allowed; lock-free ends for the app |
+//! | `HapticsPlugin` | Bevy: devices as a resource, tools and grabs as components (feature `plugin`) |
+//!
+//! # Features
+//!
+//! `inverse` (default): the Haply Inverse3. `vendor` (default): 3D Systems and Force Dimension, libraries loaded at run time. `plugin`: Bevy; without it no
+//! engine is compiled.
 #![cfg_attr(
     test,
     allow(clippy::unwrap_used, clippy::expect_used, clippy::panic, reason = "a failed test should panic")
@@ -17,6 +54,9 @@ mod inverse;
 mod local;
 mod modal_local;
 mod pace;
+#[cfg(feature = "plugin")]
+mod plugin;
+mod positioned;
 mod record;
 mod runner;
 mod safety;
@@ -36,9 +76,15 @@ pub use hand::Hand;
 pub use histogram::Histogram;
 #[cfg(feature = "inverse")]
 pub use inverse::{Inverse, InverseConfig, InverseError, Spelling};
-pub use local::{Contact, HeldGrab, LocalModel, MAX_CONTACTS, ModelWriter};
+pub use local::{Contact, FeltGrab, HeldGrab, LocalModel, MAX_CONTACTS, ModelWriter};
 pub use modal_local::ModalLocal;
 pub use pace::{LoopClock, RealPace, VirtualPace};
+#[cfg(feature = "plugin")]
+pub use plugin::{
+    DeviceId, DeviceStatus, HapticButton, HapticDevices, HapticFault, HapticNotice, HapticSystems,
+    HapticTool, HapticsPlugin, HeldBy, ToolGrabs, ToolGrip, ToolOffset, ToolPose,
+};
+pub use positioned::{Positioned, PositionedHandle};
 pub use record::{RecordError, Recorder, Replay};
 pub use runner::{HapticLoop, StopSwitch};
 pub use safety::{

@@ -78,11 +78,25 @@ pub struct HeldGrab {
     pub offset: [f64; 3],
 }
 
+/// A grab on a body that is stepped elsewhere: what was published of it.
+#[derive(Debug, Clone, Copy, PartialEq, Default)]
+pub struct FeltGrab {
+    /// Tells this grab from others, for as long as it lasts.
+    pub key: u64,
+    /// The held point from the tool point, tool axes, m of the world.
+    pub offset: [f64; 3],
+    /// Where the held patch is, m, world axes.
+    pub point: [f64; 3],
+    /// The reaction, N, world axes.
+    pub force: [f64; 3],
+}
+
 /// Writes [`LocalModel`]s from a body: keeps what it needs of the step before.
 #[derive(Debug, Clone, Default)]
 pub struct ModelWriter {
     tick: u64,
     proxies: [Option<(GrabId, Vector3<f64>)>; MAX_CONTACTS],
+    points: [Option<(u64, Vector3<f64>)>; MAX_CONTACTS],
     targets: Vec<(GrabId, Vector3<f64>)>,
     center: Option<Vector3<f64>>,
     supplied: f64,
@@ -153,6 +167,43 @@ impl ModelWriter {
         }
         self.proxies = proxies;
         Ok(())
+    }
+
+    /// Writes the same from published forces alone, for a body that somebody else steps: the spring is the coupling, its proxy the held patch.
+    ///
+    /// `stiffness` (N/m) and `damping` (N s/m) are the coupling's in the world; `period`: time between two words, s.
+    pub fn write_forces(
+        &mut self,
+        felt: &[FeltGrab],
+        stiffness: f64,
+        damping: f64,
+        period: f64,
+        stamp: f64,
+        out: &mut LocalModel,
+    ) {
+        self.tick += 1;
+        out.tick = self.tick;
+        out.stamp = stamp;
+        out.period = period;
+        (out.stored, out.supplied) = (0.0, self.supplied);
+        out.count = felt.len().min(MAX_CONTACTS);
+        let k = if stiffness.is_finite() { stiffness } else { 0.0 };
+        let before = self.points;
+        self.points = [None; MAX_CONTACTS];
+        for (i, grab) in felt.iter().take(MAX_CONTACTS).enumerate() {
+            let point = Vector3::from(grab.point);
+            let last = before.iter().flatten().find(|(key, _)| *key == grab.key).map(|(_, p)| *p);
+            let velocity = last.map_or_else(Vector3::zeros, |p| (point - p) / period);
+            out.contacts[i] = Contact {
+                offset: grab.offset,
+                proxy: grab.point,
+                velocity: velocity.into(),
+                stiffness: [[k, 0.0, 0.0], [0.0, k, 0.0], [0.0, 0.0, k]],
+                damping,
+                reaction: grab.force,
+            };
+            self.points[i] = Some((grab.key, point));
+        }
     }
 
     /// Work that other hands and gravity did in the last step, J of the body.

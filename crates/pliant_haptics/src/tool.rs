@@ -128,7 +128,7 @@ impl Tool {
     }
 
     /// World force to device force: the same work (times the force scale) for the same motion.
-    pub(crate) fn to_hand(&self, force: Vector3<f64>) -> Vector3<f64> {
+    pub(crate) fn force_to_hand(&self, force: Vector3<f64>) -> Vector3<f64> {
         let f = self.rotation.inverse() * force * (self.map.motion_scale * self.map.force_scale);
         masked(f, self.map.force_axes)
     }
@@ -178,7 +178,7 @@ mod tests {
             assert!((got - want).abs() < 1e-12, "{p:?}");
         }
         // Work: 5 N along -z over 0.4 m in the world is 20 N along x over 0.1 m at the hand.
-        let f = tool.to_hand(Vector3::new(0.0, 0.0, -5.0));
+        let f = tool.force_to_hand(Vector3::new(0.0, 0.0, -5.0));
         assert!((f - Vector3::new(20.0, 0.0, 0.0)).norm() < 1e-12, "{f}");
         // Clutched, the hand goes back and the tool stays; unclutched, it goes on from there.
         assert_eq!(still(&mut tool, [0.1, 0.0, 0.0], 2), p);

@@ -1,4 +1,5 @@
 //! What a tick costs: no allocation, ever; and its time, on its own thread and beside it.
+#![allow(clippy::unwrap_used, clippy::expect_used, clippy::panic, reason = "a failed test should panic")]
 #![allow(unsafe_code, reason = "counting allocations needs a global allocator")]
 
 mod rig;

@@ -1,4 +1,5 @@
 //! Dragging a body with the virtual device: what is promised for every cell of the table (`--example stability_table`), for some of them.
+#![allow(clippy::unwrap_used, clippy::expect_used, clippy::panic, reason = "a failed test should panic")]
 
 mod rig;
 

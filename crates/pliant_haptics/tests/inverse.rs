@@ -1,4 +1,5 @@
 //! The Inverse against a service that plays the real one, strictly: what the vendor's documentation does not allow, it refuses.
+#![allow(clippy::unwrap_used, clippy::expect_used, clippy::panic, reason = "a failed test should panic")]
 #![cfg(feature = "inverse")]
 
 use std::{

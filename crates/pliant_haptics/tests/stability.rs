@@ -1,4 +1,5 @@
 //! Limits that control theory names, found again by experiment: the same loop body, in virtual time.
+#![allow(clippy::unwrap_used, clippy::expect_used, clippy::panic, reason = "a failed test should panic")]
 
 mod rig;
 

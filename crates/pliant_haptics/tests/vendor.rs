@@ -1,4 +1,5 @@
 //! The vendors' libraries, played by small ones that this test builds with the system's C compiler. Without one it says so and passes.
+#![allow(clippy::unwrap_used, clippy::expect_used, clippy::panic, reason = "a failed test should panic")]
 #![cfg(all(feature = "vendor", unix))]
 #![allow(unsafe_code, reason = "the fake libraries are steered through C functions")]
 

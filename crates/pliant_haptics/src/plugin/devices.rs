@@ -1,0 +1,185 @@
+//! The devices that are running, and what they say.
+
+use bevy::{platform::cell::SyncCell, prelude::*};
+
+use crate::{
+    Coupling, DeviceInfo, Fault, HapticDevice, HapticLoop, LoopConfig, LoopEvent, LoopReport, ModelWriter,
+    Record, StartError, StopSwitch, ToolMap,
+};
+
+/// Names a device among the [`HapticDevices`]. Never used twice.
+#[derive(Reflect, Debug, Clone, Copy, PartialEq, Eq, Hash, PartialOrd, Ord)]
+pub struct DeviceId(u32);
+
+/// The haptic devices in use. Each runs its loop on a thread of its own until it is removed.
+#[derive(Resource, Default)]
+pub struct HapticDevices {
+    entries: Vec<Entry>,
+    next: u32,
+}
+
+/// What is known of a device, as of this frame.
+#[derive(Debug, Clone)]
+pub struct DeviceStatus {
+    /// What it is.
+    pub info: DeviceInfo,
+    /// Coupling in force, what was wanted and what clamped it.
+    pub coupling: Coupling,
+    /// State, wrench, rate, jitter, energy, faults.
+    pub report: LoopReport,
+}
+
+pub(crate) struct Entry {
+    pub(crate) id: DeviceId,
+    pub(crate) running: SyncCell<HapticLoop>,
+    pub(crate) status: DeviceStatus,
+    pub(crate) writer: ModelWriter,
+    pub(crate) map: Option<ToolMap>,
+    /// The tick of the loop whose tool position the simulation has, s.
+    pub(crate) seen: f64,
+    /// What the loop steps itself, if it does: the grabs it was made for.
+    pub(crate) modal_for: Vec<Entity>,
+    stop: StopSwitch,
+}
+
+/// A button of a device went down or came up.
+#[derive(Message, Debug, Clone, Copy, PartialEq)]
+pub struct HapticButton {
+    /// Whose.
+    pub device: DeviceId,
+    /// Which, from 0.
+    pub button: u32,
+    /// Down.
+    pub pressed: bool,
+}
+
+/// A fault of a device began; the force fades and comes back by itself once it is over.
+#[derive(Message, Debug, Clone, Copy, PartialEq)]
+pub struct HapticFault {
+    /// Whose.
+    pub device: DeviceId,
+    /// What; `None`: the last one is over.
+    pub fault: Option<Fault>,
+}
+
+/// A device was lost, came back, or needs a hand.
+#[derive(Message, Debug, Clone, Copy, PartialEq)]
+pub struct HapticNotice {
+    /// Which.
+    pub device: DeviceId,
+    /// [`LoopEvent::Lost`], [`LoopEvent::Returned`] or [`LoopEvent::Calibrate`].
+    pub event: LoopEvent,
+}
+
+impl HapticDevices {
+    /// Takes a device into use: its loop starts at once.
+    ///
+    /// # Errors
+    /// As [`HapticLoop::start`].
+    pub fn add(
+        &mut self,
+        device: impl HapticDevice + 'static,
+        config: LoopConfig,
+    ) -> Result<DeviceId, StartError> {
+        let mut running = HapticLoop::start(device, config)?;
+        let id = DeviceId(self.next);
+        self.next += 1;
+        let status = DeviceStatus {
+            info: running.info().clone(),
+            coupling: *running.coupling(),
+            report: *running.report(),
+        };
+        self.entries.push(Entry {
+            id,
+            stop: running.stop_switch(),
+            running: SyncCell::new(running),
+            status,
+            writer: ModelWriter::new(),
+            map: None,
+            seen: 0.0,
+            modal_for: Vec::new(),
+        });
+        Ok(id)
+    }
+
+    /// Stops a device and gives it back to nobody. `false`: there is none of that name.
+    pub fn remove(&mut self, id: DeviceId) -> bool {
+        let before = self.entries.len();
+        self.entries.retain(|e| e.id != id);
+        self.entries.len() < before
+    }
+
+    /// What is known of a device.
+    pub fn get(&self, id: DeviceId) -> Option<&DeviceStatus> {
+        self.entries.iter().find(|e| e.id == id).map(|e| &e.status)
+    }
+
+    /// All devices, oldest first.
+    pub fn iter(&self) -> impl Iterator<Item = (DeviceId, &DeviceStatus)> {
+        self.entries.iter().map(|e| (e.id, &e.status))
+    }
+
+    /// Emergency stop: no force on any device from its loop's next period on. Latched until [`reset_stop`](Self::reset_stop).
+    pub fn estop(&self) {
+        for entry in &self.entries {
+            entry.stop.press();
+        }
+    }
+
+    /// Unlatches the emergency stop of all devices; forces come back by their ramps.
+    pub fn reset_stop(&mut self) {
+        for entry in &mut self.entries {
+            if !entry.running.get().reset_stop() {
+                warn!("{}: the emergency stop could not be reset, the loop is busy", entry.status.info.name);
+            }
+        }
+    }
+
+    /// Begins or ends the writing down of a device's periods. `false`: no such device, or its loop is busy.
+    pub fn set_recording(&mut self, id: DeviceId, on: bool) -> bool {
+        self.entry(id).is_some_and(|e| e.running.get().set_recording(on))
+    }
+
+    /// What has been written down since the last call.
+    pub fn records(&mut self, id: DeviceId) -> Vec<Record> {
+        self.entry(id).map(|e| e.running.get().records().collect()).unwrap_or_default()
+    }
+
+    pub(crate) fn entry(&mut self, id: DeviceId) -> Option<&mut Entry> {
+        self.entries.iter_mut().find(|e| e.id == id)
+    }
+}
+
+pub(crate) fn read(
+    mut devices: ResMut<HapticDevices>,
+    mut buttons: MessageWriter<HapticButton>,
+    mut faults: MessageWriter<HapticFault>,
+    mut notices: MessageWriter<HapticNotice>,
+) {
+    for entry in &mut devices.entries {
+        let device = entry.id;
+        entry.status.report = *entry.running.get().report();
+        if let Some(coupling) = entry.status.report.coupling {
+            entry.status.coupling = coupling;
+        }
+        for event in entry.running.get().events() {
+            match event {
+                LoopEvent::Pressed(button) => {
+                    buttons.write(HapticButton { device, button, pressed: true });
+                }
+                LoopEvent::Released(button) => {
+                    buttons.write(HapticButton { device, button, pressed: false });
+                }
+                LoopEvent::Fault(fault) => {
+                    faults.write(HapticFault { device, fault: Some(fault) });
+                }
+                LoopEvent::Clear => {
+                    faults.write(HapticFault { device, fault: None });
+                }
+                event => {
+                    notices.write(HapticNotice { device, event });
+                }
+            }
+        }
+    }
+}

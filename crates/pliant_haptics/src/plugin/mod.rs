@@ -1,0 +1,88 @@
+//! The Bevy plugin: devices as a resource, tools and what they hold as components, buttons and faults as messages.
+//!
+//! ```no_run
+//! use bevy::prelude::*;
+//! use pliant_body::{ModalBody, PliantBodyPlugin};
+//! use pliant_haptics::{Hand, HapticDevices, HapticTool, HapticsPlugin, LoopConfig, ToolGrip, Virtual, VirtualConfig};
+//!
+//! fn main() {
+//!     App::new()
+//!         .add_plugins((DefaultPlugins, PliantBodyPlugin::default(), HapticsPlugin::default()))
+//!         .add_systems(Startup, setup)
+//!         .run();
+//! }
+//!
+//! fn setup(mut commands: Commands, assets: Res<AssetServer>, mut devices: ResMut<HapticDevices>) -> Result {
+//!     commands.spawn(ModalBody::new(assets.load("pip.modal")));
+//!     let device = devices.add(Virtual::new(VirtualConfig::touch(), Hand::FIRM)?, LoopConfig::default())?;
+//!     commands.spawn((HapticTool::new(device), ToolGrip::default(), Transform::from_xyz(0.0, 1.0, 0.0)));
+//!     Ok(())
+//! }
+//! ```
+
+mod devices;
+mod tool;
+mod word;
+
+use bevy::{
+    ecs::schedule::{InternedScheduleLabel, ScheduleLabel},
+    prelude::*,
+};
+use pliant_body::PliantSystems;
+
+pub use devices::{DeviceId, DeviceStatus, HapticButton, HapticDevices, HapticFault, HapticNotice};
+pub use tool::{HapticTool, HeldBy, ToolGrabs, ToolGrip, ToolOffset, ToolPose};
+
+/// What the plugin does in a tick, around [`PliantSystems`].
+#[derive(SystemSet, Debug, Clone, PartialEq, Eq, Hash)]
+pub enum HapticSystems {
+    /// Before [`PliantSystems::Input`]: tools take the devices' places, and what they hold takes theirs.
+    Move,
+    /// After [`PliantSystems::Publish`]: each device's loop gets the simulation's word.
+    Word,
+}
+
+/// Haptic devices, their tools and grabs. Needs `PliantBodyPlugin`; on bodies that somebody else steps (a session over a network) a hand feels
+/// what that session publishes.
+pub struct HapticsPlugin {
+    schedule: InternedScheduleLabel,
+}
+
+impl HapticsPlugin {
+    /// In the schedule that the bodies are stepped in.
+    pub fn new(schedule: impl ScheduleLabel) -> Self {
+        Self { schedule: schedule.intern() }
+    }
+}
+
+impl Default for HapticsPlugin {
+    /// In `FixedUpdate`.
+    fn default() -> Self {
+        Self::new(FixedUpdate)
+    }
+}
+
+impl Plugin for HapticsPlugin {
+    fn build(&self, app: &mut App) {
+        app.init_resource::<HapticDevices>()
+            .register_type::<DeviceId>()
+            .register_type::<HapticTool>()
+            .register_type::<ToolPose>()
+            .register_type::<ToolGrip>()
+            .register_type::<ToolOffset>()
+            .register_type::<HeldBy>()
+            .register_type::<ToolGrabs>()
+            .add_message::<HapticButton>()
+            .add_message::<HapticFault>()
+            .add_message::<HapticNotice>()
+            .configure_sets(self.schedule, HapticSystems::Move.before(PliantSystems::Input))
+            .configure_sets(self.schedule, HapticSystems::Word.after(PliantSystems::Publish))
+            // Every frame, whether the game is paused or not: buttons, faults and states.
+            .add_systems(PreUpdate, (devices::read, tool::place, tool::grip).chain())
+            .add_systems(self.schedule, tool::follow.in_set(HapticSystems::Move))
+            .add_systems(self.schedule, word::publish.in_set(HapticSystems::Word));
+    }
+}
+
+#[cfg(test)]
+mod tests;

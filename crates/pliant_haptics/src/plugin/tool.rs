@@ -1,0 +1,230 @@
+//! Tools: what devices are in the world, and what they hold.
+
+use bevy::{
+    math::{DQuat, DVec3},
+    prelude::*,
+};
+use pliant_body::{BodyState, Driven, Grab, GrabOf, ShownState};
+use pliant_modal::Patch;
+
+use super::{DeviceId, HapticButton, HapticDevices};
+use crate::ToolMap;
+
+/// A device's tool. The entity's transform says where the middle of the device's workspace lies in the world, and how it is turned; its scale
+/// does not count, [`motion_scale`](Self::motion_scale) does.
+#[derive(Component, Reflect, Debug, Clone, Copy, PartialEq)]
+#[reflect(Component, Clone, PartialEq)]
+#[require(Transform, ToolPose)]
+pub struct HapticTool {
+    /// The device.
+    pub device: DeviceId,
+    /// World metres per metre of the hand, above 0. Default: `1.0`.
+    pub motion_scale: f64,
+    /// Newtons at the hand per newton in the world, beyond what the motion's scale asks for, 0 or more. Default: `1.0`.
+    pub force_scale: f64,
+    /// Which axes of the force the hand gets, device axes. Default: all.
+    pub force_axes: [bool; 3],
+    /// Which axes of the torque the hand gets, device axes. Default: all.
+    pub torque_axes: [bool; 3],
+    /// Mass of the tool as felt at the hand, kg. Default: `0.0`.
+    pub mass: f64,
+    /// Buttons (bits) that lift the tool off the world while held. Default: none.
+    pub clutch: u32,
+    /// The loop steps a copy of the held body itself: finer to the touch, and immune to the simulation's rate. Default: `false`.
+    pub modal: bool,
+}
+
+impl HapticTool {
+    /// The tool of `device`, every setting at its default.
+    pub fn new(device: DeviceId) -> Self {
+        Self {
+            device,
+            motion_scale: 1.0,
+            force_scale: 1.0,
+            force_axes: [true; 3],
+            torque_axes: [true; 3],
+            mass: 0.0,
+            clutch: 0,
+            modal: false,
+        }
+    }
+
+    fn map(&self, place: &GlobalTransform) -> ToolMap {
+        let (_, rotation, translation) = place.to_scale_rotation_translation();
+        ToolMap {
+            origin: translation.as_dvec3().into(),
+            rotation: rotation.as_dquat().normalize().to_array(),
+            motion_scale: self.motion_scale,
+            force_scale: self.force_scale,
+            force_axes: self.force_axes,
+            torque_axes: self.torque_axes,
+            mass: self.mass,
+            clutch: self.clutch,
+        }
+    }
+}
+
+/// Where a tool is and what it feels, as of the last tick.
+#[derive(Component, Reflect, Debug, Default, Clone, Copy, PartialEq)]
+#[reflect(Component, Default, Clone, PartialEq)]
+pub struct ToolPose {
+    /// The tool point, m, world axes.
+    pub position: DVec3,
+    /// Its velocity, m/s, world axes.
+    pub velocity: DVec3,
+    /// Its orientation.
+    pub orientation: DQuat,
+    /// The force that the hand is given, N, device axes.
+    pub force: DVec3,
+    /// Part of the wanted force that is felt, 0 to 1.
+    pub gain: f64,
+    /// Lifted off the world by its clutch.
+    pub clutched: bool,
+    /// Buttons that are down.
+    pub buttons: u32,
+}
+
+/// The tool that holds a [`Grab`]. The grab's target, stiffness and relaxation are then the plugin's to write.
+#[derive(Component, Reflect, Debug, Clone, Copy, PartialEq, Eq)]
+#[reflect(Component, Clone, PartialEq)]
+#[relationship(relationship_target = ToolGrabs)]
+pub struct HeldBy(#[entities] pub Entity);
+
+/// What a tool holds, oldest first; the first [`MAX_CONTACTS`](crate::MAX_CONTACTS) are felt. Despawned with it.
+#[derive(Component, Reflect, Debug, Default)]
+#[reflect(Component)]
+#[relationship_target(relationship = HeldBy, linked_spawn)]
+pub struct ToolGrabs(Vec<Entity>);
+
+impl ToolGrabs {
+    /// The grabs' entities, oldest first.
+    pub fn entities(&self) -> &[Entity] {
+        &self.0
+    }
+}
+
+/// Where on the tool a grab is held, m from the tool point, tool axes. Default: at the tool point.
+#[derive(Component, Reflect, Debug, Default, Clone, Copy, PartialEq)]
+#[reflect(Component, Default, Clone, PartialEq)]
+pub struct ToolOffset(pub DVec3);
+
+/// A tool that holds the nearest body while a button is down.
+#[derive(Component, Reflect, Debug, Clone, Copy, PartialEq)]
+#[reflect(Component, Default, Clone, PartialEq)]
+pub struct ToolGrip {
+    /// The button, from 0. Default: `0`.
+    pub button: u32,
+    /// How far from the tool point a surface may be, m. Default: `0.02`.
+    pub reach: f64,
+    /// Radius of the patch as a part of the model's size. Default: `0.06`.
+    pub radius: f64,
+}
+
+impl Default for ToolGrip {
+    fn default() -> Self {
+        Self { button: 0, reach: 0.02, radius: 0.06 }
+    }
+}
+
+/// Tells the loops where their workspaces are.
+pub(crate) fn place(
+    mut devices: ResMut<HapticDevices>,
+    tools: Query<(NameOrEntity, &HapticTool, &GlobalTransform)>,
+) {
+    for (name, tool, place) in &tools {
+        let Some(entry) = devices.entry(tool.device) else { continue };
+        let map = tool.map(place);
+        if entry.map == Some(map) {
+            continue;
+        }
+        if !map.is_valid() {
+            warn!("{name}: a tool needs finite numbers and a positive motion scale; it stays as it was");
+        } else if !entry.running.get().set_tool(map) {
+            // The loop is busy: asked again in the next frame.
+            continue;
+        }
+        entry.map = Some(map);
+    }
+}
+
+/// Before a tick: tools and what they hold are where the hands are.
+pub(crate) fn follow(
+    mut devices: ResMut<HapticDevices>,
+    mut tools: Query<(&HapticTool, &mut ToolPose, Option<&ToolGrabs>)>,
+    mut grabs: Query<(&mut Grab, Option<&ToolOffset>)>,
+) {
+    for (tool, mut pose, held) in &mut tools {
+        let Some(entry) = devices.entry(tool.device) else { continue };
+        entry.status.report = *entry.running.get().report();
+        let tick = &entry.status.report.tick;
+        entry.seen = tick.now;
+        pose.set_if_neq(ToolPose {
+            position: tick.tool.into(),
+            velocity: tick.tool_velocity.into(),
+            orientation: DQuat::from_array(tick.tool_orientation),
+            force: tick.wrench.force.into(),
+            gain: tick.gain,
+            clutched: tick.clutched,
+            buttons: tick.buttons,
+        });
+        let config = entry.status.coupling.grab_config(tool.motion_scale, tool.force_scale);
+        for &grab in held.map_or(&[][..], ToolGrabs::entities) {
+            let Ok((mut grab, offset)) = grabs.get_mut(grab) else { continue };
+            let offset = offset.map_or(DVec3::ZERO, |o| o.0);
+            let target = pose.position + pose.orientation * offset;
+            let wanted = Grab { target, stiffness: config.stiffness, relaxation: config.relaxation, ..*grab };
+            grab.set_if_neq(wanted);
+        }
+    }
+}
+
+/// A press holds the nearest surface within reach; letting go lets go.
+pub(crate) fn grip(
+    mut commands: Commands,
+    mut buttons: MessageReader<HapticButton>,
+    tools: Query<(Entity, &HapticTool, &ToolGrip, &ToolPose, Option<&ToolGrabs>)>,
+    bodies: Query<(Entity, &BodyState, &ShownState, &GlobalTransform, &Driven)>,
+) {
+    for press in buttons.read() {
+        for (tool, _, grip, pose, held) in
+            tools.iter().filter(|(_, t, g, ..)| t.device == press.device && g.button == press.button)
+        {
+            if !press.pressed {
+                for &grab in held.map_or(&[][..], ToolGrabs::entities) {
+                    commands.entity(grab).despawn();
+                }
+                continue;
+            }
+            let nearest = bodies.iter().filter_map(|(body, state, shown, place, _)| {
+                let positions = state.positions_at(shown.q());
+                let (vertex, distance) = positions
+                    .iter()
+                    .map(|p| place.transform_point(Vec3::from(*p)).as_dvec3().distance(pose.position))
+                    .enumerate()
+                    .min_by(|a, b| a.1.total_cmp(&b.1))?;
+                let radius = grip.radius.max(0.0) * state.model().size();
+                let patch =
+                    Patch::around(state.model().surface(), u32::try_from(vertex).ok()?, radius).ok()?;
+                let entries = patch.entries().iter();
+                let middle: DVec3 = entries
+                    .filter_map(|&(v, w)| Some(Vec3::from(*positions.get(v as usize)?).as_dvec3() * w))
+                    .sum();
+                let middle = place.transform_point(middle.as_vec3()).as_dvec3();
+                Some((body, patch.center(), radius, middle, distance))
+            });
+            let within = nearest.filter(|(.., distance)| *distance <= grip.reach);
+            let Some((body, vertex, radius, middle, _)) = within.min_by(|a, b| a.4.total_cmp(&b.4)) else {
+                continue;
+            };
+            // Held where it is: grabbing moves nothing and pushes nobody.
+            let offset = pose.orientation.inverse() * (middle - pose.position);
+            commands.spawn((
+                Name::new("tool grab"),
+                Grab::new(vertex, radius, middle),
+                GrabOf(body),
+                HeldBy(tool),
+                ToolOffset(offset),
+            ));
+        }
+    }
+}
