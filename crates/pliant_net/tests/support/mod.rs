@@ -2,7 +2,7 @@
 #![allow(dead_code, reason = "each test uses its part")]
 
 use std::f64::consts::{FRAC_PI_2, TAU};
-use std::sync::Arc;
+use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 use std::time::{Duration, Instant};
 
 use bevy::prelude::*;
@@ -95,6 +95,12 @@ pub fn patch_at_rest(vertex: u32, radius: f64) -> [f64; 3] {
         (0..3).for_each(|axis| middle[axis] += weight * f64::from(position[axis]));
     }
     middle
+}
+
+/// Apps run in real time: those of one test at a time.
+pub fn alone() -> MutexGuard<'static, ()> {
+    static ALONE: Mutex<()> = Mutex::new(());
+    ALONE.lock().unwrap_or_else(PoisonError::into_inner)
 }
 
 /// An app without a renderer at 40 steps a second of real time.
