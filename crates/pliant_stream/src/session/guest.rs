@@ -77,6 +77,7 @@ pub struct GuestSession {
     tally: Tally,
     stats: LinkStats,
     round_trip: RoundTrip,
+    last_round_trip: Duration,
     clock: ClockEstimate,
     next_ping: Duration,
     pings: u64,
@@ -119,6 +120,7 @@ impl GuestSession {
             tally: Tally::default(),
             stats: LinkStats::default(),
             round_trip: RoundTrip::default(),
+            last_round_trip: Duration::ZERO,
             clock: ClockEstimate::default(),
             next_ping: Duration::ZERO,
             pings: 0,
@@ -324,6 +326,7 @@ impl GuestSession {
                 self.stats.loss_out = loss_of(clock.report);
                 if let Some(rtt) = self.clock.sample(clock.t1, clock.t2, clock.t3, micros(now)) {
                     self.round_trip.sample(rtt);
+                    self.last_round_trip = rtt;
                 }
             }
             Datagram::Targets(_) | Datagram::Nack(_) | Datagram::Ping(_) => self.stats.rejected += 1,
@@ -491,7 +494,7 @@ impl GuestSession {
         if now >= self.next_ping {
             self.pings += 1;
             self.next_ping = now + if self.pings < 8 { PING_SOON } else { PING_EVERY };
-            let round_trip = u32::try_from(micros(self.round_trip.smooth())).unwrap_or(u32::MAX);
+            let round_trip = u32::try_from(micros(self.last_round_trip)).unwrap_or(u32::MAX);
             let report = self.tally.report();
             let clock = Clock { t1: micros(now), report, round_trip, ..Clock::default() };
             self.datagram(&Datagram::Ping(clock));

@@ -282,7 +282,7 @@ impl HostSession {
             }
             Datagram::Ping(clock) => {
                 p.stats.loss_out = loss_of(clock.report);
-                p.stats.round_trip = Duration::from_micros(u64::from(clock.round_trip));
+                p.take_round_trip(Duration::from_micros(u64::from(clock.round_trip)));
                 p.send_pong(now, clock.t1, now, &mut self.out);
             }
             Datagram::Frame(_) | Datagram::Pong(_) => p.stats.rejected += 1,
@@ -366,7 +366,7 @@ impl HostSession {
                 self.drop_peer(id, EndReason::Silent, true);
                 continue;
             }
-            let (bytes, round_trip) = (p.stats.bytes_out, p.stats.round_trip);
+            let (bytes, round_trip) = (p.stats.bytes_out, p.last_round_trips[0].min(p.last_round_trips[1]));
             p.regulator.judge(now, bytes, round_trip, self.config.guest_rate);
             p.stats.level = p.regulator.level();
             while let Some(t) = p.transfers.front_mut() {

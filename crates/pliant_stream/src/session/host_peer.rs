@@ -4,7 +4,7 @@ use std::collections::{BTreeMap, BTreeSet, VecDeque};
 use std::sync::Arc;
 use std::time::Duration;
 
-use super::outbox::{Budget, Tally};
+use super::outbox::{Budget, RoundTrip, Tally};
 use super::regulator::Regulator;
 use super::{Channel, EndReason, LinkStats, Output};
 use crate::state::{BodyId, PeerId, Tick, UserId};
@@ -68,6 +68,8 @@ pub(crate) struct Peer {
     tally: Tally,
     pub(crate) stats: LinkStats,
     pub(crate) regulator: Regulator,
+    pub(crate) last_round_trips: [Duration; 2],
+    round_trip: RoundTrip,
 }
 
 impl Peer {
@@ -96,6 +98,8 @@ impl Peer {
             tally: Tally::default(),
             stats: LinkStats::default(),
             regulator: Regulator::default(),
+            last_round_trips: [Duration::ZERO; 2],
+            round_trip: RoundTrip::default(),
         }
     }
 
@@ -144,6 +148,16 @@ impl Peer {
         let clock = Clock { t1, t2: micros(t2), t3: micros(now), report: self.report(), round_trip: 0 };
         let sequence = self.next_sequence();
         self.datagram(Datagram::Pong(clock).encode(sequence), out);
+    }
+
+    /// A round trip that the guest measured; zero when it has none yet.
+    pub(crate) fn take_round_trip(&mut self, sample: Duration) {
+        if sample.is_zero() {
+            return;
+        }
+        self.round_trip.sample(sample);
+        self.round_trip.write(&mut self.stats);
+        self.last_round_trips = [self.last_round_trips[1], sample];
     }
 
     pub(crate) fn report(&self) -> Report {

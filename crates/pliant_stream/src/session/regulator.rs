@@ -19,18 +19,19 @@ pub(crate) struct Regulator {
     level: u8,
     since: Option<(Duration, u64)>,
     least: f64,
+    last: f64,
     calm: u32,
     patience: u32,
 }
 
 impl Default for Regulator {
     fn default() -> Self {
-        Self { level: 0, since: None, least: 3600.0, calm: 0, patience: PATIENCE }
+        Self { level: 0, since: None, least: 3600.0, last: 0.0, calm: 0, patience: PATIENCE }
     }
 }
 
 impl Regulator {
-    /// Judges the last window. `bytes`: sent in all; `rate`: bits a second that are allowed.
+    /// Judges the last window. `bytes`: sent in all; `round_trip`: the lesser of the last two, unsmoothed; `rate`: bits a second that are allowed.
     pub(crate) fn judge(&mut self, now: Duration, bytes: u64, round_trip: Duration, rate: f64) {
         let (from, before) = *self.since.get_or_insert((now, bytes));
         let passed = now.saturating_sub(from);
@@ -44,7 +45,10 @@ impl Regulator {
             // The least is forgotten within a minute: routes change for longer ones too.
             self.least = round_trip.min(self.least + 0.02 * (round_trip - self.least).clamp(0.0, 1.0));
         }
-        let queued = round_trip > self.least + QUEUE;
+        // A queue that shrinks by a third in a second is already being dealt with.
+        let excess = round_trip - self.least;
+        let queued = excess > QUEUE && excess > 0.7 * self.last;
+        self.last = excess;
         if bits > rate || queued {
             if self.calm > 0 && self.calm < self.patience {
                 // It was raised not long ago, and that was too much.

@@ -73,7 +73,7 @@ pub struct Clock {
     pub t3: u64,
     /// What the sender of this datagram has received.
     pub report: Report,
-    /// The guest's smoothed round trip, us; 0 when not known yet.
+    /// The last round trip that the guest measured, us; 0 when there is none yet.
     pub round_trip: u32,
 }
 
