@@ -6,6 +6,7 @@ use std::time::Duration;
 
 use pliant_modal::ModalModel;
 
+use super::download::Download;
 use super::guest_body::BodyView;
 use super::guest_config::{GuestConfig, GuestEvent};
 use super::host_peer::micros;
@@ -26,8 +27,6 @@ const PING_EVERY: Duration = Duration::from_millis(500);
 const PING_SOON: Duration = Duration::from_millis(100);
 /// A held target that does not move is said again this often.
 const TARGET_EVERY: Duration = Duration::from_millis(250);
-/// A model larger than this is refused, bytes.
-const MAX_MODEL: u64 = 1 << 30;
 /// Most events that wait for the application; the oldest are dropped.
 const MAX_EVENTS: usize = 4096;
 /// Each datagram says the last so many targets of a grab.
@@ -50,12 +49,6 @@ struct OwnGrab {
     said: Duration,
 }
 
-#[derive(Debug, Default)]
-struct Download {
-    bytes: Vec<u8>,
-    total: u64,
-}
-
 /// A guest of a session: a state machine without sockets or clock; see [`super`].
 #[derive(Debug)]
 pub struct GuestSession {
@@ -63,9 +56,9 @@ pub struct GuestSession {
     max_datagram: usize,
     standing: Standing,
     newmark: Newmark,
-    models: BTreeMap<[u8; 32], Arc<ModalModel>>,
-    downloads: BTreeMap<[u8; 32], Download>,
-    bodies: BTreeMap<BodyId, BodyView>,
+    pub(super) models: BTreeMap<[u8; 32], Arc<ModalModel>>,
+    pub(super) downloads: BTreeMap<[u8; 32], Download>,
+    pub(super) bodies: BTreeMap<BodyId, BodyView>,
     stalled: BTreeSet<BodyId>,
     users: BTreeMap<UserId, String>,
     grabs: BTreeMap<u16, OwnGrab>,
@@ -418,47 +411,6 @@ impl GuestSession {
         }
     }
 
-    fn model_chunk(&mut self, hash: [u8; 32], offset: u64, total: u64, bytes: &[u8]) {
-        let wanted = self.bodies.values().any(|b| b.info().hash == hash && b.model().is_none());
-        let download = self.downloads.entry(hash).or_default();
-        let received = download.bytes.len() as u64;
-        let fits = wanted
-            && (1..=MAX_MODEL).contains(&total)
-            && offset == received
-            && (received == 0 || download.total == total)
-            && received + bytes.len() as u64 <= total
-            && !bytes.is_empty();
-        if !fits {
-            return self.break_off();
-        }
-        download.total = total;
-        // Grows with what has arrived: a false total reserves nothing.
-        download.bytes.extend_from_slice(bytes);
-        let received = download.bytes.len() as u64;
-        self.event(GuestEvent::ModelProgress { hash, received, total });
-        if received < total {
-            return;
-        }
-        let Some(done) = self.downloads.remove(&hash) else { return };
-        match ModalModel::from_bytes(&done.bytes) {
-            Ok(model) if model.hash().0 == hash => {
-                let model = Arc::new(model);
-                self.models.insert(hash, model.clone());
-                let mut ready = Vec::new();
-                for view in self.bodies.values_mut().filter(|b| b.info().hash == hash) {
-                    view.set_model(model.clone());
-                    if view.is_ready() {
-                        ready.push(view.id());
-                    }
-                }
-                for body in ready {
-                    self.event(GuestEvent::BodyReady { body, model: model.clone() });
-                }
-            }
-            _ => self.break_off(),
-        }
-    }
-
     /// Steps all bodies to what is due by now, and sends what is due: targets, questions, clock requests. Call once a
     /// frame and at [`GuestSession::next_wakeup`]. Returns how many ticks all bodies took together.
     pub fn update(&mut self, now: Duration) -> u64 {
@@ -589,14 +541,14 @@ impl GuestSession {
         self.out.push_back(Output { peer: PeerId::HOST, channel: Channel::Message, bytes: bytes.into() });
     }
 
-    fn event(&mut self, event: GuestEvent) {
+    pub(super) fn event(&mut self, event: GuestEvent) {
         if self.events.len() >= MAX_EVENTS {
             self.events.pop_front();
         }
         self.events.push_back(event);
     }
 
-    fn break_off(&mut self) {
+    pub(super) fn break_off(&mut self) {
         self.message(&GuestMessage::Goodbye { reason: EndReason::Protocol });
         self.close(EndReason::Protocol);
     }

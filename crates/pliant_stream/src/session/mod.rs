@@ -15,6 +15,7 @@
 //! Messages are whole: the transport keeps their borders and their order (for QUIC: one stream each way, each message
 //! preceded by its length as four bytes, little-endian; at most [`MAX_MESSAGE`] bytes).
 
+mod download;
 mod guest;
 mod guest_body;
 mod guest_config;

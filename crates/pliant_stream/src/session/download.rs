@@ -1,0 +1,60 @@
+//! Models that arrive in pieces.
+
+use std::sync::Arc;
+
+use pliant_modal::ModalModel;
+
+use super::guest::GuestSession;
+use super::guest_config::GuestEvent;
+
+/// A model larger than this is refused, bytes.
+const MAX_MODEL: u64 = 1 << 30;
+
+#[derive(Debug, Default)]
+pub(super) struct Download {
+    pub(super) bytes: Vec<u8>,
+    pub(super) total: u64,
+}
+
+impl GuestSession {
+    pub(super) fn model_chunk(&mut self, hash: [u8; 32], offset: u64, total: u64, bytes: &[u8]) {
+        let wanted = self.bodies.values().any(|b| b.info().hash == hash && b.model().is_none());
+        let download = self.downloads.entry(hash).or_default();
+        let received = download.bytes.len() as u64;
+        let fits = wanted
+            && (1..=MAX_MODEL).contains(&total)
+            && offset == received
+            && (received == 0 || download.total == total)
+            && received + bytes.len() as u64 <= total
+            && !bytes.is_empty();
+        if !fits {
+            return self.break_off();
+        }
+        download.total = total;
+        // Grows with what has arrived: a false total reserves nothing.
+        download.bytes.extend_from_slice(bytes);
+        let received = download.bytes.len() as u64;
+        self.event(GuestEvent::ModelProgress { hash, received, total });
+        if received < total {
+            return;
+        }
+        let Some(done) = self.downloads.remove(&hash) else { return };
+        match ModalModel::from_bytes(&done.bytes) {
+            Ok(model) if model.hash().0 == hash => {
+                let model = Arc::new(model);
+                self.models.insert(hash, model.clone());
+                let mut ready = Vec::new();
+                for view in self.bodies.values_mut().filter(|b| b.info().hash == hash) {
+                    view.set_model(model.clone());
+                    if view.is_ready() {
+                        ready.push(view.id());
+                    }
+                }
+                for body in ready {
+                    self.event(GuestEvent::BodyReady { body, model: model.clone() });
+                }
+            }
+            _ => self.break_off(),
+        }
+    }
+}
