@@ -28,8 +28,9 @@ pub struct BakeConfig {
     pub damping: Damping,
     /// What is held fixed; the union of all. Default: none, a free body.
     pub anchors: Vec<Anchor>,
-    /// For how many places on the surface the residual flexibility is baked. Default: 64.
-    pub sites: usize,
+    /// For how many places on the surface the residual flexibility is baked, spread evenly; at most one a vertex.
+    /// Default: `None`, as many as a second of one core gives, from 64 to 512.
+    pub sites: Option<usize>,
     /// Radii of the patches at each of these places, as shares of the body's largest extent. Default: 0.03, 0.06, 0.12.
     pub site_radii: Vec<f64>,
     /// Folder that gets `K.mtx` and `M.mtx` (MatrixMarket); made when it is not there. Default: none.
@@ -47,7 +48,7 @@ impl Default for BakeConfig {
             density: 1000.0,
             damping: Damping::Ratio(0.03),
             anchors: Vec::new(),
-            sites: 64,
+            sites: None,
             site_radii: vec![0.03, 0.06, 0.12],
             export_matrices: None,
         }
@@ -55,7 +56,7 @@ impl Default for BakeConfig {
 }
 
 impl BakeConfig {
-    /// Checks the numbers that need no mesh. [`bake`](crate::bake) does so first; a program may before it makes a mesh.
+    /// Checks the numbers that need no mesh. [`bake()`](crate::bake()) does so first; a program may before it makes a mesh.
     ///
     /// # Errors
     /// [`BakeError::Parameter`] for a number that is not finite or not in its range, for no modes

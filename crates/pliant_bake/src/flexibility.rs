@@ -2,6 +2,7 @@
 
 use faer::Mat;
 use pliant_modal::{FlexibilitySite, ModelError, Patch, SurfaceMesh};
+use rayon::prelude::*;
 
 use crate::blocks::{self, Tall};
 use crate::fem::ANCHORED;
@@ -11,6 +12,12 @@ use crate::surface::Skin;
 
 /// Patches per group of right-hand sides; three columns each.
 const GROUP: usize = 8;
+
+/// Multiplications that the sites may take unless their number is given: about a second of one core.
+const BUDGET: f64 = 1.4e10;
+
+/// Groups that are solved side by side.
+const WAVE: usize = 8;
 
 /// `W^T (K^-1 - Phi Lambda^-1 Phi^T) W` for patches of each radius (m) around each vertex.
 pub(crate) fn sites(
@@ -33,38 +40,59 @@ pub(crate) fn sites(
     let mut order: Vec<usize> = (0..patches.len()).collect();
     order.sort_by_key(|&index| skin.first_row(patches[index].center(), number));
     let mut out: Vec<Option<FlexibilitySite>> = vec![None; patches.len()];
-    for (index, group) in order.chunks(GROUP).enumerate() {
-        report((index * GROUP) as f64 / patches.len() as f64);
-        let width = 3 * group.len();
-        let mut loads = vec![0.0; solver.dofs() * width];
-        for (place, &patch) in group.iter().enumerate() {
-            let patch = &patches[patch];
-            for &(vertex, weight) in patch.entries() {
-                skin.spread(vertex, weight, &mut |node, weight| {
-                    let row = number[node as usize];
-                    if row != ANCHORED {
-                        for axis in 0..3 {
-                            loads[(3 * row as usize + axis) * width + 3 * place + axis] += weight;
-                        }
-                    }
-                });
-            }
-        }
-        let full = held.compliance(solver, &mut loads, width, modes);
-        for (place, &site) in group.iter().enumerate() {
-            let patch = &patches[site];
-            let flexibility = std::array::from_fn(|i| {
-                std::array::from_fn(|j| {
-                    let entry = |i: usize, j: usize| full[(3 * place + i, j)];
-                    let residual = 0.5 * (entry(i, j) + entry(j, i));
-                    // Rounding must not make a compliance negative.
-                    if i == j { residual.max(0.0) } else { residual }
-                })
-            });
-            out[site] = Some(FlexibilitySite { vertex: patch.center(), radius: patch.radius(), flexibility });
+    for (index, wave) in order.chunks(GROUP * WAVE).enumerate() {
+        report((index * GROUP * WAVE) as f64 / patches.len() as f64);
+        let found: Vec<Vec<[[f64; 3]; 3]>> = wave
+            .par_chunks(GROUP)
+            .map(|group| {
+                let loads: Vec<Load> =
+                    group.iter().map(|&site| Load::new(&patches[site], skin, number)).collect();
+                held.residual(solver, modes, &loads)
+            })
+            .collect();
+        for (&site, flexibility) in wave.iter().zip(found.into_iter().flatten()) {
+            let (vertex, radius) = (patches[site].center(), patches[site].radius());
+            out[site] = Some(FlexibilitySite { vertex, radius, flexibility });
         }
     }
     Ok(out.into_iter().flatten().collect())
+}
+
+/// How many places on the surface cost about [`BUDGET`]: each patch goes once through the factor with three columns.
+pub(crate) fn affordable_sites(solver: &Solver, radii: usize) -> usize {
+    let patch = 3.0 * solver.factor.symbolic.values as f64;
+    ((BUDGET / (patch * radii.max(1) as f64)) as usize).clamp(64, 512)
+}
+
+/// A unit force on a patch, the same along each axis: rows of nodes and their shares.
+struct Load(Vec<(usize, f64)>);
+
+impl Load {
+    fn new(patch: &Patch, skin: &Skin, number: &[u32]) -> Self {
+        let mut rows = Vec::new();
+        for &(vertex, weight) in patch.entries() {
+            skin.spread(vertex, weight, &mut |node, share| {
+                let row = number[node as usize];
+                if row != ANCHORED {
+                    rows.push((row as usize, share));
+                }
+            });
+        }
+        Self(rows)
+    }
+
+    /// `X^T W` for a block X of `width` columns: `[column][axis]`.
+    fn project(&self, x: &[f64], width: usize) -> Vec<[f64; 3]> {
+        let mut out = vec![[0.0; 3]; width];
+        for &(row, share) in &self.0 {
+            for (axis, x) in x[3 * row * width..][..3 * width].chunks_exact(width).enumerate() {
+                for (out, x) in out.iter_mut().zip(x) {
+                    out[axis] += share * x;
+                }
+            }
+        }
+        out
+    }
 }
 
 /// What the pseudo-inverse of a free body adds to the factor: `Z = (K + springs)^-1 M R` and `R^T M Z`.
@@ -83,36 +111,52 @@ impl Held {
         Self { free }
     }
 
-    /// The 3x3 residual compliances of the loads W (three columns a patch), stacked: row `3 place + i`.
+    /// The residual flexibility of each load.
     ///
     /// `W^T K^-1 W = |L^-1 W|^2`: half a solution is enough. For a free body, with `r = R^T W`:
     /// `W^T K^+ W = |L^-1 W|^2 - (W^T Z) r - r^T (Z^T W) + r^T (R^T M Z) r`.
-    fn compliance(&self, solver: &Solver, loads: &mut [f64], width: usize, modes: &Modes) -> Mat<f64> {
-        let count = modes.lambda.len();
-        let along = blocks::gram(Tall::new(&modes.phi, count), Tall::new(loads, width));
-        let free = self.free.as_ref().zip(solver.rigid.as_ref()).map(|((z, inner), rigid)| {
-            let r = blocks::gram(Tall::new(&rigid.modes, 6), Tall::new(loads, width));
-            let b = blocks::gram(Tall::new(z, 6), Tall::new(loads, width));
-            (r, b, inner)
-        });
-        solver.factor.forward(loads, width);
-        let half = blocks::gram(Tall::new(loads, width), Tall::new(loads, width));
-        Mat::from_fn(width, 3, |row, j| {
-            let (i, j) = (row, row - row % 3 + j);
-            let mut sum = half[(i, j)];
-            if let Some((r, b, inner)) = &free {
-                for k in 0..6 {
-                    sum -= b[(k, i)] * r[(k, j)] + r[(k, i)] * b[(k, j)];
-                    for l in 0..6 {
-                        sum += r[(k, i)] * inner[(k, l)] * r[(l, j)];
-                    }
+    fn residual(&self, solver: &Solver, modes: &Modes, loads: &[Load]) -> Vec<[[f64; 3]; 3]> {
+        let width = 3 * loads.len();
+        let mut x = vec![0.0; solver.dofs() * width];
+        for (place, load) in loads.iter().enumerate() {
+            for &(row, share) in &load.0 {
+                for axis in 0..3 {
+                    x[(3 * row + axis) * width + 3 * place + axis] += share;
                 }
             }
-            for mode in 0..count {
-                sum -= along[(mode, i)] * along[(mode, j)] / modes.lambda[mode];
-            }
-            sum
-        })
+        }
+        solver.factor.forward(&mut x, width);
+        let half = blocks::gram(Tall::new(&x, width), Tall::new(&x, width));
+        let one = |(place, load): (usize, &Load)| {
+            let along = load.project(&modes.phi, modes.lambda.len());
+            let free = self
+                .free
+                .as_ref()
+                .zip(solver.rigid.as_ref())
+                .map(|((z, inner), rigid)| (load.project(&rigid.modes, 6), load.project(z, 6), inner));
+            let entry = |i: usize, j: usize| {
+                let mut sum = half[(3 * place + i, 3 * place + j)];
+                if let Some((r, b, inner)) = &free {
+                    for k in 0..6 {
+                        sum -= b[k][i] * r[k][j] + r[k][i] * b[k][j];
+                        for l in 0..6 {
+                            sum += r[k][i] * inner[(k, l)] * r[l][j];
+                        }
+                    }
+                }
+                let modal: f64 =
+                    along.iter().zip(&modes.lambda).map(|(phi, lambda)| phi[i] * phi[j] / lambda).sum();
+                sum - modal
+            };
+            std::array::from_fn(|i| {
+                std::array::from_fn(|j| {
+                    let residual = 0.5 * (entry(i, j) + entry(j, i));
+                    // Rounding must not make a compliance negative.
+                    if i == j { residual.max(0.0) } else { residual }
+                })
+            })
+        };
+        loads.iter().enumerate().map(one).collect()
     }
 }
 

@@ -1,6 +1,6 @@
 //! From a mesh to a modal model: finite elements, sparse factorisation and vibration modes.
 //!
-//! [`bake`] takes tetrahedra and a material and finds the lowest elastic modes of `K phi = omega^2 M phi`:
+//! [`bake()`] takes tetrahedra and a material and finds the lowest elastic modes of `K phi = omega^2 M phi`:
 //!
 //! 1. linear elasticity on 4-node or 10-node tetrahedra, consistent mass, all integrals exact; near
 //!    incompressibility (Poisson ratio above 0.45) the pressure is averaged over nodes, so that nothing locks;

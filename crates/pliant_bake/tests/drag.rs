@@ -1,0 +1,77 @@
+//! The paper's bar, baked and dragged: the reaction is smooth where the rigid constraint of its equation (4) flips sign every step.
+#![allow(clippy::unwrap_used, missing_docs, reason = "a failed test should panic")]
+
+use std::sync::Arc;
+
+use pliant_bake::{BakeConfig, bake};
+use pliant_mesh::shapes;
+use pliant_modal::{Body, BodyConfig, Damping, Element, GrabConfig, Integrator, ModalModel, Patch};
+
+/// 20 x 3 x 3 cells, 1,080 tetrahedra, fixed at x = 0, 20 modes.
+fn bar(young: f64) -> Arc<ModalModel> {
+    let mesh = shapes::bar([20, 3, 3], [1.0, 0.15, 0.15]).unwrap();
+    assert_eq!(mesh.tets.len(), 1_080);
+    let config = BakeConfig {
+        element: Element::Tet4,
+        modes: 20,
+        young,
+        damping: Damping::Ratio(0.02),
+        anchors: vec!["x<0.001".parse().unwrap()],
+        ..BakeConfig::default()
+    };
+    Arc::new(bake(&mesh, None, &config, &mut |_, _| {}).unwrap().model)
+}
+
+fn tip(model: &ModalModel) -> u32 {
+    let from_middle = |p: &[f32; 3]| (p[0] - 1.0).powi(2) + (p[1] - 0.075).powi(2) + (p[2] - 0.075).powi(2);
+    let positions = model.surface().positions();
+    (0..positions.len())
+        .min_by(|&a, &b| from_middle(&positions[a]).total_cmp(&from_middle(&positions[b])))
+        .unwrap() as u32
+}
+
+/// Rises from 0 to 1 in a second, smooth up to the acceleration.
+fn path(t: f64) -> f64 {
+    let t = t.clamp(0.0, 1.0);
+    t * t * t * (10.0 - 15.0 * t + 6.0 * t * t)
+}
+
+/// max |second difference of F| / max |F| of the tip dragged sideways by a fifth of the length: 4 for a sign flip each step.
+fn ringing(model: &Arc<ModalModel>, integrator: Integrator, step: f64) -> f64 {
+    let mut body = Body::new(model.clone(), BodyConfig { step, integrator, ..Default::default() }).unwrap();
+    let patch = Patch::around(model.surface(), tip(model), 0.06).unwrap();
+    let grab = body.grab(&patch, GrabConfig::default()).unwrap();
+    let start = body.grab_position(grab).unwrap();
+    let mut forces = Vec::new();
+    for i in 0..(2.0 / step) as usize {
+        let way = 0.2 * path((i + 1) as f64 * step);
+        body.set_target(grab, [start[0], start[1] + way, start[2]]).unwrap();
+        body.step().unwrap();
+        forces.push(body.reaction(grab).unwrap());
+    }
+    let norm = |f: [f64; 3]| f.iter().map(|x| x * x).sum::<f64>().sqrt();
+    let largest = forces.iter().map(|f| norm(*f)).fold(0.0, f64::max);
+    let jump = |w: &[[f64; 3]]| norm(std::array::from_fn(|k| w[2][k] - 2.0 * w[1][k] + w[0][k]));
+    forces.windows(3).map(jump).fold(0.0, f64::max) / largest
+}
+
+#[test]
+fn the_dragged_bar_does_not_ring() {
+    let model = bar(2e6);
+    for integrator in [Integrator::Exact, Integrator::GeneralizedAlpha { rho_inf: 0.5 }] {
+        let got = ringing(&model, integrator, 1.0 / 40.0);
+        println!("{integrator:?}: {got:.4}");
+        assert!(got < 0.1, "{integrator:?}: {got}");
+    }
+}
+
+#[test]
+fn nor_does_it_at_any_stiffness_and_step() {
+    for young in [1e5, 1e9, 1e11] {
+        let model = bar(young);
+        for step in [1.0 / 40.0, 1.0 / 240.0, 1.0 / 1000.0] {
+            let got = ringing(&model, Integrator::Exact, step);
+            assert!(got < 0.1, "E {young}, h {step}: {got}");
+        }
+    }
+}

@@ -1,0 +1,59 @@
+//! The stiffness that a hand feels between the baked sites, against the full solution.
+#![expect(clippy::unwrap_used, reason = "a failed test should panic")]
+
+use pliant_bake::{BakeConfig, bake};
+use pliant_mesh::{TetMesh, shapes};
+use pliant_modal::{ModalModel, Patch};
+
+/// `W^T Phi Lambda^-1 Phi^T W` of a patch, m/N.
+fn modal_compliance(model: &ModalModel, patch: &Patch) -> [[f64; 3]; 3] {
+    let mut out = [[0.0; 3]; 3];
+    for (mode, omega) in model.omega().iter().enumerate() {
+        let mut phi = [0.0; 3];
+        for &(vertex, weight) in patch.entries() {
+            for (axis, phi) in phi.iter_mut().enumerate() {
+                *phi += weight * f64::from(model.displacement_row(vertex, axis, mode));
+            }
+        }
+        for i in 0..3 {
+            for j in 0..3 {
+                out[i][j] += phi[i] * phi[j] / (omega * omega);
+            }
+        }
+    }
+    out
+}
+
+/// Errors of the compliance along each axis at every surface vertex, sorted: default sites against a bake with a site at each.
+fn errors(mesh: &TetMesh, config: &BakeConfig, radius: f64) -> Vec<f64> {
+    let model = bake(mesh, None, config, &mut |_, _| ()).unwrap().model;
+    let share = radius / model.size();
+    let every = BakeConfig { sites: Some(usize::MAX), site_radii: vec![share], ..config.clone() };
+    let exact = bake(mesh, None, &every, &mut |_, _| ()).unwrap().model;
+    let mut out = Vec::new();
+    for site in &exact.parts().sites {
+        let patch = Patch::around(model.surface(), site.vertex, radius).unwrap();
+        let modal = modal_compliance(&model, &patch);
+        let felt = model.residual_flexibility(&patch, model.mode_count());
+        for axis in 0..3 {
+            let truth = modal[axis][axis] + site.flexibility[axis][axis];
+            out.push(((modal[axis][axis] + felt[axis][axis]) / truth - 1.0).abs());
+        }
+    }
+    out.sort_by(f64::total_cmp);
+    out
+}
+
+#[test]
+fn a_hand_feels_the_full_stiffness_between_the_sites() {
+    let mesh = shapes::bar([20, 3, 3], [1.0, 0.15, 0.15]).unwrap();
+    let config = BakeConfig { modes: 60, anchors: vec!["x<0.001".parse().unwrap()], ..BakeConfig::default() };
+    // A bar as small as this has a site at every vertex: at the baked radii the answer is exact.
+    let errors_at_baked = errors(&mesh, &config, 0.06);
+    assert!(errors_at_baked.last().unwrap() < &1e-5, "{errors_at_baked:?}");
+    // Sites at half the vertices, and a radius between two baked ones: blended. Modes alone miss 5 % of the compliance
+    // in the median, 40 % at one vertex in ten and 89 % at worst.
+    let sparse = errors(&mesh, &BakeConfig { sites: Some(128), ..config }, 0.09);
+    let at = |share: f64| sparse[(share * (sparse.len() - 1) as f64) as usize];
+    assert!(at(0.5) < 0.02 && at(0.9) < 0.16 && at(1.0) < 0.55, "{sparse:?}");
+}
