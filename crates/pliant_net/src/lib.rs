@@ -52,19 +52,18 @@ mod phase;
 mod place;
 mod plugin;
 mod scene;
+mod seen;
 pub mod transport;
 mod user;
 
 pub use figures::{
     LOSS_IN, LOSS_OUT, NACKS, NetStats, RATE_IN, RATE_OUT, RECOVERED, ROUND_TRIP, SHOWN_OFFSET,
 };
-pub use guest::{
-    BodyArrived, BodyLeft, GrabRefused, GuestState, JoinConfig, NetGuest, RemoteBody, SeenHand, SeenHands,
-    SessionClosed,
-};
+pub use guest::{GuestState, JoinConfig, NetGuest};
 pub use host::{Holding, HostConfig, NetHost};
 pub use plugin::{NetPlugin, NetSystems};
 pub use scene::SharedBody;
+pub use seen::{BodyArrived, BodyLeft, GrabRefused, RemoteBody, SeenHand, SeenHands, SessionClosed};
 pub use transport::{Access, Emulation, Fingerprint, HostOptions, Identity, Invite, JoinOptions, Token};
 pub use user::{HandOf, Hands, User, UserJoined, UserLeft, UserLink, Yourself, colour_of};
 

@@ -11,6 +11,7 @@ use crate::figures::{self, NetStats, RateMarks};
 use crate::guest::{self, JoinConfig, NetGuest};
 use crate::host::{self, HostConfig, NetHost};
 use crate::scene::SharedBody;
+use crate::seen;
 use crate::transport::{Endpoint, Invite, TransportError};
 use crate::user::{UserJoined, UserLeft};
 
@@ -112,7 +113,7 @@ impl Plugin for NetPlugin {
                     .add_systems(PostUpdate, host::finish);
             }
             Start::Join(config, endpoint) => {
-                guest::register(app);
+                seen::register(app);
                 let mut start = Some((config, endpoint));
                 let begin = move |world: &mut World| {
                     let Some((config, endpoint)) = start.take() else { return };
