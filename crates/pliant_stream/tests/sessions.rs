@@ -643,3 +643,22 @@ fn a_force_that_the_stream_does_not_say_is_learnt() {
     let counts = pair.guests[0].session.body(BODY).unwrap().counts();
     assert!(counts.snapshots <= 1, "learnt, not sent again and again: {counts:?}");
 }
+
+#[test]
+fn a_body_that_goes_while_its_model_is_on_the_way_harms_nobody() {
+    let model = bar(40, 0.05);
+    let (mut pair, mut scene) =
+        start_with(&bar(6, 0.05), HostConfig { model_rate: 50e3, ..Default::default() });
+    scene.body = Body::new(bar(6, 0.05), BodyConfig { step: 0.025, ..Default::default() }).unwrap();
+    pair.join(GuestConfig::default(), paper1(), 1).unwrap();
+    pair.run_until(3 * S, &mut scene);
+    let second = BodyId(9);
+    pair.host.add_body(second, "brief", model.clone(), BodySetup::default()).unwrap();
+    pair.run_until(4 * S, &mut scene);
+    pair.host.remove_body(second);
+    pair.run_until(5 * S, &mut scene);
+    pair.host.add_body(second, "again", model, BodySetup::default()).unwrap();
+    pair.run_until(40 * S, &mut scene);
+    assert!(!pair.guests[0].session.is_closed());
+    assert!(pair.guests[0].session.body(second).unwrap().model().is_some(), "the model came after all");
+}

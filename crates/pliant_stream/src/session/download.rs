@@ -18,7 +18,11 @@ pub(super) struct Download {
 
 impl GuestSession {
     pub(super) fn model_chunk(&mut self, hash: [u8; 32], offset: u64, total: u64, bytes: &[u8]) {
-        let wanted = self.bodies.values().any(|b| b.info().hash == hash && b.model().is_none());
+        if self.models.contains_key(&hash) {
+            return;
+        }
+        // Also of a body that has gone since: the host counts the model as known here once it has sent it.
+        let wanted = self.announced.contains(&hash);
         let download = self.downloads.entry(hash).or_default();
         let received = download.bytes.len() as u64;
         let fits = wanted

@@ -58,6 +58,8 @@ pub struct GuestSession {
     newmark: Newmark,
     pub(super) models: BTreeMap<[u8; 32], Arc<ModalModel>>,
     pub(super) downloads: BTreeMap<[u8; 32], Download>,
+    /// Hashes of all models that the host has named.
+    pub(super) announced: BTreeSet<[u8; 32]>,
     pub(super) bodies: BTreeMap<BodyId, BodyView>,
     stalled: BTreeSet<BodyId>,
     users: BTreeMap<UserId, String>,
@@ -101,6 +103,7 @@ impl GuestSession {
             newmark: Newmark::average(1.0 / 40.0),
             models: BTreeMap::new(),
             downloads: BTreeMap::new(),
+            announced: BTreeSet::new(),
             bodies: BTreeMap::new(),
             stalled: BTreeSet::new(),
             users: BTreeMap::new(),
@@ -362,6 +365,10 @@ impl GuestSession {
                     return self.break_off();
                 }
                 let name = info.name.clone();
+                if self.announced.len() >= 16 * MAX_BODIES {
+                    return self.break_off();
+                }
+                self.announced.insert(info.hash);
                 let model = self.models.get(&info.hash).cloned();
                 let mut view =
                     BodyView::new(info, self.newmark, self.config.recovery, self.config.own_hand_first);
