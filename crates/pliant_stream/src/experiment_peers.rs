@@ -130,9 +130,14 @@ impl Experiment {
         spent: Duration,
         sent: (u64, u64),
     ) -> Figures {
+        // Taking hold is not part of what is measured.
+        let first = seen.keys().next().copied().unwrap_or(0);
+        let truth: BTreeMap<Tick, &Vec<f64>> = truth.range(first..).map(|(t, q)| (*t, q)).collect();
+        let reactions: BTreeMap<Tick, &Vec<(u16, [f64; 3])>> =
+            reactions.range(first..).map(|(t, r)| (*t, r)).collect();
         let shape = ShapeError::new(&self.model);
         let scale = truth.values().map(|q| shape.compare(q, &[]).1.sqrt()).fold(0.0, f64::max);
-        let all = || reactions.values().flatten().map(|r| norm(r.1));
+        let all = || reactions.values().copied().flatten().map(|r| norm(r.1));
         let force_scale = all().fold(0.0, f64::max);
         let mut f = Figures { scale, force_scale, lost: link.counts().lost, ..Figures::default() };
         let (mut sum, mut largest, mut last) = (0.0, 0.0_f64, 0.0);
@@ -152,7 +157,7 @@ impl Experiment {
             } else {
                 above = None;
             }
-            for (user, real) in reactions.get(tick).into_iter().flatten() {
+            for (user, real) in reactions.get(tick).copied().into_iter().flatten() {
                 let Some((_, shown)) = s.reactions.iter().find(|r| r.0 == *user) else { continue };
                 force += (0..3).map(|k| (shown[k] - real[k]).powi(2)).sum::<f64>();
                 forces += 1;
