@@ -9,7 +9,7 @@ use std::{error::Error, f64::consts::TAU, sync::Arc, time::Duration};
 
 use pliant_haptics::{
     ForceDimension, Hand, HapticDevice, HapticLoop, HeldGrab, Inverse, LoopConfig, ModalLocal, ModelWriter,
-    OpenHaptics, ToolMap, Virtual, VirtualConfig, VirtualHandle,
+    OpenHaptics, ToolMap, VirtualConfig, VirtualDevice, VirtualHandle,
 };
 use pliant_modal::{Body, BodyConfig, GrabConfig, ModalModel, Patch};
 
@@ -30,7 +30,7 @@ fn main() -> Result<(), Box<dyn Error>> {
         "touch" => Box::new(OpenHaptics::open(Default::default())?),
         "omega" => Box::new(ForceDimension::open(Default::default())?),
         _ => {
-            let device = Virtual::new(VirtualConfig::touch(), Hand::FIRM)?;
+            let device = VirtualDevice::new(VirtualConfig::touch(), Hand::FIRM)?;
             hand = Some(device.handle());
             Box::new(device)
         }

@@ -377,20 +377,23 @@ impl LoopCore {
             }
             _ => false,
         };
+        if let (Some(modal), true) = (&self.modal, stepped) {
+            felt.stored = modal.energy();
+        }
         for (i, contact) in model.contacts().iter().enumerate() {
             let arm = self.tool.orientation * Vector3::from(contact.offset);
             let (proxy, speed) = self.follow[i].advance(now, model, contact);
+            let at = self.tool.position + arm;
+            let k = Matrix3::from_fn(|r, c| contact.stiffness[r][c]);
+            let stored = |stretch: Vector3<f64>| 0.5 * stretch.dot(&(k * stretch)).max(0.0);
             let (elastic, damping) = match &self.modal {
                 Some(modal) if stepped => {
-                    felt.stored = modal.energy();
+                    felt.stored += modal.proxy(i).map_or(0.0, |proxy| stored(at - proxy));
                     (modal.reaction(i), Vector3::zeros())
                 }
                 _ => {
-                    let stretch = self.tool.position + arm - proxy;
-                    let k = Matrix3::from_fn(|r, c| contact.stiffness[r][c]);
-                    let elastic = -(k * stretch);
-                    felt.stored += 0.5 * stretch.dot(&(k * stretch)).max(0.0);
-                    (elastic, -(self.tool.velocity - speed) * contact.damping)
+                    felt.stored += stored(at - proxy);
+                    (-(k * (at - proxy)), -(self.tool.velocity - speed) * contact.damping)
                 }
             };
             felt.elastic += elastic;

@@ -4,10 +4,10 @@
 //! series with what the patch gives. Between the spring and the hand stands the [`Safety`] pipeline.
 //!
 //! ```
-//! use pliant_haptics::{Hand, HapticLoop, LoopConfig, Virtual, VirtualConfig};
+//! use pliant_haptics::{Hand, HapticLoop, LoopConfig, VirtualDevice, VirtualConfig};
 //!
 //! # fn main() -> Result<(), Box<dyn std::error::Error>> {
-//! let device = Virtual::new(VirtualConfig::touch(), Hand::FIRM)?;
+//! let device = VirtualDevice::new(VirtualConfig::touch(), Hand::FIRM)?;
 //! let mut running = HapticLoop::start(device, LoopConfig::default())?;
 //! println!("{}", running.coupling());
 //! let stamp = running.report().tick.now;
@@ -26,7 +26,7 @@
 //!
 //! | Layer | What it is |
 //! | --- | --- |
-//! | [`HapticDevice`] | takes a wrench, holds it for a period, says where the hand is: [`Virtual`], [`Positioned`], [`Replay`], `Inverse`, `OpenHaptics`, `ForceDimension` |
+//! | [`HapticDevice`] | takes a wrench, holds it for a period, says where the hand is: [`VirtualDevice`], [`Positioned`], [`Replay`], `Inverse`, `OpenHaptics`, `ForceDimension` |
 //! | [`LoopCore`] | a sample and a [`LocalModel`] in, a [`Wrench`] out: no clock, no thread, no allocation |
 //! | [`Cycle`] | the core and a device, period by period: loss and return, calibration, buttons, counters; in real or virtual time |
 //! | [`HapticLoop`] | a cycle on its thread, absolute pacing, FIFO priority where allowed; lock-free ends for the app |
@@ -94,4 +94,4 @@ pub use safety::{
 pub use tool::ToolMap;
 #[cfg(feature = "vendor")]
 pub use vendor::{ForceDimension, ForceDimensionConfig, OpenHaptics, OpenHapticsConfig, VendorError};
-pub use virtual_device::{Virtual, VirtualConfig, VirtualHandle};
+pub use virtual_device::{VirtualConfig, VirtualDevice, VirtualHandle};

@@ -91,6 +91,12 @@ impl ModalLocal {
         Vector3::from(reaction) * self.scale
     }
 
+    /// Where the copy has the patch of the tool's grab `index`, m, world axes.
+    pub(crate) fn proxy(&self, index: usize) -> Option<Vector3<f64>> {
+        let grab = self.held.get(index).copied().flatten()?;
+        Some(Vector3::from(self.body.grab_position(grab.id).ok()?) * self.scale)
+    }
+
     /// Energy that the copy could give back, J of the world.
     pub(crate) fn energy(&self) -> f64 {
         self.body.energy() * self.scale * self.scale

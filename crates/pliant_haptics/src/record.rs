@@ -211,7 +211,9 @@ impl HapticDevice for Replay {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::{Cycle, Hand, LocalModel, LoopConfig, LoopEvent, Sink, Virtual, VirtualConfig, VirtualPace};
+    use crate::{
+        Cycle, Hand, LocalModel, LoopConfig, LoopEvent, Sink, VirtualConfig, VirtualDevice, VirtualPace,
+    };
 
     struct Write<'a>(&'a mut Recorder<Vec<u8>>);
     impl Sink for Write<'_> {
@@ -223,7 +225,7 @@ mod tests {
 
     #[test]
     fn the_same_hand_twice() {
-        let device = Virtual::new(VirtualConfig::touch(), Hand::LIGHT).unwrap();
+        let device = VirtualDevice::new(VirtualConfig::touch(), Hand::LIGHT).unwrap();
         let hand = device.handle();
         let mut recorder = Recorder::new(Vec::new(), &device.info()).unwrap();
         let mut cycle = Cycle::new(device, LoopConfig::default()).unwrap();

@@ -136,7 +136,7 @@ impl VirtualConfig {
     }
 }
 
-/// Moves the hand of a [`Virtual`] device from another thread, and plays tricks on it.
+/// Moves the hand of a [`VirtualDevice`] device from another thread, and plays tricks on it.
 #[derive(Debug, Clone, Default)]
 pub struct VirtualHandle {
     shared: Arc<Shared>,
@@ -186,7 +186,7 @@ impl VirtualHandle {
 /// Integrated in closed form between the substeps (20 kHz or more), so that without friction nothing is lost or gained by integration: what is
 /// unstable here is unstable by the loop's own doing.
 #[derive(Debug)]
-pub struct Virtual {
+pub struct VirtualDevice {
     config: VirtualConfig,
     hand: Hand,
     handle: VirtualHandle,
@@ -203,7 +203,7 @@ pub struct Virtual {
     shown: Vector3<f64>,
 }
 
-impl Virtual {
+impl VirtualDevice {
     /// A device at rest in the middle of its workspace.
     ///
     /// # Errors
@@ -361,7 +361,7 @@ impl Virtual {
     }
 }
 
-impl HapticDevice for Virtual {
+impl HapticDevice for VirtualDevice {
     fn info(&self) -> DeviceInfo {
         self.config.info()
     }
@@ -394,7 +394,8 @@ mod tests {
     fn energy_is_exact() {
         // No damping, no friction, no hand: what the motors put in is what the handle has.
         let mut device =
-            Virtual::new(VirtualConfig { damping: 0.0, ..VirtualConfig::default() }, Hand::NONE).unwrap();
+            VirtualDevice::new(VirtualConfig { damping: 0.0, ..VirtualConfig::default() }, Hand::NONE)
+                .unwrap();
         for k in 0..2000 {
             let t = f64::from(k) * 1e-3;
             device.advance([(17.0 * t).sin(), 0.3, -(5.0 * t).cos()], 1e-3);
@@ -405,7 +406,7 @@ mod tests {
 
     #[test]
     fn hand_settles_where_it_should() {
-        let mut device = Virtual::new(VirtualConfig::default(), Hand::FIRM).unwrap();
+        let mut device = VirtualDevice::new(VirtualConfig::default(), Hand::FIRM).unwrap();
         device.handle().set_target([0.01, 0.0, 0.0]);
         for _ in 0..2000 {
             device.advance([1.0, 0.0, 0.0], 1e-3);
@@ -414,7 +415,7 @@ mod tests {
         assert!((device.position()[0] - 0.012).abs() < 1e-9, "{:?}", device.position());
         // Friction holds against a force below it.
         let config = VirtualConfig { friction: 0.3, ..VirtualConfig::default() };
-        let mut device = Virtual::new(config, Hand::NONE).unwrap();
+        let mut device = VirtualDevice::new(config, Hand::NONE).unwrap();
         for _ in 0..100 {
             device.advance([0.29, 0.0, 0.0], 1e-3);
         }
@@ -424,7 +425,7 @@ mod tests {
     #[test]
     fn encoder_rounds_and_nonsense_is_refused() {
         let config = VirtualConfig { resolution: 50e-6, ..VirtualConfig::default() };
-        let mut device = Virtual::new(config.clone(), Hand::NONE).unwrap();
+        let mut device = VirtualDevice::new(config.clone(), Hand::NONE).unwrap();
         device.place([1.13e-4, -0.6e-4, 0.0], [0.0; 3]);
         let p = device.sample().position;
         assert!((p[0] - 1e-4).abs() < 1e-12 && (p[1] + 5e-5).abs() < 1e-12, "{p:?}");
@@ -438,7 +439,7 @@ mod tests {
             VirtualConfig { integration_rate: 1000.0, ..config.clone() },
             VirtualConfig { delay_periods: 64, ..config },
         ] {
-            assert!(Virtual::new(bad, Hand::NONE).is_err());
+            assert!(VirtualDevice::new(bad, Hand::NONE).is_err());
         }
     }
 }

@@ -7,7 +7,7 @@ use std::cell::Cell;
 
 use pliant_haptics::{
     Calibration, Cycle, DeviceInfo, Fault, Hand, HapticDevice, LoopConfig, LoopEvent, LoopState, Pace,
-    SafetyConfig, Sample, Virtual, VirtualConfig, VirtualPace, Wrench,
+    SafetyConfig, Sample, VirtualConfig, VirtualDevice, VirtualPace, Wrench,
 };
 use rig::{
     Rig,
@@ -147,7 +147,7 @@ fn emergency_stop_is_latched() {
 
 /// A device that lies as the test says.
 struct Liar {
-    inner: Virtual,
+    inner: VirtualDevice,
     lie: Cell<Lie>,
 }
 
@@ -192,7 +192,7 @@ impl HapticDevice for Liar {
 
 /// Runs a spring of 200 N/m, 1 cm stretched by a firm hand, into `lie` for `ticks` and out again.
 fn told(lie: Lie, ticks: usize) -> (Cycle<Liar>, Vec<LoopEvent>, f64, f64) {
-    let device = Virtual::new(VirtualConfig::touch(), Hand::FIRM).unwrap();
+    let device = VirtualDevice::new(VirtualConfig::touch(), Hand::FIRM).unwrap();
     let hand = device.handle();
     hand.set_target([0.014, 0.0, 0.0]);
     let mut cycle =
@@ -257,7 +257,7 @@ fn a_driver_that_fails_each_tick() {
 
 #[test]
 fn a_real_device_is_not_run_without_its_safety() {
-    struct Real(Virtual);
+    struct Real(VirtualDevice);
     impl HapticDevice for Real {
         fn info(&self) -> DeviceInfo {
             DeviceInfo { simulated: false, ..self.0.info() }
@@ -267,7 +267,7 @@ fn a_real_device_is_not_run_without_its_safety() {
         }
         fn safe_stop(&mut self) {}
     }
-    let real = || Real(Virtual::new(VirtualConfig::touch(), Hand::NONE).unwrap());
+    let real = || Real(VirtualDevice::new(VirtualConfig::touch(), Hand::NONE).unwrap());
     let bare = LoopConfig { safety: Some(SafetyConfig::bare()), ..LoopConfig::default() };
     assert!(matches!(Cycle::new(real(), bare), Err(pliant_haptics::StartError::Unsafe(_))));
     assert!(Cycle::new(real(), LoopConfig::default()).is_ok());

@@ -10,7 +10,7 @@ use std::{
     time::{Duration, Instant},
 };
 
-use pliant_haptics::{Hand, HapticLoop, LoopConfig, LoopEvent, LoopState, Virtual, VirtualConfig};
+use pliant_haptics::{Hand, HapticLoop, LoopConfig, LoopEvent, LoopState, VirtualConfig, VirtualDevice};
 use rig::scene::{Scene, SceneConfig};
 
 struct Counting;
@@ -78,7 +78,7 @@ fn the_modal_loop_allocates_nothing() {
 
 #[test]
 fn on_its_own_thread() {
-    let device = Virtual::new(VirtualConfig::touch(), Hand::FIRM).unwrap();
+    let device = VirtualDevice::new(VirtualConfig::touch(), Hand::FIRM).unwrap();
     let hand = device.handle();
     hand.set_target([0.01, 0.0, 0.0]);
     let mut running = HapticLoop::start(device, LoopConfig::default()).unwrap();

@@ -3,7 +3,7 @@
 //! ```no_run
 //! use bevy::prelude::*;
 //! use pliant_body::{ModalBody, PliantBodyPlugin};
-//! use pliant_haptics::{Hand, HapticDevices, HapticTool, HapticsPlugin, LoopConfig, ToolGrip, Virtual, VirtualConfig};
+//! use pliant_haptics::{Hand, HapticDevices, HapticTool, HapticsPlugin, LoopConfig, ToolGrip, VirtualDevice, VirtualConfig};
 //!
 //! fn main() {
 //!     App::new()
@@ -14,7 +14,7 @@
 //!
 //! fn setup(mut commands: Commands, assets: Res<AssetServer>, mut devices: ResMut<HapticDevices>) -> Result {
 //!     commands.spawn(ModalBody::new(assets.load("pip.modal")));
-//!     let device = devices.add(Virtual::new(VirtualConfig::touch(), Hand::FIRM)?, LoopConfig::default())?;
+//!     let device = devices.add(VirtualDevice::new(VirtualConfig::touch(), Hand::FIRM)?, LoopConfig::default())?;
 //!     commands.spawn((HapticTool::new(device), ToolGrip::default(), Transform::from_xyz(0.0, 1.0, 0.0)));
 //!     Ok(())
 //! }

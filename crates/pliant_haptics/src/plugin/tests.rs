@@ -6,7 +6,7 @@ use bevy::{
 use pliant_body::{Grab, GrabForce, ModalAsset, ModalBody, PliantBodyPlugin};
 
 use super::*;
-use crate::{Hand, LoopConfig, LoopState, Virtual, VirtualConfig, VirtualHandle};
+use crate::{Hand, LoopConfig, LoopState, VirtualConfig, VirtualDevice, VirtualHandle};
 
 #[path = "../../tests/rig/block.rs"]
 mod block;
@@ -50,7 +50,7 @@ fn scene(modal: bool) -> Scene {
     let handle =
         app.world_mut().resource_mut::<Assets<ModalAsset>>().add(ModalAsset(std::sync::Arc::new(model)));
     app.world_mut().spawn(ModalBody::new(handle));
-    let device = Virtual::new(VirtualConfig::touch(), Hand::FIRM).unwrap();
+    let device = VirtualDevice::new(VirtualConfig::touch(), Hand::FIRM).unwrap();
     let hand = device.handle();
     let device = app.world_mut().resource_mut::<HapticDevices>().add(device, LoopConfig::default()).unwrap();
     let tool = app
@@ -97,7 +97,8 @@ fn a_press_holds_and_the_hand_feels_the_body() {
         let body = grabs(&mut s.app)[0].1.force;
         assert!(
             (body.x / pull.x - 1.0).abs() < 0.25,
-            "what the body says and what the hand gets: {body} and {pull}"
+            "modal {modal}: what the body says and what the hand gets: {body} and {pull}; {:?}",
+            s.app.world().resource::<HapticDevices>().get(s.device).unwrap().report.tick
         );
         let pose = *s.app.world().get::<ToolPose>(s.tool).unwrap();
         assert!(pose.gain > 0.9 && pose.position.x > 0.1, "{pose:?}");

@@ -5,12 +5,12 @@ pub mod block;
 pub mod scene;
 
 use pliant_haptics::{
-    Contact, CouplingConfig, Cycle, Hand, LocalModel, LoopConfig, LoopEvent, SafetyConfig, Virtual,
-    VirtualConfig, VirtualPace,
+    Contact, CouplingConfig, Cycle, Hand, LocalModel, LoopConfig, LoopEvent, SafetyConfig, VirtualConfig,
+    VirtualDevice, VirtualPace,
 };
 
 pub struct Rig {
-    pub cycle: Cycle<Virtual>,
+    pub cycle: Cycle<VirtualDevice>,
     pub pace: VirtualPace,
     pub model: LocalModel,
     pub events: Vec<LoopEvent>,
@@ -18,7 +18,7 @@ pub struct Rig {
 
 impl Rig {
     pub fn new(device: VirtualConfig, hand: Hand, config: LoopConfig) -> Self {
-        let device = Virtual::new(device, hand).unwrap();
+        let device = VirtualDevice::new(device, hand).unwrap();
         let rate = config.rate;
         Self {
             cycle: Cycle::new(device, config).unwrap(),
@@ -43,7 +43,7 @@ impl Rig {
         Self::new(device, hand, config)
     }
 
-    pub fn device(&self) -> &Virtual {
+    pub fn device(&self) -> &VirtualDevice {
         self.cycle.device()
     }
 

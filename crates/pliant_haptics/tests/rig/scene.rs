@@ -3,8 +3,8 @@
 use std::{collections::VecDeque, sync::Arc};
 
 use pliant_haptics::{
-    Cycle, Hand, HeldGrab, LocalModel, LoopConfig, LoopEvent, ModalLocal, ModelWriter, ToolMap, Virtual,
-    VirtualConfig, VirtualHandle, VirtualPace,
+    Cycle, Hand, HeldGrab, LocalModel, LoopConfig, LoopEvent, ModalLocal, ModelWriter, ToolMap,
+    VirtualConfig, VirtualDevice, VirtualHandle, VirtualPace,
 };
 use pliant_modal::{Body, BodyConfig, Patch};
 
@@ -14,7 +14,7 @@ pub struct Scene {
     pub body: Body,
     held: HeldGrab,
     writer: ModelWriter,
-    pub cycle: Cycle<Virtual>,
+    pub cycle: Cycle<VirtualDevice>,
     pub hand: VirtualHandle,
     pub pace: VirtualPace,
     pub model: LocalModel,
@@ -65,7 +65,7 @@ impl Scene {
         let model = Arc::new(block(c.young, c.modes));
         let step = 1.0 / c.simulation;
         let mut body = Body::new(model.clone(), BodyConfig { step, ..BodyConfig::default() }).unwrap();
-        let device = Virtual::new(c.device, c.hand).unwrap();
+        let device = VirtualDevice::new(c.device, c.hand).unwrap();
         let hand = device.handle();
         let patch = Patch::around(model.surface(), tip(), 0.01).unwrap();
         // The middle of the workspace lies on the patch, so that grabbing moves nothing.
