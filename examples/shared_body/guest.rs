@@ -13,7 +13,7 @@ use bevy::{
     app::ScheduleRunnerPlugin,
     math::DVec3,
     prelude::*,
-    render::view::screenshot::{Screenshot, save_to_disk},
+    render::view::screenshot::{Screenshot, ScreenshotCaptured, save_to_disk},
     window::{PresentMode, WindowResolution},
     winit::WinitSettings,
 };
@@ -77,8 +77,16 @@ struct Run {
     stop: Arc<AtomicBool>,
     /// When the body was first here, s.
     since: Option<f64>,
-    pictured: bool,
+    picture: Picture,
     failure: Option<String>,
+}
+
+/// How far the picture of the window is, if one is asked for.
+#[derive(Clone, Copy, PartialEq, Eq)]
+enum Picture {
+    Wanted,
+    Asked,
+    Saved,
 }
 
 /// Seconds that a guest waits for the body before it gives up.
@@ -128,7 +136,7 @@ fn run(mut app: App, guest: Guest) -> GuestReport {
             screenshot: guest.screenshot,
             stop: guest.stop,
             since: None,
-            pictured: false,
+            picture: Picture::Wanted,
             failure: None,
         })
         .add_systems(Startup, spawn)
@@ -234,6 +242,9 @@ fn record(figures: Res<Figures>, meter: Res<Meter>, mut scalars: ResMut<RerunSca
     scalars.set("error/rms", "%", meter.percent(meter.rms()));
 }
 
+/// Seconds that a picture may take to be drawn and saved: software renderers are slow.
+const PICTURE: f64 = 60.0;
+
 fn finish(
     mut commands: Commands,
     time: Res<Time<Real>>,
@@ -245,15 +256,27 @@ fn finish(
         run.failure.get_or_insert_with(|| format!("no body within {PATIENCE} s"));
     }
     let shown_for = run.since.map_or(0.0, |since| now - since);
-    if let (Some(path), Some(duration)) = (&run.screenshot, run.duration)
-        && !run.pictured
-        && shown_for > duration - 1.5
-    {
-        commands.spawn(Screenshot::primary_window()).observe(save_to_disk(path.clone()));
-        run.pictured = true;
-    }
     let over = run.duration.is_some_and(|duration| shown_for >= duration);
-    if over || run.failure.is_some() || run.stop.load(Ordering::Relaxed) {
+    let mut done = over;
+    if let (Some(path), Some(duration)) = (run.screenshot.clone(), run.duration) {
+        match run.picture {
+            Picture::Wanted if over => {
+                commands
+                    .spawn(Screenshot::primary_window())
+                    .observe(save_to_disk(path))
+                    .observe(|_: On<ScreenshotCaptured>, mut run: ResMut<Run>| run.picture = Picture::Saved);
+                run.picture = Picture::Asked;
+                done = false;
+            }
+            Picture::Wanted => {}
+            Picture::Asked => done = false,
+            Picture::Saved => done = true,
+        }
+        if run.picture != Picture::Saved && shown_for > duration + PICTURE {
+            run.failure.get_or_insert_with(|| "the window could not be pictured".into());
+        }
+    }
+    if done || run.failure.is_some() || run.stop.load(Ordering::Relaxed) {
         exit.write(AppExit::Success);
     }
 }

@@ -34,7 +34,7 @@ pub struct Options {
     #[arg(long, default_value_t = 1)]
     pub seed: u64,
 
-    /// Save a picture of the window shortly before the end (of 6 seconds, unless told otherwise) and stop.
+    /// Save a picture of the window at the end (after 6 seconds, unless told otherwise) and stop.
     #[arg(long, value_name = "FILE.png")]
     pub screenshot: Option<PathBuf>,
 

@@ -7,7 +7,7 @@ use bevy::{
     light::{CascadeShadowConfigBuilder, NotShadowCaster, NotShadowReceiver},
     prelude::*,
 };
-use pliant::prelude::*;
+use pliant::{prelude::*, rerun::RerunStyle};
 
 use crate::{
     guest::{Figures, GuestBody},
@@ -38,9 +38,9 @@ pub struct ViewPlugin;
 
 impl Plugin for ViewPlugin {
     fn build(&self, app: &mut App) {
-        app.insert_resource(ClearColor(Color::srgb(0.80, 0.85, 0.90)))
+        app.insert_resource(ClearColor(Color::srgb(0.665, 0.695, 0.73)))
             .insert_resource(GhostOn(true))
-            .add_systems(Startup, (set_scene, set_hud))
+            .add_systems(Startup, (set_scene, set_hud, set_gizmos))
             .add_systems(
                 Update,
                 (dress, ghost_follows, keys, orbit, draw_hands, write_hud, frame_body).chain(),
@@ -86,13 +86,20 @@ fn set_scene(
         Transform::from_rotation(Quat::from_euler(EulerRot::YXZ, PI + 0.6, -0.5, 0.0)),
     ));
     commands.spawn((
-        Mesh3d(meshes.add(Plane3d::default().mesh().size(12.0, 12.0))),
+        Mesh3d(meshes.add(Plane3d::default().mesh().size(80.0, 80.0))),
         MeshMaterial3d(materials.add(StandardMaterial {
             base_color: Color::srgb(0.72, 0.74, 0.78),
             perceptual_roughness: 0.95,
             ..default()
         })),
     ));
+}
+
+/// Hands and forces are drawn over everything: a reaction points into the body.
+fn set_gizmos(mut store: ResMut<GizmoConfigStore>) {
+    let (config, _) = store.config_mut::<DefaultGizmoConfigGroup>();
+    config.depth_bias = -1.0;
+    config.line.width = 3.0;
 }
 
 fn set_hud(mut commands: Commands) {
@@ -142,12 +149,15 @@ fn dress(
                 body.clone(),
                 Driven::Remote,
                 NoPointerGrab,
+                RerunStyle::Points,
                 NotShadowCaster,
                 NotShadowReceiver,
                 MeshMaterial3d(materials.add(StandardMaterial {
                     base_color: Color::srgba(0.25, 0.55, 1.0, 0.26),
                     alpha_mode: AlphaMode::Blend,
                     unlit: true,
+                    // Where both agree the body is seen, not a mixture of the two.
+                    depth_bias: -60_000.0,
                     ..default()
                 })),
             ));

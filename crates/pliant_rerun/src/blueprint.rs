@@ -6,7 +6,8 @@ use rerun::{
     EntityPath,
     blueprint::{
         Blueprint, BlueprintActivation, BlueprintPanel, ContainerLike, Grid, Horizontal, SelectionPanel,
-        Spatial3DView, TextLogView, TimePanel, TimeSeriesView, Vertical, components::PanelState,
+        Spatial3DView, TextLogView, TimePanel, TimeSeriesView, Vertical,
+        components::{PanelState, PlayState},
     },
 };
 
@@ -89,7 +90,11 @@ impl Plots {
             .with_blueprint_panel(BlueprintPanel::from_state(PanelState::Collapsed))
             .with_selection_panel(SelectionPanel::from_state(PanelState::Collapsed))
             .with_time_panel(
-                TimePanel::new().with_state(PanelState::Collapsed).with_timeline(crate::SIM_TIME),
+                // At the newest: a live viewer keeps up, and a file opens on a scene that is all there.
+                TimePanel::new()
+                    .with_state(PanelState::Collapsed)
+                    .with_timeline(crate::SIM_TIME)
+                    .with_play_state(PlayState::Following),
             )
             .send(recording, BlueprintActivation::default())
     }
