@@ -37,7 +37,13 @@ struct Service {
 }
 
 impl Service {
+    /// A service of the new kind or the old.
     fn start(new: bool) -> Self {
+        Self::speaking(new, new)
+    }
+
+    /// With the inventory of one kind and the commands of another.
+    fn speaking(inventory: bool, new: bool) -> Self {
         let listener = TcpListener::bind("127.0.0.1:0").unwrap();
         let address = listener.local_addr().unwrap().to_string();
         let desk = Arc::new(Mutex::new(Desk::default()));
@@ -50,7 +56,7 @@ impl Service {
                         stream.set_nonblocking(false).unwrap();
                         stream.set_read_timeout(Some(Duration::from_millis(20))).unwrap();
                         if let Ok(socket) = accept(stream) {
-                            serve(socket, &shared, new);
+                            serve(socket, &shared, inventory, new);
                         }
                     }
                     Err(_) => std::thread::sleep(Duration::from_millis(2)),
@@ -98,8 +104,8 @@ fn state(desk: &Desk, new: bool) -> Value {
 }
 
 /// One connection: an inventory, then exactly one state a command. A command that is not as documented ends it.
-fn serve(mut socket: WebSocket<TcpStream>, desk: &Mutex<Desk>, new: bool) {
-    let inventory = state(&desk.lock().unwrap(), new).to_string();
+fn serve(mut socket: WebSocket<TcpStream>, desk: &Mutex<Desk>, inventory: bool, new: bool) {
+    let inventory = state(&desk.lock().unwrap(), inventory).to_string();
     socket.send(Message::text(inventory)).unwrap();
     let mut first = true;
     loop {
@@ -198,17 +204,21 @@ fn both_spellings_and_the_axes() {
 
 #[test]
 fn a_wrong_guess_is_put_right() {
-    // A service that calls the field by the name that its inventory does not suggest.
-    for new in [true, false] {
-        let service = Service::start(new);
+    // Services that call the field by the name that their inventory does not suggest: the first command is refused, the second is not.
+    for (inventory, new, want) in [(true, false, Spelling::Values), (false, true, Spelling::Vector)] {
+        let service = Service::speaking(inventory, new);
         let mut device = Inverse::open(second(service.config())).unwrap();
-        let wrong = if new { Spelling::Values } else { Spelling::Vector };
-        drop(device);
-        // Told wrong on purpose, it is refused and stays refused: what the user says counts.
-        device = Inverse::open(InverseConfig { spelling: Some(wrong), ..second(service.config()) }).unwrap();
-        assert!(device.exchange(&Wrench::ZERO, &mut pace()).is_err());
-        assert!(!service.desk().refused.is_empty());
+        assert!(device.exchange(&Wrench { force: [1.0, 0.0, 0.0], ..Wrench::ZERO }, &mut pace()).is_ok());
+        assert_eq!(device.spelling(), want);
+        assert_eq!(service.desk().forces, [[1.0, -0.0, 0.0]]);
+        assert_eq!(service.desk().refused.len(), 1);
     }
+    // What the user says counts, right or wrong.
+    let service = Service::start(true);
+    let told = InverseConfig { spelling: Some(Spelling::Values), ..second(service.config()) };
+    let mut device = Inverse::open(told).unwrap();
+    assert!(device.exchange(&Wrench::ZERO, &mut pace()).is_err());
+    assert_eq!(device.spelling(), Spelling::Values);
 }
 
 #[test]

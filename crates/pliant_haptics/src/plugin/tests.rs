@@ -6,7 +6,7 @@ use bevy::{
 use pliant_body::{Grab, GrabForce, ModalAsset, ModalBody, PliantBodyPlugin};
 
 use super::*;
-use crate::{Hand, LoopConfig, LoopState, VirtualConfig, VirtualDevice, VirtualHandle};
+use crate::{Fault, Hand, LoopConfig, LoopState, VirtualConfig, VirtualDevice, VirtualHandle};
 
 #[path = "../../tests/rig/block.rs"]
 mod block;
@@ -109,6 +109,9 @@ fn a_press_holds_and_the_hand_feels_the_body() {
     }
 }
 
+#[derive(Resource, Default)]
+struct Heard(Vec<Fault>);
+
 #[test]
 fn pause_fades_and_stop_is_latched() {
     let mut s = scene(false);
@@ -117,12 +120,15 @@ fn pause_fades_and_stop_is_latched() {
     s.hand.set_target([0.02, 0.0, 0.0]);
     run(&mut s.app, 60);
     assert!(force(&s).length() > 1.0);
+    s.app.insert_resource(Heard::default());
+    s.app.add_systems(Update, |mut faults: MessageReader<HapticFault>, mut heard: ResMut<Heard>| {
+        heard.0.extend(faults.read().filter_map(|f| f.fault));
+    });
     s.app.world_mut().resource_mut::<Time<Virtual>>().pause();
     run(&mut s.app, 15);
+    let heard = &s.app.world().resource::<Heard>().0;
+    assert!(heard.iter().any(|f| matches!(f, Fault::Stale(_))), "{heard:?}");
     assert_eq!(force(&s), DVec3::ZERO, "a paused game pushes nobody");
-    let faults = s.app.world().resource::<Messages<HapticFault>>();
-    let mut cursor = faults.get_cursor();
-    let _ = cursor.read(faults).count();
     s.app.world_mut().resource_mut::<Time<Virtual>>().unpause();
     run(&mut s.app, 60);
     assert!(force(&s).length() > 1.0, "and it comes back: {}", force(&s));
@@ -137,4 +143,25 @@ fn pause_fades_and_stop_is_latched() {
     assert!(force(&s).length() > 1.0);
     assert!(s.app.world_mut().resource_mut::<HapticDevices>().remove(s.device));
     run(&mut s.app, 2);
+}
+
+#[test]
+fn a_remote_body_is_felt_through_its_published_force() {
+    let mut s = scene(false);
+    let world = s.app.world_mut();
+    let body = world.query_filtered::<Entity, With<ModalBody>>().single(world).unwrap();
+    world.entity_mut(body).insert(pliant_body::Driven::Remote);
+    let at = DVec3::from(world.get::<Transform>(s.tool).unwrap().translation.as_dvec3());
+    let grab =
+        world.spawn((Grab::new(block::tip(), 0.01, at), pliant_body::GrabOf(body), HeldBy(s.tool))).id();
+    // What a session would write: the patch stays where it is.
+    world.entity_mut(grab).insert(GrabForce { point: at, force: DVec3::ZERO });
+    s.hand.set_target([0.01, 0.0, 0.0]);
+    run(&mut s.app, 60);
+    // The coupling's 280 N/m and the arm's 500 in series over 1 cm.
+    let want = -0.01 / (1.0 / 280.0 + 1.0 / 500.0);
+    let got = force(&s);
+    assert!((got.x - want).abs() < 0.3, "{got} for {want}");
+    let target = s.app.world().get::<Grab>(grab).unwrap().target;
+    assert!(target.x > at.x + 1e-3, "and the session is told where the hand is: {target}");
 }

@@ -1,0 +1,120 @@
+//! What a tool does with what it holds: torque from several grabs, masks, scales, weight, a body turned in the world.
+#![allow(clippy::unwrap_used, clippy::expect_used, clippy::panic, reason = "a failed test should panic")]
+
+use pliant_haptics::{
+    Contact, Coupling, DeviceInfo, FeltGrab, Hand, HapticDevice, LocalModel, LoopConfig, LoopCore,
+    ModelWriter, Sample, ToolMap, VirtualConfig, VirtualDevice,
+};
+
+/// A device of six degrees of freedom that a test moves.
+fn six() -> DeviceInfo {
+    DeviceInfo { peak_torque: 0.5, torque_axes: [true; 3], resolution: 0.0, ..VirtualConfig::touch().info() }
+}
+
+fn spring(offset: [f64; 3], proxy: [f64; 3], k: f64) -> Contact {
+    Contact { offset, proxy, stiffness: [[k, 0.0, 0.0], [0.0, k, 0.0], [0.0, 0.0, k]], ..Contact::default() }
+}
+
+/// Holds still at `sample` until ramp and slew are over.
+fn settle(core: &mut LoopCore, sample: &Sample, contacts: &[Contact]) -> ([f64; 3], [f64; 3]) {
+    let mut model = LocalModel { period: 0.01, count: contacts.len(), ..LocalModel::default() };
+    model.contacts[..contacts.len()].copy_from_slice(contacts);
+    let mut now = core.last().now;
+    for k in 0..600u64 {
+        now += 1e-3;
+        model.tick = core.last().now.to_bits() + k;
+        core.tick(now, 1e-3, &Sample { sequence: Some(k), ..*sample }, &model);
+    }
+    (core.last().wrench.force, core.last().wrench.torque)
+}
+
+fn near(got: [f64; 3], want: [f64; 3], what: &str) {
+    for (g, w) in got.into_iter().zip(want) {
+        assert!((g - w).abs() < 1e-6, "{what}: {got:?} for {want:?}");
+    }
+}
+
+#[test]
+fn two_grabs_on_a_tool_turn_it() {
+    let mut core = LoopCore::new(six(), LoopConfig::default()).unwrap();
+    // A couple: held 5 cm to either side, one proxy 1 cm up, the other 1 cm down. F = 100 N/m x 1 cm = 1 N, torque 2 x 0.05 m x 1 N about z.
+    let right = spring([0.05, 0.0, 0.0], [0.05, 0.01, 0.0], 100.0);
+    let left = spring([-0.05, 0.0, 0.0], [-0.05, -0.01, 0.0], 100.0);
+    let (force, torque) = settle(&mut core, &Sample::default(), &[right, left]);
+    near(force, [0.0; 3], "no force in sum");
+    near(torque, [0.0, 0.0, 0.1], "a couple about z");
+    // The device has no motor for that axis.
+    let blind = DeviceInfo { torque_axes: [true, true, false], ..six() };
+    let mut core = LoopCore::new(blind, LoopConfig::default()).unwrap();
+    near(settle(&mut core, &Sample::default(), &[right, left]).1, [0.0; 3], "masked");
+    // More than the motors have is cut.
+    let mut core = LoopCore::new(six(), LoopConfig::default()).unwrap();
+    let strong = |c: Contact| Contact { stiffness: c.stiffness.map(|r| r.map(|x| 50.0 * x)), ..c };
+    near(settle(&mut core, &Sample::default(), &[strong(right), strong(left)]).1, [0.0, 0.0, 0.5], "clamped");
+}
+
+#[test]
+fn scale_masks_and_weight() {
+    let half = std::f64::consts::FRAC_1_SQRT_2;
+    // Twice the motion, half the force, turned by a quarter about z: the device's x is the world's y.
+    let tool = ToolMap {
+        rotation: [0.0, 0.0, half, half],
+        motion_scale: 2.0,
+        force_scale: 0.5,
+        force_axes: [true, true, false],
+        mass: 0.05,
+        ..ToolMap::default()
+    };
+    let mut core = LoopCore::new(six(), LoopConfig { tool, ..LoopConfig::default() }).unwrap();
+    let sample = Sample::at([0.005, 0.0, 0.01]);
+    let (force, _) = settle(&mut core, &sample, &[spring([0.0; 3], [0.0; 3], 100.0)]);
+    // 1 cm along y in the world, 1 N; 2 x 0.5 at the hand. And 50 g pull down.
+    near(force, [-1.0, -0.05 * 9.806_65, 0.0], "scaled, masked and weighed");
+    let tool = core.last().tool;
+    near(tool, [0.0, 0.01, 0.02], "the tool in the world");
+}
+
+#[test]
+fn a_body_elsewhere_is_felt_through_what_is_published() {
+    // Somebody else steps it: point and force come over the network.
+    let device = VirtualDevice::new(VirtualConfig::touch(), Hand::NONE).unwrap();
+    let config = LoopConfig::default();
+    let coupling = Coupling::clamp(&config.coupling, &device.info(), config.rate, 0.0, 0.0);
+    let grab = coupling.grab_config(1.0, 1.0);
+    let (k, b) = (grab.stiffness.unwrap(), grab.stiffness.unwrap() * grab.relaxation);
+    assert!((b - coupling.damping).abs() < 1e-12, "the damper is the same on both sides");
+    let mut writer = ModelWriter::new();
+    let mut word = LocalModel::default();
+    let felt = |x: f64| FeltGrab { key: 5, point: [x, 0.0, 0.0], ..FeltGrab::default() };
+    writer.write_forces(&[felt(0.0)], k, b, 0.01, 0.0, &mut word);
+    assert_eq!(word.contacts()[0].velocity, [0.0; 3], "a new grab has not moved");
+    writer.write_forces(&[felt(0.001)], k, b, 0.01, 0.01, &mut word);
+    assert!((word.contacts()[0].velocity[0] - 0.1).abs() < 1e-12 && word.tick == 2);
+    assert!((word.contacts()[0].stiffness[1][1] - k).abs() < 1e-12);
+    writer.write_forces(&[], k, b, 0.01, 0.02, &mut word);
+    assert_eq!(word.contacts().len(), 0);
+}
+
+#[test]
+fn two_devices_at_once() {
+    use pliant_haptics::HapticLoop;
+    let start = |x: f64| {
+        let device = VirtualDevice::new(VirtualConfig::touch(), Hand::FIRM).unwrap();
+        device.handle().set_target([x, 0.0, 0.0]);
+        HapticLoop::start(device, LoopConfig::default()).unwrap()
+    };
+    let mut hands = [start(0.01), start(-0.01)];
+    for tick in 1..=80 {
+        for hand in &mut hands {
+            hand.publish(|model| {
+                model.tick = tick;
+                model.period = 0.01;
+                model.count = 1;
+                model.contacts[0] = spring([0.0; 3], [0.0; 3], 200.0);
+            });
+        }
+        std::thread::sleep(std::time::Duration::from_millis(10));
+    }
+    let [right, left] = hands.each_mut().map(|h| h.report().tick.wrench.force[0]);
+    assert!(right < -0.5 && left > 0.5, "each feels its own: {right} and {left}");
+}
