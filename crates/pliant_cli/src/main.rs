@@ -8,6 +8,7 @@ mod inspect;
 mod mesh;
 mod output;
 mod progress;
+mod stream;
 
 use std::process::ExitCode;
 
@@ -29,6 +30,8 @@ enum Command {
     Bake(bake::BakeArgs),
     /// Tells what is in a model
     Inspect(inspect::InspectArgs),
+    /// Streams a body over an emulated network and measures what a guest sees
+    Stream(stream::StreamArgs),
 }
 
 fn main() -> ExitCode {
@@ -37,6 +40,7 @@ fn main() -> ExitCode {
         Command::Mesh(args) => mesh::run(args),
         Command::Bake(args) => bake::run(args),
         Command::Inspect(args) => inspect::run(&args),
+        Command::Stream(args) => stream::run(&args),
     };
     match done {
         Ok(()) => ExitCode::SUCCESS,
@@ -64,6 +68,12 @@ enum CliError {
     NoFolder(std::path::PathBuf),
     #[error("{input} holds no model: {source}")]
     NotAModel { input: std::path::PathBuf, source: pliant_modal::FileError },
+    #[error("{0}")]
+    Stream(#[from] pliant_stream::StreamError),
+    #[error("{what}: expected one of {expected}, got '{got}'")]
+    Unknown { what: &'static str, got: String, expected: String },
+    #[error("{what}: expected {low} to {high}, got {got}")]
+    Range { what: &'static str, low: f64, high: f64, got: f64 },
     #[error("cannot print: {0}")]
     Print(#[from] std::io::Error),
 }

@@ -302,3 +302,56 @@ fn models_that_are_cut_or_foreign_are_refused() {
     assert!(refused(&["inspect", &mesh]).contains("not a .modal file"));
     assert!(refused(&["inspect", &folder.file("none.modal")]).contains("none.modal"));
 }
+
+#[test]
+fn a_stream_is_measured_and_the_same_seed_gives_the_same_figures() {
+    let folder = Folder::new("stream");
+    let (mesh, model) = (folder.file("bar.msh"), folder.file("bar.modal"));
+    succeeds(&["mesh", "bar", "--cells", "8,2,2", "--size", "1,0.2,0.2", "-o", &mesh]);
+    succeeds(&["bake", &mesh, "--element", "tet4", "--modes", "12", "--anchor", "x<0.01", "-o", &model]);
+    let run = |recovery: &str, seed: &str| {
+        let text = succeeds(&[
+            "stream",
+            "--model",
+            &model,
+            "--network",
+            "paper-1",
+            "--recovery",
+            recovery,
+            "--seconds",
+            "10",
+            "--seed",
+            seed,
+            "--json",
+        ]);
+        json(&text)
+    };
+    let number = |told: &serde_json::Value, key: &str| told[key].as_f64().unwrap();
+    let default = run("default", "7");
+    assert_eq!(default["hash"], run("default", "7")["hash"]);
+    assert_ne!(default["hash"], run("default", "8")["hash"]);
+    // 10 s at 40 Hz; 9 % of the datagrams are lost on average, 36 of 400: five standard deviations (5.7) either way.
+    assert!((390.0..=410.0).contains(&number(&default, "ticks")));
+    assert!((8.0..=65.0).contains(&number(&default, "lost")));
+    // The bars of the streaming method on this network.
+    assert!(number(&default, "rms_percent") < 0.2, "{default}");
+    assert!(number(&default, "max_percent") < 3.0, "{default}");
+    assert!(number(&default, "kbit_s") < 100.0, "{default}");
+    // Without repair an acceleration stream never forgets an error.
+    assert!(number(&run("none", "7"), "rms_percent") > 100.0 * number(&default, "rms_percent"));
+
+    let table = succeeds(&["stream", "--model", &model, "--loss", "burst:12@140", "--seconds", "10"]);
+    for name in ["default", "none", "paper", "force-driven"] {
+        assert!(table.lines().any(|line| line.starts_with(name)), "{name} in {table}");
+    }
+    for bad in [
+        vec!["--network", "nowhere"],
+        vec!["--recovery", "prayer"],
+        vec!["--loss", "often"],
+        vec!["--rate", "0"],
+        vec!["--seconds", "nan"],
+    ] {
+        refused(&[&["stream", "--model", &model][..], &bad].concat());
+    }
+    refused(&["stream", "--model", &mesh]);
+}

@@ -1,0 +1,245 @@
+//! `pliant stream`: a session over an emulated network, measured; in virtual time, so that the same seed gives the same figures.
+
+use std::{
+    fmt::Write,
+    path::PathBuf,
+    sync::{Arc, OnceLock},
+    time::{Duration, Instant},
+};
+
+use clap::{Args, ValueEnum};
+use pliant_modal::{Integrator, ModalModel};
+use pliant_stream::{
+    Policy, RecoveryConfig,
+    emulator::{LinkConfig, Loss, Preset},
+    experiment::{Experiment, Figures},
+    peer::Repair,
+};
+use serde::Serialize;
+
+use crate::{CliError, output};
+
+#[derive(Args, Debug)]
+pub(crate) struct StreamArgs {
+    /// The body
+    #[arg(long, value_name = "X.modal")]
+    model: PathBuf,
+    /// A network by name: paper-1 to paper-4, lan, wifi, transatlantic, satellite [default: paper-1]
+    #[arg(long, conflicts_with = "loss")]
+    network: Option<String>,
+    /// A loss on a path without delay: none, 9%, random:22@135, burst:12@140, every:50@135, gilbert:9%:4
+    #[arg(long)]
+    loss: Option<String>,
+    /// Answers NACKs only so many ticks later, for remaking the paper's figures
+    #[arg(long, default_value_t = 0, value_name = "TICKS")]
+    resend_after: u32,
+    /// How loss is repaired: default, none, paper, paper-zero, paper-hold, paper-repeats, force-driven; without --json: all of them beside each other
+    #[arg(long)]
+    recovery: Option<String>,
+    /// Ticks over which the paper's compensation is spread
+    #[arg(long, value_name = "TICKS")]
+    blend: Option<u16>,
+    /// Steps a second
+    #[arg(long, default_value_t = 40.0, value_name = "HZ")]
+    rate: f64,
+    /// How long
+    #[arg(long, default_value_t = 60.0)]
+    seconds: f64,
+    /// Of everything that is left to chance
+    #[arg(long, default_value_t = 1)]
+    seed: u64,
+    /// Who steps: the host only, or every peer
+    #[arg(long, value_enum, default_value_t = Topology::Cs)]
+    topology: Topology,
+    /// Prints one line of JSON
+    #[arg(long)]
+    json: bool,
+}
+
+/// Who steps the body.
+#[derive(ValueEnum, Debug, Clone, Copy, PartialEq, Eq)]
+enum Topology {
+    /// Client-server: guests follow the host.
+    Cs,
+    /// Peer-to-peer: everybody steps, targets cross.
+    P2p,
+}
+
+/// The figures of one run.
+#[derive(Serialize, Debug)]
+struct Told {
+    recovery: String,
+    ticks: u64,
+    lost: u64,
+    recovered: u64,
+    rms_percent: f64,
+    max_percent: f64,
+    end_percent: f64,
+    force_rms_percent: f64,
+    force_ringing: f64,
+    hand_to_force_ms: f64,
+    shown_delay_ms: f64,
+    recover_ms: f64,
+    bytes_per_frame: f64,
+    kbit_s: f64,
+    cpu_us_per_tick: f64,
+    hash: String,
+}
+
+impl Told {
+    fn new(recovery: &str, figures: &Figures) -> Self {
+        Self {
+            recovery: recovery.into(),
+            ticks: figures.ticks,
+            lost: figures.lost,
+            recovered: figures.recovered,
+            rms_percent: figures.rms_percent,
+            max_percent: figures.max_percent,
+            end_percent: figures.end_percent,
+            force_rms_percent: figures.force_rms_percent,
+            force_ringing: figures.force_ringing,
+            hand_to_force_ms: figures.hand_to_force_ms,
+            shown_delay_ms: figures.shown_delay_ms,
+            recover_ms: figures.recover_ms,
+            bytes_per_frame: figures.bytes_per_frame,
+            kbit_s: figures.kbit_s,
+            cpu_us_per_tick: figures.cpu_us_per_tick,
+            hash: format!("{:016x}", figures.hash),
+        }
+    }
+}
+
+/// Time since the first call: the experiment owns no clock.
+fn clock() -> Duration {
+    static BEGAN: OnceLock<Instant> = OnceLock::new();
+    BEGAN.get_or_init(Instant::now).elapsed()
+}
+
+/// Names of peer-to-peer repairs.
+const REPAIRS: [(&str, Repair); 2] = [("rollback", Repair::Rollback), ("compensate", Repair::Compensate)];
+
+pub(crate) fn run(args: &StreamArgs) -> Result<(), CliError> {
+    let in_range = |what, value: f64, low, high| {
+        if (low..=high).contains(&value) {
+            Ok(())
+        } else {
+            Err(CliError::Range { what, low, high, got: value })
+        }
+    };
+    in_range("--rate", args.rate, 1.0, 2_000.0)?;
+    in_range("--seconds", args.seconds, 0.1, 36_000.0)?;
+    let model = Arc::new(ModalModel::read(&args.model)?);
+    let names: Vec<&str> = match (&args.recovery, args.topology, args.json) {
+        (Some(name), ..) => vec![name.as_str()],
+        (None, Topology::Cs, true) => vec!["default"],
+        (None, Topology::P2p, true) => vec![REPAIRS[0].0],
+        (None, Topology::Cs, false) => RecoveryConfig::NAMES.to_vec(),
+        (None, Topology::P2p, false) => REPAIRS.iter().map(|(name, _)| *name).collect(),
+    };
+    let told = names.iter().map(|name| measure(args, &model, name)).collect::<Result<Vec<_>, _>>()?;
+    match (args.json, told.as_slice()) {
+        (true, [one]) => output::print_json(one),
+        (true, all) => output::print_json(&all),
+        (false, all) => output::print(&table(all)),
+    }
+}
+
+fn measure(args: &StreamArgs, model: &Arc<ModalModel>, name: &str) -> Result<Told, CliError> {
+    let step = Duration::from_secs_f64(1.0 / args.rate);
+    let link = match (&args.loss, &args.network) {
+        (Some(words), _) => {
+            LinkConfig { loss: Loss::parse(words, args.seed, step)?, ..LinkConfig::default() }
+        }
+        (None, network) => {
+            let network = network.as_deref().unwrap_or("paper-1");
+            let preset = Preset::by_name(network).ok_or_else(|| CliError::Unknown {
+                what: "--network",
+                got: network.into(),
+                expected: Preset::ALL.map(Preset::name).join(", "),
+            })?;
+            LinkConfig::preset(preset)
+        }
+    };
+    let unknown = |expected: String| CliError::Unknown { what: "--recovery", got: name.into(), expected };
+    let figures = match args.topology {
+        Topology::Cs => {
+            let mut recovery =
+                RecoveryConfig::by_name(name).ok_or_else(|| unknown(RecoveryConfig::NAMES.join(", ")))?;
+            if let (Some(ticks), Policy::Paper { blend_ticks, .. }) = (args.blend, &mut recovery.policy) {
+                *blend_ticks = ticks;
+            }
+            // Streamed accelerations obey Newmark's formulas: the host's integrator has to as well.
+            let integrator = match recovery.policy {
+                Policy::ForceDriven { .. } => Integrator::Exact,
+                _ => Integrator::GeneralizedAlpha { rho_inf: 0.5 },
+            };
+            experiment(args, model, link, recovery, integrator, step).run()?
+        }
+        Topology::P2p => {
+            let repair = REPAIRS.iter().find(|(known, _)| *known == name).map(|(_, repair)| *repair);
+            let repair = repair.ok_or_else(|| unknown(REPAIRS.map(|(name, _)| name).join(", ")))?;
+            experiment(args, model, link, RecoveryConfig::default(), Integrator::Exact, step)
+                .run_peers(repair)?
+        }
+    };
+    Ok(Told::new(name, &figures))
+}
+
+fn experiment(
+    args: &StreamArgs,
+    model: &Arc<ModalModel>,
+    link: LinkConfig,
+    recovery: RecoveryConfig,
+    integrator: Integrator,
+    step: Duration,
+) -> Experiment {
+    Experiment {
+        rate: args.rate,
+        seconds: args.seconds,
+        seed: args.seed,
+        integrator,
+        resend_after: step * args.resend_after,
+        cpu_clock: Some(clock),
+        ..Experiment::new(model.clone(), link, recovery)
+    }
+}
+
+fn table(all: &[Told]) -> String {
+    let mut text = format!(
+        "{:<14} {:>7} {:>6} {:>9} {:>11} {:>11} {:>11} {:>10} {:>8} {:>9} {:>8} {:>8} {:>7}\n",
+        "recovery",
+        "ticks",
+        "lost",
+        "recovered",
+        "rms %",
+        "max %",
+        "end %",
+        "force %",
+        "ringing",
+        "hand ms",
+        "late ms",
+        "kbit/s",
+        "cpu us"
+    );
+    for t in all {
+        // Writing to a string cannot fail.
+        let _ = writeln!(
+            text,
+            "{:<14} {:>7} {:>6} {:>9} {:>11.4} {:>11.3} {:>11.2e} {:>10.3} {:>8.3} {:>9.0} {:>8.0} {:>8.1} {:>7.1}",
+            t.recovery,
+            t.ticks,
+            t.lost,
+            t.recovered,
+            t.rms_percent,
+            t.max_percent,
+            t.end_percent,
+            t.force_rms_percent,
+            t.force_ringing,
+            t.hand_to_force_ms,
+            t.shown_delay_ms,
+            t.kbit_s,
+            t.cpu_us_per_tick
+        );
+    }
+    text
+}
