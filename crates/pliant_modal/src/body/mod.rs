@@ -52,7 +52,7 @@ impl Default for BodyConfig {
 }
 
 /// What moves: the modal coordinates of one tick. All slices have one entry a kept mode.
-#[derive(Debug, Clone, PartialEq, Default)]
+#[derive(Debug, PartialEq, Default)]
 pub struct State {
     /// Modal coordinates, kg^1/2 m.
     pub q: Vec<f64>,
@@ -64,6 +64,24 @@ pub struct State {
     pub f: Vec<f64>,
     /// Where the body is.
     pub frame: Frame,
+}
+
+impl Clone for State {
+    fn clone(&self) -> Self {
+        let mut copy = Self::default();
+        copy.clone_from(self);
+        copy
+    }
+
+    /// Keeps the allocations of `self`: a step saves its state without any (a derived `clone_from` would make new ones).
+    fn clone_from(&mut self, from: &Self) {
+        let Self { q, v, a, f, frame } = from;
+        self.q.clone_from(q);
+        self.v.clone_from(v);
+        self.a.clone_from(a);
+        self.f.clone_from(f);
+        self.frame = *frame;
+    }
 }
 
 /// What one step did.

@@ -1,0 +1,66 @@
+//! A step allocates nothing. A test binary of its own, as it counts through the global allocator.
+#![allow(clippy::unwrap_used, reason = "a failed test should panic")]
+#![allow(unsafe_code, reason = "counting allocations needs a global allocator")]
+
+mod rod;
+
+use std::{
+    alloc::{GlobalAlloc, Layout, System},
+    cell::Cell,
+    sync::Arc,
+};
+
+use pliant_modal::{Body, BodyConfig, GrabConfig, Integrator, Patch};
+use rod::{rod, tip};
+
+struct Counting;
+
+thread_local! {
+    static CALLS: Cell<u64> = const { Cell::new(0) };
+}
+
+// SAFETY: every call goes on to the system's allocator unchanged; the counter is a plain thread-local cell without a destructor.
+unsafe impl GlobalAlloc for Counting {
+    unsafe fn alloc(&self, layout: Layout) -> *mut u8 {
+        CALLS.with(|n| n.set(n.get() + 1));
+        // SAFETY: as the caller promised.
+        unsafe { System.alloc(layout) }
+    }
+    unsafe fn dealloc(&self, at: *mut u8, layout: Layout) {
+        CALLS.with(|n| n.set(n.get() + 1));
+        // SAFETY: as the caller promised.
+        unsafe { System.dealloc(at, layout) }
+    }
+}
+
+#[global_allocator]
+static COUNTING: Counting = Counting;
+
+#[test]
+fn a_step_with_two_grabs_under_warp_allocates_nothing() {
+    for free in [false, true] {
+        for integrator in [Integrator::Exact, Integrator::GeneralizedAlpha { rho_inf: 0.5 }] {
+            let model = Arc::new(rod(2e5, 20, 0.05, free));
+            let config = BodyConfig { step: 1.0 / 240.0, integrator, warp: true, ..Default::default() };
+            let mut body = Body::new(model.clone(), config).unwrap();
+            let grabs = [tip(), tip() / 2].map(|vertex| {
+                let patch = Patch::around(model.surface(), vertex, 0.06).unwrap();
+                let grab = body.grab(&patch, GrabConfig::default()).unwrap();
+                (grab, body.grab_position(grab).unwrap())
+            });
+            let mut positions = model.surface().positions().to_vec();
+            let before = CALLS.with(Cell::get);
+            for step in 0..100 {
+                for (grab, start) in grabs {
+                    let x = start[0] + 1e-4 * f64::from(step);
+                    body.set_target(grab, [x, start[1] + 0.01, start[2]]).unwrap();
+                }
+                body.push(3, [0.1, 0.0, 0.0]).unwrap();
+                body.step().unwrap();
+                body.reconstruct(&mut positions).unwrap();
+            }
+            assert_eq!(CALLS.with(Cell::get) - before, 0, "free {free}, {integrator:?}");
+            assert!(body.reaction(grabs[0].0).unwrap()[0].abs() > 0.0, "it was held");
+        }
+    }
+}
