@@ -35,7 +35,7 @@
 //! # Features
 //!
 //! `inverse` (default): the Haply Inverse3. `vendor` (default): 3D Systems and Force Dimension, libraries loaded at run time. `plugin`: Bevy; without it no
-//! engine is compiled.
+//! engine is compiled. `rumble`: gamepads that buzz, on top of it.
 #![cfg_attr(
     test,
     allow(clippy::unwrap_used, clippy::expect_used, clippy::panic, reason = "a failed test should panic")
@@ -84,6 +84,8 @@ pub use plugin::{
     DeviceId, DeviceStatus, HapticButton, HapticDevices, HapticFault, HapticNotice, HapticSystems,
     HapticTool, HapticsPlugin, HeldBy, ToolGrabs, ToolGrip, ToolOffset, ToolPose,
 };
+#[cfg(feature = "rumble")]
+pub use plugin::{GamepadVibration, Rumble, ToolRumble};
 pub use positioned::{Positioned, PositionedHandle};
 pub use record::{RecordError, Recorder, Replay};
 pub use runner::{HapticLoop, StopSwitch};

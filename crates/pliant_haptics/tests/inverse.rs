@@ -231,21 +231,28 @@ fn the_loop_feels_a_spring_through_it() {
     let mut events: Vec<LoopEvent> = Vec::new();
     let mut model = LocalModel { count: 1, period: 0.01, ..LocalModel::default() };
     model.contacts[0].stiffness = [[100.0, 0.0, 0.0], [0.0, 100.0, 0.0], [0.0, 0.0, 100.0]];
-    for _ in 0..450 {
+    // A busy machine stutters, and every stutter fades: what must come is waited for.
+    for k in 0..5000 {
         model.tick += 1;
         cycle.step(&mut pace, &model, &mut events);
+        if k > 400 && cycle.core().last().gain == 1.0 && cycle.core().last().fault.is_none() {
+            break;
+        }
     }
     let force = cycle.core().last().wrench.force;
     assert!((force[0] + 0.4).abs() < 1e-3, "100 N/m over 4 mm: {force:?}");
     // Gone in the middle of it, and back by itself.
     service.desk().hang_up = true;
-    for _ in 0..60 {
+    for _ in 0..2000 {
         model.tick += 1;
         cycle.step(&mut pace, &model, &mut events);
+        if events.contains(&LoopEvent::Lost) {
+            break;
+        }
     }
     assert!(events.contains(&LoopEvent::Lost), "{events:?}");
     service.desk().hang_up = false;
-    for _ in 0..1700 {
+    for _ in 0..10_000 {
         model.tick += 1;
         cycle.step(&mut pace, &model, &mut events);
         if events.contains(&LoopEvent::Returned) {
@@ -253,12 +260,22 @@ fn the_loop_feels_a_spring_through_it() {
         }
     }
     assert!(events.contains(&LoopEvent::Returned));
-    for _ in 0..100 {
+    let mut largest = 0.0f64;
+    for _ in 0..5000 {
         model.tick += 1;
+        let before = cycle.core().last().wrench.force[0];
         cycle.step(&mut pace, &model, &mut events);
+        let force = cycle.core().last().wrench.force[0];
+        largest = largest.max(before - force);
+        if force < -0.3 {
+            break;
+        }
     }
-    let force = cycle.core().last().wrench.force[0];
-    assert!(force < -0.01 && force > -0.39, "comes back by the ramp: {force}");
+    // 0.4 N in 300 ms are 1.3 mN a period; a late one may take a few at once.
+    assert!(
+        cycle.core().last().wrench.force[0] < -0.3 && largest < 0.02,
+        "comes back by the ramp: steps of {largest} N"
+    );
     assert_eq!(service.desk().refused, [""; 0]);
 }
 

@@ -21,6 +21,8 @@
 //! ```
 
 mod devices;
+#[cfg(feature = "rumble")]
+mod rumble;
 mod tool;
 mod word;
 
@@ -31,6 +33,8 @@ use bevy::{
 use pliant_body::PliantSystems;
 
 pub use devices::{DeviceId, DeviceStatus, HapticButton, HapticDevices, HapticFault, HapticNotice};
+#[cfg(feature = "rumble")]
+pub use rumble::{GamepadVibration, Rumble, ToolRumble};
 pub use tool::{HapticTool, HeldBy, ToolGrabs, ToolGrip, ToolOffset, ToolPose};
 
 /// What the plugin does in a tick, around [`PliantSystems`].
@@ -81,6 +85,11 @@ impl Plugin for HapticsPlugin {
             .add_systems(PreUpdate, (devices::read, tool::place, tool::grip).chain())
             .add_systems(self.schedule, tool::follow.in_set(HapticSystems::Move))
             .add_systems(self.schedule, word::publish.in_set(HapticSystems::Word));
+        #[cfg(feature = "rumble")]
+        app.init_resource::<rumble::Rumble>()
+            .register_type::<rumble::ToolRumble>()
+            .add_message::<bevy::input::gamepad::GamepadRumbleRequest>()
+            .add_systems(PostUpdate, (rumble::follow_force, rumble::send).chain());
     }
 }
 

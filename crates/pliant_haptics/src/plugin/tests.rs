@@ -70,6 +70,17 @@ fn force(scene: &Scene) -> DVec3 {
     devices.get(scene.device).unwrap().report.tick.wrench.force.into()
 }
 
+/// Runs until it is so. The loop's clock is the real one and a busy machine stutters: what must come is waited for, what must not come is not.
+fn until(s: &mut Scene, what: &str, so: impl Fn(&mut Scene) -> bool) {
+    for _ in 0..1000 {
+        if so(s) {
+            return;
+        }
+        run(&mut s.app, 1);
+    }
+    panic!("never: {what}; the force is {} N", force(s));
+}
+
 fn grabs(app: &mut App) -> Vec<(Grab, GrabForce)> {
     let world = app.world_mut();
     world.query::<(&Grab, &GrabForce)>().iter(world).map(|(g, f)| (*g, *f)).collect()
@@ -80,9 +91,9 @@ fn a_press_holds_and_the_hand_feels_the_body() {
     for modal in [false, true] {
         let mut s = scene(modal);
         s.hand.set_buttons(1);
-        run(&mut s.app, 10);
+        until(&mut s, "the button grips what is in reach", |s| grabs(&mut s.app).len() == 1);
+        run(&mut s.app, 5);
         let held = grabs(&mut s.app);
-        assert_eq!(held.len(), 1, "the button grips what is in reach");
         assert!(
             held[0].0.stiffness.is_some_and(|k| (k - 280.0).abs() < 1.0),
             "the device's coupling: {:?}",
@@ -90,22 +101,15 @@ fn a_press_holds_and_the_hand_feels_the_body() {
         );
         assert!(force(&s).length() < 0.05, "grabbing pushes nobody: {}", force(&s));
         s.hand.set_target([0.02, 0.0, 0.0]);
-        run(&mut s.app, 80);
-        let pull = force(&s);
-        // The block has E A / L = 1600 N/m, the coupling 280, the arm 500: 2 cm of them in series are 3.1 N.
-        assert!((-3.3..-1.5).contains(&pull.x) && pull.y.abs() < 0.5, "modal {modal}: {pull}");
-        let body = grabs(&mut s.app)[0].1.force;
-        assert!(
-            (body.x / pull.x - 1.0).abs() < 0.25,
-            "modal {modal}: what the body says and what the hand gets: {body} and {pull}; {:?}",
-            s.app.world().resource::<HapticDevices>().get(s.device).unwrap().report.tick
-        );
+        // The block has E A / L = 1600 N/m, the coupling 280, the arm 500: 2 cm of them in series are 3.1 N, of which friction may hold back 0.26.
+        until(&mut s, "3 N, and the body says the same as the hand gets", |s| {
+            let (pull, body) = (force(s), grabs(&mut s.app)[0].1.force);
+            (-3.3..-2.7).contains(&pull.x) && pull.y.abs() < 0.1 && (body.x / pull.x - 1.0).abs() < 0.1
+        });
         let pose = *s.app.world().get::<ToolPose>(s.tool).unwrap();
-        assert!(pose.gain > 0.9 && pose.position.x > 0.1, "{pose:?}");
+        assert!(pose.position.x > 0.1, "{pose:?}");
         s.hand.set_buttons(0);
-        run(&mut s.app, 20);
-        assert!(grabs(&mut s.app).is_empty());
-        assert!(force(&s).length() < 0.05, "let go: {}", force(&s));
+        until(&mut s, "let go", |s| grabs(&mut s.app).is_empty() && force(s).length() < 0.05);
     }
 }
 
@@ -116,31 +120,28 @@ struct Heard(Vec<Fault>);
 fn pause_fades_and_stop_is_latched() {
     let mut s = scene(false);
     s.hand.set_buttons(1);
-    run(&mut s.app, 10);
+    until(&mut s, "gripped", |s| grabs(&mut s.app).len() == 1);
     s.hand.set_target([0.02, 0.0, 0.0]);
-    run(&mut s.app, 60);
-    assert!(force(&s).length() > 1.0);
+    until(&mut s, "a force", |s| force(s).length() > 1.0);
     s.app.insert_resource(Heard::default());
     s.app.add_systems(Update, |mut faults: MessageReader<HapticFault>, mut heard: ResMut<Heard>| {
         heard.0.extend(faults.read().filter_map(|f| f.fault));
     });
     s.app.world_mut().resource_mut::<Time<Virtual>>().pause();
-    run(&mut s.app, 15);
-    let heard = &s.app.world().resource::<Heard>().0;
-    assert!(heard.iter().any(|f| matches!(f, Fault::Stale(_))), "{heard:?}");
-    assert_eq!(force(&s), DVec3::ZERO, "a paused game pushes nobody");
+    until(&mut s, "a paused game pushes nobody, and says why", |s| {
+        let heard = &s.app.world().resource::<Heard>().0;
+        heard.iter().any(|f| matches!(f, Fault::Stale(_))) && force(s) == DVec3::ZERO
+    });
     s.app.world_mut().resource_mut::<Time<Virtual>>().unpause();
-    run(&mut s.app, 60);
-    assert!(force(&s).length() > 1.0, "and it comes back: {}", force(&s));
+    until(&mut s, "it comes back", |s| force(s).length() > 1.0);
     s.app.world().resource::<HapticDevices>().estop();
-    run(&mut s.app, 3);
-    assert_eq!(force(&s), DVec3::ZERO);
+    until(&mut s, "stopped", |s| force(s) == DVec3::ZERO);
+    run(&mut s.app, 10);
+    assert_eq!(force(&s), DVec3::ZERO, "and stays so");
     let state = |s: &Scene| s.app.world().resource::<HapticDevices>().get(s.device).unwrap().report.state;
     assert_eq!(state(&s), LoopState::Stopped);
     s.app.world_mut().resource_mut::<HapticDevices>().reset_stop();
-    run(&mut s.app, 60);
-    assert_eq!(state(&s), LoopState::Running);
-    assert!(force(&s).length() > 1.0);
+    until(&mut s, "runs again", |s| state(s) == LoopState::Running && force(s).length() > 1.0);
     assert!(s.app.world_mut().resource_mut::<HapticDevices>().remove(s.device));
     run(&mut s.app, 2);
 }
@@ -151,17 +152,15 @@ fn a_remote_body_is_felt_through_its_published_force() {
     let world = s.app.world_mut();
     let body = world.query_filtered::<Entity, With<ModalBody>>().single(world).unwrap();
     world.entity_mut(body).insert(pliant_body::Driven::Remote);
-    let at = DVec3::from(world.get::<Transform>(s.tool).unwrap().translation.as_dvec3());
+    let at = world.get::<Transform>(s.tool).unwrap().translation.as_dvec3();
     let grab =
         world.spawn((Grab::new(block::tip(), 0.01, at), pliant_body::GrabOf(body), HeldBy(s.tool))).id();
     // What a session would write: the patch stays where it is.
     world.entity_mut(grab).insert(GrabForce { point: at, force: DVec3::ZERO });
     s.hand.set_target([0.01, 0.0, 0.0]);
-    run(&mut s.app, 60);
-    // The coupling's 280 N/m and the arm's 500 in series over 1 cm.
+    // The coupling's 280 N/m and the arm's 500 in series over 1 cm; friction may hold back 0.26 N.
     let want = -0.01 / (1.0 / 280.0 + 1.0 / 500.0);
-    let got = force(&s);
-    assert!((got.x - want).abs() < 0.3, "{got} for {want}");
+    until(&mut s, "the coupling's force", |s| (force(s).x - want).abs() < 0.3);
     let target = s.app.world().get::<Grab>(grab).unwrap().target;
     assert!(target.x > at.x + 1e-3, "and the session is told where the hand is: {target}");
 }
