@@ -45,6 +45,7 @@ mod core;
 mod coupling;
 mod cycle;
 mod device;
+mod find;
 mod follow;
 mod hand;
 mod histogram;
@@ -72,6 +73,7 @@ pub use device::{
     Calibration, DeviceInfo, Fault, HapticDevice, InfoError, Pace, Pacing, Period, Sample, VibrationOutput,
     Wrench,
 };
+pub use find::{FindConfig, Found, OpenError, find_devices};
 pub use hand::Hand;
 pub use histogram::Histogram;
 #[cfg(feature = "inverse")]

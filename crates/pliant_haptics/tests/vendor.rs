@@ -247,3 +247,25 @@ fn force_dimension_faults_and_versions() {
     let old = ForceDimension::open(dhd(&path));
     assert!(matches!(old, Err(VendorError::Version { .. })), "{old:?}");
 }
+
+#[test]
+fn what_is_plugged_in_is_found() {
+    use pliant_haptics::{FindConfig, Found, find_devices};
+    let _one = ONE_HD.lock().unwrap_or_else(|e| e.into_inner());
+    let nowhere = FindConfig {
+        open_haptics: hd(Path::new("/nowhere/libHD.so")),
+        force_dimension: dhd(Path::new("/nowhere/libdhd.so")),
+        #[cfg(feature = "inverse")]
+        inverse: pliant_haptics::InverseConfig { address: "127.0.0.1:1".into(), ..Default::default() },
+    };
+    assert_eq!(find_devices(&nowhere), [Found::Virtual], "the simulated one always is");
+    assert!(Found::Virtual.open().unwrap().info().simulated);
+    let (Some(hd_path), Some(dhd_path)) = (fake("hd", "find", &[]), fake("dhd", "find", &[])) else { return };
+    let mut somewhere = nowhere;
+    somewhere.open_haptics = hd(&hd_path);
+    somewhere.force_dimension = dhd(&dhd_path);
+    let found = find_devices(&somewhere);
+    assert_eq!(found.len(), 3);
+    let names: Vec<_> = found.iter().map(|f| f.open().unwrap().info().name).collect();
+    assert_eq!(names, ["Fake Omni", "omega.6", "virtual Touch"]);
+}
