@@ -218,8 +218,8 @@ impl<D: HapticDevice> Cycle<D> {
         let wrench = if self.calibrated { self.wrench } else { Wrench::ZERO };
         let answer = self.device.exchange(&wrench, pace);
         let begun = Instant::now();
-        if pace.last().now <= before {
-            // A driver that fails does not wait either; the loop must not spin on it.
+        if pace.last().now <= before || pace.last().dt < 0.25 / self.config.rate {
+            // A driver that fails does not wait, nor does one that has lost its clock: a thread of this priority must not spin on them.
             pace.wait();
         }
         let answer = match answer {

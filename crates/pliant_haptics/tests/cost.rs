@@ -68,7 +68,6 @@ fn the_loop_allocates_nothing() {
 }
 
 #[test]
-#[ignore = "Body::step itself allocates while pliant_modal's State has no clone_from of its own"]
 fn the_modal_loop_allocates_nothing() {
     let (allocations, p999) = ticks(true, 4000);
     println!(
