@@ -40,6 +40,18 @@ pub enum ModelError {
         /// How many there are.
         count: usize,
     },
+    /// A text or a list is longer than a model keeps.
+    #[error("{what}: expected at most {most} {unit}, got {got}")]
+    TooLong {
+        /// Which one.
+        what: &'static str,
+        /// The longest that is kept.
+        most: usize,
+        /// What is counted.
+        unit: &'static str,
+        /// Its length.
+        got: usize,
+    },
     /// Nothing to simulate or nothing to see.
     #[error("a model needs at least one {0}")]
     Empty(&'static str),
@@ -56,6 +68,14 @@ pub enum FileError {
         path: String,
         /// Why.
         source: std::io::Error,
+    },
+    /// What the file holds is no model.
+    #[error("{path}: {source}")]
+    In {
+        /// The file.
+        path: String,
+        /// What is wrong with it.
+        source: Box<FileError>,
     },
     /// The first bytes are not those of a `.modal` file.
     #[error("not a .modal file: expected it to begin with \"PLIANTMB\", got {0:?}")]

@@ -13,10 +13,7 @@
 //! ```
 //! All numbers little-endian. A reader checks magic, version, length and hash before it looks at anything inside.
 
-use std::{
-    io::Write,
-    path::{Path, PathBuf},
-};
+use std::{fs, io, io::Write, path::Path};
 
 use serde::{Deserialize, Serialize};
 
@@ -163,33 +160,42 @@ impl ModalModel {
     /// Reads a `.modal` file.
     ///
     /// # Errors
-    /// The file cannot be opened, or as [`ModalModel::from_bytes`].
+    /// The file cannot be opened, or [`FileError::In`] around what [`ModalModel::from_bytes`] says; both name the file.
     pub fn read(path: impl AsRef<Path>) -> Result<Self, FileError> {
         let path = path.as_ref();
-        let bytes = std::fs::read(path)
-            .map_err(|source| FileError::Io { path: path.display().to_string(), source })?;
-        Self::from_bytes(&bytes)
+        let name = || path.display().to_string();
+        let bytes = fs::read(path).map_err(|source| FileError::Io { path: name(), source })?;
+        Self::from_bytes(&bytes).map_err(|source| FileError::In { path: name(), source: Box::new(source) })
     }
 
     /// Writes a `.modal` file: to a neighbour first, which is then renamed, so that a reader never finds half of it.
+    /// A link to a file stays one; what is no regular file (a device, a pipe) is written into.
     ///
     /// # Errors
     /// The operating system refused.
     pub fn write(&self, path: impl AsRef<Path>) -> Result<(), FileError> {
         let path = path.as_ref();
-        let mut partial = path.as_os_str().to_owned();
-        partial.push(format!(".{}.partial", std::process::id()));
-        let partial = PathBuf::from(partial);
-        let io = |source| FileError::Io { path: path.display().to_string(), source };
-        let written = std::fs::File::create(&partial)
-            .and_then(|mut file| file.write_all(&self.to_bytes()).and_then(|()| file.sync_all()))
-            .and_then(|()| std::fs::rename(&partial, path));
-        written.map_err(|source| {
-            // The first error is the one to report; a leftover that cannot be removed says nothing more.
-            let _ = std::fs::remove_file(&partial);
-            io(source)
-        })
+        write_whole(path, &self.to_bytes())
+            .map_err(|source| FileError::Io { path: path.display().to_string(), source })
     }
+}
+
+fn write_whole(path: &Path, bytes: &[u8]) -> io::Result<()> {
+    // What is not there yet has no other name.
+    let goal = fs::canonicalize(path).unwrap_or_else(|_| path.to_owned());
+    if fs::metadata(&goal).is_ok_and(|goal| !goal.is_file()) {
+        return fs::OpenOptions::new().write(true).open(&goal)?.write_all(bytes);
+    }
+    let mut partial = goal.file_name().ok_or(io::ErrorKind::InvalidFilename)?.to_owned();
+    partial.push(format!(".{}.partial", std::process::id()));
+    let partial = goal.with_file_name(partial);
+    fs::File::create(&partial)
+        .and_then(|mut file| file.write_all(bytes).and_then(|()| file.sync_all()))
+        .and_then(|()| fs::rename(&partial, &goal))
+        .inspect_err(|_| {
+            // The first error is the one to report; a leftover that cannot be removed says nothing more.
+            let _ = fs::remove_file(&partial);
+        })
 }
 
 fn decode(payload: &[u8]) -> Result<ModelParts, FileError> {

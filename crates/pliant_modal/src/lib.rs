@@ -34,6 +34,7 @@
 
 mod basis;
 mod body;
+mod check;
 mod error;
 mod file;
 mod integrator;

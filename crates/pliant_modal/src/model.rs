@@ -2,7 +2,7 @@
 
 use serde::{Deserialize, Serialize};
 
-use crate::{Basis, ModelError, SurfaceMesh};
+use crate::{Basis, ModelError, SurfaceMesh, check::check_parts};
 
 /// The finite element that a body was baked with.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
@@ -147,6 +147,12 @@ pub struct ModalModel {
 impl ModalModel {
     /// Most modes that a model may have.
     pub const MAX_MODES: usize = 4096;
+
+    /// Longest name, and longest text of one anchor, that a model keeps: bytes.
+    pub const MAX_TEXT: usize = 256;
+
+    /// Most anchors that a model keeps.
+    pub const MAX_ANCHORS: usize = 64;
 
     /// Checks the parts and builds the run-time layout.
     ///
@@ -355,71 +361,4 @@ impl ModalModel {
 
 fn combine(a: &[[f64; 3]; 3], s: f64, b: &[[f64; 3]; 3], t: f64) -> [[f64; 3]; 3] {
     std::array::from_fn(|i| std::array::from_fn(|j| s * a[i][j] + t * b[i][j]))
-}
-
-fn check_parts(parts: &ModelParts) -> Result<(), ModelError> {
-    let modes = parts.omega.len();
-    let vertices = parts.surface.positions().len();
-    if modes == 0 {
-        return Err(ModelError::Empty("mode"));
-    }
-    let length = |what, expected: usize, got: usize| {
-        if expected == got { Ok(()) } else { Err(ModelError::Length { what, expected, got }) }
-    };
-    if modes > ModalModel::MAX_MODES {
-        return Err(ModelError::Length { what: "omega", expected: ModalModel::MAX_MODES, got: modes });
-    }
-    length("damping", modes, parts.damping.len())?;
-    length("participation", modes, parts.participation.len())?;
-    length("displacement", modes * vertices * 3, parts.displacement.len())?;
-    length("rotation", modes * vertices * 3, parts.rotation.len())?;
-
-    let each = |what, expected, values: &mut dyn Iterator<Item = f64>, ok: &dyn Fn(f64) -> bool| match values
-        .enumerate()
-        .find(|&(_, x)| !(x.is_finite() && ok(x)))
-    {
-        None => Ok(()),
-        Some((index, got)) => Err(ModelError::Value { what, index, expected, got }),
-    };
-    let any = |_: f64| true;
-    let positive = |x: f64| x > 0.0;
-    let not_negative = |x: f64| x >= 0.0;
-    let info = &parts.info;
-    each("omega", "rad/s above 0", &mut parts.omega.iter().copied(), &positive)?;
-    each("omega", "ascending", &mut parts.omega.windows(2).map(|w| w[1] - w[0]), &not_negative)?;
-    each("damping", "1/s, 0 or more", &mut parts.damping.iter().copied(), &not_negative)?;
-    each("displacement", "finite", &mut parts.displacement.iter().map(|&x| f64::from(x)), &any)?;
-    each("rotation", "finite", &mut parts.rotation.iter().map(|&x| f64::from(x)), &any)?;
-    each("participation", "finite", &mut parts.participation.iter().flatten().copied(), &any)?;
-    each("mass", "kg above 0", &mut [parts.mass].into_iter(), &positive)?;
-    each("center_of_mass", "finite metres", &mut parts.center_of_mass.into_iter(), &any)?;
-    each("inertia", "finite", &mut parts.inertia.into_iter().flatten(), &any)?;
-    if nalgebra::Matrix3::from_fn(|i, j| parts.inertia[i][j]).cholesky().is_none() {
-        let got = parts.inertia[0][0];
-        return Err(ModelError::Value {
-            what: "inertia",
-            index: 0,
-            expected: "a positive definite matrix",
-            got,
-        });
-    }
-    each("young", "Pa above 0", &mut [info.young].into_iter(), &positive)?;
-    each("poisson", "-1 < nu < 0.5", &mut [info.poisson].into_iter(), &|x| x > -1.0 && x < 0.5)?;
-    each("density", "kg/m^3 above 0", &mut [info.density].into_iter(), &positive)?;
-    for (index, site) in parts.sites.iter().enumerate() {
-        if site.vertex as usize >= vertices {
-            return Err(ModelError::Vertex { what: "sites", index, vertex: site.vertex, count: vertices });
-        }
-        each("site radius", "m above 0", &mut [site.radius].into_iter(), &positive)?;
-        each("site flexibility", "finite", &mut site.flexibility.into_iter().flatten(), &any)?;
-        for k in 0..3 {
-            each(
-                "site flexibility diagonal",
-                "0 or more",
-                &mut [site.flexibility[k][k]].into_iter(),
-                &not_negative,
-            )?;
-        }
-    }
-    Ok(())
 }

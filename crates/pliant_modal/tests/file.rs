@@ -3,7 +3,7 @@
 
 mod rod;
 
-use pliant_modal::{FileError, ModalModel};
+use pliant_modal::{FileError, ModalModel, ModelParts};
 use proptest::prelude::*;
 
 #[test]
@@ -37,6 +37,72 @@ fn foreign_cut_padded_altered_and_future_files_are_named() {
     future[8] = 99;
     assert!(matches!(ModalModel::from_bytes(&future), Err(FileError::Version { got: 99, .. })));
     assert!(matches!(ModalModel::read("/nonexistent/body.modal"), Err(FileError::Io { .. })));
+}
+
+fn folder(name: &str) -> std::path::PathBuf {
+    let folder = std::env::temp_dir().join(format!("pliant_modal-{name}-{}", std::process::id()));
+    std::fs::create_dir_all(&folder).unwrap();
+    folder
+}
+
+#[test]
+fn what_is_wrong_in_a_file_names_the_file() {
+    let folder = folder("names");
+    let path = folder.join("broken.modal");
+    std::fs::write(&path, b"solid ascii stl").unwrap();
+    let error = ModalModel::read(&path).unwrap_err();
+    assert!(matches!(&error, FileError::In { source, .. } if matches!(**source, FileError::Magic(_))));
+    assert!(error.to_string().contains("broken.modal"), "{error}");
+    let error = rod::rod(1e6, 3, 0.02, false).write(folder.join("no/such.modal")).unwrap_err();
+    assert!(error.to_string().contains("such.modal"), "{error}");
+    std::fs::remove_dir_all(folder).unwrap();
+}
+
+#[cfg(unix)]
+#[test]
+fn a_link_stays_a_link_and_a_device_stays_a_device() {
+    use std::os::unix::fs::FileTypeExt;
+
+    let folder = folder("links");
+    let (file, link, null) =
+        (folder.join("real.modal"), folder.join("link.modal"), folder.join("null.modal"));
+    let model = rod::rod(1e6, 3, 0.02, false);
+    model.write(&file).unwrap();
+    std::os::unix::fs::symlink("real.modal", &link).unwrap();
+    let other = rod::rod(2e6, 3, 0.02, false);
+    other.write(&link).unwrap();
+    assert!(link.symlink_metadata().unwrap().is_symlink());
+    assert_eq!(ModalModel::read(&file).unwrap().hash(), other.hash());
+    std::os::unix::fs::symlink("/dev/null", &null).unwrap();
+    model.write(&null).unwrap();
+    assert!(std::fs::metadata("/dev/null").unwrap().file_type().is_char_device());
+    assert_eq!(std::fs::read_dir(&folder).unwrap().count(), 3, "nothing is left over");
+    std::fs::remove_dir_all(folder).unwrap();
+}
+
+#[test]
+fn parts_that_cannot_be_stepped_or_told_are_refused_by_name() {
+    let refused = |change: &dyn Fn(&mut ModelParts)| {
+        let mut parts = rod::rod(1e6, 3, 0.02, false).parts().clone();
+        change(&mut parts);
+        ModalModel::from_parts(parts).unwrap_err().to_string()
+    };
+    // 1e200 squared overflows, 1e-200 squared is zero: neither is a stiffness.
+    assert!(refused(&|p| p.omega[2] = 1e200).contains("omega[2]"));
+    assert!(refused(&|p| p.omega[0] = 1e-200).contains("omega[0]"));
+    assert!(refused(&|p| p.damping[1] = 1e300).contains("damping[1]"));
+    assert!(refused(&|p| p.sites[0].flexibility[0][1] = 1.0).contains("symmetric"));
+    let not_definite = refused(&|p| {
+        p.sites[0].flexibility[0][1] = 1.0;
+        p.sites[0].flexibility[1][0] = 1.0;
+    });
+    assert!(not_definite.contains("semi-definite"), "{not_definite}");
+    assert!(refused(&|p| p.sites[0].flexibility[2][2] = -1.0).contains("semi-definite"));
+    assert!(
+        refused(&|p| p.info.name = "x".repeat(257)).contains("name: expected at most 256 bytes, got 257")
+    );
+    assert!(refused(&|p| p.info.anchors = vec![String::new(); 65]).contains("anchors"));
+    assert!(refused(&|p| p.info.anchors = vec!["x".repeat(300)]).contains("anchor"));
 }
 
 proptest! {
