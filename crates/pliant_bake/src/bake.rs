@@ -48,6 +48,9 @@ pub fn bake(
         pliant_modal::Element::Tet10 => Element::Tet10,
         other => return Err(BakeError::Element { got: other.to_string() }),
     };
+    if let Some(folder) = &config.export_matrices {
+        matrix_market::check_folder(folder)?;
+    }
     mesh.check().map_err(BakeError::Mesh)?;
     let mut mesh = mesh.clone();
     mesh.drop_unused_nodes();
@@ -66,9 +69,6 @@ pub fn bake(
     progress(Stage::Assemble, 0.3);
     let matrix = fe.assemble(&law, &number, &ordered);
     let properties = MassProperties::new(&fe, config.density);
-    if let Some(folder) = &config.export_matrices {
-        matrix_market::export(folder, &matrix, &number)?;
-    }
     times.assemble = clock.lap();
 
     progress(Stage::Factor, 0.0);
@@ -127,6 +127,10 @@ pub fn bake(
         surface: skin.mesh,
     };
     let model = ModalModel::from_parts(parts)?;
+    // Of a bake that failed nothing is left.
+    if let Some(folder) = &config.export_matrices {
+        matrix_market::export(folder, &matrix, &number)?;
+    }
     times.surface = clock.lap();
     times.total = times.assemble + times.factor + times.modes + times.surface;
     progress(Stage::Surface, 1.0);

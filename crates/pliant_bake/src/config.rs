@@ -6,27 +6,30 @@ use pliant_modal::{Damping, Element, ModalModel};
 
 use crate::{Anchor, BakeError};
 
-const _: () = assert!(ModalModel::MAX_MODES == 4096, "the message in `check` says 4096");
+const _: () = assert!(
+    ModalModel::MAX_MODES == 4096 && ModalModel::MAX_TEXT == 256 && ModalModel::MAX_ANCHORS == 64,
+    "the messages in `check` say so"
+);
 
 /// What to make of a mesh. All numbers in SI units.
 #[derive(Clone, Debug, PartialEq)]
 pub struct BakeConfig {
-    /// A name for people, kept in the model. Default: empty.
+    /// A name for people, kept in the model; at most [`ModalModel::MAX_TEXT`] bytes. Default: empty.
     pub name: String,
     /// The finite element. Default: [`Element::Tet10`].
     pub element: Element,
     /// Elastic modes to keep. Default: 60.
     pub modes: usize,
-    /// Young's modulus, Pa. Default: 1e5, a soft silicone.
+    /// Young's modulus, 1e-3 to 1e15 Pa. Default: 1e5, a soft silicone.
     pub young: f64,
     /// Poisson ratio, above -1 and below 0.5. Default: 0.4. Above 0.45 the pressure is averaged over nodes, so that
     /// nothing locks.
     pub poisson: f64,
-    /// Density, kg/m^3. Default: 1000.
+    /// Density, 1e-6 to 1e7 kg/m^3. Default: 1000.
     pub density: f64,
-    /// How the modes lose energy. Default: 3 % of critical damping in every mode.
+    /// How the modes lose energy: a ratio of 0 to 1000, or alpha of 0 to 1e9 1/s and beta of 0 to 1e3 s. Default: 3 % of critical damping in every mode.
     pub damping: Damping,
-    /// What is held fixed; the union of all. Default: none, a free body.
+    /// What is held fixed; the union of all, at most [`ModalModel::MAX_ANCHORS`]. Default: none, a free body.
     pub anchors: Vec<Anchor>,
     /// For how many places on the surface the residual flexibility is baked, spread evenly; at most one a vertex.
     /// Default: `None`, as many as a second of one core gives, from 64 to 512.
@@ -65,19 +68,19 @@ impl BakeConfig {
         let number = |name, expected, ok: bool, got| {
             if ok { Ok(()) } else { Err(BakeError::Parameter { name, expected, got }) }
         };
-        let positive = |x: f64| x.is_finite() && x > 0.0;
-        let not_negative = |x: f64| x.is_finite() && x >= 0.0;
-        number("Young's modulus", "a finite number of Pa above 0", positive(self.young), self.young)?;
+        // Far beyond anything that exists, near enough for the arithmetic to be sound. NaN is in no range.
+        let young = self.young;
+        number("Young's modulus", "1e-3 to 1e15 Pa", (1e-3..=1e15).contains(&young), young)?;
         let nu = self.poisson;
         number("Poisson ratio", "a number above -1 and below 0.5", nu > -1.0 && nu < 0.5, nu)?;
-        number("density", "a finite number of kg/m^3 above 0", positive(self.density), self.density)?;
+        number("density", "1e-6 to 1e7 kg/m^3", (1e-6..=1e7).contains(&self.density), self.density)?;
         match self.damping {
             Damping::Rayleigh { alpha, beta } => {
-                number("Rayleigh alpha", "a finite number of 1/s, 0 or more", not_negative(alpha), alpha)?;
-                number("Rayleigh beta", "a finite number of s, 0 or more", not_negative(beta), beta)?;
+                number("Rayleigh alpha", "0 to 1e9 1/s", (0.0..=1e9).contains(&alpha), alpha)?;
+                number("Rayleigh beta", "0 to 1e3 s", (0.0..=1e3).contains(&beta), beta)?;
             }
             Damping::Ratio(zeta) => {
-                number("damping ratio", "a finite number, 0 or more", not_negative(zeta), zeta)?;
+                number("damping ratio", "0 to 1000", (0.0..=1e3).contains(&zeta), zeta)?;
             }
             // A law that is younger than this crate: the model's own check has the last word on its coefficients.
             _ => {}
@@ -86,10 +89,13 @@ impl BakeConfig {
             number(
                 "site radius",
                 "a share of the size above 0, at most 1",
-                positive(radius) && radius <= 1.0,
+                radius > 0.0 && radius <= 1.0,
                 radius,
             )?;
         }
+        let (name, anchors) = (self.name.len(), self.anchors.len());
+        number("name", "at most 256 bytes", name <= ModalModel::MAX_TEXT, name as f64)?;
+        number("anchors", "at most 64", anchors <= ModalModel::MAX_ANCHORS, anchors as f64)?;
         if self.modes == 0 || self.modes > ModalModel::MAX_MODES {
             return Err(BakeError::Parameter {
                 name: "modes",
@@ -136,4 +142,55 @@ pub struct Bake {
     pub model: ModalModel,
     /// How long it took.
     pub times: BakeTimes,
+}
+
+#[cfg(test)]
+mod tests {
+    use std::sync::Arc;
+
+    use pliant_mesh::shapes;
+    use pliant_modal::{Body, BodyConfig, GrabConfig, Patch};
+
+    use super::*;
+    use crate::bake;
+
+    /// The corners of what `check` lets through are baked, held and stepped.
+    #[test]
+    fn what_is_accepted_can_be_baked_and_stepped() {
+        let mesh = shapes::bar([4, 2, 2], [0.4, 0.2, 0.2]).unwrap();
+        let heavy = [Damping::Ratio(1e3), Damping::Rayleigh { alpha: 1e9, beta: 1e3 }];
+        let mut cases: Vec<(f64, f64, f64, Damping)> = Vec::new();
+        for young in [1e-3, 1e15] {
+            for density in [1e-6, 1e7] {
+                cases.extend([Damping::Ratio(0.0), heavy[0], heavy[1]].map(|d| (young, 0.3, density, d)));
+            }
+        }
+        let usual = Damping::Ratio(0.03);
+        cases.extend([1e2, 1e12].map(|young| (young, 0.3, 1000.0, usual)));
+        cases.extend([-0.999, -0.9, 0.0, 0.4999, 0.49999].map(|poisson| (1e5, poisson, 1000.0, usual)));
+        for (young, poisson, density, damping) in cases {
+            for anchors in [vec![], vec!["x<0.01".parse().unwrap()]] {
+                let config = BakeConfig {
+                    modes: 8,
+                    young,
+                    poisson,
+                    density,
+                    damping,
+                    anchors,
+                    ..BakeConfig::default()
+                };
+                let case = format!("{config:?}");
+                let made = bake(&mesh, None, &config, &mut |_, _| ());
+                let model = Arc::new(made.unwrap_or_else(|error| panic!("{error}: {case}")).model);
+                let mut body = Body::new(model.clone(), BodyConfig::default()).unwrap();
+                let patch = Patch::around(model.surface(), 0, 0.05).unwrap();
+                let grab = body.grab(&patch, GrabConfig::default()).unwrap();
+                let start = body.grab_position(grab).unwrap();
+                body.set_target(grab, [start[0], start[1] + 0.01, start[2]]).unwrap();
+                for _ in 0..10 {
+                    body.step().unwrap_or_else(|error| panic!("{error}: {case}"));
+                }
+            }
+        }
+    }
 }

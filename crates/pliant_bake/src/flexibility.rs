@@ -1,6 +1,7 @@
 //! Residual flexibility of patches: what the kept modes leave out of the static compliance at a hand.
 
 use faer::Mat;
+use nalgebra::Matrix3;
 use pliant_modal::{FlexibilitySite, ModelError, Patch, SurfaceMesh};
 use rayon::prelude::*;
 
@@ -148,16 +149,24 @@ impl Held {
                     along.iter().zip(&modes.lambda).map(|(phi, lambda)| phi[i] * phi[j] / lambda).sum();
                 sum - modal
             };
-            std::array::from_fn(|i| {
-                std::array::from_fn(|j| {
-                    let residual = 0.5 * (entry(i, j) + entry(j, i));
-                    // Rounding must not make a compliance negative.
-                    if i == j { residual.max(0.0) } else { residual }
-                })
-            })
+            settle(&Matrix3::from_fn(|i, j| 0.5 * (entry(i, j) + entry(j, i))))
         };
         loads.iter().enumerate().map(one).collect()
     }
+}
+
+/// Rounding must not make a compliance negative: where the kept modes say nearly all, what they leave may come out so.
+/// The nearest positive semi-definite matrix then has the negative eigenvalues set to zero.
+fn settle(residual: &Matrix3<f64>) -> [[f64; 3]; 3] {
+    let eigen = residual.symmetric_eigen();
+    let nearest = if eigen.eigenvalues.min() < 0.0 {
+        let kept = Matrix3::from_diagonal(&eigen.eigenvalues.map(|value| value.max(0.0)));
+        let turned = eigen.eigenvectors * kept * eigen.eigenvectors.transpose();
+        0.5 * (turned + turned.transpose())
+    } else {
+        *residual
+    };
+    std::array::from_fn(|i| std::array::from_fn(|j| nearest[(i, j)]))
 }
 
 /// Vertices spread over the surface: each next one is the furthest from those before. Anchored vertices are left out.

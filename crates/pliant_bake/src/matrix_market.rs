@@ -2,7 +2,9 @@
 
 use std::fs;
 use std::io::{BufWriter, Write};
-use std::path::{Path, PathBuf};
+use std::path::Path;
+
+use pliant_mesh::io::write_whole;
 
 use crate::BakeError;
 use crate::fem::ANCHORED;
@@ -10,7 +12,7 @@ use crate::sparse::BlockCsr;
 
 /// Writes `K.mtx` (N/m) and `M.mtx` (kg) into `folder`: lower triangles, `coordinate real symmetric`, of the degrees of
 /// freedom that are not anchored, in the order of the nodes: row `3 i + axis + 1` for the `i`-th free node.
-/// Each file appears whole or not at all.
+/// Each file appears whole or not at all, and not one without the other.
 pub(crate) fn export(folder: &Path, matrix: &BlockCsr, number: &[u32]) -> Result<(), BakeError> {
     let failed = |path: &Path| {
         let path = path.to_path_buf();
@@ -23,27 +25,37 @@ pub(crate) fn export(folder: &Path, matrix: &BlockCsr, number: &[u32]) -> Result
     for (natural, &row) in free.iter().enumerate() {
         rank[row as usize] = natural;
     }
-    for name in ["K", "M"] {
-        let path = folder.join(format!("{name}.mtx"));
-        let part = PathBuf::from(format!("{}.part", path.display()));
-        let written = write(&part, name == "K", matrix, &free, &rank).and_then(|()| fs::rename(&part, &path));
+    let paths = ["K", "M"].map(|name| folder.join(format!("{name}.mtx")));
+    for (index, path) in paths.iter().enumerate() {
+        let written = write_whole(path, |file| write(file, index == 0, matrix, &free, &rank));
         if let Err(source) = written {
-            // The error that matters is the first one.
-            let _ = fs::remove_file(&part);
-            return Err(failed(&path)(source));
+            if index > 0 && paths[0].is_file() {
+                // The error that matters is the first one.
+                let _ = fs::remove_file(&paths[0]);
+            }
+            return Err(failed(path)(source));
         }
     }
     Ok(())
 }
 
+/// Refuses what cannot be a folder, before the long work and not after it.
+pub(crate) fn check_folder(folder: &Path) -> Result<(), BakeError> {
+    if folder.exists() && !folder.is_dir() {
+        let source = std::io::ErrorKind::NotADirectory.into();
+        return Err(BakeError::Export { path: folder.to_path_buf(), source });
+    }
+    Ok(())
+}
+
 fn write(
-    path: &Path,
+    file: &mut fs::File,
     stiffness: bool,
     matrix: &BlockCsr,
     free: &[u32],
     rank: &[usize],
 ) -> std::io::Result<()> {
-    let mut file = BufWriter::with_capacity(1 << 20, fs::File::create(path)?);
+    let mut file = BufWriter::with_capacity(1 << 20, file);
     let n = 3 * free.len();
     let mut entries = 0usize;
     each_entry(stiffness, matrix, free, rank, &mut |_, _, _| {
@@ -56,8 +68,7 @@ fn write(
         // `{:e}` writes the shortest text that reads back to the same number.
         writeln!(file, "{} {} {value:e}", row + 1, column + 1)
     })?;
-    file.flush()?;
-    file.get_ref().sync_all()
+    file.flush()
 }
 
 fn each_entry(

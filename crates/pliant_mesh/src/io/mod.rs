@@ -176,7 +176,7 @@ pub fn write_msh_version(
     version: MshVersion,
 ) -> Result<(), MeshError> {
     mesh.check()?;
-    write_whole(path.as_ref(), msh::format(mesh, version).as_bytes())
+    write_text(path.as_ref(), &msh::format(mesh, version))
 }
 
 /// Writes tetrahedra in the format that the extension names, otherwise as [`write_msh`].
@@ -193,7 +193,7 @@ pub fn write_tets(path: impl AsRef<Path>, mesh: &TetMesh) -> Result<(), MeshErro
         _ => return Err(unknown(path, TETS)),
     };
     mesh.check()?;
-    write_whole(path, format(mesh).as_bytes())
+    write_text(path, &format(mesh))
 }
 
 fn extension(path: &Path) -> String {
@@ -218,26 +218,39 @@ fn bytes(path: &Path) -> Result<Vec<u8>, MeshError> {
     Ok(bytes)
 }
 
-/// Writes beside the goal, then renames: no reader ever sees half a file.
-fn write_whole(path: &Path, bytes: &[u8]) -> Result<(), MeshError> {
-    let failed = |source| MeshError::Write { path: path.to_owned(), source };
-    let Some(name) = path.file_name() else {
-        return Err(failed(std::io::Error::other("the path names no file")));
-    };
-    let mut part = name.to_owned();
+fn write_text(path: &Path, text: &str) -> Result<(), MeshError> {
+    write_whole(path, |file| file.write_all(text.as_bytes()))
+        .map_err(|source| MeshError::Write { path: path.to_owned(), source })
+}
+
+/// Writes a file whole or not at all: beside the goal, then renamed, so that no reader ever sees half of it.
+/// A link to a file stays one; what is no regular file (a device, a pipe) is written into.
+///
+/// # Errors
+/// What `write` or the operating system says; what stood there before is then still there.
+pub fn write_whole(
+    path: &Path,
+    write: impl FnOnce(&mut fs::File) -> std::io::Result<()>,
+) -> std::io::Result<()> {
+    // What is not there yet has no other name.
+    let goal = fs::canonicalize(path).unwrap_or_else(|_| path.to_owned());
+    if fs::metadata(&goal).is_ok_and(|goal| !goal.is_file()) {
+        return write(&mut fs::OpenOptions::new().write(true).open(&goal)?);
+    }
+    let mut part =
+        goal.file_name().ok_or_else(|| std::io::Error::other("the path names no file"))?.to_owned();
     part.push(format!(".{}.part", std::process::id()));
-    let part = path.with_file_name(part);
-    let written = fs::File::create(&part)
+    let part = goal.with_file_name(part);
+    fs::File::create(&part)
         .and_then(|mut file| {
-            file.write_all(bytes)?;
+            write(&mut file)?;
             file.sync_all()
         })
-        .and_then(|()| fs::rename(&part, path));
-    written.map_err(|source| {
-        // The first error is the one to tell; the part may not even exist.
-        let _ = fs::remove_file(&part);
-        failed(source)
-    })
+        .and_then(|()| fs::rename(&part, &goal))
+        .inspect_err(|_| {
+            // The first error is the one to tell; the part may not even exist.
+            let _ = fs::remove_file(&part);
+        })
 }
 
 #[cfg(test)]
@@ -249,6 +262,26 @@ mod tests {
         let folder = std::env::temp_dir().join(format!("pliant_mesh-{name}-{}", std::process::id()));
         fs::create_dir_all(&folder).unwrap();
         folder
+    }
+
+    #[cfg(unix)]
+    #[test]
+    fn a_link_stays_a_link_and_a_device_stays_a_device() {
+        use std::os::unix::fs::{FileTypeExt, symlink};
+
+        let folder = folder("links");
+        let (link, null) = (folder.join("link.msh"), folder.join("null.msh"));
+        fs::write(folder.join("real.msh"), "something old").unwrap();
+        symlink("real.msh", &link).unwrap();
+        symlink("/dev/null", &null).unwrap();
+        let mesh = shapes::sphere(4, 0.1).unwrap();
+        write_msh(&link, &mesh).unwrap();
+        assert!(link.symlink_metadata().unwrap().is_symlink());
+        assert_eq!(read_tets(folder.join("real.msh")).unwrap().tets.len(), mesh.tets.len());
+        write_msh(&null, &mesh).unwrap();
+        assert!(fs::metadata("/dev/null").unwrap().file_type().is_char_device());
+        assert_eq!(fs::read_dir(&folder).unwrap().count(), 3, "nothing is left over");
+        fs::remove_dir_all(folder).unwrap();
     }
 
     #[test]
