@@ -6,7 +6,7 @@ use std::time::Instant;
 use clap::Args;
 use pliant_bake::{Anchor, BakeConfig, Stage};
 use pliant_mesh::io;
-use pliant_modal::{Damping, Element};
+use pliant_modal::{Damping, Element, ModalModel};
 use serde::Serialize;
 
 use crate::output::{self, Summary};
@@ -28,13 +28,13 @@ pub(crate) struct BakeArgs {
     /// Elastic modes to keep
     #[arg(long, default_value_t = 60, allow_negative_numbers = true)]
     modes: usize,
-    /// Young's modulus, Pa
+    /// Young's modulus, 1e-3 to 1e15 Pa
     #[arg(long, value_name = "PA", default_value_t = 1e5, allow_hyphen_values = true)]
     young: f64,
-    /// Poisson ratio, above -1 and below 0.5
+    /// Poisson ratio, -0.99 to 0.49999
     #[arg(long, value_name = "NU", default_value_t = 0.4, allow_hyphen_values = true)]
     poisson: f64,
-    /// Density, kg/m^3
+    /// Density, 1e-6 to 1e7 kg/m^3
     #[arg(long, value_name = "KG_M3", default_value_t = 1000.0, allow_hyphen_values = true)]
     density: f64,
     /// Rayleigh damping: c = A + B omega^2, A in 1/s, B in s
@@ -49,7 +49,7 @@ pub(crate) struct BakeArgs {
     /// A surface to wear instead of the tetrahedra's boundary; it moves with them
     #[arg(long, value_name = "SURFACE")]
     skin: Option<PathBuf>,
-    /// Writes K.mtx and M.mtx (MatrixMarket) into this folder
+    /// Writes K.mtx and M.mtx (MatrixMarket) into this folder once the bake succeeded
     #[arg(long, value_name = "DIR")]
     export_matrices: Option<PathBuf>,
     /// Threads to use [default: one a core]. The result is the same to the bit
@@ -105,7 +105,8 @@ pub(crate) fn run(args: BakeArgs) -> Result<(), CliError> {
             return Err(wrong);
         }
     }
-    let name = args.input.file_stem().map(|stem| stem.to_string_lossy().into_owned()).unwrap_or_default();
+    let mut name = args.input.file_stem().map(|stem| stem.to_string_lossy().into_owned()).unwrap_or_default();
+    name.truncate(name.floor_char_boundary(ModalModel::MAX_TEXT));
     let defaults = BakeConfig::default();
     let damping = match (args.rayleigh, args.damping_ratio) {
         (Some([alpha, beta]), _) => Damping::Rayleigh { alpha, beta },

@@ -19,10 +19,6 @@ pub(crate) struct InspectArgs {
 }
 
 pub(crate) fn run(args: &InspectArgs) -> Result<(), CliError> {
-    let model = ModalModel::read(&args.input).map_err(|source| match source {
-        // This one names the file itself.
-        source @ pliant_modal::FileError::Io { .. } => CliError::File(source),
-        source => CliError::NotAModel { input: args.input.clone(), source },
-    })?;
+    let model = ModalModel::read(&args.input)?;
     if args.json { output::print_json(&Summary::new(&model)) } else { output::print(&output::table(&model)) }
 }

@@ -66,8 +66,6 @@ enum CliError {
     Threads { got: usize, most: usize },
     #[error("--output: the folder {0} is not there")]
     NoFolder(std::path::PathBuf),
-    #[error("{input} holds no model: {source}")]
-    NotAModel { input: std::path::PathBuf, source: pliant_modal::FileError },
     #[error("{0}")]
     Stream(#[from] pliant_stream::StreamError),
     #[error("{what}: expected one of {expected}, got '{got}'")]

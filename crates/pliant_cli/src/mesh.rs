@@ -11,17 +11,21 @@ use crate::{CliError, output};
 /// Tetrahedra that a surface or a scene is filled with unless told otherwise.
 pub(crate) const DEFAULT_TETS: usize = 10_000;
 
+/// Share of a surface's volume that a fill may lose in silence.
+const VOLUME_LOSS: f64 = 0.02;
+
 #[derive(Args, Debug)]
 #[command(args_conflicts_with_subcommands = true, subcommand_negates_reqs = true)]
 pub(crate) struct MeshArgs {
     #[command(subcommand)]
     shape: Option<Shape>,
-    /// A closed surface (.obj, .stl, .ply, .gltf, .glb) or a scene of rounded parts (.ron)
+    /// A closed surface (.obj, .stl, .ply, .gltf, .glb), a scene of rounded parts (.ron), or tetrahedra to write in
+    /// another format (.msh, .vtk, .mesh, .veg)
     #[arg(required = true)]
     input: Option<PathBuf>,
-    /// About how many tetrahedra, met within 5 %
-    #[arg(long, default_value_t = DEFAULT_TETS, allow_negative_numbers = true)]
-    tets: usize,
+    /// About how many tetrahedra to fill it with, met within 5 % [default: 10000]
+    #[arg(long, allow_negative_numbers = true)]
+    tets: Option<usize>,
     /// The file to write: .msh, .vtk, .mesh or .veg
     #[arg(short, long, required = true)]
     output: Option<PathBuf>,
@@ -96,7 +100,7 @@ pub(crate) fn run(args: MeshArgs) -> Result<(), CliError> {
             // Clap asks for both where there is no shape.
             let (input, output) = (args.input.unwrap_or_default(), args.output.unwrap_or_default());
             output::check_folder(&output)?;
-            (fill(&input, Some(args.tets), &mut Bar::new())?, output)
+            (fill(&input, args.tets, &mut Bar::new())?, output)
         }
     };
     io::write_tets(&path, &mesh)?;
@@ -113,7 +117,7 @@ pub(crate) fn run(args: MeshArgs) -> Result<(), CliError> {
 }
 
 /// The tetrahedra that a file holds, or that its shape is filled with. `tets` asked for tetrahedra: refused where the
-/// file has its own.
+/// file has its own. A fill so coarse that it rounds much of a surface away is told on stderr.
 pub(crate) fn fill(input: &Path, tets: Option<usize>, bar: &mut Bar) -> Result<TetMesh, CliError> {
     bar.report("read", 0.0);
     let read = io::read(input)?;
@@ -121,5 +125,15 @@ pub(crate) fn fill(input: &Path, tets: Option<usize>, bar: &mut Bar) -> Result<T
         return Err(CliError::TetsGiven(input.to_path_buf()));
     }
     let options = StuffOptions::with_target(tets.unwrap_or(DEFAULT_TETS));
-    Ok(read.into_tets(&options, &mut |share| bar.report("mesh", f64::from(share)))?)
+    let enclosed = if let io::Input::Surface(surface) = &read { surface.volume().abs() } else { 0.0 };
+    let mesh = read.into_tets(&options, &mut |share| bar.report("mesh", f64::from(share)))?;
+    let filled = mesh.volume();
+    if filled < (1.0 - VOLUME_LOSS) * enclosed {
+        bar.warn(&format!(
+            "the tetrahedra hold {filled:.6e} m^3 of the {enclosed:.6e} m^3 that {} encloses: edges and thin parts are \
+             rounded away; more --tets keep more",
+            input.display()
+        ));
+    }
+    Ok(mesh)
 }

@@ -73,14 +73,18 @@ pub(crate) fn table(model: &ModalModel) -> String {
     let summary = Summary::new(model);
     let mut rows: Vec<(&str, String)> = Vec::new();
     if !info.name.is_empty() {
-        rows.push(("name", info.name.clone()));
+        rows.push(("name", plain(&info.name)));
     }
     rows.push(("simulation mesh", format!("{} {}, {} nodes", summary.tets, summary.element, summary.nodes)));
     rows.push(("material", format!("E {} Pa, nu {}, {} kg/m^3", info.young, info.poisson, info.density)));
     rows.push(("damping", damping(info.damping)));
     rows.push((
         "anchors",
-        if info.anchors.is_empty() { "none: a free body".to_owned() } else { info.anchors.join(", ") },
+        if info.anchors.is_empty() {
+            "none: a free body".to_owned()
+        } else {
+            plain(&info.anchors.join(", "))
+        },
     ));
     rows.push(("mass", format!("{:.6} kg", summary.mass_kg)));
     rows.push((
@@ -100,6 +104,22 @@ pub(crate) fn table(model: &ModalModel) -> String {
     }
     text.truncate(text.trim_end().len());
     text
+}
+
+/// A text out of a file, fit for a terminal: control characters, and those that turn the direction of writing, escaped.
+fn plain(text: &str) -> String {
+    let tricky = |c: char| {
+        c.is_control()
+            || matches!(c, '\u{200e}' | '\u{200f}' | '\u{2028}'..='\u{202e}' | '\u{2066}'..='\u{2069}')
+    };
+    text.chars().fold(String::new(), |mut out, c| {
+        if tricky(c) {
+            out.extend(c.escape_unicode())
+        } else {
+            out.push(c)
+        }
+        out
+    })
 }
 
 fn damping(law: pliant_modal::Damping) -> String {

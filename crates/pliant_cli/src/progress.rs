@@ -28,6 +28,11 @@ impl Bar {
         }
         self.bar.set_position((share.clamp(0.0, 1.0) * STEPS as f64) as u64);
     }
+
+    /// One line on stderr that stays, whether there is a bar or not.
+    pub(crate) fn warn(&self, text: &str) {
+        self.bar.suspend(|| eprintln!("pliant: warning: {text}"));
+    }
 }
 
 impl Drop for Bar {

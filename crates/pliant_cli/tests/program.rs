@@ -46,11 +46,17 @@ fn pliant(arguments: &[&str]) -> Output {
 }
 
 fn succeeds(arguments: &[&str]) -> String {
+    let (told, message) = succeeds_with_a_word(arguments);
+    assert!(message.is_empty(), "no progress bar in a pipe: {message}");
+    told
+}
+
+/// What it says on stdout and on stderr.
+fn succeeds_with_a_word(arguments: &[&str]) -> (String, String) {
     let output = pliant(arguments);
     let message = String::from_utf8_lossy(&output.stderr).into_owned();
     assert!(output.status.success(), "{arguments:?}: {message}");
-    assert!(message.is_empty(), "no progress bar in a pipe: {message}");
-    String::from_utf8(output.stdout).unwrap()
+    (String::from_utf8(output.stdout).unwrap(), message)
 }
 
 /// Exit code 2, nothing on stdout, the message on stderr.
@@ -161,8 +167,12 @@ fn a_surface_is_filled_and_wears_a_skin() {
     let folder = Folder::new("surface");
     let surface = folder.write("octahedron.obj", OCTAHEDRON);
     let (mesh, model, matrices) = (folder.file("o.msh"), folder.file("o.modal"), folder.file("matrices"));
+    // So few tetrahedra round its edges and corners: 6 % of the 4/3 m^3, which is told with both volumes.
+    let (_, word) = succeeds_with_a_word(&["mesh", &surface, "--tets", "1000", "-o", &mesh]);
+    assert!(word.lines().count() == 1 && word.contains("warning") && word.contains("1.333333e0"), "{word}");
+    // 1.3 % with twice as many, and nothing is said.
     succeeds(&["mesh", &surface, "--tets", "2000", "-o", &mesh]);
-    let baked = json(&succeeds(&[
+    let (baked, _) = succeeds_with_a_word(&[
         "bake",
         &surface,
         "--tets",
@@ -180,12 +190,63 @@ fn a_surface_is_filled_and_wears_a_skin() {
         "-o",
         &model,
         "--json",
-    ]));
+    ]);
+    let baked = json(&baked);
     assert_eq!(baked["surface_vertices"], 6);
     assert_eq!(baked["rigid_modes"], 6);
     // Volume 4/3 m^3; so few tetrahedra round its edges and corners.
     assert!((baked["mass_kg"].as_f64().unwrap() / (4000.0 / 3.0) - 1.0).abs() < 0.1);
     assert!(Path::new(&matrices).join("K.mtx").exists() && Path::new(&matrices).join("M.mtx").exists());
+}
+
+#[test]
+fn tetrahedra_are_written_in_another_format() {
+    let folder = Folder::new("convert");
+    let (msh, veg, back) = (folder.file("a.msh"), folder.file("a.veg"), folder.file("b.msh"));
+    succeeds(&["mesh", "bar", "--cells", "4,1,1", "--size", "0.4,0.1,0.1", "-o", &msh]);
+    assert!(succeeds(&["mesh", &msh, "-o", &veg]).contains("24 tetrahedra"));
+    succeeds(&["mesh", &veg, "-o", &back]);
+    assert_eq!(std::fs::read(&msh).unwrap(), std::fs::read(&back).unwrap());
+    assert!(refused(&["mesh", &msh, "--tets", "500", "-o", &veg]).contains("tetrahedra already"));
+}
+
+#[test]
+fn matrices_are_left_by_a_bake_that_succeeded_only() {
+    let folder = Folder::new("matrices");
+    let (mesh, model, matrices) = (folder.file("a.msh"), folder.file("a.modal"), folder.file("matrices"));
+    succeeds(&["mesh", "bar", "--cells", "4,1,1", "--size", "0.4,0.1,0.1", "-o", &mesh]);
+    let far = folder.write("far.obj", &OCTAHEDRON.replace("v 1 0 0", "v 50 0 0"));
+    let bake = |more: &[&str]| {
+        let all =
+            [&["bake", &mesh, "--modes", "3", "-o", &model, "--export-matrices", &matrices], more].concat();
+        pliant(&all)
+    };
+    // The skin is looked at last, long after the matrices are there.
+    let failed = bake(&["--skin", &far]);
+    assert!(String::from_utf8_lossy(&failed.stderr).contains("skin"), "{failed:?}");
+    assert_eq!(folder.names(), ["a.msh", "far.obj"]);
+    // A folder that holds something else under the name of the second file: nothing is left of the first.
+    std::fs::create_dir_all(Path::new(&matrices).join("M.mtx")).unwrap();
+    assert_eq!(bake(&[]).status.code(), Some(2));
+    assert!(!Path::new(&matrices).join("K.mtx").exists() && !Path::new(&model).exists());
+    std::fs::remove_dir_all(&matrices).unwrap();
+    folder.write("matrices", "a file");
+    assert_eq!(bake(&[]).status.code(), Some(2));
+    std::fs::remove_file(&matrices).unwrap();
+    assert!(bake(&[]).status.success());
+    assert!(Path::new(&matrices).join("M.mtx").is_file());
+}
+
+#[test]
+fn a_name_cannot_write_to_the_terminal() {
+    let folder = Folder::new("plain");
+    let (mesh, model) = (folder.file("a\u{1b}[31m.msh"), folder.file("a.modal"));
+    let plain = folder.file("a.msh");
+    succeeds(&["mesh", "bar", "--cells", "4,1,1", "--size", "0.4,0.1,0.1", "-o", &plain]);
+    std::fs::rename(&plain, &mesh).unwrap();
+    succeeds(&["bake", &mesh, "--modes", "3", "-o", &model]);
+    let table = succeeds(&["inspect", &model]);
+    assert!(table.contains("a\\u{1b}[31m") && !table.contains('\u{1b}'), "{table:?}");
 }
 
 #[test]
@@ -200,9 +261,8 @@ fn simple_shapes_are_meshed() {
             .contains("384 tetrahedra")
     );
     let scene = concat!(env!("CARGO_MANIFEST_DIR"), "/../../assets/pip.ron");
-    if Path::new(scene).exists() {
-        succeeds(&["mesh", scene, "--tets", "3000", "-o", &path]);
-    }
+    assert!(Path::new(scene).is_file(), "{scene} comes with the project");
+    succeeds(&["mesh", scene, "--tets", "3000", "-o", &path]);
 }
 
 #[test]
@@ -243,6 +303,10 @@ fn bad_input_is_refused_and_leaves_no_file() {
         (&[mesh, "--poisson", "0.5"], "Poisson"),
         (&[mesh, "--poisson", "-1"], "Poisson"),
         (&[mesh, "--density", "0"], "density"),
+        (&[mesh, "--young", "1e300"], "1e-3 to 1e15 Pa"),
+        (&[mesh, "--density", "1e-300"], "1e-6 to 1e7 kg/m^3"),
+        (&[mesh, "--damping-ratio", "1e9"], "0 to 1000"),
+        (&[mesh, "--rayleigh", "0,1e200"], "beta"),
         (&[mesh, "--rayleigh", "1"], "two numbers"),
         (&[mesh, "--rayleigh", "-1,0"], "alpha"),
         (&[mesh, "--damping-ratio", "inf"], "damping ratio"),
