@@ -145,6 +145,8 @@ pub(crate) struct Held {
     /// `None`: refused, and the refusal was told.
     pub id: Option<GrabId>,
     pub hold: Hold,
+    /// Refused only because the body had no place left; it is tried again when one is free.
+    pub waiting: bool,
     /// The current target was refused and the warning given.
     pub refusing: bool,
 }

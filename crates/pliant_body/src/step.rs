@@ -8,7 +8,7 @@ use bevy::{
     math::{DQuat, DVec3},
     prelude::*,
 };
-use pliant_modal::{Body, GrabConfig, Patch};
+use pliant_modal::{Body, GrabConfig, Patch, StepError};
 
 use crate::{
     BodyError, BodyRefused, BodyState, Driven, Grab, GrabForce, Grabs, ModalAsset, ModalBody, Pose,
@@ -167,6 +167,7 @@ pub(crate) fn place_bodies(
 }
 
 /// Makes the solver's grabs those of the entities: new ones are held, gone ones are let go, targets are handed over.
+/// One that found the body full waits, and is held once a place is free.
 pub(crate) fn hold_bodies(
     mut refusals: Refusals,
     mut bodies: Query<(&mut BodyState, &Driven, Option<&Grabs>)>,
@@ -181,7 +182,7 @@ pub(crate) fn hold_bodies(
             continue;
         }
         let BodyState { body, held, scale, quiet, resting, .. } = &mut *state;
-        (*quiet, *resting) = (0.0, false);
+        let before = body.grabs().count();
         held.retain(|held| {
             let stays = wanted.contains(&held.entity)
                 && grabs.get(held.entity).is_ok_and(|(_, grab)| grab.hold().is(&held.hold));
@@ -190,14 +191,21 @@ pub(crate) fn hold_bodies(
             }
             stays
         });
+        let let_go = body.grabs().count() < before;
         for &entity in wanted {
             let Ok((name, grab)) = grabs.get(entity) else { continue };
-            let index = held.iter().position(|held| held.entity == entity).unwrap_or_else(|| {
-                let id = take_hold(body, grab).map_err(|error| refusals.tell(&name, entity, error)).ok();
-                held.push(Held { entity, id, hold: grab.hold(), refusing: false });
+            let known = held.iter().position(|held| held.entity == entity);
+            let index = known.unwrap_or_else(|| {
+                held.push(Held { entity, id: None, hold: grab.hold(), waiting: false, refusing: false });
                 held.len() - 1
             });
             let held = &mut held[index];
+            let free = body.grabs().count() < Body::MAX_GRABS;
+            if known.is_none() || (held.waiting && free) {
+                let taken = take_hold(body, grab);
+                held.waiting = matches!(taken, Err(BodyError::Grab(StepError::TooManyGrabs { .. })));
+                held.id = taken.map_err(|error| refusals.tell(&name, entity, error)).ok();
+            }
             let Some(id) = held.id else { continue };
             // Not finite is the only way in which a target can be wrong.
             let refused = body.set_target(id, (grab.target / *scale).into()).is_err();
@@ -205,6 +213,10 @@ pub(crate) fn hold_bodies(
                 refusals.tell(&name, entity, BodyError::TargetNotFinite { target: grab.target.into() });
             }
             held.refusing = refused;
+        }
+        // A hand keeps the body awake, and so does letting go for as long as it moves; a hand that was refused touches nothing.
+        if let_go || held.iter().any(|held| held.id.is_some()) {
+            (*quiet, *resting) = (0.0, false);
         }
     }
 }
@@ -250,7 +262,8 @@ pub(crate) fn step_bodies(
             }
         }
         let slow = is_slow(&state.body, body.rest_speed);
-        state.quiet = if slow && state.held.is_empty() { state.quiet + step } else { 0.0 };
+        let left_alone = state.held.iter().all(|held| held.id.is_none());
+        state.quiet = if slow && left_alone { state.quiet + step } else { 0.0 };
         state.resting = state.quiet >= REST_AFTER;
     }
     if stepped {

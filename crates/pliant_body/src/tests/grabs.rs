@@ -118,6 +118,38 @@ fn a_grab_of_nothing_is_refused_and_the_body_goes_on() {
 }
 
 #[test]
+fn a_grab_that_found_the_body_full_is_held_once_a_place_is_free() {
+    let mut app = app();
+    let body = spawn(&mut app, model::bar(), ());
+    let most = pliant_modal::Body::MAX_GRABS;
+    let hands: Vec<Entity> = (0..=most).map(|_| grab(&mut app, body, DVec3::new(1.0, 0.0, 0.0))).collect();
+    steps(&mut app, 5);
+    let told = refusals(&mut app);
+    assert!(told.len() == 1 && told[0].0 == hands[most], "told once, of the one too many: {told:?}");
+    assert_eq!(state(&app, body).body().grabs().count(), most);
+    app.world_mut().despawn(hands[3]);
+    steps(&mut app, 1);
+    assert_eq!(state(&app, body).body().grabs().count(), most);
+    assert!(state(&app, body).held.iter().all(|held| held.id.is_some()));
+    assert!(refusals(&mut app).is_empty());
+}
+
+#[test]
+fn a_grab_that_was_refused_does_not_keep_the_body_awake() {
+    let mut app = app();
+    let body = spawn(&mut app, model::bar(), ());
+    let nowhere = app.world_mut().spawn((Grab::new(1_000_000, 0.01, DVec3::ZERO), GrabOf(body))).id();
+    steps(&mut app, 30);
+    assert!(state(&app, body).is_resting(), "0.5 s are 20 steps");
+    app.world_mut().despawn(nowhere);
+    steps(&mut app, 1);
+    assert!(state(&app, body).is_resting(), "it held nothing, so nothing was let go");
+    grab(&mut app, body, DVec3::new(1.0, 0.05, 0.0));
+    steps(&mut app, 30);
+    assert!(!state(&app, body).is_resting());
+}
+
+#[test]
 fn despawning_a_grab_or_unrelating_it_lets_go() {
     let mut app = app();
     let body = spawn(&mut app, model::bar(), ());
