@@ -11,6 +11,7 @@ use std::{
 
 use bevy::{
     app::ScheduleRunnerPlugin,
+    log::{Level, LogPlugin},
     math::DVec3,
     prelude::*,
     render::view::screenshot::{Screenshot, ScreenshotCaptured, save_to_disk},
@@ -68,6 +69,8 @@ pub struct Figures {
     /// Magnitude of the own hand's reaction, N.
     pub reaction: f64,
     pub kbit_s: f64,
+    /// How long ago the host was where this guest shows the body, s.
+    pub behind: f64,
 }
 
 #[derive(Resource)]
@@ -114,14 +117,17 @@ pub fn run_windowed(guest: Guest) -> GuestReport {
     run(app, guest)
 }
 
-/// Runs a guest without a window on this thread.
-pub fn run_headless(guest: Guest) -> GuestReport {
+/// Runs a guest without a window on this thread. One app of a process prints what all of them log.
+pub fn run_headless(guest: Guest, prints: bool) -> GuestReport {
     let mut app = App::new();
     app.add_plugins((
         MinimalPlugins.set(ScheduleRunnerPlugin::run_loop(Duration::from_millis(4))),
         AssetPlugin::default(),
         TransformPlugin,
     ));
+    if prints {
+        app.add_plugins(LogPlugin { level: Level::WARN, ..default() });
+    }
     run(app, guest)
 }
 
@@ -186,7 +192,9 @@ fn measure(
     figures.reaction = forces.iter().map(|f| f.force.length()).fold(0.0, f64::max);
     meter.reaction = meter.reaction.max(figures.reaction);
     for (remote, state) in &bodies {
+        let newest = truth.newest().map_or(0, |(tick, _)| tick);
         let shown = guest.read_body(*remote, |view| {
+            figures.behind = newest.saturating_sub(view.tick()) as f64 / RATE;
             view.shown().map(|shown| meter.compare(state.model(), view.tick(), &shown.q, &truth))
         });
         if shown.flatten().is_some() {

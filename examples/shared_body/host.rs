@@ -1,11 +1,12 @@
 //! The host: it steps the body and streams it. No window.
 
 use std::{
+    collections::VecDeque,
     sync::{
         Arc, Mutex, PoisonError,
         atomic::{AtomicBool, Ordering},
     },
-    time::Duration,
+    time::{Duration, Instant},
 };
 
 use bevy::{app::ScheduleRunnerPlugin, diagnostic::DiagnosticsStore, prelude::*};
@@ -18,6 +19,9 @@ use pliant::{
 
 use crate::{BODY, RATE, meter::Truth};
 
+/// Steps whose times are kept: half an hour.
+const STEPS: usize = 72_000;
+
 /// What the host has to say at the end.
 #[derive(Default, Clone, Debug)]
 pub struct HostReport {
@@ -27,8 +31,8 @@ pub struct HostReport {
     pub bytes_out: u64,
     /// Seconds over which they were sent.
     pub seconds: f64,
-    /// Time of each tick's step, us.
-    pub step_us: Vec<f64>,
+    /// Times of the newest steps, us; a resting body is not stepped.
+    pub step_us: VecDeque<f64>,
 }
 
 /// The report as it grows, and the sign to stop.
@@ -92,6 +96,7 @@ fn record(
     diagnostics: Res<DiagnosticsStore>,
     bodies: Query<&BodyState>,
     mut since: Local<Option<f64>>,
+    mut last: Local<Option<Instant>>,
 ) {
     for state in &bodies {
         truth.push(tick.0, state.body().q());
@@ -106,7 +111,12 @@ fn record(
     report.bytes_out = stats.bytes_out;
     report.seconds = now - begun;
     if let Some(step) = diagnostics.get_measurement(&STEP_TIME) {
-        report.step_us.push(step.value * 1e3);
+        if last.replace(step.time) != Some(step.time) {
+            report.step_us.push_back(step.value * 1e3);
+            if report.step_us.len() > STEPS {
+                report.step_us.pop_front();
+            }
+        }
     }
 }
 

@@ -21,7 +21,8 @@ mod view;
 
 use std::{
     error::Error,
-    path::Path,
+    panic::{AssertUnwindSafe, catch_unwind},
+    path::{Path, PathBuf},
     process::ExitCode,
     sync::{
         Arc,
@@ -108,7 +109,7 @@ fn run(options: &Options) -> Result<(), Box<dyn Error>> {
         ..guest(&options, "other", 2, &model, &invite, &truth)?
     };
     let other_thread =
-        thread::Builder::new().name("other".into()).spawn(move || guest::run_headless(other))?;
+        thread::Builder::new().name("other".into()).spawn(move || guest::run_headless(other, false))?;
 
     let scripted = options.headless || options.screenshot.is_some();
     let you = Guest {
@@ -123,7 +124,13 @@ fn run(options: &Options) -> Result<(), Box<dyn Error>> {
         screenshot: options.screenshot.clone(),
         ..guest(&options, "you", 1, &model, &invite, &truth)?
     };
-    let yours = if options.headless { guest::run_headless(you) } else { guest::run_windowed(you) };
+    let yours = if options.headless {
+        guest::run_headless(you, true)
+    } else {
+        // Without a graphics driver the engine stops the thread: say what can be done instead.
+        catch_unwind(AssertUnwindSafe(|| guest::run_windowed(you)))
+            .map_err(|_| "the window could not be opened; --headless runs without one")?
+    };
 
     let hosted = shared.snapshot();
     stop_other.store(true, Ordering::Relaxed);
@@ -132,7 +139,12 @@ fn run(options: &Options) -> Result<(), Box<dyn Error>> {
     host_thread.join().map_err(|_| "the host's thread stopped")?;
 
     table::print(&options, &hosted, &yours, &others);
-    match failure(&yours, &others) {
+    for file in options.screenshot.iter().cloned().chain(recording(&options)) {
+        if std::fs::metadata(&file).map_or(0, |found| found.len()) == 0 {
+            return Err(format!("{} was not written", file.display()).into());
+        }
+    }
+    match failure(&options, &yours, &others) {
         Some(why) => Err(why.into()),
         None => Ok(()),
     }
@@ -176,15 +188,25 @@ fn recorder(options: &Options) -> Result<Option<RerunPlugin>, Box<dyn Error>> {
     Ok(match options.rerun.as_deref() {
         None => None,
         Some("viewer") => Some(RerunPlugin::viewer()),
-        Some(file) => Some(RerunPlugin::file(file)),
+        Some(file) => {
+            // The plugin would go on without its file; here the file is what was asked for.
+            std::fs::File::create(file).map_err(|error| format!("--rerun {file}: {error}"))?;
+            Some(RerunPlugin::file(file))
+        }
     })
 }
 
-fn failure(yours: &GuestReport, others: &GuestReport) -> Option<String> {
+/// The file that is recorded to, if one is.
+fn recording(options: &Options) -> Option<PathBuf> {
+    options.rerun.as_deref().filter(|sink| *sink != "viewer").map(PathBuf::from)
+}
+
+fn failure(options: &Options, yours: &GuestReport, others: &GuestReport) -> Option<String> {
     let of = |who: &str, report: &GuestReport| report.failure.as_ref().map(|why| format!("{who}: {why}"));
     of("your session", yours).or_else(|| {
         // The other guest is ended by us: its goodbye is no failure, a body that never came is.
-        (others.meter.ticks == 0)
+        // Nor is it one when a window is closed before the other came.
+        (others.meter.ticks == 0 && options.duration().is_some())
             .then(|| of("the other session", others).unwrap_or("the other never saw the body".into()))
     })
 }
@@ -195,5 +217,21 @@ fn display() -> bool {
         return true;
     }
     let set = |name| std::env::var_os(name).is_some_and(|value| !value.is_empty());
-    set("DISPLAY") || (cfg!(feature = "wayland") && set("WAYLAND_DISPLAY"))
+    (set("DISPLAY") && x_answers()) || (cfg!(feature = "wayland") && set("WAYLAND_DISPLAY"))
+}
+
+/// Does the X server that DISPLAY names listen? One on another machine is taken at its word.
+#[cfg(unix)]
+fn x_answers() -> bool {
+    let display = std::env::var("DISPLAY").unwrap_or_default();
+    let Some(number) = display.strip_prefix(':').or_else(|| display.strip_prefix("unix:")) else {
+        return true;
+    };
+    let number = number.split('.').next().unwrap_or_default();
+    std::os::unix::net::UnixStream::connect(format!("/tmp/.X11-unix/X{number}")).is_ok()
+}
+
+#[cfg(not(unix))]
+fn x_answers() -> bool {
+    true
 }

@@ -42,6 +42,8 @@ pub struct Meter {
     last_tick: u64,
     /// Ticks compared.
     pub ticks: u64,
+    /// Sum over ticks of how many ticks the host was ahead.
+    behind: u64,
     /// Sum over ticks of the mean squared error of the surface, m^2.
     sum: f64,
     /// Largest error of any vertex in any tick, m.
@@ -81,6 +83,7 @@ impl Meter {
         }
         let mean = sum / rest.len().max(1) as f64;
         self.ticks += 1;
+        self.behind += truth.newest().map_or(0, |(newest, _)| newest.saturating_sub(tick));
         self.sum += mean;
         self.now = mean.sqrt();
         self.max = self.max.max(worst.sqrt());
@@ -90,6 +93,11 @@ impl Meter {
     /// Root mean square over ticks and surface, m.
     pub fn rms(&self) -> f64 {
         (self.sum / self.ticks.max(1) as f64).sqrt()
+    }
+
+    /// How many ticks the host was ahead of what was shown, on average.
+    pub fn behind(&self) -> f64 {
+        self.behind as f64 / self.ticks.max(1) as f64
     }
 
     /// A length as a percentage of the largest true displacement.

@@ -7,7 +7,7 @@ fn percentile(sorted: &[f64], part: f64) -> f64 {
 }
 
 pub fn print(options: &Options, host: &HostReport, you: &GuestReport, other: &GuestReport) {
-    let mut step = host.step_us.clone();
+    let mut step: Vec<f64> = host.step_us.iter().copied().collect();
     step.sort_by(f64::total_cmp);
     println!(
         "\nnetwork {} of the paper's, recovery {}, seed {}, {:.1} s",
@@ -22,6 +22,8 @@ pub fn print(options: &Options, host: &HostReport, you: &GuestReport, other: &Gu
     };
     row("ticks sent", &|_| host.ticks.to_string());
     row("ticks shown", &|g| g.stats.shown.to_string());
+    row("ticks compared with the truth", &|g| g.meter.ticks.to_string());
+    row("shown behind the host, ms", &|g| format!("{:.0}", 1e3 * g.meter.behind() / crate::RATE));
     row("datagrams lost on the way here, %", &|g| format!("{:.1}", 100.0 * g.stats.loss_in));
     row("ticks not there in time", &|g| g.stats.guessed.to_string());
     row("of these recovered later", &|g| g.stats.recovered.to_string());

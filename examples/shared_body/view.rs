@@ -229,8 +229,9 @@ fn draw_hands(mut gizmos: Gizmos, bodies: Query<(&HeldBy, &BodyState), With<Gues
             gizmos.line(target, point, hand.colour);
             let force = hand.force.as_vec3();
             if force.length() > 0.05 {
-                // Ten newtons are a body's length.
-                gizmos.arrow(point, point + force * 0.1 * size, Color::srgb(0.85, 0.1, 0.15));
+                // Fifty newtons are a body's length; what is stronger is drawn no longer.
+                let arrow = (force * 0.02 * size).clamp_length_max(0.4 * size);
+                gizmos.arrow(point, point + arrow, Color::srgb(0.85, 0.1, 0.15));
             }
         }
     }
@@ -244,13 +245,15 @@ fn write_hud(figures: Res<Figures>, meter: Res<Meter>, mut hud: Single<&mut Text
         "{}\n\
          loss            {:6.1} %\n\
          round trip      {:6.0} ms\n\
-         error now       {:6.2} %\n\
-         error rms       {:6.2} %\n\
+         behind the host {:6.0} ms\n\
+         error now     {:8.4} %\n\
+         error rms     {:8.4} %\n\
          reaction        {:6.2} N\n\
          received        {:6.1} kbit/s",
         figures.title,
         100.0 * figures.loss,
         1e3 * figures.round_trip,
+        1e3 * figures.behind,
         meter.percent(meter.now),
         meter.percent(meter.rms()),
         figures.reaction,

@@ -110,3 +110,8 @@ pub mod prelude {
     };
     pub use crate::modal::{ModalModel, Patch};
 }
+
+/// The code in the README compiles.
+#[cfg(all(doctest, feature = "window", feature = "net"))]
+#[doc = include_str!("../../../README.md")]
+pub struct Readme;
