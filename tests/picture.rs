@@ -1,7 +1,7 @@
 //! What a user sees: the shipped body drawn by the real renderer into an image, at rest and pulled.
 //!
 //! Software rendering is enough. Where there is no graphics driver at all the test says so and passes, unless `PLIANT_REQUIRE_PICTURES` is set.
-#![allow(clippy::unwrap_used, missing_docs, reason = "a failed test should panic")]
+#![allow(clippy::unwrap_used, clippy::panic, missing_docs, reason = "a failed test should panic")]
 
 use std::{
     panic::{AssertUnwindSafe, catch_unwind},

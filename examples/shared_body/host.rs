@@ -110,12 +110,12 @@ fn record(
     report.ticks += 1;
     report.bytes_out = stats.bytes_out;
     report.seconds = now - begun;
-    if let Some(step) = diagnostics.get_measurement(&STEP_TIME) {
-        if last.replace(step.time) != Some(step.time) {
-            report.step_us.push_back(step.value * 1e3);
-            if report.step_us.len() > STEPS {
-                report.step_us.pop_front();
-            }
+    if let Some(step) = diagnostics.get_measurement(&STEP_TIME)
+        && last.replace(step.time) != Some(step.time)
+    {
+        report.step_us.push_back(step.value * 1e3);
+        if report.step_us.len() > STEPS {
+            report.step_us.pop_front();
         }
     }
 }
