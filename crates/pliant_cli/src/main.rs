@@ -4,6 +4,7 @@
 //! at all. Progress bars go to stderr when it is a terminal.
 
 mod bake;
+mod bench;
 mod inspect;
 mod mesh;
 mod output;
@@ -30,6 +31,8 @@ enum Command {
     Bake(bake::BakeArgs),
     /// Tells what is in a model
     Inspect(inspect::InspectArgs),
+    /// Measures what a body costs on this machine
+    Bench(bench::BenchArgs),
     /// Streams a body over an emulated network and measures what a guest sees
     Stream(stream::StreamArgs),
 }
@@ -40,6 +43,7 @@ fn main() -> ExitCode {
         Command::Mesh(args) => mesh::run(args),
         Command::Bake(args) => bake::run(args),
         Command::Inspect(args) => inspect::run(&args),
+        Command::Bench(args) => bench::run(&args),
         Command::Stream(args) => stream::run(&args),
     };
     match done {
@@ -66,6 +70,10 @@ enum CliError {
     Threads { got: usize, most: usize },
     #[error("--output: the folder {0} is not there")]
     NoFolder(std::path::PathBuf),
+    #[error("{0}")]
+    Model(#[from] pliant_modal::ModelError),
+    #[error("{0}")]
+    Step(#[from] pliant_modal::StepError),
     #[error("{0}")]
     Stream(#[from] pliant_stream::StreamError),
     #[error("{what}: expected one of {expected}, got '{got}'")]

@@ -419,3 +419,25 @@ fn a_stream_is_measured_and_the_same_seed_gives_the_same_figures() {
     }
     refused(&["stream", "--model", &mesh]);
 }
+
+#[test]
+fn a_body_is_timed_against_the_memory() {
+    let folder = Folder::new("bench");
+    let (mesh, model) = (folder.file("bar.msh"), folder.file("bar.modal"));
+    succeeds(&["mesh", "bar", "--cells", "8,2,2", "--size", "1,0.2,0.2", "-o", &mesh]);
+    succeeds(&["bake", &mesh, "--element", "tet4", "--modes", "12", "--anchor", "x<0.01", "-o", &model]);
+    let told = json(&succeeds(&["bench", "step", &model, "--seconds", "0.05", "--json"]));
+    for times in ["step_us", "reconstruct_us"] {
+        let at = |part: &str| told[times][part].as_f64().unwrap();
+        assert!(0.0 < at("p50") && at("p50") <= at("p99") && at("p99") <= at("p999"), "{told}");
+    }
+    // Blocks of 16 vertices, (12 modes x 6 rows + 3 of rest) x 16 x 4 bytes each, and 12 bytes written a vertex.
+    let vertices = told["surface_vertices"].as_u64().unwrap();
+    assert_eq!(
+        told["bytes"].as_u64().unwrap(),
+        vertices.div_ceil(16) * (12 * 6 + 3) * 16 * 4 + 12 * vertices
+    );
+    assert!(told["bandwidth_limit_gb_s"].as_f64().unwrap() > 0.0);
+    refused(&["bench", "step", &mesh]);
+    refused(&["bench", "step", &model, "--seconds", "-1"]);
+}

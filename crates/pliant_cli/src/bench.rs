@@ -1,0 +1,155 @@
+//! `pliant bench step`: what a body costs here, beside the limit that memory sets in the same run.
+
+use std::{hint::black_box, path::PathBuf, sync::Arc, time::Instant};
+
+use clap::{Args, Subcommand};
+use pliant_modal::{Body, BodyConfig, GrabConfig, ModalModel, Patch};
+use serde::Serialize;
+
+use crate::{CliError, output};
+
+#[derive(Args, Debug)]
+pub(crate) struct BenchArgs {
+    #[command(subcommand)]
+    what: What,
+}
+
+#[derive(Subcommand, Debug)]
+enum What {
+    /// Steps with one grab pulling, and reconstructions of the whole surface
+    Step {
+        /// The model
+        #[arg(value_name = "X.modal")]
+        model: PathBuf,
+        /// Seconds for each of the three measurements
+        #[arg(long, default_value_t = 1.0)]
+        seconds: f64,
+        /// Prints one line of JSON
+        #[arg(long)]
+        json: bool,
+    },
+}
+
+/// Percentiles of a time, us.
+#[derive(Serialize, Debug)]
+struct Times {
+    p50: f64,
+    p99: f64,
+    p999: f64,
+}
+
+/// What `--json` prints.
+#[derive(Serialize, Debug)]
+struct Told {
+    modes: usize,
+    surface_vertices: usize,
+    step_us: Times,
+    reconstruct_us: Times,
+    /// Read and written by one reconstruction.
+    bytes: usize,
+    /// Of the median reconstruction.
+    bandwidth_gb_s: f64,
+    /// Of a plain sum over a buffer of as many bytes, median, in the same run.
+    bandwidth_limit_gb_s: f64,
+}
+
+pub(crate) fn run(args: &BenchArgs) -> Result<(), CliError> {
+    let What::Step { model, seconds, json } = &args.what;
+    if !(0.01..=600.0).contains(seconds) {
+        return Err(CliError::Range { what: "--seconds", low: 0.01, high: 600.0, got: *seconds });
+    }
+    let told = measure(Arc::new(ModalModel::read(model)?), *seconds)?;
+    if *json { output::print_json(&told) } else { output::print(&text(&told)) }
+}
+
+fn measure(model: Arc<ModalModel>, seconds: f64) -> Result<Told, CliError> {
+    let mut body = Body::new(model.clone(), BodyConfig::default())?;
+    // Where the first mode moves most: a body is pulled where it gives.
+    let moves = |v: u32| (0..3).map(|axis| model.displacement_row(v, axis, 0).powi(2)).sum::<f32>();
+    let count = model.surface().positions().len() as u32;
+    let vertex = (0..count).max_by(|&a, &b| moves(a).total_cmp(&moves(b))).unwrap_or(0);
+    let patch = Patch::around(model.surface(), vertex, 0.06 * model.size())?;
+    let grab = body.grab(&patch, GrabConfig::default())?;
+    let start = body.grab_position(grab)?;
+    let mut tick = 0u32;
+    let mut failed = None;
+    let step_us = time(seconds, || {
+        tick += 1;
+        let away = 0.05 * model.size() * (0.05 * f64::from(tick)).sin();
+        let moved = body.set_target(grab, [start[0] + away, start[1] + 0.5 * away, start[2]]);
+        if let Err(error) = moved.and_then(|()| body.step().map(|_| ())) {
+            failed.get_or_insert(error);
+        }
+    });
+    if let Some(error) = failed {
+        return Err(error.into());
+    }
+    let q: Vec<f32> = body.q().iter().map(|q| *q as f32).collect();
+    let mut positions = model.surface().positions().to_vec();
+    let basis = model.basis();
+    let reconstruct_us = time(seconds, || basis.reconstruct(black_box(&q), true, black_box(&mut positions)));
+    let bytes = basis.traffic_bytes(model.mode_count());
+    let buffer = vec![1.0f32; bytes / 4];
+    let limit = time(seconds, || {
+        black_box(sum(black_box(&buffer)));
+    });
+    // Bytes a microsecond are megabytes a second.
+    let gb_s = |us: f64| bytes as f64 / us.max(1e-9) * 1e-3;
+    Ok(Told {
+        modes: model.mode_count(),
+        surface_vertices: count as usize,
+        bandwidth_gb_s: gb_s(reconstruct_us.p50),
+        bandwidth_limit_gb_s: gb_s(limit.p50),
+        step_us,
+        reconstruct_us,
+        bytes,
+    })
+}
+
+/// Reads a buffer as fast as it can be read: sixteen lanes in eight chains, so that the loads are the limit and not the sums.
+fn sum(buffer: &[f32]) -> [[f32; 16]; 8] {
+    let mut lanes = [[0.0f32; 16]; 8];
+    for chunk in buffer.chunks_exact(128) {
+        for (lane, part) in lanes.iter_mut().zip(chunk.chunks_exact(16)) {
+            for (a, b) in lane.iter_mut().zip(part) {
+                *a += b;
+            }
+        }
+    }
+    lanes
+}
+
+fn time(seconds: f64, mut work: impl FnMut()) -> Times {
+    for _ in 0..50 {
+        work();
+    }
+    let mut samples = Vec::new();
+    let begun = Instant::now();
+    while samples.len() < 1_000 || (begun.elapsed().as_secs_f64() < seconds && samples.len() < 1_000_000) {
+        let start = Instant::now();
+        work();
+        samples.push(start.elapsed().as_secs_f64() * 1e6);
+    }
+    samples.sort_by(f64::total_cmp);
+    let at = |part: f64| samples[((samples.len() - 1) as f64 * part) as usize];
+    Times { p50: at(0.5), p99: at(0.99), p999: at(0.999) }
+}
+
+fn text(told: &Told) -> String {
+    let times = |t: &Times| format!("{:.2} us (99 %: {:.2}, 99.9 %: {:.2})", t.p50, t.p99, t.p999);
+    format!(
+        "body               {} modes, {} surface vertices\n\
+         step, one grab     {}\n\
+         reconstruction     {}\n\
+         bytes moved        {}\n\
+         bandwidth          {:.1} GB/s, {:.0} % of the {:.1} GB/s of a plain sum over as many bytes",
+        told.modes,
+        told.surface_vertices,
+        times(&told.step_us),
+        times(&told.reconstruct_us),
+        told.bytes,
+        told.bandwidth_gb_s,
+        100.0 * told.bandwidth_gb_s / told.bandwidth_limit_gb_s,
+        told.bandwidth_limit_gb_s
+    )
+}
