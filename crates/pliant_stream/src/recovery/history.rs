@@ -82,8 +82,8 @@ impl History {
         tick > 0 && tick + (HISTORY as u64) > self.highest
     }
 
-    /// Takes a frame and what it repeats. Calls `new(tick, head)` for each tick that was not known before (`head` false
-    /// for a repeat) and for a head that completes a tick known from a repeat.
+    /// Takes a frame and what it repeats. Calls `new(tick, first)` for each tick that was not known before, and with
+    /// `first` false for a frame that completes a tick known from a repeat.
     pub fn take(&mut self, frame: &Frame, modes: usize, mut new: impl FnMut(Tick, bool)) {
         self.highest = self.highest.max(frame.tick);
         for repeat in &frame.repeats {
@@ -102,11 +102,12 @@ impl History {
                 slot.accelerations.extend((0..modes).map(|k| a.get(k)));
             }
             slot.known = true;
-            new(tick, false);
+            new(tick, true);
         }
         if !self.accepts(frame.tick) || self.head(frame.tick).is_some() {
             return;
         }
+        let first = self.known(frame.tick).is_none();
         let slot = self.slot(frame.tick);
         slot.grabs.clear();
         slot.grabs.extend(frame.grabs.iter().filter(|g| g.held));
@@ -119,7 +120,7 @@ impl History {
         slot.check = frame.check;
         slot.known = true;
         slot.head = true;
-        new(frame.tick, true);
+        new(frame.tick, first);
     }
 
     /// One grab at a tick: as it arrived, or between its neighbours, or where the forecast has it. `None` when nothing near

@@ -201,17 +201,17 @@ impl Receiver {
     /// shown one stays where it is and fades over.
     pub fn accept(&mut self, frame: &Frame) -> Arrival {
         let mut arrival = Arrival::default();
-        let (mut earliest, mut late) = (Tick::MAX, [0; 8]);
+        let (mut earliest, mut late) = (Tick::MAX, [(0, false); 8]);
         let mut late_count = 0;
         let tick = self.tick;
         let modes = self.shown.modes();
-        self.history.take(frame, modes, |t, _| {
+        self.history.take(frame, modes, |t, first| {
             if t > tick {
-                arrival.in_time += 1;
+                arrival.in_time += u32::from(first);
             } else {
                 earliest = earliest.min(t);
                 if late_count < late.len() {
-                    late[late_count] = t;
+                    late[late_count] = (t, first);
                     late_count += 1;
                 }
             }
@@ -221,16 +221,17 @@ impl Receiver {
             let late = &mut late[..late_count];
             late.sort_unstable();
             let whole = self.policy.driven_by_reactions();
-            for &t in late.iter() {
+            for &(t, first) in late.iter() {
                 // Re-stepping from the earliest tick takes all later ones with it.
                 let done = if whole && t != earliest { true } else { self.policy.correct(t, &self.history) };
+                // A tick whose repeat was there in time is bettered by its own frame, not repaired.
                 if done {
-                    arrival.repaired += 1;
+                    arrival.repaired += u32::from(first);
                 } else {
                     arrival.too_late += 1;
                 }
             }
-            if late.contains(&tick) {
+            if late.iter().any(|(t, _)| *t == tick) {
                 self.policy.refresh(tick, &self.history);
             }
             self.blend_from_before();
