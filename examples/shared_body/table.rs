@@ -16,9 +16,9 @@ pub fn print(options: &Options, host: &HostReport, you: &GuestReport, other: &Gu
         options.seed,
         host.seconds
     );
-    println!("{:<34}{:>14}{:>14}", "", "you", "other");
+    println!("{:<38}{:>14}{:>14}", "", "you", "other");
     let row = |name: &str, value: &dyn Fn(&GuestReport) -> String| {
-        println!("{name:<34}{:>14}{:>14}", value(you), value(other));
+        println!("{name:<38}{:>14}{:>14}", value(you), value(other));
     };
     row("ticks sent", &|_| host.ticks.to_string());
     row("ticks shown", &|g| g.stats.shown.to_string());
@@ -26,7 +26,7 @@ pub fn print(options: &Options, host: &HostReport, you: &GuestReport, other: &Gu
     row("shown behind the host, ms", &|g| format!("{:.0}", 1e3 * g.meter.behind() / crate::RATE));
     row("datagrams lost on the way here, %", &|g| format!("{:.1}", 100.0 * g.stats.loss_in));
     row("ticks not there in time", &|g| g.stats.guessed.to_string());
-    row("of these recovered later", &|g| g.stats.recovered.to_string());
+    row("ticks put right when their data came", &|g| g.stats.recovered.to_string());
     row("round trip, ms", &|g| format!("{:.0}", 1e3 * g.stats.round_trip.as_secs_f64()));
     row("bytes received a second", &|g| format!("{:.0}", g.stats.bytes_in as f64 / host.seconds.max(1e-9)));
     row("shown error, rms, mm", &|g| format!("{:.3}", 1e3 * g.meter.rms()));
