@@ -45,7 +45,10 @@
 //! | `window` | yes | what a windowed game usually has: winit on X11, user interface, text, PNG; leave it out to choose Bevy's features yourself |
 //! | `wayland` | no | native Wayland windows (needs the Wayland client headers when building) |
 //! | `net` | yes | sessions over QUIC |
+//! | `haptics` | yes | haptic devices and their loop |
 //! | `rerun` | yes | the rerun viewer's client |
+//! | `panel` | yes | the live panel (egui) |
+//! | `bake` | yes | meshing and baking in the game itself |
 
 use bevy::{
     app::{PluginGroup, PluginGroupBuilder},
@@ -53,7 +56,13 @@ use bevy::{
     prelude::FixedUpdate,
 };
 
+#[cfg(feature = "bake")]
+pub use pliant_bake as bake;
 pub use pliant_body as body;
+#[cfg(feature = "haptics")]
+pub use pliant_haptics as haptics;
+#[cfg(feature = "bake")]
+pub use pliant_mesh as mesh;
 pub use pliant_modal as modal;
 #[cfg(feature = "net")]
 pub use pliant_net as net;
