@@ -8,7 +8,7 @@ use bevy::math::{DQuat, DVec3};
 use bevy::prelude::*;
 use bytes::Bytes;
 use pliant_body::{BodyState, Driven, Grab, GrabForce, GrabOf, ModalAsset, ModalBody, ShownState};
-use pliant_modal::ModalModel;
+use pliant_modal::{GrabConfig, ModalModel};
 use pliant_stream::{
     BodyId, BodyView, Channel, GrabKey, GuestEvent, GuestSession, PeerId, Pose, RecoveryConfig, StreamError,
     UserId,
@@ -453,7 +453,8 @@ pub(crate) fn send_hands(
         let target = place.point_to_session(grab.target);
         match guest.grabs.get_mut(&entity) {
             None => {
-                let begun = session.begin_grab(now, body.0, grab.vertex, grab.radius, target);
+                let hold = GrabConfig { stiffness: grab.stiffness, relaxation: grab.relaxation };
+                let begun = session.begin_grab(now, body.0, grab.vertex, grab.radius, target, hold);
                 if let Err(error) = &begun {
                     debug!("a grab was not sent: {error}");
                 }

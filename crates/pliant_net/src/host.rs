@@ -8,7 +8,7 @@ use bevy::math::DVec3;
 use bevy::prelude::*;
 use bytes::Bytes;
 use pliant_body::{BodyState, Driven, Grab, GrabForce, GrabOf, Grabs, PliantTick};
-use pliant_modal::ModalModel;
+use pliant_modal::{GrabConfig, ModalModel};
 use pliant_stream::{
     BodyId, BodySetup, Channel, EndReason, GrabKey, GrabState, HostEvent, HostSession, LinkStats, PeerId,
     Pose, TickState, UserId,
@@ -258,8 +258,8 @@ impl NetHost {
                     world.write_message(UserLeft { id, name, reason: reason.to_string() });
                 }
             }
-            HostEvent::GrabBegan { key, body, vertex, radius, target } => {
-                if let Err(why) = self.begin_grab(world, key, body, vertex, radius, target) {
+            HostEvent::GrabBegan { key, body, vertex, radius, target, hold } => {
+                if let Err(why) = self.begin_grab(world, key, body, vertex, radius, target, hold) {
                     debug!("grab {} of user {} is refused: {why}", key.grab, key.user.0);
                     self.session.refuse_grab(key);
                 }
@@ -310,6 +310,7 @@ impl NetHost {
         vertex: u32,
         radius: f64,
         target: [f64; 3],
+        hold: GrabConfig,
     ) -> Result<(), &'static str> {
         let entity = self.entity_of(body).ok_or("no such body")?;
         let user = *self.numbers.get(&key.user).ok_or("no such user")?;
@@ -325,7 +326,8 @@ impl NetHost {
                 return Err("somebody else holds the body");
             }
         }
-        let grab = Grab::new(vertex, radius, target);
+        let GrabConfig { stiffness, relaxation } = hold;
+        let grab = Grab { stiffness, relaxation, ..Grab::new(vertex, radius, target) };
         let spawned = world
             .spawn((
                 grab,

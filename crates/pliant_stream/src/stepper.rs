@@ -43,6 +43,8 @@ pub(crate) struct Hold {
     /// `place` is a hand's target and the pull follows from the grab's compliance; else `place` was measured, and `pull`
     /// with it.
     pub(crate) target: bool,
+    /// Compliance of the hand's own spring, in series with the patch's, m/N.
+    pub(crate) hand: f64,
 }
 
 /// Steps a modal state with given reactions.
@@ -256,7 +258,7 @@ impl ForceStepper {
         for (i, h) in holds.iter().enumerate() {
             let Some(a) = self.patches.get(&key(h.vertex, h.radius)) else { continue };
             let reached = a.at + dot(&a.rows, &ahead);
-            let softness = a.compliance;
+            let softness = a.compliance + Matrix3::identity() * h.hand;
             let missing = h.place - reached - softness * h.pull;
             for (scaled, row) in self.scaled.iter_mut().zip(&a.rows) {
                 for ((s, r), c) in scaled.iter_mut().zip(row).zip(&self.coefficients) {
@@ -395,6 +397,7 @@ impl Hold {
             pull: -(back * Vector3::from(g.state.reaction)),
             place: g.displacement.into(),
             target: false,
+            hand: 0.0,
         }
     }
 }

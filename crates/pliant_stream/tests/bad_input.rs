@@ -127,7 +127,7 @@ fn session(name: &str) -> (HostSession, GuestSession, Duration) {
         publish(&mut host, now, tick);
         exchange(&mut host, &mut guest, now);
         if tick == 10 {
-            guest.begin_grab(now, BODY, 66, 0.05, [1.0, 0.0, 0.0]).unwrap();
+            guest.begin_grab(now, BODY, 66, 0.05, [1.0, 0.0, 0.0], Default::default()).unwrap();
         }
     }
     assert!(guest.body(BODY).unwrap().is_ready());
@@ -286,7 +286,18 @@ fn a_million_damaged_inputs_are_read_without_panic() {
     seeds.push(HostMessage::BodyAdded(info).encode());
     seeds.push(HostMessage::ModelChunk { hash: [1; 32], offset: 0, total: 99, bytes: vec![3; 50] }.encode());
     let target = [0.0, 1.0, 2.0];
-    seeds.push(GuestMessage::GrabBegin { grab: 1, body: 1, vertex: 5, radius: 0.1, target }.encode());
+    seeds.push(
+        GuestMessage::GrabBegin {
+            grab: 1,
+            body: 1,
+            vertex: 5,
+            radius: 0.1,
+            target,
+            stiffness: Some(50.0),
+            relaxation: 0.0,
+        }
+        .encode(),
+    );
     let ticks = vec![pliant_stream::peer::InputTick { tick: 9, held: Vec::new() }];
     seeds.push(PeerDatagram::Inputs { now: 9, ahead: None, ticks, check: None }.encode(1));
     let (mut state, mut read) = (0x9E37_79B9_7F4A_7C15, 0_u32);

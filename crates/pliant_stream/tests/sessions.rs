@@ -96,9 +96,9 @@ impl World for Scene {
 
     fn host_event(&mut self, _now: Duration, event: HostEvent, _host: &mut HostSession) {
         match &event {
-            HostEvent::GrabBegan { key, vertex, radius, target, .. } => {
+            HostEvent::GrabBegan { key, vertex, radius, target, hold, .. } => {
                 let patch = Patch::around(self.body.model().surface(), *vertex, *radius).unwrap();
-                let id = self.body.grab(&patch, GrabConfig::default()).unwrap();
+                let id = self.body.grab(&patch, *hold).unwrap();
                 self.body.set_target(id, *target).unwrap();
                 self.grabs.push((*key, id, *vertex, *radius));
             }
@@ -144,7 +144,7 @@ fn circling() -> HandScript {
         let t = now.as_secs_f64();
         let target = [1.0, 0.08 + 0.1 * (1.3 * t).sin(), 0.08 + 0.1 * (1.0 - (1.3 * t).cos())];
         match grab {
-            None => grab = session.begin_grab(now, BODY, 66, 0.05, target).ok(),
+            None => grab = session.begin_grab(now, BODY, 66, 0.05, target, GrabConfig::default()).ok(),
             Some(g) => {
                 let _ = session.set_target(g, target);
             }
@@ -661,4 +661,12 @@ fn a_body_that_goes_while_its_model_is_on_the_way_harms_nobody() {
     pair.run_until(40 * S, &mut scene);
     assert!(!pair.guests[0].session.is_closed());
     assert!(pair.guests[0].session.body(second).unwrap().model().is_some(), "the model came after all");
+}
+
+#[test]
+fn sessions_are_shared_between_threads_as_they_are() {
+    fn shared<T: Send + Sync>() {}
+    shared::<GuestSession>();
+    shared::<HostSession>();
+    shared::<Box<dyn pliant_stream::recovery::Recovery>>();
 }

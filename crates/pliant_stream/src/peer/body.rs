@@ -270,7 +270,7 @@ impl PeerBody {
             let key = g.key(*user);
             let pull = pulls.iter().find(|p| p.0 == key).map_or_else(Vector3::zeros, |p| p.1);
             let place = Vector3::from(g.target) - rest;
-            holds.push(Hold { vertex: g.vertex, radius: g.radius, pull, place, target: true });
+            holds.push(Hold { vertex: g.vertex, radius: g.radius, pull, place, target: true, hand: 0.0 });
             keys.push(key);
         }
         stepper.step_held(state, &mut holds, &[]);

@@ -4,7 +4,7 @@ use std::collections::{BTreeMap, BTreeSet, VecDeque};
 use std::sync::Arc;
 use std::time::Duration;
 
-use pliant_modal::ModalModel;
+use pliant_modal::{GrabConfig, ModalModel};
 
 use super::download::Download;
 use super::guest_body::BodyView;
@@ -17,8 +17,8 @@ use crate::clock::ClockEstimate;
 use crate::newmark::Newmark;
 use crate::state::{BodyId, PeerId, UserId, in_range};
 use crate::wire::{
-    Clock, Datagram, GuestMessage, HostMessage, MAX_BODIES, MAX_CACHED, MAX_NAME, MAX_TARGETS, MAX_TOKEN,
-    PROTOCOL_VERSION, TargetEntry, Targets,
+    Clock, Datagram, GuestMessage, HostMessage, MAX_BODIES, MAX_CACHED, MAX_NAME, MAX_RELAXATION,
+    MAX_STIFFNESS, MAX_TARGETS, MAX_TOKEN, PROTOCOL_VERSION, TargetEntry, Targets,
 };
 
 /// Clock requests come this far apart once the first eight have been answered.
@@ -217,12 +217,13 @@ impl GuestSession {
         self.clock.offset()
     }
 
-    /// Takes hold of a body. The number names the grab to the other calls; the host may answer
+    /// Takes hold of a body, as `hold` says: with the hand's own spring and damper, or as stiffly as the patch allows
+    /// ([`GrabConfig::default`]). The number names the grab to the other calls; the host may answer
     /// [`GuestEvent::GrabRefused`].
     ///
     /// # Errors
     /// [`StreamError::State`] before the welcome, [`StreamError::UnknownBody`], [`StreamError::NotFinite`],
-    /// [`StreamError::Full`] beyond 16 grabs.
+    /// [`StreamError::Config`] for a spring or damper out of range, [`StreamError::Full`] beyond 16 grabs.
     pub fn begin_grab(
         &mut self,
         now: Duration,
@@ -230,6 +231,7 @@ impl GuestSession {
         vertex: u32,
         radius: f64,
         target: [f64; 3],
+        hold: GrabConfig,
     ) -> Result<u16, StreamError> {
         if self.user().is_none() {
             let (what, state) = ("begin_grab", "not in");
@@ -240,6 +242,14 @@ impl GuestSession {
         }
         if !in_range(&target) || !(0.0..=1e9).contains(&radius) {
             return Err(StreamError::NotFinite { what: "grab" });
+        }
+        let GrabConfig { stiffness, relaxation } = hold;
+        let fail = |what, found: String, expected| Err(StreamError::Config { what, found, expected });
+        if stiffness.is_some_and(|k| !(k > 0.0 && k <= MAX_STIFFNESS)) {
+            return fail("stiffness", format!("{stiffness:?}"), "above 0, at most 1e12 N/m");
+        }
+        if !(0.0..=MAX_RELAXATION).contains(&relaxation) {
+            return fail("relaxation", relaxation.to_string(), "0..=10 s");
         }
         let limit = super::host_peer::MAX_GUEST_GRABS;
         if self.grabs.len() >= limit {
@@ -252,9 +262,17 @@ impl GuestSession {
         self.next_grab = grab.wrapping_add(1);
         self.grabs.insert(grab, OwnGrab { body, targets: VecDeque::new(), fresh: false, said: now });
         if let Some(own) = self.bodies.get_mut(&body).and_then(|b| b.own.as_mut()) {
-            own.begin(grab, vertex, radius, target);
+            own.begin(grab, vertex, radius, target, hold);
         }
-        self.message(&GuestMessage::GrabBegin { grab, body: body.0, vertex, radius, target });
+        self.message(&GuestMessage::GrabBegin {
+            grab,
+            body: body.0,
+            vertex,
+            radius,
+            target,
+            stiffness,
+            relaxation,
+        });
         Ok(grab)
     }
 

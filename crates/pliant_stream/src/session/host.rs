@@ -4,7 +4,7 @@ use std::collections::{BTreeMap, BTreeSet, VecDeque};
 use std::sync::Arc;
 use std::time::Duration;
 
-use pliant_modal::ModalModel;
+use pliant_modal::{GrabConfig, ModalModel};
 
 use super::host_config::{HostConfig, HostEvent};
 use super::host_peer::{HeldGrab, MAX_GUEST_GRABS, Peer, Standing, Transfer};
@@ -323,7 +323,10 @@ impl HostSession {
                 }
             }
             (GuestMessage::Goodbye { reason }, _) => self.drop_peer(peer, reason, false),
-            (GuestMessage::GrabBegin { grab, body, vertex, radius, target }, Some(user)) => {
+            (
+                GuestMessage::GrabBegin { grab, body, vertex, radius, target, stiffness, relaxation },
+                Some(user),
+            ) => {
                 let body = BodyId(body);
                 let vertices = self.bodies.get(&body).map_or(0, |b| b.model.surface().positions().len());
                 let fits = (vertex as usize) < vertices
@@ -332,7 +335,8 @@ impl HostSession {
                 if fits {
                     p.grabs.insert(grab, HeldGrab { body, input: None });
                     let key = GrabKey { user, grab };
-                    self.event(HostEvent::GrabBegan { key, body, vertex, radius, target });
+                    let hold = GrabConfig { stiffness, relaxation };
+                    self.event(HostEvent::GrabBegan { key, body, vertex, radius, target, hold });
                 } else {
                     p.send_message(&HostMessage::GrabRefused { grab }, &mut self.out);
                 }

@@ -2,6 +2,8 @@
 
 use std::time::Duration;
 
+use pliant_modal::GrabConfig;
+
 use super::EndReason;
 use crate::newmark::Newmark;
 use crate::state::{BodyId, GrabKey, PeerId, UserId};
@@ -87,6 +89,8 @@ pub enum HostEvent {
         radius: f64,
         /// Where the hand is, world, m.
         target: [f64; 3],
+        /// How the hand holds: its own spring and damper, within 1e12 N/m and 10 s.
+        hold: GrabConfig,
     },
     /// A hand moves.
     GrabMoved {

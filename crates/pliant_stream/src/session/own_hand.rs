@@ -12,6 +12,7 @@
 use std::collections::VecDeque;
 
 use nalgebra::Vector3;
+use pliant_modal::GrabConfig;
 
 use crate::recovery::{Blend, Forecast, Receiver};
 use crate::state::{GrabKey, ModalState, Tick, UserId};
@@ -27,6 +28,7 @@ struct OwnGrab {
     grab: u16,
     vertex: u32,
     radius: f64,
+    hold: GrabConfig,
     target: Option<[f64; 3]>,
     /// The target at each of the last ticks, newest last; none where it did not hold.
     past: VecDeque<Option<[f64; 3]>>,
@@ -107,13 +109,14 @@ impl OwnHand {
         self.lead = other.lead;
     }
 
-    pub(crate) fn begin(&mut self, grab: u16, vertex: u32, radius: f64, target: [f64; 3]) {
+    pub(crate) fn begin(&mut self, grab: u16, vertex: u32, radius: f64, target: [f64; 3], hold: GrabConfig) {
         self.grabs.retain(|g| g.grab != grab);
         self.grabs.push(OwnGrab {
             grab,
             vertex,
             // As the host's frames will say it.
             radius: f64::from(radius as f32),
+            hold,
             target: Some(target),
             past: VecDeque::with_capacity(REMEMBERED),
             reaction: [0.0; 3],
@@ -220,7 +223,8 @@ impl OwnHand {
             };
             let pull = -Vector3::from(g.reaction);
             let place = Vector3::from(target) - rest;
-            holds.push(Hold { vertex: g.vertex, radius: g.radius, pull, place, target: true });
+            let hand = g.hold.stiffness.map_or(0.0, |k| 1.0 / k);
+            holds.push(Hold { vertex: g.vertex, radius: g.radius, pull, place, target: true, hand });
             own.push(index);
         }
         self.stepper.step_held(state, &mut holds, receiver.load());

@@ -13,7 +13,7 @@ pub use datagram::{Clock, Datagram, Nack, NackRun, Report, TargetEntry, Targets}
 pub(crate) use datagram::{MAX_NACK_RUNS, MAX_TARGETS};
 pub use frame::{AccelerationCoding, Accelerations, Frame, FrameGrab, Repeat, RepeatGrab, Slice, SliceEntry};
 pub use message::{BodyInfo, GuestMessage, HostMessage, Payload, SnapshotBytes, StreamWish};
-pub(crate) use message::{MAX_BODIES, MAX_CACHED, MAX_NAME, MAX_TOKEN};
+pub(crate) use message::{MAX_BODIES, MAX_CACHED, MAX_NAME, MAX_RELAXATION, MAX_STIFFNESS, MAX_TOKEN};
 
 /// Version of everything in this module. The two sides of a session must agree.
 pub const PROTOCOL_VERSION: u16 = 1;
