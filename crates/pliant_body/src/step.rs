@@ -105,9 +105,13 @@ pub(crate) fn build_bodies(
 fn carry_over(old: &Body, mut new: Body) -> Body {
     let mut state = new.state().clone();
     let from = old.state();
-    for (to, from) in
-        [(&mut state.q, &from.q), (&mut state.v, &from.v), (&mut state.a, &from.a), (&mut state.f, &from.f)]
-    {
+    for (to, from) in [
+        (&mut state.q, &from.q),
+        (&mut state.v, &from.v),
+        (&mut state.a, &from.a),
+        (&mut state.f, &from.f),
+        (&mut state.z, &from.z),
+    ] {
         for (to, from) in to.iter_mut().zip(from) {
             *to = *from;
         }

@@ -140,6 +140,11 @@ impl ModalLocal {
         self.scratch.v.copy_from_slice(self.body.v());
         self.scratch.a.copy_from_slice(self.body.a());
         self.scratch.f.copy_from_slice(&self.body.state().f);
+        // What has relaxed changes slowly: it is drawn to the word without asking of when the word is.
+        self.scratch.z.clone_from(&self.body.state().z);
+        for (z, told) in self.scratch.z.iter_mut().zip(&model.state.z) {
+            *z += gain * (told - *z);
+        }
         let then = &self.past[at * 2 * modes..][..2 * modes];
         for i in 0..modes {
             let (eq, ev) = (model.state.q[i] - then[i], model.state.v[i] - then[modes + i]);

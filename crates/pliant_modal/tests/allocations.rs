@@ -10,7 +10,7 @@ use std::{
     sync::Arc,
 };
 
-use pliant_modal::{Body, BodyConfig, GrabConfig, Integrator, Patch};
+use pliant_modal::{Body, BodyConfig, GrabConfig, Integrator, Patch, Relaxation};
 use rod::{rod, tip};
 
 struct Counting;
@@ -38,10 +38,11 @@ static COUNTING: Counting = Counting;
 
 #[test]
 fn a_step_with_two_grabs_under_warp_allocates_nothing() {
-    for free in [false, true] {
+    let material = Relaxation { ratio: 0.5, time: 0.1 };
+    for (free, relaxation) in [(false, None), (true, None), (false, Some(material)), (true, Some(material))] {
         for integrator in [Integrator::Exact, Integrator::GeneralizedAlpha { rho_inf: 0.5 }] {
             let model = Arc::new(rod(2e5, 20, 0.05, free));
-            let config = BodyConfig { step: 1.0 / 240.0, integrator, warp: true, ..Default::default() };
+            let config = BodyConfig { step: 1.0 / 240.0, integrator, relaxation, ..Default::default() };
             let mut body = Body::new(model.clone(), config).unwrap();
             let grabs = [tip(), tip() / 2].map(|vertex| {
                 let patch = Patch::around(model.surface(), vertex, 0.06).unwrap();
@@ -59,7 +60,7 @@ fn a_step_with_two_grabs_under_warp_allocates_nothing() {
                 body.step().unwrap();
                 body.reconstruct(&mut positions).unwrap();
             }
-            assert_eq!(CALLS.with(Cell::get) - before, 0, "free {free}, {integrator:?}");
+            assert_eq!(CALLS.with(Cell::get) - before, 0, "free {free}, {integrator:?}, {relaxation:?}");
             assert!(body.reaction(grabs[0].0).unwrap()[0].abs() > 0.0, "it was held");
         }
     }

@@ -3,7 +3,7 @@
 use nalgebra::{Matrix3, Vector3};
 
 use super::patch_position;
-use crate::{ModalModel, Patch, StepError};
+use crate::{ModalModel, Patch, Relaxation, StepError};
 
 /// Names a grab on its body. Never used twice by the same body.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, PartialOrd, Ord)]
@@ -42,8 +42,13 @@ pub(crate) struct Grab {
     /// World axes, m.
     pub(crate) target: Vector3<f64>,
     pub(crate) last_target: Vector3<f64>,
-    /// Residual flexibility and hand in series, m/N, body axes.
+    /// Residual flexibility and hand in series as they answer within a step, m/N, body axes.
     pub(crate) compliance: Matrix3<f64>,
+    /// The body's part of it, at once, m/N.
+    residual: Matrix3<f64>,
+    creeping: Creeping,
+    /// How far the residual flexibility has flown, m, body axes; see [`Relaxation`].
+    pub(crate) flow: Vector3<f64>,
     /// Force on the body: body axes while a step is solved, world axes (N) between steps.
     pub(crate) pull: Vector3<f64>,
     /// Target minus where the patch would be without hands, m, body axes.
@@ -55,6 +60,15 @@ pub(crate) struct Grab {
     rotation: Vec<Vector3<f64>>,
     rows: Vec<Vector3<f64>>,
     at: Vector3<f64>,
+}
+
+/// What the modes leave out answers at once: `d = C pull + ratio y`, `time y' = d - y`. With the pull held over a step,
+/// `y1 = carry y0 + gain C pull` and `d1 = (1 + ratio gain) C pull + ratio carry y0`.
+#[derive(Debug, Clone, Copy, Default)]
+struct Creeping {
+    ratio: f64,
+    carry: f64,
+    gain: f64,
 }
 
 impl Grab {
@@ -91,16 +105,18 @@ impl Grab {
         let info = model.info();
         let radius = patch.radius().max(1e-2 * model.size());
         let contact = 1e-2 * (1.0 - info.poisson * info.poisson) / (2.0 * info.young * radius);
-        let hand = config.stiffness.map_or(0.0, |k| 1.0 / k);
-        let compliance = 0.5 * (residual + residual.transpose())
-            + Matrix3::identity() * (hand + contact.max(f64::MIN_POSITIVE));
+        let residual =
+            0.5 * (residual + residual.transpose()) + Matrix3::identity() * contact.max(f64::MIN_POSITIVE);
         let zero = Vector3::zeros();
-        Ok(Self {
+        let mut grab = Self {
             id,
             config,
             target: zero,
             last_target: Vector3::repeat(f64::NAN),
-            compliance,
+            compliance: residual,
+            residual,
+            creeping: Creeping::default(),
+            flow: zero,
             pull: zero,
             gap: zero,
             arm: zero,
@@ -109,7 +125,38 @@ impl Grab {
             displacement,
             rotation,
             at: zero,
-        })
+        };
+        grab.set_material(None, 0.0);
+        Ok(grab)
+    }
+
+    /// How what the modes leave out answers within a step of `h` seconds.
+    pub(crate) fn set_material(&mut self, relaxation: Option<Relaxation>, h: f64) {
+        let hand = Matrix3::identity() * self.config.stiffness.map_or(0.0, |k| 1.0 / k);
+        match relaxation {
+            None => {
+                self.creeping = Creeping::default();
+                self.flow = Vector3::zeros();
+                self.compliance = self.residual + hand;
+            }
+            Some(material) => {
+                let left = 1.0 - material.ratio;
+                let gone = -(-left * h / material.time).exp_m1();
+                self.creeping = Creeping { ratio: material.ratio, carry: 1.0 - gone, gain: gone / left };
+                self.compliance = material.creep(h) * self.residual + hand;
+            }
+        }
+    }
+
+    /// How far the patch gives way in this step before anyone pulls, because it was pulled before, m, body axes.
+    pub(crate) fn crept(&self) -> Vector3<f64> {
+        self.creeping.ratio * self.creeping.carry * self.flow
+    }
+
+    /// Lets what the modes leave out flow under the pull of this step (body axes).
+    pub(crate) fn relax(&mut self) {
+        let Creeping { carry, gain, .. } = self.creeping;
+        self.flow = carry * self.flow + gain * (self.residual * self.pull);
     }
 
     pub(crate) fn local_position(&self, q: &[f64], warped: bool) -> Vector3<f64> {

@@ -12,7 +12,8 @@ pub use frame::Frame;
 pub use grab::{GrabConfig, GrabId};
 
 use crate::{
-    Coefficients, Integrator, ModalModel, Patch, StepError, error::finite, warp::warp_with_jacobian,
+    Coefficients, Flow, Integrator, ModalModel, Patch, Relaxation, StepError, error::finite,
+    warp::warp_with_jacobian,
 };
 use frame::RigidMotion;
 use grab::Grab;
@@ -33,6 +34,8 @@ pub struct BodyConfig {
     pub gravity: [f64; 3],
     /// Factor on all damping coefficients, 0 or more. Default: 1.
     pub damping_scale: f64,
+    /// A material that relaxes: every mode, and the flexibility under every grab, is a standard linear solid. Default: none, elastic.
+    pub relaxation: Option<Relaxation>,
     /// Newton corrections of the grabs under warp in one step, 1 to 8. Default: 2.
     pub corrections: usize,
 }
@@ -46,12 +49,13 @@ impl Default for BodyConfig {
             modes: None,
             gravity: [0.0; 3],
             damping_scale: 1.0,
+            relaxation: None,
             corrections: 2,
         }
     }
 }
 
-/// What moves: the modal coordinates of one tick. All slices have one entry a kept mode.
+/// What moves: the modal coordinates of one tick. All slices have one entry a kept mode, `z` none where the body does not relax.
 #[derive(Debug, PartialEq, Default)]
 pub struct State {
     /// Modal coordinates, kg^1/2 m.
@@ -62,6 +66,8 @@ pub struct State {
     pub a: Vec<f64>,
     /// Modal forces of the last step, kg^1/2 m/s^2 (generalized-alpha remembers them).
     pub f: Vec<f64>,
+    /// Modal flows, kg^1/2 m: how far the dashpot of each mode's Maxwell branch has gone; see [`Relaxation`]. Empty without one.
+    pub z: Vec<f64>,
     /// Where the body is.
     pub frame: Frame,
 }
@@ -75,11 +81,12 @@ impl Clone for State {
 
     /// Keeps the allocations of `self`: a step saves its state without any (a derived `clone_from` would make new ones).
     fn clone_from(&mut self, from: &Self) {
-        let Self { q, v, a, f, frame } = from;
+        let Self { q, v, a, f, z, frame } = from;
         self.q.clone_from(q);
         self.v.clone_from(v);
         self.a.clone_from(a);
         self.f.clone_from(f);
+        self.z.clone_from(z);
         self.frame = *frame;
     }
 }
@@ -101,6 +108,8 @@ pub struct Body {
     model: Arc<ModalModel>,
     config: BodyConfig,
     coefficients: Vec<Coefficients>,
+    /// Empty where the material does not relax.
+    flows: Vec<Flow>,
     state: State,
     before: State,
     /// Modal force of everything but grabs, held for one step.
@@ -126,13 +135,15 @@ impl Body {
     /// A configuration value that is not finite or not in its range.
     pub fn new(model: Arc<ModalModel>, config: BodyConfig) -> Result<Self, StepError> {
         let modes = config.modes.unwrap_or(usize::MAX).min(model.mode_count());
-        let coefficients = coefficients(&model, &config, modes)?;
+        let (coefficients, flows) = coefficients(&model, &config, modes)?;
         finite("gravity", &config.gravity)?;
         let zero = vec![0.0; modes];
         let frame = Frame::at_rest(&model);
-        let state = State { q: zero.clone(), v: zero.clone(), a: zero.clone(), f: zero.clone(), frame };
+        let z = vec![0.0; flows.len()];
+        let state = State { q: zero.clone(), v: zero.clone(), a: zero.clone(), f: zero.clone(), z, frame };
         Ok(Self {
             coefficients,
+            flows,
             before: state.clone(),
             state,
             pushes: zero.clone(),
@@ -164,19 +175,29 @@ impl Body {
         &self.coefficients
     }
 
+    /// What relaxation adds to the recurrences of the kept modes; empty where the material does not relax.
+    pub fn flows(&self) -> &[Flow] {
+        &self.flows
+    }
+
     /// Number of modes kept.
     pub fn mode_count(&self) -> usize {
         self.state.q.len()
     }
 
-    /// Changes step size, integrator, warp, gravity or damping; the state goes on. The number of modes stays as it was made.
+    /// Changes step size, integrator, warp, gravity, damping or relaxation; the state goes on. The number of modes stays as it was made.
+    /// A material that begins to relax begins with nothing relaxed; one that ceases to forgets what had.
     ///
     /// # Errors
     /// As [`Body::new`]; the old configuration then stays.
     pub fn reconfigure(&mut self, config: BodyConfig) -> Result<(), StepError> {
         finite("gravity", &config.gravity)?;
-        self.coefficients = coefficients(&self.model, &config, self.mode_count())?;
+        (self.coefficients, self.flows) = coefficients(&self.model, &config, self.mode_count())?;
         self.config = BodyConfig { modes: self.config.modes, ..config };
+        self.state.z.resize(self.flows.len(), 0.0);
+        for grab in &mut self.grabs {
+            grab.set_material(self.config.relaxation, self.config.step);
+        }
         Ok(())
     }
 
@@ -193,6 +214,11 @@ impl Body {
     /// Modal accelerations, kg^1/2 m/s^2.
     pub fn a(&self) -> &[f64] {
         &self.state.a
+    }
+
+    /// Modal flows, kg^1/2 m; empty where the material does not relax. See [`Relaxation`].
+    pub fn z(&self) -> &[f64] {
+        &self.state.z
     }
 
     /// The whole state.
@@ -216,6 +242,10 @@ impl Body {
             }
             finite(what, slice)?;
         }
+        if state.z.len() != self.flows.len() {
+            return Err(StepError::Length { what: "z", expected: self.flows.len(), got: state.z.len() });
+        }
+        finite("z", &state.z)?;
         state.frame.check()?;
         self.state.clone_from(state);
         Ok(())
@@ -240,6 +270,7 @@ impl Body {
         }
         let id = GrabId(self.next_grab);
         let mut grab = Grab::new(id, &self.model, patch, config, self.mode_count())?;
+        grab.set_material(self.config.relaxation, self.config.step);
         let local = grab.local_position(&self.state.q, self.config.warp);
         grab.target = self.state.frame.to_world(local);
         self.next_grab += 1;
@@ -293,13 +324,37 @@ impl Body {
         Ok((-self.find(id)?.pull).into())
     }
 
-    /// The compliance of a grab (3x3, m/N, body axes): residual flexibility of the patch plus the hand's own spring.
+    /// The compliance of a grab within one step (3x3, m/N, body axes): residual flexibility of the patch plus the hand's own spring. Where
+    /// the material relaxes, the first is multiplied by [`Relaxation::creep`] of one step.
     ///
     /// # Errors
     /// No such grab.
     pub fn compliance(&self, id: GrabId) -> Result<[[f64; 3]; 3], StepError> {
         let c = self.find(id)?.compliance;
         Ok(std::array::from_fn(|i| std::array::from_fn(|j| c[(i, j)])))
+    }
+
+    /// How far the residual flexibility under a grab has flown (m, body axes): the `z` of what the modes leave out, with `creep` of the
+    /// pulls so far. Zero where the material does not relax. A copy of a body that takes over a [`State`] takes over this too.
+    ///
+    /// # Errors
+    /// No such grab.
+    pub fn grab_flow(&self, id: GrabId) -> Result<[f64; 3], StepError> {
+        Ok(self.find(id)?.flow.into())
+    }
+
+    /// Sets what [`grab_flow`](Self::grab_flow) tells; nothing where the material does not relax.
+    ///
+    /// # Errors
+    /// No such grab, a number that is not finite.
+    pub fn set_grab_flow(&mut self, id: GrabId, flow: [f64; 3]) -> Result<(), StepError> {
+        finite("grab flow", &flow)?;
+        let relaxes = !self.flows.is_empty();
+        let grab = self.find_mut(id)?;
+        if relaxes {
+            grab.flow = flow.into();
+        }
+        Ok(())
     }
 
     /// Pushes a surface vertex with `force` (N, world axes) during the next step only.
@@ -354,11 +409,20 @@ impl Body {
     }
 
     /// Kinetic plus elastic energy of the modes, and of the rigid motion of a free body, J. Potential energy in gravity is not in it.
+    /// Where the material relaxes, both springs of each mode count: `omega^2 ((1 - ratio) q^2 + ratio (q - z)^2) / 2`.
     pub fn energy(&self) -> f64 {
+        let ratio = self.config.relaxation.map_or(0.0, |r| r.ratio);
         let modes: f64 = (0..self.mode_count())
             .map(|i| {
-                let stretch = self.model.omega()[i] * self.state.q[i];
-                0.5 * (self.state.v[i] * self.state.v[i] + stretch * stretch)
+                let (omega, q, v) = (self.model.omega()[i], self.state.q[i], self.state.v[i]);
+                let stretch = omega * q;
+                let elastic = match self.state.z.get(i) {
+                    None => stretch * stretch,
+                    Some(z) => {
+                        (1.0 - ratio) * stretch * stretch + ratio * (omega * (q - z)) * (omega * (q - z))
+                    }
+                };
+                0.5 * (v * v + elastic)
             })
             .sum();
         modes + if self.model.is_free() { self.state.frame.kinetic_energy(&self.model) } else { 0.0 }
@@ -389,6 +453,7 @@ impl Body {
                 self.state.clone_from(&self.before);
                 for grab in &mut self.grabs {
                     grab.pull = Vector3::zeros();
+                    grab.flow = Vector3::zeros();
                 }
                 Err(StepError::Diverged { what })
             }
@@ -403,9 +468,11 @@ impl Body {
             Some("modal velocities")
         } else if bad(&self.state.a) {
             Some("modal accelerations")
+        } else if bad(&self.state.z) {
+            Some("modal flows")
         } else if self.state.frame.check().is_err() {
             Some("the frame")
-        } else if self.grabs.iter().any(|g| !g.pull.iter().all(|x| x.is_finite())) {
+        } else if self.grabs.iter().any(|g| !g.pull.iter().chain(&g.flow).all(|x| x.is_finite())) {
             Some("a reaction")
         } else {
             None
@@ -431,6 +498,14 @@ impl Body {
             let old = [self.state.q[i], self.state.v[i], self.state.a[i]];
             let [q, v, a] = c.step(old, self.state.f[i], self.force[i]);
             (self.state.q[i], self.state.v[i], self.state.a[i]) = (q, v, a);
+        }
+        for (i, flow) in self.flows.iter().enumerate() {
+            let old = [self.before.q[i], self.before.v[i], self.before.a[i]];
+            let z = self.before.z[i];
+            self.state.q[i] += flow.onto[0] * z;
+            self.state.v[i] += flow.onto[1] * z;
+            self.state.a[i] += flow.onto[2] * z;
+            self.state.z[i] = flow.step(old, z, self.state.f[i], self.force[i]);
         }
         let rigid = if self.model.is_free() {
             Some(RigidMotion::predict(
@@ -466,7 +541,7 @@ impl Body {
                 grab.linearise(&self.linear, self.config.warp);
                 let ahead = grab.ahead(&self.linear, &self.state.q);
                 let free_position = self.state.frame.to_world(ahead);
-                let mut gap = grab.target - free_position;
+                let mut gap = grab.target - free_position - turn * grab.crept();
                 if grab.config.relaxation > 0.0 {
                     let speed = turn * grab.rows_times(&self.state.v)
                         + rigid.map_or_else(Vector3::zeros, |_| {
@@ -502,9 +577,13 @@ impl Body {
             self.state.q[i] += c.response[0] * pull;
             self.state.v[i] += c.response[1] * pull;
             self.state.a[i] += c.response[2] * pull;
+            if let Some(flow) = self.flows.get(i) {
+                self.state.z[i] += flow.response * pull;
+            }
         }
         let (mut force, mut torque) = (Vector3::zeros(), Vector3::zeros());
         for grab in &mut self.grabs {
+            grab.relax();
             // Solved in body axes; hands live in the world's.
             grab.pull = turn * grab.pull;
             force += grab.pull;
@@ -558,14 +637,25 @@ fn coefficients(
     model: &ModalModel,
     config: &BodyConfig,
     modes: usize,
-) -> Result<Vec<Coefficients>, StepError> {
+) -> Result<(Vec<Coefficients>, Vec<Flow>), StepError> {
     let scale = config.damping_scale;
     StepError::check("damping_scale", "finite, 0 or more", scale.is_finite() && scale >= 0.0, scale)?;
-    (0..modes)
-        .map(|i| {
-            Coefficients::new(config.integrator, model.omega()[i], model.damping()[i] * scale, config.step)
-        })
-        .collect()
+    let mode = |i: usize| (config.integrator, model.omega()[i], model.damping()[i] * scale, config.step);
+    match config.relaxation {
+        Some(relaxation) => (0..modes)
+            .map(|i| {
+                let (integrator, omega, c, h) = mode(i);
+                Coefficients::relaxing(integrator, omega, c, relaxation, h)
+            })
+            .collect(),
+        None => {
+            let elastic = (0..modes).map(|i| {
+                let (integrator, omega, c, h) = mode(i);
+                Coefficients::new(integrator, omega, c, h)
+            });
+            Ok((elastic.collect::<Result<_, _>>()?, Vec::new()))
+        }
+    }
 }
 
 /// The position of a patch (m, body axes) and, when wanted, its derivative by each modal coordinate.

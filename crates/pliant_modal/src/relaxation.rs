@@ -1,0 +1,199 @@
+//! Viscoelastic bodies: a standard linear solid in every mode.
+
+use crate::{Coefficients, Integrator, StepError, exponential::exponential};
+
+/// A material that relaxes: the standard linear solid (Zener), a spring beside a Maxwell branch (a spring and a dashpot in series), of
+/// one relaxation time. The baked Young's modulus is the instantaneous one, `E`; held for long, `(1 - ratio) E` is left.
+///
+/// ```text
+/// q'' + c q' + omega^2 (q - ratio z) = f        z: the modal flow, how far the dashpot has gone
+/// time z' = q - z
+/// ```
+///
+/// so the stress under a held strain falls as [`modulus`](Self::modulus), and the strain under a held stress grows as
+/// [`creep`](Self::creep). The branch stores `ratio omega^2 (q - z)^2 / 2` and loses `ratio omega^2 (q - z)^2 / time`.
+///
+/// Source: C. Zener, *Elasticity and Anelasticity of Metals*, 1948; R. M. Christensen, *Theory of Viscoelasticity*, 2nd ed. 1982, ch. 1.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Relaxation {
+    /// Share of the instantaneous stiffness that relaxes away, 0 or more and below 1: at 1 the body would be a fluid and flow for ever.
+    pub ratio: f64,
+    /// Relaxation time under a held strain, s, above 0.
+    pub time: f64,
+}
+
+impl Relaxation {
+    /// # Errors
+    /// A ratio outside `[0, 1)`, a time that is not finite or not above 0.
+    pub fn check(&self) -> Result<(), StepError> {
+        let Self { ratio, time } = *self;
+        StepError::check("relaxation ratio", "0 or more, below 1", (0.0..1.0).contains(&ratio), ratio)?;
+        StepError::check("relaxation time", "finite seconds above 0", time.is_finite() && time > 0.0, time)
+    }
+
+    /// Relaxation modulus: stress at `t` s after a unit step of strain, as a share of the instantaneous one,
+    /// `1 - ratio (1 - exp(-t / time))`.
+    pub fn modulus(&self, t: f64) -> f64 {
+        1.0 + self.ratio * (-t / self.time).exp_m1()
+    }
+
+    /// Creep compliance: strain at `t` s after a unit step of stress, as a multiple of the instantaneous one,
+    /// `(1 - ratio exp(-(1 - ratio) t / time)) / (1 - ratio)`.
+    pub fn creep(&self, t: f64) -> f64 {
+        let left = 1.0 - self.ratio;
+        1.0 - self.ratio * (-left * t / self.time).exp_m1() / left
+    }
+
+    /// Storage and loss modulus at `omega` rad/s, as shares of the instantaneous modulus:
+    /// `1 - ratio / (1 + x^2)` and `ratio x / (1 + x^2)` with `x = omega time`.
+    pub fn complex_modulus(&self, omega: f64) -> [f64; 2] {
+        let x = omega * self.time;
+        // Not x / (1 + x^2): the square may overflow.
+        let share = if x > 1.0 { self.ratio / (x + 1.0 / x) } else { self.ratio * x / (1.0 + x * x) };
+        let lost = if x > 0.0 { share / x } else { self.ratio };
+        [1.0 - lost, share]
+    }
+}
+
+/// What the modal flow `z` adds to the recurrence of a mode; [`Coefficients`] holds the rest.
+///
+/// ```text
+/// [q1 v1 a1] = Coefficients + onto z0
+/// z1         = free [q0 v0 a0 f0] + carry z0 + response f1
+/// ```
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Flow {
+    /// What a unit of old flow adds to the new `q`, `v`, `a`.
+    pub onto: [f64; 3],
+    /// What the old `q`, `v`, `a` and modal force give the new flow.
+    pub free: [f64; 4],
+    /// What is left of the old flow.
+    pub carry: f64,
+    /// What a unit modal force at the new time adds to the flow.
+    pub response: f64,
+}
+
+impl Flow {
+    /// The flow after one step from `[q0, v0, a0]` and `z0`, with old force `f0` and new force `f1`.
+    #[inline]
+    pub fn step(&self, state: [f64; 3], z0: f64, f0: f64, f1: f64) -> f64 {
+        let [q, v, a, f] = self.free;
+        q * state[0] + v * state[1] + a * state[2] + f * f0 + self.carry * z0 + self.response * f1
+    }
+}
+
+/// Largest `rate x step` that a relaxing mode is stepped at. A faster mode has no digits left of its phase.
+const FASTEST: f64 = 1e12;
+
+impl Coefficients {
+    /// As [`Coefficients::new`], for a mode of a material that relaxes.
+    ///
+    /// [`Integrator::Exact`] is exact for a force that is constant over the step (the exponential of the 3 x 3 system, in twice double
+    /// precision). [`Integrator::Newmark`] and [`Integrator::GeneralizedAlpha`] treat the branch's stress as they treat the elastic one,
+    /// implicitly, and let it relax exactly for a strain that goes linearly over the step:
+    /// `s1 = e^-x s0 + omega^2 ratio (1 - e^-x)/x (q1 - q0)` with `s = omega^2 ratio (q - z)`, `x = h / time`. Under average
+    /// acceleration this is passive at any step: the energy with the branch's share multiplied by `(x/2) coth(x/2)` never grows unforced
+    /// (the energy itself may for one step where a state was put in by hand whose branch is far from relaxed although `time` is far
+    /// below `h`).
+    ///
+    /// # Errors
+    /// A number that is not finite or not in its range; `omega h` or `c h` above 1e12.
+    pub fn relaxing(
+        integrator: Integrator,
+        omega: f64,
+        c: f64,
+        relaxation: Relaxation,
+        h: f64,
+    ) -> Result<(Self, Flow), StepError> {
+        relaxation.check()?;
+        // The elastic mode's checks are this one's.
+        Self::new(integrator, omega, c, h)?;
+        let fastest = (omega * h).max(c * h);
+        StepError::check(
+            "omega",
+            "a relaxing mode of omega h and c h up to 1e12",
+            fastest <= FASTEST,
+            omega,
+        )?;
+        let made = match integrator {
+            Integrator::Exact => exact(omega, c, relaxation, h),
+            Integrator::Newmark => alpha(omega, c, relaxation, h, [0.0, 0.0, 0.25, 0.5]),
+            Integrator::GeneralizedAlpha { rho_inf: r } => {
+                let (am, af) = ((2.0 * r - 1.0) / (r + 1.0), r / (r + 1.0));
+                let gamma = 0.5 + af - am;
+                alpha(omega, c, relaxation, h, [am, af, (gamma + 0.5).powi(2) / 4.0, gamma])
+            }
+        };
+        let (table, flow) = &made;
+        let mut numbers = table.free.iter().flatten().chain(&table.response).chain(&flow.onto);
+        let finite = numbers.all(|x| x.is_finite()) && flow.free.iter().all(|x| x.is_finite());
+        StepError::check("omega", "a frequency whose square is finite", finite, omega)?;
+        Ok(made)
+    }
+}
+
+fn exact(omega: f64, c: f64, relaxation: Relaxation, h: f64) -> (Coefficients, Flow) {
+    let Relaxation { ratio, time } = relaxation;
+    let k = omega * omega;
+    // Coordinates (q, v / s, z) and time in steps: the entries of a fast mode are then comparable.
+    let s = omega.max(1e-3 / h);
+    let stiffness = k / s * h;
+    // A branch that relaxes in a 1e-12th of a step has relaxed.
+    let rate = (h / time).min(FASTEST);
+    let system = [[0.0, s * h, 0.0], [-stiffness, -c * h, ratio * stiffness], [rate, 0.0, -rate]];
+    let (e, g) = exponential(system, [0.0, 1.0, 0.0]);
+    let push = h / s;
+    let q = [e[0][0], e[0][1] / s, e[0][2], g[0] * push];
+    let v = [e[1][0] * s, e[1][1], e[1][2] * s, g[1] * h];
+    let z = [e[2][0], e[2][1] / s, e[2][2], g[2] * push];
+    // a1 = f1 - c v1 - k (q1 - ratio z1), so that the acceleration belongs to the state it comes with.
+    let a: [f64; 4] =
+        std::array::from_fn(|i| f64::from(u8::from(i == 3)) - c * v[i] - k * (q[i] - ratio * z[i]));
+    let table = Coefficients {
+        free: [[q[0], q[1], 0.0, 0.0], [v[0], v[1], 0.0, 0.0], [a[0], a[1], 0.0, 0.0]],
+        response: [q[3], v[3], a[3]],
+    };
+    (table, Flow { onto: [q[2], v[2], a[2]], free: [z[0], z[1], 0.0, 0.0], carry: z[2], response: z[3] })
+}
+
+fn alpha(
+    omega: f64,
+    c: f64,
+    relaxation: Relaxation,
+    h: f64,
+    [am, af, beta, gamma]: [f64; 4],
+) -> (Coefficients, Flow) {
+    let k = omega * omega;
+    let flowing = k * relaxation.ratio;
+    let x = h / relaxation.time;
+    // The flow under a strain that goes linearly over the step: z1 = e z0 + w0 q0 + w1 q1.
+    let e = (-x).exp();
+    let gone = -(-x).exp_m1();
+    let w1 =
+        if x < 1e-3 { x * (0.5 - x * (1.0 / 6.0 - x * (1.0 / 24.0 - x / 120.0))) } else { 1.0 - gone / x };
+    let w0 = gone - w1;
+    let (bh, gh) = (beta * h * h, gamma * h);
+    let (ph, mh) = (h * h * (0.5 - beta), h * (1.0 - gamma));
+    // (1 - am) a1 + am a0 + (1 - af)(c v1 + k q1 - flowing z1) + af (c v0 + k q0 - flowing z0) = (1 - af) f1 + af f0, solved for a1.
+    let (new, old) = (1.0 - af, af);
+    let held = k - flowing * w1;
+    let d = (1.0 - am) + new * (c * gh + held * bh);
+    let a = [
+        -(new * (held - flowing * w0) + old * k) / d,
+        -(c + new * held * h) / d,
+        -(am + new * (c * mh + held * ph)) / d,
+        old / d,
+    ];
+    let a_z = flowing * (new * e + old) / d;
+    let r = new / d;
+    let q = [1.0 + bh * a[0], h + bh * a[1], ph + bh * a[2], bh * a[3]];
+    let v = [gh * a[0], 1.0 + gh * a[1], mh + gh * a[2], gh * a[3]];
+    let table = Coefficients { free: [q, v, a], response: [bh * r, gh * r, r] };
+    let flow = Flow {
+        onto: [bh * a_z, gh * a_z, a_z],
+        free: [w0 + w1 * q[0], w1 * q[1], w1 * q[2], w1 * q[3]],
+        carry: e + w1 * bh * a_z,
+        response: w1 * bh * r,
+    };
+    (table, flow)
+}
