@@ -3,7 +3,7 @@
 use nalgebra::{Matrix3, Vector3};
 
 use super::patch_position;
-use crate::{ModalModel, Patch, Relaxation, StepError};
+use crate::{Coefficients, ModalModel, Patch, Relaxation, StepError};
 
 /// Names a grab on its body. Never used twice by the same body.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, PartialOrd, Ord)]
@@ -182,8 +182,23 @@ impl Grab {
         &self.rows
     }
 
-    pub(crate) fn rows_times(&self, v: &[f64]) -> Vector3<f64> {
-        self.rows.iter().zip(v).fold(Vector3::zeros(), |s, (row, v)| s + row * *v)
+    /// How fast the patch moves, m/s, as a damper on it is to see it: `before` and `q` a step of `h` seconds apart, `v` at its end.
+    ///
+    /// Of each mode the velocity at the end of the step, or the one over the step, whichever answers a push more. A mode that turns by more than half a
+    /// period within a step answers with an end velocity the other way: a damper on that would drive it.
+    pub(crate) fn speed(
+        &self,
+        coefficients: &[Coefficients],
+        before: &[f64],
+        q: &[f64],
+        v: &[f64],
+        h: f64,
+    ) -> Vector3<f64> {
+        let modes = self.rows.iter().zip(coefficients).zip(before.iter().zip(q).zip(v));
+        modes.fold(Vector3::zeros(), |sum, ((row, c), ((before, q), v))| {
+            let at_end = c.response[1] >= c.response[0] / h;
+            sum + row * if at_end { *v } else { (q - before) / h }
+        })
     }
 
     /// How fast the target moved since the last step, m/s; a fresh grab's has not.

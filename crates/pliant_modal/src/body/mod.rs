@@ -529,6 +529,7 @@ impl Body {
 
     /// Solves for the pulls of all grabs and adds what they do to the state.
     fn hold(&mut self, rigid: Option<&RigidMotion>) -> StepReport {
+        let h = self.config.step;
         let corrections = if self.config.warp { self.config.corrections.clamp(1, 8) } else { 1 };
         let reach = self.model.size();
         let turn: Matrix3<f64> = *self.state.frame.rotation().to_rotation_matrix().matrix();
@@ -543,11 +544,12 @@ impl Body {
                 let free_position = self.state.frame.to_world(ahead);
                 let mut gap = grab.target - free_position - turn * grab.crept();
                 if grab.config.relaxation > 0.0 {
-                    let speed = turn * grab.rows_times(&self.state.v)
+                    let speed = turn
+                        * grab.speed(&self.coefficients, &self.before.q, &self.state.q, &self.state.v, h)
                         + rigid.map_or_else(Vector3::zeros, |_| {
                             self.state.frame.velocity_at(&self.model, ahead)
                         });
-                    gap += grab.config.relaxation * (grab.target_velocity(self.config.step) - speed);
+                    gap += grab.config.relaxation * (grab.target_velocity(h) - speed);
                 }
                 // A hand that is a body's length away pulls no harder than from there: targets may teleport.
                 let distance = gap.norm();
@@ -557,7 +559,7 @@ impl Body {
                 grab.gap = back * gap;
                 grab.arm = ahead - Vector3::from(self.model.center_of_mass());
             }
-            report.regularised = self.schur.solve(&mut self.grabs, &self.coefficients, rigid);
+            report.regularised = self.schur.solve(&mut self.grabs, &self.coefficients, h, rigid);
             let mut moved = 0.0f64;
             for (i, q) in self.linear.iter_mut().enumerate() {
                 let pull: f64 = self.grabs.iter().map(|g| g.row(i).dot(&g.pull)).sum();
@@ -591,7 +593,7 @@ impl Body {
             grab.last_target = grab.target;
         }
         if rigid.is_some() {
-            RigidMotion::apply(&mut self.state.frame, &self.model, self.config.step, force, torque);
+            RigidMotion::apply(&mut self.state.frame, &self.model, h, force, torque);
         }
         report
     }

@@ -27,6 +27,7 @@ impl Schur {
         &mut self,
         grabs: &mut [Grab],
         coefficients: &[Coefficients],
+        step: f64,
         rigid: Option<&RigidMotion>,
     ) -> usize {
         let n = 3 * grabs.len();
@@ -34,10 +35,11 @@ impl Schur {
         for (g, a) in grabs.iter().enumerate() {
             for (h, b) in grabs.iter().enumerate().take(g + 1) {
                 let mut block = Matrix3::zeros();
-                // A velocity-dependent coupling sees the velocity response too; the larger relaxation keeps the matrix symmetric.
+                // A damper sees the velocity response too; the larger relaxation keeps the matrix symmetric.
                 let relaxation = a.config.relaxation.max(b.config.relaxation);
                 for ((ra, rb), c) in a.rows().iter().zip(b.rows()).zip(coefficients) {
-                    block += (c.response[0] + relaxation * c.response[1]) * (ra * rb.transpose());
+                    block += (c.response[0] + relaxation * c.response[1].max(c.response[0] / step))
+                        * (ra * rb.transpose());
                 }
                 if let Some(rigid) = rigid {
                     block += rigid.response(&a.arm, &b.arm, relaxation);
