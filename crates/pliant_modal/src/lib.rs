@@ -47,7 +47,7 @@ mod surface;
 mod warp;
 
 pub use basis::{BLOCK, Basis, ROWS};
-pub use body::{Body, BodyConfig, Frame, GrabConfig, GrabId, State, StepReport};
+pub use body::{Body, BodyConfig, Frame, GrabConfig, GrabId, RigidMotion, State, StepReport};
 pub use error::{FileError, ModelError, StepError};
 pub use file::{FORMAT_VERSION, MAGIC};
 pub use integrator::{Coefficients, Integrator};

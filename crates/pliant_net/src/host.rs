@@ -480,6 +480,8 @@ impl NetHost {
             integrator: config.integrator,
             warp: config.warp,
             damping_scale: config.damping_scale,
+            // An anchored body's weight turns with its entity: the stream learns it.
+            gravity: if state.model().is_free() { config.gravity } else { [0.0; 3] },
         };
         let model = state.model();
         if let Some(hosted) = self.bodies.get_mut(&entity) {

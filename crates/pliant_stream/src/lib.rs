@@ -33,9 +33,11 @@ mod patch_rows;
 pub mod peer;
 pub mod playout;
 pub mod recovery;
+mod schur;
 pub mod session;
 mod state;
 pub mod stepper;
+mod table;
 pub mod wire;
 
 pub use error::StreamError;

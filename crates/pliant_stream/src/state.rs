@@ -2,6 +2,9 @@
 
 use std::fmt;
 
+use nalgebra::{Matrix3, Quaternion, UnitQuaternion, Vector3};
+use pliant_modal::{Body, Frame, ModalModel};
+
 /// A numbered step of the host. Ticks ascend by one per step of `h` seconds.
 pub type Tick = u64;
 
@@ -82,24 +85,39 @@ impl Default for Pose {
 
 impl Pose {
     /// The frame of a body: the model's origin, and how it moves.
-    pub fn of(body: &pliant_modal::Body) -> Self {
-        use nalgebra::{Matrix3, Quaternion, UnitQuaternion, Vector3};
-        let frame = body.frame();
-        let [x, y, z, w] = frame.orientation();
-        let turn = UnitQuaternion::from_quaternion(Quaternion::new(w, x, y, z));
-        let inertia = body.model().inertia();
-        let spin = turn.inverse() * Vector3::from(frame.spin());
-        let inverse = Matrix3::from_fn(|i, j| inertia[i][j]).try_inverse().unwrap_or_else(Matrix3::zeros);
-        let angular = turn * (inverse * spin);
+    pub fn of(body: &Body) -> Self {
+        Self::of_frame(body.model(), body.frame())
+    }
+
+    /// The same of a frame alone.
+    pub fn of_frame(model: &ModalModel, frame: &Frame) -> Self {
+        let angular = frame.angular_velocity(model);
         let origin = Vector3::from(frame.origin());
         let arm = origin - Vector3::from(frame.center());
         let linear = Vector3::from(frame.velocity()) + angular.cross(&arm);
         Self {
             position: origin.into(),
-            rotation: [x, y, z, w],
+            rotation: frame.orientation(),
             linear: linear.into(),
             angular: angular.into(),
         }
+    }
+
+    /// The frame of a body in this pose; `None` when a number is not finite.
+    pub fn frame(&self, model: &ModalModel) -> Option<Frame> {
+        let turn = self.turn()?;
+        let arm = turn * Vector3::from(model.center_of_mass());
+        let angular = Vector3::from(self.angular);
+        let center = Vector3::from(self.position) + arm;
+        let velocity = Vector3::from(self.linear) + angular.cross(&arm);
+        let inertia = model.inertia();
+        let spin = turn * (Matrix3::from_fn(|i, j| inertia[i][j]) * (turn.inverse() * angular));
+        Frame::from_motion(model, center.into(), self.rotation, velocity.into(), spin.into()).ok()
+    }
+
+    pub(crate) fn turn(&self) -> Option<UnitQuaternion<f64>> {
+        let [x, y, z, w] = self.rotation;
+        UnitQuaternion::try_new(Quaternion::new(w, x, y, z), 1e-12)
     }
 
     /// True when every number is finite and within [`MAGNITUDE_LIMIT`] and the quaternion is not zero.

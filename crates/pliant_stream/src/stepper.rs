@@ -1,14 +1,15 @@
-//! The receiver's modal step: the same recurrence as the host's body, driven by reactions instead of targets.
+//! The receiver's modal step: the same recurrence as the host's body, driven by reactions or by targets.
 
-use std::collections::BTreeMap;
 use std::sync::Arc;
 
 use nalgebra::{Matrix3, Quaternion, UnitQuaternion, Vector3};
-use pliant_modal::{Coefficients, Integrator, ModalModel};
+use pliant_modal::{Frame, GrabConfig, Integrator, ModalModel, RigidMotion};
 
 use crate::StreamError;
-use crate::patch_rows::{PatchRows, Rows, dot, spread};
+use crate::patch_rows::{Grams, PatchRows, Six, Tangent, displaced, key, tangent};
+use crate::schur::solve_lower;
 use crate::state::{GrabState, ModalState};
+use crate::table::Table;
 use crate::wire::FrameGrab;
 
 /// Patches remembered at a time; a new one beyond that empties the table.
@@ -23,11 +24,14 @@ pub struct BodySetup {
     pub warp: bool,
     /// Factor on all damping coefficients. Default: 1.
     pub damping_scale: f64,
+    /// Uniform acceleration, m/s^2; world axes, for an anchored body its own. What the host's gravity has beyond this is
+    /// learnt by the stream. Default: none.
+    pub gravity: [f64; 3],
 }
 
 impl Default for BodySetup {
     fn default() -> Self {
-        Self { integrator: Integrator::default(), warp: true, damping_scale: 1.0 }
+        Self { integrator: Integrator::default(), warp: true, damping_scale: 1.0, gravity: [0.0; 3] }
     }
 }
 
@@ -36,34 +40,86 @@ impl Default for BodySetup {
 pub(crate) struct Hold {
     pub(crate) vertex: u32,
     pub(crate) radius: f64,
-    /// Force on the body: known, or where to begin looking; body axes, N.
+    pub(crate) by: By,
+    /// Force on the body, N: what was measured (body axes), and after the step what acted (world axes where the frame was
+    /// stepped with it).
     pub(crate) pull: Vector3<f64>,
-    /// Where the patch is to be, as displacement from rest in body axes, m.
-    pub(crate) place: Vector3<f64>,
-    /// `place` is a hand's target and the pull follows from the grab's compliance; else `place` was measured, and `pull`
-    /// with it.
-    pub(crate) target: bool,
-    /// Compliance of the hand's own spring, in series with the patch's, m/N.
-    pub(crate) hand: f64,
 }
 
-/// Steps a modal state with given reactions.
+/// What holds a patch.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub(crate) enum By {
+    /// The patch was measured at this displacement from rest (body axes, m), with the hold's `pull`.
+    Measured(Vector3<f64>),
+    /// A hand, as the body itself knows it.
+    Hand {
+        /// World, m; for an anchored body the body's own axes.
+        target: Vector3<f64>,
+        /// How fast the target moves, m/s.
+        velocity: Vector3<f64>,
+        /// Its spring and damper.
+        config: GrabConfig,
+    },
+}
+
+/// The rigid frame of a free body in a step, and what pushes it besides gravity and hands (world axes, N and N m).
+pub(crate) struct FrameStep<'a> {
+    pub(crate) frame: &'a mut Frame,
+    pub(crate) force: Vector3<f64>,
+    pub(crate) torque: Vector3<f64>,
+}
+
+/// One patch in the step under way.
+#[derive(Debug, Clone, Default)]
+struct Held {
+    /// Where the six numbers go without hands.
+    free: Six,
+    /// The same for their velocities; only where a hand has a damper.
+    speed: Six,
+    /// Where the tangent was taken.
+    from: Six,
+    at: Vector3<f64>,
+    tangent: Tangent,
+    compliance: Matrix3<f64>,
+    relaxation: f64,
+    /// Where the hand is, as displacement from rest, body axes, m.
+    place: Vector3<f64>,
+    velocity: Vector3<f64>,
+    /// From the centre of mass, body axes, m.
+    arm: Vector3<f64>,
+}
+
+/// Steps a modal state with given reactions or targets.
+///
+/// All Newton rounds of a step work in six numbers a patch, see [`crate::patch_rows`]; the modes are gone through for the
+/// step without hands, for where that brings the patches, and for what the pulls do.
 #[derive(Debug)]
 pub struct ForceStepper {
     model: Arc<ModalModel>,
-    coefficients: Vec<Coefficients>,
+    table: Table,
+    h: f64,
     warp: bool,
-    patches: BTreeMap<(u32, u64), PatchRows>,
+    damping_scale: f64,
+    gravity: Vector3<f64>,
+    /// Modal force of gravity on an anchored body; empty for none.
+    weight: Vec<f64>,
+    /// `1 / omega^2`.
+    softness: Vec<f64>,
+    patches: Vec<PatchRows>,
     holds: Vec<Hold>,
+    used: Vec<usize>,
+    held: Vec<Held>,
+    forces: Vec<Six>,
+    by_place: Grams,
+    by_speed: Grams,
+    by_softness: Grams,
     /// Modal force of the last step.
     old: Vec<f64>,
     force: Vec<f64>,
     free: [Vec<f64>; 3],
-    trial: Vec<f64>,
-    ahead: Vec<f64>,
+    more: Vec<f64>,
     gap: Vec<f64>,
     matrix: Vec<f64>,
-    scaled: Rows,
 }
 
 impl ForceStepper {
@@ -73,26 +129,37 @@ impl ForceStepper {
     /// [`StreamError::Model`] when the integrator cannot be set up.
     pub fn new(model: Arc<ModalModel>, setup: &BodySetup, modes: usize, h: f64) -> Result<Self, StreamError> {
         let modes = modes.min(model.mode_count());
-        let coefficients = model.omega()[..modes]
-            .iter()
-            .zip(model.damping())
-            .map(|(&omega, &c)| Coefficients::new(setup.integrator, omega, c * setup.damping_scale, h))
-            .collect::<Result<Vec<_>, _>>()
-            .map_err(|e| StreamError::Model(e.to_string()))?;
+        let table = Table::new(&model, setup, modes, h)?;
+        let gravity = Vector3::from(setup.gravity);
+        let weight = if model.is_free() || gravity == Vector3::zeros() {
+            Vec::new()
+        } else {
+            model.participation()[..modes].iter().map(|p| gravity.dot(&Vector3::from(*p))).collect()
+        };
+        let softness = model.omega()[..modes].iter().map(|w| 1.0 / w.powi(2).max(1e-12)).collect();
         Ok(Self {
             model,
-            coefficients,
+            table,
+            h,
             warp: setup.warp,
-            patches: BTreeMap::new(),
+            damping_scale: setup.damping_scale,
+            gravity,
+            weight,
+            softness,
+            patches: Vec::new(),
             holds: Vec::new(),
+            used: Vec::new(),
+            held: Vec::new(),
+            forces: Vec::new(),
+            by_place: Grams::default(),
+            by_speed: Grams::default(),
+            by_softness: Grams::default(),
             old: vec![0.0; modes],
             force: vec![0.0; modes],
             free: std::array::from_fn(|_| vec![0.0; modes]),
-            trial: vec![0.0; modes],
-            ahead: Vec::new(),
+            more: Vec::new(),
             gap: Vec::new(),
             matrix: Vec::new(),
-            scaled: std::array::from_fn(|_| vec![0.0; modes]),
         })
     }
 
@@ -101,9 +168,24 @@ impl ForceStepper {
         self.model.omega().get(mode).copied().unwrap_or(1.0)
     }
 
+    /// Does the body have a rigid frame of its own?
+    pub(crate) fn is_free(&self) -> bool {
+        self.model.is_free()
+    }
+
+    /// Length of a step, s.
+    pub(crate) fn h(&self) -> f64 {
+        self.h
+    }
+
+    /// The body.
+    pub(crate) fn model(&self) -> &Arc<ModalModel> {
+        &self.model
+    }
+
     /// Number of modes stepped.
     pub fn modes(&self) -> usize {
-        self.coefficients.len()
+        self.table.modes()
     }
 
     /// Forgets the force of the last step: after a state was taken over.
@@ -122,32 +204,34 @@ impl ForceStepper {
         }
     }
 
-    fn patch(&mut self, vertex: u32, radius: f64) -> Option<&mut PatchRows> {
-        let (modes, model) = (self.modes(), self.model.clone());
-        self.patch_of(&model, vertex, radius, modes)
+    /// Index of a patch, made when it is new; `None` for a vertex that the model has not got.
+    fn patch(&mut self, vertex: u32, radius: f64) -> Option<usize> {
+        let wanted = key(vertex, radius);
+        if let Some(index) = self.patches.iter().position(|p| p.key == wanted) {
+            return Some(index);
+        }
+        let made = PatchRows::new(&self.model, vertex, radius, self.modes()).ok()?;
+        self.patches.push(made);
+        Some(self.patches.len() - 1)
     }
 
-    fn patch_of(
-        &mut self,
-        model: &Arc<ModalModel>,
-        vertex: u32,
-        radius: f64,
-        modes: usize,
-    ) -> Option<&mut PatchRows> {
-        let key = key(vertex, radius);
-        if !self.patches.contains_key(&key) {
-            let made = PatchRows::new(model, vertex, radius, modes).ok()?;
-            if self.patches.len() >= PATCHES {
-                self.patches.clear();
-            }
-            self.patches.insert(key, made);
+    /// Keeps the patches' table from growing without bound: called where no index is held.
+    fn make_room(&mut self, more: usize) {
+        if self.patches.len() + more > PATCHES {
+            self.patches.clear();
         }
-        self.patches.get_mut(&key)
+    }
+
+    /// Is there such a patch on the body?
+    pub(crate) fn knows(&mut self, vertex: u32, radius: f64) -> bool {
+        self.make_room(1);
+        self.patch(vertex, radius).is_some()
     }
 
     /// Where a patch is at rest, body axes, m.
     pub(crate) fn rest(&mut self, vertex: u32, radius: f64) -> Option<Vector3<f64>> {
-        self.patch(vertex, radius).map(|p| p.rest)
+        self.make_room(1);
+        self.patch(vertex, radius).map(|index| self.patches[index].rest)
     }
 
     /// One step with the reactions, drawn to where the host's patches were.
@@ -156,149 +240,215 @@ impl ForceStepper {
     /// `pull = -R^T reaction`; the step is then the body's own, with its two Newton rounds:
     ///
     /// ```text
-    /// f = load + sum rows^T pull,   (A + C) correction = place + C pull_0 - (place that pull reaches) - C pull
+    /// f = load + sum rows^T pull,   (A + C) pull = place + C measured pull - (place that the free step reaches)
     /// ```
     ///
     /// The reactions alone would be a dead load: a bent body under a load that pushes is unstable (it buckles), although
     /// the same body held in place is not, and a small error would grow. This way the receiver is an observer: the
-    /// correction is zero when the state is right, and otherwise draws the patches to their places as the grab does, so
-    /// errors die as they would in the held body. A grab whose vertex the model has not got pulls nothing.
+    /// pull is the measured one when the state is right, and otherwise draws the patches to their places as the grab does,
+    /// so errors die as they would in the held body. A grab whose vertex the model has not got pulls nothing.
     pub fn step(&mut self, state: &mut ModalState, grabs: &[FrameGrab], rotation: [f64; 4], load: &[f64]) {
         let back = inverse_rotation(rotation);
         let mut holds = std::mem::take(&mut self.holds);
         holds.clear();
         holds.extend(grabs.iter().map(|g| Hold::measured(g, &back)));
-        self.step_held(state, &mut holds, load);
+        self.step_held(state, &mut holds, load, None);
         self.holds = holds;
     }
 
-    /// One step with patches held in any way; writes the pulls that acted (body axes, N).
-    pub(crate) fn step_held(&mut self, state: &mut ModalState, holds: &mut Vec<Hold>, load: &[f64]) {
-        let old = |k: usize| [state.q[k], state.v[k], state.a[k]];
-        for (k, c) in self.coefficients.iter().enumerate() {
-            let [q, v, a] = c.step(old(k), self.old[k], 0.0);
-            (self.free[0][k], self.free[1][k], self.free[2][k]) = (q, v, a);
-        }
-        let (modes, model) = (self.modes(), self.model.clone());
-        if self.patches.len() + holds.len() > PATCHES {
-            self.patches.clear();
-        }
-        holds.retain(|h| self.patch_of(&model, h.vertex, h.radius, modes).is_some());
-        for h in holds.iter_mut().filter(|h| !h.target) {
-            // Where the hand must have been: a grab that pulls so from there leaves the patch where it was measured.
-            if let Some(patch) = self.patches.get(&key(h.vertex, h.radius)) {
-                h.place += patch.compliance * h.pull;
-                h.target = true;
+    /// One step with patches held in any way, and of the frame where there is one; writes the pulls that acted. Holds of
+    /// patches that the model has not got are dropped.
+    pub(crate) fn step_held(
+        &mut self,
+        state: &mut ModalState,
+        holds: &mut Vec<Hold>,
+        load: &[f64],
+        frame: Option<FrameStep<'_>>,
+    ) {
+        self.make_room(holds.len());
+        let mut used = std::mem::take(&mut self.used);
+        used.clear();
+        holds.retain(|h| match self.patch(h.vertex, h.radius) {
+            Some(index) => {
+                used.push(index);
+                true
             }
-        }
-        self.press(&state.q, holds, load);
-        if !holds.is_empty() {
-            // Both of the body's rounds are implicit. Were the first one a dead load, a bent body would buckle under it,
-            // and the rows of the second round would be taken at the wrong place: the error then grows without bound.
-            self.correct(&state.q, holds);
-            let mut trial = std::mem::take(&mut self.trial);
-            self.reach(&mut trial);
-            self.press(&trial, holds, load);
-            self.correct(&trial, holds);
-            self.trial = trial;
-        }
-        for (k, c) in self.coefficients.iter().enumerate() {
-            let f = self.force[k];
-            state.q[k] = self.free[0][k] + c.response[0] * f;
-            state.v[k] = self.free[1][k] + c.response[1] * f;
-            state.a[k] = self.free[2][k] + c.response[2] * f;
-        }
-        self.old.copy_from_slice(&self.force);
-    }
+            None => false,
+        });
+        self.used = used;
 
-    /// The coordinates that the step reaches with the present forces.
-    fn reach(&self, q: &mut Vec<f64>) {
-        q.clear();
-        q.extend(
-            self.free[0]
-                .iter()
-                .zip(&self.coefficients)
-                .zip(&self.force)
-                .map(|((free, c), f)| free + c.response[0] * f),
-        );
-    }
-
-    /// Sets the modal forces: load and pulls, the rows taken at `q`.
-    fn press(&mut self, q: &[f64], holds: &[Hold], load: &[f64]) {
+        // The step without hands.
+        self.table.step(state, &self.old, &mut self.free);
         self.force.fill(0.0);
-        for (f, load) in self.force.iter_mut().zip(load) {
-            *f = *load;
-        }
-        for h in holds {
-            let Some(patch) = self.patches.get_mut(&key(h.vertex, h.radius)) else { continue };
-            patch.linearise(q, self.warp);
-            spread(&patch.rows, &h.pull, &mut self.force);
-        }
-    }
-
-    /// Adds to the modal forces what draws the patches to their places, on the tangent taken at `from`; see
-    /// [`ForceStepper::step`]. `(A + C) correction = place - reached - C pull`.
-    fn correct(&mut self, from: &[f64], holds: &mut [Hold]) {
-        let n = 3 * holds.len();
-        let mut ahead = std::mem::take(&mut self.ahead);
-        ahead.clear();
-        ahead.extend(
-            self.free[0]
-                .iter()
-                .zip(&self.coefficients)
-                .zip(&self.force)
-                .zip(from)
-                .map(|(((free, c), f), from)| free + c.response[0] * f - from),
-        );
-        let (mut gap, mut matrix) = (std::mem::take(&mut self.gap), std::mem::take(&mut self.matrix));
-        gap.clear();
-        gap.resize(n, 0.0);
-        matrix.clear();
-        matrix.resize(n * n, 0.0);
-        for (i, h) in holds.iter().enumerate() {
-            let Some(a) = self.patches.get(&key(h.vertex, h.radius)) else { continue };
-            let reached = a.at + dot(&a.rows, &ahead);
-            let softness = a.compliance + Matrix3::identity() * h.hand;
-            let missing = h.place - reached - softness * h.pull;
-            for (scaled, row) in self.scaled.iter_mut().zip(&a.rows) {
-                for ((s, r), c) in scaled.iter_mut().zip(row).zip(&self.coefficients) {
-                    *s = r * c.response[0];
-                }
+        for given in [load, &self.weight] {
+            for (f, given) in self.force.iter_mut().zip(given) {
+                *f += given;
             }
-            for (j, other) in holds.iter().enumerate().take(i + 1) {
-                let Some(b) = self.patches.get(&key(other.vertex, other.radius)) else { continue };
-                let columns = [0, 1, 2].map(|y| dot(&self.scaled, &b.rows[y]));
-                for (y, column) in columns.iter().enumerate() {
-                    for x in 0..3 {
-                        let soft = if i == j { softness[(x, y)] } else { 0.0 };
-                        matrix[(3 * i + x) * n + 3 * j + y] = column[x] + soft;
+        }
+        if !self.weight.is_empty() || load.iter().any(|x| *x != 0.0) {
+            self.table.press(&self.force, &mut self.free);
+        }
+        let mut frame = frame;
+        let rigid = frame
+            .as_mut()
+            .map(|f| RigidMotion::predict(f.frame, &self.model, self.h, self.gravity, f.force, f.torque));
+        if !holds.is_empty() {
+            let placed = frame.as_ref().map(|f| &*f.frame);
+            self.place(&state.q, holds, placed);
+            let rounds = if self.warp { 2 } else { 1 };
+            for round in 0..rounds {
+                // Both of the body's rounds are implicit. Were the first one a dead load, a bent body would buckle under
+                // it, and the rows of the second round would be taken at the wrong place: the error then grows.
+                self.solve(holds, placed, rigid.as_ref());
+                if round + 1 < rounds {
+                    for (i, held) in self.held.iter_mut().enumerate() {
+                        held.from = held.free + self.by_place.answer(i, &self.forces);
                     }
                 }
             }
-            for x in 0..3 {
-                gap[3 * i + x] = missing[x];
+            self.pull();
+            if let (Some(f), Some(_)) = (&mut frame, &rigid) {
+                let turn = *f.frame.rotation().to_rotation_matrix().matrix();
+                let (mut force, mut torque) = (Vector3::zeros(), Vector3::zeros());
+                for (h, held) in holds.iter_mut().zip(&self.held) {
+                    torque += turn * held.arm.cross(&h.pull);
+                    h.pull = turn * h.pull;
+                    force += h.pull;
+                }
+                RigidMotion::apply(f.frame, &self.model, self.h, force, torque);
             }
         }
-        self.ahead = ahead;
-        // A patch without any compliance in some direction gets no correction there.
-        let solved = solve_lower(&mut matrix, &mut gap);
-        let pulls = &gap;
-        let holds = if solved { holds } else { &mut [] };
-        for (i, h) in holds.iter_mut().enumerate() {
-            let more = Vector3::new(pulls[3 * i], pulls[3 * i + 1], pulls[3 * i + 2]);
-            if let Some(patch) = self.patches.get(&key(h.vertex, h.radius)) {
-                spread(&patch.rows, &more, &mut self.force);
-                h.pull += more;
+        let [q, v, a] = &self.free;
+        state.q.copy_from_slice(q);
+        state.v.copy_from_slice(v);
+        state.a.copy_from_slice(a);
+        self.old.copy_from_slice(&self.force);
+    }
+
+    /// Where the hands are and where the patches go without them.
+    fn place(&mut self, q: &[f64], holds: &[Hold], frame: Option<&Frame>) {
+        self.by_place.prepare(&self.patches, &self.used, &self.table.response[0]);
+        let damped = holds.iter().any(|h| matches!(h.by, By::Hand { config, .. } if config.relaxation > 0.0));
+        if damped {
+            self.by_speed.prepare(&self.patches, &self.used, &self.table.response[1]);
+        }
+        let center = Vector3::from(self.model.center_of_mass());
+        self.held.clear();
+        for (h, &index) in holds.iter().zip(&self.used) {
+            let patch = &self.patches[index];
+            let mut held = Held {
+                free: patch.reduce(&self.free[0], self.warp),
+                from: patch.reduce(q, self.warp),
+                compliance: patch.compliance,
+                ..Held::default()
+            };
+            match h.by {
+                By::Measured(place) => {
+                    // Where the hand must have been: a grab that pulls so from there leaves the patch where it was.
+                    held.place = place + patch.compliance * h.pull;
+                }
+                By::Hand { target, velocity, config } => {
+                    let back = frame.map(|f| f.rotation().inverse());
+                    let local = match (frame, back) {
+                        (Some(f), Some(back)) => back * (target - f.to_world(center)) + center,
+                        _ => target,
+                    };
+                    held.place = local - patch.rest;
+                    held.compliance += Matrix3::identity() * config.stiffness.map_or(0.0, |k| 1.0 / k);
+                    held.relaxation = config.relaxation;
+                    if config.relaxation > 0.0 {
+                        held.speed = patch.reduce(&self.free[1], self.warp);
+                        held.velocity = back.map_or(velocity, |back| back * velocity);
+                    }
+                }
+            }
+            self.held.push(held);
+        }
+    }
+
+    /// One Newton round: the pulls on the tangent taken at `from`.
+    fn solve(&mut self, holds: &mut [Hold], frame: Option<&Frame>, rigid: Option<&RigidMotion>) {
+        let n = 3 * holds.len();
+        let reach = self.model.size();
+        let center = Vector3::from(self.model.center_of_mass());
+        self.gap.clear();
+        self.matrix.clear();
+        self.matrix.resize(n * n, 0.0);
+        for (h, (held, &index)) in holds.iter().zip(self.held.iter_mut().zip(&self.used)) {
+            (held.at, held.tangent) = tangent(&held.from, self.warp);
+            let ahead = held.at + held.tangent * (held.free - held.from);
+            let rest = self.patches[index].rest;
+            held.arm = rest + ahead - center;
+            let mut gap = held.place - ahead;
+            if held.relaxation > 0.0 {
+                let mut speed = held.tangent * held.speed;
+                if let Some(f) = frame {
+                    speed += f.rotation().inverse() * f.velocity_at(&self.model, rest + ahead);
+                }
+                gap += held.relaxation * (held.velocity - speed);
+            }
+            // A hand that is a body's length away pulls no harder than from there: targets may teleport.
+            let distance = gap.norm();
+            if distance > reach && matches!(h.by, By::Hand { .. }) {
+                gap *= reach / distance;
+            }
+            self.gap.extend(gap.iter());
+        }
+        for i in 0..holds.len() {
+            for j in 0..=i {
+                let (a, b) = (&self.held[i], &self.held[j]);
+                let mut block = a.tangent * self.by_place.at(i, j) * b.tangent.transpose();
+                let relaxation = a.relaxation.max(b.relaxation);
+                if relaxation > 0.0 {
+                    block += relaxation * (a.tangent * self.by_speed.at(i, j) * b.tangent.transpose());
+                }
+                if let Some(rigid) = rigid {
+                    block += rigid.response(&a.arm, &b.arm, relaxation);
+                }
+                if i == j {
+                    block += a.compliance;
+                }
+                for x in 0..3 {
+                    for y in 0..3 {
+                        self.matrix[(3 * i + x) * n + 3 * j + y] = block[(x, y)];
+                    }
+                }
             }
         }
-        self.gap = gap;
-        self.matrix = matrix;
+        if solve_lower(&mut self.matrix, &mut self.gap) {
+            for (h, pull) in holds.iter_mut().zip(self.gap.chunks_exact(3)) {
+                h.pull = Vector3::new(pull[0], pull[1], pull[2]);
+            }
+        } else {
+            holds.iter_mut().for_each(|h| h.pull = Vector3::zeros());
+        }
+        self.forces.clear();
+        self.forces.extend(holds.iter().zip(&self.held).map(|(h, held)| held.tangent.tr_mul(&h.pull)));
+    }
+
+    /// Adds what the pulls do to the free step, and to the modal forces.
+    fn pull(&mut self) {
+        let mut more = std::mem::take(&mut self.more);
+        more.clear();
+        more.resize(self.force.len(), 0.0);
+        for (forces, &index) in self.forces.iter().zip(&self.used) {
+            self.patches[index].spread(forces, self.warp, &mut more);
+        }
+        self.table.press(&more, &mut self.free);
+        for (f, more) in self.force.iter_mut().zip(&more) {
+            *f += more;
+        }
+        self.more = more;
     }
 
     /// Where a patch is at `q`, as displacement from rest in body axes, m; zero for a vertex that the model has not got.
     pub fn displacement(&mut self, q: &[f64], vertex: u32, radius: f64) -> [f64; 3] {
+        self.make_room(1);
         let warp = self.warp;
-        self.patch(vertex, radius).map_or([0.0; 3], |p| p.displaced(q, warp).into())
+        match self.patch(vertex, radius) {
+            Some(index) => displaced(&self.patches[index].reduce(q, warp), warp).into(),
+            None => [0.0; 3],
+        }
     }
 
     /// The modal force per mode that a step from the true state `from` lacks to reach the true state `to`: by least
@@ -312,15 +462,15 @@ impl ForceStepper {
         load: &[f64],
         out: &mut Vec<f64>,
     ) {
-        let old = self.old.clone();
+        out.clone_from(&self.old);
         self.step(from, grabs, rotation, load);
-        self.old = old;
+        self.old.copy_from_slice(out);
         out.clear();
-        for (k, c) in self.coefficients.iter().enumerate() {
-            let weight = 1.0 / self.model.omega()[k].powi(2).max(1e-12);
+        let [by_q, by_v, _] = &self.table.response;
+        for (k, weight) in self.softness.iter().enumerate() {
             let at = |slice: &[f64]| slice.get(k).copied().unwrap_or(0.0);
             let (rq, rv) = (at(to[0]) - from.q[k], at(to[1]) - from.v[k]);
-            let (bq, bv) = (c.response[0], c.response[1]);
+            let (bq, bv) = (by_q[k], by_v[k]);
             let scale = bq * bq + bv * bv * weight;
             out.push(if scale > 0.0 { (bq * rq + bv * rv * weight) / scale } else { 0.0 });
         }
@@ -330,60 +480,63 @@ impl ForceStepper {
     /// `f = a + c v + omega^2 q`, laid on the grabs' patches by least squares:
     /// `min |f + sum rows^T R^T reaction|^2`. Writes the reactions into `grabs`; those whose rows are dependent share.
     pub fn reactions(&mut self, state: &ModalState, grabs: &mut [GrabState], rotation: [f64; 4]) {
-        let n = 3 * grabs.len();
-        if n == 0 {
+        if grabs.is_empty() {
+            return;
+        }
+        self.make_room(grabs.len());
+        let mut used = std::mem::take(&mut self.used);
+        used.clear();
+        let mut known = Vec::with_capacity(grabs.len());
+        for (i, g) in grabs.iter().enumerate() {
+            if let Some(index) = self.patch(g.vertex, g.radius) {
+                used.push(index);
+                known.push(i);
+            }
+        }
+        self.used = used;
+        // Modes are weighed by their compliance: stiff ones, whose force is least certain, would drown the others.
+        self.by_softness.prepare(&self.patches, &self.used, &self.softness);
+        let (omega, damping) = (self.model.omega(), self.model.damping());
+        for (k, f) in self.force.iter_mut().enumerate() {
+            let gravity = self.weight.get(k).copied().unwrap_or(0.0);
+            let all =
+                state.a[k] + damping[k] * self.damping_scale * state.v[k] + omega[k] * omega[k] * state.q[k];
+            *f = (all - gravity) * self.softness[k];
+        }
+        let n = 3 * known.len();
+        let mut tangents: Vec<Tangent> = Vec::with_capacity(known.len());
+        let mut right = Vec::with_capacity(n);
+        for &index in &self.used {
+            let patch = &self.patches[index];
+            let (_, t) = tangent(&patch.reduce(&state.q, self.warp), self.warp);
+            let along = t * patch.reduce(&self.force, self.warp);
+            right.extend(along.iter().map(|x| -x));
+            tangents.push(t);
+        }
+        self.matrix.clear();
+        self.matrix.resize(n * n, 0.0);
+        let mut trace = 0.0;
+        for i in 0..known.len() {
+            for j in 0..=i {
+                let block = tangents[i] * self.by_softness.at(i, j) * tangents[j].transpose();
+                for x in 0..3 {
+                    for y in 0..3 {
+                        self.matrix[(3 * i + x) * n + 3 * j + y] = block[(x, y)];
+                    }
+                }
+                trace += if i == j { block.trace() } else { 0.0 };
+            }
+        }
+        let ridge = 1e-9 * trace / n.max(1) as f64 + f64::MIN_POSITIVE;
+        for i in 0..n {
+            self.matrix[i * n + i] += ridge;
+        }
+        if !solve_lower(&mut self.matrix, &mut right) {
             return;
         }
         let turn = inverse_rotation(rotation).transpose();
-        for (k, f) in self.force.iter_mut().enumerate() {
-            *f = state.a[k]
-                + self.model.damping()[k] * state.v[k]
-                + self.model.omega()[k].powi(2) * state.q[k];
-        }
-        // Modes are weighed by their compliance: stiff ones, whose force is least certain, would drown the others.
-        let weight: Vec<f64> =
-            self.model.omega()[..self.modes()].iter().map(|w| 1.0 / w.powi(2).max(1e-12)).collect();
-        let mut columns: Vec<Rows> = Vec::with_capacity(grabs.len());
-        let (modes, warp) = (self.modes(), self.warp);
-        for g in grabs.iter() {
-            match self.patch(g.vertex, g.radius) {
-                Some(p) => {
-                    p.linearise(&state.q, warp);
-                    columns.push(p.rows.clone());
-                }
-                None => columns.push(std::array::from_fn(|_| vec![0.0; modes])),
-            }
-        }
-        let mut matrix = nalgebra::DMatrix::<f64>::zeros(n, n);
-        let mut right = nalgebra::DVector::<f64>::zeros(n);
-        for (i, a) in columns.iter().enumerate() {
-            let weighed: Rows =
-                std::array::from_fn(|x| a[x].iter().zip(&weight).map(|(r, w)| r * w).collect());
-            let along = dot(&weighed, &self.force);
-            for x in 0..3 {
-                right[3 * i + x] = -along[x];
-            }
-            for (j, b) in columns.iter().enumerate() {
-                for y in 0..3 {
-                    let column = dot(&weighed, &b[y]);
-                    for x in 0..3 {
-                        matrix[(3 * i + x, 3 * j + y)] = column[x];
-                    }
-                }
-            }
-        }
-        let ridge = 1e-9 * matrix.trace() / n as f64 + f64::MIN_POSITIVE;
-        for i in 0..n {
-            matrix[(i, i)] += ridge;
-        }
-        let Some(cholesky) = matrix.cholesky() else { return };
-        let solved = cholesky.solve(&right);
-        for (i, g) in grabs.iter_mut().enumerate() {
-            let local = Vector3::new(solved[3 * i], solved[3 * i + 1], solved[3 * i + 2]);
-            let world = turn * local;
-            if world.iter().all(|x| x.is_finite()) {
-                g.reaction = world.into();
-            }
+        for (&i, r) in known.iter().zip(right.chunks_exact(3)) {
+            grabs[i].reaction = (turn * Vector3::new(r[0], r[1], r[2])).into();
         }
     }
 }
@@ -395,66 +548,25 @@ impl Hold {
             vertex: g.state.vertex,
             radius: g.state.radius,
             pull: -(back * Vector3::from(g.state.reaction)),
-            place: g.displacement.into(),
-            target: false,
-            hand: 0.0,
+            by: By::Measured(g.displacement.into()),
         }
     }
-}
 
-/// Solves `M x = b` for a symmetric positive definite `M`, given by its lower triangle row by row, in place. False when it
-/// is not positive definite.
-fn solve_lower(m: &mut [f64], x: &mut [f64]) -> bool {
-    let n = x.len();
-    for j in 0..n {
-        let (above, rest) = m.split_at_mut(j * n);
-        let row = &mut rest[..n];
-        for k in 0..j {
-            let other = &above[k * n..k * n + k];
-            let sum: f64 = row[..k].iter().zip(other).map(|(a, b)| a * b).sum();
-            row[k] = (row[k] - sum) / above[k * n + k];
-        }
-        let square: f64 = row[..j].iter().map(|a| a * a).sum();
-        let pivot = row[j] - square;
-        if pivot.is_nan() || pivot <= 0.0 {
-            return false;
-        }
-        row[j] = pivot.sqrt();
-        let sum: f64 = row[..j].iter().zip(x.iter()).map(|(a, b)| a * b).sum();
-        x[j] = (x[j] - sum) / row[j];
+    /// A hand at a target.
+    pub(crate) fn hand(
+        vertex: u32,
+        radius: f64,
+        target: [f64; 3],
+        velocity: Vector3<f64>,
+        config: GrabConfig,
+    ) -> Self {
+        let by = By::Hand { target: target.into(), velocity, config };
+        Self { vertex, radius, by, pull: Vector3::zeros() }
     }
-    for j in (0..n).rev() {
-        let sum: f64 = (j + 1..n).map(|k| m[k * n + j] * x[k]).sum();
-        x[j] = (x[j] - sum) / m[j * n + j];
-    }
-    true
-}
-
-fn key(vertex: u32, radius: f64) -> (u32, u64) {
-    (vertex, radius.to_bits())
 }
 
 /// World to body.
 pub(crate) fn inverse_rotation([x, y, z, w]: [f64; 4]) -> Matrix3<f64> {
     UnitQuaternion::try_new(Quaternion::new(w, x, y, z), 1e-12)
         .map_or_else(Matrix3::identity, |q| *q.inverse().to_rotation_matrix().matrix())
-}
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-
-    #[test]
-    fn solves_positive_definite_systems_and_says_when_not() {
-        // M = [[4, 2, 0], [2, 5, 3], [0, 3, 6]], x = (1, -2, 3): M x = (0, 1, 12).
-        let mut m = [4.0, 0.0, 0.0, 2.0, 5.0, 0.0, 0.0, 3.0, 6.0];
-        let mut x = [0.0, 1.0, 12.0];
-        assert!(solve_lower(&mut m, &mut x));
-        for (got, want) in x.iter().zip([1.0, -2.0, 3.0]) {
-            assert!((got - want).abs() < 1e-14, "{x:?}");
-        }
-        assert!(!solve_lower(&mut [1.0, 0.0, 2.0, 1.0], &mut [1.0, 1.0]), "indefinite");
-        assert!(!solve_lower(&mut [f64::NAN], &mut [1.0]));
-        assert!(solve_lower(&mut [], &mut []));
-    }
 }

@@ -281,6 +281,7 @@ fn a_million_damaged_inputs_are_read_without_panic() {
         rho_inf: -1.0,
         warp: true,
         damping_scale: 1.0,
+        gravity: [0.0; 3],
     };
     seeds.push(HostMessage::Snapshot(snapshot).encode());
     seeds.push(HostMessage::BodyAdded(info).encode());

@@ -99,20 +99,23 @@ impl Frame {
         finite("frame spin", self.spin.as_slice())
     }
 
-    pub(crate) fn rotation(&self) -> &UnitQuaternion<f64> {
+    /// Rotation from body to world axes.
+    pub fn rotation(&self) -> &UnitQuaternion<f64> {
         &self.rotation
     }
 
     /// World position of a point of the body, m.
-    pub(crate) fn to_world(self, local: Vector3<f64>) -> Vector3<f64> {
+    pub fn to_world(self, local: Vector3<f64>) -> Vector3<f64> {
         self.position + self.rotation * (local - self.pivot)
     }
 
-    pub(crate) fn velocity_at(&self, model: &ModalModel, local: Vector3<f64>) -> Vector3<f64> {
+    /// World velocity of a point of the body that moves with the frame, m/s.
+    pub fn velocity_at(&self, model: &ModalModel, local: Vector3<f64>) -> Vector3<f64> {
         self.velocity + self.angular_velocity(model).cross(&(self.rotation * (local - self.pivot)))
     }
 
-    fn angular_velocity(&self, model: &ModalModel) -> Vector3<f64> {
+    /// Angular velocity, rad/s, world axes.
+    pub fn angular_velocity(&self, model: &ModalModel) -> Vector3<f64> {
         self.rotation * (inverse_inertia(model) * (self.rotation.inverse() * self.spin))
     }
 
@@ -152,7 +155,7 @@ fn inverse_inertia(model: &ModalModel) -> Matrix3<f64> {
 /// Velocities first, then positions with the new velocities (symplectic Euler): a stiff hand on a light body is then critically damped, where the
 /// average-acceleration rule would ring for ever. Constant forces are integrated exactly.
 #[derive(Debug, Clone, Copy)]
-pub(crate) struct RigidMotion {
+pub struct RigidMotion {
     step: f64,
     inverse_mass: f64,
     /// Body axes.
@@ -160,8 +163,9 @@ pub(crate) struct RigidMotion {
 }
 
 impl RigidMotion {
-    /// Advances the frame as if no hand held it.
-    pub(crate) fn predict(
+    /// Advances the frame by `h` (s) as if no hand held it, under `gravity` (m/s^2) and a force (N) and torque (N m) about the
+    /// centre of mass, all in world axes.
+    pub fn predict(
         frame: &mut Frame,
         model: &ModalModel,
         h: f64,
@@ -181,20 +185,15 @@ impl RigidMotion {
         Self { step: h, inverse_mass: 1.0 / model.mass(), inverse_inertia: inverse_inertia(model) }
     }
 
-    /// How far a unit pull at arm `b` moves the point at arm `a` (3x3, m/N, body axes).
-    pub(crate) fn response(&self, a: &Vector3<f64>, b: &Vector3<f64>, relaxation: f64) -> Matrix3<f64> {
+    /// How far a unit pull at arm `b` moves the point at arm `a` (3x3, m/N, body axes); with `relaxation` (s) times how fast
+    /// on top.
+    pub fn response(&self, a: &Vector3<f64>, b: &Vector3<f64>, relaxation: f64) -> Matrix3<f64> {
         let turning = a.cross_matrix() * self.inverse_inertia * b.cross_matrix().transpose();
         (self.step * (self.step + relaxation)) * (Matrix3::identity() * self.inverse_mass + turning)
     }
 
     /// Adds the pulls' total force and torque (world axes) to the predicted frame.
-    pub(crate) fn apply(
-        frame: &mut Frame,
-        model: &ModalModel,
-        h: f64,
-        force: Vector3<f64>,
-        torque: Vector3<f64>,
-    ) {
+    pub fn apply(frame: &mut Frame, model: &ModalModel, h: f64, force: Vector3<f64>, torque: Vector3<f64>) {
         frame.velocity += h * force / model.mass();
         frame.position += h * h * force / model.mass();
         frame.spin += h * torque;

@@ -8,14 +8,13 @@ use std::sync::Arc;
 
 use nalgebra::{Matrix3, Vector3};
 
-pub use frame::Frame;
+pub use frame::{Frame, RigidMotion};
 pub use grab::{GrabConfig, GrabId};
 
 use crate::{
     Coefficients, Flow, Integrator, ModalModel, Patch, Relaxation, StepError, error::finite,
     warp::warp_with_jacobian,
 };
-use frame::RigidMotion;
 use grab::Grab;
 use solve::Schur;
 

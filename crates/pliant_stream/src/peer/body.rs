@@ -2,16 +2,17 @@
 
 use std::sync::Arc;
 
-use nalgebra::Vector3;
-use pliant_modal::ModalModel;
+use nalgebra::{UnitQuaternion, Vector3};
+use pliant_modal::{Frame, GrabConfig, ModalModel};
 
 use super::inputs::{InputLog, WINDOW};
-use super::wire::{HeldAt, PeerBodyState};
+use super::wire::{HeldAt, PeerBodyState, PeerFrame};
 use crate::StreamError;
+use crate::check::projection;
 use crate::newmark::Newmark;
-use crate::recovery::{Blend, Forecast};
-use crate::state::{BodyId, GrabKey, GrabState, ModalState, Tick, UserId};
-use crate::stepper::{BodySetup, ForceStepper, Hold};
+use crate::recovery::{Blend, Forecast, PoseBlend};
+use crate::state::{BodyId, GrabKey, GrabState, ModalState, Pose, Tick, UserId};
+use crate::stepper::{BodySetup, ForceStepper, FrameStep, Hold};
 
 /// How a late input is put right.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
@@ -29,6 +30,9 @@ pub enum Repair {
 struct Past {
     tick: Tick,
     state: ModalState,
+    frame: Option<Frame>,
+    /// Modal forces of the step, which some integrators carry on.
+    force: Vec<f64>,
     pulls: Vec<(GrabKey, Vector3<f64>)>,
     used: Vec<(UserId, HeldAt)>,
 }
@@ -44,11 +48,16 @@ pub struct PeerBody {
     repair: Repair,
     tick: Tick,
     state: ModalState,
+    /// The rigid frame of a free body.
+    frame: Option<Frame>,
     pulls: Vec<(GrabKey, Vector3<f64>)>,
     past: Vec<Past>,
     held: Vec<(UserId, HeldAt)>,
     blend: Blend,
+    pose_blend: PoseBlend,
     shown: ModalState,
+    pose: Option<Pose>,
+    h: f64,
     grabs: Vec<GrabState>,
     restepped: u64,
 }
@@ -62,18 +71,16 @@ impl PeerBody {
         repair: Repair,
         blend_ticks: u16,
     ) -> Result<Self, StreamError> {
-        if model.is_free() {
-            return Err(StreamError::Config {
-                what: "body",
-                found: "a free one".into(),
-                expected: "an anchored body: peers do not step rigid frames",
-            });
-        }
         let stepper = ForceStepper::new(model.clone(), setup, model.mode_count(), h)?;
         let modes = stepper.modes();
         let (beta, gamma) = setup.integrator.newmark().unwrap_or((0.25, 0.5));
+        let frame = model.is_free().then(|| Frame::at_rest(&model));
         let mut made = Self {
             id,
+            frame,
+            pose: frame.map(|frame| Pose::of_frame(&model, &frame)),
+            pose_blend: PoseBlend::new(h, blend_ticks),
+            h,
             model,
             stepper,
             forecast: Forecast::new(h),
@@ -119,6 +126,35 @@ impl PeerBody {
         &self.shown
     }
 
+    /// The rigid frame of a free body as it is shown; `None` for an anchored one.
+    pub fn pose(&self) -> Option<Pose> {
+        self.pose
+    }
+
+    /// The rigid frame of a free body after a tick that is still remembered.
+    pub(crate) fn past_pose(&self, tick: Tick) -> Option<Pose> {
+        self.past(tick)?;
+        let frame = self.past[(tick % WINDOW as u64) as usize].frame?;
+        Some(Pose::of_frame(&self.model, &frame))
+    }
+
+    /// The checksum's value of a tick that is still remembered, and the size that it is compared by.
+    pub(crate) fn check(&self, tick: Tick) -> Option<(f64, f64)> {
+        let q = &self.past(tick)?.q;
+        let mut size = q.iter().map(|q| q * q).sum::<f64>();
+        let mut sum = projection(tick, q);
+        if let Some(pose) = self.past_pose(tick) {
+            // Place and turn in the units of the coordinates.
+            let (mass, span) = (self.model.mass().sqrt(), self.model.size());
+            let sign = if pose.rotation[3] < 0.0 { -span } else { span };
+            let turn = pose.rotation.map(|x| x * sign);
+            let all: Vec<f64> = pose.position.iter().chain(&turn).map(|x| x * mass).collect();
+            size += all.iter().map(|x| x * x).sum::<f64>();
+            sum += projection(!tick, &all);
+        }
+        Some((sum, size.sqrt()))
+    }
+
     /// Everything that holds the body, with its reactions.
     pub fn grabs(&self) -> &[GrabState] {
         &self.grabs
@@ -149,6 +185,13 @@ impl PeerBody {
             q: past.state.q.clone(),
             v: past.state.v.clone(),
             a: past.state.a.clone(),
+            force: past.force.clone(),
+            frame: past.frame.map(|f| PeerFrame {
+                center: f.center(),
+                orientation: f.orientation(),
+                velocity: f.velocity(),
+                spin: f.spin(),
+            }),
             pulls: past.pulls.iter().map(|(k, p)| (k.user.0, k.grab, (*p).into())).collect(),
         })
     }
@@ -158,19 +201,29 @@ impl PeerBody {
         if state.q.len() != self.state.modes() {
             return false;
         }
-        let before = self.state.clone();
+        let told = state
+            .frame
+            .as_ref()
+            .and_then(|f| Frame::from_motion(&self.model, f.center, f.orientation, f.velocity, f.spin).ok());
+        if told.is_some() != self.frame.is_some() {
+            return false;
+        }
+        let before = (self.state.clone(), self.frame);
+        self.frame = told;
         self.state = ModalState { q: state.q.clone(), v: state.v.clone(), a: state.a.clone() };
         let pull = |p: &(u16, u16, [f64; 3])| (GrabKey { user: UserId(p.0), grab: p.1 }, Vector3::from(p.2));
         self.pulls = state.pulls.iter().map(pull).collect();
         let fresh = self.tick == 0;
         self.tick = tick;
         self.stepper.restart();
+        self.stepper.set_last_force(&state.force);
         self.remember();
         while self.tick < to {
             self.step_once(inputs);
         }
         if fresh {
             self.blend.clear();
+            self.pose_blend.clear();
         } else {
             self.add_blend(&before);
         }
@@ -182,6 +235,7 @@ impl PeerBody {
     pub(crate) fn advance(&mut self, inputs: &InputLog) {
         self.step_once(inputs);
         self.blend.advance();
+        self.pose_blend.advance();
         self.show();
     }
 
@@ -195,14 +249,15 @@ impl PeerBody {
         if past.tick != base || past.state.modes() == 0 {
             return false;
         }
-        let before = self.state.clone();
+        let before = (self.state.clone(), self.frame);
         match self.repair {
             Repair::Rollback => {
                 let to = self.tick;
                 self.state.copy_from(&past.state);
+                self.frame = past.frame;
                 self.pulls.clone_from(&past.pulls);
+                self.stepper.set_last_force(&past.force);
                 self.tick = base;
-                self.stepper.restart();
                 while self.tick < to {
                     self.step_once(inputs);
                     self.restepped += 1;
@@ -227,76 +282,108 @@ impl PeerBody {
             if before.tick + 1 != tick {
                 continue;
             }
-            let (start, pulls) = (before.state.clone(), before.pulls.clone());
-            let mut with = start.clone();
-            let mut pulled = pulls.clone();
-            Self::press(&mut self.stepper, &mut with, &mut pulled, &held);
-            let mut without = start;
-            let mut pulled = pulls;
+            let (mut with, mut without) = (before.state.clone(), before.state.clone());
+            let (mut there, mut here) = (before.frame, before.frame);
+            let (mut pulls, force) = (before.pulls.clone(), before.force.clone());
             let used = std::mem::take(&mut self.past[index].used);
-            Self::press(&mut self.stepper, &mut without, &mut pulled, &used);
+            let now = self.stepper.last_force().to_vec();
+            self.stepper.set_last_force(&force);
+            Self::press(&mut self.stepper, &mut with, &mut there, &mut pulls, &held);
+            self.stepper.set_last_force(&force);
+            Self::press(&mut self.stepper, &mut without, &mut here, &mut pulls, &used);
+            self.stepper.set_last_force(&now);
             let (to_q, to_v) = self.newmark.response(self.tick - tick);
             for k in 0..self.state.modes() {
                 let da = with.a[k] - without.a[k];
                 self.state.q[k] += to_q * da;
                 self.state.v[k] += to_v * da;
             }
+            if let (Some(frame), Some(there), Some(here)) = (self.frame, there, here) {
+                self.frame = self.moved(&frame, &there, &here, (self.tick - tick) as f64 * self.h);
+            }
             self.past[index].used.clone_from(&held);
             self.restepped += 1;
         }
+    }
+
+    /// The frame as it would be, had it gone `there` instead of `here` so many seconds ago: what was different then in
+    /// velocity and spin has led on since.
+    fn moved(&self, frame: &Frame, there: &Frame, here: &Frame, seconds: f64) -> Option<Frame> {
+        let of = |f: fn(&Frame) -> [f64; 3]| Vector3::from(f(there)) - Vector3::from(f(here));
+        let (faster, spin) = (of(Frame::velocity), of(Frame::spin));
+        let center = Vector3::from(frame.center()) + of(Frame::center) + faster * seconds;
+        let turning = there.angular_velocity(&self.model) - here.angular_velocity(&self.model);
+        let turned = (there.rotation() * here.rotation().inverse()).scaled_axis() + turning * seconds;
+        let turn = UnitQuaternion::from_scaled_axis(turned) * frame.rotation();
+        let velocity = Vector3::from(frame.velocity()) + faster;
+        let spin = Vector3::from(frame.spin()) + spin;
+        let q = [turn.i, turn.j, turn.k, turn.w];
+        Frame::from_motion(&self.model, center.into(), q, velocity.into(), spin.into()).ok().or(Some(*frame))
     }
 
     fn step_once(&mut self, inputs: &InputLog) {
         let tick = self.tick + 1;
         let mut held = std::mem::take(&mut self.held);
         inputs.held(tick, self.id, &self.forecast, &mut held);
-        Self::press(&mut self.stepper, &mut self.state, &mut self.pulls, &held);
+        Self::press(&mut self.stepper, &mut self.state, &mut self.frame, &mut self.pulls, &held);
         self.held = held;
         self.tick = tick;
         self.remember();
     }
 
-    /// One step of a state with hands; `pulls` go in as where to begin and come out as what acted.
+    /// One step of a state with hands; the pulls that acted (N, world axes) come out.
     fn press(
         stepper: &mut ForceStepper,
         state: &mut ModalState,
+        frame: &mut Option<Frame>,
         pulls: &mut Vec<(GrabKey, Vector3<f64>)>,
         held: &[(UserId, HeldAt)],
     ) {
         let mut holds = Vec::with_capacity(held.len());
-        let mut keys = Vec::with_capacity(held.len());
-        for (user, g) in held {
-            let Some(rest) = stepper.rest(g.vertex, g.radius) else { continue };
-            let key = g.key(*user);
-            let pull = pulls.iter().find(|p| p.0 == key).map_or_else(Vector3::zeros, |p| p.1);
-            let place = Vector3::from(g.target) - rest;
-            holds.push(Hold { vertex: g.vertex, radius: g.radius, pull, place, target: true, hand: 0.0 });
-            keys.push(key);
-        }
-        stepper.step_held(state, &mut holds, &[]);
         pulls.clear();
-        pulls.extend(keys.into_iter().zip(holds.iter().map(|h| h.pull)));
+        for (user, g) in held {
+            if stepper.knows(g.vertex, g.radius) {
+                let config = GrabConfig::default();
+                holds.push(Hold::hand(g.vertex, g.radius, g.target, Vector3::zeros(), config));
+                pulls.push((g.key(*user), Vector3::zeros()));
+            }
+        }
+        let zero = Vector3::zeros();
+        let frame = frame.as_mut().map(|frame| FrameStep { frame, force: zero, torque: zero });
+        stepper.step_held(state, &mut holds, &[], frame);
+        for (pull, hold) in pulls.iter_mut().zip(&holds) {
+            pull.1 = hold.pull;
+        }
     }
 
     fn remember(&mut self) {
         let past = &mut self.past[(self.tick % WINDOW as u64) as usize];
         past.tick = self.tick;
         past.state.copy_from(&self.state);
+        past.frame = self.frame;
+        past.force.clear();
+        past.force.extend_from_slice(self.stepper.last_force());
         past.pulls.clone_from(&self.pulls);
         past.used.clone_from(&self.held);
     }
 
-    fn add_blend(&mut self, before: &ModalState) {
+    fn add_blend(&mut self, before: &(ModalState, Option<Frame>)) {
+        let (before, frame) = before;
         let now = &self.state;
         self.blend.add(
             before.q.iter().zip(&now.q).map(|(b, n)| b - n),
             before.v.iter().zip(&now.v).map(|(b, n)| b - n),
         );
+        if let (Some(before), Some(now)) = (frame, &self.frame) {
+            self.pose_blend.add(&Pose::of_frame(&self.model, before), &Pose::of_frame(&self.model, now));
+        }
     }
 
     fn show(&mut self) {
         self.shown.copy_from(&self.state);
         self.blend.apply(&mut self.shown.q, &mut self.shown.v);
+        let pose = self.frame.map(|frame| Pose::of_frame(&self.model, &frame));
+        self.pose = pose.map(|pose| self.pose_blend.apply(&pose));
         self.grabs.clear();
         for (user, g) in &self.held {
             let key = g.key(*user);

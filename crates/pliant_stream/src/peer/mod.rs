@@ -17,4 +17,4 @@ mod wire;
 pub use body::{PeerBody, Repair};
 pub use config::{PeerConfig, PeerEvent};
 pub use session::PeerSession;
-pub use wire::{HeldAt, InputTick, PeerBodyState, PeerDatagram, PeerMessage, StateCheck};
+pub use wire::{HeldAt, InputTick, PeerBodyState, PeerDatagram, PeerFrame, PeerMessage, StateCheck};

@@ -11,7 +11,6 @@ use super::config::{PeerConfig, PeerEvent};
 use super::inputs::{InputLog, WINDOW};
 use super::wire::{HeldAt, InputTick, MAX_HELD, MAX_TICKS, PeerDatagram, PeerMessage, StateCheck};
 use crate::StreamError;
-use crate::check::projection;
 use crate::session::{Channel, EndReason, Output};
 use crate::state::{BodyId, PeerId, Tick, UserId, in_range};
 use crate::stepper::BodySetup;
@@ -106,7 +105,7 @@ impl PeerSession {
     /// Adds a body; all peers add the same ones under the same numbers, before they start.
     ///
     /// # Errors
-    /// [`StreamError::Config`] for a free body or a number in use; [`StreamError::Model`].
+    /// [`StreamError::Config`] for a number in use; [`StreamError::Model`].
     pub fn add_body(
         &mut self,
         id: BodyId,
@@ -232,6 +231,11 @@ impl PeerSession {
     /// The state of a body after a tick of the last 128.
     pub fn state_at(&self, body: BodyId, tick: Tick) -> Option<&crate::ModalState> {
         self.bodies.get(&body)?.past(tick)
+    }
+
+    /// The rigid frame of a free body after a tick of the last 128.
+    pub fn pose_at(&self, body: BodyId, tick: Tick) -> Option<crate::Pose> {
+        self.bodies.get(&body)?.past_pose(tick)
     }
 
     /// Something arrived unreliably; any bytes will do.
@@ -411,10 +415,10 @@ impl PeerSession {
         if self.last_check.is_none_or(|c| c.tick < due) && due > 0 {
             // One body a time, in turn.
             let index = (due / CHECK_EVERY) as usize % self.bodies.len().max(1);
-            check = self.bodies.values().nth(index).and_then(|b| {
-                let q = &b.past(due)?.q;
-                Some(StateCheck { body: b.id(), tick: due, value: projection(due, q) as f32 })
-            });
+            check =
+                self.bodies.values().nth(index).and_then(|b| {
+                    Some(StateCheck { body: b.id(), tick: due, value: b.check(due)?.0 as f32 })
+                });
             self.last_check = check.or(self.last_check);
         }
         let peers: Vec<PeerId> = self.others.keys().copied().collect();
@@ -501,12 +505,10 @@ impl PeerSession {
         if user > self.config.user || check.tick > self.confirmed() {
             return;
         }
-        let Some(q) = self.bodies.get(&check.body).and_then(|b| b.past(check.tick)).map(|s| &s.q) else {
+        let Some((own, size)) = self.bodies.get(&check.body).and_then(|b| b.check(check.tick)) else {
             return;
         };
-        let size = q.iter().map(|q| q * q).sum::<f64>().sqrt();
-        let agrees =
-            (projection(check.tick, q) - f64::from(check.value)).abs() <= CHECK_TOLERANCE * size + 1e-7;
+        let agrees = (own - f64::from(check.value)).abs() <= CHECK_TOLERANCE * size + 1e-7;
         if let Some(other) = self.others.get_mut(&peer) {
             other.mismatched = if agrees { 0 } else { other.mismatched + 1 };
         }

@@ -209,6 +209,19 @@ impl PeerDatagram {
     }
 }
 
+/// The rigid frame of a free body in a [`PeerBodyState`], world axes.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
+pub struct PeerFrame {
+    /// Centre of mass, m.
+    pub center: [f64; 3],
+    /// Body to world, unit quaternion x, y, z, w.
+    pub orientation: [f64; 4],
+    /// Velocity of the centre of mass, m/s.
+    pub velocity: [f64; 3],
+    /// Angular momentum about it, kg m^2/s.
+    pub spin: [f64; 3],
+}
+
 /// One body's state in a [`PeerMessage::State`].
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct PeerBodyState {
@@ -220,6 +233,10 @@ pub struct PeerBodyState {
     pub v: Vec<f64>,
     /// Accelerations.
     pub a: Vec<f64>,
+    /// Modal forces of the last step, as many as coordinates.
+    pub force: Vec<f64>,
+    /// The rigid frame of a free body.
+    pub frame: Option<PeerFrame>,
     /// Pulls of the last step, which the next one begins with: user, grab, force.
     pub pulls: Vec<(u16, u16, [f64; 3])>,
 }
@@ -288,10 +305,18 @@ impl PeerMessage {
                     return invalid("state tick", tick.to_string(), "below 2^48");
                 }
                 for b in bodies {
-                    let equal = b.v.len() == b.q.len() && b.a.len() == b.q.len() && b.q.len() <= MAX_MODES;
+                    let modes = b.q.len();
+                    let equal = [&b.v, &b.a, &b.force].iter().all(|x| x.len() == modes) && modes <= MAX_MODES;
+                    let frame = b.frame.is_none_or(|f| {
+                        in_range(&f.center)
+                            && in_range(&f.velocity)
+                            && in_range(&f.spin)
+                            && (0.5..2.0).contains(&f.orientation.iter().map(|x| x * x).sum::<f64>())
+                    });
                     let sane = in_range(&b.q)
                         && in_range(&b.v)
-                        && b.a.iter().all(|x| x.abs() < 1e15)
+                        && frame
+                        && b.a.iter().chain(&b.force).all(|x| x.abs() < 1e15)
                         && b.pulls.iter().all(|p| in_range(&p.2));
                     if !(equal && sane) {
                         return invalid("state", "a number or length out of range".into(), "finite numbers");

@@ -24,6 +24,9 @@ pub struct ForceDriven {
     past: Vec<Stepped>,
     grabs: Vec<FrameGrab>,
     forecast: Forecast,
+    /// The body has a rigid frame of its own.
+    free: bool,
+    h: f64,
 }
 
 impl ForceDriven {
@@ -31,6 +34,8 @@ impl ForceDriven {
     pub fn new(stepper: ForceStepper, forecast: Forecast) -> Self {
         let modes = stepper.modes();
         Self {
+            free: stepper.is_free(),
+            h: stepper.h(),
             stepper,
             tick: 0,
             first: 0,
@@ -52,16 +57,14 @@ impl ForceDriven {
 
     fn step_to(&mut self, tick: Tick, history: &History) {
         self.grabs.clear();
-        let mut rotation = [0.0, 0.0, 0.0, 1.0];
         if let Some(data) = history.known(tick) {
             self.grabs.extend_from_slice(&data.grabs);
         } else if let Some(near) = history.last_known(tick) {
             self.grabs
                 .extend(near.grabs.iter().filter_map(|g| history.grab(g.state.key, tick, &self.forecast)));
         }
-        if let Some(pose) = history.last_known(tick).and_then(|d| d.pose) {
-            rotation = pose.rotation;
-        }
+        let pose = if self.free { history.pose(tick, self.h) } else { None };
+        let rotation = pose.map_or([0.0, 0.0, 0.0, 1.0], |p| p.rotation);
         self.stepper.step(&mut self.state, &self.grabs, rotation, &self.load);
         self.take_slice(tick, history);
         self.remember(tick);

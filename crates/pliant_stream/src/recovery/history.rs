@@ -3,10 +3,17 @@
 use crate::state::{GrabKey, GrabState, MAX_GRABS, Pose, Tick};
 use crate::wire::{Frame, FrameGrab, Slice};
 
+use nalgebra::{UnitQuaternion, Vector3};
+
 use super::forecast::{CHANNELS, Forecast};
 
 /// Ticks that a receiver remembers. Older data is not used any more.
 pub const HISTORY: usize = 256;
+
+/// Values between known ticks are looked for at most so far away.
+const NEAR: u64 = 40;
+/// A frame that is not heard of keeps its acceleration for at most so long, s.
+const FALL: f64 = 0.4;
 
 /// What is known of one tick.
 #[derive(Debug, Clone, Default)]
@@ -61,6 +68,27 @@ impl History {
     /// The newest known tick at or before `tick` and after `tick - HISTORY`.
     pub fn last_known(&self, tick: Tick) -> Option<&TickData> {
         (0..HISTORY as u64).map_while(|back| tick.checked_sub(back)).find_map(|t| self.known(t))
+    }
+
+    /// The rigid frame at a tick, `h` seconds a tick: as it arrived, or between its neighbours, or going on from the last
+    /// ones. `None` when none of the last ones is known.
+    pub fn pose(&self, tick: Tick, h: f64) -> Option<Pose> {
+        let at = |t: Tick| self.known(t).and_then(|d| d.pose);
+        if let Some(pose) = at(tick) {
+            return Some(pose);
+        }
+        let mut back = (1..HISTORY as u64).map_while(|b| tick.checked_sub(b));
+        let (before, pose) = back.find_map(|t| at(t).map(|p| (t, p)))?;
+        let after = (1..NEAR).map(|b| tick + b).take_while(|&t| t <= self.highest);
+        if let Some((t, next)) = after.filter_map(|t| at(t).map(|p| (t, p))).next() {
+            return Some(between(&pose, &next, (tick - before) as f64 / (t - before) as f64));
+        }
+        // How its speed changed last goes on for a while: it may be falling.
+        let faster = before
+            .checked_sub(1)
+            .and_then(at)
+            .map_or([0.0; 3], |last| std::array::from_fn(|k| (pose.linear[k] - last.linear[k]) / h));
+        Some(go_on(&pose, faster, (tick - before) as f64 * h))
     }
 
     fn slot(&mut self, tick: Tick) -> &mut TickData {
@@ -130,7 +158,6 @@ impl History {
         if self.known(tick).is_some() {
             return at(tick);
         }
-        const NEAR: u64 = 40;
         let before = (1..NEAR).map_while(|b| tick.checked_sub(b)).find(|&t| self.known(t).is_some());
         let after =
             (1..NEAR).map(|b| tick + b).take_while(|&t| t <= self.highest).find(|&t| self.known(t).is_some());
@@ -155,6 +182,36 @@ impl History {
             }
             (None, None) => None,
         }
+    }
+}
+
+/// A pose some seconds later on the same twist, gaining `faster` (m/s^2) for a while.
+fn go_on(pose: &Pose, faster: [f64; 3], seconds: f64) -> Pose {
+    let Some(turn) = pose.turn() else { return *pose };
+    let turned = UnitQuaternion::from_scaled_axis(Vector3::from(pose.angular) * seconds) * turn;
+    let (gaining, after) = (seconds.min(FALL), (seconds - FALL).max(0.0));
+    Pose {
+        position: std::array::from_fn(|k| {
+            let gained = faster[k] * gaining;
+            pose.position[k] + pose.linear[k] * seconds + gained * (0.5 * gaining + after)
+        }),
+        rotation: [turned.i, turned.j, turned.k, turned.w],
+        linear: std::array::from_fn(|k| pose.linear[k] + faster[k] * gaining),
+        angular: pose.angular,
+    }
+}
+
+/// A pose between two, at a share of the way.
+fn between(a: &Pose, b: &Pose, share: f64) -> Pose {
+    let (Some(from), Some(to)) = (a.turn(), b.turn()) else { return *a };
+    let way = (to * from.inverse()).scaled_axis() * share;
+    let turn = UnitQuaternion::from_scaled_axis(way) * from;
+    let mix = |a: [f64; 3], b: [f64; 3]| std::array::from_fn(|k| a[k] + share * (b[k] - a[k]));
+    Pose {
+        position: mix(a.position, b.position),
+        rotation: [turn.i, turn.j, turn.k, turn.w],
+        linear: mix(a.linear, b.linear),
+        angular: mix(a.angular, b.angular),
     }
 }
 

@@ -7,6 +7,7 @@ mod force_driven;
 mod forecast;
 mod history;
 mod passivity;
+mod pose_blend;
 mod receiver;
 
 pub use acceleration::AccelerationDriven;
@@ -16,6 +17,7 @@ pub use force_driven::ForceDriven;
 pub use forecast::Forecast;
 pub use history::{HISTORY, History, TickData};
 pub use passivity::PassivityGuard;
+pub use pose_blend::PoseBlend;
 pub use receiver::{Arrival, Receiver, RepairCounts, ShownGrab};
 
 use crate::state::{ModalState, Tick};

@@ -7,7 +7,7 @@ use pliant_modal::ModalModel;
 use super::{
     AccelerationDriven, Blend, ForceDriven, HISTORY, History, Policy, Predict, Recovery, RecoveryConfig,
 };
-use super::{Forecast, PassivityGuard};
+use super::{Forecast, PassivityGuard, PoseBlend};
 use crate::StreamError;
 use crate::check::projection;
 use crate::newmark::Newmark;
@@ -64,7 +64,11 @@ pub struct Receiver {
     tick: Tick,
     shown: ModalState,
     grabs: Vec<ShownGrab>,
+    /// The best estimate of the rigid frame at the shown tick, and what is shown of it.
+    frame: Option<Pose>,
     pose: Option<Pose>,
+    pose_blend: PoseBlend,
+    free: bool,
     counts: RepairCounts,
     mismatched: u32,
     before: ModalState,
@@ -126,7 +130,10 @@ impl Receiver {
             tick: snapshot.tick,
             shown: ModalState::zero(modes),
             grabs: Vec::new(),
+            frame: None,
             pose: None,
+            pose_blend: PoseBlend::new(newmark.h, blend_ticks),
+            free: model.is_free(),
             counts: RepairCounts::default(),
             mismatched: 0,
             before: ModalState::zero(modes),
@@ -152,6 +159,11 @@ impl Receiver {
     /// Best estimate of the truth.
     pub fn hidden(&self) -> &ModalState {
         self.policy.hidden()
+    }
+
+    /// Best estimate of the rigid frame at the shown tick, where the body is free.
+    pub(crate) fn frame(&self) -> Option<Pose> {
+        self.frame
     }
 
     pub(crate) fn load(&self) -> &[f64] {
@@ -243,6 +255,7 @@ impl Receiver {
 
     /// Steps to the next tick, with its data or without.
     pub fn advance(&mut self) {
+        self.correct_pose();
         let tick = self.tick + 1;
         self.tick = tick;
         self.counts.stepped += 1;
@@ -322,6 +335,15 @@ impl Receiver {
         self.show();
     }
 
+    /// Where the frame was shown on a guess that is known better now, the difference fades.
+    fn correct_pose(&mut self) {
+        self.pose_blend.advance();
+        let Some(guess) = self.frame else { return };
+        if let Some(known) = self.history.pose(self.tick, self.h).filter(|known| *known != guess) {
+            self.pose_blend.add(&guess, &known);
+        }
+    }
+
     fn remember_before(&mut self) {
         self.before.copy_from(self.policy.hidden());
     }
@@ -351,9 +373,8 @@ impl Receiver {
                 }
             }
         }
-        self.pose = self.history.last_known(self.tick).and_then(|d| {
-            d.pose.map(|p| extrapolate(&p, (self.tick.saturating_sub(d.tick)) as f64 * self.h))
-        });
+        self.frame = if self.free { self.history.pose(self.tick, self.h).or(self.frame) } else { None };
+        self.pose = self.frame.map(|pose| self.pose_blend.apply(&pose));
         if self.policy.driven_by_reactions() {
             let forecast = self.forecast;
             for g in &mut self.grabs {
@@ -400,21 +421,4 @@ impl Receiver {
 
 fn state_of(snapshot: &SnapshotBytes) -> ModalState {
     ModalState { q: snapshot.q.clone(), v: snapshot.v.clone(), a: snapshot.a.clone() }
-}
-
-/// A pose some seconds later on the same twist.
-fn extrapolate(pose: &Pose, seconds: f64) -> Pose {
-    use nalgebra::{Quaternion, UnitQuaternion, Vector3};
-    if seconds == 0.0 {
-        return *pose;
-    }
-    let [x, y, z, w] = pose.rotation;
-    let Some(turn) = UnitQuaternion::try_new(Quaternion::new(w, x, y, z), 1e-12) else { return *pose };
-    let turned = UnitQuaternion::from_scaled_axis(Vector3::from(pose.angular) * seconds) * turn;
-    let q = turned.quaternion();
-    Pose {
-        position: std::array::from_fn(|k| pose.position[k] + pose.linear[k] * seconds),
-        rotation: [q.i, q.j, q.k, q.w],
-        ..*pose
-    }
 }

@@ -473,6 +473,7 @@ impl HostSession {
             rho_inf: BodyInfo::rho_inf_of(b.setup.integrator),
             warp: b.setup.warp,
             damping_scale: b.setup.damping_scale,
+            gravity: b.setup.gravity,
         };
         p.send_message(&HostMessage::BodyAdded(info), &mut self.out);
         if !p.cached.contains(&b.hash) && !p.transfers.iter().any(|t| t.hash == b.hash) {

@@ -11,17 +11,19 @@
 
 use std::collections::VecDeque;
 
-use nalgebra::Vector3;
-use pliant_modal::GrabConfig;
+use nalgebra::{Matrix3, Vector3};
+use pliant_modal::{Frame, GrabConfig, RigidMotion};
 
-use crate::recovery::{Blend, Forecast, Receiver};
-use crate::state::{GrabKey, ModalState, Tick, UserId};
-use crate::stepper::{ForceStepper, Hold, inverse_rotation};
+use crate::recovery::{Blend, Forecast, PoseBlend, Receiver};
+use crate::state::{GrabKey, ModalState, Pose, Tick, UserId};
+use crate::stepper::{ForceStepper, FrameStep, Hold};
 
 /// Targets remembered, and so the largest lead, ticks.
 const REMEMBERED: usize = 64;
 /// Frames that must agree on another lead before it is taken.
 const VOTES: u32 = 4;
+/// How fast the estimate of what else pushes a free body follows.
+const LEARN: f64 = 0.25;
 
 #[derive(Debug)]
 struct OwnGrab {
@@ -34,6 +36,8 @@ struct OwnGrab {
     past: VecDeque<Option<[f64; 3]>>,
     /// World, N.
     reaction: [f64; 3],
+    /// What the reaction would have become, had nothing new been learnt.
+    would: [f64; 3],
     offset: [f64; 3],
 }
 
@@ -50,9 +54,17 @@ pub struct OwnHand {
     expected: ModalState,
     shown: ModalState,
     blend: Blend,
+    /// The rigid frame of the copy, where the body is free, and the confirmed one of the tick before.
+    frame: Option<Frame>,
+    last_frame: Option<Frame>,
+    pose: Option<Pose>,
+    pose_blend: PoseBlend,
+    /// Force and torque on the frame that nothing told explains, world axes.
+    push: (Vector3<f64>, Vector3<f64>),
     forecast: Forecast,
     fade: f64,
     holds: Vec<Hold>,
+    own: Vec<usize>,
     h: f64,
 }
 
@@ -70,9 +82,15 @@ impl OwnHand {
             expected: ModalState::zero(modes),
             shown: ModalState::zero(modes),
             blend: Blend::new(h, blend_ticks),
+            frame: None,
+            last_frame: None,
+            pose: None,
+            pose_blend: PoseBlend::new(h, blend_ticks),
+            push: (Vector3::zeros(), Vector3::zeros()),
             forecast: Forecast::new(h),
             fade: (-3.0 / f64::from(blend_ticks.max(1))).exp(),
             holds: Vec::new(),
+            own: Vec::new(),
             h,
         }
     }
@@ -90,6 +108,11 @@ impl OwnHand {
     /// The body as its holder is to see it: continuous in position and velocity.
     pub fn shown(&self) -> &ModalState {
         &self.shown
+    }
+
+    /// The rigid frame that belongs to [`OwnHand::shown`], where the body is free.
+    pub fn pose(&self) -> Option<Pose> {
+        self.pose
     }
 
     /// The reaction of one of the guest's own grabs at this moment, world, N.
@@ -120,6 +143,7 @@ impl OwnHand {
             target: Some(target),
             past: VecDeque::with_capacity(REMEMBERED),
             reaction: [0.0; 3],
+            would: [0.0; 3],
             offset: [0.0; 3],
         });
     }
@@ -138,11 +162,14 @@ impl OwnHand {
 
     /// A tick of the confirmed state has passed. `guess`: the lead to begin with, ticks.
     pub(crate) fn step(&mut self, receiver: &Receiver, user: UserId, guess: usize) {
-        if self.state.modes() != receiver.hidden().modes() || receiver.pose().is_some() {
-            // The frame of a free body is not stepped here.
+        let confirmed_frame = receiver.frame().and_then(|p| p.frame(self.stepper.model()));
+        if self.state.modes() != receiver.hidden().modes()
+            || self.stepper.is_free() != confirmed_frame.is_some()
+        {
             self.active = false;
             return;
         }
+        self.learn_push(receiver, confirmed_frame);
         for g in &mut self.grabs {
             if g.past.len() >= REMEMBERED {
                 g.past.pop_front();
@@ -165,6 +192,8 @@ impl OwnHand {
             self.state.copy_from(receiver.shown());
             self.shown.copy_from(receiver.shown());
             self.blend.clear();
+            self.frame = receiver.pose().and_then(|p| p.frame(self.stepper.model()));
+            self.pose_blend.clear();
         }
         self.vote(receiver, user);
         self.tick = confirmed + self.lead as u64;
@@ -172,67 +201,116 @@ impl OwnHand {
         // What the copy would have become, had nothing new been learnt.
         self.expected.copy_from(&self.state);
         let mut expected = std::mem::take(&mut self.expected);
-        self.one_step(&mut expected, receiver, user, self.lead);
-        let would: Vec<[f64; 3]> = self.grabs.iter().map(|g| g.reaction).collect();
+        let mut frame = self.frame;
+        self.one_step(&mut expected, &mut frame, receiver, user, self.lead);
+        for g in &mut self.grabs {
+            g.would = g.reaction;
+        }
+        let expected_frame = frame;
 
         let mut state = std::mem::take(&mut self.state);
         state.copy_from(receiver.hidden());
         self.stepper.set_last_force(receiver.last_force());
-        for g in &mut self.grabs {
-            let key = GrabKey { user, grab: g.grab };
-            g.reaction = receiver.grabs().iter().find(|x| x.key == key).map_or([0.0; 3], |x| x.reaction);
-        }
+        let mut frame = confirmed_frame;
         for j in 1..=self.lead {
-            self.one_step(&mut state, receiver, user, j);
+            self.one_step(&mut state, &mut frame, receiver, user, j);
         }
         self.blend.advance();
         self.blend.add(
             expected.q.iter().zip(&state.q).map(|(e, s)| e - s),
             expected.v.iter().zip(&state.v).map(|(e, s)| e - s),
         );
-        for (g, would) in self.grabs.iter_mut().zip(would) {
-            for ((offset, would), now) in g.offset.iter_mut().zip(would).zip(g.reaction) {
+        self.pose_blend.advance();
+        if let (Some(expected), Some(now)) = (expected_frame, frame) {
+            let model = self.stepper.model();
+            self.pose_blend.add(&Pose::of_frame(model, &expected), &Pose::of_frame(model, &now));
+        }
+        for g in &mut self.grabs {
+            for ((offset, would), now) in g.offset.iter_mut().zip(g.would).zip(g.reaction) {
                 *offset = self.fade * (*offset + would - now);
             }
         }
+        self.frame = frame;
         self.state = state;
         self.expected = expected;
         self.show();
     }
 
+    /// What pushes the frame of a free body besides gravity and the hands that the stream tells of (contacts): from the last
+    /// two confirmed ticks, smoothed.
+    fn learn_push(&mut self, receiver: &Receiver, now: Option<Frame>) {
+        let last = std::mem::replace(&mut self.last_frame, now);
+        let (Some(mut from), Some(to)) = (last, now) else { return };
+        let (model, h) = (self.stepper.model().clone(), self.h);
+        let zero = Vector3::zeros();
+        let gravity = Vector3::from(receiver.setup().gravity);
+        RigidMotion::predict(&mut from, &model, h, gravity, zero, zero);
+        let (mut force, mut torque) = (zero, zero);
+        let tick = receiver.tick();
+        let mut patches = Vec::with_capacity(receiver.grabs().len());
+        patches.extend(receiver.grabs().iter().map(|g| (g.key, g.vertex, g.radius)));
+        for (key, vertex, radius) in patches {
+            let Some(g) = receiver.history().grab(key, tick, &self.forecast) else { continue };
+            let Some(rest) = self.stepper.rest(vertex, radius) else { continue };
+            let arm = from.to_world(rest + Vector3::from(g.displacement)) - Vector3::from(from.center());
+            let pull = -Vector3::from(g.state.reaction);
+            force += pull;
+            torque += arm.cross(&pull);
+        }
+        RigidMotion::apply(&mut from, &model, h, force, torque);
+        let missing = (Vector3::from(to.velocity()) - Vector3::from(from.velocity())) * (model.mass() / h);
+        let turning = (Vector3::from(to.spin()) - Vector3::from(from.spin())) / h;
+        self.push.0 += LEARN * (missing - self.push.0);
+        self.push.1 += LEARN * (turning - self.push.1);
+    }
+
     /// Steps to `j` ticks after the confirmed one, and leaves the own reactions in the grabs.
-    fn one_step(&mut self, state: &mut ModalState, receiver: &Receiver, user: UserId, j: usize) {
+    fn one_step(
+        &mut self,
+        state: &mut ModalState,
+        frame: &mut Option<Frame>,
+        receiver: &Receiver,
+        user: UserId,
+        j: usize,
+    ) {
         let history = receiver.history();
         let tick = receiver.tick() + j as u64;
-        let back = inverse_rotation([0.0, 0.0, 0.0, 1.0]);
-        self.holds.clear();
+        let back = Matrix3::identity();
         let mut holds = std::mem::take(&mut self.holds);
+        holds.clear();
         for g in receiver.grabs().iter().filter(|g| g.key.user != user) {
-            if let Some(g) = history.grab(g.key, tick, &self.forecast) {
-                holds.push(Hold::measured(&g, &back));
-            }
+            let Some(g) = history.grab(g.key, tick, &self.forecast) else { continue };
+            holds.push(if frame.is_some() {
+                // The frame moves on from what is confirmed: the other's hand is where it goes, not where the patch was.
+                let config = GrabConfig::default();
+                Hold::hand(g.state.vertex, g.state.radius, g.state.target, Vector3::zeros(), config)
+            } else {
+                Hold::measured(&g, &back)
+            });
         }
         let others = holds.len();
-        let mut own = Vec::with_capacity(self.grabs.len());
+        let mut own = std::mem::take(&mut self.own);
+        own.clear();
+        holds.retain(|h| self.stepper.knows(h.vertex, h.radius));
+        let others = others.min(holds.len());
         for (index, g) in self.grabs.iter().enumerate() {
             // Newest is the target that arrives `lead` ticks after the confirmed one.
-            let target =
-                (g.past.len() + j).checked_sub(1 + self.lead).and_then(|i| g.past.get(i).copied().flatten());
-            let (Some(target), Some(rest)) = (target, self.stepper.rest(g.vertex, g.radius)) else {
-                continue;
-            };
-            let pull = -Vector3::from(g.reaction);
-            let place = Vector3::from(target) - rest;
-            let hand = g.hold.stiffness.map_or(0.0, |k| 1.0 / k);
-            holds.push(Hold { vertex: g.vertex, radius: g.radius, pull, place, target: true, hand });
+            let at = (g.past.len() + j).checked_sub(1 + self.lead);
+            let target = at.and_then(|i| g.past.get(i).copied().flatten());
+            let Some(target) = target.filter(|_| self.stepper.knows(g.vertex, g.radius)) else { continue };
+            let before = at.and_then(|i| i.checked_sub(1)).and_then(|i| g.past.get(i).copied().flatten());
+            let velocity =
+                before.map_or_else(Vector3::zeros, |b| (Vector3::from(target) - Vector3::from(b)) / self.h);
+            holds.push(Hold::hand(g.vertex, g.radius, target, velocity, g.hold));
             own.push(index);
         }
-        self.stepper.step_held(state, &mut holds, receiver.load());
-        if holds.len() == others + own.len() {
-            for (hold, index) in holds[others..].iter().zip(own) {
-                self.grabs[index].reaction = (-hold.pull).into();
-            }
+        let (force, torque) = self.push;
+        let frame = frame.as_mut().map(|frame| FrameStep { frame, force, torque });
+        self.stepper.step_held(state, &mut holds, receiver.load(), frame);
+        for (hold, &index) in holds[others.min(holds.len())..].iter().zip(&own) {
+            self.grabs[index].reaction = (-hold.pull).into();
         }
+        self.own = own;
         self.holds = holds;
     }
 
@@ -270,15 +348,27 @@ impl OwnHand {
             (0..new.modes()).map(|k| old.v[k] - new.v[k]),
         );
         self.state.copy_from(new);
+        self.pose_blend.advance();
+        if let (Some(old), Some(new)) = (self.frame, receiver.pose()) {
+            let model = self.stepper.model();
+            let mut old = old;
+            // Where the copy would have been by now.
+            let zero = Vector3::zeros();
+            RigidMotion::predict(&mut old, model, self.h, zero, zero, zero);
+            self.pose_blend.add(&Pose::of_frame(model, &old), &new);
+            self.frame = new.frame(model);
+        }
         self.show();
         // From here on the confirmed state is followed without new offsets.
         let offset = self.shown.q.iter().zip(&new.q).map(|(a, b)| (a - b).abs()).fold(0.0, f64::max);
         let size = new.q.iter().fold(1e-12_f64, |m, q| m.max(q.abs()));
-        self.active = offset > 1e-6 * size;
+        self.active = offset > 1e-6 * size || !self.pose_blend.is_empty();
     }
 
     fn show(&mut self) {
         self.shown.copy_from(&self.state);
         self.blend.apply(&mut self.shown.q, &mut self.shown.v);
+        let pose = self.frame.map(|frame| Pose::of_frame(self.stepper.model(), &frame));
+        self.pose = pose.map(|pose| self.pose_blend.apply(&pose));
     }
 }

@@ -62,6 +62,8 @@ pub struct BodyInfo {
     pub warp: bool,
     /// Factor on all damping coefficients.
     pub damping_scale: f64,
+    /// Uniform acceleration, m/s^2, world axes.
+    pub gravity: [f64; 3],
 }
 
 impl BodyInfo {
@@ -72,7 +74,7 @@ impl BodyInfo {
             r if r > 1.0 => Integrator::Newmark,
             rho_inf => Integrator::GeneralizedAlpha { rho_inf },
         };
-        BodySetup { integrator, warp: self.warp, damping_scale: self.damping_scale }
+        BodySetup { integrator, warp: self.warp, damping_scale: self.damping_scale, gravity: self.gravity }
     }
 
     /// [`BodyInfo::rho_inf`] of an integrator.
@@ -307,6 +309,7 @@ impl HostMessage {
                 check("rho_inf", (-1.0..=2.0).contains(&info.rho_inf), info.rho_inf, "-1..=2")?;
                 let scale = info.damping_scale;
                 check("damping_scale", (0.0..=1e6).contains(&scale), scale, "0..=1e6")?;
+                check("gravity", in_range(&info.gravity), format!("{:?}", info.gravity), "finite m/s^2")?;
             }
             Self::Snapshot(s) => {
                 check("snapshot tick", s.tick < TICK_LIMIT, s.tick, "below 2^48")?;

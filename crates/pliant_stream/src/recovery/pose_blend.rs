@@ -1,0 +1,82 @@
+//! The shown offset of a rigid frame: as [`super::Blend`] for coordinates, in place and in turn.
+
+use nalgebra::{UnitQuaternion, Vector3};
+
+use super::Blend;
+use crate::state::Pose;
+
+/// Offsets of a frame that still fade: 3 of place (m), 3 of turn (rotation vector, rad).
+#[derive(Debug, Clone)]
+pub struct PoseBlend {
+    blend: Blend,
+}
+
+impl PoseBlend {
+    /// Offsets fade over `ticks` (at least 1) steps of `h` seconds.
+    pub fn new(h: f64, ticks: u16) -> Self {
+        Self { blend: Blend::new(h, ticks) }
+    }
+
+    /// Nothing fades any more.
+    pub fn clear(&mut self) {
+        self.blend.clear();
+    }
+
+    /// True when the shown frame is the hidden one.
+    pub fn is_empty(&self) -> bool {
+        self.blend.is_empty()
+    }
+
+    /// A correction moved the hidden frame from `before` to `now`: what is shown stays and fades over.
+    pub fn add(&mut self, before: &Pose, now: &Pose) {
+        let (Some(old), Some(new)) = (before.turn(), now.turn()) else { return };
+        let turn = (old * new.inverse()).scaled_axis();
+        let place = (0..3).map(|k| before.position[k] - now.position[k]).chain(turn.iter().copied());
+        let speed = (0..3).map(|k| before.linear[k] - now.linear[k]);
+        let speed = speed.chain((0..3).map(|k| before.angular[k] - now.angular[k]));
+        self.blend.add(place, speed);
+    }
+
+    /// One tick passes.
+    pub fn advance(&mut self) {
+        self.blend.advance();
+    }
+
+    /// The shown frame for a hidden one.
+    pub fn apply(&self, pose: &Pose) -> Pose {
+        let Some(turn) = pose.turn().filter(|_| !self.is_empty()) else { return *pose };
+        let (mut place, mut speed) = ([0.0; 6], [0.0; 6]);
+        self.blend.apply(&mut place, &mut speed);
+        let offset = UnitQuaternion::from_scaled_axis(Vector3::new(place[3], place[4], place[5]));
+        let q = offset * turn;
+        Pose {
+            position: std::array::from_fn(|k| pose.position[k] + place[k]),
+            rotation: [q.i, q.j, q.k, q.w],
+            linear: std::array::from_fn(|k| pose.linear[k] + speed[k]),
+            angular: std::array::from_fn(|k| pose.angular[k] + speed[3 + k]),
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_correction_moves_nothing_at_once_and_is_gone_after_its_ticks() {
+        let half = 0.5_f64.sqrt();
+        let before = Pose { position: [1.0, 2.0, 3.0], rotation: [0.0, 0.0, half, half], ..Pose::default() };
+        let now = Pose { linear: [0.5, 0.0, 0.0], ..Pose::default() };
+        let mut blend = PoseBlend::new(0.025, 8);
+        blend.add(&before, &now);
+        let shown = blend.apply(&now);
+        for (a, b) in
+            shown.position.iter().chain(&shown.rotation).zip(before.position.iter().chain(&before.rotation))
+        {
+            assert!((a - b).abs() < 1e-12, "{shown:?}");
+        }
+        assert!(shown.linear[0].abs() < 1e-12, "velocity is continuous too: {shown:?}");
+        (0..8).for_each(|_| blend.advance());
+        assert_eq!(blend.apply(&now), now);
+    }
+}
