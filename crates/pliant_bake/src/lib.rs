@@ -31,6 +31,7 @@
 mod anchor;
 mod bake;
 mod blocks;
+mod cache;
 mod canonical;
 mod config;
 mod element;
@@ -54,5 +55,6 @@ mod physics_tests;
 
 pub use anchor::{Anchor, AnchorSyntax, Comparison};
 pub use bake::bake;
+pub use cache::{BakeCache, BakeKey, CachedBake, METHOD_VERSION, bake_cached};
 pub use config::{Bake, BakeConfig, BakeTimes, Stage};
 pub use error::BakeError;

@@ -4,7 +4,7 @@ use std::path::PathBuf;
 use std::time::Instant;
 
 use clap::Args;
-use pliant_bake::{Anchor, BakeConfig, Stage};
+use pliant_bake::{Anchor, BakeCache, BakeConfig, Stage, bake_cached};
 use pliant_mesh::io;
 use pliant_modal::{Damping, Element, ModalModel};
 use serde::Serialize;
@@ -52,6 +52,12 @@ pub(crate) struct BakeArgs {
     /// Writes K.mtx and M.mtx (MatrixMarket) into this folder once the bake succeeded
     #[arg(long, value_name = "DIR")]
     export_matrices: Option<PathBuf>,
+    /// Where finished bakes are kept, so that an unchanged one is not done again [default: a folder `pliant` in the user's cache]
+    #[arg(long, value_name = "DIR")]
+    cache: Option<PathBuf>,
+    /// Bakes even if it was done before, and keeps nothing
+    #[arg(long, conflicts_with = "cache")]
+    no_cache: bool,
     /// Threads to use [default: one a core]. The result is the same to the bit
     #[arg(long, allow_negative_numbers = true)]
     threads: Option<usize>,
@@ -82,6 +88,8 @@ fn rayleigh(text: &str) -> Result<[f64; 2], String> {
 struct Report {
     #[serde(flatten)]
     summary: Summary,
+    /// Read from the cache: only reading was paid for.
+    cached: bool,
     seconds: Seconds,
 }
 
@@ -93,6 +101,20 @@ struct Seconds {
     modes: f64,
     surface: f64,
     total: f64,
+}
+
+/// The user's own place for what can be made again; `None` where the system names none.
+fn user_cache() -> Option<PathBuf> {
+    let folder = |name: &str| std::env::var_os(name).map(PathBuf::from).filter(|path| path.is_absolute());
+    let base = if cfg!(windows) {
+        folder("LOCALAPPDATA")
+    } else if cfg!(target_os = "macos") {
+        folder("HOME").map(|home| home.join("Library/Caches"))
+    } else {
+        // The XDG base directory specification.
+        folder("XDG_CACHE_HOME").or_else(|| folder("HOME").map(|home| home.join(".cache")))
+    };
+    base.map(|base| base.join("pliant/bakes"))
 }
 
 pub(crate) fn run(args: BakeArgs) -> Result<(), CliError> {
@@ -133,7 +155,7 @@ pub(crate) fn run(args: BakeArgs) -> Result<(), CliError> {
     let skin = args.skin.map(io::read_surface).transpose()?;
     let mesh = mesh::fill(&args.input, args.tets, &mut bar)?;
     let mesh_seconds = start.elapsed().as_secs_f64();
-    let baked = pliant_bake::bake(&mesh, skin.as_ref(), &config, &mut |stage, share| {
+    let mut progress = |stage, share| {
         let stage = match stage {
             Stage::Assemble => "assemble",
             Stage::Factor => "factor",
@@ -141,9 +163,20 @@ pub(crate) fn run(args: BakeArgs) -> Result<(), CliError> {
             Stage::Surface => "surface",
         };
         bar.report(stage, share);
-    })?;
+    };
+    let cache = if args.no_cache { None } else { args.cache.or_else(user_cache) }.map(BakeCache::new);
+    let (baked, cached, not_kept) = match &cache {
+        Some(cache) => {
+            let made = bake_cached(cache, &mesh, skin.as_ref(), &config, &mut progress)?;
+            (made.bake, made.cached, made.not_kept)
+        }
+        None => (pliant_bake::bake(&mesh, skin.as_ref(), &config, &mut progress)?, false, None),
+    };
     baked.model.write(&args.output)?;
     drop(bar);
+    if let (Some(error), Some(cache)) = (not_kept, &cache) {
+        eprintln!("pliant: the bake is not kept in {}: {error}", cache.folder().display());
+    }
 
     let times = baked.times;
     let seconds = Seconds {
@@ -155,9 +188,12 @@ pub(crate) fn run(args: BakeArgs) -> Result<(), CliError> {
         total: start.elapsed().as_secs_f64(),
     };
     if args.json {
-        return output::print_json(&Report { summary: Summary::new(&baked.model), seconds });
+        return output::print_json(&Report { summary: Summary::new(&baked.model), cached, seconds });
     }
     output::print(&output::table(&baked.model))?;
+    if cached {
+        return output::print(&format!("seconds          {:.2}, read from the cache", seconds.total));
+    }
     output::print(&format!(
         "seconds          mesh {:.2}, assemble {:.2}, factor {:.2}, modes {:.2}, surface {:.2}, total {:.2}",
         seconds.mesh, seconds.assemble, seconds.factor, seconds.modes, seconds.surface, seconds.total

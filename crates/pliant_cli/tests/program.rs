@@ -41,8 +41,17 @@ impl Drop for Folder {
     }
 }
 
+/// The program without a user's cache: every bake is a bake.
+fn program() -> Command {
+    let mut command = Command::new(env!("CARGO_BIN_EXE_pliant"));
+    for name in ["HOME", "XDG_CACHE_HOME", "LOCALAPPDATA"] {
+        command.env_remove(name);
+    }
+    command
+}
+
 fn pliant(arguments: &[&str]) -> Output {
-    Command::new(env!("CARGO_BIN_EXE_pliant")).args(arguments).output().unwrap()
+    program().args(arguments).output().unwrap()
 }
 
 fn succeeds(arguments: &[&str]) -> String {
@@ -440,4 +449,49 @@ fn a_body_is_timed_against_the_memory() {
     assert!(told["bandwidth_limit_gb_s"].as_f64().unwrap() > 0.0);
     refused(&["bench", "step", &mesh]);
     refused(&["bench", "step", &model, "--seconds", "-1"]);
+}
+
+#[test]
+fn an_unchanged_bake_comes_from_the_cache() {
+    let folder = Folder::new("cache");
+    let mesh = folder.file("bar.msh");
+    succeeds(&["mesh", "bar", "--cells", "4,2,2", "--size", "0.4,0.2,0.2", "-o", &mesh]);
+    let cache = folder.file("cache");
+    let bake = |output: &str, more: &[&str]| {
+        let mut arguments =
+            vec!["bake", &mesh, "--modes", "6", "--anchor", "x<0.001", "-o", output, "--json"];
+        arguments.extend(more);
+        json(&succeeds(&arguments))
+    };
+    let [a, b, c] = ["a.modal", "b.modal", "c.modal"].map(|name| folder.file(name));
+    let first = bake(&a, &["--cache", &cache]);
+    assert_eq!(first["cached"], false);
+    let second = bake(&b, &["--cache", &cache]);
+    assert_eq!(second["cached"], true);
+    assert_eq!(second["hash"], first["hash"]);
+    assert_eq!(std::fs::read(&a).unwrap(), std::fs::read(&b).unwrap());
+    assert_eq!(bake(&c, &["--cache", &cache, "--young", "2e5"])["cached"], false);
+    assert_eq!(bake(&c, &["--no-cache"])["cached"], false);
+    let told = succeeds(&["bake", &mesh, "--modes", "6", "--anchor", "x<0.001", "-o", &b, "--cache", &cache]);
+    assert!(told.contains("read from the cache"), "{told}");
+    assert!(refused(&["bake", &mesh, "-o", &b, "--cache", &cache, "--no-cache"]).contains("--no-cache"));
+
+    // The user's own cache; one that cannot be is a word on stderr, not a failure.
+    let with_home = |home: &str| {
+        let output = program()
+            .env("XDG_CACHE_HOME", home)
+            .args(["bake", &mesh, "--modes", "6", "-o", &c, "--json"])
+            .output()
+            .unwrap();
+        assert!(output.status.success());
+        let cached = json(std::str::from_utf8(&output.stdout).unwrap())["cached"].as_bool().unwrap();
+        (cached, String::from_utf8(output.stderr).unwrap())
+    };
+    if cfg!(all(unix, not(target_os = "macos"))) {
+        let home = folder.file("home");
+        assert_eq!(with_home(&home), (false, String::new()));
+        assert_eq!(with_home(&home), (true, String::new()));
+        let (cached, word) = with_home(&mesh);
+        assert!(!cached && word.contains("not kept"), "{word}");
+    }
 }

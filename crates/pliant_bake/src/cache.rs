@@ -1,0 +1,436 @@
+//! A cache of bakes by content: what was baked before, from the same input by the same method, is read instead.
+
+use std::fs;
+use std::io::Write;
+use std::path::{Path, PathBuf};
+use std::sync::atomic::{AtomicU64, Ordering};
+use std::time::{Duration, Instant, SystemTime};
+
+use pliant_mesh::{Surface, TetMesh};
+use pliant_modal::{Damping, FORMAT_VERSION, ModalModel};
+
+use crate::{Bake, BakeConfig, BakeError, BakeTimes, Stage, bake};
+
+/// Version of the method: part of every key. Whoever changes what a bake of the same input comes out as raises it.
+pub const METHOD_VERSION: u32 = 2;
+
+/// A writer that was killed leaves its unfinished file; after so long nobody is writing it any more.
+const ABANDONED: Duration = Duration::from_secs(3600);
+
+/// Names what a bake is made of: BLAKE3 over the bits of mesh and skin, every number of the configuration, and the versions of method and
+/// file format.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Hash)]
+pub struct BakeKey([u8; 32]);
+
+impl BakeKey {
+    /// The key of a bake. [`BakeConfig::export_matrices`] is left out: it changes nothing in the model.
+    pub fn new(mesh: &TetMesh, skin: Option<&Surface>, config: &BakeConfig) -> Self {
+        let mut hash = Hasher(blake3::Hasher::new_derive_key("pliant bake"));
+        hash.words(&[METHOD_VERSION, FORMAT_VERSION]);
+        // Taken apart, so that a field that is added cannot be forgotten here.
+        let BakeConfig {
+            name,
+            element,
+            modes,
+            young,
+            poisson,
+            density,
+            damping,
+            anchors,
+            sites,
+            site_radii,
+            export_matrices: _,
+        } = config;
+        hash.text(name);
+        hash.text(&element.to_string());
+        hash.count(*modes);
+        hash.numbers(&[*young, *poisson, *density]);
+        match damping {
+            Damping::Rayleigh { alpha, beta } => hash.tagged(0, &[*alpha, *beta]),
+            Damping::Ratio(zeta) => hash.tagged(1, &[*zeta]),
+            other => hash.text(&format!("{other:?}")),
+        }
+        hash.count(anchors.len());
+        anchors.iter().for_each(|anchor| hash.text(&anchor.to_string()));
+        hash.count(sites.map_or(0, |sites| sites.saturating_add(1)));
+        hash.count(site_radii.len());
+        hash.numbers(site_radii);
+        let TetMesh { nodes, tets } = mesh;
+        hash.count(nodes.len());
+        hash.numbers(nodes.as_flattened());
+        hash.count(tets.len());
+        hash.words(tets.as_flattened());
+        hash.count(usize::from(skin.is_some()));
+        if let Some(Surface { positions, triangles, uvs }) = skin {
+            hash.count(positions.len());
+            hash.numbers(positions.as_flattened());
+            hash.count(triangles.len());
+            hash.words(triangles.as_flattened());
+            hash.count(uvs.as_ref().map_or(0, |uvs| uvs.len() + 1));
+            let bits = uvs.iter().flatten().flatten().map(|x| x.to_bits());
+            hash.words(&bits.collect::<Vec<u32>>());
+        }
+        Self(*hash.0.finalize().as_bytes())
+    }
+}
+
+impl std::fmt::Display for BakeKey {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        self.0.iter().try_for_each(|byte| write!(f, "{byte:02x}"))
+    }
+}
+
+struct Hasher(blake3::Hasher);
+
+impl Hasher {
+    fn count(&mut self, count: usize) {
+        self.0.update(&(count as u64).to_le_bytes());
+    }
+
+    fn text(&mut self, text: &str) {
+        self.count(text.len());
+        self.0.update(text.as_bytes());
+    }
+
+    fn tagged(&mut self, tag: u8, numbers: &[f64]) {
+        self.0.update(&[tag]);
+        self.numbers(numbers);
+    }
+
+    fn numbers(&mut self, numbers: &[f64]) {
+        let bytes: Vec<u8> = numbers.iter().flat_map(|x| x.to_bits().to_le_bytes()).collect();
+        self.0.update(&bytes);
+    }
+
+    fn words(&mut self, words: &[u32]) {
+        let bytes: Vec<u8> = words.iter().flat_map(|x| x.to_le_bytes()).collect();
+        self.0.update(&bytes);
+    }
+}
+
+/// A folder of baked models, each a `.modal` file named by its [`BakeKey`].
+///
+/// Any number of programs may use one folder at a time: a file appears whole or not at all. A file that was cut, altered or put in the place
+/// of another is not believed but baked again. The folder grows to [`limit`](Self::with_limit) bytes; then what was not used
+/// for longest goes.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct BakeCache {
+    folder: PathBuf,
+    limit: u64,
+}
+
+impl BakeCache {
+    /// Bytes that a cache may grow to unless it is told otherwise: 1 GiB.
+    pub const DEFAULT_LIMIT: u64 = 1 << 30;
+
+    /// A cache in `folder`, which is made when there is something to keep.
+    pub fn new(folder: impl Into<PathBuf>) -> Self {
+        Self { folder: folder.into(), limit: Self::DEFAULT_LIMIT }
+    }
+
+    /// Keeps at most so many bytes; a single model that is larger is not kept.
+    #[must_use]
+    pub fn with_limit(self, bytes: u64) -> Self {
+        Self { limit: bytes, ..self }
+    }
+
+    /// Where it is.
+    pub fn folder(&self) -> &Path {
+        &self.folder
+    }
+
+    /// The file of a key, there or not.
+    pub fn path(&self, key: BakeKey) -> PathBuf {
+        self.folder.join(format!("{key}.modal"))
+    }
+
+    /// The model of a key, when it is there and what it should be.
+    fn find(&self, key: BakeKey, mesh: &TetMesh, config: &BakeConfig) -> Option<ModalModel> {
+        let path = self.path(key);
+        let file = fs::metadata(&path).ok()?;
+        if !file.is_file() || file.len() > self.limit {
+            return None;
+        }
+        // The file's own hash says that it is whole; that it is this bake's, what it says of itself.
+        let model = ModalModel::read(&path).ok()?;
+        let info = model.info();
+        let same = info.name == config.name
+            && info.element == config.element
+            && model.mode_count() == config.modes
+            && info.tets == mesh.tets.len()
+            && [info.young, info.poisson, info.density] == [config.young, config.poisson, config.density]
+            && info.damping == config.damping
+            && info.anchors.iter().cloned().eq(config.anchors.iter().map(ToString::to_string));
+        if !same {
+            return None;
+        }
+        // Used now: it goes last. A folder that may only be read serves all the same.
+        if let Ok(file) = fs::File::options().append(true).open(&path) {
+            let _ = file.set_modified(SystemTime::now());
+        }
+        Some(model)
+    }
+
+    fn keep(&self, key: BakeKey, model: &ModalModel) -> std::io::Result<()> {
+        static NEXT: AtomicU64 = AtomicU64::new(0);
+        let bytes = model.to_bytes();
+        if bytes.len() as u64 > self.limit {
+            return Ok(());
+        }
+        fs::create_dir_all(&self.folder)?;
+        // A name of this writer's own, in the same folder, so that the renaming is one act.
+        let number = NEXT.fetch_add(1, Ordering::Relaxed);
+        let partial = self.folder.join(format!("{key}.{}.{number}.partial", std::process::id()));
+        let written = fs::File::create(&partial)
+            .and_then(|mut file| file.write_all(&bytes).and_then(|()| file.sync_all()))
+            .and_then(|()| fs::rename(&partial, self.path(key)));
+        if written.is_err() {
+            // The first error is the one that tells.
+            let _ = fs::remove_file(&partial);
+        }
+        written?;
+        self.prune(key)
+    }
+
+    /// Removes what was not used for longest until the rest fits, and what killed writers left.
+    fn prune(&self, newest: BakeKey) -> std::io::Result<()> {
+        let now = SystemTime::now();
+        let mut kept = Vec::new();
+        for entry in fs::read_dir(&self.folder)? {
+            let Ok(entry) = entry else { continue };
+            let (path, Ok(file)) = (entry.path(), entry.metadata()) else { continue };
+            let used = file.modified().unwrap_or(SystemTime::UNIX_EPOCH);
+            let name = entry.file_name().to_string_lossy().into_owned();
+            // Only what has the form of this cache's own names is ever removed.
+            let ours = name.len() > 64 && name.as_bytes()[..64].iter().all(u8::is_ascii_hexdigit);
+            if !file.is_file() || !ours {
+                continue;
+            }
+            if name.ends_with(".partial") && now.duration_since(used).is_ok_and(|age| age > ABANDONED) {
+                let _ = fs::remove_file(&path);
+            } else if name.ends_with(".modal") && path != self.path(newest) {
+                kept.push((used, path, file.len()));
+            }
+        }
+        kept.sort();
+        let newest = fs::metadata(self.path(newest)).map_or(0, |file| file.len());
+        let mut total = newest + kept.iter().map(|(_, _, bytes)| bytes).sum::<u64>();
+        for (_, path, bytes) in kept {
+            if total <= self.limit {
+                break;
+            }
+            // Another program may have removed it first.
+            let _ = fs::remove_file(path);
+            total -= bytes;
+        }
+        Ok(())
+    }
+}
+
+/// What [`bake_cached`] gave.
+#[derive(Debug)]
+pub struct CachedBake {
+    /// The model; the times are those of this call, all in `total` when it was read.
+    pub bake: Bake,
+    /// Was it read rather than baked?
+    pub cached: bool,
+    /// Why it could not be kept for the next time, if so. The bake itself is sound.
+    pub not_kept: Option<std::io::Error>,
+}
+
+/// As [`bake()`](crate::bake()), unless `cache` has it already from the same input. A cache that cannot be read or written costs nothing but the
+/// time of the bake. With [`BakeConfig::export_matrices`] it is always baked, as the matrices are wanted.
+///
+/// # Errors
+/// As [`bake()`](crate::bake()).
+pub fn bake_cached(
+    cache: &BakeCache,
+    mesh: &TetMesh,
+    skin: Option<&Surface>,
+    config: &BakeConfig,
+    progress: &mut dyn FnMut(Stage, f64),
+) -> Result<CachedBake, BakeError> {
+    config.check()?;
+    let begun = Instant::now();
+    let key = BakeKey::new(mesh, skin, config);
+    if config.export_matrices.is_none()
+        && let Some(model) = cache.find(key, mesh, config)
+    {
+        progress(Stage::Surface, 1.0);
+        let times = BakeTimes { total: begun.elapsed().as_secs_f64(), ..Default::default() };
+        return Ok(CachedBake { bake: Bake { model, times }, cached: true, not_kept: None });
+    }
+    let bake = bake(mesh, skin, config, progress)?;
+    let not_kept = cache.keep(key, &bake.model).err();
+    Ok(CachedBake { bake, cached: false, not_kept })
+}
+
+#[cfg(test)]
+mod tests {
+    use std::sync::atomic::AtomicUsize;
+
+    use pliant_mesh::shapes;
+    use pliant_modal::Element;
+
+    use super::*;
+
+    static FOLDERS: AtomicUsize = AtomicUsize::new(0);
+
+    struct Folder(PathBuf);
+
+    impl Folder {
+        fn new() -> Self {
+            let number = FOLDERS.fetch_add(1, Ordering::Relaxed);
+            let name = format!("pliant_bake-cache-{}-{number}", std::process::id());
+            Self(std::env::temp_dir().join(name))
+        }
+
+        fn files(&self) -> usize {
+            fs::read_dir(&self.0).map_or(0, Iterator::count)
+        }
+    }
+
+    impl Drop for Folder {
+        fn drop(&mut self) {
+            let _ = fs::remove_dir_all(&self.0);
+        }
+    }
+
+    fn bar() -> TetMesh {
+        shapes::bar([4, 2, 2], [0.4, 0.2, 0.2]).unwrap()
+    }
+
+    fn config() -> BakeConfig {
+        BakeConfig {
+            modes: 4,
+            sites: Some(4),
+            element: Element::Tet4,
+            anchors: vec!["x<0.001".parse().unwrap()],
+            ..Default::default()
+        }
+    }
+
+    fn made(cache: &BakeCache, config: &BakeConfig) -> CachedBake {
+        bake_cached(cache, &bar(), None, config, &mut |_, _| ()).unwrap()
+    }
+
+    #[test]
+    fn an_unchanged_bake_is_read_and_a_changed_one_made() {
+        let folder = Folder::new();
+        let cache = BakeCache::new(&folder.0);
+        let first = made(&cache, &config());
+        assert!(!first.cached && first.not_kept.is_none());
+        let second = made(&cache, &config());
+        assert!(second.cached);
+        assert_eq!(second.bake.model, first.bake.model);
+        assert!(!made(&cache, &BakeConfig { young: 1.1e5, ..config() }).cached);
+        assert_eq!(folder.files(), 2);
+        // Wanted matrices are made.
+        let export = BakeConfig { export_matrices: Some(folder.0.join("matrices")), ..config() };
+        assert!(!made(&cache, &export).cached);
+        assert!(folder.0.join("matrices/K.mtx").is_file());
+    }
+
+    #[test]
+    fn every_part_of_the_input_is_in_the_key() {
+        let (mesh, plain) = (bar(), config());
+        let mut keys = vec![BakeKey::new(&mesh, None, &plain)];
+        let changes: [&dyn Fn(&mut BakeConfig); 11] = [
+            &|c| c.name = "x".into(),
+            &|c| c.element = Element::Tet10,
+            &|c| c.modes = 5,
+            &|c| c.young = 1.0,
+            &|c| c.poisson = 0.1,
+            &|c| c.density = 1.0,
+            &|c| c.damping = Damping::Ratio(0.5),
+            &|c| c.damping = Damping::Rayleigh { alpha: 0.5, beta: 0.0 },
+            &|c| c.anchors.clear(),
+            &|c| c.sites = None,
+            &|c| c.site_radii = vec![0.03, 0.06],
+        ];
+        for change in changes {
+            let mut other = plain.clone();
+            change(&mut other);
+            keys.push(BakeKey::new(&mesh, None, &other));
+        }
+        let mut moved = mesh.clone();
+        moved.nodes[3][1] += 1e-16;
+        assert_ne!(moved.nodes[3][1], mesh.nodes[3][1]);
+        keys.push(BakeKey::new(&moved, None, &plain));
+        let mut turned = mesh.clone();
+        turned.tets[0].swap(0, 1);
+        keys.push(BakeKey::new(&turned, None, &plain));
+        let skin = mesh.boundary().0;
+        keys.push(BakeKey::new(&mesh, Some(&skin), &plain));
+        let mut textured = skin;
+        textured.uvs = Some(vec![[0.0; 2]; textured.positions.len()]);
+        keys.push(BakeKey::new(&mesh, Some(&textured), &plain));
+        for (i, a) in keys.iter().enumerate() {
+            assert!(keys[..i].iter().all(|b| a != b), "key {i} is another's too");
+        }
+        let exported = BakeConfig { export_matrices: Some("x".into()), ..plain };
+        assert_eq!(BakeKey::new(&mesh, None, &exported), keys[0]);
+    }
+
+    #[test]
+    fn cut_altered_and_foreign_files_are_baked_again() {
+        let folder = Folder::new();
+        let cache = BakeCache::new(&folder.0);
+        let truth = made(&cache, &config()).bake.model;
+        let path = cache.path(BakeKey::new(&bar(), None, &config()));
+        let good = fs::read(&path).unwrap();
+        let other = BakeConfig { young: 3e5, ..config() };
+        made(&cache, &other);
+        let foreign = fs::read(cache.path(BakeKey::new(&bar(), None, &other))).unwrap();
+        let mut altered = good.clone();
+        altered[good.len() / 2] ^= 1;
+        for bad in [&good[..good.len() - 1], &[], &altered, &foreign, b"solid ascii stl"] {
+            fs::write(&path, bad).unwrap();
+            let again = made(&cache, &config());
+            assert!(!again.cached && again.bake.model == truth);
+            assert_eq!(fs::read(&path).unwrap(), good, "put right");
+        }
+        // A folder in the file's place, and a file in the folder's.
+        fs::remove_file(&path).unwrap();
+        fs::create_dir(&path).unwrap();
+        let kept = made(&cache, &config());
+        assert!(!kept.cached && kept.not_kept.is_some());
+        let blocked = BakeCache::new(folder.0.join("file"));
+        fs::write(folder.0.join("file"), "").unwrap();
+        let kept = made(&blocked, &config());
+        assert!(kept.not_kept.is_some() && kept.bake.model == truth);
+    }
+
+    #[test]
+    fn the_folder_stays_within_its_limit_and_keeps_what_is_used() {
+        let folder = Folder::new();
+        let one = made(&BakeCache::new(&folder.0), &config()).bake.model.to_bytes().len() as u64;
+        let cache = BakeCache::new(&folder.0).with_limit(3 * one + one / 2);
+        let at = |k: usize| BakeConfig { young: 1e5 + k as f64, ..config() };
+        fs::write(folder.0.join("notes.txt"), "not ours").unwrap();
+        for k in 1..6 {
+            made(&cache, &at(k));
+            // The first is used all the time; the clock of some file systems is coarse.
+            std::thread::sleep(Duration::from_millis(15));
+            assert!(made(&cache, &config()).cached, "after {k}");
+            std::thread::sleep(Duration::from_millis(15));
+        }
+        assert_eq!(folder.files(), 4, "three models and a file that is not the cache's");
+        assert!(made(&cache, &at(5)).cached && !made(&cache, &at(1)).cached);
+        let none = BakeCache::new(folder.0.join("small")).with_limit(10);
+        assert!(!made(&none, &config()).cached && !made(&none, &config()).cached);
+    }
+
+    #[test]
+    fn many_at_once_are_no_trouble() {
+        let folder = Folder::new();
+        let cache = BakeCache::new(&folder.0);
+        std::thread::scope(|scope| {
+            let all: Vec<_> = (0..8).map(|_| scope.spawn(|| made(&cache, &config()))).collect();
+            let models: Vec<_> = all.into_iter().map(|t| t.join().unwrap().bake.model).collect();
+            assert!(models.windows(2).all(|pair| pair[0] == pair[1]));
+        });
+        assert_eq!(folder.files(), 1, "nothing half-written is left");
+        assert!(made(&cache, &config()).cached);
+    }
+}
