@@ -183,6 +183,12 @@ impl BodyState {
         &mut self.body
     }
 
+    /// The solver's name for the grab that a [`Grab`](crate::Grab) entity is, to ask [`body`](Self::body) about it. `None` before the first
+    /// tick of the grab, when it was refused or waits for a place, and on a body that somebody else moves.
+    pub fn grab_id(&self, grab: Entity) -> Option<GrabId> {
+        self.held.iter().find(|held| held.entity == grab)?.id
+    }
+
     /// The baked model.
     pub fn model(&self) -> &Arc<ModalModel> {
         self.body.model()

@@ -31,6 +31,8 @@ fn a_held_tip_pushes_back_with_its_static_stiffness() {
     let hand = grab(&mut app, body, DVec3::new(1.0, 0.05, 0.0));
     steps(&mut app, 400);
     let held = state(&app, body).body().grabs().next().unwrap();
+    assert_eq!(state(&app, body).grab_id(hand), Some(held));
+    assert_eq!(state(&app, body).grab_id(body), None, "an entity that is no grab of it");
     let c = state(&app, body).body().compliance(held).unwrap()[1][1];
     let expected = -0.05 * tip_stiffness(1, c);
     let felt = force(&app, hand);

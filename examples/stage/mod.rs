@@ -1,0 +1,165 @@
+//! The stage that the examples share: window or none, light, floor, a camera to look around with, keys and figures on screen, and a
+//! command line. An example adds [`Stage`] where a game adds `DefaultPlugins`, and its own file shows only what it teaches.
+#![allow(dead_code, unused_imports, reason = "each example uses the part of the stage that it needs")]
+
+mod options;
+mod run;
+mod text;
+mod view;
+
+use std::time::Duration;
+
+use bevy::{
+    app::{PluginGroupBuilder, ScheduleRunnerPlugin},
+    log::{DEFAULT_FILTER, Level, LogPlugin},
+    prelude::*,
+    render::{RenderPlugin, settings::WgpuSettings},
+    window::{ExitCondition, PresentMode, WindowResolution},
+    winit::{WinitPlugin, WinitSettings},
+};
+use clap::Parser;
+
+pub use options::Options;
+pub use run::Unattended;
+pub use text::Readout;
+pub use view::Look;
+
+/// The project's assets, from the crate that owns the examples.
+pub const ASSETS: &str = concat!(env!("CARGO_MANIFEST_DIR"), "/../../assets");
+
+/// What an example stands on; a plugin group in place of `DefaultPlugins`.
+///
+/// With `--headless` there is no window and no renderer, and every frame is a sixtieth of a second however long it takes. With
+/// `--screenshot` frames are as long, so that the picture shows the same moment on a slow renderer and on a fast one.
+#[derive(Clone, Debug)]
+pub struct Stage {
+    title: &'static str,
+    keys: Vec<&'static str>,
+    look: Option<Look>,
+    floor: bool,
+    real_time: bool,
+    picture_at: f64,
+    options: Options,
+}
+
+impl Stage {
+    /// A stage for an example that has no options of its own.
+    pub fn new(title: &'static str) -> Self {
+        Self::with(title, Options::parse())
+    }
+
+    /// A stage for an example that parsed the command line itself, the stage's [`Options`] flattened into its own.
+    pub fn with(title: &'static str, mut options: Options) -> Self {
+        if let Err(error) = options.settle() {
+            eprintln!("{title}: {error}");
+            std::process::exit(2);
+        }
+        Self {
+            title,
+            keys: Vec::new(),
+            look: Some(Look::default()),
+            floor: true,
+            real_time: false,
+            picture_at: 2.0,
+            options,
+        }
+    }
+
+    /// One more thing to say in the line of keys, such as `"left mouse: pull"`. Those of the stage itself follow.
+    pub fn key(mut self, key: &'static str) -> Self {
+        self.keys.push(key);
+        self
+    }
+
+    /// Where the camera looks from. Default: a body of a third of a metre, that stands on the floor.
+    pub fn look(mut self, look: Look) -> Self {
+        self.look = Some(look);
+        self
+    }
+
+    /// No floor.
+    pub fn floating(mut self) -> Self {
+        self.floor = false;
+        self
+    }
+
+    /// No camera, light or floor: the example brings its own.
+    pub fn bare(mut self) -> Self {
+        self.look = None;
+        self
+    }
+
+    /// The clock is the wall's, without a window too: for what runs on threads of its own, such as a device.
+    pub fn real_time(mut self) -> Self {
+        self.real_time = true;
+        self
+    }
+
+    /// The moment that `--screenshot` shows when the command line names none, s from when the bodies are there. Default: 2.
+    pub fn picture_at(mut self, seconds: f64) -> Self {
+        self.picture_at = seconds;
+        self
+    }
+}
+
+impl PluginGroup for Stage {
+    fn build(self) -> PluginGroupBuilder {
+        let plugins = DefaultPlugins.build().set(AssetPlugin { file_path: ASSETS.into(), ..default() });
+        let plugins = if self.options.headless {
+            let pace = Duration::from_millis(if self.real_time { 4 } else { 0 });
+            plugins
+                .set(LogPlugin {
+                    level: Level::WARN,
+                    // They warn that there is no renderer; that is what was asked for.
+                    filter: format!("{DEFAULT_FILTER},bevy_render=off,bevy_gizmos_render=off"),
+                    ..default()
+                })
+                .set(WindowPlugin {
+                    primary_window: None,
+                    exit_condition: ExitCondition::DontExit,
+                    ..default()
+                })
+                .set(RenderPlugin {
+                    render_creation: WgpuSettings { backends: None, ..default() }.into(),
+                    ..default()
+                })
+                .disable::<WinitPlugin>()
+                .add(ScheduleRunnerPlugin::run_loop(pace))
+        } else {
+            plugins
+                .set(WindowPlugin {
+                    primary_window: Some(Window {
+                        title: format!("Pliant: {}", self.title),
+                        resolution: WindowResolution::new(1280, 720),
+                        present_mode: PresentMode::AutoVsync,
+                        ..default()
+                    }),
+                    ..default()
+                })
+                // In a picture nothing may be missing because its shader is still being compiled.
+                .set(RenderPlugin {
+                    synchronous_pipeline_compilation: self.options.screenshot.is_some(),
+                    ..default()
+                })
+        };
+        plugins.add(StagePlugin(self))
+    }
+}
+
+struct StagePlugin(Stage);
+
+impl Plugin for StagePlugin {
+    fn build(&self, app: &mut App) {
+        let stage = &self.0;
+        app.init_resource::<Readout>();
+        if !stage.options.headless {
+            // The scene goes on when the window is not looked at.
+            app.insert_resource(WinitSettings::continuous());
+            text::build(app, stage.title, &stage.keys, stage.look.is_some());
+            if let Some(look) = stage.look {
+                view::build(app, look, stage.floor);
+            }
+        }
+        run::build(app, &stage.options, stage.real_time, stage.picture_at);
+    }
+}

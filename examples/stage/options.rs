@@ -1,0 +1,75 @@
+//! The command line that every example has.
+
+use std::path::PathBuf;
+
+use clap::Parser;
+
+/// How an example is run.
+#[derive(Parser, Debug, Clone, Default)]
+pub struct Options {
+    /// No window: the scene plays by itself and prints its figures at the end.
+    #[arg(long)]
+    pub headless: bool,
+
+    /// Stop after so many frames.
+    #[arg(long, value_parser = clap::value_parser!(u64).range(1..=1_000_000))]
+    pub frames: Option<u64>,
+
+    /// Stop after so many seconds. Without a window the default is 5; with one, until it is closed.
+    #[arg(long, value_parser = seconds, conflicts_with = "frames")]
+    pub seconds: Option<f64>,
+
+    /// Let the scene play by itself, save a picture of the window and stop.
+    #[arg(long, value_name = "FILE.png")]
+    pub screenshot: Option<PathBuf>,
+}
+
+fn seconds(text: &str) -> Result<f64, String> {
+    match text.parse::<f64>() {
+        Ok(s) if s.is_finite() && s > 0.0 && s <= 86_400.0 => Ok(s),
+        _ => Err("expected seconds above 0 and at most 86400".into()),
+    }
+}
+
+impl Options {
+    /// Falls back to no window where there is no display.
+    pub(super) fn settle(&mut self) -> Result<(), String> {
+        if !self.headless && !display() {
+            println!("No display is to be found: running --headless, and the scene plays by itself.");
+            self.headless = true;
+        }
+        match &self.screenshot {
+            Some(_) if self.headless => {
+                Err("a screenshot needs a window, and there is none without a display".into())
+            }
+            // Known before the scene is played, not after.
+            Some(file) => std::fs::write(file, []).map_err(|error| format!("{}: {error}", file.display())),
+            None => Ok(()),
+        }
+    }
+}
+
+/// Is there anything to open a window on?
+fn display() -> bool {
+    if cfg!(any(target_os = "windows", target_os = "macos")) {
+        return true;
+    }
+    let set = |name| std::env::var_os(name).is_some_and(|value| !value.is_empty());
+    (set("DISPLAY") && x_answers()) || (cfg!(feature = "wayland") && set("WAYLAND_DISPLAY"))
+}
+
+/// Does the X server that DISPLAY names listen? One on another machine is taken at its word.
+#[cfg(unix)]
+fn x_answers() -> bool {
+    let display = std::env::var("DISPLAY").unwrap_or_default();
+    let Some(number) = display.strip_prefix(':').or_else(|| display.strip_prefix("unix:")) else {
+        return true;
+    };
+    let number = number.split('.').next().unwrap_or_default();
+    std::os::unix::net::UnixStream::connect(format!("/tmp/.X11-unix/X{number}")).is_ok()
+}
+
+#[cfg(not(unix))]
+fn x_answers() -> bool {
+    true
+}

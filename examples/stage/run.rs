@@ -1,0 +1,190 @@
+//! The course of a run: when it begins, when it ends, and the picture of it.
+
+use std::{path::PathBuf, time::Duration};
+
+use bevy::{
+    prelude::*,
+    render::view::screenshot::{Screenshot, ScreenshotCaptured, save_to_disk},
+    time::TimeUpdateStrategy,
+};
+use pliant::prelude::*;
+
+use super::{Options, Readout};
+
+/// Nobody is at the mouse: the example plays the person's part. There for `--headless` and `--screenshot`.
+#[derive(Resource)]
+pub struct Unattended;
+
+/// Seconds of the scene that a frame is when nobody waits for it.
+const FRAME: f64 = 1.0 / 60.0;
+
+/// Frames before the picture in which cameras draw: bodies are shaped when they were seen in the frame before.
+const DRAWN: u64 = 40;
+
+/// Frames that wait for the bodies to load, and for the picture to be written, before the run is given up.
+const PATIENCE: u64 = 100_000;
+
+#[derive(Resource)]
+struct Run {
+    headless: bool,
+    /// How many frames to run from when the bodies are there.
+    frames: Option<u64>,
+    /// As seconds of the clock.
+    seconds: Option<f64>,
+    screenshot: Option<PathBuf>,
+    /// Frames and seconds since the bodies are there; `None` before.
+    since: Option<(u64, f64)>,
+    waited: u64,
+    picture: Picture,
+}
+
+/// How far the picture of the window is, if one is asked for.
+#[derive(Clone, Copy, PartialEq, Eq)]
+enum Picture {
+    Wanted,
+    Asked,
+    Captured,
+}
+
+pub(super) fn build(app: &mut App, options: &Options, real_time: bool, picture_at: f64) {
+    let unattended = options.headless || options.screenshot.is_some();
+    let seconds = match (options.frames, options.seconds) {
+        (None, None) if options.screenshot.is_some() => Some(picture_at),
+        (None, None) if options.headless => Some(5.0),
+        (_, seconds) => seconds,
+    };
+    app.insert_resource(Run {
+        headless: options.headless,
+        frames: options.frames,
+        seconds,
+        screenshot: options.screenshot.clone(),
+        since: None,
+        waited: 0,
+        picture: Picture::Wanted,
+    });
+    if unattended {
+        app.insert_resource(Unattended);
+        if !real_time {
+            app.insert_resource(TimeUpdateStrategy::ManualDuration(Duration::from_secs_f64(FRAME)));
+        }
+        app.add_systems(Startup, |mut time: ResMut<Time<Virtual>>| time.pause());
+    } else {
+        app.add_systems(PreUpdate, pause_and_step);
+    }
+    app.add_systems(First, begin.before(bevy::time::TimeSystems)).add_systems(Last, (draw_late, end).chain());
+}
+
+/// The clock of a run that nobody watches starts when all bodies are there, so that it shows the same each time.
+fn begin(
+    mut run: ResMut<Run>,
+    unattended: Option<Res<Unattended>>,
+    real: Res<Time<Real>>,
+    mut time: ResMut<Time<Virtual>>,
+    waiting: Query<(), (With<ModalBody>, Without<BodyState>)>,
+) {
+    if run.since.is_some() {
+        return;
+    }
+    run.waited += 1;
+    if unattended.is_none() {
+        run.since = Some((0, real.elapsed_secs_f64()));
+    } else if run.waited > 2 && waiting.is_empty() {
+        time.unpause();
+        run.since = Some((0, real.elapsed_secs_f64()));
+    } else {
+        // Files are read on other threads.
+        std::thread::sleep(Duration::from_millis(1));
+    }
+}
+
+/// Space holds the time, the full stop lets one step pass.
+fn pause_and_step(
+    keys: Res<ButtonInput<KeyCode>>,
+    mut time: ResMut<Time<Virtual>>,
+    mut fixed: ResMut<Time<Fixed>>,
+    mut exit: MessageWriter<AppExit>,
+) {
+    if keys.just_pressed(KeyCode::Space) {
+        if time.is_paused() { time.unpause() } else { time.pause() }
+    }
+    if keys.just_pressed(KeyCode::Period) && time.is_paused() {
+        let step = fixed.timestep();
+        fixed.accumulate_overstep(step);
+    }
+    if keys.just_pressed(KeyCode::Escape) {
+        exit.write(AppExit::Success);
+    }
+}
+
+/// A slow renderer need not draw what nobody looks at: the cameras of a picture are off until just before it.
+fn draw_late(run: Res<Run>, real: Res<Time<Real>>, mut cameras: Query<&mut Camera>) {
+    if run.screenshot.is_none() {
+        return;
+    }
+    let draws = run.since.is_some_and(|(frames, since)| {
+        let left_frames = run.frames.map(|all| all.saturating_sub(frames));
+        let left = run.seconds.map(|all| ((all - (real.elapsed_secs_f64() - since)) / FRAME).max(0.0) as u64);
+        left_frames.or(left).is_none_or(|left| left <= DRAWN)
+    });
+    for mut camera in &mut cameras {
+        if camera.is_active != draws {
+            camera.is_active = draws;
+        }
+    }
+}
+
+fn end(
+    mut commands: Commands,
+    mut run: ResMut<Run>,
+    real: Res<Time<Real>>,
+    mut time: ResMut<Time<Virtual>>,
+    readout: Res<Readout>,
+    mut exit: MessageWriter<AppExit>,
+) {
+    let Some((frames, since)) = run.since else {
+        if run.waited > PATIENCE {
+            error!("the bodies of this scene did not come; the lines above say why");
+            exit.write(AppExit::error());
+        }
+        return;
+    };
+    let frames = frames + 1;
+    run.since = Some((frames, since));
+    let over = run.frames.is_some_and(|all| frames >= all)
+        || run.seconds.is_some_and(|all| real.elapsed_secs_f64() - since >= all);
+    if !over {
+        return;
+    }
+    let Some(file) = run.screenshot.clone() else {
+        if run.headless {
+            println!("{}", readout.0);
+        }
+        exit.write(AppExit::Success);
+        return;
+    };
+    match run.picture {
+        Picture::Wanted => {
+            time.pause();
+            run.waited = 0;
+            run.picture = Picture::Asked;
+            commands
+                .spawn(Screenshot::primary_window())
+                .observe(save_to_disk(file))
+                .observe(|_: On<ScreenshotCaptured>, mut run: ResMut<Run>| run.picture = Picture::Captured);
+        }
+        Picture::Asked => {
+            run.waited += 1;
+            if run.waited > PATIENCE {
+                error!("the window could not be pictured");
+                exit.write(AppExit::error());
+            }
+        }
+        Picture::Captured => {
+            let written = std::fs::metadata(&file).is_ok_and(|found| found.len() > 0);
+            if !written {
+                error!("{} was not written", file.display());
+            }
+            exit.write(if written { AppExit::Success } else { AppExit::error() });
+        }
+    }
+}
