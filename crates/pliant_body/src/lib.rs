@@ -19,7 +19,7 @@
 //! | `Transform`: where it is | [`ShownState`]: what is on screen |
 //! | [`Grab`] and [`GrabOf`] on an entity of their own: a hold on a patch | [`GrabForce`]: the reaction, N; [`Grabs`] on the body |
 //! | [`Driven::Remote`]: somebody else moves it | [`PliantTick`]: the number of the step |
-//! | `SurfaceShading`: sharp and smooth edges (feature `render`) | [`BodyRefused`]: what was refused, and why |
+//! | `SurfaceShading`, `SurfaceDetail`, `SurfaceDeformation`: edges, level of detail, graphics card or processor (feature `render`) | [`BodyRefused`]: what was refused, and why |
 //!
 //! The crate knows no network, device, viewer or panel; they stand on it. Time is Bevy's: pausing `Time<Virtual>` pauses the bodies, and
 //! a `Time<Fixed>` advanced by hand single-steps them.
@@ -55,7 +55,7 @@ use bevy::{
 pub use asset::{ModalAsset, ModalAssetError, ModalAssetLoader};
 pub use body::{BodyState, Driven, Integration, ModalBody, NoPointerGrab};
 #[cfg(feature = "render")]
-pub use deform::{DrawnSurface, SurfaceShading};
+pub use deform::{DrawnSurface, SurfaceDeformation, SurfaceDetail, SurfaceShading};
 pub use error::{BodyError, BodyRefused};
 pub use grab::{Grab, GrabForce, GrabOf, Grabs};
 pub use pick::{SurfaceHit, pick_surface};
@@ -176,5 +176,10 @@ impl Plugin for PliantBodyPlugin {
             );
         #[cfg(feature = "render")]
         deform::build(app);
+    }
+
+    #[cfg(feature = "render")]
+    fn finish(&self, app: &mut App) {
+        deform::finish(app);
     }
 }

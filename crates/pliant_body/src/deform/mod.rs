@@ -1,19 +1,19 @@
 //! The deformed surface on screen: a [`Mesh`] a body, rewritten when its shown state moved and somebody sees it.
 //!
 //! The mesh is an ordinary one, so every material, shadow and prepass works on it unchanged. This module decides *what* is to be drawn
-//! again and keeps the bounds right; [`cpu`] writes the vertices.
+//! again, how finely ([`detail`]), and keeps the bounds right; [`gpu`] writes the vertices where they are drawn from, [`cpu`] where there is no
+//! such device.
 
 mod cpu;
+mod detail;
+mod drawing;
+mod gpu;
 mod topology;
 
-use std::{
-    collections::HashMap,
-    sync::{Arc, Weak},
-    time::Instant,
-};
+use std::{sync::Arc, time::Instant};
 
 use bevy::{
-    asset::RenderAssetUsages,
+    asset::{AssetEventSystems, RenderAssetUsages},
     camera::{
         primitives::Aabb,
         visibility::{NoAutoAabb, VisibilitySystems},
@@ -22,10 +22,15 @@ use bevy::{
     mesh::{Indices, PrimitiveTopology},
     prelude::*,
 };
-use pliant_modal::{ModalModel, ModelHash};
+use pliant_modal::ModalModel;
 
 use crate::{BodyState, DEFORM_TIME, ModalBody, PliantDisplaySystems, ShownState};
+use detail::{Detail, Views};
+use drawing::{Drawing, Drawings};
+use gpu::{Compute, GpuShape};
 use topology::Topology;
+
+pub use detail::SurfaceDetail;
 
 /// How a body's surface is shaded. Every [`ModalBody`] has one.
 #[derive(Component, Reflect, Debug, Clone, Copy, PartialEq)]
@@ -42,60 +47,18 @@ impl Default for SurfaceShading {
     }
 }
 
-/// What drawing a model needs besides its modes; shared by the bodies that look alike.
-#[derive(Debug)]
-struct Drawing {
-    topology: Topology,
-    /// For each mode the farthest that a unit of its coordinate moves any vertex, kg^-1/2: `|u| <= sum |q_k| reach_k`, warped or not,
-    /// as no singular value of `R~` exceeds one.
-    reach: Vec<f32>,
-    rest: Aabb,
-}
-
-impl Drawing {
-    fn new(model: &ModalModel, crease: f32) -> Self {
-        let vertices = model.surface().positions().len();
-        let reach = model
-            .parts()
-            .displacement
-            .chunks_exact(3 * vertices)
-            .map(|mode| {
-                mode.chunks_exact(3)
-                    .map(|u| u[0] * u[0] + u[1] * u[1] + u[2] * u[2])
-                    .fold(0.0, f32::max)
-                    .sqrt()
-            })
-            .collect();
-        let [low, high] = model.surface().bounds();
-        Self {
-            topology: Topology::new(model.surface(), crease),
-            reach,
-            rest: Aabb::from_min_max(low.into(), high.into()),
-        }
-    }
-
-    /// Bounds that hold the surface whatever its shape at `q`, at the cost of one number a mode.
-    fn bounds(&self, q: &[f64]) -> Aabb {
-        let reach: f64 = q.iter().zip(&self.reach).map(|(q, &reach)| q.abs() * f64::from(reach)).sum();
-        Aabb { center: self.rest.center, half_extents: self.rest.half_extents + reach as f32 }
-    }
-}
-
-/// The drawings in use, by model and crease angle.
-#[derive(Resource, Default)]
-struct Drawings(HashMap<(ModelHash, u32), Weak<Drawing>>);
-
-impl Drawings {
-    fn get(&mut self, model: &ModalModel, crease: f32) -> Arc<Drawing> {
-        let key = (model.hash(), crease.to_bits());
-        if let Some(drawing) = self.0.get(&key).and_then(Weak::upgrade) {
-            return drawing;
-        }
-        self.0.retain(|_, drawing| drawing.strong_count() > 0);
-        let drawing = Arc::new(Drawing::new(model, crease));
-        self.0.insert(key, Arc::downgrade(&drawing));
-        drawing
-    }
+/// Who writes the vertices of deformed surfaces. May be changed at any time.
+#[derive(Resource, Reflect, Debug, Clone, Copy, Default, PartialEq, Eq)]
+#[reflect(Resource, Default, Clone, PartialEq)]
+pub enum SurfaceDeformation {
+    /// A compute shader where the renderer has a graphics card, the processor elsewhere: without a renderer, without compute shaders, where
+    /// the "card" is the processor in disguise, for a model that does not fit into the card's bindings.
+    #[default]
+    Auto,
+    /// The processor, always. The [`Mesh`] asset then holds the deformed shape, for whoever reads it there.
+    Processor,
+    /// A compute shader wherever there is one, a software one too. The [`Mesh`] asset keeps the shape it was made with.
+    Compute,
 }
 
 /// Marks a body whose surface is on screen, and remembers which state of it.
@@ -105,23 +68,38 @@ pub struct DrawnSurface {
     drawing: Arc<Drawing>,
     crease: f32,
     version: u64,
+    detail: Detail,
+    /// By the compute shader.
+    computed: bool,
 }
 
 pub(crate) fn build(app: &mut App) {
     app.register_type::<SurfaceShading>()
+        .register_type::<SurfaceDetail>()
+        .register_type::<SurfaceDeformation>()
         .register_required_components::<ModalBody, SurfaceShading>()
+        .register_required_components::<ModalBody, SurfaceDetail>()
         .init_resource::<Drawings>()
+        .init_resource::<SurfaceDeformation>()
+        .add_systems(PreStartup, gpu::find)
         .add_systems(
             PostUpdate,
-            (make_meshes, deform_surfaces)
-                .chain()
+            (
+                (make_meshes, deform_surfaces)
+                    .chain()
+                    .in_set(PliantDisplaySystems::Deform)
+                    // It asks who was seen in the frame before; from here on visibility is found anew.
+                    .before(VisibilitySystems::VisibilityPropagate)
+                    .before(VisibilitySystems::CalculateBounds),
+                write_again.after(AssetEventSystems).run_if(resource_exists::<Compute>),
+            )
                 // A server is built with this feature when its neighbour in the workspace draws: it has no meshes.
-                .run_if(resource_exists::<Assets<Mesh>>)
-                .in_set(PliantDisplaySystems::Deform)
-                // It asks who was seen in the frame before; from here on visibility is found anew.
-                .before(VisibilitySystems::VisibilityPropagate)
-                .before(VisibilitySystems::CalculateBounds),
+                .run_if(resource_exists::<Assets<Mesh>>),
         );
+}
+
+pub(crate) fn finish(app: &mut App) {
+    gpu::finish(app);
 }
 
 fn make_meshes(
@@ -138,13 +116,24 @@ fn make_meshes(
         let drawing = drawings.get(model, shading.crease);
         let mut scratch = cpu::Scratch::default();
         let mut mesh = new_mesh(model, &drawing.topology);
+        let detail = Detail { modes: shown.q().len(), warped: state.warps() };
         let bounds = cpu::write(model, &drawing.topology, shown.q(), state.warps(), &mut mesh, &mut scratch);
-        commands.entity(entity).insert((
-            Mesh3d(meshes.add(mesh)),
-            DrawnSurface { model: model.clone(), drawing, crease: shading.crease, version: shown.version() },
-            bounds.unwrap_or_default(),
-            NoAutoAabb,
-        ));
+        commands
+            .entity(entity)
+            .insert((
+                Mesh3d(meshes.add(mesh)),
+                DrawnSurface {
+                    model: model.clone(),
+                    drawing,
+                    crease: shading.crease,
+                    version: shown.version(),
+                    detail,
+                    computed: false,
+                },
+                bounds.unwrap_or_default(),
+                NoAutoAabb,
+            ))
+            .remove::<GpuShape>();
     }
 }
 
@@ -165,14 +154,22 @@ fn new_mesh(model: &ModalModel, topology: &Topology) -> Mesh {
 }
 
 fn deform_surfaces(
+    mut commands: Commands,
+    wanted: Res<SurfaceDeformation>,
+    compute: Option<Res<Compute>>,
     mut meshes: ResMut<Assets<Mesh>>,
     mut diagnostics: Diagnostics,
     mut scratch: Local<cpu::Scratch>,
+    cameras: Query<(&Camera, &GlobalTransform)>,
     mut bodies: Query<(
+        Entity,
         &BodyState,
         &ShownState,
+        &SurfaceDetail,
+        &GlobalTransform,
         &Mesh3d,
         &mut DrawnSurface,
+        Option<&mut GpuShape>,
         &mut Aabb,
         &InheritedVisibility,
         &ViewVisibility,
@@ -180,8 +177,21 @@ fn deform_surfaces(
 ) {
     let start = Instant::now();
     let mut written = false;
-    for (state, shown, mesh, mut drawn, mut aabb, inherited, view) in &mut bodies {
-        if drawn.version == shown.version() || !inherited.get() || !Arc::ptr_eq(&drawn.model, state.model()) {
+    let views = Views::new(cameras.iter());
+    for (entity, state, shown, allowed, place, mesh, mut drawn, shape, mut aabb, inherited, view) in
+        &mut bodies
+    {
+        if !inherited.get() || !Arc::ptr_eq(&drawn.model, state.model()) {
+            continue;
+        }
+        let compute = match (*wanted, &compute) {
+            (SurfaceDeformation::Auto, Some(compute)) => !compute.software && compute.takes(&drawn.drawing),
+            (SurfaceDeformation::Compute, Some(compute)) => compute.takes(&drawn.drawing),
+            _ => false,
+        };
+        let moved = drawn.version != shown.version() || compute != drawn.computed;
+        let full = Detail { modes: shown.q().len(), warped: state.warps() };
+        if !moved && drawn.detail.covers(full) {
             continue;
         }
         if !view.get() {
@@ -189,22 +199,72 @@ fn deform_surfaces(
             aabb.set_if_neq(drawn.drawing.bounds(shown.q()));
             continue;
         }
-        let Some(mut mesh) = meshes.get_mut(&mesh.0) else { continue };
-        let bounds = cpu::write(
-            &drawn.model,
-            &drawn.drawing.topology,
-            shown.q(),
-            state.warps(),
-            &mut mesh,
-            &mut scratch,
-        );
-        if let Some(bounds) = bounds {
-            aabb.set_if_neq(bounds);
+        let detail = match views.metres_per_pixel(&aabb, place) {
+            Some(metres) => {
+                let error = f64::from(metres * allowed.tolerance.max(0.0)) / state.scale();
+                Detail::needed(&drawn.drawing, shown.q(), full.warped, error)
+            }
+            // Seen by nothing but a light, or in a test.
+            None => full,
+        };
+        if !moved && drawn.detail.covers(detail) {
+            continue;
+        }
+        let q = &shown.q()[..detail.modes];
+        if compute {
+            aabb.set_if_neq(drawn.drawing.bounds(shown.q()));
+            match shape {
+                Some(mut shape) => {
+                    shape.q.clear();
+                    shape.q.extend(q.iter().map(|&q| q as f32));
+                    shape.warped = detail.warped;
+                    shape.mesh = mesh.id();
+                }
+                None => {
+                    commands.entity(entity).insert(GpuShape {
+                        drawing: drawn.drawing.clone(),
+                        mesh: mesh.id(),
+                        q: q.iter().map(|&q| q as f32).collect(),
+                        warped: detail.warped,
+                    });
+                }
+            }
+        } else {
+            if shape.is_some() {
+                commands.entity(entity).remove::<GpuShape>();
+            }
+            let Some(mut mesh) = meshes.get_mut(&mesh.0) else { continue };
+            let bounds =
+                cpu::write(&drawn.model, &drawn.drawing.topology, q, detail.warped, &mut mesh, &mut scratch);
+            if let Some(bounds) = bounds {
+                aabb.set_if_neq(bounds);
+            }
         }
         drawn.version = shown.version();
+        drawn.detail = detail;
+        drawn.computed = compute;
         written = true;
     }
     if written {
         diagnostics.add_measurement(&DEFORM_TIME, || start.elapsed().as_secs_f64() * 1e3);
+    }
+}
+
+/// A mesh that was changed (somebody gave it vertex colours) goes to the device again with the shape it was made with: ours goes over it.
+fn write_again(mut events: MessageReader<AssetEvent<Mesh>>, mut shapes: Query<&mut GpuShape>) {
+    let modified: Vec<AssetId<Mesh>> = events
+        .read()
+        .filter_map(|event| match event {
+            AssetEvent::Modified { id } => Some(*id),
+            _ => None,
+        })
+        .collect();
+    if modified.is_empty() {
+        return;
+    }
+    for mut shape in &mut shapes {
+        if modified.contains(&shape.mesh) {
+            shape.set_changed();
+        }
     }
 }

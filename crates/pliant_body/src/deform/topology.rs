@@ -19,6 +19,29 @@ pub(super) struct Topology {
 }
 
 impl Topology {
+    /// The corners at each normal: where each normal's begin (one more than there are normals), and for each corner the triangle's three
+    /// vertices of the surface.
+    pub fn corners(&self) -> (Vec<u32>, Vec<[u32; 3]>) {
+        let mut starts = vec![0u32; self.normals + 1];
+        for &v in self.triangles.iter().flatten() {
+            starts[self.normal[v as usize] as usize + 1] += 1;
+        }
+        for i in 1..starts.len() {
+            starts[i] += starts[i - 1];
+        }
+        let mut next = starts.clone();
+        let mut corners = vec![[0; 3]; self.triangles.len() * 3];
+        for triangle in &self.triangles {
+            let vertices = triangle.map(|v| self.source[v as usize]);
+            for &v in triangle {
+                let at = &mut next[self.normal[v as usize] as usize];
+                corners[*at as usize] = vertices;
+                *at += 1;
+            }
+        }
+        (starts, corners)
+    }
+
     /// Cuts `surface` along the edges where the rest shape bends by more than `crease` (rad). Texture seams stay smooth.
     pub fn new(surface: &SurfaceMesh, crease: f32) -> Self {
         let triangles = surface.triangles();

@@ -2,7 +2,7 @@
 
 mod display;
 mod grabs;
-mod model;
+pub mod model;
 mod pointer;
 mod stepping;
 
