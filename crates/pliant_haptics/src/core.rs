@@ -382,7 +382,7 @@ impl LoopCore {
         }
         for (i, contact) in model.contacts().iter().enumerate() {
             let arm = self.tool.orientation * Vector3::from(contact.offset);
-            let (proxy, speed) = self.follow[i].advance(now, model, contact);
+            let (proxy, speed) = self.follow[i].advance(now, dt.min(2.0 / self.config.rate), model, contact);
             let at = self.tool.position + arm;
             let k = Matrix3::from_fn(|r, c| contact.stiffness[r][c]);
             let stored = |stretch: Vector3<f64>| 0.5 * stretch.dot(&(k * stretch)).max(0.0);

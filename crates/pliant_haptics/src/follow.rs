@@ -21,10 +21,12 @@ pub(crate) struct Follow {
 impl Follow {
     /// Where the proxy is now (m) and how fast (m/s).
     ///
-    /// Told: `p + v t`, for one step and no longer. Shown: the same plus what it was off when the last word came, taken out over one step.
+    /// Told: `p + v t`, for one step and no longer. Shown: the same plus what it was off when the last word came, taken out over one step, of
+    /// which this period of `dt` seconds is already a part: with a word in every period nothing is left of it, and the proxy is where it was told to be.
     pub(crate) fn advance(
         &mut self,
         now: f64,
+        dt: f64,
         model: &LocalModel,
         contact: &Contact,
     ) -> (Vector3<f64>, Vector3<f64>) {
@@ -39,9 +41,10 @@ impl Follow {
         }
         let age = (now - self.since).max(0.0);
         let speed = Vector3::from(contact.velocity);
-        let left = if self.glide > 0.0 { (1.0 - age / self.glide).max(0.0) } else { 0.0 };
+        let left = if self.glide > 0.0 { (1.0 - (age + dt) / self.glide).max(0.0) } else { 0.0 };
         let mut velocity = if age < reach { speed } else { Vector3::zeros() };
-        if left > 0.0 {
+        // A correction that is spread over less than two periods is a step, not a motion: no damper is to see it.
+        if left > 0.0 && self.glide > 2.0 * dt {
             velocity -= self.offset / self.glide;
         }
         self.shown = proxy + speed * age.min(reach) + self.offset * left;
@@ -69,10 +72,10 @@ mod tests {
             // A proxy that jumps by a centimetre each word, told with no velocity.
             model.contacts[0].proxy = [0.01 * tick as f64, 0.0, 0.0];
             for _ in 0..25 {
-                let (p, _) = follow.advance(now, &model, &model.contacts[0].clone());
+                let (p, _) = follow.advance(now, 1e-3, &model, &model.contacts[0].clone());
                 if let Some(last) = last {
-                    // One centimetre over the 24 periods between the first and the last sight of a word.
-                    assert!((p.x - last).abs() < 0.01 / 24.0 + 1e-12, "{} after {last}", p.x);
+                    // One centimetre over the 25 periods of a word.
+                    assert!((p.x - last).abs() < 0.01 / 25.0 + 1e-12, "{} after {last}", p.x);
                 }
                 last = Some(p.x);
                 now += 1e-3;
@@ -80,8 +83,24 @@ mod tests {
         }
         for _ in 0..30 {
             now += 1e-3;
-            last = Some(follow.advance(now, &model, &model.contacts[0].clone()).0.x);
+            last = Some(follow.advance(now, 1e-3, &model, &model.contacts[0].clone()).0.x);
         }
         assert!((last.unwrap() - 0.08).abs() < 1e-12, "at rest where it was told to be: {last:?}");
+    }
+    #[test]
+    fn a_word_every_period_is_taken_at_its_word() {
+        // A simulation as fast as the loop, or faster: the proxy moves at 0.1 m/s and says so.
+        for period in [1e-3, 0.5e-3] {
+            let mut follow = Follow::default();
+            let mut model = LocalModel { period, count: 1, ..LocalModel::default() };
+            for tick in 1..=100u64 {
+                let now = tick as f64 * 1e-3;
+                model.tick = tick;
+                model.contacts[0].proxy = [0.1 * now, 0.0, 0.0];
+                model.contacts[0].velocity = [0.1, 0.0, 0.0];
+                let (p, v) = follow.advance(now, 1e-3, &model, &model.contacts[0].clone());
+                assert!((p.x - 0.1 * now).abs() < 1e-12 && (v.x - 0.1).abs() < 1e-12, "{p} {v} at {now}");
+            }
+        }
     }
 }

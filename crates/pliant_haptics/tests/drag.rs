@@ -1,10 +1,15 @@
-//! Dragging a body with the virtual device: what is promised for every cell of the table (`--example stability_table`), for some of them.
+//! Dragging a body with the virtual device: what is promised for every cell of the table (`--example drag_table`), for some of them.
 #![allow(clippy::unwrap_used, clippy::expect_used, clippy::panic, reason = "a failed test should panic")]
 
 mod rig;
 
+use std::sync::Arc;
+
 use pliant_haptics::{Hand, VirtualConfig};
-use rig::scene::{Drag, SceneConfig, drag};
+use rig::{
+    baked,
+    scene::{Drag, SceneConfig, Subject, drag},
+};
 
 fn holds(config: SceneConfig) -> Drag {
     let what = format!(
@@ -67,6 +72,59 @@ fn without_friction_it_is_calm_too() {
             ..SceneConfig::default()
         });
     }
+}
+
+#[test]
+fn a_baked_body_is_calm_in_every_hand() {
+    let pip = Subject::Baked(Arc::new(baked::pip()));
+    for round_trip in [0.0, 0.196] {
+        for (_, hand) in Hand::PRESETS {
+            for (young, simulation, modal) in [
+                (1e3, 40.0, false),
+                (1e3, 1000.0, true),
+                (1e5, 120.0, true),
+                (1e5, 240.0, false),
+                (1e8, 40.0, true),
+                (1e11, 40.0, false),
+                (1e11, 1000.0, true),
+            ] {
+                let subject = pip.clone();
+                holds(SceneConfig {
+                    subject,
+                    young,
+                    hand,
+                    simulation,
+                    modal,
+                    round_trip,
+                    ..SceneConfig::default()
+                });
+            }
+        }
+    }
+}
+
+#[test]
+fn another_size_and_stiffness_of_a_bake_scales_as_it_must() {
+    // The compliance of a patch is that of its size and material: 1 / (E L). Ten times as stiff and half as large: a fifth.
+    let pip = baked::pip();
+    let patch = |m: &pliant_modal::ModalModel| {
+        pliant_modal::Patch::around(m.surface(), baked::top(m), 0.05 * m.size()).unwrap()
+    };
+    let compliance = |m: &pliant_modal::ModalModel| {
+        let modes: f64 = (0..m.mode_count())
+            .map(|k| {
+                let row: f64 =
+                    patch(m).entries().iter().map(|&(v, w)| w * f64::from(m.displacement_row(v, 0, k))).sum();
+                (row / m.omega()[k]).powi(2)
+            })
+            .sum();
+        [modes, m.residual_flexibility(&patch(m), m.mode_count())[0][0]]
+    };
+    let other = baked::made_of(&pip, 10.0 * pip.info().young, 0.5 * pip.size());
+    for (a, b) in compliance(&pip).into_iter().zip(compliance(&other)) {
+        assert!((b / a * 5.0 - 1.0).abs() < 1e-4, "{b} for a fifth of {a} m/N");
+    }
+    assert!((other.mass() / pip.mass() * 8.0 - 1.0).abs() < 1e-9);
 }
 
 #[test]

@@ -1,6 +1,7 @@
 //! A loop and a virtual device in virtual time.
 #![allow(dead_code, reason = "every test uses its own part of it")]
 
+pub mod baked;
 pub mod block;
 pub mod scene;
 

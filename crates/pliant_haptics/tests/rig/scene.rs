@@ -6,9 +6,12 @@ use pliant_haptics::{
     Cycle, Hand, HeldGrab, LocalModel, LoopConfig, LoopEvent, ModalLocal, ModelWriter, ToolMap,
     VirtualConfig, VirtualDevice, VirtualHandle, VirtualPace,
 };
-use pliant_modal::{Body, BodyConfig, Patch};
+use pliant_modal::{Body, BodyConfig, ModalModel, Patch};
 
-use super::block::{block, tip};
+use super::{
+    baked::{made_of, top},
+    block::{block, tip},
+};
 
 pub struct Scene {
     pub body: Body,
@@ -34,7 +37,17 @@ pub struct Scene {
     last_force: [f64; 3],
 }
 
+/// What is dragged.
+#[derive(Clone)]
+pub enum Subject {
+    /// The block whose modes are known in closed form, by its tip.
+    Block,
+    /// A baked body made 15 cm large, by its top.
+    Baked(Arc<ModalModel>),
+}
+
 pub struct SceneConfig {
+    pub subject: Subject,
     pub young: f64,
     pub modes: usize,
     pub device: VirtualConfig,
@@ -48,6 +61,7 @@ pub struct SceneConfig {
 impl Default for SceneConfig {
     fn default() -> Self {
         Self {
+            subject: Subject::Block,
             young: 1e5,
             modes: 60,
             device: VirtualConfig::touch(),
@@ -62,12 +76,17 @@ impl Default for SceneConfig {
 
 impl Scene {
     pub fn new(c: SceneConfig) -> Self {
-        let model = Arc::new(block(c.young, c.modes));
+        let (model, vertex, radius) = match &c.subject {
+            Subject::Block => (block(c.young, c.modes), tip(), 0.01),
+            Subject::Baked(baked) => (made_of(baked, c.young, 0.15), top(baked), 0.01),
+        };
+        let model = Arc::new(model);
         let step = 1.0 / c.simulation;
-        let mut body = Body::new(model.clone(), BodyConfig { step, ..BodyConfig::default() }).unwrap();
+        let modes = Some(c.modes.min(model.mode_count()));
+        let mut body = Body::new(model.clone(), BodyConfig { step, modes, ..BodyConfig::default() }).unwrap();
         let device = VirtualDevice::new(c.device, c.hand).unwrap();
         let hand = device.handle();
-        let patch = Patch::around(model.surface(), tip(), 0.01).unwrap();
+        let patch = Patch::around(model.surface(), vertex, radius).unwrap();
         // The middle of the workspace lies on the patch, so that grabbing moves nothing.
         let origin = {
             let mut probe = body.clone();
@@ -186,6 +205,11 @@ impl Drag {
     /// Sustained: still moving, and no slower than two seconds before.
     pub fn oscillates(&self) -> bool {
         self.speeds[1] > 5e-3 && self.speeds[1] > 0.7 * self.speeds[0]
+    }
+
+    /// No sustained oscillation, no energy beyond what was put in and the tank, no force step above the slew limit.
+    pub fn keeps_its_promises(&self) -> bool {
+        !self.oscillates() && self.given <= 5e-3 && self.step[0] <= self.step[1] * 1.000_001
     }
 }
 

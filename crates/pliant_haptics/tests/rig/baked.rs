@@ -1,0 +1,55 @@
+//! A baked body made of another material and at another size: geometry and shapes stay, everything else follows by dimension.
+
+use std::path::Path;
+
+use pliant_modal::{FlexibilitySite, ModalModel, ModelParts, SurfaceMesh};
+
+/// The body that the project ships.
+pub fn pip() -> ModalModel {
+    let path = Path::new(env!("CARGO_MANIFEST_DIR")).join("../../assets/pip.modal");
+    ModalModel::read(path).unwrap()
+}
+
+/// `model` with Young's modulus `young` (Pa) and its largest extent `size` (m), of the same density, Poisson ratio and damping ratio.
+///
+/// With lengths times `s` and stiffness times `e`: masses go as `s^3`, stiffnesses as `e s`, so frequencies as `sqrt(e) / s`, mass-normalised shapes as
+/// `s^-3/2` and compliances as `1 / (e s)`.
+pub fn made_of(model: &ModalModel, young: f64, size: f64) -> ModalModel {
+    let parts = model.parts();
+    let (s, e) = (size / model.size(), young / parts.info.young);
+    let pace = e.sqrt() / s;
+    let scaled = |values: &[f32], by: f64| values.iter().map(|x| (f64::from(*x) * by) as f32).collect();
+    let surface = &parts.surface;
+    let positions = surface.positions().iter().map(|p| p.map(|x| (f64::from(x) * s) as f32)).collect();
+    let matrix = |m: [[f64; 3]; 3], by: f64| m.map(|row| row.map(|x| x * by));
+    ModalModel::from_parts(ModelParts {
+        info: pliant_modal::BakeInfo { young, ..parts.info.clone() },
+        surface: SurfaceMesh::new(positions, surface.triangles().to_vec(), None, surface.anchored().to_vec())
+            .unwrap(),
+        omega: parts.omega.iter().map(|w| w * pace).collect(),
+        damping: parts.damping.iter().map(|c| c * pace).collect(),
+        displacement: scaled(&parts.displacement, s.powf(-1.5)),
+        rotation: scaled(&parts.rotation, s.powf(-2.5)),
+        participation: parts.participation.iter().map(|p| p.map(|x| x * s.powf(1.5))).collect(),
+        free: parts.free,
+        mass: parts.mass * s.powi(3),
+        center_of_mass: parts.center_of_mass.map(|x| x * s),
+        inertia: matrix(parts.inertia, s.powi(5)),
+        sites: parts
+            .sites
+            .iter()
+            .map(|site| FlexibilitySite {
+                vertex: site.vertex,
+                radius: site.radius * s,
+                flexibility: matrix(site.flexibility, 1.0 / (e * s)),
+            })
+            .collect(),
+    })
+    .unwrap()
+}
+
+/// The highest surface vertex: an ear, a head.
+pub fn top(model: &ModalModel) -> u32 {
+    let positions = model.surface().positions();
+    (0..positions.len()).max_by(|&a, &b| positions[a][1].total_cmp(&positions[b][1])).unwrap() as u32
+}
