@@ -35,7 +35,7 @@
 //! # Features
 //!
 //! `inverse` (default): the Haply Inverse3. `vendor` (default): 3D Systems and Force Dimension, libraries loaded at run time. `plugin`: Bevy; without it no
-//! engine is compiled. `rumble`: gamepads that buzz, on top of it.
+//! engine is compiled. `gamepad`, on top of it: gamepads as position sources; `rumble`: gamepads that buzz; `render`: the force drawn as an arrow.
 #![cfg_attr(
     test,
     allow(clippy::unwrap_used, clippy::expect_used, clippy::panic, reason = "a failed test should panic")
@@ -81,10 +81,14 @@ pub use inverse::{Inverse, InverseConfig, InverseError, Spelling};
 pub use local::{Contact, FeltGrab, HeldGrab, LocalModel, MAX_CONTACTS, ModelWriter};
 pub use modal_local::ModalLocal;
 pub use pace::{LoopClock, RealPace, VirtualPace};
+#[cfg(feature = "render")]
+pub use plugin::ForceArrow;
+#[cfg(feature = "gamepad")]
+pub use plugin::GamepadSource;
 #[cfg(feature = "plugin")]
 pub use plugin::{
     DeviceId, DeviceStatus, HapticButton, HapticDevices, HapticFault, HapticNotice, HapticSystems,
-    HapticTool, HapticsPlugin, HeldBy, ToolGrabs, ToolGrip, ToolOffset, ToolPose,
+    HapticTool, HapticsPlugin, HeldBy, PointerSource, ToolGrabs, ToolGrip, ToolOffset, ToolPose,
 };
 #[cfg(feature = "rumble")]
 pub use plugin::{GamepadVibration, Rumble, ToolRumble};

@@ -2,14 +2,24 @@
 
 use std::sync::{Arc, Mutex, PoisonError};
 
+use nalgebra::Vector3;
+
 use crate::{DeviceInfo, Fault, HapticDevice, Pace, Sample, Wrench};
 
-/// A device that is wherever its handle says.
+/// How fast it goes where its handle says, rad/s: critically damped, there to a hundredth after 80 ms.
+const PACE: f64 = 80.0;
+/// No faster than this, m/s: a pointer that leaps is a hand that hurries, not a measurement that fails.
+const FASTEST: f64 = 4.0;
+
+/// A device that goes where its handle says, as a hand would: smoothly, and not at once.
 #[derive(Debug)]
 pub struct Positioned {
     name: String,
     handle: PositionedHandle,
-    last: Sample,
+    wanted: Sample,
+    position: Vector3<f64>,
+    velocity: Vector3<f64>,
+    sequence: u64,
 }
 
 /// Moves a [`Positioned`] device from another thread.
@@ -25,6 +35,11 @@ impl PositionedHandle {
         }
     }
 
+    /// Presses these buttons and no others, wherever the device is.
+    pub fn set_buttons(&self, buttons: u32) {
+        self.0.lock().unwrap_or_else(PoisonError::into_inner).0.buttons = buttons;
+    }
+
     /// The wrench that a hand would feel: to be shown.
     pub fn wrench(&self) -> Wrench {
         self.0.lock().unwrap_or_else(PoisonError::into_inner).1
@@ -34,12 +49,32 @@ impl PositionedHandle {
 impl Positioned {
     /// A device of this name in the middle of its workspace.
     pub fn new(name: impl Into<String>) -> Self {
-        Self { name: name.into(), handle: PositionedHandle::default(), last: Sample::default() }
+        Self {
+            name: name.into(),
+            handle: PositionedHandle::default(),
+            wanted: Sample::default(),
+            position: Vector3::zeros(),
+            velocity: Vector3::zeros(),
+            sequence: 0,
+        }
     }
 
     /// To move it with while the loop has it.
     pub fn handle(&self) -> PositionedHandle {
         self.handle.clone()
+    }
+
+    /// A critically damped spring to where it is wanted, in closed form over `dt` seconds.
+    fn go(&mut self, dt: f64) {
+        let off = self.position - Vector3::from(self.wanted.position);
+        let lean = self.velocity + off * PACE;
+        let fade = (-PACE * dt).exp();
+        let step = (off + lean * dt) * fade - off;
+        let velocity = (self.velocity - lean * (PACE * dt)) * fade;
+        let longest = FASTEST * dt;
+        let capped = crate::clamp_magnitude(&step, longest);
+        self.velocity = if capped == step { crate::clamp_magnitude(&velocity, FASTEST) } else { capped / dt };
+        self.position += capped;
     }
 }
 
@@ -68,18 +103,75 @@ impl HapticDevice for Positioned {
     }
 
     fn exchange(&mut self, wrench: &Wrench, pace: &mut dyn Pace) -> Result<Sample, Fault> {
-        pace.wait();
+        let period = pace.wait();
         // A pointer moves once a frame and nobody is pushed: were its owner just writing, the last place is as good.
         if let Ok(mut shared) = self.handle.0.try_lock() {
-            self.last = shared.0;
+            self.wanted = shared.0;
             shared.1 = *wrench;
         }
-        Ok(self.last)
+        if period.dt > 0.0 {
+            self.go(period.dt.min(0.05));
+        }
+        // It measures nothing that could freeze: the counter says that a still pointer is one.
+        self.sequence += 1;
+        Ok(Sample {
+            position: self.position.into(),
+            velocity: Some(self.velocity.into()),
+            sequence: Some(self.sequence),
+            ..self.wanted
+        })
     }
 
     fn safe_stop(&mut self) {
         if let Ok(mut shared) = self.handle.0.lock() {
             shared.1 = Wrench::ZERO;
         }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::{Contact, Cycle, LocalModel, LoopConfig, LoopEvent, VirtualPace};
+
+    #[test]
+    fn a_leaping_pointer_is_a_hand_that_hurries_and_a_still_one_is_no_dead_device() {
+        let device = Positioned::new("pointer");
+        let handle = device.handle();
+        let mut cycle = Cycle::new(device, LoopConfig::default()).unwrap();
+        let mut pace = VirtualPace::new(1000.0);
+        let mut events: Vec<LoopEvent> = Vec::new();
+        let k = 100.0;
+        let mut model = LocalModel { period: 0.01, count: 1, ..LocalModel::default() };
+        model.contacts[0] =
+            Contact { stiffness: [[k, 0.0, 0.0], [0.0, k, 0.0], [0.0, 0.0, k]], ..Contact::default() };
+        let mut fastest = 0.0f64;
+        let mut run = |cycle: &mut Cycle<Positioned>, events: &mut Vec<LoopEvent>, ticks: usize| {
+            for _ in 0..ticks {
+                model.tick += 1;
+                cycle.step(&mut pace, &model, events);
+                fastest = fastest.max(cycle.core().last().velocity[0].abs());
+            }
+        };
+        run(&mut cycle, &mut events, 500);
+        // 15 cm between two frames.
+        handle.set([0.15, 0.0, 0.0], 1);
+        run(&mut cycle, &mut events, 150);
+        assert!((cycle.core().last().position[0] - 0.15).abs() < 1e-4, "{:?}", cycle.core().last().position);
+        // And then it is held still for three seconds, with 15 N on the screen.
+        run(&mut cycle, &mut events, 3000);
+        assert!((handle.wrench().force[0] + 15.0).abs() < 0.05, "{:?}", handle.wrench());
+        assert!(events.contains(&LoopEvent::Pressed(0)));
+        let wrong = |e: &LoopEvent| {
+            matches!(
+                e,
+                LoopEvent::Fault(Fault::Jump(_) | Fault::Frozen(_) | Fault::NotFinite) | LoopEvent::Lost
+            )
+        };
+        assert!(!events.iter().any(wrong), "{events:?}");
+        handle.set([f64::NAN, 0.0, 0.0], 0);
+        run(&mut cycle, &mut events, 100);
+        assert!((cycle.core().last().position[0] - 0.15).abs() < 1e-4, "refused");
+        assert!(fastest <= FASTEST + 1e-9 && fastest > 2.0, "{fastest} m/s");
     }
 }

@@ -23,11 +23,15 @@
 mod devices;
 #[cfg(feature = "rumble")]
 mod rumble;
+#[cfg(feature = "render")]
+mod show;
+mod source;
 mod tool;
 mod word;
 
 use bevy::{
     ecs::schedule::{InternedScheduleLabel, ScheduleLabel},
+    input::InputSystems,
     prelude::*,
 };
 use pliant_body::PliantSystems;
@@ -35,6 +39,11 @@ use pliant_body::PliantSystems;
 pub use devices::{DeviceId, DeviceStatus, HapticButton, HapticDevices, HapticFault, HapticNotice};
 #[cfg(feature = "rumble")]
 pub use rumble::{GamepadVibration, Rumble, ToolRumble};
+#[cfg(feature = "render")]
+pub use show::ForceArrow;
+#[cfg(feature = "gamepad")]
+pub use source::GamepadSource;
+pub use source::PointerSource;
 pub use tool::{HapticTool, HeldBy, ToolGrabs, ToolGrip, ToolOffset, ToolPose};
 
 /// What the plugin does in a tick, around [`PliantSystems`].
@@ -82,14 +91,28 @@ impl Plugin for HapticsPlugin {
             .configure_sets(self.schedule, HapticSystems::Move.before(PliantSystems::Input))
             .configure_sets(self.schedule, HapticSystems::Word.after(PliantSystems::Publish))
             // Every frame, whether the game is paused or not: buttons, faults and states.
-            .add_systems(PreUpdate, (devices::read, tool::place, tool::grip).chain())
+            .add_systems(
+                PreUpdate,
+                (devices::read, tool::place, tool::grip, source::point).chain().after(InputSystems),
+            )
             .add_systems(self.schedule, tool::follow.in_set(HapticSystems::Move))
             .add_systems(self.schedule, word::publish.in_set(HapticSystems::Word));
+        #[cfg(feature = "gamepad")]
+        app.add_systems(PreUpdate, source::steer.after(tool::grip).after(InputSystems));
+        #[cfg(feature = "render")]
+        app.register_type::<ForceArrow>();
         #[cfg(feature = "rumble")]
         app.init_resource::<rumble::Rumble>()
             .register_type::<rumble::ToolRumble>()
             .add_message::<bevy::input::gamepad::GamepadRumbleRequest>()
             .add_systems(PostUpdate, (rumble::follow_force, rumble::send).chain());
+    }
+
+    #[cfg(feature = "render")]
+    fn finish(&self, app: &mut App) {
+        if app.is_plugin_added::<bevy::gizmos::GizmoPlugin>() {
+            app.add_systems(Update, show::draw);
+        }
     }
 }
 
