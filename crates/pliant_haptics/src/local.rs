@@ -89,6 +89,9 @@ pub struct FeltGrab {
     pub point: [f64; 3],
     /// The reaction, N, world axes.
     pub force: [f64; 3],
+    /// Stiffness of the spring from patch to hand, N/m, world axes: what whoever steps the body ties the patch with, the patch's residual flexibility and
+    /// the coupling in series.
+    pub stiffness: [[f64; 3]; 3],
 }
 
 /// Writes [`LocalModel`]s from a body: keeps what it needs of the step before.
@@ -169,14 +172,13 @@ impl ModelWriter {
         Ok(())
     }
 
-    /// Writes the same from published forces alone, for a body that somebody else steps: the spring is the coupling, its proxy the held patch.
+    /// Writes the same from published forces alone, for a body that somebody else steps.
     ///
-    /// `stiffness` (N/m) and `damping` (N s/m) are the coupling's in the world; `period`: time between two words, s.
+    /// `relaxation`: of the coupling's damper, s; `period`: time between two words, s. A stiffness that is not finite is none.
     pub fn write_forces(
         &mut self,
         felt: &[FeltGrab],
-        stiffness: f64,
-        damping: f64,
+        relaxation: f64,
         period: f64,
         stamp: f64,
         out: &mut LocalModel,
@@ -187,19 +189,20 @@ impl ModelWriter {
         out.period = period;
         (out.stored, out.supplied) = (0.0, self.supplied);
         out.count = felt.len().min(MAX_CONTACTS);
-        let k = if stiffness.is_finite() { stiffness } else { 0.0 };
         let before = self.points;
         self.points = [None; MAX_CONTACTS];
         for (i, grab) in felt.iter().take(MAX_CONTACTS).enumerate() {
             let point = Vector3::from(grab.point);
             let last = before.iter().flatten().find(|(key, _)| *key == grab.key).map(|(_, p)| *p);
             let velocity = last.map_or_else(Vector3::zeros, |p| (point - p) / period);
+            let k = grab.stiffness;
+            let k = if k.iter().flatten().all(|x| x.is_finite()) { k } else { [[0.0; 3]; 3] };
             out.contacts[i] = Contact {
                 offset: grab.offset,
                 proxy: grab.point,
                 velocity: velocity.into(),
-                stiffness: [[k, 0.0, 0.0], [0.0, k, 0.0], [0.0, 0.0, k]],
-                damping,
+                stiffness: k,
+                damping: relaxation * (k[0][0] + k[1][1] + k[2][2]) / 3.0,
                 reaction: grab.force,
             };
             self.points[i] = Some((grab.key, point));

@@ -81,17 +81,21 @@ fn a_body_elsewhere_is_felt_through_what_is_published() {
     let config = LoopConfig::default();
     let coupling = Coupling::clamp(&config.coupling, &device.info(), config.rate, 0.0, 0.0);
     let grab = coupling.grab_config(1.0, 1.0);
-    let (k, b) = (grab.stiffness.unwrap(), grab.stiffness.unwrap() * grab.relaxation);
-    assert!((b - coupling.damping).abs() < 1e-12, "the damper is the same on both sides");
+    let (k, relaxation) = (grab.stiffness.unwrap(), grab.relaxation);
     let mut writer = ModelWriter::new();
     let mut word = LocalModel::default();
-    let felt = |x: f64| FeltGrab { key: 5, point: [x, 0.0, 0.0], ..FeltGrab::default() };
-    writer.write_forces(&[felt(0.0)], k, b, 0.01, 0.0, &mut word);
+    let stiffness = [[k, 0.0, 0.0], [0.0, k, 0.0], [0.0, 0.0, k]];
+    let felt = |x: f64| FeltGrab { key: 5, point: [x, 0.0, 0.0], stiffness, ..FeltGrab::default() };
+    writer.write_forces(&[felt(0.0)], relaxation, 0.01, 0.0, &mut word);
+    assert!(
+        (word.contacts()[0].damping - coupling.damping).abs() < 1e-12,
+        "the damper is the same on both sides"
+    );
     assert_eq!(word.contacts()[0].velocity, [0.0; 3], "a new grab has not moved");
-    writer.write_forces(&[felt(0.001)], k, b, 0.01, 0.01, &mut word);
+    writer.write_forces(&[felt(0.001)], relaxation, 0.01, 0.01, &mut word);
     assert!((word.contacts()[0].velocity[0] - 0.1).abs() < 1e-12 && word.tick == 2);
     assert!((word.contacts()[0].stiffness[1][1] - k).abs() < 1e-12);
-    writer.write_forces(&[], k, b, 0.01, 0.02, &mut word);
+    writer.write_forces(&[], relaxation, 0.01, 0.02, &mut word);
     assert_eq!(word.contacts().len(), 0);
 }
 

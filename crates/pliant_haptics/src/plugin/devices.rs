@@ -39,6 +39,7 @@ pub(crate) struct Entry {
     pub(crate) seen: f64,
     /// What the loop steps itself, if it does: the grabs it was made for.
     pub(crate) modal_for: Vec<Entity>,
+    pub(crate) elsewhere: super::word::Elsewhere,
     stop: StopSwitch,
 }
 
@@ -98,6 +99,7 @@ impl HapticDevices {
             map: None,
             seen: 0.0,
             modal_for: Vec::new(),
+            elsewhere: super::word::Elsewhere::default(),
         });
         Ok(id)
     }

@@ -147,20 +147,41 @@ fn pause_fades_and_stop_is_latched() {
 }
 
 #[test]
-fn a_remote_body_is_felt_through_its_published_force() {
+fn a_remote_body_is_felt_through_its_published_force_until_the_network_is_gone() {
     let mut s = scene(false);
     let world = s.app.world_mut();
     let body = world.query_filtered::<Entity, With<ModalBody>>().single(world).unwrap();
     world.entity_mut(body).insert(pliant_body::Driven::Remote);
     let at = world.get::<Transform>(s.tool).unwrap().translation.as_dvec3();
-    let grab =
-        world.spawn((Grab::new(block::tip(), 0.01, at), pliant_body::GrabOf(body), HeldBy(s.tool))).id();
-    // What a session would write: the patch stays where it is.
+    let hold = Grab { stiffness: Some(280.0), ..Grab::new(block::tip(), 0.01, at) };
+    let grab = world.spawn((hold, pliant_body::GrabOf(body), HeldBy(s.tool))).id();
+    // What a session would write: the patch stays where it is, and a state comes every frame.
     world.entity_mut(grab).insert(GrabForce { point: at, force: DVec3::ZERO });
+    #[derive(Resource)]
+    struct Network(bool);
+    s.app.insert_resource(Network(true)).insert_resource(Heard::default());
+    s.app.add_systems(PostUpdate, |network: Res<Network>, mut shown: Query<&mut pliant_body::ShownState>| {
+        for mut shown in shown.iter_mut().filter(|_| network.0) {
+            let q = shown.current().to_vec();
+            shown.snap(&q).unwrap();
+        }
+    });
+    s.app.add_systems(Update, |mut faults: MessageReader<HapticFault>, mut heard: ResMut<Heard>| {
+        heard.0.extend(faults.read().filter_map(|f| f.fault));
+    });
     s.hand.set_target([0.01, 0.0, 0.0]);
-    // The coupling's 280 N/m and the arm's 500 in series over 1 cm; friction may hold back 0.26 N.
+    // The coupling's 280 N/m (what the patch itself gives is a hundredth of that) and the arm's 500 in series over 1 cm; friction may hold back 0.26 N.
     let want = -0.01 / (1.0 / 280.0 + 1.0 / 500.0);
     until(&mut s, "the coupling's force", |s| (force(s).x - want).abs() < 0.3);
     let target = s.app.world().get::<Grab>(grab).unwrap().target;
     assert!(target.x > at.x + 1e-3, "and the session is told where the hand is: {target}");
+    s.app.world_mut().resource_mut::<Network>().0 = false;
+    until(&mut s, "nothing new comes: the force fades", |s| {
+        let heard = &s.app.world().resource::<Heard>().0;
+        heard.iter().any(|f| matches!(f, Fault::Stale(_))) && force(s) == DVec3::ZERO
+    });
+    run(&mut s.app, 10);
+    assert_eq!(force(&s), DVec3::ZERO, "and stays away");
+    s.app.world_mut().resource_mut::<Network>().0 = true;
+    until(&mut s, "it comes back", |s| (force(s).x - want).abs() < 0.3);
 }

@@ -1,21 +1,74 @@
 //! After a tick: what the simulation tells each device's loop.
 
 use bevy::{math::DVec3, prelude::*};
-use pliant_body::{BodyState, Driven, GrabForce, GrabOf};
-use pliant_modal::GrabId;
+use nalgebra::Matrix3;
+use pliant_body::{BodyState, Driven, Grab, GrabForce, GrabOf, ShownState};
+use pliant_modal::{GrabConfig, Patch};
 
 use super::{HapticDevices, HapticTool, ToolGrabs, ToolOffset};
 use crate::{FeltGrab, HeldGrab, LocalModel, MAX_CONTACTS, ModalLocal};
 
+/// A body that somebody else steps and of which nothing new has come for so long is one that the network has lost, s: four of its ticks at 40 Hz.
+const REMOTE_PATIENCE: f64 = 0.1;
+
+type HeldItem<'w> = (Entity, &'w GrabOf, &'w Grab, &'w GrabForce, Option<&'w ToolOffset>);
 type HeldGrabs<'w, 's> =
-    Query<'w, 's, (Entity, &'static GrabOf, &'static GrabForce, Option<&'static ToolOffset>)>;
+    Query<'w, 's, (Entity, &'static GrabOf, &'static Grab, &'static GrabForce, Option<&'static ToolOffset>)>;
+type Bodies<'w, 's> =
+    Query<'w, 's, (&'static BodyState, &'static Driven, &'static ShownState, &'static GlobalTransform)>;
+
+/// What is known of the tool's grabs on bodies that are stepped elsewhere.
+#[derive(Default)]
+pub(crate) struct Elsewhere {
+    springs: Vec<(Entity, Grab, Matrix3<f64>)>,
+    /// The newest of the held bodies' shown states, and when it came, s.
+    version: u64,
+    at: f64,
+}
+
+impl Elsewhere {
+    /// Whether something new of the held bodies has come lately.
+    fn is_alive(&mut self, held: &[HeldItem], bodies: &Bodies, now: f64) -> bool {
+        let remote = held.iter().filter_map(|(_, of, ..)| bodies.get(of.0).ok());
+        let mut remote = remote.filter(|(_, driven, ..)| **driven == Driven::Remote).peekable();
+        if remote.peek().is_none() {
+            return true;
+        }
+        let version =
+            remote.fold(1u64, |sum, (.., shown, _)| sum.wrapping_mul(31).wrapping_add(shown.version()));
+        if version != self.version {
+            (self.version, self.at) = (version, now);
+        }
+        now - self.at <= REMOTE_PATIENCE
+    }
+
+    /// The spring that ties a patch to the hand there, N/m, body axes: as a grab of that kind on a copy of the body would have it.
+    fn spring(&mut self, entity: Entity, grab: &Grab, state: &BodyState) -> Matrix3<f64> {
+        let same = |known: &Grab| Grab { target: known.target, ..*grab } == *known;
+        if let Some((.., spring)) = self.springs.iter().find(|(e, known, _)| *e == entity && same(known)) {
+            return *spring;
+        }
+        let mut probe = state.body().clone();
+        let hold = GrabConfig { stiffness: grab.stiffness, relaxation: grab.relaxation };
+        let compliance = Patch::around(state.model().surface(), grab.vertex, grab.radius)
+            .ok()
+            .and_then(|patch| probe.grab(&patch, hold).ok())
+            .and_then(|id| probe.compliance(id).ok());
+        let coupling = Matrix3::identity() * grab.stiffness.unwrap_or(0.0);
+        let spring =
+            compliance.and_then(|c| Matrix3::from_fn(|i, j| c[i][j]).try_inverse()).unwrap_or(coupling);
+        self.springs.retain(|(e, ..)| *e != entity);
+        self.springs.push((entity, *grab, spring));
+        spring
+    }
+}
 
 pub(crate) fn publish(
     time: Res<Time>,
     mut devices: ResMut<HapticDevices>,
     tools: Query<(&HapticTool, Option<&ToolGrabs>)>,
     grabs: HeldGrabs,
-    bodies: Query<(&BodyState, &Driven)>,
+    bodies: Bodies,
 ) {
     let period = time.delta_secs_f64();
     if period <= 0.0 {
@@ -29,6 +82,7 @@ pub(crate) fn publish(
         let local = single_body(&held, &bodies);
 
         let (seen, coupling) = (entry.seen, entry.status.coupling);
+        let now = entry.running.get().now();
         let (rate, writer) = (entry.running.get().rate(), &mut entry.writer);
         if let Some((state, ids)) = &local {
             let scale = state.scale();
@@ -38,23 +92,25 @@ pub(crate) fn publish(
             if let Some(error) = wrong {
                 warn!("{}: the hand was told of no contact: {error}", entry.status.info.name);
             }
-        } else {
+        } else if entry.elsewhere.is_alive(&held, &bodies, now) {
+            entry.elsewhere.springs.retain(|(e, ..)| entities.contains(e));
             let felt: Vec<FeltGrab> = held
                 .iter()
-                .map(|(entity, _, force, offset)| FeltGrab {
-                    key: entity.to_bits(),
-                    offset: offset.map_or(DVec3::ZERO, |o| o.0).into(),
-                    point: force.point.into(),
-                    force: force.force.into(),
+                .filter_map(|(entity, of, grab, force, offset)| {
+                    let (state, _, _, place) = bodies.get(of.0).ok()?;
+                    let turn: Matrix3<f64> = world_axes(place);
+                    let spring = turn * entry.elsewhere.spring(*entity, grab, state) * turn.transpose();
+                    Some(FeltGrab {
+                        key: entity.to_bits(),
+                        offset: offset.map_or(DVec3::ZERO, |o| o.0).into(),
+                        point: force.point.into(),
+                        force: force.force.into(),
+                        stiffness: std::array::from_fn(|r| std::array::from_fn(|c| spring[(r, c)])),
+                    })
                 })
                 .collect();
-            let config = coupling.grab_config(tool.motion_scale, tool.force_scale);
-            let stiffness = config.stiffness.unwrap_or(0.0);
-            let damping = stiffness * config.relaxation;
-            entry
-                .running
-                .get()
-                .publish(|model| writer.write_forces(&felt, stiffness, damping, period, seen, model));
+            let relaxation = coupling.grab_config(tool.motion_scale, tool.force_scale).relaxation;
+            entry.running.get().publish(|model| writer.write_forces(&felt, relaxation, period, seen, model));
         }
 
         // A body for the loop to step itself: made here, where memory may be had, whenever what is held changes.
@@ -83,29 +139,24 @@ pub(crate) fn publish(
     }
 }
 
+fn world_axes(place: &GlobalTransform) -> Matrix3<f64> {
+    let m = bevy::math::DMat3::from_quat(place.rotation().as_dquat().normalize()).to_cols_array();
+    Matrix3::from_column_slice(&m)
+}
+
 /// The one body that everything is held on, if it is one and stepped here, and the solver's names of the grabs.
-fn single_body<'a>(
-    held: &[(Entity, &GrabOf, &GrabForce, Option<&ToolOffset>)],
-    bodies: &'a Query<(&BodyState, &Driven)>,
-) -> Option<(&'a BodyState, Vec<HeldGrab>)> {
+fn single_body<'a>(held: &[HeldItem], bodies: &'a Bodies) -> Option<(&'a BodyState, Vec<HeldGrab>)> {
     let (_, of, ..) = held.first()?;
     if held.iter().any(|(_, other, ..)| other.0 != of.0) {
         return None;
     }
-    let (state, driven) = bodies.get(of.0).ok()?;
+    let (state, driven, ..) = bodies.get(of.0).ok()?;
     if *driven == Driven::Remote {
         return None;
     }
-    let ids = held.iter().map(|(_, _, force, offset)| {
-        let id = solver_name(state, force)?;
+    let ids = held.iter().map(|(entity, .., offset)| {
+        let id = state.grab_id(*entity)?;
         Some(HeldGrab { id, offset: offset.map_or(DVec3::ZERO, |o| o.0).into() })
     });
     Some((state, ids.collect::<Option<Vec<_>>>()?))
-}
-
-/// The solver's grab whose published force this is: the one whose patch is exactly where the force says.
-fn solver_name(state: &BodyState, force: &GrabForce) -> Option<GrabId> {
-    let body = state.body();
-    body.grabs()
-        .find(|&id| body.grab_position(id).is_ok_and(|p| DVec3::from(p) * state.scale() == force.point))
 }
