@@ -66,6 +66,8 @@ pub use pliant_mesh as mesh;
 pub use pliant_modal as modal;
 #[cfg(feature = "net")]
 pub use pliant_net as net;
+#[cfg(feature = "panel")]
+pub use pliant_panel as panel;
 #[cfg(feature = "rerun")]
 pub use pliant_rerun as rerun;
 #[cfg(feature = "net")]

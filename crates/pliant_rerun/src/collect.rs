@@ -11,7 +11,7 @@ use bevy::{diagnostic::DiagnosticsStore, prelude::*};
 use pliant_body::{BodyRefused, BodyState, Grab, GrabForce, PliantTick, ShownState};
 
 use crate::{
-    RerunScalars, RerunStats, RerunStyle,
+    RerunRecording, RerunScalars, RerunStats, RerunStyle,
     frame::{Drawn, Frame, Hand, Line, Place, Scalar, Shape},
     worker::Worker,
 };
@@ -19,9 +19,8 @@ use crate::{
 #[derive(Resource)]
 pub(crate) struct Collector {
     workers: Vec<Worker>,
-    /// Seconds between drawings.
-    period: f64,
-    next_drawing: f64,
+    /// When the last drawing was due, s of simulated time.
+    last_drawing: f64,
     bodies: HashMap<Entity, Followed>,
     /// Bodies that some worker has not taken notice of.
     untold: bool,
@@ -43,12 +42,10 @@ struct Followed {
 }
 
 impl Collector {
-    pub fn new(workers: Vec<Worker>, shapes_hz: f64) -> Self {
-        let period = if shapes_hz > 0.0 { 1.0 / shapes_hz } else { f64::INFINITY };
+    pub fn new(workers: Vec<Worker>) -> Self {
         Self {
             workers,
-            period,
-            next_drawing: 0.0,
+            last_drawing: f64::NEG_INFINITY,
             bodies: HashMap::new(),
             untold: false,
             had_hands: false,
@@ -56,19 +53,21 @@ impl Collector {
         }
     }
 
-    /// Whether a drawing is due at simulated time `time`.
-    fn drawing_is_due(&mut self, time: f64) -> bool {
+    /// Whether a drawing is due at simulated time `time`, at `hz` drawings a second.
+    fn drawing_is_due(&mut self, time: f64, hz: f64) -> bool {
+        let period = 1.0 / hz;
         // A millionth of a second of slack: 20 Hz of drawings in 40 Hz of ticks is every second one, whatever the rounding.
-        if !self.period.is_finite() || time + 1e-6 < self.next_drawing {
+        if !(period > 0.0 && period.is_finite()) || time + 1e-6 < self.last_drawing + period {
             return false;
         }
-        self.next_drawing = (self.next_drawing + self.period).max(time);
+        let next = self.last_drawing + period;
+        self.last_drawing = if time < next + period { next } else { time };
         true
     }
 }
 
-pub(crate) fn somebody_listens(collector: Res<Collector>) -> bool {
-    collector.workers.iter().any(Worker::listens)
+pub(crate) fn somebody_listens(collector: Res<Collector>, recording: Res<RerunRecording>) -> bool {
+    recording.on && collector.workers.iter().any(Worker::listens)
 }
 
 pub(crate) fn close_at_exit(mut collector: ResMut<Collector>) {
@@ -98,6 +97,7 @@ pub(crate) fn collect(
     mut collector: ResMut<Collector>,
     mut stats: ResMut<RerunStats>,
     mut own: ResMut<RerunScalars>,
+    recording: Res<RerunRecording>,
     tick: Res<PliantTick>,
     time: Res<Time>,
     diagnostics: Option<Res<DiagnosticsStore>>,
@@ -121,7 +121,7 @@ pub(crate) fn collect(
             .read()
             .map(|refused| Line { warning: true, text: format!("{}: {}", refused.entity, refused.error) }),
     );
-    let draw = collector.drawing_is_due(now);
+    let draw = collector.drawing_is_due(now, recording.shapes_hz);
     follow_bodies(collector, &mut frame, &bodies, draw);
 
     let mut hands: Vec<_> = grabs.iter().collect();

@@ -44,7 +44,7 @@ mod scalars;
 mod tests;
 mod worker;
 
-pub use plugin::{RerunError, RerunPlugin, RerunStats, RerunStyle, RerunSystems};
+pub use plugin::{RerunError, RerunPlugin, RerunRecording, RerunStats, RerunStyle, RerunSystems};
 pub use scalars::RerunScalars;
 
 /// Timeline: the tick, [`PliantTick`](pliant_body::PliantTick).

@@ -133,6 +133,17 @@ pub enum RerunStyle {
 #[derive(SystemSet, Debug, Clone, PartialEq, Eq, Hash)]
 pub struct RerunSystems;
 
+/// Whether a recording goes on, and how finely; may be changed at any time. There only while a [`RerunPlugin`] has a sink.
+#[derive(Resource, Reflect, Debug, Clone, Copy, PartialEq)]
+#[reflect(Resource, Clone, PartialEq)]
+pub struct RerunRecording {
+    /// Off: nothing is collected, and the recording has a gap. Default: `true`.
+    pub on: bool,
+    /// How often shapes are drawn, Hz of simulated time; figures are recorded every tick. Zero or less draws none. Default: as
+    /// [`RerunPlugin::with_shapes_hz`] says.
+    pub shapes_hz: f64,
+}
+
 /// What became of the frames.
 #[derive(Resource, Reflect, Debug, Default, Clone, Copy, PartialEq, Eq)]
 #[reflect(Resource, Default, Clone, PartialEq)]
@@ -189,7 +200,9 @@ impl Plugin for RerunPlugin {
         if workers.is_empty() {
             return;
         }
-        app.insert_resource(collect::Collector::new(workers, self.shapes_hz))
+        app.insert_resource(collect::Collector::new(workers))
+            .insert_resource(RerunRecording { on: true, shapes_hz: self.shapes_hz })
+            .register_type::<RerunRecording>()
             .init_resource::<collect::OtherHands>()
             .add_systems(
                 self.schedule,

@@ -1,0 +1,99 @@
+//! The bodies of a scene: modes, damping, energy, rest, and the hands on them.
+
+use bevy_egui::egui::{CollapsingHeader, Slider, Ui};
+
+use crate::trace::{Trace, colour, plot, short};
+
+/// A body as the panel shows it. What a knob changes is changed here; the caller takes it over.
+#[derive(Debug, Clone, Default)]
+pub struct BodyView {
+    /// What it is called.
+    pub name: String,
+    /// Modes that are kept. A knob.
+    pub modes: usize,
+    /// Modes that its model has.
+    pub all_modes: usize,
+    /// Frequency of the slowest mode, Hz.
+    pub lowest_hz: f64,
+    /// Multiplies the baked damping. A knob.
+    pub damping_scale: f64,
+    /// Bent by modal warping. A knob.
+    pub warp: bool,
+    /// Stepped by this app; else somebody else moves it, and its knobs are theirs.
+    pub local: bool,
+    /// At rest: not stepped, sent or drawn anew.
+    pub resting: bool,
+    /// Kinetic and elastic energy, J.
+    pub energy: f64,
+    /// Energy over the last seconds, J.
+    pub energies: Trace,
+    /// The hands on it.
+    pub hands: Vec<HandView>,
+    /// Somebody pressed "Wake".
+    pub wake: bool,
+    /// Somebody pressed "Let go".
+    pub release: bool,
+}
+
+/// A hand on a body.
+#[derive(Debug, Clone, Default)]
+pub struct HandView {
+    /// Whose it is.
+    pub name: String,
+    /// Magnitude of the reaction, N.
+    pub force: f64,
+    /// The same over the last seconds.
+    pub forces: Trace,
+}
+
+/// Shows `bodies`, each under a header of its own.
+pub fn show(ui: &mut Ui, bodies: &mut [BodyView]) {
+    if bodies.is_empty() {
+        ui.weak("No bodies.");
+    }
+    let many = bodies.len() > 3;
+    for (index, body) in bodies.iter_mut().enumerate() {
+        let state = match (body.local, body.resting) {
+            (false, _) => "remote",
+            (true, true) => "rests",
+            (true, false) => "moves",
+        };
+        CollapsingHeader::new(format!("{} \u{b7} {state}", body.name))
+            .id_salt(("pliant body", index))
+            .default_open(!many)
+            .show(ui, |ui| body_knobs(ui, index, body));
+    }
+}
+
+fn body_knobs(ui: &mut Ui, index: usize, body: &mut BodyView) {
+    ui.add_enabled_ui(body.local, |ui| {
+        ui.add(Slider::new(&mut body.modes, 1..=body.all_modes.max(1)).text("modes"))
+            .on_hover_text("How many modes are simulated, the slowest first.");
+        ui.add(Slider::new(&mut body.damping_scale, 0.0..=10.0).text("damping").max_decimals(2))
+            .on_hover_text("Multiplies the damping that was baked.");
+        ui.checkbox(&mut body.warp, "modal warping")
+            .on_hover_text("Right for large rotations; off is the plain linear shape.");
+    });
+    ui.horizontal(|ui| {
+        ui.label(format!("{} Hz \u{b7} {} J", short(body.lowest_hz), short(body.energy)));
+        if body.resting && ui.button("Wake").clicked() {
+            body.wake = true;
+        }
+        if !body.hands.is_empty()
+            && ui.button("Let go").on_hover_text("Takes every hand off this body.").clicked()
+        {
+            body.release = true;
+        }
+    });
+    plot(ui, &format!("pliant energy {index}"), "J", [("energy", &body.energies, colour(0))]);
+    for hand in &body.hands {
+        ui.label(format!("{}: {} N", hand.name, short(hand.force)));
+    }
+    let hands = body.hands.iter().enumerate();
+    plot(
+        ui,
+        &format!("pliant forces {index}"),
+        "N",
+        hands.map(|(i, hand)| (hand.name.as_str(), &hand.forces, colour(i))),
+    );
+}

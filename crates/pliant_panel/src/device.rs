@@ -1,0 +1,78 @@
+//! Haptic devices: force, rate, faults, the emergency stop.
+
+use bevy_egui::egui::{Button, Color32, RichText, Ui, Vec2};
+
+use crate::trace::{Trace, colour, plot, short};
+
+/// The devices as the panel shows them.
+#[derive(Debug, Clone, Default)]
+pub struct DevicesView {
+    /// All that are plugged in.
+    pub devices: Vec<DeviceView>,
+    /// The emergency stop is latched.
+    pub stopped: bool,
+    /// Somebody pressed "Stop".
+    pub stop: bool,
+    /// Somebody pressed "Release the stop".
+    pub reset: bool,
+}
+
+/// A device.
+#[derive(Debug, Clone, Default)]
+pub struct DeviceView {
+    /// Vendor and model.
+    pub name: String,
+    /// Force that goes to the hand, N.
+    pub force: f64,
+    /// Largest force that it may give, N.
+    pub limit: f64,
+    /// Exchanges a second, Hz.
+    pub rate: f64,
+    /// 99th percentile of how late an exchange was, us.
+    pub jitter_us: f64,
+    /// Energy that the hand got beyond what it gave, J.
+    pub energy: f64,
+    /// What is wrong, if something is.
+    pub fault: Option<String>,
+    /// Force over the last seconds, N.
+    pub forces: Trace,
+    /// Its samples are recorded. A knob.
+    pub recording: bool,
+}
+
+/// Shows the devices.
+pub fn show(ui: &mut Ui, view: &mut DevicesView) {
+    if view.devices.is_empty() {
+        ui.weak("No device.");
+        return;
+    }
+    if view.stopped {
+        ui.colored_label(Color32::from_rgb(255, 120, 100), "Stopped: no device gives force.");
+        if ui.button("Release the stop").clicked() {
+            view.reset = true;
+        }
+    } else {
+        let stop = Button::new(RichText::new("STOP").strong().color(Color32::WHITE))
+            .fill(Color32::from_rgb(190, 40, 30))
+            .min_size(Vec2::new(ui.available_width(), 26.0));
+        if ui.add(stop).on_hover_text("Takes the force off every device at once.").clicked() {
+            view.stop = true;
+        }
+    }
+    for (index, device) in view.devices.iter_mut().enumerate() {
+        ui.strong(&device.name);
+        ui.label(format!(
+            "{} of {} N \u{b7} {} Hz \u{b7} late {} \u{b5}s \u{b7} {} J",
+            short(device.force),
+            short(device.limit),
+            short(device.rate),
+            short(device.jitter_us),
+            short(device.energy)
+        ));
+        if let Some(fault) = &device.fault {
+            ui.colored_label(Color32::from_rgb(255, 170, 80), fault);
+        }
+        plot(ui, &format!("pliant device {index}"), "N", [("force", &device.forces, colour(4))]);
+        ui.checkbox(&mut device.recording, "record samples");
+    }
+}

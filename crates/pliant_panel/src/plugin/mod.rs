@@ -1,0 +1,119 @@
+//! The plugin: gathers what others published, shows it, takes the knobs over.
+
+mod scene;
+
+#[cfg(feature = "haptics")]
+mod devices;
+#[cfg(feature = "net")]
+mod session;
+
+use bevy::prelude::*;
+use bevy_egui::{
+    EguiContexts, EguiPlugin, EguiPrimaryContextPass, egui, input::egui_wants_any_pointer_input,
+};
+use pliant_body::PointerGrabSystems;
+
+/// The panel as a window over the scene. Adds [`EguiPlugin`] where nobody has.
+#[derive(Debug, Clone, Copy)]
+pub struct PanelPlugin {
+    /// Opens and closes the panel. Default: `F1`.
+    pub key: KeyCode,
+    /// Open from the start. Default: `true`.
+    pub open: bool,
+}
+
+impl Default for PanelPlugin {
+    fn default() -> Self {
+        Self { key: KeyCode::F1, open: true }
+    }
+}
+
+/// The panel's own settings; may be changed at any time.
+#[derive(Resource, Reflect, Debug, Clone, Copy, PartialEq)]
+#[reflect(Resource, Default, Clone, PartialEq)]
+pub struct Panel {
+    /// Whether it is there. Default: `true`.
+    pub open: bool,
+    /// Magnifies it, over the window's own scale factor. Default: `1.0`.
+    pub zoom: f32,
+    /// Opens and closes it. Default: `F1`.
+    #[reflect(ignore)]
+    pub key: KeyCode,
+}
+
+impl Default for Panel {
+    fn default() -> Self {
+        Self { open: true, zoom: 1.0, key: KeyCode::F1 }
+    }
+}
+
+impl Plugin for PanelPlugin {
+    fn build(&self, app: &mut App) {
+        if !app.is_plugin_added::<EguiPlugin>() {
+            app.add_plugins(EguiPlugin::default());
+        }
+        app.register_type::<Panel>()
+            .insert_resource(Panel { open: self.open, key: self.key, ..default() })
+            .init_resource::<scene::Histories>()
+            .add_systems(Update, toggle.run_if(resource_exists::<ButtonInput<KeyCode>>))
+            .add_systems(EguiPrimaryContextPass, draw.run_if(|panel: Res<Panel>| panel.open))
+            // What is pressed in the panel is not pressed in the scene behind it.
+            .configure_sets(PreUpdate, PointerGrabSystems::Press.run_if(not(egui_wants_any_pointer_input)));
+        #[cfg(feature = "haptics")]
+        app.init_resource::<devices::Histories>();
+        #[cfg(feature = "net")]
+        app.init_resource::<session::Histories>();
+    }
+}
+
+fn toggle(keys: Res<ButtonInput<KeyCode>>, mut panel: ResMut<Panel>) {
+    if keys.just_pressed(panel.key) {
+        panel.open = !panel.open;
+    }
+}
+
+fn draw(
+    mut contexts: EguiContexts,
+    panel: Res<Panel>,
+    mut scene: scene::Scene,
+    #[cfg(feature = "net")] mut session: session::Session,
+    #[cfg(feature = "haptics")] mut devices: devices::Devices,
+    #[cfg(feature = "rerun")] recording: scene::Recording,
+) -> Result {
+    let context = contexts.ctx_mut()?.clone();
+    if context.zoom_factor() != panel.zoom && panel.zoom.is_finite() {
+        context.set_zoom_factor(panel.zoom.clamp(0.25, 8.0));
+    }
+    let screen = context.content_rect();
+    egui::Window::new("Pliant")
+        .default_width(300.0)
+        .default_pos([screen.right() - 330.0, screen.top() + 12.0])
+        .max_height(screen.height() - 60.0)
+        .vscroll(true)
+        .show(&context, |ui| {
+            ui.spacing_mut().slider_width = 150.0;
+            section(ui, "Time", |ui| scene.show_time(ui));
+            section(ui, "Bodies", |ui| scene.show_bodies(ui));
+            #[cfg(feature = "net")]
+            if session.is_there() {
+                section(ui, "Session", |ui| session.show(ui));
+            }
+            #[cfg(feature = "haptics")]
+            if devices.are_there() {
+                section(ui, "Devices", |ui| devices.show(ui));
+            }
+            #[cfg(feature = "rerun")]
+            if recording.is_there() {
+                section(ui, "Recording", |ui| recording.show(ui));
+            }
+            ui.weak(format!("{:?} opens and closes", panel.key));
+        });
+    Ok(())
+}
+
+fn section(ui: &mut egui::Ui, title: &str, show: impl FnOnce(&mut egui::Ui)) {
+    egui::CollapsingHeader::new(egui::RichText::new(title).strong())
+        .id_salt(("pliant section", title))
+        .default_open(true)
+        .show(ui, show);
+}

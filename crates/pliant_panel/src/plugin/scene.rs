@@ -1,0 +1,190 @@
+//! Bodies, time and the recording of a scene.
+
+use bevy::{
+    diagnostic::DiagnosticsStore,
+    ecs::{entity::EntityHashMap, system::SystemParam},
+    prelude::*,
+};
+use bevy_egui::egui::Ui;
+use pliant_body::{BodyState, DEFORM_TIME, Driven, Grab, GrabForce, Grabs, ModalBody, PliantTick, STEP_TIME};
+
+use crate::{
+    Trace,
+    bodies::{self, BodyView, HandView},
+    time::{self, TimeView},
+};
+
+/// What the panel remembers of the scene, for its plots.
+#[derive(Resource, Default)]
+pub(super) struct Histories {
+    energies: EntityHashMap<Trace>,
+    forces: EntityHashMap<Trace>,
+    step_ms: Trace,
+    deform_ms: Trace,
+}
+
+#[derive(SystemParam)]
+pub(super) struct Scene<'w, 's> {
+    commands: Commands<'w, 's>,
+    histories: ResMut<'w, Histories>,
+    virtual_time: ResMut<'w, Time<Virtual>>,
+    fixed_time: Option<ResMut<'w, Time<Fixed>>>,
+    real_time: Res<'w, Time<Real>>,
+    tick: Res<'w, PliantTick>,
+    diagnostics: Option<Res<'w, DiagnosticsStore>>,
+    bodies: Query<
+        'w,
+        's,
+        (
+            NameOrEntity,
+            &'static mut ModalBody,
+            &'static mut BodyState,
+            &'static Driven,
+            Option<&'static Grabs>,
+        ),
+    >,
+    grabs: Query<'w, 's, (NameOrEntity, &'static GrabForce), With<Grab>>,
+}
+
+impl Scene<'_, '_> {
+    pub fn show_time(&mut self, ui: &mut Ui) {
+        let now = self.real_time.elapsed_secs_f64();
+        let Histories { step_ms, deform_ms, .. } = &mut *self.histories;
+        for (path, trace) in [(STEP_TIME, step_ms), (DEFORM_TIME, deform_ms)] {
+            let newest = self.diagnostics.as_ref().and_then(|all| all.get(&path)?.measurement());
+            if let Some(newest) = newest {
+                trace.push(now, newest.value);
+            }
+        }
+        let step = self.fixed_time.as_ref().map(|fixed| fixed.timestep());
+        let mut view = TimeView {
+            paused: self.virtual_time.is_paused(),
+            speed: self.virtual_time.relative_speed_f64(),
+            step: step.unwrap_or(self.virtual_time.delta()).as_secs_f64(),
+            tick: self.tick.0,
+            step_once: false,
+            step_ms: self.histories.step_ms.clone(),
+            deform_ms: self.histories.deform_ms.clone(),
+        };
+        let before = (view.paused, view.speed);
+        time::show(ui, &mut view);
+        if view.paused != before.0 {
+            if view.paused { self.virtual_time.pause() } else { self.virtual_time.unpause() }
+        }
+        if view.speed != before.1 && view.speed.is_finite() && view.speed > 0.0 {
+            self.virtual_time.set_relative_speed_f64(view.speed);
+        }
+        if view.step_once
+            && let Some(fixed) = &mut self.fixed_time
+        {
+            // The next pass of the fixed loop finds one step's worth of time, and no more.
+            let step = fixed.timestep();
+            let lacking = step.saturating_sub(fixed.overstep());
+            fixed.accumulate_overstep(lacking);
+        }
+    }
+
+    pub fn show_bodies(&mut self, ui: &mut Ui) {
+        let now = self.real_time.elapsed_secs_f64();
+        let Histories { energies, forces, .. } = &mut *self.histories;
+        energies.retain(|entity, _| self.bodies.contains(*entity));
+        forces.retain(|entity, _| self.grabs.contains(*entity));
+        let mut found: Vec<_> = self.bodies.iter_mut().collect();
+        found.sort_by_key(|(name, ..)| name.entity);
+        let mut views: Vec<BodyView> = found
+            .iter()
+            .map(|(name, body, state, driven, grabs)| {
+                let model = state.model();
+                let energy = state.body().energy();
+                let energies = energies.entry(name.entity).or_default();
+                energies.push(now, energy);
+                let held = grabs.map(Grabs::entities).unwrap_or_default();
+                BodyView {
+                    name: name.to_string(),
+                    modes: state.body().mode_count(),
+                    all_modes: model.mode_count(),
+                    lowest_hz: model.omega().first().map_or(0.0, |omega| omega / std::f64::consts::TAU),
+                    damping_scale: body.damping_scale,
+                    warp: body.warp,
+                    local: **driven == Driven::Local,
+                    resting: state.is_resting(),
+                    energy,
+                    energies: energies.clone(),
+                    hands: held
+                        .iter()
+                        .filter_map(|&grab| self.grabs.get(grab).ok())
+                        .map(|(name, force)| {
+                            let trace = forces.entry(name.entity).or_default();
+                            trace.push(now, force.force.length());
+                            HandView {
+                                name: name.name.map_or("hand", Name::as_str).into(),
+                                force: force.force.length(),
+                                forces: trace.clone(),
+                            }
+                        })
+                        .collect(),
+                    ..default()
+                }
+            })
+            .collect();
+        bodies::show(ui, &mut views);
+        for (view, (_, body, state, _, grabs)) in views.into_iter().zip(found) {
+            take_over(&view, body, state);
+            if view.release {
+                for &grab in grabs.map(Grabs::entities).unwrap_or_default() {
+                    self.commands.entity(grab).despawn();
+                }
+            }
+        }
+    }
+}
+
+fn take_over(view: &BodyView, mut body: Mut<ModalBody>, mut state: Mut<BodyState>) {
+    if !view.local {
+        return;
+    }
+    // Written only where something differs: a change makes the body look at its settings anew.
+    let kept = state.body().mode_count();
+    if view.modes != kept {
+        body.modes = (view.modes < view.all_modes).then_some(view.modes.max(1));
+    }
+    if view.damping_scale != body.damping_scale {
+        body.damping_scale = view.damping_scale;
+    }
+    if view.warp != body.warp {
+        body.warp = view.warp;
+    }
+    if view.wake {
+        state.wake();
+    }
+}
+
+#[cfg(feature = "rerun")]
+#[derive(SystemParam)]
+pub(super) struct Recording<'w> {
+    stats: Option<Res<'w, pliant_rerun::RerunStats>>,
+    settings: Option<ResMut<'w, pliant_rerun::RerunRecording>>,
+}
+
+#[cfg(feature = "rerun")]
+impl Recording<'_> {
+    pub fn is_there(&self) -> bool {
+        self.settings.is_some()
+    }
+
+    pub fn show(mut self, ui: &mut Ui) {
+        let (Some(stats), Some(settings)) = (&self.stats, &mut self.settings) else { return };
+        let mut view = crate::recording::RecordingView {
+            on: settings.on,
+            sinks: stats.sinks,
+            ticks: stats.collected,
+            dropped: stats.dropped,
+            shapes_hz: settings.shapes_hz,
+        };
+        crate::recording::show(ui, &mut view);
+        if (view.on, view.shapes_hz) != (settings.on, settings.shapes_hz) {
+            settings.on = view.on;
+            settings.shapes_hz = view.shapes_hz;
+        }
+    }
+}

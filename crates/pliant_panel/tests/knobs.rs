@@ -1,0 +1,187 @@
+//! Every knob does what it says: pressed and moved by its accessible name, on a bare egui context.
+#![allow(clippy::unwrap_used, missing_docs, reason = "a failed test should panic")]
+
+use bevy_egui::egui::{Key, accesskit::Role};
+use egui_kittest::{
+    Harness,
+    kittest::{NodeT, Queryable},
+};
+use pliant_panel::{
+    bodies::{self, BodyView, HandView},
+    device::{self, DeviceView, DevicesView},
+    network::{self, EmulatorView, NetworkView, UserView},
+    recording::{self, RecordingView},
+    time::{self, TimeView},
+};
+
+fn body() -> BodyView {
+    BodyView {
+        name: "pip".into(),
+        modes: 20,
+        all_modes: 30,
+        lowest_hz: 3.5,
+        damping_scale: 1.0,
+        warp: true,
+        local: true,
+        resting: true,
+        energy: 0.12,
+        ..Default::default()
+    }
+}
+
+/// Presses `key` on the slider called `name`.
+fn nudge<S>(harness: &mut Harness<'_, S>, name: &str, key: Key) {
+    harness.get_by_role_and_label(Role::Slider, name).focus();
+    harness.run();
+    harness.key_press(key);
+    harness.run();
+}
+
+#[test]
+fn time_is_paused_run_stepped_and_slowed() {
+    let time = TimeView { speed: 1.0, step: 0.025, tick: 7, ..Default::default() };
+    let mut harness = Harness::new_ui_state(|ui, time: &mut TimeView| time::show(ui, time), time);
+    harness.get_by_label("Pause").click();
+    harness.run();
+    assert!(harness.state().paused && !harness.state().step_once);
+    harness.get_by_label("Run").click();
+    harness.run();
+    assert!(!harness.state().paused);
+    harness.get_by_label("Step").click();
+    harness.run();
+    assert!(harness.state().paused && harness.state().step_once, "a step stops the clock first");
+    nudge(&mut harness, "speed", Key::ArrowLeft);
+    assert!(harness.state().speed < 1.0);
+}
+
+#[test]
+fn a_body_is_given_fewer_modes_more_damping_and_no_warp() {
+    let mut harness =
+        Harness::new_ui_state(|ui, bodies: &mut Vec<BodyView>| bodies::show(ui, bodies), vec![body()]);
+    nudge(&mut harness, "modes", Key::ArrowLeft);
+    assert_eq!(harness.state()[0].modes, 19);
+    nudge(&mut harness, "damping", Key::ArrowRight);
+    assert!(harness.state()[0].damping_scale > 1.0);
+    harness.get_by_label("modal warping").click();
+    harness.run();
+    assert!(!harness.state()[0].warp);
+    harness.get_by_label("Wake").click();
+    harness.run();
+    assert!(harness.state()[0].wake);
+}
+
+#[test]
+fn hands_are_taken_off_a_body_and_a_remote_body_keeps_its_own_settings() {
+    let mut held = body();
+    held.local = false;
+    held.hands = vec![HandView { name: "Ann".into(), force: 3.0, ..Default::default() }];
+    let mut harness =
+        Harness::new_ui_state(|ui, bodies: &mut Vec<BodyView>| bodies::show(ui, bodies), vec![held]);
+    harness.run();
+    assert!(harness.query_by_label("Ann: 3.00 N").is_some());
+    let slider = harness.get_by_role_and_label(Role::Slider, "modes");
+    assert!(slider.accesskit_node().is_disabled());
+    harness.get_by_label("Let go").click();
+    harness.run();
+    assert!(harness.state()[0].release);
+}
+
+#[test]
+fn the_emergency_stop_is_one_press_and_its_release_another() {
+    let devices = DevicesView {
+        devices: vec![DeviceView { name: "virtual".into(), force: 1.0, limit: 3.3, ..Default::default() }],
+        ..Default::default()
+    };
+    let mut harness = Harness::new_ui_state(|ui, view: &mut DevicesView| device::show(ui, view), devices);
+    assert!(harness.query_by_label("Release the stop").is_none());
+    harness.get_by_label("STOP").click();
+    harness.run();
+    assert!(harness.state().stop);
+    harness.get_by_label("record samples").click();
+    harness.run();
+    assert!(harness.state().devices[0].recording);
+    harness.state_mut().stopped = true;
+    harness.run();
+    assert!(harness.query_by_label("STOP").is_none());
+    harness.get_by_label("Release the stop").click();
+    harness.run();
+    assert!(harness.state().reset);
+}
+
+#[test]
+fn the_session_shows_its_people_and_never_the_secret_of_its_invite() {
+    let session = NetworkView {
+        role: "host".into(),
+        invite: Some("pliant://127.0.0.1:7400#abcdef?token=secret".into()),
+        users: vec![
+            UserView { name: "Ann".into(), yourself: true, ..Default::default() },
+            UserView { name: "Bo".into(), hands: 2, round_trip_ms: Some(196.0), ..Default::default() },
+        ],
+        ..Default::default()
+    };
+    let mut harness = Harness::new_ui_state(|ui, view: &mut NetworkView| network::show(ui, view), session);
+    assert!(harness.query_by_label("Ann (you)").is_some() && harness.query_by_label("holds 2").is_some());
+    assert!(harness.query_by_label_contains("secret").is_none());
+    assert!(harness.query_by_label_contains("127.0.0.1").is_some());
+    harness.get_by_label("Copy").click();
+    harness.run();
+    assert!(harness.state().copy);
+}
+
+#[test]
+fn the_emulated_network_is_chosen_by_name_and_its_loss_moved() {
+    let session = NetworkView {
+        role: "guest".into(),
+        emulator: Some(EmulatorView {
+            presets: vec!["none".into(), "paper-1".into(), "wifi".into()],
+            preset: 1,
+            loss: 9.0,
+            round_trip_ms: 196.0,
+        }),
+        ..Default::default()
+    };
+    let mut harness = Harness::new_ui_state(|ui, view: &mut NetworkView| network::show(ui, view), session);
+    nudge(&mut harness, "% lost", Key::ArrowRight);
+    assert!(harness.state().emulator.as_ref().unwrap().loss > 9.0);
+    nudge(&mut harness, "ms round trip", Key::ArrowLeft);
+    assert!(harness.state().emulator.as_ref().unwrap().round_trip_ms < 196.0);
+    harness.get_by_role(Role::ComboBox).click();
+    harness.run();
+    harness.get_by_label("wifi").click();
+    harness.run();
+    assert_eq!(harness.state().emulator.as_ref().unwrap().preset, 2);
+}
+
+#[test]
+fn a_recording_is_switched_off_and_thinned() {
+    let recording = RecordingView { on: true, sinks: 1, ticks: 40, dropped: 0, shapes_hz: 20.0 };
+    let mut harness =
+        Harness::new_ui_state(|ui, view: &mut RecordingView| recording::show(ui, view), recording);
+    harness.get_by_label("record").click();
+    harness.run();
+    assert!(!harness.state().on);
+    nudge(&mut harness, "shapes a second", Key::ArrowLeft);
+    assert!(harness.state().shapes_hz < 20.0);
+}
+
+#[test]
+fn tab_alone_reaches_every_knob_of_a_body() {
+    let mut harness =
+        Harness::new_ui_state(|ui, bodies: &mut Vec<BodyView>| bodies::show(ui, bodies), vec![body()]);
+    let mut reached = std::collections::BTreeSet::new();
+    for _ in 0..12 {
+        harness.key_press(Key::Tab);
+        harness.run();
+        for (role, name) in [
+            (Role::Slider, "modes"),
+            (Role::Slider, "damping"),
+            (Role::CheckBox, "modal warping"),
+            (Role::Button, "Wake"),
+        ] {
+            if harness.get_by_role_and_label(role, name).is_focused() {
+                reached.insert(name);
+            }
+        }
+    }
+    assert_eq!(reached.len(), 4, "{reached:?}");
+}
