@@ -433,18 +433,13 @@ pub(crate) fn publish(
             }
         }
         let body = state.body();
-        let frame = body.frame();
-        let pose = body.model().is_free().then(|| Pose {
-            position: frame.origin(),
-            rotation: frame.orientation(),
-            linear: frame.velocity(),
-            angular: frame.spin(),
-        });
+        let pose = body.model().is_free().then(|| Pose::of(body));
         let step = TickState {
             tick: tick.0,
             q: body.q(),
             v: body.v(),
             a: body.a(),
+            z: body.z(),
             pose,
             grabs: &streamed,
             resting: state.is_resting(),
@@ -482,6 +477,7 @@ impl NetHost {
             damping_scale: config.damping_scale,
             // An anchored body's weight turns with its entity: the stream learns it.
             gravity: if state.model().is_free() { config.gravity } else { [0.0; 3] },
+            relaxation: config.relaxation,
         };
         let model = state.model();
         if let Some(hosted) = self.bodies.get_mut(&entity) {

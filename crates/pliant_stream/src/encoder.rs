@@ -9,13 +9,14 @@ use std::sync::Arc;
 use pliant_modal::ModalModel;
 
 use crate::StreamError;
-use crate::check::projection;
-use crate::newmark::Newmark;
+use crate::check::checksum;
+use crate::newmark::{FlowFilter, Newmark};
+use crate::quanta::Quanta;
 use crate::state::{BodyId, GrabKey, GrabState, ModalState, Tick, TickState};
 use crate::stepper::{BodySetup, ForceStepper};
 use crate::wire::{
-    AccelerationCoding, Accelerations, Frame, FrameGrab, Payload, Repeat, RepeatGrab, Slice, SnapshotBytes,
-    StreamWish, Writer, round24,
+    AccelerationCoding, Accelerations, Frame, FrameGrab, MAX_PARTS, Payload, Repeat, RepeatGrab, Slice,
+    SliceEntry, SnapshotBytes, StreamWish, Writer, round24,
 };
 
 /// Frames kept for resending.
@@ -29,14 +30,41 @@ const LOAD_TICKS: f64 = 8.0;
 /// The estimate costs a step of its own: it is made every so many ticks.
 const LOAD_EVERY: u64 = 4;
 
+/// One step moves the surface by this share of how far the body is bent.
+const UNIT: f64 = 1.0 / 16_384.0;
+/// The same of an acceleration stream: finer, since a prediction multiplies its rounding and integrates it twice.
+const FINE_UNIT: f64 = UNIT / 64.0;
+/// The memory of how far it was bent, a tick.
+const VISIBLE_KEEP: f64 = 0.98;
+
 /// What was sent for a tick, for repeats and for resending.
 #[derive(Debug, Clone)]
 struct Sent {
     tick: Tick,
-    /// The frame without repeats, marked as resent.
-    bytes: Arc<[u8]>,
-    grabs: Vec<FrameGrab>,
-    accelerations: Option<Accelerations>,
+    /// The frame without repeats, marked as resent; more than one where its grabs did not fit.
+    frames: Vec<Frame>,
+}
+
+impl Sent {
+    fn grabs(&self) -> impl Iterator<Item = &FrameGrab> {
+        self.frames.iter().flat_map(|f| &f.grabs)
+    }
+}
+
+/// A tick's frames as they go out, without datagram headers: one, unless the grabs do not fit in one.
+#[derive(Debug, Clone)]
+pub struct Encoded {
+    /// The frame, or its first part.
+    pub first: Arc<[u8]>,
+    /// The other parts.
+    pub more: Vec<Arc<[u8]>>,
+}
+
+impl Encoded {
+    /// All datagrams.
+    pub fn all(&self) -> impl Iterator<Item = &Arc<[u8]>> {
+        std::iter::once(&self.first).chain(&self.more)
+    }
 }
 
 /// Encodes one body for one kind of receiver.
@@ -47,6 +75,8 @@ pub struct Encoder {
     modes: usize,
     limit: usize,
     newmark: Newmark,
+    /// How receivers of accelerations get the flow of a body that relaxes.
+    flow: Option<FlowFilter>,
     stepper: ForceStepper,
     mirror: ModalState,
     truth: ModalState,
@@ -59,6 +89,12 @@ pub struct Encoder {
     last: Tick,
     sent: VecDeque<Sent>,
     scratch: Vec<f64>,
+    quanta: Quanta,
+    /// How far the body is bent, for the steps' size, m.
+    visible: f64,
+    chosen: Vec<u16>,
+    wrong: Vec<(f64, u16)>,
+    entries: Vec<SliceEntry>,
 }
 
 impl Encoder {
@@ -83,16 +119,20 @@ impl Encoder {
                 expected: "room for a frame with one mode",
             });
         }
+        let quanta = Quanta::new(&model, modes, &newmark);
         let stepper = ForceStepper::new(model, setup, modes, newmark.h)?;
+        let rest = stepper.at_rest();
+        let flow = setup.relaxation.map(|r| FlowFilter::new(r, &newmark, 0));
         Ok(Self {
+            flow,
             body,
             wish,
             modes,
             limit,
             newmark,
             stepper,
-            mirror: ModalState::zero(modes),
-            truth: ModalState::zero(modes),
+            mirror: rest.clone(),
+            truth: rest,
             load: vec![0.0; modes],
             unexplained: vec![0.0; modes],
             loaded: false,
@@ -102,6 +142,11 @@ impl Encoder {
             last: 0,
             sent: VecDeque::with_capacity(SENT),
             scratch: Vec::new(),
+            quanta,
+            visible: 0.0,
+            chosen: Vec::new(),
+            wrong: Vec::new(),
+            entries: Vec::new(),
         })
     }
 
@@ -131,27 +176,22 @@ impl Encoder {
             q: self.mirror.q.clone(),
             v: self.mirror.v.clone(),
             a: self.mirror.a.clone(),
+            z: self.mirror.z.clone(),
             load: if self.load.iter().any(|x| *x != 0.0) { self.load.clone() } else { Vec::new() },
             resting,
         }
     }
 
-    /// The frame of a tick for resending, if it is still kept.
-    pub fn resend(&self, tick: Tick) -> Option<Arc<[u8]>> {
-        let first = self.sent.front()?.tick;
-        let index = usize::try_from(tick.checked_sub(first)?).ok()?;
-        self.sent.get(index).filter(|s| s.tick == tick).map(|s| s.bytes.clone())
+    /// The frames of a tick for resending; none when it is not kept any more.
+    pub fn resend(&self, tick: Tick) -> impl Iterator<Item = Arc<[u8]>> + '_ {
+        let index = self.sent.front().and_then(|s| usize::try_from(tick.checked_sub(s.tick)?).ok());
+        let sent = index.and_then(|index| self.sent.get(index)).filter(|s| s.tick == tick);
+        sent.into_iter().flat_map(|s| &s.frames).map(write)
     }
 
     /// Takes the truth over as it is: the next frame begins a new run, and receivers need a [`Encoder::snapshot`].
     pub fn restart(&mut self, state: &TickState<'_>) {
-        let take = |mine: &mut Vec<f64>, theirs: &[f64], modes: usize| {
-            mine.clear();
-            mine.extend(theirs.iter().copied().chain(std::iter::repeat(0.0)).take(modes));
-        };
-        take(&mut self.mirror.q, state.q, self.modes);
-        take(&mut self.mirror.v, state.v, self.modes);
-        take(&mut self.mirror.a, state.a, self.modes);
+        self.mirror.fill_from([state.q, state.v, state.a, state.z]);
         if state.resting {
             self.mirror.v.fill(0.0);
             self.mirror.a.fill(0.0);
@@ -179,7 +219,7 @@ impl Encoder {
     }
 
     /// Encodes the tick after the last one. The bytes have no datagram header yet.
-    pub fn encode(&mut self, state: &TickState<'_>) -> Arc<[u8]> {
+    pub fn encode(&mut self, state: &TickState<'_>) -> Encoded {
         let rotation = state.pose.map_or([0.0, 0.0, 0.0, 1.0], |p| p.rotation);
         let forces = self.wish.payload == Payload::Forces;
         let grabs: Vec<FrameGrab> = state
@@ -201,14 +241,15 @@ impl Encoder {
                 FrameGrab { state, displacement: displacement.map(round24), held: true }
             })
             .collect();
+        let unit = self.unit(state);
         let accelerations = match self.wish.payload {
-            Payload::Accelerations(coding) => Some(self.step_accelerations(coding, state)),
+            Payload::Accelerations(coding) => Some(self.step_accelerations(coding, state, unit)),
             Payload::Forces => {
                 self.step_forces(&grabs, state, rotation);
                 None
             }
         };
-        take_truth(&mut self.truth, state);
+        self.truth.fill_from([state.q, state.v, state.a, state.z]);
         let run = state.tick - self.started.unwrap_or(state.tick) - 1;
         let mut frame = Frame {
             body: self.body,
@@ -217,39 +258,101 @@ impl Encoder {
             resting: state.resting,
             resent: false,
             displacements: forces,
-            grabs: grabs.clone(),
+            part: None,
+            grabs,
             pose: state.pose,
             accelerations,
             slice: None,
             check: None,
             repeats: Vec::new(),
         };
-        self.repeat(&mut frame);
-        self.refresh(&mut frame, state);
-        if state.tick.is_multiple_of(CHECK_EVERY) {
-            frame.check = Some(projection(state.tick, &self.mirror.q) as f32);
+        let check = state.tick.is_multiple_of(CHECK_EVERY);
+        let room = if check { self.limit - 4 } else { self.limit };
+        let parts = self.split(&mut frame, room);
+        if parts.is_empty() {
+            self.repeat(&mut frame);
+            while 3 + frame.bytes() > room && frame.repeats.pop().is_some() {}
         }
-        while 3 + frame.bytes() > self.limit && frame.repeats.pop().is_some() {}
-        let bytes = write(&frame);
-        self.keep(frame, grabs);
+        self.refresh(&mut frame, state, unit, room);
+        if frame.repeats.is_empty() {
+            // Those that ended within the repeats are listed for the repeats only.
+            frame.grabs.retain(|g| g.held);
+        }
+        if check {
+            frame.check = Some(checksum(state.tick, &self.mirror) as f32);
+        }
+        let first = write(&frame);
+        let more = parts.iter().map(write).collect();
+        self.keep(frame, parts);
         self.last = state.tick;
         self.frames += 1;
-        bytes
+        Encoded { first, more }
     }
 
-    fn keep(&mut self, mut frame: Frame, grabs: Vec<FrameGrab>) {
+    /// What one step may move the surface by, m: a share of how far the body is bent or will be, falling slowly.
+    fn unit(&mut self, state: &TickState<'_>) -> f32 {
+        let count = self.modes.min(state.q.len());
+        let now = self.quanta.visible(&state.q[..count], &state.v[..count]);
+        self.visible = now.max(self.visible * VISIBLE_KEEP);
+        let share = if self.wish.payload == Payload::Forces { UNIT } else { FINE_UNIT };
+        let unit = (self.visible * share) as f32;
+        if unit.is_finite() { unit.clamp(1e-30, 1e6) } else { 1e6 }
+    }
+
+    /// Takes the grabs that do not fit out of a frame, into parts of their own.
+    fn split(&self, frame: &mut Frame, room: usize) -> Vec<Frame> {
+        let mut parts: Vec<Frame> = Vec::new();
+        if 3 + frame.bytes() <= room {
+            return parts;
+        }
+        let blank = Frame { grabs: Vec::new(), pose: None, accelerations: None, ..frame.clone() };
+        let mut rest = std::mem::take(&mut frame.grabs).into_iter();
+        // The two bytes that say which part it is are in none of them yet.
+        let fill = |into: &mut Frame, rest: &mut std::vec::IntoIter<FrameGrab>| {
+            while 5 + into.bytes() + Frame::grab_bytes(into.displacements) <= room {
+                let Some(g) = rest.next() else { return };
+                into.grabs.push(g);
+            }
+        };
+        fill(frame, &mut rest);
+        while rest.len() > 0 && parts.len() + 1 < usize::from(MAX_PARTS) {
+            let mut part = blank.clone();
+            fill(&mut part, &mut rest);
+            parts.push(part);
+        }
+        let of = parts.len() as u8 + 1;
+        if of > 1 {
+            for (which, part) in std::iter::once(frame).chain(&mut parts).enumerate() {
+                part.part = Some((which as u8, of));
+            }
+        }
+        parts
+    }
+
+    fn keep(&mut self, mut frame: Frame, parts: Vec<Frame>) {
         frame.repeats.clear();
         frame.grabs.retain(|g| g.held);
-        frame.resent = true;
-        let bytes = write(&frame);
-        if self.sent.len() >= SENT {
-            self.sent.pop_front();
-        }
-        self.sent.push_back(Sent { tick: frame.tick, bytes, grabs, accelerations: frame.accelerations });
+        let tick = frame.tick;
+        let mut frames = if self.sent.len() >= SENT {
+            // Its allocation is used again.
+            self.sent.pop_front().map(|s| s.frames).unwrap_or_default()
+        } else {
+            Vec::new()
+        };
+        frames.clear();
+        frames.push(frame);
+        frames.extend(parts);
+        frames.iter_mut().for_each(|f| f.resent = true);
+        self.sent.push_back(Sent { tick, frames });
     }
 
     /// The mirror's step with accelerations chosen so that it meets the truth.
-    fn step_accelerations(&mut self, coding: AccelerationCoding, state: &TickState<'_>) -> Accelerations {
+    fn step_accelerations(
+        &mut self,
+        coding: AccelerationCoding,
+        state: &TickState<'_>,
+        unit: f32,
+    ) -> Accelerations {
         let Newmark { h, beta, gamma } = self.newmark;
         // The acceleration that meets the position exactly is a filter of it with both zeros at this place; outside
         // the unit circle, or on it as for average acceleration, it rings for ever.
@@ -269,11 +372,26 @@ impl Encoder {
                 truth_at(state.a, k) + 0.1 * eq / (h * h) + 0.5 * ev / h
             });
         }
-        let accelerations = Accelerations::quantise(coding, &self.scratch);
+        let mut accelerations = Accelerations::quantise(coding, &self.scratch, unit, &self.quanta);
+        // Coarser steps where the datagram is too small for these: the closed loop makes it good later. Grabs have less of
+        // a claim: those that do not fit get a datagram of their own.
+        let pose = if state.pose.is_some() { 46 } else { 0 };
+        let room = self.limit.saturating_sub(3 + 12 + 2 + 4 + 1 + pose);
+        let mut coarser = unit;
+        while accelerations.bytes() > room && coarser < 1e9 && coding == AccelerationCoding::Visible {
+            coarser *= 4.0;
+            accelerations = Accelerations::quantise(coding, &self.scratch, coarser, &self.quanta);
+        }
         for (k, a) in self.scratch.iter_mut().enumerate() {
-            *a = accelerations.get(k);
+            *a = accelerations.get(k, &self.quanta);
+        }
+        if let Some(flow) = &self.flow {
+            flow.begin(&mut self.mirror);
         }
         self.newmark.advance(&mut self.mirror, &self.scratch);
+        if let Some(flow) = &self.flow {
+            flow.finish(&mut self.mirror);
+        }
         accelerations
     }
 
@@ -302,19 +420,47 @@ impl Encoder {
 
     /// Adds absolute state and takes it into the mirror: the modes that are most wrong in the mirror, and some in turn,
     /// for those receivers that missed what the mirror got.
-    fn refresh(&mut self, frame: &mut Frame, state: &TickState<'_>) {
+    fn refresh(&mut self, frame: &mut Frame, state: &TickState<'_>, unit: f32, room: usize) {
         if self.wish.refresh == 0 {
             return;
         }
-        let load = self.loaded;
         let share = self.modes.div_ceil(usize::from(self.wish.refresh)).min(255);
-        let mut count = share;
-        while count > 0 && 3 + frame.bytes() + Slice::bytes_of(count, load) > self.limit {
+        let truth = |slice: &[f64], k: usize| slice.get(k).copied().unwrap_or(0.0);
+        // In turn: a third; the rest by how wrong the mirror is, velocity counted as the displacement it leads to.
+        let turn = share.div_ceil(3);
+        let (first, modes) = (self.next_slice, self.modes);
+        let in_turn = |k: usize| (k + modes - first) % modes < turn;
+        self.chosen.clear();
+        self.chosen.extend((0..turn).map(|i| ((first + i) % modes) as u16));
+        self.wrong.clear();
+        for k in (0..modes).filter(|k| !in_turn(*k)) {
+            let eq = (truth(state.q, k) - self.mirror.q[k]).abs() / self.quanta.place[k];
+            let ev = (truth(state.v, k) - self.mirror.v[k]).abs() / self.quanta.speed[k];
+            let ez =
+                self.mirror.z.get(k).map_or(0.0, |z| (truth(state.z, k) - z).abs() / self.quanta.place[k]);
+            self.wrong.push((eq + ev + ez, k as u16));
+        }
+        let most = (share - turn).min(self.wrong.len());
+        if most > 0 && most < self.wrong.len() {
+            self.wrong.select_nth_unstable_by(most - 1, |a, b| b.0.total_cmp(&a.0).then(a.1.cmp(&b.1)));
+        }
+        self.chosen.extend(self.wrong.iter().take(most).map(|w| w.1));
+        let entry = |&mode: &u16| {
+            let k = usize::from(mode);
+            let load = if self.loaded { self.unexplained[k] } else { 0.0 };
+            SliceEntry { mode: k, q: truth(state.q, k), v: truth(state.v, k), load, z: truth(state.z, k) }
+        };
+        self.entries.clear();
+        self.entries.extend(self.chosen.iter().map(entry));
+        let flows = !self.mirror.z.is_empty();
+        let mut slice = Slice::quantise(&self.entries, unit, self.loaded, flows, &self.quanta);
+        let mut count = slice.steps.len();
+        while count > 0 && 3 + frame.bytes() + slice.bytes_of(count) > room {
             // Fewer modes first, then fewer repeats.
             if count > share.div_ceil(4) {
                 count -= 1;
             } else if frame.repeats.pop().is_some() {
-                count = share;
+                count = slice.steps.len();
             } else {
                 count -= 1;
             }
@@ -322,37 +468,15 @@ impl Encoder {
         if count == 0 {
             return;
         }
-        let truth = |slice: &[f64], k: usize| slice.get(k).copied().unwrap_or(0.0);
-        // In turn: a third; the rest by how wrong the mirror is, velocity counted as the displacement it leads to.
-        let turn = count.div_ceil(3);
-        let mut chosen: Vec<u16> = (0..turn).map(|i| ((self.next_slice + i) % self.modes) as u16).collect();
-        let mut wrong: Vec<(f64, u16)> = (0..self.modes)
-            .filter(|k| !chosen.contains(&(*k as u16)))
-            .map(|k| {
-                let eq = (truth(state.q, k) - self.mirror.q[k]).abs();
-                let ev = (truth(state.v, k) - self.mirror.v[k]).abs() / self.stepper.omega(k).max(1e-3);
-                (eq + ev, k as u16)
-            })
-            .collect();
-        let most = (count - turn).min(wrong.len());
-        if most > 0 && most < wrong.len() {
-            wrong.select_nth_unstable_by(most - 1, |a, b| b.0.total_cmp(&a.0).then(a.1.cmp(&b.1)));
-        }
-        chosen.extend(wrong.iter().take(most).map(|w| w.1));
-        self.next_slice = (self.next_slice + turn) % self.modes;
-        let values: Vec<(u16, [f64; 3])> = chosen
-            .iter()
-            .map(|&mode| {
-                let k = usize::from(mode);
-                let told = if load { self.unexplained[k] } else { 0.0 };
-                (mode, [truth(state.q, k), truth(state.v, k), told])
-            })
-            .collect();
-        let slice = Slice::quantise(&values);
-        for e in slice.entries() {
+        slice.steps.truncate(count);
+        self.next_slice = (first + turn.min(count)) % modes;
+        for e in slice.entries(&self.quanta) {
             self.mirror.q[e.mode] = e.q;
             self.mirror.v[e.mode] = e.v;
             self.load[e.mode] = e.load;
+            if let Some(z) = self.mirror.z.get_mut(e.mode) {
+                *z = e.z;
+            }
         }
         frame.slice = Some(slice);
     }
@@ -361,12 +485,13 @@ impl Encoder {
     fn repeat(&mut self, frame: &mut Frame) {
         for sent in self.sent.iter().rev().take(usize::from(self.wish.repeats)) {
             let Ok(back) = u8::try_from(frame.tick - sent.tick) else { break };
-            let mut grabs = Vec::with_capacity(sent.grabs.len());
-            for g in &sent.grabs {
+            let mut grabs = Vec::with_capacity(sent.frames.first().map_or(0, |f| f.grabs.len()));
+            for g in sent.grabs() {
                 let Some(index) = find_or_add(&mut frame.grabs, g) else { continue };
                 grabs.push(RepeatGrab { index, reaction: g.state.reaction, displacement: g.displacement });
             }
-            frame.repeats.push(Repeat { back, grabs, accelerations: sent.accelerations.clone() });
+            let accelerations = sent.frames.first().and_then(|f| f.accelerations.clone());
+            frame.repeats.push(Repeat { back, grabs, accelerations });
         }
     }
 }
@@ -382,14 +507,6 @@ fn find_or_add(grabs: &mut Vec<FrameGrab>, wanted: &FrameGrab) -> Option<u8> {
         None => return None,
     };
     u8::try_from(index).ok()
-}
-
-fn take_truth(truth: &mut ModalState, state: &TickState<'_>) {
-    for (mine, theirs) in [(&mut truth.q, state.q), (&mut truth.v, state.v), (&mut truth.a, state.a)] {
-        for (m, t) in mine.iter_mut().zip(theirs.iter().chain(std::iter::repeat(&0.0))) {
-            *m = *t;
-        }
-    }
 }
 
 fn write(frame: &Frame) -> Arc<[u8]> {

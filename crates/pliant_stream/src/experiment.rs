@@ -6,7 +6,7 @@ use std::collections::VecDeque;
 use std::sync::Arc;
 use std::time::Duration;
 
-use pliant_modal::{Body, BodyConfig, GrabConfig, GrabId, Integrator, ModalModel, Patch};
+use pliant_modal::{Body, BodyConfig, GrabConfig, GrabId, Integrator, ModalModel, Patch, Relaxation};
 
 use crate::StreamError;
 use crate::emulator::LinkConfig;
@@ -45,6 +45,8 @@ pub struct Experiment {
     pub modes: Option<u16>,
     /// The host's integrator. Default: exact.
     pub integrator: Integrator,
+    /// A material that relaxes. Default: none, elastic.
+    pub relaxation: Option<Relaxation>,
     /// The filter of acceleration streams; its `h` is taken from `rate`. Default: beta 4/9, gamma 5/6.
     pub newmark: Newmark,
     /// Answer NACKs only so much later. Default: at once.
@@ -162,6 +164,7 @@ impl Experiment {
             seed: 1,
             modes: None,
             integrator: Integrator::default(),
+            relaxation: None,
             newmark: Newmark { h: 1.0 / 40.0, beta: 4.0 / 9.0, gamma: 5.0 / 6.0 },
             resend_after: Duration::ZERO,
             warmup: Duration::from_secs(2),
@@ -211,10 +214,16 @@ impl Experiment {
             Pair::new(HostConfig { newmark, resend_after: self.resend_after, ..Default::default() })?;
         let body = Body::new(
             self.model.clone(),
-            BodyConfig { step: h, integrator: self.integrator, ..Default::default() },
+            BodyConfig {
+                step: h,
+                integrator: self.integrator,
+                relaxation: self.relaxation,
+                ..Default::default()
+            },
         )
         .map_err(model_error)?;
-        let setup = BodySetup { integrator: self.integrator, ..Default::default() };
+        let setup =
+            BodySetup { integrator: self.integrator, relaxation: self.relaxation, ..Default::default() };
         pair.host.add_body(BODY, "measured", self.model.clone(), setup)?;
         let guest = GuestConfig { recovery: self.recovery, modes: self.modes, ..Default::default() };
         let perfect = LinkConfig { delay: self.down.delay, ..Default::default() };
@@ -492,6 +501,7 @@ impl World for Run {
             q: self.body.q(),
             v: self.body.v(),
             a: self.body.a(),
+            z: self.body.z(),
             pose,
             grabs: &grabs,
             resting: false,

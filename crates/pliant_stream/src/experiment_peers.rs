@@ -32,7 +32,8 @@ impl Experiment {
     /// [`StreamError::Config`] for settings out of range or a free body, [`StreamError::Model`].
     pub fn run_peers(&self, repair: Repair) -> Result<Figures, StreamError> {
         let h = 1.0 / self.rate;
-        let setup = BodySetup { integrator: self.integrator, ..Default::default() };
+        let setup =
+            BodySetup { integrator: self.integrator, relaxation: self.relaxation, ..Default::default() };
         let peer = |number: u16| -> Result<PeerSession, StreamError> {
             let config = PeerConfig { user: UserId(number), step: h, repair, ..Default::default() };
             let mut peer = PeerSession::new(config)?;

@@ -9,6 +9,7 @@
 //! | [`peer`] | peer to peer: every peer steps, only targets cross, late ones are stepped again |
 //! | [`recovery`] | what a receiver does about loss: the paper's prediction and compensation, and the force-driven way |
 //! | [`encoder`] | frames in a closed loop: rounding does not add up |
+//! | [`quanta`] | how coarse each mode may be |
 //! | [`wire`] | the bytes; every parser takes anything |
 //! | [`emulator`] | a seeded bad network |
 //! | [`pair`] | host and guests joined by emulated links in virtual time: for tests |
@@ -32,6 +33,7 @@ pub mod pair;
 mod patch_rows;
 pub mod peer;
 pub mod playout;
+pub mod quanta;
 pub mod recovery;
 mod schur;
 pub mod session;

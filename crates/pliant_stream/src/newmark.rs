@@ -17,6 +17,8 @@
 //! `beta h^2`, `q_{i+1}` gets `h v_i` = `gamma h^2` and `(1/2 - beta) h^2` more, `(gamma + 1/2) h^2` in all, and every later
 //! step adds `h dv = h^2`.
 
+use pliant_modal::Relaxation;
+
 use crate::StreamError;
 use crate::state::ModalState;
 
@@ -82,5 +84,65 @@ impl Newmark {
         } else {
             ((age as f64 + self.gamma - 0.5) * h * h, h)
         }
+    }
+}
+
+/// The flow of a relaxing body (`time z' = q - z`) as a filter of its coordinates, exact where they go linearly over a step:
+///
+/// ```text
+/// z1 = e^-x z0 + (g - e^-x) q0 + (1 - g) q1,   x = h / time, g = (1 - e^-x) / x
+/// ```
+///
+/// A stream of accelerations gives the coordinates; the flow follows from them, and an error of it dies by `e^-x` a step.
+#[derive(Debug, Clone, PartialEq)]
+pub struct FlowFilter {
+    /// Share of the stiffness that relaxes away.
+    pub ratio: f64,
+    keep: f64,
+    by_old: f64,
+    by_new: f64,
+    responses: Vec<f64>,
+}
+
+impl FlowFilter {
+    /// For a material; `ages`: how many ticks back an acceleration may be put right.
+    pub fn new(relaxation: Relaxation, newmark: &Newmark, ages: usize) -> Self {
+        let x = newmark.h / relaxation.time;
+        let keep = (-x).exp();
+        let g = if x > 1e-8 { -(-x).exp_m1() / x } else { 1.0 - 0.5 * x };
+        let mut made =
+            Self { ratio: relaxation.ratio, keep, by_old: g - keep, by_new: 1.0 - g, responses: Vec::new() };
+        let (mut z, mut last) = (0.0, 0.0);
+        for age in 0..ages as u64 {
+            let (q, _) = newmark.response(age);
+            z = made.step(z, last, q);
+            last = q;
+            made.responses.push(z);
+        }
+        made
+    }
+
+    /// The flow after a step over which the coordinate went from `q0` to `q1`.
+    pub fn step(&self, z0: f64, q0: f64, q1: f64) -> f64 {
+        self.keep * z0 + self.by_old * q0 + self.by_new * q1
+    }
+
+    /// The first half of a step of all flows, before the coordinates go on: the old coordinates' part.
+    pub(crate) fn begin(&self, state: &mut ModalState) {
+        for (z, q) in state.z.iter_mut().zip(&state.q) {
+            *z = self.step(*z, *q, 0.0);
+        }
+    }
+
+    /// The second half: the new coordinates' part.
+    pub(crate) fn finish(&self, state: &mut ModalState) {
+        for (z, q) in state.z.iter_mut().zip(&state.q) {
+            *z += self.by_new * q;
+        }
+    }
+
+    /// What an acceleration wrong by 1 leaves in the flow `age` ticks later; 0 beyond the ages that it was made for.
+    pub fn response(&self, age: u64) -> f64 {
+        usize::try_from(age).ok().and_then(|age| self.responses.get(age)).copied().unwrap_or(0.0)
     }
 }

@@ -42,14 +42,10 @@ fn dot(row: &[f64], x: &[f64]) -> f64 {
 /// Three rows at once: the loads of `x` are shared and the sums do not wait for each other.
 fn dot3(rows: [&[f64]; 3], x: &[f64]) -> [f64; 3] {
     let n = x.len();
-    let [r0, r1, r2] = rows.map(|r| &r[..n]);
-    let whole = n - n % LANES;
+    let rows = rows.map(|r| r[..n].as_chunks::<LANES>());
+    let (x, tail) = x.as_chunks::<LANES>();
     let mut sums = [[0.0; LANES]; 3];
-    let lanes = |s: &[f64]| -> [f64; LANES] { std::array::from_fn(|k| s[k]) };
-    let all = r0[..whole].chunks_exact(LANES).zip(r1[..whole].chunks_exact(LANES));
-    let all = all.zip(r2[..whole].chunks_exact(LANES)).zip(x[..whole].chunks_exact(LANES));
-    for (((a, b), c), x) in all {
-        let (a, b, c, x) = (lanes(a), lanes(b), lanes(c), lanes(x));
+    for (((a, b), c), x) in rows[0].0.iter().zip(rows[1].0).zip(rows[2].0).zip(x) {
         for k in 0..LANES {
             sums[0][k] += a[k] * x[k];
             sums[1][k] += b[k] * x[k];
@@ -57,10 +53,8 @@ fn dot3(rows: [&[f64]; 3], x: &[f64]) -> [f64; 3] {
         }
     }
     let mut out = sums.map(|s| (s[0] + s[1]) + (s[2] + s[3]));
-    for k in whole..n {
-        for (o, r) in out.iter_mut().zip([r0, r1, r2]) {
-            *o += r[k] * x[k];
-        }
+    for (o, (_, row)) in out.iter_mut().zip(rows) {
+        *o += row.iter().zip(tail).map(|(a, b)| a * b).sum::<f64>();
     }
     out
 }

@@ -164,6 +164,8 @@ pub struct TickState<'a> {
     pub v: &'a [f64],
     /// Their accelerations.
     pub a: &'a [f64],
+    /// Modal flows of a body that relaxes, kg^1/2 m, as many as `q`; empty for an elastic one.
+    pub z: &'a [f64],
     /// The rigid frame of a free body; `None` for an anchored one.
     pub pose: Option<Pose>,
     /// Everything that holds the body, at most [`MAX_GRABS`].
@@ -181,12 +183,34 @@ pub struct ModalState {
     pub v: Vec<f64>,
     /// Accelerations.
     pub a: Vec<f64>,
+    /// Flows of a body that relaxes, kg^1/2 m (see [`pliant_modal::Relaxation`]); empty for an elastic one.
+    pub z: Vec<f64>,
 }
 
 impl ModalState {
-    /// At rest.
+    /// An elastic body at rest.
     pub fn zero(modes: usize) -> Self {
-        Self { q: vec![0.0; modes], v: vec![0.0; modes], a: vec![0.0; modes] }
+        Self { q: vec![0.0; modes], v: vec![0.0; modes], a: vec![0.0; modes], z: Vec::new() }
+    }
+
+    /// A body that relaxes, at rest and relaxed.
+    pub fn zero_relaxing(modes: usize) -> Self {
+        Self { z: vec![0.0; modes], ..Self::zero(modes) }
+    }
+
+    /// Takes over as many of another's numbers as there are; missing ones are 0. The sizes stay.
+    pub(crate) fn fill_from(&mut self, from: [&[f64]; 4]) {
+        let mine = [&mut self.q, &mut self.v, &mut self.a, &mut self.z];
+        for (mine, theirs) in mine.into_iter().zip(from) {
+            let count = mine.len().min(theirs.len());
+            mine[..count].copy_from_slice(&theirs[..count]);
+            mine[count..].fill(0.0);
+        }
+    }
+
+    /// The four kinds of numbers.
+    pub(crate) fn parts(&self) -> [&[f64]; 4] {
+        [&self.q, &self.v, &self.a, &self.z]
     }
 
     /// Number of modes.
@@ -199,11 +223,12 @@ impl ModalState {
         self.q.clone_from(&other.q);
         self.v.clone_from(&other.v);
         self.a.clone_from(&other.a);
+        self.z.clone_from(&other.z);
     }
 
     /// True when every number is finite.
     pub fn is_finite(&self) -> bool {
-        self.q.iter().chain(&self.v).chain(&self.a).all(|x| x.is_finite())
+        self.parts().into_iter().flatten().all(|x| x.is_finite())
     }
 }
 

@@ -3,7 +3,7 @@
 use std::sync::Arc;
 
 use nalgebra::{Matrix3, Quaternion, UnitQuaternion, Vector3};
-use pliant_modal::{Frame, GrabConfig, Integrator, ModalModel, RigidMotion};
+use pliant_modal::{Frame, GrabConfig, Integrator, ModalModel, Relaxation, RigidMotion};
 
 use crate::StreamError;
 use crate::patch_rows::{Grams, PatchRows, Six, Tangent, displaced, key, tangent};
@@ -27,11 +27,19 @@ pub struct BodySetup {
     /// Uniform acceleration, m/s^2; world axes, for an anchored body its own. What the host's gravity has beyond this is
     /// learnt by the stream. Default: none.
     pub gravity: [f64; 3],
+    /// A material that relaxes. Default: none, elastic.
+    pub relaxation: Option<Relaxation>,
 }
 
 impl Default for BodySetup {
     fn default() -> Self {
-        Self { integrator: Integrator::default(), warp: true, damping_scale: 1.0, gravity: [0.0; 3] }
+        Self {
+            integrator: Integrator::default(),
+            warp: true,
+            damping_scale: 1.0,
+            gravity: [0.0; 3],
+            relaxation: None,
+        }
     }
 }
 
@@ -44,6 +52,8 @@ pub(crate) struct Hold {
     /// Force on the body, N: what was measured (body axes), and after the step what acted (world axes where the frame was
     /// stepped with it).
     pub(crate) pull: Vector3<f64>,
+    /// How far the residual flexibility of a hand's patch has flown, body axes, m; see [`pliant_modal::Body::grab_flow`].
+    pub(crate) flow: Vector3<f64>,
 }
 
 /// What holds a patch.
@@ -60,6 +70,35 @@ pub(crate) enum By {
         /// Its spring and damper.
         config: GrabConfig,
     },
+}
+
+/// What the modes leave out under a hand, where the material relaxes: `d = C pull + ratio y`, `time y' = d - y`; see
+/// [`pliant_modal::Relaxation`]. With the pull held over a step `y1 = carry y0 + gain C pull`.
+#[derive(Debug, Clone, Copy)]
+struct Creeping {
+    ratio: f64,
+    carry: f64,
+    gain: f64,
+    /// Compliance within a step, as a multiple of the instantaneous one.
+    at_once: f64,
+}
+
+impl Default for Creeping {
+    fn default() -> Self {
+        Self { ratio: 0.0, carry: 0.0, gain: 0.0, at_once: 1.0 }
+    }
+}
+
+impl Creeping {
+    fn new(material: Relaxation, h: f64) -> Self {
+        let left = 1.0 - material.ratio;
+        let gone = -(-left * h / material.time).exp_m1();
+        Self { ratio: material.ratio, carry: 1.0 - gone, gain: gone / left, at_once: material.creep(h) }
+    }
+
+    fn step(&self, flow: Vector3<f64>, bent: Vector3<f64>) -> Vector3<f64> {
+        self.carry * flow + self.gain * bent
+    }
 }
 
 /// The rigid frame of a free body in a step, and what pushes it besides gravity and hands (world axes, N and N m).
@@ -84,6 +123,8 @@ struct Held {
     relaxation: f64,
     /// Where the hand is, as displacement from rest, body axes, m.
     place: Vector3<f64>,
+    /// How far the patch gives way in this step because it was pulled before, body axes, m.
+    crept: Vector3<f64>,
     velocity: Vector3<f64>,
     /// From the centre of mass, body axes, m.
     arm: Vector3<f64>,
@@ -116,7 +157,8 @@ pub struct ForceStepper {
     /// Modal force of the last step.
     old: Vec<f64>,
     force: Vec<f64>,
-    free: [Vec<f64>; 3],
+    free: [Vec<f64>; 4],
+    creeping: Creeping,
     more: Vec<f64>,
     gap: Vec<f64>,
     matrix: Vec<f64>,
@@ -156,7 +198,8 @@ impl ForceStepper {
             by_softness: Grams::default(),
             old: vec![0.0; modes],
             force: vec![0.0; modes],
-            free: std::array::from_fn(|_| vec![0.0; modes]),
+            free: std::array::from_fn(|i| if i < 3 { vec![0.0; modes] } else { Vec::new() }),
+            creeping: setup.relaxation.map_or(Creeping::default(), |r| Creeping::new(r, h)),
             more: Vec::new(),
             gap: Vec::new(),
             matrix: Vec::new(),
@@ -181,6 +224,26 @@ impl ForceStepper {
     /// The body.
     pub(crate) fn model(&self) -> &Arc<ModalModel> {
         &self.model
+    }
+
+    /// A state of the body at rest.
+    pub(crate) fn at_rest(&self) -> ModalState {
+        self.table.rest()
+    }
+
+    /// Lets the flow under a hand go on by one step under a pull (body axes, N).
+    pub(crate) fn relax(
+        &mut self,
+        vertex: u32,
+        radius: f64,
+        flow: Vector3<f64>,
+        pull: Vector3<f64>,
+    ) -> Vector3<f64> {
+        self.make_room(1);
+        match self.patch(vertex, radius) {
+            Some(index) => self.creeping.step(flow, self.patches[index].compliance * pull),
+            None => flow,
+        }
     }
 
     /// Number of modes stepped.
@@ -307,6 +370,11 @@ impl ForceStepper {
                 }
             }
             self.pull();
+            if self.creeping.ratio > 0.0 {
+                for (h, &index) in holds.iter_mut().zip(&self.used) {
+                    h.flow = self.creeping.step(h.flow, self.patches[index].compliance * h.pull);
+                }
+            }
             if let (Some(f), Some(_)) = (&mut frame, &rigid) {
                 let turn = *f.frame.rotation().to_rotation_matrix().matrix();
                 let (mut force, mut torque) = (Vector3::zeros(), Vector3::zeros());
@@ -318,10 +386,13 @@ impl ForceStepper {
                 RigidMotion::apply(f.frame, &self.model, self.h, force, torque);
             }
         }
-        let [q, v, a] = &self.free;
+        let [q, v, a, z] = &self.free;
         state.q.copy_from_slice(q);
         state.v.copy_from_slice(v);
         state.a.copy_from_slice(a);
+        if state.z.len() == z.len() {
+            state.z.copy_from_slice(z);
+        }
         self.old.copy_from_slice(&self.force);
     }
 
@@ -339,13 +410,13 @@ impl ForceStepper {
             let mut held = Held {
                 free: patch.reduce(&self.free[0], self.warp),
                 from: patch.reduce(q, self.warp),
-                compliance: patch.compliance,
+                compliance: patch.compliance * self.creeping.at_once,
                 ..Held::default()
             };
             match h.by {
                 By::Measured(place) => {
                     // Where the hand must have been: a grab that pulls so from there leaves the patch where it was.
-                    held.place = place + patch.compliance * h.pull;
+                    held.place = place + held.compliance * h.pull;
                 }
                 By::Hand { target, velocity, config } => {
                     let back = frame.map(|f| f.rotation().inverse());
@@ -354,6 +425,7 @@ impl ForceStepper {
                         _ => target,
                     };
                     held.place = local - patch.rest;
+                    held.crept = self.creeping.ratio * self.creeping.carry * h.flow;
                     held.compliance += Matrix3::identity() * config.stiffness.map_or(0.0, |k| 1.0 / k);
                     held.relaxation = config.relaxation;
                     if config.relaxation > 0.0 {
@@ -379,7 +451,7 @@ impl ForceStepper {
             let ahead = held.at + held.tangent * (held.free - held.from);
             let rest = self.patches[index].rest;
             held.arm = rest + ahead - center;
-            let mut gap = held.place - ahead;
+            let mut gap = held.place - ahead - held.crept;
             if held.relaxation > 0.0 {
                 let mut speed = held.tangent * held.speed;
                 if let Some(f) = frame {
@@ -477,7 +549,7 @@ impl ForceStepper {
     }
 
     /// The receiver-side reaction (equation (10) of Tang et al. 2013): the modal force that the shown state implies,
-    /// `f = a + c v + omega^2 q`, laid on the grabs' patches by least squares:
+    /// `f = a + c v + omega^2 (q - ratio z)`, laid on the grabs' patches by least squares:
     /// `min |f + sum rows^T R^T reaction|^2`. Writes the reactions into `grabs`; those whose rows are dependent share.
     pub fn reactions(&mut self, state: &ModalState, grabs: &mut [GrabState], rotation: [f64; 4]) {
         if grabs.is_empty() {
@@ -499,8 +571,9 @@ impl ForceStepper {
         let (omega, damping) = (self.model.omega(), self.model.damping());
         for (k, f) in self.force.iter_mut().enumerate() {
             let gravity = self.weight.get(k).copied().unwrap_or(0.0);
+            let stretch = state.q[k] - self.creeping.ratio * state.z.get(k).copied().unwrap_or(0.0);
             let all =
-                state.a[k] + damping[k] * self.damping_scale * state.v[k] + omega[k] * omega[k] * state.q[k];
+                state.a[k] + damping[k] * self.damping_scale * state.v[k] + omega[k] * omega[k] * stretch;
             *f = (all - gravity) * self.softness[k];
         }
         let n = 3 * known.len();
@@ -549,6 +622,7 @@ impl Hold {
             radius: g.state.radius,
             pull: -(back * Vector3::from(g.state.reaction)),
             by: By::Measured(g.displacement.into()),
+            flow: Vector3::zeros(),
         }
     }
 
@@ -561,7 +635,7 @@ impl Hold {
         config: GrabConfig,
     ) -> Self {
         let by = By::Hand { target: target.into(), velocity, config };
-        Self { vertex, radius, by, pull: Vector3::zeros() }
+        Self { vertex, radius, by, pull: Vector3::zeros(), flow: Vector3::zeros() }
     }
 }
 

@@ -5,13 +5,15 @@ mod support;
 
 use std::time::Duration;
 
+use pliant_stream::quanta::Quanta;
 use pliant_stream::wire::{
     AccelerationCoding, Accelerations, Clock, Datagram, Frame, FrameGrab, GuestMessage, HostMessage, Nack,
-    NackRun, Repeat, RepeatGrab, Report, Slice, TargetEntry, Targets,
+    NackRun, Repeat, RepeatGrab, Report, Slice, SliceEntry, TargetEntry, Targets,
 };
 use pliant_stream::{
     BodyId, BodySetup, Channel, EndReason, GrabKey, GrabState, GuestConfig, GuestEvent, GuestSession,
-    HostConfig, HostEvent, HostSession, PeerId, Pose, RecoveryConfig, StreamError, TickState, UserId,
+    HostConfig, HostEvent, HostSession, Newmark, PeerId, Pose, RecoveryConfig, StreamError, TickState,
+    UserId,
 };
 use proptest::prelude::*;
 use support::bar;
@@ -32,6 +34,19 @@ fn grab(index: u16) -> FrameGrab {
     }
 }
 
+fn quanta() -> Quanta {
+    Quanta::new(&bar(12, 0.05), 12, &Newmark::average(0.025))
+}
+
+fn quantised(coding: AccelerationCoding, values: &[f64]) -> Accelerations {
+    Accelerations::quantise(coding, values, 1e-4, &quanta())
+}
+
+fn sliced(payload: u8) -> Slice {
+    let entry = |mode, q, v| SliceEntry { mode, q, v, load: 3.0, z: 0.5 * q };
+    Slice::quantise(&[entry(3, 1.0, 2.0), entry(9, -0.5, 0.0)], 1e-4, payload == 2, payload == 3, &quanta())
+}
+
 fn samples() -> Vec<Datagram> {
     let frame = |payload: u8| Frame {
         body: BODY,
@@ -40,6 +55,7 @@ fn samples() -> Vec<Datagram> {
         resting: payload == 3,
         resent: payload == 1,
         displacements: payload == 0,
+        part: (payload == 2).then_some((1, 3)),
         grabs: if payload == 0 {
             vec![grab(1), grab(2)]
         } else {
@@ -47,12 +63,12 @@ fn samples() -> Vec<Datagram> {
         },
         pose: (payload == 2).then(|| Pose { position: [1.0, 2.0, 3.0], ..Pose::default() }),
         accelerations: match payload {
-            1 => Some(Accelerations::quantise(AccelerationCoding::Scaled16, &[1.0, -2.0, 0.25])),
-            2 => Some(Accelerations::quantise(AccelerationCoding::F32, &[1.0, -2.0, 0.25])),
-            3 => Some(Accelerations::quantise(AccelerationCoding::F64, &[1.0, -2.0, 0.25])),
+            1 => Some(quantised(AccelerationCoding::Visible, &[1.0, -2.0, 0.25])),
+            2 => Some(quantised(AccelerationCoding::F32, &[1.0, -2.0, 0.25])),
+            3 => Some(quantised(AccelerationCoding::F64, &[1.0, -2.0, 0.25])),
             _ => None,
         },
-        slice: (payload != 1).then(|| Slice::quantise(&[(3, [1.0, 2.0, 0.0]), (9, [-0.5, 0.0, 0.0])])),
+        slice: (payload != 1).then(|| sliced(payload)),
         check: (payload < 2).then_some(0.125),
         repeats: vec![Repeat {
             back: 1,
@@ -61,8 +77,7 @@ fn samples() -> Vec<Datagram> {
                 reaction: [1.0, 2.0, 3.0],
                 displacement: if payload == 0 { [0.5, 0.5, 0.5] } else { [0.0; 3] },
             }],
-            accelerations: (payload == 1)
-                .then(|| Accelerations::quantise(AccelerationCoding::Scaled16, &[1.0, 0.0, 0.0])),
+            accelerations: (payload == 1).then(|| quantised(AccelerationCoding::Visible, &[1.0, 0.0, 0.0])),
         }],
     };
     let report = Report { received: 10, highest: 12 };
@@ -138,7 +153,7 @@ fn publish(host: &mut HostSession, now: Duration, tick: u64) {
     let q: Vec<f64> = (0..12).map(|k| 0.01 * (0.002 * tick as f64 + k as f64).sin()).collect();
     let v = vec![0.0; 12];
     let grabs = [GrabState { reaction: [0.05, -0.02, 0.1], ..grab(1).state }];
-    let state = TickState { tick, q: &q, v: &v, a: &v, pose: None, grabs: &grabs, resting: false };
+    let state = TickState { tick, q: &q, v: &v, a: &v, z: &[], pose: None, grabs: &grabs, resting: false };
     host.publish(now, BODY, &state).unwrap();
 }
 
@@ -270,6 +285,7 @@ fn a_million_damaged_inputs_are_read_without_panic() {
         q: vec![0.5; 9],
         v: vec![1.0; 9],
         a: vec![2.0; 9],
+        z: Vec::new(),
         load: Vec::new(),
         resting: false,
     };
@@ -282,6 +298,7 @@ fn a_million_damaged_inputs_are_read_without_panic() {
         warp: true,
         damping_scale: 1.0,
         gravity: [0.0; 3],
+        relaxation: None,
     };
     seeds.push(HostMessage::Snapshot(snapshot).encode());
     seeds.push(HostMessage::BodyAdded(info).encode());
@@ -340,8 +357,7 @@ fn a_tick_of_the_near_future_costs_a_snapshot_and_no_more() {
     for name in ["default", "paper"] {
         let (mut host, mut guest, mut now) = session(name);
         let Datagram::Frame(f) = &samples()[0] else { unreachable!() };
-        let accelerations =
-            (name == "paper").then(|| Accelerations::quantise(AccelerationCoding::Scaled16, &[1.0; 12]));
+        let accelerations = (name == "paper").then(|| quantised(AccelerationCoding::Visible, &[1.0; 12]));
         let frame = Frame { tick: 900_000, accelerations, repeats: Vec::new(), ..f.clone() };
         guest.on_datagram(now, &Datagram::Frame(frame).encode(120));
         for tick in 60..160 {
@@ -452,14 +468,15 @@ fn the_application_cannot_publish_nonsense() {
     let at = |tick, q: &[f64]| {
         let mut h = HostSession::new(HostConfig::default()).unwrap();
         h.add_body(BODY, "bar", bar(12, 0.05), BodySetup::default()).unwrap();
-        let state = TickState { tick, q, v: &good, a: &good, pose: None, grabs: &[], resting: false };
+        let state = TickState { tick, q, v: &good, a: &good, z: &[], pose: None, grabs: &[], resting: false };
         h.publish(Duration::ZERO, BODY, &state)
     };
     assert_eq!(at(1, &good), Ok(()));
     assert_eq!(at(1, &bad), Err(StreamError::NotFinite { what: "q" }));
     assert_eq!(at(1, &long), Err(StreamError::Length { what: "q", found: 13, expected: 12 }));
     assert!(matches!(at(0, &good), Err(StreamError::TickOrder { .. })));
-    let state = TickState { tick: 5, q: &good, v: &good, a: &good, pose: None, grabs: &[], resting: false };
+    let state =
+        TickState { tick: 5, q: &good, v: &good, a: &good, z: &[], pose: None, grabs: &[], resting: false };
     host.publish(Duration::ZERO, BODY, &state).unwrap();
     assert_eq!(host.publish(Duration::ZERO, BODY, &state), Err(StreamError::TickOrder { last: 5, found: 5 }));
     assert_eq!(host.publish(Duration::ZERO, BodyId(7), &state), Err(StreamError::UnknownBody(BodyId(7))));

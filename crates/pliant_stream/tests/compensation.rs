@@ -1,6 +1,7 @@
 //! The paper's compensation against direct integration.
 #![allow(clippy::unwrap_used, clippy::expect_used, clippy::panic, reason = "a failed test should panic")]
 
+use pliant_stream::quanta::Quanta;
 use pliant_stream::recovery::{AccelerationDriven, History, Recovery};
 use pliant_stream::wire::{Accelerations, Frame};
 use pliant_stream::{BodyId, ModalState, Newmark, Predict};
@@ -13,6 +14,7 @@ fn frame(tick: u64, a: &[f64]) -> Frame {
         resting: false,
         resent: false,
         displacements: false,
+        part: None,
         grabs: Vec::new(),
         pose: None,
         accelerations: Some(Accelerations::F64(a.to_vec())),
@@ -81,12 +83,12 @@ fn every_late_acceleration_takes_its_error_out_exactly() {
                 for n in 1..=720_u64 {
                     newmark.advance(&mut whole, &truth(n));
                     if !lost.contains(&n) {
-                        history.take(&frame(n, &truth(n)), 2, |_, _| {});
+                        history.take(&frame(n, &truth(n)), &Quanta::even(2), |_, _| {});
                     }
                     receiver.advance(n, &history);
                     drifting.advance(n, &history);
                     if n > 50 && lost.contains(&(n - 50)) {
-                        history.take(&frame(n - 50, &truth(n - 50)), 2, |_, _| {});
+                        history.take(&frame(n - 50, &truth(n - 50)), &Quanta::even(2), |_, _| {});
                         assert!(receiver.correct(n - 50, &history));
                         assert!(!drifting.correct(n - 50, &history));
                     }
@@ -114,7 +116,7 @@ fn a_wrong_velocity_that_stays_drifts_linearly() {
     let mut receiver = AccelerationDriven::new(newmark, Predict::Zero, false, 1);
     for n in 1..=120_u64 {
         if n != 20 {
-            history.take(&frame(n, &[if n == 20 { 2.0 } else { 0.0 }]), 1, |_, _| {});
+            history.take(&frame(n, &[if n == 20 { 2.0 } else { 0.0 }]), &Quanta::even(1), |_, _| {});
         }
         receiver.advance(n, &history);
     }

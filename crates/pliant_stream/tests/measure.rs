@@ -287,7 +287,7 @@ fn cost_of_a_tick() {
                 })
                 .collect();
             let (q, v, a) = (truth.q(), truth.v(), truth.a());
-            let state = TickState { tick, q, v, a, pose: None, grabs: &grabs, resting: false };
+            let state = TickState { tick, q, v, a, z: &[], pose: None, grabs: &grabs, resting: false };
             if receiver.is_none() {
                 encoder.restart(&state);
                 let snapshot = encoder.snapshot(false);
@@ -301,7 +301,7 @@ fn cost_of_a_tick() {
             let body = encoder.encode(&state);
             encode.push(began.elapsed());
             let mut bytes = vec![1, 0, 0];
-            bytes.extend_from_slice(&body);
+            bytes.extend_from_slice(&body.first);
             let began = Instant::now();
             let Datagram::Frame(frame) = Datagram::decode(&bytes).unwrap().1 else { unreachable!() };
             receiver.accept(&frame);

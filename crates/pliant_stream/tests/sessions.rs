@@ -90,7 +90,7 @@ impl World for Scene {
             .collect();
         self.truth.push((tick, self.body.q().to_vec()));
         let (q, v, a) = (self.body.q(), self.body.v(), self.body.a());
-        let state = TickState { tick, q, v, a, pose: None, grabs: &grabs, resting: self.resting };
+        let state = TickState { tick, q, v, a, z: &[], pose: None, grabs: &grabs, resting: self.resting };
         host.publish(now, BODY, &state).unwrap();
     }
 
@@ -446,8 +446,12 @@ fn weak_guests_take_fewer_modes_and_small_paths_fewer_still() {
     let modes = |k: usize| pair.guests[k].session.body(BODY).unwrap().shown().unwrap().modes();
     assert_eq!(modes(0), 12);
     assert_eq!(modes(1), 500, "the force stream carries any number of modes");
-    assert_eq!(modes(2), 495, "1,200 bytes, less 209 for header, four grabs and a pose, 2 bytes a mode");
-    assert_eq!(modes(3), 95, "400 bytes, 2 bytes a mode");
+    assert_eq!(
+        modes(2),
+        500,
+        "1,200 bytes, less 209 for header, four grabs and a pose, leave a byte a mode and more"
+    );
+    assert_eq!(modes(3), 191, "400 bytes, a byte a mode");
     for g in &pair.guests {
         let longest = g.down.counts();
         assert!(longest.sent > 50);
@@ -456,7 +460,7 @@ fn weak_guests_take_fewer_modes_and_small_paths_fewer_still() {
     // And when the path shrinks while streaming.
     pair.host.set_max_datagram(PeerId(3), 300);
     pair.run_until(6 * S, &mut scene);
-    assert_eq!(pair.guests[2].session.body(BODY).unwrap().shown().unwrap().modes(), 45);
+    assert_eq!(pair.guests[2].session.body(BODY).unwrap().shown().unwrap().modes(), 91);
     pair.host.set_max_datagram(PeerId(3), 100);
     pair.run_until(7 * S, &mut scene);
     assert!(scene.saw(2, |e| matches!(e, GuestEvent::Closed { reason: EndReason::Path })));
@@ -607,7 +611,11 @@ fn a_guest_that_may_cost_little_gets_less_of_everything_but_every_tick() {
         pair.run_until(20 * S, &mut scene);
         let before =
             (pair.host.stats(PeerId(1)).unwrap(), pair.guests[0].session.body(BODY).unwrap().counts());
-        pair.run_until(40 * S, &mut scene);
+        let mut round_trips: Vec<Duration> = Vec::new();
+        for second in 21..=40 {
+            pair.run_until(second * S, &mut scene);
+            round_trips.push(pair.host.stats(PeerId(1)).unwrap().round_trip);
+        }
         let session = &pair.guests[0].session;
         let after = (pair.host.stats(PeerId(1)).unwrap(), session.body(BODY).unwrap().counts());
         let bits = 8.0 * (after.0.bytes_out - before.0.bytes_out) as f64 / 20.0;
@@ -616,7 +624,9 @@ fn a_guest_that_may_cost_little_gets_less_of_everything_but_every_tick() {
         assert!(bits < rate.min(60e3), "{bits} bit/s");
         let frames = after.0.datagrams_out - before.0.datagrams_out;
         assert!(frames >= 800, "{frames} datagrams in 800 ticks: none is dropped");
-        assert!(after.0.round_trip < 90 * MS, "no queue stands: {:?}", after.0.round_trip);
+        // Trying more makes a queue now and then; none stands.
+        round_trips.sort_unstable();
+        assert!(round_trips[10] < 90 * MS, "no queue stands: {round_trips:?}");
         let error = scene.error(session) / scene.size();
         assert!(error < 0.03, "{error}");
         assert_eq!(

@@ -8,8 +8,8 @@ use pliant_modal::{Frame, GrabConfig, ModalModel};
 use super::inputs::{InputLog, WINDOW};
 use super::wire::{HeldAt, PeerBodyState, PeerFrame};
 use crate::StreamError;
-use crate::check::projection;
-use crate::newmark::Newmark;
+use crate::check::{checksum, projection};
+use crate::newmark::{FlowFilter, Newmark};
 use crate::recovery::{Blend, Forecast, PoseBlend};
 use crate::state::{BodyId, GrabKey, GrabState, ModalState, Pose, Tick, UserId};
 use crate::stepper::{BodySetup, ForceStepper, FrameStep, Hold};
@@ -26,6 +26,16 @@ pub enum Repair {
     Compensate,
 }
 
+/// What a grab did in a step.
+#[derive(Debug, Clone, Copy, PartialEq)]
+struct Grip {
+    key: GrabKey,
+    /// World axes, N.
+    pull: Vector3<f64>,
+    /// How far the residual flexibility of its patch has flown, body axes, m.
+    flow: Vector3<f64>,
+}
+
 #[derive(Debug, Clone, Default)]
 struct Past {
     tick: Tick,
@@ -33,7 +43,7 @@ struct Past {
     frame: Option<Frame>,
     /// Modal forces of the step, which some integrators carry on.
     force: Vec<f64>,
-    pulls: Vec<(GrabKey, Vector3<f64>)>,
+    pulls: Vec<Grip>,
     used: Vec<(UserId, HeldAt)>,
 }
 
@@ -45,12 +55,13 @@ pub struct PeerBody {
     stepper: ForceStepper,
     forecast: Forecast,
     newmark: Newmark,
+    flow: Option<FlowFilter>,
     repair: Repair,
     tick: Tick,
     state: ModalState,
     /// The rigid frame of a free body.
     frame: Option<Frame>,
-    pulls: Vec<(GrabKey, Vector3<f64>)>,
+    pulls: Vec<Grip>,
     past: Vec<Past>,
     held: Vec<(UserId, HeldAt)>,
     blend: Blend,
@@ -72,7 +83,7 @@ impl PeerBody {
         blend_ticks: u16,
     ) -> Result<Self, StreamError> {
         let stepper = ForceStepper::new(model.clone(), setup, model.mode_count(), h)?;
-        let modes = stepper.modes();
+        let rest = stepper.at_rest();
         let (beta, gamma) = setup.integrator.newmark().unwrap_or((0.25, 0.5));
         let frame = model.is_free().then(|| Frame::at_rest(&model));
         let mut made = Self {
@@ -84,15 +95,16 @@ impl PeerBody {
             model,
             stepper,
             forecast: Forecast::new(h),
+            flow: setup.relaxation.map(|r| FlowFilter::new(r, &Newmark { h, beta, gamma }, WINDOW)),
             newmark: Newmark { h, beta, gamma },
             repair,
             tick: 0,
-            state: ModalState::zero(modes),
+            state: rest.clone(),
             pulls: Vec::new(),
             past: vec![Past::default(); WINDOW],
             held: Vec::new(),
             blend: Blend::new(h, blend_ticks),
-            shown: ModalState::zero(modes),
+            shown: rest,
             grabs: Vec::new(),
             restepped: 0,
         };
@@ -140,9 +152,9 @@ impl PeerBody {
 
     /// The checksum's value of a tick that is still remembered, and the size that it is compared by.
     pub(crate) fn check(&self, tick: Tick) -> Option<(f64, f64)> {
-        let q = &self.past(tick)?.q;
-        let mut size = q.iter().map(|q| q * q).sum::<f64>();
-        let mut sum = projection(tick, q);
+        let state = self.past(tick)?;
+        let mut size = state.q.iter().chain(&state.z).map(|q| q * q).sum::<f64>();
+        let mut sum = checksum(tick, state);
         if let Some(pose) = self.past_pose(tick) {
             // Place and turn in the units of the coordinates.
             let (mass, span) = (self.model.mass().sqrt(), self.model.size());
@@ -150,7 +162,7 @@ impl PeerBody {
             let turn = pose.rotation.map(|x| x * sign);
             let all: Vec<f64> = pose.position.iter().chain(&turn).map(|x| x * mass).collect();
             size += all.iter().map(|x| x * x).sum::<f64>();
-            sum += projection(!tick, &all);
+            sum += projection(tick ^ 1, &all);
         }
         Some((sum, size.sqrt()))
     }
@@ -175,7 +187,7 @@ impl PeerBody {
     pub(crate) fn reactions_at(&self, tick: Tick) -> Option<Vec<(u16, [f64; 3])>> {
         self.past(tick)?;
         let past = &self.past[(tick % WINDOW as u64) as usize];
-        Some(past.pulls.iter().map(|(key, pull)| (key.user.0, (-pull).into())).collect())
+        Some(past.pulls.iter().map(|g| (g.key.user.0, (-g.pull).into())).collect())
     }
 
     pub(crate) fn export(&self, tick: Tick) -> Option<PeerBodyState> {
@@ -185,6 +197,7 @@ impl PeerBody {
             q: past.state.q.clone(),
             v: past.state.v.clone(),
             a: past.state.a.clone(),
+            z: past.state.z.clone(),
             force: past.force.clone(),
             frame: past.frame.map(|f| PeerFrame {
                 center: f.center(),
@@ -192,13 +205,17 @@ impl PeerBody {
                 velocity: f.velocity(),
                 spin: f.spin(),
             }),
-            pulls: past.pulls.iter().map(|(k, p)| (k.user.0, k.grab, (*p).into())).collect(),
+            pulls: past
+                .pulls
+                .iter()
+                .map(|g| (g.key.user.0, g.key.grab, g.pull.into(), g.flow.into()))
+                .collect(),
         })
     }
 
     /// Takes a state over and steps on from it to the tick reached.
     pub(crate) fn import(&mut self, tick: Tick, to: Tick, state: &PeerBodyState, inputs: &InputLog) -> bool {
-        if state.q.len() != self.state.modes() {
+        if state.q.len() != self.state.modes() || state.z.len() != self.state.z.len() {
             return false;
         }
         let told = state
@@ -210,8 +227,13 @@ impl PeerBody {
         }
         let before = (self.state.clone(), self.frame);
         self.frame = told;
-        self.state = ModalState { q: state.q.clone(), v: state.v.clone(), a: state.a.clone() };
-        let pull = |p: &(u16, u16, [f64; 3])| (GrabKey { user: UserId(p.0), grab: p.1 }, Vector3::from(p.2));
+        self.state =
+            ModalState { q: state.q.clone(), v: state.v.clone(), a: state.a.clone(), z: state.z.clone() };
+        let pull = |p: &(u16, u16, [f64; 3], [f64; 3])| Grip {
+            key: GrabKey { user: UserId(p.0), grab: p.1 },
+            pull: p.2.into(),
+            flow: p.3.into(),
+        };
         self.pulls = state.pulls.iter().map(pull).collect();
         let fresh = self.tick == 0;
         self.tick = tick;
@@ -293,10 +315,14 @@ impl PeerBody {
             Self::press(&mut self.stepper, &mut without, &mut here, &mut pulls, &used);
             self.stepper.set_last_force(&now);
             let (to_q, to_v) = self.newmark.response(self.tick - tick);
+            let to_z = self.flow.as_ref().map_or(0.0, |flow| flow.response(self.tick - tick));
             for k in 0..self.state.modes() {
                 let da = with.a[k] - without.a[k];
                 self.state.q[k] += to_q * da;
                 self.state.v[k] += to_v * da;
+                if let Some(z) = self.state.z.get_mut(k) {
+                    *z += to_z * da;
+                }
             }
             if let (Some(frame), Some(there), Some(here)) = (self.frame, there, here) {
                 self.frame = self.moved(&frame, &there, &here, (self.tick - tick) as f64 * self.h);
@@ -336,24 +362,28 @@ impl PeerBody {
         stepper: &mut ForceStepper,
         state: &mut ModalState,
         frame: &mut Option<Frame>,
-        pulls: &mut Vec<(GrabKey, Vector3<f64>)>,
+        pulls: &mut Vec<Grip>,
         held: &[(UserId, HeldAt)],
     ) {
         let mut holds = Vec::with_capacity(held.len());
-        pulls.clear();
+        let mut grips = Vec::with_capacity(held.len());
         for (user, g) in held {
             if stepper.knows(g.vertex, g.radius) {
+                let key = g.key(*user);
+                let flow = pulls.iter().find(|p| p.key == key).map_or_else(Vector3::zeros, |p| p.flow);
                 let config = GrabConfig::default();
-                holds.push(Hold::hand(g.vertex, g.radius, g.target, Vector3::zeros(), config));
-                pulls.push((g.key(*user), Vector3::zeros()));
+                let hand = Hold::hand(g.vertex, g.radius, g.target, Vector3::zeros(), config);
+                holds.push(Hold { flow, ..hand });
+                grips.push(Grip { key, pull: Vector3::zeros(), flow });
             }
         }
         let zero = Vector3::zeros();
         let frame = frame.as_mut().map(|frame| FrameStep { frame, force: zero, torque: zero });
         stepper.step_held(state, &mut holds, &[], frame);
-        for (pull, hold) in pulls.iter_mut().zip(&holds) {
-            pull.1 = hold.pull;
+        for (grip, hold) in grips.iter_mut().zip(&holds) {
+            (grip.pull, grip.flow) = (hold.pull, hold.flow);
         }
+        *pulls = grips;
     }
 
     fn remember(&mut self) {
@@ -387,7 +417,7 @@ impl PeerBody {
         self.grabs.clear();
         for (user, g) in &self.held {
             let key = g.key(*user);
-            let pull = self.pulls.iter().find(|p| p.0 == key).map_or_else(Vector3::zeros, |p| p.1);
+            let pull = self.pulls.iter().find(|p| p.key == key).map_or_else(Vector3::zeros, |p| p.pull);
             self.grabs.push(GrabState {
                 key,
                 vertex: g.vertex,

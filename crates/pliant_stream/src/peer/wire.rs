@@ -233,12 +233,15 @@ pub struct PeerBodyState {
     pub v: Vec<f64>,
     /// Accelerations.
     pub a: Vec<f64>,
+    /// Flows of a body that relaxes; empty for an elastic one.
+    pub z: Vec<f64>,
     /// Modal forces of the last step, as many as coordinates.
     pub force: Vec<f64>,
     /// The rigid frame of a free body.
     pub frame: Option<PeerFrame>,
-    /// Pulls of the last step, which the next one begins with: user, grab, force.
-    pub pulls: Vec<(u16, u16, [f64; 3])>,
+    /// Pulls of the last step: user, grab, force (N, world axes), and how far the residual flexibility of the patch has flown
+    /// (m, body axes).
+    pub pulls: Vec<(u16, u16, [f64; 3], [f64; 3])>,
 }
 
 /// Reliable, between peers.
@@ -317,7 +320,9 @@ impl PeerMessage {
                         && in_range(&b.v)
                         && frame
                         && b.a.iter().chain(&b.force).all(|x| x.abs() < 1e15)
-                        && b.pulls.iter().all(|p| in_range(&p.2));
+                        && in_range(&b.z)
+                        && (b.z.is_empty() || b.z.len() == modes)
+                        && b.pulls.iter().all(|p| in_range(&p.2) && in_range(&p.3));
                     if !(equal && sane) {
                         return invalid("state", "a number or length out of range".into(), "finite numbers");
                     }

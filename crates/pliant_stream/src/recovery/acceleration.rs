@@ -1,13 +1,17 @@
 //! Policies that integrate a stream of accelerations: [`super::Policy::None`] and the paper's.
 
+use pliant_modal::Relaxation;
+
 use super::{HISTORY, History, Predict, Recovery};
-use crate::newmark::Newmark;
+use crate::newmark::{FlowFilter, Newmark};
 use crate::state::{ModalState, Tick};
 
 /// Integrates the accelerations; predicts those that are missing; takes their error out exactly when they come.
 #[derive(Debug)]
 pub struct AccelerationDriven {
     newmark: Newmark,
+    /// How the flow follows the coordinates, where the body relaxes.
+    flow: Option<FlowFilter>,
     predict: Predict,
     compensate: bool,
     tick: Tick,
@@ -25,6 +29,7 @@ impl AccelerationDriven {
     pub fn new(newmark: Newmark, predict: Predict, compensate: bool, modes: usize) -> Self {
         Self {
             newmark,
+            flow: None,
             predict,
             compensate,
             tick: 0,
@@ -34,6 +39,15 @@ impl AccelerationDriven {
             anchored: vec![0; modes],
             next: vec![0.0; modes],
         }
+    }
+
+    /// The same for a body that relaxes: its flow is filtered out of its coordinates.
+    pub fn relaxing(mut self, relaxation: Option<Relaxation>) -> Self {
+        self.flow = relaxation.map(|r| FlowFilter::new(r, &self.newmark, HISTORY));
+        if self.flow.is_some() {
+            self.state = ModalState::zero_relaxing(self.state.modes());
+        }
+        self
     }
 
     fn used(&self, tick: Tick) -> Option<&Vec<f64>> {
@@ -60,13 +74,7 @@ impl AccelerationDriven {
 
 impl Recovery for AccelerationDriven {
     fn restart(&mut self, tick: Tick, state: &ModalState, _load: &[f64]) {
-        let modes = self.state.modes();
-        for (mine, theirs) in
-            [(&mut self.state.q, &state.q), (&mut self.state.v, &state.v), (&mut self.state.a, &state.a)]
-        {
-            mine.clear();
-            mine.extend(theirs.iter().copied().chain(std::iter::repeat(0.0)).take(modes));
-        }
+        self.state.fill_from(state.parts());
         self.tick = tick;
         self.first = tick;
         self.anchored.fill(tick);
@@ -79,7 +87,13 @@ impl Recovery for AccelerationDriven {
             Some(data) => self.next.copy_from_slice(&data.accelerations),
             None => self.predict(tick),
         }
+        if let Some(flow) = &self.flow {
+            flow.begin(&mut self.state);
+        }
         self.newmark.advance(&mut self.state, &self.next);
+        if let Some(flow) = &self.flow {
+            flow.finish(&mut self.state);
+        }
         self.tick = tick;
         self.used[(tick % HISTORY as u64) as usize].clone_from(&self.next);
     }
@@ -95,6 +109,7 @@ impl Recovery for AccelerationDriven {
             return false;
         }
         let (to_q, to_v) = self.newmark.response(self.tick - from);
+        let to_z = self.flow.as_ref().map_or(0.0, |flow| flow.response(self.tick - from));
         let used = &mut self.used[(from % HISTORY as u64) as usize];
         for (k, (used, told)) in used.iter_mut().zip(&data.accelerations).enumerate() {
             if from <= self.anchored[k] {
@@ -103,6 +118,9 @@ impl Recovery for AccelerationDriven {
             let da = told - *used;
             self.state.q[k] += to_q * da;
             self.state.v[k] += to_v * da;
+            if let Some(z) = self.state.z.get_mut(k) {
+                *z += to_z * da;
+            }
             if from == self.tick {
                 self.state.a[k] += da;
             }
@@ -116,11 +134,14 @@ impl Recovery for AccelerationDriven {
             // An absolute value of the past cannot be carried to the present by a stream of accelerations with gaps.
             return;
         }
-        let Some(slice) = history.known(tick).and_then(|d| d.slice.as_ref()) else { return };
+        let Some(data) = history.known(tick) else { return };
         let modes = self.anchored.len();
-        for e in slice.entries().filter(|e| e.mode < modes) {
+        for e in data.slice.iter().filter(|e| e.mode < modes) {
             self.state.q[e.mode] = e.q;
             self.state.v[e.mode] = e.v;
+            if let Some(z) = self.state.z.get_mut(e.mode) {
+                *z = e.z;
+            }
             self.anchored[e.mode] = tick;
         }
     }

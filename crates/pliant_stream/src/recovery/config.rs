@@ -52,7 +52,7 @@ pub enum Playout {
 pub struct RecoveryConfig {
     /// The numbers. Default: [`Policy::ForceDriven`], 6 ticks of blend (150 ms at 40 Hz).
     pub policy: Policy,
-    /// How accelerations are written, where the policy streams them. Default: [`AccelerationCoding::Scaled16`].
+    /// How accelerations are written, where the policy streams them. Default: [`AccelerationCoding::Visible`].
     pub coding: AccelerationCoding,
     /// Earlier ticks that each frame repeats, 0..=7. Default: 3.
     pub repeats: u8,
@@ -77,7 +77,7 @@ impl Default for RecoveryConfig {
     fn default() -> Self {
         Self {
             policy: Policy::ForceDriven { blend_ticks: 6 },
-            coding: AccelerationCoding::Scaled16,
+            coding: AccelerationCoding::Visible,
             repeats: 3,
             refresh: 15,
             nack: true,

@@ -33,13 +33,14 @@ impl ForceDriven {
     /// At rest at tick 0; hands that are not heard of go where the forecast has them.
     pub fn new(stepper: ForceStepper, forecast: Forecast) -> Self {
         let modes = stepper.modes();
+        let rest = stepper.at_rest();
         Self {
             free: stepper.is_free(),
             h: stepper.h(),
             stepper,
             tick: 0,
             first: 0,
-            state: ModalState::zero(modes),
+            state: rest,
             load: vec![0.0; modes],
             past: vec![Stepped::default(); HISTORY],
             grabs: Vec::new(),
@@ -71,11 +72,14 @@ impl ForceDriven {
     }
 
     fn take_slice(&mut self, tick: Tick, history: &History) {
-        let Some(slice) = history.known(tick).and_then(|d| d.slice.as_ref()) else { return };
+        let Some(data) = history.known(tick) else { return };
         let modes = self.load.len();
-        for e in slice.entries().filter(|e| e.mode < modes) {
+        for e in data.slice.iter().filter(|e| e.mode < modes) {
             self.state.q[e.mode] = e.q;
             self.state.v[e.mode] = e.v;
+            if let Some(z) = self.state.z.get_mut(e.mode) {
+                *z = e.z;
+            }
             self.load[e.mode] = e.load;
         }
     }
@@ -88,9 +92,7 @@ impl Recovery for ForceDriven {
             mine.clear();
             mine.extend(theirs.iter().copied().chain(std::iter::repeat(0.0)).take(modes));
         };
-        fill(&mut self.state.q, &state.q);
-        fill(&mut self.state.v, &state.v);
-        fill(&mut self.state.a, &state.a);
+        self.state.fill_from(state.parts());
         fill(&mut self.load, load);
         self.stepper.restart();
         (self.tick, self.first) = (tick, tick);

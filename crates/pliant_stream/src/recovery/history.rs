@@ -1,7 +1,8 @@
 //! What has arrived, tick by tick: a ring of fixed length.
 
+use crate::quanta::Quanta;
 use crate::state::{GrabKey, GrabState, MAX_GRABS, Pose, Tick};
-use crate::wire::{Frame, FrameGrab, Slice};
+use crate::wire::{Frame, FrameGrab, SliceEntry};
 
 use nalgebra::{UnitQuaternion, Vector3};
 
@@ -31,9 +32,12 @@ pub struct TickData {
     /// Rigid frame of a free body.
     pub pose: Option<Pose>,
     /// A part of the absolute state.
-    pub slice: Option<Slice>,
+    pub slice: Vec<SliceEntry>,
     /// Checksum of the state.
     pub check: Option<f32>,
+    /// Grabs of the parts of this tick that have come, and which parts those are.
+    pending: Vec<FrameGrab>,
+    parts: u32,
 }
 
 /// The last [`HISTORY`] ticks.
@@ -100,8 +104,10 @@ impl History {
             slot.accelerations.clear();
             slot.grabs.clear();
             slot.pose = None;
-            slot.slice = None;
+            slot.slice.clear();
             slot.check = None;
+            slot.pending.clear();
+            slot.parts = 0;
         }
         slot
     }
@@ -112,7 +118,8 @@ impl History {
 
     /// Takes a frame and what it repeats. Calls `new(tick, first)` for each tick that was not known before, and with
     /// `first` false for a frame that completes a tick known from a repeat.
-    pub fn take(&mut self, frame: &Frame, modes: usize, mut new: impl FnMut(Tick, bool)) {
+    pub fn take(&mut self, frame: &Frame, quanta: &Quanta, mut new: impl FnMut(Tick, bool)) {
+        let modes = quanta.modes();
         self.highest = self.highest.max(frame.tick);
         for repeat in &frame.repeats {
             let Some(tick) = frame.tick.checked_sub(u64::from(repeat.back)) else { continue };
@@ -120,6 +127,7 @@ impl History {
                 continue;
             }
             let slot = self.slot(tick);
+            slot.grabs.clear();
             slot.grabs.extend(repeat.grabs.iter().filter_map(|r| {
                 let grab = frame.grabs.get(usize::from(r.index))?;
                 let state = GrabState { reaction: r.reaction, ..grab.state };
@@ -127,7 +135,7 @@ impl History {
             }));
             slot.grabs.truncate(MAX_GRABS);
             if let Some(a) = &repeat.accelerations {
-                slot.accelerations.extend((0..modes).map(|k| a.get(k)));
+                slot.accelerations.extend((0..modes).map(|k| a.get(k, quanta)));
             }
             slot.known = true;
             new(tick, true);
@@ -137,15 +145,29 @@ impl History {
         }
         let first = self.known(frame.tick).is_none();
         let slot = self.slot(frame.tick);
-        slot.grabs.clear();
-        slot.grabs.extend(frame.grabs.iter().filter(|g| g.held));
-        slot.accelerations.clear();
-        if let Some(a) = &frame.accelerations {
-            slot.accelerations.extend((0..modes).map(|k| a.get(k)));
+        let (which, of) = frame.part.unwrap_or((0, 1));
+        if slot.parts >> which & 1 == 1 {
+            return;
         }
-        slot.pose = frame.pose;
-        slot.slice.clone_from(&frame.slice);
-        slot.check = frame.check;
+        slot.parts |= 1 << which;
+        slot.pending.extend(frame.grabs.iter().filter(|g| g.held));
+        if which == 0 {
+            // Everything but grabs is in the first part.
+            if let Some(a) = &frame.accelerations {
+                slot.accelerations.clear();
+                slot.accelerations.extend((0..modes).map(|k| a.get(k, quanta)));
+            }
+            slot.pose = frame.pose;
+            slot.slice.clear();
+            slot.slice.extend(frame.slice.iter().flat_map(|s| s.entries(quanta)));
+            slot.check = frame.check;
+        }
+        if slot.parts.count_ones() < u32::from(of) {
+            return;
+        }
+        slot.pending.truncate(MAX_GRABS);
+        std::mem::swap(&mut slot.grabs, &mut slot.pending);
+        slot.pending.clear();
         slot.known = true;
         slot.head = true;
         new(frame.tick, first);

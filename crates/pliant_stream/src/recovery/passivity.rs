@@ -12,6 +12,8 @@
 //! cut to the largest `s` that it does suffice for. (Time-domain passivity after Hannaford and Ryu 2002, with the
 //! correction as the port.)
 
+use pliant_modal::Relaxation;
+
 use crate::state::ModalState;
 
 /// The tank holds at most this share of the largest energy that the body has had.
@@ -22,6 +24,8 @@ const TANK: f64 = 0.05;
 pub struct PassivityGuard {
     stiffness: Vec<f64>,
     damping: Vec<f64>,
+    /// Where the body relaxes: the share of the stiffness that does, and how fast, 1/s.
+    relaxing: (f64, f64),
     h: f64,
     level: f64,
     largest: f64,
@@ -37,6 +41,7 @@ impl PassivityGuard {
         Self {
             stiffness: omega.iter().map(|w| w * w).collect(),
             damping: damping.to_vec(),
+            relaxing: (0.0, 0.0),
             h,
             level: 0.0,
             largest: 0.0,
@@ -47,10 +52,30 @@ impl PassivityGuard {
         }
     }
 
-    /// Kinetic and elastic energy of a modal state, J.
+    /// The same for a body that relaxes.
+    pub fn relaxing(mut self, relaxation: Option<Relaxation>) -> Self {
+        self.relaxing = relaxation.map_or((0.0, 0.0), |r| (r.ratio, 1.0 / r.time));
+        self
+    }
+
+    /// Kinetic and elastic energy of a modal state, J; both springs of a mode that relaxes.
     pub fn energy(&self, state: &ModalState) -> f64 {
         let modes = state.q.iter().zip(&state.v).zip(&self.stiffness);
-        0.5 * modes.map(|((q, v), k)| v * v + k * q * q).sum::<f64>()
+        let elastic = 0.5 * modes.map(|((q, v), k)| v * v + k * q * q).sum::<f64>();
+        if state.z.is_empty() {
+            return elastic;
+        }
+        let flown = state.q.iter().zip(&state.z).zip(&self.stiffness);
+        elastic + 0.5 * self.relaxing.0 * flown.map(|((q, z), k)| k * z * (z - 2.0 * q)).sum::<f64>()
+    }
+
+    /// What the body loses in a step, J.
+    fn lost(&self, state: &ModalState) -> f64 {
+        let viscous: f64 = self.damping.iter().zip(&state.v).map(|(c, v)| c * v * v).sum();
+        let (ratio, rate) = self.relaxing;
+        let flows = state.q.iter().zip(&state.z).zip(&self.stiffness);
+        let flowing: f64 = flows.map(|((q, z), k)| k * (q - z) * (q - z)).sum();
+        self.h * (viscous + ratio * rate * flowing)
     }
 
     /// A correction moved the hidden state under the shown one: no energy was put in, and the excess is what it is now.
@@ -60,7 +85,7 @@ impl PassivityGuard {
 
     /// A tick has passed: the share of the offset `shown - hidden` that may stay, 0 to 1.
     pub fn admit(&mut self, hidden: &ModalState, shown: &ModalState) -> f64 {
-        let lost: f64 = self.h * self.damping.iter().zip(&hidden.v).map(|(c, v)| c * v * v).sum::<f64>();
+        let lost = self.lost(hidden);
         self.dissipated += lost;
         self.largest = self.largest.max(self.energy(hidden));
         let cap = TANK * self.largest;
@@ -68,7 +93,8 @@ impl PassivityGuard {
         let (mut linear, mut square) = (0.0, 0.0);
         for (k, stiffness) in self.stiffness.iter().enumerate().take(hidden.modes()) {
             let (oq, ov) = (shown.q[k] - hidden.q[k], shown.v[k] - hidden.v[k]);
-            linear += hidden.v[k] * ov + stiffness * hidden.q[k] * oq;
+            let stretch = hidden.q[k] - self.relaxing.0 * hidden.z.get(k).copied().unwrap_or(0.0);
+            linear += hidden.v[k] * ov + stiffness * stretch * oq;
             square += 0.5 * (ov * ov + stiffness * oq * oq);
         }
         let allowed = self.excess + self.level;
@@ -130,12 +156,12 @@ mod tests {
             let hidden = ModalState {
                 q: (0..2).map(|k| 0.1 * (omega[k] * t).sin() * (-0.05 * t).exp()).collect(),
                 v: (0..2).map(|k| 0.1 * omega[k] * (omega[k] * t).cos() * (-0.05 * t).exp()).collect(),
-                a: vec![0.0; 2],
+                ..ModalState::zero(2)
             };
             let with = |oq: &[f64; 2], ov: &[f64; 2]| ModalState {
                 q: (0..2).map(|k| hidden.q[k] + oq[k]).collect(),
                 v: (0..2).map(|k| hidden.v[k] + ov[k]).collect(),
-                a: vec![0.0; 2],
+                ..ModalState::zero(2)
             };
             if n % 7 == 0 {
                 for k in 0..2 {

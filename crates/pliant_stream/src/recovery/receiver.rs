@@ -9,8 +9,9 @@ use super::{
 };
 use super::{Forecast, PassivityGuard, PoseBlend};
 use crate::StreamError;
-use crate::check::projection;
+use crate::check::checksum;
 use crate::newmark::Newmark;
+use crate::quanta::Quanta;
 use crate::state::{GrabState, ModalState, Pose, Tick};
 use crate::stepper::{BodySetup, ForceStepper};
 use crate::wire::{Frame, SnapshotBytes};
@@ -58,6 +59,7 @@ pub struct Receiver {
     setup: BodySetup,
     stepper: ForceStepper,
     history: History,
+    quanta: Quanta,
     policy: Box<dyn Recovery>,
     blend: Blend,
     guard: Option<PassivityGuard>,
@@ -106,11 +108,12 @@ impl Receiver {
             return Err(StreamError::Length { what: "snapshot", found: snapshot.q.len(), expected: modes });
         }
         let stepper = || ForceStepper::new(model.clone(), &setup, modes, newmark.h);
+        let integrating = |predict, compensate| {
+            AccelerationDriven::new(newmark, predict, compensate, modes).relaxing(setup.relaxation)
+        };
         let (policy, blend_ticks): (Box<dyn Recovery>, u16) = match config.policy {
-            Policy::None => (Box::new(AccelerationDriven::new(newmark, Predict::Zero, false, modes)), 1),
-            Policy::Paper { predict, blend_ticks } => {
-                (Box::new(AccelerationDriven::new(newmark, predict, true, modes)), blend_ticks)
-            }
+            Policy::None => (Box::new(integrating(Predict::Zero, false)), 1),
+            Policy::Paper { predict, blend_ticks } => (Box::new(integrating(predict, true)), blend_ticks),
             Policy::ForceDriven { blend_ticks } => {
                 (Box::new(ForceDriven::new(stepper()?, Forecast::new(newmark.h))), blend_ticks)
             }
@@ -118,17 +121,19 @@ impl Receiver {
         let guard = config.passive.then(|| {
             let damping: Vec<f64> =
                 model.damping()[..modes].iter().map(|c| c * setup.damping_scale).collect();
-            PassivityGuard::new(&model.omega()[..modes], &damping, newmark.h)
+            PassivityGuard::new(&model.omega()[..modes], &damping, newmark.h).relaxing(setup.relaxation)
         });
+        let rest = stepper()?.at_rest();
         let mut receiver = Self {
             setup,
             stepper: stepper()?,
             history: History::new(snapshot.tick),
+            quanta: Quanta::new(&model, modes, &newmark),
             policy,
             blend: Blend::new(newmark.h, blend_ticks),
             guard,
             tick: snapshot.tick,
-            shown: ModalState::zero(modes),
+            shown: rest.clone(),
             grabs: Vec::new(),
             frame: None,
             pose: None,
@@ -136,7 +141,7 @@ impl Receiver {
             free: model.is_free(),
             counts: RepairCounts::default(),
             mismatched: 0,
-            before: ModalState::zero(modes),
+            before: rest,
             forecast: Forecast::new(newmark.h),
             h: newmark.h,
             blend_ticks,
@@ -216,8 +221,7 @@ impl Receiver {
         let (mut earliest, mut late) = (Tick::MAX, [(0, false); 8]);
         let mut late_count = 0;
         let tick = self.tick;
-        let modes = self.shown.modes();
-        self.history.take(frame, modes, |t, first| {
+        self.history.take(frame, &self.quanta, |t, first| {
             if t > tick {
                 arrival.in_time += u32::from(first);
             } else {
@@ -266,7 +270,8 @@ impl Receiver {
         }
         self.policy.advance(tick, &self.history);
         self.blend.advance();
-        if !self.policy.driven_by_reactions() && self.history.head(tick).is_some_and(|d| d.slice.is_some()) {
+        if !self.policy.driven_by_reactions() && self.history.head(tick).is_some_and(|d| !d.slice.is_empty())
+        {
             self.remember_before();
             self.policy.refresh(tick, &self.history);
             self.blend_from_before();
@@ -329,7 +334,11 @@ impl Receiver {
             return;
         }
         self.before.copy_from(self.policy.hidden());
-        let rest = ModalState { q: self.before.q.clone(), ..ModalState::zero(self.before.modes()) };
+        let rest = ModalState {
+            q: self.before.q.clone(),
+            z: self.before.z.clone(),
+            ..ModalState::zero(self.before.modes())
+        };
         self.policy.restart(tick, &rest, &[]);
         self.tick = tick;
         self.show();
@@ -408,8 +417,8 @@ impl Receiver {
     fn compare_check(&mut self) {
         let Some(told) = self.history.head(self.tick).and_then(|d| d.check) else { return };
         let state = self.policy.hidden();
-        let size = state.q.iter().map(|q| q * q).sum::<f64>().sqrt();
-        let own = projection(self.tick, &state.q);
+        let size = state.q.iter().chain(&state.z).map(|q| q * q).sum::<f64>().sqrt();
+        let own = checksum(self.tick, state);
         if (own - f64::from(told)).abs() <= CHECK_TOLERANCE * size + 1e-7 {
             self.mismatched = 0;
         } else {
@@ -420,5 +429,5 @@ impl Receiver {
 }
 
 fn state_of(snapshot: &SnapshotBytes) -> ModalState {
-    ModalState { q: snapshot.q.clone(), v: snapshot.v.clone(), a: snapshot.a.clone() }
+    ModalState { q: snapshot.q.clone(), v: snapshot.v.clone(), a: snapshot.a.clone(), z: snapshot.z.clone() }
 }

@@ -91,7 +91,8 @@ impl HostSession {
     /// Adds a body to the session; guests learn of it at once.
     ///
     /// # Errors
-    /// [`StreamError::Full`] beyond 1,024 bodies; [`StreamError::Config`] for a name over 64 bytes or a number in use.
+    /// [`StreamError::Full`] beyond 1,024 bodies; [`StreamError::Config`] for a name over 64 bytes or a number in use;
+    /// [`StreamError::Model`] for a relaxation out of range.
     pub fn add_body(
         &mut self,
         body: BodyId,
@@ -111,6 +112,9 @@ impl HostSession {
         }
         if model.mode_count() > MAX_MODES {
             return fail("modes", model.mode_count().to_string(), "at most 4096");
+        }
+        if let Some(Err(e)) = setup.relaxation.map(|r| r.check()) {
+            return Err(StreamError::Model(e.to_string()));
         }
         let entry = HostBody {
             name: name.to_owned(),
@@ -474,6 +478,7 @@ impl HostSession {
             warp: b.setup.warp,
             damping_scale: b.setup.damping_scale,
             gravity: b.setup.gravity,
+            relaxation: b.setup.relaxation.map(|r| (r.ratio, r.time)),
         };
         p.send_message(&HostMessage::BodyAdded(info), &mut self.out);
         if !p.cached.contains(&b.hash) && !p.transfers.iter().any(|t| t.hash == b.hash) {
@@ -500,7 +505,7 @@ impl HostSession {
             p.resends.pop_front();
             let Some(b) = self.bodies.get(&body) else { continue };
             let Some(key) = stream_key(p, b) else { continue };
-            if let Some(bytes) = b.streams.get(&key).and_then(|e| e.resend(tick)) {
+            for bytes in b.streams.get(&key).into_iter().flat_map(|e| e.resend(tick)) {
                 p.send_frame(&bytes, &mut self.out);
             }
         }

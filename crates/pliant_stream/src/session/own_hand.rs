@@ -16,7 +16,7 @@ use pliant_modal::{Frame, GrabConfig, RigidMotion};
 
 use crate::recovery::{Blend, Forecast, PoseBlend, Receiver};
 use crate::state::{GrabKey, ModalState, Pose, Tick, UserId};
-use crate::stepper::{ForceStepper, FrameStep, Hold};
+use crate::stepper::{ForceStepper, FrameStep, Hold, inverse_rotation};
 
 /// Targets remembered, and so the largest lead, ticks.
 const REMEMBERED: usize = 64;
@@ -38,6 +38,9 @@ struct OwnGrab {
     reaction: [f64; 3],
     /// What the reaction would have become, had nothing new been learnt.
     would: [f64; 3],
+    /// How far the residual flexibility under the hand has flown, body axes, m: at the confirmed tick, and in the copy.
+    flow: Vector3<f64>,
+    flowing: Vector3<f64>,
     offset: [f64; 3],
 }
 
@@ -70,7 +73,7 @@ pub struct OwnHand {
 
 impl OwnHand {
     pub(crate) fn new(stepper: ForceStepper, h: f64, blend_ticks: u16) -> Self {
-        let modes = stepper.modes();
+        let rest = stepper.at_rest();
         Self {
             stepper,
             grabs: Vec::new(),
@@ -78,9 +81,9 @@ impl OwnHand {
             votes: 0,
             tick: 0,
             active: false,
-            state: ModalState::zero(modes),
-            expected: ModalState::zero(modes),
-            shown: ModalState::zero(modes),
+            state: rest.clone(),
+            expected: rest.clone(),
+            shown: rest,
             blend: Blend::new(h, blend_ticks),
             frame: None,
             last_frame: None,
@@ -144,6 +147,8 @@ impl OwnHand {
             past: VecDeque::with_capacity(REMEMBERED),
             reaction: [0.0; 3],
             would: [0.0; 3],
+            flow: Vector3::zeros(),
+            flowing: Vector3::zeros(),
             offset: [0.0; 3],
         });
     }
@@ -170,6 +175,7 @@ impl OwnHand {
             return;
         }
         self.learn_push(receiver, confirmed_frame);
+        self.learn_flow(receiver, user);
         for g in &mut self.grabs {
             if g.past.len() >= REMEMBERED {
                 g.past.pop_front();
@@ -212,6 +218,7 @@ impl OwnHand {
         state.copy_from(receiver.hidden());
         self.stepper.set_last_force(receiver.last_force());
         let mut frame = confirmed_frame;
+        self.grabs.iter_mut().for_each(|g| g.flowing = g.flow);
         for j in 1..=self.lead {
             self.one_step(&mut state, &mut frame, receiver, user, j);
         }
@@ -264,6 +271,20 @@ impl OwnHand {
         self.push.1 += LEARN * (turning - self.push.1);
     }
 
+    /// Lets the flow under the own hands go on by the confirmed pulls, where the body relaxes.
+    fn learn_flow(&mut self, receiver: &Receiver, user: UserId) {
+        if receiver.setup().relaxation.is_none() {
+            return;
+        }
+        let back = receiver.frame().map_or(Matrix3::identity(), |p| inverse_rotation(p.rotation));
+        for g in &mut self.grabs {
+            let key = GrabKey { user, grab: g.grab };
+            let Some(told) = receiver.history().grab(key, receiver.tick(), &self.forecast) else { continue };
+            let pull = -(back * Vector3::from(told.state.reaction));
+            g.flow = self.stepper.relax(g.vertex, g.radius, g.flow, pull);
+        }
+    }
+
     /// Steps to `j` ticks after the confirmed one, and leaves the own reactions in the grabs.
     fn one_step(
         &mut self,
@@ -301,7 +322,8 @@ impl OwnHand {
             let before = at.and_then(|i| i.checked_sub(1)).and_then(|i| g.past.get(i).copied().flatten());
             let velocity =
                 before.map_or_else(Vector3::zeros, |b| (Vector3::from(target) - Vector3::from(b)) / self.h);
-            holds.push(Hold::hand(g.vertex, g.radius, target, velocity, g.hold));
+            let hand = Hold::hand(g.vertex, g.radius, target, velocity, g.hold);
+            holds.push(Hold { flow: g.flowing, ..hand });
             own.push(index);
         }
         let (force, torque) = self.push;
@@ -309,6 +331,7 @@ impl OwnHand {
         self.stepper.step_held(state, &mut holds, receiver.load(), frame);
         for (hold, &index) in holds[others.min(holds.len())..].iter().zip(&own) {
             self.grabs[index].reaction = (-hold.pull).into();
+            self.grabs[index].flowing = hold.flow;
         }
         self.own = own;
         self.holds = holds;

@@ -1,13 +1,12 @@
 //! From a step of the host to the frames of all its guests.
 
 use std::collections::{BTreeMap, BTreeSet};
-use std::sync::Arc;
 use std::time::Duration;
 
 use super::EndReason;
 use super::host::{HostBody, HostSession, StreamKey, stream_key};
 use crate::StreamError;
-use crate::encoder::Encoder;
+use crate::encoder::{Encoded, Encoder};
 use crate::state::{BodyId, MAX_GRABS, PeerId, TICK_LIMIT, TickState, in_range};
 use crate::wire::WIDE_LIMIT;
 
@@ -17,7 +16,7 @@ const REMINDER: Duration = Duration::from_secs(1);
 /// What goes out to all takers of one kind of stream.
 struct Outgoing {
     /// The frame; none where a snapshot takes its place.
-    frame: Option<Arc<[u8]>>,
+    frame: Option<Encoded>,
     /// All takers need a snapshot.
     anew: bool,
 }
@@ -98,9 +97,9 @@ impl HostSession {
                 continue;
             };
             let Some(p) = self.peers.get_mut(&peer) else { continue };
-            if let Some(bytes) = frame
+            if let Some(encoded) = frame
                 && p.flowing.contains(&body)
-                && !p.send_frame(bytes, &mut self.out)
+                && !encoded.all().all(|bytes| p.send_frame(bytes, &mut self.out))
             {
                 // The path shrank since the key was taken; the next tick has the new size.
                 p.due.insert(body);
@@ -129,6 +128,13 @@ fn check_state(body: &HostBody, state: &TickState<'_>) -> Result<(), StreamError
         if slice.is_empty() || slice.len() > modes {
             return Err(StreamError::Length { what, found: slice.len(), expected: modes });
         }
+    }
+    let flows = if body.setup.relaxation.is_some() { state.q.len() } else { 0 };
+    if state.z.len() != flows {
+        return Err(StreamError::Length { what: "z", found: state.z.len(), expected: flows });
+    }
+    if !in_range(state.z) {
+        return Err(StreamError::NotFinite { what: "z" });
     }
     if !in_range(state.q) {
         return Err(StreamError::NotFinite { what: "q" });

@@ -2,8 +2,10 @@
 
 use serde::{Deserialize, Serialize};
 
-use super::{Reader, Writer};
+use super::bits::{BitReader, BitWriter, WIDTH_BITS, whole, width};
+use super::{Reader, Slice, Writer};
 use crate::StreamError;
+use crate::quanta::Quanta;
 use crate::state::{BodyId, GrabKey, GrabState, MAX_GRABS, MAX_MODES, Pose, Tick, UserId};
 
 const POSE: u8 = 1;
@@ -13,18 +15,21 @@ const RESTING: u8 = 8;
 const CHECK: u8 = 16;
 const RESENT: u8 = 32;
 const DISPLACEMENTS: u8 = 64;
-const KNOWN_FLAGS: u8 = 127;
+const PART: u8 = 128;
 
 /// Bytes of one grab in a frame.
 const GRAB_BYTES: usize = 34;
+/// Most datagrams that one tick of a body may need.
+pub(crate) const MAX_PARTS: u8 = 16;
 /// Most repeats in one frame.
 pub(crate) const MAX_REPEATS: usize = 7;
 
 /// How modal accelerations are written.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, PartialOrd, Ord, Serialize, Deserialize)]
 pub enum AccelerationCoding {
-    /// 16-bit steps of one scale per frame, in a closed loop: 2 bytes a mode. The default.
-    Scaled16,
+    /// Steps that look alike on the surface, in as many bits as each mode needs, in a closed loop; see [`Quanta`]. The
+    /// default.
+    Visible,
     /// 4 bytes a mode.
     F32,
     /// 8 bytes a mode: no rounding, for measurements.
@@ -32,25 +37,28 @@ pub enum AccelerationCoding {
 }
 
 impl AccelerationCoding {
-    /// Bytes that one mode takes.
+    /// Bytes that one mode is reckoned to take.
     pub fn bytes_per_mode(self) -> usize {
         match self {
-            Self::Scaled16 => 2,
+            Self::Visible => 1,
             Self::F32 => 4,
             Self::F64 => 8,
         }
     }
 }
 
+/// Modes that share a width.
+const BLOCK: usize = 8;
+
 /// Modal accelerations as they cross.
 #[derive(Debug, Clone, PartialEq)]
 pub enum Accelerations {
-    /// Value = scale x step.
-    Scaled16 {
-        /// Size of a step.
-        scale: f32,
+    /// Value = unit x the mode's acceleration step (see [`Quanta`]) x whole number.
+    Visible {
+        /// What one step moves the surface by, m.
+        unit: f32,
         /// Whole steps, one a mode.
-        steps: Vec<i16>,
+        steps: Vec<i32>,
     },
     /// Plain.
     F32(Vec<f32>),
@@ -59,13 +67,13 @@ pub enum Accelerations {
 }
 
 impl Accelerations {
-    /// Rounds values to what a coding can carry.
-    pub fn quantise(coding: AccelerationCoding, values: &[f64]) -> Self {
+    /// Rounds values to what a coding can carry; `unit` (m) and `quanta` for [`AccelerationCoding::Visible`].
+    pub fn quantise(coding: AccelerationCoding, values: &[f64], unit: f32, quanta: &Quanta) -> Self {
         match coding {
-            AccelerationCoding::Scaled16 => {
-                let largest = values.iter().fold(0.0_f64, |m, x| m.max(x.abs()));
-                let scale = step_size(largest);
-                Self::Scaled16 { scale, steps: values.iter().map(|&x| to_step(x, scale)).collect() }
+            AccelerationCoding::Visible => {
+                let step =
+                    |(x, p): (&f64, &f64)| if unit > 0.0 { whole(x / (p * f64::from(unit))) } else { 0 };
+                Self::Visible { unit, steps: values.iter().zip(&quanta.acceleration).map(step).collect() }
             }
             AccelerationCoding::F32 => Self::F32(values.iter().map(|&x| x as f32).collect()),
             AccelerationCoding::F64 => Self::F64(values.to_vec()),
@@ -75,18 +83,19 @@ impl Accelerations {
     /// Number of modes.
     pub fn modes(&self) -> usize {
         match self {
-            Self::Scaled16 { steps, .. } => steps.len(),
+            Self::Visible { steps, .. } => steps.len(),
             Self::F32(x) => x.len(),
             Self::F64(x) => x.len(),
         }
     }
 
     /// The value of one mode; zero beyond the last.
-    pub fn get(&self, mode: usize) -> f64 {
+    pub fn get(&self, mode: usize, quanta: &Quanta) -> f64 {
         match self {
-            Self::Scaled16 { scale, steps } => {
-                f64::from(*scale) * f64::from(steps.get(mode).copied().unwrap_or(0))
-            }
+            Self::Visible { unit, steps } => match (steps.get(mode), quanta.acceleration.get(mode)) {
+                (Some(step), Some(quantum)) => f64::from(*unit) * quantum * f64::from(*step),
+                _ => 0.0,
+            },
             Self::F32(x) => f64::from(x.get(mode).copied().unwrap_or(0.0)),
             Self::F64(x) => x.get(mode).copied().unwrap_or(0.0),
         }
@@ -94,11 +103,17 @@ impl Accelerations {
 
     fn encode(&self, w: &mut Writer) {
         match self {
-            Self::Scaled16 { scale, steps } => {
+            Self::Visible { unit, steps } => {
                 w.u8(0);
                 w.u16(steps.len() as u16);
-                w.f32(*scale);
-                steps.iter().for_each(|&x| w.i16(x));
+                w.f32(*unit);
+                let mut bits = BitWriter::new(w);
+                for block in steps.chunks(BLOCK) {
+                    let wide = block_width(block);
+                    bits.put(wide, WIDTH_BITS);
+                    block.iter().for_each(|&x| bits.put(x as u32, wide));
+                }
+                bits.finish();
             }
             Self::F32(x) => {
                 w.u8(1);
@@ -113,9 +128,12 @@ impl Accelerations {
         }
     }
 
-    fn bytes(&self) -> usize {
+    pub(crate) fn bytes(&self) -> usize {
         match self {
-            Self::Scaled16 { steps, .. } => 7 + 2 * steps.len(),
+            Self::Visible { steps, .. } => {
+                let bits = |block: &[i32]| WIDTH_BITS + block_width(block) * block.len() as u32;
+                7 + steps.chunks(BLOCK).map(bits).sum::<u32>().div_ceil(8) as usize
+            }
             Self::F32(x) => 3 + 4 * x.len(),
             Self::F64(x) => 3 + 8 * x.len(),
         }
@@ -131,32 +149,39 @@ impl Accelerations {
                 expected: "at most 4096",
             });
         }
-        let fits = |size: usize| {
-            if count * size <= r.left() {
+        let fits = |needed: usize| {
+            let left = r.left();
+            if needed <= left {
                 Ok(count)
             } else {
-                let (needed, left) = (count * size, r.left());
                 Err(StreamError::Truncated { what: "accelerations", offset: 0, needed, left })
             }
         };
         match coding {
             0 => {
-                let mut steps = Vec::with_capacity(fits(2)?);
-                let scale = r.wide32("acceleration scale")?;
-                for _ in 0..count {
-                    steps.push(r.i16("acceleration")?);
+                // At least a width for each block: what is reserved is in proportion to the bytes that are there.
+                let mut steps =
+                    Vec::with_capacity(fits(4 + count.div_ceil(BLOCK) * WIDTH_BITS as usize / 8)?);
+                let unit = r.f32("acceleration unit")? as f32;
+                let mut bits = BitReader::new(r);
+                while steps.len() < count {
+                    let wide = bits.take("acceleration width", WIDTH_BITS)?;
+                    for _ in 0..BLOCK.min(count - steps.len()) {
+                        steps.push(bits.signed("acceleration", wide)?);
+                    }
                 }
-                Ok(Self::Scaled16 { scale, steps })
+                bits.finish("acceleration padding")?;
+                Ok(Self::Visible { unit, steps })
             }
             1 => {
-                let mut x = Vec::with_capacity(fits(4)?);
+                let mut x = Vec::with_capacity(fits(4 * count)?);
                 for _ in 0..count {
                     x.push(r.wide32("acceleration")?);
                 }
                 Ok(Self::F32(x))
             }
             2 => {
-                let mut x = Vec::with_capacity(fits(8)?);
+                let mut x = Vec::with_capacity(fits(8 * count)?);
                 for _ in 0..count {
                     x.push(r.wide("acceleration")?);
                 }
@@ -171,121 +196,8 @@ impl Accelerations {
     }
 }
 
-/// The step whose 32,767-fold is `largest`; never too small to represent it.
-fn step_size(largest: f64) -> f32 {
-    let scale = (largest / 32_767.0) as f32;
-    // Rounding to f32 may go down; the outermost step then clamps and the closed loop repays it at the next tick.
-    if scale.is_finite() { scale } else { 0.0 }
-}
-
-fn to_step(x: f64, scale: f32) -> i16 {
-    if scale == 0.0 {
-        return 0;
-    }
-    // A float-to-int cast saturates and takes NaN to 0.
-    (x / f64::from(scale)).round() as i16
-}
-
-/// One mode of a slice.
-#[derive(Debug, Clone, Copy, PartialEq, Default)]
-pub struct SliceEntry {
-    /// Which mode.
-    pub mode: usize,
-    /// Modal coordinate after the frame's tick.
-    pub q: f64,
-    /// Velocity after the frame's tick.
-    pub v: f64,
-    /// Modal force that the streamed reactions do not explain.
-    pub load: f64,
-}
-
-/// The absolute part of a frame: the state of some modes after the frame's tick.
-#[derive(Debug, Clone, PartialEq)]
-pub struct Slice {
-    /// Sizes of a step of q, v and load; a load of size 0 does not cross.
-    pub scales: [f32; 3],
-    /// Mode, and whole steps of q, v and load; at most 255.
-    pub steps: Vec<(u16, [i16; 3])>,
-}
-
-impl Slice {
-    /// Rounds a state to what a slice can carry: mode and (q, v, load), at most 255.
-    pub fn quantise(values: &[(u16, [f64; 3])]) -> Self {
-        let values = &values[..values.len().min(255)];
-        let mut scales = [0.0_f32; 3];
-        for (k, scale) in scales.iter_mut().enumerate() {
-            *scale = step_size(values.iter().fold(0.0_f64, |m, x| m.max(x.1[k].abs())));
-        }
-        let steps = |x: &[f64; 3]| std::array::from_fn(|k| to_step(x[k], scales[k]));
-        Self { steps: values.iter().map(|(mode, x)| (*mode, steps(x))).collect(), scales }
-    }
-
-    /// What the receiver reads, mode by mode.
-    pub fn entries(&self) -> impl Iterator<Item = SliceEntry> + '_ {
-        let value = |k: usize, steps: &[i16; 3]| f64::from(self.scales[k]) * f64::from(steps[k]);
-        self.steps.iter().map(move |(mode, s)| SliceEntry {
-            mode: usize::from(*mode),
-            q: value(0, s),
-            v: value(1, s),
-            load: value(2, s),
-        })
-    }
-
-    fn has_load(&self) -> bool {
-        self.scales[2] != 0.0
-    }
-
-    /// Bytes that a slice of so many modes takes.
-    pub(crate) fn bytes_of(modes: usize, load: bool) -> usize {
-        if load { 14 + 8 * modes } else { 10 + 6 * modes }
-    }
-
-    fn encode(&self, w: &mut Writer) {
-        w.u8(self.steps.len() as u8);
-        w.u8(u8::from(self.has_load()));
-        let parts = if self.has_load() { 3 } else { 2 };
-        self.scales[..parts].iter().for_each(|&x| w.f32(x));
-        for (mode, s) in &self.steps {
-            w.u16(*mode);
-            s[..parts].iter().for_each(|&x| w.i16(x));
-        }
-    }
-
-    fn decode(r: &mut Reader<'_>) -> Result<Self, StreamError> {
-        let count = usize::from(r.u8("slice count")?);
-        let parts = match r.u8("slice parts")? {
-            0 => 2,
-            1 => 3,
-            other => {
-                return Err(StreamError::Invalid {
-                    what: "slice parts",
-                    found: other.to_string(),
-                    expected: "0 or 1",
-                });
-            }
-        };
-        let mut scales = [0.0; 3];
-        for scale in &mut scales[..parts] {
-            *scale = r.wide32("slice scale")?;
-        }
-        let mut steps = Vec::with_capacity(count.min(r.left() / (2 + 2 * parts)));
-        for _ in 0..count {
-            let mode = r.u16("slice mode")?;
-            if usize::from(mode) >= MAX_MODES {
-                return Err(StreamError::Invalid {
-                    what: "slice mode",
-                    found: mode.to_string(),
-                    expected: "below 4096",
-                });
-            }
-            let mut s = [0; 3];
-            for x in &mut s[..parts] {
-                *x = r.i16("slice step")?;
-            }
-            steps.push((mode, s));
-        }
-        Ok(Self { scales, steps })
-    }
+fn block_width(block: &[i32]) -> u32 {
+    block.iter().map(|&x| width(x)).max().unwrap_or(0)
 }
 
 /// A grab as a frame carries it. Reactions cross rounded to 16 bits of mantissa, targets and radius as `f32`.
@@ -336,7 +248,9 @@ pub struct Frame {
     pub resent: bool,
     /// The grabs carry where their patches are: streams without accelerations.
     pub displacements: bool,
-    /// Everything that holds the body, at most 64.
+    /// Which of how many datagrams of this tick this is: the grabs did not fit in one. `None`: the only one.
+    pub part: Option<(u8, u8)>,
+    /// Everything that holds the body, at most 64; of a part, those that are in it.
     pub grabs: Vec<FrameGrab>,
     /// Rigid frame of a free body.
     pub pose: Option<Pose>,
@@ -351,6 +265,11 @@ pub struct Frame {
 }
 
 impl Frame {
+    /// Bytes of one grab.
+    pub(crate) fn grab_bytes(displacements: bool) -> usize {
+        GRAB_BYTES + if displacements { 9 } else { 0 }
+    }
+
     /// Bytes of this frame in a datagram, without the 3 bytes of header.
     pub fn bytes(&self) -> usize {
         let more = if self.displacements { 9 } else { 0 };
@@ -360,7 +279,8 @@ impl Frame {
         12 + (GRAB_BYTES + more) * self.grabs.len()
             + if self.pose.is_some() { 46 } else { 0 }
             + self.accelerations.as_ref().map_or(0, Accelerations::bytes)
-            + self.slice.as_ref().map_or(0, |s| Slice::bytes_of(s.steps.len(), s.has_load()))
+            + if self.part.is_some() { 2 } else { 0 }
+            + self.slice.as_ref().map_or(0, Slice::bytes)
             + if self.check.is_some() { 4 } else { 0 }
             + 1
             + self.repeats.iter().map(repeat).sum::<usize>()
@@ -378,7 +298,12 @@ impl Frame {
             | flag(self.resting, RESTING)
             | flag(self.check.is_some(), CHECK)
             | flag(self.resent, RESENT)
-            | flag(self.displacements, DISPLACEMENTS));
+            | flag(self.displacements, DISPLACEMENTS)
+            | flag(self.part.is_some(), PART));
+        if let Some((which, of)) = self.part {
+            w.u8(which);
+            w.u8(of);
+        }
         let grabs = &self.grabs[..self.grabs.len().min(MAX_GRABS)];
         w.u8(grabs.len() as u8);
         for g in grabs {
@@ -433,11 +358,17 @@ impl Frame {
         let tick = r.tick("tick")?;
         let run = r.u16("run")?;
         let flags = r.u8("frame flags")?;
-        let count = usize::from(r.u8("grab count")?);
         let invalid = |what, found: String, expected| Err(StreamError::Invalid { what, found, expected });
-        if flags & !KNOWN_FLAGS != 0 {
-            return invalid("frame flags", flags.to_string(), "bits 0..=6 only");
-        }
+        let part = if flags & PART == 0 {
+            None
+        } else {
+            let (which, of) = (r.u8("frame part")?, r.u8("frame parts")?);
+            if which >= of || !(2..=MAX_PARTS).contains(&of) {
+                return invalid("frame part", format!("{which} of {of}"), "one of 2 to 16");
+            }
+            Some((which, of))
+        };
+        let count = usize::from(r.u8("grab count")?);
         if count > MAX_GRABS {
             return invalid("grab count", count.to_string(), "at most 64");
         }
@@ -497,6 +428,7 @@ impl Frame {
             resting,
             resent,
             displacements,
+            part,
             grabs,
             pose,
             accelerations,

@@ -1,6 +1,6 @@
 //! Reliable messages: postcard bodies, checked after decoding.
 
-use pliant_modal::Integrator;
+use pliant_modal::{Integrator, Relaxation};
 use serde::{Deserialize, Serialize};
 
 use super::AccelerationCoding;
@@ -64,6 +64,8 @@ pub struct BodyInfo {
     pub damping_scale: f64,
     /// Uniform acceleration, m/s^2, world axes.
     pub gravity: [f64; 3],
+    /// Share of the stiffness that relaxes away, and in which time, s; none for an elastic body.
+    pub relaxation: Option<(f64, f64)>,
 }
 
 impl BodyInfo {
@@ -74,7 +76,14 @@ impl BodyInfo {
             r if r > 1.0 => Integrator::Newmark,
             rho_inf => Integrator::GeneralizedAlpha { rho_inf },
         };
-        BodySetup { integrator, warp: self.warp, damping_scale: self.damping_scale, gravity: self.gravity }
+        let relaxation = self.relaxation.map(|(ratio, time)| Relaxation { ratio, time });
+        BodySetup {
+            integrator,
+            warp: self.warp,
+            damping_scale: self.damping_scale,
+            gravity: self.gravity,
+            relaxation,
+        }
     }
 
     /// [`BodyInfo::rho_inf`] of an integrator.
@@ -100,6 +109,8 @@ pub struct SnapshotBytes {
     pub v: Vec<f64>,
     /// Accelerations.
     pub a: Vec<f64>,
+    /// Flows of a body that relaxes; empty for an elastic one.
+    pub z: Vec<f64>,
     /// Forces per mode that the streamed reactions do not explain (gravity, contacts); empty when they explain all.
     pub load: Vec<f64>,
     /// The body sleeps from this tick on.
@@ -309,16 +320,24 @@ impl HostMessage {
                 check("rho_inf", (-1.0..=2.0).contains(&info.rho_inf), info.rho_inf, "-1..=2")?;
                 let scale = info.damping_scale;
                 check("damping_scale", (0.0..=1e6).contains(&scale), scale, "0..=1e6")?;
+                let sound = info.setup().relaxation.is_none_or(|r| r.check().is_ok());
+                check(
+                    "relaxation",
+                    sound,
+                    format!("{:?}", info.relaxation),
+                    "a ratio in [0, 1), a time above 0 s",
+                )?;
                 check("gravity", in_range(&info.gravity), format!("{:?}", info.gravity), "finite m/s^2")?;
             }
             Self::Snapshot(s) => {
                 check("snapshot tick", s.tick < TICK_LIMIT, s.tick, "below 2^48")?;
                 let modes = s.q.len();
                 check("snapshot modes", (1..=MAX_MODES).contains(&modes), modes, "1..=4096")?;
-                let equal =
-                    s.v.len() == modes && s.a.len() == modes && (s.load.is_empty() || s.load.len() == modes);
-                check("snapshot lengths", equal, s.v.len(), "the same for q, v, a and load")?;
-                let finite = in_range(&s.q) && in_range(&s.v);
+                let equal = s.v.len() == modes
+                    && s.a.len() == modes
+                    && [&s.load, &s.z].iter().all(|x| x.is_empty() || x.len() == modes);
+                check("snapshot lengths", equal, s.v.len(), "the same for q, v, a, z and load")?;
+                let finite = in_range(&s.q) && in_range(&s.v) && in_range(&s.z);
                 let finite = finite && s.a.iter().chain(&s.load).all(|x| x.is_finite() && x.abs() < 1e15);
                 check("snapshot", finite, "a number out of range", "finite numbers")?;
             }
