@@ -197,7 +197,7 @@ fn open_haptics_refuses_other_libraries() {
 }
 
 fn dhd(path: &Path) -> ForceDimensionConfig {
-    ForceDimensionConfig { library: Some(path.to_path_buf()), index: 0 }
+    ForceDimensionConfig { library: Some(path.to_path_buf()), ..ForceDimensionConfig::default() }
 }
 
 #[test]
@@ -250,6 +250,47 @@ fn force_dimension_faults_and_versions() {
     call!(library, "fake_major", fn(c_int), 2);
     let old = ForceDimension::open(dhd(&path));
     assert!(matches!(old, Err(VendorError::Version { .. })), "{old:?}");
+}
+
+#[test]
+fn force_dimension_finds_its_reference_by_itself_if_it_is_told_to() {
+    let Some(path) = fake("dhd", "plain", &[]) else { return };
+    let told = |path: &Path| ForceDimensionConfig { auto_init: true, ..dhd(path) };
+    let plain = ForceDimension::open(told(&path));
+    assert!(matches!(plain, Err(VendorError::Symbol { symbol: "drdOpenID", .. })), "{plain:?}");
+    let Some(path) = fake("dhd", "robotic", &["-DWITH_DRD"]) else { return };
+    let library = open_fake(&path);
+    let drives = || call!(library, "fake_drives", fn() -> c_int,);
+    // Nobody asked it to: it does not move by itself.
+    call!(library, "fake_reset", fn(c_int), 0);
+    let mut device = ForceDimension::open(dhd(&path)).unwrap();
+    assert!(matches!(device.calibration(), Calibration::Needed(_)));
+    drop(device);
+    assert_eq!(drives(), 0);
+    // Asked, it does, once, and then the motors are ours: its own loop has ended, the forces are on.
+    let mut device = ForceDimension::open(told(&path)).unwrap();
+    assert_eq!((drives(), device.calibration()), (1, Calibration::Ready));
+    assert_eq!(call!(library, "fake_driving", fn() -> c_int,), 0);
+    assert_eq!(call!(library, "fake_enabled", fn() -> c_int,), 1);
+    assert!(device.exchange(&Wrench { force: [1.0, 2.0, 3.0], ..Wrench::ZERO }, &mut pace()).is_ok());
+    assert_eq!(force(&library), [3.0, 1.0, 2.0]);
+    // Pulled out and put back, it has forgotten, and finds it again.
+    call!(library, "fake_gone", fn(c_int), 1);
+    assert!(device.exchange(&Wrench::ZERO, &mut pace()).is_err());
+    call!(library, "fake_reset", fn(c_int), 0);
+    call!(library, "fake_gone", fn(c_int), 0);
+    assert!(device.reopen().is_ok());
+    assert_eq!((drives(), device.calibration()), (2, Calibration::Ready));
+    drop(device);
+    // One that knows its place is not driven; one that cannot move is refused and closed.
+    drop(ForceDimension::open(told(&path)).unwrap());
+    assert_eq!(drives(), 2);
+    call!(library, "fake_reset", fn(c_int), 0);
+    call!(library, "fake_stuck", fn(c_int), 1);
+    let stuck = ForceDimension::open(told(&path));
+    assert!(matches!(stuck, Err(VendorError::Device { what: "drdAutoInit", code: 1008, .. })), "{stuck:?}");
+    assert_eq!(call!(library, "fake_driving", fn() -> c_int,), 0);
+    assert_eq!(call!(library, "fake_open", fn() -> c_int,), 0);
 }
 
 #[test]

@@ -1,4 +1,5 @@
-//! Force Dimension devices (omega, delta, sigma, lambda; Novint Falcon) through the maker's DHD library, version 3.
+//! Force Dimension devices (omega, delta, sigma, lambda; Novint Falcon) through the maker's DHD library, version 3; its DRD library, which
+//! holds the same functions and those of the robotic kind, where the device is to find its reference by itself.
 //!
 //! The loop keeps the time. The maker's axes are x toward the user, y right, z up, in metres and newtons; Bevy's are (y, z, x).
 
@@ -34,6 +35,18 @@ functions! {
     }
 }
 
+functions! {
+    /// DRD's own, as drdc.h declares them.
+    struct Robotic {
+        open_id = "drdOpenID": fn(c_char) -> c_int;
+        close = "drdClose": fn(c_char) -> c_int;
+        supported = "drdIsSupported": fn(c_char) -> bool;
+        initialized = "drdIsInitialized": fn(c_char) -> bool;
+        auto_init = "drdAutoInit": fn(c_char) -> c_int;
+        stop = "drdStop": fn(bool, c_char) -> c_int;
+    }
+}
+
 /// Where the status says that the device knows its position.
 const STATUS_RESET: usize = 3;
 /// More than any version of the library writes.
@@ -44,6 +57,10 @@ const STATUS_ROOM: usize = 64;
 pub struct ForceDimensionConfig {
     /// The library's path; `None` looks for it by its usual names. Default: `None`.
     pub library: Option<PathBuf>,
+    /// Let a device that does not know its position find it by itself, when it is opened and when it comes back: **it drives through its workspace with its
+    /// own motors**, for some seconds, and no emergency stop of ours reaches it meanwhile. Hands off, and a thumb on the device's own switch. Needs the maker's
+    /// DRD library. Default: `false`, it is moved by hand.
+    pub auto_init: bool,
     /// Which of the devices that are plugged in, from 0. Default: 0.
     pub index: u8,
 }
@@ -51,6 +68,7 @@ pub struct ForceDimensionConfig {
 /// A Force Dimension device.
 pub struct ForceDimension {
     api: Api,
+    robotic: Option<Robotic>,
     config: ForceDimensionConfig,
     id: Option<c_char>,
     info: DeviceInfo,
@@ -62,10 +80,12 @@ impl ForceDimension {
     /// Loads the library and opens the device. Forces are switched on; they are zero until the loop runs.
     ///
     /// # Errors
-    /// No library, one older than 3, one that lacks a function, or no such device.
+    /// No library, one older than 3, one that lacks a function, no such device, or one that was to find its reference by itself and did not.
     pub fn open(config: ForceDimensionConfig) -> Result<Self, VendorError> {
-        let (library, path) = load(config.library.as_ref(), NAMES)?;
+        let names = if config.auto_init { ROBOTIC_NAMES } else { NAMES };
+        let (library, path) = load(config.library.as_ref(), names)?;
         let api = Api::from(&library, &path)?;
+        let robotic = if config.auto_init { Some(Robotic::from(&library, &path)?) } else { None };
         let mut v = [0 as c_int; 4];
         // SAFETY: four integers, as the header says.
         unsafe {
@@ -76,7 +96,8 @@ impl ForceDimension {
             let found = format!("{}.{}.{}.{}", v[0], v[1], v[2], v[3]);
             return Err(VendorError::Version { library: path, found, needed: "3" });
         }
-        let mut device = Self { api, config, id: None, info: describe("", 0, false), _library: library };
+        let mut device =
+            Self { api, robotic, config, id: None, info: describe("", 0, false), _library: library };
         device.connect()?;
         Ok(device)
     }
@@ -96,29 +117,43 @@ impl ForceDimension {
         let api = self.api;
         // SAFETY: plain values in, plain values out, strings are the library's own.
         unsafe {
-            let id = (api.open_id)(self.config.index as c_char);
+            let refused = |what| VendorError::Device {
+                what,
+                code: (api.error)().into(),
+                text: text((api.error_text)()),
+            };
+            let index = self.config.index as c_char;
+            let id = match &self.robotic {
+                Some(robotic) => (robotic.open_id)(index),
+                None => (api.open_id)(index),
+            };
             if id < 0 {
-                return Err(VendorError::Device {
-                    what: "dhdOpenID",
-                    code: (api.error)().into(),
-                    text: text((api.error_text)()),
-                });
+                return Err(refused(if self.robotic.is_some() { "drdOpenID" } else { "dhdOpenID" }));
             }
             let id = id as c_char;
+            self.id = Some(id);
+            if let Some(robotic) = &self.robotic
+                && (robotic.supported)(id)
+                && !(robotic.initialized)(id)
+            {
+                let found = (robotic.auto_init)(id);
+                // Its control loop is ended whatever came of it, with the forces left on for ours.
+                let stopped = (robotic.stop)(true, id);
+                if found < 0 || stopped < 0 {
+                    let error = refused("drdAutoInit");
+                    self.disconnect();
+                    return Err(error);
+                }
+            }
             let mut serial = 0u16;
             let _ = (api.serial)(&raw mut serial, id);
             self.info = describe(&text((api.name)(id)), serial, (api.active_wrist)(id));
             (api.wrench)(0.0, 0.0, 0.0, 0.0, 0.0, 0.0, id);
             if (api.enable)(1, id) < 0 {
-                let error = VendorError::Device {
-                    what: "dhdEnableForce",
-                    code: (api.error)().into(),
-                    text: text((api.error_text)()),
-                };
-                (api.close)(id);
+                let error = refused("dhdEnableForce");
+                self.disconnect();
                 return Err(error);
             }
-            self.id = Some(id);
         }
         Ok(())
     }
@@ -127,7 +162,10 @@ impl ForceDimension {
         if let Some(id) = self.id.take() {
             // SAFETY: the id is ours and is not used again.
             unsafe {
-                (self.api.close)(id);
+                match &self.robotic {
+                    Some(robotic) => (robotic.close)(id),
+                    None => (self.api.close)(id),
+                };
             }
         }
     }
@@ -148,6 +186,13 @@ const NAMES: &[&str] = &["dhd64.dll", "dhd.dll"];
 const NAMES: &[&str] = &["libdhd.dylib", "libdhd.3.dylib"];
 #[cfg(not(any(windows, target_os = "macos")))]
 const NAMES: &[&str] = &["libdhd.so", "libdhd.so.3"];
+
+#[cfg(windows)]
+const ROBOTIC_NAMES: &[&str] = &["drd64.dll", "drd.dll"];
+#[cfg(target_os = "macos")]
+const ROBOTIC_NAMES: &[&str] = &["libdrd.dylib", "libdrd.3.dylib"];
+#[cfg(not(any(windows, target_os = "macos")))]
+const ROBOTIC_NAMES: &[&str] = &["libdrd.so", "libdrd.so.3"];
 
 /// The library does not say what a device can do: these are the makers' data sheets by name, and a cautious guess for the rest.
 fn describe(name: &str, serial: u16, active_wrist: bool) -> DeviceInfo {
@@ -197,7 +242,7 @@ impl HapticDevice for ForceDimension {
             Calibration::Ready
         } else {
             Calibration::Needed(
-                "initialise the device with its maker's HapticInit, or move the handle to all its end stops",
+                "initialise the device with its maker's HapticInit, move the handle to all its end stops, or let it find them (`auto_init`)",
             )
         }
     }

@@ -4,7 +4,7 @@
 
 static struct {
     double position[3], velocity[3], rotation[3][3], wrench[6];
-    int open, enabled, reset, error, major, buttons, gone;
+    int open, enabled, reset, error, major, buttons, gone, robotic, driving, drives, stuck;
 } s = {.rotation = {{1, 0, 0}, {0, 1, 0}, {0, 0, 1}}, .reset = 1, .major = 3};
 
 static int result(char id) {
@@ -36,6 +36,7 @@ unsigned int dhdGetButtonMask(char id) { (void)id; return (unsigned int)s.button
 int dhdSetForceAndTorque(double fx, double fy, double fz, double tx, double ty, double tz, char id) {
     double w[6] = {fx, fy, fz, tx, ty, tz};
     if (result(id) < 0) return -1;
+    if (s.driving) { s.error = 1012; return -1; } /* the robotic loop has the motors */
     memcpy(s.wrench, w, sizeof w);
     return 0;
 }
@@ -43,6 +44,26 @@ bool dhdHasActiveWrist(char id) { (void)id; return false; }
 int dhdErrorGetLast(void) { return s.error; }
 const char *dhdErrorGetLastStr(void) { return "fake error"; }
 
+#ifdef WITH_DRD
+/* The robotic library: the same functions, and those that drive the device by itself. */
+int drdOpenID(char index) { int id = dhdOpenID(index); s.robotic = id >= 0; return id; }
+int drdClose(char id) { s.robotic = 0; s.driving = 0; return dhdClose(id); }
+bool drdIsSupported(char id) { return id == 2 && s.robotic; }
+bool drdIsInitialized(char id) { (void)id; return s.reset; }
+int drdAutoInit(char id) {
+    if (result(id) < 0 || !s.robotic) return -1;
+    s.driving = 1;
+    s.drives++;
+    if (s.stuck) { s.error = 1008; return -1; }
+    s.reset = 1;
+    return 0;
+}
+int drdStop(bool force, char id) { s.driving = 0; if (!force) s.enabled = 0; return result(id); }
+#endif
+void fake_stuck(int x) { s.stuck = x; }
+int fake_drives(void) { return s.drives; }
+int fake_driving(void) { return s.driving; }
+int fake_enabled(void) { return s.enabled; }
 void fake_place(double x, double y, double z, double vx) {
     s.position[0] = x; s.position[1] = y; s.position[2] = z; s.velocity[0] = vx;
 }

@@ -1,0 +1,101 @@
+//! Which device an example takes into its hand.
+#![allow(dead_code, reason = "each example uses the part that it needs")]
+
+use std::error::Error;
+
+use clap::ValueEnum;
+use pliant::haptics::{
+    FindConfig, ForceDimension, Found, Hand, HapticDevice, Inverse, LoopConfig, OpenHaptics, Positioned,
+    PositionedHandle, SafetyConfig, StaleConfig, VirtualConfig, VirtualDevice, VirtualHandle, find_devices,
+};
+
+/// The devices by name.
+#[derive(ValueEnum, Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Kind {
+    /// The first real one that is plugged in, else the virtual one.
+    Auto,
+    /// A simulated Touch in a simulated hand, which plays a script.
+    Virtual,
+    /// The mouse. The force is shown, nobody feels it.
+    Pointer,
+    /// A gamepad. The force is shown, and it buzzes.
+    Gamepad,
+    /// Haply Inverse3, through its service.
+    Inverse,
+    /// 3D Systems Touch, Omni, Premium, through OpenHaptics.
+    Touch,
+    /// Force Dimension omega, delta, sigma; Falcon.
+    ForceDimension,
+}
+
+/// How the simulated hand holds the simulated device.
+#[derive(ValueEnum, Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Grip {
+    Firm,
+    Light,
+    Loose,
+    None,
+}
+
+impl Grip {
+    fn hand(self) -> Hand {
+        match self {
+            Self::Firm => Hand::FIRM,
+            Self::Light => Hand::LIGHT,
+            Self::Loose => Hand::LOOSE,
+            Self::None => Hand::NONE,
+        }
+    }
+}
+
+/// Who moves it.
+#[derive(Debug, Clone)]
+pub enum Mover {
+    /// A script, through this.
+    Script(VirtualHandle),
+    /// Mouse or gamepad, through this.
+    Input(PositionedHandle),
+    /// A person, or a recording of one.
+    Nobody,
+}
+
+/// A device, open.
+pub struct Opened {
+    pub device: Box<dyn HapticDevice>,
+    pub mover: Mover,
+}
+
+pub fn open(kind: Kind, grip: Grip) -> Result<Opened, Box<dyn Error>> {
+    let real = |device: Box<dyn HapticDevice>| Opened { device, mover: Mover::Nobody };
+    Ok(match kind {
+        Kind::Auto => match find_devices(&FindConfig::default()).into_iter().next() {
+            None | Some(Found::Virtual) => open(Kind::Virtual, grip)?,
+            Some(found) => real(found.open().map_err(|error| error.to_string())?),
+        },
+        Kind::Virtual => {
+            let device = VirtualDevice::new(VirtualConfig::touch(), grip.hand())?;
+            let mover = Mover::Script(device.handle());
+            Opened { device: Box::new(device), mover }
+        }
+        Kind::Pointer | Kind::Gamepad => {
+            let device = Positioned::new(if kind == Kind::Pointer { "pointer" } else { "gamepad" });
+            let mover = Mover::Input(device.handle());
+            Opened { device: Box::new(device), mover }
+        }
+        Kind::Inverse => real(Box::new(Inverse::open(Default::default())?)),
+        Kind::Touch => real(Box::new(OpenHaptics::open(Default::default())?)),
+        Kind::ForceDimension => real(Box::new(ForceDimension::open(Default::default())?)),
+    })
+}
+
+/// How its loop is run. A real device always has the whole safety pipeline; where a software renderer is to draw a picture, a simulated hand waits
+/// longer for the next word than a person's would be kept waiting.
+pub fn loop_config(device: &dyn HapticDevice, modal: bool, picture: bool) -> LoopConfig {
+    let mut config = LoopConfig { modal, ..LoopConfig::default() };
+    let info = device.info();
+    if picture && info.simulated {
+        let stale = Some(StaleConfig { patience: 5.0, limit: 6.0 });
+        config.safety = Some(SafetyConfig { stale, ..SafetyConfig::for_device(&info, config.rate) });
+    }
+    config
+}
