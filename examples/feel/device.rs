@@ -14,7 +14,7 @@ use pliant::haptics::{
 pub enum Kind {
     /// The first real one that is plugged in, else the virtual one.
     Auto,
-    /// A simulated Touch in a simulated hand, which plays a script.
+    /// A simulated Premium in a simulated hand, which plays a script.
     Virtual,
     /// The mouse. The force is shown, nobody feels it.
     Pointer,
@@ -73,7 +73,7 @@ pub fn open(kind: Kind, grip: Grip) -> Result<Opened, Box<dyn Error>> {
             Some(found) => real(found.open().map_err(|error| error.to_string())?),
         },
         Kind::Virtual => {
-            let device = VirtualDevice::new(VirtualConfig::touch(), grip.hand())?;
+            let device = VirtualDevice::new(VirtualConfig::premium(), grip.hand())?;
             let mover = Mover::Script(device.handle());
             Opened { device: Box::new(device), mover }
         }

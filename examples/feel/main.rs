@@ -7,7 +7,7 @@
 //! ```sh
 //! cargo run --release --example feel                            # the mouse is the hand; the force is shown
 //! cargo run --release --example feel -- --device auto           # what is plugged in, at a tenth of its force
-//! cargo run --release --example feel -- --headless --seconds 10 # a simulated Touch in a simulated hand, and how well the loop keeps its time
+//! cargo run --release --example feel -- --headless --seconds 10 # a simulated device in a simulated hand, and how well the loop keeps its time
 //! ```
 
 mod device;
@@ -21,8 +21,8 @@ use bevy::{math::DVec3, prelude::*};
 use clap::Parser;
 use pliant::{
     haptics::{
-        DeviceId, ForceArrow, GamepadSource, HapticDevice, HapticDevices, HapticSystems, HapticTool,
-        HapticsPlugin, LoopReport, PointerSource, Recorder, Replay, ToolGrip, ToolPose,
+        Coupling, DeviceId, Fault, ForceArrow, GamepadSource, HapticDevice, HapticDevices, HapticSystems,
+        HapticTool, HapticsPlugin, LoopReport, PointerSource, Recorder, Replay, ToolGrip, ToolPose,
     },
     prelude::*,
 };
@@ -92,8 +92,8 @@ fn main() -> AppExit {
 
 fn run(options: Arguments) -> Result<AppExit, Box<dyn Error>> {
     let picture = options.stage.screenshot.is_some();
-    let mut stage = Stage::with("feel it", options.stage).real_time().picture_at(6.0);
-    for key in ["left mouse: hold the body", "E: emergency stop", "R: reset it"] {
+    let mut stage = Stage::with("feel it", options.stage).real_time().picture_at(8.5);
+    for key in ["left mouse: hold", "E, R: emergency stop, reset"] {
         stage = stage.key(key);
     }
     let mut app = App::new();
@@ -118,7 +118,7 @@ fn run(options: Arguments) -> Result<AppExit, Box<dyn Error>> {
     let id = app.world_mut().resource_mut::<HapticDevices>().add(device, config)?;
     app.insert_resource(Time::<Fixed>::from_hz(RATE))
         .insert_resource(Traces {
-            top: info.peak_force.ceil().min(20.0),
+            top: info.peak_force.ceil().min(6.0),
             traces: vec![Trace::new(id, Color::srgb(0.95, 0.35, 0.3))],
         })
         .insert_resource(Scene {
@@ -200,8 +200,8 @@ fn play(
         let t = t.clamp(0.0, 1.0);
         t * t * (3.0 - 2.0 * t)
     };
-    let out = smooth((t - 1.0) / 1.5);
-    let round = DVec3::new(0.01 * (2.1 * t).sin(), 0.02 * (1.3 * t).sin(), 0.02 * (1.7 * t).cos());
+    let out = smooth((t - 1.0) / 2.0);
+    let round = DVec3::new(0.01 * (2.1 * t).sin(), 0.015 * (1.3 * t).sin(), 0.015 * (1.7 * t).cos());
     hand.set_target((out * (DVec3::new(0.085, 0.03, 0.05) + round)).into());
 }
 
@@ -235,18 +235,21 @@ fn read_out(
     let trace = &traces.traces[0];
     let at = tools.iter().next().map_or(DVec3::ZERO, |pose| pose.position);
     let allowed = status.info.peak_force / 0.005 / 1000.0;
+    let Coupling { stiffness, damping, stiffness_limit, .. } = status.coupling;
     readout.0 = format!(
-        "{}: {:?}\n{}\ntool at          {:+.3} {:+.3} {:+.3} m\n{}\nforce, largest   {:6.2} N, step {:.3} N of {:.2} N allowed",
+        "{}: {:?}\n\
+         coupling     {stiffness:6.0} N/m, {damping:.2} N s/m, limit: {stiffness_limit:?}\n\
+         tool           {:+.3} {:+.3} {:+.3} m\n\
+         {}\n\
+         largest      {:6.2} N, step {:.3} N of {allowed:.2} N allowed",
         status.info.name,
         status.report.state,
-        status.coupling,
         at.x,
         at.y,
         at.z,
         figures(&status.report),
         trace.largest,
         trace.largest_step,
-        allowed,
     );
 }
 
@@ -256,14 +259,15 @@ fn figures(report: &LoopReport) -> String {
     let norm = |v: [f64; 3]| v.iter().map(|x| x * x).sum::<f64>().sqrt();
     let us = |s: f64| s * 1e6;
     let late = |p| us(report.lateness.percentile(p));
-    let fault = tick.fault.map_or_else(|| "none".to_owned(), |fault| fault.to_string());
+    let faults: u32 = report.faults.iter().sum();
+    let fault = tick.fault.map_or_else(|| "none now".to_owned(), |fault| fault.to_string());
     format!(
-        "force            {:6.2} N of {:.2} N wanted, gain {:.2}\n\
-         energy           {:6.1} mJ put in, {:.1} mJ given, {:.1} mJ available\n\
-         loop             {:6.0} Hz, {} of {} periods left out, real-time priority: {}\n\
-         late             p50 {:.0}, p99 {:.0}, p99.9 {:.0}, at most {:.0} us\n\
-         its own work     p50 {:.1}, p99.9 {:.1} us\n\
-         fault            {fault}",
+        "force        {:6.2} N of {:.2} N wanted, gain {:.2}\n\
+         energy       {:6.1} mJ put in, {:.1} given, {:.1} available\n\
+         loop         {:6.0} Hz, {} of {} periods left out, real-time: {}\n\
+         late         p50 {:.0}, p99 {:.0}, p99.9 {:.0}, at most {:.0} us\n\
+         its own work p50 {:.1}, p99.9 {:.1} us\n\
+         faults       {faults} so far ({} of a late simulation), {fault}",
         norm(tick.wrench.force),
         norm(tick.wanted),
         tick.gain,
@@ -280,5 +284,6 @@ fn figures(report: &LoopReport) -> String {
         us(report.lateness.largest()),
         us(report.work.percentile(0.5)),
         us(report.work.percentile(0.999)),
+        report.faults[Fault::Stale(0.0).kind()],
     )
 }

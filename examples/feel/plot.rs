@@ -13,7 +13,7 @@ use pliant::haptics::{DeviceId, HapticDevices, Record};
 const WIDTH: usize = 440;
 const HEIGHT: usize = 150;
 /// Seconds that the plot shows.
-const SPAN: f64 = 6.0;
+const SPAN: f64 = 12.0;
 /// Newtons from one line to the next.
 const GRID: f64 = 1.0;
 const BACK: [u8; 3] = [15, 20, 28];
@@ -113,18 +113,18 @@ fn spawn(mut commands: Commands, images: Option<ResMut<Assets<Image>>>, traces: 
     let corner = Node {
         position_type: PositionType::Absolute,
         right: px(14),
-        top: px(14),
+        bottom: px(60),
         padding: UiRect::all(px(8)),
         flex_direction: FlexDirection::Column,
         row_gap: px(4),
         border_radius: BorderRadius::all(px(6)),
         ..default()
     };
-    let title =
-        format!("force on the hand, N: 0 to {:.0}, the last {SPAN:.0} s, each millisecond", traces.top);
+    let title = format!("force on the hand, 0 to {:.0} N, {SPAN:.0} s, each period", traces.top);
     commands.spawn((corner, BackgroundColor(Color::srgb_u8(r, g, b)))).with_children(|corner| {
         corner.spawn((Text::new(title), TextFont { font_size: FontSize::Px(13.0), ..default() }));
-        corner.spawn((Picture, ImageNode::new(images.add(image))));
+        let size = Node { width: px(WIDTH as f32), height: px(HEIGHT as f32), ..default() };
+        corner.spawn((Picture, ImageNode::new(images.add(image)), size));
     });
 }
 

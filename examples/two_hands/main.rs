@@ -79,7 +79,7 @@ fn main() -> AppExit {
 fn run(options: Arguments) -> Result<AppExit, Box<dyn Error>> {
     let picture = options.stage.screenshot.is_some();
     let stage =
-        Stage::with("two hands", options.stage).real_time().picture_at(6.0).key("left mouse: a third hand");
+        Stage::with("two hands", options.stage).real_time().picture_at(8.5).key("left mouse: a third hand");
     let mut app = App::new();
     app.add_plugins((stage, PliantPlugins::default(), HapticsPlugin::default(), plot::plugin));
     let mut add = |kind: Kind| -> Result<(DeviceId, Mover, f64), Box<dyn Error>> {
@@ -95,7 +95,7 @@ fn run(options: Arguments) -> Result<AppExit, Box<dyn Error>> {
     let hands = [add(options.left)?, add(options.right)?];
     let traces = hands.iter().zip(SIDES).map(|((id, ..), (.., colour))| Trace::new(*id, colour)).collect();
     app.insert_resource(Time::<Fixed>::from_hz(RATE))
-        .insert_resource(Traces { top: 4.0, traces })
+        .insert_resource(Traces { top: 6.0, traces })
         .insert_resource(Hands { hands, modal: options.modal })
         .add_systems(Startup, spawn)
         .add_systems(FixedUpdate, play.before(HapticSystems::Move))
@@ -178,7 +178,7 @@ fn read_out(
         let report = &status.report;
         let [x, y, z] = report.tick.wrench.force;
         readout.0 += &format!(
-            "{side:>5}: {}, {:?}, {:+.2} {:+.2} {:+.2} N, largest {:.2} N, step {:.3} N; {:.0} Hz, late p99 {:.0} us\n",
+            "{side:>5}: {}, {:?}\n       force {:+.2} {:+.2} {:+.2} N, largest {:.2} N, step {:.3} N\n       loop {:.0} Hz, late p99 {:.0} us\n",
             status.info.name,
             report.state,
             x,

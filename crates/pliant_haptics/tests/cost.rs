@@ -60,21 +60,32 @@ fn ticks(modal: bool, ticks: usize) -> (u64, f64) {
     (allocations, scene.cycle.report().work.percentile(0.999))
 }
 
-#[test]
-fn the_loop_allocates_nothing() {
-    let (allocations, p999) = ticks(false, 4000);
-    println!("proxy model: the loop's own work p99.9 {:.1} us", p999 * 1e6);
-    assert_eq!(allocations, 0);
+/// The best of a few runs: another process on the core is not the loop's work.
+fn best(modal: bool, limit: f64) -> f64 {
+    let mut best = f64::INFINITY;
+    for _ in 0..10 {
+        let (allocations, p999) = ticks(modal, 4000);
+        assert_eq!(allocations, 0);
+        best = best.min(p999);
+        if best <= limit {
+            break;
+        }
+    }
+    best
 }
 
 #[test]
-fn the_modal_loop_allocates_nothing() {
-    let (allocations, p999) = ticks(true, 4000);
-    println!(
-        "modal model of 60 modes: the loop's own work p99.9 {:.1} us, {allocations} allocations",
-        p999 * 1e6
-    );
-    assert_eq!(allocations, 0);
+fn the_loop_allocates_nothing_and_takes_fifty_microseconds_at_most() {
+    let p999 = best(false, 50e-6);
+    println!("proxy model: the loop's own work p99.9 {:.1} us", p999 * 1e6);
+    assert!(p999 <= 50e-6, "{p999} s");
+}
+
+#[test]
+fn the_modal_loop_allocates_nothing_and_takes_a_hundred_and_fifty() {
+    let p999 = best(true, 150e-6);
+    println!("modal model of 60 modes: the loop's own work p99.9 {:.1} us", p999 * 1e6);
+    assert!(p999 <= 150e-6, "{p999} s");
 }
 
 #[test]
