@@ -93,9 +93,7 @@ pub fn bake(
     let skin = Skin::new(&mesh, &fe, skin, &number)?;
     let size = skin.mesh.size();
     let radii: Vec<f64> = config.site_radii.iter().map(|share| share * size).collect();
-    let sites = config.sites.unwrap_or_else(|| flexibility::affordable_sites(&solver, radii.len()));
-    let vertices = flexibility::spread_vertices(&skin.mesh, sites);
-    let sites = flexibility::sites(&solver, &modes, &skin, &number, &vertices, &radii, &mut |share| {
+    let sites = flexibility::sites(&solver, &modes, &skin, &number, config.sites, &radii, &mut |share| {
         progress(Stage::Surface, 0.8 * share);
     })?;
     let count = config.modes;

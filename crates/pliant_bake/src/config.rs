@@ -32,9 +32,10 @@ pub struct BakeConfig {
     /// What is held fixed; the union of all, at most [`ModalModel::MAX_ANCHORS`]. Default: none, a free body.
     pub anchors: Vec<Anchor>,
     /// For how many places on the surface the residual flexibility is baked, spread evenly; at most one a vertex.
-    /// Default: `None`, as many as a second of one core gives, from 64 to 512.
+    /// Default: `None`, one at every vertex; for very large bodies, where that would take long, 64 to 512.
     pub sites: Option<usize>,
-    /// Radii of the patches at each of these places, as shares of the body's largest extent. Default: 0.03, 0.06, 0.12.
+    /// Radii of the patches at each of these places, as shares of the body's largest extent. Between them the flexibility is interpolated.
+    /// Default: 0.02, 0.028, 0.04, 0.056, 0.08, 0.113, 0.16.
     pub site_radii: Vec<f64>,
     /// Folder that gets `K.mtx` and `M.mtx` (MatrixMarket); made when it is not there. Default: none.
     pub export_matrices: Option<PathBuf>,
@@ -52,7 +53,7 @@ impl Default for BakeConfig {
             damping: Damping::Ratio(0.03),
             anchors: Vec::new(),
             sites: None,
-            site_radii: vec![0.03, 0.06, 0.12],
+            site_radii: vec![0.02, 0.028, 0.04, 0.056, 0.08, 0.113, 0.16],
             export_matrices: None,
         }
     }

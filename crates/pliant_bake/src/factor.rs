@@ -92,7 +92,7 @@ impl Factor {
         Ok(Self { symbolic, values })
     }
 
-    fn block(&self, s: &Supernode) -> MatRef<'_, f64> {
+    pub(crate) fn block(&self, s: &Supernode) -> MatRef<'_, f64> {
         let values = &self.values[s.at..s.at + s.values()];
         MatRef::from_column_major_slice(values, s.width() + s.below(), s.width())
     }

@@ -6,94 +6,152 @@ use pliant_modal::{FlexibilitySite, ModelError, Patch, SurfaceMesh};
 use rayon::prelude::*;
 
 use crate::blocks::{self, Tall};
+use crate::compliance::{Load, Plan, Six};
 use crate::fem::ANCHORED;
 use crate::lanczos::Modes;
 use crate::solver::Solver;
 use crate::surface::Skin;
 
-/// Patches per group of right-hand sides; three columns each.
-const GROUP: usize = 8;
+/// Multiplications that the sites may take unless their number is given: a second or two of two cores.
+const BUDGET: f64 = 1.3e11;
 
-/// Multiplications that the sites may take unless their number is given: about a second of one core.
-const BUDGET: f64 = 1.4e10;
+/// Numbers that the right-hand sides of one front may take: half a gigabyte, in single precision a quarter.
+const MEMORY: usize = 64 << 20;
+
+/// Above so many multiplications they are done in single precision: off by some 1e-6 of the compliance.
+const FAST: f64 = 1e10;
+
+/// Places that are baked where not all can be: from, to.
+const SPREAD: [usize; 2] = [64, 512];
+
+/// Patches per group of right-hand sides where each has its own; three columns each.
+const GROUP: usize = 8;
 
 /// Groups that are solved side by side.
 const WAVE: usize = 8;
 
-/// `W^T (K^-1 - Phi Lambda^-1 Phi^T) W` for patches of each radius (m) around each vertex.
+/// `W^T (K^-1 - Phi Lambda^-1 Phi^T) W` for patches of each radius (m) around `count` surface vertices spread evenly; when that is not
+/// given around all, if [`BUDGET`] and [`MEMORY`] allow.
 pub(crate) fn sites(
     solver: &Solver,
     modes: &Modes,
     skin: &Skin,
     number: &[u32],
-    vertices: &[u32],
+    count: Option<usize>,
     radii: &[f64],
     report: &mut dyn FnMut(f64),
 ) -> Result<Vec<FlexibilitySite>, ModelError> {
-    let mut patches = Vec::with_capacity(vertices.len() * radii.len());
-    for &vertex in vertices {
-        for &radius in radii {
-            patches.push(Patch::around(&skin.mesh, vertex, radius)?);
-        }
+    let free = (0..skin.mesh.positions().len() as u32).filter(|&v| !skin.mesh.anchored()[v as usize]);
+    let mut vertices: Vec<u32> = free.collect();
+    if let Some(count) = count.filter(|&count| count < vertices.len()) {
+        vertices = spread_vertices(&skin.mesh, vertices, count);
     }
+    let (mut patches, mut loads) = patches(skin, number, &mut vertices, radii)?;
+    let mut plan = Plan::new(&solver.factor, &loads);
+    let apart = 3.0 * solver.factor.symbolic.values as f64;
+    if count.is_none() && (plan.cost() > BUDGET || plan.largest_block() > MEMORY) {
+        // Few places cost as much as many this way: their patches touch nearly all nodes. Each patch by itself then.
+        let affordable = (0.1 * BUDGET / (apart * radii.len().max(1) as f64)) as usize;
+        vertices = spread_vertices(&skin.mesh, vertices, affordable.clamp(SPREAD[0], SPREAD[1]));
+        (patches, loads) = self::patches(skin, number, &mut vertices, radii)?;
+        plan = Plan::new(&solver.factor, &loads);
+    }
+    let together = plan.cost() < apart * loads.len() as f64 && plan.largest_block() <= MEMORY;
+    let whole = if together {
+        // A free body's springs let it move by far more than it bends, which is taken out again: no digits to spare.
+        plan.compliances(solver.rigid.is_none() && plan.cost() > FAST, report)
+    } else {
+        one_by_one(solver, &loads, report)
+    };
     let held = Held::new(solver);
-    // Patches that are eliminated close together share a group: its loads rest on few branches of the factor.
-    let mut order: Vec<usize> = (0..patches.len()).collect();
-    order.sort_by_key(|&index| skin.first_row(patches[index].center(), number));
-    let mut out: Vec<Option<FlexibilitySite>> = vec![None; patches.len()];
-    for (index, wave) in order.chunks(GROUP * WAVE).enumerate() {
-        report((index * GROUP * WAVE) as f64 / patches.len() as f64);
-        let found: Vec<Vec<[[f64; 3]; 3]>> = wave
-            .par_chunks(GROUP)
-            .map(|group| {
-                let loads: Vec<Load> =
-                    group.iter().map(|&site| Load::new(&patches[site], skin, number)).collect();
-                held.residual(solver, modes, &loads)
-            })
-            .collect();
-        for (&site, flexibility) in wave.iter().zip(found.into_iter().flatten()) {
-            let (vertex, radius) = (patches[site].center(), patches[site].radius());
-            out[site] = Some(FlexibilitySite { vertex, radius, flexibility });
-        }
-    }
-    Ok(out.into_iter().flatten().collect())
+    let finish = |((patch, load), whole): ((&Patch, &Load), &Six)| FlexibilitySite {
+        vertex: patch.center(),
+        radius: patch.radius(),
+        flexibility: held.residual(solver, modes, load, whole),
+    };
+    Ok(patches.par_iter().zip(&loads).zip(&whole).map(finish).collect())
 }
 
-/// How many places on the surface cost about [`BUDGET`]: each patch goes once through the factor with three columns.
-pub(crate) fn affordable_sites(solver: &Solver, radii: usize) -> usize {
-    let patch = 3.0 * solver.factor.symbolic.values as f64;
-    ((BUDGET / (patch * radii.max(1) as f64)) as usize).clamp(64, 512)
+/// The patches of each radius around `vertices` and their loads. The vertices are brought into the order of their elimination, so that
+/// neighbours in the list touch the same nodes.
+fn patches(
+    skin: &Skin,
+    number: &[u32],
+    vertices: &mut [u32],
+    radii: &[f64],
+) -> Result<(Vec<Patch>, Vec<Load>), ModelError> {
+    vertices.sort_by_key(|&v| (skin.first_row(v, number), v));
+    let patches: Result<Vec<Patch>, ModelError> = vertices
+        .par_iter()
+        .flat_map_iter(|&v| radii.iter().map(move |&r| Patch::around(&skin.mesh, v, r)))
+        .collect();
+    let patches = patches?;
+    let loads = patches.par_iter().map(|patch| load(patch, skin, number)).collect();
+    Ok((patches, loads))
 }
 
-/// A unit force on a patch, the same along each axis: rows of nodes and their shares.
-struct Load(Vec<(usize, f64)>);
-
-impl Load {
-    fn new(patch: &Patch, skin: &Skin, number: &[u32]) -> Self {
-        let mut rows = Vec::new();
-        for &(vertex, weight) in patch.entries() {
-            skin.spread(vertex, weight, &mut |node, share| {
-                let row = number[node as usize];
-                if row != ANCHORED {
-                    rows.push((row as usize, share));
-                }
-            });
-        }
-        Self(rows)
-    }
-
-    /// `X^T W` for a block X of `width` columns: `[column][axis]`.
-    fn project(&self, x: &[f64], width: usize) -> Vec<[f64; 3]> {
-        let mut out = vec![[0.0; 3]; width];
-        for &(row, share) in &self.0 {
-            for (axis, x) in x[3 * row * width..][..3 * width].chunks_exact(width).enumerate() {
-                for (out, x) in out.iter_mut().zip(x) {
-                    out[axis] += share * x;
+/// `W^T A^-1 W = |L^-1 W|^2` with three columns for each load.
+fn one_by_one(solver: &Solver, loads: &[Load], report: &mut dyn FnMut(f64)) -> Vec<Six> {
+    let group = |loads: &[Load]| -> Vec<Six> {
+        let width = 3 * loads.len();
+        let mut x = vec![0.0; solver.dofs() * width];
+        for (place, load) in loads.iter().enumerate() {
+            for &(row, share) in load {
+                for axis in 0..3 {
+                    x[(3 * row + axis) * width + 3 * place + axis] += share;
                 }
             }
         }
-        out
+        solver.factor.forward(&mut x, width);
+        let half = blocks::gram(Tall::new(&x, width), Tall::new(&x, width));
+        let six = |place: usize| {
+            let at = |i, j| half[(3 * place + i, 3 * place + j)];
+            [at(0, 0), at(0, 1), at(0, 2), at(1, 1), at(1, 2), at(2, 2)]
+        };
+        (0..loads.len()).map(six).collect()
+    };
+    let mut out = Vec::with_capacity(loads.len());
+    for wave in loads.chunks(GROUP * WAVE) {
+        report(out.len() as f64 / loads.len() as f64);
+        let found: Vec<Vec<Six>> = wave.par_chunks(GROUP).map(group).collect();
+        out.extend(found.into_iter().flatten());
     }
+    out
+}
+
+fn load(patch: &Patch, skin: &Skin, number: &[u32]) -> Load {
+    let mut rows: Load = Vec::new();
+    for &(vertex, weight) in patch.entries() {
+        skin.spread(vertex, weight, &mut |node, share| {
+            let row = number[node as usize];
+            if row != ANCHORED {
+                rows.push((row as usize, share));
+            }
+        });
+    }
+    rows.sort_unstable_by_key(|&(row, _)| row);
+    // Vertices of a skin that lie in one element share its nodes.
+    rows.dedup_by(|from, to| {
+        let same = from.0 == to.0;
+        if same {
+            to.1 += from.1;
+        }
+        same
+    });
+    rows
+}
+
+/// `X^T W` for a block X of `width` columns: `[column][axis]`.
+fn project(load: &Load, x: &[f64], width: usize) -> Vec<[f64; 3]> {
+    let mut out = vec![[0.0; 3]; width];
+    for &(row, share) in load {
+        for (axis, x) in x[3 * row * width..][..3 * width].chunks_exact(width).enumerate() {
+            for (out, x) in out.iter_mut().zip(x) {
+                out[axis] += share * x;
+            }
+        }
+    }
+    out
 }
 
 /// What the pseudo-inverse of a free body adds to the factor: `Z = (K + springs)^-1 M R` and `R^T M Z`.
@@ -112,46 +170,33 @@ impl Held {
         Self { free }
     }
 
-    /// The residual flexibility of each load.
+    /// The residual flexibility of a load whose `W^T A^-1 W` is `whole`, `A` the factored matrix.
     ///
-    /// `W^T K^-1 W = |L^-1 W|^2`: half a solution is enough. For a free body, with `r = R^T W`:
-    /// `W^T K^+ W = |L^-1 W|^2 - (W^T Z) r - r^T (Z^T W) + r^T (R^T M Z) r`.
-    fn residual(&self, solver: &Solver, modes: &Modes, loads: &[Load]) -> Vec<[[f64; 3]; 3]> {
-        let width = 3 * loads.len();
-        let mut x = vec![0.0; solver.dofs() * width];
-        for (place, load) in loads.iter().enumerate() {
-            for &(row, share) in &load.0 {
-                for axis in 0..3 {
-                    x[(3 * row + axis) * width + 3 * place + axis] += share;
-                }
-            }
-        }
-        solver.factor.forward(&mut x, width);
-        let half = blocks::gram(Tall::new(&x, width), Tall::new(&x, width));
-        let one = |(place, load): (usize, &Load)| {
-            let along = load.project(&modes.phi, modes.lambda.len());
-            let free = self
-                .free
-                .as_ref()
-                .zip(solver.rigid.as_ref())
-                .map(|((z, inner), rigid)| (load.project(&rigid.modes, 6), load.project(z, 6), inner));
-            let entry = |i: usize, j: usize| {
-                let mut sum = half[(3 * place + i, 3 * place + j)];
-                if let Some((r, b, inner)) = &free {
-                    for k in 0..6 {
-                        sum -= b[k][i] * r[k][j] + r[k][i] * b[k][j];
-                        for l in 0..6 {
-                            sum += r[k][i] * inner[(k, l)] * r[l][j];
-                        }
+    /// For a free body, with `r = R^T W`: `W^T K^+ W = W^T A^-1 W - (W^T Z) r - r^T (Z^T W) + r^T (R^T M Z) r`.
+    fn residual(&self, solver: &Solver, modes: &Modes, load: &Load, whole: &Six) -> [[f64; 3]; 3] {
+        let along = project(load, &modes.phi, modes.lambda.len());
+        let free = self
+            .free
+            .as_ref()
+            .zip(solver.rigid.as_ref())
+            .map(|((z, inner), rigid)| (project(load, &rigid.modes, 6), project(load, z, 6), inner));
+        let [xx, xy, xz, yy, yz, zz] = *whole;
+        let whole = [[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]];
+        let entry = |i: usize, j: usize| {
+            let mut sum = whole[i][j];
+            if let Some((r, b, inner)) = &free {
+                for k in 0..6 {
+                    sum -= b[k][i] * r[k][j] + r[k][i] * b[k][j];
+                    for l in 0..6 {
+                        sum += r[k][i] * inner[(k, l)] * r[l][j];
                     }
                 }
-                let modal: f64 =
-                    along.iter().zip(&modes.lambda).map(|(phi, lambda)| phi[i] * phi[j] / lambda).sum();
-                sum - modal
-            };
-            settle(&Matrix3::from_fn(|i, j| 0.5 * (entry(i, j) + entry(j, i))))
+            }
+            let modal: f64 =
+                along.iter().zip(&modes.lambda).map(|(phi, lambda)| phi[i] * phi[j] / lambda).sum();
+            sum - modal
         };
-        loads.iter().enumerate().map(one).collect()
+        settle(&Matrix3::from_fn(|i, j| 0.5 * (entry(i, j) + entry(j, i))))
     }
 }
 
@@ -169,11 +214,9 @@ fn settle(residual: &Matrix3<f64>) -> [[f64; 3]; 3] {
     std::array::from_fn(|i| std::array::from_fn(|j| nearest[(i, j)]))
 }
 
-/// Vertices spread over the surface: each next one is the furthest from those before. Anchored vertices are left out.
-pub(crate) fn spread_vertices(surface: &SurfaceMesh, count: usize) -> Vec<u32> {
+/// `count` of the candidates, spread over the surface: each next one is the furthest from those before.
+fn spread_vertices(surface: &SurfaceMesh, candidates: Vec<u32>, count: usize) -> Vec<u32> {
     let positions = surface.positions();
-    let candidates: Vec<u32> =
-        (0..positions.len() as u32).filter(|&v| !surface.anchored()[v as usize]).collect();
     let distance2 = |v: u32, q: [f64; 3]| -> f64 {
         (0..3).map(|k| (f64::from(positions[v as usize][k]) - q[k]).powi(2)).sum()
     };
@@ -203,4 +246,47 @@ pub(crate) fn spread_vertices(surface: &SurfaceMesh, count: usize) -> Vec<u32> {
         out.push(chosen);
     }
     out
+}
+
+#[cfg(test)]
+mod tests {
+    use pliant_mesh::shapes;
+
+    use super::*;
+    use crate::bake::{elimination_order, law};
+    use crate::element::Element;
+    use crate::fem::FeMesh;
+    use crate::symbolic::Symbolic;
+    use crate::{BakeConfig, support};
+
+    /// Columns of nodes, columns of patches, and single precision: the same compliances, on a skin whose vertices rest on several nodes too.
+    #[test]
+    fn every_way_gives_the_same_compliances() {
+        let mesh = shapes::bar([8, 4, 4], [1.0, 0.4, 0.4]).unwrap();
+        let config = BakeConfig { anchors: vec!["x<0.001".parse().unwrap()], ..Default::default() };
+        let fe = FeMesh::new(&mesh, Element::Tet10);
+        let graph = fe.graph(false);
+        let held = support::anchored_nodes(&fe, &config.anchors).unwrap();
+        let (number, ordered) = elimination_order(&fe, &graph, &held);
+        let matrix = fe.assemble(&law(&config), &number, &ordered);
+        let solver = Solver::new(&matrix, Symbolic::new(&ordered), None).unwrap();
+        let mut worn = shapes::bar([5, 3, 3], [0.98, 0.38, 0.38]).unwrap().boundary().0;
+        worn.positions.iter_mut().flatten().for_each(|x| *x += 0.01);
+        for skin in [None, Some(&worn)] {
+            let skin = Skin::new(&mesh, &fe, skin, &number).unwrap();
+            let mut vertices: Vec<u32> = (0..skin.mesh.positions().len() as u32).collect();
+            let (_, loads) = patches(&skin, &number, &mut vertices, &[0.05, 0.15, 0.4]).unwrap();
+            let plan = Plan::new(&solver.factor, &loads);
+            let (exact, fast) = (plan.compliances(false, &mut |_| ()), plan.compliances(true, &mut |_| ()));
+            let apart = one_by_one(&solver, &loads, &mut |_| ());
+            for ((load, exact), (fast, apart)) in loads.iter().zip(&exact).zip(fast.iter().zip(&apart)) {
+                let size = exact[0] + exact[3] + exact[5];
+                assert_eq!(size > 0.0, !load.is_empty());
+                for k in 0..6 {
+                    assert!((exact[k] - apart[k]).abs() <= 1e-12 * size, "{exact:?} and {apart:?}");
+                    assert!((exact[k] - fast[k]).abs() <= 2e-6 * size, "{exact:?} and {fast:?}");
+                }
+            }
+        }
+    }
 }

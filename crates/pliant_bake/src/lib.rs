@@ -33,6 +33,7 @@ mod bake;
 mod blocks;
 mod cache;
 mod canonical;
+mod compliance;
 mod config;
 mod element;
 mod embedding;

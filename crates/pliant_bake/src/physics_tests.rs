@@ -189,11 +189,16 @@ fn modes_and_residual_flexibility_make_the_full_static_stiffness() {
         let solver = Solver::new(&matrix, Symbolic::new(&ordered), rigid).unwrap();
         let modes = lanczos::lowest(&solver, config.modes, &mut |_| ()).unwrap();
         let skin = Skin::new(&mesh, &fe, None, &number).unwrap();
-        let vertices = flexibility::spread_vertices(&skin.mesh, 6);
-        assert_eq!(vertices.len(), 6);
-        let sites = flexibility::sites(&solver, &modes, &skin, &number, &vertices, &[0.1, 0.25], &mut |_| ())
-            .unwrap();
+        let bake = |count, radii: &[f64]| {
+            flexibility::sites(&solver, &modes, &skin, &number, count, radii, &mut |_| ()).unwrap()
+        };
+        // Few places go through the factor one by one, all of them together.
+        let mut sites = bake(Some(6), &[0.1, 0.25]);
         assert_eq!(sites.len(), 12);
+        let every = bake(None, &[0.0, 0.1, 0.25]);
+        let moving = skin.mesh.anchored().iter().filter(|anchored| !**anchored).count();
+        assert_eq!(every.len(), 3 * moving);
+        sites.extend(every.into_iter().step_by(7));
         for site in &sites {
             let patch = Patch::around(&skin.mesh, site.vertex, site.radius).unwrap();
             let mut loads = vec![0.0; 3 * matrix.dofs()];

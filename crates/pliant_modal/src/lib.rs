@@ -38,6 +38,7 @@ mod check;
 mod error;
 mod exponential;
 mod file;
+mod flexibility;
 mod integrator;
 mod model;
 mod patch;

@@ -142,6 +142,8 @@ pub struct ModalModel {
     size: f64,
     hash: ModelHash,
     bytes: usize,
+    /// Radii of the sites, ascending, each once.
+    site_radii: Vec<f64>,
 }
 
 impl ModalModel {
@@ -174,7 +176,14 @@ impl ModalModel {
             Basis::new(parts.surface.positions(), parts.omega.len(), &parts.displacement, &parts.rotation);
         let size = parts.surface.size();
         let hash = crate::file::stored_hash(bytes);
-        Self { parts, basis, size, hash, bytes: bytes.len() }
+        let mut site_radii: Vec<f64> = parts.sites.iter().map(|site| site.radius).collect();
+        site_radii.sort_by(f64::total_cmp);
+        site_radii.dedup();
+        Self { parts, basis, size, hash, bytes: bytes.len(), site_radii }
+    }
+
+    pub(crate) fn site_radii(&self) -> &[f64] {
+        &self.site_radii
     }
 
     /// The parts it was made from.
@@ -274,91 +283,4 @@ impl ModalModel {
         }
         (mode * count + vertex as usize) * 3 + axis
     }
-
-    /// Residual flexibility (3x3, m/N, body axes) of a patch of `radius` around `vertex`, with `kept` of the modes kept.
-    ///
-    /// The nearest baked sites are blended by inverse squared distance at each baked radius, and the radii by a power law between them
-    /// (the compliance of a loaded patch goes as 1 / (E r), Boussinesq). What modes beyond `kept` would have given is added.
-    /// A model without sites gets the half-space estimate `(1 - nu^2) / (2 E r)`.
-    pub fn residual_flexibility(&self, patch: &crate::Patch, kept: usize) -> [[f64; 3]; 3] {
-        let mut flexibility = self.baked_flexibility(patch);
-        for mode in kept..self.mode_count() {
-            let mut phi = [0.0f64; 3];
-            for &(v, w) in patch.entries() {
-                for (axis, p) in phi.iter_mut().enumerate() {
-                    *p += w * f64::from(self.displacement_row(v, axis, mode));
-                }
-            }
-            let stiffness = self.parts.omega[mode].powi(2);
-            for i in 0..3 {
-                for j in 0..3 {
-                    flexibility[i][j] += phi[i] * phi[j] / stiffness;
-                }
-            }
-        }
-        flexibility
-    }
-
-    fn baked_flexibility(&self, patch: &crate::Patch) -> [[f64; 3]; 3] {
-        let info = &self.parts.info;
-        let radius = patch.radius().max(1e-3 * self.size).max(f64::MIN_POSITIVE);
-        if self.parts.sites.is_empty() {
-            let c = (1.0 - info.poisson * info.poisson) / (2.0 * info.young * radius);
-            return [[c, 0.0, 0.0], [0.0, c, 0.0], [0.0, 0.0, c]];
-        }
-        let mut radii: Vec<f64> = self.parts.sites.iter().map(|s| s.radius).collect();
-        radii.sort_by(f64::total_cmp);
-        radii.dedup();
-        let below = radii.iter().rev().find(|&&r| r <= radius).copied();
-        let above = radii.iter().find(|&&r| r >= radius).copied();
-        match (below, above) {
-            (Some(a), Some(b)) if a < b => {
-                let (fa, fb) =
-                    (self.flexibility_at(patch.center(), a), self.flexibility_at(patch.center(), b));
-                // Linear in 1/r: exact for the Boussinesq law, and keeps a blend of two PSD matrices PSD.
-                let t = ((1.0 / radius - 1.0 / b) / (1.0 / a - 1.0 / b)).clamp(0.0, 1.0);
-                combine(&fa, t, &fb, 1.0 - t)
-            }
-            (Some(a), _) | (None, Some(a)) => {
-                let f = self.flexibility_at(patch.center(), a);
-                combine(&f, (a / radius).min(8.0), &f, 0.0)
-            }
-            (None, None) => [[0.0; 3]; 3],
-        }
-    }
-
-    fn flexibility_at(&self, vertex: u32, radius: f64) -> [[f64; 3]; 3] {
-        const NEAREST: usize = 4;
-        let positions = self.parts.surface.positions();
-        let center = positions[vertex as usize];
-        let mut nearest = [(f64::INFINITY, usize::MAX); NEAREST];
-        for (index, site) in self.parts.sites.iter().enumerate().filter(|(_, s)| s.radius == radius) {
-            let p = positions[site.vertex as usize];
-            let d2: f64 = (0..3).map(|k| f64::from(p[k] - center[k]).powi(2)).sum();
-            if d2 < nearest[NEAREST - 1].0 {
-                nearest[NEAREST - 1] = (d2, index);
-                nearest.sort_by(|a, b| a.0.total_cmp(&b.0));
-            }
-        }
-        let mut sum = [[0.0; 3]; 3];
-        let mut total = 0.0;
-        for &(d2, index) in nearest.iter().filter(|(d2, _)| d2.is_finite()) {
-            let weight = 1.0 / (d2 + (1e-6 * self.size).powi(2)).max(f64::MIN_POSITIVE);
-            let f = &self.parts.sites[index].flexibility;
-            for i in 0..3 {
-                for j in 0..3 {
-                    sum[i][j] += weight * f[i][j];
-                }
-            }
-            total += weight;
-        }
-        if total > 0.0 {
-            sum.iter_mut().flatten().for_each(|x| *x /= total);
-        }
-        sum
-    }
-}
-
-fn combine(a: &[[f64; 3]; 3], s: f64, b: &[[f64; 3]; 3], t: f64) -> [[f64; 3]; 3] {
-    std::array::from_fn(|i| std::array::from_fn(|j| s * a[i][j] + t * b[i][j]))
 }

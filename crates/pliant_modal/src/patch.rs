@@ -50,8 +50,7 @@ impl Patch {
             let w = surface.welded()[v as usize];
             let d2 = distance2(v);
             let kernel = if r2 > 0.0 { (1.0 - (d2 / r2).min(1.0)).powi(2) } else { 0.0 };
-            let area: f64 = surface.ring(w).iter().map(|&t| triangle_area(surface, t)).sum::<f64>() / 3.0;
-            let weight = kernel * area;
+            let weight = kernel * surface.area_around(v);
             if v == vertex || weight > 0.0 {
                 entries.push((v, weight));
             }
@@ -89,13 +88,4 @@ impl Patch {
     pub fn entries(&self) -> &[(u32, f64)] {
         &self.entries
     }
-}
-
-fn triangle_area(surface: &SurfaceMesh, triangle: u32) -> f64 {
-    let [a, b, c] =
-        surface.triangles()[triangle as usize].map(|v| surface.positions()[v as usize].map(f64::from));
-    let u = [b[0] - a[0], b[1] - a[1], b[2] - a[2]];
-    let v = [c[0] - a[0], c[1] - a[1], c[2] - a[2]];
-    let n = [u[1] * v[2] - u[2] * v[1], u[2] * v[0] - u[0] * v[2], u[0] * v[1] - u[1] * v[0]];
-    0.5 * (n[0] * n[0] + n[1] * n[1] + n[2] * n[2]).sqrt()
 }

@@ -132,6 +132,18 @@ impl SurfaceMesh {
         &self.ring[self.ring_start[w] as usize..self.ring_start[w + 1] as usize]
     }
 
+    /// A third of the triangles around a vertex, m^2; what is welded to it counted in.
+    pub(crate) fn area_around(&self, vertex: u32) -> f64 {
+        let area = |&t: &u32| {
+            let [a, b, c] = self.triangles[t as usize].map(|v| self.positions[v as usize].map(f64::from));
+            let u = [b[0] - a[0], b[1] - a[1], b[2] - a[2]];
+            let v = [c[0] - a[0], c[1] - a[1], c[2] - a[2]];
+            let n = [u[1] * v[2] - u[2] * v[1], u[2] * v[0] - u[0] * v[2], u[0] * v[1] - u[1] * v[0]];
+            0.5 * (n[0] * n[0] + n[1] * n[1] + n[2] * n[2]).sqrt()
+        };
+        self.ring(self.welded[vertex as usize]).iter().map(area).sum::<f64>() / 3.0
+    }
+
     /// Least and greatest corner of the rest shape, m.
     pub fn bounds(&self) -> [[f32; 3]; 2] {
         let mut low = [f32::INFINITY; 3];

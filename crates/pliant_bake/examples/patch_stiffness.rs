@@ -1,0 +1,97 @@
+//! How near the static stiffness that a hand feels at a patch comes to the full finite-element solution: the distribution over patches around
+//! every surface vertex, at radii that are not the baked ones, and a few patches by name.
+//!
+//! `cargo run --release -p pliant_bake --example patch_stiffness -- bar | TETRAHEDRA.msh ANCHOR [tet4|tet10] [MODES]`
+#![allow(
+    clippy::unwrap_used,
+    clippy::print_stdout,
+    reason = "a measurement may stop, and prints what it finds"
+)]
+
+use std::time::Instant;
+
+use nalgebra::Matrix3;
+use pliant_bake::{BakeConfig, bake};
+use pliant_mesh::{TetMesh, io, shapes};
+use pliant_modal::{Element, ModalModel, Patch};
+
+/// `W^T Phi Lambda^-1 Phi^T W` of a patch, m/N.
+fn modal_compliance(model: &ModalModel, patch: &Patch) -> Matrix3<f64> {
+    let mut out = Matrix3::zeros();
+    for (mode, omega) in model.omega().iter().enumerate() {
+        let mut phi = nalgebra::Vector3::zeros();
+        for &(vertex, weight) in patch.entries() {
+            for axis in 0..3 {
+                phi[axis] += weight * f64::from(model.displacement_row(vertex, axis, mode));
+            }
+        }
+        out += phi * phi.transpose() / (omega * omega);
+    }
+    out
+}
+
+fn square(m: [[f64; 3]; 3]) -> Matrix3<f64> {
+    Matrix3::from_fn(|i, j| m[i][j])
+}
+
+fn main() {
+    let arguments: Vec<String> = std::env::args().skip(1).collect();
+    let argument = |k: usize| arguments.get(k).map(String::as_str);
+    let (mesh, anchor): (TetMesh, &str) = match argument(0) {
+        None | Some("bar") => (shapes::bar([40, 6, 6], [1.0, 0.15, 0.15]).unwrap(), "x<0.001"),
+        Some(path) => (io::read_tets(path).unwrap(), argument(1).unwrap()),
+    };
+    let element = if argument(2) == Some("tet4") { Element::Tet4 } else { Element::Tet10 };
+    let modes = argument(3).map_or(60, |text| text.parse().unwrap());
+    let config =
+        BakeConfig { element, modes, anchors: vec![anchor.parse().unwrap()], ..BakeConfig::default() };
+    let begun = Instant::now();
+    let made = bake(&mesh, None, &config, &mut |_, _| ()).unwrap();
+    let model = made.model;
+    println!(
+        "{} tetrahedra, {} surface vertices, {} modes, {} sites, {:?}, {:.2} s",
+        mesh.tets.len(),
+        model.surface().positions().len(),
+        modes,
+        model.parts().sites.len(),
+        made.times,
+        begun.elapsed().as_secs_f64()
+    );
+    println!("   radius   modes alone: median, 90 %, worst    felt: median, 90 %, 99 %, worst, within 2 %");
+    for share in [0.033, 0.047, 0.067, 0.095, 0.135] {
+        let every = BakeConfig { sites: Some(usize::MAX), site_radii: vec![share], ..config.clone() };
+        let exact = bake(&mesh, None, &every, &mut |_, _| ()).unwrap().model;
+        let (mut alone, mut felt, mut worst) = (Vec::new(), Vec::new(), (0.0, 0, 0));
+        for site in &exact.parts().sites {
+            let patch = Patch::around(model.surface(), site.vertex, site.radius).unwrap();
+            let modal = modal_compliance(&exact, &patch);
+            let truth = modal + square(site.flexibility);
+            let got = modal_compliance(&model, &patch) + square(model.residual_flexibility(&patch, modes));
+            for axis in 0..3 {
+                let e = (got[(axis, axis)] / truth[(axis, axis)] - 1.0).abs();
+                if e > worst.0 {
+                    worst = (e, site.vertex, axis);
+                }
+                felt.push(e);
+                alone.push((modal[(axis, axis)] / truth[(axis, axis)] - 1.0).abs());
+            }
+        }
+        alone.sort_by(f64::total_cmp);
+        felt.sort_by(f64::total_cmp);
+        let at = |list: &[f64], part: f64| 100.0 * list[((list.len() - 1) as f64 * part) as usize];
+        let within = felt.iter().filter(|e| **e <= 0.02).count() as f64 / felt.len() as f64;
+        println!(
+            "   {share:>6.3}   {:>6.2} {:>6.2} {:>6.2} %   {:>6.3} {:>6.2} {:>6.2} {:>6.2} %   {:.1} %   worst at {:?}, axis {}",
+            at(&alone, 0.5),
+            at(&alone, 0.9),
+            at(&alone, 1.0),
+            at(&felt, 0.5),
+            at(&felt, 0.9),
+            at(&felt, 0.99),
+            at(&felt, 1.0),
+            100.0 * within,
+            model.surface().positions()[worst.1 as usize],
+            worst.2
+        );
+    }
+}
