@@ -193,14 +193,15 @@ fn measure(
     meter.reaction = meter.reaction.max(figures.reaction);
     for (remote, state) in &bodies {
         let newest = truth.newest().map_or(0, |(tick, _)| tick);
-        let shown = guest.read_body(*remote, |view| {
-            figures.behind = newest.saturating_sub(view.tick()) as f64 / RATE;
-            view.shown().map(|shown| meter.compare(state.model(), view.tick(), &shown.q, &truth))
-        });
-        if shown.flatten().is_some() {
+        figures.behind =
+            guest.body(*remote).map_or(0.0, |view| newest.saturating_sub(view.tick()) as f64 / RATE);
+        // While the own hand holds the body it is shown as of a tick that the host has yet to reach; it is compared when it has.
+        if let Some((tick, shown)) = guest.shown(*remote) {
+            meter.show(tick, &shown.q);
             figures.joined = true;
             run.since.get_or_insert(time.elapsed_secs_f64());
         }
+        meter.compare(state.model(), &truth);
     }
 }
 

@@ -39,6 +39,8 @@ impl Truth {
 /// The shown error of one guest so far.
 #[derive(Resource, Default, Clone)]
 pub struct Meter {
+    /// Shapes as they were shown, with the ticks they stand for, until the host's of the same ticks are there.
+    waiting: VecDeque<(u64, Vec<f64>)>,
     last_tick: u64,
     /// Ticks compared.
     pub ticks: u64,
@@ -59,19 +61,35 @@ pub struct Meter {
 }
 
 impl Meter {
-    /// Compares the shape shown for `tick` with the host's shape of the same tick. Each tick counts once.
-    pub fn compare(&mut self, model: &ModalModel, tick: u64, shown: &[f64], truth: &Truth) {
+    /// Takes note of the shape that is shown now, and of the tick that it stands for. A tick counts once, as it was shown first.
+    pub fn show(&mut self, tick: u64, shown: &[f64]) {
         if tick <= self.last_tick {
             return;
         }
-        let Some(true_q) = truth.at(tick) else { return };
         self.last_tick = tick;
+        self.waiting.push_back((tick, shown.to_vec()));
+        if self.waiting.len() > Truth::KEPT {
+            self.waiting.pop_front();
+        }
+    }
+
+    /// Compares what was shown with the host's shapes of the same ticks, as far as the host is.
+    pub fn compare(&mut self, model: &ModalModel, truth: &Truth) {
+        let Some((newest, _)) = truth.newest() else { return };
+        while let Some((tick, shown)) = self.waiting.pop_front_if(|(tick, _)| *tick <= newest) {
+            if let Some(true_q) = truth.at(tick) {
+                self.measure(model, tick, newest, &shown, &true_q);
+            }
+        }
+    }
+
+    fn measure(&mut self, model: &ModalModel, tick: u64, newest: u64, shown: &[f64], true_q: &[f64]) {
         let rest = model.surface().positions();
         let single = |q: &[f64]| q.iter().map(|x| *x as f32).collect::<Vec<f32>>();
         self.shown.resize(rest.len(), [0.0; 3]);
         self.truth.resize(rest.len(), [0.0; 3]);
         model.basis().reconstruct(&single(shown), true, &mut self.shown);
-        model.basis().reconstruct(&single(&true_q), true, &mut self.truth);
+        model.basis().reconstruct(&single(true_q), true, &mut self.truth);
         let distance2 =
             |a: &[f32; 3], b: &[f32; 3]| (0..3).map(|k| f64::from(a[k] - b[k]).powi(2)).sum::<f64>();
         let (mut sum, mut worst, mut moved) = (0.0, 0.0f64, 0.0f64);
@@ -83,7 +101,7 @@ impl Meter {
         }
         let mean = sum / rest.len().max(1) as f64;
         self.ticks += 1;
-        self.behind += truth.newest().map_or(0, |(newest, _)| newest.saturating_sub(tick));
+        self.behind += newest.saturating_sub(tick);
         self.sum += mean;
         self.now = mean.sqrt();
         self.max = self.max.max(worst.sqrt());

@@ -1,13 +1,14 @@
 //! Bevy plugin that carries Pliant's streaming sessions over QUIC: soft bodies that several people hold at the same time.
 //!
-//! A host steps the bodies; guests see them, take hold of them and feel them. Both are one plugin:
+//! A host steps the bodies (and may play too); guests see them, take hold of them and feel them. Among peers ([`NetPlugin::peer`]) every one steps
+//! them. All are one plugin:
 //!
 //! ```no_run
 //! use bevy::prelude::*;
 //! use pliant_body::{ModalBody, PliantBodyPlugin};
 //! use pliant_net::{HostConfig, JoinConfig, NetPlugin, SharedBody};
 //!
-//! # fn host() -> Result<(), pliant_net::transport::TransportError> {
+//! # fn host() -> Result<(), pliant_net::NetError> {
 //! let net = NetPlugin::host(HostConfig::default())?;
 //! println!("join with {}", net.invite().unwrap());
 //! App::new().add_plugins((DefaultPlugins, PliantBodyPlugin::default(), net)).add_systems(Startup, setup).run();
@@ -28,12 +29,16 @@
 //! | --- | --- |
 //! | [`SharedBody`] on a body (host) | [`NetStats`]: round trip, loss, repair, rates |
 //! | [`Grab`](pliant_body::Grab) and [`GrabOf`](pliant_body::GrabOf), on guests as on a host | [`GrabForce`](pliant_body::GrabForce): the reaction, in step with what is shown |
-//! | [`HostConfig`], [`JoinConfig`] | [`User`], [`UserLink`], [`Hands`]: who is there, how well reached, holding what |
-//! | | [`BodyArrived`], [`BodyLeft`], [`UserJoined`], [`UserLeft`], [`GrabRefused`], [`SessionClosed`]: messages |
+//! | [`HostConfig`], [`JoinConfig`], [`PeerConfig`] | [`User`], [`UserLink`], [`Hands`]: who is there, how well reached, holding what |
+//! | [`Holding`] on a host's body: whose hands may be on it | [`BodyArrived`], [`BodyLeft`], [`UserJoined`], [`UserLeft`], [`GrabRefused`]: messages |
+//! | [`Interest`] on a guest's body: how many modes it wants | [`SessionJoined`], [`SessionLost`], [`SessionClosed`]: messages |
 //! | | [`SeenHands`] on a guest's bodies: where the others' hands are |
 //!
 //! Whoever is dragged by the pointer, by a script or by a device on a guest's [`Driven::Remote`](pliant_body::Driven::Remote) body makes a
 //! [`Grab`](pliant_body::Grab) as for a body of its own; this plugin sends it and writes the force.
+//!
+//! A guest that loses its host waits and joins again ([`JoinConfig::rejoin`]), under the number it had: its key is its lasting name. What it receives may
+//! be recorded ([`JoinConfig::record`]) and played again ([`NetPlugin::replay`]).
 //!
 //! Nothing that comes from outside stops an app: it is checked, counted ([`NetStats::rejected`]) and logged at debug. What is defended and
 //! what is not is in `THREATS.md`.
@@ -48,9 +53,11 @@ mod felt;
 mod figures;
 mod guest;
 mod host;
+mod peer;
 mod phase;
 mod place;
 mod plugin;
+mod recording;
 mod scene;
 mod seen;
 pub mod transport;
@@ -59,12 +66,19 @@ mod user;
 pub use figures::{
     LOSS_IN, LOSS_OUT, NACKS, NetStats, RATE_IN, RATE_OUT, RECOVERED, ROUND_TRIP, SHOWN_OFFSET,
 };
-pub use guest::{GuestState, JoinConfig, NetGuest};
+pub use guest::{CameraInterest, GuestState, Interest, JoinConfig, NetGuest};
 pub use host::{Holding, HostConfig, NetHost};
-pub use plugin::{NetPlugin, NetSystems};
+pub use peer::{NetPeer, PeerConfig, PeerState};
+pub use plugin::{NetError, NetPlugin, NetSystems};
+pub use recording::{Recording, RecordingError};
 pub use scene::SharedBody;
-pub use seen::{BodyArrived, BodyLeft, GrabRefused, RemoteBody, SeenHand, SeenHands, SessionClosed};
-pub use transport::{Access, Emulation, Fingerprint, HostOptions, Identity, Invite, JoinOptions, Token};
+pub use seen::{
+    BodyArrived, BodyLeft, GrabRefused, RemoteBody, SeenHand, SeenHands, SessionClosed, SessionJoined,
+    SessionLost,
+};
+pub use transport::{
+    Access, Emulation, Fingerprint, Grant, HostOptions, Identity, Invite, JoinOptions, Role, Token,
+};
 pub use user::{HandOf, Hands, User, UserJoined, UserLeft, UserLink, Yourself, colour_of};
 
 /// What the end of a connection is to the session.

@@ -2,23 +2,40 @@
 
 use std::sync::{Mutex, PoisonError};
 
+use bevy::camera::visibility::VisibilitySystems;
 use bevy::diagnostic::Diagnostics;
 use bevy::ecs::schedule::{InternedScheduleLabel, ScheduleLabel};
 use bevy::prelude::*;
 use pliant_body::{PliantDisplaySystems, PliantSystems};
+use thiserror::Error;
 
 use crate::figures::{self, NetStats, RateMarks};
 use crate::guest::{self, JoinConfig, NetGuest};
 use crate::host::{self, HostConfig, NetHost};
+use crate::peer::{self, NetPeer, PeerConfig};
+use crate::recording::{Recording, RecordingError};
 use crate::scene::SharedBody;
 use crate::seen;
 use crate::transport::{Endpoint, Invite, TransportError};
 use crate::user::{UserJoined, UserLeft};
 
-/// Hosts or joins a session. Add it after [`PliantBodyPlugin`](pliant_body::PliantBodyPlugin).
+/// Why a session could not be set up.
+#[derive(Debug, Error)]
+#[non_exhaustive]
+pub enum NetError {
+    /// The socket or the keys.
+    #[error(transparent)]
+    Transport(#[from] TransportError),
+    /// The file to record to or to play.
+    #[error(transparent)]
+    Recording(#[from] RecordingError),
+}
+
+/// Hosts a session, joins one, plays among peers, or plays a recording. Add it after [`PliantBodyPlugin`](pliant_body::PliantBodyPlugin).
 ///
 /// The socket is open from the constructor on, so that a host's invite can be shown before the app runs; nobody is let in before it does.
-/// When the app ends, or [`NetHost`] or [`NetGuest`] is removed, the others are told.
+/// When the app ends (closed, or by Ctrl-C where Bevy's `TerminalCtrlCHandlerPlugin` makes an exit of it), or [`NetHost`], [`NetGuest`] or
+/// [`NetPeer`] is removed, the others are told.
 pub struct NetPlugin {
     start: Mutex<Option<Start>>,
     invite: Option<Invite>,
@@ -27,7 +44,8 @@ pub struct NetPlugin {
 
 enum Start {
     Host(Box<HostConfig>, Endpoint),
-    Join(Box<JoinConfig>, Endpoint),
+    Join(Box<NetGuest>),
+    Peer(Box<NetPeer>),
 }
 
 /// The plugin's systems.
@@ -37,7 +55,7 @@ pub enum NetSystems {
     Receive,
     /// Host, in the bodies' schedule, after [`PliantSystems::Publish`]: the step is sent.
     Send,
-    /// Guest, `PostUpdate`, before the surfaces are written: own hands are sent, shapes and forces are shown.
+    /// Guest and peer, `PostUpdate`, before the surfaces are written: own hands are sent, shapes and forces are shown.
     Show,
 }
 
@@ -45,21 +63,40 @@ impl NetPlugin {
     /// Hosts a session. Guests are let in once the app runs.
     ///
     /// # Errors
-    /// [`TransportError`] when the socket or the keys cannot be set up.
-    pub fn host(mut config: HostConfig) -> Result<Self, TransportError> {
+    /// [`NetError::Transport`] when the socket or the keys cannot be set up.
+    pub fn host(mut config: HostConfig) -> Result<Self, NetError> {
         let endpoint = Endpoint::host(std::mem::take(&mut config.transport))?;
         let invite = Some(endpoint.invite());
         Ok(Self::new(Start::Host(Box::new(config), endpoint), invite))
     }
 
     /// Joins the session of an invite. That the host is there and lets us in shows later: [`NetGuest::state`],
-    /// [`SessionClosed`](crate::SessionClosed).
+    /// [`SessionJoined`](crate::SessionJoined), [`SessionClosed`](crate::SessionClosed).
     ///
     /// # Errors
-    /// [`TransportError`] when the socket or the keys cannot be set up.
-    pub fn join(invite: &Invite, mut config: JoinConfig) -> Result<Self, TransportError> {
+    /// [`NetError::Transport`] when the socket or the keys cannot be set up, [`NetError::Recording`] when the file to record to cannot be made.
+    pub fn join(invite: &Invite, mut config: JoinConfig) -> Result<Self, NetError> {
+        let limits = config.transport.limits.clone();
         let endpoint = Endpoint::join(invite, std::mem::take(&mut config.transport))?;
-        Ok(Self::new(Start::Join(Box::new(config), endpoint), None))
+        config.transport.limits = limits;
+        Ok(Self::new(Start::Join(Box::new(NetGuest::join(config, endpoint)?)), None))
+    }
+
+    /// Plays a recorded session into a guest, at the speed at which it was recorded: bodies, users and hands come and go as they did. Nothing is
+    /// sent, and grabs of this app hold nothing.
+    pub fn replay(recording: Recording, mut config: JoinConfig) -> Self {
+        config.models.extend(recording.models.iter().cloned());
+        Self::new(Start::Join(Box::new(NetGuest::replay(config, recording))), None)
+    }
+
+    /// Plays among peers, of which every one steps the bodies: begins ([`PeerConfig::join`] is `None`), or comes to those who are there.
+    ///
+    /// # Errors
+    /// [`NetError::Transport`] when a socket or the keys cannot be set up.
+    pub fn peer(config: PeerConfig) -> Result<Self, NetError> {
+        let peer = NetPeer::open(config)?;
+        let invite = Some(peer.invite());
+        Ok(Self::new(Start::Peer(Box::new(peer)), invite))
     }
 
     fn new(start: Start, invite: Option<Invite>) -> Self {
@@ -72,7 +109,7 @@ impl NetPlugin {
         self
     }
 
-    /// What guests paste to join this host. `None` for a guest.
+    /// What others paste to join this host or peer. `None` for a guest.
     pub fn invite(&self) -> Option<&Invite> {
         self.invite.as_ref()
     }
@@ -112,18 +149,29 @@ impl Plugin for NetPlugin {
                     )
                     .add_systems(PostUpdate, host::finish);
             }
-            Start::Join(config, endpoint) => {
+            Start::Join(guest) => {
                 seen::register(app);
-                let mut start = Some((config, endpoint));
-                let begin = move |world: &mut World| {
-                    let Some((config, endpoint)) = start.take() else { return };
-                    world.insert_resource(NetGuest::new(*config, endpoint));
-                };
-                app.add_systems(PreStartup, begin)
+                app.insert_resource(*guest)
                     .add_systems(PreUpdate, guest::receive.in_set(NetSystems::Receive))
                     .add_systems(
                         PostUpdate,
                         (guest::send_hands, guest::show)
+                            .chain()
+                            .in_set(NetSystems::Show)
+                            .before(PliantDisplaySystems::Interpolate),
+                    )
+                    .add_systems(
+                        PostUpdate,
+                        (guest::look, guest::say_interest).chain().after(VisibilitySystems::UpdateFrusta),
+                    );
+            }
+            Start::Peer(peer) => {
+                seen::register(app);
+                app.insert_resource(*peer)
+                    .add_systems(PreUpdate, peer::receive.in_set(NetSystems::Receive))
+                    .add_systems(
+                        PostUpdate,
+                        (peer::tell_hands, peer::show)
                             .chain()
                             .in_set(NetSystems::Show)
                             .before(PliantDisplaySystems::Interpolate),
@@ -137,11 +185,13 @@ impl Plugin for NetPlugin {
 fn measure(
     host: Option<Res<NetHost>>,
     guest: Option<Res<NetGuest>>,
+    peer: Option<Res<NetPeer>>,
     mut stats: ResMut<NetStats>,
     mut marks: ResMut<RateMarks>,
     mut diagnostics: Diagnostics,
 ) {
     let new = host.map(|host| host.figures()).or_else(|| guest.map(|guest| guest.figures()));
+    let new = new.or_else(|| peer.map(|peer| peer.figures()));
     let mut new = new.unwrap_or_default();
     new.keep_rates(&stats, &mut marks, &mut diagnostics);
     new.measure(&mut diagnostics);

@@ -50,6 +50,23 @@ pub struct GrabRefused {
     pub entity: Entity,
 }
 
+/// The host cannot be heard any more. Bodies stand as they were last seen, the others' users are gone, and joining is tried again
+/// ([`JoinConfig::rejoin`](crate::JoinConfig::rejoin)).
+#[derive(Message, Debug, Clone, PartialEq)]
+pub struct SessionLost {
+    /// Why, in words.
+    pub reason: String,
+}
+
+/// In the session: for the first time, or again.
+#[derive(Message, Debug, Clone, Copy, PartialEq, Eq)]
+pub struct SessionJoined {
+    /// Our number: the same as before, where the host remembers us.
+    pub user: UserId,
+    /// After a [`SessionLost`].
+    pub again: bool,
+}
+
 /// The session is over.
 #[derive(Message, Debug, Clone, PartialEq)]
 pub struct SessionClosed {
@@ -61,5 +78,7 @@ pub(crate) fn register(app: &mut App) {
     app.add_message::<BodyArrived>()
         .add_message::<BodyLeft>()
         .add_message::<GrabRefused>()
+        .add_message::<SessionLost>()
+        .add_message::<SessionJoined>()
         .add_message::<SessionClosed>();
 }

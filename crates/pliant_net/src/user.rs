@@ -5,6 +5,8 @@ use std::time::Duration;
 use bevy::prelude::*;
 use pliant_stream::UserId;
 
+use crate::transport::Role;
+
 /// A user of the session. Every app has an entity for each, itself included ([`Yourself`]).
 #[derive(Component, Debug, Clone, PartialEq)]
 pub struct User {
@@ -14,13 +16,19 @@ pub struct User {
     pub name: String,
     /// A colour of the user's own, the same in every app.
     pub colour: Color,
+    /// What the user may do.
+    pub role: Role,
 }
 
 impl User {
-    pub(crate) fn new(id: UserId, name: &str) -> Self {
-        let name = name.chars().filter(|c| !c.is_control()).collect();
-        Self { id, name, colour: colour_of(id) }
+    pub(crate) fn new(id: UserId, name: &str, role: Role) -> Self {
+        Self { id, name: printable(name), colour: colour_of(id), role }
     }
+}
+
+/// A name from outside, fit for a screen.
+pub(crate) fn printable(name: &str) -> String {
+    name.chars().filter(|c| !c.is_control()).collect()
 }
 
 /// The colour of a user: hues a golden angle apart, so that neighbours by number differ well however many come.
@@ -33,7 +41,8 @@ pub fn colour_of(user: UserId) -> Color {
 #[derive(Component, Debug, Clone, Copy, PartialEq, Eq)]
 pub struct Yourself;
 
-/// How well a user is reached. On the host: on every guest's entity. On a guest: on its own, for the way to the host.
+/// How well a user is reached. On the host: on every guest's entity. On a guest: on its own entity, for the way to the host, and on the other guests', as the
+/// host says about once a second. Among peers: on every other peer's.
 #[derive(Component, Debug, Clone, Copy, PartialEq, Default)]
 pub struct UserLink {
     /// Smoothed round trip; zero before the first measurement.
@@ -63,6 +72,8 @@ pub struct UserJoined {
     pub id: UserId,
     /// Its name.
     pub name: String,
+    /// The same user was here before, under the same number: by its key.
+    pub back: bool,
 }
 
 /// Somebody has left. The entity is gone.
@@ -90,6 +101,6 @@ mod tests {
                 assert!(apart.min(360.0 - apart) > 7.0, "users {n} and {m}: {apart} degrees");
             }
         }
-        assert_eq!(User::new(UserId(1), "a\u{1b}[31mb\n").name, "a[31mb");
+        assert_eq!(User::new(UserId(1), "a\u{1b}[31mb\n", Role::Hold).name, "a[31mb");
     }
 }

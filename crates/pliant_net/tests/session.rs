@@ -4,6 +4,7 @@
 mod support;
 
 use std::collections::BTreeMap;
+use std::time::Duration;
 
 use bevy::math::{DQuat, DVec3};
 use bevy::prelude::*;
@@ -158,11 +159,9 @@ fn over_the_papers_first_network_the_shape_stays_right() {
         let tick = apps[0].world().resource::<PliantTick>().0;
         truth.insert(tick, state(apps[0], body).body().q().to_vec());
         let net = apps[1].world().resource::<NetGuest>();
-        net.read_body(remote, |view| {
-            if let Some(state) = view.shown() {
-                shown.entry(view.tick()).or_insert_with(|| state.q.clone());
-            }
-        });
+        if let Some((tick, state)) = net.shown(remote) {
+            shown.entry(tick).or_insert_with(|| state.q.clone());
+        }
         start.elapsed().as_secs_f64() > 6.0
     });
     let stats = *guest.world().resource::<NetStats>();
@@ -259,7 +258,8 @@ fn one_at_a_time_means_one_at_a_time() {
 fn bodies_that_go_and_hosts_that_end_are_told() {
     let _alone = alone();
     let (mut host, invite, body) = host(HostConfig::default());
-    let mut guest = guest(&invite, JoinConfig::default());
+    // One that does not wait for a host that has gone.
+    let mut guest = guest(&invite, JoinConfig { rejoin: Duration::ZERO, ..JoinConfig::default() });
     // The app has made an entity for the body itself.
     let own = guest.world_mut().spawn((SharedBody::named("bar"), Transform::from_xyz(5.0, 0.0, 0.0))).id();
     let there = arrival(&mut host, &mut guest);

@@ -16,36 +16,98 @@ use super::invite::Token;
 /// The application protocol and its version, negotiated in the handshake: another version is refused there.
 pub const ALPN: &[u8] = b"pliant/1";
 
+/// What a user may do.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Hash, PartialOrd, Ord)]
+pub enum Role {
+    /// See the bodies and take hold of them. Default.
+    #[default]
+    Hold,
+    /// See them only: a grab is refused. A watcher costs its datagrams and nothing else.
+    Watch,
+}
+
+impl Role {
+    pub(crate) fn to_byte(self) -> u8 {
+        match self {
+            Self::Hold => 0,
+            Self::Watch => 1,
+        }
+    }
+
+    pub(crate) fn from_byte(byte: u8) -> Option<Self> {
+        match byte {
+            0 => Some(Self::Hold),
+            1 => Some(Self::Watch),
+            _ => None,
+        }
+    }
+}
+
+/// What a token lets in to, and until when.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct Grant {
+    /// The secret; put it in the [`Invite`](super::Invite).
+    pub token: Token,
+    /// What its bearers may do.
+    pub role: Role,
+    /// The moment from which it lets in nobody more; who is in stays in. `None`: as long as the host runs.
+    pub expires: Option<SystemTime>,
+}
+
+impl Grant {
+    /// Lets in to see and hold, without end.
+    pub fn hold(token: Token) -> Self {
+        Self { token, role: Role::Hold, expires: None }
+    }
+
+    /// Lets in to see, without end.
+    pub fn watch(token: Token) -> Self {
+        Self { token, role: Role::Watch, expires: None }
+    }
+
+    /// The same until a moment.
+    pub fn until(self, moment: SystemTime) -> Self {
+        Self { expires: Some(moment), ..self }
+    }
+}
+
 /// Who may join.
 #[derive(Clone, Debug, Default)]
 pub enum Access {
-    /// Anyone who knows the address. Default.
+    /// Anyone who knows the address, to hold. Default.
     #[default]
     Anyone,
-    /// Only who shows this token.
-    Token {
-        /// The secret; put it in the [`Invite`](super::Invite).
-        token: Token,
-        /// The moment from which it lets in nobody more. `None`: as long as the host runs.
-        expires: Option<SystemTime>,
-    },
+    /// Only who shows one of these tokens. The first is the one in [`Endpoint::invite`](super::Endpoint::invite).
+    Tokens(Vec<Grant>),
 }
 
 impl Access {
-    /// Why `shown` is not let in at `now`, in words for the guest.
-    pub(super) fn refusal(&self, shown: Option<Token>, now: SystemTime) -> Option<&'static str> {
+    /// What `shown` lets in to at `now`, or why not, in words for the guest.
+    pub(super) fn role(&self, shown: Option<Token>, now: SystemTime) -> Result<Role, &'static str> {
         match (self, shown) {
-            (Self::Anyone, _) => None,
-            (Self::Token { .. }, None) => Some("this host asks for a token and the invite has none"),
-            (Self::Token { token, expires }, Some(shown)) => {
-                if *token != shown {
-                    Some("wrong token")
-                } else if expires.is_some_and(|expires| now >= expires) {
-                    Some("the token has expired")
-                } else {
-                    None
+            (Self::Anyone, _) => Ok(Role::Hold),
+            (Self::Tokens(_), None) => Err("this host asks for a token and the invite has none"),
+            (Self::Tokens(grants), Some(shown)) => {
+                // All are looked at, so that the time taken tells nothing of which one it was.
+                let found = grants.iter().fold(None, |found, grant| {
+                    let same = grant.token == shown;
+                    found.or(same.then_some(grant))
+                });
+                match found {
+                    None => Err("wrong token"),
+                    Some(grant) if grant.expires.is_some_and(|expires| now >= expires) => {
+                        Err("the token has expired")
+                    }
+                    Some(grant) => Ok(grant.role),
                 }
             }
+        }
+    }
+
+    pub(super) fn first_token(&self) -> Option<Token> {
+        match self {
+            Self::Anyone => None,
+            Self::Tokens(grants) => grants.first().map(|grant| grant.token),
         }
     }
 }
@@ -55,6 +117,8 @@ impl Access {
 pub struct Limits {
     /// Peers at one time; the next is refused. Default: 256.
     pub peers: usize,
+    /// Peers and handshakes from one IP address at one time; the next is refused. Default: 64.
+    pub per_address: usize,
     /// Longest message accepted from a peer, bytes; a longer one closes the connection. Default: 1 MiB for a host, 256 MiB for a guest
     /// (models come that way).
     pub message: usize,
@@ -78,6 +142,7 @@ impl Limits {
     pub fn host() -> Self {
         Self {
             peers: 256,
+            per_address: 64,
             message: 1 << 20,
             queued_messages: 64 << 20,
             queued_datagrams: 64,
@@ -130,11 +195,13 @@ pub struct JoinOptions {
     pub limits: Limits,
     /// A lossy link put under the socket, for demonstrations and tests. Default: none.
     pub emulation: Option<Emulation>,
+    /// The own address. Default `None`: any free port, on loopback for a host there, else on every interface.
+    pub bind: Option<SocketAddr>,
 }
 
 impl Default for JoinOptions {
     fn default() -> Self {
-        Self { identity: None, limits: Limits::guest(), emulation: None }
+        Self { identity: None, limits: Limits::guest(), emulation: None, bind: None }
     }
 }
 
@@ -221,14 +288,22 @@ mod tests {
     use super::*;
 
     #[test]
-    fn a_token_lets_in_until_it_expires() {
+    fn a_token_lets_in_to_its_role_until_it_expires() {
         let now = SystemTime::UNIX_EPOCH + Duration::from_secs(1_000_000);
-        let token = Token([7; 16]);
-        let access = Access::Token { token, expires: Some(now + Duration::from_secs(60)) };
-        assert_eq!(access.refusal(Some(token), now), None);
-        assert!(access.refusal(Some(Token([8; 16])), now).unwrap().contains("wrong"));
-        assert!(access.refusal(None, now).unwrap().contains("asks for a token"));
-        assert!(access.refusal(Some(token), now + Duration::from_secs(60)).unwrap().contains("expired"));
-        assert_eq!(Access::Anyone.refusal(None, now), None);
+        let minute = Duration::from_secs(60);
+        let (held, watched) = (Token([7; 16]), Token([9; 16]));
+        let access = Access::Tokens(vec![Grant::hold(held).until(now + minute), Grant::watch(watched)]);
+        assert_eq!(access.role(Some(held), now), Ok(Role::Hold));
+        assert_eq!(access.role(Some(watched), now), Ok(Role::Watch));
+        assert!(access.role(Some(Token([8; 16])), now).unwrap_err().contains("wrong"));
+        assert!(access.role(None, now).unwrap_err().contains("asks for a token"));
+        assert!(access.role(Some(held), now + minute).unwrap_err().contains("expired"));
+        assert_eq!(access.role(Some(watched), now + minute), Ok(Role::Watch));
+        assert_eq!(Access::Anyone.role(None, now), Ok(Role::Hold));
+        assert!(Access::Tokens(Vec::new()).role(Some(held), now).is_err(), "nobody");
+        for role in [Role::Hold, Role::Watch] {
+            assert_eq!(Role::from_byte(role.to_byte()), Some(role));
+        }
+        assert_eq!(Role::from_byte(2), None);
     }
 }

@@ -20,9 +20,9 @@ use tokio::sync::Notify;
 use tokio::time::{sleep, timeout};
 use tracing::debug;
 
-use super::config::Access;
+use super::config::Role;
 use super::congestion::Bucket;
-use super::emulated::{Emulated, Emulation};
+use super::emulated::Emulated;
 use super::endpoint::{CloseReason, Event, Peer, Shared, TransportError};
 use super::identity::{Fingerprint, SERVER_NAME, shortened};
 use super::invite::Invite;
@@ -39,8 +39,8 @@ const PROTOCOL: u32 = 2;
 
 /// What this endpoint is for.
 #[derive(Debug)]
-pub(super) enum Role {
-    Host { server: ServerConfig, access: Access },
+pub(super) enum Side {
+    Host { server: ServerConfig },
     Guest { client: ClientConfig, invite: Invite, refused: Arc<Mutex<Option<Fingerprint>>> },
 }
 
@@ -48,15 +48,14 @@ pub(super) enum Role {
 pub(super) async fn run(
     shared: Arc<Shared>,
     socket: UdpSocket,
-    emulation: Option<Emulation>,
-    role: Role,
-    ready: SyncSender<Result<(), TransportError>>,
+    side: Side,
+    ready: SyncSender<Result<quinn::Endpoint, TransportError>>,
 ) {
-    let server = match &role {
-        Role::Host { server, .. } => Some(server.clone()),
-        Role::Guest { .. } => None,
+    let server = match &side {
+        Side::Host { server } => Some(server.clone()),
+        Side::Guest { .. } => None,
     };
-    let endpoint = match open(socket, emulation, server) {
+    let endpoint = match open(&shared, socket, server) {
         Ok(endpoint) => endpoint,
         Err(error) => {
             // Nobody to tell means that the application is gone as well.
@@ -64,39 +63,50 @@ pub(super) async fn run(
             return;
         }
     };
-    let _ = ready.send(Ok(()));
-    match role {
-        Role::Host { access, .. } => accept(&shared, &endpoint, access).await,
-        Role::Guest { client, invite, refused } => {
-            let joined = join(Arc::clone(&shared), endpoint.clone(), client, invite, refused);
-            let joined = tokio::spawn(joined);
-            shared.stop.notified().await;
-            endpoint.close(VarInt::from_u32(GOODBYE), b"goodbye");
-            joined.abort();
-        }
+    let _ = ready.send(Ok(endpoint.clone()));
+    match side {
+        Side::Host { .. } => accept(&shared, &endpoint).await,
+        Side::Guest { client, invite, refused } => loop {
+            let joined = join(&shared, &endpoint, client.clone(), &invite, &refused);
+            tokio::select! {
+                () = shared.stop.notified() => break,
+                () = joined => {}
+            }
+            // The next attempt is the application's decision.
+            tokio::select! {
+                () = shared.stop.notified() => break,
+                () = shared.again.notified() => {}
+            }
+        },
     }
+    endpoint.close(VarInt::from_u32(GOODBYE), GOODBYE_WORDS);
     // Close packets are repeated while the other end still sends. It must not hold up an application that ends.
     let _ = timeout(Duration::from_secs(1), endpoint.wait_idle()).await;
 }
 
+/// What an endpoint that ends says to all.
+const GOODBYE_WORDS: &[u8] = b"goodbye";
+
 fn open(
+    shared: &Shared,
     socket: UdpSocket,
-    emulation: Option<Emulation>,
     server: Option<ServerConfig>,
 ) -> Result<quinn::Endpoint, TransportError> {
     let runtime = Arc::new(TokioRuntime);
-    let mut socket = runtime.wrap_udp_socket(socket)?;
-    if let Some(emulation) = emulation {
-        socket = Emulated::under(socket, emulation)?;
-    }
+    let socket = Emulated::under(runtime.wrap_udp_socket(socket)?, &shared.emulator);
     Ok(quinn::Endpoint::new_with_abstract_socket(EndpointConfig::default(), server, socket, runtime)?)
+}
+
+/// Goes on from another socket: the host sees the guest move. Must be called on the network's runtime.
+pub(super) fn move_to(shared: &Shared, endpoint: &quinn::Endpoint, socket: UdpSocket) -> std::io::Result<()> {
+    let socket = TokioRuntime.wrap_udp_socket(socket)?;
+    endpoint.rebind_abstract(Emulated::under(socket, &shared.emulator))
 }
 
 /// With so many handshakes open, a newcomer must first prove that its address is its own.
 const HANDSHAKES_BEFORE_RETRY: usize = 16;
 
-async fn accept(shared: &Arc<Shared>, endpoint: &quinn::Endpoint, access: Access) {
-    let access = Arc::new(access);
+async fn accept(shared: &Arc<Shared>, endpoint: &quinn::Endpoint) {
     let handshakes = Arc::new(AtomicUsize::new(0));
     loop {
         let incoming = tokio::select! {
@@ -119,11 +129,16 @@ async fn accept(shared: &Arc<Shared>, endpoint: &quinn::Endpoint, access: Access
                 debug!(%address, %error, "could not ask a guest to prove its address");
             }
         } else {
+            let Some(from) = From::count(shared, address.ip()) else {
+                debug!(%address, "refused a guest: too many from its address");
+                incoming.refuse();
+                continue;
+            };
             handshakes.fetch_add(1, Ordering::Relaxed);
-            let (shared, access, handshakes) =
-                (Arc::clone(shared), Arc::clone(&access), Arc::clone(&handshakes));
+            let (shared, handshakes) = (Arc::clone(shared), Arc::clone(&handshakes));
             tokio::spawn(async move {
-                let welcomed = timeout(shared.limits.handshake, welcome(&shared, incoming, &access)).await;
+                let _from = from;
+                let welcomed = timeout(shared.limits.handshake, welcome(&shared, incoming)).await;
                 handshakes.fetch_sub(1, Ordering::Relaxed);
                 match welcomed {
                     Ok(Ok(guest)) => guest.serve(&shared).await,
@@ -136,9 +151,40 @@ async fn accept(shared: &Arc<Shared>, endpoint: &quinn::Endpoint, access: Access
     endpoint.close(VarInt::from_u32(GOODBYE), b"the host has left");
 }
 
+/// Counts a connection of an address for as long as it is kept.
+struct From {
+    shared: Arc<Shared>,
+    address: IpAddr,
+}
+
+impl From {
+    fn count(shared: &Arc<Shared>, address: IpAddr) -> Option<Self> {
+        let mut addresses = lock(&shared.addresses);
+        let count = addresses.entry(address).or_default();
+        if *count >= shared.limits.per_address.max(1) {
+            return None;
+        }
+        *count += 1;
+        Some(Self { shared: Arc::clone(shared), address })
+    }
+}
+
+impl Drop for From {
+    fn drop(&mut self) {
+        let mut addresses = lock(&self.shared.addresses);
+        if let Some(count) = addresses.get_mut(&self.address) {
+            *count -= 1;
+            if *count == 0 {
+                addresses.remove(&self.address);
+            }
+        }
+    }
+}
+
 /// An open connection that both ends have agreed to.
 struct Open {
     peer: PeerId,
+    role: Role,
     fingerprint: Fingerprint,
     connection: Connection,
     send: SendStream,
@@ -146,7 +192,7 @@ struct Open {
 }
 
 /// The host's half of the handshake.
-async fn welcome(shared: &Shared, incoming: Incoming, access: &Access) -> Result<Open, CloseReason> {
+async fn welcome(shared: &Shared, incoming: Incoming) -> Result<Open, CloseReason> {
     let connection =
         incoming.accept().map_err(|error| reason_of(error, None))?.await.map_err(|e| reason_of(e, None))?;
     let refuse = |words: &str| {
@@ -160,31 +206,34 @@ async fn welcome(shared: &Shared, incoming: Incoming, access: &Access) -> Result
     let Some(token) = token else {
         return Err(refuse("the first message is no token"));
     };
-    if let Some(words) = access.refusal(token, SystemTime::now()) {
-        return Err(refuse(words));
-    }
+    let access = Arc::clone(&lock(&shared.access));
+    let role = access.role(token, SystemTime::now()).map_err(refuse)?;
     if shared.is_stopping() {
         return Err(refuse("the host is leaving"));
     }
     discard_early(&connection).await;
-    if wire::write_prefix(&mut send, 0).await.is_err() {
+    let answered = async {
+        wire::write_prefix(&mut send, 1).await?;
+        send.write_all(&[role.to_byte()]).await
+    };
+    if answered.await.is_err() {
         return Err(CloseReason::Failed { words: "the guest closed its stream".into() });
     }
     let peer = PeerId(shared.next_peer.fetch_add(1, Ordering::Relaxed));
-    Ok(Open { peer, fingerprint, connection, send, recv })
+    Ok(Open { peer, role, fingerprint, connection, send, recv })
 }
 
 /// The guest's half: one attempt, told as an event either way.
 async fn join(
-    shared: Arc<Shared>,
-    endpoint: quinn::Endpoint,
+    shared: &Shared,
+    endpoint: &quinn::Endpoint,
     client: ClientConfig,
-    invite: Invite,
-    refused: Arc<Mutex<Option<Fingerprint>>>,
+    invite: &Invite,
+    refused: &Mutex<Option<Fingerprint>>,
 ) {
-    let entered = timeout(shared.limits.handshake, enter(&endpoint, client, &invite, &refused)).await;
+    let entered = timeout(shared.limits.handshake, enter(endpoint, client, invite, refused)).await;
     match entered.unwrap_or(Err(CloseReason::TimedOut)) {
-        Ok(host) => host.serve(&shared).await,
+        Ok(host) => host.serve(shared).await,
         Err(reason) => shared.inbox.close(PeerId::HOST, reason),
     }
 }
@@ -225,18 +274,19 @@ async fn enter(
         send.write_all(&token).await
     };
     let welcomed = match written.await {
-        Ok(()) => wire::read_message(&mut recv, 0).await.map_err(|error| error.to_string()),
+        Ok(()) => wire::read_message(&mut recv, 1).await.map_err(|error| error.to_string()),
         Err(error) => Err(error.to_string()),
     };
-    match welcomed {
-        Ok(_) => {}
+    let role = match welcomed.map(|message| message.first().copied().and_then(Role::from_byte)) {
+        Ok(Some(role)) => role,
+        Ok(None) => return Err(CloseReason::Protocol { words: "a welcome without a role".into() }),
         // A refusal closes the connection, and it has the words.
         Err(words) => {
             let closed = timeout(Duration::from_millis(200), connection.closed()).await;
             return Err(closed.map_or(failed(words), reason));
         }
-    }
-    Ok(Open { peer: PeerId::HOST, fingerprint: invite.fingerprint, connection, send, recv })
+    };
+    Ok(Open { peer: PeerId::HOST, role, fingerprint: invite.fingerprint, connection, send, recv })
 }
 
 /// Where to bind a socket that will talk to the host of `invite`.
@@ -278,7 +328,7 @@ fn reason_of(error: ConnectionError, refused: Option<CloseReason>) -> CloseReaso
         ConnectionError::ConnectionClosed(close)
             if close.error_code == TransportErrorCode::CONNECTION_REFUSED =>
         {
-            CloseReason::Refused { words: "it has no room".into() }
+            CloseReason::NoRoom
         }
         ConnectionError::ConnectionClosed(close)
             if close.error_code == TransportErrorCode::crypto(NO_APPLICATION_PROTOCOL) =>
@@ -294,12 +344,12 @@ fn reason_of(error: ConnectionError, refused: Option<CloseReason>) -> CloseReaso
 impl Open {
     /// Carries the connection's traffic until it ends, and tells the application of its beginning and end.
     async fn serve(self, shared: &Shared) {
-        let Self { peer: id, fingerprint, connection, mut send, mut recv } = self;
+        let Self { peer: id, role, fingerprint, connection, mut send, mut recv } = self;
         let peer = Arc::new(Peer::default());
         refresh(&connection, &peer);
         lock(&shared.peers).insert(id, Arc::clone(&peer));
         let address = connection.remote_address();
-        let room = shared.inbox.open(id, Event::Connected { peer: id, fingerprint, address });
+        let room = shared.inbox.open(id, Event::Connected { peer: id, fingerprint, address, role });
         let bucket = Mutex::new(Bucket::new(shared.limits.rate, Instant::now()));
         let reason = {
             let messages_in = pin!(read_messages(shared, id, &connection, &mut recv, &room));
@@ -341,6 +391,7 @@ async fn discard_early(connection: &Connection) {
 
 fn refresh(connection: &Connection, peer: &Peer) {
     let stats = connection.stats();
+    *lock(&peer.address) = Some(connection.remote_address());
     peer.max_datagram.store(connection.max_datagram_size().unwrap_or(0), Ordering::Relaxed);
     *lock(&peer.stats) = PeerStats {
         round_trip: stats.path.rtt,

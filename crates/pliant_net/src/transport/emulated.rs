@@ -4,6 +4,7 @@ use std::fmt;
 use std::io::{self, IoSliceMut};
 use std::net::{IpAddr, SocketAddr};
 use std::pin::Pin;
+use std::sync::atomic::{AtomicU64, Ordering};
 use std::sync::{Arc, Mutex};
 use std::task::{Context, Poll};
 use std::time::Instant;
@@ -73,21 +74,44 @@ impl Direction {
     }
 }
 
-/// The real socket with a link on either side of it.
+/// The links of one endpoint, which may be put in and taken out while it runs.
+#[derive(Debug, Default)]
+pub(super) struct Emulator {
+    outgoing: Mutex<Option<Direction>>,
+    incoming: Mutex<Option<Direction>>,
+    /// A packet has entered, or the socket has changed.
+    changed: Notify,
+    /// Which socket is in use.
+    generation: AtomicU64,
+}
+
+impl Emulator {
+    /// Puts links in, others in their place, or none. What is on its way on the old ones is lost.
+    pub(super) fn set(&self, emulation: Option<Emulation>) {
+        let began = Instant::now();
+        let (outgoing, incoming) = match emulation {
+            None => (None, None),
+            Some(Emulation { outgoing, incoming, seed }) => (
+                Some(Direction::new(outgoing, seed.wrapping_mul(2), began)),
+                Some(Direction::new(incoming, seed.wrapping_mul(2) | 1, began)),
+            ),
+        };
+        *lock(&self.outgoing) = outgoing;
+        *lock(&self.incoming) = incoming;
+        self.changed.notify_one();
+    }
+}
+
+/// The real socket with a link on either side of it, or with none.
 pub(super) struct Emulated {
     socket: Arc<dyn AsyncUdpSocket>,
-    outgoing: Arc<Outgoing>,
-    incoming: Mutex<Incoming>,
+    emulator: Arc<Emulator>,
+    reading: Mutex<Reading>,
 }
 
-struct Outgoing {
-    direction: Mutex<Direction>,
-    entered: Notify,
-}
-
-struct Incoming {
-    direction: Direction,
+struct Reading {
     alarm: Pin<Box<Sleep>>,
+    /// Made when a link is first there.
     buffers: Vec<Vec<u8>>,
 }
 
@@ -101,44 +125,43 @@ impl fmt::Debug for Emulated {
 const LARGEST: usize = 65_535;
 
 impl Emulated {
-    /// Puts `emulation` under `socket`. Must be called on the network's runtime, which carries the packets from then on.
+    /// Puts `emulator` under `socket`, in place of the socket it was under before. Must be called on the network's runtime, which carries the
+    /// packets from then on.
     pub(super) fn under(
         socket: Arc<dyn AsyncUdpSocket>,
-        emulation: Emulation,
-    ) -> io::Result<Arc<dyn AsyncUdpSocket>> {
-        let began = Instant::now();
-        let outgoing = Arc::new(Outgoing {
-            direction: Mutex::new(Direction::new(emulation.outgoing, emulation.seed.wrapping_mul(2), began)),
-            entered: Notify::new(),
-        });
-        tokio::spawn(carry(Arc::clone(&socket), Arc::clone(&outgoing)));
-        let segments = socket.max_receive_segments().max(1);
-        let incoming = Incoming {
-            direction: Direction::new(emulation.incoming, emulation.seed.wrapping_mul(2) | 1, began),
-            alarm: Box::pin(sleep_until(began.into())),
-            buffers: vec![vec![0; LARGEST.max(segments * 1500)]; BATCH],
-        };
-        Ok(Arc::new(Self { socket, outgoing, incoming: Mutex::new(incoming) }))
+        emulator: &Arc<Emulator>,
+    ) -> Arc<dyn AsyncUdpSocket> {
+        let generation = emulator.generation.fetch_add(1, Ordering::AcqRel) + 1;
+        tokio::spawn(carry(Arc::clone(&socket), Arc::clone(emulator), generation));
+        emulator.changed.notify_one();
+        let alarm = Box::pin(sleep_until(Instant::now().into()));
+        let reading = Mutex::new(Reading { alarm, buffers: Vec::new() });
+        Arc::new(Self { socket, emulator: Arc::clone(emulator), reading })
     }
 }
 
 /// Packets read from the real socket at a time.
 const BATCH: usize = 8;
 
-/// Hands packets to the real socket when they have crossed the link.
-async fn carry(socket: Arc<dyn AsyncUdpSocket>, outgoing: Arc<Outgoing>) {
+/// Hands packets to the real socket when they have crossed the link, until another socket takes its place.
+async fn carry(socket: Arc<dyn AsyncUdpSocket>, emulator: Arc<Emulator>, generation: u64) {
     loop {
-        let due = lock(&outgoing.direction).due();
+        let due = lock(&emulator.outgoing).as_ref().and_then(Direction::due);
         match due {
-            None => outgoing.entered.notified().await,
+            None => emulator.changed.notified().await,
             // A packet with a shorter delay may enter meanwhile.
             Some(due) => tokio::select! {
                 () = sleep_until(due.into()) => {}
-                () = outgoing.entered.notified() => {}
+                () = emulator.changed.notified() => {}
             },
         }
+        if emulator.generation.load(Ordering::Acquire) != generation {
+            // What woke this one was meant for its successor.
+            emulator.changed.notify_one();
+            return;
+        }
         loop {
-            let packet = lock(&outgoing.direction).leave(Instant::now());
+            let packet = lock(&emulator.outgoing).as_mut().and_then(|link| link.leave(Instant::now()));
             let Some(packet) = packet else { break };
             let transmit = Transmit {
                 destination: packet.address,
@@ -153,30 +176,41 @@ async fn carry(socket: Arc<dyn AsyncUdpSocket>, outgoing: Arc<Outgoing>) {
     }
 }
 
-/// The link takes whatever comes: its own queue decides what is lost.
+/// A link takes whatever comes, as its own queue decides what is lost; without one the socket decides.
 #[derive(Debug)]
-struct AlwaysWritable;
+struct Poller {
+    emulator: Arc<Emulator>,
+    socket: Pin<Box<dyn UdpPoller>>,
+}
 
-impl UdpPoller for AlwaysWritable {
-    fn poll_writable(self: Pin<&mut Self>, _cx: &mut Context) -> Poll<io::Result<()>> {
-        Poll::Ready(Ok(()))
+impl UdpPoller for Poller {
+    fn poll_writable(mut self: Pin<&mut Self>, cx: &mut Context) -> Poll<io::Result<()>> {
+        if lock(&self.emulator.outgoing).is_some() {
+            return Poll::Ready(Ok(()));
+        }
+        self.socket.as_mut().poll_writable(cx)
     }
 }
 
 impl AsyncUdpSocket for Emulated {
     fn create_io_poller(self: Arc<Self>) -> Pin<Box<dyn UdpPoller>> {
-        Box::pin(AlwaysWritable)
+        let socket = Arc::clone(&self.socket).create_io_poller();
+        Box::pin(Poller { emulator: Arc::clone(&self.emulator), socket })
     }
 
     fn try_send(&self, transmit: &Transmit) -> io::Result<()> {
+        let mut link = lock(&self.emulator.outgoing);
+        let Some(direction) = link.as_mut() else {
+            drop(link);
+            return self.socket.try_send(transmit);
+        };
         let now = Instant::now();
-        let mut direction = lock(&self.outgoing.direction);
         let size = transmit.segment_size.unwrap_or(transmit.contents.len()).max(1);
         for segment in transmit.contents.chunks(size) {
             direction.enter(now, transmit.destination, None, segment);
         }
-        drop(direction);
-        self.outgoing.entered.notify_one();
+        drop(link);
+        self.emulator.changed.notify_one();
         Ok(())
     }
 
@@ -186,8 +220,17 @@ impl AsyncUdpSocket for Emulated {
         bufs: &mut [IoSliceMut<'_>],
         meta: &mut [RecvMeta],
     ) -> Poll<io::Result<usize>> {
-        let mut incoming = lock(&self.incoming);
-        let Incoming { direction, alarm, buffers } = &mut *incoming;
+        let mut link = lock(&self.emulator.incoming);
+        let Some(direction) = link.as_mut() else {
+            drop(link);
+            return self.socket.poll_recv(cx, bufs, meta);
+        };
+        let mut reading = lock(&self.reading);
+        let Reading { alarm, buffers } = &mut *reading;
+        if buffers.is_empty() {
+            let segments = self.socket.max_receive_segments().max(1);
+            *buffers = vec![vec![0; LARGEST.max(segments * 1500)]; BATCH];
+        }
         // Everything that the real socket has goes onto the link; its waker is registered when it has no more.
         loop {
             let mut metas = [RecvMeta::default(); BATCH];
@@ -226,6 +269,10 @@ impl AsyncUdpSocket for Emulated {
             }
         }
         Poll::Pending
+    }
+
+    fn max_receive_segments(&self) -> usize {
+        self.socket.max_receive_segments()
     }
 
     fn local_addr(&self) -> io::Result<SocketAddr> {

@@ -2,7 +2,7 @@
 
 use std::collections::BTreeMap;
 use std::io;
-use std::net::{SocketAddr, UdpSocket};
+use std::net::{IpAddr, SocketAddr, UdpSocket};
 use std::sync::atomic::{AtomicBool, AtomicU64, AtomicUsize, Ordering};
 use std::sync::{Arc, Mutex, mpsc};
 use std::thread::JoinHandle;
@@ -13,8 +13,10 @@ use pliant_stream::PeerId;
 use thiserror::Error;
 use tokio::sync::Notify;
 
-use super::config::{HostOptions, JoinOptions, Limits};
-use super::driver::{self, Role};
+use super::Emulation;
+use super::config::{Access, HostOptions, JoinOptions, Limits, Role};
+use super::driver::{self, Side};
+use super::emulated::Emulator;
 use super::identity::{Fingerprint, Identity, IdentityError};
 use super::invite::{Invite, Token};
 use super::queue::{Inbox, Outbox, lock};
@@ -30,8 +32,10 @@ pub enum Event {
         peer: PeerId,
         /// Its key: the same user has the same one after a reconnect.
         fingerprint: Fingerprint,
-        /// Where it is; may change later (QUIC migration).
+        /// Where it is; may change later (QUIC migration): [`Endpoint::address`].
         address: SocketAddr,
+        /// What its token lets it do; at a guest: what this guest may do.
+        role: Role,
     },
     /// An unreliable, unordered datagram.
     Datagram {
@@ -88,6 +92,9 @@ pub enum CloseReason {
         /// Its words, shortened and without control characters.
         words: String,
     },
+    /// The host has no room for this guest now.
+    #[error("the host has no room")]
+    NoRoom,
     /// The peer broke the rules of the stream.
     #[error("the other end broke the protocol: {words}")]
     Protocol {
@@ -173,6 +180,7 @@ pub(super) struct Peer {
     pub(super) stats: Mutex<PeerStats>,
     pub(super) dropped: Mutex<DropCounts>,
     pub(super) max_datagram: AtomicUsize,
+    pub(super) address: Mutex<Option<SocketAddr>>,
 }
 
 /// What the application and the network's thread share.
@@ -184,10 +192,16 @@ pub(super) struct Shared {
     pub(super) next_peer: AtomicU64,
     pub(super) stopping: AtomicBool,
     pub(super) stop: Notify,
+    /// A guest is to join once more.
+    pub(super) again: Notify,
+    pub(super) access: Mutex<Arc<Access>>,
+    /// Connections and handshakes by where they come from.
+    pub(super) addresses: Mutex<BTreeMap<IpAddr, usize>>,
+    pub(super) emulator: Arc<Emulator>,
 }
 
 impl Shared {
-    fn new(limits: Limits, first_peer: PeerId) -> Arc<Self> {
+    fn new(limits: Limits, first_peer: PeerId, access: Access) -> Arc<Self> {
         Arc::new(Self {
             inbox: Inbox::default(),
             peers: Mutex::default(),
@@ -195,6 +209,10 @@ impl Shared {
             next_peer: AtomicU64::new(first_peer.0),
             stopping: AtomicBool::new(false),
             stop: Notify::new(),
+            again: Notify::new(),
+            access: Mutex::new(Arc::new(access)),
+            addresses: Mutex::default(),
+            emulator: Arc::default(),
         })
     }
 
@@ -210,35 +228,30 @@ impl Shared {
 pub struct Endpoint {
     shared: Arc<Shared>,
     thread: Option<JoinHandle<()>>,
-    local: SocketAddr,
+    runtime: tokio::runtime::Handle,
+    quic: quinn::Endpoint,
     fingerprint: Fingerprint,
-    token: Option<Token>,
 }
 
 impl Endpoint {
     /// Listens for guests. Returns when the socket is bound.
+    ///
+    /// # Errors
+    /// [`TransportError`] when the socket, the thread or the keys cannot be set up.
     pub fn host(options: HostOptions) -> Result<Self, TransportError> {
         let HostOptions { bind, identity, access, limits, emulation } = options;
         let identity = identity.map_or_else(Identity::generate, Ok)?;
         let server = super::config::server(&identity, &limits)?;
-        let token = match &access {
-            super::Access::Anyone => None,
-            super::Access::Token { token, .. } => Some(*token),
-        };
-        Self::start(
-            bind,
-            identity.fingerprint(),
-            token,
-            limits,
-            emulation,
-            PeerId(1),
-            Role::Host { server, access },
-        )
+        let shared = Shared::new(limits, PeerId(1), access);
+        Self::start(bind, identity.fingerprint(), shared, emulation, Side::Host { server })
     }
 
     /// Joins the host of an invite. Returns at once: the first event is [`Event::Connected`], or [`Event::Closed`] with the reason why not.
+    ///
+    /// # Errors
+    /// As [`Endpoint::host`].
     pub fn join(invite: &Invite, options: JoinOptions) -> Result<Self, TransportError> {
-        let JoinOptions { identity, limits, emulation } = options;
+        let JoinOptions { identity, limits, emulation, bind } = options;
         let identity = identity.map_or_else(Identity::generate, Ok)?;
         let mut verifier = None;
         let client = super::config::client(&identity, &limits, |provider| {
@@ -247,45 +260,39 @@ impl Endpoint {
             made
         })?;
         let refused = verifier.unwrap_or_default();
-        let role = Role::Guest { client, invite: invite.clone(), refused };
-        let bind = driver::address_for_joining(invite);
-        Self::start(bind, identity.fingerprint(), None, limits, emulation, PeerId::HOST, role)
+        let side = Side::Guest { client, invite: invite.clone(), refused };
+        let bind = bind.unwrap_or_else(|| driver::address_for_joining(invite));
+        let shared = Shared::new(limits, PeerId::HOST, Access::Anyone);
+        Self::start(bind, identity.fingerprint(), shared, emulation, side)
     }
 
     fn start(
         bind: SocketAddr,
         fingerprint: Fingerprint,
-        token: Option<Token>,
-        limits: Limits,
-        emulation: Option<super::Emulation>,
-        first_peer: PeerId,
-        role: Role,
+        shared: Arc<Shared>,
+        emulation: Option<Emulation>,
+        side: Side,
     ) -> Result<Self, TransportError> {
         let bound = |source| TransportError::Bind { address: bind, source };
         let socket = UdpSocket::bind(bind).map_err(bound)?;
-        let local = socket.local_addr().map_err(bound)?;
-        let shared = Shared::new(limits, first_peer);
+        shared.emulator.set(emulation);
         let runtime = tokio::runtime::Builder::new_current_thread().enable_all().build()?;
+        let handle = runtime.handle().clone();
         let (ready, is_ready) = mpsc::sync_channel(1);
         let for_thread = Arc::clone(&shared);
         let thread = std::thread::Builder::new()
             .name("pliant-net".into())
-            .spawn(move || runtime.block_on(driver::run(for_thread, socket, emulation, role, ready)))?;
-        let endpoint = Self { shared, thread: Some(thread), local, fingerprint, token };
-        match is_ready.recv() {
-            Ok(started) => started?,
-            Err(_) => {
-                return Err(TransportError::Thread(io::Error::other(
-                    "the network's thread ended before it began",
-                )));
-            }
-        }
-        Ok(endpoint)
+            .spawn(move || runtime.block_on(driver::run(for_thread, socket, side, ready)))?;
+        let ended =
+            |_| TransportError::Thread(io::Error::other("the network's thread ended before it began"));
+        let quic = is_ready.recv().map_err(ended)??;
+        Ok(Self { shared, thread: Some(thread), runtime: handle, quic, fingerprint })
     }
 
     /// The socket's own address.
     pub fn local_address(&self) -> SocketAddr {
-        self.local
+        // The socket is bound: a system that cannot say where has said it before.
+        self.quic.local_addr().unwrap_or_else(|_| SocketAddr::from(([0, 0, 0, 0], 0)))
     }
 
     /// This end's key.
@@ -294,17 +301,52 @@ impl Endpoint {
     }
 
     /// The invite to this host. When it listens on every address, the one that the system would use to go out is named; behind a router
-    /// replace [`Invite::host`] with what others see.
+    /// replace [`Invite::host`] with what others see. Its token is the first of [`Access::Tokens`].
     pub fn invite(&self) -> Invite {
-        let mut address = self.local;
+        let mut address = self.local_address();
         if address.ip().is_unspecified() {
             address.set_ip(address_going_out(address));
         }
+        let token: Option<Token> = lock(&self.shared.access).first_token();
         let invite = Invite::new(address, self.fingerprint);
-        match self.token {
+        match token {
             Some(token) => invite.with_token(token),
             None => invite,
         }
+    }
+
+    /// Changes who may join from now on. Who is in stays in.
+    pub fn set_access(&self, access: Access) {
+        *lock(&self.shared.access) = Arc::new(access);
+    }
+
+    /// Puts a lossy link under the socket, another one, or none: at any time, under any session. What is on its way on the old one is lost.
+    pub fn set_emulation(&self, emulation: Option<Emulation>) {
+        self.shared.emulator.set(emulation);
+    }
+
+    /// A guest whose connection has ended joins once more, with the same key and from the same socket; told as an event like the first time. Does
+    /// nothing while the connection is open, and for a host.
+    pub fn rejoin(&self) {
+        if self.peers().is_empty() {
+            self.shared.again.notify_one();
+        }
+    }
+
+    /// Goes on from another address of this machine: connections stay open (QUIC migration). A host's guests do not learn of it by themselves.
+    ///
+    /// # Errors
+    /// [`TransportError::Bind`]: the old socket is still in use.
+    pub fn rebind(&self, address: SocketAddr) -> Result<(), TransportError> {
+        let bound = |source| TransportError::Bind { address, source };
+        let socket = UdpSocket::bind(address).map_err(bound)?;
+        let _on_runtime = self.runtime.enter();
+        driver::move_to(&self.shared, &self.quic, socket).map_err(bound)
+    }
+
+    /// Where a peer is now. `None`: not connected.
+    pub fn address(&self, peer: PeerId) -> Option<SocketAddr> {
+        *lock(&self.peer(peer)?.address)
     }
 
     /// The next thing that happened, if any. Never waits.

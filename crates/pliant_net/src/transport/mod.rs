@@ -22,7 +22,7 @@ mod queue;
 mod stats;
 mod wire;
 
-pub use config::{ALPN, Access, HostOptions, JoinOptions, Limits};
+pub use config::{ALPN, Access, Grant, HostOptions, JoinOptions, Limits, Role};
 pub use congestion::RateCap;
 pub use emulated::Emulation;
 pub use endpoint::{CloseReason, Endpoint, Event, SendError, TransportError};

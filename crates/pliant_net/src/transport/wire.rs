@@ -1,7 +1,7 @@
 //! Messages on the stream: four bytes of length, little end first, then so many bytes.
 //!
-//! The guest opens the one bidirectional stream and sends its token (16 bytes, or none) as the first message. The host answers with an empty
-//! message; from then on messages and datagrams belong to the application.
+//! The guest opens the one bidirectional stream and sends its token (16 bytes, or none) as the first message. The host answers with one
+//! byte, the guest's role (0 hold, 1 watch); from then on messages and datagrams belong to the application.
 
 use bytes::{Bytes, BytesMut};
 use quinn::{ReadExactError, RecvStream, SendStream, WriteError};

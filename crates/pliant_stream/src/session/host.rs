@@ -27,6 +27,7 @@ pub(super) type StreamKey = (StreamWish, usize);
 
 #[derive(Debug)]
 pub(super) struct HostBody {
+    pub(super) id: BodyId,
     pub(super) name: String,
     pub(super) model: Arc<ModalModel>,
     pub(super) bytes: Arc<[u8]>,
@@ -117,6 +118,7 @@ impl HostSession {
             return Err(StreamError::Model(e.to_string()));
         }
         let entry = HostBody {
+            id: body,
             name: name.to_owned(),
             bytes: model.to_bytes().into(),
             hash: model.hash().0,
@@ -144,6 +146,7 @@ impl HostSession {
         for peer in self.peers.values_mut() {
             peer.due.remove(&body);
             peer.flowing.remove(&body);
+            peer.interest.remove(&body);
             peer.resends.retain(|r| r.1 != body);
             let Some(user) = peer.user() else { continue };
             let gone: Vec<u16> = peer.grabs.iter().filter(|(_, g)| g.body == body).map(|(k, _)| *k).collect();
@@ -200,6 +203,20 @@ impl HostSession {
     /// # Errors
     /// [`StreamError::UnknownPeer`]; [`StreamError::State`] when they have not knocked.
     pub fn accept(&mut self, now: Duration, peer: PeerId) -> Result<UserId, StreamError> {
+        self.accept_as(now, peer, None)
+    }
+
+    /// Lets a guest in that knocked, under the number it had `before`: somebody who comes back. A number that is in use, or the host's own, is
+    /// not given; a new one is.
+    ///
+    /// # Errors
+    /// As [`HostSession::accept`].
+    pub fn accept_as(
+        &mut self,
+        now: Duration,
+        peer: PeerId,
+        before: Option<UserId>,
+    ) -> Result<UserId, StreamError> {
         let p = self.peers.get(&peer).ok_or(StreamError::UnknownPeer(peer))?;
         if p.standing != Standing::Knocking {
             return Err(StreamError::State {
@@ -208,7 +225,7 @@ impl HostSession {
                 needed: "a knocking peer",
             });
         }
-        self.admit(now, peer, Vec::new());
+        self.admit(now, peer, Vec::new(), before);
         self.peers.get(&peer).and_then(Peer::user).ok_or(StreamError::UnknownPeer(peer))
     }
 
@@ -224,6 +241,27 @@ impl HostSession {
                 peer.send_message(&HostMessage::GrabRefused { grab: key.grab }, &mut self.out);
             }
         }
+    }
+
+    /// How many modes of a body a guest is sent: at most so many of what it takes anyway, none at all for 0, everything again for `None`. A
+    /// change begins with a snapshot. False for a guest or body that is not there.
+    pub fn set_interest(&mut self, peer: PeerId, body: BodyId, modes: Option<u16>) -> bool {
+        let Some(p) = self.peers.get_mut(&peer).filter(|p| p.announced.contains(&body)) else { return false };
+        if p.interest.get(&body).copied() == modes {
+            return true;
+        }
+        match modes {
+            Some(modes) => p.interest.insert(body, modes),
+            None => p.interest.remove(&body),
+        };
+        if modes == Some(0) {
+            p.flowing.remove(&body);
+            p.due.remove(&body);
+            p.resends.retain(|r| r.1 != body);
+        } else {
+            p.due.insert(body);
+        }
+        true
     }
 
     /// The guests that are in.
@@ -320,7 +358,7 @@ impl HostSession {
                 p.cached = cached.into_iter().collect();
                 p.standing = Standing::Knocking;
                 if self.config.open {
-                    self.admit(now, peer, token);
+                    self.admit(now, peer, token, None);
                 } else {
                     let name = p.name.clone();
                     self.event(HostEvent::Knock { peer, name, token });
@@ -435,14 +473,21 @@ impl HostSession {
         self.events.push_back(event);
     }
 
-    fn admit(&mut self, now: Duration, peer: PeerId, token: Vec<u8>) {
+    fn admit(&mut self, now: Duration, peer: PeerId, token: Vec<u8>, before: Option<UserId>) {
         let taken: BTreeSet<u16> = self.peers.values().filter_map(|p| p.user().map(|u| u.0)).collect();
-        // At most 256 guests by default, 65,535 numbers: the search ends.
-        let mut number = self.next_user;
-        while number == 0 || taken.contains(&number) {
-            number = number.wrapping_add(1);
-        }
-        self.next_user = number.wrapping_add(1);
+        let free = |number: u16| number != 0 && !taken.contains(&number);
+        let number = match before.map(|user| user.0).filter(|&number| free(number)) {
+            Some(number) => number,
+            None => {
+                // At most 256 guests by default, 65,535 numbers: the search ends.
+                let mut number = self.next_user;
+                while !free(number) {
+                    number = number.wrapping_add(1);
+                }
+                self.next_user = number.wrapping_add(1);
+                number
+            }
+        };
         let user = UserId(number);
         let users: Vec<(u16, String)> =
             self.peers.values().filter_map(|p| p.user().map(|u| (u.0, p.name.clone()))).collect();
@@ -533,6 +578,12 @@ impl HostSession {
 pub(super) fn stream_key(peer: &Peer, body: &HostBody) -> Option<StreamKey> {
     let model_modes = body.model.mode_count();
     let mut wish = peer.regulator.cut(peer.wish?, model_modes);
+    if let Some(&most) = peer.interest.get(&body.id) {
+        if most == 0 {
+            return None;
+        }
+        wish.modes = wish.modes.min(most);
+    }
     wish.modes = Encoder::modes_for(&wish, model_modes, peer.max_datagram) as u16;
     Some((wish, peer.max_datagram))
 }

@@ -57,6 +57,8 @@ pub(crate) struct Peer {
     pub(crate) due: BTreeSet<BodyId>,
     /// Bodies whose snapshot was sent: frames flow.
     pub(crate) flowing: BTreeSet<BodyId>,
+    /// Most modes that are sent of a body, where that is not all that the guest takes; 0: nothing is.
+    pub(crate) interest: BTreeMap<BodyId, u16>,
     pub(crate) grabs: BTreeMap<u16, HeldGrab>,
     pub(crate) resends: VecDeque<(Duration, BodyId, Tick)>,
     pub(crate) heard: Duration,
@@ -85,6 +87,7 @@ impl Peer {
             announced: BTreeSet::new(),
             due: BTreeSet::new(),
             flowing: BTreeSet::new(),
+            interest: BTreeMap::new(),
             grabs: BTreeMap::new(),
             resends: VecDeque::new(),
             heard: now,

@@ -1,0 +1,180 @@
+//! The host's bodies, and the entities that follow them.
+
+use std::sync::Arc;
+
+use bevy::prelude::*;
+use pliant_body::{Driven, ModalAsset, ModalBody};
+use pliant_modal::ModalModel;
+use pliant_stream::{BodyId, BodyView, Pose};
+
+use super::{Interest, NetGuest, shown_of};
+use crate::phase::Phase;
+use crate::scene::{Placement, SharedBody};
+use crate::seen::{BodyArrived, BodyLeft, RemoteBody, SeenHands};
+
+/// A body of the host, as it was shown last.
+pub(super) struct FollowedBody {
+    pub(super) entity: Entity,
+    /// Made here, not by the app: goes when the body goes, and is where the host has it.
+    made_here: bool,
+    pub(super) name: String,
+    pub(super) phase: Phase,
+    pub(super) tick: u64,
+    pub(super) previous: (Vec<f64>, Option<Pose>),
+    pub(super) current: (Vec<f64>, Option<Pose>),
+    /// The newest state is on screen and nothing has come since.
+    pub(super) settled: bool,
+    /// Largest size of the state so far, the scale of the shown offset.
+    pub(super) peak: f64,
+}
+
+impl NetGuest {
+    pub(super) fn place(&mut self, world: &mut World, placement: Placement) {
+        // As many as the session may have bodies.
+        if self.placements.len() >= 1024 && !self.placements.contains_key(&placement.body) {
+            return;
+        }
+        self.placements.insert(placement.body, placement.transform);
+        if let Some(followed) = self.bodies.get(&placement.body)
+            && followed.made_here
+            && let Some(mut transform) = world.get_mut::<Transform>(followed.entity)
+        {
+            *transform = placement.transform;
+        }
+    }
+
+    /// Model and state of a body are here: it gets its entity.
+    pub(super) fn body_ready(&mut self, world: &mut World, id: BodyId, model: Arc<ModalModel>) {
+        let Some(view) = self.session.as_ref().and_then(|session| session.body(id)) else { return };
+        let (name, warp) = (view.info().name.clone(), view.info().warp);
+        // How many of them the stream carries may change; the picture has room for all that we would take.
+        let modes = self.config.modes.map(usize::from).filter(|&modes| modes < model.mode_count());
+        let now = self.now();
+        self.line.keep_model(now, &model);
+        let handle = world.get_resource_mut::<Assets<ModalAsset>>().map(|mut assets| {
+            let known = assets.iter().find(|(_, asset)| asset.0.hash() == model.hash()).map(|(id, _)| id);
+            let known = known.and_then(|id| assets.get_strong_handle(id));
+            known.unwrap_or_else(|| assets.add(ModalAsset::from(model)))
+        });
+        let Some(handle) = handle else {
+            error_once!("a body has arrived, but the app has no PliantBodyPlugin");
+            return;
+        };
+        let followed = self.bodies.get(&id).filter(|followed| world.get_entity(followed.entity).is_ok());
+        let (entity, made_here) = match followed {
+            Some(followed) => (followed.entity, followed.made_here),
+            None => {
+                let mut waiting = world.query_filtered::<(Entity, &SharedBody), Without<RemoteBody>>();
+                let waiting =
+                    waiting.iter(world).find(|(_, shared)| shared.name == name).map(|(entity, _)| entity);
+                match waiting {
+                    Some(entity) => {
+                        // It may have been followed before the session was lost.
+                        let before = self.orphans.iter().position(|orphan| orphan.entity == entity);
+                        let before = before.map(|index| self.orphans.swap_remove(index));
+                        (entity, before.is_some_and(|before| before.made_here))
+                    }
+                    None => {
+                        let transform = self.placements.get(&id).copied().unwrap_or_default();
+                        (world.spawn((SharedBody::named(name.clone()), transform)).id(), true)
+                    }
+                }
+            }
+        };
+        let mut target = world.entity_mut(entity);
+        match target.get_mut::<ModalBody>() {
+            Some(mut body) => {
+                let new = ModalBody { model: handle, modes, warp, ..body.clone() };
+                body.set_if_neq(new);
+            }
+            None => {
+                target.insert(ModalBody { modes, warp, ..ModalBody::new(handle) });
+            }
+        }
+        target.insert((Driven::Remote, RemoteBody(id), SeenHands::default()));
+        target.entry::<Interest>().or_default();
+        self.bodies.insert(
+            id,
+            FollowedBody {
+                entity,
+                made_here,
+                name: name.clone(),
+                phase: Phase::default(),
+                tick: 0,
+                previous: (Vec::new(), None),
+                current: (Vec::new(), None),
+                settled: false,
+                peak: 0.0,
+            },
+        );
+        world.write_message(BodyArrived { entity, name });
+    }
+
+    pub(super) fn body_gone(&mut self, world: &mut World, id: BodyId) {
+        self.placements.remove(&id);
+        self.wanted.remove(&id);
+        let Some(followed) = self.bodies.remove(&id) else { return };
+        self.grabs.retain(|_, sent| sent.body != id);
+        Self::take_leave(world, followed);
+    }
+
+    /// All bodies stand still: the session is lost.
+    pub(super) fn orphan_bodies(&mut self, world: &mut World) {
+        self.placements.clear();
+        self.wanted.clear();
+        for (_, followed) in std::mem::take(&mut self.bodies) {
+            if let Ok(mut entity) = world.get_entity_mut(followed.entity) {
+                entity.remove::<(RemoteBody, SeenHands)>();
+            }
+            self.orphans.push(followed);
+        }
+    }
+
+    /// The session is there again, and these bodies are not in it any more.
+    pub(super) fn forget_orphans(&mut self, world: &mut World) {
+        for followed in std::mem::take(&mut self.orphans) {
+            Self::take_leave(world, followed);
+        }
+    }
+
+    fn take_leave(world: &mut World, followed: FollowedBody) {
+        if followed.made_here {
+            world.try_despawn(followed.entity).ok();
+        } else if let Ok(mut entity) = world.get_entity_mut(followed.entity) {
+            entity.remove::<(RemoteBody, SeenHands)>();
+        }
+        world.write_message(BodyLeft { entity: followed.entity, name: followed.name });
+    }
+}
+
+impl FollowedBody {
+    /// Takes over what the session shows now.
+    pub(super) fn take(&mut self, view: &BodyView) {
+        // The newer copy steps with the confirmed one, so the ticks of that one say when.
+        let Some((_, shown)) = shown_of(view) else { return };
+        let tick = view.tick();
+        let first = self.current.0.len() != shown.modes();
+        if tick == self.tick && !first {
+            // A snapshot may have moved the state of a tick; its blend begins at what was shown.
+            return;
+        }
+        self.tick = tick;
+        self.settled = false;
+        std::mem::swap(&mut self.previous, &mut self.current);
+        self.current.0.clone_from(&shown.q);
+        self.current.1 = view.pose();
+        if first {
+            self.previous = self.current.clone();
+        }
+        self.peak = self.peak.max(shown.q.iter().map(|q| q * q).sum::<f64>().sqrt());
+    }
+
+    /// The state between the last two, for a picture of so many modes: those that the stream does not carry are at rest.
+    pub(super) fn between(&self, fraction: f64, modes: usize, out: &mut Vec<f64>) {
+        out.clear();
+        out.extend(
+            self.previous.0.iter().zip(&self.current.0).map(|(from, to)| from + (to - from) * fraction),
+        );
+        out.resize(modes, 0.0);
+    }
+}

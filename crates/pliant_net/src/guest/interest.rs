@@ -1,0 +1,162 @@
+//! How much of each body is asked for: what is not looked at, or is far away, need not come.
+
+use std::time::Duration;
+
+use bevy::camera::primitives::{Frustum, Sphere};
+use bevy::math::Vec3A;
+use bevy::prelude::*;
+use pliant_body::{BodyState, Grabs};
+
+use super::NetGuest;
+use crate::scene::Wanted;
+use crate::seen::RemoteBody;
+
+/// How much of a body a guest wants to be sent. On every body that follows a host's; written by the app, or by [`CameraInterest`].
+///
+/// Fewer modes are fewer bytes and less work, and a coarser shape: modes are ordered, the first are the largest motions.
+#[derive(Component, Debug, Clone, Copy, Default, PartialEq, Eq, Hash)]
+pub enum Interest {
+    /// All modes that this guest takes. Default.
+    #[default]
+    All,
+    /// At most so many; at least one.
+    Modes(u16),
+    /// Nothing: the body stands still as it was last seen.
+    Nothing,
+}
+
+/// Asks for what the cameras see: nothing of a body outside of every view, a quarter or half of the modes of a small one.
+///
+/// More is asked for at once, less when it has been enough for `patience`. A body that this guest holds comes whole.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct CameraInterest {
+    /// A body whose height is at least this part of the view's comes whole. Default: 0.15.
+    pub whole: f32,
+    /// Default: 1 s.
+    pub patience: Duration,
+}
+
+impl Default for CameraInterest {
+    fn default() -> Self {
+        Self { whole: 0.15, patience: Duration::from_secs(1) }
+    }
+}
+
+impl CameraInterest {
+    /// What a body of so many modes, whose height is such a part of the view's (`None`: not seen), is worth.
+    fn worth(&self, height: Option<f32>, modes: usize) -> Interest {
+        let Some(height) = height else { return Interest::Nothing };
+        let share = [(1.0, 1), (0.5, 2), (0.25, 4)].into_iter().find(|(part, _)| height >= self.whole * part);
+        match share.map_or(8, |(_, share)| share) {
+            1 => Interest::All,
+            share => Interest::Modes(u16::try_from(modes.div_ceil(share).max(4)).unwrap_or(u16::MAX)),
+        }
+    }
+}
+
+/// What the host was told.
+#[derive(Debug, Clone, Copy)]
+pub(super) struct Said {
+    modes: u16,
+    /// The camera has seen less since.
+    less_since: Option<Duration>,
+}
+
+impl Interest {
+    fn modes(self) -> u16 {
+        match self {
+            Self::All => Wanted::ALL,
+            Self::Modes(modes) => modes.max(1),
+            Self::Nothing => 0,
+        }
+    }
+}
+
+/// `PostUpdate`: the cameras decide, where the app has left it to them.
+pub(crate) fn look(
+    guest: Option<ResMut<NetGuest>>,
+    cameras: Query<(&Camera, &Projection, &GlobalTransform, &Frustum)>,
+    mut bodies: Query<(&RemoteBody, &BodyState, &GlobalTransform, Option<&Grabs>, &mut Interest)>,
+) {
+    let Some(mut guest) = guest else { return };
+    let Some(config) = guest.config.interest else { return };
+    let now = guest.now();
+    for (body, state, place, grabs, mut interest) in &mut bodies {
+        let model = state.model();
+        let (scale, ..) = place.to_scale_rotation_translation();
+        let radius = 0.5 * model.size() as f32 * scale.x;
+        let [low, high] = model.surface().bounds();
+        let middle = place.transform_point(0.5 * (Vec3::from(low) + Vec3::from(high)));
+        let heights =
+            cameras.iter().filter(|(camera, ..)| camera.is_active).filter_map(|(_, lens, at, frustum)| {
+                // A body bends out of its bounds at rest.
+                let seen = Sphere { center: Vec3A::from(middle), radius: 1.5 * radius };
+                frustum
+                    .intersects_sphere(&seen, true)
+                    .then(|| height_in(lens, at.translation().distance(middle), radius))
+            });
+        let held = grabs.is_some_and(|grabs| !grabs.entities().is_empty());
+        let highest = heights.reduce(f32::max);
+        let worth = if held { Interest::All } else { config.worth(highest, model.mode_count()) };
+        let said = guest.wanted.get_mut(&body.0);
+        let less = worth.modes() < interest.modes();
+        let waits = said.is_some_and(|said| {
+            said.less_since = less.then(|| said.less_since.unwrap_or(now));
+            said.less_since.is_some_and(|since| now.saturating_sub(since) < config.patience)
+        });
+        if !waits {
+            interest.set_if_neq(worth);
+        }
+    }
+}
+
+/// The part of the view's height that a sphere takes.
+fn height_in(lens: &Projection, distance: f32, radius: f32) -> f32 {
+    match lens {
+        Projection::Perspective(lens) => radius / (distance.max(1e-6) * (0.5 * lens.fov).tan()),
+        Projection::Orthographic(lens) => 2.0 * radius / lens.area.height().max(1e-6),
+        // Of a lens that we do not know we know nothing: whole.
+        Projection::Custom(_) => f32::INFINITY,
+    }
+}
+
+/// `PostUpdate`, after [`look`]: the host is told what has changed.
+pub(crate) fn say_interest(guest: Option<ResMut<NetGuest>>, bodies: Query<(&RemoteBody, &Interest)>) {
+    let Some(mut guest) = guest else { return };
+    let guest = &mut *guest;
+    for (body, interest) in &bodies {
+        let modes = interest.modes();
+        let said = guest.wanted.entry(body.0).or_insert(Said { modes: Wanted::ALL, less_since: None });
+        if said.modes != modes {
+            said.modes = modes;
+            guest.line.send_message(Wanted { body: body.0, modes }.to_message());
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn small_bodies_are_worth_fewer_modes_and_unseen_ones_none() {
+        let config = CameraInterest::default();
+        assert_eq!(config.worth(None, 60), Interest::Nothing);
+        assert_eq!(config.worth(Some(0.2), 60), Interest::All);
+        assert_eq!(config.worth(Some(0.1), 60), Interest::Modes(30));
+        assert_eq!(config.worth(Some(0.05), 60), Interest::Modes(15));
+        assert_eq!(config.worth(Some(0.001), 60), Interest::Modes(8));
+        assert_eq!(config.worth(Some(0.001), 10), Interest::Modes(4), "never fewer");
+    }
+
+    #[test]
+    fn a_sphere_takes_its_part_of_the_view() {
+        let lens = Projection::Perspective(PerspectiveProjection {
+            fov: std::f32::consts::FRAC_PI_2,
+            ..PerspectiveProjection::default()
+        });
+        // The view is 2 m high at 1 m; a ball of 0.5 m across is a quarter of it.
+        assert!((height_in(&lens, 1.0, 0.25) - 0.25).abs() < 1e-6);
+        assert!((height_in(&lens, 10.0, 0.25) - 0.025).abs() < 1e-6);
+    }
+}

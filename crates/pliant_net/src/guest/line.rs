@@ -1,0 +1,153 @@
+//! Where a guest's session comes from: a host over QUIC, or a recording of one.
+
+use std::sync::Arc;
+use std::time::{Duration, Instant};
+
+use bytes::Bytes;
+use pliant_modal::ModalModel;
+use pliant_stream::{Channel, Output, PeerId};
+use tracing::debug;
+
+use crate::recording::{Record, Recorder, Recording};
+use crate::scene;
+use crate::transport::{CloseReason, Endpoint, Event, PeerStats, Role};
+
+/// The guest's end of the line.
+pub(crate) enum Line {
+    Quic { endpoint: Endpoint, recorder: Option<Recorder> },
+    Replay { recording: Recording, max_datagram: usize, over: bool },
+}
+
+/// What came, and when it did.
+pub(crate) enum Came {
+    Connected { role: Role },
+    Datagram { at: Duration, bytes: Bytes },
+    Message { bytes: Bytes },
+    Closed { reason: CloseReason },
+}
+
+impl Line {
+    pub(crate) fn replay(recording: Recording) -> Self {
+        Self::Replay { recording, max_datagram: 0, over: false }
+    }
+
+    /// The next thing that came by `now`, both since `began`.
+    pub(crate) fn poll(&mut self, began: Instant, now: Duration) -> Option<Came> {
+        match self {
+            Self::Quic { endpoint, recorder } => {
+                let (came, at, record) = match endpoint.poll()? {
+                    Event::Connected { peer, role, .. } => {
+                        let most = endpoint.max_datagram_size(peer).unwrap_or(0);
+                        let max_datagram = u16::try_from(most).unwrap_or(u16::MAX);
+                        (Came::Connected { role }, now, Record::Connected { role, max_datagram })
+                    }
+                    Event::Datagram { at, bytes, .. } => {
+                        let at = at.saturating_duration_since(began);
+                        (Came::Datagram { at, bytes: bytes.clone() }, at, Record::Datagram(bytes))
+                    }
+                    Event::Message { bytes, .. } => {
+                        (Came::Message { bytes: bytes.clone() }, now, Record::Message(bytes))
+                    }
+                    Event::Closed { reason, .. } => {
+                        let words = reason.to_string();
+                        (Came::Closed { reason }, now, Record::Closed(words))
+                    }
+                };
+                if let Some(recorder) = recorder {
+                    recorder.put(at, &record);
+                }
+                Some(came)
+            }
+            Self::Replay { recording, max_datagram, over } => {
+                let Some((at, record)) = recording.poll(now) else {
+                    let ends = recording.is_over() && !std::mem::replace(over, true);
+                    let words = "the recording is over".to_owned();
+                    return ends.then_some(Came::Closed { reason: CloseReason::ByPeer { words } });
+                };
+                Some(match record {
+                    Record::Connected { role, max_datagram: most } => {
+                        *max_datagram = usize::from(most);
+                        Came::Connected { role }
+                    }
+                    Record::Datagram(bytes) => Came::Datagram { at, bytes },
+                    Record::Message(bytes) => Came::Message { bytes },
+                    Record::Closed(words) => {
+                        // One that went on after it has what follows.
+                        if recording.is_over() {
+                            *over = true;
+                            return Some(Came::Closed { reason: CloseReason::ByPeer { words } });
+                        }
+                        Came::Closed { reason: CloseReason::Failed { words } }
+                    }
+                    // Taken up when the recording was opened.
+                    Record::Model(_) => return self.poll(began, now),
+                })
+            }
+        }
+    }
+
+    pub(crate) fn send(&self, output: Output) {
+        let Self::Quic { endpoint, .. } = self else { return };
+        // A host that does not read our few messages is as good as gone; the idle timeout will say so.
+        let sent = match output.channel {
+            Channel::Datagram => endpoint.send_datagram(PeerId::HOST, Bytes::from_owner(output.bytes)),
+            Channel::Message => endpoint.send_message(PeerId::HOST, scene::session_message(&output.bytes)),
+        };
+        if let Err(error) = sent {
+            debug!("not sent to the host: {error}");
+        }
+    }
+
+    pub(crate) fn send_message(&self, message: Bytes) {
+        if let Self::Quic { endpoint, .. } = self
+            && let Err(error) = endpoint.send_message(PeerId::HOST, message)
+        {
+            debug!("not sent to the host: {error}");
+        }
+    }
+
+    /// A model of the cache is used: a recording must have it, as it never comes over the line.
+    pub(crate) fn keep_model(&mut self, now: Duration, model: &Arc<ModalModel>) {
+        if let Self::Quic { recorder: Some(recorder), .. } = self {
+            recorder.put(now, &Record::Model(model.to_bytes().into()));
+        }
+    }
+
+    pub(crate) fn is_replay(&self) -> bool {
+        matches!(self, Self::Replay { .. })
+    }
+
+    pub(crate) fn endpoint(&self) -> Option<&Endpoint> {
+        match self {
+            Self::Quic { endpoint, .. } => Some(endpoint),
+            Self::Replay { .. } => None,
+        }
+    }
+
+    pub(crate) fn max_datagram_size(&self) -> Option<usize> {
+        match self {
+            Self::Quic { endpoint, .. } => endpoint.max_datagram_size(PeerId::HOST),
+            Self::Replay { max_datagram, .. } => Some(*max_datagram),
+        }
+    }
+
+    /// The connection's figures; a recording has none of its own.
+    pub(crate) fn stats(&self) -> Option<PeerStats> {
+        match self {
+            Self::Quic { endpoint, .. } => endpoint.stats(PeerId::HOST),
+            Self::Replay { over, .. } => (!over).then(PeerStats::default),
+        }
+    }
+
+    pub(crate) fn close(&self) {
+        if let Self::Quic { endpoint, .. } = self {
+            endpoint.close(PeerId::HOST, "goodbye");
+        }
+    }
+
+    pub(crate) fn rejoin(&self) {
+        if let Self::Quic { endpoint, .. } = self {
+            endpoint.rejoin();
+        }
+    }
+}

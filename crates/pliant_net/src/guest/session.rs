@@ -1,0 +1,267 @@
+//! The course of a guest's session: joining, being let in, losing the host, coming back.
+
+use std::sync::Arc;
+use std::time::Duration;
+
+use bevy::prelude::*;
+use pliant_body::ModalAsset;
+use pliant_stream::{EndReason, GuestEvent, GuestSession, StreamError, UserId};
+
+use super::line::Came;
+use super::{GuestState, NetGuest};
+use crate::scene::{self, Person, Reliable};
+use crate::seen::{GrabRefused, SessionClosed, SessionJoined, SessionLost};
+use crate::transport::{CloseReason, Role};
+use crate::user::{User, UserJoined, UserLeft, UserLink, Yourself};
+
+/// When joining is tried again.
+#[derive(Debug, Default)]
+pub(super) struct Retry {
+    /// The host was let go of at this time.
+    since: Option<Duration>,
+    /// The next attempt is due then; `None` while one is under way.
+    next: Option<Duration>,
+    pause: Duration,
+    /// We were in once.
+    was_in: bool,
+    /// Bodies that are not back by then are gone.
+    orphans_until: Option<Duration>,
+}
+
+/// The first attempt follows at once, the next ones after a pause that doubles up to this.
+const LONGEST_PAUSE: Duration = Duration::from_secs(2);
+const FIRST_PAUSE: Duration = Duration::from_millis(100);
+/// So long after the welcome a body may take to come again, before it counts as gone.
+const ORPHANS: Duration = Duration::from_secs(5);
+
+/// `PreUpdate`: what came from the host.
+pub(crate) fn receive(world: &mut World) {
+    world.try_resource_scope(|world, mut guest: Mut<NetGuest>| {
+        let guest = &mut *guest;
+        loop {
+            let now = guest.now();
+            let Some(came) = guest.line.poll(guest.began, now) else { break };
+            match came {
+                Came::Connected { role } => {
+                    guest.role = role;
+                    if let Err(error) = guest.greet(world, now) {
+                        guest.close(world, error.to_string());
+                    }
+                }
+                Came::Datagram { at, bytes } => {
+                    if let Some(session) = &mut guest.session {
+                        session.on_datagram(at, &bytes);
+                    }
+                }
+                Came::Message { bytes } => match (scene::read(&bytes), &mut guest.session) {
+                    (Some(Reliable::Session(bytes)), Some(session)) => session.on_message(now, bytes),
+                    (Some(Reliable::Placement(placement)), _) => guest.place(world, placement),
+                    (Some(Reliable::People(people)), _) => guest.know(world, people),
+                    (Some(Reliable::Reaches(reaches)), _) => guest.reaches = reaches,
+                    // A later host may have more to say.
+                    _ => debug!("a message of no known kind from the host"),
+                },
+                Came::Closed { reason } => {
+                    // A goodbye of the session came before this and says more.
+                    guest.take_events(world);
+                    guest.ended(world, now, &reason);
+                }
+            }
+            guest.take_events(world);
+        }
+        let now = guest.now();
+        guest.take_events(world);
+        guest.try_again(world, now);
+        guest.flush();
+    });
+}
+
+impl NetGuest {
+    /// The connection is open: says hello.
+    fn greet(&mut self, world: &World, now: Duration) -> Result<(), StreamError> {
+        let most = self.line.max_datagram_size().unwrap_or(0);
+        let config = pliant_stream::GuestConfig {
+            name: scene::shortened(&self.config.name).to_owned(),
+            recovery: self.config.recovery,
+            modes: self.config.modes,
+            own_hand_first: self.config.own_hand_first,
+            idle_timeout: self.config.transport.limits.idle_timeout,
+            ..pliant_stream::GuestConfig::default()
+        };
+        let mut session = GuestSession::new(config, most)?;
+        let loaded = world.get_resource::<Assets<ModalAsset>>();
+        let loaded = loaded.into_iter().flat_map(|assets| assets.iter().map(|(_, asset)| &asset.0));
+        for model in self.config.models.iter().chain(loaded) {
+            session.add_cached_model(Arc::clone(model));
+        }
+        session.connect(now)?;
+        self.session = Some(session);
+        Ok(())
+    }
+
+    /// The connection has ended, or there was none.
+    fn ended(&mut self, world: &mut World, now: Duration, reason: &CloseReason) {
+        if matches!(self.state, GuestState::Closed { .. }) {
+            return;
+        }
+        let may_come_back = match reason {
+            CloseReason::ByPeer { .. } | CloseReason::TimedOut | CloseReason::Failed { .. } => true,
+            // Who was in finds a place again when the house has sorted itself out.
+            CloseReason::NoRoom => self.retry.was_in,
+            // We have hung up on a host that had fallen silent.
+            CloseReason::ByUs => matches!(self.state, GuestState::Lost { .. }),
+            _ => false,
+        };
+        if may_come_back && !self.line.is_replay() {
+            self.lost(world, now, reason.to_string());
+        } else {
+            self.close(world, reason.to_string());
+        }
+    }
+
+    /// The host is not to be heard: what is here stands still, and joining is tried again.
+    fn lost(&mut self, world: &mut World, now: Duration, reason: String) {
+        let since = *self.retry.since.get_or_insert(now);
+        if now.saturating_sub(since) >= self.config.rejoin {
+            return self.close(world, reason);
+        }
+        if self.retry.next.is_none() {
+            self.retry.pause = (self.retry.pause * 2).clamp(FIRST_PAUSE, LONGEST_PAUSE);
+            self.retry.next = Some(now + self.retry.pause);
+        }
+        self.flush();
+        self.session = None;
+        if matches!(self.state, GuestState::Lost { .. }) {
+            return;
+        }
+        info!("the host cannot be heard, trying again: {reason}");
+        if matches!(self.state, GuestState::In { .. }) {
+            self.leave_session(world);
+            world.write_message(SessionLost { reason: reason.clone() });
+        }
+        self.state = GuestState::Lost { reason };
+    }
+
+    fn try_again(&mut self, world: &mut World, now: Duration) {
+        if self.retry.next.is_some_and(|due| now >= due) {
+            self.retry.next = None;
+            self.line.rejoin();
+        }
+        if self.retry.orphans_until.is_some_and(|until| now >= until) {
+            self.retry.orphans_until = None;
+            self.forget_orphans(world);
+        }
+    }
+
+    /// Grabs are not held any more, the others are not seen any more.
+    fn leave_session(&mut self, world: &mut World) {
+        self.grabs.clear();
+        self.orphan_bodies(world);
+        for (_, entity) in std::mem::take(&mut self.users) {
+            world.try_despawn(entity).ok();
+        }
+        self.people.clear();
+        self.reaches.clear();
+    }
+
+    fn close(&mut self, world: &mut World, reason: String) {
+        if matches!(self.state, GuestState::Closed { .. }) {
+            return;
+        }
+        info!("the session is over: {reason}");
+        self.flush();
+        self.line.close();
+        self.state = GuestState::Closed { reason: reason.clone() };
+        self.leave_session(world);
+        world.write_message(SessionClosed { reason });
+    }
+
+    fn take_events(&mut self, world: &mut World) {
+        while let Some(event) = self.session.as_mut().and_then(GuestSession::poll_event) {
+            match event {
+                GuestEvent::Welcomed { user } => self.welcomed(world, user),
+                GuestEvent::BodyReady { body, model } => self.body_ready(world, body, model),
+                GuestEvent::BodyGone { body } => self.body_gone(world, body),
+                GuestEvent::Stalled { body } => {
+                    debug!("body {body} stands still: nothing comes from the host")
+                }
+                GuestEvent::UserJoined { user, name } => {
+                    let (entity, name) = self.meet(world, user, &name);
+                    world.write_message(UserJoined { entity, id: user, name, back: false });
+                }
+                GuestEvent::UserLeft { user } => {
+                    self.people.remove(&user);
+                    if let Some(entity) = self.users.remove(&user) {
+                        let name =
+                            world.get::<User>(entity).map(|user| user.name.clone()).unwrap_or_default();
+                        world.try_despawn(entity).ok();
+                        world.write_message(UserLeft { id: user, name, reason: "left".into() });
+                    }
+                }
+                GuestEvent::GrabRefused { grab } => {
+                    let refused = self.grabs.iter_mut().find(|(_, sent)| sent.number == Some(grab));
+                    if let Some((&entity, sent)) = refused {
+                        sent.number = None;
+                        world.write_message(GrabRefused { entity });
+                    }
+                }
+                // Both ends have stopped hearing each other: the connection is tried anew, not given up.
+                GuestEvent::Closed { reason: EndReason::Silent | EndReason::Lost } => {
+                    self.flush();
+                    self.line.close();
+                    let now = self.now();
+                    self.lost(world, now, EndReason::Silent.to_string());
+                }
+                GuestEvent::Closed { reason } => self.close(world, reason.to_string()),
+                _ => {}
+            }
+        }
+    }
+
+    fn meet(&mut self, world: &mut World, id: UserId, name: &str) -> (Entity, String) {
+        let person = self.people.get(&id);
+        let role = person.map_or(Role::Hold, |person| person.role);
+        let user = User::new(id, person.map_or(name, |person| &person.name), role);
+        let name = user.name.clone();
+        let entity = world.spawn((user, UserLink::default())).id();
+        if let Some(old) = self.users.insert(id, entity) {
+            world.try_despawn(old).ok();
+        }
+        (entity, name)
+    }
+
+    /// The host says who is who: their names and roles, its own among them.
+    fn know(&mut self, world: &mut World, people: Vec<Person>) {
+        for person in people {
+            // As many as there are numbers; the session tells who leaves.
+            let known = self.users.get(&person.user).and_then(|&entity| world.get_mut::<User>(entity));
+            if let Some(mut user) = known {
+                user.set_if_neq(User::new(person.user, &person.name, person.role));
+            }
+            self.people.insert(person.user, person);
+        }
+    }
+
+    fn welcomed(&mut self, world: &mut World, user: UserId) {
+        let again = std::mem::replace(&mut self.retry, Retry { was_in: true, ..Retry::default() }).was_in;
+        if again {
+            self.retry.orphans_until = Some(self.now() + ORPHANS);
+        }
+        self.state = GuestState::In { user };
+        let own = self.config.name.clone();
+        let (entity, name) = self.meet(world, user, &own);
+        world.entity_mut(entity).insert(Yourself);
+        info!("in the session as {name}, user {}", user.0);
+        let others: Vec<_> = self.session.as_ref().map_or_else(Vec::new, |session| {
+            let others = session.users().filter(|(id, _)| *id != user);
+            others.map(|(id, name)| (id, name.to_owned())).collect()
+        });
+        for (id, name) in others {
+            self.meet(world, id, &name);
+        }
+        if !self.users.contains_key(&UserId::HOST) {
+            self.meet(world, UserId::HOST, "host");
+        }
+        world.write_message(SessionJoined { user, again });
+    }
+}

@@ -1,0 +1,121 @@
+//! What the session shows, written for the eye and the hand.
+
+use bevy::math::{DQuat, DVec3};
+use bevy::prelude::*;
+use pliant_body::{BodyState, GrabForce, ShownState};
+use pliant_stream::{BodyView, GrabKey, Pose};
+
+use super::NetGuest;
+use crate::place::Place;
+use crate::seen::{SeenHand, SeenHands};
+use crate::user::UserLink;
+
+type FollowedBodies<'w, 's> = Query<
+    'w,
+    's,
+    (
+        &'static BodyState,
+        &'static mut ShownState,
+        &'static mut SeenHands,
+        &'static mut Transform,
+        &'static GlobalTransform,
+    ),
+>;
+
+/// `PostUpdate`: the session is brought to now, and what it shows is written.
+pub(crate) fn show(
+    guest: Option<ResMut<NetGuest>>,
+    mut bodies: FollowedBodies,
+    mut forces: Query<&mut GrabForce>,
+    mut links: Query<&mut UserLink>,
+) {
+    let Some(mut guest) = guest else { return };
+    let guest = &mut *guest;
+    let now = guest.now();
+    let Some(session) = guest.session.as_mut() else { return };
+    if let Some(most) = guest.line.max_datagram_size() {
+        session.set_max_datagram(most);
+    }
+    guest.advance(now);
+    let Some(session) = guest.session.as_mut() else { return };
+    // Nobody's hand is one's own in a replay: all are shown.
+    let user = session.user().filter(|_| !guest.line.is_replay());
+    let step = session.step();
+    for (&id, followed) in &mut guest.bodies {
+        let Some(view) = session.body(id) else { continue };
+        let Ok((state, mut shown, mut seen, mut transform, global)) = bodies.get_mut(followed.entity) else {
+            continue;
+        };
+        followed.take(view);
+        let fraction =
+            if view.is_resting() { 1.0 } else { followed.phase.fraction(followed.tick, step, now) };
+        if !followed.settled {
+            followed.settled = fraction >= 1.0;
+            followed.between(fraction, shown.q().len(), &mut guest.scratch);
+            if let Err(error) = shown.snap(&guest.scratch) {
+                debug!("a state of {} was not shown: {error}", followed.name);
+            }
+            if let (Some(from), Some(to)) = (followed.previous.1, followed.current.1) {
+                set_pose(&mut transform, &from, &to, fraction, state.scale());
+            }
+        }
+        let Some(place) = Place::of_body(global, state) else { continue };
+        let hand = |grab: &pliant_stream::GrabState| SeenHand {
+            user: grab.key.user,
+            vertex: grab.vertex,
+            target: place.point_to_world(grab.target),
+            reaction: place.force_to_world(grab.reaction),
+        };
+        let others = view.grabs().iter().filter(|grab| Some(grab.key.user) != user).map(hand);
+        seen.set_if_neq(SeenHands(others.collect()));
+        for (&entity, sent) in guest.grabs.iter().filter(|(_, sent)| sent.body == id) {
+            let Ok(mut force) = forces.get_mut(entity) else { continue };
+            let felt = sent.number.zip(user).and_then(|(grab, user)| {
+                let key = GrabKey { user, grab };
+                let confirmed = || Some(view.grabs().iter().find(|grab| grab.key == key)?.reaction);
+                let reaction = match view.own_hand() {
+                    Some(own) => own.reaction(grab).or_else(confirmed)?,
+                    None => confirmed()?,
+                };
+                let body_point = sent.point.as_ref()?.at(shown.q(), state.warps());
+                Some(GrabForce {
+                    force: place.force_to_world(reaction),
+                    point: of_body(&place, view, body_point),
+                })
+            });
+            force.set_if_neq(felt.unwrap_or_default());
+        }
+    }
+    let link = session.stats();
+    let own = user.and_then(|user| guest.users.get(&user).copied());
+    if let Some(mut shown) = own.and_then(|own| links.get_mut(own).ok()) {
+        let new = UserLink { round_trip: link.round_trip, loss_in: link.loss_in, loss_out: link.loss_out };
+        shown.set_if_neq(new);
+    }
+    for reach in guest.reaches.drain(..).filter(|reach| Some(reach.user) != user) {
+        let other = guest.users.get(&reach.user).and_then(|&other| links.get_mut(other).ok());
+        if let Some(mut shown) = other {
+            shown.set_if_neq(reach.to_link());
+        }
+    }
+    guest.flush();
+}
+
+/// A point in body axes, in this app's world.
+fn of_body(place: &Place, view: &BodyView, point: DVec3) -> DVec3 {
+    let session = match view.pose() {
+        None => point,
+        Some(pose) => DQuat::from_array(pose.rotation) * point + DVec3::from(pose.position),
+    };
+    place.point_to_world(session.into())
+}
+
+fn set_pose(transform: &mut Transform, from: &Pose, to: &Pose, fraction: f64, scale: f64) {
+    let origin = DVec3::from(from.position).lerp(DVec3::from(to.position), fraction) * scale;
+    let [from, to] = [from, to].map(|pose| DQuat::from_array(pose.rotation).normalize());
+    let rotation = from.slerp(to, fraction).normalize();
+    if origin.is_finite() && rotation.is_finite() {
+        transform.translation = origin.as_vec3();
+        transform.rotation = rotation.as_quat();
+    }
+}

@@ -1,0 +1,207 @@
+//! Guests come, are who they were, say what they want, and go.
+
+use std::time::Duration;
+
+use bevy::prelude::*;
+use pliant_stream::{EndReason, GrabKey, HostEvent, PeerId, UserId};
+
+use super::hands::GuestGrab;
+use super::{Known, NetHost};
+use crate::scene::{self, Person, Placement, Reliable, Wanted};
+use crate::transport::{Event, Fingerprint, Role};
+use crate::user::{User, UserJoined, UserLeft, UserLink};
+
+/// A connection.
+#[derive(Debug)]
+pub(super) struct Guest {
+    pub(super) key: Fingerprint,
+    pub(super) role: Role,
+    /// The user, once it is in.
+    pub(super) entity: Option<Entity>,
+    /// Changes of interest that are still taken, and when that was counted.
+    wishes: (f64, Duration),
+}
+
+/// A guest may change its mind so often, a second, and so often at once: once for each of the most bodies there may be.
+const WISHES_PER_S: f64 = 100.0;
+const WISHES: f64 = 1024.0;
+
+/// So many who have left are remembered; who was seen longest ago is forgotten first.
+const MOST_KNOWN: usize = 4096;
+
+impl Guest {
+    fn new(key: Fingerprint, role: Role) -> Self {
+        Self { key, role, entity: None, wishes: (WISHES, Duration::ZERO) }
+    }
+
+    fn may_wish(&mut self, now: Duration) -> bool {
+        let (left, at) = self.wishes;
+        let left = (left + WISHES_PER_S * now.saturating_sub(at).as_secs_f64()).min(WISHES);
+        let may = left >= 1.0;
+        self.wishes = (if may { left - 1.0 } else { left }, now);
+        may
+    }
+}
+
+/// `PreUpdate`: what came from the guests.
+pub(crate) fn receive(world: &mut World) {
+    world.try_resource_scope(|world, mut host: Mut<NetHost>| {
+        let host = &mut *host;
+        while let Some(event) = host.endpoint.poll() {
+            let now = host.now();
+            match event {
+                Event::Connected { peer, address, fingerprint, role } => {
+                    debug!("guest {peer} from {address} with key {fingerprint}");
+                    host.guests.insert(peer, Guest::new(fingerprint, role));
+                    let most = host.endpoint.max_datagram_size(peer).unwrap_or(0);
+                    if let Err(error) = host.session.connect(now, peer, most) {
+                        host.endpoint.close(peer, &error.to_string());
+                    }
+                }
+                Event::Datagram { peer, at, bytes } => {
+                    let at = at.saturating_duration_since(host.began);
+                    host.session.on_datagram(at, peer, &bytes);
+                }
+                Event::Message { peer, bytes } => match scene::read(&bytes) {
+                    Some(Reliable::Session(bytes)) => host.session.on_message(now, peer, bytes),
+                    Some(Reliable::Wanted(wanted)) => host.wanted(now, peer, wanted),
+                    // Of the rest a guest has nothing to say.
+                    Some(Reliable::Placement(_) | Reliable::People(_) | Reliable::Reaches(_)) | None => {
+                        host.session.expel(peer, EndReason::Protocol);
+                    }
+                },
+                Event::Closed { peer, reason } => {
+                    debug!("guest {peer} is gone: {reason}");
+                    host.session.disconnect(peer, crate::end_of(&reason));
+                    host.take_events(world);
+                    host.guests.remove(&peer);
+                }
+            }
+        }
+        for peer in host.endpoint.peers() {
+            if let Some(most) = host.endpoint.max_datagram_size(peer) {
+                host.session.set_max_datagram(peer, most);
+            }
+        }
+        host.take_events(world);
+    });
+}
+
+impl NetHost {
+    fn take_events(&mut self, world: &mut World) {
+        while let Some(event) = self.session.poll_event() {
+            self.apply(world, event);
+        }
+    }
+
+    /// Somebody has said hello, and the transport has seen key and token: in they come, under the number they had.
+    fn let_in(&mut self, world: &mut World, peer: PeerId) {
+        let now = self.now();
+        let Some(key) = self.guests.get(&peer).map(|guest| guest.key) else { return };
+        // One key is one user: who comes anew takes the place of a connection that has not been missed yet.
+        let older: Vec<PeerId> = self
+            .guests
+            .iter()
+            .filter(|(other, guest)| **other != peer && guest.key == key && guest.entity.is_some())
+            .map(|(&other, _)| other)
+            .collect();
+        for other in older {
+            debug!("guest {other} has come anew as {peer}");
+            self.session.expel(other, EndReason::Left);
+        }
+        let before = self.known.get(&key).map(|known| known.user);
+        if let Err(error) = self.session.accept_as(now, peer, before) {
+            debug!("guest {peer} was not let in: {error}");
+            self.session.expel(peer, EndReason::Refused);
+        }
+        // The older one's leave comes before the newer one's arrival.
+        self.take_events(world);
+    }
+
+    fn joined(&mut self, world: &mut World, peer: PeerId, id: UserId, name: &str) {
+        let now = self.now();
+        let Some(guest) = self.guests.get_mut(&peer) else { return };
+        let user = User::new(id, name, guest.role);
+        let name = user.name.clone();
+        let before = self.known.insert(guest.key, Known { user: id, seen: now });
+        let back = before.is_some_and(|before| before.user == id);
+        let entity = world.spawn((user, UserLink::default())).id();
+        guest.entity = Some(entity);
+        self.numbers.insert(id, entity);
+        while self.known.len() > MOST_KNOWN {
+            let oldest = self.known.iter().min_by_key(|(_, known)| known.seen).map(|(&key, _)| key);
+            oldest.and_then(|key| self.known.remove(&key));
+        }
+        info!("{name} {}", if back { "is back" } else { "has joined" });
+        world.write_message(UserJoined { entity, id, name, back });
+        // All of the newcomer, and the newcomer of all.
+        let inside = self.guests.values().filter_map(|guest| guest.entity).chain([self.you]);
+        let people: Vec<Person> = inside.filter_map(|entity| world.get::<User>(entity)).map(person).collect();
+        self.send_message(peer, scene::people_message(&people));
+        if let Some(newcomer) = world.get::<User>(entity) {
+            self.tell_all(&scene::people_message(&[person(newcomer)]));
+        }
+        let places: Vec<_> = self.bodies.values().map(|b| Placement::new(b.id, &b.placed)).collect();
+        for placement in places {
+            self.tell_place(placement, Some(peer));
+        }
+    }
+
+    /// A guest says how much of a body it wants.
+    fn wanted(&mut self, now: Duration, peer: PeerId, wanted: Wanted) {
+        if self.guests.get_mut(&peer).is_some_and(|guest| guest.may_wish(now)) {
+            let modes = (wanted.modes != Wanted::ALL).then_some(wanted.modes);
+            self.session.set_interest(peer, wanted.body, modes);
+        }
+    }
+
+    fn apply(&mut self, world: &mut World, event: HostEvent) {
+        match event {
+            HostEvent::Knock { peer, .. } => self.let_in(world, peer),
+            HostEvent::Joined { peer, user, name, .. } => self.joined(world, peer, user, &name),
+            HostEvent::Left { peer, user, reason } => {
+                // The session's goodbye says more than the end of the connection.
+                self.flush();
+                self.endpoint.close(peer, &reason.to_string());
+                let entity = self.guests.get_mut(&peer).and_then(|guest| guest.entity.take());
+                if let (Some(entity), Some(id)) = (entity, user) {
+                    self.numbers.remove(&id);
+                    let name = world.get::<User>(entity).map(|user| user.name.clone()).unwrap_or_default();
+                    info!("{name} is gone: {reason}");
+                    world.try_despawn(entity).ok();
+                    world.write_message(UserLeft { id, name, reason: reason.to_string() });
+                }
+            }
+            HostEvent::GrabBegan { key, body, vertex, radius, target, hold } => {
+                if let Err(why) = self.begin_grab(world, key, body, vertex, radius, target, hold) {
+                    debug!("grab {} of user {} is refused: {why}", key.grab, key.user.0);
+                    self.session.refuse_grab(key);
+                }
+            }
+            HostEvent::GrabMoved { key, body, input, target } => {
+                let Some(target) = self.target_in_world(world, body, target) else { return };
+                let hands = self.grabs.range(hands_of(key.user)).count();
+                let grab = self.grabs.get(&key).and_then(|&entity| world.get_mut::<GuestGrab>(entity));
+                if let Some(mut grab) = grab {
+                    grab.hand.take(input, hands, target);
+                }
+            }
+            HostEvent::GrabEnded { key, .. } => {
+                if let Some(entity) = self.grabs.remove(&key) {
+                    // It may have gone with its body or its user.
+                    world.try_despawn(entity).ok();
+                }
+            }
+            _ => {}
+        }
+    }
+}
+
+/// All grabs of a user.
+fn hands_of(user: UserId) -> std::ops::RangeInclusive<GrabKey> {
+    GrabKey { user, grab: 0 }..=GrabKey { user, grab: u16::MAX }
+}
+
+fn person(user: &User) -> Person {
+    Person { user: user.id, role: user.role, name: user.name.clone() }
+}

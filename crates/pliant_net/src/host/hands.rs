@@ -1,0 +1,153 @@
+//! Guests' hands on the host's bodies.
+
+use bevy::math::DVec3;
+use bevy::prelude::*;
+use pliant_body::{BodyState, Grab, GrabOf, Grabs};
+use pliant_modal::GrabConfig;
+use pliant_stream::{BodyId, GrabKey, PeerId};
+
+use super::NetHost;
+use super::playout::HandPlayout;
+use crate::place::Place;
+use crate::transport::Role;
+use crate::user::{HandOf, User};
+
+/// Whose hands may be on a body at the same time. As a component on a host's body: for this one; else [`HostConfig::holding`](super::HostConfig::holding)
+/// says it. A change lets nobody go.
+#[derive(Component, Debug, Default, Clone, Copy, PartialEq, Eq, Hash)]
+pub enum Holding {
+    /// Anybody's: the paper's cooperative mode. Default.
+    #[default]
+    Together,
+    /// One user's at a time; another's grab is refused until the first lets go: the paper's collaborative mode.
+    OneAtATime,
+    /// No guest's: they watch.
+    HostOnly,
+}
+
+/// A guest's grab on the host.
+#[derive(Component, Debug, Clone)]
+pub(crate) struct GuestGrab {
+    pub(super) key: GrabKey,
+    pub(super) hand: HandPlayout,
+    peer: PeerId,
+    /// The farthest it may move in a tick, m.
+    most: f64,
+}
+
+/// A hand crosses a body of the size of this app's world in a twentieth of a second at most.
+const SPEED: f64 = 20.0;
+
+impl NetHost {
+    pub(super) fn entity_of(&self, body: BodyId) -> Option<Entity> {
+        self.bodies.iter().find(|(_, hosted)| hosted.id == body).map(|(&entity, _)| entity)
+    }
+
+    /// A guest's target in this app's world, within reach of the body.
+    pub(super) fn target_in_world(&self, world: &World, body: BodyId, target: [f64; 3]) -> Option<DVec3> {
+        let entity = self.entity_of(body)?;
+        let state = world.get::<BodyState>(entity)?;
+        let place = Place::of_body(world.get::<GlobalTransform>(entity)?, state)?;
+        let model = state.model();
+        let middle = if model.is_free() {
+            DVec3::from(state.body().frame().center())
+        } else {
+            let [low, high] = model.surface().bounds();
+            (Vec3::from(low).as_dvec3() + Vec3::from(high).as_dvec3()) / 2.0
+        };
+        let away = (DVec3::from(target) - middle).clamp_length_max(self.reach * model.size());
+        away.is_finite().then(|| place.point_to_world((middle + away).into()))
+    }
+
+    pub(super) fn begin_grab(
+        &mut self,
+        world: &mut World,
+        key: GrabKey,
+        body: BodyId,
+        vertex: u32,
+        radius: f64,
+        target: [f64; 3],
+        hold: GrabConfig,
+    ) -> Result<(), &'static str> {
+        let entity = self.entity_of(body).ok_or("no such body")?;
+        let user = *self.numbers.get(&key.user).ok_or("no such user")?;
+        let of_user = self.guests.iter().find(|(_, guest)| guest.entity == Some(user));
+        let peer = *of_user.ok_or("no such user")?.0;
+        if world.get::<User>(user).is_none_or(|user| user.role == Role::Watch) {
+            return Err("this user may only watch");
+        }
+        let target = self.target_in_world(world, body, target).ok_or("no place for its target")?;
+        let model = world.get::<BodyState>(entity).ok_or("the body is not ready")?.model().clone();
+        if !(0.0..=model.size()).contains(&radius) {
+            return Err("its radius is larger than the body");
+        }
+        let holding = world.get::<Holding>(entity).copied().unwrap_or(self.holding);
+        let held = world.get::<Grabs>(entity).map(|grabs| grabs.entities().to_vec()).unwrap_or_default();
+        let others = |other: &Entity| world.get::<HandOf>(*other).is_none_or(|hand| hand.0 != user);
+        match holding {
+            Holding::Together => {}
+            Holding::OneAtATime if held.iter().any(others) => return Err("somebody else holds the body"),
+            Holding::OneAtATime => {}
+            Holding::HostOnly => return Err("only the host may hold the body"),
+        }
+        let GrabConfig { stiffness, relaxation } = hold;
+        let size = world.get::<GlobalTransform>(entity).map_or(1.0, |place| f64::from(place.scale().x))
+            * model.size();
+        let grab = Grab { stiffness, relaxation, ..Grab::new(vertex, radius, target) };
+        let spawned = world
+            .spawn((
+                grab,
+                GrabOf(entity),
+                HandOf(user),
+                GuestGrab { key, hand: HandPlayout::new(target), peer, most: SPEED * size },
+            ))
+            .id();
+        self.grabs.insert(key, spawned);
+        Ok(())
+    }
+}
+
+/// Before the bodies' step: guests' hands move to their targets of this tick.
+pub(crate) fn move_hands(
+    host: Option<Res<NetHost>>,
+    time: Res<Time>,
+    mut grabs: Query<(&mut Grab, &mut GuestGrab)>,
+) {
+    let Some(host) = host else { return };
+    let step = time.delta_secs_f64();
+    for (mut grab, mut guest) in &mut grabs {
+        let link = host.session.stats(guest.peer).unwrap_or_default();
+        let depth = depth(link.round_trip.as_secs_f64(), link.jitter.as_secs_f64(), step, host.smoothing);
+        let most = guest.most * step;
+        let target = guest.hand.next(depth, most);
+        if target != grab.target {
+            grab.target = target;
+        }
+    }
+}
+
+/// Ticks by which a movement is held back: twice the way's jitter, and one more where a lost target comes with the next; at most `most` seconds.
+fn depth(round_trip: f64, jitter: f64, step: f64, most: f64) -> usize {
+    if step <= 0.0 {
+        return 1;
+    }
+    let far = if round_trip > step { 1.0 } else { 0.0 };
+    let ticks = 1.0 + far + (2.0 * jitter / step).floor();
+    // A float-to-integer cast saturates and takes NaN to zero.
+    (ticks.min((most / step).round()) as usize).max(1)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_movement_is_held_back_by_the_jitter_of_its_way() {
+        assert_eq!(depth(0.0003, 0.0001, 0.025, 0.1), 1, "at home");
+        assert_eq!(depth(0.196, 0.004, 0.025, 0.1), 2, "far and even");
+        assert_eq!(depth(0.196, 0.030, 0.025, 0.1), 4, "far and uneven");
+        assert_eq!(depth(0.196, 10.0, 0.025, 0.1), 4, "at most what is allowed");
+        assert_eq!(depth(0.196, 0.030, 0.025, 0.0), 1);
+        assert_eq!(depth(f64::NAN, f64::NAN, 0.025, 0.1), 1);
+    }
+}

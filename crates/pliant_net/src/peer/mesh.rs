@@ -1,0 +1,319 @@
+//! Who is connected with whom, and the session's traffic.
+
+use std::time::Duration;
+
+use bevy::prelude::*;
+use bytes::Bytes;
+use pliant_stream::peer::PeerEvent;
+use pliant_stream::{Channel, EndReason, PeerId, UserId};
+
+use super::message::{MOST_PEERS, Mesh, Scene};
+use super::{NetPeer, PeerState};
+use crate::seen::{SessionClosed, SessionJoined};
+use crate::transport::{Event, Fingerprint, Invite, Role};
+use crate::user::{User, UserJoined, UserLeft, UserLink};
+
+/// Somebody that this peer is connected with.
+#[derive(Debug)]
+pub(super) struct Other {
+    key: Fingerprint,
+    address: std::net::IpAddr,
+    /// Given, or said; the session knows it from then on.
+    number: Option<UserId>,
+    /// Where it listens, for those who come later.
+    invite: Option<Invite>,
+    /// It has come with our invite, and waits for its number until our own session is there.
+    waits: Option<(Scene, Invite)>,
+}
+
+impl Other {
+    /// Where it listens, by the address that it has come from.
+    fn seen_from_here(&self, invite: Invite) -> Invite {
+        Invite { host: self.address.to_string(), ..invite }
+    }
+}
+
+/// `PreUpdate`: what came from the peers.
+pub(crate) fn receive(world: &mut World) {
+    world.try_resource_scope(|world, mut peer: Mut<NetPeer>| {
+        let net = &mut *peer;
+        if matches!(net.state, PeerState::Closed { .. }) {
+            return;
+        }
+        net.start(world);
+        let mut came: Vec<(Option<PeerId>, Event)> = Vec::new();
+        // An unread queue drops its oldest datagrams, so all of it is taken.
+        came.extend(std::iter::from_fn(|| net.listening.poll()).map(|event| (None, event)));
+        for (&peer, endpoint) in &net.opened {
+            came.extend(std::iter::from_fn(|| endpoint.poll()).map(|event| (Some(peer), event)));
+        }
+        for (opened, event) in came {
+            net.take(world, opened, event);
+        }
+        net.take_events(world);
+        net.flush();
+    });
+}
+
+impl NetPeer {
+    /// Begins when the bodies are here: alone, or by asking to come in.
+    fn start(&mut self, world: &mut World) {
+        if self.scene.bodies.is_empty() && !self.gather(world) {
+            return;
+        }
+        if self.session.is_none() && self.config.join.is_none() {
+            let user = UserId(1);
+            if self.begin(world, user, true) {
+                world.write_message(SessionJoined { user, again: false });
+            }
+        }
+        let waiting: Vec<PeerId> =
+            self.others.iter().filter(|(_, other)| other.waits.is_some()).map(|(&peer, _)| peer).collect();
+        if self.session.is_some() {
+            waiting.into_iter().for_each(|peer| self.let_in(peer));
+        }
+        // The connection to the first may have been there before the bodies.
+        if self.session.is_none() {
+            let asked: Vec<PeerId> = self.opened.keys().copied().collect();
+            for peer in asked {
+                if let Some(other) = self.others.get_mut(&peer).filter(|other| other.number.is_none()) {
+                    // Asked once: the answer gives the number.
+                    other.number = Some(UserId::HOST);
+                    let (scene, invite) = (self.scene.clone(), self.listening.invite());
+                    self.tell(peer, &Mesh::Introduce { scene, invite });
+                }
+            }
+        }
+    }
+
+    fn take(&mut self, world: &mut World, opened: Option<PeerId>, event: Event) {
+        let now = self.now();
+        match event {
+            Event::Connected { peer, fingerprint, address, .. } => {
+                let peer = opened.unwrap_or(peer);
+                let (number, invite) = self.introduced.remove(&peer).unzip();
+                let address = address.ip();
+                self.others.insert(peer, Other { key: fingerprint, address, number, invite, waits: None });
+                // The first that we have come to is asked; the others are told.
+                if let (Some(_), PeerState::In { user }) = (opened, &self.state) {
+                    let (number, scene, invite) = (*user, self.scene.clone(), self.listening.invite());
+                    self.tell(peer, &Mesh::Member { number, scene, invite });
+                    self.talk_to(now, peer);
+                }
+            }
+            Event::Datagram { peer, at, bytes } => {
+                let at = at.saturating_duration_since(self.began);
+                if let Some(session) = &mut self.session {
+                    session.on_datagram(at, opened.unwrap_or(peer), &bytes);
+                }
+            }
+            Event::Message { peer, bytes } => {
+                let peer = opened.unwrap_or(peer);
+                self.heard(world, now, peer, opened.is_some(), bytes);
+            }
+            Event::Closed { peer, reason } => {
+                let peer = opened.unwrap_or(peer);
+                debug!("peer {peer} is gone: {reason}");
+                if let Some(session) = &mut self.session {
+                    session.disconnect(peer, crate::end_of(&reason));
+                }
+                self.others.remove(&peer);
+                self.introduced.remove(&peer);
+                self.opened.remove(&peer);
+                if opened.is_some() && self.session.is_none() {
+                    self.close(world, reason.to_string());
+                }
+            }
+        }
+    }
+
+    fn heard(&mut self, world: &mut World, now: Duration, peer: PeerId, opened: bool, bytes: Bytes) {
+        match Mesh::read(bytes) {
+            Some(Mesh::Session(bytes)) => {
+                if let Some(session) = &mut self.session {
+                    session.on_message(now, peer, &bytes);
+                }
+            }
+            Some(Mesh::Introduce { scene, invite }) if !opened => {
+                let Some(other) = self.others.get_mut(&peer) else { return };
+                if other.number.is_none() && other.waits.is_none() {
+                    other.waits = Some((scene, invite));
+                    if self.session.is_some() {
+                        self.let_in(peer);
+                    }
+                } else {
+                    self.hang_up(peer, "introduced twice");
+                }
+            }
+            Some(Mesh::Member { number, scene, invite }) if !opened => {
+                let known = self.others.values().any(|other| other.number == Some(number));
+                if scene != self.scene {
+                    self.hang_up(peer, "other bodies, or another step");
+                } else if known || number == UserId::HOST || self.session.is_none() {
+                    self.hang_up(peer, "no place under this number");
+                } else if let Some(other) = self.others.get_mut(&peer) {
+                    other.number = Some(number);
+                    other.invite = Some(other.seen_from_here(invite));
+                    self.numbers.insert(other.key, number);
+                    self.talk_to(now, peer);
+                }
+            }
+            Some(Mesh::Welcome { number, from, others }) if opened && self.session.is_none() => {
+                if !self.begin(world, number, false) {
+                    return;
+                }
+                if let Some(first) = self.others.get_mut(&peer) {
+                    (first.number, first.invite) = (Some(from), self.config.join.clone());
+                    self.numbers.insert(first.key, from);
+                }
+                self.talk_to(now, peer);
+                for (number, invite) in others {
+                    match self.connect_to(&invite) {
+                        Ok(peer) => {
+                            self.introduced.insert(peer, (number, invite));
+                        }
+                        Err(error) => warn!("another peer cannot be reached: {error}"),
+                    }
+                }
+            }
+            _ => self.hang_up(peer, "a message that is none"),
+        }
+    }
+
+    /// Gives a newcomer its number and tells it of all the others.
+    fn let_in(&mut self, peer: PeerId) {
+        let now = self.now();
+        let Some((scene, invite)) = self.others.get_mut(&peer).and_then(|other| other.waits.take()) else {
+            return;
+        };
+        if scene != self.scene {
+            return self.hang_up(peer, "other bodies, or another step");
+        }
+        let others: Vec<(UserId, Invite)> =
+            self.others.values().filter_map(|other| Some((other.number?, other.invite.clone()?))).collect();
+        if self.others.len() > MOST_PEERS {
+            return self.hang_up(peer, "no room");
+        }
+        let Some(key) = self.others.get(&peer).map(|other| other.key) else { return };
+        let present = self.others.values().filter_map(|other| other.number);
+        let highest = present.clone().chain(self.numbers.values().copied()).map(|user| user.0).max();
+        let before = self.numbers.get(&key).copied().filter(|before| !present.clone().any(|p| p == *before));
+        let Some(number) = before.or_else(|| highest.unwrap_or(0).checked_add(1).map(UserId)) else {
+            return self.hang_up(peer, "no number is left");
+        };
+        self.numbers.insert(key, number);
+        if let Some(other) = self.others.get_mut(&peer) {
+            other.number = Some(number);
+            other.invite = Some(other.seen_from_here(invite));
+        }
+        let PeerState::In { user: from } = self.state else { return };
+        self.tell(peer, &Mesh::Welcome { number, from, others });
+        self.talk_to(now, peer);
+    }
+
+    /// The session begins on a connection.
+    fn talk_to(&mut self, now: Duration, peer: PeerId) {
+        let (endpoint, number) = self.way(peer);
+        let most = endpoint.max_datagram_size(number).unwrap_or(0);
+        if let Some(session) = &mut self.session
+            && let Err(error) = session.connect(now, peer, most)
+        {
+            self.hang_up(peer, &error.to_string());
+        }
+    }
+
+    fn tell(&self, peer: PeerId, message: &Mesh) {
+        let (endpoint, number) = self.way(peer);
+        if let Err(error) = endpoint.send_message(number, message.to_message()) {
+            debug!("not sent to peer {peer}: {error}");
+            endpoint.close(number, "messages are not read");
+        }
+    }
+
+    fn hang_up(&mut self, peer: PeerId, why: &str) {
+        debug!("peer {peer} is sent away: {why}");
+        let (endpoint, number) = self.way(peer);
+        endpoint.close(number, why);
+        if let Some(session) = &mut self.session {
+            session.disconnect(peer, EndReason::Protocol);
+        }
+    }
+
+    pub(super) fn flush(&mut self) {
+        let Some(session) = &mut self.session else { return };
+        let mut out = Vec::new();
+        out.extend(std::iter::from_fn(|| session.poll_output()));
+        for output in out {
+            match output.channel {
+                Channel::Datagram => {
+                    let (endpoint, number) = self.way(output.peer);
+                    // One that is not taken is one that is lost: said again with the next.
+                    let _ = endpoint.send_datagram(number, Bytes::from_owner(output.bytes));
+                }
+                Channel::Message => {
+                    self.tell(output.peer, &Mesh::Session(Bytes::from_owner(output.bytes)));
+                }
+            }
+        }
+    }
+
+    fn take_events(&mut self, world: &mut World) {
+        while let Some(event) = self.session.as_mut().and_then(|session| session.poll_event()) {
+            match event {
+                PeerEvent::Started => {
+                    if let PeerState::In { user } = self.state {
+                        world.write_message(SessionJoined { user, again: false });
+                    }
+                }
+                PeerEvent::Joined { user, name } => {
+                    let joined = User::new(user, &name, Role::Hold);
+                    let name = joined.name.clone();
+                    info!("{name} is here");
+                    let entity = world.spawn((joined, UserLink::default())).id();
+                    if let Some(old) = self.users.insert(user, entity) {
+                        world.try_despawn(old).ok();
+                    }
+                    world.write_message(UserJoined { entity, id: user, name, back: false });
+                }
+                PeerEvent::Left { user, reason } => {
+                    let Some(entity) = self.users.remove(&user) else { continue };
+                    let name = world.get::<User>(entity).map(|user| user.name.clone()).unwrap_or_default();
+                    info!("{name} is gone: {reason}");
+                    world.try_despawn(entity).ok();
+                    world.write_message(UserLeft { id: user, name, reason: reason.to_string() });
+                    let gone: Vec<PeerId> = self
+                        .others
+                        .iter()
+                        .filter(|(_, other)| other.number == Some(user))
+                        .map(|(&peer, _)| peer)
+                        .collect();
+                    for peer in gone {
+                        let (endpoint, number) = self.way(peer);
+                        endpoint.close(number, &reason.to_string());
+                        if let Some(other) = self.others.get_mut(&peer) {
+                            (other.number, other.invite) = (None, None);
+                        }
+                    }
+                }
+                PeerEvent::Resynced { from } => debug!("the state of user {} was taken over", from.0),
+                _ => {}
+            }
+        }
+        // How each is reached, as QUIC says.
+        for (&peer, other) in &self.others {
+            let (endpoint, number) = self.way(peer);
+            let entity = other.number.and_then(|user| self.users.get(&user).copied());
+            let (Some(stats), Some(entity)) = (endpoint.stats(number), entity) else { continue };
+            if let Some(mut link) = world.get_mut::<UserLink>(entity) {
+                let (round_trip, loss_out) = (stats.round_trip, stats.loss());
+                link.set_if_neq(UserLink { round_trip, loss_in: link.loss_in, loss_out });
+            }
+        }
+    }
+
+    pub(super) fn close(&mut self, world: &mut World, reason: String) {
+        info!("the session is over: {reason}");
+        self.state = PeerState::Closed { reason: reason.clone() };
+        world.write_message(SessionClosed { reason });
+    }
+}

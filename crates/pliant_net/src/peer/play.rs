@@ -1,0 +1,152 @@
+//! The own hands, and what is shown and felt.
+
+use std::sync::Arc;
+
+use bevy::prelude::*;
+use pliant_body::{BodyState, Grab, GrabForce, GrabOf, ShownState};
+use pliant_modal::ModalModel;
+use pliant_stream::{BodyId, BodySetup, GrabKey, UserId};
+
+use super::{NetPeer, PeerState};
+use crate::felt::PatchPoint;
+use crate::phase::Phase;
+use crate::place::Place;
+use crate::seen::{SeenHand, SeenHands};
+
+/// A body of the peers, and what is shown of it.
+pub(super) struct PlayedBody {
+    pub(super) entity: Entity,
+    pub(super) model: Arc<ModalModel>,
+    pub(super) setup: BodySetup,
+    phase: Phase,
+    tick: u64,
+    previous: Vec<f64>,
+    current: Vec<f64>,
+}
+
+impl PlayedBody {
+    pub(super) fn new(entity: Entity, model: Arc<ModalModel>, setup: BodySetup) -> Self {
+        let phase = Phase::default();
+        Self { entity, model, setup, phase, tick: 0, previous: Vec::new(), current: Vec::new() }
+    }
+}
+
+/// An own grab as the session knows it.
+pub(super) struct SaidGrab {
+    body: BodyId,
+    vertex: u32,
+    radius: f64,
+    /// `None`: it was not taken.
+    number: Option<u16>,
+    point: Option<PatchPoint>,
+}
+
+/// `PostUpdate`: the app's own grabs are told to the session.
+pub(crate) fn tell_hands(
+    net: Option<ResMut<NetPeer>>,
+    bodies: Query<(&BodyState, &GlobalTransform)>,
+    grabs: Query<(Entity, &Grab, &GrabOf)>,
+) {
+    let Some(mut net) = net else { return };
+    let net = &mut *net;
+    if !matches!(net.state, PeerState::In { .. }) {
+        return;
+    }
+    let Some(session) = &mut net.session else { return };
+    let number_of =
+        |entity: Entity| net.bodies.iter().find(|(_, played)| played.entity == entity).map(|(&id, _)| id);
+    net.grabs.retain(|&entity, said| {
+        let stays = grabs.get(entity).is_ok_and(|(_, grab, of)| {
+            let same = grab.vertex == said.vertex && grab.radius == said.radius;
+            same && number_of(of.0) == Some(said.body)
+        });
+        if let (false, Some(number)) = (stays, said.number) {
+            session.end_grab(number);
+        }
+        stays
+    });
+    for (entity, grab, of) in &grabs {
+        let (Some(id), Ok((state, transform))) = (number_of(of.0), bodies.get(of.0)) else { continue };
+        let Some(place) = Place::of_body(transform, state) else { continue };
+        let target = place.point_to_session(grab.target);
+        let moved = match net.grabs.get(&entity) {
+            Some(said) => said.number.map(|number| session.set_target(number, target)).transpose(),
+            None => {
+                let begun = session.begin_grab(id, grab.vertex, grab.radius, target);
+                let point = PatchPoint::new(state.model(), grab.vertex, grab.radius).ok();
+                let (vertex, radius) = (grab.vertex, grab.radius);
+                let number = begun.as_ref().ok().copied();
+                net.grabs.insert(entity, SaidGrab { body: id, vertex, radius, number, point });
+                begun.map(|_| None)
+            }
+        };
+        if let Err(error) = moved {
+            debug!("a grab was not taken: {error}");
+        }
+    }
+}
+
+/// `PostUpdate`: the session is brought to now, and what it shows is written.
+pub(crate) fn show(
+    net: Option<ResMut<NetPeer>>,
+    mut bodies: Query<(&BodyState, &mut ShownState, &mut SeenHands, &GlobalTransform)>,
+    mut forces: Query<&mut GrabForce>,
+) {
+    let Some(mut net) = net else { return };
+    let net = &mut *net;
+    let PeerState::In { user } = net.state else { return };
+    let now = net.now();
+    let Some(session) = &mut net.session else { return };
+    session.update(now);
+    let step = std::time::Duration::from_nanos(net.scene.step_ns).as_secs_f64();
+    for (&id, played) in &mut net.bodies {
+        let Some(view) = session.body(id) else { continue };
+        let Ok((state, mut shown, mut seen, transform)) = bodies.get_mut(played.entity) else { continue };
+        if view.tick() != played.tick || played.current.len() != view.shown().modes() {
+            let first = played.current.len() != view.shown().modes();
+            played.tick = view.tick();
+            std::mem::swap(&mut played.previous, &mut played.current);
+            played.current.clone_from(&view.shown().q);
+            if first {
+                played.previous.clone_from(&played.current);
+            }
+        }
+        let fraction = played.phase.fraction(played.tick, step, now);
+        net.scratch.clear();
+        net.scratch.extend(
+            played.previous.iter().zip(&played.current).map(|(from, to)| from + (to - from) * fraction),
+        );
+        net.scratch.resize(shown.q().len(), 0.0);
+        if net.scratch != shown.q()
+            && let Err(error) = shown.snap(&net.scratch)
+        {
+            debug!("a state was not shown: {error}");
+        }
+        let Some(place) = Place::of_body(transform, state) else { continue };
+        let hand = |grab: &pliant_stream::GrabState| SeenHand {
+            user: grab.key.user,
+            vertex: grab.vertex,
+            target: place.point_to_world(grab.target),
+            reaction: place.force_to_world(grab.reaction),
+        };
+        let others = view.grabs().iter().filter(|grab| grab.key.user != user).map(hand);
+        seen.set_if_neq(SeenHands(others.collect()));
+        for (&entity, said) in net.grabs.iter().filter(|(_, said)| said.body == id) {
+            let Ok(mut force) = forces.get_mut(entity) else { continue };
+            let felt = said.number.and_then(|grab| felt(view.grabs(), user, grab)).and_then(|reaction| {
+                let point = said.point.as_ref()?.at(shown.q(), state.warps());
+                Some(GrabForce {
+                    force: place.force_to_world(reaction),
+                    point: place.point_to_world(point.into()),
+                })
+            });
+            force.set_if_neq(felt.unwrap_or_default());
+        }
+    }
+    net.flush();
+}
+
+fn felt(grabs: &[pliant_stream::GrabState], user: UserId, grab: u16) -> Option<[f64; 3]> {
+    let key = GrabKey { user, grab };
+    Some(grabs.iter().find(|grab| grab.key == key)?.reaction)
+}

@@ -1,0 +1,108 @@
+//! Three equal apps over real QUIC.
+#![allow(clippy::unwrap_used, clippy::expect_used, clippy::panic, reason = "a failed test should panic")]
+
+mod support;
+
+use bevy::math::DVec3;
+use bevy::prelude::*;
+use pliant_body::{Grab, GrabForce, GrabOf, ModalAsset, ModalBody, ShownState};
+use pliant_net::{
+    Emulation, Invite, NetPeer, NetPlugin, PeerConfig, PeerState, SeenHands, SharedBody, User, UserLeft,
+};
+use pliant_stream::emulator::Preset;
+use support::{MIDDLE, TIP, alone, app, bar, messages, run_for, run_until};
+
+fn peer(name: &str, join: Option<Invite>) -> (App, Entity) {
+    let net = NetPlugin::peer(PeerConfig { name: name.into(), join, ..PeerConfig::default() }).unwrap();
+    let mut app = app(net);
+    let handle = app.world_mut().resource_mut::<Assets<ModalAsset>>().add(ModalAsset(bar()));
+    // Each where it likes.
+    let place = Transform::from_xyz(0.0, name.len() as f32, 0.0);
+    let body = app.world_mut().spawn((ModalBody::new(handle), SharedBody::named("bar"), place)).id();
+    (app, body)
+}
+
+fn users(app: &mut App) -> Vec<String> {
+    let mut query = app.world_mut().query::<&User>();
+    let mut names: Vec<String> = query.iter(app.world()).map(|user| user.name.clone()).collect();
+    names.sort();
+    names
+}
+
+fn q(app: &App, body: Entity) -> Vec<f64> {
+    app.world().get::<ShownState>(body).unwrap().q().to_vec()
+}
+
+fn apart(a: &[f64], b: &[f64]) -> f64 {
+    let size = a.iter().fold(1e-9_f64, |size, q| size.max(q.abs()));
+    a.iter().zip(b).map(|(a, b)| (a - b).abs()).fold(0.0, f64::max) / size
+}
+
+#[test]
+fn three_peers_hold_one_body_and_agree_and_one_that_goes_is_missed_by_nobody() {
+    let _alone = alone();
+    let (mut a, body_a) = peer("a", None);
+    run_until(&mut [&mut a], 3.0, "the first begins", |apps| {
+        matches!(apps[0].world().resource::<NetPeer>().state(), PeerState::In { .. })
+    });
+    let invite = a.world().resource::<NetPeer>().invite();
+    let (mut b, body_b) = peer("bb", Some(invite.clone()));
+    run_until(&mut [&mut a, &mut b], 5.0, "the second is in", |apps| users(apps[1]).len() == 2);
+    // The third comes through the second, and is told of the first.
+    let through = b.world().resource::<NetPeer>().invite();
+    let (mut c, body_c) = peer("ccc", Some(through));
+    run_until(&mut [&mut a, &mut b, &mut c], 5.0, "all know all", |apps| {
+        apps.iter_mut().all(|app| users(app) == ["a", "bb", "ccc"])
+    });
+    // One of them over the paper's third network: 3 % and 60 ms.
+    c.world_mut().resource_mut::<NetPeer>().set_emulation(Some(Emulation::preset(Preset::Paper3, 7)));
+
+    let hold = |app: &mut App, body: Entity, vertex: u32, x: f64, up: f64| {
+        let place = app.world().get::<Transform>(body).unwrap().translation.as_dvec3();
+        app.world_mut().spawn((Grab::new(vertex, 0.3, place + DVec3::new(x, up, 0.1)), GrabOf(body))).id()
+    };
+    let of_a = hold(&mut a, body_a, TIP, 0.9, 0.2);
+    let of_c = hold(&mut c, body_c, MIDDLE, 0.5, -0.1);
+    run_for(&mut [&mut a, &mut b, &mut c], 3.0);
+    let (qa, qb, qc) = (q(&a, body_a), q(&b, body_b), q(&c, body_c));
+    assert!(qa.iter().any(|q| q.abs() > 0.02), "the body is bent: {qa:?}");
+    assert!(apart(&qa, &qb) < 0.01 && apart(&qa, &qc) < 0.01, "{qa:?}, {qb:?}, {qc:?}");
+    let forces = [a.world().get::<GrabForce>(of_a).unwrap(), c.world().get::<GrabForce>(of_c).unwrap()];
+    assert!(forces.iter().all(|felt| felt.force.length() > 0.1), "{forces:?}");
+    assert_eq!(b.world().get::<SeenHands>(body_b).unwrap().0.len(), 2, "the one without a hand sees both");
+    assert_eq!(a.world().get::<SeenHands>(body_a).unwrap().0.len(), 1);
+
+    // The middle one, through which the third came, goes: the others go on together.
+    drop(b);
+    run_until(&mut [&mut a, &mut c], 5.0, "both notice", |apps| {
+        apps.iter().all(|app| messages::<UserLeft>(app).iter().any(|left| left.name == "bb"))
+    });
+    a.world_mut().get_mut::<Grab>(of_a).unwrap().target.z -= 0.3;
+    run_for(&mut [&mut a, &mut c], 2.0);
+    let (qa, qc) = (q(&a, body_a), q(&c, body_c));
+    assert!(apart(&qa, &qc) < 0.01, "{qa:?}, {qc:?}");
+    c.world_mut().despawn(of_c);
+    run_until(&mut [&mut a, &mut c], 3.0, "the hand is let go of everywhere", |apps| {
+        apps[0].world().get::<SeenHands>(body_a).unwrap().0.is_empty()
+    });
+}
+
+#[test]
+fn a_peer_with_another_body_is_not_let_in() {
+    let _alone = alone();
+    let (mut a, _) = peer("a", None);
+    run_until(&mut [&mut a], 3.0, "the first begins", |apps| {
+        matches!(apps[0].world().resource::<NetPeer>().state(), PeerState::In { .. })
+    });
+    let invite = a.world().resource::<NetPeer>().invite();
+    let net = NetPlugin::peer(PeerConfig { join: Some(invite), ..PeerConfig::default() }).unwrap();
+    let mut stranger = app(net);
+    let handle = stranger.world_mut().resource_mut::<Assets<ModalAsset>>().add(ModalAsset(bar()));
+    stranger.world_mut().spawn((ModalBody::new(handle), SharedBody::named("rod")));
+    run_until(&mut [&mut a, &mut stranger], 5.0, "it is told why", |apps| {
+        matches!(
+            apps[1].world().resource::<NetPeer>().state(),
+            PeerState::Closed { reason } if reason.contains("bodies")
+        )
+    });
+}

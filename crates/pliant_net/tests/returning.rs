@@ -1,0 +1,184 @@
+//! Guests and hosts that go and come back, one way or another.
+#![allow(clippy::unwrap_used, clippy::expect_used, clippy::panic, reason = "a failed test should panic")]
+
+mod support;
+
+use std::net::SocketAddr;
+use std::time::{Duration, Instant};
+
+use bevy::math::DVec3;
+use bevy::prelude::*;
+use pliant_body::{BodyState, Grab, GrabForce, GrabOf, ShownState};
+use pliant_net::transport::Limits;
+use pliant_net::{
+    BodyArrived, BodyLeft, Emulation, GuestState, HandOf, HostConfig, HostOptions, Identity, JoinConfig,
+    JoinOptions, NetGuest, NetHost, RemoteBody, SessionClosed, SessionJoined, SessionLost, User, UserJoined,
+};
+use pliant_stream::UserId;
+use pliant_stream::emulator::{LinkConfig, Loss};
+use support::{TIP, alone, bar, guest, host, messages, only, run_for, run_until};
+
+fn state_of(app: &App) -> GuestState {
+    app.world().resource::<NetGuest>().state().clone()
+}
+
+fn is_in(app: &App) -> bool {
+    matches!(state_of(app), GuestState::In { .. })
+}
+
+fn body_of(app: &mut App) -> Option<Entity> {
+    only::<RemoteBody>(app).filter(|&body| app.world().get::<ShownState>(body).is_some())
+}
+
+/// Nothing gets through, either way.
+fn cut() -> Option<Emulation> {
+    let link = LinkConfig { loss: Loss::Random(1.0), ..LinkConfig::default() };
+    Some(Emulation { outgoing: link.clone(), incoming: link, seed: 1 })
+}
+
+fn quick(limits: Limits) -> Limits {
+    Limits { idle_timeout: Duration::from_secs(1), keep_alive: Duration::from_millis(200), ..limits }
+}
+
+/// How far the guest's picture is from the host's body, as a part of the body's largest coordinate.
+fn apart(host: &App, body: Entity, guest: &App, there: Entity) -> f64 {
+    let truth = host.world().get::<BodyState>(body).unwrap().body().q();
+    let shown = guest.world().get::<ShownState>(there).unwrap().q();
+    let size = truth.iter().fold(1e-9_f64, |size, q| size.max(q.abs()));
+    truth.iter().zip(shown).map(|(a, b)| (a - b).abs()).fold(0.0, f64::max) / size
+}
+
+#[test]
+fn a_network_that_is_away_for_longer_than_the_timeout_costs_the_time_and_nothing_else() {
+    let _alone = alone();
+    let session = pliant_stream::HostConfig { idle_timeout: Duration::from_secs(1), ..Default::default() };
+    let transport = HostOptions { limits: quick(Limits::host()), ..HostOptions::default() };
+    let (mut host, invite, body) = host(HostConfig { session, transport, ..HostConfig::default() });
+    let transport = JoinOptions { limits: quick(Limits::guest()), ..JoinOptions::default() };
+    let mut guest = guest(&invite, JoinConfig { transport, name: "Ann".into(), ..JoinConfig::default() });
+    run_until(&mut [&mut host, &mut guest], 5.0, "the body arrives", |apps| body_of(apps[1]).is_some());
+    let there = body_of(&mut guest).unwrap();
+    let user = match state_of(&guest) {
+        GuestState::In { user } => user,
+        other => panic!("{other:?}"),
+    };
+    let own = guest.world_mut().spawn((Grab::new(TIP, 0.3, DVec3::new(1.2, 2.4, 0.4)), GrabOf(there))).id();
+    run_until(&mut [&mut host, &mut guest], 3.0, "the hand takes hold", |apps| {
+        only::<HandOf>(apps[0]).is_some()
+    });
+
+    guest.world().resource::<NetGuest>().set_emulation(cut());
+    let cut_at = Instant::now();
+    run_until(&mut [&mut host, &mut guest], 6.0, "both ends notice", |apps| {
+        matches!(state_of(apps[1]), GuestState::Lost { .. }) && only::<HandOf>(apps[0]).is_none()
+    });
+    let noticed = cut_at.elapsed().as_secs_f64();
+    assert!((0.7..4.0).contains(&noticed), "the timeout is 1 s, noticed after {noticed} s");
+    assert_eq!(messages::<SessionLost>(&guest).len(), 1);
+    assert!(guest.world().get_entity(there).is_ok() && guest.world().get_entity(own).is_ok());
+    // The host's body goes on without.
+    host.world_mut().spawn((Grab::new(TIP, 0.3, DVec3::new(0.9, 2.8, -0.3)), GrabOf(body)));
+    run_for(&mut [&mut host, &mut guest], 2.0);
+
+    guest.world().resource::<NetGuest>().set_emulation(None);
+    let back_at = Instant::now();
+    run_until(&mut [&mut host, &mut guest], 12.0, "the guest is back, hand and all", |apps| {
+        is_in(apps[1]) && only::<HandOf>(apps[0]).is_some()
+    });
+    println!("noticed after {noticed:.2} s, back {:.2} s after the network", back_at.elapsed().as_secs_f64());
+    assert_eq!(state_of(&guest), GuestState::In { user }, "the same user");
+    assert!(messages::<SessionJoined>(&guest).iter().any(|joined| joined.again && joined.user == user));
+    assert!(messages::<UserJoined>(&host).iter().any(|joined| joined.back && joined.name == "Ann"));
+    run_for(&mut [&mut host, &mut guest], 2.0);
+    assert_eq!(body_of(&mut guest), Some(there), "the body is on the entity that it was on");
+    assert!(messages::<BodyLeft>(&guest).is_empty());
+    let off = apart(&host, body, &guest, there);
+    assert!(off < 0.05, "the picture is off by {off}");
+    assert!(guest.world().get::<GrabForce>(own).unwrap().force.length() > 0.1, "and is felt again");
+}
+
+#[test]
+fn guests_wait_for_a_host_that_is_started_anew() {
+    let _alone = alone();
+    let key = Identity::generate().unwrap().to_pkcs8();
+    let config = |bind: SocketAddr| HostConfig {
+        transport: HostOptions {
+            bind,
+            identity: Some(Identity::from_pkcs8(&key).unwrap()),
+            ..HostOptions::default()
+        },
+        name: "Hanna".into(),
+        ..HostConfig::default()
+    };
+    let (mut first, invite, _) = host(config("127.0.0.1:0".parse().unwrap()));
+    let address = SocketAddr::from(([127, 0, 0, 1], invite.port));
+    let mut guest = guest(&invite, JoinConfig::default());
+    run_until(&mut [&mut first, &mut guest], 5.0, "the body arrives", |apps| body_of(apps[1]).is_some());
+    let there = body_of(&mut guest).unwrap();
+    drop(first);
+    run_until(&mut [&mut guest], 3.0, "the guest hears of it", |apps| {
+        matches!(state_of(apps[0]), GuestState::Lost { .. })
+    });
+    assert!(guest.world().get_entity(there).is_ok(), "what it saw is still there");
+    let (mut second, _, body) = host(config(address));
+    let restarted = Instant::now();
+    run_until(&mut [&mut second, &mut guest], 8.0, "the guest is back", |apps| {
+        body_of(apps[1]) == Some(there)
+    });
+    println!("back {:.2} s after the host", restarted.elapsed().as_secs_f64());
+    second.world_mut().spawn((Grab::new(TIP, 0.3, DVec3::new(0.9, 2.8, -0.3)), GrabOf(body)));
+    run_for(&mut [&mut second, &mut guest], 2.0);
+    let off = apart(&second, body, &guest, there);
+    assert!(off < 0.02, "the picture is off by {off}");
+    // The host's own name is known.
+    let mut users = guest.world_mut().query::<&User>();
+    let host_user = users.iter(guest.world()).find(|user| user.id == UserId::HOST).unwrap();
+    assert_eq!(host_user.name, "Hanna");
+    assert!(messages::<SessionClosed>(&guest).is_empty());
+}
+
+#[test]
+fn two_connections_of_one_key_are_one_user_the_newer() {
+    let _alone = alone();
+    let (mut host, invite, _) = host(HostConfig::default());
+    let key = Identity::generate().unwrap().to_pkcs8();
+    let join = |name: &str| {
+        let identity = Some(Identity::from_pkcs8(&key).unwrap());
+        let transport = JoinOptions { identity, ..JoinOptions::default() };
+        // It would come back and send the other away in turn.
+        let rejoin = Duration::ZERO;
+        guest(
+            &invite,
+            JoinConfig { transport, rejoin, name: name.into(), models: vec![bar()], ..JoinConfig::default() },
+        )
+    };
+    let mut old = join("old");
+    run_until(&mut [&mut host, &mut old], 5.0, "the first is in", |apps| is_in(apps[1]));
+    let mut new = join("new");
+    run_until(&mut [&mut host, &mut old, &mut new], 5.0, "the second is in, the first is out", |apps| {
+        is_in(apps[2]) && matches!(state_of(apps[1]), GuestState::Closed { .. })
+    });
+    assert_eq!(state_of(&new), GuestState::In { user: UserId(1) }, "under the same number");
+    assert_eq!(host.world().resource::<NetHost>().guests().count(), 1);
+    // Two of one token, but each with a key of its own, are two users.
+    let mut other = guest(&invite, JoinConfig { models: vec![bar()], ..JoinConfig::default() });
+    run_until(&mut [&mut host, &mut new, &mut other], 5.0, "another one", |apps| is_in(apps[2]));
+    assert_eq!(host.world().resource::<NetHost>().guests().count(), 2);
+}
+
+#[test]
+fn a_guest_that_is_sent_away_does_not_come_back() {
+    let _alone = alone();
+    let (mut host, invite, _) = host(HostConfig::default());
+    let mut guest = guest(&invite, JoinConfig::default());
+    run_until(&mut [&mut host, &mut guest], 5.0, "the guest is in", |apps| is_in(apps[1]));
+    let user = host.world().resource::<NetHost>().guests().next().unwrap();
+    assert!(host.world().resource::<NetHost>().key_of(user).is_some());
+    assert!(host.world_mut().resource_mut::<NetHost>().expel(user));
+    run_until(&mut [&mut host, &mut guest], 3.0, "it is told", |apps| {
+        matches!(state_of(apps[1]), GuestState::Closed { .. })
+    });
+    run_for(&mut [&mut host, &mut guest], 1.0);
+    assert_eq!(host.world().resource::<NetHost>().guests().count(), 0);
+    assert!(messages::<BodyArrived>(&guest).len() <= 1);
+}

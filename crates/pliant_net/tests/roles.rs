@@ -1,0 +1,169 @@
+//! Who may do what, who sees how much, and what is kept of it.
+#![allow(clippy::unwrap_used, clippy::expect_used, clippy::panic, reason = "a failed test should panic")]
+
+mod support;
+
+use std::collections::BTreeMap;
+use std::time::{Duration, SystemTime};
+
+use bevy::math::DVec3;
+use bevy::prelude::*;
+use pliant_body::{BodyState, Grab, GrabOf, ShownState};
+use pliant_net::{
+    Access, GrabRefused, Grant, GuestState, HandOf, Holding, HostConfig, HostOptions, Interest, Invite,
+    JoinConfig, NetGuest, NetPlugin, NetStats, Recording, RemoteBody, Role, SeenHands, SessionClosed, Token,
+    User, UserLink,
+};
+use support::{TIP, alone, app, bar, guest, host, messages, only, run_for, run_until};
+
+fn body_of(app: &mut App) -> Option<Entity> {
+    only::<RemoteBody>(app).filter(|&body| app.world().get::<ShownState>(body).is_some())
+}
+
+fn cached() -> JoinConfig {
+    JoinConfig { models: vec![bar()], ..JoinConfig::default() }
+}
+
+fn roles(app: &mut App) -> BTreeMap<u16, Role> {
+    let mut users = app.world_mut().query::<&User>();
+    users.iter(app.world()).map(|user| (user.id.0, user.role)).collect()
+}
+
+#[test]
+fn a_watcher_sees_and_does_not_hold_and_all_know_who_is_who() {
+    let _alone = alone();
+    let [held, watched, spent] = [(); 3].map(|()| Token::generate().unwrap());
+    let access = Access::Tokens(vec![
+        Grant::hold(held),
+        Grant::watch(watched),
+        Grant::hold(spent).until(SystemTime::now() - Duration::from_secs(1)),
+    ]);
+    let transport = HostOptions { access, ..HostOptions::default() };
+    let (mut host, invite, _) = host(HostConfig { transport, ..HostConfig::default() });
+    let mut holder = guest(&invite, JoinConfig { name: "holder".into(), ..cached() });
+    let watching = Invite { token: Some(watched), ..invite.clone() };
+    let mut watcher = guest(&watching, JoinConfig { name: "watcher".into(), ..cached() });
+    let mut late = guest(&Invite { token: Some(spent), ..invite.clone() }, cached());
+    run_until(
+        &mut [&mut host, &mut holder, &mut watcher, &mut late],
+        5.0,
+        "two are in, one is not",
+        |apps| {
+            body_of(apps[1]).is_some()
+                && body_of(apps[2]).is_some()
+                && matches!(
+                    apps[3].world().resource::<NetGuest>().state(),
+                    GuestState::Closed { reason } if reason.contains("expired")
+                )
+        },
+    );
+    assert_eq!(watcher.world().resource::<NetGuest>().role(), Role::Watch);
+    let (there, body) = (body_of(&mut watcher).unwrap(), body_of(&mut holder).unwrap());
+    let refused = watcher.world_mut().spawn((Grab::new(TIP, 0.3, DVec3::Y), GrabOf(there))).id();
+    holder.world_mut().spawn((Grab::new(TIP, 0.3, DVec3::new(1.2, 2.5, 0.4)), GrabOf(body)));
+    run_until(&mut [&mut host, &mut holder, &mut watcher], 5.0, "one holds, the other is refused", |apps| {
+        only::<HandOf>(apps[0]).is_some()
+            && messages::<GrabRefused>(apps[2]) == [GrabRefused { entity: refused }]
+    });
+    run_until(
+        &mut [&mut host, &mut holder, &mut watcher],
+        5.0,
+        "the watcher sees the hand, and how all are reached",
+        |apps| {
+            let seen = apps[2].world().get::<SeenHands>(there).is_some_and(|hands| hands.0.len() == 1);
+            let mut links = apps[2].world_mut().query::<(&User, &UserLink)>();
+            let holder = links.iter(apps[2].world()).find(|(user, _)| user.name == "holder");
+            seen && holder.is_some_and(|(_, link)| !link.round_trip.is_zero())
+        },
+    );
+    let apps = [&mut host, &mut holder, &mut watcher];
+    let said = apps.map(roles);
+    assert_eq!(said[0].values().filter(|role| **role == Role::Watch).count(), 1);
+    assert_eq!((&said[1], &said[2]), (&said[0], &said[0]), "all know the same");
+}
+
+#[test]
+fn a_body_may_be_the_hosts_alone() {
+    let _alone = alone();
+    let (mut host, invite, body) = host(HostConfig::default());
+    host.world_mut().entity_mut(body).insert(Holding::HostOnly);
+    let mut guest = guest(&invite, cached());
+    run_until(&mut [&mut host, &mut guest], 5.0, "the body arrives", |apps| body_of(apps[1]).is_some());
+    let there = body_of(&mut guest).unwrap();
+    let grab = guest.world_mut().spawn((Grab::new(TIP, 0.3, DVec3::Y), GrabOf(there))).id();
+    run_until(&mut [&mut host, &mut guest], 3.0, "the grab is refused", |apps| {
+        messages::<GrabRefused>(apps[1]) == [GrabRefused { entity: grab }]
+    });
+    assert!(only::<HandOf>(&mut host).is_none());
+}
+
+#[test]
+fn what_is_not_wanted_is_not_sent() {
+    let _alone = alone();
+    let (mut host, invite, body) = host(HostConfig::default());
+    let mut guest = guest(&invite, cached());
+    run_until(&mut [&mut host, &mut guest], 5.0, "the body arrives", |apps| body_of(apps[1]).is_some());
+    let there = body_of(&mut guest).unwrap();
+    host.world_mut().spawn((Grab::new(TIP, 0.3, DVec3::new(1.2, 2.5, 0.4)), GrabOf(body)));
+    let sway = |time: Res<Time>, mut grab: Single<&mut Grab>| {
+        grab.target = DVec3::new(1.2, 2.5 + 0.2 * (3.0 * time.elapsed_secs_f64()).sin(), 0.4);
+    };
+    host.add_systems(FixedUpdate, sway);
+    let came = |guest: &App| guest.world().resource::<NetStats>().datagrams_in;
+    let in_a_second = |host: &mut App, guest: &mut App| {
+        let before = came(guest);
+        run_for(&mut [host, guest], 1.0);
+        came(guest) - before
+    };
+    run_for(&mut [&mut host, &mut guest], 0.5);
+    assert!(in_a_second(&mut host, &mut guest) > 30, "40 ticks a second");
+    *guest.world_mut().get_mut::<Interest>(there).unwrap() = Interest::Nothing;
+    run_for(&mut [&mut host, &mut guest], 0.5);
+    let away = in_a_second(&mut host, &mut guest);
+    assert!(away <= 5, "{away} datagrams of what nobody looks at: the clock's answers are two");
+    // Half of the four modes: the shape of those, the rest at rest.
+    *guest.world_mut().get_mut::<Interest>(there).unwrap() = Interest::Modes(2);
+    run_for(&mut [&mut host, &mut guest], 2.0);
+    let truth = host.world().get::<BodyState>(body).unwrap().body().q().to_vec();
+    let shown = guest.world().get::<ShownState>(there).unwrap().q().to_vec();
+    assert_eq!(shown[2..], [0.0, 0.0]);
+    let size = truth.iter().fold(0.0_f64, |size, q| size.max(q.abs()));
+    assert!((0..2).all(|k| (truth[k] - shown[k]).abs() < 0.25 * size), "{shown:?} for {truth:?}");
+    *guest.world_mut().get_mut::<Interest>(there).unwrap() = Interest::All;
+    run_for(&mut [&mut host, &mut guest], 1.0);
+    let shown = guest.world().get::<ShownState>(there).unwrap().q();
+    assert!(shown[2].abs() + shown[3].abs() > 0.0, "all modes again: {shown:?}");
+}
+
+#[test]
+fn a_recorded_session_is_seen_again_as_it_was() {
+    let _alone = alone();
+    let path = std::env::temp_dir().join(format!("pliant-session-{}.rec", std::process::id()));
+    let (mut host, invite, body) = host(HostConfig { name: "Hanna".into(), ..HostConfig::default() });
+    // The model is in the guest's cache: it never crosses, and is in the recording all the same.
+    let mut seen = guest(&invite, JoinConfig { record: Some(path.clone()), ..cached() });
+    run_until(&mut [&mut host, &mut seen], 5.0, "the body arrives", |apps| body_of(apps[1]).is_some());
+    host.world_mut().spawn((Grab::new(TIP, 0.3, DVec3::new(1.2, 2.5, 0.4)), GrabOf(body)));
+    run_for(&mut [&mut host, &mut seen], 2.0);
+    let there = body_of(&mut seen).unwrap();
+    let shown = seen.world().get::<ShownState>(there).unwrap().q().to_vec();
+    drop(seen);
+    drop(host);
+
+    let recording = Recording::open(&path).unwrap();
+    let mut again = app(NetPlugin::replay(recording, JoinConfig::default()));
+    run_until(&mut [&mut again], 8.0, "the recording is over", |apps| {
+        !messages::<SessionClosed>(apps[0]).is_empty()
+    });
+    let mut bodies = again.world_mut().query::<&ShownState>();
+    let replayed = bodies.single(again.world()).unwrap().q();
+    let size = shown.iter().fold(0.0_f64, |size, q| size.max(q.abs()));
+    let off = shown.iter().zip(replayed).map(|(a, b)| (a - b).abs()).fold(0.0, f64::max) / size;
+    // The body stands still under a steady hand: the end of the one is the end of the other.
+    assert!(off < 0.01, "{replayed:?}, not {shown:?}");
+    std::fs::remove_file(&path).unwrap();
+    // Who was there is there: the host, by its name.
+    let mut users = again.world_mut().query::<&User>();
+    let names: Vec<&str> = users.iter(again.world()).map(|user| user.name.as_str()).collect();
+    assert!(names.is_empty(), "the session is over: {names:?}");
+}

@@ -1,0 +1,145 @@
+//! What a guest does not look at is not sent, and who comes back is who they were.
+#![allow(clippy::unwrap_used, clippy::expect_used, clippy::panic, reason = "a failed test should panic")]
+
+mod support;
+
+use std::time::Duration;
+
+use pliant_modal::ModalModel;
+use pliant_stream::{
+    BodyId, BodySetup, Channel, GuestConfig, GuestSession, HostConfig, HostEvent, HostSession, PeerId,
+    TickState, UserId,
+};
+use support::bar;
+
+const BODY: BodyId = BodyId(9);
+const TICK: Duration = Duration::from_millis(25);
+
+/// A host and guests that hear each other at once, and everything.
+struct Room {
+    host: HostSession,
+    guests: Vec<(PeerId, GuestSession)>,
+    now: Duration,
+    tick: u64,
+    modes: usize,
+}
+
+impl Room {
+    fn new(config: HostConfig) -> Self {
+        let mut host = HostSession::new(config).unwrap();
+        let model = bar(8, 0.05);
+        let modes = model.mode_count();
+        host.add_body(BODY, "bar", model, BodySetup::default()).unwrap();
+        Self { host, guests: Vec::new(), now: Duration::ZERO, tick: 0, modes }
+    }
+
+    fn join(&mut self, peer: PeerId, model: &std::sync::Arc<ModalModel>) {
+        let mut guest = GuestSession::new(GuestConfig::default(), 1200).unwrap();
+        guest.add_cached_model(model.clone());
+        self.host.connect(self.now, peer, 1200).unwrap();
+        guest.connect(self.now).unwrap();
+        self.guests.push((peer, guest));
+    }
+
+    fn exchange(&mut self) {
+        for _ in 0..4 {
+            for (peer, guest) in &mut self.guests {
+                while let Some(out) = guest.poll_output() {
+                    match out.channel {
+                        Channel::Datagram => self.host.on_datagram(self.now, *peer, &out.bytes),
+                        Channel::Message => self.host.on_message(self.now, *peer, &out.bytes),
+                    }
+                }
+            }
+            while let Some(out) = self.host.poll_output() {
+                let Some((_, guest)) = self.guests.iter_mut().find(|g| g.0 == out.peer) else { continue };
+                match out.channel {
+                    Channel::Datagram => guest.on_datagram(self.now, &out.bytes),
+                    Channel::Message => guest.on_message(self.now, &out.bytes),
+                }
+            }
+        }
+    }
+
+    /// A tick of a body of which every mode moves.
+    fn step(&mut self) {
+        self.now += TICK;
+        self.tick += 1;
+        let t = self.tick as f64 * 0.025;
+        let rate = |k: usize| 1.0 + k as f64;
+        let q: Vec<f64> = (0..self.modes).map(|k| 0.1 * (rate(k) * t).sin()).collect();
+        let v: Vec<f64> = (0..self.modes).map(|k| 0.1 * rate(k) * (rate(k) * t).cos()).collect();
+        let a: Vec<f64> = (0..self.modes).map(|k| -0.1 * rate(k).powi(2) * (rate(k) * t).sin()).collect();
+        let state =
+            TickState { tick: self.tick, q: &q, v: &v, a: &a, pose: None, grabs: &[], resting: false };
+        self.host.publish(self.now, BODY, &state).unwrap();
+        self.host.update(self.now);
+        self.exchange();
+        for (_, guest) in &mut self.guests {
+            guest.update(self.now);
+        }
+        self.exchange();
+    }
+
+    fn datagrams(&self, guest: usize) -> u64 {
+        self.guests[guest].1.stats().datagrams_in
+    }
+}
+
+#[test]
+fn a_body_that_is_not_looked_at_costs_nothing_and_comes_back_whole() {
+    let model = bar(8, 0.05);
+    let mut room = Room::new(HostConfig::default());
+    let (looks, looks_away) = (PeerId(1), PeerId(2));
+    room.join(looks, &model);
+    room.join(looks_away, &model);
+    (0..40).for_each(|_| room.step());
+    assert!(room.guests.iter().all(|(_, g)| g.body(BODY).unwrap().is_ready()));
+
+    // Away: besides the answers to its clock, nothing comes; the other gets every tick.
+    assert!(room.host.set_interest(looks_away, BODY, Some(0)));
+    let before = [room.datagrams(0), room.datagrams(1)];
+    (0..80).for_each(|_| room.step());
+    let (other, away) = (room.datagrams(0) - before[0], room.datagrams(1) - before[1]);
+    assert!(other >= 80 && away <= 8, "{other} datagrams for who looks, {away} for who looks away");
+
+    // Far off: three modes are enough.
+    assert!(room.host.set_interest(looks_away, BODY, Some(3)));
+    (0..40).for_each(|_| room.step());
+    let state = |room: &Room, guest: usize| {
+        let view = room.guests[guest].1.body(BODY).unwrap();
+        (view.tick(), view.shown().unwrap().clone())
+    };
+    assert_eq!(state(&room, 1).1.modes(), 3);
+
+    // Near again: the whole shape, as the other has it.
+    assert!(room.host.set_interest(looks_away, BODY, None));
+    (0..40).for_each(|_| room.step());
+    let ((tick, full), (other_tick, back)) = (state(&room, 0), state(&room, 1));
+    assert_eq!((tick, full.modes()), (other_tick, back.modes()));
+    let apart = full.q.iter().zip(&back.q).map(|(a, b)| (a - b).abs()).fold(0.0, f64::max);
+    assert!(apart < 0.01, "0.1 is the size of each mode, they differ by {apart}");
+    assert!(!room.host.set_interest(PeerId(7), BODY, None), "no such guest");
+    assert!(!room.host.set_interest(looks, BodyId(1), None), "no such body");
+}
+
+#[test]
+fn who_comes_back_gets_the_number_they_had_if_it_is_free() {
+    let model = bar(8, 0.05);
+    let mut room = Room::new(HostConfig { open: false, ..HostConfig::default() });
+    let knock = |room: &mut Room, peer: PeerId, before: Option<UserId>| {
+        room.join(peer, &model);
+        room.exchange();
+        let knocked = std::iter::from_fn(|| room.host.poll_event())
+            .any(|event| matches!(event, HostEvent::Knock { peer: who, .. } if who == peer));
+        assert!(knocked);
+        room.host.accept_as(room.now, peer, before).unwrap()
+    };
+    assert_eq!(knock(&mut room, PeerId(1), None), UserId(1));
+    assert_eq!(knock(&mut room, PeerId(2), None), UserId(2));
+    room.host.disconnect(PeerId(1), pliant_stream::EndReason::Lost);
+    assert_eq!(knock(&mut room, PeerId(3), Some(UserId(1))), UserId(1));
+    // In use, or the host's: another one.
+    assert_eq!(knock(&mut room, PeerId(4), Some(UserId(2))), UserId(3));
+    assert_eq!(knock(&mut room, PeerId(5), Some(UserId::HOST)), UserId(4));
+}
