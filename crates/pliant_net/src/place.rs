@@ -6,6 +6,7 @@
 use bevy::math::{DQuat, DVec3};
 use bevy::prelude::*;
 use pliant_body::BodyState;
+use pliant_stream::Pose;
 
 /// The map between an app's world and session coordinates for one body: `world = rotation * session * scale + origin`.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -42,6 +43,15 @@ impl Place {
         self.rotation * (DVec3::from(session) * self.scale) + self.origin
     }
 
+    /// A point in body axes, in this app's world; `pose`: of a free body.
+    pub(crate) fn body_point_to_world(&self, pose: Option<Pose>, point: DVec3) -> DVec3 {
+        let session = match pose {
+            None => point,
+            Some(pose) => DQuat::from_array(pose.rotation) * point + DVec3::from(pose.position),
+        };
+        self.point_to_world(session.into())
+    }
+
     /// Forces scale like lengths: stiffness (N/m) stays as baked.
     pub(crate) fn force_to_session(&self, world: DVec3) -> [f64; 3] {
         (self.rotation.inverse() * world / self.scale).into()
@@ -49,6 +59,17 @@ impl Place {
 
     pub(crate) fn force_to_world(&self, session: [f64; 3]) -> DVec3 {
         self.rotation * DVec3::from(session) * self.scale
+    }
+}
+
+/// Puts a free body between two poses of the session.
+pub(crate) fn set_pose(transform: &mut Transform, from: &Pose, to: &Pose, fraction: f64, scale: f64) {
+    let origin = DVec3::from(from.position).lerp(DVec3::from(to.position), fraction) * scale;
+    let [from, to] = [from, to].map(|pose| DQuat::from_array(pose.rotation).normalize());
+    let rotation = from.slerp(to, fraction).normalize();
+    if origin.is_finite() && rotation.is_finite() {
+        transform.translation = origin.as_vec3();
+        transform.rotation = rotation.as_quat();
     }
 }
 

@@ -162,7 +162,10 @@ impl FollowedBody {
         self.settled = false;
         std::mem::swap(&mut self.previous, &mut self.current);
         self.current.0.clone_from(&shown.q);
-        self.current.1 = view.pose();
+        self.current.1 = match view.own_hand() {
+            Some(own) => own.pose(),
+            None => view.pose(),
+        };
         if first {
             self.previous = self.current.clone();
         }

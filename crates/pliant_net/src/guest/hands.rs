@@ -1,5 +1,6 @@
 //! The app's own hands on the session's bodies.
 
+use std::collections::VecDeque;
 use std::time::Duration;
 
 use bevy::prelude::*;
@@ -20,8 +21,7 @@ pub(super) struct SentGrab {
     /// As last said, in session coordinates, and how many ticks it has been said for.
     target: [f64; 3],
     times: u8,
-    /// Where the hand was at the end of the last frame, and where it is at the end of this one.
-    path: [[f64; 3]; 2],
+    path: HandPath,
     /// The body's tick when the target was said.
     tick: u64,
     /// The session's number; `None`: refused.
@@ -67,14 +67,58 @@ pub(crate) fn send_hands(
                     radius: grab.radius,
                     target,
                     times: 0,
-                    path: [target; 2],
+                    path: HandPath(VecDeque::from([(now, target)])),
                     tick: 0,
                     number: begun.ok(),
                     point,
                 };
                 guest.grabs.insert(entity, sent);
             }
-            Some(sent) => sent.path = [sent.path[1], target],
+            Some(sent) => sent.path.push(now, target),
+        }
+    }
+}
+
+/// Where a hand was lately, as the app's frames had it.
+///
+/// Frames, the app's fixed steps and the session's ticks beat against each other: a hand that is read at the ticks moves by none, one or two of its
+/// steps, and a stiff hold makes force of that. The mean over a tick moves evenly, half a tick later.
+struct HandPath(VecDeque<(Duration, [f64; 3])>);
+
+/// A tick of a tenth of a second at 240 frames a second, and some.
+const PLACES: usize = 32;
+
+impl HandPath {
+    fn push(&mut self, at: Duration, place: [f64; 3]) {
+        if self.0.len() >= PLACES {
+            self.0.pop_front();
+        }
+        self.0.push_back((at, place));
+    }
+
+    /// The mean place in the time `span` before `at`; each place holds until the next.
+    fn mean(&self, at: Duration, span: Duration) -> [f64; 3] {
+        let from = at.saturating_sub(span);
+        let ends = self.0.iter().skip(1).map(|(next, _)| *next).chain([Duration::MAX]);
+        // The first place is where the hand was before, too.
+        let held = self.0.iter().zip(ends).enumerate().filter_map(|(k, (&(begins, place), ends))| {
+            let begins = if k == 0 { from } else { begins.max(from) };
+            let weight = ends.min(at).checked_sub(begins)?.as_secs_f64();
+            (weight > 0.0).then_some((weight, place))
+        });
+        let mut sum = (0.0, [0.0; 3]);
+        let mut only = None;
+        let mut moved = false;
+        for (weight, place) in held {
+            moved |= *only.get_or_insert(place) != place;
+            sum.0 += weight;
+            (0..3).for_each(|i| sum.1[i] += weight * place[i]);
+        }
+        match only {
+            // A hand at rest is exactly where it is.
+            Some(place) if !moved => place,
+            Some(_) => sum.1.map(|x| x / sum.0),
+            None => self.0.back().map_or([0.0; 3], |(_, place)| *place),
         }
     }
 }
@@ -94,7 +138,8 @@ impl NetGuest {
         let Some(session) = &mut self.session else { return };
         let from = std::mem::replace(&mut self.advanced, now);
         let frame = now.saturating_sub(from);
-        let part = Duration::from_secs_f64(session.step() / READS);
+        let tick = Duration::from_secs_f64(session.step());
+        let part = tick.div_f64(READS);
         let moving = self.grabs.values().any(|sent| sent.number.is_some());
         let parts = if moving && frame.as_secs_f64() < LONGEST_FRAME {
             (frame.as_secs_f64() / part.as_secs_f64()).ceil().max(1.0) as u32
@@ -103,17 +148,15 @@ impl NetGuest {
         };
         for k in 1..=parts {
             let share = f64::from(k) / f64::from(parts);
-            session.update(from + frame.mul_f64(share).min(frame));
+            let at = from + frame.mul_f64(share).min(frame);
+            session.update(at);
             for sent in self.grabs.values_mut() {
                 let Some(number) = sent.number else { continue };
                 let Some(view) = session.body(sent.body) else { continue };
                 // A body that rests or stands still has no ticks: once a frame, so that a hand wakes it.
                 let steps = !view.is_resting() && !view.is_stalled();
                 let due = if steps { view.tick() != sent.tick } else { k == parts };
-                let target = std::array::from_fn(|i| {
-                    let [before, after] = [sent.path[0][i], sent.path[1][i]];
-                    if k == parts { after } else { before + (after - before) * share }
-                });
+                let target = sent.path.mean(at, tick);
                 sent.times = if target == sent.target { sent.times } else { 0 };
                 let enough = if steps { SAID } else { 1 };
                 if !due || sent.times >= enough {
@@ -133,4 +176,34 @@ impl NetGuest {
 
 fn view_tick(session: &pliant_stream::GuestSession, body: BodyId) -> u64 {
     session.body(body).map_or(0, pliant_stream::BodyView::tick)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_hand_that_moves_in_the_apps_steps_is_read_evenly() {
+        // Steps of 1 mm at 40 Hz, seen by frames of 7 ms; read at 40 Hz, out of step.
+        let ms = Duration::from_millis;
+        let mut path = HandPath(VecDeque::new());
+        let mut read = Vec::new();
+        for frame in 0..400u64 {
+            let now = ms(1_000 + 7 * frame);
+            path.push(now, [1e-3 * (7 * frame / 25) as f64, 0.0, 0.0]);
+            let tick = (7 * frame + 11) / 25;
+            if (7 * (frame + 1) + 11) / 25 != tick {
+                read.push(path.mean(now, ms(25))[0]);
+            }
+        }
+        let bends = read.windows(3).skip(2).map(|w| (w[0] - 2.0 * w[1] + w[2]).abs());
+        let worst = bends.fold(0.0, f64::max);
+        // Read as it is, the hand stands still in one tick and moves by two steps in the next: 2 mm.
+        assert!(worst < 0.75e-3, "{worst}");
+        // At rest it is where it is, to the bit.
+        let place = [0.1, 0.2, 0.3];
+        (0..PLACES as u64).for_each(|k| path.push(ms(10_000 + k), place));
+        assert_eq!(path.mean(ms(10_040), ms(5)), place);
+        assert_eq!(HandPath(VecDeque::new()).mean(ms(5), ms(1)), [0.0; 3]);
+    }
 }

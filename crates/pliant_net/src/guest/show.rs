@@ -1,12 +1,11 @@
 //! What the session shows, written for the eye and the hand.
 
-use bevy::math::{DQuat, DVec3};
 use bevy::prelude::*;
 use pliant_body::{BodyState, GrabForce, ShownState};
-use pliant_stream::{BodyView, GrabKey, Pose};
+use pliant_stream::GrabKey;
 
 use super::NetGuest;
-use crate::place::Place;
+use crate::place::{Place, set_pose};
 use crate::seen::{SeenHand, SeenHands};
 use crate::user::UserLink;
 
@@ -60,6 +59,7 @@ pub(crate) fn show(
             }
         }
         let Some(place) = Place::of_body(global, state) else { continue };
+        let pose = followed.current.1;
         let hand = |grab: &pliant_stream::GrabState| SeenHand {
             user: grab.key.user,
             vertex: grab.vertex,
@@ -80,7 +80,7 @@ pub(crate) fn show(
                 let body_point = sent.point.as_ref()?.at(shown.q(), state.warps());
                 Some(GrabForce {
                     force: place.force_to_world(reaction),
-                    point: of_body(&place, view, body_point),
+                    point: place.body_point_to_world(pose, body_point),
                 })
             });
             force.set_if_neq(felt.unwrap_or_default());
@@ -99,23 +99,4 @@ pub(crate) fn show(
         }
     }
     guest.flush();
-}
-
-/// A point in body axes, in this app's world.
-fn of_body(place: &Place, view: &BodyView, point: DVec3) -> DVec3 {
-    let session = match view.pose() {
-        None => point,
-        Some(pose) => DQuat::from_array(pose.rotation) * point + DVec3::from(pose.position),
-    };
-    place.point_to_world(session.into())
-}
-
-fn set_pose(transform: &mut Transform, from: &Pose, to: &Pose, fraction: f64, scale: f64) {
-    let origin = DVec3::from(from.position).lerp(DVec3::from(to.position), fraction) * scale;
-    let [from, to] = [from, to].map(|pose| DQuat::from_array(pose.rotation).normalize());
-    let rotation = from.slerp(to, fraction).normalize();
-    if origin.is_finite() && rotation.is_finite() {
-        transform.translation = origin.as_vec3();
-        transform.rotation = rotation.as_quat();
-    }
 }

@@ -148,6 +148,6 @@ mod tests {
         assert_eq!(depth(0.196, 0.030, 0.025, 0.1), 4, "far and uneven");
         assert_eq!(depth(0.196, 10.0, 0.025, 0.1), 4, "at most what is allowed");
         assert_eq!(depth(0.196, 0.030, 0.025, 0.0), 1);
-        assert_eq!(depth(f64::NAN, f64::NAN, 0.025, 0.1), 1);
+        assert_eq!(depth(0.196, 0.030, 0.0, 0.1), 1, "no step, no ticks");
     }
 }

@@ -104,7 +104,8 @@ impl HandPlayout {
             }
         }
         // However wild the targets, the hand moves no faster than a hand.
-        self.shown += (to - self.shown).clamp_length_max(most);
+        let way = to - self.shown;
+        self.shown = if way.length() <= most { to } else { self.shown + way.clamp_length_max(most) };
         self.shown
     }
 }

@@ -68,7 +68,8 @@ pub enum PeerState {
 /// The peers' session of this app.
 ///
 /// The bodies are all [`SharedBody`] entities with a model that are there when the session begins; all peers must have the same ones, by name and
-/// model. They are [`Driven::Remote`]: their steps are this resource's, at the rate of `Time<Fixed>`. Free bodies are left out.
+/// model. They are [`Driven::Remote`]: their steps are this resource's, at the rate of `Time<Fixed>`. A free body begins where its model
+/// has it, with its weight; an anchored one is where each app has placed it.
 #[derive(Resource)]
 pub struct NetPeer {
     listening: Endpoint,
@@ -254,15 +255,12 @@ impl NetPeer {
         let mut shared = world.query::<(Entity, &SharedBody, &ModalBody, Option<&BodyState>)>();
         for (entity, name, _, state) in shared.iter(world) {
             let Some(state) = state else { return false };
-            if state.model().is_free() {
-                warn_once!("{} is a free body: peers leave it out", name.name);
-                continue;
-            }
             let config = state.body().config();
             let setup = BodySetup {
                 integrator: config.integrator,
                 warp: config.warp,
                 damping_scale: config.damping_scale,
+                gravity: config.gravity,
             };
             let id = number_of(&name.name);
             if found.contains_key(&id) || found.len() >= message::MOST_BODIES {

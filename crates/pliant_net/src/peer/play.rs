@@ -5,12 +5,12 @@ use std::sync::Arc;
 use bevy::prelude::*;
 use pliant_body::{BodyState, Grab, GrabForce, GrabOf, ShownState};
 use pliant_modal::ModalModel;
-use pliant_stream::{BodyId, BodySetup, GrabKey, UserId};
+use pliant_stream::{BodyId, BodySetup, GrabKey, Pose, UserId};
 
 use super::{NetPeer, PeerState};
 use crate::felt::PatchPoint;
 use crate::phase::Phase;
-use crate::place::Place;
+use crate::place::{Place, set_pose};
 use crate::seen::{SeenHand, SeenHands};
 
 /// A body of the peers, and what is shown of it.
@@ -20,14 +20,21 @@ pub(super) struct PlayedBody {
     pub(super) setup: BodySetup,
     phase: Phase,
     tick: u64,
-    previous: Vec<f64>,
-    current: Vec<f64>,
+    previous: (Vec<f64>, Option<Pose>),
+    current: (Vec<f64>, Option<Pose>),
 }
 
 impl PlayedBody {
     pub(super) fn new(entity: Entity, model: Arc<ModalModel>, setup: BodySetup) -> Self {
-        let phase = Phase::default();
-        Self { entity, model, setup, phase, tick: 0, previous: Vec::new(), current: Vec::new() }
+        Self {
+            entity,
+            model,
+            setup,
+            phase: Phase::default(),
+            tick: 0,
+            previous: (Vec::new(), None),
+            current: (Vec::new(), None),
+        }
     }
 }
 
@@ -89,7 +96,7 @@ pub(crate) fn tell_hands(
 /// `PostUpdate`: the session is brought to now, and what it shows is written.
 pub(crate) fn show(
     net: Option<ResMut<NetPeer>>,
-    mut bodies: Query<(&BodyState, &mut ShownState, &mut SeenHands, &GlobalTransform)>,
+    mut bodies: Query<(&BodyState, &mut ShownState, &mut SeenHands, &mut Transform, &GlobalTransform)>,
     mut forces: Query<&mut GrabForce>,
 ) {
     let Some(mut net) = net else { return };
@@ -101,22 +108,27 @@ pub(crate) fn show(
     let step = std::time::Duration::from_nanos(net.scene.step_ns).as_secs_f64();
     for (&id, played) in &mut net.bodies {
         let Some(view) = session.body(id) else { continue };
-        let Ok((state, mut shown, mut seen, transform)) = bodies.get_mut(played.entity) else { continue };
-        if view.tick() != played.tick || played.current.len() != view.shown().modes() {
-            let first = played.current.len() != view.shown().modes();
+        let Ok((state, mut shown, mut seen, mut place, transform)) = bodies.get_mut(played.entity) else {
+            continue;
+        };
+        let first = played.current.0.len() != view.shown().modes();
+        if view.tick() != played.tick || first {
             played.tick = view.tick();
             std::mem::swap(&mut played.previous, &mut played.current);
-            played.current.clone_from(&view.shown().q);
+            played.current.0.clone_from(&view.shown().q);
+            played.current.1 = view.pose();
             if first {
                 played.previous.clone_from(&played.current);
             }
         }
         let fraction = played.phase.fraction(played.tick, step, now);
         net.scratch.clear();
-        net.scratch.extend(
-            played.previous.iter().zip(&played.current).map(|(from, to)| from + (to - from) * fraction),
-        );
+        let ends = played.previous.0.iter().zip(&played.current.0);
+        net.scratch.extend(ends.map(|(from, to)| from + (to - from) * fraction));
         net.scratch.resize(shown.q().len(), 0.0);
+        if let (Some(from), Some(to)) = (played.previous.1, played.current.1) {
+            set_pose(&mut place, &from, &to, fraction, state.scale());
+        }
         if net.scratch != shown.q()
             && let Err(error) = shown.snap(&net.scratch)
         {
@@ -137,7 +149,7 @@ pub(crate) fn show(
                 let point = said.point.as_ref()?.at(shown.q(), state.warps());
                 Some(GrabForce {
                     force: place.force_to_world(reaction),
-                    point: place.point_to_world(point.into()),
+                    point: place.body_point_to_world(played.current.1, point),
                 })
             });
             force.set_if_neq(felt.unwrap_or_default());

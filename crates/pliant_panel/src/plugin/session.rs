@@ -46,6 +46,7 @@ impl Session<'_, '_> {
                 (None, Some(guest)) => match guest.state() {
                     GuestState::Joining => "guest, joining".into(),
                     GuestState::In { .. } => "guest".into(),
+                    GuestState::Lost { reason } => format!("guest, waiting for the host: {reason}"),
                     GuestState::Closed { reason } => format!("not in the session: {reason}"),
                 },
                 (None, None) => String::new(),

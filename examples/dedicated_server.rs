@@ -1,0 +1,201 @@
+//! A server: no window, no renderer compiled, one body that whoever is invited may see and hold.
+//!
+//! What to learn here: a host is an app like any other, with the plugins that it needs and no more; tokens say who may do what; a kept key keeps the
+//! invite good when the server is started anew; Ctrl-C ends it in good order.
+//!
+//! ```sh
+//! cargo run --release -p pliant --no-default-features --features net --example dedicated_server -- --key server.key
+//! ```
+
+mod session;
+
+use std::error::Error;
+use std::net::SocketAddr;
+use std::path::PathBuf;
+use std::process::ExitCode;
+use std::time::Instant;
+
+use bevy::log::Level;
+use bevy::prelude::*;
+use clap::Parser;
+use pliant::net::transport::{Limits, RateCap};
+use pliant::net::{
+    Access, Grant, Holding, HostConfig, HostOptions, Invite, NetHost, NetPlugin, NetStats, SharedBody, Token, User,
+};
+use pliant::prelude::*;
+use pliant::stream::emulator::Preset;
+
+/// Serves one soft body.
+#[derive(Parser, Debug)]
+struct Options {
+    /// Where to listen. 0.0.0.0:4433 for others than this machine.
+    #[arg(long, default_value = "127.0.0.1:4433")]
+    bind: SocketAddr,
+
+    /// A file that keeps the server's key, made if it is not there: invites stay good from run to run.
+    #[arg(long)]
+    key: Option<PathBuf>,
+
+    /// Let in only who has a token; prints an invite to hold and one to watch.
+    #[arg(long)]
+    tokens: bool,
+
+    /// One user's hands at a time.
+    #[arg(long)]
+    one_at_a_time: bool,
+
+    /// Steps a second.
+    #[arg(long, default_value_t = 40.0, value_parser = rate)]
+    hz: f64,
+
+    /// The body: a file, or one of assets/.
+    #[arg(long, default_value = "pip.modal")]
+    body: PathBuf,
+
+    /// Keep only the first so many modes.
+    #[arg(long)]
+    modes: Option<usize>,
+
+    /// A hand of the server's own moves the body.
+    #[arg(long)]
+    play: bool,
+
+    /// Most guests at one time, all together and from one address.
+    #[arg(long, default_value_t = 256)]
+    guests: usize,
+
+    /// Most that is sent to a guest, Mbit/s.
+    #[arg(long, default_value_t = 8.0)]
+    rate: f64,
+
+    /// An emulated network under all connections: none, paper-1 to paper-4, lan, wifi and others.
+    #[arg(long, default_value = "none", value_parser = session::network)]
+    network: std::option::Option<Preset>,
+
+    /// End after so many seconds.
+    #[arg(long)]
+    seconds: Option<f64>,
+}
+
+fn rate(text: &str) -> Result<f64, String> {
+    match text.parse::<f64>() {
+        Ok(hz) if (1.0..=1000.0).contains(&hz) => Ok(hz),
+        _ => Err("expected 1 to 1000".into()),
+    }
+}
+
+fn main() -> ExitCode {
+    match run(&Options::parse()) {
+        Ok(()) => ExitCode::SUCCESS,
+        Err(error) => {
+            eprintln!("dedicated_server: {error}");
+            ExitCode::from(2)
+        }
+    }
+}
+
+fn run(options: &Options) -> Result<(), Box<dyn Error>> {
+    let model = session::model(&options.body)?;
+    let (hold, watch) = (Token::generate()?, Token::generate()?);
+    let access = match options.tokens {
+        true => Access::Tokens(vec![Grant::hold(hold), Grant::watch(watch)]),
+        false => Access::Anyone,
+    };
+    let limits = Limits {
+        peers: options.guests,
+        per_address: options.guests,
+        rate: RateCap::from_mbit_per_s(options.rate),
+        ..Limits::host()
+    };
+    let net = NetPlugin::host(HostConfig {
+        name: "server".into(),
+        transport: HostOptions {
+            bind: options.bind,
+            identity: session::identity(options.key.as_deref())?,
+            access,
+            limits,
+            emulation: session::emulation(options.network, 1),
+        },
+        session: pliant::stream::HostConfig { max_guests: options.guests, ..default() },
+        holding: if options.one_at_a_time { Holding::OneAtATime } else { Holding::Together },
+        ..default()
+    })?;
+    let invite = net.invite().cloned().ok_or("no invite")?;
+    println!("to hold:  {invite}");
+    if options.tokens {
+        println!("to watch: {}", Invite { token: Some(watch), ..invite });
+    }
+
+    let mut app = session::headless(Level::INFO);
+    app.add_plugins((PliantBodyPlugin::default(), net))
+        .insert_resource(Time::<Fixed>::from_hz(options.hz))
+        .insert_resource(session::EndAfter(options.seconds))
+        .init_resource::<Log>()
+        .add_systems(First, begin_frame)
+        .add_systems(FixedUpdate, session::play.before(PliantSystems::Input))
+        .add_systems(Last, (end_frame, session::end).chain());
+    let asset = app.world_mut().resource_mut::<Assets<ModalAsset>>().add(ModalAsset::from(model));
+    let body = ModalBody { modes: options.modes, ..ModalBody::new(asset) };
+    let body = app.world_mut().spawn((body, SharedBody::named(session::BODY))).id();
+    if options.play {
+        app.world_mut().entity_mut(body).insert(session::Script::of(0));
+    }
+    app.run();
+    Ok(())
+}
+
+/// How long frames with a tick in them take: everything that the server does for it but what runs on the network's thread.
+#[derive(Resource, Default)]
+struct Log {
+    began: Option<Instant>,
+    tick: u64,
+    /// ms, since the last line.
+    took: Vec<f64>,
+    said: Option<(Instant, f64, u64, u64)>,
+}
+
+fn begin_frame(mut log: ResMut<Log>) {
+    log.began = Some(Instant::now());
+}
+
+/// Every ten seconds a line of figures.
+fn end_frame(
+    mut log: ResMut<Log>,
+    tick: Res<PliantTick>,
+    host: Option<Res<NetHost>>,
+    stats: Res<NetStats>,
+    users: Query<&User>,
+) {
+    let now = Instant::now();
+    let Some(began) = log.began.take() else { return };
+    if tick.0 != log.tick {
+        log.tick = tick.0;
+        log.took.push((now - began).as_secs_f64() * 1e3);
+    }
+    let (processor, memory) = session::used().unwrap_or_default();
+    let bytes = stats.bytes_out;
+    let Some((since, processor_then, bytes_then, ticks_then)) = log.said else {
+        log.said = Some((now, processor, bytes, tick.0));
+        return;
+    };
+    let passed = (now - since).as_secs_f64();
+    if passed < 10.0 || host.is_none() {
+        return;
+    }
+    log.said = Some((now, processor, bytes, tick.0));
+    log.took.sort_by(f64::total_cmp);
+    let part = |share: f64| log.took.get((log.took.len() as f64 * share) as usize).copied().unwrap_or(0.0);
+    println!(
+        "{} users, {:.1} ticks/s, a tick {:.2} ms in the median, {:.2} at 99 %, {:.2} at most; processor {:.0} %, memory {memory:.0} MB, \
+         {:.1} Mbit/s out, {} let go",
+        users.iter().count().saturating_sub(1),
+        (tick.0 - ticks_then) as f64 / passed,
+        part(0.5),
+        part(0.99),
+        log.took.last().copied().unwrap_or(0.0),
+        100.0 * (processor - processor_then) / passed,
+        bytes.saturating_sub(bytes_then) as f64 * 8e-6 / passed,
+        stats.dropped.send_queue_full,
+    );
+    log.took.clear();
+}

@@ -1,0 +1,162 @@
+//! Hosts a session and plays in it: prints an invite, which `join` takes; you pull with the mouse, so do the guests.
+//!
+//! What to learn here: a body becomes everybody's by one component, [`SharedBody`]; the host's own grabs are ordinary ones; guests are entities.
+//!
+//! ```sh
+//! cargo run --release --example host
+//! cargo run --release --example host -- --bind 0.0.0.0:4433 --key host.key --tokens
+//! ```
+
+#[path = "../session/mod.rs"]
+mod session;
+#[path = "../stage/mod.rs"]
+mod stage;
+
+use std::error::Error;
+use std::net::SocketAddr;
+use std::path::PathBuf;
+
+use bevy::prelude::*;
+use clap::Parser;
+use pliant::net::{
+    Access, Grant, HandOf, Holding, HostConfig, HostOptions, Invite, NetPlugin, NetStats, SharedBody, Token, User,
+    UserLink, Yourself,
+};
+use pliant::prelude::*;
+use pliant::stream::emulator::Preset;
+
+/// Hosts a session and plays in it.
+#[derive(Parser, Debug)]
+struct Options {
+    #[command(flatten)]
+    stage: stage::Options,
+
+    /// Where to listen. 0.0.0.0:4433 for others than this machine; port 0 is any that is free.
+    #[arg(long, default_value = "127.0.0.1:0")]
+    bind: SocketAddr,
+
+    /// A file that keeps the host's key, made if it is not there: invites stay good from run to run.
+    #[arg(long)]
+    key: Option<PathBuf>,
+
+    /// Let in only who has a token; prints an invite to hold and one to watch.
+    #[arg(long)]
+    tokens: bool,
+
+    /// One user's hands at a time.
+    #[arg(long)]
+    one_at_a_time: bool,
+
+    /// An emulated network under all connections: none, paper-1 to paper-4, lan, wifi and others. N changes it while the session runs.
+    #[arg(long, default_value = "none", value_parser = session::network)]
+    network: std::option::Option<Preset>,
+}
+
+fn main() -> Result<(), Box<dyn Error>> {
+    let options = Options::parse();
+    let (hold, watch) = (Token::generate()?, Token::generate()?);
+    let net = NetPlugin::host(HostConfig {
+        name: "host".into(),
+        transport: HostOptions {
+            bind: options.bind,
+            identity: session::identity(options.key.as_deref())?,
+            access: match options.tokens {
+                true => Access::Tokens(vec![Grant::hold(hold), Grant::watch(watch)]),
+                false => Access::Anyone,
+            },
+            emulation: session::emulation(options.network, 1),
+            ..default()
+        },
+        holding: if options.one_at_a_time { Holding::OneAtATime } else { Holding::Together },
+        ..default()
+    })?;
+    let invite = net.invite().cloned().ok_or("no invite")?;
+    println!("to hold:  {invite}");
+    if options.tokens {
+        println!("to watch: {}", Invite { token: Some(watch), ..invite });
+    }
+    App::new()
+        .add_plugins(
+            stage::Stage::with("host", options.stage)
+                .real_time()
+                .key("left mouse: pull the body")
+                .key("N: another network"),
+        )
+        .add_plugins((PliantPlugins::default(), net))
+        .insert_resource(Time::<Fixed>::from_hz(40.0))
+        .insert_resource(Network(options.network))
+        .add_systems(Startup, setup)
+        .add_systems(FixedUpdate, session::play.before(PliantSystems::Input))
+        .add_systems(Update, (change_network, draw_hands, read_out))
+        .run();
+    Ok(())
+}
+
+fn setup(
+    mut commands: Commands,
+    assets: Res<AssetServer>,
+    mut materials: ResMut<Assets<StandardMaterial>>,
+    unattended: Option<Res<stage::Unattended>>,
+) {
+    let mut body = commands.spawn((
+        ModalBody::new(assets.load("pip.modal")),
+        SharedBody::named(session::BODY),
+        MeshMaterial3d(materials.add(Color::srgb(0.95, 0.50, 0.36))),
+    ));
+    if unattended.is_some() {
+        body.insert(session::Script::of(0));
+    }
+}
+
+#[derive(Resource)]
+struct Network(Option<Preset>);
+
+/// N goes through the networks, under the running session.
+fn change_network(
+    keys: Option<Res<ButtonInput<KeyCode>>>,
+    mut network: ResMut<Network>,
+    host: Option<Res<pliant::net::NetHost>>,
+) {
+    let (Some(keys), Some(host)) = (keys, host) else { return };
+    if keys.just_pressed(KeyCode::KeyN) {
+        let all = Preset::ALL;
+        let next = network.0.map_or(0, |now| all.iter().position(|one| *one == now).map_or(0, |at| at + 1));
+        network.0 = all.get(next).copied();
+        host.set_emulation(session::emulation(network.0, 1));
+    }
+}
+
+/// The guests' hands, each in its colour.
+fn draw_hands(hands: Query<(&Grab, &GrabForce, &HandOf)>, users: Query<&User>, mut gizmos: Gizmos) {
+    for (grab, felt, of) in &hands {
+        let Ok(user) = users.get(of.0) else { continue };
+        gizmos.sphere(grab.target.as_vec3(), 0.012, user.colour);
+        gizmos.line(grab.target.as_vec3(), felt.point.as_vec3(), user.colour);
+    }
+}
+
+fn read_out(
+    stats: Res<NetStats>,
+    network: Res<Network>,
+    users: Query<(&User, Option<&UserLink>), Without<Yourself>>,
+    mut readout: ResMut<stage::Readout>,
+) {
+    let mut lines = vec![format!(
+        "network {}, {:.0} kbit/s out",
+        network.0.map_or("as it is", Preset::name),
+        stats.bytes_out_per_s * 8e-3
+    )];
+    lines.extend(users.iter().map(|(user, link)| {
+        let link = link.copied().unwrap_or_default();
+        format!(
+            "{:12} {:6.1} ms {:5.1} % lost",
+            user.name,
+            link.round_trip.as_secs_f64() * 1e3,
+            link.loss_out.max(link.loss_in) * 100.0
+        )
+    }));
+    let text = lines.join("\n");
+    if readout.0 != text {
+        readout.0 = text;
+    }
+}

@@ -1,0 +1,185 @@
+//! Joins a session: `join pliant://…`, pasted from what a host has printed. In a window you pull with the mouse; `--headless` a hand moves by itself,
+//! `--bots 100` makes load, `--replay FILE` shows a session that `--record FILE` has kept.
+//!
+//! What to learn here: a guest needs one plugin and no scene of its own, the bodies arrive; the same app plays recordings; a host that goes and comes
+//! back is waited for.
+//!
+//! ```sh
+//! cargo run --release --example join -- "pliant://127.0.0.1:4433#…"
+//! cargo run --release --example join -- "pliant://…" --headless --network paper-1 --seconds 20
+//! ```
+
+mod bots;
+#[path = "../session/mod.rs"]
+mod session;
+#[cfg(feature = "window")]
+#[path = "../stage/mod.rs"]
+mod stage;
+#[cfg(feature = "window")]
+mod window;
+
+use std::error::Error;
+use std::path::PathBuf;
+use std::process::ExitCode;
+
+use bevy::log::Level;
+use bevy::prelude::*;
+use clap::Parser;
+use pliant::net::{
+    CameraInterest, Invite, JoinConfig, JoinOptions, NetPlugin, Recording, RemoteBody, SessionClosed, SessionJoined,
+    SessionLost,
+};
+use pliant::prelude::*;
+use pliant::stream::emulator::Preset;
+
+/// Joins a session.
+#[derive(Parser, Debug)]
+pub struct Options {
+    /// What the host has printed.
+    #[arg(required_unless_present = "replay")]
+    invite: Option<Invite>,
+
+    /// What you are called.
+    #[arg(long, default_value = "guest")]
+    name: String,
+
+    /// A file that keeps your key, made if it is not there: with it you are the same user tomorrow.
+    #[arg(long)]
+    key: Option<PathBuf>,
+
+    /// An emulated network under the connection: none, paper-1 to paper-4, lan, wifi and others.
+    #[arg(long, default_value = "none", value_parser = session::network)]
+    network: std::option::Option<Preset>,
+
+    /// Which packets the emulated network loses.
+    #[arg(long, default_value_t = 1)]
+    seed: u64,
+
+    /// Take at most so many modes of each body.
+    #[arg(long)]
+    modes: Option<u16>,
+
+    /// Have the shipped body's model at hand, so that it need not be sent.
+    #[arg(long)]
+    cached: bool,
+
+    /// Only look.
+    #[arg(long)]
+    still: bool,
+
+    /// Keep everything that comes in this file.
+    #[arg(long)]
+    record: Option<PathBuf>,
+
+    /// Show a session that was kept.
+    #[arg(long, conflicts_with = "record")]
+    replay: Option<PathBuf>,
+
+    /// No window: a hand moves by itself, a line a second says how it goes.
+    #[arg(long)]
+    headless: bool,
+
+    /// End after so many seconds.
+    #[arg(long)]
+    seconds: Option<f64>,
+
+    /// Save a picture of the window after four seconds and stop.
+    #[arg(long, value_name = "FILE.png")]
+    screenshot: Option<PathBuf>,
+
+    /// So many guests without an app, for load.
+    #[arg(long)]
+    bots: Option<usize>,
+
+    /// How many of the bots hold the body.
+    #[arg(long, default_value_t = 0)]
+    holders: usize,
+
+    /// The bots count what comes and step no body.
+    #[arg(long)]
+    light: bool,
+}
+
+fn main() -> ExitCode {
+    match run(&Options::parse()) {
+        Ok(()) => ExitCode::SUCCESS,
+        Err(error) => {
+            eprintln!("join: {error}");
+            ExitCode::from(2)
+        }
+    }
+}
+
+fn run(options: &Options) -> Result<(), Box<dyn Error>> {
+    let shipped = || session::model("pip.modal".as_ref());
+    let emulation = session::emulation(options.network, options.seed);
+    if let (Some(number), Some(invite)) = (options.bots, &options.invite) {
+        let (holders, light, seconds) = (options.holders, options.light, options.seconds.unwrap_or(10.0));
+        return bots::run(invite, &shipped()?, &bots::Bots { number, holders, light, seconds, emulation });
+    }
+    let config = JoinConfig {
+        name: options.name.clone(),
+        transport: JoinOptions { identity: session::identity(options.key.as_deref())?, emulation, ..default() },
+        modes: options.modes,
+        interest: Some(CameraInterest::default()).filter(|_| cfg!(feature = "window") && !options.headless),
+        models: if options.cached { vec![shipped()?] } else { Vec::new() },
+        record: options.record.clone(),
+        ..default()
+    };
+    let net = match (&options.replay, &options.invite) {
+        (Some(file), _) => NetPlugin::replay(Recording::open(file)?, config),
+        (None, Some(invite)) => NetPlugin::join(invite, config)?,
+        (None, None) => return Err("an invite is needed".into()),
+    };
+    #[cfg(feature = "window")]
+    if !options.headless {
+        return window::run(options, net);
+    }
+    let mut app = session::headless(Level::WARN);
+    app.add_plugins((PliantBodyPlugin::default(), net)).add_systems(Update, session::say);
+    finish(&mut app, options);
+    match app.run() {
+        AppExit::Success => Ok(()),
+        AppExit::Error(_) => Err("the session is over".into()),
+    }
+}
+
+/// What the app does with a window and without.
+fn finish(app: &mut App, options: &Options) {
+    app.insert_resource(session::EndAfter(options.seconds)).add_systems(Last, session::end).add_systems(Update, tell);
+    if options.headless && !options.still && options.replay.is_none() {
+        let number = options.seed;
+        let script = move |mut commands: Commands, bodies: Query<Entity, Added<RemoteBody>>| {
+            for body in &bodies {
+                commands.entity(body).insert(session::Script::of(number));
+            }
+        };
+        app.add_systems(Update, script).add_systems(FixedUpdate, session::play.before(PliantSystems::Input));
+    }
+}
+
+/// The course of the session, and the end of it.
+fn tell(
+    time: Res<Time<Real>>,
+    mut joined: MessageReader<SessionJoined>,
+    mut lost: MessageReader<SessionLost>,
+    mut closed: MessageReader<SessionClosed>,
+    mut exit: MessageWriter<AppExit>,
+    arrived: Query<&Name, Added<RemoteBody>>,
+    shown: Query<(), Added<ShownState>>,
+) {
+    let now = time.elapsed_secs_f64();
+    for joined in joined.read() {
+        println!("{now:6.2} s  in as user {}{}", joined.user.0, if joined.again { " again" } else { "" });
+    }
+    for lost in lost.read() {
+        println!("{now:6.2} s  the host cannot be heard: {}", lost.reason);
+    }
+    if !shown.is_empty() {
+        println!("{now:6.2} s  a body is here {}", arrived.iter().map(Name::as_str).collect::<Vec<_>>().join(", "));
+    }
+    for closed in closed.read() {
+        println!("{now:6.2} s  over: {}", closed.reason);
+        exit.write(AppExit::error());
+    }
+}

@@ -1,0 +1,64 @@
+//! The window of a guest: the bodies as they arrive, and everybody's hands.
+
+use std::error::Error;
+
+use bevy::prelude::*;
+use pliant::net::{NetPlugin, NetStats, RemoteBody, SeenHands, User, colour_of};
+use pliant::prelude::*;
+
+use crate::{Options, finish, stage};
+
+pub fn run(options: &Options, net: NetPlugin) -> Result<(), Box<dyn Error>> {
+    let stage = stage::Options {
+        headless: false,
+        frames: None,
+        seconds: options.seconds,
+        screenshot: options.screenshot.clone(),
+    };
+    let mut app = App::new();
+    app.add_plugins(
+        stage::Stage::with("join", stage).real_time().picture_at(4.0).key("left mouse: pull the body"),
+    )
+    .add_plugins((PliantPlugins::default(), net))
+    .insert_resource(bevy::winit::WinitSettings::continuous())
+    .add_systems(Update, (dress, draw_hands, read_out));
+    finish(&mut app, options);
+    match app.run() {
+        AppExit::Success => Ok(()),
+        AppExit::Error(_) => Err("the session is over".into()),
+    }
+}
+
+/// A body that has come is given a material.
+fn dress(
+    mut commands: Commands,
+    bodies: Query<Entity, Added<RemoteBody>>,
+    mut materials: ResMut<Assets<StandardMaterial>>,
+) {
+    for body in &bodies {
+        commands.entity(body).insert(MeshMaterial3d(materials.add(Color::srgb(0.95, 0.50, 0.36))));
+    }
+}
+
+/// The others' hands, each in its colour, and how hard they pull.
+fn draw_hands(bodies: Query<&SeenHands>, mut gizmos: Gizmos) {
+    for hand in bodies.iter().flat_map(|seen| &seen.0) {
+        let (at, colour) = (hand.target.as_vec3(), colour_of(hand.user));
+        gizmos.sphere(at, 0.012, colour);
+        gizmos.line(at, at + 0.02 * hand.reaction.as_vec3(), colour);
+    }
+}
+
+fn read_out(stats: Res<NetStats>, users: Query<&User>, mut readout: ResMut<stage::Readout>) {
+    let names: Vec<&str> = users.iter().map(|user| user.name.as_str()).collect();
+    let text = format!(
+        "round trip {:6.1} ms\nloss       {:6.1} %\nreceived   {:6.0} kbit/s\nhere: {}",
+        stats.round_trip.as_secs_f64() * 1e3,
+        stats.loss_in * 100.0,
+        stats.bytes_in_per_s * 8e-3,
+        names.join(", "),
+    );
+    if readout.0 != text {
+        readout.0 = text;
+    }
+}

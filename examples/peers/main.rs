@@ -1,0 +1,119 @@
+//! Equal peers: start it three times, the second and third with the invite that the first (or any other) has printed. Every process steps the body;
+//! only hands cross, and nobody is the host: whoever goes, the others play on.
+//!
+//! ```sh
+//! cargo run --release --example peers
+//! cargo run --release --example peers -- "pliant://127.0.0.1:50000#…" --network paper-2
+//! ```
+
+#[path = "../session/mod.rs"]
+mod session;
+#[path = "../stage/mod.rs"]
+mod stage;
+
+use std::error::Error;
+use std::net::SocketAddr;
+
+use bevy::prelude::*;
+use clap::Parser;
+use pliant::net::{
+    HostOptions, Invite, NetPlugin, PeerConfig, SeenHands, SharedBody, User, UserLink, colour_of,
+};
+use pliant::prelude::*;
+use pliant::stream::emulator::Preset;
+
+/// Plays among equals.
+#[derive(Parser, Debug)]
+struct Options {
+    #[command(flatten)]
+    stage: stage::Options,
+
+    /// The invite of a peer that is there; without one this is the first.
+    invite: Option<Invite>,
+
+    /// What you are called.
+    #[arg(long, default_value = "peer")]
+    name: String,
+
+    /// Where to listen.
+    #[arg(long, default_value = "127.0.0.1:0")]
+    bind: SocketAddr,
+
+    /// An emulated network under all connections of this peer: none, paper-1 to paper-4, lan, wifi and others.
+    #[arg(long, default_value = "none", value_parser = session::network)]
+    network: std::option::Option<Preset>,
+}
+
+fn main() -> Result<(), Box<dyn Error>> {
+    let options = Options::parse();
+    let number = options.name.bytes().map(u64::from).sum::<u64>();
+    let net = NetPlugin::peer(PeerConfig {
+        name: options.name,
+        join: options.invite,
+        transport: HostOptions {
+            bind: options.bind,
+            emulation: session::emulation(options.network, number),
+            ..default()
+        },
+        ..default()
+    })?;
+    println!("{}", net.invite().ok_or("no invite")?);
+    App::new()
+        .add_plugins(stage::Stage::with("peers", options.stage).real_time().key("left mouse: pull the body"))
+        .add_plugins((PliantPlugins::default(), net))
+        .insert_resource(Time::<Fixed>::from_hz(40.0))
+        .insert_resource(Number(number))
+        .add_systems(Startup, setup)
+        .add_systems(FixedUpdate, session::play.before(PliantSystems::Input))
+        .add_systems(Update, (draw_hands, read_out))
+        .run();
+    Ok(())
+}
+
+#[derive(Resource)]
+struct Number(u64);
+
+fn setup(
+    mut commands: Commands,
+    assets: Res<AssetServer>,
+    mut materials: ResMut<Assets<StandardMaterial>>,
+    unattended: Option<Res<stage::Unattended>>,
+    number: Res<Number>,
+) {
+    let mut body = commands.spawn((
+        ModalBody::new(assets.load("pip.modal")),
+        SharedBody::named(session::BODY),
+        MeshMaterial3d(materials.add(Color::srgb(0.95, 0.50, 0.36))),
+    ));
+    if unattended.is_some() {
+        body.insert(session::Script::of(number.0));
+    }
+}
+
+fn draw_hands(bodies: Query<&SeenHands>, mut gizmos: Gizmos) {
+    for hand in bodies.iter().flat_map(|seen| &seen.0) {
+        let (at, colour) = (hand.target.as_vec3(), colour_of(hand.user));
+        gizmos.sphere(at, 0.012, colour);
+        gizmos.line(at, at + 0.02 * hand.reaction.as_vec3(), colour);
+    }
+}
+
+fn read_out(
+    net: Option<Res<pliant::net::NetPeer>>,
+    users: Query<(&User, &UserLink)>,
+    mut readout: ResMut<stage::Readout>,
+) {
+    let Some(net) = net else { return };
+    let mut lines: Vec<String> = users
+        .iter()
+        .map(|(user, link)| format!("{:12} {:6.1} ms", user.name, link.round_trip.as_secs_f64() * 1e3))
+        .collect();
+    if let Some(session) = net.session() {
+        let behind = session.tick().saturating_sub(session.confirmed());
+        lines.push(format!("tick {}, {behind} of them still to be confirmed", session.tick()));
+    }
+    let text = lines.join("\n");
+    if readout.0 != text {
+        readout.0 = text;
+    }
+}

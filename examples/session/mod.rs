@@ -1,0 +1,187 @@
+//! What the networked examples share: the body, a network by its name, a kept key, a hand that moves by itself, an app without a window.
+#![allow(dead_code, reason = "each example uses the part that it needs")]
+
+use std::error::Error;
+use std::path::{Path, PathBuf};
+use std::sync::Arc;
+use std::time::Duration;
+
+use bevy::app::{ScheduleRunnerPlugin, TerminalCtrlCHandlerPlugin};
+use bevy::log::{Level, LogPlugin};
+use bevy::math::DVec3;
+use bevy::prelude::*;
+use pliant::modal::ModalModel;
+use pliant::net::{Emulation, Identity, NetStats, User};
+use pliant::prelude::*;
+use pliant::stream::emulator::Preset;
+
+/// The project's assets, from the crate that owns the examples.
+pub const ASSETS: &str = concat!(env!("CARGO_MANIFEST_DIR"), "/../../assets");
+
+/// The body's name in the session.
+pub const BODY: &str = "pip";
+
+/// An emulated network by its name; `none` for the real one as it is.
+pub fn network(name: &str) -> Result<Option<Preset>, String> {
+    if name == "none" {
+        return Ok(None);
+    }
+    let names = || Preset::ALL.map(Preset::name).join(", ");
+    Preset::by_name(name).map(Some).ok_or_else(|| format!("expected none, {}", names()))
+}
+
+/// The same as a link under a session; the seed says which packets it loses.
+pub fn emulation(network: Option<Preset>, seed: u64) -> Option<Emulation> {
+    network.map(|preset| Emulation::preset(preset, seed))
+}
+
+/// The key of a file, which is made if it is not there: with it one is the same user, or the same host, tomorrow.
+pub fn identity(file: Option<&Path>) -> Result<Option<Identity>, Box<dyn Error>> {
+    let Some(file) = file else { return Ok(None) };
+    if file.exists() {
+        return Ok(Some(Identity::from_pkcs8(&std::fs::read(file)?)?));
+    }
+    let made = Identity::generate()?;
+    std::fs::write(file, made.to_pkcs8())?;
+    #[cfg(unix)]
+    {
+        use std::os::unix::fs::PermissionsExt;
+        std::fs::set_permissions(file, std::fs::Permissions::from_mode(0o600))?;
+    }
+    Ok(Some(made))
+}
+
+/// A body of the project, or of a file.
+pub fn model(file: &Path) -> Result<Arc<ModalModel>, Box<dyn Error>> {
+    let path = if file.exists() { PathBuf::from(file) } else { Path::new(ASSETS).join(file) };
+    Ok(Arc::new(ModalModel::read(path)?))
+}
+
+/// An app without a window or a renderer, that ends in good order on Ctrl-C.
+pub fn headless(level: Level) -> App {
+    let mut app = App::new();
+    app.add_plugins((
+        MinimalPlugins.set(ScheduleRunnerPlugin::run_loop(Duration::from_millis(2))),
+        LogPlugin { level, ..default() },
+        TerminalCtrlCHandlerPlugin,
+        AssetPlugin { file_path: ASSETS.into(), ..default() },
+        TransformPlugin,
+    ));
+    app
+}
+
+/// A hand that takes hold of the farthest point of a body in some direction and moves it about.
+#[derive(Component, Debug, Clone, Copy)]
+pub struct Script {
+    /// Which point: the one farthest this way, body axes.
+    pub toward: DVec3,
+    /// Where it pulls, as parts of the body's size.
+    pub pull: DVec3,
+    /// Radians a second.
+    pub rate: f64,
+}
+
+impl Script {
+    /// A hand of one's own by one's number: each pulls elsewhere and otherwise.
+    pub fn of(number: u64) -> Self {
+        let angle = 2.4 * number as f64;
+        let side = if number.is_multiple_of(2) { 1.0 } else { -1.0 };
+        Self {
+            toward: DVec3::new(side, 0.55, 0.1 * angle.sin()),
+            pull: DVec3::new(0.12 * side, 0.05 * angle.cos(), 0.10 * angle.sin()),
+            rate: 1.7 + 0.3 * (number % 5) as f64,
+        }
+    }
+}
+
+/// The grab that a script has made, and where its patch is at rest.
+#[derive(Component, Debug, Clone, Copy)]
+pub struct Scripted {
+    script: Script,
+    at_rest: DVec3,
+    began: f64,
+}
+
+/// Plays every [`Script`] on the body that it is on. In `FixedUpdate`, before [`PliantSystems::Input`].
+pub fn play(
+    mut commands: Commands,
+    time: Res<Time>,
+    bodies: Query<(Entity, &Script, &BodyState, &GlobalTransform)>,
+    mut grabs: Query<(&mut Grab, &GrabOf, &Scripted)>,
+) {
+    let now = time.elapsed_secs_f64();
+    for (body, script, state, place) in &bodies {
+        let mut own = grabs.iter_mut().filter(|(_, of, _)| of.0 == body);
+        if let Some((mut grab, _, scripted)) = own.next() {
+            let t = now - scripted.began;
+            // Slowly to where it pulls, and about there on a path that does not repeat soon.
+            let rise = 1.0 - (-t / 0.6).exp();
+            let wave = |part: f64| 0.4 * ((script.rate * part * t).sin());
+            let about = DVec3::new(wave(1.0), wave(1.37), wave(0.81)) * script.pull.length();
+            grab.target = scripted.at_rest + state.model().size() * rise * (script.pull + about);
+        } else {
+            let surface = state.model().surface();
+            let along = |p: &[f32; 3]| Vec3::from_array(*p).as_dvec3().dot(script.toward);
+            let positions = surface.positions();
+            let far = (0..positions.len()).max_by(|&a, &b| along(&positions[a]).total_cmp(&along(&positions[b])));
+            let Some(vertex) = far else { continue };
+            let at = place.transform_point(Vec3::from(positions[vertex])).as_dvec3();
+            commands.spawn((
+                Grab::new(vertex as u32, 0.06 * state.model().size(), at),
+                GrabOf(body),
+                Scripted { script: *script, at_rest: at, began: now },
+            ));
+        }
+    }
+}
+
+/// Once a second a line of what the network does, where nobody sees a window.
+pub fn say(
+    time: Res<Time<Real>>,
+    stats: Res<NetStats>,
+    users: Query<&User>,
+    forces: Query<&GrabForce, With<Grab>>,
+    mut last: Local<f64>,
+) {
+    let now = time.elapsed_secs_f64();
+    if now < *last + 1.0 {
+        return;
+    }
+    *last = now;
+    let force = forces.iter().map(|felt| felt.force.length()).fold(0.0, f64::max);
+    println!(
+        "{now:6.1} s  {} users  round trip {:5.1} ms  loss {:4.1} % in {:4.1} % out  {:6.0} kbit/s in {:6.0} out  \
+         guessed {} put right {}  reaction {force:.2} N",
+        users.iter().count(),
+        stats.round_trip.as_secs_f64() * 1e3,
+        stats.loss_in * 100.0,
+        stats.loss_out * 100.0,
+        stats.bytes_in_per_s * 8e-3,
+        stats.bytes_out_per_s * 8e-3,
+        stats.guessed,
+        stats.recovered,
+    );
+}
+
+/// Ends the app after so many seconds, if a number is given.
+#[derive(Resource, Clone, Copy, Debug)]
+pub struct EndAfter(pub Option<f64>);
+
+/// Ends the app when its time is over.
+pub fn end(time: Res<Time<Real>>, after: Res<EndAfter>, mut exit: MessageWriter<AppExit>) {
+    if after.0.is_some_and(|after| time.elapsed_secs_f64() >= after) {
+        exit.write(AppExit::Success);
+    }
+}
+
+/// Processor time and memory of this process: s, MB; where the system tells.
+pub fn used() -> Option<(f64, f64)> {
+    let stat = std::fs::read_to_string("/proc/self/stat").ok()?;
+    // Behind the name in brackets, fields 14 and 15 are the ticks in user and system mode, a hundredth of a second each.
+    let fields: Vec<&str> = stat.rsplit_once(')')?.1.split_whitespace().collect();
+    let ticks = |at: usize| fields.get(at)?.parse::<f64>().ok();
+    let status = std::fs::read_to_string("/proc/self/status").ok()?;
+    let resident = status.lines().find_map(|line| line.strip_prefix("VmRSS:"))?;
+    let kilobytes: f64 = resident.trim().trim_end_matches("kB").trim().parse().ok()?;
+    Some(((ticks(11)? + ticks(12)?) / 100.0, kilobytes / 1e3))
+}
