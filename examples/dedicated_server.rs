@@ -20,7 +20,8 @@ use bevy::prelude::*;
 use clap::Parser;
 use pliant::net::transport::{Limits, RateCap};
 use pliant::net::{
-    Access, Grant, Holding, HostConfig, HostOptions, Invite, NetHost, NetPlugin, NetStats, SharedBody, Token, User,
+    Access, Grant, Holding, HostConfig, HostOptions, Invite, NetHost, NetPlugin, NetStats, SharedBody, Token,
+    User,
 };
 use pliant::prelude::*;
 use pliant::stream::emulator::Preset;

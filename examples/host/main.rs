@@ -19,8 +19,8 @@ use std::path::PathBuf;
 use bevy::prelude::*;
 use clap::Parser;
 use pliant::net::{
-    Access, Grant, HandOf, Holding, HostConfig, HostOptions, Invite, NetPlugin, NetStats, SharedBody, Token, User,
-    UserLink, Yourself,
+    Access, Grant, HandOf, Holding, HostConfig, HostOptions, Invite, NetPlugin, NetStats, SharedBody, Token,
+    User, UserLink, Yourself,
 };
 use pliant::prelude::*;
 use pliant::stream::emulator::Preset;

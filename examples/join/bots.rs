@@ -89,16 +89,19 @@ fn say(all: &[Bot], start: Instant) {
         .filter_map(|bot| Some(bot.ticks.last()? - bot.ticks.first()? + 1 - bot.ticks.len() as u64))
         .sum();
     let heard: usize = all.iter().map(|bot| bot.ticks.len()).sum();
-    let (guessed, repaired) = all.iter().filter_map(|bot| bot.session.as_ref()).fold((0, 0), |sum, session| {
-        session.bodies().fold(sum, |(g, r), view| (g + view.counts().guessed, r + view.counts().repaired))
-    });
+    let (guessed, repaired) =
+        all.iter().filter_map(|bot| bot.session.as_ref()).fold((0, 0), |sum, session| {
+            session.bodies().fold(sum, |(g, r), view| (g + view.counts().guessed, r + view.counts().repaired))
+        });
     println!(
         "{:5.1} s  {} bots in, joined in {median:.2} s in the median and {:.2} at most; {heard} ticks heard, {missing} missing, {:.1} kbit/s each, \
          guessed {guessed} put right {repaired}",
         start.elapsed().as_secs_f64(),
         joins.len(),
         joins.last().copied().unwrap_or(0.0),
-        all.iter().map(|bot| bot.bytes).sum::<u64>() as f64 * 8e-3 / all.len().max(1) as f64 / start.elapsed().as_secs_f64(),
+        all.iter().map(|bot| bot.bytes).sum::<u64>() as f64 * 8e-3
+            / all.len().max(1) as f64
+            / start.elapsed().as_secs_f64(),
     );
 }
 
@@ -109,8 +112,11 @@ impl Bot {
             match event {
                 Event::Connected { .. } => {
                     let most = self.endpoint.max_datagram_size(PeerId::HOST).unwrap_or(0);
-                    let config =
-                        GuestConfig { name: "bot".into(), recovery: RecoveryConfig::default(), ..Default::default() };
+                    let config = GuestConfig {
+                        name: "bot".into(),
+                        recovery: RecoveryConfig::default(),
+                        ..Default::default()
+                    };
                     let Ok(mut session) = GuestSession::new(config, most) else { return };
                     session.add_cached_model(model.clone());
                     session.connect(now).ok();
@@ -134,7 +140,8 @@ impl Bot {
                 }
                 Event::Message { bytes, .. } => {
                     self.bytes += bytes.len() as u64;
-                    if let (Some((&SESSION, bytes)), Some(session)) = (bytes.split_first(), &mut self.session) {
+                    if let (Some((&SESSION, bytes)), Some(session)) = (bytes.split_first(), &mut self.session)
+                    {
                         session.on_message(now, bytes);
                     }
                 }
@@ -152,7 +159,8 @@ impl Bot {
                 let holds = session.user().is_some_and(|user| usize::from(user.0) <= bots.holders);
                 if holds && !bots.light {
                     let positions = model.surface().positions();
-                    let vertex = (positions.len() / (bots.holders + 1)) as u32 * u32::from(session.user().map_or(1, |u| u.0));
+                    let vertex = (positions.len() / (bots.holders + 1)) as u32
+                        * u32::from(session.user().map_or(1, |u| u.0));
                     let at = positions.get(vertex as usize).map_or([0.0; 3], |p| p.map(f64::from));
                     self.grab = session
                         .begin_grab(now, body, vertex, 0.06 * model.size(), at, Default::default())
@@ -171,7 +179,8 @@ impl Bot {
                     self.endpoint.send_datagram(PeerId::HOST, Bytes::from_owner(output.bytes)).ok();
                 }
                 Channel::Message => {
-                    let message: Bytes = std::iter::once(SESSION).chain(output.bytes.iter().copied()).collect();
+                    let message: Bytes =
+                        std::iter::once(SESSION).chain(output.bytes.iter().copied()).collect();
                     self.endpoint.send_message(PeerId::HOST, message).ok();
                 }
             }

@@ -26,8 +26,8 @@ use bevy::log::Level;
 use bevy::prelude::*;
 use clap::Parser;
 use pliant::net::{
-    CameraInterest, Invite, JoinConfig, JoinOptions, NetPlugin, Recording, RemoteBody, SessionClosed, SessionJoined,
-    SessionLost,
+    CameraInterest, Invite, JoinConfig, JoinOptions, NetPlugin, Recording, RemoteBody, SessionClosed,
+    SessionJoined, SessionLost,
 };
 use pliant::prelude::*;
 use pliant::stream::emulator::Preset;
@@ -119,7 +119,11 @@ fn run(options: &Options) -> Result<(), Box<dyn Error>> {
     }
     let config = JoinConfig {
         name: options.name.clone(),
-        transport: JoinOptions { identity: session::identity(options.key.as_deref())?, emulation, ..default() },
+        transport: JoinOptions {
+            identity: session::identity(options.key.as_deref())?,
+            emulation,
+            ..default()
+        },
         modes: options.modes,
         interest: Some(CameraInterest::default()).filter(|_| cfg!(feature = "window") && !options.headless),
         models: if options.cached { vec![shipped()?] } else { Vec::new() },
@@ -146,7 +150,9 @@ fn run(options: &Options) -> Result<(), Box<dyn Error>> {
 
 /// What the app does with a window and without.
 fn finish(app: &mut App, options: &Options) {
-    app.insert_resource(session::EndAfter(options.seconds)).add_systems(Last, session::end).add_systems(Update, tell);
+    app.insert_resource(session::EndAfter(options.seconds))
+        .add_systems(Last, session::end)
+        .add_systems(Update, tell);
     if options.headless && !options.still && options.replay.is_none() {
         let number = options.seed;
         let script = move |mut commands: Commands, bodies: Query<Entity, Added<RemoteBody>>| {
@@ -176,7 +182,10 @@ fn tell(
         println!("{now:6.2} s  the host cannot be heard: {}", lost.reason);
     }
     if !shown.is_empty() {
-        println!("{now:6.2} s  a body is here {}", arrived.iter().map(Name::as_str).collect::<Vec<_>>().join(", "));
+        println!(
+            "{now:6.2} s  a body is here {}",
+            arrived.iter().map(Name::as_str).collect::<Vec<_>>().join(", ")
+        );
     }
     for closed in closed.read() {
         println!("{now:6.2} s  over: {}", closed.reason);

@@ -123,7 +123,8 @@ pub fn play(
             let surface = state.model().surface();
             let along = |p: &[f32; 3]| Vec3::from_array(*p).as_dvec3().dot(script.toward);
             let positions = surface.positions();
-            let far = (0..positions.len()).max_by(|&a, &b| along(&positions[a]).total_cmp(&along(&positions[b])));
+            let far =
+                (0..positions.len()).max_by(|&a, &b| along(&positions[a]).total_cmp(&along(&positions[b])));
             let Some(vertex) = far else { continue };
             let at = place.transform_point(Vec3::from(positions[vertex])).as_dvec3();
             commands.spawn((

@@ -70,8 +70,16 @@ impl Room {
         let q: Vec<f64> = (0..self.modes).map(|k| 0.1 * (rate(k) * t).sin()).collect();
         let v: Vec<f64> = (0..self.modes).map(|k| 0.1 * rate(k) * (rate(k) * t).cos()).collect();
         let a: Vec<f64> = (0..self.modes).map(|k| -0.1 * rate(k).powi(2) * (rate(k) * t).sin()).collect();
-        let state =
-            TickState { tick: self.tick, q: &q, v: &v, a: &a, pose: None, grabs: &[], resting: false };
+        let state = TickState {
+            tick: self.tick,
+            q: &q,
+            v: &v,
+            a: &a,
+            z: &[],
+            pose: None,
+            grabs: &[],
+            resting: false,
+        };
         self.host.publish(self.now, BODY, &state).unwrap();
         self.host.update(self.now);
         self.exchange();

@@ -124,6 +124,7 @@ impl NetHost {
             damping_scale: config.damping_scale,
             // An anchored body's weight turns with its entity: the stream learns it.
             gravity: if state.model().is_free() { config.gravity } else { [0.0; 3] },
+            relaxation: config.relaxation,
         };
         let model = state.model();
         if let Some(hosted) = self.bodies.get_mut(&entity) {

@@ -261,6 +261,7 @@ impl NetPeer {
                 warp: config.warp,
                 damping_scale: config.damping_scale,
                 gravity: config.gravity,
+                relaxation: config.relaxation,
             };
             let id = number_of(&name.name);
             if found.contains_key(&id) || found.len() >= message::MOST_BODIES {
