@@ -58,6 +58,8 @@ pub struct Encoded {
     pub first: Arc<[u8]>,
     /// The other parts.
     pub more: Vec<Arc<[u8]>>,
+    /// A hand took hold or let go at this tick: no forecast has that, so it is worth saying more than once.
+    pub news: bool,
 }
 
 impl Encoded {
@@ -281,12 +283,15 @@ impl Encoder {
         if check {
             frame.check = Some(checksum(state.tick, &self.mirror) as f32);
         }
+        let held = || frame.grabs.iter().filter(|g| g.held).map(|g| g.state.key);
+        let held = held().chain(parts.iter().flat_map(|p| p.grabs.iter().map(|g| g.state.key)));
+        let news = self.sent.back().is_some_and(|last| !held.eq(last.grabs().map(|g| g.state.key)));
         let first = write(&frame);
         let more = parts.iter().map(write).collect();
         self.keep(frame, parts);
         self.last = state.tick;
         self.frames += 1;
-        Encoded { first, more }
+        Encoded { first, more, news }
     }
 
     /// What one step may move the surface by, m: a share of how far the body is bent or will be, falling slowly.

@@ -237,6 +237,27 @@ fn all_policies_side_by_side() {
     }
 }
 
+/// The tick at which a hand lets go or takes hold is lost, with its neighbours: no forecast has it, so it is said often.
+#[test]
+fn a_lost_release_or_grab_makes_no_spike() {
+    for (what, holds) in [("release", (0.0, 8.0)), ("grab", (8.0, 1e9))] {
+        for (count, bar) in [(1, 0.5), (2, 2.0), (3, 2.0)] {
+            let (mut worst, mut at) = (0.0_f64, 0);
+            // Which datagram tells of it is tried out: those around the moment, one after the other.
+            for first in 164..=184 {
+                let link = paper1(Loss::Listed((first..first + count).collect()));
+                let mut e = Experiment::new(body(), link, RecoveryConfig::default());
+                e.seconds = 6.0;
+                e.hands[1].holds = Some(holds);
+                let f = e.run().unwrap();
+                (worst, at) = if f.max_percent > worst { (f.max_percent, first) } else { (worst, at) };
+            }
+            println!("{what}, {count} datagrams lost: at worst {worst:.2} %, from datagram {at}");
+            assert!(worst < bar, "{what}, {count} lost from {at}: {worst} %");
+        }
+    }
+}
+
 /// What one body costs a tick at 120 modes and two hands: the host's encoder, and a guest's reading, correcting and
 /// stepping. Run with `--release`.
 #[test]

@@ -46,7 +46,7 @@ pub struct RepairCounts {
     pub guessed: u64,
     /// Guessed ticks whose data came later and was used.
     pub repaired: u64,
-    /// Data that came too late.
+    /// Guessed ticks whose data came too late to be used.
     pub too_late: u64,
     /// States taken over from a snapshot.
     pub snapshots: u64,
@@ -72,6 +72,9 @@ pub struct Receiver {
     pose_blend: PoseBlend,
     free: bool,
     counts: RepairCounts,
+    /// The newest tick that is in the counts, and those on a guess that nothing has come for yet.
+    counted: Tick,
+    guessed: Vec<Tick>,
     mismatched: u32,
     before: ModalState,
     forecast: Forecast,
@@ -140,6 +143,8 @@ impl Receiver {
             pose_blend: PoseBlend::new(newmark.h, blend_ticks),
             free: model.is_free(),
             counts: RepairCounts::default(),
+            counted: snapshot.tick,
+            guessed: vec![0; HISTORY],
             mismatched: 0,
             before: rest,
             forecast: Forecast::new(newmark.h),
@@ -241,10 +246,11 @@ impl Receiver {
                 // Re-stepping from the earliest tick takes all later ones with it.
                 let done = if whole && t != earliest { true } else { self.policy.correct(t, &self.history) };
                 // A tick whose repeat was there in time is bettered by its own frame, not repaired.
-                if done {
-                    arrival.repaired += u32::from(first);
-                } else {
-                    arrival.too_late += 1;
+                let guessed = &mut self.guessed[(t % HISTORY as u64) as usize];
+                if first && *guessed == t {
+                    *guessed = 0;
+                    arrival.repaired += u32::from(done);
+                    arrival.too_late += u32::from(!done);
                 }
             }
             if late.iter().any(|(t, _)| *t == tick) {
@@ -262,11 +268,16 @@ impl Receiver {
         self.correct_pose();
         let tick = self.tick + 1;
         self.tick = tick;
-        self.counts.stepped += 1;
-        if self.history.known(tick).is_some() {
-            self.counts.in_time += 1;
-        } else {
-            self.counts.guessed += 1;
+        // A tick that is gone through again, after a snapshot of the past, has been counted.
+        if tick > self.counted {
+            self.counted = tick;
+            self.counts.stepped += 1;
+            if self.history.known(tick).is_some() {
+                self.counts.in_time += 1;
+            } else {
+                self.counts.guessed += 1;
+                self.guessed[(tick % HISTORY as u64) as usize] = tick;
+            }
         }
         self.policy.advance(tick, &self.history);
         self.blend.advance();
@@ -305,6 +316,7 @@ impl Receiver {
         let distance = self.tick.abs_diff(snapshot.tick);
         if snapshot.tick >= self.tick || distance >= HISTORY as u64 {
             self.tick = snapshot.tick;
+            self.counted = self.counted.max(snapshot.tick);
         } else {
             for tick in snapshot.tick + 1..=self.tick {
                 self.policy.advance(tick, &self.history);

@@ -315,7 +315,9 @@ impl HostSession {
                 p.stats.nacks += 1;
                 for run in nack.runs {
                     for tick in run.first..run.first + u64::from(run.count) {
-                        if p.flowing.contains(&nack.body) && p.nack_budget.spend(now, 1.0) {
+                        // What is on its way anyway needs no second answer.
+                        let waits = p.resends.iter().any(|r| r.1 == nack.body && r.2 == tick);
+                        if !waits && p.flowing.contains(&nack.body) && p.nack_budget.spend(now, 1.0) {
                             p.queue_resend(now + self.config.resend_after, nack.body, tick);
                         }
                     }

@@ -177,10 +177,12 @@ impl Peer {
         self.send_message(&HostMessage::Goodbye { reason }, out);
     }
 
-    /// Queues a resend, unless it waits already.
+    /// Queues a resend, unless it waits already, in the order in which they are due.
     pub(crate) fn queue_resend(&mut self, due: Duration, body: BodyId, tick: Tick) {
-        if self.resends.len() < MAX_RESENDS && !self.resends.iter().any(|r| r.1 == body && r.2 == tick) {
-            self.resends.push_back((due, body, tick));
+        let entry = (due, body, tick);
+        if self.resends.len() < MAX_RESENDS && !self.resends.contains(&entry) {
+            let at = self.resends.partition_point(|r| r.0 <= due);
+            self.resends.insert(at, entry);
         }
     }
 }

@@ -13,6 +13,10 @@ use crate::wire::WIDE_LIMIT;
 /// A resting body is recalled to its guests this often.
 const REMINDER: Duration = Duration::from_secs(1);
 
+/// A tick at which a hand takes hold or lets go is said again after these shares of a step: it cannot be forecast, and its
+/// repeat comes with the next tick only.
+const NEWS_AGAIN: [f64; 2] = [0.3, 0.65];
+
 /// What goes out to all takers of one kind of stream.
 struct Outgoing {
     /// The frame; none where a snapshot takes its place.
@@ -103,6 +107,12 @@ impl HostSession {
             {
                 // The path shrank since the key was taken; the next tick has the new size.
                 p.due.insert(body);
+            }
+            if frame.as_ref().is_some_and(|f| f.news) {
+                for share in NEWS_AGAIN {
+                    let due = now + Duration::from_secs_f64(share * self.config.newmark.h);
+                    p.queue_resend(due, body, state.tick);
+                }
             }
             if due || *fresh || (stays && p.flowing.contains(&body)) {
                 p.due.remove(&body);
