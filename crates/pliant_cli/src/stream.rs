@@ -8,7 +8,7 @@ use std::{
 };
 
 use clap::{Args, ValueEnum};
-use pliant_modal::{Integrator, ModalModel};
+use pliant_modal::{Integrator, ModalModel, Relaxation};
 use pliant_stream::{
     Policy, RecoveryConfig,
     emulator::{LinkConfig, Loss, Preset},
@@ -48,12 +48,25 @@ pub(crate) struct StreamArgs {
     /// Of everything that is left to chance
     #[arg(long, default_value_t = 1)]
     seed: u64,
+    /// A material that relaxes: the share of the stiffness that goes, and in what time, s: 0.5:0.4
+    #[arg(long, value_name = "RATIO:TIME", value_parser = relaxation)]
+    relax: Option<Relaxation>,
     /// Who steps: the host only, or every peer
     #[arg(long, value_enum, default_value_t = Topology::Cs)]
     topology: Topology,
     /// Prints one line of JSON
     #[arg(long)]
     json: bool,
+}
+
+/// `0.5:0.4` as a material.
+fn relaxation(words: &str) -> Result<Relaxation, String> {
+    let expected = "expected RATIO:TIME, such as 0.5:0.4";
+    let (ratio, time) = words.split_once(':').ok_or(expected)?;
+    let number = |word: &str| word.trim().parse::<f64>().map_err(|_| expected.to_owned());
+    let made = Relaxation { ratio: number(ratio)?, time: number(time)? };
+    made.check().map_err(|e| e.to_string())?;
+    Ok(made)
 }
 
 /// Who steps the body.
@@ -68,6 +81,8 @@ enum Topology {
 /// The figures of one run.
 #[derive(Serialize, Debug)]
 struct Told {
+    /// Its name stands in the table; who asks for JSON has named it.
+    #[serde(skip)]
     recovery: String,
     ticks: u64,
     lost: u64,
@@ -199,6 +214,7 @@ fn experiment(
         seed: args.seed,
         integrator,
         resend_after: step * args.resend_after,
+        relaxation: args.relax,
         cpu_clock: Some(clock),
         ..Experiment::new(model.clone(), link, recovery)
     }

@@ -413,6 +413,27 @@ fn a_stream_is_measured_and_the_same_seed_gives_the_same_figures() {
     // Without repair an acceleration stream never forgets an error.
     assert!(number(&run("none", "7"), "rms_percent") > 100.0 * number(&default, "rms_percent"));
 
+    let keys: Vec<&String> = default.as_object().unwrap().keys().collect();
+    let promised = "ticks lost recovered rms_percent max_percent end_percent force_rms_percent force_ringing \
+        hand_to_force_ms shown_delay_ms recover_ms bytes_per_frame kbit_s cpu_us_per_tick hash";
+    let mut promised: Vec<&str> = promised.split_whitespace().collect();
+    promised.sort_unstable();
+    assert_eq!(keys, promised);
+
+    // A relaxing material, the paper's resending, equal peers.
+    let more = |words: &str| {
+        let mut all = vec!["stream", "--model", &model, "--seconds", "18", "--json"];
+        all.extend(words.split_whitespace());
+        json(&succeeds(&all))
+    };
+    assert!(number(&more("--relax 0.5:0.4"), "rms_percent") < 0.5);
+    let paper = more("--loss random:22@135 --resend-after 50 --recovery paper-hold");
+    assert_eq!((number(&paper, "lost"), number(&paper, "ticks") > 300.0), (22.0, true), "{paper}");
+    for repair in ["rollback", "compensate"] {
+        let told = more(&format!("--topology p2p --recovery {repair} --network wifi"));
+        assert!(number(&told, "ticks") > 300.0 && number(&told, "hand_to_force_ms") <= 25.0, "{told}");
+    }
+
     let table = succeeds(&["stream", "--model", &model, "--loss", "burst:12@140", "--seconds", "10"]);
     for name in ["default", "none", "paper", "force-driven"] {
         assert!(table.lines().any(|line| line.starts_with(name)), "{name} in {table}");
@@ -423,6 +444,8 @@ fn a_stream_is_measured_and_the_same_seed_gives_the_same_figures() {
         vec!["--loss", "often"],
         vec!["--rate", "0"],
         vec!["--seconds", "nan"],
+        vec!["--relax", "1.0:0.4"],
+        vec!["--relax", "much"],
     ] {
         refused(&[&["stream", "--model", &model][..], &bad].concat());
     }

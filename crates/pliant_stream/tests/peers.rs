@@ -3,15 +3,17 @@
 
 mod support;
 
+use std::sync::Arc;
 use std::time::Duration;
 
+use pliant_modal::{Integrator, ModalModel, Relaxation};
 use pliant_stream::emulator::{Link, LinkConfig, Loss, Preset};
 use pliant_stream::peer::{
     HeldAt, InputTick, PeerConfig, PeerDatagram, PeerEvent, PeerMessage, PeerSession, Repair, StateCheck,
 };
 use pliant_stream::{BodyId, BodySetup, Channel, EndReason, PeerId, UserId};
 use proptest::prelude::*;
-use support::bar;
+use support::{bar, loose_bar};
 
 const BODY: BodyId = BodyId(1);
 const S: Duration = Duration::from_secs(1);
@@ -27,6 +29,8 @@ struct Mesh {
     grabs: Vec<Option<u16>>,
     /// Peer, tick, shown.
     seen: Vec<(usize, u64, Vec<f64>)>,
+    model: Arc<ModalModel>,
+    setup: BodySetup,
 }
 
 impl Mesh {
@@ -49,6 +53,8 @@ impl Mesh {
             now: Duration::ZERO,
             grabs: vec![None; count],
             seen: Vec::new(),
+            model: bar(40, 0.05),
+            setup: BodySetup::default(),
         }
     }
 
@@ -56,7 +62,7 @@ impl Mesh {
         let user = UserId(k as u16 + 1);
         let config = PeerConfig { user, repair, founds, ..Default::default() };
         let mut peer = PeerSession::new(config).unwrap();
-        peer.add_body(BODY, bar(40, 0.05), &BodySetup::default()).unwrap();
+        peer.add_body(BODY, self.model.clone(), &self.setup).unwrap();
         for other in 0..self.peers.len() {
             if let Some(o) = &mut self.peers[other] {
                 o.connect(self.now, PeerId(k as u64), 1200).unwrap();
@@ -192,6 +198,65 @@ fn rollback_is_nearer_than_the_papers_compensation() {
     println!("disagreement: rollback {exact:e}, compensation {papers:e}");
     assert_eq!(exact, 0.0);
     assert!(papers > 0.0 && papers.is_finite());
+}
+
+#[test]
+fn free_and_relaxing_bodies_agree_to_the_bit_and_late_joiners_with_them() {
+    let setup = BodySetup {
+        integrator: Integrator::GeneralizedAlpha { rho_inf: 0.5 },
+        gravity: [0.0, 0.0, -0.4],
+        relaxation: Some(Relaxation { ratio: 0.5, time: 0.4 }),
+        ..Default::default()
+    };
+    for (free, setup) in [(true, BodySetup { relaxation: None, ..setup }), (false, setup), (true, setup)] {
+        let mut mesh = Mesh::new(3, &LinkConfig::preset(Preset::Paper2), 11);
+        mesh.setup = setup;
+        mesh.model = if free { loose_bar(24, 0.05) } else { bar(24, 0.05) };
+        mesh.start(0, Repair::Rollback, true);
+        mesh.start(1, Repair::Rollback, true);
+        mesh.run(6 * S);
+        mesh.start(2, Repair::Rollback, false);
+        mesh.run(14 * S);
+        assert_eq!(mesh.agree(0, 1), 0.0, "free {free}, {setup:?}");
+        // The orientation is normalised as it arrives: the last bit of what follows from it may differ.
+        assert!(mesh.agree(0, 2) < 1e-9, "free {free}, {setup:?}: {}", mesh.agree(0, 2));
+        let all: Vec<&PeerSession> = mesh.peers.iter().flatten().collect();
+        let tick = all.iter().map(|p| p.confirmed()).min().unwrap();
+        let state = |k: usize| all[k].state_at(BODY, tick).unwrap();
+        let pose = |k: usize| all[k].pose_at(BODY, tick);
+        assert_eq!(pose(0).is_some(), free);
+        assert_eq!((pose(0), &state(0).z), (pose(1), &state(1).z));
+        let flown: f64 = state(0).z.iter().zip(&state(2).z).map(|(a, b)| (a - b).abs()).sum();
+        assert!(flown < 1e-9, "{flown}");
+        if let (Some(a), Some(b)) = (pose(0), pose(2)) {
+            assert!((0..3).all(|k| (a.position[k] - b.position[k]).abs() < 1e-9), "{a:?} and {b:?}");
+        }
+        assert_eq!(state(0).z.is_empty(), setup.relaxation.is_none());
+        if let Some(pose) = pose(0) {
+            let moved = (0..3).map(|k| pose.position[k].powi(2)).sum::<f64>().sqrt();
+            assert!(moved > 0.01, "the hands must have moved the frame: {moved} m");
+        }
+        // (Both give the joiner their state; the second of them is a resync of its own.)
+        let resynced = |e: &(usize, PeerEvent)| e.0 < 2 && matches!(e.1, PeerEvent::Resynced { .. });
+        assert!(!mesh.events.iter().any(resynced), "{:?}", mesh.events);
+    }
+}
+
+#[test]
+fn compensation_keeps_a_free_relaxing_body_together() {
+    let mut mesh = Mesh::new(2, &LinkConfig::preset(Preset::Paper3), 11);
+    mesh.setup.relaxation = Some(Relaxation { ratio: 0.5, time: 0.4 });
+    mesh.model = loose_bar(24, 0.05);
+    mesh.start(0, Repair::Compensate, true);
+    mesh.start(1, Repair::Compensate, true);
+    mesh.run(15 * S);
+    let all: Vec<&PeerSession> = mesh.peers.iter().flatten().collect();
+    let tick = all.iter().map(|p| p.confirmed()).min().unwrap();
+    let place = |k: usize| all[k].pose_at(BODY, tick).unwrap().position;
+    let apart = (0..3).map(|k| (place(0)[k] - place(1)[k]).powi(2)).sum::<f64>().sqrt();
+    println!("compensation: frames {apart:.4} m apart, shapes {:.3}", mesh.agree(0, 1));
+    assert!(apart < 0.05, "{apart} m");
+    assert!(mesh.agree(0, 1) < 0.3, "{}", mesh.agree(0, 1));
 }
 
 #[test]

@@ -1,6 +1,8 @@
 //! A body whose modes are known in closed form, so that the tests need no bake.
 #![allow(dead_code, reason = "each test uses its part")]
 
+pub mod scene;
+
 use std::sync::Arc;
 
 use pliant_modal::{BakeInfo, Damping, Element, ModalModel, ModelParts, SurfaceMesh};
@@ -8,6 +10,15 @@ use pliant_modal::{BakeInfo, Damping, Element, ModalModel, ModelParts, SurfaceMe
 /// A square bar of length 1 m, fixed at x = 0, with `modes` modes from four families whose shape along the bar is
 /// sin((2k - 1) pi x / 2): shear in y and z, stretch in x, twist about x. Mass 2 kg, damping ratio `zeta`.
 pub fn bar(modes: usize, zeta: f64) -> Arc<ModalModel> {
+    bar_that(modes, zeta, false)
+}
+
+/// The same bar let loose: a rigid frame of its own, and the same shapes about it.
+pub fn loose_bar(modes: usize, zeta: f64) -> Arc<ModalModel> {
+    bar_that(modes, zeta, true)
+}
+
+fn bar_that(modes: usize, zeta: f64, free: bool) -> Arc<ModalModel> {
     let (nx, half) = (16, 0.08);
     let mut positions = Vec::new();
     for i in 0..=nx {
@@ -24,7 +35,7 @@ pub fn bar(modes: usize, zeta: f64) -> Arc<ModalModel> {
     }
     let end = 4 * nx as u32;
     triangles.extend([[0, 1, 2], [0, 2, 3], [end, end + 2, end + 1], [end, end + 3, end + 2]]);
-    let anchored = positions.iter().map(|p| p[0] == 0.0).collect();
+    let anchored = positions.iter().map(|p| p[0] == 0.0 && !free).collect();
     let surface = SurfaceMesh::new(positions.clone(), triangles, None, anchored).unwrap();
 
     // (family, k, frequency in Hz): shear y, shear z, stretch, twist.
@@ -71,7 +82,7 @@ pub fn bar(modes: usize, zeta: f64) -> Arc<ModalModel> {
             poisson: 0.3,
             density: 1000.0,
             damping,
-            anchors: vec!["x<0.01".into()],
+            anchors: if free { Vec::new() } else { vec!["x<0.01".into()] },
             residual_max: 0.0,
             orthonormality_max: 0.0,
         },
@@ -81,7 +92,7 @@ pub fn bar(modes: usize, zeta: f64) -> Arc<ModalModel> {
         omega,
         displacement,
         rotation,
-        free: false,
+        free,
         mass,
         center_of_mass: [0.5, 0.0, 0.0],
         inertia: [[0.01, 0.0, 0.0], [0.0, 0.17, 0.0], [0.0, 0.0, 0.17]],
