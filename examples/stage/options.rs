@@ -6,6 +6,7 @@ use clap::Parser;
 
 /// How an example is run.
 #[derive(Parser, Debug, Clone, Default)]
+#[group(skip)]
 pub struct Options {
     /// No window: the scene plays by itself and prints its figures at the end.
     #[arg(long)]

@@ -1,0 +1,248 @@
+//! Bodies that are fixed nowhere: one thrown spinning, one struck again and again, one held by two hands.
+//!
+//! What to learn here: a body baked without anchors flies, and moves its own `Transform`; gravity, blows and hands act on its flight and on its
+//! shape; what its momentum changes by is what was applied and nothing else: the table on screen sums both.
+//!
+//! ```sh
+//! cargo run --release --example free_bodies
+//! ```
+
+mod stage;
+
+use bevy::{math::DVec3, prelude::*};
+use pliant::{modal::Frame, prelude::*};
+use stage::{Look, Readout, Stage};
+
+/// Weak, as on the moon, so that there is time to look.
+const GRAVITY: DVec3 = DVec3::new(0.0, -1.62, 0.0);
+
+fn main() -> AppExit {
+    App::new()
+        .add_plugins(
+            Stage::new("free bodies")
+                .key("left mouse: hold one")
+                .key("H: hit the middle one")
+                .look(Look { middle: Vec3::new(0.0, 0.0, 0.0), distance: 1.9, yaw: 0.25, pitch: 0.12 })
+                .floating()
+                .picture_at(2.35),
+        )
+        .add_plugins(PliantPlugins::default())
+        .add_systems(Startup, spawn)
+        .add_systems(
+            FixedUpdate,
+            (
+                (throw, hit, take_hold, move_hands).chain().before(PliantSystems::Input),
+                keep_account.after(PliantSystems::Publish),
+            ),
+        )
+        .add_systems(Update, (draw, write))
+        .run()
+}
+
+/// What happens to a body.
+#[derive(Component, Clone, Copy, PartialEq, Eq)]
+enum Part {
+    Thrown,
+    Struck,
+    Held,
+}
+
+/// What was done to a body since its account was opened.
+#[derive(Component, Default)]
+struct Account {
+    /// Momentum when it was opened, kg m/s; `None` before.
+    opening: Option<DVec3>,
+    /// Angular momentum about its own centre then, kg m^2/s.
+    spin: DVec3,
+    /// What hands, blows and gravity have put in since, N s.
+    applied: DVec3,
+}
+
+fn spawn(mut commands: Commands, assets: Res<AssetServer>, mut materials: ResMut<Assets<StandardMaterial>>) {
+    let parts = [
+        (Part::Thrown, -0.62, Color::srgb(0.95, 0.50, 0.36)),
+        (Part::Struck, 0.0, Color::srgb(0.42, 0.66, 0.58)),
+        (Part::Held, 0.62, Color::srgb(0.86, 0.68, 0.34)),
+    ];
+    for (part, x, colour) in parts {
+        let mut body = ModalBody::new(assets.load("jack.modal"));
+        body.gravity = if part == Part::Struck { DVec3::ZERO } else { GRAVITY };
+        commands.spawn((
+            body,
+            part,
+            Account::default(),
+            MeshMaterial3d(materials.add(StandardMaterial {
+                perceptual_roughness: 0.45,
+                clearcoat: 0.3,
+                ..colour.into()
+            })),
+            Transform::from_xyz(x, if part == Part::Thrown { -0.45 } else { 0.0 }, 0.0),
+        ));
+    }
+}
+
+/// Throws the first one up, spinning about no axis of its own, and again when it has come down.
+fn throw(mut bodies: Query<(&Part, &mut BodyState, &mut Account)>) -> Result {
+    for (part, mut state, mut account) in &mut bodies {
+        let body = state.body();
+        let down = body.frame().origin()[1] < -0.45 && body.frame().velocity()[1] < 0.0;
+        if *part != Part::Thrown || !(account.opening.is_none() || down) {
+            continue;
+        }
+        let mut thrown = body.state().clone();
+        thrown.frame = Frame::from_motion(
+            body.model(),
+            [-0.62, -0.45, 0.0],
+            body.frame().orientation(),
+            [0.0, 1.7, 0.0],
+            [1.1e-2, 0.4e-2, 1.6e-2],
+        )?;
+        state.body_mut().set_state(&thrown)?;
+        *account = Account::default();
+    }
+    Ok(())
+}
+
+/// Strikes the middle one: on a knob, back to its place.
+fn hit(
+    time: Res<Time>,
+    keys: Res<ButtonInput<KeyCode>>,
+    mut bodies: Query<(&Part, &mut BodyState, &mut Account)>,
+    mut blows: Local<u32>,
+) -> Result {
+    let due = time.elapsed_secs_f64() > 0.4 + 1.5 * f64::from(*blows);
+    if !due && !keys.just_pressed(KeyCode::KeyH) {
+        return Ok(());
+    }
+    for (part, mut state, mut account) in &mut bodies {
+        if *part != Part::Struck || account.opening.is_none() {
+            continue;
+        }
+        *blows += u32::from(due);
+        let (momentum, _) = state.body().momentum();
+        let home = -DVec3::from(state.body().frame().origin());
+        let blow = -DVec3::from(momentum) + 0.18 * home + 0.04 * DVec3::new(0.3, 1.0, 0.6);
+        let side = [Vec3::X, Vec3::Y, Vec3::NEG_X, Vec3::NEG_Y][*blows as usize % 4];
+        let knob = farthest(&state, side);
+        state.body_mut().strike(knob, blow.into())?;
+        account.applied += blow;
+    }
+    Ok(())
+}
+
+/// The surface vertex farthest along `toward`, body axes.
+fn farthest(state: &BodyState, toward: Vec3) -> u32 {
+    let positions = state.model().surface().positions();
+    let along = |i: usize| Vec3::from(positions[i]).dot(toward);
+    (0..positions.len()).max_by(|&a, &b| along(a).total_cmp(&along(b))).unwrap_or(0) as u32
+}
+
+/// A hand of the script, on the left or the right knob.
+#[derive(Component)]
+struct Hand {
+    side: f64,
+}
+
+/// Two hands take hold of the third one.
+fn take_hold(
+    mut commands: Commands,
+    bodies: Query<(Entity, &Part, &BodyState, &GlobalTransform), Added<BodyState>>,
+) {
+    for (body, part, state, place) in &bodies {
+        for side in [-1.0_f64, 1.0] {
+            if *part == Part::Held {
+                let knob = farthest(state, side as f32 * Vec3::X);
+                let at =
+                    place.transform_point(Vec3::from(state.model().surface().positions()[knob as usize]));
+                commands.spawn((Grab::new(knob, 0.04, at.as_dvec3()), GrabOf(body), Hand { side }));
+            }
+        }
+    }
+}
+
+/// They pull, wring and swing it.
+fn move_hands(time: Res<Time>, mut hands: Query<(&Hand, &mut Grab)>) {
+    let t = time.elapsed_secs_f64();
+    let gently = (t / 1.5).min(1.0);
+    for (Hand { side }, mut grab) in &mut hands {
+        let swing = DVec3::new(0.0, 0.14 * (1.9 * t).sin(), 0.12 * (1.3 * t).sin());
+        let against = DVec3::new(0.05 * (2.6 * t).sin(), 0.13 * (3.1 * t).sin(), 0.10 * (2.3 * t).cos());
+        grab.target = DVec3::new(0.62 + 0.2 * side, 0.0, 0.0) + gently * (swing + *side * against);
+    }
+}
+
+/// Sums what was applied in this tick.
+fn keep_account(
+    time: Res<Time>,
+    mut bodies: Query<(&BodyState, &ModalBody, &mut Account, Option<&Grabs>)>,
+    forces: Query<&GrabForce>,
+) {
+    for (state, settings, mut account, grabs) in &mut bodies {
+        let (momentum, _) = state.body().momentum();
+        if account.opening.is_none() {
+            *account = Account {
+                opening: Some(momentum.into()),
+                spin: state.body().frame().spin().into(),
+                applied: DVec3::ZERO,
+            };
+            continue;
+        }
+        let hands: DVec3 = grabs
+            .into_iter()
+            .flat_map(|grabs| forces.iter_many(grabs.entities()))
+            .map(|felt| -felt.force)
+            .sum();
+        account.applied += (hands + state.model().mass() * settings.gravity) * time.delta_secs_f64();
+    }
+}
+
+/// Momentum as an arrow, spin as another, hands as balls.
+fn draw(
+    mut gizmos: Gizmos,
+    bodies: Query<(&BodyState, &GlobalTransform)>,
+    hands: Query<(&Grab, &GrabForce), Without<PointerHeld>>,
+) {
+    for (state, place) in &bodies {
+        let middle = place.transform_point(DVec3::from(state.model().center_of_mass()).as_vec3());
+        let (momentum, _) = state.body().momentum();
+        let arrow = 0.9 * DVec3::from(momentum).as_vec3();
+        gizmos.arrow(middle, middle + arrow, Color::srgb(0.85, 0.1, 0.15));
+        let spin = 9.0 * DVec3::from(state.body().frame().spin()).as_vec3();
+        gizmos.arrow(middle, middle + spin, Color::srgb(0.15, 0.3, 0.8));
+    }
+    for (grab, felt) in &hands {
+        gizmos.sphere(grab.target.as_vec3(), 0.014, Color::srgb(0.25, 0.25, 0.3));
+        gizmos.line(felt.point.as_vec3(), grab.target.as_vec3(), Color::srgb(0.25, 0.25, 0.3));
+    }
+}
+
+fn write(bodies: Query<(&Part, &BodyState, &Account)>, mut readout: ResMut<Readout>) {
+    let mut text =
+        String::from("momentum, kg m/s   since it began   applied by gravity, blows, hands   missing\n");
+    for (part, state, account) in &bodies {
+        let Some(opening) = account.opening else { continue };
+        let name = match part {
+            Part::Thrown => "thrown",
+            Part::Struck => "struck",
+            Part::Held => "held  ",
+        };
+        let (momentum, _) = state.body().momentum();
+        let change = DVec3::from(momentum) - opening;
+        let three = |v: DVec3| format!("{:6.3} {:6.3} {:6.3}", v.x, v.y, v.z);
+        text += &format!(
+            "{name}  {}   {}   {:.0e}\n",
+            three(change),
+            three(account.applied),
+            (change - account.applied).length()
+        );
+        if *part == Part::Thrown {
+            let spin = DVec3::from(state.body().frame().spin());
+            text += &format!(
+                "        spin {:.4} kg m^2/s, changed by {:.0e} of it\n",
+                spin.length(),
+                (spin - account.spin).length() / spin.length()
+            );
+        }
+    }
+    readout.0 = text;
+}

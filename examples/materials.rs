@@ -1,0 +1,132 @@
+//! Three jellies of one shape: a soft and a firm one with a texture, and a soft one with a shader of its own, all pulled alike.
+//!
+//! What to learn here: a bent surface is an ordinary mesh, so any material works on it, a texture stays where it was painted, and a shader written for
+//! Bevy's `Material` needs to know nothing of bodies; stiffness is the material that was baked.
+//!
+//! ```sh
+//! cargo run --release --example materials
+//! ```
+
+mod stage;
+
+use bevy::{
+    math::DVec3,
+    pbr::{ExtendedMaterial, MaterialExtension},
+    prelude::*,
+    reflect::TypePath,
+    render::render_resource::AsBindGroup,
+    shader::ShaderRef,
+};
+use pliant::prelude::*;
+use stage::{Look, Readout, Stage};
+
+fn main() -> AppExit {
+    App::new()
+        .add_plugins(
+            Stage::new("materials")
+                .key("left mouse: pull a jelly")
+                .look(Look { middle: Vec3::new(0.0, 0.055, 0.0), distance: 0.72, yaw: 0.0, pitch: 0.34 })
+                .picture_at(2.1),
+        )
+        .add_plugins((PliantPlugins::default(), MaterialPlugin::<Glowing>::default()))
+        .add_systems(Startup, spawn)
+        .add_systems(FixedUpdate, (take_hold, pull).chain().before(PliantSystems::Input))
+        .add_systems(Update, write)
+        .run()
+}
+
+/// Bevy's own material, and light on top of it.
+type Glowing = ExtendedMaterial<StandardMaterial, Bands>;
+
+/// Bands of light along the texture's second coordinate. The layout is that of `shaders/bands.wgsl`.
+#[derive(Asset, AsBindGroup, TypePath, Clone, Debug)]
+struct Bands {
+    #[uniform(100)]
+    glow: LinearRgba,
+    /// How many.
+    #[uniform(100)]
+    count: f32,
+    /// Bands a second.
+    #[uniform(100)]
+    speed: f32,
+}
+
+impl MaterialExtension for Bands {
+    fn fragment_shader() -> ShaderRef {
+        "shaders/bands.wgsl".into()
+    }
+}
+
+fn spawn(
+    mut commands: Commands,
+    assets: Res<AssetServer>,
+    mut standard: ResMut<Assets<StandardMaterial>>,
+    mut glowing: ResMut<Assets<Glowing>>,
+) {
+    let textured = standard.add(StandardMaterial {
+        base_color_texture: Some(assets.load("jelly.png")),
+        perceptual_roughness: 0.3,
+        clearcoat: 0.6,
+        ..default()
+    });
+    let glow = glowing.add(Glowing {
+        base: StandardMaterial { perceptual_roughness: 0.35, ..Color::srgb(0.16, 0.24, 0.42).into() },
+        extension: Bands { glow: LinearRgba::rgb(0.25, 0.85, 0.75), count: 9.0, speed: 0.4 },
+    });
+    let jelly = |file: &'static str, name: &'static str, x: f32| {
+        let mut body = ModalBody::new(assets.load(file));
+        body.gravity = DVec3::new(0.0, -9.81, 0.0);
+        (Name::new(name), body, Transform::from_xyz(x, 0.0, 0.0))
+    };
+    commands.spawn((jelly("jelly-soft.modal", "soft, texture", -0.24), MeshMaterial3d(textured.clone())));
+    commands.spawn((jelly("jelly-firm.modal", "firm, texture", 0.0), MeshMaterial3d(textured)));
+    commands.spawn((jelly("jelly-soft.modal", "soft, own shader", 0.24), MeshMaterial3d(glow)));
+}
+
+/// A hand of the script, and where it took hold.
+#[derive(Component)]
+struct Hand(DVec3);
+
+/// One hand on the top of each: a soft spring, so that all are pulled with nearly the same force.
+fn take_hold(
+    mut commands: Commands,
+    bodies: Query<(Entity, &BodyState, &GlobalTransform), Added<BodyState>>,
+) {
+    for (body, state, place) in &bodies {
+        let positions = state.model().surface().positions();
+        let top =
+            (0..positions.len()).max_by(|&a, &b| positions[a][1].total_cmp(&positions[b][1])).unwrap_or(0);
+        let at = place.transform_point(Vec3::from(positions[top])).as_dvec3();
+        let grab = Grab { stiffness: Some(8.0), ..Grab::new(top as u32, 0.035, at) };
+        commands.spawn((grab, GrabOf(body), Hand(at)));
+    }
+}
+
+/// To and fro.
+fn pull(time: Res<Time>, mut hands: Query<(&Hand, &mut Grab)>) {
+    let t = time.elapsed_secs_f64();
+    let reach = 0.20 * (t / 0.6).min(1.0);
+    for (hand, mut grab) in &mut hands {
+        grab.target = hand.0 + reach * DVec3::new((1.5 * t).sin(), 0.15, (0.9 * t).sin() * 0.4);
+    }
+}
+
+fn write(
+    bodies: Query<(&Name, &BodyState, &Grabs)>,
+    forces: Query<(&GrabForce, &Hand)>,
+    mut readout: ResMut<Readout>,
+) {
+    let mut text = String::new();
+    for (name, state, grabs) in &bodies {
+        for (felt, hand) in forces.iter_many(grabs.entities()) {
+            text += &format!(
+                "{:18} E {:5.0} kPa   pulled by {:4.2} N   bent by {:5.1} mm\n",
+                name.as_str(),
+                1e-3 * state.model().info().young,
+                felt.force.length(),
+                1e3 * (felt.point - hand.0).length(),
+            );
+        }
+    }
+    readout.0 = text;
+}
