@@ -9,7 +9,10 @@
 
 mod stage;
 
-use bevy::{math::DVec3, prelude::*};
+use bevy::{
+    math::{DQuat, DVec3},
+    prelude::*,
+};
 use pliant::{modal::Frame, prelude::*};
 use stage::{Look, Readout, Stage};
 
@@ -22,9 +25,9 @@ fn main() -> AppExit {
             Stage::new("free bodies")
                 .key("left mouse: hold one")
                 .key("H: hit the middle one")
-                .look(Look { middle: Vec3::new(0.0, 0.0, 0.0), distance: 1.9, yaw: 0.25, pitch: 0.12 })
+                .look(Look { middle: Vec3::new(0.0, 0.0, 0.0), distance: 1.6, yaw: 0.25, pitch: 0.12 })
                 .floating()
-                .picture_at(2.35),
+                .picture_at(2.9),
         )
         .add_plugins(PliantPlugins::default())
         .add_systems(Startup, spawn)
@@ -40,7 +43,7 @@ fn main() -> AppExit {
 }
 
 /// What happens to a body.
-#[derive(Component, Clone, Copy, PartialEq, Eq)]
+#[derive(Component, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
 enum Part {
     Thrown,
     Struck,
@@ -164,10 +167,13 @@ fn take_hold(
 fn move_hands(time: Res<Time>, mut hands: Query<(&Hand, &mut Grab)>) {
     let t = time.elapsed_secs_f64();
     let gently = (t / 1.5).min(1.0);
+    let middle = DVec3::new(0.62, 0.10 * gently * (1.9 * t).sin(), 0.08 * gently * (1.3 * t).sin());
+    // The hands turn about each other and pull it longer and shorter.
+    let turned =
+        DQuat::from_euler(EulerRot::YZX, gently * 0.9 * (1.1 * t).sin(), gently * 0.7 * (1.7 * t).sin(), 0.0);
+    let half = 0.205 + 0.02 * gently * (2.6 * t).sin();
     for (Hand { side }, mut grab) in &mut hands {
-        let swing = DVec3::new(0.0, 0.14 * (1.9 * t).sin(), 0.12 * (1.3 * t).sin());
-        let against = DVec3::new(0.05 * (2.6 * t).sin(), 0.13 * (3.1 * t).sin(), 0.10 * (2.3 * t).cos());
-        grab.target = DVec3::new(0.62 + 0.2 * side, 0.0, 0.0) + gently * (swing + *side * against);
+        grab.target = middle + turned * DVec3::new(*side * half, 0.0, 0.0);
     }
 }
 
@@ -205,9 +211,9 @@ fn draw(
     for (state, place) in &bodies {
         let middle = place.transform_point(DVec3::from(state.model().center_of_mass()).as_vec3());
         let (momentum, _) = state.body().momentum();
-        let arrow = 0.9 * DVec3::from(momentum).as_vec3();
+        let arrow = 0.5 * DVec3::from(momentum).as_vec3();
         gizmos.arrow(middle, middle + arrow, Color::srgb(0.85, 0.1, 0.15));
-        let spin = 9.0 * DVec3::from(state.body().frame().spin()).as_vec3();
+        let spin = 12.0 * DVec3::from(state.body().frame().spin()).as_vec3();
         gizmos.arrow(middle, middle + spin, Color::srgb(0.15, 0.3, 0.8));
     }
     for (grab, felt) in &hands {
@@ -217,32 +223,25 @@ fn draw(
 }
 
 fn write(bodies: Query<(&Part, &BodyState, &Account)>, mut readout: ResMut<Readout>) {
-    let mut text =
-        String::from("momentum, kg m/s   since it began   applied by gravity, blows, hands   missing\n");
-    for (part, state, account) in &bodies {
+    let mut text = format!("{:22}{:24}{:25}", "momentum, kg m/s", "since then", "applied since then");
+    text += "missing\n";
+    for (part, state, account) in bodies.iter().sort::<&Part>() {
         let Some(opening) = account.opening else { continue };
         let name = match part {
-            Part::Thrown => "thrown",
-            Part::Struck => "struck",
-            Part::Held => "held  ",
+            Part::Thrown => "thrown: gravity",
+            Part::Struck => "struck: blows",
+            Part::Held => "held: hands, gravity",
         };
         let (momentum, _) = state.body().momentum();
         let change = DVec3::from(momentum) - opening;
         let three = |v: DVec3| format!("{:6.3} {:6.3} {:6.3}", v.x, v.y, v.z);
-        text += &format!(
-            "{name}  {}   {}   {:.0e}\n",
-            three(change),
-            three(account.applied),
-            (change - account.applied).length()
-        );
-        if *part == Part::Thrown {
-            let spin = DVec3::from(state.body().frame().spin());
-            text += &format!(
-                "        spin {:.4} kg m^2/s, changed by {:.0e} of it\n",
-                spin.length(),
-                (spin - account.spin).length() / spin.length()
-            );
-        }
+        let missing = (change - account.applied).length();
+        text += &format!("{name:20}  {}    {}    {missing:.0e}\n", three(change), three(account.applied));
+    }
+    for (_, state, account) in bodies.iter().filter(|(part, ..)| **part == Part::Thrown) {
+        let spin = DVec3::from(state.body().frame().spin());
+        let change = (spin - account.spin).length() / spin.length();
+        text += &format!("thrown: spin {:.4} kg m^2/s, changed by {change:.0e} of it", spin.length());
     }
     readout.0 = text;
 }

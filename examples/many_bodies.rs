@@ -41,7 +41,7 @@ fn main() -> AppExit {
                 .key("left mouse: pull a bud")
                 .key("S: shake them all")
                 .look(Look { middle: Vec3::new(0.0, 0.1, 0.55), distance: 2.7, yaw: 0.5, pitch: 0.42 })
-                .picture_at(4.2),
+                .picture_at(1.7),
         )
         .add_plugins(PliantPlugins::default())
         .insert_resource(Meadow { bodies: options.bodies, shake: options.shake })
@@ -81,14 +81,16 @@ fn plant(
         (0..side * side).map(|i| IVec2::new(i % side - side / 2, i / side - side / 2).as_vec2()).collect();
     places.sort_by(|a, b| a.length_squared().total_cmp(&b.length_squared()));
     for (number, place) in places.into_iter().take(meadow.bodies as usize).enumerate() {
-        let odd = |salt: u32| (number as u32 * 2_654_435_769 + salt).wrapping_mul(2_246_822_519) >> 8;
+        let odd = |salt: u32| {
+            (number as u32).wrapping_mul(2_654_435_769).wrapping_add(salt).wrapping_mul(2_246_822_519) >> 8
+        };
         let part = |salt| (odd(salt) % 1000) as f32 / 1000.0;
         let at = APART * (place + 0.5 * (Vec2::new(part(1), part(2)) - 0.5));
         commands.spawn((
             ModalBody::new(model.clone()),
             MeshMaterial3d(skins[odd(3) as usize % skins.len()].clone()),
             Transform::from_xyz(at.x, 0.0, at.y)
-                .with_rotation(Quat::from_rotation_y(6.28 * part(4)))
+                .with_rotation(Quat::from_rotation_y(std::f32::consts::TAU * part(4)))
                 .with_scale(Vec3::splat(0.8 + 0.4 * part(5))),
         ));
     }
@@ -162,7 +164,7 @@ fn shake(
     keys: Res<ButtonInput<KeyCode>>,
     mut bodies: Query<&mut BodyState>,
 ) -> Result {
-    if keys.just_pressed(KeyCode::KeyS) || (meadow.shake && tick.0 % 32 == 0) {
+    if keys.just_pressed(KeyCode::KeyS) || (meadow.shake && tick.0.is_multiple_of(32)) {
         for mut state in &mut bodies {
             let head = highest(&state);
             state.body_mut().strike(head, [0.02, 0.0, 0.01])?;

@@ -5,6 +5,7 @@
 //!
 //! ```sh
 //! cargo run --release --example materials
+//! cargo run --release --example materials -- --bake    # nothing baked is loaded: the jellies are baked while the window is open
 //! ```
 
 mod stage;
@@ -17,22 +18,45 @@ use bevy::{
     render::render_resource::AsBindGroup,
     shader::ShaderRef,
 };
-use pliant::prelude::*;
+use clap::Parser;
+use pliant::{
+    bake::BakeConfig,
+    body::{BakePlugin, BakeProgress, BakeRequest, BakeSkin},
+    modal::Damping,
+    prelude::*,
+};
 use stage::{Look, Readout, Stage};
 
+#[derive(Parser)]
+struct Options {
+    /// Bake the jellies from their surface at load, instead of loading what was baked.
+    #[arg(long)]
+    bake: bool,
+    #[command(flatten)]
+    stage: stage::Options,
+}
+
 fn main() -> AppExit {
+    let options = Options::parse();
     App::new()
         .add_plugins(
-            Stage::new("materials")
+            Stage::with("materials", options.stage)
                 .key("left mouse: pull a jelly")
-                .look(Look { middle: Vec3::new(0.0, 0.055, 0.0), distance: 0.72, yaw: 0.0, pitch: 0.34 })
+                .look(Look { middle: Vec3::new(0.0, 0.05, 0.0), distance: 0.60, yaw: 0.0, pitch: 0.34 })
                 .picture_at(2.1),
         )
-        .add_plugins((PliantPlugins::default(), MaterialPlugin::<Glowing>::default()))
+        .add_plugins((PliantPlugins::default(), MaterialPlugin::<Glowing>::default(), BakePlugin::default()))
+        .insert_resource(Source { bake: options.bake })
         .add_systems(Startup, spawn)
         .add_systems(FixedUpdate, (take_hold, pull).chain().before(PliantSystems::Input))
         .add_systems(Update, write)
         .run()
+}
+
+/// Where the jellies come from.
+#[derive(Resource)]
+struct Source {
+    bake: bool,
 }
 
 /// Bevy's own material, and light on top of it.
@@ -59,6 +83,7 @@ impl MaterialExtension for Bands {
 
 fn spawn(
     mut commands: Commands,
+    source: Res<Source>,
     assets: Res<AssetServer>,
     mut standard: ResMut<Assets<StandardMaterial>>,
     mut glowing: ResMut<Assets<Glowing>>,
@@ -73,14 +98,48 @@ fn spawn(
         base: StandardMaterial { perceptual_roughness: 0.35, ..Color::srgb(0.16, 0.24, 0.42).into() },
         extension: Bands { glow: LinearRgba::rgb(0.25, 0.85, 0.75), count: 9.0, speed: 0.4 },
     });
-    let jelly = |file: &'static str, name: &'static str, x: f32| {
-        let mut body = ModalBody::new(assets.load(file));
-        body.gravity = DVec3::new(0.0, -9.81, 0.0);
-        (Name::new(name), body, Transform::from_xyz(x, 0.0, 0.0))
-    };
-    commands.spawn((jelly("jelly-soft.modal", "soft, texture", -0.24), MeshMaterial3d(textured.clone())));
-    commands.spawn((jelly("jelly-firm.modal", "firm, texture", 0.0), MeshMaterial3d(textured)));
-    commands.spawn((jelly("jelly-soft.modal", "soft, own shader", 0.24), MeshMaterial3d(glow)));
+    let skins = [Skin::Textured(textured.clone()), Skin::Textured(textured), Skin::Glowing(glow)];
+    let names = ["soft, texture", "firm, texture", "soft, own shader"];
+    for (i, (skin, name)) in skins.into_iter().zip(names).enumerate() {
+        let firm = i == 1;
+        let mut body = ModalBody { gravity: DVec3::new(0.0, -9.81, 0.0), ..default() };
+        if !source.bake {
+            body.model = assets.load(if firm { "jelly-firm.modal" } else { "jelly-soft.modal" });
+        }
+        let place = Transform::from_xyz(0.24 * (i as f32 - 1.0), 0.0, 0.0);
+        let mut jelly = commands.spawn((Name::new(name), body, place));
+        match skin {
+            Skin::Textured(material) => jelly.insert(MeshMaterial3d(material)),
+            Skin::Glowing(material) => jelly.insert(MeshMaterial3d(material)),
+        };
+        if source.bake {
+            jelly.insert(baked(if firm { 4e4 } else { 4e3 }));
+        }
+    }
+}
+
+enum Skin {
+    Textured(Handle<StandardMaterial>),
+    Glowing(Handle<Glowing>),
+}
+
+/// What the model files were made by, but here in the game: the surface is filled with tetrahedra and worn over them.
+fn baked(young: f64) -> BakeRequest {
+    BakeRequest {
+        tets: 3_000,
+        skin: BakeSkin::Shape,
+        config: BakeConfig {
+            name: "jelly".into(),
+            modes: 20,
+            young,
+            poisson: 0.45,
+            damping: Damping::Ratio(0.05),
+            anchors: "y<0.004".parse().into_iter().collect(),
+            sites: Some(32),
+            ..default()
+        },
+        ..BakeRequest::file(format!("{}/jelly.obj", stage::ASSETS))
+    }
 }
 
 /// A hand of the script, and where it took hold.
@@ -97,7 +156,7 @@ fn take_hold(
         let top =
             (0..positions.len()).max_by(|&a, &b| positions[a][1].total_cmp(&positions[b][1])).unwrap_or(0);
         let at = place.transform_point(Vec3::from(positions[top])).as_dvec3();
-        let grab = Grab { stiffness: Some(8.0), ..Grab::new(top as u32, 0.035, at) };
+        let grab = Grab { stiffness: Some(20.0), ..Grab::new(top as u32, 0.035, at) };
         commands.spawn((grab, GrabOf(body), Hand(at)));
     }
 }
@@ -113,11 +172,12 @@ fn pull(time: Res<Time>, mut hands: Query<(&Hand, &mut Grab)>) {
 
 fn write(
     bodies: Query<(&Name, &BodyState, &Grabs)>,
+    bakes: Query<(&Name, &BakeProgress)>,
     forces: Query<(&GrabForce, &Hand)>,
     mut readout: ResMut<Readout>,
 ) {
     let mut text = String::new();
-    for (name, state, grabs) in &bodies {
+    for (name, state, grabs) in bodies.iter().sort::<&Name>() {
         for (felt, hand) in forces.iter_many(grabs.entities()) {
             text += &format!(
                 "{:18} E {:5.0} kPa   pulled by {:4.2} N   bent by {:5.1} mm\n",
@@ -127,6 +187,19 @@ fn write(
                 1e3 * (felt.point - hand.0).length(),
             );
         }
+    }
+    for (name, progress) in bakes.iter().sort::<&Name>() {
+        text += &match progress {
+            BakeProgress::Waiting => format!("{:18} waits to be baked\n", name.as_str()),
+            BakeProgress::Running { stage, share } => {
+                format!("{:18} {stage:?} {:3.0} %\n", name.as_str(), 100.0 * share)
+            }
+            BakeProgress::Done { cached: true, .. } => format!("{:18} was baked before\n", name.as_str()),
+            BakeProgress::Done { seconds, .. } => {
+                format!("{:18} baked in {seconds:.1} s\n", name.as_str())
+            }
+            BakeProgress::Failed { reason } => format!("{:18} {reason}\n", name.as_str()),
+        };
     }
     readout.0 = text;
 }

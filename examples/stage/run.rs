@@ -19,7 +19,7 @@ pub struct Unattended;
 const FRAME: f64 = 1.0 / 60.0;
 
 /// Frames before the picture in which cameras draw: bodies are shaped when they were seen in the frame before.
-const DRAWN: u64 = 40;
+const DRAWN: u64 = 5;
 
 /// Frames that wait for the bodies to load, and for the picture to be written, before the run is given up.
 const PATIENCE: u64 = 100_000;

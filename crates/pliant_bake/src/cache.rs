@@ -128,6 +128,21 @@ impl BakeCache {
         Self { folder: folder.into(), limit: Self::DEFAULT_LIMIT }
     }
 
+    /// The user's own cache, shared by all programs: a folder `pliant/bakes` where the system keeps what can be made again. `None` where it
+    /// names no such place.
+    pub fn of_user() -> Option<Self> {
+        let folder = |name: &str| std::env::var_os(name).map(PathBuf::from).filter(|path| path.is_absolute());
+        let base = if cfg!(windows) {
+            folder("LOCALAPPDATA")
+        } else if cfg!(target_os = "macos") {
+            folder("HOME").map(|home| home.join("Library/Caches"))
+        } else {
+            // The XDG base directory specification.
+            folder("XDG_CACHE_HOME").or_else(|| folder("HOME").map(|home| home.join(".cache")))
+        };
+        base.map(|base| Self::new(base.join("pliant/bakes")))
+    }
+
     /// Keeps at most so many bytes; a single model that is larger is not kept.
     #[must_use]
     pub fn with_limit(self, bytes: u64) -> Self {

@@ -29,7 +29,7 @@ use crate::{ModalAsset, grab::Hold};
 ///
 /// A change of a field takes effect at the end of the frame; the shape and its motion are kept where the model is the same.
 #[derive(Component, Reflect, Debug, Clone, PartialEq)]
-#[reflect(Component, Clone, PartialEq)]
+#[reflect(Component, Default, Clone, PartialEq)]
 #[require(Transform, Visibility, Driven)]
 pub struct ModalBody {
     /// The baked body. Swapping the handle, or the asset behind it, makes a new body at rest; grabs whose vertex it has stay.
@@ -47,6 +47,13 @@ pub struct ModalBody {
     /// The body rests once the root mean square speed of its mass stays below this, m/s of the model, for half a second with
     /// nobody holding it: it is then neither stepped nor uploaded until something touches it. Zero never rests. Default: `1e-4`.
     pub rest_speed: f64,
+}
+
+impl Default for ModalBody {
+    /// Every setting at its default, and no model yet.
+    fn default() -> Self {
+        Self::new(Handle::default())
+    }
 }
 
 impl ModalBody {

@@ -27,12 +27,17 @@
 //! # Features
 //!
 //! `render`: the deformed surface as a mesh with normals, and the pointer's target drawn. Without it no renderer is compiled.
+//!
+//! `bake`: `BakePlugin`, which meshes and bakes bodies in the game itself from a `BakeRequest`. Without it bodies come from `.modal` files and
+//! nothing of a solver is compiled.
 #![cfg_attr(
     test,
     allow(clippy::unwrap_used, clippy::expect_used, clippy::panic, reason = "a failed test should panic")
 )]
 
 mod asset;
+#[cfg(feature = "bake")]
+mod bake;
 mod body;
 #[cfg(feature = "render")]
 mod deform;
@@ -53,6 +58,10 @@ use bevy::{
 };
 
 pub use asset::{ModalAsset, ModalAssetError, ModalAssetLoader};
+#[cfg(feature = "bake")]
+pub use bake::{
+    BakeBodyError, BakeFailed, BakePlugin, BakeProgress, BakeRequest, BakeShape, BakeSkin, BakeStage,
+};
 pub use body::{BodyState, Driven, Integration, ModalBody, NoPointerGrab};
 #[cfg(feature = "render")]
 pub use deform::{DrawnSurface, SurfaceDeformation, SurfaceDetail, SurfaceShading};

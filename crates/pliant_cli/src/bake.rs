@@ -103,20 +103,6 @@ struct Seconds {
     total: f64,
 }
 
-/// The user's own place for what can be made again; `None` where the system names none.
-fn user_cache() -> Option<PathBuf> {
-    let folder = |name: &str| std::env::var_os(name).map(PathBuf::from).filter(|path| path.is_absolute());
-    let base = if cfg!(windows) {
-        folder("LOCALAPPDATA")
-    } else if cfg!(target_os = "macos") {
-        folder("HOME").map(|home| home.join("Library/Caches"))
-    } else {
-        // The XDG base directory specification.
-        folder("XDG_CACHE_HOME").or_else(|| folder("HOME").map(|home| home.join(".cache")))
-    };
-    base.map(|base| base.join("pliant/bakes"))
-}
-
 pub(crate) fn run(args: BakeArgs) -> Result<(), CliError> {
     let start = Instant::now();
     if let Some(got) = args.threads {
@@ -164,7 +150,11 @@ pub(crate) fn run(args: BakeArgs) -> Result<(), CliError> {
         };
         bar.report(stage, share);
     };
-    let cache = if args.no_cache { None } else { args.cache.or_else(user_cache) }.map(BakeCache::new);
+    let cache = match args.cache {
+        _ if args.no_cache => None,
+        Some(folder) => Some(BakeCache::new(folder)),
+        None => BakeCache::of_user(),
+    };
     let (baked, cached, not_kept) = match &cache {
         Some(cache) => {
             let made = bake_cached(cache, &mesh, skin.as_ref(), &config, &mut progress)?;

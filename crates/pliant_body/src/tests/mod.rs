@@ -1,5 +1,6 @@
 //! Apps with time by hand and a bar whose modes are written down, so that every number has an outside value.
 
+mod baking;
 mod display;
 mod grabs;
 pub mod model;

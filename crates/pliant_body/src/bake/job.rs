@@ -1,0 +1,164 @@
+//! One bake on its own threads.
+
+use std::{
+    path::Path,
+    sync::{
+        Arc,
+        atomic::{AtomicBool, AtomicU64, Ordering},
+    },
+    time::Instant,
+};
+
+use bevy::{
+    prelude::*,
+    tasks::{AsyncComputeTaskPool, Task, block_on, poll_once},
+};
+use pliant_bake::{BakeCache, Stage, bake, bake_cached};
+use pliant_mesh::{
+    StuffOptions, Surface, TetMesh,
+    io::{self, Input},
+    stuff,
+};
+use pliant_modal::ModalModel;
+
+use super::{BakeBodyError, BakeProgress, BakeRequest, BakeShape, BakeSkin, BakeStage};
+
+pub(super) enum Outcome {
+    Baked { model: Box<ModalModel>, seconds: f64, cached: bool },
+    Failed(BakeBodyError),
+    Cancelled,
+}
+
+pub(super) struct Job {
+    /// Whose it is; `None` once nobody waits for it.
+    pub entity: Option<Entity>,
+    task: Task<Outcome>,
+    shared: Arc<Shared>,
+}
+
+/// What the bake tells while it runs, and is told.
+#[derive(Default)]
+struct Shared {
+    /// The stage's number in the upper half, its share in millionths in the lower one.
+    progress: AtomicU64,
+    cancelled: AtomicBool,
+}
+
+const STAGES: [BakeStage; 5] =
+    [BakeStage::Mesh, BakeStage::Assemble, BakeStage::Factor, BakeStage::Modes, BakeStage::Surface];
+
+impl Shared {
+    fn report(&self, stage: u64, share: f64) {
+        let millionths = (share.clamp(0.0, 1.0) * 1e6) as u64;
+        self.progress.store(stage << 32 | millionths, Ordering::Relaxed);
+    }
+
+    fn is_cancelled(&self) -> bool {
+        self.cancelled.load(Ordering::Relaxed)
+    }
+}
+
+impl Job {
+    pub fn start(entity: Entity, request: BakeRequest, cache: Option<BakeCache>) -> Self {
+        let shared = Arc::<Shared>::default();
+        let task = AsyncComputeTaskPool::get().spawn({
+            let shared = shared.clone();
+            async move { run(&request, cache.as_ref(), &shared).unwrap_or_else(Outcome::Failed) }
+        });
+        Self { entity: Some(entity), task, shared }
+    }
+
+    pub fn cancel(&mut self) {
+        self.entity = None;
+        self.shared.cancelled.store(true, Ordering::Relaxed);
+    }
+
+    pub fn poll(&mut self) -> Option<Outcome> {
+        block_on(poll_once(&mut self.task))
+    }
+
+    pub fn progress(&self) -> BakeProgress {
+        let packed = self.shared.progress.load(Ordering::Relaxed);
+        let stage = STAGES.get((packed >> 32) as usize).copied().unwrap_or(BakeStage::Surface);
+        BakeProgress::Running { stage, share: (packed & u64::from(u32::MAX)) as f32 * 1e-6 }
+    }
+}
+
+fn run(request: &BakeRequest, cache: Option<&BakeCache>, shared: &Shared) -> Result<Outcome, BakeBodyError> {
+    let start = Instant::now();
+    // Cheap refusals before the long work.
+    request.config.check()?;
+    // The other half is the game's: a bake on every core would take the frames' time.
+    let cores = std::thread::available_parallelism().map_or(1, usize::from);
+    let threads = rayon::ThreadPoolBuilder::new()
+        .num_threads((cores / 2).max(1))
+        .thread_name(|number| format!("bake {number}"))
+        .build()
+        .map_err(|error| BakeBodyError::Threads(error.to_string()))?;
+    threads.install(|| {
+        let (mesh, skin) = mesh(request, shared)?;
+        if shared.is_cancelled() {
+            return Ok(Outcome::Cancelled);
+        }
+        let mut progress = |stage, share| {
+            let stage = match stage {
+                Stage::Assemble => 1,
+                Stage::Factor => 2,
+                Stage::Modes => 3,
+                Stage::Surface => 4,
+            };
+            shared.report(stage, share);
+        };
+        let (model, cached) = match cache {
+            Some(cache) => {
+                let made = bake_cached(cache, &mesh, skin.as_ref(), &request.config, &mut progress)?;
+                if let Some(error) = made.not_kept {
+                    warn!("a bake is not kept in {}: {error}", cache.folder().display());
+                }
+                (made.bake.model, made.cached)
+            }
+            None => (bake(&mesh, skin.as_ref(), &request.config, &mut progress)?.model, false),
+        };
+        Ok(Outcome::Baked { model: Box::new(model), seconds: start.elapsed().as_secs_f64(), cached })
+    })
+}
+
+/// The tetrahedra, and the surface that is worn over them if it is not their boundary.
+fn mesh(request: &BakeRequest, shared: &Shared) -> Result<(TetMesh, Option<Surface>), BakeBodyError> {
+    let options = StuffOptions::with_target(request.tets);
+    let mut progress = |share: f32| shared.report(0, f64::from(share));
+    let (tets, own) = match &request.shape {
+        BakeShape::Distance(distance) => {
+            (stuff(&**distance, &options, &mut progress)?, Own("a distance", None))
+        }
+        BakeShape::Input(input) => fill(Input::clone(input), &options, &mut progress)?,
+        BakeShape::File(path) => fill(read(path)?, &options, &mut progress)?,
+    };
+    let skin = match &request.skin {
+        BakeSkin::Tetrahedra => None,
+        BakeSkin::Shape => Some(own.1.ok_or(BakeBodyError::NoSurface { got: own.0 })?),
+        BakeSkin::File(path) => Some(io::read_surface(path)?),
+        BakeSkin::Surface(surface) => Some(Surface::clone(surface)),
+    };
+    Ok((tets, skin))
+}
+
+fn read(path: &Path) -> Result<Input, BakeBodyError> {
+    Ok(io::read(path)?)
+}
+
+/// What a shape is called, and the surface that it is, if it is one.
+struct Own(&'static str, Option<Surface>);
+
+fn fill(
+    input: Input,
+    options: &StuffOptions,
+    progress: &mut dyn FnMut(f32),
+) -> Result<(TetMesh, Own), BakeBodyError> {
+    let own = match &input {
+        Input::Surface(surface) => Own("a surface", Some(surface.clone())),
+        Input::Tets(_) => Own("tetrahedra", None),
+        _ => Own("a scene of rounded parts", None),
+    };
+    Ok((input.into_tets(options, progress)?, own))
+}

@@ -1,0 +1,139 @@
+//! Baking in the game itself, beside its frames.
+
+mod job;
+mod request;
+
+use std::collections::VecDeque;
+
+use bevy::prelude::*;
+use pliant_bake::BakeCache;
+
+pub use request::{BakeBodyError, BakeFailed, BakeProgress, BakeRequest, BakeShape, BakeSkin, BakeStage};
+
+use crate::{ModalAsset, ModalBody};
+use job::{Job, Outcome};
+
+/// Bakes what [`BakeRequest`]s ask for: meshing, finite elements and modes on threads of their own, while the game goes on.
+///
+/// One bake runs at a time, on half of the cores, the others wait in the order in which they came. Its [`BakeProgress`] stands on the
+/// entity; when it is done the entity's [`ModalBody`] has its model. Changing the request starts again; removing it or despawning the
+/// entity cancels: what waits is forgotten, what runs ends after the part that it is in, and nobody hears of it.
+///
+/// Finished bakes are kept on disk by the hash of what was asked for, so that an unchanged one is only read.
+#[derive(Debug, Clone)]
+pub struct BakePlugin {
+    /// Where finished bakes are kept. Default: the user's own cache, the one that `pliant bake` uses; `None` keeps nothing.
+    pub cache: Option<BakeCache>,
+}
+
+impl Default for BakePlugin {
+    fn default() -> Self {
+        Self { cache: BakeCache::of_user() }
+    }
+}
+
+impl Plugin for BakePlugin {
+    fn build(&self, app: &mut App) {
+        app.register_type::<BakeProgress>()
+            .register_type::<BakeStage>()
+            .add_message::<BakeFailed>()
+            .insert_resource(Bakery { cache: self.cache.clone(), waiting: VecDeque::new(), running: None })
+            .add_observer(forget)
+            .add_systems(PreUpdate, (take_orders, work).chain());
+    }
+}
+
+/// What is being baked and what waits.
+#[derive(Resource)]
+struct Bakery {
+    cache: Option<BakeCache>,
+    waiting: VecDeque<Entity>,
+    running: Option<Job>,
+}
+
+fn forget(removed: On<Remove, BakeRequest>, mut bakery: ResMut<Bakery>, mut commands: Commands) {
+    bakery.drop_order(removed.entity);
+    if let Ok(mut entity) = commands.get_entity(removed.entity) {
+        entity.try_remove::<BakeProgress>();
+    }
+}
+
+impl Bakery {
+    fn drop_order(&mut self, entity: Entity) {
+        self.waiting.retain(|&waiting| waiting != entity);
+        if let Some(job) = &mut self.running
+            && job.entity == Some(entity)
+        {
+            // No thread can be stopped from outside: it ends by itself, for nobody.
+            job.cancel();
+        }
+    }
+}
+
+fn take_orders(
+    mut bakery: ResMut<Bakery>,
+    mut requests: Query<(Entity, &mut BakeProgress), Changed<BakeRequest>>,
+) {
+    for (entity, mut progress) in &mut requests {
+        bakery.drop_order(entity);
+        bakery.waiting.push_back(entity);
+        *progress = BakeProgress::Waiting;
+    }
+}
+
+fn work(
+    mut commands: Commands,
+    mut bakery: ResMut<Bakery>,
+    mut models: ResMut<Assets<ModalAsset>>,
+    mut failures: MessageWriter<BakeFailed>,
+    mut requests: Query<(NameOrEntity, &BakeRequest, &mut BakeProgress, Option<&mut ModalBody>)>,
+) {
+    // Nothing waits and nothing runs in nearly every frame of a game.
+    if bakery.running.is_none() && bakery.waiting.is_empty() {
+        return;
+    }
+    if let Some(job) = &mut bakery.running {
+        let order = job.entity.and_then(|entity| requests.get_mut(entity).ok());
+        match (job.poll(), order) {
+            (None, Some((_, _, mut progress, _))) => {
+                let now = job.progress();
+                if *progress != now {
+                    *progress = now;
+                }
+            }
+            (None, None) => {}
+            (Some(outcome), order) => {
+                bakery.running = None;
+                if let Some((name, _, mut progress, body)) = order {
+                    match outcome {
+                        Outcome::Baked { model, seconds, cached } => {
+                            let model = models.add(ModalAsset::from(*model));
+                            *progress = BakeProgress::Done { seconds, cached };
+                            match body {
+                                Some(mut body) => body.model = model,
+                                None => {
+                                    commands.entity(name.entity).insert(ModalBody::new(model));
+                                }
+                            }
+                        }
+                        Outcome::Failed(error) => {
+                            error!("{name}: {error}");
+                            *progress = BakeProgress::Failed { reason: error.to_string() };
+                            failures.write(BakeFailed { entity: name.entity, error });
+                        }
+                        Outcome::Cancelled => {}
+                    }
+                }
+            }
+        }
+    }
+    while bakery.running.is_none()
+        && let Some(entity) = bakery.waiting.pop_front()
+    {
+        if let Ok((_, request, mut progress, _)) = requests.get_mut(entity) {
+            let job = Job::start(entity, request.clone(), bakery.cache.clone());
+            *progress = job.progress();
+            bakery.running = Some(job);
+        }
+    }
+}

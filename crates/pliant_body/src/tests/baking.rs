@@ -1,0 +1,162 @@
+#![cfg(feature = "bake")]
+
+use std::time::Duration;
+
+use bevy::prelude::*;
+use pliant_bake::{BakeCache, BakeConfig};
+use pliant_mesh::shapes;
+
+use super::{app, model, state, tick};
+use crate::{BakeFailed, BakePlugin, BakeProgress, BakeRequest, BakeSkin, BodyState, ModalAsset, ModalBody};
+
+fn baking_app(cache: Option<BakeCache>) -> App {
+    let mut app = app();
+    app.add_plugins(BakePlugin { cache });
+    app
+}
+
+/// A bar of 1 m, held at one end, that bakes in about a tenth of a second.
+fn bar(modes: usize) -> BakeRequest {
+    let config = BakeConfig {
+        name: "bar".into(),
+        modes,
+        anchors: vec!["x<0.001".parse().unwrap()],
+        sites: Some(8),
+        ..BakeConfig::default()
+    };
+    BakeRequest { config, ..BakeRequest::new(shapes::bar([12, 3, 3], [1.0, 0.2, 0.2]).unwrap().into()) }
+}
+
+fn progress(app: &App, entity: Entity) -> BakeProgress {
+    app.world().get::<BakeProgress>(entity).expect("a request has its progress").clone()
+}
+
+/// Runs frames until the bake of `entity` is over, and tells how many there were and what was seen on the way.
+fn wait(app: &mut App, entity: Entity) -> Vec<BakeProgress> {
+    let mut seen = Vec::new();
+    for _ in 0..30_000 {
+        app.update();
+        let now = progress(app, entity);
+        let over = matches!(now, BakeProgress::Done { .. } | BakeProgress::Failed { .. });
+        seen.push(now);
+        if over {
+            return seen;
+        }
+        std::thread::sleep(Duration::from_millis(1));
+    }
+    panic!("no end within 30,000 frames: {:?}", seen.last());
+}
+
+#[test]
+fn a_request_becomes_a_body_while_the_frames_go_on() {
+    let mut app = baking_app(None);
+    let mut settings = ModalBody::default();
+    settings.gravity.y = -1.0;
+    let entity = app.world_mut().spawn((bar(6), settings)).id();
+    let before = tick(&app);
+    let seen = wait(&mut app, entity);
+    // The ticks went on, one a frame, while it was baked elsewhere.
+    assert_eq!(tick(&app) - before, seen.len() as u64);
+    assert!(seen.len() > 3, "{seen:?}");
+    assert!(
+        matches!(seen.last(), Some(BakeProgress::Done { cached: false, seconds }) if *seconds > 0.0),
+        "{seen:?}"
+    );
+    app.update();
+    // The same as a bake by hand, and the settings that stood beside the request are kept.
+    let by_hand = pliant_bake::bake(
+        &shapes::bar([12, 3, 3], [1.0, 0.2, 0.2]).unwrap(),
+        None,
+        &bar(6).config,
+        &mut |_, _| (),
+    )
+    .unwrap();
+    assert_eq!(state(&app, entity).model().hash(), by_hand.model.hash());
+    assert_eq!(state(&app, entity).body().config().gravity, [0.0, -1.0, 0.0]);
+}
+
+#[test]
+fn an_unchanged_bake_is_read_and_a_changed_request_is_baked_again() {
+    let folder = std::env::temp_dir().join(format!("pliant_body-bakes-{}", std::process::id()));
+    let cache = BakeCache::new(&folder);
+    let mut app = baking_app(Some(cache.clone()));
+    let [first, second] = [0, 1].map(|_| app.world_mut().spawn(bar(5)).id());
+    wait(&mut app, second);
+    // One at a time, in the order in which they came: the second found what the first had made.
+    assert!(matches!(progress(&app, first), BakeProgress::Done { cached: false, .. }));
+    assert!(matches!(progress(&app, second), BakeProgress::Done { cached: true, .. }));
+    app.update();
+    assert_eq!(state(&app, first).model().hash(), state(&app, second).model().hash());
+
+    app.world_mut().get_mut::<BakeRequest>(second).unwrap().config.modes = 7;
+    wait(&mut app, second);
+    app.update();
+    assert_eq!((state(&app, first).body().mode_count(), state(&app, second).body().mode_count()), (5, 7));
+    std::fs::remove_dir_all(folder).unwrap();
+}
+
+#[test]
+fn what_cannot_be_baked_says_why_and_the_next_one_is_made() {
+    let mut app = baking_app(None);
+    let missing = app.world_mut().spawn((Name::new("jelly"), BakeRequest::file("no/such/jelly.obj"))).id();
+    let mut nan = bar(5);
+    nan.config.young = f64::NAN;
+    let nan = app.world_mut().spawn(nan).id();
+    let bare = app.world_mut().spawn(BakeRequest { skin: BakeSkin::Shape, ..bar(5) }).id();
+    let good = app.world_mut().spawn(bar(5)).id();
+    let mut cursor = app.world().resource::<Messages<BakeFailed>>().get_cursor();
+    let mut told = Vec::new();
+    for _ in 0..30_000 {
+        app.update();
+        let messages = app.world().resource::<Messages<BakeFailed>>();
+        told.extend(cursor.read(messages).map(|failed| (failed.entity, failed.error.to_string())));
+        if matches!(progress(&app, good), BakeProgress::Done { .. }) {
+            break;
+        }
+        std::thread::sleep(Duration::from_millis(1));
+    }
+    assert_eq!(told.iter().map(|(entity, _)| *entity).collect::<Vec<_>>(), [missing, nan, bare], "{told:?}");
+    for ((entity, text), expected) in told.iter().zip(["jelly.obj", "Young's modulus", "expected a surface"])
+    {
+        assert!(text.contains(expected), "{text}");
+        assert_eq!(progress(&app, *entity), BakeProgress::Failed { reason: text.clone() });
+        assert!(app.world().get::<ModalBody>(*entity).is_none());
+    }
+    app.update();
+    assert!(app.world().get::<BodyState>(good).is_some());
+}
+
+#[test]
+fn a_request_that_is_gone_makes_nothing_and_keeps_nobody_waiting() {
+    let mut app = baking_app(None);
+    let models = |app: &App| app.world().resource::<Assets<ModalAsset>>().len();
+    let before = models(&app);
+    let [running, waiting, withdrawn, last] =
+        [5, 6, 7, 8].map(|modes| app.world_mut().spawn(bar(modes)).id());
+    app.update();
+    assert!(matches!(progress(&app, running), BakeProgress::Running { .. }));
+    assert_eq!(progress(&app, waiting), BakeProgress::Waiting);
+    app.world_mut().despawn(running);
+    app.world_mut().despawn(waiting);
+    app.world_mut().entity_mut(withdrawn).remove::<BakeRequest>();
+    wait(&mut app, last);
+    app.update();
+    assert_eq!(state(&app, last).body().mode_count(), 8);
+    assert_eq!(models(&app), before + 1, "of the others nothing was made");
+    assert!(app.world().get::<BakeProgress>(withdrawn).is_none());
+}
+
+#[test]
+fn a_new_bake_under_a_hand_is_held_on() {
+    let mut app = baking_app(None);
+    let entity = super::spawn(&mut app, model::bar(), ());
+    let hand =
+        app.world_mut().spawn((crate::Grab::new(3, 0.1, bevy::math::DVec3::ONE), crate::GrabOf(entity))).id();
+    app.update();
+    assert!(state(&app, entity).grab_id(hand).is_some());
+    app.world_mut().entity_mut(entity).insert(bar(5));
+    wait(&mut app, entity);
+    super::steps(&mut app, 2);
+    assert_eq!(state(&app, entity).body().mode_count(), 5);
+    assert!(state(&app, entity).grab_id(hand).is_some(), "the hand holds the new body");
+}
