@@ -73,6 +73,10 @@ struct Options {
     #[arg(long, default_value = "none", value_parser = session::network)]
     network: std::option::Option<Preset>,
 
+    /// Write the state of every tick to this file, for `join --compare`.
+    #[arg(long)]
+    trace: Option<PathBuf>,
+
     /// End after so many seconds.
     #[arg(long)]
     seconds: Option<f64>,
@@ -140,6 +144,10 @@ fn run(options: &Options) -> Result<(), Box<dyn Error>> {
     let body = app.world_mut().spawn((body, SharedBody::named(session::BODY))).id();
     if options.play {
         app.world_mut().entity_mut(body).insert(session::Script::of(0));
+    }
+    if let Some(file) = &options.trace {
+        app.insert_resource(session::trace::Trace::create(file)?)
+            .add_systems(FixedUpdate, session::trace::write_truth.after(PliantSystems::Publish));
     }
     app.run();
     Ok(())

@@ -36,7 +36,7 @@ use pliant::stream::emulator::Preset;
 #[derive(Parser, Debug)]
 pub struct Options {
     /// What the host has printed.
-    #[arg(required_unless_present = "replay")]
+    #[arg(required_unless_present_any = ["replay", "compare"])]
     invite: Option<Invite>,
 
     /// What you are called.
@@ -75,6 +75,14 @@ pub struct Options {
     #[arg(long, conflicts_with = "record")]
     replay: Option<PathBuf>,
 
+    /// Write what is shown for each tick to this file.
+    #[arg(long)]
+    trace: Option<PathBuf>,
+
+    /// Compare what a guest has shown with what the host computed: two files of --trace, the host's first.
+    #[arg(long, num_args = 2, value_names = ["HOST", "GUEST"])]
+    compare: Vec<PathBuf>,
+
     /// No window: a hand moves by itself, a line a second says how it goes.
     #[arg(long)]
     headless: bool,
@@ -112,6 +120,10 @@ fn main() -> ExitCode {
 
 fn run(options: &Options) -> Result<(), Box<dyn Error>> {
     let shipped = || session::model("pip.modal".as_ref());
+    if let [host, guest] = options.compare.as_slice() {
+        // The first five seconds are for finding the clock and taking hold.
+        return session::trace::compare(&*shipped()?, host, guest, 200);
+    }
     let emulation = session::emulation(options.network, options.seed);
     if let (Some(number), Some(invite)) = (options.bots, &options.invite) {
         let (holders, light, seconds) = (options.holders, options.light, options.seconds.unwrap_or(10.0));
@@ -141,7 +153,7 @@ fn run(options: &Options) -> Result<(), Box<dyn Error>> {
     }
     let mut app = session::headless(Level::WARN);
     app.add_plugins((PliantBodyPlugin::default(), net)).add_systems(Update, session::say);
-    finish(&mut app, options);
+    finish(&mut app, options)?;
     match app.run() {
         AppExit::Success => Ok(()),
         AppExit::Error(_) => Err("the session is over".into()),
@@ -149,7 +161,11 @@ fn run(options: &Options) -> Result<(), Box<dyn Error>> {
 }
 
 /// What the app does with a window and without.
-fn finish(app: &mut App, options: &Options) {
+fn finish(app: &mut App, options: &Options) -> Result<(), Box<dyn Error>> {
+    if let Some(file) = &options.trace {
+        app.insert_resource(session::trace::Trace::create(file)?)
+            .add_systems(Last, session::trace::write_shown);
+    }
     app.insert_resource(session::EndAfter(options.seconds))
         .add_systems(Last, session::end)
         .add_systems(Update, tell);
@@ -162,6 +178,7 @@ fn finish(app: &mut App, options: &Options) {
         };
         app.add_systems(Update, script).add_systems(FixedUpdate, session::play.before(PliantSystems::Input));
     }
+    Ok(())
 }
 
 /// The course of the session, and the end of it.

@@ -22,7 +22,7 @@ pub fn run(options: &Options, net: NetPlugin) -> Result<(), Box<dyn Error>> {
     .add_plugins((PliantPlugins::default(), net))
     .insert_resource(bevy::winit::WinitSettings::continuous())
     .add_systems(Update, (dress, draw_hands, read_out));
-    finish(&mut app, options);
+    finish(&mut app, options)?;
     match app.run() {
         AppExit::Success => Ok(()),
         AppExit::Error(_) => Err("the session is over".into()),

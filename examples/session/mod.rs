@@ -1,6 +1,8 @@
 //! What the networked examples share: the body, a network by its name, a kept key, a hand that moves by itself, an app without a window.
 #![allow(dead_code, reason = "each example uses the part that it needs")]
 
+pub mod trace;
+
 use std::error::Error;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;

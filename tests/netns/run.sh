@@ -1,0 +1,157 @@
+#!/bin/sh
+# A session between three network namespaces: a server and two guests, each on a line of its own of 2 Mb/s (tbf), with the paper's first network (9 %
+# loss, 196 ms) emulated on top, 60 s of two hands dragging; then what happens when processes and lines die.
+#
+#   tests/netns/run.sh [SECONDS] [drag|faults|all]
+#
+# Needs root or CAP_NET_ADMIN, `ip` and `tc`; says so and ends with 77 (skipped) where it is not allowed. Binaries: those of BIN, or built by cargo.
+# Ends with 1 when a figure is beyond its bar.
+set -u
+cd "$(dirname "$0")/../.."
+seconds=${1:-60}
+what=${2:-all}
+
+skip() { echo "skipped: $1"; exit 77; }
+command -v ip >/dev/null || skip "no ip"
+command -v tc >/dev/null || skip "no tc"
+tag=pl$$
+ip netns add $tag-s 2>/dev/null || skip "network namespaces are not allowed here"
+
+work=$(mktemp -d)
+pids=""
+cleanup() {
+    for pid in $pids; do kill "$pid" 2>/dev/null; done
+    for ns in s a b; do ip netns del $tag-$ns 2>/dev/null; done
+    [ "${KEEP:-}" ] && echo "kept $work" || rm -rf "$work"
+}
+trap cleanup EXIT
+trap 'exit 130' INT TERM
+
+if [ -z "${BIN:-}" ]; then
+    cargo build --release -p pliant --no-default-features --features net --example dedicated_server --example join || exit 2
+    BIN=$(cargo metadata --format-version 1 --no-deps | sed 's/.*"target_directory":"\([^"]*\)".*/\1/')/release/examples
+fi
+
+# A line: a pair of veths with a token bucket at both ends.
+line() {
+    ip netns add $tag-$1 && ip link add $tag-$1 netns $tag-$1 type veth peer name v$1 netns $tag-s || skip "no veth"
+    ip netns exec $tag-s ip addr add 10.77.$2.1/24 dev v$1
+    ip netns exec $tag-$1 ip addr add 10.77.$2.2/24 dev $tag-$1
+    for end in "$tag-s v$1" "$tag-$1 $tag-$1"; do
+        set -- "$1" "$2" $end
+        ip netns exec "$3" ip link set "$4" up
+        ip netns exec "$3" tc qdisc add dev "$4" root tbf rate 2mbit burst 16kb latency 50ms || skip "no tbf"
+    done
+    ip netns exec $tag-$1 ip link set lo up
+    ip netns exec $tag-$1 ip route add default via 10.77.$2.1
+}
+line a 1
+line b 2
+ip netns exec $tag-s ip link set lo up
+
+serve() { # log, more options
+    log=$1; shift
+    ip netns exec $tag-s "$BIN/dedicated_server" --bind 0.0.0.0:4433 --key "$work/key" "$@" >"$log" 2>&1 &
+    server=$!
+    pids="$pids $server"
+    for _ in $(seq 100); do grep -q "to hold" "$log" && break; sleep 0.1; done
+    key=$(sed -n 's/.*#\([0-9a-f]*\).*/\1/p' "$log" | head -1)
+}
+# guest NAME NET LOG options
+guest() {
+    ns=$1; net=$2; log=$3; shift 3
+    ip netns exec $tag-$ns "$BIN/join" "pliant://10.77.$net.1:4433#$key" --headless --cached --name "$ns" "$@" >"$log" 2>&1 &
+    last=$!
+    pids="$pids $last"
+}
+now() { date +%s.%N; }
+failed=0
+bar() { # name value most
+    if awk "BEGIN { exit !($2 <= $3) }"; then echo "ok    $1: $2 (at most $3)"; else echo "ABOVE $1: $2 (at most $3)"; failed=1; fi
+}
+
+drag() {
+    echo "== $seconds s of two hands over 2 Mb/s, 9 % and 196 ms each"
+    serve "$work/server.log" --trace "$work/truth" --seconds $((seconds + 15))
+    guest a 1 "$work/a.log" --network paper-1 --seed 2 --seconds "$seconds" --trace "$work/a.trace"; ga=$last
+    guest b 2 "$work/b.log" --network paper-1 --seed 3 --seconds "$seconds" --trace "$work/b.trace"; gb=$last
+    sleep 5
+    from=$(cat_bytes); t0=$(now)
+    wait $ga $gb
+    to=$(cat_bytes); t1=$(now)
+    kill -INT $server; wait $server
+    for g in a b; do
+        tail -1 "$work/$g.log"
+        result=$("$BIN/join" --compare "$work/truth" "$work/$g.trace") || { echo "$result"; failed=1; continue; }
+        echo "$g: $result"
+        bar "$g: shown error rms, %" "$(echo "$result" | sed 's/.*shown error \([0-9.]*\) % rms.*/\1/')" 2
+        bar "$g: reaction rms, %" "$(echo "$result" | sed 's/.*reaction \([0-9.]*\) % rms.*/\1/')" 10
+        ticks=$(echo "$result" | sed 's/^\([0-9]*\) ticks.*/\1/')
+        bar "$g: ticks not shown, %" "$(awk "BEGIN { print 100 * (1 - $ticks / (40 * ($seconds - 6))) }")" 2
+    done
+    set -- $from $to
+    bar "a: line used, kbit/s" "$(awk "BEGIN { print ($3 - $1) * 8e-3 / ($t1 - $t0) }")" 2000
+    bar "b: line used, kbit/s" "$(awk "BEGIN { print ($4 - $2) * 8e-3 / ($t1 - $t0) }")" 2000
+}
+# Bytes that the server has sent on each line.
+cat_bytes() { for v in va vb; do ip netns exec $tag-s cat /sys/class/net/$v/statistics/tx_bytes; done | tr '\n' ' '; }
+
+# wait_for LOG PATTERN SECONDS: prints how long it took.
+wait_for() {
+    t0=$(now)
+    for _ in $(seq $(($3 * 20))); do
+        if grep -q "$2" "$1"; then awk "BEGIN { printf \"%.1f\n\", $(now) - $t0 }"; return 0; fi
+        sleep 0.05
+    done
+    echo "not within $3 s"; failed=1; return 1
+}
+
+faults() {
+    echo "== faults: who noticed, after how long"
+    serve "$work/s1.log"
+    guest a 1 "$work/fa.log"; ga=$last
+    guest b 2 "$work/fb.log"; gb=$last
+    wait_for "$work/fa.log" "in as user" 10 >/dev/null; wait_for "$work/fb.log" "in as user" 10 >/dev/null
+    sleep 2
+
+    kill -9 $gb
+    echo "kill -9 of guest b: the server, after $(wait_for "$work/s1.log" "b is gone" 15) s; guest a goes on: $(grep -c "cannot be heard" "$work/fa.log") losses"
+
+    ip netns exec $tag-s ip link set va down; sleep 10; ip netns exec $tag-s ip link set va up
+    echo "line a down for 10 s: guest a back after $(wait_for_again "$work/fa.log" 15) s of line; losses it saw: $(grep -c "cannot be heard" "$work/fa.log")"
+
+    kill -9 $server
+    echo "kill -9 of the server: guest a, after $(wait_for_new "$work/fa.log" "cannot be heard" 15) s"
+    serve "$work/s2.log"
+    echo "server started anew: guest a in again after $(wait_for_new "$work/fa.log" "again" 20) s, and $(tail -1 "$work/s2.log" | cut -c1-0)the server has $(grep -c "has joined" "$work/s2.log") guest(s)"
+    t0=$(now); kill -INT $ga; wait $ga 2>/dev/null
+    echo "Ctrl-C at guest a: the server, after $(wait_for "$work/s2.log" "a is gone" 5) s"
+    if grep -qE "ERROR|panicked" "$work"/*.log; then echo "errors in the logs:"; grep -hE "ERROR|panicked" "$work"/*.log | head -5; failed=1; else echo "no error in any log"; fi
+    kill -INT $server; wait $server 2>/dev/null
+}
+# More lines of PATTERN than there are now.
+wait_for_new() {
+    had=$(grep -c "$2" "$1"); t0=$(now)
+    for _ in $(seq $(($3 * 20))); do
+        if [ "$(grep -c "$2" "$1")" -gt "$had" ]; then awk "BEGIN { printf \"%.1f\n\", $(now) - $t0 }"; return 0; fi
+        sleep 0.05
+    done
+    echo "not within $3 s"; failed=1; return 1
+}
+# Data flows again: a line of figures with datagrams coming.
+wait_for_again() {
+    t0=$(now)
+    for _ in $(seq $(($2 * 20))); do
+        in=$(tail -1 "$1" | sed -n 's/.*  *\([0-9]*\) kbit\/s in.*/\1/p')
+        if [ "${in:-0}" -gt 10 ]; then awk "BEGIN { printf \"%.1f\n\", $(now) - $t0 }"; return 0; fi
+        sleep 0.05
+    done
+    echo "not within $2 s"; failed=1; return 1
+}
+
+case $what in
+    drag) drag ;;
+    faults) faults ;;
+    *) drag; faults ;;
+esac
+exit $failed
