@@ -50,7 +50,7 @@ line b 2
 ip netns exec $tag-s ip link set lo up
 
 serve() { # log, more options
-    log=$1; shift
+    log=$1; shift; : >"$log"
     ip netns exec $tag-s "$BIN/dedicated_server" --bind 0.0.0.0:4433 --key "$work/key" "$@" >"$log" 2>&1 &
     server=$!
     pids="$pids $server"
@@ -59,7 +59,7 @@ serve() { # log, more options
 }
 # guest NAME NET LOG options
 guest() {
-    ns=$1; net=$2; log=$3; shift 3
+    ns=$1; net=$2; log=$3; shift 3; : >"$log"
     ip netns exec $tag-$ns "$BIN/join" "pliant://10.77.$net.1:4433#$key" --headless --cached --name "$ns" "$@" >"$log" 2>&1 &
     last=$!
     pids="$pids $last"
@@ -123,7 +123,7 @@ faults() {
     kill -9 $server
     echo "kill -9 of the server: guest a, after $(wait_for_new "$work/fa.log" "cannot be heard" 15) s"
     serve "$work/s2.log"
-    echo "server started anew: guest a in again after $(wait_for_new "$work/fa.log" "again" 20) s, and $(tail -1 "$work/s2.log" | cut -c1-0)the server has $(grep -c "has joined" "$work/s2.log") guest(s)"
+    echo "server started anew: guest a in again after $(wait_for_new "$work/fa.log" "again" 20) s; the server has $(grep -c "has joined" "$work/s2.log") guest(s)"
     t0=$(now); kill -INT $ga; wait $ga 2>/dev/null
     echo "Ctrl-C at guest a: the server, after $(wait_for "$work/s2.log" "a is gone" 5) s"
     if grep -qE "ERROR|panicked" "$work"/*.log; then echo "errors in the logs:"; grep -hE "ERROR|panicked" "$work"/*.log | head -5; failed=1; else echo "no error in any log"; fi
