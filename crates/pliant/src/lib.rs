@@ -117,7 +117,7 @@ pub mod prelude {
     pub use crate::body::{
         BodyRefused, BodyState, Driven, Grab, GrabForce, GrabOf, Grabs, Integration, ModalAsset, ModalBody,
         NoPointerGrab, PliantBodyPlugin, PliantDisplaySystems, PliantSystems, PliantTick, PointerGrab,
-        PointerGrabPlugin, PointerGrabSystems, PointerHeld, ShownState,
+        PointerGrabPlugin, PointerGrabSystems, PointerHeld, ShownState, SingleSteps,
     };
     pub use crate::modal::{ModalModel, Patch};
 }
