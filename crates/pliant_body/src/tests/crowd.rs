@@ -72,5 +72,5 @@ fn a_thousand_bodies_at_rest_on_screen_write_no_mesh() {
         written += cursor.read(app.world().resource::<Messages<AssetEvent<Mesh>>>()).count();
     }
     assert_eq!(written, 0);
-    assert_eq!(measured(&app, &crate::DEFORM_TIME).0.is_some(), true, "they were drawn when they came");
+    assert!(measured(&app, &crate::DEFORM_TIME).0.is_some(), "they were drawn when they came");
 }
