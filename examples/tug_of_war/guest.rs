@@ -9,6 +9,7 @@ use std::time::Duration;
 use bevy::app::ScheduleRunnerPlugin;
 use bevy::math::DVec3;
 use bevy::prelude::*;
+use pliant::modal::ModalModel;
 use pliant::net::{Emulation, Invite, JoinConfig, JoinOptions, NetPlugin, RemoteBody};
 use pliant::prelude::*;
 
@@ -39,11 +40,15 @@ impl Other {
 
 pub fn start(
     invite: &Invite,
+    model: Arc<ModalModel>,
     emulation: Option<Emulation>,
     other: Other,
 ) -> Result<JoinHandle<()>, Box<dyn Error>> {
     let transport = JoinOptions { emulation, ..default() };
-    let net = NetPlugin::join(invite, JoinConfig { name: "right".into(), transport, ..default() })?;
+    let net = NetPlugin::join(
+        invite,
+        JoinConfig { name: "right".into(), transport, models: vec![model], ..default() },
+    )?;
     let run = move || {
         App::new()
             .add_plugins((

@@ -44,13 +44,15 @@ fn main() -> Result<(), Box<dyn Error>> {
     let net = NetPlugin::host(HostConfig { name: "left".into(), ..default() })?;
     let invite = net.invite().cloned().ok_or("no invite")?;
     let other = Other::default();
-    let thread = guest::start(&invite, session::emulation(options.network, 5), other.clone())?;
+    // What takes long over such a network is the model; here both have it.
+    let model = session::model("pip.modal".as_ref())?;
+    let thread = guest::start(&invite, model, session::emulation(options.network, 5), other.clone())?;
     App::new()
         .add_plugins(
             stage::Stage::with("tug of war", options.stage)
                 .bare()
                 .real_time()
-                .picture_at(5.0)
+                .picture_at(9.0)
                 .key("left mouse: pull on the left")
                 .key("arrows: pull on the right"),
         )
@@ -59,6 +61,7 @@ fn main() -> Result<(), Box<dyn Error>> {
         .insert_resource(other.clone())
         .init_resource::<Score>()
         .init_gizmo_group::<RightGizmos>()
+        .insert_resource(ClearColor(Color::srgb(0.665, 0.695, 0.73)))
         .add_systems(Startup, setup)
         .add_systems(FixedUpdate, session::play.before(PliantSystems::Input))
         .add_systems(Update, (split, steer, mirror, draw_hands, score).chain())
@@ -133,6 +136,13 @@ fn setup(
             Half { right },
         ));
     }
+    // Above both halves: the words.
+    commands.spawn((
+        Camera2d,
+        Camera { order: 2, clear_color: ClearColorConfig::None, ..default() },
+        RenderLayers::none(),
+        IsDefaultUiCamera,
+    ));
     gizmos.config_mut::<RightGizmos>().0.render_layers = RenderLayers::layer(1);
 }
 
@@ -140,7 +150,8 @@ fn setup(
 fn split(windows: Query<&Window>, mut cameras: Query<(&mut Camera, &Half)>) {
     let Ok(window) = windows.single() else { return };
     let size = window.physical_size();
-    let half = UVec2::new((size.x / 2).max(1), size.y.max(1));
+    // A line between them.
+    let half = UVec2::new((size.x / 2).saturating_sub(1).max(1), size.y.max(1));
     for (mut camera, part) in &mut cameras {
         let physical_position = UVec2::new(if part.right { size.x - half.x } else { 0 }, 0);
         let now = camera.viewport.as_ref().map(|view| (view.physical_position, view.physical_size));
