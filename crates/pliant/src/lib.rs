@@ -36,14 +36,6 @@
     feature = "net",
     doc = "| the plugins of [`net`] | `net` | one body held by several machines, over QUIC |"
 )]
-#![cfg_attr(
-    feature = "haptics",
-    doc = "| the plugins of [`haptics`] | `haptics` | devices that push back, their loop, gamepads that buzz |"
-)]
-#![cfg_attr(
-    feature = "bake",
-    doc = "| [`BakePlugin`](body::BakePlugin) | `bake` | surfaces and descriptions become bodies in the game, beside its frames |"
-)]
 //!
 //! # Features
 //!
@@ -125,7 +117,7 @@ pub mod prelude {
     pub use crate::body::{
         BodyRefused, BodyState, Driven, Grab, GrabForce, GrabOf, Grabs, Integration, ModalAsset, ModalBody,
         NoPointerGrab, PliantBodyPlugin, PliantDisplaySystems, PliantSystems, PliantTick, PointerGrab,
-        PointerGrabPlugin, PointerGrabSystems, PointerHeld, ShownState, SingleSteps,
+        PointerGrabPlugin, PointerGrabSystems, PointerHeld, ShownState,
     };
     pub use crate::modal::{ModalModel, Patch};
 }

@@ -9,6 +9,7 @@ mod inspect;
 mod mesh;
 mod output;
 mod progress;
+mod stability;
 mod stream;
 
 use std::process::ExitCode;
@@ -33,6 +34,8 @@ enum Command {
     Inspect(inspect::InspectArgs),
     /// Measures what a body costs on this machine
     Bench(bench::BenchArgs),
+    /// Runs stiff, extreme and unfair cases and says by what margin each keeps its bound
+    Stability(stability::StabilityArgs),
     /// Streams a body over an emulated network and measures what a guest sees
     Stream(stream::StreamArgs),
 }
@@ -44,6 +47,7 @@ fn main() -> ExitCode {
         Command::Bake(args) => bake::run(args),
         Command::Inspect(args) => inspect::run(&args),
         Command::Bench(args) => bench::run(&args),
+        Command::Stability(args) => stability::run(&args),
         Command::Stream(args) => stream::run(&args),
     };
     match done {
@@ -76,6 +80,12 @@ enum CliError {
     Step(#[from] pliant_modal::StepError),
     #[error("{0}")]
     Stream(#[from] pliant_stream::StreamError),
+    #[error("{0}")]
+    Device(#[from] pliant_haptics::StartError),
+    #[error("{0}")]
+    DeviceInfo(#[from] pliant_haptics::InfoError),
+    #[error("{broken} of {of} cases break their bounds")]
+    Unstable { broken: usize, of: usize },
     #[error("{what}: expected one of {expected}, got '{got}'")]
     Unknown { what: &'static str, got: String, expected: String },
     #[error("{what}: expected {low} to {high}, got {got}")]

@@ -518,3 +518,20 @@ fn an_unchanged_bake_comes_from_the_cache() {
         assert!(!cached && word.contains("not kept"), "{word}");
     }
 }
+
+#[test]
+fn the_short_form_of_the_stability_matrix_keeps_its_bounds() {
+    let told = json(&succeeds(&["stability", "--short", "--json"]));
+    let cases = told["cases"].as_array().unwrap();
+    assert!(cases.len() >= 30, "{}", cases.len());
+    let mut with_the_papers_scheme = 0;
+    for case in cases {
+        assert!(case["passed"] == true || case["known_limit"].is_string(), "{case}");
+        assert!(case["margin"].as_f64().unwrap() >= 1.0 || case["known_limit"].is_string(), "{case}");
+        assert!(case["bound"].as_str().unwrap().contains("<=") || case["known_limit"].is_string(), "{case}");
+        with_the_papers_scheme += usize::from(case["plain"].is_string());
+    }
+    assert!(with_the_papers_scheme >= 5, "{with_the_papers_scheme}");
+    let message = refused(&["stability", "--only", "no such case"]);
+    assert!(message.contains("--only"), "{message}");
+}

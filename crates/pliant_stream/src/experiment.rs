@@ -351,8 +351,6 @@ struct Run {
     hash: u64,
     track: Vec<(u64, f64, f64)>,
     last_tick: u64,
-    /// Ticks shown one after the other up to now.
-    in_row: u64,
 }
 
 impl Run {
@@ -392,7 +390,6 @@ impl Run {
             hash: 0xCBF2_9CE4_8422_2325,
             track: Vec::new(),
             last_tick: 0,
-            in_row: 0,
         }
     }
 
@@ -538,8 +535,6 @@ impl World for Run {
         if self.measuring.is_none() || tick <= self.last_tick {
             return;
         }
-        // Second differences are taken of ticks that follow each other; a stall that is caught up with shows as error.
-        self.in_row = if tick == self.last_tick + 1 { self.in_row + 1 } else { 0 };
         self.last_tick = tick;
         let Some(first) = self.truth.front().map(|t| t.tick) else { return };
         let Some(truth) = tick.checked_sub(first).and_then(|i| self.truth.get(i as usize)) else { return };
@@ -558,7 +553,7 @@ impl World for Run {
                 (&mut self.shown_force[i], g.reaction, &mut self.shown_second),
                 (&mut self.true_force[i], *reaction, &mut self.true_second),
             ] {
-                if self.in_row >= 2 {
+                if self.count >= 2 {
                     let d = std::array::from_fn(|k| new[k] - 2.0 * series.1[k] + series.0[k]);
                     *second = second.max(norm(d));
                 }
