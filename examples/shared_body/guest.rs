@@ -21,6 +21,7 @@ use bevy::{
 use pliant::{
     modal::{ModalModel, warp},
     net::{GuestState, NetGuest, NetPlugin, NetStats, RemoteBody, SeenHands, SharedBody, User, colour_of},
+    panel::PanelPlugin,
     prelude::*,
     rerun::{RerunPlugin, RerunScalars},
 };
@@ -43,6 +44,8 @@ pub struct Guest {
     /// Seconds from the first picture of the body on; `None`: until told to stop, or the window is closed.
     pub duration: Option<f64>,
     pub screenshot: Option<PathBuf>,
+    /// The live panel is open from the start.
+    pub panel: bool,
     pub stop: Arc<AtomicBool>,
 }
 
@@ -113,7 +116,7 @@ pub fn run_windowed(guest: Guest) -> GuestReport {
     )
     // The session goes on when the window is not looked at.
     .insert_resource(WinitSettings::continuous())
-    .add_plugins((PointerGrabPlugin, ViewPlugin));
+    .add_plugins((PointerGrabPlugin, ViewPlugin, PanelPlugin { open: guest.panel, ..default() }));
     run(app, guest)
 }
 

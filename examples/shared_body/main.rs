@@ -105,6 +105,7 @@ fn run(options: &Options) -> Result<(), Box<dyn Error>> {
         rerun: None,
         duration: None,
         screenshot: None,
+        panel: false,
         stop: stop_other.clone(),
         ..guest(&options, "other", 2, &model, &invite, &truth)?
     };
@@ -122,6 +123,7 @@ fn run(options: &Options) -> Result<(), Box<dyn Error>> {
         rerun: recorder(&options)?,
         duration: options.duration(),
         screenshot: options.screenshot.clone(),
+        panel: options.panel,
         ..guest(&options, "you", 1, &model, &invite, &truth)?
     };
     let yours = if options.headless {
@@ -180,6 +182,7 @@ fn guest(
         rerun: None,
         duration: None,
         screenshot: None,
+        panel: false,
         stop: Arc::default(),
     })
 }

@@ -38,6 +38,10 @@ pub struct Options {
     #[arg(long, value_name = "FILE.png")]
     pub screenshot: Option<PathBuf>,
 
+    /// Open the live panel; F1 does it too.
+    #[arg(long)]
+    pub panel: bool,
+
     /// The body to hold: a file under assets/.
     #[arg(long, default_value = "pip.modal")]
     pub body: String,

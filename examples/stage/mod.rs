@@ -130,7 +130,7 @@ impl PluginGroup for Stage {
                 .set(WindowPlugin {
                     primary_window: Some(Window {
                         title: format!("Pliant: {}", self.title),
-                        resolution: WindowResolution::new(1280, 720),
+                        resolution: resolution(&self.options),
                         present_mode: PresentMode::AutoVsync,
                         ..default()
                     }),
@@ -146,6 +146,15 @@ impl PluginGroup for Stage {
     }
 }
 
+/// The window's pixels, however dense the screen.
+fn resolution(options: &Options) -> WindowResolution {
+    let resolution = WindowResolution::new(options.size.0, options.size.1);
+    match options.scale {
+        Some(scale) if scale.is_finite() && scale > 0.0 => resolution.with_scale_factor_override(scale),
+        _ => resolution,
+    }
+}
+
 struct StagePlugin(Stage);
 
 impl Plugin for StagePlugin {
@@ -155,6 +164,8 @@ impl Plugin for StagePlugin {
         if !stage.options.headless {
             // The scene goes on when the window is not looked at.
             app.insert_resource(WinitSettings::continuous());
+            #[cfg(feature = "panel")]
+            app.add_plugins(pliant::panel::PanelPlugin { open: stage.options.panel, ..default() });
             text::build(app, stage.title, &stage.keys, stage.look.is_some());
             if let Some(look) = stage.look {
                 view::build(app, look, stage.floor);

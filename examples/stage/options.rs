@@ -23,6 +23,34 @@ pub struct Options {
     /// Let the scene play by itself, save a picture of the window and stop.
     #[arg(long, value_name = "FILE.png")]
     pub screenshot: Option<PathBuf>,
+
+    /// Open the live panel; F1 does it too.
+    #[arg(long)]
+    pub panel: bool,
+
+    /// Size of the window in pixels.
+    #[arg(long, value_name = "WIDTHxHEIGHT", default_value = "1280x720", value_parser = size)]
+    pub size: Size,
+
+    /// Magnifies text and panel, for dense screens. Default: what the screen says.
+    #[arg(long, value_parser = clap::value_parser!(f32))]
+    pub scale: Option<f32>,
+}
+
+/// Pixels across and down.
+#[derive(Debug, Clone, Copy)]
+pub struct Size(pub u32, pub u32);
+
+impl Default for Size {
+    fn default() -> Self {
+        Self(1280, 720)
+    }
+}
+
+fn size(text: &str) -> Result<Size, String> {
+    let side = |side: &str| side.parse().ok().filter(|side| (64..=16_384).contains(side));
+    let both = text.split_once('x').and_then(|(width, height)| Some(Size(side(width)?, side(height)?)));
+    both.ok_or_else(|| "expected WIDTHxHEIGHT, each 64 to 16384".into())
 }
 
 fn seconds(text: &str) -> Result<f64, String> {

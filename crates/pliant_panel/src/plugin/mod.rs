@@ -86,7 +86,7 @@ fn draw(
     }
     let screen = context.content_rect();
     egui::Window::new("Pliant")
-        .default_width(300.0)
+        .default_size([300.0, screen.height() - 90.0])
         .default_pos([screen.right() - 330.0, screen.top() + 12.0])
         .max_height(screen.height() - 60.0)
         .vscroll(true)
