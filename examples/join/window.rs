@@ -14,6 +14,7 @@ pub fn run(options: &Options, net: NetPlugin) -> Result<(), Box<dyn Error>> {
         frames: None,
         seconds: options.seconds,
         screenshot: options.screenshot.clone(),
+        ..default()
     };
     let mut app = App::new();
     app.add_plugins(
