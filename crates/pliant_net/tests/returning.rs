@@ -182,3 +182,30 @@ fn a_guest_that_is_sent_away_does_not_come_back() {
     assert_eq!(host.world().resource::<NetHost>().guests().count(), 0);
     assert!(messages::<BodyArrived>(&guest).len() <= 1);
 }
+
+#[test]
+fn joining_over_100_ms_takes_less_than_a_second_and_the_models_bytes() {
+    let _alone = alone();
+    let (mut host, invite, body) = host(HostConfig::default());
+    host.world_mut().spawn((Grab::new(TIP, 0.3, DVec3::new(1.2, 2.4, 0.4)), GrabOf(body)));
+    run_for(&mut [&mut host], 1.5);
+    let link = LinkConfig { delay: Duration::from_millis(50), ..LinkConfig::default() };
+    let mut first_picture = |models| {
+        let emulation = Some(Emulation { outgoing: link.clone(), incoming: link.clone(), seed: 1 });
+        let transport = JoinOptions { emulation, ..JoinOptions::default() };
+        let began = Instant::now();
+        let mut guest = guest(&invite, JoinConfig { transport, models, ..JoinConfig::default() });
+        run_until(&mut [&mut host, &mut guest], 10.0, "the body is shown as it is", |apps| {
+            let Some(there) = body_of(apps[1]) else { return false };
+            apart(apps[0], body, apps[1], there) < 0.05
+        });
+        began.elapsed().as_secs_f64()
+    };
+    let cached = first_picture(vec![bar()]);
+    let sent = first_picture(Vec::new());
+    let bytes = bar().file_bytes() as f64;
+    println!("first right picture after {cached:.2} s, after {sent:.2} s with a model of {bytes} bytes");
+    assert!(cached < 1.0, "{cached} s");
+    // A host's default is 1 MB/s for models.
+    assert!(sent < 1.0 + bytes / 1e6, "{sent} s");
+}
