@@ -351,6 +351,8 @@ struct Run {
     hash: u64,
     track: Vec<(u64, f64, f64)>,
     last_tick: u64,
+    /// Ticks shown one after the other up to now.
+    in_row: u64,
 }
 
 impl Run {
@@ -390,6 +392,7 @@ impl Run {
             hash: 0xCBF2_9CE4_8422_2325,
             track: Vec::new(),
             last_tick: 0,
+            in_row: 0,
         }
     }
 
@@ -535,6 +538,8 @@ impl World for Run {
         if self.measuring.is_none() || tick <= self.last_tick {
             return;
         }
+        // Second differences are taken of ticks that follow each other; a stall that is caught up with shows as error.
+        self.in_row = if tick == self.last_tick + 1 { self.in_row + 1 } else { 0 };
         self.last_tick = tick;
         let Some(first) = self.truth.front().map(|t| t.tick) else { return };
         let Some(truth) = tick.checked_sub(first).and_then(|i| self.truth.get(i as usize)) else { return };
@@ -553,7 +558,7 @@ impl World for Run {
                 (&mut self.shown_force[i], g.reaction, &mut self.shown_second),
                 (&mut self.true_force[i], *reaction, &mut self.true_second),
             ] {
-                if self.count >= 2 {
+                if self.in_row >= 2 {
                     let d = std::array::from_fn(|k| new[k] - 2.0 * series.1[k] + series.0[k]);
                     *second = second.max(norm(d));
                 }

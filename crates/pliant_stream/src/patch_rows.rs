@@ -179,14 +179,22 @@ impl Grams {
         if same && used.iter().zip(&self.keys).all(|(&i, key)| patches[i].key == *key) {
             return;
         }
-        self.keys.clear();
-        self.keys.extend(used.iter().map(|&i| patches[i].key));
-        self.blocks.clear();
+        // What two patches are to each other does not change when others come or go.
+        let old: Vec<Option<usize>> =
+            used.iter().map(|&i| self.keys.iter().position(|key| *key == patches[i].key)).collect();
+        let mut blocks = Vec::with_capacity(used.len() * (used.len() + 1) / 2);
         for (i, &a) in used.iter().enumerate() {
-            for &b in &used[..=i] {
-                self.blocks.push(patches[a].gram(&patches[b], weight, &mut self.scratch));
+            for (j, &b) in used[..=i].iter().enumerate() {
+                blocks.push(match (old[i], old[j]) {
+                    (Some(x), Some(y)) if x >= y => *self.at(x, y),
+                    (Some(x), Some(y)) => self.at(y, x).transpose(),
+                    _ => patches[a].gram(&patches[b], weight, &mut self.scratch),
+                });
             }
         }
+        self.blocks = blocks;
+        self.keys.clear();
+        self.keys.extend(used.iter().map(|&i| patches[i].key));
     }
 
     /// The block of two patches in use, `j` at most `i`.

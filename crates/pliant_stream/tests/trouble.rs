@@ -3,9 +3,11 @@
 
 mod support;
 
+use std::time::Duration;
+
 use pliant_stream::emulator::{LinkConfig, Loss, Preset};
 use pliant_stream::pair::PathConfig;
-use pliant_stream::{GuestConfig, GuestEvent, HostConfig, PeerId, RecoveryConfig, UserId};
+use pliant_stream::{GuestConfig, GuestEvent, HostConfig, PeerId, Playout, RecoveryConfig, UserId};
 use support::bar;
 use support::scene::{BODY, MS, S, cached, circling, paper1, path_for, start, start_with};
 
@@ -146,4 +148,51 @@ fn a_force_that_the_stream_does_not_say_is_learnt() {
     assert!(worst < 0.05, "{worst}");
     let counts = pair.guests[0].session.body(BODY).unwrap().counts();
     assert!(counts.snapshots <= 1, "learnt, not sent again and again: {counts:?}");
+}
+
+#[test]
+fn adaptive_playout_waits_only_for_what_scatters() {
+    let model = bar(20, 0.05);
+    let delay = |jitter: Duration| {
+        let (mut pair, mut scene) = start(&model);
+        scene.hand = circling();
+        let recovery = RecoveryConfig { playout: Playout::Adaptive(3), ..Default::default() };
+        let link = LinkConfig { delay: 60 * MS, jitter, ..Default::default() };
+        let config = GuestConfig { recovery, ..Default::default() };
+        pair.join_with(config, PathConfig::symmetric(link), 5, cached(&model)).unwrap();
+        // The schedule learns how arrivals scatter for the first seconds.
+        pair.run_until(5 * S, &mut scene);
+        let before = pair.guests[0].session.body(BODY).unwrap().counts();
+        pair.run_until(25 * S, &mut scene);
+        let view = pair.guests[0].session.body(BODY).unwrap();
+        let counts = view.counts();
+        let guessed = (counts.guessed - before.guessed) as f64 / (counts.stepped - before.stepped) as f64;
+        assert!(guessed < 0.05, "jitter {jitter:?}: {guessed} guessed");
+        assert!(counts.repaired + counts.too_late <= counts.guessed, "{counts:?}");
+        view.shown_delay() / 0.025
+    };
+    let (clean, rough, wild) = (delay(Duration::ZERO), delay(12 * MS), delay(30 * MS));
+    println!("ticks of playout: {clean:.2}, {rough:.2}, {wild:.2}");
+    assert!(clean < 0.5, "{clean}");
+    assert!(clean < rough && rough < wild, "{clean} {rough} {wild}");
+    assert!(wild <= 3.3, "at most three ticks: {wild}");
+}
+
+#[test]
+fn a_guest_that_was_cut_off_comes_again() {
+    let model = bar(20, 0.05);
+    let (mut pair, mut scene) = start(&model);
+    scene.hand = circling();
+    pair.join_with(GuestConfig::default(), paper1(), 1, cached(&model)).unwrap();
+    pair.run_until(5 * S, &mut scene);
+    pair.cut(0);
+    pair.run_until(17 * S, &mut scene);
+    assert_eq!(pair.host.users().count(), 0);
+    pair.join_with(GuestConfig::default(), paper1(), 7, cached(&model)).unwrap();
+    pair.run_until(19 * S, &mut scene);
+    let session = &pair.guests[1].session;
+    assert_eq!(pair.host.users().count(), 1);
+    assert!(session.body(BODY).unwrap().is_ready());
+    assert!(session.body(BODY).unwrap().tick() + 20 > pair.tick());
+    assert!(session.stats().message_bytes_in < 5_000, "the model is not sent again");
 }

@@ -1,0 +1,152 @@
+//! No datagram is longer than the path carries, whatever the modes, the hands and the policy; and the bits go where they are seen.
+#![allow(clippy::unwrap_used, clippy::expect_used, clippy::panic, reason = "a failed test should panic")]
+
+mod support;
+
+use pliant_stream::encoder::Encoder;
+use pliant_stream::quanta::Quanta;
+use pliant_stream::recovery::History;
+use pliant_stream::wire::Datagram;
+use pliant_stream::{
+    BodyId, BodySetup, GrabKey, GrabState, Newmark, Pose, RecoveryConfig, TickState, UserId,
+};
+use support::bar;
+
+const H: f64 = 0.025;
+
+fn hands(count: u16) -> Vec<GrabState> {
+    let hand = |k: u16| GrabState {
+        key: GrabKey { user: UserId(k), grab: 7 },
+        vertex: u32::from(k) + 4,
+        radius: 0.05,
+        target: [1.0, 0.1 * f64::from(k), 0.3],
+        reaction: [0.5, f64::from(k), -2.0],
+    };
+    (0..count).map(hand).collect()
+}
+
+#[test]
+fn no_frame_is_longer_than_the_path_carries_and_none_of_its_hands_is_lost() {
+    let (model, setup) = (bar(500, 0.05), BodySetup::default());
+    let newmark = Newmark { h: H, beta: 4.0 / 9.0, gamma: 5.0 / 6.0 };
+    for name in ["default", "paper", "paper-repeats", "force-driven"] {
+        for limit in [256, 400, 1200] {
+            let wish = RecoveryConfig::by_name(name).unwrap().wish(None);
+            let mut encoder = Encoder::new(BodyId(1), model.clone(), &setup, newmark, wish, limit).unwrap();
+            let modes = encoder.modes();
+            if name == "default" || limit == 1200 {
+                assert_eq!(modes, 500, "{name} at {limit} bytes");
+            }
+            let quanta = Quanta::new(&model, modes, &newmark);
+            let mut history = History::new(0);
+            let mut split = 0;
+            for tick in 1..=40_u64 {
+                let t = tick as f64 * H;
+                let q: Vec<f64> =
+                    (0..500).map(|k| 0.3 * (t * (1.0 + k as f64) + 0.7).sin() / (1.0 + k as f64)).collect();
+                let v: Vec<f64> = (0..500).map(|k| 0.3 * (t * (1.0 + k as f64) + 0.7).cos()).collect();
+                let a: Vec<f64> =
+                    (0..500).map(|k| -0.3 * (1.0 + k as f64) * (t * (1.0 + k as f64) + 0.7).sin()).collect();
+                // From no hands to as many as there may be, and back at once.
+                let grabs = hands((tick * 13 % 65) as u16);
+                let pose = (tick % 3 == 0).then(|| Pose { position: [1.0, 2.0, 3.0], ..Pose::default() });
+                let state =
+                    TickState { tick, q: &q, v: &v, a: &a, z: &[], pose, grabs: &grabs, resting: false };
+                if tick == 1 {
+                    encoder.restart(&state);
+                    continue;
+                }
+                let encoded = encoder.encode(&state);
+                split += encoded.more.len();
+                for body in encoded.all() {
+                    assert!(
+                        body.len() + 3 <= limit,
+                        "{name}: {} of {limit} bytes, {} hands",
+                        body.len() + 3,
+                        grabs.len()
+                    );
+                    let mut bytes = vec![1, 0, 0];
+                    bytes.extend_from_slice(body);
+                    let Datagram::Frame(frame) = Datagram::decode(&bytes).unwrap().1 else { unreachable!() };
+                    history.take(&frame, &quanta, |_, _| {});
+                }
+                let known = history.known(tick).expect("all parts are here");
+                assert_eq!(known.grabs.len(), grabs.len(), "{name} at {limit}, tick {tick}");
+                assert_eq!(known.pose.is_some(), pose.is_some());
+                // Sent again, each part fits too.
+                assert!(encoder.resend(tick).all(|body| body.len() + 3 <= limit));
+                assert_eq!(encoder.resend(tick).count(), 1 + encoded.more.len());
+            }
+            assert!(split > 0, "{name} at {limit} bytes: 64 hands do not fit in one datagram");
+        }
+    }
+}
+
+#[test]
+fn a_tick_whose_part_is_missing_is_not_known() {
+    let (model, setup) = (bar(20, 0.05), BodySetup::default());
+    let newmark = Newmark { h: H, beta: 4.0 / 9.0, gamma: 5.0 / 6.0 };
+    let wish = RecoveryConfig::default().wish(None);
+    let mut encoder = Encoder::new(BodyId(1), model.clone(), &setup, newmark, wish, 400).unwrap();
+    let quanta = Quanta::new(&model, 20, &newmark);
+    let (q, grabs) = ([0.01; 20], hands(20));
+    let state =
+        |tick| TickState { tick, q: &q, v: &q, a: &q, z: &[], pose: None, grabs: &grabs, resting: false };
+    encoder.restart(&state(1));
+    let encoded = encoder.encode(&state(2));
+    let all: Vec<_> = encoded.all().cloned().collect();
+    assert!(all.len() >= 3, "{} parts", all.len());
+    let mut history = History::new(0);
+    let mut take = |body: &[u8]| {
+        let mut bytes = vec![1, 0, 0];
+        bytes.extend_from_slice(body);
+        let Datagram::Frame(frame) = Datagram::decode(&bytes).unwrap().1 else { unreachable!() };
+        history.take(&frame, &quanta, |_, _| {});
+        history.known(2).map(|d| d.grabs.len())
+    };
+    // In any order, and some of them twice.
+    for body in all[1..].iter().rev().chain(&all[1..]) {
+        assert_eq!(take(body), None);
+    }
+    assert_eq!(take(&all[0]), Some(20));
+}
+
+#[test]
+fn a_step_moves_the_surface_alike_in_every_mode() {
+    let model = bar(60, 0.05);
+    let newmark = Newmark { h: H, beta: 4.0 / 9.0, gamma: 5.0 / 6.0 };
+    let wish = RecoveryConfig::default().wish(None);
+    let setup = BodySetup::default();
+    let mut encoder = Encoder::new(BodyId(1), model.clone(), &setup, newmark, wish, 1200).unwrap();
+    let q: Vec<f64> = (0..60).map(|k| 0.21 / (1.0 + f64::from(k)).powi(2)).collect();
+    let v = vec![0.0; 60];
+    let state =
+        |tick| TickState { tick, q: &q, v: &v, a: &v, z: &[], pose: None, grabs: &[], resting: false };
+    encoder.restart(&state(1));
+    let quanta = Quanta::new(&model, 60, &newmark);
+    let visible = |mode: usize| {
+        let size =
+            |v: u32| (0..3).map(|x| f64::from(model.displacement_row(v, x, mode)).powi(2)).sum::<f64>();
+        (0..model.surface().positions().len() as u32).map(size).fold(0.0, f64::max).sqrt()
+    };
+    // The most visible mode is the first; the unit is a 16,384th of what it shows.
+    let unit = 0.21 * visible(0) / 16_384.0;
+    let (mut seen, mut widths) = (std::collections::BTreeSet::new(), Vec::new());
+    for tick in 2..60 {
+        let mut bytes = vec![1, 0, 0];
+        bytes.extend_from_slice(&encoder.encode(&state(tick)).first);
+        let Datagram::Frame(frame) = Datagram::decode(&bytes).unwrap().1 else { unreachable!() };
+        let slice = frame.slice.expect("every frame has one");
+        assert!((f64::from(slice.unit) - unit).abs() < 1e-4 * unit, "{} and {unit}", slice.unit);
+        for (e, (_, steps)) in slice.entries(&quanta).zip(&slice.steps) {
+            let moved = (e.q - q[e.mode]).abs() * visible(e.mode);
+            assert!(moved <= 0.5001 * unit, "mode {}: off by {moved} m of {unit} m", e.mode);
+            seen.insert(e.mode);
+            widths.push((e.mode, steps[0]));
+        }
+    }
+    assert_eq!(seen.len(), 60, "all modes come round");
+    let of = |mode: usize| widths.iter().find(|w| w.0 == mode).unwrap().1.unsigned_abs();
+    assert!((16_380..=16_388).contains(&of(0)), "{}", of(0));
+    assert!(of(59) < 200, "a faint mode takes few bits: {}", of(59));
+}

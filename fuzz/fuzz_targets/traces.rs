@@ -1,0 +1,13 @@
+//! Recorded networks, and losses in words.
+#![no_main]
+
+use std::time::Duration;
+
+use libfuzzer_sys::fuzz_target;
+use pliant_stream::emulator::{Loss, Trace};
+
+fuzz_target!(|bytes: &[u8]| {
+    let Ok(text) = std::str::from_utf8(bytes) else { return };
+    let _ = Trace::parse(text);
+    let _ = Loss::parse(text, 1, Duration::from_millis(25));
+});
