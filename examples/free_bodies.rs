@@ -19,6 +19,9 @@ use stage::{Look, Readout, Stage};
 /// Weak, as on the moon, so that there is time to look.
 const GRAVITY: DVec3 = DVec3::new(0.0, -1.62, 0.0);
 
+/// Height from which the first one is thrown, m.
+const LOW: f64 = -0.5;
+
 fn main() -> AppExit {
     App::new()
         .add_plugins(
@@ -27,7 +30,7 @@ fn main() -> AppExit {
                 .key("H: hit the middle one")
                 .look(Look { middle: Vec3::new(0.0, 0.0, 0.0), distance: 1.6, yaw: 0.25, pitch: 0.12 })
                 .floating()
-                .picture_at(2.9),
+                .picture_at(2.6),
         )
         .add_plugins(PliantPlugins::default())
         .add_systems(Startup, spawn)
@@ -63,9 +66,9 @@ struct Account {
 
 fn spawn(mut commands: Commands, assets: Res<AssetServer>, mut materials: ResMut<Assets<StandardMaterial>>) {
     let parts = [
-        (Part::Thrown, -0.62, Color::srgb(0.95, 0.50, 0.36)),
+        (Part::Thrown, 0.62, Color::srgb(0.95, 0.50, 0.36)),
         (Part::Struck, 0.0, Color::srgb(0.42, 0.66, 0.58)),
-        (Part::Held, 0.62, Color::srgb(0.86, 0.68, 0.34)),
+        (Part::Held, -0.62, Color::srgb(0.86, 0.68, 0.34)),
     ];
     for (part, x, colour) in parts {
         let mut body = ModalBody::new(assets.load("jack.modal"));
@@ -79,7 +82,7 @@ fn spawn(mut commands: Commands, assets: Res<AssetServer>, mut materials: ResMut
                 clearcoat: 0.3,
                 ..colour.into()
             })),
-            Transform::from_xyz(x, if part == Part::Thrown { -0.45 } else { 0.0 }, 0.0),
+            Transform::from_xyz(x, if part == Part::Thrown { LOW as f32 } else { 0.0 }, 0.0),
         ));
     }
 }
@@ -88,16 +91,16 @@ fn spawn(mut commands: Commands, assets: Res<AssetServer>, mut materials: ResMut
 fn throw(mut bodies: Query<(&Part, &mut BodyState, &mut Account)>) -> Result {
     for (part, mut state, mut account) in &mut bodies {
         let body = state.body();
-        let down = body.frame().origin()[1] < -0.45 && body.frame().velocity()[1] < 0.0;
+        let down = body.frame().center()[1] < LOW && body.frame().velocity()[1] < 0.0;
         if *part != Part::Thrown || !(account.opening.is_none() || down) {
             continue;
         }
         let mut thrown = body.state().clone();
         thrown.frame = Frame::from_motion(
             body.model(),
-            [-0.62, -0.45, 0.0],
+            [0.62, LOW, 0.0],
             body.frame().orientation(),
-            [0.0, 1.7, 0.0],
+            [0.0, 1.4, 0.0],
             [1.1e-2, 0.4e-2, 1.6e-2],
         )?;
         state.body_mut().set_state(&thrown)?;
@@ -167,7 +170,7 @@ fn take_hold(
 fn move_hands(time: Res<Time>, mut hands: Query<(&Hand, &mut Grab)>) {
     let t = time.elapsed_secs_f64();
     let gently = (t / 1.5).min(1.0);
-    let middle = DVec3::new(0.62, 0.10 * gently * (1.9 * t).sin(), 0.08 * gently * (1.3 * t).sin());
+    let middle = DVec3::new(-0.62, 0.10 * gently * (1.9 * t).sin(), 0.08 * gently * (1.3 * t).sin());
     // The hands turn about each other and pull it longer and shorter.
     let turned =
         DQuat::from_euler(EulerRot::YZX, gently * 0.9 * (1.1 * t).sin(), gently * 0.7 * (1.7 * t).sin(), 0.0);

@@ -101,15 +101,14 @@ fn begin(
 fn pause_and_step(
     keys: Res<ButtonInput<KeyCode>>,
     mut time: ResMut<Time<Virtual>>,
-    mut fixed: ResMut<Time<Fixed>>,
+    mut steps: MessageWriter<SingleSteps>,
     mut exit: MessageWriter<AppExit>,
 ) {
     if keys.just_pressed(KeyCode::Space) {
         if time.is_paused() { time.unpause() } else { time.pause() }
     }
-    if keys.just_pressed(KeyCode::Period) && time.is_paused() {
-        let step = fixed.timestep();
-        fixed.accumulate_overstep(step);
+    if keys.just_pressed(KeyCode::Period) {
+        steps.write(SingleSteps(1));
     }
     if keys.just_pressed(KeyCode::Escape) {
         exit.write(AppExit::Success);

@@ -51,7 +51,7 @@ ip netns exec $tag-s ip link set lo up
 
 serve() { # log, more options
     log=$1; shift; : >"$log"
-    ip netns exec $tag-s "$BIN/dedicated_server" --bind 0.0.0.0:4433 --key "$work/key" "$@" >"$log" 2>&1 &
+    ip netns exec $tag-s env --default-signal=INT "$BIN/dedicated_server" --bind 0.0.0.0:4433 --key "$work/key" "$@" >"$log" 2>&1 &
     server=$!
     pids="$pids $server"
     for _ in $(seq 100); do grep -q "to hold" "$log" && break; sleep 0.1; done
@@ -60,7 +60,7 @@ serve() { # log, more options
 # guest NAME NET LOG options
 guest() {
     ns=$1; net=$2; log=$3; shift 3; : >"$log"
-    ip netns exec $tag-$ns "$BIN/join" "pliant://10.77.$net.1:4433#$key" --headless --cached --name "$ns" "$@" >"$log" 2>&1 &
+    ip netns exec $tag-$ns env --default-signal=INT "$BIN/join" "pliant://10.77.$net.1:4433#$key" --headless --cached --name "$ns" "$@" >"$log" 2>&1 &
     last=$!
     pids="$pids $last"
 }
@@ -120,23 +120,25 @@ faults() {
     ip netns exec $tag-s ip link set va down; sleep 10; ip netns exec $tag-s ip link set va up
     echo "line a down for 10 s: guest a back after $(wait_for_again "$work/fa.log" 15) s of line; losses it saw: $(grep -c "cannot be heard" "$work/fa.log")"
 
+    before=$(seen "$work/fa.log" "cannot be heard"); again=$(seen "$work/fa.log" " again")
     kill -9 $server
-    echo "kill -9 of the server: guest a, after $(wait_for_new "$work/fa.log" "cannot be heard" 15) s"
+    echo "kill -9 of the server: guest a, after $(wait_for_more "$work/fa.log" "cannot be heard" "$before" 15) s"
     serve "$work/s2.log"
-    echo "server started anew: guest a in again after $(wait_for_new "$work/fa.log" "again" 20) s; the server has $(grep -c "has joined" "$work/s2.log") guest(s)"
+    echo "server started anew: guest a in again after $(wait_for_more "$work/fa.log" " again" "$again" 20) s; the server has $(grep -c "has joined" "$work/s2.log") guest(s)"
     t0=$(now); kill -INT $ga; wait $ga 2>/dev/null
     echo "Ctrl-C at guest a: the server, after $(wait_for "$work/s2.log" "a is gone" 5) s"
     if grep -qE "ERROR|panicked" "$work"/*.log; then echo "errors in the logs:"; grep -hE "ERROR|panicked" "$work"/*.log | head -5; failed=1; else echo "no error in any log"; fi
     kill -INT $server; wait $server 2>/dev/null
 }
-# More lines of PATTERN than there are now.
-wait_for_new() {
-    had=$(grep -c "$2" "$1"); t0=$(now)
-    for _ in $(seq $(($3 * 20))); do
-        if [ "$(grep -c "$2" "$1")" -gt "$had" ]; then awk "BEGIN { printf \"%.1f\n\", $(now) - $t0 }"; return 0; fi
+# seen LOG PATTERN: how many lines there are; wait_for_more LOG PATTERN SEEN SECONDS: until there are more.
+seen() { grep -c "$2" "$1"; }
+wait_for_more() {
+    t0=$(now)
+    for _ in $(seq $(($4 * 20))); do
+        if [ "$(seen "$1" "$2")" -gt "$3" ]; then awk "BEGIN { printf \"%.1f\n\", $(now) - $t0 }"; return 0; fi
         sleep 0.05
     done
-    echo "not within $3 s"; failed=1; return 1
+    echo "not within $4"; failed=1; return 1
 }
 # Data flows again: a line of figures with datagrams coming.
 wait_for_again() {

@@ -36,6 +36,14 @@
     feature = "net",
     doc = "| the plugins of [`net`] | `net` | one body held by several machines, over QUIC |"
 )]
+#![cfg_attr(
+    feature = "haptics",
+    doc = "| the plugins of [`haptics`] | `haptics` | devices that push back, their loop, gamepads that buzz |"
+)]
+#![cfg_attr(
+    feature = "bake",
+    doc = "| [`BakePlugin`](body::BakePlugin) | `bake` | surfaces and descriptions become bodies in the game, beside its frames |"
+)]
 //!
 //! # Features
 //!
@@ -117,7 +125,7 @@ pub mod prelude {
     pub use crate::body::{
         BodyRefused, BodyState, Driven, Grab, GrabForce, GrabOf, Grabs, Integration, ModalAsset, ModalBody,
         NoPointerGrab, PliantBodyPlugin, PliantDisplaySystems, PliantSystems, PliantTick, PointerGrab,
-        PointerGrabPlugin, PointerGrabSystems, PointerHeld, ShownState,
+        PointerGrabPlugin, PointerGrabSystems, PointerHeld, ShownState, SingleSteps,
     };
     pub use crate::modal::{ModalModel, Patch};
 }

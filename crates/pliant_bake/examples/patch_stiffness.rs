@@ -34,6 +34,23 @@ fn square(m: [[f64; 3]; 3]) -> Matrix3<f64> {
     Matrix3::from_fn(|i, j| m[i][j])
 }
 
+/// The middle of the end in +x (a bar's tip: axial along x, bending along y and z), a place near the root, the highest vertex (a bunny's ear).
+fn named(model: &ModalModel) -> [(&'static str, u32); 3] {
+    let positions = model.surface().positions();
+    let [low, high] = model.surface().bounds();
+    let nearest = |goal: [f32; 3]| {
+        let away = |v: u32| (0..3).map(|k| (positions[v as usize][k] - goal[k]).powi(2)).sum::<f32>();
+        (0..positions.len() as u32).min_by(|&a, &b| away(a).total_cmp(&away(b))).unwrap()
+    };
+    let middle = [0, 1, 2].map(|k| 0.5 * (low[k] + high[k]));
+    let top = positions.iter().copied().max_by(|a, b| a[1].total_cmp(&b[1])).unwrap();
+    [
+        ("tip in x", nearest([high[0], middle[1], middle[2]])),
+        ("near the root", nearest([low[0] + 0.15 * (high[0] - low[0]), high[1], middle[2]])),
+        ("highest, an ear", nearest(top)),
+    ]
+}
+
 fn main() {
     let arguments: Vec<String> = std::env::args().skip(1).collect();
     let argument = |k: usize| arguments.get(k).map(String::as_str);
@@ -61,12 +78,19 @@ fn main() {
     for share in [0.033, 0.047, 0.067, 0.095, 0.135] {
         let every = BakeConfig { sites: Some(usize::MAX), site_radii: vec![share], ..config.clone() };
         let exact = bake(&mesh, None, &every, &mut |_, _| ()).unwrap().model;
+        let by_name = named(&model);
+        let mut told = String::new();
         let (mut alone, mut felt, mut worst) = (Vec::new(), Vec::new(), (0.0, 0, 0));
         for site in &exact.parts().sites {
             let patch = Patch::around(model.surface(), site.vertex, site.radius).unwrap();
             let modal = modal_compliance(&exact, &patch);
             let truth = modal + square(site.flexibility);
             let got = modal_compliance(&model, &patch) + square(model.residual_flexibility(&patch, modes));
+            for (name, _) in by_name.iter().filter(|(_, vertex)| *vertex == site.vertex) {
+                let off = |axis: usize| 100.0 * (got[(axis, axis)] / truth[(axis, axis)] - 1.0);
+                told +=
+                    &format!("            {name}: x {:+.2}, y {:+.2}, z {:+.2} %\n", off(0), off(1), off(2));
+            }
             for axis in 0..3 {
                 let e = (got[(axis, axis)] / truth[(axis, axis)] - 1.0).abs();
                 if e > worst.0 {
@@ -93,5 +117,6 @@ fn main() {
             model.surface().positions()[worst.1 as usize],
             worst.2
         );
+        print!("{told}");
     }
 }

@@ -11,6 +11,7 @@ use faer::linalg::matmul::matmul;
 use faer::linalg::triangular_solve::solve_lower_triangular_in_place;
 use faer::prelude::{IntoConst, ReborrowMut};
 use faer::traits::ComplexField;
+use faer::traits::pulp::Arch;
 use faer::{Accum, Mat, MatMut, Par};
 use rayon::prelude::*;
 
@@ -254,6 +255,15 @@ impl<T: Number> Solved<'_, T> {
     /// `|sum of shares x columns|^2` of each load. Loads that lie side by side share nodes: their columns are read piece by piece, so that
     /// the pieces stay in the cache.
     fn squares(&self, all: &[Load], loads: &[u32]) -> Vec<Six> {
+        // Compiled for every instruction set, chosen here; the same operations in the same order in each.
+        Arch::new().dispatch(
+            #[inline(always)]
+            || self.squares_here(all, loads),
+        )
+    }
+
+    #[inline(always)]
+    fn squares_here(&self, all: &[Load], loads: &[u32]) -> Vec<Six> {
         let (Some(&low), Some(&high)) = (self.nodes.first(), self.nodes.last()) else { return Vec::new() };
         let parts: Vec<Vec<(usize, T)>> = loads
             .iter()
@@ -288,6 +298,7 @@ impl<T: Number> Solved<'_, T> {
 }
 
 /// In eight running sums, so that the additions need not wait for one another.
+#[inline(always)]
 fn dot<T: Number>(a: &[T; PIECE], b: &[T; PIECE]) -> f64 {
     let mut lanes = [0.0; 8];
     for (a, b) in a.chunks_exact(8).zip(b.chunks_exact(8)) {

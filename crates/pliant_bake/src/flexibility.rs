@@ -21,6 +21,11 @@ const MEMORY: usize = 64 << 20;
 /// Above so many multiplications they are done in single precision: off by some 1e-6 of the compliance.
 const FAST: f64 = 1e10;
 
+/// Where it is much work, and very much, wide patches are baked around some vertices only: they are the costly ones, and hardly change from
+/// one vertex to the next. Radius from which on, as a share of the body's size, and one vertex in how many.
+const THIN: [(f64, [(f64, usize); 2]); 2] =
+    [(FAST, [(0.1, 4), (f64::MAX, 1)]), (6.0 * FAST, [(0.1, 8), (0.05, 2)])];
+
 /// Places that are baked where not all can be: from, to.
 const SPREAD: [usize; 2] = [64, 512];
 
@@ -46,14 +51,29 @@ pub(crate) fn sites(
     if let Some(count) = count.filter(|&count| count < vertices.len()) {
         vertices = spread_vertices(&skin.mesh, vertices, count);
     }
-    let (mut patches, mut loads) = patches(skin, number, &mut vertices, radii)?;
+    let (mut patches, mut loads) = patches(skin, number, &mut vertices, radii, &|_, _| true)?;
     let mut plan = Plan::new(&solver.factor, &loads);
+    if count.is_none()
+        && let Some((_, thin)) = THIN.iter().rev().find(|(cost, _)| plan.cost() > *cost)
+    {
+        // Each next one is the furthest from those before: any first part of them is spread evenly.
+        let mut rank = vec![usize::MAX; skin.mesh.positions().len()];
+        let order = spread_vertices(&skin.mesh, vertices.clone(), vertices.len().div_ceil(2));
+        order.into_iter().enumerate().for_each(|(index, v)| rank[v as usize] = index);
+        let (size, all) = (skin.mesh.size(), vertices.len());
+        let wanted = |v: u32, radius: f64| {
+            let rule = thin.iter().find(|(from, _)| radius >= from * size);
+            rule.is_none_or(|(_, one_in)| rank[v as usize] < all.div_ceil(*one_in))
+        };
+        (patches, loads) = self::patches(skin, number, &mut vertices, radii, &wanted)?;
+        plan = Plan::new(&solver.factor, &loads);
+    }
     let apart = 3.0 * solver.factor.symbolic.values as f64;
     if count.is_none() && (plan.cost() > BUDGET || plan.largest_block() > MEMORY) {
         // Few places cost as much as many this way: their patches touch nearly all nodes. Each patch by itself then.
         let affordable = (0.1 * BUDGET / (apart * radii.len().max(1) as f64)) as usize;
         vertices = spread_vertices(&skin.mesh, vertices, affordable.clamp(SPREAD[0], SPREAD[1]));
-        (patches, loads) = self::patches(skin, number, &mut vertices, radii)?;
+        (patches, loads) = self::patches(skin, number, &mut vertices, radii, &|_, _| true)?;
         plan = Plan::new(&solver.factor, &loads);
     }
     let together = plan.cost() < apart * loads.len() as f64 && plan.largest_block() <= MEMORY;
@@ -79,11 +99,14 @@ fn patches(
     number: &[u32],
     vertices: &mut [u32],
     radii: &[f64],
+    wanted: &(dyn Fn(u32, f64) -> bool + Sync),
 ) -> Result<(Vec<Patch>, Vec<Load>), ModelError> {
     vertices.sort_by_key(|&v| (skin.first_row(v, number), v));
     let patches: Result<Vec<Patch>, ModelError> = vertices
         .par_iter()
-        .flat_map_iter(|&v| radii.iter().map(move |&r| Patch::around(&skin.mesh, v, r)))
+        .flat_map_iter(|&v| {
+            radii.iter().filter(move |&&r| wanted(v, r)).map(move |&r| Patch::around(&skin.mesh, v, r))
+        })
         .collect();
     let patches = patches?;
     let loads = patches.par_iter().map(|patch| load(patch, skin, number)).collect();
@@ -275,7 +298,8 @@ mod tests {
         for skin in [None, Some(&worn)] {
             let skin = Skin::new(&mesh, &fe, skin, &number).unwrap();
             let mut vertices: Vec<u32> = (0..skin.mesh.positions().len() as u32).collect();
-            let (_, loads) = patches(&skin, &number, &mut vertices, &[0.05, 0.15, 0.4]).unwrap();
+            let (_, loads) =
+                patches(&skin, &number, &mut vertices, &[0.05, 0.15, 0.4], &|_, _| true).unwrap();
             let plan = Plan::new(&solver.factor, &loads);
             let (exact, fast) = (plan.compliances(false, &mut |_| ()), plan.compliances(true, &mut |_| ()));
             let apart = one_by_one(&solver, &loads, &mut |_| ());

@@ -22,7 +22,7 @@
 //! | `SurfaceShading`, `SurfaceDetail`, `SurfaceDeformation`: edges, level of detail, graphics card or processor (feature `render`) | [`BodyRefused`]: what was refused, and why |
 //!
 //! The crate knows no network, device, viewer or panel; they stand on it. Time is Bevy's: pausing `Time<Virtual>` pauses the bodies, and
-//! a `Time<Fixed>` advanced by hand single-steps them.
+//! [`SingleSteps`] lets steps pass meanwhile.
 //!
 //! # Features
 //!
@@ -43,6 +43,7 @@ mod body;
 mod deform;
 mod error;
 mod grab;
+mod pause;
 mod pick;
 mod pointer;
 mod shown;
@@ -67,6 +68,7 @@ pub use body::{BodyState, Driven, Integration, ModalBody, NoPointerGrab};
 pub use deform::{DrawnSurface, SurfaceDeformation, SurfaceDetail, SurfaceShading};
 pub use error::{BodyError, BodyRefused};
 pub use grab::{Grab, GrabForce, GrabOf, Grabs};
+pub use pause::SingleSteps;
 pub use pick::{SurfaceHit, pick_surface};
 pub use pointer::{PointerGrab, PointerGrabPlugin, PointerGrabSystems, PointerHeld};
 pub use shown::{Pose, ShownState};
@@ -74,6 +76,9 @@ pub use step::PliantTick;
 
 /// Diagnostic: time of one tick's steps of all bodies that are awake, ms.
 pub const STEP_TIME: DiagnosticPath = DiagnosticPath::const_new("pliant/step");
+
+/// Diagnostic: how many bodies were stepped in a tick.
+pub const AWAKE_BODIES: DiagnosticPath = DiagnosticPath::const_new("pliant/awake");
 
 /// Diagnostic: time of writing the surfaces that changed in a frame, ms (feature `render`).
 pub const DEFORM_TIME: DiagnosticPath = DiagnosticPath::const_new("pliant/deform");
@@ -143,10 +148,13 @@ impl Plugin for PliantBodyPlugin {
             .register_type::<GrabForce>()
             .register_type::<Pose>()
             .register_type::<PliantTick>()
+            .register_type::<SingleSteps>()
             .add_message::<BodyRefused>()
+            .add_message::<SingleSteps>()
             .init_resource::<PliantTick>()
             .insert_resource(step::Stepping { fixed })
             .register_diagnostic(Diagnostic::new(STEP_TIME).with_suffix(" ms"))
+            .register_diagnostic(Diagnostic::new(AWAKE_BODIES))
             .register_diagnostic(Diagnostic::new(DEFORM_TIME).with_suffix(" ms"))
             .add_observer(step::drop_states)
             .configure_sets(
@@ -173,6 +181,7 @@ impl Plugin for PliantBodyPlugin {
                     step::publish.in_set(PliantSystems::Publish),
                 ),
             )
+            .add_systems(PreUpdate, pause::single_steps)
             .add_systems(
                 PostUpdate,
                 (

@@ -31,6 +31,8 @@ pub struct ShownState {
     /// Ticks since the last push: 0 in the tick of the push.
     age: u8,
     settled: bool,
+    /// Where between the last two states it stands, since the last push.
+    at: Option<f64>,
     version: u64,
     /// Previous and current pose of a free body; an anchored one is where its transform is.
     poses: Option<[Pose; 2]>,
@@ -44,6 +46,7 @@ impl ShownState {
             shown: q.to_vec(),
             age: 1,
             settled: true,
+            at: None,
             version: 1,
             poses: None,
         }
@@ -59,6 +62,7 @@ impl ShownState {
         std::mem::swap(&mut self.previous, &mut self.current);
         self.current.copy_from_slice(q);
         self.age = 0;
+        self.at = None;
         self.settled = false;
         Ok(())
     }
@@ -138,7 +142,13 @@ impl ShownState {
         }
     }
 
+    /// Whether it is to be moved to `fraction` of the tick; not when it stands there already, as in every frame of a pause.
+    fn is_behind(&self, fraction: f64) -> bool {
+        !self.settled && (self.age > 0 || self.at != Some(fraction))
+    }
+
     fn interpolate(&mut self, fraction: f64) {
+        self.at = Some(fraction);
         for ((shown, a), b) in self.shown.iter_mut().zip(&self.previous).zip(&self.current) {
             *shown = a + (b - a) * fraction;
         }
@@ -166,7 +176,7 @@ pub(crate) fn interpolate(
         _ => 1.0,
     };
     for (mut shown, mut state, mut transform) in &mut bodies {
-        if shown.settled {
+        if !shown.is_behind(fraction) {
             continue;
         }
         shown.interpolate(fraction);

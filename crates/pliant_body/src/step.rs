@@ -11,8 +11,8 @@ use bevy::{
 use pliant_modal::{Body, GrabConfig, Patch, StepError};
 
 use crate::{
-    BodyError, BodyRefused, BodyState, Driven, Grab, GrabForce, Grabs, ModalAsset, ModalBody, Pose,
-    STEP_TIME, ShownState, body::Held,
+    AWAKE_BODIES, BodyError, BodyRefused, BodyState, Driven, Grab, GrabForce, Grabs, ModalAsset, ModalBody,
+    Pose, STEP_TIME, ShownState, body::Held,
 };
 
 /// The tick: how many steps the schedule of the bodies has made. It counts on while bodies rest, and stands while time is paused.
@@ -239,7 +239,7 @@ pub(crate) fn step_bodies(
 ) {
     let start = Instant::now();
     let step = time.delta_secs_f64();
-    let mut stepped = false;
+    let mut stepped = 0_usize;
     for (name, body, driven, mut state) in &mut bodies {
         let steps = *driven == Driven::Local && !state.resting;
         if state.stepped != steps {
@@ -248,7 +248,7 @@ pub(crate) fn step_bodies(
         if !steps {
             continue;
         }
-        stepped = true;
+        stepped += 1;
         let state = &mut *state;
         if state.body.config().step != step
             && let Err(error) = state.body.reconfigure(body.config(step, state.scale))
@@ -270,7 +270,8 @@ pub(crate) fn step_bodies(
         state.quiet = if slow && left_alone { state.quiet + step } else { 0.0 };
         state.resting = state.quiet >= REST_AFTER;
     }
-    if stepped {
+    diagnostics.add_measurement(&AWAKE_BODIES, || stepped as f64);
+    if stepped > 0 {
         diagnostics.add_measurement(&STEP_TIME, || start.elapsed().as_secs_f64() * 1e3);
     }
 }

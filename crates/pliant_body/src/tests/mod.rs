@@ -1,9 +1,11 @@
 //! Apps with time by hand and a bar whose modes are written down, so that every number has an outside value.
 
 mod baking;
+mod crowd;
 mod display;
 mod grabs;
 pub mod model;
+mod pausing;
 mod pointer;
 mod stepping;
 

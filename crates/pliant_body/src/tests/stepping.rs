@@ -197,28 +197,59 @@ fn a_free_body_falls_by_its_own_transform_and_can_be_put_elsewhere() {
 }
 
 #[test]
-fn a_modal_file_loads_and_a_cut_one_says_why() {
+fn a_modal_file_loads_and_one_that_is_cut_altered_or_of_another_version_says_why() {
     let folder = std::env::temp_dir().join(format!("pliant_body_test_{}", std::process::id()));
     std::fs::create_dir_all(&folder).unwrap();
     let bytes = model::bar().to_bytes();
     std::fs::write(folder.join("bar.modal"), &bytes).unwrap();
-    std::fs::write(folder.join("cut.modal"), &bytes[..bytes.len() / 2]).unwrap();
+    let altered = |at: usize, by: u8| {
+        let mut altered = bytes.clone();
+        altered[at] = altered[at].wrapping_add(by);
+        altered
+    };
+    // What is wrong with a file, and what it is told by. The version is a number at byte 8.
+    let wrong = [
+        ("cut", bytes[..bytes.len() / 2].to_vec(), "cut or padded .modal file"),
+        ("altered", altered(bytes.len() - 9, 1), "altered"),
+        ("newer", altered(8, 7), "version"),
+        ("empty", Vec::new(), "cut"),
+        (
+            "other",
+            b"solid not a model at all, but long enough to have a header of its own".repeat(4),
+            "not a .modal file",
+        ),
+    ];
+    for (name, bytes, _) in &wrong {
+        std::fs::write(folder.join(format!("{name}.modal")), bytes).unwrap();
+    }
 
     let mut app = App::new();
     let assets = AssetPlugin { file_path: folder.display().to_string(), ..Default::default() };
     app.add_plugins((MinimalPlugins, assets, TransformPlugin, PliantBodyPlugin::default()));
     let server = app.world().resource::<AssetServer>().clone();
-    let (whole, cut): (Handle<ModalAsset>, Handle<ModalAsset>) =
-        (server.load("bar.modal"), server.load("cut.modal"));
-    let body = app.world_mut().spawn(ModalBody::new(whole)).id();
+    let body = app.world_mut().spawn(ModalBody::new(server.load("bar.modal"))).id();
+    let refused: Vec<Handle<ModalAsset>> =
+        wrong.iter().map(|(name, ..)| server.load(format!("{name}.modal"))).collect();
+    for handle in &refused {
+        app.world_mut().spawn(ModalBody::new(handle.clone()));
+    }
     let deadline = std::time::Instant::now() + std::time::Duration::from_secs(20);
-    while app.world().get::<crate::BodyState>(body).is_none() || !server.load_state(&cut).is_failed() {
+    while app.world().get::<crate::BodyState>(body).is_none()
+        || !refused.iter().all(|handle| server.load_state(handle).is_failed())
+    {
         assert!(std::time::Instant::now() < deadline, "not loaded in 20 s");
         app.update();
         std::thread::sleep(std::time::Duration::from_millis(1));
     }
     assert_eq!(state(&app, body).model().hash(), model::bar().hash());
-    let LoadState::Failed(error) = server.load_state(&cut) else { panic!("loaded half a file") };
-    assert!(error.to_string().contains("cut or padded .modal file"), "{error}");
+    for ((name, _, word), handle) in wrong.iter().zip(&refused) {
+        let LoadState::Failed(error) = server.load_state(handle) else { panic!("{name} was loaded") };
+        assert!(error.to_string().contains(word), "{name}: {error}");
+    }
+    assert_eq!(
+        app.world_mut().query::<&crate::BodyState>().iter(app.world()).count(),
+        1,
+        "the others are no bodies"
+    );
     std::fs::remove_dir_all(folder).unwrap();
 }

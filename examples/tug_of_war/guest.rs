@@ -1,0 +1,129 @@
+//! The user on the right: a guest's app without a window, on a thread of its own.
+
+use std::error::Error;
+use std::sync::atomic::{AtomicBool, Ordering};
+use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
+use std::thread::{self, JoinHandle};
+use std::time::Duration;
+
+use bevy::app::ScheduleRunnerPlugin;
+use bevy::math::DVec3;
+use bevy::prelude::*;
+use pliant::modal::ModalModel;
+use pliant::net::{Emulation, Invite, JoinConfig, JoinOptions, NetPlugin, RemoteBody};
+use pliant::prelude::*;
+
+/// What the two threads tell each other.
+#[derive(Resource, Clone, Default)]
+pub struct Other {
+    seen: Arc<Mutex<Seen>>,
+    pub stop: Arc<AtomicBool>,
+}
+
+/// What the guest shows, and where its hand is to go.
+#[derive(Default)]
+pub struct Seen {
+    pub q: Vec<f64>,
+    /// Targets and patches of its own hands, m.
+    pub hands: Vec<(DVec3, DVec3)>,
+    /// N.
+    pub felt: f64,
+    /// -1 to 1 each way; `None`: it lets go.
+    pub stick: Option<DVec3>,
+}
+
+impl Other {
+    pub fn seen(&self) -> MutexGuard<'_, Seen> {
+        self.seen.lock().unwrap_or_else(PoisonError::into_inner)
+    }
+}
+
+pub fn start(
+    invite: &Invite,
+    model: Arc<ModalModel>,
+    emulation: Option<Emulation>,
+    other: Other,
+) -> Result<JoinHandle<()>, Box<dyn Error>> {
+    let transport = JoinOptions { emulation, ..default() };
+    let net = NetPlugin::join(
+        invite,
+        JoinConfig { name: "right".into(), transport, models: vec![model], ..default() },
+    )?;
+    let run = move || {
+        App::new()
+            .add_plugins((
+                MinimalPlugins.set(ScheduleRunnerPlugin::run_loop(Duration::from_millis(4))),
+                AssetPlugin::default(),
+                TransformPlugin,
+                PliantBodyPlugin::default(),
+                net,
+            ))
+            .insert_resource(Time::<Fixed>::from_hz(40.0))
+            .insert_resource(other)
+            .add_systems(FixedUpdate, pull.before(PliantSystems::Input))
+            .add_systems(Last, tell)
+            .run();
+    };
+    Ok(thread::Builder::new().name("right".into()).spawn(run)?)
+}
+
+/// Where the patch was when it was taken hold of, and how far from there the hand is.
+#[derive(Component)]
+struct Pull {
+    from: DVec3,
+    away: DVec3,
+}
+
+/// The hand goes where the stick points, at the pace of a hand.
+fn pull(
+    mut commands: Commands,
+    other: Res<Other>,
+    time: Res<Time>,
+    bodies: Query<(Entity, &BodyState, &GlobalTransform), With<RemoteBody>>,
+    mut grabs: Query<(Entity, &mut Grab, &mut Pull)>,
+) {
+    let stick = other.seen().stick;
+    let Ok((body, state, place)) = bodies.single() else { return };
+    let size = state.model().size();
+    match (grabs.single_mut(), stick) {
+        (Ok((_, mut grab, mut pull)), Some(stick)) => {
+            let to = 0.3 * size * stick.clamp_length_max(1.0);
+            let step = (to - pull.away).clamp_length_max(size * time.delta_secs_f64());
+            pull.away += step;
+            grab.target = pull.from + pull.away;
+        }
+        (Ok((entity, ..)), None) => commands.entity(entity).despawn(),
+        (Err(_), Some(_)) => {
+            let positions = state.model().surface().positions();
+            let reach = |p: &[f32; 3]| p[0] + 0.55 * p[1];
+            let far =
+                (0..positions.len()).max_by(|&a, &b| reach(&positions[a]).total_cmp(&reach(&positions[b])));
+            let Some(vertex) = far else { return };
+            let from = place.transform_point(Vec3::from(positions[vertex])).as_dvec3();
+            commands.spawn((
+                Grab::new(vertex as u32, 0.06 * size, from),
+                GrabOf(body),
+                Pull { from, away: DVec3::ZERO },
+            ));
+        }
+        (Err(_), None) => {}
+    }
+}
+
+fn tell(
+    other: Res<Other>,
+    bodies: Query<&ShownState, With<RemoteBody>>,
+    hands: Query<(&Grab, &GrabForce)>,
+    mut exit: MessageWriter<AppExit>,
+) {
+    let mut seen = other.seen();
+    if let Ok(shown) = bodies.single() {
+        seen.q.clear();
+        seen.q.extend_from_slice(shown.q());
+    }
+    seen.hands = hands.iter().map(|(grab, felt)| (grab.target, felt.point)).collect();
+    seen.felt = hands.iter().map(|(_, felt)| felt.force.length()).fold(0.0, f64::max);
+    if other.stop.load(Ordering::Relaxed) {
+        exit.write(AppExit::Success);
+    }
+}
