@@ -128,13 +128,20 @@ pub enum Driven {
 pub struct NoPointerGrab;
 
 /// A body that has its model and is simulated; the plugin adds it to a [`ModalBody`] once the asset is there.
-#[derive(Component, Debug)]
+///
+/// Reflection shows how it stands, not the solver, which is [`body`](Self::body)'s to show.
+#[derive(Component, Reflect, Debug)]
+#[reflect(Component, from_reflect = false)]
 pub struct BodyState {
     /// Its world is the entity's world divided by `scale`.
+    #[reflect(ignore)]
     pub(crate) body: Body,
+    #[reflect(ignore)]
     pub(crate) scale: f64,
     /// The transform that was last looked at: taken, refused, or written by the body itself.
+    #[reflect(ignore)]
     pub(crate) placed: Option<Affine3A>,
+    #[reflect(ignore)]
     pub(crate) held: Vec<Held>,
     /// A step was refused and the warning given.
     pub(crate) faulted: bool,

@@ -64,10 +64,12 @@ pub enum BodyError {
 }
 
 /// Sent (and logged once, with the entity's name) when something that a user or a remote wrote was refused.
-#[derive(Message, Debug)]
+#[derive(Message, Reflect, Debug)]
+#[reflect(from_reflect = false)]
 pub struct BodyRefused {
     /// The entity whose component was refused: a body or a grab.
     pub entity: Entity,
     /// What was expected and what came.
+    #[reflect(ignore)]
     pub error: BodyError,
 }

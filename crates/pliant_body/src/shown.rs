@@ -23,10 +23,15 @@ pub struct Pose {
 /// once a tick, or [`snap`](Self::snap) as often as wanted; the surface is then drawn from it exactly as for a local body.
 ///
 /// Lengths: one coordinate per kept mode, kg^1/2 m.
-#[derive(Component, Debug)]
+#[derive(Component, Reflect, Debug)]
+#[reflect(Component, from_reflect = false)]
 pub struct ShownState {
+    // Their lengths agree; nothing from outside may change one of them.
+    #[reflect(ignore)]
     previous: Vec<f64>,
+    #[reflect(ignore)]
     current: Vec<f64>,
+    #[reflect(ignore)]
     shown: Vec<f64>,
     /// Ticks since the last push: 0 in the tick of the push.
     age: u8,

@@ -34,7 +34,9 @@ impl Default for BakePlugin {
 
 impl Plugin for BakePlugin {
     fn build(&self, app: &mut App) {
-        app.register_type::<BakeProgress>()
+        app.register_type::<BakeRequest>()
+            .register_type::<BakeFailed>()
+            .register_type::<BakeProgress>()
             .register_type::<BakeStage>()
             .add_message::<BakeFailed>()
             .insert_resource(Bakery { cache: self.cache.clone(), waiting: VecDeque::new(), running: None })

@@ -21,7 +21,9 @@ use thiserror::Error;
 ///
 /// The [`ModalBody`](crate::ModalBody) beside it may have any settings, its model is written when there is one; without a `ModalBody`
 /// one is added. A new model replaces an old one as any swap of the handle does: the body begins at rest, grabs stay.
-#[derive(Component, Clone)]
+#[derive(Component, Reflect, Debug, Clone)]
+#[reflect(opaque)]
+#[reflect(Component, Debug, Clone, from_reflect = false)]
 #[require(BakeProgress)]
 pub struct BakeRequest {
     /// What is filled with tetrahedra.
@@ -160,10 +162,12 @@ pub enum BakeBodyError {
 }
 
 /// Sent, and logged with the entity's name, when a [`BakeRequest`] gave no model. The entity keeps the body it had.
-#[derive(Message, Debug)]
+#[derive(Message, Reflect, Debug)]
+#[reflect(from_reflect = false)]
 pub struct BakeFailed {
     /// The entity of the request.
     pub entity: Entity,
     /// What was expected and what came.
+    #[reflect(ignore)]
     pub error: BakeBodyError,
 }

@@ -253,3 +253,35 @@ fn a_modal_file_loads_and_one_that_is_cut_altered_or_of_another_version_says_why
     );
     std::fs::remove_dir_all(folder).unwrap();
 }
+
+#[test]
+fn a_reflecting_tool_finds_every_component_and_reads_how_a_body_stands() {
+    use std::any::TypeId;
+
+    let mut app = app();
+    let body = spawn(&mut app, model::bar(), ());
+    steps(&mut app, 30);
+    let registry = app.world().resource::<AppTypeRegistry>().clone();
+    let registry = registry.read();
+    let components = [
+        TypeId::of::<ModalBody>(),
+        TypeId::of::<crate::BodyState>(),
+        TypeId::of::<ShownState>(),
+        TypeId::of::<Driven>(),
+        TypeId::of::<crate::Grab>(),
+        TypeId::of::<crate::GrabOf>(),
+        TypeId::of::<crate::Grabs>(),
+        TypeId::of::<crate::GrabForce>(),
+        TypeId::of::<crate::NoPointerGrab>(),
+    ];
+    for id in components {
+        assert!(registry.get_type_data::<ReflectComponent>(id).is_some(), "{id:?}");
+    }
+    for id in [TypeId::of::<crate::BodyRefused>(), TypeId::of::<crate::SingleSteps>()] {
+        assert!(registry.get(id).is_some(), "{id:?}");
+    }
+    let reflected = registry.get_type_data::<ReflectComponent>(TypeId::of::<crate::BodyState>()).unwrap();
+    let state = reflected.reflect(app.world().entity(body)).unwrap().reflect_ref().as_struct().unwrap();
+    let resting = state.field("resting").and_then(|resting| resting.try_downcast_ref::<bool>());
+    assert_eq!(resting, Some(&true));
+}
