@@ -310,6 +310,7 @@ impl LoopCore {
             damping: masked(self.tool.force_to_hand(felt.damping), axes),
             weight: masked(self.tool.weight(), axes),
             stored: scale * felt.stored,
+            partial: model.partial,
             supplied: scale * supplied,
             holding,
             silent,

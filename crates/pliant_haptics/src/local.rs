@@ -40,6 +40,8 @@ pub struct LocalModel {
     pub count: usize,
     /// Energy that the body could give back, J: elastic and kinetic.
     pub stored: f64,
+    /// `stored` is the least that it could be: of a body elsewhere only the shape is known.
+    pub partial: bool,
     /// Energy that others (other hands, gravity) have put into the body so far, J, net.
     pub supplied: f64,
     /// The body's state, for a loop that steps it itself. Empty: there is none.
@@ -100,6 +102,9 @@ pub struct ModelWriter {
     tick: u64,
     proxies: [Option<(GrabId, Vector3<f64>)>; MAX_CONTACTS],
     points: [Option<(u64, Vector3<f64>)>; MAX_CONTACTS],
+    /// Of bodies elsewhere: what they stored when the first word of them was written, J, and the work of the tool's grabs on them since.
+    stored: Option<f64>,
+    worked: f64,
     targets: Vec<(GrabId, Vector3<f64>)>,
     center: Option<Vector3<f64>>,
     supplied: f64,
@@ -134,6 +139,8 @@ impl ModelWriter {
         out.period = body.config().step;
         out.count = 0;
         out.stored = body.energy() * scale * scale;
+        out.partial = false;
+        self.stored = None;
         self.supplied += self.work_of_others(body, held)? * scale * scale;
         out.supplied = self.supplied;
         out.state.clone_from(body.state());
@@ -174,11 +181,14 @@ impl ModelWriter {
 
     /// Writes the same from published forces alone, for a body that somebody else steps.
     ///
-    /// `relaxation`: of the coupling's damper, s; `period`: time between two words, s. A stiffness that is not finite is none.
+    /// `relaxation`: of the coupling's damper, s; `stored`: elastic energy of the bodies as they are shown, J of the world; `period`: time between two
+    /// words, s. A stiffness that is not finite is none. What others have put in is the most that the bodies ever stored beyond the work of these
+    /// grabs: that much it was at least.
     pub fn write_forces(
         &mut self,
         felt: &[FeltGrab],
         relaxation: f64,
+        stored: f64,
         period: f64,
         stamp: f64,
         out: &mut LocalModel,
@@ -187,14 +197,15 @@ impl ModelWriter {
         out.tick = self.tick;
         out.stamp = stamp;
         out.period = period;
-        (out.stored, out.supplied) = (0.0, self.supplied);
         out.count = felt.len().min(MAX_CONTACTS);
         let before = self.points;
         self.points = [None; MAX_CONTACTS];
         for (i, grab) in felt.iter().take(MAX_CONTACTS).enumerate() {
             let point = Vector3::from(grab.point);
             let last = before.iter().flatten().find(|(key, _)| *key == grab.key).map(|(_, p)| *p);
-            let velocity = last.map_or_else(Vector3::zeros, |p| (point - p) / period);
+            let moved = last.map_or_else(Vector3::zeros, |p| point - p);
+            self.worked -= Vector3::from(grab.force).dot(&moved);
+            let velocity = moved / period;
             let k = grab.stiffness;
             let k = if k.iter().flatten().all(|x| x.is_finite()) { k } else { [[0.0; 3]; 3] };
             out.contacts[i] = Contact {
@@ -207,6 +218,18 @@ impl ModelWriter {
             };
             self.points[i] = Some((grab.key, point));
         }
+        let stored = if stored.is_finite() { stored.max(0.0) } else { 0.0 };
+        if !self.worked.is_finite() {
+            (self.worked, self.stored) = (0.0, None);
+        }
+        // The sum from the beginning, not of the gains: what swings between speed and shape is not put in twice.
+        let before = *self.stored.get_or_insert_with(|| {
+            self.worked = 0.0;
+            stored - self.supplied
+        });
+        self.supplied = self.supplied.max(stored - before - self.worked);
+        out.partial = true;
+        (out.stored, out.supplied) = (stored, self.supplied);
     }
 
     /// Work that other hands and gravity did in the last step, J of the body.

@@ -86,16 +86,28 @@ fn a_body_elsewhere_is_felt_through_what_is_published() {
     let mut word = LocalModel::default();
     let stiffness = [[k, 0.0, 0.0], [0.0, k, 0.0], [0.0, 0.0, k]];
     let felt = |x: f64| FeltGrab { key: 5, point: [x, 0.0, 0.0], stiffness, ..FeltGrab::default() };
-    writer.write_forces(&[felt(0.0)], relaxation, 0.01, 0.0, &mut word);
+    writer.write_forces(&[felt(0.0)], relaxation, 0.0, 0.01, 0.0, &mut word);
     assert!(
         (word.contacts()[0].damping - coupling.damping).abs() < 1e-12,
         "the damper is the same on both sides"
     );
     assert_eq!(word.contacts()[0].velocity, [0.0; 3], "a new grab has not moved");
-    writer.write_forces(&[felt(0.001)], relaxation, 0.01, 0.01, &mut word);
+    writer.write_forces(&[felt(0.001)], relaxation, 0.0, 0.01, 0.01, &mut word);
     assert!((word.contacts()[0].velocity[0] - 0.1).abs() < 1e-12 && word.tick == 2);
     assert!((word.contacts()[0].stiffness[1][1] - k).abs() < 1e-12);
-    writer.write_forces(&[], relaxation, 0.01, 0.02, &mut word);
+    // The body stores 3 mJ, 1 mJ of it by this hand (1 N over 1 mm into the body): others have put in 2 mJ.
+    let pushed = FeltGrab { force: [-1.0, 0.0, 0.0], ..felt(0.002) };
+    writer.write_forces(&[pushed], relaxation, 3e-3, 0.01, 0.02, &mut word);
+    assert!((word.stored - 3e-3).abs() < 1e-15 && (word.supplied - 2e-3).abs() < 1e-15, "{}", word.supplied);
+    assert!(word.partial);
+    // It swings through and back: nobody has put in anything.
+    for stored in [0.0, 3e-3, 1e-3, 3e-3] {
+        writer.write_forces(&[pushed], relaxation, stored, 0.01, 0.02, &mut word);
+    }
+    assert!((word.supplied - 2e-3).abs() < 1e-15, "{}", word.supplied);
+    writer.write_forces(&[pushed], relaxation, f64::NAN, 0.01, 0.02, &mut word);
+    assert!(word.is_finite() && (word.supplied - 2e-3).abs() < 1e-15);
+    writer.write_forces(&[], relaxation, 0.0, 0.01, 0.02, &mut word);
     assert_eq!(word.contacts().len(), 0);
 }
 

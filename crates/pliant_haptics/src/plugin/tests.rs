@@ -71,7 +71,7 @@ fn force(scene: &Scene) -> DVec3 {
 }
 
 /// Runs until it is so. The loop's clock is the real one and a busy machine stutters: what must come is waited for, what must not come is not.
-fn until(s: &mut Scene, what: &str, so: impl Fn(&mut Scene) -> bool) {
+fn until(s: &mut Scene, what: &str, mut so: impl FnMut(&mut Scene) -> bool) {
     for _ in 0..1000 {
         if so(s) {
             return;
@@ -156,7 +156,8 @@ fn a_remote_body_is_felt_through_its_published_force_until_the_network_is_gone()
     let hold = Grab { stiffness: Some(280.0), ..Grab::new(block::tip(), 0.01, at) };
     let grab = world.spawn((hold, pliant_body::GrabOf(body), HeldBy(s.tool))).id();
     // What a session would write: the patch stays where it is, and a state comes every frame.
-    world.entity_mut(grab).insert(GrabForce { point: at, force: DVec3::ZERO });
+    let known = GrabForce { point: at, force: DVec3::ZERO };
+    world.entity_mut(grab).insert(known);
     #[derive(Resource)]
     struct Network(bool);
     s.app.insert_resource(Network(true)).insert_resource(Heard::default());
@@ -175,6 +176,17 @@ fn a_remote_body_is_felt_through_its_published_force_until_the_network_is_gone()
     until(&mut s, "the coupling's force", |s| (force(s).x - want).abs() < 0.3);
     let target = s.app.world().get::<Grab>(grab).unwrap().target;
     assert!(target.x > at.x + 1e-3, "and the session is told where the hand is: {target}");
+    // Until the session knows of the grab, and once it is over, the force says nothing: that is no patch at the origin.
+    s.app.world_mut().entity_mut(grab).insert(GrabForce::default());
+    let mut most = 0.0f64;
+    let mut frames = 0;
+    until(&mut s, "let go", |s| {
+        (most, frames) = (most.max(force(s).length()), frames + 1);
+        frames > 30 && force(s) == DVec3::ZERO
+    });
+    assert!(most < 2.5, "{most} N");
+    s.app.world_mut().entity_mut(grab).insert(known);
+    until(&mut s, "held again", |s| (force(s).x - want).abs() < 0.3);
     s.app.world_mut().resource_mut::<Network>().0 = false;
     until(&mut s, "nothing new comes: the force fades", |s| {
         let heard = &s.app.world().resource::<Heard>().0;
@@ -184,4 +196,31 @@ fn a_remote_body_is_felt_through_its_published_force_until_the_network_is_gone()
     assert_eq!(force(&s), DVec3::ZERO, "and stays away");
     s.app.world_mut().resource_mut::<Network>().0 = true;
     until(&mut s, "it comes back", |s| (force(s).x - want).abs() < 0.3);
+}
+
+#[test]
+fn two_devices_on_one_body_feel_each_other() {
+    let mut s = scene(false);
+    let at = s.app.world().get::<Transform>(s.tool).unwrap().translation;
+    let device = VirtualDevice::new(VirtualConfig::touch(), Hand::FIRM).unwrap();
+    let second = device.handle();
+    let other = s.app.world_mut().resource_mut::<HapticDevices>().add(device, LoopConfig::default()).unwrap();
+    s.app.world_mut().spawn((HapticTool::new(other), ToolGrip::default(), Transform::from_translation(at)));
+    run(&mut s.app, 5);
+    s.hand.set_buttons(1);
+    second.set_buttons(1);
+    until(&mut s, "both hold it", |s| grabs(&mut s.app).len() == 2);
+    let devices = |s: &Scene| {
+        let devices = s.app.world().resource::<HapticDevices>();
+        [s.device, other].map(|id| DVec3::from(devices.get(id).unwrap().report.tick.wrench.force))
+    };
+    // One pulls; the other holds still and is pulled along: the same force the other way, less what the block's own 1600 N/m takes.
+    s.hand.set_target([0.02, 0.0, 0.0]);
+    until(&mut s, "the still hand is pulled towards the one that pulls", |s| {
+        let [puller, holder] = devices(s);
+        puller.x < -1.0 && holder.x > 0.2
+    });
+    // And lets go: the other one is alone with the block.
+    s.hand.set_buttons(0);
+    until(&mut s, "alone", |s| grabs(&mut s.app).len() == 1 && devices(s)[1].length() < 0.3);
 }

@@ -97,6 +97,10 @@ pub(crate) fn publish(
             let felt: Vec<FeltGrab> = held
                 .iter()
                 .filter_map(|(entity, of, grab, force, offset)| {
+                    // Nothing is known of it yet, or any more: the session has not answered, or is over.
+                    if **force == GrabForce::default() {
+                        return None;
+                    }
                     let (state, _, _, place) = bodies.get(of.0).ok()?;
                     let turn: Matrix3<f64> = world_axes(place);
                     let spring = turn * entry.elsewhere.spring(*entity, grab, state) * turn.transpose();
@@ -110,7 +114,11 @@ pub(crate) fn publish(
                 })
                 .collect();
             let relaxation = coupling.grab_config(tool.motion_scale, tool.force_scale).relaxation;
-            entry.running.get().publish(|model| writer.write_forces(&felt, relaxation, period, seen, model));
+            let stored = stored(&held, &bodies);
+            let write = |model: &mut LocalModel| {
+                writer.write_forces(&felt, relaxation, stored, period, seen, model);
+            };
+            entry.running.get().publish(write);
         }
 
         // A body for the loop to step itself: made here, where memory may be had, whenever what is held changes.
@@ -137,6 +145,27 @@ pub(crate) fn publish(
             }
         }
     }
+}
+
+/// What the held bodies could give back, J: the elastic energy of the shapes shown, as nothing else is known of a body elsewhere.
+fn stored(held: &[HeldItem], bodies: &Bodies) -> f64 {
+    let mut counted: Vec<Entity> = Vec::new();
+    let mut sum = 0.0;
+    for (_, of, ..) in held {
+        let Ok((state, driven, shown, _)) = bodies.get(of.0) else { continue };
+        if counted.contains(&of.0) {
+            continue;
+        }
+        counted.push(of.0);
+        let energy = if *driven == Driven::Remote {
+            let modes = shown.current().iter().zip(state.model().omega());
+            0.5 * modes.map(|(q, omega)| (q * omega).powi(2)).sum::<f64>()
+        } else {
+            state.body().energy()
+        };
+        sum += energy * state.scale() * state.scale();
+    }
+    sum
 }
 
 fn world_axes(place: &GlobalTransform) -> Matrix3<f64> {

@@ -122,6 +122,8 @@ pub struct Wanted {
     pub weight: Vector3<f64>,
     /// Energy that the springs and the body could give back, J at the hand.
     pub stored: f64,
+    /// `stored` is the least that it could be.
+    pub partial: bool,
     /// Energy that others have put in since the last tick, J at the hand.
     pub supplied: f64,
     /// The tool holds something.
@@ -221,7 +223,7 @@ impl Safety {
 
         // Energy first of what was really held since the last tick.
         let interaction = self.last - self.last_weight;
-        self.passivity.observe(&interaction, &w.moved, w.supplied, w.stored, w.holding);
+        self.passivity.observe(&interaction, &w.moved, w.supplied, w.stored, w.partial, w.holding);
         if self.gain.value() < 1.0 {
             if self.gain.value() <= 0.0 {
                 self.passivity.refill();

@@ -74,13 +74,14 @@ impl Passivity {
     }
 
     /// Counts the work of the `force` (N) held while the hand `moved` (m), and what others `supplied` (J) in that time. `stored`: what springs
-    /// and body could give back (J). Not `holding` anything, the tank is filled up: the next grab begins anew.
+    /// and body could give back (J), the least that it could be if that is known only in part (`partial`); then everything absorbed counts. Not `holding` anything, the tank is filled up: the next grab begins anew.
     pub fn observe(
         &mut self,
         force: &Vector3<f64>,
         moved: &Vector3<f64>,
         supplied: f64,
         stored: f64,
+        partial: bool,
         holding: bool,
     ) {
         let given = force.dot(moved);
@@ -92,8 +93,12 @@ impl Passivity {
         self.port.supplied += supplied;
         // What springs and body hold now can have come from nowhere but the hand, the tank or others: anything less available has leaked.
         self.full = if holding { self.config.tank + stored.max(0.0) } else { self.config.tank };
-        self.port.available =
-            if holding { (self.port.available - given + supplied).min(self.full) } else { self.full };
+        let balance = self.port.available - given + supplied;
+        self.port.available = match (holding, partial) {
+            (false, _) => self.full,
+            (true, true) => balance,
+            (true, false) => balance.min(self.full),
+        };
     }
 
     /// Nothing is felt now: what comes next is a new engagement, and begins with a full tank.

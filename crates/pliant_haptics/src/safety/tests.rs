@@ -16,6 +16,7 @@ fn wanted(force: f64) -> Wanted {
         damping: Vector3::zeros(),
         weight: Vector3::zeros(),
         stored: 1.0,
+        partial: false,
         supplied: 0.0,
         holding: true,
         silent: 0.0,
@@ -184,14 +185,17 @@ fn energy_of_a_held_force_is_exact() {
         let f = Vector3::new((f64::from(k) * 0.7).sin(), 1.0, -0.5);
         let dx = Vector3::new(0.001, (f64::from(k) * 0.3).cos() * 1e-3, 0.0);
         sum += f.dot(&dx);
-        p.observe(&f, &dx, 0.0, 1e9, true);
+        p.observe(&f, &dx, 0.0, 1e9, false, true);
     }
     let port = p.port();
     assert!((port.available - (0.01 - sum)).abs() < 1e-15);
     assert!((port.given - port.taken - sum).abs() < 1e-15);
     // What cannot be stored is not owed: 1 J pushed into honey leaves a tank and the spring's 2 mJ.
-    p.observe(&Vector3::new(-1.0, 0.0, 0.0), &Vector3::new(1.0, 0.0, 0.0), 0.0, 0.002, true);
+    p.observe(&Vector3::new(-1.0, 0.0, 0.0), &Vector3::new(1.0, 0.0, 0.0), 0.0, 0.002, false, true);
     assert!((p.port().available - 0.012).abs() < 1e-15);
+    // Where only part of what is stored is known, all that was put in stays to the hand's credit.
+    p.observe(&Vector3::new(-1.0, 0.0, 0.0), &Vector3::new(1.0, 0.0, 0.0), 0.0, 0.002, true, true);
+    assert!((p.port().available - 1.012).abs() < 1e-15);
 }
 
 #[test]

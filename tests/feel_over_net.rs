@@ -1,0 +1,166 @@
+//! A hand on a device that holds a body on another machine: real QUIC, the paper's first network in between, the device's own thread.
+//!
+//! Everything runs in real time; what must come is waited for.
+#![allow(clippy::unwrap_used, clippy::panic, missing_docs, reason = "a failed test should panic")]
+
+use std::{
+    path::Path,
+    sync::Arc,
+    time::{Duration, Instant},
+};
+
+use bevy::{math::DVec3, prelude::*, transform::TransformPlugin};
+use pliant::{
+    haptics::{
+        DeviceId, Fault, Hand, HapticDevices, HapticFault, HapticTool, HapticsPlugin, LoopConfig, ToolGrip,
+        VirtualConfig, VirtualDevice, VirtualHandle,
+    },
+    modal::ModalModel,
+    net::{Emulation, HandOf, HostConfig, Invite, JoinConfig, JoinOptions, NetPlugin, SharedBody},
+    prelude::*,
+    stream::emulator::Preset,
+};
+
+fn pip() -> Arc<ModalModel> {
+    let path = Path::new(env!("CARGO_MANIFEST_DIR")).join("../../assets/pip.modal");
+    Arc::new(ModalModel::read(path).unwrap())
+}
+
+fn app(net: NetPlugin) -> App {
+    let mut app = App::new();
+    app.add_plugins((MinimalPlugins, AssetPlugin::default(), TransformPlugin))
+        .insert_resource(Time::<Fixed>::from_hz(40.0))
+        .add_plugins((PliantBodyPlugin::default(), net));
+    app
+}
+
+fn host(model: &Arc<ModalModel>) -> (App, Invite) {
+    let net = NetPlugin::host(HostConfig::default()).unwrap();
+    let invite = net.invite().unwrap().clone();
+    let mut app = app(net);
+    let body = app.world_mut().resource_mut::<Assets<ModalAsset>>().add(ModalAsset::from(model.clone()));
+    app.world_mut().spawn((ModalBody::new(body), SharedBody::named("pip")));
+    (app, invite)
+}
+
+#[derive(Resource, Default)]
+struct Heard(Vec<Fault>);
+
+struct Guest {
+    app: App,
+    device: DeviceId,
+    hand: VirtualHandle,
+}
+
+/// A guest behind the paper's first network (9 % loss, 196 ms), with a device whose workspace is about the body's right side.
+fn guest(model: &Arc<ModalModel>, invite: &Invite) -> Guest {
+    let transport =
+        JoinOptions { emulation: Some(Emulation::preset(Preset::Paper1, 7)), ..JoinOptions::default() };
+    let config =
+        JoinConfig { name: "Ann".into(), transport, models: vec![model.clone()], ..JoinConfig::default() };
+    let mut app = app(NetPlugin::join(invite, config).unwrap());
+    app.add_plugins(HapticsPlugin::default()).init_resource::<Heard>().add_systems(
+        Update,
+        |mut faults: MessageReader<HapticFault>, mut heard: ResMut<Heard>| {
+            heard.0.extend(faults.read().filter_map(|fault| fault.fault));
+        },
+    );
+    app.world_mut().spawn((SharedBody::named("pip"), Transform::default()));
+    // Without friction, so that the hand is where its springs say.
+    let config = VirtualConfig { friction: 0.0, ..VirtualConfig::premium() };
+    let device = VirtualDevice::new(config, Hand::FIRM).unwrap();
+    let hand = device.handle();
+    let device = app.world_mut().resource_mut::<HapticDevices>().add(device, LoopConfig::default()).unwrap();
+    let side = model
+        .surface()
+        .positions()
+        .iter()
+        .max_by(|a, b| (a[0] + 0.55 * a[1]).total_cmp(&(b[0] + 0.55 * b[1])))
+        .unwrap();
+    app.world_mut().spawn((
+        HapticTool::new(device),
+        ToolGrip::default(),
+        Transform::from_translation(Vec3::from(*side)),
+    ));
+    Guest { app, device, hand }
+}
+
+impl Guest {
+    fn force(&self) -> DVec3 {
+        let devices = self.app.world().resource::<HapticDevices>();
+        devices.get(self.device).unwrap().report.tick.wrench.force.into()
+    }
+}
+
+fn until(apps: &mut [&mut App], what: &str, mut so: impl FnMut(&mut [&mut App]) -> bool) {
+    let start = Instant::now();
+    while !so(apps) {
+        assert!(start.elapsed() < Duration::from_secs(30), "never: {what}");
+        apps.iter_mut().for_each(|app| app.update());
+        std::thread::sleep(Duration::from_millis(4));
+    }
+}
+
+/// The reaction on the guest's hand as the host computes it.
+fn at_host(host: &mut App) -> Option<DVec3> {
+    let world = host.world_mut();
+    world.query_filtered::<&GrabForce, With<HandOf>>().iter(world).next().map(|force| force.force)
+}
+
+#[test]
+fn a_hand_far_away_feels_the_body_at_once_and_nothing_when_the_network_is_gone() {
+    let model = pip();
+    let (mut host, invite) = host(&model);
+    let mut g = guest(&model, &invite);
+    until(&mut [&mut host, &mut g.app], "the body is here", |apps| {
+        let world = apps[1].world_mut();
+        world.query::<&BodyState>().iter(world).next().is_some()
+    });
+    g.hand.set_buttons(1);
+    until(&mut [&mut host, &mut g.app], "the hand is on the host's body too", |apps| {
+        at_host(apps[0]).is_some()
+    });
+    // Some time with a still hand, so that the session has measured the way.
+    let start = Instant::now();
+    until(&mut [&mut host, &mut g.app], "time passes", |_| start.elapsed() > Duration::from_secs(2));
+
+    g.hand.set_target([0.06, 0.02, 0.0]);
+    let pulled = Instant::now();
+    let mut first = None;
+    let hand = g.device;
+    let force = |app: &App| -> DVec3 {
+        app.world().resource::<HapticDevices>().get(hand).unwrap().report.tick.wrench.force.into()
+    };
+    until(
+        &mut [&mut host, &mut g.app],
+        "the hand is pushed back as hard as the host's body pushes",
+        |apps| {
+            let own = force(apps[1]);
+            if own.length() > 0.5 {
+                first.get_or_insert(pulled.elapsed());
+            }
+            let truth = at_host(apps[0]).unwrap_or_default();
+            if std::env::var_os("TRACE").is_some() && pulled.elapsed().as_millis() % 500 < 8 {
+            let d = apps[1].world().resource::<HapticDevices>();
+            let t = d.get(hand).unwrap().report.tick;
+            println!("{:?} own {own} truth {truth} gain {} fault {:?} tool {:?} silent {}", pulled.elapsed(), t.gain, t.fault, t.tool, t.silent);
+        }
+        truth.length() > 1.0 && own.distance(truth) < 0.1 * truth.length()
+        },
+    );
+    let first = first.unwrap();
+    println!("felt after {} ms on a network of 196 ms: {:?} N", first.as_millis(), g.force());
+    assert!(first < Duration::from_millis(190), "own hand first: felt after {first:?}");
+
+    // The host's machine stops: no goodbye, nothing.
+    std::mem::forget(host);
+    until(&mut [&mut g.app], "the force fades, and says why", |apps| {
+        let heard = &apps[0].world().resource::<Heard>().0;
+        force(apps[0]) == DVec3::ZERO && heard.iter().any(|fault| matches!(fault, Fault::Stale(_)))
+    });
+    let start = Instant::now();
+    until(&mut [&mut g.app], "it stays away", |apps| {
+        assert_eq!(force(apps[0]), DVec3::ZERO);
+        start.elapsed() > Duration::from_millis(500)
+    });
+}
