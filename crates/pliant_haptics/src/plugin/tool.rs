@@ -182,11 +182,12 @@ pub(crate) fn follow(
 pub(crate) fn grip(
     mut commands: Commands,
     mut buttons: MessageReader<HapticButton>,
+    devices: Res<HapticDevices>,
     tools: Query<(Entity, &HapticTool, &ToolGrip, &ToolPose, Option<&ToolGrabs>)>,
     bodies: Query<(Entity, &BodyState, &ShownState, &GlobalTransform, &Driven)>,
 ) {
     for press in buttons.read() {
-        for (tool, _, grip, pose, held) in
+        for (tool, held_by, grip, pose, held) in
             tools.iter().filter(|(_, t, g, ..)| t.device == press.device && g.button == press.button)
         {
             if !press.pressed {
@@ -216,11 +217,19 @@ pub(crate) fn grip(
             let Some((body, vertex, radius, middle, _)) = within.min_by(|a, b| a.4.total_cmp(&b.4)) else {
                 continue;
             };
+            // As the device holds, from the first moment: whoever steps the body elsewhere is told once.
+            let coupling = devices.get(press.device).map(|status| status.coupling);
+            let hold = coupling.map(|c| c.grab_config(held_by.motion_scale, held_by.force_scale));
+            let hold = hold.unwrap_or_default();
             // Held where it is: grabbing moves nothing and pushes nobody.
             let offset = pose.orientation.inverse() * (middle - pose.position);
             commands.spawn((
                 Name::new("tool grab"),
-                Grab::new(vertex, radius, middle),
+                Grab {
+                    stiffness: hold.stiffness,
+                    relaxation: hold.relaxation,
+                    ..Grab::new(vertex, radius, middle)
+                },
                 GrabOf(body),
                 HeldBy(tool),
                 ToolOffset(offset),
