@@ -59,9 +59,13 @@ pub struct Options {
     #[arg(long)]
     modes: Option<u16>,
 
-    /// Have the shipped body's model at hand, so that it need not be sent.
+    /// Have the body's model at hand, so that it need not be sent. Bots have it always.
     #[arg(long)]
     cached: bool,
+
+    /// Which model that is: a file, or one of assets/.
+    #[arg(long, default_value = "pip.modal")]
+    body: PathBuf,
 
     /// Only look.
     #[arg(long)]
@@ -119,7 +123,7 @@ fn main() -> ExitCode {
 }
 
 fn run(options: &Options) -> Result<(), Box<dyn Error>> {
-    let shipped = || session::model("pip.modal".as_ref());
+    let shipped = || session::model(&options.body);
     if let [host, guest] = options.compare.as_slice() {
         // The first five seconds are for finding the clock and taking hold.
         return session::trace::compare(&*shipped()?, host, guest, 200);
