@@ -40,6 +40,7 @@ mod exponential;
 mod file;
 mod flexibility;
 mod integrator;
+mod limit;
 mod model;
 mod patch;
 mod relaxation;
@@ -52,6 +53,7 @@ pub use body::{Body, BodyConfig, Frame, GrabConfig, GrabId, RigidMotion, State, 
 pub use error::{FileError, ModelError, StepError};
 pub use file::{FORMAT_VERSION, MAGIC};
 pub use integrator::{Coefficients, Integrator};
+pub use limit::streaming_sum;
 pub use model::{BakeInfo, Damping, Element, FlexibilitySite, ModalModel, ModelHash, ModelParts};
 pub use patch::Patch;
 pub use relaxation::{Flow, Relaxation};
