@@ -38,7 +38,7 @@
 )]
 #![cfg_attr(
     feature = "haptics",
-    doc = "| the plugins of [`haptics`] | `haptics` | devices that push back, their loop, gamepads that buzz |"
+    doc = "| [`HapticsPlugin`](haptics::HapticsPlugin) | `haptics` | haptic devices, the tools they move and the forces they give |"
 )]
 #![cfg_attr(
     feature = "bake",
@@ -127,10 +127,17 @@ pub mod prelude {
         NoPointerGrab, PliantBodyPlugin, PliantDisplaySystems, PliantSystems, PliantTick, PointerGrab,
         PointerGrabPlugin, PointerGrabSystems, PointerHeld, ShownState, SingleSteps,
     };
+    #[cfg(all(feature = "haptics", feature = "render"))]
+    pub use crate::haptics::ForceArrow;
+    #[cfg(feature = "haptics")]
+    pub use crate::haptics::{
+        HapticButton, HapticDevices, HapticFault, HapticNotice, HapticTool, HapticsPlugin, ToolGrabs,
+        ToolGrip, ToolOffset, ToolPose,
+    };
     pub use crate::modal::{ModalModel, Patch};
 }
 
 /// The code in the README compiles.
-#[cfg(all(doctest, feature = "window", feature = "net"))]
+#[cfg(all(doctest, feature = "window", feature = "net", feature = "haptics"))]
 #[doc = include_str!("../../../README.md")]
 pub struct Readme;
