@@ -88,7 +88,7 @@ pub(crate) fn shape(element: Element, l: [f64; 4]) -> [f64; MAX_NODES] {
 }
 
 /// Points of the quadrature that integrates the stiffness exactly, and their common weight as a share of the volume.
-fn stiffness_points(element: Element) -> (&'static [[f64; 4]], f64) {
+pub(crate) fn stiffness_points(element: Element) -> (&'static [[f64; 4]], f64) {
     const CENTRE: [[f64; 4]; 1] = [[0.25; 4]];
     // Degree 2: a = (5 + 3 sqrt 5) / 20, b = (5 - sqrt 5) / 20.
     const A: f64 = 0.585_410_196_624_968_5;

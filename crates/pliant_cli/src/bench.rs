@@ -32,25 +32,25 @@ enum What {
 
 /// Percentiles of a time, us.
 #[derive(Serialize, Debug)]
-struct Times {
-    p50: f64,
-    p99: f64,
+pub(crate) struct Times {
+    pub(crate) p50: f64,
+    pub(crate) p99: f64,
     p999: f64,
 }
 
 /// What `--json` prints.
 #[derive(Serialize, Debug)]
-struct Told {
+pub(crate) struct Told {
     modes: usize,
-    surface_vertices: usize,
-    step_us: Times,
-    reconstruct_us: Times,
+    pub(crate) surface_vertices: usize,
+    pub(crate) step_us: Times,
+    pub(crate) reconstruct_us: Times,
     /// Read and written by one reconstruction.
     bytes: usize,
     /// Of the median reconstruction.
-    bandwidth_gb_s: f64,
+    pub(crate) bandwidth_gb_s: f64,
     /// Of a plain sum over a buffer of as many bytes in the processor's widest registers, median, in the same run.
-    bandwidth_limit_gb_s: f64,
+    pub(crate) bandwidth_limit_gb_s: f64,
 }
 
 pub(crate) fn run(args: &BenchArgs) -> Result<(), CliError> {
@@ -62,7 +62,7 @@ pub(crate) fn run(args: &BenchArgs) -> Result<(), CliError> {
     if *json { output::print_json(&told) } else { output::print(&text(&told)) }
 }
 
-fn measure(model: Arc<ModalModel>, seconds: f64) -> Result<Told, CliError> {
+pub(crate) fn measure(model: Arc<ModalModel>, seconds: f64) -> Result<Told, CliError> {
     let mut body = Body::new(model.clone(), BodyConfig::default())?;
     // Where the first mode moves most: a body is pulled where it gives.
     let moves = |v: u32| (0..3).map(|axis| model.displacement_row(v, axis, 0).powi(2)).sum::<f32>();

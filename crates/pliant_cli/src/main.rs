@@ -9,6 +9,7 @@ mod inspect;
 mod mesh;
 mod output;
 mod progress;
+mod report;
 mod stability;
 mod stream;
 
@@ -34,6 +35,8 @@ enum Command {
     Inspect(inspect::InspectArgs),
     /// Measures what a body costs on this machine
     Bench(bench::BenchArgs),
+    /// Measures what the method costs and what it is off by, as tables and plots
+    Report(report::ReportArgs),
     /// Runs stiff, extreme and unfair cases and says by what margin each keeps its bound
     Stability(stability::StabilityArgs),
     /// Streams a body over an emulated network and measures what a guest sees
@@ -47,6 +50,7 @@ fn main() -> ExitCode {
         Command::Bake(args) => bake::run(args),
         Command::Inspect(args) => inspect::run(&args),
         Command::Bench(args) => bench::run(&args),
+        Command::Report(args) => report::run(&args),
         Command::Stability(args) => stability::run(&args),
         Command::Stream(args) => stream::run(&args),
     };
@@ -84,6 +88,8 @@ enum CliError {
     Device(#[from] pliant_haptics::StartError),
     #[error("{0}")]
     DeviceInfo(#[from] pliant_haptics::InfoError),
+    #[error("{0}: cannot be drawn")]
+    Plot(std::path::PathBuf),
     #[error("{broken} of {of} cases break their bounds")]
     Unstable { broken: usize, of: usize },
     #[error("{what}: expected one of {expected}, got '{got}'")]

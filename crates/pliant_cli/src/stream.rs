@@ -125,7 +125,7 @@ impl Told {
 }
 
 /// Time since the first call: the experiment owns no clock.
-fn clock() -> Duration {
+pub(crate) fn clock() -> Duration {
     static BEGAN: OnceLock<Instant> = OnceLock::new();
     BEGAN.get_or_init(Instant::now).elapsed()
 }

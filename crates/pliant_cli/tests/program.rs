@@ -535,3 +535,27 @@ fn the_short_form_of_the_stability_matrix_keeps_its_bounds() {
     let message = refused(&["stability", "--only", "no such case"]);
     assert!(message.contains("--only"), "{message}");
 }
+
+#[test]
+fn a_report_writes_its_words_numbers_and_pictures() {
+    let folder = Folder::new("report");
+    let told =
+        json(&succeeds(&["report", "--quick", "--only", "steps", "-o", &folder.file("out"), "--json"]));
+    assert_eq!(told["parts"][0]["name"], "steps");
+    let read = |name: &str| std::fs::read(folder.0.join("out").join(name)).unwrap();
+    for file in told["parts"][0]["files"].as_array().unwrap() {
+        assert!(!read(file.as_str().unwrap()).is_empty(), "{file}");
+    }
+    assert!(read("c-steps-free.png").starts_with(b"\x89PNG"));
+    let text = String::from_utf8(read("report.md")).unwrap();
+    assert!(text.contains("c-steps-held.svg") && text.contains("The reference itself is off by"), "{text}");
+    // The exact step needs no small steps: at 60 Hz a struck bar is off by rounding, Newmark by more than a percent.
+    let csv = String::from_utf8(read("c-steps-free.csv")).unwrap();
+    let error = |line: &str| {
+        let row = csv.lines().find(|row| row.starts_with(&format!("\"{line}"))).unwrap();
+        row.split(',').nth(2).unwrap().parse::<f64>().unwrap()
+    };
+    assert!(error("exact") < 1e-10 && error("Newmark") > 0.01, "{csv}");
+    let message = refused(&["report", "--only", "nothing", "-o", &folder.file("out")]);
+    assert!(message.contains("--only"), "{message}");
+}

@@ -1,0 +1,217 @@
+//! `pliant report`: what the method costs and what it is off by, remade on this machine: tables, CSV, SVG, PNG and the words for them.
+
+mod physics;
+mod plot;
+mod tables;
+mod work;
+
+use std::{fmt::Write, path::PathBuf, time::Instant};
+
+use clap::Args;
+use serde::Serialize;
+
+use crate::{CliError, output, progress::Bar};
+use plot::Figure;
+
+const PARTS: [&str; 11] = [
+    "elements",
+    "modes",
+    "steps",
+    "warp",
+    "precision",
+    "network",
+    "front",
+    "table-2",
+    "courses",
+    "default",
+    "all",
+];
+
+#[derive(Args, Debug)]
+pub(crate) struct ReportArgs {
+    /// Only one part: elements, modes, steps, warp, precision, network, front, table-2, courses, default
+    #[arg(long, default_value = "all")]
+    only: String,
+    /// Fewer points and shorter timings: within ten minutes on two cores
+    #[arg(long)]
+    quick: bool,
+    /// Surfaces that are measured when they are there: bunny.obj, armadillo.obj
+    #[arg(long, value_name = "DIR", default_value = "../shared/models")]
+    models: PathBuf,
+    /// The project's own body: a surface or a scene
+    #[arg(long, value_name = "FILE", default_value = "assets/pip.ron")]
+    own: PathBuf,
+    /// The folder to write
+    #[arg(short, long, value_name = "DIR")]
+    output: PathBuf,
+    /// Prints one line of JSON: the parts, their files and seconds
+    #[arg(long)]
+    json: bool,
+}
+
+#[derive(Serialize, Debug)]
+struct Part {
+    name: &'static str,
+    files: Vec<String>,
+    seconds: f64,
+}
+
+#[derive(Serialize, Debug)]
+struct Told {
+    parts: Vec<Part>,
+    seconds: f64,
+}
+
+pub(crate) fn run(args: &ReportArgs) -> Result<(), CliError> {
+    if !PARTS.contains(&args.only.as_str()) {
+        return Err(CliError::Unknown { what: "--only", got: args.only.clone(), expected: PARTS.join(", ") });
+    }
+    std::fs::create_dir_all(&args.output)?;
+    // Timings of one thread are not to share their core with a pool: one thread for those; bakes take all cores.
+    let began = Instant::now();
+    let mut text = heading();
+    let mut told = Told { parts: Vec::new(), seconds: 0.0 };
+    let mut bar = Bar::new();
+    for name in PARTS.into_iter().filter(|p| *p != "all" && (args.only == "all" || args.only == *p)) {
+        bar.report(name, 0.0);
+        let start = Instant::now();
+        let (figures, words) = part(name, args, &mut bar)?;
+        let mut files = Vec::new();
+        let _ = writeln!(text, "\n## {}\n", title(name));
+        for figure in &figures {
+            plot::write(&args.output, figure)?;
+            let _ = writeln!(text, "![{}]({}.svg)\n\n{}", figure.title, figure.file, figure.words);
+            if let Some(error) = figure.reference_error {
+                let _ = writeln!(text, "The reference itself is off by about {error:.1e}.");
+            }
+            let _ = writeln!(text, "\n{}", rows(figure));
+            files.extend(["csv", "svg", "png"].map(|e| format!("{}.{e}", figure.file)));
+        }
+        let _ = writeln!(text, "{words}");
+        told.parts.push(Part { name, files, seconds: start.elapsed().as_secs_f64() });
+    }
+    drop(bar);
+    told.seconds = began.elapsed().as_secs_f64();
+    let _ = writeln!(
+        text,
+        "\nMade in {:.0} s by `pliant report{}`.",
+        told.seconds,
+        if args.quick { " --quick" } else { "" }
+    );
+    std::fs::write(args.output.join("report.md"), text)?;
+    if args.json {
+        return output::print_json(&told);
+    }
+    output::print(&format!("{} in {:.0} s", args.output.join("report.md").display(), told.seconds))
+}
+
+fn title(part: &str) -> &'static str {
+    match part {
+        "elements" => "a. Elements and mesh size",
+        "modes" => "b. Modes kept",
+        "steps" => "c. Integrator and step",
+        "warp" => "d. Warp against a nonlinear solution",
+        "precision" => "e. Precision",
+        "network" => "f. Network",
+        "front" => "g. All together",
+        "table-2" => "The paper's table 2",
+        "courses" => "The paper's figures 7, 8 and 9",
+        _ => "The default setting in words",
+    }
+}
+
+fn part(name: &str, args: &ReportArgs, bar: &mut Bar) -> Result<(Vec<Figure>, String), CliError> {
+    let quick = args.quick;
+    Ok(match name {
+        "elements" => (vec![physics::elements(quick)?], String::new()),
+        "modes" => (vec![physics::modes(quick)?], String::new()),
+        "steps" => (physics::steps(quick)?.into(), String::new()),
+        "warp" => (physics::warp(quick)?, String::new()),
+        "precision" => {
+            let (figure, _) = tables::precision()?;
+            (vec![figure], String::new())
+        }
+        "network" => {
+            let (figure, table) = tables::networks(quick, bar)?;
+            (vec![figure], table)
+        }
+        "front" => (vec![physics::front(quick)?], WHICH.to_owned()),
+        "table-2" => {
+            (Vec::new(), tables::table_2(&args.models, &args.own, if quick { 0.3 } else { 2.0 }, bar)?)
+        }
+        "courses" => (tables::courses()?, String::new()),
+        _ => (
+            Vec::new(),
+            tables::default_setting(&args.models, &args.own, if quick { 12_000 } else { 50_000 }, bar)?,
+        ),
+    })
+}
+
+const WHICH: &str = "Which setting for which need: *many bodies in the background*: 6 to 12 modes, no warp unless they turn or bend far; *a body that is dragged and looked at*: the default \
+    (ten-node tetrahedra, 20 to 60 modes, exact step, warp); *a body that is felt*: the same, and more modes only for the picture, as the residual flexibility already gives the hand what \
+    they would; *the paper's comparison*: four-node tetrahedra and Newmark, for nothing else.";
+
+fn rows(figure: &Figure) -> String {
+    if !figure.logarithmic {
+        return String::new();
+    }
+    let mut out = format!("| line | {} | {} |\n| --- | --- | --- |\n", figure.x, figure.y);
+    for series in &figure.series {
+        for (x, y) in &series.points {
+            let _ = writeln!(out, "| {} | {x:.4} | {y:.2e} |", series.name);
+        }
+    }
+    out
+}
+
+fn heading() -> String {
+    let days = std::time::SystemTime::now()
+        .duration_since(std::time::UNIX_EPOCH)
+        .map_or(0, |since| since.as_secs() / 86_400);
+    let [y, m, d] = date(days as i64);
+    let cores = std::thread::available_parallelism().map_or(1, usize::from);
+    format!(
+        "# What Pliant costs and what it is off by\n\n{y:04}-{m:02}-{d:02}, Pliant {}, {cores} cores, {} {}, {}. Times are of one core, medians after a warm-up, unless it says otherwise.\n",
+        env!("CARGO_PKG_VERSION"),
+        std::env::consts::ARCH,
+        std::env::consts::OS,
+        vectors(),
+    )
+}
+
+/// The widest vectors of this processor that the reconstruction knows.
+fn vectors() -> &'static str {
+    #[cfg(target_arch = "x86_64")]
+    {
+        if std::arch::is_x86_feature_detected!("avx512f") {
+            return "AVX-512";
+        }
+        if std::arch::is_x86_feature_detected!("avx2") && std::arch::is_x86_feature_detected!("fma") {
+            return "AVX2";
+        }
+    }
+    "portable vectors"
+}
+
+/// Year, month and day (UTC) of a number of days since 1970-01-01 in the Gregorian calendar.
+fn date(days: i64) -> [i64; 3] {
+    // H. Hinnant, "chrono-compatible low-level date algorithms": eras of 400 years that begin in March.
+    let z = days + 719_468;
+    let era = z.div_euclid(146_097);
+    let day = z.rem_euclid(146_097);
+    let year = (day - day / 1_460 + day / 36_524 - day / 146_096) / 365;
+    let of_year = day - (365 * year + year / 4 - year / 100);
+    let shifted = (5 * of_year + 2) / 153;
+    let month = if shifted < 10 { shifted + 3 } else { shifted - 9 };
+    [year + era * 400 + i64::from(month <= 2), month, of_year - (153 * shifted + 2) / 5 + 1]
+}
+
+#[cfg(test)]
+mod tests {
+    #[test]
+    fn dates_are_those_of_the_calendar() {
+        assert_eq!(super::date(0), [1970, 1, 1]);
+        assert_eq!(super::date(11_016), [2000, 2, 29]);
+        assert_eq!(super::date(20_819), [2027, 1, 1]);
+    }
+}

@@ -1,0 +1,68 @@
+//! What the figures share: timings, bodies, errors.
+
+use std::{sync::Arc, time::Instant};
+
+use pliant_bake::{Anchor, BakeConfig, Comparison, bake};
+use pliant_mesh::TetMesh;
+use pliant_modal::{Damping, Element, ModalModel};
+
+use crate::CliError;
+
+/// Median and 99th percentile of a piece of work, us, after a warm-up.
+pub(super) fn time_us(
+    repeats: usize,
+    mut work: impl FnMut() -> Result<(), CliError>,
+) -> Result<[f64; 2], CliError> {
+    for _ in 0..repeats / 10 + 1 {
+        work()?;
+    }
+    let mut samples = Vec::with_capacity(repeats);
+    for _ in 0..repeats.max(1) {
+        let began = Instant::now();
+        work()?;
+        samples.push(began.elapsed().as_secs_f64() * 1e6);
+    }
+    samples.sort_by(f64::total_cmp);
+    Ok([samples[samples.len() / 2], samples[(samples.len() - 1) * 99 / 100]])
+}
+
+/// Held where `axis` is below `bound`.
+pub(super) fn anchor(axis: usize, bound: f64) -> Anchor {
+    Anchor { axis, comparison: Comparison::Less, bound }
+}
+
+pub(super) fn config(element: Element, modes: usize, anchors: Vec<Anchor>) -> BakeConfig {
+    BakeConfig {
+        element,
+        modes,
+        poisson: 0.3,
+        damping: Damping::Ratio(0.05),
+        anchors,
+        sites: Some(64),
+        ..BakeConfig::default()
+    }
+}
+
+/// The model and the seconds that its bake took.
+pub(super) fn baked(mesh: &TetMesh, config: &BakeConfig) -> Result<(Arc<ModalModel>, f64), CliError> {
+    let made = bake(mesh, None, config, &mut |_, _| ())?;
+    Ok((Arc::new(made.model), made.times.total))
+}
+
+/// The surface vertex that lies farthest along a direction.
+pub(super) fn farthest(model: &ModalModel, along: [f32; 3]) -> u32 {
+    let positions = model.surface().positions();
+    let reach = |v: u32| (0..3).map(|k| positions[v as usize][k] * along[k]).sum::<f32>();
+    (0..positions.len() as u32).max_by(|a, b| reach(*a).total_cmp(&reach(*b))).unwrap_or(0)
+}
+
+/// Root mean square and largest distance between two shapes, m.
+pub(super) fn apart(a: &[[f64; 3]], b: &[[f64; 3]]) -> [f64; 2] {
+    let (mut sum, mut most) = (0.0, 0.0f64);
+    for (a, b) in a.iter().zip(b) {
+        let d: f64 = (0..3).map(|k| (a[k] - b[k]).powi(2)).sum();
+        sum += d;
+        most = most.max(d);
+    }
+    [(sum / a.len().max(1) as f64).sqrt(), most.sqrt()]
+}
