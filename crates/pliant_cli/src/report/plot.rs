@@ -59,7 +59,7 @@ pub(super) fn write(folder: &Path, figure: &Figure) -> Result<(), CliError> {
     for series in &figure.series {
         for (x, y) in &series.points {
             // Writing to a string cannot fail.
-            let _ = writeln!(csv, "\"{}\",{x:.6e},{y:.6e},{reference}", series.name);
+            let _ = writeln!(csv, "\"{}\",{x:.4e},{y:.3e},{reference}", series.name);
         }
     }
     std::fs::write(folder.join(format!("{}.csv", figure.file)), csv)?;

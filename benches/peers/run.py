@@ -1,0 +1,208 @@
+#!/usr/bin/env python3
+"""Pliant beside its peers: one mesh, one material, one run, ratios.
+
+    python3 benches/peers/run.py [--json] [--pliant PATH]
+
+Needs numpy and scipy; takes pybullet and mujoco where they are installed (PyPI) and says so where not. Every peer is asked for a step of the same free
+bar of 1,080 tetrahedra (1 m x 0.15 m x 0.15 m, E 2e5 Pa, nu 0.3, 1000 kg/m^3), and what it computes in that time is said beside the number. One thread.
+"""
+
+import argparse, json, os, pathlib, struct, subprocess, sys, tempfile, time
+
+os.environ.setdefault("OMP_NUM_THREADS", "1")
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+
+import numpy as np
+from scipy.io import mmread
+from scipy.sparse.linalg import eigsh
+
+CELLS, SIZE, MODES = (20, 3, 3), (1.0, 0.15, 0.15), 20
+YOUNG, POISSON, DENSITY = 2e5, 0.3, 1000.0
+ROOT = pathlib.Path(__file__).resolve().parents[2]
+
+
+def median_us(work, repeats, warm=20):
+    for _ in range(warm):
+        work()
+    samples = []
+    for _ in range(repeats):
+        began = time.perf_counter()
+        work()
+        samples.append((time.perf_counter() - began) * 1e6)
+    return float(np.median(samples)), float(np.percentile(samples, 99))
+
+
+class Pliant:
+    def __init__(self, path, folder):
+        self.command = [path] if path else ["cargo", "run", "--release", "-q", "-p", "pliant_cli", "--"]
+        self.folder = folder
+
+    def __call__(self, *arguments):
+        done = subprocess.run([*self.command, *map(str, arguments)], cwd=ROOT, check=True, capture_output=True, text=True)
+        return done.stdout
+
+    def modes_only(self, cells, modes, folder):
+        """A finer bar, for the eigensolver alone: its seconds and frequencies."""
+        folder.mkdir()
+        comma = lambda values: ",".join(map(str, values))
+        self("mesh", "bar", "--cells", comma(cells), "--size", comma(SIZE), "-o", folder / "bar.vtk")
+        told = json.loads(self("bake", folder / "bar.vtk", "--element", "tet4", "--modes", modes, "--young", YOUNG, "--poisson", POISSON,
+                               "--density", DENSITY, "--no-cache", "--threads", 1, "--export-matrices", folder, "-o", folder / "bar.modal", "--json"))
+        return {"frequencies": told["frequencies_hz"], "modes_s": told["seconds"]["factor"] + told["seconds"]["modes"], "tets": told["tets"]}
+
+    def measure(self):
+        mesh, model = self.folder / "bar.vtk", self.folder / "bar.modal"
+        comma = lambda values: ",".join(map(str, values))
+        self("mesh", "bar", "--cells", comma(CELLS), "--size", comma(SIZE), "-o", mesh)
+        bake = ["bake", mesh, "--element", "tet4", "--modes", MODES, "--young", YOUNG, "--poisson", POISSON,
+                "--density", DENSITY, "--no-cache", "--threads", 1, "--export-matrices", self.folder, "-o", model, "--json"]
+        told = json.loads(self(*bake))
+        seconds = told["seconds"]
+        stepped = json.loads(self("bench", "step", model, "--json"))
+        return {
+            "frequencies": told["frequencies_hz"],
+            "modes_s": seconds["factor"] + seconds["modes"],
+            "step_us": stepped["step_us"]["p50"],
+            "surface_us": stepped["reconstruct_us"]["p50"],
+            "frame_us": stepped["step_us"]["p50"] + stepped["reconstruct_us"]["p50"],
+        }
+
+
+def read_vtk(path):
+    """Points and tetrahedra of a legacy ASCII file."""
+    words = iter(path.read_text().split())
+    points = tets = None
+    for word in words:
+        if word == "POINTS":
+            count = int(next(words)); next(words)
+            points = np.array([float(next(words)) for _ in range(3 * count)]).reshape(-1, 3)
+        elif word == "CELLS":
+            count = int(next(words)); next(words)
+            tets = np.array([int(next(words)) for _ in range(5 * count)]).reshape(-1, 5)[:, 1:]
+    return points, tets
+
+
+def scipy_modes(folder, ours, modes=MODES):
+    """SciPy's shift-invert Lanczos (ARPACK over SuperLU) on the very matrices of our bake."""
+    stiffness, mass = (mmread(folder / f"{name}.mtx").tocsc() for name in "KM")
+    shift = -(2.0 * np.pi * ours["frequencies"][0]) ** 2
+    began = time.perf_counter()
+    values, vectors = eigsh(stiffness, k=modes + 6, M=mass, sigma=shift)
+    seconds = time.perf_counter() - began
+    order = np.argsort(values)[6:]
+    hertz = np.sqrt(values[order]) / (2.0 * np.pi)
+    off = float(np.max(np.abs(hertz / np.array(ours["frequencies"]) - 1.0)))
+    return seconds, off, values[order], vectors[:, order], np.asarray(mass.sum(axis=1)).ravel()[::3]
+
+
+def bullet(folder, values, vectors, nodal_mass):
+    import pybullet
+
+    points, tets = read_vtk(folder / "bar.vtk")
+    place = folder / "bullet"
+    place.mkdir()
+    lines = ["# vtk DataFile Version 2.0", "bar", "ASCII", "DATASET UNSTRUCTURED_GRID", f"POINTS {len(points)} double"]
+    lines += [" ".join(map(repr, map(float, p))) for p in points]
+    lines += [f"CELLS {len(tets)} {5 * len(tets)}"] + ["4 " + " ".join(map(str, t)) for t in tets]
+    lines += [f"CELL_TYPES {len(tets)}"] + ["10"] * len(tets)
+    (place / "bar.vtk").write_text("\n".join(lines) + "\n")
+
+    def numbers(name, array):
+        flat = np.ascontiguousarray(array, dtype="<f8").ravel()
+        (place / name).write_bytes(struct.pack("<I", flat.size) + flat.tobytes())
+
+    # Mass-normalised modes: the reduced stiffness is the eigenvalue itself.
+    numbers("eigenvalues.bin", values)
+    numbers("K_r_diag_mat.bin", values)
+    numbers("modes.bin", vectors.T)
+    numbers("M_diag_mat.bin", nodal_mass)
+    (place / "bar.urdf").write_text(
+        f"""<?xml version="1.0"?>
+<robot name="bar"><reduced_deformable name="bar"><num_modes value="{MODES}"/><mass value="{nodal_mass.sum()}"/>
+<stiffness_scale value="1"/><collision_margin value="0.001"/><erp value="0.2"/><cfm value="0.2"/><friction value="0.5"/>
+<damping_coefficient value="0.0001"/><visual filename="bar.vtk"/></reduced_deformable></robot>"""
+    )
+    pybullet.connect(pybullet.DIRECT)
+    pybullet.resetSimulation(pybullet.RESET_USE_REDUCED_DEFORMABLE_WORLD)
+    pybullet.setGravity(0, 0, -9.81)
+    pybullet.setAdditionalSearchPath(str(place))
+    pybullet.setTimeStep(1 / 240)
+    body = pybullet.loadURDF("bar.urdf", [0, 0, 0])
+    if body < 0:
+        raise RuntimeError("PyBullet did not take the file")
+    times = median_us(pybullet.stepSimulation, 500)
+    fell = pybullet.getMeshData(body, -1)[1]
+    pybullet.disconnect()
+    drop = float(np.mean([p[2] for p in fell]))
+    if not drop < -1.0:
+        raise RuntimeError(f"PyBullet's bar did not fall: mean height {drop} m")
+    return times
+
+
+def mujoco_flex():
+    import mujoco
+
+    spacing = " ".join(str(s / c) for s, c in zip(SIZE, CELLS))
+    count = " ".join(str(c + 1) for c in CELLS)
+    mass = DENSITY * np.prod(SIZE)
+    xml = f"""<mujoco><option timestep="0.0005" gravity="0 0 -9.81"/><size memory="200M"/><worldbody>
+      <flexcomp name="bar" type="grid" count="{count}" spacing="{spacing}" mass="{mass}" dim="3" radius="0.001">
+      <contact selfcollide="none" contype="0" conaffinity="0"/>
+      <elasticity young="{YOUNG}" poisson="{POISSON}" damping="0.001"/></flexcomp></worldbody></mujoco>"""
+    model = mujoco.MjModel.from_xml_string(xml)
+    data = mujoco.MjData(model)
+    times = median_us(lambda: mujoco.mj_step(model, data), 200)
+    if not np.all(np.isfinite(data.qpos)):
+        raise RuntimeError("MuJoCo's bar is no longer finite")
+    return times, int(model.nv)
+
+
+def main():
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--json", action="store_true")
+    parser.add_argument("--pliant", help="the program; default: cargo run --release")
+    args = parser.parse_args()
+    rows = []
+
+    def row(name, what, value, ours, unit, computes):
+        rows.append({"peer": name, "job": what, "peer_value": value, "ours": ours, "unit": unit,
+                     "ratio": None if value is None else value / ours, "computes": computes})
+
+    with tempfile.TemporaryDirectory() as folder:
+        folder = pathlib.Path(folder)
+        pliant = Pliant(args.pliant, folder)
+        ours = pliant.measure()
+        seconds, off, values, vectors, nodal_mass = scipy_modes(folder, ours)
+        row("SciPy eigsh", f"{MODES} modes of the same K and M", seconds, ours["modes_s"], "s",
+            f"factor and Lanczos on the same matrices; frequencies agree to {off:.0e}")
+        finer = pliant.modes_only((60, 12, 12), 60, folder / "finer")
+        finer_seconds, finer_off, *_ = scipy_modes(folder / "finer", finer, 60)
+        row("SciPy eigsh", f"60 modes of {finer['tets']} tetrahedra", finer_seconds, finer["modes_s"], "s",
+            f"the same on a finer mesh; frequencies agree to {finer_off:.0e}")
+        try:
+            step, _ = bullet(folder, values, vectors, nodal_mass)
+            row("PyBullet reduced deformable", "a step and all vertices", step, ours["frame_us"], "us",
+                "the same 20 modes on the same mesh, written in its own format; also the rigid motion, the positions of all nodes and the broad phase of its collision world; "
+                "ours: a step with a hand pulling and the warped surface")
+        except Exception as error:  # a peer that is not there, or refuses, is told and the others go on
+            row("PyBullet reduced deformable", "a step and all vertices", None, ours["frame_us"], "us", f"not measured: {error}")
+        try:
+            (step, _), freedoms = mujoco_flex()
+            row("MuJoCo flex", "a step", step, ours["frame_us"], "us",
+                f"the full mesh, not modes: {freedoms} degrees of freedom, nonlinear elasticity, steps of 0.5 ms, contacts off")
+        except Exception as error:
+            row("MuJoCo flex", "a step", None, ours["frame_us"], "us", f"not measured: {error}")
+    row("Exudyn modal floating frame", "a step", None, ours["frame_us"], "us", "not measured: on PyPI, its import of our matrices is still to be written")
+    row("Rapier soft bodies", "a step", None, ours["frame_us"], "us", "not measured: not on PyPI")
+    if args.json:
+        print(json.dumps({"rows": rows, "ours": ours}))
+        return
+    print("| peer | job | peer | ours | times ours | what it computes |\n| --- | --- | --- | --- | --- | --- |")
+    for r in rows:
+        value = "" if r["peer_value"] is None else f"{r['peer_value']:.4g} {r['unit']}"
+        ratio = "" if r["ratio"] is None else f"{r['ratio']:.3g}"
+        print(f"| {r['peer']} | {r['job']} | {value} | {r['ours']:.4g} {r['unit']} | {ratio} | {r['computes']} |")
+
+
+if __name__ == "__main__":
+    sys.exit(main())
