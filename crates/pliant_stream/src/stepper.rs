@@ -132,7 +132,7 @@ struct Held {
 
 /// Steps a modal state with given reactions or targets.
 ///
-/// All Newton rounds of a step work in six numbers a patch, see [`crate::patch_rows`]; the modes are gone through for the
+/// All Newton rounds of a step work in six numbers a patch, see `patch_rows.rs`; the modes are gone through for the
 /// step without hands, for where that brings the patches, and for what the pulls do.
 #[derive(Debug)]
 pub struct ForceStepper {

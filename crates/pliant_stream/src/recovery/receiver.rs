@@ -21,6 +21,9 @@ const CHECKS: u32 = 3;
 /// Share of the state's size by which a checksum may differ.
 const CHECK_TOLERANCE: f64 = 2e-3;
 
+/// Rate at which the offset of a reaction fades, in lengths of the blend.
+const REACTION_FADE: f64 = 2.5;
+
 /// A grab as it is shown: its reaction belongs to the shape that is shown with it.
 pub type ShownGrab = GrabState;
 
@@ -66,6 +69,9 @@ pub struct Receiver {
     tick: Tick,
     shown: ModalState,
     grabs: Vec<ShownGrab>,
+    /// The tick of `grabs`, and what was shown at the two ticks before it, the newer first.
+    grabs_at: Tick,
+    trail: [Vec<ShownGrab>; 2],
     /// The best estimate of the rigid frame at the shown tick, and what is shown of it.
     frame: Option<Pose>,
     pose: Option<Pose>,
@@ -138,6 +144,8 @@ impl Receiver {
             tick: snapshot.tick,
             shown: rest.clone(),
             grabs: Vec::new(),
+            grabs_at: snapshot.tick,
+            trail: [Vec::new(), Vec::new()],
             frame: None,
             pose: None,
             pose_blend: PoseBlend::new(newmark.h, blend_ticks),
@@ -385,7 +393,12 @@ impl Receiver {
     fn show(&mut self) {
         self.shown.copy_from(self.policy.hidden());
         self.blend.apply(&mut self.shown.q, &mut self.shown.v);
-        let previous = std::mem::take(&mut self.grabs);
+        if self.tick != self.grabs_at {
+            self.trail.swap(0, 1);
+            std::mem::swap(&mut self.trail[0], &mut self.grabs);
+            self.grabs_at = self.tick;
+        }
+        self.grabs.clear();
         match self.history.known(self.tick) {
             Some(data) => self.grabs.extend(data.grabs.iter().map(|g| g.state)),
             None => {
@@ -401,24 +414,38 @@ impl Receiver {
             for g in &mut self.grabs {
                 if let Some(now) = self.history.grab(g.key, self.tick, &forecast) {
                     *g = now.state;
+                } else if let Some(shown) = self.trail[0].iter().find(|p| p.key == g.key) {
+                    // Beyond what a forecast is good for the hand is felt as it was last.
+                    g.reaction = shown.reaction;
                 }
             }
-            self.blend_reactions(&previous);
+            self.blend_reactions();
         } else {
             let rotation = self.pose.map_or([0.0, 0.0, 0.0, 1.0], |p| p.rotation);
             self.stepper.reactions(&self.shown, &mut self.grabs, rotation);
         }
     }
 
-    /// A reaction shown on a guess was off by what is known of that tick now; the offset fades, so the force does not jump.
-    fn blend_reactions(&mut self, previous: &[ShownGrab]) {
-        let keep = (-3.0 / f64::from(self.blend_ticks)).exp();
+    /// A reaction shown on a guess was off by what is known of that tick now. The offset fades as a critically damped motion does,
+    /// `o(t) = 2 k o(t-1) - k^2 o(t-2)`, so that what is felt neither jumps nor kinks, however wrong the guess was.
+    fn blend_reactions(&mut self) {
+        let keep = (-REACTION_FADE / f64::from(self.blend_ticks)).exp();
+        let [last, before] = &self.trail;
         for g in &mut self.grabs {
-            let Some(shown) = previous.iter().find(|p| p.key == g.key) else { continue };
-            let known = self.tick.checked_sub(1).and_then(|t| self.history.grab(g.key, t, &self.forecast));
-            let Some(known) = known.map(|k| k.state.reaction) else { continue };
-            for ((reaction, shown), known) in g.reaction.iter_mut().zip(shown.reaction).zip(known) {
-                let offset = keep * (shown - known);
+            let Some(s1) = last.iter().find(|p| p.key == g.key) else { continue };
+            // Where nothing is known of a tick, its reaction was a guess all through.
+            let known = |back: u64| {
+                let tick = self.grabs_at.checked_sub(back)?;
+                self.history.grab(g.key, tick, &self.forecast).map(|k| k.state.reaction)
+            };
+            let k1 = known(1).unwrap_or(g.reaction);
+            let o1: [f64; 3] = std::array::from_fn(|k| s1.reaction[k] - k1[k]);
+            let o2 = before.iter().find(|p| p.key == g.key).map_or(o1, |s2| {
+                let k2 = known(2).unwrap_or(k1);
+                std::array::from_fn(|k| s2.reaction[k] - k2[k])
+            });
+            for (k, reaction) in g.reaction.iter_mut().enumerate() {
+                let offset = 2.0 * keep * o1[k] - keep * keep * o2[k];
                 if offset.abs() > 1e-7 * reaction.abs() {
                     *reaction += offset;
                 }
