@@ -270,6 +270,74 @@ fn free_flight_keeps_its_momenta_and_two_hands_account_for_every_newton() {
     assert!(body.energy().is_finite());
 }
 
+/// `dL = sum of r x F dt`: the step takes each arm where the body would be without its hands, so the sum with the arms of the shape it ends in differs
+/// by the step's own motion, and by half as much in half the step.
+#[test]
+fn the_torques_of_two_hands_account_for_the_angular_momentum() {
+    let model = Arc::new(rod(1e6, 8, 0.05, true));
+    let cross = |a: [f64; 3], b: [f64; 3]| {
+        [a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]]
+    };
+    let missing = |steps: u32| {
+        let h = 1.0 / f64::from(steps);
+        let mut body = Body::new(model.clone(), BodyConfig { step: h, ..Default::default() }).unwrap();
+        let a = body.grab(&tip_patch(&model), GrabConfig::default()).unwrap();
+        let b = body.grab(&Patch::around(model.surface(), 1, 0.0).unwrap(), GrabConfig::default()).unwrap();
+        let starts = [a, b].map(|id| body.grab_position(id).unwrap());
+        let start = body.momentum().1;
+        let mut sum = [0.0; 3];
+        for i in 1..=steps {
+            let s = (f64::from(i) * h * std::f64::consts::PI).sin();
+            for (id, start, way) in [(a, starts[0], [0.05, 0.3, 0.1]), (b, starts[1], [0.0, -0.2, 0.15])] {
+                body.set_target(id, std::array::from_fn(|k| start[k] + s * way[k])).unwrap();
+            }
+            body.step().unwrap();
+            for id in [a, b] {
+                // The reaction is what the hand gets: the body gets the opposite.
+                let torque = cross(body.grab_position(id).unwrap(), body.reaction(id).unwrap());
+                (0..3).for_each(|k| sum[k] -= torque[k] * h);
+            }
+        }
+        let change: [f64; 3] = std::array::from_fn(|k| body.momentum().1[k] - start[k]);
+        let norm = |v: [f64; 3]| v.iter().map(|x| x * x).sum::<f64>().sqrt();
+        norm(std::array::from_fn(|k| change[k] - sum[k])) / norm(change)
+    };
+    let [coarse, fine] = [missing(2_000), missing(4_000)];
+    assert!(fine < 5e-3, "{fine} of the change is missing");
+    assert!(fine < 0.6 * coarse, "{coarse}, and in half the step {fine}");
+}
+
+#[test]
+fn a_strike_and_a_push_bring_their_momentum_and_its_moment() {
+    let model = Arc::new(rod(1e6, 8, 0.0, true));
+    let h = 1e-4;
+    let mut body = Body::new(model.clone(), BodyConfig { step: h, ..Default::default() }).unwrap();
+    let at = model.surface().positions()[tip() as usize].map(f64::from);
+    let impulse = [0.3, -2.0, 0.7];
+    let moment =
+        |f: [f64; 3]| [at[1] * f[2] - at[2] * f[1], at[2] * f[0] - at[0] * f[2], at[0] * f[1] - at[1] * f[0]];
+    body.strike(tip(), impulse).unwrap();
+    let (p, l) = body.momentum();
+    for k in 0..3 {
+        assert!((p[k] - impulse[k]).abs() < 1e-9, "{p:?}");
+        assert!((l[k] - moment(impulse)[k]).abs() < 1e-6, "{l:?}, expected {:?}", moment(impulse));
+    }
+    // A force over one step, on a body at rest.
+    let mut body = Body::new(model.clone(), BodyConfig { step: h, ..Default::default() }).unwrap();
+    let force = [40.0, 10.0, -5.0];
+    body.push(tip(), force).unwrap();
+    body.step().unwrap();
+    let (p, l) = body.momentum();
+    for k in 0..3 {
+        assert!((p[k] - h * force[k]).abs() < 1e-9, "{p:?}");
+        assert!((l[k] - h * moment(force)[k]).abs() < 1e-6, "{l:?}, expected {:?}", moment(force));
+    }
+    body.step().unwrap();
+    for k in 0..3 {
+        assert!((body.momentum().0[k] - h * force[k]).abs() < 1e-9, "a push lasts one step");
+    }
+}
+
 #[test]
 fn a_tumbling_body_keeps_energy_and_momentum() {
     // An explicit midpoint rule let the energy of a body that turns once a second grow sevenfold in half an hour, until it turned about its long axis.
