@@ -333,8 +333,8 @@ fn a_strike_and_a_push_bring_their_momentum_and_its_moment() {
         assert!((l[k] - h * moment(force)[k]).abs() < 1e-6, "{l:?}, expected {:?}", moment(force));
     }
     body.step().unwrap();
-    for k in 0..3 {
-        assert!((body.momentum().0[k] - h * force[k]).abs() < 1e-9, "a push lasts one step");
+    for (p, force) in body.momentum().0.iter().zip(force) {
+        assert!((p - h * force).abs() < 1e-9, "a push lasts one step");
     }
 }
 
