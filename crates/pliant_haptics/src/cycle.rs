@@ -25,6 +25,8 @@ pub enum LoopState {
     Lost,
     /// The emergency stop is latched: no force.
     Stopped,
+    /// The driver has panicked and the loop is over: no force, until the device is taken into use anew.
+    Ended,
 }
 
 /// What the loop says about itself, once a period.
@@ -64,7 +66,7 @@ pub enum LoopEvent {
     Fault(Fault),
     /// The last fault is over; the force ramps up.
     Clear,
-    /// The device was lost and is looked for.
+    /// The device was lost and is looked for; after a [`Fault::Panicked`] it is not.
     Lost,
     /// It came back.
     Returned,

@@ -209,6 +209,9 @@ pub enum Fault {
     /// Somebody pressed the emergency stop.
     #[error("emergency stop")]
     EmergencyStop,
+    /// The driver panicked, and the loop with it: this device does not come back until it is added anew.
+    #[error("the driver panicked; its loop is over")]
+    Panicked,
 }
 
 impl Fault {
@@ -228,11 +231,12 @@ impl Fault {
             Self::Stalled(_) => 10,
             Self::NotCalibrated => 11,
             Self::EmergencyStop => 12,
+            Self::Panicked => 13,
         }
     }
 
     /// How many kinds there are.
-    pub const KINDS: usize = 13;
+    pub const KINDS: usize = 14;
 }
 
 /// One period of the loop, as it was and not as it should have been.

@@ -151,11 +151,20 @@ impl Inverse {
     }
 
     /// One command, one answer.
+    ///
+    /// A connection on which an answer did not come, or not whole, is given up: nothing in an answer says which command it belongs to, so the late one
+    /// would be taken for the next one's, and every position from then on would be an exchange old.
     fn ask(&mut self, force: [f64; 3]) -> Result<Value, Fault> {
         let command = self.command(force, self.sequence == 0);
         let socket = self.socket.as_mut().ok_or(Fault::Gone)?;
-        socket.send(Message::text(command)).map_err(|e| fault(&e, self.config.timeout))?;
-        read(socket).map_err(|e| fault(&e, self.config.timeout))?.ok_or(Fault::Malformed)
+        let answer = socket.send(Message::text(command)).and_then(|()| read(socket));
+        match answer {
+            Ok(answer) => answer.ok_or(Fault::Malformed),
+            Err(error) => {
+                self.socket = None;
+                Err(fault(&error, self.config.timeout))
+            }
+        }
     }
 }
 
@@ -185,28 +194,17 @@ impl HapticDevice for Inverse {
 
     fn exchange(&mut self, wrench: &Wrench, pace: &mut dyn Pace) -> Result<Sample, Fault> {
         pace.wait();
-        let answer = self.ask(wrench.force);
-        let answer = match answer {
+        let answer = match self.ask(wrench.force) {
             // The first command was refused: the service may know the field by its other name.
             Err(Fault::Gone | Fault::Malformed) if !self.confirmed => {
                 self.spelling = self.spelling.other();
                 self.confirmed = true;
                 self.sequence = 0;
-                self.socket = None;
                 let (socket, _) = connect(&self.config).map_err(|_| Fault::Gone)?;
                 self.socket = Some(socket);
-                self.ask(wrench.force)
+                self.ask(wrench.force)?
             }
-            other => other,
-        };
-        let answer = match answer {
-            Ok(answer) => answer,
-            Err(fault) => {
-                if fault == Fault::Gone {
-                    self.socket = None;
-                }
-                return Err(fault);
-            }
+            other => other?,
         };
         self.confirmed = true;
         self.sequence += 1;

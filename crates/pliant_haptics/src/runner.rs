@@ -1,6 +1,8 @@
 //! The loop on its own thread, and the ends of the queues that the app holds.
 
 use std::{
+    collections::VecDeque,
+    panic::{AssertUnwindSafe, catch_unwind},
     sync::{
         Arc,
         atomic::{AtomicBool, Ordering},
@@ -11,8 +13,8 @@ use std::{
 use triple_buffer::TripleBuffer;
 
 use crate::{
-    Coupling, Cycle, DeviceInfo, HapticDevice, LocalModel, LoopClock, LoopConfig, LoopEvent, LoopReport,
-    ModalLocal, RealPace, Record, StartError, ToolMap, cycle::Sink,
+    Coupling, Cycle, DeviceInfo, Fault, HapticDevice, LocalModel, LoopClock, LoopConfig, LoopEvent,
+    LoopReport, LoopState, ModalLocal, RealPace, Record, StartError, ToolMap, Wrench, cycle::Sink,
 };
 
 /// Events that wait to be read at most; more are dropped and counted.
@@ -49,7 +51,8 @@ impl StopSwitch {
 ///
 /// The app writes the simulation's word with [`publish`](Self::publish) and reads [`report`](Self::report); neither ever waits for the other side,
 /// and the loop neither locks, nor allocates, nor drops shared memory (a body that it steps itself is handed back to be dropped here). What a
-/// driver does within `exchange` is the driver's.
+/// driver does within `exchange` is the driver's; one that panics ends its loop and nothing else: the report says [`LoopState::Ended`] and
+/// [`Fault::Panicked`] from then on, without a force, and events tell it once.
 pub struct HapticLoop {
     model: triple_buffer::Input<LocalModel>,
     report: triple_buffer::Output<LoopReport>,
@@ -60,6 +63,9 @@ pub struct HapticLoop {
     stop: StopSwitch,
     quit: Arc<AtomicBool>,
     thread: Option<JoinHandle<()>>,
+    /// The thread has ended without having been asked to, and what there was to be said about it is in `last_words`.
+    dead: bool,
+    last_words: VecDeque<LoopEvent>,
     clock: LoopClock,
     info: DeviceInfo,
     coupling: Coupling,
@@ -111,6 +117,8 @@ impl HapticLoop {
             stop,
             quit,
             thread: Some(thread),
+            dead: false,
+            last_words: VecDeque::new(),
             clock,
             info,
             coupling,
@@ -148,12 +156,40 @@ impl HapticLoop {
     /// What the loop says about itself: the newest there is.
     pub fn report(&mut self) -> &LoopReport {
         while self.trash.pop().is_ok() {}
-        self.report.read()
+        self.look_after();
+        if self.dead { self.report.output_buffer() } else { self.report.read() }
+    }
+
+    /// Notices that the thread has ended by itself: the driver has panicked. Its last report says that all is well, and nobody is left to write another.
+    fn look_after(&mut self) {
+        let ended = self.thread.as_ref().is_some_and(JoinHandle::is_finished);
+        if self.dead || !ended || self.quit.load(Ordering::Acquire) {
+            return;
+        }
+        self.dead = true;
+        tracing::error!(
+            device = self.info.name,
+            serial = self.info.serial,
+            "the device's driver panicked: its force is off and its loop is over; take the device away and add it anew"
+        );
+        self.report.update();
+        let report = self.report.output_buffer_mut();
+        let down = report.tick.buttons;
+        self.last_words.extend((0..32).filter(|bit| down >> bit & 1 == 1).map(LoopEvent::Released));
+        self.last_words.extend([LoopEvent::Fault(Fault::Panicked), LoopEvent::Lost]);
+        let count = &mut report.faults[Fault::Panicked.kind()];
+        *count = count.saturating_add(1);
+        (report.state, report.rate) = (LoopState::Ended, 0.0);
+        let tick = &mut report.tick;
+        (tick.wrench, tick.wanted, tick.gain) = (Wrench::ZERO, [0.0; 3], 0.0);
+        (tick.velocity, tick.tool_velocity, tick.buttons) = ([0.0; 3], [0.0; 3], 0);
+        tick.fault = Some(Fault::Panicked);
     }
 
     /// What has happened since the last call, oldest first.
     pub fn events(&mut self) -> impl Iterator<Item = LoopEvent> + '_ {
-        std::iter::from_fn(|| self.events.pop().ok())
+        self.look_after();
+        std::iter::from_fn(|| self.events.pop().ok().or_else(|| self.last_words.pop_front()))
     }
 
     /// Moves the workspace in the world. `false`: the map is invalid or the loop has not taken earlier commands yet; ask again.
@@ -195,11 +231,13 @@ impl HapticLoop {
 
 impl Drop for HapticLoop {
     fn drop(&mut self) {
+        self.look_after();
         self.quit.store(true, Ordering::Release);
         if let Some(thread) = self.thread.take()
             && thread.join().is_err()
+            && !self.dead
         {
-            tracing::error!("the haptic loop's thread panicked");
+            tracing::error!(device = self.info.name, "the device's driver panicked at the end");
         }
     }
 }
@@ -244,7 +282,15 @@ struct Inner<D> {
 }
 
 impl<D: HapticDevice> Inner<D> {
+    /// Until it is told to quit or the driver panics; in either case the last thing is that the force is taken off.
     fn run(mut self, clock: LoopClock, rate: f64) {
+        // What a panic leaves behind is only stopped and dropped, each on its own: a driver that panics at that too must not take the process with it,
+        // as a panic within a panic would.
+        let _ = catch_unwind(AssertUnwindSafe(|| self.go_round(clock, rate)));
+        let _ = catch_unwind(AssertUnwindSafe(|| self.cycle.device_mut().safe_stop()));
+    }
+
+    fn go_round(&mut self, clock: LoopClock, rate: f64) {
         self.cycle.set_realtime(raise_priority());
         let mut pace = RealPace::new(clock, rate);
         while !self.quit.load(Ordering::Acquire) {
@@ -260,7 +306,6 @@ impl<D: HapticDevice> Inner<D> {
             let report = *self.cycle.step(&mut pace, self.model.read(), &mut self.queues);
             self.report.write(report);
         }
-        self.cycle.device_mut().safe_stop();
     }
 
     fn obey(&mut self, command: Command) {

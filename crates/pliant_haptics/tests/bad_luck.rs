@@ -3,11 +3,18 @@
 
 mod rig;
 
-use std::cell::Cell;
+use std::{
+    cell::Cell,
+    sync::{
+        Arc,
+        atomic::{AtomicBool, AtomicU32, Ordering},
+    },
+    time::Duration,
+};
 
 use pliant_haptics::{
-    Calibration, Cycle, DeviceInfo, Fault, Hand, HapticDevice, LoopConfig, LoopEvent, LoopState, Pace,
-    SafetyConfig, Sample, VirtualConfig, VirtualDevice, VirtualPace, Wrench,
+    Calibration, Cycle, DeviceInfo, Fault, Hand, HapticDevice, HapticLoop, LoopConfig, LoopEvent, LoopReport,
+    LoopState, Pace, SafetyConfig, Sample, VirtualConfig, VirtualDevice, VirtualPace, Wrench,
 };
 use rig::{
     Rig,
@@ -240,12 +247,13 @@ fn a_jump_of_a_metre() {
 #[test]
 fn a_driver_that_fails_each_tick() {
     for lie in [Lie::Error, Lie::ErrorAtOnce] {
-        let (cycle, events, lowest, _) = told(lie, 1500);
+        let (cycle, events, lowest, step) = told(lie, 1500);
         assert!(events.iter().any(|e| matches!(e, LoopEvent::Fault(Fault::Driver(_)))));
         assert!(events.contains(&LoopEvent::Lost), "after 100 ms it counts as lost");
         assert!(events.contains(&LoopEvent::Returned));
         assert_eq!(lowest, 0.0);
         assert!(cycle.core().last().wrench.force[0] < -1.0);
+        assert!(step <= slew_per_tick() * 1.000_001, "and nothing kicks, going or coming back: {step}");
         let of_kind = cycle.report().faults[Fault::Driver(0).kind()];
         assert!(
             of_kind >= 1 && events.len() < 20,
@@ -274,5 +282,84 @@ fn a_real_device_is_not_run_without_its_safety() {
     for rate in [100.0, 1e5, f64::NAN] {
         let config = LoopConfig { rate, ..LoopConfig::default() };
         assert!(matches!(Cycle::new(real(), config), Err(pliant_haptics::StartError::Rate(_))));
+    }
+}
+
+/// A device whose driver panics when it is told to.
+struct Bomb {
+    inner: VirtualDevice,
+    panic: Arc<AtomicBool>,
+    stopped: Arc<AtomicU32>,
+    /// And once more while it is being stopped.
+    twice: bool,
+}
+
+impl HapticDevice for Bomb {
+    fn info(&self) -> DeviceInfo {
+        self.inner.info()
+    }
+    fn exchange(&mut self, wrench: &Wrench, pace: &mut dyn Pace) -> Result<Sample, Fault> {
+        assert!(!self.panic.load(Ordering::Acquire), "the driver's own bug, on purpose");
+        self.inner.exchange(wrench, pace)
+    }
+    fn safe_stop(&mut self) {
+        self.inner.safe_stop();
+        self.stopped.fetch_add(1, Ordering::AcqRel);
+        assert!(!self.twice, "and another one, on purpose");
+    }
+}
+
+#[test]
+fn a_driver_that_panics() {
+    for twice in [false, true] {
+        let inner = VirtualDevice::new(VirtualConfig::touch(), Hand::FIRM).unwrap();
+        let hand = inner.handle();
+        hand.set_target([0.014, 0.0, 0.0]);
+        let (panic, stopped) = (Arc::new(AtomicBool::new(false)), Arc::new(AtomicU32::new(0)));
+        let bomb = Bomb { inner, panic: panic.clone(), stopped: stopped.clone(), twice };
+        let mut running = HapticLoop::start(bomb, LoopConfig::default()).unwrap();
+        let mut tick = 0;
+        let mut heard: Vec<LoopEvent> = Vec::new();
+        let mut until = |running: &mut HapticLoop,
+                         heard: &mut Vec<LoopEvent>,
+                         so: &dyn Fn(&LoopReport) -> bool| {
+            for _ in 0..1000 {
+                tick += 1;
+                running.publish(|model| {
+                    (model.tick, model.period, model.count) = (tick, 0.01, 1);
+                    model.contacts[0].stiffness = [[200.0, 0.0, 0.0], [0.0, 200.0, 0.0], [0.0, 0.0, 200.0]];
+                });
+                std::thread::sleep(Duration::from_millis(10));
+                heard.extend(running.events());
+                if so(running.report()) {
+                    return;
+                }
+            }
+            panic!("never: {:?}", running.report());
+        };
+        until(&mut running, &mut heard, &|r| r.tick.wrench.force[0] < -0.5);
+        hand.set_buttons(1);
+        until(&mut running, &mut heard, &|r| r.tick.wrench.force[0] < -0.5 && r.tick.buttons == 1);
+        assert_eq!(running.report().state, LoopState::Running);
+        panic.store(true, Ordering::Release);
+        until(&mut running, &mut heard, &|r| r.state == LoopState::Ended);
+        heard.extend(running.events());
+        let report = *running.report();
+        assert_eq!(report.tick.wrench, Wrench::ZERO, "nobody is told of a force that is not there");
+        assert_eq!((report.tick.gain, report.tick.buttons, report.rate), (0.0, 0, 0.0));
+        assert_eq!(report.tick.fault, Some(Fault::Panicked));
+        assert_eq!(report.faults[Fault::Panicked.kind()], 1);
+        assert!(stopped.load(Ordering::Acquire) >= 1, "and the device was told to let go");
+        let last: Vec<_> = heard.iter().rev().take(3).rev().copied().collect();
+        assert_eq!(
+            last,
+            [LoopEvent::Released(0), LoopEvent::Fault(Fault::Panicked), LoopEvent::Lost],
+            "{heard:?}"
+        );
+        // Told once, and for good.
+        heard.clear();
+        until(&mut running, &mut heard, &|_| true);
+        assert_eq!(heard, []);
+        assert_eq!(running.report().state, LoopState::Ended);
     }
 }

@@ -26,6 +26,8 @@ struct Desk {
     /// Answer with this instead.
     say: Option<String>,
     mute: bool,
+    /// The next answer, and only that one, comes so late.
+    late: Option<Duration>,
     quit: bool,
     hang_up: bool,
 }
@@ -136,6 +138,10 @@ fn serve(mut socket: WebSocket<TcpStream>, desk: &Mutex<Desk>, inventory: bool, 
             continue;
         }
         let answer = desk.say.clone().unwrap_or_else(|| state(&desk, new).to_string());
+        if let Some(late) = desk.late.take() {
+            drop(desk);
+            std::thread::sleep(late);
+        }
         if socket.send(Message::text(answer)).is_err() {
             return;
         }
@@ -312,4 +318,42 @@ fn nonsense_and_silence() {
     let nobody = InverseConfig { address: "127.0.0.1:1".into(), ..InverseConfig::default() };
     assert!(matches!(Inverse::open(nobody), Err(InverseError::Connect { .. })));
     let _ = pace.last();
+}
+
+#[test]
+fn a_late_answer_is_not_taken_for_the_next_one() {
+    let service = Service::start(true);
+    let config = InverseConfig { timeout: 0.05, ..second(service.config()) };
+    let mut device = Inverse::open(config).unwrap();
+    let mut pace = pace();
+    assert!(device.exchange(&Wrench::ZERO, &mut pace).is_ok());
+    service.desk().late = Some(Duration::from_millis(100));
+    assert_eq!(device.exchange(&Wrench::ZERO, &mut pace).unwrap_err(), Fault::Timeout(0.05));
+    std::thread::sleep(Duration::from_millis(100));
+    // The loop's part: a device that is gone is looked for.
+    let mut current = 0;
+    for k in 1..=100 {
+        let x = 1e-4 * f64::from(k);
+        service.desk().position = [x, 0.0, 0.0];
+        match device.exchange(&Wrench::ZERO, &mut pace) {
+            Ok(sample) => {
+                let off = (sample.position[0] - x).abs();
+                assert!(off < 1e-9, "where the hand is now, not an exchange ago: off by {off} m");
+                current += 1;
+            }
+            Err(_) => {
+                let _ = device.reopen();
+            }
+        }
+    }
+    assert!(current > 50, "it is back: {current} of 100");
+    // A stop whose answer is late leaves no answer behind either.
+    service.desk().late = Some(Duration::from_millis(100));
+    device.safe_stop();
+    std::thread::sleep(Duration::from_millis(100));
+    while device.exchange(&Wrench::ZERO, &mut pace).is_err() {
+        let _ = device.reopen();
+    }
+    service.desk().position = [0.07, 0.0, 0.0];
+    assert!((device.exchange(&Wrench::ZERO, &mut pace).unwrap().position[0] - 0.07).abs() < 1e-9);
 }
