@@ -55,8 +55,8 @@ impl Coupling {
     /// The limit of a sampled spring with delay, `K < (b + B) / (T/2 + d)` (`2 b / T` when `B = d = 0`); that of a virtual damper whose
     /// velocity is measured, a third of `M / lag` (see [`stable_damping`](crate::stable_damping)); and the
     /// maker's own numbers. A body far away that follows the hand entirely is a spring to where the hand was: `M x'' + (b + B) x' + K (x - x(t - t_r)) = 0`
-    /// is stable for any `t_r` if the delayed part is nowhere larger than the rest (small gain), `K < (b + B)^2 / M`, or as a spring with that
-    /// much delay; the larger of the two counts. Numbers that are not finite or not in their range count as the default.
+    /// is stable below `K = (b + B)^2 / (2 M cos^2 x)`, `x` the root of `tan x = -2 x M / ((b + B) t_r)` between pi/2 and pi (its characteristic equation on the
+    /// imaginary axis); `(b + B)^2 / M` where that is less, or as a spring with that much delay, whichever is larger. Numbers that are not finite or not in their range count as the default.
     pub fn clamp(
         config: &CouplingConfig,
         device: &DeviceInfo,
@@ -79,7 +79,9 @@ impl Coupling {
         let (damping, damping_limit) = tightest(wanted_damping, &limits);
         let calming = device.damping + damping;
         let far = if round_trip > 0.0 {
-            (calming / (lag + round_trip)).max(calming * calming / device.mass)
+            let trip = lag + round_trip;
+            let cosine = 1.0 + first_root(device.mass / (calming * trip)).tan().powi(2);
+            (calming / trip).max(calming * calming / device.mass * (0.5 * cosine).min(1.0))
         } else {
             f64::INFINITY
         };
@@ -135,6 +137,17 @@ impl std::fmt::Display for Coupling {
     }
 }
 
+/// `tan x = -2 r x` between pi/2 and pi.
+fn first_root(r: f64) -> f64 {
+    let (mut low, mut high) = (std::f64::consts::FRAC_PI_2, std::f64::consts::PI);
+    for _ in 0..60 {
+        let x = 0.5 * (low + high);
+        // Without the pole at pi/2: sin x + 2 r x cos x falls through zero once.
+        if x.sin() + 2.0 * r * x * x.cos() > 0.0 { low = x } else { high = x }
+    }
+    0.5 * (low + high)
+}
+
 fn tightest(wanted: f64, limits: &[(f64, CouplingLimit)]) -> (f64, CouplingLimit) {
     limits
         .iter()
@@ -185,5 +198,61 @@ mod tests {
             0.0,
         );
         assert!(c.stiffness.is_finite() && c.damping.is_finite());
+    }
+
+    /// Whether `M x'' + c x' + K (x - x(t - t_r)) = 0` calms down, by stepping it: an independent check of the limit.
+    fn calms(m: f64, c: f64, k: f64, round_trip: f64) -> bool {
+        let dt = 5e-4;
+        let late = (round_trip / dt).round() as usize;
+        let mut past = std::collections::VecDeque::from(vec![0.0; late]);
+        let (mut x, mut v) = (0.0f64, 0.1f64);
+        let steps = 400 * late;
+        let (mut early, mut last) = (0.0f64, 0.0f64);
+        for i in 0..steps {
+            past.push_back(x);
+            let then = past.pop_front().unwrap();
+            v += dt / m * (-c * v - k * (x - then));
+            x += dt * v;
+            match i * 4 / steps {
+                1 => early = early.max(v.abs()),
+                3 => last = last.max(v.abs()),
+                _ => {}
+            }
+        }
+        last < early
+    }
+
+    #[test]
+    fn a_round_trip_clamps_below_what_is_stable() {
+        let free = CouplingConfig { stiffness: 1e9, damping: 0.5, headroom: 1.0 };
+        let device = VirtualConfig { mass: 0.2, damping: 0.5, ..VirtualConfig::default() }.info();
+        // M 0.2 kg, b + B 1 N s/m: 1 / 10.5 ms; (b + B)^2 / M = 5 N/m; and half of that as the trip grows for ever.
+        for (trip, want, near) in [(0.01, 95.24, 0.01), (0.4, 5.0, 1e-9), (2000.0, 2.5, 0.01)] {
+            let c = Coupling::clamp(&free, &device, 1000.0, 0.0, trip);
+            assert_eq!(c.stiffness_limit, CouplingLimit::RoundTrip, "{c}");
+            assert!((c.stiffness - want).abs() < near, "{trip} s: {c}");
+        }
+        assert!(Coupling::clamp(&free, &device, 1000.0, 0.0, 0.4).to_string().contains("round trip"));
+        // And stepped: what the clamp leaves calms down, for devices from light to heavy and trips from short to very long.
+        for (m, b) in [(0.045, 0.3), (0.2, 0.5), (0.2, 1.5)] {
+            let device = VirtualConfig { mass: m, damping: b, ..VirtualConfig::default() }.info();
+            for trip in [0.05, 0.196, 1.0, 4.0] {
+                let c = Coupling::clamp(&free, &device, 1000.0, 0.0, trip);
+                assert!(
+                    calms(m, b + c.damping, 0.98 * c.stiffness, trip),
+                    "{m} kg, {b} N s/m, {trip} s: {c}"
+                );
+            }
+        }
+        // The check can fail: c^2 / M = 5 N/m is too much for four seconds, as twice what theory allows for 0.2 s (36 N/m) is.
+        assert!(!calms(0.2, 1.0, 5.0, 4.0) && !calms(0.2, 1.0, 45.0, 0.2) && calms(0.2, 1.0, 30.0, 0.2));
+        // The paper's first network on the devices that the tables name: what small gain leaves, which the trip is too short to undercut.
+        for device in [VirtualConfig::touch(), VirtualConfig::premium(), VirtualConfig::omega3()] {
+            let c = Coupling::clamp(&free, &device.info(), 1000.0, 0.0, 0.196);
+            let calming = device.damping + c.damping;
+            let small =
+                (calming * calming / device.mass).max(calming / (0.196 + 0.5e-3 + device.info().delay));
+            assert!((c.stiffness / small - 1.0).abs() < 1e-9, "{}: {c}", device.name);
+        }
     }
 }

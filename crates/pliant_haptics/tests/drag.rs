@@ -5,7 +5,7 @@ mod rig;
 
 use std::sync::Arc;
 
-use pliant_haptics::{Hand, VirtualConfig};
+use pliant_haptics::{Coupling, CouplingConfig, Hand, VirtualConfig};
 use rig::{
     baked,
     scene::{Drag, SceneConfig, Subject, drag},
@@ -142,5 +142,39 @@ fn the_hand_feels_the_body() {
         assert!((free.force / want - 1.0).abs() < 0.03, "{} N for {want} N", free.force);
         // Friction (0.26 N) holds part of it back.
         assert!((d.force - want).abs() < 0.26, "{} N for {want} N", d.force);
+    }
+}
+
+#[test]
+fn a_slow_loop_and_a_fast_one() {
+    for rate in [500.0, 8000.0] {
+        for modal in [false, true] {
+            for (young, hand, simulation) in [
+                (1e3, Hand::LOOSE, 40.0),
+                (1e5, Hand::LIGHT, 120.0),
+                (1e5, Hand::NONE, 240.0),
+                (1e11, Hand::FIRM, 120.0),
+            ] {
+                holds(SceneConfig {
+                    young,
+                    hand,
+                    simulation,
+                    rate,
+                    modal,
+                    modes: 12,
+                    ..SceneConfig::default()
+                });
+            }
+            // And the hand feels what it would at 1000 Hz: body, arm and the coupling that this rate allows, in series.
+            let device = VirtualConfig { friction: 0.0, ..VirtualConfig::touch() };
+            let coupling =
+                Coupling::clamp(&CouplingConfig::default(), &device.info(), rate, 0.0, 0.0).stiffness;
+            let hand = Hand::LIGHT;
+            let d = holds(SceneConfig { young: 1e4, hand, device, rate, modal, ..SceneConfig::default() });
+            let want = 0.03 / (1.0 / 160.0 + 1.0 / 150.0 + 1.0 / coupling);
+            assert!((d.force / want - 1.0).abs() < 0.03, "{rate} Hz: {} N for {want} N", d.force);
+            // The slew limit is one in newtons a second, whatever the rate: the whole force in 5 ms.
+            assert!((d.step[1] * rate * 5e-3 - 3.3).abs() < 1e-9, "{rate} Hz: {} N a period", d.step[1]);
+        }
     }
 }

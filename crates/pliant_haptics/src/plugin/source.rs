@@ -167,3 +167,6 @@ pub(crate) fn steer(
         source.handle.set(source.place.into(), bits);
     }
 }
+
+#[cfg(test)]
+mod tests;

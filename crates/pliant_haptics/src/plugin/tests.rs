@@ -9,7 +9,7 @@ use super::*;
 use crate::{Fault, Hand, LoopConfig, LoopState, VirtualConfig, VirtualDevice, VirtualHandle};
 
 #[path = "../../tests/rig/block.rs"]
-mod block;
+pub(super) mod block;
 
 /// Fixed steps of a hundredth of a second in real time: the loop's thread has its own clock.
 fn app() -> App {
@@ -223,4 +223,67 @@ fn two_devices_on_one_body_feel_each_other() {
     // And lets go: the other one is alone with the block.
     s.hand.set_buttons(0);
     until(&mut s, "alone", |s| grabs(&mut s.app).len() == 1 && devices(s)[1].length() < 0.3);
+}
+
+#[test]
+fn a_driver_that_panics_is_told_and_lets_go() {
+    struct Bomb(VirtualDevice, std::sync::Arc<std::sync::atomic::AtomicBool>);
+    impl crate::HapticDevice for Bomb {
+        fn info(&self) -> crate::DeviceInfo {
+            self.0.info()
+        }
+        fn exchange(
+            &mut self,
+            wrench: &crate::Wrench,
+            pace: &mut dyn crate::Pace,
+        ) -> Result<crate::Sample, Fault> {
+            assert!(!self.1.load(std::sync::atomic::Ordering::Acquire), "the driver's own bug, on purpose");
+            self.0.exchange(wrench, pace)
+        }
+        fn safe_stop(&mut self) {
+            self.0.safe_stop();
+        }
+    }
+    #[derive(Resource, Default)]
+    struct Notices(Vec<crate::LoopEvent>);
+    let mut s = scene(false);
+    let at = *s.app.world().get::<Transform>(s.tool).unwrap();
+    s.app.world_mut().despawn(s.tool);
+    let device = VirtualDevice::new(VirtualConfig::touch(), Hand::FIRM).unwrap();
+    let (hand, fuse) = (device.handle(), std::sync::Arc::default());
+    let bomb = Bomb(device, std::sync::Arc::clone(&fuse));
+    s.device = s.app.world_mut().resource_mut::<HapticDevices>().add(bomb, LoopConfig::default()).unwrap();
+    s.tool = s.app.world_mut().spawn((HapticTool::new(s.device), ToolGrip::default(), at)).id();
+    s.app.init_resource::<Heard>().init_resource::<Notices>();
+    s.app.add_systems(
+        Update,
+        |mut faults: MessageReader<HapticFault>,
+         mut notices: MessageReader<HapticNotice>,
+         mut heard: ResMut<Heard>,
+         mut told: ResMut<Notices>| {
+            heard.0.extend(faults.read().filter_map(|f| f.fault));
+            told.0.extend(notices.read().map(|n| n.event));
+        },
+    );
+    run(&mut s.app, 5);
+    hand.set_buttons(1);
+    until(&mut s, "gripped", |s| grabs(&mut s.app).len() == 1);
+    hand.set_target([0.02, 0.0, 0.0]);
+    until(&mut s, "a force", |s| force(s).length() > 1.0);
+    fuse.store(true, std::sync::atomic::Ordering::Release);
+    until(&mut s, "the body is let go of", |s| grabs(&mut s.app).is_empty());
+    run(&mut s.app, 5);
+    let report = s.app.world().resource::<HapticDevices>().get(s.device).unwrap().report;
+    assert_eq!((report.state, force(&s)), (LoopState::Ended, DVec3::ZERO));
+    let count = |world: &World| world.resource::<Heard>().0.iter().filter(|f| **f == Fault::Panicked).count();
+    assert_eq!(count(s.app.world()), 1, "told once");
+    assert_eq!(s.app.world().resource::<Notices>().0, [crate::LoopEvent::Lost]);
+    // The app goes on, and a new device takes the place of the dead one.
+    assert!(s.app.world_mut().resource_mut::<HapticDevices>().remove(s.device));
+    let device = VirtualDevice::new(VirtualConfig::touch(), Hand::FIRM).unwrap();
+    s.device = s.app.world_mut().resource_mut::<HapticDevices>().add(device, LoopConfig::default()).unwrap();
+    until(&mut s, "another one runs", |s| {
+        let devices = s.app.world().resource::<HapticDevices>();
+        devices.get(s.device).unwrap().report.state == LoopState::Running
+    });
 }

@@ -222,13 +222,12 @@ pub fn drag(config: SceneConfig) -> Drag {
         let at = scene.cycle.device().position();
         scene.cycle.device_mut().place(at, [0.1, 0.05, 0.0]);
     } else {
-        for k in 1..=500 {
-            let s = f64::from(k) / 500.0;
+        let ticks = (0.5 * scene.cycle.core().config().rate) as u32;
+        for k in 1..=ticks {
+            let s = f64::from(k) / f64::from(ticks);
             let smooth = s * s * (3.0 - 2.0 * s);
             scene.hand.set_target([0.02 * smooth, 0.02 * smooth, -0.01 * smooth]);
-            for _ in 0..(scene.cycle.core().config().rate / 1000.0) as usize {
-                scene.tick();
-            }
+            scene.tick();
         }
     }
     scene.run(1.0);

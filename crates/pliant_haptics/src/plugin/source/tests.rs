@@ -1,0 +1,207 @@
+//! Bevy's input goes in, the device's position comes out of its loop.
+
+use std::time::Duration;
+
+use bevy::{
+    asset::AssetPlugin,
+    camera::{ComputedCameraValues, RenderTargetInfo},
+    input::{ButtonState, InputPlugin, mouse::MouseButtonInput},
+    math::DVec3,
+    prelude::*,
+    time::TimeUpdateStrategy,
+    transform::TransformPlugin,
+    window::PrimaryWindow,
+};
+use pliant_body::{ModalAsset, ModalBody, PliantBodyPlugin};
+
+use super::{super::tests::block, *};
+use crate::{DeviceId, HapticsPlugin, LoopConfig, Positioned};
+
+/// Seconds a frame, whatever the machine takes for it.
+const FRAME: f64 = 0.01;
+
+struct Scene {
+    app: App,
+    device: DeviceId,
+}
+
+/// An app with Bevy's own input, and a device that goes where it is put; its tool is `place`d with what `source` makes of its handle.
+fn scene<S: Component>(place: Transform, motion_scale: f64, source: impl Fn(PositionedHandle) -> S) -> Scene {
+    let mut app = App::new();
+    app.add_plugins((
+        MinimalPlugins,
+        AssetPlugin::default(),
+        TransformPlugin,
+        InputPlugin,
+        PliantBodyPlugin::default(),
+        HapticsPlugin::default(),
+    ))
+    .insert_resource(TimeUpdateStrategy::ManualDuration(Duration::from_secs_f64(FRAME)));
+    app.finish();
+    app.cleanup();
+    let device = Positioned::new("input");
+    let source = source(device.handle());
+    let device = app.world_mut().resource_mut::<HapticDevices>().add(device, LoopConfig::default()).unwrap();
+    app.world_mut().spawn((HapticTool { motion_scale, ..HapticTool::new(device) }, source, place));
+    let mut scene = Scene { app, device };
+    scene.run(5);
+    scene
+}
+
+impl Scene {
+    fn run(&mut self, frames: usize) {
+        for _ in 0..frames {
+            self.app.update();
+            std::thread::sleep(Duration::from_secs_f64(FRAME));
+        }
+    }
+
+    fn tick(&self) -> crate::Tick {
+        self.app.world().resource::<HapticDevices>().get(self.device).unwrap().report.tick
+    }
+
+    fn position(&self) -> DVec3 {
+        self.tick().position.into()
+    }
+
+    /// Runs until the device is at `place` (m, device axes) to `near`, and then for a while, in which it is to stay there.
+    fn comes_to_rest_at(&mut self, place: DVec3, near: f64) {
+        let there = |s: &Self| s.position().distance(place) < near;
+        // The loop's clock is the real one and a busy machine stutters.
+        for _ in 0..500 {
+            if there(self) {
+                break;
+            }
+            self.run(1);
+        }
+        for _ in 0..20 {
+            assert!(there(self), "at {} m, not at {place} m", self.position());
+            self.run(1);
+        }
+    }
+
+    fn buttons_become(&mut self, wanted: u32) {
+        for _ in 0..500 {
+            if self.tick().buttons == wanted {
+                return;
+            }
+            self.run(1);
+        }
+        panic!("buttons {:#b}, not {wanted:#b}", self.tick().buttons);
+    }
+
+    /// A window of 800 x 600 and a camera two metres in front of the origin.
+    fn window(&mut self) -> Entity {
+        let window = Window { resolution: (800, 600).into(), ..Default::default() };
+        let size = RenderTargetInfo { physical_size: UVec2::new(800, 600), scale_factor: 1.0 };
+        let clip_from_view = Mat4::perspective_infinite_reverse_rh(1.0, 800.0 / 600.0, 0.1);
+        let computed = ComputedCameraValues { clip_from_view, target_info: Some(size), ..Default::default() };
+        let world = self.app.world_mut();
+        world.spawn((Camera { computed, ..Default::default() }, Transform::from_xyz(0.0, 0.0, 2.0)));
+        world.spawn((window, PrimaryWindow)).id()
+    }
+
+    /// Puts the pointer at `at`, m from the middle of the view in the plane z = 0.
+    fn point(&mut self, window: Entity, at: Option<Vec2>) {
+        let pixels_a_metre = 300.0 / (2.0 * 0.5f32.tan());
+        let cursor = at.map(|at| Vec2::new(400.0, 300.0) + Vec2::new(at.x, -at.y) * pixels_a_metre);
+        self.app.world_mut().get_mut::<Window>(window).unwrap().set_cursor_position(cursor);
+    }
+
+    fn press(&mut self, window: Entity, button: MouseButton, state: ButtonState) {
+        self.app.world_mut().write_message(MouseButtonInput { button, state, window });
+    }
+}
+
+#[test]
+fn the_pointer_moves_the_device_to_where_it_points() {
+    let turned = Transform::from_rotation(Quat::from_rotation_z(std::f32::consts::FRAC_PI_2));
+    for (place, scale, want) in [
+        (Transform::IDENTITY, 1.0, DVec3::new(0.1, 0.05, 0.0)),
+        // A quarter turn about z takes the device's x to the world's y, and a metre of the hand is two of the world.
+        (turned, 2.0, DVec3::new(0.025, -0.05, 0.0)),
+    ] {
+        let mut s = scene(place, scale, PointerSource::new);
+        let window = s.window();
+        s.comes_to_rest_at(DVec3::ZERO, 1e-9);
+        s.point(window, Some(Vec2::new(0.1, 0.05)));
+        s.comes_to_rest_at(want, 1e-4);
+        s.press(window, MouseButton::Left, ButtonState::Pressed);
+        s.press(window, MouseButton::Middle, ButtonState::Pressed);
+        s.buttons_become(0b101);
+        // Out of the window: the hand waits where it is, and lets go.
+        s.point(window, None);
+        s.press(window, MouseButton::Left, ButtonState::Released);
+        s.press(window, MouseButton::Middle, ButtonState::Released);
+        s.buttons_become(0);
+        s.comes_to_rest_at(want, 1e-4);
+    }
+}
+
+#[test]
+fn with_empty_hands_the_pointer_lies_on_the_surface() {
+    let mut s = scene(Transform::IDENTITY, 1.0, PointerSource::new);
+    let window = s.window();
+    let model = ModalAsset(std::sync::Arc::new(block::block(1e5, 12)));
+    let handle = s.app.world_mut().resource_mut::<Assets<ModalAsset>>().add(model);
+    s.app.world_mut().spawn(ModalBody::new(handle));
+    s.run(5);
+    // The block is 4 cm thick and so its face 2 cm nearer, where the ray is a hundredth nearer to the middle of the view.
+    s.point(window, Some(Vec2::new(0.05, 0.0)));
+    s.comes_to_rest_at(DVec3::new(0.0495, 0.0, 0.02), 1e-4);
+}
+
+#[cfg(feature = "gamepad")]
+#[test]
+fn the_gamepad_moves_the_device_as_long_as_a_stick_is_held() {
+    use bevy::input::gamepad::{
+        GamepadAxis, GamepadButton, GamepadConnection, GamepadConnectionEvent, RawGamepadAxisChangedEvent,
+        RawGamepadButtonChangedEvent, RawGamepadEvent,
+    };
+    let mut s = scene(Transform::IDENTITY, 1.0, GamepadSource::new);
+    let pad = s.app.world_mut().spawn_empty().id();
+    let axis = |s: &mut Scene, axis, value| {
+        let event = RawGamepadAxisChangedEvent::new(pad, axis, value);
+        s.app.world_mut().write_message(RawGamepadEvent::Axis(event));
+    };
+    let button = |s: &mut Scene, button, value| {
+        let event = RawGamepadButtonChangedEvent::new(pad, button, value);
+        s.app.world_mut().write_message(RawGamepadEvent::Button(event));
+    };
+    s.comes_to_rest_at(DVec3::ZERO, 1e-9);
+    let connected = GamepadConnection::Connected { name: "pad".into(), vendor_id: None, product_id: None };
+    s.app.world_mut().write_message(GamepadConnectionEvent::new(pad, connected));
+    s.comes_to_rest_at(DVec3::ZERO, 1e-9);
+
+    // Twenty frames of 10 ms at 0.15 m/s.
+    let moved = 20.0 * FRAME * 0.15;
+    let mut want = DVec3::ZERO;
+    for (stick, way) in [
+        (GamepadAxis::LeftStickX, DVec3::X),
+        (GamepadAxis::RightStickY, DVec3::Y),
+        (GamepadAxis::LeftStickY, DVec3::NEG_Z),
+    ] {
+        axis(&mut s, stick, 1.0);
+        s.run(20);
+        axis(&mut s, stick, 0.0);
+        want += way * moved;
+        s.comes_to_rest_at(want, 1e-4);
+    }
+    // Half way is half as fast, with what Bevy leaves for the dead zone (0.05 by default).
+    axis(&mut s, GamepadAxis::LeftStickX, -0.525);
+    s.run(20);
+    axis(&mut s, GamepadAxis::LeftStickX, 0.0);
+    want.x -= 0.5 * moved;
+    s.comes_to_rest_at(want, 1e-3);
+
+    button(&mut s, GamepadButton::South, 1.0);
+    button(&mut s, GamepadButton::RightTrigger2, 1.0);
+    s.buttons_become(0b100001);
+    // Pulled out with a stick held: it stays, and nobody presses anything.
+    let stays = s.position();
+    let gone = GamepadConnectionEvent::new(pad, GamepadConnection::Disconnected);
+    axis(&mut s, GamepadAxis::LeftStickX, 1.0);
+    s.app.world_mut().write_message(gone);
+    s.buttons_become(0);
+    s.comes_to_rest_at(stays, 2e-3);
+}
