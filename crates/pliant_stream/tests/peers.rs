@@ -9,7 +9,8 @@ use std::time::Duration;
 use pliant_modal::{Integrator, ModalModel, Relaxation};
 use pliant_stream::emulator::{Link, LinkConfig, Loss, Preset};
 use pliant_stream::peer::{
-    HeldAt, InputTick, PeerConfig, PeerDatagram, PeerEvent, PeerMessage, PeerSession, Repair, StateCheck,
+    HeldAt, InputTick, PeerBodyState, PeerConfig, PeerDatagram, PeerEvent, PeerMessage, PeerSession, Repair,
+    StateCheck,
 };
 use pliant_stream::{BodyId, BodySetup, Channel, EndReason, PeerId, UserId};
 use proptest::prelude::*;
@@ -236,8 +237,8 @@ fn free_and_relaxing_bodies_agree_to_the_bit_and_late_joiners_with_them() {
             let moved = (0..3).map(|k| pose.position[k].powi(2)).sum::<f64>().sqrt();
             assert!(moved > 0.01, "the hands must have moved the frame: {moved} m");
         }
-        // (Both give the joiner their state; the second of them is a resync of its own.)
-        let resynced = |e: &(usize, PeerEvent)| e.0 < 2 && matches!(e.1, PeerEvent::Resynced { .. });
+        // Both give the joiner their state; it takes the first.
+        let resynced = |e: &(usize, PeerEvent)| matches!(e.1, PeerEvent::Resynced { .. });
         assert!(!mesh.events.iter().any(resynced), "{:?}", mesh.events);
     }
 }
@@ -308,6 +309,114 @@ fn a_liar_is_not_believed_by_the_lowest_and_cannot_harm() {
     mesh.run(8 * S);
     assert!(!mesh.events.iter().any(|e| matches!(e, (0, PeerEvent::Resynced { .. }))));
     assert_eq!(mesh.agree(0, 1), 0.0);
+}
+
+#[test]
+fn a_state_that_nobody_asked_for_is_not_taken() {
+    // Whoever lies: the higher number to the lower, and the lower to the higher.
+    for (liar, victim) in [(1, 0), (0, 1)] {
+        let mut mesh = Mesh::new(2, &LinkConfig { delay: 20 * MS, ..Default::default() }, 9);
+        for k in 0..2 {
+            mesh.start(k, Repair::Rollback, true);
+        }
+        mesh.run(5 * S);
+        let p = mesh.peers[victim].as_mut().unwrap();
+        let body = PeerBodyState {
+            body: BODY.0,
+            q: vec![5.0; 40],
+            v: vec![5.0; 40],
+            a: vec![0.0; 40],
+            z: Vec::new(),
+            force: vec![0.0; 40],
+            frame: None,
+            pulls: Vec::new(),
+        };
+        let tick = p.confirmed();
+        let lie = PeerMessage::State { tick, now: p.tick(), bodies: vec![body] }.encode();
+        let before = p.body(BODY).unwrap().hidden().q.clone();
+        for _ in 0..50 {
+            p.on_message(mesh.now, PeerId(liar), &lie);
+        }
+        assert_eq!(p.body(BODY).unwrap().hidden().q, before);
+        mesh.run(8 * S);
+        assert!(!mesh.events.iter().any(|e| matches!(e.1, PeerEvent::Resynced { .. })), "{:?}", mesh.events);
+        assert_eq!(mesh.agree(0, 1), 0.0);
+    }
+}
+
+#[test]
+fn the_lowest_number_is_believed_when_it_was_asked() {
+    let mut mesh = Mesh::new(2, &LinkConfig { delay: 20 * MS, ..Default::default() }, 9);
+    for k in 0..2 {
+        mesh.start(k, Repair::Rollback, true);
+    }
+    mesh.run(5 * S);
+    // Checks of the lowest that do not agree: its state is asked for, comes, and is what it was.
+    let p = mesh.peers[1].as_mut().unwrap();
+    for s in 0..3_u16 {
+        let check = Some(StateCheck { body: BODY, tick: p.confirmed(), value: 1e6 });
+        let said = PeerDatagram::Inputs { now: p.tick(), ahead: None, ticks: Vec::new(), check };
+        p.on_datagram(mesh.now, PeerId(0), &said.encode(s));
+    }
+    mesh.run(8 * S);
+    let resynced = |e: &&(usize, PeerEvent)| e.1 == PeerEvent::Resynced { from: UserId(1) };
+    assert_eq!(mesh.events.iter().filter(resynced).count(), 1, "{:?}", mesh.events);
+    assert!(mesh.agree(0, 1) < 1e-9, "{}", mesh.agree(0, 1));
+}
+
+#[test]
+fn ask_floods_are_answered_within_bounds() {
+    let mut mesh = Mesh::new(2, &LinkConfig { delay: 20 * MS, ..Default::default() }, 9);
+    for k in 0..2 {
+        mesh.start(k, Repair::Rollback, true);
+    }
+    mesh.run(5 * S);
+    let p = mesh.peers[0].as_mut().unwrap();
+    let now = p.tick();
+    let ask = PeerDatagram::Ask { runs: vec![(now - 100, 100); 16] };
+    let answered = |p: &mut PeerSession, at: Duration| {
+        for s in 0..2000_u16 {
+            p.on_datagram(at, PeerId(1), &ask.encode(s));
+            p.on_message(at, PeerId(1), &PeerMessage::StateRequest.encode());
+        }
+        let (mut ticks, mut states) = (0, 0);
+        p.update(at);
+        while let Some(o) = p.poll_output() {
+            match (PeerDatagram::decode(&o.bytes), PeerMessage::decode(&o.bytes)) {
+                (Ok((_, PeerDatagram::Inputs { ticks: t, .. })), _) if o.channel == Channel::Datagram => {
+                    ticks += t.len();
+                }
+                (_, Ok(PeerMessage::State { .. })) if o.channel == Channel::Message => states += 1,
+                _ => {}
+            }
+        }
+        (ticks, states)
+    };
+    let (ticks, states) = answered(p, mesh.now);
+    assert!((1000..=1005).contains(&ticks), "{ticks} ticks for 256,000 questions");
+    assert_eq!(states, 1, "one state an update");
+    let (ticks, _) = answered(p, mesh.now + 100 * MS);
+    assert!((100..=125).contains(&ticks), "{ticks} ticks 0.1 s later: 1,000 a second");
+    let states: usize = (0..200).map(|k| answered(p, mesh.now + 100 * MS + k * MS).1).sum();
+    assert!((10..=16).contains(&states), "{states} states: 16 at once and two a second");
+    mesh.run(8 * S);
+    assert_eq!(mesh.agree(0, 1), 0.0, "who is flooded goes on");
+}
+
+#[test]
+fn what_nobody_fetches_does_not_grow_for_ever() {
+    let mut p = PeerSession::new(PeerConfig { idle_timeout: 100_000 * S, ..Default::default() }).unwrap();
+    p.add_body(BODY, bar(4, 0.05), &BodySetup::default()).unwrap();
+    p.connect(Duration::ZERO, PeerId(7), 1200).unwrap();
+    for k in 1..=20_000_u32 {
+        p.update(k * 25 * MS);
+    }
+    assert!(p.tick() > 19_000);
+    let mut count = 0;
+    while p.poll_output().is_some() {
+        count += 1;
+    }
+    assert_eq!(count, 16_384);
 }
 
 proptest! {

@@ -88,6 +88,15 @@ impl InputLog {
         self.users.insert(user, UserInputs::new(first));
     }
 
+    /// Forgets users that have gone and whose last input is older than the window: nothing is stepped again from that far
+    /// back, and after its last input a gone user holds nothing.
+    pub(crate) fn forget_gone(&mut self, tick: Tick) {
+        self.users.retain(|_, u| {
+            let said_nothing = u.highest < u.first;
+            !(u.gone && (said_nothing || u.highest + WINDOW as u64 <= tick))
+        });
+    }
+
     /// Takes an input in; true when it is news.
     pub(crate) fn put(&mut self, user: UserId, input: InputTick) -> bool {
         self.users.get_mut(&user).is_some_and(|u| u.put(input))
@@ -116,5 +125,36 @@ impl InputLog {
     pub(crate) fn complete(&self) -> Tick {
         let each = self.users.values().filter(|u| !u.gone).map(|u| u.complete);
         each.min().unwrap_or(0)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn users_that_have_gone_are_forgotten_after_the_window() {
+        let mut log = InputLog::default();
+        let window = WINDOW as u64;
+        for user in 0..1000_u16 {
+            let (user, tick) = (UserId(user), 10 * (u64::from(user) + 1));
+            log.expect(user, tick);
+            assert!(log.put(user, InputTick { tick, held: Vec::new() }));
+            if let Some(u) = log.users.get_mut(&user) {
+                u.gone = true;
+            }
+            log.forget_gone(tick);
+            // Ten ticks apart: as many as fit in the window are left.
+            assert!(log.users.len() as u64 <= window / 10 + 1, "{}", log.users.len());
+        }
+        assert_eq!(log.users.len() as u64, window / 10 + 1);
+        // Who said nothing is forgotten at once, who stays never.
+        log.expect(UserId(2000), 10_001);
+        if let Some(u) = log.users.get_mut(&UserId(2000)) {
+            u.gone = true;
+        }
+        log.expect(UserId(3000), 10_001);
+        log.forget_gone(10_000 + window);
+        assert_eq!(log.users.keys().copied().collect::<Vec<_>>(), [UserId(3000)]);
     }
 }

@@ -6,11 +6,12 @@
 //! is asked for. Checksums of ticks for which all inputs are known are compared: the peer with the lowest number is right,
 //! and the others take its state over when they disagree. A late joiner begins with its state too.
 //!
-//! Anchored bodies only: the rigid frame of a free one is not stepped here.
+//! Free bodies are stepped with their rigid frames, bodies that relax with their flows.
 
 mod body;
 mod config;
 mod inputs;
+mod other;
 mod session;
 mod wire;
 

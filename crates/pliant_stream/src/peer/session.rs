@@ -9,6 +9,7 @@ use pliant_modal::ModalModel;
 use super::body::PeerBody;
 use super::config::{PeerConfig, PeerEvent};
 use super::inputs::{InputLog, WINDOW};
+use super::other::Other;
 use super::wire::{HeldAt, InputTick, MAX_HELD, MAX_TICKS, PeerDatagram, PeerMessage, StateCheck};
 use crate::StreamError;
 use crate::session::{Channel, EndReason, Output};
@@ -18,6 +19,8 @@ use crate::wire::{MAX_NAME, PROTOCOL_VERSION};
 
 /// Most peers beside oneself.
 const MAX_PEERS: usize = 64;
+/// Most datagrams that wait to be fetched; newer ones are dropped, as a path would drop them.
+const MAX_OUT: usize = 16_384;
 /// Most events that wait for the application; the oldest are dropped.
 const MAX_EVENTS: usize = 4096;
 /// Ticks between checks.
@@ -30,21 +33,6 @@ const CHECK_TOLERANCE: f64 = 1e-3;
 const SLEW: f64 = 0.01;
 /// Pause between questions for the same tick.
 const ASK_AGAIN: Duration = Duration::from_millis(150);
-
-#[derive(Debug)]
-struct Other {
-    user: Option<UserId>,
-    heard: Duration,
-    sequence: u16,
-    /// Running mean of: own tick less theirs at arrival.
-    ahead: Option<f64>,
-    /// The same as they see it.
-    theirs: Option<f64>,
-    asked: BTreeMap<Tick, Duration>,
-    max_datagram: usize,
-    mismatched: u32,
-    wants_state: bool,
-}
 
 /// One of several equal peers: a state machine without sockets or clock.
 #[derive(Debug)]
@@ -59,6 +47,8 @@ pub struct PeerSession {
     started: bool,
     next_step: Option<Duration>,
     dirty: Option<Tick>,
+    /// The tick of the last state taken over: what was before it is not gone back to.
+    taken: Tick,
     out: VecDeque<Output>,
     events: VecDeque<PeerEvent>,
     requested: Option<Duration>,
@@ -95,6 +85,7 @@ impl PeerSession {
             started,
             next_step: None,
             dirty: None,
+            taken: 0,
             out: VecDeque::new(),
             events: VecDeque::new(),
             requested: None,
@@ -130,18 +121,7 @@ impl PeerSession {
         if self.others.len() >= MAX_PEERS {
             return Err(StreamError::Full { what: "peers", limit: MAX_PEERS });
         }
-        let other = Other {
-            user: None,
-            heard: now,
-            sequence: 0,
-            ahead: None,
-            theirs: None,
-            asked: BTreeMap::new(),
-            max_datagram,
-            mismatched: 0,
-            wants_state: false,
-        };
-        self.others.insert(peer, other);
+        self.others.insert(peer, Other::new(now, max_datagram));
         let hello = PeerMessage::Hello {
             version: PROTOCOL_VERSION,
             user: self.config.user.0,
@@ -160,6 +140,7 @@ impl PeerSession {
             // All hear the same last input or forecast the same hands a little on; then the hands let go.
             inputs.gone = true;
             self.dirty = Some(self.dirty.map_or(inputs.highest + 1, |d| d.min(inputs.highest + 1)));
+            self.inputs.forget_gone(self.tick);
         }
         self.event(PeerEvent::Left { user, reason });
     }
@@ -265,7 +246,7 @@ impl PeerSession {
                     self.compare(peer, user, check);
                 }
             }
-            PeerDatagram::Ask { runs } => self.answer(peer, &runs),
+            PeerDatagram::Ask { runs } => self.answer(now, peer, &runs),
         }
     }
 
@@ -294,7 +275,12 @@ impl PeerSession {
             Ok(PeerMessage::StateRequest) => other.wants_state = true,
             Ok(PeerMessage::State { tick, now: theirs, bodies }) => {
                 let Some(user) = other.user else { return };
-                self.take_state(now, user, tick, theirs, &bodies);
+                // A joiner has asked everybody by its hello. After that nobody's word is taken unasked, nor a higher
+                // number's at all: whoever could send a state at will could put any shape into any peer.
+                let asked = std::mem::take(&mut other.asked_state);
+                if !self.started || (asked && user < self.config.user) {
+                    self.take_state(now, user, tick, theirs, &bodies);
+                }
             }
             Ok(PeerMessage::Goodbye { reason }) => self.disconnect(peer, reason),
             Err(_) => {
@@ -332,6 +318,7 @@ impl PeerSession {
             }
         }
         self.tick = to;
+        self.taken = tick;
         if self.started {
             self.event(PeerEvent::Resynced { from });
         } else {
@@ -371,7 +358,7 @@ impl PeerSession {
         }
         self.next_step = Some(due);
         self.ask(now);
-        self.give_states();
+        self.give_states(now);
         stepped
     }
 
@@ -380,7 +367,9 @@ impl PeerSession {
         self.next_step.filter(|_| self.started)
     }
 
-    /// The next thing to send.
+    /// The next thing to send. At most 16,384 datagrams wait here, newer ones are dropped. Messages are never dropped:
+    /// beside the first and the last of each connection they are questions, at most one a second, and states, at most
+    /// 16 and two a second for each peer and none while the queue is full.
     pub fn poll_output(&mut self) -> Option<Output> {
         self.out.pop_front()
     }
@@ -393,12 +382,15 @@ impl PeerSession {
     /// Goes back to the earliest tick for which something new is known.
     fn settle(&mut self) {
         let Some(from) = self.dirty.take() else { return };
+        // Whoever gave a state knew all inputs up to it: late ones are in it.
+        let from = from.max(self.taken + 1);
         let mut too_late = false;
         for body in self.bodies.values_mut() {
             too_late |= !body.correct(from, &self.inputs);
         }
         if too_late {
-            self.request_state();
+            // Only a state can help; it is asked for with what else is missing.
+            self.others.values_mut().for_each(|o| o.mismatched = CHECKS);
         }
     }
 
@@ -409,6 +401,7 @@ impl PeerSession {
         for body in self.bodies.values_mut() {
             body.advance(&self.inputs);
         }
+        self.inputs.forget_gone(self.tick);
         let confirmed = self.confirmed();
         let due = confirmed - confirmed % CHECK_EVERY;
         let mut check = None;
@@ -442,11 +435,14 @@ impl PeerSession {
         self.datagram(peer, &PeerDatagram::Inputs { now, ahead, ticks, check });
     }
 
-    fn answer(&mut self, peer: PeerId, runs: &[(Tick, u8)]) {
+    fn answer(&mut self, now: Duration, peer: PeerId, runs: &[(Tick, u8)]) {
         let Some(own) = self.inputs.users.get(&self.config.user) else { return };
+        let Some(other) = self.others.get_mut(&peer) else { return };
         let wanted = runs.iter().flat_map(|(first, count)| *first..first + u64::from(*count));
-        let mut ticks: Vec<InputTick> = wanted.filter_map(|t| own.at(t).cloned()).take(WINDOW).collect();
-        let limit = self.others.get(&peer).map_or(256, |o| o.max_datagram);
+        let known = wanted.filter_map(|t| own.at(t)).take(WINDOW);
+        let mut ticks: Vec<InputTick> =
+            known.take_while(|_| other.answer_budget.spend(now, 1.0)).cloned().collect();
+        let limit = other.max_datagram;
         while !ticks.is_empty() {
             let mut count = ticks.len().min(MAX_TICKS);
             let bytes = |n: usize| PeerDatagram::bytes_of(ticks[..n].iter().map(|t| t.held.len()));
@@ -492,11 +488,7 @@ impl PeerSession {
             self.datagram(peer, &question);
         }
         if self.others.values().any(|o| o.mismatched >= CHECKS) {
-            let due = self.requested.is_none_or(|at| now.saturating_sub(at) > Duration::from_secs(1));
-            if due {
-                self.requested = Some(now);
-                self.request_state();
-            }
+            self.request_state(now);
         }
     }
 
@@ -514,23 +506,28 @@ impl PeerSession {
         }
     }
 
-    /// Asks the peer with the lowest number, if that is not oneself.
-    fn request_state(&mut self) {
-        let lowest = self.others.iter().filter_map(|(p, o)| o.user.map(|u| (u, *p))).min();
-        if let Some((user, peer)) = lowest
+    /// Asks the peer with the lowest number, if that is not oneself, at most once a second.
+    fn request_state(&mut self, now: Duration) {
+        if self.requested.is_some_and(|at| now.saturating_sub(at) <= Duration::from_secs(1)) {
+            return;
+        }
+        let lowest = self.others.iter_mut().filter_map(|(p, o)| o.user.map(|u| (u, *p, o)));
+        if let Some((user, peer, other)) = lowest.min_by_key(|(u, ..)| *u)
             && user < self.config.user
         {
+            self.requested = Some(now);
+            other.asked_state = true;
             self.message(peer, &PeerMessage::StateRequest);
         }
     }
 
-    fn give_states(&mut self) {
+    fn give_states(&mut self, now: Duration) {
         let wanting: Vec<PeerId> =
             self.others.iter().filter(|(_, o)| o.wants_state && o.user.is_some()).map(|(p, _)| *p).collect();
         // Who has just come has no inputs yet and must not hold the confirmed tick back.
         let each = self.inputs.users.values().filter(|u| !u.gone && u.first <= self.tick);
         let tick = each.map(|u| u.complete).min().unwrap_or(self.tick).min(self.tick);
-        if wanting.is_empty() || tick == 0 {
+        if wanting.is_empty() || tick == 0 || self.out.len() >= MAX_OUT {
             return;
         }
         let bodies: Vec<_> = self.bodies.values().filter_map(|b| b.export(tick)).collect();
@@ -539,10 +536,12 @@ impl PeerSession {
         }
         let state = PeerMessage::State { tick, now: self.tick, bodies };
         for peer in wanting {
-            if let Some(other) = self.others.get_mut(&peer) {
+            let Some(other) = self.others.get_mut(&peer) else { continue };
+            // Who asks too often waits.
+            if other.state_budget.spend(now, 1.0) {
                 other.wants_state = false;
+                self.message(peer, &state);
             }
-            self.message(peer, &state);
         }
     }
 
@@ -564,6 +563,9 @@ impl PeerSession {
         let Some(other) = self.others.get_mut(&peer) else { return };
         let bytes = datagram.encode(other.sequence);
         other.sequence = other.sequence.wrapping_add(1);
+        if self.out.len() >= MAX_OUT {
+            return;
+        }
         self.out.push_back(Output { peer, channel: Channel::Datagram, bytes: bytes.into() });
     }
 

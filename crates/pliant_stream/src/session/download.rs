@@ -4,11 +4,9 @@ use std::sync::Arc;
 
 use pliant_modal::ModalModel;
 
+use super::EndReason;
 use super::guest::GuestSession;
 use super::guest_config::GuestEvent;
-
-/// A model larger than this is refused, bytes.
-const MAX_MODEL: u64 = 1 << 30;
 
 #[derive(Debug, Default)]
 pub(super) struct Download {
@@ -26,14 +24,20 @@ impl GuestSession {
         let download = self.downloads.entry(hash).or_default();
         let received = download.bytes.len() as u64;
         let fits = wanted
-            && (1..=MAX_MODEL).contains(&total)
+            && total >= 1
             && offset == received
             && (received == 0 || download.total == total)
             && received + bytes.len() as u64 <= total
             && !bytes.is_empty();
         if !fits {
-            return self.break_off();
+            return self.break_off(EndReason::Protocol);
         }
+        // What a model will take counts from its first piece on: no two unfinished ones share the same room.
+        let more = if received == 0 { total } else { 0 };
+        if more > self.config.model_bytes.saturating_sub(self.model_bytes) {
+            return self.break_off(EndReason::Full);
+        }
+        self.model_bytes += more;
         download.total = total;
         // Grows with what has arrived: a false total reserves nothing.
         download.bytes.extend_from_slice(bytes);
@@ -58,7 +62,7 @@ impl GuestSession {
                     self.event(GuestEvent::BodyReady { body, model: model.clone() });
                 }
             }
-            _ => self.break_off(),
+            _ => self.break_off(EndReason::Protocol),
         }
     }
 }

@@ -52,13 +52,15 @@ struct OwnGrab {
 /// A guest of a session: a state machine without sockets or clock; see [`super`].
 #[derive(Debug)]
 pub struct GuestSession {
-    config: GuestConfig,
+    pub(super) config: GuestConfig,
     max_datagram: usize,
     standing: Standing,
     newmark: Newmark,
     pub(super) models: BTreeMap<[u8; 32], Arc<ModalModel>>,
     pub(super) downloads: BTreeMap<[u8; 32], Download>,
-    /// Hashes of all models that the host has named.
+    /// Bytes that downloads and downloaded models take together, see [`GuestConfig::model_bytes`].
+    pub(super) model_bytes: u64,
+    /// Hashes of all models that the host has named, at most 16,384 (512 KiB).
     pub(super) announced: BTreeSet<[u8; 32]>,
     pub(super) bodies: BTreeMap<BodyId, BodyView>,
     stalled: BTreeSet<BodyId>,
@@ -103,6 +105,7 @@ impl GuestSession {
             newmark: Newmark::average(1.0 / 40.0),
             models: BTreeMap::new(),
             downloads: BTreeMap::new(),
+            model_bytes: 0,
             announced: BTreeSet::new(),
             bodies: BTreeMap::new(),
             stalled: BTreeSet::new(),
@@ -356,7 +359,7 @@ impl GuestSession {
         self.stats.message_bytes_in += bytes.len() as u64;
         let Ok(message) = HostMessage::decode(bytes) else {
             self.stats.rejected += 1;
-            return self.break_off();
+            return self.break_off(EndReason::Protocol);
         };
         match (message, self.standing) {
             (HostMessage::Welcome { version, user, step_ns, beta, gamma, users }, Standing::Greeted) => {
@@ -371,7 +374,7 @@ impl GuestSession {
             }
             (HostMessage::Goodbye { reason }, _) => self.close(reason),
             (message, Standing::In(_)) => self.in_session(now, message),
-            _ => self.break_off(),
+            _ => self.break_off(EndReason::Protocol),
         }
     }
 
@@ -380,11 +383,11 @@ impl GuestSession {
             HostMessage::BodyAdded(info) => {
                 let body = BodyId(info.body);
                 if self.bodies.len() >= MAX_BODIES || self.bodies.contains_key(&body) {
-                    return self.break_off();
+                    return self.break_off(EndReason::Protocol);
                 }
                 let name = info.name.clone();
                 if self.announced.len() >= 16 * MAX_BODIES {
-                    return self.break_off();
+                    return self.break_off(EndReason::Protocol);
                 }
                 self.announced.insert(info.hash);
                 let model = self.models.get(&info.hash).cloned();
@@ -432,7 +435,7 @@ impl GuestSession {
                     self.event(GuestEvent::GrabRefused { grab });
                 }
             }
-            HostMessage::Welcome { .. } | HostMessage::Goodbye { .. } => self.break_off(),
+            HostMessage::Welcome { .. } | HostMessage::Goodbye { .. } => self.break_off(EndReason::Protocol),
         }
     }
 
@@ -500,7 +503,8 @@ impl GuestSession {
         Some(next.max(now))
     }
 
-    /// The next thing to send.
+    /// The next thing to send. Nothing is dropped here; each [`GuestSession::update`] adds one question a body, one
+    /// datagram of targets and one clock request at most, each message of the host at most one answer.
     pub fn poll_output(&mut self) -> Option<Output> {
         self.out.pop_front()
     }
@@ -573,15 +577,16 @@ impl GuestSession {
         self.events.push_back(event);
     }
 
-    pub(super) fn break_off(&mut self) {
-        self.message(&GuestMessage::Goodbye { reason: EndReason::Protocol });
-        self.close(EndReason::Protocol);
+    pub(super) fn break_off(&mut self, reason: EndReason) {
+        self.message(&GuestMessage::Goodbye { reason });
+        self.close(reason);
     }
 
     fn close(&mut self, reason: EndReason) {
         if self.standing != Standing::Closed {
             self.standing = Standing::Closed;
             self.grabs.clear();
+            self.downloads.clear();
             self.event(GuestEvent::Closed { reason });
         }
     }

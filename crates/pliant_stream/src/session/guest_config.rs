@@ -23,6 +23,9 @@ pub struct GuestConfig {
     /// Step a newer copy of each body that this guest holds, in which its own hands do not wait for the round trip; see
     /// [`BodyView::own_hand`](super::BodyView::own_hand). Default: true.
     pub own_hand_first: bool,
+    /// Most bytes of models that a host may send, those that are here and those on their way together; a host that sends
+    /// more is left with [`EndReason::Full`]. Models that the application named itself do not count. Default: 1 GiB.
+    pub model_bytes: u64,
     /// A host that is silent for so long is gone. Default: 10 s.
     pub idle_timeout: Duration,
 }
@@ -35,6 +38,7 @@ impl Default for GuestConfig {
             recovery: RecoveryConfig::default(),
             modes: None,
             own_hand_first: true,
+            model_bytes: 1 << 30,
             idle_timeout: Duration::from_secs(10),
         }
     }

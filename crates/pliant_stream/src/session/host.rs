@@ -452,7 +452,8 @@ impl HostSession {
         each.flatten().min()
     }
 
-    /// The next thing to send.
+    /// The next thing to send. Nothing is dropped here: fetch it after each call. A guest adds no more by what it asks than
+    /// its budgets allow: 4,000 ticks, 2 snapshots and 200 messages a second (16 snapshots, 400 messages at once).
     pub fn poll_output(&mut self) -> Option<Output> {
         self.out.pop_front()
     }

@@ -27,6 +27,8 @@ mod own_hand;
 mod publish;
 mod regulator;
 
+pub(crate) use outbox::Budget;
+
 pub use guest::GuestSession;
 pub use guest_body::BodyView;
 pub use guest_config::{GuestConfig, GuestEvent};
