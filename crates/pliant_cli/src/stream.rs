@@ -20,6 +20,9 @@ use serde::Serialize;
 use crate::{CliError, output};
 
 #[derive(Args, Debug)]
+#[command(
+    after_help = "hand_to_force_ms is reckoned, not timed: for force-driven repair and between peers it is one step by construction, as the own copy answers at its next step; else half the measured round trip, half a step and the measured delay of showing."
+)]
 pub(crate) struct StreamArgs {
     /// The body
     #[arg(long, value_name = "X.modal")]

@@ -122,8 +122,8 @@ pub struct Figures {
     pub force_ringing: f64,
     /// The same of the true reaction.
     pub true_ringing: f64,
-    /// From a hand's motion to the force that answers it, ms: one tick where the policy owns the model (see
-    /// [`crate::BodyView::own_hand`]), else the round trip and the delays on the way.
+    /// From a hand's motion to the force that answers it, ms; reckoned, not timed. Where the policy owns the model it is one
+    /// tick by construction (the guest's own copy answers at its next step, see [`crate::BodyView::own_hand`]), else the round trip and the delays on the way.
     pub hand_to_force_ms: f64,
     /// How far the shown tick lies behind its step at the host, ms, mean.
     pub shown_delay_ms: f64,

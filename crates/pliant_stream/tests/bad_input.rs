@@ -9,8 +9,7 @@ use std::time::Duration;
 use pliant_modal::ModalModel;
 use pliant_stream::emulator::{Loss, Trace};
 use pliant_stream::peer::{
-    HeldAt, InputTick, PeerBodyState, PeerConfig, PeerDatagram, PeerEvent, PeerFrame, PeerMessage,
-    PeerSession, StateCheck,
+    HeldAt, InputTick, PeerBodyState, PeerDatagram, PeerFrame, PeerMessage, StateCheck,
 };
 
 use pliant_stream::quanta::Quanta;
@@ -20,28 +19,12 @@ use pliant_stream::wire::{
     Targets,
 };
 use pliant_stream::{
-    BodyId, BodySetup, Channel, EndReason, GrabKey, GrabState, GuestConfig, GuestEvent, GuestSession,
-    HostConfig, HostEvent, HostSession, Newmark, PeerId, Pose, RecoveryConfig, StreamError, TickState,
-    UserId,
+    BodyId, BodySetup, Channel, EndReason, GuestConfig, GuestEvent, GuestSession, HostConfig, HostEvent,
+    HostSession, Newmark, PeerId, Pose, RecoveryConfig, StreamError, TickState,
 };
 use proptest::prelude::*;
 use support::bar;
-
-const BODY: BodyId = BodyId(1);
-
-fn grab(index: u16) -> FrameGrab {
-    FrameGrab {
-        state: GrabState {
-            key: GrabKey { user: UserId(index), grab: 7 },
-            vertex: 5,
-            radius: 0.25,
-            target: [1.0, 2.0, 3.0],
-            reaction: [0.5, -8.0, 1024.0],
-        },
-        displacement: [0.25, 0.0, -0.5],
-        held: index != 2,
-    }
-}
+use support::direct::{BODY, exchange, grab, publish, random, session};
 
 fn quanta() -> Quanta {
     Quanta::new(&bar(12, 0.05), 12, &Newmark::average(0.025))
@@ -135,56 +118,6 @@ fn not_a_number_is_refused_by_name() {
     assert!(matches!(Datagram::decode(&huge.encode(0)), Err(StreamError::Invalid { what: "target", .. })));
 }
 
-/// A host and a guest in full session, without links: what one says the other hears.
-fn session(name: &str) -> (HostSession, GuestSession, Duration) {
-    let model = bar(12, 0.05);
-    let mut host = HostSession::new(HostConfig::default()).unwrap();
-    host.add_body(BODY, "bar", model.clone(), BodySetup::default()).unwrap();
-    let recovery = RecoveryConfig::by_name(name).unwrap();
-    let mut guest = GuestSession::new(GuestConfig { recovery, ..Default::default() }, 1200).unwrap();
-    guest.add_cached_model(model);
-    let mut now = Duration::ZERO;
-    host.connect(now, PeerId(1), 1200).unwrap();
-    guest.connect(now).unwrap();
-    for tick in 1..60 {
-        now += Duration::from_millis(25);
-        publish(&mut host, now, tick);
-        exchange(&mut host, &mut guest, now);
-        if tick == 10 {
-            guest.begin_grab(now, BODY, 66, 0.05, [1.0, 0.0, 0.0], Default::default()).unwrap();
-        }
-    }
-    assert!(guest.body(BODY).unwrap().is_ready());
-    (host, guest, now)
-}
-
-fn publish(host: &mut HostSession, now: Duration, tick: u64) {
-    let q: Vec<f64> = (0..12).map(|k| 0.01 * (0.002 * tick as f64 + k as f64).sin()).collect();
-    let v = vec![0.0; 12];
-    let grabs = [GrabState { reaction: [0.05, -0.02, 0.1], ..grab(1).state }];
-    let state = TickState { tick, q: &q, v: &v, a: &v, z: &[], pose: None, grabs: &grabs, resting: false };
-    host.publish(now, BODY, &state).unwrap();
-}
-
-fn exchange(host: &mut HostSession, guest: &mut GuestSession, now: Duration) {
-    for _ in 0..3 {
-        host.update(now);
-        guest.update(now);
-        while let Some(o) = guest.poll_output() {
-            match o.channel {
-                Channel::Datagram => host.on_datagram(now, PeerId(1), &o.bytes),
-                Channel::Message => host.on_message(now, PeerId(1), &o.bytes),
-            }
-        }
-        while let Some(o) = host.poll_output() {
-            match o.channel {
-                Channel::Datagram => guest.on_datagram(now, &o.bytes),
-                Channel::Message => guest.on_message(now, &o.bytes),
-            }
-        }
-    }
-}
-
 fn finite(guest: &GuestSession) {
     if let Some(shown) = guest.body(BODY).and_then(|b| b.shown()) {
         assert!(shown.is_finite());
@@ -275,14 +208,6 @@ fn sessions_survive_a_hundred_thousand_damaged_datagrams() {
         // Whatever a liar put in, a snapshot puts right.
         assert!(!guest.is_closed(), "{name}");
     }
-}
-
-/// Xorshift (Marsaglia 2003): any bytes will do, but the same ones every time.
-fn random(state: &mut u64) -> u64 {
-    *state ^= *state << 13;
-    *state ^= *state >> 7;
-    *state ^= *state << 17;
-    *state
 }
 
 /// Real bytes of every kind that comes from outside.
@@ -438,159 +363,6 @@ fn a_tick_of_the_near_future_costs_a_snapshot_and_no_more() {
             // No reaction explains this shape: the force-driven receiver holds it by the load that it is told.
             assert!((q - truth(k)).abs() < 1e-3, "{name} mode {k}: {q} and {}", truth(k));
         }
-    }
-}
-
-#[test]
-fn a_host_cannot_make_a_guest_hold_more_than_its_bound() {
-    // The real thing, on a small scale: one model fits, the same beside another download does not.
-    let model = bar(12, 0.05);
-    let size = model.to_bytes().len() as u64;
-    let info = |body: u16, hash: [u8; 32]| BodyInfo {
-        body,
-        name: "a body".into(),
-        hash,
-        modes: 9,
-        rho_inf: -1.0,
-        warp: true,
-        damping_scale: 1.0,
-        gravity: [0.0; 3],
-        relaxation: None,
-    };
-    let chunk = |hash, total, bytes: &[u8]| {
-        HostMessage::ModelChunk { hash, offset: 0, total, bytes: bytes.to_vec() }.encode()
-    };
-    for (room, fits) in [(size, 1), (2 * size - 1, 1), (2 * size, 2), (size - 1, 0)] {
-        let config = GuestConfig { model_bytes: room, ..Default::default() };
-        let mut guest = GuestSession::new(config, 1200).unwrap();
-        let now = Duration::from_secs(1);
-        guest.connect(now).unwrap();
-        let newmark = Newmark::average(0.025);
-        let (beta, gamma, users) = (newmark.beta, newmark.gamma, Vec::new());
-        let welcome = HostMessage::Welcome { version: 1, user: 1, step_ns: 25_000_000, beta, gamma, users };
-        guest.on_message(now, &welcome.encode());
-        // A whole model, then the first bytes of one that says to be as large: it counts as what it will be.
-        let hash = model.hash().0;
-        guest.on_message(now, &HostMessage::BodyAdded(info(1, hash)).encode());
-        guest.on_message(now, &HostMessage::BodyAdded(info(2, [9; 32])).encode());
-        guest.on_message(now, &chunk(hash, size, &model.to_bytes()));
-        assert_eq!(guest.is_closed(), fits == 0, "room for {room} of {size}");
-        guest.on_message(now, &chunk([9; 32], size, &[0; 16]));
-        assert_eq!(guest.is_closed(), fits < 2, "room for {room} of {size}");
-        let closed = std::iter::from_fn(|| guest.poll_event())
-            .find_map(|e| if let GuestEvent::Closed { reason } = e { Some(reason) } else { None });
-        assert_eq!(closed, (fits < 2).then_some(EndReason::Full));
-    }
-}
-
-#[test]
-fn hands_that_are_not_numbers_are_refused_and_the_old_target_stays() {
-    let (_, mut guest, now) = session("default");
-    let grab = guest.grabs().next().unwrap().0;
-    let mut peer = PeerSession::new(PeerConfig::default()).unwrap();
-    peer.add_body(BODY, bar(12, 0.05), &BodySetup::default()).unwrap();
-    let own = peer.begin_grab(BODY, 66, 0.05, [1.0, 0.0, 0.0]).unwrap();
-    for bad in [f64::NAN, f64::INFINITY, -1e300] {
-        let refused = Err(StreamError::NotFinite { what: "target" });
-        for at in 0..3 {
-            let mut target = [1.0, 0.0, 0.0];
-            target[at] = bad;
-            assert_eq!(guest.set_target(grab, target), refused);
-            assert_eq!(peer.set_target(own, target), refused);
-            let refused = Err(StreamError::NotFinite { what: "grab" });
-            assert_eq!(peer.begin_grab(BODY, 66, 0.05, target), refused);
-            assert_eq!(guest.begin_grab(now, BODY, 66, 0.05, target, Default::default()), refused);
-        }
-    }
-    for k in 1..80_u32 {
-        peer.update(k * Duration::from_millis(25));
-    }
-    let body = peer.body(BODY).unwrap();
-    assert_eq!(body.grabs()[0].target, [1.0, 0.0, 0.0]);
-    assert!(body.shown().is_finite());
-}
-
-/// Three peers without links; what each says goes to the one it is for.
-fn peers(now: Duration) -> Vec<PeerSession> {
-    let mut all: Vec<PeerSession> = (0..3)
-        .map(|k| {
-            let config = PeerConfig { user: UserId(k + 1), ..Default::default() };
-            let mut peer = PeerSession::new(config).unwrap();
-            peer.add_body(BODY, bar(12, 0.05), &BodySetup::default()).unwrap();
-            for other in (0..3).filter(|o| *o != k) {
-                peer.connect(now, PeerId(u64::from(other)), 1200).unwrap();
-            }
-            peer.begin_grab(BODY, 66, 0.05, [1.0, 0.05 * f64::from(k), 0.0]).unwrap();
-            peer
-        })
-        .collect();
-    pass(&mut all, now, |_, _, _| {});
-    all
-}
-
-fn pass(all: &mut [PeerSession], now: Duration, mut seen: impl FnMut(usize, usize, &[u8])) {
-    for from in 0..all.len() {
-        all[from].update(now);
-        while let Some(o) = all[from].poll_output() {
-            let to = o.peer.0 as usize;
-            if o.channel == Channel::Datagram {
-                seen(from, to, &o.bytes);
-                all[to].on_datagram(now, PeerId(from as u64), &o.bytes);
-            } else {
-                all[to].on_message(now, PeerId(from as u64), &o.bytes);
-            }
-        }
-    }
-}
-
-#[test]
-fn peers_survive_a_hundred_thousand_damaged_datagrams() {
-    let mut now = Duration::from_millis(1);
-    let mut all = peers(now);
-    let mut state = 88_172_645_463_325_252;
-    let mut next = || random(&mut state);
-    let mut last: Vec<Vec<u8>> = vec![PeerDatagram::Ask { runs: vec![(5, 3)] }.encode(2)];
-    let mut taken = 0_u64;
-    for round in 0..100_000_u64 {
-        if round % 100 == 0 {
-            now += Duration::from_millis(25);
-            pass(&mut all, now, |_, _, bytes| last.push(bytes.to_vec()));
-            let old = last.len().saturating_sub(12);
-            last.drain(1..1.max(old));
-            for p in &mut all {
-                assert!(p.body(BODY).unwrap().shown().is_finite(), "round {round}");
-                while let Some(e) = p.poll_event() {
-                    assert!(!matches!(e, PeerEvent::Left { .. }), "round {round}: {e:?}");
-                }
-            }
-        }
-        let mut bytes = last[(next() % last.len() as u64) as usize].clone();
-        for _ in 0..=next() % 3 {
-            let at = next() as usize % bytes.len();
-            bytes[at] = next() as u8;
-        }
-        if next().is_multiple_of(8) {
-            bytes.truncate(next() as usize % (bytes.len() + 1));
-        }
-        taken += u64::from(PeerDatagram::decode(&bytes).is_ok());
-        let (from, to) = (next() % 3, (next() % 3) as usize);
-        if from as usize != to {
-            all[to].on_datagram(now, PeerId(from), &bytes);
-        }
-    }
-    println!("{taken} of 100,000 damaged datagrams could be read");
-    assert!(taken > 20_000, "{taken}");
-    // Once nobody damages anything any more, all agree again.
-    for _ in 0..400 {
-        now += Duration::from_millis(25);
-        pass(&mut all, now, |_, _, _| {});
-    }
-    let tick = all.iter().map(PeerSession::confirmed).min().unwrap();
-    assert!(tick > 1300, "{tick}");
-    let of = |k: usize| &all[k].state_at(BODY, tick).unwrap().q;
-    for k in [1, 2] {
-        let off: f64 = of(0).iter().zip(of(k)).map(|(a, b)| (a - b).abs()).sum();
-        assert!(off < 1e-6, "peer {}: {off}", k + 1);
     }
 }
 

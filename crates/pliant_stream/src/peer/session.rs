@@ -494,7 +494,8 @@ impl PeerSession {
 
     /// Only those with a lower number are believed.
     fn compare(&mut self, peer: PeerId, user: UserId, check: StateCheck) {
-        if user > self.config.user || check.tick > self.confirmed() {
+        let unsettled = self.dirty.is_some_and(|from| from <= check.tick);
+        if user > self.config.user || unsettled || check.tick > self.confirmed() {
             return;
         }
         let Some((own, size)) = self.bodies.get(&check.body).and_then(|b| b.check(check.tick)) else {

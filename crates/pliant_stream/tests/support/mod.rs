@@ -1,6 +1,7 @@
 //! A body whose modes are known in closed form, so that the tests need no bake.
 #![allow(dead_code, reason = "each test uses its part")]
 
+pub mod direct;
 pub mod scene;
 
 use std::sync::Arc;
