@@ -79,7 +79,7 @@ fn make(
     output: &Path,
 ) -> Result<(), Box<dyn Error>> {
     let skin = wears_it.then(|| io::read_surface(input)).transpose()?;
-    let mesh = io::read(input)?.into_tets(&StuffOptions::with_target(tets), &mut |_| ())?;
+    let (mesh, _) = io::read(input)?.into_tets(&StuffOptions::with_target(tets), &mut |_| ())?;
     let baked = bake(&mesh, skin.as_ref(), config, &mut |_, _| ())?;
     baked.model.write(output)?;
     println!(

@@ -5,7 +5,7 @@ use std::time::Instant;
 
 use clap::Args;
 use pliant_bake::{Anchor, BakeCache, BakeConfig, Stage, bake_cached};
-use pliant_mesh::io;
+use pliant_mesh::{Repair, io};
 use pliant_modal::{Damping, Element, ModalModel};
 use serde::Serialize;
 
@@ -17,7 +17,7 @@ const MAX_THREADS: usize = 1024;
 
 #[derive(Args, Debug)]
 pub(crate) struct BakeArgs {
-    /// A closed surface (.obj, .stl, .ply, .gltf, .glb), a scene (.ron) or tetrahedra (.msh, .vtk, .mesh, .veg)
+    /// A surface, mended if it is dirty (.obj, .stl, .ply, .gltf, .glb), a scene (.ron) or tetrahedra (.msh, .vtk, .mesh, .veg)
     input: PathBuf,
     /// About how many tetrahedra to fill a surface or a scene with [default: 10000]
     #[arg(long, allow_negative_numbers = true)]
@@ -64,7 +64,7 @@ pub(crate) struct BakeArgs {
     /// The model to write
     #[arg(short, long, value_name = "X.modal")]
     output: PathBuf,
-    /// Prints JSON: what `inspect --json` tells and the seconds spent
+    /// Prints JSON: what `inspect --json` tells, what was mended and the seconds spent
     #[arg(long)]
     json: bool,
 }
@@ -90,7 +90,28 @@ struct Report {
     summary: Summary,
     /// Read from the cache: only reading was paid for.
     cached: bool,
+    /// What was mended of a dirty surface; null: nothing had to be.
+    repair: Option<Mended>,
     seconds: Seconds,
+}
+
+#[derive(Serialize)]
+struct Mended {
+    welded_vertices: usize,
+    dropped_triangles: usize,
+    turned_triangles: usize,
+    covered_holes: usize,
+}
+
+impl From<Repair> for Mended {
+    fn from(repair: Repair) -> Self {
+        Self {
+            welded_vertices: repair.welded_vertices,
+            dropped_triangles: repair.dropped_triangles,
+            turned_triangles: repair.turned_triangles,
+            covered_holes: repair.covered_holes,
+        }
+    }
 }
 
 #[derive(Serialize)]
@@ -139,7 +160,7 @@ pub(crate) fn run(args: BakeArgs) -> Result<(), CliError> {
 
     let mut bar = Bar::new();
     let skin = args.skin.map(io::read_surface).transpose()?;
-    let mesh = mesh::fill(&args.input, args.tets, &mut bar)?;
+    let (mesh, repair) = mesh::fill(&args.input, args.tets, &mut bar)?;
     let mesh_seconds = start.elapsed().as_secs_f64();
     let mut progress = |stage, share| {
         let stage = match stage {
@@ -178,7 +199,8 @@ pub(crate) fn run(args: BakeArgs) -> Result<(), CliError> {
         total: start.elapsed().as_secs_f64(),
     };
     if args.json {
-        return output::print_json(&Report { summary: Summary::new(&baked.model), cached, seconds });
+        let repair = repair.map(Mended::from);
+        return output::print_json(&Report { summary: Summary::new(&baked.model), cached, repair, seconds });
     }
     output::print(&output::table(&baked.model))?;
     if cached {

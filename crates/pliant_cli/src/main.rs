@@ -74,6 +74,8 @@ enum CliError {
     File(#[from] pliant_modal::FileError),
     #[error("--tets: {0} holds tetrahedra already; expected a surface or a scene, or no --tets")]
     TetsGiven(std::path::PathBuf),
+    #[error("--msh-version: expected an output whose name ends in .msh, got {0}")]
+    NoMsh(std::path::PathBuf),
     #[error("--threads: expected 1 to {most}, got {got}")]
     Threads { got: usize, most: usize },
     #[error("--output: the folder {0} is not there")]

@@ -3,7 +3,7 @@
 use std::path::{Path, PathBuf};
 
 use clap::{Args, Subcommand};
-use pliant_mesh::{StuffOptions, TetMesh, io, shapes};
+use pliant_mesh::{Repair, StuffOptions, TetMesh, io, shapes};
 
 use crate::progress::Bar;
 use crate::{CliError, output};
@@ -19,7 +19,7 @@ const VOLUME_LOSS: f64 = 0.02;
 pub(crate) struct MeshArgs {
     #[command(subcommand)]
     shape: Option<Shape>,
-    /// A closed surface (.obj, .stl, .ply, .gltf, .glb), a scene of rounded parts (.ron), or tetrahedra to write in
+    /// A surface, mended if it is dirty (.obj, .stl, .ply, .gltf, .glb), a scene of rounded parts (.ron), or tetrahedra to write in
     /// another format (.msh, .vtk, .mesh, .veg)
     #[arg(required = true)]
     input: Option<PathBuf>,
@@ -29,6 +29,15 @@ pub(crate) struct MeshArgs {
     /// The file to write: .msh, .vtk, .mesh or .veg
     #[arg(short, long, required = true)]
     output: Option<PathBuf>,
+    #[command(flatten)]
+    msh: Msh,
+}
+
+#[derive(Args, Debug)]
+struct Msh {
+    /// Version of Gmsh's format that a .msh is written in: 2.2 or 4.1 [default: 4.1]
+    #[arg(long, value_name = "VERSION", value_parser = msh_version)]
+    msh_version: Option<io::MshVersion>,
 }
 
 #[derive(Subcommand, Debug)]
@@ -44,6 +53,8 @@ enum Shape {
         /// The file to write: .msh, .vtk, .mesh or .veg
         #[arg(short, long)]
         output: PathBuf,
+        #[command(flatten)]
+        msh: Msh,
     },
     /// A cube with one corner at the origin
     Cube {
@@ -56,6 +67,8 @@ enum Shape {
         /// The file to write: .msh, .vtk, .mesh or .veg
         #[arg(short, long)]
         output: PathBuf,
+        #[command(flatten)]
+        msh: Msh,
     },
     /// A ball around the origin, its boundary nodes on the sphere
     Sphere {
@@ -68,6 +81,8 @@ enum Shape {
         /// The file to write: .msh, .vtk, .mesh or .veg
         #[arg(short, long)]
         output: PathBuf,
+        #[command(flatten)]
+        msh: Msh,
     },
 }
 
@@ -82,28 +97,56 @@ fn three<T: std::str::FromStr>(text: &str) -> Result<[T; 3], String> {
     })
 }
 
+fn msh_version(text: &str) -> Result<io::MshVersion, String> {
+    match text {
+        "2.2" => Ok(io::MshVersion::V2_2),
+        "4.1" => Ok(io::MshVersion::V4_1),
+        _ => Err("expected 2.2 or 4.1".to_owned()),
+    }
+}
+
+impl Msh {
+    /// Cheap refusals before the long work.
+    fn check(&self, output: &Path) -> Result<(), CliError> {
+        output::check_folder(output)?;
+        let is_msh = output.extension().is_some_and(|name| name.eq_ignore_ascii_case("msh"));
+        if self.msh_version.is_some() && !is_msh {
+            return Err(CliError::NoMsh(output.to_path_buf()));
+        }
+        Ok(())
+    }
+
+    fn write(&self, output: &Path, mesh: &TetMesh) -> Result<(), CliError> {
+        match self.msh_version {
+            Some(version) => io::write_msh_version(output, mesh, version)?,
+            None => io::write_tets(output, mesh)?,
+        }
+        Ok(())
+    }
+}
+
 pub(crate) fn run(args: MeshArgs) -> Result<(), CliError> {
-    let (mesh, path) = match args.shape {
-        Some(Shape::Bar { cells, size, output }) => {
-            output::check_folder(&output)?;
-            (shapes::bar(cells, size)?, output)
+    let (mesh, path, msh) = match args.shape {
+        Some(Shape::Bar { cells, size, output, msh }) => {
+            msh.check(&output)?;
+            (shapes::bar(cells, size)?, output, msh)
         }
-        Some(Shape::Cube { cells, size, output }) => {
-            output::check_folder(&output)?;
-            (shapes::cube(cells, size)?, output)
+        Some(Shape::Cube { cells, size, output, msh }) => {
+            msh.check(&output)?;
+            (shapes::cube(cells, size)?, output, msh)
         }
-        Some(Shape::Sphere { cells, radius, output }) => {
-            output::check_folder(&output)?;
-            (shapes::sphere(cells, radius)?, output)
+        Some(Shape::Sphere { cells, radius, output, msh }) => {
+            msh.check(&output)?;
+            (shapes::sphere(cells, radius)?, output, msh)
         }
         None => {
             // Clap asks for both where there is no shape.
             let (input, output) = (args.input.unwrap_or_default(), args.output.unwrap_or_default());
-            output::check_folder(&output)?;
-            (fill(&input, args.tets, &mut Bar::new())?, output)
+            args.msh.check(&output)?;
+            (fill(&input, args.tets, &mut Bar::new())?.0, output, args.msh)
         }
     };
-    io::write_tets(&path, &mesh)?;
+    msh.write(&path, &mesh)?;
     let quality = mesh.quality();
     output::print(&format!(
         "{}: {} tetrahedra, {} nodes, {:.6e} m^3, dihedral angles {:.1} to {:.1} degrees",
@@ -117,8 +160,13 @@ pub(crate) fn run(args: MeshArgs) -> Result<(), CliError> {
 }
 
 /// The tetrahedra that a file holds, or that its shape is filled with. `tets` asked for tetrahedra: refused where the
-/// file has its own. A fill so coarse that it rounds much of a surface away is told on stderr.
-pub(crate) fn fill(input: &Path, tets: Option<usize>, bar: &mut Bar) -> Result<TetMesh, CliError> {
+/// file has its own. What was mended of a dirty surface is told on stderr and returned; a fill so coarse that it rounds
+/// much of a surface away is told on stderr.
+pub(crate) fn fill(
+    input: &Path,
+    tets: Option<usize>,
+    bar: &mut Bar,
+) -> Result<(TetMesh, Option<Repair>), CliError> {
     bar.report("read", 0.0);
     let read = io::read(input)?;
     if tets.is_some() && matches!(read, io::Input::Tets(_)) {
@@ -126,7 +174,12 @@ pub(crate) fn fill(input: &Path, tets: Option<usize>, bar: &mut Bar) -> Result<T
     }
     let options = StuffOptions::with_target(tets.unwrap_or(DEFAULT_TETS));
     let enclosed = if let io::Input::Surface(surface) = &read { surface.volume().abs() } else { 0.0 };
-    let mesh = read.into_tets(&options, &mut |share| bar.report("mesh", f64::from(share)))?;
+    let (mesh, repair) = read.into_tets(&options, &mut |share| bar.report("mesh", f64::from(share)))?;
+    if let Some(repair) = repair {
+        bar.warn(&format!("{} was mended: {repair}", input.display()));
+        // What a dirty surface encloses is no measure of the fill: holes, and parts that are counted twice.
+        return Ok((mesh, Some(repair)));
+    }
     let filled = mesh.volume();
     if filled < (1.0 - VOLUME_LOSS) * enclosed {
         bar.warn(&format!(
@@ -135,5 +188,5 @@ pub(crate) fn fill(input: &Path, tets: Option<usize>, bar: &mut Bar) -> Result<T
             input.display()
         ));
     }
-    Ok(mesh)
+    Ok((mesh, None))
 }

@@ -208,6 +208,75 @@ fn a_surface_is_filled_and_wears_a_skin() {
     assert!(Path::new(&matrices).join("K.mtx").exists() && Path::new(&matrices).join("M.mtx").exists());
 }
 
+/// The faces of a cube of 1 m around the origin, each a grid of 4 x 4 cells with vertices of its own.
+fn cube_faces() -> (String, Vec<String>) {
+    let (mut vertices, mut faces) = (String::new(), Vec::new());
+    for (face, (axis, side)) in (0..3).flat_map(|axis| [(axis, -0.5), (axis, 0.5)]).enumerate() {
+        for n in 0..25 {
+            let mut at = [side; 3];
+            at[(axis + 1) % 3] = f64::from(n % 5) / 4.0 - 0.5;
+            at[(axis + 2) % 3] = f64::from(n / 5) / 4.0 - 0.5;
+            vertices += &format!("v {} {} {}\n", at[0], at[1], at[2]);
+        }
+        for cell in 0..16 {
+            let a = 25 * face + cell / 4 * 5 + cell % 4 + 1;
+            for [b, c] in [[a + 1, a + 6], [a + 6, a + 5]] {
+                let [b, c] = if side > 0.0 { [b, c] } else { [c, b] };
+                faces.push(format!("f {a} {b} {c}\n"));
+            }
+        }
+    }
+    (vertices, faces)
+}
+
+#[test]
+fn a_dirty_surface_is_mended_and_a_sheet_is_refused() {
+    let folder = Folder::new("dirty");
+    let (vertices, faces) = cube_faces();
+    let clean = folder.write("clean.obj", &(vertices.clone() + &faces.concat()));
+    let sheet = folder.write("sheet.obj", &(vertices.clone() + &faces[..32].concat()));
+    let mut dirty = faces;
+    let corners: Vec<&str> = dirty[10].split_whitespace().collect();
+    dirty[10] = format!("f {} {} {}\n", corners[1], corners[3], corners[2]);
+    dirty.push(dirty[70].clone());
+    dirty.remove(100);
+    let dirty = folder.write("dirty.obj", &(vertices + &dirty.concat()));
+    let model = folder.file("box.modal");
+    let bake = |surface: &str| {
+        let (told, word) = succeeds_with_a_word(&[
+            "bake",
+            surface,
+            "--tets",
+            "2000",
+            "--element",
+            "tet4",
+            "--modes",
+            "6",
+            "-o",
+            &model,
+            "--json",
+        ]);
+        (json(&told), word)
+    };
+    let (sound, _) = bake(&clean);
+    assert!(sound["repair"].is_null(), "{sound}");
+    let (mended, word) = bake(&dirty);
+    // 6 x 25 vertices, of which a cube of 4 x 4 x 4 cells has 125 - 27 on its surface.
+    let counts = serde_json::json!({
+        "welded_vertices": 150 - 98, "dropped_triangles": 1, "turned_triangles": 1, "covered_holes": 1
+    });
+    assert_eq!(mended["repair"], counts);
+    let words =
+        "dirty.obj was mended: 52 vertices welded, 1 triangle dropped, 1 triangle turned, 1 hole covered";
+    assert!(word.contains(words), "{word}");
+    // The same cube again.
+    let mass = |told: &serde_json::Value| told["mass_kg"].as_f64().unwrap();
+    assert!((mass(&mended) / mass(&sound) - 1.0).abs() < 1e-6, "{mended} {sound}");
+    std::fs::remove_file(&model).unwrap();
+    assert!(refused(&["bake", &sheet, "-o", &model]).contains("open surface"));
+    assert!(!Path::new(&model).exists());
+}
+
 #[test]
 fn tetrahedra_are_written_in_another_format() {
     let folder = Folder::new("convert");
@@ -217,6 +286,19 @@ fn tetrahedra_are_written_in_another_format() {
     succeeds(&["mesh", &veg, "-o", &back]);
     assert_eq!(std::fs::read(&msh).unwrap(), std::fs::read(&back).unwrap());
     assert!(refused(&["mesh", &msh, "--tets", "500", "-o", &veg]).contains("tetrahedra already"));
+    // The older version of Gmsh's format, of a file and of a shape; the same nodes to the bit.
+    let (old, again) = (folder.file("old.msh"), folder.file("again.msh"));
+    let heads = |path: &str, version: &str| {
+        std::fs::read_to_string(path).unwrap().starts_with(&format!("$MeshFormat\n{version} 0 8\n"))
+    };
+    succeeds(&["mesh", &msh, "--msh-version", "2.2", "-o", &old]);
+    assert!(heads(&old, "2.2") && heads(&msh, "4.1"));
+    succeeds(&["mesh", &old, "--msh-version", "4.1", "-o", &again]);
+    assert_eq!(std::fs::read(&msh).unwrap(), std::fs::read(&again).unwrap());
+    succeeds(&["mesh", "cube", "--cells", "1", "--size", "1", "--msh-version", "2.2", "-o", &old]);
+    assert!(heads(&old, "2.2"));
+    assert!(refused(&["mesh", &msh, "--msh-version", "2.2", "-o", &veg]).contains("ends in .msh"));
+    assert!(refused(&["mesh", &msh, "--msh-version", "3", "-o", &old]).contains("2.2 or 4.1"));
 }
 
 #[test]
@@ -299,7 +381,7 @@ fn bad_input_is_refused_and_leaves_no_file() {
         (&[&foreign], "foreign.msh"),
         (&[&text], "extension"),
         (&[&open], "open"),
-        (&[&crossing], "cross"),
+        (&[&crossing], "bounds no body"),
         (&[&flat], "volume"),
         (&[mesh, "--anchor", "x<-1"], "holds nothing"),
         (&[mesh, "--anchor", "x<9"], "hold all"),

@@ -3,7 +3,7 @@
 //! ```
 //! use pliant_mesh::{StuffOptions, io, sdf::SurfaceDistance, shapes, stuff};
 //!
-//! // Any closed surface will do: io::read_surface("bunny.obj")?
+//! // Any closed surface will do: io::read_surface("bunny.obj")?; SurfaceDistance::mended takes dirty ones too.
 //! let (surface, _) = shapes::sphere(8, 0.1)?.boundary();
 //! let shape = SurfaceDistance::new(&surface)?;
 //! let mesh = stuff(&shape, &StuffOptions::with_target(5000), &mut |_share| ())?;

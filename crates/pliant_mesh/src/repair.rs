@@ -1,6 +1,9 @@
 //! Dirty surfaces made into the boundary of a solid, where winding numbers decide what is inside.
 
-use std::collections::{BTreeMap, HashMap};
+use std::{
+    collections::{BTreeMap, HashMap},
+    fmt,
+};
 
 use nalgebra::Vector3;
 
@@ -27,6 +30,27 @@ pub struct Repair {
     pub turned_triangles: usize,
     /// Holes that were covered.
     pub covered_holes: usize,
+}
+
+impl fmt::Display for Repair {
+    /// What was done, in words: `8 vertices welded, 1 hole covered`; that parts cross, where there was nothing else.
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        let all = [
+            (self.welded_vertices, "vertex", "vertices", "welded"),
+            (self.dropped_triangles, "triangle", "triangles", "dropped"),
+            (self.turned_triangles, "triangle", "triangles", "turned"),
+            (self.covered_holes, "hole", "holes", "covered"),
+        ];
+        let mut comma = "";
+        for (count, one, many, done) in all.into_iter().filter(|(count, ..)| *count > 0) {
+            write!(f, "{comma}{count} {} {done}", if count == 1 { one } else { many })?;
+            comma = ", ";
+        }
+        if comma.is_empty() {
+            f.write_str("triangles that cross each other left, inside told by winding numbers")?;
+        }
+        Ok(())
+    }
 }
 
 impl Surface {

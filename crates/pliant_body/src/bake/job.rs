@@ -15,7 +15,7 @@ use bevy::{
 };
 use pliant_bake::{BakeCache, Stage, bake, bake_cached};
 use pliant_mesh::{
-    StuffOptions, Surface, TetMesh,
+    Repair, StuffOptions, Surface, TetMesh,
     io::{self, Input},
     stuff,
 };
@@ -24,7 +24,7 @@ use pliant_modal::ModalModel;
 use super::{BakeBodyError, BakeProgress, BakeRequest, BakeShape, BakeSkin, BakeStage};
 
 pub(super) enum Outcome {
-    Baked { model: Box<ModalModel>, seconds: f64, cached: bool },
+    Baked { model: Box<ModalModel>, seconds: f64, cached: bool, repair: Option<Repair> },
     Failed(BakeBodyError),
     Cancelled,
 }
@@ -96,7 +96,7 @@ fn run(request: &BakeRequest, cache: Option<&BakeCache>, shared: &Shared) -> Res
         .build()
         .map_err(|error| BakeBodyError::Threads(error.to_string()))?;
     threads.install(|| {
-        let (mesh, skin) = mesh(request, shared)?;
+        let (mesh, skin, repair) = mesh(request, shared)?;
         if shared.is_cancelled() {
             return Ok(Outcome::Cancelled);
         }
@@ -119,17 +119,20 @@ fn run(request: &BakeRequest, cache: Option<&BakeCache>, shared: &Shared) -> Res
             }
             None => (bake(&mesh, skin.as_ref(), &request.config, &mut progress)?.model, false),
         };
-        Ok(Outcome::Baked { model: Box::new(model), seconds: start.elapsed().as_secs_f64(), cached })
+        Ok(Outcome::Baked { model: Box::new(model), seconds: start.elapsed().as_secs_f64(), cached, repair })
     })
 }
 
-/// The tetrahedra, and the surface that is worn over them if it is not their boundary.
-fn mesh(request: &BakeRequest, shared: &Shared) -> Result<(TetMesh, Option<Surface>), BakeBodyError> {
+/// The tetrahedra, the surface that is worn over them if it is not their boundary, and what was mended.
+fn mesh(
+    request: &BakeRequest,
+    shared: &Shared,
+) -> Result<(TetMesh, Option<Surface>, Option<Repair>), BakeBodyError> {
     let options = StuffOptions::with_target(request.tets);
     let mut progress = |share: f32| shared.report(0, f64::from(share));
-    let (tets, own) = match &request.shape {
+    let ((tets, repair), own) = match &request.shape {
         BakeShape::Distance(distance) => {
-            (stuff(&**distance, &options, &mut progress)?, Own("a distance", None))
+            ((stuff(&**distance, &options, &mut progress)?, None), Own("a distance", None))
         }
         BakeShape::Input(input) => fill(Input::clone(input), &options, &mut progress)?,
         BakeShape::File(path) => fill(read(path)?, &options, &mut progress)?,
@@ -140,7 +143,7 @@ fn mesh(request: &BakeRequest, shared: &Shared) -> Result<(TetMesh, Option<Surfa
         BakeSkin::File(path) => Some(io::read_surface(path)?),
         BakeSkin::Surface(surface) => Some(Surface::clone(surface)),
     };
-    Ok((tets, skin))
+    Ok((tets, skin, repair))
 }
 
 fn read(path: &Path) -> Result<Input, BakeBodyError> {
@@ -154,7 +157,7 @@ fn fill(
     input: Input,
     options: &StuffOptions,
     progress: &mut dyn FnMut(f32),
-) -> Result<(TetMesh, Own), BakeBodyError> {
+) -> Result<((TetMesh, Option<Repair>), Own), BakeBodyError> {
     let own = match &input {
         Input::Surface(surface) => Own("a surface", Some(surface.clone())),
         Input::Tets(_) => Own("tetrahedra", None),

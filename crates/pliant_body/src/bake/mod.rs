@@ -108,9 +108,12 @@ fn work(
                 bakery.running = None;
                 if let Some((name, _, mut progress, body)) = order {
                     match outcome {
-                        Outcome::Baked { model, seconds, cached } => {
+                        Outcome::Baked { model, seconds, cached, repair } => {
+                            if let Some(repair) = repair {
+                                warn!("{name}: the surface was mended: {repair}");
+                            }
                             let model = models.add(ModalAsset::from(*model));
-                            *progress = BakeProgress::Done { seconds, cached };
+                            *progress = BakeProgress::Done { seconds, cached, repair };
                             match body {
                                 Some(mut body) => body.model = model,
                                 None => {

@@ -4,7 +4,7 @@ use std::{fmt, path::PathBuf, sync::Arc};
 
 use bevy::prelude::*;
 use pliant_bake::{BakeConfig, BakeError};
-use pliant_mesh::{MeshError, Surface, TetMesh, io::Input, sdf::SignedDistance};
+use pliant_mesh::{MeshError, Repair, Surface, TetMesh, io::Input, sdf::SignedDistance};
 use thiserror::Error;
 
 /// Asks for the body of this entity to be baked. Needs [`BakePlugin`](crate::BakePlugin).
@@ -51,7 +51,7 @@ impl BakeRequest {
 /// What a body is made of before it is baked.
 #[derive(Clone)]
 pub enum BakeShape {
-    /// A file on disk: a closed surface (`.obj`, `.stl`, `.ply`, `.gltf`, `.glb`), a scene of rounded parts (`.ron`) or tetrahedra (`.msh`,
+    /// A file on disk: a surface, mended if it is dirty (`.obj`, `.stl`, `.ply`, `.gltf`, `.glb`), a scene of rounded parts (`.ron`) or tetrahedra (`.msh`,
     /// `.vtk`, `.mesh`, `.veg`). A relative path begins in the working directory, not in the folder of assets.
     File(PathBuf),
     /// A surface, a scene or tetrahedra that are there already.
@@ -116,6 +116,9 @@ pub enum BakeProgress {
         seconds: f64,
         /// It was not baked but read: the same had been baked before.
         cached: bool,
+        /// What was mended of a dirty surface before it was filled. `None`: nothing had to be.
+        #[reflect(ignore)]
+        repair: Option<Repair>,
     },
     /// There is no model. The error itself is in [`BakeFailed`].
     Failed {

@@ -59,7 +59,7 @@ fn a_request_becomes_a_body_while_the_frames_go_on() {
     assert_eq!(tick(&app) - before, seen.len() as u64);
     assert!(seen.len() > 3, "{seen:?}");
     assert!(
-        matches!(seen.last(), Some(BakeProgress::Done { cached: false, seconds }) if *seconds > 0.0),
+        matches!(seen.last(), Some(BakeProgress::Done { cached: false, seconds, repair: None }) if *seconds > 0.0),
         "{seen:?}"
     );
     app.update();
@@ -124,6 +124,20 @@ fn what_cannot_be_baked_says_why_and_the_next_one_is_made() {
     }
     app.update();
     assert!(app.world().get::<BodyState>(good).is_some());
+}
+
+#[test]
+fn a_dirty_surface_is_mended_and_says_how() {
+    let (mut ball, _) = shapes::sphere(6, 0.5).unwrap().boundary();
+    ball.triangles[7].swap(0, 1);
+    ball.triangles.pop();
+    let mut app = baking_app(None);
+    let config = BakeConfig { modes: 3, sites: Some(8), ..BakeConfig::default() };
+    let entity =
+        app.world_mut().spawn(BakeRequest { tets: 1000, config, ..BakeRequest::new(ball.into()) }).id();
+    let seen = wait(&mut app, entity);
+    let Some(BakeProgress::Done { repair: Some(repair), .. }) = seen.last() else { panic!("{seen:?}") };
+    assert_eq!((repair.turned_triangles, repair.covered_holes), (1, 1), "{repair}");
 }
 
 #[test]

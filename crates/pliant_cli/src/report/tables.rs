@@ -208,7 +208,7 @@ pub(super) fn table_2(models: &Path, own: &Path, seconds: f64, bar: &mut Bar) ->
         }
         let mesh = match &source {
             None => shapes::bar([20, 3, 3], [1.0, 0.15, 0.15])?,
-            Some(path) => mesh::fill(path, Some(tets), bar)?,
+            Some(path) => mesh::fill(path, Some(tets), bar)?.0,
         };
         let low = mesh.bounds()[0];
         let high = mesh.bounds()[1];
@@ -252,7 +252,7 @@ pub(super) fn default_setting(
 ) -> Result<String, CliError> {
     let bunny = models.join("bunny.obj");
     let (path, name) = if bunny.is_file() { (bunny, "bunny") } else { (own.to_path_buf(), "own body") };
-    let mesh = mesh::fill(&path, Some(tets), bar)?;
+    let (mesh, _) = mesh::fill(&path, Some(tets), bar)?;
     let [low, high] = mesh.bounds();
     let setting = BakeConfig {
         sites: None,

@@ -33,7 +33,7 @@ use std::{
 };
 
 use crate::{
-    MeshError, StuffOptions, Surface, TetMesh,
+    MeshError, Repair, StuffOptions, Surface, TetMesh,
     sdf::{Scene, SurfaceDistance},
     stuff,
 };
@@ -61,19 +61,23 @@ pub enum Input {
 }
 
 impl Input {
-    /// The tetrahedra themselves, or what [`stuff`] makes of the shape.
+    /// The tetrahedra themselves, or what [`stuff`] makes of the shape. A dirty surface (holes, flipped faces, copies,
+    /// crossing parts) is mended first, and what was done is told beside the tetrahedra; `None`: it was sound.
     ///
     /// # Errors
-    /// What [`SurfaceDistance::new`] and [`stuff`] say.
+    /// What [`SurfaceDistance::mended`] and [`stuff`] say.
     pub fn into_tets(
         self,
         options: &StuffOptions,
         progress: &mut dyn FnMut(f32),
-    ) -> Result<TetMesh, MeshError> {
+    ) -> Result<(TetMesh, Option<Repair>), MeshError> {
         match self {
-            Self::Surface(surface) => stuff(&SurfaceDistance::new(&surface)?, options, progress),
-            Self::Sdf(scene) => stuff(&scene, options, progress),
-            Self::Tets(mesh) => Ok(mesh),
+            Self::Surface(surface) => {
+                let (solid, repair) = SurfaceDistance::mended(&surface)?;
+                Ok((stuff(&solid, options, progress)?, repair))
+            }
+            Self::Sdf(scene) => Ok((stuff(&scene, options, progress)?, None)),
+            Self::Tets(mesh) => Ok((mesh, None)),
         }
     }
 }
@@ -94,7 +98,7 @@ pub fn read(path: impl AsRef<Path>) -> Result<Input, MeshError> {
 }
 
 /// Reads a triangle surface: finite, with valid indices, but perhaps open or crossing itself (a visible skin may be;
-/// what is to be filled with tetrahedra may not, see [`Surface::closed`]).
+/// what is to be filled with tetrahedra is mended, see [`Surface::repaired`]).
 ///
 /// Polygons are cut into fans. Where a vertex has several texture coordinates it is split, one copy for each.
 ///
@@ -342,7 +346,7 @@ mod tests {
     }
 
     #[test]
-    fn a_surface_that_bounds_nothing_is_refused_when_it_is_to_be_filled() {
+    fn a_surface_that_is_to_be_filled_is_mended_and_refused_where_it_bounds_nothing() {
         let folder = folder("open");
         let (ball, _) = shapes::sphere(4, 0.1).unwrap().boundary();
         let mut text: String = ball.positions.iter().map(|[x, y, z]| format!("v {x} {y} {z}\n")).collect();
@@ -354,12 +358,25 @@ mod tests {
             fs::write(&path, text).unwrap();
             read(&path)?.into_tets(&StuffOptions::with_target(1000), &mut |_| ())
         };
-        filled(&text).unwrap().check().unwrap();
+        let (sound, none) = filled(&text).unwrap();
+        sound.check().unwrap();
+        assert_eq!(none, None);
         // Cut within the last line, and after the line before it.
         let cut = text.len() - 8;
         assert!(matches!(filled(&text[..cut]), Err(MeshError::InFile { .. })));
         let cut = text.len() - faces[faces.len() - 1].len();
-        assert!(matches!(filled(&text[..cut]), Err(MeshError::Open { edges: 3, .. })));
+        let (mended, repair) = filled(&text[..cut]).unwrap();
+        assert_eq!(repair, Some(Repair { covered_holes: 1, ..Repair::default() }));
+        assert_eq!(repair.unwrap().to_string(), "1 hole covered");
+        // The very triangle that was missing covers the hole.
+        assert!((mended.volume() / sound.volume() - 1.0).abs() < 1e-3, "{}", mended.volume());
+        // Every second triangle gone: more hole than ball.
+        let half: String = ball.positions.iter().map(|[x, y, z]| format!("v {x} {y} {z}\n")).collect();
+        let half = half + &faces.iter().step_by(2).cloned().collect::<String>();
+        assert!(matches!(filled(&half), Err(MeshError::Open { .. })));
+        // Both sides of one triangle: closed, and nothing in it.
+        let doubled = "v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 3\nf 1 3 2\n";
+        assert!(matches!(filled(doubled), Err(MeshError::Parameter { name: "box around the shape", .. })));
         fs::remove_dir_all(folder).unwrap();
     }
 

@@ -54,6 +54,26 @@ impl SurfaceDistance {
         Ok((Self { bvh: Bvh::new(&corners), bounds: solid.bounds(), sign: Sign::Winding }, repair))
     }
 
+    /// Prepares a surface as it is where [`SurfaceDistance::new`] takes it, else [`SurfaceDistance::repaired`]: what is
+    /// sound keeps its exact sign, what is dirty is mended and tells how. `None`: nothing had to be.
+    ///
+    /// # Errors
+    /// What [`Surface::check`] says, and of a dirty surface what [`Surface::repaired`] says: it is refused only where
+    /// winding numbers cannot decide what is inside.
+    pub fn mended(surface: &Surface) -> Result<(Self, Option<Repair>), MeshError> {
+        match Self::new(surface) {
+            Ok(sound) => Ok((sound, None)),
+            Err(
+                MeshError::FlatTriangle { .. }
+                | MeshError::Open { .. }
+                | MeshError::NonManifoldEdge { .. }
+                | MeshError::Orientation { .. }
+                | MeshError::SelfCrossing { .. },
+            ) => Self::repaired(surface).map(|(solid, repair)| (solid, Some(repair))),
+            Err(other) => Err(other),
+        }
+    }
+
     /// How often the surface winds around `p`: 1 inside, 0 outside.
     pub fn winding_number(&self, p: [f64; 3]) -> f64 {
         self.bvh.winding_number(p.into())
