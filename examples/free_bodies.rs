@@ -113,14 +113,15 @@ fn throw(mut bodies: Query<(&Part, &mut BodyState, &mut Account)>) -> Result {
 fn hit(
     time: Res<Time>,
     keys: Res<ButtonInput<KeyCode>>,
-    mut bodies: Query<(&Part, &mut BodyState, &mut Account)>,
+    mut bodies: Query<(Entity, &Part, &BodyState, &mut Account)>,
+    mut strikes: MessageWriter<Strike>,
     mut blows: Local<u32>,
-) -> Result {
+) {
     let due = time.elapsed_secs_f64() > 0.4 + 1.5 * f64::from(*blows);
     if !due && !keys.just_pressed(KeyCode::KeyH) {
-        return Ok(());
+        return;
     }
-    for (part, mut state, mut account) in &mut bodies {
+    for (body, part, state, mut account) in &mut bodies {
         if *part != Part::Struck || account.opening.is_none() {
             continue;
         }
@@ -129,11 +130,9 @@ fn hit(
         let home = -DVec3::from(state.body().frame().origin());
         let blow = -DVec3::from(momentum) + 0.18 * home + 0.04 * DVec3::new(0.3, 1.0, 0.6);
         let side = [Vec3::X, Vec3::Y, Vec3::NEG_X, Vec3::NEG_Y][*blows as usize % 4];
-        let knob = farthest(&state, side);
-        state.body_mut().strike(knob, blow.into())?;
+        strikes.write(Strike { body, vertex: farthest(state, side), impulse: blow });
         account.applied += blow;
     }
-    Ok(())
 }
 
 /// The surface vertex farthest along `toward`, body axes.

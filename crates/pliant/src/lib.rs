@@ -120,13 +120,14 @@ impl PluginGroup for PliantPlugins {
 /// The names that a scene uses.
 pub mod prelude {
     pub use crate::PliantPlugins;
-    #[cfg(feature = "render")]
-    pub use crate::body::SurfaceShading;
     pub use crate::body::{
         BodyRefused, BodyState, Driven, Grab, GrabForce, GrabOf, Grabs, Integration, ModalAsset, ModalBody,
         NoPointerGrab, PliantBodyPlugin, PliantDisplaySystems, PliantSystems, PliantTick, PointerGrab,
-        PointerGrabPlugin, PointerGrabSystems, PointerHeld, ShownState, SingleSteps,
+        PointerGrabPlugin, PointerGrabSystems, PointerHeld, Push, ShownState, SingleSteps, Strike,
+        Viscoelastic,
     };
+    #[cfg(feature = "render")]
+    pub use crate::body::{SurfaceDeformation, SurfaceDetail, SurfaceShading};
     #[cfg(all(feature = "haptics", feature = "render"))]
     pub use crate::haptics::ForceArrow;
     #[cfg(feature = "haptics")]

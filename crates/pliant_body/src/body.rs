@@ -6,7 +6,7 @@ use bevy::{
     math::{Affine3A, DVec3},
     prelude::*,
 };
-use pliant_modal::{Body, BodyConfig, GrabId, Integrator, ModalModel};
+use pliant_modal::{Body, BodyConfig, GrabId, Integrator, ModalModel, Relaxation};
 
 use crate::{ModalAsset, grab::Hold};
 
@@ -27,7 +27,8 @@ use crate::{ModalAsset, grab::Hold};
 /// anchors without inertia (quasi-static). A free body writes its own motion into its `Transform` each frame and must have no
 /// parent; writing the transform puts it elsewhere with its velocity kept.
 ///
-/// A change of a field takes effect at the end of the frame; the shape and its motion are kept where the model is the same.
+/// A change of a field takes effect at the end of the frame; the shape and its motion are kept where the model is the same. A change that
+/// makes no body is refused once ([`BodyRefused`](crate::BodyRefused)), and the body goes on with the settings it had.
 #[derive(Component, Reflect, Debug, Clone, PartialEq)]
 #[reflect(Component, Default, Clone, PartialEq)]
 #[require(Transform, Visibility, Driven)]
@@ -42,6 +43,11 @@ pub struct ModalBody {
     pub warp: bool,
     /// Multiplies the baked damping of every mode, 0 or more. Default: `1.0`.
     pub damping_scale: f64,
+    /// A material that relaxes under a held strain and creeps under a held force. Default: `None`, elastic.
+    pub relaxation: Option<Viscoelastic>,
+    /// Newton corrections in one step of the grabs on a body that is bent by warping, a number from 1 to 8 (what is outside is taken as
+    /// the nearest of them). Default: `2`.
+    pub corrections: usize,
     /// Acceleration of gravity, m/s^2, in world axes. Default: zero, as a bake at rest is usually wanted as it was drawn.
     pub gravity: DVec3,
     /// The body rests once the root mean square speed of its mass stays below this, m/s of the model, for half a second with
@@ -65,6 +71,8 @@ impl ModalBody {
             modes: None,
             warp: true,
             damping_scale: 1.0,
+            relaxation: None,
+            corrections: BodyConfig::default().corrections,
             gravity: DVec3::ZERO,
             rest_speed: 1e-4,
         }
@@ -79,8 +87,34 @@ impl ModalBody {
             modes: self.modes,
             gravity: (self.gravity / scale).into(),
             damping_scale: self.damping_scale,
-            ..BodyConfig::default()
+            relaxation: self.relaxation.map(Relaxation::from),
+            corrections: self.corrections,
         }
+    }
+}
+
+/// The material of a [`ModalBody`] that relaxes: [`Relaxation`], which knows no engine, as a field that reflection sees.
+///
+/// The stress under a strain that is held falls to `1 - ratio` of what it was, as `1 - ratio (1 - exp(-t / time))`. Default: half of the
+/// stiffness within a second.
+#[derive(Reflect, Debug, Clone, Copy, PartialEq)]
+#[reflect(Debug, Default, Clone, PartialEq)]
+pub struct Viscoelastic {
+    /// Share of the baked stiffness that relaxes away, 0 or more and below 1. Default: `0.5`.
+    pub ratio: f64,
+    /// Relaxation time under a held strain, s, above 0. Default: `1.0`.
+    pub time: f64,
+}
+
+impl Default for Viscoelastic {
+    fn default() -> Self {
+        Self { ratio: 0.5, time: 1.0 }
+    }
+}
+
+impl From<Viscoelastic> for Relaxation {
+    fn from(Viscoelastic { ratio, time }: Viscoelastic) -> Self {
+        Self { ratio, time }
     }
 }
 
@@ -190,7 +224,8 @@ impl BodyState {
         &self.body
     }
 
-    /// The simulated body, to be changed: it wakes. Grabs made here are the caller's to release; those of [`Grab`](crate::Grab) entities
+    /// The simulated body, to be changed: it wakes. What is configured here holds until a field of the [`ModalBody`] changes, which sets all
+    /// of them again. Grabs made here are the caller's to release; those of [`Grab`](crate::Grab) entities
     /// are not to be touched.
     pub fn body_mut(&mut self) -> &mut Body {
         self.wake();

@@ -37,6 +37,16 @@ pub enum BodyError {
     /// A step failed; the state before it is kept.
     #[error("the step was refused: {0}")]
     Step(StepError),
+    /// A [`Strike`](crate::Strike) or [`Push`](crate::Push) at a vertex that the body lacks, with a number that is NaN or infinite, or so
+    /// hard that the body's velocity is no number any more.
+    #[error("the blow was refused: {0}")]
+    Blow(StepError),
+    /// A [`Strike`](crate::Strike) or [`Push`](crate::Push) at an entity that is no body, or whose model is not there yet.
+    #[error("the blow was refused: this entity is no body, or its model is not there yet")]
+    NoBody,
+    /// A [`Strike`](crate::Strike) or [`Push`](crate::Push) at a body that somebody else moves.
+    #[error("the blow was refused: this body is driven remotely and is not stepped here")]
+    NotLocal,
     /// A shown state with the wrong number of modes.
     #[error("a shown state needs {expected} modal coordinates, got {found}")]
     ShownLength {
@@ -67,7 +77,7 @@ pub enum BodyError {
 #[derive(Message, Reflect, Debug)]
 #[reflect(from_reflect = false)]
 pub struct BodyRefused {
-    /// The entity whose component was refused: a body or a grab.
+    /// The entity whose component was refused, or that a message named: a body or a grab.
     pub entity: Entity,
     /// What was expected and what came.
     #[reflect(ignore)]

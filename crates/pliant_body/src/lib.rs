@@ -18,6 +18,7 @@
 //! | [`ModalBody`]: the model and how it is stepped | [`BodyState`]: the simulated body |
 //! | `Transform`: where it is | [`ShownState`]: what is on screen |
 //! | [`Grab`] and [`GrabOf`] on an entity of their own: a hold on a patch | [`GrabForce`]: the reaction, N; [`Grabs`] on the body |
+//! | [`Strike`], [`Push`] as messages: a blow, N s; a force for one tick, N | [`BodyState::body`]: what came of it |
 //! | [`Driven::Remote`]: somebody else moves it | [`PliantTick`]: the number of the step |
 //! | `SurfaceShading`, `SurfaceDetail`, `SurfaceDeformation`: edges, level of detail, graphics card or processor (feature `render`) | [`BodyRefused`]: what was refused, and why |
 //!
@@ -38,6 +39,7 @@
 mod asset;
 #[cfg(feature = "bake")]
 mod bake;
+mod blow;
 mod body;
 #[cfg(feature = "render")]
 mod deform;
@@ -63,7 +65,8 @@ pub use asset::{ModalAsset, ModalAssetError, ModalAssetLoader};
 pub use bake::{
     BakeBodyError, BakeFailed, BakePlugin, BakeProgress, BakeRequest, BakeShape, BakeSkin, BakeStage,
 };
-pub use body::{BodyState, Driven, Integration, ModalBody, NoPointerGrab};
+pub use blow::{Push, Strike};
+pub use body::{BodyState, Driven, Integration, ModalBody, NoPointerGrab, Viscoelastic};
 #[cfg(feature = "render")]
 pub use deform::{DrawnSurface, SurfaceDeformation, SurfaceDetail, SurfaceShading};
 pub use error::{BodyError, BodyRefused};
@@ -86,7 +89,8 @@ pub const DEFORM_TIME: DiagnosticPath = DiagnosticPath::const_new("pliant/deform
 /// A tick, in this order, in the schedule that [`PliantBodyPlugin`] was given. None of it runs while the schedule's time stands still.
 #[derive(SystemSet, Debug, Clone, PartialEq, Eq, Hash)]
 pub enum PliantSystems {
-    /// Places and grabs are taken over. Whoever moves a [`Grab`] once a tick (a script, a session) does so before this set.
+    /// Places, grabs and blows are taken over. Whoever moves a [`Grab`] or sends a [`Strike`] or [`Push`] once a tick (a script, a session) does
+    /// so before this set.
     Input,
     /// Local bodies are stepped.
     Step,
@@ -152,8 +156,12 @@ impl Plugin for PliantBodyPlugin {
             .register_type::<ShownState>()
             .register_type::<BodyRefused>()
             .register_type::<SingleSteps>()
+            .register_type::<Strike>()
+            .register_type::<Push>()
             .add_message::<BodyRefused>()
             .add_message::<SingleSteps>()
+            .add_message::<Strike>()
+            .add_message::<Push>()
             .init_resource::<PliantTick>()
             .insert_resource(step::Stepping { fixed })
             .register_diagnostic(Diagnostic::new(STEP_TIME).with_suffix(" ms"))
@@ -177,7 +185,13 @@ impl Plugin for PliantBodyPlugin {
             .add_systems(
                 self.schedule,
                 (
-                    (step::count_tick, shown::begin_tick, step::place_bodies, step::hold_bodies)
+                    (
+                        step::count_tick,
+                        shown::begin_tick,
+                        step::place_bodies,
+                        step::hold_bodies,
+                        blow::hit_bodies,
+                    )
                         .chain()
                         .in_set(PliantSystems::Input),
                     step::step_bodies.in_set(PliantSystems::Step),

@@ -103,17 +103,17 @@ impl ShownState {
         Ok(())
     }
 
-    /// What is on screen in this frame.
+    /// What is on screen in this frame: one coordinate a kept mode, kg^1/2 m.
     pub fn q(&self) -> &[f64] {
         &self.shown
     }
 
-    /// The newest state that was pushed.
+    /// The newest state that was pushed: one coordinate a kept mode, kg^1/2 m.
     pub fn current(&self) -> &[f64] {
         &self.current
     }
 
-    /// The state pushed before [`current`](Self::current).
+    /// The state pushed before [`current`](Self::current), kg^1/2 m; the same one where a tick passed without a push.
     pub fn previous(&self) -> &[f64] {
         &self.previous
     }

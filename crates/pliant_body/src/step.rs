@@ -1,14 +1,17 @@
 //! The fixed step: bodies are made, placed, held, stepped, and what came of it is published.
 
-use std::{sync::Arc, time::Instant};
+use std::{
+    sync::{Arc, Weak},
+    time::Instant,
+};
 
 use bevy::{
     diagnostic::Diagnostics,
-    ecs::system::SystemParam,
+    ecs::{name::NameOrEntityItem, system::SystemParam},
     math::{DQuat, DVec3},
     prelude::*,
 };
-use pliant_modal::{Body, GrabConfig, Patch, StepError};
+use pliant_modal::{Body, BodyConfig, GrabConfig, ModalModel, Patch, StepError};
 
 use crate::{
     AWAKE_BODIES, BodyError, BodyRefused, BodyState, Driven, Grab, GrabForce, Grabs, ModalAsset, ModalBody,
@@ -27,9 +30,9 @@ pub(crate) struct Stepping {
     pub fixed: bool,
 }
 
-/// The body of this entity was refused; it is tried again when its [`ModalBody`] changes.
+/// The body of this entity was refused with this model; it is tried again when its [`ModalBody`] or the asset behind it changes.
 #[derive(Component)]
-pub(crate) struct BuildRefused;
+pub(crate) struct BuildRefused(Weak<ModalModel>);
 
 /// Seconds for which a body must be slow before it rests.
 const REST_AFTER: f64 = 0.5;
@@ -40,14 +43,15 @@ pub(crate) struct Refusals<'w> {
 }
 
 impl Refusals<'_> {
-    fn tell(&mut self, name: &impl std::fmt::Display, entity: Entity, error: BodyError) {
+    pub fn tell(&mut self, name: &impl std::fmt::Display, entity: Entity, error: BodyError) {
         warn!("{name}: {error}");
         self.messages.write(BodyRefused { entity, error });
     }
 }
 
 /// A body as it is asked for, and as it is.
-type Buildable = (NameOrEntity, Ref<'static, ModalBody>, Option<&'static mut BodyState>, Has<BuildRefused>);
+type Buildable =
+    (NameOrEntity, Ref<'static, ModalBody>, Option<&'static mut BodyState>, Option<&'static BuildRefused>);
 
 pub(crate) fn build_bodies(
     mut commands: Commands,
@@ -76,14 +80,15 @@ pub(crate) fn build_bodies(
                 }
             }
             state => {
-                if refused && !body.is_changed() {
+                let same = refused.is_some_and(|BuildRefused(with)| with.as_ptr() == Arc::as_ptr(model));
+                if same && !body.is_changed() {
                     continue;
                 }
                 match Body::new(model.clone(), body.config(step, 1.0)) {
                     Ok(new) => {
                         // Fewer or more modes of one model: the motion of those that stay goes on.
                         let new = match state {
-                            Some(old) if Arc::ptr_eq(old.model(), model) => carry_over(&old.body, new),
+                            Some(old) if Arc::ptr_eq(old.model(), model) => carry_over(&name, &old.body, new),
                             _ => new,
                         };
                         let shown = ShownState::new(new.q());
@@ -94,7 +99,7 @@ pub(crate) fn build_bodies(
                     }
                     Err(error) => {
                         refusals.tell(&name, name.entity, BodyError::Build(error));
-                        commands.entity(name.entity).insert(BuildRefused);
+                        commands.entity(name.entity).insert(BuildRefused(Arc::downgrade(model)));
                     }
                 }
             }
@@ -102,7 +107,7 @@ pub(crate) fn build_bodies(
     }
 }
 
-fn carry_over(old: &Body, mut new: Body) -> Body {
+fn carry_over(name: &NameOrEntityItem, old: &Body, mut new: Body) -> Body {
     let mut state = new.state().clone();
     let from = old.state();
     for (to, from) in [
@@ -119,7 +124,7 @@ fn carry_over(old: &Body, mut new: Body) -> Body {
     state.frame = from.frame;
     // A state that the old body had is finite; were it not, the new one stays at rest.
     if let Err(error) = new.set_state(&state) {
-        warn!("the motion of a body was not carried over: {error}");
+        warn!("{name}: the motion of the body was not carried over: {error}");
     }
     new
 }
@@ -138,9 +143,9 @@ pub(crate) fn count_tick(mut tick: ResMut<PliantTick>) {
 /// Takes the place of every body whose transform changed.
 pub(crate) fn place_bodies(
     mut refusals: Refusals,
-    mut bodies: Query<(NameOrEntity, &ModalBody, &Transform, &GlobalTransform, &mut BodyState)>,
+    mut bodies: Query<(NameOrEntity, &Transform, &GlobalTransform, &mut BodyState), With<ModalBody>>,
 ) {
-    for (name, body, local, global, mut state) in &mut bodies {
+    for (name, local, global, mut state) in &mut bodies {
         // A free body has no parent; what was written into its transform since the last frame is not in the global one yet.
         let transform = if state.model().is_free() { GlobalTransform::from(*local) } else { *global };
         let affine = transform.affine();
@@ -155,11 +160,16 @@ pub(crate) fn place_bodies(
             continue;
         }
         let scale = f64::from(scale.x);
-        let step = state.body.config().step;
         if scale != state.scale {
-            state.scale = scale;
-            if let Err(error) = state.body_mut().reconfigure(body.config(step, scale)) {
-                refusals.tell(&name, name.entity, BodyError::Build(error));
+            // From what the body runs with, not from its component, whose fields may have been refused.
+            let running = state.body.config().clone();
+            let gravity = DVec3::from(running.gravity) * (state.scale / scale);
+            match state.body_mut().reconfigure(BodyConfig { gravity: gravity.into(), ..running }) {
+                Ok(()) => state.scale = scale,
+                Err(error) => {
+                    refusals.tell(&name, name.entity, BodyError::Build(error));
+                    continue;
+                }
             }
         }
         let origin = translation.as_dvec3() / scale;
@@ -250,13 +260,12 @@ pub(crate) fn step_bodies(
         }
         stepped += 1;
         let state = &mut *state;
-        if state.body.config().step != step
-            && let Err(error) = state.body.reconfigure(body.config(step, state.scale))
-        {
-            refusals.tell(&name, name.entity, BodyError::Step(error));
-            continue;
-        }
-        match state.body.step() {
+        // From what the body runs with: the component's fields may have been refused.
+        let lengthened = match state.body.config() {
+            running if running.step == step => Ok(()),
+            running => state.body.reconfigure(BodyConfig { step, ..running.clone() }),
+        };
+        match lengthened.and_then(|()| state.body.step()) {
             Ok(_) => state.faulted = false,
             Err(error) => {
                 if !state.faulted {
@@ -280,7 +289,9 @@ pub(crate) fn step_bodies(
 fn is_slow(body: &Body, limit: f64) -> bool {
     let mass = body.model().mass();
     let modes: f64 = body.v().iter().map(|v| v * v).sum();
-    if modes >= limit * limit * mass {
+    // A limit that is NaN lets nothing rest.
+    let below = modes < limit * limit * mass;
+    if !below {
         return false;
     }
     if !body.model().is_free() {
@@ -292,8 +303,11 @@ fn is_slow(body: &Body, limit: f64) -> bool {
     velocity.length() < limit && spin.length() < limit * mass * body.model().size()
 }
 
-pub(crate) fn publish(mut bodies: Query<(&BodyState, &mut ShownState)>, mut forces: Query<&mut GrabForce>) {
-    for (state, mut shown) in &mut bodies {
+pub(crate) fn publish(
+    mut bodies: Query<(NameOrEntity, &BodyState, &mut ShownState)>,
+    mut forces: Query<&mut GrabForce>,
+) {
+    for (name, state, mut shown) in &mut bodies {
         if !state.stepped {
             continue;
         }
@@ -309,7 +323,7 @@ pub(crate) fn publish(mut bodies: Query<(&BodyState, &mut ShownState)>, mut forc
             shown.push(body.q())
         };
         if let Err(error) = pushed {
-            warn!("a step was not shown: {error}");
+            warn!("{name}: a step was not shown: {error}");
         }
         for held in &state.held {
             let Ok(mut force) = forces.get_mut(held.entity) else { continue };

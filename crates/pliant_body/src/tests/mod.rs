@@ -1,17 +1,19 @@
 //! Apps with time by hand and a bar whose modes are written down, so that every number has an outside value.
 
 mod baking;
+mod blows;
 mod crowd;
 mod display;
 mod grabs;
 pub mod model;
 mod pausing;
 mod pointer;
+mod settings;
 mod stepping;
 
 use std::{sync::Arc, time::Duration};
 
-use bevy::{prelude::*, time::TimeUpdateStrategy, transform::TransformPlugin};
+use bevy::{ecs::schedule::ScheduleLabel, prelude::*, time::TimeUpdateStrategy, transform::TransformPlugin};
 use pliant_modal::ModalModel;
 
 use crate::{BodyRefused, BodyState, ModalAsset, ModalBody, PliantBodyPlugin, PliantTick};
@@ -21,11 +23,16 @@ pub const STEP: f64 = 1.0 / 40.0;
 
 /// An app without a renderer whose every update is one step.
 pub fn app() -> App {
+    app_in(FixedUpdate)
+}
+
+/// As [`app`], with bodies that are stepped in `schedule`.
+pub fn app_in(schedule: impl ScheduleLabel) -> App {
     let mut app = App::new();
     app.add_plugins((MinimalPlugins, AssetPlugin::default(), TransformPlugin))
         .insert_resource(Time::<Fixed>::from_seconds(STEP))
         .insert_resource(TimeUpdateStrategy::FixedTimesteps(1))
-        .add_plugins(PliantBodyPlugin::default())
+        .add_plugins(PliantBodyPlugin::new(schedule))
         .init_resource::<Told>()
         .add_systems(Last, |mut refused: MessageReader<BodyRefused>, mut told: ResMut<Told>| {
             told.0.extend(refused.read().map(|refused| (refused.entity, refused.error.to_string())));

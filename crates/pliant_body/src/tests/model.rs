@@ -19,18 +19,23 @@ pub fn tip() -> u32 {
 }
 
 pub fn bar() -> ModalModel {
-    bar_with(false)
+    bar_with(false, 1.0)
 }
 
 /// The same elastic shapes on a body without anchors.
 pub fn free_bar() -> ModalModel {
-    bar_with(true)
+    bar_with(true, 1.0)
+}
+
+/// The bar with frequencies `factor` times as high.
+pub fn stiff_bar(factor: f64) -> ModalModel {
+    bar_with(false, factor)
 }
 
 /// Displacement and rotation of a mode at a point, for its scale.
 type Shape = fn([f64; 3], f64) -> ([f64; 3], [f64; 3]);
 
-fn bar_with(free: bool) -> ModalModel {
+fn bar_with(free: bool, factor: f64) -> ModalModel {
     let surface = surface();
     // Mass-normalised: the integral of rho |phi|^2 over the bar is 1, sections staying plane and turning inertia left out.
     let bend = (5.0 / MASS).sqrt();
@@ -50,7 +55,7 @@ fn bar_with(free: bool) -> ModalModel {
             rotation.extend(w.map(|x| x as f32));
         }
     }
-    let omega: Vec<f64> = FREQUENCIES.iter().map(|f| TAU * f).collect();
+    let omega: Vec<f64> = FREQUENCIES.iter().map(|f| TAU * f * factor).collect();
     let damping = omega.iter().map(|w| Damping::Ratio(0.2).coefficient(*w)).collect();
     // The integral of rho phi: a third of the tip for bending, a half for stretch.
     let participation = [

@@ -166,6 +166,8 @@ fn a_transform_that_cannot_place_a_body_is_refused_and_the_body_stays() {
         Transform::from_scale(Vec3::ZERO),
         Transform::from_scale(Vec3::new(-1.0, 1.0, 1.0)),
         Transform::from_xyz(f32::NAN, 0.0, 0.0),
+        Transform::from_xyz(0.0, f32::INFINITY, 0.0),
+        Transform::from_scale(Vec3::splat(f32::INFINITY)),
     ];
     for transform in wrong {
         app.world_mut().entity_mut(body).insert(transform);
@@ -277,7 +279,13 @@ fn a_reflecting_tool_finds_every_component_and_reads_how_a_body_stands() {
     for id in components {
         assert!(registry.get_type_data::<ReflectComponent>(id).is_some(), "{id:?}");
     }
-    for id in [TypeId::of::<crate::BodyRefused>(), TypeId::of::<crate::SingleSteps>()] {
+    let messages = [
+        TypeId::of::<crate::BodyRefused>(),
+        TypeId::of::<crate::SingleSteps>(),
+        TypeId::of::<crate::Strike>(),
+        TypeId::of::<crate::Push>(),
+    ];
+    for id in messages {
         assert!(registry.get(id).is_some(), "{id:?}");
     }
     let reflected = registry.get_type_data::<ReflectComponent>(TypeId::of::<crate::BodyState>()).unwrap();

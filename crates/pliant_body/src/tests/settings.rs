@@ -1,0 +1,135 @@
+//! Settings that are changed, mended and refused while bodies run.
+
+use std::time::Duration;
+
+use bevy::{math::DVec3, prelude::*, time::TimeUpdateStrategy};
+
+use super::{STEP, app, model, refusals, spawn_with, state, steps};
+use crate::{BodyState, ModalAsset, ModalBody, Viscoelastic};
+
+fn settings(app: &mut App, body: Entity) -> Mut<'_, ModalBody> {
+    app.world_mut().get_mut::<ModalBody>(body).unwrap()
+}
+
+/// Two bodies fall alike; one is given settings that make no body, and the tick's length changes: it goes on as the other one.
+fn goes_on_with_the_settings_it_had(mut app: App, lengthen: impl Fn(&mut App, Duration)) {
+    let falls = |body: &mut ModalBody| body.gravity = DVec3::NEG_Y;
+    let good = spawn_with(&mut app, model::bar(), falls, ());
+    let bad = spawn_with(&mut app, model::bar(), falls, ());
+    lengthen(&mut app, Duration::from_millis(25));
+    steps(&mut app, 5);
+    let same = state(&app, good).body().state().clone();
+    app.world_mut().get_mut::<BodyState>(bad).unwrap().body_mut().set_state(&same).unwrap();
+    {
+        let mut bad = settings(&mut app, bad);
+        bad.damping_scale = f64::NAN;
+        // Refused with the rest.
+        bad.gravity = DVec3::ZERO;
+    }
+    for millis in [25, 20, 10, 30, 10] {
+        lengthen(&mut app, Duration::from_millis(millis));
+        steps(&mut app, 2);
+    }
+    let told = refusals(&mut app);
+    assert_eq!(told.len(), 1, "{told:?}");
+    assert!(told[0].0 == bad && told[0].1.contains("damping_scale"), "{told:?}");
+    let config = state(&app, bad).body().config();
+    assert_eq!((config.step, config.damping_scale, config.gravity), (0.010, 1.0, [0.0, -1.0, 0.0]));
+    assert_ne!(state(&app, good).body().q(), same.q, "it moves");
+    assert_eq!(state(&app, bad).body().state(), state(&app, good).body().state());
+
+    // Twice as large, and still with the settings it had: gravity in the body's own world is half.
+    app.world_mut().entity_mut(bad).insert(Transform::from_scale(Vec3::splat(2.0)));
+    steps(&mut app, 3);
+    assert_eq!(refusals(&mut app), []);
+    assert_eq!(state(&app, bad).body().config().gravity, [0.0, -0.5, 0.0]);
+
+    settings(&mut app, bad).damping_scale = 3.0;
+    steps(&mut app, 1);
+    assert_eq!(refusals(&mut app), []);
+    let config = state(&app, bad).body().config();
+    assert_eq!((config.damping_scale, config.gravity), (3.0, [0.0; 3]));
+}
+
+#[test]
+fn a_refused_change_and_frames_of_other_lengths_in_update() {
+    let mut app = super::app_in(Update);
+    app.update();
+    goes_on_with_the_settings_it_had(app, |app, length| {
+        app.insert_resource(TimeUpdateStrategy::ManualDuration(length));
+    });
+}
+
+#[test]
+fn a_refused_change_and_another_fixed_step() {
+    goes_on_with_the_settings_it_had(app(), |app, length| {
+        app.world_mut().resource_mut::<Time<Fixed>>().set_timestep(length);
+    });
+}
+
+#[test]
+fn a_material_set_on_the_component_relaxes_and_stays_through_other_steps() {
+    let mut app = app();
+    let material = Viscoelastic { ratio: 0.5, time: 0.2 };
+    let body = spawn_with(
+        &mut app,
+        model::bar(),
+        |body| {
+            body.gravity = DVec3::NEG_Y;
+            body.relaxation = Some(material);
+            body.corrections = 5;
+        },
+        (),
+    );
+    app.world_mut().resource_mut::<Time<Fixed>>().set_timestep_seconds(STEP / 2.0);
+    steps(&mut app, 2_000);
+    let config = state(&app, body).body().config();
+    assert_eq!((config.step, config.corrections), (STEP / 2.0, 5));
+    assert_eq!(config.relaxation, Some(pliant_modal::Relaxation { ratio: 0.5, time: 0.2 }));
+    // Half of the stiffness is left: it hangs twice as low as an elastic one, 5/3 g / omega^2.
+    let expected = 2.0 * 5.0 / 3.0 / (std::f64::consts::TAU * model::FREQUENCIES[0]).powi(2);
+    let tip = (5.0 / model::MASS).sqrt() * state(&app, body).body().q()[0];
+    assert!((tip + expected).abs() < 1e-3 * expected, "sank {tip} m, expected -{expected} m");
+
+    settings(&mut app, body).relaxation = Some(Viscoelastic { ratio: 1.0, time: 0.2 });
+    steps(&mut app, 3);
+    let told = refusals(&mut app);
+    assert!(told.len() == 1 && told[0].1.contains("relaxation ratio"), "{told:?}");
+    settings(&mut app, body).relaxation = None;
+    steps(&mut app, 1);
+    assert_eq!(state(&app, body).body().config().relaxation, None);
+}
+
+#[test]
+fn what_was_configured_on_the_body_itself_stays_when_the_step_and_the_scale_change() {
+    let mut app = app();
+    let body = spawn_with(&mut app, model::bar(), |_| (), ());
+    let relaxation = Some(pliant_modal::Relaxation { ratio: 0.25, time: 2.0 });
+    let mut running = app.world_mut().get_mut::<BodyState>(body).unwrap();
+    let config = pliant_modal::BodyConfig { relaxation, corrections: 7, ..running.body().config().clone() };
+    running.body_mut().reconfigure(config).unwrap();
+    app.world_mut().resource_mut::<Time<Fixed>>().set_timestep_seconds(STEP / 4.0);
+    app.world_mut().entity_mut(body).insert(Transform::from_scale(Vec3::splat(0.5)));
+    steps(&mut app, 3);
+    let config = state(&app, body).body().config();
+    assert_eq!((config.step, config.relaxation, config.corrections), (STEP / 4.0, relaxation, 7));
+}
+
+#[test]
+fn a_model_that_was_refused_is_tried_again_when_its_asset_changes() {
+    let mut app = app();
+    // Too fast for a material that relaxes: omega h above 1e12.
+    let material = Some(Viscoelastic::default());
+    let body = spawn_with(&mut app, model::stiff_bar(1e13), |body| body.relaxation = material, ());
+    steps(&mut app, 3);
+    assert!(app.world().get::<BodyState>(body).is_none());
+    let told = refusals(&mut app);
+    assert!(told.len() == 1 && told[0].1.contains("omega"), "{told:?}");
+
+    let handle = settings(&mut app, body).bypass_change_detection().model.clone();
+    let mut assets = app.world_mut().resource_mut::<Assets<ModalAsset>>();
+    *assets.get_mut(&handle).unwrap() = ModalAsset::from(model::bar());
+    steps(&mut app, 1);
+    assert_eq!(state(&app, body).model().hash(), model::bar().hash());
+    assert_eq!(refusals(&mut app), []);
+}
