@@ -5,8 +5,11 @@ use std::f64::consts::{FRAC_PI_2, TAU};
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 use std::time::{Duration, Instant};
 
-use bevy::prelude::*;
 use bevy::transform::TransformPlugin;
+use bevy::{
+    ecs::message::{MessageRegistry, ShouldUpdateMessages},
+    prelude::*,
+};
 use pliant_body::{ModalAsset, ModalBody, PliantBodyPlugin};
 use pliant_modal::{BakeInfo, Damping, Element, FlexibilitySite, ModalModel, ModelParts, Patch, SurfaceMesh};
 use pliant_net::{HostConfig, Invite, JoinConfig, NetPlugin, SharedBody};
@@ -108,8 +111,14 @@ pub fn app(net: NetPlugin) -> App {
     let mut app = App::new();
     app.add_plugins((MinimalPlugins, AssetPlugin::default(), TransformPlugin))
         .insert_resource(Time::<Fixed>::from_hz(40.0))
-        .add_plugins((PliantBodyPlugin::default(), net));
+        .add_plugins((PliantBodyPlugin::default(), net))
+        .add_systems(Last, keep_messages);
     app
+}
+
+/// A test asks what has been said so far, at whatever time: nothing said is dropped.
+fn keep_messages(mut registry: ResMut<MessageRegistry>) {
+    registry.should_update = ShouldUpdateMessages::Waiting;
 }
 
 /// A host that shares `bar` at 1 m above the origin: the app, its invite, the body.
