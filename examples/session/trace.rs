@@ -1,6 +1,6 @@
 //! What the host computed and what a guest showed, tick by tick, in files: to be compared when both have ended, on whatever machines they ran.
 //!
-//! A record: `u64` tick, `u16` user, 3 x `f32` reaction on that user's hand (N; NaN where it has none), `u16` number of modes, so many `f32`.
+//! A record: `u64` tick, `u16` user (the host: the body as it is streamed, or the truth; a guest: as its own hand has it), 3 x `f32` reaction on that user's hand (N; NaN where it has none), `u16` number of modes, so many `f32`.
 
 use std::collections::BTreeMap;
 use std::error::Error;
@@ -20,12 +20,13 @@ use pliant::stream::UserId;
 pub struct Trace {
     file: BufWriter<File>,
     last: u64,
+    last_held: u64,
 }
 
 impl Trace {
     pub fn create(path: &Path) -> Result<Self, Box<dyn Error>> {
         let file = File::create(path).map_err(|error| format!("{}: {error}", path.display()))?;
-        Ok(Self { file: BufWriter::new(file), last: 0 })
+        Ok(Self { file: BufWriter::new(file), last: 0, last_held: 0 })
     }
 
     fn put(&mut self, tick: u64, user: UserId, reaction: Option<DVec3>, q: &[f64]) -> std::io::Result<()> {
@@ -62,7 +63,7 @@ pub fn write_truth(
     }
 }
 
-/// Each tick that a guest shows, as it was shown first: the newer copy's while its hand holds the body.
+/// Each tick that a guest shows, as it was shown first: as it is streamed, and the newer copy with the reaction while its hand holds the body.
 pub fn write_shown(
     trace: Option<ResMut<Trace>>,
     guest: Option<Res<NetGuest>>,
@@ -72,13 +73,21 @@ pub fn write_shown(
     let (Some(mut trace), Some(guest)) = (trace, guest) else { return };
     let user = guest.session().and_then(|session| session.user()).unwrap_or(UserId::HOST);
     for body in &bodies {
-        let Some((tick, state)) = guest.shown(*body) else { continue };
-        if tick <= trace.last {
-            continue;
+        let mut written = Ok(());
+        if let Some(view) = guest.body(*body)
+            && let Some(streamed) = view.shown()
+            && view.tick() > trace.last
+        {
+            trace.last = view.tick();
+            written = trace.put(view.tick(), UserId::HOST, None, &streamed.q);
         }
-        trace.last = tick;
-        let felt = forces.iter().next().map(|felt| felt.force);
-        if let Err(error) = trace.put(tick, user, felt, &state.q) {
+        if let (Some((tick, state)), Some(felt)) = (guest.shown(*body), forces.iter().next())
+            && tick > trace.last_held
+        {
+            trace.last_held = tick;
+            written = written.and(trace.put(tick, user, Some(felt.force), &state.q));
+        }
+        if let Err(error) = written {
             warn_once!("the trace is not whole: {error}");
         }
     }
@@ -110,57 +119,84 @@ fn read(path: &Path) -> Result<BTreeMap<(u64, u16), Line>, Box<dyn Error>> {
     }
 }
 
-/// Compares what a guest has shown with the truth of the same ticks: over the surface, as parts of the largest true displacement, and the reactions as
-/// parts of the largest true one. The first `skip` ticks of the guest are left out.
-pub fn compare(model: &ModalModel, truth: &Path, shown: &Path, skip: usize) -> Result<(), Box<dyn Error>> {
-    let (truth, shown) = (read(truth)?, read(shown)?);
-    let rest = model.surface().positions();
-    let (mut a, mut b) = (vec![[0.0f32; 3]; rest.len()], vec![[0.0f32; 3]; rest.len()]);
-    let whole = |q: &[f32]| {
-        let mut q = q.to_vec();
-        q.resize(model.mode_count(), 0.0);
-        q
-    };
-    let (mut ticks, mut sum, mut worst, mut largest) = (0u64, 0.0f64, 0.0f64, 0.0f64);
-    let (mut felt, mut force_sum, mut force_worst, mut force_most) = (0u64, 0.0f64, 0.0f64, 0.0f64);
-    let rest_count = rest.len().max(1) as f64;
-    let far = |a: &[f32; 3], b: &[f32; 3]| f64::from(Vec3::from(*a).distance_squared(Vec3::from(*b)));
-    for (&(tick, user), line) in shown.iter().skip(skip) {
-        let Some(host) = truth.get(&(tick, UserId::HOST.0)) else { continue };
-        model.basis().reconstruct(&whole(&line.q), true, &mut a);
-        model.basis().reconstruct(&whole(&host.q), true, &mut b);
+/// How far a shape is off, and how far its truth is from rest.
+#[derive(Default)]
+struct Off {
+    ticks: u64,
+    sum: f64,
+    worst: f64,
+    largest: f64,
+}
+
+impl Off {
+    fn add(&mut self, model: &ModalModel, shown: &[f32], truth: &[f32]) {
+        let rest = model.surface().positions();
+        let shape = |q: &[f32]| {
+            let mut q = q.to_vec();
+            q.resize(model.mode_count(), 0.0);
+            let mut out = vec![[0.0f32; 3]; rest.len()];
+            model.basis().reconstruct(&q, true, &mut out);
+            out
+        };
+        let (a, b) = (shape(shown), shape(truth));
+        let far = |a: &[f32; 3], b: &[f32; 3]| f64::from(Vec3::from(*a).distance_squared(Vec3::from(*b)));
         let (mut mean, mut most, mut moved) = (0.0, 0.0f64, 0.0f64);
         for ((a, b), rest) in a.iter().zip(&b).zip(rest) {
             let error = far(a, b);
-            mean += error / rest_count;
+            mean += error / rest.len().max(1) as f64;
             most = most.max(error);
             moved = moved.max(far(b, rest));
         }
-        ticks += 1;
-        sum += mean;
-        worst = worst.max(most.sqrt());
-        largest = largest.max(moved.sqrt());
-        if let Some(own) =
-            truth.get(&(tick, user)).filter(|own| own.reaction.is_finite() && line.reaction.is_finite())
+        self.ticks += 1;
+        self.sum += mean;
+        self.worst = self.worst.max(most.sqrt());
+        self.largest = self.largest.max(moved.sqrt());
+    }
+
+    fn rms(&self) -> f64 {
+        percent((self.sum / self.ticks.max(1) as f64).sqrt(), self.largest)
+    }
+}
+
+fn percent(x: f64, of: f64) -> f64 {
+    if of > 0.0 { 100.0 * x / of } else { 0.0 }
+}
+
+/// Compares what a guest has shown with the truth of the same ticks: the streamed shapes over the surface, and those with its own hand first, as parts
+/// of the largest true displacement; the reactions as parts of the largest true one. The first `skip` ticks of the guest are left out.
+pub fn compare(model: &ModalModel, truth: &Path, shown: &Path, skip: usize) -> Result<(), Box<dyn Error>> {
+    let (truth, shown) = (read(truth)?, read(shown)?);
+    let (mut streamed, mut own) = (Off::default(), Off::default());
+    let (mut felt, mut force_sum, mut force_worst, mut force_most) = (0u64, 0.0f64, 0.0f64, 0.0f64);
+    let host = UserId::HOST.0;
+    let first = shown.keys().filter(|key| key.1 == host).nth(skip).map_or(u64::MAX, |key| key.0);
+    for (&(tick, user), line) in shown.range((first, 0)..) {
+        let Some(real) = truth.get(&(tick, host)) else { continue };
+        let off = if user == host { &mut streamed } else { &mut own };
+        off.add(model, &line.q, &real.q);
+        if let Some(real) =
+            truth.get(&(tick, user)).filter(|real| real.reaction.is_finite() && line.reaction.is_finite())
         {
-            let error = f64::from(own.reaction.distance(line.reaction));
+            let error = f64::from(real.reaction.distance(line.reaction));
             felt += 1;
             force_sum += error * error;
             force_worst = force_worst.max(error);
-            force_most = force_most.max(f64::from(own.reaction.length()));
+            force_most = force_most.max(f64::from(real.reaction.length()));
         }
     }
-    if ticks == 0 {
+    if streamed.ticks == 0 {
         return Err("no tick is in both files".into());
     }
-    let part = |x: f64, of: f64| if of > 0.0 { 100.0 * x / of } else { 0.0 };
     println!(
-        "{ticks} ticks: shown error {:.2} % rms, {:.1} % at most, of {:.1} mm; reaction {:.2} % rms, {:.1} % at most, of {force_most:.2} N ({felt} ticks)",
-        part((sum / ticks as f64).sqrt(), largest),
-        part(worst, largest),
-        largest * 1e3,
-        part((force_sum / felt.max(1) as f64).sqrt(), force_most),
-        part(force_worst, force_most),
+        "{} ticks: shown error {:.3} % rms, {:.1} % at most, of {:.1} mm; reaction {:.2} % rms, {:.1} % at most, of {force_most:.2} N ({felt} ticks); \
+         own hand first, against what the host made of it later, {:.2} % rms",
+        streamed.ticks,
+        streamed.rms(),
+        percent(streamed.worst, streamed.largest),
+        streamed.largest * 1e3,
+        percent((force_sum / felt.max(1) as f64).sqrt(), force_most),
+        percent(force_worst, force_most),
+        own.rms(),
     );
     Ok(())
 }

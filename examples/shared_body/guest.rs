@@ -29,7 +29,8 @@ use pliant::{
 use crate::{
     BODY, RATE,
     hand::{self, ScriptedHand},
-    meter::{Meter, Truth},
+    meter::{Meters, Truth},
+    stage,
     view::{DrawnHand, HeldBy, ViewPlugin},
 };
 
@@ -52,7 +53,7 @@ pub struct Guest {
 /// What this guest saw, taken out of the app when it has ended.
 #[derive(Default, Clone)]
 pub struct GuestReport {
-    pub meter: Meter,
+    pub meters: Meters,
     pub stats: NetStats,
     /// Why the session ended early, if it did.
     pub failure: Option<String>,
@@ -65,15 +66,14 @@ pub struct GuestBody;
 /// The newest figures, for the corner of the window and for the recording.
 #[derive(Resource, Default)]
 pub struct Figures {
-    pub title: String,
     pub joined: bool,
     pub loss: f64,
     pub round_trip: f64,
     /// Magnitude of the own hand's reaction, N.
     pub reaction: f64,
     pub kbit_s: f64,
-    /// How long ago the host was where this guest shows the body, s.
-    pub behind: f64,
+    /// How far ahead of the host's word the body is shown because the own hand holds it, s.
+    pub ahead: f64,
 }
 
 #[derive(Resource)]
@@ -112,11 +112,15 @@ pub fn run_windowed(guest: Guest) -> GuestReport {
                 }),
                 ..default()
             })
-            .set(AssetPlugin { file_path: crate::ASSETS.into(), ..default() }),
+            .set(AssetPlugin { file_path: stage::ASSETS.into(), ..default() }),
     )
     // The session goes on when the window is not looked at.
     .insert_resource(WinitSettings::continuous())
-    .add_plugins((PointerGrabPlugin, ViewPlugin, PanelPlugin { open: guest.panel, ..default() }));
+    .add_plugins((
+        PointerGrabPlugin,
+        ViewPlugin { title: guest.title.clone() },
+        PanelPlugin { open: guest.panel, ..default() },
+    ));
     run(app, guest)
 }
 
@@ -138,8 +142,8 @@ fn run(mut app: App, guest: Guest) -> GuestReport {
     app.add_plugins((PliantBodyPlugin::default(), guest.net))
         .insert_resource(Time::<Fixed>::from_hz(RATE))
         .insert_resource(guest.truth)
-        .init_resource::<Meter>()
-        .insert_resource(Figures { title: guest.title, ..default() })
+        .init_resource::<Meters>()
+        .init_resource::<Figures>()
         .insert_resource(Run {
             duration: guest.duration,
             screenshot: guest.screenshot,
@@ -173,12 +177,12 @@ fn spawn(mut commands: Commands) {
     ));
 }
 
-/// Compares what is shown with the truth of the same tick, and gathers the figures.
+/// Compares what is here with the truth of the same ticks, and gathers the figures.
 fn measure(
     guest: Option<Res<NetGuest>>,
     stats: Res<NetStats>,
     truth: Res<Truth>,
-    mut meter: ResMut<Meter>,
+    mut meters: ResMut<Meters>,
     mut figures: ResMut<Figures>,
     mut run: ResMut<Run>,
     time: Res<Time<Real>>,
@@ -193,18 +197,21 @@ fn measure(
     figures.round_trip = stats.round_trip.as_secs_f64();
     figures.kbit_s = stats.bytes_in_per_s * 8e-3;
     figures.reaction = forces.iter().map(|f| f.force.length()).fold(0.0, f64::max);
-    meter.reaction = meter.reaction.max(figures.reaction);
+    meters.reaction = meters.reaction.max(figures.reaction);
     for (remote, state) in &bodies {
-        let newest = truth.newest().map_or(0, |(tick, _)| tick);
-        figures.behind =
-            guest.body(*remote).map_or(0.0, |view| newest.saturating_sub(view.tick()) as f64 / RATE);
-        // While the own hand holds the body it is shown as of a tick that the host has yet to reach; it is compared when it has.
-        if let Some((tick, shown)) = guest.shown(*remote) {
-            meter.show(tick, &shown.q);
-            figures.joined = true;
-            run.since.get_or_insert(time.elapsed_secs_f64());
+        let Some(view) = guest.body(*remote) else { continue };
+        let Some(streamed) = view.shown() else { continue };
+        figures.joined = true;
+        run.since.get_or_insert(time.elapsed_secs_f64());
+        meters.streamed.show(view.tick(), &streamed.q);
+        figures.ahead = 0.0;
+        if let Some(own) = view.own_hand() {
+            // This is as of a tick that the host has yet to reach; it is compared when it has.
+            figures.ahead = own.tick().saturating_sub(view.tick()) as f64 / RATE;
+            meters.own_hand.show(own.tick(), &own.shown().q);
+            meters.waiting.show(own.tick(), &streamed.q);
         }
-        meter.compare(state.model(), &truth);
+        meters.compare(state.model(), &truth);
     }
 }
 
@@ -246,12 +253,14 @@ fn surface_point(model: &ModalModel, vertex: u32, q: &[f64]) -> Vec3 {
 }
 
 /// The error, beside the shapes, forces and network figures that the plugin records by itself.
-fn record(figures: Res<Figures>, meter: Res<Meter>, mut scalars: ResMut<RerunScalars>) {
+fn record(figures: Res<Figures>, meters: Res<Meters>, mut scalars: ResMut<RerunScalars>) {
     if !figures.joined {
         return;
     }
-    scalars.set("error/now", "%", meter.percent(meter.now));
-    scalars.set("error/rms", "%", meter.percent(meter.rms()));
+    for (name, meter) in [("streamed", &meters.streamed), ("own hand first", &meters.own_hand)] {
+        scalars.set(format!("error/{name}"), "%", meter.percent(meter.now));
+    }
+    scalars.set("error/streamed, rms", "%", meters.streamed.percent(meters.streamed.rms()));
 }
 
 /// Seconds that a picture may take to be drawn and saved: software renderers are slow.
@@ -303,9 +312,9 @@ impl Kept {
     }
 }
 
-fn keep(kept: Res<Kept>, meter: Res<Meter>, stats: Res<NetStats>, run: Res<Run>) {
+fn keep(kept: Res<Kept>, meters: Res<Meters>, stats: Res<NetStats>, run: Res<Run>) {
     let mut report = kept.0.lock().unwrap_or_else(std::sync::PoisonError::into_inner);
-    report.meter.clone_from(&meter);
+    report.meters.clone_from(&meters);
     // When the connection is closed its figures are gone: the last ones count.
     if stats.peers > 0 {
         report.stats = *stats;

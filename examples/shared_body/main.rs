@@ -16,6 +16,8 @@ mod hand;
 mod host;
 mod meter;
 mod options;
+#[path = "../stage/mod.rs"]
+mod stage;
 mod table;
 mod view;
 
@@ -52,9 +54,6 @@ const RATE: f64 = 40.0;
 /// The body's name in the session.
 const BODY: &str = "pip";
 
-/// Where the baked bodies are, from the crate that owns this example.
-const ASSETS: &str = concat!(env!("CARGO_MANIFEST_DIR"), "/../../assets");
-
 fn main() -> ExitCode {
     let options = Options::parse();
     match run(&options) {
@@ -68,14 +67,14 @@ fn main() -> ExitCode {
 
 fn run(options: &Options) -> Result<(), Box<dyn Error>> {
     let mut options = options.clone();
-    if !options.headless && !display() {
+    if !options.headless && !stage::display() {
         println!("No display is to be found: running --headless, with a scripted hand in your place.");
         options.headless = true;
     }
     if options.headless && options.screenshot.is_some() {
         return Err("a screenshot needs a window, and there is none without a display".into());
     }
-    let path = Path::new(ASSETS).join(&options.body);
+    let path = Path::new(stage::ASSETS).join(&options.body);
     let model = Arc::new(ModalModel::read(path)?);
 
     let hosting = NetPlugin::host(HostConfig::default())?;
@@ -209,32 +208,7 @@ fn failure(options: &Options, yours: &GuestReport, others: &GuestReport) -> Opti
     of("your session", yours).or_else(|| {
         // The other guest is ended by us: its goodbye is no failure, a body that never came is.
         // Nor is it one when a window is closed before the other came.
-        (others.meter.ticks == 0 && options.duration().is_some())
+        (others.meters.streamed.ticks == 0 && options.duration().is_some())
             .then(|| of("the other session", others).unwrap_or("the other never saw the body".into()))
     })
-}
-
-/// Is there anything to open a window on?
-fn display() -> bool {
-    if cfg!(any(target_os = "windows", target_os = "macos")) {
-        return true;
-    }
-    let set = |name| std::env::var_os(name).is_some_and(|value| !value.is_empty());
-    (set("DISPLAY") && x_answers()) || (cfg!(feature = "wayland") && set("WAYLAND_DISPLAY"))
-}
-
-/// Does the X server that DISPLAY names listen? One on another machine is taken at its word.
-#[cfg(unix)]
-fn x_answers() -> bool {
-    let display = std::env::var("DISPLAY").unwrap_or_default();
-    let Some(number) = display.strip_prefix(':').or_else(|| display.strip_prefix("unix:")) else {
-        return true;
-    };
-    let number = number.split('.').next().unwrap_or_default();
-    std::os::unix::net::UnixStream::connect(format!("/tmp/.X11-unix/X{number}")).is_ok()
-}
-
-#[cfg(not(unix))]
-fn x_answers() -> bool {
-    true
 }

@@ -36,8 +36,31 @@ impl Truth {
     }
 }
 
-/// The shown error of one guest so far.
+/// What one guest's pictures of the body are worth, against the host's body of the same ticks.
 #[derive(Resource, Default, Clone)]
+pub struct Meters {
+    /// The body as it is streamed: what recovery is to get right.
+    pub streamed: Meter,
+    /// The newer copy that is shown while the own hand holds the body, against what the host made of its tick later. What the other's hand did
+    /// on the way nobody here could know.
+    pub own_hand: Meter,
+    /// The streamed body at those same moments, had it been shown instead: what waiting for the host's word would have cost.
+    pub waiting: Meter,
+    /// Largest reaction that this guest's own hand felt, N.
+    pub reaction: f64,
+}
+
+impl Meters {
+    /// Compares all that was shown with the host's shapes of the same ticks, as far as the host is.
+    pub fn compare(&mut self, model: &ModalModel, truth: &Truth) {
+        for meter in [&mut self.streamed, &mut self.own_hand, &mut self.waiting] {
+            meter.compare(model, truth);
+        }
+    }
+}
+
+/// How far one kind of picture is off, so far.
+#[derive(Default, Clone)]
 pub struct Meter {
     /// Shapes as they were shown, with the ticks they stand for, until the host's of the same ticks are there.
     waiting: VecDeque<(u64, Vec<f64>)>,
@@ -54,8 +77,6 @@ pub struct Meter {
     pub now: f64,
     /// Largest true displacement of any vertex in any tick, m: what percentages are of.
     pub largest: f64,
-    /// Largest reaction that this guest's own hand felt, N.
-    pub reaction: f64,
     shown: Vec<[f32; 3]>,
     truth: Vec<[f32; 3]>,
 }
@@ -74,7 +95,7 @@ impl Meter {
     }
 
     /// Compares what was shown with the host's shapes of the same ticks, as far as the host is.
-    pub fn compare(&mut self, model: &ModalModel, truth: &Truth) {
+    fn compare(&mut self, model: &ModalModel, truth: &Truth) {
         let Some((newest, _)) = truth.newest() else { return };
         while let Some((tick, shown)) = self.waiting.pop_front_if(|(tick, _)| *tick <= newest) {
             if let Some(true_q) = truth.at(tick) {

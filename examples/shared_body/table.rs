@@ -1,6 +1,6 @@
 //! The table at the end.
 
-use crate::{guest::GuestReport, host::HostReport, options::Options};
+use crate::{guest::GuestReport, host::HostReport, meter::Meter, options::Options};
 
 fn percentile(sorted: &[f64], part: f64) -> f64 {
     sorted.get(((sorted.len() as f64 - 1.0) * part).round().max(0.0) as usize).copied().unwrap_or(0.0)
@@ -16,25 +16,32 @@ pub fn print(options: &Options, host: &HostReport, you: &GuestReport, other: &Gu
         options.seed,
         host.seconds
     );
-    println!("{:<38}{:>14}{:>14}", "", "you", "other");
+    println!("{:<42}{:>12}{:>12}", "", "you", "other");
     let row = |name: &str, value: &dyn Fn(&GuestReport) -> String| {
-        println!("{name:<38}{:>14}{:>14}", value(you), value(other));
+        println!("{name:<42}{:>12}{:>12}", value(you), value(other));
     };
     row("ticks sent", &|_| host.ticks.to_string());
     row("ticks shown", &|g| g.stats.shown.to_string());
-    row("ticks compared with the truth", &|g| g.meter.ticks.to_string());
-    row("shown behind the host, ms", &|g| format!("{:.0}", 1e3 * g.meter.behind() / crate::RATE));
+    row("ticks compared with the truth", &|g| g.meters.streamed.ticks.to_string());
+    row("behind the host, ms", &|g| format!("{:.0}", 1e3 * g.meters.streamed.behind() / crate::RATE));
     row("datagrams lost on the way here, %", &|g| format!("{:.1}", 100.0 * g.stats.loss_in));
     row("ticks not there in time", &|g| g.stats.guessed.to_string());
     row("ticks put right when their data came", &|g| g.stats.recovered.to_string());
     row("round trip, ms", &|g| format!("{:.0}", 1e3 * g.stats.round_trip.as_secs_f64()));
     row("bytes received a second", &|g| format!("{:.0}", g.stats.bytes_in as f64 / host.seconds.max(1e-9)));
-    row("shown error, rms, mm", &|g| format!("{:.3}", 1e3 * g.meter.rms()));
-    row("shown error, max, mm", &|g| format!("{:.3}", 1e3 * g.meter.max));
-    row("largest displacement, mm", &|g| format!("{:.1}", 1e3 * g.meter.largest));
-    row("shown error, rms, % of it", &|g| format!("{:.3}", g.meter.percent(g.meter.rms())));
-    row("shown error, max, % of it", &|g| format!("{:.3}", g.meter.percent(g.meter.max)));
-    row("largest reaction, N", &|g| format!("{:.2}", g.meter.reaction));
+    row("largest displacement, mm", &|g| format!("{:.1}", 1e3 * g.meters.streamed.largest));
+    let errors = |name: &str, meter: &dyn Fn(&GuestReport) -> Meter| {
+        row(&format!("{name}, rms, mm"), &|g| format!("{:.3}", 1e3 * meter(g).rms()));
+        row(&format!("{name}, max, mm"), &|g| format!("{:.3}", 1e3 * meter(g).max));
+        let percent = |meter: Meter, length: f64| format!("{:.3}", meter.percent(length));
+        row(&format!("{name}, rms, % of largest"), &|g| percent(meter(g), meter(g).rms()));
+        row(&format!("{name}, max, % of largest"), &|g| percent(meter(g), meter(g).max));
+    };
+    errors("streamed error", &|g| g.meters.streamed.clone());
+    println!("while the own hand holds it, against what the host made of that tick later:");
+    errors("  own hand first", &|g| g.meters.own_hand.clone());
+    errors("  had it waited for the host", &|g| g.meters.waiting.clone());
+    row("largest reaction, N", &|g| format!("{:.2}", g.meters.reaction));
     println!(
         "host: time a step, us: median {:.1}, 99th percentile {:.1}; {:.0} bytes a second sent to both",
         percentile(&step, 0.5),

@@ -19,7 +19,7 @@ use bevy::{
 };
 use clap::Parser;
 
-pub use options::Options;
+pub use options::{Options, display};
 pub use run::Unattended;
 pub use text::Readout;
 pub use view::Look;
@@ -155,22 +155,45 @@ fn resolution(options: &Options) -> WindowResolution {
     }
 }
 
+/// Light, floor, camera and words, for a window that is not a [`Stage`]'s: that of an app which runs by its own clock.
+pub struct Setting {
+    /// Stands above the [`Readout`].
+    pub title: String,
+    /// Stand below, with those of the camera and Esc.
+    pub keys: Vec<&'static str>,
+    /// Where the camera looks from; `None`: no camera, light or floor.
+    pub look: Option<Look>,
+    pub floor: bool,
+}
+
+impl Plugin for Setting {
+    fn build(&self, app: &mut App) {
+        text::build(app, &self.title, &self.keys, self.look.is_some());
+        if let Some(look) = self.look {
+            view::build(app, look, self.floor);
+        }
+    }
+}
+
 struct StagePlugin(Stage);
 
 impl Plugin for StagePlugin {
     fn build(&self, app: &mut App) {
         let stage = &self.0;
-        app.init_resource::<Readout>();
         if !stage.options.headless {
             // The scene goes on when the window is not looked at.
             app.insert_resource(WinitSettings::continuous());
             #[cfg(feature = "panel")]
             app.add_plugins(pliant::panel::PanelPlugin { open: stage.options.panel, ..default() });
-            text::build(app, stage.title, &stage.keys, stage.look.is_some());
-            if let Some(look) = stage.look {
-                view::build(app, look, stage.floor);
-            }
+            let keys = [stage.keys.as_slice(), &["Space: pause", "full stop: one step"]].concat();
+            app.add_plugins(Setting {
+                title: stage.title.into(),
+                keys,
+                look: stage.look,
+                floor: stage.floor,
+            });
         }
+        app.init_resource::<Readout>();
         run::build(app, &stage.options, stage.real_time, stage.picture_at);
     }
 }

@@ -79,7 +79,7 @@ impl Options {
 }
 
 /// Is there anything to open a window on?
-fn display() -> bool {
+pub fn display() -> bool {
     if cfg!(any(target_os = "windows", target_os = "macos")) {
         return true;
     }

@@ -9,21 +9,22 @@ pub struct Readout(pub String);
 
 #[derive(Component)]
 struct Figures {
-    title: &'static str,
+    title: String,
 }
 
-pub(super) fn build(app: &mut App, title: &'static str, keys: &[&'static str], orbits: bool) {
+pub(super) fn build(app: &mut App, title: &str, keys: &[&'static str], orbits: bool) {
     let mut keys = keys.to_vec();
     if orbits {
         keys.extend(["right mouse: look around", "wheel: nearer, farther"]);
     }
-    keys.extend(["Space: pause", "full stop: one step", "Esc: end"]);
-    let keys = keys.join("    ");
-    app.add_systems(Startup, move |commands: Commands| spawn(commands, title, &keys))
+    keys.push("Esc: end");
+    let (title, keys) = (title.to_owned(), keys.join("    "));
+    app.init_resource::<Readout>()
+        .add_systems(Startup, move |commands: Commands| spawn(commands, &title, &keys))
         .add_systems(Update, write.run_if(resource_changed::<Readout>));
 }
 
-fn spawn(mut commands: Commands, title: &'static str, keys: &str) {
+fn spawn(mut commands: Commands, title: &str, keys: &str) {
     let panel = |top: Val, bottom: Val| {
         (
             Node {
@@ -39,7 +40,11 @@ fn spawn(mut commands: Commands, title: &'static str, keys: &str) {
         )
     };
     let font = |size: f32| TextFont { font_size: FontSize::Px(size), ..default() };
-    commands.spawn(panel(px(14), Val::Auto)).with_child((Text::new(title), font(15.0), Figures { title }));
+    commands.spawn(panel(px(14), Val::Auto)).with_child((
+        Text::new(title),
+        font(15.0),
+        Figures { title: title.into() },
+    ));
     commands.spawn(panel(Val::Auto, px(14))).with_child((
         Text::new(keys),
         font(13.0),
@@ -49,6 +54,6 @@ fn spawn(mut commands: Commands, title: &'static str, keys: &str) {
 
 fn write(readout: Res<Readout>, mut texts: Query<(&mut Text, &Figures)>) {
     for (mut text, figures) in &mut texts {
-        text.0 = [figures.title, readout.0.as_str()].join("\n").trim_end().to_owned();
+        text.0 = [figures.title.as_str(), readout.0.as_str()].join("\n").trim_end().to_owned();
     }
 }
