@@ -2,11 +2,6 @@
 //! every surface vertex, at radii that are not the baked ones, and a few patches by name.
 //!
 //! `cargo run --release -p pliant_bake --example patch_stiffness -- bar | TETRAHEDRA.msh ANCHOR [tet4|tet10] [MODES]`
-#![allow(
-    clippy::unwrap_used,
-    clippy::print_stdout,
-    reason = "a measurement may stop, and prints what it finds"
-)]
 
 use std::time::Instant;
 

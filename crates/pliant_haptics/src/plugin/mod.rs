@@ -115,6 +115,3 @@ impl Plugin for HapticsPlugin {
         }
     }
 }
-
-#[cfg(test)]
-mod tests;

@@ -167,6 +167,3 @@ pub(crate) fn steer(
         source.handle.set(source.place.into(), bits);
     }
 }
-
-#[cfg(test)]
-mod tests;

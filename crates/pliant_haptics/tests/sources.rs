@@ -1,4 +1,6 @@
 //! Bevy's input goes in, the device's position comes out of its loop.
+#![cfg(feature = "plugin")]
+#![allow(clippy::unwrap_used, clippy::panic, reason = "a failed test should panic")]
 
 use std::time::Duration;
 
@@ -14,8 +16,15 @@ use bevy::{
 };
 use pliant_body::{ModalAsset, ModalBody, PliantBodyPlugin};
 
-use super::{super::tests::block, *};
-use crate::{DeviceId, HapticsPlugin, LoopConfig, Positioned};
+#[cfg(feature = "gamepad")]
+use pliant_haptics::GamepadSource;
+use pliant_haptics::{
+    DeviceId, HapticDevices, HapticTool, HapticsPlugin, LoopConfig, PointerSource, Positioned,
+    PositionedHandle,
+};
+
+#[path = "rig/block.rs"]
+mod block;
 
 /// Seconds a frame, whatever the machine takes for it.
 const FRAME: f64 = 0.01;
@@ -56,7 +65,7 @@ impl Scene {
         }
     }
 
-    fn tick(&self) -> crate::Tick {
+    fn tick(&self) -> pliant_haptics::Tick {
         self.app.world().resource::<HapticDevices>().get(self.device).unwrap().report.tick
     }
 

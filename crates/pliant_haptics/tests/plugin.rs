@@ -1,3 +1,7 @@
+//! Devices, tools and grips in an app without a window.
+#![cfg(feature = "plugin")]
+#![allow(clippy::unwrap_used, clippy::panic, reason = "a failed test should panic")]
+
 use std::time::Duration;
 
 use bevy::{
@@ -5,11 +9,13 @@ use bevy::{
 };
 use pliant_body::{Grab, GrabForce, ModalAsset, ModalBody, PliantBodyPlugin};
 
-use super::*;
-use crate::{Fault, Hand, LoopConfig, LoopState, VirtualConfig, VirtualDevice, VirtualHandle};
+use pliant_haptics::{
+    DeviceId, Fault, Hand, HapticDevices, HapticFault, HapticNotice, HapticTool, HapticsPlugin, HeldBy,
+    LoopConfig, LoopState, ToolGrip, ToolPose, VirtualConfig, VirtualDevice, VirtualHandle,
+};
 
-#[path = "../../tests/rig/block.rs"]
-pub(super) mod block;
+#[path = "rig/block.rs"]
+mod block;
 
 /// Fixed steps of a hundredth of a second in real time: the loop's thread has its own clock.
 fn app() -> App {
@@ -228,15 +234,15 @@ fn two_devices_on_one_body_feel_each_other() {
 #[test]
 fn a_driver_that_panics_is_told_and_lets_go() {
     struct Bomb(VirtualDevice, std::sync::Arc<std::sync::atomic::AtomicBool>);
-    impl crate::HapticDevice for Bomb {
-        fn info(&self) -> crate::DeviceInfo {
+    impl pliant_haptics::HapticDevice for Bomb {
+        fn info(&self) -> pliant_haptics::DeviceInfo {
             self.0.info()
         }
         fn exchange(
             &mut self,
-            wrench: &crate::Wrench,
-            pace: &mut dyn crate::Pace,
-        ) -> Result<crate::Sample, Fault> {
+            wrench: &pliant_haptics::Wrench,
+            pace: &mut dyn pliant_haptics::Pace,
+        ) -> Result<pliant_haptics::Sample, Fault> {
             assert!(!self.1.load(std::sync::atomic::Ordering::Acquire), "the driver's own bug, on purpose");
             self.0.exchange(wrench, pace)
         }
@@ -245,7 +251,7 @@ fn a_driver_that_panics_is_told_and_lets_go() {
         }
     }
     #[derive(Resource, Default)]
-    struct Notices(Vec<crate::LoopEvent>);
+    struct Notices(Vec<pliant_haptics::LoopEvent>);
     let mut s = scene(false);
     let at = *s.app.world().get::<Transform>(s.tool).unwrap();
     s.app.world_mut().despawn(s.tool);
@@ -277,7 +283,7 @@ fn a_driver_that_panics_is_told_and_lets_go() {
     assert_eq!((report.state, force(&s)), (LoopState::Ended, DVec3::ZERO));
     let count = |world: &World| world.resource::<Heard>().0.iter().filter(|f| **f == Fault::Panicked).count();
     assert_eq!(count(s.app.world()), 1, "told once");
-    assert_eq!(s.app.world().resource::<Notices>().0, [crate::LoopEvent::Lost]);
+    assert_eq!(s.app.world().resource::<Notices>().0, [pliant_haptics::LoopEvent::Lost]);
     // The app goes on, and a new device takes the place of the dead one.
     assert!(s.app.world_mut().resource_mut::<HapticDevices>().remove(s.device));
     let device = VirtualDevice::new(VirtualConfig::touch(), Hand::FIRM).unwrap();

@@ -1,0 +1,191 @@
+//! The program as a user runs it: streams, times, the cache, the stability matrix and the report.
+
+#![expect(clippy::unwrap_used, reason = "a failed test should panic")]
+
+mod support;
+
+use support::{Folder, json, program, refused, succeeds};
+
+#[test]
+fn a_stream_is_measured_and_the_same_seed_gives_the_same_figures() {
+    let folder = Folder::new("stream");
+    let (mesh, model) = (folder.file("bar.msh"), folder.file("bar.modal"));
+    succeeds(&["mesh", "bar", "--cells", "8,2,2", "--size", "1,0.2,0.2", "-o", &mesh]);
+    succeeds(&["bake", &mesh, "--element", "tet4", "--modes", "12", "--anchor", "x<0.01", "-o", &model]);
+    let run = |recovery: &str, seed: &str| {
+        let text = succeeds(&[
+            "stream",
+            "--model",
+            &model,
+            "--network",
+            "paper-1",
+            "--recovery",
+            recovery,
+            "--seconds",
+            "10",
+            "--seed",
+            seed,
+            "--json",
+        ]);
+        json(&text)
+    };
+    let number = |told: &serde_json::Value, key: &str| told[key].as_f64().unwrap();
+    let default = run("default", "7");
+    assert_eq!(default["hash"], run("default", "7")["hash"]);
+    assert_ne!(default["hash"], run("default", "8")["hash"]);
+    // 10 s at 40 Hz; 9 % of the datagrams are lost on average, 36 of 400: five standard deviations (5.7) either way.
+    assert!((390.0..=410.0).contains(&number(&default, "ticks")));
+    assert!((8.0..=65.0).contains(&number(&default, "lost")));
+    // The bars of the streaming method on this network.
+    assert!(number(&default, "rms_percent") < 0.2, "{default}");
+    assert!(number(&default, "max_percent") < 3.0, "{default}");
+    assert!(number(&default, "kbit_s") < 100.0, "{default}");
+    // Without repair an acceleration stream never forgets an error.
+    assert!(number(&run("none", "7"), "rms_percent") > 100.0 * number(&default, "rms_percent"));
+
+    let keys: Vec<&String> = default.as_object().unwrap().keys().collect();
+    let promised = "ticks lost recovered rms_percent max_percent end_percent force_rms_percent force_ringing \
+        hand_to_force_ms shown_delay_ms recover_ms bytes_per_frame kbit_s cpu_us_per_tick hash";
+    let mut promised: Vec<&str> = promised.split_whitespace().collect();
+    promised.sort_unstable();
+    assert_eq!(keys, promised);
+
+    // A relaxing material, the paper's resending, equal peers.
+    let more = |words: &str| {
+        let mut all = vec!["stream", "--model", &model, "--seconds", "18", "--json"];
+        all.extend(words.split_whitespace());
+        json(&succeeds(&all))
+    };
+    assert!(number(&more("--relax 0.5:0.4"), "rms_percent") < 0.5);
+    let paper = more("--loss random:22@135 --resend-after 50 --recovery paper-hold");
+    assert_eq!((number(&paper, "lost"), number(&paper, "ticks") > 300.0), (22.0, true), "{paper}");
+    for repair in ["rollback", "compensate"] {
+        let told = more(&format!("--topology p2p --recovery {repair} --network wifi"));
+        assert!(number(&told, "ticks") > 300.0 && number(&told, "hand_to_force_ms") <= 25.0, "{told}");
+    }
+
+    let table = succeeds(&["stream", "--model", &model, "--loss", "burst:12@140", "--seconds", "10"]);
+    for name in ["default", "none", "paper", "force-driven"] {
+        assert!(table.lines().any(|line| line.starts_with(name)), "{name} in {table}");
+    }
+    for bad in [
+        vec!["--network", "nowhere"],
+        vec!["--recovery", "prayer"],
+        vec!["--loss", "often"],
+        vec!["--rate", "0"],
+        vec!["--seconds", "nan"],
+        vec!["--relax", "1.0:0.4"],
+        vec!["--relax", "much"],
+    ] {
+        refused(&[&["stream", "--model", &model][..], &bad].concat());
+    }
+    refused(&["stream", "--model", &mesh]);
+}
+
+#[test]
+fn a_body_is_timed_against_the_memory() {
+    let folder = Folder::new("bench");
+    let (mesh, model) = (folder.file("bar.msh"), folder.file("bar.modal"));
+    succeeds(&["mesh", "bar", "--cells", "8,2,2", "--size", "1,0.2,0.2", "-o", &mesh]);
+    succeeds(&["bake", &mesh, "--element", "tet4", "--modes", "12", "--anchor", "x<0.01", "-o", &model]);
+    let told = json(&succeeds(&["bench", "step", &model, "--seconds", "0.05", "--json"]));
+    for times in ["step_us", "reconstruct_us"] {
+        let at = |part: &str| told[times][part].as_f64().unwrap();
+        assert!(0.0 < at("p50") && at("p50") <= at("p99") && at("p99") <= at("p999"), "{told}");
+    }
+    // Blocks of 16 vertices, (12 modes x 6 rows + 3 of rest) x 16 x 4 bytes each, and 12 bytes written a vertex.
+    let vertices = told["surface_vertices"].as_u64().unwrap();
+    assert_eq!(
+        told["bytes"].as_u64().unwrap(),
+        vertices.div_ceil(16) * (12 * 6 + 3) * 16 * 4 + 12 * vertices
+    );
+    assert!(told["bandwidth_limit_gb_s"].as_f64().unwrap() > 0.0);
+    refused(&["bench", "step", &mesh]);
+    refused(&["bench", "step", &model, "--seconds", "-1"]);
+}
+
+#[test]
+fn an_unchanged_bake_comes_from_the_cache() {
+    let folder = Folder::new("cache");
+    let mesh = folder.file("bar.msh");
+    succeeds(&["mesh", "bar", "--cells", "4,2,2", "--size", "0.4,0.2,0.2", "-o", &mesh]);
+    let cache = folder.file("cache");
+    let bake = |output: &str, more: &[&str]| {
+        let mut arguments =
+            vec!["bake", &mesh, "--modes", "6", "--anchor", "x<0.001", "-o", output, "--json"];
+        arguments.extend(more);
+        json(&succeeds(&arguments))
+    };
+    let [a, b, c] = ["a.modal", "b.modal", "c.modal"].map(|name| folder.file(name));
+    let first = bake(&a, &["--cache", &cache]);
+    assert_eq!(first["cached"], false);
+    let second = bake(&b, &["--cache", &cache]);
+    assert_eq!(second["cached"], true);
+    assert_eq!(second["hash"], first["hash"]);
+    assert_eq!(std::fs::read(&a).unwrap(), std::fs::read(&b).unwrap());
+    assert_eq!(bake(&c, &["--cache", &cache, "--young", "2e5"])["cached"], false);
+    assert_eq!(bake(&c, &["--no-cache"])["cached"], false);
+    let told = succeeds(&["bake", &mesh, "--modes", "6", "--anchor", "x<0.001", "-o", &b, "--cache", &cache]);
+    assert!(told.contains("read from the cache"), "{told}");
+    assert!(refused(&["bake", &mesh, "-o", &b, "--cache", &cache, "--no-cache"]).contains("--no-cache"));
+
+    // The user's own cache; one that cannot be is a word on stderr, not a failure.
+    let with_home = |home: &str| {
+        let output = program()
+            .env("XDG_CACHE_HOME", home)
+            .args(["bake", &mesh, "--modes", "6", "-o", &c, "--json"])
+            .output()
+            .unwrap();
+        assert!(output.status.success());
+        let cached = json(std::str::from_utf8(&output.stdout).unwrap())["cached"].as_bool().unwrap();
+        (cached, String::from_utf8(output.stderr).unwrap())
+    };
+    if cfg!(all(unix, not(target_os = "macos"))) {
+        let home = folder.file("home");
+        assert_eq!(with_home(&home), (false, String::new()));
+        assert_eq!(with_home(&home), (true, String::new()));
+        let (cached, word) = with_home(&mesh);
+        assert!(!cached && word.contains("not kept"), "{word}");
+    }
+}
+
+#[test]
+fn the_short_form_of_the_stability_matrix_keeps_its_bounds() {
+    let told = json(&succeeds(&["stability", "--short", "--json"]));
+    let cases = told["cases"].as_array().unwrap();
+    assert!(cases.len() >= 30, "{}", cases.len());
+    let mut with_the_papers_scheme = 0;
+    for case in cases {
+        assert!(case["passed"] == true || case["known_limit"].is_string(), "{case}");
+        assert!(case["margin"].as_f64().unwrap() >= 1.0 || case["known_limit"].is_string(), "{case}");
+        assert!(case["bound"].as_str().unwrap().contains("<=") || case["known_limit"].is_string(), "{case}");
+        with_the_papers_scheme += usize::from(case["plain"].is_string());
+    }
+    assert!(with_the_papers_scheme >= 5, "{with_the_papers_scheme}");
+    let message = refused(&["stability", "--only", "no such case"]);
+    assert!(message.contains("--only"), "{message}");
+}
+
+#[test]
+fn a_report_writes_its_words_numbers_and_pictures() {
+    let folder = Folder::new("report");
+    let told =
+        json(&succeeds(&["report", "--quick", "--only", "steps", "-o", &folder.file("out"), "--json"]));
+    assert_eq!(told["parts"][0]["name"], "steps");
+    let read = |name: &str| std::fs::read(folder.0.join("out").join(name)).unwrap();
+    for file in told["parts"][0]["files"].as_array().unwrap() {
+        assert!(!read(file.as_str().unwrap()).is_empty(), "{file}");
+    }
+    assert!(read("c-steps-free.png").starts_with(b"\x89PNG"));
+    let text = String::from_utf8(read("report.md")).unwrap();
+    assert!(text.contains("c-steps-held.svg") && text.contains("The reference itself is off by"), "{text}");
+    // The exact step needs no small steps: at 60 Hz a struck bar is off by rounding, Newmark by more than a percent.
+    let csv = String::from_utf8(read("c-steps-free.csv")).unwrap();
+    let error = |line: &str| {
+        let row = csv.lines().find(|row| row.starts_with(&format!("\"{line}"))).unwrap();
+        row.split(',').nth(2).unwrap().parse::<f64>().unwrap()
+    };
+    assert!(error("exact") < 1e-10 && error("Newmark") > 0.01, "{csv}");
+    let message = refused(&["report", "--only", "nothing", "-o", &folder.file("out")]);
+    assert!(message.contains("--only"), "{message}");
+}
