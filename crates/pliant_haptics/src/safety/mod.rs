@@ -229,6 +229,8 @@ impl Safety {
                 self.passivity.refill();
             }
             self.passivity.forgive();
+        } else {
+            self.passivity.repay(w.dt);
         }
         let (mut elastic, mut damping) = (elastic, damping);
         let slew = self.slew_rate();

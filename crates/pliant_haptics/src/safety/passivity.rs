@@ -9,17 +9,20 @@ pub struct PassivityConfig {
     pub tank: f64,
     /// Most damping that the controller adds, N s/m. Default: 5.
     pub max_damping: f64,
+    /// After a fade: power at which the energy is given back that a spring gained while it was not felt, W; 0 never gives it back. A hand that rests
+    /// would otherwise feel less than the body pulls for as long as it rests. Default: 0.01.
+    pub repay: f64,
 }
 
 impl Default for PassivityConfig {
     fn default() -> Self {
-        Self { tank: 0.005, max_damping: 5.0 }
+        Self { tank: 0.005, max_damping: 5.0, repay: 0.01 }
     }
 }
 
 impl PassivityConfig {
     pub(crate) fn is_valid(&self) -> bool {
-        self.tank.is_finite() && self.tank >= 0.0 && self.max_damping.is_finite() && self.max_damping >= 0.0
+        [self.tank, self.max_damping, self.repay].iter().all(|x| x.is_finite() && *x >= 0.0)
     }
 }
 
@@ -34,6 +37,9 @@ pub struct Port {
     pub given: f64,
     /// What others have put in since, net.
     pub supplied: f64,
+    /// What has been given back after fades: never more than springs had gained in them, never more than the tank holds at a time, and no faster than
+    /// [`PassivityConfig::repay`].
+    pub repaid: f64,
     /// Force times displacement that the controller has held back or damped away, for diagnosis.
     pub dissipated: f64,
 }
@@ -110,6 +116,17 @@ impl Passivity {
     /// is not available either.
     pub fn forgive(&mut self) {
         self.forgiven = (self.full - self.port.available).max(0.0);
+    }
+
+    /// A fade is over and `dt` (s) has passed: some of what was [forgiven](Self::forgive) is available again, until the tank is full.
+    pub fn repay(&mut self, dt: f64) {
+        let room = (self.config.tank - self.port.available).min(self.forgiven);
+        let back = (self.config.repay * dt).min(room);
+        if back > 0.0 {
+            self.port.available += back;
+            self.port.repaid += back;
+            self.forgiven -= back;
+        }
     }
 
     /// The damping force (N) that pays back what has leaked, at `velocity` (m/s) over `dt` (s).

@@ -179,7 +179,8 @@ fn emergency_stop_cuts_and_stays() {
 
 #[test]
 fn energy_of_a_held_force_is_exact() {
-    let mut p = Passivity::new(PassivityConfig { tank: 0.01, max_damping: 5.0 });
+    let mut p =
+        Passivity::new(PassivityConfig { tank: 0.01, max_damping: 5.0, ..PassivityConfig::default() });
     let mut sum = 0.0;
     for k in 0..100 {
         let f = Vector3::new((f64::from(k) * 0.7).sin(), 1.0, -0.5);
@@ -215,4 +216,41 @@ fn no_more_comes_out_than_went_in_plus_the_tank() {
         assert!(given <= tank, "{given} J");
     }
     assert!(given > 0.3 * tank, "and most of the tank it does get: {given} J");
+}
+
+#[test]
+fn a_spring_stretched_in_a_fade_is_felt_again_by_a_hand_that_rests() {
+    // While the simulation's word was missing a hand stretched a spring to 3 N and 30 mJ, and then rests. Nothing was felt, so nothing is available but
+    // a tank at most: the force comes back all the same, no faster than the repayment's power.
+    let config = PassivityConfig::default();
+    let mut safety = Safety::new(SafetyConfig::for_device(&info(), 1000.0), 0.045);
+    let rests = || Wanted { stored: 0.03, ..wanted(3.0) };
+    for _ in 0..1000 {
+        safety.tick(&Wanted { stored: 0.0, ..wanted(0.0) });
+    }
+    for k in 0..100 {
+        let share = f64::from(k) / 100.0;
+        let moved = Vector3::new(-2e-4, 0.0, 0.0);
+        let stretching = Wanted { moved, stored: 0.03 * share * share, ..wanted(3.0 * share) };
+        safety.tick(&Wanted { fault: Some(Fault::BadModel), ..stretching });
+    }
+    // A hand carried along spends the tank that a fade leaves: 3 N over 1.6 mm.
+    let mut port = Port::default();
+    let mut spent = 0.0;
+    let mut last = Vector3::zeros();
+    while spent < 0.0049 && port.given < 1.0 {
+        let moved = Vector3::new(1e-5, 0.0, 0.0);
+        spent += last.dot(&moved);
+        let out = safety.tick(&Wanted { moved, ..rests() });
+        (last, port) = (out.force, out.port);
+    }
+    let before = port.repaid;
+    let mut out = safety.tick(&rests());
+    for _ in 0..700 {
+        out = safety.tick(&rests());
+    }
+    assert!((out.force.x - 3.0).abs() < 1e-9, "{} N of 3", out.force.x);
+    let repaid = out.port.repaid - before;
+    assert!(repaid > 0.0 && repaid <= config.repay * 0.702 && repaid <= config.tank, "{repaid} J");
+    assert!(out.port.available <= config.tank + 1e-12);
 }
