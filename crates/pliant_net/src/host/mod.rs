@@ -176,6 +176,11 @@ impl NetHost {
 
     fn flush(&mut self) {
         let now = self.now();
+        // A model is handed over no faster than the line takes it.
+        let fetching: Vec<PeerId> = self.session.fetching().collect();
+        for peer in fetching {
+            self.session.set_unsent(peer, self.endpoint.unsent(peer));
+        }
         self.session.update(now);
         while let Some(output) = self.session.poll_output() {
             match output.channel {

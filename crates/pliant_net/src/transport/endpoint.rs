@@ -392,6 +392,11 @@ impl Endpoint {
         }
     }
 
+    /// Bytes of messages to a peer that wait to be sent, without what QUIC has taken (at most 1 MiB). 0 where it is not connected.
+    pub fn unsent(&self, peer: PeerId) -> usize {
+        self.peer(peer).map_or(0, |peer| peer.outbox.message_bytes())
+    }
+
     /// Closes a connection once its queued messages are out (it waits at most a second for that). `words` reach the peer.
     pub fn close(&self, peer: PeerId, words: &str) {
         if let Some(peer) = self.peer(peer) {

@@ -165,6 +165,11 @@ impl Outbox {
         true
     }
 
+    /// Bytes of messages that wait, and what they cost beside.
+    pub(super) fn message_bytes(&self) -> usize {
+        lock(&self.state).message_bytes
+    }
+
     pub(super) fn close(&self, code: u32, words: String) {
         lock(&self.state).closing.get_or_insert((code, words));
         self.message_waits.notify_one();

@@ -9,6 +9,7 @@ use pliant_modal::{GrabConfig, ModalModel};
 use super::host_config::{HostConfig, HostEvent};
 use super::host_peer::{HeldGrab, MAX_GUEST_GRABS, Peer, Standing, Transfer};
 use super::outbox::loss_of;
+use super::upload::Upload;
 use super::{EndReason, LinkStats, MIN_DATAGRAM, Output};
 use crate::StreamError;
 use crate::encoder::Encoder;
@@ -17,8 +18,6 @@ use crate::state::{BodyId, GrabKey, MAX_MODES, PeerId, Tick, UserId};
 use crate::stepper::BodySetup;
 use crate::wire::{BodyInfo, Datagram, GuestMessage, HostMessage, PROTOCOL_VERSION, StreamWish};
 
-/// Bytes of a model in one message.
-const CHUNK: usize = 16 * 1024;
 /// Most events that wait for the application; the oldest are dropped.
 const MAX_EVENTS: usize = 4096;
 
@@ -50,6 +49,7 @@ pub struct HostSession {
     events: VecDeque<HostEvent>,
     next_user: u16,
     dropped_events: u64,
+    pub(super) upload: Upload,
 }
 
 impl HostSession {
@@ -59,13 +59,7 @@ impl HostSession {
     /// [`StreamError::Config`] for a setting out of range.
     pub fn new(config: HostConfig) -> Result<Self, StreamError> {
         config.newmark.check()?;
-        if !(config.model_rate.is_finite() && config.model_rate >= 1.0) {
-            return Err(StreamError::Config {
-                what: "model_rate",
-                found: config.model_rate.to_string(),
-                expected: "at least 1 byte a second",
-            });
-        }
+        let upload = Upload::new(&config)?;
         if config.guest_rate.is_nan() || config.guest_rate < 1.0 {
             return Err(StreamError::Config {
                 what: "guest_rate",
@@ -81,6 +75,7 @@ impl HostSession {
             events: VecDeque::new(),
             next_user: 1,
             dropped_events: 0,
+            upload,
         })
     }
 
@@ -417,35 +412,14 @@ impl HostSession {
             let (bytes, round_trip) = (p.stats.bytes_out, p.last_round_trips[0].min(p.last_round_trips[1]));
             p.regulator.judge(now, bytes, round_trip, self.config.guest_rate);
             p.stats.level = p.regulator.level();
-            while let Some(t) = p.transfers.front_mut() {
-                let end = (t.offset + CHUNK).min(t.bytes.len());
-                if !p.model_budget.spend(now, (end - t.offset) as f64) {
-                    break;
-                }
-                let chunk = HostMessage::ModelChunk {
-                    hash: t.hash,
-                    offset: t.offset as u64,
-                    total: t.bytes.len() as u64,
-                    bytes: t.bytes[t.offset..end].to_vec(),
-                };
-                t.offset = end;
-                if end == t.bytes.len() {
-                    let hash = t.hash;
-                    p.transfers.pop_front();
-                    p.cached.insert(hash);
-                }
-                p.send_message(&chunk, &mut self.out);
-            }
         }
+        self.send_models(now);
     }
 
     /// When to call [`HostSession::update`] at the latest, if nothing happens before.
     pub fn next_wakeup(&self) -> Option<Duration> {
         let each = self.peers.values().flat_map(|p| {
-            let model = p
-                .transfers
-                .front()
-                .map(|t| p.model_budget.ready_at((t.bytes.len() - t.offset).min(CHUNK) as f64));
+            let model = self.upload.ready_at(p);
             let resend = p.resends.iter().map(|r| r.0).min();
             [Some(p.heard + self.config.idle_timeout + Duration::from_millis(1)), model, resend]
         });

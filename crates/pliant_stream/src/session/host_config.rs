@@ -21,6 +21,9 @@ pub struct HostConfig {
     pub idle_timeout: Duration,
     /// Bytes a second at which models are sent to one guest. Default: 1 MB/s.
     pub model_rate: f64,
+    /// Bytes a second at which models are sent to all guests together, in turns of 16 KiB: however many fetch at once, each gets its part, and the
+    /// frames of the others have the rest of the line. Default: 8 MB/s.
+    pub models_rate: f64,
     /// Bits a second of datagrams that one guest may cost. Beyond it, or when a guest's round trip grows by 50 ms over its
     /// least, the guest gets fewer repeats, then fewer refreshes, then fewer modes; no tick is dropped. Default: 1 Mbit/s.
     pub guest_rate: f64,
@@ -37,6 +40,7 @@ impl Default for HostConfig {
             max_guests: 256,
             idle_timeout: Duration::from_secs(10),
             model_rate: 1e6,
+            models_rate: 8e6,
             guest_rate: 1e6,
             resend_after: Duration::ZERO,
             open: true,

@@ -63,6 +63,8 @@ pub(crate) struct Peer {
     pub(crate) resends: VecDeque<(Duration, BodyId, Tick)>,
     pub(crate) heard: Duration,
     pub(crate) model_budget: Budget,
+    /// Bytes of messages that the transport has taken and not sent, as it last said.
+    pub(crate) unsent: usize,
     pub(crate) nack_budget: Budget,
     pub(crate) snapshot_budget: Budget,
     pub(crate) message_budget: Budget,
@@ -92,6 +94,7 @@ impl Peer {
             resends: VecDeque::new(),
             heard: now,
             model_budget: Budget::new(model_rate, 64.0 * 1024.0),
+            unsent: 0,
             // A guest may ask for 4,000 ticks a second: 60 Hz at full loss with every tick asked for eight times, and
             // some bodies at once.
             nack_budget: Budget::new(4000.0, 4000.0),

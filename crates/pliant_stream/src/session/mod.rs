@@ -26,6 +26,7 @@ mod outbox;
 mod own_hand;
 mod publish;
 mod regulator;
+mod upload;
 
 pub(crate) use outbox::Budget;
 

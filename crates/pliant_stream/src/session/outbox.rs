@@ -90,10 +90,15 @@ impl Budget {
         self.at = self.at.max(now);
     }
 
+    /// Whether `amount` is there.
+    pub(crate) fn has(&mut self, now: Duration, amount: f64) -> bool {
+        self.refill(now);
+        self.left >= amount
+    }
+
     /// Takes `amount` if it is there.
     pub(crate) fn spend(&mut self, now: Duration, amount: f64) -> bool {
-        self.refill(now);
-        let there = self.left >= amount;
+        let there = self.has(now, amount);
         if there {
             self.left -= amount;
         }

@@ -1,0 +1,134 @@
+//! Models on their way to many guests at once: one rate for all, in fair turns, and no more than the line takes.
+#![allow(clippy::unwrap_used, clippy::expect_used, clippy::panic, reason = "a failed test should panic")]
+
+mod support;
+
+use std::collections::BTreeMap;
+use std::time::Duration;
+
+use pliant_stream::{
+    BodyId, BodySetup, Channel, GuestConfig, GuestSession, HostConfig, HostSession, PeerId, StreamError,
+};
+use support::bar;
+
+const GUESTS: u64 = 256;
+const FRAME: Duration = Duration::from_micros(16_667);
+
+/// The first words of a guest that has nothing.
+fn hello() -> Vec<Vec<u8>> {
+    let mut guest = GuestSession::new(GuestConfig::default(), 1200).unwrap();
+    guest.connect(Duration::ZERO).unwrap();
+    std::iter::from_fn(|| guest.poll_output())
+        .filter(|output| output.channel == Channel::Message)
+        .map(|output| output.bytes.to_vec())
+        .collect()
+}
+
+fn host(config: HostConfig, guests: u64) -> (HostSession, u64) {
+    let model = bar(40, 0.05);
+    let bytes = model.to_bytes().len() as u64;
+    // They say nothing more while they wait, and are not let go for it.
+    let idle_timeout = Duration::from_secs(1000);
+    let mut host = HostSession::new(HostConfig { idle_timeout, ..config }).unwrap();
+    host.add_body(BodyId(1), "bar", model, BodySetup::default()).unwrap();
+    let words = hello();
+    for peer in 1..=guests {
+        host.connect(Duration::ZERO, PeerId(peer), 1200).unwrap();
+        words.iter().for_each(|word| host.on_message(Duration::ZERO, PeerId(peer), word));
+    }
+    (host, bytes)
+}
+
+#[test]
+fn two_hundred_and_fifty_six_fetch_at_once_at_one_rate_and_in_turns() {
+    let config = HostConfig { models_rate: 2e6, ..Default::default() };
+    let (mut host, bytes) = host(config, GUESTS);
+    assert_eq!(host.fetching().count() as u64, GUESTS);
+    let mut got: BTreeMap<PeerId, u64> = BTreeMap::new();
+    let (mut now, mut widest) = (Duration::ZERO, 0);
+    while host.fetching().next().is_some() {
+        assert!(now < Duration::from_secs(120), "{} still wait", host.fetching().count());
+        host.update(now);
+        while let Some(output) = host.poll_output() {
+            if output.channel == Channel::Message {
+                *got.entry(output.peer).or_default() += output.bytes.len() as u64;
+            }
+        }
+        // Never more than the rate and one burst of a tenth of a second; a guest's other messages are 20 kB with all who came.
+        let sent: u64 = got.values().sum();
+        let most = 2e6 * (now.as_secs_f64() + 0.1) + GUESTS as f64 * 20e3;
+        assert!((sent as f64) < most, "{sent} bytes after {now:?}");
+        let (least, most) = (got.values().min().unwrap(), got.values().max().unwrap());
+        if got.len() as u64 == GUESTS && host.fetching().count() as u64 == GUESTS {
+            widest = widest.max(most - least);
+        }
+        now += FRAME;
+    }
+    // Whoever came first is at most one piece of 16 KiB and its other messages ahead.
+    assert!(widest < 16 * 1024 + 25_000, "one is {widest} bytes ahead of another");
+    let ideal = (GUESTS * bytes) as f64 / 2e6;
+    let took = now.as_secs_f64();
+    assert!((ideal - 0.2..1.05 * ideal + 0.2).contains(&took), "{took} s for {ideal} s of the rate");
+    assert_eq!(host.users().count() as u64, GUESTS, "nobody was let go");
+}
+
+#[test]
+fn one_alone_has_its_own_rate_and_not_that_of_all() {
+    let (mut host, bytes) = host(HostConfig { model_rate: 100e3, ..Default::default() }, 1);
+    let mut now = Duration::ZERO;
+    while host.fetching().next().is_some() {
+        let wakes = host.next_wakeup().unwrap().max(now + Duration::from_micros(1));
+        assert!(wakes < now + Duration::from_secs(1), "asleep with a model on its way");
+        host.update(wakes);
+        while host.poll_output().is_some() {}
+        now = wakes;
+    }
+    // 64 KiB go at once.
+    let ideal = (bytes as f64 - 65_536.0) / 100e3;
+    assert!((now.as_secs_f64() - ideal).abs() < 0.02 * ideal + 0.02, "{now:?} for {ideal} s");
+}
+
+#[test]
+fn what_a_line_does_not_take_is_not_handed_over_and_holds_up_nobody_else() {
+    let (mut host, bytes) = host(HostConfig::default(), 2);
+    let (slow, fast) = (PeerId(1), PeerId(2));
+    let mut got = BTreeMap::from([(slow, 0_u64), (fast, 0)]);
+    let mut unsent = 0.0_f64;
+    let mut now = Duration::ZERO;
+    let mut held = 0.0_f64;
+    let mut until_fast = None;
+    while host.fetching().next().is_some() {
+        assert!(now < Duration::from_secs(300));
+        host.set_unsent(slow, unsent as usize);
+        host.update(now);
+        while let Some(output) = host.poll_output() {
+            *got.get_mut(&output.peer).unwrap() += output.bytes.len() as u64;
+            if output.peer == slow {
+                unsent += output.bytes.len() as f64;
+            }
+        }
+        held = held.max(unsent);
+        if !host.fetching().any(|peer| peer == fast) {
+            until_fast.get_or_insert(now);
+        }
+        // 50 kB/s where the host would send 1 MB/s.
+        unsent = (unsent - 50e3 * FRAME.as_secs_f64()).max(0.0);
+        now += FRAME;
+    }
+    assert!(held < (128.0 + 64.0 + 16.0) * 1024.0 + 5e3, "{held} bytes wait for a slow line");
+    assert!(got[&slow] >= bytes && got[&fast] >= bytes);
+    let (fast, ideal) = (until_fast.unwrap().as_secs_f64(), (bytes as f64 - 65_536.0) / 1e6);
+    assert!(fast < 1.1 * ideal + 0.1, "the other had to wait: {fast} s for {ideal}");
+}
+
+#[test]
+fn rates_that_are_none_are_refused() {
+    for bad in [0.0, -1.0, f64::NAN, f64::INFINITY] {
+        for config in [
+            HostConfig { model_rate: bad, ..Default::default() },
+            HostConfig { models_rate: bad, ..Default::default() },
+        ] {
+            assert!(matches!(HostSession::new(config), Err(StreamError::Config { .. })), "{bad}");
+        }
+    }
+}
