@@ -10,7 +10,6 @@
 mod session;
 
 use std::error::Error;
-use std::net::SocketAddr;
 use std::path::PathBuf;
 use std::process::ExitCode;
 use std::time::Instant;
@@ -19,31 +18,14 @@ use bevy::log::Level;
 use bevy::prelude::*;
 use clap::Parser;
 use pliant::net::transport::{Limits, RateCap};
-use pliant::net::{
-    Access, Grant, Holding, HostConfig, HostOptions, Invite, NetHost, NetPlugin, NetStats, SharedBody, Token,
-    User,
-};
+use pliant::net::{NetHost, NetStats, SharedBody, User};
 use pliant::prelude::*;
-use pliant::stream::emulator::Preset;
 
 /// Serves one soft body.
 #[derive(Parser, Debug)]
 struct Options {
-    /// Where to listen. 0.0.0.0:4433 for others than this machine.
-    #[arg(long, default_value = "127.0.0.1:4433")]
-    bind: SocketAddr,
-
-    /// A file that keeps the server's key, made if it is not there: invites stay good from run to run.
-    #[arg(long)]
-    key: Option<PathBuf>,
-
-    /// Let in only who has a token; prints an invite to hold and one to watch.
-    #[arg(long)]
-    tokens: bool,
-
-    /// One user's hands at a time.
-    #[arg(long)]
-    one_at_a_time: bool,
+    #[command(flatten)]
+    serve: session::serve::Serve,
 
     /// Steps a second.
     #[arg(long, default_value_t = 40.0, value_parser = rate)]
@@ -68,10 +50,6 @@ struct Options {
     /// Most that is sent to a guest, Mbit/s.
     #[arg(long, default_value_t = 8.0)]
     rate: f64,
-
-    /// An emulated network under all connections: none, paper-1 to paper-4, lan, wifi and others.
-    #[arg(long, default_value = "none", value_parser = session::network)]
-    network: std::option::Option<Preset>,
 
     /// Write the state of every tick to this file, for `join --compare`.
     #[arg(long)]
@@ -101,36 +79,13 @@ fn main() -> ExitCode {
 
 fn run(options: &Options) -> Result<(), Box<dyn Error>> {
     let model = session::model(&options.body)?;
-    let (hold, watch) = (Token::generate()?, Token::generate()?);
-    let access = match options.tokens {
-        true => Access::Tokens(vec![Grant::hold(hold), Grant::watch(watch)]),
-        false => Access::Anyone,
-    };
     let limits = Limits {
         peers: options.guests,
         per_address: options.guests,
         rate: RateCap::from_mbit_per_s(options.rate),
         ..Limits::host()
     };
-    let net = NetPlugin::host(HostConfig {
-        name: "server".into(),
-        transport: HostOptions {
-            bind: options.bind,
-            identity: session::identity(options.key.as_deref())?,
-            access,
-            limits,
-            emulation: session::emulation(options.network, 1),
-        },
-        session: pliant::stream::HostConfig { max_guests: options.guests, ..default() },
-        holding: if options.one_at_a_time { Holding::OneAtATime } else { Holding::Together },
-        ..default()
-    })?;
-    let invite = net.invite().cloned().ok_or("no invite")?;
-    println!("to hold:  {invite}");
-    if options.tokens {
-        println!("to watch: {}", Invite { token: Some(watch), ..invite });
-    }
-
+    let net = options.serve.open("server", limits)?;
     let mut app = session::headless(Level::INFO);
     app.add_plugins((PliantBodyPlugin::default(), net))
         .insert_resource(Time::<Fixed>::from_hz(options.hz))

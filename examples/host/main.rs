@@ -4,7 +4,7 @@
 //!
 //! ```sh
 //! cargo run --release --example host
-//! cargo run --release --example host -- --bind 0.0.0.0:4433 --key host.key --tokens
+//! cargo run --release --example host -- --bind 0.0.0.0:4433 --key host.key --tokens   # N in the window: another network
 //! ```
 
 #[path = "../session/mod.rs"]
@@ -13,15 +13,11 @@ mod session;
 mod stage;
 
 use std::error::Error;
-use std::net::SocketAddr;
-use std::path::PathBuf;
 
 use bevy::prelude::*;
 use clap::Parser;
-use pliant::net::{
-    Access, Grant, HandOf, Holding, HostConfig, HostOptions, Invite, NetPlugin, NetStats, SharedBody, Token,
-    User, UserLink, Yourself,
-};
+use pliant::net::transport::Limits;
+use pliant::net::{HandOf, NetStats, SharedBody, User, UserLink, Yourself};
 use pliant::prelude::*;
 use pliant::stream::emulator::Preset;
 
@@ -31,50 +27,13 @@ struct Options {
     #[command(flatten)]
     stage: stage::Options,
 
-    /// Where to listen. 0.0.0.0:4433 for others than this machine; port 0 is any that is free.
-    #[arg(long, default_value = "127.0.0.1:0")]
-    bind: SocketAddr,
-
-    /// A file that keeps the host's key, made if it is not there: invites stay good from run to run.
-    #[arg(long)]
-    key: Option<PathBuf>,
-
-    /// Let in only who has a token; prints an invite to hold and one to watch.
-    #[arg(long)]
-    tokens: bool,
-
-    /// One user's hands at a time.
-    #[arg(long)]
-    one_at_a_time: bool,
-
-    /// An emulated network under all connections: none, paper-1 to paper-4, lan, wifi and others. N changes it while the session runs.
-    #[arg(long, default_value = "none", value_parser = session::network)]
-    network: std::option::Option<Preset>,
+    #[command(flatten)]
+    serve: session::serve::Serve,
 }
 
 fn main() -> Result<(), Box<dyn Error>> {
     let options = Options::parse();
-    let (hold, watch) = (Token::generate()?, Token::generate()?);
-    let net = NetPlugin::host(HostConfig {
-        name: "host".into(),
-        transport: HostOptions {
-            bind: options.bind,
-            identity: session::identity(options.key.as_deref())?,
-            access: match options.tokens {
-                true => Access::Tokens(vec![Grant::hold(hold), Grant::watch(watch)]),
-                false => Access::Anyone,
-            },
-            emulation: session::emulation(options.network, 1),
-            ..default()
-        },
-        holding: if options.one_at_a_time { Holding::OneAtATime } else { Holding::Together },
-        ..default()
-    })?;
-    let invite = net.invite().cloned().ok_or("no invite")?;
-    println!("to hold:  {invite}");
-    if options.tokens {
-        println!("to watch: {}", Invite { token: Some(watch), ..invite });
-    }
+    let net = options.serve.open("host", Limits::host())?;
     App::new()
         .add_plugins(
             stage::Stage::with("host", options.stage)
@@ -84,7 +43,7 @@ fn main() -> Result<(), Box<dyn Error>> {
         )
         .add_plugins((PliantPlugins::default(), net))
         .insert_resource(Time::<Fixed>::from_hz(40.0))
-        .insert_resource(Network(options.network))
+        .insert_resource(Network(options.serve.network))
         .add_systems(Startup, setup)
         .add_systems(FixedUpdate, session::play.before(PliantSystems::Input))
         .add_systems(Update, (change_network, draw_hands, read_out))

@@ -19,6 +19,8 @@ pub struct Bots {
     pub holders: usize,
     /// They read what comes and count it, and step no body: the processor is the host's.
     pub light: bool,
+    /// They have the model, so that it is not sent to them.
+    pub cached: bool,
     pub seconds: f64,
     pub emulation: Option<Emulation>,
 }
@@ -118,7 +120,9 @@ impl Bot {
                         ..Default::default()
                     };
                     let Ok(mut session) = GuestSession::new(config, most) else { return };
-                    session.add_cached_model(model.clone());
+                    if bots.cached {
+                        session.add_cached_model(model.clone());
+                    }
                     session.connect(now).ok();
                     self.session = Some(session);
                 }

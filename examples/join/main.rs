@@ -59,7 +59,7 @@ pub struct Options {
     #[arg(long)]
     modes: Option<u16>,
 
-    /// Have the body's model at hand, so that it need not be sent. Bots have it always.
+    /// Have the body's model at hand, so that it need not be sent.
     #[arg(long)]
     cached: bool,
 
@@ -131,7 +131,9 @@ fn run(options: &Options) -> Result<(), Box<dyn Error>> {
     let emulation = session::emulation(options.network, options.seed);
     if let (Some(number), Some(invite)) = (options.bots, &options.invite) {
         let (holders, light, seconds) = (options.holders, options.light, options.seconds.unwrap_or(10.0));
-        return bots::run(invite, &shipped()?, &bots::Bots { number, holders, light, seconds, emulation });
+        let cached = options.cached;
+        let bots = bots::Bots { number, holders, light, cached, seconds, emulation };
+        return bots::run(invite, &shipped()?, &bots);
     }
     let config = JoinConfig {
         name: options.name.clone(),

@@ -1,6 +1,7 @@
 //! What the networked examples share: the body, a network by its name, a kept key, a hand that moves by itself, an app without a window.
 #![allow(dead_code, reason = "each example uses the part that it needs")]
 
+pub mod serve;
 pub mod trace;
 
 use std::error::Error;
