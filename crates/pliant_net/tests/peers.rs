@@ -3,23 +3,43 @@
 
 mod support;
 
+use std::time::Duration;
+
 use bevy::math::DVec3;
 use bevy::prelude::*;
 use pliant_body::{Grab, GrabForce, GrabOf, ModalAsset, ModalBody, ShownState};
+use pliant_net::transport::Limits;
 use pliant_net::{
-    Emulation, Invite, NetPeer, NetPlugin, PeerConfig, PeerState, SeenHands, SharedBody, User, UserLeft,
+    Emulation, HostOptions, Invite, NetPeer, NetPlugin, PeerConfig, PeerState, SeenHands, SharedBody, User,
+    UserLeft,
 };
-use pliant_stream::emulator::Preset;
+use pliant_stream::emulator::{LinkConfig, Loss, Preset};
 use support::{MIDDLE, TIP, alone, app, bar, messages, run_for, run_until};
 
 fn peer(name: &str, join: Option<Invite>) -> (App, Entity) {
-    let net = NetPlugin::peer(PeerConfig { name: name.into(), join, ..PeerConfig::default() }).unwrap();
-    let mut app = app(net);
+    placed(PeerConfig { name: name.into(), join, ..PeerConfig::default() })
+}
+
+fn placed(config: PeerConfig) -> (App, Entity) {
+    let x = config.name.len() as f32;
+    let mut app = app(NetPlugin::peer(config).unwrap());
     let handle = app.world_mut().resource_mut::<Assets<ModalAsset>>().add(ModalAsset(bar()));
     // Each where it likes.
-    let place = Transform::from_xyz(0.0, name.len() as f32, 0.0);
+    let place = Transform::from_xyz(0.0, x, 0.0);
     let body = app.world_mut().spawn((ModalBody::new(handle), SharedBody::named("bar"), place)).id();
     (app, body)
+}
+
+/// One that misses the others after a second.
+fn quick_peer(name: &str, join: Option<Invite>) -> (App, Entity) {
+    let limits = Limits {
+        idle_timeout: Duration::from_secs(1),
+        keep_alive: Duration::from_millis(200),
+        handshake: Duration::from_secs(2),
+        ..Limits::host()
+    };
+    let transport = HostOptions { limits, ..HostOptions::default() };
+    placed(PeerConfig { name: name.into(), join, transport, ..PeerConfig::default() })
 }
 
 fn users(app: &mut App) -> Vec<String> {
@@ -85,6 +105,78 @@ fn three_peers_hold_one_body_and_agree_and_one_that_goes_is_missed_by_nobody() {
     run_until(&mut [&mut a, &mut c], 3.0, "the hand is let go of everywhere", |apps| {
         apps[0].world().get::<SeenHands>(body_a).unwrap().0.is_empty()
     });
+}
+
+/// Nothing gets through, either way.
+fn cut() -> Option<Emulation> {
+    let link = LinkConfig { loss: Loss::Random(1.0), ..LinkConfig::default() };
+    Some(Emulation { outgoing: link.clone(), incoming: link, seed: 1 })
+}
+
+#[test]
+fn peers_that_have_lost_everybody_find_each_other_again_and_one_that_comes_late_finds_all() {
+    let _alone = alone();
+    let (mut a, body_a) = quick_peer("a", None);
+    run_until(&mut [&mut a], 3.0, "the first begins", |apps| {
+        matches!(apps[0].world().resource::<NetPeer>().state(), PeerState::In { .. })
+    });
+    let invite = a.world().resource::<NetPeer>().invite();
+    let (mut b, body_b) = quick_peer("bb", Some(invite.clone()));
+    let (mut c, body_c) = quick_peer("ccc", Some(invite.clone()));
+    run_until(&mut [&mut a, &mut b, &mut c], 5.0, "all know all", |apps| {
+        apps.iter_mut().all(|app| users(app) == ["a", "bb", "ccc"])
+    });
+    let number = |app: &App| app.world().resource::<NetPeer>().state().clone();
+    let numbers = [number(&a), number(&b), number(&c)];
+    let all_a = a.world().get::<Transform>(body_a).unwrap().translation.as_dvec3();
+    let of_a =
+        a.world_mut().spawn((Grab::new(TIP, 0.3, all_a + DVec3::new(0.9, 0.2, 0.1)), GrabOf(body_a))).id();
+    run_for(&mut [&mut a, &mut b, &mut c], 1.0);
+
+    // Every line is down: each is alone, and plays on alone.
+    for app in [&mut a, &mut b, &mut c] {
+        app.world_mut().resource_mut::<NetPeer>().set_emulation(cut());
+    }
+    run_until(&mut [&mut a, &mut b, &mut c], 8.0, "each is alone", |apps| {
+        apps.iter_mut().all(|app| users(app).len() == 1)
+    });
+    a.world_mut().get_mut::<Grab>(of_a).unwrap().target.z -= 0.3;
+    run_for(&mut [&mut a, &mut b, &mut c], 1.5);
+    let (qa, qb) = (q(&a, body_a), q(&b, body_b));
+    assert!(apart(&qa, &qb) > 0.3, "they have gone different ways: {qa:?}, {qb:?}");
+
+    for app in [&mut a, &mut b, &mut c] {
+        app.world_mut().resource_mut::<NetPeer>().set_emulation(None);
+    }
+    let up = std::time::Instant::now();
+    run_until(&mut [&mut a, &mut b, &mut c], 20.0, "all know all again", |apps| {
+        apps.iter_mut().all(|app| users(app) == ["a", "bb", "ccc"])
+    });
+    println!("together again {:.2} s after the lines", up.elapsed().as_secs_f64());
+    assert_eq!([number(&a), number(&b), number(&c)], numbers, "all are who they were");
+    run_until(&mut [&mut a, &mut b, &mut c], 10.0, "one shape again", |apps| {
+        let (qa, qb, qc) = (q(apps[0], body_a), q(apps[1], body_b), q(apps[2], body_c));
+        apart(&qa, &qb) < 0.02 && apart(&qa, &qc) < 0.02
+    });
+    println!("one shape again {:.2} s after the lines", up.elapsed().as_secs_f64());
+
+    // One more, after all that, through the last: it finds everybody, the shape and the hand.
+    let through = c.world().resource::<NetPeer>().invite();
+    let (mut d, body_d) = quick_peer("dddd", Some(through));
+    run_until(&mut [&mut a, &mut b, &mut c, &mut d], 5.0, "all know the late one, and it them", |apps| {
+        apps.iter_mut().all(|app| users(app) == ["a", "bb", "ccc", "dddd"])
+    });
+    run_until(&mut [&mut a, &mut b, &mut c, &mut d], 3.0, "it has the shape", |apps| {
+        let seen = apps[3].world().get::<SeenHands>(body_d).is_some_and(|hands| hands.0.len() == 1);
+        seen && apart(&q(apps[0], body_a), &q(apps[3], body_d)) < 0.02
+    });
+    // Who says goodbye is not looked for.
+    drop(d);
+    run_until(&mut [&mut a, &mut b, &mut c], 5.0, "it has left", |apps| {
+        apps.iter_mut().all(|app| users(app) == ["a", "bb", "ccc"])
+    });
+    run_for(&mut [&mut a, &mut b, &mut c], 1.5);
+    assert!([&a, &b, &c].iter().all(|app| app.world().resource::<NetPeer>().looked_for() == 0));
 }
 
 #[test]

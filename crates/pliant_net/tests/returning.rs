@@ -4,15 +4,16 @@
 mod support;
 
 use std::net::SocketAddr;
-use std::time::{Duration, Instant};
+use std::time::{Duration, Instant, SystemTime};
 
 use bevy::math::DVec3;
 use bevy::prelude::*;
 use pliant_body::{BodyState, Grab, GrabForce, GrabOf, ShownState};
 use pliant_net::transport::Limits;
 use pliant_net::{
-    BodyArrived, BodyLeft, Emulation, GuestState, HandOf, HostConfig, HostOptions, Identity, JoinConfig,
-    JoinOptions, NetGuest, NetHost, RemoteBody, SessionClosed, SessionJoined, SessionLost, User, UserJoined,
+    Access, BodyArrived, BodyLeft, Emulation, Grant, GuestState, HandOf, HostConfig, HostOptions, Identity,
+    Invite, JoinConfig, JoinOptions, NetGuest, NetHost, RemoteBody, SessionClosed, SessionJoined,
+    SessionLost, Token, User, UserJoined,
 };
 use pliant_stream::UserId;
 use pliant_stream::emulator::{LinkConfig, Loss};
@@ -135,6 +136,83 @@ fn guests_wait_for_a_host_that_is_started_anew() {
     let host_user = users.iter(guest.world()).find(|user| user.id == UserId::HOST).unwrap();
     assert_eq!(host_user.name, "Hanna");
     assert!(messages::<SessionClosed>(&guest).is_empty());
+}
+
+#[test]
+fn a_number_is_given_to_nobody_else_also_after_the_host_was_started_anew() {
+    let _alone = alone();
+    let server = Identity::generate().unwrap().to_pkcs8();
+    let start = |bind: SocketAddr, known| {
+        let identity = Some(Identity::from_pkcs8(&server).unwrap());
+        let transport = HostOptions { bind, identity, ..HostOptions::default() };
+        host(HostConfig { transport, known, ..HostConfig::default() })
+    };
+    let join = |invite: &Invite, name: &str| {
+        guest(invite, JoinConfig { name: name.into(), models: vec![bar()], ..JoinConfig::default() })
+    };
+    let (mut first, invite, _) = start("127.0.0.1:0".parse().unwrap(), Vec::new());
+    let address = SocketAddr::from(([127, 0, 0, 1], invite.port));
+    let mut ann = join(&invite, "Ann");
+    run_until(&mut [&mut first, &mut ann], 5.0, "Ann is in", |apps| is_in(apps[1]));
+    let mut bob = join(&invite, "Bob");
+    run_until(&mut [&mut first, &mut ann, &mut bob], 5.0, "Bob is in", |apps| is_in(apps[2]));
+    assert_eq!(state_of(&ann), GuestState::In { user: UserId(1) });
+    assert_eq!(state_of(&bob), GuestState::In { user: UserId(2) });
+    let known: Vec<_> = first.world().resource::<NetHost>().known().collect();
+    assert_eq!(known.len(), 2);
+    drop(first);
+    run_until(&mut [&mut ann, &mut bob], 3.0, "they hear of it", |apps| {
+        apps.iter().all(|app| matches!(state_of(app), GuestState::Lost { .. }))
+    });
+
+    // Somebody who was never here is the first at the door; the others come back later.
+    let (mut second, invite, _) = start(address, known);
+    let mut new = join(&invite, "Cy");
+    run_until(&mut [&mut second, &mut new], 5.0, "Cy is in", |apps| is_in(apps[1]));
+    assert_eq!(state_of(&new), GuestState::In { user: UserId(3) }, "1 and 2 are Ann's and Bob's");
+    run_until(&mut [&mut second, &mut new, &mut ann, &mut bob], 8.0, "Ann and Bob are back", |apps| {
+        is_in(apps[2]) && is_in(apps[3])
+    });
+    assert_eq!(state_of(&ann), GuestState::In { user: UserId(1) });
+    assert_eq!(state_of(&bob), GuestState::In { user: UserId(2) });
+    assert!(messages::<UserJoined>(&second).iter().filter(|joined| joined.back).count() == 2);
+}
+
+#[test]
+fn two_of_one_token_are_two_users() {
+    let _alone = alone();
+    let token = Token::generate().unwrap();
+    // It expires in an hour of the host's clock. That of a guest is never asked.
+    let access =
+        Access::Tokens(vec![Grant::hold(token).until(SystemTime::now() + Duration::from_secs(3600))]);
+    let transport = HostOptions { access, ..HostOptions::default() };
+    let (mut host, invite, _) = host(HostConfig { transport, ..HostConfig::default() });
+    assert_eq!(invite.token, Some(token));
+    let join = |name: &str| {
+        guest(&invite, JoinConfig { name: name.into(), models: vec![bar()], ..JoinConfig::default() })
+    };
+    let (mut one, mut two) = (join("one"), join("two"));
+    run_until(&mut [&mut host, &mut one, &mut two], 5.0, "both have the body", |apps| {
+        body_of(apps[1]).is_some() && body_of(apps[2]).is_some()
+    });
+    let numbers = [state_of(&one), state_of(&two)];
+    assert!(numbers[0] != numbers[1], "{numbers:?}");
+    // Both hold, and neither's hand is taken for the other's.
+    for app in [&mut one, &mut two] {
+        let there = body_of(app).unwrap();
+        app.world_mut().spawn((Grab::new(TIP, 0.3, DVec3::new(1.2, 2.4, 0.4)), GrabOf(there)));
+    }
+    run_until(&mut [&mut host, &mut one, &mut two], 5.0, "two hands of two users", |apps| {
+        let mut hands = apps[0].world_mut().query::<&HandOf>();
+        let of: Vec<Entity> = hands.iter(apps[0].world()).map(|hand| hand.0).collect();
+        of.len() == 2 && of[0] != of[1]
+    });
+    // One goes; the other, of the same token, stays and holds on.
+    drop(one);
+    run_until(&mut [&mut host, &mut two], 5.0, "one has left", |apps| {
+        apps[0].world().resource::<NetHost>().guests().count() == 1
+    });
+    assert!(is_in(&two) && only::<HandOf>(&mut host).is_some());
 }
 
 #[test]

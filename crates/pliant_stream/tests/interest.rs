@@ -132,6 +132,37 @@ fn a_body_that_is_not_looked_at_costs_nothing_and_comes_back_whole() {
 }
 
 #[test]
+fn a_frame_is_encoded_once_for_all_who_take_the_same_and_one_more_costs_its_datagrams() {
+    let model = bar(8, 0.05);
+    let mut room = Room::new(HostConfig::default());
+    (1..=2).for_each(|peer| room.join(PeerId(peer), &model));
+    (0..40).for_each(|_| room.step());
+    let run = |room: &mut Room| {
+        let before = (room.host.encoded(), room.host.stats(PeerId(1)).unwrap().bytes_out);
+        (0..80).for_each(|_| room.step());
+        (room.host.encoded() - before.0, room.host.stats(PeerId(1)).unwrap().bytes_out - before.1)
+    };
+    assert_eq!(run(&mut room).0, 80, "two guests, one frame a tick");
+    // Thirty who only watch: not one frame more is encoded, and each is sent what the first is sent.
+    (3..=32).for_each(|peer| room.join(PeerId(peer), &model));
+    (0..40).for_each(|_| room.step());
+    let (encoded, first) = run(&mut room);
+    assert_eq!(encoded, 80, "thirty-two guests, one frame a tick");
+    let watcher = room.host.stats(PeerId(20)).unwrap().bytes_out;
+    (0..80).for_each(|_| room.step());
+    let watcher = room.host.stats(PeerId(20)).unwrap().bytes_out - watcher;
+    assert!(watcher.abs_diff(first) < first / 20, "{watcher} bytes for who watches, {first} for the first");
+    // One who takes fewer modes is one kind more.
+    assert!(room.host.set_interest(PeerId(7), BODY, Some(3)));
+    (0..3).for_each(|_| room.step());
+    assert_eq!(run(&mut room).0, 160);
+    // Ten more of that kind are none.
+    (8..18).for_each(|peer| assert!(room.host.set_interest(PeerId(peer), BODY, Some(3))));
+    (0..3).for_each(|_| room.step());
+    assert_eq!(run(&mut room).0, 160);
+}
+
+#[test]
 fn who_comes_back_gets_the_number_they_had_if_it_is_free() {
     let model = bar(8, 0.05);
     let mut room = Room::new(HostConfig { open: false, ..HostConfig::default() });

@@ -27,6 +27,8 @@ struct Mesh {
     links: Vec<Vec<(Link, Link)>>,
     events: Vec<(usize, PeerEvent)>,
     now: Duration,
+    /// What each one's clock said when the others' began.
+    began: Vec<Duration>,
     grabs: Vec<Option<u16>>,
     /// Peer, tick, shown.
     seen: Vec<(usize, u64, Vec<f64>)>,
@@ -52,6 +54,7 @@ impl Mesh {
             links,
             events: Vec::new(),
             now: Duration::ZERO,
+            began: vec![Duration::ZERO; count],
             grabs: vec![None; count],
             seen: Vec::new(),
             model: bar(40, 0.05),
@@ -66,8 +69,8 @@ impl Mesh {
         peer.add_body(BODY, self.model.clone(), &self.setup).unwrap();
         for other in 0..self.peers.len() {
             if let Some(o) = &mut self.peers[other] {
-                o.connect(self.now, PeerId(k as u64), 1200).unwrap();
-                peer.connect(self.now, PeerId(other as u64), 1200).unwrap();
+                o.connect(self.began[other] + self.now, PeerId(k as u64), 1200).unwrap();
+                peer.connect(self.began[k] + self.now, PeerId(other as u64), 1200).unwrap();
             }
         }
         self.peers[k] = Some(peer);
@@ -90,12 +93,12 @@ impl Mesh {
                     let (datagrams, messages) = &mut self.links[from][to];
                     while let Some(bytes) = messages.poll(self.now) {
                         if let Some(p) = &mut self.peers[to] {
-                            p.on_message(self.now, PeerId(from as u64), &bytes);
+                            p.on_message(self.began[to] + self.now, PeerId(from as u64), &bytes);
                         }
                     }
                     while let Some(bytes) = datagrams.poll(self.now) {
                         if let Some(p) = &mut self.peers[to] {
-                            p.on_datagram(self.now, PeerId(from as u64), &bytes);
+                            p.on_datagram(self.began[to] + self.now, PeerId(from as u64), &bytes);
                         }
                     }
                 }
@@ -109,7 +112,7 @@ impl Mesh {
                         Some(g) => p.set_target(g, target).unwrap(),
                     }
                 }
-                let stepped = p.update(self.now);
+                let stepped = p.update(self.began[k] + self.now);
                 while let Some(e) = p.poll_event() {
                     self.events.push((k, e));
                 }
@@ -275,6 +278,31 @@ fn late_joiner_takes_the_state_of_another_and_follows() {
     assert!(mesh.agree(0, 1) < 1e-9);
     let late = mesh.peers[2].as_ref().unwrap();
     assert_eq!(late.body(BODY).unwrap().grabs().len(), 3, "all three hold on");
+}
+
+#[test]
+fn clocks_that_differ_by_years_change_nothing_among_peers() {
+    let year = Duration::from_secs(365 * 86_400);
+    let go = |began: [Duration; 3]| {
+        let mut mesh = Mesh::new(3, &LinkConfig::preset(Preset::Paper1), 4);
+        mesh.began = began.to_vec();
+        mesh.start(0, Repair::Rollback, true);
+        mesh.start(1, Repair::Rollback, true);
+        mesh.run(4 * S);
+        // The third comes late, from another age.
+        mesh.start(2, Repair::Rollback, false);
+        mesh.run(10 * S);
+        assert_eq!((mesh.agree(0, 1), mesh.agree(0, 2)), (0.0, 0.0), "to the bit");
+        let ticks: Vec<u64> = mesh.peers.iter().flatten().map(PeerSession::tick).collect();
+        assert!(ticks.iter().max().unwrap() - ticks.iter().min().unwrap() <= 8, "{ticks:?}");
+        ticks
+    };
+    let one_age = go([Duration::ZERO; 3]);
+    for began in [[Duration::ZERO, 30 * year, 60 * year], [60 * year, Duration::ZERO, 30 * year]] {
+        let ticks = go(began);
+        let apart = ticks.iter().zip(&one_age).map(|(a, b)| a.abs_diff(*b)).max().unwrap();
+        assert!(apart <= 2, "{ticks:?} where one clock has {one_age:?}");
+    }
 }
 
 #[test]

@@ -1,5 +1,6 @@
 //! Guests come, are who they were, say what they want, and go.
 
+use std::collections::{BTreeMap, BTreeSet};
 use std::time::Duration;
 
 use bevy::prelude::*;
@@ -41,6 +42,13 @@ impl Guest {
         self.wishes = (if may { left - 1.0 } else { left }, now);
         may
     }
+}
+
+/// Those whom the application remembers from an earlier run; of two with one number the first has it.
+pub(super) fn known_before(known: &[(Fingerprint, UserId)]) -> BTreeMap<Fingerprint, Known> {
+    let mut taken = BTreeSet::from([UserId::HOST]);
+    let fresh = known.iter().take(MOST_KNOWN).filter(|(_, user)| taken.insert(*user));
+    fresh.map(|&(key, user)| (key, Known { user, seen: Duration::ZERO })).collect()
 }
 
 /// `PreUpdate`: what came from the guests.
@@ -109,13 +117,26 @@ impl NetHost {
             debug!("guest {other} has come anew as {peer}");
             self.session.expel(other, EndReason::Left);
         }
-        let before = self.known.get(&key).map(|known| known.user);
+        let before = self.known.get(&key).map(|known| known.user).or_else(|| self.free_number());
         if let Err(error) = self.session.accept_as(now, peer, before) {
             debug!("guest {peer} was not let in: {error}");
             self.session.expel(peer, EndReason::Refused);
         }
         // The older one's leave comes before the newer one's arrival.
         self.take_events(world);
+    }
+
+    /// A number that nobody has or had, as far as is remembered.
+    fn free_number(&mut self) -> Option<UserId> {
+        let had: BTreeSet<UserId> = self.known.values().map(|known| known.user).collect();
+        for _ in 0..=u16::MAX {
+            self.next_user = self.next_user.wrapping_add(1);
+            let number = UserId(self.next_user);
+            if number != UserId::HOST && !had.contains(&number) && !self.numbers.contains_key(&number) {
+                return Some(number);
+            }
+        }
+        None
     }
 
     fn joined(&mut self, world: &mut World, peer: PeerId, id: UserId, name: &str) {

@@ -42,6 +42,9 @@ pub struct HostConfig {
     pub smoothing: f64,
     /// How far from a body's middle a guest's target may be, in sizes of the body; a target beyond is drawn in to that distance. Default: 4.
     pub reach: f64,
+    /// Who had which number when this host ran before ([`NetHost::known`]): the same key gets the same number, and nobody else does. At most
+    /// 4,096; the host's own number is nobody's. Default: none, and numbers begin at 1.
+    pub known: Vec<(Fingerprint, UserId)>,
 }
 
 impl Default for HostConfig {
@@ -53,6 +56,7 @@ impl Default for HostConfig {
             holding: Holding::default(),
             smoothing: 0.1,
             reach: 4.0,
+            known: Vec::new(),
         }
     }
 }
@@ -74,6 +78,8 @@ pub struct NetHost {
     /// Who has which key: somebody who comes back is who they were.
     known: BTreeMap<Fingerprint, Known>,
     numbers: BTreeMap<UserId, Entity>,
+    /// The number that was given last.
+    next_user: u16,
     grabs: BTreeMap<GrabKey, Entity>,
     own_grabs: BTreeMap<Entity, u16>,
     next_own_grab: u16,
@@ -116,7 +122,8 @@ impl NetHost {
             bodies: BTreeMap::new(),
             next_body: 1,
             guests: BTreeMap::new(),
-            known: BTreeMap::new(),
+            known: guests::known_before(&config.known),
+            next_user: 0,
             numbers: BTreeMap::from([(UserId::HOST, you)]),
             grabs: BTreeMap::new(),
             own_grabs: BTreeMap::new(),
@@ -160,6 +167,12 @@ impl NetHost {
     /// The key of a guest: its lasting name. `None` for an entity that is no guest.
     pub fn key_of(&self, guest: Entity) -> Option<Fingerprint> {
         self.guests.values().find(|one| one.entity == Some(guest)).map(|one| one.key)
+    }
+
+    /// Who has, or had, which number, by key. Kept in a file and given to the next run ([`HostConfig::known`]), guests are who they were also after
+    /// the host was started anew; without that a number is as good as the run of its host, and only the key says who somebody is.
+    pub fn known(&self) -> impl Iterator<Item = (Fingerprint, UserId)> + '_ {
+        self.known.iter().map(|(&key, known)| (key, known.user))
     }
 
     /// Sends a guest away. False for an entity that is no guest.

@@ -10,18 +10,18 @@ use pliant_stream::{Channel, EndReason, PeerId, UserId};
 use super::message::{MOST_PEERS, Mesh, Scene};
 use super::{NetPeer, PeerState};
 use crate::seen::{SessionClosed, SessionJoined};
-use crate::transport::{Event, Fingerprint, Invite, Role};
+use crate::transport::{CloseReason, Event, Fingerprint, Invite, Role};
 use crate::user::{User, UserJoined, UserLeft, UserLink};
 
 /// Somebody that this peer is connected with.
 #[derive(Debug)]
 pub(super) struct Other {
-    key: Fingerprint,
+    pub(super) key: Fingerprint,
     address: std::net::IpAddr,
     /// Given, or said; the session knows it from then on.
-    number: Option<UserId>,
+    pub(super) number: Option<UserId>,
     /// Where it listens, for those who come later.
-    invite: Option<Invite>,
+    pub(super) invite: Option<Invite>,
     /// It has come with our invite, and waits for its number until our own session is there.
     waits: Option<(Scene, Invite)>,
 }
@@ -51,6 +51,7 @@ pub(crate) fn receive(world: &mut World) {
             net.take(world, opened, event);
         }
         net.take_events(world);
+        net.look_for_the_missed();
         net.flush();
     });
 }
@@ -114,6 +115,7 @@ impl NetPeer {
             Event::Closed { peer, reason } => {
                 let peer = opened.unwrap_or(peer);
                 debug!("peer {peer} is gone: {reason}");
+                self.miss(now, peer, &reason);
                 if let Some(session) = &mut self.session {
                     session.disconnect(peer, crate::end_of(&reason));
                 }
@@ -258,6 +260,7 @@ impl NetPeer {
     }
 
     fn take_events(&mut self, world: &mut World) {
+        let now = self.now();
         while let Some(event) = self.session.as_mut().and_then(|session| session.poll_event()) {
             match event {
                 PeerEvent::Started => {
@@ -266,6 +269,7 @@ impl NetPeer {
                     }
                 }
                 PeerEvent::Joined { user, name } => {
+                    self.found(user);
                     let joined = User::new(user, &name, Role::Hold);
                     let name = joined.name.clone();
                     info!("{name} is here");
@@ -288,6 +292,9 @@ impl NetPeer {
                         .map(|(&peer, _)| peer)
                         .collect();
                     for peer in gone {
+                        if reason == EndReason::Silent {
+                            self.miss(now, peer, &CloseReason::TimedOut);
+                        }
                         let (endpoint, number) = self.way(peer);
                         endpoint.close(number, &reason.to_string());
                         if let Some(other) = self.others.get_mut(&peer) {

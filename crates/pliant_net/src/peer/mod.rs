@@ -3,6 +3,7 @@
 //! Each peer listens and each connects: who comes with the invite of any of them is told of all the others, and joins them too. One that goes
 //! leaves the others connected.
 
+mod again;
 mod mesh;
 mod message;
 mod play;
@@ -22,6 +23,7 @@ use crate::transport::{
     TransportError,
 };
 use crate::user::{User, UserLink, Yourself};
+use again::Missed;
 use mesh::Other;
 use message::Scene;
 use play::{PlayedBody, SaidGrab};
@@ -40,11 +42,20 @@ pub struct PeerConfig {
     pub transport: HostOptions,
     /// How a late hand is put right. Default: [`Repair::Rollback`].
     pub repair: Repair,
+    /// A peer that cannot be heard any more, without having said goodbye, is looked for again for so long, where it last listened; of the two the
+    /// one with the higher number calls, and takes over the other's state. Zero: never. Default: 60 s.
+    pub rejoin: Duration,
 }
 
 impl Default for PeerConfig {
     fn default() -> Self {
-        Self { name: "peer".into(), join: None, transport: HostOptions::default(), repair: Repair::default() }
+        Self {
+            name: "peer".into(),
+            join: None,
+            transport: HostOptions::default(),
+            repair: Repair::default(),
+            rejoin: Duration::from_secs(60),
+        }
     }
 }
 
@@ -88,6 +99,8 @@ pub struct NetPeer {
     others: BTreeMap<PeerId, Other>,
     /// Whom we are on the way to, as the first peer has told.
     introduced: BTreeMap<PeerId, (UserId, Invite)>,
+    /// Who was lost, and is looked for.
+    missed: Vec<Missed>,
     /// Who has which key, to be the same again.
     numbers: BTreeMap<Fingerprint, UserId>,
     users: BTreeMap<UserId, Entity>,
@@ -121,6 +134,7 @@ impl NetPeer {
             bodies: BTreeMap::new(),
             others: BTreeMap::new(),
             introduced: BTreeMap::new(),
+            missed: Vec::new(),
             numbers: BTreeMap::new(),
             users: BTreeMap::new(),
             grabs: BTreeMap::new(),
@@ -161,6 +175,11 @@ impl NetPeer {
     /// The session below, for those who want to know more. `None` until the models are here and a number is given.
     pub fn session(&self) -> Option<&PeerSession> {
         self.session.as_ref()
+    }
+
+    /// Peers that were lost and that this one calls ([`PeerConfig::rejoin`]).
+    pub fn looked_for(&self) -> usize {
+        self.missed.len()
     }
 
     /// The session's number of the body of a name.

@@ -50,6 +50,7 @@ pub struct HostSession {
     next_user: u16,
     dropped_events: u64,
     pub(super) upload: Upload,
+    pub(super) encoded: u64,
 }
 
 impl HostSession {
@@ -76,6 +77,7 @@ impl HostSession {
             next_user: 1,
             dropped_events: 0,
             upload,
+            encoded: 0,
         })
     }
 
@@ -440,6 +442,12 @@ impl HostSession {
     /// Events that nobody fetched and that were dropped.
     pub fn dropped_events(&self) -> u64 {
         self.dropped_events
+    }
+
+    /// Frames that were encoded so far: one for each body and tick, and for each kind of receiver (payload, modes, room in the datagram), however many
+    /// guests it goes to.
+    pub fn encoded(&self) -> u64 {
+        self.encoded
     }
 
     fn event(&mut self, event: HostEvent) {

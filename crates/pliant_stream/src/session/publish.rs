@@ -92,6 +92,7 @@ impl HostSession {
                 if woke {
                     encoder.begin_run(state.tick - 1);
                 }
+                self.encoded += 1;
                 frames.insert(key, Outgoing { frame: Some(encoder.encode(state)), anew: false });
             }
         }
