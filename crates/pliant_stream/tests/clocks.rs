@@ -42,7 +42,7 @@ fn shown(
     let mut passed = Duration::ZERO;
     while passed < Duration::from_secs(8) {
         let (at_host, at_guest) = (host_clock + passed, guest_clock + passed);
-        if passed.as_micros() % 25_000 == 0 {
+        if passed.as_micros().is_multiple_of(25_000) {
             let tick = passed.as_micros() as u64 / 25_000 + 1;
             let t = passed.as_secs_f64();
             body.set_target(grab, [1.0, 0.08 + 0.1 * (1.3 * t).sin(), 0.08 + 0.1 * (1.7 * t).sin()]).unwrap();
