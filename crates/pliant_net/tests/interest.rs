@@ -25,6 +25,10 @@ fn pip() -> Arc<ModalModel> {
     Arc::new(ModalModel::read(file).unwrap())
 }
 
+/// The host's hand rests.
+#[derive(Resource)]
+struct Still;
+
 /// A host whose body is always in motion.
 fn moving() -> (App, Invite, Entity) {
     let net = NetPlugin::host(HostConfig::default()).unwrap();
@@ -32,10 +36,15 @@ fn moving() -> (App, Invite, Entity) {
     let mut host = app(net);
     let handle = host.world_mut().resource_mut::<Assets<ModalAsset>>().add(ModalAsset(pip()));
     let body = host.world_mut().spawn((ModalBody::new(handle), SharedBody::named("pip"))).id();
-    host.world_mut().spawn((Grab::new(0, 0.03, DVec3::Y * 0.2), GrabOf(body)));
-    let sway = |time: Res<Time>, mut grab: Single<&mut Grab>| {
-        let t = time.elapsed_secs_f64();
-        grab.target = DVec3::new(0.05 * (3.0 * t).sin(), 0.2, 0.05 * (5.0 * t).cos());
+    // By the top of its head, a tenth of its height each way.
+    let model = pip();
+    let positions = model.surface().positions();
+    let top = (0..positions.len()).max_by(|&a, &b| positions[a][1].total_cmp(&positions[b][1])).unwrap();
+    let at = Vec3::from(positions[top]).as_dvec3();
+    host.world_mut().spawn((Grab::new(top as u32, 0.03, at), GrabOf(body)));
+    let sway = move |time: Res<Time>, still: Option<Res<Still>>, mut grab: Single<&mut Grab>| {
+        let t = if still.is_some() { 0.5 } else { time.elapsed_secs_f64() };
+        grab.target = at + 0.03 * DVec3::new((3.0 * t).sin(), 0.0, (5.0 * t).cos());
     };
     host.add_systems(FixedUpdate, sway.before(PliantSystems::Input));
     (host, invite, body)
@@ -103,8 +112,8 @@ fn what_the_camera_does_not_see_is_not_sent_and_comes_back_when_it_does() {
     };
     assert_eq!(modes, 4, "of 30");
     let far = in_a_second(&mut host, &mut guest);
-    // (The default stream is mostly hands and repeats: fewer modes are less work, and a little less to send.)
-    assert!(far.0 > 30 && far.1 < seen.1, "{far:?} far away, {seen:?} near");
+    // (The default stream is mostly hands and repeats: fewer modes are less work for both sides, and hardly fewer bytes.)
+    assert!(far.0 > 30 && (far.1 as f64) < 1.1 * seen.1 as f64, "{far:?} far away, {seen:?} near");
     let shown = guest.world().get::<ShownState>(there).unwrap().q().to_vec();
     assert!(shown[usize::from(modes)..].iter().all(|q| *q == 0.0) && shown[0] != 0.0, "{shown:?}");
 
@@ -117,16 +126,14 @@ fn what_the_camera_does_not_see_is_not_sent_and_comes_back_when_it_does() {
     println!(
         "a second in sight {seen:?}, out of sight {unseen:?}, far away at {modes} modes {far:?}, in sight {again:?}"
     );
-    // The host's hand stands still, so that both can be held against each other.
-    host.world_mut().resource_mut::<Time<Virtual>>().pause();
-    run_for(&mut [&mut host, &mut guest], 0.5);
+    host.world_mut().insert_resource(Still);
+    run_for(&mut [&mut host, &mut guest], 2.0);
     let truth = host.world().get::<BodyState>(body).unwrap().body().q().to_vec();
     let shown = guest.world().get::<ShownState>(there).unwrap().q();
     let size = truth.iter().fold(0.0_f64, |size, q| size.max(q.abs()));
     let off = truth.iter().zip(shown).map(|(a, b)| (a - b).abs()).fold(0.0, f64::max) / size;
-    assert!(off < 0.2, "off by {off}: within the few ticks that a guest is behind");
+    assert!(off < 0.05, "off by {off}");
     // A camera that is switched off sees nothing.
-    host.world_mut().resource_mut::<Time<Virtual>>().unpause();
     guest.world_mut().get_mut::<Camera>(camera).unwrap().is_active = false;
     run_for(&mut [&mut host, &mut guest], 1.6);
     assert_eq!(interest(&guest), Interest::Nothing);
