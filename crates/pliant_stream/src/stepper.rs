@@ -300,7 +300,7 @@ impl ForceStepper {
             self.table.press(&self.force, &mut self.free);
         }
         let mut frame = frame;
-        let rigid = frame
+        let mut rigid = frame
             .as_mut()
             .map(|f| RigidMotion::predict(f.frame, &self.model, self.h, self.gravity, f.force, f.torque));
         if !holds.is_empty() {
@@ -310,7 +310,7 @@ impl ForceStepper {
             for round in 0..rounds {
                 // Both of the body's rounds are implicit. Were the first one a dead load, a bent body would buckle under
                 // it, and the rows of the second round would be taken at the wrong place: the error then grows.
-                self.solve(holds, placed, rigid.as_ref());
+                self.solve(holds, placed, rigid.as_mut());
                 if round + 1 < rounds {
                     for (i, held) in self.held.iter_mut().enumerate() {
                         held.from = held.free + self.by_place.answer(i, &self.forces);
@@ -323,7 +323,7 @@ impl ForceStepper {
                     h.flow = self.creeping.step(h.flow, self.patches[index].compliance * h.pull);
                 }
             }
-            if let (Some(f), Some(_)) = (&mut frame, &rigid) {
+            if let (Some(f), Some(rigid)) = (&mut frame, &rigid) {
                 let turn = *f.frame.rotation().to_rotation_matrix().matrix();
                 let (mut force, mut torque) = (Vector3::zeros(), Vector3::zeros());
                 for (h, held) in holds.iter_mut().zip(&self.held) {
@@ -331,7 +331,7 @@ impl ForceStepper {
                     h.pull = turn * h.pull;
                     force += h.pull;
                 }
-                RigidMotion::apply(f.frame, &self.model, self.h, force, torque);
+                rigid.apply(f.frame, &self.model, force, torque);
             }
         }
         let [q, v, a, z] = &self.free;
@@ -387,7 +387,7 @@ impl ForceStepper {
     }
 
     /// One Newton round: the pulls on the tangent taken at `from`.
-    fn solve(&mut self, holds: &mut [Hold], frame: Option<&Frame>, rigid: Option<&RigidMotion>) {
+    fn solve(&mut self, holds: &mut [Hold], frame: Option<&Frame>, mut rigid: Option<&mut RigidMotion>) {
         let n = 3 * holds.len();
         let reach = self.model.size();
         let center = Vector3::from(self.model.center_of_mass());
@@ -398,7 +398,7 @@ impl ForceStepper {
             (held.at, held.tangent) = tangent(&held.from, self.warp);
             let ahead = held.at + held.tangent * (held.free - held.from);
             let rest = self.patches[index].rest;
-            held.arm = rest + ahead - center;
+            held.arm = rest + held.at - center;
             let mut gap = held.place - ahead - held.crept;
             if held.relaxation > 0.0 {
                 let mut speed = held.tangent * held.speed;
@@ -414,6 +414,11 @@ impl ForceStepper {
             }
             self.gap.extend(gap.iter());
         }
+        if let Some(rigid) = &mut rigid {
+            // The pulls of the round before; none in the first.
+            let pulls = self.held.iter().zip(holds.iter()).map(|(held, h)| (held.arm, h.pull));
+            rigid.tighten(&self.model, pulls);
+        }
         for i in 0..holds.len() {
             for j in 0..=i {
                 let (a, b) = (&self.held[i], &self.held[j]);
@@ -422,7 +427,7 @@ impl ForceStepper {
                 if relaxation > 0.0 {
                     block += relaxation * (a.tangent * self.by_speed.at(i, j) * b.tangent.transpose());
                 }
-                if let Some(rigid) = rigid {
+                if let Some(rigid) = &rigid {
                     block += rigid.response(&a.arm, &b.arm, relaxation);
                 }
                 if i == j {

@@ -2,7 +2,7 @@
 
 use nalgebra::{Matrix3, Vector3};
 
-use super::{Body, RigidMotion, StepReport};
+use super::{Body, RigidMotion, StepReport, grab::Grab};
 use crate::StepError;
 
 impl Body {
@@ -94,14 +94,14 @@ impl Body {
         };
         let mut report = StepReport::default();
         if !self.grabs.is_empty() {
-            report = self.hold(rigid.as_ref());
+            report = self.hold(rigid);
         }
         self.state.f.copy_from_slice(&self.force);
         report
     }
 
     /// Solves for the pulls of all grabs and adds what they do to the state.
-    fn hold(&mut self, rigid: Option<&RigidMotion>) -> StepReport {
+    fn hold(&mut self, mut rigid: Option<RigidMotion>) -> StepReport {
         let h = self.config.step;
         let corrections = if self.config.warp { self.config.corrections.clamp(1, 8) } else { 1 };
         let reach = self.model.size();
@@ -119,7 +119,7 @@ impl Body {
                 if grab.config.relaxation > 0.0 {
                     let speed = turn
                         * grab.speed(&self.coefficients, &self.before.q, &self.state.q, &self.state.v, h)
-                        + rigid.map_or_else(Vector3::zeros, |_| {
+                        + rigid.as_ref().map_or_else(Vector3::zeros, |_| {
                             self.state.frame.velocity_at(&self.model, ahead)
                         });
                     gap += grab.config.relaxation * (grab.target_velocity(h) - speed);
@@ -130,9 +130,14 @@ impl Body {
                     gap *= reach / distance;
                 }
                 grab.gap = back * gap;
-                grab.arm = ahead - Vector3::from(self.model.center_of_mass());
+                grab.arm = grab.at() - Vector3::from(self.model.center_of_mass());
             }
-            report.regularised = self.schur.solve(&mut self.grabs, &self.coefficients, h, rigid);
+            if let Some(rigid) = &mut rigid {
+                // The pulls of the round before, at first those of the step before, which are in world axes.
+                let pull = |grab: &Grab| if round == 0 { back * grab.pull } else { grab.pull };
+                rigid.tighten(&self.model, self.grabs.iter().map(|grab| (grab.arm, pull(grab))));
+            }
+            report.regularised = self.schur.solve(&mut self.grabs, &self.coefficients, h, rigid.as_ref());
             let mut moved = 0.0f64;
             for (i, q) in self.linear.iter_mut().enumerate() {
                 let pull: f64 = self.grabs.iter().map(|g| g.row(i).dot(&g.pull)).sum();
@@ -165,8 +170,8 @@ impl Body {
             torque += (turn * grab.arm).cross(&grab.pull);
             grab.last_target = grab.target;
         }
-        if rigid.is_some() {
-            RigidMotion::apply(&mut self.state.frame, &self.model, h, force, torque);
+        if let Some(rigid) = &rigid {
+            rigid.apply(&mut self.state.frame, &self.model, force, torque);
         }
         report
     }

@@ -198,6 +198,8 @@ pub struct RigidMotion {
     inverse_mass: f64,
     /// Body axes.
     inverse_inertia: Matrix3<f64>,
+    /// The same with what the pulls themselves add, see [`RigidMotion::tighten`].
+    turning: Matrix3<f64>,
 }
 
 impl RigidMotion {
@@ -216,23 +218,50 @@ impl RigidMotion {
         frame.velocity += h * acceleration;
         frame.spin += h * torque;
         frame.turn(model, h);
-        Self { step: h, inverse_mass: 1.0 / model.mass(), inverse_inertia: inverse_inertia(model) }
+        let inverse_inertia = inverse_inertia(model);
+        Self { step: h, inverse_mass: 1.0 / model.mass(), inverse_inertia, turning: inverse_inertia }
+    }
+
+    /// Takes into account how `pulls` (N) at their arms (m, both body axes) turn with the body: two hands that pull apart keep it in line
+    /// between them, as a weight keeps a pendulum. To a turn by `t` they answer with the torque `-K t`,
+    /// `K = sum (p . a) 1 - (p a^T + a p^T) / 2`, and the turn of a step is that of the inertia `I + h^2 K`. What would drive the body
+    /// out of line (hands that press) is left to the steps, which follow it.
+    pub fn tighten(&mut self, model: &ModalModel, pulls: impl Iterator<Item = (Vector3<f64>, Vector3<f64>)>) {
+        let mut k = Matrix3::zeros();
+        for (arm, pull) in pulls {
+            let outer = pull * arm.transpose();
+            k += Matrix3::identity() * pull.dot(&arm) - 0.5 * (outer + outer.transpose());
+        }
+        self.turning = self.inverse_inertia;
+        if !k.iter().all(|x| x.is_finite()) {
+            return;
+        }
+        let mut own = k.symmetric_eigen();
+        own.eigenvalues.apply(|x| *x = x.max(0.0));
+        let i = model.inertia();
+        let inertia = Matrix3::from_fn(|r, c| i[r][c]);
+        let tight = inertia + self.step * self.step * own.recompose();
+        self.turning = tight.try_inverse().unwrap_or(self.inverse_inertia);
     }
 
     /// How far a unit pull at arm `b` moves the point at arm `a` (3x3, m/N, body axes); with `relaxation` (s) times how fast
     /// on top.
     pub fn response(&self, a: &Vector3<f64>, b: &Vector3<f64>, relaxation: f64) -> Matrix3<f64> {
-        let turning = a.cross_matrix() * self.inverse_inertia * b.cross_matrix().transpose();
+        let turning = a.cross_matrix() * self.turning * b.cross_matrix().transpose();
         (self.step * (self.step + relaxation)) * (Matrix3::identity() * self.inverse_mass + turning)
     }
 
     /// Adds the pulls' total force and torque (world axes) to the predicted frame.
-    pub fn apply(frame: &mut Frame, model: &ModalModel, h: f64, force: Vector3<f64>, torque: Vector3<f64>) {
-        frame.velocity += h * force / model.mass();
-        frame.position += h * h * force / model.mass();
-        frame.spin += h * torque;
-        let turned = frame.rotation * (inverse_inertia(model) * (frame.rotation.inverse() * torque));
-        frame.rotation = UnitQuaternion::from_scaled_axis(h * h * turned) * frame.rotation;
+    pub fn apply(&self, frame: &mut Frame, model: &ModalModel, force: Vector3<f64>, torque: Vector3<f64>) {
+        let h = self.step;
+        frame.velocity += h * force * self.inverse_mass;
+        frame.position += h * h * force * self.inverse_mass;
+        let turn = h * h * (self.turning * (frame.rotation.inverse() * torque));
+        // The torque that is left at the end of that turn is what the spin gains: h torque where nothing is tight.
+        let i = model.inertia();
+        let inertia = Matrix3::from_fn(|r, c| i[r][c]);
+        frame.spin += frame.rotation * (inertia * turn) / h;
+        frame.rotation = UnitQuaternion::from_scaled_axis(frame.rotation * turn) * frame.rotation;
         frame.rotation.renormalize_fast();
     }
 }

@@ -174,6 +174,11 @@ impl Grab {
         self.rows.iter().zip(from.iter().zip(q)).fold(self.at, |p, (row, (f, q))| p + row * (q - f))
     }
 
+    /// Where the patch is where rows were last taken, m, body axes.
+    pub(crate) fn at(&self) -> Vector3<f64> {
+        self.at
+    }
+
     pub(crate) fn row(&self, mode: usize) -> Vector3<f64> {
         self.rows[mode]
     }

@@ -251,7 +251,7 @@ impl OwnHand {
         let (model, h) = (self.stepper.model().clone(), self.h);
         let zero = Vector3::zeros();
         let gravity = Vector3::from(receiver.setup().gravity);
-        RigidMotion::predict(&mut from, &model, h, gravity, zero, zero);
+        let rigid = RigidMotion::predict(&mut from, &model, h, gravity, zero, zero);
         let (mut force, mut torque) = (zero, zero);
         let tick = receiver.tick();
         let mut patches = Vec::with_capacity(receiver.grabs().len());
@@ -264,7 +264,7 @@ impl OwnHand {
             force += pull;
             torque += arm.cross(&pull);
         }
-        RigidMotion::apply(&mut from, &model, h, force, torque);
+        rigid.apply(&mut from, &model, force, torque);
         let missing = (Vector3::from(to.velocity()) - Vector3::from(from.velocity())) * (model.mass() / h);
         let turning = (Vector3::from(to.spin()) - Vector3::from(from.spin())) / h;
         self.push.0 += LEARN * (missing - self.push.0);
