@@ -45,6 +45,8 @@
     doc = "| [`BakePlugin`](body::BakePlugin) | `bake` | surfaces and descriptions become bodies in the game, beside its frames |"
 )]
 //!
+//! A scene need not be code: [`scene`] reads bodies, hands, a session, a device and a recording from a file.
+//!
 //! # Features
 //!
 //! | Feature | Default | What it brings |
@@ -57,6 +59,11 @@
 //! | `rerun` | yes | the rerun viewer's client |
 //! | `panel` | yes | the live panel (egui) |
 //! | `bake` | yes | meshing and baking in the game itself |
+
+#![cfg_attr(
+    test,
+    allow(clippy::unwrap_used, clippy::expect_used, clippy::panic, reason = "a failed test should panic")
+)]
 
 use bevy::{
     app::{PluginGroup, PluginGroupBuilder},
@@ -80,6 +87,8 @@ pub use pliant_panel as panel;
 pub use pliant_rerun as rerun;
 #[cfg(feature = "net")]
 pub use pliant_stream as stream;
+
+pub mod scene;
 
 /// What a scene with soft bodies needs; see the [crate page](crate#plugins) for what is in it and what may be added.
 ///

@@ -1,0 +1,208 @@
+//! A scene that was read and checked; the loader of scene files.
+
+use std::{fs::File, io::Read, path::Path, sync::Arc};
+
+use bevy::{
+    asset::{Asset, AssetLoader, AsyncReadExt, LoadContext, io::Reader},
+    reflect::TypePath,
+};
+use ron::{error::SpannedError, extensions::Extensions};
+
+use super::check::{self, Fault};
+use super::error::nearest;
+use super::locate::{Step, locate};
+use super::{MAX_BYTES, SceneDescription, SceneError, SceneErrorKind};
+
+/// A scene that was read and checked, as a Bevy asset.
+///
+/// ```
+/// use pliant::scene::SceneFile;
+///
+/// let scene = SceneFile::from_ron(r#"(bodies: [(name: "pip", model: "pip.modal")])"#, "in the documentation")?;
+/// assert_eq!(scene.scene().bodies[0].name, "pip");
+///
+/// let wrong = SceneFile::from_ron(r#"(bodies: [(name: "pip", modle: "pip.modal")])"#, "pip.ron").unwrap_err();
+/// assert!(wrong.to_string().starts_with("pip.ron:1:24: unknown field `modle` in Body; did you mean `model`?"));
+/// # Ok::<(), pliant::scene::SceneError>(())
+/// ```
+#[derive(Asset, TypePath, Debug, Clone, PartialEq)]
+pub struct SceneFile {
+    origin: Arc<str>,
+    /// For the places of mistakes that show later. Empty for a scene made in code.
+    text: Arc<str>,
+    scene: Arc<SceneDescription>,
+}
+
+impl SceneFile {
+    /// Reads a file.
+    ///
+    /// # Errors
+    /// As [`from_ron`](Self::from_ron); [`SceneErrorKind::Read`] when it cannot be read, is no text, or is longer than [`MAX_BYTES`].
+    pub fn read(path: impl AsRef<Path>) -> Result<Self, SceneError> {
+        let path = path.as_ref();
+        let origin = path.display().to_string();
+        let failed = |error: std::io::Error| {
+            SceneError::without_place(
+                &origin,
+                SceneErrorKind::Read,
+                format!("the scene cannot be read: {error}"),
+            )
+        };
+        let file = File::open(path).map_err(failed)?;
+        let mut bytes = Vec::new();
+        file.take(MAX_BYTES as u64 + 1).read_to_end(&mut bytes).map_err(failed)?;
+        Self::from_bytes(&bytes, &origin)
+    }
+
+    fn from_bytes(bytes: &[u8], origin: &str) -> Result<Self, SceneError> {
+        if bytes.len() > MAX_BYTES {
+            let message = format!("expected a scene of at most {MAX_BYTES} bytes, got a longer file");
+            return Err(SceneError::without_place(origin, SceneErrorKind::Read, message));
+        }
+        match std::str::from_utf8(bytes) {
+            Ok(text) => Self::from_ron(text, origin),
+            Err(error) => {
+                let good = String::from_utf8_lossy(&bytes[..error.valid_up_to()]);
+                let message = "expected text in UTF-8, got bytes that are none".into();
+                Err(SceneError::at(origin, &good, good.len(), SceneErrorKind::Read, message))
+            }
+        }
+    }
+
+    /// Reads a text; `origin` is what errors call it.
+    ///
+    /// # Errors
+    /// Says line, column, and what was expected, when the text is no RON ([`SceneErrorKind::Syntax`]), has unknown or missing fields
+    /// ([`Field`](SceneErrorKind::Field)), values out of their range ([`Value`](SceneErrorKind::Value)) or names that are there twice or not at all
+    /// ([`Name`](SceneErrorKind::Name)).
+    pub fn from_ron(text: &str, origin: impl AsRef<str>) -> Result<Self, SceneError> {
+        let origin = origin.as_ref();
+        if text.len() > MAX_BYTES {
+            return Self::from_bytes(text.as_bytes(), origin);
+        }
+        let text = text.strip_prefix('\u{feff}').unwrap_or(text);
+        let options = ron::Options::default().with_default_extension(Extensions::IMPLICIT_SOME);
+        let scene: SceneDescription =
+            options.from_str(text).map_err(|error| refused(origin, text, &error))?;
+        Self::checked(scene, origin, text)
+    }
+
+    /// A scene made in code.
+    ///
+    /// # Errors
+    /// As [`from_ron`](Self::from_ron), without lines.
+    pub fn new(scene: SceneDescription) -> Result<Self, SceneError> {
+        Self::checked(scene, "a scene made in code", "")
+    }
+
+    fn checked(scene: SceneDescription, origin: &str, text: &str) -> Result<Self, SceneError> {
+        let checked = check::check(&scene);
+        let file = Self { origin: origin.into(), text: text.into(), scene: Arc::new(scene) };
+        match checked {
+            Ok(()) => Ok(file),
+            Err(Fault { path, kind, message, other }) => {
+                let place =
+                    other.map_or(0, |other| super::locate::line_and_column(text, locate(text, &other)).0);
+                let place = if text.is_empty() { "another place".into() } else { format!("line {place}") };
+                let message = message.replace("{line}", &place);
+                Err(file.error(&path, kind, message))
+            }
+        }
+    }
+
+    /// What the scene says.
+    pub fn scene(&self) -> &SceneDescription {
+        &self.scene
+    }
+
+    /// What errors call it: the file.
+    pub fn origin(&self) -> &str {
+        &self.origin
+    }
+
+    /// An error about one of its values.
+    pub(super) fn error(&self, path: &[Step], kind: SceneErrorKind, message: String) -> SceneError {
+        if self.text.is_empty() {
+            return SceneError::without_place(&self.origin, kind, message);
+        }
+        SceneError::at(&self.origin, &self.text, locate(&self.text, path), kind, message)
+    }
+}
+
+/// What the parser refused, in words.
+fn refused(origin: &str, text: &str, error: &SpannedError) -> SceneError {
+    use ron::Error;
+    let inside =
+        |outer: &Option<String>| outer.as_ref().map_or(String::new(), |outer| format!(" in {outer}"));
+    let listed = |names: &[&str]| names.iter().map(|name| format!("`{name}`")).collect::<Vec<_>>().join(", ");
+    let wrong = |what: &str, found: &str, outer: &Option<String>, names: &'static [&'static str]| {
+        let shown: String = found.chars().take(80).collect();
+        let names_there = listed(names);
+        match nearest(found, names.iter().copied()) {
+            Some(near) => {
+                format!(
+                    "unknown {what} `{shown}`{}; did you mean `{near}`? There are {names_there}",
+                    inside(outer)
+                )
+            }
+            None => format!("unknown {what} `{shown}`{}; expected one of {names_there}", inside(outer)),
+        }
+    };
+    let (kind, message) = match &error.code {
+        Error::NoSuchStructField { expected, found, outer } => {
+            (SceneErrorKind::Field, wrong("field", found, outer, expected))
+        }
+        Error::NoSuchEnumVariant { expected, found, outer } => {
+            (SceneErrorKind::Field, wrong("value", found, outer, expected))
+        }
+        Error::MissingStructField { field, outer } => {
+            (SceneErrorKind::Field, format!("the field `{field}` is missing{}", inside(outer)))
+        }
+        Error::DuplicateStructField { field, outer } => {
+            (SceneErrorKind::Field, format!("the field `{field}` is there twice{}", inside(outer)))
+        }
+        Error::ExceededRecursionLimit => {
+            (SceneErrorKind::Syntax, "brackets are nested deeper than any scene's".to_owned())
+        }
+        _ if text.trim().is_empty() => {
+            (SceneErrorKind::Syntax, "the file is empty; expected a scene: `(bodies: [..])`".to_owned())
+        }
+        // Some repeat what they found, however long that is.
+        other => (SceneErrorKind::Syntax, other.to_string().chars().take(400).collect()),
+    };
+    let start = error.span.start;
+    SceneError::at_position(origin, text, (start.line, start.col), kind, message)
+}
+
+/// Loads scene files (`.ron`) as [`SceneFile`]s.
+#[derive(Default, TypePath)]
+pub struct SceneFileLoader;
+
+impl AssetLoader for SceneFileLoader {
+    type Asset = SceneFile;
+    type Settings = ();
+    type Error = SceneError;
+
+    async fn load(
+        &self,
+        reader: &mut dyn Reader,
+        _settings: &Self::Settings,
+        load_context: &mut LoadContext<'_>,
+    ) -> Result<Self::Asset, Self::Error> {
+        let origin = load_context.path().to_string();
+        let mut bytes = Vec::new();
+        let read = reader.take(MAX_BYTES as u64 + 1).read_to_end(&mut bytes).await;
+        read.map_err(|error| {
+            SceneError::without_place(
+                &origin,
+                SceneErrorKind::Read,
+                format!("the scene cannot be read: {error}"),
+            )
+        })?;
+        SceneFile::from_bytes(&bytes, &origin)
+    }
+
+    fn extensions(&self) -> &[&str] {
+        &["scene.ron", "ron"]
+    }
+}

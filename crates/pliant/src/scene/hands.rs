@@ -1,0 +1,134 @@
+//! Hands that play the scene's scripts.
+
+use bevy::{math::DVec3, prelude::*};
+
+use super::locate::Step::Field;
+use super::motion::smooth;
+use super::spawn::{self, PartOf, SceneBody, SceneClock, Source};
+use super::{GrabEntry, PatchEntry, SceneError, SceneErrorKind};
+use crate::body::{BodyState, Grab, GrabForce, GrabOf, ShownState};
+use crate::modal::{ModalModel, Patch};
+
+/// A hand of a scene, between its times a [`Grab`].
+#[derive(Component, Debug)]
+pub(super) struct ScriptedHand {
+    entry: GrabEntry,
+    /// Where the patch was when it took hold, m, and when that was, s of the scene.
+    held: Option<(DVec3, f64)>,
+    /// It cannot hold what it is to hold, and that was said.
+    refused: bool,
+}
+
+impl ScriptedHand {
+    pub(super) fn new(entry: GrabEntry) -> Self {
+        Self { entry, held: None, refused: false }
+    }
+}
+
+/// The vertex that a patch is round.
+pub(super) fn vertex_of(patch: &PatchEntry, model: &ModalModel) -> Result<u32, String> {
+    let positions = model.surface().positions();
+    let place = |p: &[f32; 3]| Vec3::from(*p).as_dvec3();
+    let best = |measure: &dyn Fn(DVec3) -> f64| {
+        (0..positions.len())
+            .max_by(|&a, &b| measure(place(&positions[a])).total_cmp(&measure(place(&positions[b]))))
+    };
+    let found = match patch {
+        PatchEntry::Toward(way) => best(&|at| at.dot((*way).into())),
+        PatchEntry::Near(point) => best(&|at| -at.distance_squared((*point).into())),
+        PatchEntry::Vertex(vertex) => Some(*vertex as usize).filter(|&vertex| vertex < positions.len()),
+    };
+    let found = found.and_then(|vertex| u32::try_from(vertex).ok());
+    found.ok_or_else(|| match patch {
+        PatchEntry::Vertex(vertex) => {
+            format!(
+                "expected a vertex of the surface, 0 to {}, got {vertex}",
+                positions.len().saturating_sub(1)
+            )
+        }
+        _ => "the body has no surface".into(),
+    })
+}
+
+/// A patch's radius where the scene gives none, as a part of the body's size.
+const RADIUS: f64 = 0.06;
+
+/// A patch on a body as it is now: its vertex, its radius, and its middle in the world, m.
+fn take_hold(
+    entry: &GrabEntry,
+    state: &BodyState,
+    shown: &ShownState,
+    place: &GlobalTransform,
+) -> Result<(u32, f64, DVec3), String> {
+    let model = state.model();
+    let vertex = vertex_of(&entry.patch, model)?;
+    let radius = entry.radius.unwrap_or(RADIUS * model.size());
+    let patch = Patch::around(model.surface(), vertex, radius).map_err(|error| error.to_string())?;
+    let positions = state.positions_at(shown.q());
+    let middle: DVec3 = patch
+        .entries()
+        .iter()
+        .filter_map(|&(v, weight)| Some(Vec3::from(*positions.get(v as usize)?).as_dvec3() * weight))
+        .sum();
+    Ok((vertex, radius, place.transform_point(middle.as_vec3()).as_dvec3()))
+}
+
+/// In the bodies' schedule, before the tick: hands take hold, go where they are to be, let go.
+pub(super) fn play(
+    mut commands: Commands,
+    time: Res<Time>,
+    clocks: Query<(&SceneClock, &GlobalTransform)>,
+    bodies: Query<(Entity, &Name, &PartOf, &BodyState, &ShownState, &GlobalTransform), With<SceneBody>>,
+    mut hands: Query<(Entity, &mut ScriptedHand, &PartOf, &Source, Option<&mut Grab>)>,
+) {
+    for (entity, mut hand, part, source, grab) in &mut hands {
+        let Ok((clock, scene)) = clocks.get(part.0) else { continue };
+        let Some(t) = clock.at(time.elapsed_secs_f64()) else { continue };
+        let entry = &hand.entry;
+        let holds = t >= entry.from && entry.until.is_none_or(|until| t < until);
+        match (hand.held, grab) {
+            (Some(_), _) if !holds => {
+                commands.entity(entity).remove::<(Grab, GrabOf, GrabForce)>();
+                hand.held = None;
+            }
+            (Some((from, since)), Some(mut grab)) => {
+                let t = t - since;
+                let rise = if entry.rise > 0.0 { smooth(t / entry.rise) } else { 1.0 };
+                let way = rise * (DVec3::from(entry.pull) + entry.motion.at(t));
+                let target = from + scene.affine().transform_vector3(way.as_vec3()).as_dvec3();
+                if grab.target != target {
+                    grab.target = target;
+                }
+            }
+            (None, _) if holds && !hand.refused => {
+                let body =
+                    bodies.iter().find(|(_, name, of, ..)| of.0 == part.0 && name.as_str() == entry.body);
+                // One that went is waited for: in a session it may come back.
+                let Some((body, _, _, state, shown, place)) = body else { continue };
+                match take_hold(entry, state, shown, place) {
+                    Ok((vertex, radius, from)) => {
+                        let grab = Grab {
+                            stiffness: entry.stiffness,
+                            relaxation: entry.relaxation,
+                            ..Grab::new(vertex, radius, from)
+                        };
+                        commands.entity(entity).insert((grab, GrabOf(body)));
+                        hand.held = Some((from, t));
+                    }
+                    Err(problem) => {
+                        let message =
+                            format!("the grab `{}` cannot hold `{}`: {problem}", entry.name, entry.body);
+                        let path = [source.path.as_slice(), &[Field("patch")]].concat();
+                        let error: SceneError = source.file.error(&path, SceneErrorKind::Asset, message);
+                        let instance = part.0;
+                        commands.queue(move |world: &mut World| spawn::fail(world, instance, error));
+                        hand.refused = true;
+                    }
+                }
+            }
+            // The body went, and the grab with it.
+            (Some(_), None) => hand.held = None,
+            (None, _) => {}
+        }
+    }
+}

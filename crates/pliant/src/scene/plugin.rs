@@ -1,0 +1,213 @@
+//! The plugin: scene files as assets, and whole scenes with what they need of an app.
+
+use std::{
+    path::PathBuf,
+    sync::{Mutex, PoisonError},
+};
+
+use bevy::{
+    asset::io::file::FileAssetReader,
+    ecs::schedule::{InternedScheduleLabel, ScheduleLabel},
+    prelude::*,
+};
+
+use super::locate::Step::{Field, Item};
+use super::{
+    SceneError, SceneErrorKind, SceneFailed, SceneFile, SceneFileLoader, SceneInstance, hands, spawn,
+};
+use crate::body::PliantSystems;
+
+/// Scene files as assets; add it after [`PliantPlugins`](crate::PliantPlugins).
+///
+/// By `default()` it only makes what a [`SceneInstance`] asks for: bodies, hands, and tools where the app has a `HapticsPlugin`. A scene that is
+/// [opened](Self::open) is there from the start, with the session, the device and the recording that it asks for.
+///
+/// ```no_run
+/// use bevy::prelude::*;
+/// use pliant::{prelude::*, scene::{SceneFile, SceneFilePlugin}};
+///
+/// # fn main() -> Result<(), pliant::scene::SceneError> {
+/// let scene = SceneFilePlugin::open(SceneFile::read("assets/scenes/solo.ron")?)?;
+/// App::new().add_plugins((DefaultPlugins, PliantPlugins::default(), scene)).run();
+/// # Ok(()) }
+/// ```
+pub struct SceneFilePlugin {
+    schedule: InternedScheduleLabel,
+    role: Role,
+    file: Option<SceneFile>,
+    #[cfg(feature = "net")]
+    network: Mutex<Option<super::network::Opened>>,
+    #[cfg(feature = "net")]
+    invite: Option<crate::net::Invite>,
+}
+
+/// Whose an instance is.
+#[derive(Component, Debug, Default, Clone, Copy, PartialEq, Eq)]
+pub(super) enum Role {
+    /// A game's, which has its own session and recording, or none.
+    #[default]
+    Asset,
+    /// The app was built for it.
+    Opened,
+    /// It is what the guest beside a host has.
+    #[cfg_attr(not(feature = "net"), expect(dead_code, reason = "guests come with the network"))]
+    Guest,
+}
+
+/// The folder of assets, for files that Bevy does not load.
+#[derive(Resource, Debug, Clone)]
+pub(super) struct AssetRoot(pub(super) PathBuf);
+
+impl Default for SceneFilePlugin {
+    /// Scenes are loaded by the game; their hands move in `FixedUpdate`.
+    fn default() -> Self {
+        Self {
+            schedule: FixedUpdate.intern(),
+            role: Role::Asset,
+            file: None,
+            #[cfg(feature = "net")]
+            network: Mutex::new(None),
+            #[cfg(feature = "net")]
+            invite: None,
+        }
+    }
+}
+
+impl SceneFilePlugin {
+    /// The app is for this scene: the session is opened now, so that its invite is known before the app runs; the device and the recording with
+    /// the app.
+    ///
+    /// # Errors
+    /// [`SceneErrorKind::Feature`] when the program was compiled without what the scene asks for, [`SceneErrorKind::Open`] when the session's
+    /// socket cannot be opened.
+    pub fn open(file: SceneFile) -> Result<Self, SceneError> {
+        compiled(&file)?;
+        #[cfg(feature = "net")]
+        let opened =
+            file.scene().network.as_ref().map(|entry| super::network::open(&file, entry)).transpose()?;
+        Ok(Self {
+            role: Role::Opened,
+            #[cfg(feature = "net")]
+            invite: opened.as_ref().and_then(|opened| opened.net.invite().cloned()),
+            #[cfg(feature = "net")]
+            network: Mutex::new(opened),
+            file: Some(file),
+            ..Self::default()
+        })
+    }
+
+    /// What a guest beside the host has of the scene.
+    #[cfg(feature = "net")]
+    pub(super) fn guest(file: SceneFile) -> Self {
+        Self { role: Role::Guest, file: Some(file), ..Self::default() }
+    }
+
+    /// The schedule in which the bodies are stepped, where it is not `FixedUpdate`.
+    pub fn in_schedule(mut self, schedule: impl ScheduleLabel) -> Self {
+        self.schedule = schedule.intern();
+        self
+    }
+
+    /// What others paste to join a scene that hosts or is a peer.
+    #[cfg(feature = "net")]
+    pub fn invite(&self) -> Option<&crate::net::Invite> {
+        self.invite.as_ref()
+    }
+}
+
+impl Plugin for SceneFilePlugin {
+    fn build(&self, app: &mut App) {
+        let folder = app.get_added_plugins::<AssetPlugin>();
+        let folder = folder.first().map_or("assets", |plugin| plugin.file_path.as_str());
+        let root = FileAssetReader::get_base_path().join(folder);
+        app.insert_resource(AssetRoot(root))
+            .init_asset::<SceneFile>()
+            .init_asset_loader::<SceneFileLoader>()
+            .add_message::<SceneFailed>()
+            .add_systems(PostUpdate, (spawn::watch, spawn::make).chain().after(TransformSystems::Propagate))
+            .add_systems(self.schedule, (spawn::begin, hands::play).chain().before(PliantSystems::Input));
+        #[cfg(feature = "bake")]
+        app.add_systems(PostUpdate, spawn::watch_bakes);
+        let Some(file) = &self.file else {
+            self.build_devices(app);
+            return;
+        };
+        let scene = file.scene();
+        if let Some(hz) = scene.step_hz {
+            app.insert_resource(Time::<Fixed>::from_hz(hz));
+        }
+        #[cfg(feature = "bake")]
+        if scene.bodies.iter().any(|body| body.bake.is_some())
+            && !app.is_plugin_added::<crate::body::BakePlugin>()
+        {
+            app.add_plugins(crate::body::BakePlugin::default());
+        }
+        #[cfg(feature = "net")]
+        if let Some(opened) = self.network.lock().unwrap_or_else(PoisonError::into_inner).take() {
+            super::network::build(app, opened, file);
+        }
+        if self.role == Role::Opened {
+            #[cfg(feature = "haptics")]
+            if scene.device.is_some() && !app.is_plugin_added::<crate::haptics::HapticsPlugin>() {
+                app.add_plugins(crate::haptics::HapticsPlugin::new(self.schedule));
+            }
+            #[cfg(feature = "rerun")]
+            if let Some(recording) = &scene.recording
+                && !app.is_plugin_added::<crate::rerun::RerunPlugin>()
+            {
+                app.add_plugins(recording.plugin(&scene.title).in_schedule(self.schedule));
+            }
+        }
+        self.build_devices(app);
+        let (file, role) = (file.clone(), self.role);
+        let spawn = move |mut commands: Commands, mut files: ResMut<Assets<SceneFile>>| {
+            commands.spawn((SceneInstance(files.add(file.clone())), role, Name::new("scene")));
+        };
+        app.add_systems(Startup, spawn);
+    }
+}
+
+impl SceneFilePlugin {
+    #[cfg(feature = "haptics")]
+    fn build_devices(&self, app: &mut App) {
+        use crate::haptics::HapticSystems;
+        app.add_observer(super::device::close).add_systems(
+            self.schedule,
+            super::device::play.after(spawn::begin).before(HapticSystems::Move).before(PliantSystems::Input),
+        );
+    }
+
+    #[cfg(not(feature = "haptics"))]
+    fn build_devices(&self, _: &mut App) {}
+}
+
+/// Refuses a scene that asks for what this program does not have.
+fn compiled(file: &SceneFile) -> Result<(), SceneError> {
+    let scene = file.scene();
+    if cfg!(not(feature = "net")) && scene.network.is_some() {
+        return without(file, &[Field("network")], "a network", "net");
+    }
+    if cfg!(not(feature = "haptics")) && scene.device.is_some() {
+        return without(file, &[Field("device")], "a device", "haptics");
+    }
+    if cfg!(not(feature = "rerun")) && scene.recording.is_some() {
+        return without(file, &[Field("recording")], "a recording", "rerun");
+    }
+    let bakes = scene.bodies.iter().position(|body| body.bake.is_some());
+    match bakes.filter(|_| cfg!(not(feature = "bake"))) {
+        Some(body) => without(file, &[Field("bodies"), Item(body), Field("bake")], "a bake", "bake"),
+        None => Ok(()),
+    }
+}
+
+pub(super) fn without(
+    file: &SceneFile,
+    path: &[super::locate::Step],
+    what: &str,
+    feature: &str,
+) -> Result<(), SceneError> {
+    let message = format!(
+        "this scene asks for {what}, this program was compiled without `{feature}` (a feature of `pliant`)"
+    );
+    Err(file.error(path, SceneErrorKind::Feature, message))
+}

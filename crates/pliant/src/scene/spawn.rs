@@ -1,0 +1,363 @@
+//! A scene becomes entities: bodies, hands, tools.
+
+use bevy::{asset::AssetLoadFailedEvent, math::DVec3, prelude::*};
+
+use super::locate::Step::{self, Field, Item};
+#[cfg(feature = "bake")]
+use super::plugin::AssetRoot;
+use super::plugin::Role;
+use super::{
+    BodyEntry, By, IntegratorEntry, NetworkEntry, PlaceEntry, SceneError, SceneErrorKind, SceneFile,
+};
+use crate::body::{BodyState, Integration, ModalAsset, ModalBody, NoPointerGrab, Viscoelastic};
+
+/// A scene in the world: spawn it, and the scene's bodies, hands and tools come as soon as the file is loaded, where this entity is. They are
+/// its [`SceneParts`] and go with it. When the file changes (Bevy's `file_watcher`), all of them are made anew.
+///
+/// ```
+/// # use bevy::prelude::*;
+/// # use pliant::scene::SceneInstance;
+/// fn setup(mut commands: Commands, assets: Res<AssetServer>) {
+///     commands.spawn((SceneInstance(assets.load("scenes/solo.ron")), Transform::from_xyz(2.0, 0.0, 0.0)));
+/// }
+/// ```
+#[derive(Component, Debug, Clone)]
+#[require(Transform, Visibility, SceneClock)]
+pub struct SceneInstance(pub Handle<SceneFile>);
+
+/// The clock of a [`SceneInstance`]'s scripts: it begins when all bodies of the scene are there.
+#[derive(Component, Debug, Default, Clone, Copy, PartialEq)]
+pub struct SceneClock {
+    pub(super) began: Option<f64>,
+}
+
+impl SceneClock {
+    /// Seconds since it began at `now`, the elapsed time of the schedule that the bodies are stepped in. `None`: not all bodies are there.
+    pub fn at(&self, now: f64) -> Option<f64> {
+        self.began.map(|began| (now - began).max(0.0))
+    }
+}
+
+/// The [`SceneInstance`] that an entity is of.
+#[derive(Component, Debug, Clone, Copy, PartialEq, Eq)]
+#[relationship(relationship_target = SceneParts)]
+pub struct PartOf(#[entities] pub Entity);
+
+/// What a [`SceneInstance`] has made. Despawned with it.
+#[derive(Component, Debug, Default)]
+#[relationship_target(relationship = PartOf, linked_spawn)]
+pub struct SceneParts(Vec<Entity>);
+
+impl SceneParts {
+    /// The entities: bodies, hands, tools.
+    pub fn entities(&self) -> &[Entity] {
+        &self.0
+    }
+}
+
+/// A body of a scene; its `Name` is the entry's.
+#[derive(Component, Debug, Clone, Copy, PartialEq, Eq)]
+pub struct SceneBody {
+    /// Its entry in [`SceneDescription::bodies`](super::SceneDescription::bodies).
+    pub entry: usize,
+}
+
+/// Sent, and logged, when a scene cannot be read, or something that it names is not there. What else is in it goes on.
+#[derive(Message, Debug, Clone)]
+pub struct SceneFailed {
+    /// The entity of the [`SceneInstance`].
+    pub instance: Entity,
+    /// Where in the file, and what was expected.
+    pub error: SceneError,
+}
+
+/// What a part of a scene was made from, to say where in the file a mistake is.
+#[derive(Component, Debug, Clone)]
+pub(super) struct Source {
+    pub(super) file: SceneFile,
+    pub(super) path: Vec<Step>,
+}
+
+/// The model of a body that a host will send, so that it is known here.
+#[derive(Component)]
+#[expect(dead_code, reason = "held, so that the asset stays")]
+struct Kept(Handle<ModalAsset>);
+
+/// The file that an instance was made from.
+#[derive(Component)]
+pub(super) struct Made;
+
+pub(super) fn fail(world: &mut World, instance: Entity, error: SceneError) {
+    error!("{error}");
+    world.write_message(SceneFailed { instance, error });
+}
+
+/// Instances whose file is there, or has changed, are made.
+pub(super) fn make(
+    mut commands: Commands,
+    mut changes: MessageReader<AssetEvent<SceneFile>>,
+    instances: Query<(Entity, &SceneInstance, Has<Made>)>,
+    files: Res<Assets<SceneFile>>,
+) {
+    let changed: Vec<AssetId<SceneFile>> = changes
+        .read()
+        .filter_map(|event| if let AssetEvent::Modified { id } = event { Some(*id) } else { None })
+        .collect();
+    for (instance, handle, made) in &instances {
+        if made && !changed.contains(&handle.0.id()) {
+            continue;
+        }
+        let Some(file) = files.get(&handle.0) else { continue };
+        let file = file.clone();
+        commands.queue(move |world: &mut World| build(world, instance, &file));
+    }
+}
+
+/// A file that cannot be read, and models that are not there.
+pub(super) fn watch(
+    mut commands: Commands,
+    mut scenes: MessageReader<AssetLoadFailedEvent<SceneFile>>,
+    mut models: MessageReader<AssetLoadFailedEvent<ModalAsset>>,
+    instances: Query<(Entity, &SceneInstance)>,
+    bodies: Query<(&PartOf, &SceneBody, &ModalBody, &Source)>,
+) {
+    for failed in scenes.read() {
+        for (instance, _) in instances.iter().filter(|(_, handle)| handle.0.id() == failed.id) {
+            // The loader's own error is the one with the line.
+            let message = failed.error.to_string();
+            let error = match &failed.error {
+                bevy::asset::AssetLoadError::AssetLoaderError(inner) => {
+                    inner.error().downcast_ref::<SceneError>().cloned()
+                }
+                _ => None,
+            };
+            let path = failed.path.to_string();
+            let error =
+                error.unwrap_or_else(|| SceneError::without_place(&path, SceneErrorKind::Read, message));
+            commands.queue(move |world: &mut World| fail(world, instance, error));
+        }
+    }
+    for failed in models.read() {
+        let mut told = Vec::new();
+        for (part, body, _, source) in bodies.iter().filter(|(.., body, _)| body.model.id() == failed.id) {
+            // Once for all copies.
+            if told.contains(&(part.0, body.entry)) {
+                continue;
+            }
+            told.push((part.0, body.entry));
+            let message = format!(
+                "the body `{}` cannot be loaded: {}",
+                source.file.scene().bodies.get(body.entry).map_or("", |entry| entry.name.as_str()),
+                failed.error
+            );
+            let path = [source.path.as_slice(), &[Field("model")]].concat();
+            let error = source.file.error(&path, SceneErrorKind::Asset, message);
+            let instance = part.0;
+            commands.queue(move |world: &mut World| fail(world, instance, error));
+        }
+    }
+}
+
+/// Bodies that cannot be baked.
+#[cfg(feature = "bake")]
+pub(super) fn watch_bakes(
+    mut commands: Commands,
+    mut failures: Option<MessageReader<crate::body::BakeFailed>>,
+    bodies: Query<(&PartOf, &Name, &Source), With<SceneBody>>,
+) {
+    for failed in failures.iter_mut().flat_map(|failures| failures.read()) {
+        let Ok((part, name, source)) = bodies.get(failed.entity) else { continue };
+        let message = format!("the body `{name}` cannot be made: {}", failed.error);
+        let path = [source.path.as_slice(), &[Field("bake"), Field("shape")]].concat();
+        let error = source.file.error(&path, SceneErrorKind::Asset, message);
+        let instance = part.0;
+        commands.queue(move |world: &mut World| fail(world, instance, error));
+    }
+}
+
+/// The scripts' time begins when everybody is there.
+pub(super) fn begin(
+    time: Res<Time>,
+    mut instances: Query<(&mut SceneClock, &SceneParts), With<Made>>,
+    bodies: Query<Has<BodyState>, With<SceneBody>>,
+) {
+    for (mut clock, parts) in &mut instances {
+        if clock.began.is_none() && parts.entities().iter().all(|part| bodies.get(*part).unwrap_or(true)) {
+            clock.began = Some(time.elapsed_secs_f64());
+        }
+    }
+}
+
+fn build(world: &mut World, instance: Entity, file: &SceneFile) {
+    let Ok(mut entity) = world.get_entity_mut(instance) else { return };
+    // A scene that is made anew.
+    entity.despawn_related::<SceneParts>();
+    entity.insert((Made, SceneClock::default()));
+    let place = entity.get::<GlobalTransform>().copied().unwrap_or_default();
+    let role = entity.get::<Role>().copied().unwrap_or_default();
+    let scene = file.scene();
+    if role == Role::Asset && (scene.network.is_some() || scene.recording.is_some()) {
+        let (field, what) =
+            if scene.network.is_some() { ("network", "a network") } else { ("recording", "a recording") };
+        let message = format!(
+            "this scene asks for {what}, which an app gets when it is built; expected it to be given to `SceneFilePlugin::open`"
+        );
+        let error = file.error(&[Field(field)], SceneErrorKind::Feature, message);
+        return fail(world, instance, error);
+    }
+    for (entry, body) in scene.bodies.iter().enumerate() {
+        for copy in 0..body.count() {
+            spawn_body(world, instance, file, place, role, (entry, body), copy);
+        }
+    }
+    let ours = if role == Role::Guest { By::Guest } else { By::Here };
+    for (entry, grab) in scene.grabs.iter().enumerate().filter(|(_, grab)| grab.by == ours) {
+        world.spawn((
+            Name::new(grab.name.clone()),
+            super::hands::ScriptedHand::new(grab.clone()),
+            Source { file: file.clone(), path: vec![Field("grabs"), Item(entry)] },
+            PartOf(instance),
+        ));
+    }
+    if let Some(device) = scene.device.as_ref().filter(|_| role != Role::Guest) {
+        #[cfg(feature = "haptics")]
+        let added = super::device::add(world, instance, file, device);
+        #[cfg(not(feature = "haptics"))]
+        let added = {
+            let _ = device;
+            super::plugin::without(file, &[Field("device")], "a device", "haptics")
+        };
+        if let Err(error) = added {
+            fail(world, instance, error);
+        }
+    }
+    #[cfg(feature = "net")]
+    if role == Role::Opened {
+        super::network::spawn_views(world, instance, file, place);
+    }
+}
+
+fn spawn_body(
+    world: &mut World,
+    instance: Entity,
+    file: &SceneFile,
+    place: GlobalTransform,
+    role: Role,
+    (entry, body): (usize, &BodyEntry),
+    copy: usize,
+) {
+    let scene = file.scene();
+    let shared = body.shared.unwrap_or(scene.network.is_some());
+    // What a guest has comes from its host.
+    let guest = role == Role::Guest || (shared && matches!(scene.network, Some(NetworkEntry::Join { .. })));
+    if role == Role::Guest && !shared {
+        return;
+    }
+    let transform = place.mul_transform(body.transform(copy)).compute_transform();
+    let path = vec![Field("bodies"), Item(entry)];
+    let mut spawned = world.spawn((
+        Name::new(body.name_of(copy)),
+        SceneBody { entry },
+        Source { file: file.clone(), path },
+        PartOf(instance),
+        transform,
+    ));
+    #[cfg(feature = "net")]
+    if shared {
+        spawned.insert(crate::net::SharedBody::named(body.name_of(copy)));
+    }
+    if !body.pointer {
+        spawned.insert(NoPointerGrab);
+    }
+    let id = spawned.id();
+    if let Some(model) = body.model.clone() {
+        let Some(assets) = world.get_resource::<AssetServer>() else { return };
+        let model = assets.load(model);
+        // A model that is here need not be sent.
+        let mut made = world.entity_mut(id);
+        if guest {
+            made.insert(Kept(model))
+        } else {
+            made.insert(ModalBody { model, ..body.modal() })
+        };
+    }
+    #[cfg(feature = "bake")]
+    if let Some(bake) = body.bake.as_ref().filter(|_| !guest) {
+        use crate::bake::{Anchor, BakeConfig};
+        use crate::body::{BakeRequest, BakeShape};
+        use crate::modal::Damping;
+        let root = world.get_resource::<AssetRoot>().map(|root| root.0.clone()).unwrap_or_default();
+        let config = BakeConfig {
+            name: body.name.clone(),
+            modes: bake.modes,
+            young: bake.young,
+            poisson: bake.poisson,
+            density: bake.density,
+            damping: Damping::Ratio(bake.damping_ratio),
+            // They were read before, by the check.
+            anchors: bake.anchors.iter().filter_map(|anchor| anchor.parse::<Anchor>().ok()).collect(),
+            ..default()
+        };
+        let shape = BakeShape::File(root.join(&bake.shape));
+        let request = BakeRequest { tets: bake.tets, config, ..BakeRequest::new(shape) };
+        world.entity_mut(id).insert((body.modal(), request));
+    }
+    #[cfg(feature = "render")]
+    if let Some(mut materials) = world.get_resource_mut::<Assets<StandardMaterial>>() {
+        let [r, g, b] = body.colour.map(|part| part as f32);
+        let material = materials.add(StandardMaterial {
+            base_color: Color::srgb(r, g, b),
+            perceptual_roughness: body.roughness as f32,
+            ..default()
+        });
+        world.entity_mut(id).insert(MeshMaterial3d(material));
+    }
+}
+
+impl PlaceEntry {
+    /// As Bevy has it: turned about x, then y, then z.
+    pub fn transform(&self) -> Transform {
+        let [x, y, z] = self.turn.map(|degrees| degrees.to_radians() as f32);
+        Transform {
+            translation: DVec3::from(self.at).as_vec3(),
+            rotation: Quat::from_euler(EulerRot::ZYX, z, y, x),
+            scale: Vec3::splat(self.scale as f32),
+        }
+    }
+}
+
+impl BodyEntry {
+    /// Where its copy of this number is, in the scene.
+    pub fn transform(&self, copy: usize) -> Transform {
+        let mut place = self.place.transform();
+        if let Some(copies) = self.copies {
+            let columns = copies.count[0].max(1);
+            let middle = |count: usize| (count.saturating_sub(1)) as f64 / 2.0;
+            let x = (copy % columns) as f64 - middle(copies.count[0]);
+            let z = (copy / columns) as f64 - middle(copies.count[1]);
+            place.translation +=
+                Vec3::new((x * copies.spacing[0]) as f32, 0.0, (z * copies.spacing[1]) as f32);
+        }
+        place
+    }
+
+    /// Its settings, without a model.
+    pub(super) fn modal(&self) -> ModalBody {
+        let defaults = ModalBody::default();
+        ModalBody {
+            integrator: match self.integrator {
+                IntegratorEntry::Exact => Integration::Exact,
+                IntegratorEntry::Newmark => Integration::Newmark,
+                IntegratorEntry::GeneralizedAlpha { rho_inf } => Integration::GeneralizedAlpha { rho_inf },
+            },
+            modes: self.modes,
+            warp: self.warp,
+            damping_scale: self.damping,
+            relaxation: self.relaxation.map(|entry| Viscoelastic { ratio: entry.ratio, time: entry.time }),
+            corrections: self.corrections.unwrap_or(defaults.corrections),
+            gravity: self.gravity.into(),
+            rest_speed: self.rest_speed.unwrap_or(defaults.rest_speed),
+            ..defaults
+        }
+    }
+}

@@ -1,0 +1,510 @@
+//! What a person is told about a scene that is wrong, and what a right one becomes.
+
+use std::time::Duration;
+
+use bevy::{prelude::*, time::TimeUpdateStrategy};
+
+use super::*;
+use crate::body::{BodyState, Grab, GrabForce, ModalBody};
+use crate::prelude::PliantPlugins;
+
+/// A scene that is right, line by line.
+const GOOD: &str = r#"(
+    title: "one",
+    bodies: [
+        (name: "pip", model: "pip.modal"),
+        (name: "bud", model: "bud.modal", place: (at: (0.5, 0, 0))),
+    ],
+    grabs: [
+        (name: "left", body: "pip", patch: Toward((1, 0, 0))),
+        (name: "right", body: "pip", patch: Near((0, 0.2, 0)), stiffness: 200),
+    ],
+)"#;
+
+fn refused(text: &str) -> SceneError {
+    SceneFile::from_ron(text, "my.ron").expect_err("this scene is wrong")
+}
+
+/// The good scene with a part of it replaced.
+fn with(part: &str, by: &str) -> SceneError {
+    assert!(GOOD.contains(part));
+    refused(&GOOD.replacen(part, by, 1))
+}
+
+#[test]
+fn a_good_scene_is_read() {
+    let scene = SceneFile::from_ron(GOOD, "my.ron").unwrap();
+    assert_eq!((scene.scene().bodies.len(), scene.scene().grabs.len()), (2, 2));
+    assert_eq!(scene.scene().grabs[1].stiffness, Some(200.0));
+    assert_eq!(SceneFile::new(scene.scene().clone()).unwrap().scene(), scene.scene());
+}
+
+#[test]
+fn a_typo_and_an_unknown_field_are_told_with_what_was_expected() {
+    let error = with("model: \"bud.modal\"", "modle: \"bud.modal\"");
+    assert_eq!((error.position, error.kind), (Some((5, 23)), SceneErrorKind::Field));
+    let text = error.to_string();
+    assert!(text.starts_with("my.ron:5:23: unknown field `modle` in Body; did you mean `model`?"), "{text}");
+    assert!(
+        text.ends_with(
+            "  5 |         (name: \"bud\", modle: \"bud.modal\", place: (at: (0.5, 0, 0))),\n    |                       ^"
+        ),
+        "{text}"
+    );
+
+    let error = with("title", "wind_speed");
+    assert_eq!(error.position, Some((2, 5)));
+    assert!(
+        error.message.starts_with(
+            "unknown field `wind_speed` in Scene; expected one of `title`, `step_hz`, `view`, `bodies`"
+        ),
+        "{error}"
+    );
+
+    let error = with("Toward((1", "Twoard((1");
+    assert_eq!(error.position, Some((8, 44)));
+    assert!(error.message.starts_with("unknown value `Twoard` in Patch; did you mean `Toward`?"), "{error}");
+}
+
+#[test]
+fn what_is_no_ron_is_told_where_it_ends_to_be_one() {
+    let error = with("(name: \"pip\", model", "(name: \"pip\" model");
+    assert_eq!(error.to_string().lines().next(), Some("my.ron:4:22: Expected comma"));
+    let error = with("stiffness: 200", "stiffness: \"200\"");
+    assert_eq!((error.position, error.kind), (Some((9, 74)), SceneErrorKind::Syntax), "{error}");
+    let error = with("model: \"pip.modal\"", "modes: 3, modes: 4");
+    assert_eq!(error.position.unwrap().0, 4);
+    assert!(error.message.contains("`modes` is there twice in Body"), "{error}");
+    let error = with("name: \"left\", ", "");
+    assert_eq!(error.position.unwrap().0, 8);
+    assert!(error.message.contains("the field `name` is missing in Grab"), "{error}");
+    assert_eq!(refused("").to_string(), "my.ron:1:1: the file is empty; expected a scene: `(bodies: [..])`");
+    assert!(refused("  \n ").message.starts_with("the file is empty"));
+}
+
+#[test]
+fn names_that_are_there_twice_or_not_at_all() {
+    let error = with("name: \"right\"", "name: \"left\"");
+    assert_eq!(
+        error.to_string().lines().next(),
+        Some(
+            "my.ron:9:16: the grab `left` is there already, in line 8, where it holds `pip`; every grab needs a name of its own"
+        )
+    );
+    let error = with("\"right\", body: \"pip\"", "\"right\", body: \"pup\"");
+    assert_eq!(
+        error.to_string().lines().next(),
+        Some(
+            "my.ron:9:31: the grab `right` holds a body `pup` that is not in the scene; did you mean `pip`?"
+        )
+    );
+    let error = with("\"right\", body: \"pip\"", "\"right\", body: \"dragon\"");
+    assert!(error.message.ends_with("its bodies are `bud`, `pip`"), "{error}");
+    let error = with("name: \"bud\"", "name: \"pip\"");
+    assert_eq!(
+        error.to_string().lines().next(),
+        Some("my.ron:5:16: the body `pip` is there already, in line 4; every body needs a name of its own")
+    );
+    assert_eq!(error.kind, SceneErrorKind::Name);
+    // A copy's name is one, too.
+    let copies = GOOD
+        .replacen("name: \"bud\"", "name: \"b\", copies: (count: (2, 1), spacing: (1, 1))", 1)
+        .replacen("name: \"pip\"", "name: \"b.1\"", 1);
+    assert!(refused(&copies).message.starts_with("the body `b.1` is there already"));
+}
+
+#[test]
+fn numbers_out_of_their_range_are_told_where_they_are() {
+    for (part, by, wrong, words) in [
+        ("(0.5, 0, 0)", "(0.5, NaN, 0)", "NaN", "expected metres from -1000000 to 1000000, got NaN"),
+        ("(0.5, 0, 0)", "(inf, 0, 0)", "inf", "got inf"),
+        ("stiffness: 200", "stiffness: -1", "-1", "expected N/m above 0 and at most 1000000000, got -1"),
+        ("stiffness: 200", "stiffness: 1e999", "1e999", "got inf"),
+        (
+            "stiffness: 200",
+            "from: 2, until: 1.5",
+            "1.5",
+            "expected a time after `from`, which is 2 s, got 1.5",
+        ),
+        (
+            "stiffness: 200",
+            "motion: Path(points: [(at: 1, to: (0, 0, 0)), (at: 0.75, to: (0, 0, 0))])",
+            "0.75",
+            "expected a time after 1 s",
+        ),
+        ("Toward((1, 0, 0))", "Toward((-0, 0, 0))", "(-0", "expected a direction, got one without a length"),
+        ("title: \"one\"", "step_hz: 0", "0", "expected ticks a second from 1 to 2000, got 0"),
+        ("model: \"pip.modal\"", "model: \"../s.modal\"", "\"../s", "a path under the folder of assets"),
+        ("model: \"pip.modal\"", "model: \"/pip.modal\"", "\"/pip", "a path under the folder of assets"),
+        ("model: \"pip.modal\"", "model: \"pip.obj\"", "\"pip.obj", "a file that ends with .modal"),
+        ("model: \"pip.modal\"", "modes: 3", "\"pip\"", "is made of nothing"),
+        ("title: \"one\"", "recording: (file: \"/etc/x.rrd\")", "\"/etc", "below the working directory"),
+        ("title: \"one\"", "recording: (file: \"../x.rrd\")", "\"../", "below the working directory"),
+        ("title: \"one\"", "recording: ()", "()", "goes nowhere"),
+        ("place:", "copies: (count: (100000, 9), spacing: (1, 1)), place:", "100000", "a number of rows"),
+        (
+            "place:",
+            "copies: (count: (100, 99), spacing: (1, 1)), place:",
+            "(name: \"bud\"",
+            "at most 4096 bodies",
+        ),
+    ] {
+        let text = GOOD.replacen(part, by, 1);
+        let error = refused(&text);
+        assert!(error.message.contains(words), "{error}");
+        let before = &text[..text.find(wrong).unwrap()];
+        let place = (before.lines().count(), before.lines().last().unwrap().len() + 1);
+        assert_eq!(error.position, Some(place), "{error}");
+        assert_eq!(with(part, by), error);
+    }
+}
+
+#[cfg(feature = "net")]
+#[test]
+fn networks_by_names_that_there_are() {
+    let error = with("title: \"one\"", "network: Host(guest: (link: \"paper1\"))");
+    assert_eq!(error.position, Some((2, 33)), "{error}");
+    assert!(error.message.contains("did you mean `paper-1`? The networks are paper-1, paper-2"), "{error}");
+    let error = with("title: \"one\"", "network: Join(invite: \"http://here\")");
+    assert_eq!((error.position, error.kind), (Some((2, 27)), SceneErrorKind::Value), "{error}");
+    let error = with("title: \"one\"", "network: Host(listen: \"localhost\")");
+    assert!(error.message.contains("such as \"0.0.0.0:7400\""), "{error}");
+    let error = with("stiffness: 200", "by: Guest");
+    assert!(error.message.contains("the scene has none"), "{error}");
+}
+
+#[test]
+fn a_mistake_in_a_scene_without_a_text_has_no_line() {
+    let mut scene = SceneFile::from_ron(GOOD, "my.ron").unwrap().scene().clone();
+    scene.grabs[1].name = "left".into();
+    let error = SceneFile::new(scene).unwrap_err();
+    assert_eq!(error.position, None);
+    assert!(
+        error
+            .to_string()
+            .starts_with("a scene made in code: the grab `left` is there already, in another place")
+    );
+}
+
+#[test]
+fn no_input_panics_or_takes_long() {
+    // Deep, long, cut, and not text at all.
+    assert!(refused(&"(bodies: [".repeat(10_000)).message.len() < 400);
+    assert!(refused(&format!("(title: {}", "[".repeat(100_000))).to_string().len() < 2000);
+    assert!(refused(&format!("(bodies: {}", "(".repeat(100_000))).to_string().len() < 2000);
+    assert_eq!(refused(&"a".repeat(MAX_BYTES + 1)).kind, SceneErrorKind::Read);
+    assert!(refused(&"a".repeat(MAX_BYTES)).to_string().len() < 2000);
+    assert!(refused(&format!("({}: 1)", "b".repeat(100_000))).to_string().len() < 2000);
+    assert!(refused(&"/*".repeat(100_000)).to_string().len() < 2000);
+    for cut in (0..GOOD.len() - 1).filter(|&cut| GOOD.is_char_boundary(cut)) {
+        assert_ne!(refused(&GOOD[..cut]).to_string(), "");
+    }
+    // Every byte of it another one: no panic.
+    for at in 0..GOOD.len() {
+        for byte in [b'(', b')', b'"', b'-', b'9', 0] {
+            let mut bytes = GOOD.as_bytes().to_vec();
+            bytes[at] = byte;
+            let _ = SceneFile::from_ron(std::str::from_utf8(&bytes).unwrap(), "my.ron")
+                .map_err(|e| e.to_string());
+        }
+    }
+}
+
+#[test]
+fn a_file_that_is_too_long_or_no_text_or_not_there() {
+    let folder = std::env::temp_dir().join(format!("pliant-scene-{}", std::process::id()));
+    std::fs::create_dir_all(&folder).unwrap();
+    let file = folder.join("long.ron");
+    // A hundred megabytes, of which one is read.
+    std::fs::File::create(&file).unwrap().set_len(100 << 20).unwrap();
+    let began = std::time::Instant::now();
+    let error = SceneFile::read(&file).unwrap_err();
+    assert_eq!(error.kind, SceneErrorKind::Read);
+    assert!(error.message.contains("at most 1048576 bytes"), "{error}");
+    assert!(began.elapsed() < Duration::from_secs(2));
+    std::fs::write(&file, b"(bodies:\n [\xff]").unwrap();
+    let error = SceneFile::read(&file).unwrap_err();
+    assert_eq!((error.position, error.kind), (Some((2, 3)), SceneErrorKind::Read));
+    std::fs::remove_dir_all(&folder).unwrap();
+    let error = SceneFile::read(&file).unwrap_err();
+    assert!(error.to_string().contains("long.ron: the scene cannot be read: "), "{error}");
+}
+
+const ASSETS: &str = concat!(env!("CARGO_MANIFEST_DIR"), "/../../assets");
+
+fn app() -> App {
+    let mut app = App::new();
+    app.add_plugins((
+        MinimalPlugins,
+        AssetPlugin { file_path: ASSETS.into(), ..default() },
+        TransformPlugin,
+        bevy::diagnostic::DiagnosticsPlugin,
+        PliantPlugins::default().build().disable::<crate::body::PointerGrabPlugin>(),
+    ))
+    .insert_resource(TimeUpdateStrategy::ManualDuration(Duration::from_secs_f64(1.0 / 64.0)));
+    #[cfg(feature = "render")]
+    app.init_asset::<Mesh>().init_asset::<StandardMaterial>();
+    app
+}
+
+/// Runs until `done`, with files read on other threads.
+fn run_until(app: &mut App, what: &str, mut done: impl FnMut(&mut World) -> bool) {
+    for _ in 0..20_000 {
+        app.update();
+        if done(app.world_mut()) {
+            return;
+        }
+        std::thread::sleep(Duration::from_millis(1));
+    }
+    panic!("{what} did not come");
+}
+
+fn failures(world: &mut World) -> Vec<SceneError> {
+    world.resource_mut::<Messages<SceneFailed>>().drain().map(|failed| failed.error).collect()
+}
+
+#[test]
+fn a_scene_becomes_bodies_and_hands_that_hold_and_let_go() {
+    let mut app = app();
+    let text = GOOD.replacen(
+        "stiffness: 200",
+        "stiffness: 200, from: 0.25, until: 0.75, pull: (0, 0, 0.05), rise: 0.1",
+        1,
+    );
+    app.add_plugins(SceneFilePlugin::open(SceneFile::from_ron(&text, "my.ron").unwrap()).unwrap());
+    let hand = |world: &mut World, name: &str| {
+        let mut hands = world.query::<(&Name, &Grab, &GrabForce)>();
+        hands.iter(world).find(|(own, ..)| own.as_str() == name).map(|(_, grab, force)| (*grab, *force))
+    };
+    run_until(&mut app, "the left hand", |world| hand(world, "left").is_some());
+    // 64 ticks a second: the right one waits for a quarter of a second.
+    assert!(hand(app.world_mut(), "right").is_none());
+    for _ in 0..16 {
+        app.update();
+    }
+    let (taken, _) = hand(app.world_mut(), "right").unwrap();
+    for _ in 0..16 {
+        app.update();
+    }
+    let (grab, force) = hand(app.world_mut(), "right").unwrap();
+    assert_eq!(grab.stiffness, Some(200.0));
+    assert!((grab.target - taken.target).length() <= 0.05 + 1e-6);
+    assert!((grab.target.z - taken.target.z - 0.05).abs() < 0.01, "{grab:?} {taken:?}");
+    // It is pulled along, so the body pulls back, and no harder than the spring lets it.
+    assert!(force.force.z < -0.01 && force.force.length() <= 200.0 * 0.05, "{force:?}");
+    for _ in 0..24 {
+        app.update();
+    }
+    assert!(hand(app.world_mut(), "right").is_none() && hand(app.world_mut(), "left").is_some());
+    let world = app.world_mut();
+    let places: Vec<(String, f32)> = world
+        .query::<(&Name, &Transform, &BodyState)>()
+        .iter(world)
+        .map(|(name, place, _)| (name.to_string(), place.translation.x))
+        .collect();
+    assert!(places.contains(&("pip".into(), 0.0)) && places.contains(&("bud".into(), 0.5)), "{places:?}");
+    // With the instance goes all that it made.
+    let instance = world.query_filtered::<Entity, With<SceneInstance>>().single(world).unwrap();
+    world.despawn(instance);
+    assert_eq!(world.query::<&ModalBody>().iter(world).count(), 0);
+    assert_eq!(world.query::<&Grab>().iter(world).count(), 0);
+}
+
+#[test]
+fn a_file_of_the_scene_that_is_not_there_is_told_with_its_entry_and_line() {
+    let mut app = app();
+    let text = GOOD.replacen("bud.modal", "bad.modal", 1);
+    app.add_plugins(SceneFilePlugin::open(SceneFile::from_ron(&text, "my.ron").unwrap()).unwrap());
+    let mut errors = Vec::new();
+    run_until(&mut app, "the failure", |world| {
+        errors.extend(failures(world));
+        !errors.is_empty()
+    });
+    assert_eq!(errors.len(), 1, "{errors:?}");
+    let told = errors[0].to_string();
+    assert!(told.starts_with("my.ron:5:30: the body `bud` cannot be loaded: "), "{told}");
+    assert!(told.contains("bad.modal"), "{told}");
+    assert_eq!(errors[0].kind, SceneErrorKind::Asset);
+}
+
+#[test]
+fn a_vertex_that_the_body_does_not_have_is_told_once() {
+    let mut app = app();
+    let text = GOOD.replacen("Toward((1, 0, 0))", "Vertex(4000000)", 1);
+    app.add_plugins(SceneFilePlugin::open(SceneFile::from_ron(&text, "my.ron").unwrap()).unwrap());
+    let mut errors = Vec::new();
+    run_until(&mut app, "the failure", |world| {
+        errors.extend(failures(world));
+        !errors.is_empty()
+    });
+    for _ in 0..10 {
+        app.update();
+        errors.extend(failures(app.world_mut()));
+    }
+    assert_eq!(errors.len(), 1, "{errors:?}");
+    let told = errors[0].to_string();
+    assert!(
+        told.starts_with(
+            "my.ron:8:44: the grab `left` cannot hold `pip`: expected a vertex of the surface, 0 to "
+        ),
+        "{told}"
+    );
+}
+
+#[test]
+fn a_game_loads_scenes_as_assets_where_it_likes() {
+    let mut app = app();
+    app.add_plugins(SceneFilePlugin::default());
+    let files: [Handle<SceneFile>; 2] = {
+        let assets = app.world().resource::<AssetServer>();
+        [assets.load("scenes/solo.ron"), assets.load("pip.ron")]
+    };
+    let place = Transform::from_xyz(2.0, 0.0, 0.0);
+    let [solo, wrong] = files.map(|file| app.world_mut().spawn((SceneInstance(file), place)).id());
+    let mut errors = Vec::new();
+    run_until(&mut app, "the body and the failure", |world| {
+        errors.extend(failures(world));
+        let body = world.query::<(&SceneBody, &BodyState, &GlobalTransform)>().iter(world).next();
+        body.is_some_and(|(.., at)| at.translation().x > 1.0) && !errors.is_empty()
+    });
+    // A description of a shape is another thing; the message has its line.
+    assert_eq!(errors.len(), 1, "{errors:?}");
+    assert!(errors[0].to_string().starts_with("pip.ron:"), "{}", errors[0]);
+    assert!(errors[0].position.is_some());
+    assert!(app.world().get::<SceneParts>(wrong).is_none());
+    assert!(!app.world().get::<SceneParts>(solo).unwrap().entities().is_empty());
+}
+
+/// Another copy of the file's text, as a watcher would bring it.
+#[test]
+fn a_scene_that_changes_is_made_anew() {
+    let mut app = app();
+    app.add_plugins(SceneFilePlugin::default());
+    let file = SceneFile::from_ron(GOOD, "my.ron").unwrap();
+    let handle = app.world_mut().resource_mut::<Assets<SceneFile>>().add(file);
+    let instance = app.world_mut().spawn(SceneInstance(handle.clone())).id();
+    run_until(&mut app, "the bodies", |world| world.query::<&BodyState>().iter(world).count() == 2);
+    let changed = SceneFile::from_ron(r#"(bodies: [(name: "bud", model: "bud.modal")])"#, "my.ron").unwrap();
+    app.world_mut().resource_mut::<Assets<SceneFile>>().insert(handle.id(), changed).unwrap();
+    run_until(&mut app, "the other scene", |world| {
+        let names: Vec<String> =
+            world.query_filtered::<&Name, With<SceneBody>>().iter(world).map(ToString::to_string).collect();
+        names == ["bud"]
+    });
+    assert_eq!(app.world().get::<SceneParts>(instance).unwrap().entities().len(), 1);
+}
+
+#[cfg(feature = "net")]
+#[test]
+fn a_session_is_for_an_app_that_was_built_for_it() {
+    let mut app = app();
+    app.add_plugins(SceneFilePlugin::default());
+    let file = SceneFile::from_ron(&GOOD.replacen("title: \"one\"", "network: Host()", 1), "my.ron").unwrap();
+    let handle = app.world_mut().resource_mut::<Assets<SceneFile>>().add(file);
+    app.world_mut().spawn(SceneInstance(handle));
+    let mut errors = Vec::new();
+    run_until(&mut app, "the failure", |world| {
+        errors.extend(failures(world));
+        !errors.is_empty()
+    });
+    assert!(
+        errors[0].to_string().starts_with("my.ron:2:14: this scene asks for a network, which"),
+        "{}",
+        errors[0]
+    );
+}
+
+#[cfg(feature = "net")]
+#[test]
+fn a_guest_in_the_same_process_pulls_the_host_s_body_and_sees_it() {
+    let text = GOOD
+        .replacen("title: \"one\"", "network: Host(guest: (link: \"paper-4\", beside: (1, 0, 0)))", 1)
+        .replacen("stiffness: 200", "pull: (0, 0, 0.08), by: Guest", 1);
+    let plugin = SceneFilePlugin::open(SceneFile::from_ron(&text, "my.ron").unwrap()).unwrap();
+    assert!(plugin.invite().is_some());
+    let mut app = app();
+    // A session's time is the wall's.
+    app.insert_resource(TimeUpdateStrategy::Automatic).add_plugins(plugin);
+    let mut pulled = 0.0_f64;
+    run_until(&mut app, "the guest's hand and its view", |world| {
+        let forces: Vec<f64> = world
+            .query_filtered::<&GrabForce, With<crate::net::HandOf>>()
+            .iter(world)
+            .map(|felt| felt.force.length())
+            .collect();
+        pulled = forces.into_iter().fold(pulled, f64::max);
+        let mut views = world.query::<(&Name, &Transform, &crate::body::ShownState)>();
+        let moved = views.iter(world).any(|(name, place, shown)| {
+            name.as_str() == "pip (guest)"
+                && place.translation.x == 1.0
+                && shown.q().iter().any(|q| q.abs() > 1e-4)
+        });
+        moved && pulled > 0.1
+    });
+}
+
+#[cfg(feature = "haptics")]
+#[test]
+fn a_simulated_device_takes_hold_and_is_gone_with_its_scene() {
+    use crate::haptics::{HapticDevices, ToolGrabs};
+    let device = "device: Virtual(on: (body: \"pip\", patch: Toward((1, 0.5, 0))), from: 0.3,\
+                  motion: Path(points: [(at: 0.5, to: (0.04, 0, 0))]))";
+    let text = GOOD.replacen("title: \"one\"", device, 1);
+    let mut app = app();
+    app.insert_resource(TimeUpdateStrategy::Automatic)
+        .add_plugins(bevy::input::InputPlugin)
+        .add_plugins(SceneFilePlugin::open(SceneFile::from_ron(&text, "my.ron").unwrap()).unwrap());
+    run_until(&mut app, "a force in the hand", |world| {
+        let holds = world.query::<&ToolGrabs>().iter(world).any(|held| !held.entities().is_empty());
+        let felt =
+            world.resource::<HapticDevices>().iter().map(|(_, status)| status.report.tick.wrench.force);
+        holds && felt.into_iter().any(|force| force.iter().any(|newtons| newtons.abs() > 0.05))
+    });
+    let world = app.world_mut();
+    let instance = world.query_filtered::<Entity, With<SceneInstance>>().single(world).unwrap();
+    world.despawn(instance);
+    assert_eq!(world.resource::<HapticDevices>().iter().count(), 0);
+}
+
+#[test]
+fn what_was_not_compiled_is_said() {
+    let tries = [
+        (cfg!(feature = "net"), "network: Host()", 14, "a network", "net"),
+        (
+            cfg!(feature = "haptics"),
+            "device: Pointer(on: (body: \"pip\", patch: Vertex(0)))",
+            13,
+            "a device",
+            "haptics",
+        ),
+        (cfg!(feature = "rerun"), "recording: (file: \"never.rrd\")", 16, "a recording", "rerun"),
+    ];
+    for (compiled, field, column, what, feature) in tries {
+        let file = SceneFile::from_ron(&GOOD.replacen("title: \"one\"", field, 1), "my.ron").unwrap();
+        match SceneFilePlugin::open(file) {
+            Ok(_) => assert!(compiled, "{feature}"),
+            Err(error) => {
+                assert!(!compiled, "{error}");
+                let expected = format!(
+                    "my.ron:2:{column}: this scene asks for {what}, this program was compiled without `{feature}`"
+                );
+                assert!(error.to_string().starts_with(&expected), "{error}");
+            }
+        }
+    }
+}
+
+#[test]
+fn the_project_s_scenes_are_right() {
+    let mut count = 0;
+    for entry in std::fs::read_dir(format!("{ASSETS}/scenes")).unwrap() {
+        let path = entry.unwrap().path();
+        let scene = SceneFile::read(&path).unwrap_or_else(|error| panic!("{error}"));
+        for model in scene.scene().bodies.iter().filter_map(|body| body.model.as_ref()) {
+            assert!(std::path::Path::new(ASSETS).join(model).exists(), "{model}");
+        }
+        assert_ne!(scene.scene().title, "", "{path:?}");
+        count += 1;
+    }
+    assert!(count >= 5);
+}

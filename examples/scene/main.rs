@@ -1,0 +1,144 @@
+//! Plays a scene file: bodies, hands, a session, a device and a recording, without a line of code.
+//!
+//! What to learn here: [`SceneFile::read`] reads and checks, [`SceneFilePlugin::open`] brings what the scene asks for; mistakes are told with line and
+//! column, before the window opens or, where a file is missing, as [`SceneFailed`].
+//!
+//! ```sh
+//! cargo run --release --example scene -- assets/scenes/everything.ron
+//! cargo run --release --example scene -- assets/scenes/solo.ron --headless --frames 120
+//! cargo run --release --example scene -- --check assets/scenes/*.ron
+//! ```
+
+#[path = "../stage/mod.rs"]
+mod stage;
+
+use std::path::PathBuf;
+
+use bevy::{ecs::name::NameOrEntityItem, prelude::*};
+use clap::Parser;
+#[cfg(feature = "net")]
+use pliant::net::{NetStats, User};
+use pliant::{
+    prelude::*,
+    scene::{SceneBody, SceneError, SceneFailed, SceneFile, SceneFilePlugin, ViewEntry},
+};
+
+use stage::{Look, Readout, Stage};
+
+/// Plays a scene file.
+#[derive(Parser, Debug)]
+struct Options {
+    #[command(flatten)]
+    stage: stage::Options,
+
+    /// Read the files, say what is wrong with them, and play none.
+    #[arg(long)]
+    check: bool,
+
+    /// The scene; with --check, any number of them.
+    #[arg(required = true, value_name = "FILE.ron")]
+    files: Vec<PathBuf>,
+}
+
+/// What the scene is called.
+#[derive(Resource)]
+struct Title(String);
+
+fn main() -> AppExit {
+    let options = Options::parse();
+    let told = |error: &SceneError| {
+        eprintln!("{error}");
+        AppExit::from_code(2)
+    };
+    if options.check {
+        let wrong: Vec<SceneError> =
+            options.files.iter().filter_map(|file| SceneFile::read(file).err()).collect();
+        wrong.iter().for_each(|error| eprintln!("{error}"));
+        println!("{} of {} scenes are right", options.files.len() - wrong.len(), options.files.len());
+        return if wrong.is_empty() { AppExit::Success } else { AppExit::from_code(2) };
+    }
+    let file = match options.files.as_slice() {
+        [file] => SceneFile::read(file),
+        files => {
+            eprintln!("scene: expected one file to play, got {}", files.len());
+            return AppExit::from_code(2);
+        }
+    };
+    let (file, scene) = match file.and_then(|file| Ok((file.clone(), SceneFilePlugin::open(file)?))) {
+        Ok(both) => both,
+        Err(error) => return told(&error),
+    };
+    #[cfg(feature = "net")]
+    if let Some(invite) = scene.invite() {
+        println!("{invite}");
+    }
+    let description = file.scene();
+    let mut stage = Stage::with("a scene from a file", options.stage).picture_at(4.0).key("left mouse: pull");
+    if let Some(view) = description.view {
+        stage = stage.look(look(&view));
+    }
+    // Sessions and devices have clocks and threads of their own.
+    if description.network.is_some() || description.device.is_some() {
+        stage = stage.real_time();
+    }
+    App::new()
+        .add_plugins((stage, PliantPlugins::default(), scene))
+        .insert_resource(Title(description.title.clone()))
+        .add_systems(Update, (read_out, end_on_failure))
+        .run()
+}
+
+/// The stage's camera goes round where the scene says.
+fn look(view: &ViewEntry) -> Look {
+    let [x, y, z] = view.middle.map(|v| v as f32);
+    Look {
+        middle: Vec3::new(x, y, z),
+        distance: view.distance as f32,
+        yaw: (view.yaw as f32).to_radians(),
+        pitch: (view.pitch as f32).to_radians(),
+    }
+}
+
+/// The line with the mistake is logged; a scene that lacks a part of it is not played.
+fn end_on_failure(mut failures: MessageReader<SceneFailed>, mut exit: MessageWriter<AppExit>) {
+    if failures.read().count() > 0 {
+        exit.write(AppExit::from_code(2));
+    }
+}
+
+/// Hands of other users have no names of their own.
+fn called(hand: NameOrEntityItem) -> String {
+    hand.name.map_or_else(|| "another's hand".to_owned(), ToString::to_string)
+}
+
+fn read_out(
+    title: Res<Title>,
+    bodies: Query<&BodyState, With<SceneBody>>,
+    hands: Query<(NameOrEntity, &GrabForce), With<Grab>>,
+    #[cfg(feature = "net")] session: (Option<Res<NetStats>>, Query<&User>),
+    #[cfg(feature = "haptics")] devices: Option<Res<HapticDevices>>,
+    mut readout: ResMut<Readout>,
+) {
+    let awake = bodies.iter().filter(|body| !body.is_resting()).count();
+    let mut lines = vec![format!("{}: {awake} of {} bodies awake", title.0, bodies.iter().count())];
+    let mut felt: Vec<(String, f64)> =
+        hands.iter().map(|(name, felt)| (called(name), felt.force.length())).collect();
+    felt.sort_by(|a, b| a.0.cmp(&b.0));
+    lines.extend(felt.iter().take(8).map(|(name, force)| format!("{name:16} {force:6.2} N")));
+    #[cfg(feature = "net")]
+    if let (Some(stats), users) = &session {
+        lines.push(format!(
+            "session          {} users, {:.0} kbit/s out, {} messages refused",
+            users.iter().count(),
+            stats.bytes_out_per_s * 8e-3,
+            stats.rejected,
+        ));
+    }
+    #[cfg(feature = "haptics")]
+    for (_, status) in devices.iter().flat_map(|devices| devices.iter()) {
+        let force = Vec3::from(status.report.tick.wrench.force.map(|newtons| newtons as f32)).length();
+        lines
+            .push(format!("{:16} {force:6.2} N in the hand, {:.0} Hz", status.info.name, status.report.rate));
+    }
+    readout.0 = lines.join("\n");
+}
