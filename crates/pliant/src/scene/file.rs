@@ -22,7 +22,7 @@ use super::{MAX_BYTES, SceneDescription, SceneError, SceneErrorKind};
 /// assert_eq!(scene.scene().bodies[0].name, "pip");
 ///
 /// let wrong = SceneFile::from_ron(r#"(bodies: [(name: "pip", modle: "pip.modal")])"#, "pip.ron").unwrap_err();
-/// assert!(wrong.to_string().starts_with("pip.ron:1:24: unknown field `modle` in Body; did you mean `model`?"));
+/// assert!(wrong.to_string().starts_with("pip.ron:1:25: unknown field `modle` in Body; did you mean `model`?"));
 /// # Ok::<(), pliant::scene::SceneError>(())
 /// ```
 #[derive(Asset, TypePath, Debug, Clone, PartialEq)]
