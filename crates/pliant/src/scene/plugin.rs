@@ -1,9 +1,8 @@
 //! The plugin: scene files as assets, and whole scenes with what they need of an app.
 
-use std::{
-    path::PathBuf,
-    sync::{Mutex, PoisonError},
-};
+use std::path::PathBuf;
+#[cfg(feature = "net")]
+use std::sync::{Mutex, PoisonError};
 
 use bevy::{
     asset::io::file::FileAssetReader,
@@ -50,12 +49,15 @@ pub(super) enum Role {
     /// The app was built for it.
     Opened,
     /// It is what the guest beside a host has.
-    #[cfg_attr(not(feature = "net"), expect(dead_code, reason = "guests come with the network"))]
     Guest,
 }
 
 /// The folder of assets, for files that Bevy does not load.
 #[derive(Resource, Debug, Clone)]
+#[cfg_attr(
+    not(any(feature = "net", feature = "bake")),
+    expect(dead_code, reason = "read by guests and bakes")
+)]
 pub(super) struct AssetRoot(pub(super) PathBuf);
 
 impl Default for SceneFilePlugin {

@@ -1,0 +1,125 @@
+#!/usr/bin/env bash
+# Remakes the pictures of the gallery (examples/README.md) in docs/images, without a screen: under Xvfb, and with a software driver where there is no
+# graphics card.
+#
+#   examples/pictures.sh [NAME ...]      all of them, or those named
+#
+# Each is made by the example itself (--screenshot), at 1280x720, and has at most 300,000 bytes: a larger one gets a palette where Python's Pillow or
+# ImageMagick is there, and is taken smaller where neither is. OUT is another folder for them, BIN one with the examples' binaries, PROFILE
+# one of cargo's.
+set -euo pipefail
+cd "$(dirname "$0")/.."
+
+if [ -z "${PICTURES_DISPLAY:-}" ]; then
+    command -v xvfb-run >/dev/null || { echo "xvfb-run is not here; install xvfb, and mesa-vulkan-drivers where there is no graphics card" >&2; exit 2; }
+    PICTURES_DISPLAY=1 exec xvfb-run -a -s "-screen 0 1280x720x24" "$0" "$@"
+fi
+export PICTURES_DISPLAY
+
+out="$(realpath -m "${OUT:-docs/images}")"
+mkdir -p "$out"
+most=300000
+work="$(mktemp -d)"
+pids=()
+cleanup() {
+    for pid in "${pids[@]}"; do kill "$pid" 2>/dev/null || true; done
+    rm -rf "$work"
+}
+trap cleanup EXIT
+
+if [ -z "${BIN:-}" ]; then
+    cargo build --profile "${PROFILE:-dev}" --examples
+    profile="${PROFILE:-dev}"
+    [ "$profile" = dev ] && profile=debug
+    BIN="${CARGO_TARGET_DIR:-target}/$profile/examples"
+fi
+BIN="$(realpath "$BIN")"
+root="$PWD"
+
+wanted=("$@")
+is_wanted() {
+    [ "${#wanted[@]}" -eq 0 ] && return 0
+    for name in "${wanted[@]}"; do [ "$name" = "$1" ] && return 0; done
+    return 1
+}
+
+# Fewer colours, or give up.
+smaller() {
+    if python3 -c 'import PIL' 2>/dev/null; then
+        python3 - "$1" <<'PYTHON'
+import sys
+from PIL import Image
+picture = Image.open(sys.argv[1]).convert("RGB")
+picture.quantize(256, dither=Image.Dither.FLOYDSTEINBERG).save(sys.argv[1], optimize=True)
+PYTHON
+    elif command -v magick >/dev/null; then
+        magick "$1" -colors 256 "png8:$1"
+    else
+        return 1
+    fi
+}
+
+picture() { # name of the picture, example, arguments
+    local name="$1" example="$2"
+    shift 2
+    is_wanted "$name" || return 0
+    local file="$work/$name.png"
+    # What the example records or prints is not wanted here.
+    (cd "$work" && "$BIN/$example" "$@" --screenshot "$file" >"$work/$name.log" 2>&1) || { cat "$work/$name.log" >&2; return 1; }
+    if [ "$(stat -c %s "$file")" -gt $most ] && ! smaller "$file"; then
+        (cd "$work" && "$BIN/$example" "$@" --size 896x504 --screenshot "$file" >"$work/$name.log" 2>&1)
+    fi
+    local bytes
+    bytes="$(stat -c %s "$file")"
+    [ "$bytes" -le $most ] || { echo "$name.png has $bytes bytes, at most $most are wanted" >&2; return 1; }
+    mv "$file" "$out/$name.png"
+    printf '%-24s %7d bytes, %d s\n' "$name.png" "$bytes" "$SECONDS"
+}
+
+# The pictures need the models that the examples load, and a picture of what make_models makes.
+picture hello_body hello_body
+picture many_bodies many_bodies
+picture materials materials
+picture free_bodies free_bodies
+picture feel feel
+picture two_hands two_hands
+picture shared_body shared_body
+picture tug_of_war tug_of_war
+for scene in "$root"/assets/scenes/*.ron; do
+    picture "scene-$(basename "$scene" .ron)" scene "$scene"
+done
+
+# Those who need somebody else there.
+serve() { # log, binary, arguments: starts it and says its invite
+    local log="$1"
+    shift
+    "$@" >"$log" 2>&1 &
+    pids+=($!)
+    for _ in $(seq 600); do
+        if grep -o 'pliant://[^ ]*' "$log" | head -n 1 | grep .; then return 0; fi
+        sleep 0.1
+    done
+    cat "$log" >&2
+    return 1
+}
+if is_wanted host; then
+    # A host with a guest in its session.
+    coproc_log="$work/guest.log"
+    port=$((20000 + RANDOM % 20000))
+    key="$work/host.key"
+    # The key is made by a first, short run, so that the guest knows the invite before the host is there.
+    invite="$(serve "$work/first.log" "$BIN/host" --headless --seconds 1 --bind "127.0.0.1:$port" --key "$key")"
+    sleep 3
+    "$BIN/join" "$invite" --headless --cached --seconds 60 >"$coproc_log" 2>&1 &
+    pids+=($!)
+    picture host host --bind "127.0.0.1:$port" --key "$key"
+fi
+if is_wanted join || is_wanted dedicated_server; then
+    invite="$(serve "$work/server.log" "$BIN/dedicated_server" --play)"
+    picture dedicated_server join "$invite" --cached --still --name "somebody who looks"
+    picture join join "$invite" --cached --name guest
+fi
+if is_wanted peers; then
+    invite="$(serve "$work/peer.log" "$BIN/peers" --headless --seconds 120 --name one)"
+    picture peers peers "$invite" --name two
+fi
