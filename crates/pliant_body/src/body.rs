@@ -43,6 +43,9 @@ pub struct ModalBody {
     pub warp: bool,
     /// Multiplies the baked damping of every mode, 0 or more. Default: `1.0`.
     pub damping_scale: f64,
+    /// Multiplies the baked stiffness, 1e-6 to 1e6, as though it were baked with so many times the Young's modulus: frequencies go with its root.
+    /// May be changed while the body moves. Default: `1.0`.
+    pub stiffness_scale: f64,
     /// A material that relaxes under a held strain and creeps under a held force. Default: `None`, elastic.
     pub relaxation: Option<Viscoelastic>,
     /// Newton corrections in one step of the grabs on a body that is bent by warping, a number from 1 to 8 (what is outside is taken as
@@ -71,6 +74,7 @@ impl ModalBody {
             modes: None,
             warp: true,
             damping_scale: 1.0,
+            stiffness_scale: 1.0,
             relaxation: None,
             corrections: BodyConfig::default().corrections,
             gravity: DVec3::ZERO,
@@ -87,6 +91,7 @@ impl ModalBody {
             modes: self.modes,
             gravity: (self.gravity / scale).into(),
             damping_scale: self.damping_scale,
+            stiffness_scale: self.stiffness_scale,
             relaxation: self.relaxation.map(Relaxation::from),
             corrections: self.corrections,
         }

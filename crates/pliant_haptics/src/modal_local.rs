@@ -149,7 +149,7 @@ impl ModalLocal {
         for i in 0..modes {
             let (eq, ev) = (model.state.q[i] - then[i], model.state.v[i] - then[modes + i]);
             // The difference of then has swung on since, as a mode does that nobody holds.
-            let (omega, damping) = (self.body.model().omega()[i], self.body.model().damping()[i]);
+            let (omega, damping) = (self.body.omega()[i], self.body.damping()[i]);
             let [eq, ev, _] = match Coefficients::new(Integrator::Exact, omega, damping, age.max(self.period))
             {
                 Ok(swing) if back > 0 => swing.step([eq, ev, 0.0], 0.0, 0.0),

@@ -231,6 +231,24 @@ impl ModalModel {
         self.parts.inertia
     }
 
+    /// Angular frequency (rad/s) and damping coefficient (1/s) of a mode of the same body made of a material `scale` times as stiff: what a
+    /// bake with `scale` times the Young's modulus would give, as `K` is proportional to it and `M` knows nothing of it: the same shapes, `omega sqrt(scale)`,
+    /// and damping by the same law at that frequency. At a scale of 1 both are the baked ones to the bit.
+    pub fn stiffened(&self, mode: usize, scale: f64) -> (f64, f64) {
+        let (Some(&omega), Some(&c)) = (self.omega().get(mode), self.damping().get(mode)) else {
+            return (0.0, 0.0);
+        };
+        if scale == 1.0 {
+            return (omega, c);
+        }
+        let stiff = omega * scale.sqrt();
+        let law = self.parts.info.damping;
+        // A model's coefficients need not be those of its law: they keep their ratio to it.
+        let before = law.coefficient(omega);
+        let c = if before > 0.0 { c * (law.coefficient(stiff) / before) } else { c };
+        (stiff, c)
+    }
+
     /// How a uniform acceleration drives each mode, kg^1/2.
     pub fn participation(&self) -> &[[f64; 3]] {
         &self.parts.participation

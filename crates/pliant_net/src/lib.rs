@@ -66,6 +66,9 @@ mod user;
 pub use figures::{
     LOSS_IN, LOSS_OUT, NACKS, NetStats, RATE_IN, RATE_OUT, RECOVERED, ROUND_TRIP, SHOWN_OFFSET,
 };
+/// The networks that an [`Emulation`] is made of.
+pub use pliant_stream::emulator;
+
 pub use guest::{CameraInterest, GuestState, Interest, JoinConfig, NetGuest};
 pub use host::{Holding, HostConfig, NetHost};
 pub use peer::{NetPeer, PeerConfig, PeerState};

@@ -121,7 +121,7 @@ impl Encoder {
                 expected: "room for a frame with one mode",
             });
         }
-        let quanta = Quanta::new(&model, modes, &newmark);
+        let quanta = Quanta::stiffened(&model, setup.stiffness_scale, modes, &newmark);
         let stepper = ForceStepper::new(model, setup, modes, newmark.h)?;
         let rest = stepper.at_rest();
         let flow = setup.relaxation.map(|r| FlowFilter::new(r, &newmark, 0));

@@ -76,6 +76,7 @@ impl PatchRows {
         vertex: u32,
         radius: f64,
         modes: usize,
+        stiffness_scale: f64,
     ) -> Result<Self, StreamError> {
         let failed = |e: String| StreamError::Model(e);
         let patch = Patch::around(model.surface(), vertex, radius).map_err(|e| failed(e.to_string()))?;
@@ -94,7 +95,7 @@ impl PatchRows {
             }
         }
         // What a grab of the body itself would have: asked of a body, so that the two never differ.
-        let config = BodyConfig { modes: Some(modes), ..Default::default() };
+        let config = BodyConfig { modes: Some(modes), stiffness_scale, ..Default::default() };
         let mut body = Body::new(model.clone(), config).map_err(|e| failed(e.to_string()))?;
         let grab = body.grab(&patch, GrabConfig::default()).map_err(|e| failed(e.to_string()))?;
         let compliance = body.compliance(grab).map_err(|e| failed(e.to_string()))?;

@@ -33,6 +33,11 @@ pub struct Quanta {
 impl Quanta {
     /// For the first `modes` of a model; accelerations are integrated by `newmark`.
     pub fn new(model: &ModalModel, modes: usize, newmark: &Newmark) -> Self {
+        Self::stiffened(model, 1.0, modes, newmark)
+    }
+
+    /// For a body whose stiffness is `scale` times the baked one: its velocities and forces are as much larger for one displacement.
+    pub(crate) fn stiffened(model: &ModalModel, scale: f64, modes: usize, newmark: &Newmark) -> Self {
         let modes = modes.min(model.mode_count());
         let vertices = model.surface().positions().len();
         let every = vertices.div_ceil(VERTICES).max(1);
@@ -46,7 +51,8 @@ impl Quanta {
         let most = all.iter().copied().fold(f64::MIN_POSITIVE.sqrt(), f64::max);
         let place: Vec<f64> = all.iter().map(|s| 1.0 / s.max(FAINT * most)).collect();
         let by_omega = |power: i32| {
-            place.iter().zip(model.omega()).map(|(p, omega)| p * omega.max(SLOW).powi(power)).collect()
+            let omega = model.omega().iter().map(|omega| omega * scale.sqrt());
+            place.iter().zip(omega).map(|(p, omega)| p * omega.max(SLOW).powi(power)).collect()
         };
         let gain = newmark.beta.max(1.0 / 12.0) * newmark.h * newmark.h;
         Self {

@@ -30,6 +30,8 @@ pub struct BodySetup {
     pub warp: bool,
     /// Factor on all damping coefficients. Default: 1.
     pub damping_scale: f64,
+    /// Factor on the material's stiffness; see [`pliant_modal::BodyConfig::stiffness_scale`]. Default: 1.
+    pub stiffness_scale: f64,
     /// Uniform acceleration, m/s^2; world axes, for an anchored body its own. What the host's gravity has beyond this is
     /// learnt by the stream. Default: none.
     pub gravity: [f64; 3],
@@ -43,9 +45,21 @@ impl Default for BodySetup {
             integrator: Integrator::default(),
             warp: true,
             damping_scale: 1.0,
+            stiffness_scale: 1.0,
             gravity: [0.0; 3],
             relaxation: None,
         }
+    }
+}
+
+impl BodySetup {
+    /// Angular frequencies (rad/s) and damping coefficients (1/s) of the first `modes` of a model, as they are stepped.
+    pub(crate) fn modes(&self, model: &ModalModel, modes: usize) -> (Vec<f64>, Vec<f64>) {
+        let one = |mode| {
+            let (omega, c) = model.stiffened(mode, self.stiffness_scale);
+            (omega, c * self.damping_scale)
+        };
+        (0..modes.min(model.mode_count())).map(one).unzip()
     }
 }
 
@@ -88,7 +102,10 @@ pub struct ForceStepper {
     table: Table,
     h: f64,
     warp: bool,
-    damping_scale: f64,
+    stiffness_scale: f64,
+    /// Of the modes as they are stepped: rad/s, 1/s.
+    omega: Vec<f64>,
+    damping: Vec<f64>,
     gravity: Vector3<f64>,
     /// Modal force of gravity on an anchored body; empty for none.
     weight: Vec<f64>,
@@ -126,13 +143,16 @@ impl ForceStepper {
         } else {
             model.participation()[..modes].iter().map(|p| gravity.dot(&Vector3::from(*p))).collect()
         };
-        let softness = model.omega()[..modes].iter().map(|w| 1.0 / w.powi(2).max(1e-12)).collect();
+        let (omega, damping) = setup.modes(&model, modes);
+        let softness = omega.iter().map(|w| 1.0 / w.powi(2).max(1e-12)).collect();
         Ok(Self {
             model,
             table,
             h,
             warp: setup.warp,
-            damping_scale: setup.damping_scale,
+            stiffness_scale: setup.stiffness_scale,
+            omega,
+            damping,
             gravity,
             weight,
             softness,
@@ -156,7 +176,7 @@ impl ForceStepper {
 
     /// Angular frequency of a mode, rad/s.
     pub(crate) fn omega(&self, mode: usize) -> f64 {
-        self.model.omega().get(mode).copied().unwrap_or(1.0)
+        self.omega.get(mode).copied().unwrap_or(1.0)
     }
 
     /// Does the body have a rigid frame of its own?
@@ -221,7 +241,7 @@ impl ForceStepper {
         if let Some(index) = self.patches.iter().position(|p| p.key == wanted) {
             return Some(index);
         }
-        let made = PatchRows::new(&self.model, vertex, radius, self.modes()).ok()?;
+        let made = PatchRows::new(&self.model, vertex, radius, self.modes(), self.stiffness_scale).ok()?;
         self.patches.push(made);
         Some(self.patches.len() - 1)
     }
@@ -521,12 +541,11 @@ impl ForceStepper {
         self.used = used;
         // Modes are weighed by their compliance: stiff ones, whose force is least certain, would drown the others.
         self.by_softness.prepare(&self.patches, &self.used, &self.softness);
-        let (omega, damping) = (self.model.omega(), self.model.damping());
+        let (omega, damping) = (&self.omega, &self.damping);
         for (k, f) in self.force.iter_mut().enumerate() {
             let gravity = self.weight.get(k).copied().unwrap_or(0.0);
             let stretch = state.q[k] - self.creeping.ratio * state.z.get(k).copied().unwrap_or(0.0);
-            let all =
-                state.a[k] + damping[k] * self.damping_scale * state.v[k] + omega[k] * omega[k] * stretch;
+            let all = state.a[k] + damping[k] * state.v[k] + omega[k] * omega[k] * stretch;
             *f = (all - gravity) * self.softness[k];
         }
         let n = 3 * known.len();

@@ -35,8 +35,8 @@ impl Table {
         h: f64,
     ) -> Result<Self, StreamError> {
         let (mut made, mut flows) = (Vec::with_capacity(modes), Vec::new());
-        for (&omega, &c) in model.omega()[..modes].iter().zip(model.damping()) {
-            let c = c * setup.damping_scale;
+        let (omega, damping) = setup.modes(model, modes);
+        for (omega, c) in omega.into_iter().zip(damping) {
             let failed = |e: StepError| StreamError::Model(e.to_string());
             match setup.relaxation {
                 None => made.push(Coefficients::new(setup.integrator, omega, c, h).map_err(failed)?),

@@ -231,6 +231,7 @@ fn real_inputs() -> Vec<Vec<u8>> {
         rho_inf: -1.0,
         warp: true,
         damping_scale: 1.0,
+        stiffness_scale: 1.0,
         gravity: [0.0, 0.0, -9.81],
         relaxation: Some((0.5, 0.4)),
     };

@@ -27,6 +27,7 @@ fn a_host_cannot_make_a_guest_hold_more_than_its_bound() {
         rho_inf: -1.0,
         warp: true,
         damping_scale: 1.0,
+        stiffness_scale: 1.0,
         gravity: [0.0; 3],
         relaxation: None,
     };

@@ -101,6 +101,53 @@ fn a_material_set_on_the_component_relaxes_and_stays_through_other_steps() {
 }
 
 #[test]
+fn a_body_made_twice_as_stiff_while_it_hangs_hangs_half_as_low_and_swings_root_two_faster() {
+    let mut app = app();
+    let body = spawn_with(
+        &mut app,
+        model::bar(),
+        |body| {
+            body.gravity = DVec3::NEG_Y;
+            body.rest_speed = 0.0;
+        },
+        (),
+    );
+    let tip = |app: &App| (5.0 / model::MASS).sqrt() * state(app, body).body().q()[0];
+    let hangs = |stiffness: f64| {
+        // 5/3 g / omega^2
+        -5.0 / 3.0 / (stiffness * (std::f64::consts::TAU * model::FREQUENCIES[0]).powi(2))
+    };
+    steps(&mut app, 2_000);
+    assert!((tip(&app) / hangs(1.0) - 1.0).abs() < 1e-3, "{} m", tip(&app));
+    // Undamped from here on: it swings about where it would hang, up from where it hung.
+    settings(&mut app, body).stiffness_scale = 2.0;
+    settings(&mut app, body).damping_scale = 0.0;
+    let (mut crossings, mut before, mut highest) = (Vec::new(), f64::NAN, f64::NEG_INFINITY);
+    for step in 0..1_000 {
+        steps(&mut app, 1);
+        let off = tip(&app) - hangs(2.0);
+        highest = highest.max(off);
+        if before < 0.0 && off >= 0.0 {
+            crossings.push(STEP * (f64::from(step) - off / (off - before)));
+        }
+        before = off;
+    }
+    let half = hangs(1.0) - hangs(2.0);
+    assert!((highest / -half - 1.0).abs() < 0.02, "swings {highest} m up, not {}", -half);
+    let period = (crossings[crossings.len() - 1] - crossings[0]) / (crossings.len() - 1) as f64;
+    let expected = 1.0 / (model::FREQUENCIES[0] * 2f64.sqrt());
+    assert!((period / expected - 1.0).abs() < 0.01, "{period} s, expected {expected} s");
+    settings(&mut app, body).damping_scale = 1.0;
+    steps(&mut app, 2_000);
+    assert!((tip(&app) / hangs(2.0) - 1.0).abs() < 1e-3, "{} m", tip(&app));
+    settings(&mut app, body).stiffness_scale = 0.0;
+    steps(&mut app, 2);
+    let told = refusals(&mut app);
+    assert!(told.len() == 1 && told[0].1.contains("stiffness_scale"), "{told:?}");
+    assert_eq!(state(&app, body).body().config().stiffness_scale, 2.0);
+}
+
+#[test]
 fn what_was_configured_on_the_body_itself_stays_when_the_step_and_the_scale_change() {
     let mut app = app();
     let body = spawn_with(&mut app, model::bar(), |_| (), ());

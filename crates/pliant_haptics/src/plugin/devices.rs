@@ -39,6 +39,8 @@ pub(crate) struct Entry {
     pub(crate) seen: f64,
     /// What the loop steps itself, if it does: the grabs it was made for.
     pub(crate) modal_for: Vec<Entity>,
+    /// How the body was stepped when it was made.
+    pub(crate) modal_config: Option<pliant_modal::BodyConfig>,
     pub(crate) elsewhere: super::word::Elsewhere,
     stop: StopSwitch,
 }
@@ -99,6 +101,7 @@ impl HapticDevices {
             map: None,
             seen: 0.0,
             modal_for: Vec::new(),
+            modal_config: None,
             elsewhere: super::word::Elsewhere::default(),
         });
         Ok(id)

@@ -124,7 +124,8 @@ pub(crate) fn publish(
         // A body for the loop to step itself: made here, where memory may be had, whenever what is held changes.
         let wanted: Vec<Entity> =
             if tool.modal && local.is_some() { held.iter().map(|(e, ..)| *e).collect() } else { Vec::new() };
-        if wanted != entry.modal_for {
+        let config = local.as_ref().map(|(state, _)| state.body().config());
+        if wanted != entry.modal_for || (!wanted.is_empty() && config != entry.modal_config.as_ref()) {
             let modal = match &local {
                 Some((state, ids)) if !wanted.is_empty() => {
                     match ModalLocal::new(state.body(), ids, state.scale(), rate) {
@@ -141,6 +142,7 @@ pub(crate) fn publish(
                 _ => None,
             };
             if entry.running.get().set_modal(modal) {
+                entry.modal_config = config.cloned();
                 entry.modal_for = wanted;
             }
         }
@@ -158,7 +160,7 @@ fn stored(held: &[HeldItem], bodies: &Bodies) -> f64 {
         }
         counted.push(of.0);
         let energy = if *driven == Driven::Remote {
-            let modes = shown.current().iter().zip(state.model().omega());
+            let modes = shown.current().iter().zip(state.body().omega());
             0.5 * modes.map(|(q, omega)| (q * omega).powi(2)).sum::<f64>()
         } else {
             state.body().energy()

@@ -3,7 +3,7 @@
 use nalgebra::{Matrix3, Vector3};
 
 use super::patch_position;
-use crate::{Coefficients, ModalModel, Patch, Relaxation, StepError};
+use crate::{BodyConfig, Coefficients, ModalModel, Patch, StepError};
 
 /// Names a grab on its body. Never used twice by the same body.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, PartialOrd, Ord)]
@@ -44,6 +44,8 @@ pub(crate) struct Grab {
     pub(crate) last_target: Vector3<f64>,
     /// Residual flexibility and hand in series as they answer within a step, m/N, body axes.
     pub(crate) compliance: Matrix3<f64>,
+    /// The body's part of it at the baked stiffness, m/N.
+    baked: Matrix3<f64>,
     /// The body's part of it, at once, m/N.
     residual: Matrix3<f64>,
     creeping: Creeping,
@@ -108,12 +110,13 @@ impl Grab {
         let residual =
             0.5 * (residual + residual.transpose()) + Matrix3::identity() * contact.max(f64::MIN_POSITIVE);
         let zero = Vector3::zeros();
-        let mut grab = Self {
+        Ok(Self {
             id,
             config,
             target: zero,
             last_target: Vector3::repeat(f64::NAN),
             compliance: residual,
+            baked: residual,
             residual,
             creeping: Creeping::default(),
             flow: zero,
@@ -125,15 +128,15 @@ impl Grab {
             displacement,
             rotation,
             at: zero,
-        };
-        grab.set_material(None, 0.0);
-        Ok(grab)
+        })
     }
 
-    /// How what the modes leave out answers within a step of `h` seconds.
-    pub(crate) fn set_material(&mut self, relaxation: Option<Relaxation>, h: f64) {
+    /// How what the modes leave out answers within a step; to be told before the first one.
+    pub(crate) fn set_material(&mut self, config: &BodyConfig) {
+        let h = config.step;
+        self.residual = self.baked / config.stiffness_scale;
         let hand = Matrix3::identity() * self.config.stiffness.map_or(0.0, |k| 1.0 / k);
-        match relaxation {
+        match config.relaxation {
             None => {
                 self.creeping = Creeping::default();
                 self.flow = Vector3::zeros();

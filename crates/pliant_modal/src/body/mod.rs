@@ -4,6 +4,7 @@ mod advance;
 mod frame;
 mod grab;
 mod solve;
+mod stepping;
 
 use std::sync::Arc;
 
@@ -18,6 +19,7 @@ use crate::{
 };
 use grab::Grab;
 use solve::Schur;
+use stepping::Stepping;
 
 /// How a body is stepped.
 #[derive(Debug, Clone, PartialEq)]
@@ -34,6 +36,10 @@ pub struct BodyConfig {
     pub gravity: [f64; 3],
     /// Factor on all damping coefficients, 0 or more. Default: 1.
     pub damping_scale: f64,
+    /// Factor on the material's stiffness, 1e-6 to 1e6: the body as it would be with Young's modulus so many times the baked one. Frequencies go
+    /// with its root, compliances with its inverse, what the grabs' patches give way by too; damping as
+    /// [`ModalModel::stiffened`] says. Default: 1.
+    pub stiffness_scale: f64,
     /// A material that relaxes: every mode, and the flexibility under every grab, is a standard linear solid. Default: none, elastic.
     pub relaxation: Option<Relaxation>,
     /// Newton corrections of the grabs under warp in one step, 1 to 8. Default: 2.
@@ -49,6 +55,7 @@ impl Default for BodyConfig {
             modes: None,
             gravity: [0.0; 3],
             damping_scale: 1.0,
+            stiffness_scale: 1.0,
             relaxation: None,
             corrections: 2,
         }
@@ -107,6 +114,9 @@ pub struct StepReport {
 pub struct Body {
     model: Arc<ModalModel>,
     config: BodyConfig,
+    /// Of the kept modes, as they are stepped: with the scales of stiffness and damping.
+    omega: Vec<f64>,
+    damping: Vec<f64>,
     coefficients: Vec<Coefficients>,
     /// Empty where the material does not relax.
     flows: Vec<Flow>,
@@ -135,13 +145,15 @@ impl Body {
     /// A configuration value that is not finite or not in its range.
     pub fn new(model: Arc<ModalModel>, config: BodyConfig) -> Result<Self, StepError> {
         let modes = config.modes.unwrap_or(usize::MAX).min(model.mode_count());
-        let (coefficients, flows) = coefficients(&model, &config, modes)?;
+        let Stepping { omega, damping, coefficients, flows } = Stepping::new(&model, &config, modes)?;
         finite("gravity", &config.gravity)?;
         let zero = vec![0.0; modes];
         let frame = Frame::at_rest(&model);
         let z = vec![0.0; flows.len()];
         let state = State { q: zero.clone(), v: zero.clone(), a: zero.clone(), f: zero.clone(), z, frame };
         Ok(Self {
+            omega,
+            damping,
             coefficients,
             flows,
             before: state.clone(),
@@ -185,18 +197,40 @@ impl Body {
         self.state.q.len()
     }
 
-    /// Changes step size, integrator, warp, gravity, damping or relaxation; the state goes on. The number of modes stays as it was made.
+    /// Angular frequencies of the kept modes as they are stepped, rad/s: the model's, with the scale of stiffness.
+    pub fn omega(&self) -> &[f64] {
+        &self.omega
+    }
+
+    /// Damping coefficients of the kept modes as they are stepped, 1/s: the model's, with the scales of stiffness and damping.
+    pub fn damping(&self) -> &[f64] {
+        &self.damping
+    }
+
+    /// Changes step size, integrator, warp, gravity, damping, stiffness or relaxation; coordinates and velocities go on, and accelerations with the
+    /// new elastic and damping forces. The number of modes stays as it was made.
     /// A material that begins to relax begins with nothing relaxed; one that ceases to forgets what had.
     ///
     /// # Errors
     /// As [`Body::new`]; the old configuration then stays.
     pub fn reconfigure(&mut self, config: BodyConfig) -> Result<(), StepError> {
         finite("gravity", &config.gravity)?;
-        (self.coefficients, self.flows) = coefficients(&self.model, &config, self.mode_count())?;
+        let Stepping { omega, damping, coefficients, flows } =
+            Stepping::new(&self.model, &config, self.mode_count())?;
+        if config.stiffness_scale != self.config.stiffness_scale {
+            // `a = f - c v - omega^2 (q - ratio z)`: the acceleration belongs to the state.
+            let ratio = self.config.relaxation.map_or(0.0, |r| r.ratio);
+            for (i, a) in self.state.a.iter_mut().enumerate() {
+                let stretch = self.state.q[i] - ratio * self.state.z.get(i).copied().unwrap_or(0.0);
+                *a += (self.omega[i].powi(2) - omega[i].powi(2)) * stretch
+                    + (self.damping[i] - damping[i]) * self.state.v[i];
+            }
+        }
+        (self.omega, self.damping, self.coefficients, self.flows) = (omega, damping, coefficients, flows);
         self.config = BodyConfig { modes: self.config.modes, ..config };
         self.state.z.resize(self.flows.len(), 0.0);
         for grab in &mut self.grabs {
-            grab.set_material(self.config.relaxation, self.config.step);
+            grab.set_material(&self.config);
         }
         Ok(())
     }
@@ -270,7 +304,7 @@ impl Body {
         }
         let id = GrabId(self.next_grab);
         let mut grab = Grab::new(id, &self.model, patch, config, self.mode_count())?;
-        grab.set_material(self.config.relaxation, self.config.step);
+        grab.set_material(&self.config);
         let local = grab.local_position(&self.state.q, self.config.warp);
         grab.target = self.state.frame.to_world(local);
         self.next_grab += 1;
@@ -387,7 +421,7 @@ impl Body {
         for (i, dv) in change.into_iter().enumerate() {
             self.state.v[i] += dv;
             // The acceleration belongs to the state: damping answers the new velocity.
-            self.state.a[i] -= self.model.damping()[i] * self.config.damping_scale * dv;
+            self.state.a[i] -= self.damping[i] * dv;
         }
         if self.model.is_free() {
             self.state.frame.add_momentum(&self.model, impulse, arm.cross(&impulse));
@@ -414,7 +448,7 @@ impl Body {
         let ratio = self.config.relaxation.map_or(0.0, |r| r.ratio);
         let modes: f64 = (0..self.mode_count())
             .map(|i| {
-                let (omega, q, v) = (self.model.omega()[i], self.state.q[i], self.state.v[i]);
+                let (omega, q, v) = (self.omega[i], self.state.q[i], self.state.v[i]);
                 let stretch = omega * q;
                 let elastic = match self.state.z.get(i) {
                     None => stretch * stretch,
@@ -467,31 +501,6 @@ struct VertexRows {
 impl VertexRows {
     fn at(&self, mode: usize) -> Vector3<f64> {
         Vector3::from_fn(|axis, _| f64::from(self.model.displacement_row(self.vertex, axis, mode)))
-    }
-}
-
-fn coefficients(
-    model: &ModalModel,
-    config: &BodyConfig,
-    modes: usize,
-) -> Result<(Vec<Coefficients>, Vec<Flow>), StepError> {
-    let scale = config.damping_scale;
-    StepError::check("damping_scale", "finite, 0 or more", scale.is_finite() && scale >= 0.0, scale)?;
-    let mode = |i: usize| (config.integrator, model.omega()[i], model.damping()[i] * scale, config.step);
-    match config.relaxation {
-        Some(relaxation) => (0..modes)
-            .map(|i| {
-                let (integrator, omega, c, h) = mode(i);
-                Coefficients::relaxing(integrator, omega, c, relaxation, h)
-            })
-            .collect(),
-        None => {
-            let elastic = (0..modes).map(|i| {
-                let (integrator, omega, c, h) = mode(i);
-                Coefficients::new(integrator, omega, c, h)
-            });
-            Ok((elastic.collect::<Result<_, _>>()?, Vec::new()))
-        }
     }
 }
 

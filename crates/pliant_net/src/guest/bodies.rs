@@ -46,7 +46,9 @@ impl NetGuest {
     /// Model and state of a body are here: it gets its entity.
     pub(super) fn body_ready(&mut self, world: &mut World, id: BodyId, model: Arc<ModalModel>) {
         let Some(view) = self.session.as_ref().and_then(|session| session.body(id)) else { return };
-        let (name, warp) = (view.info().name.clone(), view.info().warp);
+        let info = view.info();
+        let (name, warp) = (info.name.clone(), info.warp);
+        let (damping_scale, stiffness_scale) = (info.damping_scale, info.stiffness_scale);
         // How many of them the stream carries may change; the picture has room for all that we would take.
         let modes = self.config.modes.map(usize::from).filter(|&modes| modes < model.mode_count());
         let now = self.now();
@@ -84,11 +86,13 @@ impl NetGuest {
         let mut target = world.entity_mut(entity);
         match target.get_mut::<ModalBody>() {
             Some(mut body) => {
-                let new = ModalBody { model: handle, modes, warp, ..body.clone() };
+                let model = handle;
+                let new = ModalBody { model, modes, warp, damping_scale, stiffness_scale, ..body.clone() };
                 body.set_if_neq(new);
             }
             None => {
-                target.insert(ModalBody { modes, warp, ..ModalBody::new(handle) });
+                let new = ModalBody::new(handle);
+                target.insert(ModalBody { modes, warp, damping_scale, stiffness_scale, ..new });
             }
         }
         target.insert((Driven::Remote, RemoteBody(id), SeenHands::default()));
@@ -108,6 +112,18 @@ impl NetGuest {
             },
         );
         world.write_message(BodyArrived { entity, name });
+    }
+
+    /// The host steps it otherwise: what is shown of it here (its energy, its knobs) goes by the same settings.
+    pub(super) fn body_changed(&mut self, world: &mut World, id: BodyId) {
+        let Some(view) = self.session.as_ref().and_then(|session| session.body(id)) else { return };
+        let (damping_scale, stiffness_scale) = (view.info().damping_scale, view.info().stiffness_scale);
+        let warp = view.info().warp;
+        let Some(followed) = self.bodies.get(&id) else { return };
+        if let Some(mut body) = world.get_mut::<ModalBody>(followed.entity) {
+            let new = ModalBody { warp, damping_scale, stiffness_scale, ..body.clone() };
+            body.set_if_neq(new);
+        }
     }
 
     pub(super) fn body_gone(&mut self, world: &mut World, id: BodyId) {

@@ -113,6 +113,8 @@ pub struct NetGuest {
     grabs: BTreeMap<Entity, SentGrab>,
     /// The session was brought to this time.
     advanced: Duration,
+    /// Somebody asked to leave.
+    leaving: bool,
     wanted: BTreeMap<BodyId, interest::Said>,
     retry: session::Retry,
     scratch: Vec<f64>,
@@ -144,6 +146,7 @@ impl NetGuest {
             reaches: Vec::new(),
             grabs: BTreeMap::new(),
             advanced: Duration::ZERO,
+            leaving: false,
             wanted: BTreeMap::new(),
             retry: session::Retry::default(),
             scratch: Vec::new(),
@@ -176,6 +179,17 @@ impl NetGuest {
     pub fn shown(&self, body: RemoteBody) -> Option<(Tick, &ModalState)> {
         let view = self.body(body)?;
         shown_of(view)
+    }
+
+    /// Leaves the session: the host is told, the connection is closed, and it is not tried again. The state is
+    /// [`GuestState::Closed`] from the next frame on; bodies stay as they were last seen.
+    pub fn leave(&mut self) {
+        self.leaving = true;
+    }
+
+    /// The emulated link under the session, if there is one.
+    pub fn emulation(&self) -> Option<Emulation> {
+        self.line.endpoint().and_then(Endpoint::emulation)
     }
 
     /// Puts an emulated link under the session, another one, or none, at any time.

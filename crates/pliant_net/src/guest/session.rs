@@ -38,6 +38,12 @@ const ORPHANS: Duration = Duration::from_secs(5);
 pub(crate) fn receive(world: &mut World) {
     world.try_resource_scope(|world, mut guest: Mut<NetGuest>| {
         let guest = &mut *guest;
+        if std::mem::take(&mut guest.leaving) {
+            if let Some(session) = &mut guest.session {
+                session.leave();
+            }
+            guest.close(world, "left".into());
+        }
         loop {
             let now = guest.now();
             let Some(came) = guest.line.poll(guest.began, now) else { break };
@@ -181,6 +187,7 @@ impl NetGuest {
             match event {
                 GuestEvent::Welcomed { user } => self.welcomed(world, user),
                 GuestEvent::BodyReady { body, model } => self.body_ready(world, body, model),
+                GuestEvent::BodyChanged { body } => self.body_changed(world, body),
                 GuestEvent::BodyGone { body } => self.body_gone(world, body),
                 GuestEvent::Stalled { body } => {
                     debug!("body {body} stands still: nothing comes from the host")

@@ -65,6 +65,7 @@ impl Default for HostConfig {
 #[derive(Resource)]
 pub struct NetHost {
     endpoint: Endpoint,
+    ended: bool,
     began: Instant,
     session: HostSession,
     holding: Holding,
@@ -113,6 +114,7 @@ impl NetHost {
         let reach = if config.reach.is_finite() { config.reach.clamp(0.0, 1e3) } else { 4.0 };
         world.insert_resource(Self {
             endpoint,
+            ended: false,
             began: Instant::now(),
             session,
             holding: config.holding,
@@ -142,6 +144,27 @@ impl NetHost {
     /// Changes who may join from now on; who is in stays in, and in the same role.
     pub fn set_access(&self, access: Access) {
         self.endpoint.set_access(access);
+    }
+
+    /// Ends the session: everybody is told and sent away, and nobody is let in any more. Bodies go on here.
+    pub fn end(&mut self) {
+        self.ended = true;
+        self.endpoint.set_access(Access::Tokens(Vec::new()));
+        let peers: Vec<PeerId> = self.guests.keys().copied().collect();
+        for peer in peers {
+            self.session.expel(peer, EndReason::Left);
+        }
+        self.flush();
+    }
+
+    /// Whether [`end`](Self::end) was called.
+    pub fn has_ended(&self) -> bool {
+        self.ended
+    }
+
+    /// The emulated link under the session, if there is one.
+    pub fn emulation(&self) -> Option<Emulation> {
+        self.endpoint.emulation()
     }
 
     /// Puts an emulated link under the session, another one, or none, at any time.

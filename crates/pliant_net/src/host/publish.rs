@@ -19,10 +19,15 @@ pub(super) struct HostedBody {
     pub(super) id: BodyId,
     model: Arc<ModalModel>,
     setup: BodySetup,
+    /// When the guests were told of the setup.
+    told: Duration,
     pub(super) placed: GlobalTransform,
     /// A refusal to publish was logged; once is enough.
     faulted: bool,
 }
+
+/// A body's settings are told to the guests at most so often: a slider that is dragged changes them every frame, and each change begins the streams anew.
+const SETTINGS_EVERY: Duration = Duration::from_millis(250);
 
 type SharedBodies<'w, 's> = Query<
     'w,
@@ -109,7 +114,7 @@ pub(crate) fn publish(
 }
 
 impl NetHost {
-    /// The body's number in the session; it is announced, or announced anew with another model or other settings, when there is need.
+    /// The body's number in the session; it is announced, announced anew with another model, and its settings are told, when there is need.
     fn announced(
         &mut self,
         entity: Entity,
@@ -122,14 +127,23 @@ impl NetHost {
             integrator: config.integrator,
             warp: config.warp,
             damping_scale: config.damping_scale,
+            stiffness_scale: config.stiffness_scale,
             // An anchored body's weight turns with its entity: the stream learns it.
             gravity: if state.model().is_free() { config.gravity } else { [0.0; 3] },
             relaxation: config.relaxation,
         };
         let model = state.model();
+        let now = self.now();
         if let Some(hosted) = self.bodies.get_mut(&entity) {
-            if Arc::ptr_eq(&hosted.model, model) && hosted.setup == setup {
+            if Arc::ptr_eq(&hosted.model, model) {
                 let id = hosted.id;
+                // Until they are told the stream learns of it from the state, as of any force that is not known.
+                if hosted.setup != setup && now.saturating_sub(hosted.told) >= SETTINGS_EVERY {
+                    (hosted.setup, hosted.told) = (setup, now);
+                    if let Err(error) = self.session.set_setup(id, setup) {
+                        warn_once!("a body's settings are not shared: {error}");
+                    }
+                }
                 // A free body's place is in its frames.
                 if hosted.placed != *transform && !model.is_free() {
                     hosted.placed = *transform;
@@ -146,8 +160,10 @@ impl NetHost {
         match self.session.add_body(id, &shared.name, Arc::clone(model), setup) {
             Ok(()) => {
                 let model = Arc::clone(model);
-                self.bodies
-                    .insert(entity, HostedBody { id, model, setup, placed: *transform, faulted: false });
+                self.bodies.insert(
+                    entity,
+                    HostedBody { id, model, setup, told: now, placed: *transform, faulted: false },
+                );
                 self.tell_place(Placement::new(id, transform), None);
                 Some(id)
             }

@@ -187,6 +187,11 @@ impl NetPeer {
         self.bodies.iter().find(|(_, played)| played.entity == entity).map(|(&id, _)| id)
     }
 
+    /// The emulated link under every connection of this peer, if there is one.
+    pub fn emulation(&self) -> Option<&Emulation> {
+        self.emulation.as_ref()
+    }
+
     /// Puts an emulated link under every connection of this peer, another one, or none, at any time.
     pub fn set_emulation(&mut self, emulation: Option<Emulation>) {
         self.listening.set_emulation(emulation.clone());
@@ -279,6 +284,7 @@ impl NetPeer {
                 integrator: config.integrator,
                 warp: config.warp,
                 damping_scale: config.damping_scale,
+                stiffness_scale: config.stiffness_scale,
                 gravity: config.gravity,
                 relaxation: config.relaxation,
             };

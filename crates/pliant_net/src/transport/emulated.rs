@@ -79,6 +79,8 @@ impl Direction {
 pub(super) struct Emulator {
     outgoing: Mutex<Option<Direction>>,
     incoming: Mutex<Option<Direction>>,
+    /// What was put in.
+    emulation: Mutex<Option<Emulation>>,
     /// A packet has entered, or the socket has changed.
     changed: Notify,
     /// Which socket is in use.
@@ -86,18 +88,35 @@ pub(super) struct Emulator {
 }
 
 impl Emulator {
-    /// Puts links in, others in their place, or none. What is on its way on the old ones is lost.
+    /// What was put in last.
+    pub(super) fn get(&self) -> Option<Emulation> {
+        lock(&self.emulation).clone()
+    }
+
+    /// Puts links in, others in their place, or none. What is on its way on the old ones is lost, but for links of the same seed, which go on under
+    /// the new settings.
     pub(super) fn set(&self, emulation: Option<Emulation>) {
+        let before = std::mem::replace(&mut *lock(&self.emulation), emulation.clone());
         let began = Instant::now();
+        let same = before.map(|before| before.seed) == emulation.as_ref().map(|new| new.seed);
+        let place = |direction: &Mutex<Option<Direction>>, new: Option<(LinkConfig, u64)>| {
+            let mut direction = lock(direction);
+            if same
+                && let (Some(running), Some((config, _))) = (&mut *direction, &new)
+                && running.link.reconfigure(config.clone()).is_ok()
+            {
+                return;
+            }
+            *direction = new.map(|(config, seed)| Direction::new(config, seed, began));
+        };
         let (outgoing, incoming) = match emulation {
             None => (None, None),
-            Some(Emulation { outgoing, incoming, seed }) => (
-                Some(Direction::new(outgoing, seed.wrapping_mul(2), began)),
-                Some(Direction::new(incoming, seed.wrapping_mul(2) | 1, began)),
-            ),
+            Some(Emulation { outgoing, incoming, seed }) => {
+                (Some((outgoing, seed.wrapping_mul(2))), Some((incoming, seed.wrapping_mul(2) | 1)))
+            }
         };
-        *lock(&self.outgoing) = outgoing;
-        *lock(&self.incoming) = incoming;
+        place(&self.outgoing, outgoing);
+        place(&self.incoming, incoming);
         self.changed.notify_one();
     }
 }

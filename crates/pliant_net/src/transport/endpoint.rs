@@ -320,7 +320,13 @@ impl Endpoint {
         *lock(&self.shared.access) = Arc::new(access);
     }
 
-    /// Puts a lossy link under the socket, another one, or none: at any time, under any session. What is on its way on the old one is lost.
+    /// The lossy link under the socket, if there is one.
+    pub fn emulation(&self) -> Option<Emulation> {
+        self.shared.emulator.get()
+    }
+
+    /// Puts a lossy link under the socket, another one, or none: at any time, under any session. What is on its way on the old one is lost,
+    /// unless the new one has the same seed: then it is the same link under other settings, and what is on its way arrives.
     pub fn set_emulation(&self, emulation: Option<Emulation>) {
         self.shared.emulator.set(emulation);
     }

@@ -128,16 +128,15 @@ impl Receiver {
             }
         };
         let guard = config.passive.then(|| {
-            let damping: Vec<f64> =
-                model.damping()[..modes].iter().map(|c| c * setup.damping_scale).collect();
-            PassivityGuard::new(&model.omega()[..modes], &damping, newmark.h).relaxing(setup.relaxation)
+            let (omega, damping) = setup.modes(&model, modes);
+            PassivityGuard::new(&omega, &damping, newmark.h).relaxing(setup.relaxation)
         });
         let rest = stepper()?.at_rest();
         let mut receiver = Self {
             setup,
             stepper: stepper()?,
             history: History::new(snapshot.tick),
-            quanta: Quanta::new(&model, modes, &newmark),
+            quanta: Quanta::stiffened(&model, setup.stiffness_scale, modes, &newmark),
             policy,
             blend: Blend::new(newmark.h, blend_ticks),
             guard,

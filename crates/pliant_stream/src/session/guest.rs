@@ -382,7 +382,14 @@ impl GuestSession {
         match message {
             HostMessage::BodyAdded(info) => {
                 let body = BodyId(info.body);
-                if self.bodies.len() >= MAX_BODIES || self.bodies.contains_key(&body) {
+                if let Some(view) = self.bodies.get_mut(&body) {
+                    // The same body, stepped otherwise from the snapshot on that follows.
+                    if !view.change(info) {
+                        return self.break_off(EndReason::Protocol);
+                    }
+                    return;
+                }
+                if self.bodies.len() >= MAX_BODIES {
                     return self.break_off(EndReason::Protocol);
                 }
                 let name = info.name.clone();
@@ -414,10 +421,14 @@ impl GuestSession {
                 let Some(view) = self.bodies.get_mut(&body) else { return };
                 let ready = view.take_snapshot(now, snapshot);
                 let resynced = std::mem::take(&mut view.resynced);
+                let changed = std::mem::take(&mut view.changed);
                 if ready && let Some(model) = view.model().cloned() {
                     self.event(GuestEvent::BodyReady { body, model });
                 } else if resynced {
                     self.event(GuestEvent::Resynced { body });
+                }
+                if changed {
+                    self.event(GuestEvent::BodyChanged { body });
                 }
                 self.ask(now, body);
             }

@@ -53,6 +53,10 @@ pub struct BodyView {
     snapshot_asked: Option<Duration>,
     pub(crate) wants_snapshot: bool,
     pub(crate) resynced: bool,
+    /// The host steps it otherwise from the next snapshot on.
+    retuned: bool,
+    /// It was made anew for that, and nobody was told yet.
+    pub(crate) changed: bool,
 }
 
 impl BodyView {
@@ -78,6 +82,8 @@ impl BodyView {
             snapshot_asked: None,
             wants_snapshot: false,
             resynced: false,
+            retuned: false,
+            changed: false,
         }
     }
 
@@ -157,6 +163,16 @@ impl BodyView {
         self.begin();
     }
 
+    /// Another way to be stepped, from the next snapshot on; false where it is another body.
+    pub(crate) fn change(&mut self, info: BodyInfo) -> bool {
+        let same = self.info.hash == info.hash && self.info.name == info.name;
+        if same {
+            self.retuned = true;
+            self.info = info;
+        }
+        same
+    }
+
     /// Takes a snapshot; true when the body became ready with it.
     pub(crate) fn take_snapshot(&mut self, now: Duration, snapshot: SnapshotBytes) -> bool {
         self.resting = snapshot.resting;
@@ -164,18 +180,21 @@ impl BodyView {
         self.wants_snapshot = false;
         self.settled = self.settled.max(snapshot.tick);
         let modes = snapshot.q.len();
+        let retuned = std::mem::take(&mut self.retuned);
         if let Some(receiver) = &mut self.receiver
             && receiver.hidden().modes() == modes
+            && !retuned
         {
             receiver.restart(&snapshot);
             self.resynced = true;
             return false;
         }
-        // Another number of modes: the receiver is made anew.
+        // Another number of modes, or another way to be stepped: the receiver is made anew.
         let again = self.receiver.take().is_some();
         self.snapshot = Some(snapshot);
         let ready = self.begin();
         self.resynced |= again && ready;
+        self.changed |= again && ready && retuned;
         ready && !again
     }
 

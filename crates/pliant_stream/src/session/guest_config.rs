@@ -76,6 +76,11 @@ pub enum GuestEvent {
         /// Its model, for the caller's cache too.
         model: Arc<ModalModel>,
     },
+    /// The host steps a body otherwise from now on: [`BodyView::info`](super::BodyView::info) says how. Hands on it stay.
+    BodyChanged {
+        /// Which.
+        body: BodyId,
+    },
     /// A body left the session.
     BodyGone {
         /// Which.

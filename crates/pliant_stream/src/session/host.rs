@@ -39,6 +39,25 @@ pub(super) struct HostBody {
     pub(super) streams: BTreeMap<StreamKey, Encoder>,
 }
 
+impl HostBody {
+    /// What a guest is told of it; `None` before the guest has said what it wants.
+    fn info(&self, guest: &Peer) -> Option<BodyInfo> {
+        let setup = &self.setup;
+        Some(BodyInfo {
+            body: self.id.0,
+            name: self.name.clone(),
+            hash: self.hash,
+            modes: Encoder::modes_for(&guest.wish?, self.model.mode_count(), guest.max_datagram) as u16,
+            rho_inf: BodyInfo::rho_inf_of(setup.integrator),
+            warp: setup.warp,
+            damping_scale: setup.damping_scale,
+            stiffness_scale: setup.stiffness_scale,
+            gravity: setup.gravity,
+            relaxation: setup.relaxation.map(|r| (r.ratio, r.time)),
+        })
+    }
+}
+
 /// The host of a session: a state machine without sockets or clock; see [`super`].
 #[derive(Debug)]
 pub struct HostSession {
@@ -130,6 +149,30 @@ impl HostSession {
         let joined: Vec<PeerId> = self.peers.values().filter(|p| p.user().is_some()).map(|p| p.id).collect();
         for peer in joined {
             self.announce(peer, body);
+        }
+        Ok(())
+    }
+
+    /// From the next tick on the body is stepped as `setup` says: who has it is told, and gets a snapshot. Hands on it stay. Not for many times a
+    /// second: every change begins every guest's stream anew.
+    ///
+    /// # Errors
+    /// [`StreamError::UnknownBody`], [`StreamError::Model`]; the old setup then stays.
+    pub fn set_setup(&mut self, body: BodyId, setup: BodySetup) -> Result<(), StreamError> {
+        if let Some(Err(e)) = setup.relaxation.map(|r| r.check()) {
+            return Err(StreamError::Model(e.to_string()));
+        }
+        let entry = self.bodies.get_mut(&body).ok_or(StreamError::UnknownBody(body))?;
+        if entry.setup == setup {
+            return Ok(());
+        }
+        entry.setup = setup;
+        entry.streams.clear();
+        let entry = &*entry;
+        for p in self.peers.values_mut().filter(|p| p.announced.contains(&body)) {
+            let Some(info) = entry.info(p) else { continue };
+            p.send_message(&HostMessage::BodyAdded(info), &mut self.out);
+            p.due.insert(body);
         }
         Ok(())
     }
@@ -498,18 +541,7 @@ impl HostSession {
 
     fn announce(&mut self, peer: PeerId, body: BodyId) {
         let (Some(p), Some(b)) = (self.peers.get_mut(&peer), self.bodies.get(&body)) else { return };
-        let Some(wish) = p.wish else { return };
-        let info = BodyInfo {
-            body: body.0,
-            name: b.name.clone(),
-            hash: b.hash,
-            modes: Encoder::modes_for(&wish, b.model.mode_count(), p.max_datagram) as u16,
-            rho_inf: BodyInfo::rho_inf_of(b.setup.integrator),
-            warp: b.setup.warp,
-            damping_scale: b.setup.damping_scale,
-            gravity: b.setup.gravity,
-            relaxation: b.setup.relaxation.map(|r| (r.ratio, r.time)),
-        };
+        let Some(info) = b.info(p) else { return };
         p.send_message(&HostMessage::BodyAdded(info), &mut self.out);
         if !p.cached.contains(&b.hash) && !p.transfers.iter().any(|t| t.hash == b.hash) {
             p.transfers.push_back(Transfer { hash: b.hash, bytes: b.bytes.clone(), offset: 0 });

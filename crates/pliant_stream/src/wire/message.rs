@@ -62,6 +62,8 @@ pub struct BodyInfo {
     pub warp: bool,
     /// Factor on all damping coefficients.
     pub damping_scale: f64,
+    /// Factor on the material's stiffness.
+    pub stiffness_scale: f64,
     /// Uniform acceleration, m/s^2, world axes.
     pub gravity: [f64; 3],
     /// Share of the stiffness that relaxes away, and in which time, s; none for an elastic body.
@@ -81,6 +83,7 @@ impl BodyInfo {
             integrator,
             warp: self.warp,
             damping_scale: self.damping_scale,
+            stiffness_scale: self.stiffness_scale,
             gravity: self.gravity,
             relaxation,
         }
@@ -320,6 +323,8 @@ impl HostMessage {
                 check("rho_inf", (-1.0..=2.0).contains(&info.rho_inf), info.rho_inf, "-1..=2")?;
                 let scale = info.damping_scale;
                 check("damping_scale", (0.0..=1e6).contains(&scale), scale, "0..=1e6")?;
+                let stiffness = info.stiffness_scale;
+                check("stiffness_scale", (1e-6..=1e6).contains(&stiffness), stiffness, "1e-6..=1e6")?;
                 let sound = info.setup().relaxation.is_none_or(|r| r.check().is_ok());
                 check(
                     "relaxation",

@@ -1,0 +1,131 @@
+//! A body as many times as stiff: against a rod of as many times the Young's modulus, and against closed forms.
+#![allow(clippy::unwrap_used, reason = "a failed test should panic")]
+
+mod rod;
+
+use std::sync::Arc;
+
+use pliant_modal::{Body, BodyConfig, GrabConfig, Integrator, Patch, Relaxation, StepError};
+use rod::{AREA, DENSITY, LENGTH, rod, tip};
+
+const YOUNG: f64 = 1e5;
+const H: f64 = 1e-3;
+
+fn config(integrator: Integrator, stiffness_scale: f64) -> BodyConfig {
+    BodyConfig { step: H, integrator, stiffness_scale, ..BodyConfig::default() }
+}
+
+/// Where a hand that wanders leads a body: tip and reaction, step by step.
+fn dragged(mut body: Body) -> Vec<f64> {
+    let patch = Patch::around(body.model().surface(), tip(), 0.01).unwrap();
+    let hand = body.grab(&patch, GrabConfig { stiffness: Some(500.0), relaxation: 0.01 }).unwrap();
+    let start = body.grab_position(hand).unwrap();
+    let mut seen = Vec::new();
+    for tick in 0..400 {
+        let t = f64::from(tick) * H;
+        body.set_target(hand, [start[0] + 0.02 * (31.0 * t).sin(), start[1], start[2]]).unwrap();
+        body.push(tip(), [0.4, 0.0, 0.0]).unwrap();
+        body.step().unwrap();
+        seen.extend([body.grab_position(hand).unwrap()[0], body.reaction(hand).unwrap()[0], body.energy()]);
+    }
+    seen
+}
+
+#[test]
+fn a_scaled_body_is_the_body_of_as_stiff_a_material() {
+    let relaxing = Some(Relaxation { ratio: 0.4, time: 0.05 });
+    for integrator in [Integrator::Exact, Integrator::Newmark, Integrator::GeneralizedAlpha { rho_inf: 0.5 }]
+    {
+        for (scale, relaxation) in [(3.0, None), (0.2, None), (3.0, relaxing), (1.0, None)] {
+            let with = BodyConfig { relaxation, ..config(integrator, scale) };
+            let scaled = Body::new(Arc::new(rod(YOUNG, 6, 0.05, false)), with.clone()).unwrap();
+            let plain = BodyConfig { stiffness_scale: 1.0, ..with };
+            let baked = Body::new(Arc::new(rod(YOUNG * scale, 6, 0.05, false)), plain).unwrap();
+            for (a, b) in scaled.omega().iter().zip(baked.omega()) {
+                assert!((a / b - 1.0).abs() < 1e-14);
+            }
+            for (a, b) in scaled.damping().iter().zip(baked.damping()) {
+                assert!((a / b - 1.0).abs() < 1e-13);
+            }
+            let (scaled, baked) = (dragged(scaled), dragged(baked));
+            let size = baked.iter().fold(0.0_f64, |m, x| m.max(x.abs()));
+            let off = scaled.iter().zip(&baked).fold(0.0_f64, |m, (a, b)| m.max((a - b).abs()));
+            assert!(off < 1e-9 * size, "{integrator:?}, {scale} times: {off} of {size}");
+        }
+    }
+}
+
+#[test]
+fn twice_as_stiff_it_sinks_half_as_far_and_swings_root_two_faster() {
+    let model = Arc::new(rod(YOUNG, 1, 0.0, false));
+    let quarter_wave = std::f64::consts::FRAC_PI_2 / LENGTH;
+    let phi = (2.0 / (DENSITY * AREA * LENGTH)).sqrt();
+    for stiffness in [1.0, 2.0, 0.5] {
+        let omega = quarter_wave * (YOUNG * stiffness / DENSITY).sqrt();
+        // Changed while it runs, not only made so.
+        let mut body = Body::new(model.clone(), config(Integrator::Exact, 1.0)).unwrap();
+        body.reconfigure(BodyConfig { damping_scale: 0.0, ..config(Integrator::Exact, stiffness) }).unwrap();
+        // A load that is there all at once: it swings about where it would hang, phi^2 F / omega^2, from nought to twice that.
+        let (mut crossings, mut before, mut mean, mut most) = (Vec::new(), 0.0, 0.0, 0.0_f64);
+        let hangs = phi * phi * 2.0 / (omega * omega);
+        let steps = 8_000;
+        for tick in 1..=steps {
+            body.push(tip(), [2.0, 0.0, 0.0]).unwrap();
+            body.step().unwrap();
+            let at = phi * body.q()[0];
+            (mean, most) = (mean + at / f64::from(steps), most.max(at));
+            let off = at - hangs;
+            if tick > 1 && before < 0.0 && off >= 0.0 {
+                crossings.push(f64::from(tick) * H - H * off / (off - before));
+            }
+            before = off;
+        }
+        let periods = (crossings.len() - 1) as f64;
+        let period = (crossings[crossings.len() - 1] - crossings[0]) / periods;
+        let expected = std::f64::consts::TAU / omega;
+        assert!((period / expected - 1.0).abs() < 1e-6, "{stiffness}: {period} s for {expected} s");
+        assert!((most / (2.0 * hangs) - 1.0).abs() < 1e-3, "{stiffness}: {most} m for {} m", 2.0 * hangs);
+        assert!((mean / hangs - 1.0).abs() < 0.02, "{stiffness}: {mean} m for {hangs} m");
+    }
+}
+
+#[test]
+fn a_change_on_the_way_keeps_the_motion_and_the_balance_of_forces() {
+    for relaxation in [None, Some(Relaxation { ratio: 0.3, time: 0.1 })] {
+        let alpha = Integrator::GeneralizedAlpha { rho_inf: 0.5 };
+        let before = BodyConfig { relaxation, ..config(alpha, 1.0) };
+        let mut body = Body::new(Arc::new(rod(YOUNG, 4, 0.03, false)), before.clone()).unwrap();
+        body.strike(tip(), [0.5, 0.0, 0.0]).unwrap();
+        for _ in 0..37 {
+            body.step().unwrap();
+        }
+        let (q, v) = (body.q().to_vec(), body.v().to_vec());
+        // Nobody pushes: a + c v + omega^2 (q - ratio z) is what is left over, small as the integrator's error is.
+        let ratio = relaxation.map_or(0.0, |r| r.ratio);
+        let left_over = |body: &Body| -> Vec<f64> {
+            (0..4)
+                .map(|i| {
+                    let stretch = body.q()[i] - ratio * body.z().get(i).copied().unwrap_or(0.0);
+                    body.a()[i] + body.damping()[i] * body.v()[i] + body.omega()[i].powi(2) * stretch
+                })
+                .collect()
+        };
+        let unbalanced = left_over(&body);
+        body.reconfigure(BodyConfig { stiffness_scale: 7.0, ..before }).unwrap();
+        assert_eq!((body.q(), body.v()), (&q[..], &v[..]));
+        for (then, now) in unbalanced.iter().zip(left_over(&body)) {
+            let size = body.omega()[3].powi(2) * q.iter().fold(0.0_f64, |m, q| m.max(q.abs()));
+            assert!((then - now).abs() < 1e-12 * size, "{then} became {now} of {size}");
+        }
+    }
+}
+
+#[test]
+fn what_is_no_stiffness_is_refused_and_changes_nothing() {
+    let mut body = Body::new(Arc::new(rod(YOUNG, 2, 0.1, false)), config(Integrator::Exact, 2.0)).unwrap();
+    for bad in [f64::NAN, f64::INFINITY, 0.0, -1.0, 1e-7, 1e7] {
+        let error = body.reconfigure(config(Integrator::Exact, bad)).unwrap_err();
+        assert!(matches!(error, StepError::Input { what: "stiffness_scale", .. }), "{error}");
+        assert_eq!(body.config().stiffness_scale, 2.0);
+    }
+}
