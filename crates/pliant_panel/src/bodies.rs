@@ -1,6 +1,6 @@
 //! The bodies of a scene: modes, damping, energy, rest, and the hands on them.
 
-use bevy_egui::egui::{CollapsingHeader, Slider, Ui};
+use bevy_egui::egui::{CollapsingHeader, Color32, RichText, Slider, SliderClamping, Ui};
 
 use crate::trace::{Trace, colour, plot, short};
 
@@ -15,6 +15,8 @@ pub struct BodyView {
     pub all_modes: usize,
     /// Frequency of the slowest mode, Hz.
     pub lowest_hz: f64,
+    /// Multiplies the baked stiffness. A knob.
+    pub stiffness_scale: f64,
     /// Multiplies the baked damping. A knob.
     pub damping_scale: f64,
     /// Bent by modal warping. A knob.
@@ -40,6 +42,8 @@ pub struct BodyView {
 pub struct HandView {
     /// Whose it is.
     pub name: String,
+    /// The colour of whose it is, sRGB; `None` takes one of the plot's own.
+    pub colour: Option<[u8; 3]>,
     /// Magnitude of the reaction, N.
     pub force: f64,
     /// The same over the last seconds.
@@ -69,6 +73,14 @@ fn body_knobs(ui: &mut Ui, index: usize, body: &mut BodyView) {
     ui.add_enabled_ui(body.local, |ui| {
         ui.add(Slider::new(&mut body.modes, 1..=body.all_modes.max(1)).text("modes"))
             .on_hover_text("How many modes are simulated, the slowest first.");
+        ui.add(
+            Slider::new(&mut body.stiffness_scale, 0.1..=10.0)
+                .logarithmic(true)
+                .clamping(SliderClamping::Edits)
+                .text("stiffness")
+                .max_decimals(2),
+        )
+        .on_hover_text("Multiplies Young's modulus: four times as stiff swings twice as fast.");
         ui.add(Slider::new(&mut body.damping_scale, 0.0..=10.0).text("damping").max_decimals(2))
             .on_hover_text("Multiplies the damping that was baked.");
         ui.checkbox(&mut body.warp, "modal warping")
@@ -86,14 +98,20 @@ fn body_knobs(ui: &mut Ui, index: usize, body: &mut BodyView) {
         }
     });
     plot(ui, &format!("pliant energy {index}"), "J", [("energy", &body.energies, colour(0))]);
-    for hand in &body.hands {
-        ui.label(format!("{}: {} N", hand.name, short(hand.force)));
+    let colour_of = |index: usize, hand: &HandView| {
+        hand.colour.map_or_else(|| colour(index), |[r, g, b]| Color32::from_rgb(r, g, b))
+    };
+    for (hand_index, hand) in body.hands.iter().enumerate() {
+        ui.horizontal(|ui| {
+            ui.label(RichText::new("\u{25cf}").color(colour_of(hand_index, hand)));
+            ui.label(format!("{}: {} N", hand.name, short(hand.force)));
+        });
     }
     let hands = body.hands.iter().enumerate();
     plot(
         ui,
         &format!("pliant forces {index}"),
         "N",
-        hands.map(|(i, hand)| (hand.name.as_str(), &hand.forces, colour(i))),
+        hands.map(|(i, hand)| (hand.name.as_str(), &hand.forces, colour_of(i, hand))),
     );
 }

@@ -1,6 +1,6 @@
 //! Haptic devices: force, rate, faults, the emergency stop.
 
-use bevy_egui::egui::{Button, Color32, RichText, Ui, Vec2};
+use bevy_egui::egui::{Button, Color32, RichText, Slider, Ui, Vec2};
 
 use crate::trace::{Trace, colour, plot, short};
 
@@ -32,6 +32,10 @@ pub struct DeviceView {
     pub jitter_us: f64,
     /// Energy that the hand got beyond what it gave, J.
     pub energy: f64,
+    /// Multiplies what the tools that it moves give back, 0 to 1; `None` where it moves none. A knob.
+    pub force_scale: Option<f64>,
+    /// What is to be done by hand before its positions can be trusted.
+    pub calibrate: Option<String>,
     /// What is wrong, if something is.
     pub fault: Option<String>,
     /// Force over the last seconds, N.
@@ -69,10 +73,17 @@ pub fn show(ui: &mut Ui, view: &mut DevicesView) {
             short(device.jitter_us),
             short(device.energy)
         ));
+        if let Some(how) = &device.calibrate {
+            ui.colored_label(Color32::from_rgb(120, 200, 255), format!("Calibrate: {how}"));
+        }
         if let Some(fault) = &device.fault {
             ui.colored_label(Color32::from_rgb(255, 170, 80), fault);
         }
         plot(ui, &format!("pliant device {index}"), "N", [("force", &device.forces, colour(4))]);
+        if let Some(scale) = &mut device.force_scale {
+            ui.add(Slider::new(scale, 0.0..=1.0).text("force").max_decimals(2))
+                .on_hover_text("Share of the body's force that reaches the hand.");
+        }
         ui.checkbox(&mut device.recording, "record samples");
     }
 }

@@ -29,7 +29,9 @@ pub struct NetworkView {
     pub emulator: Option<EmulatorView>,
     /// Somebody pressed "Copy" at the invite.
     pub copy: bool,
-    /// Somebody asked to leave the session.
+    /// What the button says that ends one's part in the session: "Leave", "End the session"; `None` where there is nothing to leave.
+    pub way_out: Option<&'static str>,
+    /// Somebody pressed it.
     pub leave: bool,
 }
 
@@ -48,10 +50,10 @@ pub struct UserView {
     pub round_trip_ms: Option<f64>,
 }
 
-/// The knobs of the link emulator.
+/// The knobs of the link emulator. Moving loss, round trip or jitter away from a preset leaves its other traits (rate, bursts, order) as they are.
 #[derive(Debug, Clone, Default, PartialEq)]
 pub struct EmulatorView {
-    /// Names of the presets; the first is no emulation.
+    /// Names of the presets; the first is no emulation, the last none of the others.
     pub presets: Vec<String>,
     /// The one in use. A knob.
     pub preset: usize,
@@ -59,13 +61,17 @@ pub struct EmulatorView {
     pub loss: f64,
     /// Round trip, ms. A knob.
     pub round_trip_ms: f64,
+    /// Mean of what is added to the way of a packet at random, ms. A knob.
+    pub jitter_ms: f64,
 }
 
 /// Shows the session.
 pub fn show(ui: &mut Ui, network: &mut NetworkView) {
     ui.horizontal(|ui| {
         ui.strong(&network.role);
-        if ui.button("Leave").clicked() {
+        if let Some(way_out) = network.way_out
+            && ui.button(way_out).clicked()
+        {
             network.leave = true;
         }
     });
@@ -114,7 +120,7 @@ pub fn show(ui: &mut Ui, network: &mut NetworkView) {
 }
 
 fn emulator_knobs(ui: &mut Ui, emulator: &mut EmulatorView) {
-    let EmulatorView { presets, preset, loss, round_trip_ms } = emulator;
+    let EmulatorView { presets, preset, loss, round_trip_ms, jitter_ms } = emulator;
     let name = presets.get(*preset).cloned().unwrap_or_default();
     ComboBox::from_label("emulated network").selected_text(name).show_ui(ui, |ui| {
         for (index, name) in presets.iter().enumerate() {
@@ -124,5 +130,6 @@ fn emulator_knobs(ui: &mut Ui, emulator: &mut EmulatorView) {
     if *preset > 0 {
         ui.add(Slider::new(loss, 0.0..=50.0).text("% lost").max_decimals(1));
         ui.add(Slider::new(round_trip_ms, 0.0..=1000.0).text("ms round trip").max_decimals(0));
+        ui.add(Slider::new(jitter_ms, 0.0..=100.0).text("ms jitter").max_decimals(1));
     }
 }

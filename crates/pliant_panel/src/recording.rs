@@ -1,6 +1,6 @@
 //! The recording for the rerun viewer.
 
-use bevy_egui::egui::Ui;
+use bevy_egui::egui::{Slider, Ui};
 
 use crate::trace::short;
 
@@ -17,6 +17,10 @@ pub struct RecordingView {
     pub dropped: u64,
     /// Shapes a second. A knob.
     pub shapes_hz: f64,
+    /// Drawings of the modes' energies and spectra a second. A knob.
+    pub modes_hz: f64,
+    /// Surfaces are coloured by stress, not by displacement. A knob.
+    pub stress: bool,
 }
 
 /// Shows the recording.
@@ -30,10 +34,13 @@ pub fn show(ui: &mut Ui, recording: &mut RecordingView) {
         let sinks = if recording.sinks == 1 { "1 sink".into() } else { format!("{} sinks", recording.sinks) };
         ui.label(format!("{} ticks to {sinks}, {} dropped", recording.ticks, recording.dropped));
     });
-    ui.add(
-        bevy_egui::egui::Slider::new(&mut recording.shapes_hz, 0.0..=60.0)
-            .text("shapes a second")
-            .max_decimals(0),
-    )
-    .on_hover_text(format!("Shapes drawn in the recording, now {} a second.", short(recording.shapes_hz)));
+    ui.add(Slider::new(&mut recording.shapes_hz, 0.0..=60.0).text("shapes a second").max_decimals(0))
+        .on_hover_text(format!(
+            "Shapes drawn in the recording, now {} a second.",
+            short(recording.shapes_hz)
+        ));
+    ui.add(Slider::new(&mut recording.modes_hz, 0.0..=20.0).text("bars a second").max_decimals(0))
+        .on_hover_text("The energies of the modes and the spectrum; zero leaves them out.");
+    ui.checkbox(&mut recording.stress, "colour by stress")
+        .on_hover_text("Off, surfaces are coloured by displacement.");
 }

@@ -21,6 +21,7 @@ fn body() -> BodyView {
         all_modes: 30,
         lowest_hz: 3.5,
         damping_scale: 1.0,
+        stiffness_scale: 1.0,
         warp: true,
         local: true,
         resting: true,
@@ -60,6 +61,8 @@ fn a_body_is_given_fewer_modes_more_damping_and_no_warp() {
         Harness::new_ui_state(|ui, bodies: &mut Vec<BodyView>| bodies::show(ui, bodies), vec![body()]);
     nudge(&mut harness, "modes", Key::ArrowLeft);
     assert_eq!(harness.state()[0].modes, 19);
+    nudge(&mut harness, "stiffness", Key::ArrowRight);
+    assert!(harness.state()[0].stiffness_scale > 1.0);
     nudge(&mut harness, "damping", Key::ArrowRight);
     assert!(harness.state()[0].damping_scale > 1.0);
     harness.get_by_label("modal warping").click();
@@ -89,7 +92,14 @@ fn hands_are_taken_off_a_body_and_a_remote_body_keeps_its_own_settings() {
 #[test]
 fn the_emergency_stop_is_one_press_and_its_release_another() {
     let devices = DevicesView {
-        devices: vec![DeviceView { name: "virtual".into(), force: 1.0, limit: 3.3, ..Default::default() }],
+        devices: vec![DeviceView {
+            name: "virtual".into(),
+            force: 1.0,
+            limit: 3.3,
+            force_scale: Some(0.5),
+            calibrate: Some("press the button in its corner".into()),
+            ..Default::default()
+        }],
         ..Default::default()
     };
     let mut harness = Harness::new_ui_state(|ui, view: &mut DevicesView| device::show(ui, view), devices);
@@ -97,6 +107,9 @@ fn the_emergency_stop_is_one_press_and_its_release_another() {
     harness.get_by_label("STOP").click();
     harness.run();
     assert!(harness.state().stop);
+    assert!(harness.query_by_label_contains("press the button").is_some());
+    nudge(&mut harness, "force", Key::ArrowLeft);
+    assert!(harness.state().devices[0].force_scale.unwrap() < 0.5);
     harness.get_by_label("record samples").click();
     harness.run();
     assert!(harness.state().devices[0].recording);
@@ -137,6 +150,7 @@ fn the_emulated_network_is_chosen_by_name_and_its_loss_moved() {
             preset: 1,
             loss: 9.0,
             round_trip_ms: 196.0,
+            jitter_ms: 2.0,
         }),
         ..Default::default()
     };
@@ -145,16 +159,45 @@ fn the_emulated_network_is_chosen_by_name_and_its_loss_moved() {
     assert!(harness.state().emulator.as_ref().unwrap().loss > 9.0);
     nudge(&mut harness, "ms round trip", Key::ArrowLeft);
     assert!(harness.state().emulator.as_ref().unwrap().round_trip_ms < 196.0);
+    nudge(&mut harness, "ms jitter", Key::ArrowRight);
+    assert!(harness.state().emulator.as_ref().unwrap().jitter_ms > 2.0);
     harness.get_by_role(Role::ComboBox).click();
     harness.run();
     harness.get_by_label("wifi").click();
     harness.run();
     assert_eq!(harness.state().emulator.as_ref().unwrap().preset, 2);
+    // Off: its knobs go with it.
+    harness.get_by_role(Role::ComboBox).click();
+    harness.run();
+    harness.get_by_label("none").click();
+    harness.run();
+    assert_eq!(harness.state().emulator.as_ref().unwrap().preset, 0);
+    assert!(harness.query_by_label("% lost").is_none());
+}
+
+#[test]
+fn a_session_is_left_where_there_is_one_to_leave() {
+    let session = NetworkView { role: "guest".into(), way_out: Some("Leave"), ..Default::default() };
+    let mut harness = Harness::new_ui_state(|ui, view: &mut NetworkView| network::show(ui, view), session);
+    harness.get_by_label("Leave").click();
+    harness.run();
+    assert!(std::mem::take(&mut harness.state_mut().leave));
+    harness.state_mut().way_out = None;
+    harness.run();
+    assert!(harness.query_by_label("Leave").is_none() && !harness.state().leave);
 }
 
 #[test]
 fn a_recording_is_switched_off_and_thinned() {
-    let recording = RecordingView { on: true, sinks: 1, ticks: 40, dropped: 0, shapes_hz: 20.0 };
+    let recording = RecordingView {
+        on: true,
+        sinks: 1,
+        ticks: 40,
+        dropped: 0,
+        shapes_hz: 20.0,
+        modes_hz: 4.0,
+        stress: false,
+    };
     let mut harness =
         Harness::new_ui_state(|ui, view: &mut RecordingView| recording::show(ui, view), recording);
     harness.get_by_label("record").click();
@@ -162,6 +205,11 @@ fn a_recording_is_switched_off_and_thinned() {
     assert!(!harness.state().on);
     nudge(&mut harness, "shapes a second", Key::ArrowLeft);
     assert!(harness.state().shapes_hz < 20.0);
+    nudge(&mut harness, "bars a second", Key::ArrowRight);
+    assert!(harness.state().modes_hz > 4.0);
+    harness.get_by_label("colour by stress").click();
+    harness.run();
+    assert!(harness.state().stress);
 }
 
 #[test]
@@ -175,6 +223,7 @@ fn tab_alone_reaches_every_knob_of_a_body() {
         for (role, name) in [
             (Role::Slider, "modes"),
             (Role::Slider, "damping"),
+            (Role::Slider, "stiffness"),
             (Role::CheckBox, "modal warping"),
             (Role::Button, "Wake"),
         ] {
@@ -183,5 +232,5 @@ fn tab_alone_reaches_every_knob_of_a_body() {
             }
         }
     }
-    assert_eq!(reached.len(), 4, "{reached:?}");
+    assert_eq!(reached.len(), 5, "{reached:?}");
 }

@@ -1,17 +1,28 @@
-//! The layout that ships with a recording: the scene on the left, a plot for every kind of figure on the right.
+//! The layout that ships with a recording: the scene on the left with the modes' bars and the log under it, plots on the right.
 
 use std::collections::{BTreeMap, BTreeSet};
 
 use rerun::{
-    EntityPath,
+    EntityPath, EntityPathPart,
     blueprint::{
-        Blueprint, BlueprintActivation, BlueprintPanel, ContainerLike, Grid, Horizontal, SelectionPanel,
-        Spatial3DView, TextLogView, TimePanel, TimeSeriesView, Vertical,
+        BarChartView, Blueprint, BlueprintActivation, BlueprintPanel, ContainerLike, Grid, Horizontal,
+        SelectionPanel, Spatial3DView, Tabs, TextLogView, TimePanel, TimeSeriesView, Vertical,
         components::{PanelState, PlayState},
     },
 };
 
 use crate::recorder::path;
+
+/// Plots that have a place of their own; beyond, those of the machinery share one.
+const MOST_PLOTS: usize = 8;
+
+/// Bodies whose bars have a tab; the others' are there to be opened by hand.
+const MOST_TABS: usize = 12;
+
+/// Whether figures are about how the program runs and not about bodies, hands and what the network does to them.
+fn is_housekeeping(area: &str, unit: &str) -> bool {
+    area == "time" || (area == "net" && matches!(unit, "" | "/s"))
+}
 
 /// The plots of a recording: figures with one first part of their path and one unit share an axis.
 #[derive(Debug, Clone, Default)]
@@ -19,6 +30,8 @@ pub(crate) struct Plots {
     titles: BTreeMap<String, String>,
     /// Area, unit, paths.
     seen: BTreeMap<(String, String), BTreeSet<String>>,
+    /// Bar charts: area, names.
+    bars: BTreeMap<&'static str, BTreeSet<String>>,
     changed: bool,
     log: bool,
 }
@@ -35,6 +48,14 @@ impl Plots {
         let new = self.seen.entry(key).or_default().insert(path.to_owned());
         self.changed |= new;
         new
+    }
+
+    /// Notes a bar chart `area/name`.
+    pub fn note_bars(&mut self, area: &'static str, name: &str) {
+        let names = self.bars.entry(area).or_default();
+        if !names.contains(name) {
+            self.changed |= names.insert(name.to_owned());
+        }
     }
 
     /// Notes that there are lines of text.
@@ -61,27 +82,58 @@ impl Plots {
         }
     }
 
+    /// The bar charts of an area: one, or a tab for each body.
+    fn bar_views(&self, area: &str, title: &str) -> Option<ContainerLike> {
+        let names = self.bars.get(area)?;
+        let view = |title: String, name: &str| {
+            let entity = EntityPath::from(vec![EntityPathPart::new(area), EntityPathPart::new(name)]);
+            BarChartView::new(title).with_origin(entity.clone()).with_contents([entity.to_string()])
+        };
+        if names.len() == 1 {
+            return names.first().map(|name| view(title.to_owned(), name).into());
+        }
+        let tabs = names.iter().take(MOST_TABS).map(|name| view(format!("{title}: {name}"), name).into());
+        Some(Tabs::new(tabs).into())
+    }
+
     /// Sends the layout with the recording.
     pub fn send(&self, recording: &rerun::RecordingStream) -> Result<(), rerun::RecordingStreamError> {
         let scene = Spatial3DView::new("Scene").with_origin(EntityPath::from("world"));
-        let mut plots: Vec<ContainerLike> =
-            self.seen.iter().map(|((area, unit), paths)| self.view(area, unit, paths).into()).collect();
-        // Text wants the width: it goes under the scene.
-        let left: ContainerLike = if self.log {
-            let log = TextLogView::new("Log").with_origin(path("log"));
-            Vertical::new([scene.into(), log.into()]).with_row_shares([4.0, 1.0]).into()
-        } else {
-            scene.into()
+        let of = |housekeeping: bool| -> Vec<ContainerLike> {
+            let plots =
+                self.seen.iter().filter(|((area, unit), _)| is_housekeeping(area, unit) == housekeeping);
+            plots.map(|((area, unit), paths)| self.view(area, unit, paths).into()).collect()
         };
+        let (mut plots, mut others) = (of(false), of(true));
+        if plots.len() + others.len() <= MOST_PLOTS {
+            plots.append(&mut others);
+        }
+        // Bars and text want the width: they go under the scene.
+        let bars = [("modes", "Energy of each mode (J)"), ("spectrum", "Spectrum (m over Hz)")];
+        let bars: Vec<_> = bars.iter().filter_map(|(area, title)| self.bar_views(area, title)).collect();
+        let (mut left, mut shares): (Vec<ContainerLike>, Vec<f32>) = (vec![scene.into()], vec![4.0]);
+        if !bars.is_empty() {
+            left.push(Horizontal::new(bars).into());
+            shares.push(1.6);
+        }
+        if self.log {
+            left.push(TextLogView::new("Log").with_origin(path("log")).into());
+            shares.push(1.2);
+        }
+        let left = Vertical::new(left).with_row_shares(shares);
+        // What tells of the machinery and not of the bodies shares one place, in tabs.
+        if !others.is_empty() {
+            plots.push(Tabs::new(others).with_name("More").into());
+        }
         let root: ContainerLike = match plots.len() {
-            0 => Horizontal::new([left]).into(),
-            1..=4 => {
-                Horizontal::new([left, Vertical::new(plots).into()]).with_column_shares([3.0, 2.0]).into()
-            }
+            0 => Horizontal::new([left.into()]).into(),
+            1..=4 => Horizontal::new([left.into(), Vertical::new(plots).into()])
+                .with_column_shares([3.0, 2.0])
+                .into(),
             // An odd one out would leave a hole in two columns; the grid fills row by row.
             _ => {
-                let plots = Grid::new(plots.drain(..)).with_grid_columns(2);
-                Horizontal::new([left, plots.into()]).with_column_shares([1.0, 1.0]).into()
+                let plots = Grid::new(plots).with_grid_columns(2);
+                Horizontal::new([left.into(), plots.into()]).with_column_shares([1.0, 1.15]).into()
             }
         };
         Blueprint::new(root)

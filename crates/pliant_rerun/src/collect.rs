@@ -7,8 +7,8 @@ use std::{
     time::{Instant, SystemTime},
 };
 
-use bevy::{diagnostic::DiagnosticsStore, prelude::*};
-use pliant_body::{BodyRefused, BodyState, Grab, GrabForce, PliantTick, ShownState};
+use bevy::{diagnostic::DiagnosticsStore, ecs::entity::EntityHashMap, prelude::*};
+use pliant_body::{BodyRefused, BodyState, Driven, Grab, GrabForce, PliantTick, ShownState};
 
 use crate::{
     RerunRecording, RerunScalars, RerunStats, RerunStyle,
@@ -19,8 +19,10 @@ use crate::{
 #[derive(Resource)]
 pub(crate) struct Collector {
     workers: Vec<Worker>,
-    /// When the last drawing was due, s of simulated time.
-    last_drawing: f64,
+    shapes: Due,
+    figures: Due,
+    hands: Due,
+    modes: Due,
     bodies: HashMap<Entity, Followed>,
     /// Bodies that some worker has not taken notice of.
     untold: bool,
@@ -29,9 +31,55 @@ pub(crate) struct Collector {
     measured: HashMap<String, Instant>,
 }
 
-/// Hands that are not entities here: those of a session's other users.
+/// What a session says of hands.
 #[derive(Resource, Default)]
-pub(crate) struct OtherHands(pub Vec<Hand>);
+pub(crate) struct Hands {
+    /// Those that are not entities here: of a session's other users.
+    pub others: Vec<Hand>,
+    /// Whose those are that are.
+    pub whose: EntityHashMap<Whose>,
+}
+
+/// The user behind a hand.
+#[derive(Debug, Clone)]
+pub(crate) struct Whose {
+    pub name: String,
+    /// sRGB.
+    pub colour: [u8; 3],
+}
+
+/// When something was due last, s of simulated time.
+#[derive(Debug, Clone, Copy)]
+struct Due(f64);
+
+impl Due {
+    const NEVER: Self = Self(f64::NEG_INFINITY);
+
+    /// Whether it is due at simulated time `time`, so often as `hz` says.
+    fn at(&mut self, time: f64, hz: f64) -> bool {
+        let period = 1.0 / hz;
+        // A millionth of a second of slack: 20 Hz in 40 Hz of ticks is every second one, whatever the rounding. Time that went back is a new run.
+        if hz.is_nan() || hz <= 0.0 || (time + 1e-6 < self.0 + period && time >= self.0) {
+            return false;
+        }
+        let next = self.0 + period;
+        self.0 = if time < next + period { next } else { time };
+        true
+    }
+}
+
+/// What of a tick is wanted now.
+#[derive(Debug, Clone, Copy)]
+struct Wanted {
+    draw: bool,
+    figures: bool,
+    /// A sample for the spectrum.
+    sample: bool,
+    /// The energies of the modes.
+    energies: bool,
+    /// Length of a tick, s.
+    tick: f64,
+}
 
 struct Followed {
     drawn: Arc<Drawn>,
@@ -45,24 +93,15 @@ impl Collector {
     pub fn new(workers: Vec<Worker>) -> Self {
         Self {
             workers,
-            last_drawing: f64::NEG_INFINITY,
+            shapes: Due::NEVER,
+            figures: Due::NEVER,
+            hands: Due::NEVER,
+            modes: Due::NEVER,
             bodies: HashMap::new(),
             untold: false,
             had_hands: false,
             measured: HashMap::new(),
         }
-    }
-
-    /// Whether a drawing is due at simulated time `time`, at `hz` drawings a second.
-    fn drawing_is_due(&mut self, time: f64, hz: f64) -> bool {
-        let period = 1.0 / hz;
-        // A millionth of a second of slack: 20 Hz of drawings in 40 Hz of ticks is every second one, whatever the rounding.
-        if !(period > 0.0 && period.is_finite()) || time + 1e-6 < self.last_drawing + period {
-            return false;
-        }
-        let next = self.last_drawing + period;
-        self.last_drawing = if time < next + period { next } else { time };
-        true
     }
 }
 
@@ -84,6 +123,7 @@ type Bodies<'w, 's> = Query<
         Option<&'static Name>,
         &'static BodyState,
         &'static ShownState,
+        &'static Driven,
         &'static GlobalTransform,
         Option<&'static RerunStyle>,
     ),
@@ -102,7 +142,7 @@ pub(crate) fn collect(
     time: Res<Time>,
     diagnostics: Option<Res<DiagnosticsStore>>,
     mut refused: MessageReader<BodyRefused>,
-    others: Res<OtherHands>,
+    session: Res<Hands>,
     bodies: Bodies,
     grabs: Query<(Entity, Option<&Name>, &Grab, &GrabForce)>,
 ) {
@@ -112,7 +152,7 @@ pub(crate) fn collect(
         tick: tick.0,
         time: now,
         wall: SystemTime::UNIX_EPOCH.elapsed().map_or(0.0, |since| since.as_secs_f64()),
-        scalars: std::mem::take(&mut own.scalars),
+        colour: recording.colour,
         lines: std::mem::take(&mut own.lines),
         ..Frame::default()
     };
@@ -121,19 +161,32 @@ pub(crate) fn collect(
             .read()
             .map(|refused| Line { warning: true, text: format!("{}: {}", refused.entity, refused.error) }),
     );
-    let draw = collector.drawing_is_due(now, recording.shapes_hz);
-    follow_bodies(collector, &mut frame, &bodies, draw);
+    let wanted = Wanted {
+        draw: collector.shapes.at(now, recording.shapes_hz),
+        figures: collector.figures.at(now, recording.figures_hz),
+        sample: recording.modes_hz > 0.0,
+        energies: collector.modes.at(now, recording.modes_hz),
+        tick: time.delta_secs_f64(),
+    };
+    follow_bodies(collector, &mut frame, &bodies, wanted);
 
-    let mut hands: Vec<_> = grabs.iter().collect();
-    hands.sort_by_key(|(entity, ..)| *entity);
-    let hands = hands.into_iter().map(|(_, name, grab, force)| hand(name, grab, force));
-    let hands: Vec<Hand> = hands.chain(others.0.iter().cloned()).collect();
-    if !hands.is_empty() || collector.had_hands {
-        collector.had_hands = !hands.is_empty();
-        frame.hands = Some(hands);
+    if collector.hands.at(now, recording.hands_hz) {
+        let mut hands: Vec<_> = grabs.iter().collect();
+        hands.sort_by_key(|(entity, ..)| *entity);
+        let hands = hands
+            .into_iter()
+            .map(|(entity, name, grab, force)| hand(name, session.whose.get(&entity), grab, force));
+        let hands: Vec<Hand> = hands.chain(session.others.iter().cloned()).collect();
+        if !hands.is_empty() || collector.had_hands {
+            collector.had_hands = !hands.is_empty();
+            frame.hands = Some(hands);
+        }
     }
-    if let Some(diagnostics) = &diagnostics {
-        frame.scalars.extend(measurements(&mut collector.measured, diagnostics));
+    if wanted.figures {
+        frame.scalars = std::mem::take(&mut own.scalars);
+        if let Some(diagnostics) = &diagnostics {
+            frame.scalars.extend(measurements(&mut collector.measured, diagnostics));
+        }
     }
 
     if collector.untold {
@@ -156,7 +209,7 @@ pub(crate) fn collect(
     stats.sinks = collector.workers.iter().filter(|worker| worker.listens()).count();
 }
 
-fn follow_bodies(collector: &mut Collector, frame: &mut Frame, bodies: &Bodies, draw: bool) {
+fn follow_bodies(collector: &mut Collector, frame: &mut Frame, bodies: &Bodies, wanted: Wanted) {
     let present: HashSet<Entity> = bodies.iter().map(|(entity, ..)| entity).collect();
     collector.bodies.retain(|entity, followed| {
         let stays = present.contains(entity);
@@ -165,7 +218,7 @@ fn follow_bodies(collector: &mut Collector, frame: &mut Frame, bodies: &Bodies, 
         }
         stays
     });
-    for (entity, name, state, shown, transform, style) in bodies {
+    for (entity, name, state, shown, driven, transform, style) in bodies {
         let style = style.copied().unwrap_or_default();
         let known = collector.bodies.get(&entity);
         if known
@@ -182,7 +235,12 @@ fn follow_bodies(collector: &mut Collector, frame: &mut Frame, bodies: &Bodies, 
         let (scale, rotation, translation) = transform.to_scale_rotation_translation();
         let place = Place { translation: translation.into(), rotation: rotation.into(), scale: scale.x };
         let moved = followed.version != shown.version() || followed.place != Some(place);
+        let draw = wanted.draw && style != RerunStyle::Hidden;
         if !moved && shown.is_settled() && (followed.complete || !draw) {
+            continue;
+        }
+        if !(draw || wanted.figures || wanted.sample) {
+            // What moves goes on counting as moved until somebody wants it.
             continue;
         }
         followed.version = shown.version();
@@ -193,7 +251,11 @@ fn follow_bodies(collector: &mut Collector, frame: &mut Frame, bodies: &Bodies, 
             q: shown.current().iter().map(|&q| q as f32).collect(),
             warped: state.warps(),
             place,
+            stiffness: state.body().config().stiffness_scale as f32,
             draw,
+            figures: wanted.figures,
+            sample: wanted.sample,
+            energies: wanted.energies.then(|| energies(state, driven, shown, wanted.tick)),
         });
     }
 }
@@ -208,9 +270,27 @@ fn free_path(bodies: &HashMap<Entity, Followed>, entity: Entity, name: Option<&N
     }
 }
 
-fn hand(name: Option<&Name>, grab: &Grab, force: &GrabForce) -> Hand {
+/// Kinetic and elastic energy of each mode, J. Of a body that somebody else steps the velocities are those of its shape over the last tick of
+/// `tick` seconds.
+fn energies(state: &BodyState, driven: &Driven, shown: &ShownState, tick: f64) -> Vec<f64> {
+    let body = state.body();
+    let scale = state.scale() * state.scale();
+    let of = |omega: f64, q: f64, v: f64| 0.5 * scale * (v * v + (omega * q).powi(2));
+    let kept = body.omega().iter();
+    match driven {
+        Driven::Local => kept.zip(body.q()).zip(body.v()).map(|((&omega, &q), &v)| of(omega, q, v)).collect(),
+        Driven::Remote => kept
+            .zip(shown.current().iter().zip(shown.previous()))
+            .map(|(&omega, (&q, &before))| of(omega, q, if tick > 0.0 { (q - before) / tick } else { 0.0 }))
+            .collect(),
+    }
+}
+
+fn hand(name: Option<&Name>, whose: Option<&Whose>, grab: &Grab, force: &GrabForce) -> Hand {
+    let name = name.map(Name::as_str).or(whose.map(|whose| whose.name.as_str())).unwrap_or("hand");
     Hand {
-        name: name.map_or("hand", Name::as_str).replace('/', " ").into(),
+        name: name.replace('/', " ").into(),
+        colour: whose.map(|whose| whose.colour),
         force: force.force.into(),
         point: force.point.into(),
         target: grab.target.into(),

@@ -17,6 +17,7 @@ pub(crate) struct Frame {
     /// Paths of bodies that are gone.
     pub left: Vec<Arc<str>>,
     pub shapes: Vec<Shape>,
+    pub colour: crate::RerunColour,
     /// All hands of the tick; `None` when there are none and were none before.
     pub hands: Option<Vec<Hand>>,
     pub scalars: Vec<Scalar>,
@@ -38,8 +39,16 @@ pub(crate) struct Shape {
     pub q: Vec<f32>,
     pub warped: bool,
     pub place: Place,
-    /// Draw it now; else only its figures are wanted.
+    /// Stiffness as a multiple of the baked one.
+    pub stiffness: f32,
+    /// What is wanted of it now: its picture,
     pub draw: bool,
+    /// its figures,
+    pub figures: bool,
+    /// and a sample for its spectrum.
+    pub sample: bool,
+    /// Energy of each mode, J; `None` when the bars are not due.
+    pub energies: Option<Vec<f64>>,
 }
 
 /// Where a body is.
@@ -54,6 +63,8 @@ pub(crate) struct Place {
 #[derive(Debug, Clone)]
 pub(crate) struct Hand {
     pub name: Arc<str>,
+    /// Of whose hand it is, sRGB; `None` takes one of the recording's own.
+    pub colour: Option<[u8; 3]>,
     /// Reaction, N.
     pub force: [f64; 3],
     pub point: [f64; 3],

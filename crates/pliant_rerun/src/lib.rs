@@ -12,20 +12,24 @@
 //!
 //! | Path | What |
 //! | --- | --- |
-//! | `world/NAME` | the deformed surface of every body, coloured by displacement; connectivity once, then positions |
+//! | `world/NAME` | the deformed surface of every body, coloured by displacement or stress ([`RerunColour`]); connectivity once, then positions |
 //! | `world/hands` | every grab: its reaction as an arrow, its target, the line between |
-//! | `reaction/NAME` | magnitude of the reaction, N |
+//! | `reaction/NAME` | magnitude of the reaction, N, in the colour of the hand's user |
 //! | `displacement/NAME` | largest displacement of the surface, m |
+//! | `stress/NAME` | largest von Mises stress in the skin, Pa, when that is the colour |
+//! | `modes/NAME` | energy of each mode, J, as bars |
+//! | `spectrum/NAME` | how far the loosest point of the body swings at each frequency, m over Hz, in the last 256 ticks |
 //! | `AREA/NAME` | every Bevy diagnostic under `pliant/AREA/`, as the network and the step have them; `time/` for those without an area |
 //! | any other | what anybody sets in [`RerunScalars`] |
 //! | `log` | what was refused, and what is written with [`RerunScalars::say`] |
 //!
-//! With the feature `net`, the hands of a session's other users are among the hands, and who comes and goes is in the log.
+//! With the feature `net`, the hands of a session's other users are among the hands, and who comes and goes and how the connection stands
+//! is in the log. With the feature `haptics`, `device/NAME/` has the force, lateness and energy of every device, and the log its faults.
 //!
 //! A layout comes with the recording: the scene beside a plot for each kind of figure.
 //!
 //! The app never waits: one thread a sink logs from a bounded queue, which drops and counts what it has no room for
-//! ([`RerunStats`]). Bodies that rest are not sent. A viewer that is not there is no error, and costs nothing from then on. The recording
+//! ([`RerunStats`]). Bodies that rest are not sent, and what [`RerunRecording`] gives a rate of zero is not gathered. A viewer that is not there is no error, and costs nothing from then on. The recording
 //! is whole after [`AppExit`](bevy::app::AppExit), when the app is dropped, and when a panic unwinds it.
 #![cfg_attr(
     test,
@@ -35,16 +39,24 @@
 mod blueprint;
 mod collect;
 mod frame;
+#[cfg(feature = "haptics")]
+mod haptics;
+mod motion;
 #[cfg(feature = "net")]
 mod net;
 mod plugin;
 mod recorder;
 mod scalars;
+mod stress;
 #[cfg(test)]
 mod tests;
+#[cfg(test)]
+mod tests_streams;
 mod worker;
 
-pub use plugin::{RerunError, RerunPlugin, RerunRecording, RerunStats, RerunStyle, RerunSystems};
+pub use plugin::{
+    RerunColour, RerunError, RerunPlugin, RerunRecording, RerunStats, RerunStyle, RerunSystems,
+};
 pub use scalars::RerunScalars;
 
 /// Timeline: the tick, [`PliantTick`](pliant_body::PliantTick).

@@ -1,11 +1,19 @@
-//! What the network tells: who comes and goes, and the hands of the others.
+//! What the network tells: who comes and goes, how the session stands, whose hand is whose, and the hands of the others.
 //!
-//! Its figures (round trip, loss, rates) need nothing here: they are diagnostics, and are recorded like all others.
+//! Most of its figures (round trip, loss, rates, NACKs) need nothing here: they are diagnostics, and are recorded like all others.
 
-use bevy::prelude::*;
-use pliant_net::{GrabRefused, SeenHands, SessionClosed, User, UserJoined, UserLeft};
+use bevy::{math::DVec3, prelude::*};
+use pliant_body::{BodyState, Grab, ShownState};
+use pliant_net::{
+    GrabRefused, GuestState, HandOf, NetGuest, NetHost, NetPeer, NetStats, PeerState, SeenHands,
+    SessionClosed, User, UserJoined, UserLeft, Yourself,
+};
 
-use crate::{RerunScalars, collect::OtherHands, frame::Hand};
+use crate::{
+    RerunScalars,
+    collect::{Hands, Whose},
+    frame::Hand,
+};
 
 pub(crate) fn say_who_comes_and_goes(
     mut joined: MessageReader<UserJoined>,
@@ -28,21 +36,127 @@ pub(crate) fn say_who_comes_and_goes(
     }
 }
 
+/// What was told of the session last.
+#[derive(Default)]
+pub(crate) struct Told {
+    standing: String,
+    let_go: u64,
+    second: f64,
+}
+
+/// The connection's state as lines and as a figure, and what its queues let go.
+pub(crate) fn say_how_it_stands(
+    host: Option<Res<NetHost>>,
+    guest: Option<Res<NetGuest>>,
+    peer: Option<Res<NetPeer>>,
+    stats: Option<Res<NetStats>>,
+    time: Res<Time>,
+    mut own: ResMut<RerunScalars>,
+    mut told: Local<Told>,
+) {
+    let (standing, stands) = match (&host, &guest, &peer) {
+        (Some(host), ..) if host.has_ended() => ("the session is over".to_owned(), false),
+        (Some(host), ..) => (format!("hosting, {} guests", host.guests().count()), true),
+        (None, Some(guest), _) => match guest.state() {
+            GuestState::Joining => ("joining".into(), false),
+            GuestState::In { user } => (format!("in the session as user {}", user.0), true),
+            GuestState::Lost { reason } => (format!("the host is not to be heard: {reason}"), false),
+            GuestState::Closed { reason } => (format!("not in the session: {reason}"), false),
+        },
+        (None, None, Some(peer)) => match peer.state() {
+            PeerState::Joining => ("joining".into(), false),
+            PeerState::In { user } => (format!("among peers as user {}", user.0), true),
+            PeerState::Closed { reason } => (format!("not in the session: {reason}"), false),
+        },
+        (None, None, None) => return,
+    };
+    let changed = told.standing != standing;
+    if changed {
+        if stands {
+            own.say(standing.clone())
+        } else {
+            own.warn(standing.clone())
+        }
+        told.standing = standing;
+    }
+    let now = time.elapsed_secs_f64();
+    let passed = now - told.second;
+    if !changed && (0.0..1.0).contains(&passed) {
+        return;
+    }
+    told.second = now;
+    own.set("net/connected", "", f64::from(u8::from(stands)));
+    let Some(stats) = stats else { return };
+    own.set("net/queueing", "", f64::from(u8::from(stats.queueing)));
+    let dropped = stats.dropped;
+    let let_go =
+        [dropped.send_queue_full, dropped.receive_queue_full, dropped.too_large, dropped.not_connected];
+    let let_go: u64 = let_go.into_iter().sum();
+    if passed > 0.0 {
+        own.set("net/let go", "/s", let_go.saturating_sub(told.let_go) as f64 / passed);
+    }
+    told.let_go = let_go;
+}
+
+/// Name and colour of whose hand each grab here is.
+pub(crate) fn see_whose_hands(
+    mut hands: ResMut<Hands>,
+    grabs: Query<(Entity, Option<&HandOf>), With<Grab>>,
+    users: Query<&User>,
+    you: Query<&User, With<Yourself>>,
+) {
+    hands.whose.clear();
+    for (grab, of) in &grabs {
+        let user = match of {
+            Some(of) => users.get(of.0).ok(),
+            None => you.iter().next(),
+        };
+        if let Some(user) = user {
+            hands.whose.insert(grab, Whose { name: user.name.clone(), colour: srgb(user.colour) });
+        }
+    }
+}
+
 pub(crate) fn see_other_hands(
-    mut others: ResMut<OtherHands>,
-    bodies: Query<&SeenHands>,
+    mut others: ResMut<Hands>,
+    bodies: Query<(&SeenHands, &BodyState, &ShownState, &GlobalTransform)>,
     users: Query<&User>,
 ) {
-    others.0.clear();
-    for hand in bodies.iter().flat_map(|hands| &hands.0) {
-        let user = users.iter().find(|user| user.id == hand.user);
-        let name = user.map_or_else(|| format!("user {}", hand.user.0), |user| user.name.replace('/', " "));
-        others.0.push(Hand {
-            name: name.into(),
-            force: hand.reaction.into(),
-            // The others' patches are not known to the micrometre here; their targets are.
-            point: hand.target.into(),
-            target: hand.target.into(),
-        });
+    others.others.clear();
+    for (hands, state, shown, place) in &bodies {
+        for hand in &hands.0 {
+            let user = users.iter().find(|user| user.id == hand.user);
+            let name = user.map_or_else(|| format!("user {}", hand.user.0), |user| user.name.clone());
+            let point =
+                place.affine().transform_point3(surface_point(state, hand.vertex, shown.current()).as_vec3());
+            others.others.push(Hand {
+                name: name.replace('/', " ").into(),
+                colour: user.map(|user| srgb(user.colour)),
+                force: hand.reaction.into(),
+                point: point.as_dvec3().into(),
+                target: hand.target.into(),
+            });
+        }
     }
+}
+
+/// Where a vertex is in body axes, m: the middle of a patch of which only that is known.
+fn surface_point(state: &BodyState, vertex: u32, q: &[f64]) -> DVec3 {
+    let model = state.model();
+    let Some(rest) = model.surface().positions().get(vertex as usize) else { return DVec3::ZERO };
+    let along = |row: &dyn Fn(usize, usize) -> f32| -> [f64; 3] {
+        std::array::from_fn(|axis| q.iter().enumerate().map(|(mode, q)| q * f64::from(row(axis, mode))).sum())
+    };
+    let moved = along(&|axis, mode| model.displacement_row(vertex, axis, mode));
+    let moved = if state.warps() {
+        pliant_modal::warp(along(&|axis, mode| model.rotation_row(vertex, axis, mode)), moved)
+    } else {
+        moved
+    };
+    Vec3::from(*rest).as_dvec3() + DVec3::from(moved)
+}
+
+fn srgb(colour: Color) -> [u8; 3] {
+    let colour = colour.to_srgba();
+    [colour.red, colour.green, colour.blue].map(|x| (x.clamp(0.0, 1.0) * 255.0).round() as u8)
 }

@@ -22,7 +22,7 @@ pub struct RerunPlugin {
     file: Option<PathBuf>,
     viewer: Option<u16>,
     spawn: bool,
-    shapes_hz: f64,
+    rates: RerunRecording,
     queue: usize,
     schedule: InternedScheduleLabel,
     titles: Vec<(String, String)>,
@@ -54,12 +54,14 @@ impl RerunPlugin {
             file: None,
             viewer: None,
             spawn: true,
-            shapes_hz: 20.0,
+            rates: RerunRecording::default(),
             queue: 256,
             schedule: FixedUpdate.intern(),
             titles: vec![
                 ("displacement".into(), "Largest displacement".into()),
+                ("device".into(), "Devices".into()),
                 ("net".into(), "Network".into()),
+                ("stress".into(), "Largest stress".into()),
                 ("time".into(), "Time a tick".into()),
             ],
         }
@@ -93,11 +95,24 @@ impl RerunPlugin {
         self
     }
 
-    /// How often shapes are drawn, Hz of simulated time; figures are recorded every tick. Zero or less draws none.
-    /// Default: `20.0`. A body of 3,500 vertices takes about 100 kB a drawing before compression.
+    /// How often shapes are drawn, Hz of simulated time ([`RerunRecording::shapes_hz`]). Zero or less draws none. Default: `20.0`. A body of 3,500 vertices takes about 100 kB a drawing before compression.
     #[must_use]
     pub fn with_shapes_hz(mut self, hz: f64) -> Self {
-        self.shapes_hz = hz;
+        self.rates.shapes_hz = hz;
+        self
+    }
+
+    /// Every rate, and what the colour of a surface says. Default: [`RerunRecording::default`].
+    #[must_use]
+    pub fn with_rates(mut self, rates: RerunRecording) -> Self {
+        self.rates = rates;
+        self
+    }
+
+    /// What the colour of a surface says. Default: [`RerunColour::Displacement`].
+    #[must_use]
+    pub fn with_colour(mut self, colour: RerunColour) -> Self {
+        self.rates.colour = colour;
         self
     }
 
@@ -134,14 +149,47 @@ pub enum RerunStyle {
 pub struct RerunSystems;
 
 /// Whether a recording goes on, and how finely; may be changed at any time. There only while a [`RerunPlugin`] has a sink.
+///
+/// Rates are in Hz of simulated time: one above that of the ticks (also an infinite one) is every tick, zero or less (or NaN) is none, and nothing is gathered for it.
 #[derive(Resource, Reflect, Debug, Clone, Copy, PartialEq)]
-#[reflect(Resource, Clone, PartialEq)]
+#[reflect(Resource, Default, Clone, PartialEq)]
 pub struct RerunRecording {
     /// Off: nothing is collected, and the recording has a gap. Default: `true`.
     pub on: bool,
-    /// How often shapes are drawn, Hz of simulated time; figures are recorded every tick. Zero or less draws none. Default: as
-    /// [`RerunPlugin::with_shapes_hz`] says.
+    /// How often shapes are drawn. Default: `20.0`.
     pub shapes_hz: f64,
+    /// How often figures are recorded. Default: infinite, every tick.
+    pub figures_hz: f64,
+    /// How often hands are drawn, with their reactions. Default: infinite, every tick.
+    pub hands_hz: f64,
+    /// How often the energies of the modes and the spectrum are drawn. Default: `4.0`.
+    pub modes_hz: f64,
+    /// What the colour of a surface says. Default: [`RerunColour::Displacement`].
+    pub colour: RerunColour,
+}
+
+impl Default for RerunRecording {
+    fn default() -> Self {
+        Self {
+            on: true,
+            shapes_hz: 20.0,
+            figures_hz: f64::INFINITY,
+            hands_hz: f64::INFINITY,
+            modes_hz: 4.0,
+            colour: RerunColour::default(),
+        }
+    }
+}
+
+/// What the colour of a recorded surface says.
+#[derive(Reflect, Debug, Default, Clone, Copy, PartialEq, Eq)]
+#[reflect(Default, Clone, PartialEq)]
+pub enum RerunColour {
+    /// How far each point is from where it rests: the last colour at 0.3 of the body's size.
+    #[default]
+    Displacement,
+    /// Von Mises stress in the skin, in plane stress from how the triangles are stretched: the last colour at 0.2 of Young's modulus.
+    Stress,
 }
 
 /// What became of the frames.
@@ -201,9 +249,9 @@ impl Plugin for RerunPlugin {
             return;
         }
         app.insert_resource(collect::Collector::new(workers))
-            .insert_resource(RerunRecording { on: true, shapes_hz: self.shapes_hz })
+            .insert_resource(RerunRecording { on: true, ..self.rates })
             .register_type::<RerunRecording>()
-            .init_resource::<collect::OtherHands>()
+            .init_resource::<collect::Hands>()
             .add_systems(
                 self.schedule,
                 collect::collect
@@ -222,10 +270,21 @@ impl Plugin for RerunPlugin {
                         .and_then(resource_exists::<Messages<pliant_net::GrabRefused>>)
                         .and_then(resource_exists::<Messages<pliant_net::SessionClosed>>),
                 ),
+                crate::net::say_how_it_stands,
+                crate::net::see_whose_hands,
                 crate::net::see_other_hands,
             )
                 .after(PliantSystems::Publish)
                 .before(RerunSystems)
+                .run_if(collect::somebody_listens),
+        );
+        #[cfg(feature = "haptics")]
+        app.add_systems(
+            self.schedule,
+            crate::haptics::see_devices
+                .after(PliantSystems::Publish)
+                .before(RerunSystems)
+                .run_if(resource_exists::<pliant_haptics::HapticDevices>)
                 .run_if(collect::somebody_listens),
         );
     }

@@ -7,19 +7,24 @@ use std::{
 };
 
 use rerun::{
-    Arrows3D, Color, EntityPath, EntityPathPart, LineStrips3D, Mesh3D, Points3D, Quaternion, RecordingStream,
-    RecordingStreamError, Scalars, SeriesLines, TextLog, TextLogLevel, Transform3D, ViewCoordinates,
-    archetypes::Clear,
+    Arrows3D, BarChart, Color, EntityPath, EntityPathPart, LineStrips3D, Mesh3D, Points3D, Quaternion,
+    RecordingStream, RecordingStreamError, Scalars, SeriesLines, TextLog, TextLogLevel, Transform3D,
+    ViewCoordinates, archetypes::Clear,
 };
 
 use crate::{
-    RerunStyle, SIM_TIME, TICK, WALL_TIME,
+    RerunColour, RerunStyle, SIM_TIME, TICK, WALL_TIME,
     blueprint::Plots,
     frame::{Drawn, Frame, Hand, Place, Shape},
+    motion::Motion,
+    stress::Skin,
 };
 
 /// A displacement of this part of the body's size has the last colour of the scale.
 const FULL_COLOUR: f32 = 0.3;
+
+/// A stress of this part of Young's modulus has the last colour of the scale.
+const FULL_STRESS: f32 = 0.2;
 
 /// The longest arrow yet, as a part of the largest body's size.
 const LONGEST_ARROW: f64 = 0.5;
@@ -58,6 +63,11 @@ pub(crate) struct Recorder {
     positions: Vec<[f32; 3]>,
     normals: Vec<[f32; 3]>,
     sums: Vec<[f32; 3]>,
+    stresses: Vec<f32>,
+    /// The colour that each line of a plot was given.
+    colours: HashMap<String, Color>,
+    /// Hands of the last tick that had any, by name.
+    held: HashSet<String>,
     started: bool,
 }
 
@@ -65,6 +75,8 @@ struct Known {
     body: Arc<Drawn>,
     place: Option<Place>,
     meshed: bool,
+    motion: Option<Motion>,
+    skin: Option<Skin>,
 }
 
 impl Recorder {
@@ -79,6 +91,9 @@ impl Recorder {
             positions: Vec::new(),
             normals: Vec::new(),
             sums: Vec::new(),
+            stresses: Vec::new(),
+            colours: HashMap::new(),
+            held: HashSet::new(),
             started: false,
         }
     }
@@ -108,12 +123,13 @@ impl Recorder {
                     self.stream.log(body_path(&body.path), &Clear::recursive())?;
                 }
                 self.size = self.size.max(body.model.size());
-                let known = Known { body: body.clone(), place: None, meshed: false };
+                let known =
+                    Known { body: body.clone(), place: None, meshed: false, motion: None, skin: None };
                 self.bodies.insert(body.path.clone(), known);
             }
         }
         for shape in &frame.shapes {
-            self.shape(shape)?;
+            self.shape(shape, frame)?;
         }
         if let Some(hands) = &frame.hands {
             self.hands(hands)?;
@@ -152,7 +168,11 @@ impl Recorder {
         Ok(())
     }
 
-    fn shape(&mut self, shape: &Shape) -> Result<(), RecordingStreamError> {
+    fn shape(&mut self, shape: &Shape, frame: &Frame) -> Result<(), RecordingStreamError> {
+        self.modes(shape, frame)?;
+        if !(shape.draw || shape.figures) {
+            return Ok(());
+        }
         let Some(known) = self.bodies.get_mut(&shape.body.path) else { return Ok(()) };
         let model = &shape.body.model;
         let surface = model.surface();
@@ -171,12 +191,23 @@ impl Recorder {
         model.basis().reconstruct(&shape.q, shape.warped, &mut self.positions);
         let full = FULL_COLOUR * model.size() as f32;
         let mut largest = 0.0f32;
-        let mut colours = Vec::with_capacity(self.positions.len());
+        let by_displacement = shape.draw && frame.colour == RerunColour::Displacement;
+        let mut colours = Vec::with_capacity(if shape.draw { self.positions.len() } else { 0 });
+        let mut most_stress = None;
+        if frame.colour == RerunColour::Stress {
+            let skin = known.skin.get_or_insert_with(|| Skin::new(surface));
+            let young = model.info().young as f32 * shape.stiffness;
+            let poisson = model.info().poisson as f32;
+            most_stress = Some(skin.stress(surface, &self.positions, young, poisson, &mut self.stresses));
+            if shape.draw {
+                colours.extend(self.stresses.iter().map(|stress| colour(stress / (FULL_STRESS * young))));
+            }
+        }
         for (p, rest) in self.positions.iter().zip(surface.positions()) {
             let moved = [p[0] - rest[0], p[1] - rest[1], p[2] - rest[2]];
             let distance = moved.iter().map(|x| x * x).sum::<f32>().sqrt();
             largest = largest.max(distance);
-            if shape.draw {
+            if by_displacement {
                 colours.push(colour(distance / full));
             }
         }
@@ -210,7 +241,47 @@ impl Recorder {
                 RerunStyle::Hidden => {}
             }
         }
-        self.scalar(&format!("displacement/{}", shape.body.path), "m", largest)
+        if shape.figures {
+            if let Some(stress) = most_stress {
+                self.scalar(&format!("stress/{}", shape.body.path), "Pa", f64::from(stress))?;
+            }
+            self.scalar(&format!("displacement/{}", shape.body.path), "m", largest)?;
+        }
+        Ok(())
+    }
+
+    /// Energies of the modes and the spectrum, as bars.
+    fn modes(&mut self, shape: &Shape, frame: &Frame) -> Result<(), RecordingStreamError> {
+        let Some(known) = self.bodies.get_mut(&shape.body.path) else { return Ok(()) };
+        let model = &shape.body.model;
+        if shape.sample {
+            let motion = known.motion.get_or_insert_with(|| Motion::new(model));
+            motion.push(model, &shape.q, frame.tick, frame.time);
+        }
+        let Some(energies) = &shape.energies else { return Ok(()) };
+        let spectrum = known.motion.as_ref().and_then(Motion::spectrum);
+        let name = &shape.body.path;
+        let numbers: Vec<f64> = (1..=energies.len()).map(|mode| mode as f64).collect();
+        let bars = BarChart::new(energies.as_slice())
+            .with_abscissa(numbers.as_slice())
+            .with_color(Color::from_rgb(230, 159, 0));
+        let path_of =
+            |area: &str| EntityPath::from(vec![EntityPathPart::new(area), EntityPathPart::new(&**name)]);
+        self.plots.note_bars("modes", name);
+        self.stream.log(path_of("modes"), &bars)?;
+        if let Some((frequencies, amplitudes)) = spectrum {
+            let scale = f64::from(shape.place.scale);
+            let amplitudes: Vec<f64> = amplitudes.iter().map(|a| a * scale).collect();
+            let step = frequencies.get(1).copied().unwrap_or(1.0) as f32;
+            let widths = vec![step; frequencies.len()];
+            let bars = BarChart::new(amplitudes.as_slice())
+                .with_abscissa(frequencies.as_slice())
+                .with_widths(widths)
+                .with_color(Color::from_rgb(86, 180, 233));
+            self.plots.note_bars("spectrum", name);
+            self.stream.log(path_of("spectrum"), &bars)?;
+        }
+        Ok(())
     }
 
     fn hands(&mut self, hands: &[Hand]) -> Result<(), RecordingStreamError> {
@@ -218,7 +289,10 @@ impl Recorder {
         self.force = hands.iter().map(|hand| magnitude(&hand.force)).fold(self.force, f64::max);
         let metres_a_newton = if self.force > 0.0 { LONGEST_ARROW * self.size / self.force } else { 0.0 };
         let single = |p: [f64; 3]| p.map(|x| x as f32);
-        let colours: Vec<Color> = (0..hands.len()).map(colour_of).collect();
+        let colour_at = |index: usize, hand: &Hand| {
+            hand.colour.map_or_else(|| colour_of(index), |[r, g, b]| Color::from_rgb(r, g, b))
+        };
+        let colours: Vec<Color> = hands.iter().enumerate().map(|(i, hand)| colour_at(i, hand)).collect();
         let arrows =
             Arrows3D::from_vectors(hands.iter().map(|h| single(h.force.map(|f| f * metres_a_newton))))
                 .with_origins(hands.iter().map(|h| single(h.point)))
@@ -243,9 +317,13 @@ impl Recorder {
                 .find(|name| !used.contains(name))
                 .unwrap_or_default();
             // The line in the plot has the colour of the arrow.
-            let colour = colour_of(used.len());
+            let colour = colour_at(used.len(), hand);
             self.coloured_scalar(&format!("reaction/{name}"), "N", magnitude(&hand.force), Some(colour))?;
             used.insert(name);
+        }
+        // The line of a hand that let go ends there, and does not run on to where it takes hold again.
+        for name in std::mem::replace(&mut self.held, used).difference(&self.held) {
+            self.stream.log(path(&format!("reaction/{name}")), &Clear::flat())?;
         }
         Ok(())
     }
@@ -262,7 +340,11 @@ impl Recorder {
         colour: Option<Color>,
     ) -> Result<(), RecordingStreamError> {
         let entity = path(name);
-        if self.plots.note(name, unit) {
+        let recoloured = colour.is_some_and(|colour| self.colours.get(name) != Some(&colour));
+        if let (true, Some(colour)) = (recoloured, colour) {
+            self.colours.insert(name.to_owned(), colour);
+        }
+        if self.plots.note(name, unit) || recoloured {
             let label = name.split_once('/').map_or(name, |(_, rest)| rest);
             let series = SeriesLines::new().with_names([label]).with_widths([1.5]);
             let series = colour.map_or(series.clone(), |colour| series.with_colors([colour]));

@@ -21,7 +21,7 @@ use crate::{
 };
 
 /// A unit square in the plane z = 0 on which one mode lifts the far side (y = 1) by q metres.
-fn square() -> ModalModel {
+pub(crate) fn square() -> ModalModel {
     let positions = vec![[0.0, 0.0, 0.0], [1.0, 0.0, 0.0], [1.0, 1.0, 0.0], [0.0, 1.0, 0.0]];
     let surface = SurfaceMesh::new(positions, vec![[0, 1, 2], [0, 2, 3]], None, Vec::new()).unwrap();
     ModalModel::from_parts(ModelParts {
@@ -55,7 +55,7 @@ fn square() -> ModalModel {
 
 const HERE: Place = Place { translation: [0.0, 1.0, 0.0], rotation: [0.0, 0.0, 0.0, 1.0], scale: 2.0 };
 
-fn body() -> Arc<Drawn> {
+pub(crate) fn body() -> Arc<Drawn> {
     Arc::new(Drawn {
         path: "my/body".replace('/', " ").into(),
         model: Arc::new(square()),
@@ -63,8 +63,18 @@ fn body() -> Arc<Drawn> {
     })
 }
 
-fn frame(tick: u64, body: &Arc<Drawn>, q: f32) -> Frame {
-    let shape = Shape { body: body.clone(), q: vec![q], warped: false, place: HERE, draw: true };
+pub(crate) fn frame(tick: u64, body: &Arc<Drawn>, q: f32) -> Frame {
+    let shape = Shape {
+        body: body.clone(),
+        q: vec![q],
+        warped: false,
+        place: HERE,
+        stiffness: 1.0,
+        draw: true,
+        figures: true,
+        sample: true,
+        energies: None,
+    };
     Frame {
         tick,
         time: tick as f64 / 40.0,
@@ -75,7 +85,7 @@ fn frame(tick: u64, body: &Arc<Drawn>, q: f32) -> Frame {
     }
 }
 
-fn recorder() -> (Recorder, rerun::RecordingStream, MemorySinkStorage) {
+pub(crate) fn recorder() -> (Recorder, rerun::RecordingStream, MemorySinkStorage) {
     let (stream, storage) = RecordingStreamBuilder::new("pliant_test").memory().unwrap();
     (Recorder::new(stream.clone(), Plots::default()), stream, storage)
 }
@@ -90,13 +100,44 @@ fn chunks(messages: &[LogMsg], path: &str) -> Vec<Chunk> {
 }
 
 /// How many rows have the component whose name ends so.
-fn rows(messages: &[LogMsg], path: &str, component: &str) -> usize {
+pub(crate) fn rows(messages: &[LogMsg], path: &str, component: &str) -> usize {
     let of = |chunk: &Chunk| {
         let found =
             chunk.components().values().find(|column| column.descriptor.to_string().ends_with(component));
         found.map_or(0, |column| column.list_array.iter().filter(Option::is_some).count())
     };
     chunks(messages, path).iter().map(of).sum()
+}
+
+/// All numbers of a component whose name ends so, row by row.
+pub(crate) fn numbers(messages: &[LogMsg], path: &str, component: &str) -> Vec<f64> {
+    let mut values = Vec::new();
+    for chunk in chunks(messages, path) {
+        for column in chunk.components().values() {
+            if column.descriptor.to_string().ends_with(component) {
+                let array = column.list_array.values();
+                let array = array.as_any().downcast_ref::<rerun::external::arrow::array::Float64Array>();
+                values.extend(array.unwrap().values().iter().copied());
+            }
+        }
+    }
+    values
+}
+
+/// The colours that a path was given, row by row, red, green and blue.
+pub(crate) fn bytes_of_colours(messages: &[LogMsg], path: &str) -> Vec<[u8; 3]> {
+    let mut colours = Vec::new();
+    for chunk in chunks(messages, path) {
+        for column in chunk.components().values() {
+            if column.descriptor.to_string().ends_with("colors") {
+                let array = column.list_array.values();
+                let array = array.as_any().downcast_ref::<rerun::external::arrow::array::UInt32Array>();
+                let rgba = array.unwrap().values().iter().map(|rgba| rgba.to_be_bytes());
+                colours.extend(rgba.map(|[r, g, b, _]| [r, g, b]));
+            }
+        }
+    }
+    colours
 }
 
 #[test]
@@ -133,19 +174,7 @@ fn figures_have_their_values_and_the_displacement_is_in_the_world() {
     recorder.end();
     drop(stream);
     let messages = storage.take();
-    let values = |path: &str| -> Vec<f64> {
-        let mut values = Vec::new();
-        for chunk in chunks(&messages, path) {
-            for column in chunk.components().values() {
-                if column.descriptor.to_string().ends_with("scalars") {
-                    let array = column.list_array.values();
-                    let array = array.as_any().downcast_ref::<rerun::external::arrow::array::Float64Array>();
-                    values.extend(array.unwrap().values().iter().copied());
-                }
-            }
-        }
-        values
-    };
+    let values = |path: &str| numbers(&messages, path, "scalars");
     // One mode lifts the far side by q; the body is drawn twice as large.
     assert_eq!(values("/displacement/my\\ body"), [0.5, 1.0, 1.5, 2.0]);
     assert_eq!(values("/net/round\\ trip"), [196.0; 4]);
@@ -154,7 +183,8 @@ fn figures_have_their_values_and_the_displacement_is_in_the_world() {
 #[test]
 fn hands_of_one_name_are_two_lines_and_an_empty_hand_clears_the_arrows() {
     let (mut recorder, stream, storage) = recorder();
-    let hand = Hand { name: "hand".into(), force: [3.0, 4.0, 0.0], point: [0.0; 3], target: [0.0; 3] };
+    let hand =
+        Hand { name: "hand".into(), colour: None, force: [3.0, 4.0, 0.0], point: [0.0; 3], target: [0.0; 3] };
     let line = Line { warning: true, text: "watch out".into() };
     recorder
         .log(&Frame { tick: 1, hands: Some(vec![hand.clone(), hand]), lines: vec![line], ..Frame::default() })
@@ -200,7 +230,7 @@ fn figures_of_two_units_get_two_plots() {
     assert!(plots.take_changed() && !plots.take_changed());
 }
 
-fn app(plugin: RerunPlugin) -> App {
+pub(crate) fn app(plugin: RerunPlugin) -> App {
     let mut app = App::new();
     app.add_plugins((MinimalPlugins, AssetPlugin::default(), TransformPlugin, PliantBodyPlugin::default()))
         .insert_resource(Time::<Fixed>::from_seconds(1.0 / 40.0))
@@ -213,7 +243,7 @@ fn app(plugin: RerunPlugin) -> App {
     app
 }
 
-fn scratch(name: &str) -> PathBuf {
+pub(crate) fn scratch(name: &str) -> PathBuf {
     std::env::temp_dir().join(format!("pliant_rerun_{}_{name}.rrd", std::process::id()))
 }
 
@@ -317,7 +347,7 @@ fn a_path_that_cannot_be_written_leaves_the_app_running() {
 #[test]
 fn a_resting_body_is_not_sent() {
     let path = scratch("rest");
-    let mut app = app(RerunPlugin::file(&path));
+    let mut app = app(RerunPlugin::file(&path).with_queue(2048));
     let body = app.world_mut().query_filtered::<Entity, With<ModalBody>>().single(app.world()).unwrap();
     app.world_mut().entity_mut(body).insert(Driven::Remote);
     (0..40).for_each(|_| app.update());
@@ -329,6 +359,7 @@ fn a_resting_body_is_not_sent() {
     app.world_mut().get_mut::<ShownState>(body).unwrap().snap(&[0.1]).unwrap();
     (0..400).for_each(|_| app.update());
     let shapes = app.world().resource::<RerunStats>().shapes - after.shapes;
+    assert_eq!(app.world().resource::<RerunStats>().dropped, 0, "what was dropped would be sent again");
     assert!((1..=3).contains(&shapes), "{shapes} shapes");
     drop(app);
     std::fs::remove_file(path).unwrap();

@@ -4,7 +4,7 @@ use std::collections::HashMap;
 
 use bevy::{ecs::system::SystemParam, prelude::*};
 use bevy_egui::egui::Ui;
-use pliant_haptics::{DeviceId, HapticDevices, LoopState};
+use pliant_haptics::{DeviceId, HapticDevices, HapticNotice, HapticTool, LoopEvent, LoopState};
 
 use crate::{
     Trace,
@@ -16,16 +16,20 @@ use crate::{
 pub(super) struct Histories {
     forces: HashMap<DeviceId, Trace>,
     recording: HashMap<DeviceId, bool>,
+    /// What each has asked to be done by hand.
+    calibrate: HashMap<DeviceId, &'static str>,
 }
 
 #[derive(SystemParam)]
-pub(super) struct Devices<'w> {
+pub(super) struct Devices<'w, 's> {
     devices: Option<ResMut<'w, HapticDevices>>,
     histories: ResMut<'w, Histories>,
     time: Res<'w, Time<Real>>,
+    tools: Query<'w, 's, &'static mut HapticTool>,
+    notices: Option<MessageReader<'w, 's, HapticNotice>>,
 }
 
-impl Devices<'_> {
+impl Devices<'_, '_> {
     pub fn are_there(&self) -> bool {
         self.devices.as_ref().is_some_and(|devices| devices.iter().next().is_some())
     }
@@ -33,7 +37,12 @@ impl Devices<'_> {
     pub fn show(&mut self, ui: &mut Ui) {
         let Some(devices) = &mut self.devices else { return };
         let now = self.time.elapsed_secs_f64();
-        let Histories { forces, recording } = &mut *self.histories;
+        let Histories { forces, recording, calibrate } = &mut *self.histories;
+        for notice in self.notices.iter_mut().flat_map(|notices| notices.read()) {
+            if let LoopEvent::Calibrate(how) = notice.event {
+                calibrate.insert(notice.device, how);
+            }
+        }
         forces.retain(|id, _| devices.get(*id).is_some());
         recording.retain(|id, _| devices.get(*id).is_some());
         let mut view = DevicesView::default();
@@ -45,7 +54,7 @@ impl Devices<'_> {
             trace.push(now, force);
             let fault = match report.state {
                 LoopState::Running => report.tick.fault.map(|fault| fault.to_string()),
-                LoopState::Calibrating => Some("waits for its calibration".into()),
+                LoopState::Calibrating => Some("waits for its calibration: no force".into()),
                 LoopState::Lost => Some("lost; it is looked for".into()),
                 LoopState::Stopped => {
                     view.stopped = true;
@@ -61,17 +70,34 @@ impl Devices<'_> {
                 rate: report.rate,
                 jitter_us: report.lateness.percentile(0.99) * 1e6,
                 energy: report.tick.port.given - report.tick.port.taken,
+                force_scale: self
+                    .tools
+                    .iter()
+                    .find(|tool| tool.device == id && tool.force_scale.is_finite())
+                    .map(|tool| tool.force_scale),
+                calibrate: (report.state == LoopState::Calibrating)
+                    .then(|| calibrate.get(&id).map_or("see the log", |how| how).to_owned()),
                 fault,
                 forces: trace.clone(),
                 recording: recording.get(&id).copied().unwrap_or(false),
             });
         }
         device::show(ui, &mut view);
-        for (id, device) in ids.into_iter().zip(&view.devices) {
+        for (&id, device) in ids.iter().zip(&view.devices) {
             if device.recording != recording.get(&id).copied().unwrap_or(false)
                 && devices.set_recording(id, device.recording)
             {
                 recording.insert(id, device.recording);
+            }
+        }
+        for (id, device) in ids.iter().zip(&view.devices) {
+            let Some(scale) = device.force_scale else { continue };
+            let one_of_its =
+                self.tools.iter_mut().find(|tool| tool.device == *id && tool.force_scale.is_finite());
+            if let Some(mut tool) = one_of_its
+                && tool.force_scale != scale
+            {
+                tool.force_scale = scale;
             }
         }
         if view.stop {

@@ -5,6 +5,10 @@ mod scene;
 #[cfg(feature = "haptics")]
 mod devices;
 #[cfg(feature = "net")]
+mod emulator;
+#[cfg(feature = "net")]
+mod hands;
+#[cfg(feature = "net")]
 mod session;
 
 use bevy::prelude::*;
@@ -62,7 +66,7 @@ impl Plugin for PanelPlugin {
         #[cfg(feature = "haptics")]
         app.init_resource::<devices::Histories>();
         #[cfg(feature = "net")]
-        app.init_resource::<session::Histories>();
+        app.init_resource::<session::Histories>().init_resource::<hands::Histories>();
     }
 }
 

@@ -6,7 +6,9 @@ use bevy::{
     prelude::*,
 };
 use bevy_egui::egui::Ui;
-use pliant_body::{BodyState, DEFORM_TIME, Driven, Grab, GrabForce, Grabs, ModalBody, PliantTick, STEP_TIME};
+use pliant_body::{
+    BodyState, DEFORM_TIME, Driven, Grab, GrabForce, Grabs, ModalBody, PliantTick, STEP_TIME, ShownState,
+};
 
 use crate::{
     Trace,
@@ -40,10 +42,13 @@ pub(super) struct Scene<'w, 's> {
             &'static mut ModalBody,
             &'static mut BodyState,
             &'static Driven,
+            Option<&'static ShownState>,
             Option<&'static Grabs>,
         ),
     >,
     grabs: Query<'w, 's, (NameOrEntity, &'static GrabForce), With<Grab>>,
+    #[cfg(feature = "net")]
+    people: super::hands::People<'w, 's>,
 }
 
 impl Scene<'_, '_> {
@@ -93,42 +98,61 @@ impl Scene<'_, '_> {
         found.sort_by_key(|(name, ..)| name.entity);
         let mut views: Vec<BodyView> = found
             .iter()
-            .map(|(name, body, state, driven, grabs)| {
+            .map(|(name, body, state, driven, shown, grabs)| {
                 let model = state.model();
-                let energy = state.body().energy();
+                let energy = energy_of(state, driven, *shown);
                 let energies = energies.entry(name.entity).or_default();
                 energies.push(now, energy);
                 let held = grabs.map(Grabs::entities).unwrap_or_default();
+                #[cfg_attr(
+                    not(feature = "net"),
+                    expect(unused_mut, reason = "others' hands come with the network")
+                )]
+                let mut hands: Vec<HandView> = held
+                    .iter()
+                    .filter_map(|&grab| self.grabs.get(grab).ok())
+                    .map(|(name, force)| {
+                        let trace = forces.entry(name.entity).or_default();
+                        trace.push(now, force.force.length());
+                        #[cfg(feature = "net")]
+                        let whose = self.people.whose(name.entity);
+                        #[cfg(not(feature = "net"))]
+                        let whose: Option<(String, [u8; 3])> = None;
+                        let (whose, colour) = whose.unzip();
+                        let own = name.name.map(|name| name.as_str().to_owned());
+                        HandView {
+                            name: own.or(whose).unwrap_or_else(|| "hand".into()),
+                            colour,
+                            force: force.force.length(),
+                            forces: trace.clone(),
+                        }
+                    })
+                    .collect();
+                #[cfg(feature = "net")]
+                hands.extend(self.people.others(name.entity, now));
                 BodyView {
                     name: name.to_string(),
                     modes: state.body().mode_count(),
                     all_modes: model.mode_count(),
-                    lowest_hz: model.omega().first().map_or(0.0, |omega| omega / std::f64::consts::TAU),
+                    lowest_hz: state
+                        .body()
+                        .omega()
+                        .first()
+                        .map_or(0.0, |omega| omega / std::f64::consts::TAU),
+                    stiffness_scale: body.stiffness_scale,
                     damping_scale: body.damping_scale,
                     warp: body.warp,
                     local: **driven == Driven::Local,
                     resting: state.is_resting(),
                     energy,
                     energies: energies.clone(),
-                    hands: held
-                        .iter()
-                        .filter_map(|&grab| self.grabs.get(grab).ok())
-                        .map(|(name, force)| {
-                            let trace = forces.entry(name.entity).or_default();
-                            trace.push(now, force.force.length());
-                            HandView {
-                                name: name.name.map_or("hand", Name::as_str).into(),
-                                force: force.force.length(),
-                                forces: trace.clone(),
-                            }
-                        })
-                        .collect(),
+                    hands,
                     ..default()
                 }
             })
             .collect();
         bodies::show(ui, &mut views);
-        for (view, (_, body, state, _, grabs)) in views.into_iter().zip(found) {
+        for (view, (_, body, state, _, _, grabs)) in views.into_iter().zip(found) {
             take_over(&view, body, state);
             if view.release {
                 for &grab in grabs.map(Grabs::entities).unwrap_or_default() {
@@ -139,6 +163,18 @@ impl Scene<'_, '_> {
     }
 }
 
+/// Kinetic and elastic energy, J of the world; of a body that somebody else steps only the shape is known, and only its elastic energy.
+fn energy_of(state: &BodyState, driven: &Driven, shown: Option<&ShownState>) -> f64 {
+    let energy = match (driven, shown) {
+        (Driven::Remote, Some(shown)) => {
+            let modes = shown.current().iter().zip(state.body().omega());
+            0.5 * modes.map(|(q, omega)| (q * omega).powi(2)).sum::<f64>()
+        }
+        _ => state.body().energy(),
+    };
+    energy * state.scale() * state.scale()
+}
+
 fn take_over(view: &BodyView, mut body: Mut<ModalBody>, mut state: Mut<BodyState>) {
     if !view.local {
         return;
@@ -147,6 +183,9 @@ fn take_over(view: &BodyView, mut body: Mut<ModalBody>, mut state: Mut<BodyState
     let kept = state.body().mode_count();
     if view.modes != kept {
         body.modes = (view.modes < view.all_modes).then_some(view.modes.max(1));
+    }
+    if view.stiffness_scale != body.stiffness_scale {
+        body.stiffness_scale = view.stiffness_scale;
     }
     if view.damping_scale != body.damping_scale {
         body.damping_scale = view.damping_scale;
@@ -173,6 +212,8 @@ impl Recording<'_> {
     }
 
     pub fn show(mut self, ui: &mut Ui) {
+        use pliant_rerun::RerunColour;
+
         let (Some(stats), Some(settings)) = (&self.stats, &mut self.settings) else { return };
         let mut view = crate::recording::RecordingView {
             on: settings.on,
@@ -180,11 +221,20 @@ impl Recording<'_> {
             ticks: stats.collected,
             dropped: stats.dropped,
             shapes_hz: settings.shapes_hz,
+            modes_hz: settings.modes_hz,
+            stress: settings.colour == RerunColour::Stress,
         };
         crate::recording::show(ui, &mut view);
-        if (view.on, view.shapes_hz) != (settings.on, settings.shapes_hz) {
-            settings.on = view.on;
-            settings.shapes_hz = view.shapes_hz;
+        let colour = if view.stress { RerunColour::Stress } else { RerunColour::Displacement };
+        let wanted = pliant_rerun::RerunRecording {
+            on: view.on,
+            shapes_hz: view.shapes_hz,
+            modes_hz: view.modes_hz,
+            colour,
+            ..**settings
+        };
+        if wanted != **settings {
+            **settings = wanted;
         }
     }
 }

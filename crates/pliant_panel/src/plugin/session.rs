@@ -2,8 +2,11 @@
 
 use bevy::{ecs::system::SystemParam, prelude::*};
 use bevy_egui::egui::Ui;
-use pliant_net::{GuestState, Hands, NetGuest, NetHost, NetStats, User, UserLink, Yourself};
+use pliant_net::{
+    Emulation, GuestState, Hands, NetGuest, NetHost, NetPeer, NetStats, PeerState, User, UserLink, Yourself,
+};
 
+use super::{emulator, hands::srgb};
 use crate::{
     Trace,
     network::{self, NetworkView, UserView},
@@ -18,8 +21,9 @@ pub(super) struct Histories {
 
 #[derive(SystemParam)]
 pub(super) struct Session<'w, 's> {
-    host: Option<Res<'w, NetHost>>,
-    guest: Option<Res<'w, NetGuest>>,
+    host: Option<ResMut<'w, NetHost>>,
+    guest: Option<ResMut<'w, NetGuest>>,
+    peer: Option<ResMut<'w, NetPeer>>,
     stats: Option<Res<'w, NetStats>>,
     histories: ResMut<'w, Histories>,
     time: Res<'w, Time<Real>>,
@@ -28,7 +32,7 @@ pub(super) struct Session<'w, 's> {
 
 impl Session<'_, '_> {
     pub fn is_there(&self) -> bool {
-        self.stats.is_some() && (self.host.is_some() || self.guest.is_some())
+        self.stats.is_some() && (self.host.is_some() || self.guest.is_some() || self.peer.is_some())
     }
 
     pub fn show(&mut self, ui: &mut Ui) {
@@ -41,17 +45,10 @@ impl Session<'_, '_> {
         let mut users: Vec<_> = self.users.iter().collect();
         users.sort_by_key(|(user, ..)| user.id);
         let mut view = NetworkView {
-            role: match (&self.host, &self.guest) {
-                (Some(_), _) => "host".into(),
-                (None, Some(guest)) => match guest.state() {
-                    GuestState::Joining => "guest, joining".into(),
-                    GuestState::In { .. } => "guest".into(),
-                    GuestState::Lost { reason } => format!("guest, waiting for the host: {reason}"),
-                    GuestState::Closed { reason } => format!("not in the session: {reason}"),
-                },
-                (None, None) => String::new(),
-            },
-            invite: self.host.as_ref().map(|host| host.invite().to_string()),
+            role: self.role(),
+            invite: self.invite(),
+            way_out: self.way_out(),
+            emulator: self.may_emulate().then(|| emulator::view_of(self.emulation().as_ref())),
             round_trip_ms,
             loss: [stats.loss_in * 100.0, stats.loss_out * 100.0],
             rate,
@@ -60,27 +57,98 @@ impl Session<'_, '_> {
             rates: self.histories.rates.clone(),
             users: users
                 .into_iter()
-                .map(|(user, yourself, hands, link)| {
-                    let colour = user.colour.to_srgba();
-                    UserView {
-                        name: user.name.clone(),
-                        colour: [colour.red, colour.green, colour.blue]
-                            .map(|x| (x.clamp(0.0, 1.0) * 255.0) as u8),
-                        yourself,
-                        hands: hands.map_or(0, |hands| hands.iter().count()),
-                        round_trip_ms: link
-                            .map(|link| link.round_trip.as_secs_f64() * 1e3)
-                            .filter(|ms| *ms > 0.0),
-                    }
+                .map(|(user, yourself, hands, link)| UserView {
+                    name: user.name.clone(),
+                    colour: srgb(user.colour),
+                    yourself,
+                    hands: hands.map_or(0, |hands| hands.iter().count()),
+                    round_trip_ms: link
+                        .map(|link| link.round_trip.as_secs_f64() * 1e3)
+                        .filter(|ms| *ms > 0.0),
                 })
                 .collect(),
             ..default()
         };
+        let before = view.emulator.clone();
         network::show(ui, &mut view);
         if view.copy
             && let Some(invite) = view.invite
         {
             ui.ctx().copy_text(invite);
+        }
+        if let (Some(before), Some(wanted)) = (before, view.emulator)
+            && before != wanted
+        {
+            let now = self.emulation();
+            self.emulate(emulator::emulation_of(&before, &wanted, now.as_ref()));
+        }
+        if view.leave {
+            if let Some(host) = &mut self.host {
+                host.end();
+            } else if let Some(guest) = &mut self.guest {
+                guest.leave();
+            }
+        }
+    }
+
+    fn role(&self) -> String {
+        match (&self.host, &self.guest, &self.peer) {
+            (Some(host), ..) if host.has_ended() => "the session is over".into(),
+            (Some(_), ..) => "host".into(),
+            (None, Some(guest), _) => match guest.state() {
+                GuestState::Joining => "guest, joining".into(),
+                GuestState::In { .. } => "guest".into(),
+                GuestState::Lost { reason } => format!("guest, waiting for the host: {reason}"),
+                GuestState::Closed { reason } => format!("not in the session: {reason}"),
+            },
+            (None, None, Some(peer)) => match peer.state() {
+                PeerState::Joining => "peer, joining".into(),
+                PeerState::In { .. } => "peer".into(),
+                PeerState::Closed { reason } => format!("not in the session: {reason}"),
+            },
+            (None, None, None) => String::new(),
+        }
+    }
+
+    fn invite(&self) -> Option<String> {
+        match (&self.host, &self.peer) {
+            (Some(host), _) => (!host.has_ended()).then(|| host.invite().to_string()),
+            (None, Some(peer)) => Some(peer.invite().to_string()),
+            (None, None) => None,
+        }
+    }
+
+    fn way_out(&self) -> Option<&'static str> {
+        match (&self.host, &self.guest) {
+            (Some(host), _) => (!host.has_ended()).then_some("End the session"),
+            (None, Some(guest)) => (!matches!(guest.state(), GuestState::Closed { .. })).then_some("Leave"),
+            (None, None) => None,
+        }
+    }
+
+    /// A recording that is played again has no network under it.
+    fn may_emulate(&self) -> bool {
+        self.host.is_some()
+            || self.peer.is_some()
+            || self.guest.as_ref().is_some_and(|guest| guest.endpoint().is_some())
+    }
+
+    fn emulation(&self) -> Option<Emulation> {
+        match (&self.host, &self.guest, &self.peer) {
+            (Some(host), ..) => host.emulation(),
+            (None, Some(guest), _) => guest.emulation(),
+            (None, None, Some(peer)) => peer.emulation().cloned(),
+            (None, None, None) => None,
+        }
+    }
+
+    fn emulate(&mut self, emulation: Option<Emulation>) {
+        if let Some(host) = &self.host {
+            host.set_emulation(emulation);
+        } else if let Some(guest) = &self.guest {
+            guest.set_emulation(emulation);
+        } else if let Some(peer) = &mut self.peer {
+            peer.set_emulation(emulation);
         }
     }
 }

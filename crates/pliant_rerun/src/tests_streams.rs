@@ -1,0 +1,228 @@
+//! What each stream says, and what it costs when it is off.
+
+use bevy::{math::DVec3, prelude::*};
+use pliant_body::{Grab, ModalBody};
+use rerun::log::LogMsg;
+
+use crate::{
+    RerunColour, RerunPlugin, RerunRecording, RerunScalars, RerunStats, RerunStyle,
+    frame::{Frame, Hand},
+    motion::Motion,
+    stress::Skin,
+    tests::{app, body, bytes_of_colours, frame, numbers, recorder, rows, scratch, square},
+};
+
+#[test]
+fn a_skin_that_is_stretched_and_turned_has_the_stress_of_the_closed_form() {
+    let model = square();
+    let surface = model.surface();
+    let skin = Skin::new(surface);
+    let (young, nu) = (2e5_f32, 0.3_f32);
+    let mut out = Vec::new();
+    // At rest, and turned by any angle: none.
+    let turned = |stretch: [f32; 2], shear: f32, angle: f32| -> Vec<[f32; 3]> {
+        let (s, c) = angle.sin_cos();
+        let positions = surface.positions().iter();
+        positions
+            .map(|p| {
+                let (x, y) = (p[0] * stretch[0] + shear * p[1], p[1] * stretch[1]);
+                [c * x - s * y, 0.5, s * x + c * y]
+            })
+            .collect()
+    };
+    assert!(skin.stress(surface, &turned([1.0, 1.0], 0.0, 1.1), young, nu, &mut out) < 1e-6 * young);
+    // Stretched by a tenth along x, and let in by nu a tenth along y: one stress only, E times Green's strain.
+    let green = |stretch: f32| 0.5 * (stretch * stretch - 1.0);
+    let across = (1.0 - 2.0 * nu * green(1.1)).sqrt();
+    let largest = skin.stress(surface, &turned([1.1, across], 0.0, 0.7), young, nu, &mut out);
+    let expected = young * green(1.1);
+    assert!((largest / expected - 1.0).abs() < 1e-4, "{largest} Pa for {expected} Pa");
+    assert!(out.iter().all(|stress| (stress / expected - 1.0).abs() < 1e-4), "the same everywhere: {out:?}");
+    // Stretched alike both ways: s = E e / (1 - nu), and von Mises of (s, s, 0) is s.
+    let largest = skin.stress(surface, &turned([1.02, 1.02], 0.0, 0.0), young, nu, &mut out);
+    let expected = young * green(1.02) / (1.0 - nu);
+    assert!((largest / expected - 1.0).abs() < 1e-3, "{largest} Pa for {expected} Pa");
+    // Sheared a little by g: sqrt(3) G g, with G = E / 2 (1 + nu).
+    let largest = skin.stress(surface, &turned([1.0, 1.0], 0.001, 0.0), young, nu, &mut out);
+    let expected = 3f32.sqrt() * young / (2.0 * (1.0 + nu)) * 0.001;
+    assert!((largest / expected - 1.0).abs() < 2e-3, "{largest} Pa for {expected} Pa");
+}
+
+#[test]
+fn a_swing_of_a_known_frequency_and_amplitude_is_in_the_spectrum_there_and_so_high() {
+    let model = square();
+    let mut motion = Motion::new(&model);
+    let (hz, tick) = (5.0, 1.0 / 40.0);
+    for i in 0_u32..400 {
+        let time = f64::from(i) * tick;
+        let q = 0.2 + 0.05 * (std::f64::consts::TAU * hz * time).sin();
+        motion.push(&model, &[q as f32], u64::from(i), time);
+        assert_eq!(motion.spectrum().is_some(), i >= 255, "not before the window is full");
+    }
+    let (frequencies, amplitudes) = motion.spectrum().unwrap();
+    assert!((frequencies[1] - 40.0 / 256.0).abs() < 1e-6 && frequencies.len() == 128);
+    let highest = (0..128).max_by(|&a, &b| amplitudes[a].total_cmp(&amplitudes[b])).unwrap();
+    assert!((frequencies[highest] - hz).abs() < 1e-3, "{} Hz", frequencies[highest]);
+    // The mode lifts the far side by q.
+    assert!((amplitudes[highest] - 0.05).abs() < 5e-4, "{} m", amplitudes[highest]);
+    assert!(amplitudes[0] < 1e-6, "where it hangs is not a swing");
+    assert!(amplitudes[highest + 3..].iter().all(|a| *a < 1e-3), "nothing elsewhere");
+    // It stood still for a whole window: nothing is left of the swing but the step at its end.
+    motion.push(&model, &[0.2], 1000, 1000.0 * tick);
+    motion.push(&model, &[0.2], 1400, 1400.0 * tick);
+    let (_, still) = motion.spectrum().unwrap();
+    assert!(still.iter().all(|a| *a < 1e-6), "{still:?}");
+}
+
+#[test]
+fn the_energy_of_each_mode_is_a_bar() {
+    let (mut recorder, stream, storage) = recorder();
+    let body = body();
+    for tick in 1..=300 {
+        let mut frame = frame(tick, &body, 0.1);
+        frame.shapes[0].energies = (tick % 100 == 0).then(|| vec![0.25]);
+        recorder.log(&frame).unwrap();
+    }
+    recorder.end();
+    drop(stream);
+    let messages = storage.take();
+    assert_eq!(rows(&messages, "/modes/my\\ body", "values"), 3);
+    assert_eq!(rows(&messages, "/spectrum/my\\ body", "values"), 1, "once the window is full");
+    let views = |class: &str| {
+        let told = messages.iter().filter(|message| match message {
+            LogMsg::ArrowMsg(store, data) if store.is_blueprint() => format!("{data:?}").contains(class),
+            _ => false,
+        });
+        told.count()
+    };
+    assert!(views("BarChart") >= 2, "both have a place in the layout");
+}
+
+#[test]
+fn a_hand_has_its_users_colour_in_the_plot_and_in_the_scene_and_its_line_ends_with_it() {
+    let (mut recorder, stream, storage) = recorder();
+    let hand = |colour| Hand {
+        name: "Ann".into(),
+        colour: Some(colour),
+        force: [3.0, 4.0, 0.0],
+        point: [0.0; 3],
+        target: [0.0; 3],
+    };
+    let at = |tick, hands| Frame { tick, hands: Some(hands), ..Frame::default() };
+    recorder.log(&at(1, vec![hand([10, 200, 30])])).unwrap();
+    recorder.log(&at(2, vec![hand([10, 200, 30])])).unwrap();
+    recorder.log(&at(3, Vec::new())).unwrap();
+    // Another Ann.
+    recorder.log(&at(4, vec![hand([200, 10, 30])])).unwrap();
+    recorder.end();
+    drop(stream);
+    let messages = storage.take();
+    assert_eq!(numbers(&messages, "/reaction/Ann", "scalars"), [5.0; 3]);
+    let plotted = bytes_of_colours(&messages, "/reaction/Ann");
+    assert_eq!(plotted, [[10, 200, 30], [200, 10, 30]], "told once each");
+    let drawn = bytes_of_colours(&messages, "/world/hands/reactions");
+    assert_eq!(drawn, [[10, 200, 30], [10, 200, 30], [200, 10, 30]]);
+    assert_eq!(rows(&messages, "/reaction/Ann", "is_recursive"), 1, "the line ends where the hand let go");
+}
+
+#[test]
+fn the_colour_says_displacement_or_stress() {
+    let stressed = |colour| {
+        let (mut recorder, stream, storage) = recorder();
+        let body = body();
+        let mut one = frame(1, &body, 0.3);
+        one.colour = colour;
+        recorder.log(&one).unwrap();
+        recorder.end();
+        drop(stream);
+        let messages = storage.take();
+        let stress = numbers(&messages, "/stress/my\\ body", "scalars");
+        (bytes_of_colours(&messages, "/world/my\\ body"), stress)
+    };
+    let (by_displacement, none) = stressed(RerunColour::Displacement);
+    let (by_stress, largest) = stressed(RerunColour::Stress);
+    assert_eq!((by_displacement.len(), by_stress.len(), none.len(), largest.len()), (4, 4, 0, 1));
+    assert_ne!(by_displacement[0], by_displacement[2], "the near side rests, the far side is lifted");
+    assert_ne!(by_displacement, by_stress);
+    assert!(largest[0] > 0.0);
+}
+
+/// Frames of an app at these rates: what was collected.
+fn collected(rates: RerunRecording, name: &str, style: RerunStyle) -> (RerunStats, u64) {
+    let path = scratch(name);
+    let mut app = app(RerunPlugin::file(&path).with_rates(rates).with_queue(2048));
+    let bodies: Vec<Entity> =
+        app.world_mut().query_filtered::<Entity, With<ModalBody>>().iter(app.world()).collect();
+    for body in bodies {
+        app.world_mut().entity_mut(body).insert(style);
+    }
+    for tick in 0..200 {
+        let mut grabs = app.world_mut().query::<&mut Grab>();
+        for mut grab in grabs.iter_mut(app.world_mut()) {
+            grab.target = DVec3::new(1.0, 1.0, 0.1 * (0.3 * f64::from(tick)).sin());
+        }
+        app.world_mut().resource_mut::<RerunScalars>().set("error/now", "%", f64::from(tick));
+        app.update();
+    }
+    let stats = *app.world().resource::<RerunStats>();
+    drop(app);
+    let bytes = std::fs::metadata(&path).unwrap().len();
+    std::fs::remove_file(path).unwrap();
+    (stats, bytes)
+}
+
+#[test]
+fn a_stream_with_a_rate_of_zero_is_not_gathered_and_not_in_the_file() {
+    let off = RerunRecording {
+        shapes_hz: 0.0,
+        figures_hz: 0.0,
+        hands_hz: 0.0,
+        modes_hz: f64::NAN,
+        ..RerunRecording::default()
+    };
+    let (none, empty) = collected(off, "off", RerunStyle::Surface);
+    assert_eq!((none.collected, none.shapes), (200, 0));
+    let (all, full) = collected(RerunRecording::default(), "all", RerunStyle::Surface);
+    assert!(all.shapes >= 195, "{all:?}");
+    let (drawn, drawn_bytes) =
+        collected(RerunRecording { shapes_hz: 10.0, ..off }, "drawn", RerunStyle::Surface);
+    assert!((48..=51).contains(&drawn.shapes), "10 Hz of 40: {drawn:?}");
+    let (hidden, hidden_bytes) =
+        collected(RerunRecording { shapes_hz: 10.0, ..off }, "hidden", RerunStyle::Hidden);
+    assert_eq!(hidden.shapes, 0);
+    println!("bytes: off {empty}, hidden {hidden_bytes}, shapes {drawn_bytes}, all {full}");
+    assert!(empty < 8_000 && hidden_bytes < empty + 200, "nothing but the layout");
+    assert!(drawn_bytes > 2 * empty && full > 2 * drawn_bytes);
+}
+
+#[test]
+fn the_log_of_a_tick_whose_figures_are_not_due_is_kept_and_so_are_the_figures() {
+    let path = scratch("kept");
+    let rates = RerunRecording { figures_hz: 1.0, ..RerunRecording::default() };
+    let mut app = app(RerunPlugin::file(&path).with_rates(rates));
+    for tick in 0..10 {
+        let mut own = app.world_mut().resource_mut::<RerunScalars>();
+        own.set("error/now", "%", f64::from(tick));
+        own.say("a line");
+        app.update();
+    }
+    let own = app.world().resource::<RerunScalars>();
+    assert_eq!(
+        (own.scalars.len(), own.lines.len()),
+        (1, 0),
+        "the newest value waits, the lines are gone to the log"
+    );
+    drop(app);
+    std::fs::remove_file(path).unwrap();
+}
+
+#[test]
+fn two_bodies_of_one_name_have_their_own_bars() {
+    let mut plots = crate::blueprint::Plots::default();
+    plots.note_bars("modes", "pip");
+    assert!(plots.take_changed());
+    plots.note_bars("modes", "pip");
+    assert!(!plots.take_changed(), "known");
+    plots.note_bars("modes", "pip 2");
+    assert!(plots.take_changed());
+}
