@@ -5,7 +5,7 @@ use std::collections::{BTreeMap, BTreeSet};
 use rerun::{
     EntityPath, EntityPathPart,
     blueprint::{
-        BarChartView, Blueprint, BlueprintActivation, BlueprintPanel, ContainerLike, Grid, Horizontal,
+        BarChartView, Blueprint, BlueprintActivation, BlueprintPanel, ContainerLike, Horizontal,
         SelectionPanel, Spatial3DView, Tabs, TextLogView, TimePanel, TimeSeriesView, Vertical,
         components::{PanelState, PlayState},
     },
@@ -130,9 +130,12 @@ impl Plots {
             1..=4 => Horizontal::new([left.into(), Vertical::new(plots).into()])
                 .with_column_shares([3.0, 2.0])
                 .into(),
-            // An odd one out would leave a hole in two columns; the grid fills row by row.
-            _ => {
-                let plots = Grid::new(plots).with_grid_columns(2);
+            // In pairs, and one that is left over has a row of its own: a grid would leave a hole beside it.
+            count => {
+                let rows = count.div_ceil(2);
+                let mut plots = plots.into_iter();
+                let pairs = (0..rows).map(|_| Horizontal::new(plots.by_ref().take(2)).into());
+                let plots = Vertical::new(pairs.collect::<Vec<ContainerLike>>());
                 Horizontal::new([left.into(), plots.into()]).with_column_shares([1.0, 1.15]).into()
             }
         };
