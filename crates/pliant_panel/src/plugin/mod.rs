@@ -90,27 +90,32 @@ fn draw(
     }
     let screen = context.content_rect();
     egui::Window::new("Pliant")
-        .default_size([300.0, screen.height() - 90.0])
+        .default_width(300.0)
         .default_pos([screen.right() - 330.0, screen.top() + 12.0])
-        .max_height(screen.height() - 60.0)
-        .vscroll(true)
+        .resizable([true, false])
         .show(&context, |ui| {
-            ui.spacing_mut().slider_width = 150.0;
-            section(ui, "Time", |ui| scene.show_time(ui));
-            section(ui, "Bodies", |ui| scene.show_bodies(ui));
-            #[cfg(feature = "net")]
-            if session.is_there() {
-                section(ui, "Session", |ui| session.show(ui));
-            }
-            #[cfg(feature = "haptics")]
-            if devices.are_there() {
-                section(ui, "Devices", |ui| devices.show(ui));
-            }
-            #[cfg(feature = "rerun")]
-            if recording.is_there() {
-                section(ui, "Recording", |ui| recording.show(ui));
-            }
-            ui.weak(format!("{:?} opens and closes", panel.key));
+            // As high as what is in it, and no higher than the screen.
+            egui::ScrollArea::vertical().auto_shrink([false, true]).max_height(screen.height() - 90.0).show(
+                ui,
+                |ui| {
+                    ui.spacing_mut().slider_width = 150.0;
+                    section(ui, "Time", |ui| scene.show_time(ui));
+                    section(ui, "Bodies", |ui| scene.show_bodies(ui));
+                    #[cfg(feature = "net")]
+                    if session.is_there() {
+                        section(ui, "Session", |ui| session.show(ui));
+                    }
+                    #[cfg(feature = "haptics")]
+                    if devices.are_there() {
+                        section(ui, "Devices", |ui| devices.show(ui));
+                    }
+                    #[cfg(feature = "rerun")]
+                    if recording.is_there() {
+                        section(ui, "Recording", |ui| recording.show(ui));
+                    }
+                    ui.weak(format!("{:?} opens and closes", panel.key));
+                },
+            );
         });
     Ok(())
 }

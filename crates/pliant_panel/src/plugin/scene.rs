@@ -131,7 +131,9 @@ impl Scene<'_, '_> {
                 #[cfg(feature = "net")]
                 hands.extend(self.people.others(name.entity, now));
                 BodyView {
-                    name: name.to_string(),
+                    name: name
+                        .name
+                        .map_or_else(|| model_name(&model.info().name, name.entity), ToString::to_string),
                     modes: state.body().mode_count(),
                     all_modes: model.mode_count(),
                     lowest_hz: state
@@ -161,6 +163,12 @@ impl Scene<'_, '_> {
             }
         }
     }
+}
+
+/// What a body without a name of its own is called: as the file that it was baked from.
+fn model_name(file: &str, entity: Entity) -> String {
+    let file = std::path::Path::new(file).file_stem();
+    file.map_or_else(|| format!("body {entity}"), |stem| stem.to_string_lossy().into_owned())
 }
 
 /// Kinetic and elastic energy, J of the world; of a body that somebody else steps only the shape is known, and only its elastic energy.
