@@ -89,8 +89,7 @@ fn change_network(
 fn draw_hands(hands: Query<(&Grab, &GrabForce, &HandOf)>, users: Query<&User>, mut gizmos: Gizmos) {
     for (grab, felt, of) in &hands {
         let Ok(user) = users.get(of.0) else { continue };
-        gizmos.sphere(grab.target.as_vec3(), 0.012, user.colour);
-        gizmos.line(grab.target.as_vec3(), felt.point.as_vec3(), user.colour);
+        stage::draw_hand(&mut gizmos, grab.target, Some(felt.point), -felt.force, user.colour);
     }
 }
 

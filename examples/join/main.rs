@@ -143,7 +143,9 @@ fn run(options: &Options) -> Result<(), Box<dyn Error>> {
             ..default()
         },
         modes: options.modes,
-        interest: Some(CameraInterest::default()).filter(|_| cfg!(feature = "window") && !options.headless),
+        // For a picture the camera is off until just before it, and would see nothing.
+        interest: Some(CameraInterest::default())
+            .filter(|_| cfg!(feature = "window") && !options.headless && options.screenshot.is_none()),
         models: if options.cached { vec![shipped()?] } else { Vec::new() },
         record: options.record.clone(),
         ..default()

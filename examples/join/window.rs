@@ -24,6 +24,8 @@ pub fn run(options: &Options, net: NetPlugin) -> Result<(), Box<dyn Error>> {
     .insert_resource(bevy::winit::WinitSettings::continuous())
     .add_systems(Update, (dress, draw_hands, read_out));
     finish(&mut app, options)?;
+    // The stage ends the run, after the picture if one is taken.
+    app.insert_resource(crate::session::EndAfter(None));
     match app.run() {
         AppExit::Success => Ok(()),
         AppExit::Error(_) => Err("the session is over".into()),
@@ -44,9 +46,7 @@ fn dress(
 /// The others' hands, each in its colour, and how hard they pull.
 fn draw_hands(bodies: Query<&SeenHands>, mut gizmos: Gizmos) {
     for hand in bodies.iter().flat_map(|seen| &seen.0) {
-        let (at, colour) = (hand.target.as_vec3(), colour_of(hand.user));
-        gizmos.sphere(at, 0.012, colour);
-        gizmos.line(at, at + 0.02 * hand.reaction.as_vec3(), colour);
+        stage::draw_hand(&mut gizmos, hand.target, None, -hand.reaction, colour_of(hand.user));
     }
 }
 

@@ -17,7 +17,7 @@ use std::net::SocketAddr;
 use bevy::prelude::*;
 use clap::Parser;
 use pliant::net::{
-    HostOptions, Invite, NetPlugin, PeerConfig, SeenHands, SharedBody, User, UserLink, colour_of,
+    HostOptions, Invite, NetPlugin, PeerConfig, SeenHands, SharedBody, User, UserLink, Yourself, colour_of,
 };
 use pliant::prelude::*;
 use pliant::stream::emulator::Preset;
@@ -92,15 +92,13 @@ fn setup(
 
 fn draw_hands(bodies: Query<&SeenHands>, mut gizmos: Gizmos) {
     for hand in bodies.iter().flat_map(|seen| &seen.0) {
-        let (at, colour) = (hand.target.as_vec3(), colour_of(hand.user));
-        gizmos.sphere(at, 0.012, colour);
-        gizmos.line(at, at + 0.02 * hand.reaction.as_vec3(), colour);
+        stage::draw_hand(&mut gizmos, hand.target, None, -hand.reaction, colour_of(hand.user));
     }
 }
 
 fn read_out(
     net: Option<Res<pliant::net::NetPeer>>,
-    users: Query<(&User, &UserLink)>,
+    users: Query<(&User, &UserLink), Without<Yourself>>,
     mut readout: ResMut<stage::Readout>,
 ) {
     let Some(net) = net else { return };

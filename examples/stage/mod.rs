@@ -2,6 +2,7 @@
 //! command line. An example adds [`Stage`] where a game adds `DefaultPlugins`, and its own file shows only what it teaches.
 #![allow(dead_code, unused_imports, reason = "each example uses the part of the stage that it needs")]
 
+mod hands;
 mod options;
 mod run;
 mod text;
@@ -19,6 +20,7 @@ use bevy::{
 };
 use clap::Parser;
 
+pub use hands::draw_hand;
 pub use options::{Options, display};
 pub use run::Unattended;
 pub use text::Readout;

@@ -35,6 +35,8 @@ struct Run {
     /// Frames and seconds since the bodies are there; `None` before.
     since: Option<(u64, f64)>,
     waited: u64,
+    /// Frames in which the cameras have drawn.
+    drawn: u64,
     picture: Picture,
 }
 
@@ -60,6 +62,7 @@ pub(super) fn build(app: &mut App, options: &Options, real_time: bool, picture_a
         screenshot: options.screenshot.clone(),
         since: None,
         waited: 0,
+        drawn: 0,
         picture: Picture::Wanted,
     });
     if unattended {
@@ -116,7 +119,7 @@ fn pause_and_step(
 }
 
 /// A slow renderer need not draw what nobody looks at: the cameras of a picture are off until just before it.
-fn draw_late(run: Res<Run>, real: Res<Time<Real>>, mut cameras: Query<&mut Camera>) {
+fn draw_late(mut run: ResMut<Run>, real: Res<Time<Real>>, mut cameras: Query<&mut Camera>) {
     if run.screenshot.is_none() {
         return;
     }
@@ -125,6 +128,7 @@ fn draw_late(run: Res<Run>, real: Res<Time<Real>>, mut cameras: Query<&mut Camer
         let left = run.seconds.map(|all| ((all - (real.elapsed_secs_f64() - since)) / FRAME).max(0.0) as u64);
         left_frames.or(left).is_none_or(|left| left <= DRAWN)
     });
+    run.drawn += u64::from(draws);
     for mut camera in &mut cameras {
         if camera.is_active != draws {
             camera.is_active = draws;
@@ -162,6 +166,8 @@ fn end(
         return;
     };
     match run.picture {
+        // Frames may be longer than they were thought to be.
+        Picture::Wanted if run.drawn < DRAWN => {}
         Picture::Wanted => {
             time.pause();
             run.waited = 0;

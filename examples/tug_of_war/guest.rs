@@ -24,8 +24,8 @@ pub struct Other {
 #[derive(Default)]
 pub struct Seen {
     pub q: Vec<f64>,
-    /// Targets and patches of its own hands, m.
-    pub hands: Vec<(DVec3, DVec3)>,
+    /// Targets and patches of its own hands, m, and what they feel, N.
+    pub hands: Vec<(DVec3, DVec3, DVec3)>,
     /// N.
     pub felt: f64,
     /// -1 to 1 each way; `None`: it lets go.
@@ -121,7 +121,7 @@ fn tell(
         seen.q.clear();
         seen.q.extend_from_slice(shown.q());
     }
-    seen.hands = hands.iter().map(|(grab, felt)| (grab.target, felt.point)).collect();
+    seen.hands = hands.iter().map(|(grab, felt)| (grab.target, felt.point, felt.force)).collect();
     seen.felt = hands.iter().map(|(_, felt)| felt.force.length()).fold(0.0, f64::max);
     if other.stop.load(Ordering::Relaxed) {
         exit.write(AppExit::Success);

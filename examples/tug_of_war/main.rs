@@ -104,7 +104,7 @@ fn setup(
     if unattended.is_some() {
         own.insert(session::Script {
             toward: DVec3::new(-1.0, 0.55, 0.0),
-            pull: DVec3::new(-0.2, 0.04, 0.06),
+            pull: DVec3::new(-0.12, 0.03, 0.05),
             rate: 1.3,
         });
     }
@@ -131,7 +131,7 @@ fn setup(
             Camera3d::default(),
             Camera { order: isize::from(right), ..default() },
             AmbientLight { brightness: 350.0, ..default() },
-            Transform::from_xyz(0.0, 0.28, 0.75).looking_at(Vec3::Y * 0.14, Vec3::Y),
+            Transform::from_xyz(0.0, 0.32, 0.98).looking_at(Vec3::Y * 0.15, Vec3::Y),
             RenderLayers::layer(usize::from(right)),
             Half { right },
         ));
@@ -171,7 +171,7 @@ fn steer(
     let t = time.elapsed_secs_f64();
     let stick = match keys {
         _ if unattended.is_some() => {
-            Some(DVec3::new(0.8 + 0.2 * (1.1 * t).sin(), 0.25 * (1.7 * t).sin(), 0.3 * (0.7 * t).cos()))
+            Some(DVec3::new(0.4 + 0.15 * (1.1 * t).sin(), 0.2 * (1.7 * t).sin(), 0.2 * (0.7 * t).cos()))
         }
         Some(keys) => {
             let axis = |more, less| f64::from(i8::from(keys.pressed(more)) - i8::from(keys.pressed(less)));
@@ -208,12 +208,10 @@ fn draw_hands(
     let [warm, cool] = [Color::srgb(1.0, 0.80, 0.30), Color::srgb(0.25, 0.55, 1.0)];
     let seen = other.seen();
     for (grab, felt) in &hands {
-        left.sphere(grab.target.as_vec3(), 0.012, warm);
-        left.line(grab.target.as_vec3(), felt.point.as_vec3(), warm);
+        stage::draw_hand(&mut left, grab.target, Some(felt.point), -felt.force, warm);
     }
-    for (target, point) in &seen.hands {
-        right.sphere(target.as_vec3(), 0.012, cool);
-        right.line(target.as_vec3(), point.as_vec3(), cool);
+    for &(target, point, force) in &seen.hands {
+        stage::draw_hand(&mut right, target, Some(point), -force, cool);
     }
 }
 

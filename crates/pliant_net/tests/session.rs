@@ -312,9 +312,12 @@ fn a_guest_that_talks_nonsense_is_sent_away_and_the_others_notice_nothing() {
     });
     host.world_mut().spawn((Grab::new(TIP, 0.3, DVec3::new(1.2, 2.6, 0.3)), GrabOf(body)));
     run_for(&mut [&mut host, &mut good], 1.5);
-    let truth = self::state(&host, body).body().q().to_vec();
-    let shown = good.world().get::<ShownState>(there).unwrap().q();
-    assert!(distance(&truth, shown) < 0.02 * size(&truth), "shown {shown:?}, true {truth:?}");
+    // A guest is a few ticks behind, more on a busy machine: when the body is nearly at rest, what it shows is what is true.
+    run_until(&mut [&mut host, &mut good], 6.0, "the good guest sees what is true", |apps| {
+        let truth = self::state(apps[0], body).body().q();
+        let shown = apps[1].world().get::<ShownState>(there).unwrap().q();
+        distance(truth, shown) < 0.02 * size(truth) && size(truth) > 0.1
+    });
     assert_eq!(good.world().resource::<NetStats>().rejected, 0);
 }
 

@@ -1,0 +1,145 @@
+//! Who comes in and who does not.
+
+use std::net::UdpSocket;
+use std::time::{Duration, SystemTime};
+
+use bytes::Bytes;
+use pliant_net::transport::{
+    ALPN, Access, CloseReason, Endpoint, Event, Fingerprint, Grant, HostOptions, Invite, JoinOptions, Limits,
+    PeerId, Role, Token,
+};
+
+use crate::endpoints::{closed, connected, datagram, guest, host, next};
+use crate::stranger::Stranger;
+
+#[test]
+fn another_key_than_the_invites_is_refused() {
+    let host = host();
+    let mut invite = host.invite();
+    invite.fingerprint = Fingerprint([1; 32]);
+    let guest = guest(&invite);
+    let expected = CloseReason::WrongFingerprint { expected: invite.fingerprint, found: host.fingerprint() };
+    assert_eq!(closed(&guest), expected);
+    assert!(host.poll().is_none(), "the host's application never hears of it");
+}
+
+#[test]
+fn tokens_are_asked_for_and_say_the_role() {
+    let [held, watched, spent] = [(); 3].map(|()| Token::generate().unwrap());
+    let access = Access::Tokens(vec![
+        Grant::hold(held),
+        Grant::watch(watched),
+        Grant::hold(spent).until(SystemTime::now()),
+    ]);
+    let host = Endpoint::host(HostOptions { access, ..HostOptions::default() }).unwrap();
+    let invite = host.invite();
+    assert_eq!(invite.token, Some(held));
+    let role = |endpoint: &Endpoint| {
+        next(endpoint, |event| match event {
+            Event::Connected { role, .. } => Some(role),
+            // Of the guest before, at the host.
+            _ => None,
+        })
+    };
+    for (token, expected) in [(held, Role::Hold), (watched, Role::Watch)] {
+        let guest = guest(&Invite { token: Some(token), ..invite.clone() });
+        assert_eq!((role(&guest), role(&host)), (expected, expected), "both ends know");
+    }
+    for wrong in [None, Some(Token([0; 16]))] {
+        let guest = guest(&Invite { token: wrong, ..invite.clone() });
+        assert!(matches!(closed(&guest), CloseReason::Refused { words } if words.contains("token")));
+    }
+    let late = guest(&Invite { token: Some(spent), ..invite.clone() });
+    assert_eq!(closed(&late), CloseReason::Refused { words: "the token has expired".into() });
+    // The door is shut while the house is open: who is in stays, nobody else comes.
+    let inside = guest(&invite);
+    connected(&inside);
+    host.set_access(Access::Tokens(Vec::new()));
+    assert!(matches!(closed(&guest(&invite)), CloseReason::Refused { .. }));
+    inside.send_message(PeerId::HOST, Bytes::from_static(b"still here")).unwrap();
+    let said = next(&host, |event| match event {
+        Event::Message { bytes, .. } => Some(bytes),
+        _ => None,
+    });
+    assert_eq!(said, "still here");
+}
+
+#[test]
+fn a_host_that_is_not_there_is_reported() {
+    let silent = UdpSocket::bind("127.0.0.1:0").unwrap();
+    let limits = Limits { handshake: Duration::from_millis(700), ..Limits::guest() };
+    let invite = Invite::new(silent.local_addr().unwrap(), Fingerprint([0; 32]));
+    let guest = Endpoint::join(&invite, JoinOptions { limits, ..JoinOptions::default() }).unwrap();
+    assert_eq!(closed(&guest), CloseReason::TimedOut);
+    let nowhere = Invite { host: "no-such-host.invalid".into(), ..invite };
+    let guest = self::guest(&nowhere);
+    assert!(matches!(closed(&guest), CloseReason::Failed { words } if words.contains("no-such-host")));
+}
+
+#[test]
+fn a_full_host_refuses_the_next_guest() {
+    let limits = Limits { peers: 1, ..Limits::host() };
+    let host = Endpoint::host(HostOptions { limits, ..HostOptions::default() }).unwrap();
+    let first = guest(&host.invite());
+    connected(&first);
+    connected(&host);
+    assert_eq!(closed(&guest(&host.invite())), CloseReason::NoRoom);
+    drop(first);
+    closed(&host);
+    connected(&guest(&host.invite()));
+}
+
+#[test]
+fn another_version_is_refused_in_the_handshake() {
+    let host = host();
+    let error = Stranger::new(b"pliant/0", true).connect(&host).unwrap_err();
+    assert!(error.to_string().contains("120"), "no_application_protocol is alert 120: {error}");
+    assert!(host.poll().is_none());
+}
+
+#[test]
+fn a_guest_without_a_key_is_refused() {
+    let host = host();
+    let stranger = Stranger::new(ALPN, false);
+    // The client's side of the handshake is over before the host refuses.
+    if let Ok(connection) = stranger.connect(&host) {
+        let error = stranger.runtime.block_on(connection.closed()).to_string();
+        assert!(
+            error.contains("116") || error.contains("certificate"),
+            "certificate_required is alert 116: {error}"
+        );
+    }
+    assert!(host.poll().is_none());
+}
+
+#[test]
+fn datagrams_before_the_token_do_not_count_and_garbage_after_it_is_the_applications() {
+    let host = host();
+    let stranger = Stranger::new(ALPN, true);
+    let connection = stranger.connect(&host).unwrap();
+    stranger.runtime.block_on(async {
+        connection.send_datagram(Bytes::from_static(b"early")).unwrap();
+        tokio::time::sleep(Duration::from_millis(100)).await;
+    });
+    assert!(host.poll().is_none(), "not let in before its token");
+    stranger.runtime.block_on(async {
+        let (mut send, mut recv) = connection.open_bi().await.unwrap();
+        send.write_all(&0u32.to_le_bytes()).await.unwrap();
+        let mut welcome = [9; 5];
+        recv.read_exact(&mut welcome).await.unwrap();
+        assert_eq!(welcome, [1, 0, 0, 0, 0], "one byte: the role");
+        connection.send_datagram(Bytes::from_static(b"\xff\x00garbage")).unwrap();
+        tokio::time::sleep(Duration::from_millis(50)).await;
+    });
+    connected(&host);
+    assert_eq!(datagram(&host), &b"\xff\x00garbage"[..], "the first that counts");
+
+    // A first message that is no token.
+    let second = stranger.connect(&host).unwrap();
+    let error = stranger.runtime.block_on(async {
+        let (mut send, _recv) = second.open_bi().await.unwrap();
+        send.write_all(b"\x05\x00\x00\x00hello").await.unwrap();
+        second.closed().await
+    });
+    assert!(error.to_string().contains("no token"), "{error}");
+}

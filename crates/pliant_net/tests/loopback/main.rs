@@ -1,0 +1,8 @@
+//! Endpoints on loopback: what arrives, what is refused, and who notices when someone is gone.
+#![allow(clippy::unwrap_used, clippy::expect_used, clippy::panic, reason = "a failed test should panic")]
+
+mod crossing;
+mod endpoints;
+mod entering;
+mod misbehaving;
+mod stranger;

@@ -1,0 +1,158 @@
+//! Guests that break the rules, or just break.
+
+use std::net::{SocketAddr, UdpSocket};
+use std::time::{Duration, Instant};
+
+use bytes::Bytes;
+use pliant_net::transport::{
+    ALPN, CloseReason, Endpoint, Event, HostOptions, Identity, Invite, JoinOptions, Limits, PeerId, SendError,
+};
+
+use crate::endpoints::{closed, connected, datagram, guest, host, message, quick};
+use crate::stranger::Stranger;
+
+#[test]
+fn a_message_over_the_limit_ends_the_connection_of_its_sender_only() {
+    let limits = Limits { message: 1000, ..Limits::host() };
+    let host = Endpoint::host(HostOptions { limits, ..HostOptions::default() }).unwrap();
+    let (bad, good) = (guest(&host.invite()), guest(&host.invite()));
+    connected(&bad);
+    connected(&good);
+    bad.send_message(PeerId::HOST, Bytes::from(vec![0; 1000])).unwrap();
+    assert_eq!(message(&host).len(), 1000);
+    bad.send_message(PeerId::HOST, Bytes::from(vec![0; 1001])).unwrap();
+    assert!(
+        matches!(closed(&host), CloseReason::Protocol { words } if words.contains("1001") && words.contains("1000"))
+    );
+    assert!(matches!(closed(&bad), CloseReason::Failed { words } if words.contains("1001")));
+    good.send_message(PeerId::HOST, Bytes::from_static(b"still here")).unwrap();
+    assert_eq!(message(&host), "still here");
+}
+
+#[test]
+fn garbage_on_the_port_disturbs_nobody() {
+    let host = host();
+    let guest = guest(&host.invite());
+    connected(&guest);
+    let (peer, _) = connected(&host);
+    let socket = UdpSocket::bind("127.0.0.1:0").unwrap();
+    let mut state = 0x2545_f491_4f6c_dd1d_u64;
+    for i in 0..2000usize {
+        let bytes: Vec<u8> = (0..i % 1300)
+            .map(|_| {
+                state ^= state << 13;
+                state ^= state >> 7;
+                state ^= state << 17;
+                state as u8
+            })
+            .collect();
+        socket.send_to(&bytes, host.local_address()).unwrap();
+    }
+    guest.send_datagram(PeerId::HOST, Bytes::from_static(b"through")).unwrap();
+    assert_eq!(datagram(&host), "through");
+    host.send_datagram(peer, Bytes::from_static(b"and back")).unwrap();
+    assert_eq!(datagram(&guest), "and back");
+}
+
+#[test]
+fn a_guest_that_dies_without_a_word_is_noticed_after_the_idle_timeout() {
+    let host = host();
+    let stranger = Stranger::new(ALPN, true);
+    let connection = stranger.connect(&host).unwrap();
+    stranger.runtime.block_on(async {
+        let (mut send, mut recv) = connection.open_bi().await.unwrap();
+        send.write_all(&0u32.to_le_bytes()).await.unwrap();
+        let mut welcome = [9; 5];
+        recv.read_exact(&mut welcome).await.unwrap();
+        std::mem::forget((send, recv));
+    });
+    let (peer, _) = connected(&host);
+    // From here on nobody drives the stranger's side: as if its process had been killed.
+    let start = Instant::now();
+    assert_eq!(closed(&host), CloseReason::TimedOut);
+    let after = start.elapsed().as_secs_f64();
+    assert!((0.5..3.0).contains(&after), "the idle timeout is 1 s, noticed after {after} s");
+    assert!(host.stats(peer).is_none());
+    std::mem::forget(connection);
+}
+
+#[test]
+fn a_guest_that_never_reads_costs_a_bounded_queue() {
+    let limits = Limits { queued_messages: 1 << 20, ..quick(Limits::host()) };
+    let host = Endpoint::host(HostOptions { limits, ..HostOptions::default() }).unwrap();
+    let guest_limits = Limits { queued_messages: 1 << 16, ..quick(Limits::guest()) };
+    let options = JoinOptions {
+        limits: guest_limits,
+        identity: Some(Identity::generate().unwrap()),
+        ..JoinOptions::default()
+    };
+    let guest = Endpoint::join(&host.invite(), options).unwrap();
+    let (peer, _) = connected(&host);
+    let part = Bytes::from(vec![0; 100_000]);
+    let mut taken = 0;
+    let error = loop {
+        match host.send_message(peer, part.clone()) {
+            Ok(()) => taken += 1,
+            Err(error) => break error,
+        }
+        assert!(taken < 200, "20 MB queued for a guest that reads nothing");
+    };
+    assert_eq!(error, SendError::QueueFull { len: part.len() });
+    // Datagrams are not held up by the messages that wait, and the oldest make room for the newest.
+    for i in 0..200u8 {
+        host.send_datagram(peer, Bytes::copy_from_slice(&[i])).unwrap();
+    }
+    std::thread::sleep(Duration::from_millis(300));
+    connected(&guest);
+    let mut got = Vec::new();
+    let start = Instant::now();
+    while start.elapsed() < Duration::from_millis(300) {
+        if let Some(Event::Datagram { bytes, .. }) = guest.poll() {
+            got.push(bytes[0]);
+        }
+    }
+    assert_eq!(got.last(), Some(&199));
+    let dropped = host.stats(peer).unwrap().dropped.send_queue_full as usize;
+    let unread = guest.stats(PeerId::HOST).unwrap().dropped.receive_queue_full as usize;
+    assert_eq!(
+        got.len() + dropped + unread,
+        200,
+        "{} read, {dropped} not sent, {unread} not read",
+        got.len()
+    );
+}
+
+#[test]
+fn a_thousand_connections_from_one_address_cost_the_others_nothing() {
+    let limits = Limits { per_address: 8, handshake: Duration::from_secs(30), ..quick(Limits::host()) };
+    let bind = "0.0.0.0:0".parse().unwrap();
+    let host = Endpoint::host(HostOptions { bind, limits, ..HostOptions::default() }).unwrap();
+    let port = host.local_address().port();
+    let good = guest(&Invite::new(SocketAddr::from(([127, 0, 0, 1], port)), host.fingerprint()));
+    connected(&good);
+    connected(&host);
+    // Another address of this machine, as a stranger's would be: 1,000 handshakes, none of which says a word after it.
+    let stranger = Stranger::new(ALPN, true);
+    let target = SocketAddr::from(([127, 0, 0, 1], port));
+    let (open, refused) = stranger.runtime.block_on(async {
+        let socket = UdpSocket::bind("127.0.0.2:0").unwrap();
+        stranger.endpoint.rebind(socket).unwrap();
+        let mut attempts = tokio::task::JoinSet::new();
+        for _ in 0..1000 {
+            let connecting = stranger.endpoint.connect(target, "pliant").unwrap();
+            attempts.spawn(async move { connecting.await.ok() });
+        }
+        let mut open = Vec::new();
+        while let Some(done) = attempts.join_next().await {
+            open.extend(done.unwrap());
+        }
+        let refused = 1000 - open.len();
+        (open, refused)
+    });
+    assert!(open.len() <= 8 && refused >= 992, "{} got as far as a handshake", open.len());
+    good.send_message(PeerId::HOST, Bytes::from_static(b"as ever")).unwrap();
+    assert_eq!(message(&host), "as ever");
+    // A second guest from the first one's address comes in at once.
+    let another = guest(&Invite::new(target, host.fingerprint()));
+    connected(&another);
+}
