@@ -76,7 +76,7 @@ picture() { # name of the picture, example, arguments
     printf '%-24s %7d bytes, %d s\n' "$name.png" "$bytes" "$SECONDS"
 }
 
-# The pictures need the models that the examples load, and a picture of what make_models makes.
+
 picture hello_body hello_body
 picture many_bodies many_bodies
 picture materials materials
@@ -88,6 +88,8 @@ picture tug_of_war tug_of_war
 for scene in "$root"/assets/scenes/*.ron; do
     picture "scene-$(basename "$scene" .ron)" scene "$scene"
 done
+
+if is_wanted make_models; then cp "$root/assets/jelly.png" "$out/make_models.png"; fi
 
 # Those who need somebody else there.
 serve() { # log, binary, arguments: starts it and says its invite
