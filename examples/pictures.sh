@@ -50,10 +50,10 @@ smaller() {
 import sys
 from PIL import Image
 picture = Image.open(sys.argv[1]).convert("RGB")
-picture.quantize(256, dither=Image.Dither.FLOYDSTEINBERG).save(sys.argv[1], optimize=True)
+picture.quantize(256, dither=Image.Dither.NONE).save(sys.argv[1], optimize=True)
 PYTHON
     elif command -v magick >/dev/null; then
-        magick "$1" -colors 256 "png8:$1"
+        magick "$1" +dither -colors 256 "png8:$1"
     else
         return 1
     fi

@@ -425,8 +425,9 @@ fn device(scene: &SceneDescription, bodies: &HashMap<String, usize>) -> Checked 
         patch(&inner("patch"), &on.patch)
     };
     match entry {
-        DeviceEntry::Virtual { on, motion: script, from, until, force_scale, .. } => {
+        DeviceEntry::Virtual { on, motion: script, from, until, force_scale, patience, .. } => {
             touched(on)?;
+            patience.map_or(Ok(()), |patience| within(&at("patience"), "seconds", patience, 0.01..=60.0))?;
             motion(&at("motion"), script)?;
             times(&at("from"), &at("until"), *from, *until, 0.2)?;
             within(&at("force_scale"), "a scale of forces", *force_scale, 0.0..=100.0)

@@ -450,6 +450,10 @@ pub enum DeviceEntry {
         /// The loop steps a copy of the body itself. Default: false.
         #[serde(default)]
         modal: bool,
+        /// How long the force waits for the simulation's next word before it fades, s, 0.01 to 60: for slow machines, as nobody's hand is on a
+        /// simulated device. Default: `None`, as for a real one.
+        #[serde(default)]
+        patience: Option<f64>,
     },
     /// The pointer, as a device: its force is shown and nobody feels it.
     Pointer {

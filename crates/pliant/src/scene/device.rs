@@ -9,7 +9,7 @@ use super::{DeviceEntry, Grip, Like, Motion, SceneError, SceneErrorKind, SceneFi
 use crate::body::{BodyState, PointerGrab};
 use crate::haptics::{
     DeviceId, Hand, HapticDevice, HapticDevices, HapticTool, LoopConfig, PointerSource, Positioned,
-    PositionedHandle, ToolGrip, VirtualConfig, VirtualDevice, VirtualHandle,
+    PositionedHandle, SafetyConfig, StaleConfig, ToolGrip, VirtualConfig, VirtualDevice, VirtualHandle,
 };
 
 /// The tool of a scene's device; it is in the world once the body that it begins at is there.
@@ -38,8 +38,10 @@ pub(super) fn add(
     entry: &DeviceEntry,
 ) -> Result<(), SceneError> {
     let failed = |kind, message: String| file.error(&[Field("device")], kind, message);
+    let mut patient = None;
     let (device, mover, on, force_scale, modal): (Box<dyn HapticDevice>, _, _, _, _) = match entry {
-        DeviceEntry::Virtual { like, grip, on, motion, from, until, force_scale, modal } => {
+        DeviceEntry::Virtual { like, grip, on, motion, from, until, force_scale, modal, patience } => {
+            patient = *patience;
             let config = match like {
                 Like::Touch => VirtualConfig::touch(),
                 Like::Omni => VirtualConfig::omni(),
@@ -68,7 +70,11 @@ pub(super) fn add(
         let message = "this scene asks for a device, and this app has no `HapticsPlugin`";
         return Err(failed(SceneErrorKind::Feature, message.into()));
     };
-    let config = LoopConfig { modal, ..LoopConfig::default() };
+    let mut config = LoopConfig { modal, ..LoopConfig::default() };
+    if let Some(patience) = patient {
+        let stale = Some(StaleConfig { patience, limit: patience + 1.0 });
+        config.safety = Some(SafetyConfig { stale, ..SafetyConfig::for_device(&device.info(), config.rate) });
+    }
     let device = devices
         .add(device, config)
         .map_err(|error| failed(SceneErrorKind::Open, format!("the device cannot be started: {error}")))?;
