@@ -1,23 +1,7 @@
 //! What crosses the network, and what repairs it when some of it does not arrive.
 //!
 //! A host steps soft bodies and streams them; guests follow, hold on to them and feel them. Everything here is a state
-//! machine: no socket, no clock, no thread, no randomness without a seed. `(now, datagrams in) -> (datagrams out, state)`. A session over a bad
-//! network, in virtual time:
-//!
-//! ```
-//! # fn main() -> Result<(), Box<dyn std::error::Error>> {
-//! use std::{path::Path, sync::Arc};
-//! use pliant_modal::ModalModel;
-//! use pliant_stream::{RecoveryConfig, emulator::{LinkConfig, Preset}, experiment::Experiment};
-//!
-//! let model = Path::new(env!("CARGO_MANIFEST_DIR")).join("../../assets/pip.modal");
-//! let link = LinkConfig::preset(Preset::Paper1); // 9 % of the packets lost, 196 ms there and back
-//! let mut session = Experiment::new(Arc::new(ModalModel::read(model)?), link, RecoveryConfig::default());
-//! session.seconds = 5.0;
-//! let figures = session.run()?;
-//! assert!(figures.rms_percent < 1.0); // what the guest was shown, of the largest displacement
-//! # Ok(()) }
-//! ```
+//! machine: no socket, no clock, no thread, no randomness without a seed. `(now, datagrams in) -> (datagrams out, state)`.
 //!
 //! | module | what it holds |
 //! | --- | --- |
