@@ -90,7 +90,9 @@ fn draw(
     }
     let screen = context.content_rect();
     egui::Window::new("Pliant")
-        .default_width(300.0)
+        // The height is that of what is in it: this only leaves it room.
+        .default_size([300.0, 4096.0])
+        .constrain_to(screen.shrink(12.0))
         .default_pos([screen.right() - 330.0, screen.top() + 12.0])
         .resizable([true, false])
         .show(&context, |ui| {
