@@ -31,9 +31,9 @@ const LOAD_TICKS: f64 = 8.0;
 const LOAD_EVERY: u64 = 4;
 
 /// One step moves the surface by this share of how far the body is bent.
-const UNIT: f64 = 1.0 / 16_384.0;
-/// The same of an acceleration stream: finer, since a prediction multiplies its rounding and integrates it twice.
-const FINE_UNIT: f64 = UNIT / 64.0;
+pub(crate) const QUANTUM: f64 = 1.0 / 16_384.0;
+/// An acceleration stream's steps are so much finer, since a prediction multiplies its rounding and integrates it twice.
+const FINER: f64 = 64.0;
 /// The memory of how far it was bent, a tick.
 const VISIBLE_KEEP: f64 = 0.98;
 
@@ -92,6 +92,8 @@ pub struct Encoder {
     sent: VecDeque<Sent>,
     scratch: Vec<f64>,
     quanta: Quanta,
+    /// Share of how far the body is bent that one step is.
+    quantum: f64,
     /// How far the body is bent, for the steps' size, m.
     visible: f64,
     chosen: Vec<u16>,
@@ -145,11 +147,19 @@ impl Encoder {
             sent: VecDeque::with_capacity(SENT),
             scratch: Vec::new(),
             quanta,
+            quantum: QUANTUM,
             visible: 0.0,
             chosen: Vec::new(),
             wrong: Vec::new(),
             entries: Vec::new(),
         })
+    }
+
+    /// What one step may move the surface by, as a share of how far the body is bent; see [`crate::HostConfig::quantum`].
+    #[must_use]
+    pub fn with_quantum(mut self, share: f64) -> Self {
+        self.quantum = if share.is_finite() { share.clamp(1e-9, 0.1) } else { QUANTUM };
+        self
     }
 
     /// How many modes a stream carries: what is wished, what the model has, and (accelerations) what fits beside four
@@ -299,7 +309,8 @@ impl Encoder {
         let count = self.modes.min(state.q.len());
         let now = self.quanta.visible(&state.q[..count], &state.v[..count]);
         self.visible = now.max(self.visible * VISIBLE_KEEP);
-        let share = if self.wish.payload == Payload::Forces { UNIT } else { FINE_UNIT };
+        let finer = if self.wish.payload == Payload::Forces { 1.0 } else { FINER };
+        let share = self.quantum / finer;
         let unit = (self.visible * share) as f32;
         if unit.is_finite() { unit.clamp(1e-30, 1e6) } else { 1e6 }
     }

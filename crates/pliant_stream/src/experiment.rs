@@ -56,8 +56,13 @@ pub struct Experiment {
     pub warmup: Duration,
     /// Hands, scripted. Default: [`Experiment::default_hands`].
     pub hands: Vec<Hand>,
+    /// [`HostConfig::quantum`]. Default: 2^-14.
+    pub quantum: f64,
     /// A clock for the time that decoding, correcting and stepping take; `None` leaves [`Figures::cpu_us_per_tick`] 0.
     pub cpu_clock: Option<fn() -> Duration>,
+    /// The guest holds the body, too, where the first hand does, and sends its target every tick: for counting what goes up. The host does not
+    /// act on it, so what is shown is not compared with anything then: the errors mean nothing. Default: false.
+    pub guest_hand: bool,
     /// Keep the shown and true position of the first hand's patch, tick by tick, for plots. Default: false.
     pub keep_track: bool,
 }
@@ -133,6 +138,11 @@ pub struct Figures {
     pub bytes_per_frame: f64,
     /// Bits down in a second, datagrams without the transport's own bytes, kbit/s.
     pub kbit_s: f64,
+    /// Mean bytes of a datagram up, and bits up in a second: kbit/s. Clock, loss reports and NACKs; targets only with
+    /// [`Experiment::guest_hand`].
+    pub bytes_per_datagram_up: f64,
+    /// See [`Figures::bytes_per_datagram_up`].
+    pub kbit_s_up: f64,
     /// Time for decoding, correcting and stepping a tick at the guest, us.
     pub cpu_us_per_tick: f64,
     /// Everything shown and every fate on the path, in one number.
@@ -168,7 +178,9 @@ impl Experiment {
             newmark: Newmark { h: 1.0 / 40.0, beta: 4.0 / 9.0, gamma: 5.0 / 6.0 },
             resend_after: Duration::ZERO,
             warmup: Duration::from_secs(2),
+            quantum: HostConfig::default().quantum,
             cpu_clock: None,
+            guest_hand: false,
             keep_track: false,
         }
     }
@@ -210,8 +222,12 @@ impl Experiment {
     pub fn run(&self) -> Result<Figures, StreamError> {
         let h = 1.0 / self.rate;
         let newmark = Newmark { h, ..self.newmark };
-        let mut pair =
-            Pair::new(HostConfig { newmark, resend_after: self.resend_after, ..Default::default() })?;
+        let mut pair = Pair::new(HostConfig {
+            newmark,
+            resend_after: self.resend_after,
+            quantum: self.quantum,
+            ..Default::default()
+        })?;
         let body = Body::new(
             self.model.clone(),
             BodyConfig {
@@ -249,6 +265,9 @@ impl Experiment {
         figures.bytes_per_frame = (after.bytes_out - before.bytes_out) as f64
             / (after.datagrams_out - before.datagrams_out).max(1) as f64;
         figures.kbit_s = (after.bytes_out - before.bytes_out) as f64 * 8e-3 / self.seconds;
+        let up = (after.bytes_in - before.bytes_in) as f64;
+        figures.bytes_per_datagram_up = up / (after.datagrams_in - before.datagrams_in).max(1) as f64;
+        figures.kbit_s_up = up * 8e-3 / self.seconds;
         figures.hash = fold(figures.hash, &guest.down.hash().to_le_bytes());
         figures.cpu_us_per_tick = 1e6 * pair.guests_spent().as_secs_f64() / figures.ticks.max(1) as f64;
         figures.nacks = guest.session.stats().nacks;
@@ -331,6 +350,10 @@ struct Run {
     shape: ShapeError,
     track_row: Vec<f64>,
     keep_track: bool,
+    /// Who holds at the guest: the hand, and the grab once there is one.
+    guest_hand: Option<(Hand, Option<u16>)>,
+    /// When it last said its target.
+    guest_said: Duration,
     own_hand_first: bool,
     measuring: Option<Duration>,
     sum: f64,
@@ -372,6 +395,8 @@ impl Run {
             shape,
             track_row,
             keep_track: experiment.keep_track,
+            guest_hand: experiment.hands.first().filter(|_| experiment.guest_hand).map(|hand| (*hand, None)),
+            guest_said: Duration::ZERO,
             own_hand_first: matches!(experiment.recovery.policy, Policy::ForceDriven { .. }),
             measuring: None,
             sum: 0.0,
@@ -393,6 +418,28 @@ impl Run {
             track: Vec::new(),
             last_tick: 0,
             in_row: 0,
+        }
+    }
+
+    /// The guest's own hand, on the path of the first one of the host.
+    fn hold_at_guest(&mut self, now: Duration, session: &mut GuestSession) {
+        let Some((hand, grab)) = &mut self.guest_hand else { return };
+        // Once a tick: a target that is said makes the session look again at once.
+        if now.saturating_sub(self.guest_said).as_secs_f64() < 0.9 * self.h {
+            return;
+        }
+        self.guest_said = now;
+        let place = self.body.model().surface().positions().get(hand.vertex as usize).copied();
+        let (rest, d) = (place.unwrap_or_default(), hand.path(now.as_secs_f64()));
+        let target = std::array::from_fn(|k| f64::from(rest[k]) + d[k]);
+        match grab {
+            // Refused before the body is there: again at the next tick.
+            None => {
+                let hold = GrabConfig::default();
+                *grab = session.begin_grab(now, BODY, hand.vertex, hand.radius, target, hold).ok();
+            }
+            // A finite hand's target is taken.
+            Some(grab) => drop(session.set_target(*grab, target)),
         }
     }
 
@@ -532,6 +579,7 @@ impl World for Run {
     fn host_event(&mut self, _now: Duration, _event: HostEvent, _host: &mut HostSession) {}
 
     fn guest_stepped(&mut self, now: Duration, _guest: usize, _stepped: u64, session: &mut GuestSession) {
+        self.hold_at_guest(now, session);
         let Some(view) = session.body(BODY) else { return };
         let (Some(shown), Some(hidden)) = (view.shown(), view.hidden()) else { return };
         let tick = view.tick();

@@ -29,6 +29,9 @@ pub struct HostConfig {
     pub guest_rate: f64,
     /// Answer a NACK only so much later: for remaking the paper's figures. Default: at once.
     pub resend_after: Duration,
+    /// What one step of a quantised number may move the surface by, as a share of how far the body is bent, 1e-9 to 0.1 (values outside are brought
+    /// there); streams of accelerations take a 64th of it. Default: 2^-14.
+    pub quantum: f64,
     /// Take in everybody who says hello; else [`HostEvent::Knock`] asks and [`crate::HostSession::accept`] answers. Default: true.
     pub open: bool,
 }
@@ -43,6 +46,7 @@ impl Default for HostConfig {
             models_rate: 8e6,
             guest_rate: 1e6,
             resend_after: Duration::ZERO,
+            quantum: crate::encoder::QUANTUM,
             open: true,
         }
     }

@@ -79,7 +79,7 @@ impl HostSession {
                         key.1,
                     );
                     match made {
-                        Ok(encoder) => e.insert(encoder),
+                        Ok(encoder) => e.insert(encoder.with_quantum(self.config.quantum)),
                         Err(_) => continue,
                     }
                 }
