@@ -6,7 +6,7 @@ use bevy::{
     math::{Affine3A, DVec3},
     prelude::*,
 };
-use pliant_modal::{Body, BodyConfig, GrabId, Integrator, ModalModel, Relaxation};
+use pliant_modal::{Body, BodyConfig, GrabId, Integrator, ModalModel, Precision, Relaxation};
 
 use crate::{ModalAsset, grab::Hold};
 
@@ -51,6 +51,9 @@ pub struct ModalBody {
     /// Newton corrections in one step of the grabs on a body that is bent by warping, a number from 1 to 8 (what is outside is taken as
     /// the nearest of them). Default: `2`.
     pub corrections: usize,
+    /// Where the processor writes the surface (see `SurfaceDeformation`): from a basis in half precision, in half the time where the surface is large,
+    /// and off by some 5e-5 of the body's size where it is pulled by a fifth of it. Default: `false`.
+    pub half_basis: bool,
     /// Acceleration of gravity, m/s^2, in world axes. Default: zero, as a bake at rest is usually wanted as it was drawn.
     pub gravity: DVec3,
     /// The body rests once the root mean square speed of its mass stays below this, m/s of the model, for half a second with
@@ -77,6 +80,7 @@ impl ModalBody {
             stiffness_scale: 1.0,
             relaxation: None,
             corrections: BodyConfig::default().corrections,
+            half_basis: false,
             gravity: DVec3::ZERO,
             rest_speed: 1e-4,
         }
@@ -94,6 +98,7 @@ impl ModalBody {
             stiffness_scale: self.stiffness_scale,
             relaxation: self.relaxation.map(Relaxation::from),
             corrections: self.corrections,
+            precision: if self.half_basis { Precision::Half } else { Precision::Single },
         }
     }
 }
@@ -251,6 +256,11 @@ impl BodyState {
     /// Whether the shape is bent by modal warping.
     pub fn warps(&self) -> bool {
         self.body.config().warp
+    }
+
+    /// What the surface is written from on the processor.
+    pub fn precision(&self) -> Precision {
+        self.body.config().precision
     }
 
     /// The uniform scale that the entity's transform gives the body.

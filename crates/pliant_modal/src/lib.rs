@@ -48,7 +48,7 @@ mod simd;
 mod surface;
 mod warp;
 
-pub use basis::{BLOCK, Basis, ROWS};
+pub use basis::{BLOCK, Basis, Precision, ROWS};
 pub use body::{Body, BodyConfig, Frame, GrabConfig, GrabId, RigidMotion, State, StepReport};
 pub use error::{FileError, ModelError, StepError};
 pub use file::{FORMAT_VERSION, MAGIC};

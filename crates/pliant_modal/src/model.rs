@@ -1,8 +1,10 @@
 //! The baked model: what a body is, independent of where it is and how it moves.
 
+use std::sync::OnceLock;
+
 use serde::{Deserialize, Serialize};
 
-use crate::{Basis, ModelError, SurfaceMesh, check::check_parts};
+use crate::{Basis, ModelError, Precision, SurfaceMesh, check::check_parts};
 
 /// The finite element that a body was baked with.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
@@ -135,15 +137,24 @@ pub struct ModelParts {
 }
 
 /// A baked body, immutable; share it as `Arc<ModalModel>` between all bodies that look alike.
-#[derive(Debug, Clone, PartialEq)]
+#[derive(Debug, Clone)]
 pub struct ModalModel {
     parts: ModelParts,
     basis: Basis,
+    /// Made when it is first asked for.
+    half: OnceLock<Basis>,
     size: f64,
     hash: ModelHash,
     bytes: usize,
     /// Radii of the sites, ascending, each once.
     site_radii: Vec<f64>,
+}
+
+impl PartialEq for ModalModel {
+    /// By what it was made from; whether the half-precision basis was asked for makes no difference.
+    fn eq(&self, other: &Self) -> bool {
+        self.parts == other.parts
+    }
 }
 
 impl ModalModel {
@@ -179,7 +190,7 @@ impl ModalModel {
         let mut site_radii: Vec<f64> = parts.sites.iter().map(|site| site.radius).collect();
         site_radii.sort_by(f64::total_cmp);
         site_radii.dedup();
-        Self { parts, basis, size, hash, bytes: bytes.len(), site_radii }
+        Self { parts, basis, half: OnceLock::new(), size, hash, bytes: bytes.len(), site_radii }
     }
 
     pub(crate) fn site_radii(&self) -> &[f64] {
@@ -262,6 +273,14 @@ impl ModalModel {
     /// Modes at the surface in the layout that reconstruction reads.
     pub fn basis(&self) -> &Basis {
         &self.basis
+    }
+
+    /// The same in another precision. In half precision it is made when it is first asked for, and kept: half as much memory again.
+    pub fn basis_in(&self, precision: Precision) -> &Basis {
+        match precision {
+            Precision::Single => &self.basis,
+            Precision::Half => self.half.get_or_init(|| self.basis.to_half()),
+        }
     }
 
     /// Largest extent of the rest shape's bounds, m: what errors are measured against.

@@ -5,7 +5,9 @@ mod rod;
 
 use std::sync::Arc;
 
-use pliant_modal::{Body, BodyConfig, GrabConfig, Integrator, ModalModel, Patch, State, StepError};
+use pliant_modal::{
+    Body, BodyConfig, GrabConfig, Integrator, ModalModel, Patch, Precision, State, StepError,
+};
 use rod::{AREA, DENSITY, LENGTH, rod, tip};
 
 fn tip_patch(model: &ModalModel) -> Patch {
@@ -423,4 +425,28 @@ fn reconstruction_equals_the_sum_over_modes() {
         assert!((f64::from(got[0]) - want).abs() < 1e-6, "vertex {v}");
     }
     assert!(body.reconstruct(&mut out[1..]).is_err());
+}
+
+#[test]
+fn a_half_precision_surface_is_off_by_its_rounding_and_the_step_by_nothing() {
+    let pulled = |precision| {
+        let model = Arc::new(rod(2e5, 12, 0.3, false));
+        let config = BodyConfig { precision, ..Default::default() };
+        let mut body = Body::new(model.clone(), config).unwrap();
+        let grab = body.grab(&tip_patch(&model), GrabConfig::default()).unwrap();
+        let start = body.grab_position(grab).unwrap();
+        body.set_target(grab, [start[0] + 0.02, start[1], start[2]]).unwrap();
+        for _ in 0..200 {
+            body.step().unwrap();
+        }
+        let mut surface = vec![[0.0f32; 3]; model.surface().positions().len()];
+        body.reconstruct(&mut surface).unwrap();
+        (body.q().to_vec(), surface)
+    };
+    let ((q, single), (same, half)) = (pulled(Precision::Single), pulled(Precision::Half));
+    assert_eq!(q, same);
+    let off =
+        single.iter().flatten().zip(half.iter().flatten()).map(|(a, b)| (a - b).abs()).fold(0.0, f32::max);
+    // 2^-11 of twelve modes that move 0.02 m together, and not nothing.
+    assert!(off > 0.0 && off < 12.0 * 0.02 / 2048.0, "{off} m");
 }

@@ -2,7 +2,7 @@
 //! the mesh for its render world.
 
 use bevy::{camera::primitives::Aabb, mesh::VertexAttributeValues, prelude::*};
-use pliant_modal::ModalModel;
+use pliant_modal::{ModalModel, Precision};
 
 use super::topology::Topology;
 
@@ -14,10 +14,11 @@ pub(super) struct Scratch {
     normals: Vec<Vec3>,
 }
 
-/// Writes positions (m, body axes) and area-weighted normals at modal coordinates `q` into `mesh`, which was made for `topology`;
+/// Writes positions (m, body axes), from the basis in `precision`, and area-weighted normals at modal coordinates `q` into `mesh`, which was made for `topology`;
 /// returns the bounds, or `None` when the mesh is not of this topology (somebody replaced it), which is then left alone.
 pub(super) fn write(
     model: &ModalModel,
+    precision: Precision,
     topology: &Topology,
     q: &[f64],
     warped: bool,
@@ -28,7 +29,7 @@ pub(super) fn write(
     coordinates.clear();
     coordinates.extend(q.iter().map(|&q| q as f32));
     positions.resize(model.surface().positions().len(), [0.0; 3]);
-    model.basis().reconstruct(coordinates, warped, positions);
+    model.basis_in(precision).reconstruct(coordinates, warped, positions);
 
     let drawn = float3(mesh, Mesh::ATTRIBUTE_POSITION.id, topology.source.len())?;
     let (mut low, mut high) = (Vec3::INFINITY, Vec3::NEG_INFINITY);

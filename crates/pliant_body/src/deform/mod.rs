@@ -117,7 +117,15 @@ fn make_meshes(
         let mut scratch = cpu::Scratch::default();
         let mut mesh = new_mesh(model, &drawing.topology);
         let detail = Detail { modes: shown.q().len(), warped: state.warps() };
-        let bounds = cpu::write(model, &drawing.topology, shown.q(), state.warps(), &mut mesh, &mut scratch);
+        let bounds = cpu::write(
+            model,
+            state.precision(),
+            &drawing.topology,
+            shown.q(),
+            state.warps(),
+            &mut mesh,
+            &mut scratch,
+        );
         commands
             .entity(entity)
             .insert((
@@ -234,8 +242,15 @@ fn deform_surfaces(
                 commands.entity(entity).remove::<GpuShape>();
             }
             let Some(mut mesh) = meshes.get_mut(&mesh.0) else { continue };
-            let bounds =
-                cpu::write(&drawn.model, &drawn.drawing.topology, q, detail.warped, &mut mesh, &mut scratch);
+            let bounds = cpu::write(
+                &drawn.model,
+                state.precision(),
+                &drawn.drawing.topology,
+                q,
+                detail.warped,
+                &mut mesh,
+                &mut scratch,
+            );
             if let Some(bounds) = bounds {
                 aabb.set_if_neq(bounds);
             }

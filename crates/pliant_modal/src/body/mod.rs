@@ -14,7 +14,7 @@ pub use frame::{Frame, RigidMotion};
 pub use grab::{GrabConfig, GrabId};
 
 use crate::{
-    Coefficients, Flow, Integrator, ModalModel, Patch, Relaxation, StepError, error::finite,
+    Coefficients, Flow, Integrator, ModalModel, Patch, Precision, Relaxation, StepError, error::finite,
     warp::warp_with_jacobian,
 };
 use grab::Grab;
@@ -44,6 +44,8 @@ pub struct BodyConfig {
     pub relaxation: Option<Relaxation>,
     /// Newton corrections of the grabs under warp in one step, 1 to 8. Default: 2.
     pub corrections: usize,
+    /// What [`Body::reconstruct`] reads. Steps, grabs and forces are in double precision either way. Default: [`Precision::Single`].
+    pub precision: Precision,
 }
 
 impl Default for BodyConfig {
@@ -58,6 +60,7 @@ impl Default for BodyConfig {
             stiffness_scale: 1.0,
             relaxation: None,
             corrections: 2,
+            precision: Precision::default(),
         }
     }
 }
@@ -479,7 +482,7 @@ impl Body {
         for (s, q) in self.single.iter_mut().zip(&self.state.q) {
             *s = *q as f32;
         }
-        self.model.basis().reconstruct(&self.single, self.config.warp, out);
+        self.model.basis_in(self.config.precision).reconstruct(&self.single, self.config.warp, out);
         Ok(())
     }
 
