@@ -3,10 +3,10 @@
 use std::{hint::black_box, path::PathBuf, sync::Arc, time::Instant};
 
 use clap::{Args, Subcommand};
-use pliant_modal::{Body, BodyConfig, GrabConfig, ModalModel, Patch, streaming_sum};
+use pliant_modal::{Body, BodyConfig, GrabConfig, ModalModel, Patch, Precision, streaming_sum};
 use serde::Serialize;
 
-use crate::{CliError, output};
+use crate::{CliError, machine::Pinned, output};
 
 #[derive(Args, Debug)]
 pub(crate) struct BenchArgs {
@@ -24,13 +24,16 @@ enum What {
         /// Seconds for each of the three measurements
         #[arg(long, default_value_t = 1.0)]
         seconds: f64,
+        /// Reconstruct from a basis in half precision
+        #[arg(long)]
+        half: bool,
         /// Prints one line of JSON
         #[arg(long)]
         json: bool,
     },
 }
 
-/// Percentiles of a time, us.
+/// Percentiles of a time, us, on one core.
 #[derive(Serialize, Debug)]
 pub(crate) struct Times {
     pub(crate) p50: f64,
@@ -54,16 +57,18 @@ pub(crate) struct Told {
 }
 
 pub(crate) fn run(args: &BenchArgs) -> Result<(), CliError> {
-    let What::Step { model, seconds, json } = &args.what;
+    let What::Step { model, seconds, half, json } = &args.what;
     if !(0.01..=600.0).contains(seconds) {
         return Err(CliError::Range { what: "--seconds", low: 0.01, high: 600.0, got: *seconds });
     }
-    let told = measure(Arc::new(ModalModel::read(model)?), *seconds)?;
+    let precision = if *half { Precision::Half } else { Precision::Single };
+    let told = measure(Arc::new(ModalModel::read(model)?), *seconds, precision)?;
     if *json { output::print_json(&told) } else { output::print(&text(&told)) }
 }
 
-pub(crate) fn measure(model: Arc<ModalModel>, seconds: f64) -> Result<Told, CliError> {
-    let mut body = Body::new(model.clone(), BodyConfig::default())?;
+pub(crate) fn measure(model: Arc<ModalModel>, seconds: f64, precision: Precision) -> Result<Told, CliError> {
+    let _pinned = Pinned::new();
+    let mut body = Body::new(model.clone(), BodyConfig { precision, ..BodyConfig::default() })?;
     // Where the first mode moves most: a body is pulled where it gives.
     let moves = |v: u32| (0..3).map(|axis| model.displacement_row(v, axis, 0).powi(2)).sum::<f32>();
     let count = model.surface().positions().len() as u32;
@@ -86,7 +91,7 @@ pub(crate) fn measure(model: Arc<ModalModel>, seconds: f64) -> Result<Told, CliE
     }
     let q: Vec<f32> = body.q().iter().map(|q| *q as f32).collect();
     let mut positions = model.surface().positions().to_vec();
-    let basis = model.basis();
+    let basis = model.basis_in(precision);
     let bytes = basis.traffic_bytes(model.mode_count());
     let buffer = vec![1.0f32; bytes / 4];
     let [reconstruct_us, limit] = time_by_turns(

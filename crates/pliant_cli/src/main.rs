@@ -6,6 +6,7 @@
 mod bake;
 mod bench;
 mod inspect;
+mod machine;
 mod mesh;
 mod output;
 mod progress;

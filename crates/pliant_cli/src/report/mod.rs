@@ -1,5 +1,6 @@
 //! `pliant report`: what the method costs and what it is off by, remade on this machine: tables, CSV, SVG, PNG and the words for them.
 
+mod frames;
 mod physics;
 mod plot;
 mod tables;
@@ -10,18 +11,20 @@ use std::{fmt::Write, path::PathBuf, time::Instant};
 use clap::Args;
 use serde::Serialize;
 
-use crate::{CliError, output, progress::Bar};
+use crate::{CliError, machine, output, progress::Bar};
 use plot::Figure;
 
-const PARTS: [&str; 11] = [
+const PARTS: [&str; 13] = [
     "elements",
     "modes",
     "steps",
     "warp",
     "precision",
+    "frames",
     "network",
     "front",
     "table-2",
+    "table-3",
     "courses",
     "default",
     "all",
@@ -29,7 +32,7 @@ const PARTS: [&str; 11] = [
 
 #[derive(Args, Debug)]
 pub(crate) struct ReportArgs {
-    /// Only one part: elements, modes, steps, warp, precision, network, front, table-2, courses, default
+    /// Only one part: elements, modes, steps, warp, precision, frames, network, front, table-2, table-3, courses, default
     #[arg(long, default_value = "all")]
     only: String,
     /// Fewer points and shorter timings: within ten minutes on two cores
@@ -67,9 +70,9 @@ pub(crate) fn run(args: &ReportArgs) -> Result<(), CliError> {
         return Err(CliError::Unknown { what: "--only", got: args.only.clone(), expected: PARTS.join(", ") });
     }
     std::fs::create_dir_all(&args.output)?;
-    // Timings of one thread are not to share their core with a pool: one thread for those; bakes take all cores.
     let began = Instant::now();
     let mut text = heading();
+    let load = machine::load();
     let mut told = Told { parts: Vec::new(), seconds: 0.0 };
     let mut bar = Bar::new();
     for name in PARTS.into_iter().filter(|p| *p != "all" && (args.only == "all" || args.only == *p)) {
@@ -94,9 +97,10 @@ pub(crate) fn run(args: &ReportArgs) -> Result<(), CliError> {
     told.seconds = began.elapsed().as_secs_f64();
     let _ = writeln!(
         text,
-        "\nMade in {:.0} s by `pliant report{}`.",
+        "\nMade in {:.0} s by `pliant report{}`. {}",
         told.seconds,
-        if args.quick { " --quick" } else { "" }
+        if args.quick { " --quick" } else { "" },
+        quiet(load, machine::load()),
     );
     std::fs::write(args.output.join("report.md"), text)?;
     if args.json {
@@ -112,9 +116,11 @@ fn title(part: &str) -> &'static str {
         "steps" => "c. Integrator and step",
         "warp" => "d. Warp against a nonlinear solution",
         "precision" => "e. Precision",
+        "frames" => "e. Quantised frames",
         "network" => "f. Network",
         "front" => "g. All together",
         "table-2" => "The paper's table 2",
+        "table-3" => "The paper's networks and what crosses them (its table 3)",
         "courses" => "The paper's figures 7, 8 and 9",
         _ => "The default setting in words",
     }
@@ -131,6 +137,7 @@ fn part(name: &str, args: &ReportArgs, bar: &mut Bar) -> Result<(Vec<Figure>, St
             let (figure, _) = tables::precision()?;
             (vec![figure], String::new())
         }
+        "frames" => (vec![frames::quantised(quick, bar)?], String::new()),
         "network" => {
             let (figure, table) = tables::networks(quick, bar)?;
             (vec![figure], table)
@@ -139,6 +146,7 @@ fn part(name: &str, args: &ReportArgs, bar: &mut Bar) -> Result<(Vec<Figure>, St
         "table-2" => {
             (Vec::new(), tables::table_2(&args.models, &args.own, if quick { 0.3 } else { 2.0 }, bar)?)
         }
+        "table-3" => (Vec::new(), frames::table_3(quick, bar)?),
         "courses" => (tables::courses()?, String::new()),
         _ => (
             Vec::new(),
@@ -155,13 +163,25 @@ fn rows(figure: &Figure) -> String {
     if !figure.logarithmic {
         return String::new();
     }
-    let mut out = format!("| line | {} | {} |\n| --- | --- | --- |\n", figure.x, figure.y);
+    let timed = figure.series.iter().any(|series| !series.late.is_empty());
+    let (head, rule) = if timed { (" 99 % |", " --- |") } else { ("", "") };
+    let mut out = format!("| line | {} |{head} {} |\n| --- | --- |{rule} --- |\n", figure.x, figure.y);
     for series in &figure.series {
-        for (x, y) in &series.points {
-            let _ = writeln!(out, "| {} | {x:.4} | {y:.2e} |", series.name);
+        for (index, (x, y)) in series.points.iter().enumerate() {
+            let late = series.late.get(index).map_or(String::new(), |late| format!(" {late:.4} |"));
+            let _ = writeln!(out, "| {} | {x:.4} |{late} {y:.2e} |", series.name);
         }
     }
     out
+}
+
+/// What else the machine did meanwhile, as far as the system says.
+fn quiet(before: Option<f64>, after: Option<f64>) -> String {
+    let (Some(before), Some(after)) = (before, after) else { return String::new() };
+    format!(
+        "The machine's load (programs that want to run, mean over a minute) was {before:.1} when it began and {after:.1} at the end; the report itself is one of them, and bakes take all cores. Above that, times are \
+         too long, and ratios within a run are what holds."
+    )
 }
 
 fn heading() -> String {
@@ -171,8 +191,12 @@ fn heading() -> String {
     let [y, m, d] = date(days as i64);
     let cores = std::thread::available_parallelism().map_or(1, usize::from);
     format!(
-        "# What Pliant costs and what it is off by\n\n{y:04}-{m:02}-{d:02}, Pliant {}, {cores} cores, {} {}, {}. Times are of one core, medians after a warm-up, unless it says otherwise.\n",
+        "# What Pliant costs and what it is off by\n\n{y:04}-{m:02}-{d:02}, Pliant {}, {cores} cores{}, {} {}, {}. Times are of one thread kept on one core, medians after a warm-up with the 99th percentile beside them (whiskers in the figures), unless it says otherwise.\n",
         env!("CARGO_PKG_VERSION"),
+        match machine::processor() {
+            name if name.is_empty() => name,
+            name => format!(" of {name}"),
+        },
         std::env::consts::ARCH,
         std::env::consts::OS,
         vectors(),

@@ -37,7 +37,7 @@ pub(super) fn elements(quick: bool) -> Result<Figure, CliError> {
                 .fold(0.0, f64::max);
             points.push((seconds, worst));
         }
-        series.push(Series { name: format!("{element}"), points });
+        series.push(Series::new(format!("{element}"), points));
     }
     let words = "Largest error of the first eleven frequencies of a free cube against Demarest's values, over the time of the whole bake. Ten-node tetrahedra are the default: \
         for the same error they take a small part of the time. The run-time cost is the same."
@@ -127,14 +127,12 @@ pub(super) fn modes(quick: bool) -> Result<Figure, CliError> {
         let mut body = Body::new(full.clone(), config.clone())?;
         let patch = Patch::around(full.surface(), farthest(&full, [1.0, 0.01, 0.02]), 0.12)?;
         body.grab(&patch, GrabConfig::default())?;
-        let [us, _] = time_us(if quick { 2_000 } else { 20_000 }, || Ok(body.step().map(|_| ())?))?;
+        let us = time_us(if quick { 2_000 } else { 20_000 }, || Ok(body.step().map(|_| ())?))?;
         with.push((us, relative(&dragged(&full, config)?, &want, 0)));
         without.push((us, relative(&dragged(&Arc::new(bare(&full, kept)?), elastic.clone())?, &want, 0)));
     }
-    let series = vec![
-        Series { name: "with residual flexibility (default)".into(), points: with },
-        Series { name: "without".into(), points: without },
-    ];
+    let series =
+        vec![Series::timed("with residual flexibility (default)", with), Series::timed("without", without)];
     let words = "Error of the reaction of a dragged bar against all 216 modes of its mesh, over the time of a step, for 2 to 128 modes kept. What the kept modes leave out at the hand \
         is added as a compliance; without it a hand on few modes feels a body that is much too stiff."
         .to_owned();
@@ -201,15 +199,21 @@ pub(super) fn steps(quick: bool) -> Result<[Figure; 2], CliError> {
         let (mut a, mut b) = (Vec::new(), Vec::new());
         for &rate in rates {
             let mut body = Body::new(model.clone(), at(rate, integrator))?;
-            let [us, _] = time_us(2_000, || Ok(body.step().map(|_| ())?))?;
+            let us = time_us(2_000, || Ok(body.step().map(|_| ())?))?;
             let patch = Patch::around(model.surface(), farthest(&model, [1.0, 0.01, 0.02]), 0.12)?;
             body.grab(&patch, GrabConfig::default())?;
-            let [with_hand, _] = time_us(2_000, || Ok(body.step().map(|_| ())?))?;
-            a.push((us * rate, relative(&ring(at(rate, integrator))?, &free_truth, 0).max(1e-16)));
-            b.push((with_hand * rate, relative(&dragged(&model, at(rate, integrator))?, &held_truth, 0)));
+            let with_hand = time_us(2_000, || Ok(body.step().map(|_| ())?))?;
+            a.push((
+                us.map(|us| us * rate),
+                relative(&ring(at(rate, integrator))?, &free_truth, 0).max(1e-16),
+            ));
+            b.push((
+                with_hand.map(|us| us * rate),
+                relative(&dragged(&model, at(rate, integrator))?, &held_truth, 0),
+            ));
         }
-        free.push(Series { name: name.into(), points: a });
-        held.push(Series { name: name.into(), points: b });
+        free.push(Series::timed(name, a));
+        held.push(Series::timed(name, b));
     }
     Ok([
         figure("c-steps-free", "Integrator and step: a struck bar", "us of one core for a second of motion", "tip error after 1 s, rms / rms", free, None, "A struck bar for a second, against the closed form. The exact step has no error at any step size (rounding is drawn at 1e-16 at least); Newmark shifts every frequency.".into()),
@@ -322,7 +326,7 @@ pub(super) fn warp(quick: bool) -> Result<Vec<Figure>, CliError> {
     }
     let name = |which: usize| if which == 0 { "warped (default)" } else { "linear, without warp" }.to_owned();
     let lines = |all: [Vec<(f64, f64)>; 2]| {
-        all.into_iter().enumerate().map(|(k, points)| Series { name: name(k), points }).collect::<Vec<_>>()
+        all.into_iter().enumerate().map(|(k, points)| Series::new(name(k), points)).collect::<Vec<_>>()
     };
     let mut forces = lines(force);
     for line in &mut forces {
@@ -388,12 +392,11 @@ pub(super) fn front(quick: bool) -> Result<Figure, CliError> {
             let held = held_as(&model, load, solved, config.clone())?;
             let mut body = Body::new(model.clone(), config)?;
             let mut positions = vec![[0.0f32; 3]; model.surface().positions().len()];
-            let [frame, _] =
+            let frame =
                 time_us(if quick { 1_000 } else { 10_000 }, || Ok(body.reconstruct(&mut positions)?))?;
-            points.push((held.step_us[0] + frame, held.shape[1]));
+            points.push(([held.step_us[0] + frame[0], held.step_us[1] + frame[1]], held.shape[1]));
         }
-        series
-            .push(Series { name: format!("{element}, {}", if warp { "warped" } else { "linear" }), points });
+        series.push(Series::timed(format!("{element}, {}", if warp { "warped" } else { "linear" }), points));
     }
     Ok(figure("g-front", "All together: what a frame costs and what it is off by", "step and whole surface, us (median)", "largest error of the surface / length", series, None, "The bar pulled aside by a sixth of its length: modes 3, 6, 12, 24, 60 along each line. Error is the largest distance of the surfaces as a share of the length.".into()))
 }

@@ -14,6 +14,24 @@ use crate::CliError;
 pub(super) struct Series {
     pub(super) name: String,
     pub(super) points: Vec<(f64, f64)>,
+    /// Where x is the median of a time: its 99th percentile at each point.
+    pub(super) late: Vec<f64>,
+}
+
+impl Series {
+    /// Without percentiles.
+    pub(super) fn new(name: impl Into<String>, points: Vec<(f64, f64)>) -> Self {
+        Self { name: name.into(), points, late: Vec::new() }
+    }
+
+    /// Points of a median time, its 99th percentile, and an error.
+    pub(super) fn timed(name: impl Into<String>, points: Vec<([f64; 2], f64)>) -> Self {
+        Self {
+            name: name.into(),
+            points: points.iter().map(|(x, y)| (x[0], *y)).collect(),
+            late: points.iter().map(|(x, _)| x[1]).collect(),
+        }
+    }
 }
 
 /// A figure: points with what they cost along x and what they are off by along y, or a course over time.
@@ -54,12 +72,13 @@ pub(super) fn write(folder: &Path, figure: &Figure) -> Result<(), CliError> {
     FONT.get_or_init(|| {
         register_font("sans-serif", FontStyle::Normal, epaint_default_fonts::UBUNTU_LIGHT).is_ok()
     });
-    let mut csv = format!("series,\"{}\",\"{}\",reference error\n", figure.x, figure.y);
+    let mut csv = format!("series,\"{}\",\"{}\",reference error,99th percentile of x\n", figure.x, figure.y);
     let reference = figure.reference_error.map_or(String::new(), |e| format!("{e:.6e}"));
     for series in &figure.series {
-        for (x, y) in &series.points {
+        for (index, (x, y)) in series.points.iter().enumerate() {
+            let late = series.late.get(index).map_or(String::new(), |late| format!("{late:.4e}"));
             // Writing to a string cannot fail.
-            let _ = writeln!(csv, "\"{}\",{x:.4e},{y:.3e},{reference}", series.name);
+            let _ = writeln!(csv, "\"{}\",{x:.4e},{y:.3e},{reference},{late}", series.name);
         }
     }
     std::fs::write(folder.join(format!("{}.csv", figure.file)), csv)?;
@@ -91,7 +110,8 @@ fn draw<B: DrawingBackend>(
 ) -> Result<(), DrawingAreaErrorKind<B::ErrorType>> {
     area.fill(&WHITE)?;
     let all = || figure.series.iter().flat_map(|s| s.points.iter().copied());
-    let xs = range(all().map(|p| p.0), figure.logarithmic);
+    let late = || figure.series.iter().flat_map(|s| s.late.iter().copied());
+    let xs = range(all().map(|p| p.0).chain(late()), figure.logarithmic);
     let ys = range(all().map(|p| p.1).chain(figure.reference_error), figure.logarithmic);
     let mut chart = ChartBuilder::on(area);
     chart.caption(&figure.title, ("sans-serif", 20)).margin(12).x_label_area_size(44).y_label_area_size(72);
@@ -123,6 +143,13 @@ fn draw<B: DrawingBackend>(
                     .legend(move |(x, y)| {
                         PathElement::new(vec![(x, y), (x + 18, y)], colour.stroke_width(2))
                     });
+                // A whisker from the median to the 99th percentile.
+                for (point, late) in series.points.iter().zip(&series.late) {
+                    if point.1 > 0.0 {
+                        let y = point.1.clamp(ys.start, ys.end);
+                        chart.draw_series(LineSeries::new([(point.0, y), (*late, y)], colour.mix(0.5)))?;
+                    }
+                }
                 if figure.logarithmic {
                     chart.draw_series(points.iter().map(|p| Circle::new(*p, 3, colour.filled())))?;
                 }

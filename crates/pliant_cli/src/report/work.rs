@@ -6,13 +6,14 @@ use pliant_bake::{Anchor, BakeConfig, Comparison, bake};
 use pliant_mesh::TetMesh;
 use pliant_modal::{Damping, Element, ModalModel};
 
-use crate::CliError;
+use crate::{CliError, machine::Pinned};
 
-/// Median and 99th percentile of a piece of work, us, after a warm-up.
+/// Median and 99th percentile of a piece of work, us, after a warm-up, on one core.
 pub(super) fn time_us(
     repeats: usize,
     mut work: impl FnMut() -> Result<(), CliError>,
 ) -> Result<[f64; 2], CliError> {
+    let _pinned = Pinned::new();
     for _ in 0..repeats / 10 + 1 {
         work()?;
     }

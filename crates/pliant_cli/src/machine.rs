@@ -1,0 +1,46 @@
+//! The machine that is measured on.
+
+/// Keeps this thread on one core as long as it lives; what it starts meanwhile stays there, too. Elsewhere than on Linux, or where that is
+/// refused, nothing changes.
+pub(crate) struct Pinned {
+    #[cfg(target_os = "linux")]
+    before: Option<rustix::thread::CpuSet>,
+}
+
+impl Pinned {
+    pub(crate) fn new() -> Self {
+        #[cfg(target_os = "linux")]
+        {
+            use rustix::thread::{CpuSet, sched_getaffinity, sched_getcpu, sched_setaffinity};
+            let before = sched_getaffinity(None).ok();
+            let mut one = CpuSet::new();
+            one.set(sched_getcpu());
+            let pinned = before.is_some() && sched_setaffinity(None, &one).is_ok();
+            Self { before: before.filter(|_| pinned) }
+        }
+        #[cfg(not(target_os = "linux"))]
+        Self {}
+    }
+}
+
+impl Drop for Pinned {
+    fn drop(&mut self) {
+        #[cfg(target_os = "linux")]
+        if let Some(before) = &self.before {
+            // It was its own a moment ago.
+            let _ = rustix::thread::sched_setaffinity(None, before);
+        }
+    }
+}
+
+/// Runnable programs, mean over a minute; `None` where the system does not say.
+pub(crate) fn load() -> Option<f64> {
+    std::fs::read_to_string("/proc/loadavg").ok()?.split(' ').next()?.parse().ok()
+}
+
+/// The processor's name; empty where the system does not say.
+pub(crate) fn processor() -> String {
+    let told = std::fs::read_to_string("/proc/cpuinfo").unwrap_or_default();
+    let line = told.lines().find_map(|line| line.strip_prefix("model name")?.split_once(':'));
+    line.map_or(String::new(), |(_, name)| name.trim().to_owned())
+}
