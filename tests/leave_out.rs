@@ -1,0 +1,114 @@
+//! What a scene leaves out costs nothing: no system where there is no plugin, no step, state, message or mesh where nobody touches anything.
+#![allow(clippy::unwrap_used, clippy::panic, missing_docs, reason = "a failed test should panic")]
+
+use std::{path::PathBuf, time::Duration};
+
+use bevy::{
+    diagnostic::DiagnosticsStore, ecs::schedule::Schedules, prelude::*, time::TimeUpdateStrategy,
+    transform::TransformPlugin,
+};
+use pliant::{
+    body::{AWAKE_BODIES, PointerGrabPlugin, STEP_TIME},
+    modal::ModalModel,
+    prelude::*,
+};
+
+fn engine() -> App {
+    let mut app = App::new();
+    app.add_plugins((MinimalPlugins, AssetPlugin::default(), TransformPlugin))
+        .insert_resource(TimeUpdateStrategy::ManualDuration(Duration::from_secs_f64(1.0 / 60.0)))
+        .insert_resource(Time::<Fixed>::from_hz(60.0));
+    app
+}
+
+fn ready(app: &mut App) {
+    app.finish();
+    app.cleanup();
+    app.update();
+}
+
+/// Systems in all schedules, after a frame.
+fn systems(mut app: App) -> usize {
+    ready(&mut app);
+    app.world().resource::<Schedules>().iter().map(|(_, schedule)| schedule.systems_len()).sum()
+}
+
+fn with(plugins: impl FnOnce(&mut App)) -> usize {
+    let mut app = engine();
+    plugins(&mut app);
+    systems(app)
+}
+
+/// The plugin alone, by what it adds to the engine; a plugin that is left out adds nothing, whatever is compiled.
+#[test]
+fn each_plugin_brings_its_own_systems_and_no_other() {
+    let none = systems(engine());
+    assert_eq!(none, systems(engine()), "counting is repeatable");
+    let body = with(|app| {
+        app.add_plugins(PliantBodyPlugin::default());
+    }) - none;
+    // It was 19 with its messages and assets; a new one is to be noticed, a few are welcome.
+    assert!((10..=24).contains(&body), "{body} systems of the body plugin");
+    let pointer = with(|app| {
+        app.add_plugins((PliantBodyPlugin::default(), PointerGrabPlugin));
+    });
+    assert!((1..=6).contains(&(pointer - none - body)), "{} systems of the pointer", pointer - none - body);
+    #[cfg(feature = "net")]
+    {
+        use pliant::net::{HostConfig, NetPlugin};
+        let host = |app: &mut App| {
+            app.add_plugins((PliantBodyPlugin::default(), NetPlugin::host(HostConfig::default()).unwrap()));
+        };
+        let net = with(host) - none - body;
+        assert!((1..=12).contains(&net), "{net} systems of the network");
+    }
+    #[cfg(feature = "haptics")]
+    {
+        let felt = with(|app| {
+            app.add_plugins((PliantBodyPlugin::default(), HapticsPlugin::default()));
+        });
+        assert!(
+            (1..=20).contains(&(felt - none - body)),
+            "{} systems of the device layer",
+            felt - none - body
+        );
+    }
+}
+
+/// A body that rests takes no step, writes no state and moves no component for ten seconds; a touch wakes it.
+#[test]
+fn a_body_at_rest_takes_no_step_and_changes_nothing() {
+    let mut app = engine();
+    app.add_plugins(PliantPlugins::default());
+    ready(&mut app);
+    let path = PathBuf::from(env!("CARGO_MANIFEST_DIR")).join("../../assets/pip.modal");
+    let model = ModalAsset::from(ModalModel::read(path).unwrap());
+    let handle = app.world_mut().resource_mut::<Assets<ModalAsset>>().add(model);
+    let body = app.world_mut().spawn(ModalBody::new(handle)).id();
+    let frames = |app: &mut App, count: usize| (0..count).for_each(|_| app.update());
+    frames(&mut app, 120);
+    let steps = |app: &App| {
+        let store = app.world().resource::<DiagnosticsStore>();
+        (store.get(&AWAKE_BODIES).unwrap().value().unwrap(), store.get(&STEP_TIME).unwrap().history_len())
+    };
+    let last = |app: &mut App| {
+        let world = app.world_mut();
+        let mut query =
+            world.query::<(Ref<BodyState>, Ref<ShownState>, Ref<Transform>, Ref<GlobalTransform>)>();
+        let (state, shown, place, seen) = query.get(world, body).unwrap();
+        [state.last_changed(), shown.last_changed(), place.last_changed(), seen.last_changed()]
+            .map(|t| t.get())
+    };
+    let (before, timed) = (last(&mut app), steps(&app).1);
+    frames(&mut app, 600);
+    assert_eq!(last(&mut app), before, "no component of a resting body is written");
+    assert_eq!(steps(&app), (0.0, timed), "no body was awake and no step was timed");
+    app.world_mut().write_message(Strike {
+        body,
+        vertex: 0,
+        impulse: bevy::math::DVec3::new(0.0, 0.01, 0.0),
+    });
+    frames(&mut app, 3);
+    assert_ne!(last(&mut app), before);
+    assert_eq!(steps(&app).0, 1.0);
+}
