@@ -72,13 +72,15 @@ pub(super) fn write(folder: &Path, figure: &Figure) -> Result<(), CliError> {
     FONT.get_or_init(|| {
         register_font("sans-serif", FontStyle::Normal, epaint_default_fonts::UBUNTU_LIGHT).is_ok()
     });
-    let mut csv = format!("series,\"{}\",\"{}\",reference error,99th percentile of x\n", figure.x, figure.y);
+    let timed = figure.series.iter().any(|series| !series.late.is_empty());
+    let late = if timed { ",99th percentile of x" } else { "" };
+    let mut csv = format!("series,\"{}\",\"{}\",reference error{late}\n", figure.x, figure.y);
     let reference = figure.reference_error.map_or(String::new(), |e| format!("{e:.6e}"));
     for series in &figure.series {
         for (index, (x, y)) in series.points.iter().enumerate() {
-            let late = series.late.get(index).map_or(String::new(), |late| format!("{late:.4e}"));
+            let late = series.late.get(index).map_or(String::new(), |late| format!(",{late:.4e}"));
             // Writing to a string cannot fail.
-            let _ = writeln!(csv, "\"{}\",{x:.4e},{y:.3e},{reference},{late}", series.name);
+            let _ = writeln!(csv, "\"{}\",{x:.4e},{y:.3e},{reference}{late}", series.name);
         }
     }
     std::fs::write(folder.join(format!("{}.csv", figure.file)), csv)?;
