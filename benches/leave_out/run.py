@@ -65,6 +65,8 @@ def main():
     for scene, (_, features) in SCENES.items():
         if args.only and scene not in args.only:
             continue
+        if args.programs and not (args.programs / "-".join(features)).is_file():
+            continue
         if args.programs:
             programs[tuple(features)] = args.programs / "-".join(features)
         elif tuple(features) not in programs:
@@ -101,6 +103,9 @@ def main():
         lines.append(f"| {r['scene']}: {r['what']} | {r['features'].replace(' ', ', ')} | {r['crates']} | {r['program_mb']:.1f} | {r['systems']} ({r['engine_systems']}) | "
                      f"{r['rest_frame_ms']:.3f} ({r['rest_frame_ms_p99']:.2f}) | {r['work_frame_ms']:.3f} ({r['work_frame_ms_p99']:.2f}) | "
                      f"{r['rest_processor_ms']:.2f} / {r['work_processor_ms']:.2f} | {r['rest_awake']:.0f} / {r['work_awake']:.0f} |")
+    for scene, (what, features) in SCENES.items():
+        if not any(row["scene"] == scene for row in rows):
+            lines.append(f"| {scene}: {what} | {', '.join(features)} | {crates(features)} | not measured in this run |  |  |  |  |  |")
     lines += ["",
               "*Crates*: packages in the dependency tree with the scene's features, our own among them. *Program*: optimised, stripped, with all of the engine that a windowed game has; the "
               "scene without a picture has the engine without a renderer." + (" The engine and all that is not ours were compiled once, with the features that the whole project asks of them; "

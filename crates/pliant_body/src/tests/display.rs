@@ -124,21 +124,3 @@ fn another_crease_angle_makes_another_mesh() {
     assert_eq!(smooth, state(&app, body).model().surface().positions().len());
     assert!(smooth < sharp);
 }
-
-#[test]
-fn a_half_precision_basis_draws_the_same_shape_to_its_rounding() {
-    let drawn = |half_basis: bool| {
-        let mut app = drawn_app();
-        let body = spawn(&mut app, model::bar(), Driven::Remote);
-        app.world_mut().get_mut::<ModalBody>(body).unwrap().half_basis = half_basis;
-        see(&mut app, body);
-        steps(&mut app, 2);
-        app.world_mut().get_mut::<ShownState>(body).unwrap().snap(&[2.0, 0.5, 0.1, 0.2]).unwrap();
-        steps(&mut app, 1);
-        attribute(&app, body, Mesh::ATTRIBUTE_POSITION)
-    };
-    let (single, half) = (drawn(false), drawn(true));
-    let off = single.iter().zip(&half).map(|(a, b)| a.distance(*b)).fold(0.0, f32::max);
-    // 2^-11 of each mode's largest displacement at most, and the warp's share; the body is some half a metre long.
-    assert!((1e-7..2e-3).contains(&off), "{off} m");
-}
