@@ -66,6 +66,8 @@ guest() {
 }
 now() { date +%s.%N; }
 failed=0
+# Also from within `$(...)`, where a variable would be lost.
+fail() { touch "$work/failed"; }
 bar() { # name value most
     if awk "BEGIN { exit !($2 <= $3) }"; then echo "ok    $1: $2 (at most $3)"; else echo "ABOVE $1: $2 (at most $3)"; failed=1; fi
 }
@@ -103,7 +105,7 @@ wait_for() {
         if grep -q "$2" "$1"; then awk "BEGIN { printf \"%.1f\n\", $(now) - $t0 }"; return 0; fi
         sleep 0.05
     done
-    echo "not within $3 s"; failed=1; return 1
+    echo "not within $3 s"; fail; return 1
 }
 
 faults() {
@@ -138,7 +140,7 @@ wait_for_more() {
         if [ "$(seen "$1" "$2")" -gt "$3" ]; then awk "BEGIN { printf \"%.1f\n\", $(now) - $t0 }"; return 0; fi
         sleep 0.05
     done
-    echo "not within $4"; failed=1; return 1
+    echo "not within $4 s"; fail; return 1
 }
 # Data flows again: a line of figures with datagrams coming.
 wait_for_again() {
@@ -148,7 +150,7 @@ wait_for_again() {
         if [ "${in:-0}" -gt 10 ]; then awk "BEGIN { printf \"%.1f\n\", $(now) - $t0 }"; return 0; fi
         sleep 0.05
     done
-    echo "not within $2 s"; failed=1; return 1
+    echo "not within $2 s"; fail; return 1
 }
 
 case $what in
@@ -156,4 +158,5 @@ case $what in
     faults) faults ;;
     *) drag; faults ;;
 esac
+[ -e "$work/failed" ] && failed=1
 exit $failed

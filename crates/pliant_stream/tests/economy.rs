@@ -49,6 +49,28 @@ fn resting_body_sends_next_to_nothing_and_wakes_right() {
 }
 
 #[test]
+fn who_fetches_a_resting_bodys_model_costs_nobody_else() {
+    let model = bar(500, 0.2);
+    // So slowly that the model is still on its way at the end.
+    let slow = HostConfig { model_rate: 2e4, models_rate: 2e4, ..Default::default() };
+    let (mut pair, mut scene) = start_with(&model, slow);
+    scene.resting = true;
+    let path = PathConfig::symmetric(LinkConfig { delay: 10 * MS, ..Default::default() });
+    pair.join_with(GuestConfig::default(), path.clone(), 1, cached(&model)).unwrap();
+    pair.run_until(2 * S, &mut scene);
+    pair.join_with(GuestConfig::default(), path, 2, |_| {}).unwrap();
+    pair.run_until(3 * S, &mut scene);
+    let before = pair.host.stats(PeerId(1)).unwrap().message_bytes_out;
+    pair.run_until(13 * S, &mut scene);
+    let fetched = pair.host.stats(PeerId(2)).unwrap().message_bytes_out;
+    assert!(fetched > 100_000 && !pair.guests[1].session.body(BODY).unwrap().is_ready(), "{fetched} bytes");
+    let sent = pair.host.stats(PeerId(1)).unwrap().message_bytes_out - before;
+    // A state of 500 modes is 12 kB; a resting body is recalled once a second.
+    assert!(sent < 11 * 13_000, "{sent} bytes in 10 s of rest");
+    assert!(sent > 0);
+}
+
+#[test]
 fn weak_guests_take_fewer_modes_and_small_paths_fewer_still() {
     let model = bar(500, 0.05);
     let (mut pair, mut scene) = start(&model);

@@ -46,6 +46,8 @@ pub struct JoinConfig {
     /// Show and feel the own hands at once: a body that this guest holds is stepped on to where the hands are now, instead of shown as the
     /// host had it half a round trip ago. Default: true.
     pub own_hand_first: bool,
+    /// Most force that one of the own hands is told of, N, whatever the host says; the direction stays. Default: 1000.
+    pub most_force: f64,
     /// Ask for no more of each body than the cameras see. Default `None`: everything, unless an [`Interest`] says otherwise.
     pub interest: Option<CameraInterest>,
     /// When the host cannot be heard any more, or is not there yet, joining is tried again for so long. Zero: never. Default: 60 s.
@@ -64,6 +66,7 @@ impl Default for JoinConfig {
             recovery: RecoveryConfig::default(),
             modes: None,
             own_hand_first: true,
+            most_force: 1000.0,
             interest: None,
             rejoin: Duration::from_secs(60),
             models: Vec::new(),

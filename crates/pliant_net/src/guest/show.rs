@@ -30,6 +30,8 @@ pub(crate) fn show(
 ) {
     let Some(mut guest) = guest else { return };
     let guest = &mut *guest;
+    // Not a number and below zero are no bound: no force then.
+    let most_force = guest.config.most_force.max(0.0);
     let now = guest.now();
     let Some(session) = guest.session.as_mut() else { return };
     if let Some(most) = guest.line.max_datagram_size() {
@@ -79,7 +81,7 @@ pub(crate) fn show(
                 };
                 let body_point = sent.point.as_ref()?.at(shown.q(), state.warps());
                 Some(GrabForce {
-                    force: place.force_to_world(reaction),
+                    force: place.force_to_world(reaction).clamp_length_max(most_force),
                     point: place.body_point_to_world(pose, body_point),
                 })
             });

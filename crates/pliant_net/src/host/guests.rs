@@ -85,6 +85,8 @@ pub(crate) fn receive(world: &mut World) {
                     host.guests.remove(&peer);
                 }
             }
+            // At once: the session keeps so many events and drops the oldest, and one guest's flood must not cost another its goodbye.
+            host.take_events(world);
         }
         for peer in host.endpoint.peers() {
             if let Some(most) = host.endpoint.max_datagram_size(peer) {

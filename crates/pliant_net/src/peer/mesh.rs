@@ -1,5 +1,6 @@
 //! Who is connected with whom, and the session's traffic.
 
+use std::collections::BTreeSet;
 use std::time::Duration;
 
 use bevy::prelude::*;
@@ -12,6 +13,9 @@ use super::{NetPeer, PeerState};
 use crate::seen::{SessionClosed, SessionJoined};
 use crate::transport::{CloseReason, Event, Fingerprint, Invite, Role};
 use crate::user::{User, UserJoined, UserLeft, UserLink};
+
+/// Keys whose numbers are kept.
+const MOST_REMEMBERED: usize = 4096;
 
 /// Somebody that this peer is connected with.
 #[derive(Debug)]
@@ -49,6 +53,8 @@ pub(crate) fn receive(world: &mut World) {
         }
         for (opened, event) in came {
             net.take(world, opened, event);
+            // At once: the session keeps so many events only, and one peer's flood must not cost another its goodbye.
+            net.take_events(world);
         }
         net.take_events(world);
         net.look_for_the_missed();
@@ -90,11 +96,15 @@ impl NetPeer {
     fn take(&mut self, world: &mut World, opened: Option<PeerId>, event: Event) {
         let now = self.now();
         match event {
-            Event::Connected { peer, fingerprint, address, .. } => {
+            Event::Connected { peer, fingerprint, address, role } => {
                 let peer = opened.unwrap_or(peer);
                 let (number, invite) = self.introduced.remove(&peer).unzip();
                 let address = address.ip();
                 self.others.insert(peer, Other { key: fingerprint, address, number, invite, waits: None });
+                if role == Role::Watch && opened.is_none() {
+                    // Every peer steps the bodies with its own hands: there is no place for one that may not hold.
+                    return self.hang_up(peer, "among equals everybody holds");
+                }
                 // The first that we have come to is asked; the others are told.
                 if let (Some(_), PeerState::In { user }) = (opened, &self.state) {
                     let (number, scene, invite) = (*user, self.scene.clone(), self.listening.invite());
@@ -156,7 +166,8 @@ impl NetPeer {
                 } else if let Some(other) = self.others.get_mut(&peer) {
                     other.number = Some(number);
                     other.invite = Some(other.seen_from_here(invite));
-                    self.numbers.insert(other.key, number);
+                    let key = other.key;
+                    self.remember(key, number);
                     self.talk_to(now, peer);
                 }
             }
@@ -166,7 +177,8 @@ impl NetPeer {
                 }
                 if let Some(first) = self.others.get_mut(&peer) {
                     (first.number, first.invite) = (Some(from), self.config.join.clone());
-                    self.numbers.insert(first.key, from);
+                    let key = first.key;
+                    self.remember(key, from);
                 }
                 self.talk_to(now, peer);
                 for (number, invite) in others {
@@ -180,6 +192,16 @@ impl NetPeer {
             }
             _ => self.hang_up(peer, "a message that is none"),
         }
+    }
+
+    /// Whose number this is, for when it comes back; of those who are gone so many are remembered.
+    pub(super) fn remember(&mut self, key: Fingerprint, number: UserId) {
+        if self.numbers.len() >= MOST_REMEMBERED && !self.numbers.contains_key(&key) {
+            let here: BTreeSet<Fingerprint> = self.others.values().map(|other| other.key).collect();
+            let gone = self.numbers.keys().find(|key| !here.contains(key)).copied();
+            gone.map(|key| self.numbers.remove(&key));
+        }
+        self.numbers.insert(key, number);
     }
 
     /// Gives a newcomer its number and tells it of all the others.
@@ -197,13 +219,16 @@ impl NetPeer {
             return self.hang_up(peer, "no room");
         }
         let Some(key) = self.others.get(&peer).map(|other| other.key) else { return };
-        let present = self.others.values().filter_map(|other| other.number);
-        let highest = present.clone().chain(self.numbers.values().copied()).map(|user| user.0).max();
-        let before = self.numbers.get(&key).copied().filter(|before| !present.clone().any(|p| p == *before));
-        let Some(number) = before.or_else(|| highest.unwrap_or(0).checked_add(1).map(UserId)) else {
+        let present: BTreeSet<UserId> = self.others.values().filter_map(|other| other.number).collect();
+        let before = self.numbers.get(&key).copied().filter(|before| !present.contains(before));
+        let PeerState::In { user: own } = self.state else { return };
+        let taken: BTreeSet<UserId> =
+            self.numbers.values().copied().chain(present).chain([own, UserId::HOST]).collect();
+        // The first that nobody has or had: one peer's word for its own number, however large, leaves room for all others.
+        let Some(number) = before.or_else(|| (1..=u16::MAX).map(UserId).find(|n| !taken.contains(n))) else {
             return self.hang_up(peer, "no number is left");
         };
-        self.numbers.insert(key, number);
+        self.remember(key, number);
         if let Some(other) = self.others.get_mut(&peer) {
             other.number = Some(number);
             other.invite = Some(other.seen_from_here(invite));

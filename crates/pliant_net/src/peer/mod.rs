@@ -262,7 +262,7 @@ impl NetPeer {
                 return false;
             }
         }
-        self.numbers.insert(self.listening.fingerprint(), user);
+        self.remember(self.listening.fingerprint(), user);
         self.state = PeerState::In { user };
         let you = User::new(user, scene::shortened(&self.config.name), Role::Hold);
         info!("among the peers as {}, user {}", you.name, user.0);

@@ -37,6 +37,9 @@ const REFUSED: u32 = 1;
 /// The other end broke the rules.
 const PROTOCOL: u32 = 2;
 
+/// So long the last words may take to get through.
+const GRACE: Duration = Duration::from_secs(1);
+
 /// What this endpoint is for.
 #[derive(Debug)]
 pub(super) enum Side {
@@ -333,7 +336,8 @@ fn reason_of(error: ConnectionError, refused: Option<CloseReason>) -> CloseReaso
         ConnectionError::ConnectionClosed(close)
             if close.error_code == TransportErrorCode::crypto(NO_APPLICATION_PROTOCOL) =>
         {
-            CloseReason::Failed { words: "the host speaks another version of the protocol".into() }
+            // Trying again does not change that.
+            CloseReason::Refused { words: "it speaks another version of the protocol".into() }
         }
         other => {
             refused.unwrap_or_else(|| CloseReason::Failed { words: clean(other.to_string().as_bytes()) })
@@ -357,9 +361,11 @@ impl Open {
             let messages_out = pin!(write_messages(&connection, &peer, &bucket, &mut send));
             let datagrams_out = pin!(write_datagrams(&connection, &peer, &bucket));
             let figures = pin!(keep_figures(&connection, &peer));
+            let hung_up = pin!(hang_up(&connection, &peer));
             tokio::select! {
                 reason = messages_in => reason,
                 reason = messages_out => reason,
+                reason = hung_up => reason,
                 error = connection.closed() => reason_of(error, None),
                 () = datagrams_in => unreachable_end(),
                 () = datagrams_out => unreachable_end(),
@@ -471,13 +477,21 @@ async fn write_messages(
             Some(Next::Close(code, words)) => {
                 // Already closed streams and connections need no goodbye.
                 let _ = send.finish();
-                let _ = timeout(Duration::from_secs(1), send.stopped()).await;
+                let _ = timeout(GRACE, send.stopped()).await;
                 connection.close(VarInt::from_u32(code), words.as_bytes());
                 return CloseReason::ByUs;
             }
             None => peer.outbox.message_waits.notified().await,
         }
     }
+}
+
+/// A peer that does not read holds up the messages before the goodbye; the connection is closed all the same.
+async fn hang_up(connection: &Connection, peer: &Peer) -> CloseReason {
+    let (code, words) = peer.outbox.closing().await;
+    sleep(GRACE).await;
+    connection.close(VarInt::from_u32(code), words.as_bytes());
+    CloseReason::ByUs
 }
 
 async fn write_message(

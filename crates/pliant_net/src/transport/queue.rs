@@ -118,6 +118,7 @@ pub(super) struct Outbox {
     state: Mutex<OutboxState>,
     pub(super) datagram_waits: Notify,
     pub(super) message_waits: Notify,
+    close_waits: Notify,
 }
 
 #[derive(Debug, Default)]
@@ -127,6 +128,8 @@ struct OutboxState {
     message_bytes: usize,
     /// Code and words to close with, once the messages are out.
     closing: Option<(u32, String)>,
+    /// The same, and it stays.
+    hung_up: Option<(u32, String)>,
 }
 
 /// What the message writer does next.
@@ -155,7 +158,7 @@ impl Outbox {
     pub(super) fn push_message(&self, bytes: Bytes, most: usize) -> bool {
         let mut state = lock(&self.state);
         let cost = bytes.len() + MESSAGE_COST;
-        if state.closing.is_some() || (state.message_bytes > 0 && state.message_bytes + cost > most) {
+        if state.hung_up.is_some() || (state.message_bytes > 0 && state.message_bytes + cost > most) {
             return false;
         }
         state.message_bytes += cost;
@@ -171,8 +174,24 @@ impl Outbox {
     }
 
     pub(super) fn close(&self, code: u32, words: String) {
-        lock(&self.state).closing.get_or_insert((code, words));
+        let mut state = lock(&self.state);
+        if state.hung_up.is_none() {
+            state.hung_up = Some((code, words.clone()));
+            state.closing = Some((code, words));
+        }
+        drop(state);
         self.message_waits.notify_one();
+        self.close_waits.notify_one();
+    }
+
+    /// Waits for [`Outbox::close`].
+    pub(super) async fn closing(&self) -> (u32, String) {
+        loop {
+            if let Some(asked) = lock(&self.state).hung_up.clone() {
+                return asked;
+            }
+            self.close_waits.notified().await;
+        }
     }
 
     pub(super) fn pop_datagram(&self) -> Option<Bytes> {

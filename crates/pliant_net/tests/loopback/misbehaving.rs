@@ -120,6 +120,12 @@ fn a_guest_that_never_reads_costs_a_bounded_queue() {
         "{} read, {dropped} not sent, {unread} not read",
         got.len()
     );
+    // Its messages hold up the goodbye too: it is let go all the same.
+    let start = Instant::now();
+    host.close(peer, "messages are not read");
+    assert_eq!(closed(&host), CloseReason::ByUs);
+    let after = start.elapsed().as_secs_f64();
+    assert!(after < 4.0, "a second for the last words, gone after {after} s");
 }
 
 #[test]

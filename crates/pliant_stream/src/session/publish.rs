@@ -5,6 +5,7 @@ use std::time::Duration;
 
 use super::EndReason;
 use super::host::{HostBody, HostSession, StreamKey, stream_key};
+use super::host_peer::Peer;
 use crate::StreamError;
 use crate::encoder::{Encoded, Encoder};
 use crate::state::{BodyId, MAX_GRABS, PeerId, TICK_LIMIT, TickState, in_range};
@@ -40,12 +41,14 @@ impl HostSession {
         let stays = entry.resting && state.resting;
         entry.last = Some(state.tick);
         entry.resting = state.resting;
-        if stays {
-            if now.saturating_sub(entry.reminded) < REMINDER && self.peers.values().all(|p| p.due.is_empty())
-            {
-                return Ok(());
-            }
+        let hash = entry.hash;
+        // Who wants the state and has the model; who is still fetching it waits, and nobody else pays for that.
+        let is_due = |p: &Peer| p.due.contains(&body) && !p.transfers.iter().any(|t| t.hash == hash);
+        let reminds = stays && now.saturating_sub(entry.reminded) >= REMINDER;
+        if reminds {
             entry.reminded = now;
+        } else if stays && !self.peers.values().any(is_due) {
+            return Ok(());
         }
         // A pause in the ticks, or falling asleep: everybody takes the truth over anew. Waking up goes on from the state
         // that all have, so nothing but a new run begins.
@@ -58,7 +61,7 @@ impl HostSession {
         let mut takers: Vec<(PeerId, StreamKey, bool)> = Vec::new();
         for p in self.peers.values_mut() {
             let Some(key) = stream_key(p, entry) else { continue };
-            let due = p.due.contains(&body) && !p.transfers.iter().any(|t| t.hash == entry.hash);
+            let due = is_due(p);
             if p.flowing.contains(&body) || due {
                 keys.insert(key);
                 takers.push((p.id, key, due));
@@ -115,7 +118,7 @@ impl HostSession {
                     p.queue_resend(due, body, state.tick);
                 }
             }
-            if due || *fresh || (stays && p.flowing.contains(&body)) {
+            if due || *fresh || (reminds && p.flowing.contains(&body)) {
                 p.due.remove(&body);
                 p.flowing.insert(body);
                 self.send_snapshot(peer, body);
