@@ -3,7 +3,7 @@
 //!
 //! `cargo run --release -p pliant_bake --example patch_stiffness -- bar | TETRAHEDRA.msh ANCHOR [tet4|tet10] [MODES]`
 
-use std::time::Instant;
+use std::{error::Error, time::Instant};
 
 use nalgebra::Matrix3;
 use pliant_bake::{BakeConfig, bake};
@@ -35,10 +35,10 @@ fn named(model: &ModalModel) -> [(&'static str, u32); 3] {
     let [low, high] = model.surface().bounds();
     let nearest = |goal: [f32; 3]| {
         let away = |v: u32| (0..3).map(|k| (positions[v as usize][k] - goal[k]).powi(2)).sum::<f32>();
-        (0..positions.len() as u32).min_by(|&a, &b| away(a).total_cmp(&away(b))).unwrap()
+        (0..positions.len() as u32).min_by(|&a, &b| away(a).total_cmp(&away(b))).unwrap_or(0)
     };
     let middle = [0, 1, 2].map(|k| 0.5 * (low[k] + high[k]));
-    let top = positions.iter().copied().max_by(|a, b| a[1].total_cmp(&b[1])).unwrap();
+    let top = positions.iter().copied().max_by(|a, b| a[1].total_cmp(&b[1])).unwrap_or(high);
     [
         ("tip in x", nearest([high[0], middle[1], middle[2]])),
         ("near the root", nearest([low[0] + 0.15 * (high[0] - low[0]), high[1], middle[2]])),
@@ -46,19 +46,18 @@ fn named(model: &ModalModel) -> [(&'static str, u32); 3] {
     ]
 }
 
-fn main() {
+fn main() -> Result<(), Box<dyn Error>> {
     let arguments: Vec<String> = std::env::args().skip(1).collect();
     let argument = |k: usize| arguments.get(k).map(String::as_str);
     let (mesh, anchor): (TetMesh, &str) = match argument(0) {
-        None | Some("bar") => (shapes::bar([40, 6, 6], [1.0, 0.15, 0.15]).unwrap(), "x<0.001"),
-        Some(path) => (io::read_tets(path).unwrap(), argument(1).unwrap()),
+        None | Some("bar") => (shapes::bar([40, 6, 6], [1.0, 0.15, 0.15])?, "x<0.001"),
+        Some(path) => (io::read_tets(path)?, argument(1).ok_or("which nodes are held? such as 'x<0.01'")?),
     };
     let element = if argument(2) == Some("tet4") { Element::Tet4 } else { Element::Tet10 };
-    let modes = argument(3).map_or(60, |text| text.parse().unwrap());
-    let config =
-        BakeConfig { element, modes, anchors: vec![anchor.parse().unwrap()], ..BakeConfig::default() };
+    let modes = argument(3).map_or(Ok(60), str::parse)?;
+    let config = BakeConfig { element, modes, anchors: vec![anchor.parse()?], ..BakeConfig::default() };
     let begun = Instant::now();
-    let made = bake(&mesh, None, &config, &mut |_, _| ()).unwrap();
+    let made = bake(&mesh, None, &config, &mut |_, _| ())?;
     let model = made.model;
     println!(
         "{} tetrahedra, {} surface vertices, {} modes, {} sites, {:?}, {:.2} s",
@@ -72,12 +71,12 @@ fn main() {
     println!("   radius   modes alone: median, 90 %, worst    felt: median, 90 %, 99 %, worst, within 2 %");
     for share in [0.033, 0.047, 0.067, 0.095, 0.135] {
         let every = BakeConfig { sites: Some(usize::MAX), site_radii: vec![share], ..config.clone() };
-        let exact = bake(&mesh, None, &every, &mut |_, _| ()).unwrap().model;
+        let exact = bake(&mesh, None, &every, &mut |_, _| ())?.model;
         let by_name = named(&model);
         let mut told = String::new();
         let (mut alone, mut felt, mut worst) = (Vec::new(), Vec::new(), (0.0, 0, 0));
         for site in &exact.parts().sites {
-            let patch = Patch::around(model.surface(), site.vertex, site.radius).unwrap();
+            let patch = Patch::around(model.surface(), site.vertex, site.radius)?;
             let modal = modal_compliance(&exact, &patch);
             let truth = modal + square(site.flexibility);
             let got = modal_compliance(&model, &patch) + square(model.residual_flexibility(&patch, modes));
@@ -114,4 +113,5 @@ fn main() {
         );
         print!("{told}");
     }
+    Ok(())
 }
