@@ -139,11 +139,12 @@ impl Off {
             out
         };
         let (a, b) = (shape(shown), shape(truth));
+        let places = rest.len().max(1) as f64;
         let far = |a: &[f32; 3], b: &[f32; 3]| f64::from(Vec3::from(*a).distance_squared(Vec3::from(*b)));
         let (mut mean, mut most, mut moved) = (0.0, 0.0f64, 0.0f64);
         for ((a, b), rest) in a.iter().zip(&b).zip(rest) {
             let error = far(a, b);
-            mean += error / rest.len().max(1) as f64;
+            mean += error / places;
             most = most.max(error);
             moved = moved.max(far(b, rest));
         }
