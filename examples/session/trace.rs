@@ -185,11 +185,14 @@ pub fn compare(model: &ModalModel, truth: &Path, shown: &Path, skip: usize) -> R
             force_most = force_most.max(f64::from(real.reaction.length()));
         }
     }
+    // From the first compared tick to the last one that was shown: what is not among them was never shown.
+    let last = shown.keys().filter(|key| key.1 == host).next_back().map_or(first, |key| key.0);
+    let span = last.saturating_sub(first) + 1;
     if streamed.ticks == 0 {
         return Err("no tick is in both files".into());
     }
     println!(
-        "{} ticks: shown error {:.3} % rms, {:.1} % at most, of {:.1} mm; reaction {:.2} % rms, {:.1} % at most, of {force_most:.2} N ({felt} ticks); \
+        "{} of {span} ticks: shown error {:.3} % rms, {:.1} % at most, of {:.1} mm; reaction {:.2} % rms, {:.1} % at most, of {force_most:.2} N ({felt} ticks); \
          own hand first, against what the host made of it later, {:.2} % rms",
         streamed.ticks,
         streamed.rms(),

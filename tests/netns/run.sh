@@ -88,8 +88,10 @@ drag() {
         echo "$g: $result"
         bar "$g: shown error rms, %" "$(echo "$result" | sed 's/.*shown error \([0-9.]*\) % rms.*/\1/')" 2
         bar "$g: reaction rms, %" "$(echo "$result" | sed 's/.*reaction \([0-9.]*\) % rms.*/\1/')" 10
-        ticks=$(echo "$result" | sed 's/^\([0-9]*\) ticks.*/\1/')
-        bar "$g: ticks not shown, %" "$(awk "BEGIN { print 100 * (1 - $ticks / (40 * ($seconds - 6))) }")" 2
+        set -- $(echo "$result" | sed 's/^\([0-9]*\) of \([0-9]*\) ticks.*/\1 \2/')
+        bar "$g: ticks not shown, %" "$(awk "BEGIN { print 100 * (1 - $1 / $2) }")" 0.1
+        # Five seconds to come in and five that are not compared; a guest that was out for long has fewer.
+        bar "$g: ticks missed by coming late, %" "$(awk "BEGIN { print 100 * (1 - $2 / (40 * ($seconds - 10))) }")" 0
     done
     set -- $from $to
     bar "a: line used, kbit/s" "$(awk "BEGIN { print ($3 - $1) * 8e-3 / ($t1 - $t0) }")" 2000
