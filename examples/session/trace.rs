@@ -186,7 +186,7 @@ pub fn compare(model: &ModalModel, truth: &Path, shown: &Path, skip: usize) -> R
         }
     }
     // From the first compared tick to the last one that was shown: what is not among them was never shown.
-    let last = shown.keys().filter(|key| key.1 == host).next_back().map_or(first, |key| key.0);
+    let last = shown.keys().rfind(|key| key.1 == host).map_or(first, |key| key.0);
     let span = last.saturating_sub(first) + 1;
     if streamed.ticks == 0 {
         return Err("no tick is in both files".into());
