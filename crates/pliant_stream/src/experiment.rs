@@ -2,6 +2,8 @@
 //!
 //! All in virtual time: ten minutes of a session take seconds, and the same seed gives the same figures and the same hash.
 
+mod shape_error;
+
 use std::collections::VecDeque;
 use std::sync::Arc;
 use std::time::Duration;
@@ -17,10 +19,10 @@ use crate::session::{GuestConfig, GuestSession, HostConfig, HostEvent, HostSessi
 use crate::state::{BodyId, GrabKey, GrabState, Pose, TickState, UserId};
 use crate::stepper::BodySetup;
 
+pub(crate) use shape_error::ShapeError;
+
 /// Truth kept for comparison, ticks.
 const KEPT: usize = 4096;
-/// Surface vertices at which shapes are compared.
-const SAMPLES: usize = 48;
 /// Shown error above which a body counts as not recovered, share of the largest displacement.
 pub(crate) const RECOVERED: f64 = 0.005;
 
@@ -286,47 +288,6 @@ pub(crate) fn fold(mut hash: u64, bytes: &[u8]) -> u64 {
         hash = (hash ^ u64::from(*b)).wrapping_mul(0x0000_0100_0000_01B3);
     }
     hash
-}
-
-/// Compares shapes at some surface vertices, evenly chosen; unwarped, so that the same difference of coordinates counts
-/// the same in every shape.
-pub(crate) struct ShapeError {
-    rows: Vec<Vec<[f64; 3]>>,
-}
-
-impl ShapeError {
-    pub(crate) fn new(model: &ModalModel) -> Self {
-        let vertices = model.surface().positions().len();
-        let row = |v: usize, mode: usize| -> [f64; 3] {
-            std::array::from_fn(|a| f64::from(model.displacement_row(v as u32, a, mode)))
-        };
-        let modes = model.mode_count();
-        let step = (vertices / SAMPLES).max(1);
-        Self { rows: (0..vertices).step_by(step).map(|v| (0..modes).map(|m| row(v, m)).collect()).collect() }
-    }
-
-    /// How many places there are.
-    pub(crate) fn places(&self) -> f64 {
-        self.rows.len().max(1) as f64
-    }
-
-    /// Squared differences at the places, m^2: sum and largest. Missing coordinates count as 0.
-    pub(crate) fn compare(&self, a: &[f64], b: &[f64]) -> (f64, f64) {
-        let (mut sum, mut largest) = (0.0, 0.0_f64);
-        for rows in &self.rows {
-            let mut u = [0.0; 3];
-            for (k, row) in rows.iter().enumerate() {
-                let d = a.get(k).copied().unwrap_or(0.0) - b.get(k).copied().unwrap_or(0.0);
-                for x in 0..3 {
-                    u[x] += row[x] * d;
-                }
-            }
-            let s = u.iter().map(|x| x * x).sum::<f64>();
-            sum += s;
-            largest = largest.max(s);
-        }
-        (sum, largest)
-    }
 }
 
 struct Held {

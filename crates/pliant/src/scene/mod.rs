@@ -39,8 +39,6 @@ mod plugin;
 #[cfg(feature = "rerun")]
 mod recording;
 mod spawn;
-#[cfg(test)]
-mod tests;
 
 pub use describe::{
     BakeEntry, BodyEntry, By, CopiesEntry, DeviceEntry, GrabEntry, Grip, GuestEntry, IntegratorEntry, Like,

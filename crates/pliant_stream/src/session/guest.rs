@@ -4,34 +4,29 @@ use std::collections::{BTreeMap, BTreeSet, VecDeque};
 use std::sync::Arc;
 use std::time::Duration;
 
-use pliant_modal::{GrabConfig, ModalModel};
+use pliant_modal::ModalModel;
 
 use super::download::Download;
 use super::guest_body::BodyView;
 use super::guest_config::{GuestConfig, GuestEvent};
+use super::guest_hands::OwnGrab;
 use super::host_peer::micros;
 use super::outbox::{RoundTrip, Tally, loss_of};
 use super::{Channel, EndReason, LinkStats, MIN_DATAGRAM, Output};
 use crate::StreamError;
 use crate::clock::ClockEstimate;
 use crate::newmark::Newmark;
-use crate::state::{BodyId, PeerId, UserId, in_range};
+use crate::state::{BodyId, PeerId, UserId};
 use crate::wire::{
-    Clock, Datagram, GuestMessage, HostMessage, MAX_BODIES, MAX_CACHED, MAX_NAME, MAX_RELAXATION,
-    MAX_STIFFNESS, MAX_TARGETS, MAX_TOKEN, PROTOCOL_VERSION, TargetEntry, Targets,
+    Clock, Datagram, GuestMessage, HostMessage, MAX_BODIES, MAX_CACHED, MAX_NAME, MAX_TOKEN, PROTOCOL_VERSION,
 };
 
 /// Clock requests come this far apart once the first eight have been answered.
 const PING_EVERY: Duration = Duration::from_millis(500);
 /// The first clock requests.
 const PING_SOON: Duration = Duration::from_millis(100);
-/// A held target that does not move is said again this often.
-const TARGET_EVERY: Duration = Duration::from_millis(250);
 /// Most events that wait for the application; the oldest are dropped.
 const MAX_EVENTS: usize = 4096;
-/// Each datagram says the last so many targets of a grab.
-const TARGET_REPEATS: usize = 3;
-
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 enum Standing {
     New,
@@ -40,20 +35,11 @@ enum Standing {
     Closed,
 }
 
-#[derive(Debug)]
-struct OwnGrab {
-    body: BodyId,
-    /// The newest last; at most three.
-    targets: VecDeque<TargetEntry>,
-    fresh: bool,
-    said: Duration,
-}
-
 /// A guest of a session: a state machine without sockets or clock; see [`super`].
 #[derive(Debug)]
 pub struct GuestSession {
     pub(super) config: GuestConfig,
-    max_datagram: usize,
+    pub(super) max_datagram: usize,
     standing: Standing,
     newmark: Newmark,
     pub(super) models: BTreeMap<[u8; 32], Arc<ModalModel>>,
@@ -65,9 +51,9 @@ pub struct GuestSession {
     pub(super) bodies: BTreeMap<BodyId, BodyView>,
     stalled: BTreeSet<BodyId>,
     users: BTreeMap<UserId, String>,
-    grabs: BTreeMap<u16, OwnGrab>,
-    next_grab: u16,
-    input: u32,
+    pub(super) grabs: BTreeMap<u16, OwnGrab>,
+    pub(super) next_grab: u16,
+    pub(super) input: u32,
     out: VecDeque<Output>,
     events: VecDeque<GuestEvent>,
     sequence: u16,
@@ -218,100 +204,6 @@ impl GuestSession {
     /// Host clock minus own clock, s.
     pub fn clock_offset(&self) -> Option<f64> {
         self.clock.offset()
-    }
-
-    /// Takes hold of a body, as `hold` says: with the hand's own spring and damper, or as stiffly as the patch allows
-    /// ([`GrabConfig::default`]). The number names the grab to the other calls; the host may answer
-    /// [`GuestEvent::GrabRefused`].
-    ///
-    /// # Errors
-    /// [`StreamError::State`] before the welcome, [`StreamError::UnknownBody`], [`StreamError::NotFinite`],
-    /// [`StreamError::Config`] for a spring or damper out of range, [`StreamError::Full`] beyond 16 grabs.
-    pub fn begin_grab(
-        &mut self,
-        now: Duration,
-        body: BodyId,
-        vertex: u32,
-        radius: f64,
-        target: [f64; 3],
-        hold: GrabConfig,
-    ) -> Result<u16, StreamError> {
-        if self.user().is_none() {
-            let (what, state) = ("begin_grab", "not in");
-            return Err(StreamError::State { what, state, needed: "the host's welcome" });
-        }
-        if !self.bodies.contains_key(&body) {
-            return Err(StreamError::UnknownBody(body));
-        }
-        if !in_range(&target) || !(0.0..=1e9).contains(&radius) {
-            return Err(StreamError::NotFinite { what: "grab" });
-        }
-        let GrabConfig { stiffness, relaxation } = hold;
-        let fail = |what, found: String, expected| Err(StreamError::Config { what, found, expected });
-        if stiffness.is_some_and(|k| !(k > 0.0 && k <= MAX_STIFFNESS)) {
-            return fail("stiffness", format!("{stiffness:?}"), "above 0, at most 1e12 N/m");
-        }
-        if !(0.0..=MAX_RELAXATION).contains(&relaxation) {
-            return fail("relaxation", relaxation.to_string(), "0..=10 s");
-        }
-        let limit = super::host_peer::MAX_GUEST_GRABS;
-        if self.grabs.len() >= limit {
-            return Err(StreamError::Full { what: "grabs", limit });
-        }
-        while self.grabs.contains_key(&self.next_grab) {
-            self.next_grab = self.next_grab.wrapping_add(1);
-        }
-        let grab = self.next_grab;
-        self.next_grab = grab.wrapping_add(1);
-        self.grabs.insert(grab, OwnGrab { body, targets: VecDeque::new(), fresh: false, said: now });
-        if let Some(own) = self.bodies.get_mut(&body).and_then(|b| b.own.as_mut()) {
-            own.begin(grab, vertex, radius, target, hold);
-        }
-        self.message(&GuestMessage::GrabBegin {
-            grab,
-            body: body.0,
-            vertex,
-            radius,
-            target,
-            stiffness,
-            relaxation,
-        });
-        Ok(grab)
-    }
-
-    /// Moves a hand. Sent with the next [`GuestSession::update`], and twice more with the targets after it.
-    ///
-    /// # Errors
-    /// [`StreamError::UnknownGrab`], [`StreamError::NotFinite`] (the old target stays).
-    pub fn set_target(&mut self, grab: u16, target: [f64; 3]) -> Result<(), StreamError> {
-        if !in_range(&target) {
-            return Err(StreamError::NotFinite { what: "target" });
-        }
-        let own = self.grabs.get_mut(&grab).ok_or(StreamError::UnknownGrab(grab))?;
-        if own.targets.len() >= TARGET_REPEATS {
-            own.targets.pop_front();
-        }
-        self.input = self.input.wrapping_add(1);
-        own.targets.push_back(TargetEntry { grab, input: self.input, target });
-        own.fresh = true;
-        let body = own.body;
-        if let Some(own) = self.bodies.get_mut(&body).and_then(|b| b.own.as_mut()) {
-            own.set(grab, target);
-        }
-        Ok(())
-    }
-
-    /// Lets go. Letting go twice is no error.
-    pub fn end_grab(&mut self, grab: u16) {
-        if let Some(own) = self.grabs.remove(&grab) {
-            self.forget_own(own.body, grab);
-            self.message(&GuestMessage::GrabEnd { grab });
-        }
-    }
-
-    /// Our grabs: number and body.
-    pub fn grabs(&self) -> impl Iterator<Item = (u16, BodyId)> {
-        self.grabs.iter().map(|(k, g)| (*k, g.body))
     }
 
     /// Something arrived unreliably. Any bytes will do: what makes no sense is counted and forgotten.
@@ -507,8 +399,7 @@ impl GuestSession {
                 next = view.next_ask().map_or(next, |t| next.min(t));
             }
             for g in self.grabs.values() {
-                let due = if g.fresh { now } else { g.said + TARGET_EVERY };
-                next = if g.targets.is_empty() { next } else { next.min(due) };
+                next = g.due(now).map_or(next, |due| next.min(due));
             }
         }
         Some(next.max(now))
@@ -523,12 +414,6 @@ impl GuestSession {
     /// The next thing that happened.
     pub fn poll_event(&mut self) -> Option<GuestEvent> {
         self.events.pop_front()
-    }
-
-    fn forget_own(&mut self, body: BodyId, grab: u16) {
-        if let Some(own) = self.bodies.get_mut(&body).and_then(|b| b.own.as_mut()) {
-            own.end(grab);
-        }
     }
 
     fn ask(&mut self, now: Duration, body: BodyId) {
@@ -546,28 +431,7 @@ impl GuestSession {
         }
     }
 
-    fn say_targets(&mut self, now: Duration) {
-        let mut entries = Vec::new();
-        let room = ((self.max_datagram.max(MIN_DATAGRAM) - 4) / 18).min(MAX_TARGETS);
-        for g in self.grabs.values_mut() {
-            let again = now.saturating_sub(g.said) >= TARGET_EVERY;
-            if g.targets.is_empty() || !(g.fresh || again) {
-                continue;
-            }
-            let first = if g.fresh { 0 } else { g.targets.len() - 1 };
-            if entries.len() + g.targets.len() - first > room {
-                continue;
-            }
-            entries.extend(g.targets.iter().skip(first));
-            g.fresh = false;
-            g.said = now;
-        }
-        if !entries.is_empty() {
-            self.datagram(&Datagram::Targets(Targets { entries }));
-        }
-    }
-
-    fn datagram(&mut self, datagram: &Datagram) {
+    pub(super) fn datagram(&mut self, datagram: &Datagram) {
         let bytes = datagram.encode(self.sequence);
         self.sequence = self.sequence.wrapping_add(1);
         self.stats.datagrams_out += 1;
@@ -575,7 +439,7 @@ impl GuestSession {
         self.out.push_back(Output { peer: PeerId::HOST, channel: Channel::Datagram, bytes: bytes.into() });
     }
 
-    fn message(&mut self, message: &GuestMessage) {
+    pub(super) fn message(&mut self, message: &GuestMessage) {
         let bytes = message.encode();
         self.stats.message_bytes_out += bytes.len() as u64;
         self.out.push_back(Output { peer: PeerId::HOST, channel: Channel::Message, bytes: bytes.into() });

@@ -7,14 +7,14 @@ use std::time::Duration;
 use pliant_modal::{GrabConfig, ModalModel};
 
 use super::host_config::{HostConfig, HostEvent};
-use super::host_peer::{HeldGrab, MAX_GUEST_GRABS, Peer, Standing, Transfer};
+use super::host_peer::{HeldGrab, MAX_GUEST_GRABS, Peer, Standing};
 use super::outbox::loss_of;
 use super::upload::Upload;
 use super::{EndReason, LinkStats, MIN_DATAGRAM, Output};
 use crate::StreamError;
 use crate::encoder::Encoder;
 use crate::newmark::Newmark;
-use crate::state::{BodyId, GrabKey, MAX_MODES, PeerId, Tick, UserId};
+use crate::state::{BodyId, GrabKey, PeerId, Tick, UserId};
 use crate::stepper::BodySetup;
 use crate::wire::{BodyInfo, Datagram, GuestMessage, HostMessage, PROTOCOL_VERSION, StreamWish};
 
@@ -41,7 +41,7 @@ pub(super) struct HostBody {
 
 impl HostBody {
     /// What a guest is told of it; `None` before the guest has said what it wants.
-    fn info(&self, guest: &Peer) -> Option<BodyInfo> {
+    pub(super) fn info(&self, guest: &Peer) -> Option<BodyInfo> {
         let setup = &self.setup;
         Some(BodyInfo {
             body: self.id.0,
@@ -103,102 +103,6 @@ impl HostSession {
     /// The settings.
     pub fn config(&self) -> &HostConfig {
         &self.config
-    }
-
-    /// Adds a body to the session; guests learn of it at once.
-    ///
-    /// # Errors
-    /// [`StreamError::Full`] beyond 1,024 bodies; [`StreamError::Config`] for a name over 64 bytes or a number in use;
-    /// [`StreamError::Model`] for a relaxation out of range.
-    pub fn add_body(
-        &mut self,
-        body: BodyId,
-        name: &str,
-        model: Arc<ModalModel>,
-        setup: BodySetup,
-    ) -> Result<(), StreamError> {
-        if self.bodies.len() >= crate::wire::MAX_BODIES {
-            return Err(StreamError::Full { what: "bodies", limit: crate::wire::MAX_BODIES });
-        }
-        let fail = |what, found: String, expected| Err(StreamError::Config { what, found, expected });
-        if name.len() > crate::wire::MAX_NAME {
-            return fail("body name", name.to_owned(), "at most 64 bytes");
-        }
-        if self.bodies.contains_key(&body) {
-            return fail("body", body.to_string(), "a number that is not in use");
-        }
-        if model.mode_count() > MAX_MODES {
-            return fail("modes", model.mode_count().to_string(), "at most 4096");
-        }
-        if let Some(Err(e)) = setup.relaxation.map(|r| r.check()) {
-            return Err(StreamError::Model(e.to_string()));
-        }
-        let entry = HostBody {
-            id: body,
-            name: name.to_owned(),
-            bytes: model.to_bytes().into(),
-            hash: model.hash().0,
-            model,
-            setup,
-            last: None,
-            resting: false,
-            reminded: Duration::ZERO,
-            streams: BTreeMap::new(),
-        };
-        self.bodies.insert(body, entry);
-        let joined: Vec<PeerId> = self.peers.values().filter(|p| p.user().is_some()).map(|p| p.id).collect();
-        for peer in joined {
-            self.announce(peer, body);
-        }
-        Ok(())
-    }
-
-    /// From the next tick on the body is stepped as `setup` says: who has it is told, and gets a snapshot. Hands on it stay. Not for many times a
-    /// second: every change begins every guest's stream anew.
-    ///
-    /// # Errors
-    /// [`StreamError::UnknownBody`], [`StreamError::Model`]; the old setup then stays.
-    pub fn set_setup(&mut self, body: BodyId, setup: BodySetup) -> Result<(), StreamError> {
-        if let Some(Err(e)) = setup.relaxation.map(|r| r.check()) {
-            return Err(StreamError::Model(e.to_string()));
-        }
-        let entry = self.bodies.get_mut(&body).ok_or(StreamError::UnknownBody(body))?;
-        if entry.setup == setup {
-            return Ok(());
-        }
-        entry.setup = setup;
-        entry.streams.clear();
-        let entry = &*entry;
-        for p in self.peers.values_mut().filter(|p| p.announced.contains(&body)) {
-            let Some(info) = entry.info(p) else { continue };
-            p.send_message(&HostMessage::BodyAdded(info), &mut self.out);
-            p.due.insert(body);
-        }
-        Ok(())
-    }
-
-    /// Takes a body out of the session. Grabs on it end.
-    pub fn remove_body(&mut self, body: BodyId) {
-        if self.bodies.remove(&body).is_none() {
-            return;
-        }
-        let mut ended = Vec::new();
-        for peer in self.peers.values_mut() {
-            peer.due.remove(&body);
-            peer.flowing.remove(&body);
-            peer.interest.remove(&body);
-            peer.resends.retain(|r| r.1 != body);
-            let Some(user) = peer.user() else { continue };
-            let gone: Vec<u16> = peer.grabs.iter().filter(|(_, g)| g.body == body).map(|(k, _)| *k).collect();
-            for grab in gone {
-                peer.grabs.remove(&grab);
-                ended.push(HostEvent::GrabEnded { key: GrabKey { user, grab }, body });
-            }
-            if peer.announced.remove(&body) {
-                peer.send_message(&HostMessage::BodyRemoved { body: body.0 }, &mut self.out);
-            }
-        }
-        ended.into_iter().for_each(|e| self.event(e));
     }
 
     /// A connection opened; its datagrams carry at most so many bytes.
@@ -493,7 +397,7 @@ impl HostSession {
         self.encoded
     }
 
-    fn event(&mut self, event: HostEvent) {
+    pub(super) fn event(&mut self, event: HostEvent) {
         if self.events.len() >= MAX_EVENTS {
             self.events.pop_front();
             self.dropped_events += 1;
@@ -537,17 +441,6 @@ impl HostSession {
         for body in bodies {
             self.announce(peer, body);
         }
-    }
-
-    fn announce(&mut self, peer: PeerId, body: BodyId) {
-        let (Some(p), Some(b)) = (self.peers.get_mut(&peer), self.bodies.get(&body)) else { return };
-        let Some(info) = b.info(p) else { return };
-        p.send_message(&HostMessage::BodyAdded(info), &mut self.out);
-        if !p.cached.contains(&b.hash) && !p.transfers.iter().any(|t| t.hash == b.hash) {
-            p.transfers.push_back(Transfer { hash: b.hash, bytes: b.bytes.clone(), offset: 0 });
-        }
-        p.announced.insert(body);
-        p.due.insert(body);
     }
 
     pub(super) fn send_snapshot(&mut self, peer: PeerId, body: BodyId) {

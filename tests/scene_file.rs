@@ -1,12 +1,13 @@
 //! What a person is told about a scene that is wrong, and what a right one becomes.
+#![allow(clippy::unwrap_used, clippy::expect_used, clippy::panic, reason = "a failed test should panic")]
 
 use std::time::Duration;
 
 use bevy::{prelude::*, time::TimeUpdateStrategy};
 
-use super::*;
-use crate::body::{BodyState, Grab, GrabForce, ModalBody};
-use crate::prelude::PliantPlugins;
+use pliant::body::{BodyState, Grab, GrabForce, ModalBody};
+use pliant::prelude::PliantPlugins;
+use pliant::scene::*;
 
 /// A scene that is right, line by line.
 const GOOD: &str = r#"(
@@ -239,7 +240,7 @@ fn app() -> App {
         AssetPlugin { file_path: ASSETS.into(), ..default() },
         TransformPlugin,
         bevy::diagnostic::DiagnosticsPlugin,
-        PliantPlugins::default().build().disable::<crate::body::PointerGrabPlugin>(),
+        PliantPlugins::default().build().disable::<pliant::body::PointerGrabPlugin>(),
     ))
     .insert_resource(TimeUpdateStrategy::ManualDuration(Duration::from_secs_f64(1.0 / 64.0)));
     #[cfg(feature = "render")]
@@ -428,12 +429,12 @@ fn a_guest_in_the_same_process_pulls_the_host_s_body_and_sees_it() {
     let mut pulled = 0.0_f64;
     run_until(&mut app, "the guest's hand and its view", |world| {
         let forces: Vec<f64> = world
-            .query_filtered::<&GrabForce, With<crate::net::HandOf>>()
+            .query_filtered::<&GrabForce, With<pliant::net::HandOf>>()
             .iter(world)
             .map(|felt| felt.force.length())
             .collect();
         pulled = forces.into_iter().fold(pulled, f64::max);
-        let mut views = world.query::<(&Name, &Transform, &crate::body::ShownState)>();
+        let mut views = world.query::<(&Name, &Transform, &pliant::body::ShownState)>();
         let moved = views.iter(world).any(|(name, place, shown)| {
             name.as_str() == "pip (guest)"
                 && place.translation.x == 1.0
@@ -446,7 +447,7 @@ fn a_guest_in_the_same_process_pulls_the_host_s_body_and_sees_it() {
 #[cfg(feature = "haptics")]
 #[test]
 fn a_simulated_device_takes_hold_and_is_gone_with_its_scene() {
-    use crate::haptics::{HapticDevices, ToolGrabs};
+    use pliant::haptics::{HapticDevices, ToolGrabs};
     let device = "device: Virtual(on: (body: \"pip\", patch: Toward((1, 0.5, 0))), from: 0.3,\
                   motion: Path(points: [(at: 0.5, to: (0.04, 0, 0))]))";
     let text = GOOD.replacen("title: \"one\"", device, 1);

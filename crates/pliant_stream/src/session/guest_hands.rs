@@ -1,0 +1,157 @@
+//! A guest's own hands: what they hold, and how their targets are said.
+
+use std::collections::VecDeque;
+use std::time::Duration;
+
+use pliant_modal::GrabConfig;
+
+use super::MIN_DATAGRAM;
+use super::guest::GuestSession;
+use crate::StreamError;
+use crate::state::{BodyId, in_range};
+use crate::wire::{Datagram, GuestMessage, MAX_RELAXATION, MAX_STIFFNESS, MAX_TARGETS, TargetEntry, Targets};
+
+/// A held target that does not move is said again this often.
+const TARGET_EVERY: Duration = Duration::from_millis(250);
+/// Each datagram says the last so many targets of a grab.
+const TARGET_REPEATS: usize = 3;
+
+#[derive(Debug)]
+pub(super) struct OwnGrab {
+    pub(super) body: BodyId,
+    /// The newest last; at most three.
+    targets: VecDeque<TargetEntry>,
+    fresh: bool,
+    said: Duration,
+}
+
+impl OwnGrab {
+    /// When its target is to be said next, if it has one.
+    pub(super) fn due(&self, now: Duration) -> Option<Duration> {
+        let due = if self.fresh { now } else { self.said + TARGET_EVERY };
+        (!self.targets.is_empty()).then_some(due)
+    }
+}
+
+impl GuestSession {
+    /// Takes hold of a body, as `hold` says: with the hand's own spring and damper, or as stiffly as the patch allows
+    /// ([`GrabConfig::default`]). The number names the grab to the other calls; the host may answer
+    /// [`GuestEvent::GrabRefused`].
+    ///
+    /// # Errors
+    /// [`StreamError::State`] before the welcome, [`StreamError::UnknownBody`], [`StreamError::NotFinite`],
+    /// [`StreamError::Config`] for a spring or damper out of range, [`StreamError::Full`] beyond 16 grabs.
+    pub fn begin_grab(
+        &mut self,
+        now: Duration,
+        body: BodyId,
+        vertex: u32,
+        radius: f64,
+        target: [f64; 3],
+        hold: GrabConfig,
+    ) -> Result<u16, StreamError> {
+        if self.user().is_none() {
+            let (what, state) = ("begin_grab", "not in");
+            return Err(StreamError::State { what, state, needed: "the host's welcome" });
+        }
+        if !self.bodies.contains_key(&body) {
+            return Err(StreamError::UnknownBody(body));
+        }
+        if !in_range(&target) || !(0.0..=1e9).contains(&radius) {
+            return Err(StreamError::NotFinite { what: "grab" });
+        }
+        let GrabConfig { stiffness, relaxation } = hold;
+        let fail = |what, found: String, expected| Err(StreamError::Config { what, found, expected });
+        if stiffness.is_some_and(|k| !(k > 0.0 && k <= MAX_STIFFNESS)) {
+            return fail("stiffness", format!("{stiffness:?}"), "above 0, at most 1e12 N/m");
+        }
+        if !(0.0..=MAX_RELAXATION).contains(&relaxation) {
+            return fail("relaxation", relaxation.to_string(), "0..=10 s");
+        }
+        let limit = super::host_peer::MAX_GUEST_GRABS;
+        if self.grabs.len() >= limit {
+            return Err(StreamError::Full { what: "grabs", limit });
+        }
+        while self.grabs.contains_key(&self.next_grab) {
+            self.next_grab = self.next_grab.wrapping_add(1);
+        }
+        let grab = self.next_grab;
+        self.next_grab = grab.wrapping_add(1);
+        self.grabs.insert(grab, OwnGrab { body, targets: VecDeque::new(), fresh: false, said: now });
+        if let Some(own) = self.bodies.get_mut(&body).and_then(|b| b.own.as_mut()) {
+            own.begin(grab, vertex, radius, target, hold);
+        }
+        self.message(&GuestMessage::GrabBegin {
+            grab,
+            body: body.0,
+            vertex,
+            radius,
+            target,
+            stiffness,
+            relaxation,
+        });
+        Ok(grab)
+    }
+
+    /// Moves a hand. Sent with the next [`GuestSession::update`], and twice more with the targets after it.
+    ///
+    /// # Errors
+    /// [`StreamError::UnknownGrab`], [`StreamError::NotFinite`] (the old target stays).
+    pub fn set_target(&mut self, grab: u16, target: [f64; 3]) -> Result<(), StreamError> {
+        if !in_range(&target) {
+            return Err(StreamError::NotFinite { what: "target" });
+        }
+        let own = self.grabs.get_mut(&grab).ok_or(StreamError::UnknownGrab(grab))?;
+        if own.targets.len() >= TARGET_REPEATS {
+            own.targets.pop_front();
+        }
+        self.input = self.input.wrapping_add(1);
+        own.targets.push_back(TargetEntry { grab, input: self.input, target });
+        own.fresh = true;
+        let body = own.body;
+        if let Some(own) = self.bodies.get_mut(&body).and_then(|b| b.own.as_mut()) {
+            own.set(grab, target);
+        }
+        Ok(())
+    }
+
+    /// Lets go. Letting go twice is no error.
+    pub fn end_grab(&mut self, grab: u16) {
+        if let Some(own) = self.grabs.remove(&grab) {
+            self.forget_own(own.body, grab);
+            self.message(&GuestMessage::GrabEnd { grab });
+        }
+    }
+
+    /// Our grabs: number and body.
+    pub fn grabs(&self) -> impl Iterator<Item = (u16, BodyId)> {
+        self.grabs.iter().map(|(k, g)| (*k, g.body))
+    }
+
+    pub(super) fn forget_own(&mut self, body: BodyId, grab: u16) {
+        if let Some(own) = self.bodies.get_mut(&body).and_then(|b| b.own.as_mut()) {
+            own.end(grab);
+        }
+    }
+
+    pub(super) fn say_targets(&mut self, now: Duration) {
+        let mut entries = Vec::new();
+        let room = ((self.max_datagram.max(MIN_DATAGRAM) - 4) / 18).min(MAX_TARGETS);
+        for g in self.grabs.values_mut() {
+            let again = now.saturating_sub(g.said) >= TARGET_EVERY;
+            if g.targets.is_empty() || !(g.fresh || again) {
+                continue;
+            }
+            let first = if g.fresh { 0 } else { g.targets.len() - 1 };
+            if entries.len() + g.targets.len() - first > room {
+                continue;
+            }
+            entries.extend(g.targets.iter().skip(first));
+            g.fresh = false;
+            g.said = now;
+        }
+        if !entries.is_empty() {
+            self.datagram(&Datagram::Targets(Targets { entries }));
+        }
+    }
+}

@@ -1,0 +1,124 @@
+//! The bodies of a session: they come, change and go, and every guest is told.
+
+use std::collections::BTreeMap;
+use std::sync::Arc;
+use std::time::Duration;
+
+use pliant_modal::ModalModel;
+
+use super::host::{HostBody, HostSession};
+use super::host_config::HostEvent;
+use super::host_peer::Transfer;
+use crate::StreamError;
+use crate::state::{BodyId, GrabKey, MAX_MODES, PeerId};
+use crate::stepper::BodySetup;
+use crate::wire::HostMessage;
+
+impl HostSession {
+    /// Adds a body to the session; guests learn of it at once.
+    ///
+    /// # Errors
+    /// [`StreamError::Full`] beyond 1,024 bodies; [`StreamError::Config`] for a name over 64 bytes or a number in use;
+    /// [`StreamError::Model`] for a relaxation out of range.
+    pub fn add_body(
+        &mut self,
+        body: BodyId,
+        name: &str,
+        model: Arc<ModalModel>,
+        setup: BodySetup,
+    ) -> Result<(), StreamError> {
+        if self.bodies.len() >= crate::wire::MAX_BODIES {
+            return Err(StreamError::Full { what: "bodies", limit: crate::wire::MAX_BODIES });
+        }
+        let fail = |what, found: String, expected| Err(StreamError::Config { what, found, expected });
+        if name.len() > crate::wire::MAX_NAME {
+            return fail("body name", name.to_owned(), "at most 64 bytes");
+        }
+        if self.bodies.contains_key(&body) {
+            return fail("body", body.to_string(), "a number that is not in use");
+        }
+        if model.mode_count() > MAX_MODES {
+            return fail("modes", model.mode_count().to_string(), "at most 4096");
+        }
+        if let Some(Err(e)) = setup.relaxation.map(|r| r.check()) {
+            return Err(StreamError::Model(e.to_string()));
+        }
+        let entry = HostBody {
+            id: body,
+            name: name.to_owned(),
+            bytes: model.to_bytes().into(),
+            hash: model.hash().0,
+            model,
+            setup,
+            last: None,
+            resting: false,
+            reminded: Duration::ZERO,
+            streams: BTreeMap::new(),
+        };
+        self.bodies.insert(body, entry);
+        let joined: Vec<PeerId> = self.peers.values().filter(|p| p.user().is_some()).map(|p| p.id).collect();
+        for peer in joined {
+            self.announce(peer, body);
+        }
+        Ok(())
+    }
+
+    /// From the next tick on the body is stepped as `setup` says: who has it is told, and gets a snapshot. Hands on it stay. Not for many times a
+    /// second: every change begins every guest's stream anew.
+    ///
+    /// # Errors
+    /// [`StreamError::UnknownBody`], [`StreamError::Model`]; the old setup then stays.
+    pub fn set_setup(&mut self, body: BodyId, setup: BodySetup) -> Result<(), StreamError> {
+        if let Some(Err(e)) = setup.relaxation.map(|r| r.check()) {
+            return Err(StreamError::Model(e.to_string()));
+        }
+        let entry = self.bodies.get_mut(&body).ok_or(StreamError::UnknownBody(body))?;
+        if entry.setup == setup {
+            return Ok(());
+        }
+        entry.setup = setup;
+        entry.streams.clear();
+        let entry = &*entry;
+        for p in self.peers.values_mut().filter(|p| p.announced.contains(&body)) {
+            let Some(info) = entry.info(p) else { continue };
+            p.send_message(&HostMessage::BodyAdded(info), &mut self.out);
+            p.due.insert(body);
+        }
+        Ok(())
+    }
+
+    /// Takes a body out of the session. Grabs on it end.
+    pub fn remove_body(&mut self, body: BodyId) {
+        if self.bodies.remove(&body).is_none() {
+            return;
+        }
+        let mut ended = Vec::new();
+        for peer in self.peers.values_mut() {
+            peer.due.remove(&body);
+            peer.flowing.remove(&body);
+            peer.interest.remove(&body);
+            peer.resends.retain(|r| r.1 != body);
+            let Some(user) = peer.user() else { continue };
+            let gone: Vec<u16> = peer.grabs.iter().filter(|(_, g)| g.body == body).map(|(k, _)| *k).collect();
+            for grab in gone {
+                peer.grabs.remove(&grab);
+                ended.push(HostEvent::GrabEnded { key: GrabKey { user, grab }, body });
+            }
+            if peer.announced.remove(&body) {
+                peer.send_message(&HostMessage::BodyRemoved { body: body.0 }, &mut self.out);
+            }
+        }
+        ended.into_iter().for_each(|e| self.event(e));
+    }
+
+    pub(super) fn announce(&mut self, peer: PeerId, body: BodyId) {
+        let (Some(p), Some(b)) = (self.peers.get_mut(&peer), self.bodies.get(&body)) else { return };
+        let Some(info) = b.info(p) else { return };
+        p.send_message(&HostMessage::BodyAdded(info), &mut self.out);
+        if !p.cached.contains(&b.hash) && !p.transfers.iter().any(|t| t.hash == b.hash) {
+            p.transfers.push_back(Transfer { hash: b.hash, bytes: b.bytes.clone(), offset: 0 });
+        }
+        p.announced.insert(body);
+        p.due.insert(body);
+    }
+}
