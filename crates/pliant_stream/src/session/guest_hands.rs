@@ -36,7 +36,7 @@ impl OwnGrab {
 impl GuestSession {
     /// Takes hold of a body, as `hold` says: with the hand's own spring and damper, or as stiffly as the patch allows
     /// ([`GrabConfig::default`]). The number names the grab to the other calls; the host may answer
-    /// [`GuestEvent::GrabRefused`].
+    /// [`GuestEvent::GrabRefused`](crate::GuestEvent::GrabRefused).
     ///
     /// # Errors
     /// [`StreamError::State`] before the welcome, [`StreamError::UnknownBody`], [`StreamError::NotFinite`],
