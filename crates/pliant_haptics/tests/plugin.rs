@@ -153,6 +153,35 @@ fn pause_fades_and_stop_is_latched() {
 }
 
 #[test]
+fn a_stop_holds_for_devices_that_come_later() {
+    let mut s = scene(false);
+    let devices = |s: &mut Scene| -> Vec<(LoopState, DVec3)> {
+        let devices = s.app.world().resource::<HapticDevices>();
+        devices.iter().map(|(_, d)| (d.report.state, d.report.tick.wrench.force.into())).collect()
+    };
+    assert!(!s.app.world().resource::<HapticDevices>().is_stopped());
+    s.app.world().resource::<HapticDevices>().estop();
+    let tip = *s.app.world().get::<Transform>(s.tool).unwrap();
+    let device = VirtualDevice::new(VirtualConfig::touch(), Hand::FIRM).unwrap();
+    let hand = device.handle();
+    let later = s.app.world_mut().resource_mut::<HapticDevices>().add(device, LoopConfig::default()).unwrap();
+    s.app.world_mut().spawn((HapticTool::new(later), ToolGrip::default(), tip));
+    run(&mut s.app, 5);
+    hand.set_buttons(1);
+    until(&mut s, "the later device holds the block", |s| grabs(&mut s.app).len() == 1);
+    hand.set_target([0.02, 0.0, 0.0]);
+    for _ in 0..30 {
+        run(&mut s.app, 1);
+        for (state, force) in devices(&mut s) {
+            assert_eq!((state, force), (LoopState::Stopped, DVec3::ZERO), "stopped, old and new");
+        }
+    }
+    s.app.world_mut().resource_mut::<HapticDevices>().reset_stop();
+    assert!(!s.app.world().resource::<HapticDevices>().is_stopped());
+    until(&mut s, "the later device gives its force", |s| devices(s)[1].1.length() > 1.0);
+}
+
+#[test]
 fn a_remote_body_is_felt_through_its_published_force_until_the_network_is_gone() {
     let mut s = scene(false);
     let world = s.app.world_mut();

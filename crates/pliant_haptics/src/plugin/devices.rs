@@ -1,5 +1,7 @@
 //! The devices that are running, and what they say.
 
+use std::sync::atomic::{AtomicBool, Ordering};
+
 use bevy::{platform::cell::SyncCell, prelude::*};
 
 use crate::{
@@ -16,6 +18,8 @@ pub struct DeviceId(u32);
 pub struct HapticDevices {
     entries: Vec<Entry>,
     next: u32,
+    /// The emergency stop, for devices that come later too.
+    stopped: AtomicBool,
 }
 
 /// What is known of a device, as of this frame.
@@ -75,7 +79,8 @@ pub struct HapticNotice {
 }
 
 impl HapticDevices {
-    /// Takes a device into use: its loop starts at once.
+    /// Takes a device into use: its loop starts at once. Under a latched [`estop`](Self::estop) it gives no force until the
+    /// [`reset_stop`](Self::reset_stop).
     ///
     /// # Errors
     /// As [`HapticLoop::start`].
@@ -85,6 +90,10 @@ impl HapticDevices {
         config: LoopConfig,
     ) -> Result<DeviceId, StartError> {
         let mut running = HapticLoop::start(device, config)?;
+        if self.is_stopped() {
+            // It has no word of the simulation yet, and so no force either.
+            running.emergency_stop();
+        }
         let id = DeviceId(self.next);
         self.next += 1;
         let status = DeviceStatus {
@@ -124,17 +133,26 @@ impl HapticDevices {
         self.entries.iter().map(|e| (e.id, &e.status))
     }
 
-    /// Emergency stop: no force on any device from its loop's next period on. Latched until [`reset_stop`](Self::reset_stop).
+    /// Emergency stop: no force on any device from its loop's next period on, nor on any that is added later. Latched until
+    /// [`reset_stop`](Self::reset_stop).
     pub fn estop(&self) {
+        self.stopped.store(true, Ordering::Release);
         for entry in &self.entries {
             entry.stop.press();
         }
     }
 
-    /// Unlatches the emergency stop of all devices; forces come back by their ramps.
+    /// Whether the emergency stop is latched.
+    pub fn is_stopped(&self) -> bool {
+        self.stopped.load(Ordering::Acquire)
+    }
+
+    /// Unlatches the emergency stop of all devices; forces come back by their ramps. It stays latched where a loop was too busy to be told.
     pub fn reset_stop(&mut self) {
+        self.stopped.store(false, Ordering::Release);
         for entry in &mut self.entries {
             if !entry.running.get().reset_stop() {
+                self.stopped.store(true, Ordering::Release);
                 warn!("{}: the emergency stop could not be reset, the loop is busy", entry.status.info.name);
             }
         }
