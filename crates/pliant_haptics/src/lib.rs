@@ -88,7 +88,8 @@ pub use plugin::GamepadSource;
 #[cfg(feature = "plugin")]
 pub use plugin::{
     DeviceId, DeviceStatus, HapticButton, HapticDevices, HapticFault, HapticNotice, HapticSystems,
-    HapticTool, HapticsPlugin, HeldBy, PointerSource, ToolGrabs, ToolGrip, ToolOffset, ToolPose,
+    HapticTool, HapticsPlugin, HeldBy, PointerSource, PointerToolSystems, ToolGrabs, ToolGrip, ToolOffset,
+    ToolPose,
 };
 #[cfg(feature = "rumble")]
 pub use plugin::{GamepadVibration, Rumble, ToolRumble};

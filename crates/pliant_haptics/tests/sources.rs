@@ -19,8 +19,8 @@ use pliant_body::{ModalAsset, ModalBody, PliantBodyPlugin};
 #[cfg(feature = "gamepad")]
 use pliant_haptics::GamepadSource;
 use pliant_haptics::{
-    DeviceId, HapticDevices, HapticTool, HapticsPlugin, LoopConfig, PointerSource, Positioned,
-    PositionedHandle,
+    DeviceId, HapticDevices, HapticTool, HapticsPlugin, LoopConfig, PointerSource, PointerToolSystems,
+    Positioned, PositionedHandle,
 };
 
 #[path = "rig/block.rs"]
@@ -145,6 +145,36 @@ fn the_pointer_moves_the_device_to_where_it_points() {
         s.buttons_become(0);
         s.comes_to_rest_at(want, 1e-4);
     }
+}
+
+#[test]
+fn a_press_that_is_somebody_elses_is_not_the_tools_and_one_that_is_ends() {
+    #[derive(Resource)]
+    struct Panel(bool);
+    let mut s = scene(Transform::IDENTITY, 1.0, PointerSource::new);
+    s.app
+        .insert_resource(Panel(true))
+        .configure_sets(PreUpdate, PointerToolSystems::Press.run_if(|panel: Res<Panel>| !panel.0));
+    let window = s.window();
+    s.point(window, Some(Vec2::ZERO));
+    s.press(window, MouseButton::Left, ButtonState::Pressed);
+    s.run(10);
+    // Held on the way out of the panel it is still the panel's.
+    s.app.world_mut().resource_mut::<Panel>().0 = false;
+    s.run(10);
+    assert_eq!(s.tick().buttons, 0);
+    s.press(window, MouseButton::Right, ButtonState::Pressed);
+    s.buttons_become(0b10);
+    s.app.world_mut().resource_mut::<Panel>().0 = true;
+    s.run(10);
+    assert_eq!(s.tick().buttons, 0b10, "a hand that passes over the panel does not let go");
+    s.press(window, MouseButton::Right, ButtonState::Released);
+    s.buttons_become(0);
+    s.press(window, MouseButton::Left, ButtonState::Released);
+    s.app.world_mut().resource_mut::<Panel>().0 = false;
+    s.run(2);
+    s.press(window, MouseButton::Left, ButtonState::Pressed);
+    s.buttons_become(0b1);
 }
 
 #[test]

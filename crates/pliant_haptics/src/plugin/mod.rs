@@ -43,7 +43,7 @@ pub use rumble::{GamepadVibration, Rumble, ToolRumble};
 pub use show::ForceArrow;
 #[cfg(feature = "gamepad")]
 pub use source::GamepadSource;
-pub use source::PointerSource;
+pub use source::{PointerSource, PointerToolSystems};
 pub use tool::{HapticTool, HeldBy, ToolGrabs, ToolGrip, ToolOffset, ToolPose};
 
 /// What the plugin does in a tick, around [`PliantSystems`].
@@ -78,6 +78,7 @@ impl Default for HapticsPlugin {
 impl Plugin for HapticsPlugin {
     fn build(&self, app: &mut App) {
         app.init_resource::<HapticDevices>()
+            .init_resource::<source::PointerButtons>()
             .register_type::<DeviceId>()
             .register_type::<HapticTool>()
             .register_type::<ToolPose>()
@@ -93,7 +94,15 @@ impl Plugin for HapticsPlugin {
             // Every frame, whether the game is paused or not: buttons, faults and states.
             .add_systems(
                 PreUpdate,
-                (devices::read, tool::place, tool::grip, source::point).chain().after(InputSystems),
+                (
+                    devices::read,
+                    tool::place,
+                    tool::grip,
+                    source::press.in_set(PointerToolSystems::Press),
+                    source::point.in_set(PointerToolSystems::Move),
+                )
+                    .chain()
+                    .after(InputSystems),
             )
             .add_systems(self.schedule, tool::follow.in_set(HapticSystems::Move))
             .add_systems(self.schedule, word::publish.in_set(HapticSystems::Word));

@@ -29,6 +29,39 @@ impl PointerSource {
     }
 }
 
+/// How the pointer moves tools, in `PreUpdate` after the input of the frame. An interface that wants the pointer for itself gates the press and only the
+/// press, so that what is held is always let go:
+///
+/// ```
+/// # use bevy::prelude::*;
+/// # use pliant_haptics::PointerToolSystems;
+/// # #[derive(Resource)] struct PanelWantsPointer(bool);
+/// # let mut app = App::new();
+/// app.configure_sets(PreUpdate, PointerToolSystems::Press.run_if(|panel: Res<PanelWantsPointer>| !panel.0));
+/// ```
+#[derive(SystemSet, Debug, Clone, PartialEq, Eq, Hash)]
+pub enum PointerToolSystems {
+    /// A button that goes down in the scene is the tools' until it comes up.
+    Press,
+    /// The tools follow the pointer, with the buttons that are theirs.
+    Move,
+}
+
+/// The pointer's buttons that went down in the scene and are held still, the left, right and middle one in the lowest bits.
+#[derive(Resource, Default, PartialEq)]
+pub(crate) struct PointerButtons(u32);
+
+const POINTER_BUTTONS: [MouseButton; 3] = [MouseButton::Left, MouseButton::Right, MouseButton::Middle];
+
+fn bits(is: impl Fn(MouseButton) -> bool) -> u32 {
+    POINTER_BUTTONS.into_iter().enumerate().fold(0, |bits, (i, b)| bits | u32::from(is(b)) << i)
+}
+
+pub(crate) fn press(buttons: Option<Res<ButtonInput<MouseButton>>>, mut taken: ResMut<PointerButtons>) {
+    let pressed = bits(|button| buttons.as_ref().is_some_and(|b| b.just_pressed(button)));
+    taken.set_if_neq(PointerButtons(taken.0 | pressed));
+}
+
 /// On a tool: a gamepad moves it. The left stick moves right and away, the right stick up; buttons South, East, West, North and the triggers are 0 to 5.
 #[cfg(feature = "gamepad")]
 #[derive(Component, Debug, Clone)]
@@ -74,6 +107,7 @@ fn ray(
 
 pub(crate) fn point(
     buttons: Option<Res<ButtonInput<MouseButton>>>,
+    mut taken: ResMut<PointerButtons>,
     devices: Res<HapticDevices>,
     cameras: Cameras,
     windows: Query<&Window>,
@@ -81,9 +115,8 @@ pub(crate) fn point(
     tools: Query<(&HapticTool, &PointerSource, &ToolPose, &GlobalTransform, Option<&ToolGrabs>)>,
     bodies: Query<(&BodyState, &ShownState, &GlobalTransform), Without<NoPointerGrab>>,
 ) {
-    let down = |button| buttons.as_ref().is_some_and(|b| b.pressed(button));
-    let pressed = [MouseButton::Left, MouseButton::Right, MouseButton::Middle];
-    let bits = pressed.into_iter().enumerate().fold(0u32, |bits, (i, b)| bits | u32::from(down(b)) << i);
+    let bits = taken.0 & bits(|button| buttons.as_ref().is_some_and(|b| b.pressed(button)));
+    taken.set_if_neq(PointerButtons(bits));
     for (tool, source, pose, place, held) in &tools {
         let Some(status) = devices.get(tool.device) else { continue };
         let tick = &status.report.tick;
