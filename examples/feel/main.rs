@@ -132,7 +132,9 @@ fn run(options: Arguments) -> Result<AppExit, Box<dyn Error>> {
         })
         .add_systems(Startup, spawn)
         .add_systems(FixedUpdate, play.before(HapticSystems::Move))
-        .add_systems(Update, (hold_out, stop_keys, read_out.after(plot::gather)));
+        .add_systems(Update, (hold_out, read_out.after(plot::gather)))
+        // The stop is heard whatever has the keyboard.
+        .add_systems(PreUpdate, stop_keys.after(bevy::input::InputSystems).before(stage::SceneKeys));
     Ok(app.run())
 }
 

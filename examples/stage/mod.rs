@@ -171,10 +171,44 @@ pub struct Setting {
 impl Plugin for Setting {
     fn build(&self, app: &mut App) {
         text::build(app, &self.title, &self.keys, self.look.is_some());
+        #[cfg(feature = "panel")]
+        app.add_systems(
+            PreUpdate,
+            keep_typed_from_scene
+                .run_if(resource_exists::<pliant::panel::Panel>.and_then(pliant::panel::wants_keyboard))
+                .in_set(SceneKeys)
+                .after(bevy::input::InputSystems),
+        );
         if let Some(look) = self.look {
             view::build(app, look, self.floor);
         }
     }
+}
+
+/// In `PreUpdate`: what is typed into the panel is taken off `ButtonInput<KeyCode>`, but for the panel's own key. What must be heard whatever has the
+/// keyboard runs before.
+#[derive(SystemSet, Debug, Clone, PartialEq, Eq, Hash)]
+pub struct SceneKeys;
+
+#[cfg(feature = "panel")]
+fn keep_typed_from_scene(mut keys: ResMut<ButtonInput<KeyCode>>, panel: Res<pliant::panel::Panel>) {
+    let typed: Vec<KeyCode> = keys.get_pressed().copied().filter(|key| *key != panel.key).collect();
+    for key in typed {
+        keys.release(key);
+        keys.clear_just_pressed(key);
+        keys.clear_just_released(key);
+    }
+}
+
+/// Run condition: the pointer is not the panel's.
+#[cfg(feature = "panel")]
+fn scene_has_pointer(panel: Option<Res<pliant::panel::bevy_egui::input::EguiWantsInput>>) -> bool {
+    !pliant::panel::wants_pointer(panel)
+}
+
+#[cfg(not(feature = "panel"))]
+fn scene_has_pointer() -> bool {
+    true
 }
 
 struct StagePlugin(Stage);
@@ -187,7 +221,8 @@ impl Plugin for StagePlugin {
             app.insert_resource(WinitSettings::continuous());
             #[cfg(feature = "panel")]
             app.add_plugins(pliant::panel::PanelPlugin { open: stage.options.panel, ..default() });
-            let keys = [stage.keys.as_slice(), &["Space: pause", "full stop: one step"]].concat();
+            let panel: &[&str] = if cfg!(feature = "panel") { &["F1: panel"] } else { &[] };
+            let keys = [stage.keys.as_slice(), &["Space: pause", "full stop: one step"], panel].concat();
             app.add_plugins(Setting {
                 title: stage.title.into(),
                 keys,

@@ -72,7 +72,7 @@ pub(super) fn build(app: &mut App, options: &Options, real_time: bool, picture_a
         }
         app.add_systems(Startup, |mut time: ResMut<Time<Virtual>>| time.pause());
     } else {
-        app.add_systems(PreUpdate, pause_and_step);
+        app.add_systems(PreUpdate, pause_and_step.after(super::SceneKeys));
     }
     app.add_systems(First, begin.before(bevy::time::TimeSystems)).add_systems(Last, (draw_late, end).chain());
 }

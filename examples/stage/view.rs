@@ -46,7 +46,7 @@ pub(super) fn build(app: &mut App, look: Look, floor: bool) {
         .insert_resource(look)
         .insert_resource(Reach([0.3 * look.distance, 3.5 * look.distance]))
         .add_systems(Startup, (light, set_gizmos))
-        .add_systems(Update, orbit);
+        .add_systems(Update, (orbit.run_if(super::scene_has_pointer), follow_look).chain());
     if floor {
         app.add_systems(Startup, lay_floor);
     }
@@ -112,7 +112,6 @@ fn orbit(
     wheel: Res<AccumulatedMouseScroll>,
     reach: Res<Reach>,
     mut look: ResMut<Look>,
-    mut camera: Single<&mut Transform, With<Orbits>>,
 ) {
     if buttons.pressed(MouseButton::Right) && motion.delta != Vec2::ZERO {
         look.yaw -= motion.delta.x * 0.006;
@@ -122,6 +121,9 @@ fn orbit(
         let nearer = 1.0 - 0.08 * wheel.delta.y.clamp(-3.0, 3.0);
         look.distance = (look.distance * nearer).clamp(reach.0[0], reach.0[1]);
     }
+}
+
+fn follow_look(look: Res<Look>, mut camera: Single<&mut Transform, With<Orbits>>) {
     if look.is_changed() {
         **camera = look.place();
     }

@@ -1,8 +1,11 @@
 //! The bodies of a scene: modes, damping, energy, rest, and the hands on them.
 
-use bevy_egui::egui::{CollapsingHeader, Color32, RichText, Slider, SliderClamping, Ui};
+use bevy_egui::egui::{CollapsingHeader, Color32, RichText, Ui};
 
-use crate::trace::{Trace, colour, plot, short};
+use crate::{
+    knob::knob,
+    trace::{Trace, colour, plot, short},
+};
 
 /// A body as the panel shows it. What a knob changes is changed here; the caller takes it over.
 #[derive(Debug, Clone, Default)]
@@ -71,17 +74,13 @@ pub fn show(ui: &mut Ui, bodies: &mut [BodyView]) {
 
 fn body_knobs(ui: &mut Ui, index: usize, body: &mut BodyView) {
     ui.add_enabled_ui(body.local, |ui| {
-        ui.add(Slider::new(&mut body.modes, 1..=body.all_modes.max(1)).text("modes"))
+        knob(ui, &mut body.modes, 1..=body.all_modes.max(1), |slider| slider.text("modes"))
             .on_hover_text("How many modes are simulated, the slowest first.");
-        ui.add(
-            Slider::new(&mut body.stiffness_scale, 0.1..=10.0)
-                .logarithmic(true)
-                .clamping(SliderClamping::Edits)
-                .text("stiffness")
-                .max_decimals(2),
-        )
+        knob(ui, &mut body.stiffness_scale, 0.1..=10.0, |slider| {
+            slider.logarithmic(true).text("stiffness").max_decimals(2)
+        })
         .on_hover_text("Multiplies Young's modulus: four times as stiff swings twice as fast.");
-        ui.add(Slider::new(&mut body.damping_scale, 0.0..=10.0).text("damping").max_decimals(2))
+        knob(ui, &mut body.damping_scale, 0.0..=10.0, |slider| slider.text("damping").max_decimals(2))
             .on_hover_text("Multiplies the damping that was baked.");
         ui.checkbox(&mut body.warp, "modal warping")
             .on_hover_text("Right for large rotations; off is the plain linear shape.");

@@ -1,8 +1,11 @@
 //! Haptic devices: force, rate, faults, the emergency stop.
 
-use bevy_egui::egui::{Button, Color32, RichText, Slider, Ui, Vec2};
+use bevy_egui::egui::{Button, Color32, RichText, Ui, Vec2};
 
-use crate::trace::{Trace, colour, plot, short};
+use crate::{
+    knob::knob,
+    trace::{Trace, colour, plot, short},
+};
 
 /// The devices as the panel shows them.
 #[derive(Debug, Clone, Default)]
@@ -32,7 +35,7 @@ pub struct DeviceView {
     pub jitter_us: f64,
     /// Energy that the hand got beyond what it gave, J.
     pub energy: f64,
-    /// Multiplies what the tools that it moves give back, 0 to 1; `None` where it moves none. A knob.
+    /// Multiplies what the tools that it moves give back, 0 to 1 on its knob; `None` where it moves none. A knob.
     pub force_scale: Option<f64>,
     /// What is to be done by hand before its positions can be trusted.
     pub calibrate: Option<String>,
@@ -44,24 +47,38 @@ pub struct DeviceView {
     pub recording: bool,
 }
 
-/// Shows the devices.
+/// Shows the stop and the devices.
 pub fn show(ui: &mut Ui, view: &mut DevicesView) {
-    if view.devices.is_empty() {
-        ui.weak("No device.");
-        return;
-    }
-    if view.stopped {
-        ui.colored_label(Color32::from_rgb(255, 120, 100), "Stopped: no device gives force.");
-        if ui.button("Release the stop").clicked() {
-            view.reset = true;
-        }
-    } else {
+    show_stop(ui, view);
+    show_devices(ui, view);
+}
+
+/// The emergency stop alone, for a place where it is always in sight: it can be pressed whatever state the devices are in, and its release stands beside
+/// it while it is latched.
+pub fn show_stop(ui: &mut Ui, view: &mut DevicesView) {
+    ui.horizontal(|ui| {
+        let release = view.stopped.then(|| Button::new("Release the stop").min_size(Vec2::new(0.0, 26.0)));
+        // Beside it there is room for the release's words.
+        let width = ui.available_width() - if release.is_some() { 130.0 } else { 0.0 };
         let stop = Button::new(RichText::new("STOP").strong().color(Color32::WHITE))
             .fill(Color32::from_rgb(190, 40, 30))
-            .min_size(Vec2::new(ui.available_width(), 26.0));
+            .min_size(Vec2::new(width.max(40.0), 26.0));
         if ui.add(stop).on_hover_text("Takes the force off every device at once.").clicked() {
             view.stop = true;
         }
+        if release.is_some_and(|release| ui.add(release).clicked()) {
+            view.reset = true;
+        }
+    });
+    if view.stopped {
+        ui.colored_label(Color32::from_rgb(255, 120, 100), "Stopped: no device gives force.");
+    }
+}
+
+/// The devices without the stop.
+pub fn show_devices(ui: &mut Ui, view: &mut DevicesView) {
+    if view.devices.is_empty() {
+        ui.weak("No device.");
     }
     for (index, device) in view.devices.iter_mut().enumerate() {
         ui.strong(&device.name);
@@ -81,7 +98,7 @@ pub fn show(ui: &mut Ui, view: &mut DevicesView) {
         }
         plot(ui, &format!("pliant device {index}"), "N", [("force", &device.forces, colour(4))]);
         if let Some(scale) = &mut device.force_scale {
-            ui.add(Slider::new(scale, 0.0..=1.0).text("force").max_decimals(2))
+            knob(ui, scale, 0.0..=1.0, |slider| slider.text("force").max_decimals(2))
                 .on_hover_text("Share of the body's force that reaches the hand.");
         }
         ui.checkbox(&mut device.recording, "record samples");

@@ -10,7 +10,8 @@
 //! }
 //! ```
 //!
-//! `F1` opens and closes it; Tab and the arrow keys reach every knob. While it has the pointer, no body is grabbed through it. It shows what other plugins publish, and a section appears
+//! `F1` opens and closes it; Tab and the arrow keys reach every knob. While it has the pointer, no body is grabbed through it, by a tool that the pointer moves neither; what else the pointer and the keys do in a scene asks
+//! [`wants_pointer`] and [`wants_keyboard`]. It shows what other plugins publish, and a section appears
 //! once its plugin is there: nothing of the network, a device or a recording is asked for by this one. Closed, it gathers and draws nothing.
 //!
 //! Each part is a function over [`egui::Ui`] and a plain struct, for a panel of your own: [`bodies::show`], [`time::show`], [`network::show`], [`device::show`],
@@ -26,6 +27,7 @@
 
 pub mod bodies;
 pub mod device;
+mod knob;
 pub mod network;
 mod plugin;
 pub mod recording;
@@ -33,5 +35,5 @@ pub mod time;
 mod trace;
 
 pub use bevy_egui::{self, egui};
-pub use plugin::{Panel, PanelPlugin};
+pub use plugin::{Panel, PanelPlugin, wants_keyboard, wants_pointer};
 pub use trace::{Trace, plot};

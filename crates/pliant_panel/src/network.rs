@@ -1,8 +1,11 @@
 //! Users, the network and its emulator.
 
-use bevy_egui::egui::{Color32, ComboBox, RichText, Slider, Ui};
+use bevy_egui::egui::{Color32, ComboBox, RichText, Ui};
 
-use crate::trace::{Trace, colour, plot, short};
+use crate::{
+    knob::knob,
+    trace::{Trace, colour, plot, short},
+};
 
 /// The session as the panel shows it.
 #[derive(Debug, Clone, Default)]
@@ -113,7 +116,7 @@ pub fn show(ui: &mut Ui, network: &mut NetworkView) {
         network.repaired[1]
     ));
     plot(ui, "pliant round trip", "ms", [("round trip", &network.round_trips, colour(2))]);
-    plot(ui, "pliant rate", "kb/s", [("received", &network.rates, colour(3))]);
+    plot(ui, "pliant rate", "kbit/s", [("received", &network.rates, colour(3))]);
     if let Some(emulator) = &mut network.emulator {
         emulator_knobs(ui, emulator);
     }
@@ -128,8 +131,8 @@ fn emulator_knobs(ui: &mut Ui, emulator: &mut EmulatorView) {
         }
     });
     if *preset > 0 {
-        ui.add(Slider::new(loss, 0.0..=50.0).text("% lost").max_decimals(1));
-        ui.add(Slider::new(round_trip_ms, 0.0..=1000.0).text("ms round trip").max_decimals(0));
-        ui.add(Slider::new(jitter_ms, 0.0..=100.0).text("ms jitter").max_decimals(1));
+        knob(ui, loss, 0.0..=50.0, |slider| slider.text("% lost").max_decimals(1));
+        knob(ui, round_trip_ms, 0.0..=1000.0, |slider| slider.text("ms round trip").max_decimals(0));
+        knob(ui, jitter_ms, 0.0..=100.0, |slider| slider.text("ms jitter").max_decimals(1));
     }
 }

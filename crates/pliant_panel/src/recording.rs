@@ -1,8 +1,8 @@
 //! The recording for the rerun viewer.
 
-use bevy_egui::egui::{Slider, Ui};
+use bevy_egui::egui::Ui;
 
-use crate::trace::short;
+use crate::{knob::knob, trace::short};
 
 /// The recording as the panel shows it.
 #[derive(Debug, Clone, Default)]
@@ -34,12 +34,14 @@ pub fn show(ui: &mut Ui, recording: &mut RecordingView) {
         let sinks = if recording.sinks == 1 { "1 sink".into() } else { format!("{} sinks", recording.sinks) };
         ui.label(format!("{} ticks to {sinks}, {} dropped", recording.ticks, recording.dropped));
     });
-    ui.add(Slider::new(&mut recording.shapes_hz, 0.0..=60.0).text("shapes a second").max_decimals(0))
-        .on_hover_text(format!(
-            "Shapes drawn in the recording, now {} a second.",
-            short(recording.shapes_hz)
-        ));
-    ui.add(Slider::new(&mut recording.modes_hz, 0.0..=20.0).text("bars a second").max_decimals(0))
+    let every = if recording.shapes_hz.is_finite() {
+        format!("now {} a second", short(recording.shapes_hz))
+    } else {
+        "now every one".into()
+    };
+    knob(ui, &mut recording.shapes_hz, 0.0..=60.0, |slider| slider.text("shapes a second").max_decimals(0))
+        .on_hover_text(format!("Shapes drawn in the recording, {every}."));
+    knob(ui, &mut recording.modes_hz, 0.0..=20.0, |slider| slider.text("bars a second").max_decimals(0))
         .on_hover_text("The energies of the modes and the spectrum; zero leaves them out.");
     ui.checkbox(&mut recording.stress, "colour by stress")
         .on_hover_text("Off, surfaces are coloured by displacement.");

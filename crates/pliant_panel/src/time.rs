@@ -1,8 +1,11 @@
 //! Time: pause, single steps, speed.
 
-use bevy_egui::egui::{Slider, Ui};
+use bevy_egui::egui::Ui;
 
-use crate::trace::{Trace, colour, plot, short};
+use crate::{
+    knob::knob,
+    trace::{Trace, colour, plot, short},
+};
 
 /// The clock as the panel shows it.
 #[derive(Debug, Clone, Default)]
@@ -36,7 +39,7 @@ pub fn show(ui: &mut Ui, time: &mut TimeView) {
         }
         ui.label(format!("tick {} \u{b7} {} ms", time.tick, short(time.step * 1e3)));
     });
-    ui.add(Slider::new(&mut time.speed, 0.05..=4.0).logarithmic(true).text("speed").max_decimals(2))
+    knob(ui, &mut time.speed, 0.05..=4.0, |slider| slider.logarithmic(true).text("speed").max_decimals(2))
         .on_hover_text("Simulated seconds a second.");
     plot(
         ui,

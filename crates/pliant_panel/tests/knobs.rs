@@ -1,7 +1,7 @@
 //! Every knob does what it says: pressed and moved by its accessible name, on a bare egui context.
 #![allow(clippy::unwrap_used, missing_docs, reason = "a failed test should panic")]
 
-use bevy_egui::egui::{Key, accesskit::Role};
+use bevy_egui::egui::{self, Key, accesskit::Role};
 use egui_kittest::{
     Harness,
     kittest::{NodeT, Queryable},
@@ -114,11 +114,21 @@ fn the_emergency_stop_is_one_press_and_its_release_another() {
     harness.run();
     assert!(harness.state().devices[0].recording);
     harness.state_mut().stopped = true;
+    harness.state_mut().stop = false;
     harness.run();
-    assert!(harness.query_by_label("STOP").is_none());
     harness.get_by_label("Release the stop").click();
     harness.run();
-    assert!(harness.state().reset);
+    assert!(harness.state().reset && !harness.state().stop);
+    // One device may be stopped, and another come since: the stop can be pressed at any time, with no device there too.
+    harness.get_by_label("STOP").click();
+    harness.run();
+    assert!(std::mem::take(&mut harness.state_mut().stop));
+    harness.state_mut().devices.clear();
+    harness.run();
+    assert!(harness.query_by_label("Release the stop").is_some());
+    harness.get_by_label("STOP").click();
+    harness.run();
+    assert!(harness.state().stop);
 }
 
 #[test]
@@ -233,4 +243,62 @@ fn tab_alone_reaches_every_knob_of_a_body() {
         }
     }
     assert_eq!(reached.len(), 5, "{reached:?}");
+}
+
+/// Shows `view`, passes the focus through all that is in it, and expects it to be what it was.
+fn untouched<S: Clone + std::fmt::Debug>(view: S, show: fn(&mut egui::Ui, &mut S), words: &str) {
+    let before = format!("{view:?}");
+    let mut harness = Harness::builder()
+        .with_size([400.0, 900.0])
+        .build_ui_state(move |ui, view: &mut S| show(ui, view), view);
+    assert_eq!(format!("{:?}", harness.state()), before, "{words}: looked at");
+    for _ in 0..24 {
+        harness.key_press(Key::Tab);
+        harness.run_steps(2);
+        assert_eq!(format!("{:?}", harness.state()), before, "{words}: the focus went through");
+    }
+}
+
+#[test]
+fn what_nobody_touches_stays_as_it_is_whatever_it_is() {
+    for (scale, modes) in [(20.0, 45), (1.0 / 3.0, 0), (0.0, 1), (-1.5, 7), (1e9, 30)] {
+        let body = BodyView { damping_scale: scale, stiffness_scale: scale, modes, ..body() };
+        untouched(vec![body], |ui, bodies| bodies::show(ui, bodies), "body");
+        untouched(TimeView { speed: scale, step: 0.025, ..Default::default() }, time::show, "time");
+        let device = DeviceView { force_scale: Some(scale), ..Default::default() };
+        untouched(DevicesView { devices: vec![device], ..Default::default() }, device::show, "device");
+        let recording = |shapes_hz| RecordingView {
+            on: true,
+            sinks: 1,
+            shapes_hz,
+            modes_hz: scale,
+            ..Default::default()
+        };
+        untouched(recording(scale), recording::show, "recording");
+        untouched(recording(f64::INFINITY), recording::show, "recording of everything");
+        let emulator = EmulatorView {
+            presets: vec!["none".into(), "one".into()],
+            preset: 1,
+            loss: scale,
+            round_trip_ms: scale,
+            jitter_ms: scale,
+        };
+        let network = NetworkView { emulator: Some(emulator), ..Default::default() };
+        untouched(network, network::show, "network");
+    }
+}
+
+#[test]
+fn what_is_typed_is_taken() {
+    let mut harness =
+        Harness::new_ui_state(|ui, bodies: &mut Vec<BodyView>| bodies::show(ui, bodies), vec![body()]);
+    // The field beside the slider has its name too, and comes after it.
+    let field = || "damping";
+    harness.get_by_role_and_label(Role::SpinButton, field()).focus();
+    harness.run();
+    harness.get_by_role_and_label(Role::SpinButton, field()).type_text("2.25");
+    harness.run();
+    harness.key_press(Key::Enter);
+    harness.run();
+    assert_eq!(harness.state()[0].damping_scale, 2.25);
 }

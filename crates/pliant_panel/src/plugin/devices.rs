@@ -30,8 +30,23 @@ pub(super) struct Devices<'w, 's> {
 }
 
 impl Devices<'_, '_> {
+    /// There is a device, or a stop that the next one will obey.
     pub fn are_there(&self) -> bool {
-        self.devices.as_ref().is_some_and(|devices| devices.iter().next().is_some())
+        self.devices.as_ref().is_some_and(|devices| devices.is_stopped() || devices.iter().next().is_some())
+    }
+
+    /// The emergency stop, which is in sight whatever else is rolled up or scrolled away.
+    pub fn show_stop(&mut self, ui: &mut Ui) {
+        let Some(devices) = &mut self.devices else { return };
+        let one_is = devices.iter().any(|(_, status)| status.report.state == LoopState::Stopped);
+        let mut view = DevicesView { stopped: devices.is_stopped() || one_is, ..default() };
+        device::show_stop(ui, &mut view);
+        if view.stop {
+            devices.estop();
+        }
+        if view.reset {
+            devices.reset_stop();
+        }
     }
 
     pub fn show(&mut self, ui: &mut Ui) {
@@ -56,10 +71,7 @@ impl Devices<'_, '_> {
                 LoopState::Running => report.tick.fault.map(|fault| fault.to_string()),
                 LoopState::Calibrating => Some("waits for its calibration: no force".into()),
                 LoopState::Lost => Some("lost; it is looked for".into()),
-                LoopState::Stopped => {
-                    view.stopped = true;
-                    None
-                }
+                LoopState::Stopped => Some("stopped: no force".into()),
                 other => Some(format!("{other:?}")),
             };
             ids.push(id);
@@ -82,7 +94,7 @@ impl Devices<'_, '_> {
                 recording: recording.get(&id).copied().unwrap_or(false),
             });
         }
-        device::show(ui, &mut view);
+        device::show_devices(ui, &mut view);
         for (&id, device) in ids.iter().zip(&view.devices) {
             if device.recording != recording.get(&id).copied().unwrap_or(false)
                 && devices.set_recording(id, device.recording)
@@ -99,12 +111,6 @@ impl Devices<'_, '_> {
             {
                 tool.force_scale = scale;
             }
-        }
-        if view.stop {
-            devices.estop();
-        }
-        if view.reset {
-            devices.reset_stop();
         }
     }
 }

@@ -12,9 +12,7 @@ mod hands;
 mod session;
 
 use bevy::prelude::*;
-use bevy_egui::{
-    EguiContexts, EguiPlugin, EguiPrimaryContextPass, egui, input::egui_wants_any_pointer_input,
-};
+use bevy_egui::{EguiContexts, EguiPlugin, EguiPrimaryContextPass, egui, input::EguiWantsInput};
 use pliant_body::PointerGrabSystems;
 
 /// The panel as a window over the scene. Adds [`EguiPlugin`] where nobody has.
@@ -62,12 +60,31 @@ impl Plugin for PanelPlugin {
             .add_systems(Update, toggle.run_if(resource_exists::<ButtonInput<KeyCode>>))
             .add_systems(EguiPrimaryContextPass, draw.run_if(|panel: Res<Panel>| panel.open))
             // What is pressed in the panel is not pressed in the scene behind it.
-            .configure_sets(PreUpdate, PointerGrabSystems::Press.run_if(not(egui_wants_any_pointer_input)));
+            .configure_sets(PreUpdate, PointerGrabSystems::Press.run_if(not(wants_pointer)));
         #[cfg(feature = "haptics")]
-        app.init_resource::<devices::Histories>();
+        app.init_resource::<devices::Histories>()
+            .configure_sets(PreUpdate, pliant_haptics::PointerToolSystems::Press.run_if(not(wants_pointer)));
         #[cfg(feature = "net")]
         app.init_resource::<session::Histories>().init_resource::<hands::Histories>();
     }
+}
+
+/// Run condition: the pointer is over the panel, or something in it is being dragged. For what the wheel and the buttons do in the scene; bodies and tools
+/// are not grabbed through the panel anyway. `false` where there is no panel.
+///
+/// ```
+/// # use bevy::prelude::*;
+/// # fn zoom() {}
+/// # let mut app = App::new();
+/// app.add_systems(Update, zoom.run_if(not(pliant_panel::wants_pointer)));
+/// ```
+pub fn wants_pointer(wants: Option<Res<EguiWantsInput>>) -> bool {
+    wants.is_some_and(|wants| wants.wants_any_pointer_input())
+}
+
+/// Run condition: something in the panel has the keyboard's focus, as a number that is typed. For the keys of the scene; `false` where there is no panel.
+pub fn wants_keyboard(wants: Option<Res<EguiWantsInput>>) -> bool {
+    wants.is_some_and(|wants| wants.wants_any_keyboard_input())
 }
 
 fn toggle(keys: Res<ButtonInput<KeyCode>>, mut panel: ResMut<Panel>) {
@@ -96,6 +113,10 @@ fn draw(
         .default_pos([screen.right() - 330.0, screen.top() + 12.0])
         .resizable([true, false])
         .show(&context, |ui| {
+            #[cfg(feature = "haptics")]
+            if devices.are_there() {
+                devices.show_stop(ui);
+            }
             // As high as what is in it, and no higher than the screen.
             egui::ScrollArea::vertical().auto_shrink([false, true]).max_height(screen.height() - 90.0).show(
                 ui,
