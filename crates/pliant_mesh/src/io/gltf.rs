@@ -3,8 +3,9 @@
 //! The document is read here and not by the `gltf` crate, whose validation panics on some damaged documents.
 
 use std::{
+    borrow::Cow,
     collections::HashMap,
-    path::{Component, Path},
+    path::{Component, Path, PathBuf},
 };
 
 use nalgebra::{Matrix4, Point3, Quaternion, Translation3, UnitQuaternion, Vector3};
@@ -15,8 +16,11 @@ use crate::{MeshError, Place, Surface};
 
 /// Deeper trees of nodes are refused: they may be rings.
 const DEEPEST: usize = 200;
-/// More placed nodes than this are refused: nodes may share children, and their number grow without bound.
+/// More placed nodes, and primitives in them, than this are refused: nodes may share children, and their number grow without bound.
 const MAX_NODES: usize = 100_000;
+/// Vertices and triangles that a document may place whatever its size: nodes may share a mesh, so a small file may ask for many. Beyond it,
+/// one a byte of what was read: a vertex takes twelve.
+const ALWAYS_PLACED: usize = 1_000_000;
 
 const TRIANGLES: u32 = 4;
 const UNSIGNED_BYTE: u32 = 5121;
@@ -120,9 +124,18 @@ pub(super) fn parse(bytes: &[u8], folder: &Path) -> Result<Surface, MeshError> {
     if let Some(extension) = document.extensions_required.first() {
         return Err(wrong("a document that needs no extension", extension.as_str()));
     }
-    let buffers = document.buffers.iter().map(|b| b.read(blob, folder)).collect::<Result<_, _>>()?;
-    let mut reader =
-        Reader { document: &document, buffers, surface: Surface::default(), uvs: Some(Vec::new()), nodes: 0 };
+    let mut files = Files { folder, read: HashMap::new(), bytes: 0 };
+    document.buffers.iter().try_for_each(|buffer| files.read(buffer))?;
+    let buffers = document.buffers.iter().map(|b| b.data(blob, &files)).collect::<Result<_, _>>()?;
+    let most = ALWAYS_PLACED.saturating_add(bytes.len()).saturating_add(files.bytes);
+    let mut reader = Reader {
+        document: &document,
+        buffers,
+        surface: Surface::default(),
+        uvs: Some(Vec::new()),
+        nodes: 0,
+        most,
+    };
     let scenes = match document.scene {
         Some(scene) => std::slice::from_ref(item(&document.scenes, scene, "scene")?),
         None => &document.scenes,
@@ -164,11 +177,14 @@ fn chunks(bytes: &[u8]) -> Result<(&[u8], Option<&[u8]>), MeshError> {
 
 struct Reader<'a> {
     document: &'a Document,
-    buffers: Vec<Vec<u8>>,
+    buffers: Vec<Cow<'a, [u8]>>,
     surface: Surface,
     /// Given up when a mesh has none.
     uvs: Option<Vec<[f32; 2]>>,
+    /// Nodes and primitives so far.
     nodes: usize,
+    /// Vertices that may be placed, and triangles.
+    most: usize,
 }
 
 impl Reader<'_> {
@@ -181,7 +197,9 @@ impl Reader<'_> {
         let node = item(&document.nodes, node, "node")?;
         let place = parent * node.place();
         if let Some(mesh) = node.mesh {
-            for primitive in &item(&document.meshes, mesh, "mesh")?.primitives {
+            let primitives = &item(&document.meshes, mesh, "mesh")?.primitives;
+            self.nodes = self.nodes.saturating_add(primitives.len());
+            for primitive in primitives {
                 match primitive.mode.unwrap_or(TRIANGLES) {
                     TRIANGLES => self.triangles(primitive, place)?,
                     // Points and lines.
@@ -197,13 +215,20 @@ impl Reader<'_> {
         let Some(&positions) = primitive.attributes.get("POSITION") else {
             return Err(wrong("a mesh with positions", "one without"));
         };
-        let positions: Vec<[f32; 3]> = self.floats(positions, "VEC3")?;
-        let uvs: Option<Vec<[f32; 2]>> =
-            primitive.attributes.get("TEXCOORD_0").and_then(|&uvs| self.floats(uvs, "VEC2").ok());
-        let indices = match primitive.indices {
-            Some(indices) => self.indices(indices)?,
-            None => (0..positions.len() as u32).collect(),
-        };
+        let positions = self.floats::<3>(positions, "VEC3")?;
+        let vertices = positions.len();
+        let indices = primitive.indices.map(|indices| self.indices(indices)).transpose()?;
+        let triangles = indices.as_ref().map_or(vertices, |indices| indices.len()) / 3;
+        // Before anything is read: that costs time and memory too.
+        let room = |has: usize, more: usize| has.checked_add(more).is_some_and(|all| all <= self.most);
+        if !(room(self.surface.positions.len(), vertices) && room(self.surface.triangles.len(), triangles)) {
+            let expected = format!("at most {} placed vertices, and triangles", self.most);
+            return Err(wrong(expected, format!("{vertices} and {triangles} more")));
+        }
+        let uvs = primitive.attributes.get("TEXCOORD_0").and_then(|&uvs| self.floats::<2>(uvs, "VEC2").ok());
+        let uvs: Option<Vec<_>> = uvs.filter(|uvs| uvs.len() == vertices).map(Iterator::collect);
+        let positions: Vec<[f32; 3]> = positions.collect();
+        let indices: Vec<u32> = indices.map_or_else(|| (0..vertices as u32).collect(), Iterator::collect);
         if let Some(&index) = indices.iter().find(|&&i| i as usize >= positions.len()) {
             let (index, count) = (u64::from(index), positions.len());
             return Err(MeshError::Index {
@@ -213,7 +238,7 @@ impl Reader<'_> {
                 count,
             });
         }
-        match (&mut self.uvs, uvs.filter(|uvs| uvs.len() == positions.len())) {
+        match (&mut self.uvs, uvs) {
             (Some(all), Some(uvs)) => all.extend(uvs),
             _ => self.uvs = None,
         }
@@ -232,7 +257,11 @@ impl Reader<'_> {
         Ok(())
     }
 
-    fn floats<const N: usize>(&self, accessor: usize, kind: &str) -> Result<Vec<[f32; N]>, MeshError> {
+    fn floats<const N: usize>(
+        &self,
+        accessor: usize,
+        kind: &str,
+    ) -> Result<impl ExactSizeIterator<Item = [f32; N]>, MeshError> {
         let accessor = item(&self.document.accessors, accessor, "accessor")?;
         if accessor.component_type != FLOAT || accessor.kind != kind {
             let found = format!("{} of type {}", accessor.kind, accessor.component_type);
@@ -242,10 +271,10 @@ impl Reader<'_> {
             let mut numbers = item.as_chunks::<4>().0.iter().map(|b| f32::from_le_bytes(*b));
             std::array::from_fn(|_| numbers.next().unwrap_or(f32::NAN))
         };
-        Ok(self.items(accessor, 4 * N)?.map(numbers).collect())
+        Ok(self.items(accessor, 4 * N)?.map(numbers))
     }
 
-    fn indices(&self, accessor: usize) -> Result<Vec<u32>, MeshError> {
+    fn indices(&self, accessor: usize) -> Result<impl ExactSizeIterator<Item = u32>, MeshError> {
         let accessor = item(&self.document.accessors, accessor, "accessor")?;
         let size = match (accessor.component_type, accessor.kind.as_str()) {
             (UNSIGNED_BYTE, "SCALAR") => 1,
@@ -259,11 +288,15 @@ impl Reader<'_> {
             }
         };
         let number = |item: &[u8]| item.iter().rev().fold(0, |n, &byte| n << 8 | u32::from(byte));
-        Ok(self.items(accessor, size)?.map(number).collect())
+        Ok(self.items(accessor, size)?.map(number))
     }
 
     /// The bytes of each item of an accessor. All its numbers come from the file, so none is trusted.
-    fn items(&self, accessor: &Accessor, size: usize) -> Result<impl Iterator<Item = &[u8]>, MeshError> {
+    fn items(
+        &self,
+        accessor: &Accessor,
+        size: usize,
+    ) -> Result<impl ExactSizeIterator<Item = &[u8]>, MeshError> {
         let Some(view) = accessor.buffer_view.filter(|_| accessor.sparse.is_none()) else {
             return Err(wrong("data that is stored whole", "a sparse accessor"));
         };
@@ -298,22 +331,52 @@ impl Node {
     }
 }
 
-impl Buffer {
-    fn read(&self, blob: Option<&[u8]>, folder: &Path) -> Result<Vec<u8>, MeshError> {
-        let Some(uri) = &self.uri else {
-            return blob.map(<[u8]>::to_vec).ok_or_else(|| wrong("binary data after the document", "none"));
-        };
-        if let Some(data) = uri.strip_prefix("data:") {
-            let text = data.split_once(";base64,").map(|parts| parts.1);
-            return text.and_then(base64).ok_or_else(|| wrong("data in base 64", "something else"));
-        }
+/// The files that a document names, each read once.
+struct Files<'a> {
+    folder: &'a Path,
+    read: HashMap<PathBuf, Vec<u8>>,
+    /// Of all of them.
+    bytes: usize,
+}
+
+impl Files<'_> {
+    fn read(&mut self, buffer: &Buffer) -> Result<(), MeshError> {
+        let Some(path) = buffer.file() else { return Ok(()) };
         // A file beside the document, and nowhere else.
-        let path = Path::new(uri);
-        if path.components().all(|part| matches!(part, Component::Normal(_))) {
-            super::bytes(&folder.join(path))
-        } else {
-            Err(wrong("a file in the folder of the document", uri.as_str()))
+        if !path.components().all(|part| matches!(part, Component::Normal(_))) {
+            return Err(wrong("a file in the folder of the document", path.display().to_string()));
         }
+        let path: PathBuf = path.components().collect();
+        if self.read.contains_key(&path) {
+            return Ok(());
+        }
+        let bytes = super::bytes(&self.folder.join(&path))?;
+        self.bytes = self.bytes.saturating_add(bytes.len());
+        if self.bytes as u64 > super::MAX_FILE {
+            return Err(wrong(format!("files of at most {} bytes in all", super::MAX_FILE), "more"));
+        }
+        self.read.insert(path, bytes);
+        Ok(())
+    }
+}
+
+impl Buffer {
+    /// Of a file that the document names.
+    fn file(&self) -> Option<&Path> {
+        self.uri.as_deref().filter(|uri| !uri.starts_with("data:")).map(Path::new)
+    }
+
+    fn data<'a>(&self, blob: Option<&'a [u8]>, files: &'a Files) -> Result<Cow<'a, [u8]>, MeshError> {
+        if let Some(path) = self.file() {
+            let path: PathBuf = path.components().collect();
+            let bytes = files.read.get(&path).map(|bytes| Cow::Borrowed(&bytes[..]));
+            return bytes.ok_or_else(|| wrong("a file that was read", path.display().to_string()));
+        }
+        let Some(data) = self.uri.as_deref().and_then(|uri| uri.strip_prefix("data:")) else {
+            return blob.map(Cow::Borrowed).ok_or_else(|| wrong("binary data after the document", "none"));
+        };
+        let text = data.split_once(";base64,").map(|parts| parts.1);
+        text.and_then(base64).map(Cow::Owned).ok_or_else(|| wrong("data in base 64", "something else"))
     }
 }
 
@@ -395,16 +458,70 @@ pub(super) mod tests {
         assert!(message("glTF".into()).contains("a JSON chunk"));
     }
 
-    #[test]
-    fn a_glb_holds_its_own_data() {
-        let text = document("", "3", CHILDREN).replace(r#","uri":"""#, "");
-        let data = base64(DATA.split_once(',').unwrap().1).unwrap();
+    /// The document with its data behind it.
+    fn glb(text: &str, data: &[u8]) -> Vec<u8> {
         let mut glb = b"glTF\x02\0\0\0\0\0\0\0".to_vec();
-        for (kind, chunk) in [(b"JSON", text.as_bytes()), (b"BIN\0", &data)] {
+        for (kind, chunk) in [(b"JSON", text.as_bytes()), (b"BIN\0", data)] {
             glb.extend((chunk.len() as u32).to_le_bytes());
             glb.extend(kind);
             glb.extend(chunk);
         }
+        glb
+    }
+
+    #[test]
+    fn a_file_takes_no_more_than_its_size_allows() {
+        // A thousand triangles, 1,024 times over a tree of ten doublings: 3 million corners of 36 kB.
+        let nodes: Vec<String> = (1..=10).map(|k| format!(r#"{{"children":[{k},{k}]}}"#)).collect();
+        let text = |nodes: &str, buffers: &str| {
+            format!(
+                r#"{{"asset":{{"version":"2.0"}},"scenes":[{{"nodes":[0]}}],"nodes":[{nodes}],
+                "meshes":[{{"primitives":[{{"attributes":{{"POSITION":0,"TEXCOORD_0":1}}}}]}}],
+                "accessors":[{{"bufferView":0,"componentType":5126,"count":3000,"type":"VEC3"}},
+                    {{"bufferView":0,"componentType":5126,"count":4500,"type":"VEC2"}}],
+                "bufferViews":[{{"buffer":0,"byteLength":36000}}],"buffers":[{buffers}]}}"#
+            )
+        };
+        let data = vec![0; 36_000];
+        let shared = format!("{},{}", nodes.join(","), r#"{"mesh":0}"#);
+        let error = parse(&glb(&text(&shared, "{}"), &data), Path::new(".")).unwrap_err().to_string();
+        assert!(error.contains("placed vertices"), "{error}");
+        // Half as many again as it may always place, once more than the limit without its bytes: 333 meshes of 3,000 are 999,000.
+        let many = |count: usize| {
+            let nodes: Vec<String> = (1..=count).map(|k| k.to_string()).collect();
+            let meshes = vec![r#"{"mesh":0}"#; count].join(",");
+            text(&format!(r#"{{"children":[{}]}},{meshes}"#, nodes.join(",")), "{}")
+        };
+        let placed = parse(&glb(&many(333), &data), Path::new(".")).unwrap();
+        assert_eq!((placed.positions.len(), placed.triangles.len()), (999_000, 333_000));
+        assert!(parse(&glb(&many(400), &data), Path::new(".")).is_err());
+        // Every buffer is the one blob, however many there are: borrowed, not copied (it would be 3.6 GB).
+        let buffers = vec!["{}"; 100_000].join(",");
+        let one = parse(&glb(&text(r#"{"mesh":0}"#, &buffers), &data), Path::new(".")).unwrap();
+        assert_eq!(one.triangles.len(), 1_000);
+    }
+
+    #[test]
+    fn a_file_that_is_named_often_is_read_once() {
+        let folder = std::env::temp_dir().join(format!("pliant_gltf_{}", std::process::id()));
+        std::fs::create_dir_all(&folder).unwrap();
+        std::fs::write(folder.join("a.bin"), base64(DATA.split_once(',').unwrap().1).unwrap()).unwrap();
+        let mut files = Files { folder: &folder, read: HashMap::new(), bytes: 0 };
+        for uri in ["a.bin", "a.bin", "a.bin/", "./a.bin"] {
+            let read = files.read(&Buffer { uri: Some(uri.into()) });
+            assert_eq!(read.is_ok(), !uri.starts_with('.'), "{uri}");
+        }
+        assert_eq!((files.read.len(), files.bytes), (1, 42));
+        let surface = parse(document("a.bin", "3", CHILDREN).as_bytes(), &folder).unwrap();
+        assert_eq!(surface.triangles, [[0, 2, 1]]);
+        std::fs::remove_dir_all(folder).unwrap();
+    }
+
+    #[test]
+    fn a_glb_holds_its_own_data() {
+        let text = document("", "3", CHILDREN).replace(r#","uri":"""#, "");
+        let data = base64(DATA.split_once(',').unwrap().1).unwrap();
+        let glb = glb(&text, &data);
         assert_eq!(parse(&glb, Path::new(".")).unwrap().triangles, [[0, 2, 1]]);
         assert!(parse(&glb[..glb.len() - 1], Path::new(".")).is_err());
     }

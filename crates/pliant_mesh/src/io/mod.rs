@@ -30,6 +30,7 @@ use std::{
     fs,
     io::{Read as _, Write as _},
     path::Path,
+    sync::atomic::{AtomicU64, Ordering},
 };
 
 use crate::{
@@ -243,7 +244,10 @@ pub fn write_whole(
     }
     let mut part =
         goal.file_name().ok_or_else(|| std::io::Error::other("the path names no file"))?.to_owned();
-    part.push(format!(".{}.part", std::process::id()));
+    // Two threads that write one file each write their own neighbour: the last to end wins.
+    static WRITES: AtomicU64 = AtomicU64::new(0);
+    let number = WRITES.fetch_add(1, Ordering::Relaxed);
+    part.push(format!(".{}.{number}.part", std::process::id()));
     let part = goal.with_file_name(part);
     fs::File::create(&part)
         .and_then(|mut file| {
