@@ -4,6 +4,9 @@ use nalgebra::Matrix3;
 
 use crate::{BakeInfo, Coefficients, FlexibilitySite, Integrator, ModalModel, ModelError, ModelParts};
 
+/// What rounding may do to the symmetry of an inertia, as a share of its largest entry.
+const INERTIA_ROUNDING: f64 = 1e-9;
+
 /// What rounding may do to a residual flexibility, as a share of the compliances that it is the difference of.
 const FLEXIBILITY_ROUNDING: f64 = 1e-7;
 
@@ -58,15 +61,7 @@ pub(crate) fn check_parts(parts: &ModelParts) -> Result<(), ModelError> {
     each("mass", "kg above 0", &mut [parts.mass].into_iter(), &positive)?;
     each("center_of_mass", "finite metres", &mut parts.center_of_mass.into_iter(), &any)?;
     each("inertia", "finite", &mut parts.inertia.into_iter().flatten(), &any)?;
-    if Matrix3::from_fn(|i, j| parts.inertia[i][j]).cholesky().is_none() {
-        let got = parts.inertia[0][0];
-        return Err(ModelError::Value {
-            what: "inertia",
-            index: 0,
-            expected: "a positive definite matrix",
-            got,
-        });
-    }
+    check_inertia(&parts.inertia)?;
     each("young", "Pa above 0", &mut [info.young].into_iter(), &positive)?;
     each("poisson", "-1 < nu < 0.5", &mut [info.poisson].into_iter(), &|x| x > -1.0 && x < 0.5)?;
     each("density", "kg/m^3 above 0", &mut [info.density].into_iter(), &positive)?;
@@ -77,6 +72,20 @@ pub(crate) fn check_parts(parts: &ModelParts) -> Result<(), ModelError> {
         each("site radius", "m above 0", &mut [site.radius].into_iter(), &positive)?;
         each("site flexibility", "finite", &mut site.flexibility.into_iter().flatten(), &any)?;
         check_flexibility(parts, index)?;
+    }
+    Ok(())
+}
+
+/// Cholesky reads one triangle only: what a step makes of the other would turn a body by itself.
+fn check_inertia(inertia: &[[f64; 3]; 3]) -> Result<(), ModelError> {
+    let inertia = Matrix3::from_fn(|i, j| inertia[i][j]);
+    let wrong = |expected, got| Err(ModelError::Value { what: "inertia", index: 0, expected, got });
+    let skew = (inertia - inertia.transpose()).amax();
+    if skew > INERTIA_ROUNDING * inertia.amax() {
+        return wrong("a symmetric matrix", skew);
+    }
+    if inertia.cholesky().is_none() {
+        return wrong("a positive definite matrix", inertia[(0, 0)]);
     }
     Ok(())
 }

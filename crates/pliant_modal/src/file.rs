@@ -13,7 +13,12 @@
 //! ```
 //! All numbers little-endian. A reader checks magic, version, length and hash before it looks at anything inside.
 
-use std::{fs, io, io::Write, path::Path};
+use std::{
+    fs, io,
+    io::Write,
+    path::Path,
+    sync::atomic::{AtomicU64, Ordering},
+};
 
 use serde::{Deserialize, Serialize};
 
@@ -187,7 +192,10 @@ fn write_whole(path: &Path, bytes: &[u8]) -> io::Result<()> {
         return fs::OpenOptions::new().write(true).open(&goal)?.write_all(bytes);
     }
     let mut partial = goal.file_name().ok_or(io::ErrorKind::InvalidFilename)?.to_owned();
-    partial.push(format!(".{}.partial", std::process::id()));
+    // Two threads that write one file each write their own neighbour: the last to end wins.
+    static WRITES: AtomicU64 = AtomicU64::new(0);
+    let write = WRITES.fetch_add(1, Ordering::Relaxed);
+    partial.push(format!(".{}.{write}.partial", std::process::id()));
     let partial = goal.with_file_name(partial);
     fs::File::create(&partial)
         .and_then(|mut file| file.write_all(bytes).and_then(|()| file.sync_all()))

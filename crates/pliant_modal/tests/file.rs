@@ -81,6 +81,23 @@ fn a_link_stays_a_link_and_a_device_stays_a_device() {
 }
 
 #[test]
+fn threads_that_write_one_file_leave_one_whole_file() {
+    let folder = folder("threads");
+    let path = folder.join("rod.modal");
+    let models = [rod::rod(1e6, 3, 0.02, false), rod::rod(1e6, 4, 0.02, false)];
+    std::thread::scope(|scope| {
+        for thread in 0..4 {
+            let (path, model) = (&path, &models[thread % 2]);
+            scope.spawn(move || (0..20).for_each(|_| model.write(path).unwrap()));
+        }
+    });
+    let read = ModalModel::read(&path).unwrap();
+    assert!(models.iter().any(|model| model.hash() == read.hash()));
+    assert_eq!(std::fs::read_dir(&folder).unwrap().count(), 1, "nothing is left over");
+    std::fs::remove_dir_all(folder).unwrap();
+}
+
+#[test]
 fn parts_that_cannot_be_stepped_or_told_are_refused_by_name() {
     let refused = |change: &dyn Fn(&mut ModelParts)| {
         let mut parts = rod::rod(1e6, 3, 0.02, false).parts().clone();
@@ -98,6 +115,10 @@ fn parts_that_cannot_be_stepped_or_told_are_refused_by_name() {
     });
     assert!(not_definite.contains("semi-definite"), "{not_definite}");
     assert!(refused(&|p| p.sites[0].flexibility[2][2] = -1.0).contains("semi-definite"));
+    // Its lower triangle alone is positive definite.
+    let skew = refused(&|p| p.inertia[0][1] = 0.3 * p.inertia[1][1]);
+    assert!(skew.contains("inertia[0]: expected a symmetric matrix"), "{skew}");
+    assert!(refused(&|p| p.inertia[1][1] *= -1.0).contains("positive definite"));
     assert!(
         refused(&|p| p.info.name = "x".repeat(257)).contains("name: expected at most 256 bytes, got 257")
     );
