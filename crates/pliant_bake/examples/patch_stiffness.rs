@@ -79,7 +79,7 @@ fn main() -> Result<(), Box<dyn Error>> {
             let patch = Patch::around(model.surface(), site.vertex, site.radius)?;
             let modal = modal_compliance(&exact, &patch);
             let truth = modal + square(site.flexibility);
-            let got = modal_compliance(&model, &patch) + square(model.residual_flexibility(&patch, modes));
+            let got = modal_compliance(&model, &patch) + square(model.residual_flexibility(&patch, modes)?);
             for (name, _) in by_name.iter().filter(|(_, vertex)| *vertex == site.vertex) {
                 let off = |axis: usize| 100.0 * (got[(axis, axis)] / truth[(axis, axis)] - 1.0);
                 told +=

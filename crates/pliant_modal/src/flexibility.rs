@@ -2,7 +2,7 @@
 
 use nalgebra::Matrix3;
 
-use crate::{ModalModel, Patch, SurfaceMesh};
+use crate::{ModalModel, ModelError, Patch, SurfaceMesh};
 
 /// Sites that are blended where none lies at the patch itself.
 const NEAREST: usize = 4;
@@ -18,7 +18,19 @@ impl ModalModel {
     /// extent `a`); between places, the four nearest are blended by inverse squared distance, each scaled to the patch's
     /// sharpness. What modes beyond `kept` would have given is added.
     /// A model without sites gets the half-space estimate `(1 - nu^2) / (2 E r)`.
-    pub fn residual_flexibility(&self, patch: &Patch, kept: usize) -> [[f64; 3]; 3] {
+    ///
+    /// # Errors
+    /// [`ModelError::Vertex`]: the patch is one of another surface, with a vertex that this one does not have.
+    pub fn residual_flexibility(&self, patch: &Patch, kept: usize) -> Result<[[f64; 3]; 3], ModelError> {
+        let count = self.surface().positions().len();
+        match patch.entries().iter().enumerate().find(|(_, (vertex, _))| *vertex as usize >= count) {
+            Some((index, &(vertex, _))) => Err(ModelError::Vertex { what: "patch", index, vertex, count }),
+            None => Ok(self.flexibility_of(patch, kept)),
+        }
+    }
+
+    /// [`residual_flexibility`](Self::residual_flexibility) of a patch whose vertices are known to be there.
+    pub(crate) fn flexibility_of(&self, patch: &Patch, kept: usize) -> [[f64; 3]; 3] {
         let mut flexibility = self.baked_flexibility(patch);
         for mode in kept..self.mode_count() {
             let mut phi = nalgebra::Vector3::zeros();

@@ -100,7 +100,7 @@ impl Grab {
                 }
             }
         }
-        let residual = model.residual_flexibility(patch, modes);
+        let residual = model.flexibility_of(patch, modes);
         let residual = Matrix3::from_fn(|i, j| residual[i][j]);
         // A patch on an anchor has no flexibility at all, and a hand on it would pull with an infinite force: skin and fingertip give a
         // hundredth of the patch's own contact compliance.
