@@ -128,7 +128,7 @@ pub enum StepError {
         /// What came.
         got: f64,
     },
-    /// The state became non-finite in a step; the body was put back to the state before it.
+    /// The state became non-finite in a step; the body was put back to the state before it (see [`Body::step`](crate::Body::step)).
     #[error("the step made {what} non-finite; the body was put back to the state before it")]
     Diverged {
         /// What became non-finite.

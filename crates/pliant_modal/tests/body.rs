@@ -207,12 +207,50 @@ fn a_step_that_would_overflow_is_taken_back() {
 }
 
 #[test]
+fn no_blow_or_push_stops_a_body_for_good() {
+    for free in [false, true] {
+        let model = Arc::new(rod(1e5, 5, 0.01, free));
+        let mut body = Body::new(model, BodyConfig::default()).unwrap();
+        body.strike(tip(), [0.3, 0.2, -0.1]).unwrap();
+        let before = body.state().clone();
+        for impulse in [[f64::MAX; 3], [1e308, 0.0, 0.0], [1e160, 0.0, 0.0]] {
+            let error = body.strike(tip(), impulse).unwrap_err();
+            assert!(matches!(error, StepError::Input { what: "impulse", .. }), "{error}");
+            assert_eq!(*body.state(), before, "what is refused changes nothing");
+            body.clone().step().unwrap();
+        }
+        // A force that a step takes, or the steps after it only, or none: whichever, the body goes on.
+        for exponent in [100, 150, 155, 200, 290, 300, 304, 306, 307, 308] {
+            let mut body = body.clone();
+            body.push(tip(), [10f64.powi(exponent), -10f64.powi(exponent), 0.0]).unwrap();
+            let refused = (0..2_000).filter(|_| body.step().is_err()).count();
+            assert!(refused <= 2, "free: {free}, 1e{exponent} N: {refused} steps were refused");
+            assert!(body.q().iter().chain(body.v()).all(|x| x.is_finite()));
+        }
+        // A state from outside that nothing can be stepped from.
+        for huge in [1e150, 1e300, f64::MAX] {
+            let mut state = before.clone();
+            (state.q[0], state.v[1], state.a[2]) = (huge, -huge, huge);
+            body.set_state(&state).unwrap();
+            let refused = (0..100).filter(|_| body.step().is_err()).count();
+            assert!(refused <= 1, "free: {free}, {huge}: {refused} steps were refused");
+        }
+    }
+}
+
+#[test]
 fn teleporting_targets_coincident_hands_and_hands_on_anchors() {
     let model = Arc::new(rod(2e6, 2, 0.05, false));
     let mut body = Body::new(model.clone(), BodyConfig { step: 1.0 / 40.0, ..Default::default() }).unwrap();
     let patch = tip_patch(&model);
     let hands: Vec<_> = (0..6).map(|_| body.grab(&patch, GrabConfig::default()).unwrap()).collect();
     let anchor = body.grab(&Patch::around(model.surface(), 0, 0.0).unwrap(), GrabConfig::default()).unwrap();
+    let size = model.size();
+    let softest = body.compliance(anchor).unwrap()[1][1];
+    // Each is pulled from a body's length away at most, and the patch itself is not farther than that.
+    let most = 2.0 * size / softest;
+    // The six ask for +-100 m and the tip is at 1 m: their middle is a hundredth of a length away, and the tip swings to twice that.
+    let swing = 0.5 * 2e6 * AREA / LENGTH * (0.02 * size).powi(2);
     for i in 0..400 {
         let far = if i % 7 == 0 { 100.0 } else { -100.0 };
         for (k, hand) in hands.iter().enumerate() {
@@ -221,6 +259,14 @@ fn teleporting_targets_coincident_hands_and_hands_on_anchors() {
         }
         body.set_target(anchor, [0.3, 0.0, 0.0]).unwrap();
         body.step().unwrap();
+        for hand in &hands {
+            let pull = body.reaction(*hand).unwrap().iter().map(|x| x * x).sum::<f64>().sqrt();
+            assert!(pull > 0.1 * most && pull < most, "step {i}: {pull} N, at most {most} N");
+        }
+        // What is anchored does not move: the whole of the way is the skin's.
+        let pull = body.reaction(anchor).unwrap()[0] * softest;
+        assert!((pull + 0.3).abs() < 1e-9, "step {i}: the skin on the anchor gives way by {pull} m");
+        assert!(body.energy() < swing, "step {i}: {} J, at most {swing} J", body.energy());
     }
     for hand in hands {
         body.release(hand);

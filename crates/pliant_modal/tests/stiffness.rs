@@ -5,7 +5,10 @@ mod rod;
 
 use std::sync::Arc;
 
-use pliant_modal::{Body, BodyConfig, GrabConfig, Integrator, Patch, Relaxation, StepError};
+use pliant_modal::{
+    Body, BodyConfig, GrabConfig, Integrator, ModalModel, ModelError, Patch, Relaxation, StepError,
+    SurfaceMesh,
+};
 use rod::{AREA, DENSITY, LENGTH, rod, tip};
 
 const YOUNG: f64 = 1e5;
@@ -91,9 +94,20 @@ fn twice_as_stiff_it_sinks_half_as_far_and_swings_root_two_faster() {
 
 #[test]
 fn a_change_on_the_way_keeps_the_motion_and_the_balance_of_forces() {
-    for relaxation in [None, Some(Relaxation { ratio: 0.3, time: 0.1 })] {
-        let alpha = Integrator::GeneralizedAlpha { rho_inf: 0.5 };
-        let before = BodyConfig { relaxation, ..config(alpha, 1.0) };
+    let relaxing = Some(Relaxation { ratio: 0.3, time: 0.1 });
+    let alpha = Integrator::GeneralizedAlpha { rho_inf: 0.5 };
+    let plain = config(alpha, 1.0);
+    let cases = [
+        (None, BodyConfig { stiffness_scale: 7.0, ..plain.clone() }),
+        (relaxing, BodyConfig { stiffness_scale: 7.0, relaxation: relaxing, ..plain.clone() }),
+        (None, BodyConfig { damping_scale: 5.0, ..plain.clone() }),
+        (relaxing, BodyConfig { damping_scale: 0.0, relaxation: relaxing, ..plain.clone() }),
+        (relaxing, plain.clone()),
+        (None, BodyConfig { relaxation: relaxing, ..plain.clone() }),
+        (relaxing, BodyConfig { relaxation: Some(Relaxation { ratio: 0.8, time: 0.3 }), ..plain.clone() }),
+    ];
+    for (relaxation, after) in cases {
+        let before = BodyConfig { relaxation, ..plain.clone() };
         let mut body = Body::new(Arc::new(rod(YOUNG, 4, 0.03, false)), before.clone()).unwrap();
         body.strike(tip(), [0.5, 0.0, 0.0]).unwrap();
         for _ in 0..37 {
@@ -101,8 +115,8 @@ fn a_change_on_the_way_keeps_the_motion_and_the_balance_of_forces() {
         }
         let (q, v) = (body.q().to_vec(), body.v().to_vec());
         // Nobody pushes: a + c v + omega^2 (q - ratio z) is what is left over, small as the integrator's error is.
-        let ratio = relaxation.map_or(0.0, |r| r.ratio);
         let left_over = |body: &Body| -> Vec<f64> {
+            let ratio = body.config().relaxation.map_or(0.0, |r| r.ratio);
             (0..4)
                 .map(|i| {
                     let stretch = body.q()[i] - ratio * body.z().get(i).copied().unwrap_or(0.0);
@@ -111,13 +125,41 @@ fn a_change_on_the_way_keeps_the_motion_and_the_balance_of_forces() {
                 .collect()
         };
         let unbalanced = left_over(&body);
-        body.reconfigure(BodyConfig { stiffness_scale: 7.0, ..before }).unwrap();
+        let resisted = body.a().to_vec();
+        body.reconfigure(BodyConfig { step: 0.5 * H, ..before }).unwrap();
+        assert_eq!(body.a(), resisted, "another step is no other force");
+        body.reconfigure(after).unwrap();
         assert_eq!((body.q(), body.v()), (&q[..], &v[..]));
+        // What begins to relax has not flown yet.
+        let begins = relaxation.is_none() && body.config().relaxation.is_some();
+        assert_eq!(body.a() == resisted, begins);
         for (then, now) in unbalanced.iter().zip(left_over(&body)) {
             let size = body.omega()[3].powi(2) * q.iter().fold(0.0_f64, |m, q| m.max(q.abs()));
             assert!((then - now).abs() < 1e-12 * size, "{then} became {now} of {size}");
         }
     }
+}
+
+#[test]
+fn a_patch_of_another_surface_has_no_flexibility_here() {
+    let model = rod(YOUNG, 3, 0.1, false);
+    let three = three_of_it(&model);
+    let patch = Patch::around(&three, 200, 0.0).unwrap();
+    let error = model.residual_flexibility(&patch, 3).unwrap_err();
+    assert!(matches!(error, ModelError::Vertex { what: "patch", vertex: 200, count: 84, .. }), "{error}");
+    let mut body = Body::new(Arc::new(model), config(Integrator::Exact, 1.0)).unwrap();
+    assert_eq!(body.grab(&patch, GrabConfig::default()), Err(StepError::Vertex { vertex: 200, count: 84 }));
+}
+
+/// A surface with more vertices than that of `model`: three of it, one beside the other.
+fn three_of_it(model: &ModalModel) -> SurfaceMesh {
+    let (mut positions, mut triangles) = (Vec::new(), Vec::new());
+    for copy in 0..3 {
+        let first = positions.len() as u32;
+        positions.extend(model.surface().positions().iter().map(|p| [p[0], p[1] + copy as f32, p[2]]));
+        triangles.extend(model.surface().triangles().iter().map(|t| t.map(|v| v + first)));
+    }
+    SurfaceMesh::new(positions, triangles, None, Vec::new()).unwrap()
 }
 
 #[test]

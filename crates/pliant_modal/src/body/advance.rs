@@ -13,7 +13,8 @@ impl Body {
     /// `corrections` times (Newton).
     ///
     /// # Errors
-    /// [`StepError::Diverged`] when the result would not be finite; the body is then in the state it had before.
+    /// [`StepError::Diverged`] when the result would not be finite; the body is then in the state it had before, unless that is one that nothing can be
+    /// stepped from (with a number beyond 1e100 in it): then it is at rest where its frame is.
     pub fn step(&mut self) -> Result<StepReport, StepError> {
         self.before.clone_from(&self.state);
         let report = self.advance();
@@ -24,6 +25,9 @@ impl Body {
             None => Ok(report),
             Some(what) => {
                 self.state.clone_from(&self.before);
+                if !self.state.is_moderate() {
+                    self.state.stop();
+                }
                 for grab in &mut self.grabs {
                     grab.pull = Vector3::zeros();
                     grab.flow = Vector3::zeros();
@@ -109,7 +113,6 @@ impl Body {
         let back = turn.transpose();
         let mut report = StepReport::default();
         for round in 0..corrections {
-            let last = round + 1 == corrections;
             for grab in &mut self.grabs {
                 // Linearise where the last round ended; project the unheld step onto that plane.
                 grab.linearise(&self.linear, self.config.warp);
@@ -138,17 +141,11 @@ impl Body {
                 rigid.tighten(&self.model, self.grabs.iter().map(|grab| (grab.arm, pull(grab))));
             }
             report.regularised = self.schur.solve(&mut self.grabs, &self.coefficients, h, rigid.as_ref());
-            let mut moved = 0.0f64;
-            for (i, q) in self.linear.iter_mut().enumerate() {
-                let pull: f64 = self.grabs.iter().map(|g| g.row(i).dot(&g.pull)).sum();
-                let next = self.state.q[i] + self.coefficients[i].response[0] * pull;
-                if last {
-                    moved = moved.max((next - *q).abs());
+            if round + 1 < corrections {
+                for (i, q) in self.linear.iter_mut().enumerate() {
+                    let pull: f64 = self.grabs.iter().map(|g| g.row(i).dot(&g.pull)).sum();
+                    *q = self.state.q[i] + self.coefficients[i].response[0] * pull;
                 }
-                *q = next;
-            }
-            if last {
-                report.last_correction = moved;
             }
         }
         for (i, c) in self.coefficients.iter().enumerate() {

@@ -92,6 +92,15 @@ impl Frame {
         Ok(())
     }
 
+    /// Neither moves nor turns; where it is farther away than `most` (m) it is back at the origin.
+    pub(crate) fn stop(&mut self, most: f64) {
+        self.velocity = Vector3::zeros();
+        self.spin = Vector3::zeros();
+        if self.position.amax() > most {
+            self.position = self.rotation * self.pivot;
+        }
+    }
+
     pub(crate) fn check(&self) -> Result<(), StepError> {
         finite("frame position", self.position.as_slice())?;
         finite("frame rotation", self.rotation.coords.as_slice())?;

@@ -82,6 +82,27 @@ pub struct State {
     pub frame: Frame,
 }
 
+impl State {
+    /// Beyond this, kg^1/2 m and its like, squares of coordinates and velocities may overflow in a step.
+    const MOST: f64 = 1e100;
+
+    /// Whether coordinates, velocities and forces are such that a step without hands and pushes stays finite.
+    fn is_moderate(&self) -> bool {
+        let frame = &self.frame;
+        let rigid = frame.velocity().into_iter().chain(frame.spin()).chain(frame.center());
+        let modes = [&self.q, &self.v, &self.a, &self.f, &self.z].into_iter().flatten().copied();
+        modes.chain(rigid).all(|x| x.abs() <= Self::MOST)
+    }
+
+    /// At rest and undeformed, where the frame is (or at the origin, where that is nowhere).
+    fn stop(&mut self) {
+        for slice in [&mut self.q, &mut self.v, &mut self.a, &mut self.f, &mut self.z] {
+            slice.fill(0.0);
+        }
+        self.frame.stop(Self::MOST);
+    }
+}
+
 impl Clone for State {
     fn clone(&self) -> Self {
         let mut copy = Self::default();
@@ -104,8 +125,6 @@ impl Clone for State {
 /// What one step did.
 #[derive(Debug, Clone, Copy, PartialEq, Default)]
 pub struct StepReport {
-    /// Distance that the last Newton correction still moved a grab by, m; 0 without grabs or warp.
-    pub last_correction: f64,
     /// Directions in which grabs were linearly dependent and had to be regularised.
     pub regularised: usize,
 }
@@ -210,8 +229,8 @@ impl Body {
         &self.damping
     }
 
-    /// Changes step size, integrator, warp, gravity, damping, stiffness or relaxation; coordinates and velocities go on, and accelerations with the
-    /// new elastic and damping forces. The number of modes stays as it was made.
+    /// Changes step size, integrator, warp, gravity, damping, stiffness or relaxation; coordinates and velocities go on, and accelerations change
+    /// by as much as the elastic and damping forces. The number of modes stays as it was made.
     /// A material that begins to relax begins with nothing relaxed; one that ceases to forgets what had.
     ///
     /// # Errors
@@ -220,18 +239,22 @@ impl Body {
         finite("gravity", &config.gravity)?;
         let Stepping { omega, damping, coefficients, flows } =
             Stepping::new(&self.model, &config, self.mode_count())?;
-        if config.stiffness_scale != self.config.stiffness_scale {
-            // `a = f - c v - omega^2 (q - ratio z)`: the acceleration belongs to the state.
-            let ratio = self.config.relaxation.map_or(0.0, |r| r.ratio);
-            for (i, a) in self.state.a.iter_mut().enumerate() {
-                let stretch = self.state.q[i] - ratio * self.state.z.get(i).copied().unwrap_or(0.0);
-                *a += (self.omega[i].powi(2) - omega[i].powi(2)) * stretch
-                    + (self.damping[i] - damping[i]) * self.state.v[i];
-            }
+        // `a = f - c v - omega^2 (q - ratio z)`: the acceleration belongs to the state. What has not changed cancels to the bit.
+        let resisted = |body: &Self, i: usize| {
+            let ratio = body.config.relaxation.map_or(0.0, |r| r.ratio);
+            let stretch = body.state.q[i] - ratio * body.state.z.get(i).copied().unwrap_or(0.0);
+            body.damping[i] * body.state.v[i] + body.omega[i].powi(2) * stretch
+        };
+        // Scratch of the step.
+        for i in 0..self.mode_count() {
+            self.linear[i] = resisted(self, i);
         }
         (self.omega, self.damping, self.coefficients, self.flows) = (omega, damping, coefficients, flows);
         self.config = BodyConfig { modes: self.config.modes, ..config };
         self.state.z.resize(self.flows.len(), 0.0);
+        for i in 0..self.mode_count() {
+            self.state.a[i] += self.linear[i] - resisted(self, i);
+        }
         for grab in &mut self.grabs {
             grab.set_material(&self.config);
         }
@@ -414,14 +437,16 @@ impl Body {
     /// Strikes a surface vertex with `impulse` (N s, world axes): velocities change at once.
     ///
     /// # Errors
-    /// An impulse that is not finite, a vertex that is not on the surface.
+    /// An impulse that is not finite or brings a velocity or an acceleration beyond 1e100, a vertex that is not on the surface; the body
+    /// then stays as it was.
     pub fn strike(&mut self, vertex: u32, impulse: [f64; 3]) -> Result<(), StepError> {
         finite("impulse", &impulse)?;
         let (rows, arm) = self.vertex_rows(vertex)?;
         let impulse = Vector3::from(impulse);
         let local = self.state.frame.rotation().inverse() * impulse;
-        let change: Vec<f64> = (0..self.mode_count()).map(|mode| rows.at(mode).dot(&local)).collect();
-        for (i, dv) in change.into_iter().enumerate() {
+        self.before.clone_from(&self.state);
+        for i in 0..self.mode_count() {
+            let dv = rows.at(i).dot(&local);
             self.state.v[i] += dv;
             // The acceleration belongs to the state: damping answers the new velocity.
             self.state.a[i] -= self.damping[i] * dv;
@@ -429,7 +454,13 @@ impl Body {
         if self.model.is_free() {
             self.state.frame.add_momentum(&self.model, impulse, arm.cross(&impulse));
         }
-        Ok(())
+        // What has overflowed here no step would put right: it goes back to the state before it, which is this one.
+        if self.state.is_moderate() {
+            return Ok(());
+        }
+        self.state.clone_from(&self.before);
+        let expected = "one that leaves velocities and accelerations below 1e100";
+        Err(StepError::Input { what: "impulse", expected, got: impulse.norm() })
     }
 
     /// For a vertex: its (unwarped) displacement rows by mode, and its arm from the centre of mass in world axes.
