@@ -5,7 +5,7 @@
 #   examples/pictures.sh [NAME ...]      all of them, or those named
 #
 # Each is made by the example itself (--screenshot), at 1280x720, and has at most 300,000 bytes: a larger one gets a palette where Python's Pillow or
-# ImageMagick is there, and is taken at 896x504 if that is not enough. OUT is another folder for them, BIN one with the examples' binaries, PROFILE
+# ImageMagick is there, and is taken smaller if that is not enough. OUT is another folder for them, BIN one with the examples' binaries, PROFILE
 # one of cargo's.
 set -euo pipefail
 cd "$(dirname "$0")/.."
@@ -43,17 +43,21 @@ is_wanted() {
     return 1
 }
 
-# Fewer colours, or give up.
+# As many colours as there is room for, or give up.
 smaller() {
     if python3 -c 'import PIL' 2>/dev/null; then
-        python3 - "$1" <<'PYTHON'
-import sys
+        python3 - "$1" "$most" <<'PYTHON'
+import os, sys
 from PIL import Image
-picture = Image.open(sys.argv[1]).convert("RGB")
-picture.quantize(256, dither=Image.Dither.NONE).save(sys.argv[1], optimize=True)
+file, most = sys.argv[1], int(sys.argv[2])
+picture = Image.open(file).convert("RGB")
+for colours in 256, 192, 128:
+    picture.quantize(colours, dither=Image.Dither.NONE).save(file, optimize=True)
+    if os.path.getsize(file) <= most:
+        break
 PYTHON
     elif command -v magick >/dev/null; then
-        magick "$1" +dither -colors 256 "png8:$1"
+        magick "$1" +dither -colors 128 "png8:$1"
     else
         return 1
     fi
@@ -63,15 +67,14 @@ picture() { # name of the picture, example, arguments
     local name="$1" example="$2"
     shift 2
     is_wanted "$name" || return 0
-    local file="$work/$name.png"
-    # What the example records or prints is not wanted here.
-    (cd "$work" && "$BIN/$example" "$@" --screenshot "$file" >"$work/$name.log" 2>&1) || { cat "$work/$name.log" >&2; return 1; }
-    if [ "$(stat -c %s "$file")" -gt $most ]; then smaller "$file" || true; fi
-    if [ "$(stat -c %s "$file")" -gt $most ]; then
-        (cd "$work" && "$BIN/$example" "$@" --size 896x504 --screenshot "$file" >"$work/$name.log" 2>&1)
-    fi
-    local bytes
-    bytes="$(stat -c %s "$file")"
+    local file="$work/$name.png" bytes size
+    for size in 1280x720 896x504 640x360; do
+        # What the example records or prints is not wanted here.
+        (cd "$work" && "$BIN/$example" "$@" --size "$size" --screenshot "$file" >"$work/$name.log" 2>&1) || { cat "$work/$name.log" >&2; return 1; }
+        if [ "$(stat -c %s "$file")" -gt $most ]; then smaller "$file" || true; fi
+        bytes="$(stat -c %s "$file")"
+        [ "$bytes" -gt $most ] || break
+    done
     [ "$bytes" -le $most ] || { echo "$name.png has $bytes bytes, at most $most are wanted" >&2; return 1; }
     mv "$file" "$out/$name.png"
     printf '%-24s %7d bytes, %d s\n' "$name.png" "$bytes" "$SECONDS"
