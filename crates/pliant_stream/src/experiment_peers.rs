@@ -41,8 +41,8 @@ impl Experiment {
             Ok(peer)
         };
         let mut peers = [peer(1)?, peer(2)?];
-        peers[0].connect(Duration::ZERO, PeerId(1), 1200)?;
-        peers[1].connect(Duration::ZERO, PeerId(0), 1200)?;
+        peers[0].connect(Duration::ZERO, PeerId(1), UserId(2), 1200)?;
+        peers[1].connect(Duration::ZERO, PeerId(0), UserId(1), 1200)?;
         let reliable = |l: &LinkConfig| LinkConfig { loss: Loss::None, keep_order: true, ..l.clone() };
         // links[k]: what peer k says; datagrams, then messages.
         let mut links: [[Link; 2]; 2] = [

@@ -69,8 +69,9 @@ impl Mesh {
         peer.add_body(BODY, self.model.clone(), &self.setup).unwrap();
         for other in 0..self.peers.len() {
             if let Some(o) = &mut self.peers[other] {
-                o.connect(self.began[other] + self.now, PeerId(k as u64), 1200).unwrap();
-                peer.connect(self.began[k] + self.now, PeerId(other as u64), 1200).unwrap();
+                o.connect(self.began[other] + self.now, PeerId(k as u64), user, 1200).unwrap();
+                let number = UserId(other as u16 + 1);
+                peer.connect(self.began[k] + self.now, PeerId(other as u64), number, 1200).unwrap();
             }
         }
         self.peers[k] = Some(peer);
@@ -434,10 +435,47 @@ fn ask_floods_are_answered_within_bounds() {
 }
 
 #[test]
+fn a_peer_under_another_number_than_the_one_it_was_given_is_turned_away() {
+    // Had it been let in under 1, its word would count for more than anybody's.
+    for claimed in [0, 1, 3, 9] {
+        let config = PeerConfig { user: UserId(3), ..Default::default() };
+        let mut p = PeerSession::new(config).unwrap();
+        p.add_body(BODY, bar(4, 0.05), &BodySetup::default()).unwrap();
+        p.connect(Duration::ZERO, PeerId(7), UserId(8), 1200).unwrap();
+        let hello = |user| PeerMessage::Hello { version: 1, user, name: "other".into(), joining: false };
+        p.on_message(MS, PeerId(7), &hello(claimed).encode());
+        let turned = PeerEvent::TurnedAway { peer: PeerId(7), reason: EndReason::Protocol };
+        assert_eq!(p.poll_event(), Some(turned), "as {claimed}");
+        // Nor by saying it again, rightly.
+        p.on_message(MS, PeerId(7), &hello(8).encode());
+        assert_eq!((p.poll_event(), p.user_of(PeerId(7))), (None, None));
+        p.connect(MS, PeerId(9), UserId(8), 1200).unwrap();
+        p.on_message(MS, PeerId(9), &hello(8).encode());
+        assert_eq!(p.poll_event(), Some(PeerEvent::Joined { user: UserId(8), name: "other".into() }));
+        assert_eq!(p.user_of(PeerId(9)), Some(UserId(8)));
+    }
+    assert!(PeerSession::new(PeerConfig { user: UserId::HOST, ..Default::default() }).is_err());
+}
+
+#[test]
+fn a_peer_that_never_says_hello_is_told_of_when_it_goes() {
+    let mut p = PeerSession::new(PeerConfig::default()).unwrap();
+    p.add_body(BODY, bar(4, 0.05), &BodySetup::default()).unwrap();
+    assert!(p.connect(Duration::ZERO, PeerId(7), UserId::HOST, 1200).is_err());
+    assert!(p.connect(Duration::ZERO, PeerId(7), UserId(1), 1200).is_err(), "our own");
+    p.connect(Duration::ZERO, PeerId(7), UserId(2), 1200).unwrap();
+    p.update(9 * S);
+    assert_eq!(p.poll_event(), None);
+    p.update(11 * S);
+    let turned = PeerEvent::TurnedAway { peer: PeerId(7), reason: EndReason::Silent };
+    assert_eq!(p.poll_event(), Some(turned));
+}
+
+#[test]
 fn what_nobody_fetches_does_not_grow_for_ever() {
     let mut p = PeerSession::new(PeerConfig { idle_timeout: 100_000 * S, ..Default::default() }).unwrap();
     p.add_body(BODY, bar(4, 0.05), &BodySetup::default()).unwrap();
-    p.connect(Duration::ZERO, PeerId(7), 1200).unwrap();
+    p.connect(Duration::ZERO, PeerId(7), UserId(2), 1200).unwrap();
     for k in 1..=20_000_u32 {
         p.update(k * 25 * MS);
     }

@@ -11,7 +11,7 @@ use pliant_stream::{Channel, EndReason, PeerId, UserId};
 use super::message::{MOST_PEERS, Mesh, Scene};
 use super::{NetPeer, PeerState};
 use crate::seen::{SessionClosed, SessionJoined};
-use crate::transport::{CloseReason, Event, Fingerprint, Invite, Role};
+use crate::transport::{CloseReason, Endpoint, Event, Fingerprint, Invite, Role};
 use crate::user::{User, UserJoined, UserLeft, UserLink};
 
 /// Keys whose numbers are kept.
@@ -28,6 +28,10 @@ pub(super) struct Other {
     pub(super) invite: Option<Invite>,
     /// It has come with our invite, and waits for its number until our own session is there.
     waits: Option<(Scene, Invite)>,
+    /// When it came.
+    since: Duration,
+    /// It has been hung up on: what it still says, until its line is down, is not heard.
+    sent_away: bool,
 }
 
 impl Other {
@@ -57,6 +61,8 @@ pub(crate) fn receive(world: &mut World) {
             net.take_events(world);
         }
         net.take_events(world);
+        net.hang_up_on_the_silent();
+        net.ending.retain(|thread| !thread.is_finished());
         net.look_for_the_missed();
         net.flush();
     });
@@ -100,7 +106,9 @@ impl NetPeer {
                 let peer = opened.unwrap_or(peer);
                 let (number, invite) = self.introduced.remove(&peer).unzip();
                 let address = address.ip();
-                self.others.insert(peer, Other { key: fingerprint, address, number, invite, waits: None });
+                let (waits, since, sent_away) = (None, now, false);
+                let other = Other { key: fingerprint, address, number, invite, waits, since, sent_away };
+                self.others.insert(peer, other);
                 if role == Role::Watch && opened.is_none() {
                     // Every peer steps the bodies with its own hands: there is no place for one that may not hold.
                     return self.hang_up(peer, "among equals everybody holds");
@@ -112,6 +120,9 @@ impl NetPeer {
                     self.talk_to(now, peer);
                 }
             }
+            // Its line stays open for its last words from us.
+            Event::Datagram { peer, .. } | Event::Message { peer, .. }
+                if self.others.get(&opened.unwrap_or(peer)).is_none_or(|other| other.sent_away) => {}
             Event::Datagram { peer, at, bytes } => {
                 let at = at.saturating_duration_since(self.began);
                 if let Some(session) = &mut self.session {
@@ -131,7 +142,8 @@ impl NetPeer {
                 }
                 self.others.remove(&peer);
                 self.introduced.remove(&peer);
-                self.opened.remove(&peer);
+                // Its thread may wait for the other end's last packets: not here.
+                self.ending.extend(self.opened.remove(&peer).and_then(Endpoint::let_go));
                 if opened.is_some() && self.session.is_none() {
                     self.close(world, reason.to_string());
                 }
@@ -159,9 +171,10 @@ impl NetPeer {
             }
             Some(Mesh::Member { number, scene, invite }) if !opened => {
                 let known = self.others.values().any(|other| other.number == Some(number));
+                let own = if let PeerState::In { user } = self.state { user } else { UserId::HOST };
                 if scene != self.scene {
                     self.hang_up(peer, "other bodies, or another step");
-                } else if known || number == UserId::HOST || self.session.is_none() {
+                } else if known || number == UserId::HOST || number == own || self.session.is_none() {
                     self.hang_up(peer, "no place under this number");
                 } else if let Some(other) = self.others.get_mut(&peer) {
                     other.number = Some(number);
@@ -171,7 +184,12 @@ impl NetPeer {
                     self.talk_to(now, peer);
                 }
             }
-            Some(Mesh::Welcome { number, from, others }) if opened && self.session.is_none() => {
+            Some(Mesh::Welcome { number, from, others })
+                if opened
+                    && self.session.is_none()
+                    && ![number, from].contains(&UserId::HOST)
+                    && number != from =>
+            {
                 if !self.begin(world, number, false) {
                     return;
                 }
@@ -243,7 +261,8 @@ impl NetPeer {
         let (endpoint, number) = self.way(peer);
         let most = endpoint.max_datagram_size(number).unwrap_or(0);
         if let Some(session) = &mut self.session
-            && let Err(error) = session.connect(now, peer, most)
+            && let Some(user) = self.others.get(&peer).and_then(|other| other.number)
+            && let Err(error) = session.connect(now, peer, user, most)
         {
             self.hang_up(peer, &error.to_string());
         }
@@ -257,8 +276,24 @@ impl NetPeer {
         }
     }
 
+    /// Hangs up on those who connect and then do not say who they are: each would keep a place from somebody else.
+    fn hang_up_on_the_silent(&mut self) {
+        let Some(session) = &self.session else { return };
+        let (now, most) = (self.now(), self.limits.handshake);
+        let silent = |(peer, other): &(&PeerId, &Other)| {
+            // Who came while our own bodies were being loaded could not be answered before.
+            let since = other.since.max(self.began_at);
+            !other.sent_away && now.saturating_sub(since) > most && session.user_of(**peer).is_none()
+        };
+        let silent: Vec<PeerId> = self.others.iter().filter(silent).map(|(&peer, _)| peer).collect();
+        silent.into_iter().for_each(|peer| self.hang_up(peer, "has not said who it is"));
+    }
+
     fn hang_up(&mut self, peer: PeerId, why: &str) {
         debug!("peer {peer} is sent away: {why}");
+        if let Some(other) = self.others.get_mut(&peer) {
+            (other.sent_away, other.waits) = (true, None);
+        }
         let (endpoint, number) = self.way(peer);
         endpoint.close(number, why);
         if let Some(session) = &mut self.session {
@@ -323,9 +358,14 @@ impl NetPeer {
                         let (endpoint, number) = self.way(peer);
                         endpoint.close(number, &reason.to_string());
                         if let Some(other) = self.others.get_mut(&peer) {
-                            (other.number, other.invite) = (None, None);
+                            (other.number, other.invite, other.sent_away) = (None, None, true);
                         }
                     }
+                }
+                PeerEvent::TurnedAway { peer, reason } => {
+                    // The session's goodbye says more than the end of the connection.
+                    self.flush();
+                    self.hang_up(peer, &reason.to_string());
                 }
                 PeerEvent::Resynced { from } => debug!("the state of user {} was taken over", from.0),
                 _ => {}

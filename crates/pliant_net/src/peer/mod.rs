@@ -9,6 +9,7 @@ mod message;
 mod play;
 
 use std::collections::BTreeMap;
+use std::thread::JoinHandle;
 use std::time::{Duration, Instant};
 
 use bevy::prelude::*;
@@ -86,12 +87,16 @@ pub struct NetPeer {
     listening: Endpoint,
     /// Connections that this peer has opened.
     opened: BTreeMap<PeerId, Endpoint>,
+    /// Threads of connections that are over and still say goodbye: no frame waits for them.
+    ending: Vec<JoinHandle<()>>,
     /// The key, to show it on those too.
     key: Vec<u8>,
     config: PeerConfig,
     limits: Limits,
     emulation: Option<Emulation>,
     began: Instant,
+    /// When the session began, on the clock of `began`.
+    began_at: Duration,
     state: PeerState,
     session: Option<PeerSession>,
     scene: Scene,
@@ -123,11 +128,13 @@ impl NetPeer {
         let mut peer = Self {
             listening,
             opened: BTreeMap::new(),
+            ending: Vec::new(),
             key,
             config,
             limits,
             emulation,
             began: Instant::now(),
+            began_at: Duration::ZERO,
             state: PeerState::Joining,
             session: None,
             scene: Scene { step_ns: 0, bodies: Vec::new() },
@@ -256,7 +263,7 @@ impl NetPeer {
             Ok(session)
         });
         match made {
-            Ok(session) => self.session = Some(session),
+            Ok(session) => (self.session, self.began_at) = (Some(session), self.now()),
             Err(error) => {
                 self.close(world, format!("the session cannot begin: {error}"));
                 return false;
@@ -307,6 +314,19 @@ impl NetPeer {
         };
         self.bodies = found;
         true
+    }
+}
+
+impl Drop for NetPeer {
+    /// Says goodbye to all at once, which takes a second at most however many there are.
+    fn drop(&mut self) {
+        self.listening.signal();
+        let opened = std::mem::take(&mut self.opened).into_values();
+        self.ending.extend(opened.filter_map(Endpoint::let_go));
+        for thread in self.ending.drain(..) {
+            // A panic of that thread has been reported there.
+            let _ = thread.join();
+        }
     }
 }
 

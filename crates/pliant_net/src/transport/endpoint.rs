@@ -280,9 +280,11 @@ impl Endpoint {
         let handle = runtime.handle().clone();
         let (ready, is_ready) = mpsc::sync_channel(1);
         let for_thread = Arc::clone(&shared);
-        let thread = std::thread::Builder::new()
-            .name("pliant-net".into())
-            .spawn(move || runtime.block_on(driver::run(for_thread, socket, side, ready)))?;
+        let thread = std::thread::Builder::new().name("pliant-net".into()).spawn(move || {
+            runtime.block_on(driver::run(for_thread, socket, side, ready));
+            // A name that is still being looked up, on a thread of the runtime's own, holds up nobody.
+            runtime.shutdown_background();
+        })?;
         let ended =
             |_| TransportError::Thread(io::Error::other("the network's thread ended before it began"));
         let quic = is_ready.recv().map_err(ended)??;
@@ -424,10 +426,23 @@ impl Endpoint {
     }
 }
 
-impl Drop for Endpoint {
-    fn drop(&mut self) {
+impl Endpoint {
+    /// Tells the network's thread to say goodbye and end; does not wait for it.
+    pub(crate) fn signal(&self) {
         self.shared.stopping.store(true, Ordering::Release);
         self.shared.stop.notify_one();
+    }
+
+    /// Says goodbye without waiting until it is said. The thread has ended when the handle says so.
+    pub(crate) fn let_go(mut self) -> Option<JoinHandle<()>> {
+        self.signal();
+        self.thread.take()
+    }
+}
+
+impl Drop for Endpoint {
+    fn drop(&mut self) {
+        self.signal();
         if let Some(thread) = self.thread.take() {
             // A panic of that thread has been reported there.
             let _ = thread.join();

@@ -4,7 +4,7 @@ use std::time::Duration;
 
 use super::body::Repair;
 use crate::session::EndReason;
-use crate::state::UserId;
+use crate::state::{PeerId, UserId};
 
 /// Settings of a peer.
 #[derive(Debug, Clone, PartialEq)]
@@ -59,6 +59,14 @@ pub enum PeerEvent {
     Left {
         /// Number.
         user: UserId,
+        /// Why.
+        reason: EndReason,
+    },
+    /// A connection is over before its peer was let in: it said no hello in time, or one that does not hold. No
+    /// [`PeerEvent::Joined`] came before. Close the connection.
+    TurnedAway {
+        /// Which connection.
+        peer: PeerId,
         /// Why.
         reason: EndReason,
     },

@@ -8,7 +8,10 @@ use crate::state::{Tick, UserId};
 
 #[derive(Debug)]
 pub(super) struct Other {
+    /// Who it is, once it has said so.
     pub(super) user: Option<UserId>,
+    /// Who it must be.
+    pub(super) expected: UserId,
     pub(super) heard: Duration,
     pub(super) sequence: u16,
     /// Running mean of: own tick less theirs at arrival.
@@ -28,9 +31,10 @@ pub(super) struct Other {
 }
 
 impl Other {
-    pub(super) fn new(now: Duration, max_datagram: usize) -> Self {
+    pub(super) fn new(now: Duration, expected: UserId, max_datagram: usize) -> Self {
         Self {
             user: None,
+            expected,
             heard: now,
             sequence: 0,
             ahead: None,

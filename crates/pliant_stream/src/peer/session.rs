@@ -59,9 +59,12 @@ impl PeerSession {
     /// A peer alone.
     ///
     /// # Errors
-    /// [`StreamError::Config`].
+    /// [`StreamError::Config`], also for the user number 0, which is a host's.
     pub fn new(config: PeerConfig) -> Result<Self, StreamError> {
         let fail = |what, found: String, expected| Err(StreamError::Config { what, found, expected });
+        if config.user == UserId::HOST {
+            return fail("user", "0".into(), "1 or more");
+        }
         if !(1e-5..=1.0).contains(&config.step) {
             return fail("step", config.step.to_string(), "1e-5 to 1 s");
         }
@@ -113,15 +116,26 @@ impl PeerSession {
         Ok(())
     }
 
-    /// A connection to another peer opened; says hello.
+    /// A connection to another peer opened; says hello. `user` is the number that the peer has been given: under another one it is not
+    /// let in, since the lowest number is believed.
     ///
     /// # Errors
-    /// [`StreamError::Full`] beyond 64.
-    pub fn connect(&mut self, now: Duration, peer: PeerId, max_datagram: usize) -> Result<(), StreamError> {
+    /// [`StreamError::Full`] beyond 64; [`StreamError::Config`] for the number 0, which no peer has, or one's own.
+    pub fn connect(
+        &mut self,
+        now: Duration,
+        peer: PeerId,
+        user: UserId,
+        max_datagram: usize,
+    ) -> Result<(), StreamError> {
+        if user == UserId::HOST || user == self.config.user {
+            let found = user.0.to_string();
+            return Err(StreamError::Config { what: "user", found, expected: "a number of another peer" });
+        }
         if self.others.len() >= MAX_PEERS {
             return Err(StreamError::Full { what: "peers", limit: MAX_PEERS });
         }
-        self.others.insert(peer, Other::new(now, max_datagram));
+        self.others.insert(peer, Other::new(now, user, max_datagram));
         let hello = PeerMessage::Hello {
             version: PROTOCOL_VERSION,
             user: self.config.user.0,
@@ -135,7 +149,7 @@ impl PeerSession {
     /// A connection closed.
     pub fn disconnect(&mut self, peer: PeerId, reason: EndReason) {
         let Some(other) = self.others.remove(&peer) else { return };
-        let Some(user) = other.user else { return };
+        let Some(user) = other.user else { return self.event(PeerEvent::TurnedAway { peer, reason }) };
         if let Some(inputs) = self.inputs.users.get_mut(&user) {
             // All hear the same last input or forecast the same hands a little on; then the hands let go.
             inputs.gone = true;
@@ -192,6 +206,11 @@ impl PeerSession {
     /// Lets go at the next tick.
     pub fn end_grab(&mut self, grab: u16) {
         self.own.remove(&grab);
+    }
+
+    /// Who a connection's peer is; `None` before its hello, and for no connection.
+    pub fn user_of(&self, peer: PeerId) -> Option<UserId> {
+        self.others.get(&peer)?.user
     }
 
     /// A body.
@@ -258,7 +277,7 @@ impl PeerSession {
             Ok(PeerMessage::Hello { version, user, name, joining }) => {
                 let user = UserId(user);
                 let taken = user == self.config.user || self.inputs.users.get(&user).is_some_and(|u| !u.gone);
-                if version != PROTOCOL_VERSION || other.user.is_some() || taken {
+                if version != PROTOCOL_VERSION || other.user.is_some() || user != other.expected || taken {
                     let reason =
                         if version == PROTOCOL_VERSION { EndReason::Protocol } else { EndReason::Version };
                     self.message(peer, &PeerMessage::Goodbye { reason });
