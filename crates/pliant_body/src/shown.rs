@@ -128,6 +128,11 @@ impl ShownState {
         self.settled
     }
 
+    /// The next pose is where it is shown at once: there is none to come from.
+    pub(crate) fn forget_pose(&mut self) {
+        self.poses = None;
+    }
+
     fn check(&self, q: &[f64]) -> Result<(), BodyError> {
         if q.len() != self.current.len() {
             return Err(BodyError::ShownLength { expected: self.current.len(), found: q.len() });

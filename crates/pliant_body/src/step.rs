@@ -14,8 +14,8 @@ use bevy::{
 use pliant_modal::{Body, BodyConfig, GrabConfig, ModalModel, Patch, StepError};
 
 use crate::{
-    AWAKE_BODIES, BodyError, BodyRefused, BodyState, Driven, Grab, GrabForce, Grabs, ModalAsset, ModalBody,
-    Pose, STEP_TIME, ShownState, body::Held,
+    AWAKE_BODIES, BodyError, BodyRefused, BodyState, Driven, Grab, GrabForce, GrabOf, Grabs, ModalAsset,
+    ModalBody, Pose, STEP_TIME, ShownState, body::Held,
 };
 
 /// The tick: how many steps the schedule of the bodies has made. It counts on while bodies rest, and stands while time is paused.
@@ -92,14 +92,15 @@ pub(crate) fn build_bodies(
                             _ => new,
                         };
                         let shown = ShownState::new(new.q());
+                        // Somebody may have despawned it in this very frame.
                         commands
                             .entity(name.entity)
-                            .insert((BodyState::new(new), shown))
-                            .remove::<BuildRefused>();
+                            .try_insert((BodyState::new(new), shown))
+                            .try_remove::<BuildRefused>();
                     }
                     Err(error) => {
                         refusals.tell(&name, name.entity, BodyError::Build(error));
-                        commands.entity(name.entity).insert(BuildRefused(Arc::downgrade(model)));
+                        commands.entity(name.entity).try_insert(BuildRefused(Arc::downgrade(model)));
                     }
                 }
             }
@@ -129,10 +130,32 @@ fn carry_over(name: &NameOrEntityItem, old: &Body, mut new: Body) -> Body {
     new
 }
 
-/// An asset that was removed with its body taken away leaves no state behind.
+/// An entity whose [`ModalBody`] is taken away keeps nothing of the simulation.
 pub(crate) fn drop_states(removed: On<Remove, ModalBody>, mut commands: Commands) {
     if let Ok(mut entity) = commands.get_entity(removed.entity) {
         entity.try_remove::<(BodyState, ShownState, BuildRefused)>();
+    }
+}
+
+/// A grab that is taken off its body feels nothing any more.
+pub(crate) fn let_go(removed: On<Remove, GrabOf>, mut forces: Query<&mut GrabForce>) {
+    feel_nothing(removed.entity, &mut forces);
+}
+
+/// Nor do the grabs on a body that is not there any more.
+pub(crate) fn lose_body(
+    removed: On<Remove, BodyState>,
+    grabs: Query<&Grabs>,
+    mut forces: Query<&mut GrabForce>,
+) {
+    for &grab in grabs.get(removed.entity).map_or(&[][..], Grabs::entities) {
+        feel_nothing(grab, &mut forces);
+    }
+}
+
+fn feel_nothing(grab: Entity, forces: &mut Query<&mut GrabForce>) {
+    if let Ok(mut force) = forces.get_mut(grab) {
+        force.set_if_neq(GrabForce::default());
     }
 }
 
@@ -143,9 +166,12 @@ pub(crate) fn count_tick(mut tick: ResMut<PliantTick>) {
 /// Takes the place of every body whose transform changed.
 pub(crate) fn place_bodies(
     mut refusals: Refusals,
-    mut bodies: Query<(NameOrEntity, &Transform, &GlobalTransform, &mut BodyState), With<ModalBody>>,
+    mut bodies: Query<
+        (NameOrEntity, &Transform, &GlobalTransform, &mut BodyState, &mut ShownState),
+        With<ModalBody>,
+    >,
 ) {
-    for (name, local, global, mut state) in &mut bodies {
+    for (name, local, global, mut state, mut shown) in &mut bodies {
         // A free body has no parent; what was written into its transform since the last frame is not in the global one yet.
         let transform = if state.model().is_free() { GlobalTransform::from(*local) } else { *global };
         let affine = transform.affine();
@@ -174,8 +200,10 @@ pub(crate) fn place_bodies(
         }
         let origin = translation.as_dvec3() / scale;
         let rotation = rotation.as_dquat().normalize();
-        if let Err(error) = state.body_mut().set_pose(origin.into(), rotation.into()) {
-            refusals.tell(&name, name.entity, BodyError::Step(error));
+        match state.body_mut().set_pose(origin.into(), rotation.into()) {
+            // It did not fly here: the picture has nothing to pass through.
+            Ok(()) => shown.bypass_change_detection().forget_pose(),
+            Err(error) => refusals.tell(&name, name.entity, BodyError::Step(error)),
         }
     }
 }
@@ -186,6 +214,7 @@ pub(crate) fn hold_bodies(
     mut refusals: Refusals,
     mut bodies: Query<(&mut BodyState, &Driven, Option<&Grabs>)>,
     grabs: Query<(NameOrEntity, &Grab)>,
+    mut forces: Query<&mut GrabForce>,
 ) {
     for (mut state, driven, list) in &mut bodies {
         let wanted = match (driven, list) {
@@ -198,8 +227,11 @@ pub(crate) fn hold_bodies(
         let BodyState { body, held, scale, quiet, resting, .. } = &mut *state;
         let before = body.grabs().count();
         held.retain(|held| {
-            let stays = wanted.contains(&held.entity)
-                && grabs.get(held.entity).is_ok_and(|(_, grab)| grab.hold().is(&held.hold));
+            let grab = wanted.contains(&held.entity).then(|| grabs.get(held.entity).ok()).flatten();
+            if grab.is_none() {
+                feel_nothing(held.entity, &mut forces);
+            }
+            let stays = grab.is_some_and(|(_, grab)| grab.hold().is(&held.hold));
             if let (false, Some(id)) = (stays, held.id) {
                 body.release(id);
             }

@@ -117,7 +117,7 @@ fn work(
                             match body {
                                 Some(mut body) => body.model = model,
                                 None => {
-                                    commands.entity(name.entity).insert(ModalBody::new(model));
+                                    commands.entity(name.entity).try_insert(ModalBody::new(model));
                                 }
                             }
                         }

@@ -66,7 +66,9 @@ impl Compute {
         let Some(rows) = basis.rows() else { return false };
         let largest = self.limits.max_storage_buffer_binding_size;
         let vertices = basis.vertices().max(drawing.topology.source.len()) as u64;
-        size_of_val(rows) as u64 <= largest.min(self.limits.max_buffer_size)
+        let buffer = largest.min(self.limits.max_buffer_size);
+        size_of_val(rows) as u64 <= buffer
+            && 4 * drawing.topology.words() as u64 <= buffer
             // Twelve floats a vertex is more than any mesh of this plugin has.
             && vertices * 48 <= largest
             && vertices.div_ceil(u64::from(WORKGROUP)) <= u64::from(self.limits.max_compute_workgroups_per_dimension)
@@ -194,8 +196,7 @@ impl Resident {
         let basis = drawing.model.basis();
         let topology = &drawing.topology;
         let (starts, corners) = topology.corners();
-        let mut words: Vec<u32> =
-            Vec::with_capacity(2 * topology.source.len() + starts.len() + 3 * corners.len());
+        let mut words: Vec<u32> = Vec::with_capacity(topology.words());
         words.extend(
             topology.source.iter().zip(&topology.normal).flat_map(|(&source, &normal)| [source, normal]),
         );
@@ -348,6 +349,8 @@ fn prepare(
 ) {
     let device = device.into_inner();
     device.dispatches.clear();
+    // In every frame: a model that nobody draws any more gives its memory back though nothing else moves.
+    device.residents.retain(|_, resident| resident.of.strong_count() > 0);
     if cache.get_compute_pipeline(pipelines.positions).is_none()
         || cache.get_compute_pipeline(pipelines.mesh).is_none()
     {
@@ -373,7 +376,6 @@ fn prepare(
     }
     work.sort_by_key(|(drawing, place, _)| (*drawing, place.buffer.id(), place.first));
 
-    device.residents.retain(|_, resident| resident.of.strong_count() > 0);
     device.surfaces.clear();
     device.jobs.clear();
     device.coordinates.clear();
@@ -516,5 +518,43 @@ fn dispatch(
     }
     if let Some(span) = span {
         span.end(&mut pass);
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use pliant_modal::ModalModel;
+
+    use super::*;
+    use crate::{deform::drawing::Drawings, tests::model};
+
+    #[test]
+    fn a_model_goes_to_a_device_that_holds_each_of_its_buffers() {
+        // Of one mode: what its triangles take is more than what the basis does.
+        let mut parts = model::bar().parts().clone();
+        let rows = parts.displacement.len() / parts.omega.len();
+        parts.displacement.truncate(rows);
+        parts.rotation.truncate(rows);
+        parts.omega.truncate(1);
+        parts.damping.truncate(1);
+        parts.participation.truncate(1);
+        let drawing = Drawings::default().get(&Arc::new(ModalModel::from_parts(parts).unwrap()), 0.9);
+        let topology = &drawing.topology;
+        let (starts, corners) = topology.corners();
+        assert_eq!(topology.words(), 2 * topology.source.len() + starts.len() + 3 * corners.len());
+        let bytes = 4 * topology.words() as u64;
+        let basis = size_of_val(drawing.model.basis().rows().unwrap()) as u64;
+        assert!(bytes > basis && bytes > 48 * topology.source.len() as u64, "{bytes}, {basis}");
+        let takes = |binding: u64, buffer: u64| {
+            let limits = WgpuLimits {
+                max_storage_buffer_binding_size: binding,
+                max_buffer_size: buffer,
+                ..WgpuLimits::default()
+            };
+            Compute { limits, software: false }.takes(&drawing)
+        };
+        assert!(takes(bytes, bytes));
+        assert!(!takes(bytes - 1, bytes));
+        assert!(!takes(bytes, bytes - 1));
     }
 }

@@ -66,6 +66,8 @@ pub enum SurfaceDeformation {
 pub struct DrawnSurface {
     model: Arc<ModalModel>,
     drawing: Arc<Drawing>,
+    /// The mesh that was made for it.
+    mesh: AssetId<Mesh>,
     crease: f32,
     version: u64,
     detail: Detail,
@@ -81,6 +83,7 @@ pub(crate) fn build(app: &mut App) {
         .register_required_components::<ModalBody, SurfaceDetail>()
         .init_resource::<Drawings>()
         .init_resource::<SurfaceDeformation>()
+        .add_observer(take_down)
         .add_systems(PreStartup, gpu::find)
         .add_systems(
             PostUpdate,
@@ -110,7 +113,11 @@ fn make_meshes(
 ) {
     for (entity, state, shown, shading, drawn) in &bodies {
         let model = state.model();
-        if drawn.is_some_and(|drawn| Arc::ptr_eq(&drawn.model, model) && drawn.crease == shading.crease) {
+        // By bits: an angle that is NaN is the same NaN in the next frame.
+        let same = |drawn: &DrawnSurface| {
+            Arc::ptr_eq(&drawn.model, model) && drawn.crease.to_bits() == shading.crease.to_bits()
+        };
+        if drawn.is_some_and(same) {
             continue;
         }
         let drawing = drawings.get(model, shading.crease);
@@ -126,11 +133,14 @@ fn make_meshes(
             &mut mesh,
             &mut scratch,
         );
+        let mesh = meshes.add(mesh);
+        // Somebody may have despawned it in this very frame.
         commands
             .entity(entity)
-            .insert((
-                Mesh3d(meshes.add(mesh)),
+            .try_insert((
+                Mesh3d(mesh.clone()),
                 DrawnSurface {
+                    mesh: mesh.id(),
                     model: model.clone(),
                     drawing,
                     crease: shading.crease,
@@ -141,7 +151,21 @@ fn make_meshes(
                 bounds.unwrap_or_default(),
                 NoAutoAabb,
             ))
-            .remove::<GpuShape>();
+            .try_remove::<GpuShape>();
+    }
+}
+
+/// An entity whose [`ModalBody`] is taken away is not drawn any more; a mesh that somebody has given it since stays.
+fn take_down(
+    removed: On<Remove, ModalBody>,
+    mut commands: Commands,
+    drawn: Query<(&DrawnSurface, Option<&Mesh3d>)>,
+) {
+    let Ok((drawn, mesh)) = drawn.get(removed.entity) else { return };
+    let mut entity = commands.entity(removed.entity);
+    entity.try_remove::<(DrawnSurface, GpuShape)>();
+    if mesh.is_some_and(|mesh| mesh.id() == drawn.mesh) {
+        entity.try_remove::<(Mesh3d, Aabb, NoAutoAabb)>();
     }
 }
 
@@ -229,7 +253,7 @@ fn deform_surfaces(
                     shape.mesh = mesh.id();
                 }
                 None => {
-                    commands.entity(entity).insert(GpuShape {
+                    commands.entity(entity).try_insert(GpuShape {
                         drawing: drawn.drawing.clone(),
                         mesh: mesh.id(),
                         q: q.iter().map(|&q| q as f32).collect(),
@@ -239,7 +263,7 @@ fn deform_surfaces(
             }
         } else {
             if shape.is_some() {
-                commands.entity(entity).remove::<GpuShape>();
+                commands.entity(entity).try_remove::<GpuShape>();
             }
             let Some(mut mesh) = meshes.get_mut(&mesh.0) else { continue };
             let bounds = cpu::write(

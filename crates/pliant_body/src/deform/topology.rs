@@ -19,6 +19,11 @@ pub(super) struct Topology {
 }
 
 impl Topology {
+    /// How many numbers it is on the device: two a drawn vertex, where each normal's corners begin, nine a triangle.
+    pub fn words(&self) -> usize {
+        2 * self.source.len() + self.normals + 1 + 9 * self.triangles.len()
+    }
+
     /// The corners at each normal: where each normal's begin (one more than there are normals), and for each corner the triangle's three
     /// vertices of the surface.
     pub fn corners(&self) -> (Vec<u32>, Vec<[u32; 3]>) {

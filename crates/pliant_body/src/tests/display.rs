@@ -1,13 +1,16 @@
 #![cfg(feature = "render")]
 
 use bevy::{
-    camera::{primitives::Aabb, visibility::ViewVisibility},
+    camera::{
+        primitives::Aabb,
+        visibility::{NoAutoAabb, ViewVisibility},
+    },
     mesh::{MeshPlugin, VertexAttributeValues},
     prelude::*,
 };
 
-use super::{app, model, spawn, state, steps};
-use crate::{Driven, ShownState, SurfaceShading};
+use super::{app, model, spawn, spawn_with, state, steps};
+use crate::{BodyState, DrawnSurface, Driven, ModalBody, ShownState, SurfaceShading};
 
 fn drawn_app() -> App {
     let mut app = app();
@@ -123,4 +126,88 @@ fn another_crease_angle_makes_another_mesh() {
     let smooth = attribute(&app, body, Mesh::ATTRIBUTE_POSITION).len();
     assert_eq!(smooth, state(&app, body).model().surface().positions().len());
     assert!(smooth < sharp);
+}
+
+#[test]
+fn a_crease_angle_that_is_no_number_makes_one_mesh_and_not_one_a_frame() {
+    let mut app = drawn_app();
+    let body = spawn(&mut app, model::bar(), SurfaceShading { crease: f32::NAN });
+    steps(&mut app, 1);
+    let first = app.world().get::<Mesh3d>(body).unwrap().id();
+    steps(&mut app, 3);
+    assert_eq!(app.world().get::<Mesh3d>(body).unwrap().id(), first);
+    assert_eq!(app.world().resource::<Assets<Mesh>>().len(), 1);
+}
+
+#[test]
+fn a_body_whose_component_is_taken_away_is_not_drawn_any_more() {
+    let mut app = drawn_app();
+    let [body, other] = [(); 2].map(|()| spawn(&mut app, model::bar(), ()));
+    steps(&mut app, 2);
+    assert!(app.world().get::<Aabb>(body).is_some());
+    // The other was given a mesh of its own meanwhile, which is not the plugin's to take.
+    let own = app.world_mut().resource_mut::<Assets<Mesh>>().add(Cuboid::default());
+    app.world_mut().entity_mut(other).insert(Mesh3d(own.clone()));
+    for entity in [body, other] {
+        app.world_mut().entity_mut(entity).remove::<ModalBody>();
+    }
+    steps(&mut app, 2);
+    let left = |entity: Entity| {
+        let entity = app.world().entity(entity);
+        [entity.contains::<Mesh3d>(), entity.contains::<DrawnSurface>(), entity.contains::<NoAutoAabb>()]
+    };
+    assert_eq!(left(body), [false; 3]);
+    assert!(app.world().get::<Aabb>(body).is_none());
+    assert!(app.world().get::<BodyState>(body).is_none());
+    assert_eq!(app.world().get::<Mesh3d>(other).unwrap().0, own);
+    assert!(!left(other)[1]);
+}
+
+#[test]
+fn a_body_that_is_despawned_in_the_frame_in_which_it_is_first_drawn_is_no_accident() {
+    let mut app = drawn_app();
+    let kill = |mut commands: Commands, new: Query<Entity, (With<BodyState>, Without<DrawnSurface>)>| {
+        new.iter().for_each(|body| commands.entity(body).try_despawn());
+    };
+    app.add_systems(
+        PostUpdate,
+        kill.after(crate::step::build_bodies).before_ignore_deferred(crate::PliantDisplaySystems::Deform),
+    );
+    let body = spawn(&mut app, model::bar(), ());
+    steps(&mut app, 1);
+    assert!(app.world().get_entity(body).is_err());
+}
+
+#[test]
+fn a_surface_in_half_precision_is_off_by_its_rounding() {
+    // A tip pulled aside by a fifth of the length, an end twisted, and all at once, which goes farther. Single precision is off by 1e-7.
+    let fifth = 0.2 * (model::MASS / 5.0).sqrt();
+    let shapes = [
+        ([fifth, 0.0, 0.0, 0.0], 5.5e-5),
+        ([0.0, -fifth, 0.0, 0.0], 5.5e-5),
+        ([0.0, 0.0, 0.5, 0.0], 5.5e-5),
+        ([0.6 * fifth, 0.6 * fifth, 0.3, -0.3 * fifth], 8e-5),
+    ];
+    for warp in [true, false] {
+        for (q, most) in shapes {
+            let drawn = |half_basis: bool| {
+                let mut app = drawn_app();
+                let settings = |body: &mut ModalBody| (body.half_basis, body.warp) = (half_basis, warp);
+                let body = spawn_with(&mut app, model::bar(), settings, Driven::Remote);
+                see(&mut app, body);
+                app.world_mut().get_mut::<ShownState>(body).unwrap().snap(&q).unwrap();
+                steps(&mut app, 1);
+                (
+                    attribute(&app, body, Mesh::ATTRIBUTE_POSITION),
+                    attribute(&app, body, Mesh::ATTRIBUTE_NORMAL),
+                )
+            };
+            let (single, half) = (drawn(false), drawn(true));
+            let off = single.0.iter().zip(&half.0).map(|(a, b)| a.distance(*b)).fold(0.0, f32::max);
+            let turned = single.1.iter().zip(&half.1).map(|(a, b)| a.distance(*b)).fold(0.0, f32::max);
+            assert!(off > 1e-5, "it was not drawn in half precision: {off} m");
+            assert!(off < most, "warp {warp}, {q:?}: {off} m of 1 m");
+            assert!(turned < 2e-3, "warp {warp}, {q:?}: normals by {turned}");
+        }
+    }
 }

@@ -226,3 +226,53 @@ fn a_remote_body_leaves_its_grabs_to_its_driver() {
     steps(&mut app, 5);
     assert_eq!(force(&app, hand), given);
 }
+
+#[test]
+fn a_hand_that_lost_its_body_feels_nothing() {
+    type Lose = fn(&mut World, Entity, Entity);
+    let ways: [(&str, Lose); 6] = [
+        ("let go", |world, _, hand| {
+            world.entity_mut(hand).remove::<GrabOf>();
+        }),
+        ("no grab any more", |world, _, hand| {
+            world.entity_mut(hand).remove::<Grab>();
+        }),
+        ("no body any more", |world, body, _| {
+            world.entity_mut(body).remove::<ModalBody>();
+        }),
+        ("not simulated any more", |world, body, _| {
+            world.entity_mut(body).remove::<BodyState>();
+            world.entity_mut(body).get_mut::<ModalBody>().unwrap().model = Handle::default();
+        }),
+        ("onto what is no body", |world, _, hand| {
+            let other = world.spawn_empty().id();
+            world.entity_mut(hand).insert(GrabOf(other));
+        }),
+        ("driven by somebody else", |world, body, _| {
+            world.entity_mut(body).insert(Driven::Remote);
+        }),
+    ];
+    for (way, lose) in ways {
+        let mut app = app();
+        let body = spawn(&mut app, model::bar(), ());
+        let hand = grab(&mut app, body, DVec3::new(1.0, 0.05, 0.0));
+        steps(&mut app, 20);
+        assert!(force(&app, hand).force.length() > 1.0);
+        lose(app.world_mut(), body, hand);
+        steps(&mut app, 1);
+        assert_eq!(force(&app, hand), GrabForce::default(), "{way}");
+    }
+    // On a body that somebody else drives, whose hands' forces are that one's to write.
+    for lose in [ways[0].1, ways[2].1] {
+        let mut app = app();
+        let body = spawn(&mut app, model::bar(), Driven::Remote);
+        let hand = grab(&mut app, body, DVec3::new(1.0, 0.05, 0.0));
+        steps(&mut app, 2);
+        let felt = GrabForce { force: DVec3::X, point: DVec3::Y };
+        *app.world_mut().get_mut::<GrabForce>(hand).unwrap() = felt;
+        steps(&mut app, 2);
+        assert_eq!(force(&app, hand), felt);
+        lose(app.world_mut(), body, hand);
+        assert_eq!(force(&app, hand), GrabForce::default());
+    }
+}
