@@ -52,6 +52,7 @@ mod shown;
 mod step;
 #[cfg(test)]
 mod tests;
+mod under_pointer;
 
 use bevy::{
     asset::AssetEventSystems,
@@ -76,6 +77,7 @@ pub use pick::{SurfaceHit, pick_surface};
 pub use pointer::{PointerGrab, PointerGrabPlugin, PointerGrabSystems, PointerHeld};
 pub use shown::{Pose, ShownState};
 pub use step::PliantTick;
+pub use under_pointer::{PointerHit, UnderPointer};
 
 /// Diagnostic: time of one tick's steps of all bodies that are awake, ms.
 pub const STEP_TIME: DiagnosticPath = DiagnosticPath::const_new("pliant/step");

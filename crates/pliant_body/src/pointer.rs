@@ -1,15 +1,9 @@
 //! Dragging bodies with the pointer.
 
-use bevy::{
-    camera::{NormalizedRenderTarget, RenderTarget},
-    input::InputSystems,
-    math::DVec3,
-    prelude::*,
-    window::PrimaryWindow,
-};
+use bevy::{input::InputSystems, math::DVec3, prelude::*};
 use pliant_modal::Patch;
 
-use crate::{BodyState, Grab, GrabOf, NoPointerGrab, ShownState, pick_surface};
+use crate::{Grab, GrabOf, PointerHit, UnderPointer};
 
 /// Lets the pointer drag bodies: press on the deformed surface, drag in the plane that faces the camera through the place that was hit,
 /// let go to release. The grab it makes is an ordinary [`Grab`], on remote bodies too.
@@ -92,82 +86,25 @@ impl Plugin for PointerGrabPlugin {
     }
 }
 
-/// The ray under the pointer through each camera that shows a window, front-most camera first.
-#[derive(bevy::ecs::system::SystemParam)]
-struct PointerRays<'w, 's> {
-    cameras: Query<'w, 's, (Entity, &'static Camera, &'static RenderTarget, &'static GlobalTransform)>,
-    windows: Query<'w, 's, &'static Window>,
-    primary: Query<'w, 's, Entity, With<PrimaryWindow>>,
-}
-
-impl PointerRays<'_, '_> {
-    fn through(&self, camera: Entity) -> Option<(Ray3d, &GlobalTransform)> {
-        let (_, camera, target, transform) = self.cameras.get(camera).ok()?;
-        let NormalizedRenderTarget::Window(window) = target.normalize(self.primary.single().ok())? else {
-            return None;
-        };
-        let cursor = self.windows.get(window.entity()).ok()?.cursor_position()?;
-        let ray = camera.viewport_to_world(transform, cursor).ok()?;
-        Some((ray, transform))
-    }
-
-    /// The front-most active camera whose viewport the pointer is in, and the ray through it.
-    fn front(&self) -> Option<(Entity, Ray3d)> {
-        let mut cameras: Vec<_> = self.cameras.iter().filter(|(_, camera, ..)| camera.is_active).collect();
-        cameras.sort_by_key(|&(entity, camera, ..)| (std::cmp::Reverse(camera.order), entity));
-        cameras.into_iter().find_map(|(entity, camera, target, _)| {
-            let NormalizedRenderTarget::Window(window) = target.normalize(self.primary.single().ok())? else {
-                return None;
-            };
-            let cursor = self.windows.get(window.entity()).ok()?.cursor_position()?;
-            let inside = camera.logical_viewport_rect()?.contains(cursor);
-            inside.then(|| self.through(entity)).flatten().map(|(ray, _)| (entity, ray))
-        })
-    }
-}
-
-/// A body as the pointer sees it.
-type Touchable = (
-    Entity,
-    &'static BodyState,
-    &'static ShownState,
-    &'static GlobalTransform,
-    Option<&'static InheritedVisibility>,
-);
-
 fn press(
     mut commands: Commands,
     settings: Res<PointerGrab>,
     buttons: Option<Res<ButtonInput<MouseButton>>>,
-    rays: PointerRays,
-    bodies: Query<Touchable, Without<NoPointerGrab>>,
+    pointer: UnderPointer,
     held: Query<(), With<PointerHeld>>,
 ) {
     let pressed = buttons.is_some_and(|buttons| buttons.just_pressed(settings.button));
     if !pressed || !settings.enabled || !held.is_empty() {
         return;
     }
-    let Some((camera, ray)) = rays.front() else { return };
-    let hits = bodies.iter().filter(|(.., seen)| seen.is_none_or(|seen| seen.get())).filter_map(
-        |(entity, state, shown, transform, _)| {
-            let positions = state.positions_at(shown.q());
-            let inverse = transform.affine().inverse();
-            // The direction keeps its length in the body's axes, so that distances along it compare between bodies.
-            let origin = inverse.transform_point3(ray.origin).as_dvec3();
-            let direction = inverse.transform_vector3(*ray.direction).as_dvec3();
-            let surface = state.model().surface();
-            let hit = pick_surface(&positions, surface.triangles(), origin.into(), direction.into())?;
-            let radius = settings.radius.max(0.0) * state.model().size();
-            let patch = Patch::around(surface, hit.vertex, radius).ok()?;
-            let middle = middle_of(&patch, &positions);
-            Some((entity, hit, radius, transform.transform_point(middle.as_vec3())))
-        },
-    );
-    let Some((body, hit, radius, middle)) = hits.min_by(|a, b| a.1.distance.total_cmp(&b.1.distance)) else {
-        return;
-    };
+    let Some(PointerHit { camera, ray, body, hit }) = pointer.body(None) else { return };
+    let Some((state, shown, transform)) = pointer.shape(body) else { return };
+    let positions = state.positions_at(shown.q());
+    let radius = settings.radius.max(0.0) * state.model().size();
+    let Ok(patch) = Patch::around(state.model().surface(), hit.vertex, radius) else { return };
+    let middle = transform.transform_point(middle_of(&patch, &positions).as_vec3());
     let point = ray.get_point(hit.distance as f32);
-    let mark = bodies.get(body).map_or(0.01, |(_, state, ..)| 0.015 * state.model().size() as f32);
+    let mark = (0.015 * state.model().size() * state.scale()) as f32;
     commands.spawn((
         Name::new("pointer grab"),
         Grab::new(hit.vertex, radius, middle.as_dvec3()),
@@ -185,7 +122,7 @@ fn drag(
     mut commands: Commands,
     settings: Res<PointerGrab>,
     buttons: Option<Res<ButtonInput<MouseButton>>>,
-    rays: PointerRays,
+    cameras: UnderPointer,
     mut held: Query<(Entity, &PointerHeld, &mut Grab)>,
 ) {
     let down = settings.enabled && buttons.is_some_and(|buttons| buttons.pressed(settings.button));
@@ -195,7 +132,7 @@ fn drag(
             continue;
         }
         // Outside the window the target waits at its last place.
-        let Some((ray, camera)) = rays.through(pointer.camera) else { continue };
+        let Some((ray, camera)) = cameras.through(pointer.camera) else { continue };
         let facing = InfinitePlane3d::new(camera.forward());
         if let Some(distance) = ray.intersect_plane(pointer.hit, facing) {
             let target = ray.get_point(distance).as_dvec3() + pointer.offset;

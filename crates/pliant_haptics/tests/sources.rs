@@ -183,7 +183,7 @@ fn with_empty_hands_the_pointer_lies_on_the_surface() {
     let window = s.window();
     let model = ModalAsset(std::sync::Arc::new(block::block(1e5, 12)));
     let handle = s.app.world_mut().resource_mut::<Assets<ModalAsset>>().add(model);
-    s.app.world_mut().spawn(ModalBody::new(handle));
+    s.app.world_mut().spawn((ModalBody::new(handle), InheritedVisibility::VISIBLE));
     s.run(5);
     // The block is 4 cm thick and so its face 2 cm nearer, where the ray is a hundredth nearer to the middle of the view.
     s.point(window, Some(Vec2::new(0.05, 0.0)));

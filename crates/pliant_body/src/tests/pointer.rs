@@ -1,5 +1,5 @@
 use bevy::{
-    camera::{ComputedCameraValues, RenderTargetInfo},
+    camera::{ComputedCameraValues, RenderTargetInfo, visibility::RenderLayers},
     math::DVec3,
     prelude::*,
     window::PrimaryWindow,
@@ -8,16 +8,21 @@ use bevy::{
 use super::{app, model, spawn_with, state, steps};
 use crate::{Driven, Grab, GrabOf, NoPointerGrab, PointerGrab, PointerGrabPlugin, PointerHeld, ShownState};
 
+/// A camera over the whole window.
+fn camera(order: isize) -> Camera {
+    let size = RenderTargetInfo { physical_size: UVec2::new(800, 600), scale_factor: 1.0 };
+    let clip_from_view = Mat4::perspective_infinite_reverse_rh(1.0, 800.0 / 600.0, 0.1);
+    let computed = ComputedCameraValues { clip_from_view, target_info: Some(size), ..Default::default() };
+    Camera { computed, order, ..Default::default() }
+}
+
 /// A camera two metres from the tip of the bar, looking along -z at a window of 800 x 600, and the bar, driven by hand.
 fn scene() -> (App, Entity, Entity) {
     let mut app = app();
     app.add_plugins(PointerGrabPlugin).init_resource::<ButtonInput<MouseButton>>();
     let window = Window { resolution: (800, 600).into(), ..Default::default() };
     let window = app.world_mut().spawn((window, PrimaryWindow)).id();
-    let size = RenderTargetInfo { physical_size: UVec2::new(800, 600), scale_factor: 1.0 };
-    let clip_from_view = Mat4::perspective_infinite_reverse_rh(1.0, 800.0 / 600.0, 0.1);
-    let computed = ComputedCameraValues { clip_from_view, target_info: Some(size), ..Default::default() };
-    app.world_mut().spawn((Camera { computed, ..Default::default() }, Transform::from_xyz(1.0, 0.0, 2.1)));
+    app.world_mut().spawn((camera(0), Transform::from_xyz(1.0, 0.0, 2.1)));
     let body = spawn_with(
         &mut app,
         model::bar(),
@@ -113,4 +118,49 @@ fn a_body_that_goes_while_it_is_dragged_takes_the_grab_along() {
     app.world_mut().despawn(body);
     point(&mut app, window, Vec2::new(0.0, 0.1), true);
     assert_eq!(held(&mut app), None);
+}
+
+#[test]
+fn a_camera_with_no_body_under_the_pointer_leaves_it_to_the_one_behind() {
+    let here = Transform::from_xyz(1.0, 0.0, 2.1);
+    let away = here.looking_to(Vec3::Z, Vec3::Y);
+    let all = RenderLayers::layer(0);
+    // An interface that looks elsewhere, or at the same place but at other layers; a second camera of the scene; the scene on a layer of its own.
+    for (front, layers, of_scene, of_body, through_front) in [
+        (away, &all, &all, &all, Some(false)),
+        (here, &RenderLayers::layer(5), &all, &all, Some(false)),
+        (here, &RenderLayers::from_layers(&[0, 5]), &all, &all, Some(true)),
+        (away, &all, &RenderLayers::layer(3), &RenderLayers::layer(3), Some(false)),
+        (away, &all, &RenderLayers::layer(3), &all, None),
+    ] {
+        let (mut app, window, body) = scene();
+        let mut cameras = app.world_mut().query_filtered::<Entity, With<Camera>>();
+        let back = cameras.single(app.world()).unwrap();
+        let front = app.world_mut().spawn((camera(1), front, layers.clone())).id();
+        app.world_mut().entity_mut(back).insert(of_scene.clone());
+        app.world_mut().entity_mut(body).insert(of_body.clone());
+        steps(&mut app, 1);
+        point(&mut app, window, Vec2::new(-0.05, 0.0), true);
+        let through = held(&mut app).map(|(grab, ..)| app.world().get::<PointerHeld>(grab).unwrap().camera);
+        assert_eq!(through, through_front.map(|through| if through { front } else { back }));
+        let Some(start) = held(&mut app).map(|(_, grab, _)| grab.target) else { continue };
+        // It is dragged through the camera that took it.
+        point(&mut app, window, Vec2::new(0.05, 0.0), true);
+        let way = held(&mut app).unwrap().1.target - start;
+        assert!((way - DVec3::new(0.1, 0.0, 0.0)).length() < 1e-3, "{way}");
+    }
+}
+
+#[test]
+fn the_mark_at_the_target_is_as_large_as_the_body_makes_it() {
+    let mark = |scale: f32| {
+        let (mut app, window, body) = scene();
+        let place = Transform::from_xyz(1.0 - scale, 0.0, 0.0).with_scale(Vec3::splat(scale));
+        app.world_mut().entity_mut(body).insert(place);
+        steps(&mut app, 2);
+        point(&mut app, window, Vec2::new(-0.05, 0.0), true);
+        let (grab, ..) = held(&mut app).expect("it is under the pointer");
+        app.world().get::<PointerHeld>(grab).unwrap().mark
+    };
+    assert!((mark(2.0) / mark(1.0) - 2.0).abs() < 1e-5);
 }

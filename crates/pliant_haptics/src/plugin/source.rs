@@ -1,12 +1,10 @@
 //! Pointer and gamepad as hands: they move a [`Positioned`](crate::Positioned) device, and the force is shown where nobody can feel it.
 
 use bevy::{
-    camera::{NormalizedRenderTarget, RenderTarget},
     math::{DQuat, DVec3},
     prelude::*,
-    window::PrimaryWindow,
 };
-use pliant_body::{BodyState, NoPointerGrab, ShownState, pick_surface};
+use pliant_body::UnderPointer;
 
 use super::{HapticDevices, HapticTool, ToolGrabs, ToolPose};
 use crate::PositionedHandle;
@@ -18,14 +16,17 @@ use crate::PositionedHandle;
 #[derive(Component, Debug, Clone)]
 pub struct PointerSource {
     handle: PositionedHandle,
-    /// The camera that is looked through. Default: the front-most active one that shows the window.
+    /// The camera that is looked through. Default: the front-most active one of the window with a body under the pointer; where there is none,
+    /// the one before.
     pub camera: Option<Entity>,
+    /// The camera that a body was last seen through.
+    through: Option<Entity>,
 }
 
 impl PointerSource {
     /// For the device that `handle` moves.
     pub fn new(handle: PositionedHandle) -> Self {
-        Self { handle, camera: None }
+        Self { handle, camera: None, through: None }
     }
 }
 
@@ -82,79 +83,51 @@ impl GamepadSource {
     }
 }
 
-type Cameras<'w, 's> =
-    Query<'w, 's, (Entity, &'static Camera, &'static RenderTarget, &'static GlobalTransform)>;
-
-/// The ray under the pointer, and the camera it goes through.
-fn ray(
-    wanted: Option<Entity>,
-    cameras: &Cameras,
-    windows: &Query<&Window>,
-    primary: Option<Entity>,
-) -> Option<(Ray3d, Dir3)> {
-    let mut sorted: Vec<_> = cameras
-        .iter()
-        .filter(|(entity, camera, ..)| camera.is_active && wanted.is_none_or(|wanted| wanted == *entity))
-        .collect();
-    sorted.sort_by_key(|&(entity, camera, ..)| (std::cmp::Reverse(camera.order), entity));
-    sorted.into_iter().find_map(|(_, camera, target, place)| {
-        let NormalizedRenderTarget::Window(window) = target.normalize(primary)? else { return None };
-        let cursor = windows.get(window.entity()).ok()?.cursor_position()?;
-        camera.logical_viewport_rect()?.contains(cursor).then_some(())?;
-        Some((camera.viewport_to_world(place, cursor).ok()?, place.forward()))
-    })
-}
-
 pub(crate) fn point(
     buttons: Option<Res<ButtonInput<MouseButton>>>,
     mut taken: ResMut<PointerButtons>,
     devices: Res<HapticDevices>,
-    cameras: Cameras,
-    windows: Query<&Window>,
-    primary: Query<Entity, With<PrimaryWindow>>,
-    tools: Query<(&HapticTool, &PointerSource, &ToolPose, &GlobalTransform, Option<&ToolGrabs>)>,
-    bodies: Query<(&BodyState, &ShownState, &GlobalTransform), Without<NoPointerGrab>>,
+    pointer: UnderPointer,
+    mut tools: Query<(&HapticTool, &mut PointerSource, &ToolPose, &GlobalTransform, Option<&ToolGrabs>)>,
 ) {
     let bits = taken.0 & bits(|button| buttons.as_ref().is_some_and(|b| b.pressed(button)));
     taken.set_if_neq(PointerButtons(bits));
-    for (tool, source, pose, place, held) in &tools {
+    for (tool, mut source, pose, place, held) in &mut tools {
         let Some(status) = devices.get(tool.device) else { continue };
         let tick = &status.report.tick;
         let at = DVec3::from(tick.position);
-        let Some((ray, facing)) = ray(source.camera, &cameras, &windows, primary.single().ok()) else {
+        let holds = held.is_some_and(|held| !held.entities().is_empty());
+        let hit = if holds { None } else { pointer.body(source.camera) };
+        if hit.is_some() {
+            source.through = hit.map(|hit| hit.camera);
+        }
+        let under = |wanted: Option<Entity>| {
+            pointer
+                .rays()
+                .map(|(camera, _)| camera)
+                .find(|camera| wanted.is_none_or(|wanted| wanted == *camera))
+        };
+        // Until a body was seen any camera is as good as the other.
+        let front = match source.camera {
+            None => source.through.and_then(|last| under(Some(last))).or_else(|| under(None)),
+            wanted => under(wanted),
+        };
+        let Some((ray, camera)) = front.and_then(|camera| pointer.through(camera)) else {
             // Outside the window the hand waits where it is; its buttons still come up.
             source.handle.set_buttons(bits);
             continue;
         };
-        let holds = held.is_some_and(|held| !held.entities().is_empty());
-        let hit = if holds { None } else { surface_under(&ray, &bodies) };
         let plane = || {
-            let distance = ray.intersect_plane(pose.position.as_vec3(), InfinitePlane3d::new(facing))?;
-            Some(ray.get_point(distance))
+            let facing = InfinitePlane3d::new(camera.forward());
+            Some(ray.get_point(ray.intersect_plane(pose.position.as_vec3(), facing)?))
         };
+        let hit = hit.map(|hit| hit.ray.get_point(hit.hit.distance as f32));
         let Some(wanted) = hit.or_else(plane) else { continue };
         // From where the tool is to where it is wanted, so that a clutch or a jump that moved the origin does not matter.
         let turn: DQuat = place.rotation().as_dquat().normalize();
         let way = turn.inverse() * (wanted.as_dvec3() - DVec3::from(tick.tool)) / tool.motion_scale;
         source.handle.set((at + way).into(), bits);
     }
-}
-
-/// The nearest surface point under the pointer.
-fn surface_under(
-    ray: &Ray3d,
-    bodies: &Query<(&BodyState, &ShownState, &GlobalTransform), Without<NoPointerGrab>>,
-) -> Option<Vec3> {
-    let hits = bodies.iter().filter_map(|(state, shown, place)| {
-        let inverse = place.affine().inverse();
-        // The direction keeps its length in the body's axes, so that distances along it compare between bodies.
-        let origin = inverse.transform_point3(ray.origin).as_dvec3();
-        let direction = inverse.transform_vector3(*ray.direction).as_dvec3();
-        let positions = state.positions_at(shown.q());
-        let triangles = state.model().surface().triangles();
-        Some(pick_surface(&positions, triangles, origin.into(), direction.into())?.distance)
-    });
-    Some(ray.get_point(hits.min_by(f64::total_cmp)? as f32))
 }
 
 #[cfg(feature = "gamepad")]
