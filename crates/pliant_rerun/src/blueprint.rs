@@ -1,27 +1,44 @@
 //! The layout that ships with a recording: the scene on the left with the modes' bars and the log under it, plots on the right.
 
-use std::collections::{BTreeMap, BTreeSet};
+use std::collections::{BTreeMap, BTreeSet, HashMap};
 
 use rerun::{
-    EntityPath, EntityPathPart,
+    DynamicArchetype, EntityPath, EntityPathPart, RecordingStreamBuilder, TimePoint, Timeline,
     blueprint::{
         BarChartView, Blueprint, BlueprintActivation, BlueprintPanel, ContainerLike, Horizontal,
         SelectionPanel, Spatial3DView, Tabs, TextLogView, TimePanel, TimeSeriesView, Vertical,
-        components::{PanelState, PlayState},
+        components::{Corner2D, PanelState, PlayState},
     },
+    components::Visible,
+    log::{Chunk, LogMsg},
 };
 
 use crate::recorder::path;
 
-/// Plots that have a place of their own; beyond, those of the machinery share one.
-const MOST_PLOTS: usize = 8;
+/// Plots that have a place of their own; those beyond share the last one, as tabs.
+const MOST_CELLS: usize = 8;
 
 /// Bodies whose bars have a tab; the others' are there to be opened by hand.
 const MOST_TABS: usize = 12;
 
-/// Whether figures are about how the program runs and not about bodies, hands and what the network does to them.
-fn is_housekeeping(area: &str, unit: &str) -> bool {
-    area == "time" || (area == "net" && matches!(unit, "" | "/s"))
+/// How the program runs, not what bodies, hands and the network do: one place, in tabs.
+const HOUSEKEEPING: [&str; 3] = ["time", "frame", "bodies"];
+
+/// What is looked at first comes first; areas that are not named here, a game's own, are where the gap is.
+const FIRST: [&str; 2] = ["reaction", "displacement"];
+const LAST: [&str; 5] = ["energy", "stress", "device", "net", "time"];
+
+/// Of the units of one area, those whose tab is in front.
+const UNITS: [&str; 4] = ["ms", "N", "%", "kbit/s"];
+
+/// One plot: figures with one first part of their path and one unit.
+#[derive(Debug, Clone, PartialEq)]
+pub(crate) struct Plot {
+    pub title: String,
+    pub area: String,
+    pub contents: Vec<String>,
+    /// Lines in it.
+    pub lines: usize,
 }
 
 /// The plots of a recording: figures with one first part of their path and one unit share an axis.
@@ -30,6 +47,8 @@ pub(crate) struct Plots {
     titles: BTreeMap<String, String>,
     /// Area, unit, paths.
     seen: BTreeMap<(String, String), BTreeSet<String>>,
+    /// The unit of each path that was noted.
+    known: HashMap<String, String>,
     /// Bar charts: area, names.
     bars: BTreeMap<&'static str, BTreeSet<String>>,
     changed: bool,
@@ -44,6 +63,11 @@ impl Plots {
 
     /// Notes a figure; `true` when it is a new one.
     pub fn note(&mut self, path: &str, unit: &str) -> bool {
+        // Asked for every figure of every tick.
+        if self.known.get(path).is_some_and(|known| known == unit) {
+            return false;
+        }
+        self.known.insert(path.to_owned(), unit.to_owned());
         let key = (area(path).to_owned(), unit.trim().to_owned());
         let new = self.seen.entry(key).or_default().insert(path.to_owned());
         self.changed |= new;
@@ -69,17 +93,39 @@ impl Plots {
         std::mem::take(&mut self.changed)
     }
 
-    fn view(&self, area: &str, unit: &str, paths: &BTreeSet<String>) -> TimeSeriesView {
-        let title = self.titles.get(area).map_or_else(|| capital(area), Clone::clone);
-        let title = if unit.is_empty() { title } else { format!("{title} ({unit})") };
-        let view = TimeSeriesView::new(title).with_origin(path(area));
-        let alone = self.seen.keys().filter(|(other, _)| other == area).count() == 1;
-        if alone {
-            // Figures that are yet to come find their place by themselves.
-            view.with_contents([format!("{}/**", path(area))])
-        } else {
-            view.with_contents(paths.iter().map(|p| path(p).to_string()))
+    /// The plots of each place, in the order of the places: those of one area share one.
+    pub fn cells(&self) -> Vec<Vec<Plot>> {
+        let mut cells: BTreeMap<(usize, &str), Vec<(usize, Plot)>> = BTreeMap::new();
+        for ((area, unit), paths) in &self.seen {
+            let title = self.titles.get(area).map_or_else(|| capital(area), Clone::clone);
+            let title = if unit.is_empty() { title } else { format!("{title} ({unit})") };
+            let alone = self.seen.keys().filter(|(other, _)| other == area).count() == 1;
+            let contents = if alone {
+                // Figures that are yet to come find their place by themselves.
+                vec![format!("{}/**", path(area))]
+            } else {
+                paths.iter().map(|p| path(p).to_string()).collect()
+            };
+            let cell = if HOUSEKEEPING.contains(&area.as_str()) { HOUSEKEEPING[0] } else { area };
+            let place = match FIRST.iter().position(|first| *first == cell) {
+                Some(place) => place,
+                None => LAST.iter().position(|last| *last == cell).map_or(FIRST.len(), |p| 10 + p),
+            };
+            let front = HOUSEKEEPING.iter().position(|other| other == area).unwrap_or(0) * UNITS.len();
+            let front = front + UNITS.iter().position(|other| other == unit).unwrap_or(UNITS.len());
+            let plot = Plot { title, area: area.clone(), contents, lines: paths.len() };
+            cells.entry((place, cell)).or_default().push((front, plot));
         }
+        let cells = cells.into_values().map(|mut plots| {
+            plots.sort_by_key(|(front, _)| *front);
+            plots.into_iter().map(|(_, plot)| plot).collect()
+        });
+        let mut cells: Vec<Vec<Plot>> = cells.collect();
+        let beyond: Vec<Plot> = cells.drain(MOST_CELLS.min(cells.len())..).flatten().collect();
+        if let Some(last) = cells.last_mut() {
+            last.extend(beyond);
+        }
+        cells
     }
 
     /// The bar charts of an area: one, or a tab for each body.
@@ -99,35 +145,38 @@ impl Plots {
     /// Sends the layout with the recording.
     pub fn send(&self, recording: &rerun::RecordingStream) -> Result<(), rerun::RecordingStreamError> {
         let scene = Spatial3DView::new("Scene").with_origin(EntityPath::from("world"));
-        let of = |housekeeping: bool| -> Vec<ContainerLike> {
-            let plots =
-                self.seen.iter().filter(|((area, unit), _)| is_housekeeping(area, unit) == housekeeping);
-            plots.map(|((area, unit), paths)| self.view(area, unit, paths).into()).collect()
+        let view = |plot: &Plot| -> ContainerLike {
+            TimeSeriesView::new(plot.title.as_str())
+                .with_origin(path(&plot.area))
+                .with_contents(plot.contents.iter().cloned())
+                .into()
         };
-        let (mut plots, mut others) = (of(false), of(true));
-        if plots.len() + others.len() <= MOST_PLOTS {
-            plots.append(&mut others);
-        }
+        let cells = self.cells();
+        let single: BTreeSet<&str> =
+            cells.iter().flatten().filter(|plot| plot.lines == 1).map(|plot| plot.title.as_str()).collect();
+        let plots: Vec<ContainerLike> = cells
+            .iter()
+            .map(|plots| match plots.as_slice() {
+                [plot] => view(plot),
+                plots => Tabs::new(plots.iter().map(view).collect::<Vec<_>>()).into(),
+            })
+            .collect();
         // Bars and text want the width: they go under the scene.
         let bars = [("modes", "Energy of each mode (J)"), ("spectrum", "Spectrum (m over Hz)")];
         let bars: Vec<_> = bars.iter().filter_map(|(area, title)| self.bar_views(area, title)).collect();
         let (mut left, mut shares): (Vec<ContainerLike>, Vec<f32>) = (vec![scene.into()], vec![4.0]);
         if !bars.is_empty() {
             left.push(Horizontal::new(bars).into());
-            shares.push(1.6);
+            shares.push(1.5);
         }
         if self.log {
             left.push(TextLogView::new("Log").with_origin(path("log")).into());
-            shares.push(1.2);
+            shares.push(1.0);
         }
         let left = Vertical::new(left).with_row_shares(shares);
-        // What tells of the machinery and not of the bodies shares one place, in tabs.
-        if !others.is_empty() {
-            plots.push(Tabs::new(others).with_name("More").into());
-        }
         let root: ContainerLike = match plots.len() {
             0 => Horizontal::new([left.into()]).into(),
-            1..=4 => Horizontal::new([left.into(), Vertical::new(plots).into()])
+            1..=3 => Horizontal::new([left.into(), Vertical::new(plots).into()])
                 .with_column_shares([3.0, 2.0])
                 .into(),
             // In pairs, and one that is left over has a row of its own: a grid would leave a hole beside it.
@@ -139,7 +188,7 @@ impl Plots {
                 Horizontal::new([left.into(), plots.into()]).with_column_shares([1.0, 1.15]).into()
             }
         };
-        Blueprint::new(root)
+        let blueprint = Blueprint::new(root)
             .with_auto_views(false)
             .with_auto_layout(false)
             .with_blueprint_panel(BlueprintPanel::from_state(PanelState::Collapsed))
@@ -150,9 +199,55 @@ impl Plots {
                     .with_state(PanelState::Collapsed)
                     .with_timeline(crate::SIM_TIME)
                     .with_play_state(PlayState::Following),
-            )
-            .send(recording, BlueprintActivation::default())
+            );
+        // By way of a memory, as the SDK's own blueprints have no legends.
+        let application = recording.store_info().map(|info| info.application_id().clone());
+        let Some(application) = application else { return Ok(()) };
+        let (stream, memory) = RecordingStreamBuilder::new(application).memory()?;
+        blueprint.send(&stream, BlueprintActivation::default())?;
+        stream.flush_blocking().ok();
+        let mut messages = Vec::new();
+        let mut activation = None;
+        for message in memory.take() {
+            match message {
+                LogMsg::BlueprintActivationCommand(command) => activation = Some(command),
+                message if message.store_id().is_blueprint() => messages.push(message),
+                _ => {}
+            }
+        }
+        let legends: Vec<LogMsg> = messages.iter().filter_map(|message| legend(message, &single)).collect();
+        messages.extend(legends);
+        if let Some(activation) = activation {
+            recording.send_blueprint(messages, activation);
+        }
+        Ok(())
     }
+}
+
+/// The legend of the plot that this message of a blueprint is about, if it is one: none where there is one line only, whose name the title
+/// tells, and else where lines begin and not where they go on.
+fn legend(message: &LogMsg, single: &BTreeSet<&str>) -> Option<LogMsg> {
+    let LogMsg::ArrowMsg(store, data) = message else { return None };
+    let chunk = Chunk::from_arrow_msg(data).ok()?;
+    let text = |name: &str| {
+        let column =
+            chunk.components().values().find(|column| column.descriptor.to_string().ends_with(name))?;
+        let array = column.list_array.values();
+        let array = array.as_any().downcast_ref::<rerun::external::arrow::array::StringArray>()?;
+        array.iter().flatten().next().map(str::to_owned)
+    };
+    if text("class_identifier")? != "TimeSeries" {
+        return None;
+    }
+    let title = text("display_name")?;
+    // The SDK does not export this archetype by its type.
+    let legend = DynamicArchetype::new("rerun.blueprint.archetypes.PlotLegend")
+        .with_component::<Corner2D>("corner", [Corner2D::LeftTop])
+        .with_component::<Visible>("visible", [!single.contains(&*title)]);
+    let entity = chunk.entity_path().join(&EntityPath::from("PlotLegend"));
+    let now = TimePoint::default().with(Timeline::new_sequence("blueprint"), 0);
+    let legend = Chunk::builder(entity).with_archetype_auto_row(now, &legend).build().ok()?;
+    Some(LogMsg::ArrowMsg(store.clone(), legend.to_arrow_msg().ok()?))
 }
 
 fn area(path: &str) -> &str {

@@ -1,34 +1,57 @@
 //! The app's side: reads what others published and offers it to the workers.
 
 use std::{
-    borrow::Cow,
     collections::{HashMap, HashSet},
     sync::Arc,
     time::{Instant, SystemTime},
 };
 
-use bevy::{diagnostic::DiagnosticsStore, ecs::entity::EntityHashMap, prelude::*};
+use bevy::{
+    diagnostic::{DiagnosticPath, DiagnosticsStore},
+    ecs::entity::EntityHashMap,
+    prelude::*,
+};
+use crossbeam_channel::Receiver;
 use pliant_body::{BodyRefused, BodyState, Driven, Grab, GrabForce, PliantTick, ShownState};
 
 use crate::{
     RerunRecording, RerunScalars, RerunStats, RerunStyle,
-    frame::{Drawn, Frame, Hand, Line, Place, Scalar, Shape},
+    frame::{Drawn, Figure, Frame, Hand, Place, Shape},
+    log_lines::LogLines,
     worker::Worker,
 };
 
 #[derive(Resource)]
 pub(crate) struct Collector {
     workers: Vec<Worker>,
+    /// Frames that have been logged, to be filled again: what is recorded every tick takes no memory anew.
+    spare: Receiver<Frame>,
     shapes: Due,
     figures: Due,
     hands: Due,
     modes: Due,
+    words: Due,
     bodies: HashMap<Entity, Followed>,
-    /// Bodies that some worker has not taken notice of.
+    /// Bodies came that no frame has told of.
     untold: bool,
     had_hands: bool,
-    /// Newest measurement of each diagnostic that was recorded.
-    measured: HashMap<String, Instant>,
+    /// The diagnostics that were recorded.
+    measured: HashMap<DiagnosticPath, Measured>,
+    /// Grabs in the order in which they are drawn, and what they are called.
+    order: Vec<Entity>,
+    names: EntityHashMap<Called>,
+}
+
+struct Measured {
+    /// When it was last measured.
+    newest: Instant,
+    figure: Arc<Figure>,
+}
+
+/// A hand's name as it was given, and as it is recorded.
+struct Called {
+    given: String,
+    name: Arc<str>,
 }
 
 /// What a session says of hands.
@@ -68,18 +91,24 @@ impl Due {
     }
 }
 
-/// What of a tick is wanted now.
-#[derive(Debug, Clone, Copy)]
-struct Wanted {
+/// What of a tick is wanted now. Decided before anybody gathers anything, so that a stream that is off costs nothing.
+#[derive(Resource, Debug, Default, Clone, Copy)]
+pub(crate) struct Wanted {
     draw: bool,
     figures: bool,
+    hands: bool,
     /// A sample for the spectrum.
     sample: bool,
-    /// The energies of the modes.
-    energies: bool,
+    /// The energies of the modes as bars.
+    bars: bool,
+    /// What is said in words when it changes; looked at a few times a second.
+    words: bool,
     /// Length of a tick, s.
     tick: f64,
 }
+
+/// How often it is looked for what is said in words, Hz of simulated time.
+const WORDS_HZ: f64 = 10.0;
 
 struct Followed {
     drawn: Arc<Drawn>,
@@ -90,23 +119,88 @@ struct Followed {
 }
 
 impl Collector {
-    pub fn new(workers: Vec<Worker>) -> Self {
+    pub fn new(workers: Vec<Worker>, spare: Receiver<Frame>) -> Self {
         Self {
             workers,
+            spare,
             shapes: Due::NEVER,
             figures: Due::NEVER,
             hands: Due::NEVER,
             modes: Due::NEVER,
+            words: Due::NEVER,
             bodies: HashMap::new(),
             untold: false,
             had_hands: false,
             measured: HashMap::new(),
+            order: Vec::new(),
+            names: EntityHashMap::default(),
         }
     }
 }
 
 pub(crate) fn somebody_listens(collector: Res<Collector>, recording: Res<RerunRecording>) -> bool {
     recording.on && collector.workers.iter().any(Worker::listens)
+}
+
+pub(crate) fn wants_figures(wanted: Res<Wanted>) -> bool {
+    wanted.figures
+}
+
+pub(crate) fn wants_hands(wanted: Res<Wanted>) -> bool {
+    wanted.hands
+}
+
+pub(crate) fn wants_words(wanted: Res<Wanted>) -> bool {
+    wanted.words
+}
+
+/// Nobody listens or nothing is recorded: what was set meanwhile is of another time than what is recorded next.
+pub(crate) fn forget(
+    mut own: ResMut<RerunScalars>,
+    mut wanted: ResMut<Wanted>,
+    lines: Option<Res<LogLines>>,
+) {
+    own.forget_figures();
+    own.lines.clear();
+    *wanted = Wanted::default();
+    if let Some(lines) = lines {
+        lines.0.try_iter().for_each(drop);
+    }
+}
+
+/// What is wanted of this tick.
+pub(crate) fn decide(
+    mut collector: ResMut<Collector>,
+    mut wanted: ResMut<Wanted>,
+    mut own: ResMut<RerunScalars>,
+    mut stats: ResMut<RerunStats>,
+    recording: Res<RerunRecording>,
+    time: Res<Time>,
+) {
+    let collector = &mut *collector;
+    if recording.figures_hz.is_nan() || recording.figures_hz <= 0.0 {
+        // Nobody takes them; later they would be of another time.
+        own.forget_figures();
+    }
+    if collector.workers.iter().all(Worker::is_full) {
+        // Nobody has room for it, so it is not made. What is due stays due.
+        collector.workers.iter_mut().for_each(Worker::miss);
+        collector.bodies.values_mut().for_each(|followed| followed.complete = false);
+        own.forget_figures();
+        stats.dropped = collector.workers.iter().map(Worker::dropped).sum();
+        *wanted = Wanted::default();
+        return;
+    }
+    let now = time.elapsed_secs_f64();
+    *wanted = Wanted {
+        draw: collector.shapes.at(now, recording.shapes_hz),
+        figures: collector.figures.at(now, recording.figures_hz),
+        hands: collector.hands.at(now, recording.hands_hz),
+        sample: recording.modes_hz > 0.0,
+        bars: collector.modes.at(now, recording.modes_hz),
+        words: collector.words.at(now, WORDS_HZ),
+        tick: time.delta_secs_f64(),
+    };
 }
 
 pub(crate) fn close_at_exit(mut collector: ResMut<Collector>) {
@@ -137,82 +231,71 @@ pub(crate) fn collect(
     mut collector: ResMut<Collector>,
     mut stats: ResMut<RerunStats>,
     mut own: ResMut<RerunScalars>,
+    wanted: Res<Wanted>,
     recording: Res<RerunRecording>,
     tick: Res<PliantTick>,
     time: Res<Time>,
     diagnostics: Option<Res<DiagnosticsStore>>,
     mut refused: MessageReader<BodyRefused>,
+    logged: Option<Res<LogLines>>,
     session: Res<Hands>,
     bodies: Bodies,
-    grabs: Query<(Entity, Option<&Name>, &Grab, &GrabForce)>,
+    grabs: Grabs,
 ) {
     let collector = &mut *collector;
-    let now = time.elapsed_secs_f64();
-    let mut frame = Frame {
-        tick: tick.0,
-        time: now,
-        wall: SystemTime::UNIX_EPOCH.elapsed().map_or(0.0, |since| since.as_secs_f64()),
-        colour: recording.colour,
-        lines: std::mem::take(&mut own.lines),
-        ..Frame::default()
-    };
-    frame.lines.extend(
-        refused
-            .read()
-            .map(|refused| Line { warning: true, text: format!("{}: {}", refused.entity, refused.error) }),
-    );
-    let wanted = Wanted {
-        draw: collector.shapes.at(now, recording.shapes_hz),
-        figures: collector.figures.at(now, recording.figures_hz),
-        sample: recording.modes_hz > 0.0,
-        energies: collector.modes.at(now, recording.modes_hz),
-        tick: time.delta_secs_f64(),
-    };
+    let wanted = *wanted;
+    for refused in refused.read() {
+        own.warn(format!("{}: {}", refused.entity, refused.error));
+    }
+    if collector.workers.iter().all(Worker::is_full) && collector.workers.iter().any(Worker::listens) {
+        // `decide` has counted it. The lines wait.
+        return;
+    }
+    let mut frame = collector.spare.try_recv().unwrap_or_default();
+    frame.tick = tick.0;
+    frame.time = time.elapsed_secs_f64();
+    frame.wall = SystemTime::UNIX_EPOCH.elapsed().map_or(0.0, |since| since.as_secs_f64());
+    frame.colour = recording.colour;
+    std::mem::swap(&mut frame.lines, &mut own.lines);
+    if let Some(logged) = logged {
+        frame.lines.extend(logged.0.try_iter());
+    }
     follow_bodies(collector, &mut frame, &bodies, wanted);
-
-    if collector.hands.at(now, recording.hands_hz) {
-        let mut hands: Vec<_> = grabs.iter().collect();
-        hands.sort_by_key(|(entity, ..)| *entity);
-        let hands = hands
-            .into_iter()
-            .map(|(entity, name, grab, force)| hand(name, session.whose.get(&entity), grab, force));
-        let hands: Vec<Hand> = hands.chain(session.others.iter().cloned()).collect();
-        if !hands.is_empty() || collector.had_hands {
-            collector.had_hands = !hands.is_empty();
-            frame.hands = Some(hands);
-        }
+    if wanted.hands {
+        gather_hands(collector, &mut frame, &grabs, &session);
     }
     if wanted.figures {
-        frame.scalars = std::mem::take(&mut own.scalars);
+        std::mem::swap(&mut frame.scalars, &mut own.scalars);
+        std::mem::swap(&mut frame.samples, &mut own.samples);
+        std::mem::swap(&mut frame.measured, &mut own.measured);
         if let Some(diagnostics) = &diagnostics {
-            frame.scalars.extend(measurements(&mut collector.measured, diagnostics));
+            measure(&mut collector.measured, diagnostics, &mut frame.measured);
         }
     }
 
-    if collector.untold {
-        frame.arrived = collector.bodies.values().map(|followed| followed.drawn.clone()).collect();
+    if std::mem::take(&mut collector.untold) {
+        frame.arrived.extend(collector.bodies.values().map(|followed| followed.drawn.clone()));
         frame.arrived.sort_by(|a, b| a.path.cmp(&b.path));
-    }
-    let frame = Arc::new(frame);
-    let mut missed = false;
-    for worker in &mut collector.workers {
-        missed |= !worker.offer(&frame) && worker.listens();
-    }
-    // A frame that was dropped may have told of a body or drawn its last shape: tell again.
-    collector.untold = missed;
-    if missed {
-        collector.bodies.values_mut().for_each(|followed| followed.complete = false);
     }
     stats.collected += 1;
     stats.shapes += frame.shapes.len() as u64;
+    let frame = Arc::new(frame);
+    let mut missed = false;
+    for worker in &mut collector.workers {
+        let all = || collector.bodies.values().map(|followed| followed.drawn.clone()).collect();
+        missed |= !worker.offer(&frame, all) && worker.listens();
+    }
+    if missed {
+        // A frame that was dropped may have drawn the last shape of a body: draw it again.
+        collector.bodies.values_mut().for_each(|followed| followed.complete = false);
+    }
     stats.dropped = collector.workers.iter().map(Worker::dropped).sum();
     stats.sinks = collector.workers.iter().filter(|worker| worker.listens()).count();
 }
 
 fn follow_bodies(collector: &mut Collector, frame: &mut Frame, bodies: &Bodies, wanted: Wanted) {
-    let present: HashSet<Entity> = bodies.iter().map(|(entity, ..)| entity).collect();
     collector.bodies.retain(|entity, followed| {
-        let stays = present.contains(entity);
+        let stays = bodies.contains(*entity);
         if !stays {
             frame.left.push(followed.drawn.path.clone());
         }
@@ -246,16 +329,24 @@ fn follow_bodies(collector: &mut Collector, frame: &mut Frame, bodies: &Bodies, 
         followed.version = shown.version();
         followed.place = Some(place);
         followed.complete = draw && shown.is_settled();
+        let from = frame.coordinates.len();
+        frame.coordinates.extend(shown.current().iter().map(|&q| q as f32));
+        let energies = (wanted.figures || wanted.bars).then(|| {
+            let from = frame.energies.len();
+            energies(&mut frame.energies, state, driven, shown, wanted.tick);
+            from..frame.energies.len()
+        });
         frame.shapes.push(Shape {
             body: followed.drawn.clone(),
-            q: shown.current().iter().map(|&q| q as f32).collect(),
+            coordinates: from..frame.coordinates.len(),
             warped: state.warps(),
             place,
             stiffness: state.body().config().stiffness_scale as f32,
             draw,
             figures: wanted.figures,
             sample: wanted.sample,
-            energies: wanted.energies.then(|| energies(state, driven, shown, wanted.tick)),
+            energies,
+            bars: wanted.bars,
         });
     }
 }
@@ -270,46 +361,88 @@ fn free_path(bodies: &HashMap<Entity, Followed>, entity: Entity, name: Option<&N
     }
 }
 
-/// Kinetic and elastic energy of each mode, J. Of a body that somebody else steps the velocities are those of its shape over the last tick of
-/// `tick` seconds.
-fn energies(state: &BodyState, driven: &Driven, shown: &ShownState, tick: f64) -> Vec<f64> {
+/// Adds kinetic and elastic energy of each mode, J, to `to`. Of a body that somebody else steps the velocities are those of its shape over
+/// the last tick of `tick` seconds.
+fn energies(to: &mut Vec<f64>, state: &BodyState, driven: &Driven, shown: &ShownState, tick: f64) {
     let body = state.body();
     let scale = state.scale() * state.scale();
     let of = |omega: f64, q: f64, v: f64| 0.5 * scale * (v * v + (omega * q).powi(2));
     let kept = body.omega().iter();
     match driven {
-        Driven::Local => kept.zip(body.q()).zip(body.v()).map(|((&omega, &q), &v)| of(omega, q, v)).collect(),
-        Driven::Remote => kept
-            .zip(shown.current().iter().zip(shown.previous()))
-            .map(|(&omega, (&q, &before))| of(omega, q, if tick > 0.0 { (q - before) / tick } else { 0.0 }))
-            .collect(),
+        Driven::Local => {
+            to.extend(kept.zip(body.q()).zip(body.v()).map(|((&omega, &q), &v)| of(omega, q, v)));
+        }
+        Driven::Remote => {
+            to.extend(kept.zip(shown.current().iter().zip(shown.previous())).map(
+                |(&omega, (&q, &before))| of(omega, q, if tick > 0.0 { (q - before) / tick } else { 0.0 }),
+            ))
+        }
     }
 }
 
-fn hand(name: Option<&Name>, whose: Option<&Whose>, grab: &Grab, force: &GrabForce) -> Hand {
-    let name = name.map(Name::as_str).or(whose.map(|whose| whose.name.as_str())).unwrap_or("hand");
-    Hand {
-        name: name.replace('/', " ").into(),
-        colour: whose.map(|whose| whose.colour),
-        force: force.force.into(),
-        point: force.point.into(),
-        target: grab.target.into(),
+type Grabs<'w, 's> = Query<'w, 's, (Entity, Option<&'static Name>, &'static Grab, &'static GrabForce)>;
+
+fn gather_hands(collector: &mut Collector, frame: &mut Frame, grabs: &Grabs, session: &Hands) {
+    let order = &mut collector.order;
+    order.clear();
+    order.extend(grabs.iter().map(|(entity, ..)| entity));
+    order.sort_unstable();
+    let mut hands = frame.take_room();
+    for &entity in &*order {
+        let Ok((_, name, grab, force)) = grabs.get(entity) else { continue };
+        let whose = session.whose.get(&entity);
+        let given = name.map(Name::as_str).or(whose.map(|whose| whose.name.as_str())).unwrap_or("hand");
+        let call = || Called { given: given.to_owned(), name: given.replace('/', " ").into() };
+        let called = collector.names.entry(entity).or_insert_with(call);
+        if called.given != given {
+            *called = call();
+        }
+        hands.push(Hand {
+            name: called.name.clone(),
+            colour: whose.map(|whose| whose.colour),
+            force: force.force.into(),
+            point: force.point.into(),
+            target: grab.target.into(),
+        });
+    }
+    if collector.names.len() > order.len() {
+        let held: HashSet<Entity> = order.iter().copied().collect();
+        collector.names.retain(|entity, _| held.contains(entity));
+    }
+    hands.extend_from_slice(&session.others);
+    if !hands.is_empty() || collector.had_hands {
+        collector.had_hands = !hands.is_empty();
+        frame.hands = Some(hands);
     }
 }
 
-/// The diagnostics under `pliant/` that were measured since the last tick.
-fn measurements(measured: &mut HashMap<String, Instant>, diagnostics: &DiagnosticsStore) -> Vec<Scalar> {
-    let mut scalars = Vec::new();
+/// Where the diagnostics of `pliant_body` go, which have no area of their own in their path: each with those of its kind.
+const AREAS: [(&str, &str); 3] =
+    [("step", "time/step"), ("awake", "bodies/awake"), ("deform", "frame/deform")];
+
+/// Adds the diagnostics under `pliant/` that were measured since the last tick to `to`.
+fn measure(
+    measured: &mut HashMap<DiagnosticPath, Measured>,
+    diagnostics: &DiagnosticsStore,
+    to: &mut Vec<(Arc<Figure>, f64)>,
+) {
     for diagnostic in diagnostics.iter() {
-        let Some(rest) = diagnostic.path().as_str().strip_prefix("pliant/") else { continue };
         let Some(measurement) = diagnostic.measurement() else { continue };
-        if measured.get(rest) == Some(&measurement.time) {
+        let Some(rest) = diagnostic.path().as_str().strip_prefix("pliant/") else { continue };
+        if let Some(known) = measured.get_mut(diagnostic.path()) {
+            if known.newest != measurement.time {
+                known.newest = measurement.time;
+                to.push((known.figure.clone(), measurement.value));
+            }
             continue;
         }
-        measured.insert(rest.to_owned(), measurement.time);
-        let path = if rest.contains('/') { rest.to_owned() } else { format!("time/{rest}") };
-        let unit = diagnostic.suffix.trim().to_owned();
-        scalars.push(Scalar { path: Cow::Owned(path), unit: Cow::Owned(unit), value: measurement.value });
+        let known = AREAS.iter().find(|(name, _)| *name == rest).map(|(_, path)| (*path).to_owned());
+        let path = known.unwrap_or_else(|| match rest.contains('/') {
+            true => rest.to_owned(),
+            false => format!("figures/{rest}"),
+        });
+        let figure = Arc::new(Figure { path, unit: diagnostic.suffix.trim().to_owned() });
+        to.push((figure.clone(), measurement.value));
+        measured.insert(diagnostic.path().clone(), Measured { newest: measurement.time, figure });
     }
-    scalars
 }

@@ -1,34 +1,76 @@
-//! What the devices do: their force, how late their loops are, what the hand got, and what is wrong.
+//! What the devices do: their force, how late their loops are, what the hand got, what is wrong, and every period of their loops.
 
-use std::collections::HashMap;
+use std::{
+    collections::{HashMap, HashSet},
+    sync::Arc,
+};
 
 use bevy::prelude::*;
 use pliant_haptics::{DeviceId, HapticDevices, LoopState};
 
-use crate::RerunScalars;
+use crate::{
+    RerunRecording, RerunScalars,
+    frame::{Figure, Samples},
+};
+
+/// What each device is called: by its name, and the second of one name by its number, too.
+fn names(devices: &HapticDevices) -> Vec<(DeviceId, String)> {
+    let mut names = Vec::new();
+    let mut seen: Vec<&str> = Vec::new();
+    for (id, status) in devices.iter() {
+        let nth = seen.iter().filter(|other| **other == status.info.name).count();
+        seen.push(&status.info.name);
+        let name = status.info.name.replace('/', " ");
+        names.push((id, if nth == 0 { name } else { format!("{name} {}", nth + 1) }));
+    }
+    names
+}
+
+/// The figures of each device, made once: they are set every tick.
+type Figures = Vec<(DeviceId, [Arc<Figure>; 4])>;
+
+pub(crate) fn see_devices(
+    devices: Res<HapticDevices>,
+    mut own: ResMut<RerunScalars>,
+    mut figures: Local<Figures>,
+) {
+    if !devices.iter().map(|(id, _)| id).eq(figures.iter().map(|(id, _)| *id)) {
+        let figure = |name: &str, what: &str, unit: &str| {
+            Arc::new(Figure { path: format!("device/{name}/{what}"), unit: unit.to_owned() })
+        };
+        let of = |name: &str| {
+            [
+                figure(name, "force", "N"),
+                figure(name, "late, 99 %", "us"),
+                figure(name, "missed periods", ""),
+                figure(name, "given to the hand", "J"),
+            ]
+        };
+        *figures = names(&devices).iter().map(|(id, name)| (*id, of(name))).collect();
+    }
+    for ((_, status), (_, [force, late, missed, given])) in devices.iter().zip(&*figures) {
+        let report = &status.report;
+        let newton = report.tick.wrench.force.iter().map(|f| f * f).sum::<f64>().sqrt();
+        own.measured(force, newton);
+        own.measured(late, report.lateness.percentile(0.99) * 1e6);
+        own.measured(missed, report.missed as f64);
+        own.measured(given, report.tick.port.given - report.tick.port.taken);
+    }
+}
 
 /// What was said last of a device: its state, and its fault in words.
 type Said = HashMap<DeviceId, (LoopState, Option<String>)>;
 
-pub(crate) fn see_devices(devices: Res<HapticDevices>, mut own: ResMut<RerunScalars>, mut said: Local<Said>) {
+pub(crate) fn say_how_they_are(
+    devices: Res<HapticDevices>,
+    mut own: ResMut<RerunScalars>,
+    mut said: Local<Said>,
+) {
     said.retain(|id, _| devices.get(*id).is_some());
-    let mut names: Vec<&str> = Vec::new();
-    for (id, status) in devices.iter() {
-        let report = &status.report;
-        let name = status.info.name.replace('/', " ");
-        let nth = names.iter().filter(|other| **other == status.info.name).count();
-        names.push(&status.info.name);
-        let name = if nth == 0 { name } else { format!("{name} {}", nth + 1) };
-        let force = report.tick.wrench.force.iter().map(|f| f * f).sum::<f64>().sqrt();
-        own.set(format!("device/{name}/force"), "N", force);
-        own.set(format!("device/{name}/late, 99 %"), "us", report.lateness.percentile(0.99) * 1e6);
-        own.set(
-            format!("device/{name}/given to the hand"),
-            "J",
-            report.tick.port.given - report.tick.port.taken,
-        );
-        let fault = report.tick.fault.map(|fault| fault.to_string());
-        let now = (report.state, fault);
+    for (id, name) in names(&devices) {
+        let Some(status) = devices.get(id) else { continue };
+        let fault = status.report.tick.fault.map(|fault| fault.to_string());
+        let now = (status.report.state, fault);
         if said.get(&id) == Some(&now) {
             continue;
         }
@@ -39,6 +81,43 @@ pub(crate) fn see_devices(devices: Res<HapticDevices>, mut own: ResMut<RerunScal
             (state, Some(fault)) => own.warn(format!("{name}: {}, {fault}", words(*state))),
         }
         said.insert(id, now);
+    }
+}
+
+/// Every period of the devices' loops, where that is asked for ([`RerunRecording::device_loops`]).
+pub(crate) fn take_samples(
+    mut devices: ResMut<HapticDevices>,
+    recording: Res<RerunRecording>,
+    mut own: ResMut<RerunScalars>,
+    mut asked: Local<HashSet<DeviceId>>,
+) {
+    if !recording.device_loops {
+        for id in asked.drain() {
+            devices.set_recording(id, false);
+        }
+        return;
+    }
+    asked.retain(|id| devices.get(*id).is_some());
+    for (id, name) in names(&devices) {
+        if !asked.contains(&id) {
+            if devices.set_recording(id, true) {
+                asked.insert(id);
+            }
+            continue;
+        }
+        let records = devices.records(id);
+        let Some(newest) = records.last().map(|record| record.now) else { continue };
+        let mut add = |what: &str, unit, value: &dyn Fn(&pliant_haptics::Record) -> f64| {
+            let values = records.iter().map(|record| (newest - record.now, value(record))).collect();
+            own.samples.push(Samples { path: format!("device/{name}/loop/{what}"), unit, values });
+        };
+        for (axis, what) in ["force x", "force y", "force z"].into_iter().enumerate() {
+            add(what, "N", &|record| record.wrench.force[axis]);
+        }
+        for (axis, what) in ["position x", "position y", "position z"].into_iter().enumerate() {
+            add(what, "m", &|record| record.sample.position[axis]);
+        }
+        add("period", "us", &|record| record.dt * 1e6);
     }
 }
 

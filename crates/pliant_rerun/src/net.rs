@@ -36,25 +36,13 @@ pub(crate) fn say_who_comes_and_goes(
     }
 }
 
-/// What was told of the session last.
-#[derive(Default)]
-pub(crate) struct Told {
-    standing: String,
-    let_go: u64,
-    second: f64,
-}
-
-/// The connection's state as lines and as a figure, and what its queues let go.
-pub(crate) fn say_how_it_stands(
-    host: Option<Res<NetHost>>,
-    guest: Option<Res<NetGuest>>,
-    peer: Option<Res<NetPeer>>,
-    stats: Option<Res<NetStats>>,
-    time: Res<Time>,
-    mut own: ResMut<RerunScalars>,
-    mut told: Local<Told>,
-) {
-    let (standing, stands) = match (&host, &guest, &peer) {
+/// How the session stands, in words, and whether this end is in it; `None` where there is no session.
+fn standing(
+    host: Option<&NetHost>,
+    guest: Option<&NetGuest>,
+    peer: Option<&NetPeer>,
+) -> Option<(String, bool)> {
+    Some(match (host, guest, peer) {
         (Some(host), ..) if host.has_ended() => ("the session is over".to_owned(), false),
         (Some(host), ..) => (format!("hosting, {} guests", host.guests().count()), true),
         (None, Some(guest), _) => match guest.state() {
@@ -68,34 +56,69 @@ pub(crate) fn say_how_it_stands(
             PeerState::In { user } => (format!("among peers as user {}", user.0), true),
             PeerState::Closed { reason } => (format!("not in the session: {reason}"), false),
         },
-        (None, None, None) => return,
+        (None, None, None) => return None,
+    })
+}
+
+/// The connection's state, when it becomes another one.
+pub(crate) fn say_how_it_stands(
+    host: Option<Res<NetHost>>,
+    guest: Option<Res<NetGuest>>,
+    peer: Option<Res<NetPeer>>,
+    mut own: ResMut<RerunScalars>,
+    mut told: Local<String>,
+) {
+    let Some((standing, stands)) = standing(host.as_deref(), guest.as_deref(), peer.as_deref()) else {
+        return;
     };
-    let changed = told.standing != standing;
-    if changed {
-        if stands {
-            own.say(standing.clone())
-        } else {
-            own.warn(standing.clone())
-        }
-        told.standing = standing;
-    }
-    let now = time.elapsed_secs_f64();
-    let passed = now - told.second;
-    if !changed && (0.0..1.0).contains(&passed) {
+    if *told == standing {
         return;
     }
-    told.second = now;
+    if stands {
+        own.say(standing.clone());
+    } else {
+        own.warn(standing.clone());
+    }
+    *told = standing;
+}
+
+/// When the session's figures were recorded last, and what they were counted from.
+#[derive(Default)]
+pub(crate) struct Counted {
+    let_go: u64,
+    /// s of simulated time.
+    second: Option<f64>,
+}
+
+/// The connection's state as a figure, how uneven its line is, what waits in its queues and what they let go; once a second.
+pub(crate) fn say_its_figures(
+    host: Option<Res<NetHost>>,
+    guest: Option<Res<NetGuest>>,
+    peer: Option<Res<NetPeer>>,
+    stats: Option<Res<NetStats>>,
+    time: Res<Time>,
+    mut own: ResMut<RerunScalars>,
+    mut counted: Local<Counted>,
+) {
+    let now = time.elapsed_secs_f64();
+    let passed = counted.second.map(|second| now - second);
+    if passed.is_some_and(|passed| (0.0..1.0).contains(&passed)) {
+        return;
+    }
+    let Some((_, stands)) = standing(host.as_deref(), guest.as_deref(), peer.as_deref()) else { return };
+    counted.second = Some(now);
     own.set("net/connected", "", f64::from(u8::from(stands)));
     let Some(stats) = stats else { return };
+    own.set("net/jitter", "ms", stats.jitter.as_secs_f64() * 1e3);
     own.set("net/queueing", "", f64::from(u8::from(stats.queueing)));
     let dropped = stats.dropped;
     let let_go =
         [dropped.send_queue_full, dropped.receive_queue_full, dropped.too_large, dropped.not_connected];
     let let_go: u64 = let_go.into_iter().sum();
-    if passed > 0.0 {
-        own.set("net/let go", "/s", let_go.saturating_sub(told.let_go) as f64 / passed);
+    if let Some(passed) = passed.filter(|passed| *passed > 0.0) {
+        own.set("net/let go", "/s", let_go.saturating_sub(counted.let_go) as f64 / passed);
     }
-    told.let_go = let_go;
+    counted.let_go = let_go;
 }
 
 /// Name and colour of whose hand each grab here is.

@@ -62,7 +62,10 @@ impl RerunPlugin {
                 ("device".into(), "Devices".into()),
                 ("net".into(), "Network".into()),
                 ("stress".into(), "Largest stress".into()),
+                ("energy".into(), "Energy".into()),
                 ("time".into(), "Time a tick".into()),
+                ("frame".into(), "Time a frame".into()),
+                ("bodies".into(), "Bodies that are awake".into()),
             ],
         }
     }
@@ -166,6 +169,9 @@ pub struct RerunRecording {
     pub modes_hz: f64,
     /// What the colour of a surface says. Default: [`RerunColour::Displacement`].
     pub colour: RerunColour,
+    /// Whether every period of the devices' loops is recorded (`device/NAME/loop/`, with the feature `haptics`) while figures are: at 1 kHz about
+    /// 70 kB a second and device. The recording then takes what `HapticDevices::records` would give to others. Default: `false`.
+    pub device_loops: bool,
 }
 
 impl Default for RerunRecording {
@@ -177,6 +183,7 @@ impl Default for RerunRecording {
             hands_hz: f64::INFINITY,
             modes_hz: 4.0,
             colour: RerunColour::default(),
+            device_loops: false,
         }
     }
 }
@@ -216,7 +223,7 @@ pub enum RerunError {
         /// The path that was asked for.
         path: PathBuf,
         /// What the system says.
-        source: Box<rerun::RecordingStreamError>,
+        source: std::io::Error,
     },
     /// The name of the recording is not one.
     #[error("a recording's application name must not be empty, got {name:?}")]
@@ -238,8 +245,9 @@ impl Plugin for RerunPlugin {
         ];
         let plots = Plots::new(self.titles.iter().cloned());
         let mut workers = Vec::new();
+        let (spare, logged) = crossbeam_channel::bounded(self.queue.max(1));
         for target in targets.into_iter().flatten() {
-            match Worker::start(&self.application, &target, self.queue, plots.clone()) {
+            match Worker::start(&self.application, &target, self.queue, plots.clone(), spare.clone()) {
                 Ok(worker) => workers.push(worker),
                 // A game without its recording is better than no game.
                 Err(error) => error!("{error}"),
@@ -248,44 +256,61 @@ impl Plugin for RerunPlugin {
         if workers.is_empty() {
             return;
         }
-        app.insert_resource(collect::Collector::new(workers))
-            .insert_resource(RerunRecording { on: true, ..self.rates })
+        app.world_mut().resource_mut::<RerunStats>().sinks = workers.len();
+        app.insert_resource(collect::Collector::new(workers, logged))
+            .insert_resource(self.rates)
             .register_type::<RerunRecording>()
             .init_resource::<collect::Hands>()
+            .init_resource::<collect::Wanted>()
             .add_systems(
                 self.schedule,
-                collect::collect
-                    .in_set(RerunSystems)
-                    .after(PliantSystems::Publish)
-                    .run_if(collect::somebody_listens),
+                (
+                    collect::decide.in_set(Deciding).run_if(collect::somebody_listens),
+                    collect::collect.in_set(RerunSystems).run_if(collect::somebody_listens),
+                    collect::forget.in_set(RerunSystems).run_if(not(collect::somebody_listens)),
+                ),
+            )
+            .configure_sets(
+                self.schedule,
+                (Deciding.after(PliantSystems::Publish).before(Gathering), Gathering.before(RerunSystems)),
             )
             .add_systems(Last, collect::close_at_exit.run_if(on_message::<AppExit>));
         #[cfg(feature = "net")]
         app.add_systems(
             self.schedule,
             (
-                crate::net::say_who_comes_and_goes.run_if(
-                    resource_exists::<Messages<pliant_net::UserJoined>>
-                        .and_then(resource_exists::<Messages<pliant_net::UserLeft>>)
-                        .and_then(resource_exists::<Messages<pliant_net::GrabRefused>>)
-                        .and_then(resource_exists::<Messages<pliant_net::SessionClosed>>),
-                ),
-                crate::net::say_how_it_stands,
-                crate::net::see_whose_hands,
-                crate::net::see_other_hands,
+                crate::net::say_who_comes_and_goes
+                    .run_if(
+                        resource_exists::<Messages<pliant_net::UserJoined>>
+                            .and_then(resource_exists::<Messages<pliant_net::UserLeft>>)
+                            .and_then(resource_exists::<Messages<pliant_net::GrabRefused>>)
+                            .and_then(resource_exists::<Messages<pliant_net::SessionClosed>>),
+                    )
+                    .run_if(collect::somebody_listens),
+                crate::net::say_how_it_stands.run_if(collect::wants_words),
+                crate::net::say_its_figures.run_if(collect::wants_figures),
+                (crate::net::see_whose_hands, crate::net::see_other_hands).run_if(collect::wants_hands),
             )
-                .after(PliantSystems::Publish)
-                .before(RerunSystems)
-                .run_if(collect::somebody_listens),
+                .in_set(Gathering),
         );
         #[cfg(feature = "haptics")]
         app.add_systems(
             self.schedule,
-            crate::haptics::see_devices
-                .after(PliantSystems::Publish)
-                .before(RerunSystems)
-                .run_if(resource_exists::<pliant_haptics::HapticDevices>)
-                .run_if(collect::somebody_listens),
+            (
+                crate::haptics::say_how_they_are.run_if(collect::wants_words),
+                crate::haptics::see_devices.run_if(collect::wants_figures),
+                crate::haptics::take_samples.run_if(collect::wants_figures),
+            )
+                .in_set(Gathering)
+                .run_if(resource_exists::<pliant_haptics::HapticDevices>),
         );
     }
 }
+
+/// What is wanted of a tick is decided,
+#[derive(SystemSet, Debug, Clone, PartialEq, Eq, Hash)]
+struct Deciding;
+
+/// and gathered by those who have it, before the frame is made in [`RerunSystems`].
+#[derive(SystemSet, Debug, Clone, PartialEq, Eq, Hash)]
+struct Gathering;

@@ -8,14 +8,15 @@ use std::{
 
 use rerun::{
     Arrows3D, BarChart, Color, EntityPath, EntityPathPart, LineStrips3D, Mesh3D, Points3D, Quaternion,
-    RecordingStream, RecordingStreamError, Scalars, SeriesLines, TextLog, TextLogLevel, Transform3D,
-    ViewCoordinates, archetypes::Clear,
+    RecordingStream, RecordingStreamError, SeriesLines, TextLog, TextLogLevel, Transform3D, ViewCoordinates,
+    archetypes::Clear,
 };
 
 use crate::{
     RerunColour, RerunStyle, SIM_TIME, TICK, WALL_TIME,
     blueprint::Plots,
-    frame::{Drawn, Frame, Hand, Place, Shape},
+    columns::{Columns, HandColumns, Moment},
+    frame::{Drawn, Frame, Hand, Line, Owed, Place, Shape},
     motion::Motion,
     stress::Skin,
 };
@@ -64,6 +65,12 @@ pub(crate) struct Recorder {
     normals: Vec<[f32; 3]>,
     sums: Vec<[f32; 3]>,
     stresses: Vec<f32>,
+    /// What is logged now belongs to this moment.
+    now: Moment,
+    columns: Columns,
+    hand_columns: HandColumns,
+    /// The size that arrows, targets and lines were last drawn for, m.
+    drawn_for: f64,
     /// The colour that each line of a plot was given.
     colours: HashMap<String, Color>,
     /// Hands of the last tick that had any, by name.
@@ -92,6 +99,10 @@ impl Recorder {
             normals: Vec::new(),
             sums: Vec::new(),
             stresses: Vec::new(),
+            now: Moment::default(),
+            columns: Columns::default(),
+            hand_columns: HandColumns::default(),
+            drawn_for: 0.0,
             colours: HashMap::new(),
             held: HashSet::new(),
             started: false,
@@ -100,33 +111,12 @@ impl Recorder {
 
     /// Logs one tick at its times.
     pub fn log(&mut self, frame: &Frame) -> Result<(), RecordingStreamError> {
-        if !self.started {
-            self.started = true;
-            // The times are the app's own, not those of the worker.
-            self.stream.set_log_time_enabled(false);
-            self.stream.set_log_tick_enabled(false);
-            self.stream.log_static("world", &ViewCoordinates::RIGHT_HAND_Y_UP())?;
-        }
-        self.stream.set_time_sequence(TICK, i64::try_from(frame.tick).unwrap_or(i64::MAX));
-        self.stream.set_duration_secs(SIM_TIME, frame.time);
-        self.stream.set_timestamp_secs_since_epoch(WALL_TIME, frame.wall);
-
+        self.at(frame)?;
         for name in &frame.left {
-            if self.bodies.remove(name).is_some() {
-                self.stream.log(body_path(name), &Clear::recursive())?;
-            }
+            self.leave(name)?;
         }
         for body in &frame.arrived {
-            let known = self.bodies.get(&body.path).is_some_and(|known| Arc::ptr_eq(&known.body, body));
-            if !known {
-                if self.bodies.contains_key(&body.path) {
-                    self.stream.log(body_path(&body.path), &Clear::recursive())?;
-                }
-                self.size = self.size.max(body.model.size());
-                let known =
-                    Known { body: body.clone(), place: None, meshed: false, motion: None, skin: None };
-                self.bodies.insert(body.path.clone(), known);
-            }
+            self.arrive(body)?;
         }
         for shape in &frame.shapes {
             self.shape(shape, frame)?;
@@ -134,23 +124,95 @@ impl Recorder {
         if let Some(hands) = &frame.hands {
             self.hands(hands)?;
         }
+        for (figure, value) in &frame.measured {
+            self.scalar(&figure.path, &figure.unit, *value)?;
+        }
         for scalar in &frame.scalars {
             self.scalar(&scalar.path, &scalar.unit, scalar.value)?;
         }
-        for line in &frame.lines {
-            self.plots.note_log();
-            let level = if line.warning { TextLogLevel::WARN } else { TextLogLevel::INFO };
-            self.stream.log("log", &TextLog::new(line.text.as_str()).with_level(level))?;
+        for samples in &frame.samples {
+            self.introduce(&samples.path, samples.unit, None)?;
+            for &(before, value) in &samples.values {
+                self.columns.push(&samples.path, self.now.before(before), value);
+            }
+        }
+        self.lines(&frame.lines)?;
+        if self.columns.is_full() {
+            self.send()?;
         }
         self.lay_out(false)
     }
 
+    /// The moment of everything that is logged next.
+    fn at(&mut self, frame: &Frame) -> Result<(), RecordingStreamError> {
+        if !self.started {
+            self.started = true;
+            // The times are the app's own, not those of the worker.
+            self.stream.set_log_time_enabled(false);
+            self.stream.set_log_tick_enabled(false);
+            self.stream.log_static("world", &ViewCoordinates::RIGHT_HAND_Y_UP())?;
+        }
+        self.now = Moment::of(frame);
+        self.stream.set_time_sequence(TICK, i64::try_from(frame.tick).unwrap_or(i64::MAX));
+        self.stream.set_duration_secs(SIM_TIME, frame.time);
+        self.stream.set_timestamp_secs_since_epoch(WALL_TIME, frame.wall);
+        Ok(())
+    }
+
+    /// Tells what was missed between the last frame and `next`, which is logged after it.
+    pub fn catch_up(&mut self, next: &Frame, owed: &Owed) -> Result<(), RecordingStreamError> {
+        self.at(next)?;
+        let gone = self.bodies.keys().filter(|path| !owed.bodies.iter().any(|body| body.path == **path));
+        for path in gone.cloned().collect::<Vec<_>>() {
+            self.leave(&path)?;
+        }
+        for body in &owed.bodies {
+            self.arrive(body)?;
+        }
+        if owed.no_hands && next.hands.is_none() {
+            self.hands(&[])?;
+        }
+        self.lines(&owed.lines)
+    }
+
+    /// Sends the figures and hands that wait.
+    pub fn send(&mut self) -> Result<(), RecordingStreamError> {
+        self.columns.send(&self.stream).and(self.hand_columns.send(&self.stream))
+    }
+
+    fn lines(&mut self, lines: &[Line]) -> Result<(), RecordingStreamError> {
+        for line in lines {
+            self.plots.note_log();
+            let level = if line.warning { TextLogLevel::WARN } else { TextLogLevel::INFO };
+            self.stream.log("log", &TextLog::new(line.text.as_str()).with_level(level))?;
+        }
+        Ok(())
+    }
+
+    fn leave(&mut self, path: &Arc<str>) -> Result<(), RecordingStreamError> {
+        if self.bodies.remove(path).is_some() {
+            self.stream.log(body_path(path), &Clear::recursive())?;
+        }
+        Ok(())
+    }
+
+    fn arrive(&mut self, body: &Arc<Drawn>) -> Result<(), RecordingStreamError> {
+        if self.bodies.get(&body.path).is_some_and(|known| Arc::ptr_eq(&known.body, body)) {
+            return Ok(());
+        }
+        self.leave(&body.path)?;
+        self.size = self.size.max(body.model.size());
+        let known = Known { body: body.clone(), place: None, meshed: false, motion: None, skin: None };
+        self.bodies.insert(body.path.clone(), known);
+        Ok(())
+    }
+
     /// Sends the final layout and everything that is buffered.
     pub fn end(mut self) {
-        let laid_out = self.lay_out(true);
+        let laid_out = self.send().and(self.lay_out(true));
         let flushed = self.stream.flush_blocking();
         if let Err(error) = laid_out {
-            bevy::log::warn!("the layout was not recorded: {error}");
+            bevy::log::warn!("the last figures or the layout were not recorded: {error}");
         }
         if let Err(error) = flushed {
             bevy::log::warn!("the end of the recording may be missing: {error}");
@@ -188,7 +250,7 @@ impl Recorder {
         }
 
         self.positions.resize(surface.positions().len(), [0.0; 3]);
-        model.basis().reconstruct(&shape.q, shape.warped, &mut self.positions);
+        model.basis().reconstruct(frame.coordinates(shape), shape.warped, &mut self.positions);
         let full = FULL_COLOUR * model.size() as f32;
         let mut largest = 0.0f32;
         let by_displacement = shape.draw && frame.colour == RerunColour::Displacement;
@@ -196,7 +258,9 @@ impl Recorder {
         let mut most_stress = None;
         if frame.colour == RerunColour::Stress {
             let skin = known.skin.get_or_insert_with(|| Skin::new(surface));
-            let young = model.info().young as f32 * shape.stiffness;
+            // A scaled body keeps its stiffness in N/m while its lengths grow: it is of a softer material, E L is what stays.
+            let young = model.info().young as f32 * shape.stiffness / shape.place.scale.abs();
+            let young = if young.is_finite() { young } else { 0.0 };
             let poisson = model.info().poisson as f32;
             most_stress = Some(skin.stress(surface, &self.positions, young, poisson, &mut self.stresses));
             if shape.draw {
@@ -246,6 +310,9 @@ impl Recorder {
                 self.scalar(&format!("stress/{}", shape.body.path), "Pa", f64::from(stress))?;
             }
             self.scalar(&format!("displacement/{}", shape.body.path), "m", largest)?;
+            if let Some(energies) = frame.energies(shape) {
+                self.scalar(&format!("energy/{}", shape.body.path), "J", energies.iter().sum())?;
+            }
         }
         Ok(())
     }
@@ -256,13 +323,13 @@ impl Recorder {
         let model = &shape.body.model;
         if shape.sample {
             let motion = known.motion.get_or_insert_with(|| Motion::new(model));
-            motion.push(model, &shape.q, frame.tick, frame.time);
+            motion.push(model, frame.coordinates(shape), frame.tick, frame.time);
         }
-        let Some(energies) = &shape.energies else { return Ok(()) };
+        let Some(energies) = frame.energies(shape).filter(|_| shape.bars) else { return Ok(()) };
         let spectrum = known.motion.as_ref().and_then(Motion::spectrum);
         let name = &shape.body.path;
         let numbers: Vec<f64> = (1..=energies.len()).map(|mode| mode as f64).collect();
-        let bars = BarChart::new(energies.as_slice())
+        let bars = BarChart::new(energies)
             .with_abscissa(numbers.as_slice())
             .with_color(Color::from_rgb(230, 159, 0));
         let path_of =
@@ -292,22 +359,26 @@ impl Recorder {
         let colour_at = |index: usize, hand: &Hand| {
             hand.colour.map_or_else(|| colour_of(index), |[r, g, b]| Color::from_rgb(r, g, b))
         };
-        let colours: Vec<Color> = hands.iter().enumerate().map(|(i, hand)| colour_at(i, hand)).collect();
-        let arrows =
-            Arrows3D::from_vectors(hands.iter().map(|h| single(h.force.map(|f| f * metres_a_newton))))
-                .with_origins(hands.iter().map(|h| single(h.point)))
-                .with_radii([0.008 * self.size as f32])
-                .with_labels(hands.iter().map(|h| format!("{} {:.3} N", h.name, magnitude(&h.force))))
-                .with_colors(colours.clone());
-        self.stream.log("world/hands/reactions", &arrows)?;
-        let targets = Points3D::new(hands.iter().map(|h| single(h.target)))
-            .with_radii([0.012 * self.size as f32])
-            .with_colors(colours.clone());
-        self.stream.log("world/hands/targets", &targets)?;
-        let lines = LineStrips3D::new(hands.iter().map(|h| [single(h.point), single(h.target)]))
-            .with_radii([0.002 * self.size as f32])
-            .with_colors(colours);
-        self.stream.log("world/hands/lines", &lines)?;
+        if self.drawn_for != self.size {
+            self.drawn_for = self.size;
+            let size = self.size as f32;
+            let arrows = Arrows3D::update_fields().with_radii([0.008 * size]);
+            self.stream.log_static("world/hands/reactions", &arrows)?;
+            let targets = Points3D::update_fields().with_radii([0.012 * size]);
+            self.stream.log_static("world/hands/targets", &targets)?;
+            let lines = LineStrips3D::update_fields().with_radii([0.002 * size]);
+            self.stream.log_static("world/hands/lines", &lines)?;
+        }
+        self.hand_columns.begin(self.now);
+        for (index, hand) in hands.iter().enumerate() {
+            self.hand_columns.push(
+                single(hand.force.map(|f| f * metres_a_newton)),
+                single(hand.point),
+                single(hand.target),
+                format!("{} {:.3} N", hand.name, magnitude(&hand.force)),
+                colour_at(index, hand),
+            );
+        }
 
         let mut used = HashSet::new();
         for hand in hands {
@@ -339,7 +410,18 @@ impl Recorder {
         value: f64,
         colour: Option<Color>,
     ) -> Result<(), RecordingStreamError> {
-        let entity = path(name);
+        self.introduce(name, unit, colour)?;
+        self.columns.push(name, self.now, value);
+        Ok(())
+    }
+
+    /// Gives a line its place in the layout, its name and its colour, where those are new.
+    fn introduce(
+        &mut self,
+        name: &str,
+        unit: &str,
+        colour: Option<Color>,
+    ) -> Result<(), RecordingStreamError> {
         let recoloured = colour.is_some_and(|colour| self.colours.get(name) != Some(&colour));
         if let (true, Some(colour)) = (recoloured, colour) {
             self.colours.insert(name.to_owned(), colour);
@@ -348,9 +430,9 @@ impl Recorder {
             let label = name.split_once('/').map_or(name, |(_, rest)| rest);
             let series = SeriesLines::new().with_names([label]).with_widths([1.5]);
             let series = colour.map_or(series.clone(), |colour| series.with_colors([colour]));
-            self.stream.log_static(entity.clone(), &series)?;
+            self.stream.log_static(path(name), &series)?;
         }
-        self.stream.log(entity, &Scalars::single(value))
+        Ok(())
     }
 }
 

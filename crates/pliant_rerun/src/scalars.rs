@@ -1,13 +1,14 @@
 //! Figures and lines of text from anybody.
 
-use std::borrow::Cow;
+use std::{borrow::Cow, sync::Arc};
 
 use bevy::prelude::*;
 
-use crate::frame::{Line, Scalar};
+use crate::frame::{Figure, Line, Samples, Scalar};
 
 /// Figures to be plotted over time, and lines for the log. Written by whoever has them, taken by [`RerunPlugin`](crate::RerunPlugin) every
-/// tick. Systems of a crate that should work without the plugin ask for `Option<ResMut<RerunScalars>>`.
+/// tick for which figures are due ([`RerunRecording::figures_hz`](crate::RerunRecording::figures_hz)); while they are off, or nothing is recorded, what is
+/// set is forgotten. Systems of a crate that should work without the plugin ask for `Option<ResMut<RerunScalars>>`.
 ///
 /// ```
 /// # use bevy::prelude::*;
@@ -22,6 +23,10 @@ use crate::frame::{Line, Scalar};
 pub struct RerunScalars {
     pub(crate) scalars: Vec<Scalar>,
     pub(crate) lines: Vec<Line>,
+    /// Figures whose names are kept by those who set them.
+    pub(crate) measured: Vec<(Arc<Figure>, f64)>,
+    /// Of the devices' own loops.
+    pub(crate) samples: Vec<Samples>,
 }
 
 impl RerunScalars {
@@ -52,6 +57,20 @@ impl RerunScalars {
     /// Writes a warning into the recording's log.
     pub fn warn(&mut self, text: impl Into<String>) {
         self.line(true, text.into());
+    }
+
+    #[cfg(feature = "haptics")]
+    pub(crate) fn measured(&mut self, figure: &Arc<Figure>, value: f64) {
+        if self.measured.len() < Self::LIMIT {
+            self.measured.push((figure.clone(), value));
+        }
+    }
+
+    /// Forgets figures that nobody took at their time.
+    pub(crate) fn forget_figures(&mut self) {
+        self.scalars.clear();
+        self.measured.clear();
+        self.samples.clear();
     }
 
     fn line(&mut self, warning: bool, text: String) {

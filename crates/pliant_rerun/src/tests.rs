@@ -66,7 +66,7 @@ pub(crate) fn body() -> Arc<Drawn> {
 pub(crate) fn frame(tick: u64, body: &Arc<Drawn>, q: f32) -> Frame {
     let shape = Shape {
         body: body.clone(),
-        q: vec![q],
+        coordinates: 0..1,
         warped: false,
         place: HERE,
         stiffness: 1.0,
@@ -74,6 +74,7 @@ pub(crate) fn frame(tick: u64, body: &Arc<Drawn>, q: f32) -> Frame {
         figures: true,
         sample: true,
         energies: None,
+        bars: false,
     };
     Frame {
         tick,
@@ -81,6 +82,7 @@ pub(crate) fn frame(tick: u64, body: &Arc<Drawn>, q: f32) -> Frame {
         wall: 1.7e9 + tick as f64 / 40.0,
         arrived: if tick == 1 { vec![body.clone()] } else { Vec::new() },
         shapes: vec![shape],
+        coordinates: vec![q],
         ..Frame::default()
     }
 }
@@ -91,7 +93,7 @@ pub(crate) fn recorder() -> (Recorder, rerun::RecordingStream, MemorySinkStorage
 }
 
 /// The chunks of the recording itself (not of its layout) for one path, in order.
-fn chunks(messages: &[LogMsg], path: &str) -> Vec<Chunk> {
+pub(crate) fn chunks(messages: &[LogMsg], path: &str) -> Vec<Chunk> {
     let data = messages.iter().filter_map(|message| match message {
         LogMsg::ArrowMsg(store, data) if store.is_recording() => Some(Chunk::from_arrow_msg(data).unwrap()),
         _ => None,
@@ -178,6 +180,11 @@ fn figures_have_their_values_and_the_displacement_is_in_the_world() {
     // One mode lifts the far side by q; the body is drawn twice as large.
     assert_eq!(values("/displacement/my\\ body"), [0.5, 1.0, 1.5, 2.0]);
     assert_eq!(values("/net/round\\ trip"), [196.0; 4]);
+    assert_eq!(
+        chunks(&messages, "/net/round\\ trip").len(),
+        2,
+        "the line's name, and one column of its values"
+    );
 }
 
 #[test]
@@ -218,6 +225,13 @@ fn the_layout_ships_with_the_recording_and_is_made_active() {
         _ => false,
     });
     assert!(views.count() >= 2, "the scene and the plot of the displacement");
+    let legends = messages.iter().filter(|message| match message {
+        LogMsg::ArrowMsg(store, data) if store.is_blueprint() => {
+            Chunk::from_arrow_msg(data).unwrap().entity_path().to_string().ends_with("/PlotLegend")
+        }
+        _ => false,
+    });
+    assert!(legends.count() >= 1);
 }
 
 #[test]
@@ -228,6 +242,23 @@ fn figures_of_two_units_get_two_plots() {
     assert!(plots.note("net/round_trip", "ms"));
     assert!(!plots.note("net/loss_in", "%"), "known");
     assert!(plots.take_changed() && !plots.take_changed());
+    assert!(
+        plots.note("time/step", "ms") && plots.note("frame/deform", "ms") && plots.note("bodies/awake", "")
+    );
+    assert!(plots.note("reaction/left", "N") && plots.note("error/now", "%"));
+    let titles: Vec<Vec<String>> =
+        plots.cells().into_iter().map(|cell| cell.into_iter().map(|plot| plot.title).collect()).collect();
+    let expected: [&[&str]; 4] =
+        [&["Reaction (N)"], &["Error (%)"], &["Net (ms)", "Net (%)"], &["Time (ms)", "Frame (ms)", "Bodies"]];
+    assert_eq!(titles, expected);
+    let net = plots.cells().swap_remove(2);
+    assert_eq!(net[0].contents, ["/net/round_trip"]);
+    assert_eq!(net[1].contents, ["/net/loss_in", "/net/loss_out"]);
+    for i in 0..20 {
+        plots.note(&format!("game{i}/x"), "");
+    }
+    assert_eq!(plots.cells().len(), 8, "the others are tabs of the last");
+    assert_eq!(plots.cells().iter().flatten().count(), 27);
 }
 
 pub(crate) fn app(plugin: RerunPlugin) -> App {

@@ -6,10 +6,10 @@ use rerun::log::LogMsg;
 
 use crate::{
     RerunColour, RerunPlugin, RerunRecording, RerunScalars, RerunStats, RerunStyle,
-    frame::{Frame, Hand},
+    frame::{Frame, Hand, Samples},
     motion::Motion,
     stress::Skin,
-    tests::{app, body, bytes_of_colours, frame, numbers, recorder, rows, scratch, square},
+    tests::{app, body, bytes_of_colours, chunks, frame, numbers, recorder, rows, scratch, square},
 };
 
 #[test]
@@ -80,7 +80,9 @@ fn the_energy_of_each_mode_is_a_bar() {
     let body = body();
     for tick in 1..=300 {
         let mut frame = frame(tick, &body, 0.1);
-        frame.shapes[0].energies = (tick % 100 == 0).then(|| vec![0.25]);
+        frame.shapes[0].bars = tick % 100 == 0;
+        frame.shapes[0].energies = Some(0..1);
+        frame.energies = vec![0.25];
         recorder.log(&frame).unwrap();
     }
     recorder.end();
@@ -127,11 +129,12 @@ fn a_hand_has_its_users_colour_in_the_plot_and_in_the_scene_and_its_line_ends_wi
 
 #[test]
 fn the_colour_says_displacement_or_stress() {
-    let stressed = |colour| {
+    let stressed = |colour, scale| {
         let (mut recorder, stream, storage) = recorder();
         let body = body();
         let mut one = frame(1, &body, 0.3);
         one.colour = colour;
+        one.shapes[0].place.scale = scale;
         recorder.log(&one).unwrap();
         recorder.end();
         drop(stream);
@@ -139,12 +142,51 @@ fn the_colour_says_displacement_or_stress() {
         let stress = numbers(&messages, "/stress/my\\ body", "scalars");
         (bytes_of_colours(&messages, "/world/my\\ body"), stress)
     };
-    let (by_displacement, none) = stressed(RerunColour::Displacement);
-    let (by_stress, largest) = stressed(RerunColour::Stress);
+    let (by_displacement, none) = stressed(RerunColour::Displacement, 1.0);
+    let (by_stress, largest) = stressed(RerunColour::Stress, 1.0);
     assert_eq!((by_displacement.len(), by_stress.len(), none.len(), largest.len()), (4, 4, 0, 1));
     assert_ne!(by_displacement[0], by_displacement[2], "the near side rests, the far side is lifted");
     assert_ne!(by_displacement, by_stress);
     assert!(largest[0] > 0.0);
+    // Twice as large with the same stiffness in N/m: twice the displacement, the same strain, half the stress.
+    let (same, half) = stressed(RerunColour::Stress, 2.0);
+    assert!((half[0] / largest[0] - 0.5).abs() < 1e-6, "{half:?} Pa for half of {largest:?} Pa");
+    assert_eq!(same, by_stress, "the colour is relative to Young's modulus");
+}
+
+#[test]
+fn energies_are_a_line_and_what_comes_faster_than_ticks_has_its_own_times() {
+    let (mut recorder, stream, storage) = recorder();
+    let body = body();
+    for tick in 1..=2 {
+        let mut frame = frame(tick, &body, 0.1);
+        frame.shapes[0].energies = Some(0..2);
+        frame.energies = vec![0.25, 0.5];
+        let values = (0..25).rev().map(|i| (f64::from(i) * 1e-3, f64::from(i))).collect();
+        frame.samples.push(Samples { path: "device/pen/loop/force x".into(), unit: "N", values });
+        recorder.log(&frame).unwrap();
+    }
+    recorder.end();
+    drop(stream);
+    let messages = storage.take();
+    assert_eq!(numbers(&messages, "/energy/my\\ body", "scalars"), [0.75, 0.75]);
+    assert_eq!(rows(&messages, "/modes/my\\ body", "values"), 0, "the bars were not due");
+    let path = "/device/pen/loop/force\\ x";
+    assert_eq!(numbers(&messages, path, "scalars").len(), 50);
+    let columns = chunks(&messages, path);
+    let times = columns.iter().find_map(|chunk| {
+        chunk
+            .timelines()
+            .iter()
+            .find(|(name, _)| name.as_str() == "sim_time")
+            .map(|(_, c)| c.times_raw().to_vec())
+    });
+    let times = times.unwrap();
+    assert_eq!(
+        (times[0], times[24], times[49]),
+        (1_000_000, 25_000_000, 50_000_000),
+        "ns: a millisecond apart"
+    );
 }
 
 /// Frames of an app at these rates: what was collected.
@@ -214,15 +256,4 @@ fn the_log_of_a_tick_whose_figures_are_not_due_is_kept_and_so_are_the_figures() 
     );
     drop(app);
     std::fs::remove_file(path).unwrap();
-}
-
-#[test]
-fn two_bodies_of_one_name_have_their_own_bars() {
-    let mut plots = crate::blueprint::Plots::default();
-    plots.note_bars("modes", "pip");
-    assert!(plots.take_changed());
-    plots.note_bars("modes", "pip");
-    assert!(!plots.take_changed(), "known");
-    plots.note_bars("modes", "pip 2");
-    assert!(plots.take_changed());
 }

@@ -1,21 +1,31 @@
 //! The thread that logs. It may wait for a disk or a viewer; the app never does: it offers a frame, and a full queue drops it.
 
 use std::{
+    any::Any,
     net::{SocketAddr, TcpStream},
     path::PathBuf,
     sync::{
         Arc,
-        atomic::{AtomicU64, Ordering},
+        atomic::{AtomicBool, Ordering},
     },
     thread::JoinHandle,
     time::{Duration, Instant},
 };
 
-use bevy::log::{info, warn};
-use crossbeam_channel::{Receiver, Sender, TrySendError, bounded};
-use rerun::{ApplicationId, RecordingStream, RecordingStreamBuilder, SpawnOptions};
+use bevy::log::{debug, error, info, warn};
+use crossbeam_channel::{Receiver, RecvTimeoutError, Sender, TrySendError, bounded};
+use rerun::{
+    ApplicationId, RecordingStream, RecordingStreamBuilder, RecordingStreamError, SpawnOptions,
+    log::ChunkBatcherConfig,
+    sink::{GrpcSink, GrpcSinkConnectionState, LogSink},
+};
 
-use crate::{RerunError, blueprint::Plots, frame::Frame, recorder::Recorder};
+use crate::{
+    RerunError,
+    blueprint::Plots,
+    frame::{Drawn, Frame, Owed},
+    recorder::Recorder,
+};
 
 /// How long a viewer may take to start.
 const VIEWER_START: Duration = Duration::from_secs(10);
@@ -31,62 +41,135 @@ pub(crate) enum Target {
     Viewer { port: u16, spawn: bool },
 }
 
+/// How long a worker lets ticks gather before it logs them: it is woken a few times a second and not by every tick.
+const PAUSE: Duration = Duration::from_millis(100);
+
+/// Figures are sent so often to a viewer, which shows them as they come, and to a file, where fewer and longer columns are smaller.
+const VIEWER_COLUMNS: Duration = Duration::from_millis(90);
+const FILE_COLUMNS: Duration = Duration::from_millis(500);
+
+/// How often it is looked whether the viewer is still there.
+const WATCH: Duration = Duration::from_secs(1);
+
+/// One tick on its way to a worker.
+pub(crate) struct Message {
+    pub frame: Arc<Frame>,
+    pub owed: Option<Owed>,
+}
+
 /// One worker as the app sees it.
 pub(crate) struct Worker {
-    frames: Option<Sender<Arc<Frame>>>,
+    frames: Option<Sender<Message>>,
+    /// Wakes the worker; dropped, it tells it to end.
+    nudge: Option<Sender<()>>,
     thread: Option<JoinHandle<()>>,
     ended: Receiver<()>,
     patience: Duration,
-    dropped: Arc<AtomicU64>,
+    dropped: u64,
+    owed: Option<Owed>,
 }
 
 impl Worker {
-    /// Starts a worker with room for `queue` frames. A file is created here, so that a wrong path is told at once.
-    pub fn start(application: &str, target: &Target, queue: usize, plots: Plots) -> Result<Self, RerunError> {
+    /// Starts a worker with room for `queue` frames. A file is created here, so that a wrong path is told at once. Frames that have been
+    /// logged go to `spare`, for their memory.
+    pub fn start(
+        application: &str,
+        target: &Target,
+        queue: usize,
+        plots: Plots,
+        spare: Sender<Frame>,
+    ) -> Result<Self, RerunError> {
         let id = ApplicationId::try_from(application.to_owned())
             .map_err(|_| RerunError::Application { name: application.to_owned() })?;
         let builder = RecordingStreamBuilder::new(id);
         let (frames, inbox) = bounded(queue.max(1));
+        let (nudge, nudged) = bounded(1);
         let (end, ended) = bounded(1);
-        let (opened, patience) = match target.clone() {
+        let patience = match target {
             Target::File(path) => {
-                let stream = builder
-                    .save(&path)
-                    .map_err(|source| RerunError::File { path: path.clone(), source: Box::new(source) })?;
+                std::fs::File::create(path)
+                    .map_err(|source| RerunError::File { path: path.clone(), source })?;
                 info!("recording to {}", path.display());
-                (Opened::Stream(stream), FILE_END)
+                FILE_END
             }
-            Target::Viewer { port, spawn } => {
-                (Opened::Later { builder: Box::new(builder), port, spawn }, VIEWER_END)
-            }
+            Target::Viewer { .. } => VIEWER_END,
         };
+        let target = target.clone();
         let thread = std::thread::Builder::new()
             .name("pliant rerun".into())
             .spawn(move || {
-                match opened.stream() {
-                    Some(stream) => record(&stream, &inbox, plots),
+                // Before there is a stream: the threads that it makes inherit it.
+                give_way();
+                match target.open(builder) {
+                    Some(stream) => record(&stream, &target, Inbox { frames: inbox, nudged, spare }, plots),
                     // Dropping the inbox tells the app that nobody listens.
                     None => drop(inbox),
                 }
                 drop(end);
             })
             .map_err(RerunError::Thread)?;
-        Ok(Self { frames: Some(frames), thread: Some(thread), ended, patience, dropped: Arc::default() })
+        Ok(Self {
+            frames: Some(frames),
+            nudge: Some(nudge),
+            thread: Some(thread),
+            ended,
+            patience,
+            dropped: 0,
+            owed: None,
+        })
     }
 
-    /// Offers a frame without waiting; `false` when it was not taken. A worker that has ended takes nothing and drops nothing.
-    pub fn offer(&mut self, frame: &Arc<Frame>) -> bool {
+    /// A worker whose frames a test takes.
+    #[cfg(test)]
+    pub fn held(queue: usize) -> (Self, Receiver<Message>) {
+        let (frames, inbox) = bounded(queue);
+        let (_, ended) = bounded(1);
+        let patience = Duration::ZERO;
+        let worker =
+            Self { frames: Some(frames), nudge: None, thread: None, ended, patience, dropped: 0, owed: None };
+        (worker, inbox)
+    }
+
+    /// Offers a frame without waiting; `false` when it was not taken. A worker that has ended takes nothing and drops nothing. One that
+    /// missed something is told of `bodies`, all that there are.
+    pub fn offer(&mut self, frame: &Arc<Frame>, bodies: impl FnOnce() -> Vec<Arc<Drawn>>) -> bool {
         let Some(frames) = &self.frames else { return false };
-        match frames.try_send(frame.clone()) {
-            Ok(()) => true,
-            Err(TrySendError::Full(_)) => {
-                self.dropped.fetch_add(1, Ordering::Relaxed);
+        let owed = self.owed.take().map(|owed| Owed { bodies: bodies(), ..owed });
+        match frames.try_send(Message { frame: frame.clone(), owed }) {
+            Ok(()) => {
+                // A queue that fills faster than the worker looks.
+                if frames.capacity().is_some_and(|room| 2 * frames.len() >= room)
+                    && let Some(nudge) = &self.nudge
+                {
+                    // Full: it is being woken.
+                    nudge.try_send(()).ok();
+                }
+                true
+            }
+            Err(TrySendError::Full(Message { owed, .. })) => {
+                self.dropped += 1;
+                let mut owed = owed.unwrap_or_default();
+                owed.add(frame);
+                self.owed = Some(owed);
                 false
             }
             Err(TrySendError::Disconnected(_)) => {
                 self.frames = None;
                 false
             }
+        }
+    }
+
+    /// Whether a frame would not be taken.
+    pub fn is_full(&self) -> bool {
+        self.frames.as_ref().is_none_or(Sender::is_full)
+    }
+
+    /// Counts a frame that was not even made, as nobody had room for it.
+    pub fn miss(&mut self) {
+        if self.frames.is_some() {
+            self.dropped += 1;
+            self.owed.get_or_insert_default();
         }
     }
 
@@ -97,12 +180,13 @@ impl Worker {
 
     /// Frames that were not taken because the queue was full.
     pub fn dropped(&self) -> u64 {
-        self.dropped.load(Ordering::Relaxed)
+        self.dropped
     }
 
     /// Lets the worker log what is queued and close its recording.
     pub fn close(&mut self) {
         self.frames = None;
+        self.nudge = None;
         let Some(thread) = self.thread.take() else { return };
         match self.ended.recv_timeout(self.patience) {
             Err(crossbeam_channel::RecvTimeoutError::Timeout) => {
@@ -123,34 +207,108 @@ impl Drop for Worker {
     }
 }
 
-fn record(stream: &RecordingStream, inbox: &Receiver<Arc<Frame>>, plots: Plots) {
+/// Lowers the priority of this thread: what it does can wait, and a frame cannot. On Linux the threads that it starts inherit that.
+///
+/// Not as far as `SCHED_IDLE`: on a machine that is busy all the time a recording would never come to its end.
+fn give_way() {
+    use thread_priority::{ThreadPriority, ThreadPriorityValue};
+    // A quarter of the way up; on Linux that is a nice value of 9.
+    let Ok(priority) = ThreadPriorityValue::try_from(25_u8).map(ThreadPriority::Crossplatform) else {
+        return;
+    };
+    #[cfg(target_os = "linux")]
+    let result = {
+        use thread_priority::{
+            NormalThreadSchedulePolicy, ThreadSchedulePolicy, set_thread_priority_and_policy,
+            thread_native_id,
+        };
+        // A batch thread that wakes up does not push another off its core.
+        let policy = ThreadSchedulePolicy::Normal(NormalThreadSchedulePolicy::Batch);
+        set_thread_priority_and_policy(thread_native_id(), priority, policy)
+    };
+    #[cfg(not(target_os = "linux"))]
+    let result = priority.set_for_current();
+    if let Err(error) = result {
+        debug!("the recording thread keeps its priority: {error:?}");
+    }
+}
+
+/// What a worker takes from, and gives back to.
+struct Inbox {
+    frames: Receiver<Message>,
+    nudged: Receiver<()>,
+    spare: Sender<Frame>,
+}
+
+/// Logs until the app ends or the viewer is gone. Owns the inbox: dropping it tells the app that nobody listens.
+fn record(stream: &RecordingStream, target: &Target, inbox: Inbox, plots: Plots) {
     let mut recorder = Recorder::new(stream.clone(), plots);
     let mut failing = false;
-    for frame in inbox {
-        match recorder.log(&frame) {
-            Ok(()) => failing = false,
-            Err(error) => {
-                if !failing {
-                    warn!("tick {} was not recorded: {error}", frame.tick);
-                }
-                failing = true;
+    let (mut sent, mut watched) = (Instant::now(), Instant::now());
+    let lost = Arc::new(AtomicBool::new(false));
+    let columns = if matches!(target, Target::File(_)) { FILE_COLUMNS } else { VIEWER_COLUMNS };
+    loop {
+        let ends = inbox.nudged.recv_timeout(PAUSE) == Err(RecvTimeoutError::Disconnected);
+        for Message { frame, owed } in inbox.frames.try_iter() {
+            let mut logged = owed.map_or(Ok(()), |owed| recorder.catch_up(&frame, &owed));
+            logged = logged.and(recorder.log(&frame));
+            tell(logged, frame.tick, &mut failing);
+            if let Some(frame) = Arc::into_inner(frame) {
+                // No room: enough of them wait already.
+                inbox.spare.try_send(frame.cleared()).ok();
             }
+            // The SDK takes in what a closed viewer does not, so that has to be asked for; also between ticks, as there may be many.
+            if let Target::Viewer { port, .. } = target
+                && watched.elapsed() >= WATCH
+            {
+                watched = Instant::now();
+                let seen = lost.clone();
+                stream.inspect_sink(move |sink| seen.store(is_lost(sink), Ordering::Relaxed));
+                if lost.load(Ordering::Relaxed) {
+                    info!("the rerun viewer on port {port} was closed: going on without it");
+                    // The app hears of it before the SDK has tidied up.
+                    drop(inbox);
+                    return;
+                }
+            }
+        }
+        if ends {
+            break;
+        }
+        if sent.elapsed() >= columns {
+            sent = Instant::now();
+            tell(recorder.send(), 0, &mut failing);
         }
     }
     recorder.end();
 }
 
-enum Opened {
-    Stream(RecordingStream),
-    Later { builder: Box<RecordingStreamBuilder>, port: u16, spawn: bool },
+fn tell(logged: Result<(), RecordingStreamError>, tick: u64, failing: &mut bool) {
+    if let Err(error) = &logged
+        && !*failing
+    {
+        warn!("tick {tick} was not recorded: {error}");
+    }
+    *failing = logged.is_err();
 }
 
-impl Opened {
+fn is_lost(sink: &dyn LogSink) -> bool {
+    let sink: &dyn Any = sink;
+    sink.downcast_ref::<GrpcSink>()
+        .is_some_and(|sink| matches!(sink.status(), GrpcSinkConnectionState::Disconnected(_)))
+}
+
+impl Target {
     /// A stream to something that is there. The SDK's own connection would wait for a viewer for ever, and at its end, too.
-    fn stream(self) -> Option<RecordingStream> {
-        let (builder, port, spawn) = match self {
-            Self::Stream(stream) => return Some(stream),
-            Self::Later { builder, port, spawn } => (builder, port, spawn),
+    fn open(&self, builder: RecordingStreamBuilder) -> Option<RecordingStream> {
+        let (port, spawn) = match self {
+            Self::File(path) => {
+                let stream = builder.save(path);
+                return stream
+                    .inspect_err(|error| error!("cannot record to {}: {error}", path.display()))
+                    .ok();
+            }
+            &Self::Viewer { port, spawn } => (port, spawn),
         };
         if !listens(port) {
             if !spawn {
@@ -174,7 +332,11 @@ impl Opened {
                 std::thread::sleep(Duration::from_millis(100));
             }
         }
-        match builder.connect_grpc_opts(format!("rerun+http://127.0.0.1:{port}/proxy")) {
+        // The SDK's own choice is to flush its rows every 8 ms.
+        match builder
+            .batcher_config(ChunkBatcherConfig { flush_tick: PAUSE, ..ChunkBatcherConfig::DEFAULT })
+            .connect_grpc_opts(format!("rerun+http://127.0.0.1:{port}/proxy"))
+        {
             Ok(stream) => {
                 info!("streaming to the rerun viewer on port {port}");
                 Some(stream)

@@ -1,0 +1,225 @@
+//! What a sink that is slow, closed or off is told, and what it costs.
+
+use std::time::{Duration, Instant};
+
+use bevy::{
+    log::{
+        debug, info,
+        tracing::subscriber,
+        tracing_subscriber::{layer::SubscriberExt, registry},
+        warn,
+    },
+    prelude::*,
+};
+use crossbeam_channel::{Receiver, bounded};
+use pliant_body::{Grab, ModalBody};
+
+use crate::{
+    RerunPlugin, RerunRecording, RerunScalars, RerunStats,
+    collect::Collector,
+    log_lines::Lines,
+    tests::{app, numbers, recorder, rows, scratch},
+    worker::{Message, Worker},
+};
+
+/// An app whose sinks are queues that the test empties.
+fn app_to(name: &str, queues: &[usize]) -> (App, Vec<Receiver<Message>>) {
+    let path = scratch(name);
+    let mut app = app(RerunPlugin::file(&path));
+    let (workers, inboxes) = queues.iter().map(|&room| Worker::held(room)).unzip();
+    let (_, spare) = bounded(1);
+    app.insert_resource(Collector::new(workers, spare));
+    std::fs::remove_file(path).unwrap();
+    (app, inboxes)
+}
+
+/// Logs what a queue holds.
+fn played(inbox: &Receiver<Message>) -> Vec<rerun::log::LogMsg> {
+    let (mut recorder, stream, storage) = recorder();
+    for Message { frame, owed } in inbox.try_iter() {
+        if let Some(owed) = owed {
+            recorder.catch_up(&frame, &owed).unwrap();
+        }
+        recorder.log(&frame).unwrap();
+    }
+    recorder.end();
+    drop(stream);
+    storage.take()
+}
+
+#[test]
+fn what_went_in_a_tick_without_room_is_made_up_for() {
+    // Alone the slow sink's ticks are not even made; beside another they are, and it is owed what was in them.
+    for queues in [&[2][..], &[2, 1000][..]] {
+        let (mut app, inboxes) = app_to(&format!("owed{}", queues.len()), queues);
+        let slow = &inboxes[0];
+        let mut seen: Vec<Message> = Vec::new();
+        while !(seen.iter().any(|m| !m.frame.arrived.is_empty())
+            && seen.iter().any(|m| m.frame.hands.is_some()))
+        {
+            assert!(seen.len() < 20, "body and hand are there");
+            app.update();
+            seen.extend(slow.try_iter());
+        }
+        // It reads no more, and its two places fill; then hand and body go, and somebody says so.
+        app.update();
+        app.update();
+        let gone: Vec<Entity> = app
+            .world_mut()
+            .query_filtered::<Entity, Or<(With<Grab>, With<ModalBody>)>>()
+            .iter(app.world())
+            .collect();
+        gone.into_iter().for_each(|entity| app.world_mut().despawn(entity).then_some(()).unwrap());
+        for line in ["first", "second", "third"] {
+            app.world_mut().resource_mut::<RerunScalars>().say(line);
+            app.world_mut().resource_mut::<RerunScalars>().set("of/then", "", 1.0);
+            app.update();
+        }
+        assert_eq!(app.world().resource::<RerunStats>().dropped, 3);
+        seen.extend(slow.try_iter());
+        app.update();
+        seen.extend(slow.try_iter());
+        let (again, inbox) = bounded(32);
+        seen.into_iter().for_each(|message| again.send(message).ok().unwrap());
+        let messages = played(&inbox);
+        assert_eq!(rows(&messages, "/world/square", "is_recursive"), 1, "the body does not stay as a ghost");
+        assert_eq!(rows(&messages, "/reaction/hand", "is_recursive"), 1, "nor does the hand");
+        assert_eq!(rows(&messages, "/log", "text"), 3, "every line, once");
+        assert!(
+            numbers(&messages, "/of/then", "scalars").is_empty(),
+            "figures of a lost tick are not another's"
+        );
+        if let Some(quick) = inboxes.get(1) {
+            let messages = played(quick);
+            assert_eq!(rows(&messages, "/log", "text"), 3, "the other sink had them already");
+            assert_eq!(rows(&messages, "/world/square", "is_recursive"), 1);
+        }
+    }
+}
+
+#[test]
+fn two_bodies_of_one_name_are_two_bodies() {
+    let (mut app, inboxes) = app_to("names", &[100]);
+    let first = app.world_mut().query::<&ModalBody>().single(app.world()).unwrap().clone();
+    app.world_mut().spawn((first, Name::new("square")));
+    (0..3).for_each(|_| app.update());
+    let paths: Vec<String> = inboxes[0]
+        .try_iter()
+        .flat_map(|message| {
+            message.frame.arrived.iter().map(|body| body.path.to_string()).collect::<Vec<_>>()
+        })
+        .collect();
+    let mut different = paths.clone();
+    different.sort();
+    different.dedup();
+    assert_eq!(different.len(), 2, "{paths:?}");
+    assert_eq!(different[0], "square");
+    assert!(different[1].starts_with("square "), "{paths:?}");
+}
+
+#[test]
+fn what_is_set_while_nothing_is_recorded_is_not_recorded_later() {
+    let (mut app, inboxes) = app_to("stale", &[100]);
+    let set = |app: &mut App, value: f64| {
+        app.world_mut().resource_mut::<RerunScalars>().set("a/b", "", value);
+        app.world_mut().resource_mut::<RerunScalars>().say(format!("{value}"));
+        app.update();
+    };
+    app.world_mut().resource_mut::<RerunRecording>().figures_hz = 0.0;
+    set(&mut app, 1.0);
+    app.world_mut().resource_mut::<RerunRecording>().on = false;
+    set(&mut app, 2.0);
+    *app.world_mut().resource_mut::<RerunRecording>() = RerunRecording::default();
+    app.update();
+    set(&mut app, 3.0);
+    let messages = played(&inboxes[0]);
+    assert_eq!(numbers(&messages, "/a/b", "scalars"), [3.0]);
+    assert_eq!(rows(&messages, "/log", "text"), 2, "the first and the third: lines go with every tick");
+}
+
+#[test]
+fn a_recording_that_starts_off_is_off_and_knows_its_sinks_before_the_first_tick() {
+    let path = scratch("off from the start");
+    let mut app = App::new();
+    let off = RerunRecording { on: false, ..RerunRecording::default() };
+    app.add_plugins((MinimalPlugins, AssetPlugin::default(), pliant_body::PliantBodyPlugin::default()))
+        .add_plugins(RerunPlugin::file(&path).with_rates(off));
+    assert_eq!(app.world().resource::<RerunStats>().sinks, 1);
+    assert!(!app.world().resource::<RerunRecording>().on);
+    drop(app);
+    std::fs::remove_file(path).unwrap();
+}
+
+#[test]
+fn a_viewer_that_is_closed_is_noticed() {
+    let listener = std::net::TcpListener::bind("127.0.0.1:0").unwrap();
+    let port = listener.local_addr().unwrap().port();
+    listener.set_nonblocking(true).unwrap();
+    let (close, closed) = bounded::<()>(0);
+    let viewer = std::thread::spawn(move || {
+        let mut taken = Vec::new();
+        while closed.try_recv() != Err(crossbeam_channel::TryRecvError::Disconnected) {
+            taken.extend(listener.accept());
+            std::thread::sleep(Duration::from_millis(5));
+        }
+        taken.len()
+    });
+    let mut app = app(RerunPlugin::viewer().with_viewer_port(port).with_spawn(false).with_queue(1000));
+    let start = Instant::now();
+    while start.elapsed() < Duration::from_secs(1) {
+        app.update();
+        std::thread::sleep(Duration::from_millis(10));
+    }
+    assert_eq!(app.world().resource::<RerunStats>().sinks, 1, "it is there");
+    drop(close);
+    assert!(viewer.join().unwrap() >= 2, "asked for, and streamed to");
+    let start = Instant::now();
+    while app.world().resource::<RerunStats>().sinks > 0 {
+        assert!(start.elapsed() < Duration::from_secs(20), "still streaming to nobody");
+        app.update();
+        std::thread::sleep(Duration::from_millis(10));
+    }
+    let collected = app.world().resource::<RerunStats>().collected;
+    (0..20).for_each(|_| app.update());
+    assert_eq!(app.world().resource::<RerunStats>().collected, collected, "nothing is collected for nobody");
+}
+
+#[cfg(target_os = "linux")]
+#[test]
+fn the_threads_of_a_recording_give_way() {
+    let path = scratch("nice");
+    let mut app = app(RerunPlugin::file(&path));
+    let start = Instant::now();
+    // The SDK's thread that writes the file, made by the worker.
+    let nice = loop {
+        app.update();
+        let threads = std::fs::read_dir("/proc/self/task").unwrap().flatten();
+        let stats = threads.filter_map(|thread| std::fs::read_to_string(thread.path().join("stat")).ok());
+        // `id (name) state ppid ...`: the 19th field is the nice value.
+        let of = |stat: &str| stat.rsplit(')').next().unwrap().split_whitespace().nth(16).unwrap().to_owned();
+        let found: Vec<String> =
+            stats.filter(|stat| stat.contains("(file_writer)")).map(|s| of(&s)).collect();
+        if !found.is_empty() {
+            break found;
+        }
+        assert!(start.elapsed() < Duration::from_secs(20), "no such thread");
+    };
+    assert!(nice.iter().all(|nice| nice == "9"), "{nice:?}");
+    drop(app);
+    std::fs::remove_file(path).unwrap();
+}
+
+#[test]
+fn what_the_app_logs_is_a_line_but_for_what_the_recorder_says_of_itself() {
+    let (lines, taken) = bounded(3);
+    subscriber::with_default(registry().with(Lines(lines)), || {
+        info!(target: "game", points = 3, "half time");
+        debug!(target: "game", "chatter");
+        warn!(target: "re_sdk", "about itself");
+        warn!(target: "game", "low on time");
+        (0..10).for_each(|_| info!(target: "game", "flood"));
+    });
+    let lines: Vec<(bool, String)> = taken.try_iter().map(|line| (line.warning, line.text)).collect();
+    let expected = [(false, "game: half time points=3"), (true, "game: low on time"), (false, "game: flood")];
+    assert_eq!(lines, expected.map(|(warning, text)| (warning, text.to_owned())));
+}
