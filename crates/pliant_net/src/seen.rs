@@ -43,7 +43,7 @@ pub struct BodyLeft {
     pub name: String,
 }
 
-/// The host has not let one of our grabs hold. Despawn it, or change its vertex or radius to try again.
+/// The host has not let one of our grabs hold, or has taken it off the body. Despawn it, or change its vertex or radius to try again.
 #[derive(Message, Debug, Clone, PartialEq)]
 pub struct GrabRefused {
     /// The grab.

@@ -53,7 +53,8 @@ pub struct UserLink {
     pub loss_out: f64,
 }
 
-/// The user whose hand a [`Grab`](pliant_body::Grab) is.
+/// The user whose hand a [`Grab`](pliant_body::Grab) is. Despawned on a host, a guest's grab lets go, and the guest is told
+/// ([`GrabRefused`](crate::GrabRefused)).
 #[derive(Component, Debug, Clone, Copy, PartialEq, Eq)]
 #[relationship(relationship_target = Hands)]
 pub struct HandOf(#[entities] pub Entity);

@@ -98,6 +98,29 @@ fn a_body_may_be_the_hosts_alone() {
 }
 
 #[test]
+fn a_host_takes_a_guests_hand_off_and_the_guest_knows() {
+    let _alone = alone();
+    let (mut host, invite, _) = host(HostConfig::default());
+    let mut guest = guest(&invite, cached());
+    run_until(&mut [&mut host, &mut guest], 5.0, "the body arrives", |apps| body_of(apps[1]).is_some());
+    let there = body_of(&mut guest).unwrap();
+    let hold = (Grab::new(TIP, 0.3, DVec3::new(1.2, 2.5, 0.4)), GrabOf(there));
+    let grab = guest.world_mut().spawn(hold).id();
+    run_until(&mut [&mut host, &mut guest], 3.0, "held", |apps| only::<HandOf>(apps[0]).is_some());
+    let hand = only::<HandOf>(&mut host).unwrap();
+    host.world_mut().despawn(hand);
+    run_until(&mut [&mut host, &mut guest], 3.0, "the guest is told", |apps| {
+        messages::<GrabRefused>(apps[1]) == [GrabRefused { entity: grab }]
+    });
+    // The targets that it still says move nothing, and another hand of its may hold.
+    run_for(&mut [&mut host, &mut guest], 0.3);
+    assert!(only::<HandOf>(&mut host).is_none());
+    guest.world_mut().despawn(grab);
+    guest.world_mut().spawn(hold);
+    run_until(&mut [&mut host, &mut guest], 3.0, "held again", |apps| only::<HandOf>(apps[0]).is_some());
+}
+
+#[test]
 fn what_is_not_wanted_is_not_sent() {
     let _alone = alone();
     let (mut host, invite, body) = host(HostConfig::default());

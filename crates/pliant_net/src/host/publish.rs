@@ -60,6 +60,13 @@ pub(crate) fn publish(
             host.session.remove_body(body.id);
         }
     }
+    // A guest's hand whose grab the app has despawned is off: its guest is told.
+    let off: Vec<GrabKey> =
+        host.grabs.iter().filter(|(_, grab)| !grabs.contains(**grab)).map(|(&key, _)| key).collect();
+    for key in off {
+        host.grabs.remove(&key);
+        host.session.refuse_grab(key);
+    }
     let mut held = BTreeSet::new();
     for (entity, shared, state, driven, transform, list) in &bodies {
         if *driven == Driven::Remote {
