@@ -34,6 +34,9 @@ pub struct BodyView {
     pub energies: Trace,
     /// The hands on it.
     pub hands: Vec<HandView>,
+    /// Its header is closed: what stands under it need not be filled in. Set by [`show`], for the next frame; a body that comes folded is first shown
+    /// so.
+    pub folded: bool,
     /// Somebody pressed "Wake".
     pub wake: bool,
     /// Somebody pressed "Let go".
@@ -47,6 +50,8 @@ pub struct HandView {
     pub name: String,
     /// The colour of whose it is, sRGB; `None` takes one of the plot's own.
     pub colour: Option<[u8; 3]>,
+    /// It is held from here, and "Let go" takes it off.
+    pub releasable: bool,
     /// Magnitude of the reaction, N.
     pub force: f64,
     /// The same over the last seconds.
@@ -65,10 +70,17 @@ pub fn show(ui: &mut Ui, bodies: &mut [BodyView]) {
             (true, true) => "rests",
             (true, false) => "moves",
         };
-        CollapsingHeader::new(format!("{} \u{b7} {state}", body.name))
+        let folded = body.folded;
+        let header = CollapsingHeader::new(format!("{} \u{b7} {state}", body.name))
             .id_salt(("pliant body", index))
-            .default_open(!many)
-            .show(ui, |ui| body_knobs(ui, index, body));
+            .default_open(!many && !folded)
+            .show(ui, |ui| {
+                // Just opened: there is nothing to show yet, and nothing that a knob could change.
+                if !folded {
+                    body_knobs(ui, index, body);
+                }
+            });
+        body.folded = header.body_returned.is_none() && header.openness == 0.0;
     }
 }
 
@@ -90,9 +102,13 @@ fn body_knobs(ui: &mut Ui, index: usize, body: &mut BodyView) {
         if body.resting && ui.button("Wake").clicked() {
             body.wake = true;
         }
-        if !body.hands.is_empty()
-            && ui.button("Let go").on_hover_text("Takes every hand off this body.").clicked()
-        {
+        let releasable = body.hands.iter().filter(|hand| hand.releasable).count();
+        let words = if releasable == body.hands.len() {
+            "Takes every hand off this body."
+        } else {
+            "Takes off the hands that are held from here; the others let go themselves."
+        };
+        if releasable > 0 && ui.button("Let go").on_hover_text(words).clicked() {
             body.release = true;
         }
     });

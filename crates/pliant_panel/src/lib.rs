@@ -10,9 +10,10 @@
 //! }
 //! ```
 //!
-//! `F1` opens and closes it; Tab and the arrow keys reach every knob. While it has the pointer, no body is grabbed through it, by a tool that the pointer moves neither; what else the pointer and the keys do in a scene asks
-//! [`wants_pointer`] and [`wants_keyboard`]. It shows what other plugins publish, and a section appears
-//! once its plugin is there: nothing of the network, a device or a recording is asked for by this one. Closed, it gathers and draws nothing.
+//! `F1` opens and closes it; Tab and the arrow keys reach every knob. While it has the pointer, neither the pointer nor a tool that the pointer moves grabs
+//! a body through it; what else pointer and keys do in a scene is asked of [`wants_pointer`] and [`wants_keyboard`]. It shows what other plugins
+//! publish, and a section appears once its plugin is there: nothing of the network, a device or a recording is asked for by this one. Closed, it
+//! gathers and draws nothing; of a body whose header is closed it gathers name and state.
 //!
 //! Each part is a function over [`egui::Ui`] and a plain struct, for a panel of your own: [`bodies::show`], [`time::show`], [`network::show`], [`device::show`],
 //! [`recording::show`]. A knob changes its field of the struct; taking it over is up to you, as [`PanelPlugin`] does.

@@ -1,6 +1,6 @@
 //! Users, the network and its emulator.
 
-use bevy_egui::egui::{Color32, ComboBox, RichText, Ui};
+use bevy_egui::egui::{Color32, ComboBox, DragValue, Grid, RichText, Ui};
 
 use crate::{
     knob::knob,
@@ -16,12 +16,24 @@ pub struct NetworkView {
     pub invite: Option<String>,
     /// Round trip, ms.
     pub round_trip_ms: f64,
+    /// Smoothed deviation of the round trip, ms.
+    pub jitter_ms: f64,
     /// Share of datagrams lost on the way here and there, %.
     pub loss: [f64; 2],
     /// Received and sent, kbit/s.
     pub rate: [f64; 2],
-    /// Ticks shown on a guess, and put right since.
-    pub repaired: [u64; 2],
+    /// Ticks shown on a guess, and put right since; `None` where nobody's word is waited for.
+    pub repaired: Option<[u64; 2]>,
+    /// Ticks that were asked for again: by a guest, of a host.
+    pub asked_again: u64,
+    /// States taken over whole, from snapshots.
+    pub snapshots: u64,
+    /// Datagrams that this end let go because a queue was full or the path too narrow.
+    pub dropped: u64,
+    /// Packets wait in a queue on their way: the round trip has grown, and less should be sent.
+    pub queueing: bool,
+    /// How far what is shown is from the best estimate of the truth, %; `None` where the truth is here.
+    pub shown_offset: Option<f64>,
     /// Round trip over the last seconds, ms.
     pub round_trips: Trace,
     /// Received over the last seconds, kbit/s.
@@ -51,21 +63,49 @@ pub struct UserView {
     pub hands: usize,
     /// Round trip, ms; `None` where it is not known here.
     pub round_trip_ms: Option<f64>,
+    /// Share of datagrams lost on the way here from the user and there, %; `None` where it is not known here.
+    pub loss: Option<[f64; 2]>,
 }
 
-/// The knobs of the link emulator. Moving loss, round trip or jitter away from a preset leaves its other traits (rate, bursts, order) as they are.
+/// The knobs of the link emulator: both ways alike. What is moved away from a preset makes it another network ([`other`](Self::other)), whose finer
+/// traits have knobs too.
 #[derive(Debug, Clone, Default, PartialEq)]
 pub struct EmulatorView {
     /// Names of the presets; the first is no emulation, the last none of the others.
     pub presets: Vec<String>,
     /// The one in use. A knob.
     pub preset: usize,
+    /// A recorded path stands in for delay, jitter and loss, whose knobs are off.
+    pub recorded: bool,
     /// Loss, %. A knob.
     pub loss: f64,
     /// Round trip, ms. A knob.
     pub round_trip_ms: f64,
     /// Mean of what is added to the way of a packet at random, ms. A knob.
     pub jitter_ms: f64,
+    /// How long a burst of losses lasts on average, ms; 0 loses each packet for itself. A knob, off while nothing is lost.
+    pub burst_ms: f64,
+    /// What the line carries, Mbit/s; 0: as much as one likes. A knob.
+    pub rate_mbit: f64,
+    /// What may wait for the line, KiB; what does not fit is dropped. A knob.
+    pub queue_kib: f64,
+    /// Packets that are held back, and so overtaken, %. A knob.
+    pub reordered: f64,
+    /// How long those are held back, and how much later a copy comes at most, ms. A knob.
+    pub held_back_ms: f64,
+    /// Packets that arrive twice, %. A knob.
+    pub duplicated: f64,
+    /// Jitter lets no packet overtake another. A knob.
+    pub keep_order: bool,
+    /// Of all chances. A knob.
+    pub seed: u64,
+}
+
+impl EmulatorView {
+    /// Whether the network in use is none of the presets.
+    pub fn other(&self) -> bool {
+        self.preset > 0 && self.preset + 1 == self.presets.len()
+    }
 }
 
 /// Shows the session.
@@ -100,21 +140,54 @@ pub fn show(ui: &mut Ui, network: &mut NetworkView) {
             if let Some(ms) = user.round_trip_ms {
                 ui.weak(format!("{} ms", short(ms)));
             }
+            if let Some([here, there]) = user.loss {
+                ui.weak(format!("\u{2193}{} % \u{2191}{} %", short(here), short(there)))
+                    .on_hover_text("Lost on the way here, and on the way there.");
+            }
         });
     }
-    ui.label(format!(
-        "round trip {} ms \u{b7} lost {} % in, {} % out",
-        short(network.round_trip_ms),
-        short(network.loss[0]),
-        short(network.loss[1])
-    ));
-    ui.label(format!(
-        "{} kbit/s in, {} out \u{b7} {} ticks guessed, {} put right",
-        short(network.rate[0]),
-        short(network.rate[1]),
-        network.repaired[0],
-        network.repaired[1]
-    ));
+    Grid::new("pliant network").num_columns(2).spacing([10.0, 2.0]).show(ui, |ui| {
+        let mut line = |name: &str, words: String, hover: &str| {
+            ui.label(name);
+            ui.label(words).on_hover_text(hover);
+            ui.end_row();
+        };
+        let [round_trip, jitter] = [network.round_trip_ms, network.jitter_ms].map(short);
+        let waits = if network.queueing { ", queueing" } else { "" };
+        line(
+            "round trip",
+            format!("{round_trip} \u{b1} {jitter} ms{waits}"),
+            "There and back, and its deviation. Queueing: packets wait on the way, and less should be sent.",
+        );
+        let [here, there] = network.loss.map(short);
+        line("lost", format!("{here} % in, {there} % out"), "Datagrams that did not arrive.");
+        let [received, sent] = network.rate.map(short);
+        line("rate", format!("{received} kbit/s in, {sent} out"), "With all that the line carries.");
+        if let Some([guessed, right]) = network.repaired {
+            line(
+                "guessed",
+                format!("{guessed} ticks, {right} put right"),
+                "Shown before their data came, and mended when it did.",
+            );
+        }
+        line(
+            "asked again",
+            format!("{} ticks, snapshots: {}", network.asked_again, network.snapshots),
+            "Repeats of what was lost, and states that were taken over whole.",
+        );
+        line(
+            "dropped here",
+            network.dropped.to_string(),
+            "Datagrams that this end let go: full queues, narrow paths.",
+        );
+        if let Some(offset) = network.shown_offset {
+            line(
+                "shown offset",
+                format!("{} %", short(offset)),
+                "How far what is shown is from the best estimate of the truth.",
+            );
+        }
+    });
     plot(ui, "pliant round trip", "ms", [("round trip", &network.round_trips, colour(2))]);
     plot(ui, "pliant rate", "kbit/s", [("received", &network.rates, colour(3))]);
     if let Some(emulator) = &mut network.emulator {
@@ -123,16 +196,50 @@ pub fn show(ui: &mut Ui, network: &mut NetworkView) {
 }
 
 fn emulator_knobs(ui: &mut Ui, emulator: &mut EmulatorView) {
-    let EmulatorView { presets, preset, loss, round_trip_ms, jitter_ms } = emulator;
-    let name = presets.get(*preset).cloned().unwrap_or_default();
+    let name = emulator.presets.get(emulator.preset).cloned().unwrap_or_default();
     ComboBox::from_label("emulated network").selected_text(name).show_ui(ui, |ui| {
-        for (index, name) in presets.iter().enumerate() {
-            ui.selectable_value(preset, index, name);
+        for (index, name) in emulator.presets.iter().enumerate() {
+            ui.selectable_value(&mut emulator.preset, index, name);
         }
     });
-    if *preset > 0 {
-        knob(ui, loss, 0.0..=50.0, |slider| slider.text("% lost").max_decimals(1));
-        knob(ui, round_trip_ms, 0.0..=1000.0, |slider| slider.text("ms round trip").max_decimals(0));
-        knob(ui, jitter_ms, 0.0..=100.0, |slider| slider.text("ms jitter").max_decimals(1));
+    if emulator.preset == 0 {
+        return;
     }
+    ui.add_enabled_ui(!emulator.recorded, |ui| {
+        knob(ui, &mut emulator.loss, 0.0..=50.0, |slider| slider.text("% lost").max_decimals(1));
+        knob(ui, &mut emulator.round_trip_ms, 0.0..=1000.0, |slider| {
+            slider.text("ms round trip").max_decimals(1)
+        });
+        knob(ui, &mut emulator.jitter_ms, 0.0..=100.0, |slider| slider.text("ms jitter").max_decimals(2));
+    });
+    if !emulator.other() {
+        return;
+    }
+    ui.add_enabled_ui(!emulator.recorded && emulator.loss > 0.0, |ui| {
+        knob(ui, &mut emulator.burst_ms, 0.0..=500.0, |slider| slider.text("ms bursts").max_decimals(1))
+            .on_hover_text("How long a burst of losses lasts on average; 0 loses each packet for itself.");
+    });
+    knob(ui, &mut emulator.rate_mbit, 0.0..=1000.0, |slider| {
+        slider.logarithmic(true).smallest_positive(0.1).text("Mbit/s").max_decimals(2)
+    })
+    .on_hover_text("What the line carries; 0: as much as one likes.");
+    knob(ui, &mut emulator.queue_kib, 1.0..=1024.0, |slider| {
+        slider.logarithmic(true).text("KiB queue").max_decimals(0)
+    })
+    .on_hover_text("What may wait for the line; what does not fit is dropped.");
+    knob(ui, &mut emulator.reordered, 0.0..=50.0, |slider| slider.text("% reordered").max_decimals(1))
+        .on_hover_text("Packets that are held back, so that others overtake them.");
+    knob(ui, &mut emulator.held_back_ms, 0.0..=200.0, |slider| slider.text("ms held back").max_decimals(1))
+        .on_hover_text("How long those are held back; a copy comes at most so much later.");
+    knob(ui, &mut emulator.duplicated, 0.0..=50.0, |slider| slider.text("% twice").max_decimals(1))
+        .on_hover_text("Packets that arrive twice.");
+    ui.checkbox(&mut emulator.keep_order, "jitter keeps the order");
+    ui.horizontal(|ui| {
+        let label = ui.label("seed");
+        let mut seed = emulator.seed;
+        let field = ui.add(DragValue::new(&mut seed).speed(1.0)).labelled_by(label.id);
+        if field.changed() && !field.lost_focus() {
+            emulator.seed = seed;
+        }
+    });
 }

@@ -77,16 +77,38 @@ fn a_body_is_given_fewer_modes_more_damping_and_no_warp() {
 fn hands_are_taken_off_a_body_and_a_remote_body_keeps_its_own_settings() {
     let mut held = body();
     held.local = false;
-    held.hands = vec![HandView { name: "Ann".into(), force: 3.0, ..Default::default() }];
+    let ann = HandView { name: "Ann".into(), force: 3.0, ..Default::default() };
+    held.hands = vec![ann.clone()];
     let mut harness =
         Harness::new_ui_state(|ui, bodies: &mut Vec<BodyView>| bodies::show(ui, bodies), vec![held]);
     harness.run();
     assert!(harness.query_by_label("Ann: 3.00 N").is_some());
     let slider = harness.get_by_role_and_label(Role::Slider, "modes");
     assert!(slider.accesskit_node().is_disabled());
+    assert!(harness.query_by_label("Let go").is_none(), "Ann is elsewhere, and lets go herself");
+    let own = HandView { name: "pointer grab".into(), releasable: true, ..ann };
+    harness.state_mut()[0].hands.push(own);
+    harness.run();
     harness.get_by_label("Let go").click();
     harness.run();
     assert!(harness.state()[0].release);
+}
+
+#[test]
+fn what_a_closed_header_hides_is_asked_for_when_it_is_opened() {
+    let bodies = (0..4).map(|i| BodyView { name: format!("pip {i}"), folded: i == 0, ..body() }).collect();
+    let mut harness =
+        Harness::new_ui_state(|ui, bodies: &mut Vec<BodyView>| bodies::show(ui, bodies), bodies);
+    harness.run();
+    assert!(harness.state().iter().all(|body| body.folded), "more than three begin closed");
+    harness.get_by_label_contains("pip 2").click();
+    harness.run();
+    let folded: Vec<bool> = harness.state().iter().map(|body| body.folded).collect();
+    assert_eq!(folded, [true, true, false, true]);
+    harness.get_by_role_and_label(Role::Slider, "modes");
+    harness.get_by_label_contains("pip 2").click();
+    harness.run();
+    assert!(harness.state()[2].folded);
 }
 
 #[test]
@@ -161,6 +183,7 @@ fn the_emulated_network_is_chosen_by_name_and_its_loss_moved() {
             loss: 9.0,
             round_trip_ms: 196.0,
             jitter_ms: 2.0,
+            ..Default::default()
         }),
         ..Default::default()
     };
@@ -183,6 +206,85 @@ fn the_emulated_network_is_chosen_by_name_and_its_loss_moved() {
     harness.run();
     assert_eq!(harness.state().emulator.as_ref().unwrap().preset, 0);
     assert!(harness.query_by_label("% lost").is_none());
+}
+
+#[test]
+fn another_network_has_knobs_for_all_that_it_can_do() {
+    let emulator = EmulatorView {
+        presets: vec!["none".into(), "wifi".into(), "other".into()],
+        preset: 1,
+        loss: 9.0,
+        queue_kib: 64.0,
+        seed: 7,
+        ..Default::default()
+    };
+    let session = NetworkView { role: "peer".into(), emulator: Some(emulator), ..Default::default() };
+    let mut harness = Harness::builder()
+        .with_size([400.0, 900.0])
+        .build_ui_state(|ui, view: &mut NetworkView| network::show(ui, view), session);
+    assert!(harness.query_by_label("Mbit/s").is_none(), "a preset is what it is called");
+    harness.get_by_role(Role::ComboBox).click();
+    harness.run();
+    harness.get_by_label("other").click();
+    harness.run();
+    let knobs = ["ms bursts", "Mbit/s", "KiB queue", "% reordered", "ms held back", "% twice"];
+    for name in knobs {
+        nudge(&mut harness, name, Key::ArrowRight);
+    }
+    harness.get_by_label("jitter keeps the order").click();
+    harness.run();
+    let seed = harness.get_by_role_and_label(Role::SpinButton, "seed");
+    seed.focus();
+    harness.run();
+    harness.get_by_role_and_label(Role::SpinButton, "seed").type_text("12");
+    harness.run();
+    let moved = harness.state().emulator.as_ref().unwrap();
+    for (name, value) in knobs.into_iter().zip([
+        moved.burst_ms,
+        moved.rate_mbit,
+        moved.queue_kib - 64.0,
+        moved.reordered,
+        moved.held_back_ms,
+        moved.duplicated,
+    ]) {
+        assert!(value > 0.0, "{name}: {moved:?}");
+    }
+    assert_eq!((moved.keep_order, moved.seed), (true, 12));
+}
+
+#[test]
+fn the_figures_of_a_session_are_shown_with_their_units() {
+    let session = NetworkView {
+        round_trip_ms: 196.0,
+        jitter_ms: 2.0,
+        loss: [9.0, 8.5],
+        rate: [103.0, 20.0],
+        repaired: Some([12, 11]),
+        asked_again: 4,
+        snapshots: 1,
+        dropped: 3,
+        queueing: true,
+        shown_offset: Some(0.25),
+        users: vec![UserView { name: "Bo".into(), loss: Some([3.0, 4.0]), ..Default::default() }],
+        ..Default::default()
+    };
+    let mut harness = Harness::new_ui_state(|ui, view: &mut NetworkView| network::show(ui, view), session);
+    for words in [
+        "196 \u{b1} 2.00 ms, queueing",
+        "9.00 % in, 8.50 % out",
+        "103 kbit/s in, 20.0 out",
+        "12 ticks, 11 put right",
+        "4 ticks, snapshots: 1",
+        "3",
+        "0.25 %",
+        "\u{2193}3.00 % \u{2191}4.00 %",
+    ] {
+        assert!(harness.query_by_label(words).is_some(), "{words}");
+    }
+    harness.state_mut().repaired = None;
+    harness.state_mut().shown_offset = None;
+    harness.run();
+    assert!(harness.query_by_label("shown offset").is_none() && harness.query_by_label("guessed").is_none());
 }
 
 #[test]
@@ -252,7 +354,7 @@ fn untouched<S: Clone + std::fmt::Debug>(view: S, show: fn(&mut egui::Ui, &mut S
         .with_size([400.0, 900.0])
         .build_ui_state(move |ui, view: &mut S| show(ui, view), view);
     assert_eq!(format!("{:?}", harness.state()), before, "{words}: looked at");
-    for _ in 0..24 {
+    for _ in 0..32 {
         harness.key_press(Key::Tab);
         harness.run_steps(2);
         assert_eq!(format!("{:?}", harness.state()), before, "{words}: the focus went through");
@@ -282,7 +384,16 @@ fn what_nobody_touches_stays_as_it_is_whatever_it_is() {
             loss: scale,
             round_trip_ms: scale,
             jitter_ms: scale,
+            burst_ms: scale,
+            rate_mbit: scale,
+            queue_kib: scale,
+            reordered: scale,
+            held_back_ms: scale,
+            duplicated: scale,
+            seed: u64::MAX,
+            ..Default::default()
         };
+        assert!(emulator.other());
         let network = NetworkView { emulator: Some(emulator), ..Default::default() };
         untouched(network, network::show, "network");
     }

@@ -1,24 +1,16 @@
 //! Whose hand is whose, and the hands that are on other machines.
 
-use std::collections::HashMap;
-
 use bevy::{ecs::system::SystemParam, prelude::*};
 use pliant_net::{HandOf, SeenHands, User, Yourself};
 
-use crate::{Trace, bodies::HandView};
-
-/// What the panel remembers of the hands on other machines: by body, user, and which of the user's.
-#[derive(Resource, Default)]
-pub(super) struct Histories {
-    forces: HashMap<(Entity, u16, usize), Trace>,
-}
+use super::scene::HandKey;
+use crate::bodies::HandView;
 
 #[derive(SystemParam)]
 pub(super) struct People<'w, 's> {
     users: Query<'w, 's, (&'static User, Has<Yourself>)>,
     hands: Query<'w, 's, &'static HandOf>,
     seen: Query<'w, 's, &'static SeenHands>,
-    histories: ResMut<'w, Histories>,
 }
 
 impl People<'_, '_> {
@@ -31,27 +23,23 @@ impl People<'_, '_> {
         Some((user.name.clone(), srgb(user.colour)))
     }
 
-    /// The hands that others have on a body, as the session shows them at `now` (s).
-    pub fn others(&mut self, body: Entity, now: f64) -> Vec<HandView> {
-        let Self { users, seen, histories, .. } = self;
-        histories.forces.retain(|(body, ..), _| seen.contains(*body));
-        let mut views: Vec<(u16, HandView)> = Vec::new();
-        for hand in seen.get(body).into_iter().flat_map(|seen| &seen.0) {
-            let user = users.iter().map(|(user, _)| user).find(|user| user.id == hand.user);
+    /// The hands that others have on a body, as the session shows them, each with what tells it from the others.
+    pub fn others(&self, body: Entity) -> Vec<(HandKey, HandView)> {
+        let mut views: Vec<(HandKey, HandView)> = Vec::new();
+        for hand in self.seen.get(body).into_iter().flat_map(|seen| &seen.0) {
+            let user = self.users.iter().map(|(user, _)| user).find(|user| user.id == hand.user);
             let number = hand.user.0;
-            let nth = views.iter().filter(|(of, _)| *of == number).count();
-            let trace = histories.forces.entry((body, number, nth)).or_default();
-            let force = hand.reaction.length();
-            trace.push(now, force);
+            let of_user = |key: &HandKey| matches!(key, HandKey::Seen { user, .. } if *user == number);
+            let nth = views.iter().filter(|(key, _)| of_user(key)).count();
             let view = HandView {
                 name: user.map_or_else(|| format!("user {number}"), |user| user.name.clone()),
                 colour: user.map(|user| srgb(user.colour)),
-                force,
-                forces: trace.clone(),
+                force: hand.reaction.length(),
+                ..default()
             };
-            views.push((number, view));
+            views.push((HandKey::Seen { body, user: number, nth }, view));
         }
-        views.into_iter().map(|(_, view)| view).collect()
+        views
     }
 }
 

@@ -65,7 +65,7 @@ impl Plugin for PanelPlugin {
         app.init_resource::<devices::Histories>()
             .configure_sets(PreUpdate, pliant_haptics::PointerToolSystems::Press.run_if(not(wants_pointer)));
         #[cfg(feature = "net")]
-        app.init_resource::<session::Histories>().init_resource::<hands::Histories>();
+        app.init_resource::<session::Histories>();
     }
 }
 

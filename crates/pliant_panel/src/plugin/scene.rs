@@ -1,5 +1,7 @@
 //! Bodies, time and the recording of a scene.
 
+use std::collections::HashMap;
+
 use bevy::{
     diagnostic::DiagnosticsStore,
     ecs::{entity::EntityHashMap, system::SystemParam},
@@ -8,6 +10,7 @@ use bevy::{
 use bevy_egui::egui::Ui;
 use pliant_body::{
     BodyState, DEFORM_TIME, Driven, Grab, GrabForce, Grabs, ModalBody, PliantTick, STEP_TIME, ShownState,
+    SingleSteps,
 };
 
 use crate::{
@@ -20,9 +23,21 @@ use crate::{
 #[derive(Resource, Default)]
 pub(super) struct Histories {
     energies: EntityHashMap<Trace>,
-    forces: EntityHashMap<Trace>,
+    forces: HashMap<HandKey, Trace>,
+    /// Whether a body's header is closed.
+    folded: EntityHashMap<bool>,
     step_ms: Trace,
     deform_ms: Trace,
+}
+
+/// Tells a hand from all others.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
+pub(super) enum HandKey {
+    /// A grab of this app.
+    Grab(Entity),
+    /// Held elsewhere: on which body, by whom, and which of that user's hands there.
+    #[cfg(feature = "net")]
+    Seen { body: Entity, user: u16, nth: usize },
 }
 
 #[derive(SystemParam)]
@@ -30,7 +45,8 @@ pub(super) struct Scene<'w, 's> {
     commands: Commands<'w, 's>,
     histories: ResMut<'w, Histories>,
     virtual_time: ResMut<'w, Time<Virtual>>,
-    fixed_time: Option<ResMut<'w, Time<Fixed>>>,
+    steps: MessageWriter<'w, SingleSteps>,
+    fixed_time: Option<Res<'w, Time<Fixed>>>,
     real_time: Res<'w, Time<Real>>,
     tick: Res<'w, PliantTick>,
     diagnostics: Option<Res<'w, DiagnosticsStore>>,
@@ -68,99 +84,104 @@ impl Scene<'_, '_> {
             step: step.unwrap_or(self.virtual_time.delta()).as_secs_f64(),
             tick: self.tick.0,
             step_once: false,
-            step_ms: self.histories.step_ms.clone(),
-            deform_ms: self.histories.deform_ms.clone(),
+            step_ms: std::mem::take(&mut self.histories.step_ms),
+            deform_ms: std::mem::take(&mut self.histories.deform_ms),
         };
         let before = (view.paused, view.speed);
         time::show(ui, &mut view);
+        (self.histories.step_ms, self.histories.deform_ms) = (view.step_ms, view.deform_ms);
         if view.paused != before.0 {
             if view.paused { self.virtual_time.pause() } else { self.virtual_time.unpause() }
         }
         if view.speed != before.1 && view.speed.is_finite() && view.speed > 0.0 {
             self.virtual_time.set_relative_speed_f64(view.speed);
         }
-        if view.step_once
-            && let Some(fixed) = &mut self.fixed_time
-        {
-            // The next pass of the fixed loop finds one step's worth of time, and no more.
-            let step = fixed.timestep();
-            let lacking = step.saturating_sub(fixed.overstep());
-            fixed.accumulate_overstep(lacking);
+        if view.step_once {
+            self.steps.write(SingleSteps(1));
         }
     }
 
     pub fn show_bodies(&mut self, ui: &mut Ui) {
         let now = self.real_time.elapsed_secs_f64();
-        let Histories { energies, forces, .. } = &mut *self.histories;
-        energies.retain(|entity, _| self.bodies.contains(*entity));
-        forces.retain(|entity, _| self.grabs.contains(*entity));
+        // What is not shown in this frame is not put back: bodies that are gone, hands that let go, users that left.
+        let mut energies = std::mem::take(&mut self.histories.energies);
+        let mut forces = std::mem::take(&mut self.histories.forces);
+        let folded = std::mem::take(&mut self.histories.folded);
         let mut found: Vec<_> = self.bodies.iter_mut().collect();
         found.sort_by_key(|(name, ..)| name.entity);
-        let mut views: Vec<BodyView> = found
-            .iter()
-            .map(|(name, body, state, driven, shown, grabs)| {
-                let model = state.model();
-                let energy = energy_of(state, driven, *shown);
-                let energies = energies.entry(name.entity).or_default();
-                energies.push(now, energy);
-                let held = grabs.map(Grabs::entities).unwrap_or_default();
-                #[cfg_attr(
-                    not(feature = "net"),
-                    expect(unused_mut, reason = "others' hands come with the network")
-                )]
-                let mut hands: Vec<HandView> = held
-                    .iter()
-                    .filter_map(|&grab| self.grabs.get(grab).ok())
-                    .map(|(name, force)| {
-                        let trace = forces.entry(name.entity).or_default();
-                        trace.push(now, force.force.length());
-                        #[cfg(feature = "net")]
-                        let whose = self.people.whose(name.entity);
-                        #[cfg(not(feature = "net"))]
-                        let whose: Option<(String, [u8; 3])> = None;
-                        let (whose, colour) = whose.unzip();
-                        let own = name.name.map(|name| name.as_str().to_owned());
-                        HandView {
-                            name: own.or(whose).unwrap_or_else(|| "hand".into()),
-                            colour,
-                            force: force.force.length(),
-                            forces: trace.clone(),
-                        }
-                    })
-                    .collect();
-                #[cfg(feature = "net")]
-                hands.extend(self.people.others(name.entity, now));
-                BodyView {
-                    name: name
-                        .name
-                        .map_or_else(|| model_name(&model.info().name, name.entity), ToString::to_string),
-                    modes: state.body().mode_count(),
-                    all_modes: model.mode_count(),
-                    lowest_hz: state
-                        .body()
-                        .omega()
-                        .first()
-                        .map_or(0.0, |omega| omega / std::f64::consts::TAU),
-                    stiffness_scale: body.stiffness_scale,
-                    damping_scale: body.damping_scale,
-                    warp: body.warp,
-                    local: **driven == Driven::Local,
-                    resting: state.is_resting(),
-                    energy,
-                    energies: energies.clone(),
-                    hands,
-                    ..default()
+        let many = found.len() > 3;
+        let (mut views, mut keys) = (Vec::with_capacity(found.len()), Vec::with_capacity(found.len()));
+        for (name, body, state, driven, shown, grabs) in &found {
+            let model = state.model();
+            let mut view = BodyView {
+                name: name
+                    .name
+                    .map_or_else(|| model_name(&model.info().name, name.entity), ToString::to_string),
+                local: **driven == Driven::Local,
+                resting: state.is_resting(),
+                folded: folded.get(&name.entity).copied().unwrap_or(many),
+                ..default()
+            };
+            let mut keys_here = Vec::new();
+            if !view.folded {
+                view.modes = state.body().mode_count();
+                view.all_modes = model.mode_count();
+                let omega = state.body().omega().first();
+                view.lowest_hz = omega.map_or(0.0, |omega| omega / std::f64::consts::TAU);
+                (view.stiffness_scale, view.damping_scale) = (body.stiffness_scale, body.damping_scale);
+                view.warp = body.warp;
+                view.energy = energy_of(state, driven, *shown);
+                view.energies = energies.remove(&name.entity).unwrap_or_default();
+                view.energies.push(now, view.energy);
+                for &grab in grabs.map(Grabs::entities).unwrap_or_default() {
+                    let Ok((name, force)) = self.grabs.get(grab) else { continue };
+                    #[cfg(feature = "net")]
+                    let whose = self.people.whose(grab);
+                    #[cfg(not(feature = "net"))]
+                    let whose: Option<(String, [u8; 3])> = None;
+                    let (whose, colour) = whose.unzip();
+                    let own = name.name.map(|name| name.as_str().to_owned());
+                    keys_here.push(HandKey::Grab(grab));
+                    view.hands.push(HandView {
+                        name: own.or(whose).unwrap_or_else(|| "hand".into()),
+                        colour,
+                        releasable: true,
+                        force: force.force.length(),
+                        ..default()
+                    });
                 }
-            })
-            .collect();
+                #[cfg(feature = "net")]
+                for (key, hand) in self.people.others(name.entity) {
+                    keys_here.push(key);
+                    view.hands.push(hand);
+                }
+                for (key, hand) in keys_here.iter().zip(&mut view.hands) {
+                    hand.forces = forces.remove(key).unwrap_or_default();
+                    hand.forces.push(now, hand.force);
+                }
+            }
+            views.push(view);
+            keys.push(keys_here);
+        }
+        let filled: Vec<bool> = views.iter().map(|view| !view.folded).collect();
         bodies::show(ui, &mut views);
-        for (view, (_, body, state, _, _, grabs)) in views.into_iter().zip(found) {
+        let histories = &mut *self.histories;
+        for (((view, keys), filled), (name, body, state, _, _, grabs)) in
+            views.into_iter().zip(keys).zip(filled).zip(found)
+        {
+            histories.folded.insert(name.entity, view.folded);
+            if !filled {
+                continue;
+            }
             take_over(&view, body, state);
             if view.release {
+                // A guest whose hand this was is told by the session.
                 for &grab in grabs.map(Grabs::entities).unwrap_or_default() {
                     self.commands.entity(grab).despawn();
                 }
             }
+            histories.energies.insert(name.entity, view.energies);
+            histories.forces.extend(keys.into_iter().zip(view.hands.into_iter().map(|hand| hand.forces)));
         }
     }
 }

@@ -17,6 +17,8 @@ use crate::{
 pub(super) struct Histories {
     round_trips: Trace,
     rates: Trace,
+    /// "other" was chosen among the emulated networks.
+    other: bool,
 }
 
 #[derive(SystemParam)]
@@ -42,19 +44,31 @@ impl Session<'_, '_> {
         let rate = [stats.bytes_in_per_s * 8e-3, stats.bytes_out_per_s * 8e-3];
         self.histories.round_trips.push(now, round_trip_ms);
         self.histories.rates.push(now, rate[0]);
+        let dropped = stats.dropped;
         let mut users: Vec<_> = self.users.iter().collect();
         users.sort_by_key(|(user, ..)| user.id);
         let mut view = NetworkView {
             role: self.role(),
             invite: self.invite(),
             way_out: self.way_out(),
-            emulator: self.may_emulate().then(|| emulator::view_of(self.emulation().as_ref())),
+            emulator: self
+                .may_emulate()
+                .then(|| emulator::view_of(self.emulation().as_ref(), self.histories.other)),
             round_trip_ms,
             loss: [stats.loss_in * 100.0, stats.loss_out * 100.0],
             rate,
-            repaired: [stats.guessed, stats.recovered],
-            round_trips: self.histories.round_trips.clone(),
-            rates: self.histories.rates.clone(),
+            jitter_ms: stats.jitter.as_secs_f64() * 1e3,
+            repaired: self.host.is_none().then_some([stats.guessed, stats.recovered]),
+            asked_again: stats.nacks,
+            snapshots: stats.snapshots,
+            dropped: dropped.send_queue_full
+                + dropped.receive_queue_full
+                + dropped.too_large
+                + dropped.not_connected,
+            queueing: stats.queueing,
+            shown_offset: self.guest.is_some().then_some(stats.shown_offset * 100.0),
+            round_trips: std::mem::take(&mut self.histories.round_trips),
+            rates: std::mem::take(&mut self.histories.rates),
             users: users
                 .into_iter()
                 .map(|(user, yourself, hands, link)| UserView {
@@ -65,12 +79,16 @@ impl Session<'_, '_> {
                     round_trip_ms: link
                         .map(|link| link.round_trip.as_secs_f64() * 1e3)
                         .filter(|ms| *ms > 0.0),
+                    loss: link
+                        .filter(|link| !link.round_trip.is_zero())
+                        .map(|link| [link.loss_in * 100.0, link.loss_out * 100.0]),
                 })
                 .collect(),
             ..default()
         };
         let before = view.emulator.clone();
         network::show(ui, &mut view);
+        (self.histories.round_trips, self.histories.rates) = (view.round_trips, view.rates);
         if view.copy
             && let Some(invite) = view.invite
         {
@@ -80,6 +98,8 @@ impl Session<'_, '_> {
             && before != wanted
         {
             let now = self.emulation();
+            // Moved away from its preset, or called so: another network until a preset is chosen again.
+            self.histories.other = wanted.other() || (wanted.preset == before.preset && wanted.preset > 0);
             self.emulate(emulator::emulation_of(&before, &wanted, now.as_ref()));
         }
         if view.leave {
