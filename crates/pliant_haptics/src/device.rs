@@ -182,8 +182,8 @@ pub enum Fault {
     /// The device's answer could not be read.
     #[error("the device sent something that could not be read")]
     Malformed,
-    /// A position, orientation or velocity that is NaN or infinite.
-    #[error("the device sent a number that is not finite")]
+    /// A position, orientation or velocity that is NaN or infinite, or a force that came out so.
+    #[error("a measurement, or the force that answers it, is a number that is not finite")]
     NotFinite,
     /// The position jumped farther than a hand can.
     #[error("the position jumped by {0} m in one period")]
@@ -191,7 +191,7 @@ pub enum Fault {
     /// The device repeats its last measurement.
     #[error("the device has sent the same measurement for {0} s")]
     Frozen(f64),
-    /// The hand is faster than the cut-out allows.
+    /// The hand is faster than the cut-out allows, or than any hand, as the device has it.
     #[error("the hand moves at {0} m/s")]
     TooFast(f64),
     /// The simulation has been silent for so long, s.

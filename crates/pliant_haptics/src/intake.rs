@@ -2,9 +2,9 @@
 
 use nalgebra::{Quaternion, UnitQuaternion, Vector3};
 
-use crate::{DeviceInfo, Fault, Sample};
+use crate::{DeviceInfo, Fault, Sample, clamp_magnitude};
 
-/// No hand is faster, m/s: more is a jump of the measurement.
+/// No hand is faster, m/s: more is a jump of the measurement, or a filter of the device's gone wild.
 const FASTEST: f64 = 10.0;
 /// So long must a new place hold before it is believed, s.
 const SETTLE: f64 = 0.02;
@@ -132,16 +132,20 @@ impl Intake {
         self.buttons = sample.buttons & self.trusted;
 
         let frozen = self.frozen(dt, sample, force);
-        let velocity = match sample.velocity {
-            Some(v) => v.into(),
-            None => self.estimate(now, raw),
+        self.note(now, raw);
+        let told = sample.velocity.map(Vector3::from);
+        // By its largest component: the square of a number like 1e200 is not finite, and no such number is to go any further.
+        let wild = told.map(|v| v.amax()).filter(|speed| *speed > FASTEST);
+        let velocity = match told {
+            Some(v) if wild.is_none() => v,
+            _ => clamp_magnitude(&self.estimate(now, raw), FASTEST),
         };
         Believed {
             position: raw,
             velocity,
             orientation,
             buttons: self.buttons,
-            fault: frozen,
+            fault: frozen.or(wild.map(Fault::TooFast)),
             jumped,
             shifted,
         }
@@ -158,12 +162,16 @@ impl Intake {
         (self.same >= limit).then_some(Fault::Frozen(self.same))
     }
 
-    /// First-order adaptive windowing (Janabi-Sharifi, Hayward and Chen 2000): the longest window over which a straight line explains every
-    /// sample to within its rounding, axis by axis. Low noise when slow, no lag when fast.
-    fn estimate(&mut self, now: f64, position: Vector3<f64>) -> Vector3<f64> {
+    /// Remembers where it was and when, for [`estimate`](Self::estimate).
+    fn note(&mut self, now: f64, position: Vector3<f64>) {
         self.head = (self.head + 1) % WINDOW;
         self.window[self.head] = (now, position);
         self.filled = (self.filled + 1).min(WINDOW);
+    }
+
+    /// First-order adaptive windowing (Janabi-Sharifi, Hayward and Chen 2000): the longest window over which a straight line explains every
+    /// sample to within its rounding, axis by axis. Low noise when slow, no lag when fast.
+    fn estimate(&self, now: f64, position: Vector3<f64>) -> Vector3<f64> {
         let at = |back: usize| self.window[(self.head + WINDOW - back) % WINDOW];
         Vector3::from_fn(|axis, _| {
             let mut best = 0.0;
@@ -255,6 +263,23 @@ mod tests {
         };
         assert_eq!(refused, 20);
         assert!(b.jumped);
+    }
+
+    #[test]
+    fn a_velocity_that_no_hand_has_is_estimated_instead() {
+        let mut intake = intake(0.0);
+        let at = |k: u32| f64::from(k) * 1e-3;
+        let told = |k: u32, v| Sample { velocity: Some(v), ..Sample::at([0.1 * at(k), 0.0, 0.0]) };
+        for k in 0..20 {
+            let b = intake.take(at(k), 1e-3, &told(k, [0.1, 0.0, 0.0]), 0.0);
+            assert_eq!((b.fault, b.velocity.x), (None, 0.1));
+        }
+        for (k, wild) in [(20, 1e200), (21, -f64::MAX), (22, 10.5)] {
+            let b = intake.take(at(k), 1e-3, &told(k, [0.0, wild, 0.0]), 0.0);
+            assert_eq!(b.fault, Some(Fault::TooFast(f64::abs(wild))));
+            assert!((b.velocity - Vector3::new(0.1, 0.0, 0.0)).norm() < 1e-9, "{}", b.velocity);
+        }
+        assert_eq!(intake.take(at(23), 1e-3, &told(23, [0.1, 0.0, 0.0]), 0.0).fault, None);
     }
 
     #[test]

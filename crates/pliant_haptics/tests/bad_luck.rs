@@ -163,6 +163,7 @@ enum Lie {
     None,
     NotANumber,
     Elsewhere,
+    Wild,
     Error,
     ErrorAtOnce,
 }
@@ -185,6 +186,7 @@ impl HapticDevice for Liar {
                 let [x, y, z] = sample.position;
                 Ok(Sample { position: [x + 1.0, y, z], ..sample })
             }
+            Lie::Wild => Ok(Sample { velocity: Some([0.0, 1e200, 0.0]), ..sample }),
             Lie::Error => Err(Fault::Driver(0x301)),
             _ => Ok(sample),
         }
@@ -231,6 +233,21 @@ fn not_a_number_from_the_device() {
     assert_eq!(lowest, 0.0, "faded within 60 ms");
     assert!(cycle.core().last().wrench.force[0] < -1.0, "and back: {:?}", cycle.core().last().wrench);
     assert!(step <= slew_per_tick() * 1.000_001, "{step}");
+}
+
+#[test]
+fn a_velocity_that_overflows() {
+    // Finite, but its square is not: one such sample sent NaN to the motors for good. One, and many.
+    for ticks in [1, 60] {
+        let (mut cycle, events, lowest, step) = told(Lie::Wild, ticks);
+        assert!(events.iter().any(|e| matches!(e, LoopEvent::Fault(Fault::TooFast(v)) if *v == 1e200)));
+        assert!(lowest.is_finite() && (ticks == 1 || lowest == 0.0), "faded: {lowest} N");
+        assert!(cycle.core().last().wrench.force[0] < -1.0, "and back: {:?}", cycle.core().last().wrench);
+        assert!(step <= slew_per_tick() * 1.000_001, "{step}");
+        cycle.emergency_stop();
+        cycle.step(&mut VirtualPace::new(1000.0), &pliant_haptics::LocalModel::default(), &mut ());
+        assert_eq!(cycle.core().last().wrench, Wrench::ZERO);
+    }
 }
 
 #[test]

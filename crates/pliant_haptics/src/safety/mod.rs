@@ -4,7 +4,7 @@
 //!
 //! | Stage | What it does |
 //! | --- | --- |
-//! | finite check | a force that is not finite counts as none, and as a fault |
+//! | finite check | a number that is not finite counts as none, and as a fault; before the other stages, and once more after them |
 //! | [`Passivity`] | counts the energy at the port exactly; damps what leaks, and lets no more out than went in plus a tank |
 //! | damping cap | no more damping than device and rate close stably |
 //! | [`Slew`] | the force changes by so many newtons a second and no faster |
@@ -212,14 +212,24 @@ impl Safety {
         (limit - fades).max(0.25 * limit)
     }
 
-    /// One tick.
+    /// One tick. Whatever it is given, what it lets out is finite; no force at a gain of 0 is exactly that.
     pub fn tick(&mut self, wanted: &Wanted) -> Allowed {
-        let w = wanted;
-        let finite = [w.elastic, w.damping, w.weight].iter().all(|v| v.iter().all(|x| x.is_finite()));
-        let mut fault = (!finite).then_some(Fault::BadModel);
         let zero = Vector3::zeros();
-        let (elastic, damping, weight) =
-            if finite { (w.elastic, w.damping, w.weight) } else { (zero, zero, zero) };
+        let mut fault = None;
+        let mut w = *wanted;
+        if ![w.elastic, w.damping, w.weight].iter().all(is_finite) {
+            fault = Some(Fault::BadModel);
+            (w.elastic, w.damping, w.weight) = (zero, zero, zero);
+        }
+        if !(is_finite(&w.moved)
+            && is_finite(&w.velocity)
+            && w.dt.is_finite()
+            && w.dt >= 0.0
+            && w.silent.is_finite())
+        {
+            fault = fault.or(Some(Fault::NotFinite));
+            (w.moved, w.velocity, w.dt, w.silent) = (zero, zero, 0.0, f64::INFINITY);
+        }
 
         // Energy first of what was really held since the last tick.
         let interaction = self.last - self.last_weight;
@@ -232,7 +242,7 @@ impl Safety {
         } else {
             self.passivity.repay(w.dt);
         }
-        let (mut elastic, mut damping) = (elastic, damping);
+        let (mut elastic, mut damping) = (w.elastic, w.damping);
         let slew = self.slew_rate();
         if self.config.passivity.is_some() {
             damping += self.passivity.dissipate(&w.velocity, w.dt);
@@ -245,7 +255,7 @@ impl Safety {
             damping = cap_damping(&damping, &w.velocity, limit);
         }
 
-        let mut force = elastic + damping + weight;
+        let mut force = elastic + damping + w.weight;
         if slew.is_finite() {
             force = self.slew.limit(&force, slew * w.dt);
         }
@@ -256,18 +266,31 @@ impl Safety {
             let limit = self.thermal.limit(thermal, self.config.peak.unwrap_or(thermal.continuous));
             force = clamp_magnitude(&force, limit);
         }
+        if !is_finite(&force) {
+            // None of the stages is to let such a force through; if one does, it goes no further, and none of them remembers it.
+            fault = fault.or(Some(Fault::NotFinite));
+            force = zero;
+            self.slew = Slew::default();
+            self.passivity = Passivity::new(self.config.passivity.unwrap_or_default());
+        }
         self.slew.hold(&force);
         let (gain, cut) =
             self.gain.tick(&self.config, w.dt, w.velocity.norm(), w.silent, w.fault.or(fault), w.stop);
         fault = fault.or(cut);
-        let force = force * gain;
+        // Times zero a number may still be one with a sign.
+        let felt = |f: Vector3<f64>| if gain > 0.0 { f * gain } else { zero };
+        let force = felt(force);
         if let Some(thermal) = &self.config.thermal {
             self.thermal.heat(thermal, self.config.peak.unwrap_or(thermal.continuous), force.norm(), w.dt);
         }
-        self.last_weight = weight * gain;
+        self.last_weight = felt(w.weight);
         self.last = force;
         Allowed { force, gain, fault, port: self.passivity.port() }
     }
+}
+
+fn is_finite(v: &Vector3<f64>) -> bool {
+    v.iter().all(|x| x.is_finite())
 }
 
 #[cfg(test)]

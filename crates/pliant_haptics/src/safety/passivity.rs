@@ -135,7 +135,7 @@ impl Passivity {
         self.forgiven = self.forgiven.min(gap).max(0.0);
         let missing = gap - self.forgiven;
         let v2 = velocity.norm_squared();
-        if missing <= 0.0 || v2 * dt <= 0.0 {
+        if missing <= 0.0 || v2 * dt <= 0.0 || !v2.is_finite() {
             return Vector3::zeros();
         }
         let damping = (missing / (v2 * dt)).min(self.config.max_damping);
@@ -159,11 +159,14 @@ impl Passivity {
         if size <= 0.0 {
             return *force;
         }
-        let speed = velocity.dot(force) / size;
+        let speed = velocity.dot(&(force / size));
         let energy = self.port.available.max(0.0);
         // The root of I^2 / (2 M) + v I = E, without the cancellation of a fast handle.
-        let root = (speed * speed + 2.0 * energy / mass).sqrt();
+        let root = speed.hypot((2.0 * energy / mass).sqrt());
         let impulse = if speed > 0.0 { 2.0 * energy / (root + speed) } else { mass * (root - speed) };
+        if impulse == f64::INFINITY {
+            return *force;
+        }
         let most = if slew.is_finite() {
             // The root of f^2 / (2 S) + f dt = I.
             2.0 * impulse / (dt + (dt * dt + 2.0 * impulse / slew).sqrt())

@@ -93,6 +93,46 @@ fn not_finite_is_no_force() {
 }
 
 #[test]
+fn no_number_poisons_the_pipeline() {
+    let huge = Vector3::new(1e200, -1e200, 1e-3);
+    let nan = Vector3::new(f64::NAN, 0.0, 0.0);
+    let poisons: [(&str, fn(&mut Wanted, Vector3<f64>)); 7] = [
+        ("velocity", |w, v| w.velocity = v),
+        ("moved", |w, v| w.moved = v),
+        ("elastic", |w, v| w.elastic = v),
+        ("damping", |w, v| w.damping = v),
+        ("energies", |w, v| (w.stored, w.supplied) = (v.x, v.y)),
+        ("silence", |w, v| w.silent = v.x),
+        // A long period is one, and heats; one of less than nothing is none.
+        ("period", |w, v| w.dt = if v.x.is_finite() { -v.x.abs() } else { v.x }),
+    ];
+    for (what, poison) in poisons {
+        for value in [huge, -huge, nan, Vector3::repeat(f64::INFINITY), Vector3::repeat(f64::MAX)] {
+            let mut safety = engaged(1.0);
+            // With a leak that is to be damped away, and without.
+            safety.tick(&Wanted { moved: Vector3::new(2e-3, 0.0, 0.0), ..wanted(1.0) });
+            for _ in 0..3 {
+                let mut w = wanted(1.0);
+                poison(&mut w, value);
+                let out = safety.tick(&w);
+                assert!(
+                    is_finite(&out.force) && out.force.norm() <= 3.3,
+                    "{what} {value:?}: {:?}",
+                    out.force
+                );
+            }
+            // And it is over with the next grab, whatever has been counted in this one.
+            safety.tick(&Wanted { holding: false, ..wanted(0.0) });
+            let out = (0..1500).map(|_| safety.tick(&wanted(1.0))).last().unwrap();
+            assert!((out.force.x - 1.0).abs() < 1e-6, "{what} {value:?}: {:?} N", out.force);
+            let out = safety.tick(&Wanted { stop: true, ..wanted(1.0) });
+            assert_eq!(out.force, Vector3::zeros(), "{what} {value:?}");
+            assert!(out.force.iter().all(|x| x.is_sign_positive()), "exactly nothing: {}", out.force);
+        }
+    }
+}
+
+#[test]
 fn thermal_budget_ends_at_the_continuous_force() {
     let config = ThermalConfig { continuous: 1.0, peak_seconds: 5.0 };
     let mut thermal = Thermal::default();
