@@ -1,12 +1,12 @@
 //! The loop's body without a clock, a thread or a device: a sample and the simulation's last word in, a wrench out.
 
-use nalgebra::{Matrix3, Vector3};
+use nalgebra::Vector3;
 use thiserror::Error;
 
 use crate::{
-    Coupling, CouplingConfig, DeviceInfo, Fault, InfoError, LocalModel, MAX_CONTACTS, ModalLocal, Port,
-    Safety, SafetyConfig, Sample, ToolMap, Wanted, Wrench,
-    follow::Follow,
+    Coupling, CouplingConfig, DeviceInfo, Fault, InfoError, LocalModel, ModalLocal, Port, Safety,
+    SafetyConfig, Sample, ToolMap, Wanted, Wrench,
+    held::{Change, Felt, Held, When},
     intake::{Believed, Intake},
     safety::{Slew, clamp_magnitude},
     tool::{Tool, masked},
@@ -141,14 +141,12 @@ pub struct LoopCore {
     tool: Tool,
     safety: Safety,
     torque: Slew,
-    follow: [Follow; MAX_CONTACTS],
-    modal: Option<Box<ModalLocal>>,
+    held: Held,
     /// Last word of the simulation: its tick, when it came, what others had supplied, whether it was finite.
     heard: u64,
     heard_at: f64,
     supplied: f64,
     good: bool,
-    held: usize,
     last_position: Vector3<f64>,
     stalled_until: f64,
     stall: f64,
@@ -188,13 +186,11 @@ impl LoopCore {
             tool: Tool::new(config.tool),
             safety: Safety::new(safety, info.mass),
             torque: Slew::default(),
-            follow: [Follow::default(); MAX_CONTACTS],
-            modal: None,
+            held: Held::new(safety.ramp),
             heard: 0,
             heard_at: 0.0,
             supplied: 0.0,
             good: true,
-            held: 0,
             last_position: Vector3::zeros(),
             stalled_until: f64::NEG_INFINITY,
             stall: 0.0,
@@ -231,10 +227,15 @@ impl LoopCore {
         self.tool.set_map(map)
     }
 
-    /// Gives the loop a body to step itself, or takes it away; the one before comes back, to be dropped elsewhere.
+    /// Gives the loop a body to step itself, or takes it away; the one before comes back, to be dropped elsewhere. The force goes over from the
+    /// one's to the other's within 50 ms.
     pub fn set_modal(&mut self, modal: Option<Box<ModalLocal>>) -> Option<Box<ModalLocal>> {
-        self.safety.engage();
-        std::mem::replace(&mut self.modal, modal)
+        self.held.set_modal(modal)
+    }
+
+    /// Whether there is a body to step.
+    pub fn has_modal(&self) -> bool {
+        self.held.has_modal()
     }
 
     /// No force from the next tick on, until [`reset_stop`](Self::reset_stop).
@@ -298,7 +299,13 @@ impl LoopCore {
         let holding = self.good && self.heard > 0 && model.count > 0;
         let silent = if holding { (now - self.heard_at).max(0.0) } else { 0.0 };
 
-        let felt = if holding { self.springs(now, dt, &hand, model) } else { Felt::default() };
+        let felt = if holding {
+            let when = When { now, dt, period: 1.0 / self.config.rate };
+            self.held.forces(when, hand.fault.is_none(), &self.tool, model)
+        } else {
+            self.held.rest();
+            Felt::default()
+        };
         let scale = self.tool.energy_scale();
         let axes = self.info.force_axes;
         let allowed = self.safety.tick(&Wanted {
@@ -312,6 +319,7 @@ impl LoopCore {
             stored: scale * felt.stored,
             partial: model.partial,
             supplied: scale * supplied,
+            growing: felt.growing,
             holding,
             silent,
             fault,
@@ -349,65 +357,21 @@ impl LoopCore {
             return 0.0;
         }
         self.good = model.is_finite();
-        let fresh = self.heard == 0 || model.count != self.held;
+        let first_word = self.heard == 0;
         self.heard = model.tick;
         self.heard_at = now;
         if !self.good {
             return 0.0;
         }
-        let supplied = if fresh { 0.0 } else { model.supplied - self.supplied };
+        let change = self.held.take(model);
+        if change == Change::First {
+            self.safety.engage();
+        }
+        // What is told of other grabs, and so perhaps of another body, does not go on from what was told of these.
+        let goes_on = !first_word && change == Change::None;
+        let supplied = if goes_on { model.supplied - self.supplied } else { 0.0 };
         self.supplied = model.supplied;
-        if model.count != self.held {
-            if self.held == 0 {
-                self.safety.engage();
-            }
-            self.held = model.count;
-            self.follow.iter_mut().for_each(Follow::reset);
-        }
         supplied
-    }
-
-    /// The forces of the tool's contacts, world axes.
-    fn springs(&mut self, now: f64, dt: f64, hand: &Believed, model: &LocalModel) -> Felt {
-        let mut felt = Felt { stored: model.stored, ..Felt::default() };
-        let period = 1.0 / self.config.rate;
-        let stepped = match &mut self.modal {
-            Some(modal) if hand.fault.is_none() => {
-                let steps = (dt / period).round().clamp(1.0, 4.0) as usize;
-                modal.advance(now, steps, &self.tool, model)
-            }
-            _ => false,
-        };
-        if let (Some(modal), true) = (&self.modal, stepped) {
-            felt.stored = modal.energy();
-        }
-        for (i, contact) in model.contacts().iter().enumerate() {
-            let arm = self.tool.orientation * Vector3::from(contact.offset);
-            let (proxy, speed) = self.follow[i].advance(now, dt.min(2.0 / self.config.rate), model, contact);
-            let at = self.tool.position + arm;
-            let k = Matrix3::from_fn(|r, c| contact.stiffness[r][c]);
-            let stored = |stretch: Vector3<f64>| 0.5 * stretch.dot(&(k * stretch)).max(0.0);
-            let (elastic, damping) = match &self.modal {
-                Some(modal) if stepped => {
-                    felt.stored += modal.proxy(i).map_or(0.0, |proxy| stored(at - proxy));
-                    (modal.reaction(i), Vector3::zeros())
-                }
-                _ => {
-                    felt.stored += stored(at - proxy);
-                    (-(k * (at - proxy)), -(self.tool.velocity - speed) * contact.damping)
-                }
-            };
-            felt.elastic += elastic;
-            felt.damping += damping;
-            felt.torque += arm.cross(&(elastic + damping));
-        }
-        if self.tool.is_clutched() {
-            // A tool that is off the world is not dragged by it; what is held stays where it is held.
-            felt.elastic = Vector3::zeros();
-            felt.damping = Vector3::zeros();
-            felt.torque = Vector3::zeros();
-        }
-        felt
     }
 
     fn torque_to_hand(&mut self, felt: &Felt, dt: f64, gain: f64) -> Vector3<f64> {
@@ -423,15 +387,6 @@ impl LoopCore {
         self.torque.hold(&torque);
         torque * gain
     }
-}
-
-/// Forces before safety, world axes.
-#[derive(Debug, Clone, Copy, Default)]
-struct Felt {
-    elastic: Vector3<f64>,
-    damping: Vector3<f64>,
-    torque: Vector3<f64>,
-    stored: f64,
 }
 
 fn positive(dt: f64) -> f64 {

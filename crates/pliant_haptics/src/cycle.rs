@@ -123,6 +123,8 @@ pub struct Cycle<D> {
     told: Option<&'static str>,
     stopped: bool,
     counted_from: (f64, u64),
+    /// A copy of a body that the loop does not want any more.
+    trash: Option<Box<ModalLocal>>,
 }
 
 impl<D: HapticDevice> Cycle<D> {
@@ -147,6 +149,7 @@ impl<D: HapticDevice> Cycle<D> {
             told: None,
             stopped: false,
             counted_from: (0.0, 0),
+            trash: None,
         })
     }
 
@@ -202,6 +205,17 @@ impl<D: HapticDevice> Cycle<D> {
     /// Gives the loop a body to step itself, or takes it away; the one before comes back.
     pub fn set_modal(&mut self, modal: Option<Box<ModalLocal>>) -> Option<Box<ModalLocal>> {
         self.core.set_modal(modal)
+    }
+
+    /// A copy of a body that the loop gave up by itself (another device came back, with another coupling), to be dropped where that may take its
+    /// time. A new one is to be given to it.
+    pub fn take_trash(&mut self) -> Option<Box<ModalLocal>> {
+        self.trash.take()
+    }
+
+    /// Whether the loop has a body to step itself.
+    pub fn has_modal(&self) -> bool {
+        self.core.has_modal()
     }
 
     /// One period.
@@ -348,6 +362,13 @@ impl<D: HapticDevice> Cycle<D> {
             let Ok(mut core) = LoopCore::new(info, self.config) else { return };
             if self.core.is_stopped() {
                 core.emergency_stop();
+            }
+            // The copy of the body goes with it, unless its hand's spring is another device's: then the proxy does until somebody gives a new one.
+            let copy = self.core.set_modal(None);
+            if core.coupling() == self.core.coupling() {
+                core.set_modal(copy);
+            } else {
+                self.trash = copy.or(self.trash.take());
             }
             self.core = core;
             self.report.coupling = Some(*self.core.coupling());

@@ -65,11 +65,6 @@ impl Follow {
     fn shown(&self, now: f64, dt: f64) -> Vector3<f64> {
         self.told + self.speed * self.age(now).min(self.interval) + self.offset * self.left(now, dt)
     }
-
-    /// Forgets the last contact: the next one begins where it is.
-    pub(crate) fn reset(&mut self) {
-        *self = Self::default();
-    }
 }
 
 #[cfg(test)]

@@ -48,6 +48,7 @@ mod device;
 mod find;
 mod follow;
 mod hand;
+mod held;
 mod histogram;
 mod intake;
 #[cfg(feature = "inverse")]

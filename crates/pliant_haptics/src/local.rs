@@ -11,6 +11,8 @@ pub const MAX_CONTACTS: usize = 4;
 /// One grab as the loop sees it: a spring from a point of the tool to the *proxy*, the place where the held patch is.
 #[derive(Debug, Clone, Copy, PartialEq, Default)]
 pub struct Contact {
+    /// Tells the grab from others, for as long as it lasts: one of another key is another, and comes by a ramp.
+    pub key: u64,
     /// The held point from the tool point, in tool axes, m of the world.
     pub offset: [f64; 3],
     /// Where the patch was when the model was written, m, world axes.
@@ -74,6 +76,8 @@ impl LocalModel {
 /// A grab of the tool: which one, and where on the tool.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct HeldGrab {
+    /// Tells this grab from others, on whatever body, for as long as it lasts.
+    pub key: u64,
     /// The grab on the body.
     pub id: GrabId,
     /// The held point from the tool point, tool axes, m of the world.
@@ -100,7 +104,7 @@ pub struct FeltGrab {
 #[derive(Debug, Clone, Default)]
 pub struct ModelWriter {
     tick: u64,
-    proxies: [Option<(GrabId, Vector3<f64>)>; MAX_CONTACTS],
+    proxies: [Option<(u64, Vector3<f64>)>; MAX_CONTACTS],
     points: [Option<(u64, Vector3<f64>)>; MAX_CONTACTS],
     /// Of bodies elsewhere: what they stored when the first word of them was written, J, and the work of the tool's grabs on them since.
     stored: Option<f64>,
@@ -151,7 +155,7 @@ impl ModelWriter {
         let mut proxies = [None; MAX_CONTACTS];
         for (i, grab) in held.iter().take(MAX_CONTACTS).enumerate() {
             let proxy = Vector3::from(body.grab_position(grab.id)?) * scale;
-            let before = self.proxies.iter().flatten().find(|(id, _)| *id == grab.id).map(|(_, p)| *p);
+            let before = self.proxies.iter().flatten().find(|(key, _)| *key == grab.key).map(|(_, p)| *p);
             let velocity = before.map_or_else(Vector3::zeros, |p| (proxy - p) / out.period);
             let compliance = body.compliance(grab.id)?;
             let compliance = Matrix3::from_fn(|r, c| compliance[r][c]);
@@ -165,6 +169,7 @@ impl ModelWriter {
                 0.0
             };
             out.contacts[i] = Contact {
+                key: grab.key,
                 offset: grab.offset,
                 proxy: proxy.into(),
                 velocity: velocity.into(),
@@ -173,7 +178,7 @@ impl ModelWriter {
                 reaction: reaction.into(),
             };
             out.count = i + 1;
-            proxies[i] = Some((grab.id, proxy));
+            proxies[i] = Some((grab.key, proxy));
         }
         self.proxies = proxies;
         Ok(())
@@ -209,6 +214,7 @@ impl ModelWriter {
             let k = grab.stiffness;
             let k = if k.iter().flatten().all(|x| x.is_finite()) { k } else { [[0.0; 3]; 3] };
             out.contacts[i] = Contact {
+                key: grab.key,
                 offset: grab.offset,
                 proxy: grab.point,
                 velocity: velocity.into(),

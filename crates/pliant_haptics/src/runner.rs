@@ -303,6 +303,11 @@ impl<D: HapticDevice> Inner<D> {
             if self.stop.is_pressed() {
                 self.cycle.emergency_stop();
             }
+            if !self.trash.is_full()
+                && let Some(old) = self.cycle.take_trash()
+            {
+                let _ = self.trash.push(old);
+            }
             let report = *self.cycle.step(&mut pace, self.model.read(), &mut self.queues);
             self.report.write(report);
         }

@@ -122,7 +122,7 @@ impl Scene {
         let id = body.grab(&patch, cycle.core().coupling().grab_config(1.0, 1.0))?;
         Ok(Self {
             body,
-            held: HeldGrab { id, offset: [0.0; 3] },
+            held: HeldGrab { key: 0, id, offset: [0.0; 3] },
             writer: ModelWriter::new(),
             cycle,
             pace: VirtualPace::new(RATE),

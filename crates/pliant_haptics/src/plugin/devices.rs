@@ -20,6 +20,8 @@ pub struct HapticDevices {
     next: u32,
     /// The emergency stop, for devices that come later too.
     stopped: AtomicBool,
+    /// Buttons of devices that have been taken away while they were down.
+    left_down: Vec<HapticButton>,
 }
 
 /// What is known of a device, as of this frame.
@@ -41,11 +43,11 @@ pub(crate) struct Entry {
     pub(crate) map: Option<ToolMap>,
     /// The tick of the loop whose tool position the simulation has, s.
     pub(crate) seen: f64,
-    /// What the loop steps itself, if it does: the grabs it was made for.
-    pub(crate) modal_for: Vec<Entity>,
-    /// How the body was stepped when it was made.
-    pub(crate) modal_config: Option<pliant_modal::BodyConfig>,
+    /// What the body that the loop steps itself was made for; the default: it has none.
+    pub(crate) modal_for: super::word::CopyOf,
     pub(crate) elsewhere: super::word::Elsewhere,
+    /// Buttons that the app has been told are down.
+    pressed: u32,
     stop: StopSwitch,
 }
 
@@ -109,18 +111,24 @@ impl HapticDevices {
             writer: ModelWriter::new(),
             map: None,
             seen: 0.0,
-            modal_for: Vec::new(),
-            modal_config: None,
+            modal_for: super::word::CopyOf::default(),
             elsewhere: super::word::Elsewhere::default(),
+            pressed: 0,
         });
         Ok(id)
     }
 
-    /// Stops a device and gives it back to nobody. `false`: there is none of that name.
+    /// Stops a device and gives it back to nobody: its buttons come up, and its tools let go of what they hold in the next frame. `false`: there is
+    /// none of that name.
     pub fn remove(&mut self, id: DeviceId) -> bool {
-        let before = self.entries.len();
-        self.entries.retain(|e| e.id != id);
-        self.entries.len() < before
+        let Some(entry) = self.entries.iter().position(|e| e.id == id) else { return false };
+        let down = self.entries.remove(entry).pressed;
+        self.left_down.extend((0..32).filter(|bit| down >> bit & 1 == 1).map(|button| HapticButton {
+            device: id,
+            button,
+            pressed: false,
+        }));
+        true
     }
 
     /// What is known of a device.
@@ -179,6 +187,7 @@ pub(crate) fn read(
     mut faults: MessageWriter<HapticFault>,
     mut notices: MessageWriter<HapticNotice>,
 ) {
+    buttons.write_batch(devices.left_down.drain(..));
     for entry in &mut devices.entries {
         let device = entry.id;
         entry.status.report = *entry.running.get().report();
@@ -188,9 +197,11 @@ pub(crate) fn read(
         for event in entry.running.get().events() {
             match event {
                 LoopEvent::Pressed(button) => {
+                    entry.pressed |= 1 << button;
                     buttons.write(HapticButton { device, button, pressed: true });
                 }
                 LoopEvent::Released(button) => {
+                    entry.pressed &= !(1 << button);
                     buttons.write(HapticButton { device, button, pressed: false });
                 }
                 LoopEvent::Fault(fault) => {

@@ -98,6 +98,7 @@ impl Plugin for HapticsPlugin {
                     devices::read,
                     tool::place,
                     tool::grip,
+                    tool::let_go,
                     source::press.in_set(PointerToolSystems::Press),
                     source::point.in_set(PointerToolSystems::Move),
                 )

@@ -178,6 +178,25 @@ pub(crate) fn follow(
     }
 }
 
+/// A tool whose device has been taken away is nobody's hand: it lets go, and feels nothing.
+pub(crate) fn let_go(
+    mut commands: Commands,
+    devices: Res<HapticDevices>,
+    mut tools: Query<(&HapticTool, &mut ToolPose, Option<&ToolGrabs>)>,
+) {
+    for (tool, mut pose, held) in &mut tools {
+        if devices.get(tool.device).is_some() {
+            continue;
+        }
+        for &grab in held.map_or(&[][..], ToolGrabs::entities) {
+            commands.entity(grab).try_despawn();
+        }
+        let still =
+            ToolPose { position: pose.position, orientation: pose.orientation, ..ToolPose::default() };
+        pose.set_if_neq(still);
+    }
+}
+
 /// A press holds the nearest surface within reach; letting go lets go.
 pub(crate) fn grip(
     mut commands: Commands,
@@ -192,7 +211,7 @@ pub(crate) fn grip(
         {
             if !press.pressed {
                 for &grab in held.map_or(&[][..], ToolGrabs::entities) {
-                    commands.entity(grab).despawn();
+                    commands.entity(grab).try_despawn();
                 }
                 continue;
             }

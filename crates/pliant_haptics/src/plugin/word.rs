@@ -1,12 +1,14 @@
 //! After a tick: what the simulation tells each device's loop.
 
+use std::sync::Arc;
+
 use bevy::{math::DVec3, prelude::*};
 use nalgebra::Matrix3;
 use pliant_body::{BodyState, Driven, Grab, GrabForce, GrabOf, ShownState};
-use pliant_modal::{GrabConfig, Patch};
+use pliant_modal::{BodyConfig, GrabConfig, ModalModel, Patch};
 
 use super::{HapticDevices, HapticTool, ToolGrabs, ToolOffset};
-use crate::{FeltGrab, HeldGrab, LocalModel, MAX_CONTACTS, ModalLocal};
+use crate::{Coupling, FeltGrab, HeldGrab, LocalModel, MAX_CONTACTS, ModalLocal};
 
 /// A body that somebody else steps and of which nothing new has come for so long is one that the network has lost, s: four of its ticks at 40 Hz.
 const REMOTE_PATIENCE: f64 = 0.1;
@@ -17,10 +19,41 @@ type HeldGrabs<'w, 's> =
 type Bodies<'w, 's> =
     Query<'w, 's, (&'static BodyState, &'static Driven, &'static ShownState, &'static GlobalTransform)>;
 
+/// What a local copy of a body was made for and from. Any other one asks for another copy.
+#[derive(Default, PartialEq)]
+pub(crate) struct CopyOf {
+    grabs: Vec<u64>,
+    /// The model by its place in memory, which the copy that has it keeps from being another's.
+    model: usize,
+    /// Without the step, which the loop has its own of: in a schedule of the picture's rate it differs each time.
+    config: Option<BodyConfig>,
+    coupling: Option<Coupling>,
+}
+
+impl CopyOf {
+    fn new(state: &BodyState, held: &[HeldGrab], coupling: &Coupling) -> Self {
+        Self {
+            grabs: held.iter().map(|grab| grab.key).collect(),
+            model: Arc::as_ptr(state.model()).addr(),
+            config: Some(BodyConfig { step: 0.0, ..state.body().config().clone() }),
+            coupling: Some(*coupling),
+        }
+    }
+}
+
+/// A grab on a body elsewhere, the body as it was when its spring was found, and the spring.
+struct Spring {
+    of: Entity,
+    grab: Grab,
+    model: Arc<ModalModel>,
+    config: BodyConfig,
+    stiffness: Matrix3<f64>,
+}
+
 /// What is known of the tool's grabs on bodies that are stepped elsewhere.
 #[derive(Default)]
 pub(crate) struct Elsewhere {
-    springs: Vec<(Entity, Grab, Matrix3<f64>)>,
+    springs: Vec<(Entity, Spring)>,
     /// The newest of the held bodies' shown states, and when it came, s.
     version: u64,
     at: f64,
@@ -43,10 +76,16 @@ impl Elsewhere {
     }
 
     /// The spring that ties a patch to the hand there, N/m, body axes: as a grab of that kind on a copy of the body would have it.
-    fn spring(&mut self, entity: Entity, grab: &Grab, state: &BodyState) -> Matrix3<f64> {
-        let same = |known: &Grab| Grab { target: known.target, ..*grab } == *known;
-        if let Some((.., spring)) = self.springs.iter().find(|(e, known, _)| *e == entity && same(known)) {
-            return *spring;
+    fn spring(&mut self, entity: Entity, of: Entity, grab: &Grab, state: &BodyState) -> Matrix3<f64> {
+        let config = BodyConfig { step: 0.0, ..state.body().config().clone() };
+        let same = |known: &Spring| {
+            known.of == of
+                && Grab { target: known.grab.target, ..*grab } == known.grab
+                && Arc::ptr_eq(&known.model, state.model())
+                && known.config == config
+        };
+        if let Some((_, spring)) = self.springs.iter().find(|(e, known)| *e == entity && same(known)) {
+            return spring.stiffness;
         }
         let mut probe = state.body().clone();
         let hold = GrabConfig { stiffness: grab.stiffness, relaxation: grab.relaxation };
@@ -55,11 +94,12 @@ impl Elsewhere {
             .and_then(|patch| probe.grab(&patch, hold).ok())
             .and_then(|id| probe.compliance(id).ok());
         let coupling = Matrix3::identity() * grab.stiffness.unwrap_or(0.0);
-        let spring =
+        let stiffness =
             compliance.and_then(|c| Matrix3::from_fn(|i, j| c[i][j]).try_inverse()).unwrap_or(coupling);
-        self.springs.retain(|(e, ..)| *e != entity);
-        self.springs.push((entity, *grab, spring));
-        spring
+        self.springs.retain(|(e, _)| *e != entity);
+        let spring = Spring { of, grab: *grab, model: state.model().clone(), config, stiffness };
+        self.springs.push((entity, spring));
+        stiffness
     }
 }
 
@@ -93,7 +133,7 @@ pub(crate) fn publish(
                 warn!("{}: the hand was told of no contact: {error}", entry.status.info.name);
             }
         } else if entry.elsewhere.is_alive(&held, &bodies, now) {
-            entry.elsewhere.springs.retain(|(e, ..)| entities.contains(e));
+            entry.elsewhere.springs.retain(|(e, _)| entities.contains(e));
             let felt: Vec<FeltGrab> = held
                 .iter()
                 .filter_map(|(entity, of, grab, force, offset)| {
@@ -103,9 +143,9 @@ pub(crate) fn publish(
                     }
                     let (state, _, _, place) = bodies.get(of.0).ok()?;
                     let turn: Matrix3<f64> = world_axes(place);
-                    let spring = turn * entry.elsewhere.spring(*entity, grab, state) * turn.transpose();
+                    let spring = turn * entry.elsewhere.spring(*entity, of.0, grab, state) * turn.transpose();
                     Some(FeltGrab {
-                        key: entity.to_bits(),
+                        key: key(*entity, of),
                         offset: offset.map_or(DVec3::ZERO, |o| o.0).into(),
                         point: force.point.into(),
                         force: force.force.into(),
@@ -122,27 +162,20 @@ pub(crate) fn publish(
         }
 
         // A body for the loop to step itself: made here, where memory may be had, whenever what is held changes.
-        let wanted: Vec<Entity> =
-            if tool.modal && local.is_some() { held.iter().map(|(e, ..)| *e).collect() } else { Vec::new() };
-        let config = local.as_ref().map(|(state, _)| state.body().config());
-        if wanted != entry.modal_for || (!wanted.is_empty() && config != entry.modal_config.as_ref()) {
+        let local = local.filter(|_| tool.modal);
+        let wanted = local.as_ref().map_or_else(CopyOf::default, |(s, ids)| CopyOf::new(s, ids, &coupling));
+        if wanted != entry.modal_for {
             let modal = match &local {
-                Some((state, ids)) if !wanted.is_empty() => {
-                    match ModalLocal::new(state.body(), ids, state.scale(), rate) {
-                        Ok(modal) => Some(Box::new(modal)),
-                        Err(error) => {
-                            warn!(
-                                "{}: the loop does not step the body itself: {error}",
-                                entry.status.info.name
-                            );
-                            None
-                        }
+                Some((state, ids)) => match ModalLocal::new(state.body(), ids, state.scale(), rate) {
+                    Ok(modal) => Some(Box::new(modal)),
+                    Err(error) => {
+                        warn!("{}: the loop does not step the body itself: {error}", entry.status.info.name);
+                        None
                     }
-                }
-                _ => None,
+                },
+                None => None,
             };
             if entry.running.get().set_modal(modal) {
-                entry.modal_config = config.cloned();
                 entry.modal_for = wanted;
             }
         }
@@ -170,6 +203,11 @@ fn stored(held: &[HeldItem], bodies: &Bodies) -> f64 {
     sum
 }
 
+/// A grab's name for the loop: another entity is another grab, and so is the same one on another body.
+fn key(grab: Entity, of: &GrabOf) -> u64 {
+    grab.to_bits() ^ of.0.to_bits().rotate_left(23)
+}
+
 fn world_axes(place: &GlobalTransform) -> Matrix3<f64> {
     let m = bevy::math::DMat3::from_quat(place.rotation().as_dquat().normalize()).to_cols_array();
     Matrix3::from_column_slice(&m)
@@ -185,9 +223,9 @@ fn single_body<'a>(held: &[HeldItem], bodies: &'a Bodies) -> Option<(&'a BodySta
     if *driven == Driven::Remote {
         return None;
     }
-    let ids = held.iter().map(|(entity, .., offset)| {
+    let ids = held.iter().map(|(entity, of, .., offset)| {
         let id = state.grab_id(*entity)?;
-        Some(HeldGrab { id, offset: offset.map_or(DVec3::ZERO, |o| o.0).into() })
+        Some(HeldGrab { key: key(*entity, of), id, offset: offset.map_or(DVec3::ZERO, |o| o.0).into() })
     });
     Some((state, ids.collect::<Option<Vec<_>>>()?))
 }

@@ -126,6 +126,8 @@ pub struct Wanted {
     pub partial: bool,
     /// Energy that others have put in since the last tick, J at the hand.
     pub supplied: f64,
+    /// Springs are coming up by ramps of their own: what they store without being felt has not leaked.
+    pub growing: bool,
     /// The tool holds something.
     pub holding: bool,
     /// Time since the simulation's last word, s.
@@ -234,7 +236,7 @@ impl Safety {
         // Energy first of what was really held since the last tick.
         let interaction = self.last - self.last_weight;
         self.passivity.observe(&interaction, &w.moved, w.supplied, w.stored, w.partial, w.holding);
-        if self.gain.value() < 1.0 {
+        if self.gain.value() < 1.0 || w.growing {
             if self.gain.value() <= 0.0 {
                 self.passivity.refill();
             }

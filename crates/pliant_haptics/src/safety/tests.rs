@@ -18,6 +18,7 @@ fn wanted(force: f64) -> Wanted {
         stored: 1.0,
         partial: false,
         supplied: 0.0,
+        growing: false,
         holding: true,
         silent: 0.0,
         fault: None,

@@ -15,7 +15,7 @@ use super::{
 
 pub struct Scene {
     pub body: Body,
-    held: HeldGrab,
+    pub held: HeldGrab,
     writer: ModelWriter,
     pub cycle: Cycle<VirtualDevice>,
     pub hand: VirtualHandle,
@@ -102,7 +102,7 @@ impl Scene {
         };
         let mut cycle = Cycle::new(device, config).unwrap();
         let id = body.grab(&patch, cycle.core().coupling().grab_config(1.0, 1.0)).unwrap();
-        let held = HeldGrab { id, offset: [0.0; 3] };
+        let held = HeldGrab { key: 0, id, offset: [0.0; 3] };
         if c.modal {
             cycle.set_modal(Some(Box::new(ModalLocal::new(&body, &[held], 1.0, c.rate).unwrap())));
         }
