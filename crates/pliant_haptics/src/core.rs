@@ -308,14 +308,20 @@ impl LoopCore {
         };
         let scale = self.tool.energy_scale();
         let axes = self.info.force_axes;
+        let [elastic, damping, weight] = [
+            self.tool.force_to_hand(felt.elastic),
+            self.tool.force_to_hand(felt.damping),
+            self.tool.weight(),
+        ]
+        .map(|force| masked(force, axes));
         let allowed = self.safety.tick(&Wanted {
             // Memory of what came before is not run faster after a stall: a fade takes its ticks.
             dt: dt.min(2.0 / self.config.rate),
             moved,
             velocity: hand.velocity,
-            elastic: masked(self.tool.force_to_hand(felt.elastic), axes),
-            damping: masked(self.tool.force_to_hand(felt.damping), axes),
-            weight: masked(self.tool.weight(), axes),
+            elastic,
+            damping,
+            weight,
             stored: scale * felt.stored,
             partial: model.partial,
             supplied: scale * supplied,
@@ -325,7 +331,9 @@ impl LoopCore {
             fault,
             stop: std::mem::take(&mut self.stop),
         });
-        let torque = self.torque_to_hand(&felt, dt, allowed.gain);
+        let asked = (elastic + damping + weight).norm();
+        let share = if asked > 1e-9 { (allowed.force.norm() / asked).min(1.0) } else { 1.0 };
+        let torque = self.torque_to_hand(&felt, dt, allowed.gain, share);
         let wrench = Wrench { force: allowed.force.into(), torque: torque.into() };
         let orientation = self.tool.orientation.quaternion();
         self.last = Tick {
@@ -374,18 +382,26 @@ impl LoopCore {
         supplied
     }
 
-    fn torque_to_hand(&mut self, felt: &Felt, dt: f64, gain: f64) -> Vector3<f64> {
+    /// The torque of what is held, cut as the force was: `share` of the force that was asked for is felt, and `gain` of a couple, which asks for none.
+    ///
+    /// Beyond that it is only clamped and slewed: its work is not counted at the port, and the stiffness that turns a handle is not held to what the
+    /// device closes. So a device that pushes somebody gets none.
+    fn torque_to_hand(&mut self, felt: &Felt, dt: f64, gain: f64, share: f64) -> Vector3<f64> {
+        if !self.info.simulated || gain <= 0.0 {
+            self.torque = Slew::default();
+            return Vector3::zeros();
+        }
         let peak = self.info.peak_torque;
         let torque = masked(self.tool.torque_to_hand(felt.torque), self.info.torque_axes);
         let torque = if torque.iter().all(|x| x.is_finite()) {
-            clamp_magnitude(&torque, peak)
+            clamp_magnitude(&(torque * share.min(gain)), peak)
         } else {
             Vector3::zeros()
         };
         // The whole torque in 5 ms, as for the force.
         let torque = self.torque.limit(&torque, peak / 0.005 * dt.min(2.0 / self.config.rate));
         self.torque.hold(&torque);
-        torque * gain
+        torque
     }
 }
 

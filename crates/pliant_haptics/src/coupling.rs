@@ -2,6 +2,9 @@
 
 use crate::DeviceInfo;
 
+/// The weakest spring that a grab is made of, N/m: a newton over a thousand kilometres. A grab of the body has no spring of nothing.
+const WEAKEST: f64 = 1e-6;
+
 /// What is wanted of the coupling, and how much room to leave.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct CouplingConfig {
@@ -100,13 +103,14 @@ impl Coupling {
     }
 
     /// How a grab on the body is to be configured so that body and loop hold the same spring; `force_scale` and `motion_scale` are the
-    /// tool's: a spring of `K` in the world feels like `motion_scale^2 force_scale K` in the hand.
+    /// tool's: a spring of `K` in the world feels like `motion_scale^2 force_scale K` in the hand. Infinitely stiff only where the coupling is, or where
+    /// the hand feels nothing of it; a coupling that a device closes with 0 N/m is one of 1e-6.
     pub fn grab_config(&self, motion_scale: f64, force_scale: f64) -> pliant_modal::GrabConfig {
         let felt = motion_scale * motion_scale * force_scale;
-        let stiffness = self.stiffness / felt;
-        let ok = stiffness.is_finite() && stiffness > 0.0;
+        // Nothing of nothing is nothing, and not NaN.
+        let stiffness = if self.stiffness > 0.0 { self.stiffness / felt } else { 0.0 };
         pliant_modal::GrabConfig {
-            stiffness: ok.then_some(stiffness),
+            stiffness: (!stiffness.is_infinite()).then_some(stiffness.max(WEAKEST)),
             relaxation: if self.stiffness.is_finite() && self.stiffness > 0.0 {
                 self.damping / self.stiffness
             } else {
@@ -198,6 +202,23 @@ mod tests {
             0.0,
         );
         assert!(c.stiffness.is_finite() && c.damping.is_finite());
+    }
+
+    #[test]
+    fn a_coupling_of_nothing_holds_with_nothing() {
+        // A device without damping of its own, and none wanted: 2 b / T = 0.
+        let device = VirtualConfig { damping: 0.0, ..VirtualConfig::default() }.info();
+        let wanted = CouplingConfig { damping: 0.0, ..CouplingConfig::default() };
+        let c = Coupling::clamp(&wanted, &device, 1000.0, 0.0, 0.0);
+        assert_eq!(c.stiffness, 0.0, "{c}");
+        let weakest = pliant_modal::GrabConfig { stiffness: Some(1e-6), relaxation: 0.0 };
+        for (motion, force) in [(1.0, 1.0), (0.1, 1.0), (1.0, 0.0)] {
+            assert_eq!(c.grab_config(motion, force), weakest, "{motion} {force}");
+        }
+        let finite = Coupling { stiffness: 280.0, damping: 0.28, ..c };
+        assert_eq!(finite.grab_config(2.0, 0.5).stiffness, Some(140.0));
+        assert_eq!(finite.grab_config(1.0, 0.0).stiffness, None, "not felt at all, so as stiff as the patch");
+        assert_eq!(Coupling { stiffness: f64::INFINITY, ..c }.grab_config(1.0, 1.0).stiffness, None);
     }
 
     /// Whether `M x'' + c x' + K (x - x(t - t_r)) = 0` calms down, by stepping it: an independent check of the limit.

@@ -8,7 +8,7 @@ use thiserror::Error;
 pub struct Wrench {
     /// Force on the hand, N. Default: none.
     pub force: [f64; 3],
-    /// Torque on the hand about the tool point, N m; devices of three degrees of freedom ignore it. Default: none.
+    /// Torque on the hand about the tool point, N m; devices of three degrees of freedom ignore it, and real ones are sent none. Default: none.
     pub torque: [f64; 3],
 }
 

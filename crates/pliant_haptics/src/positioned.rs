@@ -1,6 +1,9 @@
 //! A position without motors: pointer, gamepad, script. The force is there to be shown, nobody feels it.
 
-use std::sync::{Arc, Mutex, PoisonError};
+use std::sync::{
+    Arc, Mutex, PoisonError,
+    atomic::{AtomicU64, Ordering},
+};
 
 use nalgebra::Vector3;
 
@@ -24,25 +27,40 @@ pub struct Positioned {
 
 /// Moves a [`Positioned`] device from another thread.
 #[derive(Debug, Clone, Default)]
-pub struct PositionedHandle(Arc<Mutex<(Sample, Wrench)>>);
+pub struct PositionedHandle(Arc<Shared>);
+
+#[derive(Debug, Default)]
+struct Shared {
+    wanted: Mutex<Sample>,
+    /// Force and torque, each number by itself: it is drawn, and the loop waits for nobody who draws.
+    wrench: [AtomicU64; 6],
+}
 
 impl PositionedHandle {
-    /// Puts the device somewhere (m, device axes), with these buttons down. A number that is not finite is refused.
+    /// Puts the device somewhere (m, device axes), with these buttons down. A place that is not finite is refused; the buttons count all the same.
     pub fn set(&self, position: [f64; 3], buttons: u32) {
+        let mut wanted = self.0.wanted.lock().unwrap_or_else(PoisonError::into_inner);
+        wanted.buttons = buttons;
         if position.iter().all(|x| x.is_finite()) {
-            let mut shared = self.0.lock().unwrap_or_else(PoisonError::into_inner);
-            shared.0 = Sample { position, buttons, ..shared.0 };
+            wanted.position = position;
         }
     }
 
     /// Presses these buttons and no others, wherever the device is.
     pub fn set_buttons(&self, buttons: u32) {
-        self.0.lock().unwrap_or_else(PoisonError::into_inner).0.buttons = buttons;
+        self.0.wanted.lock().unwrap_or_else(PoisonError::into_inner).buttons = buttons;
     }
 
     /// The wrench that a hand would feel: to be shown.
     pub fn wrench(&self) -> Wrench {
-        self.0.lock().unwrap_or_else(PoisonError::into_inner).1
+        let n = |i: usize| f64::from_bits(self.0.wrench[i].load(Ordering::Relaxed));
+        Wrench { force: [n(0), n(1), n(2)], torque: [n(3), n(4), n(5)] }
+    }
+
+    fn show(&self, wrench: &Wrench) {
+        for (cell, x) in self.0.wrench.iter().zip(wrench.force.iter().chain(&wrench.torque)) {
+            cell.store(x.to_bits(), Ordering::Relaxed);
+        }
     }
 }
 
@@ -105,10 +123,10 @@ impl HapticDevice for Positioned {
     fn exchange(&mut self, wrench: &Wrench, pace: &mut dyn Pace) -> Result<Sample, Fault> {
         let period = pace.wait();
         // A pointer moves once a frame and nobody is pushed: were its owner just writing, the last place is as good.
-        if let Ok(mut shared) = self.handle.0.try_lock() {
-            self.wanted = shared.0;
-            shared.1 = *wrench;
+        if let Ok(wanted) = self.handle.0.wanted.try_lock() {
+            self.wanted = *wanted;
         }
+        self.handle.show(wrench);
         if period.dt > 0.0 {
             self.go(period.dt.min(0.05));
         }
@@ -123,9 +141,7 @@ impl HapticDevice for Positioned {
     }
 
     fn safe_stop(&mut self) {
-        if let Ok(mut shared) = self.handle.0.lock() {
-            shared.1 = Wrench::ZERO;
-        }
+        self.handle.show(&Wrench::ZERO);
     }
 }
 
@@ -133,6 +149,36 @@ impl HapticDevice for Positioned {
 mod tests {
     use super::*;
     use crate::{Contact, Cycle, LocalModel, LoopConfig, LoopEvent, VirtualPace};
+
+    #[test]
+    fn a_stop_waits_for_nobody() {
+        let mut device = Positioned::new("pointer");
+        let handle = device.handle();
+        let push = Wrench { force: [1.0, 2.0, 3.0], torque: [4.0, 5.0, 6.0] };
+        device.exchange(&push, &mut VirtualPace::new(1000.0)).unwrap();
+        assert_eq!(handle.wrench(), push);
+        // Whoever moves the pointer is in the middle of it, for as long as it takes.
+        let moving = handle.0.wanted.lock().unwrap();
+        let stopped = std::thread::spawn(move || device.safe_stop());
+        for _ in 0..1000 {
+            if stopped.is_finished() {
+                break;
+            }
+            std::thread::sleep(std::time::Duration::from_millis(5));
+        }
+        assert!(stopped.is_finished(), "the loop's thread waits for a lock");
+        drop(moving);
+        assert_eq!(handle.wrench(), Wrench::ZERO);
+    }
+
+    #[test]
+    fn buttons_come_up_wherever_the_pointer_is() {
+        let mut device = Positioned::new("pointer");
+        device.handle().set([0.0; 3], 1);
+        device.handle().set([f64::NAN, 0.0, 0.0], 0);
+        let sample = device.exchange(&Wrench::ZERO, &mut VirtualPace::new(1000.0)).unwrap();
+        assert_eq!((sample.buttons, sample.position), (0, [0.0; 3]));
+    }
 
     #[test]
     fn a_leaping_pointer_is_a_hand_that_hurries_and_a_still_one_is_no_dead_device() {

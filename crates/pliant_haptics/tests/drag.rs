@@ -31,6 +31,20 @@ fn holds(config: SceneConfig) -> Drag {
 }
 
 #[test]
+fn what_counts_as_calm() {
+    let of = |early: f64, late: f64| Drag { speeds: [early, late], given: 0.0, step: [0.0, 1.0], force: 0.0 };
+    for (early, late) in [(0.0, 0.0), (0.9, 0.004), (0.005, 0.005), (0.02, 0.013), (0.9, 0.02)] {
+        assert!(!of(early, late).oscillates(), "{early} then {late} m/s");
+    }
+    for (early, late) in
+        [(0.9, 0.6), (0.9, 0.021), (0.006, 0.006), (0.02, 0.015), (0.0, 0.01), (0.9, f64::NAN)]
+    {
+        assert!(of(early, late).oscillates(), "{early} then {late} m/s");
+        assert!(!of(early, late).keeps_its_promises());
+    }
+}
+
+#[test]
 fn dragging_near_is_calm() {
     for young in [1e3, 1e5, 1e11] {
         for simulation in [40.0, 240.0] {

@@ -89,6 +89,7 @@ impl Scene {
         }
     }
 
+    #[track_caller]
     fn buttons_become(&mut self, wanted: u32) {
         for _ in 0..500 {
             if self.tick().buttons == wanted {
@@ -175,6 +176,22 @@ fn a_press_that_is_somebody_elses_is_not_the_tools_and_one_that_is_ends() {
     s.run(2);
     s.press(window, MouseButton::Left, ButtonState::Pressed);
     s.buttons_become(0b1);
+}
+
+#[test]
+fn buttons_come_up_where_the_pointer_points_at_nothing() {
+    let mut s = scene(Transform::IDENTITY, 1.0, PointerSource::new);
+    let window = s.window();
+    s.point(window, Some(Vec2::new(0.1, 0.05)));
+    s.press(window, MouseButton::Left, ButtonState::Pressed);
+    s.buttons_become(1);
+    // The camera goes on by four metres: the tool is behind it, and no ray meets a plane there.
+    let world = s.app.world_mut();
+    let camera = world.query_filtered::<Entity, With<Camera>>().single(world).unwrap();
+    world.get_mut::<Transform>(camera).unwrap().translation.z = -2.0;
+    s.run(3);
+    s.press(window, MouseButton::Left, ButtonState::Released);
+    s.buttons_become(0);
 }
 
 #[test]

@@ -54,6 +54,32 @@ fn two_grabs_on_a_tool_turn_it() {
 }
 
 #[test]
+fn a_torque_is_cut_as_its_force_is_and_real_motors_get_none() {
+    // 10 N on an arm of 5 cm, of which the device has 3.3 N: 0.165 N m, not the 0.5 that the motors have.
+    let pull = spring([0.05, 0.0, 0.0], [0.05, 0.01, 0.0], 1000.0);
+    let mut core = LoopCore::new(six(), LoopConfig::default()).unwrap();
+    let (force, torque) = settle(&mut core, &Sample::default(), &[pull]);
+    near(force, [0.0, 3.3, 0.0], "the peak");
+    near(torque, [0.0, 0.0, 0.05 * 3.3], "and its torque");
+    // A stop takes both, in one tick.
+    core.emergency_stop();
+    let now = core.last().now + 1e-3;
+    let stopped = core.tick(
+        now,
+        1e-3,
+        &Sample { sequence: Some(1 << 40), ..Sample::default() },
+        &LocalModel::default(),
+    );
+    assert_eq!(stopped, pliant_haptics::Wrench::ZERO);
+    // Nobody has shown that a handle turned by a stiff spring is calm: motors that turn somebody's hand are not driven.
+    let real = DeviceInfo { simulated: false, ..six() };
+    let mut core = LoopCore::new(real, LoopConfig::default()).unwrap();
+    let (force, torque) = settle(&mut core, &Sample::default(), &[pull]);
+    near(force, [0.0, 3.3, 0.0], "the force is felt");
+    assert_eq!(torque, [0.0; 3]);
+}
+
+#[test]
 fn scale_masks_and_weight() {
     let half = std::f64::consts::FRAC_1_SQRT_2;
     // Twice the motion, half the force, turned by a quarter about z: the device's x is the world's y.

@@ -102,6 +102,13 @@ fn open_haptics_units_axes_and_sizes() {
     assert_eq!(info.workspace, [[-0.08, -0.06, -0.035], [0.08, 0.06, 0.035]]);
     assert!(!info.simulated && info.check().is_ok());
     assert_eq!(device.calibration(), Calibration::Ready);
+    // Of two devices each is asked for itself, whichever was asked last.
+    call!(library, "fake_calibration", fn(c_int), 0x5002);
+    call!(library, "fake_another_is_current", fn(),);
+    assert_eq!(device.calibration(), Calibration::Needed("put the stylus into its inkwell"));
+    call!(library, "fake_calibration", fn(c_int), 0x5001);
+    call!(library, "fake_another_is_current", fn(),);
+    assert_eq!(device.calibration(), Calibration::Ready, "it only needed to be told");
 
     place(&library, [10.0, -20.0, 30.0], 250.0);
     call!(library, "fake_buttons", fn(c_int), 0b10);

@@ -122,7 +122,11 @@ pub(crate) fn point(
             Some(ray.get_point(ray.intersect_plane(pose.position.as_vec3(), facing)?))
         };
         let hit = hit.map(|hit| hit.ray.get_point(hit.hit.distance as f32));
-        let Some(wanted) = hit.or_else(plane) else { continue };
+        let Some(wanted) = hit.or_else(plane) else {
+            // A tool behind the camera, or a look along its plane: no place, but the buttons are what they are.
+            source.handle.set_buttons(bits);
+            continue;
+        };
         // From where the tool is to where it is wanted, so that a clutch or a jump that moved the origin does not matter.
         let turn: DQuat = place.rotation().as_dquat().normalize();
         let way = turn.inverse() * (wanted.as_dvec3() - DVec3::from(tick.tool)) / tool.motion_scale;

@@ -328,11 +328,12 @@ impl HapticDevice for OpenHaptics {
     }
 
     fn calibration(&mut self) -> Calibration {
-        if self.handle.is_none() {
+        let Some(handle) = self.handle else {
             return Calibration::Needed("connect the device");
-        }
-        // SAFETY: the device is ours and open.
+        };
+        // SAFETY: the device is ours and open. What is asked below names no device and means the current one, which may be another of this process.
         unsafe {
+            (self.api.make_current)(handle);
             match (self.api.check_calibration)() {
                 CALIBRATION_OK => Calibration::Ready,
                 state => {

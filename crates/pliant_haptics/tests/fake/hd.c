@@ -27,7 +27,7 @@ void hdMakeCurrentDevice(HHD h) { if (h != 7) fail(0x104); s.current = 1; }
 void hdBeginFrame(HHD h) {
     if (h != 7 || !s.open) { fail(0x104); return; }
     if (s.in_frame || !s.running) fail(0x400);
-    s.in_frame = 1;
+    s.in_frame = s.current = 1;
 }
 void hdEndFrame(HHD h) {
     if (!s.in_frame) fail(0x401);
@@ -61,7 +61,7 @@ void hdSetDoublev(unsigned int what, const double *in) {
 }
 void hdGetIntegerv(unsigned int what, int *out) {
     if (what == 0x2000) *out = s.buttons;
-    else if (what == 0x2555) *out = s.styles;
+    else if (what == 0x2555 && s.current) *out = s.styles;
     else fail(0x100);
 }
 const char *hdGetString(unsigned int what) {
@@ -77,9 +77,10 @@ HDErrorInfo hdGetError(void) {
     s.error = 0;
     return e;
 }
-unsigned int hdCheckCalibration(void) { return (unsigned int)s.calibration; }
+/* Of the current device; the other one is well. */
+unsigned int hdCheckCalibration(void) { return s.current ? (unsigned int)s.calibration : 0x5000; }
 void hdUpdateCalibration(unsigned int style) {
-    if (!(style & (unsigned int)s.styles)) { fail(0x101); return; }
+    if (!s.current || !(style & (unsigned int)s.styles)) { fail(0x101); return; }
     if (s.calibration == 0x5001) s.calibration = 0x5000;
 }
 void hdStartScheduler(void) { if (s.running) fail(0x102); s.running = 1; }
@@ -101,6 +102,7 @@ void fake_quarter_turn(void) { /* about x: y to z; column-major */
     static const double t[16] = {1, 0, 0, 0, 0, 0, 1, 0, 0, -1, 0, 0, 0, 0, 0, 1};
     memcpy(s.transform, t, sizeof t);
 }
+void fake_another_is_current(void) { s.current = 0; }
 void fake_buttons(int b) { s.buttons = b; }
 void fake_error(unsigned int code) { s.each_frame = code; }
 void fake_calibration(int c) { s.calibration = c; }

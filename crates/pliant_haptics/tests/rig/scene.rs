@@ -202,9 +202,12 @@ pub struct Drag {
 }
 
 impl Drag {
-    /// Sustained: still moving, and no slower than two seconds before.
+    /// Sustained: still moving, and not much slower than two seconds before, or as fast as no hand at rest is, however fast it was.
     pub fn oscillates(&self) -> bool {
-        self.speeds[1] > 5e-3 && self.speeds[1] > 0.7 * self.speeds[0]
+        let [early, late] = self.speeds;
+        // Not the other way round: what is not a number is not calm.
+        let calm = late <= 5e-3 || (late <= 0.7 * early && late <= 20e-3);
+        !calm
     }
 
     /// No sustained oscillation, no energy beyond what was put in and the tank, no force step above the slew limit.
