@@ -43,8 +43,6 @@ pub struct DeviceView {
     pub fault: Option<String>,
     /// Force over the last seconds, N.
     pub forces: Trace,
-    /// Its samples are recorded. A knob.
-    pub recording: bool,
 }
 
 /// Shows the stop and the devices.
@@ -101,6 +99,5 @@ pub fn show_devices(ui: &mut Ui, view: &mut DevicesView) {
             knob(ui, scale, 0.0..=1.0, |slider| slider.text("force").max_decimals(2))
                 .on_hover_text("Share of the body's force that reaches the hand.");
         }
-        ui.checkbox(&mut device.recording, "record samples");
     }
 }

@@ -36,5 +36,5 @@ pub mod time;
 mod trace;
 
 pub use bevy_egui::{self, egui};
-pub use plugin::{Panel, PanelPlugin, wants_keyboard, wants_pointer};
+pub use plugin::{Panel, PanelPlugin, PanelSection, wants_keyboard, wants_pointer};
 pub use trace::{Trace, plot};

@@ -15,7 +15,6 @@ use crate::{
 #[derive(Resource, Default)]
 pub(super) struct Histories {
     forces: HashMap<DeviceId, Trace>,
-    recording: HashMap<DeviceId, bool>,
     /// What each has asked to be done by hand.
     calibrate: HashMap<DeviceId, &'static str>,
 }
@@ -52,20 +51,20 @@ impl Devices<'_, '_> {
     pub fn show(&mut self, ui: &mut Ui) {
         let Some(devices) = &mut self.devices else { return };
         let now = self.time.elapsed_secs_f64();
-        let Histories { forces, recording, calibrate } = &mut *self.histories;
+        let Histories { forces, calibrate } = &mut *self.histories;
         for notice in self.notices.iter_mut().flat_map(|notices| notices.read()) {
             if let LoopEvent::Calibrate(how) = notice.event {
                 calibrate.insert(notice.device, how);
             }
         }
         forces.retain(|id, _| devices.get(*id).is_some());
-        recording.retain(|id, _| devices.get(*id).is_some());
+        calibrate.retain(|id, _| devices.get(*id).is_some());
         let mut view = DevicesView::default();
         let mut ids = Vec::new();
         for (id, status) in devices.iter() {
             let report = &status.report;
             let force = report.tick.wrench.force.iter().map(|f| f * f).sum::<f64>().sqrt();
-            let trace = forces.entry(id).or_default();
+            let mut trace = forces.remove(&id).unwrap_or_default();
             trace.push(now, force);
             let fault = match report.state {
                 LoopState::Running => report.tick.fault.map(|fault| fault.to_string()),
@@ -90,17 +89,12 @@ impl Devices<'_, '_> {
                 calibrate: (report.state == LoopState::Calibrating)
                     .then(|| calibrate.get(&id).map_or("see the log", |how| how).to_owned()),
                 fault,
-                forces: trace.clone(),
-                recording: recording.get(&id).copied().unwrap_or(false),
+                forces: trace,
             });
         }
         device::show_devices(ui, &mut view);
-        for (&id, device) in ids.iter().zip(&view.devices) {
-            if device.recording != recording.get(&id).copied().unwrap_or(false)
-                && devices.set_recording(id, device.recording)
-            {
-                recording.insert(id, device.recording);
-            }
+        for (id, device) in ids.iter().zip(&mut view.devices) {
+            forces.insert(*id, std::mem::take(&mut device.forces));
         }
         for (id, device) in ids.iter().zip(&view.devices) {
             let Some(scale) = device.force_scale else { continue };

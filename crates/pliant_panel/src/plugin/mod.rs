@@ -22,11 +22,29 @@ pub struct PanelPlugin {
     pub key: KeyCode,
     /// Open from the start. Default: `true`.
     pub open: bool,
+    /// The one section that is unfolded at first. Default: `None`, all of them.
+    pub only: Option<PanelSection>,
+}
+
+/// A section of the panel.
+#[derive(Reflect, Debug, Clone, Copy, PartialEq, Eq, Hash)]
+#[reflect(Clone, PartialEq)]
+pub enum PanelSection {
+    /// Pause, steps, speed, cost.
+    Time,
+    /// The bodies and the hands on them.
+    Bodies,
+    /// Users, network, emulator.
+    Session,
+    /// Haptic devices.
+    Devices,
+    /// The recording for the rerun viewer.
+    Recording,
 }
 
 impl Default for PanelPlugin {
     fn default() -> Self {
-        Self { key: KeyCode::F1, open: true }
+        Self { key: KeyCode::F1, open: true, only: None }
     }
 }
 
@@ -41,11 +59,13 @@ pub struct Panel {
     /// Opens and closes it. Default: `F1`.
     #[reflect(ignore)]
     pub key: KeyCode,
+    /// The one section that is unfolded when the panel is first shown. Default: `None`, all of them.
+    pub only: Option<PanelSection>,
 }
 
 impl Default for Panel {
     fn default() -> Self {
-        Self { open: true, zoom: 1.0, key: KeyCode::F1 }
+        Self { open: true, zoom: 1.0, key: KeyCode::F1, only: None }
     }
 }
 
@@ -55,7 +75,7 @@ impl Plugin for PanelPlugin {
             app.add_plugins(EguiPlugin::default());
         }
         app.register_type::<Panel>()
-            .insert_resource(Panel { open: self.open, key: self.key, ..default() })
+            .insert_resource(Panel { open: self.open, key: self.key, only: self.only, ..default() })
             .init_resource::<scene::Histories>()
             .add_systems(Update, toggle.run_if(resource_exists::<ButtonInput<KeyCode>>))
             .add_systems(EguiPrimaryContextPass, draw.run_if(|panel: Res<Panel>| panel.open))
@@ -99,13 +119,20 @@ fn draw(
     mut scene: scene::Scene,
     #[cfg(feature = "net")] mut session: session::Session,
     #[cfg(feature = "haptics")] mut devices: devices::Devices,
-    #[cfg(feature = "rerun")] recording: scene::Recording,
+    #[cfg(feature = "rerun")] mut recording: scene::Recording,
 ) -> Result {
     let context = contexts.ctx_mut()?.clone();
     if context.zoom_factor() != panel.zoom && panel.zoom.is_finite() {
         context.set_zoom_factor(panel.zoom.clamp(0.25, 8.0));
     }
     let screen = context.content_rect();
+    let section = |ui: &mut egui::Ui, which: PanelSection, show: &mut dyn FnMut(&mut egui::Ui)| {
+        let title = format!("{which:?}");
+        egui::CollapsingHeader::new(egui::RichText::new(&title).strong())
+            .id_salt(("pliant section", &title))
+            .default_open(panel.only.is_none_or(|only| only == which))
+            .show(ui, show);
+    };
     egui::Window::new("Pliant")
         // The height is that of what is in it: this only leaves it room.
         .default_size([300.0, 4096.0])
@@ -122,30 +149,23 @@ fn draw(
                 ui,
                 |ui| {
                     ui.spacing_mut().slider_width = 150.0;
-                    section(ui, "Time", |ui| scene.show_time(ui));
-                    section(ui, "Bodies", |ui| scene.show_bodies(ui));
+                    section(ui, PanelSection::Time, &mut |ui| scene.show_time(ui));
+                    section(ui, PanelSection::Bodies, &mut |ui| scene.show_bodies(ui));
                     #[cfg(feature = "net")]
                     if session.is_there() {
-                        section(ui, "Session", |ui| session.show(ui));
+                        section(ui, PanelSection::Session, &mut |ui| session.show(ui));
                     }
                     #[cfg(feature = "haptics")]
                     if devices.are_there() {
-                        section(ui, "Devices", |ui| devices.show(ui));
+                        section(ui, PanelSection::Devices, &mut |ui| devices.show(ui));
                     }
                     #[cfg(feature = "rerun")]
                     if recording.is_there() {
-                        section(ui, "Recording", |ui| recording.show(ui));
+                        section(ui, PanelSection::Recording, &mut |ui| recording.show(ui));
                     }
                     ui.weak(format!("{:?} opens and closes", panel.key));
                 },
             );
         });
     Ok(())
-}
-
-fn section(ui: &mut egui::Ui, title: &str, show: impl FnOnce(&mut egui::Ui)) {
-    egui::CollapsingHeader::new(egui::RichText::new(title).strong())
-        .id_salt(("pliant section", title))
-        .default_open(true)
-        .show(ui, show);
 }

@@ -240,7 +240,7 @@ impl Recording<'_> {
         self.settings.is_some()
     }
 
-    pub fn show(mut self, ui: &mut Ui) {
+    pub fn show(&mut self, ui: &mut Ui) {
         use pliant_rerun::RerunColour;
 
         let (Some(stats), Some(settings)) = (&self.stats, &mut self.settings) else { return };
