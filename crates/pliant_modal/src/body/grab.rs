@@ -73,6 +73,22 @@ struct Creeping {
     gain: f64,
 }
 
+/// How a patch gives way at once at the baked stiffness, m/N, body axes.
+pub(crate) fn give_at(model: &ModalModel, patch: &Patch, modes: usize) -> Result<Matrix3<f64>, StepError> {
+    let count = model.surface().positions().len();
+    if let Some(&(vertex, _)) = patch.entries().iter().find(|&&(v, _)| v as usize >= count) {
+        return Err(StepError::Vertex { vertex, count });
+    }
+    let residual = model.flexibility_of(patch, modes);
+    let residual = Matrix3::from_fn(|i, j| residual[i][j]);
+    // A patch on an anchor has no flexibility at all, and a hand on it would pull with an infinite force: skin and fingertip give a
+    // hundredth of the patch's own contact compliance.
+    let info = model.info();
+    let radius = patch.radius().max(1e-2 * model.size());
+    let contact = 1e-2 * (1.0 - info.poisson * info.poisson) / (2.0 * info.young * radius);
+    Ok(0.5 * (residual + residual.transpose()) + Matrix3::identity() * contact.max(f64::MIN_POSITIVE))
+}
+
 impl Grab {
     pub(crate) fn new(
         id: GrabId,
@@ -83,10 +99,7 @@ impl Grab {
     ) -> Result<Self, StepError> {
         config.check()?;
         let surface = model.surface();
-        let count = surface.positions().len();
-        if let Some(&(vertex, _)) = patch.entries().iter().find(|&&(v, _)| v as usize >= count) {
-            return Err(StepError::Vertex { vertex, count });
-        }
+        let residual = give_at(model, patch, modes)?;
         let mut rest = Vector3::zeros();
         let mut displacement = vec![Vector3::zeros(); modes];
         let mut rotation = vec![Vector3::zeros(); modes];
@@ -100,15 +113,6 @@ impl Grab {
                 }
             }
         }
-        let residual = model.flexibility_of(patch, modes);
-        let residual = Matrix3::from_fn(|i, j| residual[i][j]);
-        // A patch on an anchor has no flexibility at all, and a hand on it would pull with an infinite force: skin and fingertip give a
-        // hundredth of the patch's own contact compliance.
-        let info = model.info();
-        let radius = patch.radius().max(1e-2 * model.size());
-        let contact = 1e-2 * (1.0 - info.poisson * info.poisson) / (2.0 * info.young * radius);
-        let residual =
-            0.5 * (residual + residual.transpose()) + Matrix3::identity() * contact.max(f64::MIN_POSITIVE);
         let zero = Vector3::zeros();
         Ok(Self {
             id,

@@ -384,6 +384,21 @@ impl Body {
         Ok((-self.find(id)?.pull).into())
     }
 
+    /// What [`compliance`](Self::compliance) would be of a rigid hand on a patch of an elastic body of so many modes, whose stiffness is
+    /// `stiffness_scale` times the baked one, without making the body: 3x3, m/N, body axes.
+    ///
+    /// # Errors
+    /// A patch of another surface.
+    pub fn compliance_of(
+        model: &ModalModel,
+        patch: &Patch,
+        modes: usize,
+        stiffness_scale: f64,
+    ) -> Result<[[f64; 3]; 3], StepError> {
+        let c = grab::give_at(model, patch, modes.min(model.mode_count()))? / stiffness_scale;
+        Ok(std::array::from_fn(|i| std::array::from_fn(|j| c[(i, j)])))
+    }
+
     /// The compliance of a grab within one step (3x3, m/N, body axes): residual flexibility of the patch plus the hand's own spring. Where
     /// the material relaxes, the first is multiplied by [`Relaxation::creep`] of one step.
     ///
