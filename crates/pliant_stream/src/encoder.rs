@@ -114,6 +114,20 @@ impl Encoder {
         wish: StreamWish,
         limit: usize,
     ) -> Result<Self, StreamError> {
+        let visible = Quanta::visible_of(&model, Self::modes_for(&wish, model.mode_count(), limit));
+        Self::with_visible(body, model, setup, newmark, wish, limit, &visible)
+    }
+
+    /// As [`Encoder::new`], with the visible amplitudes of all that may be wanted of the model's modes.
+    pub(crate) fn with_visible(
+        body: BodyId,
+        model: Arc<ModalModel>,
+        setup: &BodySetup,
+        newmark: Newmark,
+        wish: StreamWish,
+        limit: usize,
+        visible: &[f64],
+    ) -> Result<Self, StreamError> {
         newmark.check()?;
         let modes = Self::modes_for(&wish, model.mode_count(), limit);
         if modes == 0 {
@@ -123,7 +137,8 @@ impl Encoder {
                 expected: "room for a frame with one mode",
             });
         }
-        let quanta = Quanta::stiffened(&model, setup.stiffness_scale, modes, &newmark);
+        let visible = &visible[..modes.min(visible.len())];
+        let quanta = Quanta::of_visible(&model, visible, setup.stiffness_scale, &newmark);
         let stepper = ForceStepper::new(model, setup, modes, newmark.h)?;
         let rest = stepper.at_rest();
         let flow = setup.relaxation.map(|r| FlowFilter::new(r, &newmark, 0));

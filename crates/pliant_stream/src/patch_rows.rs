@@ -4,7 +4,7 @@
 //! works in these six numbers a patch: the modes are gone through three times, however many Newton rounds there are.
 
 use nalgebra::{Matrix3, SMatrix, SVector, Vector3};
-use pliant_modal::{Body, BodyConfig, GrabConfig, ModalModel, Patch, warp, warp_jacobian};
+use pliant_modal::{Body, ModalModel, Patch, warp, warp_jacobian};
 use std::sync::Arc;
 
 use crate::StreamError;
@@ -94,11 +94,9 @@ impl PatchRows {
                 }
             }
         }
-        // What a grab of the body itself would have: asked of a body, so that the two never differ.
-        let config = BodyConfig { modes: Some(modes), stiffness_scale, ..Default::default() };
-        let mut body = Body::new(model.clone(), config).map_err(|e| failed(e.to_string()))?;
-        let grab = body.grab(&patch, GrabConfig::default()).map_err(|e| failed(e.to_string()))?;
-        let compliance = body.compliance(grab).map_err(|e| failed(e.to_string()))?;
+        // What a grab of the body itself would have.
+        let compliance = Body::compliance_of(model, &patch, modes, stiffness_scale);
+        let compliance = compliance.map_err(|e| failed(e.to_string()))?;
         let compliance = Matrix3::from_fn(|i, j| compliance[i][j]);
         Ok(Self { key: key(vertex, radius), rows, rest, compliance })
     }

@@ -38,6 +38,12 @@ impl Quanta {
 
     /// For a body whose stiffness is `scale` times the baked one: its velocities and forces are as much larger for one displacement.
     pub(crate) fn stiffened(model: &ModalModel, scale: f64, modes: usize, newmark: &Newmark) -> Self {
+        Self::of_visible(model, &Self::visible_of(model, modes), scale, newmark)
+    }
+
+    /// The visible amplitudes of the first `modes` of a model, m for a unit of the coordinate. Costs a look at every mode at up to 4,096
+    /// vertices, so it is kept where it is needed often.
+    pub(crate) fn visible_of(model: &ModalModel, modes: usize) -> Vec<f64> {
         let modes = modes.min(model.mode_count());
         let vertices = model.surface().positions().len();
         let every = vertices.div_ceil(VERTICES).max(1);
@@ -47,7 +53,11 @@ impl Quanta {
             };
             (0..vertices).step_by(every).map(size).fold(0.0, f64::max).sqrt()
         };
-        let all: Vec<f64> = (0..modes).map(visible).collect();
+        (0..modes).map(visible).collect()
+    }
+
+    /// From the visible amplitudes of as many modes as are wanted.
+    pub(crate) fn of_visible(model: &ModalModel, all: &[f64], scale: f64, newmark: &Newmark) -> Self {
         let most = all.iter().copied().fold(f64::MIN_POSITIVE.sqrt(), f64::max);
         let place: Vec<f64> = all.iter().map(|s| 1.0 / s.max(FAINT * most)).collect();
         let by_omega = |power: i32| {

@@ -179,3 +179,31 @@ fn losses_are_read_from_words() {
         assert!(parse(bad).is_err(), "{bad}");
     }
 }
+
+#[test]
+fn words_for_losses_far_off_or_without_end_are_refused_or_say_what_is_done() {
+    let parse = |words: &str| Loss::parse(words, 1, 25 * MS);
+    for far in ["random:1@18446744073709551615", "burst:3@18446744073709551615", "every:5@281474976710656"] {
+        assert!(parse(far).is_err(), "{far}");
+    }
+    // The last that may be, and shifted by more than there is.
+    for last in ["random:500@281474976710655", "burst:3@281474976710655", "every:5@281474976710655"] {
+        let loss = parse(last).unwrap();
+        assert_eq!(loss.check(), Ok(()), "{last}");
+        let shifted = loss.shifted(u64::MAX - 5, Duration::MAX);
+        let (arrived, _) = run(LinkConfig { loss: shifted, ..Default::default() }, 3, 100, 25 * MS, 100);
+        assert_eq!(arrived.len(), 100, "{last}");
+    }
+    let outage = Loss::Outage { from: MS, to: 2 * MS }.shifted(1, Duration::MAX);
+    assert_eq!(outage, Loss::Outage { from: Duration::MAX, to: Duration::MAX });
+    // Everything is lost, however it is said: it used to be nothing.
+    for words in ["gilbert:100%:4", "100%"] {
+        let loss = parse(words).unwrap();
+        assert_eq!(loss.check(), Ok(()), "{words}");
+        let (arrived, _) = run(LinkConfig { loss, ..Default::default() }, 3, 2000, 25 * MS, 100);
+        assert!(arrived.len() <= 4, "{words}: {} of 2,000 arrive", arrived.len());
+    }
+    for bad in [Loss::gilbert(f64::NAN, f64::NAN, Duration::MAX), Loss::gilbert(0.5, 1e300, Duration::ZERO)] {
+        assert_eq!(bad.check(), Ok(()), "{bad:?}");
+    }
+}

@@ -7,8 +7,8 @@ use std::time::Duration;
 
 use pliant_modal::ModalModel;
 use pliant_stream::{
-    BodyId, BodySetup, Channel, GuestConfig, GuestSession, HostConfig, HostEvent, HostSession, PeerId,
-    TickState, UserId,
+    BodyId, BodySetup, Channel, GuestConfig, GuestEvent, GuestSession, HostConfig, HostEvent, HostSession,
+    PeerId, TickState, UserId,
 };
 use support::bar;
 
@@ -181,4 +181,61 @@ fn who_comes_back_gets_the_number_they_had_if_it_is_free() {
     // In use, or the host's: another one.
     assert_eq!(knock(&mut room, PeerId(4), Some(UserId(2))), UserId(3));
     assert_eq!(knock(&mut room, PeerId(5), Some(UserId::HOST)), UserId(4));
+}
+
+#[test]
+fn guests_that_want_all_kinds_of_numbers_of_modes_share_few_encoders() {
+    let model = bar(8, 0.05);
+    let mut room = Room::new(HostConfig::default());
+    let all = room.modes as u16;
+    (1..=40).for_each(|peer| room.join(PeerId(peer), &model));
+    (0..40).for_each(|_| room.step());
+    for peer in 1..=40_u16 {
+        assert!(room.host.set_interest(PeerId(u64::from(peer)), BODY, Some(1 + peer % all)));
+    }
+    (0..3).for_each(|_| room.step());
+    let before = room.host.encoded();
+    (0..40).for_each(|_| room.step());
+    let kinds = (room.host.encoded() - before) / 40;
+    // Two for each doubling: 1, 2, 3, 4, 6, 8 and so on up to all.
+    let most = 2 * u64::from(all.ilog2()) + 2;
+    assert!(kinds <= most && kinds >= 3, "{kinds} encoders for {all} modes");
+    // Nobody gets less than asked for.
+    for (peer, guest) in &room.guests {
+        let modes = guest.body(BODY).unwrap().shown().unwrap().modes() as u64;
+        assert!(modes > peer.0 % u64::from(all), "{modes} modes for guest {}", peer.0);
+    }
+}
+
+#[test]
+fn grabs_are_begun_no_faster_than_hands_can() {
+    let model = bar(8, 0.05);
+    let mut room = Room::new(HostConfig::default());
+    room.join(PeerId(1), &model);
+    (0..40).for_each(|_| room.step());
+    let mut begun = 0;
+    let mut refused = 0;
+    // Each with a patch of its own, as fast as messages are taken: 100 a second, half of them to begin, for four seconds.
+    for k in 0..400_u32 {
+        let now = room.now;
+        let radius = 0.05 + 1e-5 * f64::from(k);
+        let guest = &mut room.guests[0].1;
+        for _ in 0..2 {
+            let grab = guest.begin_grab(now, BODY, 20, radius, [0.0; 3], Default::default()).unwrap();
+            guest.end_grab(grab);
+        }
+        room.now += TICK / 5;
+        room.exchange();
+        begun += std::iter::from_fn(|| room.host.poll_event())
+            .filter(|event| matches!(event, HostEvent::GrabBegan { .. }))
+            .count();
+        refused += std::iter::from_fn(|| room.guests[0].1.poll_event())
+            .filter(|event| matches!(event, GuestEvent::GrabRefused { .. }))
+            .count();
+        if room.host.users().next().is_none() {
+            break;
+        }
+    }
+    // 120 at once and 60 a second, whatever was said.
+    assert!((120..=125 + 60 * 2).contains(&begun), "{begun} begun, {refused} refused");
 }

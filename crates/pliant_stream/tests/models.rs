@@ -6,11 +6,14 @@ mod support;
 use std::collections::BTreeMap;
 use std::time::Duration;
 
+use pliant_modal::ModalModel;
 use pliant_stream::{
-    BodyId, BodySetup, Channel, GuestConfig, GuestSession, HostConfig, HostSession, PeerId, StreamError,
+    BodyId, BodySetup, Channel, GuestConfig, GuestEvent, GuestSession, HostConfig, HostSession, PeerId,
+    StreamError, TickState,
 };
 use support::bar;
 
+const BODY: BodyId = BodyId(9);
 const GUESTS: u64 = 256;
 const FRAME: Duration = Duration::from_micros(16_667);
 
@@ -130,5 +133,68 @@ fn rates_that_are_none_are_refused() {
         ] {
             assert!(matches!(HostSession::new(config), Err(StreamError::Config { .. })), "{bad}");
         }
+    }
+}
+
+#[test]
+fn a_model_may_be_read_by_the_caller_and_another_one_ends_the_session() {
+    for right in [true, false] {
+        let model = bar(8, 0.05);
+        let mut host = HostSession::new(HostConfig::default()).unwrap();
+        let file = model.to_bytes().into();
+        host.add_body_as(BODY, "bar", model.clone(), file, BodySetup::default()).unwrap();
+        host.connect(Duration::ZERO, PeerId(1), 1200).unwrap();
+        let mut guest =
+            GuestSession::new(GuestConfig { models_apart: true, ..Default::default() }, 1200).unwrap();
+        guest.connect(Duration::ZERO).unwrap();
+        let (mut came, mut ready, mut closed) = (None, false, false);
+        for k in 1..200_u32 {
+            let now = k * Duration::from_millis(25);
+            while let Some(out) = guest.poll_output() {
+                match out.channel {
+                    Channel::Datagram => host.on_datagram(now, PeerId(1), &out.bytes),
+                    Channel::Message => host.on_message(now, PeerId(1), &out.bytes),
+                }
+            }
+            let q = vec![0.01; model.mode_count()];
+            let state = TickState {
+                tick: u64::from(k),
+                q: &q,
+                v: &q,
+                a: &q,
+                z: &[],
+                pose: None,
+                grabs: &[],
+                resting: false,
+            };
+            host.publish(now, BODY, &state).unwrap();
+            host.update(now);
+            while let Some(out) = host.poll_output() {
+                match out.channel {
+                    Channel::Datagram => guest.on_datagram(now, &out.bytes),
+                    Channel::Message => guest.on_message(now, &out.bytes),
+                }
+            }
+            guest.update(now);
+            while let Some(event) = guest.poll_event() {
+                match event {
+                    GuestEvent::ModelCame { hash, bytes } => came = Some((k, hash, bytes)),
+                    GuestEvent::BodyReady { .. } => ready = true,
+                    GuestEvent::Closed { .. } => closed = true,
+                    _ => {}
+                }
+            }
+            // It takes its time, while frames come.
+            if let Some((_, hash, bytes)) = came.take_if(|(at, ..)| *at + 20 < k) {
+                assert!(!ready, "without its model");
+                let read = ModalModel::from_bytes(&bytes).unwrap();
+                assert_eq!(read.hash(), model.hash());
+                // One that nobody has asked for changes nothing.
+                guest.give_model([7; 32], Some(bar(4, 0.05)));
+                guest.give_model(hash, Some(if right { read.into() } else { bar(4, 0.05) }));
+            }
+        }
+        assert_eq!((ready, closed), (right, !right));
+        assert_eq!(guest.body(BODY).is_some_and(|view| view.is_ready()), right);
     }
 }

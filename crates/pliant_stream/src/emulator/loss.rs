@@ -53,13 +53,19 @@ pub enum Loss {
     },
 }
 
+/// Packets have lower numbers than this: of a stream of a thousand a second, none is sent for thousands of years.
+const LAST: u64 = 1 << 48;
+
 impl Loss {
     /// Gilbert's loss by what a sender of a packet every `interval` sees: mean loss `loss`, mean burst of `burst` packets.
     /// The bad state loses everything and lasts `burst` intervals on average, the good one `burst (1 - loss) / loss`.
     pub fn gilbert(loss: f64, burst: f64, interval: Duration) -> Self {
-        let loss = loss.clamp(1e-9, 1.0 - 1e-9);
-        let bad = interval.mul_f64(burst.clamp(1e-3, 1e6));
-        Self::GilbertElliott { good: bad.mul_f64((1.0 - loss) / loss), bad, loss_good: 0.0, loss_bad: 1.0 }
+        let loss = if loss.is_nan() { 0.5 } else { loss.clamp(1e-9, 1.0 - 1e-9) };
+        // No number is too large for a time, and none so small that it is none.
+        let stay = |seconds: f64| Duration::from_secs_f64(seconds.clamp(1e-6, 1e9));
+        let bad = interval.as_secs_f64() * if burst.is_nan() { 1.0 } else { burst.clamp(1e-3, 1e6) };
+        let good = bad * (1.0 - loss) / loss;
+        Self::GilbertElliott { good: stay(good), bad: stay(bad), loss_good: 0.0, loss_bad: 1.0 }
     }
 
     /// From words:
@@ -73,7 +79,7 @@ impl Loss {
     /// | `every:50@135` | one in 50 from number 135 |
     /// | `gilbert:9%:4` | mean loss 9 %, mean burst 4 packets of a sender that sends one every `interval` |
     ///
-    /// `@135` may be left out.
+    /// `@135` may be left out; it is below 2^48.
     ///
     /// # Errors
     /// [`StreamError::Invalid`] with the words.
@@ -89,7 +95,8 @@ impl Loss {
         };
         let counted = |text: &str| -> Option<(u64, u64)> {
             let (count, first) = text.split_once('@').unwrap_or((text, "135"));
-            Some((count.parse().ok().filter(|c| (1..=1_000_000).contains(c))?, first.parse().ok()?))
+            let first = first.parse().ok().filter(|first| *first < LAST)?;
+            Some((count.parse().ok().filter(|c| (1..=1_000_000).contains(c))?, first))
         };
         let words = words.trim();
         let made = match words.split_once(':') {
@@ -124,10 +131,12 @@ impl Loss {
     #[must_use]
     pub fn shifted(&self, packets: u64, time: Duration) -> Self {
         match self.clone() {
-            Self::Burst { first, count } => Self::Burst { first: first + packets, count },
-            Self::Every { first, every } => Self::Every { first: first + packets, every },
-            Self::Listed(list) => Self::Listed(list.into_iter().map(|k| k + packets).collect()),
-            Self::Outage { from, to } => Self::Outage { from: from + time, to: to + time },
+            Self::Burst { first, count } => Self::Burst { first: first.saturating_add(packets), count },
+            Self::Every { first, every } => Self::Every { first: first.saturating_add(packets), every },
+            Self::Listed(list) => Self::Listed(list.into_iter().map(|k| k.saturating_add(packets)).collect()),
+            Self::Outage { from, to } => {
+                Self::Outage { from: from.saturating_add(time), to: to.saturating_add(time) }
+            }
             other @ (Self::None | Self::Random(_) | Self::GilbertElliott { .. }) => other,
         }
     }

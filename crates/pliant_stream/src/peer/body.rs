@@ -368,7 +368,8 @@ impl PeerBody {
         let mut holds = Vec::with_capacity(held.len());
         let mut grips = Vec::with_capacity(held.len());
         for (user, g) in held {
-            if stepper.knows(g.vertex, g.radius) {
+            // All peers leave out the same: one that is larger than the body costs a look at every vertex of it.
+            if g.radius <= stepper.model().size() && stepper.knows(g.vertex, g.radius) {
                 let key = g.key(*user);
                 let flow = pulls.iter().find(|p| p.key == key).map_or_else(Vector3::zeros, |p| p.flow);
                 let config = GrabConfig::default();

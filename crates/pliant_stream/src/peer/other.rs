@@ -3,7 +3,7 @@
 use std::collections::BTreeMap;
 use std::time::Duration;
 
-use crate::session::Budget;
+use crate::session::{Budget, LinkStats, Tally};
 use crate::state::{Tick, UserId};
 
 #[derive(Debug)]
@@ -14,6 +14,10 @@ pub(super) struct Other {
     pub(super) expected: UserId,
     pub(super) heard: Duration,
     pub(super) sequence: u16,
+    pub(super) tally: Tally,
+    pub(super) stats: LinkStats,
+    /// How early datagrams come, s: own clock less their ticks' time, the mean of it.
+    pub(super) way: Option<f64>,
     /// Running mean of: own tick less theirs at arrival.
     pub(super) ahead: Option<f64>,
     /// The same as they see it.
@@ -37,6 +41,9 @@ impl Other {
             expected,
             heard: now,
             sequence: 0,
+            tally: Tally::default(),
+            stats: LinkStats::default(),
+            way: None,
             ahead: None,
             theirs: None,
             asked: BTreeMap::new(),
@@ -48,5 +55,19 @@ impl Other {
             answer_budget: Budget::new(1000.0, 1000.0),
             state_budget: Budget::new(2.0, 16.0),
         }
+    }
+
+    /// Takes in when a datagram came that was sent at `theirs` (s of the sender's ticks): how unevenly the way takes (RFC 3550, 6.4.1).
+    pub(super) fn came(&mut self, now: Duration, theirs: f64) {
+        let early = now.as_secs_f64() - theirs;
+        let off = early - *self.way.get_or_insert(early);
+        // Far off: one of the clocks has jumped.
+        if off.abs() > 10.0 {
+            self.way = Some(early);
+            return;
+        }
+        self.way = self.way.map(|way| way + off / 16.0);
+        let jitter = self.stats.jitter.as_secs_f64();
+        self.stats.jitter = Duration::from_secs_f64(jitter + (off.abs() - jitter) / 16.0);
     }
 }

@@ -1,5 +1,7 @@
 //! The session of one peer with all the others.
 
+mod states;
+
 use std::collections::{BTreeMap, VecDeque};
 use std::sync::Arc;
 use std::time::Duration;
@@ -12,7 +14,7 @@ use super::inputs::{InputLog, WINDOW};
 use super::other::Other;
 use super::wire::{HeldAt, InputTick, MAX_HELD, MAX_TICKS, PeerDatagram, PeerMessage, StateCheck};
 use crate::StreamError;
-use crate::session::{Channel, EndReason, Output};
+use crate::session::{Channel, EndReason, LinkStats, Output};
 use crate::state::{BodyId, PeerId, Tick, UserId, in_range};
 use crate::stepper::BodySetup;
 use crate::wire::{MAX_NAME, PROTOCOL_VERSION};
@@ -53,6 +55,8 @@ pub struct PeerSession {
     events: VecDeque<PeerEvent>,
     requested: Option<Duration>,
     last_check: Option<StateCheck>,
+    /// The counts of those who are gone.
+    gone: LinkStats,
 }
 
 impl PeerSession {
@@ -93,6 +97,7 @@ impl PeerSession {
             events: VecDeque::new(),
             requested: None,
             last_check: None,
+            gone: LinkStats::default(),
         })
     }
 
@@ -149,6 +154,7 @@ impl PeerSession {
     /// A connection closed.
     pub fn disconnect(&mut self, peer: PeerId, reason: EndReason) {
         let Some(other) = self.others.remove(&peer) else { return };
+        self.gone.add_counts(&other.stats);
         let Some(user) = other.user else { return self.event(PeerEvent::TurnedAway { peer, reason }) };
         if let Some(inputs) = self.inputs.users.get_mut(&user) {
             // All hear the same last input or forecast the same hands a little on; then the hands let go.
@@ -162,7 +168,8 @@ impl PeerSession {
     /// Takes hold of a body at the next tick.
     ///
     /// # Errors
-    /// [`StreamError::UnknownBody`], [`StreamError::NotFinite`], [`StreamError::Model`] for a vertex that is not there,
+    /// [`StreamError::UnknownBody`], [`StreamError::NotFinite`], [`StreamError::Model`] for a vertex that is not there or a radius
+    /// larger than the body,
     /// [`StreamError::Full`] beyond 16 grabs.
     pub fn begin_grab(
         &mut self,
@@ -177,6 +184,9 @@ impl PeerSession {
         }
         if vertex as usize >= b.model().surface().positions().len() {
             return Err(StreamError::Model(format!("vertex {vertex} is not on the surface")));
+        }
+        if radius > b.model().size() {
+            return Err(StreamError::Model(format!("a radius of {radius} m is larger than the body")));
         }
         if self.own.len() >= MAX_HELD {
             return Err(StreamError::Full { what: "grabs", limit: MAX_HELD });
@@ -206,6 +216,20 @@ impl PeerSession {
     /// Lets go at the next tick.
     pub fn end_grab(&mut self, grab: u16) {
         self.own.remove(&grab);
+    }
+
+    /// How a path does: what came and went, the share that did not arrive here, how unevenly the way here takes (`jitter`), questions for
+    /// inputs (`nacks`), what could not be read. The round trip and the share lost on the way there are the transport's to tell. `None` for no
+    /// connection.
+    pub fn stats(&self, peer: PeerId) -> Option<LinkStats> {
+        self.others.get(&peer).map(|other| other.stats)
+    }
+
+    /// The counts of all paths, of those who are gone too: they never fall.
+    pub fn totals(&self) -> LinkStats {
+        let mut sum = self.gone;
+        self.others.values().for_each(|other| sum.add_counts(&other.stats));
+        sum
     }
 
     /// Who a connection's peer is; `None` before its hello, and for no connection.
@@ -241,11 +265,20 @@ impl PeerSession {
     /// Something arrived unreliably; any bytes will do.
     pub fn on_datagram(&mut self, now: Duration, peer: PeerId, bytes: &[u8]) {
         let Some(other) = self.others.get_mut(&peer) else { return };
-        let (Some(user), Ok((_, datagram))) = (other.user, PeerDatagram::decode(bytes)) else { return };
+        let (Some(user), Ok((sequence, datagram))) = (other.user, PeerDatagram::decode(bytes)) else {
+            other.stats.rejected += 1;
+            return;
+        };
         other.heard = now;
+        if other.tally.take(sequence) {
+            other.stats.datagrams_in += 1;
+            other.stats.bytes_in += bytes.len() as u64;
+        }
+        other.stats.loss_in = other.tally.loss();
         match datagram {
             PeerDatagram::Inputs { now: theirs, ahead: seen, ticks, check } => {
                 other.theirs = seen.or(other.theirs);
+                other.came(now, theirs as f64 * self.config.step);
                 let sample = self.tick as f64 - theirs as f64;
                 if sample.abs() < WINDOW as f64 {
                     let ahead = other.ahead.get_or_insert(sample);
@@ -273,6 +306,7 @@ impl PeerSession {
     pub fn on_message(&mut self, now: Duration, peer: PeerId, bytes: &[u8]) {
         let Some(other) = self.others.get_mut(&peer) else { return };
         other.heard = now;
+        other.stats.message_bytes_in += bytes.len() as u64;
         match PeerMessage::decode(bytes) {
             Ok(PeerMessage::Hello { version, user, name, joining }) => {
                 let user = UserId(user);
@@ -303,49 +337,11 @@ impl PeerSession {
             }
             Ok(PeerMessage::Goodbye { reason }) => self.disconnect(peer, reason),
             Err(_) => {
+                other.stats.rejected += 1;
                 self.message(peer, &PeerMessage::Goodbye { reason: EndReason::Protocol });
                 self.disconnect(peer, EndReason::Protocol);
             }
         }
-    }
-
-    fn take_state(
-        &mut self,
-        now: Duration,
-        from: UserId,
-        tick: Tick,
-        theirs: Tick,
-        bodies: &[super::wire::PeerBodyState],
-    ) {
-        let to = if self.started { self.tick } else { theirs.min(tick + WINDOW as u64 / 2) };
-        if tick > to || to - tick >= WINDOW as u64 {
-            return;
-        }
-        if !self.started {
-            for inputs in self.inputs.users.values_mut() {
-                inputs.first = inputs.first.max(tick + 1);
-                inputs.complete = inputs.complete.max(tick);
-            }
-            // Nothing was held by us in the ticks that we were not there.
-            for t in tick + 1..=to {
-                self.inputs.put(self.config.user, InputTick { tick: t, held: Vec::new() });
-            }
-        }
-        for b in bodies {
-            if let Some(body) = self.bodies.get_mut(&BodyId(b.body)) {
-                body.import(tick, to, b, &self.inputs);
-            }
-        }
-        self.tick = to;
-        self.taken = tick;
-        if self.started {
-            self.event(PeerEvent::Resynced { from });
-        } else {
-            self.started = true;
-            self.next_step = Some(now + Duration::from_secs_f64(self.config.step));
-            self.event(PeerEvent::Started);
-        }
-        self.others.values_mut().for_each(|o| o.mismatched = 0);
     }
 
     /// Steps to what is due by now and sends what is due. Returns the ticks taken.
@@ -497,6 +493,7 @@ impl PeerSession {
             other.asked.retain(|t, _| *t >= from);
             runs.truncate(MAX_TICKS);
             if !runs.is_empty() {
+                other.stats.nacks += 1;
                 questions.push((*peer, PeerDatagram::Ask { runs }));
             }
             if inputs.complete + (WINDOW as u64) / 2 < inputs.highest {
@@ -508,60 +505,6 @@ impl PeerSession {
         }
         if self.others.values().any(|o| o.mismatched >= CHECKS) {
             self.request_state(now);
-        }
-    }
-
-    /// Only those with a lower number are believed.
-    fn compare(&mut self, peer: PeerId, user: UserId, check: StateCheck) {
-        let unsettled = self.dirty.is_some_and(|from| from <= check.tick);
-        if user > self.config.user || unsettled || check.tick > self.confirmed() {
-            return;
-        }
-        let Some((own, size)) = self.bodies.get(&check.body).and_then(|b| b.check(check.tick)) else {
-            return;
-        };
-        let agrees = (own - f64::from(check.value)).abs() <= CHECK_TOLERANCE * size + 1e-7;
-        if let Some(other) = self.others.get_mut(&peer) {
-            other.mismatched = if agrees { 0 } else { other.mismatched + 1 };
-        }
-    }
-
-    /// Asks the peer with the lowest number, if that is not oneself, at most once a second.
-    fn request_state(&mut self, now: Duration) {
-        if self.requested.is_some_and(|at| now.saturating_sub(at) <= Duration::from_secs(1)) {
-            return;
-        }
-        let lowest = self.others.iter_mut().filter_map(|(p, o)| o.user.map(|u| (u, *p, o)));
-        if let Some((user, peer, other)) = lowest.min_by_key(|(u, ..)| *u)
-            && user < self.config.user
-        {
-            self.requested = Some(now);
-            other.asked_state = true;
-            self.message(peer, &PeerMessage::StateRequest);
-        }
-    }
-
-    fn give_states(&mut self, now: Duration) {
-        let wanting: Vec<PeerId> =
-            self.others.iter().filter(|(_, o)| o.wants_state && o.user.is_some()).map(|(p, _)| *p).collect();
-        // Who has just come has no inputs yet and must not hold the confirmed tick back.
-        let each = self.inputs.users.values().filter(|u| !u.gone && u.first <= self.tick);
-        let tick = each.map(|u| u.complete).min().unwrap_or(self.tick).min(self.tick);
-        if wanting.is_empty() || tick == 0 || self.out.len() >= MAX_OUT {
-            return;
-        }
-        let bodies: Vec<_> = self.bodies.values().filter_map(|b| b.export(tick)).collect();
-        if bodies.len() != self.bodies.len() {
-            return;
-        }
-        let state = PeerMessage::State { tick, now: self.tick, bodies };
-        for peer in wanting {
-            let Some(other) = self.others.get_mut(&peer) else { continue };
-            // Who asks too often waits.
-            if other.state_budget.spend(now, 1.0) {
-                other.wants_state = false;
-                self.message(peer, &state);
-            }
         }
     }
 
@@ -586,11 +529,17 @@ impl PeerSession {
         if self.out.len() >= MAX_OUT {
             return;
         }
+        other.stats.datagrams_out += 1;
+        other.stats.bytes_out += bytes.len() as u64;
         self.out.push_back(Output { peer, channel: Channel::Datagram, bytes: bytes.into() });
     }
 
     fn message(&mut self, peer: PeerId, message: &PeerMessage) {
-        self.out.push_back(Output { peer, channel: Channel::Message, bytes: message.encode().into() });
+        let bytes = message.encode();
+        if let Some(other) = self.others.get_mut(&peer) {
+            other.stats.message_bytes_out += bytes.len() as u64;
+        }
+        self.out.push_back(Output { peer, channel: Channel::Message, bytes: bytes.into() });
     }
 
     fn event(&mut self, event: PeerEvent) {

@@ -16,7 +16,7 @@ pub(super) struct Download {
 
 impl GuestSession {
     pub(super) fn model_chunk(&mut self, hash: [u8; 32], offset: u64, total: u64, bytes: &[u8]) {
-        if self.models.contains_key(&hash) {
+        if self.models.contains_key(&hash) || self.being_read.contains(&hash) {
             return;
         }
         // Also of a body that has gone since: the host counts the model as known here once it has sent it.
@@ -47,9 +47,25 @@ impl GuestSession {
             return;
         }
         let Some(done) = self.downloads.remove(&hash) else { return };
-        match ModalModel::from_bytes(&done.bytes) {
-            Ok(model) if model.hash().0 == hash => {
-                let model = Arc::new(model);
+        if self.config.models_apart {
+            self.being_read.insert(hash);
+            return self.event(GuestEvent::ModelCame { hash, bytes: done.bytes.into() });
+        }
+        let read = ModalModel::from_bytes(&done.bytes).ok().map(Arc::new);
+        self.take_model(hash, read);
+    }
+
+    /// What has been read of the bytes of a [`GuestEvent::ModelCame`]; `None` where they are no model, which ends the session, as another model than
+    /// the announced one does. Nothing for a model that is not waited for.
+    pub fn give_model(&mut self, hash: [u8; 32], model: Option<Arc<ModalModel>>) {
+        if self.being_read.remove(&hash) && !self.is_closed() {
+            self.take_model(hash, model);
+        }
+    }
+
+    fn take_model(&mut self, hash: [u8; 32], model: Option<Arc<ModalModel>>) {
+        match model {
+            Some(model) if model.hash().0 == hash => {
                 self.models.insert(hash, model.clone());
                 let mut ready = Vec::new();
                 for view in self.bodies.values_mut().filter(|b| b.info().hash == hash) {

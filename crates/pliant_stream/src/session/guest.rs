@@ -44,6 +44,8 @@ pub struct GuestSession {
     newmark: Newmark,
     pub(super) models: BTreeMap<[u8; 32], Arc<ModalModel>>,
     pub(super) downloads: BTreeMap<[u8; 32], Download>,
+    /// Models that the caller reads.
+    pub(super) being_read: BTreeSet<[u8; 32]>,
     /// Bytes that downloads and downloaded models take together, see [`GuestConfig::model_bytes`].
     pub(super) model_bytes: u64,
     /// Hashes of all models that the host has named, at most 16,384 (512 KiB).
@@ -91,6 +93,7 @@ impl GuestSession {
             newmark: Newmark::average(1.0 / 40.0),
             models: BTreeMap::new(),
             downloads: BTreeMap::new(),
+            being_read: BTreeSet::new(),
             model_bytes: 0,
             announced: BTreeSet::new(),
             bodies: BTreeMap::new(),
@@ -153,11 +156,6 @@ impl GuestSession {
             self.message(&GuestMessage::Goodbye { reason: EndReason::Left });
             self.close(EndReason::Left);
         }
-    }
-
-    /// The transport lost the connection.
-    pub fn disconnected(&mut self) {
-        self.close(EndReason::Lost);
     }
 
     /// Our number, once the host has let us in.

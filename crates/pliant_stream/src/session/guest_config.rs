@@ -26,6 +26,9 @@ pub struct GuestConfig {
     /// Most bytes of models that a host may send, those that are here and those on their way together; a host that sends
     /// more is left with [`EndReason::Full`]. Models that the application named itself do not count. Default: 1 GiB.
     pub model_bytes: u64,
+    /// Models that have arrived are handed out as bytes ([`GuestEvent::ModelCame`]) for the caller to read elsewhere, and taken back by
+    /// [`GuestSession::give_model`](super::GuestSession::give_model): reading one takes long for a frame. Default: false, they are read at once.
+    pub models_apart: bool,
     /// A host that is silent for so long is gone. Default: 10 s.
     pub idle_timeout: Duration,
 }
@@ -39,6 +42,7 @@ impl Default for GuestConfig {
             modes: None,
             own_hand_first: true,
             model_bytes: 1 << 30,
+            models_apart: false,
             idle_timeout: Duration::from_secs(10),
         }
     }
@@ -68,6 +72,13 @@ pub enum GuestEvent {
         received: u64,
         /// Bytes in all.
         total: u64,
+    },
+    /// A model is here, to be read ([`GuestConfig::models_apart`]).
+    ModelCame {
+        /// Which model.
+        hash: [u8; 32],
+        /// A `.modal` file, if the host is honest.
+        bytes: Arc<[u8]>,
     },
     /// Model and state of a body are here: it can be shown.
     BodyReady {

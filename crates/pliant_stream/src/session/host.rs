@@ -1,7 +1,7 @@
 //! The host's side: it steps the bodies, and every guest follows.
 
 use std::collections::{BTreeMap, BTreeSet, VecDeque};
-use std::sync::Arc;
+use std::sync::{Arc, OnceLock};
 use std::time::Duration;
 
 use pliant_modal::{GrabConfig, ModalModel};
@@ -35,6 +35,8 @@ pub(super) struct HostBody {
     pub(super) last: Option<Tick>,
     pub(super) resting: bool,
     pub(super) reminded: Duration,
+    /// The visible amplitudes of its modes, for its encoders.
+    pub(super) visible: OnceLock<Vec<f64>>,
     /// One encoder per kind of receiver and room in the datagram.
     pub(super) streams: BTreeMap<StreamKey, Encoder>,
 }
@@ -70,6 +72,8 @@ pub struct HostSession {
     dropped_events: u64,
     pub(super) upload: Upload,
     pub(super) encoded: u64,
+    /// The counts of those who are gone.
+    gone: LinkStats,
 }
 
 impl HostSession {
@@ -97,6 +101,7 @@ impl HostSession {
             dropped_events: 0,
             upload,
             encoded: 0,
+            gone: LinkStats::default(),
         })
     }
 
@@ -187,11 +192,13 @@ impl HostSession {
         }
     }
 
-    /// How many modes of a body a guest is sent: at most so many of what it takes anyway, none at all for 0, everything again for `None`. A
-    /// change begins with a snapshot. False for a guest or body that is not there.
+    /// How many modes of a body a guest is sent: so many of what it takes anyway, taken up to the next of 1, 2, 3, 4, 6, 8, 12 and so on, so
+    /// that guests share encoders; none at all for 0, everything again for `None`. A change begins with a snapshot. False for a guest or body that is not there.
     pub fn set_interest(&mut self, peer: PeerId, body: BodyId, modes: Option<u16>) -> bool {
         let Some(p) = self.peers.get_mut(&peer).filter(|p| p.announced.contains(&body)) else { return false };
-        if p.interest.get(&body).copied() == modes {
+        let before = p.interest.get(&body).copied();
+        let same = |a: u16, b: u16| (a == 0) == (b == 0) && step_up(a) == step_up(b);
+        if before == modes || before.zip(modes).is_some_and(|(a, b)| same(a, b)) {
             return true;
         }
         match modes {
@@ -216,6 +223,13 @@ impl HostSession {
     /// How a guest's path does.
     pub fn stats(&self, peer: PeerId) -> Option<LinkStats> {
         self.peers.get(&peer).map(|p| p.stats)
+    }
+
+    /// The counts of all paths, of those who are gone too: they never fall. Times, shares and the level are zero.
+    pub fn totals(&self) -> LinkStats {
+        let mut sum = self.gone;
+        self.peers.values().for_each(|p| sum.add_counts(&p.stats));
+        sum
     }
 
     /// Something arrived unreliably. Any bytes will do: what makes no sense is counted and forgotten.
@@ -317,7 +331,9 @@ impl HostSession {
             ) => {
                 let body = BodyId(body);
                 let vertices = self.bodies.get(&body).map_or(0, |b| b.model.surface().positions().len());
+                // A new patch costs every encoder of the body a table of its own.
                 let fits = (vertex as usize) < vertices
+                    && p.grab_budget.spend(now, 1.0)
                     && p.grabs.len() < MAX_GUEST_GRABS
                     && !p.grabs.contains_key(&grab);
                 if fits {
@@ -471,6 +487,7 @@ impl HostSession {
         if tell {
             p.say_goodbye(reason, &mut self.out);
         }
+        self.gone.add_counts(&p.stats);
         let user = p.user();
         if let Some(user) = user {
             for (grab, held) in &p.grabs {
@@ -484,6 +501,14 @@ impl HostSession {
     }
 }
 
+/// The next of 1, 2, 3, 4, 6, 8, 12 and so on: however many guests change their minds, and however often, a body has two encoders at most for
+/// each doubling of its modes.
+fn step_up(modes: u16) -> u16 {
+    let whole = modes.checked_next_power_of_two().unwrap_or(u16::MAX);
+    let between = whole / 4 * 3;
+    if between >= modes && between > 0 { between } else { whole }
+}
+
 /// The kind of stream that a guest takes of a body: what it wished, less what its path does not bear.
 pub(super) fn stream_key(peer: &Peer, body: &HostBody) -> Option<StreamKey> {
     let model_modes = body.model.mode_count();
@@ -492,8 +517,24 @@ pub(super) fn stream_key(peer: &Peer, body: &HostBody) -> Option<StreamKey> {
         if most == 0 {
             return None;
         }
-        wish.modes = wish.modes.min(most);
+        wish.modes = wish.modes.min(step_up(most));
     }
     wish.modes = Encoder::modes_for(&wish, model_modes, peer.max_datagram) as u16;
     Some((wish, peer.max_datagram))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn interest_is_taken_up_to_few_steps() {
+        let steps: BTreeSet<u16> = (1..=4096).map(step_up).collect();
+        assert_eq!(steps.iter().copied().take(8).collect::<Vec<_>>(), [1, 2, 3, 4, 6, 8, 12, 16]);
+        assert_eq!(steps.len(), 24, "{steps:?}");
+        assert!(
+            (1..=4096).all(|modes| step_up(modes) >= modes && step_up(modes) <= modes + modes.div_ceil(2))
+        );
+        assert_eq!(step_up(u16::MAX), u16::MAX);
+    }
 }

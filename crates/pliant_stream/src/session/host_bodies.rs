@@ -1,7 +1,7 @@
 //! The bodies of a session: they come, change and go, and every guest is told.
 
 use std::collections::BTreeMap;
-use std::sync::Arc;
+use std::sync::{Arc, OnceLock};
 use std::time::Duration;
 
 use pliant_modal::ModalModel;
@@ -27,6 +27,23 @@ impl HostSession {
         model: Arc<ModalModel>,
         setup: BodySetup,
     ) -> Result<(), StreamError> {
+        let bytes = model.to_bytes().into();
+        self.add_body_as(body, name, model, bytes, setup)
+    }
+
+    /// As [`HostSession::add_body`], with the model's file (`model.to_bytes()`), made elsewhere: that takes long for a frame. Guests leave a
+    /// session whose models are not what their hashes say.
+    ///
+    /// # Errors
+    /// As [`HostSession::add_body`].
+    pub fn add_body_as(
+        &mut self,
+        body: BodyId,
+        name: &str,
+        model: Arc<ModalModel>,
+        bytes: Arc<[u8]>,
+        setup: BodySetup,
+    ) -> Result<(), StreamError> {
         if self.bodies.len() >= crate::wire::MAX_BODIES {
             return Err(StreamError::Full { what: "bodies", limit: crate::wire::MAX_BODIES });
         }
@@ -46,13 +63,14 @@ impl HostSession {
         let entry = HostBody {
             id: body,
             name: name.to_owned(),
-            bytes: model.to_bytes().into(),
+            bytes,
             hash: model.hash().0,
             model,
             setup,
             last: None,
             resting: false,
             reminded: Duration::ZERO,
+            visible: OnceLock::new(),
             streams: BTreeMap::new(),
         };
         self.bodies.insert(body, entry);

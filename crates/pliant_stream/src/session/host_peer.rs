@@ -68,6 +68,8 @@ pub(crate) struct Peer {
     pub(crate) nack_budget: Budget,
     pub(crate) snapshot_budget: Budget,
     pub(crate) message_budget: Budget,
+    /// Grabs that it may begin.
+    pub(crate) grab_budget: Budget,
     sequence: u16,
     tally: Tally,
     pub(crate) stats: LinkStats,
@@ -100,6 +102,8 @@ impl Peer {
             nack_budget: Budget::new(4000.0, 4000.0),
             snapshot_budget: Budget::new(2.0, 16.0),
             message_budget: Budget::new(200.0, 400.0),
+            // A hand that slides takes hold anew each tick; no more, and its hands at once.
+            grab_budget: Budget::new(60.0, 120.0),
             sequence: 0,
             tally: Tally::default(),
             stats: LinkStats::default(),

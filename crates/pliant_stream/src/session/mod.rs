@@ -30,7 +30,7 @@ mod publish;
 mod regulator;
 mod upload;
 
-pub(crate) use outbox::Budget;
+pub(crate) use outbox::{Budget, Tally};
 
 pub use guest::GuestSession;
 pub use guest_body::BodyView;
@@ -129,4 +129,18 @@ pub struct LinkStats {
     /// Host only: how far this guest's stream is cut down, 0 (not at all) to 6; see
     /// [`HostConfig::guest_rate`].
     pub level: u8,
+}
+
+impl LinkStats {
+    /// Adds another connection's counts; times, shares and the level stay.
+    pub fn add_counts(&mut self, other: &Self) {
+        self.datagrams_out += other.datagrams_out;
+        self.datagrams_in += other.datagrams_in;
+        self.bytes_out += other.bytes_out;
+        self.bytes_in += other.bytes_in;
+        self.message_bytes_out += other.message_bytes_out;
+        self.message_bytes_in += other.message_bytes_in;
+        self.nacks += other.nacks;
+        self.rejected += other.rejected;
+    }
 }

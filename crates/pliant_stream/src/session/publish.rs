@@ -8,6 +8,7 @@ use super::host::{HostBody, HostSession, StreamKey, stream_key};
 use super::host_peer::Peer;
 use crate::StreamError;
 use crate::encoder::{Encoded, Encoder};
+use crate::quanta::Quanta;
 use crate::state::{BodyId, MAX_GRABS, PeerId, TICK_LIMIT, TickState, in_range};
 use crate::wire::WIDE_LIMIT;
 
@@ -73,13 +74,17 @@ impl HostSession {
             let encoder = match entry.streams.entry(key) {
                 std::collections::btree_map::Entry::Occupied(e) => e.into_mut(),
                 std::collections::btree_map::Entry::Vacant(e) => {
-                    let made = Encoder::new(
+                    let visible = entry
+                        .visible
+                        .get_or_init(|| Quanta::visible_of(&entry.model, entry.model.mode_count()));
+                    let made = Encoder::with_visible(
                         body,
                         entry.model.clone(),
                         &entry.setup,
                         self.config.newmark,
                         key.0,
                         key.1,
+                        visible,
                     );
                     match made {
                         Ok(encoder) => e.insert(encoder.with_quantum(self.config.quantum)),
