@@ -1,15 +1,22 @@
 //! What the network does, in numbers: a resource for games, diagnostics for everything that shows them.
 
+use std::collections::BTreeMap;
 use std::time::{Duration, Instant};
 
 use bevy::diagnostic::{Diagnostic, DiagnosticPath, Diagnostics, RegisterDiagnostic};
 use bevy::prelude::*;
-use pliant_stream::LinkStats;
+use pliant_stream::{LinkStats, PeerId};
 
 use crate::transport::{DropCounts, PeerStats};
 
 /// Diagnostic: smoothed round trip, ms. On a host: the longest of its guests'.
 pub const ROUND_TRIP: DiagnosticPath = DiagnosticPath::const_new("pliant/net/round_trip");
+/// Diagnostic: smoothed deviation of the round trip, ms; among peers of the way here. Of several the largest.
+pub const JITTER: DiagnosticPath = DiagnosticPath::const_new("pliant/net/jitter");
+/// Diagnostic: how long packets wait in queues on the way, ms: [`NetStats::queue`].
+pub const QUEUE: DiagnosticPath = DiagnosticPath::const_new("pliant/net/queue");
+/// Diagnostic: datagrams that this end let go ([`NetStats::dropped`]), a second.
+pub const DROPPED: DiagnosticPath = DiagnosticPath::const_new("pliant/net/dropped");
 /// Diagnostic: share of the other side's datagrams that do not arrive here, %.
 pub const LOSS_IN: DiagnosticPath = DiagnosticPath::const_new("pliant/net/loss_in");
 /// Diagnostic: share of this side's datagrams that do not arrive there, %.
@@ -25,15 +32,15 @@ pub const RECOVERED: DiagnosticPath = DiagnosticPath::const_new("pliant/net/reco
 /// Diagnostic: how far the shown state of a guest's bodies is known to be from the estimate of the truth, % of the state's size.
 pub const SHOWN_OFFSET: DiagnosticPath = DiagnosticPath::const_new("pliant/net/shown_offset");
 
-/// The network's figures, refreshed every frame. Counts are since the start of the connections that are open now; a
-/// host adds up its guests, and gives the worst of their round trips and the mean of their losses.
+/// The network's figures, refreshed every frame. Counts are since the app began and never fall: connections that are over stay counted. A
+/// host adds up its guests, a peer the others, and gives the worst of their round trips and the mean of their losses.
 #[derive(Resource, Debug, Clone, Copy, Default, PartialEq)]
 pub struct NetStats {
     /// Connections that are open.
     pub peers: usize,
     /// Smoothed round trip between the sessions; zero before the first measurement.
     pub round_trip: Duration,
-    /// Smoothed deviation of the round trip.
+    /// Smoothed deviation of the round trip; among peers of the time that the way here takes. The largest of all.
     pub jitter: Duration,
     /// Share of the other side's datagrams that do not arrive here, 0 to 1.
     pub loss_in: f64,
@@ -51,7 +58,7 @@ pub struct NetStats {
     pub bytes_out_per_s: f64,
     /// UDP payload received in the last second, bytes a second.
     pub bytes_in_per_s: f64,
-    /// NACKs sent (guest) or received (host).
+    /// NACKs sent (guest) or received (host); among peers, questions for inputs that were sent.
     pub nacks: u64,
     /// Guest: ticks whose data was not there when they were shown.
     pub guessed: u64,
@@ -67,6 +74,8 @@ pub struct NetStats {
     pub dropped: DropCounts,
     /// QUIC's own count of packets sent and lost on the way there, 0 to 1.
     pub packet_loss: f64,
+    /// How much longer the round trip is than the shortest one seen: packets wait so long in queues. Of several the longest.
+    pub queue: Duration,
     /// A peer's round trip has grown by more than 50 ms: packets wait in a queue, and less should be sent.
     pub queueing: bool,
     /// Guest: how far what is shown is from the best estimate of the truth, the largest of all bodies, as a share of the state's size (0 to 1
@@ -75,7 +84,7 @@ pub struct NetStats {
 }
 
 impl NetStats {
-    /// Adds one connection's figures.
+    /// Adds how one open connection does; its counts come by [`NetStats::count`].
     pub(crate) fn add(&mut self, link: &LinkStats, transport: &PeerStats) {
         let before = self.peers as f64;
         let mean = |old: f64, new: f64| (old * before + new) / (before + 1.0);
@@ -84,18 +93,67 @@ impl NetStats {
         self.loss_in = mean(self.loss_in, link.loss_in);
         self.loss_out = mean(self.loss_out, link.loss_out);
         self.packet_loss = mean(self.packet_loss, transport.loss());
-        self.datagrams_out += link.datagrams_out;
-        self.datagrams_in += link.datagrams_in;
-        self.bytes_out += transport.sent_bytes;
-        self.bytes_in += transport.received_bytes;
-        self.nacks += link.nacks;
-        self.rejected += link.rejected;
-        self.dropped.send_queue_full += transport.dropped.send_queue_full;
-        self.dropped.receive_queue_full += transport.dropped.receive_queue_full;
-        self.dropped.too_large += transport.dropped.too_large;
-        self.dropped.not_connected += transport.dropped.not_connected;
+        self.queue = self.queue.max(transport.round_trip.saturating_sub(transport.min_round_trip));
         self.queueing |= transport.queueing();
         self.peers += 1;
+    }
+
+    /// Takes over the counts of all connections, those that are over included.
+    pub(crate) fn count(&mut self, links: &LinkStats, lines: &LineCounts) {
+        self.datagrams_out = links.datagrams_out;
+        self.datagrams_in = links.datagrams_in;
+        self.nacks = links.nacks;
+        self.rejected = links.rejected;
+        (self.bytes_out, self.bytes_in, self.dropped) = (lines.bytes_out, lines.bytes_in, lines.dropped);
+    }
+}
+
+/// What the transport has counted.
+#[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
+pub(crate) struct LineCounts {
+    bytes_out: u64,
+    bytes_in: u64,
+    dropped: DropCounts,
+}
+
+impl LineCounts {
+    fn of(line: &PeerStats) -> Self {
+        Self { bytes_out: line.sent_bytes, bytes_in: line.received_bytes, dropped: line.dropped }
+    }
+
+    fn add(&mut self, other: &Self) {
+        self.bytes_out += other.bytes_out;
+        self.bytes_in += other.bytes_in;
+        self.dropped.send_queue_full += other.dropped.send_queue_full;
+        self.dropped.receive_queue_full += other.dropped.receive_queue_full;
+        self.dropped.too_large += other.dropped.too_large;
+        self.dropped.not_connected += other.dropped.not_connected;
+    }
+}
+
+/// Keeps what connections have counted when they are over, so that sums never fall. What a connection does after the last frame that saw it
+/// is not in it.
+#[derive(Debug, Default)]
+pub(crate) struct Ledger {
+    open: BTreeMap<PeerId, LineCounts>,
+    over: LineCounts,
+}
+
+impl Ledger {
+    /// The sums, with the connections that are open now.
+    pub(crate) fn sum(&mut self, open: impl Iterator<Item = (PeerId, PeerStats)>) -> LineCounts {
+        let now: BTreeMap<PeerId, LineCounts> =
+            open.map(|(peer, line)| (peer, LineCounts::of(&line))).collect();
+        for (peer, before) in std::mem::take(&mut self.open) {
+            // A number may be that of a new connection: its bytes begin at none.
+            if now.get(&peer).is_none_or(|now| now.bytes_out < before.bytes_out) {
+                self.over.add(&before);
+            }
+        }
+        self.open = now;
+        let mut sum = self.over;
+        self.open.values().for_each(|line| sum.add(line));
+        sum
     }
 }
 
@@ -107,6 +165,7 @@ pub(crate) struct RateMarks {
     bytes_out: u64,
     nacks: u64,
     recovered: u64,
+    dropped: u64,
 }
 
 /// Rates are refreshed so often.
@@ -130,6 +189,7 @@ impl NetStats {
             diagnostics.add_measurement(&RATE_OUT, || self.bytes_out_per_s * 8e-3);
             diagnostics.add_measurement(&NACKS, || per_s(self.nacks, marks.nacks));
             diagnostics.add_measurement(&RECOVERED, || per_s(self.recovered, marks.recovered));
+            diagnostics.add_measurement(&DROPPED, || per_s(self.dropped.all(), marks.dropped));
         }
         *marks = RateMarks {
             since: Some(now),
@@ -137,6 +197,7 @@ impl NetStats {
             bytes_out: self.bytes_out,
             nacks: self.nacks,
             recovered: self.recovered,
+            dropped: self.dropped.all(),
         };
     }
 
@@ -145,6 +206,8 @@ impl NetStats {
             return;
         }
         diagnostics.add_measurement(&ROUND_TRIP, || self.round_trip.as_secs_f64() * 1e3);
+        diagnostics.add_measurement(&JITTER, || self.jitter.as_secs_f64() * 1e3);
+        diagnostics.add_measurement(&QUEUE, || self.queue.as_secs_f64() * 1e3);
         diagnostics.add_measurement(&LOSS_IN, || self.loss_in * 100.0);
         diagnostics.add_measurement(&LOSS_OUT, || self.loss_out * 100.0);
         diagnostics.add_measurement(&SHOWN_OFFSET, || self.shown_offset * 100.0);
@@ -154,6 +217,9 @@ impl NetStats {
 pub(crate) fn register(app: &mut App) {
     for (path, suffix) in [
         (ROUND_TRIP, " ms"),
+        (JITTER, " ms"),
+        (QUEUE, " ms"),
+        (DROPPED, " /s"),
         (LOSS_IN, " %"),
         (LOSS_OUT, " %"),
         (RATE_IN, " kbit/s"),
@@ -163,5 +229,29 @@ pub(crate) fn register(app: &mut App) {
         (SHOWN_OFFSET, " %"),
     ] {
         app.register_diagnostic(Diagnostic::new(path).with_suffix(suffix));
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn sums_do_not_fall_when_connections_end_or_their_numbers_begin_anew() {
+        let mut ledger = Ledger::default();
+        let line = |peer: u64, sent_bytes: u64| {
+            let dropped = DropCounts { too_large: sent_bytes / 100, ..DropCounts::default() };
+            (PeerId(peer), PeerStats { sent_bytes, received_bytes: 2 * sent_bytes, dropped, ..default() })
+        };
+        let mut sum = |lines: &[(PeerId, PeerStats)]| {
+            let sum = ledger.sum(lines.iter().copied());
+            (sum.bytes_out, sum.bytes_in, sum.dropped.all())
+        };
+        assert_eq!(sum(&[line(1, 1000), line(2, 100)]), (1100, 2200, 11));
+        assert_eq!(sum(&[line(2, 200)]), (1200, 2400, 12), "the first, of long standing, is gone");
+        assert_eq!(sum(&[]), (1200, 2400, 12));
+        assert_eq!(sum(&[line(0, 500)]), (1700, 3400, 17));
+        assert_eq!(sum(&[line(0, 100)]), (1800, 3600, 18), "a guest has come back");
+        assert_eq!(sum(&[line(0, 300)]), (2000, 4000, 20));
     }
 }

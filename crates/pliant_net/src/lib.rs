@@ -64,7 +64,8 @@ pub mod transport;
 mod user;
 
 pub use figures::{
-    LOSS_IN, LOSS_OUT, NACKS, NetStats, RATE_IN, RATE_OUT, RECOVERED, ROUND_TRIP, SHOWN_OFFSET,
+    DROPPED, JITTER, LOSS_IN, LOSS_OUT, NACKS, NetStats, QUEUE, RATE_IN, RATE_OUT, RECOVERED, ROUND_TRIP,
+    SHOWN_OFFSET,
 };
 /// The networks that an [`Emulation`] is made of.
 pub use pliant_stream::emulator;

@@ -102,9 +102,12 @@ mod tests {
         for bad in [
             Transform::from_scale(Vec3::ZERO),
             Transform::from_xyz(f32::NAN, 0.0, 0.0),
+            // A mirror: no rotation and no scale.
             Transform::from_scale(Vec3::splat(-1.0)),
         ] {
-            assert!(Place::of(&GlobalTransform::from(bad), false).is_none_or(|place| place.scale > 0.0));
+            for free in [false, true] {
+                assert_eq!(Place::of(&GlobalTransform::from(bad), free), None, "{bad:?}");
+            }
         }
     }
 }

@@ -183,15 +183,15 @@ impl Plugin for NetPlugin {
 
 /// `Last`: the figures of this frame.
 fn measure(
-    host: Option<Res<NetHost>>,
-    guest: Option<Res<NetGuest>>,
-    peer: Option<Res<NetPeer>>,
+    host: Option<ResMut<NetHost>>,
+    guest: Option<ResMut<NetGuest>>,
+    peer: Option<ResMut<NetPeer>>,
     mut stats: ResMut<NetStats>,
     mut marks: ResMut<RateMarks>,
     mut diagnostics: Diagnostics,
 ) {
-    let new = host.map(|host| host.figures()).or_else(|| guest.map(|guest| guest.figures()));
-    let new = new.or_else(|| peer.map(|peer| peer.figures()));
+    let new = host.map(|mut host| host.figures()).or_else(|| guest.map(|mut guest| guest.figures()));
+    let new = new.or_else(|| peer.map(|mut peer| peer.figures()));
     let mut new = new.unwrap_or_default();
     new.keep_rates(&stats, &mut marks, &mut diagnostics);
     new.measure(&mut diagnostics);

@@ -7,6 +7,9 @@ use std::fs::File;
 use std::io::{self, BufReader, Read, Write};
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
+use std::sync::atomic::{AtomicUsize, Ordering};
+use std::sync::mpsc::{self, Receiver, SyncSender, TrySendError};
+use std::thread::JoinHandle;
 use std::time::Duration;
 
 use bevy::log::{error, warn};
@@ -50,6 +53,17 @@ pub(crate) enum Record {
     Closed(String),
 }
 
+impl Record {
+    /// What it holds in memory, bytes.
+    fn len(&self) -> usize {
+        match self {
+            Self::Connected { .. } => 0,
+            Self::Datagram(bytes) | Self::Message(bytes) | Self::Model(bytes) => bytes.len(),
+            Self::Closed(words) => words.len(),
+        }
+    }
+}
+
 /// Why a recording cannot be made or played.
 #[derive(Debug, Error)]
 #[non_exhaustive]
@@ -72,11 +86,31 @@ pub enum RecordingError {
 
 type Encoder = zstd::stream::write::Encoder<'static, File>;
 
-/// Writes a recording; it is whole when this is dropped, and but for a second when the process is killed.
+/// What waits for the recorder's thread at most: records, and bytes in them (models not counted, they are held anyway).
+const MOST_WAITING: usize = 8192;
+const MOST_WAITING_BYTES: usize = 64 << 20;
+
+/// What is kept.
+enum Kept {
+    Record(Record),
+    /// To be written as a file on the way.
+    Model(Arc<ModalModel>),
+}
+
+/// Writes a recording on a thread of its own, so that no frame waits for a disk; it is whole when this is dropped, and but for a second when the
+/// process is killed.
 pub(crate) struct Recorder {
     /// None after a failure.
-    encoder: Option<Encoder>,
+    to: Option<SyncSender<(Duration, Kept)>>,
+    waiting: Arc<AtomicUsize>,
+    thread: Option<JoinHandle<()>>,
     path: PathBuf,
+}
+
+/// The thread's side.
+struct Writer {
+    encoder: Encoder,
+    waiting: Arc<AtomicUsize>,
     written: u64,
     flushed: Duration,
 }
@@ -87,37 +121,75 @@ impl Recorder {
         let mut file = File::create(path).map_err(fail)?;
         file.write_all(MAGIC).map_err(fail)?;
         let encoder = zstd::stream::write::Encoder::new(file, LEVEL).map_err(fail)?;
-        Ok(Self { encoder: Some(encoder), path: path.to_owned(), written: 0, flushed: Duration::ZERO })
+        let waiting = Arc::new(AtomicUsize::new(0));
+        let (to, from) = mpsc::sync_channel(MOST_WAITING);
+        let mut writer = Writer { encoder, waiting: waiting.clone(), written: 0, flushed: Duration::ZERO };
+        let named = path.to_owned();
+        let write = move || {
+            if let Err(error) = writer.write_all(&from) {
+                // The session is worth more than its recording.
+                error!("{}: {error}; the recording ends here", named.display());
+            }
+        };
+        let thread = std::thread::Builder::new().name("pliant-record".into()).spawn(write).map_err(fail)?;
+        Ok(Self { to: Some(to), waiting, thread: Some(thread), path: path.to_owned() })
     }
 
     pub(crate) fn put(&mut self, at: Duration, record: &Record) {
-        let Some(encoder) = &mut self.encoder else { return };
-        let written = if self.written >= MOST_BYTES {
-            Err(io::Error::other(format!("more than {MOST_BYTES} bytes")))
-        } else {
-            write(encoder, at, record).and_then(|bytes| {
-                self.written += bytes;
-                if at.saturating_sub(self.flushed) >= FLUSH_EVERY {
-                    self.flushed = at;
-                    encoder.flush()?;
-                }
-                Ok(())
-            })
-        };
-        if let Err(error) = written {
-            // The session is worth more than its recording.
-            error!("{}: {error}; the recording ends here", self.path.display());
-            self.encoder = None;
+        self.send(at, record.len(), Kept::Record(record.clone()));
+    }
+
+    /// A model of the guest's cache, which never comes over the line.
+    pub(crate) fn put_model(&mut self, at: Duration, model: &Arc<ModalModel>) {
+        self.send(at, 0, Kept::Model(model.clone()));
+    }
+
+    fn send(&mut self, at: Duration, bytes: usize, kept: Kept) {
+        let Some(to) = &self.to else { return };
+        let waiting = self.waiting.fetch_add(bytes, Ordering::Relaxed) + bytes;
+        let full = waiting > MOST_WAITING_BYTES && bytes < waiting;
+        let sent = if full { Err(TrySendError::Full((at, kept))) } else { to.try_send((at, kept)) };
+        match sent {
+            Ok(()) => {}
+            Err(TrySendError::Full(_)) => {
+                error!("{}: the disk does not keep up; the recording ends here", self.path.display());
+                self.to = None;
+            }
+            // The thread has said why.
+            Err(TrySendError::Disconnected(_)) => self.to = None,
         }
+    }
+}
+
+impl Writer {
+    fn write_all(&mut self, from: &Receiver<(Duration, Kept)>) -> io::Result<()> {
+        for (at, kept) in from {
+            let record = match kept {
+                Kept::Record(record) => {
+                    self.waiting.fetch_sub(record.len(), Ordering::Relaxed);
+                    record
+                }
+                Kept::Model(model) => Record::Model(model.to_bytes().into()),
+            };
+            if self.written >= MOST_BYTES {
+                return Err(io::Error::other(format!("more than {MOST_BYTES} bytes")));
+            }
+            self.written += write(&mut self.encoder, at, &record)?;
+            if at.saturating_sub(self.flushed) >= FLUSH_EVERY {
+                self.flushed = at;
+                self.encoder.flush()?;
+            }
+        }
+        self.encoder.do_finish()
     }
 }
 
 impl Drop for Recorder {
     fn drop(&mut self) {
-        if let Some(mut encoder) = self.encoder.take()
-            && let Err(error) = encoder.do_finish()
-        {
-            error!("{}: {error}; the recording's last second is lost", self.path.display());
+        self.to = None;
+        if let Some(thread) = self.thread.take() {
+            // A panic of that thread has been reported there.
+            let _ = thread.join();
         }
     }
 }

@@ -14,8 +14,8 @@ use pliant_modal::ModalModel;
 use pliant_net::transport::Limits;
 use pliant_net::{
     Access, BodyArrived, BodyLeft, Emulation, Grant, GuestState, HandOf, HostConfig, HostOptions, Identity,
-    Invite, JoinConfig, JoinOptions, NetGuest, NetHost, NetPlugin, RemoteBody, SessionClosed, SessionJoined,
-    SessionLost, SharedBody, Token, User, UserJoined,
+    Invite, JoinConfig, JoinOptions, NetGuest, NetHost, NetPlugin, NetStats, RemoteBody, SessionClosed,
+    SessionJoined, SessionLost, SharedBody, Token, User, UserJoined,
 };
 use pliant_stream::UserId;
 use pliant_stream::emulator::{LinkConfig, Loss};
@@ -327,4 +327,38 @@ fn joining_the_shipped_body_over_100_ms_takes_less_than_a_second_and_the_models_
     assert!(cached < 1.0, "{cached} s");
     assert!(sent > 0.8 * bytes / 1e6, "{sent} s: faster than the rate cap");
     assert!(sent < 1.0 + bytes / 1e6, "{sent} s");
+}
+
+#[test]
+fn bodies_stay_while_a_host_that_was_lost_twice_is_waited_for() {
+    let _alone = alone();
+    let session = pliant_stream::HostConfig { idle_timeout: Duration::from_secs(1), ..Default::default() };
+    let transport = HostOptions { limits: quick(Limits::host()), ..HostOptions::default() };
+    let (mut host, invite, _) = host(HostConfig { session, transport, ..HostConfig::default() });
+    let transport = JoinOptions { limits: quick(Limits::guest()), ..JoinOptions::default() };
+    let mut guest = guest(&invite, JoinConfig { transport, models: vec![bar()], ..JoinConfig::default() });
+    run_until(&mut [&mut host, &mut guest], 5.0, "the body arrives", |apps| body_of(apps[1]).is_some());
+    let there = body_of(&mut guest).unwrap();
+    let lost = |app: &App| matches!(state_of(app), GuestState::Lost { .. });
+    guest.world().resource::<NetGuest>().set_emulation(cut());
+    run_until(&mut [&mut host, &mut guest], 6.0, "it is lost", |apps| lost(apps[1]));
+    guest.world().resource::<NetGuest>().set_emulation(None);
+    run_until(&mut [&mut host, &mut guest], 12.0, "it is back", |apps| is_in(apps[1]));
+    // Lost again, before the time is over in which the bodies of the first session are waited for.
+    guest.world().resource::<NetGuest>().set_emulation(cut());
+    run_until(&mut [&mut host, &mut guest], 6.0, "it is lost again", |apps| lost(apps[1]));
+    run_for(&mut [&mut host, &mut guest], 6.0);
+    assert!(lost(&guest));
+    assert!(guest.world().get_entity(there).is_ok(), "what was there stays as it was last seen");
+    assert!(messages::<BodyLeft>(&guest).is_empty());
+    // Counts never fall, though this is the third connection's turn.
+    let before = *guest.world().resource::<NetStats>();
+    assert!(before.datagrams_in > 0 && before.bytes_in > 0, "{before:?}");
+    guest.world().resource::<NetGuest>().set_emulation(None);
+    run_until(&mut [&mut host, &mut guest], 12.0, "it is back for good", |apps| {
+        is_in(apps[1]) && body_of(apps[1]).is_some()
+    });
+    assert_eq!(body_of(&mut guest), Some(there));
+    let after = *guest.world().resource::<NetStats>();
+    assert!(after.datagrams_in >= before.datagrams_in && after.bytes_in >= before.bytes_in, "{after:?}");
 }

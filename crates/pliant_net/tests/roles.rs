@@ -8,11 +8,11 @@ use std::time::{Duration, SystemTime};
 
 use bevy::math::DVec3;
 use bevy::prelude::*;
-use pliant_body::{BodyState, Grab, GrabOf, ShownState};
+use pliant_body::{BodyState, Grab, GrabForce, GrabOf, ModalAsset, ModalBody, ShownState};
 use pliant_net::{
     Access, GrabRefused, Grant, GuestState, HandOf, Holding, HostConfig, HostOptions, Interest, Invite,
-    JoinConfig, NetGuest, NetPlugin, NetStats, Recording, RemoteBody, Role, SeenHands, SessionClosed, Token,
-    User, UserLink,
+    JoinConfig, NetGuest, NetPlugin, NetStats, Recording, RemoteBody, Role, SeenHands, SessionClosed,
+    SharedBody, Token, User, UserLink,
 };
 use support::{TIP, alone, app, bar, guest, host, messages, only, run_for, run_until};
 
@@ -189,4 +189,90 @@ fn a_recorded_session_is_seen_again_as_it_was() {
     let mut users = again.world_mut().query::<&User>();
     let names: Vec<&str> = users.iter(again.world()).map(|user| user.name.as_str()).collect();
     assert!(names.is_empty(), "the session is over: {names:?}");
+}
+
+#[test]
+fn a_body_that_is_full_says_so_and_one_user_leaves_room_for_the_next() {
+    let _alone = alone();
+    let (mut host, invite, body) = host(HostConfig::default());
+    let mut guests: Vec<App> = (0..3).map(|_| guest(&invite, cached())).collect();
+    let all =
+        |host: &mut App, guests: &mut [App], what: &str, done: &mut dyn FnMut(&mut [&mut App]) -> bool| {
+            let mut apps: Vec<&mut App> = std::iter::once(host).chain(guests.iter_mut()).collect();
+            run_until(&mut apps, 8.0, what, done);
+        };
+    all(&mut host, &mut guests, "the body is everywhere", &mut |apps| {
+        (1..4).all(|at| body_of(apps[at]).is_some())
+    });
+    let hands = |host: &mut App| host.world_mut().query::<&HandOf>().iter(host.world()).count();
+    // As many as a guest may hold at all, each with a patch of its own; half of what is left; one.
+    for (guest, asked, held) in [(0, 16, 16), (1, 16, 24), (2, 1, 25)] {
+        let there = body_of(&mut guests[guest]).unwrap();
+        for k in 0..asked {
+            let grab = Grab::new(TIP, 0.3 + 0.01 * f64::from(k), DVec3::new(0.9, 1.9, 0.0));
+            guests[guest].world_mut().spawn((grab, GrabOf(there)));
+        }
+        all(&mut host, &mut guests, "all are held or refused", &mut |apps| {
+            let refused = messages::<GrabRefused>(apps[guest + 1]).len();
+            hands(apps[0]) == held && refused == asked as usize + [0, 16, 24][guest] - held
+        });
+    }
+    // The host's own hands are not bound: the body fills, and the next guest's is refused instead of waiting unheard.
+    for _ in 0..7 {
+        host.world_mut().spawn((Grab::new(TIP, 0.3, DVec3::new(0.9, 1.9, 0.0)), GrabOf(body)));
+    }
+    let there = body_of(&mut guests[2]).unwrap();
+    let late = guests[2].world_mut().spawn((Grab::new(TIP, 0.5, DVec3::Y), GrabOf(there))).id();
+    all(&mut host, &mut guests, "the last is refused", &mut |apps| {
+        messages::<GrabRefused>(apps[3]) == [GrabRefused { entity: late }]
+    });
+}
+
+#[test]
+fn a_hand_is_told_of_no_more_force_than_it_may_be() {
+    let _alone = alone();
+    let (mut host, invite, _) = host(HostConfig::default());
+    let mut guest = guest(&invite, JoinConfig { most_force: 0.25, ..cached() });
+    run_until(&mut [&mut host, &mut guest], 5.0, "the body arrives", |apps| body_of(apps[1]).is_some());
+    let there = body_of(&mut guest).unwrap();
+    let own = guest.world_mut().spawn((Grab::new(TIP, 0.3, DVec3::new(1.2, 2.5, 0.4)), GrabOf(there))).id();
+    let strongest = |app: &mut App| {
+        let mut forces = app.world_mut().query::<&GrabForce>();
+        forces.iter(app.world()).map(|felt| felt.force.length()).fold(0.0, f64::max)
+    };
+    run_until(&mut [&mut host, &mut guest], 5.0, "the host's body pulls back", |apps| {
+        strongest(apps[0]) > 1.0
+    });
+    run_until(&mut [&mut host, &mut guest], 5.0, "the guest feels it", |apps| strongest(apps[1]) > 0.2);
+    let mut most = 0.0_f64;
+    for _ in 0..10 {
+        run_for(&mut [&mut host, &mut guest], 0.1);
+        most = most.max(strongest(&mut guest));
+    }
+    let felt = guest.world().get::<GrabForce>(own).unwrap().force.length();
+    most = most.max(felt);
+    assert!(most <= 0.25 + 1e-9, "{most} N");
+    assert!(felt > 0.24, "in its direction, as much as may be: {felt} N");
+}
+
+#[test]
+fn a_body_that_goes_while_a_guest_holds_it_takes_the_hand_with_it() {
+    let _alone = alone();
+    let (mut host, invite, body) = host(HostConfig::default());
+    let mut guest = guest(&invite, cached());
+    run_until(&mut [&mut host, &mut guest], 5.0, "the body arrives", |apps| body_of(apps[1]).is_some());
+    let there = body_of(&mut guest).unwrap();
+    guest.world_mut().spawn((Grab::new(TIP, 0.3, DVec3::new(1.2, 2.5, 0.4)), GrabOf(there)));
+    run_until(&mut [&mut host, &mut guest], 5.0, "it is held", |apps| only::<HandOf>(apps[0]).is_some());
+    host.world_mut().despawn(body);
+    run_until(&mut [&mut host, &mut guest], 5.0, "it is gone", |apps| {
+        body_of(apps[1]).is_none() && only::<HandOf>(apps[0]).is_none()
+    });
+    // The session goes on: another body comes and is held.
+    let handle = host.world_mut().resource_mut::<Assets<ModalAsset>>().add(ModalAsset(bar()));
+    host.world_mut().spawn((ModalBody::new(handle), SharedBody::named("bar")));
+    run_until(&mut [&mut host, &mut guest], 5.0, "another comes", |apps| body_of(apps[1]).is_some());
+    let there = body_of(&mut guest).unwrap();
+    guest.world_mut().spawn((Grab::new(TIP, 0.3, DVec3::new(1.2, 0.5, 0.4)), GrabOf(there)));
+    run_until(&mut [&mut host, &mut guest], 5.0, "and is held", |apps| only::<HandOf>(apps[0]).is_some());
 }

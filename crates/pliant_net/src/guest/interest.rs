@@ -19,7 +19,7 @@ pub enum Interest {
     /// All modes that this guest takes. Default.
     #[default]
     All,
-    /// At most so many; at least one.
+    /// So many, taken up to the next of 1, 2, 3, 4, 6, 8, 12 and so on; at least one, and no more than this guest takes.
     Modes(u16),
     /// Nothing: the body stands still as it was last seen.
     Nothing,

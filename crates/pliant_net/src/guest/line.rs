@@ -109,7 +109,7 @@ impl Line {
     /// A model of the cache is used: a recording must have it, as it never comes over the line.
     pub(crate) fn keep_model(&mut self, now: Duration, model: &Arc<ModalModel>) {
         if let Self::Quic { recorder: Some(recorder), .. } = self {
-            recorder.put(now, &Record::Model(model.to_bytes().into()));
+            recorder.put_model(now, model);
         }
     }
 

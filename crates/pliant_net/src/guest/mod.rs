@@ -13,10 +13,13 @@ use std::sync::Arc;
 use std::time::{Duration, Instant};
 
 use bevy::prelude::*;
+use bevy::tasks::Task;
 use pliant_modal::ModalModel;
-use pliant_stream::{BodyId, BodyView, GuestSession, ModalState, RecoveryConfig, Tick, UserId};
+use pliant_stream::{
+    BodyId, BodyView, GuestSession, LinkStats, ModalState, PeerId, RecoveryConfig, Tick, UserId,
+};
 
-use crate::figures::NetStats;
+use crate::figures::{Ledger, NetStats};
 use crate::scene::{Person, Reach};
 use crate::seen::RemoteBody;
 use crate::transport::{Emulation, Endpoint, JoinOptions, Role};
@@ -121,6 +124,11 @@ pub struct NetGuest {
     wanted: BTreeMap<BodyId, interest::Said>,
     retry: session::Retry,
     scratch: Vec<f64>,
+    ledger: Ledger,
+    /// Models that have come and are being read.
+    being_read: Vec<([u8; 32], Task<Option<Arc<ModalModel>>>)>,
+    /// The counts of sessions that are over.
+    before: LinkStats,
 }
 
 impl NetGuest {
@@ -153,6 +161,9 @@ impl NetGuest {
             wanted: BTreeMap::new(),
             retry: session::Retry::default(),
             scratch: Vec::new(),
+            ledger: Ledger::default(),
+            being_read: Vec::new(),
+            before: LinkStats::default(),
         }
     }
 
@@ -218,9 +229,15 @@ impl NetGuest {
         }
     }
 
-    pub(crate) fn figures(&self) -> NetStats {
+    pub(crate) fn figures(&mut self) -> NetStats {
         let mut stats = NetStats::default();
-        let (Some(session), Some(transport)) = (&self.session, self.line.stats()) else { return stats };
+        let line = self.line.stats();
+        let mut links = self.before;
+        if let Some(session) = &self.session {
+            links.add_counts(&session.stats());
+        }
+        stats.count(&links, &self.ledger.sum(line.iter().map(|line| (PeerId::HOST, *line))));
+        let (Some(session), Some(transport)) = (&self.session, line) else { return stats };
         stats.add(&session.stats(), &transport);
         for view in session.bodies() {
             let counts = view.counts();

@@ -4,7 +4,9 @@ use std::sync::Arc;
 use std::time::Duration;
 
 use bevy::prelude::*;
+use bevy::tasks::{AsyncComputeTaskPool, block_on, poll_once};
 use pliant_body::ModalAsset;
+use pliant_modal::ModalModel;
 use pliant_stream::{EndReason, GuestEvent, GuestSession, StreamError, UserId};
 
 use super::line::Came;
@@ -65,7 +67,10 @@ pub(crate) fn receive(world: &mut World) {
                     (Some(Reliable::People(people)), _) => guest.know(world, people),
                     (Some(Reliable::Reaches(reaches)), _) => guest.reaches = reaches,
                     // A later host may have more to say.
-                    _ => debug!("a message of no known kind from the host"),
+                    _ => {
+                        guest.before.rejected += 1;
+                        debug!("a message of no known kind from the host");
+                    }
                 },
                 Came::Closed { reason } => {
                     // A goodbye of the session came before this and says more.
@@ -76,6 +81,7 @@ pub(crate) fn receive(world: &mut World) {
             guest.take_events(world);
         }
         let now = guest.now();
+        guest.take_models();
         guest.take_events(world);
         guest.try_again(world, now);
         guest.flush();
@@ -92,6 +98,7 @@ impl NetGuest {
             modes: self.config.modes,
             own_hand_first: self.config.own_hand_first,
             idle_timeout: self.config.transport.limits.idle_timeout,
+            models_apart: true,
             ..pliant_stream::GuestConfig::default()
         };
         let mut session = GuestSession::new(config, most)?;
@@ -101,8 +108,39 @@ impl NetGuest {
             session.add_cached_model(Arc::clone(model));
         }
         session.connect(now)?;
+        self.end_session();
         self.session = Some(session);
         Ok(())
+    }
+
+    /// A model is read elsewhere, since a large one takes longer than a frame.
+    fn read_model(&mut self, hash: [u8; 32], bytes: Arc<[u8]>) {
+        let read = move || ModalModel::from_bytes(&bytes).ok().map(Arc::new);
+        match (AsyncComputeTaskPool::try_get(), &mut self.session) {
+            (Some(pool), _) => self.being_read.push((hash, pool.spawn(async move { read() }))),
+            (None, Some(session)) => session.give_model(hash, read()),
+            (None, None) => {}
+        }
+    }
+
+    /// The models that have been read since.
+    fn take_models(&mut self) {
+        let Some(session) = &mut self.session else { return };
+        self.being_read.retain_mut(|(hash, task)| match block_on(poll_once(task)) {
+            Some(model) => {
+                session.give_model(*hash, model);
+                false
+            }
+            None => true,
+        });
+    }
+
+    /// What a session has counted stays counted.
+    fn end_session(&mut self) {
+        self.being_read.clear();
+        if let Some(session) = self.session.take() {
+            self.before.add_counts(&session.stats());
+        }
     }
 
     /// The connection has ended, or there was none.
@@ -127,6 +165,7 @@ impl NetGuest {
 
     /// The host is not to be heard: what is here stands still, and joining is tried again.
     fn lost(&mut self, world: &mut World, now: Duration, reason: String) {
+        self.retry.orphans_until = None;
         let since = *self.retry.since.get_or_insert(now);
         if now.saturating_sub(since) >= self.config.rejoin {
             return self.close(world, reason);
@@ -136,7 +175,7 @@ impl NetGuest {
             self.retry.next = Some(now + self.retry.pause);
         }
         self.flush();
-        self.session = None;
+        self.end_session();
         if matches!(self.state, GuestState::Lost { .. }) {
             return;
         }
@@ -153,7 +192,9 @@ impl NetGuest {
             self.retry.next = None;
             self.line.rejoin();
         }
-        if self.retry.orphans_until.is_some_and(|until| now >= until) {
+        // While the host cannot be heard, nothing says that its bodies are gone.
+        let inside = matches!(self.state, GuestState::In { .. });
+        if inside && self.retry.orphans_until.is_some_and(|until| now >= until) {
             self.retry.orphans_until = None;
             self.forget_orphans(world);
         }
@@ -186,6 +227,7 @@ impl NetGuest {
         while let Some(event) = self.session.as_mut().and_then(GuestSession::poll_event) {
             match event {
                 GuestEvent::Welcomed { user } => self.welcomed(world, user),
+                GuestEvent::ModelCame { hash, bytes } => self.read_model(hash, bytes),
                 GuestEvent::BodyReady { body, model } => self.body_ready(world, body, model),
                 GuestEvent::BodyChanged { body } => self.body_changed(world, body),
                 GuestEvent::BodyGone { body } => self.body_gone(world, body),

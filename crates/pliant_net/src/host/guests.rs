@@ -75,6 +75,7 @@ pub(crate) fn receive(world: &mut World) {
                     Some(Reliable::Wanted(wanted)) => host.wanted(now, peer, wanted),
                     // Of the rest a guest has nothing to say.
                     Some(Reliable::Placement(_) | Reliable::People(_) | Reliable::Reaches(_)) | None => {
+                        host.rejected += 1;
                         host.session.expel(peer, EndReason::Protocol);
                     }
                 },

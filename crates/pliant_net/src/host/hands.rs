@@ -3,7 +3,7 @@
 use bevy::math::DVec3;
 use bevy::prelude::*;
 use pliant_body::{BodyState, Grab, GrabOf, Grabs};
-use pliant_modal::GrabConfig;
+use pliant_modal::{Body, GrabConfig};
 use pliant_stream::{BodyId, GrabKey, PeerId};
 
 use super::NetHost;
@@ -84,6 +84,16 @@ impl NetHost {
         let holding = world.get::<Holding>(entity).copied().unwrap_or(self.holding);
         let held = world.get::<Grabs>(entity).map(|grabs| grabs.entities().to_vec()).unwrap_or_default();
         let others = |other: &Entity| world.get::<HandOf>(*other).is_none_or(|hand| hand.0 != user);
+        // A grab that finds no place would wait, and its hand would hold nothing without knowing why. One user takes at most half of what is
+        // left: five must come together to fill a body, and there is still a place for a sixth.
+        let free = Body::MAX_GRABS.saturating_sub(held.len());
+        let own = held.iter().filter(|other| !others(other)).count();
+        if free == 0 {
+            return Err("as many hands as there can be hold the body");
+        }
+        if own >= free {
+            return Err("the places that are left are for others");
+        }
         match holding {
             Holding::Together => {}
             Holding::OneAtATime if held.iter().any(others) => return Err("somebody else holds the body"),

@@ -6,13 +6,16 @@ mod playout;
 mod publish;
 
 use std::collections::BTreeMap;
+use std::sync::Arc;
 use std::time::{Duration, Instant};
 
 use bevy::prelude::*;
+use bevy::tasks::Task;
 use bytes::Bytes;
+use pliant_modal::ModalModel;
 use pliant_stream::{Channel, EndReason, GrabKey, GrabState, HostSession, LinkStats, PeerId, UserId};
 
-use crate::figures::NetStats;
+use crate::figures::{Ledger, NetStats};
 use crate::scene::{self, Placement};
 use crate::transport::{
     Access, Emulation, Endpoint, Fingerprint, HostOptions, Invite, PeerStats, Role, SendError,
@@ -86,6 +89,11 @@ pub struct NetHost {
     next_own_grab: u16,
     reaches_said: Duration,
     scratch: Vec<GrabState>,
+    ledger: Ledger,
+    /// Messages that no guest has to say.
+    rejected: u64,
+    /// Bodies that come, and their models' files, which are being made.
+    files: BTreeMap<Entity, (Arc<ModalModel>, Task<Arc<[u8]>>)>,
 }
 
 /// Somebody who was here, or is.
@@ -132,6 +140,9 @@ impl NetHost {
             next_own_grab: 0,
             reaches_said: Duration::ZERO,
             scratch: Vec::new(),
+            ledger: Ledger::default(),
+            rejected: 0,
+            files: BTreeMap::new(),
         });
         Ok(())
     }
@@ -264,12 +275,16 @@ impl NetHost {
         Some((link, transport))
     }
 
-    pub(crate) fn figures(&self) -> NetStats {
+    pub(crate) fn figures(&mut self) -> NetStats {
         let mut sum = NetStats::default();
         let inside = self.guests.iter().filter(|(_, guest)| guest.entity.is_some());
         for (link, transport) in inside.filter_map(|(&peer, _)| self.link(peer)) {
             sum.add(&link, &transport);
         }
+        let open = self.guests.keys().filter_map(|&peer| Some((peer, self.endpoint.stats(peer)?)));
+        let mut totals = self.session.totals();
+        totals.rejected += self.rejected;
+        sum.count(&totals, &self.ledger.sum(open));
         sum
     }
 }

@@ -5,6 +5,7 @@ use std::sync::Arc;
 use std::time::Duration;
 
 use bevy::prelude::*;
+use bevy::tasks::{AsyncComputeTaskPool, block_on, poll_once};
 use pliant_body::{BodyState, Driven, Grab, GrabForce, Grabs, PliantTick};
 use pliant_modal::ModalModel;
 use pliant_stream::{BodyId, BodySetup, GrabKey, GrabState, Pose, TickState, UserId};
@@ -54,6 +55,7 @@ pub(crate) fn publish(
     let now = host.now();
     let present =
         |entity: &Entity| bodies.get(*entity).is_ok_and(|(.., driven, _, _)| *driven == Driven::Local);
+    host.files.retain(|entity, _| present(entity));
     let gone: Vec<Entity> = host.bodies.keys().copied().filter(|entity| !present(entity)).collect();
     for entity in gone {
         if let Some(body) = host.bodies.remove(&entity) {
@@ -161,10 +163,11 @@ impl NetHost {
             self.session.remove_body(hosted.id);
             self.bodies.remove(&entity);
         }
+        let bytes = self.file_of(entity, model)?;
         // Numbers go round; one that is in use is refused, and the next tick tries the next.
         let id = BodyId(self.next_body);
         self.next_body = self.next_body.wrapping_add(1);
-        match self.session.add_body(id, &shared.name, Arc::clone(model), setup) {
+        match self.session.add_body_as(id, &shared.name, Arc::clone(model), bytes, setup) {
             Ok(()) => {
                 let model = Arc::clone(model);
                 self.bodies.insert(
@@ -179,6 +182,22 @@ impl NetHost {
                 None
             }
         }
+    }
+
+    /// The file of a body's model, for guests that have it not; `None` while it is being made, since that takes long for a step.
+    fn file_of(&mut self, entity: Entity, model: &Arc<ModalModel>) -> Option<Arc<[u8]>> {
+        let Some(pool) = AsyncComputeTaskPool::try_get() else { return Some(model.to_bytes().into()) };
+        let begin = || {
+            let model = Arc::clone(model);
+            (Arc::clone(&model), pool.spawn(async move { Arc::from(model.to_bytes()) }))
+        };
+        let (of, task) = self.files.entry(entity).or_insert_with(begin);
+        if !Arc::ptr_eq(of, model) {
+            (*of, *task) = begin();
+        }
+        let bytes = block_on(poll_once(task))?;
+        self.files.remove(&entity);
+        Some(bytes)
     }
 
     /// The session's name for a grab made at the host.

@@ -208,7 +208,10 @@ impl NetPeer {
                     }
                 }
             }
-            _ => self.hang_up(peer, "a message that is none"),
+            _ => {
+                self.rejected += 1;
+                self.hang_up(peer, "a message that is none");
+            }
         }
     }
 
@@ -378,7 +381,9 @@ impl NetPeer {
             let (Some(stats), Some(entity)) = (endpoint.stats(number), entity) else { continue };
             if let Some(mut link) = world.get_mut::<UserLink>(entity) {
                 let (round_trip, loss_out) = (stats.round_trip, stats.loss());
-                link.set_if_neq(UserLink { round_trip, loss_in: link.loss_in, loss_out });
+                let session = self.session.as_ref().and_then(|session| session.stats(peer));
+                let loss_in = session.map_or(0.0, |session| session.loss_in);
+                link.set_if_neq(UserLink { round_trip, loss_in, loss_out });
             }
         }
     }

@@ -17,10 +17,10 @@ use pliant_body::{BodyState, Driven, ModalBody};
 use pliant_stream::peer::{PeerConfig as SessionConfig, PeerSession, Repair};
 use pliant_stream::{BodyId, BodySetup, LinkStats, PeerId, UserId};
 
-use crate::figures::NetStats;
+use crate::figures::{Ledger, NetStats};
 use crate::scene::{self, SharedBody};
 use crate::transport::{
-    Emulation, Endpoint, Fingerprint, HostOptions, Identity, Invite, JoinOptions, Limits, Role,
+    Emulation, Endpoint, Fingerprint, HostOptions, Identity, Invite, JoinOptions, Limits, PeerStats, Role,
     TransportError,
 };
 use crate::user::{User, UserLink, Yourself};
@@ -111,6 +111,9 @@ pub struct NetPeer {
     users: BTreeMap<UserId, Entity>,
     grabs: BTreeMap<Entity, SaidGrab>,
     scratch: Vec<f64>,
+    ledger: Ledger,
+    /// Messages that no peer has to say.
+    rejected: u64,
     next_opened: u64,
 }
 
@@ -146,6 +149,8 @@ impl NetPeer {
             users: BTreeMap::new(),
             grabs: BTreeMap::new(),
             scratch: Vec::new(),
+            ledger: Ledger::default(),
+            rejected: 0,
             next_opened: OPENED,
         };
         if let Some(invite) = peer.config.join.clone() {
@@ -218,20 +223,22 @@ impl NetPeer {
         }
     }
 
-    pub(crate) fn figures(&self) -> NetStats {
+    pub(crate) fn figures(&mut self) -> NetStats {
         let mut stats = NetStats::default();
-        for &peer in self.others.keys() {
+        let line = |&peer: &PeerId| {
             let (endpoint, number) = self.way(peer);
-            let Some(transport) = endpoint.stats(number) else { continue };
-            let link = LinkStats {
-                round_trip: transport.round_trip,
-                datagrams_out: transport.sent_datagrams,
-                datagrams_in: transport.received_datagrams,
-                loss_out: transport.loss(),
-                ..LinkStats::default()
-            };
-            stats.add(&link, &transport);
+            Some((peer, endpoint.stats(number)?))
+        };
+        let lines: Vec<(PeerId, PeerStats)> = self.others.keys().filter_map(line).collect();
+        for (peer, transport) in &lines {
+            let link = self.session.as_ref().and_then(|session| session.stats(*peer)).unwrap_or_default();
+            // Both ways' times and the way there are QUIC's to tell.
+            let (round_trip, loss_out) = (transport.round_trip, transport.loss());
+            stats.add(&LinkStats { round_trip, loss_out, ..link }, transport);
         }
+        let mut totals = self.session.as_ref().map(PeerSession::totals).unwrap_or_default();
+        totals.rejected += self.rejected;
+        stats.count(&totals, &self.ledger.sum(lines.into_iter()));
         if let Some(session) = &self.session {
             stats.shown = session.tick();
             stats.recovered = self

@@ -17,6 +17,13 @@ pub struct DropCounts {
     pub receive_queue_full: u64,
 }
 
+impl DropCounts {
+    /// All of them.
+    pub fn all(&self) -> u64 {
+        self.send_queue_full + self.too_large + self.not_connected + self.receive_queue_full
+    }
+}
+
 /// A connection's figures, refreshed ten times a second.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
 #[non_exhaustive]
