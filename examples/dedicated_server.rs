@@ -1,7 +1,7 @@
 //! A server: no window, no renderer compiled, one body that whoever is invited may see and hold.
 //!
 //! What to learn here: a host is an app like any other, with the plugins that it needs and no more; tokens say who may do what; a kept key keeps the
-//! invite good when the server is started anew; Ctrl-C ends it in good order.
+//! invite good when the server is started anew; Ctrl-C ends it in good order, and so does the SIGTERM of a service manager.
 //!
 //! ```sh
 //! cargo run --release -p pliant --no-default-features --features net --example dedicated_server -- --key server.key
@@ -78,6 +78,7 @@ fn main() -> ExitCode {
 }
 
 fn run(options: &Options) -> Result<(), Box<dyn Error>> {
+    session::end_on_terminate();
     let model = session::model(&options.body)?;
     let limits = Limits {
         peers: options.guests,

@@ -33,7 +33,10 @@ struct Options {
 
 fn main() -> Result<(), Box<dyn Error>> {
     let options = Options::parse();
-    let net = options.serve.open("host", Limits::host())?;
+    session::end_on_terminate();
+    // A hundred bots of `join` come from one machine.
+    let limits = Limits { per_address: 256, ..Limits::host() };
+    let net = options.serve.open("host", limits)?;
     App::new()
         .add_plugins(
             stage::Stage::with("host", options.stage)

@@ -3,6 +3,7 @@
 use std::collections::BTreeSet;
 use std::error::Error;
 use std::sync::Arc;
+use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::{Duration, Instant};
 
 use bytes::Bytes;
@@ -23,6 +24,8 @@ pub struct Bots {
     pub cached: bool,
     pub seconds: f64,
     pub emulation: Option<Emulation>,
+    /// Stop before their time.
+    pub stopped: Arc<AtomicBool>,
 }
 
 /// A message of the session, as `pliant_net` marks it.
@@ -44,6 +47,9 @@ pub fn run(invite: &Invite, model: &Arc<ModalModel>, bots: &Bots) -> Result<(), 
     let mut all = Vec::new();
     let start = Instant::now();
     for number in 0..bots.number {
+        if bots.stopped.load(Ordering::Relaxed) {
+            break;
+        }
         let emulation = bots.emulation.clone().map(|e| Emulation { seed: e.seed + number as u64, ..e });
         let endpoint = Endpoint::join(invite, JoinOptions { emulation, ..JoinOptions::default() })?;
         all.push(Bot {
@@ -65,7 +71,7 @@ pub fn run(invite: &Invite, model: &Arc<ModalModel>, bots: &Bots) -> Result<(), 
     }
     println!("{} bots after {:.1} s", all.len(), start.elapsed().as_secs_f64());
     let mut said = Instant::now();
-    while start.elapsed().as_secs_f64() < bots.seconds {
+    while start.elapsed().as_secs_f64() < bots.seconds && !bots.stopped.load(Ordering::Relaxed) {
         all.iter_mut().for_each(|bot| bot.turn(model, bots, start));
         std::thread::sleep(Duration::from_millis(2));
         if said.elapsed().as_secs_f64() > 10.0 {

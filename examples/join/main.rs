@@ -26,8 +26,8 @@ use bevy::log::Level;
 use bevy::prelude::*;
 use clap::Parser;
 use pliant::net::{
-    CameraInterest, Invite, JoinConfig, JoinOptions, NetPlugin, Recording, RemoteBody, SessionClosed,
-    SessionJoined, SessionLost,
+    CameraInterest, Invite, JoinConfig, JoinOptions, NetGuest, NetPlugin, Recording, RemoteBody,
+    SessionClosed, SessionJoined, SessionLost,
 };
 use pliant::prelude::*;
 use pliant::stream::emulator::Preset;
@@ -131,10 +131,11 @@ fn run(options: &Options) -> Result<(), Box<dyn Error>> {
     let emulation = session::emulation(options.network, options.seed);
     if let (Some(number), Some(invite)) = (options.bots, &options.invite) {
         let (holders, light, seconds) = (options.holders, options.light, options.seconds.unwrap_or(10.0));
-        let cached = options.cached;
-        let bots = bots::Bots { number, holders, light, cached, seconds, emulation };
+        let (cached, stopped) = (options.cached, session::stopped());
+        let bots = bots::Bots { number, holders, light, cached, seconds, emulation, stopped };
         return bots::run(invite, &shipped()?, &bots);
     }
+    session::end_on_terminate();
     let config = JoinConfig {
         name: options.name.clone(),
         transport: JoinOptions {
@@ -162,10 +163,7 @@ fn run(options: &Options) -> Result<(), Box<dyn Error>> {
     let mut app = session::headless(Level::WARN);
     app.add_plugins((PliantBodyPlugin::default(), net)).add_systems(Update, session::say);
     finish(&mut app, options)?;
-    match app.run() {
-        AppExit::Success => Ok(()),
-        AppExit::Error(_) => Err("the session is over".into()),
-    }
+    session::ended(&app.run())
 }
 
 /// What the app does with a window and without.
@@ -196,6 +194,7 @@ fn tell(
     mut lost: MessageReader<SessionLost>,
     mut closed: MessageReader<SessionClosed>,
     mut exit: MessageWriter<AppExit>,
+    guest: Res<NetGuest>,
     arrived: Query<&Name, Added<RemoteBody>>,
     shown: Query<(), Added<ShownState>>,
 ) {
@@ -214,6 +213,7 @@ fn tell(
     }
     for closed in closed.read() {
         println!("{now:6.2} s  over: {}", closed.reason);
-        exit.write(AppExit::error());
+        // A recording that was shown to its end has done what it was to do.
+        exit.write(if guest.endpoint().is_none() { AppExit::Success } else { AppExit::error() });
     }
 }

@@ -26,10 +26,7 @@ pub fn run(options: &Options, net: NetPlugin) -> Result<(), Box<dyn Error>> {
     finish(&mut app, options)?;
     // The stage ends the run, after the picture if one is taken.
     app.insert_resource(crate::session::EndAfter(None));
-    match app.run() {
-        AppExit::Success => Ok(()),
-        AppExit::Error(_) => Err("the session is over".into()),
-    }
+    crate::session::ended(&app.run())
 }
 
 /// A body that has come is given a material.

@@ -46,6 +46,7 @@ struct Options {
 
 fn main() -> Result<(), Box<dyn Error>> {
     let options = Options::parse();
+    session::end_on_terminate();
     let number = options.name.bytes().map(u64::from).sum::<u64>();
     let net = NetPlugin::peer(PeerConfig {
         name: options.name,

@@ -7,6 +7,7 @@ pub mod trace;
 use std::error::Error;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
+use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::Duration;
 
 use bevy::app::{ScheduleRunnerPlugin, TerminalCtrlCHandlerPlugin};
@@ -60,7 +61,7 @@ pub fn model(file: &Path) -> Result<Arc<ModalModel>, Box<dyn Error>> {
     Ok(Arc::new(ModalModel::read(path)?))
 }
 
-/// An app without a window or a renderer, that ends in good order on Ctrl-C.
+/// An app without a window or a renderer, that ends in good order on Ctrl-C, and on SIGTERM after [`end_on_terminate`].
 pub fn headless(level: Level) -> App {
     let mut app = App::new();
     app.add_plugins((
@@ -71,6 +72,53 @@ pub fn headless(level: Level) -> App {
         TransformPlugin,
     ));
     app
+}
+
+/// From here on a SIGTERM ends the app as Ctrl-C does: goodbyes are said, files are finished. To be called before any thread is made: those
+/// that are there already would end everything at once.
+pub fn end_on_terminate() {
+    #[cfg(unix)]
+    on_signals(&[nix::sys::signal::Signal::SIGTERM], TerminalCtrlCHandlerPlugin::gracefully_exit);
+}
+
+/// The same for a program without an app: true from Ctrl-C or a SIGTERM on; a second one ends it at once.
+pub fn stopped() -> Arc<AtomicBool> {
+    let stopped = Arc::new(AtomicBool::new(false));
+    #[cfg(unix)]
+    {
+        use nix::sys::signal::Signal::{SIGINT, SIGTERM};
+        let flag = stopped.clone();
+        on_signals(&[SIGINT, SIGTERM], move || {
+            if flag.swap(true, Ordering::Relaxed) {
+                std::process::exit(i32::from(CTRL_C));
+            }
+        });
+    }
+    stopped
+}
+
+/// The signals are kept from all threads but one, which waits for them.
+#[cfg(unix)]
+fn on_signals(signals: &[nix::sys::signal::Signal], act: impl Fn() + Send + 'static) {
+    let set: nix::sys::signal::SigSet = signals.iter().copied().collect();
+    if set.thread_block().is_ok() {
+        std::thread::spawn(move || {
+            while set.wait().is_ok() {
+                act();
+            }
+        });
+    }
+}
+
+/// What Bevy ends an app with on Ctrl-C, by the custom of shells.
+const CTRL_C: u8 = 130;
+
+/// Is this how an app was to end? Ctrl-C is no failure.
+pub fn ended(exit: &AppExit) -> Result<(), Box<dyn Error>> {
+    match exit {
+        AppExit::Error(code) if code.get() != CTRL_C => Err("the session is over".into()),
+        AppExit::Success | AppExit::Error(_) => Ok(()),
+    }
 }
 
 /// A hand that takes hold of the farthest point of a body in some direction and moves it about.
