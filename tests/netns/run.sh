@@ -86,7 +86,8 @@ drag() {
         tail -1 "$work/$g.log"
         result=$("$BIN/join" --compare "$work/truth" "$work/$g.trace") || { echo "$result"; failed=1; continue; }
         echo "$g: $result"
-        bar "$g: shown error rms, %" "$(echo "$result" | sed 's/.*shown error \([0-9.]*\) % rms.*/\1/')" 2
+        bar "$g: shown error rms, %" "$(echo "$result" | sed 's/.*shown error \([0-9.]*\) % rms.*/\1/')" 0.2
+        bar "$g: shown error at most, %" "$(echo "$result" | sed 's/.*shown error [0-9.]* % rms, \([0-9.]*\) % at most.*/\1/')" 3
         bar "$g: reaction rms, %" "$(echo "$result" | sed 's/.*reaction \([0-9.]*\) % rms.*/\1/')" 10
         set -- $(echo "$result" | sed 's/^\([0-9]*\) of \([0-9]*\) ticks.*/\1 \2/')
         bar "$g: ticks not shown, %" "$(awk "BEGIN { print 100 * (1 - $1 / $2) }")" 0.1
