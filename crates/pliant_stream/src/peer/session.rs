@@ -185,7 +185,8 @@ impl PeerSession {
         if vertex as usize >= b.model().surface().positions().len() {
             return Err(StreamError::Model(format!("vertex {vertex} is not on the surface")));
         }
-        if radius > b.model().size() {
+        // As it crosses.
+        if f64::from(radius as f32) > b.model().size() {
             return Err(StreamError::Model(format!("a radius of {radius} m is larger than the body")));
         }
         if self.own.len() >= MAX_HELD {
