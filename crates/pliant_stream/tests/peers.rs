@@ -521,7 +521,7 @@ fn every_datagram_reads_back_as_it_was_written() {
 
 #[test]
 fn peers_tell_how_their_paths_do() {
-    let link = LinkConfig { loss: Loss::Random(0.1), delay: 40 * MS, jitter: 0 * MS, ..Default::default() };
+    let link = LinkConfig { loss: Loss::Random(0.1), delay: 40 * MS, ..Default::default() };
     let mut mesh = Mesh::new(2, &link, 5);
     for k in 0..2 {
         mesh.start(k, Repair::Rollback, true);
