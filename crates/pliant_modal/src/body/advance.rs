@@ -2,15 +2,15 @@
 
 use nalgebra::{Matrix3, Vector3};
 
-use super::{Body, RigidMotion, StepReport, grab::Grab};
-use crate::StepError;
+use super::{Body, Frame, RigidMotion, StepReport, grab::Grab};
+use crate::{ModalModel, StepError};
 
 impl Body {
     /// One step of the configured length.
     ///
     /// Grabs are compliant and implicit: with `x = x* + A lambda` the patch's position after the step, the pull `lambda` (N) solves
     /// `(A + C) lambda = target - x*`, `C` the grab's compliance; the reaction is `-lambda`. Under warp the rows are corrected
-    /// `corrections` times (Newton).
+    /// `corrections` times (Newton), and so is the place of a free body's frame.
     ///
     /// # Errors
     /// [`StepError::Diverged`] when the result would not be finite; the body is then in the state it had before, unless that is one that nothing can be
@@ -109,18 +109,26 @@ impl Body {
         let h = self.config.step;
         let corrections = if self.config.warp { self.config.corrections.clamp(1, 8) } else { 1 };
         let reach = self.model.size();
-        let turn: Matrix3<f64> = *self.state.frame.rotation().to_rotation_matrix().matrix();
-        let back = turn.transpose();
         let mut report = StepReport::default();
+        let mut place = Place::unheld(self.state.frame);
         for round in 0..corrections {
             for grab in &mut self.grabs {
-                // Linearise where the last round ended; project the unheld step onto that plane.
+                // Linearise where the last round ended.
                 grab.linearise(&self.linear, self.config.warp);
+                grab.arm = grab.at() - Vector3::from(self.model.center_of_mass());
+                // The pulls of the round before, at first those of the step before, which are in world axes.
+                grab.pull = place.axes * grab.pull;
+            }
+            if let Some(rigid) = &mut rigid {
+                rigid.tighten(&self.model, self.grabs.iter().map(|grab| (grab.arm, grab.pull)));
+            }
+            for grab in &mut self.grabs {
+                // Project the unheld step onto that plane.
                 let ahead = grab.ahead(&self.linear, &self.state.q);
-                let free_position = self.state.frame.to_world(ahead);
-                let mut gap = grab.target - free_position - turn * grab.crept();
+                let free_position = place.unheld_position(&self.model, rigid.as_ref(), ahead);
+                let mut gap = grab.target - free_position - place.turn * grab.crept();
                 if grab.config.relaxation > 0.0 {
-                    let speed = turn
+                    let speed = place.turn
                         * grab.speed(&self.coefficients, &self.before.q, &self.state.q, &self.state.v, h)
                         + rigid.as_ref().map_or_else(Vector3::zeros, |_| {
                             self.state.frame.velocity_at(&self.model, ahead)
@@ -132,19 +140,16 @@ impl Body {
                 if distance > reach {
                     gap *= reach / distance;
                 }
-                grab.gap = back * gap;
-                grab.arm = grab.at() - Vector3::from(self.model.center_of_mass());
-            }
-            if let Some(rigid) = &mut rigid {
-                // The pulls of the round before, at first those of the step before, which are in world axes.
-                let pull = |grab: &Grab| if round == 0 { back * grab.pull } else { grab.pull };
-                rigid.tighten(&self.model, self.grabs.iter().map(|grab| (grab.arm, pull(grab))));
+                grab.gap = place.back * gap;
             }
             report.regularised = self.schur.solve(&mut self.grabs, &self.coefficients, h, rigid.as_ref());
             if round + 1 < corrections {
                 for (i, q) in self.linear.iter_mut().enumerate() {
                     let pull: f64 = self.grabs.iter().map(|g| g.row(i).dot(&g.pull)).sum();
                     *q = self.state.q[i] + self.coefficients[i].response[0] * pull;
+                }
+                if let Some(rigid) = &rigid {
+                    place = place.moved(&self.state.frame, &self.model, rigid, &self.grabs);
                 }
             }
         }
@@ -158,18 +163,82 @@ impl Body {
                 self.state.z[i] += flow.response * pull;
             }
         }
-        let (mut force, mut torque) = (Vector3::zeros(), Vector3::zeros());
+        let [force, torque] = place.load(&self.grabs);
+        if let Some(rigid) = &rigid {
+            rigid.apply(&mut self.state.frame, &self.model, force, torque + place.slack(rigid));
+        }
         for grab in &mut self.grabs {
             grab.relax();
             // Solved in body axes; hands live in the world's.
-            grab.pull = turn * grab.pull;
-            force += grab.pull;
-            torque += (turn * grab.arm).cross(&grab.pull);
+            grab.pull = place.turn * grab.pull;
             grab.last_target = grab.target;
         }
-        if let Some(rigid) = &rigid {
-            rigid.apply(&mut self.state.frame, &self.model, force, torque);
-        }
         report
+    }
+}
+
+/// Where a round of the solution takes the frame to be: at first where it goes without hands, then where the pulls of the round before brought it.
+/// Tension turns a body within a step, and the pulls with it: taken along a step late they would drive the modes that it bends.
+struct Place {
+    frame: Frame,
+    /// From body to world axes, and back.
+    turn: Matrix3<f64>,
+    back: Matrix3<f64>,
+    /// From the axes that the pulls are still told in to these body axes.
+    axes: Matrix3<f64>,
+    /// By what the pulls have moved it, m, world axes, and all of the turn since the unheld one, rad, body axes.
+    way: Vector3<f64>,
+    turned: Vector3<f64>,
+}
+
+impl Place {
+    /// Turns of a step beyond this (rad; a hand that leaps) are not to be taken for their tangent: such a step keeps to the unheld place.
+    const FARTHEST: f64 = 0.25;
+
+    fn at(frame: Frame, pulls: &Matrix3<f64>, way: Vector3<f64>, turned: Vector3<f64>) -> Self {
+        let turn: Matrix3<f64> = *frame.rotation().to_rotation_matrix().matrix();
+        let back = turn.transpose();
+        Self { frame, turn, back, axes: back * pulls, way, turned }
+    }
+
+    fn unheld(frame: Frame) -> Self {
+        Self::at(frame, &Matrix3::identity(), Vector3::zeros(), Vector3::zeros())
+    }
+
+    fn moved(&self, unheld: &Frame, model: &ModalModel, rigid: &RigidMotion, grabs: &[Grab]) -> Self {
+        let [force, torque] = self.load(grabs);
+        let mut frame = *unheld;
+        rigid.apply(&mut frame, model, force, torque + self.slack(rigid));
+        let turned = (unheld.rotation().inverse() * frame.rotation()).scaled_axis();
+        if turned.norm() < Self::FARTHEST {
+            Self::at(frame, &self.turn, rigid.way(force), turned)
+        } else {
+            Self::at(*unheld, &self.turn, Vector3::zeros(), Vector3::zeros())
+        }
+    }
+
+    /// Force (N) and torque about the centre of mass (N m) of the pulls, world axes.
+    fn load(&self, grabs: &[Grab]) -> [Vector3<f64>; 2] {
+        grabs.iter().fold([Vector3::zeros(); 2], |[force, torque], grab| {
+            let pull = self.turn * grab.pull;
+            [force + pull, torque + (self.turn * grab.arm).cross(&pull)]
+        })
+    }
+
+    /// What is to be added to a torque (N m, world axes) that is told for this place already, where the rigid motion takes it for that of the unheld one.
+    fn slack(&self, rigid: &RigidMotion) -> Vector3<f64> {
+        self.turn * rigid.slack(&self.turned)
+    }
+
+    /// Where a point (m, body axes) is, to first order about this place, when nobody pulls: m, world axes.
+    fn unheld_position(
+        &self,
+        model: &ModalModel,
+        rigid: Option<&RigidMotion>,
+        point: Vector3<f64>,
+    ) -> Vector3<f64> {
+        let arm = point - Vector3::from(model.center_of_mass());
+        let turned = rigid.map_or_else(Vector3::zeros, |rigid| rigid.unpulled(&self.turned) - self.turned);
+        self.frame.to_world(point) - self.way + self.turn * turned.cross(&arm)
     }
 }

@@ -209,6 +209,8 @@ pub struct RigidMotion {
     inverse_inertia: Matrix3<f64>,
     /// The same with what the pulls themselves add, see [`RigidMotion::tighten`].
     turning: Matrix3<f64>,
+    /// Torque by which tight pulls answer a turn, N m/rad, body axes: the `K` of [`RigidMotion::tighten`].
+    tightness: Matrix3<f64>,
 }
 
 impl RigidMotion {
@@ -228,7 +230,8 @@ impl RigidMotion {
         frame.spin += h * torque;
         frame.turn(model, h);
         let inverse_inertia = inverse_inertia(model);
-        Self { step: h, inverse_mass: 1.0 / model.mass(), inverse_inertia, turning: inverse_inertia }
+        let (inverse_mass, tightness) = (1.0 / model.mass(), Matrix3::zeros());
+        Self { step: h, inverse_mass, inverse_inertia, turning: inverse_inertia, tightness }
     }
 
     /// Takes into account how `pulls` (N) at their arms (m, both body axes) turn with the body: two hands that pull apart keep it in line
@@ -242,6 +245,7 @@ impl RigidMotion {
             k += Matrix3::identity() * pull.dot(&arm) - 0.5 * (outer + outer.transpose());
         }
         self.turning = self.inverse_inertia;
+        self.tightness = Matrix3::zeros();
         if !k.iter().all(|x| x.is_finite()) {
             return;
         }
@@ -249,7 +253,8 @@ impl RigidMotion {
         own.eigenvalues.apply(|x| *x = x.max(0.0));
         let i = model.inertia();
         let inertia = Matrix3::from_fn(|r, c| i[r][c]);
-        let tight = inertia + self.step * self.step * own.recompose();
+        self.tightness = own.recompose();
+        let tight = inertia + self.step * self.step * self.tightness;
         self.turning = tight.try_inverse().unwrap_or(self.inverse_inertia);
     }
 
@@ -258,6 +263,21 @@ impl RigidMotion {
     pub fn response(&self, a: &Vector3<f64>, b: &Vector3<f64>, relaxation: f64) -> Matrix3<f64> {
         let turning = a.cross_matrix() * self.turning * b.cross_matrix().transpose();
         (self.step * (self.step + relaxation)) * (Matrix3::identity() * self.inverse_mass + turning)
+    }
+
+    /// By how much a force (N) moves the centre of mass within the step, m.
+    pub(crate) fn way(&self, force: Vector3<f64>) -> Vector3<f64> {
+        self.step * self.step * self.inverse_mass * force
+    }
+
+    /// The torque (N m, body axes) by which tight pulls have answered a turn (rad) already.
+    pub(crate) fn slack(&self, turned: &Vector3<f64>) -> Vector3<f64> {
+        self.tightness * turned
+    }
+
+    /// The turn (rad, body axes) that a step whose pulls are told at `turned` makes when they are none.
+    pub(crate) fn unpulled(&self, turned: &Vector3<f64>) -> Vector3<f64> {
+        self.step * self.step * (self.turning * self.slack(turned))
     }
 
     /// Adds the pulls' total force and torque (world axes) to the predicted frame.
