@@ -70,9 +70,32 @@ fn a_typo_and_an_unknown_field_are_told_with_what_was_expected() {
 #[test]
 fn what_is_no_ron_is_told_where_it_ends_to_be_one() {
     let error = with("(name: \"pip\", model", "(name: \"pip\" model");
-    assert_eq!(error.to_string().lines().next(), Some("my.ron:4:22: Expected comma"));
+    assert_eq!(
+        error.to_string().lines().next(),
+        Some("my.ron:4:22: expected a comma or a closing bracket, got `model`")
+    );
     let error = with("stiffness: 200", "stiffness: \"200\"");
     assert_eq!((error.position, error.kind), (Some((9, 74)), SceneErrorKind::Syntax), "{error}");
+    assert_eq!(error.message, "expected a number, got `\"200\"`");
+    for (part, by, told) in [
+        ("model: \"pip.modal\"", "model: pip.modal", "expected text in double quotes, got `pip.modal`"),
+        ("model: \"pip.modal\"", "model: \"pip.modal\", modes: 3.5", "expected a whole number, got `.5`"),
+        (
+            "model: \"pip.modal\"",
+            "model: \"pip.modal\", modes: -3",
+            "expected a whole number, 0 or more, got `-3`",
+        ),
+        ("model: \"pip.modal\"", "model: \"pip.modal\", warp: yes", "expected true or false, got `yes`"),
+        (
+            "Toward((1, 0, 0))",
+            "Toward(1, 0, 0)",
+            "expected an opening bracket (what has parts has brackets of its own, such as `Toward((1, 0, 0))`), got `1`",
+        ),
+    ] {
+        assert_eq!(with(part, by).message, told);
+    }
+    let open = &GOOD[..GOOD.find(",\n    ],\n    grabs").unwrap()];
+    assert_eq!(refused(open).message, "expected a comma or a closing bracket, got the end of the file");
     let error = with("model: \"pip.modal\"", "modes: 3, modes: 4");
     assert_eq!(error.position.unwrap().0, 4);
     assert!(error.message.contains("`modes` is there twice in Body"), "{error}");
@@ -326,6 +349,8 @@ fn a_file_of_the_scene_that_is_not_there_is_told_with_its_entry_and_line() {
     assert!(told.starts_with("my.ron:5:30: the body `bud` cannot be loaded: "), "{told}");
     assert!(told.contains("bad.modal"), "{told}");
     assert_eq!(errors[0].kind, SceneErrorKind::Asset);
+    // The other body is held all the same.
+    run_until(&mut app, "the hands", |world| world.query::<(&Grab, &GrabForce)>().iter(world).count() == 2);
 }
 
 #[test]
@@ -413,6 +438,96 @@ fn a_session_is_for_an_app_that_was_built_for_it() {
         "{}",
         errors[0]
     );
+    // What else is in it goes on.
+    run_until(&mut app, "the hands", |world| world.query::<(&Grab, &GrabForce)>().iter(world).count() == 2);
+}
+
+/// What the game does not get is said, an error each, and the bodies are there with the hands on them.
+#[cfg(all(feature = "net", feature = "rerun", feature = "haptics", feature = "bake"))]
+#[test]
+fn the_project_s_scenes_may_be_assets_of_a_game() {
+    let mut app = app();
+    app.add_plugins(SceneFilePlugin::default());
+    let scenes = ["scenes/shared.ron", "scenes/everything.ron"];
+    let instances = scenes.map(|scene| {
+        let handle: Handle<SceneFile> = app.world().resource::<AssetServer>().load(scene);
+        app.world_mut().spawn(SceneInstance(handle)).id()
+    });
+    let mut told = Vec::new();
+    run_until(&mut app, "the bodies and the clocks", |world| {
+        told.extend(world.resource_mut::<Messages<SceneFailed>>().drain());
+        let begun = |at: &Entity| world.get::<SceneClock>(*at).is_some_and(|clock| clock.at(0.0).is_some());
+        instances.iter().all(begun)
+    });
+    for _ in 0..10 {
+        app.update();
+    }
+    let of = |instance| -> Vec<String> {
+        told.iter().filter(|one| one.instance == instance).map(|one| one.error.message.clone()).collect()
+    };
+    let shared = of(instances[0]);
+    assert_eq!(shared.len(), 1, "{shared:#?}");
+    assert!(shared[0].starts_with("this scene asks for a network, which an app gets when it is built"));
+    let everything = of(instances[1]).join("\n");
+    for part in [
+        "this scene asks for a network, which",
+        "this scene asks for a recording, which",
+        "this app has no `HapticsPlugin`",
+        "the body `jelly` is to be baked, and this app has no `BakePlugin`",
+    ] {
+        assert_eq!(everything.matches(part).count(), 1, "{part}: {everything}");
+    }
+    assert_eq!(everything.lines().count(), 4, "{everything}");
+    let world = app.world_mut();
+    let hands: Vec<String> =
+        world.query_filtered::<&Name, With<GrabForce>>().iter(world).map(ToString::to_string).collect();
+    // That of shared.ron; of the other scene's two one is the guest's, and one is on the body that is not there.
+    assert_eq!(hands, ["of the host"]);
+    let bodies: Vec<Entity> = world.query_filtered::<Entity, With<BodyState>>().iter(world).collect();
+    assert_eq!(bodies.len(), 2);
+}
+
+/// The guest beside a host shows baked bodies, too, and leaves alone what rests.
+#[cfg(all(feature = "net", feature = "bake"))]
+#[test]
+fn a_guest_s_view_of_a_baked_body_is_of_the_host_s_model_and_rests_with_it() {
+    let shape = "bake: (shape: \"jelly.obj\", tets: 800, modes: 6, young: 2e4, damping_ratio: 0.3, anchors: [\"y<0.01\"])";
+    let text = format!(
+        "(bodies: [(name: \"bud\", {shape})], network: Host(guest: (beside: (1, 0, 0))),\
+         grabs: [(name: \"hand\", body: \"bud\", patch: Toward((0, 1, 0)), pull: (0.02, 0, 0), until: 2)])"
+    );
+    let mut app = app();
+    app.insert_resource(TimeUpdateStrategy::Automatic)
+        .add_plugins(pliant::body::BakePlugin { cache: None })
+        .add_plugins(SceneFilePlugin::open(SceneFile::from_ron(&text, "my.ron").unwrap()).unwrap());
+    let view = |world: &mut World| {
+        let mut views = world.query::<(&Name, &pliant::body::ShownState, &ModalBody)>();
+        let found = views.iter(world).find(|(name, ..)| name.as_str() == "bud (guest)");
+        found.map(|(_, shown, body)| {
+            (shown.version(), shown.q().iter().fold(0.0_f64, |most, q| most.max(q.abs())), body.model.id())
+        })
+    };
+    let mut most = 0.0_f64;
+    run_until(&mut app, "the guest's view of the pull", |world| {
+        assert_eq!(failures(world), []);
+        most = view(world).map_or(most, |(_, q, _)| most.max(q));
+        most > 1e-6
+    });
+    let (.., model) = view(app.world_mut()).unwrap();
+    let world = app.world_mut();
+    let hosts = world.query_filtered::<&ModalBody, With<SceneBody>>().single(world).unwrap();
+    assert_eq!(hosts.model.id(), model, "one model in memory");
+    // It is let go of and comes to rest; then nobody writes the view any more.
+    run_until(&mut app, "rest", |world| {
+        world.query_filtered::<&BodyState, With<SceneBody>>().single(world).unwrap().is_resting()
+    });
+    let (mut last, mut same) = (0, 0);
+    run_until(&mut app, "a view that is left alone", |world| {
+        let (version, ..) = view(world).unwrap();
+        same = if version == last { same + 1 } else { 0 };
+        last = version;
+        same > 500
+    });
 }
 
 #[cfg(feature = "net")]
@@ -467,32 +582,178 @@ fn a_simulated_device_takes_hold_and_is_gone_with_its_scene() {
     assert_eq!(world.resource::<HapticDevices>().iter().count(), 0);
 }
 
+/// A field of the scene, what it is, where it is, and the feature that it needs.
+const NEEDS: [(&str, &str, (usize, usize), &str); 4] = [
+    ("title: \"one\"", "network: Host()", (2, 14), "net"),
+    ("title: \"one\"", "device: Pointer(on: (body: \"pip\", patch: Vertex(0)))", (2, 13), "haptics"),
+    ("title: \"one\"", "recording: (file: \"never/made.rrd\")", (2, 16), "rerun"),
+    ("model: \"bud.modal\"", "bake: (shape: \"bud.ron\")", (5, 29), "bake"),
+];
+
 #[test]
-fn what_was_not_compiled_is_said() {
-    let tries = [
-        (cfg!(feature = "net"), "network: Host()", 14, "a network", "net"),
-        (
-            cfg!(feature = "haptics"),
-            "device: Pointer(on: (body: \"pip\", patch: Vertex(0)))",
-            13,
-            "a device",
-            "haptics",
-        ),
-        (cfg!(feature = "rerun"), "recording: (file: \"never.rrd\")", 16, "a recording", "rerun"),
-    ];
-    for (compiled, field, column, what, feature) in tries {
-        let file = SceneFile::from_ron(&GOOD.replacen("title: \"one\"", field, 1), "my.ron").unwrap();
-        match SceneFilePlugin::open(file) {
-            Ok(_) => assert!(compiled, "{feature}"),
-            Err(error) => {
-                assert!(!compiled, "{error}");
-                let expected = format!(
-                    "my.ron:2:{column}: this scene asks for {what}, this program was compiled without `{feature}`"
-                );
-                assert!(error.to_string().starts_with(&expected), "{error}");
+fn each_entry_needs_its_feature_and_no_other() {
+    let good = SceneFile::from_ron(GOOD, "my.ron").unwrap();
+    assert_eq!(good.lacking(|_| false), []);
+    let words = ["a network", "a device", "a recording", "a bake"];
+    for ((part, by, place, feature), what) in NEEDS.into_iter().zip(words) {
+        let file = SceneFile::from_ron(&GOOD.replacen(part, by, 1), "my.ron").unwrap();
+        assert_eq!(file.lacking(|_| true), [], "{feature}");
+        assert_eq!(file.lacking(|has| has == feature), [], "nothing but {feature} is needed");
+        let told = file.lacking(|has| has != feature);
+        assert_eq!(told.len(), 1, "{told:?}");
+        assert_eq!((told[0].position, told[0].kind), (Some(place), SceneErrorKind::Feature), "{}", told[0]);
+        let expected =
+            format!("this scene asks for {what}, and this program was compiled without `{feature}`");
+        assert!(told[0].message.starts_with(&expected), "{}", told[0]);
+    }
+}
+
+#[test]
+fn a_scene_that_the_program_was_not_compiled_for_is_not_opened() {
+    let compiled =
+        [cfg!(feature = "net"), cfg!(feature = "haptics"), cfg!(feature = "rerun"), cfg!(feature = "bake")];
+    for ((part, by, _, feature), compiled) in NEEDS.into_iter().zip(compiled) {
+        // The folder of the recording is not there: what was compiled refuses that, and what was not says so first.
+        let opened =
+            SceneFilePlugin::open(SceneFile::from_ron(&GOOD.replacen(part, by, 1), "my.ron").unwrap());
+        match (compiled, opened) {
+            (true, Ok(_)) => assert_ne!(feature, "rerun"),
+            (true, Err(error)) => {
+                assert_eq!((feature, error.kind), ("rerun", SceneErrorKind::Open), "{error}")
             }
+            (false, Ok(_)) => panic!("`{feature}` was not compiled, and the scene was opened"),
+            (false, Err(error)) => assert_eq!(error.kind, SceneErrorKind::Feature, "{error}"),
         }
     }
+}
+
+#[test]
+fn a_recording_that_cannot_be_written_is_told_before_the_scene_plays() {
+    let wrong = |file: &str| {
+        let text = GOOD.replacen("title: \"one\"", &format!("recording: (file: \"{file}\")"), 1);
+        SceneFile::from_ron(&text, "my.ron").unwrap()
+    };
+    let file = wrong("no/such folder/out.rrd");
+    let told = file.check_files(ASSETS);
+    assert_eq!(told.len(), 1, "{told:?}");
+    assert_eq!((told[0].position, told[0].kind), (Some((2, 23)), SceneErrorKind::Open));
+    assert_eq!(told[0].message, "cannot record to no/such folder/out.rrd: there is no folder no/such folder");
+    #[cfg(feature = "rerun")]
+    assert_eq!(SceneFilePlugin::open(file).err(), Some(told[0].clone()));
+    // Not below any folder that could be missing, but a folder itself.
+    let folder = format!("pliant-scene-{}.rrd", std::process::id());
+    std::fs::create_dir(&folder).unwrap();
+    let told = wrong(&folder).check_files(ASSETS);
+    std::fs::remove_dir(&folder).unwrap();
+    assert!(told[0].message.ends_with(": it is a folder"), "{told:?}");
+    assert_eq!(wrong("out.rrd").check_files(ASSETS), []);
+    assert!(!std::path::Path::new("out.rrd").exists(), "a check makes no file");
+}
+
+#[test]
+fn missing_files_are_told_by_a_check_with_their_lines() {
+    assert_eq!(SceneFile::from_ron(GOOD, "my.ron").unwrap().check_files(ASSETS), []);
+    let text = GOOD.replacen("model: \"pip.modal\"", "model: \"pop.modal\"", 1).replacen(
+        "model: \"bud.modal\"",
+        "bake: (shape: \"jelly.obi\")",
+        1,
+    );
+    let told = SceneFile::from_ron(&text, "my.ron").unwrap().check_files(ASSETS);
+    let lines: Vec<String> =
+        told.iter().map(|error| error.to_string().lines().next().unwrap().to_owned()).collect();
+    assert_eq!(lines.len(), 2, "{lines:#?}");
+    assert!(
+        lines[0].starts_with("my.ron:4:30: the body `pip` cannot be loaded: there is no pop.modal in "),
+        "{}",
+        lines[0]
+    );
+    assert!(lines[0].ends_with("assets; did you mean `pip.modal`?"), "{}", lines[0]);
+    assert!(
+        lines[1].starts_with("my.ron:5:37: the body `bud` cannot be made: there is no jelly.obi in "),
+        "{}",
+        lines[1]
+    );
+    assert!(lines[1].ends_with("; did you mean `jelly.obj`?"), "{}", lines[1]);
+    assert!(told.iter().all(|error| error.kind == SceneErrorKind::Asset));
+    // One that is there and is none.
+    let text = GOOD.replacen("model: \"bud.modal\"", "model: \"../Cargo.toml\"", 1);
+    assert!(SceneFile::from_ron(&text, "my.ron").is_err());
+    let folder = std::env::temp_dir().join(format!("pliant-models-{}", std::process::id()));
+    std::fs::create_dir_all(&folder).unwrap();
+    std::fs::write(folder.join("pip.modal"), "nothing that was baked").unwrap();
+    std::fs::copy(format!("{ASSETS}/bud.modal"), folder.join("bud.modal")).unwrap();
+    let told = SceneFile::from_ron(GOOD, "my.ron").unwrap().check_files(&folder);
+    std::fs::remove_dir_all(&folder).unwrap();
+    assert_eq!((told.len(), told[0].position), (1, Some((4, 30))), "{told:?}");
+    // A vertex that the model does not have.
+    let text = GOOD.replacen("Toward((1, 0, 0))", "Vertex(4000000)", 1);
+    let told = SceneFile::from_ron(&text, "my.ron").unwrap().check_files(ASSETS);
+    assert_eq!((told.len(), told[0].position), (1, Some((8, 44))), "{told:?}");
+    assert!(
+        told[0].message.starts_with("the grab `left` cannot hold `pip`: expected a vertex"),
+        "{}",
+        told[0]
+    );
+}
+
+#[test]
+fn stiffness_and_the_basis_of_a_body_are_the_scene_s() {
+    let text =
+        GOOD.replacen("model: \"pip.modal\"", "model: \"pip.modal\", stiffness: 4, half_basis: true", 1);
+    let mut app = app();
+    app.add_plugins(SceneFilePlugin::open(SceneFile::from_ron(&text, "my.ron").unwrap()).unwrap());
+    run_until(&mut app, "the bodies", |world| world.query::<&BodyState>().iter(world).count() == 2);
+    let world = app.world_mut();
+    let bodies: Vec<(String, f64, bool, f64)> = world
+        .query::<(&Name, &ModalBody, &BodyState)>()
+        .iter(world)
+        .map(|(name, body, state)| {
+            let ratio = state.body().omega()[0] / state.model().omega()[0];
+            (name.to_string(), body.stiffness_scale, body.half_basis, ratio)
+        })
+        .collect();
+    let of = |name: &str| bodies.iter().find(|body| body.0 == name).unwrap();
+    assert_eq!((of("pip").1, of("pip").2), (4.0, true));
+    // Four times as stiff: twice the frequency.
+    assert!((of("pip").3 - 2.0).abs() < 1e-9, "{bodies:?}");
+    assert_eq!((of("bud").1, of("bud").2), (1.0, false));
+    let error = with("model: \"pip.modal\"", "model: \"pip.modal\", stiffness: 0");
+    assert_eq!(error.position, Some((4, 54)));
+    assert_eq!(error.message, "expected a factor of the stiffness from 0.000001 to 1000000, got 0");
+}
+
+#[cfg(feature = "rerun")]
+#[test]
+fn a_recording_s_rates_and_colour_are_the_scene_s() {
+    use pliant::rerun::{RerunColour, RerunRecording};
+    let folder = format!("pliant-recordings-{}", std::process::id());
+    std::fs::create_dir(&folder).unwrap();
+    let made = |fields: &str| {
+        let recording = format!("recording: (file: \"{folder}/out.rrd\"{fields})");
+        let text = GOOD.replacen("title: \"one\"", &recording, 1);
+        let mut app = app();
+        app.add_plugins(SceneFilePlugin::open(SceneFile::from_ron(&text, "my.ron").unwrap()).unwrap());
+        *app.world().resource::<RerunRecording>()
+    };
+    assert_eq!(made(""), RerunRecording::default());
+    let all = made(", shapes_hz: 5, figures_hz: 30, hands_hz: 0, modes_hz: 2.5, colour: Stress");
+    let expected = RerunRecording {
+        on: true,
+        shapes_hz: 5.0,
+        figures_hz: 30.0,
+        hands_hz: 0.0,
+        modes_hz: 2.5,
+        colour: RerunColour::Stress,
+    };
+    assert_eq!(all, expected);
+    std::fs::remove_dir_all(&folder).unwrap();
+    for (field, place) in [("modes_hz: NaN", 44), ("figures_hz: -1", 46), ("hands_hz: inf", 44)] {
+        let error = with("title: \"one\"", &format!("recording: (file: \"out.rrd\", {field})"));
+        assert_eq!(error.position, Some((2, place)), "{error}");
+        assert!(error.message.starts_with("expected Hz from 0 to "), "{error}");
+    }
+    let error = with("title: \"one\"", "recording: (file: \"out.rrd\", colour: Strain)");
+    assert!(error.message.starts_with("unknown value `Strain` in Colour; "), "{error}");
 }
 
 #[test]
@@ -501,9 +762,7 @@ fn the_project_s_scenes_are_right() {
     for entry in std::fs::read_dir(format!("{ASSETS}/scenes")).unwrap() {
         let path = entry.unwrap().path();
         let scene = SceneFile::read(&path).unwrap_or_else(|error| panic!("{error}"));
-        for model in scene.scene().bodies.iter().filter_map(|body| body.model.as_ref()) {
-            assert!(std::path::Path::new(ASSETS).join(model).exists(), "{model}");
-        }
+        assert_eq!(scene.check_files(ASSETS), []);
         assert_ne!(scene.scene().title, "", "{path:?}");
         count += 1;
     }

@@ -1,7 +1,7 @@
 //! Plays a scene file: bodies, hands, a session, a device and a recording, without a line of code.
 //!
 //! What to learn here: [`SceneFile::read`] reads and checks, [`SceneFilePlugin::open`] brings what the scene asks for; mistakes are told with line and
-//! column, before the window opens or, where a file is missing, as [`SceneFailed`].
+//! column, [`SceneFile::check_files`] tells those of the files that it names, all before the window opens; what shows only later comes as [`SceneFailed`].
 //!
 //! ```sh
 //! cargo run --release --example scene -- assets/scenes/everything.ron
@@ -12,7 +12,7 @@
 #[path = "../stage/mod.rs"]
 mod stage;
 
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 
 use bevy::{ecs::name::NameOrEntityItem, prelude::*};
 use clap::Parser;
@@ -31,7 +31,7 @@ struct Options {
     #[command(flatten)]
     stage: stage::Options,
 
-    /// Read the files, say what is wrong with them, and play none.
+    /// Read the files and those that they name, say what is wrong with them, and play none.
     #[arg(long)]
     check: bool,
 
@@ -51,20 +51,16 @@ fn main() -> AppExit {
         AppExit::from_code(2)
     };
     if options.check {
-        let wrong: Vec<SceneError> =
-            options.files.iter().filter_map(|file| SceneFile::read(file).err()).collect();
-        wrong.iter().for_each(|error| eprintln!("{error}"));
-        println!("{} of {} scenes are right", options.files.len() - wrong.len(), options.files.len());
-        return if wrong.is_empty() { AppExit::Success } else { AppExit::from_code(2) };
+        let right = options.files.iter().filter(|file| read(file).is_some()).count();
+        println!("{right} of {} scenes are right", options.files.len());
+        return if right == options.files.len() { AppExit::Success } else { AppExit::from_code(2) };
     }
-    let file = match options.files.as_slice() {
-        [file] => SceneFile::read(file),
-        files => {
-            eprintln!("scene: expected one file to play, got {}", files.len());
-            return AppExit::from_code(2);
-        }
+    let [file] = options.files.as_slice() else {
+        eprintln!("scene: expected one file to play, got {}", options.files.len());
+        return AppExit::from_code(2);
     };
-    let (file, scene) = match file.and_then(|file| Ok((file.clone(), SceneFilePlugin::open(file)?))) {
+    let Some(file) = read(file) else { return AppExit::from_code(2) };
+    let (file, scene) = match SceneFilePlugin::open(file.clone()).map(|scene| (file, scene)) {
         Ok(both) => both,
         Err(error) => return told(&error),
     };
@@ -86,6 +82,19 @@ fn main() -> AppExit {
         .insert_resource(Title(description.title.clone()))
         .add_systems(Update, (read_out, end_on_failure))
         .run()
+}
+
+/// The scene, if it and the files that it names are right; else says what is wrong with them.
+fn read(file: &Path) -> Option<SceneFile> {
+    let (scene, wrong) = match SceneFile::read(file) {
+        Ok(scene) => {
+            let wrong = scene.check_files(stage::ASSETS);
+            (Some(scene), wrong)
+        }
+        Err(error) => (None, vec![error]),
+    };
+    wrong.iter().for_each(|error| eprintln!("{error}"));
+    scene.filter(|_| wrong.is_empty())
 }
 
 /// The stage's camera goes round where the scene says.

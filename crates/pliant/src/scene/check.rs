@@ -217,6 +217,7 @@ fn settings(body: &BodyEntry, at: &dyn Fn(&'static str) -> [Step; 3]) -> Checked
         within(&at("modes"), "a number of modes", modes as f64, 1.0..=100_000.0)?;
     }
     within(&at("damping"), "a factor of the damping", body.damping, 0.0..=1000.0)?;
+    within(&at("stiffness"), "a factor of the stiffness", body.stiffness, 1e-6..=1e6)?;
     if let Some(relaxation) = body.relaxation {
         within(&inner("relaxation", "ratio"), "a part that relaxes", relaxation.ratio, 0.0..=0.999_999)?;
         above_zero(&inner("relaxation", "time"), "seconds", relaxation.time, LONGEST)?;
@@ -443,6 +444,10 @@ fn recording(scene: &SceneDescription) -> Checked {
     let Some(recording) = &scene.recording else { return Ok(()) };
     let at = |field| [Field("recording"), Field(field)];
     within(&at("shapes_hz"), "Hz", recording.shapes_hz, 0.0..=1000.0)?;
+    within(&at("modes_hz"), "Hz", recording.modes_hz, 0.0..=1000.0)?;
+    for (field, hz) in [("figures_hz", recording.figures_hz), ("hands_hz", recording.hands_hz)] {
+        hz.map_or(Ok(()), |hz| within(&at(field), "Hz", hz, 0.0..=1e6))?;
+    }
     let Some(file) = &recording.file else {
         if recording.viewer {
             return Ok(());

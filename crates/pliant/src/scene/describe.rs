@@ -94,6 +94,13 @@ pub struct BodyEntry {
     /// Multiplies the baked damping, 0 to 1000. Default: 1.
     #[serde(default = "one")]
     pub damping: f64,
+    /// Multiplies the baked stiffness, 1e-6 to 1e6: [`ModalBody::stiffness_scale`](crate::body::ModalBody::stiffness_scale). Default: 1.
+    #[serde(default = "one")]
+    pub stiffness: f64,
+    /// Where the processor writes the surface, from a basis in half precision: [`ModalBody::half_basis`](crate::body::ModalBody::half_basis).
+    /// Default: false.
+    #[serde(default)]
+    pub half_basis: bool,
     /// A material that relaxes. Default: `None`, elastic.
     #[serde(default)]
     pub relaxation: Option<RelaxationEntry>,
@@ -518,8 +525,35 @@ pub struct RecordingEntry {
     /// How often shapes are drawn, Hz, 0 to 1000. Default: 20.
     #[serde(default = "shapes_hz")]
     pub shapes_hz: f64,
+    /// How often figures are recorded, Hz, 0 to 1e6. Default: `None`, every tick.
+    #[serde(default)]
+    pub figures_hz: Option<f64>,
+    /// How often hands are drawn, with their reactions, Hz, 0 to 1e6. Default: `None`, every tick.
+    #[serde(default)]
+    pub hands_hz: Option<f64>,
+    /// How often the energies of the modes and the spectrum are drawn, Hz, 0 to 1000. Default: 4.
+    #[serde(default = "modes_hz")]
+    pub modes_hz: f64,
+    /// What the colour of a surface says. Default: `Displacement`.
+    #[serde(default)]
+    pub colour: ColourEntry,
 }
 
 fn shapes_hz() -> f64 {
     20.0
+}
+
+fn modes_hz() -> f64 {
+    4.0
+}
+
+/// What the colour of a recorded surface says.
+#[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Deserialize)]
+#[serde(rename = "Colour")]
+pub enum ColourEntry {
+    /// How far each point is from where it rests: the last colour at 0.3 of the body's size.
+    #[default]
+    Displacement,
+    /// Von Mises stress in the skin: the last colour at 0.2 of Young's modulus.
+    Stress,
 }

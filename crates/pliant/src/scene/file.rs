@@ -6,11 +6,11 @@ use bevy::{
     asset::{Asset, AssetLoader, AsyncReadExt, LoadContext, io::Reader},
     reflect::TypePath,
 };
-use ron::{error::SpannedError, extensions::Extensions};
+use ron::extensions::Extensions;
 
 use super::check::{self, Fault};
-use super::error::nearest;
 use super::locate::{Step, locate};
+use super::syntax::refused;
 use super::{MAX_BYTES, SceneDescription, SceneError, SceneErrorKind};
 
 /// A scene that was read and checked, as a Bevy asset.
@@ -127,51 +127,6 @@ impl SceneFile {
         }
         SceneError::at(&self.origin, &self.text, locate(&self.text, path), kind, message)
     }
-}
-
-/// What the parser refused, in words.
-fn refused(origin: &str, text: &str, error: &SpannedError) -> SceneError {
-    use ron::Error;
-    let inside =
-        |outer: &Option<String>| outer.as_ref().map_or(String::new(), |outer| format!(" in {outer}"));
-    let listed = |names: &[&str]| names.iter().map(|name| format!("`{name}`")).collect::<Vec<_>>().join(", ");
-    let wrong = |what: &str, found: &str, outer: &Option<String>, names: &'static [&'static str]| {
-        let shown: String = found.chars().take(80).collect();
-        let names_there = listed(names);
-        match nearest(found, names.iter().copied()) {
-            Some(near) => {
-                format!(
-                    "unknown {what} `{shown}`{}; did you mean `{near}`? There are {names_there}",
-                    inside(outer)
-                )
-            }
-            None => format!("unknown {what} `{shown}`{}; expected one of {names_there}", inside(outer)),
-        }
-    };
-    let (kind, message) = match &error.code {
-        Error::NoSuchStructField { expected, found, outer } => {
-            (SceneErrorKind::Field, wrong("field", found, outer, expected))
-        }
-        Error::NoSuchEnumVariant { expected, found, outer } => {
-            (SceneErrorKind::Field, wrong("value", found, outer, expected))
-        }
-        Error::MissingStructField { field, outer } => {
-            (SceneErrorKind::Field, format!("the field `{field}` is missing{}", inside(outer)))
-        }
-        Error::DuplicateStructField { field, outer } => {
-            (SceneErrorKind::Field, format!("the field `{field}` is there twice{}", inside(outer)))
-        }
-        Error::ExceededRecursionLimit => {
-            (SceneErrorKind::Syntax, "brackets are nested deeper than any scene's".to_owned())
-        }
-        _ if text.trim().is_empty() => {
-            (SceneErrorKind::Syntax, "the file is empty; expected a scene: `(bodies: [..])`".to_owned())
-        }
-        // Some repeat what they found, however long that is.
-        other => (SceneErrorKind::Syntax, other.to_string().chars().take(400).collect()),
-    };
-    let start = error.span.start;
-    SceneError::at_position(origin, text, (start.line, start.col), kind, message)
 }
 
 /// Loads scene files (`.ron`) as [`SceneFile`]s.

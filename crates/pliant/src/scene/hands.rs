@@ -36,18 +36,23 @@ pub(super) fn vertex_of(patch: &PatchEntry, model: &ModalModel) -> Result<u32, S
     let found = match patch {
         PatchEntry::Toward(way) => best(&|at| at.dot((*way).into())),
         PatchEntry::Near(point) => best(&|at| -at.distance_squared((*point).into())),
-        PatchEntry::Vertex(vertex) => Some(*vertex as usize).filter(|&vertex| vertex < positions.len()),
+        PatchEntry::Vertex(vertex) => return vertex_there(*vertex, positions.len()),
     };
     let found = found.and_then(|vertex| u32::try_from(vertex).ok());
-    found.ok_or_else(|| match patch {
-        PatchEntry::Vertex(vertex) => {
-            format!(
-                "expected a vertex of the surface, 0 to {}, got {vertex}",
-                positions.len().saturating_sub(1)
-            )
-        }
-        _ => "the body has no surface".into(),
-    })
+    found.ok_or_else(|| "the body has no surface".into())
+}
+
+/// A vertex by its number, where there are so many.
+pub(super) fn vertex_there(vertex: u32, count: usize) -> Result<u32, String> {
+    if (vertex as usize) < count {
+        return Ok(vertex);
+    }
+    Err(format!("expected a vertex of the surface, 0 to {}, got {vertex}", count.saturating_sub(1)))
+}
+
+/// What is said of a hand that cannot hold what it is to hold.
+pub(super) fn cannot_hold(grab: &GrabEntry, problem: &str) -> String {
+    format!("the grab `{}` cannot hold `{}`: {problem}", grab.name, grab.body)
 }
 
 /// A patch's radius where the scene gives none, as a part of the body's size.
@@ -116,8 +121,7 @@ pub(super) fn play(
                         hand.held = Some((from, t));
                     }
                     Err(problem) => {
-                        let message =
-                            format!("the grab `{}` cannot hold `{}`: {problem}", entry.name, entry.body);
+                        let message = cannot_hold(entry, &problem);
                         let path = [source.path.as_slice(), &[Field("patch")]].concat();
                         let error: SceneError = source.file.error(&path, SceneErrorKind::Asset, message);
                         let instance = part.0;

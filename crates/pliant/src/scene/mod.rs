@@ -33,17 +33,19 @@ mod file;
 mod hands;
 mod locate;
 mod motion;
+mod needs;
 #[cfg(feature = "net")]
 mod network;
 mod plugin;
 #[cfg(feature = "rerun")]
 mod recording;
 mod spawn;
+mod syntax;
 
 pub use describe::{
-    BakeEntry, BodyEntry, By, CopiesEntry, DeviceEntry, GrabEntry, Grip, GuestEntry, IntegratorEntry, Like,
-    Motion, NetworkEntry, PatchEntry, PlaceEntry, PointEntry, RecordingEntry, RelaxationEntry,
-    SceneDescription, TouchEntry, ViewEntry,
+    BakeEntry, BodyEntry, By, ColourEntry, CopiesEntry, DeviceEntry, GrabEntry, Grip, GuestEntry,
+    IntegratorEntry, Like, Motion, NetworkEntry, PatchEntry, PlaceEntry, PointEntry, RecordingEntry,
+    RelaxationEntry, SceneDescription, TouchEntry, ViewEntry,
 };
 pub use error::{SceneError, SceneErrorKind};
 pub use file::{SceneFile, SceneFileLoader};

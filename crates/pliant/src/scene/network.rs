@@ -120,7 +120,7 @@ pub(super) fn build(app: &mut App, opened: Opened, file: &SceneFile) {
             return;
         }
     };
-    app.insert_resource(seen).add_systems(Update, show);
+    app.insert_resource(seen).add_systems(Update, (lend, show));
 }
 
 /// The guest's app, on its own thread.
@@ -180,6 +180,9 @@ fn tell(seen: Res<Seen>, bodies: Query<(&Name, &ShownState, &BodyState, &Transfo
 pub(super) struct GuestsView {
     name: String,
     beside: DVec3,
+    settings: ModalBody,
+    /// Where a free one was shown last.
+    pose: Option<Pose>,
 }
 
 /// The guest's bodies, in the host's app.
@@ -187,10 +190,7 @@ pub(super) fn spawn_views(world: &mut World, instance: Entity, file: &SceneFile,
     let scene = file.scene();
     let Some(NetworkEntry::Host { guest: Some(guest), .. }) = &scene.network else { return };
     for body in scene.bodies.iter().filter(|body| body.shared.unwrap_or(true)) {
-        let Some(model) = &body.model else { continue };
         for copy in 0..body.count() {
-            let Some(assets) = world.get_resource::<AssetServer>() else { return };
-            let modal = ModalBody { model: assets.load(model.clone()), ..body.modal() };
             let mut transform = place.mul_transform(body.transform(copy)).compute_transform();
             let beside = place.affine().transform_vector3(DVec3::from(guest.beside).as_vec3());
             transform.translation += beside;
@@ -198,8 +198,7 @@ pub(super) fn spawn_views(world: &mut World, instance: Entity, file: &SceneFile,
             let view = world
                 .spawn((
                     Name::new(format!("{name} ({})", guest.name)),
-                    GuestsView { name, beside: beside.as_dvec3() },
-                    modal,
+                    GuestsView { name, beside: beside.as_dvec3(), settings: body.modal(), pose: None },
                     Driven::Remote,
                     NoPointerGrab,
                     transform,
@@ -223,12 +222,30 @@ pub(super) fn spawn_views(world: &mut World, instance: Entity, file: &SceneFile,
     }
 }
 
-fn show(seen: Res<Seen>, mut views: Query<(&GuestsView, &mut ShownState)>) {
+/// What the guest shows is of the host's model, loaded or baked, as soon as there is one.
+fn lend(
+    mut commands: Commands,
+    bodies: Query<(&Name, &PartOf, &ModalBody), (With<SceneBody>, Added<BodyState>)>,
+    views: Query<(Entity, &GuestsView, &PartOf), Without<ModalBody>>,
+) {
+    for (name, part, body) in &bodies {
+        for (entity, view, _) in views.iter().filter(|(_, view, of)| of.0 == part.0 && view.name == **name) {
+            commands.entity(entity).insert(ModalBody { model: body.model.clone(), ..view.settings.clone() });
+        }
+    }
+}
+
+fn show(seen: Res<Seen>, mut views: Query<(&mut GuestsView, &mut ShownState)>) {
     let seen = seen.0.lock().unwrap_or_else(PoisonError::into_inner);
-    for (view, mut shown) in &mut views {
+    for (mut view, mut shown) in &mut views {
         let Some((q, pose)) = seen.get(&view.name).filter(|(q, _)| q.len() == shown.q().len()) else {
             continue;
         };
+        // One that rests is not drawn, uploaded and recorded anew.
+        if shown.current() == q.as_slice() && view.pose == *pose {
+            continue;
+        }
+        view.pose = *pose;
         let written = match pose {
             None => shown.snap(q),
             Some(pose) => shown.push_at(q, Pose { origin: pose.origin + view.beside, ..*pose }),

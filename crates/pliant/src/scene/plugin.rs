@@ -10,7 +10,8 @@ use bevy::{
     prelude::*,
 };
 
-use super::locate::Step::{Field, Item};
+use super::locate::Step::Field;
+use super::needs::compiled;
 use super::{
     SceneError, SceneErrorKind, SceneFailed, SceneFile, SceneFileLoader, SceneInstance, hands, spawn,
 };
@@ -18,8 +19,10 @@ use crate::body::PliantSystems;
 
 /// Scene files as assets; add it after [`PliantPlugins`](crate::PliantPlugins).
 ///
-/// By `default()` it only makes what a [`SceneInstance`] asks for: bodies, hands, and tools where the app has a `HapticsPlugin`. A scene that is
-/// [opened](Self::open) is there from the start, with the session, the device and the recording that it asks for.
+/// By `default()` it only makes what a [`SceneInstance`] asks for: bodies and hands; baked bodies where the app has a `BakePlugin`, tools where it has a
+/// `HapticsPlugin`. A `network` and a `recording` are not opened then, which the message [`SceneFailed`] says, and the rest of the scene is there: an app
+/// has one session and one recording, from when it is built. Where the game has its own, the scene's bodies are in them, those that are `shared` in the
+/// session. A scene that is [opened](Self::open) is there from the start, with the session, the device and the recording that it asks for.
 ///
 /// ```no_run
 /// use bevy::prelude::*;
@@ -81,9 +84,16 @@ impl SceneFilePlugin {
     ///
     /// # Errors
     /// [`SceneErrorKind::Feature`] when the program was compiled without what the scene asks for, [`SceneErrorKind::Open`] when the session's
-    /// socket cannot be opened.
+    /// socket or the recording's file cannot be opened. The other files that it names are read with the app ([`SceneFailed`]);
+    /// [`SceneFile::check_files`] reads them before.
     pub fn open(file: SceneFile) -> Result<Self, SceneError> {
-        compiled(&file)?;
+        if let Some(lacking) = file.lacking(compiled).into_iter().next() {
+            return Err(lacking);
+        }
+        // Before the session: nobody is invited to a scene that is not played.
+        if let Some(error) = file.recording_writable(true) {
+            return Err(error);
+        }
         #[cfg(feature = "net")]
         let opened =
             file.scene().network.as_ref().map(|entry| super::network::open(&file, entry)).transpose()?;
@@ -126,7 +136,10 @@ impl Plugin for SceneFilePlugin {
             .init_asset::<SceneFile>()
             .init_asset_loader::<SceneFileLoader>()
             .add_message::<SceneFailed>()
-            .add_systems(PostUpdate, (spawn::watch, spawn::make).chain().after(TransformSystems::Propagate))
+            .add_systems(
+                PostUpdate,
+                (spawn::watch, spawn::watch_settings, spawn::make).chain().after(TransformSystems::Propagate),
+            )
             .add_systems(self.schedule, (spawn::begin, hands::play).chain().before(PliantSystems::Input));
         #[cfg(feature = "bake")]
         app.add_systems(PostUpdate, spawn::watch_bakes);
@@ -153,19 +166,44 @@ impl Plugin for SceneFilePlugin {
             if scene.device.is_some() && !app.is_plugin_added::<crate::haptics::HapticsPlugin>() {
                 app.add_plugins(crate::haptics::HapticsPlugin::new(self.schedule));
             }
-            #[cfg(feature = "rerun")]
-            if let Some(recording) = &scene.recording
-                && !app.is_plugin_added::<crate::rerun::RerunPlugin>()
-            {
-                app.add_plugins(recording.plugin(&scene.title).in_schedule(self.schedule));
-            }
         }
+        #[cfg(feature = "rerun")]
+        let unrecorded = self.record(app, file);
+        #[cfg(not(feature = "rerun"))]
+        let unrecorded: Option<SceneError> = None;
         self.build_devices(app);
         let (file, role) = (file.clone(), self.role);
         let spawn = move |mut commands: Commands, mut files: ResMut<Assets<SceneFile>>| {
-            commands.spawn((SceneInstance(files.add(file.clone())), role, Name::new("scene")));
+            let instance = SceneInstance(files.add(file.clone()));
+            let instance = commands.spawn((instance, role, Name::new("scene"))).id();
+            if let Some(error) = unrecorded.clone() {
+                commands.queue(move |world: &mut World| spawn::fail(world, instance, error));
+            }
         };
         app.add_systems(Startup, spawn);
+    }
+}
+
+#[cfg(feature = "rerun")]
+impl SceneFilePlugin {
+    /// Adds the recording that the scene asks for; returns what keeps it from being made.
+    fn record(&self, app: &mut App, file: &SceneFile) -> Option<SceneError> {
+        use crate::rerun::{RerunPlugin, RerunRecording};
+        let scene = file.scene();
+        let recording = scene.recording.as_ref().filter(|_| self.role == Role::Opened)?;
+        let failed = |kind, message: &str| Some(file.error(&[Field("recording")], kind, message.into()));
+        if app.is_plugin_added::<RerunPlugin>() {
+            return failed(
+                SceneErrorKind::Feature,
+                "this scene asks for a recording, and this app makes one already; the bodies are in that one",
+            );
+        }
+        app.add_plugins(recording.plugin(&scene.title).in_schedule(self.schedule));
+        // There while something records.
+        if app.world().contains_resource::<RerunRecording>() {
+            return None;
+        }
+        failed(SceneErrorKind::Open, "the recording cannot be started; the line above says why")
     }
 }
 
@@ -181,35 +219,4 @@ impl SceneFilePlugin {
 
     #[cfg(not(feature = "haptics"))]
     fn build_devices(&self, _: &mut App) {}
-}
-
-/// Refuses a scene that asks for what this program does not have.
-fn compiled(file: &SceneFile) -> Result<(), SceneError> {
-    let scene = file.scene();
-    if cfg!(not(feature = "net")) && scene.network.is_some() {
-        return without(file, &[Field("network")], "a network", "net");
-    }
-    if cfg!(not(feature = "haptics")) && scene.device.is_some() {
-        return without(file, &[Field("device")], "a device", "haptics");
-    }
-    if cfg!(not(feature = "rerun")) && scene.recording.is_some() {
-        return without(file, &[Field("recording")], "a recording", "rerun");
-    }
-    let bakes = scene.bodies.iter().position(|body| body.bake.is_some());
-    match bakes.filter(|_| cfg!(not(feature = "bake"))) {
-        Some(body) => without(file, &[Field("bodies"), Item(body), Field("bake")], "a bake", "bake"),
-        None => Ok(()),
-    }
-}
-
-pub(super) fn without(
-    file: &SceneFile,
-    path: &[super::locate::Step],
-    what: &str,
-    feature: &str,
-) -> Result<(), SceneError> {
-    let message = format!(
-        "this scene asks for {what}, this program was compiled without `{feature}` (a feature of `pliant`)"
-    );
-    Err(file.error(path, SceneErrorKind::Feature, message))
 }

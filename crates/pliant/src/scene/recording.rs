@@ -1,7 +1,7 @@
 //! The recording that a scene asks for.
 
-use super::RecordingEntry;
-use crate::rerun::RerunPlugin;
+use super::{ColourEntry, RecordingEntry};
+use crate::rerun::{RerunColour, RerunPlugin, RerunRecording};
 
 impl RecordingEntry {
     /// The plugin, not yet in an app.
@@ -13,6 +13,21 @@ impl RecordingEntry {
             (None, false) => RerunPlugin::none(),
         };
         let name = if title.trim().is_empty() { "pliant scene" } else { title };
-        plugin.with_application(name).with_shapes_hz(self.shapes_hz)
+        plugin.with_application(name).with_rates(self.rates())
+    }
+
+    /// How often what is recorded.
+    fn rates(&self) -> RerunRecording {
+        RerunRecording {
+            on: true,
+            shapes_hz: self.shapes_hz,
+            figures_hz: self.figures_hz.unwrap_or(f64::INFINITY),
+            hands_hz: self.hands_hz.unwrap_or(f64::INFINITY),
+            modes_hz: self.modes_hz,
+            colour: match self.colour {
+                ColourEntry::Displacement => RerunColour::Displacement,
+                ColourEntry::Stress => RerunColour::Stress,
+            },
+        }
     }
 }

@@ -3,13 +3,14 @@
 use bevy::{asset::AssetLoadFailedEvent, math::DVec3, prelude::*};
 
 use super::locate::Step::{self, Field, Item};
+use super::needs::compiled;
 #[cfg(feature = "bake")]
 use super::plugin::AssetRoot;
 use super::plugin::Role;
 use super::{
     BodyEntry, By, IntegratorEntry, NetworkEntry, PlaceEntry, SceneError, SceneErrorKind, SceneFile,
 };
-use crate::body::{BodyState, Integration, ModalAsset, ModalBody, NoPointerGrab, Viscoelastic};
+use crate::body::{BodyRefused, BodyState, Integration, ModalAsset, ModalBody, NoPointerGrab, Viscoelastic};
 
 /// A scene in the world: spawn it, and the scene's bodies, hands and tools come as soon as the file is loaded, where this entity is. They are
 /// its [`SceneParts`] and go with it. When the file changes (Bevy's `file_watcher`), all of them are made anew.
@@ -62,7 +63,8 @@ pub struct SceneBody {
     pub entry: usize,
 }
 
-/// Sent, and logged, when a scene cannot be read, or something that it names is not there. What else is in it goes on.
+/// Sent, and logged, when a scene cannot be read, something that it names is not there, or the app lacks what it asks for. What else is in it goes on: the
+/// other bodies, and the hands on them.
 #[derive(Message, Debug, Clone)]
 pub struct SceneFailed {
     /// The entity of the [`SceneInstance`].
@@ -86,6 +88,10 @@ struct Kept(Handle<ModalAsset>);
 /// The file that an instance was made from.
 #[derive(Component)]
 pub(super) struct Made;
+
+/// A body that does not come; nobody waits for it.
+#[derive(Component)]
+pub(super) struct Lost;
 
 pub(super) fn fail(world: &mut World, instance: Entity, error: SceneError) {
     error!("{error}");
@@ -119,7 +125,7 @@ pub(super) fn watch(
     mut scenes: MessageReader<AssetLoadFailedEvent<SceneFile>>,
     mut models: MessageReader<AssetLoadFailedEvent<ModalAsset>>,
     instances: Query<(Entity, &SceneInstance)>,
-    bodies: Query<(&PartOf, &SceneBody, &ModalBody, &Source)>,
+    bodies: Query<(Entity, &PartOf, &SceneBody, &ModalBody, &Source)>,
 ) {
     for failed in scenes.read() {
         for (instance, _) in instances.iter().filter(|(_, handle)| handle.0.id() == failed.id) {
@@ -139,7 +145,10 @@ pub(super) fn watch(
     }
     for failed in models.read() {
         let mut told = Vec::new();
-        for (part, body, _, source) in bodies.iter().filter(|(.., body, _)| body.model.id() == failed.id) {
+        for (entity, part, body, _, source) in
+            bodies.iter().filter(|(.., body, _)| body.model.id() == failed.id)
+        {
+            commands.entity(entity).try_insert(Lost);
             // Once for all copies.
             if told.contains(&(part.0, body.entry)) {
                 continue;
@@ -158,6 +167,22 @@ pub(super) fn watch(
     }
 }
 
+/// Bodies whose settings are refused.
+pub(super) fn watch_settings(
+    mut commands: Commands,
+    mut refused: MessageReader<BodyRefused>,
+    bodies: Query<(&PartOf, &Name, &Source), (With<SceneBody>, Without<BodyState>)>,
+) {
+    for refused in refused.read() {
+        let Ok((part, name, source)) = bodies.get(refused.entity) else { continue };
+        let message = format!("the body `{name}` cannot be made: {}", refused.error);
+        let error = source.file.error(&source.path, SceneErrorKind::Value, message);
+        let instance = part.0;
+        commands.entity(refused.entity).try_insert(Lost);
+        commands.queue(move |world: &mut World| fail(world, instance, error));
+    }
+}
+
 /// Bodies that cannot be baked.
 #[cfg(feature = "bake")]
 pub(super) fn watch_bakes(
@@ -171,18 +196,21 @@ pub(super) fn watch_bakes(
         let path = [source.path.as_slice(), &[Field("bake"), Field("shape")]].concat();
         let error = source.file.error(&path, SceneErrorKind::Asset, message);
         let instance = part.0;
+        commands.entity(failed.entity).try_insert(Lost);
         commands.queue(move |world: &mut World| fail(world, instance, error));
     }
 }
 
-/// The scripts' time begins when everybody is there.
+/// The scripts' time begins when everybody is there who comes.
 pub(super) fn begin(
     time: Res<Time>,
     mut instances: Query<(&mut SceneClock, &SceneParts), With<Made>>,
-    bodies: Query<Has<BodyState>, With<SceneBody>>,
+    bodies: Query<AnyOf<(&BodyState, &Lost)>, With<SceneBody>>,
+    all: Query<(), With<SceneBody>>,
 ) {
     for (mut clock, parts) in &mut instances {
-        if clock.began.is_none() && parts.entities().iter().all(|part| bodies.get(*part).unwrap_or(true)) {
+        let there = |part: &Entity| bodies.contains(*part) || !all.contains(*part);
+        if clock.began.is_none() && parts.entities().iter().all(there) {
             clock.began = Some(time.elapsed_secs_f64());
         }
     }
@@ -196,16 +224,19 @@ fn build(world: &mut World, instance: Entity, file: &SceneFile) {
     let place = entity.get::<GlobalTransform>().copied().unwrap_or_default();
     let role = entity.get::<Role>().copied().unwrap_or_default();
     let scene = file.scene();
-    if role == Role::Asset && (scene.network.is_some() || scene.recording.is_some()) {
-        let (field, what) =
-            if scene.network.is_some() { ("network", "a network") } else { ("recording", "a recording") };
-        let message = format!(
-            "this scene asks for {what}, which an app gets when it is built; expected it to be given to `SceneFilePlugin::open`"
-        );
-        let error = file.error(&[Field(field)], SceneErrorKind::Feature, message);
-        return fail(world, instance, error);
+    // What a game that loads the scene as it goes does not get; an app that was built for it has it, or was refused.
+    if role == Role::Asset {
+        for error in not_in_a_game(file) {
+            fail(world, instance, error);
+        }
     }
     for (entry, body) in scene.bodies.iter().enumerate() {
+        if let Err(unmade) = can_be_made(world, file, role, (entry, body)) {
+            if let Some(error) = unmade {
+                fail(world, instance, error);
+            }
+            continue;
+        }
         for copy in 0..body.count() {
             spawn_body(world, instance, file, place, role, (entry, body), copy);
         }
@@ -219,22 +250,76 @@ fn build(world: &mut World, instance: Entity, file: &SceneFile) {
             PartOf(instance),
         ));
     }
-    if let Some(device) = scene.device.as_ref().filter(|_| role != Role::Guest) {
-        #[cfg(feature = "haptics")]
-        let added = super::device::add(world, instance, file, device);
-        #[cfg(not(feature = "haptics"))]
-        let added = {
-            let _ = device;
-            super::plugin::without(file, &[Field("device")], "a device", "haptics")
-        };
-        if let Err(error) = added {
-            fail(world, instance, error);
-        }
+    #[cfg(feature = "haptics")]
+    if let Some(device) = scene.device.as_ref().filter(|_| role != Role::Guest)
+        && let Err(error) = super::device::add(world, instance, file, device)
+    {
+        fail(world, instance, error);
     }
     #[cfg(feature = "net")]
     if role == Role::Opened {
         super::network::spawn_views(world, instance, file, place);
     }
+}
+
+/// What the scene asks for and only an app that was built for it has.
+fn not_in_a_game(file: &SceneFile) -> Vec<SceneError> {
+    let scene = file.scene();
+    let mut errors = file.lacking(compiled);
+    let asked = [
+        ("network", "a network", scene.network.is_some() && compiled("net")),
+        ("recording", "a recording", scene.recording.is_some() && compiled("rerun")),
+    ];
+    for (field, what, _) in asked.into_iter().filter(|(.., asked)| *asked) {
+        let message = format!(
+            "this scene asks for {what}, which an app gets when it is built (`SceneFilePlugin::open`); the scene goes on without it"
+        );
+        errors.push(file.error(&[Field(field)], SceneErrorKind::Feature, message));
+    }
+    errors
+}
+
+/// Whether a body of a scene is the host's: what a guest has comes from there.
+fn is_hosts(world: &World, file: &SceneFile, role: Role, body: &BodyEntry) -> bool {
+    let scene = file.scene();
+    let shared = body.shared.unwrap_or(scene.network.is_some());
+    let joins = shared && matches!(scene.network, Some(NetworkEntry::Join { .. }));
+    match role {
+        Role::Guest => true,
+        Role::Opened => joins,
+        // In the session of the game, if it is a guest in one.
+        #[cfg(feature = "net")]
+        Role::Asset => joins && world.contains_resource::<crate::net::NetGuest>(),
+        #[cfg(not(feature = "net"))]
+        Role::Asset => {
+            let _ = world;
+            false
+        }
+    }
+}
+
+/// Refuses a body that would never come, with what is to be said about it if nobody has said it yet.
+fn can_be_made(
+    world: &World,
+    file: &SceneFile,
+    role: Role,
+    (entry, body): (usize, &BodyEntry),
+) -> Result<(), Option<SceneError>> {
+    if is_hosts(world, file, role, body) || body.model.is_some() {
+        return Ok(());
+    }
+    // It would have come from a host; that there is none has been said.
+    if body.bake.is_none() {
+        return Err(None);
+    }
+    #[cfg(feature = "bake")]
+    if !world.contains_resource::<Messages<crate::body::BakeFailed>>() {
+        let message = format!("the body `{}` is to be baked, and this app has no `BakePlugin`", body.name);
+        let path = [Field("bodies"), Item(entry), Field("bake")];
+        return Err(Some(file.error(&path, SceneErrorKind::Feature, message)));
+    }
+    let _ = entry;
+    if compiled("bake") { Ok(()) } else { Err(None) }
 }
 
 fn spawn_body(
@@ -248,8 +333,7 @@ fn spawn_body(
 ) {
     let scene = file.scene();
     let shared = body.shared.unwrap_or(scene.network.is_some());
-    // What a guest has comes from its host.
-    let guest = role == Role::Guest || (shared && matches!(scene.network, Some(NetworkEntry::Join { .. })));
+    let guest = is_hosts(world, file, role, body);
     if role == Role::Guest && !shared {
         return;
     }
@@ -353,6 +437,8 @@ impl BodyEntry {
             modes: self.modes,
             warp: self.warp,
             damping_scale: self.damping,
+            stiffness_scale: self.stiffness,
+            half_basis: self.half_basis,
             relaxation: self.relaxation.map(|entry| Viscoelastic { ratio: entry.ratio, time: entry.time }),
             corrections: self.corrections.unwrap_or(defaults.corrections),
             gravity: self.gravity.into(),
