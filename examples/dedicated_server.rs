@@ -90,7 +90,7 @@ fn run(options: &Options) -> Result<(), Box<dyn Error>> {
     let mut app = session::headless(Level::INFO);
     app.add_plugins((PliantBodyPlugin::default(), net))
         .insert_resource(Time::<Fixed>::from_hz(options.hz))
-        .insert_resource(session::EndAfter(options.seconds))
+        .insert_resource(session::EndAfter { seconds: options.seconds, frames: None })
         .init_resource::<Log>()
         .add_systems(First, begin_frame)
         .add_systems(FixedUpdate, session::play.before(PliantSystems::Input))

@@ -15,6 +15,10 @@ mod session;
 #[cfg(feature = "window")]
 #[path = "../stage/mod.rs"]
 mod stage;
+// Without a window only its command line is left.
+#[cfg(not(feature = "window"))]
+#[path = "../stage/options.rs"]
+mod stage;
 #[cfg(feature = "window")]
 mod window;
 
@@ -34,7 +38,12 @@ use pliant::stream::emulator::Preset;
 
 /// Joins a session.
 #[derive(Parser, Debug)]
+#[command(mut_arg("headless", |headless| headless.help("No window: a hand moves by itself, a line a second says how it goes")))]
+#[command(mut_arg("seconds", |seconds| seconds.help("End after so many seconds. Default: when the session ends, or the window is closed")))]
 pub struct Options {
+    #[command(flatten)]
+    stage: stage::Options,
+
     /// What the host has printed.
     #[arg(required_unless_present_any = ["replay", "compare"])]
     invite: Option<Invite>,
@@ -87,18 +96,6 @@ pub struct Options {
     #[arg(long, num_args = 2, value_names = ["HOST", "GUEST"])]
     compare: Vec<PathBuf>,
 
-    /// No window: a hand moves by itself, a line a second says how it goes.
-    #[arg(long)]
-    headless: bool,
-
-    /// End after so many seconds.
-    #[arg(long)]
-    seconds: Option<f64>,
-
-    /// Save a picture of the window after four seconds and stop.
-    #[arg(long, value_name = "FILE.png")]
-    screenshot: Option<PathBuf>,
-
     /// So many guests without an app, for load.
     #[arg(long)]
     bots: Option<usize>,
@@ -113,7 +110,7 @@ pub struct Options {
 }
 
 fn main() -> ExitCode {
-    match run(&Options::parse()) {
+    match run(Options::parse()) {
         Ok(()) => ExitCode::SUCCESS,
         Err(error) => {
             eprintln!("join: {error}");
@@ -122,7 +119,12 @@ fn main() -> ExitCode {
     }
 }
 
-fn run(options: &Options) -> Result<(), Box<dyn Error>> {
+fn run(mut options: Options) -> Result<(), Box<dyn Error>> {
+    options.stage.headless |= cfg!(not(feature = "window"));
+    if options.bots.is_none() && options.compare.is_empty() {
+        options.stage.settle()?;
+    }
+    let options = &options;
     let shipped = || session::model(&options.body);
     if let [host, guest] = options.compare.as_slice() {
         // The first five seconds are for finding the clock and taking hold.
@@ -130,7 +132,8 @@ fn run(options: &Options) -> Result<(), Box<dyn Error>> {
     }
     let emulation = session::emulation(options.network, options.seed);
     if let (Some(number), Some(invite)) = (options.bots, &options.invite) {
-        let (holders, light, seconds) = (options.holders, options.light, options.seconds.unwrap_or(10.0));
+        let (holders, light, seconds) =
+            (options.holders, options.light, options.stage.seconds.unwrap_or(10.0));
         let (cached, stopped) = (options.cached, session::stopped());
         let bots = bots::Bots { number, holders, light, cached, seconds, emulation, stopped };
         return bots::run(invite, &shipped()?, &bots);
@@ -145,8 +148,9 @@ fn run(options: &Options) -> Result<(), Box<dyn Error>> {
         },
         modes: options.modes,
         // For a picture the camera is off until just before it, and would see nothing.
-        interest: Some(CameraInterest::default())
-            .filter(|_| cfg!(feature = "window") && !options.headless && options.screenshot.is_none()),
+        interest: Some(CameraInterest::default()).filter(|_| {
+            cfg!(feature = "window") && !options.stage.headless && options.stage.screenshot.is_none()
+        }),
         models: if options.cached { vec![shipped()?] } else { Vec::new() },
         record: options.record.clone(),
         ..default()
@@ -157,7 +161,7 @@ fn run(options: &Options) -> Result<(), Box<dyn Error>> {
         (None, None) => return Err("an invite is needed".into()),
     };
     #[cfg(feature = "window")]
-    if !options.headless {
+    if !options.stage.headless {
         return window::run(options, net);
     }
     let mut app = session::headless(Level::WARN);
@@ -172,10 +176,10 @@ fn finish(app: &mut App, options: &Options) -> Result<(), Box<dyn Error>> {
         app.insert_resource(session::trace::Trace::create(file)?)
             .add_systems(Last, session::trace::write_shown);
     }
-    app.insert_resource(session::EndAfter(options.seconds))
+    app.insert_resource(session::EndAfter { seconds: options.stage.seconds, frames: options.stage.frames })
         .add_systems(Last, session::end)
         .add_systems(Update, tell);
-    if options.headless && !options.still && options.replay.is_none() {
+    if options.stage.headless && !options.still && options.replay.is_none() {
         let number = options.seed;
         let script = move |mut commands: Commands, bodies: Query<Entity, Added<RemoteBody>>| {
             for body in &bodies {
@@ -195,8 +199,7 @@ fn tell(
     mut closed: MessageReader<SessionClosed>,
     mut exit: MessageWriter<AppExit>,
     guest: Res<NetGuest>,
-    arrived: Query<&Name, Added<RemoteBody>>,
-    shown: Query<(), Added<ShownState>>,
+    shown: Query<&Name, (With<RemoteBody>, Added<ShownState>)>,
 ) {
     let now = time.elapsed_secs_f64();
     for joined in joined.read() {
@@ -205,11 +208,8 @@ fn tell(
     for lost in lost.read() {
         println!("{now:6.2} s  the host cannot be heard: {}", lost.reason);
     }
-    if !shown.is_empty() {
-        println!(
-            "{now:6.2} s  a body is here {}",
-            arrived.iter().map(Name::as_str).collect::<Vec<_>>().join(", ")
-        );
+    for body in &shown {
+        println!("{now:6.2} s  a body is here: {body}");
     }
     for closed in closed.read() {
         println!("{now:6.2} s  over: {}", closed.reason);

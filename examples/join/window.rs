@@ -9,23 +9,19 @@ use pliant::prelude::*;
 use crate::{Options, finish, stage};
 
 pub fn run(options: &Options, net: NetPlugin) -> Result<(), Box<dyn Error>> {
-    let stage = stage::Options {
-        headless: false,
-        frames: None,
-        seconds: options.seconds,
-        screenshot: options.screenshot.clone(),
-        ..default()
-    };
     let mut app = App::new();
     app.add_plugins(
-        stage::Stage::with("join", stage).real_time().picture_at(4.0).key("left mouse: pull the body"),
+        stage::Stage::with("join", options.stage.clone())
+            .real_time()
+            .picture_at(4.0)
+            .key("left mouse: pull the body"),
     )
     .add_plugins((PliantPlugins::default(), net))
     .insert_resource(bevy::winit::WinitSettings::continuous())
     .add_systems(Update, (dress, draw_hands, read_out));
     finish(&mut app, options)?;
     // The stage ends the run, after the picture if one is taken.
-    app.insert_resource(crate::session::EndAfter(None));
+    app.insert_resource(crate::session::EndAfter::default());
     crate::session::ended(&app.run())
 }
 

@@ -215,13 +215,26 @@ pub fn say(
     );
 }
 
-/// Ends the app after so many seconds, if a number is given.
-#[derive(Resource, Clone, Copy, Debug)]
-pub struct EndAfter(pub Option<f64>);
+/// When the app ends by itself.
+#[derive(Resource, Clone, Copy, Debug, Default)]
+pub struct EndAfter {
+    /// From its start, s.
+    pub seconds: Option<f64>,
+    /// From when a body is there.
+    pub frames: Option<u64>,
+}
 
 /// Ends the app when its time is over.
-pub fn end(time: Res<Time<Real>>, after: Res<EndAfter>, mut exit: MessageWriter<AppExit>) {
-    if after.0.is_some_and(|after| time.elapsed_secs_f64() >= after) {
+pub fn end(
+    time: Res<Time<Real>>,
+    mut after: ResMut<EndAfter>,
+    bodies: Query<(), With<BodyState>>,
+    mut exit: MessageWriter<AppExit>,
+) {
+    if let Some(frames) = after.frames.as_mut().filter(|_| !bodies.is_empty()) {
+        *frames = frames.saturating_sub(1);
+    }
+    if after.frames == Some(0) || after.seconds.is_some_and(|after| time.elapsed_secs_f64() >= after) {
         exit.write(AppExit::Success);
     }
 }

@@ -15,7 +15,7 @@ use bevy::{
     math::DVec3,
     prelude::*,
     render::view::screenshot::{Screenshot, ScreenshotCaptured, save_to_disk},
-    window::{PresentMode, WindowResolution},
+    window::PresentMode,
     winit::WinitSettings,
 };
 use pliant::{
@@ -44,9 +44,8 @@ pub struct Guest {
     pub rerun: Option<RerunPlugin>,
     /// Seconds from the first picture of the body on; `None`: until told to stop, or the window is closed.
     pub duration: Option<f64>,
-    pub screenshot: Option<PathBuf>,
-    /// The live panel is open from the start.
-    pub panel: bool,
+    /// Frames, picture, window and panel.
+    pub stage: stage::Options,
     pub stop: Arc<AtomicBool>,
 }
 
@@ -79,10 +78,14 @@ pub struct Figures {
 #[derive(Resource)]
 struct Run {
     duration: Option<f64>,
+    /// Frames that are still to come, counted while the body is here.
+    frames: Option<u64>,
     screenshot: Option<PathBuf>,
     stop: Arc<AtomicBool>,
     /// When the body was first here, s.
     since: Option<f64>,
+    /// When the picture was asked for, s.
+    asked: f64,
     picture: Picture,
     failure: Option<String>,
 }
@@ -106,7 +109,7 @@ pub fn run_windowed(guest: Guest) -> GuestReport {
             .set(WindowPlugin {
                 primary_window: Some(Window {
                     title: "Pliant: shared body".into(),
-                    resolution: WindowResolution::new(1280, 720),
+                    resolution: stage::resolution(&guest.stage),
                     present_mode: PresentMode::AutoVsync,
                     ..default()
                 }),
@@ -119,7 +122,7 @@ pub fn run_windowed(guest: Guest) -> GuestReport {
     .add_plugins((
         PointerGrabPlugin,
         ViewPlugin { title: guest.title.clone() },
-        PanelPlugin { open: guest.panel, ..default() },
+        PanelPlugin { open: guest.stage.panel, ..default() },
     ));
     run(app, guest)
 }
@@ -146,9 +149,11 @@ fn run(mut app: App, guest: Guest) -> GuestReport {
         .init_resource::<Figures>()
         .insert_resource(Run {
             duration: guest.duration,
-            screenshot: guest.screenshot,
+            frames: guest.stage.frames,
+            screenshot: guest.stage.screenshot,
             stop: guest.stop,
             since: None,
+            asked: 0.0,
             picture: Picture::Wanted,
             failure: None,
         })
@@ -277,9 +282,12 @@ fn finish(
         run.failure.get_or_insert_with(|| format!("no body within {PATIENCE} s"));
     }
     let shown_for = run.since.map_or(0.0, |since| now - since);
-    let over = run.duration.is_some_and(|duration| shown_for >= duration);
+    if run.since.is_some() {
+        run.frames = run.frames.map(|frames| frames.saturating_sub(1));
+    }
+    let over = run.duration.is_some_and(|duration| shown_for >= duration) || run.frames == Some(0);
     let mut done = over;
-    if let (Some(path), Some(duration)) = (run.screenshot.clone(), run.duration) {
+    if let Some(path) = run.screenshot.clone() {
         match run.picture {
             Picture::Wanted if over => {
                 commands
@@ -287,13 +295,14 @@ fn finish(
                     .observe(save_to_disk(path))
                     .observe(|_: On<ScreenshotCaptured>, mut run: ResMut<Run>| run.picture = Picture::Saved);
                 run.picture = Picture::Asked;
+                run.asked = now;
                 done = false;
             }
             Picture::Wanted => {}
             Picture::Asked => done = false,
             Picture::Saved => done = true,
         }
-        if run.picture != Picture::Saved && shown_for > duration + PICTURE {
+        if run.picture == Picture::Asked && now > run.asked + PICTURE {
             run.failure.get_or_insert_with(|| "the window could not be pictured".into());
         }
     }

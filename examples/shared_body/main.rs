@@ -1,7 +1,7 @@
 //! Two people hold one soft body over a network that loses packets.
 //!
 //! One process, three apps on three threads: a host that steps the body, you, and a scripted second user. They are joined by real QUIC on
-//! loopback; between each guest and the host lies one of the paper's networks (`--network 1..4`), emulated packet by packet.
+//! loopback; between each guest and the host lies one of the paper's networks (`--network 1` to `4`, or another by its name), emulated packet by packet.
 //!
 //! What to learn here: how a body is shared (`host.rs`, ten lines), how a guest sees and holds it (`guest.rs`), and what loss does to what you see
 //! and feel: the blue ghost is the host's newest truth.
@@ -40,7 +40,7 @@ use pliant::{
     modal::ModalModel,
     net::{Emulation, HostConfig, Invite, JoinConfig, JoinOptions, NetPlugin},
     rerun::RerunPlugin,
-    stream::{RecoveryConfig, emulator::Preset},
+    stream::RecoveryConfig,
 };
 
 use guest::{Guest, GuestReport};
@@ -67,13 +67,7 @@ fn main() -> ExitCode {
 
 fn run(options: &Options) -> Result<(), Box<dyn Error>> {
     let mut options = options.clone();
-    if !options.headless && !stage::display() {
-        println!("No display is to be found: running --headless, with a scripted hand in your place.");
-        options.headless = true;
-    }
-    if options.headless && options.screenshot.is_some() {
-        return Err("a screenshot needs a window, and there is none without a display".into());
-    }
+    options.stage.settle()?;
     let path = Path::new(stage::ASSETS).join(&options.body);
     let model = Arc::new(ModalModel::read(path)?);
 
@@ -103,17 +97,16 @@ fn run(options: &Options) -> Result<(), Box<dyn Error>> {
         }),
         rerun: None,
         duration: None,
-        screenshot: None,
-        panel: false,
+        stage: stage::Options { headless: true, ..stage::Options::default() },
         stop: stop_other.clone(),
         ..guest(&options, "other", 2, &model, &invite, &truth)?
     };
     let other_thread =
         thread::Builder::new().name("other".into()).spawn(move || guest::run_headless(other, false))?;
 
-    let scripted = options.headless || options.screenshot.is_some();
+    let scripted = options.stage.headless || options.stage.screenshot.is_some();
     let you = Guest {
-        title: format!("network {} of the paper's", options.network),
+        title: format!("network {}", options.network.name()),
         hand: scripted.then_some(ScriptedHand {
             toward: DVec3::new(1.0, 0.55, 0.0),
             pull: DVec3::new(0.18, 0.06, 0.13),
@@ -121,11 +114,9 @@ fn run(options: &Options) -> Result<(), Box<dyn Error>> {
         }),
         rerun: recorder(&options)?,
         duration: options.duration(),
-        screenshot: options.screenshot.clone(),
-        panel: options.panel,
         ..guest(&options, "you", 1, &model, &invite, &truth)?
     };
-    let yours = if options.headless {
+    let yours = if options.stage.headless {
         guest::run_headless(you, true)
     } else {
         // Without a graphics driver the engine stops the thread: say what can be done instead.
@@ -140,7 +131,7 @@ fn run(options: &Options) -> Result<(), Box<dyn Error>> {
     host_thread.join().map_err(|_| "the host's thread stopped")?;
 
     table::print(&options, &hosted, &yours, &others);
-    for file in options.screenshot.iter().cloned().chain(recording(&options)) {
+    for file in options.stage.screenshot.iter().cloned().chain(recording(&options)) {
         if std::fs::metadata(&file).map_or(0, |found| found.len()) == 0 {
             return Err(format!("{} was not written", file.display()).into());
         }
@@ -160,13 +151,11 @@ fn guest(
     invite: &Invite,
     truth: &Truth,
 ) -> Result<Guest, Box<dyn Error>> {
-    let network =
-        [Preset::Paper1, Preset::Paper2, Preset::Paper3, Preset::Paper4][usize::from(options.network - 1)];
     let seed = options.seed.wrapping_mul(1_000).wrapping_add(number);
     let config = JoinConfig {
         name: name.into(),
         transport: JoinOptions {
-            emulation: Some(Emulation::preset(network, seed)),
+            emulation: Some(Emulation::preset(options.network, seed)),
             ..JoinOptions::default()
         },
         recovery: RecoveryConfig::by_name(options.recovery.name()).ok_or("no such recovery")?,
@@ -180,8 +169,7 @@ fn guest(
         hand: None,
         rerun: None,
         duration: None,
-        screenshot: None,
-        panel: false,
+        stage: options.stage.clone(),
         stop: Arc::default(),
     })
 }
@@ -208,7 +196,8 @@ fn failure(options: &Options, yours: &GuestReport, others: &GuestReport) -> Opti
     of("your session", yours).or_else(|| {
         // The other guest is ended by us: its goodbye is no failure, a body that never came is.
         // Nor is it one when a window is closed before the other came.
-        (others.meters.streamed.ticks == 0 && options.duration().is_some())
-            .then(|| of("the other session", others).unwrap_or("the other never saw the body".into()))
+        (others.meters.streamed.ticks == 0
+            && (options.duration().is_some() || options.stage.frames.is_some()))
+        .then(|| of("the other session", others).unwrap_or("the other never saw the body".into()))
     })
 }

@@ -1,46 +1,37 @@
 //! The command line.
 
-use std::path::PathBuf;
-
 use clap::{Parser, ValueEnum};
+use pliant::stream::emulator::Preset;
+
+use crate::stage;
 
 /// Two people hold one soft body over a network that loses packets.
 ///
 /// One process: a host and two guests as separate apps on separate threads, joined by real QUIC on loopback through a seeded link emulator.
 /// You are the first guest; drag the body with the left mouse button.
 #[derive(Parser, Debug, Clone)]
+#[command(mut_arg("seconds", |seconds| seconds.help("Stop after so many seconds. Without a window the default is 10; with one, until it is closed")))]
+#[command(mut_arg("screenshot", |picture| picture.help("Save a picture of the window at the end (after 6 seconds, unless told otherwise) and stop")))]
 pub struct Options {
-    /// Which of the paper's networks lies between host and guests: 1 (9 % loss, 196 ms) to 4 (no loss, 20 ms).
-    #[arg(long, default_value_t = 1, value_parser = clap::value_parser!(u8).range(1..=4))]
-    pub network: u8,
+    #[command(flatten)]
+    pub stage: stage::Options,
+
+    /// What lies between host and guests: one of the paper's networks, 1 (9 % loss, 196 ms) to 4 (no loss, 20 ms), or another by name: paper-1 to
+    /// paper-4, lan, wifi, transatlantic, satellite.
+    #[arg(long, default_value = "paper-1", value_parser = network)]
+    pub network: Preset,
 
     /// How loss is repaired.
     #[arg(long, value_enum, default_value_t = Recovery::Default)]
     pub recovery: Recovery,
 
-    /// No window: a scripted hand plays your part.
-    #[arg(long)]
-    pub headless: bool,
-
-    /// Stop after so many seconds. Without a window the default is 10; with one, until it is closed.
-    #[arg(long, value_parser = seconds)]
-    pub seconds: Option<f64>,
-
-    /// Record for the rerun viewer: a file to write, or `viewer` for one that is running.
+    /// Record for the rerun viewer: a file to write, or `viewer` for the viewer on this machine, which is started if it is installed and none runs.
     #[arg(long, value_name = "FILE|viewer")]
     pub rerun: Option<String>,
 
     /// Seed of the link emulator: the same seed loses the same packets.
     #[arg(long, default_value_t = 1)]
     pub seed: u64,
-
-    /// Save a picture of the window at the end (after 6 seconds, unless told otherwise) and stop.
-    #[arg(long, value_name = "FILE.png")]
-    pub screenshot: Option<PathBuf>,
-
-    /// Open the live panel; F1 does it too.
-    #[arg(long)]
-    pub panel: bool,
 
     /// The body to hold: a file under assets/.
     #[arg(long, default_value = "pip.modal")]
@@ -69,20 +60,23 @@ impl Recovery {
     }
 }
 
-fn seconds(text: &str) -> Result<f64, String> {
-    match text.parse::<f64>() {
-        Ok(s) if s.is_finite() && s > 0.0 && s <= 86_400.0 => Ok(s),
-        _ => Err("expected seconds above 0 and at most 86400".into()),
-    }
+/// A network by its name, or by its number in the paper.
+fn network(text: &str) -> Result<Preset, String> {
+    let numbered = [Preset::Paper1, Preset::Paper2, Preset::Paper3, Preset::Paper4];
+    let number = text.parse::<usize>().ok().and_then(|number| numbered.get(number.checked_sub(1)?).copied());
+    let names = || Preset::ALL.map(Preset::name).join(", ");
+    number.or_else(|| Preset::by_name(text)).ok_or_else(|| format!("expected 1 to 4, {}", names()))
 }
 
 impl Options {
-    /// How long to run; `None` until the window is closed.
+    /// How long to run, s; `None`: by frames, or until the window is closed.
     pub fn duration(&self) -> Option<f64> {
-        match (self.seconds, &self.screenshot) {
+        let stage = &self.stage;
+        match (stage.seconds, &stage.screenshot) {
             (Some(s), _) => Some(s),
+            _ if stage.frames.is_some() => None,
             (None, Some(_)) => Some(6.0),
-            (None, None) if self.headless => Some(10.0),
+            (None, None) if stage.headless => Some(10.0),
             (None, None) => None,
         }
     }

@@ -10,8 +10,8 @@ pub fn print(options: &Options, host: &HostReport, you: &GuestReport, other: &Gu
     let mut step: Vec<f64> = host.step_us.iter().copied().collect();
     step.sort_by(f64::total_cmp);
     println!(
-        "\nnetwork {} of the paper's, recovery {}, seed {}, {:.1} s",
-        options.network,
+        "\nnetwork {}, recovery {}, seed {}, {:.1} s",
+        options.network.name(),
         options.recovery.name(),
         options.seed,
         host.seconds

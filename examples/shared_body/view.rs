@@ -87,7 +87,10 @@ fn ghost_follows(
 ) {
     for (mut shown, mut visibility) in &mut ghosts {
         visibility.set_if_neq(if on.0 { Visibility::Inherited } else { Visibility::Hidden });
-        if let Some((_, q)) = truth.newest() {
+        if let Some((_, q)) = truth.newest()
+            // One that rests is not drawn and recorded anew.
+            && *shown.q() != *q
+        {
             // Another number of modes for a moment, while the body changes: the ghost waits.
             shown.snap(&q).ok();
         }

@@ -149,7 +149,7 @@ impl PluginGroup for Stage {
 }
 
 /// The window's pixels, however dense the screen.
-fn resolution(options: &Options) -> WindowResolution {
+pub fn resolution(options: &Options) -> WindowResolution {
     let resolution = WindowResolution::new(options.size.0, options.size.1);
     match options.scale {
         Some(scale) if scale.is_finite() && scale > 0.0 => resolution.with_scale_factor_override(scale),

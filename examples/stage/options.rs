@@ -12,7 +12,7 @@ pub struct Options {
     #[arg(long)]
     pub headless: bool,
 
-    /// Stop after so many frames.
+    /// Stop after so many frames, counted from when the bodies are there.
     #[arg(long, value_parser = clap::value_parser!(u64).range(1..=1_000_000))]
     pub frames: Option<u64>,
 
@@ -62,7 +62,7 @@ fn seconds(text: &str) -> Result<f64, String> {
 
 impl Options {
     /// Falls back to no window where there is no display.
-    pub(super) fn settle(&mut self) -> Result<(), String> {
+    pub fn settle(&mut self) -> Result<(), String> {
         if !self.headless && !display() {
             println!("No display is to be found: running --headless, and the scene plays by itself.");
             self.headless = true;

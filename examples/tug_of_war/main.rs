@@ -191,7 +191,9 @@ fn steer(
 fn mirror(other: Res<Other>, mut bodies: Query<&mut ShownState, With<Mirrored>>) {
     let seen = other.seen();
     for mut shown in &mut bodies {
+        // One that rests is not drawn anew.
         if seen.q.len() == shown.q().len()
+            && seen.q != shown.q()
             && let Err(error) = shown.snap(&seen.q)
         {
             warn_once!("{error}");
