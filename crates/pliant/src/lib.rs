@@ -151,3 +151,32 @@ pub mod prelude {
 #[cfg(all(doctest, feature = "window", feature = "net", feature = "haptics"))]
 #[doc = include_str!("../../../README.md")]
 pub struct Readme;
+
+/// So does the code in the book, and what does not say `no_run` runs.
+#[cfg(all(
+    doctest,
+    feature = "window",
+    feature = "net",
+    feature = "haptics",
+    feature = "rerun",
+    feature = "panel",
+    feature = "bake"
+))]
+pub mod book {
+    #[doc = include_str!("../../../docs/concepts.md")]
+    pub struct Concepts;
+    #[doc = include_str!("../../../docs/first-scene.md")]
+    pub struct FirstScene;
+    #[doc = include_str!("../../../docs/baking.md")]
+    pub struct Baking;
+    #[doc = include_str!("../../../docs/multiuser.md")]
+    pub struct Multiuser;
+    #[doc = include_str!("../../../docs/devices.md")]
+    pub struct Devices;
+    #[doc = include_str!("../../../docs/recording.md")]
+    pub struct Recording;
+    #[doc = include_str!("../../../docs/performance.md")]
+    pub struct Performance;
+    #[doc = include_str!("../../../docs/limits.md")]
+    pub struct Limits;
+}

@@ -2,6 +2,18 @@
 //!
 //! Whatever is wrong with the input ends in one message on stderr and exit code 2; an output file appears whole or not
 //! at all. Progress bars go to stderr when it is a terminal.
+//!
+//! From nothing to a body that somebody else holds, over a network that loses packets:
+//!
+//! ```sh
+//! pliant mesh bar --cells 8,2,2 --size 1,0.2,0.2 -o bar.msh                  # a metre of tetrahedra
+//! pliant bake bar.msh --modes 12 --young 1e5 --anchor 'x<0.01' -o bar.modal   # held at one end
+//! pliant inspect bar.modal                                                   # its modes, and how exact they are
+//! pliant bench step bar.modal                                                # what it costs here
+//! pliant stream --model bar.modal --network paper-1 --seconds 5              # what a guest sees of it
+//! ```
+//!
+//! (`tests/start.rs` runs these lines.) `pliant COMMAND --help` tells the rest.
 
 mod bake;
 mod bench;
