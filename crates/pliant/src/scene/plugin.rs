@@ -10,11 +10,8 @@ use bevy::{
     prelude::*,
 };
 
-use super::locate::Step::Field;
 use super::needs::compiled;
-use super::{
-    SceneError, SceneErrorKind, SceneFailed, SceneFile, SceneFileLoader, SceneInstance, hands, spawn,
-};
+use super::{SceneError, SceneFailed, SceneFile, SceneFileLoader, SceneInstance, hands, spawn};
 use crate::body::PliantSystems;
 
 /// Scene files as assets; add it after [`PliantPlugins`](crate::PliantPlugins).
@@ -83,7 +80,7 @@ impl SceneFilePlugin {
     /// the app.
     ///
     /// # Errors
-    /// [`SceneErrorKind::Feature`] when the program was compiled without what the scene asks for, [`SceneErrorKind::Open`] when the session's
+    /// [`SceneErrorKind::Feature`](super::SceneErrorKind::Feature) when the program was compiled without what the scene asks for, [`SceneErrorKind::Open`](super::SceneErrorKind::Open) when the session's
     /// socket or the recording's file cannot be opened. The other files that it names are read with the app ([`SceneFailed`]);
     /// [`SceneFile::check_files`] reads them before.
     pub fn open(file: SceneFile) -> Result<Self, SceneError> {
@@ -188,6 +185,7 @@ impl Plugin for SceneFilePlugin {
 impl SceneFilePlugin {
     /// Adds the recording that the scene asks for; returns what keeps it from being made.
     fn record(&self, app: &mut App, file: &SceneFile) -> Option<SceneError> {
+        use super::{SceneErrorKind, locate::Step::Field};
         use crate::rerun::{RerunPlugin, RerunRecording};
         let scene = file.scene();
         let recording = scene.recording.as_ref().filter(|_| self.role == Role::Opened)?;

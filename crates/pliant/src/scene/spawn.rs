@@ -173,12 +173,18 @@ pub(super) fn watch_settings(
     mut refused: MessageReader<BodyRefused>,
     bodies: Query<(&PartOf, &Name, &Source), (With<SceneBody>, Without<BodyState>)>,
 ) {
+    let mut told = Vec::new();
     for refused in refused.read() {
         let Ok((part, name, source)) = bodies.get(refused.entity) else { continue };
+        commands.entity(refused.entity).try_insert(Lost);
+        // Once for all copies.
+        if told.contains(&(part.0, &source.path)) {
+            continue;
+        }
+        told.push((part.0, &source.path));
         let message = format!("the body `{name}` cannot be made: {}", refused.error);
         let error = source.file.error(&source.path, SceneErrorKind::Value, message);
         let instance = part.0;
-        commands.entity(refused.entity).try_insert(Lost);
         commands.queue(move |world: &mut World| fail(world, instance, error));
     }
 }
