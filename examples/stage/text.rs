@@ -32,6 +32,8 @@ fn spawn(mut commands: Commands, title: &str, keys: &str) {
                 left: px(14),
                 top,
                 bottom,
+                // In a narrow window the keys take two lines.
+                max_width: percent(96),
                 padding: UiRect::axes(px(12), px(8)),
                 border_radius: BorderRadius::all(px(6)),
                 ..default()

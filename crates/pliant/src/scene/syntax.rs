@@ -48,11 +48,12 @@ pub(super) fn refused(origin: &str, text: &str, error: &SpannedError) -> SceneEr
     SceneError::at_position(origin, text, (start.line, start.col), kind, message)
 }
 
-/// The text from a line and a column on, both from 1.
+/// The text from a line and a column on, both from 1; with the sign that was read before a number was refused.
 fn after(text: &str, line: usize, column: usize) -> &str {
     let begin: usize = text.split_inclusive('\n').take(line.saturating_sub(1)).map(str::len).sum();
     let rest = text.get(begin..).unwrap_or_default();
     let skipped: usize = rest.chars().take(column.saturating_sub(1)).map(char::len_utf8).sum();
+    let skipped = skipped - usize::from(rest.get(..skipped).is_some_and(|read| read.ends_with('-')));
     rest.get(skipped..).unwrap_or_default()
 }
 
