@@ -18,6 +18,7 @@ mod stage;
 // Without a window only its command line is left.
 #[cfg(not(feature = "window"))]
 #[path = "../stage/options.rs"]
+#[expect(dead_code, reason = "no window has a size, a scale, a panel")]
 mod stage;
 #[cfg(feature = "window")]
 mod window;
