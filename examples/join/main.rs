@@ -32,7 +32,7 @@ use bevy::prelude::*;
 use clap::Parser;
 use pliant::net::{
     CameraInterest, Invite, JoinConfig, JoinOptions, NetGuest, NetPlugin, Recording, RemoteBody,
-    SessionClosed, SessionJoined, SessionLost,
+    SessionClosed, SessionJoined, SessionLost, SharedBody,
 };
 use pliant::prelude::*;
 use pliant::stream::emulator::Preset;
@@ -200,7 +200,7 @@ fn tell(
     mut closed: MessageReader<SessionClosed>,
     mut exit: MessageWriter<AppExit>,
     guest: Res<NetGuest>,
-    shown: Query<&Name, (With<RemoteBody>, Added<ShownState>)>,
+    shown: Query<&SharedBody, (With<RemoteBody>, Added<ShownState>)>,
 ) {
     let now = time.elapsed_secs_f64();
     for joined in joined.read() {
@@ -210,7 +210,7 @@ fn tell(
         println!("{now:6.2} s  the host cannot be heard: {}", lost.reason);
     }
     for body in &shown {
-        println!("{now:6.2} s  a body is here: {body}");
+        println!("{now:6.2} s  a body is here: {}", body.name);
     }
     for closed in closed.read() {
         println!("{now:6.2} s  over: {}", closed.reason);
