@@ -736,7 +736,9 @@ fn a_recording_s_rates_and_colour_are_the_scene_s() {
         *app.world().resource::<RerunRecording>()
     };
     assert_eq!(made(""), RerunRecording::default());
-    let all = made(", shapes_hz: 5, figures_hz: 30, hands_hz: 0, modes_hz: 2.5, colour: Stress");
+    let all = made(
+        ", shapes_hz: 5, figures_hz: 30, hands_hz: 0, modes_hz: 2.5, colour: Stress, device_loops: true",
+    );
     let expected = RerunRecording {
         on: true,
         shapes_hz: 5.0,
@@ -744,6 +746,7 @@ fn a_recording_s_rates_and_colour_are_the_scene_s() {
         hands_hz: 0.0,
         modes_hz: 2.5,
         colour: RerunColour::Stress,
+        device_loops: true,
     };
     assert_eq!(all, expected);
     std::fs::remove_dir_all(&folder).unwrap();

@@ -537,6 +537,9 @@ pub struct RecordingEntry {
     /// What the colour of a surface says. Default: `Displacement`.
     #[serde(default)]
     pub colour: ColourEntry,
+    /// Whether every period of a device's loop is recorded (`RerunRecording::device_loops`). Default: false.
+    #[serde(default)]
+    pub device_loops: bool,
 }
 
 fn shapes_hz() -> f64 {

@@ -28,6 +28,7 @@ impl RecordingEntry {
                 ColourEntry::Displacement => RerunColour::Displacement,
                 ColourEntry::Stress => RerunColour::Stress,
             },
+            device_loops: self.device_loops,
         }
     }
 }
