@@ -82,8 +82,13 @@ impl SceneFile {
         }
         let text = text.strip_prefix('\u{feff}').unwrap_or(text);
         let options = ron::Options::default().with_default_extension(Extensions::IMPLICIT_SOME);
-        let scene: SceneDescription =
-            options.from_str(text).map_err(|error| refused(origin, text, &error))?;
+        let scene: SceneDescription = options.from_str(text).map_err(|error| {
+            // At the very end of a text the parser points to its last character, and behind that only where something follows.
+            let ended = format!("{text}\n");
+            let again =
+                options.from_str::<SceneDescription>(&ended).err().filter(|_| !text.trim().is_empty());
+            refused(origin, text, &again.unwrap_or(error))
+        })?;
         Self::checked(scene, origin, text)
     }
 
