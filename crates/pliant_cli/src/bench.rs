@@ -21,7 +21,7 @@ enum What {
         /// The model
         #[arg(value_name = "X.modal")]
         model: PathBuf,
-        /// Seconds for each of the three measurements
+        /// Seconds for each of the measurements
         #[arg(long, default_value_t = 1.0)]
         seconds: f64,
         /// Reconstruct from a basis in half precision
@@ -48,11 +48,13 @@ pub(crate) struct Told {
     pub(crate) surface_vertices: usize,
     pub(crate) step_us: Times,
     pub(crate) reconstruct_us: Times,
+    /// A step under a hand that moves and the whole surface of what it came to, one after the other, as a frame does.
+    pub(crate) frame_us: Times,
     /// Read and written by one reconstruction.
     bytes: usize,
-    /// Of the median reconstruction.
+    /// Of the median reconstruction, as its turn in a frame: after a step, of a shape that is new each time.
     pub(crate) bandwidth_gb_s: f64,
-    /// Of a plain sum over a buffer of as many bytes in the processor's widest registers, median, in the same run.
+    /// Of a plain sum over a buffer of as many bytes in the processor's widest registers, the fastest of all in the same run: nothing reads faster.
     pub(crate) bandwidth_limit_gb_s: f64,
 }
 
@@ -78,38 +80,47 @@ pub(crate) fn measure(model: Arc<ModalModel>, seconds: f64, precision: Precision
     let start = body.grab_position(grab)?;
     let mut tick = 0u32;
     let mut failed = None;
-    let step_us = time(seconds, || {
+    let mut pull = |body: &mut Body| {
         tick += 1;
         let away = 0.05 * model.size() * (0.05 * f64::from(tick)).sin();
         let moved = body.set_target(grab, [start[0] + away, start[1] + 0.5 * away, start[2]]);
         if let Err(error) = moved.and_then(|()| body.step().map(|_| ())) {
             failed.get_or_insert(error);
         }
-    });
-    if let Some(error) = failed {
-        return Err(error.into());
-    }
-    let q: Vec<f32> = body.q().iter().map(|q| *q as f32).collect();
+    };
+    let step_us = time(seconds, || pull(&mut body));
     let mut positions = model.surface().positions().to_vec();
-    let basis = model.basis_in(precision);
-    let bytes = basis.traffic_bytes(model.mode_count());
+    let bytes = model.basis_in(precision).traffic_bytes(model.mode_count());
     let buffer = vec![1.0f32; bytes / 4];
-    let [reconstruct_us, limit] = time_by_turns(
+    let mut broken = None;
+    let [of_frame, of_surface, of_sum] = by_turns(
         seconds,
-        || basis.reconstruct(black_box(&q), true, black_box(&mut positions)),
+        &mut body,
+        &mut pull,
+        |body| {
+            if let Err(error) = body.reconstruct(black_box(&mut positions)) {
+                broken.get_or_insert(error);
+            }
+        },
         || {
             black_box(streaming_sum(black_box(&buffer)));
         },
     );
+    if let Some(error) = failed.or(broken) {
+        return Err(error.into());
+    }
+    let fastest = of_sum.iter().copied().fold(f64::INFINITY, f64::min);
+    let (frame_us, reconstruct_us) = (percentiles(of_frame), percentiles(of_surface));
     // Bytes a microsecond are megabytes a second.
     let gb_s = |us: f64| bytes as f64 / us.max(1e-9) * 1e-3;
     Ok(Told {
         modes: model.mode_count(),
         surface_vertices: count as usize,
         bandwidth_gb_s: gb_s(reconstruct_us.p50),
-        bandwidth_limit_gb_s: gb_s(limit.p50),
+        bandwidth_limit_gb_s: gb_s(fastest),
         step_us,
         reconstruct_us,
+        frame_us,
         bytes,
     })
 }
@@ -126,18 +137,35 @@ fn time(seconds: f64, mut work: impl FnMut()) -> Times {
     percentiles(samples)
 }
 
-/// Two works in turns of sixteen, so that whatever else the machine does slows both alike; the first of each turn, for which the caches are still
-/// full of the other, is not counted.
-fn time_by_turns(seconds: f64, mut a: impl FnMut(), mut b: impl FnMut()) -> [Times; 2] {
-    let (mut of_a, mut of_b) = (Vec::new(), Vec::new());
+/// Frames (a step, then the surface) in turns of sixteen with plain sums, so that whatever else the machine does slows both alike; the first of each turn, for
+/// which the caches are still full of the other, is not counted. Samples, us: whole frames, their surfaces, sums.
+fn by_turns<T>(
+    seconds: f64,
+    body: &mut T,
+    mut step: impl FnMut(&mut T),
+    mut surface: impl FnMut(&mut T),
+    mut sum: impl FnMut(),
+) -> [Vec<f64>; 3] {
+    let mut samples = [Vec::new(), Vec::new(), Vec::new()];
     let begun = Instant::now();
-    while of_a.len() < 1_000 || (begun.elapsed().as_secs_f64() < 2.0 * seconds && of_a.len() < 1_000_000) {
-        a();
-        of_a.extend((0..15).map(|_| once(&mut a)));
-        b();
-        of_b.extend((0..15).map(|_| once(&mut b)));
+    while samples[0].len() < 1_000
+        || (begun.elapsed().as_secs_f64() < 2.0 * seconds && samples[0].len() < 1_000_000)
+    {
+        for turn in 0..16 {
+            let start = Instant::now();
+            step(body);
+            let stepped = Instant::now();
+            surface(body);
+            let done = Instant::now();
+            if turn > 0 {
+                samples[0].push((done - start).as_secs_f64() * 1e6);
+                samples[1].push((done - stepped).as_secs_f64() * 1e6);
+            }
+        }
+        sum();
+        samples[2].extend((0..15).map(|_| once(&mut sum)));
     }
-    [percentiles(of_a), percentiles(of_b)]
+    samples
 }
 
 /// us.
@@ -159,12 +187,14 @@ fn text(told: &Told) -> String {
         "body               {} modes, {} surface vertices\n\
          step, one grab     {}\n\
          reconstruction     {}\n\
+         both, as a frame   {}\n\
          bytes moved        {}\n\
-         bandwidth          {:.1} GB/s, {:.0} % of the {:.1} GB/s of a plain sum over as many bytes",
+         bandwidth          {:.1} GB/s, {:.0} % of the {:.1} GB/s of the fastest plain sum over as many bytes",
         told.modes,
         told.surface_vertices,
         times(&told.step_us),
         times(&told.reconstruct_us),
+        times(&told.frame_us),
         told.bytes,
         told.bandwidth_gb_s,
         100.0 * told.bandwidth_gb_s / told.bandwidth_limit_gb_s,

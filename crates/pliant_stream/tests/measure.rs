@@ -417,3 +417,18 @@ fn cost_of_a_tick() {
         );
     }
 }
+
+#[test]
+fn what_is_not_shown_counts_as_missing_and_as_wrong() {
+    let link = |loss| LinkConfig { loss, delay: Duration::from_millis(10), ..LinkConfig::default() };
+    let whole = run(&link(Loss::None), "default", 10.0, 1);
+    assert!(whole.missing == 0 && whole.ticks >= 399 && whole.max_percent < 0.1, "{whole:?}");
+    // Nothing arrives any more: after a second and a bit of guessing the picture stands still, and every tick from then on is missed and compared.
+    let none = run(&link(Loss::Burst { first: 0, count: 100_000 }), "default", 10.0, 1);
+    assert!(none.missing > 300 && none.ticks + none.missing >= 398, "{none:?}");
+    assert!(none.rms_percent > 10.0 && none.end_percent > 1.0, "{none:?}");
+    // A second without frames: some ticks are missed while it lasts, and what is caught up with is not taken for shown.
+    let gap = run(&link(Loss::Burst { first: 100, count: 60 }), "default", 10.0, 1);
+    assert!((5..=60).contains(&gap.missing) && gap.max_percent > 1.0, "{gap:?}");
+    assert!(gap.ticks + gap.missing >= 398, "{gap:?}");
+}

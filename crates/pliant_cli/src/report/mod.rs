@@ -1,9 +1,11 @@
 //! `pliant report`: what the method costs and what it is off by, remade on this machine: tables, CSV, SVG, PNG and the words for them.
 
 mod frames;
+mod front;
 mod physics;
 mod plot;
 mod tables;
+mod warp;
 mod work;
 
 use std::{fmt::Write, path::PathBuf, time::Instant};
@@ -122,27 +124,21 @@ fn title(part: &str) -> &'static str {
         "table-2" => "The paper's table 2",
         "table-3" => "The paper's networks and what crosses them (its table 3)",
         "courses" => "The paper's figures 7, 8 and 9",
-        _ => "The default setting in words",
+        _ => "The default at run time, in words",
     }
 }
 
 fn part(name: &str, args: &ReportArgs, bar: &mut Bar) -> Result<(Vec<Figure>, String), CliError> {
     let quick = args.quick;
     Ok(match name {
-        "elements" => (vec![physics::elements(quick)?], String::new()),
-        "modes" => (vec![physics::modes(quick)?], String::new()),
-        "steps" => (physics::steps(quick)?.into(), String::new()),
-        "warp" => (physics::warp(quick)?, String::new()),
-        "precision" => {
-            let (figure, _) = tables::precision()?;
-            (vec![figure], String::new())
-        }
+        "elements" => (physics::elements(quick)?, String::new()),
+        "modes" => (physics::modes(quick)?, String::new()),
+        "steps" => (physics::steps(quick)?, String::new()),
+        "warp" => (warp::warp(quick)?, String::new()),
+        "precision" => (vec![tables::precision()?], String::new()),
         "frames" => (vec![frames::quantised(quick, bar)?], String::new()),
-        "network" => {
-            let (figure, table) = tables::networks(quick, bar)?;
-            (vec![figure], table)
-        }
-        "front" => (vec![physics::front(quick)?], WHICH.to_owned()),
+        "network" => tables::networks(quick, bar)?,
+        "front" => front::all_together(quick, bar)?,
         "table-2" => {
             (Vec::new(), tables::table_2(&args.models, &args.own, if quick { 0.3 } else { 2.0 }, bar)?)
         }
@@ -150,14 +146,15 @@ fn part(name: &str, args: &ReportArgs, bar: &mut Bar) -> Result<(Vec<Figure>, St
         "courses" => (tables::courses()?, String::new()),
         _ => (
             Vec::new(),
-            tables::default_setting(&args.models, &args.own, if quick { 12_000 } else { 50_000 }, bar)?,
+            tables::default_setting(
+                &args.models,
+                &args.own,
+                if quick { [12_000, 2_000] } else { [50_000, 12_000] },
+                bar,
+            )?,
         ),
     })
 }
-
-const WHICH: &str = "Which setting for which need: *many bodies in the background*: 6 to 12 modes, no warp unless they turn or bend far; *a body that is dragged and looked at*: the default \
-    (ten-node tetrahedra, 20 to 60 modes, exact step, warp); *a body that is felt*: the same, and more modes only for the picture, as the residual flexibility already gives the hand what \
-    they would; *the paper's comparison*: four-node tetrahedra and Newmark, for nothing else.";
 
 fn rows(figure: &Figure) -> String {
     if !figure.logarithmic {

@@ -16,12 +16,14 @@ pub(super) struct Series {
     pub(super) points: Vec<(f64, f64)>,
     /// Where x is the median of a time: its 99th percentile at each point.
     pub(super) late: Vec<f64>,
+    /// Points that no line joins: settings beside each other, not one setting turned up.
+    pub(super) scattered: bool,
 }
 
 impl Series {
     /// Without percentiles.
     pub(super) fn new(name: impl Into<String>, points: Vec<(f64, f64)>) -> Self {
-        Self { name: name.into(), points, late: Vec::new() }
+        Self { name: name.into(), points, late: Vec::new(), scattered: false }
     }
 
     /// Points of a median time, its 99th percentile, and an error.
@@ -30,7 +32,12 @@ impl Series {
             name: name.into(),
             points: points.iter().map(|(x, y)| (x[0], *y)).collect(),
             late: points.iter().map(|(x, _)| x[1]).collect(),
+            scattered: false,
         }
+    }
+
+    pub(super) fn scattered(self) -> Self {
+        Self { scattered: true, ..self }
     }
 }
 
@@ -114,7 +121,10 @@ fn draw<B: DrawingBackend>(
     let all = || figure.series.iter().flat_map(|s| s.points.iter().copied());
     let late = || figure.series.iter().flat_map(|s| s.late.iter().copied());
     let xs = range(all().map(|p| p.0).chain(late()), figure.logarithmic);
-    let ys = range(all().map(|p| p.1).chain(figure.reference_error), figure.logarithmic);
+    // A reference far below all that is drawn would squeeze it: its error is told in words.
+    let least = all().map(|p| p.1).fold(f64::INFINITY, f64::min);
+    let reference = figure.reference_error.filter(|error| *error > 0.1 * least);
+    let ys = range(all().map(|p| p.1).chain(reference), figure.logarithmic);
     let mut chart = ChartBuilder::on(area);
     chart.caption(&figure.title, ("sans-serif", 20)).margin(12).x_label_area_size(44).y_label_area_size(72);
     // The two coordinate systems are different types: the same lines for each.
@@ -139,8 +149,9 @@ fn draw<B: DrawingBackend>(
                     .filter(|p| p.1.is_finite() && (!figure.logarithmic || (p.1 > 0.0 && p.0 > 0.0)))
                     .map(|p| (p.0, p.1.clamp(ys.start, ys.end)))
                     .collect();
+                let joined = if series.scattered { &points[..0] } else { &points[..] };
                 chart
-                    .draw_series(LineSeries::new(points.iter().copied(), colour.stroke_width(2)))?
+                    .draw_series(LineSeries::new(joined.iter().copied(), colour.stroke_width(2)))?
                     .label(&series.name)
                     .legend(move |(x, y)| {
                         PathElement::new(vec![(x, y), (x + 18, y)], colour.stroke_width(2))
@@ -156,7 +167,7 @@ fn draw<B: DrawingBackend>(
                     chart.draw_series(points.iter().map(|p| Circle::new(*p, 3, colour.filled())))?;
                 }
             }
-            if let Some(error) = figure.reference_error.filter(|e| *e > 0.0) {
+            if let Some(error) = reference {
                 chart
                     .draw_series(LineSeries::new(
                         [(xs.start, error), (xs.end, error)],

@@ -67,3 +67,33 @@ pub(super) fn apart(a: &[[f64; 3]], b: &[[f64; 3]]) -> [f64; 2] {
     }
     [(sum / a.len().max(1) as f64).sqrt(), most.sqrt()]
 }
+
+/// What a mass-weighted difference of two motions is at each sample, and its root mean square over all of them, both as shares of the root mean square of
+/// the second: the modes are orthonormal by mass, so `|q_a - q_b|^2 / mass` is the mean square distance over the whole body. What only one has counts as 0
+/// in the other.
+pub(super) fn by_mass(got: &[Vec<f64>], want: &[Vec<f64>]) -> (Vec<f64>, f64) {
+    let at = |q: &[f64], k: usize| q.get(k).copied().unwrap_or(0.0);
+    let square = |a: &[f64], b: &[f64]| -> f64 {
+        (0..a.len().max(b.len())).map(|k| (at(a, k) - at(b, k)).powi(2)).sum()
+    };
+    let count = want.len().max(1) as f64;
+    let size = (want.iter().map(|q| square(q, &[])).sum::<f64>() / count).sqrt().max(f64::MIN_POSITIVE);
+    let off: Vec<f64> = got.iter().zip(want).map(|(a, b)| square(a, b).sqrt() / size).collect();
+    let all = (off.iter().map(|e| e * e).sum::<f64>() / count).sqrt();
+    (off, all)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_mass_weighted_error_is_a_share_of_the_motion() {
+        let want = vec![vec![3.0, 4.0], vec![0.0, 5.0]];
+        assert_eq!(by_mass(&want, &want), (vec![0.0, 0.0], 0.0));
+        // Without its second mode the first sample is off by 4 of 5, the other by all of it.
+        let (off, all) = by_mass(&[vec![3.0], vec![0.0]], &want);
+        assert!((off[0] - 0.8).abs() < 1e-12 && (off[1] - 1.0).abs() < 1e-12, "{off:?}");
+        assert!((all - (0.5f64 * (0.64 + 1.0)).sqrt()).abs() < 1e-12, "{all}");
+    }
+}
