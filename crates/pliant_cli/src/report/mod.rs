@@ -163,7 +163,8 @@ fn rows(figure: &Figure) -> String {
     let timed = figure.series.iter().any(|series| !series.late.is_empty());
     let (head, rule) = if timed { (" 99 % |", " --- |") } else { ("", "") };
     let mut out = format!("| line | {} |{head} {} |\n| --- | --- |{rule} --- |\n", figure.x, figure.y);
-    for series in &figure.series {
+    // Settings beside each other are many: the words of such a figure hold a table of those that count, the CSV all.
+    for series in figure.series.iter().filter(|series| !series.scattered) {
         for (index, (x, y)) in series.points.iter().enumerate() {
             let late = series.late.get(index).map_or(String::new(), |late| format!(" {late:.4} |"));
             let _ = writeln!(out, "| {} | {x:.4} |{late} {y:.2e} |", series.name);
