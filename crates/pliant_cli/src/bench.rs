@@ -54,7 +54,7 @@ pub(crate) struct Told {
     bytes: usize,
     /// Of the median reconstruction, as its turn in a frame: after a step, of a shape that is new each time.
     pub(crate) bandwidth_gb_s: f64,
-    /// Of a plain sum over a buffer of as many bytes in the processor's widest registers, the fastest of all in the same run: nothing reads faster.
+    /// Of the fastest pass over as many bytes in the same run: plain sums in the processor's widest registers, and reconstructions.
     pub(crate) bandwidth_limit_gb_s: f64,
 }
 
@@ -109,7 +109,8 @@ pub(crate) fn measure(model: Arc<ModalModel>, seconds: f64, precision: Precision
     if let Some(error) = failed.or(broken) {
         return Err(error.into());
     }
-    let fastest = of_sum.iter().copied().fold(f64::INFINITY, f64::min);
+    // The armadillo's surface has been read faster than it was summed: the bound is what memory gave at best, whoever read.
+    let fastest = of_sum.iter().chain(&of_surface).copied().fold(f64::INFINITY, f64::min);
     let (frame_us, reconstruct_us) = (percentiles(of_frame), percentiles(of_surface));
     // Bytes a microsecond are megabytes a second.
     let gb_s = |us: f64| bytes as f64 / us.max(1e-9) * 1e-3;
@@ -189,7 +190,7 @@ fn text(told: &Told) -> String {
          reconstruction     {}\n\
          both, as a frame   {}\n\
          bytes moved        {}\n\
-         bandwidth          {:.1} GB/s, {:.0} % of the {:.1} GB/s of the fastest plain sum over as many bytes",
+         bandwidth          {:.1} GB/s, {:.0} % of the {:.1} GB/s of the fastest pass over as many bytes",
         told.modes,
         told.surface_vertices,
         times(&told.step_us),

@@ -139,7 +139,12 @@ fn a_body_is_timed_against_the_memory() {
         told["bytes"].as_u64().unwrap(),
         vertices.div_ceil(16) * (12 * 6 + 3) * 16 * 4 + 12 * vertices
     );
-    assert!(told["bandwidth_limit_gb_s"].as_f64().unwrap() > 0.0);
+    // A bound: nothing in the run was faster.
+    let [speed, limit] = ["bandwidth_gb_s", "bandwidth_limit_gb_s"].map(|key| told[key].as_f64().unwrap());
+    assert!(0.0 < speed && speed <= limit, "{told}");
+    // A frame is a step and a surface.
+    let median = |times: &str| told[times]["p50"].as_f64().unwrap();
+    assert!(median("frame_us") >= median("reconstruct_us"), "{told}");
     let half = json(&succeeds(&["bench", "step", &model, "--seconds", "0.05", "--half", "--json"]));
     assert_eq!(
         half["bytes"].as_u64().unwrap(),

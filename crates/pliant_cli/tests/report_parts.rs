@@ -166,8 +166,9 @@ fn the_front_is_what_was_measured_and_so_is_the_advice() {
         let points = part.points(figure);
         let front: Vec<_> = points.iter().filter(|p| p.0.starts_with("the front")).collect();
         assert!(!front.is_empty(), "{figure}");
+        // The file has four digits: neighbours may look alike.
         for pair in front.windows(2) {
-            assert!(pair[0].1 < pair[1].1 && pair[0].2 > pair[1].2, "{figure}: {pair:?}");
+            assert!(pair[0].1 <= pair[1].1 && pair[0].2 >= pair[1].2, "{figure}: {pair:?}");
         }
         // Nothing lies below and left of the front.
         for p in points.iter().filter(|p| !p.0.starts_with("the front")) {

@@ -254,7 +254,7 @@ const BAR: f64 = 20.0;
 
 const BOUND: &str = "\nA frame is a step under a hand that moves and the whole surface of the shape that it came to, one after the other; steps a second are those of its median. What bounds it: a step takes a few \
     microseconds; the rest is the surface, and the surface is one pass over the basis, 24 bytes a vertex and mode (displacement and rotation, single precision), read once a frame. Its speed is beside \
-    that of the fastest of some thousand plain sums over a buffer of as many bytes in the same run: nothing reads faster, and where it comes near 100 % nothing is left to gain but fewer bytes. Half precision is \
+    that of the fastest of some thousand passes in the same run, plain sums over a buffer of as many bytes and surfaces alike: memory gave no more, and where it comes near 100 % nothing is left to gain but fewer bytes. Half precision is \
     that (12 bytes; `ModalBody::half_basis`): an option, off by default, so that a row that reaches the bar only with it is short of it by default. So is leaving out modes that move nothing by a tenth of a \
     pixel (`SurfaceDetail`, on by default in the picture, off here). The limit itself moves with what else the machine's memory serves. What differs from the paper: its processor (one core of a 2.93 GHz Core 2 \
     Duo of 2008), its meshes of the same sizes, and the warp, which is in our surface.\n";
