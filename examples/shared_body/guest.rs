@@ -21,7 +21,6 @@ use bevy::{
 use pliant::{
     modal::{ModalModel, warp},
     net::{GuestState, NetGuest, NetPlugin, NetStats, RemoteBody, SeenHands, SharedBody, User, colour_of},
-    panel::PanelPlugin,
     prelude::*,
     rerun::{RerunPlugin, RerunScalars},
 };
@@ -119,11 +118,7 @@ pub fn run_windowed(guest: Guest) -> GuestReport {
     )
     // The session goes on when the window is not looked at.
     .insert_resource(WinitSettings::continuous())
-    .add_plugins((
-        PointerGrabPlugin,
-        ViewPlugin { title: guest.title.clone() },
-        PanelPlugin { open: guest.stage.panel, ..default() },
-    ));
+    .add_plugins((PointerGrabPlugin, ViewPlugin { title: guest.title.clone() }, guest.stage.panel()));
     run(app, guest)
 }
 

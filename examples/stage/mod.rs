@@ -220,7 +220,7 @@ impl Plugin for StagePlugin {
             // The scene goes on when the window is not looked at.
             app.insert_resource(WinitSettings::continuous());
             #[cfg(feature = "panel")]
-            app.add_plugins(pliant::panel::PanelPlugin { open: stage.options.panel, ..default() });
+            app.add_plugins(stage.options.panel());
             let panel: &[&str] = if cfg!(feature = "panel") { &["F1: panel"] } else { &[] };
             let keys = [stage.keys.as_slice(), &["Space: pause", "full stop: one step"], panel].concat();
             app.add_plugins(Setting {

@@ -24,9 +24,9 @@ pub struct Options {
     #[arg(long, value_name = "FILE.png")]
     pub screenshot: Option<PathBuf>,
 
-    /// Open the live panel; F1 does it too.
-    #[arg(long)]
-    pub panel: bool,
+    /// Open the live panel; F1 does it too. `--panel=SECTION` unfolds that section alone.
+    #[arg(long, value_name = "SECTION", num_args = 0..=1, require_equals = true)]
+    pub panel: Option<Option<Section>>,
 
     /// Size of the window in pixels.
     #[arg(long, value_name = "WIDTHxHEIGHT", default_value = "1280x720", value_parser = size)]
@@ -35,6 +35,16 @@ pub struct Options {
     /// Magnifies text and panel, for dense screens. Default: what the screen says.
     #[arg(long, value_parser = clap::value_parser!(f32))]
     pub scale: Option<f32>,
+}
+
+/// A section of the panel.
+#[derive(clap::ValueEnum, Debug, Clone, Copy)]
+pub enum Section {
+    Time,
+    Bodies,
+    Session,
+    Devices,
+    Recording,
 }
 
 /// Pixels across and down.
@@ -61,6 +71,24 @@ fn seconds(text: &str) -> Result<f64, String> {
 }
 
 impl Options {
+    /// The panel as asked for: closed unless `--panel` is there.
+    #[cfg(feature = "panel")]
+    pub fn panel(&self) -> pliant::panel::PanelPlugin {
+        use pliant::panel::PanelSection;
+        let section = |section| match section {
+            Section::Time => PanelSection::Time,
+            Section::Bodies => PanelSection::Bodies,
+            Section::Session => PanelSection::Session,
+            Section::Devices => PanelSection::Devices,
+            Section::Recording => PanelSection::Recording,
+        };
+        pliant::panel::PanelPlugin {
+            open: self.panel.is_some(),
+            only: self.panel.flatten().map(section),
+            ..Default::default()
+        }
+    }
+
     /// Falls back to no window where there is no display.
     pub fn settle(&mut self) -> Result<(), String> {
         if !self.headless && !display() {
