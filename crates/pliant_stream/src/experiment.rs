@@ -262,7 +262,8 @@ impl Experiment {
         let before = pair.host.stats(crate::state::PeerId(1)).unwrap_or_default();
         let until = joined + Duration::from_secs_f64(self.seconds.clamp(0.1, 1e6));
         pair.run_until(until, &mut run);
-        let after = pair.host.stats(crate::state::PeerId(1)).unwrap_or_default();
+        // A guest that the host has let go has no counts any more.
+        let after = pair.host.stats(crate::state::PeerId(1)).unwrap_or(before);
         let guest = &pair.guests[0];
         run.end(until);
         let mut figures = run.figures(&guest.session);
