@@ -1,10 +1,10 @@
 //! The bodies of a scene: modes, damping, energy, rest, and the hands on them.
 
-use bevy_egui::egui::{CollapsingHeader, Color32, RichText, Ui};
+use bevy_egui::egui::{CollapsingHeader, Color32, Ui};
 
 use crate::{
     knob::knob,
-    trace::{Trace, colour, plot, short},
+    trace::{Trace, colour, dot, plot, short},
 };
 
 /// A body as the panel shows it. What a knob changes is changed here; the caller takes it over.
@@ -118,7 +118,7 @@ fn body_knobs(ui: &mut Ui, index: usize, body: &mut BodyView) {
     };
     for (hand_index, hand) in body.hands.iter().enumerate() {
         ui.horizontal(|ui| {
-            ui.label(RichText::new("\u{25cf}").color(colour_of(hand_index, hand)));
+            dot(ui, colour_of(hand_index, hand));
             ui.label(format!("{}: {} N", hand.name, short(hand.force)));
         });
     }

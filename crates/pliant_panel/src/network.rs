@@ -1,10 +1,10 @@
 //! Users, the network and its emulator.
 
-use bevy_egui::egui::{Color32, ComboBox, DragValue, Grid, RichText, Ui};
+use bevy_egui::egui::{Color32, ComboBox, DragValue, Grid, Ui};
 
 use crate::{
     knob::knob,
-    trace::{Trace, colour, plot, short},
+    trace::{Trace, colour, dot, plot, short},
 };
 
 /// The session as the panel shows it.
@@ -131,7 +131,7 @@ pub fn show(ui: &mut Ui, network: &mut NetworkView) {
     for user in &network.users {
         ui.horizontal(|ui| {
             let [r, g, b] = user.colour;
-            ui.label(RichText::new("\u{25cf}").color(Color32::from_rgb(r, g, b)));
+            dot(ui, Color32::from_rgb(r, g, b));
             let who = if user.yourself { format!("{} (you)", user.name) } else { user.name.clone() };
             ui.label(who);
             if user.hands > 0 {
@@ -141,7 +141,7 @@ pub fn show(ui: &mut Ui, network: &mut NetworkView) {
                 ui.weak(format!("{} ms", short(ms)));
             }
             if let Some([here, there]) = user.loss {
-                ui.weak(format!("\u{2193}{} % \u{2191}{} %", short(here), short(there)))
+                ui.weak(format!("lost {} % in, {} % out", short(here), short(there)))
                     .on_hover_text("Lost on the way here, and on the way there.");
             }
         });

@@ -2,7 +2,7 @@
 
 use std::collections::VecDeque;
 
-use bevy_egui::egui::{self, Color32, Ui};
+use bevy_egui::egui::{self, Color32, Sense, TextStyle, Ui, Vec2};
 use egui_plot::{Legend, Line, Plot, PlotPoints};
 
 /// A figure over the last seconds: at most so many points, the oldest forgotten first.
@@ -115,6 +115,13 @@ pub(crate) fn short(value: f64) -> String {
     } else {
         format!("{value:.2}")
     }
+}
+
+/// A dot of a colour, drawn: the sign for it is not in the font.
+pub(crate) fn dot(ui: &mut Ui, colour: Color32) {
+    let side = 0.7 * ui.text_style_height(&TextStyle::Body);
+    let (place, _) = ui.allocate_exact_size(Vec2::splat(side), Sense::hover());
+    ui.painter().circle_filled(place.center(), 0.45 * side, colour);
 }
 
 /// A colour for the `index`th of several lines.

@@ -274,7 +274,7 @@ fn the_figures_of_a_session_are_shown_with_their_units() {
         "4 ticks, snapshots: 1",
         "3",
         "0.25 %",
-        "\u{2193}3.00 % \u{2191}4.00 %",
+        "lost 3.00 % in, 4.00 % out",
     ] {
         assert!(harness.query_by_label(words).is_some(), "{words}");
     }
