@@ -16,7 +16,7 @@ use pliant::{
         VirtualConfig, VirtualDevice, VirtualHandle,
     },
     modal::ModalModel,
-    net::{Emulation, HandOf, HostConfig, Invite, JoinConfig, JoinOptions, NetPlugin, SharedBody},
+    net::{Emulation, HandOf, HostConfig, Invite, JoinConfig, JoinOptions, NetPlugin, NetStats, SharedBody},
     prelude::*,
     stream::emulator::Preset,
 };
@@ -85,17 +85,13 @@ fn guest(model: &Arc<ModalModel>, invite: &Invite) -> Guest {
     Guest { app, device, hand }
 }
 
-impl Guest {
-    fn force(&self) -> DVec3 {
-        let devices = self.app.world().resource::<HapticDevices>();
-        devices.get(self.device).unwrap().report.tick.wrench.force.into()
-    }
-}
+/// So long what must come is waited for: a busy machine makes the test slow and never red.
+const PATIENCE: Duration = Duration::from_secs(60);
 
 fn until(apps: &mut [&mut App], what: &str, mut so: impl FnMut(&mut [&mut App]) -> bool) {
     let start = Instant::now();
     while !so(apps) {
-        assert!(start.elapsed() < Duration::from_secs(30), "never: {what}");
+        assert!(start.elapsed() < PATIENCE, "never: {what}");
         apps.iter_mut().for_each(|app| app.update());
         std::thread::sleep(Duration::from_millis(4));
     }
@@ -121,32 +117,48 @@ fn a_hand_far_away_feels_the_body_at_once_and_nothing_when_the_network_is_gone()
         at_host(apps[0]).is_some()
     });
     // Some time with a still hand, so that the session has measured the way.
-    let start = Instant::now();
-    until(&mut [&mut host, &mut g.app], "time passes", |_| start.elapsed() > Duration::from_secs(2));
+    until(&mut [&mut host, &mut g.app], "two seconds are shown", |apps| {
+        let stats = apps[1].world().resource::<NetStats>();
+        stats.shown > 80 && !stats.round_trip.is_zero()
+    });
 
-    // Not far: a force that a late frame has faded must find what it takes to come back in the tank.
-    g.hand.set_target([0.02, 0.007, 0.0]);
-    let pulled = Instant::now();
-    let mut first = None;
     let hand = g.device;
     let force = |app: &App| -> DVec3 {
         app.world().resource::<HapticDevices>().get(hand).unwrap().report.tick.wrench.force.into()
     };
-    until(
-        &mut [&mut host, &mut g.app],
-        "the hand is pushed back as hard as the host's body pushes",
-        |apps| {
-            let own = force(apps[1]);
-            if own.length() > 0.2 {
-                first.get_or_insert(pulled.elapsed());
-            }
-            let truth = at_host(apps[0]).unwrap_or_default();
-            truth.length() > 0.5 && own.distance(truth) < 0.1 * truth.length()
-        },
-    );
-    let first = first.unwrap();
-    println!("felt after {} ms on a network of 196 ms: {:?} N", first.as_millis(), g.force());
-    assert!(first < Duration::from_millis(190), "own hand first: felt after {first:?}");
+    // A pull is felt before the host can have answered, which is never sooner than the network lets
+    // it. A busy machine may be late all the same, so the hand goes back and pulls again until it
+    // has felt one so soon.
+    let start = Instant::now();
+    loop {
+        // Not far: a force that a late frame has faded must find what it takes to come back in the
+        // tank.
+        g.hand.set_target([0.02, 0.007, 0.0]);
+        let pulled = Instant::now();
+        let mut first = None;
+        until(
+            &mut [&mut host, &mut g.app],
+            "the hand is pushed back as hard as the host's body pushes",
+            |apps| {
+                let own = force(apps[1]);
+                if own.length() > 0.2 {
+                    first.get_or_insert(pulled.elapsed());
+                }
+                let truth = at_host(apps[0]).unwrap_or_default();
+                truth.length() > 0.5 && own.distance(truth) < 0.1 * truth.length()
+            },
+        );
+        let first = first.unwrap();
+        println!("felt after {} ms on a network of 196 ms: {:?} N", first.as_millis(), force(&g.app));
+        if first < Duration::from_millis(190) {
+            break;
+        }
+        assert!(start.elapsed() < PATIENCE, "own hand first: felt after {first:?}");
+        g.hand.set_target([0.0; 3]);
+        until(&mut [&mut host, &mut g.app], "nothing is felt where the hand began", |apps| {
+            force(apps[1]).length() < 0.1 && at_host(apps[0]).is_some_and(|truth| truth.length() < 0.1)
+        });
+    }
 
     // The host's machine stops: no goodbye, nothing.
     std::mem::forget(host);

@@ -14,12 +14,15 @@ use pliant_modal::ModalModel;
 use pliant_net::transport::Limits;
 use pliant_net::{
     Access, BodyArrived, BodyLeft, Emulation, Grant, GuestState, HandOf, HostConfig, HostOptions, Identity,
-    Invite, JoinConfig, JoinOptions, NetGuest, NetHost, NetPlugin, NetStats, RemoteBody, SessionClosed,
-    SessionJoined, SessionLost, SharedBody, Token, User, UserJoined,
+    Invite, JoinConfig, JoinOptions, NetGuest, NetHost, NetPlugin, NetStats, SessionClosed, SessionJoined,
+    SessionLost, SharedBody, Token, User, UserJoined,
 };
 use pliant_stream::UserId;
 use pliant_stream::emulator::{LinkConfig, Loss};
-use support::{TIP, alone, app, bar, guest, host, messages, only, run_for, run_until};
+use support::{
+    TIP, alone, app, arrival, bar, body_of, guest, host, messages, must, only, rests, run_frames, run_until,
+    wait_for,
+};
 
 fn state_of(app: &App) -> GuestState {
     app.world().resource::<NetGuest>().state().clone()
@@ -29,18 +32,36 @@ fn is_in(app: &App) -> bool {
     matches!(state_of(app), GuestState::In { .. })
 }
 
-fn body_of(app: &mut App) -> Option<Entity> {
-    only::<RemoteBody>(app).filter(|&body| app.world().get::<ShownState>(body).is_some())
-}
-
 /// Nothing gets through, either way.
 fn cut() -> Option<Emulation> {
     let link = LinkConfig { loss: Loss::Random(1.0), ..LinkConfig::default() };
     Some(Emulation { outgoing: link.clone(), incoming: link, seed: 1 })
 }
 
-fn quick(limits: Limits) -> Limits {
-    Limits { idle_timeout: Duration::from_secs(1), keep_alive: Duration::from_millis(200), ..limits }
+fn quick(limits: Limits, idle_timeout: Duration) -> Limits {
+    Limits { idle_timeout, keep_alive: Duration::from_millis(200), ..limits }
+}
+
+/// A host and a guest that miss each other after so long.
+fn quick_pair(idle_timeout: Duration) -> (App, Entity, App) {
+    let session = pliant_stream::HostConfig { idle_timeout, ..Default::default() };
+    let limits = quick(Limits::host(), idle_timeout);
+    let transport = HostOptions { limits, ..HostOptions::default() };
+    let (host, invite, body) = host(HostConfig { session, transport, ..HostConfig::default() });
+    let limits = quick(Limits::guest(), idle_timeout);
+    let transport = JoinOptions { limits, ..JoinOptions::default() };
+    let guest = guest(&invite, JoinConfig { transport, name: "Ann".into(), ..JoinConfig::default() });
+    (host, body, guest)
+}
+
+/// Does the guest show the host's body as it is, where a hand holds it?
+fn is_right(apps: &[&mut App], body: Entity, there: Entity, within: f64) -> Result<(), String> {
+    let truth = apps[0].world().get::<BodyState>(body).unwrap().body().q();
+    let size = truth.iter().fold(0.0_f64, |size, q| size.max(q.abs()));
+    must!(size > 0.05 && rests(apps[0], body, size), "{truth:?}");
+    let off = apart(apps[0], body, apps[1], there);
+    must!(off < within, "the picture is off by {off}");
+    Ok(())
 }
 
 /// How far the guest's picture is from the host's body, as a part of the body's largest coordinate.
@@ -54,50 +75,51 @@ fn apart(host: &App, body: Entity, guest: &App, there: Entity) -> f64 {
 #[test]
 fn a_network_that_is_away_for_longer_than_the_timeout_costs_the_time_and_nothing_else() {
     let _alone = alone();
-    let session = pliant_stream::HostConfig { idle_timeout: Duration::from_secs(1), ..Default::default() };
-    let transport = HostOptions { limits: quick(Limits::host()), ..HostOptions::default() };
-    let (mut host, invite, body) = host(HostConfig { session, transport, ..HostConfig::default() });
-    let transport = JoinOptions { limits: quick(Limits::guest()), ..JoinOptions::default() };
-    let mut guest = guest(&invite, JoinConfig { transport, name: "Ann".into(), ..JoinConfig::default() });
-    run_until(&mut [&mut host, &mut guest], 5.0, "the body arrives", |apps| body_of(apps[1]).is_some());
-    let there = body_of(&mut guest).unwrap();
+    let (mut host, body, mut guest) = quick_pair(Duration::from_secs(3));
+    let there = arrival(&mut host, &mut guest);
     let user = match state_of(&guest) {
         GuestState::In { user } => user,
         other => panic!("{other:?}"),
     };
     let own = guest.world_mut().spawn((Grab::new(TIP, 0.3, DVec3::new(1.2, 2.4, 0.4)), GrabOf(there))).id();
-    run_until(&mut [&mut host, &mut guest], 3.0, "the hand takes hold", |apps| {
-        only::<HandOf>(apps[0]).is_some()
-    });
+    run_until(&mut [&mut host, &mut guest], "the hand takes hold", |apps| only::<HandOf>(apps[0]).is_some());
 
     guest.world().resource::<NetGuest>().set_emulation(cut());
     let cut_at = Instant::now();
-    run_until(&mut [&mut host, &mut guest], 6.0, "both ends notice", |apps| {
+    run_until(&mut [&mut host, &mut guest], "both ends notice", |apps| {
         matches!(state_of(apps[1]), GuestState::Lost { .. }) && only::<HandOf>(apps[0]).is_none()
     });
     let noticed = cut_at.elapsed().as_secs_f64();
-    assert!((0.7..4.0).contains(&noticed), "the timeout is 1 s, noticed after {noticed} s");
+    // What was last heard came a little before the cut. The default timeout, in place of the one
+    // that is set, is 10 s.
+    assert!((2.0..9.0).contains(&noticed), "the timeout is 3 s, noticed after {noticed} s");
     assert_eq!(messages::<SessionLost>(&guest).len(), 1);
     assert!(guest.world().get_entity(there).is_ok() && guest.world().get_entity(own).is_ok());
     // The host's body goes on without.
     host.world_mut().spawn((Grab::new(TIP, 0.3, DVec3::new(0.9, 2.8, -0.3)), GrabOf(body)));
-    run_for(&mut [&mut host, &mut guest], 2.0);
+    run_until(&mut [&mut host, &mut guest], "the picture is of the past", |apps| {
+        let off = apart(apps[0], body, apps[1], there);
+        must!(off > 0.1 && is_right(apps, body, there, f64::INFINITY).is_ok(), "off by {off}");
+        Ok(())
+    });
 
     guest.world().resource::<NetGuest>().set_emulation(None);
     let back_at = Instant::now();
-    run_until(&mut [&mut host, &mut guest], 12.0, "the guest is back, hand and all", |apps| {
+    run_until(&mut [&mut host, &mut guest], "the guest is back, hand and all", |apps| {
         is_in(apps[1]) && only::<HandOf>(apps[0]).is_some()
     });
     println!("noticed after {noticed:.2} s, back {:.2} s after the network", back_at.elapsed().as_secs_f64());
     assert_eq!(state_of(&guest), GuestState::In { user }, "the same user");
     assert!(messages::<SessionJoined>(&guest).iter().any(|joined| joined.again && joined.user == user));
     assert!(messages::<UserJoined>(&host).iter().any(|joined| joined.back && joined.name == "Ann"));
-    run_for(&mut [&mut host, &mut guest], 2.0);
+    run_until(&mut [&mut host, &mut guest], "the picture is right, and is felt again", |apps| {
+        is_right(apps, body, there, 0.05)?;
+        let felt = apps[1].world().get::<GrabForce>(own).unwrap().force.length();
+        must!(felt > 0.1, "{felt} N");
+        Ok(())
+    });
     assert_eq!(body_of(&mut guest), Some(there), "the body is on the entity that it was on");
     assert!(messages::<BodyLeft>(&guest).is_empty());
-    let off = apart(&host, body, &guest, there);
-    assert!(off < 0.05, "the picture is off by {off}");
-    assert!(guest.world().get::<GrabForce>(own).unwrap().force.length() > 0.1, "and is felt again");
 }
 
 #[test]
@@ -116,27 +138,24 @@ fn guests_wait_for_a_host_that_is_started_anew() {
     let (mut first, invite, _) = host(config("127.0.0.1:0".parse().unwrap()));
     let address = SocketAddr::from(([127, 0, 0, 1], invite.port));
     let mut guest = guest(&invite, JoinConfig::default());
-    run_until(&mut [&mut first, &mut guest], 5.0, "the body arrives", |apps| body_of(apps[1]).is_some());
-    let there = body_of(&mut guest).unwrap();
+    let there = arrival(&mut first, &mut guest);
     drop(first);
-    run_until(&mut [&mut guest], 3.0, "the guest hears of it", |apps| {
+    run_until(&mut [&mut guest], "the guest hears of it", |apps| {
         matches!(state_of(apps[0]), GuestState::Lost { .. })
     });
     assert!(guest.world().get_entity(there).is_ok(), "what it saw is still there");
     let (mut second, _, body) = host(config(address));
     let restarted = Instant::now();
-    run_until(&mut [&mut second, &mut guest], 8.0, "the guest is back", |apps| {
-        body_of(apps[1]) == Some(there)
-    });
+    run_until(&mut [&mut second, &mut guest], "the guest is back", |apps| body_of(apps[1]) == Some(there));
     println!("back {:.2} s after the host", restarted.elapsed().as_secs_f64());
     second.world_mut().spawn((Grab::new(TIP, 0.3, DVec3::new(0.9, 2.8, -0.3)), GrabOf(body)));
-    run_for(&mut [&mut second, &mut guest], 2.0);
-    let off = apart(&second, body, &guest, there);
-    assert!(off < 0.02, "the picture is off by {off}");
-    // The host's own name is known.
-    let mut users = guest.world_mut().query::<&User>();
-    let host_user = users.iter(guest.world()).find(|user| user.id == UserId::HOST).unwrap();
-    assert_eq!(host_user.name, "Hanna");
+    run_until(&mut [&mut second, &mut guest], "the picture is right, and the host's name is known", |apps| {
+        is_right(apps, body, there, 0.02)?;
+        let mut users = apps[1].world_mut().query::<&User>();
+        let host_user = users.iter(apps[1].world()).find(|user| user.id == UserId::HOST);
+        must!(host_user.is_some_and(|user| user.name == "Hanna"));
+        Ok(())
+    });
     assert!(messages::<SessionClosed>(&guest).is_empty());
 }
 
@@ -155,24 +174,24 @@ fn a_number_is_given_to_nobody_else_also_after_the_host_was_started_anew() {
     let (mut first, invite, _) = start("127.0.0.1:0".parse().unwrap(), Vec::new());
     let address = SocketAddr::from(([127, 0, 0, 1], invite.port));
     let mut ann = join(&invite, "Ann");
-    run_until(&mut [&mut first, &mut ann], 5.0, "Ann is in", |apps| is_in(apps[1]));
+    run_until(&mut [&mut first, &mut ann], "Ann is in", |apps| is_in(apps[1]));
     let mut bob = join(&invite, "Bob");
-    run_until(&mut [&mut first, &mut ann, &mut bob], 5.0, "Bob is in", |apps| is_in(apps[2]));
+    run_until(&mut [&mut first, &mut ann, &mut bob], "Bob is in", |apps| is_in(apps[2]));
     assert_eq!(state_of(&ann), GuestState::In { user: UserId(1) });
     assert_eq!(state_of(&bob), GuestState::In { user: UserId(2) });
     let known: Vec<_> = first.world().resource::<NetHost>().known().collect();
     assert_eq!(known.len(), 2);
     drop(first);
-    run_until(&mut [&mut ann, &mut bob], 3.0, "they hear of it", |apps| {
+    run_until(&mut [&mut ann, &mut bob], "they hear of it", |apps| {
         apps.iter().all(|app| matches!(state_of(app), GuestState::Lost { .. }))
     });
 
     // Somebody who was never here is the first at the door; the others come back later.
     let (mut second, invite, _) = start(address, known);
     let mut new = join(&invite, "Cy");
-    run_until(&mut [&mut second, &mut new], 5.0, "Cy is in", |apps| is_in(apps[1]));
+    run_until(&mut [&mut second, &mut new], "Cy is in", |apps| is_in(apps[1]));
     assert_eq!(state_of(&new), GuestState::In { user: UserId(3) }, "1 and 2 are Ann's and Bob's");
-    run_until(&mut [&mut second, &mut new, &mut ann, &mut bob], 8.0, "Ann and Bob are back", |apps| {
+    run_until(&mut [&mut second, &mut new, &mut ann, &mut bob], "Ann and Bob are back", |apps| {
         is_in(apps[2]) && is_in(apps[3])
     });
     assert_eq!(state_of(&ann), GuestState::In { user: UserId(1) });
@@ -194,7 +213,7 @@ fn two_of_one_token_are_two_users() {
         guest(&invite, JoinConfig { name: name.into(), models: vec![bar()], ..JoinConfig::default() })
     };
     let (mut one, mut two) = (join("one"), join("two"));
-    run_until(&mut [&mut host, &mut one, &mut two], 5.0, "both have the body", |apps| {
+    run_until(&mut [&mut host, &mut one, &mut two], "both have the body", |apps| {
         body_of(apps[1]).is_some() && body_of(apps[2]).is_some()
     });
     let numbers = [state_of(&one), state_of(&two)];
@@ -204,14 +223,14 @@ fn two_of_one_token_are_two_users() {
         let there = body_of(app).unwrap();
         app.world_mut().spawn((Grab::new(TIP, 0.3, DVec3::new(1.2, 2.4, 0.4)), GrabOf(there)));
     }
-    run_until(&mut [&mut host, &mut one, &mut two], 5.0, "two hands of two users", |apps| {
+    run_until(&mut [&mut host, &mut one, &mut two], "two hands of two users", |apps| {
         let mut hands = apps[0].world_mut().query::<&HandOf>();
         let of: Vec<Entity> = hands.iter(apps[0].world()).map(|hand| hand.0).collect();
         of.len() == 2 && of[0] != of[1]
     });
     // One goes; the other, of the same token, stays and holds on.
     drop(one);
-    run_until(&mut [&mut host, &mut two], 5.0, "one has left", |apps| {
+    run_until(&mut [&mut host, &mut two], "one has left", |apps| {
         apps[0].world().resource::<NetHost>().guests().count() == 1
     });
     assert!(is_in(&two) && only::<HandOf>(&mut host).is_some());
@@ -233,16 +252,16 @@ fn two_connections_of_one_key_are_one_user_the_newer() {
         )
     };
     let mut old = join("old");
-    run_until(&mut [&mut host, &mut old], 5.0, "the first is in", |apps| is_in(apps[1]));
+    run_until(&mut [&mut host, &mut old], "the first is in", |apps| is_in(apps[1]));
     let mut new = join("new");
-    run_until(&mut [&mut host, &mut old, &mut new], 5.0, "the second is in, the first is out", |apps| {
+    run_until(&mut [&mut host, &mut old, &mut new], "the second is in, the first is out", |apps| {
         is_in(apps[2]) && matches!(state_of(apps[1]), GuestState::Closed { .. })
     });
     assert_eq!(state_of(&new), GuestState::In { user: UserId(1) }, "under the same number");
     assert_eq!(host.world().resource::<NetHost>().guests().count(), 1);
     // Two of one token, but each with a key of its own, are two users.
     let mut other = guest(&invite, JoinConfig { models: vec![bar()], ..JoinConfig::default() });
-    run_until(&mut [&mut host, &mut new, &mut other], 5.0, "another one", |apps| is_in(apps[2]));
+    run_until(&mut [&mut host, &mut new, &mut other], "another one", |apps| is_in(apps[2]));
     assert_eq!(host.world().resource::<NetHost>().guests().count(), 2);
 }
 
@@ -251,62 +270,76 @@ fn a_guest_that_is_sent_away_does_not_come_back() {
     let _alone = alone();
     let (mut host, invite, _) = host(HostConfig::default());
     let mut guest = guest(&invite, JoinConfig::default());
-    run_until(&mut [&mut host, &mut guest], 5.0, "the guest is in", |apps| is_in(apps[1]));
+    run_until(&mut [&mut host, &mut guest], "the guest is in", |apps| is_in(apps[1]));
     let user = host.world().resource::<NetHost>().guests().next().unwrap();
     assert!(host.world().resource::<NetHost>().key_of(user).is_some());
     assert!(host.world_mut().resource_mut::<NetHost>().expel(user));
-    run_until(&mut [&mut host, &mut guest], 3.0, "it is told", |apps| {
+    run_until(&mut [&mut host, &mut guest], "it is told", |apps| {
         matches!(state_of(apps[1]), GuestState::Closed { .. })
     });
-    run_for(&mut [&mut host, &mut guest], 1.0);
-    assert_eq!(host.world().resource::<NetHost>().guests().count(), 0);
+    // It would be back before another one has joined and has its body.
+    let mut other = support::guest(&invite, JoinConfig::default());
+    run_until(&mut [&mut host, &mut other, &mut guest], "another one joins", |apps| body_of(apps[1]));
+    run_frames(&mut [&mut host, &mut other, &mut guest], 100);
+    assert_eq!(host.world().resource::<NetHost>().guests().count(), 1);
+    assert!(matches!(state_of(&guest), GuestState::Closed { .. }));
     assert!(messages::<BodyArrived>(&guest).len() <= 1);
 }
 
-/// Seconds until a guest, 100 ms there and back away, shows a body as it is. Up to four times, until it is within `bar`: other work on the machine makes it
-/// slower, nothing makes it faster.
-fn first_picture(host: &mut App, body: Entity, invite: &Invite, models: &[Arc<ModalModel>], bar: f64) -> f64 {
-    let tries = std::iter::repeat_with(|| one_first_picture(host, body, invite, models.to_vec()));
-    let mut best = f64::INFINITY;
-    for took in tries.take(4) {
-        best = best.min(took);
-        if best < bar {
-            break;
-        }
-    }
-    best
+/// There and back. The machine's own time for a join, which is work and not way, is little beside
+/// ten of these.
+const ROUND_TRIP: f64 = 0.6;
+/// A join is done in ten round trips: over 100 ms in a second.
+const JOIN: f64 = 10.0 * ROUND_TRIP;
+
+/// Seconds until a guest shows a body as it is. Guests join until one is there within `most`: other
+/// work on the machine makes it slower, nothing makes it faster.
+fn first_picture(
+    host: &mut App,
+    body: Entity,
+    invite: &Invite,
+    models: &[Arc<ModalModel>],
+    most: f64,
+) -> f64 {
+    run_until(&mut [&mut *host], "the host's body rests where it is held", |apps| {
+        let truth = apps[0].world().get::<BodyState>(body).unwrap().body().q();
+        let size = truth.iter().fold(0.0_f64, |size, q| size.max(q.abs()));
+        size > 0.0 && rests(apps[0], body, size)
+    });
+    wait_for("a right picture in ten round trips and the model's bytes", || {
+        let took = one_first_picture(host, body, invite, models.to_vec());
+        must!(took < most, "{took} s, not {most} s");
+        Ok(took)
+    })
 }
 
 fn one_first_picture(host: &mut App, body: Entity, invite: &Invite, models: Vec<Arc<ModalModel>>) -> f64 {
-    let link = LinkConfig { delay: Duration::from_millis(50), ..LinkConfig::default() };
+    let link = LinkConfig { delay: Duration::from_secs_f64(0.5 * ROUND_TRIP), ..LinkConfig::default() };
     let emulation = Some(Emulation { outgoing: link.clone(), incoming: link, seed: 1 });
     let transport = JoinOptions { emulation, ..JoinOptions::default() };
     let began = Instant::now();
     let mut guest = guest(invite, JoinConfig { transport, models, ..JoinConfig::default() });
-    run_until(&mut [host, &mut guest], 20.0, "the body is shown as it is", |apps| {
-        let Some(there) = body_of(apps[1]) else { return false };
-        apart(apps[0], body, apps[1], there) < 0.05
+    run_until(&mut [host, &mut guest], "the body is shown as it is", |apps| {
+        let there = body_of(apps[1])?;
+        (apart(apps[0], body, apps[1], there) < 0.05).then_some(())
     });
     began.elapsed().as_secs_f64()
 }
 
 #[test]
-fn joining_over_100_ms_takes_less_than_a_second_and_the_models_bytes() {
+fn joining_takes_less_than_ten_round_trips_and_the_models_bytes() {
     let _alone = alone();
     let (mut host, invite, body) = host(HostConfig::default());
     host.world_mut().spawn((Grab::new(TIP, 0.3, DVec3::new(1.2, 2.4, 0.4)), GrabOf(body)));
-    run_for(&mut [&mut host], 1.5);
-    let cached = first_picture(&mut host, body, &invite, &[bar()], 1.0);
-    let bytes = bar().file_bytes() as f64;
-    let sent = first_picture(&mut host, body, &invite, &[], 1.0 + bytes / 1e6);
-    println!("first right picture after {cached:.2} s, after {sent:.2} s with a model of {bytes} bytes");
-    assert!(cached < 1.0, "{cached} s");
+    let cached = first_picture(&mut host, body, &invite, &[bar()], JOIN);
     // A host's default is 1 MB/s for models.
-    assert!(sent < 1.0 + bytes / 1e6, "{sent} s");
+    let bytes = bar().file_bytes() as f64;
+    let sent = first_picture(&mut host, body, &invite, &[], JOIN + bytes / 1e6);
+    println!("first right picture after {cached:.2} s, after {sent:.2} s with a model of {bytes} bytes");
 }
 
 #[test]
-fn joining_the_shipped_body_over_100_ms_takes_less_than_a_second_and_the_models_bytes() {
+fn joining_the_shipped_body_takes_less_than_ten_round_trips_and_the_models_bytes() {
     let _alone = alone();
     let file = std::path::Path::new(concat!(env!("CARGO_MANIFEST_DIR"), "/../../assets/pip.modal"));
     let model = Arc::new(ModalModel::read(file).unwrap());
@@ -319,35 +352,31 @@ fn joining_the_shipped_body_over_100_ms_takes_less_than_a_second_and_the_models_
     let top = (0..positions.len()).max_by(|&a, &b| positions[a][1].total_cmp(&positions[b][1])).unwrap();
     let at = Vec3::from(positions[top]).as_dvec3() + DVec3::new(0.04, 0.0, 0.02);
     host.world_mut().spawn((Grab::new(top as u32, 0.03, at), GrabOf(body)));
-    run_for(&mut [&mut host], 3.0);
-    let cached = first_picture(&mut host, body, &invite, std::slice::from_ref(&model), 1.0);
+    let cached = first_picture(&mut host, body, &invite, std::slice::from_ref(&model), JOIN);
     let bytes = model.file_bytes() as f64;
-    let sent = first_picture(&mut host, body, &invite, &[], 1.0 + bytes / 1e6);
+    let sent = first_picture(&mut host, body, &invite, &[], JOIN + bytes / 1e6);
     println!("the shipped body: after {cached:.2} s, after {sent:.2} s with a model of {bytes} bytes");
-    assert!(cached < 1.0, "{cached} s");
     assert!(sent > 0.8 * bytes / 1e6, "{sent} s: faster than the rate cap");
-    assert!(sent < 1.0 + bytes / 1e6, "{sent} s");
 }
 
 #[test]
 fn bodies_stay_while_a_host_that_was_lost_twice_is_waited_for() {
     let _alone = alone();
-    let session = pliant_stream::HostConfig { idle_timeout: Duration::from_secs(1), ..Default::default() };
-    let transport = HostOptions { limits: quick(Limits::host()), ..HostOptions::default() };
-    let (mut host, invite, _) = host(HostConfig { session, transport, ..HostConfig::default() });
-    let transport = JoinOptions { limits: quick(Limits::guest()), ..JoinOptions::default() };
-    let mut guest = guest(&invite, JoinConfig { transport, models: vec![bar()], ..JoinConfig::default() });
-    run_until(&mut [&mut host, &mut guest], 5.0, "the body arrives", |apps| body_of(apps[1]).is_some());
-    let there = body_of(&mut guest).unwrap();
+    // Soon lost: bodies are waited for for five seconds after a return.
+    let (mut host, _, mut guest) = quick_pair(Duration::from_secs(1));
+    let there = arrival(&mut host, &mut guest);
     let lost = |app: &App| matches!(state_of(app), GuestState::Lost { .. });
     guest.world().resource::<NetGuest>().set_emulation(cut());
-    run_until(&mut [&mut host, &mut guest], 6.0, "it is lost", |apps| lost(apps[1]));
+    run_until(&mut [&mut host, &mut guest], "it is lost", |apps| lost(apps[1]));
     guest.world().resource::<NetGuest>().set_emulation(None);
-    run_until(&mut [&mut host, &mut guest], 12.0, "it is back", |apps| is_in(apps[1]));
+    run_until(&mut [&mut host, &mut guest], "it is back", |apps| is_in(apps[1]));
     // Lost again, before the time is over in which the bodies of the first session are waited for.
     guest.world().resource::<NetGuest>().set_emulation(cut());
-    run_until(&mut [&mut host, &mut guest], 6.0, "it is lost again", |apps| lost(apps[1]));
-    run_for(&mut [&mut host, &mut guest], 6.0);
+    run_until(&mut [&mut host, &mut guest], "it is lost again", |apps| lost(apps[1]));
+    let since = Instant::now();
+    run_until(&mut [&mut host, &mut guest], "that time is over", |_| {
+        since.elapsed() > Duration::from_secs(6)
+    });
     assert!(lost(&guest));
     assert!(guest.world().get_entity(there).is_ok(), "what was there stays as it was last seen");
     assert!(messages::<BodyLeft>(&guest).is_empty());
@@ -355,7 +384,7 @@ fn bodies_stay_while_a_host_that_was_lost_twice_is_waited_for() {
     let before = *guest.world().resource::<NetStats>();
     assert!(before.datagrams_in > 0 && before.bytes_in > 0, "{before:?}");
     guest.world().resource::<NetGuest>().set_emulation(None);
-    run_until(&mut [&mut host, &mut guest], 12.0, "it is back for good", |apps| {
+    run_until(&mut [&mut host, &mut guest], "it is back for good", |apps| {
         is_in(apps[1]) && body_of(apps[1]).is_some()
     });
     assert_eq!(body_of(&mut guest), Some(there));

@@ -185,6 +185,27 @@ mod tests {
         assert!(hand.queue.len() <= MOST_WAITING);
     }
 
+    /// A guest that rests says so six times and is silent then.
+    #[test]
+    fn a_silent_hand_comes_to_rest_where_it_was_said() {
+        let mut hand = HandPlayout::new(DVec3::ZERO);
+        for input in 0..5 {
+            hand.take(input, 1, DVec3::X * 0.01 * f64::from(input));
+            hand.next(1, MOST);
+        }
+        // A tick without a target is guessed, so what comes next is a correction that fades.
+        hand.next(1, MOST);
+        let end = DVec3::Y * 0.3;
+        for input in 5..11 {
+            hand.take(input, 1, end);
+            hand.next(1, MOST);
+        }
+        for _ in 0..40 {
+            hand.next(1, MOST);
+        }
+        assert_eq!(hand.next(1, MOST), end);
+    }
+
     #[test]
     fn a_hand_that_rests_and_moves_again_is_where_it_says() {
         let mut hand = HandPlayout::new(DVec3::ZERO);

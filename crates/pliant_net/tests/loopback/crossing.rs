@@ -5,11 +5,13 @@ use std::time::{Duration, Instant};
 
 use bytes::Bytes;
 use pliant_net::transport::{
-    CloseReason, Emulation, Endpoint, Event, HostOptions, Identity, Invite, JoinOptions, PeerId, SendError,
+    CloseReason, Emulation, Endpoint, Event, HostOptions, Identity, Invite, JoinOptions, Limits, PeerId,
+    RateCap, SendError,
 };
-use pliant_stream::emulator::Preset;
+use pliant_stream::emulator::{LinkConfig, Preset};
 
-use crate::endpoints::{closed, connected, datagram, guest, host, message};
+use crate::endpoints::{closed, connected, datagram, guest, host, message, patient};
+use crate::patience::{must, wait_for};
 
 #[test]
 fn datagrams_and_messages_cross_both_ways_and_a_goodbye_is_heard() {
@@ -26,20 +28,6 @@ fn datagrams_and_messages_cross_both_ways_and_a_goodbye_is_heard() {
     guest.send_datagram(at_guest, Bytes::from_static(b"target")).unwrap();
     assert_eq!(datagram(&host), "target");
 
-    // Three megabytes at 8 Mbit/s take three seconds; half of one is enough to see order and wholeness.
-    let model: Bytes = (0..500_000u32).map(|i| (i.wrapping_mul(2_654_435_761) >> 24) as u8).collect();
-    host.send_message(at_host, model.clone()).unwrap();
-    host.send_message(at_host, Bytes::new()).unwrap();
-    host.send_message(at_host, Bytes::from_static(b"last")).unwrap();
-    let start = Instant::now();
-    assert_eq!(message(&guest), model);
-    let seconds = start.elapsed().as_secs_f64();
-    assert!(seconds > 0.4, "500 kB in {seconds} s is above the cap of 8 Mbit/s");
-    assert_eq!(message(&guest), "");
-    assert_eq!(message(&guest), "last");
-    guest.send_message(at_guest, Bytes::from_static(b"thanks")).unwrap();
-    assert_eq!(message(&host), "thanks");
-
     let most = host.max_datagram_size(at_host).unwrap();
     assert!((1100..1200).contains(&most), "QUIC's smallest packet less its headers, not {most}");
     let large = Bytes::from(vec![0; most + 1]);
@@ -47,10 +35,30 @@ fn datagrams_and_messages_cross_both_ways_and_a_goodbye_is_heard() {
     host.send_datagram(at_host, Bytes::from(vec![7; most])).unwrap();
     assert_eq!(datagram(&guest).len(), most);
 
-    std::thread::sleep(Duration::from_millis(150));
-    let stats = host.stats(at_host).unwrap();
-    assert_eq!((stats.sent_datagrams, stats.received_datagrams, stats.dropped.too_large), (2, 1, 1));
-    assert!(stats.round_trip < Duration::from_millis(100) && stats.loss() == 0.0, "{stats:?}");
+    // So little fits every buffer of the system, however late a thread comes to empty it: nothing
+    // is lost.
+    wait_for("the figures", || {
+        let stats = host.stats(at_host).unwrap();
+        must!((stats.sent_datagrams, stats.received_datagrams) == (2, 1), "{stats:?}");
+        must!(stats.dropped.too_large == 1, "{stats:?}");
+        must!(stats.round_trip < Duration::from_millis(100), "{stats:?}");
+        must!(stats.loss() == 0.0, "{stats:?}");
+        Ok(())
+    });
+
+    // Three megabytes at 8 Mbit/s take three seconds; half of one is enough to see order and wholeness.
+    let start = Instant::now();
+    let model: Bytes = (0..500_000u32).map(|i| (i.wrapping_mul(2_654_435_761) >> 24) as u8).collect();
+    host.send_message(at_host, model.clone()).unwrap();
+    host.send_message(at_host, Bytes::new()).unwrap();
+    host.send_message(at_host, Bytes::from_static(b"last")).unwrap();
+    assert_eq!(message(&guest), model);
+    let seconds = start.elapsed().as_secs_f64();
+    assert!(seconds > 0.4, "500 kB in {seconds} s is above the cap of 8 Mbit/s");
+    assert_eq!(message(&guest), "");
+    assert_eq!(message(&guest), "last");
+    guest.send_message(at_guest, Bytes::from_static(b"thanks")).unwrap();
+    assert_eq!(message(&host), "thanks");
 
     guest.send_message(at_guest, Bytes::from_static(b"said before leaving")).unwrap();
     guest.close(at_guest, "bye\n\u{7}now");
@@ -67,56 +75,87 @@ fn dropping_an_endpoint_says_goodbye() {
     let guest = guest(&host.invite());
     connected(&guest);
     connected(&host);
-    let start = Instant::now();
+    // It is said: the idle timeout would be another reason.
     drop(guest);
     assert!(matches!(closed(&host), CloseReason::ByPeer { .. }));
-    assert!(start.elapsed() < Duration::from_millis(900), "sooner than any timeout: {:?}", start.elapsed());
     let guest = self::guest(&host.invite());
     connected(&guest);
     drop(host);
     assert!(matches!(closed(&guest), CloseReason::ByPeer { words } if words.contains("host")));
 }
 
+/// Datagrams that an endpoint has let come so far.
+fn arrived(endpoint: &Endpoint, whole: &mut Vec<usize>) -> usize {
+    let datagram = |event| match event {
+        Event::Datagram { .. } => 1,
+        Event::Message { bytes, .. } => {
+            whole.push(bytes.len());
+            0
+        }
+        other => panic!("{other:?}"),
+    };
+    std::iter::from_fn(|| endpoint.poll()).map(datagram).sum()
+}
+
 #[test]
 fn a_lossy_link_loses_its_share_of_datagrams_and_no_message() {
-    let host = Endpoint::host(HostOptions::default()).unwrap();
-    let emulation = Emulation::preset(Preset::Paper1, 1);
-    let options = JoinOptions { emulation: Some(emulation), ..JoinOptions::default() };
+    // The link has no rate and the endpoints have a low one, and queues for all: what a thread that
+    // comes late finds fits every buffer, so that only the link loses, and as much at whatever
+    // speed.
+    let slow = |limits: Limits| {
+        let (queued_datagrams, rate) = (2000, RateCap::from_mbit_per_s(2.0));
+        patient(Limits { queued_datagrams, rate, ..limits })
+    };
+    let link = LinkConfig { bits_per_second: None, ..LinkConfig::preset(Preset::Paper1) };
+    let emulation = Some(Emulation { outgoing: link.clone(), incoming: link, seed: 1 });
+    let host =
+        Endpoint::host(HostOptions { limits: slow(Limits::host()), ..HostOptions::default() }).unwrap();
+    let options = JoinOptions { emulation, limits: slow(Limits::guest()), ..JoinOptions::default() };
     let guest = Endpoint::join(&host.invite(), options).unwrap();
     connected(&guest);
     let (peer, _) = connected(&host);
     let model = Bytes::from(vec![5; 100_000]);
     host.send_message(peer, model.clone()).unwrap();
-    let (mut at_host, mut at_guest, mut whole) = (0, 0, false);
-    let sent = 500;
+    let sent = 1000;
+    // Two of them do not fit one packet, which would make the loss of one that of the other.
     for _ in 0..sent {
-        host.send_datagram(peer, Bytes::from(vec![0; 270])).unwrap();
-        guest.send_datagram(PeerId::HOST, Bytes::from(vec![0; 40])).unwrap();
-        std::thread::sleep(Duration::from_millis(4));
-        while let Some(event) = guest.poll() {
-            match event {
-                Event::Datagram { .. } => at_guest += 1,
-                Event::Message { bytes, .. } => whole |= bytes == model,
-                other => panic!("{other:?}"),
-            }
-        }
-        at_host += std::iter::from_fn(|| host.poll()).count();
+        host.send_datagram(peer, Bytes::from(vec![0; 700])).unwrap();
+        guest.send_datagram(PeerId::HOST, Bytes::from(vec![0; 700])).unwrap();
     }
-    std::thread::sleep(Duration::from_millis(400));
-    while let Some(event) = guest.poll() {
-        at_guest += usize::from(matches!(event, Event::Datagram { .. }));
-    }
-    at_host += std::iter::from_fn(|| host.poll()).count();
-    assert!(whole, "a message of 100 kB did not cross in two seconds");
+    let (mut at_host, mut at_guest) = ((0, Vec::new()), (0, Vec::new()));
+    let mut listen = || {
+        at_host.0 += arrived(&host, &mut at_host.1);
+        at_guest.0 += arrived(&guest, &mut at_guest.1);
+        (at_host.clone(), at_guest.clone())
+    };
+    let out = |endpoint: &Endpoint, peer| endpoint.stats(peer).unwrap().sent_datagrams == sent;
+    wait_for("all is sent", || {
+        listen();
+        out(&host, peer) && out(&guest, PeerId::HOST)
+    });
+    // The last word comes after all that is not lost.
+    host.send_message(peer, Bytes::from_static(b"end")).unwrap();
+    guest.send_message(PeerId::HOST, Bytes::from_static(b"end")).unwrap();
+    let (at_host, at_guest) = wait_for("the last words", || {
+        let (at_host, at_guest) = listen();
+        (at_host.1 == [3] && at_guest.1 == [model.len(), 3]).then_some((at_host, at_guest))
+    });
     let stats = host.stats(peer).unwrap();
-    for arrived in [at_host, at_guest] {
-        let loss = 1.0 - arrived as f64 / f64::from(sent);
-        // Three standard deviations of a share of 9 % in 500 are 3.8 %. A window that backed off would lose far more.
+    for (arrived, _) in [at_host, at_guest] {
+        let loss = 1.0 - arrived as f64 / sent as f64;
+        // Four standard deviations of a share of 9 % in 1,000 are 3.6 %.
         assert!((loss - 0.09).abs() < 0.04, "lost {loss}: {stats:?}");
     }
-    let round_trip = stats.round_trip.as_secs_f64();
-    assert!((0.19..0.30).contains(&round_trip), "196 ms and the acknowledgement's delay, not {round_trip}");
-    assert!((stats.loss() - 0.09).abs() < 0.05, "QUIC's own count: {stats:?}");
+    assert_eq!(stats.dropped.all() + guest.stats(PeerId::HOST).unwrap().dropped.all(), 0);
+    // One that backs off at a loss has come down to some 5 kB by now: 200 kbit/s.
+    assert!(stats.window > 50_000, "{stats:?}");
+    // Of a connection that lives on the round trip is measured on.
+    wait_for("196 ms and the acknowledgement's delay, QUIC's own count of the loss", || {
+        let stats = host.stats(peer).unwrap();
+        must!((0.19..0.30).contains(&stats.round_trip.as_secs_f64()), "{stats:?}");
+        must!((stats.loss() - 0.09).abs() < 0.05, "{stats:?}");
+        Ok(())
+    });
 }
 
 #[test]
@@ -130,13 +169,12 @@ fn a_guest_that_changes_its_address_stays_connected() {
     let after = guest.local_address();
     assert_ne!(before, after);
     // Datagrams and messages go on, both ways, and nobody was told of an end.
-    let start = Instant::now();
-    while start.elapsed() < Duration::from_secs(2) && host.address(peer) != Some(after) {
+    wait_for("the host sees where the guest is now", || {
         guest.send_datagram(PeerId::HOST, Bytes::from_static(b"moved")).unwrap();
         host.send_datagram(peer, Bytes::from_static(b"seen")).unwrap();
         std::thread::sleep(Duration::from_millis(20));
-    }
-    assert_eq!(host.address(peer), Some(after), "the host sees where the guest is now");
+        host.address(peer) == Some(after)
+    });
     guest.send_message(PeerId::HOST, Bytes::from_static(b"from there")).unwrap();
     assert_eq!(message(&host), "from there");
     host.send_message(peer, Bytes::from_static(b"to there")).unwrap();
@@ -157,18 +195,25 @@ fn a_link_is_put_under_an_open_session_and_taken_out_again() {
         assert_eq!(datagram(&guest), "pong");
         start.elapsed().as_secs_f64()
     };
-    let median = |mut times: Vec<f64>| {
-        times.sort_by(f64::total_cmp);
-        times[times.len() / 2]
+    // A busy machine makes a round longer and nothing makes it shorter than its link. So the
+    // medians of nine are taken until one is short enough: with the link none ever is as short as
+    // without it.
+    let median = |longest: f64| {
+        let nine = || {
+            let mut times: [f64; 9] = std::array::from_fn(|_| round());
+            times.sort_by(f64::total_cmp);
+            must!(times[4] < longest, "{times:?}");
+            Ok(times)
+        };
+        wait_for("nine rounds of which most are short enough", nine)
     };
-    let bare = median((0..9).map(|_| round()).collect());
+    median(0.010);
     // The fourth network: no loss, 20 ms there and back. It stands on the guest's side only, for both directions.
     guest.set_emulation(Some(Emulation::preset(Preset::Paper4, 1)));
-    let with = median((0..9).map(|_| round()).collect());
+    let with = median(0.040);
+    assert!(with[0] > 0.019, "a round over 20 ms took {} s", with[0]);
     guest.set_emulation(None);
-    let without = median((0..9).map(|_| round()).collect());
-    assert!(bare < 0.010 && without < 0.010, "bare {bare} s, without a link again {without} s");
-    assert!((0.019..0.040).contains(&with), "20 ms and the scheduler's, not {with} s");
+    median(0.010);
 }
 
 #[test]

@@ -1,25 +1,33 @@
 //! A host, a guest, and the next thing that happened to them.
 
-use std::time::{Duration, Instant};
+use std::time::Duration;
 
 use bytes::Bytes;
 use pliant_net::transport::{
     CloseReason, Endpoint, Event, Fingerprint, HostOptions, Invite, JoinOptions, Limits, PeerId,
 };
 
-pub const PATIENCE: Duration = Duration::from_secs(5);
+use crate::patience::wait_for;
 
 /// The next event that `wanted` accepts; others are passed over.
 pub fn next<T>(endpoint: &Endpoint, mut wanted: impl FnMut(Event) -> Option<T>) -> T {
-    let start = Instant::now();
-    while start.elapsed() < PATIENCE {
-        match endpoint.poll().map(&mut wanted) {
-            Some(Some(found)) => return found,
-            Some(None) => {}
-            None => std::thread::sleep(Duration::from_millis(1)),
-        }
-    }
-    panic!("nothing of the kind within {PATIENCE:?}");
+    wait_for("an event of the kind", || std::iter::from_fn(|| endpoint.poll()).find_map(&mut wanted))
+}
+
+/// The very next event.
+pub fn first(endpoint: &Endpoint) -> Event {
+    wait_for("an event", || endpoint.poll())
+}
+
+/// A guest comes in, and its coming is the first that the application of `host` hears: of nobody
+/// before.
+pub fn is_first_heard_of(host: &Endpoint) -> Endpoint {
+    let guest = guest(&host.invite());
+    let heard = first(host);
+    let own = guest.fingerprint();
+    let so = matches!(heard, Event::Connected { fingerprint, .. } if fingerprint == own);
+    assert!(so, "{heard:?}");
+    guest
 }
 
 pub fn connected(endpoint: &Endpoint) -> (PeerId, Fingerprint) {
@@ -53,14 +61,23 @@ pub fn datagram(endpoint: &Endpoint) -> Bytes {
     })
 }
 
+/// Misses a silent peer after two seconds.
 pub fn quick(limits: Limits) -> Limits {
-    Limits { idle_timeout: Duration::from_secs(1), keep_alive: Duration::from_millis(200), ..limits }
+    Limits { idle_timeout: Duration::from_secs(2), keep_alive: Duration::from_millis(200), ..limits }
+}
+
+/// Takes a peer that a busy machine keeps silent for one that is there, and measures often.
+pub fn patient(limits: Limits) -> Limits {
+    let half_a_minute = Duration::from_secs(30);
+    let keep_alive = Duration::from_millis(200);
+    Limits { idle_timeout: half_a_minute, handshake: half_a_minute, keep_alive, ..limits }
 }
 
 pub fn host() -> Endpoint {
-    Endpoint::host(HostOptions { limits: quick(Limits::host()), ..HostOptions::default() }).unwrap()
+    Endpoint::host(HostOptions { limits: patient(Limits::host()), ..HostOptions::default() }).unwrap()
 }
 
 pub fn guest(invite: &Invite) -> Endpoint {
-    Endpoint::join(invite, JoinOptions { limits: quick(Limits::guest()), ..JoinOptions::default() }).unwrap()
+    let limits = patient(Limits::guest());
+    Endpoint::join(invite, JoinOptions { limits, ..JoinOptions::default() }).unwrap()
 }

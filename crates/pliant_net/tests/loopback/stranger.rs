@@ -2,8 +2,11 @@
 
 use std::net::SocketAddr;
 use std::sync::Arc;
+use std::time::Duration;
 
 use pliant_net::transport::Endpoint;
+
+use crate::patience::{Look, wait_for};
 
 /// A guest made of bare quinn, which can do what ours never does.
 pub struct Stranger {
@@ -77,6 +80,14 @@ impl Stranger {
             endpoint
         });
         Self { runtime, endpoint }
+    }
+
+    /// Lives on until `look` finds what is awaited: nobody else drives its side.
+    pub fn live_until<L: Look>(&self, awaited: &str, mut look: impl FnMut() -> L) -> L::Found {
+        wait_for(awaited, || {
+            self.runtime.block_on(async { tokio::time::sleep(Duration::from_millis(1)).await });
+            look()
+        })
     }
 
     pub fn connect(&self, host: &Endpoint) -> Result<quinn::Connection, quinn::ConnectionError> {

@@ -1,5 +1,7 @@
 //! Apps that share a body over loopback, and a body whose modes are known in closed form.
-#![allow(dead_code, reason = "each test uses its part")]
+#![allow(dead_code, unused_imports, reason = "each test uses its part")]
+
+mod patience;
 
 use std::f64::consts::{FRAC_PI_2, TAU};
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
@@ -10,9 +12,12 @@ use bevy::{
     ecs::message::{MessageRegistry, ShouldUpdateMessages},
     prelude::*,
 };
-use pliant_body::{ModalAsset, ModalBody, PliantBodyPlugin};
+use pliant_body::{BodyState, ModalAsset, ModalBody, PliantBodyPlugin, PliantTick, ShownState};
 use pliant_modal::{BakeInfo, Damping, Element, FlexibilitySite, ModalModel, ModelParts, Patch, SurfaceMesh};
-use pliant_net::{HostConfig, Invite, JoinConfig, NetPlugin, SharedBody};
+use pliant_net::{HostConfig, Invite, JoinConfig, NetPlugin, NetStats, RemoteBody, SharedBody};
+
+pub(crate) use patience::must;
+pub use patience::{Look, PATIENCE, wait_for};
 
 /// Cells along the bar.
 const CELLS: u32 = 16;
@@ -138,27 +143,109 @@ pub fn guest(invite: &Invite, config: JoinConfig) -> App {
     app(NetPlugin::join(invite, config).unwrap())
 }
 
-/// Runs the apps at some 150 frames a second until `done` says so. Panics, saying what was awaited, after `seconds`.
-pub fn run_until(
+/// Runs the apps, at some 150 frames a second where the machine has the time, until `look` finds
+/// what is awaited. Panics, saying what is still off, after [`PATIENCE`].
+pub fn run_until<L: Look>(
     apps: &mut [&mut App],
-    seconds: f64,
     awaited: &str,
-    mut done: impl FnMut(&mut [&mut App]) -> bool,
-) {
-    let start = Instant::now();
-    loop {
+    mut look: impl FnMut(&mut [&mut App]) -> L,
+) -> L::Found {
+    wait_for(awaited, || {
+        std::thread::sleep(Duration::from_millis(4));
         apps.iter_mut().for_each(|app| app.update());
-        if done(apps) {
-            return;
-        }
-        assert!(start.elapsed().as_secs_f64() < seconds, "within {seconds} s: {awaited}");
-        std::thread::sleep(Duration::from_millis(5));
+        look(apps)
+    })
+}
+
+/// Runs the apps for so many frames, to see that nothing comes of it. What must come is waited for
+/// instead.
+pub fn run_frames(apps: &mut [&mut App], frames: usize) {
+    let mut left = frames;
+    run_until(apps, "the frames are over", |_| {
+        left = left.saturating_sub(1);
+        left == 0
+    });
+}
+
+/// What has come to a guest while its host has made so many steps, in so many seconds.
+#[derive(Debug, Clone, Copy)]
+pub struct Came {
+    pub datagrams: u64,
+    pub bytes: u64,
+    ticks: u64,
+    seconds: f64,
+}
+
+impl Came {
+    /// Bytes in as many ticks as there should be in a second.
+    pub fn bytes_in_40_ticks(&self) -> f64 {
+        40.0 * self.bytes as f64 / self.ticks as f64
+    }
+
+    /// Bytes in a second, or in less than one.
+    pub fn bytes_in_a_second(&self) -> f64 {
+        self.bytes as f64 / self.seconds.max(1.0)
+    }
+
+    /// A datagram for nearly every tick: 30 in 40.
+    pub fn ticks_come(self) -> Result<Self, String> {
+        must!(40 * self.datagrams > 30 * self.ticks, "{self:?}");
+        Ok(self)
+    }
+
+    /// What nobody looks at does not come. The clock's answers are two a second, however many ticks
+    /// the host makes.
+    pub fn only_the_clock(self) -> Result<Self, String> {
+        must!(self.datagrams as f64 <= 5.0 * self.seconds.max(1.0), "{self:?}");
+        Ok(self)
     }
 }
 
-pub fn run_for(apps: &mut [&mut App], seconds: f64) {
-    let start = Instant::now();
-    run_until(apps, seconds + 10.0, "the time", |_| start.elapsed().as_secs_f64() >= seconds);
+/// For [`run_until`] with a host and a guest: what comes while the host makes forty steps, again
+/// and again until `look` finds it right. What was on its way before then does not matter, nor what
+/// a busy machine drops now and then.
+pub fn window<T>(
+    look: impl Fn(Came) -> Result<T, String>,
+) -> impl FnMut(&mut [&mut App]) -> Result<T, String> {
+    let mut begin: Option<(NetStats, u64, Instant)> = None;
+    let mut last = String::from("forty steps are not over");
+    move |apps| {
+        let (stats, now) = (*apps[1].world().resource::<NetStats>(), tick(apps[0]));
+        let (before, first, start) = begin.get_or_insert((stats, now, Instant::now()));
+        if now < *first + 40 {
+            return Err(last.clone());
+        }
+        let came = Came {
+            datagrams: stats.datagrams_in - before.datagrams_in,
+            bytes: stats.bytes_in - before.bytes_in,
+            ticks: now - *first,
+            seconds: start.elapsed().as_secs_f64(),
+        };
+        begin = None;
+        look(came).inspect_err(|off| last.clone_from(off))
+    }
+}
+
+/// The steps that an app's bodies have made.
+pub fn tick(app: &App) -> u64 {
+    app.world().resource::<PliantTick>().0
+}
+
+/// The host's body that a guest is shown, once it is.
+pub fn body_of(guest: &mut App) -> Option<Entity> {
+    only::<RemoteBody>(guest).filter(|&body| guest.world().get::<ShownState>(body).is_some())
+}
+
+/// Waits for the host's body on a guest.
+pub fn arrival(host: &mut App, guest: &mut App) -> Entity {
+    run_until(&mut [host, guest], "the body arrives", |apps| body_of(apps[1]))
+}
+
+/// Has a body come to rest? It is so slow that in a tenth of a second it moves by less than a
+/// hundredth of `size`.
+pub fn rests(app: &App, body: Entity, size: f64) -> bool {
+    let speed = app.world().get::<BodyState>(body).unwrap().body().v().iter().map(|v| v * v).sum::<f64>();
+    speed.sqrt() < 0.1 * size
 }
 
 /// The messages of a kind so far.
