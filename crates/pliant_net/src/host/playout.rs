@@ -81,15 +81,12 @@ impl HandPlayout {
                 Some(target) => {
                     let follows = skipped.is_none() && !self.guessed;
                     let offset = if follows { self.shown - self.said } else { expected - target };
-                    let offset = offset * FADE;
-                    // A difference that small is none: then the guest recognises its own targets.
-                    let offset = if offset.length() < 1e-4 * most { DVec3::ZERO } else { offset };
                     let before = skipped.unwrap_or(self.said);
                     if !self.guessed {
                         self.velocity = target - before;
                     }
                     (self.said, self.guessed) = (target, false);
-                    to = target + offset;
+                    to = target + faded(offset, most);
                 }
                 None => {
                     self.velocity *= SLOWING;
@@ -103,11 +100,24 @@ impl HandPlayout {
                 }
             }
         }
+        if !self.playing {
+            // A guest that rests says so a few times only: what is left of a correction fades in
+            // silence, too.
+            self.guessed = false;
+            to = self.said + faded(self.shown - self.said, most);
+        }
         // However wild the targets, the hand moves no faster than a hand.
         let way = to - self.shown;
         self.shown = if way.length() <= most { to } else { self.shown + way.clamp_length_max(most) };
         self.shown
     }
+}
+
+/// What is left of a correction after a tick. One so small is none: then the guest recognises its
+/// own targets.
+fn faded(offset: DVec3, most: f64) -> DVec3 {
+    let offset = offset * FADE;
+    if offset.length() < 1e-4 * most { DVec3::ZERO } else { offset }
 }
 
 #[cfg(test)]
@@ -221,7 +231,8 @@ mod tests {
         for _ in 0..60 {
             hand.next(2, MOST);
         }
-        assert!(hand.next(2, MOST).distance(end) < 0.02, "it went on a little when nothing came");
+        // It went on a little when nothing came, and went back.
+        assert_eq!(hand.next(2, MOST), end);
         for input in 11..80 {
             hand.take(input, 1, end);
             hand.next(2, MOST);
