@@ -1,65 +1,142 @@
-//! What a scene leaves out: the crates that each feature set of the face compiles, by Cargo's own account.
+//! What each set of features compiles and which crates may not import what, by Cargo's own account.
+//!
+//! Cargo reads the manifests of the crates that it lists. It downloads those that no build here has
+//! needed yet, so these tests need no used cargo home, and without the network a used one is enough.
 
 #![expect(clippy::unwrap_used, reason = "a failed test should panic")]
 
 use std::{collections::BTreeSet, process::Command};
 
-/// The crates that `pliant` compiles with these features.
-fn crates(features: &[&str]) -> BTreeSet<String> {
+/// The crates that a package compiles for this platform with these arguments about features.
+fn crates(package: &str, features: &[&str]) -> BTreeSet<String> {
     let output = Command::new(env!("CARGO"))
-        .args(["tree", "-p", "pliant", "-e", "normal", "--prefix", "none", "--offline"])
+        .args(["tree", "--locked", "-p", package, "-e", "normal", "--prefix", "none"])
         .args(features)
         .current_dir(concat!(env!("CARGO_MANIFEST_DIR"), "/../.."))
         .output()
         .unwrap();
-    assert!(output.status.success(), "{}", String::from_utf8_lossy(&output.stderr));
+    let told = String::from_utf8_lossy(&output.stderr);
+    assert!(output.status.success(), "cargo tree of {package} with {features:?}: {told}");
     let text = String::from_utf8(output.stdout).unwrap();
-    text.lines().filter_map(|line| line.split(' ').next()).map(str::to_owned).collect()
+    let list: BTreeSet<String> =
+        text.lines().filter_map(|line| line.split(' ').next()).map(str::to_owned).collect();
+    assert!(list.contains(package), "{text}");
+    list
 }
+
+/// The crates of the face with these features and no others.
+fn with(features: &str) -> BTreeSet<String> {
+    crates("pliant", &["--no-default-features", "--features", features])
+}
+
+/// Those of a list that a pattern means: a name, or with a star at its end a beginning.
+fn matching<'a>(list: &'a BTreeSet<String>, pattern: &str) -> Vec<&'a String> {
+    list.iter()
+        .filter(|name| match pattern.strip_suffix('*') {
+            Some(beginning) => name.starts_with(beginning),
+            None => *name == pattern,
+        })
+        .collect()
+}
+
+fn lacks(list: &BTreeSet<String>, patterns: &[&str], who: &str) {
+    for pattern in patterns {
+        let found = matching(list, pattern);
+        assert!(found.is_empty(), "{who} compiles {found:?}");
+    }
+}
+
+const RENDERER: [&str; 6] = ["bevy_render", "bevy_pbr", "bevy_core_pipeline", "bevy_winit", "winit", "wgpu"];
 
 /// Name of the scene, its features, and what it must not compile.
 const SCENES: [(&str, &str, &[&str]); 6] = [
     (
         "a body without a picture",
         "",
-        &["bevy_render", "wgpu", "quinn", "tokio", "rerun", "bevy_egui", "pliant_haptics", "faer"],
+        &[
+            "wgpu",
+            "bevy_render",
+            "quinn*",
+            "tokio",
+            "rerun",
+            "arrow",
+            "bevy_egui",
+            "egui",
+            "pliant_haptics",
+            "faer",
+        ],
     ),
     (
         "one body or many",
         "render",
-        &["quinn", "tokio", "rerun", "bevy_egui", "pliant_haptics", "pliant_stream", "faer", "bevy_winit"],
+        &["quinn*", "tokio", "rerun", "bevy_egui", "pliant_haptics", "pliant_stream", "faer", "bevy_winit"],
     ),
     (
         "a host without a picture",
         "net",
-        &["bevy_render", "wgpu", "rerun", "bevy_egui", "pliant_haptics", "faer"],
+        &["wgpu", "bevy_render", "rerun", "arrow", "bevy_egui", "egui", "pliant_haptics", "faer"],
     ),
     ("a guest", "net,render", &["rerun", "bevy_egui", "pliant_haptics", "faer"]),
     (
         "a body that is felt",
         "haptics,render",
-        &["quinn", "tokio", "rerun", "bevy_egui", "pliant_stream", "faer"],
+        &["quinn*", "tokio", "rerun", "bevy_egui", "pliant_stream", "faer"],
     ),
     (
         "baking in the game",
         "bake",
-        &["bevy_render", "wgpu", "quinn", "tokio", "rerun", "bevy_egui", "pliant_haptics"],
+        &["bevy_render", "wgpu", "quinn*", "tokio", "rerun", "bevy_egui", "pliant_haptics"],
     ),
 ];
 
 #[test]
 fn a_scene_compiles_nothing_that_it_does_not_need() {
-    let everything = crates(&["--all-features"]);
+    let everything = crates("pliant", &[]);
     for (name, features, without) in SCENES {
-        let list = crates(&["--no-default-features", "--features", features]);
+        let list = with(features);
         println!("{name} ({features}): {} crates of {}", list.len(), everything.len());
-        for forbidden in without {
-            assert!(!list.contains(*forbidden), "{name} compiles {forbidden}");
-            assert!(
-                everything.contains(*forbidden),
-                "{forbidden} is no crate of ours at all: the list is out of date"
-            );
+        lacks(&list, without, name);
+        if !features.contains("render") {
+            lacks(&list, &RENDERER, name);
         }
         assert!(list.len() < everything.len());
+    }
+    let named = SCENES.iter().flat_map(|scene| scene.2).chain(&RENDERER);
+    for pattern in named {
+        let found = matching(&everything, pattern);
+        assert!(!found.is_empty(), "{pattern} is no crate of ours at all: the list is out of date");
+    }
+}
+
+/// Each feature that has crates of its own, those crates, and features that cannot be without it.
+const FEATURES: [(&str, &[&str], &[&str]); 6] = [
+    ("render", &["bevy_render", "bevy_pbr", "bevy_core_pipeline", "wgpu"], &["panel"]),
+    ("net", &["pliant_net", "quinn*"], &[]),
+    ("haptics", &["pliant_haptics"], &[]),
+    ("rerun", &["pliant_rerun", "rerun", "re_*", "arrow"], &[]),
+    ("panel", &["pliant_panel", "bevy_egui", "egui", "egui_plot"], &[]),
+    ("bake", &["pliant_bake", "pliant_mesh", "faer"], &[]),
+];
+
+#[test]
+fn a_feature_that_is_off_compiles_none_of_its_crates() {
+    for (feature, own, needing) in FEATURES {
+        let others: Vec<&str> = FEATURES
+            .iter()
+            .map(|other| other.0)
+            .filter(|other| *other != feature && !needing.contains(other))
+            .collect();
+        lacks(&with(&others.join(",")), own, &format!("pliant without {feature}"));
+        let list = with(feature);
+        for pattern in own {
+            assert!(!matching(&list, pattern).is_empty(), "{feature} does not compile {pattern}");
+        }
+    }
+}
+
+#[test]
+fn the_crates_below_the_plugins_import_no_engine_runtime_or_viewer() {
+    for package in ["pliant_mesh", "pliant_bake", "pliant_modal", "pliant_stream"] {
+        lacks(&crates(package, &[]), &["bevy*", "tokio", "quinn*", "rerun", "egui*"], package);
     }
 }
