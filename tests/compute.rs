@@ -1,13 +1,10 @@
-//! The compute pass against the processor: the vertex buffer that bodies are drawn from is read back and compared, vertex by vertex.
-//!
-//! Software rendering is enough. Where there is no graphics driver at all the test says so and passes, unless `PLIANT_REQUIRE_PICTURES` is set.
+//! The compute pass against the processor: the vertex buffer that bodies are drawn from is read
+//! back and compared, vertex by vertex.
 #![allow(clippy::unwrap_used, clippy::panic, missing_docs, reason = "a failed test should panic")]
 
-use std::{
-    panic::{AssertUnwindSafe, catch_unwind},
-    path::PathBuf,
-    time::{Duration, Instant},
-};
+mod drawing;
+
+use std::{path::PathBuf, process::ExitCode, time::Duration};
 
 use bevy::{
     app::{PluginsState, ScheduleRunnerPlugin},
@@ -115,16 +112,11 @@ fn farthest(a: &[Vec3], b: &[Vec3]) -> f32 {
     a.iter().zip(b).map(|(a, b)| a.distance(*b)).fold(0.0, f32::max)
 }
 
-#[test]
-fn the_compute_pass_and_the_processor_draw_the_same_shapes() {
-    let mut app = match catch_unwind(AssertUnwindSafe(studio)) {
-        Ok(app) => app,
-        Err(_) if std::env::var_os("PLIANT_REQUIRE_PICTURES").is_none() => {
-            println!("skipped: there is no graphics driver here, not even a software one");
-            return;
-        }
-        Err(reason) => std::panic::resume_unwind(reason),
-    };
+fn main() -> ExitCode {
+    drawing::main(studio, &[("the_compute_pass_and_the_processor_draw_the_same_shapes", the_same_shapes)])
+}
+
+fn the_same_shapes(mut app: App) {
     let model = pip();
     let (size, modes) = (model.size() as f32, model.mode_count());
     // The first mode's coordinate that turns some vertex by one radian.
@@ -164,16 +156,16 @@ fn the_compute_pass_and_the_processor_draw_the_same_shapes() {
         bodies.iter().map(|body| app.world().get::<Mesh3d>(*body).unwrap().id()).collect();
     let rest = on_device(&app, meshes[0]);
     // The pipelines are compiled in the background.
-    let start = Instant::now();
-    let computed = loop {
+    let computed = drawing::wait_for("the compute pass runs", || {
         app.update();
         let computed: Vec<_> = meshes.iter().map(|mesh| on_device(&app, *mesh)).collect();
-        if computed.iter().all(|shape| farthest(&shape.0, &rest.0) > 0.01 * size) {
-            break computed;
+        let moved: Vec<f32> = computed.iter().map(|shape| farthest(&shape.0, &rest.0)).collect();
+        if moved.iter().all(|moved| *moved > 0.01 * size) {
+            Ok(computed)
+        } else {
+            Err(format!("the bodies have moved by {moved:?} m"))
         }
-        assert!(start.elapsed() < Duration::from_secs(120), "the compute pass has not run");
-        std::thread::sleep(Duration::from_millis(20));
-    };
+    });
     for (mesh, body) in meshes.iter().zip(&bodies) {
         assert!(farthest(&in_asset(&app, *mesh).0, &rest.0) < 1e-6 * size, "the asset is not touched");
         let aabb = app.world().get::<Aabb>(*body).unwrap();

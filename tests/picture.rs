@@ -1,11 +1,11 @@
 //! What a user sees: the shipped body drawn by the real renderer into an image, at rest and pulled.
-//!
-//! Software rendering is enough. Where there is no graphics driver at all the test says so and passes, unless `PLIANT_REQUIRE_PICTURES` is set.
 #![allow(clippy::unwrap_used, clippy::panic, missing_docs, reason = "a failed test should panic")]
 
+mod drawing;
+
 use std::{
-    panic::{AssertUnwindSafe, catch_unwind},
     path::PathBuf,
+    process::ExitCode,
     sync::{Arc, Mutex},
     time::Duration,
 };
@@ -36,7 +36,7 @@ struct Picture(Arc<Mutex<Option<Vec<u8>>>>);
 struct Canvas(Handle<Image>);
 
 /// An app that draws the body from the front onto an image; a light from above left throws its shadow.
-fn studio(picture: Picture) -> App {
+fn studio() -> App {
     let model =
         ModalModel::read(PathBuf::from(env!("CARGO_MANIFEST_DIR")).join("../../assets/pip.modal")).unwrap();
     let mut app = App::new();
@@ -49,7 +49,7 @@ fn studio(picture: Picture) -> App {
     .insert_resource(TimeUpdateStrategy::ManualDuration(Duration::from_millis(25)))
     .insert_resource(Time::<Fixed>::from_hz(40.0))
     .insert_resource(ClearColor(Color::BLACK))
-    .insert_resource(picture);
+    .init_resource::<Picture>();
     while app.plugins_state() == PluginsState::Adding {
         bevy::tasks::tick_global_task_pools_on_main_thread();
     }
@@ -94,15 +94,12 @@ fn shoot(app: &mut App, frames: usize) -> Vec<u8> {
     app.world_mut().spawn(Screenshot::image(canvas)).observe(move |shot: On<ScreenshotCaptured>| {
         *kept.0.lock().unwrap() = shot.image.data.clone();
     });
-    for _ in 0..200 {
+    let bytes = drawing::wait_for("a picture is read back", || {
         app.update();
-        if let Some(bytes) = picture.0.lock().unwrap().take() {
-            assert_eq!(bytes.len(), (WIDTH * HEIGHT * 4) as usize);
-            return bytes;
-        }
-        std::thread::sleep(Duration::from_millis(5));
-    }
-    panic!("no picture within 200 frames");
+        picture.0.lock().unwrap().take().ok_or_else(|| "none has come".to_owned())
+    });
+    assert_eq!(bytes.len(), (WIDTH * HEIGHT * 4) as usize);
+    bytes
 }
 
 /// Pixels of the body, of the lit ground, and of the ground in shadow.
@@ -121,33 +118,28 @@ fn count(picture: &[u8]) -> [usize; 3] {
     counts
 }
 
-#[test]
-fn the_body_is_drawn_shadowed_and_pulled_out_of_shape() {
-    let studio = catch_unwind(AssertUnwindSafe(|| studio(Picture::default())));
-    let mut app = match studio {
-        Ok(app) => app,
-        Err(_) if std::env::var_os("PLIANT_REQUIRE_PICTURES").is_none() => {
-            println!("skipped: there is no graphics driver here, not even a software one");
-            return;
-        }
-        Err(reason) => std::panic::resume_unwind(reason),
-    };
-    // The first frames compile the shaders; the picture is good when two in a row agree.
-    let mut rest = shoot(&mut app, 20);
-    for _ in 0..30 {
-        let next = shoot(&mut app, 10);
-        let drawn = count(&next)[0] > 0 && next == rest;
-        rest = next;
-        if drawn {
-            break;
-        }
-    }
-    let [body, lit, shadow] = count(&rest);
+fn main() -> ExitCode {
+    drawing::main(
+        studio,
+        &[("the_body_is_drawn_shadowed_and_pulled_out_of_shape", drawn_shadowed_and_pulled)],
+    )
+}
+
+fn drawn_shadowed_and_pulled(mut app: App) {
     let all = (WIDTH * HEIGHT) as usize;
-    // 0.3 m of body at 0.9 m with a 45 degree lens is about a third of the height: a tenth of the picture, give or take a factor of three.
-    assert!((all / 30..all / 3).contains(&body), "{body} pixels of body of {all}");
-    assert!(lit > all / 10, "{lit} pixels of lit ground of {all}");
-    assert!(shadow > body / 20, "{shadow} pixels of shadow under {body} of body");
+    let mut before = Vec::new();
+    // The first frames compile the shaders; the picture is good when two in a row agree.
+    let rest = drawing::wait_for("the body and its shadow are drawn", || {
+        let next = shoot(&mut app, 10);
+        let still = next == before;
+        before.clone_from(&next);
+        let [body, lit, shadow] = count(&next);
+        // 0.3 m of body at 0.9 m with a 45 degree lens is about a third of the height: a tenth of
+        // the picture, give or take a factor of three.
+        let right = (all / 30..all / 3).contains(&body) && lit > all / 10 && shadow > body / 20;
+        let told = || format!("{body} pixels of body, {lit} of lit ground, {shadow} of shadow, of {all}");
+        if still && right { Ok(next) } else { Err(told()) }
+    });
 
     // Pull an ear sideways by a quarter of the body's size.
     let world = app.world_mut();
