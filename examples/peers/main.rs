@@ -48,6 +48,7 @@ fn main() -> Result<(), Box<dyn Error>> {
     let options = Options::parse();
     session::end_on_terminate();
     let number = options.name.bytes().map(u64::from).sum::<u64>();
+    let joins = options.invite.is_some();
     let net = NetPlugin::peer(PeerConfig {
         name: options.name,
         join: options.invite,
@@ -59,14 +60,17 @@ fn main() -> Result<(), Box<dyn Error>> {
         ..default()
     })?;
     println!("{}", net.invite().ok_or("no invite")?);
-    App::new()
-        .add_plugins(stage::Stage::with("peers", options.stage).real_time().key("left mouse: pull the body"))
+    let mut app = App::new();
+    if joins {
+        app.world_mut().spawn(stage::Awaited);
+    }
+    app.add_plugins(stage::Stage::with("peers", options.stage).real_time().key("left mouse: pull the body"))
         .add_plugins((PliantPlugins::default(), net))
         .insert_resource(Time::<Fixed>::from_hz(40.0))
         .insert_resource(Number(number))
         .add_systems(Startup, setup)
         .add_systems(FixedUpdate, session::play.before(PliantSystems::Input))
-        .add_systems(Update, (draw_hands, read_out))
+        .add_systems(Update, (draw_hands, read_out, meet))
         .run();
     Ok(())
 }
@@ -88,6 +92,17 @@ fn setup(
     ));
     if unattended.is_some() {
         body.insert(session::Script::of(number.0));
+    }
+}
+
+/// The first of the others is here.
+fn meet(
+    mut commands: Commands,
+    awaited: Query<Entity, With<stage::Awaited>>,
+    others: Query<(), (With<UserLink>, Without<Yourself>)>,
+) {
+    if !others.is_empty() {
+        awaited.iter().for_each(|entity| commands.entity(entity).despawn());
     }
 }
 

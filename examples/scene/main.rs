@@ -17,7 +17,10 @@ use std::path::{Path, PathBuf};
 use bevy::{ecs::name::NameOrEntityItem, prelude::*};
 use clap::Parser;
 #[cfg(feature = "net")]
-use pliant::net::{NetStats, User};
+use pliant::{
+    net::{NetStats, User},
+    scene::NetworkEntry,
+};
 use pliant::{
     prelude::*,
     scene::{SceneBody, SceneError, SceneFailed, SceneFile, SceneFilePlugin, ViewEntry},
@@ -77,11 +80,24 @@ fn main() -> AppExit {
     if description.network.is_some() || description.device.is_some() {
         stage = stage.real_time();
     }
-    App::new()
-        .add_plugins((stage, PliantPlugins::default(), scene))
+    let mut app = App::new();
+    #[cfg(feature = "net")]
+    if matches!(description.network, Some(NetworkEntry::Host { guest: Some(_), .. })) {
+        app.world_mut().spawn(stage::Awaited);
+        app.add_systems(Update, meet);
+    }
+    app.add_plugins((stage, PliantPlugins::default(), scene))
         .insert_resource(Title(description.title.clone()))
         .add_systems(Update, (read_out, end_on_failure))
         .run()
+}
+
+/// The guest is in the host's session.
+#[cfg(feature = "net")]
+fn meet(mut commands: Commands, awaited: Query<Entity, With<stage::Awaited>>, users: Query<(), With<User>>) {
+    if users.iter().count() > 1 {
+        awaited.iter().for_each(|entity| commands.entity(entity).despawn());
+    }
 }
 
 /// The scene, if it and the files that it names are right; else says what is wrong with them.

@@ -22,7 +22,7 @@ use clap::Parser;
 
 pub use hands::draw_hand;
 pub use options::{Options, display};
-pub use run::Unattended;
+pub use run::{Awaited, Unattended};
 pub use text::Readout;
 pub use view::Look;
 

@@ -15,6 +15,11 @@ use super::{Options, Readout};
 #[derive(Resource)]
 pub struct Unattended;
 
+/// Somebody or something that has yet to come. A run that nobody watches does not count its frames
+/// and seconds while there is an entity with this: how long others take is the machine's affair.
+#[derive(Component)]
+pub struct Awaited;
+
 /// Seconds of the scene that a frame is when nobody waits for it.
 const FRAME: f64 = 1.0 / 60.0;
 
@@ -142,8 +147,19 @@ fn end(
     real: Res<Time<Real>>,
     mut time: ResMut<Time<Virtual>>,
     readout: Res<Readout>,
+    unattended: Option<Res<Unattended>>,
+    awaited: Query<(), With<Awaited>>,
     mut exit: MessageWriter<AppExit>,
 ) {
+    if run.since.is_some() && unattended.is_some() && !awaited.is_empty() {
+        run.since = Some((0, real.elapsed_secs_f64()));
+        run.waited += 1;
+        if run.waited > PATIENCE {
+            error!("whoever this scene waits for did not come");
+            exit.write(AppExit::error());
+        }
+        return;
+    }
     let Some((frames, since)) = run.since else {
         if run.waited > PATIENCE {
             error!("the bodies of this scene did not come; the lines above say why");
