@@ -1,7 +1,7 @@
 //! What a person is told about a scene that is wrong, and what a right one becomes.
 #![allow(clippy::unwrap_used, clippy::expect_used, clippy::panic, reason = "a failed test should panic")]
 
-use std::time::Duration;
+use std::time::{Duration, Instant};
 
 use bevy::{prelude::*, time::TimeUpdateStrategy};
 
@@ -239,13 +239,12 @@ fn a_file_that_is_too_long_or_no_text_or_not_there() {
     let folder = std::env::temp_dir().join(format!("pliant-scene-{}", std::process::id()));
     std::fs::create_dir_all(&folder).unwrap();
     let file = folder.join("long.ron");
-    // A hundred megabytes, of which one is read.
-    std::fs::File::create(&file).unwrap().set_len(100 << 20).unwrap();
-    let began = std::time::Instant::now();
+    // Of a file that no memory holds, one megabyte is read. Elsewhere a hole takes room on the disk.
+    let bytes = if cfg!(target_os = "linux") { 1 << 40 } else { 2 << 20 };
+    std::fs::File::create(&file).unwrap().set_len(bytes).unwrap();
     let error = SceneFile::read(&file).unwrap_err();
     assert_eq!(error.kind, SceneErrorKind::Read);
     assert!(error.message.contains("at most 1048576 bytes"), "{error}");
-    assert!(began.elapsed() < Duration::from_secs(2));
     std::fs::write(&file, b"(bodies:\n [\xff]").unwrap();
     let error = SceneFile::read(&file).unwrap_err();
     assert_eq!((error.position, error.kind), (Some((2, 3)), SceneErrorKind::Read));
@@ -271,16 +270,17 @@ fn app() -> App {
     app
 }
 
-/// Runs until `done`, with files read on other threads.
+/// Runs until `done`, with files read on other threads, however long a busy machine takes for that.
 fn run_until(app: &mut App, what: &str, mut done: impl FnMut(&mut World) -> bool) {
-    for _ in 0..20_000 {
+    let start = Instant::now();
+    loop {
         app.update();
         if done(app.world_mut()) {
             return;
         }
+        assert!(start.elapsed() < Duration::from_secs(120), "{what} did not come");
         std::thread::sleep(Duration::from_millis(1));
     }
-    panic!("{what} did not come");
 }
 
 fn failures(world: &mut World) -> Vec<SceneError> {
