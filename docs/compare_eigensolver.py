@@ -21,9 +21,13 @@ import time
 for name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
     os.environ[name] = "1"
 
-import numpy as np
-from scipy.io import mmread
-from scipy.sparse.linalg import eigsh
+try:
+    import numpy as np
+    from scipy.io import mmread
+    from scipy.sparse.linalg import eigsh
+except ImportError as error:
+    print(f"skipped: {error} (pip install numpy scipy)")
+    sys.exit(77)
 
 
 def measure(pliant, element, cells, modes, rounds):
@@ -61,6 +65,9 @@ def main():
     parser.add_argument("--element", action="append", choices=["tet4", "tet10"])
     parser.add_argument("--cells", action="append")
     args = parser.parse_args()
+    if not os.path.isfile(args.pliant):
+        print(f"skipped: no program at {args.pliant} (cargo build --release -p pliant_cli)")
+        return 77
     print("  element      cells     dof  pliant s   scipy s  ratio    differ")
     worst = 0.0
     for element in args.element or ["tet4", "tet10"]:

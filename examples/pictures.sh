@@ -11,7 +11,10 @@ set -euo pipefail
 cd "$(dirname "$0")/.."
 
 if [ -z "${PICTURES_DISPLAY:-}" ]; then
-    command -v xvfb-run >/dev/null || { echo "xvfb-run is not here; install xvfb, and mesa-vulkan-drivers where there is no graphics card" >&2; exit 2; }
+    command -v xvfb-run >/dev/null || {
+        echo "skipped: no xvfb-run (Debian: xvfb xauth, and without a graphics card mesa-vulkan-drivers)" >&2
+        exit 77
+    }
     PICTURES_DISPLAY=1 exec xvfb-run -a -s "-screen 0 1280x720x24" "$0" "$@"
 fi
 export PICTURES_DISPLAY
@@ -31,7 +34,7 @@ if [ -z "${BIN:-}" ]; then
     cargo build --profile "${PROFILE:-dev}" --examples
     profile="${PROFILE:-dev}"
     [ "$profile" = dev ] && profile=debug
-    BIN="${CARGO_TARGET_DIR:-target}/$profile/examples"
+    BIN="$(cargo metadata --format-version 1 --no-deps | sed 's/.*"target_directory":"\([^"]*\)".*/\1/')/$profile/examples"
 fi
 BIN="$(realpath "$BIN")"
 root="$PWD"
@@ -102,36 +105,37 @@ picture panel-session shared_body --panel=session --seconds 25
 if is_wanted make_models; then cp "$root/assets/jelly.png" "$out/make_models.png"; fi
 
 # Those who need somebody else there.
-serve() { # log, binary, arguments: starts it and says its invite
-    local log="$1"
+serve() { # log, binary, arguments: starts it and leaves its invite in $invite
+    local log="$1" pid
     shift
     "$@" >"$log" 2>&1 &
-    pids+=($!)
-    for _ in $(seq 600); do
-        if grep -o 'pliant://[^ ]*' "$log" | head -n 1 | grep .; then return 0; fi
+    pid=$!
+    pids+=("$pid")
+    while kill -0 "$pid" 2>/dev/null; do
+        invite="$(grep -o 'pliant://[^ ]*' "$log" | head -n 1 || true)"
+        [ -z "$invite" ] || return 0
         sleep 0.1
     done
     cat "$log" >&2
     return 1
 }
 if is_wanted host; then
-    # A host with a guest in its session.
-    coproc_log="$work/guest.log"
-    port=$((20000 + RANDOM % 20000))
+    # A host with a guest in its session. The key and the port are those of a first, short run, so
+    # that the guest has the invite before the host is there.
     key="$work/host.key"
-    # The key is made by a first, short run, so that the guest knows the invite before the host is there.
-    invite="$(serve "$work/first.log" "$BIN/host" --headless --seconds 1 --bind "127.0.0.1:$port" --key "$key")"
-    sleep 3
-    "$BIN/join" "$invite" --headless --cached --seconds 60 >"$coproc_log" 2>&1 &
+    serve "$work/first.log" "$BIN/host" --headless --seconds 1 --bind 127.0.0.1:0 --key "$key"
+    wait "${pids[-1]}"
+    address="${invite#pliant://}"
+    "$BIN/join" "$invite" --headless --cached --seconds 60 >"$work/guest.log" 2>&1 &
     pids+=($!)
-    picture host host --bind "127.0.0.1:$port" --key "$key"
+    picture host host --bind "${address%%#*}" --key "$key"
 fi
 if is_wanted join || is_wanted dedicated_server; then
-    invite="$(serve "$work/server.log" "$BIN/dedicated_server" --play)"
+    serve "$work/server.log" "$BIN/dedicated_server" --bind 127.0.0.1:0 --play
     picture dedicated_server join "$invite" --cached --still --name "somebody who looks"
     picture join join "$invite" --cached --name guest
 fi
 if is_wanted peers; then
-    invite="$(serve "$work/peer.log" "$BIN/peers" --headless --seconds 120 --name one)"
+    serve "$work/peer.log" "$BIN/peers" --headless --seconds 600 --name one
     picture peers peers "$invite" --name two
 fi

@@ -15,9 +15,13 @@ import argparse, importlib.metadata, json, os, pathlib, platform, struct, subpro
 for pool in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "RAYON_NUM_THREADS"):
     os.environ[pool] = "1"
 
-import numpy as np
-from scipy.io import mmread
-from scipy.sparse.linalg import eigsh
+try:
+    import numpy as np
+    from scipy.io import mmread
+    from scipy.sparse.linalg import eigsh
+except ImportError as error:
+    print(f"skipped: {error} (pip install numpy scipy)")
+    sys.exit(77)
 
 CELLS, SIZE, MODES = (20, 3, 3), (1.0, 0.15, 0.15), 20
 YOUNG, POISSON, DENSITY = 2e5, 0.3, 1000.0

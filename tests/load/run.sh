@@ -7,7 +7,15 @@
 #
 # SENT=1: the bots have no model, so that it is sent to all of them at once. AS="chrt --rr 10" or another prefix for the server's command, so that the bots'
 # threads and whatever else runs here do not take its processor from it. Binaries: those of BIN, or built by cargo.
+#
+# Its figures are times. Where something else keeps the machine busy it says so and ends with 77 (skipped); BUSY=1 measures all the same.
 set -u
+skip() { echo "skipped: $1"; exit 77; }
+[ -r /proc/loadavg ] || skip "needs Linux: no /proc/loadavg"
+env --default-signal=INT true 2>/dev/null || skip "needs env of GNU coreutils"
+if [ -z "${BUSY:-}" ] && awk -v cores="$(nproc)" '{ exit !($1 > cores / 2) }' /proc/loadavg; then
+    skip "the machine is busy: load $(cut -d' ' -f1 /proc/loadavg) on $(nproc) cores"
+fi
 body=$(realpath "${1:?which body}")
 long=${2:-60}
 [ $# -ge 2 ] && shift 2 || shift $#
@@ -31,7 +39,7 @@ for n in $users; do
     [ "$n" = "${users##* }" ] && seconds=$long
     env --default-signal=INT ${AS:-} "$BIN/dedicated_server" --bind 127.0.0.1:0 --hz 60 --play --body "$body" --guests "$n" >"$work/server" 2>&1 &
     server=$!
-    for _ in $(seq 600); do grep -q "to hold" "$work/server" && break; sleep 0.1; done
+    while kill -0 $server 2>/dev/null && ! grep -q "to hold" "$work/server"; do sleep 0.1; done
     invite=$(sed -n 's/^to hold:  //p' "$work/server" | head -1)
     # Five seconds to come in, and the windows of ten seconds do not begin with the bots.
     "$BIN/join" "$invite" --bots "$n" --light $cached --body "$body" --seconds $((seconds + 15)) >"$work/bots" 2>&1 || { tail -3 "$work/bots"; failed=1; }
