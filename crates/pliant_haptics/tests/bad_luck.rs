@@ -17,7 +17,7 @@ use pliant_haptics::{
     LoopState, Pace, SafetyConfig, Sample, VirtualConfig, VirtualDevice, VirtualPace, Wrench,
 };
 use rig::{
-    Rig,
+    Rig, machine,
     scene::{Scene, SceneConfig},
 };
 
@@ -334,13 +334,14 @@ fn a_driver_that_panics() {
         hand.set_target([0.014, 0.0, 0.0]);
         let (panic, stopped) = (Arc::new(AtomicBool::new(false)), Arc::new(AtomicU32::new(0)));
         let bomb = Bomb { inner, panic: panic.clone(), stopped: stopped.clone(), twice };
-        let mut running = HapticLoop::start(bomb, LoopConfig::default()).unwrap();
+        let mut running = HapticLoop::start(bomb, machine::patient()).unwrap();
         let mut tick = 0;
         let mut heard: Vec<LoopEvent> = Vec::new();
         let mut until = |running: &mut HapticLoop,
                          heard: &mut Vec<LoopEvent>,
+                         what: &str,
                          so: &dyn Fn(&LoopReport) -> bool| {
-            for _ in 0..1000 {
+            machine::until(what, || {
                 tick += 1;
                 running.publish(|model| {
                     (model.tick, model.period, model.count) = (tick, 0.01, 1);
@@ -348,18 +349,18 @@ fn a_driver_that_panics() {
                 });
                 std::thread::sleep(Duration::from_millis(10));
                 heard.extend(running.events());
-                if so(running.report()) {
-                    return;
-                }
-            }
-            panic!("never: {:?}", running.report());
+                let report = running.report();
+                if so(report) { Ok(()) } else { Err((report.state, report.tick)) }
+            });
         };
-        until(&mut running, &mut heard, &|r| r.tick.wrench.force[0] < -0.5);
+        until(&mut running, &mut heard, "a force", &|r| r.tick.wrench.force[0] < -0.5);
         hand.set_buttons(1);
-        until(&mut running, &mut heard, &|r| r.tick.wrench.force[0] < -0.5 && r.tick.buttons == 1);
+        until(&mut running, &mut heard, "a force and a button", &|r| {
+            r.tick.wrench.force[0] < -0.5 && r.tick.buttons == 1
+        });
         assert_eq!(running.report().state, LoopState::Running);
         panic.store(true, Ordering::Release);
-        until(&mut running, &mut heard, &|r| r.state == LoopState::Ended);
+        until(&mut running, &mut heard, "the end", &|r| r.state == LoopState::Ended);
         heard.extend(running.events());
         let report = *running.report();
         assert_eq!(report.tick.wrench, Wrench::ZERO, "nobody is told of a force that is not there");
@@ -375,7 +376,7 @@ fn a_driver_that_panics() {
         );
         // Told once, and for good.
         heard.clear();
-        until(&mut running, &mut heard, &|_| true);
+        until(&mut running, &mut heard, "another look", &|_| true);
         assert_eq!(heard, []);
         assert_eq!(running.report().state, LoopState::Ended);
     }

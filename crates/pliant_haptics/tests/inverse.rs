@@ -2,6 +2,9 @@
 #![allow(clippy::unwrap_used, clippy::expect_used, clippy::panic, reason = "a failed test should panic")]
 #![cfg(feature = "inverse")]
 
+#[path = "rig/machine.rs"]
+mod machine;
+
 use std::{
     net::{TcpListener, TcpStream},
     sync::{Arc, Mutex},
@@ -11,7 +14,7 @@ use std::{
 
 use pliant_haptics::{
     Cycle, Fault, HapticDevice, Inverse, InverseConfig, InverseError, LocalModel, LoopConfig, LoopEvent,
-    Pace, RealPace, Spelling, Wrench,
+    RealPace, Sample, Spelling, VirtualPace, Wrench,
 };
 use serde_json::{Value, json};
 use tungstenite::{Message, WebSocket, accept};
@@ -26,8 +29,9 @@ struct Desk {
     /// Answer with this instead.
     say: Option<String>,
     mute: bool,
-    /// The next answer, and only that one, comes so late.
-    late: Option<Duration>,
+    /// The next answer is held back until this is taken away again; then it was `sent`.
+    late: bool,
+    sent: bool,
     quit: bool,
     hang_up: bool,
 }
@@ -56,8 +60,11 @@ impl Service {
                 match listener.accept() {
                     Ok((stream, _)) => {
                         stream.set_nonblocking(false).unwrap();
-                        stream.set_read_timeout(Some(Duration::from_millis(20))).unwrap();
+                        // Who has connected says hello or goes away, and takes what time it needs
+                        // for either.
                         if let Ok(socket) = accept(stream) {
+                            let end = socket.get_ref();
+                            end.set_read_timeout(Some(Duration::from_millis(20))).unwrap();
                             serve(socket, &shared, inventory, new);
                         }
                     }
@@ -68,8 +75,19 @@ impl Service {
         Self { address, desk, thread: Some(thread) }
     }
 
+    /// With the longest timeout that counts: nothing that comes is late, and a refusal comes at
+    /// once.
     fn config(&self) -> InverseConfig {
-        InverseConfig { address: self.address.clone(), timeout: 0.5, ..InverseConfig::default() }
+        InverseConfig { address: self.address.clone(), timeout: 10.0, ..InverseConfig::default() }
+    }
+
+    /// Sends the answer that was held back, to whoever still listens.
+    fn send_late(&self) {
+        self.desk().late = false;
+        machine::until("the late answer is sent", || {
+            std::thread::sleep(Duration::from_millis(1));
+            if std::mem::take(&mut self.desk().sent) { Ok(()) } else { Err("held back") }
+        });
     }
 
     fn desk(&self) -> std::sync::MutexGuard<'_, Desk> {
@@ -106,12 +124,14 @@ fn state(desk: &Desk, new: bool) -> Value {
 }
 
 /// One connection: an inventory, then exactly one state a command. A command that is not as documented ends it.
-fn serve(mut socket: WebSocket<TcpStream>, desk: &Mutex<Desk>, inventory: bool, new: bool) {
-    let inventory = state(&desk.lock().unwrap(), inventory).to_string();
-    socket.send(Message::text(inventory)).unwrap();
+fn serve(mut socket: WebSocket<TcpStream>, shared: &Mutex<Desk>, inventory: bool, new: bool) {
+    let inventory = state(&shared.lock().unwrap(), inventory).to_string();
+    if socket.send(Message::text(inventory)).is_err() {
+        return;
+    }
     let mut first = true;
     loop {
-        if desk.lock().unwrap().quit || desk.lock().unwrap().hang_up {
+        if shared.lock().unwrap().quit || shared.lock().unwrap().hang_up {
             return;
         }
         let text = match socket.read() {
@@ -124,7 +144,7 @@ fn serve(mut socket: WebSocket<TcpStream>, desk: &Mutex<Desk>, inventory: bool, 
             Ok(_) => continue,
             Err(_) => return,
         };
-        let mut desk = desk.lock().unwrap();
+        let mut desk = shared.lock().unwrap();
         match check(text.as_str(), new, first) {
             Ok(force) => desk.forces.push(force),
             Err(why) => {
@@ -138,11 +158,14 @@ fn serve(mut socket: WebSocket<TcpStream>, desk: &Mutex<Desk>, inventory: bool, 
             continue;
         }
         let answer = desk.say.clone().unwrap_or_else(|| state(&desk, new).to_string());
-        if let Some(late) = desk.late.take() {
-            drop(desk);
-            std::thread::sleep(late);
+        let late = desk.late;
+        drop(desk);
+        while shared.lock().is_ok_and(|desk| desk.late && !desk.quit) {
+            std::thread::sleep(Duration::from_millis(1));
         }
-        if socket.send(Message::text(answer)).is_err() {
+        let sent = socket.send(Message::text(answer));
+        shared.lock().unwrap().sent = late;
+        if sent.is_err() {
             return;
         }
     }
@@ -233,62 +256,50 @@ fn the_loop_feels_a_spring_through_it() {
     service.desk().position = [0.004, 0.0, 0.0];
     let device = Inverse::open(second(service.config())).unwrap();
     let mut cycle = Cycle::new(device, LoopConfig::default()).unwrap();
-    let mut pace = pace();
+    // In virtual time: an answer is in time however long a busy machine takes for it.
+    let mut pace = VirtualPace::new(1000.0);
     let mut events: Vec<LoopEvent> = Vec::new();
     let mut model = LocalModel { count: 1, period: 0.01, ..LocalModel::default() };
     model.contacts[0].stiffness = [[100.0, 0.0, 0.0], [0.0, 100.0, 0.0], [0.0, 0.0, 100.0]];
-    // A busy machine stutters, and every stutter fades: what must come is waited for.
-    for k in 0..5000 {
+    let mut step = |cycle: &mut Cycle<Inverse>, events: &mut Vec<LoopEvent>| {
         model.tick += 1;
-        cycle.step(&mut pace, &model, &mut events);
-        if k > 400 && cycle.core().last().gain == 1.0 && cycle.core().last().fault.is_none() {
-            break;
-        }
+        cycle.step(&mut pace, &model, events);
+        cycle.core().last().wrench.force[0]
+    };
+    for _ in 0..400 {
+        step(&mut cycle, &mut events);
     }
+    assert_eq!((cycle.core().last().gain, cycle.core().last().fault), (1.0, None), "after the ramp");
     let force = cycle.core().last().wrench.force;
     assert!((force[0] + 0.4).abs() < 1e-3, "100 N/m over 4 mm: {force:?}");
     // Gone in the middle of it, and back by itself.
     service.desk().hang_up = true;
-    for _ in 0..2000 {
-        model.tick += 1;
-        cycle.step(&mut pace, &model, &mut events);
-        if events.contains(&LoopEvent::Lost) {
-            break;
-        }
-    }
-    assert!(events.contains(&LoopEvent::Lost), "{events:?}");
+    let lost = (0..200).any(|_| {
+        step(&mut cycle, &mut events);
+        events.contains(&LoopEvent::Lost)
+    });
+    assert!(lost, "{events:?}");
     service.desk().hang_up = false;
-    for _ in 0..10_000 {
-        model.tick += 1;
-        cycle.step(&mut pace, &model, &mut events);
-        if events.contains(&LoopEvent::Returned) {
-            break;
-        }
+    let returned = (0..10_000).any(|_| {
+        step(&mut cycle, &mut events);
+        events.contains(&LoopEvent::Returned)
+    });
+    assert!(returned, "{events:?}");
+    let (mut largest, mut last) = (0.0f64, cycle.core().last().wrench.force[0]);
+    for _ in 0..400 {
+        let force = step(&mut cycle, &mut events);
+        largest = largest.max(last - force);
+        last = force;
     }
-    assert!(events.contains(&LoopEvent::Returned));
-    let mut largest = 0.0f64;
-    for _ in 0..5000 {
-        model.tick += 1;
-        let before = cycle.core().last().wrench.force[0];
-        cycle.step(&mut pace, &model, &mut events);
-        let force = cycle.core().last().wrench.force[0];
-        largest = largest.max(before - force);
-        if force < -0.3 {
-            break;
-        }
-    }
-    // 0.4 N in 300 ms are 1.3 mN a period; a late one may take a few at once.
-    assert!(
-        cycle.core().last().wrench.force[0] < -0.3 && largest < 0.02,
-        "comes back by the ramp: steps of {largest} N"
-    );
+    // 0.4 N in 300 ms are 1.3 mN a period.
+    assert!(last < -0.3 && largest < 0.002, "comes back by the ramp: {last} N, steps of {largest} N");
     assert_eq!(service.desk().refused, [""; 0]);
 }
 
 #[test]
 fn nonsense_and_silence() {
     let service = Service::start(true);
-    let config = InverseConfig { timeout: 0.05, ..second(service.config()) };
+    let config = second(service.config());
     let mut device = Inverse::open(config.clone()).unwrap();
     let mut pace = pace();
     assert!(device.exchange(&Wrench::ZERO, &mut pace).is_ok());
@@ -306,8 +317,11 @@ fn nonsense_and_silence() {
         assert_eq!(device.exchange(&Wrench::ZERO, &mut pace).unwrap_err(), want, "{nonsense}");
     }
     service.desk().say = None;
+    drop(device);
+    let mut device = hasty(&service);
+    assert!(answer(&mut device).position[0].abs() < 1e-9);
     service.desk().mute = true;
-    assert_eq!(device.exchange(&Wrench::ZERO, &mut pace).unwrap_err(), Fault::Timeout(0.05));
+    assert_eq!(device.exchange(&Wrench::ZERO, &mut pace).unwrap_err(), Fault::Timeout(HASTE));
     drop(device);
     service.desk().mute = false;
     let missing = Inverse::open(InverseConfig { device: Some("FFFF".into()), ..config });
@@ -315,45 +329,49 @@ fn nonsense_and_silence() {
         matches!(missing, Err(InverseError::NoDevice { ref found, .. }) if found.len() == 2),
         "{missing:?}"
     );
-    let nobody = InverseConfig { address: "127.0.0.1:1".into(), ..InverseConfig::default() };
-    assert!(matches!(Inverse::open(nobody), Err(InverseError::Connect { .. })));
-    let _ = pace.last();
+    let nobody = machine::Nobody::new();
+    let nobody = Inverse::open(InverseConfig { address: nobody.address.clone(), ..InverseConfig::default() });
+    assert!(matches!(nobody, Err(InverseError::Connect { .. })), "{nobody:?}");
+}
+
+/// A timeout that is waited for, s.
+const HASTE: f64 = 0.2;
+
+/// A device that waits no longer than [`HASTE`]: a busy service may need more than one try.
+fn hasty(service: &Service) -> Inverse {
+    let config = InverseConfig { timeout: HASTE, ..second(service.config()) };
+    machine::until("a connection in time", || Inverse::open(config.clone()))
+}
+
+/// Asks until there is an answer in time. The loop's part: a device that is gone is looked for.
+fn answer(device: &mut Inverse) -> Sample {
+    machine::until("an answer in time", || {
+        let answer = device.exchange(&Wrench::ZERO, &mut pace());
+        answer.inspect_err(|_| {
+            let _ = device.reopen();
+        })
+    })
 }
 
 #[test]
 fn a_late_answer_is_not_taken_for_the_next_one() {
     let service = Service::start(true);
-    let config = InverseConfig { timeout: 0.05, ..second(service.config()) };
-    let mut device = Inverse::open(config).unwrap();
-    let mut pace = pace();
-    assert!(device.exchange(&Wrench::ZERO, &mut pace).is_ok());
-    service.desk().late = Some(Duration::from_millis(100));
-    assert_eq!(device.exchange(&Wrench::ZERO, &mut pace).unwrap_err(), Fault::Timeout(0.05));
-    std::thread::sleep(Duration::from_millis(100));
-    // The loop's part: a device that is gone is looked for.
-    let mut current = 0;
+    let mut device = hasty(&service);
+    answer(&mut device);
+    service.desk().late = true;
+    assert_eq!(device.exchange(&Wrench::ZERO, &mut pace()).unwrap_err(), Fault::Timeout(HASTE));
+    service.send_late();
     for k in 1..=100 {
         let x = 1e-4 * f64::from(k);
         service.desk().position = [x, 0.0, 0.0];
-        match device.exchange(&Wrench::ZERO, &mut pace) {
-            Ok(sample) => {
-                let off = (sample.position[0] - x).abs();
-                assert!(off < 1e-9, "where the hand is now, not an exchange ago: off by {off} m");
-                current += 1;
-            }
-            Err(_) => {
-                let _ = device.reopen();
-            }
-        }
+        let off = (answer(&mut device).position[0] - x).abs();
+        assert!(off < 1e-9, "where the hand is now, not an exchange ago: off by {off} m");
     }
-    assert!(current > 50, "it is back: {current} of 100");
     // A stop whose answer is late leaves no answer behind either.
-    service.desk().late = Some(Duration::from_millis(100));
+    service.desk().late = true;
     device.safe_stop();
-    std::thread::sleep(Duration::from_millis(100));
-    while device.exchange(&Wrench::ZERO, &mut pace).is_err() {
-        let _ = device.reopen();
-    }
+    service.send_late();
+    answer(&mut device);
     service.desk().position = [0.07, 0.0, 0.0];
-    assert!((device.exchange(&Wrench::ZERO, &mut pace).unwrap().position[0] - 0.07).abs() < 1e-9);
+    assert!((answer(&mut device).position[0] - 0.07).abs() < 1e-9);
 }

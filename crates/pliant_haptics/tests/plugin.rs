@@ -7,7 +7,7 @@ use std::time::Duration;
 use bevy::{
     asset::AssetPlugin, math::DVec3, prelude::*, time::TimeUpdateStrategy, transform::TransformPlugin,
 };
-use pliant_body::{Grab, GrabForce, ModalAsset, ModalBody, PliantBodyPlugin};
+use pliant_body::{BodyState, Grab, GrabForce, ModalAsset, ModalBody, PliantBodyPlugin};
 
 use pliant_haptics::{
     DeviceId, Fault, Hand, HapticButton, HapticDevices, HapticFault, HapticNotice, HapticTool, HapticsPlugin,
@@ -16,6 +16,9 @@ use pliant_haptics::{
 
 #[path = "rig/block.rs"]
 mod block;
+
+#[path = "rig/machine.rs"]
+mod machine;
 
 /// Fixed steps of a hundredth of a second in real time: the loop's thread has its own clock.
 fn app() -> App {
@@ -31,18 +34,10 @@ fn app_in(schedule: impl bevy::ecs::schedule::ScheduleLabel + Clone) -> App {
         PliantBodyPlugin::new(schedule.clone()),
         HapticsPlugin::new(schedule),
     ))
-    .insert_resource(TimeUpdateStrategy::ManualDuration(Duration::from_millis(10)))
     .insert_resource(Time::<Fixed>::from_hz(100.0));
     app.finish();
     app.cleanup();
     app
-}
-
-fn run(app: &mut App, frames: usize) {
-    for _ in 0..frames {
-        app.update();
-        std::thread::sleep(Duration::from_millis(10));
-    }
 }
 
 struct Scene {
@@ -50,32 +45,50 @@ struct Scene {
     device: DeviceId,
     tool: Entity,
     hand: VirtualHandle,
+    frames: u32,
+    /// No two frames are of one length.
+    uneven: bool,
 }
 
 /// A block with its tip at the middle of the workspace, a firm hand there.
 fn scene(modal: bool) -> Scene {
-    scene_in(app(), modal)
+    scene_in(app(), modal, false)
 }
 
-fn scene_in(mut app: App, modal: bool) -> Scene {
+fn scene_in(mut app: App, modal: bool, uneven: bool) -> Scene {
     let model = block::block(1e5, 12);
     let tip = model.surface().positions()[block::tip() as usize];
     let handle =
         app.world_mut().resource_mut::<Assets<ModalAsset>>().add(ModalAsset(std::sync::Arc::new(model)));
     app.world_mut().spawn(ModalBody::new(handle));
+    let (device, hand) = add_device(&mut app);
+    let tool = HapticTool { modal, ..HapticTool::new(device) };
+    let place = Transform::from_translation(tip.into());
+    let tool = app.world_mut().spawn((tool, ToolGrip::default(), place)).id();
+    let mut scene = Scene { app, device, tool, hand, frames: 0, uneven };
+    in_place(&mut scene, tool);
+    scene
+}
+
+/// A virtual device in a firm hand that rests.
+fn add_device(app: &mut App) -> (DeviceId, VirtualHandle) {
     let device = VirtualDevice::new(VirtualConfig::touch(), Hand::FIRM).unwrap();
     let hand = device.handle();
-    let device = app.world_mut().resource_mut::<HapticDevices>().add(device, LoopConfig::default()).unwrap();
-    let tool = app
-        .world_mut()
-        .spawn((
-            HapticTool { modal, ..HapticTool::new(device) },
-            ToolGrip::default(),
-            Transform::from_translation(tip.into()),
-        ))
-        .id();
-    run(&mut app, 5);
-    Scene { app, device, tool, hand }
+    (app.world_mut().resource_mut::<HapticDevices>().add(device, machine::patient()).unwrap(), hand)
+}
+
+impl Scene {
+    /// Frames at their own pace: the loop carries what it is told on from one to the next.
+    fn run(&mut self, frames: usize) {
+        for _ in 0..frames {
+            self.frames += 1;
+            let uneven = u64::from(self.frames * 137 % 4000);
+            let length = Duration::from_micros(if self.uneven { 8000 + uneven } else { 10_000 });
+            self.app.insert_resource(TimeUpdateStrategy::ManualDuration(length));
+            self.app.update();
+            std::thread::sleep(length);
+        }
+    }
 }
 
 fn force(scene: &Scene) -> DVec3 {
@@ -83,15 +96,41 @@ fn force(scene: &Scene) -> DVec3 {
     devices.get(scene.device).unwrap().report.tick.wrench.force.into()
 }
 
-/// Runs until it is so. The loop's clock is the real one and a busy machine stutters: what must come is waited for, what must not come is not.
+/// Runs until it is so. The loop's clock is the real one and a busy machine stutters: what must
+/// come is waited for.
 fn until(s: &mut Scene, what: &str, mut so: impl FnMut(&mut Scene) -> bool) {
-    for _ in 0..1000 {
+    machine::until(what, || {
         if so(s) {
-            return;
+            return Ok(());
         }
-        run(&mut s.app, 1);
-    }
-    panic!("never: {what}; the force is {} N", force(s));
+        s.run(1);
+        let devices = s.app.world().resource::<HapticDevices>().iter();
+        Err(devices.map(|(_, d)| (d.report.state, d.report.ticks, d.report.tick)).collect::<Vec<_>>())
+    });
+}
+
+/// It stays so: for thirty frames, and as many periods of every loop as a force needs to come back
+/// by its ramp and more.
+fn stays(s: &mut Scene, what: &str, mut so: impl FnMut(&mut Scene) -> bool) {
+    let ticks = |s: &Scene| -> Vec<u64> {
+        s.app.world().resource::<HapticDevices>().iter().map(|(_, d)| d.report.ticks).collect()
+    };
+    let (begun, frames) = (ticks(s), s.frames);
+    until(s, "frames and periods go on", |s| {
+        assert!(so(s), "{what}: {} N", force(s));
+        s.frames >= frames + 30 && ticks(s).iter().zip(&begun).all(|(now, then)| now - then >= 400)
+    });
+}
+
+/// Runs until there is a body and the loop says that the tool is where it was put. A press before
+/// that would hold nothing, for good.
+fn in_place(s: &mut Scene, tool: Entity) {
+    until(s, "a body, and the tool in its place", |s| {
+        let bodies = s.app.world_mut().query::<&BodyState>().iter(s.app.world()).count();
+        let world = s.app.world();
+        let place = world.get::<Transform>(tool).unwrap().translation.as_dvec3();
+        bodies == 1 && world.get::<ToolPose>(tool).unwrap().position.distance(place) < 1e-3
+    });
 }
 
 fn grabs(app: &mut App) -> Vec<(Grab, GrabForce)> {
@@ -105,14 +144,13 @@ fn a_press_holds_and_the_hand_feels_the_body() {
         let mut s = scene(modal);
         s.hand.set_buttons(1);
         until(&mut s, "the button grips what is in reach", |s| grabs(&mut s.app).len() == 1);
-        run(&mut s.app, 5);
+        stays(&mut s, "grabbing pushes nobody", |s| force(s).length() < 0.05);
         let held = grabs(&mut s.app);
         assert!(
             held[0].0.stiffness.is_some_and(|k| (k - 280.0).abs() < 1.0),
             "the device's coupling: {:?}",
             held[0].0
         );
-        assert!(force(&s).length() < 0.05, "grabbing pushes nobody: {}", force(&s));
         s.hand.set_target([0.02, 0.0, 0.0]);
         // The block has E A / L = 1600 N/m, the coupling 280, the arm 500: 2 cm of them in series are 3.1 N, of which friction may hold back 0.26.
         until(&mut s, "3 N, and the body says the same as the hand gets", |s| {
@@ -149,8 +187,7 @@ fn pause_fades_and_stop_is_latched() {
     until(&mut s, "it comes back", |s| force(s).length() > 1.0);
     s.app.world().resource::<HapticDevices>().estop();
     until(&mut s, "stopped", |s| force(s) == DVec3::ZERO);
-    run(&mut s.app, 10);
-    assert_eq!(force(&s), DVec3::ZERO, "and stays so");
+    stays(&mut s, "and stays so", |s| force(s) == DVec3::ZERO);
     let state = |s: &Scene| s.app.world().resource::<HapticDevices>().get(s.device).unwrap().report.state;
     assert_eq!(state(&s), LoopState::Stopped);
     s.app.world_mut().resource_mut::<HapticDevices>().reset_stop();
@@ -162,12 +199,12 @@ fn pause_fades_and_stop_is_latched() {
     s.app.add_systems(Update, |mut news: MessageReader<HapticButton>, mut told: ResMut<Buttons>| {
         told.0.extend(news.read());
     });
-    run(&mut s.app, 2);
+    s.run(2);
     s.app.world_mut().resource_mut::<Buttons>().0.clear();
     assert_eq!(grabs(&mut s.app).len(), 1);
     assert!(s.app.world_mut().resource_mut::<HapticDevices>().remove(s.device));
     assert!(!s.app.world_mut().resource_mut::<HapticDevices>().remove(s.device), "once");
-    run(&mut s.app, 2);
+    s.run(2);
     assert_eq!(grabs(&mut s.app).len(), 0, "no phantom hand");
     let up = HapticButton { device: s.device, button: 0, pressed: false };
     assert_eq!(s.app.world().resource::<Buttons>().0, [up]);
@@ -178,25 +215,11 @@ fn pause_fades_and_stop_is_latched() {
 #[test]
 fn a_copy_of_the_body_stands_steps_of_changing_length() {
     // In a schedule that runs once a picture no two steps are the same, and the loop's copy of the body is not made anew for that.
-    let mut s = scene_in(app_in(Update), true);
-    let mut frame = 0u32;
-    let mut until = |s: &mut Scene, what: &str, so: &mut dyn FnMut(&mut Scene) -> bool| {
-        for _ in 0..1000 {
-            if so(s) {
-                return;
-            }
-            frame += 1;
-            let length = Duration::from_micros(8000 + u64::from(frame * 137 % 4000));
-            s.app.insert_resource(TimeUpdateStrategy::ManualDuration(length));
-            s.app.update();
-            std::thread::sleep(length);
-        }
-        panic!("never: {what}; the force is {} N", force(s));
-    };
+    let mut s = scene_in(app_in(Update), true, true);
     s.hand.set_buttons(1);
-    until(&mut s, "gripped", &mut |s| grabs(&mut s.app).len() == 1);
+    until(&mut s, "gripped", |s| grabs(&mut s.app).len() == 1);
     s.hand.set_target([0.02, 0.0, 0.0]);
-    until(&mut s, "3 N", &mut |s| (-3.3..-2.7).contains(&force(s).x));
+    until(&mut s, "3 N", |s| (-3.3..-2.7).contains(&force(s).x));
 }
 
 #[test]
@@ -243,20 +266,16 @@ fn a_stop_holds_for_devices_that_come_later() {
     assert!(!s.app.world().resource::<HapticDevices>().is_stopped());
     s.app.world().resource::<HapticDevices>().estop();
     let tip = *s.app.world().get::<Transform>(s.tool).unwrap();
-    let device = VirtualDevice::new(VirtualConfig::touch(), Hand::FIRM).unwrap();
-    let hand = device.handle();
-    let later = s.app.world_mut().resource_mut::<HapticDevices>().add(device, LoopConfig::default()).unwrap();
-    s.app.world_mut().spawn((HapticTool::new(later), ToolGrip::default(), tip));
-    run(&mut s.app, 5);
+    let (later, hand) = add_device(&mut s.app);
+    let tool = s.app.world_mut().spawn((HapticTool::new(later), ToolGrip::default(), tip)).id();
+    in_place(&mut s, tool);
+    until(&mut s, "both are stopped", |s| devices(s).iter().all(|d| d.0 == LoopState::Stopped));
     hand.set_buttons(1);
     until(&mut s, "the later device holds the block", |s| grabs(&mut s.app).len() == 1);
     hand.set_target([0.02, 0.0, 0.0]);
-    for _ in 0..30 {
-        run(&mut s.app, 1);
-        for (state, force) in devices(&mut s) {
-            assert_eq!((state, force), (LoopState::Stopped, DVec3::ZERO), "stopped, old and new");
-        }
-    }
+    stays(&mut s, "stopped, old and new", |s| {
+        devices(s).iter().all(|d| *d == (LoopState::Stopped, DVec3::ZERO))
+    });
     s.app.world_mut().resource_mut::<HapticDevices>().reset_stop();
     assert!(!s.app.world().resource::<HapticDevices>().is_stopped());
     until(&mut s, "the later device gives its force", |s| devices(s)[1].1.length() > 1.0);
@@ -294,22 +313,17 @@ fn a_remote_body_is_felt_through_its_published_force_until_the_network_is_gone()
     assert!(target.x > at.x + 1e-3, "and the session is told where the hand is: {target}");
     // Until the session knows of the grab, and once it is over, the force says nothing: that is no patch at the origin.
     s.app.world_mut().entity_mut(grab).insert(GrabForce::default());
-    let mut most = 0.0f64;
-    let mut frames = 0;
-    until(&mut s, "let go", |s| {
-        (most, frames) = (most.max(force(s).length()), frames + 1);
-        frames > 30 && force(s) == DVec3::ZERO
-    });
-    assert!(most < 2.5, "{most} N");
+    stays(&mut s, "no more than before", |s| force(s).length() < 2.5);
+    until(&mut s, "let go", |s| force(s) == DVec3::ZERO);
     s.app.world_mut().entity_mut(grab).insert(known);
     until(&mut s, "held again", |s| (force(s).x - want).abs() < 0.3);
+    s.app.world_mut().resource_mut::<Heard>().0.clear();
     s.app.world_mut().resource_mut::<Network>().0 = false;
     until(&mut s, "nothing new comes: the force fades", |s| {
         let heard = &s.app.world().resource::<Heard>().0;
         heard.iter().any(|f| matches!(f, Fault::Stale(_))) && force(s) == DVec3::ZERO
     });
-    run(&mut s.app, 10);
-    assert_eq!(force(&s), DVec3::ZERO, "and stays away");
+    stays(&mut s, "and stays away", |s| force(s) == DVec3::ZERO);
     s.app.world_mut().resource_mut::<Network>().0 = true;
     until(&mut s, "it comes back", |s| (force(s).x - want).abs() < 0.3);
 }
@@ -318,11 +332,10 @@ fn a_remote_body_is_felt_through_its_published_force_until_the_network_is_gone()
 fn two_devices_on_one_body_feel_each_other() {
     let mut s = scene(false);
     let at = s.app.world().get::<Transform>(s.tool).unwrap().translation;
-    let device = VirtualDevice::new(VirtualConfig::touch(), Hand::FIRM).unwrap();
-    let second = device.handle();
-    let other = s.app.world_mut().resource_mut::<HapticDevices>().add(device, LoopConfig::default()).unwrap();
-    s.app.world_mut().spawn((HapticTool::new(other), ToolGrip::default(), Transform::from_translation(at)));
-    run(&mut s.app, 5);
+    let (other, second) = add_device(&mut s.app);
+    let place = Transform::from_translation(at);
+    let tool = s.app.world_mut().spawn((HapticTool::new(other), ToolGrip::default(), place)).id();
+    in_place(&mut s, tool);
     s.hand.set_buttons(1);
     second.set_buttons(1);
     until(&mut s, "both hold it", |s| grabs(&mut s.app).len() == 2);
@@ -368,7 +381,7 @@ fn a_driver_that_panics_is_told_and_lets_go() {
     let device = VirtualDevice::new(VirtualConfig::touch(), Hand::FIRM).unwrap();
     let (hand, fuse) = (device.handle(), std::sync::Arc::default());
     let bomb = Bomb(device, std::sync::Arc::clone(&fuse));
-    s.device = s.app.world_mut().resource_mut::<HapticDevices>().add(bomb, LoopConfig::default()).unwrap();
+    s.device = s.app.world_mut().resource_mut::<HapticDevices>().add(bomb, machine::patient()).unwrap();
     s.tool = s.app.world_mut().spawn((HapticTool::new(s.device), ToolGrip::default(), at)).id();
     s.app.init_resource::<Heard>().init_resource::<Notices>();
     s.app.add_systems(
@@ -381,14 +394,15 @@ fn a_driver_that_panics_is_told_and_lets_go() {
             told.0.extend(notices.read().map(|n| n.event));
         },
     );
-    run(&mut s.app, 5);
+    let tool = s.tool;
+    in_place(&mut s, tool);
     hand.set_buttons(1);
     until(&mut s, "gripped", |s| grabs(&mut s.app).len() == 1);
     hand.set_target([0.02, 0.0, 0.0]);
     until(&mut s, "a force", |s| force(s).length() > 1.0);
     fuse.store(true, std::sync::atomic::Ordering::Release);
     until(&mut s, "the body is let go of", |s| grabs(&mut s.app).is_empty());
-    run(&mut s.app, 5);
+    s.run(5);
     let report = s.app.world().resource::<HapticDevices>().get(s.device).unwrap().report;
     assert_eq!((report.state, force(&s)), (LoopState::Ended, DVec3::ZERO));
     let count = |world: &World| world.resource::<Heard>().0.iter().filter(|f| **f == Fault::Panicked).count();

@@ -25,6 +25,8 @@ use pliant_haptics::{
 
 #[path = "rig/block.rs"]
 mod block;
+#[path = "rig/machine.rs"]
+mod machine;
 
 /// Seconds a frame, whatever the machine takes for it.
 const FRAME: f64 = 0.01;
@@ -69,35 +71,53 @@ impl Scene {
         self.app.world().resource::<HapticDevices>().get(self.device).unwrap().report.tick
     }
 
+    /// Periods that the loop has run.
+    fn ticks(&self) -> u64 {
+        self.app.world().resource::<HapticDevices>().get(self.device).unwrap().report.ticks
+    }
+
     fn position(&self) -> DVec3 {
         self.tick().position.into()
     }
 
+    /// It stays so for twenty frames, in which the loop has had the time to say otherwise.
+    #[track_caller]
+    fn stays(&mut self, what: &str, so: impl Fn(&Self) -> bool) {
+        let begun = self.ticks();
+        let mut frames = 0;
+        machine::until("frames and periods go on", || {
+            assert!(so(self), "{what}: {:?}", self.tick());
+            self.run(1);
+            frames += 1;
+            let ticks = self.ticks() - begun;
+            if frames >= 20 && ticks >= 200 { Ok(()) } else { Err((frames, ticks)) }
+        });
+    }
+
     /// Runs until the device is at `place` (m, device axes) to `near`, and then for a while, in which it is to stay there.
+    #[track_caller]
     fn comes_to_rest_at(&mut self, place: DVec3, near: f64) {
         let there = |s: &Self| s.position().distance(place) < near;
         // The loop's clock is the real one and a busy machine stutters.
-        for _ in 0..500 {
+        machine::until("the device comes to its place", || {
             if there(self) {
-                break;
+                return Ok(());
             }
             self.run(1);
-        }
-        for _ in 0..20 {
-            assert!(there(self), "at {} m, not at {place} m", self.position());
-            self.run(1);
-        }
+            Err((self.position(), place))
+        });
+        self.stays("it rests there", there);
     }
 
     #[track_caller]
     fn buttons_become(&mut self, wanted: u32) {
-        for _ in 0..500 {
+        machine::until("buttons", || {
             if self.tick().buttons == wanted {
-                return;
+                return Ok(());
             }
             self.run(1);
-        }
-        panic!("buttons {:#b}, not {wanted:#b}", self.tick().buttons);
+            Err((self.tick().buttons, wanted))
+        });
     }
 
     /// A window of 800 x 600 and a camera two metres in front of the origin.
@@ -159,16 +179,14 @@ fn a_press_that_is_somebody_elses_is_not_the_tools_and_one_that_is_ends() {
     let window = s.window();
     s.point(window, Some(Vec2::ZERO));
     s.press(window, MouseButton::Left, ButtonState::Pressed);
-    s.run(10);
+    s.stays("the panel's", |s| s.tick().buttons == 0);
     // Held on the way out of the panel it is still the panel's.
     s.app.world_mut().resource_mut::<Panel>().0 = false;
-    s.run(10);
-    assert_eq!(s.tick().buttons, 0);
+    s.stays("still the panel's", |s| s.tick().buttons == 0);
     s.press(window, MouseButton::Right, ButtonState::Pressed);
     s.buttons_become(0b10);
     s.app.world_mut().resource_mut::<Panel>().0 = true;
-    s.run(10);
-    assert_eq!(s.tick().buttons, 0b10, "a hand that passes over the panel does not let go");
+    s.stays("a hand that passes over the panel does not let go", |s| s.tick().buttons == 0b10);
     s.press(window, MouseButton::Right, ButtonState::Released);
     s.buttons_become(0);
     s.press(window, MouseButton::Left, ButtonState::Released);

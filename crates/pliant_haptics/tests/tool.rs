@@ -6,6 +6,9 @@ use pliant_haptics::{
     ModelWriter, Sample, ToolMap, VirtualConfig, VirtualDevice,
 };
 
+#[path = "rig/machine.rs"]
+mod machine;
+
 /// A device of six degrees of freedom that a test moves.
 fn six() -> DeviceInfo {
     DeviceInfo { peak_torque: 0.5, torque_axes: [true; 3], resolution: 0.0, ..VirtualConfig::touch().info() }
@@ -143,24 +146,22 @@ fn two_devices_at_once() {
     let start = |x: f64| {
         let device = VirtualDevice::new(VirtualConfig::touch(), Hand::FIRM).unwrap();
         device.handle().set_target([x, 0.0, 0.0]);
-        HapticLoop::start(device, LoopConfig::default()).unwrap()
+        HapticLoop::start(device, machine::patient()).unwrap()
     };
     let mut hands = [start(0.01), start(-0.01)];
-    let mut felt = [0.0; 2];
-    for tick in 1..=1000 {
-        for (hand, felt) in hands.iter_mut().zip(&mut felt) {
+    let mut tick = 0;
+    machine::until("each feels its own", || {
+        tick += 1;
+        let felt = hands.each_mut().map(|hand| {
             hand.publish(|model| {
                 model.tick = tick;
                 model.period = 0.01;
                 model.count = 1;
                 model.contacts[0] = spring([0.0; 3], [0.0; 3], 200.0);
             });
-            *felt = hand.report().tick.wrench.force[0];
-        }
-        if felt[0] < -0.5 && felt[1] > 0.5 {
-            return;
-        }
+            hand.report().tick.wrench.force[0]
+        });
         std::thread::sleep(std::time::Duration::from_millis(10));
-    }
-    panic!("each feels its own: {felt:?} N");
+        if felt[0] < -0.5 && felt[1] > 0.5 { Ok(()) } else { Err(felt) }
+    });
 }

@@ -1,7 +1,10 @@
 //! The panel in an app: what is pressed and moved in it, by accessible names, is done to components and resources.
 #![allow(clippy::unwrap_used, clippy::panic, missing_docs, reason = "a failed test should panic")]
 
-use std::time::Duration;
+use std::{
+    fmt::Debug,
+    time::{Duration, Instant},
+};
 
 use bevy::{
     asset::AssetPlugin, prelude::*, time::TimeUpdateStrategy, transform::TransformPlugin,
@@ -19,6 +22,19 @@ use pliant_body::{BodyState, Driven, Grab, GrabOf, ModalBody, PliantBodyPlugin, 
 use pliant_panel::{Panel, PanelPlugin};
 
 type Shown = Harness<'static, App>;
+
+/// How long anything that must come may take. Only what never comes takes longer.
+const LIMIT: Duration = Duration::from_secs(60);
+
+/// Looks until it sees what is waited for. `look` goes on by a frame, and says what it saw instead.
+#[track_caller]
+fn until<L: Debug>(what: &str, mut look: impl FnMut() -> Result<(), L>) {
+    let begun = Instant::now();
+    while let Err(seen) = look() {
+        assert!(begun.elapsed() < LIMIT, "not in {LIMIT:?}: {what}; the last was {seen:?}");
+        std::thread::sleep(Duration::from_millis(5));
+    }
+}
 
 /// An app without a window, a hundredth of a second a frame, with Pip in it and the panel open.
 fn app(more: impl FnOnce(&mut App)) -> App {
@@ -46,14 +62,11 @@ fn app(more: impl FnOnce(&mut App)) -> App {
     app.world_mut().spawn((PrimaryEguiContext, context));
     let pip = app.world().resource::<AssetServer>().load("pip.modal");
     app.world_mut().spawn((ModalBody::new(pip), Name::new("pip")));
-    for _ in 0..1000 {
+    until("the body is read", || {
         app.update();
-        if find::<BodyState>(&mut app).is_some() {
-            return app;
-        }
-        std::thread::sleep(Duration::from_millis(5));
-    }
-    panic!("the body does not come");
+        find::<BodyState>(&mut app).map(drop).ok_or("no body")
+    });
+    app
 }
 
 fn find<C: Component>(app: &mut App) -> Option<Entity> {
@@ -147,12 +160,11 @@ fn let_go_takes_off_what_is_held_here_and_wake_wakes() {
     click(&mut shown, "Let go");
     assert!(find::<Grab>(shown.state_mut()).is_none());
     assert!(shown.query_by_label("Let go").is_none());
-    for _ in 0..3000 {
+    let rests = (0..3000).any(|_| {
         shown.state_mut().update();
-        if shown.state().world().get::<BodyState>(pip).unwrap().is_resting() {
-            break;
-        }
-    }
+        shown.state().world().get::<BodyState>(pip).unwrap().is_resting()
+    });
+    assert!(rests, "there is something to wake");
     shown.run_steps(2);
     click(&mut shown, "Pause");
     click(&mut shown, "Wake");
@@ -361,15 +373,11 @@ mod session {
             app.add_plugins(guest);
         }));
         let state = |shown: &Shown| shown.state().world().resource::<NetGuest>().state().clone();
-        for _ in 0..1000 {
+        until("the guest is in", || {
             host.update();
             shown.run_steps(1);
-            if matches!(state(&shown), GuestState::In { .. }) {
-                break;
-            }
-            std::thread::sleep(Duration::from_millis(5));
-        }
-        assert!(matches!(state(&shown), GuestState::In { .. }), "{:?}", state(&shown));
+            if matches!(state(&shown), GuestState::In { .. }) { Ok(()) } else { Err(state(&shown)) }
+        });
         click(&mut shown, "Leave");
         shown.run_steps(3);
         assert!(matches!(state(&shown), GuestState::Closed { .. }), "{:?}", state(&shown));

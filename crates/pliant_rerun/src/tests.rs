@@ -1,4 +1,6 @@
 use std::{
+    fmt::Debug,
+    net::{TcpListener, TcpStream},
     path::{Path, PathBuf},
     sync::Arc,
     time::{Duration, Instant},
@@ -18,7 +20,31 @@ use crate::{
     blueprint::Plots,
     frame::{Drawn, Frame, Hand, Line, Place, Scalar, Shape},
     recorder::Recorder,
+    worker::{Target, Worker},
 };
+
+/// How long anything that must come may take. Only what never comes takes longer.
+const LIMIT: Duration = Duration::from_secs(60);
+
+/// Looks until it sees what is waited for; `look` says what it saw instead.
+#[track_caller]
+pub(crate) fn until<T, L: Debug>(what: &str, mut look: impl FnMut() -> Result<T, L>) -> T {
+    let begun = Instant::now();
+    loop {
+        match look() {
+            Ok(seen) => return seen,
+            Err(seen) => assert!(begun.elapsed() < LIMIT, "not in {LIMIT:?}: {what}; the last was {seen:?}"),
+        }
+        std::thread::sleep(Duration::from_millis(5));
+    }
+}
+
+/// A frame of the app, and then its figures if they are as wanted.
+pub(crate) fn update_to(app: &mut App, so: impl Fn(&RerunStats) -> bool) -> Result<(), RerunStats> {
+    app.update();
+    let stats = *app.world().resource::<RerunStats>();
+    if so(&stats) { Ok(()) } else { Err(stats) }
+}
 
 /// A unit square in the plane z = 0 on which one mode lifts the far side (y = 1) by q metres.
 pub(crate) fn square() -> ModalModel {
@@ -323,42 +349,38 @@ fn a_file_is_whole_after_a_panic() {
 
 #[test]
 fn without_a_viewer_nothing_is_lost_but_the_recording() {
-    // A port that was free a moment ago, and no viewer started on it.
-    let port = std::net::TcpListener::bind("127.0.0.1:0").unwrap().local_addr().unwrap().port();
+    // Nobody listens on this port, nor can anybody begin to: it is the near end of a connection
+    // that stays.
+    let listener = TcpListener::bind("127.0.0.1:0").unwrap();
+    let stream = TcpStream::connect(listener.local_addr().unwrap()).unwrap();
+    let port = stream.local_addr().unwrap().port();
     let mut app = app(RerunPlugin::viewer().with_viewer_port(port).with_spawn(false));
-    let start = Instant::now();
-    while app.world().resource::<RerunStats>().sinks > 0
-        || app.world().resource::<RerunStats>().collected == 0
-    {
-        app.update();
-        assert!(start.elapsed() < Duration::from_secs(10), "still waiting for a viewer");
-        std::thread::sleep(Duration::from_millis(1));
-    }
+    until("on without a viewer", || update_to(&mut app, |stats| stats.sinks == 0 && stats.collected > 0));
     let collected = app.world().resource::<RerunStats>().collected;
     (0..20).for_each(|_| app.update());
     assert_eq!(app.world().resource::<RerunStats>().collected, collected, "nothing is collected for nobody");
-    let start = Instant::now();
-    drop(app);
-    assert!(start.elapsed() < Duration::from_secs(2), "the end does not wait for it either");
+    // The end does not wait for a viewer either: the worker has ended before anybody asks it to.
+    let target = Target::Viewer { port, spawn: false };
+    let (spare, _logged) = crossbeam_channel::bounded(1);
+    let worker = Worker::start("pliant_test", &target, 1, Plots::default(), spare).unwrap();
+    until("the worker ends", || if worker.has_ended() { Ok(()) } else { Err("it runs") });
 }
 
 #[test]
 fn a_viewer_that_does_not_read_drops_ticks_and_never_holds_the_app_up() {
     // It listens and accepts, and then says nothing: the worst kind.
-    let listener = std::net::TcpListener::bind("127.0.0.1:0").unwrap();
+    let listener = TcpListener::bind("127.0.0.1:0").unwrap();
     let port = listener.local_addr().unwrap().port();
-    let mut app = app(RerunPlugin::viewer().with_viewer_port(port).with_spawn(false).with_queue(4));
-    let mut longest = Duration::ZERO;
-    let start = Instant::now();
-    while app.world().resource::<RerunStats>().dropped == 0 {
-        let one = Instant::now();
-        app.update();
-        longest = longest.max(one.elapsed());
-        assert!(start.elapsed() < Duration::from_secs(60), "the queue never filled");
-    }
-    // A millisecond is usual for this app in an unoptimised build; waiting for the viewer would be seconds.
-    assert!(longest < Duration::from_millis(500), "{longest:?}");
-    drop(listener);
+    let run = std::thread::spawn(move || {
+        let mut app = app(RerunPlugin::viewer().with_viewer_port(port).with_spawn(false).with_queue(4));
+        until("the queue is full", || update_to(&mut app, |stats| stats.dropped > 0));
+        (0..500).for_each(|_| app.update());
+        drop(listener);
+    });
+    // A millisecond a tick is usual for this app in an unoptimised build. What the limit is for is
+    // a wait for the viewer, which would be for ever, or a shorter one in each of the ticks.
+    until("five hundred ticks beside it", || if run.is_finished() { Ok(()) } else { Err("held up") });
+    run.join().unwrap();
 }
 
 #[test]

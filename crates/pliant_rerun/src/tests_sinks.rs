@@ -1,6 +1,13 @@
 //! What a sink that is slow, closed or off is told, and what it costs.
 
-use std::time::{Duration, Instant};
+use std::{
+    io::Read,
+    sync::{
+        Arc,
+        atomic::{AtomicUsize, Ordering},
+    },
+    time::Duration,
+};
 
 use bevy::{
     log::{
@@ -18,7 +25,7 @@ use crate::{
     RerunPlugin, RerunRecording, RerunScalars, RerunStats,
     collect::Collector,
     log_lines::Lines,
-    tests::{app, numbers, recorder, rows, scratch},
+    tests::{app, numbers, recorder, rows, scratch, until, update_to},
     worker::{Message, Worker},
 };
 
@@ -156,29 +163,33 @@ fn a_viewer_that_is_closed_is_noticed() {
     let port = listener.local_addr().unwrap().port();
     listener.set_nonblocking(true).unwrap();
     let (close, closed) = bounded::<()>(0);
+    let taken = Arc::new(AtomicUsize::new(0));
+    let count = taken.clone();
     let viewer = std::thread::spawn(move || {
-        let mut taken = Vec::new();
+        let mut guests = Vec::new();
+        let mut bytes = [0; 4096];
         while closed.try_recv() != Err(crossbeam_channel::TryRecvError::Disconnected) {
-            taken.extend(listener.accept());
+            if let Ok((guest, _)) = listener.accept() {
+                guest.set_nonblocking(true).unwrap();
+                guests.push(guest);
+            }
+            let read = guests.iter_mut().filter_map(|guest| guest.read(&mut bytes).ok());
+            count.fetch_add(read.sum(), Ordering::Relaxed);
             std::thread::sleep(Duration::from_millis(5));
         }
-        taken.len()
+        guests.len()
     });
     let mut app = app(RerunPlugin::viewer().with_viewer_port(port).with_spawn(false).with_queue(1000));
-    let start = Instant::now();
-    while start.elapsed() < Duration::from_secs(1) {
-        app.update();
-        std::thread::sleep(Duration::from_millis(10));
-    }
+    // HTTP/2 begins with 24 bytes that are the same for everybody. With more than those the
+    // connection is made, and not to be tried again.
+    until("it is streamed to", || {
+        let streams = |_: &RerunStats| taken.load(Ordering::Relaxed) > 24;
+        update_to(&mut app, streams).map_err(|stats| (stats, taken.load(Ordering::Relaxed)))
+    });
     assert_eq!(app.world().resource::<RerunStats>().sinks, 1, "it is there");
     drop(close);
     assert!(viewer.join().unwrap() >= 2, "asked for, and streamed to");
-    let start = Instant::now();
-    while app.world().resource::<RerunStats>().sinks > 0 {
-        assert!(start.elapsed() < Duration::from_secs(20), "still streaming to nobody");
-        app.update();
-        std::thread::sleep(Duration::from_millis(10));
-    }
+    until("it is gone", || update_to(&mut app, |stats| stats.sinks == 0));
     let collected = app.world().resource::<RerunStats>().collected;
     (0..20).for_each(|_| app.update());
     assert_eq!(app.world().resource::<RerunStats>().collected, collected, "nothing is collected for nobody");
@@ -187,24 +198,22 @@ fn a_viewer_that_is_closed_is_noticed() {
 #[cfg(target_os = "linux")]
 #[test]
 fn the_threads_of_a_recording_give_way() {
+    // `id (name) state ppid ...`: the 19th field is the nice value.
+    let of = |stat: &str| stat.rsplit(')').next()?.split_whitespace().nth(16)?.parse::<i32>().ok();
+    let own = of(&std::fs::read_to_string("/proc/self/stat").unwrap()).unwrap();
     let path = scratch("nice");
     let mut app = app(RerunPlugin::file(&path));
-    let start = Instant::now();
     // The SDK's thread that writes the file, made by the worker.
-    let nice = loop {
+    let nice = until("a thread that writes the file", || {
         app.update();
         let threads = std::fs::read_dir("/proc/self/task").unwrap().flatten();
         let stats = threads.filter_map(|thread| std::fs::read_to_string(thread.path().join("stat")).ok());
-        // `id (name) state ppid ...`: the 19th field is the nice value.
-        let of = |stat: &str| stat.rsplit(')').next().unwrap().split_whitespace().nth(16).unwrap().to_owned();
-        let found: Vec<String> =
-            stats.filter(|stat| stat.contains("(file_writer)")).map(|s| of(&s)).collect();
-        if !found.is_empty() {
-            break found;
-        }
-        assert!(start.elapsed() < Duration::from_secs(20), "no such thread");
-    };
-    assert!(nice.iter().all(|nice| nice == "9"), "{nice:?}");
+        let (writers, others): (Vec<_>, Vec<_>) = stats.partition(|stat| stat.contains("(file_writer)"));
+        if writers.is_empty() { Err(others) } else { Ok(writers) }
+    });
+    // Tests that were told to give way more than that need no more.
+    let right = |nice| if own <= 9 { nice == 9 } else { nice >= 9 };
+    assert!(nice.iter().all(|stat| of(stat).is_some_and(right)), "{nice:?}");
     drop(app);
     std::fs::remove_file(path).unwrap();
 }

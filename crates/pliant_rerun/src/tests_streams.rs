@@ -1,8 +1,13 @@
 //! What each stream says, and what it costs when it is off.
 
+use std::collections::BTreeSet;
+
 use bevy::{math::DVec3, prelude::*};
 use pliant_body::{Grab, ModalBody};
-use rerun::log::LogMsg;
+use rerun::{
+    external::re_log_encoding::rrd::DecoderApp,
+    log::{Chunk, LogMsg},
+};
 
 use crate::{
     RerunColour, RerunPlugin, RerunRecording, RerunScalars, RerunStats, RerunStyle,
@@ -189,8 +194,8 @@ fn energies_are_a_line_and_what_comes_faster_than_ticks_has_its_own_times() {
     );
 }
 
-/// Frames of an app at these rates: what was collected.
-fn collected(rates: RerunRecording, name: &str, style: RerunStyle) -> (RerunStats, u64) {
+/// Two hundred frames of an app at these rates: what was collected, and what is in the file.
+fn collected(rates: RerunRecording, name: &str, style: RerunStyle) -> (RerunStats, Vec<LogMsg>) {
     let path = scratch(name);
     let mut app = app(RerunPlugin::file(&path).with_rates(rates).with_queue(2048));
     let bodies: Vec<Entity> =
@@ -208,9 +213,10 @@ fn collected(rates: RerunRecording, name: &str, style: RerunStyle) -> (RerunStat
     }
     let stats = *app.world().resource::<RerunStats>();
     drop(app);
-    let bytes = std::fs::metadata(&path).unwrap().len();
+    let file = std::io::BufReader::new(std::fs::File::open(&path).unwrap());
+    let messages = DecoderApp::decode_lazy(file).map(Result::unwrap).collect();
     std::fs::remove_file(path).unwrap();
-    (stats, bytes)
+    (stats, messages)
 }
 
 #[test]
@@ -222,19 +228,34 @@ fn a_stream_with_a_rate_of_zero_is_not_gathered_and_not_in_the_file() {
         modes_hz: f64::NAN,
         ..RerunRecording::default()
     };
+    // How large a file is hangs on how often its worker gets to write; what is told in it does not.
+    let told = |messages: &[LogMsg]| -> BTreeSet<String> {
+        let of = |message: &LogMsg| match message {
+            LogMsg::ArrowMsg(store, data) if store.is_recording() => {
+                Some(Chunk::from_arrow_msg(data).unwrap().entity_path().to_string())
+            }
+            _ => None,
+        };
+        let paths = messages.iter().filter_map(of);
+        paths.filter(|path| path != "/world" && !path.starts_with("/__properties")).collect()
+    };
+    let nothing = BTreeSet::new();
+    let shapes = |messages: &[LogMsg]| rows(messages, "/world/square", "vertex_positions") as u64;
     let (none, empty) = collected(off, "off", RerunStyle::Surface);
     assert_eq!((none.collected, none.shapes), (200, 0));
+    assert_eq!(told(&empty), nothing, "nothing but the world's axes and the layout");
     let (all, full) = collected(RerunRecording::default(), "all", RerunStyle::Surface);
     assert!(all.shapes >= 195, "{all:?}");
-    let (drawn, drawn_bytes) =
-        collected(RerunRecording { shapes_hz: 10.0, ..off }, "drawn", RerunStyle::Surface);
+    assert!((95..=101).contains(&shapes(&full)), "20 Hz of 40: {}", shapes(&full));
+    assert_eq!(numbers(&full, "/error/now", "scalars").len(), 200);
+    let streams =
+        ["/displacement/square", "/energy/square", "/modes/square", "/reaction/hand", "/world/hands/targets"];
+    assert!(streams.iter().all(|path| told(&full).contains(*path)), "{:?}", told(&full));
+    let (drawn, file) = collected(RerunRecording { shapes_hz: 10.0, ..off }, "drawn", RerunStyle::Surface);
     assert!((48..=51).contains(&drawn.shapes), "10 Hz of 40: {drawn:?}");
-    let (hidden, hidden_bytes) =
-        collected(RerunRecording { shapes_hz: 10.0, ..off }, "hidden", RerunStyle::Hidden);
-    assert_eq!(hidden.shapes, 0);
-    println!("bytes: off {empty}, hidden {hidden_bytes}, shapes {drawn_bytes}, all {full}");
-    assert!(empty < 8_000 && hidden_bytes < empty + 200, "nothing but the layout");
-    assert!(drawn_bytes > 2 * empty && full > 2 * drawn_bytes);
+    assert_eq!((shapes(&file), told(&file)), (drawn.shapes, BTreeSet::from(["/world/square".to_owned()])));
+    let (hidden, file) = collected(RerunRecording { shapes_hz: 10.0, ..off }, "hidden", RerunStyle::Hidden);
+    assert_eq!((hidden.shapes, told(&file)), (0, nothing));
 }
 
 #[test]

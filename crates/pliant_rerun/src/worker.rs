@@ -130,6 +130,12 @@ impl Worker {
         (worker, inbox)
     }
 
+    /// Whether the thread has ended by itself, so that closing waits for nothing.
+    #[cfg(test)]
+    pub fn has_ended(&self) -> bool {
+        self.ended.try_recv() == Err(crossbeam_channel::TryRecvError::Disconnected)
+    }
+
     /// Offers a frame without waiting; `false` when it was not taken. A worker that has ended takes nothing and drops nothing. One that
     /// missed something is told of `bodies`, all that there are.
     pub fn offer(&mut self, frame: &Arc<Frame>, bodies: impl FnOnce() -> Vec<Arc<Drawn>>) -> bool {

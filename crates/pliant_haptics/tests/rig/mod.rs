@@ -3,6 +3,7 @@
 
 pub mod baked;
 pub mod block;
+pub mod machine;
 pub mod scene;
 
 use pliant_haptics::{
