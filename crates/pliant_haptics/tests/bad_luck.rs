@@ -350,7 +350,7 @@ fn a_driver_that_panics() {
                 std::thread::sleep(Duration::from_millis(10));
                 heard.extend(running.events());
                 let report = running.report();
-                if so(report) { Ok(()) } else { Err((report.state, report.tick)) }
+                if so(report) { Ok(()) } else { Err(Box::new((report.state, report.tick))) }
             });
         };
         until(&mut running, &mut heard, "a force", &|r| r.tick.wrench.force[0] < -0.5);

@@ -157,7 +157,7 @@ fn on_its_own_thread() {
             std::thread::sleep(Duration::from_millis(10));
             events.extend(running.events());
             let seen = (running.report().state, running.report().tick);
-            if so(running) { Ok(()) } else { Err(seen) }
+            if so(running) { Ok(()) } else { Err(Box::new(seen)) }
         });
     };
     let pushes = |running: &mut HapticLoop| running.report().tick.wrench.force[0] < -0.1;
@@ -215,7 +215,7 @@ fn on_its_own_thread() {
     machine::until("no force", || {
         std::thread::sleep(Duration::from_millis(5));
         let tick = running.report().tick;
-        if tick.wrench.force == [0.0; 3] { Ok(()) } else { Err(tick) }
+        if tick.wrench.force == [0.0; 3] { Ok(()) } else { Err(Box::new(tick)) }
     });
     // A loop that does not stop when it is dropped never does.
     let drops = std::thread::spawn(move || drop(running));

@@ -53,12 +53,14 @@ pub fn wait_for<L: Look>(awaited: &str, mut look: impl FnMut() -> L) -> L::Found
 /// it never is.
 macro_rules! must {
     ($so:expr) => {
-        if !$so {
+        let so: bool = $so;
+        if !so {
             return Err(stringify!($so).to_string());
         }
     };
     ($so:expr, $($said:tt)+) => {
-        if !$so {
+        let so: bool = $so;
+        if !so {
             return Err(format!("{}: {}", stringify!($so), format_args!($($said)+)));
         }
     };
