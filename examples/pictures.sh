@@ -11,8 +11,9 @@ set -euo pipefail
 cd "$(dirname "$0")/.."
 
 if [ -z "${PICTURES_DISPLAY:-}" ]; then
-    command -v xvfb-run >/dev/null || {
-        echo "skipped: no xvfb-run (Debian: xvfb xauth, and without a graphics card mesa-vulkan-drivers)" >&2
+    command -v xvfb-run >/dev/null && command -v xauth >/dev/null || {
+        echo "skipped: no xvfb-run or xauth (Debian: xvfb xauth, and without a graphics card" \
+            "mesa-vulkan-drivers libvulkan1)" >&2
         exit 77
     }
     PICTURES_DISPLAY=1 exec xvfb-run -a -s "-screen 0 1280x720x24" "$0" "$@"
@@ -34,7 +35,9 @@ if [ -z "${BIN:-}" ]; then
     cargo build --profile "${PROFILE:-dev}" --examples
     profile="${PROFILE:-dev}"
     [ "$profile" = dev ] && profile=debug
-    BIN="$(cargo metadata --format-version 1 --no-deps | sed 's/.*"target_directory":"\([^"]*\)".*/\1/')/$profile/examples"
+    target="$(cargo metadata --format-version 1 --no-deps)"
+    target="$(sed 's/.*"target_directory":"\([^"]*\)".*/\1/' <<<"$target")"
+    BIN="$target/$profile/examples"
 fi
 BIN="$(realpath "$BIN")"
 root="$PWD"
@@ -126,7 +129,7 @@ if is_wanted host; then
     serve "$work/first.log" "$BIN/host" --headless --seconds 1 --bind 127.0.0.1:0 --key "$key"
     wait "${pids[-1]}"
     address="${invite#pliant://}"
-    "$BIN/join" "$invite" --headless --cached --seconds 60 >"$work/guest.log" 2>&1 &
+    "$BIN/join" "$invite" --headless --cached --seconds 600 >"$work/guest.log" 2>&1 &
     pids+=($!)
     picture host host --bind "${address%%#*}" --key "$key"
 fi

@@ -2,7 +2,7 @@
 //!
 //! ```sh
 //! cargo test -p pliant                      # builds the examples first, as any `cargo test` of the package does
-//! RUN=join cargo test -p pliant             # those whose file's name begins like that
+//! PLIANT_RUN=join cargo test -p pliant      # those whose file's name begins like that
 //! ```
 //!
 //! They are run in a folder of their own, with no display and a cache of their own.
@@ -106,9 +106,20 @@ fn every_example_has_a_run_and_those_that_draw_run_headless_for_so_many_frames()
 fn program(example: &str) -> PathBuf {
     let test = std::env::current_exe().unwrap();
     let name = format!("{example}{}", std::env::consts::EXE_SUFFIX);
-    let path = test.parent().unwrap().with_file_name("examples").join(name);
-    assert!(path.exists(), "{} is not there; `cargo build --examples` makes it", path.display());
-    path
+    test.parent().unwrap().with_file_name("examples").join(name)
+}
+
+/// Cargo builds them for a test of the whole package, and not for `--test examples` alone.
+fn build_examples() {
+    if examples().iter().all(|(name, _)| program(name).exists()) {
+        return;
+    }
+    let mut cargo = Command::new(env!("CARGO"));
+    cargo.args(["build", "-p", "pliant", "--examples"]).current_dir(ROOT);
+    if !cfg!(debug_assertions) {
+        cargo.arg("--release");
+    }
+    assert!(cargo.status().unwrap().success(), "the examples cannot be built");
 }
 
 /// A program that is ended when nobody needs it any more.
@@ -208,8 +219,9 @@ fn try_run(run: &Run, folder: &Path) -> Result<(), String> {
 
 #[test]
 fn every_example_runs_and_says_what_its_file_says() {
-    let wanted = std::env::var("RUN").unwrap_or_default();
+    let wanted = std::env::var("PLIANT_RUN").unwrap_or_default();
     let runs: Vec<(String, Run)> = runs().into_iter().filter(|(name, _)| name.starts_with(&wanted)).collect();
+    build_examples();
     assert!(!runs.is_empty(), "no file of tests/examples begins with {wanted:?}");
     let scratch = std::env::temp_dir().join(format!("pliant-examples-{}", std::process::id()));
     let next = AtomicUsize::new(0);

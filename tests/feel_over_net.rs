@@ -126,9 +126,8 @@ fn a_hand_far_away_feels_the_body_at_once_and_nothing_when_the_network_is_gone()
     let force = |app: &App| -> DVec3 {
         app.world().resource::<HapticDevices>().get(hand).unwrap().report.tick.wrench.force.into()
     };
-    // A pull is felt before the host can have answered, which is never sooner than the network lets
-    // it. A busy machine may be late all the same, so the hand goes back and pulls again until it
-    // has felt one so soon.
+    // A pull is felt before the host's body has felt it. A busy machine may look too late to tell,
+    // so the hand goes back and pulls again until it was seen.
     let start = Instant::now();
     loop {
         // Not far: a force that a late frame has faded must find what it takes to come back in the
@@ -141,19 +140,19 @@ fn a_hand_far_away_feels_the_body_at_once_and_nothing_when_the_network_is_gone()
             "the hand is pushed back as hard as the host's body pushes",
             |apps| {
                 let own = force(apps[1]);
-                if own.length() > 0.2 {
-                    first.get_or_insert(pulled.elapsed());
-                }
                 let truth = at_host(apps[0]).unwrap_or_default();
+                if own.length() > 0.2 {
+                    first.get_or_insert((pulled.elapsed(), truth.length()));
+                }
                 truth.length() > 0.5 && own.distance(truth) < 0.1 * truth.length()
             },
         );
-        let first = first.unwrap();
+        let (first, truth) = first.unwrap();
         println!("felt after {} ms on a network of 196 ms: {:?} N", first.as_millis(), force(&g.app));
-        if first < Duration::from_millis(190) {
+        if truth < 0.1 {
             break;
         }
-        assert!(start.elapsed() < PATIENCE, "own hand first: felt after {first:?}");
+        assert!(start.elapsed() < PATIENCE, "felt when the host's body pushed with {truth} N");
         g.hand.set_target([0.0; 3]);
         until(&mut [&mut host, &mut g.app], "nothing is felt where the hand began", |apps| {
             force(apps[1]).length() < 0.1 && at_host(apps[0]).is_some_and(|truth| truth.length() < 0.1)

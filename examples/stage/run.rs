@@ -26,6 +26,9 @@ const FRAME: f64 = 1.0 / 60.0;
 /// Frames before the picture in which cameras draw: bodies are shaped when they were seen in the frame before.
 const DRAWN: u64 = 5;
 
+/// How long others may take to come, s.
+const LONGEST_WAIT: f64 = 300.0;
+
 /// Frames that wait for the bodies to load, and for the picture to be written, before the run is given up.
 const PATIENCE: u64 = 100_000;
 
@@ -39,6 +42,8 @@ struct Run {
     screenshot: Option<PathBuf>,
     /// Frames and seconds since the bodies are there; `None` before.
     since: Option<(u64, f64)>,
+    /// When it began to wait for others, s of real time.
+    awaits_since: Option<f64>,
     waited: u64,
     /// Frames in which the cameras have drawn.
     drawn: u64,
@@ -66,6 +71,7 @@ pub(super) fn build(app: &mut App, options: &Options, real_time: bool, picture_a
         seconds,
         screenshot: options.screenshot.clone(),
         since: None,
+        awaits_since: None,
         waited: 0,
         drawn: 0,
         picture: Picture::Wanted,
@@ -152,9 +158,9 @@ fn end(
     mut exit: MessageWriter<AppExit>,
 ) {
     if run.since.is_some() && unattended.is_some() && !awaited.is_empty() {
-        run.since = Some((0, real.elapsed_secs_f64()));
-        run.waited += 1;
-        if run.waited > PATIENCE {
+        let now = real.elapsed_secs_f64();
+        run.since = Some((0, now));
+        if now - *run.awaits_since.get_or_insert(now) > LONGEST_WAIT {
             error!("whoever this scene waits for did not come");
             exit.write(AppExit::error());
         }

@@ -3,7 +3,8 @@
 //! fail instead.
 
 use std::{
-    env, panic,
+    env,
+    panic::{self, resume_unwind},
     process::ExitCode,
     time::{Duration, Instant},
 };
@@ -40,9 +41,16 @@ fn can_draw(studio: fn() -> App) -> bool {
     // The line above says it; the engine's panic would only alarm.
     let hook = panic::take_hook();
     panic::set_hook(Box::new(|_| ()));
-    let drawn = panic::catch_unwind(studio).is_ok();
+    let drawn = panic::catch_unwind(studio);
     panic::set_hook(hook);
-    drawn
+    let Err(reason) = drawn else { return true };
+    let words = reason.downcast_ref::<&str>().copied();
+    let words = words.or_else(|| reason.downcast_ref::<String>().map(String::as_str));
+    match words {
+        Some(words) if words.contains("Unable to find a GPU") => false,
+        // Another fault is no missing driver.
+        _ => resume_unwind(reason),
+    }
 }
 
 /// Calls `frame` until it returns something. Shaders are compiled and pictures are read back on

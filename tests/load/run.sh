@@ -8,7 +8,8 @@
 # SENT=1: the bots have no model, so that it is sent to all of them at once. AS="chrt --rr 10" or another prefix for the server's command, so that the bots'
 # threads and whatever else runs here do not take its processor from it. Binaries: those of BIN, or built by cargo.
 #
-# Its figures are times. Where something else keeps the machine busy it says so and ends with 77 (skipped); BUSY=1 measures all the same.
+# Its figures are times. Where something else keeps the machine busy it says so and ends with 77
+# (skipped); BUSY=1 measures all the same.
 set -u
 skip() { echo "skipped: $1"; exit 77; }
 [ -r /proc/loadavg ] || skip "needs Linux: no /proc/loadavg"
@@ -30,6 +31,7 @@ cached=--cached
 work=$(mktemp -d)
 server=""
 trap 'kill $server 2>/dev/null; rm -rf "$work"' EXIT
+trap 'exit 130' INT TERM HUP
 failed=0
 echo "load before: $(cut -d' ' -f1-3 /proc/loadavg), $(nproc) cores"
 echo "| users | ticks/s | a tick, median, ms | at 99 % | at most | processor, % | memory, MB, first and last | out, Mbit/s | kbit/s a user | let go | ticks heard | missing |"

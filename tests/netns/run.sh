@@ -5,8 +5,8 @@
 #   tests/netns/run.sh [SECONDS] [drag|faults|all]
 #
 # Needs root or CAP_NET_ADMIN, `ip` and `tc`; says so and ends with 77 (skipped) where it is not allowed. Binaries: those of BIN, or built by cargo.
-# Ends with 1 when a figure is beyond its bar. The figures of `drag` are of a session in real time: where something else keeps the machine busy
-# it ends with 77, too; BUSY=1 measures all the same.
+# Ends with 1 when a figure is beyond its bar. The figures of `drag` are of a session in real time:
+# where something else keeps the machine busy it ends with 77, too; BUSY=1 measures all the same.
 set -u
 cd "$(dirname "$0")/../.."
 seconds=${1:-60}
@@ -16,7 +16,8 @@ skip() { echo "skipped: $1"; exit 77; }
 command -v ip >/dev/null || skip "no ip"
 command -v tc >/dev/null || skip "no tc"
 env --default-signal=INT true 2>/dev/null || skip "no env of GNU coreutils"
-if [ -z "${BUSY:-}" ] && [ "$what" != faults ] && awk -v cores="$(nproc)" '{ exit !($1 > cores / 2) }' /proc/loadavg; then
+busy() { awk -v cores="$(nproc)" '{ exit !($1 > cores / 2) }' /proc/loadavg; }
+if [ -z "${BUSY:-}" ] && [ "$what" != faults ] && busy; then
     skip "the machine is busy: load $(cut -d' ' -f1 /proc/loadavg) on $(nproc) cores"
 fi
 tag=pl$$
@@ -30,7 +31,7 @@ cleanup() {
     [ "${KEEP:-}" ] && echo "kept $work" || rm -rf "$work"
 }
 trap cleanup EXIT
-trap 'exit 130' INT TERM
+trap 'exit 130' INT TERM HUP
 
 if [ -z "${BIN:-}" ]; then
     cargo build --release -p pliant --no-default-features --features net --example dedicated_server --example join || exit 2

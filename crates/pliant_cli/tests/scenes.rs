@@ -1,7 +1,7 @@
 //! What each set of features compiles and which crates may not import what, by Cargo's own account.
 //!
 //! Cargo reads the manifests of the crates that it lists. It downloads those that no build here has
-//! needed yet, so these tests need no used cargo home, and without the network a used one is enough.
+//! needed yet, so these tests need no used cargo home; without the network a used one is enough.
 
 #![expect(clippy::unwrap_used, reason = "a failed test should panic")]
 

@@ -402,10 +402,14 @@ fn a_driver_that_panics_is_told_and_lets_go() {
     until(&mut s, "a force", |s| force(s).length() > 1.0);
     fuse.store(true, std::sync::atomic::Ordering::Release);
     until(&mut s, "the body is let go of", |s| grabs(&mut s.app).is_empty());
-    s.run(5);
-    let report = s.app.world().resource::<HapticDevices>().get(s.device).unwrap().report;
-    assert_eq!((report.state, force(&s)), (LoopState::Ended, DVec3::ZERO));
     let count = |world: &World| world.resource::<Heard>().0.iter().filter(|f| **f == Fault::Panicked).count();
+    let state = |s: &Scene| s.app.world().resource::<HapticDevices>().get(s.device).unwrap().report.state;
+    until(&mut s, "the end is told", |s| {
+        let world = s.app.world();
+        state(s) == LoopState::Ended && count(world) > 0 && !world.resource::<Notices>().0.is_empty()
+    });
+    s.run(5);
+    assert_eq!((state(&s), force(&s)), (LoopState::Ended, DVec3::ZERO));
     assert_eq!(count(s.app.world()), 1, "told once");
     assert_eq!(s.app.world().resource::<Notices>().0, [pliant_haptics::LoopEvent::Lost]);
     // The app goes on, and a new device takes the place of the dead one.

@@ -10,7 +10,9 @@
 //! assert!(mesh.tets.len().abs_diff(5000) <= 250);
 //! // Corners are rounded by up to a cell, so a little is missing.
 //! assert!((0.97..1.0).contains(&(mesh.volume() / surface.volume())));
-//! io::write_msh(std::env::temp_dir().join("pliant_mesh-example.msh"), &mesh)?;
+//! let file = std::env::temp_dir().join(format!("ball-{}.msh", std::process::id()));
+//! io::write_msh(&file, &mesh)?;
+//! # std::fs::remove_file(file).ok();
 //! # Ok::<(), pliant_mesh::MeshError>(())
 //! ```
 //!

@@ -16,7 +16,7 @@ use pliant_net::{
 };
 use pliant_stream::PeerId;
 use pliant_stream::emulator::{LinkConfig, Loss};
-use support::{alone, app, bar, run_frames, run_until, wait_for};
+use support::{alone, app, bar, must, run_until, wait_for};
 
 const INTRODUCE: u8 = 16;
 const WELCOME: u8 = 17;
@@ -171,7 +171,8 @@ fn cut() -> Option<Emulation> {
 #[test]
 fn who_has_lost_two_peers_looks_for_both() {
     let _alone = alone();
-    let quick = || Limits { idle_timeout: Duration::from_secs(3), ..limits() };
+    let handshake = Duration::from_secs(2);
+    let quick = || Limits { idle_timeout: Duration::from_secs(3), handshake, ..limits() };
     let (mut a, _, invite) = first(Access::Anyone, quick());
     let (mut b, _) = peer("b", Some(invite.clone()), Access::Anyone, quick());
     let (mut c, _) = peer("c", Some(invite), Access::Anyone, quick());
@@ -183,7 +184,11 @@ fn who_has_lost_two_peers_looks_for_both() {
     run_until(&mut [&mut a, &mut b, &mut c], "the last is alone", |apps| {
         users(apps[2]) == 1 && apps[2].world().resource::<NetPeer>().looked_for() == 2
     });
-    run_frames(&mut [&mut a, &mut b, &mut c], 200);
+    // After a call that has failed it calls again. The pause between two is a second.
+    let since = Instant::now();
+    run_until(&mut [&mut a, &mut b, &mut c], "each was called twice", |_| {
+        since.elapsed() > 2 * (handshake + Duration::from_secs(1))
+    });
     assert_eq!(c.world().resource::<NetPeer>().looked_for(), 2);
 }
 
@@ -228,19 +233,26 @@ fn calls_in_vain_freeze_no_frame_and_an_end_waits_for_all_of_them_at_once() {
     let _alone = alone();
     let door = Endpoint::host(HostOptions::default()).unwrap();
     let silent = UdpSocket::bind("127.0.0.1:0").unwrap();
-    // All calls are given up after two seconds, about when it has waited as long for the one at the
-    // door to say more.
-    let mut app = calling(&door, &silent, Limits { handshake: Duration::from_secs(2), ..limits() });
-    let (began, mut longest, mut hung_up) = (Instant::now(), Duration::ZERO, false);
-    wait_for("the calls are over", || {
-        let frame = Instant::now();
-        app.update();
-        longest = longest.max(frame.elapsed());
-        hung_up |= std::iter::from_fn(|| door.poll()).any(|event| matches!(event, Event::Closed { .. }));
-        hung_up && began.elapsed() > Duration::from_secs(4)
+    // A call that a frame waits for freezes it for a second, each time. A busy machine freezes one
+    // now and then: a round of calls without is waited for.
+    wait_for("no frame waits for a call", || {
+        // All calls are given up after two seconds, about when it has waited as long for the one at
+        // the door to say more.
+        let limits = Limits { handshake: Duration::from_secs(2), ..limits() };
+        let mut app = calling(&door, &silent, limits);
+        let (began, mut longest, mut hung_up) = (Instant::now(), Duration::ZERO, false);
+        wait_for("the calls are over", || {
+            let frame = Instant::now();
+            app.update();
+            longest = longest.max(frame.elapsed());
+            let closed = |event| matches!(event, Event::Closed { .. });
+            hung_up |= std::iter::from_fn(|| door.poll()).any(closed);
+            hung_up && began.elapsed() > Duration::from_secs(4)
+        });
+        println!("longest frame {:.1} ms", longest.as_secs_f64() * 1e3);
+        must!(longest < Duration::from_millis(500), "a frame of {longest:?}");
+        Ok(())
     });
-    println!("longest frame {:.1} ms", longest.as_secs_f64() * 1e3);
-    assert!(longest < TOO_LONG, "a frame of {longest:?}");
     // In the middle of its calls.
     let app = calling(&door, &silent, Limits { handshake: Duration::from_secs(600), ..limits() });
     let end = Instant::now();

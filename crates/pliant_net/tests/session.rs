@@ -188,11 +188,13 @@ fn over_the_papers_first_network_the_shape_stays_right() {
             must!((0.03..0.18).contains(&stats.loss_in), "{stats:?}");
             must!((190..300).contains(&stats.round_trip.as_millis()), "{stats:?}");
             must!(stats.recovered > 0, "{stats:?}");
+            // A busy machine adds to the errors by coming late: a second and a half in which it did
+            // not is waited for. The sessions' own tests (pliant_stream) hold all of them against
+            // their bounds, in virtual time.
+            let (rms, max) = off(apps[0], &seen, 60);
+            must!(rms < 0.01 && max < 0.05, "rms {rms}, max {max}");
             Ok(seen)
         });
-    // How large the errors are while the hand moves depends on how late the frames are: 0.05-0.2 %
-    // and 0.3-1 % where none is. The sessions' own tests (pliant_stream) hold them against their
-    // bounds, in virtual time.
     let (rms, max) = off(&host, &seen, usize::MAX);
     println!("{} ticks, rms {:.3} %, max {:.2} %", seen.len(), 100.0 * rms, 100.0 * max);
     // Here the shape must be right when the hand rests, over the same line.

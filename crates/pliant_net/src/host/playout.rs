@@ -103,7 +103,6 @@ impl HandPlayout {
         if !self.playing {
             // A guest that rests says so a few times only: what is left of a correction fades in
             // silence, too.
-            self.guessed = false;
             to = self.said + faded(self.shown - self.said, most);
         }
         // However wild the targets, the hand moves no faster than a hand.
@@ -176,6 +175,19 @@ mod tests {
         assert!(worst < 0.06, "{worst}");
         let lag = (0..10).find(|lag| played[299] == circle(299 - lag));
         assert!(lag.is_some(), "and it is found again exactly");
+    }
+
+    #[test]
+    fn after_a_long_gap_the_path_bends_too() {
+        for lost in [14, 16, 20, 30] {
+            let arrivals: Vec<(u32, u32)> = (0..300)
+                .filter(|input| !(150..150 + lost).contains(input))
+                .map(|input| (input + 2, input))
+                .collect();
+            let (played, worst) = play(&arrivals, 300, 2);
+            assert!(worst < 0.08, "{lost} targets lost: {worst}");
+            assert!((0..10).any(|lag| played[299] == circle(299 - lag)), "{lost} targets lost");
+        }
     }
 
     #[test]
