@@ -371,14 +371,28 @@ fn a_viewer_that_does_not_read_drops_ticks_and_never_holds_the_app_up() {
     // It listens and accepts, and then says nothing: the worst kind.
     let listener = TcpListener::bind("127.0.0.1:0").unwrap();
     let port = listener.local_addr().unwrap().port();
+    let (full, filled) = crossbeam_channel::bounded(1);
     let run = std::thread::spawn(move || {
         let mut app = app(RerunPlugin::viewer().with_viewer_port(port).with_spawn(false).with_queue(4));
-        until("the queue is full", || update_to(&mut app, |stats| stats.dropped > 0));
+        // The SDK takes in what the viewer does not read, up to a limit in bytes. Long lines reach
+        // that limit soon; a tick of this app alone has about a kilobyte.
+        app.add_systems(Update, |mut figures: ResMut<RerunScalars>| figures.say("x".repeat(1 << 19)));
+        // A worker that is only late drops some of the ticks. One that is stuck drops all of them.
+        let mut stuck = 0;
+        let mut last = 0;
+        while stuck < 200 {
+            app.update();
+            let dropped = app.world().resource::<RerunStats>().dropped;
+            stuck = if dropped > last { stuck + 1 } else { 0 };
+            last = dropped;
+        }
+        full.send(()).unwrap();
         (0..500).for_each(|_| app.update());
         drop(listener);
     });
-    // A millisecond a tick is usual for this app in an unoptimised build. What the limit is for is
-    // a wait for the viewer, which would be for ever, or a shorter one in each of the ticks.
+    let is_full = || filled.try_recv().map_err(|_| "room for more");
+    until("the queue is full and stays full", is_full);
+    // What the limit is for is a wait for the viewer: for ever, or a short one in each tick.
     until("five hundred ticks beside it", || if run.is_finished() { Ok(()) } else { Err("held up") });
     run.join().unwrap();
 }
