@@ -48,10 +48,6 @@ const PAUSE: Duration = Duration::from_millis(100);
 const VIEWER_COLUMNS: Duration = Duration::from_millis(90);
 const FILE_COLUMNS: Duration = Duration::from_millis(500);
 
-/// What the SDK may hold in each of its two stages for a viewer that does not read, bytes. Beyond
-/// it the queue fills and ticks are dropped. The SDK's own choice is 100 MiB.
-const VIEWER_ROOM: u64 = 16 << 20;
-
 /// How often it is looked whether the viewer is still there.
 const WATCH: Duration = Duration::from_secs(1);
 
@@ -344,11 +340,7 @@ impl Target {
         }
         // The SDK's own choice is to flush its rows every 8 ms.
         match builder
-            .batcher_config(ChunkBatcherConfig {
-                flush_tick: PAUSE,
-                max_bytes_in_flight: VIEWER_ROOM,
-                ..ChunkBatcherConfig::DEFAULT
-            })
+            .batcher_config(ChunkBatcherConfig { flush_tick: PAUSE, ..ChunkBatcherConfig::DEFAULT })
             .connect_grpc_opts(format!("rerun+http://127.0.0.1:{port}/proxy"))
         {
             Ok(stream) => {
