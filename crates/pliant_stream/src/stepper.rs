@@ -1,6 +1,8 @@
 //! The receiver's modal step: the same recurrence as the host's body, driven by reactions or by targets.
 
 mod hold;
+#[cfg(test)]
+mod side_by_side;
 
 use std::sync::Arc;
 

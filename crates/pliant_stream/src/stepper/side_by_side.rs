@@ -1,0 +1,176 @@
+//! A body and a receiver's copy of it, side by side: the same inputs give the same states.
+
+use std::{path::Path, sync::Arc};
+
+use nalgebra::Vector3;
+use pliant_modal::{Body, BodyConfig, Frame, GrabConfig, Integrator, ModalModel, Patch, Relaxation};
+
+use super::{BodySetup, ForceStepper, FrameStep, Hold};
+
+/// Largest difference as a share of the largest number of its kind in the run.
+const SAME: f64 = 1e-12;
+
+fn model(name: &str) -> Arc<ModalModel> {
+    let assets = Path::new(env!("CARGO_MANIFEST_DIR")).join("../../assets");
+    Arc::new(ModalModel::read(assets.join(name)).unwrap())
+}
+
+/// The surface vertex that is farthest along an axis.
+fn end(model: &ModalModel, axis: [f32; 3]) -> u32 {
+    let along = |p: &[f32; 3]| p[0] * axis[0] + p[1] * axis[1] + p[2] * axis[2];
+    let positions = model.surface().positions();
+    let far = |&a: &usize, &b: &usize| along(&positions[a]).total_cmp(&along(&positions[b]));
+    (0..positions.len()).max_by(far).unwrap() as u32
+}
+
+/// A hand of a case: where it holds, how, and how far (m) its target goes until it rests.
+struct Hand {
+    vertex: u32,
+    radius: f64,
+    config: GrabConfig,
+    way: [f64; 3],
+}
+
+fn hand(vertex: u32, radius: f64, way: [f64; 3]) -> Hand {
+    Hand { vertex, radius, config: GrabConfig::default(), way }
+}
+
+/// Steps both for so many steps, and compares states and reactions after each.
+fn compare(name: &str, model: &Arc<ModalModel>, config: BodyConfig, hands: &[Hand], steps: usize) {
+    let h = config.step;
+    let setup = BodySetup {
+        integrator: config.integrator,
+        warp: config.warp,
+        damping_scale: config.damping_scale,
+        stiffness_scale: config.stiffness_scale,
+        gravity: config.gravity,
+        relaxation: config.relaxation,
+    };
+    let mut body = Body::new(model.clone(), config).unwrap();
+    let grabs: Vec<_> = hands
+        .iter()
+        .map(|hand| {
+            let patch = Patch::around(model.surface(), hand.vertex, hand.radius).unwrap();
+            let id = body.grab(&patch, hand.config).unwrap();
+            (id, Vector3::from(body.target(id).unwrap()))
+        })
+        .collect();
+    let mut copy = ForceStepper::new(model.clone(), &setup, model.mode_count(), h).unwrap();
+    let mut state = copy.at_rest();
+    let mut frame = Frame::at_rest(model);
+    let mut holds: Vec<Hold> = hands
+        .iter()
+        .zip(&grabs)
+        .map(|(hand, (_, at))| {
+            Hold::hand(hand.vertex, hand.radius, (*at).into(), Vector3::zeros(), hand.config)
+        })
+        .collect();
+    let mut last: Vec<Vector3<f64>> = Vec::new();
+    let mut largest = [0.0f64; 3];
+    let mut off = Vec::new();
+    for step in 0..steps {
+        let share = (step as f64 * h / 0.5).min(1.0);
+        let share = share * share * (3.0 - 2.0 * share);
+        let targets: Vec<Vector3<f64>> =
+            hands.iter().zip(&grabs).map(|(hand, (_, at))| at + share * Vector3::from(hand.way)).collect();
+        for ((id, _), target) in grabs.iter().zip(&targets) {
+            body.set_target(*id, (*target).into()).unwrap();
+        }
+        body.step().unwrap();
+        for (i, hold) in holds.iter_mut().enumerate() {
+            let velocity = last.get(i).map_or_else(Vector3::zeros, |before| (targets[i] - before) / h);
+            let (vertex, radius, config) = (hands[i].vertex, hands[i].radius, hands[i].config);
+            *hold =
+                Hold { flow: hold.flow, ..Hold::hand(vertex, radius, targets[i].into(), velocity, config) };
+        }
+        last = targets;
+        let zero = Vector3::zeros();
+        let rigid = model.is_free().then_some(FrameStep { frame: &mut frame, force: zero, torque: zero });
+        copy.step_held(&mut state, &mut holds, &[], rigid);
+
+        let mut off_now = [0.0f64; 3];
+        for (kind, (true_, copied)) in [(body.q(), &state.q), (body.v(), &state.v)].into_iter().enumerate() {
+            for (a, b) in true_.iter().zip(copied) {
+                largest[kind] = largest[kind].max(a.abs());
+                off_now[kind] = off_now[kind].max((a - b).abs());
+            }
+        }
+        for ((id, _), hold) in grabs.iter().zip(&holds) {
+            let reaction = Vector3::from(body.reaction(*id).unwrap());
+            largest[2] = largest[2].max(reaction.norm());
+            off_now[2] = off_now[2].max((reaction + hold.pull).norm());
+        }
+        let center = Vector3::from(body.frame().center()) - Vector3::from(frame.center());
+        off.push([off_now[0], off_now[1], off_now[2], center.norm()]);
+    }
+    let scale = [largest[0], largest[1], largest[2], model.size()];
+    for (step, off) in off.iter().enumerate() {
+        let [q, v, reaction, apart] = [0, 1, 2, 3].map(|kind| off[kind] / scale[kind]);
+        assert!(
+            [q, v, reaction, apart].iter().all(|off| *off <= SAME),
+            "{name}, step {step}: q is off by {q:.1e} of its largest, v by {v:.1e}, the reaction by \
+             {reaction:.1e}; the frames are {apart:.1e} sizes apart"
+        );
+    }
+    assert!(largest[2] > 0.0, "{name}: nothing was held");
+}
+
+#[test]
+fn a_damped_hand() {
+    let bud = model("bud.modal");
+    let tip = end(&bud, [0.0, 1.0, 0.0]);
+    let config = GrabConfig { relaxation: 0.02, ..GrabConfig::default() };
+    let hands = [Hand { config, ..hand(tip, 0.1 * bud.size(), [0.05 * bud.size(), 0.0, 0.0]) }];
+    compare("damped", &bud, BodyConfig { step: 1.0 / 64.0, ..Default::default() }, &hands, 128);
+}
+
+#[test]
+fn a_free_jack_stretched() {
+    let jack = model("jack.modal");
+    let way = 0.5 * 0.4 * jack.size();
+    let hands = [1.0, -1.0]
+        .map(|side| hand(end(&jack, [side as f32, 0.0, 0.0]), 0.03, [side * way, 0.003 * side, 0.0]));
+    compare("stretched", &jack, BodyConfig { step: 1.0 / 64.0, ..Default::default() }, &hands, 256);
+}
+
+#[test]
+fn eight_corrections() {
+    let pip = model("pip.modal");
+    let tip = end(&pip, [0.0, 1.0, 0.0]);
+    let size = pip.size();
+    let hands = [hand(tip, 0.08 * size, [0.3 * size, 0.1 * size, 0.0])];
+    compare("corrections", &pip, BodyConfig { corrections: 8, ..Default::default() }, &hands, 128);
+}
+
+#[test]
+fn a_relaxing_body() {
+    let pip = model("pip.modal");
+    let tip = end(&pip, [0.0, 1.0, 0.0]);
+    let relaxation = Some(Relaxation { ratio: 0.5, time: 0.2 });
+    for integrator in [Integrator::Exact, Integrator::GeneralizedAlpha { rho_inf: 0.5 }] {
+        let hands = [hand(tip, 0.08 * pip.size(), [0.2 * pip.size(), 0.0, 0.0])];
+        let config = BodyConfig { integrator, relaxation, ..Default::default() };
+        compare("relaxing", &pip, config, &hands, 128);
+    }
+}
+
+#[test]
+fn two_hands() {
+    let pip = model("pip.modal");
+    let size = pip.size();
+    let soft = GrabConfig { stiffness: Some(200.0), ..GrabConfig::default() };
+    let (right, left) = (end(&pip, [1.0, 0.0, 0.0]), end(&pip, [-1.0, 0.0, 0.0]));
+    let hands = [
+        hand(right, 0.08 * size, [0.2 * size, 0.1 * size, 0.0]),
+        Hand { config: soft, ..hand(left, 0.05 * size, [0.0, 0.2 * size, -0.1 * size]) },
+    ];
+    compare("two hands", &pip, BodyConfig::default(), &hands, 128);
+}
+
+#[test]
+fn under_gravity() {
+    let pip = model("pip.modal");
+    let tip = end(&pip, [0.0, 1.0, 0.0]);
+    let config = BodyConfig { gravity: [0.0, -9.81, 0.0], ..Default::default() };
+    compare("gravity", &pip, config, &[hand(tip, 0.02, [0.02, 0.0, 0.0])], 64);
+}
