@@ -6,7 +6,7 @@
 use crate::StepError;
 
 /// How the modes are stepped.
-#[derive(Debug, Clone, Copy, PartialEq, Default)]
+#[derive(Debug, Clone, Copy, PartialEq, Default, serde::Serialize, serde::Deserialize)]
 #[non_exhaustive]
 pub enum Integrator {
     /// The oscillator's closed form, exact when the force is constant over the step. The default: no period error at any step.

@@ -45,11 +45,12 @@ mod model;
 mod patch;
 mod relaxation;
 mod simd;
+mod step;
 mod surface;
 mod warp;
 
 pub use basis::{BLOCK, Basis, Precision, ROWS};
-pub use body::{Body, BodyConfig, Frame, GrabConfig, GrabId, RigidMotion, State, StepReport};
+pub use body::{Body, BodyConfig, GrabId};
 pub use error::{FileError, ModelError, StepError};
 pub use file::{FORMAT_VERSION, MAGIC};
 pub use integrator::{Coefficients, Integrator};
@@ -57,5 +58,8 @@ pub use limit::streaming_sum;
 pub use model::{BakeInfo, Damping, Element, FlexibilitySite, ModalModel, ModelHash, ModelParts};
 pub use patch::Patch;
 pub use relaxation::{Flow, Relaxation};
+pub use step::{
+    Frame, GrabConfig, Hand, HeldPatch, Hold, Kernel, Load, RigidMotion, State, StepReport, StepSettings,
+};
 pub use surface::SurfaceMesh;
 pub use warp::{warp, warp_jacobian};

@@ -14,7 +14,7 @@ use crate::{Coefficients, Integrator, StepError, exponential::exponential};
 /// [`creep`](Self::creep). The branch stores `ratio omega^2 (q - z)^2 / 2` and loses `ratio omega^2 (q - z)^2 / time`.
 ///
 /// Source: C. Zener, *Elasticity and Anelasticity of Metals*, 1948; R. M. Christensen, *Theory of Viscoelasticity*, 2nd ed. 1982, ch. 1.
-#[derive(Debug, Clone, Copy, PartialEq)]
+#[derive(Debug, Clone, Copy, PartialEq, serde::Serialize, serde::Deserialize)]
 pub struct Relaxation {
     /// Share of the instantaneous stiffness that relaxes away, 0 or more and below 1: at 1 the body would be a fluid and flow for ever.
     pub ratio: f64,

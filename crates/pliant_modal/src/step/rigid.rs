@@ -258,11 +258,11 @@ impl RigidMotion {
         self.turning = tight.try_inverse().unwrap_or(self.inverse_inertia);
     }
 
-    /// How far a unit pull at arm `b` moves the point at arm `a` (3x3, m/N, body axes); with `relaxation` (s) times how fast
-    /// on top.
-    pub fn response(&self, a: &Vector3<f64>, b: &Vector3<f64>, relaxation: f64) -> Matrix3<f64> {
+    /// How fast a unit pull at arm `b` makes the point at arm `a` within the step: 3x3, m/s/N, body
+    /// axes. It moves it by so much times the step.
+    pub(crate) fn velocity_response(&self, a: &Vector3<f64>, b: &Vector3<f64>) -> Matrix3<f64> {
         let turning = a.cross_matrix() * self.turning * b.cross_matrix().transpose();
-        (self.step * (self.step + relaxation)) * (Matrix3::identity() * self.inverse_mass + turning)
+        self.step * (Matrix3::identity() * self.inverse_mass + turning)
     }
 
     /// By how much a force (N) moves the centre of mass within the step, m.

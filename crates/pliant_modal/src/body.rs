@@ -1,25 +1,17 @@
-//! A body in motion: its modal coordinates, its frame, its grabs, and one step of all of them.
-
-mod advance;
-mod frame;
-mod grab;
-mod solve;
-mod stepping;
+//! A body in motion: its state, the hands on it by name, and what pushes it.
 
 use std::sync::Arc;
 
 use nalgebra::Vector3;
 
-pub use frame::{Frame, RigidMotion};
-pub use grab::{GrabConfig, GrabId};
-
 use crate::{
-    Coefficients, Flow, Integrator, ModalModel, Patch, Precision, Relaxation, StepError, error::finite,
-    warp::warp_with_jacobian,
+    Frame, GrabConfig, Hand, HeldPatch, Hold, Integrator, Kernel, Load, ModalModel, Patch, Precision,
+    Relaxation, State, StepError, StepReport, StepSettings, error::finite,
 };
-use grab::Grab;
-use solve::Schur;
-use stepping::Stepping;
+
+/// Names a grab on its body. Never used twice by the same body.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, PartialOrd, Ord)]
+pub struct GrabId(pub(crate) u64);
 
 /// How a body is stepped.
 #[derive(Debug, Clone, PartialEq)]
@@ -65,68 +57,19 @@ impl Default for BodyConfig {
     }
 }
 
-/// What moves: the modal coordinates of one tick. All slices have one entry a kept mode, `z` none where the body does not relax.
-#[derive(Debug, PartialEq, Default)]
-pub struct State {
-    /// Modal coordinates, kg^1/2 m.
-    pub q: Vec<f64>,
-    /// Modal velocities, kg^1/2 m/s.
-    pub v: Vec<f64>,
-    /// Modal accelerations as the integrator defines them, kg^1/2 m/s^2.
-    pub a: Vec<f64>,
-    /// Modal forces of the last step, kg^1/2 m/s^2 (generalized-alpha remembers them).
-    pub f: Vec<f64>,
-    /// Modal flows, kg^1/2 m: how far the dashpot of each mode's Maxwell branch has gone; see [`Relaxation`]. Empty without one.
-    pub z: Vec<f64>,
-    /// Where the body is.
-    pub frame: Frame,
-}
-
-impl State {
-    /// Beyond this, kg^1/2 m and its like, squares of coordinates and velocities may overflow in a step.
-    const MOST: f64 = 1e100;
-
-    /// Whether coordinates, velocities and forces are such that a step without hands and pushes stays finite.
-    fn is_moderate(&self) -> bool {
-        let frame = &self.frame;
-        let rigid = frame.velocity().into_iter().chain(frame.spin()).chain(frame.center());
-        let modes = [&self.q, &self.v, &self.a, &self.f, &self.z].into_iter().flatten().copied();
-        modes.chain(rigid).all(|x| x.abs() <= Self::MOST)
-    }
-
-    /// At rest and undeformed, where the frame is (or at the origin, where that is nowhere).
-    fn stop(&mut self) {
-        for slice in [&mut self.q, &mut self.v, &mut self.a, &mut self.f, &mut self.z] {
-            slice.fill(0.0);
+impl BodyConfig {
+    /// What copies of the body have to agree on.
+    pub fn settings(&self) -> StepSettings {
+        StepSettings {
+            integrator: self.integrator,
+            warp: self.warp,
+            corrections: self.corrections.clamp(1, StepSettings::MOST_CORRECTIONS.into()) as u8,
+            gravity: self.gravity,
+            damping_scale: self.damping_scale,
+            stiffness_scale: self.stiffness_scale,
+            relaxation: self.relaxation,
         }
-        self.frame.stop(Self::MOST);
     }
-}
-
-impl Clone for State {
-    fn clone(&self) -> Self {
-        let mut copy = Self::default();
-        copy.clone_from(self);
-        copy
-    }
-
-    /// Keeps the allocations of `self`: a step saves its state without any (a derived `clone_from` would make new ones).
-    fn clone_from(&mut self, from: &Self) {
-        let Self { q, v, a, f, z, frame } = from;
-        self.q.clone_from(q);
-        self.v.clone_from(v);
-        self.a.clone_from(a);
-        self.f.clone_from(f);
-        self.z.clone_from(z);
-        self.frame = *frame;
-    }
-}
-
-/// What one step did.
-#[derive(Debug, Clone, Copy, PartialEq, Default)]
-pub struct StepReport {
-    /// Directions in which grabs were linearly dependent and had to be regularised.
-    pub regularised: usize,
 }
 
 /// A deformable body: an [`Arc`] to its model, its state, and the hands on it.
@@ -134,27 +77,30 @@ pub struct StepReport {
 /// A step costs a few operations a mode and 3 rows a grab, allocates nothing, and leaves the body in its last good state when it fails.
 #[derive(Debug, Clone)]
 pub struct Body {
-    model: Arc<ModalModel>,
     config: BodyConfig,
-    /// Of the kept modes, as they are stepped: with the scales of stiffness and damping.
-    omega: Vec<f64>,
-    damping: Vec<f64>,
-    coefficients: Vec<Coefficients>,
-    /// Empty where the material does not relax.
-    flows: Vec<Flow>,
+    kernel: Kernel,
     state: State,
-    before: State,
-    /// Modal force of everything but grabs, held for one step.
+    /// Modal force of everything but hands and gravity, held for one step.
     pushes: Vec<f64>,
     push_force: Vector3<f64>,
     push_torque: Vector3<f64>,
+    /// The hands, and by which name each of them is known.
+    hands: Vec<Hand>,
     grabs: Vec<Grab>,
     next_grab: u64,
-    schur: Schur,
-    /// Scratch, one entry a mode.
-    force: Vec<f64>,
-    linear: Vec<f64>,
+    /// Scratch: a state, and one entry a mode.
+    spare: State,
+    resisted: Vec<f64>,
     single: Vec<f32>,
+}
+
+#[derive(Debug, Clone)]
+struct Grab {
+    id: GrabId,
+    target: Vector3<f64>,
+    /// The target of the step before; none of a hand that has just taken hold.
+    last_target: Option<Vector3<f64>>,
+    config: GrabConfig,
 }
 
 impl Body {
@@ -166,52 +112,34 @@ impl Body {
     /// # Errors
     /// A configuration value that is not finite or not in its range.
     pub fn new(model: Arc<ModalModel>, config: BodyConfig) -> Result<Self, StepError> {
-        let modes = config.modes.unwrap_or(usize::MAX).min(model.mode_count());
-        let Stepping { omega, damping, coefficients, flows } = Stepping::new(&model, &config, modes)?;
-        finite("gravity", &config.gravity)?;
-        let zero = vec![0.0; modes];
-        let frame = Frame::at_rest(&model);
-        let z = vec![0.0; flows.len()];
-        let state = State { q: zero.clone(), v: zero.clone(), a: zero.clone(), f: zero.clone(), z, frame };
+        let modes = config.modes.unwrap_or(usize::MAX);
+        let kernel = Kernel::new(model, config.settings(), modes, config.step)?;
+        let zero = vec![0.0; kernel.modes()];
+        let state = kernel.at_rest();
         Ok(Self {
-            omega,
-            damping,
-            coefficients,
-            flows,
-            before: state.clone(),
+            config,
+            spare: state.clone(),
             state,
             pushes: zero.clone(),
             push_force: Vector3::zeros(),
             push_torque: Vector3::zeros(),
+            hands: Vec::new(),
             grabs: Vec::new(),
             next_grab: 1,
-            schur: Schur::default(),
-            force: zero.clone(),
-            linear: zero,
-            single: vec![0.0; modes],
-            model,
-            config,
+            single: vec![0.0; zero.len()],
+            resisted: zero,
+            kernel,
         })
     }
 
     /// The model it is made of.
     pub fn model(&self) -> &Arc<ModalModel> {
-        &self.model
+        self.kernel.model()
     }
 
     /// How it is stepped.
     pub fn config(&self) -> &BodyConfig {
         &self.config
-    }
-
-    /// The recurrences of the kept modes.
-    pub fn coefficients(&self) -> &[Coefficients] {
-        &self.coefficients
-    }
-
-    /// What relaxation adds to the recurrences of the kept modes; empty where the material does not relax.
-    pub fn flows(&self) -> &[Flow] {
-        &self.flows
     }
 
     /// Number of modes kept.
@@ -221,12 +149,12 @@ impl Body {
 
     /// Angular frequencies of the kept modes as they are stepped, rad/s: the model's, with the scale of stiffness.
     pub fn omega(&self) -> &[f64] {
-        &self.omega
+        self.kernel.omega()
     }
 
     /// Damping coefficients of the kept modes as they are stepped, 1/s: the model's, with the scales of stiffness and damping.
     pub fn damping(&self) -> &[f64] {
-        &self.damping
+        self.kernel.damping()
     }
 
     /// Changes step size, integrator, warp, gravity, damping, stiffness or relaxation; coordinates and velocities go on, and accelerations change
@@ -236,27 +164,28 @@ impl Body {
     /// # Errors
     /// As [`Body::new`]; the old configuration then stays.
     pub fn reconfigure(&mut self, config: BodyConfig) -> Result<(), StepError> {
-        finite("gravity", &config.gravity)?;
-        let Stepping { omega, damping, coefficients, flows } =
-            Stepping::new(&self.model, &config, self.mode_count())?;
-        // `a = f - c v - omega^2 (q - ratio z)`: the acceleration belongs to the state. What has not changed cancels to the bit.
-        let resisted = |body: &Self, i: usize| {
-            let ratio = body.config.relaxation.map_or(0.0, |r| r.ratio);
-            let stretch = body.state.q[i] - ratio * body.state.z.get(i).copied().unwrap_or(0.0);
-            body.damping[i] * body.state.v[i] + body.omega[i].powi(2) * stretch
+        let before = *self.kernel.settings();
+        // `a = f - c v - omega^2 (q - ratio z)`: the acceleration belongs to the state. What has not
+        // changed cancels to the bit.
+        let resisted = |kernel: &Kernel, state: &State, settings: &StepSettings, i: usize| {
+            let ratio = settings.relaxation.map_or(0.0, |r| r.ratio);
+            let stretch = state.q[i] - ratio * state.z.get(i).copied().unwrap_or(0.0);
+            kernel.damping()[i] * state.v[i] + kernel.omega()[i].powi(2) * stretch
         };
-        // Scratch of the step.
-        for i in 0..self.mode_count() {
-            self.linear[i] = resisted(self, i);
+        for (i, force) in self.resisted.iter_mut().enumerate() {
+            *force = resisted(&self.kernel, &self.state, &before, i);
         }
-        (self.omega, self.damping, self.coefficients, self.flows) = (omega, damping, coefficients, flows);
+        let settings = config.settings();
+        self.kernel.reconfigure(settings, config.step)?;
+        self.kernel.prepare(&self.hands);
         self.config = BodyConfig { modes: self.config.modes, ..config };
-        self.state.z.resize(self.flows.len(), 0.0);
-        for i in 0..self.mode_count() {
-            self.state.a[i] += self.linear[i] - resisted(self, i);
+        let flows = if settings.relaxation.is_some() { self.mode_count() } else { 0 };
+        self.state.z.resize(flows, 0.0);
+        for (i, force) in self.resisted.iter().enumerate() {
+            self.state.a[i] += force - resisted(&self.kernel, &self.state, &settings, i);
         }
-        for grab in &mut self.grabs {
-            grab.set_material(&self.config);
+        if settings.relaxation.is_none() {
+            self.hands.iter_mut().for_each(|hand| hand.flow = Vector3::zeros());
         }
         Ok(())
     }
@@ -296,17 +225,7 @@ impl Body {
     /// # Errors
     /// A slice of another length, a number that is not finite; the body then stays as it was.
     pub fn set_state(&mut self, state: &State) -> Result<(), StepError> {
-        for (what, slice) in [("q", &state.q), ("v", &state.v), ("a", &state.a), ("f", &state.f)] {
-            if slice.len() != self.mode_count() {
-                return Err(StepError::Length { what, expected: self.mode_count(), got: slice.len() });
-            }
-            finite(what, slice)?;
-        }
-        if state.z.len() != self.flows.len() {
-            return Err(StepError::Length { what: "z", expected: self.flows.len(), got: state.z.len() });
-        }
-        finite("z", &state.z)?;
-        state.frame.check()?;
+        self.kernel.check(state)?;
         self.state.clone_from(state);
         Ok(())
     }
@@ -317,7 +236,7 @@ impl Body {
     /// # Errors
     /// A number that is not finite, a quaternion of length zero.
     pub fn set_pose(&mut self, position: [f64; 3], rotation: [f64; 4]) -> Result<(), StepError> {
-        self.state.frame.set_pose(&self.model, position, rotation)
+        self.state.frame.set_pose(self.kernel.model(), position, rotation)
     }
 
     /// Holds a patch of the body; its target begins where the patch is now, so that grabbing moves nothing.
@@ -328,20 +247,26 @@ impl Body {
         if self.grabs.len() >= Self::MAX_GRABS {
             return Err(StepError::TooManyGrabs { limit: Self::MAX_GRABS });
         }
+        config.check()?;
+        let patch = HeldPatch::new(self.model(), patch, self.mode_count())?;
+        let local = patch.rest() + patch.displacement(&self.state.q, self.config.warp);
+        let target = self.state.frame.to_world(local);
         let id = GrabId(self.next_grab);
-        let mut grab = Grab::new(id, &self.model, patch, config, self.mode_count())?;
-        grab.set_material(&self.config);
-        let local = grab.local_position(&self.state.q, self.config.warp);
-        grab.target = self.state.frame.to_world(local);
         self.next_grab += 1;
-        self.grabs.push(grab);
-        self.schur.reserve(self.grabs.len());
+        let hold = Hold::Target { target, velocity: Vector3::zeros(), config };
+        self.hands.push(Hand::new(Arc::new(patch), hold));
+        self.grabs.push(Grab { id, target, last_target: None, config });
+        self.kernel.prepare(&self.hands);
         Ok(id)
     }
 
     /// Lets go. Letting go twice is no error.
     pub fn release(&mut self, id: GrabId) {
-        self.grabs.retain(|g| g.id != id);
+        if let Ok(index) = self.find(id) {
+            self.grabs.remove(index);
+            self.hands.remove(index);
+            self.kernel.prepare(&self.hands);
+        }
     }
 
     /// The grabs on the body, oldest first.
@@ -355,7 +280,8 @@ impl Body {
     /// A target that is not finite (the old one stays), or no such grab.
     pub fn set_target(&mut self, id: GrabId, target: [f64; 3]) -> Result<(), StepError> {
         finite("grab target", &target)?;
-        self.find_mut(id)?.target = target.into();
+        let index = self.find(id)?;
+        self.grabs[index].target = target.into();
         Ok(())
     }
 
@@ -364,7 +290,7 @@ impl Body {
     /// # Errors
     /// No such grab.
     pub fn target(&self, id: GrabId) -> Result<[f64; 3], StepError> {
-        Ok(self.find(id)?.target.into())
+        Ok(self.grabs[self.find(id)?].target.into())
     }
 
     /// Where the held patch is now, m, world axes.
@@ -372,7 +298,8 @@ impl Body {
     /// # Errors
     /// No such grab.
     pub fn grab_position(&self, id: GrabId) -> Result<[f64; 3], StepError> {
-        let local = self.find(id)?.local_position(&self.state.q, self.config.warp);
+        let patch = &self.hands[self.find(id)?].patch;
+        let local = patch.rest() + patch.displacement(&self.state.q, self.config.warp);
         Ok(self.state.frame.to_world(local).into())
     }
 
@@ -381,22 +308,7 @@ impl Body {
     /// # Errors
     /// No such grab.
     pub fn reaction(&self, id: GrabId) -> Result<[f64; 3], StepError> {
-        Ok((-self.find(id)?.pull).into())
-    }
-
-    /// What [`compliance`](Self::compliance) would be of a rigid hand on a patch of an elastic body of so many modes, whose stiffness is
-    /// `stiffness_scale` times the baked one, without making the body: 3x3, m/N, body axes.
-    ///
-    /// # Errors
-    /// A patch of another surface.
-    pub fn compliance_of(
-        model: &ModalModel,
-        patch: &Patch,
-        modes: usize,
-        stiffness_scale: f64,
-    ) -> Result<[[f64; 3]; 3], StepError> {
-        let c = grab::give_at(model, patch, modes.min(model.mode_count()))? / stiffness_scale;
-        Ok(std::array::from_fn(|i| std::array::from_fn(|j| c[(i, j)])))
+        Ok((-self.hands[self.find(id)?].pull).into())
     }
 
     /// The compliance of a grab within one step (3x3, m/N, body axes): residual flexibility of the patch plus the hand's own spring. Where
@@ -405,7 +317,7 @@ impl Body {
     /// # Errors
     /// No such grab.
     pub fn compliance(&self, id: GrabId) -> Result<[[f64; 3]; 3], StepError> {
-        let c = self.find(id)?.compliance;
+        let c = self.kernel.compliance(&self.hands[self.find(id)?]);
         Ok(std::array::from_fn(|i| std::array::from_fn(|j| c[(i, j)])))
     }
 
@@ -415,7 +327,7 @@ impl Body {
     /// # Errors
     /// No such grab.
     pub fn grab_flow(&self, id: GrabId) -> Result<[f64; 3], StepError> {
-        Ok(self.find(id)?.flow.into())
+        Ok(self.hands[self.find(id)?].flow.into())
     }
 
     /// Sets what [`grab_flow`](Self::grab_flow) tells; nothing where the material does not relax.
@@ -424,10 +336,9 @@ impl Body {
     /// No such grab, a number that is not finite.
     pub fn set_grab_flow(&mut self, id: GrabId, flow: [f64; 3]) -> Result<(), StepError> {
         finite("grab flow", &flow)?;
-        let relaxes = !self.flows.is_empty();
-        let grab = self.find_mut(id)?;
-        if relaxes {
-            grab.flow = flow.into();
+        let index = self.find(id)?;
+        if self.config.relaxation.is_some() {
+            self.hands[index].flow = flow.into();
         }
         Ok(())
     }
@@ -459,35 +370,35 @@ impl Body {
         let (rows, arm) = self.vertex_rows(vertex)?;
         let impulse = Vector3::from(impulse);
         let local = self.state.frame.rotation().inverse() * impulse;
-        self.before.clone_from(&self.state);
+        self.spare.clone_from(&self.state);
         for i in 0..self.mode_count() {
             let dv = rows.at(i).dot(&local);
             self.state.v[i] += dv;
             // The acceleration belongs to the state: damping answers the new velocity.
-            self.state.a[i] -= self.damping[i] * dv;
+            self.state.a[i] -= self.kernel.damping()[i] * dv;
         }
-        if self.model.is_free() {
-            self.state.frame.add_momentum(&self.model, impulse, arm.cross(&impulse));
+        if self.model().is_free() {
+            self.state.frame.add_momentum(self.kernel.model(), impulse, arm.cross(&impulse));
         }
         // What has overflowed here no step would put right: it goes back to the state before it, which is this one.
         if self.state.is_moderate() {
             return Ok(());
         }
-        self.state.clone_from(&self.before);
+        self.state.clone_from(&self.spare);
         let expected = "one that leaves velocities and accelerations below 1e100";
         Err(StepError::Input { what: "impulse", expected, got: impulse.norm() })
     }
 
     /// For a vertex: its (unwarped) displacement rows by mode, and its arm from the centre of mass in world axes.
     fn vertex_rows(&self, vertex: u32) -> Result<(VertexRows, Vector3<f64>), StepError> {
-        let surface = self.model.surface().positions();
+        let surface = self.model().surface().positions();
         let count = surface.len();
         let Some(rest) = surface.get(vertex as usize) else {
             return Err(StepError::Vertex { vertex, count });
         };
         let arm = self.state.frame.rotation()
-            * (Vector3::from(rest.map(f64::from)) - Vector3::from(self.model.center_of_mass()));
-        let rows = VertexRows { model: self.model.clone(), vertex };
+            * (Vector3::from(rest.map(f64::from)) - Vector3::from(self.model().center_of_mass()));
+        let rows = VertexRows { model: self.model().clone(), vertex };
         Ok((rows, arm))
     }
 
@@ -497,7 +408,7 @@ impl Body {
         let ratio = self.config.relaxation.map_or(0.0, |r| r.ratio);
         let modes: f64 = (0..self.mode_count())
             .map(|i| {
-                let (omega, q, v) = (self.omega[i], self.state.q[i], self.state.v[i]);
+                let (omega, q, v) = (self.omega()[i], self.state.q[i], self.state.v[i]);
                 let stretch = omega * q;
                 let elastic = match self.state.z.get(i) {
                     None => stretch * stretch,
@@ -508,12 +419,12 @@ impl Body {
                 0.5 * (v * v + elastic)
             })
             .sum();
-        modes + if self.model.is_free() { self.state.frame.kinetic_energy(&self.model) } else { 0.0 }
+        modes + if self.model().is_free() { self.state.frame.kinetic_energy(self.model()) } else { 0.0 }
     }
 
     /// Linear (kg m/s) and angular momentum about the world's origin (kg m^2/s) of a free body's rigid motion; zero for an anchored one.
     pub fn momentum(&self) -> ([f64; 3], [f64; 3]) {
-        if self.model.is_free() { self.state.frame.momentum(&self.model) } else { ([0.0; 3], [0.0; 3]) }
+        if self.model().is_free() { self.state.frame.momentum(self.model()) } else { ([0.0; 3], [0.0; 3]) }
     }
 
     /// Writes the deformed surface (m, body axes): multiply by the frame, or by an engine's transform, to place it.
@@ -521,23 +432,41 @@ impl Body {
     /// # Errors
     /// `out` is shorter than the surface.
     pub fn reconstruct(&mut self, out: &mut [[f32; 3]]) -> Result<(), StepError> {
-        let expected = self.model.surface().positions().len();
+        let expected = self.model().surface().positions().len();
         if out.len() < expected {
             return Err(StepError::Length { what: "positions", expected, got: out.len() });
         }
         for (s, q) in self.single.iter_mut().zip(&self.state.q) {
             *s = *q as f32;
         }
-        self.model.basis_in(self.config.precision).reconstruct(&self.single, self.config.warp, out);
+        self.kernel.model().basis_in(self.config.precision).reconstruct(&self.single, self.config.warp, out);
         Ok(())
     }
 
-    fn find(&self, id: GrabId) -> Result<&Grab, StepError> {
-        self.grabs.iter().find(|g| g.id == id).ok_or(StepError::NoGrab)
+    /// One step of the configured length; see [`Kernel`].
+    ///
+    /// # Errors
+    /// [`StepError::Diverged`] when the result would not be finite; the body is then in the state it had before, unless that is one that nothing can be
+    /// stepped from (with a number beyond 1e100 in it): then it is at rest where its frame is.
+    pub fn step(&mut self) -> Result<StepReport, StepError> {
+        for (hand, grab) in self.hands.iter_mut().zip(&mut self.grabs) {
+            // A hand that has just taken hold has not moved.
+            let way = grab.last_target.map_or_else(Vector3::zeros, |last| grab.target - last);
+            let (target, config) = (grab.target, grab.config);
+            hand.hold = Hold::Target { target, velocity: way / self.config.step, config };
+            grab.last_target = Some(target);
+        }
+        let (force, torque) = (self.push_force, self.push_torque);
+        let load = Load { modal: &self.pushes, force, torque, frame_is_given: false };
+        let report = self.kernel.step(&mut self.state, &mut self.hands, &load);
+        self.pushes.fill(0.0);
+        self.push_force = Vector3::zeros();
+        self.push_torque = Vector3::zeros();
+        report
     }
 
-    fn find_mut(&mut self, id: GrabId) -> Result<&mut Grab, StepError> {
-        self.grabs.iter_mut().find(|g| g.id == id).ok_or(StepError::NoGrab)
+    fn find(&self, id: GrabId) -> Result<usize, StepError> {
+        self.grabs.iter().position(|g| g.id == id).ok_or(StepError::NoGrab)
     }
 }
 
@@ -551,30 +480,4 @@ impl VertexRows {
     fn at(&self, mode: usize) -> Vector3<f64> {
         Vector3::from_fn(|axis, _| f64::from(self.model.displacement_row(self.vertex, axis, mode)))
     }
-}
-
-/// The position of a patch (m, body axes) and, when wanted, its derivative by each modal coordinate.
-fn patch_position(
-    rest: Vector3<f64>,
-    displacement: &[Vector3<f64>],
-    rotation: &[Vector3<f64>],
-    q: &[f64],
-    warped: bool,
-    rows: Option<&mut [Vector3<f64>]>,
-) -> Vector3<f64> {
-    let sum = |columns: &[Vector3<f64>]| columns.iter().zip(q).fold(Vector3::zeros(), |s, (c, q)| s + c * *q);
-    let d = sum(displacement);
-    if !warped {
-        if let Some(rows) = rows {
-            rows.copy_from_slice(displacement);
-        }
-        return rest + d;
-    }
-    let (u, by_d, by_w) = warp_with_jacobian(sum(rotation), d);
-    if let Some(rows) = rows {
-        for ((row, phi), psi) in rows.iter_mut().zip(displacement).zip(rotation) {
-            *row = by_d * phi + by_w * psi;
-        }
-    }
-    rest + u
 }

@@ -1,0 +1,439 @@
+//! One step of a body: the modes and the frame without hands, then all hands at once, implicitly.
+
+use std::sync::Arc;
+
+use nalgebra::{Matrix3, Vector3};
+
+use super::{
+    Frame, Hand, Hold, RigidMotion, State, StepSettings,
+    constraint::Creep,
+    modes::Modes,
+    patch::{Grams, Six, Tangent, tangent},
+    place::Place,
+    solve::System,
+};
+use crate::{ModalModel, StepError};
+
+/// What one step did.
+#[derive(Debug, Clone, Copy, PartialEq, Default)]
+pub struct StepReport {
+    /// Directions in which hands were linearly dependent and had to be regularised.
+    pub regularised: usize,
+}
+
+/// What acts on a body in one step besides its hands and gravity.
+#[derive(Debug, Clone, Copy, PartialEq, Default)]
+pub struct Load<'a> {
+    /// Modal force, kg^1/2 m/s^2, of the first so many modes.
+    pub modal: &'a [f64],
+    /// Force on the frame of a free body, N, world axes.
+    pub force: Vector3<f64>,
+    /// Torque on it about the centre of mass, N m, world axes.
+    pub torque: Vector3<f64>,
+    /// The frame of a free body is known from elsewhere and stays where the state has it.
+    pub frame_is_given: bool,
+}
+
+/// A hand in the step under way.
+#[derive(Debug, Clone, Default)]
+struct Solving {
+    /// Where the patch's six numbers go without hands.
+    free: Six,
+    /// The same for their velocities; only where the hand has a damper.
+    speed: Six,
+    /// Where the tangent was taken.
+    from: Six,
+    /// Displacement and its derivative there, m, body axes.
+    at: Vector3<f64>,
+    tangent: Tangent,
+    compliance: Matrix3<f64>,
+    /// Relaxation time of the damper, s.
+    relaxation: f64,
+    /// How far the patch gives way in this step because it was pulled before, m, body axes.
+    crept: Vector3<f64>,
+    /// From the centre of mass, m, body axes.
+    arm: Vector3<f64>,
+    /// Force on the body, N, body axes.
+    pull: Vector3<f64>,
+}
+
+/// Steps states of one model: the only place that does. It holds tables and workspace and no state,
+/// so that one kernel may step any number of copies of the body.
+///
+/// Hands are compliant and implicit. With `x = x* + A pull` the patches' positions after the step, the
+/// pulls (N) solve `(A + C) pull = target - x*`, `C` the compliance of each: what the modes leave out of
+/// the patch, and the hand's spring. A damper adds its relaxation time times the velocities. Under warp
+/// rows are corrected by Newton's method, and so is the place of a free body's frame.
+///
+/// A step allocates nothing after [`Kernel::prepare`] was called with the same hands.
+#[derive(Debug, Clone)]
+pub struct Kernel {
+    model: Arc<ModalModel>,
+    settings: StepSettings,
+    h: f64,
+    modes: Modes,
+    creep: Creep,
+    before: State,
+    /// Modal forces: of everything but hands, then of hands.
+    force: Vec<f64>,
+    pulls: Vec<f64>,
+    /// Modal velocities as dampers see them.
+    velocity: Vec<f64>,
+    solving: Vec<Solving>,
+    /// The hands' forces on their patches' six numbers.
+    forces: Vec<Six>,
+    responses: Grams,
+    dampers: Grams,
+    system: System,
+}
+
+impl Kernel {
+    /// For the first `modes` modes of a model at steps of `h` seconds.
+    ///
+    /// # Errors
+    /// A setting or step that is not finite or not in its range.
+    pub fn new(
+        model: Arc<ModalModel>,
+        settings: StepSettings,
+        modes: usize,
+        h: f64,
+    ) -> Result<Self, StepError> {
+        settings.check()?;
+        let modes = Modes::new(&model, &settings, modes, h)?;
+        let zero = vec![0.0; modes.count()];
+        let mut kernel = Self {
+            creep: Creep::new(settings.relaxation, settings.stiffness_scale, h),
+            before: State::default(),
+            force: zero.clone(),
+            pulls: zero.clone(),
+            velocity: zero,
+            solving: Vec::new(),
+            forces: Vec::new(),
+            responses: Grams::default(),
+            dampers: Grams::default(),
+            system: System::default(),
+            model,
+            settings,
+            h,
+            modes,
+        };
+        kernel.before = kernel.at_rest();
+        Ok(kernel)
+    }
+
+    /// Changes settings and the length of a step; the number of modes stays.
+    ///
+    /// # Errors
+    /// As [`Kernel::new`]; the old ones then stay.
+    pub fn reconfigure(&mut self, settings: StepSettings, h: f64) -> Result<(), StepError> {
+        settings.check()?;
+        self.modes = Modes::new(&self.model, &settings, self.modes.count(), h)?;
+        self.creep = Creep::new(settings.relaxation, settings.stiffness_scale, h);
+        (self.settings, self.h) = (settings, h);
+        self.before = self.at_rest();
+        self.responses.forget();
+        self.dampers.forget();
+        Ok(())
+    }
+
+    /// The body's model.
+    pub fn model(&self) -> &Arc<ModalModel> {
+        &self.model
+    }
+
+    /// How it is stepped.
+    pub fn settings(&self) -> &StepSettings {
+        &self.settings
+    }
+
+    /// Length of a step, s.
+    pub fn h(&self) -> f64 {
+        self.h
+    }
+
+    /// Number of modes stepped.
+    pub fn modes(&self) -> usize {
+        self.modes.count()
+    }
+
+    /// Angular frequencies of the modes as they are stepped, rad/s.
+    pub fn omega(&self) -> &[f64] {
+        &self.modes.omega
+    }
+
+    /// Damping coefficients of the modes as they are stepped, 1/s.
+    pub fn damping(&self) -> &[f64] {
+        &self.modes.damping
+    }
+
+    /// What a unit modal force adds to coordinate, velocity and acceleration of each mode in a step.
+    pub fn responses(&self) -> [&[f64]; 3] {
+        self.modes.response.each_ref().map(Vec::as_slice)
+    }
+
+    /// A state of the body at rest, in its model's own place.
+    pub fn at_rest(&self) -> State {
+        let zero = vec![0.0; self.modes.count()];
+        let z = if self.modes.is_viscous() { zero.clone() } else { Vec::new() };
+        let frame = Frame::at_rest(&self.model);
+        State { q: zero.clone(), v: zero.clone(), a: zero.clone(), f: zero, z, frame }
+    }
+
+    /// Whether a state has as many numbers as this kernel steps, all of them finite.
+    ///
+    /// # Errors
+    /// A slice of another length, a number that is not finite.
+    pub fn check(&self, state: &State) -> Result<(), StepError> {
+        self.check_lengths(state)?;
+        let slices = [("q", &state.q), ("v", &state.v), ("a", &state.a), ("f", &state.f), ("z", &state.z)];
+        slices.into_iter().try_for_each(|(what, slice)| crate::error::finite(what, slice))?;
+        state.frame.check()
+    }
+
+    fn check_lengths(&self, state: &State) -> Result<(), StepError> {
+        let expected = self.modes.count();
+        for (what, got) in
+            [("q", state.q.len()), ("v", state.v.len()), ("a", state.a.len()), ("f", state.f.len())]
+        {
+            if got != expected {
+                return Err(StepError::Length { what, expected, got });
+            }
+        }
+        let (expected, got) = (if self.modes.is_viscous() { expected } else { 0 }, state.z.len());
+        if got == expected { Ok(()) } else { Err(StepError::Length { what: "z", expected, got }) }
+    }
+
+    /// What a hand gives way by within one step besides the modes: residual flexibility of its patch
+    /// plus its own spring, 3x3, m/N, body axes. Where the material is viscoelastic, the first is
+    /// multiplied by [`Relaxation::creep`](crate::Relaxation::creep) of one step.
+    pub fn compliance(&self, hand: &Hand) -> Matrix3<f64> {
+        self.creep.compliance(hand)
+    }
+
+    /// The flow of a hand's patch after one step under a pull (N, body axes).
+    pub fn flow(&self, hand: &Hand, pull: Vector3<f64>) -> Vector3<f64> {
+        self.creep.step(hand, &pull)
+    }
+
+    /// Makes what the steps with these hands need, so that they allocate nothing.
+    pub fn prepare(&mut self, hands: &[Hand]) {
+        self.responses.prepare(hands, &self.modes.response[0]);
+        if hands.iter().any(|hand| hand.config().relaxation > 0.0) {
+            self.dampers.prepare(hands, &self.modes.damper);
+        }
+        self.solving.reserve(hands.len().saturating_sub(self.solving.len()));
+        self.forces.reserve(hands.len().saturating_sub(self.forces.len()));
+        self.system.reserve(hands.len());
+    }
+
+    /// One step of a state with these hands.
+    ///
+    /// # Errors
+    /// [`StepError::Length`] for a state or a patch of another size, which nothing is done with.
+    /// [`StepError::Diverged`] when the result would not be finite: the state is then as it was before,
+    /// unless it is one that nothing can be stepped from (with a number beyond 1e100 in it), and then it
+    /// is at rest where its frame is; the hands pull nothing.
+    pub fn step(
+        &mut self,
+        state: &mut State,
+        hands: &mut [Hand],
+        load: &Load<'_>,
+    ) -> Result<StepReport, StepError> {
+        self.check_lengths(state)?;
+        let expected = self.modes.count();
+        if let Some(hand) = hands.iter().find(|hand| hand.patch.modes() != expected) {
+            return Err(StepError::Length { what: "a held patch", expected, got: hand.patch.modes() });
+        }
+        self.before.clone_from(state);
+        let report = self.advance(state, hands, load);
+        let bad = |hand: &Hand| !hand.pull.iter().chain(&hand.flow).all(|x| x.is_finite());
+        let what = state.non_finite().or(hands.iter().any(bad).then_some("a reaction"));
+        let Some(what) = what else { return Ok(report) };
+        state.clone_from(&self.before);
+        if !state.is_moderate() {
+            state.stop();
+        }
+        for hand in hands {
+            (hand.pull, hand.flow) = (Vector3::zeros(), Vector3::zeros());
+        }
+        Err(StepError::Diverged { what })
+    }
+
+    fn advance(&mut self, state: &mut State, hands: &mut [Hand], load: &Load<'_>) -> StepReport {
+        let gravity = Vector3::from(self.settings.gravity);
+        self.force.fill(0.0);
+        if !self.model.is_free() && gravity != Vector3::zeros() {
+            let local = state.frame.rotation().inverse() * gravity;
+            for (f, participation) in self.force.iter_mut().zip(self.model.participation()) {
+                *f = local.dot(&Vector3::from(*participation));
+            }
+        }
+        for (f, load) in self.force.iter_mut().zip(load.modal) {
+            *f += load;
+        }
+        self.modes.advance(&self.before, &self.force, state);
+        let rigid = (self.model.is_free() && !load.frame_is_given).then(|| {
+            RigidMotion::predict(&mut state.frame, &self.model, self.h, gravity, load.force, load.torque)
+        });
+        let mut report = StepReport::default();
+        if !hands.is_empty() {
+            report = self.hold(state, hands, rigid);
+        }
+        state.f.copy_from_slice(&self.force);
+        report
+    }
+
+    /// Solves for the pulls of all hands and adds what they do to the state.
+    fn hold(&mut self, state: &mut State, hands: &mut [Hand], mut rigid: Option<RigidMotion>) -> StepReport {
+        self.prepare(hands);
+        self.begin(state, hands);
+        let most = StepSettings::MOST_CORRECTIONS;
+        let rounds = if self.settings.warp { self.settings.corrections.clamp(1, most) } else { 1 };
+        let mut report = StepReport::default();
+        let mut place = Place::unheld(state.frame);
+        for round in 0..rounds {
+            let center = Vector3::from(self.model.center_of_mass());
+            for (solving, hand) in self.solving.iter_mut().zip(hands.iter()) {
+                // Linearise where the last round ended.
+                (solving.at, solving.tangent) = tangent(&solving.from, self.settings.warp);
+                solving.arm = hand.patch.rest() + solving.at - center;
+                // The pulls of the round before, at first those of the step before, which are in world axes.
+                solving.pull = place.axes * solving.pull;
+            }
+            if let Some(rigid) = &mut rigid {
+                rigid.tighten(&self.model, self.solving.iter().map(|s| (s.arm, s.pull)));
+            }
+            report.regularised = self.solve(&state.frame, hands, &place, rigid.as_ref());
+            if round + 1 < rounds {
+                for (i, solving) in self.solving.iter_mut().enumerate() {
+                    solving.from = solving.free + self.responses.answer(i, &self.forces);
+                }
+                if let Some(rigid) = &rigid {
+                    place = place.moved(&state.frame, &self.model, rigid, self.total(&place));
+                }
+            }
+        }
+        self.pulls.fill(0.0);
+        for (hand, forces) in hands.iter().zip(&self.forces) {
+            hand.patch.spread(forces, self.settings.warp, &mut self.pulls);
+        }
+        self.modes.respond(&self.pulls, state);
+        for (f, pull) in self.force.iter_mut().zip(&self.pulls) {
+            *f += pull;
+        }
+        let [force, torque] = self.total(&place);
+        if let Some(rigid) = &rigid {
+            rigid.apply(&mut state.frame, &self.model, force, torque + place.slack(rigid));
+        }
+        for (hand, solving) in hands.iter_mut().zip(&self.solving) {
+            hand.flow = self.creep.step(hand, &solving.pull);
+            // Solved in body axes; hands live in the world's.
+            hand.pull = place.turn * solving.pull;
+        }
+        report
+    }
+
+    /// What the rounds of a step begin with: where the patches are, and where they go without hands.
+    fn begin(&mut self, state: &State, hands: &[Hand]) {
+        let warp = self.settings.warp;
+        let damped = hands.iter().any(|hand| hand.config().relaxation > 0.0);
+        if damped {
+            self.modes.velocities(&self.before, state, self.h, &mut self.velocity);
+        }
+        self.solving.clear();
+        for hand in hands {
+            let mut solving = Solving {
+                free: hand.patch.reduce(&state.q, warp),
+                from: hand.patch.reduce(&self.before.q, warp),
+                compliance: self.creep.compliance(hand),
+                pull: hand.pull,
+                ..Solving::default()
+            };
+            if let Hold::Target { config, .. } = hand.hold {
+                solving.crept = self.creep.crept(&hand.flow);
+                solving.relaxation = config.relaxation;
+                if config.relaxation > 0.0 {
+                    solving.speed = hand.patch.reduce(&self.velocity, warp);
+                }
+            }
+            self.solving.push(solving);
+        }
+    }
+
+    /// One round: the pulls on the tangent, for a frame in `place`. `unheld`: the frame without hands.
+    fn solve(&mut self, unheld: &Frame, hands: &[Hand], place: &Place, rigid: Option<&RigidMotion>) -> usize {
+        let relaxations = || self.solving.iter().map(|s| s.relaxation);
+        let damped = relaxations().any(|r| r > 0.0);
+        let first = relaxations().next().unwrap_or(0.0);
+        self.system.clear(3 * hands.len(), relaxations().all(|r| r == first));
+        let right = self.system.right().as_chunks_mut::<3>().0;
+        for ((hand, solving), right) in hands.iter().zip(&self.solving).zip(right) {
+            // Project the unheld step onto the tangent plane.
+            let along = solving.at + solving.tangent * (solving.free - solving.from);
+            let gap = match hand.hold {
+                // Where the hand must have been: one that pulls so from there leaves the patch where it was.
+                Hold::Measured(there) => there + solving.compliance * (place.back * hand.pull) - along,
+                Hold::Target { target, velocity, config } => {
+                    let ahead = hand.patch.rest() + along;
+                    let mut gap = target
+                        - place.unheld_position(&self.model, rigid, ahead)
+                        - place.turn * solving.crept;
+                    if config.relaxation > 0.0 {
+                        let frame =
+                            rigid.map_or_else(Vector3::zeros, |_| unheld.velocity_at(&self.model, ahead));
+                        let speed = place.turn * (solving.tangent * solving.speed) + frame;
+                        gap += config.relaxation * (velocity - speed);
+                    }
+                    // A hand that is a body's length away pulls no harder than from there: targets may teleport.
+                    let (distance, reach) = (gap.norm(), self.model.size());
+                    if distance > reach {
+                        gap *= reach / distance;
+                    }
+                    place.back * gap
+                }
+            };
+            right.copy_from_slice(gap.as_slice());
+        }
+        for (i, a) in self.solving.iter().enumerate() {
+            for (j, b) in self.solving[..=i].iter().enumerate() {
+                let across = |grams: &Grams| a.tangent * grams.at(i, j) * b.tangent.transpose();
+                let mut position = across(&self.responses);
+                let mut velocity = if damped { across(&self.dampers) } else { Matrix3::zeros() };
+                if let Some(rigid) = rigid {
+                    let response = rigid.velocity_response(&a.arm, &b.arm);
+                    position += self.h * response;
+                    velocity += response;
+                }
+                if i == j {
+                    position += a.compliance;
+                }
+                for x in 0..3 {
+                    for y in 0..3 {
+                        // A damper is in its own hand's rows.
+                        let (row, column) = (3 * i + x, 3 * j + y);
+                        let (position, velocity) = (position[(x, y)], velocity[(x, y)]);
+                        self.system.set(row, column, position + a.relaxation * velocity);
+                        if i != j {
+                            self.system.set(column, row, position + b.relaxation * velocity);
+                        }
+                    }
+                }
+            }
+        }
+        let lost = self.system.solve();
+        self.forces.clear();
+        for (solving, pull) in self.solving.iter_mut().zip(self.system.right().as_chunks::<3>().0) {
+            solving.pull = Vector3::from(*pull);
+            self.forces.push(solving.tangent.tr_mul(&solving.pull));
+        }
+        lost
+    }
+
+    /// Force (N) and torque about the centre of mass (N m) of the hands, world axes.
+    fn total(&self, place: &Place) -> [Vector3<f64>; 2] {
+        self.solving.iter().fold([Vector3::zeros(); 2], |[force, torque], solving| {
+            let pull = place.turn * solving.pull;
+            [force + pull, torque + (place.turn * solving.arm).cross(&pull)]
+        })
+    }
+}

@@ -1,0 +1,18 @@
+//! The step of a body: one kernel for bodies, guests, predictions, peers and devices.
+
+mod constraint;
+mod kernel;
+mod modes;
+mod patch;
+mod place;
+mod rigid;
+mod settings;
+mod solve;
+mod state;
+
+pub use constraint::{GrabConfig, Hand, Hold};
+pub use kernel::{Kernel, Load, StepReport};
+pub use patch::HeldPatch;
+pub use rigid::{Frame, RigidMotion};
+pub use settings::StepSettings;
+pub use state::State;

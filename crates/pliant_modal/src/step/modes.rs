@@ -1,0 +1,141 @@
+//! The recurrences of all modes, column by column, so that loops over the modes vectorize.
+
+use super::{State, StepSettings};
+use crate::{Coefficients, Integrator, ModalModel, StepError};
+
+/// What one step makes of every mode.
+#[derive(Debug, Clone)]
+pub(crate) struct Modes {
+    /// Angular frequencies as stepped, rad/s.
+    pub(crate) omega: Vec<f64>,
+    /// Damping coefficients as stepped, 1/s.
+    pub(crate) damping: Vec<f64>,
+    /// `free[row][column]`: rows q, v, a; columns q, v, a, force of the last step.
+    free: [[Vec<f64>; 4]; 3],
+    /// What a unit modal force adds to q, v, a.
+    pub(crate) response: [Vec<f64>; 3],
+    /// What a unit modal force adds to the velocity that a damper sees, see [`Modes::velocities`].
+    pub(crate) damper: Vec<f64>,
+    /// The step looks at the old acceleration and force too.
+    memory: bool,
+    viscous: Option<Viscous>,
+}
+
+/// What viscoelasticity adds; see [`crate::Flow`].
+#[derive(Debug, Clone)]
+struct Viscous {
+    onto: [Vec<f64>; 3],
+    free: [Vec<f64>; 4],
+    carry: Vec<f64>,
+    response: Vec<f64>,
+}
+
+impl Modes {
+    /// For the first `count` modes of a model at a step of `h` seconds.
+    pub(crate) fn new(
+        model: &ModalModel,
+        settings: &StepSettings,
+        count: usize,
+        h: f64,
+    ) -> Result<Self, StepError> {
+        let count = count.min(model.mode_count());
+        let (omega, damping): (Vec<f64>, Vec<f64>) =
+            (0..count).map(|mode| settings.mode(model, mode)).unzip();
+        let (mut made, mut flows) = (Vec::with_capacity(count), Vec::new());
+        for (&omega, &c) in omega.iter().zip(&damping) {
+            match settings.relaxation {
+                None => made.push(Coefficients::new(settings.integrator, omega, c, h)?),
+                Some(relaxation) => {
+                    let (one, flow) = Coefficients::relaxing(settings.integrator, omega, c, relaxation, h)?;
+                    made.push(one);
+                    flows.push(flow);
+                }
+            }
+        }
+        let viscous = settings.relaxation.map(|_| Viscous {
+            onto: std::array::from_fn(|row| flows.iter().map(|f| f.onto[row]).collect()),
+            free: std::array::from_fn(|column| flows.iter().map(|f| f.free[column]).collect()),
+            carry: flows.iter().map(|f| f.carry).collect(),
+            response: flows.iter().map(|f| f.response).collect(),
+        });
+        Ok(Self {
+            omega,
+            damping,
+            free: std::array::from_fn(|row| {
+                std::array::from_fn(|column| made.iter().map(|c| c.free[row][column]).collect())
+            }),
+            response: std::array::from_fn(|row| made.iter().map(|c| c.response[row]).collect()),
+            damper: made.iter().map(|c| c.response[1].max(c.response[0] / h)).collect(),
+            memory: settings.integrator != Integrator::Exact,
+            viscous,
+        })
+    }
+
+    /// Number of modes.
+    pub(crate) fn count(&self) -> usize {
+        self.omega.len()
+    }
+
+    /// Whether the material is viscoelastic, so that a state has a `z`.
+    pub(crate) fn is_viscous(&self) -> bool {
+        self.viscous.is_some()
+    }
+
+    /// The step of all modes from `before` under a modal force, into `after`.
+    pub(crate) fn advance(&self, before: &State, force: &[f64], after: &mut State) {
+        let n = self.count();
+        let (q, v, a, f) = (&before.q[..n], &before.v[..n], &before.a[..n], &before.f[..n]);
+        let force = &force[..n];
+        let rows = [&mut after.q, &mut after.v, &mut after.a];
+        for ((columns, response), out) in self.free.iter().zip(&self.response).zip(rows) {
+            let [by_q, by_v, by_a, by_f] = columns.each_ref().map(|c| &c[..n]);
+            let (response, out) = (&response[..n], &mut out[..n]);
+            if self.memory {
+                for k in 0..n {
+                    let old = (by_q[k] * q[k] + by_v[k] * v[k]) + (by_a[k] * a[k] + by_f[k] * f[k]);
+                    out[k] = old + response[k] * force[k];
+                }
+            } else {
+                for k in 0..n {
+                    out[k] = (by_q[k] * q[k] + by_v[k] * v[k]) + response[k] * force[k];
+                }
+            }
+        }
+        let Some(viscous) = &self.viscous else { return };
+        let z = &before.z[..n];
+        for (onto, out) in viscous.onto.iter().zip([&mut after.q, &mut after.v, &mut after.a]) {
+            for ((out, onto), z) in out.iter_mut().zip(onto).zip(z) {
+                *out += onto * z;
+            }
+        }
+        let [by_q, by_v, by_a, by_f] = viscous.free.each_ref().map(|c| &c[..n]);
+        let (carry, response) = (&viscous.carry[..n], &viscous.response[..n]);
+        for (k, out) in after.z.iter_mut().enumerate().take(n) {
+            let old = (by_q[k] * q[k] + by_v[k] * v[k]) + (by_a[k] * a[k] + by_f[k] * f[k]);
+            *out = old + carry[k] * z[k] + response[k] * force[k];
+        }
+    }
+
+    /// Adds what a further modal force does within the step.
+    pub(crate) fn respond(&self, force: &[f64], state: &mut State) {
+        let viscous = self.viscous.as_ref().map(|viscous| &viscous.response);
+        let rows = [&mut state.q, &mut state.v, &mut state.a, &mut state.z];
+        for (response, out) in self.response.iter().chain(viscous).zip(rows) {
+            for ((out, response), force) in out.iter_mut().zip(response).zip(force) {
+                *out += response * force;
+            }
+        }
+    }
+
+    /// How fast the modes move as a damper on them is to see it.
+    ///
+    /// Of each mode the velocity at the end of the step, or the mean over the step, whichever answers
+    /// a push more. A mode that turns by more than half a period within a step answers with an end
+    /// velocity the other way: a damper on that would drive it.
+    pub(crate) fn velocities(&self, before: &State, after: &State, h: f64, out: &mut [f64]) {
+        for (k, out) in out.iter_mut().enumerate().take(self.count()) {
+            let at_end = self.response[1][k] >= self.response[0][k] / h;
+            *out = if at_end { after.v[k] } else { (after.q[k] - before.q[k]) / h };
+        }
+    }
+}

@@ -1,0 +1,242 @@
+//! A patch of a body as a step sees it.
+//!
+//! Where a patch is depends on six sums over the modes only: its mean displacement and its mean
+//! rotation. A step works in these six numbers a patch. It goes through the modes once for the step
+//! without hands and once for what the hands do, however many corrections there are.
+
+use std::sync::Arc;
+
+use nalgebra::{Matrix3, SMatrix, SVector, Vector3};
+
+use super::Hand;
+use crate::{ModalModel, Patch, StepError, warp::warp_with_jacobian};
+
+/// Displacement (0..3) and rotation (3..6) of a patch, or the forces that belong to them.
+pub(crate) type Six = SVector<f64, 6>;
+/// Derivative of a patch's place by its six numbers.
+pub(crate) type Tangent = SMatrix<f64, 3, 6>;
+/// How two patches' six numbers answer each other's forces.
+type Block = SMatrix<f64, 6, 6>;
+
+/// Sums run in so many lanes: a fixed order, so equal on all machines, and wide.
+const LANES: usize = 4;
+
+fn dot(row: &[f64], x: &[f64]) -> f64 {
+    let mut sums = [0.0; LANES];
+    let ((a, tail_a), (b, tail_b)) = (row.as_chunks::<LANES>(), x.as_chunks::<LANES>());
+    for (a, b) in a.iter().zip(b) {
+        for k in 0..LANES {
+            sums[k] += a[k] * b[k];
+        }
+    }
+    let rest: f64 = tail_a.iter().zip(tail_b).map(|(a, b)| a * b).sum();
+    (sums[0] + sums[1]) + (sums[2] + sums[3]) + rest
+}
+
+/// Three rows at once: the loads of `x` are shared and the sums do not wait for each other.
+fn dot3(rows: [&[f64]; 3], x: &[f64]) -> [f64; 3] {
+    let n = x.len();
+    let rows = rows.map(|r| r[..n].as_chunks::<LANES>());
+    let (x, tail) = x.as_chunks::<LANES>();
+    let mut sums = [[0.0; LANES]; 3];
+    for (((a, b), c), x) in rows[0].0.iter().zip(rows[1].0).zip(rows[2].0).zip(x) {
+        for k in 0..LANES {
+            sums[0][k] += a[k] * x[k];
+            sums[1][k] += b[k] * x[k];
+            sums[2][k] += c[k] * x[k];
+        }
+    }
+    let mut out = sums.map(|s| (s[0] + s[1]) + (s[2] + s[3]));
+    for (o, (_, row)) in out.iter_mut().zip(rows) {
+        *o += row.iter().zip(tail).map(|(a, b)| a * b).sum::<f64>();
+    }
+    out
+}
+
+/// A patch of a model with what its steps need: the weighted means of its vertices' modes, and how
+/// the patch gives way besides them. Made once, shared by all copies of the body.
+#[derive(Debug, Clone)]
+pub struct HeldPatch {
+    /// Rows of the mean displacement and of the mean rotation, one entry a mode.
+    rows: [Vec<f64>; 6],
+    rest: Vector3<f64>,
+    /// Residual flexibility at the baked stiffness, m/N.
+    residual: Matrix3<f64>,
+}
+
+impl HeldPatch {
+    /// Of the first `modes` modes of a model.
+    ///
+    /// # Errors
+    /// [`StepError::Vertex`] for a patch of another surface.
+    pub fn new(model: &ModalModel, patch: &Patch, modes: usize) -> Result<Self, StepError> {
+        let modes = modes.min(model.mode_count());
+        let residual = residual(model, patch, modes)?;
+        let mut rest = Vector3::zeros();
+        let mut rows: [Vec<f64>; 6] = std::array::from_fn(|_| vec![0.0; modes]);
+        for &(vertex, weight) in patch.entries() {
+            rest += weight * Vector3::from(model.surface().positions()[vertex as usize].map(f64::from));
+            for axis in 0..3 {
+                for (mode, row) in rows[axis].iter_mut().enumerate() {
+                    *row += weight * f64::from(model.displacement_row(vertex, axis, mode));
+                }
+                for (mode, row) in rows[3 + axis].iter_mut().enumerate() {
+                    *row += weight * f64::from(model.rotation_row(vertex, axis, mode));
+                }
+            }
+        }
+        Ok(Self { rows, rest, residual })
+    }
+
+    /// Where the patch is at rest, m, body axes.
+    pub fn rest(&self) -> Vector3<f64> {
+        self.rest
+    }
+
+    /// What the modes leave out of the patch's flexibility at the baked stiffness: 3x3, m/N, body axes.
+    pub fn residual(&self) -> Matrix3<f64> {
+        self.residual
+    }
+
+    /// Number of modes.
+    pub fn modes(&self) -> usize {
+        self.rows[0].len()
+    }
+
+    /// How far the patch is from its rest at the coordinates `q`, m, body axes.
+    pub fn displacement(&self, q: &[f64], warped: bool) -> Vector3<f64> {
+        displacement(&self.reduce(q, warped), warped)
+    }
+
+    /// The six sums `B x`. Without warp the rotation plays no part and stays zero.
+    pub(crate) fn reduce(&self, x: &[f64], warped: bool) -> Six {
+        let [a, b, c, d, e, f] = &self.rows;
+        let u = dot3([a, b, c], x);
+        let w = if warped { dot3([d, e, f], x) } else { [0.0; 3] };
+        Six::new(u[0], u[1], u[2], w[0], w[1], w[2])
+    }
+
+    /// `out += B^T forces`.
+    pub(crate) fn spread(&self, forces: &Six, warped: bool, out: &mut [f64]) {
+        let n = out.len();
+        let [a, b, c, d, e, f] = self.rows.each_ref().map(|r| &r[..n]);
+        let g = forces;
+        if warped {
+            for k in 0..n {
+                let straight = a[k] * g[0] + b[k] * g[1] + c[k] * g[2];
+                out[k] += straight + (d[k] * g[3] + e[k] * g[4] + f[k] * g[5]);
+            }
+        } else {
+            for k in 0..n {
+                out[k] += a[k] * g[0] + b[k] * g[1] + c[k] * g[2];
+            }
+        }
+    }
+
+    /// `B_self diag(weight) B_other^T`.
+    fn gram(&self, other: &Self, weight: &[f64], scratch: &mut Vec<f64>) -> Block {
+        let mut block = Block::zeros();
+        for (i, mine) in self.rows.iter().enumerate() {
+            scratch.clear();
+            scratch.extend(mine.iter().zip(weight).map(|(r, w)| r * w));
+            for (j, theirs) in other.rows.iter().enumerate() {
+                block[(i, j)] = dot(scratch, theirs);
+            }
+        }
+        block
+    }
+}
+
+/// How a patch gives way at once at the baked stiffness besides its modes, m/N, body axes.
+fn residual(model: &ModalModel, patch: &Patch, modes: usize) -> Result<Matrix3<f64>, StepError> {
+    let count = model.surface().positions().len();
+    if let Some(&(vertex, _)) = patch.entries().iter().find(|&&(v, _)| v as usize >= count) {
+        return Err(StepError::Vertex { vertex, count });
+    }
+    let residual = model.flexibility_of(patch, modes);
+    let residual = Matrix3::from_fn(|i, j| residual[i][j]);
+    // A patch on an anchor has no flexibility at all, and a hand on it would pull with an infinite
+    // force: skin and fingertip give a hundredth of the patch's own contact compliance.
+    let info = model.info();
+    let radius = patch.radius().max(1e-2 * model.size());
+    let contact = 1e-2 * (1.0 - info.poisson * info.poisson) / (2.0 * info.young * radius);
+    Ok(0.5 * (residual + residual.transpose()) + Matrix3::identity() * contact.max(f64::MIN_POSITIVE))
+}
+
+/// Displacement of a patch from its six numbers, body axes, m.
+pub(crate) fn displacement(six: &Six, warped: bool) -> Vector3<f64> {
+    let d = Vector3::new(six[0], six[1], six[2]);
+    if warped { crate::warp([six[3], six[4], six[5]], d.into()).into() } else { d }
+}
+
+/// Displacement and its derivative by the six numbers.
+pub(crate) fn tangent(six: &Six, warped: bool) -> (Vector3<f64>, Tangent) {
+    let d = Vector3::new(six[0], six[1], six[2]);
+    let mut tangent = Tangent::zeros();
+    if !warped {
+        tangent.fixed_view_mut::<3, 3>(0, 0).fill_with_identity();
+        return (d, tangent);
+    }
+    let (u, by_d, by_w) = warp_with_jacobian(Vector3::new(six[3], six[4], six[5]), d);
+    tangent.fixed_view_mut::<3, 3>(0, 0).copy_from(&by_d);
+    tangent.fixed_view_mut::<3, 3>(0, 3).copy_from(&by_w);
+    (u, tangent)
+}
+
+/// [`HeldPatch::gram`] of all pairs of held patches, lower triangle; kept while the patches stay.
+#[derive(Debug, Clone, Default)]
+pub(crate) struct Grams {
+    patches: Vec<Arc<HeldPatch>>,
+    blocks: Vec<Block>,
+    scratch: Vec<f64>,
+}
+
+impl Grams {
+    /// Makes the blocks for the hands' patches, unless they are there.
+    pub(crate) fn prepare(&mut self, hands: &[Hand], weight: &[f64]) {
+        let same = self.patches.len() == hands.len();
+        if same && hands.iter().zip(&self.patches).all(|(hand, patch)| Arc::ptr_eq(&hand.patch, patch)) {
+            return;
+        }
+        // What two patches are to each other does not change when others come or go.
+        let known = |hand: &Hand| self.patches.iter().position(|patch| Arc::ptr_eq(&hand.patch, patch));
+        let old: Vec<Option<usize>> = hands.iter().map(known).collect();
+        let mut blocks = Vec::with_capacity(hands.len() * (hands.len() + 1) / 2);
+        for (i, a) in hands.iter().enumerate() {
+            for (j, b) in hands[..=i].iter().enumerate() {
+                blocks.push(match (old[i], old[j]) {
+                    (Some(x), Some(y)) if x >= y => *self.at(x, y),
+                    (Some(x), Some(y)) => self.at(y, x).transpose(),
+                    _ => a.patch.gram(&b.patch, weight, &mut self.scratch),
+                });
+            }
+        }
+        self.blocks = blocks;
+        self.patches.clear();
+        self.patches.extend(hands.iter().map(|hand| hand.patch.clone()));
+    }
+
+    /// Forgets all blocks, as their weights have changed.
+    pub(crate) fn forget(&mut self) {
+        self.patches.clear();
+        self.blocks.clear();
+    }
+
+    /// The block of two hands, `j` at most `i`.
+    pub(crate) fn at(&self, i: usize, j: usize) -> &Block {
+        &self.blocks[i * (i + 1) / 2 + j]
+    }
+
+    /// `sum over j of block(i, j) forces[j]`.
+    pub(crate) fn answer(&self, i: usize, forces: &[Six]) -> Six {
+        let mut sum = Six::zeros();
+        for (j, f) in forces.iter().enumerate() {
+            if j <= i {
+                sum += self.at(i, j) * f;
+            } else {
+                sum += self.at(j, i).tr_mul(f);
+            }
+        }
+        sum
+    }
+}

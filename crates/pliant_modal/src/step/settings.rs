@@ -1,0 +1,82 @@
+//! How a body is stepped, wherever a copy of it is.
+
+use serde::{Deserialize, Serialize};
+
+use crate::{Integrator, ModalModel, Relaxation, StepError, error::finite};
+
+/// How a body is stepped: everything that the host, its guests and peers have to agree on, besides
+/// the model and the length of a step.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
+#[serde(default)]
+pub struct StepSettings {
+    /// How the modes are integrated. Default: [`Integrator::Exact`].
+    pub integrator: Integrator,
+    /// Bend by modal warping (Choi and Ko 2005). Without it displacements stay linear, and the body
+    /// grows when it turns. Default: `true`.
+    pub warp: bool,
+    /// Newton corrections of the hands in one step, 1 to [`StepSettings::MOST_CORRECTIONS`]. They
+    /// only matter under warp and on a free body. Default: 2.
+    pub corrections: u8,
+    /// Uniform acceleration, m/s^2, world axes. Default: none.
+    pub gravity: [f64; 3],
+    /// Factor on all damping coefficients, 0 or more. Default: 1.
+    pub damping_scale: f64,
+    /// Factor on the material's stiffness, 1e-6 to 1e6: the body as it would be with so many times
+    /// the baked Young's modulus. Frequencies go with its root, compliances (those of held patches,
+    /// too) with its inverse; damping as [`ModalModel::stiffened`] says. Default: 1.
+    pub stiffness_scale: f64,
+    /// A viscoelastic material: every mode, and the flexibility under every hand, is a standard
+    /// linear solid. Default: none, elastic.
+    pub relaxation: Option<Relaxation>,
+}
+
+impl Default for StepSettings {
+    fn default() -> Self {
+        Self {
+            integrator: Integrator::default(),
+            warp: true,
+            corrections: 2,
+            gravity: [0.0; 3],
+            damping_scale: 1.0,
+            stiffness_scale: 1.0,
+            relaxation: None,
+        }
+    }
+}
+
+impl StepSettings {
+    /// Most Newton corrections in one step.
+    pub const MOST_CORRECTIONS: u8 = 8;
+
+    /// Checks all ranges, also those of settings that came from a network.
+    ///
+    /// # Errors
+    /// [`StepError::Input`] with the value that is not finite or not in its range.
+    pub fn check(&self) -> Result<(), StepError> {
+        let Self { damping_scale: damping, stiffness_scale: stiffness, .. } = *self;
+        StepError::check(
+            "damping_scale",
+            "finite, 0 or more",
+            damping.is_finite() && damping >= 0.0,
+            damping,
+        )?;
+        let sound = (1e-6..=1e6).contains(&stiffness);
+        StepError::check("stiffness_scale", "1e-6 to 1e6", sound, stiffness)?;
+        let corrections = self.corrections;
+        let sound = (1..=Self::MOST_CORRECTIONS).contains(&corrections);
+        StepError::check("corrections", "1 to 8", sound, corrections.into())?;
+        if let Integrator::GeneralizedAlpha { rho_inf } = self.integrator {
+            StepError::check("rho_inf", "0 to 1", (0.0..=1.0).contains(&rho_inf), rho_inf)?;
+        }
+        if let Some(relaxation) = &self.relaxation {
+            relaxation.check()?;
+        }
+        finite("gravity", &self.gravity)
+    }
+
+    /// Angular frequency (rad/s) and damping coefficient (1/s) of a mode as it is stepped.
+    pub fn mode(&self, model: &ModalModel, mode: usize) -> (f64, f64) {
+        let (omega, damping) = model.stiffened(mode, self.stiffness_scale);
+        (omega, damping * self.damping_scale)
+    }
+}

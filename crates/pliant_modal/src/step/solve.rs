@@ -1,0 +1,206 @@
+//! The system of all hands, `(A + r B + C) pull = gap`, three rows a hand.
+
+/// Workspace of the solve. It grows when hands are added.
+#[derive(Debug, Clone, Default)]
+pub(crate) struct System {
+    /// Row-major, `n x n`.
+    matrix: Vec<f64>,
+    right: Vec<f64>,
+    pivots: Vec<usize>,
+    symmetric: bool,
+}
+
+impl System {
+    /// A pivot below this share of its diagonal has been eaten by rounding: two hands on one spot, more rows than modes.
+    const LOST: f64 = 1e-13;
+
+    /// Makes room for so many hands, so that a step needs no memory.
+    pub(crate) fn reserve(&mut self, hands: usize) {
+        let n = 3 * hands;
+        self.matrix.reserve((n * n).saturating_sub(self.matrix.len()));
+        self.right.reserve(n.saturating_sub(self.right.len()));
+        self.pivots.reserve(n.saturating_sub(self.pivots.len()));
+    }
+
+    /// An empty system of so many rows; of a `symmetric` one only the lower triangle needs to be set.
+    pub(crate) fn clear(&mut self, n: usize, symmetric: bool) {
+        self.matrix.clear();
+        self.matrix.resize(n * n, 0.0);
+        self.right.clear();
+        self.right.resize(n, 0.0);
+        self.symmetric = symmetric;
+    }
+
+    pub(crate) fn set(&mut self, row: usize, column: usize, value: f64) {
+        let n = self.right.len();
+        self.matrix[row * n + column] = value;
+    }
+
+    pub(crate) fn right(&mut self) -> &mut [f64] {
+        &mut self.right
+    }
+
+    /// Replaces the right side by the solution. Returns in how many directions the system had lost its
+    /// rank: these get no share of their own and leave the solution of the others standing.
+    pub(crate) fn solve(&mut self) -> usize {
+        if self.symmetric { self.cholesky() } else { self.eliminate() }
+    }
+
+    /// `L L^T` of the lower triangle, in place.
+    fn cholesky(&mut self) -> usize {
+        let n = self.right.len();
+        let (m, x) = (&mut self.matrix, &mut self.right);
+        let mut lost = 0;
+        for j in 0..n {
+            let diagonal = m[j * n + j];
+            let square: f64 = m[j * n..j * n + j].iter().map(|a| a * a).sum();
+            let pivot = diagonal - square;
+            if pivot <= Self::LOST * diagonal.abs() {
+                lost += 1;
+                // The direction is a combination of earlier ones: a huge pivot gives it no share.
+                for i in j + 1..n {
+                    m[i * n + j] = 0.0;
+                }
+                m[j * n + j] = f64::MAX.sqrt();
+                continue;
+            }
+            let root = pivot.sqrt();
+            m[j * n + j] = root;
+            for i in j + 1..n {
+                let (above, below) = m.split_at_mut(i * n);
+                let (other, row) = (&above[j * n..j * n + j], &mut below[..n]);
+                let sum: f64 = row[..j].iter().zip(other).map(|(a, b)| a * b).sum();
+                row[j] = (row[j] - sum) / root;
+            }
+        }
+        for j in 0..n {
+            let sum: f64 = m[j * n..j * n + j].iter().zip(x.iter()).map(|(a, b)| a * b).sum();
+            x[j] = (x[j] - sum) / m[j * n + j];
+        }
+        for j in (0..n).rev() {
+            let sum: f64 = (j + 1..n).map(|k| m[k * n + j] * x[k]).sum();
+            x[j] = (x[j] - sum) / m[j * n + j];
+        }
+        lost
+    }
+
+    /// Gaussian elimination with row exchange, in place. A column without a pivot is an unknown
+    /// without a share.
+    fn eliminate(&mut self) -> usize {
+        let n = self.right.len();
+        let (m, x) = (&mut self.matrix, &mut self.right);
+        self.pivots.clear();
+        for j in 0..n {
+            let row = self.pivots.len();
+            // What is left of the column is compared with what it was.
+            let scale = (0..n).fold(0.0f64, |scale, i| scale.max(m[i * n + j].abs()));
+            let mut best = row;
+            for i in row + 1..n {
+                if m[i * n + j].abs() > m[best * n + j].abs() {
+                    best = i;
+                }
+            }
+            if m[best * n + j].abs() <= Self::LOST * scale {
+                continue;
+            }
+            if best != row {
+                for k in j..n {
+                    m.swap(row * n + k, best * n + k);
+                }
+                x.swap(row, best);
+            }
+            for i in row + 1..n {
+                let factor = m[i * n + j] / m[row * n + j];
+                if factor != 0.0 {
+                    let (above, below) = m.split_at_mut(i * n);
+                    let pivot = &above[row * n + j..(row + 1) * n];
+                    for (a, b) in below[j..n].iter_mut().zip(pivot) {
+                        *a -= factor * b;
+                    }
+                    x[i] -= factor * x[row];
+                }
+            }
+            self.pivots.push(j);
+        }
+        // From the last pivot up. A solution goes where its column is, which is never above its row,
+        // so that no right side is lost before it is used.
+        let lost = n - self.pivots.len();
+        x[self.pivots.len()..].fill(0.0);
+        for (row, &j) in self.pivots.iter().enumerate().rev() {
+            let sum: f64 = (j + 1..n).map(|k| m[row * n + k] * x[k]).sum();
+            let solution = (x[row] - sum) / m[row * n + j];
+            x[row] = 0.0;
+            x[j] = solution;
+        }
+        lost
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn system(full: &[f64], right: &[f64], symmetric: bool) -> System {
+        let mut system = System::default();
+        let n = right.len();
+        system.clear(n, symmetric);
+        for i in 0..n {
+            for j in 0..if symmetric { i + 1 } else { n } {
+                system.set(i, j, full[i * n + j]);
+            }
+        }
+        system.right().copy_from_slice(right);
+        system
+    }
+
+    /// Solves, and compares `full x` with the right side.
+    fn solved(full: &[f64], right: &[f64], symmetric: bool) -> usize {
+        let mut system = system(full, right, symmetric);
+        let lost = system.solve();
+        for (row, want) in full.chunks_exact(right.len()).zip(right) {
+            let got: f64 = row.iter().zip(system.right().iter()).map(|(a, b)| a * b).sum();
+            assert!((got - want).abs() < 1e-11, "{got} and {want}");
+        }
+        lost
+    }
+
+    #[test]
+    fn both_solve_a_positive_definite_system() {
+        let full = [4.0, 2.0, 0.0, 2.0, 5.0, 3.0, 0.0, 3.0, 6.0];
+        for symmetric in [true, false] {
+            assert_eq!(solved(&full, &[0.0, 1.0, 12.0], symmetric), 0);
+        }
+    }
+
+    #[test]
+    fn elimination_solves_what_is_not_symmetric_and_needs_rows_exchanged() {
+        let full = [0.0, 2.0, 1.0, 1.0, -5.0, 3.0, 4.0, 3.0, 0.5];
+        assert_eq!(solved(&full, &[1.0, -2.0, 3.0], false), 0);
+    }
+
+    #[test]
+    fn lost_rank_leaves_a_solution_standing() {
+        // Rows 0 and 2 are the same row: their shares must still solve it.
+        let full = [4.0, 1.0, 4.0, 1.0, 3.0, 1.0, 4.0, 1.0, 4.0];
+        for symmetric in [true, false] {
+            assert_eq!(solved(&full, &[1.0, 2.0, 1.0], symmetric), 1);
+        }
+    }
+
+    #[test]
+    fn a_column_without_a_pivot_does_not_cost_an_equation() {
+        // The first two unknowns only count together, and all three equations are consistent.
+        let full = [1.0, 1.0, 2.0, 1.0, 1.0, 3.0, 2.0, 2.0, 5.0];
+        assert_eq!(solved(&full, &[1.0, 2.0, 3.0], false), 1);
+    }
+
+    #[test]
+    fn nothing_and_no_number_are_no_panic() {
+        for symmetric in [true, false] {
+            assert_eq!(system(&[], &[], symmetric).solve(), 0);
+            let mut system = system(&[f64::NAN], &[1.0], symmetric);
+            system.solve();
+            assert!(!system.right()[0].is_finite());
+        }
+    }
+}

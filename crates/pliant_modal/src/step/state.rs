@@ -1,0 +1,75 @@
+//! What moves.
+
+use super::Frame;
+
+/// The state of a body at one tick. All slices have one entry a stepped mode; `z` has none where
+/// the material is elastic.
+#[derive(Debug, PartialEq, Default)]
+pub struct State {
+    /// Modal coordinates, kg^1/2 m.
+    pub q: Vec<f64>,
+    /// Modal velocities, kg^1/2 m/s.
+    pub v: Vec<f64>,
+    /// Modal accelerations as the integrator defines them, kg^1/2 m/s^2.
+    pub a: Vec<f64>,
+    /// Modal forces of the last step, kg^1/2 m/s^2 (generalized-alpha remembers them).
+    pub f: Vec<f64>,
+    /// Modal flows, kg^1/2 m: how far the dashpot of each mode's Maxwell branch has gone; see
+    /// [`Relaxation`](crate::Relaxation).
+    pub z: Vec<f64>,
+    /// Where the body is.
+    pub frame: Frame,
+}
+
+impl State {
+    /// Beyond this, kg^1/2 m and its like, squares of coordinates and velocities may overflow in a step.
+    const MOST: f64 = 1e100;
+
+    /// Whether coordinates, velocities and forces are such that a step without hands and pushes stays finite.
+    pub(crate) fn is_moderate(&self) -> bool {
+        let frame = &self.frame;
+        let rigid = frame.velocity().into_iter().chain(frame.spin()).chain(frame.center());
+        let modes = [&self.q, &self.v, &self.a, &self.f, &self.z].into_iter().flatten().copied();
+        modes.chain(rigid).all(|x| x.abs() <= Self::MOST)
+    }
+
+    /// At rest and undeformed, where the frame is (or at the origin, where that is nowhere).
+    pub(crate) fn stop(&mut self) {
+        for slice in [&mut self.q, &mut self.v, &mut self.a, &mut self.f, &mut self.z] {
+            slice.fill(0.0);
+        }
+        self.frame.stop(Self::MOST);
+    }
+
+    /// What is not finite, if anything is.
+    pub(crate) fn non_finite(&self) -> Option<&'static str> {
+        let named = [
+            ("modal coordinates", &self.q),
+            ("modal velocities", &self.v),
+            ("modal accelerations", &self.a),
+            ("modal flows", &self.z),
+        ];
+        let bad = named.into_iter().find(|(_, slice)| slice.iter().any(|x| !x.is_finite()));
+        bad.map(|(what, _)| what).or(self.frame.check().is_err().then_some("the frame"))
+    }
+}
+
+impl Clone for State {
+    fn clone(&self) -> Self {
+        let mut copy = Self::default();
+        copy.clone_from(self);
+        copy
+    }
+
+    /// Keeps the allocations of `self`: a step saves its state without any (a derived `clone_from`
+    /// would make new ones).
+    fn clone_from(&mut self, from: &Self) {
+        let Self { q, v, a, f, z, frame } = from;
+        self.q.clone_from(q);
+        self.v.clone_from(v);
+        self.a.clone_from(a);
+        self.f.clone_from(f);
+        self.z.clone_from(z);
+        self.frame = *frame;
+    }
+}
