@@ -7,7 +7,7 @@ use std::time::Duration;
 use libfuzzer_sys::fuzz_target;
 use pliant_modal::{BakeInfo, Damping, Element, ModalModel, ModelParts, SurfaceMesh};
 use pliant_stream::{
-    BodyId, BodySetup, Channel, GuestConfig, GuestSession, HostConfig, HostSession, PeerId, RecoveryConfig,
+    BodyId, StepSettings, Channel, GuestConfig, GuestSession, HostConfig, HostSession, PeerId, RecoveryConfig,
     TickState,
 };
 
@@ -56,7 +56,7 @@ fn model() -> Arc<ModalModel> {
 
 fuzz_target!(|bytes: &[u8]| {
     let mut host = HostSession::new(HostConfig::default()).expect("sound");
-    host.add_body(BODY, "fuzz", model(), BodySetup::default()).expect("sound");
+    host.add_body(BODY, "fuzz", model(), StepSettings::default()).expect("sound");
     let recovery = match bytes.first().copied().unwrap_or(0) % 3 {
         0 => RecoveryConfig::default(),
         1 => RecoveryConfig::paper(),

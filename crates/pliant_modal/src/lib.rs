@@ -59,7 +59,8 @@ pub use model::{BakeInfo, Damping, Element, FlexibilitySite, ModalModel, ModelHa
 pub use patch::Patch;
 pub use relaxation::{Flow, Relaxation};
 pub use step::{
-    Frame, GrabConfig, Hand, HeldPatch, Hold, Kernel, Load, RigidMotion, State, StepReport, StepSettings,
+    Frame, GrabConfig, Hand, HeldPatch, Hold, ImpliedPulls, Kernel, Load, RigidMotion, State, StepReport,
+    StepSettings,
 };
 pub use surface::SurfaceMesh;
 pub use warp::{warp, warp_jacobian};

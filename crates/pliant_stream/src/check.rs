@@ -1,6 +1,6 @@
 //! The state's checksum: a projection that any lasting error shows in, and rounding does not upset.
 
-use crate::state::{ModalState, Tick};
+use crate::state::{State, Tick};
 
 /// Sum of all coordinates with signs drawn from the tick (SplitMix64). A hash would cry at the last bit; this is compared
 /// with a tolerance, and an error that one tick's signs hide the next tick's show.
@@ -17,7 +17,7 @@ pub fn projection(tick: Tick, q: &[f64]) -> f64 {
 }
 
 /// The checksum of a state: its coordinates, and where the body relaxes its flows under another tick's signs.
-pub fn checksum(tick: Tick, state: &ModalState) -> f64 {
+pub fn checksum(tick: Tick, state: &State) -> f64 {
     projection(tick, &state.q) + projection(!tick, &state.z)
 }
 

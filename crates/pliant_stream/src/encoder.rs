@@ -6,14 +6,14 @@
 use std::collections::VecDeque;
 use std::sync::Arc;
 
-use pliant_modal::ModalModel;
+use pliant_modal::{ModalModel, StepSettings};
 
 use crate::StreamError;
 use crate::check::checksum;
 use crate::newmark::{FlowFilter, Newmark};
 use crate::quanta::Quanta;
-use crate::state::{BodyId, GrabKey, GrabState, ModalState, Tick, TickState};
-use crate::stepper::{BodySetup, ForceStepper};
+use crate::replica::{self, Replica};
+use crate::state::{BodyId, GrabKey, GrabState, State, Tick, TickState};
 use crate::wire::{
     AccelerationCoding, Accelerations, Frame, FrameGrab, MAX_PARTS, Payload, Repeat, RepeatGrab, Slice,
     SliceEntry, SnapshotBytes, StreamWish, Writer, round24,
@@ -79,9 +79,9 @@ pub struct Encoder {
     newmark: Newmark,
     /// How receivers of accelerations get the flow of a body that relaxes.
     flow: Option<FlowFilter>,
-    stepper: ForceStepper,
-    mirror: ModalState,
-    truth: ModalState,
+    replica: Replica,
+    mirror: State,
+    truth: State,
     load: Vec<f64>,
     unexplained: Vec<f64>,
     loaded: bool,
@@ -109,20 +109,20 @@ impl Encoder {
     pub fn new(
         body: BodyId,
         model: Arc<ModalModel>,
-        setup: &BodySetup,
+        settings: &StepSettings,
         newmark: Newmark,
         wish: StreamWish,
         limit: usize,
     ) -> Result<Self, StreamError> {
         let visible = Quanta::visible_of(&model, Self::modes_for(&wish, model.mode_count(), limit));
-        Self::with_visible(body, model, setup, newmark, wish, limit, &visible)
+        Self::with_visible(body, model, settings, newmark, wish, limit, &visible)
     }
 
     /// As [`Encoder::new`], with the visible amplitudes of all that may be wanted of the model's modes.
     pub(crate) fn with_visible(
         body: BodyId,
         model: Arc<ModalModel>,
-        setup: &BodySetup,
+        settings: &StepSettings,
         newmark: Newmark,
         wish: StreamWish,
         limit: usize,
@@ -138,10 +138,10 @@ impl Encoder {
             });
         }
         let visible = &visible[..modes.min(visible.len())];
-        let quanta = Quanta::of_visible(&model, visible, setup.stiffness_scale, &newmark);
-        let stepper = ForceStepper::new(model, setup, modes, newmark.h)?;
-        let rest = stepper.at_rest();
-        let flow = setup.relaxation.map(|r| FlowFilter::new(r, &newmark, 0));
+        let quanta = Quanta::of_visible(&model, visible, settings.stiffness_scale, &newmark);
+        let replica = Replica::new(model, *settings, modes, newmark.h)?;
+        let rest = replica.kernel().at_rest();
+        let flow = settings.relaxation.map(|r| FlowFilter::new(r, &newmark, 0));
         Ok(Self {
             flow,
             body,
@@ -149,7 +149,7 @@ impl Encoder {
             modes,
             limit,
             newmark,
-            stepper,
+            replica,
             mirror: rest.clone(),
             truth: rest,
             load: vec![0.0; modes],
@@ -218,13 +218,12 @@ impl Encoder {
 
     /// Takes the truth over as it is: the next frame begins a new run, and receivers need a [`Encoder::snapshot`].
     pub fn restart(&mut self, state: &TickState<'_>) {
-        self.mirror.fill_from([state.q, state.v, state.a, state.z]);
+        replica::fill(&mut self.mirror, [state.q, state.v, state.a, state.z]);
         if state.resting {
             self.mirror.v.fill(0.0);
             self.mirror.a.fill(0.0);
         }
-        self.truth.copy_from(&self.mirror);
-        self.stepper.restart();
+        self.truth.clone_from(&self.mirror);
         self.load.fill(0.0);
         self.unexplained.fill(0.0);
         self.loaded = false;
@@ -247,7 +246,8 @@ impl Encoder {
 
     /// Encodes the tick after the last one. The bytes have no datagram header yet.
     pub fn encode(&mut self, state: &TickState<'_>) -> Encoded {
-        let rotation = state.pose.map_or([0.0, 0.0, 0.0, 1.0], |p| p.rotation);
+        replica::place(&mut self.mirror, self.replica.model(), state.pose.as_ref());
+        self.truth.frame = self.mirror.frame;
         let forces = self.wish.payload == Payload::Forces;
         let grabs: Vec<FrameGrab> = state
             .grabs
@@ -255,7 +255,7 @@ impl Encoder {
             .map(|g| {
                 let radius = f64::from(g.radius as f32);
                 let displacement = if forces {
-                    self.stepper.displacement(&state.q[..self.modes.min(state.q.len())], g.vertex, radius)
+                    self.replica.displacement(&state.q[..self.modes.min(state.q.len())], g.vertex, radius)
                 } else {
                     [0.0; 3]
                 };
@@ -272,11 +272,11 @@ impl Encoder {
         let accelerations = match self.wish.payload {
             Payload::Accelerations(coding) => Some(self.step_accelerations(coding, state, unit)),
             Payload::Forces => {
-                self.step_forces(&grabs, state, rotation);
+                self.step_forces(&grabs, state);
                 None
             }
         };
-        self.truth.fill_from([state.q, state.v, state.a, state.z]);
+        replica::fill(&mut self.truth, [state.q, state.v, state.a, state.z]);
         let run = state.tick - self.started.unwrap_or(state.tick) - 1;
         let mut frame = Frame {
             body: self.body,
@@ -427,21 +427,23 @@ impl Encoder {
     }
 
     /// The mirror's step with the reactions as they cross, and the estimate of what they leave unexplained.
-    fn step_forces(&mut self, grabs: &[FrameGrab], state: &TickState<'_>, rotation: [f64; 4]) {
+    fn step_forces(&mut self, grabs: &[FrameGrab], state: &TickState<'_>) {
         if self.frames.is_multiple_of(LOAD_EVERY) {
             // From the truth of the tick before, as a receiver without error would step.
             let mut lacking = std::mem::take(&mut self.scratch);
             let to = [state.q, state.v];
-            self.stepper.lacking(&mut self.truth, to, grabs, rotation, &self.load, &mut lacking);
+            self.truth.f.clone_from(&self.mirror.f);
+            self.replica.lacking(&mut self.truth, to, grabs, &self.load, &mut lacking);
             let share = LOAD_EVERY as f64 / LOAD_TICKS;
             for ((told, load), lacking) in self.unexplained.iter_mut().zip(&self.load).zip(&lacking) {
                 *told += (load + lacking - *told) * share;
             }
             self.scratch = lacking;
         }
-        self.stepper.step(&mut self.mirror, grabs, rotation, &self.load);
+        self.replica.step_measured(&mut self.mirror, grabs, &self.load);
         if !self.loaded {
-            let static_part = |k: usize| self.unexplained[k].abs() / self.stepper.omega(k).powi(2).max(1e-12);
+            let omega = self.replica.kernel().omega();
+            let static_part = |k: usize| self.unexplained[k].abs() / omega[k].powi(2).max(1e-12);
             let largest = |x: &mut dyn Iterator<Item = f64>| x.fold(0.0_f64, f64::max);
             let load = largest(&mut (0..self.modes).map(static_part));
             let shape = largest(&mut state.q.iter().take(self.modes).map(|q| q.abs()));

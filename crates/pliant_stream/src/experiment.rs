@@ -8,7 +8,7 @@ mod shape_error;
 use std::sync::Arc;
 use std::time::Duration;
 
-use pliant_modal::{Body, BodyConfig, Integrator, ModalModel, Relaxation};
+use pliant_modal::{Body, BodyConfig, Integrator, ModalModel, Relaxation, StepSettings};
 
 use crate::StreamError;
 use crate::emulator::LinkConfig;
@@ -17,7 +17,6 @@ use crate::pair::{Pair, PathConfig};
 use crate::recovery::{RecoveryConfig, RepairCounts};
 use crate::session::{GuestConfig, HostConfig};
 use crate::state::BodyId;
-use crate::stepper::BodySetup;
 
 use run::Run;
 pub(crate) use shape_error::ShapeError;
@@ -242,9 +241,9 @@ impl Experiment {
             },
         )
         .map_err(model_error)?;
-        let setup =
-            BodySetup { integrator: self.integrator, relaxation: self.relaxation, ..Default::default() };
-        pair.host.add_body(BODY, "measured", self.model.clone(), setup)?;
+        let settings =
+            StepSettings { integrator: self.integrator, relaxation: self.relaxation, ..Default::default() };
+        pair.host.add_body(BODY, "measured", self.model.clone(), settings)?;
         let guest = GuestConfig { recovery: self.recovery, modes: self.modes, ..Default::default() };
         let perfect = LinkConfig { delay: self.down.delay, ..Default::default() };
         let path = PathConfig { down: perfect, up: self.up.clone(), max_datagram: 1200 };

@@ -3,13 +3,14 @@
 use std::collections::BTreeMap;
 use std::time::Duration;
 
+use pliant_modal::StepSettings;
+
 use crate::StreamError;
 use crate::emulator::{Link, LinkConfig, Loss};
 use crate::experiment::{BODY, Experiment, Figures, ShapeError, fold, norm};
 use crate::peer::{PeerConfig, PeerSession, Repair};
 use crate::session::Channel;
 use crate::state::{PeerId, Tick, UserId};
-use crate::stepper::BodySetup;
 
 /// How often a peer's application looks at its session.
 const LOOK: Duration = Duration::from_millis(5);
@@ -32,12 +33,12 @@ impl Experiment {
     /// [`StreamError::Config`] for settings out of range or a free body, [`StreamError::Model`].
     pub fn run_peers(&self, repair: Repair) -> Result<Figures, StreamError> {
         let h = 1.0 / self.rate;
-        let setup =
-            BodySetup { integrator: self.integrator, relaxation: self.relaxation, ..Default::default() };
+        let settings =
+            StepSettings { integrator: self.integrator, relaxation: self.relaxation, ..Default::default() };
         let peer = |number: u16| -> Result<PeerSession, StreamError> {
             let config = PeerConfig { user: UserId(number), step: h, repair, ..Default::default() };
             let mut peer = PeerSession::new(config)?;
-            peer.add_body(BODY, self.model.clone(), &setup)?;
+            peer.add_body(BODY, self.model.clone(), &settings)?;
             Ok(peer)
         };
         let mut peers = [peer(1)?, peer(2)?];

@@ -51,27 +51,26 @@ pub mod experiment;
 mod experiment_peers;
 pub mod newmark;
 pub mod pair;
-mod patch_rows;
 pub mod peer;
 pub mod playout;
 pub mod quanta;
 pub mod recovery;
-mod schur;
+mod replica;
 pub mod session;
+#[cfg(test)]
+mod side_by_side;
 mod state;
-pub mod stepper;
-mod table;
 pub mod wire;
 
 pub use error::StreamError;
 pub use newmark::Newmark;
+pub use pliant_modal::StepSettings;
 pub use recovery::{Playout, Policy, Predict, RecoveryConfig, RepairCounts};
 pub use session::{
     BodyView, Channel, EndReason, GuestConfig, GuestEvent, GuestSession, HostConfig, HostEvent, HostSession,
     LinkStats, MAX_MESSAGE, MIN_DATAGRAM, Output, OwnHand,
 };
 pub use state::{
-    BodyId, GrabKey, GrabState, MAGNITUDE_LIMIT, MAX_GRABS, MAX_MODES, ModalState, PeerId, Pose, TICK_LIMIT,
-    Tick, TickState, UserId,
+    BodyId, GrabKey, GrabState, MAGNITUDE_LIMIT, MAX_GRABS, MAX_MODES, PeerId, Pose, State, TICK_LIMIT, Tick,
+    TickState, UserId,
 };
-pub use stepper::BodySetup;

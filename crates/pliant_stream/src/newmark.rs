@@ -20,7 +20,7 @@
 use pliant_modal::Relaxation;
 
 use crate::StreamError;
-use crate::state::ModalState;
+use crate::state::State;
 
 /// A member of Newmark's family and its step.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -69,7 +69,7 @@ impl Newmark {
     }
 
     /// Steps all coordinates of a state to the new accelerations.
-    pub fn advance(&self, state: &mut ModalState, a_new: &[f64]) {
+    pub fn advance(&self, state: &mut State, a_new: &[f64]) {
         for (((q, v), a), &a_new) in state.q.iter_mut().zip(&mut state.v).zip(&mut state.a).zip(a_new) {
             (*q, *v) = self.step(*q, *v, *a, a_new);
             *a = a_new;
@@ -128,14 +128,14 @@ impl FlowFilter {
     }
 
     /// The first half of a step of all flows, before the coordinates go on: the old coordinates' part.
-    pub(crate) fn begin(&self, state: &mut ModalState) {
+    pub(crate) fn begin(&self, state: &mut State) {
         for (z, q) in state.z.iter_mut().zip(&state.q) {
             *z = self.step(*z, *q, 0.0);
         }
     }
 
     /// The second half: the new coordinates' part.
-    pub(crate) fn finish(&self, state: &mut ModalState) {
+    pub(crate) fn finish(&self, state: &mut State) {
         for (z, q) in state.z.iter_mut().zip(&state.q) {
             *z += self.by_new * q;
         }

@@ -3,6 +3,7 @@
 use std::fmt;
 
 use nalgebra::{Matrix3, Quaternion, UnitQuaternion, Vector3};
+pub use pliant_modal::State;
 use pliant_modal::{Body, Frame, ModalModel};
 
 /// A numbered step of the host. Ticks ascend by one per step of `h` seconds.
@@ -172,64 +173,6 @@ pub struct TickState<'a> {
     pub grabs: &'a [GrabState],
     /// The body sleeps: nothing is sent until this is false again, except a slow reminder.
     pub resting: bool,
-}
-
-/// Modal coordinates with their velocities and accelerations: one value a mode.
-#[derive(Debug, Clone, PartialEq, Default)]
-pub struct ModalState {
-    /// Modal coordinates, kg^1/2 m.
-    pub q: Vec<f64>,
-    /// Velocities.
-    pub v: Vec<f64>,
-    /// Accelerations.
-    pub a: Vec<f64>,
-    /// Flows of a body that relaxes, kg^1/2 m (see [`pliant_modal::Relaxation`]); empty for an elastic one.
-    pub z: Vec<f64>,
-}
-
-impl ModalState {
-    /// An elastic body at rest.
-    pub fn zero(modes: usize) -> Self {
-        Self { q: vec![0.0; modes], v: vec![0.0; modes], a: vec![0.0; modes], z: Vec::new() }
-    }
-
-    /// A body that relaxes, at rest and relaxed.
-    pub fn zero_relaxing(modes: usize) -> Self {
-        Self { z: vec![0.0; modes], ..Self::zero(modes) }
-    }
-
-    /// Takes over as many of another's numbers as there are; missing ones are 0. The sizes stay.
-    pub(crate) fn fill_from(&mut self, from: [&[f64]; 4]) {
-        let mine = [&mut self.q, &mut self.v, &mut self.a, &mut self.z];
-        for (mine, theirs) in mine.into_iter().zip(from) {
-            let count = mine.len().min(theirs.len());
-            mine[..count].copy_from_slice(&theirs[..count]);
-            mine[count..].fill(0.0);
-        }
-    }
-
-    /// The four kinds of numbers.
-    pub(crate) fn parts(&self) -> [&[f64]; 4] {
-        [&self.q, &self.v, &self.a, &self.z]
-    }
-
-    /// Number of modes.
-    pub fn modes(&self) -> usize {
-        self.q.len()
-    }
-
-    /// Copies another state of the same size over this one; no allocation when the sizes agree.
-    pub fn copy_from(&mut self, other: &Self) {
-        self.q.clone_from(&other.q);
-        self.v.clone_from(&other.v);
-        self.a.clone_from(&other.a);
-        self.z.clone_from(&other.z);
-    }
-
-    /// True when every number is finite.
-    pub fn is_finite(&self) -> bool {
-        self.parts().into_iter().flatten().all(|x| x.is_finite())
-    }
 }
 
 /// True when all are finite and at most [`MAGNITUDE_LIMIT`].

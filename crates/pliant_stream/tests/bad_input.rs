@@ -6,7 +6,7 @@ mod support;
 use std::sync::OnceLock;
 use std::time::Duration;
 
-use pliant_modal::ModalModel;
+use pliant_modal::{ModalModel, Relaxation};
 use pliant_stream::emulator::{Loss, Trace};
 use pliant_stream::peer::{
     HeldAt, InputTick, PeerBodyState, PeerDatagram, PeerFrame, PeerMessage, StateCheck,
@@ -19,8 +19,8 @@ use pliant_stream::wire::{
     Targets,
 };
 use pliant_stream::{
-    BodyId, BodySetup, Channel, EndReason, GuestConfig, GuestEvent, GuestSession, HostConfig, HostEvent,
-    HostSession, Newmark, PeerId, Pose, RecoveryConfig, StreamError, TickState,
+    BodyId, Channel, EndReason, GuestConfig, GuestEvent, GuestSession, HostConfig, HostEvent, HostSession,
+    Newmark, PeerId, Pose, RecoveryConfig, StepSettings, StreamError, TickState,
 };
 use proptest::prelude::*;
 use support::bar;
@@ -228,12 +228,11 @@ fn real_inputs() -> Vec<Vec<u8>> {
         name: "a body".into(),
         hash: [7; 32],
         modes: 9,
-        rho_inf: -1.0,
-        warp: true,
-        damping_scale: 1.0,
-        stiffness_scale: 1.0,
-        gravity: [0.0, 0.0, -9.81],
-        relaxation: Some((0.5, 0.4)),
+        settings: StepSettings {
+            gravity: [0.0, 0.0, -9.81],
+            relaxation: Some(Relaxation { ratio: 0.5, time: 0.4 }),
+            ..Default::default()
+        },
     };
     all.push(HostMessage::Snapshot(snapshot).encode());
     all.push(HostMessage::BodyAdded(info).encode());
@@ -404,7 +403,7 @@ fn a_guest_that_breaks_the_protocol_is_shown_out_with_a_reason() {
 fn a_host_that_sends_a_false_model_is_left() {
     let model = bar(12, 0.05);
     let mut host = HostSession::new(HostConfig::default()).unwrap();
-    host.add_body(BODY, "bar", model, BodySetup::default()).unwrap();
+    host.add_body(BODY, "bar", model, StepSettings::default()).unwrap();
     let mut guest = GuestSession::new(GuestConfig::default(), 1200).unwrap();
     let now = Duration::from_secs(1);
     host.connect(now, PeerId(1), 1200).unwrap();
@@ -452,13 +451,13 @@ fn another_version_is_told_so() {
 fn the_application_cannot_publish_nonsense() {
     let model = bar(12, 0.05);
     let mut host = HostSession::new(HostConfig::default()).unwrap();
-    host.add_body(BODY, "bar", model, BodySetup::default()).unwrap();
+    host.add_body(BODY, "bar", model, StepSettings::default()).unwrap();
     let good = vec![0.0; 12];
     let bad = vec![f64::NAN; 12];
     let long = vec![0.0; 13];
     let at = |tick, q: &[f64]| {
         let mut h = HostSession::new(HostConfig::default()).unwrap();
-        h.add_body(BODY, "bar", bar(12, 0.05), BodySetup::default()).unwrap();
+        h.add_body(BODY, "bar", bar(12, 0.05), StepSettings::default()).unwrap();
         let state = TickState { tick, q, v: &good, a: &good, z: &[], pose: None, grabs: &[], resting: false };
         h.publish(Duration::ZERO, BODY, &state)
     };

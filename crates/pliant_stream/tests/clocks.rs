@@ -9,8 +9,8 @@ use std::time::Duration;
 use pliant_modal::{Body, BodyConfig, GrabConfig, Patch};
 use pliant_stream::emulator::{Link, LinkConfig, Loss, Preset};
 use pliant_stream::{
-    BodyId, BodySetup, Channel, GrabKey, GrabState, GuestConfig, GuestSession, HostConfig, HostSession,
-    PeerId, TickState, UserId,
+    BodyId, Channel, GrabKey, GrabState, GuestConfig, GuestSession, HostConfig, HostSession, PeerId,
+    StepSettings, TickState, UserId,
 };
 use support::bar;
 
@@ -26,7 +26,7 @@ fn shown(
 ) -> (BTreeMap<u64, Vec<f64>>, BTreeMap<u64, Vec<f64>>, f64) {
     let model = bar(12, 0.05);
     let mut host = HostSession::new(HostConfig::default()).unwrap();
-    host.add_body(BODY, "bar", model.clone(), BodySetup::default()).unwrap();
+    host.add_body(BODY, "bar", model.clone(), StepSettings::default()).unwrap();
     let mut guest = GuestSession::new(GuestConfig::default(), 1200).unwrap();
     guest.add_cached_model(model.clone());
     host.connect(host_clock, GUEST, 1200).unwrap();

@@ -4,7 +4,7 @@
 use pliant_stream::quanta::Quanta;
 use pliant_stream::recovery::{AccelerationDriven, History, Recovery};
 use pliant_stream::wire::{Accelerations, Frame};
-use pliant_stream::{BodyId, ModalState, Newmark, Predict};
+use pliant_stream::{BodyId, Newmark, Predict, State};
 
 fn frame(tick: u64, a: &[f64]) -> Frame {
     Frame {
@@ -75,7 +75,7 @@ fn every_late_acceleration_takes_its_error_out_exactly() {
             for (beta, gamma) in PAIRS {
                 let newmark = Newmark { h: 0.025, beta, gamma };
                 let truth = |n: u64| [(n as f64 * 0.11).sin(), 40.0 * (n as f64 * 0.53).cos()];
-                let mut whole = ModalState::zero(2);
+                let mut whole = State::zero(2, false);
                 let mut history = History::new(0);
                 let mut receiver = AccelerationDriven::new(newmark, predict, true, 2);
                 let mut drifting = AccelerationDriven::new(newmark, predict, false, 2);

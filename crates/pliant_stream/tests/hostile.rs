@@ -8,7 +8,7 @@ use std::time::Duration;
 use pliant_stream::peer::{PeerConfig, PeerDatagram, PeerEvent, PeerSession};
 use pliant_stream::wire::{BodyInfo, GuestMessage, HostMessage};
 use pliant_stream::{
-    BodySetup, Channel, EndReason, GuestConfig, GuestEvent, GuestSession, HostSession, Newmark, PeerId,
+    Channel, EndReason, GuestConfig, GuestEvent, GuestSession, HostSession, Newmark, PeerId, StepSettings,
     StreamError,
 };
 use support::bar;
@@ -24,12 +24,7 @@ fn a_host_cannot_make_a_guest_hold_more_than_its_bound() {
         name: "a body".into(),
         hash,
         modes: 9,
-        rho_inf: -1.0,
-        warp: true,
-        damping_scale: 1.0,
-        stiffness_scale: 1.0,
-        gravity: [0.0; 3],
-        relaxation: None,
+        settings: StepSettings::default(),
     };
     let chunk = |hash, total, bytes: &[u8]| {
         HostMessage::ModelChunk { hash, offset: 0, total, bytes: bytes.to_vec() }.encode()
@@ -62,7 +57,7 @@ fn hands_that_are_not_numbers_are_refused_and_the_old_target_stays() {
     let (_, mut guest, now) = session("default");
     let grab = guest.grabs().next().unwrap().0;
     let mut peer = PeerSession::new(PeerConfig::default()).unwrap();
-    peer.add_body(BODY, bar(12, 0.05), &BodySetup::default()).unwrap();
+    peer.add_body(BODY, bar(12, 0.05), &StepSettings::default()).unwrap();
     let own = peer.begin_grab(BODY, 66, 0.05, [1.0, 0.0, 0.0]).unwrap();
     for bad in [f64::NAN, f64::INFINITY, -1e300] {
         let refused = Err(StreamError::NotFinite { what: "target" });

@@ -7,8 +7,8 @@ use std::time::Duration;
 
 use pliant_modal::ModalModel;
 use pliant_stream::{
-    BodyId, BodySetup, Channel, GuestConfig, GuestEvent, GuestSession, HostConfig, HostEvent, HostSession,
-    PeerId, TickState, UserId,
+    BodyId, Channel, GuestConfig, GuestEvent, GuestSession, HostConfig, HostEvent, HostSession, PeerId,
+    StepSettings, TickState, UserId,
 };
 use support::bar;
 
@@ -29,7 +29,7 @@ impl Room {
         let mut host = HostSession::new(config).unwrap();
         let model = bar(8, 0.05);
         let modes = model.mode_count();
-        host.add_body(BODY, "bar", model, BodySetup::default()).unwrap();
+        host.add_body(BODY, "bar", model, StepSettings::default()).unwrap();
         Self { host, guests: Vec::new(), now: Duration::ZERO, tick: 0, modes }
     }
 

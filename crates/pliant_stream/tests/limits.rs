@@ -8,7 +8,7 @@ use pliant_stream::quanta::Quanta;
 use pliant_stream::recovery::History;
 use pliant_stream::wire::Datagram;
 use pliant_stream::{
-    BodyId, BodySetup, GrabKey, GrabState, Newmark, Pose, RecoveryConfig, TickState, UserId,
+    BodyId, GrabKey, GrabState, Newmark, Pose, RecoveryConfig, StepSettings, TickState, UserId,
 };
 use support::bar;
 
@@ -27,12 +27,13 @@ fn hands(count: u16) -> Vec<GrabState> {
 
 #[test]
 fn no_frame_is_longer_than_the_path_carries_and_none_of_its_hands_is_lost() {
-    let (model, setup) = (bar(500, 0.05), BodySetup::default());
+    let (model, settings) = (bar(500, 0.05), StepSettings::default());
     let newmark = Newmark { h: H, beta: 4.0 / 9.0, gamma: 5.0 / 6.0 };
     for name in ["default", "paper", "paper-repeats", "force-driven"] {
         for limit in [256, 400, 1200] {
             let wish = RecoveryConfig::by_name(name).unwrap().wish(None);
-            let mut encoder = Encoder::new(BodyId(1), model.clone(), &setup, newmark, wish, limit).unwrap();
+            let mut encoder =
+                Encoder::new(BodyId(1), model.clone(), &settings, newmark, wish, limit).unwrap();
             let modes = encoder.modes();
             if name == "default" || limit == 1200 {
                 assert_eq!(modes, 500, "{name} at {limit} bytes");
@@ -84,10 +85,10 @@ fn no_frame_is_longer_than_the_path_carries_and_none_of_its_hands_is_lost() {
 
 #[test]
 fn a_tick_whose_part_is_missing_is_not_known() {
-    let (model, setup) = (bar(20, 0.05), BodySetup::default());
+    let (model, settings) = (bar(20, 0.05), StepSettings::default());
     let newmark = Newmark { h: H, beta: 4.0 / 9.0, gamma: 5.0 / 6.0 };
     let wish = RecoveryConfig::default().wish(None);
-    let mut encoder = Encoder::new(BodyId(1), model.clone(), &setup, newmark, wish, 400).unwrap();
+    let mut encoder = Encoder::new(BodyId(1), model.clone(), &settings, newmark, wish, 400).unwrap();
     let quanta = Quanta::new(&model, 20, &newmark);
     let (q, grabs) = ([0.01; 20], hands(20));
     let state =
@@ -116,8 +117,8 @@ fn a_step_moves_the_surface_alike_in_every_mode() {
     let model = bar(60, 0.05);
     let newmark = Newmark { h: H, beta: 4.0 / 9.0, gamma: 5.0 / 6.0 };
     let wish = RecoveryConfig::default().wish(None);
-    let setup = BodySetup::default();
-    let mut encoder = Encoder::new(BodyId(1), model.clone(), &setup, newmark, wish, 1200).unwrap();
+    let settings = StepSettings::default();
+    let mut encoder = Encoder::new(BodyId(1), model.clone(), &settings, newmark, wish, 1200).unwrap();
     let q: Vec<f64> = (0..60).map(|k| 0.21 / (1.0 + f64::from(k)).powi(2)).collect();
     let v = vec![0.0; 60];
     let state =

@@ -328,7 +328,7 @@ fn cost_of_a_tick() {
     use pliant_stream::encoder::Encoder;
     use pliant_stream::recovery::Receiver;
     use pliant_stream::wire::Datagram;
-    use pliant_stream::{BodyId, BodySetup, GrabKey, GrabState, TickState, UserId};
+    use pliant_stream::{BodyId, GrabKey, GrabState, StepSettings, TickState, UserId};
     let model = body();
     let h = 0.025;
     let newmark = Newmark { h, beta: 4.0 / 9.0, gamma: 5.0 / 6.0 };
@@ -344,9 +344,9 @@ fn cost_of_a_tick() {
                 (id, truth.grab_position(id).unwrap())
             })
             .collect();
-        let (id, setup) = (BodyId(1), BodySetup::default());
+        let (id, settings) = (BodyId(1), StepSettings::default());
         let mut encoder =
-            Encoder::new(id, model.clone(), &setup, newmark, recovery.wish(None), 1200).unwrap();
+            Encoder::new(id, model.clone(), &settings, newmark, recovery.wish(None), 1200).unwrap();
         let mut receiver: Option<Receiver> = None;
         let (mut encode, mut decode) = (Vec::new(), Vec::new());
         let mut chance = 88_172_645_463_325_252;
@@ -377,8 +377,9 @@ fn cost_of_a_tick() {
                 encoder.restart(&state);
                 let snapshot = encoder.snapshot(false);
                 let modes = encoder.modes();
-                receiver =
-                    Some(Receiver::new(model.clone(), setup, modes, newmark, &recovery, &snapshot).unwrap());
+                receiver = Some(
+                    Receiver::new(model.clone(), settings, modes, newmark, &recovery, &snapshot).unwrap(),
+                );
                 continue;
             }
             let receiver = receiver.as_mut().unwrap();

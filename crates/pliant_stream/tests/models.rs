@@ -8,7 +8,7 @@ use std::time::Duration;
 
 use pliant_modal::ModalModel;
 use pliant_stream::{
-    BodyId, BodySetup, Channel, GuestConfig, GuestEvent, GuestSession, HostConfig, HostSession, PeerId,
+    BodyId, Channel, GuestConfig, GuestEvent, GuestSession, HostConfig, HostSession, PeerId, StepSettings,
     StreamError, TickState,
 };
 use support::bar;
@@ -33,7 +33,7 @@ fn host(config: HostConfig, guests: u64) -> (HostSession, u64) {
     // They say nothing more while they wait, and are not let go for it.
     let idle_timeout = Duration::from_secs(1000);
     let mut host = HostSession::new(HostConfig { idle_timeout, ..config }).unwrap();
-    host.add_body(BodyId(1), "bar", model, BodySetup::default()).unwrap();
+    host.add_body(BodyId(1), "bar", model, StepSettings::default()).unwrap();
     let words = hello();
     for peer in 1..=guests {
         host.connect(Duration::ZERO, PeerId(peer), 1200).unwrap();
@@ -142,7 +142,7 @@ fn a_model_may_be_read_by_the_caller_and_another_one_ends_the_session() {
         let model = bar(8, 0.05);
         let mut host = HostSession::new(HostConfig::default()).unwrap();
         let file = model.to_bytes().into();
-        host.add_body_as(BODY, "bar", model.clone(), file, BodySetup::default()).unwrap();
+        host.add_body_as(BODY, "bar", model.clone(), file, StepSettings::default()).unwrap();
         host.connect(Duration::ZERO, PeerId(1), 1200).unwrap();
         let mut guest =
             GuestSession::new(GuestConfig { models_apart: true, ..Default::default() }, 1200).unwrap();

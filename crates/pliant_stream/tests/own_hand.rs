@@ -8,7 +8,7 @@ use std::time::Duration;
 use pliant_stream::emulator::{LinkConfig, Preset};
 use pliant_stream::pair::{Pair, PathConfig, World};
 use pliant_stream::{
-    BodySetup, GuestConfig, GuestEvent, GuestSession, HostConfig, HostEvent, HostSession, Pose,
+    GuestConfig, GuestEvent, GuestSession, HostConfig, HostEvent, HostSession, Pose, StepSettings,
 };
 use support::scene::{BODY, S, Scene, cached, circling, start};
 use support::{bar, loose_bar};
@@ -104,9 +104,9 @@ fn own_hand_does_not_wait_for_the_round_trip() {
 fn own_hand_on_a_free_body_takes_its_frame_along() {
     // A free body falls slowly and is dragged: the copy's frame against the host's of the same ticks later.
     let model = loose_bar(24, 0.05);
-    let setup = BodySetup { gravity: [0.0, 0.0, -0.3], ..Default::default() };
+    let settings = StepSettings { gravity: [0.0, 0.0, -0.3], ..Default::default() };
     let mut pair = Pair::new(HostConfig::default()).unwrap();
-    pair.host.add_body(BODY, "bar", model.clone(), setup).unwrap();
+    pair.host.add_body(BODY, "bar", model.clone(), settings).unwrap();
     struct Watch(Scene, Vec<(u64, Pose)>, Vec<(u64, Pose)>);
     impl World for Watch {
         fn step(&mut self, now: Duration, tick: u64, host: &mut HostSession) {
@@ -123,7 +123,7 @@ fn own_hand_on_a_free_body_takes_its_frame_along() {
             self.1.push((own.tick(), own.pose().expect("a free body has a frame")));
         }
     }
-    let mut watch = Watch(Scene::with(&model, &setup), Vec::new(), Vec::new());
+    let mut watch = Watch(Scene::with(&model, &settings), Vec::new(), Vec::new());
     watch.0.hand = circling();
     let path = PathConfig::symmetric(LinkConfig::preset(Preset::Paper2));
     pair.join_with(GuestConfig::default(), path, 3, cached(&model)).unwrap();

@@ -12,7 +12,7 @@ use pliant_stream::peer::{
     HeldAt, InputTick, PeerBodyState, PeerConfig, PeerDatagram, PeerEvent, PeerMessage, PeerSession, Repair,
     StateCheck,
 };
-use pliant_stream::{BodyId, BodySetup, Channel, EndReason, PeerId, UserId};
+use pliant_stream::{BodyId, Channel, EndReason, PeerId, StepSettings, UserId};
 use proptest::prelude::*;
 use support::{bar, loose_bar};
 
@@ -33,7 +33,7 @@ struct Mesh {
     /// Peer, tick, shown.
     seen: Vec<(usize, u64, Vec<f64>)>,
     model: Arc<ModalModel>,
-    setup: BodySetup,
+    settings: StepSettings,
 }
 
 impl Mesh {
@@ -58,7 +58,7 @@ impl Mesh {
             grabs: vec![None; count],
             seen: Vec::new(),
             model: bar(40, 0.05),
-            setup: BodySetup::default(),
+            settings: StepSettings::default(),
         }
     }
 
@@ -66,7 +66,7 @@ impl Mesh {
         let user = UserId(k as u16 + 1);
         let config = PeerConfig { user, repair, founds, ..Default::default() };
         let mut peer = PeerSession::new(config).unwrap();
-        peer.add_body(BODY, self.model.clone(), &self.setup).unwrap();
+        peer.add_body(BODY, self.model.clone(), &self.settings).unwrap();
         for other in 0..self.peers.len() {
             if let Some(o) = &mut self.peers[other] {
                 o.connect(self.began[other] + self.now, PeerId(k as u64), user, 1200).unwrap();
@@ -207,24 +207,26 @@ fn rollback_is_nearer_than_the_papers_compensation() {
 
 #[test]
 fn free_and_relaxing_bodies_agree_to_the_bit_and_late_joiners_with_them() {
-    let setup = BodySetup {
+    let settings = StepSettings {
         integrator: Integrator::GeneralizedAlpha { rho_inf: 0.5 },
         gravity: [0.0, 0.0, -0.4],
         relaxation: Some(Relaxation { ratio: 0.5, time: 0.4 }),
         ..Default::default()
     };
-    for (free, setup) in [(true, BodySetup { relaxation: None, ..setup }), (false, setup), (true, setup)] {
+    for (free, settings) in
+        [(true, StepSettings { relaxation: None, ..settings }), (false, settings), (true, settings)]
+    {
         let mut mesh = Mesh::new(3, &LinkConfig::preset(Preset::Paper2), 11);
-        mesh.setup = setup;
+        mesh.settings = settings;
         mesh.model = if free { loose_bar(24, 0.05) } else { bar(24, 0.05) };
         mesh.start(0, Repair::Rollback, true);
         mesh.start(1, Repair::Rollback, true);
         mesh.run(6 * S);
         mesh.start(2, Repair::Rollback, false);
         mesh.run(14 * S);
-        assert_eq!(mesh.agree(0, 1), 0.0, "free {free}, {setup:?}");
+        assert_eq!(mesh.agree(0, 1), 0.0, "free {free}, {settings:?}");
         // The orientation is normalised as it arrives: the last bit of what follows from it may differ.
-        assert!(mesh.agree(0, 2) < 1e-9, "free {free}, {setup:?}: {}", mesh.agree(0, 2));
+        assert!(mesh.agree(0, 2) < 1e-9, "free {free}, {settings:?}: {}", mesh.agree(0, 2));
         let all: Vec<&PeerSession> = mesh.peers.iter().flatten().collect();
         let tick = all.iter().map(|p| p.confirmed()).min().unwrap();
         let state = |k: usize| all[k].state_at(BODY, tick).unwrap();
@@ -236,7 +238,7 @@ fn free_and_relaxing_bodies_agree_to_the_bit_and_late_joiners_with_them() {
         if let (Some(a), Some(b)) = (pose(0), pose(2)) {
             assert!((0..3).all(|k| (a.position[k] - b.position[k]).abs() < 1e-9), "{a:?} and {b:?}");
         }
-        assert_eq!(state(0).z.is_empty(), setup.relaxation.is_none());
+        assert_eq!(state(0).z.is_empty(), settings.relaxation.is_none());
         if let Some(pose) = pose(0) {
             let moved = (0..3).map(|k| pose.position[k].powi(2)).sum::<f64>().sqrt();
             assert!(moved > 0.01, "the hands must have moved the frame: {moved} m");
@@ -252,7 +254,7 @@ fn free_and_relaxing_bodies_agree_to_the_bit_and_late_joiners_with_them() {
 #[test]
 fn compensation_keeps_a_free_relaxing_body_together() {
     let mut mesh = Mesh::new(2, &LinkConfig::preset(Preset::Paper3), 11);
-    mesh.setup.relaxation = Some(Relaxation { ratio: 0.5, time: 0.4 });
+    mesh.settings.relaxation = Some(Relaxation { ratio: 0.5, time: 0.4 });
     mesh.model = loose_bar(24, 0.05);
     mesh.start(0, Repair::Compensate, true);
     mesh.start(1, Repair::Compensate, true);
@@ -440,7 +442,7 @@ fn a_peer_under_another_number_than_the_one_it_was_given_is_turned_away() {
     for claimed in [0, 1, 3, 9] {
         let config = PeerConfig { user: UserId(3), ..Default::default() };
         let mut p = PeerSession::new(config).unwrap();
-        p.add_body(BODY, bar(4, 0.05), &BodySetup::default()).unwrap();
+        p.add_body(BODY, bar(4, 0.05), &StepSettings::default()).unwrap();
         p.connect(Duration::ZERO, PeerId(7), UserId(8), 1200).unwrap();
         let hello = |user| PeerMessage::Hello { version: 1, user, name: "other".into(), joining: false };
         p.on_message(MS, PeerId(7), &hello(claimed).encode());
@@ -460,7 +462,7 @@ fn a_peer_under_another_number_than_the_one_it_was_given_is_turned_away() {
 #[test]
 fn a_peer_that_never_says_hello_is_told_of_when_it_goes() {
     let mut p = PeerSession::new(PeerConfig::default()).unwrap();
-    p.add_body(BODY, bar(4, 0.05), &BodySetup::default()).unwrap();
+    p.add_body(BODY, bar(4, 0.05), &StepSettings::default()).unwrap();
     assert!(p.connect(Duration::ZERO, PeerId(7), UserId::HOST, 1200).is_err());
     assert!(p.connect(Duration::ZERO, PeerId(7), UserId(1), 1200).is_err(), "our own");
     p.connect(Duration::ZERO, PeerId(7), UserId(2), 1200).unwrap();
@@ -474,7 +476,7 @@ fn a_peer_that_never_says_hello_is_told_of_when_it_goes() {
 #[test]
 fn what_nobody_fetches_does_not_grow_for_ever() {
     let mut p = PeerSession::new(PeerConfig { idle_timeout: 100_000 * S, ..Default::default() }).unwrap();
-    p.add_body(BODY, bar(4, 0.05), &BodySetup::default()).unwrap();
+    p.add_body(BODY, bar(4, 0.05), &StepSettings::default()).unwrap();
     p.connect(Duration::ZERO, PeerId(7), UserId(2), 1200).unwrap();
     for k in 1..=20_000_u32 {
         p.update(k * 25 * MS);

@@ -13,8 +13,8 @@ use pliant_stream::peer::Repair;
 use pliant_stream::recovery::Receiver;
 use pliant_stream::wire::Datagram;
 use pliant_stream::{
-    BodyId, BodySetup, GrabKey, GrabState, GuestConfig, HostConfig, ModalState, Newmark, Policy,
-    RecoveryConfig, TickState, UserId,
+    BodyId, GrabKey, GrabState, GuestConfig, HostConfig, Newmark, Policy, RecoveryConfig, State,
+    StepSettings, TickState, UserId,
 };
 use support::bar;
 use support::scene::{BODY, S, Scene, cached, circling, paper1};
@@ -79,7 +79,7 @@ fn peers_step_a_relaxing_body_together() {
 fn wrong_flow(recovery: &RecoveryConfig, ticks: u64) -> Vec<(f64, f64)> {
     let model = bar(24, 0.05);
     let integrator = integrator_for(recovery);
-    let setup = BodySetup { integrator, relaxation: Some(MATERIAL), ..Default::default() };
+    let settings = StepSettings { integrator, relaxation: Some(MATERIAL), ..Default::default() };
     let config = BodyConfig { step: H, integrator, relaxation: Some(MATERIAL), ..Default::default() };
     let mut truth = Body::new(model.clone(), config).unwrap();
     let patch = Patch::around(model.surface(), 66, 0.05).unwrap();
@@ -88,7 +88,7 @@ fn wrong_flow(recovery: &RecoveryConfig, ticks: u64) -> Vec<(f64, f64)> {
     let (beta, gamma) = integrator.newmark().unwrap_or((4.0 / 9.0, 5.0 / 6.0));
     let newmark = Newmark { h: H, beta, gamma };
     let mut encoder =
-        Encoder::new(BodyId(1), model.clone(), &setup, newmark, recovery.wish(None), 1200).unwrap();
+        Encoder::new(BodyId(1), model.clone(), &settings, newmark, recovery.wish(None), 1200).unwrap();
     let mut receiver: Option<Receiver> = None;
     let mut errors = Vec::new();
     for tick in 1..=200 + ticks {
@@ -114,7 +114,8 @@ fn wrong_flow(recovery: &RecoveryConfig, ticks: u64) -> Vec<(f64, f64)> {
             let mut snapshot = encoder.snapshot(false);
             assert_eq!(snapshot.z.len(), 24, "a snapshot carries the flow");
             snapshot.z.fill(0.0);
-            receiver = Some(Receiver::new(model.clone(), setup, 24, newmark, recovery, &snapshot).unwrap());
+            receiver =
+                Some(Receiver::new(model.clone(), settings, 24, newmark, recovery, &snapshot).unwrap());
             continue;
         };
         let mut bytes = vec![1, 0, 0];
@@ -122,7 +123,7 @@ fn wrong_flow(recovery: &RecoveryConfig, ticks: u64) -> Vec<(f64, f64)> {
         let Datagram::Frame(frame) = Datagram::decode(&bytes).unwrap().1 else { unreachable!() };
         receiver.accept(&frame);
         receiver.advance();
-        let distance = |of: fn(&ModalState) -> &Vec<f64>, truth: &[f64]| {
+        let distance = |of: fn(&State) -> &Vec<f64>, truth: &[f64]| {
             let size = truth.iter().map(|x| x * x).sum::<f64>().sqrt();
             of(receiver.hidden()).iter().zip(truth).map(|(a, b)| (a - b).powi(2)).sum::<f64>().sqrt() / size
         };
@@ -150,10 +151,10 @@ fn a_wrong_flow_is_forgotten_by_every_policy_and_put_right_by_slices() {
 #[test]
 fn a_guest_joins_follows_rests_and_feels_a_relaxing_body() {
     let model = bar(40, 0.05);
-    let setup = BodySetup { relaxation: Some(MATERIAL), ..Default::default() };
+    let settings = StepSettings { relaxation: Some(MATERIAL), ..Default::default() };
     let mut pair = pliant_stream::pair::Pair::new(HostConfig::default()).unwrap();
-    pair.host.add_body(BODY, "bar", model.clone(), setup).unwrap();
-    let mut scene = Scene::with(&model, &setup);
+    pair.host.add_body(BODY, "bar", model.clone(), settings).unwrap();
+    let mut scene = Scene::with(&model, &settings);
     scene.hand = circling();
     pair.join_with(GuestConfig::default(), paper1(), 1, cached(&model)).unwrap();
     pair.run_until(8 * S, &mut scene);

@@ -9,8 +9,8 @@ use pliant_modal::{Body, BodyConfig};
 use pliant_stream::emulator::LinkConfig;
 use pliant_stream::pair::{Pair, PathConfig, World};
 use pliant_stream::{
-    BodyId, BodySetup, EndReason, GuestConfig, GuestEvent, GuestSession, HostConfig, HostEvent, HostSession,
-    PeerId, UserId,
+    BodyId, EndReason, GuestConfig, GuestEvent, GuestSession, HostConfig, HostEvent, HostSession, PeerId,
+    StepSettings, UserId,
 };
 use support::bar;
 use support::scene::{BODY, MS, S, Scene, cached, circling, paper1, start, start_with};
@@ -59,7 +59,7 @@ fn goodbyes_and_bodies_that_go() {
     pair.join_with(GuestConfig::default(), paper1(), 1, cached(&model)).unwrap();
     pair.run_until(3 * S, &mut scene);
     let second = BodyId(9);
-    pair.host.add_body(second, "other", model.clone(), BodySetup::default()).unwrap();
+    pair.host.add_body(second, "other", model.clone(), StepSettings::default()).unwrap();
     pair.run_until(4 * S, &mut scene);
     assert!(scene.saw(0, |e| matches!(e, GuestEvent::BodyAnnounced { body: BodyId(9), .. })));
     pair.host.remove_body(second);
@@ -95,7 +95,7 @@ fn a_closed_house_asks_before_it_lets_in() {
     }
     let model = bar(20, 0.05);
     let mut pair = Pair::new(HostConfig { open: false, ..Default::default() }).unwrap();
-    pair.host.add_body(BODY, "bar", model.clone(), BodySetup::default()).unwrap();
+    pair.host.add_body(BODY, "bar", model.clone(), StepSettings::default()).unwrap();
     let mut door = Door(Scene::new(&model), true);
     for (seed, token) in [(1, &b"sesame"[..]), (2, b"wrong")] {
         let config = GuestConfig { token: token.to_vec(), ..Default::default() };
@@ -132,11 +132,11 @@ fn a_body_that_goes_while_its_model_is_on_the_way_harms_nobody() {
     pair.join(GuestConfig::default(), paper1(), 1).unwrap();
     pair.run_until(3 * S, &mut scene);
     let second = BodyId(9);
-    pair.host.add_body(second, "brief", model.clone(), BodySetup::default()).unwrap();
+    pair.host.add_body(second, "brief", model.clone(), StepSettings::default()).unwrap();
     pair.run_until(4 * S, &mut scene);
     pair.host.remove_body(second);
     pair.run_until(5 * S, &mut scene);
-    pair.host.add_body(second, "again", model, BodySetup::default()).unwrap();
+    pair.host.add_body(second, "again", model, StepSettings::default()).unwrap();
     pair.run_until(40 * S, &mut scene);
     assert!(!pair.guests[0].session.is_closed());
     assert!(pair.guests[0].session.body(second).unwrap().model().is_some(), "the model came after all");

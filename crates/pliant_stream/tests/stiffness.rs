@@ -4,7 +4,7 @@
 mod support;
 
 use pliant_modal::BodyConfig;
-use pliant_stream::{BodySetup, GuestConfig, GuestEvent, HostConfig};
+use pliant_stream::{GuestConfig, GuestEvent, HostConfig, StepSettings};
 use support::bar;
 use support::scene::{BODY, S, Scene, cached, circling, paper1};
 
@@ -12,26 +12,26 @@ use support::scene::{BODY, S, Scene, cached, circling, paper1};
 fn after_a_change(told: bool, scale: f64) -> f64 {
     let model = bar(24, 0.05);
     let mut pair = pliant_stream::pair::Pair::new(HostConfig::default()).unwrap();
-    let setup = BodySetup::default();
-    pair.host.add_body(BODY, "bar", model.clone(), setup).unwrap();
-    let mut scene = Scene::with(&model, &setup);
+    let settings = StepSettings::default();
+    pair.host.add_body(BODY, "bar", model.clone(), settings).unwrap();
+    let mut scene = Scene::with(&model, &settings);
     scene.hand = circling();
     pair.join_with(GuestConfig::default(), paper1(), 1, cached(&model)).unwrap();
     pair.run_until(5 * S, &mut scene);
-    let stiff = BodySetup { stiffness_scale: scale, ..setup };
+    let stiff = StepSettings { stiffness_scale: scale, ..settings };
     let config = BodyConfig { stiffness_scale: scale, ..scene.body.config().clone() };
     scene.body.reconfigure(config).unwrap();
     if told {
-        pair.host.set_setup(BODY, stiff).unwrap();
+        pair.host.set_settings(BODY, stiff).unwrap();
         // Once more is nothing new.
-        pair.host.set_setup(BODY, stiff).unwrap();
+        pair.host.set_settings(BODY, stiff).unwrap();
     }
     scene.settled = 6 * S;
     pair.run_until(12 * S, &mut scene);
     let changes = scene.guest_events.iter().filter(|e| matches!(e.1, GuestEvent::BodyChanged { body: BODY }));
     assert_eq!(changes.count(), usize::from(told), "told once");
     let view = pair.guests[0].session.body(BODY).unwrap();
-    assert_eq!(view.info().setup().stiffness_scale, if told { scale } else { 1.0 });
+    assert_eq!(view.info().settings.stiffness_scale, if told { scale } else { 1.0 });
     assert!(view.own_hand().is_some(), "the guest's hand is still on it");
     assert_eq!(scene.grabs.len(), 1, "at the host too");
     assert!(!scene.saw(0, |e| matches!(e, GuestEvent::BodyGone { .. })));
@@ -50,10 +50,10 @@ fn guests_follow_a_body_that_becomes_stiffer_or_softer_with_their_hands_on_it() 
 }
 
 #[test]
-fn a_setup_of_another_body_under_a_known_number_ends_the_session() {
+fn settings_of_another_body_under_a_known_number_ends_the_session() {
     let model = bar(12, 0.05);
     let mut pair = pliant_stream::pair::Pair::new(HostConfig::default()).unwrap();
-    pair.host.add_body(BODY, "bar", model.clone(), BodySetup::default()).unwrap();
+    pair.host.add_body(BODY, "bar", model.clone(), StepSettings::default()).unwrap();
     let mut scene = Scene::new(&model);
     pair.join_with(GuestConfig::default(), paper1(), 1, cached(&model)).unwrap();
     pair.run_until(2 * S, &mut scene);

@@ -173,10 +173,8 @@ impl Kernel {
 
     /// A state of the body at rest, in its model's own place.
     pub fn at_rest(&self) -> State {
-        let zero = vec![0.0; self.modes.count()];
-        let z = if self.modes.is_viscous() { zero.clone() } else { Vec::new() };
         let frame = Frame::at_rest(&self.model);
-        State { q: zero.clone(), v: zero.clone(), a: zero.clone(), f: zero, z, frame }
+        State { frame, ..State::zero(self.modes.count(), self.modes.is_viscous()) }
     }
 
     /// Whether a state has as many numbers as this kernel steps, all of them finite.
@@ -259,15 +257,24 @@ impl Kernel {
         Err(StepError::Diverged { what })
     }
 
+    /// Modal force of gravity, kg^1/2 m/s^2; nothing where there is none on the modes.
+    pub(crate) fn weight(&self, frame: &Frame) -> impl Iterator<Item = f64> + use<'_> {
+        let gravity = Vector3::from(self.settings.gravity);
+        let weighs = !self.model.is_free() && gravity != Vector3::zeros();
+        let local = frame.rotation().inverse() * gravity;
+        let participation = self.model.participation();
+        let participation = if weighs { participation } else { &[] };
+        participation.iter().map(move |p| local.dot(&Vector3::from(*p)))
+    }
+
     fn advance(&mut self, state: &mut State, hands: &mut [Hand], load: &Load<'_>) -> StepReport {
         let gravity = Vector3::from(self.settings.gravity);
-        self.force.fill(0.0);
-        if !self.model.is_free() && gravity != Vector3::zeros() {
-            let local = state.frame.rotation().inverse() * gravity;
-            for (f, participation) in self.force.iter_mut().zip(self.model.participation()) {
-                *f = local.dot(&Vector3::from(*participation));
-            }
+        let mut force = std::mem::take(&mut self.force);
+        force.fill(0.0);
+        for (f, weight) in force.iter_mut().zip(self.weight(&state.frame)) {
+            *f = weight;
         }
+        self.force = force;
         for (f, load) in self.force.iter_mut().zip(load.modal) {
             *f += load;
         }

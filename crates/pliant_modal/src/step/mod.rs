@@ -1,6 +1,7 @@
 //! The step of a body: one kernel for bodies, guests, predictions, peers and devices.
 
 mod constraint;
+mod implied;
 mod kernel;
 mod modes;
 mod patch;
@@ -11,6 +12,7 @@ mod solve;
 mod state;
 
 pub use constraint::{GrabConfig, Hand, Hold};
+pub use implied::ImpliedPulls;
 pub use kernel::{Kernel, Load, StepReport};
 pub use patch::HeldPatch;
 pub use rigid::{Frame, RigidMotion};

@@ -35,9 +35,9 @@ fn dot(row: &[f64], x: &[f64]) -> f64 {
 
 /// Three rows at once: the loads of `x` are shared and the sums do not wait for each other.
 fn dot3(rows: [&[f64]; 3], x: &[f64]) -> [f64; 3] {
-    let n = x.len();
+    let n = x.len().min(rows[0].len());
     let rows = rows.map(|r| r[..n].as_chunks::<LANES>());
-    let (x, tail) = x.as_chunks::<LANES>();
+    let (x, tail) = x[..n].as_chunks::<LANES>();
     let mut sums = [[0.0; LANES]; 3];
     for (((a, b), c), x) in rows[0].0.iter().zip(rows[1].0).zip(rows[2].0).zip(x) {
         for k in 0..LANES {

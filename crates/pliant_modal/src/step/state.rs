@@ -22,6 +22,23 @@ pub struct State {
 }
 
 impl State {
+    /// All zero, in the default frame. A `viscous` material has a `z`.
+    pub fn zero(modes: usize, viscous: bool) -> Self {
+        let zero = vec![0.0; modes];
+        let z = if viscous { zero.clone() } else { Vec::new() };
+        Self { q: zero.clone(), v: zero.clone(), a: zero.clone(), f: zero, z, frame: Frame::default() }
+    }
+
+    /// Number of modes.
+    pub fn modes(&self) -> usize {
+        self.q.len()
+    }
+
+    /// Whether every number is finite.
+    pub fn is_finite(&self) -> bool {
+        self.non_finite().is_none()
+    }
+
     /// Beyond this, kg^1/2 m and its like, squares of coordinates and velocities may overflow in a step.
     const MOST: f64 = 1e100;
 

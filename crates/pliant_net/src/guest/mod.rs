@@ -16,7 +16,7 @@ use bevy::prelude::*;
 use bevy::tasks::Task;
 use pliant_modal::ModalModel;
 use pliant_stream::{
-    BodyId, BodyView, GuestSession, LinkStats, ModalState, PeerId, RecoveryConfig, Tick, UserId,
+    BodyId, BodyView, GuestSession, LinkStats, State, PeerId, RecoveryConfig, Tick, UserId,
 };
 
 use crate::figures::{Ledger, NetStats};
@@ -190,7 +190,7 @@ impl NetGuest {
 
     /// The state that a body is shown in, and the tick it stands for: that of the newer copy while this guest's own hand holds it
     /// ([`BodyView::own_hand`]), that of the confirmed stream otherwise. The host's tick of a newer copy may still be to come.
-    pub fn shown(&self, body: RemoteBody) -> Option<(Tick, &ModalState)> {
+    pub fn shown(&self, body: RemoteBody) -> Option<(Tick, &State)> {
         let view = self.body(body)?;
         shown_of(view)
     }
@@ -257,7 +257,7 @@ impl NetGuest {
     }
 }
 
-fn shown_of(view: &BodyView) -> Option<(Tick, &ModalState)> {
+fn shown_of(view: &BodyView) -> Option<(Tick, &State)> {
     match view.own_hand() {
         Some(own) => Some((own.tick(), own.shown())),
         None => Some((view.tick(), view.shown()?)),

@@ -8,7 +8,7 @@ use bevy::prelude::*;
 use bevy::tasks::{AsyncComputeTaskPool, block_on, poll_once};
 use pliant_body::{BodyState, Driven, Grab, GrabForce, Grabs, PliantTick};
 use pliant_modal::ModalModel;
-use pliant_stream::{BodyId, BodySetup, GrabKey, GrabState, Pose, TickState, UserId};
+use pliant_stream::{BodyId, StepSettings, GrabKey, GrabState, Pose, TickState, UserId};
 
 use super::NetHost;
 use super::hands::GuestGrab;
@@ -19,7 +19,7 @@ use crate::user::{User, UserLink};
 pub(super) struct HostedBody {
     pub(super) id: BodyId,
     model: Arc<ModalModel>,
-    setup: BodySetup,
+    setup: StepSettings,
     /// When the guests were told of the setup.
     told: Duration,
     pub(super) placed: GlobalTransform,
@@ -132,7 +132,7 @@ impl NetHost {
         transform: &GlobalTransform,
     ) -> Option<BodyId> {
         let config = state.body().config();
-        let setup = BodySetup {
+        let setup = StepSettings {
             integrator: config.integrator,
             warp: config.warp,
             damping_scale: config.damping_scale,

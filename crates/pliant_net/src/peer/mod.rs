@@ -15,7 +15,7 @@ use std::time::{Duration, Instant};
 use bevy::prelude::*;
 use pliant_body::{BodyState, Driven, ModalBody};
 use pliant_stream::peer::{PeerConfig as SessionConfig, PeerSession, Repair};
-use pliant_stream::{BodyId, BodySetup, LinkStats, PeerId, UserId};
+use pliant_stream::{BodyId, StepSettings, LinkStats, PeerId, UserId};
 
 use crate::figures::{Ledger, NetStats};
 use crate::scene::{self, SharedBody};
@@ -294,7 +294,7 @@ impl NetPeer {
         for (entity, name, _, state) in shared.iter(world) {
             let Some(state) = state else { return false };
             let config = state.body().config();
-            let setup = BodySetup {
+            let setup = StepSettings {
                 integrator: config.integrator,
                 warp: config.warp,
                 damping_scale: config.damping_scale,

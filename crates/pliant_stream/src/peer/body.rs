@@ -3,7 +3,7 @@
 use std::sync::Arc;
 
 use nalgebra::{UnitQuaternion, Vector3};
-use pliant_modal::{Frame, GrabConfig, ModalModel};
+use pliant_modal::{Frame, GrabConfig, Hand, Hold, Load, ModalModel, StepSettings};
 
 use super::inputs::{InputLog, WINDOW};
 use super::wire::{HeldAt, PeerBodyState, PeerFrame};
@@ -11,8 +11,8 @@ use crate::StreamError;
 use crate::check::{checksum, projection};
 use crate::newmark::{FlowFilter, Newmark};
 use crate::recovery::{Blend, Forecast, PoseBlend};
-use crate::state::{BodyId, GrabKey, GrabState, ModalState, Pose, Tick, UserId};
-use crate::stepper::{BodySetup, ForceStepper, FrameStep, Hold};
+use crate::replica::Replica;
+use crate::state::{BodyId, GrabKey, GrabState, Pose, State, Tick, UserId};
 
 /// How a late input is put right.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
@@ -39,10 +39,7 @@ struct Grip {
 #[derive(Debug, Clone, Default)]
 struct Past {
     tick: Tick,
-    state: ModalState,
-    frame: Option<Frame>,
-    /// Modal forces of the step, which some integrators carry on.
-    force: Vec<f64>,
+    state: State,
     pulls: Vec<Grip>,
     used: Vec<(UserId, HeldAt)>,
 }
@@ -52,23 +49,20 @@ struct Past {
 pub struct PeerBody {
     pub(crate) id: BodyId,
     pub(crate) model: Arc<ModalModel>,
-    stepper: ForceStepper,
+    replica: Replica,
     forecast: Forecast,
     newmark: Newmark,
     flow: Option<FlowFilter>,
     repair: Repair,
     tick: Tick,
-    state: ModalState,
-    /// The rigid frame of a free body.
-    frame: Option<Frame>,
+    state: State,
     pulls: Vec<Grip>,
     past: Vec<Past>,
     held: Vec<(UserId, HeldAt)>,
     blend: Blend,
     pose_blend: PoseBlend,
-    shown: ModalState,
+    shown: State,
     pose: Option<Pose>,
-    h: f64,
     grabs: Vec<GrabState>,
     restepped: u64,
 }
@@ -77,25 +71,22 @@ impl PeerBody {
     pub(crate) fn new(
         id: BodyId,
         model: Arc<ModalModel>,
-        setup: &BodySetup,
+        settings: &StepSettings,
         h: f64,
         repair: Repair,
         blend_ticks: u16,
     ) -> Result<Self, StreamError> {
-        let stepper = ForceStepper::new(model.clone(), setup, model.mode_count(), h)?;
-        let rest = stepper.at_rest();
-        let (beta, gamma) = setup.integrator.newmark().unwrap_or((0.25, 0.5));
-        let frame = model.is_free().then(|| Frame::at_rest(&model));
+        let replica = Replica::new(model.clone(), *settings, model.mode_count(), h)?;
+        let rest = replica.kernel().at_rest();
+        let (beta, gamma) = settings.integrator.newmark().unwrap_or((0.25, 0.5));
         let mut made = Self {
             id,
-            frame,
-            pose: frame.map(|frame| Pose::of_frame(&model, &frame)),
+            pose: model.is_free().then(|| Pose::of_frame(&model, &rest.frame)),
             pose_blend: PoseBlend::new(h, blend_ticks),
-            h,
             model,
-            stepper,
+            replica,
             forecast: Forecast::new(h),
-            flow: setup.relaxation.map(|r| FlowFilter::new(r, &Newmark { h, beta, gamma }, WINDOW)),
+            flow: settings.relaxation.map(|r| FlowFilter::new(r, &Newmark { h, beta, gamma }, WINDOW)),
             newmark: Newmark { h, beta, gamma },
             repair,
             tick: 0,
@@ -129,12 +120,12 @@ impl PeerBody {
     }
 
     /// Best estimate of what all peers will agree on.
-    pub fn hidden(&self) -> &ModalState {
+    pub fn hidden(&self) -> &State {
         &self.state
     }
 
     /// What the eye and the hand get: continuous in position and velocity.
-    pub fn shown(&self) -> &ModalState {
+    pub fn shown(&self) -> &State {
         &self.shown
     }
 
@@ -146,8 +137,8 @@ impl PeerBody {
     /// The rigid frame of a free body after a tick that is still remembered.
     pub(crate) fn past_pose(&self, tick: Tick) -> Option<Pose> {
         self.past(tick)?;
-        let frame = self.past[(tick % WINDOW as u64) as usize].frame?;
-        Some(Pose::of_frame(&self.model, &frame))
+        let past = &self.past[(tick % WINDOW as u64) as usize];
+        self.model.is_free().then(|| Pose::of_frame(&self.model, &past.state.frame))
     }
 
     /// The checksum's value of a tick that is still remembered, and the size that it is compared by.
@@ -178,7 +169,7 @@ impl PeerBody {
     }
 
     /// The state after a tick that is still remembered.
-    pub(crate) fn past(&self, tick: Tick) -> Option<&ModalState> {
+    pub(crate) fn past(&self, tick: Tick) -> Option<&State> {
         let past = &self.past[(tick % WINDOW as u64) as usize];
         (past.tick == tick && tick <= self.tick && past.state.modes() > 0).then_some(&past.state)
     }
@@ -198,8 +189,8 @@ impl PeerBody {
             v: past.state.v.clone(),
             a: past.state.a.clone(),
             z: past.state.z.clone(),
-            force: past.force.clone(),
-            frame: past.frame.map(|f| PeerFrame {
+            force: past.state.f.clone(),
+            frame: self.model.is_free().then_some(past.state.frame).map(|f| PeerFrame {
                 center: f.center(),
                 orientation: f.orientation(),
                 velocity: f.velocity(),
@@ -215,20 +206,21 @@ impl PeerBody {
 
     /// Takes a state over and steps on from it to the tick reached.
     pub(crate) fn import(&mut self, tick: Tick, to: Tick, state: &PeerBodyState, inputs: &InputLog) -> bool {
-        if state.q.len() != self.state.modes() || state.z.len() != self.state.z.len() {
-            return false;
-        }
         let told = state
             .frame
             .as_ref()
             .and_then(|f| Frame::from_motion(&self.model, f.center, f.orientation, f.velocity, f.spin).ok());
-        if told.is_some() != self.frame.is_some() {
+        if told.is_some() != self.model.is_free() {
             return false;
         }
-        let before = (self.state.clone(), self.frame);
-        self.frame = told;
-        self.state =
-            ModalState { q: state.q.clone(), v: state.v.clone(), a: state.a.clone(), z: state.z.clone() };
+        // Integrators that remember no force may leave it out.
+        let f = if state.force.is_empty() { vec![0.0; self.state.modes()] } else { state.force.clone() };
+        let (q, v, a, z) = (state.q.clone(), state.v.clone(), state.a.clone(), state.z.clone());
+        let told = State { q, v, a, f, z, frame: told.unwrap_or(self.state.frame) };
+        if self.replica.kernel().check(&told).is_err() {
+            return false;
+        }
+        let before = std::mem::replace(&mut self.state, told);
         let pull = |p: &(u16, u16, [f64; 3], [f64; 3])| Grip {
             key: GrabKey { user: UserId(p.0), grab: p.1 },
             pull: p.2.into(),
@@ -237,8 +229,6 @@ impl PeerBody {
         self.pulls = state.pulls.iter().map(pull).collect();
         let fresh = self.tick == 0;
         self.tick = tick;
-        self.stepper.restart();
-        self.stepper.set_last_force(&state.force);
         self.remember();
         while self.tick < to {
             self.step_once(inputs);
@@ -271,14 +261,12 @@ impl PeerBody {
         if past.tick != base || past.state.modes() == 0 {
             return false;
         }
-        let before = (self.state.clone(), self.frame);
+        let before = self.state.clone();
         match self.repair {
             Repair::Rollback => {
                 let to = self.tick;
-                self.state.copy_from(&past.state);
-                self.frame = past.frame;
+                self.state.clone_from(&past.state);
                 self.pulls.clone_from(&past.pulls);
-                self.stepper.set_last_force(&past.force);
                 self.tick = base;
                 while self.tick < to {
                     self.step_once(inputs);
@@ -305,15 +293,10 @@ impl PeerBody {
                 continue;
             }
             let (mut with, mut without) = (before.state.clone(), before.state.clone());
-            let (mut there, mut here) = (before.frame, before.frame);
-            let (mut pulls, force) = (before.pulls.clone(), before.force.clone());
+            let (mut pulls, mut old_pulls) = (before.pulls.clone(), before.pulls.clone());
             let used = std::mem::take(&mut self.past[index].used);
-            let now = self.stepper.last_force().to_vec();
-            self.stepper.set_last_force(&force);
-            Self::press(&mut self.stepper, &mut with, &mut there, &mut pulls, &held);
-            self.stepper.set_last_force(&force);
-            Self::press(&mut self.stepper, &mut without, &mut here, &mut pulls, &used);
-            self.stepper.set_last_force(&now);
+            Self::press(&mut self.replica, &mut with, &mut pulls, &held);
+            Self::press(&mut self.replica, &mut without, &mut old_pulls, &used);
             let (to_q, to_v) = self.newmark.response(self.tick - tick);
             let to_z = self.flow.as_ref().map_or(0.0, |flow| flow.response(self.tick - tick));
             for k in 0..self.state.modes() {
@@ -324,8 +307,9 @@ impl PeerBody {
                     *z += to_z * da;
                 }
             }
-            if let (Some(frame), Some(there), Some(here)) = (self.frame, there, here) {
-                self.frame = self.moved(&frame, &there, &here, (self.tick - tick) as f64 * self.h);
+            if self.model.is_free() {
+                let seconds = (self.tick - tick) as f64 * self.replica.kernel().h();
+                self.state.frame = self.moved(&self.state.frame, &with.frame, &without.frame, seconds);
             }
             self.past[index].used.clone_from(&held);
             self.restepped += 1;
@@ -334,7 +318,7 @@ impl PeerBody {
 
     /// The frame as it would be, had it gone `there` instead of `here` so many seconds ago: what was different then in
     /// velocity and spin has led on since.
-    fn moved(&self, frame: &Frame, there: &Frame, here: &Frame, seconds: f64) -> Option<Frame> {
+    fn moved(&self, frame: &Frame, there: &Frame, here: &Frame, seconds: f64) -> Frame {
         let of = |f: fn(&Frame) -> [f64; 3]| Vector3::from(f(there)) - Vector3::from(f(here));
         let (faster, spin) = (of(Frame::velocity), of(Frame::spin));
         let center = Vector3::from(frame.center()) + of(Frame::center) + faster * seconds;
@@ -344,76 +328,68 @@ impl PeerBody {
         let velocity = Vector3::from(frame.velocity()) + faster;
         let spin = Vector3::from(frame.spin()) + spin;
         let q = [turn.i, turn.j, turn.k, turn.w];
-        Frame::from_motion(&self.model, center.into(), q, velocity.into(), spin.into()).ok().or(Some(*frame))
+        Frame::from_motion(&self.model, center.into(), q, velocity.into(), spin.into()).unwrap_or(*frame)
     }
 
     fn step_once(&mut self, inputs: &InputLog) {
         let tick = self.tick + 1;
         let mut held = std::mem::take(&mut self.held);
         inputs.held(tick, self.id, &self.forecast, &mut held);
-        Self::press(&mut self.stepper, &mut self.state, &mut self.frame, &mut self.pulls, &held);
+        Self::press(&mut self.replica, &mut self.state, &mut self.pulls, &held);
         self.held = held;
         self.tick = tick;
         self.remember();
     }
 
     /// One step of a state with hands; the pulls that acted (N, world axes) come out.
-    fn press(
-        stepper: &mut ForceStepper,
-        state: &mut ModalState,
-        frame: &mut Option<Frame>,
-        pulls: &mut Vec<Grip>,
-        held: &[(UserId, HeldAt)],
-    ) {
-        let mut holds = Vec::with_capacity(held.len());
-        let mut grips = Vec::with_capacity(held.len());
+    fn press(replica: &mut Replica, state: &mut State, pulls: &mut Vec<Grip>, held: &[(UserId, HeldAt)]) {
+        let mut hands = Vec::with_capacity(held.len());
+        let mut keys = Vec::with_capacity(held.len());
         for (user, g) in held {
             // All peers leave out the same: one that is larger than the body costs a look at every vertex of it.
-            if g.radius <= stepper.model().size() && stepper.knows(g.vertex, g.radius) {
-                let key = g.key(*user);
-                let flow = pulls.iter().find(|p| p.key == key).map_or_else(Vector3::zeros, |p| p.flow);
-                let config = GrabConfig::default();
-                let hand = Hold::hand(g.vertex, g.radius, g.target, Vector3::zeros(), config);
-                holds.push(Hold { flow, ..hand });
-                grips.push(Grip { key, pull: Vector3::zeros(), flow });
+            if g.radius > replica.model().size() {
+                continue;
             }
+            let Some(patch) = replica.patch(g.vertex, g.radius) else { continue };
+            let key = g.key(*user);
+            let (velocity, config) = (Vector3::zeros(), GrabConfig::default());
+            let hand = Hand::new(patch, Hold::Target { target: g.target.into(), velocity, config });
+            hands.push(match pulls.iter().find(|p| p.key == key) {
+                Some(before) => Hand { pull: before.pull, flow: before.flow, ..hand },
+                None => hand,
+            });
+            keys.push(key);
         }
-        let zero = Vector3::zeros();
-        let frame = frame.as_mut().map(|frame| FrameStep { frame, force: zero, torque: zero });
-        stepper.step_held(state, &mut holds, &[], frame);
-        for (grip, hold) in grips.iter_mut().zip(&holds) {
-            (grip.pull, grip.flow) = (hold.pull, hold.flow);
-        }
-        *pulls = grips;
+        replica.step(state, &mut hands, &Load::default());
+        pulls.clear();
+        let grip = |(key, hand): (GrabKey, &Hand)| Grip { key, pull: hand.pull, flow: hand.flow };
+        pulls.extend(keys.into_iter().zip(&hands).map(grip));
     }
 
     fn remember(&mut self) {
         let past = &mut self.past[(self.tick % WINDOW as u64) as usize];
         past.tick = self.tick;
-        past.state.copy_from(&self.state);
-        past.frame = self.frame;
-        past.force.clear();
-        past.force.extend_from_slice(self.stepper.last_force());
+        past.state.clone_from(&self.state);
         past.pulls.clone_from(&self.pulls);
         past.used.clone_from(&self.held);
     }
 
-    fn add_blend(&mut self, before: &(ModalState, Option<Frame>)) {
-        let (before, frame) = before;
+    fn add_blend(&mut self, before: &State) {
         let now = &self.state;
         self.blend.add(
             before.q.iter().zip(&now.q).map(|(b, n)| b - n),
             before.v.iter().zip(&now.v).map(|(b, n)| b - n),
         );
-        if let (Some(before), Some(now)) = (frame, &self.frame) {
+        if self.model.is_free() {
+            let (before, now) = (&before.frame, &now.frame);
             self.pose_blend.add(&Pose::of_frame(&self.model, before), &Pose::of_frame(&self.model, now));
         }
     }
 
     fn show(&mut self) {
-        self.shown.copy_from(&self.state);
+        self.shown.clone_from(&self.state);
         self.blend.apply(&mut self.shown.q, &mut self.shown.v);
-        let pose = self.frame.map(|frame| Pose::of_frame(&self.model, &frame));
+        let pose = self.model.is_free().then(|| Pose::of_frame(&self.model, &self.state.frame));
         self.pose = pose.map(|pose| self.pose_blend.apply(&pose));
         self.grabs.clear();
         for (user, g) in &self.held {

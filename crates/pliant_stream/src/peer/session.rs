@@ -6,7 +6,7 @@ use std::collections::{BTreeMap, VecDeque};
 use std::sync::Arc;
 use std::time::Duration;
 
-use pliant_modal::ModalModel;
+use pliant_modal::{ModalModel, StepSettings};
 
 use super::body::PeerBody;
 use super::config::{PeerConfig, PeerEvent};
@@ -16,7 +16,6 @@ use super::wire::{HeldAt, InputTick, MAX_HELD, MAX_TICKS, PeerDatagram, PeerMess
 use crate::StreamError;
 use crate::session::{Channel, EndReason, LinkStats, Output};
 use crate::state::{BodyId, PeerId, Tick, UserId, in_range};
-use crate::stepper::BodySetup;
 use crate::wire::{MAX_NAME, PROTOCOL_VERSION};
 
 /// Most peers beside oneself.
@@ -109,14 +108,14 @@ impl PeerSession {
         &mut self,
         id: BodyId,
         model: Arc<ModalModel>,
-        setup: &BodySetup,
+        settings: &StepSettings,
     ) -> Result<(), StreamError> {
         if self.bodies.contains_key(&id) {
             let found = id.to_string();
             return Err(StreamError::Config { what: "body", found, expected: "a number that is not in use" });
         }
         let c = &self.config;
-        let body = PeerBody::new(id, model, setup, c.step, c.repair, c.blend_ticks)?;
+        let body = PeerBody::new(id, model, settings, c.step, c.repair, c.blend_ticks)?;
         self.bodies.insert(id, body);
         Ok(())
     }
@@ -254,7 +253,7 @@ impl PeerSession {
     }
 
     /// The state of a body after a tick of the last 128.
-    pub fn state_at(&self, body: BodyId, tick: Tick) -> Option<&crate::ModalState> {
+    pub fn state_at(&self, body: BodyId, tick: Tick) -> Option<&crate::State> {
         self.bodies.get(&body)?.past(tick)
     }
 

@@ -4,7 +4,8 @@ use pliant_modal::Relaxation;
 
 use super::{HISTORY, History, Predict, Recovery};
 use crate::newmark::{FlowFilter, Newmark};
-use crate::state::{ModalState, Tick};
+use crate::replica;
+use crate::state::{State, Tick};
 
 /// Integrates the accelerations; predicts those that are missing; takes their error out exactly when they come.
 #[derive(Debug)]
@@ -16,7 +17,7 @@ pub struct AccelerationDriven {
     compensate: bool,
     tick: Tick,
     first: Tick,
-    state: ModalState,
+    state: State,
     /// The accelerations that each tick was stepped with.
     used: Vec<Vec<f64>>,
     /// Per mode: the tick at which its absolute state was last taken over. What was wrong up to then is gone with it.
@@ -34,7 +35,7 @@ impl AccelerationDriven {
             compensate,
             tick: 0,
             first: 0,
-            state: ModalState::zero(modes),
+            state: State::zero(modes, false),
             used: vec![Vec::new(); HISTORY],
             anchored: vec![0; modes],
             next: vec![0.0; modes],
@@ -45,7 +46,7 @@ impl AccelerationDriven {
     pub fn relaxing(mut self, relaxation: Option<Relaxation>) -> Self {
         self.flow = relaxation.map(|r| FlowFilter::new(r, &self.newmark, HISTORY));
         if self.flow.is_some() {
-            self.state = ModalState::zero_relaxing(self.state.modes());
+            self.state = State::zero(self.state.modes(), true);
         }
         self
     }
@@ -73,8 +74,8 @@ impl AccelerationDriven {
 }
 
 impl Recovery for AccelerationDriven {
-    fn restart(&mut self, tick: Tick, state: &ModalState, _load: &[f64]) {
-        self.state.fill_from(state.parts());
+    fn restart(&mut self, tick: Tick, state: &State, _load: &[f64]) {
+        replica::fill(&mut self.state, [&state.q, &state.v, &state.a, &state.z]);
         self.tick = tick;
         self.first = tick;
         self.anchored.fill(tick);
@@ -146,7 +147,7 @@ impl Recovery for AccelerationDriven {
         }
     }
 
-    fn hidden(&self) -> &ModalState {
+    fn hidden(&self) -> &State {
         &self.state
     }
 

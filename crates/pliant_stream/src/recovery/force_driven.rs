@@ -1,59 +1,50 @@
 //! The better way: the receiver owns the damped model and steps it with the streamed reactions.
 
 use super::{Forecast, HISTORY, History, Recovery};
-use crate::state::{ModalState, Tick};
-use crate::stepper::ForceStepper;
+use crate::replica::{self, Replica};
+use crate::state::{State, Tick};
 use crate::wire::FrameGrab;
 
 /// A tick as it was stepped.
 #[derive(Debug, Clone, Default)]
 struct Stepped {
     tick: Tick,
-    state: ModalState,
-    force: Vec<f64>,
+    state: State,
 }
 
 /// Steps the modal recurrence with the reactions. What was stepped on a guess is stepped again when the truth comes.
 #[derive(Debug)]
 pub struct ForceDriven {
-    stepper: ForceStepper,
+    replica: Replica,
     tick: Tick,
     first: Tick,
-    state: ModalState,
+    state: State,
     load: Vec<f64>,
     past: Vec<Stepped>,
     grabs: Vec<FrameGrab>,
     forecast: Forecast,
-    /// The body has a rigid frame of its own.
-    free: bool,
-    h: f64,
 }
 
 impl ForceDriven {
     /// At rest at tick 0; hands that are not heard of go where the forecast has them.
-    pub fn new(stepper: ForceStepper, forecast: Forecast) -> Self {
-        let modes = stepper.modes();
-        let rest = stepper.at_rest();
+    pub(crate) fn new(replica: Replica, forecast: Forecast) -> Self {
+        let state = replica.kernel().at_rest();
         Self {
-            free: stepper.is_free(),
-            h: stepper.h(),
-            stepper,
             tick: 0,
             first: 0,
-            state: rest,
-            load: vec![0.0; modes],
+            load: vec![0.0; state.modes()],
+            state,
             past: vec![Stepped::default(); HISTORY],
             grabs: Vec::new(),
             forecast,
+            replica,
         }
     }
 
     fn remember(&mut self, tick: Tick) {
         let slot = &mut self.past[(tick % HISTORY as u64) as usize];
         slot.tick = tick;
-        slot.state.copy_from(&self.state);
-        slot.force.clear();
-        slot.force.extend_from_slice(self.stepper.last_force());
+        slot.state.clone_from(&self.state);
     }
 
     fn step_to(&mut self, tick: Tick, history: &History) {
@@ -64,9 +55,11 @@ impl ForceDriven {
             self.grabs
                 .extend(near.grabs.iter().filter_map(|g| history.grab(g.state.key, tick, &self.forecast)));
         }
-        let pose = if self.free { history.pose(tick, self.h) } else { None };
-        let rotation = pose.map_or([0.0, 0.0, 0.0, 1.0], |p| p.rotation);
-        self.stepper.step(&mut self.state, &self.grabs, rotation, &self.load);
+        if self.replica.model().is_free() {
+            let pose = history.pose(tick, self.replica.kernel().h());
+            replica::place(&mut self.state, self.replica.model(), pose.as_ref());
+        }
+        self.replica.step_measured(&mut self.state, &self.grabs, &self.load);
         self.take_slice(tick, history);
         self.remember(tick);
     }
@@ -86,15 +79,14 @@ impl ForceDriven {
 }
 
 impl Recovery for ForceDriven {
-    fn restart(&mut self, tick: Tick, state: &ModalState, load: &[f64]) {
+    fn restart(&mut self, tick: Tick, state: &State, load: &[f64]) {
         let modes = self.state.modes();
         let fill = |mine: &mut Vec<f64>, theirs: &[f64]| {
             mine.clear();
             mine.extend(theirs.iter().copied().chain(std::iter::repeat(0.0)).take(modes));
         };
-        self.state.fill_from(state.parts());
+        replica::fill(&mut self.state, [&state.q, &state.v, &state.a, &state.z]);
         fill(&mut self.load, load);
-        self.stepper.restart();
         (self.tick, self.first) = (tick, tick);
         self.remember(tick);
     }
@@ -112,8 +104,7 @@ impl Recovery for ForceDriven {
         if base.tick != from - 1 || base.state.modes() != self.state.modes() {
             return false;
         }
-        self.state.copy_from(&base.state);
-        self.stepper.set_last_force(&base.force);
+        self.state.clone_from(&base.state);
         for tick in from..=self.tick {
             self.step_to(tick, history);
         }
@@ -124,16 +115,12 @@ impl Recovery for ForceDriven {
         // Slices are part of stepping to their tick.
     }
 
-    fn hidden(&self) -> &ModalState {
+    fn hidden(&self) -> &State {
         &self.state
     }
 
     fn load(&self) -> &[f64] {
         &self.load
-    }
-
-    fn last_force(&self) -> &[f64] {
-        self.stepper.last_force()
     }
 
     fn driven_by_reactions(&self) -> bool {

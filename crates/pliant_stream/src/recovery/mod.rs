@@ -20,7 +20,7 @@ pub use passivity::PassivityGuard;
 pub use pose_blend::PoseBlend;
 pub use receiver::{Arrival, Receiver, RepairCounts, ShownGrab};
 
-use crate::state::{ModalState, Tick};
+use crate::state::{State, Tick};
 
 /// How a receiver turns what arrived into its best estimate of the host's state.
 ///
@@ -28,7 +28,7 @@ use crate::state::{ModalState, Tick};
 /// that were already stepped arrived late, and blends the difference away from what is shown.
 pub trait Recovery: Send + Sync {
     /// Takes a state over as true after `tick`.
-    fn restart(&mut self, tick: Tick, state: &ModalState, load: &[f64]);
+    fn restart(&mut self, tick: Tick, state: &State, load: &[f64]);
 
     /// Steps to `tick`, one beyond the last, with its data where `history` has it and a prediction where not.
     fn advance(&mut self, tick: Tick, history: &History);
@@ -41,15 +41,10 @@ pub trait Recovery: Send + Sync {
     fn refresh(&mut self, tick: Tick, history: &History);
 
     /// The best estimate of the truth at the tick reached.
-    fn hidden(&self) -> &ModalState;
+    fn hidden(&self) -> &State;
 
     /// Modal forces that the reactions do not explain, as far as they are known; empty for none.
     fn load(&self) -> &[f64] {
-        &[]
-    }
-
-    /// The modal forces of the last step, where the step needs them again; else empty.
-    fn last_force(&self) -> &[f64] {
         &[]
     }
 

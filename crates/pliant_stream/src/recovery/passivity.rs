@@ -14,7 +14,7 @@
 
 use pliant_modal::Relaxation;
 
-use crate::state::ModalState;
+use crate::state::State;
 
 /// The tank holds at most this share of the largest energy that the body has had.
 const TANK: f64 = 0.05;
@@ -59,7 +59,7 @@ impl PassivityGuard {
     }
 
     /// Kinetic and elastic energy of a modal state, J; both springs of a mode that relaxes.
-    pub fn energy(&self, state: &ModalState) -> f64 {
+    pub fn energy(&self, state: &State) -> f64 {
         let modes = state.q.iter().zip(&state.v).zip(&self.stiffness);
         let elastic = 0.5 * modes.map(|((q, v), k)| v * v + k * q * q).sum::<f64>();
         if state.z.is_empty() {
@@ -70,7 +70,7 @@ impl PassivityGuard {
     }
 
     /// What the body loses in a step, J.
-    fn lost(&self, state: &ModalState) -> f64 {
+    fn lost(&self, state: &State) -> f64 {
         let viscous: f64 = self.damping.iter().zip(&state.v).map(|(c, v)| c * v * v).sum();
         let (ratio, rate) = self.relaxing;
         let flows = state.q.iter().zip(&state.z).zip(&self.stiffness);
@@ -79,12 +79,12 @@ impl PassivityGuard {
     }
 
     /// A correction moved the hidden state under the shown one: no energy was put in, and the excess is what it is now.
-    pub fn corrected(&mut self, hidden: &ModalState, shown: &ModalState) {
+    pub fn corrected(&mut self, hidden: &State, shown: &State) {
         self.excess = self.energy(shown) - self.energy(hidden);
     }
 
     /// A tick has passed: the share of the offset `shown - hidden` that may stay, 0 to 1.
-    pub fn admit(&mut self, hidden: &ModalState, shown: &ModalState) -> f64 {
+    pub fn admit(&mut self, hidden: &State, shown: &State) -> f64 {
         let lost = self.lost(hidden);
         self.dissipated += lost;
         self.largest = self.largest.max(self.energy(hidden));
@@ -153,15 +153,15 @@ mod tests {
         let mut last_excess = 0.0;
         for n in 0..4000 {
             let t = f64::from(n) * h;
-            let hidden = ModalState {
+            let hidden = State {
                 q: (0..2).map(|k| 0.1 * (omega[k] * t).sin() * (-0.05 * t).exp()).collect(),
                 v: (0..2).map(|k| 0.1 * omega[k] * (omega[k] * t).cos() * (-0.05 * t).exp()).collect(),
-                ..ModalState::zero(2)
+                ..State::zero(2, false)
             };
-            let with = |oq: &[f64; 2], ov: &[f64; 2]| ModalState {
+            let with = |oq: &[f64; 2], ov: &[f64; 2]| State {
                 q: (0..2).map(|k| hidden.q[k] + oq[k]).collect(),
                 v: (0..2).map(|k| hidden.v[k] + ov[k]).collect(),
-                ..ModalState::zero(2)
+                ..State::zero(2, false)
             };
             if n % 7 == 0 {
                 for k in 0..2 {
@@ -203,8 +203,8 @@ mod tests {
     #[test]
     fn a_fading_offset_at_rest_is_let_pass() {
         let mut guard = PassivityGuard::new(&[5.0], &[0.1], 0.01);
-        let hidden = ModalState::zero(1);
-        let at = |q: f64| ModalState { q: vec![q], ..ModalState::zero(1) };
+        let hidden = State::zero(1, false);
+        let at = |q: f64| State { q: vec![q], ..State::zero(1, false) };
         guard.corrected(&hidden, &at(1.0));
         for n in 1..100 {
             assert_eq!(

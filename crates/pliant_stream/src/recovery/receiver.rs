@@ -2,7 +2,7 @@
 
 use std::sync::Arc;
 
-use pliant_modal::ModalModel;
+use pliant_modal::{ModalModel, StepSettings};
 
 use super::{
     AccelerationDriven, Blend, ForceDriven, HISTORY, History, Policy, Predict, Recovery, RecoveryConfig,
@@ -12,8 +12,8 @@ use crate::StreamError;
 use crate::check::checksum;
 use crate::newmark::Newmark;
 use crate::quanta::Quanta;
-use crate::state::{GrabState, ModalState, Pose, Tick};
-use crate::stepper::{BodySetup, ForceStepper};
+use crate::replica::{self, Replica};
+use crate::state::{GrabState, Pose, State, Tick};
 use crate::wire::{Frame, SnapshotBytes};
 
 /// Disagreeing checksums in a row before a snapshot is wanted: a slice or a repair may be under way.
@@ -59,15 +59,15 @@ pub struct RepairCounts {
 
 /// A body at a receiver.
 pub struct Receiver {
-    setup: BodySetup,
-    stepper: ForceStepper,
+    settings: StepSettings,
+    replica: Replica,
     history: History,
     quanta: Quanta,
     policy: Box<dyn Recovery>,
     blend: Blend,
     guard: Option<PassivityGuard>,
     tick: Tick,
-    shown: ModalState,
+    shown: State,
     grabs: Vec<ShownGrab>,
     /// The tick of `grabs`, and what was shown at the two ticks before it, the newer first.
     grabs_at: Tick,
@@ -82,7 +82,7 @@ pub struct Receiver {
     counted: Tick,
     guessed: Vec<Tick>,
     mismatched: u32,
-    before: ModalState,
+    before: State,
     forecast: Forecast,
     h: f64,
     blend_ticks: u16,
@@ -104,7 +104,7 @@ impl Receiver {
     /// [`StreamError::Config`], [`StreamError::Model`], [`StreamError::Length`] when the snapshot has other modes.
     pub fn new(
         model: Arc<ModalModel>,
-        setup: BodySetup,
+        settings: StepSettings,
         modes: usize,
         newmark: Newmark,
         config: &RecoveryConfig,
@@ -116,27 +116,29 @@ impl Receiver {
         if snapshot.q.len() != modes {
             return Err(StreamError::Length { what: "snapshot", found: snapshot.q.len(), expected: modes });
         }
-        let stepper = || ForceStepper::new(model.clone(), &setup, modes, newmark.h);
+        let replica = || Replica::new(model.clone(), settings, modes, newmark.h);
         let integrating = |predict, compensate| {
-            AccelerationDriven::new(newmark, predict, compensate, modes).relaxing(setup.relaxation)
+            AccelerationDriven::new(newmark, predict, compensate, modes).relaxing(settings.relaxation)
         };
         let (policy, blend_ticks): (Box<dyn Recovery>, u16) = match config.policy {
             Policy::None => (Box::new(integrating(Predict::Zero, false)), 1),
             Policy::Paper { predict, blend_ticks } => (Box::new(integrating(predict, true)), blend_ticks),
             Policy::ForceDriven { blend_ticks } => {
-                (Box::new(ForceDriven::new(stepper()?, Forecast::new(newmark.h))), blend_ticks)
+                (Box::new(ForceDriven::new(replica()?, Forecast::new(newmark.h))), blend_ticks)
             }
         };
         let guard = config.passive.then(|| {
-            let (omega, damping) = setup.modes(&model, modes);
-            PassivityGuard::new(&omega, &damping, newmark.h).relaxing(setup.relaxation)
+            let (omega, damping): (Vec<f64>, Vec<f64>) =
+                (0..modes).map(|mode| settings.mode(&model, mode)).unzip();
+            PassivityGuard::new(&omega, &damping, newmark.h).relaxing(settings.relaxation)
         });
-        let rest = stepper()?.at_rest();
+        let replica = replica()?;
+        let rest = replica.kernel().at_rest();
         let mut receiver = Self {
-            setup,
-            stepper: stepper()?,
+            settings,
+            replica,
             history: History::new(snapshot.tick),
-            quanta: Quanta::stiffened(&model, setup.stiffness_scale, modes, &newmark),
+            quanta: Quanta::stiffened(&model, settings.stiffness_scale, modes, &newmark),
             policy,
             blend: Blend::new(newmark.h, blend_ticks),
             guard,
@@ -159,7 +161,7 @@ impl Receiver {
             blend_ticks,
         };
         receiver.policy.restart(snapshot.tick, &state_of(snapshot), &snapshot.load);
-        receiver.shown.copy_from(receiver.policy.hidden());
+        receiver.shown.clone_from(receiver.policy.hidden());
         Ok(receiver)
     }
 
@@ -174,7 +176,7 @@ impl Receiver {
     }
 
     /// Best estimate of the truth.
-    pub fn hidden(&self) -> &ModalState {
+    pub fn hidden(&self) -> &State {
         self.policy.hidden()
     }
 
@@ -187,12 +189,8 @@ impl Receiver {
         self.policy.load()
     }
 
-    pub(crate) fn last_force(&self) -> &[f64] {
-        self.policy.last_force()
-    }
-
     /// What the eye and the hand get.
-    pub fn shown(&self) -> &ModalState {
+    pub fn shown(&self) -> &State {
         &self.shown
     }
 
@@ -222,8 +220,8 @@ impl Receiver {
     }
 
     /// How the host steps the body.
-    pub fn setup(&self) -> &BodySetup {
-        &self.setup
+    pub fn settings(&self) -> &StepSettings {
+        &self.settings
     }
 
     /// Takes a frame in. What it says of ticks that were already stepped is put right at once in the hidden state; the
@@ -296,7 +294,7 @@ impl Receiver {
         }
         if let Some(guard) = &mut self.guard {
             let hidden = self.policy.hidden();
-            self.shown.copy_from(hidden);
+            self.shown.clone_from(hidden);
             self.blend.apply(&mut self.shown.q, &mut self.shown.v);
             let share = guard.admit(hidden, &self.shown);
             if share < 1.0 {
@@ -352,11 +350,11 @@ impl Receiver {
         if tick <= self.tick {
             return;
         }
-        self.before.copy_from(self.policy.hidden());
-        let rest = ModalState {
+        self.before.clone_from(self.policy.hidden());
+        let rest = State {
             q: self.before.q.clone(),
             z: self.before.z.clone(),
-            ..ModalState::zero(self.before.modes())
+            ..State::zero(self.before.modes(), false)
         };
         self.policy.restart(tick, &rest, &[]);
         self.tick = tick;
@@ -373,7 +371,7 @@ impl Receiver {
     }
 
     fn remember_before(&mut self) {
-        self.before.copy_from(self.policy.hidden());
+        self.before.clone_from(self.policy.hidden());
     }
 
     fn blend_from_before(&mut self) {
@@ -383,14 +381,14 @@ impl Receiver {
             self.before.v.iter().zip(&now.v).map(|(b, n)| b - n),
         );
         if let Some(guard) = &mut self.guard {
-            self.shown.copy_from(now);
+            self.shown.clone_from(now);
             self.blend.apply(&mut self.shown.q, &mut self.shown.v);
             guard.corrected(now, &self.shown);
         }
     }
 
     fn show(&mut self) {
-        self.shown.copy_from(self.policy.hidden());
+        self.shown.clone_from(self.policy.hidden());
         self.blend.apply(&mut self.shown.q, &mut self.shown.v);
         if self.tick != self.grabs_at {
             self.trail.swap(0, 1);
@@ -420,8 +418,8 @@ impl Receiver {
             }
             self.blend_reactions();
         } else {
-            let rotation = self.pose.map_or([0.0, 0.0, 0.0, 1.0], |p| p.rotation);
-            self.stepper.reactions(&self.shown, &mut self.grabs, rotation);
+            replica::place(&mut self.shown, self.replica.model(), self.pose.as_ref());
+            self.replica.reactions(&self.shown, &mut self.grabs);
         }
     }
 
@@ -466,6 +464,12 @@ impl Receiver {
     }
 }
 
-fn state_of(snapshot: &SnapshotBytes) -> ModalState {
-    ModalState { q: snapshot.q.clone(), v: snapshot.v.clone(), a: snapshot.a.clone(), z: snapshot.z.clone() }
+fn state_of(snapshot: &SnapshotBytes) -> State {
+    State {
+        q: snapshot.q.clone(),
+        v: snapshot.v.clone(),
+        a: snapshot.a.clone(),
+        z: snapshot.z.clone(),
+        ..State::default()
+    }
 }

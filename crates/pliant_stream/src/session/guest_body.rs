@@ -9,8 +9,8 @@ use super::own_hand::OwnHand;
 use crate::newmark::Newmark;
 use crate::playout::PlayoutClock;
 use crate::recovery::{HISTORY, Policy, Receiver, RecoveryConfig, RepairCounts, ShownGrab};
-use crate::state::{BodyId, ModalState, Pose, Tick, UserId};
-use crate::stepper::ForceStepper;
+use crate::replica::Replica;
+use crate::state::{BodyId, Pose, State, Tick, UserId};
 use crate::wire::{BodyInfo, Frame, MAX_NACK_RUNS, Nack, NackRun, Payload, SnapshotBytes};
 
 /// Frames that wait for the snapshot.
@@ -113,12 +113,12 @@ impl BodyView {
     }
 
     /// Best estimate of the truth at the shown tick: for the next step's physics, not for the eye.
-    pub fn hidden(&self) -> Option<&ModalState> {
+    pub fn hidden(&self) -> Option<&State> {
         self.receiver.as_ref().map(Receiver::hidden)
     }
 
     /// What the eye and the hand get at the shown tick: continuous in position and velocity.
-    pub fn shown(&self) -> Option<&ModalState> {
+    pub fn shown(&self) -> Option<&State> {
         self.receiver.as_ref().map(Receiver::shown)
     }
 
@@ -205,7 +205,7 @@ impl BodyView {
         let (Some(model), Some(snapshot)) = (&self.model, &self.snapshot) else { return false };
         let modes = snapshot.q.len();
         let made =
-            Receiver::new(model.clone(), self.info.setup(), modes, self.newmark, &self.config, snapshot);
+            Receiver::new(model.clone(), self.info.settings, modes, self.newmark, &self.config, snapshot);
         let Ok(mut receiver) = made else { return false };
         for frame in self.waiting.drain(..) {
             if frame.tick > snapshot.tick {
@@ -213,10 +213,9 @@ impl BodyView {
             }
         }
         if let (Policy::ForceDriven { blend_ticks }, true) = (self.config.policy, self.own_first)
-            && let Ok(stepper) = ForceStepper::new(model.clone(), &self.info.setup(), modes, self.newmark.h)
+            && let Ok(replica) = Replica::new(model.clone(), self.info.settings, modes, self.newmark.h)
         {
-            let h = self.newmark.h;
-            let mut own = OwnHand::new(stepper, h, blend_ticks);
+            let mut own = OwnHand::new(replica, blend_ticks);
             if let Some(before) = self.own.take() {
                 own.take_grabs(before);
             }

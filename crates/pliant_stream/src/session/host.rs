@@ -4,7 +4,7 @@ use std::collections::{BTreeMap, BTreeSet, VecDeque};
 use std::sync::{Arc, OnceLock};
 use std::time::Duration;
 
-use pliant_modal::{GrabConfig, ModalModel};
+use pliant_modal::{GrabConfig, ModalModel, StepSettings};
 
 use super::host_config::{HostConfig, HostEvent};
 use super::host_peer::{HeldGrab, MAX_GUEST_GRABS, Peer, Standing};
@@ -15,7 +15,6 @@ use crate::StreamError;
 use crate::encoder::Encoder;
 use crate::newmark::Newmark;
 use crate::state::{BodyId, GrabKey, PeerId, Tick, UserId};
-use crate::stepper::BodySetup;
 use crate::wire::{BodyInfo, Datagram, GuestMessage, HostMessage, PROTOCOL_VERSION, StreamWish};
 
 /// Most events that wait for the application; the oldest are dropped.
@@ -31,7 +30,7 @@ pub(super) struct HostBody {
     pub(super) model: Arc<ModalModel>,
     pub(super) bytes: Arc<[u8]>,
     pub(super) hash: [u8; 32],
-    pub(super) setup: BodySetup,
+    pub(super) settings: StepSettings,
     pub(super) last: Option<Tick>,
     pub(super) resting: bool,
     pub(super) reminded: Duration,
@@ -44,18 +43,12 @@ pub(super) struct HostBody {
 impl HostBody {
     /// What a guest is told of it; `None` before the guest has said what it wants.
     pub(super) fn info(&self, guest: &Peer) -> Option<BodyInfo> {
-        let setup = &self.setup;
         Some(BodyInfo {
             body: self.id.0,
             name: self.name.clone(),
             hash: self.hash,
             modes: Encoder::modes_for(&guest.wish?, self.model.mode_count(), guest.max_datagram) as u16,
-            rho_inf: BodyInfo::rho_inf_of(setup.integrator),
-            warp: setup.warp,
-            damping_scale: setup.damping_scale,
-            stiffness_scale: setup.stiffness_scale,
-            gravity: setup.gravity,
-            relaxation: setup.relaxation.map(|r| (r.ratio, r.time)),
+            settings: self.settings,
         })
     }
 }

@@ -4,14 +4,13 @@ use std::collections::BTreeMap;
 use std::sync::{Arc, OnceLock};
 use std::time::Duration;
 
-use pliant_modal::ModalModel;
+use pliant_modal::{ModalModel, StepSettings};
 
 use super::host::{HostBody, HostSession};
 use super::host_config::HostEvent;
 use super::host_peer::Transfer;
 use crate::StreamError;
 use crate::state::{BodyId, GrabKey, MAX_MODES, PeerId};
-use crate::stepper::BodySetup;
 use crate::wire::HostMessage;
 
 impl HostSession {
@@ -19,16 +18,16 @@ impl HostSession {
     ///
     /// # Errors
     /// [`StreamError::Full`] beyond 1,024 bodies; [`StreamError::Config`] for a name over 64 bytes or a number in use;
-    /// [`StreamError::Model`] for a relaxation out of range.
+    /// [`StreamError::Model`] for settings out of their ranges.
     pub fn add_body(
         &mut self,
         body: BodyId,
         name: &str,
         model: Arc<ModalModel>,
-        setup: BodySetup,
+        settings: StepSettings,
     ) -> Result<(), StreamError> {
         let bytes = model.to_bytes().into();
-        self.add_body_as(body, name, model, bytes, setup)
+        self.add_body_as(body, name, model, bytes, settings)
     }
 
     /// As [`HostSession::add_body`], with the model's file (`model.to_bytes()`), made elsewhere: that takes long for a frame. Guests leave a
@@ -42,7 +41,7 @@ impl HostSession {
         name: &str,
         model: Arc<ModalModel>,
         bytes: Arc<[u8]>,
-        setup: BodySetup,
+        settings: StepSettings,
     ) -> Result<(), StreamError> {
         if self.bodies.len() >= crate::wire::MAX_BODIES {
             return Err(StreamError::Full { what: "bodies", limit: crate::wire::MAX_BODIES });
@@ -57,16 +56,14 @@ impl HostSession {
         if model.mode_count() > MAX_MODES {
             return fail("modes", model.mode_count().to_string(), "at most 4096");
         }
-        if let Some(Err(e)) = setup.relaxation.map(|r| r.check()) {
-            return Err(StreamError::Model(e.to_string()));
-        }
+        settings.check().map_err(|e| StreamError::Model(e.to_string()))?;
         let entry = HostBody {
             id: body,
             name: name.to_owned(),
             bytes,
             hash: model.hash().0,
             model,
-            setup,
+            settings,
             last: None,
             resting: false,
             reminded: Duration::ZERO,
@@ -81,20 +78,18 @@ impl HostSession {
         Ok(())
     }
 
-    /// From the next tick on the body is stepped as `setup` says: who has it is told, and gets a snapshot. Hands on it stay. Not for many times a
+    /// From the next tick on the body is stepped as `settings` say: who has it is told, and gets a snapshot. Hands on it stay. Not for many times a
     /// second: every change begins every guest's stream anew.
     ///
     /// # Errors
-    /// [`StreamError::UnknownBody`], [`StreamError::Model`]; the old setup then stays.
-    pub fn set_setup(&mut self, body: BodyId, setup: BodySetup) -> Result<(), StreamError> {
-        if let Some(Err(e)) = setup.relaxation.map(|r| r.check()) {
-            return Err(StreamError::Model(e.to_string()));
-        }
+    /// [`StreamError::UnknownBody`], [`StreamError::Model`]; the old settings then stay.
+    pub fn set_settings(&mut self, body: BodyId, settings: StepSettings) -> Result<(), StreamError> {
+        settings.check().map_err(|e| StreamError::Model(e.to_string()))?;
         let entry = self.bodies.get_mut(&body).ok_or(StreamError::UnknownBody(body))?;
-        if entry.setup == setup {
+        if entry.settings == settings {
             return Ok(());
         }
-        entry.setup = setup;
+        entry.settings = settings;
         entry.streams.clear();
         let entry = &*entry;
         for p in self.peers.values_mut().filter(|p| p.announced.contains(&body)) {

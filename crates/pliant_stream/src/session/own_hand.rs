@@ -11,12 +11,12 @@
 
 use std::collections::VecDeque;
 
-use nalgebra::{Matrix3, Vector3};
-use pliant_modal::{Frame, GrabConfig, RigidMotion};
+use nalgebra::Vector3;
+use pliant_modal::{Frame, GrabConfig, Hand, Hold, Load, RigidMotion};
 
 use crate::recovery::{Blend, Forecast, PoseBlend, Receiver};
-use crate::state::{GrabKey, ModalState, Pose, Tick, UserId};
-use crate::stepper::{ForceStepper, FrameStep, Hold, inverse_rotation};
+use crate::replica::{self, Replica};
+use crate::state::{GrabKey, Pose, State, Tick, UserId};
 
 /// Targets remembered, and so the largest lead, ticks.
 const REMEMBERED: usize = 64;
@@ -47,18 +47,17 @@ struct OwnGrab {
 /// A guest's newer copy of a body that it holds.
 #[derive(Debug)]
 pub struct OwnHand {
-    stepper: ForceStepper,
+    replica: Replica,
     grabs: Vec<OwnGrab>,
     lead: usize,
     votes: u32,
     tick: Tick,
     active: bool,
-    state: ModalState,
-    expected: ModalState,
-    shown: ModalState,
+    state: State,
+    expected: State,
+    shown: State,
     blend: Blend,
-    /// The rigid frame of the copy, where the body is free, and the confirmed one of the tick before.
-    frame: Option<Frame>,
+    /// The confirmed frame of the tick before, where the body is free.
     last_frame: Option<Frame>,
     pose: Option<Pose>,
     pose_blend: PoseBlend,
@@ -66,16 +65,15 @@ pub struct OwnHand {
     push: (Vector3<f64>, Vector3<f64>),
     forecast: Forecast,
     fade: f64,
-    holds: Vec<Hold>,
+    hands: Vec<Hand>,
     own: Vec<usize>,
-    h: f64,
 }
 
 impl OwnHand {
-    pub(crate) fn new(stepper: ForceStepper, h: f64, blend_ticks: u16) -> Self {
-        let rest = stepper.at_rest();
+    pub(crate) fn new(replica: Replica, blend_ticks: u16) -> Self {
+        let (rest, h) = (replica.kernel().at_rest(), replica.kernel().h());
         Self {
-            stepper,
+            replica,
             grabs: Vec::new(),
             lead: 0,
             votes: 0,
@@ -85,16 +83,14 @@ impl OwnHand {
             expected: rest.clone(),
             shown: rest,
             blend: Blend::new(h, blend_ticks),
-            frame: None,
             last_frame: None,
             pose: None,
             pose_blend: PoseBlend::new(h, blend_ticks),
             push: (Vector3::zeros(), Vector3::zeros()),
             forecast: Forecast::new(h),
             fade: (-3.0 / f64::from(blend_ticks.max(1))).exp(),
-            holds: Vec::new(),
+            hands: Vec::new(),
             own: Vec::new(),
-            h,
         }
     }
 
@@ -109,7 +105,7 @@ impl OwnHand {
     }
 
     /// The body as its holder is to see it: continuous in position and velocity.
-    pub fn shown(&self) -> &ModalState {
+    pub fn shown(&self) -> &State {
         &self.shown
     }
 
@@ -165,11 +161,16 @@ impl OwnHand {
         }
     }
 
+    /// The rigid frame of a copy, where the body is free.
+    fn frame_of(&self, state: &State) -> Option<Frame> {
+        self.replica.model().is_free().then_some(state.frame)
+    }
+
     /// A tick of the confirmed state has passed. `guess`: the lead to begin with, ticks.
     pub(crate) fn step(&mut self, receiver: &Receiver, user: UserId, guess: usize) {
-        let confirmed_frame = receiver.frame().and_then(|p| p.frame(self.stepper.model()));
+        let confirmed_frame = receiver.frame().and_then(|p| p.frame(self.replica.model()));
         if self.state.modes() != receiver.hidden().modes()
-            || self.stepper.is_free() != confirmed_frame.is_some()
+            || self.replica.model().is_free() != confirmed_frame.is_some()
         {
             self.active = false;
             return;
@@ -195,32 +196,36 @@ impl OwnHand {
         if !self.active {
             self.active = true;
             self.lead = guess.min(REMEMBERED - 1);
-            self.state.copy_from(receiver.shown());
-            self.shown.copy_from(receiver.shown());
+            self.take(receiver.shown());
+            replica::place(&mut self.state, self.replica.model(), receiver.pose().as_ref());
+            self.shown.clone_from(&self.state);
             self.blend.clear();
-            self.frame = receiver.pose().and_then(|p| p.frame(self.stepper.model()));
             self.pose_blend.clear();
         }
         self.vote(receiver, user);
         self.tick = confirmed + self.lead as u64;
 
         // What the copy would have become, had nothing new been learnt.
-        self.expected.copy_from(&self.state);
         let mut expected = std::mem::take(&mut self.expected);
-        let mut frame = self.frame;
-        self.one_step(&mut expected, &mut frame, receiver, user, self.lead);
+        expected.clone_from(&self.state);
+        self.one_step(&mut expected, receiver, user, self.lead);
         for g in &mut self.grabs {
             g.would = g.reaction;
         }
-        let expected_frame = frame;
 
         let mut state = std::mem::take(&mut self.state);
-        state.copy_from(receiver.hidden());
-        self.stepper.set_last_force(receiver.last_force());
-        let mut frame = confirmed_frame;
-        self.grabs.iter_mut().for_each(|g| g.flowing = g.flow);
+        state.clone_from(receiver.hidden());
+        if let Some(frame) = confirmed_frame {
+            state.frame = frame;
+        }
+        for g in &mut self.grabs {
+            g.flowing = g.flow;
+            let key = GrabKey { user, grab: g.grab };
+            let told = receiver.grabs().iter().find(|told| told.key == key);
+            g.reaction = told.map_or(g.reaction, |told| told.reaction);
+        }
         for j in 1..=self.lead {
-            self.one_step(&mut state, &mut frame, receiver, user, j);
+            self.one_step(&mut state, receiver, user, j);
         }
         self.blend.advance();
         self.blend.add(
@@ -228,16 +233,16 @@ impl OwnHand {
             expected.v.iter().zip(&state.v).map(|(e, s)| e - s),
         );
         self.pose_blend.advance();
-        if let (Some(expected), Some(now)) = (expected_frame, frame) {
-            let model = self.stepper.model();
-            self.pose_blend.add(&Pose::of_frame(model, &expected), &Pose::of_frame(model, &now));
+        if self.replica.model().is_free() {
+            let model = self.replica.model();
+            let (expected, now) = (&expected.frame, &state.frame);
+            self.pose_blend.add(&Pose::of_frame(model, expected), &Pose::of_frame(model, now));
         }
         for g in &mut self.grabs {
             for ((offset, would), now) in g.offset.iter_mut().zip(g.would).zip(g.reaction) {
                 *offset = self.fade * (*offset + would - now);
             }
         }
-        self.frame = frame;
         self.state = state;
         self.expected = expected;
         self.show();
@@ -248,9 +253,9 @@ impl OwnHand {
     fn learn_push(&mut self, receiver: &Receiver, now: Option<Frame>) {
         let last = std::mem::replace(&mut self.last_frame, now);
         let (Some(mut from), Some(to)) = (last, now) else { return };
-        let (model, h) = (self.stepper.model().clone(), self.h);
+        let (model, h) = (self.replica.model().clone(), self.replica.kernel().h());
         let zero = Vector3::zeros();
-        let gravity = Vector3::from(receiver.setup().gravity);
+        let gravity = Vector3::from(receiver.settings().gravity);
         let rigid = RigidMotion::predict(&mut from, &model, h, gravity, zero, zero);
         let (mut force, mut torque) = (zero, zero);
         let tick = receiver.tick();
@@ -258,8 +263,9 @@ impl OwnHand {
         patches.extend(receiver.grabs().iter().map(|g| (g.key, g.vertex, g.radius)));
         for (key, vertex, radius) in patches {
             let Some(g) = receiver.history().grab(key, tick, &self.forecast) else { continue };
-            let Some(rest) = self.stepper.rest(vertex, radius) else { continue };
-            let arm = from.to_world(rest + Vector3::from(g.displacement)) - Vector3::from(from.center());
+            let Some(patch) = self.replica.patch(vertex, radius) else { continue };
+            let at = from.to_world(patch.rest() + Vector3::from(g.displacement));
+            let arm = at - Vector3::from(from.center());
             let pull = -Vector3::from(g.state.reaction);
             force += pull;
             torque += arm.cross(&pull);
@@ -273,68 +279,69 @@ impl OwnHand {
 
     /// Lets the flow under the own hands go on by the confirmed pulls, where the body relaxes.
     fn learn_flow(&mut self, receiver: &Receiver, user: UserId) {
-        if receiver.setup().relaxation.is_none() {
+        if receiver.settings().relaxation.is_none() {
             return;
         }
-        let back = receiver.frame().map_or(Matrix3::identity(), |p| inverse_rotation(p.rotation));
+        let turn = receiver.frame().and_then(|p| p.frame(self.replica.model())).unwrap_or_default();
         for g in &mut self.grabs {
             let key = GrabKey { user, grab: g.grab };
             let Some(told) = receiver.history().grab(key, receiver.tick(), &self.forecast) else { continue };
-            let pull = -(back * Vector3::from(told.state.reaction));
-            g.flow = self.stepper.relax(g.vertex, g.radius, g.flow, pull);
+            let Some(patch) = self.replica.patch(g.vertex, g.radius) else { continue };
+            let pull = -(turn.rotation().inverse() * Vector3::from(told.state.reaction));
+            let hand = Hand { flow: g.flow, ..Hand::new(patch, Hold::Measured(Vector3::zeros())) };
+            g.flow = self.replica.kernel().flow(&hand, pull);
         }
     }
 
     /// Steps to `j` ticks after the confirmed one, and leaves the own reactions in the grabs.
-    fn one_step(
-        &mut self,
-        state: &mut ModalState,
-        frame: &mut Option<Frame>,
-        receiver: &Receiver,
-        user: UserId,
-        j: usize,
-    ) {
+    fn one_step(&mut self, state: &mut State, receiver: &Receiver, user: UserId, j: usize) {
         let history = receiver.history();
-        let tick = receiver.tick() + j as u64;
-        let back = Matrix3::identity();
-        let mut holds = std::mem::take(&mut self.holds);
-        holds.clear();
+        let (tick, h) = (receiver.tick() + j as u64, self.replica.kernel().h());
+        let free = self.replica.model().is_free();
+        let mut hands = std::mem::take(&mut self.hands);
+        hands.clear();
         for g in receiver.grabs().iter().filter(|g| g.key.user != user) {
             let Some(g) = history.grab(g.key, tick, &self.forecast) else { continue };
-            holds.push(if frame.is_some() {
+            let Some(mut hand) = self.replica.measured(&g) else { continue };
+            if free {
                 // The frame moves on from what is confirmed: the other's hand is where it goes, not where the patch was.
-                let config = GrabConfig::default();
-                Hold::hand(g.state.vertex, g.state.radius, g.state.target, Vector3::zeros(), config)
-            } else {
-                Hold::measured(&g, &back)
-            });
+                let (velocity, config) = (Vector3::zeros(), GrabConfig::default());
+                hand.hold = Hold::Target { target: g.state.target.into(), velocity, config };
+            }
+            hands.push(hand);
         }
-        let others = holds.len();
+        let others = hands.len();
         let mut own = std::mem::take(&mut self.own);
         own.clear();
-        holds.retain(|h| self.stepper.knows(h.vertex, h.radius));
-        let others = others.min(holds.len());
         for (index, g) in self.grabs.iter().enumerate() {
             // Newest is the target that arrives `lead` ticks after the confirmed one.
             let at = (g.past.len() + j).checked_sub(1 + self.lead);
-            let target = at.and_then(|i| g.past.get(i).copied().flatten());
-            let Some(target) = target.filter(|_| self.stepper.knows(g.vertex, g.radius)) else { continue };
+            let target = at.and_then(|i| g.past.get(i).copied().flatten()).map(Vector3::from);
+            let (Some(target), Some(patch)) = (target, self.replica.patch(g.vertex, g.radius)) else {
+                continue;
+            };
             let before = at.and_then(|i| i.checked_sub(1)).and_then(|i| g.past.get(i).copied().flatten());
-            let velocity =
-                before.map_or_else(Vector3::zeros, |b| (Vector3::from(target) - Vector3::from(b)) / self.h);
-            let hand = Hold::hand(g.vertex, g.radius, target, velocity, g.hold);
-            holds.push(Hold { flow: g.flowing, ..hand });
+            let velocity = before.map_or_else(Vector3::zeros, |b| (target - Vector3::from(b)) / h);
+            let hold = Hold::Target { target, velocity, config: g.hold };
+            hands.push(Hand { patch, hold, pull: -Vector3::from(g.reaction), flow: g.flowing });
             own.push(index);
         }
         let (force, torque) = self.push;
-        let frame = frame.as_mut().map(|frame| FrameStep { frame, force, torque });
-        self.stepper.step_held(state, &mut holds, receiver.load(), frame);
-        for (hold, &index) in holds[others.min(holds.len())..].iter().zip(&own) {
-            self.grabs[index].reaction = (-hold.pull).into();
-            self.grabs[index].flowing = hold.flow;
+        let load = Load { modal: receiver.load(), force, torque, frame_is_given: false };
+        self.replica.step(state, &mut hands, &load);
+        for (hand, &index) in hands[others..].iter().zip(&own) {
+            self.grabs[index].reaction = (-hand.pull).into();
+            self.grabs[index].flowing = hand.flow;
         }
         self.own = own;
-        self.holds = holds;
+        self.hands = hands;
+    }
+
+    /// Takes a state over; the forces of the last step stay.
+    fn take(&mut self, from: &State) {
+        let (frame, f) = (self.state.frame, std::mem::take(&mut self.state.f));
+        self.state.clone_from(from);
+        (self.state.frame, self.state.f) = (frame, f);
     }
 
     /// Finds how many ticks ago the target was said that the host's frame of the confirmed tick shows.
@@ -364,22 +371,22 @@ impl OwnHand {
     fn fall_back(&mut self, receiver: &Receiver) {
         self.blend.advance();
         let new = receiver.shown();
-        let h = self.h;
+        let h = self.replica.kernel().h();
         let old = &self.state;
         self.blend.add(
             (0..new.modes()).map(|k| old.q[k] + h * old.v[k] - new.q[k]),
             (0..new.modes()).map(|k| old.v[k] - new.v[k]),
         );
-        self.state.copy_from(new);
         self.pose_blend.advance();
-        if let (Some(old), Some(new)) = (self.frame, receiver.pose()) {
-            let model = self.stepper.model();
-            let mut old = old;
+        let mut old = self.state.frame;
+        self.take(new);
+        if let (true, Some(new)) = (self.replica.model().is_free(), receiver.pose()) {
+            let model = self.replica.model();
             // Where the copy would have been by now.
             let zero = Vector3::zeros();
-            RigidMotion::predict(&mut old, model, self.h, zero, zero, zero);
+            RigidMotion::predict(&mut old, model, h, zero, zero, zero);
             self.pose_blend.add(&Pose::of_frame(model, &old), &new);
-            self.frame = new.frame(model);
+            replica::place(&mut self.state, model, Some(&new));
         }
         self.show();
         // From here on the confirmed state is followed without new offsets.
@@ -389,9 +396,9 @@ impl OwnHand {
     }
 
     fn show(&mut self) {
-        self.shown.copy_from(&self.state);
+        self.shown.clone_from(&self.state);
         self.blend.apply(&mut self.shown.q, &mut self.shown.v);
-        let pose = self.frame.map(|frame| Pose::of_frame(self.stepper.model(), &frame));
+        let pose = self.frame_of(&self.state).map(|frame| Pose::of_frame(self.replica.model(), &frame));
         self.pose = pose.map(|pose| self.pose_blend.apply(&pose));
     }
 }

@@ -80,7 +80,7 @@ impl HostSession {
                     let made = Encoder::with_visible(
                         body,
                         entry.model.clone(),
-                        &entry.setup,
+                        &entry.settings,
                         self.config.newmark,
                         key.0,
                         key.1,
@@ -148,7 +148,7 @@ fn check_state(body: &HostBody, state: &TickState<'_>) -> Result<(), StreamError
             return Err(StreamError::Length { what, found: slice.len(), expected: modes });
         }
     }
-    let flows = if body.setup.relaxation.is_some() { state.q.len() } else { 0 };
+    let flows = if body.settings.relaxation.is_some() { state.q.len() } else { 0 };
     if state.z.len() != flows {
         return Err(StreamError::Length { what: "z", found: state.z.len(), expected: flows });
     }

@@ -1,13 +1,12 @@
 //! Reliable messages: postcard bodies, checked after decoding.
 
-use pliant_modal::{Integrator, Relaxation};
+use pliant_modal::StepSettings;
 use serde::{Deserialize, Serialize};
 
 use super::AccelerationCoding;
 use crate::StreamError;
 use crate::session::{EndReason, MAX_MESSAGE};
 use crate::state::{MAX_MODES, TICK_LIMIT, in_range};
-use crate::stepper::BodySetup;
 
 /// Longest name of a user or a body, bytes of UTF-8.
 pub(crate) const MAX_NAME: usize = 64;
@@ -55,48 +54,8 @@ pub struct BodyInfo {
     pub hash: [u8; 32],
     /// Modes that this guest's frames carry.
     pub modes: u16,
-    /// The host's integrator: negative for the exact step, else generalized-alpha with this spectral radius at infinity
-    /// (2 for Newmark's average acceleration).
-    pub rho_inf: f64,
-    /// Does the body bend by modal warping?
-    pub warp: bool,
-    /// Factor on all damping coefficients.
-    pub damping_scale: f64,
-    /// Factor on the material's stiffness.
-    pub stiffness_scale: f64,
-    /// Uniform acceleration, m/s^2, world axes.
-    pub gravity: [f64; 3],
-    /// Share of the stiffness that relaxes away, and in which time, s; none for an elastic body.
-    pub relaxation: Option<(f64, f64)>,
-}
-
-impl BodyInfo {
-    /// How the host steps the body.
-    pub fn setup(&self) -> BodySetup {
-        let integrator = match self.rho_inf {
-            r if r < 0.0 => Integrator::Exact,
-            r if r > 1.0 => Integrator::Newmark,
-            rho_inf => Integrator::GeneralizedAlpha { rho_inf },
-        };
-        let relaxation = self.relaxation.map(|(ratio, time)| Relaxation { ratio, time });
-        BodySetup {
-            integrator,
-            warp: self.warp,
-            damping_scale: self.damping_scale,
-            stiffness_scale: self.stiffness_scale,
-            gravity: self.gravity,
-            relaxation,
-        }
-    }
-
-    /// [`BodyInfo::rho_inf`] of an integrator.
-    pub fn rho_inf_of(integrator: Integrator) -> f64 {
-        match integrator {
-            Integrator::Newmark => 2.0,
-            Integrator::GeneralizedAlpha { rho_inf } => rho_inf,
-            _ => -1.0,
-        }
-    }
+    /// How the host steps it.
+    pub settings: StepSettings,
 }
 
 /// The encoder's own image of the receiver at a tick: a receiver that takes it over has no error against the stream.
@@ -320,19 +279,14 @@ impl HostMessage {
                 check("name", info.name.len() <= MAX_NAME, info.name.len(), "at most 64 bytes")?;
                 let modes = usize::from(info.modes);
                 check("modes", (1..=MAX_MODES).contains(&modes), modes, "1..=4096")?;
-                check("rho_inf", (-1.0..=2.0).contains(&info.rho_inf), info.rho_inf, "-1..=2")?;
-                let scale = info.damping_scale;
-                check("damping_scale", (0.0..=1e6).contains(&scale), scale, "0..=1e6")?;
-                let stiffness = info.stiffness_scale;
-                check("stiffness_scale", (1e-6..=1e6).contains(&stiffness), stiffness, "1e-6..=1e6")?;
-                let sound = info.setup().relaxation.is_none_or(|r| r.check().is_ok());
-                check(
-                    "relaxation",
-                    sound,
-                    format!("{:?}", info.relaxation),
-                    "a ratio in [0, 1), a time above 0 s",
-                )?;
-                check("gravity", in_range(&info.gravity), format!("{:?}", info.gravity), "finite m/s^2")?;
+                let settings = &info.settings;
+                if let Err(error) = settings.check() {
+                    check("settings", false, error, "settings in their ranges")?;
+                }
+                let scale = settings.damping_scale;
+                check("damping_scale", scale <= 1e6, scale, "0..=1e6")?;
+                let gravity = &settings.gravity;
+                check("gravity", in_range(gravity), format!("{gravity:?}"), "finite m/s^2")?;
             }
             Self::Snapshot(s) => {
                 check("snapshot tick", s.tick < TICK_LIMIT, s.tick, "below 2^48")?;

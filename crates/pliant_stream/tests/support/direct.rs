@@ -5,8 +5,8 @@ use std::time::Duration;
 use pliant_stream::peer::{PeerConfig, PeerSession};
 use pliant_stream::wire::FrameGrab;
 use pliant_stream::{
-    BodyId, BodySetup, Channel, GrabKey, GrabState, GuestConfig, GuestSession, HostConfig, HostSession,
-    PeerId, RecoveryConfig, TickState, UserId,
+    BodyId, Channel, GrabKey, GrabState, GuestConfig, GuestSession, HostConfig, HostSession, PeerId,
+    RecoveryConfig, StepSettings, TickState, UserId,
 };
 
 use super::bar;
@@ -31,7 +31,7 @@ pub fn grab(index: u16) -> FrameGrab {
 pub fn session(name: &str) -> (HostSession, GuestSession, Duration) {
     let model = bar(12, 0.05);
     let mut host = HostSession::new(HostConfig::default()).unwrap();
-    host.add_body(BODY, "bar", model.clone(), BodySetup::default()).unwrap();
+    host.add_body(BODY, "bar", model.clone(), StepSettings::default()).unwrap();
     let recovery = RecoveryConfig::by_name(name).unwrap();
     let mut guest = GuestSession::new(GuestConfig { recovery, ..Default::default() }, 1200).unwrap();
     guest.add_cached_model(model);
@@ -91,7 +91,7 @@ pub fn peers(now: Duration) -> Vec<PeerSession> {
         .map(|k| {
             let config = PeerConfig { user: UserId(k + 1), ..Default::default() };
             let mut peer = PeerSession::new(config).unwrap();
-            peer.add_body(BODY, bar(12, 0.05), &BodySetup::default()).unwrap();
+            peer.add_body(BODY, bar(12, 0.05), &StepSettings::default()).unwrap();
             for other in (0..3).filter(|o| *o != k) {
                 peer.connect(now, PeerId(u64::from(other)), UserId(other + 1), 1200).unwrap();
             }

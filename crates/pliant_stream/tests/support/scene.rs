@@ -8,8 +8,8 @@ use pliant_modal::{Body, BodyConfig, GrabConfig, GrabId, ModalModel, Patch};
 use pliant_stream::emulator::{LinkConfig, Loss, Preset};
 use pliant_stream::pair::{Pair, PathConfig, World};
 use pliant_stream::{
-    BodyId, BodySetup, GrabKey, GrabState, GuestEvent, GuestSession, HostConfig, HostEvent, HostSession,
-    Pose, TickState,
+    BodyId, GrabKey, GrabState, GuestEvent, GuestSession, HostConfig, HostEvent, HostSession, Pose,
+    StepSettings, TickState,
 };
 
 pub const BODY: BodyId = BodyId(3);
@@ -39,15 +39,15 @@ pub struct Scene {
 
 impl Scene {
     pub fn new(model: &Arc<ModalModel>) -> Self {
-        Self::with(model, &BodySetup::default())
+        Self::with(model, &StepSettings::default())
     }
 
-    pub fn with(model: &Arc<ModalModel>, setup: &BodySetup) -> Self {
+    pub fn with(model: &Arc<ModalModel>, settings: &StepSettings) -> Self {
         let config = BodyConfig {
             step: 1.0 / 40.0,
-            integrator: setup.integrator,
-            gravity: setup.gravity,
-            relaxation: setup.relaxation,
+            integrator: settings.integrator,
+            gravity: settings.gravity,
+            relaxation: settings.relaxation,
             ..Default::default()
         };
         Self {
@@ -170,7 +170,7 @@ pub fn start(model: &Arc<ModalModel>) -> (Pair, Scene) {
 
 pub fn start_with(model: &Arc<ModalModel>, config: HostConfig) -> (Pair, Scene) {
     let mut pair = Pair::new(config).unwrap();
-    pair.host.add_body(BODY, "bar", model.clone(), BodySetup::default()).unwrap();
+    pair.host.add_body(BODY, "bar", model.clone(), StepSettings::default()).unwrap();
     (pair, Scene::new(model))
 }
 

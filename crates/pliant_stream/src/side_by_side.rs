@@ -3,9 +3,11 @@
 use std::{path::Path, sync::Arc};
 
 use nalgebra::Vector3;
-use pliant_modal::{Body, BodyConfig, Frame, GrabConfig, Integrator, ModalModel, Patch, Relaxation};
+use pliant_modal::{
+    Body, BodyConfig, GrabConfig, Hand, Hold, Integrator, Load, ModalModel, Patch, Relaxation,
+};
 
-use super::{BodySetup, ForceStepper, FrameStep, Hold};
+use crate::replica::Replica;
 
 /// Largest difference as a share of the largest number of its kind in the run.
 const SAME: f64 = 1e-12;
@@ -24,69 +26,58 @@ fn end(model: &ModalModel, axis: [f32; 3]) -> u32 {
 }
 
 /// A hand of a case: where it holds, how, and how far (m) its target goes until it rests.
-struct Hand {
+struct Case {
     vertex: u32,
     radius: f64,
     config: GrabConfig,
     way: [f64; 3],
 }
 
-fn hand(vertex: u32, radius: f64, way: [f64; 3]) -> Hand {
-    Hand { vertex, radius, config: GrabConfig::default(), way }
+fn hand(vertex: u32, radius: f64, way: [f64; 3]) -> Case {
+    Case { vertex, radius, config: GrabConfig::default(), way }
 }
 
 /// Steps both for so many steps, and compares states and reactions after each.
-fn compare(name: &str, model: &Arc<ModalModel>, config: BodyConfig, hands: &[Hand], steps: usize) {
+fn compare(name: &str, model: &Arc<ModalModel>, config: BodyConfig, cases: &[Case], steps: usize) {
     let h = config.step;
-    let setup = BodySetup {
-        integrator: config.integrator,
-        warp: config.warp,
-        damping_scale: config.damping_scale,
-        stiffness_scale: config.stiffness_scale,
-        gravity: config.gravity,
-        relaxation: config.relaxation,
-    };
+    let settings = config.settings();
     let mut body = Body::new(model.clone(), config).unwrap();
-    let grabs: Vec<_> = hands
+    let grabs: Vec<_> = cases
         .iter()
-        .map(|hand| {
-            let patch = Patch::around(model.surface(), hand.vertex, hand.radius).unwrap();
-            let id = body.grab(&patch, hand.config).unwrap();
+        .map(|case| {
+            let patch = Patch::around(model.surface(), case.vertex, case.radius).unwrap();
+            let id = body.grab(&patch, case.config).unwrap();
             (id, Vector3::from(body.target(id).unwrap()))
         })
         .collect();
-    let mut copy = ForceStepper::new(model.clone(), &setup, model.mode_count(), h).unwrap();
-    let mut state = copy.at_rest();
-    let mut frame = Frame::at_rest(model);
-    let mut holds: Vec<Hold> = hands
+    let mut copy = Replica::new(model.clone(), settings, model.mode_count(), h).unwrap();
+    let mut state = copy.kernel().at_rest();
+    let mut hands: Vec<Hand> = cases
         .iter()
-        .zip(&grabs)
-        .map(|(hand, (_, at))| {
-            Hold::hand(hand.vertex, hand.radius, (*at).into(), Vector3::zeros(), hand.config)
+        .map(|case| {
+            let patch = copy.patch(case.vertex, case.radius).unwrap();
+            Hand::new(patch, Hold::Measured(Vector3::zeros()))
         })
         .collect();
-    let mut last: Vec<Vector3<f64>> = Vec::new();
+    let mut last: Option<Vec<Vector3<f64>>> = None;
     let mut largest = [0.0f64; 3];
     let mut off = Vec::new();
     for step in 0..steps {
         let share = (step as f64 * h / 0.5).min(1.0);
         let share = share * share * (3.0 - 2.0 * share);
         let targets: Vec<Vector3<f64>> =
-            hands.iter().zip(&grabs).map(|(hand, (_, at))| at + share * Vector3::from(hand.way)).collect();
+            cases.iter().zip(&grabs).map(|(case, (_, at))| at + share * Vector3::from(case.way)).collect();
         for ((id, _), target) in grabs.iter().zip(&targets) {
             body.set_target(*id, (*target).into()).unwrap();
         }
         body.step().unwrap();
-        for (i, hold) in holds.iter_mut().enumerate() {
-            let velocity = last.get(i).map_or_else(Vector3::zeros, |before| (targets[i] - before) / h);
-            let (vertex, radius, config) = (hands[i].vertex, hands[i].radius, hands[i].config);
-            *hold =
-                Hold { flow: hold.flow, ..Hold::hand(vertex, radius, targets[i].into(), velocity, config) };
+        for (i, (hand, case)) in hands.iter_mut().zip(cases).enumerate() {
+            let (target, config) = (targets[i], case.config);
+            let velocity = last.as_ref().map_or_else(Vector3::zeros, |last| (target - last[i]) / h);
+            hand.hold = Hold::Target { target, velocity, config };
         }
-        last = targets;
-        let zero = Vector3::zeros();
-        let rigid = model.is_free().then_some(FrameStep { frame: &mut frame, force: zero, torque: zero });
-        copy.step_held(&mut state, &mut holds, &[], rigid);
+        last = Some(targets);
+        copy.step(&mut state, &mut hands, &Load::default());
 
         let mut off_now = [0.0f64; 3];
         for (kind, (true_, copied)) in [(body.q(), &state.q), (body.v(), &state.v)].into_iter().enumerate() {
@@ -95,12 +86,12 @@ fn compare(name: &str, model: &Arc<ModalModel>, config: BodyConfig, hands: &[Han
                 off_now[kind] = off_now[kind].max((a - b).abs());
             }
         }
-        for ((id, _), hold) in grabs.iter().zip(&holds) {
+        for ((id, _), hand) in grabs.iter().zip(&hands) {
             let reaction = Vector3::from(body.reaction(*id).unwrap());
             largest[2] = largest[2].max(reaction.norm());
-            off_now[2] = off_now[2].max((reaction + hold.pull).norm());
+            off_now[2] = off_now[2].max((reaction + hand.pull).norm());
         }
-        let center = Vector3::from(body.frame().center()) - Vector3::from(frame.center());
+        let center = Vector3::from(body.frame().center()) - Vector3::from(state.frame.center());
         off.push([off_now[0], off_now[1], off_now[2], center.norm()]);
     }
     let scale = [largest[0], largest[1], largest[2], model.size()];
@@ -120,7 +111,7 @@ fn a_damped_hand() {
     let bud = model("bud.modal");
     let tip = end(&bud, [0.0, 1.0, 0.0]);
     let config = GrabConfig { relaxation: 0.02, ..GrabConfig::default() };
-    let hands = [Hand { config, ..hand(tip, 0.1 * bud.size(), [0.05 * bud.size(), 0.0, 0.0]) }];
+    let hands = [Case { config, ..hand(tip, 0.1 * bud.size(), [0.05 * bud.size(), 0.0, 0.0]) }];
     compare("damped", &bud, BodyConfig { step: 1.0 / 64.0, ..Default::default() }, &hands, 128);
 }
 
@@ -162,7 +153,7 @@ fn two_hands() {
     let (right, left) = (end(&pip, [1.0, 0.0, 0.0]), end(&pip, [-1.0, 0.0, 0.0]));
     let hands = [
         hand(right, 0.08 * size, [0.2 * size, 0.1 * size, 0.0]),
-        Hand { config: soft, ..hand(left, 0.05 * size, [0.0, 0.2 * size, -0.1 * size]) },
+        Case { config: soft, ..hand(left, 0.05 * size, [0.0, 0.2 * size, -0.1 * size]) },
     ];
     compare("two hands", &pip, BodyConfig::default(), &hands, 128);
 }

@@ -1,0 +1,169 @@
+//! A copy of a body: the kernel that steps it, and its patches by the names that the stream has for
+//! them.
+
+use std::sync::Arc;
+
+use nalgebra::Vector3;
+use pliant_modal::{
+    Hand, HeldPatch, Hold, ImpliedPulls, Kernel, Load, ModalModel, Patch, State, StepSettings,
+};
+
+use crate::StreamError;
+use crate::state::{GrabState, Pose};
+use crate::wire::FrameGrab;
+
+/// Patches remembered at a time; a new one beyond that empties the table.
+const PATCHES: usize = 256;
+
+/// Names a patch: vertex, bits of the radius.
+type Key = (u32, u64);
+
+/// What steps copies of one body.
+#[derive(Debug)]
+pub(crate) struct Replica {
+    kernel: Kernel,
+    patches: Vec<(Key, Arc<HeldPatch>)>,
+    hands: Vec<Hand>,
+    implied: ImpliedPulls,
+}
+
+impl Replica {
+    /// For the first `modes` of a model at step `h` (s).
+    pub(crate) fn new(
+        model: Arc<ModalModel>,
+        settings: StepSettings,
+        modes: usize,
+        h: f64,
+    ) -> Result<Self, StreamError> {
+        let kernel = Kernel::new(model, settings, modes, h).map_err(|e| StreamError::Model(e.to_string()))?;
+        let implied = ImpliedPulls::new(&kernel);
+        Ok(Self { kernel, patches: Vec::new(), hands: Vec::new(), implied })
+    }
+
+    pub(crate) fn kernel(&self) -> &Kernel {
+        &self.kernel
+    }
+
+    pub(crate) fn model(&self) -> &Arc<ModalModel> {
+        self.kernel.model()
+    }
+
+    /// A patch of the body, made when it is new; `None` for a vertex that the model has not got.
+    pub(crate) fn patch(&mut self, vertex: u32, radius: f64) -> Option<Arc<HeldPatch>> {
+        let wanted = (vertex, radius.to_bits());
+        if let Some((_, patch)) = self.patches.iter().find(|(key, _)| *key == wanted) {
+            return Some(patch.clone());
+        }
+        let patch = Patch::around(self.model().surface(), vertex, radius).ok()?;
+        let patch = Arc::new(HeldPatch::new(self.model(), &patch, self.kernel.modes()).ok()?);
+        if self.patches.len() >= PATCHES {
+            self.patches.clear();
+        }
+        self.patches.push((wanted, patch.clone()));
+        Some(patch)
+    }
+
+    /// One step of a state with hands. A step that would not be finite leaves the state as it was.
+    pub(crate) fn step(&mut self, state: &mut State, hands: &mut [Hand], load: &Load<'_>) {
+        // The sizes are this replica's own, and a receiver has nobody to tell of a state that it
+        // cannot step on from: a checksum or a snapshot puts it right.
+        self.kernel.step(state, hands, load).ok();
+    }
+
+    /// A hand as the stream tells of it.
+    pub(crate) fn measured(&mut self, g: &FrameGrab) -> Option<Hand> {
+        let patch = self.patch(g.state.vertex, g.state.radius)?;
+        let hand = Hand::new(patch, Hold::Measured(g.displacement.into()));
+        Some(Hand { pull: -Vector3::from(g.state.reaction), ..hand })
+    }
+
+    /// One step with the reactions, drawn to where the host's patches were; the frame stays where the
+    /// state has it.
+    ///
+    /// Reaction and place together say where the hand must have been, `place + C pull` with `C` the
+    /// hand's compliance; the step is then the body's own. The reactions alone would be a dead load: a
+    /// bent body under a load that pushes is unstable (it buckles), although the same body held in
+    /// place is not, and a small error would grow. This way the receiver is an observer: the pull is
+    /// the measured one when the state is right, and otherwise draws the patches to their places as the
+    /// grab does, so errors die as they would in the held body. A grab whose vertex the model has not
+    /// got pulls nothing.
+    pub(crate) fn step_measured(&mut self, state: &mut State, grabs: &[FrameGrab], load: &[f64]) {
+        let mut hands = std::mem::take(&mut self.hands);
+        hands.clear();
+        hands.extend(grabs.iter().filter_map(|g| self.measured(g)));
+        let load = Load { modal: load, frame_is_given: true, ..Load::default() };
+        self.step(state, &mut hands, &load);
+        self.hands = hands;
+    }
+
+    /// Where a patch is at `q`, as displacement from rest in body axes, m; zero for a vertex that the
+    /// model has not got. Modes that `q` lacks do not move.
+    pub(crate) fn displacement(&mut self, q: &[f64], vertex: u32, radius: f64) -> [f64; 3] {
+        let warp = self.kernel.settings().warp;
+        self.patch(vertex, radius).map_or([0.0; 3], |patch| patch.displacement(q, warp).into())
+    }
+
+    /// The modal force per mode that a step from the true state `from` lacks to reach the true
+    /// coordinates and velocities `to`: by least squares over displacement and velocity, in units of
+    /// the mode's own amplitude. Steps `from`.
+    pub(crate) fn lacking(
+        &mut self,
+        from: &mut State,
+        to: [&[f64]; 2],
+        grabs: &[FrameGrab],
+        load: &[f64],
+        out: &mut Vec<f64>,
+    ) {
+        self.step_measured(from, grabs, load);
+        out.clear();
+        let [by_q, by_v, _] = self.kernel.responses();
+        for (k, omega) in self.kernel.omega().iter().enumerate() {
+            let at = |slice: &[f64]| slice.get(k).copied().unwrap_or(0.0);
+            let (rq, rv) = (at(to[0]) - from.q[k], at(to[1]) - from.v[k]);
+            let (bq, bv) = (by_q[k], by_v[k]);
+            let weight = 1.0 / omega.powi(2).max(1e-12);
+            let scale = bq * bq + bv * bv * weight;
+            out.push(if scale > 0.0 { (bq * rq + bv * rv * weight) / scale } else { 0.0 });
+        }
+    }
+
+    /// Writes the reactions that a state implies into `grabs`; see [`ImpliedPulls`].
+    pub(crate) fn reactions(&mut self, state: &State, grabs: &mut [GrabState]) {
+        let mut hands = std::mem::take(&mut self.hands);
+        hands.clear();
+        let known = |replica: &mut Self, g: &GrabState| {
+            let hand = Hand::new(replica.patch(g.vertex, g.radius)?, Hold::Measured(Vector3::zeros()));
+            Some(Hand { pull: -Vector3::from(g.reaction), ..hand })
+        };
+        hands.extend(grabs.iter().filter_map(|g| known(self, g)));
+        self.implied.solve(&self.kernel, state, &mut hands);
+        let mut solved = hands.iter();
+        for g in grabs {
+            if self.patch(g.vertex, g.radius).is_some()
+                && let Some(hand) = solved.next()
+            {
+                g.reaction = (-hand.pull).into();
+            }
+        }
+        self.hands = hands;
+    }
+}
+
+/// Takes over as many of another state's coordinates, velocities, accelerations and flows as there
+/// are; missing ones are 0, and so are the forces of the last step. Sizes and frame stay.
+pub(crate) fn fill(state: &mut State, from: [&[f64]; 4]) {
+    let mine = [&mut state.q, &mut state.v, &mut state.a, &mut state.z];
+    for (mine, theirs) in mine.into_iter().zip(from) {
+        let count = mine.len().min(theirs.len());
+        mine[..count].copy_from_slice(&theirs[..count]);
+        mine[count..].fill(0.0);
+    }
+    state.f.fill(0.0);
+}
+
+/// Puts the frame of a state where a pose has it; a pose that is none leaves it.
+pub(crate) fn place(state: &mut State, model: &ModalModel, pose: Option<&Pose>) {
+    if let Some(frame) = pose.and_then(|pose| pose.frame(model)) {
+        state.frame = frame;
+    }
+}
