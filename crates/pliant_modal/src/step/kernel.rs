@@ -8,7 +8,7 @@ use super::{
     Frame, Hand, Hold, RigidMotion, State, StepSettings,
     constraint::Creep,
     modes::Modes,
-    patch::{Grams, Six, Tangent, tangent},
+    patch::{Grams, Six, Tangent, displacement, tangent},
     place::Place,
     solve::System,
 };
@@ -49,6 +49,9 @@ struct Solving {
     compliance: Matrix3<f64>,
     /// Relaxation time of the damper, s.
     relaxation: f64,
+    /// Where the hand is to be taken to be, m, and its velocity times the relaxation, m, world axes.
+    target: Vector3<f64>,
+    lead: Vector3<f64>,
     /// How far the patch gives way in this step because it was pulled before, m, body axes.
     crept: Vector3<f64>,
     /// From the centre of mass, m, body axes.
@@ -356,7 +359,13 @@ impl Kernel {
                 pull: hand.pull,
                 ..Solving::default()
             };
-            if let Hold::Target { config, .. } = hand.hold {
+            if let Hold::Target { target, velocity, config } = hand.hold {
+                // Targets may teleport: a hand that is a body's length away pulls no harder than from there.
+                let reach = self.model.size();
+                let local = hand.patch.rest() + displacement(&solving.from, warp);
+                let start = self.before.frame.to_world(local);
+                solving.target = start + (target - start).cap_magnitude(reach);
+                solving.lead = (config.relaxation * velocity).cap_magnitude(reach);
                 solving.crept = self.creep.crept(&hand.flow);
                 solving.relaxation = config.relaxation;
                 if config.relaxation > 0.0 {
@@ -380,21 +389,16 @@ impl Kernel {
             let gap = match hand.hold {
                 // Where the hand must have been: one that pulls so from there leaves the patch where it was.
                 Hold::Measured(there) => there + solving.compliance * (place.back * hand.pull) - along,
-                Hold::Target { target, velocity, config } => {
+                Hold::Target { config, .. } => {
                     let ahead = hand.patch.rest() + along;
-                    let mut gap = target
+                    let mut gap = solving.target
                         - place.unheld_position(&self.model, rigid, ahead)
                         - place.turn * solving.crept;
                     if config.relaxation > 0.0 {
                         let frame =
                             rigid.map_or_else(Vector3::zeros, |_| unheld.velocity_at(&self.model, ahead));
                         let speed = place.turn * (solving.tangent * solving.speed) + frame;
-                        gap += config.relaxation * (velocity - speed);
-                    }
-                    // A hand that is a body's length away pulls no harder than from there: targets may teleport.
-                    let (distance, reach) = (gap.norm(), self.model.size());
-                    if distance > reach {
-                        gap *= reach / distance;
+                        gap += solving.lead - config.relaxation * speed;
                     }
                     place.back * gap
                 }
