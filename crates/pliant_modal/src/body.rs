@@ -20,6 +20,8 @@ pub struct BodyConfig {
     pub step: f64,
     /// Default: [`Integrator::Exact`].
     pub integrator: Integrator,
+    /// See [`StepSettings::second_order`]. Default: `true`.
+    pub second_order: bool,
     /// Bend by modal warping; off, displacements stay linear and grow when the body turns. Default: `true`.
     pub warp: bool,
     /// Keep only the first so many modes; `None` keeps all. Modes are ordered, so this is the level of detail. Default: `None`.
@@ -45,6 +47,7 @@ impl Default for BodyConfig {
         Self {
             step: 1.0 / 60.0,
             integrator: Integrator::default(),
+            second_order: true,
             warp: true,
             modes: None,
             gravity: [0.0; 3],
@@ -62,6 +65,7 @@ impl BodyConfig {
     pub fn settings(&self) -> StepSettings {
         StepSettings {
             integrator: self.integrator,
+            second_order: self.second_order,
             warp: self.warp,
             corrections: self.corrections.clamp(1, StepSettings::MOST_CORRECTIONS.into()) as u8,
             gravity: self.gravity,
@@ -309,6 +313,27 @@ impl Body {
     /// No such grab.
     pub fn reaction(&self, id: GrabId) -> Result<[f64; 3], StepError> {
         Ok((-self.hands[self.find(id)?].pull).into())
+    }
+
+    /// The force over the last step that the body exerted on the hand, N, world axes: times the step it
+    /// is the impulse that the hand got. [`reaction`](Self::reaction) is the force at the step's end.
+    ///
+    /// # Errors
+    /// No such grab.
+    pub fn mean_reaction(&self, id: GrabId) -> Result<[f64; 3], StepError> {
+        Ok((-self.hands[self.find(id)?].mean).into())
+    }
+
+    /// Sets what [`mean_reaction`](Self::mean_reaction) tells, which the next step looks at. A copy of a
+    /// body that takes over a [`State`] takes over this too.
+    ///
+    /// # Errors
+    /// No such grab, a number that is not finite.
+    pub fn set_mean_reaction(&mut self, id: GrabId, force: [f64; 3]) -> Result<(), StepError> {
+        finite("mean reaction", &force)?;
+        let index = self.find(id)?;
+        self.hands[index].mean = -Vector3::from(force);
+        Ok(())
     }
 
     /// The compliance of a grab within one step (3x3, m/N, body axes): residual flexibility of the patch plus the hand's own spring. Where

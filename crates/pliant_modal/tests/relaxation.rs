@@ -341,6 +341,7 @@ fn the_state_carries_the_flow() {
     let hand = other.grab(&tip_patch(&model), GrabConfig::default()).unwrap();
     other.set_state(body.state()).unwrap();
     other.set_grab_flow(hand, body.grab_flow(grab).unwrap()).unwrap();
+    other.set_mean_reaction(hand, body.mean_reaction(grab).unwrap()).unwrap();
     other.set_target(hand, body.target(grab).unwrap()).unwrap();
     for _ in 0..30 {
         body.step().unwrap();

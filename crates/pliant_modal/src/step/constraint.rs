@@ -44,8 +44,10 @@ pub struct Hand {
     pub patch: Arc<HeldPatch>,
     /// By what it is held.
     pub hold: Hold,
-    /// Force on the body in the last step, N, world axes; minus the reaction.
+    /// Force on the body at the end of the last step, N, world axes; minus the reaction.
     pub pull: Vector3<f64>,
+    /// Force on the body over the last step, which is held constant over it, N, world axes.
+    pub mean: Vector3<f64>,
     /// How far the patch's residual flexibility has flown, m, body axes: the `z` of what the modes
     /// leave out. Zero where the material is elastic.
     pub flow: Vector3<f64>,
@@ -71,7 +73,8 @@ pub enum Hold {
 impl Hand {
     /// A hand that has not pulled yet.
     pub fn new(patch: Arc<HeldPatch>, hold: Hold) -> Self {
-        Self { patch, hold, pull: Vector3::zeros(), flow: Vector3::zeros() }
+        let zero = Vector3::zeros();
+        Self { patch, hold, pull: zero, mean: zero, flow: zero }
     }
 
     /// Spring and damper; those of a measured patch play no part.

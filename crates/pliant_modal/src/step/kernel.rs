@@ -8,7 +8,7 @@ use super::{
     Frame, Hand, Hold, RigidMotion, State, StepSettings,
     constraint::Creep,
     modes::Modes,
-    patch::{Grams, Six, Tangent, displacement, tangent},
+    patch::{Grams, Six, Tangent, tangent},
     place::Place,
     solve::System,
 };
@@ -52,11 +52,13 @@ struct Solving {
     /// Where the hand is to be taken to be, m, and its velocity times the relaxation, m, world axes.
     target: Vector3<f64>,
     lead: Vector3<f64>,
+    /// By how much more the force over the step counts in that at its end, less that of the step before.
+    beyond: f64,
     /// How far the patch gives way in this step because it was pulled before, m, body axes.
     crept: Vector3<f64>,
     /// From the centre of mass, m, body axes.
     arm: Vector3<f64>,
-    /// Force on the body, N, body axes.
+    /// Force on the body over the step, N, body axes.
     pull: Vector3<f64>,
 }
 
@@ -247,7 +249,7 @@ impl Kernel {
         }
         self.before.clone_from(state);
         let report = self.advance(state, hands, load);
-        let bad = |hand: &Hand| !hand.pull.iter().chain(&hand.flow).all(|x| x.is_finite());
+        let bad = |hand: &Hand| !hand.pull.iter().chain(&hand.mean).chain(&hand.flow).all(|x| x.is_finite());
         let what = state.non_finite().or(hands.iter().any(bad).then_some("a reaction"));
         let Some(what) = what else { return Ok(report) };
         state.clone_from(&self.before);
@@ -255,7 +257,9 @@ impl Kernel {
             state.stop();
         }
         for hand in hands {
-            (hand.pull, hand.flow) = (Vector3::zeros(), Vector3::zeros());
+            hand.pull = Vector3::zeros();
+            hand.mean = Vector3::zeros();
+            hand.flow = Vector3::zeros();
         }
         Err(StepError::Diverged { what })
     }
@@ -338,7 +342,9 @@ impl Kernel {
         for (hand, solving) in hands.iter_mut().zip(&self.solving) {
             hand.flow = self.creep.step(hand, &solving.pull);
             // Solved in body axes; hands live in the world's.
-            hand.pull = place.turn * solving.pull;
+            let mean = place.turn * solving.pull;
+            hand.pull = mean + solving.beyond * (mean - hand.mean);
+            hand.mean = mean;
         }
         report
     }
@@ -350,21 +356,28 @@ impl Kernel {
         if damped {
             self.modes.velocities(&self.before, state, self.h, &mut self.velocity);
         }
+        let beyond = self.settings.extrapolation(&self.model);
         self.solving.clear();
         for hand in hands {
             let mut solving = Solving {
                 free: hand.patch.reduce(&state.q, warp),
                 from: hand.patch.reduce(&self.before.q, warp),
                 compliance: self.creep.compliance(hand),
-                pull: hand.pull,
+                beyond,
+                pull: hand.mean,
                 ..Solving::default()
             };
             if let Hold::Target { target, velocity, config } = hand.hold {
-                // Targets may teleport: a hand that is a body's length away pulls no harder than from there.
+                // Targets may teleport: a hand that is a body's length away from where its patch belongs
+                // pulls no harder than from there.
                 let reach = self.model.size();
-                let local = hand.patch.rest() + displacement(&solving.from, warp);
-                let start = self.before.frame.to_world(local);
-                solving.target = start + (target - start).cap_magnitude(reach);
+                let rest = self.before.frame.to_world(hand.patch.rest());
+                let way = target - rest;
+                solving.target = rest + way.cap_magnitude(reach);
+                // Nor is its force one that could be extrapolated.
+                if way.norm() > reach {
+                    solving.beyond = 0.0;
+                }
                 solving.lead = (config.relaxation * velocity).cap_magnitude(reach);
                 solving.crept = self.creep.crept(&hand.flow);
                 solving.relaxation = config.relaxation;
@@ -403,6 +416,8 @@ impl Kernel {
                     place.back * gap
                 }
             };
+            // What gives way does so under the force at the end, `(1 + x) F - x F_before`.
+            let gap = gap + solving.beyond * (solving.compliance * (place.back * hand.mean));
             right.copy_from_slice(gap.as_slice());
         }
         for (i, a) in self.solving.iter().enumerate() {
@@ -416,7 +431,7 @@ impl Kernel {
                     velocity += response;
                 }
                 if i == j {
-                    position += a.compliance;
+                    position += (1.0 + a.beyond) * a.compliance;
                 }
                 for x in 0..3 {
                     for y in 0..3 {

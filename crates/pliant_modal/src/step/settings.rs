@@ -11,6 +11,12 @@ use crate::{Integrator, ModalModel, Relaxation, StepError, error::finite};
 pub struct StepSettings {
     /// How the modes are integrated. Default: [`Integrator::Exact`].
     pub integrator: Integrator,
+    /// Take a hand's force over a step for that of the step's middle, which it is, and tell the
+    /// reaction at the end as `1.5 F - 0.5 F_before`: what is felt is then of second order in the step.
+    /// Without it the force over the step is told as it is, of first order. Only the exact integrator
+    /// has a choice, the others take the force at the end anyway; and only on anchored bodies, as the
+    /// frame of a free one moves by a first-order step. Default: `true`.
+    pub second_order: bool,
     /// Bend by modal warping (Choi and Ko 2005). Without it displacements stay linear, and the body
     /// grows when it turns. Default: `true`.
     pub warp: bool,
@@ -34,6 +40,7 @@ impl Default for StepSettings {
     fn default() -> Self {
         Self {
             integrator: Integrator::default(),
+            second_order: true,
             warp: true,
             corrections: 2,
             gravity: [0.0; 3],
@@ -72,6 +79,13 @@ impl StepSettings {
             relaxation.check()?;
         }
         finite("gravity", &self.gravity)
+    }
+
+    /// By how much more than the force over a step the force at its end counts, less that of the step
+    /// before: `F_end = (1 + x) F - x F_before`.
+    pub(crate) fn extrapolation(&self, model: &ModalModel) -> f64 {
+        let second = self.second_order && self.integrator == Integrator::Exact && !model.is_free();
+        if second { 0.5 } else { 0.0 }
     }
 
     /// Angular frequency (rad/s) and damping coefficient (1/s) of a mode as it is stepped.
