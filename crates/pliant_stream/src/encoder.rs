@@ -6,13 +6,14 @@
 use std::collections::VecDeque;
 use std::sync::Arc;
 
+use nalgebra::Vector3;
 use pliant_modal::{ModalModel, StepSettings};
 
 use crate::StreamError;
 use crate::check::checksum;
 use crate::newmark::{FlowFilter, Newmark};
 use crate::quanta::Quanta;
-use crate::replica::{self, Replica};
+use crate::replica::{self, Mean, Replica};
 use crate::state::{BodyId, GrabKey, GrabState, State, Tick, TickState};
 use crate::wire::{
     AccelerationCoding, Accelerations, Frame, FrameGrab, MAX_PARTS, Payload, Repeat, RepeatGrab, Slice,
@@ -82,6 +83,9 @@ pub struct Encoder {
     replica: Replica,
     mirror: State,
     truth: State,
+    /// The hands' forces over the last step, in the mirror and in truth.
+    mirror_means: Vec<Mean>,
+    truth_means: Vec<Mean>,
     load: Vec<f64>,
     unexplained: Vec<f64>,
     loaded: bool,
@@ -152,6 +156,8 @@ impl Encoder {
             replica,
             mirror: rest.clone(),
             truth: rest,
+            mirror_means: Vec::new(),
+            truth_means: Vec::new(),
             load: vec![0.0; modes],
             unexplained: vec![0.0; modes],
             loaded: false,
@@ -205,6 +211,11 @@ impl Encoder {
             a: self.mirror.a.clone(),
             z: self.mirror.z.clone(),
             load: if self.load.iter().any(|x| *x != 0.0) { self.load.clone() } else { Vec::new() },
+            means: self
+                .mirror_means
+                .iter()
+                .map(|(key, mean)| (key.user.0, key.grab, (*mean).into()))
+                .collect(),
             resting,
         }
     }
@@ -224,6 +235,10 @@ impl Encoder {
             self.mirror.a.fill(0.0);
         }
         self.truth.clone_from(&self.mirror);
+        // What they were over the last step nobody says; a hand that changes slowly had nearly what it has.
+        self.truth_means.clear();
+        self.truth_means.extend(state.grabs.iter().map(|g| (g.key, -Vector3::from(g.reaction))));
+        self.mirror_means.clone_from(&self.truth_means);
         self.load.fill(0.0);
         self.unexplained.fill(0.0);
         self.loaded = false;
@@ -433,14 +448,21 @@ impl Encoder {
             let mut lacking = std::mem::take(&mut self.scratch);
             let to = [state.q, state.v];
             self.truth.f.clone_from(&self.mirror.f);
-            self.replica.lacking(&mut self.truth, to, grabs, &self.load, &mut lacking);
+            let mut means = self.truth_means.clone();
+            self.replica.lacking(&mut self.truth, to, grabs, &self.load, &mut means, &mut lacking);
             let share = LOAD_EVERY as f64 / LOAD_TICKS;
             for ((told, load), lacking) in self.unexplained.iter_mut().zip(&self.load).zip(&lacking) {
                 *told += (load + lacking - *told) * share;
             }
             self.scratch = lacking;
         }
-        self.replica.step_measured(&mut self.mirror, grabs, &self.load);
+        let means = &mut self.mirror_means;
+        self.replica.step_measured(&mut self.mirror, grabs, &self.load, means);
+        let before = std::mem::take(&mut self.truth_means);
+        self.truth_means.extend(grabs.iter().map(|g| {
+            let (key, end) = (g.state.key, -Vector3::from(g.state.reaction));
+            (key, self.replica.mean(end, replica::mean_of(&before, key)))
+        }));
         if !self.loaded {
             let omega = self.replica.kernel().omega();
             let static_part = |k: usize| self.unexplained[k].abs() / omega[k].powi(2).max(1e-12);

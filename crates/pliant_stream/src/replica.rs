@@ -9,11 +9,19 @@ use pliant_modal::{
 };
 
 use crate::StreamError;
-use crate::state::{GrabState, Pose};
+use crate::state::{GrabKey, GrabState, Pose};
 use crate::wire::FrameGrab;
 
 /// Patches remembered at a time; a new one beyond that empties the table.
 const PATCHES: usize = 256;
+
+/// The force of a hand on a body over the last step, N, world axes; see [`Hand::mean`].
+pub(crate) type Mean = (GrabKey, Vector3<f64>);
+
+/// Of a hand, zero where there is none yet.
+pub(crate) fn mean_of(means: &[Mean], key: GrabKey) -> Vector3<f64> {
+    means.iter().find(|(known, _)| *known == key).map_or_else(Vector3::zeros, |(_, mean)| *mean)
+}
 
 /// Names a patch: vertex, bits of the radius.
 type Key = (u32, u64);
@@ -24,6 +32,7 @@ pub(crate) struct Replica {
     kernel: Kernel,
     patches: Vec<(Key, Arc<HeldPatch>)>,
     hands: Vec<Hand>,
+    keys: Vec<GrabKey>,
     implied: ImpliedPulls,
 }
 
@@ -37,7 +46,7 @@ impl Replica {
     ) -> Result<Self, StreamError> {
         let kernel = Kernel::new(model, settings, modes, h).map_err(|e| StreamError::Model(e.to_string()))?;
         let implied = ImpliedPulls::new(&kernel);
-        Ok(Self { kernel, patches: Vec::new(), hands: Vec::new(), implied })
+        Ok(Self { kernel, patches: Vec::new(), hands: Vec::new(), keys: Vec::new(), implied })
     }
 
     pub(crate) fn kernel(&self) -> &Kernel {
@@ -86,14 +95,41 @@ impl Replica {
     /// place is not, and a small error would grow. This way the receiver is an observer: the pull is
     /// the measured one when the state is right, and otherwise draws the patches to their places as the
     /// grab does, so errors die as they would in the held body. A grab whose vertex the model has not
-    /// got pulls nothing.
-    pub(crate) fn step_measured(&mut self, state: &mut State, grabs: &[FrameGrab], load: &[f64]) {
-        let mut hands = std::mem::take(&mut self.hands);
+    /// got pulls nothing. `means`: the hands' forces over the step before, and then over this one.
+    pub(crate) fn step_measured(
+        &mut self,
+        state: &mut State,
+        grabs: &[FrameGrab],
+        load: &[f64],
+        means: &mut Vec<Mean>,
+    ) {
+        let (mut hands, mut keys) = (std::mem::take(&mut self.hands), std::mem::take(&mut self.keys));
         hands.clear();
-        hands.extend(grabs.iter().filter_map(|g| self.measured(g)));
+        keys.clear();
+        for g in grabs {
+            if let Some(hand) = self.measured(g) {
+                hands.push(Hand { mean: mean_of(means, g.state.key), ..hand });
+                keys.push(g.state.key);
+            }
+        }
         let load = Load { modal: load, frame_is_given: true, ..Load::default() };
         self.step(state, &mut hands, &load);
-        self.hands = hands;
+        means.clear();
+        means.extend(keys.iter().copied().zip(hands.iter().map(|hand| hand.mean)));
+        (self.hands, self.keys) = (hands, keys);
+    }
+
+    /// The force of a hand at the end of a step from those over this step and the one `before`, N.
+    pub(crate) fn end(&self, mean: Vector3<f64>, before: Vector3<f64>) -> Vector3<f64> {
+        let beyond = self.kernel.settings().extrapolation(self.kernel.model());
+        mean + beyond * (mean - before)
+    }
+
+    /// The force over a step of a hand whose force at the end of it is told (N, world axes), as it was
+    /// `before` over the step before.
+    pub(crate) fn mean(&self, end: Vector3<f64>, before: Vector3<f64>) -> Vector3<f64> {
+        let beyond = self.kernel.settings().extrapolation(self.kernel.model());
+        (end + beyond * before) / (1.0 + beyond)
     }
 
     /// Where a patch is at `q`, as displacement from rest in body axes, m; zero for a vertex that the
@@ -112,9 +148,10 @@ impl Replica {
         to: [&[f64]; 2],
         grabs: &[FrameGrab],
         load: &[f64],
+        means: &mut Vec<Mean>,
         out: &mut Vec<f64>,
     ) {
-        self.step_measured(from, grabs, load);
+        self.step_measured(from, grabs, load, means);
         out.clear();
         let [by_q, by_v, _] = self.kernel.responses();
         for (k, omega) in self.kernel.omega().iter().enumerate() {

@@ -9,7 +9,7 @@ use std::time::Duration;
 use pliant_modal::{ModalModel, Relaxation};
 use pliant_stream::emulator::{Loss, Trace};
 use pliant_stream::peer::{
-    HeldAt, InputTick, PeerBodyState, PeerDatagram, PeerFrame, PeerMessage, StateCheck,
+    HeldAt, InputTick, PeerBodyState, PeerDatagram, PeerFrame, PeerGrip, PeerMessage, StateCheck,
 };
 
 use pliant_stream::quanta::Quanta;
@@ -221,6 +221,7 @@ fn real_inputs() -> Vec<Vec<u8>> {
         a: vec![2.0; 9],
         z: vec![0.25; 9],
         load: Vec::new(),
+        means: vec![(1, 2, [0.5, -3.0, 1.0])],
         resting: false,
     };
     let info = BodyInfo {
@@ -264,7 +265,7 @@ fn real_inputs() -> Vec<Vec<u8>> {
         z: Vec::new(),
         force: vec![0.0; 4],
         frame: Some(frame),
-        pulls: vec![(1, 2, [0.5; 3], [0.0; 3])],
+        pulls: vec![PeerGrip { user: 1, grab: 2, pull: [0.5; 3], mean: [0.25; 3], flow: [0.0; 3] }],
     };
     all.push(PeerMessage::State { tick: 7, now: 9, bodies: vec![body] }.encode());
     all.push(b"12.5\nlost # a comment\n13\n".to_vec());

@@ -6,7 +6,7 @@ mod support;
 use std::time::Duration;
 
 use pliant_stream::peer::{PeerConfig, PeerDatagram, PeerEvent, PeerSession};
-use pliant_stream::wire::{BodyInfo, GuestMessage, HostMessage};
+use pliant_stream::wire::{BodyInfo, GuestMessage, HostMessage, PROTOCOL_VERSION};
 use pliant_stream::{
     Channel, EndReason, GuestConfig, GuestEvent, GuestSession, HostSession, Newmark, PeerId, StepSettings,
     StreamError,
@@ -36,7 +36,14 @@ fn a_host_cannot_make_a_guest_hold_more_than_its_bound() {
         guest.connect(now).unwrap();
         let newmark = Newmark::average(0.025);
         let (beta, gamma, users) = (newmark.beta, newmark.gamma, Vec::new());
-        let welcome = HostMessage::Welcome { version: 1, user: 1, step_ns: 25_000_000, beta, gamma, users };
+        let welcome = HostMessage::Welcome {
+            version: PROTOCOL_VERSION,
+            user: 1,
+            step_ns: 25_000_000,
+            beta,
+            gamma,
+            users,
+        };
         guest.on_message(now, &welcome.encode());
         // A whole model, then the first bytes of one that says to be as large: it counts as what it will be.
         let hash = model.hash().0;

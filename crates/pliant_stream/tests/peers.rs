@@ -12,6 +12,7 @@ use pliant_stream::peer::{
     HeldAt, InputTick, PeerBodyState, PeerConfig, PeerDatagram, PeerEvent, PeerMessage, PeerSession, Repair,
     StateCheck,
 };
+use pliant_stream::wire::PROTOCOL_VERSION;
 use pliant_stream::{BodyId, Channel, EndReason, PeerId, StepSettings, UserId};
 use proptest::prelude::*;
 use support::{bar, loose_bar};
@@ -444,7 +445,12 @@ fn a_peer_under_another_number_than_the_one_it_was_given_is_turned_away() {
         let mut p = PeerSession::new(config).unwrap();
         p.add_body(BODY, bar(4, 0.05), &StepSettings::default()).unwrap();
         p.connect(Duration::ZERO, PeerId(7), UserId(8), 1200).unwrap();
-        let hello = |user| PeerMessage::Hello { version: 1, user, name: "other".into(), joining: false };
+        let hello = |user| PeerMessage::Hello {
+            version: PROTOCOL_VERSION,
+            user,
+            name: "other".into(),
+            joining: false,
+        };
         p.on_message(MS, PeerId(7), &hello(claimed).encode());
         let turned = PeerEvent::TurnedAway { peer: PeerId(7), reason: EndReason::Protocol };
         assert_eq!(p.poll_event(), Some(turned), "as {claimed}");

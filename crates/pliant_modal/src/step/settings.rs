@@ -83,7 +83,7 @@ impl StepSettings {
 
     /// By how much more than the force over a step the force at its end counts, less that of the step
     /// before: `F_end = (1 + x) F - x F_before`.
-    pub(crate) fn extrapolation(&self, model: &ModalModel) -> f64 {
+    pub fn extrapolation(&self, model: &ModalModel) -> f64 {
         let second = self.second_order && self.integrator == Integrator::Exact && !model.is_free();
         if second { 0.5 } else { 0.0 }
     }

@@ -15,9 +15,7 @@ use std::time::{Duration, Instant};
 use bevy::prelude::*;
 use bevy::tasks::Task;
 use pliant_modal::ModalModel;
-use pliant_stream::{
-    BodyId, BodyView, GuestSession, LinkStats, State, PeerId, RecoveryConfig, Tick, UserId,
-};
+use pliant_stream::{BodyId, BodyView, GuestSession, LinkStats, PeerId, RecoveryConfig, State, Tick, UserId};
 
 use crate::figures::{Ledger, NetStats};
 use crate::scene::{Person, Reach};

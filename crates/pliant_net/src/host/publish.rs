@@ -8,7 +8,7 @@ use bevy::prelude::*;
 use bevy::tasks::{AsyncComputeTaskPool, block_on, poll_once};
 use pliant_body::{BodyState, Driven, Grab, GrabForce, Grabs, PliantTick};
 use pliant_modal::ModalModel;
-use pliant_stream::{BodyId, StepSettings, GrabKey, GrabState, Pose, TickState, UserId};
+use pliant_stream::{BodyId, GrabKey, GrabState, Pose, StepSettings, TickState, UserId};
 
 use super::NetHost;
 use super::hands::GuestGrab;
@@ -19,8 +19,8 @@ use crate::user::{User, UserLink};
 pub(super) struct HostedBody {
     pub(super) id: BodyId,
     model: Arc<ModalModel>,
-    setup: StepSettings,
-    /// When the guests were told of the setup.
+    settings: StepSettings,
+    /// When the guests were told of the settings.
     told: Duration,
     pub(super) placed: GlobalTransform,
     /// A refusal to publish was logged; once is enough.
@@ -132,24 +132,18 @@ impl NetHost {
         transform: &GlobalTransform,
     ) -> Option<BodyId> {
         let config = state.body().config();
-        let setup = StepSettings {
-            integrator: config.integrator,
-            warp: config.warp,
-            damping_scale: config.damping_scale,
-            stiffness_scale: config.stiffness_scale,
-            // An anchored body's weight turns with its entity: the stream learns it.
-            gravity: if state.model().is_free() { config.gravity } else { [0.0; 3] },
-            relaxation: config.relaxation,
-        };
+        // An anchored body's weight turns with its entity: the stream learns it.
+        let gravity = if state.model().is_free() { config.gravity } else { [0.0; 3] };
+        let settings = StepSettings { gravity, ..config.settings() };
         let model = state.model();
         let now = self.now();
         if let Some(hosted) = self.bodies.get_mut(&entity) {
             if Arc::ptr_eq(&hosted.model, model) {
                 let id = hosted.id;
                 // Until they are told the stream learns of it from the state, as of any force that is not known.
-                if hosted.setup != setup && now.saturating_sub(hosted.told) >= SETTINGS_EVERY {
-                    (hosted.setup, hosted.told) = (setup, now);
-                    if let Err(error) = self.session.set_setup(id, setup) {
+                if hosted.settings != settings && now.saturating_sub(hosted.told) >= SETTINGS_EVERY {
+                    (hosted.settings, hosted.told) = (settings, now);
+                    if let Err(error) = self.session.set_settings(id, settings) {
                         warn_once!("a body's settings are not shared: {error}");
                     }
                 }
@@ -167,12 +161,12 @@ impl NetHost {
         // Numbers go round; one that is in use is refused, and the next tick tries the next.
         let id = BodyId(self.next_body);
         self.next_body = self.next_body.wrapping_add(1);
-        match self.session.add_body_as(id, &shared.name, Arc::clone(model), bytes, setup) {
+        match self.session.add_body_as(id, &shared.name, Arc::clone(model), bytes, settings) {
             Ok(()) => {
                 let model = Arc::clone(model);
                 self.bodies.insert(
                     entity,
-                    HostedBody { id, model, setup, told: now, placed: *transform, faulted: false },
+                    HostedBody { id, model, settings, told: now, placed: *transform, faulted: false },
                 );
                 self.tell_place(Placement::new(id, transform), None);
                 Some(id)

@@ -15,7 +15,7 @@ use std::time::{Duration, Instant};
 use bevy::prelude::*;
 use pliant_body::{BodyState, Driven, ModalBody};
 use pliant_stream::peer::{PeerConfig as SessionConfig, PeerSession, Repair};
-use pliant_stream::{BodyId, StepSettings, LinkStats, PeerId, UserId};
+use pliant_stream::{BodyId, LinkStats, PeerId, UserId};
 
 use crate::figures::{Ledger, NetStats};
 use crate::scene::{self, SharedBody};
@@ -265,7 +265,7 @@ impl NetPeer {
         };
         let made = PeerSession::new(config).and_then(|mut session| {
             for (&id, played) in &self.bodies {
-                session.add_body(id, played.model.clone(), &played.setup)?;
+                session.add_body(id, played.model.clone(), &played.settings)?;
             }
             Ok(session)
         });
@@ -293,21 +293,13 @@ impl NetPeer {
         let mut shared = world.query::<(Entity, &SharedBody, &ModalBody, Option<&BodyState>)>();
         for (entity, name, _, state) in shared.iter(world) {
             let Some(state) = state else { return false };
-            let config = state.body().config();
-            let setup = StepSettings {
-                integrator: config.integrator,
-                warp: config.warp,
-                damping_scale: config.damping_scale,
-                stiffness_scale: config.stiffness_scale,
-                gravity: config.gravity,
-                relaxation: config.relaxation,
-            };
+            let settings = state.body().config().settings();
             let id = number_of(&name.name);
             if found.contains_key(&id) || found.len() >= message::MOST_BODIES {
                 warn_once!("{} is left out: another body has its number", name.name);
                 continue;
             }
-            found.insert(id, PlayedBody::new(entity, state.model().clone(), setup));
+            found.insert(id, PlayedBody::new(entity, state.model().clone(), settings));
         }
         if found.is_empty() {
             return false;

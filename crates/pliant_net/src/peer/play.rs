@@ -5,7 +5,7 @@ use std::sync::Arc;
 use bevy::prelude::*;
 use pliant_body::{BodyState, Grab, GrabForce, GrabOf, ShownState};
 use pliant_modal::ModalModel;
-use pliant_stream::{BodyId, StepSettings, GrabKey, Pose, UserId};
+use pliant_stream::{BodyId, GrabKey, Pose, StepSettings, UserId};
 
 use super::{NetPeer, PeerState};
 use crate::felt::PatchPoint;
@@ -17,7 +17,7 @@ use crate::seen::{SeenHand, SeenHands};
 pub(super) struct PlayedBody {
     pub(super) entity: Entity,
     pub(super) model: Arc<ModalModel>,
-    pub(super) setup: StepSettings,
+    pub(super) settings: StepSettings,
     phase: Phase,
     tick: u64,
     previous: (Vec<f64>, Option<Pose>),
@@ -25,11 +25,11 @@ pub(super) struct PlayedBody {
 }
 
 impl PlayedBody {
-    pub(super) fn new(entity: Entity, model: Arc<ModalModel>, setup: StepSettings) -> Self {
+    pub(super) fn new(entity: Entity, model: Arc<ModalModel>, settings: StepSettings) -> Self {
         Self {
             entity,
             model,
-            setup,
+            settings,
             phase: Phase::default(),
             tick: 0,
             previous: (Vec::new(), None),

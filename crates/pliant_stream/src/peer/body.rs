@@ -6,7 +6,7 @@ use nalgebra::{UnitQuaternion, Vector3};
 use pliant_modal::{Frame, GrabConfig, Hand, Hold, Load, ModalModel, StepSettings};
 
 use super::inputs::{InputLog, WINDOW};
-use super::wire::{HeldAt, PeerBodyState, PeerFrame};
+use super::wire::{HeldAt, PeerBodyState, PeerFrame, PeerGrip};
 use crate::StreamError;
 use crate::check::{checksum, projection};
 use crate::newmark::{FlowFilter, Newmark};
@@ -30,8 +30,9 @@ pub enum Repair {
 #[derive(Debug, Clone, Copy, PartialEq)]
 struct Grip {
     key: GrabKey,
-    /// World axes, N.
+    /// At the end of the step, and over it, world axes, N.
     pull: Vector3<f64>,
+    mean: Vector3<f64>,
     /// How far the residual flexibility of its patch has flown, body axes, m.
     flow: Vector3<f64>,
 }
@@ -199,7 +200,13 @@ impl PeerBody {
             pulls: past
                 .pulls
                 .iter()
-                .map(|g| (g.key.user.0, g.key.grab, g.pull.into(), g.flow.into()))
+                .map(|g| PeerGrip {
+                    user: g.key.user.0,
+                    grab: g.key.grab,
+                    pull: g.pull.into(),
+                    mean: g.mean.into(),
+                    flow: g.flow.into(),
+                })
                 .collect(),
         })
     }
@@ -221,10 +228,11 @@ impl PeerBody {
             return false;
         }
         let before = std::mem::replace(&mut self.state, told);
-        let pull = |p: &(u16, u16, [f64; 3], [f64; 3])| Grip {
-            key: GrabKey { user: UserId(p.0), grab: p.1 },
-            pull: p.2.into(),
-            flow: p.3.into(),
+        let pull = |p: &PeerGrip| Grip {
+            key: GrabKey { user: UserId(p.user), grab: p.grab },
+            pull: p.pull.into(),
+            mean: p.mean.into(),
+            flow: p.flow.into(),
         };
         self.pulls = state.pulls.iter().map(pull).collect();
         let fresh = self.tick == 0;
@@ -355,14 +363,17 @@ impl PeerBody {
             let (velocity, config) = (Vector3::zeros(), GrabConfig::default());
             let hand = Hand::new(patch, Hold::Target { target: g.target.into(), velocity, config });
             hands.push(match pulls.iter().find(|p| p.key == key) {
-                Some(before) => Hand { pull: before.pull, flow: before.flow, ..hand },
+                Some(before) => Hand { pull: before.pull, mean: before.mean, flow: before.flow, ..hand },
                 None => hand,
             });
             keys.push(key);
         }
         replica.step(state, &mut hands, &Load::default());
         pulls.clear();
-        let grip = |(key, hand): (GrabKey, &Hand)| Grip { key, pull: hand.pull, flow: hand.flow };
+        let grip = |(key, hand): (GrabKey, &Hand)| {
+            let &Hand { pull, mean, flow, .. } = hand;
+            Grip { key, pull, mean, flow }
+        };
         pulls.extend(keys.into_iter().zip(&hands).map(grip));
     }
 

@@ -18,4 +18,6 @@ mod wire;
 pub use body::{PeerBody, Repair};
 pub use config::{PeerConfig, PeerEvent};
 pub use session::PeerSession;
-pub use wire::{HeldAt, InputTick, PeerBodyState, PeerDatagram, PeerFrame, PeerMessage, StateCheck};
+pub use wire::{
+    HeldAt, InputTick, PeerBodyState, PeerDatagram, PeerFrame, PeerGrip, PeerMessage, StateCheck,
+};

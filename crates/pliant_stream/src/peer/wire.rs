@@ -239,9 +239,23 @@ pub struct PeerBodyState {
     pub force: Vec<f64>,
     /// The rigid frame of a free body.
     pub frame: Option<PeerFrame>,
-    /// Pulls of the last step: user, grab, force (N, world axes), and how far the residual flexibility of the patch has flown
-    /// (m, body axes).
-    pub pulls: Vec<(u16, u16, [f64; 3], [f64; 3])>,
+    /// The hands on it, as of the last step.
+    pub pulls: Vec<PeerGrip>,
+}
+
+/// What one hand did in the last step of a [`PeerBodyState`].
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
+pub struct PeerGrip {
+    /// Whose hand.
+    pub user: u16,
+    /// Which of the user's.
+    pub grab: u16,
+    /// Force on the body at the end of the step, N, world axes.
+    pub pull: [f64; 3],
+    /// Force on it over the step, N, world axes.
+    pub mean: [f64; 3],
+    /// How far the residual flexibility of the patch has flown, m, body axes.
+    pub flow: [f64; 3],
 }
 
 /// Reliable, between peers.
@@ -322,7 +336,9 @@ impl PeerMessage {
                         && b.a.iter().chain(&b.force).all(|x| x.abs() < 1e15)
                         && in_range(&b.z)
                         && (b.z.is_empty() || b.z.len() == modes)
-                        && b.pulls.iter().all(|p| in_range(&p.2) && in_range(&p.3));
+                        && b.pulls
+                            .iter()
+                            .all(|p| [&p.pull, &p.mean, &p.flow].into_iter().all(|x| in_range(x)));
                     if !(equal && sane) {
                         return invalid("state", "a number or length out of range".into(), "finite numbers");
                     }

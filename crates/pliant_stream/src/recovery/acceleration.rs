@@ -4,7 +4,7 @@ use pliant_modal::Relaxation;
 
 use super::{HISTORY, History, Predict, Recovery};
 use crate::newmark::{FlowFilter, Newmark};
-use crate::replica;
+use crate::replica::{self, Mean};
 use crate::state::{State, Tick};
 
 /// Integrates the accelerations; predicts those that are missing; takes their error out exactly when they come.
@@ -74,7 +74,7 @@ impl AccelerationDriven {
 }
 
 impl Recovery for AccelerationDriven {
-    fn restart(&mut self, tick: Tick, state: &State, _load: &[f64]) {
+    fn restart(&mut self, tick: Tick, state: &State, _load: &[f64], _means: &[Mean]) {
         replica::fill(&mut self.state, [&state.q, &state.v, &state.a, &state.z]);
         self.tick = tick;
         self.first = tick;

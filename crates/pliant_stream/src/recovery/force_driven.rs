@@ -1,7 +1,7 @@
 //! The better way: the receiver owns the damped model and steps it with the streamed reactions.
 
 use super::{Forecast, HISTORY, History, Recovery};
-use crate::replica::{self, Replica};
+use crate::replica::{self, Mean, Replica};
 use crate::state::{State, Tick};
 use crate::wire::FrameGrab;
 
@@ -10,6 +10,7 @@ use crate::wire::FrameGrab;
 struct Stepped {
     tick: Tick,
     state: State,
+    means: Vec<Mean>,
 }
 
 /// Steps the modal recurrence with the reactions. What was stepped on a guess is stepped again when the truth comes.
@@ -20,6 +21,7 @@ pub struct ForceDriven {
     first: Tick,
     state: State,
     load: Vec<f64>,
+    means: Vec<Mean>,
     past: Vec<Stepped>,
     grabs: Vec<FrameGrab>,
     forecast: Forecast,
@@ -33,6 +35,7 @@ impl ForceDriven {
             tick: 0,
             first: 0,
             load: vec![0.0; state.modes()],
+            means: Vec::new(),
             state,
             past: vec![Stepped::default(); HISTORY],
             grabs: Vec::new(),
@@ -45,6 +48,7 @@ impl ForceDriven {
         let slot = &mut self.past[(tick % HISTORY as u64) as usize];
         slot.tick = tick;
         slot.state.clone_from(&self.state);
+        slot.means.clone_from(&self.means);
     }
 
     fn step_to(&mut self, tick: Tick, history: &History) {
@@ -59,7 +63,7 @@ impl ForceDriven {
             let pose = history.pose(tick, self.replica.kernel().h());
             replica::place(&mut self.state, self.replica.model(), pose.as_ref());
         }
-        self.replica.step_measured(&mut self.state, &self.grabs, &self.load);
+        self.replica.step_measured(&mut self.state, &self.grabs, &self.load, &mut self.means);
         self.take_slice(tick, history);
         self.remember(tick);
     }
@@ -79,7 +83,7 @@ impl ForceDriven {
 }
 
 impl Recovery for ForceDriven {
-    fn restart(&mut self, tick: Tick, state: &State, load: &[f64]) {
+    fn restart(&mut self, tick: Tick, state: &State, load: &[f64], means: &[Mean]) {
         let modes = self.state.modes();
         let fill = |mine: &mut Vec<f64>, theirs: &[f64]| {
             mine.clear();
@@ -87,6 +91,8 @@ impl Recovery for ForceDriven {
         };
         replica::fill(&mut self.state, [&state.q, &state.v, &state.a, &state.z]);
         fill(&mut self.load, load);
+        self.means.clear();
+        self.means.extend_from_slice(means);
         (self.tick, self.first) = (tick, tick);
         self.remember(tick);
     }
@@ -105,6 +111,7 @@ impl Recovery for ForceDriven {
             return false;
         }
         self.state.clone_from(&base.state);
+        self.means.clone_from(&base.means);
         for tick in from..=self.tick {
             self.step_to(tick, history);
         }
@@ -121,6 +128,10 @@ impl Recovery for ForceDriven {
 
     fn load(&self) -> &[f64] {
         &self.load
+    }
+
+    fn means(&self) -> &[Mean] {
+        &self.means
     }
 
     fn driven_by_reactions(&self) -> bool {

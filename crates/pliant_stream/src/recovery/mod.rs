@@ -20,15 +20,18 @@ pub use passivity::PassivityGuard;
 pub use pose_blend::PoseBlend;
 pub use receiver::{Arrival, Receiver, RepairCounts, ShownGrab};
 
-use crate::state::{State, Tick};
+use nalgebra::Vector3;
+
+use crate::state::{GrabKey, State, Tick};
 
 /// How a receiver turns what arrived into its best estimate of the host's state.
 ///
 /// The [`Receiver`] calls it: [`Recovery::advance`] once per tick in order, [`Recovery::correct`] when data for ticks
 /// that were already stepped arrived late, and blends the difference away from what is shown.
 pub trait Recovery: Send + Sync {
-    /// Takes a state over as true after `tick`.
-    fn restart(&mut self, tick: Tick, state: &State, load: &[f64]);
+    /// Takes a state over as true after `tick`, with the modal forces that the reactions do not explain
+    /// and the forces of the hands over the last step (N, world axes).
+    fn restart(&mut self, tick: Tick, state: &State, load: &[f64], means: &[(GrabKey, Vector3<f64>)]);
 
     /// Steps to `tick`, one beyond the last, with its data where `history` has it and a prediction where not.
     fn advance(&mut self, tick: Tick, history: &History);
@@ -45,6 +48,11 @@ pub trait Recovery: Send + Sync {
 
     /// Modal forces that the reactions do not explain, as far as they are known; empty for none.
     fn load(&self) -> &[f64] {
+        &[]
+    }
+
+    /// The forces of the hands over the last step, N, world axes, as far as they are known.
+    fn means(&self) -> &[(GrabKey, Vector3<f64>)] {
         &[]
     }
 

@@ -12,8 +12,8 @@ use crate::StreamError;
 use crate::check::checksum;
 use crate::newmark::Newmark;
 use crate::quanta::Quanta;
-use crate::replica::{self, Replica};
-use crate::state::{GrabState, Pose, State, Tick};
+use crate::replica::{self, Mean, Replica};
+use crate::state::{GrabKey, GrabState, Pose, State, Tick, UserId};
 use crate::wire::{Frame, SnapshotBytes};
 
 /// Disagreeing checksums in a row before a snapshot is wanted: a slice or a repair may be under way.
@@ -72,6 +72,8 @@ pub struct Receiver {
     /// The tick of `grabs`, and what was shown at the two ticks before it, the newer first.
     grabs_at: Tick,
     trail: [Vec<ShownGrab>; 2],
+    /// The forces over the steps to this tick and to the one before, where they are computed.
+    implied: [Vec<Mean>; 2],
     /// The best estimate of the rigid frame at the shown tick, and what is shown of it.
     frame: Option<Pose>,
     pose: Option<Pose>,
@@ -147,6 +149,7 @@ impl Receiver {
             grabs: Vec::new(),
             grabs_at: snapshot.tick,
             trail: [Vec::new(), Vec::new()],
+            implied: [Vec::new(), Vec::new()],
             frame: None,
             pose: None,
             pose_blend: PoseBlend::new(newmark.h, blend_ticks),
@@ -160,7 +163,7 @@ impl Receiver {
             h: newmark.h,
             blend_ticks,
         };
-        receiver.policy.restart(snapshot.tick, &state_of(snapshot), &snapshot.load);
+        receiver.policy.restart(snapshot.tick, &state_of(snapshot), &snapshot.load, &means_of(snapshot));
         receiver.shown.clone_from(receiver.policy.hidden());
         Ok(receiver)
     }
@@ -183,6 +186,10 @@ impl Receiver {
     /// Best estimate of the rigid frame at the shown tick, where the body is free.
     pub(crate) fn frame(&self) -> Option<Pose> {
         self.frame
+    }
+
+    pub(crate) fn means(&self) -> &[Mean] {
+        self.policy.means()
     }
 
     pub(crate) fn load(&self) -> &[f64] {
@@ -312,7 +319,7 @@ impl Receiver {
             return;
         }
         self.remember_before();
-        self.policy.restart(snapshot.tick, &state_of(snapshot), &snapshot.load);
+        self.policy.restart(snapshot.tick, &state_of(snapshot), &snapshot.load, &means_of(snapshot));
         if self.history.highest() > snapshot.tick + HISTORY as u64 {
             // Something claimed to come from the future: what is true now would look too old to be used.
             self.history = History::new(snapshot.tick);
@@ -356,7 +363,8 @@ impl Receiver {
             z: self.before.z.clone(),
             ..State::zero(self.before.modes(), false)
         };
-        self.policy.restart(tick, &rest, &[]);
+        let means = self.policy.means().to_vec();
+        self.policy.restart(tick, &rest, &[], &means);
         self.tick = tick;
         self.show();
     }
@@ -394,7 +402,9 @@ impl Receiver {
             self.trail.swap(0, 1);
             std::mem::swap(&mut self.trail[0], &mut self.grabs);
             self.grabs_at = self.tick;
+            self.implied.swap(0, 1);
         }
+        self.implied[0].clear();
         self.grabs.clear();
         match self.history.known(self.tick) {
             Some(data) => self.grabs.extend(data.grabs.iter().map(|g| g.state)),
@@ -420,6 +430,14 @@ impl Receiver {
         } else {
             replica::place(&mut self.shown, self.replica.model(), self.pose.as_ref());
             self.replica.reactions(&self.shown, &mut self.grabs);
+            // An acceleration has the force over its step in it; what is felt is the force at the end.
+            for g in &mut self.grabs {
+                let mean = -nalgebra::Vector3::from(g.reaction);
+                if let Some((_, before)) = self.implied[1].iter().find(|(key, _)| *key == g.key) {
+                    g.reaction = (-self.replica.end(mean, *before)).into();
+                }
+                self.implied[0].push((g.key, mean));
+            }
         }
     }
 
@@ -462,6 +480,13 @@ impl Receiver {
             self.counts.mismatches += 1;
         }
     }
+}
+
+fn means_of(snapshot: &SnapshotBytes) -> Vec<Mean> {
+    let of = |&(user, grab, pull): &(u16, u16, [f64; 3])| {
+        (GrabKey { user: UserId(user), grab }, nalgebra::Vector3::from(pull))
+    };
+    snapshot.means.iter().map(of).collect()
 }
 
 fn state_of(snapshot: &SnapshotBytes) -> State {

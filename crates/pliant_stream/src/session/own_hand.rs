@@ -15,7 +15,7 @@ use nalgebra::Vector3;
 use pliant_modal::{Frame, GrabConfig, Hand, Hold, Load, RigidMotion};
 
 use crate::recovery::{Blend, Forecast, PoseBlend, Receiver};
-use crate::replica::{self, Replica};
+use crate::replica::{self, Mean, Replica};
 use crate::state::{GrabKey, Pose, State, Tick, UserId};
 
 /// Targets remembered, and so the largest lead, ticks.
@@ -54,6 +54,8 @@ pub struct OwnHand {
     tick: Tick,
     active: bool,
     state: State,
+    /// The forces over the last step of all hands of `state`, N, world axes.
+    means: Vec<Mean>,
     expected: State,
     shown: State,
     blend: Blend,
@@ -66,6 +68,7 @@ pub struct OwnHand {
     forecast: Forecast,
     fade: f64,
     hands: Vec<Hand>,
+    keys: Vec<GrabKey>,
     own: Vec<usize>,
 }
 
@@ -80,6 +83,7 @@ impl OwnHand {
             tick: 0,
             active: false,
             state: rest.clone(),
+            means: Vec::new(),
             expected: rest.clone(),
             shown: rest,
             blend: Blend::new(h, blend_ticks),
@@ -90,6 +94,7 @@ impl OwnHand {
             forecast: Forecast::new(h),
             fade: (-3.0 / f64::from(blend_ticks.max(1))).exp(),
             hands: Vec::new(),
+            keys: Vec::new(),
             own: Vec::new(),
         }
     }
@@ -208,7 +213,8 @@ impl OwnHand {
         // What the copy would have become, had nothing new been learnt.
         let mut expected = std::mem::take(&mut self.expected);
         expected.clone_from(&self.state);
-        self.one_step(&mut expected, receiver, user, self.lead);
+        let mut means = std::mem::take(&mut self.means);
+        self.one_step(&mut expected, &mut means, receiver, user, self.lead);
         for g in &mut self.grabs {
             g.would = g.reaction;
         }
@@ -224,9 +230,12 @@ impl OwnHand {
             let told = receiver.grabs().iter().find(|told| told.key == key);
             g.reaction = told.map_or(g.reaction, |told| told.reaction);
         }
+        means.clear();
+        means.extend_from_slice(receiver.means());
         for j in 1..=self.lead {
-            self.one_step(&mut state, receiver, user, j);
+            self.one_step(&mut state, &mut means, receiver, user, j);
         }
+        self.means = means;
         self.blend.advance();
         self.blend.add(
             expected.q.iter().zip(&state.q).map(|(e, s)| e - s),
@@ -285,30 +294,42 @@ impl OwnHand {
         let turn = receiver.frame().and_then(|p| p.frame(self.replica.model())).unwrap_or_default();
         for g in &mut self.grabs {
             let key = GrabKey { user, grab: g.grab };
-            let Some(told) = receiver.history().grab(key, receiver.tick(), &self.forecast) else { continue };
+            if !receiver.means().iter().any(|(known, _)| *known == key) {
+                continue;
+            }
             let Some(patch) = self.replica.patch(g.vertex, g.radius) else { continue };
-            let pull = -(turn.rotation().inverse() * Vector3::from(told.state.reaction));
+            let pull = turn.rotation().inverse() * replica::mean_of(receiver.means(), key);
             let hand = Hand { flow: g.flow, ..Hand::new(patch, Hold::Measured(Vector3::zeros())) };
             g.flow = self.replica.kernel().flow(&hand, pull);
         }
     }
 
     /// Steps to `j` ticks after the confirmed one, and leaves the own reactions in the grabs.
-    fn one_step(&mut self, state: &mut State, receiver: &Receiver, user: UserId, j: usize) {
+    fn one_step(
+        &mut self,
+        state: &mut State,
+        means: &mut Vec<Mean>,
+        receiver: &Receiver,
+        user: UserId,
+        j: usize,
+    ) {
         let history = receiver.history();
         let (tick, h) = (receiver.tick() + j as u64, self.replica.kernel().h());
         let free = self.replica.model().is_free();
-        let mut hands = std::mem::take(&mut self.hands);
+        let (mut hands, mut keys) = (std::mem::take(&mut self.hands), std::mem::take(&mut self.keys));
         hands.clear();
+        keys.clear();
         for g in receiver.grabs().iter().filter(|g| g.key.user != user) {
             let Some(g) = history.grab(g.key, tick, &self.forecast) else { continue };
             let Some(mut hand) = self.replica.measured(&g) else { continue };
+            hand.mean = replica::mean_of(means, g.state.key);
             if free {
                 // The frame moves on from what is confirmed: the other's hand is where it goes, not where the patch was.
                 let (velocity, config) = (Vector3::zeros(), GrabConfig::default());
                 hand.hold = Hold::Target { target: g.state.target.into(), velocity, config };
             }
             hands.push(hand);
+            keys.push(g.state.key);
         }
         let others = hands.len();
         let mut own = std::mem::take(&mut self.own);
@@ -323,7 +344,10 @@ impl OwnHand {
             let before = at.and_then(|i| i.checked_sub(1)).and_then(|i| g.past.get(i).copied().flatten());
             let velocity = before.map_or_else(Vector3::zeros, |b| (target - Vector3::from(b)) / h);
             let hold = Hold::Target { target, velocity, config: g.hold };
-            hands.push(Hand { patch, hold, pull: -Vector3::from(g.reaction), flow: g.flowing });
+            let (key, pull) = (GrabKey { user, grab: g.grab }, -Vector3::from(g.reaction));
+            let mean = replica::mean_of(means, key);
+            hands.push(Hand { patch, hold, pull, mean, flow: g.flowing });
+            keys.push(key);
             own.push(index);
         }
         let (force, torque) = self.push;
@@ -333,8 +357,10 @@ impl OwnHand {
             self.grabs[index].reaction = (-hand.pull).into();
             self.grabs[index].flowing = hand.flow;
         }
+        means.clear();
+        means.extend(keys.iter().copied().zip(hands.iter().map(|hand| hand.mean)));
         self.own = own;
-        self.hands = hands;
+        (self.hands, self.keys) = (hands, keys);
     }
 
     /// Takes a state over; the forces of the last step stay.

@@ -6,7 +6,7 @@ use serde::{Deserialize, Serialize};
 use super::AccelerationCoding;
 use crate::StreamError;
 use crate::session::{EndReason, MAX_MESSAGE};
-use crate::state::{MAX_MODES, TICK_LIMIT, in_range};
+use crate::state::{MAX_GRABS, MAX_MODES, TICK_LIMIT, in_range};
 
 /// Longest name of a user or a body, bytes of UTF-8.
 pub(crate) const MAX_NAME: usize = 64;
@@ -75,6 +75,8 @@ pub struct SnapshotBytes {
     pub z: Vec<f64>,
     /// Forces per mode that the streamed reactions do not explain (gravity, contacts); empty when they explain all.
     pub load: Vec<f64>,
+    /// The force of each hand on the body over the last step, N, world axes: user, grab, force.
+    pub means: Vec<(u16, u16, [f64; 3])>,
     /// The body sleeps from this tick on.
     pub resting: bool,
 }
@@ -296,7 +298,12 @@ impl HostMessage {
                     && s.a.len() == modes
                     && [&s.load, &s.z].iter().all(|x| x.is_empty() || x.len() == modes);
                 check("snapshot lengths", equal, s.v.len(), "the same for q, v, a, z and load")?;
-                let finite = in_range(&s.q) && in_range(&s.v) && in_range(&s.z);
+                let hands = s.means.len();
+                check("snapshot hands", hands <= MAX_GRABS, hands, "at most 64")?;
+                let finite = in_range(&s.q)
+                    && s.means.iter().all(|(_, _, pull)| in_range(pull))
+                    && in_range(&s.v)
+                    && in_range(&s.z);
                 let finite = finite && s.a.iter().chain(&s.load).all(|x| x.is_finite() && x.abs() < 1e15);
                 check("snapshot", finite, "a number out of range", "finite numbers")?;
             }

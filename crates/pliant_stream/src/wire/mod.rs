@@ -20,4 +20,4 @@ pub(crate) use message::{MAX_BODIES, MAX_CACHED, MAX_NAME, MAX_RELAXATION, MAX_S
 pub use slice::{Slice, SliceEntry};
 
 /// Version of everything in this module. The two sides of a session must agree.
-pub const PROTOCOL_VERSION: u16 = 1;
+pub const PROTOCOL_VERSION: u16 = 2;

@@ -35,6 +35,8 @@ pub struct Scene {
     pub settled: Duration,
     /// The rigid frame of each tick, where the body is free.
     pub poses: Vec<(u64, Pose)>,
+    /// The reaction of each hand at each tick, N.
+    pub reactions: Vec<(u64, GrabKey, [f64; 3])>,
 }
 
 impl Scene {
@@ -62,6 +64,7 @@ impl Scene {
             worst: 0.0,
             settled: Duration::MAX,
             poses: Vec::new(),
+            reactions: Vec::new(),
         }
     }
 
@@ -98,6 +101,7 @@ impl World for Scene {
                 reaction: self.body.reaction(*id).unwrap(),
             })
             .collect();
+        self.reactions.extend(grabs.iter().map(|g| (tick, g.key, g.reaction)));
         let pose = self.body.model().is_free().then(|| Pose::of(&self.body));
         self.poses.extend(pose.map(|pose| (tick, pose)));
         self.truth.push((tick, self.body.q().to_vec()));
