@@ -51,17 +51,17 @@ fn exact(model: &Arc<ModalModel>, hz: f64, fine: f64) -> Vec<f64> {
             patch.entries().iter().map(row).sum()
         })
         .collect();
-    let pull = |q: &[f64], t: f64| {
-        (way(t) - phi.iter().zip(q).map(|(phi, q)| phi * q).sum::<f64>()) / compliance
-    };
+    let pull =
+        |q: &[f64], t: f64| (way(t) - phi.iter().zip(q).map(|(phi, q)| phi * q).sum::<f64>()) / compliance;
     let slope = |state: &[f64], t: f64| -> Vec<f64> {
         let (q, v) = state.split_at(MODES);
         let pull = pull(q, t);
-        let a = (0..MODES)
-            .map(|k| phi[k] * pull - model.damping()[k] * v[k] - model.omega()[k].powi(2) * q[k]);
+        let a =
+            (0..MODES).map(|k| phi[k] * pull - model.damping()[k] * v[k] - model.omega()[k].powi(2) * q[k]);
         v.iter().copied().chain(a).collect()
     };
-    let add = |s: &[f64], k: &[f64], h: f64| -> Vec<f64> { s.iter().zip(k).map(|(s, k)| s + h * k).collect() };
+    let add =
+        |s: &[f64], k: &[f64], h: f64| -> Vec<f64> { s.iter().zip(k).map(|(s, k)| s + h * k).collect() };
     let (h, every) = (1.0 / fine, (fine / hz) as usize);
     let mut state = vec![0.0; 2 * MODES];
     let mut out = Vec::new();

@@ -3,7 +3,7 @@
 use std::collections::BTreeMap;
 use std::time::Duration;
 
-use pliant_modal::StepSettings;
+use pliant_modal::{GrabConfig, StepSettings};
 
 use crate::StreamError;
 use crate::emulator::{Link, LinkConfig, Loss};
@@ -80,7 +80,9 @@ impl Experiment {
                     let target = std::array::from_fn(|x| start[x] + d[x]);
                     match grabs[index] {
                         None => {
-                            grabs[index] = peers[k].begin_grab(BODY, hand.vertex, hand.radius, target).ok()
+                            grabs[index] = peers[k]
+                                .begin_grab(BODY, hand.vertex, hand.radius, target, GrabConfig::default())
+                                .ok()
                         }
                         Some(grab) => peers[k].set_target(grab, target)?,
                     }

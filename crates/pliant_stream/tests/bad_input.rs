@@ -6,7 +6,7 @@ mod support;
 use std::sync::OnceLock;
 use std::time::Duration;
 
-use pliant_modal::{ModalModel, Relaxation};
+use pliant_modal::{GrabConfig, ModalModel, Relaxation};
 use pliant_stream::emulator::{Loss, Trace};
 use pliant_stream::peer::{
     HeldAt, InputTick, PeerBodyState, PeerDatagram, PeerFrame, PeerGrip, PeerMessage, StateCheck,
@@ -245,12 +245,18 @@ fn real_inputs() -> Vec<Vec<u8>> {
             vertex: 5,
             radius: 0.1,
             target: [0.0, 1.0, 2.0],
-            stiffness: Some(50.0),
-            relaxation: 0.01,
+            hold: GrabConfig { stiffness: Some(50.0), relaxation: 0.01 },
         }
         .encode(),
     );
-    let held = vec![HeldAt { body: BODY, grab: 3, vertex: 9, radius: 0.25, target: [1.0, -2.0, 0.5] }];
+    let held = vec![HeldAt {
+        body: BODY,
+        grab: 3,
+        vertex: 9,
+        radius: 0.25,
+        target: [1.0, -2.0, 0.5],
+        hold: GrabConfig { stiffness: Some(400.0), relaxation: 0.01 }.capped(),
+    }];
     let ticks = vec![InputTick { tick: 9, held }, InputTick { tick: 8, held: Vec::new() }];
     let check = Some(StateCheck { body: BODY, tick: 8, value: 0.5 });
     all.push(PeerDatagram::Inputs { now: 9, ahead: Some(0.5), ticks, check }.encode(1));
@@ -265,7 +271,14 @@ fn real_inputs() -> Vec<Vec<u8>> {
         z: Vec::new(),
         force: vec![0.0; 4],
         frame: Some(frame),
-        pulls: vec![PeerGrip { user: 1, grab: 2, pull: [0.5; 3], mean: [0.25; 3], flow: [0.0; 3] }],
+        pulls: vec![PeerGrip {
+            user: 1,
+            grab: 2,
+            pull: [0.5; 3],
+            mean: [0.25; 3],
+            target: [1.0; 3],
+            flow: [0.0; 3],
+        }],
     };
     all.push(PeerMessage::State { tick: 7, now: 9, bodies: vec![body] }.encode());
     all.push(b"12.5\nlost # a comment\n13\n".to_vec());

@@ -65,7 +65,7 @@ fn hands_that_are_not_numbers_are_refused_and_the_old_target_stays() {
     let grab = guest.grabs().next().unwrap().0;
     let mut peer = PeerSession::new(PeerConfig::default()).unwrap();
     peer.add_body(BODY, bar(12, 0.05), &StepSettings::default()).unwrap();
-    let own = peer.begin_grab(BODY, 66, 0.05, [1.0, 0.0, 0.0]).unwrap();
+    let own = peer.begin_grab(BODY, 66, 0.05, [1.0, 0.0, 0.0], Default::default()).unwrap();
     for bad in [f64::NAN, f64::INFINITY, -1e300] {
         let refused = Err(StreamError::NotFinite { what: "target" });
         for at in 0..3 {
@@ -74,7 +74,7 @@ fn hands_that_are_not_numbers_are_refused_and_the_old_target_stays() {
             assert_eq!(guest.set_target(grab, target), refused);
             assert_eq!(peer.set_target(own, target), refused);
             let refused = Err(StreamError::NotFinite { what: "grab" });
-            assert_eq!(peer.begin_grab(BODY, 66, 0.05, target), refused);
+            assert_eq!(peer.begin_grab(BODY, 66, 0.05, target, Default::default()), refused);
             assert_eq!(guest.begin_grab(now, BODY, 66, 0.05, target, Default::default()), refused);
         }
     }

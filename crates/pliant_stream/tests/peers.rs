@@ -6,7 +6,7 @@ mod support;
 use std::sync::Arc;
 use std::time::Duration;
 
-use pliant_modal::{Integrator, ModalModel, Relaxation};
+use pliant_modal::{Body, BodyConfig, GrabConfig, Integrator, ModalModel, Patch, Relaxation};
 use pliant_stream::emulator::{Link, LinkConfig, Loss, Preset};
 use pliant_stream::peer::{
     HeldAt, InputTick, PeerBodyState, PeerConfig, PeerDatagram, PeerEvent, PeerMessage, PeerSession, Repair,
@@ -35,6 +35,7 @@ struct Mesh {
     seen: Vec<(usize, u64, Vec<f64>)>,
     model: Arc<ModalModel>,
     settings: StepSettings,
+    hold: GrabConfig,
 }
 
 impl Mesh {
@@ -60,6 +61,7 @@ impl Mesh {
             seen: Vec::new(),
             model: bar(40, 0.05),
             settings: StepSettings::default(),
+            hold: GrabConfig::default(),
         }
     }
 
@@ -110,7 +112,9 @@ impl Mesh {
                 if p.tick() > 40 {
                     let target = Self::hand(k, self.now);
                     match self.grabs[k] {
-                        None => self.grabs[k] = p.begin_grab(BODY, Self::VERTEX[k], 0.05, target).ok(),
+                        None => {
+                            self.grabs[k] = p.begin_grab(BODY, Self::VERTEX[k], 0.05, target, self.hold).ok()
+                        }
                         Some(g) => p.set_target(g, target).unwrap(),
                     }
                 }
@@ -267,6 +271,92 @@ fn compensation_keeps_a_free_relaxing_body_together() {
     println!("compensation: frames {apart:.4} m apart, shapes {:.3}", mesh.agree(0, 1));
     assert!(apart < 0.05, "{apart} m");
     assert!(mesh.agree(0, 1) < 0.3, "{}", mesh.agree(0, 1));
+}
+
+#[test]
+fn compensation_puts_the_history_right_with_the_state_of_now() {
+    let link = LinkConfig { loss: Loss::Random(0.1), delay: 60 * MS, ..Default::default() };
+    for free in [false, true] {
+        let mut mesh = Mesh::new(2, &link, 3);
+        mesh.model = if free { loose_bar(24, 0.05) } else { bar(24, 0.05) };
+        for k in 0..2 {
+            mesh.start(k, Repair::Compensate, true);
+        }
+        for look in 1..=100 {
+            mesh.run(50 * MS * look);
+            for p in mesh.peers.iter().flatten() {
+                let (now, past) = (p.body(BODY).unwrap().hidden(), p.state_at(BODY, p.tick()).unwrap());
+                assert_eq!(
+                    (&now.q, &now.v, now.frame),
+                    (&past.q, &past.v, past.frame),
+                    "free {free}, look {look}"
+                );
+            }
+        }
+        assert!(mesh.peers.iter().flatten().all(|p| p.body(BODY).unwrap().restepped() > 0));
+    }
+}
+
+/// What `check` has to say of a body that agrees.
+fn agreeing(p: &PeerSession, body: BodyId) -> StateCheck {
+    let tick = p.confirmed();
+    let value = pliant_stream::check::checksum(tick, p.state_at(body, tick).unwrap()) as f32;
+    StateCheck { body, tick, value }
+}
+
+#[test]
+fn a_body_that_differs_is_noticed_beside_one_that_agrees() {
+    const OTHER: BodyId = BodyId(2);
+    let mut p = PeerSession::new(PeerConfig { user: UserId(2), ..Default::default() }).unwrap();
+    for body in [BODY, OTHER] {
+        p.add_body(body, bar(4, 0.05), &StepSettings::default()).unwrap();
+    }
+    p.connect(Duration::ZERO, PeerId(1), UserId(1), 1200).unwrap();
+    let hello = PeerMessage::Hello {
+        version: PROTOCOL_VERSION,
+        user: 1,
+        name: "first".into(),
+        joining: false,
+        scene: p.scene(),
+    };
+    p.on_message(Duration::ZERO, PeerId(1), &hello.encode());
+    let mut sequence = 0;
+    let mut asked = false;
+    for tick in 1..=40_u64 {
+        let now = 25 * MS * tick as u32;
+        p.update(now);
+        let inputs = |tick| InputTick { tick, held: Vec::new() };
+        let check = match tick {
+            0..10 => None,
+            // The first body agrees each time, the second never does.
+            _ if tick % 2 == 0 => Some(agreeing(&p, BODY)),
+            _ => Some(StateCheck { value: 1e3, ..agreeing(&p, OTHER) }),
+        };
+        let ticks = vec![inputs(p.tick())];
+        let datagram = PeerDatagram::Inputs { now: p.tick(), ahead: None, ticks, check };
+        p.on_datagram(now, PeerId(1), &datagram.encode(sequence));
+        sequence += 1;
+        while let Some(out) = p.poll_output() {
+            asked |= out.channel == Channel::Message
+                && PeerMessage::decode(&out.bytes) == Ok(PeerMessage::StateRequest);
+        }
+    }
+    assert!(asked, "the lowest number was asked for its state");
+}
+
+#[test]
+fn peers_with_other_settings_are_turned_away() {
+    let link = LinkConfig { delay: 20 * MS, ..Default::default() };
+    let mut mesh = Mesh::new(2, &link, 3);
+    mesh.start(0, Repair::Rollback, true);
+    mesh.settings.stiffness_scale = 2.0;
+    mesh.start(1, Repair::Rollback, true);
+    mesh.run(S);
+    let turned = |k: usize| {
+        let away = |e: &(usize, PeerEvent)| matches!(e, (at, PeerEvent::TurnedAway { reason: EndReason::Scene, .. }) if *at == k);
+        mesh.events.iter().any(away)
+    };
+    assert!(turned(0) && turned(1), "{:?}", mesh.events);
 }
 
 #[test]
@@ -445,11 +535,13 @@ fn a_peer_under_another_number_than_the_one_it_was_given_is_turned_away() {
         let mut p = PeerSession::new(config).unwrap();
         p.add_body(BODY, bar(4, 0.05), &StepSettings::default()).unwrap();
         p.connect(Duration::ZERO, PeerId(7), UserId(8), 1200).unwrap();
+        let scene = p.scene();
         let hello = |user| PeerMessage::Hello {
             version: PROTOCOL_VERSION,
             user,
             name: "other".into(),
             joining: false,
+            scene,
         };
         p.on_message(MS, PeerId(7), &hello(claimed).encode());
         let turned = PeerEvent::TurnedAway { peer: PeerId(7), reason: EndReason::Protocol };
@@ -511,7 +603,14 @@ proptest! {
 
 #[test]
 fn every_datagram_reads_back_as_it_was_written() {
-    let held = vec![HeldAt { body: BODY, grab: 3, vertex: 9, radius: 0.25, target: [1.0, -2.0, 0.5] }];
+    let held = vec![HeldAt {
+        body: BODY,
+        grab: 3,
+        vertex: 9,
+        radius: 0.25,
+        target: [1.0, -2.0, 0.5],
+        hold: GrabConfig::default(),
+    }];
     let ticks = vec![InputTick { tick: 77, held }, InputTick { tick: 76, held: Vec::new() }];
     let check = Some(StateCheck { body: BODY, tick: 64, value: 0.5 });
     for d in [
@@ -550,5 +649,46 @@ fn peers_tell_how_their_paths_do() {
     assert_eq!(p.stats(PeerId(1)), None, "who breaks the protocol is gone");
     assert_eq!(after.rejected, before.rejected + 2, "and stays counted");
     assert_eq!(after.datagrams_in, before.datagrams_in);
-    assert!(p.begin_grab(BODY, 66, 50.0, [0.0; 3]).is_err(), "a patch larger than the body");
+    assert!(
+        p.begin_grab(BODY, 66, 50.0, [0.0; 3], GrabConfig::default()).is_err(),
+        "a patch larger than the body"
+    );
+}
+
+/// A device's spring and damper on Pip, as a peer steps it and as the body does.
+#[test]
+fn a_peers_hand_has_its_own_spring_and_damper() {
+    let path = std::path::Path::new(env!("CARGO_MANIFEST_DIR")).join("../../assets/pip.modal");
+    let pip = Arc::new(ModalModel::read(path).unwrap());
+    let (vertex, radius) = (76, f64::from(0.0216_f32));
+    // A Touch: 400 N/m and 4 N s/m.
+    let hold = GrabConfig { stiffness: Some(400.0), relaxation: 0.01 }.capped();
+    let mut peer = PeerSession::new(PeerConfig::default()).unwrap();
+    peer.add_body(BODY, pip.clone(), &StepSettings::default()).unwrap();
+    let mut body = Body::new(pip.clone(), BodyConfig { step: 1.0 / 40.0, ..Default::default() }).unwrap();
+    let patch = Patch::around(pip.surface(), vertex, radius).unwrap();
+    let id = body.grab(&patch, hold).unwrap();
+    let start = body.target(id).unwrap();
+    let at = |tick: u64| {
+        let way = 0.02 * (tick as f64 / 40.0).min(1.0);
+        [start[0] + way, start[1] - 0.5 * way, start[2]].map(|x| f64::from(x as f32))
+    };
+    peer.update(Duration::ZERO);
+    let grab = peer.begin_grab(BODY, vertex, radius, at(0), hold).unwrap();
+    let mut largest = 0.0f64;
+    for tick in 1..=120 {
+        peer.set_target(grab, at(tick)).unwrap();
+        assert_eq!(peer.update(25 * MS * tick as u32 + MS), 1);
+        body.set_target(id, at(tick)).unwrap();
+        body.step().unwrap();
+        let (felt, expected) = (peer.body(BODY).unwrap().grabs()[0].reaction, body.reaction(id).unwrap());
+        for (felt, expected) in felt.iter().zip(expected) {
+            largest = largest.max(expected.abs());
+            assert!(
+                (felt - expected).abs() <= 1e-9 * largest,
+                "tick {tick}: {felt} N instead of {expected} N"
+            );
+        }
+    }
+    assert!(largest > 0.05, "{largest} N");
 }

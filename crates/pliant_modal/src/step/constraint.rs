@@ -3,12 +3,13 @@
 use std::sync::Arc;
 
 use nalgebra::{Matrix3, Vector3};
+use serde::{Deserialize, Serialize};
 
 use super::HeldPatch;
 use crate::{Relaxation, StepError};
 
 /// How a hand holds.
-#[derive(Debug, Clone, Copy, PartialEq)]
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 pub struct GrabConfig {
     /// Stiffness of the hand's own spring (the device's coupling), N/m, in series with the patch's residual flexibility.
     /// `None`: the hand is as stiff as the patch it holds allows. Default: `None`.
@@ -24,6 +25,24 @@ impl Default for GrabConfig {
 }
 
 impl GrabConfig {
+    /// Stiffest spring that is taken from a network, N/m: twenty times that of the stiffest devices
+    /// (5,000 N/m), for tools that scale forces up.
+    pub const MOST_STIFFNESS: f64 = 1e5;
+    /// Longest relaxation time of a damper that is taken from a network, s: the strongest dampers of
+    /// devices (30 N s/m) on the softest hands (50 N/m) have 0.6 s.
+    pub const MOST_RELAXATION: f64 = 1.0;
+
+    /// The same within what real devices have, and as single precision has it: what crosses a network.
+    #[must_use]
+    pub fn capped(self) -> Self {
+        let cap = |x: f64, most: f64| f64::from(x.min(most) as f32);
+        Self {
+            // A spring too soft for single precision is still a spring.
+            stiffness: self.stiffness.map(|k| cap(k, Self::MOST_STIFFNESS).max(f64::from(f32::MIN_POSITIVE))),
+            relaxation: cap(self.relaxation, Self::MOST_RELAXATION),
+        }
+    }
+
     /// Checks both ranges.
     ///
     /// # Errors

@@ -4,7 +4,7 @@ use std::sync::Arc;
 
 use bevy::prelude::*;
 use pliant_body::{BodyState, Grab, GrabForce, GrabOf, ShownState};
-use pliant_modal::ModalModel;
+use pliant_modal::{GrabConfig, ModalModel};
 use pliant_stream::{BodyId, GrabKey, Pose, StepSettings, UserId};
 
 use super::{NetPeer, PeerState};
@@ -79,7 +79,8 @@ pub(crate) fn tell_hands(
         let moved = match net.grabs.get(&entity) {
             Some(said) => said.number.map(|number| session.set_target(number, target)).transpose(),
             None => {
-                let begun = session.begin_grab(id, grab.vertex, grab.radius, target);
+                let hold = GrabConfig { stiffness: grab.stiffness, relaxation: grab.relaxation };
+                let begun = session.begin_grab(id, grab.vertex, grab.radius, target, hold);
                 let point = PatchPoint::new(state.model(), grab.vertex, grab.radius).ok();
                 let (vertex, radius) = (grab.vertex, grab.radius);
                 let number = begun.as_ref().ok().copied();

@@ -3,7 +3,7 @@
 use std::sync::Arc;
 
 use nalgebra::{UnitQuaternion, Vector3};
-use pliant_modal::{Frame, GrabConfig, Hand, Hold, Load, ModalModel, StepSettings};
+use pliant_modal::{Frame, Hand, Hold, Load, ModalModel, StepSettings};
 
 use super::inputs::{InputLog, WINDOW};
 use super::wire::{HeldAt, PeerBodyState, PeerFrame, PeerGrip};
@@ -33,6 +33,8 @@ struct Grip {
     /// At the end of the step, and over it, world axes, N.
     pull: Vector3<f64>,
     mean: Vector3<f64>,
+    /// Where the hand was, world, m.
+    target: Vector3<f64>,
     /// How far the residual flexibility of its patch has flown, body axes, m.
     flow: Vector3<f64>,
 }
@@ -113,6 +115,11 @@ impl PeerBody {
     /// Its model.
     pub fn model(&self) -> &Arc<ModalModel> {
         &self.model
+    }
+
+    /// How it is stepped.
+    pub fn settings(&self) -> &StepSettings {
+        self.replica.kernel().settings()
     }
 
     /// The tick that it has reached.
@@ -205,6 +212,7 @@ impl PeerBody {
                     grab: g.key.grab,
                     pull: g.pull.into(),
                     mean: g.mean.into(),
+                    target: g.target.into(),
                     flow: g.flow.into(),
                 })
                 .collect(),
@@ -232,6 +240,7 @@ impl PeerBody {
             key: GrabKey { user: UserId(p.user), grab: p.grab },
             pull: p.pull.into(),
             mean: p.mean.into(),
+            target: p.target.into(),
             flow: p.flow.into(),
         };
         self.pulls = state.pulls.iter().map(pull).collect();
@@ -305,23 +314,43 @@ impl PeerBody {
             let used = std::mem::take(&mut self.past[index].used);
             Self::press(&mut self.replica, &mut with, &mut pulls, &held);
             Self::press(&mut self.replica, &mut without, &mut old_pulls, &used);
-            let (to_q, to_v) = self.newmark.response(self.tick - tick);
-            let to_z = self.flow.as_ref().map_or(0.0, |flow| flow.response(self.tick - tick));
-            for k in 0..self.state.modes() {
-                let da = with.a[k] - without.a[k];
-                self.state.q[k] += to_q * da;
-                self.state.v[k] += to_v * da;
-                if let Some(z) = self.state.z.get_mut(k) {
-                    *z += to_z * da;
+            // The history is put right like the state of now: later corrections and checks are against it.
+            for t in tick..=self.tick {
+                let at = (t % WINDOW as u64) as usize;
+                if self.past[at].tick != t {
+                    continue;
+                }
+                let (to_q, to_v) = self.newmark.response(t - tick);
+                let to_z = self.flow.as_ref().map_or(0.0, |flow| flow.response(t - tick));
+                let seconds = (t - tick) as f64 * self.replica.kernel().h();
+                let moved = self
+                    .model
+                    .is_free()
+                    .then(|| self.moved(&self.past[at].state.frame, &with.frame, &without.frame, seconds));
+                let state = &mut self.past[at].state;
+                for k in 0..state.modes() {
+                    let da = with.a[k] - without.a[k];
+                    // At its own tick the difference is known.
+                    let own = t == tick;
+                    state.q[k] += if own { with.q[k] - without.q[k] } else { to_q * da };
+                    state.v[k] += if own { with.v[k] - without.v[k] } else { to_v * da };
+                    if let Some(z) = state.z.get_mut(k) {
+                        *z += to_z * da;
+                    }
+                }
+                if let Some(frame) = moved {
+                    state.frame = frame;
                 }
             }
-            if self.model.is_free() {
-                let seconds = (self.tick - tick) as f64 * self.replica.kernel().h();
-                self.state.frame = self.moved(&self.state.frame, &with.frame, &without.frame, seconds);
-            }
+            let now = &mut self.past[index];
+            (now.state.a, now.state.f) = (with.a, with.f);
+            now.pulls = pulls;
             self.past[index].used.clone_from(&held);
             self.restepped += 1;
         }
+        let now = &self.past[(self.tick % WINDOW as u64) as usize];
+        self.state.clone_from(&now.state);
+        self.pulls.clone_from(&now.pulls);
     }
 
     /// The frame as it would be, had it gone `there` instead of `here` so many seconds ago: what was different then in
@@ -360,19 +389,23 @@ impl PeerBody {
             }
             let Some(patch) = replica.patch(g.vertex, g.radius) else { continue };
             let key = g.key(*user);
-            let (velocity, config) = (Vector3::zeros(), GrabConfig::default());
-            let hand = Hand::new(patch, Hold::Target { target: g.target.into(), velocity, config });
-            hands.push(match pulls.iter().find(|p| p.key == key) {
+            let (target, config) = (Vector3::from(g.target), g.hold);
+            let before = pulls.iter().find(|p| p.key == key);
+            // A hand that has just taken hold has not moved.
+            let way = before.map_or_else(Vector3::zeros, |before| target - before.target);
+            let velocity = way / replica.kernel().h();
+            let hand = Hand::new(patch, Hold::Target { target, velocity, config });
+            hands.push(match before {
                 Some(before) => Hand { pull: before.pull, mean: before.mean, flow: before.flow, ..hand },
                 None => hand,
             });
-            keys.push(key);
+            keys.push((key, target));
         }
         replica.step(state, &mut hands, &Load::default());
         pulls.clear();
-        let grip = |(key, hand): (GrabKey, &Hand)| {
+        let grip = |((key, target), hand): ((GrabKey, Vector3<f64>), &Hand)| {
             let &Hand { pull, mean, flow, .. } = hand;
-            Grip { key, pull, mean, flow }
+            Grip { key, pull, mean, target, flow }
         };
         pulls.extend(keys.into_iter().zip(&hands).map(grip));
     }

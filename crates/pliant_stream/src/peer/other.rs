@@ -4,7 +4,10 @@ use std::collections::BTreeMap;
 use std::time::Duration;
 
 use crate::session::{Budget, LinkStats, Tally};
-use crate::state::{Tick, UserId};
+use crate::state::{BodyId, Tick, UserId};
+
+/// Disagreements in a row before the other's state is taken over.
+const CHECKS: u32 = 3;
 
 #[derive(Debug)]
 pub(super) struct Other {
@@ -24,7 +27,10 @@ pub(super) struct Other {
     pub(super) theirs: Option<f64>,
     pub(super) asked: BTreeMap<Tick, Duration>,
     pub(super) max_datagram: usize,
-    pub(super) mismatched: u32,
+    /// Checks in a row that disagreed, for each body.
+    pub(super) mismatched: BTreeMap<BodyId, u32>,
+    /// What it said came too late to be of use: only a state can help.
+    pub(super) lost: bool,
     pub(super) wants_state: bool,
     /// We have asked it for its state and it has not answered.
     pub(super) asked_state: bool,
@@ -48,13 +54,25 @@ impl Other {
             theirs: None,
             asked: BTreeMap::new(),
             max_datagram,
-            mismatched: 0,
+            mismatched: BTreeMap::new(),
+            lost: false,
             wants_state: false,
             asked_state: false,
             // All of the window, asked for again every 150 ms, is 853 ticks a second: nobody honest asks for more.
             answer_budget: Budget::new(1000.0, 1000.0),
             state_budget: Budget::new(2.0, 16.0),
         }
+    }
+
+    /// Whether a body of ours lastingly differs from this peer's.
+    pub(super) fn is_apart(&self) -> bool {
+        self.lost || self.mismatched.values().any(|count| *count >= CHECKS)
+    }
+
+    /// Forgets what differed.
+    pub(super) fn agreed(&mut self) {
+        self.mismatched.clear();
+        self.lost = false;
     }
 
     /// Takes in when a datagram came that was sent at `theirs` (s of the sender's ticks): how unevenly the way takes (RFC 3550, 6.4.1).

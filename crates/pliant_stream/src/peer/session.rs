@@ -6,7 +6,7 @@ use std::collections::{BTreeMap, VecDeque};
 use std::sync::Arc;
 use std::time::Duration;
 
-use pliant_modal::{ModalModel, StepSettings};
+use pliant_modal::{GrabConfig, ModalModel, StepSettings};
 
 use super::body::PeerBody;
 use super::config::{PeerConfig, PeerEvent};
@@ -26,8 +26,6 @@ const MAX_OUT: usize = 16_384;
 const MAX_EVENTS: usize = 4096;
 /// Ticks between checks.
 const CHECK_EVERY: u64 = 16;
-/// Disagreements in a row before the other's state is taken over.
-const CHECKS: u32 = 3;
 /// Share of the state's size by which checks may differ: peers' machines round differently.
 const CHECK_TOLERANCE: f64 = 1e-3;
 /// A peer's tick is drawn towards the others' at most at this rate.
@@ -120,6 +118,21 @@ impl PeerSession {
         Ok(())
     }
 
+    /// Digest of the bodies, their models and how they are stepped, and of the length of a step.
+    pub fn scene(&self) -> u64 {
+        let mut hasher = blake3::Hasher::new();
+        hasher.update(&self.config.step.to_bits().to_le_bytes());
+        for (id, body) in &self.bodies {
+            hasher.update(&id.0.to_le_bytes());
+            hasher.update(&body.model().hash().0);
+            // Into memory, and of plain numbers: it does not fail.
+            hasher.update(&postcard::to_allocvec(body.settings()).unwrap_or_default());
+        }
+        let mut first = [0; 8];
+        first.copy_from_slice(&hasher.finalize().as_bytes()[..8]);
+        u64::from_le_bytes(first)
+    }
+
     /// A connection to another peer opened; says hello. `user` is the number that the peer has been given: under another one it is not
     /// let in, since the lowest number is believed.
     ///
@@ -145,6 +158,7 @@ impl PeerSession {
             user: self.config.user.0,
             name: self.config.name.clone(),
             joining: !self.started,
+            scene: self.scene(),
         };
         self.message(peer, &hello);
         Ok(())
@@ -164,7 +178,8 @@ impl PeerSession {
         self.event(PeerEvent::Left { user, reason });
     }
 
-    /// Takes hold of a body at the next tick.
+    /// Takes hold of a body at the next tick, as `hold` says: with the hand's own spring and damper,
+    /// capped at what devices have, or as stiffly as the patch allows ([`GrabConfig::default`]).
     ///
     /// # Errors
     /// [`StreamError::UnknownBody`], [`StreamError::NotFinite`], [`StreamError::Model`] for a vertex that is not there or a radius
@@ -176,10 +191,15 @@ impl PeerSession {
         vertex: u32,
         radius: f64,
         target: [f64; 3],
+        hold: GrabConfig,
     ) -> Result<u16, StreamError> {
         let b = self.bodies.get(&body).ok_or(StreamError::UnknownBody(body))?;
         if !in_range(&target) || !(0.0..=1e9).contains(&radius) {
             return Err(StreamError::NotFinite { what: "grab" });
+        }
+        if let Err(error) = hold.check() {
+            let expected = "a spring above 0 N/m, a damper of 0 s or more";
+            return Err(StreamError::Config { what: "hold", found: error.to_string(), expected });
         }
         if vertex as usize >= b.model().surface().positions().len() {
             return Err(StreamError::Model(format!("vertex {vertex} is not on the surface")));
@@ -196,7 +216,7 @@ impl PeerSession {
         }
         let grab = self.next_grab;
         self.next_grab = grab.wrapping_add(1);
-        self.own.insert(grab, HeldAt { body, grab, vertex, radius, target }.rounded());
+        self.own.insert(grab, HeldAt { body, grab, vertex, radius, target, hold }.rounded());
         Ok(grab)
     }
 
@@ -304,16 +324,22 @@ impl PeerSession {
 
     /// Something arrived reliably. What breaks the protocol ends the connection.
     pub fn on_message(&mut self, now: Duration, peer: PeerId, bytes: &[u8]) {
+        let own = self.scene();
         let Some(other) = self.others.get_mut(&peer) else { return };
         other.heard = now;
         other.stats.message_bytes_in += bytes.len() as u64;
         match PeerMessage::decode(bytes) {
-            Ok(PeerMessage::Hello { version, user, name, joining }) => {
+            Ok(PeerMessage::Hello { version, user, name, joining, scene }) => {
                 let user = UserId(user);
                 let taken = user == self.config.user || self.inputs.users.get(&user).is_some_and(|u| !u.gone);
-                if version != PROTOCOL_VERSION || other.user.is_some() || user != other.expected || taken {
-                    let reason =
-                        if version == PROTOCOL_VERSION { EndReason::Protocol } else { EndReason::Version };
+                let refused = if version != PROTOCOL_VERSION {
+                    Some(EndReason::Version)
+                } else if other.user.is_some() || user != other.expected || taken {
+                    Some(EndReason::Protocol)
+                } else {
+                    (scene != own).then_some(EndReason::Scene)
+                };
+                if let Some(reason) = refused {
                     self.message(peer, &PeerMessage::Goodbye { reason });
                     return self.disconnect(peer, reason);
                 }
@@ -405,7 +431,7 @@ impl PeerSession {
         }
         if too_late {
             // Only a state can help; it is asked for with what else is missing.
-            self.others.values_mut().for_each(|o| o.mismatched = CHECKS);
+            self.others.values_mut().for_each(|o| o.lost = true);
         }
     }
 
@@ -442,7 +468,7 @@ impl PeerSession {
             .map_while(|back| self.tick.checked_sub(back))
             .filter_map(|t| own.at(t).cloned())
             .collect();
-        let bytes = |t: &[InputTick]| PeerDatagram::bytes_of(t.iter().map(|t| t.held.len()));
+        let bytes = |t: &[InputTick]| PeerDatagram::bytes_of(t.iter().map(|t| t.held.as_slice()));
         while ticks.len() > 1 && bytes(&ticks) > other.max_datagram {
             ticks.pop();
         }
@@ -460,7 +486,7 @@ impl PeerSession {
         let limit = other.max_datagram;
         while !ticks.is_empty() {
             let mut count = ticks.len().min(MAX_TICKS);
-            let bytes = |n: usize| PeerDatagram::bytes_of(ticks[..n].iter().map(|t| t.held.len()));
+            let bytes = |n: usize| PeerDatagram::bytes_of(ticks[..n].iter().map(|t| t.held.as_slice()));
             while count > 1 && bytes(count) > limit {
                 count -= 1;
             }
@@ -497,13 +523,13 @@ impl PeerSession {
                 questions.push((*peer, PeerDatagram::Ask { runs }));
             }
             if inputs.complete + (WINDOW as u64) / 2 < inputs.highest {
-                other.mismatched = CHECKS;
+                other.lost = true;
             }
         }
         for (peer, question) in questions {
             self.datagram(peer, &question);
         }
-        if self.others.values().any(|o| o.mismatched >= CHECKS) {
+        if self.others.values().any(Other::is_apart) {
             self.request_state(now);
         }
     }

@@ -2,6 +2,8 @@
 
 use serde::{Deserialize, Serialize};
 
+use pliant_modal::GrabConfig;
+
 use crate::StreamError;
 use crate::session::{EndReason, MAX_MESSAGE};
 use crate::state::{BodyId, GrabKey, MAX_MODES, TICK_LIMIT, Tick, UserId, in_range};
@@ -14,7 +16,9 @@ pub(crate) const MAX_TICKS: usize = 16;
 /// Most grabs of one user at one tick.
 pub(crate) const MAX_HELD: usize = 16;
 /// Bytes of one grab.
-const HELD_BYTES: usize = 24;
+const HELD_BYTES: usize = 25;
+/// Bytes of its spring, and as many of its damper, where it has one.
+const HOLD_BYTES: usize = 4;
 
 /// A hand at one tick.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -29,6 +33,8 @@ pub struct HeldAt {
     pub radius: f64,
     /// Where the hand is, world, m.
     pub target: [f64; 3],
+    /// The hand's own spring and damper, within what devices have ([`GrabConfig::capped`]).
+    pub hold: GrabConfig,
 }
 
 impl HeldAt {
@@ -41,6 +47,7 @@ impl HeldAt {
     pub(crate) fn rounded(mut self) -> Self {
         self.radius = f64::from(self.radius as f32);
         self.target = self.target.map(|x| f64::from(x as f32));
+        self.hold = self.hold.capped();
         self
     }
 }
@@ -109,6 +116,14 @@ impl PeerDatagram {
                         w.u32(g.vertex);
                         w.f32(g.radius as f32);
                         w.vector(g.target);
+                        let damper = g.hold.relaxation != 0.0;
+                        w.u8(u8::from(g.hold.stiffness.is_some()) | u8::from(damper) << 1);
+                        if let Some(stiffness) = g.hold.stiffness {
+                            w.f32(stiffness as f32);
+                        }
+                        if damper {
+                            w.f32(g.hold.relaxation as f32);
+                        }
                     }
                 }
                 w.u8(u8::from(check.is_some()));
@@ -132,9 +147,14 @@ impl PeerDatagram {
         w.into_bytes()
     }
 
-    /// Bytes that inputs of these numbers of grabs take.
-    pub(crate) fn bytes_of(held: impl Iterator<Item = usize>) -> usize {
-        3 + 6 + 2 + 1 + 1 + 12 + held.map(|n| 7 + n * HELD_BYTES).sum::<usize>()
+    /// Bytes that inputs with these grabs at their ticks take.
+    pub(crate) fn bytes_of<'a>(ticks: impl Iterator<Item = &'a [HeldAt]>) -> usize {
+        let one = |g: &HeldAt| {
+            let parts = usize::from(g.hold.stiffness.is_some()) + usize::from(g.hold.relaxation != 0.0);
+            HELD_BYTES + parts * HOLD_BYTES
+        };
+        let tick = |held: &'a [HeldAt]| 7 + held.iter().map(one).sum::<usize>();
+        3 + 6 + 2 + 1 + 1 + 12 + ticks.map(tick).sum::<usize>()
     }
 
     /// Reads any bytes.
@@ -166,13 +186,29 @@ impl PeerDatagram {
                     }
                     let mut held = Vec::with_capacity(count.min(r.left() / HELD_BYTES));
                     for _ in 0..count {
-                        let g = HeldAt {
+                        let mut g = HeldAt {
                             body: BodyId(r.u16("held body")?),
                             grab: r.u16("held grab")?,
                             vertex: r.u32("held vertex")?,
                             radius: r.f32("held radius")?,
                             target: r.vector("held target")?,
+                            hold: GrabConfig::default(),
                         };
+                        let has = r.u8("held hand")?;
+                        if has > 3 {
+                            return invalid("held hand", has.to_string(), "0 to 3");
+                        }
+                        if has & 1 != 0 {
+                            g.hold.stiffness = Some(r.f32("held stiffness")?);
+                        }
+                        if has & 2 != 0 {
+                            g.hold.relaxation = r.f32("held relaxation")?;
+                        }
+                        if let Err(error) = g.hold.check() {
+                            let expected = "a spring above 0 N/m, a damper of 0 s or more";
+                            return invalid("held hand", error.to_string(), expected);
+                        }
+                        g.hold = g.hold.capped();
                         if g.radius < 0.0 {
                             return invalid("held radius", g.radius.to_string(), "0 m or more");
                         }
@@ -254,6 +290,8 @@ pub struct PeerGrip {
     pub pull: [f64; 3],
     /// Force on it over the step, N, world axes.
     pub mean: [f64; 3],
+    /// Where the hand was, world, m.
+    pub target: [f64; 3],
     /// How far the residual flexibility of the patch has flown, m, body axes.
     pub flow: [f64; 3],
 }
@@ -271,6 +309,8 @@ pub enum PeerMessage {
         name: String,
         /// The sender has no state yet and wants one.
         joining: bool,
+        /// Digest of its bodies and of how it steps them; all peers have the same.
+        scene: u64,
     },
     /// Send me your state: checks disagree, or too much is missing.
     StateRequest,
@@ -338,7 +378,7 @@ impl PeerMessage {
                         && (b.z.is_empty() || b.z.len() == modes)
                         && b.pulls
                             .iter()
-                            .all(|p| [&p.pull, &p.mean, &p.flow].into_iter().all(|x| in_range(x)));
+                            .all(|p| [&p.pull, &p.mean, &p.target, &p.flow].into_iter().all(|x| in_range(x)));
                     if !(equal && sane) {
                         return invalid("state", "a number or length out of range".into(), "finite numbers");
                     }

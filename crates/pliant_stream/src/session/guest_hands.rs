@@ -9,7 +9,7 @@ use super::MIN_DATAGRAM;
 use super::guest::GuestSession;
 use crate::StreamError;
 use crate::state::{BodyId, in_range};
-use crate::wire::{Datagram, GuestMessage, MAX_RELAXATION, MAX_STIFFNESS, MAX_TARGETS, TargetEntry, Targets};
+use crate::wire::{Datagram, GuestMessage, MAX_TARGETS, TargetEntry, Targets};
 
 /// A held target that does not move is said again this often.
 const TARGET_EVERY: Duration = Duration::from_millis(250);
@@ -35,7 +35,7 @@ impl OwnGrab {
 
 impl GuestSession {
     /// Takes hold of a body, as `hold` says: with the hand's own spring and damper, or as stiffly as the patch allows
-    /// ([`GrabConfig::default`]). The number names the grab to the other calls; the host may answer
+    /// ([`GrabConfig::default`]); capped at what devices have. The number names the grab to the other calls; the host may answer
     /// [`GuestEvent::GrabRefused`](crate::GuestEvent::GrabRefused).
     ///
     /// # Errors
@@ -60,14 +60,12 @@ impl GuestSession {
         if !in_range(&target) || !(0.0..=1e9).contains(&radius) {
             return Err(StreamError::NotFinite { what: "grab" });
         }
-        let GrabConfig { stiffness, relaxation } = hold;
-        let fail = |what, found: String, expected| Err(StreamError::Config { what, found, expected });
-        if stiffness.is_some_and(|k| !(k > 0.0 && k <= MAX_STIFFNESS)) {
-            return fail("stiffness", format!("{stiffness:?}"), "above 0, at most 1e12 N/m");
+        if let Err(error) = hold.check() {
+            let expected = "a spring above 0 N/m, a damper of 0 s or more";
+            return Err(StreamError::Config { what: "hold", found: error.to_string(), expected });
         }
-        if !(0.0..=MAX_RELAXATION).contains(&relaxation) {
-            return fail("relaxation", relaxation.to_string(), "0..=10 s");
-        }
+        // As the host will have it.
+        let hold = hold.capped();
         let limit = super::host_peer::MAX_GUEST_GRABS;
         if self.grabs.len() >= limit {
             return Err(StreamError::Full { what: "grabs", limit });
@@ -81,15 +79,7 @@ impl GuestSession {
         if let Some(own) = self.bodies.get_mut(&body).and_then(|b| b.own.as_mut()) {
             own.begin(grab, vertex, radius, target, hold);
         }
-        self.message(&GuestMessage::GrabBegin {
-            grab,
-            body: body.0,
-            vertex,
-            radius,
-            target,
-            stiffness,
-            relaxation,
-        });
+        self.message(&GuestMessage::GrabBegin { grab, body: body.0, vertex, radius, target, hold });
         Ok(grab)
     }
 

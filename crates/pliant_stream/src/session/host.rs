@@ -4,7 +4,7 @@ use std::collections::{BTreeMap, BTreeSet, VecDeque};
 use std::sync::{Arc, OnceLock};
 use std::time::Duration;
 
-use pliant_modal::{GrabConfig, ModalModel, StepSettings};
+use pliant_modal::{ModalModel, StepSettings};
 
 use super::host_config::{HostConfig, HostEvent};
 use super::host_peer::{HeldGrab, MAX_GUEST_GRABS, Peer, Standing};
@@ -318,10 +318,7 @@ impl HostSession {
                 }
             }
             (GuestMessage::Goodbye { reason }, _) => self.drop_peer(peer, reason, false),
-            (
-                GuestMessage::GrabBegin { grab, body, vertex, radius, target, stiffness, relaxation },
-                Some(user),
-            ) => {
+            (GuestMessage::GrabBegin { grab, body, vertex, radius, target, hold }, Some(user)) => {
                 let body = BodyId(body);
                 let vertices = self.bodies.get(&body).map_or(0, |b| b.model.surface().positions().len());
                 // A new patch costs every encoder of the body a table of its own.
@@ -332,7 +329,6 @@ impl HostSession {
                 if fits {
                     p.grabs.insert(grab, HeldGrab { body, input: None });
                     let key = GrabKey { user, grab };
-                    let hold = GrabConfig { stiffness, relaxation };
                     self.event(HostEvent::GrabBegan { key, body, vertex, radius, target, hold });
                 } else {
                     p.send_message(&HostMessage::GrabRefused { grab }, &mut self.out);

@@ -1,6 +1,6 @@
 //! Reliable messages: postcard bodies, checked after decoding.
 
-use pliant_modal::StepSettings;
+use pliant_modal::{GrabConfig, StepSettings};
 use serde::{Deserialize, Serialize};
 
 use super::AccelerationCoding;
@@ -14,10 +14,6 @@ pub(crate) const MAX_NAME: usize = 64;
 pub(crate) const MAX_TOKEN: usize = 1024;
 /// Most models that a guest may name as cached.
 pub(crate) const MAX_CACHED: usize = 256;
-/// Stiffest spring of a hand, N/m.
-pub(crate) const MAX_STIFFNESS: f64 = 1e12;
-/// Longest relaxation time of a hand's damper, s.
-pub(crate) const MAX_RELAXATION: f64 = 10.0;
 /// Most bodies of a session.
 pub(crate) const MAX_BODIES: usize = 1024;
 
@@ -109,10 +105,8 @@ pub enum GuestMessage {
         radius: f64,
         /// First target, world, m.
         target: [f64; 3],
-        /// Stiffness of the hand's own spring, N/m, above 0 and at most 1e12; none for a hand as stiff as its patch.
-        stiffness: Option<f64>,
-        /// Relaxation time of the hand's damper, s, 0 to 10.
-        relaxation: f64,
+        /// The hand's own spring and damper, capped at what devices have ([`GrabConfig::capped`]).
+        hold: GrabConfig,
     },
     /// A hand lets go.
     GrabEnd {
@@ -234,8 +228,8 @@ impl GuestMessage {
     /// # Errors
     /// [`StreamError::Invalid`], naming the field.
     pub fn decode(bytes: &[u8]) -> Result<Self, StreamError> {
-        let message: Self = decode("guest message", bytes)?;
-        match &message {
+        let mut message: Self = decode("guest message", bytes)?;
+        match &mut message {
             Self::Hello { name, token, wish, cached, .. } => {
                 check("name", name.len() <= MAX_NAME, name.len(), "at most 64 bytes")?;
                 check("token", token.len() <= MAX_TOKEN, token.len(), "at most 1024 bytes")?;
@@ -243,12 +237,13 @@ impl GuestMessage {
                 check("repeats", wish.repeats <= 7, wish.repeats, "0..=7")?;
                 check("modes", wish.modes >= 1, wish.modes, "at least 1")?;
             }
-            Self::GrabBegin { radius, target, stiffness, relaxation, .. } => {
+            Self::GrabBegin { radius, target, hold, .. } => {
                 check("radius", *radius >= 0.0 && in_range(&[*radius]), radius, "0..=1e9 m")?;
                 check("target", in_range(target), format!("{target:?}"), "finite metres")?;
-                let stiff = stiffness.is_none_or(|k| k > 0.0 && k <= MAX_STIFFNESS);
-                check("stiffness", stiff, format!("{stiffness:?}"), "above 0, at most 1e12 N/m")?;
-                check("relaxation", (0.0..=MAX_RELAXATION).contains(relaxation), relaxation, "0..=10 s")?;
+                if let Err(error) = hold.check() {
+                    check("hold", false, error, "a spring above 0 N/m, a damper of 0 s or more")?;
+                }
+                *hold = hold.capped();
             }
             Self::GrabEnd { .. } | Self::SnapshotRequest { .. } | Self::Goodbye { .. } => {}
         }

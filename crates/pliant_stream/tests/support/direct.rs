@@ -95,7 +95,7 @@ pub fn peers(now: Duration) -> Vec<PeerSession> {
             for other in (0..3).filter(|o| *o != k) {
                 peer.connect(now, PeerId(u64::from(other)), UserId(other + 1), 1200).unwrap();
             }
-            peer.begin_grab(BODY, 66, 0.05, [1.0, 0.05 * f64::from(k), 0.0]).unwrap();
+            peer.begin_grab(BODY, 66, 0.05, [1.0, 0.05 * f64::from(k), 0.0], Default::default()).unwrap();
             peer
         })
         .collect();

@@ -5,6 +5,7 @@ use std::time::Duration;
 use super::{CHECK_TOLERANCE, MAX_OUT, PeerSession};
 use crate::peer::config::PeerEvent;
 use crate::peer::inputs::WINDOW;
+use crate::peer::other::Other;
 use crate::peer::wire::{InputTick, PeerBodyState, PeerMessage, StateCheck};
 use crate::state::{BodyId, PeerId, Tick, UserId};
 
@@ -45,7 +46,7 @@ impl PeerSession {
             self.next_step = Some(now + Duration::from_secs_f64(self.config.step));
             self.event(PeerEvent::Started);
         }
-        self.others.values_mut().for_each(|o| o.mismatched = 0);
+        self.others.values_mut().for_each(Other::agreed);
     }
 
     /// Only those with a lower number are believed.
@@ -59,7 +60,8 @@ impl PeerSession {
         };
         let agrees = (own - f64::from(check.value)).abs() <= CHECK_TOLERANCE * size + 1e-7;
         if let Some(other) = self.others.get_mut(&peer) {
-            other.mismatched = if agrees { 0 } else { other.mismatched + 1 };
+            let count = other.mismatched.entry(check.body).or_default();
+            *count = if agrees { 0 } else { *count + 1 };
         }
     }
 
