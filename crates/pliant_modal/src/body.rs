@@ -6,7 +6,9 @@ use nalgebra::Vector3;
 
 use crate::{
     Frame, GrabConfig, Hand, HeldPatch, Hold, Integrator, Kernel, Load, ModalModel, Patch, Precision,
-    Relaxation, State, StepError, StepReport, StepSettings, error::finite,
+    Relaxation, State, StepError, StepReport, StepSettings,
+    error::finite,
+    step::{Six, tangent},
 };
 
 /// Names a grab on its body. Never used twice by the same body.
@@ -374,12 +376,11 @@ impl Body {
     /// A force that is not finite, a vertex that is not on the surface.
     pub fn push(&mut self, vertex: u32, force: [f64; 3]) -> Result<(), StepError> {
         finite("force", &force)?;
-        let (rows, arm) = self.vertex_rows(vertex)?;
         let force = Vector3::from(force);
-        let local = self.state.frame.rotation().inverse() * force;
-        for (mode, p) in self.pushes.iter_mut().enumerate() {
-            *p += rows.at(mode).dot(&local);
-        }
+        let mut pushes = std::mem::take(&mut self.pushes);
+        let pushed = self.press(vertex, &force, &mut pushes);
+        self.pushes = pushes;
+        let arm = pushed?;
         self.push_force += force;
         self.push_torque += arm.cross(&force);
         Ok(())
@@ -392,12 +393,15 @@ impl Body {
     /// then stays as it was.
     pub fn strike(&mut self, vertex: u32, impulse: [f64; 3]) -> Result<(), StepError> {
         finite("impulse", &impulse)?;
-        let (rows, arm) = self.vertex_rows(vertex)?;
         let impulse = Vector3::from(impulse);
-        let local = self.state.frame.rotation().inverse() * impulse;
+        let mut gained = std::mem::take(&mut self.resisted);
+        gained.fill(0.0);
+        let struck = self.press(vertex, &impulse, &mut gained);
+        self.resisted = gained;
+        let arm = struck?;
         self.spare.clone_from(&self.state);
         for i in 0..self.mode_count() {
-            let dv = rows.at(i).dot(&local);
+            let dv = self.resisted[i];
             self.state.v[i] += dv;
             // The acceleration belongs to the state: damping answers the new velocity.
             self.state.a[i] -= self.kernel.damping()[i] * dv;
@@ -414,17 +418,35 @@ impl Body {
         Err(StepError::Input { what: "impulse", expected, got: impulse.norm() })
     }
 
-    /// For a vertex: its (unwarped) displacement rows by mode, and its arm from the centre of mass in world axes.
-    fn vertex_rows(&self, vertex: u32) -> Result<(VertexRows, Vector3<f64>), StepError> {
-        let surface = self.model().surface().positions();
+    /// Adds the modal force of a force (N, world axes) on a surface vertex, through the derivative of
+    /// where the vertex is; its arm from the centre of mass in world axes, m.
+    fn press(&self, vertex: u32, force: &Vector3<f64>, modal: &mut [f64]) -> Result<Vector3<f64>, StepError> {
+        let model = self.model();
+        let surface = model.surface().positions();
         let count = surface.len();
         let Some(rest) = surface.get(vertex as usize) else {
             return Err(StepError::Vertex { vertex, count });
         };
-        let arm = self.state.frame.rotation()
-            * (Vector3::from(rest.map(f64::from)) - Vector3::from(self.model().center_of_mass()));
-        let rows = VertexRows { model: self.model().clone(), vertex };
-        Ok((rows, arm))
+        let row =
+            |row: Row, mode: usize| Vector3::from_fn(|axis, _| f64::from(row(model, vertex, axis, mode)));
+        let (shift, turn): (Row, Row) = (ModalModel::displacement_row, ModalModel::rotation_row);
+        let sum = |of: Row| -> Vector3<f64> {
+            self.state.q.iter().enumerate().map(|(mode, q)| *q * row(of, mode)).sum()
+        };
+        let warp = self.config.warp;
+        let (d, w) = (sum(shift), if warp { sum(turn) } else { Vector3::zeros() });
+        let (moved, tangent) = tangent(&Six::new(d.x, d.y, d.z, w.x, w.y, w.z), warp);
+        let rotation = self.state.frame.rotation();
+        let six = tangent.tr_mul(&(rotation.inverse() * force));
+        let (by_d, by_w) = (six.fixed_rows::<3>(0), six.fixed_rows::<3>(3));
+        for (mode, modal) in modal.iter_mut().enumerate() {
+            *modal += row(shift, mode).dot(&by_d);
+            if warp {
+                *modal += row(turn, mode).dot(&by_w);
+            }
+        }
+        let at = Vector3::from(rest.map(f64::from)) + moved;
+        Ok(rotation * (at - Vector3::from(model.center_of_mass())))
     }
 
     /// Kinetic plus elastic energy of the modes, and of the rigid motion of a free body, J. Potential energy in gravity is not in it.
@@ -495,14 +517,5 @@ impl Body {
     }
 }
 
-/// The (unwarped) displacement rows of one vertex.
-struct VertexRows {
-    model: Arc<ModalModel>,
-    vertex: u32,
-}
-
-impl VertexRows {
-    fn at(&self, mode: usize) -> Vector3<f64> {
-        Vector3::from_fn(|axis, _| f64::from(self.model.displacement_row(self.vertex, axis, mode)))
-    }
-}
+/// Rows of the basis: of a vertex, an axis and a mode.
+type Row = fn(&ModalModel, u32, usize, usize) -> f32;

@@ -1,9 +1,10 @@
 //! The baked model: what a body is, independent of where it is and how it moves.
 
-use std::sync::OnceLock;
+use std::sync::{Arc, OnceLock};
 
 use serde::{Deserialize, Serialize};
 
+use crate::step::MassSites;
 use crate::{Basis, ModelError, Precision, SurfaceMesh, check::check_parts};
 
 /// The finite element that a body was baked with.
@@ -143,6 +144,8 @@ pub struct ModalModel {
     basis: Basis,
     /// Made when it is first asked for.
     half: OnceLock<Basis>,
+    /// Made when gravity first pulls on a bent body.
+    mass_sites: OnceLock<Arc<MassSites>>,
     size: f64,
     hash: ModelHash,
     bytes: usize,
@@ -190,7 +193,20 @@ impl ModalModel {
         let mut site_radii: Vec<f64> = parts.sites.iter().map(|site| site.radius).collect();
         site_radii.sort_by(f64::total_cmp);
         site_radii.dedup();
-        Self { parts, basis, half: OnceLock::new(), size, hash, bytes: bytes.len(), site_radii }
+        Self {
+            parts,
+            basis,
+            half: OnceLock::new(),
+            mass_sites: OnceLock::new(),
+            size,
+            hash,
+            bytes: bytes.len(),
+            site_radii,
+        }
+    }
+
+    pub(crate) fn mass_sites(&self) -> &MassSites {
+        self.mass_sites.get_or_init(|| Arc::new(MassSites::new(self)))
     }
 
     pub(crate) fn site_radii(&self) -> &[f64] {

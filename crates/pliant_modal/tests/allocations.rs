@@ -42,7 +42,9 @@ fn a_step_with_two_grabs_under_warp_allocates_nothing() {
     for (free, relaxation) in [(false, None), (true, None), (false, Some(material)), (true, Some(material))] {
         for integrator in [Integrator::Exact, Integrator::GeneralizedAlpha { rho_inf: 0.5 }] {
             let model = Arc::new(rod(2e5, 20, 0.05, free));
-            let config = BodyConfig { step: 1.0 / 240.0, integrator, relaxation, ..Default::default() };
+            let gravity = [0.0, -9.81, 0.0];
+            let config =
+                BodyConfig { step: 1.0 / 240.0, integrator, relaxation, gravity, ..Default::default() };
             let mut body = Body::new(model.clone(), config).unwrap();
             let grabs = [tip(), tip() / 2].map(|vertex| {
                 let patch = Patch::around(model.surface(), vertex, 0.06).unwrap();

@@ -17,6 +17,7 @@ pub struct ImpliedPulls {
     /// `1 / omega^2`.
     softness: Vec<f64>,
     force: Vec<f64>,
+    weight: Vec<f64>,
     grams: Grams,
     tangents: Vec<Tangent>,
     system: System,
@@ -26,9 +27,9 @@ impl ImpliedPulls {
     /// For the states that a kernel steps.
     pub fn new(kernel: &Kernel) -> Self {
         let softness: Vec<f64> = kernel.omega().iter().map(|w| 1.0 / w.powi(2).max(1e-12)).collect();
-        let force = softness.clone();
+        let (force, weight) = (softness.clone(), softness.clone());
         let (grams, tangents, system) = (Grams::default(), Vec::new(), System::default());
-        Self { softness, force, grams, tangents, system }
+        Self { softness, force, weight, grams, tangents, system }
     }
 
     /// Writes the pulls (N, world axes) into the hands. Those whose rows are dependent share. Hands of
@@ -48,7 +49,8 @@ impl ImpliedPulls {
             let (omega, damping) = (kernel.omega()[k], kernel.damping()[k]);
             *force = state.a[k] + damping * state.v[k] + omega * omega * stretch;
         }
-        for (force, weight) in self.force.iter_mut().zip(kernel.weight(&state.frame)) {
+        kernel.weight(&state.frame, &state.q, &mut self.weight);
+        for (force, weight) in self.force.iter_mut().zip(&self.weight) {
             *force -= weight;
         }
         for (force, softness) in self.force.iter_mut().zip(&self.softness) {
@@ -58,8 +60,8 @@ impl ImpliedPulls {
         self.system.clear(n, true);
         self.tangents.clear();
         for (i, hand) in hands.iter().enumerate() {
-            let (_, t) = tangent(&hand.patch.reduce(&state.q, settings.warp), settings.warp);
-            let along = t * hand.patch.reduce(&self.force, settings.warp);
+            let (_, t) = tangent(&hand.patch.rows().reduce(&state.q, settings.warp), settings.warp);
+            let along = t * hand.patch.rows().reduce(&self.force, settings.warp);
             self.system.right()[3 * i..3 * i + 3].copy_from_slice(along.as_slice());
             self.tangents.push(t);
         }

@@ -123,6 +123,7 @@ impl Kernel {
             modes,
         };
         kernel.before = kernel.at_rest();
+        kernel.prepare_weight();
         Ok(kernel)
     }
 
@@ -136,6 +137,7 @@ impl Kernel {
         self.creep = Creep::new(settings.relaxation, settings.stiffness_scale, h);
         (self.settings, self.h) = (settings, h);
         self.before = self.at_rest();
+        self.prepare_weight();
         self.responses.forget();
         self.dampers.forget();
         Ok(())
@@ -264,23 +266,33 @@ impl Kernel {
         Err(StepError::Diverged { what })
     }
 
-    /// Modal force of gravity, kg^1/2 m/s^2; nothing where there is none on the modes.
-    pub(crate) fn weight(&self, frame: &Frame) -> impl Iterator<Item = f64> + use<'_> {
+    /// Makes what gravity needs, so that the first step does not have to.
+    fn prepare_weight(&self) {
+        if self.settings.warp && !self.model.is_free() && self.settings.gravity != [0.0; 3] {
+            self.model.mass_sites();
+        }
+    }
+
+    /// Modal force of gravity on an anchored body, kg^1/2 m/s^2, into `force`.
+    pub(crate) fn weight(&self, frame: &Frame, q: &[f64], force: &mut [f64]) {
+        force.fill(0.0);
         let gravity = Vector3::from(self.settings.gravity);
-        let weighs = !self.model.is_free() && gravity != Vector3::zeros();
+        if self.model.is_free() || gravity == Vector3::zeros() {
+            return;
+        }
         let local = frame.rotation().inverse() * gravity;
-        let participation = self.model.participation();
-        let participation = if weighs { participation } else { &[] };
-        participation.iter().map(move |p| local.dot(&Vector3::from(*p)))
+        for (f, participation) in force.iter_mut().zip(self.model.participation()) {
+            *f = local.dot(&Vector3::from(*participation));
+        }
+        if self.settings.warp {
+            self.model.mass_sites().add(&local, q, force);
+        }
     }
 
     fn advance(&mut self, state: &mut State, hands: &mut [Hand], load: &Load<'_>) -> StepReport {
         let gravity = Vector3::from(self.settings.gravity);
         let mut force = std::mem::take(&mut self.force);
-        force.fill(0.0);
-        for (f, weight) in force.iter_mut().zip(self.weight(&state.frame)) {
-            *f = weight;
-        }
+        self.weight(&state.frame, &state.q, &mut force);
         self.force = force;
         for (f, load) in self.force.iter_mut().zip(load.modal) {
             *f += load;
@@ -329,7 +341,7 @@ impl Kernel {
         }
         self.pulls.fill(0.0);
         for (hand, forces) in hands.iter().zip(&self.forces) {
-            hand.patch.spread(forces, self.settings.warp, &mut self.pulls);
+            hand.patch.rows().spread(forces, self.settings.warp, &mut self.pulls);
         }
         self.modes.respond(&self.pulls, state);
         for (f, pull) in self.force.iter_mut().zip(&self.pulls) {
@@ -360,8 +372,8 @@ impl Kernel {
         self.solving.clear();
         for hand in hands {
             let mut solving = Solving {
-                free: hand.patch.reduce(&state.q, warp),
-                from: hand.patch.reduce(&self.before.q, warp),
+                free: hand.patch.rows().reduce(&state.q, warp),
+                from: hand.patch.rows().reduce(&self.before.q, warp),
                 compliance: self.creep.compliance(hand),
                 beyond,
                 pull: hand.mean,
@@ -382,7 +394,7 @@ impl Kernel {
                 solving.crept = self.creep.crept(&hand.flow);
                 solving.relaxation = config.relaxation;
                 if config.relaxation > 0.0 {
-                    solving.speed = hand.patch.reduce(&self.velocity, warp);
+                    solving.speed = hand.patch.rows().reduce(&self.velocity, warp);
                 }
             }
             self.solving.push(solving);

@@ -10,6 +10,7 @@ mod rigid;
 mod settings;
 mod solve;
 mod state;
+mod weight;
 
 pub use constraint::{GrabConfig, Hand, Hold};
 pub use implied::ImpliedPulls;
@@ -18,3 +19,6 @@ pub use patch::HeldPatch;
 pub use rigid::{Frame, RigidMotion};
 pub use settings::StepSettings;
 pub use state::State;
+
+pub(crate) use patch::{Six, tangent};
+pub(crate) use weight::MassSites;

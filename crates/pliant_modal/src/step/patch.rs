@@ -53,12 +53,15 @@ fn dot3(rows: [&[f64]; 3], x: &[f64]) -> [f64; 3] {
     out
 }
 
+/// Rows of the mean displacement and of the mean rotation of some vertices, one entry a mode.
+#[derive(Debug, Clone)]
+pub(crate) struct MeanRows([Vec<f64>; 6]);
+
 /// A patch of a model with what its steps need: the weighted means of its vertices' modes, and how
 /// the patch gives way besides them. Made once, shared by all copies of the body.
 #[derive(Debug, Clone)]
 pub struct HeldPatch {
-    /// Rows of the mean displacement and of the mean rotation, one entry a mode.
-    rows: [Vec<f64>; 6],
+    rows: MeanRows,
     rest: Vector3<f64>,
     /// Residual flexibility at the baked stiffness, m/N.
     residual: Matrix3<f64>,
@@ -72,20 +75,10 @@ impl HeldPatch {
     pub fn new(model: &ModalModel, patch: &Patch, modes: usize) -> Result<Self, StepError> {
         let modes = modes.min(model.mode_count());
         let residual = residual(model, patch, modes)?;
-        let mut rest = Vector3::zeros();
-        let mut rows: [Vec<f64>; 6] = std::array::from_fn(|_| vec![0.0; modes]);
-        for &(vertex, weight) in patch.entries() {
-            rest += weight * Vector3::from(model.surface().positions()[vertex as usize].map(f64::from));
-            for axis in 0..3 {
-                for (mode, row) in rows[axis].iter_mut().enumerate() {
-                    *row += weight * f64::from(model.displacement_row(vertex, axis, mode));
-                }
-                for (mode, row) in rows[3 + axis].iter_mut().enumerate() {
-                    *row += weight * f64::from(model.rotation_row(vertex, axis, mode));
-                }
-            }
-        }
-        Ok(Self { rows, rest, residual })
+        let positions = model.surface().positions();
+        let at = |vertex: u32| Vector3::from(positions[vertex as usize].map(f64::from));
+        let rest = patch.entries().iter().map(|&(vertex, weight)| weight * at(vertex)).sum();
+        Ok(Self { rows: MeanRows::new(model, patch.entries(), modes), rest, residual })
     }
 
     /// Where the patch is at rest, m, body axes.
@@ -100,17 +93,39 @@ impl HeldPatch {
 
     /// Number of modes.
     pub fn modes(&self) -> usize {
-        self.rows[0].len()
+        self.rows.0[0].len()
     }
 
     /// How far the patch is from its rest at the coordinates `q`, m, body axes.
     pub fn displacement(&self, q: &[f64], warped: bool) -> Vector3<f64> {
-        displacement(&self.reduce(q, warped), warped)
+        displacement(&self.rows.reduce(q, warped), warped)
+    }
+
+    pub(crate) fn rows(&self) -> &MeanRows {
+        &self.rows
+    }
+}
+
+impl MeanRows {
+    /// Of surface vertices with weights whose sum is 1.
+    pub(crate) fn new(model: &ModalModel, entries: &[(u32, f64)], modes: usize) -> Self {
+        let mut rows: [Vec<f64>; 6] = std::array::from_fn(|_| vec![0.0; modes]);
+        for &(vertex, weight) in entries {
+            for axis in 0..3 {
+                for (mode, row) in rows[axis].iter_mut().enumerate() {
+                    *row += weight * f64::from(model.displacement_row(vertex, axis, mode));
+                }
+                for (mode, row) in rows[3 + axis].iter_mut().enumerate() {
+                    *row += weight * f64::from(model.rotation_row(vertex, axis, mode));
+                }
+            }
+        }
+        Self(rows)
     }
 
     /// The six sums `B x`. Without warp the rotation plays no part and stays zero.
     pub(crate) fn reduce(&self, x: &[f64], warped: bool) -> Six {
-        let [a, b, c, d, e, f] = &self.rows;
+        let [a, b, c, d, e, f] = &self.0;
         let u = dot3([a, b, c], x);
         let w = if warped { dot3([d, e, f], x) } else { [0.0; 3] };
         Six::new(u[0], u[1], u[2], w[0], w[1], w[2])
@@ -119,7 +134,7 @@ impl HeldPatch {
     /// `out += B^T forces`.
     pub(crate) fn spread(&self, forces: &Six, warped: bool, out: &mut [f64]) {
         let n = out.len();
-        let [a, b, c, d, e, f] = self.rows.each_ref().map(|r| &r[..n]);
+        let [a, b, c, d, e, f] = self.0.each_ref().map(|r| &r[..n]);
         let g = forces;
         if warped {
             for k in 0..n {
@@ -136,10 +151,10 @@ impl HeldPatch {
     /// `B_self diag(weight) B_other^T`.
     fn gram(&self, other: &Self, weight: &[f64], scratch: &mut Vec<f64>) -> Block {
         let mut block = Block::zeros();
-        for (i, mine) in self.rows.iter().enumerate() {
+        for (i, mine) in self.0.iter().enumerate() {
             scratch.clear();
             scratch.extend(mine.iter().zip(weight).map(|(r, w)| r * w));
-            for (j, theirs) in other.rows.iter().enumerate() {
+            for (j, theirs) in other.0.iter().enumerate() {
                 block[(i, j)] = dot(scratch, theirs);
             }
         }
@@ -183,7 +198,7 @@ pub(crate) fn tangent(six: &Six, warped: bool) -> (Vector3<f64>, Tangent) {
     (u, tangent)
 }
 
-/// [`HeldPatch::gram`] of all pairs of held patches, lower triangle; kept while the patches stay.
+/// [`MeanRows::gram`] of all pairs of held patches, lower triangle; kept while the patches stay.
 #[derive(Debug, Clone, Default)]
 pub(crate) struct Grams {
     patches: Vec<Arc<HeldPatch>>,
@@ -207,7 +222,7 @@ impl Grams {
                 blocks.push(match (old[i], old[j]) {
                     (Some(x), Some(y)) if x >= y => *self.at(x, y),
                     (Some(x), Some(y)) => self.at(y, x).transpose(),
-                    _ => a.patch.gram(&b.patch, weight, &mut self.scratch),
+                    _ => a.patch.rows.gram(&b.patch.rows, weight, &mut self.scratch),
                 });
             }
         }

@@ -1,0 +1,95 @@
+//! A slender bar held at one end, hanging under its own weight.
+#![allow(clippy::unwrap_used, missing_docs, reason = "a failed test should panic")]
+
+use std::sync::Arc;
+
+use pliant_bake::{BakeConfig, bake};
+use pliant_mesh::shapes;
+use pliant_modal::{Body, BodyConfig, Damping, HeldPatch, ModalModel, Patch};
+
+const YOUNG: f64 = 2.9e6;
+const DENSITY: f64 = 1000.0;
+const SIDE: f64 = 0.05;
+
+/// 1 x 0.05 x 0.05 m of 40 x 2 x 2 cells, fixed at x = 0, 20 modes.
+fn bar() -> Arc<ModalModel> {
+    let mesh = shapes::bar([40, 2, 2], [1.0, SIDE, SIDE]).unwrap();
+    let config = BakeConfig {
+        modes: 20,
+        young: YOUNG,
+        density: DENSITY,
+        damping: Damping::Ratio(0.5),
+        anchors: vec!["x<0.001".parse().unwrap()],
+        ..BakeConfig::default()
+    };
+    Arc::new(bake(&mesh, None, &config, &mut |_, _| {}).unwrap().model)
+}
+
+/// Where the middle of the end comes to rest under so many times the earth's gravity, m.
+fn end_of(model: &Arc<ModalModel>, times: f64) -> [f64; 3] {
+    let gravity = [0.0, -9.81 * times, 0.0];
+    let mut body = Body::new(model.clone(), BodyConfig { gravity, ..Default::default() }).unwrap();
+    for _ in 0..60 * 30 {
+        body.step().unwrap();
+    }
+    let positions = model.surface().positions();
+    let off = |p: &[f32; 3]| {
+        (p[0] - 1.0).powi(2) + (p[1] - 0.5 * SIDE as f32).powi(2) + (p[2] - 0.5 * SIDE as f32).powi(2)
+    };
+    let end = (0..positions.len()).min_by(|&a, &b| off(&positions[a]).total_cmp(&off(&positions[b])));
+    let patch = Patch::around(model.surface(), end.unwrap() as u32, 0.0).unwrap();
+    let patch = HeldPatch::new(model, &patch, model.mode_count()).unwrap();
+    (patch.rest() + patch.displacement(body.q(), true)).into()
+}
+
+/// The heavy elastica, `E I t'' = -w (L - s) cos t`, `t(0) = 0`, `t'(L) = 0`: where its end is, m, by
+/// Runge and Kutta's method and bisection of the curvature at the wall.
+fn elastica(times: f64) -> [f64; 2] {
+    let stiffness = YOUNG * SIDE.powi(4) / 12.0;
+    let weight = DENSITY * SIDE * SIDE * 9.81 * times;
+    const PARTS: usize = 2000;
+    let h = 1.0 / PARTS as f64;
+    let shoot = |curvature: f64| {
+        let slope = |s: f64, t: f64, k: f64| [k, weight * (1.0 - s) * t.cos() / stiffness, t.cos(), t.sin()];
+        let mut y = [0.0, curvature, 0.0, 0.0];
+        for i in 0..PARTS {
+            let s = i as f64 * h;
+            let k1 = slope(s, y[0], y[1]);
+            let k2 = slope(s + 0.5 * h, y[0] + 0.5 * h * k1[0], y[1] + 0.5 * h * k1[1]);
+            let k3 = slope(s + 0.5 * h, y[0] + 0.5 * h * k2[0], y[1] + 0.5 * h * k2[1]);
+            let k4 = slope(s + h, y[0] + h * k3[0], y[1] + h * k3[1]);
+            for j in 0..4 {
+                y[j] += h / 6.0 * (k1[j] + 2.0 * k2[j] + 2.0 * k3[j] + k4[j]);
+            }
+        }
+        y
+    };
+    // Downwards is negative: the curvature at the wall is, and the more so the heavier the bar.
+    let (mut low, mut high) = (-weight / stiffness, 0.0);
+    for _ in 0..200 {
+        let middle = 0.5 * (low + high);
+        if shoot(middle)[1] > 0.0 { high = middle } else { low = middle }
+    }
+    let end = shoot(0.5 * (low + high));
+    [end[2], end[3]]
+}
+
+#[test]
+fn a_bar_hangs_lower_the_heavier_it_is_and_never_behind_its_wall() {
+    let model = bar();
+    let mut last = 0.0;
+    for times in [0.05, 0.2, 0.5, 1.0, 2.0] {
+        let ([x, y, _], [true_x, true_y]) = (end_of(&model, times), elastica(times));
+        let fallen = 0.5 * SIDE - y;
+        println!(
+            "{times} g: the end is at {x:.3} m and {fallen:.3} m lower; the elastica's at {true_x:.3} and {:.3}",
+            -true_y
+        );
+        assert!(x > 0.0, "{times} g: behind the wall at {x} m");
+        assert!(fallen > last, "{times} g: {fallen} m, less than {last} m under less");
+        last = fallen;
+        if times <= 0.05 {
+            assert!((fallen / -true_y - 1.0).abs() < 0.05, "{times} g: {fallen} m instead of {} m", -true_y);
+        }
+    }
+}
