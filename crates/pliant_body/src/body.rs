@@ -91,6 +91,7 @@ impl ModalBody {
         BodyConfig {
             step,
             integrator: self.integrator.into(),
+            second_order: true,
             warp: self.warp,
             modes: self.modes,
             gravity: (self.gravity / scale).into(),

@@ -323,7 +323,7 @@ fn is_slow(body: &Body, limit: f64) -> bool {
     let modes: f64 = body.v().iter().map(|v| v * v).sum();
     // A limit that is NaN lets nothing rest.
     let below = modes < limit * limit * mass;
-    if !below {
+    if !below || is_relaxing(body, limit) {
         return false;
     }
     if !body.model().is_free() {
@@ -333,6 +333,17 @@ fn is_slow(body: &Body, limit: f64) -> bool {
     let velocity = DVec3::from(frame.velocity());
     let spin = DVec3::from(frame.spin());
     velocity.length() < limit && spin.length() < limit * mass * body.model().size()
+}
+
+/// Whether a viscoelastic body has still farther to go than it would at this speed (m/s) in the time
+/// after which it rests. However slowly it goes there, it is not where it will be.
+///
+/// Unmoved, `omega^2 (q - ratio z) = f` and in the end `q = z`: what is left is `ratio / (1 - ratio) (z - q)`.
+fn is_relaxing(body: &Body, limit: f64) -> bool {
+    let Some(relaxation) = body.config().relaxation else { return false };
+    let share = relaxation.ratio / (1.0 - relaxation.ratio);
+    let left: f64 = body.q().iter().zip(body.z()).map(|(q, z)| (share * (z - q)).powi(2)).sum();
+    left > (limit * REST_AFTER).powi(2) * body.model().mass()
 }
 
 pub(crate) fn publish(

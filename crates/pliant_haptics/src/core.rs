@@ -298,6 +298,7 @@ impl LoopCore {
         }
         let holding = self.good && self.heard > 0 && model.count > 0;
         let silent = if holding { (now - self.heard_at).max(0.0) } else { 0.0 };
+        let silent = StaleConfig::counted(silent, model.interval);
 
         let felt = if holding {
             let when = When { now, dt, period: 1.0 / self.config.rate };

@@ -36,6 +36,8 @@ pub struct LocalModel {
     pub stamp: f64,
     /// Time that a step of the simulation covers, s.
     pub period: f64,
+    /// Real time between two words, as far as the simulation knows it, s; 0 where it does not.
+    pub interval: f64,
     /// The first `count` are in use.
     pub contacts: [Contact; MAX_CONTACTS],
     /// Number of grabs that the tool holds.
@@ -46,6 +48,8 @@ pub struct LocalModel {
     pub partial: bool,
     /// Energy that others (other hands, gravity) have put into the body so far, J, net.
     pub supplied: f64,
+    /// Where the other hands on the body are, m, the body's world.
+    pub others: Vec<(GrabId, [f64; 3])>,
     /// The body's state, for a loop that steps it itself. Empty: there is none.
     pub state: State,
 }
@@ -58,12 +62,13 @@ impl LocalModel {
 
     /// Room for the state of `body`, so that the first write allocates nothing either.
     pub fn sized_for(body: &Body) -> Self {
-        Self { state: body.state().clone(), ..Self::default() }
+        let others = Vec::with_capacity(Body::MAX_GRABS);
+        Self { others, state: body.state().clone(), ..Self::default() }
     }
 
     /// No number in it is NaN or infinite.
     pub fn is_finite(&self) -> bool {
-        let scalars = [self.stamp, self.period, self.stored, self.supplied];
+        let scalars = [self.stamp, self.period, self.interval, self.stored, self.supplied];
         scalars.iter().all(|x| x.is_finite())
             && self.contacts().iter().all(|c| {
                 let vectors = [c.offset, c.proxy, c.velocity, c.reaction];
@@ -110,7 +115,8 @@ pub struct ModelWriter {
     stored: Option<f64>,
     worked: f64,
     targets: Vec<(GrabId, Vector3<f64>)>,
-    center: Option<Vector3<f64>>,
+    /// Potential energy of the body in gravity, J, as of the last word.
+    potential: Option<f64>,
     supplied: f64,
 }
 
@@ -148,6 +154,10 @@ impl ModelWriter {
         self.supplied += self.work_of_others(body, held)? * scale * scale;
         out.supplied = self.supplied;
         out.state.clone_from(body.state());
+        out.others.clear();
+        for id in body.grabs().filter(|id| held.iter().all(|held| held.id != *id)) {
+            out.others.push((id, body.target(id)?));
+        }
 
         let [x, y, z, w] = body.frame().orientation();
         let turn =
@@ -235,6 +245,7 @@ impl ModelWriter {
         });
         self.supplied = self.supplied.max(stored - before - self.worked);
         out.partial = true;
+        out.others.clear();
         (out.stored, out.supplied) = (stored, self.supplied);
     }
 
@@ -255,12 +266,10 @@ impl ModelWriter {
             }
         }
         self.targets.retain(|(known, _)| body.grabs().any(|id| id == *known));
-        let center = Vector3::from(body.frame().center());
-        if body.model().is_free() {
-            let last = self.center.unwrap_or(center);
-            work += body.model().mass() * Vector3::from(body.config().gravity).dot(&(center - last));
-        }
-        self.center = Some(center);
+        // Of an anchored body too: it bends under its own weight as a hand lifts and lowers it.
+        let potential = body.potential_energy();
+        work += self.potential.unwrap_or(potential) - potential;
+        self.potential = Some(potential);
         Ok(work)
     }
 }

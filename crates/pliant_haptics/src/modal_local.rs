@@ -69,6 +69,10 @@ impl ModalLocal {
                 return false;
             }
         }
+        // Whoever else holds the body goes where the simulation has seen them go.
+        for &(id, target) in &model.others {
+            self.body.set_target(id, target).ok();
+        }
         for grab in self.held.iter().flatten() {
             let target = (tool.position + tool.orientation * Vector3::from(grab.offset)) / self.scale;
             if !tool.is_clutched() && self.body.set_target(grab.id, target.into()).is_err() {
@@ -115,26 +119,39 @@ impl ModalLocal {
         self.frames[self.head] = (now, *self.body.frame());
     }
 
+    /// The slot whose time is nearest to one, where it is within a period of it. A loop that missed
+    /// periods has fewer slots than periods.
+    fn remembered(&self, time: f64) -> Option<usize> {
+        let slots = self.slots();
+        let newest_first = (0..slots).map(|back| (self.head + slots - back) % slots);
+        let mut nearest = None;
+        let mut off = self.period;
+        for at in newest_first {
+            let distance = (self.frames[at].0 - time).abs();
+            // They only get older.
+            if distance > off {
+                if nearest.is_some() || self.frames[at].0 < time {
+                    break;
+                }
+                continue;
+            }
+            (nearest, off) = (Some(at), distance);
+        }
+        nearest
+    }
+
     /// Takes the simulation's word about the time of its stamp.
     fn correct(&mut self, model: &LocalModel) -> bool {
         let modes = self.body.mode_count();
         if model.state.q.len() != modes || model.state.v.len() != modes {
             return false;
         }
-        // The newest memory that is not younger than the word; none: the word is about the time before the copy, or the first.
-        let slots = self.slots();
-        let age = (self.frames[self.head].0 - model.stamp) / self.period;
-        let Some(back) = (age.is_finite() && age.round() >= 0.0 && (age.round() as usize) < slots)
-            .then_some(age.round() as usize)
-        else {
+        // The memory of that time; none: the word is about the time before the copy, or the first.
+        let Some(at) = self.remembered(model.stamp) else {
             return self.body.set_state(&model.state).is_ok();
         };
-        let at = (self.head + slots - back) % slots;
-        if self.frames[at].0 == f64::NEG_INFINITY {
-            return self.body.set_state(&model.state).is_ok();
-        }
         // A difference that is taken out faster than it can be seen to go is taken out twice.
-        let age = back as f64 * self.period;
+        let age = self.frames[self.head].0 - self.frames[at].0;
         let gain = 1.0 - (-model.period.max(0.0) / CORRECTION.max(age / PATIENCE)).exp();
         self.scratch.q.copy_from_slice(self.body.q());
         self.scratch.v.copy_from_slice(self.body.v());
@@ -152,7 +169,7 @@ impl ModalLocal {
             let (omega, damping) = (self.body.omega()[i], self.body.damping()[i]);
             let [eq, ev, _] = match Coefficients::new(Integrator::Exact, omega, damping, age.max(self.period))
             {
-                Ok(swing) if back > 0 => swing.step([eq, ev, 0.0], 0.0, 0.0),
+                Ok(swing) if at != self.head => swing.step([eq, ev, 0.0], 0.0, 0.0),
                 _ => [eq, ev, 0.0],
             };
             self.scratch.q[i] += gain * eq;

@@ -469,6 +469,12 @@ impl Body {
         modes + if self.model().is_free() { self.state.frame.kinetic_energy(self.model()) } else { 0.0 }
     }
 
+    /// Potential energy in gravity, J: of the deformation of an anchored body (0 when undeformed), of the
+    /// place of a free one (0 at the world's origin).
+    pub fn potential_energy(&self) -> f64 {
+        self.kernel.potential_energy(&self.state)
+    }
+
     /// Linear (kg m/s) and angular momentum about the world's origin (kg m^2/s) of a free body's rigid motion; zero for an anchored one.
     pub fn momentum(&self) -> ([f64; 3], [f64; 3]) {
         if self.model().is_free() { self.state.frame.momentum(self.model()) } else { ([0.0; 3], [0.0; 3]) }

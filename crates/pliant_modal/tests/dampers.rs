@@ -11,6 +11,26 @@ fn pip() -> Arc<ModalModel> {
     Arc::new(ModalModel::read(path).unwrap())
 }
 
+/// Gravity on a bent body does the work of its potential: without damping nothing is lost or gained.
+#[test]
+fn under_gravity_energy_stays() {
+    let model = pip();
+    let config = BodyConfig {
+        step: 1.0 / 60.0,
+        damping_scale: 0.0,
+        gravity: [25.0, -15.0, 10.0],
+        ..Default::default()
+    };
+    let mut body = Body::new(model, config).unwrap();
+    let (mut most, mut off) = (0.0f64, 0.0f64);
+    for _ in 0..60 * 60 {
+        body.step().unwrap();
+        most = most.max(body.energy());
+        off = off.max((body.energy() + body.potential_energy()).abs());
+    }
+    assert!(most > 1.0 && off < 1e-6 * most, "{off} J of {most} J");
+}
+
 /// Two hands 2 cm apart, with their dampers' relaxation times (s).
 fn held(step: f64, integrator: Integrator, warp: bool, relaxations: [f64; 2]) -> (Body, [GrabId; 2]) {
     let model = pip();

@@ -5,7 +5,7 @@ use std::sync::Arc;
 use bevy::{math::DVec3, prelude::*};
 use nalgebra::Matrix3;
 use pliant_body::{BodyState, Driven, Grab, GrabForce, GrabOf, ShownState};
-use pliant_modal::{BodyConfig, GrabConfig, ModalModel, Patch};
+use pliant_modal::{BodyConfig, GrabConfig, GrabId, ModalModel, Patch};
 
 use super::{HapticDevices, HapticTool, ToolGrabs, ToolOffset};
 use crate::{Coupling, FeltGrab, HeldGrab, LocalModel, MAX_CONTACTS, ModalLocal};
@@ -23,6 +23,8 @@ type Bodies<'w, 's> =
 #[derive(Default, PartialEq)]
 pub(crate) struct CopyOf {
     grabs: Vec<u64>,
+    /// All grabs on the body: the copy has the others' too, and they come and go.
+    all: Vec<GrabId>,
     /// The model by its place in memory, which the copy that has it keeps from being another's.
     model: usize,
     /// Without the step, which the loop has its own of: in a schedule of the picture's rate it differs each time.
@@ -34,6 +36,7 @@ impl CopyOf {
     fn new(state: &BodyState, held: &[HeldGrab], coupling: &Coupling) -> Self {
         Self {
             grabs: held.iter().map(|grab| grab.key).collect(),
+            all: state.body().grabs().collect(),
             model: Arc::as_ptr(state.model()).addr(),
             config: Some(BodyConfig { step: 0.0, ..state.body().config().clone() }),
             coupling: Some(*coupling),
@@ -105,6 +108,7 @@ impl Elsewhere {
 
 pub(crate) fn publish(
     time: Res<Time>,
+    simulated: Option<Res<Time<Virtual>>>,
     mut devices: ResMut<HapticDevices>,
     tools: Query<(&HapticTool, Option<&ToolGrabs>)>,
     grabs: HeldGrabs,
@@ -115,6 +119,8 @@ pub(crate) fn publish(
         // Paused: the simulation is silent, and the loop fades.
         return;
     }
+    let speed = simulated.map_or(1.0, |time| f64::from(time.relative_speed()));
+    let interval = if speed > 0.0 { period / speed } else { 0.0 };
     for (tool, held) in &tools {
         let Some(entry) = devices.entry(tool.device) else { continue };
         let entities = held.map_or(&[][..], ToolGrabs::entities);
@@ -127,6 +133,7 @@ pub(crate) fn publish(
         if let Some((state, ids)) = &local {
             let scale = state.scale();
             let wrong = entry.running.get().publish(|model: &mut LocalModel| {
+                model.interval = interval;
                 writer.write(state.body(), ids, &coupling, scale, seen, model).err()
             });
             if let Some(error) = wrong {
@@ -156,6 +163,7 @@ pub(crate) fn publish(
             let relaxation = coupling.grab_config(tool.motion_scale, tool.force_scale).relaxation;
             let stored = stored(&held, &bodies);
             let write = |model: &mut LocalModel| {
+                model.interval = interval;
                 writer.write_forces(&felt, relaxation, stored, period, seen, model);
             };
             entry.running.get().publish(write);

@@ -27,7 +27,9 @@ impl VelocityCutConfig {
     }
 }
 
-/// When the simulation is silent.
+/// When the simulation is silent. The limits are for one that speaks every 25 ms or more often; where
+/// it is known to speak more seldom (simulated time runs slower than real time) they are longer in
+/// proportion, at most four times.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct StaleConfig {
     /// Silence that is taken for granted, s: a step at 40 Hz and its jitter. Default: 0.030.
@@ -43,6 +45,18 @@ impl Default for StaleConfig {
 }
 
 impl StaleConfig {
+    /// How often the simulation speaks for which the limits are, s.
+    const EVERY: f64 = 0.025;
+    /// Most times that they are longer.
+    const MOST: f64 = 4.0;
+
+    /// A silence (s) as it counts where the simulation speaks every `interval` s.
+    pub(crate) fn counted(silent: f64, interval: f64) -> f64 {
+        let slower = interval / Self::EVERY;
+        // Not `clamp`: what is not a number changes nothing.
+        if slower > 1.0 { silent / slower.min(Self::MOST) } else { silent }
+    }
+
     pub(crate) fn is_valid(&self) -> bool {
         self.patience >= 0.0 && self.limit.is_finite() && self.limit > self.patience
     }

@@ -82,6 +82,7 @@ pub struct Kernel {
     /// Modal forces: of everything but hands, then of hands.
     force: Vec<f64>,
     pulls: Vec<f64>,
+    bend: Vec<f64>,
     /// Modal velocities as dampers see them.
     velocity: Vec<f64>,
     solving: Vec<Solving>,
@@ -111,6 +112,7 @@ impl Kernel {
             before: State::default(),
             force: zero.clone(),
             pulls: zero.clone(),
+            bend: zero.clone(),
             velocity: zero,
             solving: Vec::new(),
             forces: Vec::new(),
@@ -268,13 +270,27 @@ impl Kernel {
 
     /// Makes what gravity needs, so that the first step does not have to.
     fn prepare_weight(&self) {
-        if self.settings.warp && !self.model.is_free() && self.settings.gravity != [0.0; 3] {
+        if self.bends_under_gravity() {
             self.model.mass_sites();
         }
     }
 
     /// Modal force of gravity on an anchored body, kg^1/2 m/s^2, into `force`.
     pub(crate) fn weight(&self, frame: &Frame, q: &[f64], force: &mut [f64]) {
+        self.weight_at_rest(frame, force);
+        if self.bends_under_gravity() {
+            let local = frame.rotation().inverse() * Vector3::from(self.settings.gravity);
+            self.model.mass_sites().add(&local, q, force);
+        }
+    }
+
+    /// Whether gravity does other work on the deformed shape than on the one at rest.
+    fn bends_under_gravity(&self) -> bool {
+        self.settings.warp && !self.model.is_free() && self.settings.gravity != [0.0; 3]
+    }
+
+    /// Modal force of gravity on the undeformed shape.
+    fn weight_at_rest(&self, frame: &Frame, force: &mut [f64]) {
         force.fill(0.0);
         let gravity = Vector3::from(self.settings.gravity);
         if self.model.is_free() || gravity == Vector3::zeros() {
@@ -284,20 +300,64 @@ impl Kernel {
         for (f, participation) in force.iter_mut().zip(self.model.participation()) {
             *f = local.dot(&Vector3::from(*participation));
         }
-        if self.settings.warp {
-            self.model.mass_sites().add(&local, q, force);
+    }
+
+    /// Adds to the step without hands what gravity does on the way between its two shapes.
+    fn bend_under_gravity(&mut self, state: &mut State) {
+        /// The force moves the end of the step, and that the force. A gentle bend is done in two rounds.
+        const MOST_ROUNDS: usize = 12;
+        /// Of the force that is left wrong.
+        const SHARE: f64 = 1e-9;
+        let local = state.frame.rotation().inverse() * Vector3::from(self.settings.gravity);
+        // What it was in the round before.
+        self.pulls.fill(0.0);
+        for _ in 0..MOST_ROUNDS {
+            let ends = [&*self.before.q, &*state.q];
+            self.model.mass_sites().between(&local, ends, &mut self.velocity, &mut self.bend);
+            for (last, now) in self.pulls.iter_mut().zip(&self.bend) {
+                *last = now - *last;
+            }
+            self.modes.respond(&self.pulls, state);
+            let largest = |forces: &[f64]| forces.iter().fold(0.0f64, |most, f| most.max(f.abs()));
+            if largest(&self.pulls) <= SHARE * largest(&self.bend) {
+                break;
+            }
+            self.pulls.copy_from_slice(&self.bend);
         }
+        for (force, bend) in self.force.iter_mut().zip(&self.bend) {
+            *force += bend;
+        }
+    }
+
+    /// Potential energy in gravity, J: of the deformation of an anchored body, of the place of a free one.
+    pub fn potential_energy(&self, state: &State) -> f64 {
+        let gravity = Vector3::from(self.settings.gravity);
+        if gravity == Vector3::zeros() {
+            return 0.0;
+        }
+        if self.model.is_free() {
+            return -self.model.mass() * gravity.dot(&Vector3::from(state.frame.center()));
+        }
+        let local = state.frame.rotation().inverse() * gravity;
+        let straight = state.q.iter().zip(self.model.participation());
+        let straight: f64 = straight.map(|(q, p)| q * local.dot(&Vector3::from(*p))).sum();
+        let bent = if self.settings.warp { self.model.mass_sites().work(&local, &state.q) } else { 0.0 };
+        -(straight + bent)
     }
 
     fn advance(&mut self, state: &mut State, hands: &mut [Hand], load: &Load<'_>) -> StepReport {
         let gravity = Vector3::from(self.settings.gravity);
+        let bends = self.bends_under_gravity();
         let mut force = std::mem::take(&mut self.force);
-        self.weight(&state.frame, &state.q, &mut force);
+        self.weight_at_rest(&state.frame, &mut force);
         self.force = force;
         for (f, load) in self.force.iter_mut().zip(load.modal) {
             *f += load;
         }
         self.modes.advance(&self.before, &self.force, state);
+        if bends {
+            self.bend_under_gravity(state);
+        }
         let rigid = (self.model.is_free() && !load.frame_is_given).then(|| {
             RigidMotion::predict(&mut state.frame, &self.model, self.h, gravity, load.force, load.torque)
         });

@@ -2,11 +2,11 @@
 
 use nalgebra::Vector3;
 
-use super::patch::{MeanRows, tangent};
+use super::patch::{MeanRows, displacement, tangent};
 use crate::ModalModel;
 
 /// Into so many parts a body's mass is divided.
-const SITES: usize = 24;
+const SITES: usize = 16;
 
 /// A body's mass in parts, each where its bit of the surface is.
 ///
@@ -46,6 +46,43 @@ impl MassSites {
             sound.then(|| (model.mass() * share / whole, MeanRows::new(model, &entries, model.mode_count())))
         };
         Self((0..SITES).filter_map(site).collect())
+    }
+
+    /// The work of that on the way from rest to the shape `q`, J.
+    pub(crate) fn work(&self, gravity: &Vector3<f64>, q: &[f64]) -> f64 {
+        let of = |(mass, rows): &(f64, MeanRows)| {
+            let six = rows.reduce(q, true);
+            let straight = Vector3::new(six[0], six[1], six[2]);
+            *mass * gravity.dot(&(displacement(&six, true) - straight))
+        };
+        self.0.iter().map(of).sum()
+    }
+
+    /// The modal force of that over a step from `from` to `to`, as far as its work there goes: the
+    /// discrete gradient of Gonzalez (J. Nonlinear Sci. 6, 1996), the force in the middle plus what makes
+    /// `force . (to - from)` the work between them to rounding. A force that is constant over a step and
+    /// taken at its beginning would feed a swinging body, step by step. `middle` is scratch.
+    pub(crate) fn between(
+        &self,
+        gravity: &Vector3<f64>,
+        [from, to]: [&[f64]; 2],
+        middle: &mut [f64],
+        force: &mut [f64],
+    ) {
+        force.fill(0.0);
+        for (middle, (from, to)) in middle.iter_mut().zip(from.iter().zip(to)) {
+            *middle = 0.5 * (from + to);
+        }
+        self.add(gravity, middle, force);
+        let way = || from.iter().zip(to).map(|(from, to)| to - from);
+        let square: f64 = way().map(|way| way * way).sum();
+        let along: f64 = way().zip(&*force).map(|(way, force)| way * force).sum();
+        let missing = self.work(gravity, to) - self.work(gravity, from) - along;
+        let share = missing / square;
+        // Of no way there is no work.
+        if share.is_finite() {
+            force.iter_mut().zip(way()).for_each(|(force, way)| *force += share * way);
+        }
     }
 
     /// Adds to the modal force what gravity (m/s^2, body axes) does more on the shape `q` than at rest.
