@@ -5,7 +5,7 @@ use thiserror::Error;
 
 use crate::{
     Coupling, CouplingConfig, DeviceInfo, Fault, InfoError, LocalModel, ModalLocal, Port, Safety,
-    SafetyConfig, Sample, ToolMap, Wanted, Wrench,
+    SafetyConfig, Sample, StaleConfig, ToolMap, Wanted, Wrench,
     held::{Change, Felt, Held, When},
     intake::{Believed, Intake},
     safety::{Slew, clamp_magnitude},

@@ -186,6 +186,12 @@ impl ModalLocal {
         self.body.set_state(&self.scratch).is_ok()
     }
 
+    /// The time of a slot, as a test looks at it.
+    #[cfg(test)]
+    fn time_of(&self, slot: usize) -> f64 {
+        self.frames[slot].0
+    }
+
     fn corrected_frame(&self, then: &Frame, told: &Frame, gain: f64) -> Result<Frame, StepError> {
         let now = self.body.frame();
         let toward = |now: [f64; 3], told: [f64; 3], then: [f64; 3]| -> [f64; 3] {
@@ -202,5 +208,87 @@ impl ModalLocal {
             toward(now.velocity(), told.velocity(), then.velocity()),
             toward(now.spin(), told.spin(), then.spin()),
         )
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use std::{path::Path, sync::Arc};
+
+    use pliant_modal::{BodyConfig, GrabConfig, ModalModel, Patch};
+
+    use super::*;
+    use crate::{Coupling, CouplingLimit, ToolMap, local::ModelWriter};
+
+    fn pip(gravity: [f64; 3]) -> Body {
+        let path = Path::new(env!("CARGO_MANIFEST_DIR")).join("../../assets/pip.modal");
+        let model = Arc::new(ModalModel::read(path).unwrap());
+        Body::new(model, BodyConfig { gravity, ..Default::default() }).unwrap()
+    }
+
+    fn coupling() -> Coupling {
+        let limit = CouplingLimit::None;
+        let [stiffness, damping] = [400.0, 4.0];
+        let wanted = [stiffness, damping];
+        Coupling { stiffness, damping, wanted, stiffness_limit: limit, damping_limit: limit }
+    }
+
+    fn grab(body: &mut Body, vertex: u32) -> pliant_modal::GrabId {
+        let patch = Patch::around(body.model().surface(), vertex, 0.02).unwrap();
+        body.grab(&patch, GrabConfig::default()).unwrap()
+    }
+
+    #[test]
+    fn a_word_is_about_its_time_whatever_periods_were_missed() {
+        let mut copy = ModalLocal::new(&pip([0.0; 3]), &[], 1.0, 1000.0).unwrap();
+        let model = LocalModel::default();
+        // Every third time four periods at once.
+        let mut now = 0.0;
+        for k in 0..120 {
+            let steps = if k % 3 == 0 { 4 } else { 1 };
+            now += f64::from(steps) * 1e-3;
+            assert!(copy.advance(now, steps as usize, &Tool::new(ToolMap::default()), &model));
+        }
+        for back in [0.0, 0.013, 0.050, 0.1, 0.2] {
+            let slot = copy.remembered(now - back).unwrap();
+            // Between two slots there are up to four periods.
+            assert!((copy.time_of(slot) - (now - back)).abs() <= 1e-3, "{back} s ago");
+        }
+        assert_eq!(copy.remembered(now + 0.01), None, "the future");
+        assert_eq!(copy.remembered(now - 10.0), None, "long ago");
+    }
+
+    #[test]
+    fn the_other_hands_go_where_the_simulation_has_them() {
+        let mut body = pip([0.0; 3]);
+        let (own, other) = (grab(&mut body, 76), grab(&mut body, 63));
+        let held = HeldGrab { key: 1, id: own, offset: [0.0; 3] };
+        let mut copy = ModalLocal::new(&body, &[held], 1.0, 1000.0).unwrap();
+        let [x, y, z] = body.target(other).unwrap();
+        body.set_target(other, [x + 0.01, y, z]).unwrap();
+        body.step().unwrap();
+        let mut model = LocalModel::sized_for(&body);
+        ModelWriter::new().write(&body, &[held], &coupling(), 1.0, 0.0, &mut model).unwrap();
+        assert!(copy.advance(1e-3, 1, &Tool::new(ToolMap::default()), &model));
+        assert_eq!(copy.body.target(other).unwrap(), [x + 0.01, y, z]);
+    }
+
+    #[test]
+    fn what_gravity_gives_to_a_bent_body_is_supplied() {
+        let mut body = pip([0.0, -9.81, 0.0]);
+        let own = grab(&mut body, 76);
+        let held = HeldGrab { key: 1, id: own, offset: [0.0; 3] };
+        let (mut writer, mut model) = (ModelWriter::new(), LocalModel::sized_for(&body));
+        let [x, y, z] = body.target(own).unwrap();
+        let mut begun = None;
+        for k in 0..240 {
+            let way = 0.02 * (f64::from(k) * 0.05).sin();
+            body.set_target(own, [x, y + way, z]).unwrap();
+            body.step().unwrap();
+            writer.write(&body, &[held], &coupling(), 1.0, 0.0, &mut model).unwrap();
+            let (from, at) = *begun.get_or_insert((model.supplied, body.potential_energy()));
+            let given = at - body.potential_energy();
+            assert!((model.supplied - from - given).abs() < 1e-12, "{} J of {given} J", model.supplied - from);
+        }
     }
 }

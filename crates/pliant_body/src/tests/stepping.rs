@@ -113,6 +113,31 @@ fn a_still_body_rests_after_half_a_second_and_a_touch_wakes_it() {
 }
 
 #[test]
+fn a_body_that_creeps_back_does_not_rest_while_it_is_bent() {
+    let mut app = app();
+    // It goes back within some 40 s, and always slower than what counts as rest.
+    let relaxation = crate::Viscoelastic { ratio: 0.5, time: 20.0 };
+    let slow = |body: &mut ModalBody| (body.relaxation, body.rest_speed) = (Some(relaxation), 0.01);
+    let body = spawn_with(&mut app, model::bar(), slow, ());
+    // Held aside for long, and let go.
+    let mut entity = app.world_mut().get_mut::<crate::BodyState>(body).unwrap();
+    let mut bent = entity.body().state().clone();
+    (bent.q[0], bent.z[0]) = (0.05, 0.1);
+    entity.body_mut().set_state(&bent).unwrap();
+    let mass = state(&app, body).model().mass();
+    for _ in 0..40 * 200 {
+        app.update();
+        let state = state(&app, body);
+        if state.is_resting() {
+            break;
+        }
+    }
+    let state = state(&app, body);
+    let bent = (state.body().q()[0].powi(2) / mass).sqrt();
+    assert!(state.is_resting() && bent < 0.01 * 0.5, "it rests bent by {bent} m");
+}
+
+#[test]
 fn the_picture_stands_between_the_last_two_steps() {
     let mut app = app();
     let body = spawn_with(&mut app, model::bar(), |body| body.gravity = DVec3::NEG_Y, ());

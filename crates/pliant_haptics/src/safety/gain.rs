@@ -67,6 +67,22 @@ impl StaleConfig {
     }
 }
 
+#[cfg(test)]
+#[test]
+fn a_slow_simulation_is_waited_for_within_bounds() {
+    let stale = StaleConfig::default();
+    let allowed = |silent: f64, interval: f64| stale.allows(StaleConfig::counted(silent, interval));
+    for interval in [0.0, 0.016, 0.025, f64::NAN, -1.0] {
+        assert_eq!((allowed(0.029, interval), allowed(0.050, interval)), (1.0, 0.0), "every {interval} s");
+    }
+    // A quarter of the speed at 40 Hz.
+    assert_eq!((allowed(0.119, 0.1), allowed(0.2, 0.1)), (1.0, 0.0));
+    // However slow it is, a fifth of a second is the most.
+    for interval in [1.0, 1e300, f64::INFINITY] {
+        assert_eq!(allowed(0.2, interval), 0.0, "every {interval} s");
+    }
+}
+
 /// Part of the force that is felt.
 #[derive(Debug, Clone, Copy)]
 pub struct Gain {

@@ -47,8 +47,8 @@ impl NetGuest {
     pub(super) fn body_ready(&mut self, world: &mut World, id: BodyId, model: Arc<ModalModel>) {
         let Some(view) = self.session.as_ref().and_then(|session| session.body(id)) else { return };
         let info = view.info();
-        let (name, warp) = (info.name.clone(), info.warp);
-        let (damping_scale, stiffness_scale) = (info.damping_scale, info.stiffness_scale);
+        let name = info.name.clone();
+        let StepSettings { warp, damping_scale, stiffness_scale, .. } = info.settings;
         // How many of them the stream carries may change; the picture has room for all that we would take.
         let modes = self.config.modes.map(usize::from).filter(|&modes| modes < model.mode_count());
         let now = self.now();
@@ -117,8 +117,7 @@ impl NetGuest {
     /// The host steps it otherwise: what is shown of it here (its energy, its knobs) goes by the same settings.
     pub(super) fn body_changed(&mut self, world: &mut World, id: BodyId) {
         let Some(view) = self.session.as_ref().and_then(|session| session.body(id)) else { return };
-        let (damping_scale, stiffness_scale) = (view.info().damping_scale, view.info().stiffness_scale);
-        let warp = view.info().warp;
+        let StepSettings { warp, damping_scale, stiffness_scale, .. } = view.info().settings;
         let Some(followed) = self.bodies.get(&id) else { return };
         if let Some(mut body) = world.get_mut::<ModalBody>(followed.entity) {
             let new = ModalBody { warp, damping_scale, stiffness_scale, ..body.clone() };
