@@ -5,7 +5,7 @@ use std::sync::Arc;
 use bevy::prelude::*;
 use pliant_body::{Driven, ModalAsset, ModalBody};
 use pliant_modal::ModalModel;
-use pliant_stream::{BodyId, BodyView, Pose};
+use pliant_stream::{BodyId, BodyView, Pose, StepSettings};
 
 use super::{Interest, NetGuest, shown_of};
 use crate::phase::Phase;
