@@ -29,7 +29,7 @@ fn a_held_tip_pushes_back_with_its_static_stiffness() {
     let mut app = app();
     let body = spawn_with(&mut app, model::bar(), linear, ());
     let hand = grab(&mut app, body, DVec3::new(1.0, 0.05, 0.0));
-    steps(&mut app, 400);
+    steps(&mut app, 800);
     let held = state(&app, body).body().grabs().next().unwrap();
     assert_eq!(state(&app, body).grab_id(hand), Some(held));
     assert_eq!(state(&app, body).grab_id(body), None, "an entity that is no grab of it");
