@@ -138,13 +138,13 @@ fn a_slow_world_is_felt_as_well() {
     let mut s = scene(false);
     // As sessions step: 40 Hz, at a quarter of the speed every tenth of a second.
     s.app.insert_resource(Time::<Fixed>::from_hz(40.0));
-    s.app.world_mut().get_mut::<ToolGrip>(s.tool).unwrap().press();
+    s.hand.set_buttons(1);
     until(&mut s, "it is held", |s| grabs(&mut s.app).len() == 1);
     s.hand.set_target([0.02, 0.0, 0.0]);
-    until(&mut s, "a force", |s| force(s).length() > 0.2);
+    until(&mut s, "3 N", |s| (-3.3..-2.7).contains(&force(s).x));
     s.app.world_mut().resource_mut::<Time<Virtual>>().set_relative_speed(0.25);
     s.run(50);
-    stays(&mut s, "at a quarter of the speed", |s| force(s).length() > 0.1);
+    stays(&mut s, "at a quarter of the speed", |s| force(s).length() > 2.0);
 }
 
 fn grabs(app: &mut App) -> Vec<(Grab, GrabForce)> {
