@@ -98,15 +98,18 @@ fn modes_left_out_are_given_to_the_hand_by_their_flexibility() {
 }
 
 #[test]
-fn under_a_hand_the_exact_step_is_of_first_order_and_the_others_of_second() {
+fn under_a_hand_all_steps_are_of_second_order() {
     let part = Part::of("steps");
-    // From 60 to 960 steps a second: sixteen times better, and a hundred times and more.
+    // From 60 to 960 steps a second: of second order is 256 times better. The exact step has a small
+    // part of first order left, from the rows of a hand on a bent body, which are those of the step's end.
     let gain = |name: &str| {
         let line = part.line("c-steps-held", name);
         line[0].1 / last(&line)
     };
     let (exact, alpha) = (gain("exact (default)"), gain("generalized-alpha 0.5"));
-    assert!((12.0..25.0).contains(&exact) && alpha > 60.0, "{exact}, {alpha}");
+    assert!(exact > 30.0 && alpha > 60.0, "{exact}, {alpha}");
+    let exact = part.line("c-steps-held", "exact (default)");
+    assert!(exact[0].1 < 6e-3 && exact[1].1 < 6e-4, "at 60 and 240 steps a second: {exact:?}");
     assert!(gain("Newmark (the paper's)") > 60.0);
     // A reference worth the name: at most a tenth of what is measured by it.
     let csv = std::fs::read_to_string(part.folder.0.join("out/c-steps-held.csv")).unwrap();
