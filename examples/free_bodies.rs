@@ -72,7 +72,7 @@ fn spawn(mut commands: Commands, assets: Res<AssetServer>, mut materials: ResMut
     ];
     for (part, x, colour) in parts {
         let mut body = ModalBody::new(assets.load("jack.modal"));
-        body.gravity = if part == Part::Struck { DVec3::ZERO } else { GRAVITY };
+        body.settings.gravity = if part == Part::Struck { [0.0; 3] } else { GRAVITY.into() };
         commands.spawn((
             body,
             part,
@@ -200,7 +200,8 @@ fn keep_account(
             .flat_map(|grabs| forces.iter_many(grabs.entities()))
             .map(|felt| -felt.force)
             .sum();
-        account.applied += (hands + state.model().mass() * settings.gravity) * time.delta_secs_f64();
+        account.applied +=
+            (hands + state.model().mass() * DVec3::from(settings.settings.gravity)) * time.delta_secs_f64();
     }
 }
 

@@ -102,7 +102,8 @@ fn spawn(
     let names = ["soft, texture", "firm, texture", "soft, own shader"];
     for (i, (skin, name)) in skins.into_iter().zip(names).enumerate() {
         let firm = i == 1;
-        let mut body = ModalBody { gravity: DVec3::new(0.0, -9.81, 0.0), ..default() };
+        let mut body = ModalBody::default();
+        body.settings.gravity = [0.0, -9.81, 0.0];
         if !source.bake {
             body.model = assets.load(if firm { "jelly-firm.modal" } else { "jelly-soft.modal" });
         }

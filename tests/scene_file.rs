@@ -85,7 +85,7 @@ fn what_is_no_ron_is_told_where_it_ends_to_be_one() {
             "model: \"pip.modal\", modes: -3",
             "expected a whole number, 0 or more, got `-3`",
         ),
-        ("model: \"pip.modal\"", "model: \"pip.modal\", warp: yes", "expected true or false, got `yes`"),
+        ("model: \"pip.modal\"", "model: \"pip.modal\", pointer: yes", "expected true or false, got `yes`"),
         (
             "Toward((1, 0, 0))",
             "Toward(1, 0, 0)",
@@ -699,8 +699,11 @@ fn missing_files_are_told_by_a_check_with_their_lines() {
 
 #[test]
 fn stiffness_and_the_basis_of_a_body_are_the_scene_s() {
-    let text =
-        GOOD.replacen("model: \"pip.modal\"", "model: \"pip.modal\", stiffness: 4, half_basis: true", 1);
+    let text = GOOD.replacen(
+        "model: \"pip.modal\"",
+        "model: \"pip.modal\", settings: (stiffness_scale: 4), half_basis: true",
+        1,
+    );
     let mut app = app();
     app.add_plugins(SceneFilePlugin::open(SceneFile::from_ron(&text, "my.ron").unwrap()).unwrap());
     run_until(&mut app, "the bodies", |world| world.query::<&BodyState>().iter(world).count() == 2);
@@ -710,7 +713,7 @@ fn stiffness_and_the_basis_of_a_body_are_the_scene_s() {
         .iter(world)
         .map(|(name, body, state)| {
             let ratio = state.body().omega()[0] / state.model().omega()[0];
-            (name.to_string(), body.stiffness_scale, body.half_basis, ratio)
+            (name.to_string(), body.settings.stiffness_scale, body.half_basis, ratio)
         })
         .collect();
     let of = |name: &str| bodies.iter().find(|body| body.0 == name).unwrap();
@@ -718,9 +721,15 @@ fn stiffness_and_the_basis_of_a_body_are_the_scene_s() {
     // Four times as stiff: twice the frequency.
     assert!((of("pip").3 - 2.0).abs() < 1e-9, "{bodies:?}");
     assert_eq!((of("bud").1, of("bud").2), (1.0, false));
-    let error = with("model: \"pip.modal\"", "model: \"pip.modal\", stiffness: 0");
-    assert_eq!(error.position, Some((4, 54)));
-    assert_eq!(error.message, "expected a factor of the stiffness from 0.000001 to 1000000, got 0");
+    for (settings, column, told) in [
+        ("stiffness_scale: 0", 71, "stiffness_scale: expected 1e-6 to 1e6, got 0"),
+        ("relaxation: (ratio: 1, time: 2)", 74, "relaxation ratio: expected 0 or more, below 1, got 1"),
+        ("integrator: GeneralizedAlpha(rho_inf: 2)", 92, "rho_inf: expected 0 to 1, got 2"),
+    ] {
+        let settings = format!("model: \"pip.modal\", settings: ({settings})");
+        let error = with("model: \"pip.modal\"", &settings);
+        assert_eq!((error.position, error.message.as_str()), (Some((4, column)), told));
+    }
 }
 
 #[cfg(feature = "rerun")]

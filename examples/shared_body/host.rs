@@ -11,7 +11,7 @@ use std::{
 
 use bevy::{app::ScheduleRunnerPlugin, diagnostic::DiagnosticsStore, prelude::*};
 use pliant::{
-    body::{Integration, STEP_TIME},
+    body::{Integrator, STEP_TIME},
     modal::ModalModel,
     net::{NetHost, NetPlugin, NetStats, SharedBody},
     prelude::*,
@@ -52,10 +52,10 @@ impl Shared {
 struct Model(Arc<ModalModel>);
 
 #[derive(Resource)]
-struct Stepped(Integration);
+struct Stepped(Integrator);
 
 /// Runs the host's app on this thread until it is told to stop.
-pub fn run(model: Arc<ModalModel>, integrator: Integration, net: NetPlugin, truth: Truth, shared: Shared) {
+pub fn run(model: Arc<ModalModel>, integrator: Integrator, net: NetPlugin, truth: Truth, shared: Shared) {
     App::new()
         .add_plugins((
             MinimalPlugins.set(ScheduleRunnerPlugin::run_loop(Duration::from_millis(2))),
@@ -82,7 +82,8 @@ fn spawn(
     mut assets: ResMut<Assets<ModalAsset>>,
 ) {
     let asset = assets.add(ModalAsset::from(model.0.clone()));
-    let body = ModalBody { integrator: integrator.0, ..ModalBody::new(asset) };
+    let mut body = ModalBody::new(asset);
+    body.settings.integrator = integrator.0;
     commands.spawn((body, SharedBody::named(BODY)));
 }
 

@@ -36,7 +36,7 @@ use std::{
 use bevy::math::DVec3;
 use clap::Parser;
 use pliant::{
-    body::Integration,
+    body::Integrator,
     modal::ModalModel,
     net::{Emulation, HostConfig, Invite, JoinConfig, JoinOptions, NetPlugin},
     rerun::RerunPlugin,
@@ -79,8 +79,8 @@ fn run(options: &Options) -> Result<(), Box<dyn Error>> {
         let (model, truth, shared) = (model.clone(), truth.clone(), shared.clone());
         // Streamed accelerations are read by Newmark's formulas, so the body is stepped by a method that obeys them; a stream of reactions has no such wish.
         let integrator = match options.recovery {
-            Recovery::Default => Integration::Exact,
-            Recovery::Paper | Recovery::None => Integration::GeneralizedAlpha { rho_inf: 0.5 },
+            Recovery::Default => Integrator::Exact,
+            Recovery::Paper | Recovery::None => Integrator::GeneralizedAlpha { rho_inf: 0.5 },
         };
         thread::Builder::new()
             .name("host".into())

@@ -5,7 +5,9 @@ use std::sync::Arc;
 
 use pliant_bake::{BakeConfig, bake};
 use pliant_mesh::shapes;
-use pliant_modal::{Body, BodyConfig, Damping, Element, GrabConfig, Integrator, ModalModel, Patch};
+use pliant_modal::{
+    Body, BodyConfig, Damping, Element, GrabConfig, Integrator, ModalModel, Patch, StepSettings,
+};
 
 /// 20 x 3 x 3 cells, 1,080 tetrahedra, fixed at x = 0, 20 modes.
 fn bar(young: f64) -> Arc<ModalModel> {
@@ -38,7 +40,15 @@ fn path(t: f64) -> f64 {
 
 /// max |second difference of F| / max |F| of the tip dragged sideways by a fifth of the length: 4 for a sign flip each step.
 fn ringing(model: &Arc<ModalModel>, integrator: Integrator, step: f64) -> f64 {
-    let mut body = Body::new(model.clone(), BodyConfig { step, integrator, ..Default::default() }).unwrap();
+    let mut body = Body::new(
+        model.clone(),
+        BodyConfig {
+            step,
+            settings: StepSettings { integrator, ..Default::default() },
+            ..Default::default()
+        },
+    )
+    .unwrap();
     let patch = Patch::around(model.surface(), tip(model), 0.06).unwrap();
     let grab = body.grab(&patch, GrabConfig::default()).unwrap();
     let start = body.grab_position(grab).unwrap();

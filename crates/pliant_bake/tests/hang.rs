@@ -5,7 +5,7 @@ use std::sync::Arc;
 
 use pliant_bake::{BakeConfig, bake};
 use pliant_mesh::shapes;
-use pliant_modal::{Body, BodyConfig, Damping, HeldPatch, ModalModel, Patch};
+use pliant_modal::{Body, BodyConfig, Damping, HeldPatch, ModalModel, Patch, StepSettings};
 
 const YOUNG: f64 = 2.9e6;
 const DENSITY: f64 = 1000.0;
@@ -28,7 +28,8 @@ fn bar() -> Arc<ModalModel> {
 /// Where the middle of the end comes to rest under so many times the earth's gravity, m.
 fn end_of(model: &Arc<ModalModel>, times: f64) -> [f64; 3] {
     let gravity = [0.0, -9.81 * times, 0.0];
-    let mut body = Body::new(model.clone(), BodyConfig { gravity, ..Default::default() }).unwrap();
+    let mut body =
+        Body::new(model.clone(), BodyConfig::from(StepSettings { gravity, ..Default::default() })).unwrap();
     for _ in 0..60 * 30 {
         body.step().unwrap();
     }

@@ -5,8 +5,9 @@ use std::sync::Arc;
 use bevy::{
     math::{Affine3A, DVec3},
     prelude::*,
+    reflect::reflect_remote,
 };
-use pliant_modal::{Body, BodyConfig, GrabId, Integrator, ModalModel, Precision, Relaxation};
+use pliant_modal::{Body, BodyConfig, GrabId, Integrator, ModalModel, Precision, Relaxation, StepSettings};
 
 use crate::{ModalAsset, grab::Hold};
 
@@ -35,29 +36,19 @@ use crate::{ModalAsset, grab::Hold};
 pub struct ModalBody {
     /// The baked body. Swapping the handle, or the asset behind it, makes a new body at rest; grabs whose vertex it has stay.
     pub model: Handle<ModalAsset>,
-    /// How a step is integrated. Default: [`Integration::Exact`].
-    pub integrator: Integration,
+    /// How it is stepped: integrator, warp, gravity, damping, stiffness, relaxation. Gravity is in
+    /// world axes and world lengths.
+    #[reflect(remote = ReflectedSettings)]
+    pub settings: StepSettings,
     /// How many of the model's modes are kept, lowest first: the level of detail. Default: `None`, all.
     pub modes: Option<usize>,
-    /// Bend by modal warping, right for large rotations; `false` is the plain linear shape. Default: `true`.
-    pub warp: bool,
-    /// Multiplies the baked damping of every mode, 0 or more. Default: `1.0`.
-    pub damping_scale: f64,
-    /// Multiplies the baked stiffness, 1e-6 to 1e6, as though it were baked with so many times the Young's modulus: frequencies go with its root.
-    /// May be changed while the body moves. Default: `1.0`.
-    pub stiffness_scale: f64,
-    /// A material that relaxes under a held strain and creeps under a held force. Default: `None`, elastic.
-    pub relaxation: Option<Viscoelastic>,
-    /// Newton corrections in one step of the grabs on a body that is bent by warping, a number from 1 to 8 (what is outside is taken as
-    /// the nearest of them). Default: `2`.
-    pub corrections: usize,
-    /// Where the processor writes the surface (see `SurfaceDeformation`): from a basis in half precision, in half the time where the surface is large,
-    /// and off by some 5e-5 of the body's size where it is pulled by a fifth of it. Default: `false`.
+    /// Whether the processor writes the surface (see `SurfaceDeformation`) from a basis in half
+    /// precision: in half the time where the surface is large, and off by some 5e-5 of the body's
+    /// size where it is pulled by a fifth of it. Default: `false`.
     pub half_basis: bool,
-    /// Acceleration of gravity, m/s^2, in world axes. Default: zero, as a bake at rest is usually wanted as it was drawn.
-    pub gravity: DVec3,
-    /// The body rests once the root mean square speed of its mass stays below this, m/s of the model, for half a second with
-    /// nobody holding it: it is then neither stepped nor uploaded until something touches it. Zero never rests. Default: `1e-4`.
+    /// The body rests once the root mean square speed of its mass stays below this, m/s of the model,
+    /// for half a second with nobody holding it: it is then neither stepped nor uploaded until
+    /// something touches it. Zero never rests. Default: `1e-4`.
     pub rest_speed: f64,
 }
 
@@ -71,88 +62,67 @@ impl Default for ModalBody {
 impl ModalBody {
     /// A body of `model` with every setting at its default.
     pub fn new(model: Handle<ModalAsset>) -> Self {
-        Self {
-            model,
-            integrator: Integration::default(),
-            modes: None,
-            warp: true,
-            damping_scale: 1.0,
-            stiffness_scale: 1.0,
-            relaxation: None,
-            corrections: BodyConfig::default().corrections,
-            half_basis: false,
-            gravity: DVec3::ZERO,
-            rest_speed: 1e-4,
-        }
+        Self { model, settings: StepSettings::default(), modes: None, half_basis: false, rest_speed: 1e-4 }
     }
 
     /// What the solver is told, for a step of `step` seconds under a uniform scale of `scale`.
     pub(crate) fn config(&self, step: f64, scale: f64) -> BodyConfig {
         BodyConfig {
+            settings: StepSettings {
+                gravity: self.settings.gravity.map(|acceleration| acceleration / scale),
+                ..self.settings
+            },
             step,
-            integrator: self.integrator.into(),
-            second_order: true,
-            warp: self.warp,
             modes: self.modes,
-            gravity: (self.gravity / scale).into(),
-            damping_scale: self.damping_scale,
-            stiffness_scale: self.stiffness_scale,
-            relaxation: self.relaxation.map(Relaxation::from),
-            corrections: self.corrections,
             precision: if self.half_basis { Precision::Half } else { Precision::Single },
         }
     }
 }
 
-/// The material of a [`ModalBody`] that relaxes: [`Relaxation`], which knows no engine, as a field that reflection sees.
-///
-/// The stress under a strain that is held falls to `1 - ratio` of what it was, as `1 - ratio (1 - exp(-t / time))`. Default: half of the
-/// stiffness within a second.
-#[derive(Reflect, Debug, Clone, Copy, PartialEq)]
+// The solver's types know no engine. Reflection sees their fields through these, which the compiler
+// holds to be the same.
+
+#[reflect_remote(StepSettings)]
+#[derive(Debug, Default, Clone, Copy, PartialEq)]
 #[reflect(Debug, Default, Clone, PartialEq)]
-pub struct Viscoelastic {
-    /// Share of the baked stiffness that relaxes away, 0 or more and below 1. Default: `0.5`.
-    pub ratio: f64,
-    /// Relaxation time under a held strain, s, above 0. Default: `1.0`.
-    pub time: f64,
+pub(crate) struct ReflectedSettings {
+    #[reflect(remote = ReflectedIntegrator)]
+    integrator: Integrator,
+    second_order: bool,
+    warp: bool,
+    corrections: u8,
+    gravity: [f64; 3],
+    damping_scale: f64,
+    stiffness_scale: f64,
+    #[reflect(remote = MaybeRelaxation)]
+    relaxation: Option<Relaxation>,
 }
 
-impl Default for Viscoelastic {
-    fn default() -> Self {
-        Self { ratio: 0.5, time: 1.0 }
-    }
-}
-
-impl From<Viscoelastic> for Relaxation {
-    fn from(Viscoelastic { ratio, time }: Viscoelastic) -> Self {
-        Self { ratio, time }
-    }
-}
-
-/// How a [`ModalBody`] is stepped: [`Integrator`], which knows no engine, as a field that reflection sees.
-#[derive(Reflect, Debug, Default, Clone, Copy, PartialEq)]
+#[reflect_remote(Integrator)]
+#[derive(Debug, Default, Clone, Copy, PartialEq)]
 #[reflect(Debug, Default, Clone, PartialEq)]
-pub enum Integration {
-    /// [`Integrator::Exact`]: closed form, exact for a force that is constant over the step.
-    #[default]
+pub(crate) enum ReflectedIntegrator {
     Exact,
-    /// [`Integrator::Newmark`]: average acceleration.
     Newmark,
-    /// [`Integrator::GeneralizedAlpha`]: the form whose accelerations are streamed.
-    GeneralizedAlpha {
-        /// Spectral radius at infinite frequency, 0 to 1; 0.5 suits hands.
-        rho_inf: f64,
-    },
+    GeneralizedAlpha { rho_inf: f64 },
 }
 
-impl From<Integration> for Integrator {
-    fn from(integration: Integration) -> Self {
-        match integration {
-            Integration::Exact => Self::Exact,
-            Integration::Newmark => Self::Newmark,
-            Integration::GeneralizedAlpha { rho_inf } => Self::GeneralizedAlpha { rho_inf },
-        }
-    }
+type Relaxes = Option<Relaxation>;
+
+#[reflect_remote(Relaxes)]
+#[derive(Debug, Default, Clone, Copy, PartialEq)]
+#[reflect(Debug, Default, Clone, PartialEq)]
+pub(crate) enum MaybeRelaxation {
+    None,
+    Some(#[reflect(remote = ReflectedRelaxation)] Relaxation),
+}
+
+#[reflect_remote(Relaxation)]
+#[derive(Debug, Clone, Copy, PartialEq)]
+#[reflect(Debug, Clone, PartialEq)]
+pub(crate) struct ReflectedRelaxation {
+    ratio: f64,
+    time: f64,
 }
 
 /// Who moves a body. Default: [`Local`](Self::Local).
@@ -230,6 +200,11 @@ impl BodyState {
         self.placed.is_some_and(|placed| bits(&placed) == bits(affine))
     }
 
+    /// Whether the entity's transform has been taken over, which the first tick does.
+    pub fn has_place(&self) -> bool {
+        self.placed.is_some()
+    }
+
     /// The simulated body: its modal state, its frame, its grabs.
     pub fn body(&self) -> &Body {
         &self.body
@@ -256,7 +231,7 @@ impl BodyState {
 
     /// Whether the shape is bent by modal warping.
     pub fn warps(&self) -> bool {
-        self.body.config().warp
+        self.body.config().settings.warp
     }
 
     /// What the surface is written from on the processor.

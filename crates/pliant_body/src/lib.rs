@@ -67,13 +67,14 @@ pub use bake::{
     BakeBodyError, BakeFailed, BakePlugin, BakeProgress, BakeRequest, BakeShape, BakeSkin, BakeStage,
 };
 pub use blow::{Push, Strike};
-pub use body::{BodyState, Driven, Integration, ModalBody, NoPointerGrab, Viscoelastic};
+pub use body::{BodyState, Driven, ModalBody, NoPointerGrab};
 #[cfg(feature = "render")]
 pub use deform::{DrawnSurface, SurfaceDeformation, SurfaceDetail, SurfaceShading};
 pub use error::{BodyError, BodyRefused};
 pub use grab::{Grab, GrabForce, GrabOf, Grabs};
 pub use pause::SingleSteps;
 pub use pick::{SurfaceHit, pick_surface};
+pub use pliant_modal::{Integrator, Relaxation, StepSettings};
 pub use pointer::{PointerGrab, PointerGrabPlugin, PointerGrabSystems, PointerHeld};
 pub use shown::{Pose, ShownState};
 pub use step::PliantTick;

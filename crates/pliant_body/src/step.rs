@@ -11,7 +11,7 @@ use bevy::{
     math::{DQuat, DVec3},
     prelude::*,
 };
-use pliant_modal::{Body, BodyConfig, GrabConfig, ModalModel, Patch, StepError};
+use pliant_modal::{Body, BodyConfig, GrabConfig, ModalModel, Patch, StepError, StepSettings};
 
 use crate::{
     AWAKE_BODIES, BodyError, BodyRefused, BodyState, Driven, Grab, GrabForce, GrabOf, Grabs, ModalAsset,
@@ -188,9 +188,10 @@ pub(crate) fn place_bodies(
         let scale = f64::from(scale.x);
         if scale != state.scale {
             // From what the body runs with, not from its component, whose fields may have been refused.
-            let running = state.body.config().clone();
-            let gravity = DVec3::from(running.gravity) * (state.scale / scale);
-            match state.body_mut().reconfigure(BodyConfig { gravity: gravity.into(), ..running }) {
+            let mut running = state.body.config().clone();
+            let shrink = state.scale / scale;
+            running.settings.gravity = running.settings.gravity.map(|acceleration| acceleration * shrink);
+            match state.body_mut().reconfigure(running) {
                 Ok(()) => state.scale = scale,
                 Err(error) => {
                     refusals.tell(&name, name.entity, BodyError::Build(error));
@@ -340,7 +341,7 @@ fn is_slow(body: &Body, limit: f64) -> bool {
 ///
 /// Unmoved, `omega^2 (q - ratio z) = f` and in the end `q = z`: what is left is `ratio / (1 - ratio) (z - q)`.
 fn is_relaxing(body: &Body, limit: f64) -> bool {
-    let Some(relaxation) = body.config().relaxation else { return false };
+    let Some(relaxation) = body.config().settings.relaxation else { return false };
     let share = relaxation.ratio / (1.0 - relaxation.ratio);
     let left: f64 = body.q().iter().zip(body.z()).map(|(q, z)| (share * (z - q)).powi(2)).sum();
     left > (limit * REST_AFTER).powi(2) * body.model().mass()

@@ -218,7 +218,7 @@ impl ModalLocal {
 mod tests {
     use std::{path::Path, sync::Arc};
 
-    use pliant_modal::{BodyConfig, GrabConfig, ModalModel, Patch};
+    use pliant_modal::{BodyConfig, GrabConfig, ModalModel, Patch, StepSettings};
 
     use super::*;
     use crate::{Coupling, CouplingLimit, ToolMap, local::ModelWriter};
@@ -226,7 +226,7 @@ mod tests {
     fn pip(gravity: [f64; 3]) -> Body {
         let path = Path::new(env!("CARGO_MANIFEST_DIR")).join("../../assets/pip.modal");
         let model = Arc::new(ModalModel::read(path).unwrap());
-        Body::new(model, BodyConfig { gravity, ..Default::default() }).unwrap()
+        Body::new(model, BodyConfig::from(StepSettings { gravity, ..Default::default() })).unwrap()
     }
 
     fn coupling() -> Coupling {

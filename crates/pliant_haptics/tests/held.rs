@@ -12,7 +12,7 @@ use pliant_haptics::{
     Contact, Cycle, DeviceInfo, Fault, Hand, HapticDevice, LocalModel, LoopConfig, LoopCore, LoopEvent,
     LoopState, ModalLocal, Pace, SafetyConfig, Sample, VirtualConfig, VirtualDevice, VirtualPace, Wrench,
 };
-use pliant_modal::BodyConfig;
+use pliant_modal::{BodyConfig, StepSettings};
 use rig::scene::{Scene, SceneConfig};
 
 /// A firm hand that has pulled the block to the side and holds it there.
@@ -61,7 +61,10 @@ fn a_new_copy_of_the_body_takes_over_without_letting_go() {
 fn a_stiffer_body_is_felt_as_one_little_by_little() {
     let mut scene = holding(true, 0.01);
     let before = scene.force();
-    let stiffer = BodyConfig { stiffness_scale: 4.0, ..scene.body.config().clone() };
+    let stiffer = BodyConfig {
+        settings: StepSettings { stiffness_scale: 4.0, ..scene.body.config().settings },
+        ..scene.body.config().clone()
+    };
     scene.body.reconfigure(stiffer).unwrap();
     let copy = ModalLocal::new(&scene.body, &[scene.held], 1.0, 1000.0).unwrap();
     scene.cycle.set_modal(Some(Box::new(copy)));

@@ -266,7 +266,7 @@ fn a_remote_body_that_turns_softer_is_felt_so() {
     let [stiff, soft] = [1.0, 1e-3].map(want);
     assert!((stiff / soft) > 3.0, "{stiff} and {soft} N");
     until(&mut s, "the stiff one", |s| (force(s).x - stiff).abs() < 0.3);
-    s.app.world_mut().get_mut::<ModalBody>(body).unwrap().stiffness_scale = 1e-3;
+    s.app.world_mut().get_mut::<ModalBody>(body).unwrap().settings.stiffness_scale = 1e-3;
     until(&mut s, "the soft one", |s| (force(s).x - soft).abs() < 0.1);
 }
 

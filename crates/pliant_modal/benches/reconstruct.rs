@@ -7,7 +7,7 @@ use std::{hint::black_box, sync::Arc, time::Instant};
 
 use pliant_modal::{
     BakeInfo, Body, BodyConfig, Damping, Element, GrabConfig, ModalModel, ModelParts, Patch, Relaxation,
-    SurfaceMesh, streaming_sum,
+    StepSettings, SurfaceMesh, streaming_sum,
 };
 
 /// A strip of triangles with smooth, meaningless modes: the cost does not depend on the shape.
@@ -169,7 +169,7 @@ fn many_bodies() {
     for (name, relaxation) in [("elastic", None), ("viscoelastic", material)] {
         let mut bodies = bodies.clone();
         for body in &mut bodies {
-            body.reconfigure(BodyConfig { relaxation, ..Default::default() }).unwrap();
+            body.reconfigure(BodyConfig::from(StepSettings { relaxation, ..Default::default() })).unwrap();
         }
         let [median, p99] = time(|| {
             for body in &mut bodies {

@@ -5,8 +5,8 @@ use std::sync::Arc;
 use nalgebra::Vector3;
 
 use crate::{
-    Frame, GrabConfig, Hand, HeldPatch, Hold, Integrator, Kernel, Load, ModalModel, Patch, Precision,
-    Relaxation, State, StepError, StepReport, StepSettings,
+    Frame, GrabConfig, Hand, HeldPatch, Hold, Kernel, Load, ModalModel, Patch, Precision, State, StepError,
+    StepReport, StepSettings,
     error::finite,
     step::{Six, tangent},
 };
@@ -15,66 +15,31 @@ use crate::{
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, PartialOrd, Ord)]
 pub struct GrabId(pub(crate) u64);
 
-/// How a body is stepped.
+/// What one copy of a body is made with. Its copies elsewhere share the [`StepSettings`]; the rest is
+/// each one's own.
 #[derive(Debug, Clone, PartialEq)]
 pub struct BodyConfig {
-    /// Seconds a step. Default: 1/60.
+    /// How it is stepped.
+    pub settings: StepSettings,
+    /// Length of a step, s. Default: 1/60.
     pub step: f64,
-    /// Default: [`Integrator::Exact`].
-    pub integrator: Integrator,
-    /// See [`StepSettings::second_order`]. Default: `true`.
-    pub second_order: bool,
-    /// Bend by modal warping; off, displacements stay linear and grow when the body turns. Default: `true`.
-    pub warp: bool,
-    /// Keep only the first so many modes; `None` keeps all. Modes are ordered, so this is the level of detail. Default: `None`.
+    /// Keep only so many modes, lowest first: the level of detail. Default: `None`, all.
     pub modes: Option<usize>,
-    /// Uniform acceleration, m/s^2, world axes. Default: none.
-    pub gravity: [f64; 3],
-    /// Factor on all damping coefficients, 0 or more. Default: 1.
-    pub damping_scale: f64,
-    /// Factor on the material's stiffness, 1e-6 to 1e6: the body as it would be with Young's modulus so many times the baked one. Frequencies go
-    /// with its root, compliances with its inverse, what the grabs' patches give way by too; damping as
-    /// [`ModalModel::stiffened`] says. Default: 1.
-    pub stiffness_scale: f64,
-    /// A material that relaxes: every mode, and the flexibility under every grab, is a standard linear solid. Default: none, elastic.
-    pub relaxation: Option<Relaxation>,
-    /// Newton corrections of the grabs under warp in one step, 1 to 8. Default: 2.
-    pub corrections: usize,
-    /// What [`Body::reconstruct`] reads. Steps, grabs and forces are in double precision either way. Default: [`Precision::Single`].
+    /// Precision of the basis that [`Body::reconstruct`] reads. Steps, grabs and forces are in double
+    /// precision either way. Default: [`Precision::Single`].
     pub precision: Precision,
 }
 
 impl Default for BodyConfig {
     fn default() -> Self {
-        Self {
-            step: 1.0 / 60.0,
-            integrator: Integrator::default(),
-            second_order: true,
-            warp: true,
-            modes: None,
-            gravity: [0.0; 3],
-            damping_scale: 1.0,
-            stiffness_scale: 1.0,
-            relaxation: None,
-            corrections: 2,
-            precision: Precision::default(),
-        }
+        StepSettings::default().into()
     }
 }
 
-impl BodyConfig {
-    /// What copies of the body have to agree on.
-    pub fn settings(&self) -> StepSettings {
-        StepSettings {
-            integrator: self.integrator,
-            second_order: self.second_order,
-            warp: self.warp,
-            corrections: self.corrections.clamp(1, StepSettings::MOST_CORRECTIONS.into()) as u8,
-            gravity: self.gravity,
-            damping_scale: self.damping_scale,
-            stiffness_scale: self.stiffness_scale,
-            relaxation: self.relaxation,
-        }
+impl From<StepSettings> for BodyConfig {
+    /// A body that is stepped so, the rest as by default.
+    fn from(settings: StepSettings) -> Self {
+        Self { settings, step: 1.0 / 60.0, modes: None, precision: Precision::default() }
     }
 }
 
@@ -119,7 +84,7 @@ impl Body {
     /// A configuration value that is not finite or not in its range.
     pub fn new(model: Arc<ModalModel>, config: BodyConfig) -> Result<Self, StepError> {
         let modes = config.modes.unwrap_or(usize::MAX);
-        let kernel = Kernel::new(model, config.settings(), modes, config.step)?;
+        let kernel = Kernel::new(model, config.settings, modes, config.step)?;
         let zero = vec![0.0; kernel.modes()];
         let state = kernel.at_rest();
         Ok(Self {
@@ -181,7 +146,7 @@ impl Body {
         for (i, force) in self.resisted.iter_mut().enumerate() {
             *force = resisted(&self.kernel, &self.state, &before, i);
         }
-        let settings = config.settings();
+        let settings = config.settings;
         self.kernel.reconfigure(settings, config.step)?;
         self.kernel.prepare(&self.hands);
         self.config = BodyConfig { modes: self.config.modes, ..config };
@@ -255,7 +220,7 @@ impl Body {
         }
         config.check()?;
         let patch = HeldPatch::new(self.model(), patch, self.mode_count())?;
-        let local = patch.rest() + patch.displacement(&self.state.q, self.config.warp);
+        let local = patch.rest() + patch.displacement(&self.state.q, self.config.settings.warp);
         let target = self.state.frame.to_world(local);
         let id = GrabId(self.next_grab);
         self.next_grab += 1;
@@ -305,7 +270,7 @@ impl Body {
     /// No such grab.
     pub fn grab_position(&self, id: GrabId) -> Result<[f64; 3], StepError> {
         let patch = &self.hands[self.find(id)?].patch;
-        let local = patch.rest() + patch.displacement(&self.state.q, self.config.warp);
+        let local = patch.rest() + patch.displacement(&self.state.q, self.config.settings.warp);
         Ok(self.state.frame.to_world(local).into())
     }
 
@@ -364,7 +329,7 @@ impl Body {
     pub fn set_grab_flow(&mut self, id: GrabId, flow: [f64; 3]) -> Result<(), StepError> {
         finite("grab flow", &flow)?;
         let index = self.find(id)?;
-        if self.config.relaxation.is_some() {
+        if self.config.settings.relaxation.is_some() {
             self.hands[index].flow = flow.into();
         }
         Ok(())
@@ -433,7 +398,7 @@ impl Body {
         let sum = |of: Row| -> Vector3<f64> {
             self.state.q.iter().enumerate().map(|(mode, q)| *q * row(of, mode)).sum()
         };
-        let warp = self.config.warp;
+        let warp = self.config.settings.warp;
         let (d, w) = (sum(shift), if warp { sum(turn) } else { Vector3::zeros() });
         let (moved, tangent) = tangent(&Six::new(d.x, d.y, d.z, w.x, w.y, w.z), warp);
         let rotation = self.state.frame.rotation();
@@ -452,7 +417,7 @@ impl Body {
     /// Kinetic plus elastic energy of the modes, and of the rigid motion of a free body, J. Potential energy in gravity is not in it.
     /// Where the material relaxes, both springs of each mode count: `omega^2 ((1 - ratio) q^2 + ratio (q - z)^2) / 2`.
     pub fn energy(&self) -> f64 {
-        let ratio = self.config.relaxation.map_or(0.0, |r| r.ratio);
+        let ratio = self.config.settings.relaxation.map_or(0.0, |r| r.ratio);
         let modes: f64 = (0..self.mode_count())
             .map(|i| {
                 let (omega, q, v) = (self.omega()[i], self.state.q[i], self.state.v[i]);
@@ -492,7 +457,11 @@ impl Body {
         for (s, q) in self.single.iter_mut().zip(&self.state.q) {
             *s = *q as f32;
         }
-        self.kernel.model().basis_in(self.config.precision).reconstruct(&self.single, self.config.warp, out);
+        self.kernel.model().basis_in(self.config.precision).reconstruct(
+            &self.single,
+            self.config.settings.warp,
+            out,
+        );
         Ok(())
     }
 

@@ -7,7 +7,7 @@ use crate::StepError;
 
 /// How the modes are stepped.
 #[derive(Debug, Clone, Copy, PartialEq, Default, serde::Serialize, serde::Deserialize)]
-#[non_exhaustive]
+#[serde(deny_unknown_fields)]
 pub enum Integrator {
     /// The oscillator's closed form, exact when the force is constant over the step. The default: no period error at any step.
     #[default]

@@ -15,6 +15,7 @@ use crate::{Coefficients, Integrator, StepError, exponential::exponential};
 ///
 /// Source: C. Zener, *Elasticity and Anelasticity of Metals*, 1948; R. M. Christensen, *Theory of Viscoelasticity*, 2nd ed. 1982, ch. 1.
 #[derive(Debug, Clone, Copy, PartialEq, serde::Serialize, serde::Deserialize)]
+#[serde(deny_unknown_fields)]
 pub struct Relaxation {
     /// Share of the instantaneous stiffness that relaxes away, 0 or more and below 1: at 1 the body would be a fluid and flow for ever.
     pub ratio: f64,

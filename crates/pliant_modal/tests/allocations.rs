@@ -10,7 +10,7 @@ use std::{
     sync::Arc,
 };
 
-use pliant_modal::{Body, BodyConfig, GrabConfig, Integrator, Patch, Relaxation};
+use pliant_modal::{Body, BodyConfig, GrabConfig, Integrator, Patch, Relaxation, StepSettings};
 use rod::{rod, tip};
 
 struct Counting;
@@ -43,8 +43,11 @@ fn a_step_with_two_grabs_under_warp_allocates_nothing() {
         for integrator in [Integrator::Exact, Integrator::GeneralizedAlpha { rho_inf: 0.5 }] {
             let model = Arc::new(rod(2e5, 20, 0.05, free));
             let gravity = [0.0, -9.81, 0.0];
-            let config =
-                BodyConfig { step: 1.0 / 240.0, integrator, relaxation, gravity, ..Default::default() };
+            let config = BodyConfig {
+                step: 1.0 / 240.0,
+                settings: StepSettings { integrator, relaxation, gravity, ..Default::default() },
+                ..Default::default()
+            };
             let mut body = Body::new(model.clone(), config).unwrap();
             let grabs = [tip(), tip() / 2].map(|vertex| {
                 let patch = Patch::around(model.surface(), vertex, 0.06).unwrap();

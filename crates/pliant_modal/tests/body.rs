@@ -6,7 +6,7 @@ mod rod;
 use std::sync::Arc;
 
 use pliant_modal::{
-    Body, BodyConfig, GrabConfig, Integrator, ModalModel, Patch, Precision, State, StepError,
+    Body, BodyConfig, GrabConfig, Integrator, ModalModel, Patch, Precision, State, StepError, StepSettings,
 };
 use rod::{AREA, DENSITY, LENGTH, rod, tip};
 
@@ -33,7 +33,11 @@ fn reaction_reaches_the_static_value() {
             [Integrator::Exact, Integrator::Newmark, Integrator::GeneralizedAlpha { rho_inf: 0.5 }]
         {
             let model = Arc::new(rod(2e5, modes, 0.3, false));
-            let config = BodyConfig { step: 1.0 / 40.0, integrator, ..Default::default() };
+            let config = BodyConfig {
+                step: 1.0 / 40.0,
+                settings: StepSettings { integrator, ..Default::default() },
+                ..Default::default()
+            };
             let mut body = Body::new(model.clone(), config).unwrap();
             let grab = body.grab(&tip_patch(&model), GrabConfig::default()).unwrap();
             let start = body.grab_position(grab).unwrap();
@@ -59,8 +63,15 @@ fn a_dragged_reaction_does_not_ring_at_any_stiffness_or_step() {
         for step in [1.0 / 40.0, 1.0 / 240.0, 1.0 / 1000.0] {
             for integrator in [Integrator::Exact, Integrator::GeneralizedAlpha { rho_inf: 0.5 }] {
                 let model = Arc::new(rod(young, 20, 0.02, false));
-                let mut body =
-                    Body::new(model.clone(), BodyConfig { step, integrator, ..Default::default() }).unwrap();
+                let mut body = Body::new(
+                    model.clone(),
+                    BodyConfig {
+                        step,
+                        settings: StepSettings { integrator, ..Default::default() },
+                        ..Default::default()
+                    },
+                )
+                .unwrap();
                 let grab = body.grab(&tip_patch(&model), GrabConfig::default()).unwrap();
                 let start = body.grab_position(grab).unwrap();
                 let mut force = Vec::new();
@@ -90,7 +101,11 @@ fn a_damped_hand_comes_to_rest_at_any_stiffness_step_and_damper() {
             for step in [0.1, 1.0 / 40.0, 1.0 / 120.0, 1.0 / 240.0, 1e-3] {
                 for stiffness in [10.0, 280.0, 1e4] {
                     for relaxation in [0.2, 0.05, 0.02, 2e-3] {
-                        let config = BodyConfig { step, integrator, ..BodyConfig::default() };
+                        let config = BodyConfig {
+                            step,
+                            settings: StepSettings { integrator, ..Default::default() },
+                            ..BodyConfig::default()
+                        };
                         let mut body = Body::new(model.clone(), config).unwrap();
                         let hand = GrabConfig { stiffness: Some(stiffness), relaxation };
                         let grab = body.grab(&tip_patch(&model), hand).unwrap();
@@ -128,8 +143,15 @@ fn unforced_energy_never_grows() {
     for integrator in [Integrator::Exact, Integrator::Newmark, Integrator::GeneralizedAlpha { rho_inf: 0.8 }]
     {
         let model = Arc::new(rod(1e7, 30, 0.01, false));
-        let mut body =
-            Body::new(model, BodyConfig { step: 1.0 / 60.0, integrator, ..Default::default() }).unwrap();
+        let mut body = Body::new(
+            model,
+            BodyConfig {
+                step: 1.0 / 60.0,
+                settings: StepSettings { integrator, ..Default::default() },
+                ..Default::default()
+            },
+        )
+        .unwrap();
         body.strike(tip(), [3.0, 0.0, 0.0]).unwrap();
         let start = body.energy();
         let mut last = start;
@@ -155,8 +177,11 @@ fn hanging_rod_stretches_as_the_textbook_says() {
     // rho g L^2 / (2 E); 60 modes leave out sum_{k > 60} of a series that falls as k^-3.
     let young = 1e6;
     let model = Arc::new(rod(young, 60, 1.0, false));
-    let mut body =
-        Body::new(model.clone(), BodyConfig { gravity: [9.81, 0.0, 0.0], ..Default::default() }).unwrap();
+    let mut body = Body::new(
+        model.clone(),
+        BodyConfig::from(StepSettings { gravity: [9.81, 0.0, 0.0], ..Default::default() }),
+    )
+    .unwrap();
     for _ in 0..600 {
         body.step().unwrap();
     }
@@ -196,8 +221,11 @@ fn bad_numbers_are_refused_and_change_nothing() {
 #[test]
 fn a_step_that_would_overflow_is_taken_back() {
     let model = Arc::new(rod(1e5, 5, 0.0, false));
-    let mut body =
-        Body::new(model, BodyConfig { integrator: Integrator::Newmark, ..Default::default() }).unwrap();
+    let mut body = Body::new(
+        model,
+        BodyConfig::from(StepSettings { integrator: Integrator::Newmark, ..Default::default() }),
+    )
+    .unwrap();
     for _ in 0..9 {
         body.push(tip(), [f64::MAX, 0.0, 0.0]).unwrap();
     }
@@ -455,7 +483,9 @@ fn a_symmetric_top_precesses_at_the_textbook_rate() {
 #[test]
 fn reconstruction_equals_the_sum_over_modes() {
     let model = Arc::new(rod(1e6, 13, 0.0, false));
-    let mut body = Body::new(model.clone(), BodyConfig { warp: false, ..Default::default() }).unwrap();
+    let mut body =
+        Body::new(model.clone(), BodyConfig::from(StepSettings { warp: false, ..Default::default() }))
+            .unwrap();
     let mut state = body.state().clone();
     for (i, q) in state.q.iter_mut().enumerate() {
         *q = 0.01 * ((i * 7 + 3) % 5) as f64 - 0.02;

@@ -4,7 +4,7 @@
 use std::sync::Arc;
 
 use nalgebra::{Matrix3, Vector3};
-use pliant_modal::{Body, BodyConfig, GrabConfig, GrabId, Integrator, ModalModel, Patch};
+use pliant_modal::{Body, BodyConfig, GrabConfig, GrabId, Integrator, ModalModel, Patch, StepSettings};
 
 fn pip() -> Arc<ModalModel> {
     let path = concat!(env!("CARGO_MANIFEST_DIR"), "/../../assets/pip.modal");
@@ -17,8 +17,7 @@ fn under_gravity_energy_stays() {
     let model = pip();
     let config = BodyConfig {
         step: 1.0 / 60.0,
-        damping_scale: 0.0,
-        gravity: [25.0, -15.0, 10.0],
+        settings: StepSettings { damping_scale: 0.0, gravity: [25.0, -15.0, 10.0], ..Default::default() },
         ..Default::default()
     };
     let mut body = Body::new(model, config).unwrap();
@@ -34,7 +33,11 @@ fn under_gravity_energy_stays() {
 /// Two hands 2 cm apart, with their dampers' relaxation times (s).
 fn held(step: f64, integrator: Integrator, warp: bool, relaxations: [f64; 2]) -> (Body, [GrabId; 2]) {
     let model = pip();
-    let config = BodyConfig { step, integrator, warp, ..Default::default() };
+    let config = BodyConfig {
+        step,
+        settings: StepSettings { integrator, warp, ..Default::default() },
+        ..Default::default()
+    };
     let mut body = Body::new(model.clone(), config).unwrap();
     let grabs = [(76, relaxations[0]), (63, relaxations[1])].map(|(vertex, relaxation)| {
         let patch = Patch::around(model.surface(), vertex, 0.0216).unwrap();

@@ -5,7 +5,7 @@ mod rod;
 
 use std::sync::Arc;
 
-use pliant_modal::{Body, BodyConfig, GrabConfig, ModalModel, Patch};
+use pliant_modal::{Body, BodyConfig, GrabConfig, ModalModel, Patch, StepSettings};
 use rod::{rod, tip};
 
 const MODES: usize = 8;
@@ -25,7 +25,11 @@ fn patch(model: &ModalModel) -> Patch {
 
 /// Reaction along the rod at the end of each step, N.
 fn felt(model: &Arc<ModalModel>, hz: f64, second_order: bool) -> Vec<f64> {
-    let config = BodyConfig { step: 1.0 / hz, second_order, warp: false, ..Default::default() };
+    let config = BodyConfig {
+        step: 1.0 / hz,
+        settings: StepSettings { second_order, warp: false, ..Default::default() },
+        ..Default::default()
+    };
     let mut body = Body::new(model.clone(), config).unwrap();
     let grab = body.grab(&patch(model), GrabConfig::default()).unwrap();
     let [x, y, z] = body.target(grab).unwrap();

@@ -8,6 +8,7 @@ use std::sync::Arc;
 use nalgebra::{Complex, Matrix4, Vector4};
 use pliant_modal::{
     Body, BodyConfig, Coefficients, Flow, GrabConfig, Integrator, ModalModel, Patch, Relaxation, StepError,
+    StepSettings,
 };
 use rod::{AREA, DENSITY, LENGTH, rod, tip};
 
@@ -234,8 +235,11 @@ fn a_fast_pull_feels_the_instantaneous_stiffness_and_a_long_one_the_relaxed() {
         for integrator in [Integrator::Exact, Integrator::GeneralizedAlpha { rho_inf: 0.5 }] {
             let model = Arc::new(rod(young, modes, 0.5, false));
             let h = 1.0 / 480.0;
-            let config =
-                BodyConfig { step: h, integrator, relaxation: Some(relaxation), ..Default::default() };
+            let config = BodyConfig {
+                step: h,
+                settings: StepSettings { integrator, relaxation: Some(relaxation), ..Default::default() },
+                ..Default::default()
+            };
             let mut body = Body::new(model.clone(), config).unwrap();
             let grab = body.grab(&tip_patch(&model), GrabConfig::default()).unwrap();
             let start = body.grab_position(grab).unwrap();
@@ -262,7 +266,9 @@ fn a_fast_pull_feels_the_instantaneous_stiffness_and_a_long_one_the_relaxed() {
     // A material that takes a year to relax is elastic to a hand.
     let model = Arc::new(rod(young, 12, 0.5, false));
     let relaxation = Some(Relaxation { ratio: 0.6, time: 3e7 });
-    let mut body = Body::new(model.clone(), BodyConfig { relaxation, ..Default::default() }).unwrap();
+    let mut body =
+        Body::new(model.clone(), BodyConfig::from(StepSettings { relaxation, ..Default::default() }))
+            .unwrap();
     let grab = body.grab(&tip_patch(&model), GrabConfig::default()).unwrap();
     let start = body.grab_position(grab).unwrap();
     body.set_target(grab, [start[0] + pulled, start[1], start[2]]).unwrap();
@@ -282,7 +288,11 @@ fn held_reactions_stay_smooth_and_finite_at_every_extreme() {
                     for time in [1e-9, 1e-3, 0.1, 1e9] {
                         let relaxation = Some(Relaxation { ratio, time });
                         let model = Arc::new(rod(young, 20, 0.05, false));
-                        let config = BodyConfig { step, integrator, relaxation, ..Default::default() };
+                        let config = BodyConfig {
+                            step,
+                            settings: StepSettings { integrator, relaxation, ..Default::default() },
+                            ..Default::default()
+                        };
                         let mut body = Body::new(model.clone(), config).unwrap();
                         let grab = body.grab(&tip_patch(&model), GrabConfig::default()).unwrap();
                         let start = body.grab_position(grab).unwrap();
@@ -325,7 +335,7 @@ fn held_reactions_stay_smooth_and_finite_at_every_extreme() {
 fn the_state_carries_the_flow() {
     let model = Arc::new(rod(2e5, 8, 0.05, false));
     let relaxation = Some(Relaxation { ratio: 0.5, time: 0.2 });
-    let config = BodyConfig { relaxation, ..Default::default() };
+    let config = BodyConfig::from(StepSettings { relaxation, ..Default::default() });
     let mut body = Body::new(model.clone(), config.clone()).unwrap();
     let grab = body.grab(&tip_patch(&model), GrabConfig::default()).unwrap();
     let start = body.grab_position(grab).unwrap();
@@ -357,7 +367,11 @@ fn the_state_carries_the_flow() {
     assert!(body.set_grab_flow(grab, [f64::NAN, 0.0, 0.0]).is_err());
     // Elastic again, and back: nothing relaxed is left.
     let held = body.config().clone();
-    body.reconfigure(BodyConfig { relaxation: None, ..held.clone() }).unwrap();
+    body.reconfigure(BodyConfig {
+        settings: StepSettings { relaxation: None, ..held.settings },
+        ..held.clone()
+    })
+    .unwrap();
     assert!(body.z().is_empty());
     body.step().unwrap();
     body.reconfigure(held).unwrap();
@@ -377,7 +391,10 @@ fn materials_that_are_none_are_refused() {
         (0.5, -1.0),
     ] {
         let relaxation = Some(Relaxation { ratio, time });
-        assert!(Body::new(model.clone(), BodyConfig { relaxation, ..Default::default() }).is_err());
+        assert!(
+            Body::new(model.clone(), BodyConfig::from(StepSettings { relaxation, ..Default::default() }))
+                .is_err()
+        );
     }
     let relaxation = Relaxation { ratio: 0.5, time: 1.0 };
     assert!(Coefficients::relaxing(Integrator::Exact, 1e15, 0.0, relaxation, 0.1).is_err());

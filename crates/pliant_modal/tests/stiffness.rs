@@ -7,7 +7,7 @@ use std::sync::Arc;
 
 use pliant_modal::{
     Body, BodyConfig, GrabConfig, Integrator, ModalModel, ModelError, Patch, Relaxation, StepError,
-    SurfaceMesh,
+    StepSettings, SurfaceMesh,
 };
 use rod::{AREA, DENSITY, LENGTH, rod, tip};
 
@@ -15,7 +15,11 @@ const YOUNG: f64 = 1e5;
 const H: f64 = 1e-3;
 
 fn config(integrator: Integrator, stiffness_scale: f64) -> BodyConfig {
-    BodyConfig { step: H, integrator, stiffness_scale, ..BodyConfig::default() }
+    BodyConfig {
+        step: H,
+        settings: StepSettings { integrator, stiffness_scale, ..Default::default() },
+        ..BodyConfig::default()
+    }
 }
 
 /// Where a hand that wanders leads a body: tip and reaction, step by step.
@@ -40,9 +44,13 @@ fn a_scaled_body_is_the_body_of_as_stiff_a_material() {
     for integrator in [Integrator::Exact, Integrator::Newmark, Integrator::GeneralizedAlpha { rho_inf: 0.5 }]
     {
         for (scale, relaxation) in [(3.0, None), (0.2, None), (3.0, relaxing), (1.0, None)] {
-            let with = BodyConfig { relaxation, ..config(integrator, scale) };
+            let with = BodyConfig {
+                settings: StepSettings { relaxation, ..config(integrator, scale).settings },
+                ..config(integrator, scale)
+            };
             let scaled = Body::new(Arc::new(rod(YOUNG, 6, 0.05, false)), with.clone()).unwrap();
-            let plain = BodyConfig { stiffness_scale: 1.0, ..with };
+            let plain =
+                BodyConfig { settings: StepSettings { stiffness_scale: 1.0, ..with.settings }, ..with };
             let baked = Body::new(Arc::new(rod(YOUNG * scale, 6, 0.05, false)), plain).unwrap();
             for (a, b) in scaled.omega().iter().zip(baked.omega()) {
                 assert!((a / b - 1.0).abs() < 1e-14);
@@ -67,7 +75,11 @@ fn twice_as_stiff_it_sinks_half_as_far_and_swings_root_two_faster() {
         let omega = quarter_wave * (YOUNG * stiffness / DENSITY).sqrt();
         // Changed while it runs, not only made so.
         let mut body = Body::new(model.clone(), config(Integrator::Exact, 1.0)).unwrap();
-        body.reconfigure(BodyConfig { damping_scale: 0.0, ..config(Integrator::Exact, stiffness) }).unwrap();
+        body.reconfigure(BodyConfig {
+            settings: StepSettings { damping_scale: 0.0, ..config(Integrator::Exact, stiffness).settings },
+            ..config(Integrator::Exact, stiffness)
+        })
+        .unwrap();
         // A load that is there all at once: it swings about where it would hang, phi^2 F / omega^2, from nought to twice that.
         let (mut crossings, mut before, mut mean, mut most) = (Vec::new(), 0.0, 0.0, 0.0_f64);
         let hangs = phi * phi * 2.0 / (omega * omega);
@@ -98,16 +110,46 @@ fn a_change_on_the_way_keeps_the_motion_and_the_balance_of_forces() {
     let alpha = Integrator::GeneralizedAlpha { rho_inf: 0.5 };
     let plain = config(alpha, 1.0);
     let cases = [
-        (None, BodyConfig { stiffness_scale: 7.0, ..plain.clone() }),
-        (relaxing, BodyConfig { stiffness_scale: 7.0, relaxation: relaxing, ..plain.clone() }),
-        (None, BodyConfig { damping_scale: 5.0, ..plain.clone() }),
-        (relaxing, BodyConfig { damping_scale: 0.0, relaxation: relaxing, ..plain.clone() }),
+        (
+            None,
+            BodyConfig { settings: StepSettings { stiffness_scale: 7.0, ..plain.settings }, ..plain.clone() },
+        ),
+        (
+            relaxing,
+            BodyConfig {
+                settings: StepSettings { stiffness_scale: 7.0, relaxation: relaxing, ..plain.settings },
+                ..plain.clone()
+            },
+        ),
+        (
+            None,
+            BodyConfig { settings: StepSettings { damping_scale: 5.0, ..plain.settings }, ..plain.clone() },
+        ),
+        (
+            relaxing,
+            BodyConfig {
+                settings: StepSettings { damping_scale: 0.0, relaxation: relaxing, ..plain.settings },
+                ..plain.clone()
+            },
+        ),
         (relaxing, plain.clone()),
-        (None, BodyConfig { relaxation: relaxing, ..plain.clone() }),
-        (relaxing, BodyConfig { relaxation: Some(Relaxation { ratio: 0.8, time: 0.3 }), ..plain.clone() }),
+        (
+            None,
+            BodyConfig { settings: StepSettings { relaxation: relaxing, ..plain.settings }, ..plain.clone() },
+        ),
+        (
+            relaxing,
+            BodyConfig {
+                settings: StepSettings {
+                    relaxation: Some(Relaxation { ratio: 0.8, time: 0.3 }),
+                    ..plain.settings
+                },
+                ..plain.clone()
+            },
+        ),
     ];
     for (relaxation, after) in cases {
-        let before = BodyConfig { relaxation, ..plain.clone() };
+        let before = BodyConfig { settings: StepSettings { relaxation, ..plain.settings }, ..plain.clone() };
         let mut body = Body::new(Arc::new(rod(YOUNG, 4, 0.03, false)), before.clone()).unwrap();
         body.strike(tip(), [0.5, 0.0, 0.0]).unwrap();
         for _ in 0..37 {
@@ -116,7 +158,7 @@ fn a_change_on_the_way_keeps_the_motion_and_the_balance_of_forces() {
         let (q, v) = (body.q().to_vec(), body.v().to_vec());
         // Nobody pushes: a + c v + omega^2 (q - ratio z) is what is left over, small as the integrator's error is.
         let left_over = |body: &Body| -> Vec<f64> {
-            let ratio = body.config().relaxation.map_or(0.0, |r| r.ratio);
+            let ratio = body.config().settings.relaxation.map_or(0.0, |r| r.ratio);
             (0..4)
                 .map(|i| {
                     let stretch = body.q()[i] - ratio * body.z().get(i).copied().unwrap_or(0.0);
@@ -131,7 +173,7 @@ fn a_change_on_the_way_keeps_the_motion_and_the_balance_of_forces() {
         body.reconfigure(after).unwrap();
         assert_eq!((body.q(), body.v()), (&q[..], &v[..]));
         // What begins to relax has not flown yet.
-        let begins = relaxation.is_none() && body.config().relaxation.is_some();
+        let begins = relaxation.is_none() && body.config().settings.relaxation.is_some();
         assert_eq!(body.a() == resisted, begins);
         for (then, now) in unbalanced.iter().zip(left_over(&body)) {
             let size = body.omega()[3].powi(2) * q.iter().fold(0.0_f64, |m, q| m.max(q.abs()));
@@ -168,6 +210,6 @@ fn what_is_no_stiffness_is_refused_and_changes_nothing() {
     for bad in [f64::NAN, f64::INFINITY, 0.0, -1.0, 1e-7, 1e7] {
         let error = body.reconfigure(config(Integrator::Exact, bad)).unwrap_err();
         assert!(matches!(error, StepError::Input { what: "stiffness_scale", .. }), "{error}");
-        assert_eq!(body.config().stiffness_scale, 2.0);
+        assert_eq!(body.config().settings.stiffness_scale, 2.0);
     }
 }

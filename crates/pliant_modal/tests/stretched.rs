@@ -3,7 +3,7 @@
 
 use std::sync::Arc;
 
-use pliant_modal::{Body, BodyConfig, GrabConfig, Integrator, ModalModel, Patch};
+use pliant_modal::{Body, BodyConfig, GrabConfig, Integrator, ModalModel, Patch, StepSettings};
 
 /// The free jack that `free_bodies` throws: 0.41 m, 0.66 kg, three moments of inertia, knobs on thin arms.
 fn jack() -> Arc<ModalModel> {
@@ -20,7 +20,11 @@ fn tension(
     corrections: usize,
     part: f64,
 ) -> (f64, f64, f64) {
-    let config = BodyConfig { step, integrator, corrections, ..Default::default() };
+    let config = BodyConfig {
+        step,
+        settings: StepSettings { integrator, corrections, ..Default::default() },
+        ..Default::default()
+    };
     let mut body = Body::new(model.clone(), config).unwrap();
     let positions = model.surface().positions();
     let hands = [1.0f64, -1.0].map(|side| {

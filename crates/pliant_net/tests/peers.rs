@@ -3,11 +3,13 @@
 
 mod support;
 
+use std::sync::Arc;
 use std::time::Duration;
 
 use bevy::math::DVec3;
 use bevy::prelude::*;
 use pliant_body::{Grab, GrabForce, GrabOf, ModalAsset, ModalBody, ShownState};
+use pliant_modal::{Body, ModalModel, StepSettings};
 use pliant_net::transport::Limits;
 use pliant_net::{
     Emulation, HostOptions, Invite, NetPeer, NetPlugin, NetStats, PeerConfig, PeerState, SeenHands,
@@ -70,6 +72,38 @@ fn agree(shapes: &[Vec<f64>], within: f64) -> Result<(), String> {
 fn apart(a: &[f64], b: &[f64]) -> f64 {
     let size = a.iter().fold(1e-9_f64, |size, q| size.max(q.abs()));
     a.iter().zip(b).map(|(a, b)| (a - b).abs()).fold(0.0, f64::max) / size
+}
+
+#[test]
+fn a_turned_body_hangs_among_peers_as_it_does_alone() {
+    let _quiet = alone();
+    let bud = concat!(env!("CARGO_MANIFEST_DIR"), "/../../assets/bud.modal");
+    let bud = Arc::new(ModalModel::read(bud).unwrap());
+    let turn = Quat::from_rotation_x(std::f32::consts::FRAC_PI_2);
+    let settings = StepSettings { gravity: [0.0, -9.81, 0.0], ..StepSettings::default() };
+    // The same body by itself, until it hangs still; and one that stands upright.
+    let hung = |turn: Quat| {
+        let mut body = Body::new(bud.clone(), settings.into()).unwrap();
+        body.set_pose([0.0; 3], turn.as_dquat().normalize().into()).unwrap();
+        (0..3000).for_each(|_| drop(body.step().unwrap()));
+        body.q().to_vec()
+    };
+    let (alone, upright) = (hung(turn), hung(Quat::IDENTITY));
+    assert!(apart(&alone, &upright) > 0.5, "{alone:?}, {upright:?}");
+
+    let mut app = app(NetPlugin::peer(PeerConfig { name: "a".into(), ..PeerConfig::default() }).unwrap());
+    let model = app.world_mut().resource_mut::<Assets<ModalAsset>>().add(ModalAsset(bud));
+    let body = ModalBody { settings, ..ModalBody::new(model) };
+    let place = Transform::from_rotation(turn);
+    let entity = app.world_mut().spawn((body, SharedBody::named("bud"), place)).id();
+    run_until(&mut [&mut app], "it hangs", |apps| {
+        let net = apps[0].world().resource::<NetPeer>();
+        must!(matches!(net.state(), PeerState::In { .. }));
+        let shown = q(apps[0], entity);
+        must!(shown.len() == alone.len() && apart(&alone, &shown) < 0.01, "{shown:?}, {alone:?}");
+        must!(still(apps[0], entity));
+        Ok(())
+    });
 }
 
 #[test]

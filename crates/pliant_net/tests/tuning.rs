@@ -47,14 +47,16 @@ fn a_guest_follows_a_body_that_its_host_makes_stiffer_and_keeps_its_hand_on_it()
 
     // A slider that is dragged: another number in every frame, and only the last of them counts.
     for step in 0..40 {
-        host.world_mut().get_mut::<ModalBody>(body).unwrap().stiffness_scale =
+        host.world_mut().get_mut::<ModalBody>(body).unwrap().settings.stiffness_scale =
             1.0 + 3.0 * f64::from(step) / 39.0;
         run_frames(&mut [&mut host, &mut guest], 1);
     }
     // The hand pulls as far: against springs that are all four times as stiff.
     run_until(&mut [&mut host, &mut guest], "the guest feels the stiff body", |apps| {
-        must!(apps[1].world().get::<ModalBody>(there).unwrap().stiffness_scale == 4.0);
-        must!(apps[0].world().get::<BodyState>(body).unwrap().body().config().stiffness_scale == 4.0);
+        must!(apps[1].world().get::<ModalBody>(there).unwrap().settings.stiffness_scale == 4.0);
+        must!(
+            apps[0].world().get::<BodyState>(body).unwrap().body().config().settings.stiffness_scale == 4.0
+        );
         let stiff = felt_at_rest(apps)?;
         must!((stiff / soft - 4.0).abs() < 0.4, "{soft} N, then {stiff} N");
         Ok(())

@@ -1,6 +1,7 @@
 //! The bodies of a scene: modes, damping, energy, rest, and the hands on them.
 
 use bevy_egui::egui::{CollapsingHeader, Color32, Ui};
+use pliant_body::StepSettings;
 
 use crate::{
     knob::knob,
@@ -18,12 +19,8 @@ pub struct BodyView {
     pub all_modes: usize,
     /// Frequency of the slowest mode, Hz.
     pub lowest_hz: f64,
-    /// Multiplies the baked stiffness. A knob.
-    pub stiffness_scale: f64,
-    /// Multiplies the baked damping. A knob.
-    pub damping_scale: f64,
-    /// Bent by modal warping. A knob.
-    pub warp: bool,
+    /// How it is stepped. Stiffness, damping and warp have knobs.
+    pub settings: StepSettings,
     /// Stepped by this app; else somebody else moves it, and its knobs are theirs.
     pub local: bool,
     /// At rest: not stepped, sent or drawn anew.
@@ -88,13 +85,15 @@ fn body_knobs(ui: &mut Ui, index: usize, body: &mut BodyView) {
     ui.add_enabled_ui(body.local, |ui| {
         knob(ui, &mut body.modes, 1..=body.all_modes.max(1), |slider| slider.text("modes"))
             .on_hover_text("How many modes are simulated, the slowest first.");
-        knob(ui, &mut body.stiffness_scale, 0.1..=10.0, |slider| {
+        knob(ui, &mut body.settings.stiffness_scale, 0.1..=10.0, |slider| {
             slider.logarithmic(true).text("stiffness").max_decimals(2)
         })
         .on_hover_text("Multiplies Young's modulus: four times as stiff swings twice as fast.");
-        knob(ui, &mut body.damping_scale, 0.0..=10.0, |slider| slider.text("damping").max_decimals(2))
-            .on_hover_text("Multiplies the damping that was baked.");
-        ui.checkbox(&mut body.warp, "modal warping")
+        knob(ui, &mut body.settings.damping_scale, 0.0..=10.0, |slider| {
+            slider.text("damping").max_decimals(2)
+        })
+        .on_hover_text("Multiplies the damping that was baked.");
+        ui.checkbox(&mut body.settings.warp, "modal warping")
             .on_hover_text("Right for large rotations; off is the plain linear shape.");
     });
     ui.horizontal(|ui| {

@@ -115,7 +115,7 @@ fn body(shown: &mut Shown) -> (ModalBody, usize) {
 }
 
 fn settings(body: &ModalBody) -> (Option<usize>, f64, f64, bool) {
-    (body.modes, body.stiffness_scale, body.damping_scale, body.warp)
+    (body.modes, body.settings.stiffness_scale, body.settings.damping_scale, body.settings.warp)
 }
 
 #[test]
@@ -124,7 +124,7 @@ fn a_bodys_knobs_change_the_body_and_only_when_they_are_moved() {
     let entity = find::<ModalBody>(&mut app).unwrap();
     // Beyond what the sliders reach, and between what they show.
     let mut odd = app.world_mut().get_mut::<ModalBody>(entity).unwrap();
-    (odd.damping_scale, odd.stiffness_scale) = (20.0, 1.0 / 3.0);
+    (odd.settings.damping_scale, odd.settings.stiffness_scale) = (20.0, 1.0 / 3.0);
     let mut shown = show(app);
     for _ in 0..40 {
         shown.key_press(Key::Tab);
@@ -139,11 +139,11 @@ fn a_bodys_knobs_change_the_body_and_only_when_they_are_moved() {
     nudge(&mut shown, "modes", Key::ArrowRight);
     assert_eq!((body(&mut shown).0.modes, body(&mut shown).1), (None, all));
     nudge(&mut shown, "stiffness", Key::ArrowRight);
-    assert!(body(&mut shown).0.stiffness_scale > 1.0 / 3.0);
+    assert!(body(&mut shown).0.settings.stiffness_scale > 1.0 / 3.0);
     nudge(&mut shown, "damping", Key::ArrowLeft);
-    assert!(body(&mut shown).0.damping_scale <= 10.0, "once it is moved it is within its range");
+    assert!(body(&mut shown).0.settings.damping_scale <= 10.0, "once it is moved it is within its range");
     click(&mut shown, "modal warping");
-    assert!(!body(&mut shown).0.warp);
+    assert!(!body(&mut shown).0.settings.warp);
 }
 
 #[test]

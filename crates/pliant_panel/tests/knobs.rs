@@ -6,6 +6,7 @@ use egui_kittest::{
     Harness,
     kittest::{NodeT, Queryable},
 };
+use pliant_body::StepSettings;
 use pliant_panel::{
     bodies::{self, BodyView, HandView},
     device::{self, DeviceView, DevicesView},
@@ -20,9 +21,7 @@ fn body() -> BodyView {
         modes: 20,
         all_modes: 30,
         lowest_hz: 3.5,
-        damping_scale: 1.0,
-        stiffness_scale: 1.0,
-        warp: true,
+        settings: StepSettings::default(),
         local: true,
         resting: true,
         energy: 0.12,
@@ -62,12 +61,12 @@ fn a_body_is_given_fewer_modes_more_damping_and_no_warp() {
     nudge(&mut harness, "modes", Key::ArrowLeft);
     assert_eq!(harness.state()[0].modes, 19);
     nudge(&mut harness, "stiffness", Key::ArrowRight);
-    assert!(harness.state()[0].stiffness_scale > 1.0);
+    assert!(harness.state()[0].settings.stiffness_scale > 1.0);
     nudge(&mut harness, "damping", Key::ArrowRight);
-    assert!(harness.state()[0].damping_scale > 1.0);
+    assert!(harness.state()[0].settings.damping_scale > 1.0);
     harness.get_by_label("modal warping").click();
     harness.run();
-    assert!(!harness.state()[0].warp);
+    assert!(!harness.state()[0].settings.warp);
     harness.get_by_label("Wake").click();
     harness.run();
     assert!(harness.state()[0].wake);
@@ -361,7 +360,8 @@ fn untouched<S: Clone + std::fmt::Debug>(view: S, show: fn(&mut egui::Ui, &mut S
 #[test]
 fn what_nobody_touches_stays_as_it_is_whatever_it_is() {
     for (scale, modes) in [(20.0, 45), (1.0 / 3.0, 0), (0.0, 1), (-1.5, 7), (1e9, 30)] {
-        let body = BodyView { damping_scale: scale, stiffness_scale: scale, modes, ..body() };
+        let settings = StepSettings { damping_scale: scale, stiffness_scale: scale, ..Default::default() };
+        let body = BodyView { settings, modes, ..body() };
         untouched(vec![body], |ui, bodies| bodies::show(ui, bodies), "body");
         untouched(TimeView { speed: scale, step: 0.025, ..Default::default() }, time::show, "time");
         let device = DeviceView { force_scale: Some(scale), ..Default::default() };
@@ -408,5 +408,5 @@ fn what_is_typed_is_taken() {
     harness.run();
     harness.key_press(Key::Enter);
     harness.run();
-    assert_eq!(harness.state()[0].damping_scale, 2.25);
+    assert_eq!(harness.state()[0].settings.damping_scale, 2.25);
 }

@@ -231,18 +231,10 @@ impl Experiment {
             quantum: self.quantum,
             ..Default::default()
         })?;
-        let body = Body::new(
-            self.model.clone(),
-            BodyConfig {
-                step: h,
-                integrator: self.integrator,
-                relaxation: self.relaxation,
-                ..Default::default()
-            },
-        )
-        .map_err(model_error)?;
         let settings =
             StepSettings { integrator: self.integrator, relaxation: self.relaxation, ..Default::default() };
+        let config = BodyConfig { step: h, ..settings.into() };
+        let body = Body::new(self.model.clone(), config).map_err(model_error)?;
         pair.host.add_body(BODY, "measured", self.model.clone(), settings)?;
         let guest = GuestConfig { recovery: self.recovery, modes: self.modes, ..Default::default() };
         let perfect = LinkConfig { delay: self.down.delay, ..Default::default() };

@@ -4,7 +4,7 @@ use std::{path::Path, sync::Arc};
 
 use nalgebra::Vector3;
 use pliant_modal::{
-    Body, BodyConfig, GrabConfig, Hand, Hold, Integrator, Load, ModalModel, Patch, Relaxation,
+    Body, BodyConfig, GrabConfig, Hand, Hold, Integrator, Load, ModalModel, Patch, Relaxation, StepSettings,
 };
 
 use crate::replica::Replica;
@@ -40,7 +40,7 @@ fn hand(vertex: u32, radius: f64, way: [f64; 3]) -> Case {
 /// Steps both for so many steps, and compares states and reactions after each.
 fn compare(name: &str, model: &Arc<ModalModel>, config: BodyConfig, cases: &[Case], steps: usize) {
     let h = config.step;
-    let settings = config.settings();
+    let settings = config.settings;
     let mut body = Body::new(model.clone(), config).unwrap();
     let grabs: Vec<_> = cases
         .iter()
@@ -130,7 +130,13 @@ fn eight_corrections() {
     let tip = end(&pip, [0.0, 1.0, 0.0]);
     let size = pip.size();
     let hands = [hand(tip, 0.08 * size, [0.3 * size, 0.1 * size, 0.0])];
-    compare("corrections", &pip, BodyConfig { corrections: 8, ..Default::default() }, &hands, 128);
+    compare(
+        "corrections",
+        &pip,
+        BodyConfig::from(StepSettings { corrections: 8, ..Default::default() }),
+        &hands,
+        128,
+    );
 }
 
 #[test]
@@ -140,7 +146,7 @@ fn a_relaxing_body() {
     let relaxation = Some(Relaxation { ratio: 0.5, time: 0.2 });
     for integrator in [Integrator::Exact, Integrator::GeneralizedAlpha { rho_inf: 0.5 }] {
         let hands = [hand(tip, 0.08 * pip.size(), [0.2 * pip.size(), 0.0, 0.0])];
-        let config = BodyConfig { integrator, relaxation, ..Default::default() };
+        let config = BodyConfig::from(StepSettings { integrator, relaxation, ..Default::default() });
         compare("relaxing", &pip, config, &hands, 128);
     }
 }
@@ -162,6 +168,6 @@ fn two_hands() {
 fn under_gravity() {
     let pip = model("pip.modal");
     let tip = end(&pip, [0.0, 1.0, 0.0]);
-    let config = BodyConfig { gravity: [0.0, -9.81, 0.0], ..Default::default() };
+    let config = BodyConfig::from(StepSettings { gravity: [0.0, -9.81, 0.0], ..Default::default() });
     compare("gravity", &pip, config, &[hand(tip, 0.02, [0.02, 0.0, 0.0])], 64);
 }

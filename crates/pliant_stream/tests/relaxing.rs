@@ -80,7 +80,11 @@ fn wrong_flow(recovery: &RecoveryConfig, ticks: u64) -> Vec<(f64, f64)> {
     let model = bar(24, 0.05);
     let integrator = integrator_for(recovery);
     let settings = StepSettings { integrator, relaxation: Some(MATERIAL), ..Default::default() };
-    let config = BodyConfig { step: H, integrator, relaxation: Some(MATERIAL), ..Default::default() };
+    let config = BodyConfig {
+        step: H,
+        settings: StepSettings { integrator, relaxation: Some(MATERIAL), ..Default::default() },
+        ..Default::default()
+    };
     let mut truth = Body::new(model.clone(), config).unwrap();
     let patch = Patch::around(model.surface(), 66, 0.05).unwrap();
     let hand = truth.grab(&patch, GrabConfig::default()).unwrap();

@@ -3,7 +3,7 @@
 
 mod support;
 
-use pliant_modal::BodyConfig;
+use pliant_modal::{BodyConfig, StepSettings};
 use pliant_stream::{GuestConfig, GuestEvent, HostConfig, StepSettings};
 use support::bar;
 use support::scene::{BODY, S, Scene, cached, circling, paper1};
@@ -19,7 +19,10 @@ fn after_a_change(told: bool, scale: f64) -> f64 {
     pair.join_with(GuestConfig::default(), paper1(), 1, cached(&model)).unwrap();
     pair.run_until(5 * S, &mut scene);
     let stiff = StepSettings { stiffness_scale: scale, ..settings };
-    let config = BodyConfig { stiffness_scale: scale, ..scene.body.config().clone() };
+    let config = BodyConfig {
+        settings: StepSettings { stiffness_scale: scale, ..scene.body.config().settings },
+        ..scene.body.config().clone()
+    };
     scene.body.reconfigure(config).unwrap();
     if told {
         pair.host.set_settings(BODY, stiff).unwrap();

@@ -6,9 +6,10 @@ use std::ops::RangeInclusive;
 use super::error::nearest;
 use super::locate::Step::{self, Field, Item};
 use super::{
-    BodyEntry, By, DeviceEntry, GrabEntry, IntegratorEntry, MAX_BODIES, MAX_GRABS, Motion, NetworkEntry,
-    PatchEntry, SceneDescription, SceneErrorKind, TouchEntry,
+    BodyEntry, By, DeviceEntry, GrabEntry, MAX_BODIES, MAX_GRABS, Motion, NetworkEntry, PatchEntry,
+    SceneDescription, SceneErrorKind, TouchEntry,
 };
+use crate::modal::StepError;
 
 /// What is wrong, and which value of the scene it is.
 #[derive(Debug)]
@@ -210,22 +211,24 @@ fn settings(body: &BodyEntry, at: &dyn Fn(&'static str) -> [Step; 3]) -> Checked
     within(&inner("place", "scale"), "a scale", body.place.scale, 1e-3..=1e3)?;
     each(&at("colour"), "a part of red, green and blue", &body.colour, &(0.0..=1.0))?;
     within(&at("roughness"), "a roughness", body.roughness, 0.0..=1.0)?;
-    if let IntegratorEntry::GeneralizedAlpha { rho_inf } = body.integrator {
-        within(&inner("integrator", "rho_inf"), "a spectral radius", rho_inf, 0.0..=1.0)?;
-    }
     if let Some(modes) = body.modes {
         within(&at("modes"), "a number of modes", modes as f64, 1.0..=100_000.0)?;
     }
-    within(&at("damping"), "a factor of the damping", body.damping, 0.0..=1000.0)?;
-    within(&at("stiffness"), "a factor of the stiffness", body.stiffness, 1e-6..=1e6)?;
-    if let Some(relaxation) = body.relaxation {
-        within(&inner("relaxation", "ratio"), "a part that relaxes", relaxation.ratio, 0.0..=0.999_999)?;
-        above_zero(&inner("relaxation", "time"), "seconds", relaxation.time, LONGEST)?;
-    }
-    if let Some(corrections) = body.corrections {
-        within(&at("corrections"), "corrections", corrections as f64, 1.0..=8.0)?;
-    }
-    each(&at("gravity"), "m/s^2", &body.gravity, &(-1e4..=1e4))?;
+    body.settings.check().map_err(|error| {
+        let mut path = at("settings").to_vec();
+        match error {
+            StepError::Input { what: "rho_inf", .. } => path.extend([Field("integrator"), Field("rho_inf")]),
+            StepError::Input { what: "relaxation ratio", .. } => {
+                path.extend([Field("relaxation"), Field("ratio")]);
+            }
+            StepError::Input { what: "relaxation time", .. } => {
+                path.extend([Field("relaxation"), Field("time")]);
+            }
+            StepError::Input { what, .. } => path.push(Field(what)),
+            _ => {}
+        }
+        fault(&path, SceneErrorKind::Value, error.to_string())
+    })?;
     body.rest_speed.map_or(Ok(()), |speed| within(&at("rest_speed"), "m/s", speed, 0.0..=LARGEST))
 }
 

@@ -2,6 +2,8 @@
 
 use serde::Deserialize;
 
+use crate::modal::StepSettings;
+
 /// A scene: bodies, the hands on them, and what is to be added to the app for it.
 ///
 /// Lengths are in m, times in s, y is up. Everything but `bodies` may be left out.
@@ -82,34 +84,17 @@ pub struct BodyEntry {
     /// How rough its surface looks, 0 to 1. Default: 0.45.
     #[serde(default = "roughness")]
     pub roughness: f64,
-    /// As [`ModalBody::integrator`](crate::body::ModalBody::integrator). Default: `Exact`.
+    /// How it is stepped: `settings: (stiffness_scale: 4, gravity: (0, -9.81, 0))`. Default: all of
+    /// [`StepSettings`] at their defaults.
     #[serde(default)]
-    pub integrator: IntegratorEntry,
+    pub settings: StepSettings,
     /// How many modes are kept, at least 1. Default: `None`, all.
     #[serde(default)]
     pub modes: Option<usize>,
-    /// Bend by modal warping. Default: true.
-    #[serde(default = "yes")]
-    pub warp: bool,
-    /// Multiplies the baked damping, 0 to 1000. Default: 1.
-    #[serde(default = "one")]
-    pub damping: f64,
-    /// Multiplies the baked stiffness, 1e-6 to 1e6: [`ModalBody::stiffness_scale`](crate::body::ModalBody::stiffness_scale). Default: 1.
-    #[serde(default = "one")]
-    pub stiffness: f64,
     /// Where the processor writes the surface, from a basis in half precision: [`ModalBody::half_basis`](crate::body::ModalBody::half_basis).
     /// Default: false.
     #[serde(default)]
     pub half_basis: bool,
-    /// A material that relaxes. Default: `None`, elastic.
-    #[serde(default)]
-    pub relaxation: Option<RelaxationEntry>,
-    /// Newton corrections a step, 1 to 8. Default: `None`, as [`ModalBody::corrections`](crate::body::ModalBody::corrections).
-    #[serde(default)]
-    pub corrections: Option<usize>,
-    /// Acceleration of gravity, m/s^2. Default: none.
-    #[serde(default)]
-    pub gravity: [f64; 3],
     /// Below this speed it comes to rest, m/s; 0 never. Default: `None`, as [`ModalBody::rest_speed`](crate::body::ModalBody::rest_speed).
     #[serde(default)]
     pub rest_speed: Option<f64>,
@@ -220,32 +205,6 @@ pub struct CopiesEntry {
     pub count: [usize; 2],
     /// How far apart, m, along x and z.
     pub spacing: [f64; 2],
-}
-
-/// How a body is stepped: [`Integration`](crate::body::Integration).
-#[derive(Debug, Clone, Copy, Default, PartialEq, Deserialize)]
-#[serde(rename = "Integrator", deny_unknown_fields)]
-pub enum IntegratorEntry {
-    /// Closed form.
-    #[default]
-    Exact,
-    /// Average acceleration.
-    Newmark,
-    /// The form whose accelerations are streamed.
-    GeneralizedAlpha {
-        /// Spectral radius at infinite frequency, 0 to 1.
-        rho_inf: f64,
-    },
-}
-
-/// A material that relaxes: [`Viscoelastic`](crate::body::Viscoelastic).
-#[derive(Debug, Clone, Copy, PartialEq, Deserialize)]
-#[serde(rename = "Relaxation", deny_unknown_fields)]
-pub struct RelaxationEntry {
-    /// Part of the stiffness that relaxes away, 0 or more and below 1.
-    pub ratio: f64,
-    /// Relaxation time, s, above 0.
-    pub time: f64,
 }
 
 /// A hand that holds a patch of a body and moves by a script.

@@ -43,9 +43,9 @@ mod spawn;
 mod syntax;
 
 pub use describe::{
-    BakeEntry, BodyEntry, By, ColourEntry, CopiesEntry, DeviceEntry, GrabEntry, Grip, GuestEntry,
-    IntegratorEntry, Like, Motion, NetworkEntry, PatchEntry, PlaceEntry, PointEntry, RecordingEntry,
-    RelaxationEntry, SceneDescription, TouchEntry, ViewEntry,
+    BakeEntry, BodyEntry, By, ColourEntry, CopiesEntry, DeviceEntry, GrabEntry, Grip, GuestEntry, Like,
+    Motion, NetworkEntry, PatchEntry, PlaceEntry, PointEntry, RecordingEntry, SceneDescription, TouchEntry,
+    ViewEntry,
 };
 pub use error::{SceneError, SceneErrorKind};
 pub use file::{SceneFile, SceneFileLoader};

@@ -7,10 +7,8 @@ use super::needs::compiled;
 #[cfg(feature = "bake")]
 use super::plugin::AssetRoot;
 use super::plugin::Role;
-use super::{
-    BodyEntry, By, IntegratorEntry, NetworkEntry, PlaceEntry, SceneError, SceneErrorKind, SceneFile,
-};
-use crate::body::{BodyRefused, BodyState, Integration, ModalAsset, ModalBody, NoPointerGrab, Viscoelastic};
+use super::{BodyEntry, By, NetworkEntry, PlaceEntry, SceneError, SceneErrorKind, SceneFile};
+use crate::body::{BodyRefused, BodyState, ModalAsset, ModalBody, NoPointerGrab};
 
 /// A scene in the world: spawn it, and the scene's bodies, hands and tools come as soon as the file is loaded, where this entity is. They are
 /// its [`SceneParts`] and go with it. When the file changes (Bevy's `file_watcher`), all of them are made anew.
@@ -435,19 +433,9 @@ impl BodyEntry {
     pub(super) fn modal(&self) -> ModalBody {
         let defaults = ModalBody::default();
         ModalBody {
-            integrator: match self.integrator {
-                IntegratorEntry::Exact => Integration::Exact,
-                IntegratorEntry::Newmark => Integration::Newmark,
-                IntegratorEntry::GeneralizedAlpha { rho_inf } => Integration::GeneralizedAlpha { rho_inf },
-            },
+            settings: self.settings,
             modes: self.modes,
-            warp: self.warp,
-            damping_scale: self.damping,
-            stiffness_scale: self.stiffness,
             half_basis: self.half_basis,
-            relaxation: self.relaxation.map(|entry| Viscoelastic { ratio: entry.ratio, time: entry.time }),
-            corrections: self.corrections.unwrap_or(defaults.corrections),
-            gravity: self.gravity.into(),
             rest_speed: self.rest_speed.unwrap_or(defaults.rest_speed),
             ..defaults
         }

@@ -57,7 +57,7 @@ fn wait_with(app: &mut App, entity: Entity, mut look: impl FnMut(&App)) -> Vec<B
 fn a_request_becomes_a_body_while_the_frames_go_on() {
     let mut app = baking_app(None);
     let mut settings = ModalBody::default();
-    settings.gravity.y = -1.0;
+    settings.settings.gravity[1] = -1.0;
     let entity = app.world_mut().spawn((bar(6), settings)).id();
     let before = tick(&app);
     let seen = wait(&mut app, entity);
@@ -79,7 +79,7 @@ fn a_request_becomes_a_body_while_the_frames_go_on() {
     )
     .unwrap();
     assert_eq!(state(&app, entity).model().hash(), by_hand.model.hash());
-    assert_eq!(state(&app, entity).body().config().gravity, [0.0, -1.0, 0.0]);
+    assert_eq!(state(&app, entity).body().config().settings.gravity, [0.0, -1.0, 0.0]);
 }
 
 #[test]

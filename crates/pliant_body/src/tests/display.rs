@@ -192,7 +192,8 @@ fn a_surface_in_half_precision_is_off_by_its_rounding() {
         for (q, most) in shapes {
             let drawn = |half_basis: bool| {
                 let mut app = drawn_app();
-                let settings = |body: &mut ModalBody| (body.half_basis, body.warp) = (half_basis, warp);
+                let settings =
+                    |body: &mut ModalBody| (body.half_basis, body.settings.warp) = (half_basis, warp);
                 let body = spawn_with(&mut app, model::bar(), settings, Driven::Remote);
                 see(&mut app, body);
                 app.world_mut().get_mut::<ShownState>(body).unwrap().snap(&q).unwrap();

@@ -4,7 +4,7 @@ use super::{app, model, refusals, spawn, spawn_with, state, steps};
 use crate::{BodyState, Driven, Grab, GrabForce, GrabOf, Grabs, ModalAsset, ModalBody};
 
 fn linear(body: &mut ModalBody) {
-    body.warp = false;
+    body.settings.warp = false;
 }
 
 fn grab(app: &mut App, body: Entity, target: DVec3) -> Entity {
@@ -107,7 +107,7 @@ fn a_target_that_is_not_finite_is_refused_and_the_last_good_one_stays() {
 #[test]
 fn a_grab_of_nothing_is_refused_and_the_body_goes_on() {
     let mut app = app();
-    let body = spawn_with(&mut app, model::bar(), |body| body.gravity = DVec3::NEG_Y, ());
+    let body = spawn_with(&mut app, model::bar(), |body| body.settings.gravity = [0.0, -1.0, 0.0], ());
     for (vertex, radius) in [(1_000_000, 0.01), (0, f64::NAN), (0, -1.0)] {
         let hand = app.world_mut().spawn((Grab::new(vertex, radius, DVec3::ZERO), GrabOf(body))).id();
         let before = state(&app, body).body().q()[0];
@@ -202,7 +202,7 @@ fn a_body_swapped_while_held_is_held_on_in_its_new_shape() {
 #[test]
 fn changing_the_number_of_modes_keeps_the_motion_of_those_that_stay() {
     let mut app = app();
-    let body = spawn_with(&mut app, model::bar(), |body| body.gravity = DVec3::new(1.0, -9.0, 0.0), ());
+    let body = spawn_with(&mut app, model::bar(), |body| body.settings.gravity = [1.0, -9.0, 0.0], ());
     steps(&mut app, 400);
     let before = state(&app, body).body().q().to_vec();
     app.world_mut().get_mut::<ModalBody>(body).unwrap().modes = Some(2);

@@ -14,7 +14,7 @@ fn version(app: &App, body: Entity) -> u64 {
 #[test]
 fn a_pause_steps_nothing_shows_nothing_new_and_acts_on_no_hand() {
     let mut app = app();
-    let body = spawn_with(&mut app, model::bar(), |body| body.gravity = DVec3::NEG_Y, ());
+    let body = spawn_with(&mut app, model::bar(), |body| body.settings.gravity = [0.0, -1.0, 0.0], ());
     let hand = app.world_mut().spawn((Grab::new(model::tip(), 0.05, DVec3::X), GrabOf(body))).id();
     // Frames that end between two steps: the picture of a pause stands there, too.
     frames_of(&mut app, 0.4);
@@ -38,7 +38,7 @@ fn a_pause_steps_nothing_shows_nothing_new_and_acts_on_no_hand() {
 fn single_steps_are_as_many_as_were_asked_for_and_like_any_others() {
     let run = |by_hand: bool| {
         let mut app = app();
-        let body = spawn_with(&mut app, model::bar(), |body| body.gravity = DVec3::NEG_Y, ());
+        let body = spawn_with(&mut app, model::bar(), |body| body.settings.gravity = [0.0, -1.0, 0.0], ());
         if by_hand {
             pause(&mut app);
             for asked in [1, 3, 0, 4] {

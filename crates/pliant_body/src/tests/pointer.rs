@@ -26,7 +26,7 @@ fn scene() -> (App, Entity, Entity) {
     let body = spawn_with(
         &mut app,
         model::bar(),
-        |body| body.warp = false,
+        |body| body.settings.warp = false,
         (Driven::Remote, InheritedVisibility::VISIBLE),
     );
     (app, window, body)

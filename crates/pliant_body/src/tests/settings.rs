@@ -5,7 +5,9 @@ use std::time::Duration;
 use bevy::{math::DVec3, prelude::*, time::TimeUpdateStrategy};
 
 use super::{STEP, app, model, refusals, spawn_with, state, steps};
-use crate::{BodyState, ModalAsset, ModalBody, Viscoelastic};
+use pliant_modal::Relaxation;
+
+use crate::{BodyState, ModalAsset, ModalBody};
 
 fn settings(app: &mut App, body: Entity) -> Mut<'_, ModalBody> {
     app.world_mut().get_mut::<ModalBody>(body).unwrap()
@@ -13,7 +15,7 @@ fn settings(app: &mut App, body: Entity) -> Mut<'_, ModalBody> {
 
 /// Two bodies fall alike; one is given settings that make no body, and the tick's length changes: it goes on as the other one.
 fn goes_on_with_the_settings_it_had(mut app: App, lengthen: impl Fn(&mut App, Duration)) {
-    let falls = |body: &mut ModalBody| body.gravity = DVec3::NEG_Y;
+    let falls = |body: &mut ModalBody| body.settings.gravity = [0.0, -1.0, 0.0];
     let good = spawn_with(&mut app, model::bar(), falls, ());
     let bad = spawn_with(&mut app, model::bar(), falls, ());
     lengthen(&mut app, Duration::from_millis(25));
@@ -22,9 +24,9 @@ fn goes_on_with_the_settings_it_had(mut app: App, lengthen: impl Fn(&mut App, Du
     app.world_mut().get_mut::<BodyState>(bad).unwrap().body_mut().set_state(&same).unwrap();
     {
         let mut bad = settings(&mut app, bad);
-        bad.damping_scale = f64::NAN;
+        bad.settings.damping_scale = f64::NAN;
         // Refused with the rest.
-        bad.gravity = DVec3::ZERO;
+        bad.settings.gravity = [0.0; 3];
     }
     for millis in [25, 20, 10, 30, 10] {
         lengthen(&mut app, Duration::from_millis(millis));
@@ -34,7 +36,10 @@ fn goes_on_with_the_settings_it_had(mut app: App, lengthen: impl Fn(&mut App, Du
     assert_eq!(told.len(), 1, "{told:?}");
     assert!(told[0].0 == bad && told[0].1.contains("damping_scale"), "{told:?}");
     let config = state(&app, bad).body().config();
-    assert_eq!((config.step, config.damping_scale, config.gravity), (0.010, 1.0, [0.0, -1.0, 0.0]));
+    assert_eq!(
+        (config.step, config.settings.damping_scale, config.settings.gravity),
+        (0.010, 1.0, [0.0, -1.0, 0.0])
+    );
     assert_ne!(state(&app, good).body().q(), same.q, "it moves");
     assert_eq!(state(&app, bad).body().state(), state(&app, good).body().state());
 
@@ -42,13 +47,13 @@ fn goes_on_with_the_settings_it_had(mut app: App, lengthen: impl Fn(&mut App, Du
     app.world_mut().entity_mut(bad).insert(Transform::from_scale(Vec3::splat(2.0)));
     steps(&mut app, 3);
     assert_eq!(refusals(&mut app), []);
-    assert_eq!(state(&app, bad).body().config().gravity, [0.0, -0.5, 0.0]);
+    assert_eq!(state(&app, bad).body().config().settings.gravity, [0.0, -0.5, 0.0]);
 
-    settings(&mut app, bad).damping_scale = 3.0;
+    settings(&mut app, bad).settings.damping_scale = 3.0;
     steps(&mut app, 1);
     assert_eq!(refusals(&mut app), []);
     let config = state(&app, bad).body().config();
-    assert_eq!((config.damping_scale, config.gravity), (3.0, [0.0; 3]));
+    assert_eq!((config.settings.damping_scale, config.settings.gravity), (3.0, [0.0; 3]));
 }
 
 #[test]
@@ -70,36 +75,36 @@ fn a_refused_change_and_another_fixed_step() {
 #[test]
 fn a_material_set_on_the_component_relaxes_and_stays_through_other_steps() {
     let mut app = app();
-    let material = Viscoelastic { ratio: 0.5, time: 0.2 };
+    let material = Relaxation { ratio: 0.5, time: 0.2 };
     let body = spawn_with(
         &mut app,
         model::bar(),
         |body| {
             // What is expected is said of the straight body.
-            body.warp = false;
-            body.gravity = DVec3::NEG_Y;
-            body.relaxation = Some(material);
-            body.corrections = 5;
+            body.settings.warp = false;
+            body.settings.gravity = [0.0, -1.0, 0.0];
+            body.settings.relaxation = Some(material);
+            body.settings.corrections = 5;
         },
         (),
     );
     app.world_mut().resource_mut::<Time<Fixed>>().set_timestep_seconds(STEP / 2.0);
     steps(&mut app, 2_000);
     let config = state(&app, body).body().config();
-    assert_eq!((config.step, config.corrections), (STEP / 2.0, 5));
-    assert_eq!(config.relaxation, Some(pliant_modal::Relaxation { ratio: 0.5, time: 0.2 }));
+    assert_eq!((config.step, config.settings.corrections), (STEP / 2.0, 5));
+    assert_eq!(config.settings.relaxation, Some(pliant_modal::Relaxation { ratio: 0.5, time: 0.2 }));
     // Half of the stiffness is left: it hangs twice as low as an elastic one, 5/3 g / omega^2.
     let expected = 2.0 * 5.0 / 3.0 / (std::f64::consts::TAU * model::FREQUENCIES[0]).powi(2);
     let tip = (5.0 / model::MASS).sqrt() * state(&app, body).body().q()[0];
     assert!((tip + expected).abs() < 1e-3 * expected, "sank {tip} m, expected -{expected} m");
 
-    settings(&mut app, body).relaxation = Some(Viscoelastic { ratio: 1.0, time: 0.2 });
+    settings(&mut app, body).settings.relaxation = Some(Relaxation { ratio: 1.0, time: 0.2 });
     steps(&mut app, 3);
     let told = refusals(&mut app);
     assert!(told.len() == 1 && told[0].1.contains("relaxation ratio"), "{told:?}");
-    settings(&mut app, body).relaxation = None;
+    settings(&mut app, body).settings.relaxation = None;
     steps(&mut app, 1);
-    assert_eq!(state(&app, body).body().config().relaxation, None);
+    assert_eq!(state(&app, body).body().config().settings.relaxation, None);
 }
 
 #[test]
@@ -110,8 +115,8 @@ fn a_body_made_twice_as_stiff_while_it_hangs_hangs_half_as_low_and_swings_root_t
         model::bar(),
         |body| {
             // What is expected is said of the straight body.
-            body.warp = false;
-            body.gravity = DVec3::NEG_Y;
+            body.settings.warp = false;
+            body.settings.gravity = [0.0, -1.0, 0.0];
             body.rest_speed = 0.0;
         },
         (),
@@ -124,8 +129,8 @@ fn a_body_made_twice_as_stiff_while_it_hangs_hangs_half_as_low_and_swings_root_t
     steps(&mut app, 2_000);
     assert!((tip(&app) / hangs(1.0) - 1.0).abs() < 1e-3, "{} m", tip(&app));
     // Undamped from here on: it swings about where it would hang, up from where it hung.
-    settings(&mut app, body).stiffness_scale = 2.0;
-    settings(&mut app, body).damping_scale = 0.0;
+    settings(&mut app, body).settings.stiffness_scale = 2.0;
+    settings(&mut app, body).settings.damping_scale = 0.0;
     let (mut crossings, mut before, mut highest) = (Vec::new(), f64::NAN, f64::NEG_INFINITY);
     for step in 0..1_000 {
         steps(&mut app, 1);
@@ -141,14 +146,14 @@ fn a_body_made_twice_as_stiff_while_it_hangs_hangs_half_as_low_and_swings_root_t
     let period = (crossings[crossings.len() - 1] - crossings[0]) / (crossings.len() - 1) as f64;
     let expected = 1.0 / (model::FREQUENCIES[0] * 2f64.sqrt());
     assert!((period / expected - 1.0).abs() < 0.01, "{period} s, expected {expected} s");
-    settings(&mut app, body).damping_scale = 1.0;
+    settings(&mut app, body).settings.damping_scale = 1.0;
     steps(&mut app, 2_000);
     assert!((tip(&app) / hangs(2.0) - 1.0).abs() < 1e-3, "{} m", tip(&app));
-    settings(&mut app, body).stiffness_scale = 0.0;
+    settings(&mut app, body).settings.stiffness_scale = 0.0;
     steps(&mut app, 2);
     let told = refusals(&mut app);
     assert!(told.len() == 1 && told[0].1.contains("stiffness_scale"), "{told:?}");
-    assert_eq!(state(&app, body).body().config().stiffness_scale, 2.0);
+    assert_eq!(state(&app, body).body().config().settings.stiffness_scale, 2.0);
 }
 
 #[test]
@@ -157,21 +162,25 @@ fn what_was_configured_on_the_body_itself_stays_when_the_step_and_the_scale_chan
     let body = spawn_with(&mut app, model::bar(), |_| (), ());
     let relaxation = Some(pliant_modal::Relaxation { ratio: 0.25, time: 2.0 });
     let mut running = app.world_mut().get_mut::<BodyState>(body).unwrap();
-    let config = pliant_modal::BodyConfig { relaxation, corrections: 7, ..running.body().config().clone() };
+    let mut config = running.body().config().clone();
+    (config.settings.relaxation, config.settings.corrections) = (relaxation, 7);
     running.body_mut().reconfigure(config).unwrap();
     app.world_mut().resource_mut::<Time<Fixed>>().set_timestep_seconds(STEP / 4.0);
     app.world_mut().entity_mut(body).insert(Transform::from_scale(Vec3::splat(0.5)));
     steps(&mut app, 3);
     let config = state(&app, body).body().config();
-    assert_eq!((config.step, config.relaxation, config.corrections), (STEP / 4.0, relaxation, 7));
+    assert_eq!(
+        (config.step, config.settings.relaxation, config.settings.corrections),
+        (STEP / 4.0, relaxation, 7)
+    );
 }
 
 #[test]
 fn a_model_that_was_refused_is_tried_again_when_its_asset_changes() {
     let mut app = app();
     // Too fast for a material that relaxes: omega h above 1e12.
-    let material = Some(Viscoelastic::default());
-    let body = spawn_with(&mut app, model::stiff_bar(1e13), |body| body.relaxation = material, ());
+    let material = Some(Relaxation { ratio: 0.5, time: 1.0 });
+    let body = spawn_with(&mut app, model::stiff_bar(1e13), |body| body.settings.relaxation = material, ());
     steps(&mut app, 3);
     assert!(app.world().get::<BodyState>(body).is_none());
     let told = refusals(&mut app);

@@ -7,7 +7,8 @@ use crate::{Driven, Grab, GrabOf, ModalAsset, ModalBody, PliantBodyPlugin, Plian
 fn a_body_under_its_own_weight_hangs_by_participation_over_stiffness() {
     let mut app = app();
     // What is expected is said of the straight body.
-    let falls = |body: &mut ModalBody| (body.warp, body.gravity) = (false, DVec3::new(0.0, -9.81, 0.0));
+    let falls =
+        |body: &mut ModalBody| (body.settings.warp, body.settings.gravity) = (false, [0.0, -9.81, 0.0]);
     let body = spawn_with(&mut app, model::bar(), falls, ());
     steps(&mut app, 400);
     // One mode of bending along y, phi = sqrt(5/m) x^2: q = g Gamma / omega^2, and the tip sinks by phi(1) q = 5/3 g / omega^2.
@@ -27,7 +28,7 @@ fn the_shape_is_the_same_to_the_bit_whatever_the_order_of_spawning() {
         let mut bodies = [Entity::PLACEHOLDER; 3];
         for which in order {
             let mut body = ModalBody::new(if which == 2 { free.clone() } else { bar.clone() });
-            body.gravity = DVec3::new(0.3, [-9.81, -1.62, -3.0][which], 0.1);
+            body.settings.gravity = [0.3, [-9.81, -1.62, -3.0][which], 0.1];
             bodies[which] = app.world_mut().spawn(body).id();
             for pull in [0.1, -0.2] {
                 let grab = Grab::new(model::tip(), 0.1, DVec3::new(1.0, pull * which as f64, 0.03));
@@ -47,8 +48,8 @@ fn the_shape_is_the_same_to_the_bit_whatever_the_order_of_spawning() {
 #[test]
 fn a_body_that_is_despawned_in_the_frame_in_which_it_is_made_is_no_accident() {
     let mut app = app();
-    let refused = spawn_with(&mut app, model::bar(), |body| body.damping_scale = f64::NAN, ());
-    app.world_mut().get_mut::<ModalBody>(refused).unwrap().damping_scale = -1.0;
+    let refused = spawn_with(&mut app, model::bar(), |body| body.settings.damping_scale = f64::NAN, ());
+    app.world_mut().get_mut::<ModalBody>(refused).unwrap().settings.damping_scale = -1.0;
     let model = app.world_mut().resource_mut::<Assets<ModalAsset>>().add(ModalAsset::from(model::bar()));
     let made = app.world_mut().spawn(ModalBody::new(model)).id();
     let kill = move |mut commands: Commands, bodies: Query<Entity, With<ModalBody>>| {
@@ -63,7 +64,7 @@ fn a_body_that_is_despawned_in_the_frame_in_which_it_is_made_is_no_accident() {
 #[test]
 fn a_body_whose_component_is_taken_away_keeps_nothing_and_may_have_it_again() {
     let mut app = app();
-    let body = spawn_with(&mut app, model::bar(), |body| body.gravity = DVec3::NEG_Y, ());
+    let body = spawn_with(&mut app, model::bar(), |body| body.settings.gravity = [0.0, -1.0, 0.0], ());
     steps(&mut app, 5);
     let settings = app.world_mut().entity_mut(body).take::<ModalBody>().unwrap();
     steps(&mut app, 2);
@@ -77,7 +78,7 @@ fn a_body_whose_component_is_taken_away_keeps_nothing_and_may_have_it_again() {
 #[test]
 fn pausing_virtual_time_stops_the_tick_and_the_state() {
     let mut app = app();
-    let body = spawn_with(&mut app, model::bar(), |body| body.gravity = DVec3::NEG_Y, ());
+    let body = spawn_with(&mut app, model::bar(), |body| body.settings.gravity = [0.0, -1.0, 0.0], ());
     frames_of(&mut app, 1.0);
     steps(&mut app, 5);
     app.world_mut().resource_mut::<Time<Virtual>>().pause();
@@ -118,8 +119,8 @@ fn a_still_body_rests_after_half_a_second_and_a_touch_wakes_it() {
 fn a_body_that_creeps_back_does_not_rest_while_it_is_bent() {
     let mut app = app();
     // It goes back within some 40 s, and always slower than what counts as rest.
-    let relaxation = crate::Viscoelastic { ratio: 0.5, time: 20.0 };
-    let slow = |body: &mut ModalBody| (body.relaxation, body.rest_speed) = (Some(relaxation), 0.01);
+    let relaxation = pliant_modal::Relaxation { ratio: 0.5, time: 20.0 };
+    let slow = |body: &mut ModalBody| (body.settings.relaxation, body.rest_speed) = (Some(relaxation), 0.01);
     let body = spawn_with(&mut app, model::bar(), slow, ());
     // Held aside for long, and let go.
     let mut entity = app.world_mut().get_mut::<crate::BodyState>(body).unwrap();
@@ -142,7 +143,7 @@ fn a_body_that_creeps_back_does_not_rest_while_it_is_bent() {
 #[test]
 fn the_picture_stands_between_the_last_two_steps() {
     let mut app = app();
-    let body = spawn_with(&mut app, model::bar(), |body| body.gravity = DVec3::NEG_Y, ());
+    let body = spawn_with(&mut app, model::bar(), |body| body.settings.gravity = [0.0, -1.0, 0.0], ());
     steps(&mut app, 3);
     frames_of(&mut app, 0.25);
     let mut seen = Vec::new();
@@ -161,7 +162,8 @@ fn the_picture_stands_between_the_last_two_steps() {
 #[test]
 fn a_remote_body_shows_what_is_pushed_and_is_not_stepped() {
     let mut app = app();
-    let body = spawn_with(&mut app, model::bar(), |body| body.gravity = DVec3::NEG_Y, Driven::Remote);
+    let body =
+        spawn_with(&mut app, model::bar(), |body| body.settings.gravity = [0.0, -1.0, 0.0], Driven::Remote);
     steps(&mut app, 10);
     assert_eq!(state(&app, body).body().q(), [0.0; 4]);
 
@@ -192,7 +194,7 @@ fn in_another_schedule_the_step_is_the_frame() {
         .insert_resource(bevy::time::TimeUpdateStrategy::ManualDuration(std::time::Duration::from_millis(5)))
         .add_plugins(PliantBodyPlugin::new(Update));
     app.update();
-    let body = spawn_with(&mut app, model::bar(), |body| body.gravity = DVec3::NEG_Y, ());
+    let body = spawn_with(&mut app, model::bar(), |body| body.settings.gravity = [0.0, -1.0, 0.0], ());
     steps(&mut app, 9);
     assert_eq!(tick(&app), 10, "the first update of an app has no time in it");
     assert_eq!(state(&app, body).body().config().step, 0.005);
@@ -203,20 +205,21 @@ fn in_another_schedule_the_step_is_the_frame() {
 #[test]
 fn settings_that_make_no_body_are_refused_by_name_and_may_be_mended() {
     let mut app = app();
-    let body = spawn_with(&mut app, model::bar(), |body| body.damping_scale = f64::NAN, Name::new("jelly"));
+    let body =
+        spawn_with(&mut app, model::bar(), |body| body.settings.damping_scale = f64::NAN, Name::new("jelly"));
     steps(&mut app, 3);
     assert!(app.world().get::<crate::BodyState>(body).is_none());
     let told = refusals(&mut app);
     assert_eq!(told.len(), 1, "once, not every frame: {told:?}");
     assert!(told[0].0 == body && told[0].1.contains("damping_scale"), "{told:?}");
 
-    app.world_mut().get_mut::<ModalBody>(body).unwrap().damping_scale = 1.0;
+    app.world_mut().get_mut::<ModalBody>(body).unwrap().settings.damping_scale = 1.0;
     steps(&mut app, 1);
     assert!(app.world().get::<crate::BodyState>(body).is_some());
     // A change for the worse leaves the running body as it was.
-    app.world_mut().get_mut::<ModalBody>(body).unwrap().damping_scale = -1.0;
+    app.world_mut().get_mut::<ModalBody>(body).unwrap().settings.damping_scale = -1.0;
     steps(&mut app, 1);
-    assert_eq!(state(&app, body).body().config().damping_scale, 1.0);
+    assert_eq!(state(&app, body).body().config().settings.damping_scale, 1.0);
     assert_eq!(refusals(&mut app).len(), 1);
 }
 
@@ -248,7 +251,7 @@ fn a_free_body_falls_by_its_own_transform_and_can_be_put_elsewhere() {
     let mut app = app();
     let start = Transform::from_xyz(0.0, 10.0, 0.0);
     let body =
-        spawn_with(&mut app, model::free_bar(), |body| body.gravity = DVec3::new(0.0, -10.0, 0.0), start);
+        spawn_with(&mut app, model::free_bar(), |body| body.settings.gravity = [0.0, -10.0, 0.0], start);
     steps(&mut app, 40);
     // One second, and as every update is a whole step, the picture is one step behind: s = g t^2 / 2.
     let t = 39.0 * super::STEP;
@@ -266,7 +269,7 @@ fn a_free_body_falls_by_its_own_transform_and_can_be_put_elsewhere() {
 #[test]
 fn a_free_body_that_is_put_elsewhere_is_seen_there_and_nowhere_between() {
     let mut app = app();
-    let body = spawn_with(&mut app, model::free_bar(), |body| body.gravity = DVec3::NEG_Y, ());
+    let body = spawn_with(&mut app, model::free_bar(), |body| body.settings.gravity = [0.0, -1.0, 0.0], ());
     steps(&mut app, 3);
     frames_of(&mut app, 0.2);
     steps(&mut app, 8);

@@ -3,7 +3,9 @@
 use std::{fmt::Write, sync::Arc, time::Instant};
 
 use pliant_mesh::shapes;
-use pliant_modal::{Body, BodyConfig, Element, GrabConfig, Integrator, ModalModel, Patch, Precision};
+use pliant_modal::{
+    Body, BodyConfig, Element, GrabConfig, Integrator, ModalModel, Patch, Precision, StepSettings,
+};
 use pliant_stream::{
     Policy, RecoveryConfig,
     emulator::{LinkConfig, Preset},
@@ -171,7 +173,15 @@ fn local(quick: bool, bar: &mut Bar) -> Result<(Vec<Figure>, String), CliError> 
     let fine = |cells: [usize; 3], rate: f64| -> Result<Run, CliError> {
         let (model, _) = baked(&shapes::bar(cells, size)?, &held(Element::Tet10, 120))?;
         let places = every(&model)?;
-        moving(&model, &places, BodyConfig { step: 1.0 / rate, integrator: ALPHA, ..BodyConfig::default() })
+        moving(
+            &model,
+            &places,
+            BodyConfig {
+                step: 1.0 / rate,
+                settings: StepSettings { integrator: ALPHA, ..Default::default() },
+                ..BodyConfig::default()
+            },
+        )
     };
     let truth = fine(if quick { [16, 4, 4] } else { [24, 6, 6] }, 3840.0)?;
     let between = fine(if quick { [8, 2, 2] } else { [16, 4, 4] }, 1920.0)?;
@@ -193,9 +203,9 @@ fn local(quick: bool, bar: &mut Bar) -> Result<(Vec<Figure>, String), CliError> 
                         bar.report("front", choices.len() as f64 / (20 * rates.len() * 2) as f64);
                         let setting = BodyConfig {
                             step: 1.0 / rate,
-                            integrator,
                             modes: Some(modes),
                             precision,
+                            settings: StepSettings { integrator, ..Default::default() },
                             ..BodyConfig::default()
                         };
                         // Once to fill the caches; the times are of the runs after it, the errors of any.

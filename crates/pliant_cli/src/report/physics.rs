@@ -6,6 +6,7 @@ use nalgebra::{Matrix3, Vector3};
 use pliant_mesh::{TetMesh, shapes};
 use pliant_modal::{
     Body, BodyConfig, Element, FlexibilitySite, GrabConfig, Integrator, ModalModel, ModelParts, Patch,
+    StepSettings,
 };
 
 use super::{
@@ -206,7 +207,7 @@ fn bar() -> Result<TetMesh, CliError> {
 pub(super) fn modes(quick: bool) -> Result<Vec<Figure>, CliError> {
     // Every mode that the mesh has: nothing is left out.
     let (full, _) = baked(&bar()?, &config(Element::Tet4, 216, vec![anchor(0, 1e-9)]))?;
-    let elastic = BodyConfig { warp: false, ..BodyConfig::default() };
+    let elastic = BodyConfig::from(StepSettings { warp: false, ..Default::default() });
     let want = dragged(&full, elastic.clone())?;
     let step =
         relative(&dragged(&full, BodyConfig { step: 1.0 / 120.0, ..elastic.clone() })?.force, &want.force);
@@ -298,7 +299,11 @@ pub(super) fn steps(quick: bool) -> Result<Vec<Figure>, CliError> {
     ];
     let rates: &[f64] =
         if quick { &[60.0, 240.0, 960.0] } else { &[60.0, 120.0, 240.0, 480.0, 960.0, 1920.0] };
-    let at = |rate: f64, integrator| BodyConfig { step: 1.0 / rate, integrator, ..BodyConfig::default() };
+    let at = |rate: f64, integrator| BodyConfig {
+        step: 1.0 / rate,
+        settings: StepSettings { integrator, ..Default::default() },
+        ..BodyConfig::default()
+    };
     // Free: a closed form exists, which `exact` is at any step.
     let ring = |config: BodyConfig| -> Result<(Vec<[f64; 3]>, Vec<Vec<f64>>), CliError> {
         let per = (1.0 / 60.0 / config.step).round() as usize;

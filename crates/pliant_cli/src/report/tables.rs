@@ -4,7 +4,7 @@ use std::{fmt::Write, path::Path, sync::Arc, time::Duration};
 
 use pliant_bake::{BakeConfig, DeadLoad, deflect};
 use pliant_mesh::shapes;
-use pliant_modal::{BodyConfig, Element, Integrator, ModalModel, Patch, Precision};
+use pliant_modal::{BodyConfig, Element, Integrator, ModalModel, Patch, Precision, StepSettings};
 use pliant_stream::{
     Newmark, Policy, Predict, RecoveryConfig,
     emulator::{LinkConfig, Loss, Preset},
@@ -393,7 +393,12 @@ fn setting(
         };
         let reach = truth.patches[0].iter().map(|x| x * x).sum::<f64>().sqrt() / size;
         let held = held_as(&model, &load, &truth, BodyConfig::default())?;
-        let flat = held_as(&model, &load, &truth, BodyConfig { warp: false, ..BodyConfig::default() })?;
+        let flat = held_as(
+            &model,
+            &load,
+            &truth,
+            BodyConfig::from(StepSettings { warp: false, ..Default::default() }),
+        )?;
         let _ = writeln!(
             out,
             "| {:.1} | {:.3} / {:.2} | {:.2} | {:.1} ({:.0}) | {:.1} ({:.0}) | {:.1} |",

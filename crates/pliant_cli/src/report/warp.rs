@@ -4,7 +4,7 @@ use std::sync::Arc;
 
 use pliant_bake::{BakeConfig, DeadLoad, Deflection, deflect};
 use pliant_mesh::shapes;
-use pliant_modal::{Body, BodyConfig, Element, GrabConfig, ModalModel, Patch};
+use pliant_modal::{Body, BodyConfig, Element, GrabConfig, ModalModel, Patch, StepSettings};
 
 use super::{
     physics::{figure, smooth},
@@ -100,7 +100,12 @@ pub(super) fn warp(quick: bool) -> Result<Vec<Figure>, CliError> {
         let truth = deflect(&mesh, &setting, &load)?;
         let reach = truth.patches[0].iter().map(|x| x * x).sum::<f64>().sqrt();
         for (which, warp) in [true, false].into_iter().enumerate() {
-            let held = held_as(&model, &load, &truth, BodyConfig { warp, ..BodyConfig::default() })?;
+            let held = held_as(
+                &model,
+                &load,
+                &truth,
+                BodyConfig::from(StepSettings { warp, ..Default::default() }),
+            )?;
             bend[which].push((reach, held.shape[1]));
             force[which].push((reach, held.along));
             whole[which].push((reach, held.force));
@@ -113,7 +118,12 @@ pub(super) fn warp(quick: bool) -> Result<Vec<Figure>, CliError> {
         let truth = deflect(&mesh, &setting, &load)?;
         let turn = truth.patches[0].iter().map(|x| x * x).sum::<f64>().sqrt();
         for (which, warp) in [true, false].into_iter().enumerate() {
-            let held = held_as(&model, &load, &truth, BodyConfig { warp, ..BodyConfig::default() })?;
+            let held = held_as(
+                &model,
+                &load,
+                &truth,
+                BodyConfig::from(StepSettings { warp, ..Default::default() }),
+            )?;
             twist[which].push((turn, held.shape[1]));
         }
         own_twist = own_twist.max(truth.residual * turn);

@@ -206,7 +206,7 @@ pub(super) fn no_growth(growth: f64) -> Bound {
 pub(super) fn state(body: &Body, q: Vec<f64>, v: Vec<f64>) -> State {
     let mut state = body.state().clone();
     let model = body.model();
-    let damping = body.config().damping_scale;
+    let damping = body.config().settings.damping_scale;
     state.a = (0..q.len())
         .map(|i| -model.damping()[i] * damping * v[i] - model.omega()[i].powi(2) * q[i])
         .collect();

@@ -1,7 +1,7 @@
 //! Hands that do what no hand should: teleport, tremble, twist, oppose each other, share a spot, hold an anchor, outnumber the modes.
 
 use nalgebra::Vector3;
-use pliant_modal::{Body, BodyConfig, GrabConfig, GrabId, ModalModel, Patch};
+use pliant_modal::{Body, BodyConfig, GrabConfig, GrabId, ModalModel, Patch, StepSettings};
 
 use super::{
     Bound, Case, Expected, Outcome,
@@ -185,7 +185,8 @@ fn jitter(young: f64, step: f64) -> Result<Outcome, CliError> {
 fn twist(young: f64, corrections: usize) -> Result<Outcome, CliError> {
     let bar = Bar { young, zeta: 0.05, modes: 30, ..Bar::default() };
     let model = bar.bake()?;
-    let mut body = Body::new(model.clone(), BodyConfig { corrections, ..BodyConfig::default() })?;
+    let mut body =
+        Body::new(model.clone(), BodyConfig::from(StepSettings { corrections, ..Default::default() }))?;
     let mut hands: Vec<(GrabId, Vector3<f64>)> = Vec::new();
     let mut patches = Vec::new();
     for corner in [[0.0, 0.0], [1.0, 0.0], [1.0, 1.0], [0.0, 1.0]] {

@@ -1,6 +1,6 @@
 //! Numbers that are none: refused by name, and nothing has changed.
 
-use pliant_modal::{Body, BodyConfig, GrabConfig, Integrator, StepError};
+use pliant_modal::{Body, BodyConfig, GrabConfig, Integrator, StepError, StepSettings};
 
 use super::{Bound, Case, Outcome, bodies::Bar};
 use crate::CliError;
@@ -15,7 +15,7 @@ pub(super) fn cases(out: &mut Vec<Case>) {
     out.push(Case::new("inputs", "pushes beyond the largest number".into(), || {
         let bar = Bar { zeta: 0.0, ..Bar::default() };
         let model = bar.bake()?;
-        let config = BodyConfig { integrator: Integrator::Newmark, ..BodyConfig::default() };
+        let config = BodyConfig::from(StepSettings { integrator: Integrator::Newmark, ..Default::default() });
         let mut body = Body::new(model.clone(), config)?;
         let vertex = bar.vertex(&model, [1.0, 0.5, 0.5]);
         for _ in 0..9 {
@@ -47,8 +47,10 @@ fn refused(bad: f64) -> Result<Outcome, CliError> {
         body.set_pose([0.0; 3], [0.0, bad, 0.0, 1.0]).is_ok(),
         body.set_grab_flow(grab, [bad, 0.0, 0.0]).is_ok(),
         Body::new(model.clone(), BodyConfig { step: bad, ..BodyConfig::default() }).is_ok(),
-        Body::new(model.clone(), BodyConfig { damping_scale: bad, ..BodyConfig::default() }).is_ok(),
-        Body::new(model, BodyConfig { gravity: [0.0, bad, 0.0], ..BodyConfig::default() }).is_ok(),
+        Body::new(model.clone(), BodyConfig::from(StepSettings { damping_scale: bad, ..Default::default() }))
+            .is_ok(),
+        Body::new(model, BodyConfig::from(StepSettings { gravity: [0.0, bad, 0.0], ..Default::default() }))
+            .is_ok(),
     ];
     for _ in 0..100 {
         body.step()?;

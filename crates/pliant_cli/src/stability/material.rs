@@ -2,7 +2,7 @@
 
 use nalgebra::Vector3;
 use pliant_mesh::TetMesh;
-use pliant_modal::{BodyConfig, Element, GrabConfig, Integrator, Patch};
+use pliant_modal::{BodyConfig, Element, GrabConfig, Integrator, Patch, StepSettings};
 
 use super::{
     Bound, Case, Expected, Outcome,
@@ -34,7 +34,10 @@ pub(super) fn cases(out: &mut Vec<Case>) {
         for young in [1e3, 1e6, 1e12] {
             let name = format!("E {young:.0e} Pa, {}, tip dragged", word(integrator));
             out.push(Case::new("stiffness", name, move || {
-                drag(&Bar { young, ..Bar::default() }, BodyConfig { integrator, ..BodyConfig::default() })
+                drag(
+                    &Bar { young, ..Bar::default() },
+                    BodyConfig::from(StepSettings { integrator, ..Default::default() }),
+                )
             }));
         }
     }
@@ -202,8 +205,15 @@ fn hold_patch(bar: &Bar, mut held: Held) -> Result<Outcome, CliError> {
 
 /// Struck at the tip and left alone for 5,000 steps: the energy never grows.
 fn struck(bar: &Bar, step: f64, integrator: Integrator) -> Result<Outcome, CliError> {
-    let held =
-        Held::new(bar, BodyConfig { step, integrator, ..BodyConfig::default() }, GrabConfig::default())?;
+    let held = Held::new(
+        bar,
+        BodyConfig {
+            step,
+            settings: StepSettings { integrator, ..Default::default() },
+            ..BodyConfig::default()
+        },
+        GrabConfig::default(),
+    )?;
     let mut body = held.body;
     body.release(held.grab);
     let impulse = 0.05 * bar.length * held.model.omega()[0] * held.model.mass();

@@ -1,7 +1,7 @@
 //! Motion without hands, and free bodies: energy and momentum.
 
 use nalgebra::Vector3;
-use pliant_modal::{Body, BodyConfig, Frame, GrabConfig, Integrator, Relaxation};
+use pliant_modal::{Body, BodyConfig, Frame, GrabConfig, Integrator, Relaxation, StepSettings};
 
 use super::{
     Bound, Case, Expected, Outcome,
@@ -99,7 +99,8 @@ fn far_and_fast(shape: [f64; 3]) -> Option<Expected> {
 
 fn random(seed: u64, integrator: Integrator) -> Result<Outcome, CliError> {
     let bar = Bar { zeta: 0.01, ..Bar::default() };
-    let mut body = Body::new(bar.bake()?, BodyConfig { integrator, ..BodyConfig::default() })?;
+    let mut body =
+        Body::new(bar.bake()?, BodyConfig::from(StepSettings { integrator, ..Default::default() }))?;
     let mut dice = Dice(seed);
     let modes = body.mode_count();
     let speed = body.model().mass().sqrt() * body.model().size();
@@ -116,7 +117,10 @@ fn started(scale: [f64; 3], held: bool, warp: bool, step: f64) -> Result<Outcome
     let model = bar.bake()?;
     let middle = [0.0, 0.1, 0.1];
     let q = nearest(&model, |p| std::array::from_fn(|k| (scale[k] - 1.0) * (p[k] - middle[k])));
-    let mut body = Body::new(model.clone(), BodyConfig { warp, step, ..BodyConfig::default() })?;
+    let mut body = Body::new(
+        model.clone(),
+        BodyConfig { step, settings: StepSettings { warp, ..Default::default() }, ..BodyConfig::default() },
+    )?;
     let v = vec![0.0; q.len()];
     body.set_state(&state(&body, q, v))?;
     let start = body.energy();
@@ -225,8 +229,10 @@ fn counted(step: f64) -> Result<Outcome, CliError> {
 fn relaxing_energy(relaxation: Relaxation) -> Result<Outcome, CliError> {
     let bar = Bar { zeta: 0.0, ..Bar::default() };
     let model = bar.bake()?;
-    let mut body =
-        Body::new(model.clone(), BodyConfig { relaxation: Some(relaxation), ..BodyConfig::default() })?;
+    let mut body = Body::new(
+        model.clone(),
+        BodyConfig::from(StepSettings { relaxation: Some(relaxation), ..Default::default() }),
+    )?;
     let impulse = 0.05 * model.omega()[0] * model.mass();
     body.strike(bar.vertex(&model, [1.0, 0.5, 0.5]), [0.3 * impulse, impulse, -0.7 * impulse])?;
     let [growth, _] = energy_growth(&mut body, 5_000)?;
@@ -239,7 +245,7 @@ fn relaxed_reaction(relaxation: Relaxation) -> Result<Outcome, CliError> {
     let elastic = Held::new(&bar, BodyConfig::default(), GrabConfig::default())?;
     let away = [0.0, 1e-6, 0.5e-6];
     let want = (1.0 - relaxation.ratio) * static_pull(&elastic, away)?;
-    let config = BodyConfig { relaxation: Some(relaxation), ..BodyConfig::default() };
+    let config = BodyConfig::from(StepSettings { relaxation: Some(relaxation), ..Default::default() });
     let mut held = Held::new(&bar, config, GrabConfig::default())?;
     held.pull(away)?;
     let slow = 12.0 * relaxation.time / (1.0 - relaxation.ratio) * 60.0;

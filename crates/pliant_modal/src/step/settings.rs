@@ -7,7 +7,7 @@ use crate::{Integrator, ModalModel, Relaxation, StepError, error::finite};
 /// How a body is stepped: everything that the host, its guests and peers have to agree on, besides
 /// the model and the length of a step.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
-#[serde(default)]
+#[serde(default, deny_unknown_fields)]
 pub struct StepSettings {
     /// How the modes are integrated. Default: [`Integrator::Exact`].
     pub integrator: Integrator,

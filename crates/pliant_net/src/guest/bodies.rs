@@ -48,7 +48,7 @@ impl NetGuest {
         let Some(view) = self.session.as_ref().and_then(|session| session.body(id)) else { return };
         let info = view.info();
         let name = info.name.clone();
-        let StepSettings { warp, damping_scale, stiffness_scale, .. } = info.settings;
+        let settings = info.settings;
         // How many of them the stream carries may change; the picture has room for all that we would take.
         let modes = self.config.modes.map(usize::from).filter(|&modes| modes < model.mode_count());
         let now = self.now();
@@ -87,12 +87,14 @@ impl NetGuest {
         match target.get_mut::<ModalBody>() {
             Some(mut body) => {
                 let model = handle;
-                let new = ModalBody { model, modes, warp, damping_scale, stiffness_scale, ..body.clone() };
+                let settings = stepped_as(&settings, &body);
+                let new = ModalBody { model, modes, settings, ..body.clone() };
                 body.set_if_neq(new);
             }
             None => {
                 let new = ModalBody::new(handle);
-                target.insert(ModalBody { modes, warp, damping_scale, stiffness_scale, ..new });
+                let settings = stepped_as(&settings, &new);
+                target.insert(ModalBody { modes, settings, ..new });
             }
         }
         target.insert((Driven::Remote, RemoteBody(id), SeenHands::default()));
@@ -117,10 +119,10 @@ impl NetGuest {
     /// The host steps it otherwise: what is shown of it here (its energy, its knobs) goes by the same settings.
     pub(super) fn body_changed(&mut self, world: &mut World, id: BodyId) {
         let Some(view) = self.session.as_ref().and_then(|session| session.body(id)) else { return };
-        let StepSettings { warp, damping_scale, stiffness_scale, .. } = view.info().settings;
+        let settings = view.info().settings;
         let Some(followed) = self.bodies.get(&id) else { return };
         if let Some(mut body) = world.get_mut::<ModalBody>(followed.entity) {
-            let new = ModalBody { warp, damping_scale, stiffness_scale, ..body.clone() };
+            let new = ModalBody { settings: stepped_as(&settings, &body), ..body.clone() };
             body.set_if_neq(new);
         }
     }
@@ -195,4 +197,10 @@ impl FollowedBody {
         );
         out.resize(modes, 0.0);
     }
+}
+
+/// A guest's copy is stepped as the host says. Gravity stays the copy's own: what crosses is in the
+/// axes of the stream.
+fn stepped_as(settings: &StepSettings, body: &ModalBody) -> StepSettings {
+    StepSettings { gravity: body.settings.gravity, ..*settings }
 }

@@ -133,8 +133,8 @@ impl NetHost {
     ) -> Option<BodyId> {
         let config = state.body().config();
         // An anchored body's weight turns with its entity: the stream learns it.
-        let gravity = if state.model().is_free() { config.gravity } else { [0.0; 3] };
-        let settings = StepSettings { gravity, ..config.settings() };
+        let gravity = if state.model().is_free() { config.settings.gravity } else { [0.0; 3] };
+        let settings = StepSettings { gravity, ..config.settings };
         let model = state.model();
         let now = self.now();
         if let Some(hosted) = self.bodies.get_mut(&entity) {

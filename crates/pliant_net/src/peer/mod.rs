@@ -292,8 +292,8 @@ impl NetPeer {
         let mut found = BTreeMap::new();
         let mut shared = world.query::<(Entity, &SharedBody, &ModalBody, Option<&BodyState>)>();
         for (entity, name, _, state) in shared.iter(world) {
-            let Some(state) = state else { return false };
-            let settings = state.body().config().settings();
+            let Some(state) = state.filter(|state| state.has_place()) else { return false };
+            let settings = play::agreed_settings(state.body());
             let id = number_of(&name.name);
             if found.contains_key(&id) || found.len() >= message::MOST_BODIES {
                 warn_once!("{} is left out: another body has its number", name.name);

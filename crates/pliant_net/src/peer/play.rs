@@ -2,9 +2,10 @@
 
 use std::sync::Arc;
 
+use bevy::math::{DQuat, DVec3};
 use bevy::prelude::*;
 use pliant_body::{BodyState, Grab, GrabForce, GrabOf, ShownState};
-use pliant_modal::{GrabConfig, ModalModel};
+use pliant_modal::{Body, GrabConfig, ModalModel};
 use pliant_stream::{BodyId, GrabKey, Pose, StepSettings, UserId};
 
 use super::{NetPeer, PeerState};
@@ -36,6 +37,18 @@ impl PlayedBody {
             current: (Vec::new(), None),
         }
     }
+}
+
+/// The settings that all peers step this body with: its own, with gravity in the axes that they step
+/// it in. Those of an anchored body are its own, wherever each of them puts it.
+pub(super) fn agreed_settings(body: &Body) -> StepSettings {
+    let settings = body.config().settings;
+    if body.model().is_free() {
+        return settings;
+    }
+    let turned = DQuat::from_array(body.frame().orientation()).inverse() * DVec3::from(settings.gravity);
+    // Settings are compared by their bytes: a negative zero becomes zero.
+    StepSettings { gravity: (turned + DVec3::ZERO).into(), ..settings }
 }
 
 /// An own grab as the session knows it.

@@ -128,8 +128,7 @@ impl Scene<'_, '_> {
                 view.all_modes = model.mode_count();
                 let omega = state.body().omega().first();
                 view.lowest_hz = omega.map_or(0.0, |omega| omega / std::f64::consts::TAU);
-                (view.stiffness_scale, view.damping_scale) = (body.stiffness_scale, body.damping_scale);
-                view.warp = body.warp;
+                view.settings = body.settings;
                 view.energy = energy_of(state, driven, *shown);
                 view.energies = energies.remove(&name.entity).unwrap_or_default();
                 view.energies.push(now, view.energy);
@@ -213,14 +212,8 @@ fn take_over(view: &BodyView, mut body: Mut<ModalBody>, mut state: Mut<BodyState
     if view.modes != kept {
         body.modes = (view.modes < view.all_modes).then_some(view.modes.max(1));
     }
-    if view.stiffness_scale != body.stiffness_scale {
-        body.stiffness_scale = view.stiffness_scale;
-    }
-    if view.damping_scale != body.damping_scale {
-        body.damping_scale = view.damping_scale;
-    }
-    if view.warp != body.warp {
-        body.warp = view.warp;
+    if view.settings != body.settings {
+        body.settings = view.settings;
     }
     if view.wake {
         state.wake();

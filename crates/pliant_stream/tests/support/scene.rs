@@ -45,13 +45,7 @@ impl Scene {
     }
 
     pub fn with(model: &Arc<ModalModel>, settings: &StepSettings) -> Self {
-        let config = BodyConfig {
-            step: 1.0 / 40.0,
-            integrator: settings.integrator,
-            gravity: settings.gravity,
-            relaxation: settings.relaxation,
-            ..Default::default()
-        };
+        let config = BodyConfig { step: 1.0 / 40.0, settings: *settings, ..Default::default() };
         Self {
             body: Body::new(model.clone(), config).unwrap(),
             grabs: Vec::new(),
