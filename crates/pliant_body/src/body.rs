@@ -2,11 +2,7 @@
 
 use std::sync::Arc;
 
-use bevy::{
-    math::{Affine3A, DVec3},
-    prelude::*,
-    reflect::reflect_remote,
-};
+use bevy::{math::Affine3A, prelude::*, reflect::reflect_remote};
 use pliant_modal::{Body, BodyConfig, GrabId, Integrator, ModalModel, Precision, Relaxation, StepSettings};
 
 use crate::{ModalAsset, grab::Hold};

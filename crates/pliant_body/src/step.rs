@@ -11,7 +11,7 @@ use bevy::{
     math::{DQuat, DVec3},
     prelude::*,
 };
-use pliant_modal::{Body, BodyConfig, GrabConfig, ModalModel, Patch, StepError, StepSettings};
+use pliant_modal::{Body, BodyConfig, GrabConfig, ModalModel, Patch, StepError};
 
 use crate::{
     AWAKE_BODIES, BodyError, BodyRefused, BodyState, Driven, Grab, GrabForce, GrabOf, Grabs, ModalAsset,

@@ -17,7 +17,7 @@ fn tension(
     model: &Arc<ModalModel>,
     integrator: Integrator,
     step: f64,
-    corrections: usize,
+    corrections: u8,
     part: f64,
 ) -> (f64, f64, f64) {
     let config = BodyConfig {

@@ -85,7 +85,9 @@ fn a_turned_body_hangs_among_peers_as_it_does_alone() {
     let hung = |turn: Quat| {
         let mut body = Body::new(bud.clone(), settings.into()).unwrap();
         body.set_pose([0.0; 3], turn.as_dquat().normalize().into()).unwrap();
-        (0..3000).for_each(|_| drop(body.step().unwrap()));
+        for _ in 0..3000 {
+            body.step().unwrap();
+        }
         body.q().to_vec()
     };
     let (alone, upright) = (hung(turn), hung(Quat::IDENTITY));

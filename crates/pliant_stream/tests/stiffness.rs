@@ -3,7 +3,7 @@
 
 mod support;
 
-use pliant_modal::{BodyConfig, StepSettings};
+use pliant_modal::BodyConfig;
 use pliant_stream::{GuestConfig, GuestEvent, HostConfig, StepSettings};
 use support::bar;
 use support::scene::{BODY, S, Scene, cached, circling, paper1};

@@ -2,7 +2,7 @@
 
 use std::time::Duration;
 
-use bevy::{math::DVec3, prelude::*, time::TimeUpdateStrategy};
+use bevy::{prelude::*, time::TimeUpdateStrategy};
 
 use super::{STEP, app, model, refusals, spawn_with, state, steps};
 use pliant_modal::Relaxation;

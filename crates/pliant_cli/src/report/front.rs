@@ -206,7 +206,6 @@ fn local(quick: bool, bar: &mut Bar) -> Result<(Vec<Figure>, String), CliError> 
                             modes: Some(modes),
                             precision,
                             settings: StepSettings { integrator, ..Default::default() },
-                            ..BodyConfig::default()
                         };
                         // Once to fill the caches; the times are of the runs after it, the errors of any.
                         moving(model, &places, setting.clone())?;

@@ -182,7 +182,7 @@ fn jitter(young: f64, step: f64) -> Result<Outcome, CliError> {
 }
 
 /// Four hands on the corners of the end turn it about the axis by two full turns, hold, and let go.
-fn twist(young: f64, corrections: usize) -> Result<Outcome, CliError> {
+fn twist(young: f64, corrections: u8) -> Result<Outcome, CliError> {
     let bar = Bar { young, zeta: 0.05, modes: 30, ..Bar::default() };
     let model = bar.bake()?;
     let mut body =

@@ -94,12 +94,12 @@ pub enum EndReason {
     /// The host has no place left.
     #[error("full")]
     Full,
-    /// The two sides have other bodies, or step them in other ways.
-    #[error("other bodies or settings")]
-    Scene,
     /// The path's datagrams are too small, see [`MIN_DATAGRAM`].
     #[error("datagrams too small")]
     Path,
+    /// The two sides have other bodies, or step them in other ways.
+    #[error("other bodies or settings")]
+    Scene,
 }
 
 /// How well the path and the repair are doing, as one side sees it. Counts are since the session began.
