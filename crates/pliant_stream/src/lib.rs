@@ -49,6 +49,7 @@ pub mod encoder;
 mod error;
 pub mod experiment;
 mod experiment_peers;
+mod link;
 pub mod newmark;
 pub mod pair;
 pub mod peer;

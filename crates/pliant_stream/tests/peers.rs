@@ -311,6 +311,39 @@ fn a_body_that_differs_is_noticed_beside_one_that_agrees() {
     for body in [BODY, OTHER] {
         p.add_body(body, bar(4, 0.05), &StepSettings::default()).unwrap();
     }
+    greeted(&mut p);
+    let mut asked = false;
+    for tick in 1..=40_u16 {
+        p.update(25 * MS * u32::from(tick));
+        let check = match tick {
+            0..10 => None,
+            // The first body agrees each time, the second never does.
+            _ if tick % 2 == 0 => Some(agreeing(&p, BODY)),
+            _ => Some(StateCheck { value: 1e3, ..agreeing(&p, OTHER) }),
+        };
+        asked |= asks(&mut p, tick, tick, check);
+    }
+    assert!(asked, "the lowest number was asked for its state");
+}
+
+#[test]
+fn copies_of_one_datagram_are_one_disagreement() {
+    let mut p = PeerSession::new(PeerConfig { user: UserId(2), ..Default::default() }).unwrap();
+    p.add_body(BODY, bar(4, 0.05), &StepSettings::default()).unwrap();
+    greeted(&mut p);
+    for tick in 1..=20_u16 {
+        p.update(25 * MS * u32::from(tick));
+        let wrong = StateCheck { value: 1e3, ..agreeing(&p, BODY) };
+        let check = (tick > 10).then_some(wrong);
+        // From the eleventh on, the network copies that one.
+        let asked = asks(&mut p, tick, tick.min(11), check);
+        assert!(!asked, "tick {tick}");
+    }
+    assert_eq!(p.stats(PeerId(1)).unwrap().datagrams_in, 11);
+}
+
+/// Lets the peer of the lowest number in.
+fn greeted(p: &mut PeerSession) {
     p.connect(Duration::ZERO, PeerId(1), UserId(1), 1200).unwrap();
     let hello = PeerMessage::Hello {
         version: PROTOCOL_VERSION,
@@ -320,26 +353,19 @@ fn a_body_that_differs_is_noticed_beside_one_that_agrees() {
         scene: p.scene(),
     };
     p.on_message(Duration::ZERO, PeerId(1), &hello.encode());
+}
+
+/// Hears inputs of the lowest number; whether its state is then asked for.
+fn asks(p: &mut PeerSession, tick: u16, sequence: u16, check: Option<StateCheck>) -> bool {
+    let ticks = vec![InputTick { tick: p.tick(), held: Vec::new() }];
+    let datagram = PeerDatagram::Inputs { now: p.tick(), ahead: None, ticks, check };
+    p.on_datagram(25 * MS * u32::from(tick), PeerId(1), &datagram.encode(sequence));
     let mut asked = false;
-    for tick in 1..=40_u16 {
-        let now = 25 * MS * u32::from(tick);
-        p.update(now);
-        let inputs = |tick| InputTick { tick, held: Vec::new() };
-        let check = match tick {
-            0..10 => None,
-            // The first body agrees each time, the second never does.
-            _ if tick % 2 == 0 => Some(agreeing(&p, BODY)),
-            _ => Some(StateCheck { value: 1e3, ..agreeing(&p, OTHER) }),
-        };
-        let ticks = vec![inputs(p.tick())];
-        let datagram = PeerDatagram::Inputs { now: p.tick(), ahead: None, ticks, check };
-        p.on_datagram(now, PeerId(1), &datagram.encode(tick));
-        while let Some(out) = p.poll_output() {
-            asked |= out.channel == Channel::Message
-                && PeerMessage::decode(&out.bytes) == Ok(PeerMessage::StateRequest);
-        }
+    while let Some(out) = p.poll_output() {
+        asked |= out.channel == Channel::Message
+            && PeerMessage::decode(&out.bytes) == Ok(PeerMessage::StateRequest);
     }
-    assert!(asked, "the lowest number was asked for its state");
+    asked
 }
 
 #[test]

@@ -3,22 +3,19 @@
 use std::collections::BTreeMap;
 use std::time::Duration;
 
-use crate::session::{Budget, LinkStats, Tally};
-use crate::state::{BodyId, Tick, UserId};
+use crate::link::{Budget, Link};
+use crate::state::{BodyId, PeerId, Tick, UserId};
 
 /// Disagreements in a row before the other's state is taken over.
 const CHECKS: u32 = 3;
 
 #[derive(Debug)]
 pub(super) struct Other {
+    pub(super) link: Link,
     /// Who it is, once it has said so.
     pub(super) user: Option<UserId>,
     /// Who it must be.
     pub(super) expected: UserId,
-    pub(super) heard: Duration,
-    pub(super) sequence: u16,
-    pub(super) tally: Tally,
-    pub(super) stats: LinkStats,
     /// How early datagrams come, s: own clock less their ticks' time, the mean of it.
     pub(super) way: Option<f64>,
     /// Running mean of: own tick less theirs at arrival.
@@ -26,7 +23,6 @@ pub(super) struct Other {
     /// The same as they see it.
     pub(super) theirs: Option<f64>,
     pub(super) asked: BTreeMap<Tick, Duration>,
-    pub(super) max_datagram: usize,
     /// Checks in a row that disagreed, for each body.
     pub(super) mismatched: BTreeMap<BodyId, u32>,
     /// What it said came too late to be of use: only a state can help.
@@ -41,19 +37,15 @@ pub(super) struct Other {
 }
 
 impl Other {
-    pub(super) fn new(now: Duration, expected: UserId, max_datagram: usize) -> Self {
+    pub(super) fn new(peer: PeerId, now: Duration, expected: UserId, max_datagram: usize) -> Self {
         Self {
+            link: Link::new(peer, now, max_datagram),
             user: None,
             expected,
-            heard: now,
-            sequence: 0,
-            tally: Tally::default(),
-            stats: LinkStats::default(),
             way: None,
             ahead: None,
             theirs: None,
             asked: BTreeMap::new(),
-            max_datagram,
             mismatched: BTreeMap::new(),
             lost: false,
             wants_state: false,
@@ -85,7 +77,7 @@ impl Other {
             return;
         }
         self.way = self.way.map(|way| way + off / 16.0);
-        let jitter = self.stats.jitter.as_secs_f64();
-        self.stats.jitter = Duration::from_secs_f64(jitter + (off.abs() - jitter) / 16.0);
+        let jitter = self.link.stats.jitter.as_secs_f64();
+        self.link.stats.jitter = Duration::from_secs_f64(jitter + (off.abs() - jitter) / 16.0);
     }
 }

@@ -14,7 +14,8 @@ use super::inputs::{InputLog, WINDOW};
 use super::other::Other;
 use super::wire::{HeldAt, InputTick, MAX_HELD, MAX_TICKS, PeerDatagram, PeerMessage, StateCheck};
 use crate::StreamError;
-use crate::session::{Channel, EndReason, LinkStats, Output};
+use crate::link::Events;
+use crate::session::{EndReason, LinkStats, Output};
 use crate::state::{BodyId, PeerId, Tick, UserId, in_range};
 use crate::wire::{MAX_NAME, PROTOCOL_VERSION};
 
@@ -22,8 +23,6 @@ use crate::wire::{MAX_NAME, PROTOCOL_VERSION};
 const MAX_PEERS: usize = 64;
 /// Most datagrams that wait to be fetched; newer ones are dropped, as a path would drop them.
 const MAX_OUT: usize = 16_384;
-/// Most events that wait for the application; the oldest are dropped.
-const MAX_EVENTS: usize = 4096;
 /// Ticks between checks.
 const CHECK_EVERY: u64 = 16;
 /// Share of the state's size by which checks may differ: peers' machines round differently.
@@ -49,7 +48,7 @@ pub struct PeerSession {
     /// The tick of the last state taken over: what was before it is not gone back to.
     taken: Tick,
     out: VecDeque<Output>,
-    events: VecDeque<PeerEvent>,
+    events: Events<PeerEvent>,
     requested: Option<Duration>,
     last_check: Option<StateCheck>,
     /// The counts of those who are gone.
@@ -91,7 +90,7 @@ impl PeerSession {
             dirty: None,
             taken: 0,
             out: VecDeque::new(),
-            events: VecDeque::new(),
+            events: Events::default(),
             requested: None,
             last_check: None,
             gone: LinkStats::default(),
@@ -152,7 +151,7 @@ impl PeerSession {
         if self.others.len() >= MAX_PEERS {
             return Err(StreamError::Full { what: "peers", limit: MAX_PEERS });
         }
-        self.others.insert(peer, Other::new(now, user, max_datagram));
+        self.others.insert(peer, Other::new(peer, now, user, max_datagram));
         let hello = PeerMessage::Hello {
             version: PROTOCOL_VERSION,
             user: self.config.user.0,
@@ -167,7 +166,7 @@ impl PeerSession {
     /// A connection closed.
     pub fn disconnect(&mut self, peer: PeerId, reason: EndReason) {
         let Some(other) = self.others.remove(&peer) else { return };
-        self.gone.add_counts(&other.stats);
+        self.gone.add_counts(&other.link.stats);
         let Some(user) = other.user else { return self.event(PeerEvent::TurnedAway { peer, reason }) };
         if let Some(inputs) = self.inputs.users.get_mut(&user) {
             // All hear the same last input or forecast the same hands a little on; then the hands let go.
@@ -242,13 +241,13 @@ impl PeerSession {
     /// inputs (`nacks`), what could not be read. The round trip and the share lost on the way there are the transport's to tell. `None` for no
     /// connection.
     pub fn stats(&self, peer: PeerId) -> Option<LinkStats> {
-        self.others.get(&peer).map(|other| other.stats)
+        self.others.get(&peer).map(|other| other.link.stats())
     }
 
     /// The counts of all paths, of those who are gone too: they never fall.
     pub fn totals(&self) -> LinkStats {
         let mut sum = self.gone;
-        self.others.values().for_each(|other| sum.add_counts(&other.stats));
+        self.others.values().for_each(|other| sum.add_counts(&other.link.stats));
         sum
     }
 
@@ -286,15 +285,12 @@ impl PeerSession {
     pub fn on_datagram(&mut self, now: Duration, peer: PeerId, bytes: &[u8]) {
         let Some(other) = self.others.get_mut(&peer) else { return };
         let (Some(user), Ok((sequence, datagram))) = (other.user, PeerDatagram::decode(bytes)) else {
-            other.stats.rejected += 1;
+            other.link.reject();
             return;
         };
-        other.heard = now;
-        if other.tally.take(sequence) {
-            other.stats.datagrams_in += 1;
-            other.stats.bytes_in += bytes.len() as u64;
+        if !other.link.receive_datagram(now, sequence, bytes.len()) {
+            return;
         }
-        other.stats.loss_in = other.tally.loss();
         match datagram {
             PeerDatagram::Inputs { now: theirs, ahead: seen, ticks, check } => {
                 other.theirs = seen.or(other.theirs);
@@ -326,8 +322,7 @@ impl PeerSession {
     pub fn on_message(&mut self, now: Duration, peer: PeerId, bytes: &[u8]) {
         let own = self.scene();
         let Some(other) = self.others.get_mut(&peer) else { return };
-        other.heard = now;
-        other.stats.message_bytes_in += bytes.len() as u64;
+        other.link.receive_message(now, bytes.len());
         match PeerMessage::decode(bytes) {
             Ok(PeerMessage::Hello { version, user, name, joining, scene }) => {
                 let user = UserId(user);
@@ -363,7 +358,7 @@ impl PeerSession {
             }
             Ok(PeerMessage::Goodbye { reason }) => self.disconnect(peer, reason),
             Err(_) => {
-                other.stats.rejected += 1;
+                other.link.reject();
                 self.message(peer, &PeerMessage::Goodbye { reason: EndReason::Protocol });
                 self.disconnect(peer, EndReason::Protocol);
             }
@@ -375,7 +370,7 @@ impl PeerSession {
         let silent: Vec<PeerId> = self
             .others
             .iter()
-            .filter(|(_, o)| now.saturating_sub(o.heard) > self.config.idle_timeout)
+            .filter(|(_, o)| o.link.is_silent(now, self.config.idle_timeout))
             .map(|(p, _)| *p)
             .collect();
         for peer in silent {
@@ -417,7 +412,7 @@ impl PeerSession {
 
     /// The next thing that happened.
     pub fn poll_event(&mut self) -> Option<PeerEvent> {
-        self.events.pop_front()
+        self.events.pop()
     }
 
     /// Goes back to the earliest tick for which something new is known.
@@ -469,7 +464,7 @@ impl PeerSession {
             .filter_map(|t| own.at(t).cloned())
             .collect();
         let bytes = |t: &[InputTick]| PeerDatagram::bytes_of(t.iter().map(|t| t.held.as_slice()));
-        while ticks.len() > 1 && bytes(&ticks) > other.max_datagram {
+        while ticks.len() > 1 && bytes(&ticks) > other.link.max_datagram {
             ticks.pop();
         }
         let (now, ahead) = (self.tick, other.ahead);
@@ -483,7 +478,7 @@ impl PeerSession {
         let known = wanted.filter_map(|t| own.at(t)).take(WINDOW);
         let mut ticks: Vec<InputTick> =
             known.take_while(|_| other.answer_budget.spend(now, 1.0)).cloned().collect();
-        let limit = other.max_datagram;
+        let limit = other.link.max_datagram;
         while !ticks.is_empty() {
             let mut count = ticks.len().min(MAX_TICKS);
             let bytes = |n: usize| PeerDatagram::bytes_of(ticks[..n].iter().map(|t| t.held.as_slice()));
@@ -519,7 +514,7 @@ impl PeerSession {
             other.asked.retain(|t, _| *t >= from);
             runs.truncate(MAX_TICKS);
             if !runs.is_empty() {
-                other.stats.nacks += 1;
+                other.link.stats.nacks += 1;
                 questions.push((*peer, PeerDatagram::Ask { runs }));
             }
             if inputs.complete + (WINDOW as u64) / 2 < inputs.highest {
@@ -550,28 +545,19 @@ impl PeerSession {
 
     fn datagram(&mut self, peer: PeerId, datagram: &PeerDatagram) {
         let Some(other) = self.others.get_mut(&peer) else { return };
-        let bytes = datagram.encode(other.sequence);
-        other.sequence = other.sequence.wrapping_add(1);
         if self.out.len() >= MAX_OUT {
-            return;
+            return other.link.drop_datagram();
         }
-        other.stats.datagrams_out += 1;
-        other.stats.bytes_out += bytes.len() as u64;
-        self.out.push_back(Output { peer, channel: Channel::Datagram, bytes: bytes.into() });
+        other.link.send_datagram(|sequence| datagram.encode(sequence), &mut self.out);
     }
 
     fn message(&mut self, peer: PeerId, message: &PeerMessage) {
-        let bytes = message.encode();
         if let Some(other) = self.others.get_mut(&peer) {
-            other.stats.message_bytes_out += bytes.len() as u64;
+            other.link.send_message(message.encode(), &mut self.out);
         }
-        self.out.push_back(Output { peer, channel: Channel::Message, bytes: bytes.into() });
     }
 
     fn event(&mut self, event: PeerEvent) {
-        if self.events.len() >= MAX_EVENTS {
-            self.events.pop_front();
-        }
-        self.events.push_back(event);
+        self.events.push(event);
     }
 }

@@ -10,11 +10,10 @@ use super::download::Download;
 use super::guest_body::BodyView;
 use super::guest_config::{GuestConfig, GuestEvent};
 use super::guest_hands::OwnGrab;
-use super::host_peer::micros;
-use super::outbox::{RoundTrip, Tally, loss_of};
-use super::{Channel, EndReason, LinkStats, MIN_DATAGRAM, Output};
+use super::{EndReason, LinkStats, MIN_DATAGRAM, Output};
 use crate::StreamError;
 use crate::clock::ClockEstimate;
+use crate::link::{Events, Link, micros};
 use crate::newmark::Newmark;
 use crate::state::{BodyId, PeerId, UserId};
 use crate::wire::{
@@ -25,8 +24,7 @@ use crate::wire::{
 const PING_EVERY: Duration = Duration::from_millis(500);
 /// The first clock requests.
 const PING_SOON: Duration = Duration::from_millis(100);
-/// Most events that wait for the application; the oldest are dropped.
-const MAX_EVENTS: usize = 4096;
+
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 enum Standing {
     New,
@@ -39,7 +37,7 @@ enum Standing {
 #[derive(Debug)]
 pub struct GuestSession {
     pub(super) config: GuestConfig,
-    pub(super) max_datagram: usize,
+    pub(super) link: Link,
     standing: Standing,
     newmark: Newmark,
     pub(super) models: BTreeMap<[u8; 32], Arc<ModalModel>>,
@@ -57,16 +55,10 @@ pub struct GuestSession {
     pub(super) next_grab: u16,
     pub(super) input: u32,
     out: VecDeque<Output>,
-    events: VecDeque<GuestEvent>,
-    sequence: u16,
-    tally: Tally,
-    stats: LinkStats,
-    round_trip: RoundTrip,
-    last_round_trip: Duration,
+    events: Events<GuestEvent>,
     clock: ClockEstimate,
     next_ping: Duration,
     pings: u64,
-    heard: Duration,
 }
 
 impl GuestSession {
@@ -88,7 +80,7 @@ impl GuestSession {
         }
         Ok(Self {
             config,
-            max_datagram,
+            link: Link::new(PeerId::HOST, Duration::ZERO, max_datagram),
             standing: Standing::New,
             newmark: Newmark::average(1.0 / 40.0),
             models: BTreeMap::new(),
@@ -103,16 +95,10 @@ impl GuestSession {
             next_grab: 0,
             input: 0,
             out: VecDeque::new(),
-            events: VecDeque::new(),
-            sequence: 0,
-            tally: Tally::default(),
-            stats: LinkStats::default(),
-            round_trip: RoundTrip::default(),
-            last_round_trip: Duration::ZERO,
+            events: Events::default(),
             clock: ClockEstimate::default(),
             next_ping: Duration::ZERO,
             pings: 0,
-            heard: Duration::ZERO,
         })
     }
 
@@ -133,7 +119,7 @@ impl GuestSession {
             return Err(StreamError::State { what, state, needed: "a new session" });
         }
         self.standing = Standing::Greeted;
-        self.heard = now;
+        self.link.heard(now);
         let hello = GuestMessage::Hello {
             version: PROTOCOL_VERSION,
             name: self.config.name.clone(),
@@ -147,7 +133,7 @@ impl GuestSession {
 
     /// The path's datagrams have another size now. (Everything a guest sends fits the smallest.)
     pub fn set_max_datagram(&mut self, bytes: usize) {
-        self.max_datagram = bytes;
+        self.link.max_datagram = bytes;
     }
 
     /// Says goodbye. The session is closed.
@@ -193,10 +179,7 @@ impl GuestSession {
 
     /// How the path does.
     pub fn stats(&self) -> LinkStats {
-        let mut stats = self.stats;
-        stats.loss_in = self.tally.loss();
-        self.round_trip.write(&mut stats);
-        stats
+        self.link.stats()
     }
 
     /// Host clock minus own clock, s.
@@ -212,16 +195,13 @@ impl GuestSession {
         let (sequence, datagram) = match Datagram::decode(bytes) {
             Ok(x) => x,
             Err(_) => {
-                self.stats.rejected += 1;
+                self.link.reject();
                 return;
             }
         };
-        self.heard = now;
-        if !self.tally.take(sequence) {
+        if !self.link.receive_datagram(now, sequence, bytes.len()) {
             return;
         }
-        self.stats.datagrams_in += 1;
-        self.stats.bytes_in += bytes.len() as u64;
         match datagram {
             Datagram::Frame(frame) => {
                 let body = frame.body;
@@ -230,13 +210,12 @@ impl GuestSession {
                 self.ask(now, body);
             }
             Datagram::Pong(clock) => {
-                self.stats.loss_out = loss_of(clock.report);
+                self.link.take_report(clock.report);
                 if let Some(rtt) = self.clock.sample(clock.t1, clock.t2, clock.t3, micros(now)) {
-                    self.round_trip.sample(rtt);
-                    self.last_round_trip = rtt;
+                    self.link.sample_round_trip(rtt);
                 }
             }
-            Datagram::Targets(_) | Datagram::Nack(_) | Datagram::Ping(_) => self.stats.rejected += 1,
+            Datagram::Targets(_) | Datagram::Nack(_) | Datagram::Ping(_) => self.link.reject(),
         }
     }
 
@@ -245,10 +224,9 @@ impl GuestSession {
         if self.standing == Standing::Closed {
             return;
         }
-        self.heard = now;
-        self.stats.message_bytes_in += bytes.len() as u64;
+        self.link.receive_message(now, bytes.len());
         let Ok(message) = HostMessage::decode(bytes) else {
-            self.stats.rejected += 1;
+            self.link.reject();
             return self.break_off(EndReason::Protocol);
         };
         match (message, self.standing) {
@@ -345,17 +323,17 @@ impl GuestSession {
     pub fn update(&mut self, now: Duration) -> u64 {
         let Some(user) = self.user() else {
             let waits = self.standing == Standing::Greeted;
-            if waits && now.saturating_sub(self.heard) > self.config.idle_timeout {
+            if waits && self.link.is_silent(now, self.config.idle_timeout) {
                 self.close(EndReason::Silent);
             }
             return 0;
         };
-        if now.saturating_sub(self.heard) > self.config.idle_timeout {
+        if self.link.is_silent(now, self.config.idle_timeout) {
             self.message(&GuestMessage::Goodbye { reason: EndReason::Silent });
             self.close(EndReason::Silent);
             return 0;
         }
-        let round_trip = self.round_trip.smooth();
+        let round_trip = self.link.round_trip().unwrap_or_default();
         let mut stepped = 0;
         let ids: Vec<BodyId> = self.bodies.keys().copied().collect();
         for id in ids {
@@ -375,9 +353,7 @@ impl GuestSession {
         if now >= self.next_ping {
             self.pings += 1;
             self.next_ping = now + if self.pings < 8 { PING_SOON } else { PING_EVERY };
-            let round_trip = u32::try_from(micros(self.last_round_trip)).unwrap_or(u32::MAX);
-            let report = self.tally.report();
-            let clock = Clock { t1: micros(now), report, round_trip, ..Clock::default() };
+            let clock = Clock { t1: micros(now), ..self.link.clock() };
             self.datagram(&Datagram::Ping(clock));
         }
         stepped
@@ -389,7 +365,7 @@ impl GuestSession {
         if matches!(self.standing, Standing::New | Standing::Closed) {
             return None;
         }
-        let mut next = self.heard + self.config.idle_timeout + Duration::from_millis(1);
+        let mut next = self.link.silent_at(self.config.idle_timeout);
         if self.user().is_some() {
             next = next.min(self.next_ping);
             for view in self.bodies.values() {
@@ -411,17 +387,16 @@ impl GuestSession {
 
     /// The next thing that happened.
     pub fn poll_event(&mut self) -> Option<GuestEvent> {
-        self.events.pop_front()
+        self.events.pop()
     }
 
     fn ask(&mut self, now: Duration, body: BodyId) {
-        let round_trip =
-            if self.round_trip.is_known() { self.round_trip.smooth() } else { Duration::from_millis(200) };
+        let round_trip = self.link.round_trip().unwrap_or(Duration::from_millis(200));
         let Some(view) = self.bodies.get_mut(&body) else { return };
         let nack = view.missing(now, round_trip);
         let snapshot = view.ask_snapshot(now);
         if let Some(nack) = nack {
-            self.stats.nacks += 1;
+            self.link.stats.nacks += 1;
             self.datagram(&Datagram::Nack(nack));
         }
         if snapshot {
@@ -430,24 +405,15 @@ impl GuestSession {
     }
 
     pub(super) fn datagram(&mut self, datagram: &Datagram) {
-        let bytes = datagram.encode(self.sequence);
-        self.sequence = self.sequence.wrapping_add(1);
-        self.stats.datagrams_out += 1;
-        self.stats.bytes_out += bytes.len() as u64;
-        self.out.push_back(Output { peer: PeerId::HOST, channel: Channel::Datagram, bytes: bytes.into() });
+        self.link.send_datagram(|sequence| datagram.encode(sequence), &mut self.out);
     }
 
     pub(super) fn message(&mut self, message: &GuestMessage) {
-        let bytes = message.encode();
-        self.stats.message_bytes_out += bytes.len() as u64;
-        self.out.push_back(Output { peer: PeerId::HOST, channel: Channel::Message, bytes: bytes.into() });
+        self.link.send_message(message.encode(), &mut self.out);
     }
 
     pub(super) fn event(&mut self, event: GuestEvent) {
-        if self.events.len() >= MAX_EVENTS {
-            self.events.pop_front();
-        }
-        self.events.push_back(event);
+        self.events.push(event);
     }
 
     pub(super) fn break_off(&mut self, reason: EndReason) {

@@ -126,7 +126,7 @@ impl GuestSession {
 
     pub(super) fn say_targets(&mut self, now: Duration) {
         let mut entries = Vec::new();
-        let room = ((self.max_datagram.max(MIN_DATAGRAM) - 4) / 18).min(MAX_TARGETS);
+        let room = ((self.link.max_datagram.max(MIN_DATAGRAM) - 4) / 18).min(MAX_TARGETS);
         for g in self.grabs.values_mut() {
             let again = now.saturating_sub(g.said) >= TARGET_EVERY;
             if g.targets.is_empty() || !(g.fresh || again) {

@@ -8,17 +8,14 @@ use pliant_modal::{ModalModel, StepSettings};
 
 use super::host_config::{HostConfig, HostEvent};
 use super::host_peer::{HeldGrab, MAX_GUEST_GRABS, Peer, Standing};
-use super::outbox::loss_of;
 use super::upload::Upload;
 use super::{EndReason, LinkStats, MIN_DATAGRAM, Output};
 use crate::StreamError;
 use crate::encoder::Encoder;
+use crate::link::Events;
 use crate::newmark::Newmark;
 use crate::state::{BodyId, GrabKey, PeerId, Tick, UserId};
 use crate::wire::{BodyInfo, Datagram, GuestMessage, HostMessage, PROTOCOL_VERSION, StreamWish};
-
-/// Most events that wait for the application; the oldest are dropped.
-const MAX_EVENTS: usize = 4096;
 
 /// A kind of receiver, and how many bytes its datagrams may have.
 pub(super) type StreamKey = (StreamWish, usize);
@@ -47,7 +44,7 @@ impl HostBody {
             body: self.id.0,
             name: self.name.clone(),
             hash: self.hash,
-            modes: Encoder::modes_for(&guest.wish?, self.model.mode_count(), guest.max_datagram) as u16,
+            modes: Encoder::modes_for(&guest.wish?, self.model.mode_count(), guest.link.max_datagram) as u16,
             settings: self.settings,
         })
     }
@@ -60,9 +57,8 @@ pub struct HostSession {
     pub(super) peers: BTreeMap<PeerId, Peer>,
     pub(super) bodies: BTreeMap<BodyId, HostBody>,
     pub(super) out: VecDeque<Output>,
-    events: VecDeque<HostEvent>,
+    events: Events<HostEvent>,
     next_user: u16,
-    dropped_events: u64,
     pub(super) upload: Upload,
     pub(super) encoded: u64,
     /// The counts of those who are gone.
@@ -89,9 +85,8 @@ impl HostSession {
             peers: BTreeMap::new(),
             bodies: BTreeMap::new(),
             out: VecDeque::new(),
-            events: VecDeque::new(),
+            events: Events::default(),
             next_user: 1,
-            dropped_events: 0,
             upload,
             encoded: 0,
             gone: LinkStats::default(),
@@ -128,10 +123,10 @@ impl HostSession {
     /// The path's datagrams have another size now.
     pub fn set_max_datagram(&mut self, peer: PeerId, bytes: usize) {
         let Some(p) = self.peers.get_mut(&peer) else { return };
-        if p.max_datagram == bytes {
+        if p.link.max_datagram == bytes {
             return;
         }
-        p.max_datagram = bytes;
+        p.link.max_datagram = bytes;
         // A new size is another encoder: its receivers begin from a snapshot.
         let flowing = std::mem::take(&mut p.flowing);
         p.due.extend(flowing);
@@ -215,13 +210,13 @@ impl HostSession {
 
     /// How a guest's path does.
     pub fn stats(&self, peer: PeerId) -> Option<LinkStats> {
-        self.peers.get(&peer).map(|p| p.stats)
+        self.peers.get(&peer).map(|p| p.link.stats())
     }
 
     /// The counts of all paths, of those who are gone too: they never fall. Times, shares and the level are zero.
     pub fn totals(&self) -> LinkStats {
         let mut sum = self.gone;
-        self.peers.values().for_each(|p| sum.add_counts(&p.stats));
+        self.peers.values().for_each(|p| sum.add_counts(&p.link.stats));
         sum
     }
 
@@ -229,15 +224,15 @@ impl HostSession {
     pub fn on_datagram(&mut self, now: Duration, peer: PeerId, bytes: &[u8]) {
         let Some(p) = self.peers.get_mut(&peer) else { return };
         let Ok((sequence, datagram)) = Datagram::decode(bytes) else {
-            p.stats.rejected += 1;
+            p.link.reject();
             return;
         };
         // Nothing counts before the guest has been let in.
         let Some(user) = p.user() else {
-            p.stats.rejected += 1;
+            p.link.reject();
             return;
         };
-        if !p.count_in(now, sequence, bytes.len()) {
+        if !p.link.receive_datagram(now, sequence, bytes.len()) {
             return;
         }
         match datagram {
@@ -263,7 +258,7 @@ impl HostSession {
                 moved.into_iter().for_each(|e| self.event(e));
             }
             Datagram::Nack(nack) => {
-                p.stats.nacks += 1;
+                p.link.stats.nacks += 1;
                 for run in nack.runs {
                     for tick in run.first..run.first + u64::from(run.count) {
                         // What is on its way anyway needs no second answer.
@@ -276,23 +271,25 @@ impl HostSession {
                 self.resend_due(now, peer);
             }
             Datagram::Ping(clock) => {
-                p.stats.loss_out = loss_of(clock.report);
-                p.take_round_trip(Duration::from_micros(u64::from(clock.round_trip)));
-                p.send_pong(now, clock.t1, now, &mut self.out);
+                p.link.take_report(clock.report);
+                // Zero: the guest has measured none yet.
+                if clock.round_trip > 0 {
+                    p.link.sample_round_trip(Duration::from_micros(u64::from(clock.round_trip)));
+                }
+                p.send_pong(now, clock.t1, &mut self.out);
             }
-            Datagram::Frame(_) | Datagram::Pong(_) => p.stats.rejected += 1,
+            Datagram::Frame(_) | Datagram::Pong(_) => p.link.reject(),
         }
     }
 
     /// Something arrived reliably. A message that breaks the protocol ends the guest's session.
     pub fn on_message(&mut self, now: Duration, peer: PeerId, bytes: &[u8]) {
         let Some(p) = self.peers.get_mut(&peer) else { return };
-        p.heard = now;
-        p.stats.message_bytes_in += bytes.len() as u64;
+        p.link.receive_message(now, bytes.len());
         let message = match GuestMessage::decode(bytes) {
             Ok(m) if p.message_budget.spend(now, 1.0) => m,
             _ => {
-                p.stats.rejected += 1;
+                p.link.reject();
                 return self.drop_peer(peer, EndReason::Protocol, true);
             }
         };
@@ -303,7 +300,7 @@ impl HostSession {
                 if version != PROTOCOL_VERSION {
                     return self.drop_peer(peer, EndReason::Version, true);
                 }
-                if p.max_datagram < MIN_DATAGRAM {
+                if p.link.max_datagram < MIN_DATAGRAM {
                     return self.drop_peer(peer, EndReason::Path, true);
                 }
                 p.name = name;
@@ -346,7 +343,7 @@ impl HostSession {
                 }
             }
             _ => {
-                p.stats.rejected += 1;
+                p.link.reject();
                 self.drop_peer(peer, EndReason::Protocol, true);
             }
         }
@@ -359,13 +356,13 @@ impl HostSession {
         for id in ids {
             self.resend_due(now, id);
             let Some(p) = self.peers.get_mut(&id) else { continue };
-            if now.saturating_sub(p.heard) > self.config.idle_timeout {
+            if p.link.is_silent(now, self.config.idle_timeout) {
                 self.drop_peer(id, EndReason::Silent, true);
                 continue;
             }
-            let (bytes, round_trip) = (p.stats.bytes_out, p.last_round_trips[0].min(p.last_round_trips[1]));
+            let (bytes, round_trip) = (p.link.stats.bytes_out, p.link.least_round_trip());
             p.regulator.judge(now, bytes, round_trip, self.config.guest_rate);
-            p.stats.level = p.regulator.level();
+            p.link.stats.level = p.regulator.level();
         }
         self.send_models(now);
     }
@@ -375,7 +372,7 @@ impl HostSession {
         let each = self.peers.values().flat_map(|p| {
             let model = self.upload.ready_at(p);
             let resend = p.resends.iter().map(|r| r.0).min();
-            [Some(p.heard + self.config.idle_timeout + Duration::from_millis(1)), model, resend]
+            [Some(p.link.silent_at(self.config.idle_timeout)), model, resend]
         });
         each.flatten().min()
     }
@@ -388,12 +385,12 @@ impl HostSession {
 
     /// The next thing that happened.
     pub fn poll_event(&mut self) -> Option<HostEvent> {
-        self.events.pop_front()
+        self.events.pop()
     }
 
     /// Events that nobody fetched and that were dropped.
     pub fn dropped_events(&self) -> u64 {
-        self.dropped_events
+        self.events.dropped()
     }
 
     /// Frames that were encoded so far: one for each body and tick, and for each kind of receiver (payload, modes, room in the datagram), however many
@@ -403,11 +400,7 @@ impl HostSession {
     }
 
     pub(super) fn event(&mut self, event: HostEvent) {
-        if self.events.len() >= MAX_EVENTS {
-            self.events.pop_front();
-            self.dropped_events += 1;
-        }
-        self.events.push_back(event);
+        self.events.push(event);
     }
 
     fn admit(&mut self, now: Duration, peer: PeerId, token: Vec<u8>, before: Option<UserId>) {
@@ -430,7 +423,7 @@ impl HostSession {
             self.peers.values().filter_map(|p| p.user().map(|u| (u.0, p.name.clone()))).collect();
         let Some(p) = self.peers.get_mut(&peer) else { return };
         p.standing = Standing::Joined(user);
-        p.heard = now;
+        p.link.heard(now);
         let Newmark { h, beta, gamma } = self.config.newmark;
         let step_ns = (h * 1e9).round() as u64;
         let welcome =
@@ -476,7 +469,7 @@ impl HostSession {
         if tell {
             p.say_goodbye(reason, &mut self.out);
         }
-        self.gone.add_counts(&p.stats);
+        self.gone.add_counts(&p.link.stats);
         let user = p.user();
         if let Some(user) = user {
             for (grab, held) in &p.grabs {
@@ -508,8 +501,8 @@ pub(super) fn stream_key(peer: &Peer, body: &HostBody) -> Option<StreamKey> {
         }
         wish.modes = wish.modes.min(step_up(most));
     }
-    wish.modes = Encoder::modes_for(&wish, model_modes, peer.max_datagram) as u16;
-    Some((wish, peer.max_datagram))
+    wish.modes = Encoder::modes_for(&wish, model_modes, peer.link.max_datagram) as u16;
+    Some((wish, peer.link.max_datagram))
 }
 
 #[cfg(test)]

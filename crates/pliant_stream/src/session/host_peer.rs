@@ -4,11 +4,11 @@ use std::collections::{BTreeMap, BTreeSet, VecDeque};
 use std::sync::Arc;
 use std::time::Duration;
 
-use super::outbox::{Budget, RoundTrip, Tally};
 use super::regulator::Regulator;
-use super::{Channel, EndReason, LinkStats, Output};
+use super::{EndReason, Output};
+use crate::link::{Budget, Link, micros};
 use crate::state::{BodyId, PeerId, Tick, UserId};
-use crate::wire::{Clock, Datagram, HostMessage, Report, StreamWish};
+use crate::wire::{Clock, Datagram, HostMessage, StreamWish};
 
 /// Most grabs that one guest may hold.
 pub(crate) const MAX_GUEST_GRABS: usize = 16;
@@ -45,10 +45,10 @@ pub(crate) struct HeldGrab {
 #[derive(Debug)]
 pub(crate) struct Peer {
     pub(crate) id: PeerId,
+    pub(crate) link: Link,
     pub(crate) standing: Standing,
     pub(crate) name: String,
     pub(crate) wish: Option<StreamWish>,
-    pub(crate) max_datagram: usize,
     pub(crate) cached: BTreeSet<[u8; 32]>,
     pub(crate) transfers: VecDeque<Transfer>,
     /// Bodies announced to the guest.
@@ -61,7 +61,6 @@ pub(crate) struct Peer {
     pub(crate) interest: BTreeMap<BodyId, u16>,
     pub(crate) grabs: BTreeMap<u16, HeldGrab>,
     pub(crate) resends: VecDeque<(Duration, BodyId, Tick)>,
-    pub(crate) heard: Duration,
     pub(crate) model_budget: Budget,
     /// Bytes of messages that the transport has taken and not sent, as it last said.
     pub(crate) unsent: usize,
@@ -70,22 +69,17 @@ pub(crate) struct Peer {
     pub(crate) message_budget: Budget,
     /// Grabs that it may begin.
     pub(crate) grab_budget: Budget,
-    sequence: u16,
-    tally: Tally,
-    pub(crate) stats: LinkStats,
     pub(crate) regulator: Regulator,
-    pub(crate) last_round_trips: [Duration; 2],
-    round_trip: RoundTrip,
 }
 
 impl Peer {
     pub(crate) fn new(id: PeerId, now: Duration, max_datagram: usize, model_rate: f64) -> Self {
         Self {
             id,
+            link: Link::new(id, now, max_datagram),
             standing: Standing::Silent,
             name: String::new(),
             wish: None,
-            max_datagram,
             cached: BTreeSet::new(),
             transfers: VecDeque::new(),
             announced: BTreeSet::new(),
@@ -94,7 +88,6 @@ impl Peer {
             interest: BTreeMap::new(),
             grabs: BTreeMap::new(),
             resends: VecDeque::new(),
-            heard: now,
             model_budget: Budget::new(model_rate, 64.0 * 1024.0),
             unsent: 0,
             // A guest may ask for 4,000 ticks a second: 60 Hz at full loss with every tick asked for eight times, and
@@ -104,12 +97,7 @@ impl Peer {
             message_budget: Budget::new(200.0, 400.0),
             // A hand that slides takes hold anew each tick; no more, and its hands at once.
             grab_budget: Budget::new(60.0, 120.0),
-            sequence: 0,
-            tally: Tally::default(),
-            stats: LinkStats::default(),
             regulator: Regulator::default(),
-            last_round_trips: [Duration::ZERO; 2],
-            round_trip: RoundTrip::default(),
         }
     }
 
@@ -120,64 +108,23 @@ impl Peer {
         }
     }
 
-    /// Counts an arriving datagram; false for a copy.
-    pub(crate) fn count_in(&mut self, now: Duration, sequence: u16, bytes: usize) -> bool {
-        self.heard = now;
-        let fresh = self.tally.take(sequence);
-        if fresh {
-            self.stats.datagrams_in += 1;
-            self.stats.bytes_in += bytes as u64;
-        }
-        self.stats.loss_in = self.tally.loss();
-        fresh
-    }
-
-    fn next_sequence(&mut self) -> u16 {
-        let s = self.sequence;
-        self.sequence = s.wrapping_add(1);
-        s
-    }
-
-    fn datagram(&mut self, bytes: Vec<u8>, out: &mut VecDeque<Output>) {
-        self.stats.datagrams_out += 1;
-        self.stats.bytes_out += bytes.len() as u64;
-        out.push_back(Output { peer: self.id, channel: Channel::Datagram, bytes: bytes.into() });
-    }
-
     /// Sends a frame that was encoded for several; false when it is longer than the path carries by now.
     pub(crate) fn send_frame(&mut self, body: &[u8], out: &mut VecDeque<Output>) -> bool {
-        if body.len() + 3 > self.max_datagram {
+        if body.len() + 3 > self.link.max_datagram {
             return false;
         }
-        let sequence = self.next_sequence();
-        self.datagram(Datagram::wrap_frame(sequence, body), out);
+        self.link.send_datagram(|sequence| Datagram::wrap_frame(sequence, body), out);
         true
     }
 
-    pub(crate) fn send_pong(&mut self, now: Duration, t1: u64, t2: Duration, out: &mut VecDeque<Output>) {
-        let clock = Clock { t1, t2: micros(t2), t3: micros(now), report: self.report(), round_trip: 0 };
-        let sequence = self.next_sequence();
-        self.datagram(Datagram::Pong(clock).encode(sequence), out);
-    }
-
-    /// A round trip that the guest measured; zero when it has none yet.
-    pub(crate) fn take_round_trip(&mut self, sample: Duration) {
-        if sample.is_zero() {
-            return;
-        }
-        self.round_trip.sample(sample);
-        self.round_trip.write(&mut self.stats);
-        self.last_round_trips = [self.last_round_trips[1], sample];
-    }
-
-    pub(crate) fn report(&self) -> Report {
-        self.tally.report()
+    /// Answers a clock request that came, and is answered, at `now`.
+    pub(crate) fn send_pong(&mut self, now: Duration, t1: u64, out: &mut VecDeque<Output>) {
+        let clock = Clock { t1, t2: micros(now), t3: micros(now), round_trip: 0, ..self.link.clock() };
+        self.link.send_datagram(|sequence| Datagram::Pong(clock).encode(sequence), out);
     }
 
     pub(crate) fn send_message(&mut self, message: &HostMessage, out: &mut VecDeque<Output>) {
-        let bytes = message.encode();
-        self.stats.message_bytes_out += bytes.len() as u64;
-        out.push_back(Output { peer: self.id, channel: Channel::Message, bytes: bytes.into() });
+        self.link.send_message(message.encode(), out);
     }
 
     pub(crate) fn say_goodbye(&mut self, reason: EndReason, out: &mut VecDeque<Output>) {
@@ -192,8 +139,4 @@ impl Peer {
             self.resends.insert(at, entry);
         }
     }
-}
-
-pub(crate) fn micros(t: Duration) -> u64 {
-    u64::try_from(t.as_micros()).unwrap_or(u64::MAX)
 }

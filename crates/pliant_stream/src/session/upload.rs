@@ -8,8 +8,8 @@ use super::Output;
 use super::host::HostSession;
 use super::host_config::HostConfig;
 use super::host_peer::Peer;
-use super::outbox::Budget;
 use crate::StreamError;
+use crate::link::Budget;
 use crate::state::PeerId;
 use crate::wire::HostMessage;
 

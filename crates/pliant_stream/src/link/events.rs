@@ -1,0 +1,38 @@
+//! What happened, until the application asks.
+
+use std::collections::VecDeque;
+
+/// Most events that wait for the application.
+const MOST: usize = 4096;
+
+/// Events in order. When too many wait, the oldest is dropped and counted.
+#[derive(Debug)]
+pub(crate) struct Events<T> {
+    waiting: VecDeque<T>,
+    dropped: u64,
+}
+
+impl<T> Default for Events<T> {
+    fn default() -> Self {
+        Self { waiting: VecDeque::new(), dropped: 0 }
+    }
+}
+
+impl<T> Events<T> {
+    pub(crate) fn push(&mut self, event: T) {
+        if self.waiting.len() >= MOST {
+            self.waiting.pop_front();
+            self.dropped += 1;
+        }
+        self.waiting.push_back(event);
+    }
+
+    pub(crate) fn pop(&mut self) -> Option<T> {
+        self.waiting.pop_front()
+    }
+
+    /// Events that nobody fetched in time.
+    pub(crate) fn dropped(&self) -> u64 {
+        self.dropped
+    }
+}

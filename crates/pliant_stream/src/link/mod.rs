@@ -1,0 +1,149 @@
+//! One connection's books: the same for a host's guest, a guest's host and a peer's peer.
+
+mod budget;
+mod events;
+mod round_trip;
+mod stats;
+mod tally;
+
+use std::collections::VecDeque;
+use std::time::Duration;
+
+pub(crate) use budget::Budget;
+pub(crate) use events::Events;
+pub use stats::LinkStats;
+
+use crate::session::{Channel, Output};
+use crate::state::PeerId;
+use crate::wire::{Clock, Report};
+use round_trip::RoundTrip;
+use tally::{Arrival, Tally, loss_of};
+
+/// The state of a connection: sequence numbers, what was lost, the round trip, when the other side was
+/// last heard, and counts.
+#[derive(Debug)]
+pub(crate) struct Link {
+    peer: PeerId,
+    /// Bytes that a datagram may have.
+    pub(crate) max_datagram: usize,
+    heard: Duration,
+    sequence: u16,
+    received: Tally,
+    round_trip: RoundTrip,
+    last_round_trips: [Duration; 2],
+    /// Counts, and what only one role measures. [`Link::stats`] has the rest too.
+    pub(crate) stats: LinkStats,
+}
+
+impl Link {
+    pub(crate) fn new(peer: PeerId, now: Duration, max_datagram: usize) -> Self {
+        Self {
+            peer,
+            max_datagram,
+            heard: now,
+            sequence: 0,
+            received: Tally::default(),
+            round_trip: RoundTrip::default(),
+            last_round_trips: [Duration::ZERO; 2],
+            stats: LinkStats::default(),
+        }
+    }
+
+    /// The other side has said something, or is given time anew.
+    pub(crate) fn heard(&mut self, now: Duration) {
+        self.heard = now;
+    }
+
+    /// Whether nothing came for longer than `patience`.
+    pub(crate) fn is_silent(&self, now: Duration, patience: Duration) -> bool {
+        now.saturating_sub(self.heard) > patience
+    }
+
+    /// When it will have been silent for longer than `patience`.
+    pub(crate) fn silent_at(&self, patience: Duration) -> Duration {
+        self.heard + patience + Duration::from_millis(1)
+    }
+
+    /// Takes in a datagram that could be read; false for a copy of one that has come before.
+    pub(crate) fn receive_datagram(&mut self, now: Duration, sequence: u16, bytes: usize) -> bool {
+        self.heard = now;
+        let arrival = self.received.take(sequence);
+        if arrival == Arrival::New {
+            self.stats.datagrams_in += 1;
+            self.stats.bytes_in += bytes as u64;
+        }
+        arrival != Arrival::Copy
+    }
+
+    /// Takes in a message, which may yet turn out to make no sense.
+    pub(crate) fn receive_message(&mut self, now: Duration, bytes: usize) {
+        self.heard = now;
+        self.stats.message_bytes_in += bytes as u64;
+    }
+
+    /// Counts what could not be read or made no sense.
+    pub(crate) fn reject(&mut self) {
+        self.stats.rejected += 1;
+    }
+
+    /// Sends a datagram, which is encoded with its sequence number.
+    pub(crate) fn send_datagram(&mut self, encode: impl FnOnce(u16) -> Vec<u8>, out: &mut VecDeque<Output>) {
+        let bytes = encode(self.sequence);
+        self.sequence = self.sequence.wrapping_add(1);
+        self.stats.datagrams_out += 1;
+        self.stats.bytes_out += bytes.len() as u64;
+        out.push_back(Output { peer: self.peer, channel: Channel::Datagram, bytes: bytes.into() });
+    }
+
+    /// Does not send a datagram for which there is no room: to the other side it is lost.
+    pub(crate) fn drop_datagram(&mut self) {
+        self.sequence = self.sequence.wrapping_add(1);
+    }
+
+    /// Sends a message.
+    pub(crate) fn send_message(&mut self, bytes: Vec<u8>, out: &mut VecDeque<Output>) {
+        self.stats.message_bytes_out += bytes.len() as u64;
+        out.push_back(Output { peer: self.peer, channel: Channel::Message, bytes: bytes.into() });
+    }
+
+    /// What the other side says of the datagrams that it had from here.
+    pub(crate) fn take_report(&mut self, report: Report) {
+        self.stats.loss_out = loss_of(report);
+    }
+
+    /// What a clock exchange says beside its times.
+    pub(crate) fn clock(&self) -> Clock {
+        let round_trip = u32::try_from(micros(self.last_round_trips[1])).unwrap_or(u32::MAX);
+        Clock { report: self.received.report(), round_trip, ..Clock::default() }
+    }
+
+    /// A round trip was measured, here or by the other side.
+    pub(crate) fn sample_round_trip(&mut self, sample: Duration) {
+        self.round_trip.sample(sample);
+        self.last_round_trips = [self.last_round_trips[1], sample];
+    }
+
+    /// The smoothed round trip; `None` before the first was measured.
+    pub(crate) fn round_trip(&self) -> Option<Duration> {
+        self.round_trip.known().map(|[smooth, _]| smooth)
+    }
+
+    /// The lesser of the last two round trips, unsmoothed; zero before there are two.
+    pub(crate) fn least_round_trip(&self) -> Duration {
+        self.last_round_trips[0].min(self.last_round_trips[1])
+    }
+
+    /// How the connection does.
+    pub(crate) fn stats(&self) -> LinkStats {
+        let mut stats = self.stats;
+        stats.loss_in = self.received.loss();
+        if let Some([round_trip, jitter]) = self.round_trip.known() {
+            (stats.round_trip, stats.jitter) = (round_trip, jitter);
+        }
+        stats
+    }
+}
+
+pub(crate) fn micros(t: Duration) -> u64 {
+    u64::try_from(t.as_micros()).unwrap_or(u64::MAX)
+}
