@@ -273,7 +273,7 @@ fn a_guest_that_is_sent_away_does_not_come_back() {
     run_until(&mut [&mut host, &mut guest], "the guest is in", |apps| is_in(apps[1]));
     let user = host.world().resource::<NetHost>().guests().next().unwrap();
     assert!(host.world().resource::<NetHost>().key_of(user).is_some());
-    assert!(host.world_mut().resource_mut::<NetHost>().expel(user));
+    assert!(host.world_mut().resource_mut::<NetHost>().kick(user));
     run_until(&mut [&mut host, &mut guest], "it is told", |apps| {
         matches!(state_of(apps[1]), GuestState::Closed { .. })
     });

@@ -452,7 +452,6 @@ fn another_version_is_told_so() {
     let hello = GuestMessage::Hello {
         version: 999,
         name: "old".into(),
-        token: Vec::new(),
         wish: RecoveryConfig::default().wish(None),
         cached: Vec::new(),
     };

@@ -166,21 +166,21 @@ fn a_frame_is_encoded_once_for_all_who_take_the_same_and_one_more_costs_its_data
 fn who_comes_back_gets_the_number_they_had_if_it_is_free() {
     let model = bar(8, 0.05);
     let mut room = Room::new(HostConfig { open: false, ..HostConfig::default() });
-    let knock = |room: &mut Room, peer: PeerId, before: Option<UserId>| {
+    let ask = |room: &mut Room, peer: PeerId, before: Option<UserId>| {
         room.join(peer, &model);
         room.exchange();
-        let knocked = std::iter::from_fn(|| room.host.poll_event())
-            .any(|event| matches!(event, HostEvent::Knock { peer: who, .. } if who == peer));
-        assert!(knocked);
+        let asked = std::iter::from_fn(|| room.host.poll_event())
+            .any(|event| matches!(event, HostEvent::JoinRequest { peer: who, .. } if who == peer));
+        assert!(asked);
         room.host.accept_as(room.now, peer, before).unwrap()
     };
-    assert_eq!(knock(&mut room, PeerId(1), None), UserId(1));
-    assert_eq!(knock(&mut room, PeerId(2), None), UserId(2));
+    assert_eq!(ask(&mut room, PeerId(1), None), UserId(1));
+    assert_eq!(ask(&mut room, PeerId(2), None), UserId(2));
     room.host.disconnect(PeerId(1), pliant_stream::EndReason::Lost);
-    assert_eq!(knock(&mut room, PeerId(3), Some(UserId(1))), UserId(1));
+    assert_eq!(ask(&mut room, PeerId(3), Some(UserId(1))), UserId(1));
     // In use, or the host's: another one.
-    assert_eq!(knock(&mut room, PeerId(4), Some(UserId(2))), UserId(3));
-    assert_eq!(knock(&mut room, PeerId(5), Some(UserId::HOST)), UserId(4));
+    assert_eq!(ask(&mut room, PeerId(4), Some(UserId(2))), UserId(3));
+    assert_eq!(ask(&mut room, PeerId(5), Some(UserId::HOST)), UserId(4));
 }
 
 #[test]

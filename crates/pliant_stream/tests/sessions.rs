@@ -80,8 +80,8 @@ fn a_closed_house_asks_before_it_lets_in() {
             self.0.step(now, tick, host);
         }
         fn host_event(&mut self, now: Duration, event: HostEvent, host: &mut HostSession) {
-            if let HostEvent::Knock { peer, token, .. } = &event {
-                if token == b"sesame" && self.1 {
+            if let HostEvent::JoinRequest { peer, name } = &event {
+                if name == "friend" && self.1 {
                     host.accept(now, *peer).unwrap();
                 } else {
                     host.refuse(*peer);
@@ -97,8 +97,8 @@ fn a_closed_house_asks_before_it_lets_in() {
     let mut pair = Pair::new(HostConfig { open: false, ..Default::default() }).unwrap();
     pair.host.add_body(BODY, "bar", model.clone(), StepSettings::default()).unwrap();
     let mut door = Door(Scene::new(&model), true);
-    for (seed, token) in [(1, &b"sesame"[..]), (2, b"wrong")] {
-        let config = GuestConfig { token: token.to_vec(), ..Default::default() };
+    for (seed, name) in [(1, "friend"), (2, "stranger")] {
+        let config = GuestConfig { name: name.into(), ..Default::default() };
         pair.join_with(config, paper1(), seed, cached(&model)).unwrap();
     }
     pair.run_until(3 * S, &mut door);

@@ -76,7 +76,7 @@ pub(crate) fn receive(world: &mut World) {
                     // Of the rest a guest has nothing to say.
                     Some(Reliable::Placement(_) | Reliable::People(_) | Reliable::Reaches(_)) | None => {
                         host.rejected += 1;
-                        host.session.expel(peer, EndReason::Protocol);
+                        host.session.kick(peer, EndReason::Protocol);
                     }
                 },
                 Event::Closed { peer, reason } => {
@@ -118,12 +118,12 @@ impl NetHost {
             .collect();
         for other in older {
             debug!("guest {other} has come anew as {peer}");
-            self.session.expel(other, EndReason::Left);
+            self.session.kick(other, EndReason::Left);
         }
         let before = self.known.get(&key).map(|known| known.user).or_else(|| self.free_number());
         if let Err(error) = self.session.accept_as(now, peer, before) {
             debug!("guest {peer} was not let in: {error}");
-            self.session.expel(peer, EndReason::Refused);
+            self.session.kick(peer, EndReason::Refused);
         }
         // The older one's leave comes before the newer one's arrival.
         self.take_events(world);
@@ -181,7 +181,7 @@ impl NetHost {
 
     fn apply(&mut self, world: &mut World, event: HostEvent) {
         match event {
-            HostEvent::Knock { peer, .. } => self.let_in(world, peer),
+            HostEvent::JoinRequest { peer, .. } => self.let_in(world, peer),
             HostEvent::Joined { peer, user, name, .. } => self.joined(world, peer, user, &name),
             HostEvent::Left { peer, user, reason } => {
                 // The session's goodbye says more than the end of the connection.

@@ -36,7 +36,7 @@ pub struct HostConfig {
     pub name: String,
     /// Socket, key, who may join, limits, emulated link.
     pub transport: HostOptions,
-    /// The session's settings. The step is always that of `Time<Fixed>`, and who knocks is let in: who may is [`HostOptions::access`].
+    /// The session's settings. The step is always that of `Time<Fixed>`, and who asks is let in: who may is [`HostOptions::access`].
     pub session: pliant_stream::HostConfig,
     /// Whose hands may be on a body at the same time, where the body has no [`Holding`] of its own.
     pub holding: Holding,
@@ -163,7 +163,7 @@ impl NetHost {
         self.endpoint.set_access(Access::Tokens(Vec::new()));
         let peers: Vec<PeerId> = self.guests.keys().copied().collect();
         for peer in peers {
-            self.session.expel(peer, EndReason::Left);
+            self.session.kick(peer, EndReason::Left);
         }
         self.flush();
     }
@@ -210,10 +210,10 @@ impl NetHost {
     }
 
     /// Sends a guest away. False for an entity that is no guest.
-    pub fn expel(&mut self, guest: Entity) -> bool {
+    pub fn kick(&mut self, guest: Entity) -> bool {
         let found = self.guests.iter().find(|(_, one)| one.entity == Some(guest));
         let Some(peer) = found.map(|(&peer, _)| peer) else { return false };
-        self.session.expel(peer, EndReason::Refused);
+        self.session.kick(peer, EndReason::Refused);
         true
     }
 

@@ -17,7 +17,7 @@ use crate::link::{Events, Link, micros};
 use crate::newmark::Newmark;
 use crate::state::{BodyId, PeerId, UserId};
 use crate::wire::{
-    Clock, Datagram, GuestMessage, HostMessage, MAX_BODIES, MAX_CACHED, MAX_NAME, MAX_TOKEN, PROTOCOL_VERSION,
+    Clock, Datagram, GuestMessage, HostMessage, MAX_BODIES, MAX_CACHED, MAX_NAME, PROTOCOL_VERSION,
 };
 
 /// Clock requests come this far apart once the first eight have been answered.
@@ -65,15 +65,12 @@ impl GuestSession {
     /// A guest whose path carries datagrams of so many bytes.
     ///
     /// # Errors
-    /// [`StreamError::Config`] for a name, token, path or repair out of range.
+    /// [`StreamError::Config`] for a name, path or repair out of range.
     pub fn new(config: GuestConfig, max_datagram: usize) -> Result<Self, StreamError> {
         let fail = |what, found: String, expected| Err(StreamError::Config { what, found, expected });
         config.recovery.check()?;
         if config.name.len() > MAX_NAME {
             return fail("name", config.name, "at most 64 bytes");
-        }
-        if config.token.len() > MAX_TOKEN {
-            return fail("token", format!("{} bytes", config.token.len()), "at most 1024 bytes");
         }
         if max_datagram < MIN_DATAGRAM {
             return fail("datagram size", max_datagram.to_string(), "at least 256 bytes");
@@ -123,7 +120,6 @@ impl GuestSession {
         let hello = GuestMessage::Hello {
             version: PROTOCOL_VERSION,
             name: self.config.name.clone(),
-            token: self.config.token.clone(),
             wish: self.config.recovery.wish(self.config.modes),
             cached: self.models.keys().copied().collect(),
         };

@@ -14,8 +14,6 @@ use crate::state::{BodyId, UserId};
 pub struct GuestConfig {
     /// A name for people, at most 64 bytes.
     pub name: String,
-    /// Shown to the host's application, at most 1 KiB. Default: empty.
-    pub token: Vec<u8>,
     /// How loss is repaired. Default: [`RecoveryConfig::default`].
     pub recovery: RecoveryConfig,
     /// Take at most so many modes of each body: for weak machines and thin links. Default: all.
@@ -37,7 +35,6 @@ impl Default for GuestConfig {
     fn default() -> Self {
         Self {
             name: "guest".to_owned(),
-            token: Vec::new(),
             recovery: RecoveryConfig::default(),
             modes: None,
             own_hand_first: true,

@@ -116,7 +116,7 @@ impl HostSession {
     }
 
     /// Ends a guest's session with a reason that they are told.
-    pub fn expel(&mut self, peer: PeerId, reason: EndReason) {
+    pub fn kick(&mut self, peer: PeerId, reason: EndReason) {
         self.drop_peer(peer, reason, true);
     }
 
@@ -135,15 +135,15 @@ impl HostSession {
         }
     }
 
-    /// Lets a guest in that knocked.
+    /// Lets a guest in that asked.
     ///
     /// # Errors
-    /// [`StreamError::UnknownPeer`]; [`StreamError::State`] when they have not knocked.
+    /// [`StreamError::UnknownPeer`]; [`StreamError::State`] when they have not asked.
     pub fn accept(&mut self, now: Duration, peer: PeerId) -> Result<UserId, StreamError> {
         self.accept_as(now, peer, None)
     }
 
-    /// Lets a guest in that knocked, under the number it had `before`: somebody who comes back. A number that is in use, or the host's own, is
+    /// Lets a guest in that asked, under the number it had `before`: somebody who comes back. A number that is in use, or the host's own, is
     /// not given; a new one is.
     ///
     /// # Errors
@@ -155,18 +155,18 @@ impl HostSession {
         before: Option<UserId>,
     ) -> Result<UserId, StreamError> {
         let p = self.peers.get(&peer).ok_or(StreamError::UnknownPeer(peer))?;
-        if p.standing != Standing::Knocking {
+        if p.standing != Standing::Asking {
             return Err(StreamError::State {
                 what: "accept",
-                state: "not knocking",
-                needed: "a knocking peer",
+                state: "not asking",
+                needed: "a peer that has asked to join",
             });
         }
-        self.admit(now, peer, Vec::new(), before);
+        self.admit(now, peer, before);
         self.peers.get(&peer).and_then(Peer::user).ok_or(StreamError::UnknownPeer(peer))
     }
 
-    /// Turns a guest away that knocked.
+    /// Turns a guest away that asked.
     pub fn refuse(&mut self, peer: PeerId) {
         self.drop_peer(peer, EndReason::Refused, true);
     }
@@ -294,9 +294,7 @@ impl HostSession {
             }
         };
         match (message, p.user()) {
-            (GuestMessage::Hello { version, name, token, wish, cached }, None)
-                if p.standing == Standing::Silent =>
-            {
+            (GuestMessage::Hello { version, name, wish, cached }, None) if p.standing == Standing::Silent => {
                 if version != PROTOCOL_VERSION {
                     return self.drop_peer(peer, EndReason::Version, true);
                 }
@@ -306,12 +304,12 @@ impl HostSession {
                 p.name = name;
                 p.wish = Some(wish);
                 p.cached = cached.into_iter().collect();
-                p.standing = Standing::Knocking;
+                p.standing = Standing::Asking;
                 if self.config.open {
-                    self.admit(now, peer, token, None);
+                    self.admit(now, peer, None);
                 } else {
                     let name = p.name.clone();
-                    self.event(HostEvent::Knock { peer, name, token });
+                    self.event(HostEvent::JoinRequest { peer, name });
                 }
             }
             (GuestMessage::Goodbye { reason }, _) => self.drop_peer(peer, reason, false),
@@ -403,7 +401,7 @@ impl HostSession {
         self.events.push(event);
     }
 
-    fn admit(&mut self, now: Duration, peer: PeerId, token: Vec<u8>, before: Option<UserId>) {
+    fn admit(&mut self, now: Duration, peer: PeerId, before: Option<UserId>) {
         let taken: BTreeSet<u16> = self.peers.values().filter_map(|p| p.user().map(|u| u.0)).collect();
         let free = |number: u16| number != 0 && !taken.contains(&number);
         let number = match before.map(|user| user.0).filter(|&number| free(number)) {
@@ -434,7 +432,7 @@ impl HostSession {
             let told = HostMessage::UserJoined { user: number, name: name.clone() };
             other.send_message(&told, &mut self.out);
         }
-        self.event(HostEvent::Joined { peer, user, name, token });
+        self.event(HostEvent::Joined { peer, user, name });
         let bodies: Vec<BodyId> = self.bodies.keys().copied().collect();
         for body in bodies {
             self.announce(peer, body);

@@ -32,7 +32,9 @@ pub struct HostConfig {
     /// What one step of a quantised number may move the surface by, as a share of how far the body is bent, 1e-9 to 0.1 (values outside are brought
     /// there); streams of accelerations take a 64th of it. Default: 2^-14.
     pub quantum: f64,
-    /// Take in everybody who says hello; else [`HostEvent::Knock`] asks and [`crate::HostSession::accept`] answers. Default: true.
+    /// Let everybody in who says hello; else [`HostEvent::JoinRequest`] asks and
+    /// [`crate::HostSession::accept`] answers. Who may come at all is the transport's to know. Default:
+    /// true.
     pub open: bool,
 }
 
@@ -56,14 +58,13 @@ impl Default for HostConfig {
 #[derive(Debug, Clone, PartialEq)]
 #[non_exhaustive]
 pub enum HostEvent {
-    /// Somebody asks to come in; answer with [`crate::HostSession::accept`] or [`crate::HostSession::refuse`]. Not with `open`.
-    Knock {
+    /// Somebody asks to come in; answer with [`crate::HostSession::accept`] or
+    /// [`crate::HostSession::refuse`]. Not with `open`.
+    JoinRequest {
         /// Who.
         peer: PeerId,
         /// Their name.
         name: String,
-        /// What they show.
-        token: Vec<u8>,
     },
     /// A guest is in.
     Joined {
@@ -73,8 +74,6 @@ pub enum HostEvent {
         user: UserId,
         /// Their name.
         name: String,
-        /// What they showed.
-        token: Vec<u8>,
     },
     /// A guest is gone; their grabs have ended ([`HostEvent::GrabEnded`] came before this).
     Left {

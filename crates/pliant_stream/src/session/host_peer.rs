@@ -21,7 +21,7 @@ pub(crate) enum Standing {
     /// Connected, has not said hello.
     Silent,
     /// Has said hello and waits for the application's word.
-    Knocking,
+    Asking,
     /// In the session.
     Joined(UserId),
 }
@@ -104,7 +104,7 @@ impl Peer {
     pub(crate) fn user(&self) -> Option<UserId> {
         match self.standing {
             Standing::Joined(user) => Some(user),
-            Standing::Silent | Standing::Knocking => None,
+            Standing::Silent | Standing::Asking => None,
         }
     }
 

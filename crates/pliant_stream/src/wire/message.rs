@@ -10,8 +10,6 @@ use crate::state::{MAX_GRABS, MAX_MODES, TICK_LIMIT, in_range};
 
 /// Longest name of a user or a body, bytes of UTF-8.
 pub(crate) const MAX_NAME: usize = 64;
-/// Longest token that a guest may show, bytes.
-pub(crate) const MAX_TOKEN: usize = 1024;
 /// Most models that a guest may name as cached.
 pub(crate) const MAX_CACHED: usize = 256;
 /// Most bodies of a session.
@@ -86,8 +84,6 @@ pub enum GuestMessage {
         version: u16,
         /// At most 64 bytes.
         name: String,
-        /// Opaque to the session; the host's application judges it. At most 1 KiB.
-        token: Vec<u8>,
         /// What to stream.
         wish: StreamWish,
         /// Models that need not be sent.
@@ -230,9 +226,8 @@ impl GuestMessage {
     pub fn decode(bytes: &[u8]) -> Result<Self, StreamError> {
         let mut message: Self = decode("guest message", bytes)?;
         match &mut message {
-            Self::Hello { name, token, wish, cached, .. } => {
+            Self::Hello { name, wish, cached, .. } => {
                 check("name", name.len() <= MAX_NAME, name.len(), "at most 64 bytes")?;
-                check("token", token.len() <= MAX_TOKEN, token.len(), "at most 1024 bytes")?;
                 check("cached models", cached.len() <= MAX_CACHED, cached.len(), "at most 256")?;
                 check("repeats", wish.repeats <= 7, wish.repeats, "0..=7")?;
                 check("modes", wish.modes >= 1, wish.modes, "at least 1")?;

@@ -16,7 +16,7 @@ pub(crate) use datagram::{MAX_NACK_RUNS, MAX_TARGETS};
 pub(crate) use frame::MAX_PARTS;
 pub use frame::{AccelerationCoding, Accelerations, Frame, FrameGrab, Repeat, RepeatGrab};
 pub use message::{BodyInfo, GuestMessage, HostMessage, Payload, SnapshotBytes, StreamWish};
-pub(crate) use message::{MAX_BODIES, MAX_CACHED, MAX_NAME, MAX_TOKEN};
+pub(crate) use message::{MAX_BODIES, MAX_CACHED, MAX_NAME};
 pub use slice::{Slice, SliceEntry};
 
 /// Version of everything in this module. The two sides of a session must agree.
