@@ -90,7 +90,8 @@ fn end_of(reason: &transport::CloseReason) -> pliant_stream::EndReason {
     use pliant_stream::EndReason;
     use transport::CloseReason;
     match reason {
-        CloseReason::ByUs | CloseReason::ByPeer { .. } => EndReason::Left,
+        CloseReason::ByUs => EndReason::Left,
+        CloseReason::ByPeer { reason, .. } => *reason,
         CloseReason::TimedOut => EndReason::Silent,
         CloseReason::Protocol { .. } => EndReason::Protocol,
         CloseReason::Refused { .. } => EndReason::Refused,

@@ -5,7 +5,7 @@ use std::time::{Duration, Instant};
 
 use bytes::Bytes;
 use pliant_modal::ModalModel;
-use pliant_stream::{Channel, Output, PeerId};
+use pliant_stream::{Channel, EndReason, Output, PeerId};
 use tracing::debug;
 
 use crate::recording::{Record, Recorder, Recording};
@@ -62,7 +62,9 @@ impl Line {
                 let Some((at, record)) = recording.poll(now) else {
                     let ends = recording.is_over() && !std::mem::replace(over, true);
                     let words = "the recording is over".to_owned();
-                    return ends.then_some(Came::Closed { reason: CloseReason::ByPeer { words } });
+                    return ends.then_some(Came::Closed {
+                        reason: CloseReason::ByPeer { reason: EndReason::Left, words },
+                    });
                 };
                 Some(match record {
                     Record::Connected { role, max_datagram: most } => {
@@ -75,7 +77,8 @@ impl Line {
                         // One that went on after it has what follows.
                         if recording.is_over() {
                             *over = true;
-                            return Some(Came::Closed { reason: CloseReason::ByPeer { words } });
+                            let reason = CloseReason::ByPeer { reason: EndReason::Left, words };
+                            return Some(Came::Closed { reason });
                         }
                         Came::Closed { reason: CloseReason::Failed { words } }
                     }
@@ -141,7 +144,7 @@ impl Line {
 
     pub(crate) fn close(&self) {
         if let Self::Quic { endpoint, .. } = self {
-            endpoint.close(PeerId::HOST, "goodbye");
+            endpoint.close(PeerId::HOST, EndReason::Left, "goodbye");
         }
     }
 

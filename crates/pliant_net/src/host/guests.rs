@@ -63,7 +63,7 @@ pub(crate) fn receive(world: &mut World) {
                     host.guests.insert(peer, Guest::new(fingerprint, role));
                     let most = host.endpoint.max_datagram_size(peer).unwrap_or(0);
                     if let Err(error) = host.session.connect(now, peer, most) {
-                        host.endpoint.close(peer, &error.to_string());
+                        host.endpoint.close(peer, EndReason::Full, &error.to_string());
                     }
                 }
                 Event::Datagram { peer, at, bytes } => {
@@ -186,7 +186,7 @@ impl NetHost {
             HostEvent::Left { peer, user, reason } => {
                 // The session's goodbye says more than the end of the connection.
                 self.flush();
-                self.endpoint.close(peer, &reason.to_string());
+                self.endpoint.close(peer, reason, &reason.to_string());
                 let entity = self.guests.get_mut(&peer).and_then(|guest| guest.entity.take());
                 if let (Some(entity), Some(id)) = (entity, user) {
                     self.numbers.remove(&id);

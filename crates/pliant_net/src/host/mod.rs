@@ -245,7 +245,7 @@ impl NetHost {
         if let Err(error @ SendError::QueueFull { .. }) = self.endpoint.send_message(peer, message) {
             debug!("guest {peer} is sent away: {error}");
             self.session.disconnect(peer, EndReason::Lost);
-            self.endpoint.close(peer, "messages are not read");
+            self.endpoint.close(peer, EndReason::Lost, "messages are not read");
         }
     }
 

@@ -27,7 +27,7 @@ const MOST_MISSED: usize = 64;
 /// Did the other end go of its own will? One that has found us silent has not.
 fn has_left(reason: &CloseReason) -> bool {
     match reason {
-        CloseReason::ByPeer { words } => *words != EndReason::Silent.to_string(),
+        CloseReason::ByPeer { reason, .. } => *reason != EndReason::Silent,
         CloseReason::Protocol { .. } | CloseReason::Refused { .. } | CloseReason::WrongFingerprint { .. } => {
             true
         }

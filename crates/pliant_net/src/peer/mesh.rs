@@ -111,7 +111,7 @@ impl NetPeer {
                 self.others.insert(peer, other);
                 if role == Role::Watch && opened.is_none() {
                     // Every peer steps the bodies with its own hands: there is no place for one that may not hold.
-                    return self.hang_up(peer, "among equals everybody holds");
+                    return self.hang_up(peer, EndReason::Refused, "among equals everybody holds");
                 }
                 // The first that we have come to is asked; the others are told.
                 if let (Some(_), PeerState::In { user }) = (opened, &self.state) {
@@ -166,16 +166,16 @@ impl NetPeer {
                         self.let_in(peer);
                     }
                 } else {
-                    self.hang_up(peer, "introduced twice");
+                    self.hang_up(peer, EndReason::Protocol, "introduced twice");
                 }
             }
             Some(Mesh::Member { number, scene, invite }) if !opened => {
                 let known = self.others.values().any(|other| other.number == Some(number));
                 let own = if let PeerState::In { user } = self.state { user } else { UserId::HOST };
                 if scene != self.scene {
-                    self.hang_up(peer, "other bodies, or another step");
+                    self.hang_up(peer, EndReason::Scene, "other bodies, or another step");
                 } else if known || number == UserId::HOST || number == own || self.session.is_none() {
-                    self.hang_up(peer, "no place under this number");
+                    self.hang_up(peer, EndReason::Refused, "no place under this number");
                 } else if let Some(other) = self.others.get_mut(&peer) {
                     other.number = Some(number);
                     other.invite = Some(other.seen_from_here(invite));
@@ -210,7 +210,7 @@ impl NetPeer {
             }
             _ => {
                 self.rejected += 1;
-                self.hang_up(peer, "a message that is none");
+                self.hang_up(peer, EndReason::Protocol, "a message that is none");
             }
         }
     }
@@ -232,12 +232,12 @@ impl NetPeer {
             return;
         };
         if scene != self.scene {
-            return self.hang_up(peer, "other bodies, or another step");
+            return self.hang_up(peer, EndReason::Scene, "other bodies, or another step");
         }
         let others: Vec<(UserId, Invite)> =
             self.others.values().filter_map(|other| Some((other.number?, other.invite.clone()?))).collect();
         if self.others.len() > MOST_PEERS {
-            return self.hang_up(peer, "no room");
+            return self.hang_up(peer, EndReason::Full, "no room");
         }
         let Some(key) = self.others.get(&peer).map(|other| other.key) else { return };
         let present: BTreeSet<UserId> = self.others.values().filter_map(|other| other.number).collect();
@@ -247,7 +247,7 @@ impl NetPeer {
             self.numbers.values().copied().chain(present).chain([own, UserId::HOST]).collect();
         // The first that nobody has or had: one peer's word for its own number, however large, leaves room for all others.
         let Some(number) = before.or_else(|| (1..=u16::MAX).map(UserId).find(|n| !taken.contains(n))) else {
-            return self.hang_up(peer, "no number is left");
+            return self.hang_up(peer, EndReason::Full, "no number is left");
         };
         self.remember(key, number);
         if let Some(other) = self.others.get_mut(&peer) {
@@ -267,7 +267,7 @@ impl NetPeer {
             && let Some(user) = self.others.get(&peer).and_then(|other| other.number)
             && let Err(error) = session.connect(now, peer, user, most)
         {
-            self.hang_up(peer, &error.to_string());
+            self.hang_up(peer, EndReason::Refused, &error.to_string());
         }
     }
 
@@ -275,7 +275,7 @@ impl NetPeer {
         let (endpoint, number) = self.way(peer);
         if let Err(error) = endpoint.send_message(number, message.to_message()) {
             debug!("not sent to peer {peer}: {error}");
-            endpoint.close(number, "messages are not read");
+            endpoint.close(number, EndReason::Lost, "messages are not read");
         }
     }
 
@@ -289,16 +289,18 @@ impl NetPeer {
             !other.sent_away && now.saturating_sub(since) > most && session.user_of(**peer).is_none()
         };
         let silent: Vec<PeerId> = self.others.iter().filter(silent).map(|(&peer, _)| peer).collect();
-        silent.into_iter().for_each(|peer| self.hang_up(peer, "has not said who it is"));
+        for peer in silent {
+            self.hang_up(peer, EndReason::Refused, "has not said who it is");
+        }
     }
 
-    fn hang_up(&mut self, peer: PeerId, why: &str) {
+    fn hang_up(&mut self, peer: PeerId, reason: EndReason, why: &str) {
         debug!("peer {peer} is sent away: {why}");
         if let Some(other) = self.others.get_mut(&peer) {
             (other.sent_away, other.waits) = (true, None);
         }
         let (endpoint, number) = self.way(peer);
-        endpoint.close(number, why);
+        endpoint.close(number, reason, why);
         if let Some(session) = &mut self.session {
             session.disconnect(peer, EndReason::Protocol);
         }
@@ -359,7 +361,7 @@ impl NetPeer {
                             self.miss(now, peer, &CloseReason::TimedOut);
                         }
                         let (endpoint, number) = self.way(peer);
-                        endpoint.close(number, &reason.to_string());
+                        endpoint.close(number, reason, &reason.to_string());
                         if let Some(other) = self.others.get_mut(&peer) {
                             (other.number, other.invite, other.sent_away) = (None, None, true);
                         }
@@ -368,7 +370,7 @@ impl NetPeer {
                 PeerEvent::TurnedAway { peer, reason } => {
                     // The session's goodbye says more than the end of the connection.
                     self.flush();
-                    self.hang_up(peer, &reason.to_string());
+                    self.hang_up(peer, reason, &reason.to_string());
                 }
                 PeerEvent::Resynced { from } => debug!("the state of user {} was taken over", from.0),
                 _ => {}

@@ -10,7 +10,7 @@ use std::task::Poll;
 use std::time::{Duration, Instant, SystemTime};
 
 use bytes::Bytes;
-use pliant_stream::PeerId;
+use pliant_stream::{EndReason, PeerId};
 use quinn::{
     ClientConfig, Connection, ConnectionError, EndpointConfig, Incoming, RecvStream, Runtime,
     SendDatagramError, SendStream, ServerConfig, TokioRuntime, TransportErrorCode, VarInt,
@@ -30,12 +30,19 @@ use super::queue::{Next, lock};
 use super::stats::PeerStats;
 use super::wire::{self, ReadMessageError, TOKEN_MESSAGE};
 
-/// An ordinary end.
-pub(super) const GOODBYE: u32 = 0;
+/// An endpoint ends.
+const GOODBYE: u32 = 0;
 /// The host does not let the guest in.
 const REFUSED: u32 = 1;
 /// The other end broke the rules.
 const PROTOCOL: u32 = 2;
+/// The session is over: this and the number of its [`EndReason`].
+const SESSION: u32 = 16;
+
+/// The code with which a connection is closed whose session is over.
+pub(super) fn code_of(reason: EndReason) -> u32 {
+    SESSION + u32::from(reason.code())
+}
 
 /// So long the last words may take to get through.
 const GRACE: Duration = Duration::from_secs(1);
@@ -325,7 +332,12 @@ fn reason_of(error: ConnectionError, refused: Option<CloseReason>) -> CloseReaso
             match u32::try_from(close.error_code.into_inner()) {
                 Ok(REFUSED) => CloseReason::Refused { words },
                 Ok(PROTOCOL) => CloseReason::Failed { words: format!("the other end says: {words}") },
-                _ => CloseReason::ByPeer { words },
+                code => {
+                    let reason = code.ok().and_then(|code| u8::try_from(code.checked_sub(SESSION)?).ok());
+                    // A later version may have more reasons.
+                    let reason = reason.and_then(EndReason::from_code).unwrap_or(EndReason::Left);
+                    CloseReason::ByPeer { reason, words }
+                }
             }
         }
         ConnectionError::ConnectionClosed(close)

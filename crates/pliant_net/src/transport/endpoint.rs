@@ -9,7 +9,7 @@ use std::thread::JoinHandle;
 use std::time::{Duration, Instant};
 
 use bytes::Bytes;
-use pliant_stream::PeerId;
+use pliant_stream::{EndReason, PeerId};
 use thiserror::Error;
 use tokio::sync::Notify;
 
@@ -72,6 +72,8 @@ pub enum CloseReason {
     /// The other end closed it.
     #[error("the other end left: {words}")]
     ByPeer {
+        /// Why, by the code that came.
+        reason: EndReason,
         /// Its words, shortened and without control characters.
         words: String,
     },
@@ -405,10 +407,11 @@ impl Endpoint {
         self.peer(peer).map_or(0, |peer| peer.outbox.message_bytes())
     }
 
-    /// Closes a connection once its queued messages are out (it waits at most a second for that). `words` reach the peer.
-    pub fn close(&self, peer: PeerId, words: &str) {
+    /// Closes a connection once its queued messages are out (it waits at most a second for that).
+    /// `reason` reaches the peer as a code, `words` as they are, for people.
+    pub fn close(&self, peer: PeerId, reason: EndReason, words: &str) {
         if let Some(peer) = self.peer(peer) {
-            peer.outbox.close(driver::GOODBYE, words.to_owned());
+            peer.outbox.close(driver::code_of(reason), words.to_owned());
         }
     }
 

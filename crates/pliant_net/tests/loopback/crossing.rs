@@ -8,6 +8,7 @@ use pliant_net::transport::{
     CloseReason, Emulation, Endpoint, Event, HostOptions, Identity, Invite, JoinOptions, Limits, PeerId,
     RateCap, SendError,
 };
+use pliant_stream::EndReason;
 use pliant_stream::emulator::{LinkConfig, Preset};
 
 use crate::endpoints::{closed, connected, datagram, guest, host, message, patient};
@@ -61,9 +62,9 @@ fn datagrams_and_messages_cross_both_ways_and_a_goodbye_is_heard() {
     assert_eq!(message(&host), "thanks");
 
     guest.send_message(at_guest, Bytes::from_static(b"said before leaving")).unwrap();
-    guest.close(at_guest, "bye\n\u{7}now");
+    guest.close(at_guest, EndReason::Silent, "bye\n\u{7}now");
     assert_eq!(message(&host), "said before leaving");
-    assert_eq!(closed(&host), CloseReason::ByPeer { words: "byenow".into() });
+    assert_eq!(closed(&host), CloseReason::ByPeer { reason: EndReason::Silent, words: "byenow".into() });
     assert_eq!(closed(&guest), CloseReason::ByUs);
     assert_eq!(host.send_datagram(at_host, Bytes::new()), Err(SendError::NotConnected));
     assert!(host.peers().is_empty());
@@ -81,7 +82,7 @@ fn dropping_an_endpoint_says_goodbye() {
     let guest = self::guest(&host.invite());
     connected(&guest);
     drop(host);
-    assert!(matches!(closed(&guest), CloseReason::ByPeer { words } if words.contains("host")));
+    assert!(matches!(closed(&guest), CloseReason::ByPeer { words, .. } if words.contains("host")));
 }
 
 /// Datagrams that an endpoint has let come so far.

@@ -8,6 +8,7 @@ use pliant_net::transport::{
     ALPN, CloseReason, Endpoint, Event, HostOptions, Identity, Invite, JoinOptions, Limits, PeerId, RateCap,
     SendError,
 };
+use pliant_stream::EndReason;
 
 use crate::endpoints::{closed, connected, datagram, guest, host, message, patient, quick};
 use crate::patience::{must, wait_for};
@@ -150,7 +151,7 @@ fn a_guest_that_never_reads_costs_a_bounded_queue() {
     // Its messages hold up the goodbye too: it is let go all the same, a second later. Nothing else
     // would end this connection, since the guest's own thread answers as long as the guest is
     // there.
-    host.close(peer, "messages are not read");
+    host.close(peer, EndReason::Lost, "messages are not read");
     assert_eq!(closed(&host), CloseReason::ByUs);
 }
 

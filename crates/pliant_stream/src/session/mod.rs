@@ -97,3 +97,42 @@ pub enum EndReason {
     #[error("other bodies or settings")]
     Scene,
 }
+
+impl EndReason {
+    /// All of them, each at the place of its number on the wire.
+    const ALL: [Self; 9] = [
+        Self::Left,
+        Self::Silent,
+        Self::Lost,
+        Self::Protocol,
+        Self::Version,
+        Self::Refused,
+        Self::Full,
+        Self::Path,
+        Self::Scene,
+    ];
+
+    /// Its number on the wire.
+    pub fn code(self) -> u8 {
+        self as u8
+    }
+
+    /// The reason of this number; `None` for one that this version does not know.
+    pub fn from_code(code: u8) -> Option<Self> {
+        Self::ALL.get(usize::from(code)).copied()
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn each_end_has_the_same_number_in_messages_and_as_a_code() {
+        for (code, reason) in (0..).zip(EndReason::ALL) {
+            assert_eq!(postcard::to_allocvec(&reason).unwrap(), [code]);
+            assert_eq!((reason.code(), EndReason::from_code(code)), (code, Some(reason)));
+        }
+        assert_eq!(EndReason::from_code(9), None);
+    }
+}
