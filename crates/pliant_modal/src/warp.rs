@@ -4,24 +4,37 @@
 
 use nalgebra::{Matrix3, Vector3};
 
+/// Terms of the series of `A` and `B`: rounding below `s = 1/2`, where the closed forms cancel.
+const TERMS: usize = 9;
+
+/// `1 / (2k + first)!`
+const fn inverse_factorials(first: usize) -> [f64; TERMS] {
+    let mut out = [0.0; TERMS];
+    let mut k = 0;
+    while k < TERMS {
+        let mut factorial = 1.0;
+        let mut n = 2;
+        while n <= 2 * k + first {
+            factorial *= n as f64;
+            n += 1;
+        }
+        out[k] = 1.0 / factorial;
+        k += 1;
+    }
+    out
+}
+
+/// `A = sum (-s)^k / (2k + 2)!`, `B = sum (-s)^k / (2k + 3)!`
+const COEFFICIENTS: [[f64; TERMS]; 2] = [inverse_factorials(2), inverse_factorials(3)];
+
 /// `A(s)`, `B(s)` and their derivatives by `s = |w|^2`.
-fn coefficients(s: f64) -> [f64; 4] {
+pub(crate) fn coefficients(s: f64) -> [f64; 4] {
     if s < 0.5 {
-        // A = sum (-s)^k / (2k+2)!, B = sum (-s)^k / (2k+3)!: eight terms reach rounding below s = 1/2, where the closed forms cancel.
-        let (mut a, mut b, mut da, mut db) = (0.0, 0.0, 0.0, 0.0);
-        let mut power = 1.0; // (-s)^k
-        let mut before = 0.0; // d/ds (-s)^k = -k (-s)^(k-1)
-        let mut factorial = 2.0; // (2k+2)!
-        for k in 0..9 {
-            let kf = f64::from(k);
-            a += power / factorial;
-            da += before / factorial;
-            let odd = factorial * (2.0 * kf + 3.0);
-            b += power / odd;
-            db += before / odd;
-            before = -(kf + 1.0) * power;
-            power *= -s;
-            factorial = odd * (2.0 * kf + 4.0);
+        // Horner's rule for the value and the derivative at once.
+        let [mut a, mut b, mut da, mut db] = [0.0; 4];
+        for (of_a, of_b) in COEFFICIENTS[0].iter().zip(&COEFFICIENTS[1]).rev() {
+            (da, db) = (-a - s * da, -b - s * db);
+            (a, b) = (of_a - s * a, of_b - s * b);
         }
         [a, b, da, db]
     } else {

@@ -27,7 +27,7 @@ fn under_gravity_energy_stays() {
         most = most.max(body.energy());
         off = off.max((body.energy() + body.potential_energy()).abs());
     }
-    assert!(most > 1.0 && off < 2e-4 * most, "{off} J of {most} J");
+    assert!(most > 1.0 && off < 1e-5 * most, "{off} J of {most} J");
 }
 
 /// Two hands 2 cm apart, with their dampers' relaxation times (s).

@@ -11,6 +11,7 @@ use super::{
     patch::{Grams, Six, Tangent, tangent},
     place::Place,
     solve::System,
+    weight::between,
 };
 use crate::{ModalModel, StepError};
 
@@ -82,7 +83,11 @@ pub struct Kernel {
     /// Modal forces: of everything but hands, then of hands.
     force: Vec<f64>,
     pulls: Vec<f64>,
+    /// What gravity does to the bend: over the step, and at its beginning.
     bend: Vec<f64>,
+    start: Vec<f64>,
+    /// By how much that was off in the round before, and what came out of it.
+    rounds: Vec<[f64; 2]>,
     /// Modal velocities as dampers see them.
     velocity: Vec<f64>,
     solving: Vec<Solving>,
@@ -113,6 +118,8 @@ impl Kernel {
             force: zero.clone(),
             pulls: zero.clone(),
             bend: zero.clone(),
+            start: zero.clone(),
+            rounds: vec![[0.0; 2]; zero.len()],
             velocity: zero,
             solving: Vec::new(),
             forces: Vec::new(),
@@ -304,25 +311,45 @@ impl Kernel {
 
     /// Adds to the step without hands what gravity does on the way between its two shapes.
     fn bend_under_gravity(&mut self, state: &mut State) {
-        /// The force moves the end of the step, and that the force. A gentle bend is done in two rounds.
+        /// The force moves the end of the step, and that the force.
         const MOST_ROUNDS: usize = 12;
-        /// Of the force that is left wrong.
-        const SHARE: f64 = 1e-9;
+        /// Of the largest force that may be left wrong.
+        const SHARE: f64 = 1e-6;
         let local = state.frame.rotation().inverse() * Vector3::from(self.settings.gravity);
-        // What it was in the round before.
-        self.pulls.fill(0.0);
-        for _ in 0..MOST_ROUNDS {
-            let ends = [&*self.before.q, &*state.q];
-            self.model.mass_sites().between(&local, ends, &mut self.velocity, &mut self.bend);
-            for (last, now) in self.pulls.iter_mut().zip(&self.bend) {
-                *last = now - *last;
+        let sites = self.model.mass_sites();
+        let enough = SHARE * self.force.iter().fold(0.0f64, |most, f| most.max(f.abs()));
+        // At first as though it stayed what it is; `pulls` is what is new in a round.
+        self.start.fill(0.0);
+        let before = sites.add(&local, &self.before.q, &mut self.start);
+        self.bend.copy_from_slice(&self.start);
+        self.pulls.copy_from_slice(&self.start);
+        self.modes.respond(&self.pulls, state);
+        for round in 0..MOST_ROUNDS {
+            self.pulls.copy_from_slice(&self.start);
+            let work = sites.add(&local, &state.q, &mut self.pulls) - before;
+            self.pulls.iter_mut().for_each(|force| *force *= 0.5);
+            between(&self.before.q, &state.q, work, &mut self.pulls);
+            let mut change = 0.0f64;
+            let (mut along, mut square) = (0.0, 0.0);
+            for ((bend, now), [last_off, _]) in self.bend.iter().zip(&self.pulls).zip(&self.rounds) {
+                let off = now - bend;
+                let turn = off - last_off;
+                (along, square) = (along + off * turn, square + turn * turn);
+                change = change.max(off.abs());
+            }
+            // What is off shrinks from round to round along much the same line: where on it nothing would
+            // be off (Anderson 1965, of depth one).
+            let back = if round > 0 && square > 0.0 { (along / square).clamp(-4.0, 4.0) } else { 0.0 };
+            let here = self.bend.iter_mut().zip(&mut self.pulls).zip(&mut self.rounds);
+            for ((bend, now), [last_off, last_now]) in here {
+                let next = *now - back * (*now - *last_now);
+                (*last_off, *last_now) = (*now - *bend, *now);
+                (*bend, *now) = (next, next - *bend);
             }
             self.modes.respond(&self.pulls, state);
-            let largest = |forces: &[f64]| forces.iter().fold(0.0f64, |most, f| most.max(f.abs()));
-            if largest(&self.pulls) <= SHARE * largest(&self.bend) {
+            if change <= enough {
                 break;
             }
-            self.pulls.copy_from_slice(&self.bend);
         }
         for (force, bend) in self.force.iter_mut().zip(&self.bend) {
             *force += bend;

@@ -2,11 +2,14 @@
 
 use nalgebra::Vector3;
 
-use super::patch::{MeanRows, displacement, tangent};
 use crate::ModalModel;
+use crate::warp::coefficients;
 
 /// Into so many parts a body's mass is divided.
 const SITES: usize = 16;
+
+/// One number for each part.
+type Each = [f64; SITES];
 
 /// A body's mass in parts, each where its bit of the surface is.
 ///
@@ -15,7 +18,13 @@ const SITES: usize = 16;
 /// that is more: `sum m (J(q) - J(0))^T g`. So the force stays the gradient of a potential, and a part's
 /// place needs no more than the accuracy of a bend.
 #[derive(Debug)]
-pub(crate) struct MassSites(Vec<(f64, MeanRows)>);
+pub(crate) struct MassSites {
+    /// kg; none for parts that are not there.
+    mass: Each,
+    /// For each mode how it moves (x, y, z) and turns (x, y, z) each part: the parts side by side, so that
+    /// one instruction does several.
+    modes: Vec<[Each; 6]>,
+}
 
 impl MassSites {
     pub(crate) fn new(model: &ModalModel) -> Self {
@@ -35,66 +44,141 @@ impl MassSites {
             }
             next = (0..nearest.len()).max_by(|&a, &b| nearest[a].0.total_cmp(&nearest[b].0)).unwrap_or(0);
         }
-        let area = |vertex: usize| surface.area_around(vertex as u32);
-        let whole: f64 = (0..positions.len()).map(area).sum();
-        let site = |site: usize| {
-            let mut entries: Vec<(u32, f64)> = Vec::new();
-            entries.extend((0..nearest.len()).filter(|&v| nearest[v].1 == site).map(|v| (v as u32, area(v))));
-            let share: f64 = entries.iter().map(|(_, area)| area).sum();
-            entries.iter_mut().for_each(|(_, weight)| *weight /= share);
-            let sound = share > 0.0 && whole.is_finite();
-            sound.then(|| (model.mass() * share / whole, MeanRows::new(model, &entries, model.mode_count())))
-        };
-        Self((0..SITES).filter_map(site).collect())
-    }
-
-    /// The work of that on the way from rest to the shape `q`, J.
-    pub(crate) fn work(&self, gravity: &Vector3<f64>, q: &[f64]) -> f64 {
-        let of = |(mass, rows): &(f64, MeanRows)| {
-            let six = rows.reduce(q, true);
-            let straight = Vector3::new(six[0], six[1], six[2]);
-            *mass * gravity.dot(&(displacement(&six, true) - straight))
-        };
-        self.0.iter().map(of).sum()
-    }
-
-    /// The modal force of that over a step from `from` to `to`, as far as its work there goes: the
-    /// discrete gradient of Gonzalez (J. Nonlinear Sci. 6, 1996), the force in the middle plus what makes
-    /// `force . (to - from)` the work between them to rounding. A force that is constant over a step and
-    /// taken at its beginning would feed a swinging body, step by step. `middle` is scratch.
-    pub(crate) fn between(
-        &self,
-        gravity: &Vector3<f64>,
-        [from, to]: [&[f64]; 2],
-        middle: &mut [f64],
-        force: &mut [f64],
-    ) {
-        force.fill(0.0);
-        for (middle, (from, to)) in middle.iter_mut().zip(from.iter().zip(to)) {
-            *middle = 0.5 * (from + to);
+        let mut share = [0.0; SITES];
+        let areas: Vec<f64> = (0..positions.len()).map(|v| surface.area_around(v as u32)).collect();
+        for (&(_, site), area) in nearest.iter().zip(&areas) {
+            share[site] += area;
         }
-        self.add(gravity, middle, force);
-        let way = || from.iter().zip(to).map(|(from, to)| to - from);
-        let square: f64 = way().map(|way| way * way).sum();
-        let along: f64 = way().zip(&*force).map(|(way, force)| way * force).sum();
-        let missing = self.work(gravity, to) - self.work(gravity, from) - along;
-        let share = missing / square;
-        // Of no way there is no work.
-        if share.is_finite() {
-            force.iter_mut().zip(way()).for_each(|(force, way)| *force += share * way);
-        }
-    }
-
-    /// Adds to the modal force what gravity (m/s^2, body axes) does more on the shape `q` than at rest.
-    pub(crate) fn add(&self, gravity: &Vector3<f64>, q: &[f64], force: &mut [f64]) {
-        for (mass, rows) in &self.0 {
-            let (_, tangent) = tangent(&rows.reduce(q, true), true);
-            let weight = *mass * gravity;
-            let mut six = tangent.tr_mul(&weight);
-            for axis in 0..3 {
-                six[axis] -= weight[axis];
+        let whole: f64 = share.iter().sum();
+        let mass = share.map(|share| {
+            let mass = model.mass() * share / whole;
+            if mass.is_finite() { mass } else { 0.0 }
+        });
+        let mut modes = vec![[[0.0; SITES]; 6]; model.mode_count()];
+        for (vertex, (&(_, site), area)) in nearest.iter().zip(&areas).enumerate() {
+            let weight = area / share[site];
+            if mass[site] <= 0.0 {
+                continue;
             }
-            rows.spread(&six, true, force);
+            for (mode, rows) in modes.iter_mut().enumerate() {
+                for axis in 0..3 {
+                    let moved = f64::from(model.displacement_row(vertex as u32, axis, mode));
+                    let turned = f64::from(model.rotation_row(vertex as u32, axis, mode));
+                    rows[axis][site] += weight * moved;
+                    rows[3 + axis][site] += weight * turned;
+                }
+            }
+        }
+        Self { mass, modes }
+    }
+
+    /// The work of that on the way from rest to the shape `q`, J, for gravity in body axes, m/s^2.
+    pub(crate) fn work(&self, gravity: &Vector3<f64>, q: &[f64]) -> f64 {
+        let mut six = self.reduce(q);
+        self.work_and_forces(gravity, &mut six)
+    }
+
+    /// The same, and adds the modal force that does it: the work's gradient.
+    pub(crate) fn add(&self, gravity: &Vector3<f64>, q: &[f64], force: &mut [f64]) -> f64 {
+        let mut six = self.reduce(q);
+        let work = self.work_and_forces(gravity, &mut six);
+        for (force, rows) in force.iter_mut().zip(&self.modes) {
+            let mut sums = [0.0; SITES];
+            for (row, part) in rows.iter().zip(&six) {
+                for ((sum, row), part) in sums.iter_mut().zip(row).zip(part) {
+                    *sum += row * part;
+                }
+            }
+            *force += sums.iter().sum::<f64>();
+        }
+        work
+    }
+
+    /// How far the linear modes move each part (m) and turn it (rad).
+    fn reduce(&self, q: &[f64]) -> [Each; 6] {
+        let mut six = [[0.0; SITES]; 6];
+        for (q, rows) in q.iter().zip(&self.modes) {
+            for (sum, row) in six.iter_mut().zip(rows) {
+                for (sum, row) in sum.iter_mut().zip(row) {
+                    *sum += q * row;
+                }
+            }
+        }
+        six
+    }
+
+    /// The work at these six numbers of each part; they become its derivatives by themselves.
+    ///
+    /// A part's way beyond the straight one is `A w x u + B w x (w x u)` (Choi and Ko 2005), so the work
+    /// is `m (A g.(w x u) + B ((g.w)(w.u) - (w.w)(g.u)))`.
+    fn work_and_forces(&self, gravity: &Vector3<f64>, six: &mut [Each; 6]) -> f64 {
+        let mut work = 0.0;
+        for (i, mass) in self.mass.iter().enumerate() {
+            let [x, y, z, wx, wy, wz] = six.each_ref().map(|row| row[i]);
+            let (u, w, g) = (Vector3::new(x, y, z), Vector3::new(wx, wy, wz), *mass * gravity);
+            let s = w.norm_squared();
+            let [a, b, da, db] = coefficients(s);
+            let (across, gw, wu, gu) = (u.cross(&g), g.dot(&w), w.dot(&u), g.dot(&u));
+            let (once, twice) = (w.dot(&across), gw * wu - s * gu);
+            work += a * once + b * twice;
+            let by_u = a * g.cross(&w) + b * (gw * w - s * g);
+            let by_w = a * across + b * (wu * g + gw * u - 2.0 * gu * w) + 2.0 * (da * once + db * twice) * w;
+            for (row, value) in six.iter_mut().zip(by_u.iter().chain(&by_w)) {
+                row[i] = *value;
+            }
+        }
+        work
+    }
+}
+
+/// The force of gravity's bend over a step, kg^1/2 m/s^2: the discrete gradient of Gonzalez (J. Nonlinear
+/// Sci. 6, 1996) round the mean of the forces at both ends, so that `force . (to - from)` is the work
+/// between them to rounding. A force taken at the step's beginning would feed a swinging body, step by
+/// step. `force` is that mean and becomes the result; `work` is that from one end to the other, J.
+pub(crate) fn between(from: &[f64], to: &[f64], work: f64, force: &mut [f64]) {
+    let way = || from.iter().zip(to).map(|(from, to)| to - from);
+    let square: f64 = way().map(|way| way * way).sum();
+    let along: f64 = way().zip(&*force).map(|(way, force)| way * force).sum();
+    let share = (work - along) / square;
+    // Of no way there is no work.
+    if share.is_finite() {
+        force.iter_mut().zip(way()).for_each(|(force, way)| *force += share * way);
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn the_work_is_that_of_the_warp_and_the_force_its_gradient() {
+        let mut sites = MassSites { mass: [0.0; SITES], modes: vec![[[0.0; SITES]; 6]; 6] };
+        let gravity = Vector3::new(1.0, -9.0, 2.0);
+        (sites.mass[0], sites.mass[5]) = (0.5, 2.0);
+        for mode in 0..6 {
+            sites.modes[mode][mode][0] = 1.0;
+            sites.modes[mode][mode][5] = -0.3;
+        }
+        for turn in [1e-9, 0.1, 0.6, 2.0, 5.0, 9.0] {
+            let q = [0.1, -0.2, 0.3, 0.8 * turn, -0.5 * turn, 0.3 * turn];
+            let part = |scale: f64, mass: f64| {
+                let [d, w] = [0, 3].map(|at| [q[at], q[at + 1], q[at + 2]].map(|x| scale * x));
+                mass * gravity.dot(&(Vector3::from(crate::warp(w, d)) - Vector3::from(d)))
+            };
+            let want = part(1.0, 0.5) + part(-0.3, 2.0);
+            let mut force = [0.0; 6];
+            let work = sites.add(&gravity, &q, &mut force);
+            assert!((work - want).abs() < 1e-12, "{turn}: {work}, {want}");
+            assert_eq!(sites.work(&gravity, &q), work);
+            for mode in 0..6 {
+                let at = |step: f64| {
+                    let mut q = q;
+                    q[mode] += step;
+                    sites.work(&gravity, &q)
+                };
+                let slope = (at(1e-5) - at(-1e-5)) / 2e-5;
+                assert!((force[mode] - slope).abs() < 1e-8, "{turn}, {mode}: {} {slope}", force[mode]);
+            }
         }
     }
 }
