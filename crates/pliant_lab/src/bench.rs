@@ -1,74 +1,50 @@
-//! `pliant bench step`: what a body costs here, beside the limit that memory sets in the same run.
+//! What a body costs here, beside the limit that memory sets in the same run.
 
-use std::{hint::black_box, path::PathBuf, sync::Arc, time::Instant};
+use std::{hint::black_box, sync::Arc, time::Instant};
 
-use clap::{Args, Subcommand};
 use pliant_modal::{Body, BodyConfig, GrabConfig, ModalModel, Patch, Precision, streaming_sum};
 use serde::Serialize;
 
-use crate::{CliError, machine::Pinned, output};
-
-#[derive(Args, Debug)]
-pub(crate) struct BenchArgs {
-    #[command(subcommand)]
-    what: What,
-}
-
-#[derive(Subcommand, Debug)]
-enum What {
-    /// Steps with one grab pulling, and reconstructions of the whole surface
-    Step {
-        /// The model
-        #[arg(value_name = "X.modal")]
-        model: PathBuf,
-        /// Seconds for each of the measurements
-        #[arg(long, default_value_t = 1.0)]
-        seconds: f64,
-        /// Reconstruct from a basis in half precision
-        #[arg(long)]
-        half: bool,
-        /// Prints one line of JSON
-        #[arg(long)]
-        json: bool,
-    },
-}
+use crate::{LabError, machine::Pinned};
 
 /// Percentiles of a time, us, on one core.
-#[derive(Serialize, Debug)]
-pub(crate) struct Times {
-    pub(crate) p50: f64,
-    pub(crate) p99: f64,
-    p999: f64,
+#[derive(Serialize, Debug, Clone, Copy)]
+pub struct Percentiles {
+    /// The median.
+    pub p50: f64,
+    /// The 99th percentile.
+    pub p99: f64,
+    /// The 99.9th percentile.
+    pub p999: f64,
 }
 
-/// What `--json` prints.
-#[derive(Serialize, Debug)]
-pub(crate) struct Told {
-    modes: usize,
-    pub(crate) surface_vertices: usize,
-    pub(crate) step_us: Times,
-    pub(crate) reconstruct_us: Times,
+/// What a body costs.
+#[derive(Serialize, Debug, Clone)]
+pub struct Cost {
+    /// Elastic modes.
+    pub modes: usize,
+    /// Vertices of the surface.
+    pub surface_vertices: usize,
+    /// A step with one grab that pulls.
+    pub step_us: Percentiles,
+    /// A reconstruction of the whole surface.
+    pub reconstruct_us: Percentiles,
     /// A step under a hand that moves and the whole surface of what it came to, one after the other, as a frame does.
-    pub(crate) frame_us: Times,
+    pub frame_us: Percentiles,
     /// Read and written by one reconstruction.
-    bytes: usize,
-    /// Of the median reconstruction, as its turn in a frame: after a step, of a shape that is new each time.
-    pub(crate) bandwidth_gb_s: f64,
-    /// Of the fastest pass over as many bytes in the same run: plain sums in the processor's widest registers, and reconstructions.
-    pub(crate) bandwidth_limit_gb_s: f64,
+    pub bytes: usize,
+    /// GB/s of the median reconstruction, as its turn in a frame: after a step, of a shape that is new each time.
+    pub bandwidth_gb_s: f64,
+    /// GB/s of the fastest pass over as many bytes in the same run: plain sums in the processor's widest registers, and
+    /// reconstructions.
+    pub bandwidth_limit_gb_s: f64,
 }
 
-pub(crate) fn run(args: &BenchArgs) -> Result<(), CliError> {
-    let What::Step { model, seconds, half, json } = &args.what;
-    if !(0.01..=600.0).contains(seconds) {
-        return Err(CliError::Range { what: "--seconds", low: 0.01, high: 600.0, got: *seconds });
-    }
-    let precision = if *half { Precision::Half } else { Precision::Single };
-    let told = measure(Arc::new(ModalModel::read(model)?), *seconds, precision)?;
-    if *json { output::print_json(&told) } else { output::print(&text(&told)) }
-}
-
-pub(crate) fn measure(model: Arc<ModalModel>, seconds: f64, precision: Precision) -> Result<Told, CliError> {
+/// Times steps and reconstructions of a body on one core, for `seconds` each and then twice as long as frames.
+///
+/// # Errors
+/// [`LabError::Model`] or [`LabError::Step`] where the body cannot be held or stepped.
+pub fn measure(model: Arc<ModalModel>, seconds: f64, precision: Precision) -> Result<Cost, LabError> {
     let _pinned = Pinned::new();
     let mut body = Body::new(model.clone(), BodyConfig { precision, ..BodyConfig::default() })?;
     // Where the first mode moves most: a body is pulled where it gives.
@@ -114,7 +90,7 @@ pub(crate) fn measure(model: Arc<ModalModel>, seconds: f64, precision: Precision
     let (frame_us, reconstruct_us) = (percentiles(of_frame), percentiles(of_surface));
     // Bytes a microsecond are megabytes a second.
     let gb_s = |us: f64| bytes as f64 / us.max(1e-9) * 1e-3;
-    Ok(Told {
+    Ok(Cost {
         modes: model.mode_count(),
         surface_vertices: count as usize,
         bandwidth_gb_s: gb_s(reconstruct_us.p50),
@@ -126,7 +102,7 @@ pub(crate) fn measure(model: Arc<ModalModel>, seconds: f64, precision: Precision
     })
 }
 
-fn time(seconds: f64, mut work: impl FnMut()) -> Times {
+fn time(seconds: f64, mut work: impl FnMut()) -> Percentiles {
     for _ in 0..50 {
         work();
     }
@@ -176,29 +152,8 @@ fn once(work: &mut impl FnMut()) -> f64 {
     start.elapsed().as_secs_f64() * 1e6
 }
 
-fn percentiles(mut samples: Vec<f64>) -> Times {
+fn percentiles(mut samples: Vec<f64>) -> Percentiles {
     samples.sort_by(f64::total_cmp);
     let at = |part: f64| samples[((samples.len() - 1) as f64 * part) as usize];
-    Times { p50: at(0.5), p99: at(0.99), p999: at(0.999) }
-}
-
-fn text(told: &Told) -> String {
-    let times = |t: &Times| format!("{:.2} us (99 %: {:.2}, 99.9 %: {:.2})", t.p50, t.p99, t.p999);
-    format!(
-        "body               {} modes, {} surface vertices\n\
-         step, one grab     {}\n\
-         reconstruction     {}\n\
-         both, as a frame   {}\n\
-         bytes moved        {}\n\
-         bandwidth          {:.1} GB/s, {:.0} % of the {:.1} GB/s of the fastest pass over as many bytes",
-        told.modes,
-        told.surface_vertices,
-        times(&told.step_us),
-        times(&told.reconstruct_us),
-        times(&told.frame_us),
-        told.bytes,
-        told.bandwidth_gb_s,
-        100.0 * told.bandwidth_gb_s / told.bandwidth_limit_gb_s,
-        told.bandwidth_limit_gb_s
-    )
+    Percentiles { p50: at(0.5), p99: at(0.99), p999: at(0.999) }
 }

@@ -5,12 +5,11 @@
 
 use std::time::Duration;
 
-use crate::StreamError;
-use crate::emulator::{Link, LinkConfig, Loss};
-use crate::session::{
-    Channel, GuestConfig, GuestEvent, GuestSession, HostConfig, HostEvent, HostSession, Output,
+use pliant_stream::emulator::{Link, LinkConfig, Loss};
+use pliant_stream::{
+    Channel, GuestConfig, GuestEvent, GuestSession, HostConfig, HostEvent, HostSession, Output, PeerId,
+    StreamError,
 };
-use crate::state::PeerId;
 
 /// What happens around the sessions. All methods may be left as they are but [`World::step`].
 pub trait World {

@@ -5,8 +5,8 @@ mod support;
 
 use std::time::Duration;
 
+use pliant_lab::pair::PathConfig;
 use pliant_stream::emulator::LinkConfig;
-use pliant_stream::pair::PathConfig;
 use pliant_stream::{EndReason, GuestConfig, GuestEvent, HostConfig, PeerId, RecoveryConfig};
 use support::bar;
 use support::scene::{BODY, MS, S, cached, circling, path_for, start, start_with};

@@ -1,4 +1,4 @@
-//! Remakes the paper's figures 7 to 9 as pictures: `cargo test -p pliant_stream --test figures -- --ignored` writes
+//! Remakes the paper's figures 7 to 9 as pictures: `cargo test -p pliant_lab --test figures -- --ignored` writes
 //! `docs/figures/stream-*.svg`.
 #![allow(clippy::unwrap_used, clippy::expect_used, clippy::panic, reason = "a failed test should panic")]
 
@@ -7,9 +7,9 @@ mod support;
 use std::fmt::Write as _;
 use std::time::Duration;
 
+use pliant_lab::experiment::{Experiment, Figures};
 use pliant_modal::Integrator;
 use pliant_stream::emulator::{LinkConfig, Loss};
-use pliant_stream::experiment::{Experiment, Figures};
 use pliant_stream::wire::AccelerationCoding;
 use pliant_stream::{Newmark, Predict, RecoveryConfig};
 use support::bar;

@@ -1,6 +1,6 @@
 //! Whole sessions over emulated paths against the bars of the design: 40 Hz, 120 modes.
 //!
-//! `cargo test -p pliant_stream --test measure -- --ignored --nocapture` runs the long form: ten minutes, many seeds, and
+//! `cargo test -p pliant_lab --test measure -- --ignored --nocapture` runs the long form: ten minutes, many seeds, and
 //! all policies side by side.
 #![allow(clippy::unwrap_used, clippy::expect_used, clippy::panic, reason = "a failed test should panic")]
 
@@ -9,9 +9,9 @@ mod support;
 use std::sync::{Arc, OnceLock};
 use std::time::{Duration, Instant};
 
+use pliant_lab::experiment::{Experiment, Figures};
 use pliant_modal::{Integrator, ModalModel};
 use pliant_stream::emulator::{LinkConfig, Loss, Preset};
-use pliant_stream::experiment::{Experiment, Figures};
 use pliant_stream::peer::Repair;
 use pliant_stream::wire::AccelerationCoding;
 use pliant_stream::{Newmark, Policy, Predict, RecoveryConfig};
@@ -392,7 +392,7 @@ fn cost_of_a_tick() {
                 arrived
                     .extend(lost.pop_front().into_iter().flat_map(|at| encoder.resend(at)).map(|b| wrap(&b)));
             }
-            if support::direct::random(&mut chance) % 100 < 9 {
+            if support::random(&mut chance) % 100 < 9 {
                 lost.push_back(tick);
             } else {
                 arrived.push(wrap(&body.first));

@@ -5,8 +5,8 @@ mod support;
 
 use std::time::Duration;
 
+use pliant_lab::pair::{Pair, PathConfig, World};
 use pliant_stream::emulator::{LinkConfig, Preset};
-use pliant_stream::pair::{Pair, PathConfig, World};
 use pliant_stream::{
     GuestConfig, GuestEvent, GuestSession, HostConfig, HostEvent, HostSession, Pose, StepSettings,
 };

@@ -5,9 +5,9 @@ mod support;
 
 use std::time::Duration;
 
+use pliant_lab::experiment::{Experiment, Figures};
 use pliant_stream::RecoveryConfig;
 use pliant_stream::emulator::LinkConfig;
-use pliant_stream::experiment::{Experiment, Figures};
 use support::bar;
 
 fn run(change: impl Fn(&mut Experiment)) -> Figures {

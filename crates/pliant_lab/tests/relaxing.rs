@@ -5,10 +5,10 @@ mod support;
 
 use std::time::Duration;
 
+use pliant_lab::experiment::Experiment;
 use pliant_modal::{Body, BodyConfig, GrabConfig, Integrator, Patch, Relaxation};
 use pliant_stream::emulator::{LinkConfig, Loss, Preset};
 use pliant_stream::encoder::Encoder;
-use pliant_stream::experiment::Experiment;
 use pliant_stream::peer::Repair;
 use pliant_stream::recovery::Receiver;
 use pliant_stream::wire::Datagram;
@@ -156,7 +156,7 @@ fn a_wrong_flow_is_forgotten_by_every_policy_and_put_right_by_slices() {
 fn a_guest_joins_follows_rests_and_feels_a_relaxing_body() {
     let model = bar(40, 0.05);
     let settings = StepSettings { relaxation: Some(MATERIAL), ..Default::default() };
-    let mut pair = pliant_stream::pair::Pair::new(HostConfig::default()).unwrap();
+    let mut pair = pliant_lab::pair::Pair::new(HostConfig::default()).unwrap();
     pair.host.add_body(BODY, "bar", model.clone(), settings).unwrap();
     let mut scene = Scene::with(&model, &settings);
     scene.hand = circling();

@@ -5,9 +5,9 @@ mod support;
 
 use std::time::Duration;
 
+use pliant_lab::pair::{Pair, PathConfig, World};
 use pliant_modal::{Body, BodyConfig};
 use pliant_stream::emulator::LinkConfig;
-use pliant_stream::pair::{Pair, PathConfig, World};
 use pliant_stream::{
     BodyId, EndReason, GuestConfig, GuestEvent, GuestSession, HostConfig, HostEvent, HostSession, PeerId,
     StepSettings, UserId,

@@ -4,14 +4,14 @@
 mod support;
 
 use pliant_modal::{BodyConfig, StepSettings};
-use pliant_stream::{GuestConfig, GuestEvent, HostConfig, StepSettings};
+use pliant_stream::{GuestConfig, GuestEvent, HostConfig};
 use support::bar;
 use support::scene::{BODY, S, Scene, cached, circling, paper1};
 
 /// The worst error of what is shown from a second after the change on, as a share of the largest shape; and how far the stream had got.
 fn after_a_change(told: bool, scale: f64) -> f64 {
     let model = bar(24, 0.05);
-    let mut pair = pliant_stream::pair::Pair::new(HostConfig::default()).unwrap();
+    let mut pair = pliant_lab::pair::Pair::new(HostConfig::default()).unwrap();
     let settings = StepSettings::default();
     pair.host.add_body(BODY, "bar", model.clone(), settings).unwrap();
     let mut scene = Scene::with(&model, &settings);
@@ -55,7 +55,7 @@ fn guests_follow_a_body_that_becomes_stiffer_or_softer_with_their_hands_on_it() 
 #[test]
 fn settings_of_another_body_under_a_known_number_ends_the_session() {
     let model = bar(12, 0.05);
-    let mut pair = pliant_stream::pair::Pair::new(HostConfig::default()).unwrap();
+    let mut pair = pliant_lab::pair::Pair::new(HostConfig::default()).unwrap();
     pair.host.add_body(BODY, "bar", model.clone(), StepSettings::default()).unwrap();
     let mut scene = Scene::new(&model);
     pair.join_with(GuestConfig::default(), paper1(), 1, cached(&model)).unwrap();

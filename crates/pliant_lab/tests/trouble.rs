@@ -5,8 +5,8 @@ mod support;
 
 use std::time::Duration;
 
+use pliant_lab::pair::PathConfig;
 use pliant_stream::emulator::{LinkConfig, Loss, Preset};
-use pliant_stream::pair::PathConfig;
 use pliant_stream::{GrabKey, GuestConfig, GuestEvent, HostConfig, PeerId, Playout, RecoveryConfig, UserId};
 use support::bar;
 use support::scene::{BODY, MS, S, cached, circling, paper1, path_for, start, start_with};

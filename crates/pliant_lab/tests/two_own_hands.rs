@@ -9,9 +9,9 @@ mod support;
 use std::sync::Arc;
 use std::time::Duration;
 
+use pliant_lab::pair::{PathConfig, World};
 use pliant_modal::{GrabConfig, ModalModel};
 use pliant_stream::emulator::{LinkConfig, Preset};
-use pliant_stream::pair::{PathConfig, World};
 use pliant_stream::{GuestConfig, GuestEvent, GuestSession, HostEvent, HostSession};
 use support::bar;
 use support::scene::{BODY, HandScript, S, Scene, cached, start};

@@ -2,6 +2,7 @@
 //!
 //! All in virtual time: ten minutes of a session take seconds, and the same seed gives the same figures and the same hash.
 
+mod peers;
 mod run;
 mod shape_error;
 
@@ -9,20 +10,17 @@ use std::sync::Arc;
 use std::time::Duration;
 
 use pliant_modal::{Body, BodyConfig, Integrator, ModalModel, Relaxation, StepSettings};
+use pliant_stream::emulator::LinkConfig;
+use pliant_stream::{
+    BodyId, GuestConfig, HostConfig, Newmark, PeerId, RecoveryConfig, RepairCounts, StreamError,
+};
 
-use crate::StreamError;
-use crate::emulator::LinkConfig;
-use crate::newmark::Newmark;
 use crate::pair::{Pair, PathConfig};
-use crate::recovery::{RecoveryConfig, RepairCounts};
-use crate::session::{GuestConfig, HostConfig};
-use crate::state::BodyId;
-
 use run::Run;
-pub(crate) use shape_error::ShapeError;
+use shape_error::ShapeError;
 
 /// Shown error above which a body counts as not recovered, share of the largest displacement.
-pub(crate) const RECOVERED: f64 = 0.005;
+const RECOVERED: f64 = 0.005;
 
 /// What to measure.
 #[derive(Debug, Clone)]
@@ -131,7 +129,7 @@ pub struct Figures {
     /// The same of the true reaction.
     pub true_ringing: f64,
     /// From a hand's motion to the force that answers it, ms; reckoned, not timed. Where the policy owns the model it is one
-    /// tick by construction (the guest's own copy answers at its next step, see [`crate::BodyView::own_hand`]), else the round trip and the delays on the way.
+    /// tick by construction (the guest's own copy answers at its next step, see [`pliant_stream::BodyView::own_hand`]), else the round trip and the delays on the way.
     pub hand_to_force_ms: f64,
     /// How far the shown tick lies behind its step at the host, ms, mean.
     pub shown_delay_ms: f64,
@@ -250,11 +248,11 @@ impl Experiment {
         let mut down = self.down.clone();
         down.loss = down.loss.shifted(link.counts().sent, joined);
         link.reconfigure(down)?;
-        let before = pair.host.stats(crate::state::PeerId(1)).unwrap_or_default();
+        let before = pair.host.stats(PeerId(1)).unwrap_or_default();
         let until = joined + Duration::from_secs_f64(self.seconds.clamp(0.1, 1e6));
         pair.run_until(until, &mut run);
         // A guest that the host has let go has no counts any more.
-        let after = pair.host.stats(crate::state::PeerId(1)).unwrap_or(before);
+        let after = pair.host.stats(PeerId(1)).unwrap_or(before);
         let guest = &pair.guests[0];
         run.end(until);
         let mut figures = run.figures(&guest.session);
@@ -272,19 +270,19 @@ impl Experiment {
     }
 }
 
-pub(crate) const BODY: BodyId = BodyId(1);
+const BODY: BodyId = BodyId(1);
 
 fn model_error(e: impl std::fmt::Display) -> StreamError {
     StreamError::Model(e.to_string())
 }
 
-pub(crate) fn fold(mut hash: u64, bytes: &[u8]) -> u64 {
+fn fold(mut hash: u64, bytes: &[u8]) -> u64 {
     for b in bytes {
         hash = (hash ^ u64::from(*b)).wrapping_mul(0x0000_0100_0000_01B3);
     }
     hash
 }
 
-pub(crate) fn norm(v: [f64; 3]) -> f64 {
+fn norm(v: [f64; 3]) -> f64 {
     v.iter().map(|x| x * x).sum::<f64>().sqrt()
 }

@@ -4,13 +4,11 @@ use std::collections::BTreeMap;
 use std::time::Duration;
 
 use pliant_modal::{GrabConfig, StepSettings};
+use pliant_stream::emulator::{Link, LinkConfig, Loss};
+use pliant_stream::peer::{PeerConfig, PeerSession, Repair};
+use pliant_stream::{Channel, PeerId, StreamError, Tick, UserId};
 
-use crate::StreamError;
-use crate::emulator::{Link, LinkConfig, Loss};
-use crate::experiment::{BODY, Experiment, Figures, ShapeError, fold, norm};
-use crate::peer::{PeerConfig, PeerSession, Repair};
-use crate::session::Channel;
-use crate::state::{PeerId, Tick, UserId};
+use super::{BODY, Experiment, Figures, RECOVERED, ShapeError, fold, norm};
 
 /// How often a peer's application looks at its session.
 const LOOK: Duration = Duration::from_millis(5);
@@ -20,7 +18,7 @@ const SETTLED: Duration = Duration::from_secs(3);
 struct Seen {
     at: Duration,
     q: Vec<f64>,
-    reactions: Vec<(u16, [f64; 3])>,
+    reactions: Vec<(UserId, [f64; 3])>,
 }
 
 impl Experiment {
@@ -60,7 +58,7 @@ impl Experiment {
         let mut grabs: Vec<Option<u16>> = vec![None; self.hands.len()];
         let mut seen: BTreeMap<Tick, Seen> = BTreeMap::new();
         let mut truth: BTreeMap<Tick, Vec<f64>> = BTreeMap::new();
-        let mut reactions: BTreeMap<Tick, Vec<(u16, [f64; 3])>> = BTreeMap::new();
+        let mut reactions: BTreeMap<Tick, Vec<(UserId, [f64; 3])>> = BTreeMap::new();
         let mut now = Duration::ZERO;
         let until = SETTLED + Duration::from_secs_f64(self.seconds.clamp(0.1, 1e6));
         let (mut spent, mut sent) = (Duration::ZERO, (0_u64, 0_u64));
@@ -99,7 +97,7 @@ impl Experiment {
                     && now >= SETTLED
                     && let Some(body) = peers[1].body(BODY)
                 {
-                    let reactions = body.grabs().iter().map(|g| (g.key.user.0, g.reaction)).collect();
+                    let reactions = body.grabs().iter().map(|g| (g.key.user, g.reaction)).collect();
                     seen.insert(peers[1].tick(), Seen { at: now, q: body.shown().q.clone(), reactions });
                 }
                 while let Some(out) = peers[k].poll_output() {
@@ -115,7 +113,7 @@ impl Experiment {
             for tick in confirmed.saturating_sub(8)..=confirmed {
                 if let Some(state) = peers[0].state_at(BODY, tick) {
                     truth.insert(tick, state.q.clone());
-                    if let Some(r) = peers[0].body(BODY).and_then(|b| b.reactions_at(tick)) {
+                    if let Some(r) = peers[0].reactions_at(BODY, tick) {
                         reactions.insert(tick, r);
                     }
                 }
@@ -129,7 +127,7 @@ impl Experiment {
         &self,
         seen: &BTreeMap<Tick, Seen>,
         truth: &BTreeMap<Tick, Vec<f64>>,
-        reactions: &BTreeMap<Tick, Vec<(u16, [f64; 3])>>,
+        reactions: &BTreeMap<Tick, Vec<(UserId, [f64; 3])>>,
         link: &Link,
         spent: Duration,
         sent: (u64, u64),
@@ -137,7 +135,7 @@ impl Experiment {
         // Taking hold is not part of what is measured.
         let first = seen.keys().next().copied().unwrap_or(0);
         let truth: BTreeMap<Tick, &Vec<f64>> = truth.range(first..).map(|(t, q)| (*t, q)).collect();
-        let reactions: BTreeMap<Tick, &Vec<(u16, [f64; 3])>> =
+        let reactions: BTreeMap<Tick, &Vec<(UserId, [f64; 3])>> =
             reactions.range(first..).map(|(t, r)| (*t, r)).collect();
         let shape = ShapeError::new(&self.model);
         let scale = truth.values().map(|q| shape.compare(q, &[]).1.sqrt()).fold(0.0, f64::max);
@@ -155,7 +153,7 @@ impl Experiment {
             largest = largest.max(most);
             last = most;
             f.ticks += 1;
-            if most.sqrt() > crate::experiment::RECOVERED * scale {
+            if most.sqrt() > RECOVERED * scale {
                 let from: &mut Duration = above.get_or_insert(s.at);
                 longest = longest.max(s.at.saturating_sub(*from));
             } else {
@@ -175,7 +173,7 @@ impl Experiment {
                 series.windows(3).map(|w| norm(std::array::from_fn(|k| w[2][k] - 2.0 * w[1][k] + w[0][k])));
             all.fold(0.0, f64::max)
         };
-        let of_first = |r: &[(u16, [f64; 3])]| r.iter().find(|r| r.0 == 1).map(|r| r.1);
+        let of_first = |r: &[(UserId, [f64; 3])]| r.iter().find(|r| r.0 == UserId(1)).map(|r| r.1);
         let percent = |x: f64, scale: f64| if scale > 0.0 { 100.0 * x / scale } else { 0.0 };
         let ticks = f.ticks.max(1) as f64;
         f.rms_percent = percent((sum / ticks / shape.places()).sqrt(), scale);

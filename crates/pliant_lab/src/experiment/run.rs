@@ -4,12 +4,12 @@ use std::collections::VecDeque;
 use std::time::Duration;
 
 use pliant_modal::{Body, GrabConfig, GrabId, Patch};
+use pliant_stream::{
+    GrabKey, GrabState, GuestSession, HostEvent, HostSession, Policy, Pose, TickState, UserId,
+};
 
 use super::{BODY, Experiment, Figures, Hand, RECOVERED, ShapeError, fold, norm};
 use crate::pair::World;
-use crate::recovery::Policy;
-use crate::session::{GuestSession, HostEvent, HostSession};
-use crate::state::{GrabKey, GrabState, Pose, TickState, UserId};
 
 /// Truth kept for comparison, ticks.
 const KEPT: usize = 4096;

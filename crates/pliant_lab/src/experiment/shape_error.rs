@@ -7,12 +7,12 @@ const SAMPLES: usize = 48;
 
 /// Compares shapes at some surface vertices, evenly chosen; unwarped, so that the same difference of coordinates counts
 /// the same in every shape.
-pub(crate) struct ShapeError {
+pub(super) struct ShapeError {
     rows: Vec<Vec<[f64; 3]>>,
 }
 
 impl ShapeError {
-    pub(crate) fn new(model: &ModalModel) -> Self {
+    pub(super) fn new(model: &ModalModel) -> Self {
         let vertices = model.surface().positions().len();
         let row = |v: usize, mode: usize| -> [f64; 3] {
             std::array::from_fn(|a| f64::from(model.displacement_row(v as u32, a, mode)))
@@ -23,12 +23,12 @@ impl ShapeError {
     }
 
     /// How many places there are.
-    pub(crate) fn places(&self) -> f64 {
+    pub(super) fn places(&self) -> f64 {
         self.rows.len().max(1) as f64
     }
 
     /// Squared differences at the places, m^2: sum and largest. Missing coordinates count as 0.
-    pub(crate) fn compare(&self, a: &[f64], b: &[f64]) -> (f64, f64) {
+    pub(super) fn compare(&self, a: &[f64], b: &[f64]) -> (f64, f64) {
         let (mut sum, mut largest) = (0.0, 0.0_f64);
         for rows in &self.rows {
             let mut u = [0.0; 3];

@@ -7,20 +7,23 @@ use pliant_modal::{Element, Integrator};
 use pliant_stream::{
     Policy, RecoveryConfig,
     emulator::{LinkConfig, Preset},
-    experiment::{Experiment, Figures},
 };
 
 use super::{
     plot::{Figure, Series},
     work::{anchor, baked, config},
 };
-use crate::{CliError, progress::Bar};
+use crate::{
+    LabError,
+    experiment::{Experiment, Figures},
+    progress::Progress,
+};
 
 /// Steps a second, as the paper's.
 const RATE: f64 = 40.0;
 
 /// As many modes as the paper's largest row.
-fn experiment(modes: usize, link: LinkConfig, recovery: RecoveryConfig) -> Result<Experiment, CliError> {
+fn experiment(modes: usize, link: LinkConfig, recovery: RecoveryConfig) -> Result<Experiment, LabError> {
     let mesh = shapes::bar([8, 2, 2], [1.0, 0.2, 0.2])?;
     let (model, _) = baked(&mesh, &config(Element::Tet10, modes, vec![anchor(0, 1e-9)]))?;
     let mut made = Experiment::new(model, link, recovery);
@@ -35,7 +38,7 @@ fn bytes_a_tick(kbit_s: f64) -> f64 {
 }
 
 /// One source of error: how coarse the numbers of a frame are, without any loss.
-pub(super) fn quantised(quick: bool, bar: &mut Bar) -> Result<Figure, CliError> {
+pub(super) fn quantised(quick: bool, progress: &mut dyn Progress) -> Result<Figure, LabError> {
     let powers: &[i32] = if quick { &[4, 8, 14, 20] } else { &[4, 6, 8, 10, 12, 14, 16, 18, 20, 24] };
     let mut series = Vec::new();
     let mut words = "What one step of a quantised number moves the surface by, as a share of how far the body is bent, from left to right 2^-4 to 2^-20 and finer (default 2^-14; streams of \
@@ -48,7 +51,7 @@ pub(super) fn quantised(quick: bool, bar: &mut Bar) -> Result<Figure, CliError> 
         let mut made = experiment(120, LinkConfig::preset(Preset::Paper4), recovery)?;
         made.seconds = if quick { 10.0 } else { 30.0 };
         for (index, &power) in powers.iter().enumerate() {
-            bar.report("frames", 0.5 * (done as f64 + index as f64 / powers.len() as f64));
+            progress.report("frames", 0.5 * (done as f64 + index as f64 / powers.len() as f64));
             made.quantum = 2.0f64.powi(-power);
             let f = made.run()?;
             points.push((bytes_a_tick(f.kbit_s), f.rms_percent.max(1e-9)));
@@ -78,7 +81,7 @@ pub(super) fn quantised(quick: bool, bar: &mut Bar) -> Result<Figure, CliError> 
 }
 
 /// The paper's networks with what crosses them: its loss and bandwidth, and bytes beside those that it gives.
-pub(super) fn table_3(quick: bool, bar: &mut Bar) -> Result<String, CliError> {
+pub(super) fn table_3(quick: bool, progress: &mut dyn Progress) -> Result<String, LabError> {
     // Loss in % and bandwidth in Mb/s as the paper's; its round trips are in a figure only, but for the first.
     const PAPER: [(Preset, f64, f64, &str); 4] = [
         (Preset::Paper1, 9.0, 2.0, "196"),
@@ -89,7 +92,7 @@ pub(super) fn table_3(quick: bool, bar: &mut Bar) -> Result<String, CliError> {
     let mut out = "| network | loss % | Mb/s | round trip ms | repair | down, bytes a tick (paper: 2,000-3,000) | up with a hand, bytes a tick (paper: 1,000-2,000) | of the bandwidth % | frames lost | shown error rms / largest % | reaction rms % |\n| --- | --- | --- | --- | --- | --- | --- | --- | --- | --- | --- |\n".to_owned();
     for (done, (preset, loss, megabits, trip)) in PAPER.into_iter().enumerate() {
         for name in ["paper", "paper-zero", "default"] {
-            bar.report("table 3", done as f64 / 4.0);
+            progress.report("table 3", done as f64 / 4.0);
             let recovery = RecoveryConfig::by_name(name).unwrap_or_default();
             let mut made = experiment(120, LinkConfig::preset(preset), recovery)?;
             made.seconds = if quick { 20.0 } else { 60.0 };

@@ -9,7 +9,6 @@ use pliant_modal::{
 use pliant_stream::{
     Policy, RecoveryConfig,
     emulator::{LinkConfig, Preset},
-    experiment::Experiment,
 };
 
 use super::{
@@ -17,7 +16,7 @@ use super::{
     plot::{Figure, Series},
     work::{anchor, baked, config},
 };
-use crate::{CliError, machine::Pinned, progress::Bar};
+use crate::{LabError, experiment::Experiment, machine::Pinned, progress::Progress};
 
 /// Surfaces a second.
 const PICTURES: f64 = 60.0;
@@ -43,7 +42,7 @@ fn shared(model: &ModalModel, places: &[[f32; 3]]) -> Option<Vec<usize>> {
 }
 
 /// Two seconds under a hand that circles, further and further out for the first of them.
-fn moving(model: &Arc<ModalModel>, places: &[usize], config: BodyConfig) -> Result<Run, CliError> {
+fn moving(model: &Arc<ModalModel>, places: &[usize], config: BodyConfig) -> Result<Run, LabError> {
     let _pinned = Pinned::new();
     let (step, per) = (config.step, (1.0 / PICTURES / config.step).round().max(1.0) as usize);
     let mut body = Body::new(model.clone(), config)?;
@@ -144,18 +143,21 @@ fn advice(front: &[&Choice], error: impl Fn(&Choice) -> f64, what: &str) -> Stri
     out + ". "
 }
 
-pub(super) fn all_together(quick: bool, bar: &mut Bar) -> Result<(Vec<Figure>, String), CliError> {
-    let (mut figures, mut words) = local(quick, bar)?;
-    let (figure, more) = over_network(quick, bar)?;
+pub(super) fn all_together(
+    quick: bool,
+    progress: &mut dyn Progress,
+) -> Result<(Vec<Figure>, String), LabError> {
+    let (mut figures, mut words) = local(quick, progress)?;
+    let (figure, more) = over_network(quick, progress)?;
     figures.push(figure);
     words += &more;
     Ok((figures, words))
 }
 
-fn local(quick: bool, bar: &mut Bar) -> Result<(Vec<Figure>, String), CliError> {
+fn local(quick: bool, progress: &mut dyn Progress) -> Result<(Vec<Figure>, String), LabError> {
     let size = [1.0, 0.2, 0.2];
     let held = |element, modes| config(element, modes, vec![anchor(0, 1e-9)]);
-    bar.report("front", 0.0);
+    progress.report("front", 0.0);
     let coarse = shapes::bar([8, 2, 2], size)?;
     let models = [Element::Tet10, Element::Tet4]
         .map(|element| baked(&coarse, &held(element, 60)).map(|(model, seconds)| (element, model, seconds)));
@@ -163,14 +165,14 @@ fn local(quick: bool, bar: &mut Bar) -> Result<(Vec<Figure>, String), CliError> 
     let models = [ten?, four?];
     let places = models[0].1.surface().positions().to_vec();
     let every = |model: &ModalModel| {
-        shared(model, &places).ok_or(CliError::Bake(pliant_bake::BakeError::Parameter {
+        shared(model, &places).ok_or(LabError::Bake(pliant_bake::BakeError::Parameter {
             name: "places",
             expected: "vertices that all meshes share",
             got: places.len() as f64,
         }))
     };
     // The reference: far finer mesh, twice the modes, far shorter steps of second order; and what it is off by, by a mesh between.
-    let fine = |cells: [usize; 3], rate: f64| -> Result<Run, CliError> {
+    let fine = |cells: [usize; 3], rate: f64| -> Result<Run, LabError> {
         let (model, _) = baked(&shapes::bar(cells, size)?, &held(Element::Tet10, 120))?;
         let places = every(&model)?;
         moving(
@@ -200,7 +202,7 @@ fn local(quick: bool, bar: &mut Bar) -> Result<(Vec<Figure>, String), CliError> 
                 for modes in [3, 6, 12, 24, 60] {
                     for (precision, half) in [(Precision::Single, ""), (Precision::Half, ", half precision")]
                     {
-                        bar.report("front", choices.len() as f64 / (20 * rates.len() * 2) as f64);
+                        progress.report("front", choices.len() as f64 / (20 * rates.len() * 2) as f64);
                         let setting = BodyConfig {
                             step: 1.0 / rate,
                             modes: Some(modes),
@@ -353,14 +355,14 @@ fn local(quick: bool, bar: &mut Bar) -> Result<(Vec<Figure>, String), CliError> 
 }
 
 /// The second front: how a guest is kept up to date over the paper's worst network.
-fn over_network(quick: bool, bar: &mut Bar) -> Result<(Figure, String), CliError> {
+fn over_network(quick: bool, progress: &mut dyn Progress) -> Result<(Figure, String), LabError> {
     let (model, _) =
         baked(&shapes::bar([8, 2, 2], [1.0, 0.2, 0.2])?, &config(Element::Tet10, 60, vec![anchor(0, 1e-9)]))?;
     let powers: &[i32] = if quick { &[6, 14] } else { &[4, 6, 8, 10, 14, 18] };
     let mut choices: Vec<Choice> = Vec::new();
     let mut names = Vec::new();
     for (line, name) in RecoveryConfig::NAMES.into_iter().filter(|name| *name != "none").enumerate() {
-        bar.report("network", line as f64 / RecoveryConfig::NAMES.len() as f64);
+        progress.report("network", line as f64 / RecoveryConfig::NAMES.len() as f64);
         names.push(name);
         let recovery = RecoveryConfig::by_name(name).unwrap_or_default();
         for &power in powers {

@@ -1,4 +1,4 @@
-//! `pliant report`: what the method costs and what it is off by, remade on this machine: tables, CSV, SVG, PNG and the words for them.
+//! What the method costs and what it is off by, remade on this machine: tables, CSV, SVG, PNG and the words for them.
 
 mod frames;
 mod front;
@@ -8,83 +8,155 @@ mod tables;
 mod warp;
 mod work;
 
-use std::{fmt::Write, path::PathBuf, time::Instant};
+use std::{
+    fmt::Write,
+    path::{Path, PathBuf},
+    time::Instant,
+};
 
-use clap::Args;
 use serde::Serialize;
 
-use crate::{CliError, machine, output, progress::Bar};
+use crate::{LabError, machine, progress::Progress};
 use plot::Figure;
 
-const PARTS: [&str; 13] = [
-    "elements",
-    "modes",
-    "steps",
-    "warp",
-    "precision",
-    "frames",
-    "network",
-    "front",
-    "table-2",
-    "table-3",
-    "courses",
-    "default",
-    "all",
-];
-
-#[derive(Args, Debug)]
-pub(crate) struct ReportArgs {
-    /// Only one part: elements, modes, steps, warp, precision, frames, network, front, table-2, table-3, courses, default
-    #[arg(long, default_value = "all")]
-    only: String,
-    /// Fewer points and shorter timings: within ten minutes on two cores
-    #[arg(long)]
-    quick: bool,
-    /// Surfaces that are measured when they are there: bunny.obj, armadillo.obj
-    #[arg(long, value_name = "DIR", default_value = "../shared/models")]
-    models: PathBuf,
-    /// The project's own body: a surface or a scene
-    #[arg(long, value_name = "FILE", default_value = "assets/pip.ron")]
-    own: PathBuf,
-    /// The folder to write
-    #[arg(short, long, value_name = "DIR")]
-    output: PathBuf,
-    /// Prints one line of JSON: the parts, their files and seconds
-    #[arg(long)]
-    json: bool,
+/// A part of the report.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Part {
+    /// Elements and mesh size.
+    Elements,
+    /// Modes kept.
+    Modes,
+    /// Integrator and step.
+    Steps,
+    /// The warp against a nonlinear solution.
+    Warp,
+    /// Half precision of the basis.
+    Precision,
+    /// Quantised frames.
+    Frames,
+    /// Ways of repair on the paper's networks.
+    Network,
+    /// Everything together: what a user chooses from.
+    Front,
+    /// The paper's table 2.
+    Table2,
+    /// The paper's networks and what crosses them.
+    Table3,
+    /// The paper's figures 7 to 9.
+    Courses,
+    /// The default at run time, in words.
+    Default,
 }
 
-#[derive(Serialize, Debug)]
-struct Part {
-    name: &'static str,
-    files: Vec<String>,
-    seconds: f64,
-}
+impl Part {
+    /// All of them, in the order of the report.
+    pub const ALL: [Self; 12] = [
+        Self::Elements,
+        Self::Modes,
+        Self::Steps,
+        Self::Warp,
+        Self::Precision,
+        Self::Frames,
+        Self::Network,
+        Self::Front,
+        Self::Table2,
+        Self::Table3,
+        Self::Courses,
+        Self::Default,
+    ];
 
-#[derive(Serialize, Debug)]
-struct Told {
-    parts: Vec<Part>,
-    seconds: f64,
-}
-
-pub(crate) fn run(args: &ReportArgs) -> Result<(), CliError> {
-    if !PARTS.contains(&args.only.as_str()) {
-        return Err(CliError::Unknown { what: "--only", got: args.only.clone(), expected: PARTS.join(", ") });
+    /// Its name: lower case, such as `table-2`.
+    pub fn name(self) -> &'static str {
+        match self {
+            Self::Elements => "elements",
+            Self::Modes => "modes",
+            Self::Steps => "steps",
+            Self::Warp => "warp",
+            Self::Precision => "precision",
+            Self::Frames => "frames",
+            Self::Network => "network",
+            Self::Front => "front",
+            Self::Table2 => "table-2",
+            Self::Table3 => "table-3",
+            Self::Courses => "courses",
+            Self::Default => "default",
+        }
     }
-    std::fs::create_dir_all(&args.output)?;
+
+    /// The part of this name.
+    pub fn by_name(name: &str) -> Option<Self> {
+        Self::ALL.into_iter().find(|part| part.name() == name)
+    }
+
+    fn title(self) -> &'static str {
+        match self {
+            Self::Elements => "a. Elements and mesh size",
+            Self::Modes => "b. Modes kept",
+            Self::Steps => "c. Integrator and step",
+            Self::Warp => "d. Warp against a nonlinear solution",
+            Self::Precision => "e. Precision",
+            Self::Frames => "e. Quantised frames",
+            Self::Network => "f. Network",
+            Self::Front => "g. All together",
+            Self::Table2 => "The paper's table 2",
+            Self::Table3 => "The paper's networks and what crosses them (its table 3)",
+            Self::Courses => "The paper's figures 7, 8 and 9",
+            Self::Default => "The default at run time, in words",
+        }
+    }
+}
+
+/// What to report on.
+#[derive(Debug, Clone)]
+pub struct Settings {
+    /// Parts to make, in this order.
+    pub parts: Vec<Part>,
+    /// Fewer points and shorter timings.
+    pub quick: bool,
+    /// The folder of surfaces that are measured when they are there: bunny.obj, armadillo.obj.
+    pub models: PathBuf,
+    /// The project's own body: a surface or a scene.
+    pub own: PathBuf,
+}
+
+/// A part as it was written.
+#[derive(Serialize, Debug, Clone)]
+pub struct Written {
+    /// Its name.
+    pub name: &'static str,
+    /// Names of its files within the folder.
+    pub files: Vec<String>,
+    /// What it took, s.
+    pub seconds: f64,
+}
+
+/// What was written.
+#[derive(Serialize, Debug, Clone)]
+pub struct Report {
+    /// The parts, in their order.
+    pub parts: Vec<Written>,
+    /// What all of it took, s.
+    pub seconds: f64,
+}
+
+/// Measures, and writes `report.md` with its figures (CSV, SVG and PNG) into a folder, which is made if it is not there.
+///
+/// # Errors
+/// [`LabError::Write`] or [`LabError::Plot`] for files, the others for what cannot be measured.
+pub fn write(folder: &Path, settings: &Settings, progress: &mut dyn Progress) -> Result<Report, LabError> {
+    std::fs::create_dir_all(folder)?;
     let began = Instant::now();
     let mut text = heading();
     let load = machine::load();
-    let mut told = Told { parts: Vec::new(), seconds: 0.0 };
-    let mut bar = Bar::new();
-    for name in PARTS.into_iter().filter(|p| *p != "all" && (args.only == "all" || args.only == *p)) {
-        bar.report(name, 0.0);
+    let mut report = Report { parts: Vec::new(), seconds: 0.0 };
+    for &part in &settings.parts {
+        progress.report(part.name(), 0.0);
         let start = Instant::now();
-        let (figures, words) = part(name, args, &mut bar)?;
+        let (figures, words) = measure(part, settings, progress)?;
         let mut files = Vec::new();
-        let _ = writeln!(text, "\n## {}\n", title(name));
+        let _ = writeln!(text, "\n## {}\n", part.title());
         for figure in &figures {
-            plot::write(&args.output, figure)?;
+            plot::write(folder, figure)?;
             let _ = writeln!(text, "![{}]({}.svg)\n\n{}", figure.title, figure.file, figure.words);
             if let Some(error) = figure.reference_error {
                 let _ = writeln!(text, "The reference itself is off by about {error:.1e}.");
@@ -93,66 +165,43 @@ pub(crate) fn run(args: &ReportArgs) -> Result<(), CliError> {
             files.extend(["csv", "svg", "png"].map(|e| format!("{}.{e}", figure.file)));
         }
         let _ = writeln!(text, "{words}");
-        told.parts.push(Part { name, files, seconds: start.elapsed().as_secs_f64() });
+        report.parts.push(Written { name: part.name(), files, seconds: start.elapsed().as_secs_f64() });
     }
-    drop(bar);
-    told.seconds = began.elapsed().as_secs_f64();
+    report.seconds = began.elapsed().as_secs_f64();
     let _ = writeln!(
         text,
         "\nMade in {:.0} s by `pliant report{}`. {}",
-        told.seconds,
-        if args.quick { " --quick" } else { "" },
+        report.seconds,
+        if settings.quick { " --quick" } else { "" },
         quiet(load, machine::load()),
     );
-    std::fs::write(args.output.join("report.md"), text)?;
-    if args.json {
-        return output::print_json(&told);
-    }
-    output::print(&format!("{} in {:.0} s", args.output.join("report.md").display(), told.seconds))
+    std::fs::write(folder.join("report.md"), text)?;
+    Ok(report)
 }
 
-fn title(part: &str) -> &'static str {
-    match part {
-        "elements" => "a. Elements and mesh size",
-        "modes" => "b. Modes kept",
-        "steps" => "c. Integrator and step",
-        "warp" => "d. Warp against a nonlinear solution",
-        "precision" => "e. Precision",
-        "frames" => "e. Quantised frames",
-        "network" => "f. Network",
-        "front" => "g. All together",
-        "table-2" => "The paper's table 2",
-        "table-3" => "The paper's networks and what crosses them (its table 3)",
-        "courses" => "The paper's figures 7, 8 and 9",
-        _ => "The default at run time, in words",
-    }
-}
-
-fn part(name: &str, args: &ReportArgs, bar: &mut Bar) -> Result<(Vec<Figure>, String), CliError> {
-    let quick = args.quick;
-    Ok(match name {
-        "elements" => (physics::elements(quick)?, String::new()),
-        "modes" => (physics::modes(quick)?, String::new()),
-        "steps" => (physics::steps(quick)?, String::new()),
-        "warp" => (warp::warp(quick)?, String::new()),
-        "precision" => (vec![tables::precision()?], String::new()),
-        "frames" => (vec![frames::quantised(quick, bar)?], String::new()),
-        "network" => tables::networks(quick, bar)?,
-        "front" => front::all_together(quick, bar)?,
-        "table-2" => {
-            (Vec::new(), tables::table_2(&args.models, &args.own, if quick { 0.3 } else { 2.0 }, bar)?)
+fn measure(
+    part: Part,
+    settings: &Settings,
+    progress: &mut dyn Progress,
+) -> Result<(Vec<Figure>, String), LabError> {
+    let Settings { quick, models, own, .. } = settings;
+    let quick = *quick;
+    Ok(match part {
+        Part::Elements => (physics::elements(quick)?, String::new()),
+        Part::Modes => (physics::modes(quick)?, String::new()),
+        Part::Steps => (physics::steps(quick)?, String::new()),
+        Part::Warp => (warp::warp(quick)?, String::new()),
+        Part::Precision => (vec![tables::precision()?], String::new()),
+        Part::Frames => (vec![frames::quantised(quick, progress)?], String::new()),
+        Part::Network => tables::networks(quick, progress)?,
+        Part::Front => front::all_together(quick, progress)?,
+        Part::Table2 => (Vec::new(), tables::table_2(models, own, if quick { 0.3 } else { 2.0 }, progress)?),
+        Part::Table3 => (Vec::new(), frames::table_3(quick, progress)?),
+        Part::Courses => (tables::courses()?, String::new()),
+        Part::Default => {
+            let tets = if quick { [12_000, 2_000] } else { [50_000, 12_000] };
+            (Vec::new(), tables::default_setting(models, own, tets, progress)?)
         }
-        "table-3" => (Vec::new(), frames::table_3(quick, bar)?),
-        "courses" => (tables::courses()?, String::new()),
-        _ => (
-            Vec::new(),
-            tables::default_setting(
-                &args.models,
-                &args.own,
-                if quick { [12_000, 2_000] } else { [50_000, 12_000] },
-                bar,
-            )?,
-        ),
     })
 }
 
@@ -230,6 +279,14 @@ fn date(days: i64) -> [i64; 3] {
 
 #[cfg(test)]
 mod tests {
+    use super::Part;
+
+    #[test]
+    fn every_part_is_found_by_its_own_name() {
+        Part::ALL.iter().for_each(|part| assert_eq!(Part::by_name(part.name()), Some(*part)));
+        assert_eq!(Part::by_name("all"), None);
+    }
+
     #[test]
     fn dates_are_those_of_the_calendar() {
         assert_eq!(super::date(0), [1970, 1, 1]);

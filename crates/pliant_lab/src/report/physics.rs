@@ -13,13 +13,13 @@ use super::{
     plot::{Figure, Series},
     work::{anchor, baked, by_mass, config, farthest, time_us},
 };
-use crate::CliError;
+use crate::LabError;
 
 /// Free cube, nu = 0.3: `omega L sqrt(rho / mu)` of its first eleven elastic modes (Legendre-Ritz, order 12; Demarest 1971; the last three are exact).
 const CUBE: [f64; 11] =
     [2.8561, 2.8561, 3.8460, 3.8460, 3.8460, 3.9113, 3.9113, 3.9113, 4.44288, 4.44288, 4.44288];
 
-pub(super) fn elements(quick: bool) -> Result<Vec<Figure>, CliError> {
+pub(super) fn elements(quick: bool) -> Result<Vec<Figure>, LabError> {
     // The first bake of a program pays for its threads.
     baked(&shapes::cube(2, 1.0)?, &config(Element::Tet4, 11, Vec::new()))?;
     let mut series = Vec::new();
@@ -57,8 +57,8 @@ pub(super) fn elements(quick: bool) -> Result<Vec<Figure>, CliError> {
 }
 
 /// A held bar's first six frequencies, and how far its end gives way under a pull on it, against those of a far finer mesh of ten-node tetrahedra.
-fn against_finer(quick: bool) -> Result<[Figure; 2], CliError> {
-    let measure = |element: Element, n: usize| -> Result<(Vec<f64>, f64, f64), CliError> {
+fn against_finer(quick: bool) -> Result<[Figure; 2], LabError> {
+    let measure = |element: Element, n: usize| -> Result<(Vec<f64>, f64, f64), LabError> {
         let mesh = shapes::bar([5 * n, n, n], [1.0, 0.2, 0.2])?;
         let setting = config(element, 20, vec![anchor(0, 1e-9)]);
         let (model, seconds) = baked(&mesh, &setting)?;
@@ -171,7 +171,7 @@ struct Track {
 }
 
 /// Drags the end of a bar to the side in a second and holds it for one more.
-fn dragged(model: &Arc<ModalModel>, config: BodyConfig) -> Result<Track, CliError> {
+fn dragged(model: &Arc<ModalModel>, config: BodyConfig) -> Result<Track, LabError> {
     let per = (1.0 / 60.0 / config.step).round().max(1.0) as usize;
     let step = config.step;
     let mut body = Body::new(model.clone(), config)?;
@@ -200,11 +200,11 @@ fn relative(got: &[[f64; 3]], want: &[[f64; 3]]) -> f64 {
     (off / size.max(f64::MIN_POSITIVE)).sqrt()
 }
 
-fn bar() -> Result<TetMesh, CliError> {
+fn bar() -> Result<TetMesh, LabError> {
     Ok(shapes::bar([8, 2, 2], [1.0, 0.2, 0.2])?)
 }
 
-pub(super) fn modes(quick: bool) -> Result<Vec<Figure>, CliError> {
+pub(super) fn modes(quick: bool) -> Result<Vec<Figure>, LabError> {
     // Every mode that the mesh has: nothing is left out.
     let (full, _) = baked(&bar()?, &config(Element::Tet4, 216, vec![anchor(0, 1e-9)]))?;
     let elastic = BodyConfig::from(StepSettings { warp: false, ..Default::default() });
@@ -277,7 +277,7 @@ pub(super) fn modes(quick: bool) -> Result<Vec<Figure>, CliError> {
 }
 
 /// The first modes alone, with nothing for those left out.
-fn bare(model: &ModalModel, kept: usize) -> Result<ModalModel, CliError> {
+fn bare(model: &ModalModel, kept: usize) -> Result<ModalModel, LabError> {
     let mut parts: ModelParts = model.parts().clone();
     let per = 3 * parts.surface.positions().len();
     parts.omega.truncate(kept);
@@ -289,7 +289,7 @@ fn bare(model: &ModalModel, kept: usize) -> Result<ModalModel, CliError> {
     Ok(ModalModel::from_parts(parts)?)
 }
 
-pub(super) fn steps(quick: bool) -> Result<Vec<Figure>, CliError> {
+pub(super) fn steps(quick: bool) -> Result<Vec<Figure>, LabError> {
     let (model, _) = baked(&bar()?, &config(Element::Tet10, 20, vec![anchor(0, 1e-9)]))?;
     let alpha = Integrator::GeneralizedAlpha { rho_inf: 0.5 };
     let all = [
@@ -305,7 +305,7 @@ pub(super) fn steps(quick: bool) -> Result<Vec<Figure>, CliError> {
         ..BodyConfig::default()
     };
     // Free: a closed form exists, which `exact` is at any step.
-    let ring = |config: BodyConfig| -> Result<(Vec<[f64; 3]>, Vec<Vec<f64>>), CliError> {
+    let ring = |config: BodyConfig| -> Result<(Vec<[f64; 3]>, Vec<Vec<f64>>), LabError> {
         let per = (1.0 / 60.0 / config.step).round() as usize;
         let mut body = Body::new(model.clone(), config)?;
         let vertex = farthest(&model, [1.0, 0.01, 0.02]);

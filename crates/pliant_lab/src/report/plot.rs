@@ -8,7 +8,7 @@ use plotters::{
     style::{FontStyle, register_font},
 };
 
-use crate::CliError;
+use crate::LabError;
 
 /// One line of a figure.
 pub(super) struct Series {
@@ -74,7 +74,7 @@ fn colour(index: usize) -> RGBColor {
 }
 
 /// Writes all three files into a folder.
-pub(super) fn write(folder: &Path, figure: &Figure) -> Result<(), CliError> {
+pub(super) fn write(folder: &Path, figure: &Figure) -> Result<(), LabError> {
     static FONT: OnceLock<bool> = OnceLock::new();
     FONT.get_or_init(|| {
         register_font("sans-serif", FontStyle::Normal, epaint_default_fonts::UBUNTU_LIGHT).is_ok()
@@ -93,9 +93,9 @@ pub(super) fn write(folder: &Path, figure: &Figure) -> Result<(), CliError> {
     std::fs::write(folder.join(format!("{}.csv", figure.file)), csv)?;
     let svg = folder.join(format!("{}.svg", figure.file));
     draw(&SVGBackend::new(&svg, SIZE).into_drawing_area(), figure)
-        .map_err(|_| CliError::Plot(svg.clone()))?;
+        .map_err(|_| LabError::Plot(svg.clone()))?;
     let png = folder.join(format!("{}.png", figure.file));
-    draw(&BitMapBackend::new(&png, SIZE).into_drawing_area(), figure).map_err(|_| CliError::Plot(png.clone()))
+    draw(&BitMapBackend::new(&png, SIZE).into_drawing_area(), figure).map_err(|_| LabError::Plot(png.clone()))
 }
 
 fn range(values: impl Iterator<Item = f64>, logarithmic: bool) -> std::ops::Range<f64> {

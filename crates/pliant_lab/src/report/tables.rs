@@ -8,7 +8,6 @@ use pliant_modal::{BodyConfig, Element, Integrator, ModalModel, Patch, Precision
 use pliant_stream::{
     Newmark, Policy, Predict, RecoveryConfig,
     emulator::{LinkConfig, Loss, Preset},
-    experiment::{Experiment, Figures},
     peer::Repair,
     wire::AccelerationCoding,
 };
@@ -19,19 +18,20 @@ use super::{
     work::{anchor, baked, config, farthest, time_us},
 };
 use crate::{
-    CliError, bench,
+    LabError, bench,
+    experiment::{Experiment, Figures},
+    fill::fill,
     machine::{self, Pinned},
-    mesh,
-    progress::Bar,
+    progress::Progress,
 };
 
-fn body() -> Result<Arc<ModalModel>, CliError> {
+fn body() -> Result<Arc<ModalModel>, LabError> {
     Ok(baked(&shapes::bar([8, 2, 2], [1.0, 0.2, 0.2])?, &config(Element::Tet10, 60, vec![anchor(0, 1e-9)]))?
         .0)
 }
 
 /// Single against half precision of the basis, on a pose of every mode.
-pub(super) fn precision() -> Result<Figure, CliError> {
+pub(super) fn precision() -> Result<Figure, LabError> {
     let (model, _) = baked(
         &shapes::bar([60, 12, 12], [1.0, 0.2, 0.2])?,
         &config(Element::Tet4, 60, vec![anchor(0, 1e-9)]),
@@ -86,7 +86,7 @@ pub(super) fn precision() -> Result<Figure, CliError> {
 }
 
 /// Every way of repair on the four networks of the paper, over bytes and over processor time; a guest's ways, and those between equal peers.
-pub(super) fn networks(quick: bool, bar: &mut Bar) -> Result<(Vec<Figure>, String), CliError> {
+pub(super) fn networks(quick: bool, progress: &mut dyn Progress) -> Result<(Vec<Figure>, String), LabError> {
     let model = body()?;
     // Pinned (after the bake, whose threads would stay here), and the thread's own time: what else the machine does is not in it.
     let _pinned = Pinned::new();
@@ -102,7 +102,7 @@ pub(super) fn networks(quick: bool, bar: &mut Bar) -> Result<(Vec<Figure>, Strin
     for (done, (name, recovery, between_peers)) in ways.into_iter().enumerate() {
         let (mut bytes, mut time) = (Vec::new(), Vec::new());
         for preset in [Preset::Paper1, Preset::Paper2, Preset::Paper3, Preset::Paper4] {
-            bar.report("network", done as f64 / count);
+            progress.report("network", done as f64 / count);
             let mut experiment = Experiment::new(model.clone(), LinkConfig::preset(preset), recovery);
             if !matches!(recovery.policy, Policy::ForceDriven { .. }) {
                 experiment.integrator = Integrator::GeneralizedAlpha { rho_inf: 0.5 };
@@ -170,7 +170,7 @@ pub(super) fn networks(quick: bool, bar: &mut Bar) -> Result<(Vec<Figure>, Strin
 }
 
 /// The paper's figures 7 to 9: losses that its compensation takes out again, and what the default way shows with the same losses.
-pub(super) fn courses() -> Result<Vec<Figure>, CliError> {
+pub(super) fn courses() -> Result<Vec<Figure>, LabError> {
     let model = body()?;
     let mut random: Vec<u64> = (0..22u64).map(|k| 135 + (k * 7919 + 31) % 311).collect();
     random.sort_unstable();
@@ -181,7 +181,7 @@ pub(super) fn courses() -> Result<Vec<Figure>, CliError> {
     ];
     let mut out = Vec::new();
     for (number, title, lost) in cases {
-        let run = |mut recovery: RecoveryConfig, late: bool| -> Result<Figures, CliError> {
+        let run = |mut recovery: RecoveryConfig, late: bool| -> Result<Figures, LabError> {
             recovery.coding = AccelerationCoding::F64;
             let link = LinkConfig {
                 delay: Duration::from_millis(10),
@@ -269,7 +269,12 @@ fn verdict(single: f64, half: f64) -> String {
 }
 
 /// Table 2 beside the paper's numbers. Surfaces that may not be shipped are taken from `models` when they are there.
-pub(super) fn table_2(models: &Path, own: &Path, seconds: f64, bar: &mut Bar) -> Result<String, CliError> {
+pub(super) fn table_2(
+    models: &Path,
+    own: &Path,
+    seconds: f64,
+    progress: &mut dyn Progress,
+) -> Result<String, LabError> {
     let mut out = "| body | tetrahedra | modes | surface | bake s (paper) | step us, 50 % / 99 % | step and surface us, 50 % / 99 % | steps/s with surface and hand (paper) | ratio | the surface, of the memory's limit | half-precision basis: step and surface us, 50 % / 99 % | ratio | of the memory's limit | the bar |\n| --- | --- | --- | --- | --- | --- | --- | --- | --- | --- | --- | --- | --- | --- |\n".to_owned();
     for (name, tets, modes, paper_bake, paper_rate) in PAPER {
         let (source, label) = match name {
@@ -284,13 +289,13 @@ pub(super) fn table_2(models: &Path, own: &Path, seconds: f64, bar: &mut Bar) ->
         }
         let mesh = match &source {
             None => shapes::bar([20, 3, 3], [1.0, 0.15, 0.15])?,
-            Some(path) => mesh::fill(path, Some(tets), bar)?.0,
+            Some(path) => fill(path, Some(tets), progress)?.0,
         };
         let low = mesh.bounds()[0];
         let high = mesh.bounds()[1];
         let held =
             if source.is_none() { anchor(0, 1e-9) } else { anchor(1, low[1] + 0.06 * (high[1] - low[1])) };
-        bar.report("bake", 0.5);
+        progress.report("bake", 0.5);
         let (model, bake) =
             baked(&mesh, &BakeConfig { sites: None, ..config(Element::Tet4, modes, vec![held]) })?;
         let told = bench::measure(model.clone(), seconds, Precision::Single)?;
@@ -324,12 +329,12 @@ pub(super) fn default_setting(
     models: &Path,
     own: &Path,
     [four, ten]: [usize; 2],
-    bar: &mut Bar,
-) -> Result<String, CliError> {
+    progress: &mut dyn Progress,
+) -> Result<String, LabError> {
     let all: &[f64] = &[0.02, 0.05, 0.1, 0.2];
-    let mut out = setting(models, own, Element::Tet4, four, all, bar)?;
+    let mut out = setting(models, own, Element::Tet4, four, all, progress)?;
     out.push('\n');
-    out.push_str(&setting(models, own, Element::Tet10, ten, &all[1..3], bar)?);
+    out.push_str(&setting(models, own, Element::Tet10, ten, &all[1..3], progress)?);
     Ok(out)
 }
 
@@ -339,17 +344,17 @@ fn setting(
     element: Element,
     tets: usize,
     shares: &[f64],
-    bar: &mut Bar,
-) -> Result<String, CliError> {
+    progress: &mut dyn Progress,
+) -> Result<String, LabError> {
     let bunny = models.join("bunny.obj");
     let (path, name) = if bunny.is_file() { (bunny, "bunny") } else { (own.to_path_buf(), "own body") };
-    let (mesh, _) = mesh::fill(&path, Some(tets), bar)?;
+    let (mesh, _) = fill(&path, Some(tets), progress)?;
     let [low, high] = mesh.bounds();
     let setting = BakeConfig {
         sites: None,
         ..config(element, 60, vec![anchor(1, low[1] + 0.06 * (high[1] - low[1]))])
     };
-    bar.report("bake", 0.2);
+    progress.report("bake", 0.2);
     let (model, _) = baked(&mesh, &setting)?;
     let size = model.size();
     // Where the first mode moves most: a body is pulled where it gives.
@@ -377,7 +382,7 @@ fn setting(
     );
     let mut words = String::new();
     for &share in shares {
-        bar.report("nonlinear", share / 0.2);
+        progress.report("nonlinear", share / 0.2);
         let load =
             vec![DeadLoad { patch: patch.clone(), force: way.map(|x| share * size / give * x / length) }];
         let truth = match deflect(&mesh, &setting, &load) {

@@ -11,7 +11,7 @@ use super::{
     plot::{Figure, Series},
     work::{anchor, apart, baked, config, farthest, time_us},
 };
-use crate::CliError;
+use crate::LabError;
 
 /// A body held where a nonlinear solution has its patches, against that solution.
 pub(super) struct Held {
@@ -30,7 +30,7 @@ pub(super) fn held_as(
     load: &[DeadLoad],
     truth: &Deflection,
     body_config: BodyConfig,
-) -> Result<Held, CliError> {
+) -> Result<Held, LabError> {
     let mut body = Body::new(model.clone(), body_config)?;
     let mut grabs = Vec::new();
     for (dead, moved) in load.iter().zip(&truth.patches) {
@@ -69,7 +69,7 @@ pub(super) fn held_as(
     })
 }
 
-pub(super) fn warp(quick: bool) -> Result<Vec<Figure>, CliError> {
+pub(super) fn warp(quick: bool) -> Result<Vec<Figure>, LabError> {
     let thick = 0.1;
     let cells = [16, 2, 2];
     let mesh = shapes::bar(cells, [1.0, thick, thick])?;
@@ -79,7 +79,7 @@ pub(super) fn warp(quick: bool) -> Result<Vec<Figure>, CliError> {
     let corner = |y: f32, z: f32| farthest(&model, [10.0, y, z]);
     let patch = |v: u32| Patch::around(model.surface(), v, 0.06);
     let middle = Patch::around(model.surface(), nearest_end(&model, thick), 0.08)?;
-    let couple = |f: f64| -> Result<Vec<DeadLoad>, CliError> {
+    let couple = |f: f64| -> Result<Vec<DeadLoad>, LabError> {
         let at = [
             (1.0f32, 1.0f32, [0.0, -f, f]),
             (-1.0, -1.0, [0.0, f, -f]),
@@ -201,7 +201,7 @@ fn nearest_end(model: &ModalModel, thick: f64) -> u32 {
 }
 
 /// The same load on a finer mesh: how far from the reference's patch it has its own.
-fn on_finer(setting: &BakeConfig, thick: f64, force: f64, truth: &Deflection) -> Result<f64, CliError> {
+fn on_finer(setting: &BakeConfig, thick: f64, force: f64, truth: &Deflection) -> Result<f64, LabError> {
     let fine = shapes::bar([24, 4, 4], [1.0, thick, thick])?;
     let (model, _) = baked(&fine, &BakeConfig { modes: 4, ..setting.clone() })?;
     let patch = Patch::around(model.surface(), nearest_end(&model, thick), 0.08)?;

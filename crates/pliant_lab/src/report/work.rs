@@ -6,13 +6,13 @@ use pliant_bake::{Anchor, BakeConfig, Comparison, bake};
 use pliant_mesh::TetMesh;
 use pliant_modal::{Damping, Element, ModalModel};
 
-use crate::{CliError, machine::Pinned};
+use crate::{LabError, machine::Pinned};
 
 /// Median and 99th percentile of a piece of work, us, after a warm-up, on one core.
 pub(super) fn time_us(
     repeats: usize,
-    mut work: impl FnMut() -> Result<(), CliError>,
-) -> Result<[f64; 2], CliError> {
+    mut work: impl FnMut() -> Result<(), LabError>,
+) -> Result<[f64; 2], LabError> {
     let _pinned = Pinned::new();
     for _ in 0..repeats / 10 + 1 {
         work()?;
@@ -45,7 +45,7 @@ pub(super) fn config(element: Element, modes: usize, anchors: Vec<Anchor>) -> Ba
 }
 
 /// The model and the seconds that its bake took.
-pub(super) fn baked(mesh: &TetMesh, config: &BakeConfig) -> Result<(Arc<ModalModel>, f64), CliError> {
+pub(super) fn baked(mesh: &TetMesh, config: &BakeConfig) -> Result<(Arc<ModalModel>, f64), LabError> {
     let made = bake(mesh, None, config, &mut |_, _| ())?;
     Ok((Arc::new(made.model), made.times.total))
 }

@@ -10,7 +10,7 @@ use pliant_modal::{
 };
 
 use super::Bound;
-use crate::CliError;
+use crate::LabError;
 
 /// A bar along x with its corner in the origin.
 #[derive(Debug, Clone)]
@@ -53,15 +53,15 @@ impl Bar {
         [self.length, self.section[0] * self.length, self.section[1] * self.length]
     }
 
-    pub(super) fn mesh(&self) -> Result<TetMesh, CliError> {
+    pub(super) fn mesh(&self) -> Result<TetMesh, LabError> {
         Ok(shapes::bar(self.cells, self.size())?)
     }
 
-    pub(super) fn bake(&self) -> Result<Arc<ModalModel>, CliError> {
+    pub(super) fn bake(&self) -> Result<Arc<ModalModel>, LabError> {
         self.bake_mesh(&self.mesh()?)
     }
 
-    pub(super) fn bake_mesh(&self, mesh: &TetMesh) -> Result<Arc<ModalModel>, CliError> {
+    pub(super) fn bake_mesh(&self, mesh: &TetMesh) -> Result<Arc<ModalModel>, LabError> {
         let anchors = if self.held {
             vec![Anchor { axis: 0, comparison: Comparison::Less, bound: 1e-9 * self.length }]
         } else {
@@ -93,7 +93,7 @@ impl Bar {
     }
 
     /// The patch in the middle of the free end.
-    pub(super) fn tip(&self, model: &ModalModel) -> Result<Patch, CliError> {
+    pub(super) fn tip(&self, model: &ModalModel) -> Result<Patch, LabError> {
         Ok(Patch::around(model.surface(), self.vertex(model, [1.0, 0.5, 0.5]), 0.12 * self.length)?)
     }
 }
@@ -108,7 +108,7 @@ pub(super) struct Held {
 }
 
 impl Held {
-    pub(super) fn new(bar: &Bar, config: BodyConfig, hand: GrabConfig) -> Result<Self, CliError> {
+    pub(super) fn new(bar: &Bar, config: BodyConfig, hand: GrabConfig) -> Result<Self, LabError> {
         let model = bar.bake()?;
         let patch = bar.tip(&model)?;
         Self::of(model, patch, config, hand)
@@ -119,7 +119,7 @@ impl Held {
         patch: Patch,
         config: BodyConfig,
         hand: GrabConfig,
-    ) -> Result<Self, CliError> {
+    ) -> Result<Self, LabError> {
         let mut body = Body::new(model.clone(), config)?;
         let grab = body.grab(&patch, hand)?;
         let start = body.grab_position(grab)?;

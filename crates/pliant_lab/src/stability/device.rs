@@ -12,7 +12,7 @@ use super::{
     Bound, Case, Outcome,
     bodies::{Bar, smooth},
 };
-use crate::CliError;
+use crate::LabError;
 
 /// Periods a second of the loop.
 const RATE: f64 = 1000.0;
@@ -42,7 +42,7 @@ pub(super) fn cases(out: &mut Vec<Case>) {
 }
 
 /// Does a free device on a bare spring of `k` (N/m) calm down?
-fn calms(device: &VirtualConfig, k: f64) -> Result<bool, CliError> {
+fn calms(device: &VirtualConfig, k: f64) -> Result<bool, LabError> {
     let config = LoopConfig { safety: Some(SafetyConfig::bare()), ..LoopConfig::default() };
     let mut cycle = Cycle::new(VirtualDevice::new(device.clone(), Hand::NONE)?, config)?;
     let mut pace = VirtualPace::new(RATE);
@@ -74,7 +74,7 @@ fn calms(device: &VirtualConfig, k: f64) -> Result<bool, CliError> {
 }
 
 /// The stiffest wall by bisection, beside the known limit of a sampled spring.
-fn sampled_spring(mass: f64, damping: f64) -> Result<Outcome, CliError> {
+fn sampled_spring(mass: f64, damping: f64) -> Result<Outcome, LabError> {
     let device = VirtualConfig { mass, damping, peak_force: 1e6, ..VirtualConfig::default() };
     let want = 2.0 * damping * RATE;
     let (mut low, mut high) = (0.5 * want, 2.0 * want);
@@ -106,7 +106,7 @@ struct Scene {
 }
 
 impl Scene {
-    fn new(young: f64, hand: Hand, simulation: f64, round_trip: f64) -> Result<Self, CliError> {
+    fn new(young: f64, hand: Hand, simulation: f64, round_trip: f64) -> Result<Self, LabError> {
         let bar = Bar { young, length: 0.15, modes: 12, zeta: 0.05, ..Bar::default() };
         let model = bar.bake()?;
         let patch = bar.tip(&model)?;
@@ -139,7 +139,7 @@ impl Scene {
     }
 
     /// One period of the loop, and every step that falls into it.
-    fn tick(&mut self) -> Result<(), CliError> {
+    fn tick(&mut self) -> Result<(), LabError> {
         let now = self.pace.now();
         let newest = self.cycle.core().last();
         self.targets.push_back((now + self.one_way, newest.now, newest.tool));
@@ -171,7 +171,7 @@ impl Scene {
     }
 
     /// Largest speed of the tool over `seconds`, m/s.
-    fn largest_speed(&mut self, seconds: f64) -> Result<f64, CliError> {
+    fn largest_speed(&mut self, seconds: f64) -> Result<f64, LabError> {
         let mut worst = 0.0f64;
         for _ in 0..(seconds * RATE) as usize {
             self.tick()?;
@@ -182,7 +182,7 @@ impl Scene {
 }
 
 /// Pulls 3 cm to the side in half a second and stays there; nobody's hand gives the free device a push instead.
-fn drag(young: f64, hand: Hand, simulation: f64, round_trip: f64) -> Result<Outcome, CliError> {
+fn drag(young: f64, hand: Hand, simulation: f64, round_trip: f64) -> Result<Outcome, LabError> {
     let mut scene = Scene::new(young, hand, simulation, round_trip)?;
     scene.largest_speed(0.5)?;
     if hand == Hand::NONE {

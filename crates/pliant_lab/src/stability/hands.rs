@@ -8,7 +8,7 @@ use super::{
     bodies::{Bar, Held, compliance, modal_compliance, settling, smooth},
     plain,
 };
-use crate::CliError;
+use crate::LabError;
 
 const TOO_FEW_CORRECTIONS: &str = "four stiff hands that hold two turns against each other need more than the two Newton corrections of the default; eight come to rest (`BodyConfig::corrections`)";
 
@@ -121,7 +121,7 @@ pub(super) fn cases(out: &mut Vec<Case>) {
 }
 
 /// Targets a hundred sizes away, to and fro, then let go.
-fn teleport(young: f64, step: f64) -> Result<Outcome, CliError> {
+fn teleport(young: f64, step: f64) -> Result<Outcome, LabError> {
     let bar = Bar { young, zeta: 0.05, ..Bar::default() };
     let mut held = Held::new(&bar, BodyConfig { step, ..BodyConfig::default() }, GrabConfig::default())?;
     let away = |i: usize| {
@@ -153,7 +153,7 @@ fn teleport(young: f64, step: f64) -> Result<Outcome, CliError> {
 }
 
 /// The target trembles by the step of a cheap encoder, a flip each step.
-fn jitter(young: f64, step: f64) -> Result<Outcome, CliError> {
+fn jitter(young: f64, step: f64) -> Result<Outcome, LabError> {
     let bar = Bar { young, length: 0.15, ..Bar::default() };
     let mut held = Held::new(&bar, BodyConfig { step, ..BodyConfig::default() }, GrabConfig::default())?;
     let size = 55e-6;
@@ -182,7 +182,7 @@ fn jitter(young: f64, step: f64) -> Result<Outcome, CliError> {
 }
 
 /// Four hands on the corners of the end turn it about the axis by two full turns, hold, and let go.
-fn twist(young: f64, corrections: usize) -> Result<Outcome, CliError> {
+fn twist(young: f64, corrections: u8) -> Result<Outcome, LabError> {
     let bar = Bar { young, zeta: 0.05, modes: 30, ..Bar::default() };
     let model = bar.bake()?;
     let mut body =
@@ -241,7 +241,7 @@ fn twist(young: f64, corrections: usize) -> Result<Outcome, CliError> {
 }
 
 /// Two hands on either side of the end pull apart by a tenth of the length.
-fn opposed(young: f64, stiffness: Option<f64>) -> Result<Outcome, CliError> {
+fn opposed(young: f64, stiffness: Option<f64>) -> Result<Outcome, LabError> {
     let bar = Bar { young, zeta: 0.1, ..Bar::default() };
     let model = bar.bake()?;
     let mut body = Body::new(model.clone(), BodyConfig::default())?;
@@ -274,7 +274,7 @@ fn opposed(young: f64, stiffness: Option<f64>) -> Result<Outcome, CliError> {
 }
 
 /// Hands on one spot share what one hand of their joint compliance would feel.
-fn coincident(hands: usize) -> Result<Outcome, CliError> {
+fn coincident(hands: usize) -> Result<Outcome, LabError> {
     let bar = Bar { zeta: 0.3, ..Bar::default() };
     let model = bar.bake()?;
     let patch = bar.tip(&model)?;
@@ -309,7 +309,7 @@ fn coincident(hands: usize) -> Result<Outcome, CliError> {
 }
 
 /// A hand on what cannot move feels its own contact compliance and nothing else.
-fn on_anchor(young: f64, beside: bool) -> Result<Outcome, CliError> {
+fn on_anchor(young: f64, beside: bool) -> Result<Outcome, LabError> {
     let bar = Bar { young, zeta: 0.3, ..Bar::default() };
     let model = bar.bake()?;
     let mut body = Body::new(model.clone(), BodyConfig::default())?;
@@ -341,7 +341,7 @@ fn on_anchor(young: f64, beside: bool) -> Result<Outcome, CliError> {
     })
 }
 
-fn spread(bar: &Bar, model: &ModalModel, hands: usize) -> Result<Vec<Patch>, CliError> {
+fn spread(bar: &Bar, model: &ModalModel, hands: usize) -> Result<Vec<Patch>, LabError> {
     (0..hands)
         .map(|k| {
             let along = 0.3 + 0.7 * k as f64 / hands.max(2) as f64;
@@ -352,7 +352,7 @@ fn spread(bar: &Bar, model: &ModalModel, hands: usize) -> Result<Vec<Patch>, Cli
 }
 
 /// More rows than modes: the hands disagree, the body settles all the same.
-fn many(modes: usize, hands: usize) -> Result<Outcome, CliError> {
+fn many(modes: usize, hands: usize) -> Result<Outcome, LabError> {
     let bar = Bar { modes, zeta: 0.2, ..Bar::default() };
     let model = bar.bake()?;
     let patches = spread(&bar, &model, hands)?;
@@ -369,7 +369,7 @@ fn many(modes: usize, hands: usize) -> Result<Outcome, CliError> {
     for _ in 0..settling(&model, 1.0 / 60.0) {
         body.step()?;
     }
-    let reactions = |body: &Body| -> Result<Vec<Vector3<f64>>, CliError> {
+    let reactions = |body: &Body| -> Result<Vec<Vector3<f64>>, LabError> {
         grabs.iter().map(|g| Ok(Vector3::from(body.reaction(*g)?))).collect()
     };
     let before = reactions(&body)?;
@@ -389,7 +389,7 @@ fn many(modes: usize, hands: usize) -> Result<Outcome, CliError> {
 }
 
 /// A free body pulled to and fro: masses a million times apart under the same hand.
-fn light_and_heavy(density: f64, stiffness: Option<f64>) -> Result<Outcome, CliError> {
+fn light_and_heavy(density: f64, stiffness: Option<f64>) -> Result<Outcome, LabError> {
     let bar = Bar { held: false, density, modes: 12, zeta: 0.1, ..Bar::default() };
     let model = bar.bake()?;
     let patch = bar.tip(&model)?;

@@ -3,7 +3,7 @@
 use pliant_modal::{Body, BodyConfig, GrabConfig, Integrator, StepError, StepSettings};
 
 use super::{Bound, Case, Outcome, bodies::Bar};
-use crate::CliError;
+use crate::LabError;
 
 const BAD: [(&str, f64); 3] =
     [("NaN", f64::NAN), ("infinity", f64::INFINITY), ("minus infinity", f64::NEG_INFINITY)];
@@ -31,7 +31,7 @@ pub(super) fn cases(out: &mut Vec<Case>) {
     }));
 }
 
-fn refused(bad: f64) -> Result<Outcome, CliError> {
+fn refused(bad: f64) -> Result<Outcome, LabError> {
     let bar = Bar::default();
     let model = bar.bake()?;
     let mut body = Body::new(model.clone(), BodyConfig::default())?;

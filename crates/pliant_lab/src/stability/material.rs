@@ -9,7 +9,7 @@ use super::{
     bodies::{Bar, Held, energy_growth, no_growth, ringing, settling, smooth, static_pull},
     plain,
 };
-use crate::CliError;
+use crate::LabError;
 
 /// How far a dragged patch may go, in drags: overshoot is physics, ten times the way is not.
 const EXCURSION: f64 = 10.0;
@@ -129,7 +129,7 @@ fn shaped(
     group: &'static str,
     name: String,
     refused: bool,
-    made: impl Fn() -> Result<(Bar, TetMesh), CliError> + Send + Sync + 'static,
+    made: impl Fn() -> Result<(Bar, TetMesh), LabError> + Send + Sync + 'static,
 ) -> Case {
     let case = Case::new(group, name, move || {
         let (bar, mesh) = made()?;
@@ -148,7 +148,7 @@ pub(super) fn word(integrator: Integrator) -> &'static str {
 
 /// A smooth drag by a twentieth of the length in a second (or forty steps) and as long a hold. The force must not ring; a body far slower than the step is
 /// still under way and is held to less.
-fn drag(bar: &Bar, config: BodyConfig) -> Result<Outcome, CliError> {
+fn drag(bar: &Bar, config: BodyConfig) -> Result<Outcome, LabError> {
     let step = config.step;
     let mut held = Held::new(bar, config, GrabConfig::default())?;
     let seconds = (40.0 * step).max(1.0);
@@ -179,11 +179,11 @@ fn drag(bar: &Bar, config: BodyConfig) -> Result<Outcome, CliError> {
 
 /// Held a millionth of the length away until all is quiet: the reaction is the static one. (A bar that bends by `d` also shortens by `d^2 / L`, which its axial
 /// stiffness answers: at a ten-thousandth that is half a percent already.)
-fn hold(bar: &Bar, step: f64) -> Result<Outcome, CliError> {
+fn hold(bar: &Bar, step: f64) -> Result<Outcome, LabError> {
     hold_mesh(bar, &bar.mesh()?, step)
 }
 
-fn hold_mesh(bar: &Bar, mesh: &TetMesh, step: f64) -> Result<Outcome, CliError> {
+fn hold_mesh(bar: &Bar, mesh: &TetMesh, step: f64) -> Result<Outcome, LabError> {
     let model = bar.bake_mesh(mesh)?;
     let patch = bar.tip(&model)?;
     hold_patch(
@@ -192,7 +192,7 @@ fn hold_mesh(bar: &Bar, mesh: &TetMesh, step: f64) -> Result<Outcome, CliError> 
     )
 }
 
-fn hold_patch(bar: &Bar, mut held: Held) -> Result<Outcome, CliError> {
+fn hold_patch(bar: &Bar, mut held: Held) -> Result<Outcome, LabError> {
     let away = [0.0, 1e-6 * bar.length, 0.5e-6 * bar.length];
     held.pull(away)?;
     for _ in 0..settling(&held.model, held.body.config().step) {
@@ -204,7 +204,7 @@ fn hold_patch(bar: &Bar, mut held: Held) -> Result<Outcome, CliError> {
 }
 
 /// Struck at the tip and left alone for 5,000 steps: the energy never grows.
-fn struck(bar: &Bar, step: f64, integrator: Integrator) -> Result<Outcome, CliError> {
+fn struck(bar: &Bar, step: f64, integrator: Integrator) -> Result<Outcome, LabError> {
     let held = Held::new(
         bar,
         BodyConfig {
@@ -261,7 +261,7 @@ fn slivers(mut mesh: TetMesh, share: f64) -> TetMesh {
 }
 
 /// The bar with slices that grow along it: the last is `ratio` times as heavy as the first.
-fn graded(bar: &Bar, ratio: f64) -> Result<TetMesh, CliError> {
+fn graded(bar: &Bar, ratio: f64) -> Result<TetMesh, LabError> {
     let mut mesh = Bar { cells: [16, 2, 2], ..bar.clone() }.mesh()?;
     let growth = ratio.powf(1.0 / 15.0);
     let whole = growth.powi(16) - 1.0;

@@ -1,7 +1,9 @@
-//! `pliant stability`: a matrix of stiff, extreme and unfair cases, each with the bound that it has to keep and the margin that it keeps it by.
+//! A matrix of stiff, extreme and unfair cases, each with the bound that it has to keep and the margin
+//! that it keeps it by.
 //!
-//! A bound is a number measured against a limit. The margin is `limit / measured` of the tightest bound of a case, cut at a million million: 1 just
-//! holds, 10 holds ten times over. Where hands pull, the paper's plain scheme ([`plain`]) runs through the same script, and what it did stands beside.
+//! A bound is a number measured against a limit. The margin is `limit / measured` of the tightest bound of a case, cut at
+//! a million million: 1 just holds, 10 holds ten times over. Where hands pull, the paper's plain scheme (average
+//! acceleration, hands as rigid position constraints) runs through the same script, and what it did stands beside.
 
 mod bodies;
 mod device;
@@ -13,40 +15,40 @@ mod network;
 mod plain;
 
 use std::{
-    fmt::Write,
     panic::{AssertUnwindSafe, catch_unwind},
+    sync::Mutex,
     time::Instant,
 };
 
-use clap::Args;
 use pliant_bake::BakeError;
 use rayon::prelude::*;
 use serde::Serialize;
 
-use crate::{CliError, output, progress::Bar};
+use crate::{LabError, progress::Progress};
 
-#[derive(Args, Debug)]
-pub(crate) struct StabilityArgs {
-    /// Only cases whose group or name holds this text
-    #[arg(long, value_name = "TEXT")]
-    only: Option<String>,
-    /// One case in eight, for the tests of the project: seconds
-    #[arg(long)]
-    short: bool,
-    /// Threads to use [default: one a core]
-    #[arg(long)]
-    threads: Option<usize>,
-    /// Prints one line of JSON
-    #[arg(long)]
-    json: bool,
+/// Threads that work on cases at most.
+const MOST_THREADS: usize = 64;
+
+/// Which cases to run, and how.
+#[derive(Debug, Clone, Default)]
+pub struct Settings {
+    /// Only cases whose group or name holds this text. Default: all.
+    pub only: Option<String>,
+    /// One case in eight. Default: false.
+    pub short: bool,
+    /// Threads to use, at most 64. Default: one a core.
+    pub threads: Option<usize>,
 }
 
 /// A number that must stay at or below a limit.
 #[derive(Serialize, Debug, Clone, Copy)]
-struct Bound {
-    what: &'static str,
-    measured: f64,
-    limit: f64,
+pub struct Bound {
+    /// What was measured, with its unit where it has one.
+    pub what: &'static str,
+    /// The number.
+    pub measured: f64,
+    /// What it may be at most.
+    pub limit: f64,
 }
 
 impl Bound {
@@ -55,7 +57,7 @@ impl Bound {
     }
 
     /// `limit / measured`; 0 for what is not finite.
-    fn margin(&self) -> f64 {
+    pub fn margin(&self) -> f64 {
         const MOST: f64 = 1e12;
         if !self.measured.is_finite() {
             0.0
@@ -66,7 +68,8 @@ impl Bound {
         }
     }
 
-    fn text(&self) -> String {
+    /// In words: name, number and limit.
+    pub fn text(&self) -> String {
         format!("{} {:.3e} <= {:.3e}", self.what, self.measured, self.limit)
     }
 }
@@ -102,9 +105,9 @@ enum Expected {
 }
 
 impl Expected {
-    fn holds(self, came: &Result<Outcome, CliError>) -> bool {
+    fn holds(self, came: &Result<Outcome, LabError>) -> bool {
         match (self, came) {
-            (Self::Inaccurate, Err(CliError::Bake(BakeError::Inaccurate { .. }))) => true,
+            (Self::Inaccurate, Err(LabError::Bake(BakeError::Inaccurate { .. }))) => true,
             (Self::Measured(known), Ok(outcome)) => {
                 let broken = || outcome.bounds.iter().filter(|bound| bound.margin() < 1.0);
                 let is_known = |b: &Bound| {
@@ -124,14 +127,14 @@ struct Case {
     group: &'static str,
     name: String,
     known_limit: Option<Limit>,
-    run: Box<dyn Fn() -> Result<Outcome, CliError> + Send + Sync>,
+    run: Box<dyn Fn() -> Result<Outcome, LabError> + Send + Sync>,
 }
 
 impl Case {
     fn new(
         group: &'static str,
         name: String,
-        run: impl Fn() -> Result<Outcome, CliError> + Send + Sync + 'static,
+        run: impl Fn() -> Result<Outcome, LabError> + Send + Sync + 'static,
     ) -> Self {
         Self { group, name, known_limit: None, run: Box::new(run) }
     }
@@ -141,34 +144,52 @@ impl Case {
     }
 }
 
-/// A case as it is told.
-#[derive(Serialize, Debug)]
-struct Told {
-    name: String,
-    group: &'static str,
-    passed: bool,
-    margin: f64,
-    /// The tightest of the bounds.
-    bound: String,
-    bounds: Vec<Bound>,
+/// What became of a case.
+#[derive(Serialize, Debug, Clone)]
+pub struct Verdict {
+    /// Its name, unique within its group.
+    pub name: String,
+    /// Its group.
+    pub group: &'static str,
+    /// It keeps all its bounds.
+    pub passed: bool,
+    /// `limit / measured` of the tightest bound: 1 just holds. 0 where nothing was measured.
+    pub margin: f64,
+    /// The tightest of the bounds in words, or why nothing was measured.
+    pub bound: String,
+    /// All of them.
+    pub bounds: Vec<Bound>,
     /// Why it does not pass, where that is known and what happened is what was expected.
-    known_limit: Option<&'static str>,
+    pub known_limit: Option<&'static str>,
     /// It was listed as a known limit, and passes: the list is out of date, which counts as broken.
-    limit_gone: bool,
-    plain: Option<String>,
-    seconds: f64,
+    pub limit_gone: bool,
+    /// What the paper's plain scheme did with the same script.
+    pub plain: Option<String>,
+    /// What it took, s.
+    pub seconds: f64,
 }
 
-impl Told {
-    fn broken(&self) -> bool {
+impl Verdict {
+    /// It fails without being a known limit, or is listed as one and passes.
+    pub fn broken(&self) -> bool {
         self.limit_gone || (!self.passed && self.known_limit.is_none())
     }
 }
 
-#[derive(Serialize, Debug)]
-struct Report {
-    cases: Vec<Told>,
-    seconds: f64,
+/// What became of all cases.
+#[derive(Serialize, Debug, Clone)]
+pub struct Report {
+    /// In the order of the matrix.
+    pub cases: Vec<Verdict>,
+    /// What all of it took, s.
+    pub seconds: f64,
+}
+
+impl Report {
+    /// Cases that are broken.
+    pub fn broken(&self) -> usize {
+        self.cases.iter().filter(|case| case.broken()).count()
+    }
 }
 
 /// All cases, in the order in which they are told.
@@ -183,61 +204,54 @@ fn all() -> Vec<Case> {
     cases
 }
 
-pub(crate) fn run(args: &StabilityArgs) -> Result<(), CliError> {
+/// Runs the chosen cases of the matrix; the report is empty where none has such a name.
+///
+/// # Errors
+/// [`LabError::Threads`]; what goes wrong in a case is told as its verdict.
+pub fn run(settings: &Settings, progress: &mut dyn Progress) -> Result<Report, LabError> {
     let began = Instant::now();
     let wanted = |case: &Case| {
-        args.only
+        settings
+            .only
             .as_ref()
             .is_none_or(|text| case.group.contains(text.as_str()) || case.name.contains(text.as_str()))
     };
     let chosen: Vec<Case> = all()
         .into_iter()
         .enumerate()
-        .filter(|(index, case)| wanted(case) && (!args.short || index % 8 == 0))
+        .filter(|(index, case)| wanted(case) && (!settings.short || index % 8 == 0))
         .map(|(_, case)| case)
         .collect();
-    if chosen.is_empty() {
-        let got = args.only.clone().unwrap_or_default();
-        let expected = "a text that the name or the group of a case holds".to_owned();
-        return Err(CliError::Unknown { what: "--only", got, expected });
-    }
+    let threads = settings.threads.unwrap_or(0);
     let pool = rayon::ThreadPoolBuilder::new()
-        .num_threads(args.threads.unwrap_or(0).min(64))
+        .num_threads(threads.min(MOST_THREADS))
         .build()
-        .map_err(|_| CliError::Threads { got: args.threads.unwrap_or(0), most: 64 })?;
-    let bar = std::sync::Mutex::new((Bar::new(), 0usize));
-    let told: Vec<Told> = pool.install(|| {
+        .map_err(|_| LabError::Threads { got: threads, most: MOST_THREADS })?;
+    let progress = Mutex::new((progress, 0usize));
+    let cases: Vec<Verdict> = pool.install(|| {
         chosen
             .par_iter()
             // One case at a time is handed out: they differ a thousandfold in length.
             .with_max_len(1)
             .map(|case| {
-                let told = tell(case);
-                if let Ok(mut bar) = bar.lock() {
-                    bar.1 += 1;
-                    let share = bar.1 as f64 / chosen.len() as f64;
-                    bar.0.report("stability", share);
+                let verdict = judge(case);
+                if let Ok(mut progress) = progress.lock() {
+                    progress.1 += 1;
+                    let share = progress.1 as f64 / chosen.len() as f64;
+                    progress.0.report("stability", share);
                 }
-                told
+                verdict
             })
             .collect()
     });
-    drop(bar);
-    let broken = told.iter().filter(|t| t.broken()).count();
-    let report = Report { cases: told, seconds: began.elapsed().as_secs_f64() };
-    if args.json {
-        output::print_json(&report)?
-    } else {
-        output::print(&table(&report))?
-    }
-    if broken > 0 { Err(CliError::Unstable { broken, of: report.cases.len() }) } else { Ok(()) }
+    Ok(Report { cases, seconds: began.elapsed().as_secs_f64() })
 }
 
-fn tell(case: &Case) -> Told {
+fn judge(case: &Case) -> Verdict {
     let began = Instant::now();
     // A panic is this case's failure, not the end of all others; nothing of it is used afterwards.
     let came = catch_unwind(AssertUnwindSafe(|| (case.run)()));
-    let expected = |came: &Result<Outcome, CliError>| {
+    let expected = |came: &Result<Outcome, LabError>| {
         case.known_limit.filter(|limit| limit.expected.holds(came)).map(|limit| limit.why)
     };
     let (margin, bound, bounds, plain, known_limit) = match came {
@@ -260,7 +274,7 @@ fn tell(case: &Case) -> Told {
         }
     };
     let passed = margin >= 1.0;
-    Told {
+    Verdict {
         name: case.name.clone(),
         group: case.group,
         passed,
@@ -272,47 +286,6 @@ fn tell(case: &Case) -> Told {
         plain,
         seconds: began.elapsed().as_secs_f64(),
     }
-}
-
-fn table(report: &Report) -> String {
-    let mut text = String::new();
-    let mut group = "";
-    for case in &report.cases {
-        // Writing to a string cannot fail.
-        if case.group != group {
-            group = case.group;
-            let _ = writeln!(text, "{group}");
-        }
-        let verdict = match (case.passed, case.known_limit) {
-            (true, _) if case.limit_gone => "GONE",
-            (true, _) => "ok",
-            (false, Some(_)) => "limit",
-            (false, None) => "FAILS",
-        };
-        let margin = if case.margin >= 1e6 { "> 1e6".to_owned() } else { format!("{:.3}", case.margin) };
-        let _ = writeln!(text, "  {verdict:<6} {margin:>10}  {:<58} {}", case.name, case.bound);
-        if let Some(why) = case.known_limit {
-            let _ = writeln!(text, "                     known limit: {why}");
-        }
-        if case.limit_gone {
-            let _ = writeln!(
-                text,
-                "                     was listed as a known limit and passes: the list is out of date"
-            );
-        }
-        if let Some(plain) = &case.plain {
-            let _ = writeln!(text, "                     the paper's plain scheme: {plain}");
-        }
-    }
-    let passed = report.cases.iter().filter(|c| c.passed).count();
-    let known = report.cases.iter().filter(|c| c.known_limit.is_some()).count();
-    let _ = write!(
-        text,
-        "{passed} of {} cases keep their bounds, {known} are known limits; {:.0} s",
-        report.cases.len(),
-        report.seconds
-    );
-    text
 }
 
 #[cfg(test)]
@@ -340,10 +313,10 @@ mod tests {
     #[test]
     fn a_case_that_breaks_its_bound_is_told_so() {
         let broken = Case::new("g", "n".into(), || Ok(Outcome::of(vec![Bound::new("x", 3.0, 1.0)])));
-        let told = tell(&broken);
+        let told = judge(&broken);
         assert!(!told.passed && (told.margin - 1.0 / 3.0).abs() < 1e-12, "{told:?}");
-        let failed = Case::new("g", "n".into(), || Err(CliError::Threads { got: 0, most: 1 }));
-        assert!(!tell(&failed).passed);
+        let failed = Case::new("g", "n".into(), || Err(LabError::Threads { got: 0, most: 1 }));
+        assert!(!judge(&failed).passed);
     }
 
     #[test]
@@ -352,7 +325,7 @@ mod tests {
             let run =
                 move || Ok(Outcome::of(vec![Bound::new("x", measured, 1.0), Bound::new("y", other, 1.0)]));
             let expected = Expected::Measured(&[("x", 2.0, 4.0)]);
-            tell(&Case::new("g", "n".into(), run).limited("known", expected))
+            judge(&Case::new("g", "n".into(), run).limited("known", expected))
         };
         let limit = case(3.0, 0.5);
         assert!(!limit.broken() && !limit.passed && limit.known_limit == Some("known"), "{limit:?}");
@@ -365,8 +338,8 @@ mod tests {
         assert!(gone.passed && gone.limit_gone && gone.broken(), "{gone:?}");
         // Refused is not the same as measured, and refused for another reason is not refused for this one.
         let refused = |expected| {
-            let run = || Err(CliError::Threads { got: 0, most: 1 });
-            tell(&Case::new("g", "n".into(), run).limited("known", expected))
+            let run = || Err(LabError::Threads { got: 0, most: 1 });
+            judge(&Case::new("g", "n".into(), run).limited("known", expected))
         };
         assert!(refused(Expected::Inaccurate).broken());
         assert!(refused(Expected::Measured(&[("x", 0.0, 1e9)])).broken());
@@ -376,7 +349,7 @@ mod tests {
     fn a_case_that_panics_is_told_and_is_the_only_one_lost() {
         let none: Vec<f64> = Vec::new();
         let run = move || Ok(Outcome::of(vec![Bound::new("x", none[0], 1.0)]));
-        let told = tell(&Case::new("g", "n".into(), run));
+        let told = judge(&Case::new("g", "n".into(), run));
         assert!(told.broken() && told.bound.starts_with("panicked: index out of bounds"), "{told:?}");
     }
 }

@@ -8,7 +8,7 @@ use super::{
     bodies::{Bar, Dice, Held, energy_growth, nearest, no_growth, settling, state, static_pull},
     material::word,
 };
-use crate::CliError;
+use crate::LabError;
 
 const FAR_AND_FAST: &str = "the held patch is lengths away from its rest: a pull there turns the warp's rows within a step of 1/60 s, and its work over the step is not what it was taken to be; at 1/240 s, or without the warp, the same start is quiet";
 
@@ -97,7 +97,7 @@ fn far_and_fast(shape: [f64; 3]) -> Option<Expected> {
     (shape[0] > 1.0).then_some(unrest)
 }
 
-fn random(seed: u64, integrator: Integrator) -> Result<Outcome, CliError> {
+fn random(seed: u64, integrator: Integrator) -> Result<Outcome, LabError> {
     let bar = Bar { zeta: 0.01, ..Bar::default() };
     let mut body =
         Body::new(bar.bake()?, BodyConfig::from(StepSettings { integrator, ..Default::default() }))?;
@@ -112,7 +112,7 @@ fn random(seed: u64, integrator: Integrator) -> Result<Outcome, CliError> {
 }
 
 /// The surface's points are multiplied by `scale` about the middle of the held end, as nearly as the modes can.
-fn started(scale: [f64; 3], held: bool, warp: bool, step: f64) -> Result<Outcome, CliError> {
+fn started(scale: [f64; 3], held: bool, warp: bool, step: f64) -> Result<Outcome, LabError> {
     let bar = Bar { zeta: 0.05, ..Bar::default() };
     let model = bar.bake()?;
     let middle = [0.0, 0.1, 0.1];
@@ -148,7 +148,7 @@ fn free(young: f64) -> Bar {
     Bar { held: false, young, modes: 12, zeta: 0.01, ..Bar::default() }
 }
 
-fn flight(step: f64) -> Result<Outcome, CliError> {
+fn flight(step: f64) -> Result<Outcome, LabError> {
     let bar = free(1e6);
     let model = bar.bake()?;
     let mut body = Body::new(model.clone(), BodyConfig { step, ..BodyConfig::default() })?;
@@ -171,7 +171,7 @@ fn flight(step: f64) -> Result<Outcome, CliError> {
 }
 
 /// Tumbling about no axis of its own for 100,000 steps: energy and spin stay.
-fn spinning(turns: f64, step: f64) -> Result<Outcome, CliError> {
+fn spinning(turns: f64, step: f64) -> Result<Outcome, LabError> {
     let bar = Bar { section: [0.2, 0.3], ..free(1e6) };
     let model = bar.bake()?;
     let mut body = Body::new(model.clone(), BodyConfig { step, ..BodyConfig::default() })?;
@@ -196,7 +196,7 @@ fn spinning(turns: f64, step: f64) -> Result<Outcome, CliError> {
 }
 
 /// What two hands pull is what the momentum changes by.
-fn counted(step: f64) -> Result<Outcome, CliError> {
+fn counted(step: f64) -> Result<Outcome, LabError> {
     let bar = free(1e6);
     let model = bar.bake()?;
     let mut body = Body::new(model.clone(), BodyConfig { step, ..BodyConfig::default() })?;
@@ -226,7 +226,7 @@ fn counted(step: f64) -> Result<Outcome, CliError> {
     ]))
 }
 
-fn relaxing_energy(relaxation: Relaxation) -> Result<Outcome, CliError> {
+fn relaxing_energy(relaxation: Relaxation) -> Result<Outcome, LabError> {
     let bar = Bar { zeta: 0.0, ..Bar::default() };
     let model = bar.bake()?;
     let mut body = Body::new(
@@ -240,7 +240,7 @@ fn relaxing_energy(relaxation: Relaxation) -> Result<Outcome, CliError> {
 }
 
 /// Held for long, `1 - ratio` of the reaction is left.
-fn relaxed_reaction(relaxation: Relaxation) -> Result<Outcome, CliError> {
+fn relaxed_reaction(relaxation: Relaxation) -> Result<Outcome, LabError> {
     let bar = Bar { zeta: 0.3, ..Bar::default() };
     let elastic = Held::new(&bar, BodyConfig::default(), GrabConfig::default())?;
     let away = [0.0, 1e-6, 0.5e-6];

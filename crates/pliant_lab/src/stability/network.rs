@@ -6,12 +6,12 @@ use pliant_modal::Integrator;
 use pliant_stream::{
     Policy, RecoveryConfig,
     emulator::{LinkConfig, Loss, Preset},
-    experiment::{Experiment, Figures},
     peer::Repair,
 };
 
 use super::{Bound, Case, Expected, Outcome, bodies::Bar};
-use crate::CliError;
+use crate::LabError;
+use crate::experiment::{Experiment, Figures};
 
 /// At 40 Hz.
 const TICK: Duration = Duration::from_millis(25);
@@ -65,7 +65,7 @@ pub(super) fn cases(out: &mut Vec<Case>) {
     }
 }
 
-fn experiment(link: &LinkConfig, rate: f64, recovery: RecoveryConfig) -> Result<Experiment, CliError> {
+fn experiment(link: &LinkConfig, rate: f64, recovery: RecoveryConfig) -> Result<Experiment, LabError> {
     let model = Bar { modes: 30, zeta: 0.05, ..Bar::default() }.bake()?;
     let mut experiment = Experiment::new(model, link.clone(), recovery);
     experiment.rate = rate;
@@ -77,7 +77,7 @@ fn experiment(link: &LinkConfig, rate: f64, recovery: RecoveryConfig) -> Result<
     Ok(experiment)
 }
 
-fn guest(link: &LinkConfig, rate: f64, rms: f64, max: f64) -> Result<Outcome, CliError> {
+fn guest(link: &LinkConfig, rate: f64, rms: f64, max: f64) -> Result<Outcome, LabError> {
     let made = experiment(link, rate, RecoveryConfig::default())?;
     let ticks = made.rate * made.seconds;
     let ours = made.run()?;
@@ -105,7 +105,7 @@ fn words(f: &Figures) -> String {
     format!("rms {:.3} %, largest {:.1} %", f.rms_percent, f.max_percent)
 }
 
-fn peers(link: &LinkConfig) -> Result<Outcome, CliError> {
+fn peers(link: &LinkConfig) -> Result<Outcome, LabError> {
     let f = experiment(link, 40.0, RecoveryConfig::default())?.run_peers(Repair::Rollback)?;
     Ok(Outcome::of(vec![
         Bound::new(RMS, f.rms_percent, 2.0),

@@ -4,9 +4,9 @@
 use std::sync::Arc;
 use std::time::Duration;
 
+use pliant_lab::pair::{Pair, PathConfig, World};
 use pliant_modal::{Body, BodyConfig, GrabConfig, GrabId, ModalModel, Patch};
 use pliant_stream::emulator::{LinkConfig, Loss, Preset};
-use pliant_stream::pair::{Pair, PathConfig, World};
 use pliant_stream::{
     BodyId, GrabKey, GrabState, GuestEvent, GuestSession, HostConfig, HostEvent, HostSession, Pose,
     StepSettings, TickState,
