@@ -320,9 +320,8 @@ fn a_body_that_differs_is_noticed_beside_one_that_agrees() {
         scene: p.scene(),
     };
     p.on_message(Duration::ZERO, PeerId(1), &hello.encode());
-    let mut sequence = 0;
     let mut asked = false;
-    for tick in 1..=40_u64 {
+    for (sequence, tick) in (0..).zip(1..=40_u64) {
         let now = 25 * MS * tick as u32;
         p.update(now);
         let inputs = |tick| InputTick { tick, held: Vec::new() };
@@ -335,7 +334,6 @@ fn a_body_that_differs_is_noticed_beside_one_that_agrees() {
         let ticks = vec![inputs(p.tick())];
         let datagram = PeerDatagram::Inputs { now: p.tick(), ahead: None, ticks, check };
         p.on_datagram(now, PeerId(1), &datagram.encode(sequence));
-        sequence += 1;
         while let Some(out) = p.poll_output() {
             asked |= out.channel == Channel::Message
                 && PeerMessage::decode(&out.bytes) == Ok(PeerMessage::StateRequest);

@@ -208,7 +208,6 @@ fn local(quick: bool, progress: &mut dyn Progress) -> Result<(Vec<Figure>, Strin
                             modes: Some(modes),
                             precision,
                             settings: StepSettings { integrator, ..Default::default() },
-                            ..BodyConfig::default()
                         };
                         // Once to fill the caches; the times are of the runs after it, the errors of any.
                         moving(model, &places, setting.clone())?;
