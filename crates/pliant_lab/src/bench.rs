@@ -29,18 +29,20 @@ pub struct Cost {
     pub step_us: Percentiles,
     /// A reconstruction of the whole surface.
     pub reconstruct_us: Percentiles,
-    /// A step under a hand that moves and the whole surface of what it came to, one after the other, as a frame does.
+    /// A step under a hand that moves and the whole surface of what it came to, one after the
+    /// other, as a frame does.
     pub frame_us: Percentiles,
     /// Read and written by one reconstruction.
     pub bytes: usize,
-    /// GB/s of the median reconstruction, as its turn in a frame: after a step, of a shape that is new each time.
+    /// GB/s of the median reconstruction, as its turn in a frame: after a step, of a shape that is
+    /// new each time.
     pub bandwidth_gb_s: f64,
-    /// GB/s of the fastest pass over as many bytes in the same run: plain sums in the processor's widest registers, and
-    /// reconstructions.
+    /// GB/s of the fastest pass over as many bytes in the same run: plain sums in the processor's
+    /// widest registers, and reconstructions.
     pub bandwidth_limit_gb_s: f64,
 }
 
-/// Times steps and reconstructions of a body on one core, for `seconds` each and then twice as long as frames.
+/// Times a body on one core: steps for so many seconds, then frames for twice as long.
 ///
 /// # Errors
 /// [`LabError::Model`] or [`LabError::Step`] where the body cannot be held or stepped.

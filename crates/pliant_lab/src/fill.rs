@@ -12,12 +12,12 @@ const DEFAULT_TETS: usize = 10_000;
 /// Share of a surface's volume that a fill may lose in silence.
 const VOLUME_LOSS: f64 = 0.02;
 
-/// The tetrahedra that a file holds, or that its shape is filled with. `tets` asked for tetrahedra: refused where the
-/// file has its own; `None`: 10,000. What was mended of a dirty surface is a warning and is returned; a fill so coarse
-/// that it rounds much of a surface away is a warning.
+/// The tetrahedra that a file holds, or that its shape is filled with: about as many as `tets`, or
+/// 10,000. What was mended of a dirty surface is a warning and is returned; a fill so coarse that
+/// it rounds much of a surface away is a warning.
 ///
 /// # Errors
-/// [`LabError::Mesh`], or [`LabError::TetsGiven`] for tetrahedra where `tets` asks for some.
+/// [`LabError::Mesh`], or [`LabError::TetsGiven`] where `tets` is given for a file that has its own.
 pub fn fill(
     input: &Path,
     tets: Option<usize>,

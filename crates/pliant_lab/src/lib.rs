@@ -1,7 +1,8 @@
-//! The laboratory: Pliant measured, in virtual time or on this machine. It is for the project's own tests, its report
-//! and the `pliant` program; no app needs it.
+//! The laboratory: Pliant measured, in virtual time or on this machine. It is for the project's own
+//! tests, its report and the `pliant` program; no app needs it.
 //!
-//! A whole session, a host and a guest and two hands over a network that loses packets, in virtual time:
+//! A whole session, a host and a guest and two hands over a network that loses packets, in virtual
+//! time:
 //!
 //! ```
 //! use std::sync::Arc;
@@ -12,9 +13,9 @@
 //! # fn main() -> Result<(), Box<dyn std::error::Error>> {
 //! let model = Arc::new(ModalModel::read("../../assets/bud.modal")?);
 //! let network = LinkConfig::preset(Preset::Paper1); // 9 % lost, 196 ms there and back
-//! let session = Experiment { seconds: 5.0, ..Experiment::new(model, network, RecoveryConfig::default()) };
-//! let seen = session.run()?;
-//! println!("{} frames lost, shown within {:.3} % of the truth (rms)", seen.lost, seen.rms_percent);
+//! let whole = Experiment::new(model, network, RecoveryConfig::default());
+//! let seen = Experiment { seconds: 5.0, ..whole }.run()?;
+//! println!("{} frames lost, shown within {:.3} % (rms)", seen.lost, seen.rms_percent);
 //! assert!(seen.lost > 0 && seen.rms_percent < 0.5);
 //! # Ok(())
 //! # }
@@ -24,8 +25,8 @@
 //! | --- | --- |
 //! | [`pair`] | host and guests joined by emulated links in virtual time |
 //! | [`experiment`] | a session measured: errors, forces, bytes |
-//! | [`bench`] | what a body costs on this machine, beside the limit that memory sets |
-//! | [`report`] | what the method costs and what it is off by: tables, figures and the words for them |
+//! | [`bench`](mod@bench) | what a body costs on this machine, beside the limit that memory sets |
+//! | [`report`] | what the method costs and what it is off by: tables, figures, words |
 //! | [`stability`] | stiff, extreme and unfair cases, each with its bound and its margin |
 //! | [`fill`](mod@fill) | tetrahedra out of a file, whatever it holds |
 //! | [`progress`] | who is told how far a measurement is |

@@ -3,15 +3,16 @@
 //! A host steps soft bodies and streams them; guests follow, hold on to them and feel them. Everything here is a state
 //! machine: no socket, no clock, no thread, no randomness without a seed. `(now, datagrams in) -> (datagrams out, state)`.
 //!
-//! A host and a guest over a network that loses packets, in virtual time. The caller carries the bytes, here through the
-//! [`emulator`]; [`session`] says when to call what:
+//! A host and a guest over a network that loses packets, in virtual time. The caller carries the
+//! bytes, here through the [`emulator`]; [`session`] says when to call what:
 //!
 //! ```
 //! use std::{sync::Arc, time::Duration};
 //! use pliant_modal::{Body, BodyConfig, ModalModel};
 //! use pliant_stream::emulator::{Link, LinkConfig, Preset};
 //! use pliant_stream::{
-//!     BodyId, Channel, GuestConfig, GuestSession, HostConfig, HostSession, PeerId, StepSettings, TickState,
+//!     BodyId, Channel, GuestConfig, GuestSession, HostConfig, HostSession, PeerId, StepSettings,
+//!     TickState,
 //! };
 //!
 //! # fn main() -> Result<(), Box<dyn std::error::Error>> {
@@ -26,7 +27,7 @@
 //! guest.connect(start)?;
 //!
 //! let lossy = LinkConfig::preset(Preset::Paper1); // 9 % lost, 196 ms there and back
-//! let [mut down, mut up] = [1, 2].map(|seed| Link::new(lossy.clone(), seed));
+//! let [mut down, mut up] = [1, 2].map(|seed| Link::<Vec<u8>>::new(lossy.clone(), seed));
 //! for tick in 1..=400 {
 //!     let now = tick as u32 * Duration::from_millis(25);
 //!     body.push(0, [0.0, 0.0, 0.1 * (0.1 * tick as f64).sin()])?;

@@ -1,4 +1,5 @@
-//! What the method costs and what it is off by, remade on this machine: tables, CSV, SVG, PNG and the words for them.
+//! What the method costs and what it is off by, remade on this machine: tables, CSV, SVG, PNG and
+//! the words for them.
 
 mod frames;
 mod front;
@@ -139,7 +140,8 @@ pub struct Report {
     pub seconds: f64,
 }
 
-/// Measures, and writes `report.md` with its figures (CSV, SVG and PNG) into a folder, which is made if it is not there.
+/// Measures, and writes `report.md` with its figures (CSV, SVG and PNG) into a folder, which is made
+/// if it is not there.
 ///
 /// # Errors
 /// [`LabError::Write`] or [`LabError::Plot`] for files, the others for what cannot be measured.

@@ -1,9 +1,10 @@
-//! A matrix of stiff, extreme and unfair cases, each with the bound that it has to keep and the margin
-//! that it keeps it by.
+//! A matrix of stiff, extreme and unfair cases, each with the bound that it has to keep and the
+//! margin that it keeps it by.
 //!
-//! A bound is a number measured against a limit. The margin is `limit / measured` of the tightest bound of a case, cut at
-//! a million million: 1 just holds, 10 holds ten times over. Where hands pull, the paper's plain scheme (average
-//! acceleration, hands as rigid position constraints) runs through the same script, and what it did stands beside.
+//! A bound is a number measured against a limit. The margin is `limit / measured` of the tightest
+//! bound of a case, cut at a million million: 1 just holds, 10 holds ten times over. Where hands
+//! pull, the paper's plain scheme (average acceleration, hands as rigid position constraints) runs
+//! through the same script, and what it did stands beside.
 
 mod bodies;
 mod device;
