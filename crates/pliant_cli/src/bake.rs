@@ -5,13 +5,14 @@ use std::time::Instant;
 
 use clap::Args;
 use pliant_bake::{Anchor, BakeCache, BakeConfig, Stage, bake_cached};
+use pliant_lab::{Progress, fill::fill};
 use pliant_mesh::{Repair, io};
 use pliant_modal::{Damping, Element, ModalModel};
 use serde::Serialize;
 
+use crate::CliError;
 use crate::output::{self, Summary};
 use crate::progress::Bar;
-use crate::{CliError, mesh};
 
 const MAX_THREADS: usize = 1024;
 
@@ -160,7 +161,7 @@ pub(crate) fn run(args: BakeArgs) -> Result<(), CliError> {
 
     let mut bar = Bar::new();
     let skin = args.skin.map(io::read_surface).transpose()?;
-    let (mesh, repair) = mesh::fill(&args.input, args.tets, &mut bar)?;
+    let (mesh, repair) = fill(&args.input, args.tets, &mut bar)?;
     let mesh_seconds = start.elapsed().as_secs_f64();
     let mut progress = |stage, share| {
         let stage = match stage {

@@ -1,12 +1,12 @@
 //! `pliant bench step`: what a body costs here, beside the limit that memory sets in the same run.
 
-use std::{hint::black_box, path::PathBuf, sync::Arc, time::Instant};
+use std::{path::PathBuf, sync::Arc};
 
 use clap::{Args, Subcommand};
-use pliant_modal::{Body, BodyConfig, GrabConfig, ModalModel, Patch, Precision, streaming_sum};
-use serde::Serialize;
+use pliant_lab::bench::{Cost, Percentiles, measure};
+use pliant_modal::{ModalModel, Precision};
 
-use crate::{CliError, machine::Pinned, output};
+use crate::{CliError, output};
 
 #[derive(Args, Debug)]
 pub(crate) struct BenchArgs {
@@ -33,157 +33,18 @@ enum What {
     },
 }
 
-/// Percentiles of a time, us, on one core.
-#[derive(Serialize, Debug)]
-pub(crate) struct Times {
-    pub(crate) p50: f64,
-    pub(crate) p99: f64,
-    p999: f64,
-}
-
-/// What `--json` prints.
-#[derive(Serialize, Debug)]
-pub(crate) struct Told {
-    modes: usize,
-    pub(crate) surface_vertices: usize,
-    pub(crate) step_us: Times,
-    pub(crate) reconstruct_us: Times,
-    /// A step under a hand that moves and the whole surface of what it came to, one after the other, as a frame does.
-    pub(crate) frame_us: Times,
-    /// Read and written by one reconstruction.
-    bytes: usize,
-    /// Of the median reconstruction, as its turn in a frame: after a step, of a shape that is new each time.
-    pub(crate) bandwidth_gb_s: f64,
-    /// Of the fastest pass over as many bytes in the same run: plain sums in the processor's widest registers, and reconstructions.
-    pub(crate) bandwidth_limit_gb_s: f64,
-}
-
 pub(crate) fn run(args: &BenchArgs) -> Result<(), CliError> {
     let What::Step { model, seconds, half, json } = &args.what;
     if !(0.01..=600.0).contains(seconds) {
         return Err(CliError::Range { what: "--seconds", low: 0.01, high: 600.0, got: *seconds });
     }
     let precision = if *half { Precision::Half } else { Precision::Single };
-    let told = measure(Arc::new(ModalModel::read(model)?), *seconds, precision)?;
-    if *json { output::print_json(&told) } else { output::print(&text(&told)) }
+    let cost = measure(Arc::new(ModalModel::read(model)?), *seconds, precision)?;
+    if *json { output::print_json(&cost) } else { output::print(&text(&cost)) }
 }
 
-pub(crate) fn measure(model: Arc<ModalModel>, seconds: f64, precision: Precision) -> Result<Told, CliError> {
-    let _pinned = Pinned::new();
-    let mut body = Body::new(model.clone(), BodyConfig { precision, ..BodyConfig::default() })?;
-    // Where the first mode moves most: a body is pulled where it gives.
-    let moves = |v: u32| (0..3).map(|axis| model.displacement_row(v, axis, 0).powi(2)).sum::<f32>();
-    let count = model.surface().positions().len() as u32;
-    let vertex = (0..count).max_by(|&a, &b| moves(a).total_cmp(&moves(b))).unwrap_or(0);
-    let patch = Patch::around(model.surface(), vertex, 0.06 * model.size())?;
-    let grab = body.grab(&patch, GrabConfig::default())?;
-    let start = body.grab_position(grab)?;
-    let mut tick = 0u32;
-    let mut failed = None;
-    let mut pull = |body: &mut Body| {
-        tick += 1;
-        let away = 0.05 * model.size() * (0.05 * f64::from(tick)).sin();
-        let moved = body.set_target(grab, [start[0] + away, start[1] + 0.5 * away, start[2]]);
-        if let Err(error) = moved.and_then(|()| body.step().map(|_| ())) {
-            failed.get_or_insert(error);
-        }
-    };
-    let step_us = time(seconds, || pull(&mut body));
-    let mut positions = model.surface().positions().to_vec();
-    let bytes = model.basis_in(precision).traffic_bytes(model.mode_count());
-    let buffer = vec![1.0f32; bytes / 4];
-    let mut broken = None;
-    let [of_frame, of_surface, of_sum] = by_turns(
-        seconds,
-        &mut body,
-        &mut pull,
-        |body| {
-            if let Err(error) = body.reconstruct(black_box(&mut positions)) {
-                broken.get_or_insert(error);
-            }
-        },
-        || {
-            black_box(streaming_sum(black_box(&buffer)));
-        },
-    );
-    if let Some(error) = failed.or(broken) {
-        return Err(error.into());
-    }
-    // The armadillo's surface has been read faster than it was summed: the bound is what memory gave at best, whoever read.
-    let fastest = of_sum.iter().chain(&of_surface).copied().fold(f64::INFINITY, f64::min);
-    let (frame_us, reconstruct_us) = (percentiles(of_frame), percentiles(of_surface));
-    // Bytes a microsecond are megabytes a second.
-    let gb_s = |us: f64| bytes as f64 / us.max(1e-9) * 1e-3;
-    Ok(Told {
-        modes: model.mode_count(),
-        surface_vertices: count as usize,
-        bandwidth_gb_s: gb_s(reconstruct_us.p50),
-        bandwidth_limit_gb_s: gb_s(fastest),
-        step_us,
-        reconstruct_us,
-        frame_us,
-        bytes,
-    })
-}
-
-fn time(seconds: f64, mut work: impl FnMut()) -> Times {
-    for _ in 0..50 {
-        work();
-    }
-    let mut samples = Vec::new();
-    let begun = Instant::now();
-    while samples.len() < 1_000 || (begun.elapsed().as_secs_f64() < seconds && samples.len() < 1_000_000) {
-        samples.push(once(&mut work));
-    }
-    percentiles(samples)
-}
-
-/// Frames (a step, then the surface) in turns of sixteen with plain sums, so that whatever else the machine does slows both alike; the first of each turn, for
-/// which the caches are still full of the other, is not counted. Samples, us: whole frames, their surfaces, sums.
-fn by_turns<T>(
-    seconds: f64,
-    body: &mut T,
-    mut step: impl FnMut(&mut T),
-    mut surface: impl FnMut(&mut T),
-    mut sum: impl FnMut(),
-) -> [Vec<f64>; 3] {
-    let mut samples = [Vec::new(), Vec::new(), Vec::new()];
-    let begun = Instant::now();
-    while samples[0].len() < 1_000
-        || (begun.elapsed().as_secs_f64() < 2.0 * seconds && samples[0].len() < 1_000_000)
-    {
-        for turn in 0..16 {
-            let start = Instant::now();
-            step(body);
-            let stepped = Instant::now();
-            surface(body);
-            let done = Instant::now();
-            if turn > 0 {
-                samples[0].push((done - start).as_secs_f64() * 1e6);
-                samples[1].push((done - stepped).as_secs_f64() * 1e6);
-            }
-        }
-        sum();
-        samples[2].extend((0..15).map(|_| once(&mut sum)));
-    }
-    samples
-}
-
-/// us.
-fn once(work: &mut impl FnMut()) -> f64 {
-    let start = Instant::now();
-    work();
-    start.elapsed().as_secs_f64() * 1e6
-}
-
-fn percentiles(mut samples: Vec<f64>) -> Times {
-    samples.sort_by(f64::total_cmp);
-    let at = |part: f64| samples[((samples.len() - 1) as f64 * part) as usize];
-    Times { p50: at(0.5), p99: at(0.99), p999: at(0.999) }
-}
-
-fn text(told: &Told) -> String {
-    let times = |t: &Times| format!("{:.2} us (99 %: {:.2}, 99.9 %: {:.2})", t.p50, t.p99, t.p999);
+fn text(cost: &Cost) -> String {
+    let times = |t: &Percentiles| format!("{:.2} us (99 %: {:.2}, 99.9 %: {:.2})", t.p50, t.p99, t.p999);
     format!(
         "body               {} modes, {} surface vertices\n\
          step, one grab     {}\n\
@@ -191,14 +52,14 @@ fn text(told: &Told) -> String {
          both, as a frame   {}\n\
          bytes moved        {}\n\
          bandwidth          {:.1} GB/s, {:.0} % of the {:.1} GB/s of the fastest pass over as many bytes",
-        told.modes,
-        told.surface_vertices,
-        times(&told.step_us),
-        times(&told.reconstruct_us),
-        times(&told.frame_us),
-        told.bytes,
-        told.bandwidth_gb_s,
-        100.0 * told.bandwidth_gb_s / told.bandwidth_limit_gb_s,
-        told.bandwidth_limit_gb_s
+        cost.modes,
+        cost.surface_vertices,
+        times(&cost.step_us),
+        times(&cost.reconstruct_us),
+        times(&cost.frame_us),
+        cost.bytes,
+        cost.bandwidth_gb_s,
+        100.0 * cost.bandwidth_gb_s / cost.bandwidth_limit_gb_s,
+        cost.bandwidth_limit_gb_s
     )
 }

@@ -18,7 +18,6 @@
 mod bake;
 mod bench;
 mod inspect;
-mod machine;
 mod mesh;
 mod output;
 mod progress;
@@ -29,6 +28,7 @@ mod stream;
 use std::process::ExitCode;
 
 use clap::{Parser, Subcommand};
+use pliant_lab::LabError;
 
 /// Soft bodies from meshes: tetrahedra, vibration modes, models.
 #[derive(Parser, Debug)]
@@ -94,17 +94,9 @@ enum CliError {
     #[error("--output: the folder {0} is not there")]
     NoFolder(std::path::PathBuf),
     #[error("{0}")]
-    Model(#[from] pliant_modal::ModelError),
-    #[error("{0}")]
-    Step(#[from] pliant_modal::StepError),
-    #[error("{0}")]
     Stream(#[from] pliant_stream::StreamError),
     #[error("{0}")]
-    Device(#[from] pliant_haptics::StartError),
-    #[error("{0}")]
-    DeviceInfo(#[from] pliant_haptics::InfoError),
-    #[error("{0}: cannot be drawn")]
-    Plot(std::path::PathBuf),
+    Lab(LabError),
     #[error("{broken} of {of} cases break their bounds")]
     Unstable { broken: usize, of: usize },
     #[error("{what}: expected one of {expected}, got '{got}'")]
@@ -113,4 +105,16 @@ enum CliError {
     Range { what: &'static str, low: f64, high: f64, got: f64 },
     #[error("cannot print: {0}")]
     Print(#[from] std::io::Error),
+}
+
+impl From<LabError> for CliError {
+    /// What names an option is told in the program's own words.
+    fn from(error: LabError) -> Self {
+        match error {
+            LabError::TetsGiven(path) => Self::TetsGiven(path),
+            LabError::Threads { got, most } => Self::Threads { got, most },
+            LabError::Write(error) => Self::Print(error),
+            other => Self::Lab(other),
+        }
+    }
 }

@@ -3,16 +3,11 @@
 use std::path::{Path, PathBuf};
 
 use clap::{Args, Subcommand};
-use pliant_mesh::{Repair, StuffOptions, TetMesh, io, shapes};
+use pliant_lab::fill::fill;
+use pliant_mesh::{TetMesh, io, shapes};
 
 use crate::progress::Bar;
 use crate::{CliError, output};
-
-/// Tetrahedra that a surface or a scene is filled with unless told otherwise.
-pub(crate) const DEFAULT_TETS: usize = 10_000;
-
-/// Share of a surface's volume that a fill may lose in silence.
-const VOLUME_LOSS: f64 = 0.02;
 
 #[derive(Args, Debug)]
 #[command(args_conflicts_with_subcommands = true, subcommand_negates_reqs = true)]
@@ -157,36 +152,4 @@ pub(crate) fn run(args: MeshArgs) -> Result<(), CliError> {
         quality.min_dihedral_deg,
         quality.max_dihedral_deg,
     ))
-}
-
-/// The tetrahedra that a file holds, or that its shape is filled with. `tets` asked for tetrahedra: refused where the
-/// file has its own. What was mended of a dirty surface is told on stderr and returned; a fill so coarse that it rounds
-/// much of a surface away is told on stderr.
-pub(crate) fn fill(
-    input: &Path,
-    tets: Option<usize>,
-    bar: &mut Bar,
-) -> Result<(TetMesh, Option<Repair>), CliError> {
-    bar.report("read", 0.0);
-    let read = io::read(input)?;
-    if tets.is_some() && matches!(read, io::Input::Tets(_)) {
-        return Err(CliError::TetsGiven(input.to_path_buf()));
-    }
-    let options = StuffOptions::with_target(tets.unwrap_or(DEFAULT_TETS));
-    let enclosed = if let io::Input::Surface(surface) = &read { surface.volume().abs() } else { 0.0 };
-    let (mesh, repair) = read.into_tets(&options, &mut |share| bar.report("mesh", f64::from(share)))?;
-    if let Some(repair) = repair {
-        bar.warn(&format!("{} was mended: {repair}", input.display()));
-        // What a dirty surface encloses is no measure of the fill: holes, and parts that are counted twice.
-        return Ok((mesh, Some(repair)));
-    }
-    let filled = mesh.volume();
-    if filled < (1.0 - VOLUME_LOSS) * enclosed {
-        bar.warn(&format!(
-            "the tetrahedra hold {filled:.6e} m^3 of the {enclosed:.6e} m^3 that {} encloses: edges and thin parts are \
-             rounded away; more --tets keep more",
-            input.display()
-        ));
-    }
-    Ok((mesh, None))
 }

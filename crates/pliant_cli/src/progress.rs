@@ -1,6 +1,7 @@
 //! A progress bar on stderr where that is a terminal, silence elsewhere.
 
 use indicatif::{ProgressBar, ProgressDrawTarget, ProgressStyle};
+use pliant_lab::Progress;
 
 const STEPS: u64 = 1000;
 
@@ -19,9 +20,10 @@ impl Bar {
         }
         Self { bar, stage: "" }
     }
+}
 
-    /// `share` of the stage is done, 0 to 1.
-    pub(crate) fn report(&mut self, stage: &'static str, share: f64) {
+impl Progress for Bar {
+    fn report(&mut self, stage: &'static str, share: f64) {
         if self.stage != stage {
             self.stage = stage;
             self.bar.set_message(stage);
@@ -30,7 +32,7 @@ impl Bar {
     }
 
     /// One line on stderr that stays, whether there is a bar or not.
-    pub(crate) fn warn(&self, text: &str) {
+    fn warn(&mut self, text: &str) {
         self.bar.suspend(|| eprintln!("pliant: warning: {text}"));
     }
 }

@@ -8,11 +8,11 @@ use std::{
 };
 
 use clap::{Args, ValueEnum};
+use pliant_lab::experiment::{Experiment, Figures};
 use pliant_modal::{Integrator, ModalModel, Relaxation};
 use pliant_stream::{
     Policy, RecoveryConfig,
     emulator::{LinkConfig, Loss, Preset},
-    experiment::{Experiment, Figures},
     peer::Repair,
 };
 use serde::Serialize;
@@ -128,7 +128,7 @@ impl Told {
 }
 
 /// Time since the first call: the experiment owns no clock.
-pub(crate) fn clock() -> Duration {
+fn clock() -> Duration {
     static BEGAN: OnceLock<Instant> = OnceLock::new();
     BEGAN.get_or_init(Instant::now).elapsed()
 }

@@ -136,7 +136,19 @@ fn a_feature_that_is_off_compiles_none_of_its_crates() {
 
 #[test]
 fn the_crates_below_the_plugins_import_no_engine_runtime_or_viewer() {
-    for package in ["pliant_mesh", "pliant_bake", "pliant_modal", "pliant_stream"] {
+    for package in ["pliant_mesh", "pliant_bake", "pliant_modal", "pliant_stream", "pliant_lab"] {
         lacks(&crates(package, &[]), &["bevy*", "tokio", "quinn*", "rerun", "egui*"], package);
     }
+}
+
+#[test]
+fn only_the_program_imports_the_laboratory() {
+    // The face with all its features compiles every crate that an app can have.
+    for package in ["pliant", "pliant_mesh", "pliant_bake", "pliant_modal", "pliant_stream"] {
+        lacks(&crates(package, &[]), &["pliant_lab"], package);
+    }
+    assert!(crates("pliant_cli", &[]).contains("pliant_lab"));
+    // The protocol knows no mesh and no bake; what measures knows neither plugins nor program.
+    lacks(&crates("pliant_stream", &[]), &["pliant_mesh", "pliant_bake", "plotters"], "pliant_stream");
+    lacks(&crates("pliant_lab", &[]), &["pliant_cli", "pliant_body", "clap"], "pliant_lab");
 }

@@ -189,7 +189,7 @@ fn over_the_papers_first_network_the_shape_stays_right() {
             must!((190..300).contains(&stats.round_trip.as_millis()), "{stats:?}");
             must!(stats.recovered > 0, "{stats:?}");
             // A busy machine adds to the errors by coming late: a second and a half in which it did
-            // not is waited for. The sessions' own tests (pliant_stream) hold all of them against
+            // not is waited for. The sessions' own tests (pliant_lab) hold all of them against
             // their bounds, in virtual time.
             let (rms, max) = off(apps[0], &seen, 60);
             must!(rms < 0.01 && max < 0.05, "rms {rms}, max {max}");

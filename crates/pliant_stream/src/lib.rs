@@ -3,26 +3,62 @@
 //! A host steps soft bodies and streams them; guests follow, hold on to them and feel them. Everything here is a state
 //! machine: no socket, no clock, no thread, no randomness without a seed. `(now, datagrams in) -> (datagrams out, state)`.
 //!
-//! A whole session, a host and a guest and two hands over a network that loses packets, in virtual time:
+//! A host and a guest over a network that loses packets, in virtual time. The caller carries the
+//! bytes, here through the [`emulator`]; [`session`] says when to call what:
 //!
 //! ```
-//! use std::sync::Arc;
-//! use pliant_modal::ModalModel;
-//! use pliant_stream::{RecoveryConfig, emulator::{LinkConfig, Preset}, experiment::Experiment};
+//! use std::{sync::Arc, time::Duration};
+//! use pliant_modal::{Body, BodyConfig, ModalModel};
+//! use pliant_stream::emulator::{Link, LinkConfig, Preset};
+//! use pliant_stream::{
+//!     BodyId, Channel, GuestConfig, GuestSession, HostConfig, HostSession, PeerId, StepSettings,
+//!     TickState,
+//! };
 //!
 //! # fn main() -> Result<(), Box<dyn std::error::Error>> {
+//! let (id, guest_id, start) = (BodyId(1), PeerId(1), Duration::ZERO);
 //! let model = Arc::new(ModalModel::read("../../assets/bud.modal")?);
-//! let network = LinkConfig::preset(Preset::Paper1); // 9 % lost, 196 ms there and back
-//! let session = Experiment { seconds: 5.0, ..Experiment::new(model, network, RecoveryConfig::default()) };
-//! let seen = session.run()?;
-//! println!("{} frames lost, shown within {:.3} % of the truth (rms)", seen.lost, seen.rms_percent);
-//! assert!(seen.lost > 0 && seen.rms_percent < 0.5);
+//! let mut body = Body::new(model.clone(), BodyConfig { step: 1.0 / 40.0, ..Default::default() })?;
+//! let mut host = HostSession::new(HostConfig::default())?; // 40 ticks a second
+//! host.add_body(id, "bud", model.clone(), StepSettings::default())?;
+//! let mut guest = GuestSession::new(GuestConfig::default(), 1200)?;
+//! guest.add_cached_model(model);
+//! host.connect(start, guest_id, 1200)?;
+//! guest.connect(start)?;
+//!
+//! let lossy = LinkConfig::preset(Preset::Paper1); // 9 % lost, 196 ms there and back
+//! let [mut down, mut up] = [1, 2].map(|seed| Link::<Vec<u8>>::new(lossy.clone(), seed));
+//! for tick in 1..=400 {
+//!     let now = tick as u32 * Duration::from_millis(25);
+//!     body.push(0, [0.0, 0.0, 0.1 * (0.1 * tick as f64).sin()])?;
+//!     body.step()?;
+//!     let (q, v, a) = (body.q(), body.v(), body.a());
+//!     let state = TickState { tick, q, v, a, z: &[], pose: None, grabs: &[], resting: false };
+//!     host.publish(now, id, &state)?;
+//!     // Datagrams may be lost; messages are the transport's to deliver.
+//!     while let Some(bytes) = down.poll(now) { guest.on_datagram(now, &bytes); }
+//!     while let Some(bytes) = up.poll(now) { host.on_datagram(now, guest_id, &bytes); }
+//!     host.update(now);
+//!     guest.update(now);
+//!     while let Some(out) = host.poll_output() {
+//!         match out.channel {
+//!             Channel::Datagram => down.send(now, out.bytes.to_vec(), out.bytes.len()),
+//!             Channel::Message => guest.on_message(now, &out.bytes),
+//!         }
+//!     }
+//!     while let Some(out) = guest.poll_output() {
+//!         match out.channel {
+//!             Channel::Datagram => up.send(now, out.bytes.to_vec(), out.bytes.len()),
+//!             Channel::Message => host.on_message(now, guest_id, &out.bytes),
+//!         }
+//!     }
+//! }
+//! let view = guest.body(id).ok_or("the body has not arrived")?;
+//! println!("shown: tick {} of 400, {} frames lost", view.tick(), down.counts().lost);
+//! assert!(view.tick() > 380 && down.counts().lost > 0);
 //! # Ok(())
 //! # }
 //! ```
-//!
-//! Over a network of one's own: a [`HostSession`] and a [`GuestSession`], whose bytes the caller carries ([`session`] says when to call what;
-//! [`pair`] does it over the emulator).
 //!
 //! | module | what it holds |
 //! | --- | --- |
@@ -33,8 +69,6 @@
 //! | [`quanta`] | how coarse each mode may be |
 //! | [`wire`] | the bytes; every parser takes anything |
 //! | [`emulator`] | a seeded bad network |
-//! | [`pair`] | host and guests joined by emulated links in virtual time: for tests |
-//! | [`experiment`] | a session measured: errors, forces, bytes |
 //! | [`newmark`] | the identities that make compensation exact |
 
 #![cfg_attr(
@@ -47,11 +81,8 @@ pub mod clock;
 pub mod emulator;
 pub mod encoder;
 mod error;
-pub mod experiment;
-mod experiment_peers;
 mod link;
 pub mod newmark;
-pub mod pair;
 pub mod peer;
 pub mod playout;
 pub mod quanta;

@@ -182,11 +182,11 @@ impl PeerBody {
         (past.tick == tick && tick <= self.tick && past.state.modes() > 0).then_some(&past.state)
     }
 
-    /// The reactions of the hands at a tick that is still remembered: user, N.
-    pub(crate) fn reactions_at(&self, tick: Tick) -> Option<Vec<(u16, [f64; 3])>> {
+    /// The reactions (N) of the hands at a tick that is still remembered, with whose they are.
+    pub(crate) fn reactions_at(&self, tick: Tick) -> Option<Vec<(UserId, [f64; 3])>> {
         self.past(tick)?;
         let past = &self.past[(tick % WINDOW as u64) as usize];
-        Some(past.pulls.iter().map(|g| (g.key.user.0, (-g.pull).into())).collect())
+        Some(past.pulls.iter().map(|g| (g.key.user, (-g.pull).into())).collect())
     }
 
     pub(crate) fn export(&self, tick: Tick) -> Option<PeerBodyState> {

@@ -276,6 +276,11 @@ impl PeerSession {
         self.bodies.get(&body)?.past(tick)
     }
 
+    /// The reactions (N) of the hands on a body at a tick of the last 128, with whose they are.
+    pub fn reactions_at(&self, body: BodyId, tick: Tick) -> Option<Vec<(UserId, [f64; 3])>> {
+        self.bodies.get(&body)?.reactions_at(tick)
+    }
+
     /// The rigid frame of a free body after a tick of the last 128.
     pub fn pose_at(&self, body: BodyId, tick: Tick) -> Option<crate::Pose> {
         self.bodies.get(&body)?.past_pose(tick)

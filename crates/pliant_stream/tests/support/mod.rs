@@ -2,7 +2,6 @@
 #![allow(dead_code, reason = "each test uses its part")]
 
 pub mod direct;
-pub mod scene;
 
 use std::sync::Arc;
 

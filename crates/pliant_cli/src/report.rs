@@ -1,0 +1,60 @@
+//! `pliant report`: what the method costs and what it is off by, remade on this machine.
+
+use std::path::PathBuf;
+
+use clap::Args;
+use pliant_lab::report::{Part, Settings, write};
+
+use crate::{CliError, output, progress::Bar};
+
+/// The name of all parts together.
+const ALL: &str = "all";
+
+#[derive(Args, Debug)]
+pub(crate) struct ReportArgs {
+    /// Only one part: elements, modes, steps, warp, precision, frames, network, front, table-2, table-3, courses, default
+    #[arg(long, default_value = ALL)]
+    only: String,
+    /// Fewer points and shorter timings: within ten minutes on two cores
+    #[arg(long)]
+    quick: bool,
+    /// Surfaces that are measured when they are there: bunny.obj, armadillo.obj
+    #[arg(long, value_name = "DIR", default_value = "../shared/models")]
+    models: PathBuf,
+    /// The project's own body: a surface or a scene
+    #[arg(long, value_name = "FILE", default_value = "assets/pip.ron")]
+    own: PathBuf,
+    /// The folder to write
+    #[arg(short, long, value_name = "DIR")]
+    output: PathBuf,
+    /// Prints one line of JSON: the parts, their files and seconds
+    #[arg(long)]
+    json: bool,
+}
+
+impl ReportArgs {
+    fn parts(&self) -> Result<Vec<Part>, CliError> {
+        if self.only == ALL {
+            return Ok(Part::ALL.to_vec());
+        }
+        Part::by_name(&self.only).map(|part| vec![part]).ok_or_else(|| CliError::Unknown {
+            what: "--only",
+            got: self.only.clone(),
+            expected: format!("{}, {ALL}", Part::ALL.map(Part::name).join(", ")),
+        })
+    }
+}
+
+pub(crate) fn run(args: &ReportArgs) -> Result<(), CliError> {
+    let settings = Settings {
+        parts: args.parts()?,
+        quick: args.quick,
+        models: args.models.clone(),
+        own: args.own.clone(),
+    };
+    let report = write(&args.output, &settings, &mut Bar::new())?;
+    if args.json {
+        return output::print_json(&report);
+    }
+    output::print(&format!("{} in {:.0} s", args.output.join("report.md").display(), report.seconds))
+}

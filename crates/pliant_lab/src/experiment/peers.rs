@@ -1,0 +1,195 @@
+//! Peer to peer measured: two peers, each with one of the scripted hands, and what the second is shown.
+
+use std::collections::BTreeMap;
+use std::time::Duration;
+
+use pliant_modal::{GrabConfig, StepSettings};
+use pliant_stream::emulator::{Link, LinkConfig, Loss};
+use pliant_stream::peer::{PeerConfig, PeerSession, Repair};
+use pliant_stream::{Channel, PeerId, StreamError, Tick, UserId};
+
+use super::{BODY, Experiment, Figures, RECOVERED, ShapeError, fold, norm};
+
+/// How often a peer's application looks at its session.
+const LOOK: Duration = Duration::from_millis(5);
+/// Both have joined and hold by then.
+const SETTLED: Duration = Duration::from_secs(3);
+
+struct Seen {
+    at: Duration,
+    q: Vec<f64>,
+    reactions: Vec<(UserId, [f64; 3])>,
+}
+
+impl Experiment {
+    /// Runs the experiment between two equal peers instead of host and guest: the first peer has the first hand, the
+    /// second the others, and the path between them is `up` and `down`. Truth is what both agree on once all inputs are
+    /// known; the figures are of what the second was shown before that. `recovery`, `modes`, `newmark` and `resend_after`
+    /// play no part.
+    ///
+    /// # Errors
+    /// [`StreamError::Config`] for settings out of range or a free body, [`StreamError::Model`].
+    pub fn run_peers(&self, repair: Repair) -> Result<Figures, StreamError> {
+        let h = 1.0 / self.rate;
+        let settings =
+            StepSettings { integrator: self.integrator, relaxation: self.relaxation, ..Default::default() };
+        let peer = |number: u16| -> Result<PeerSession, StreamError> {
+            let config = PeerConfig { user: UserId(number), step: h, repair, ..Default::default() };
+            let mut peer = PeerSession::new(config)?;
+            peer.add_body(BODY, self.model.clone(), &settings)?;
+            Ok(peer)
+        };
+        let mut peers = [peer(1)?, peer(2)?];
+        peers[0].connect(Duration::ZERO, PeerId(1), UserId(2), 1200)?;
+        peers[1].connect(Duration::ZERO, PeerId(0), UserId(1), 1200)?;
+        let reliable = |l: &LinkConfig| LinkConfig { loss: Loss::None, keep_order: true, ..l.clone() };
+        // links[k]: what peer k says; datagrams, then messages.
+        let mut links: [[Link; 2]; 2] = [
+            [Link::new(self.down.clone(), self.seed), Link::new(reliable(&self.down), self.seed ^ 0x51)],
+            [
+                Link::new(self.up.clone(), self.seed ^ 0xFFFF_0000),
+                Link::new(reliable(&self.up), self.seed ^ 0x57),
+            ],
+        ];
+        let rest = |index: usize| {
+            let place = self.model.surface().positions().get(self.hands[index].vertex as usize);
+            place.copied().unwrap_or_default().map(f64::from)
+        };
+        let mut grabs: Vec<Option<u16>> = vec![None; self.hands.len()];
+        let mut seen: BTreeMap<Tick, Seen> = BTreeMap::new();
+        let mut truth: BTreeMap<Tick, Vec<f64>> = BTreeMap::new();
+        let mut reactions: BTreeMap<Tick, Vec<(UserId, [f64; 3])>> = BTreeMap::new();
+        let mut now = Duration::ZERO;
+        let until = SETTLED + Duration::from_secs_f64(self.seconds.clamp(0.1, 1e6));
+        let (mut spent, mut sent) = (Duration::ZERO, (0_u64, 0_u64));
+        while now < until {
+            for k in 0..2 {
+                let other = 1 - k;
+                let began = self.cpu_clock.map(|c| c());
+                while let Some(bytes) = links[other][1].poll(now) {
+                    peers[k].on_message(now, PeerId(other as u64), &bytes);
+                }
+                while let Some(bytes) = links[other][0].poll(now) {
+                    peers[k].on_datagram(now, PeerId(other as u64), &bytes);
+                }
+                let t = now.as_secs_f64();
+                for (index, hand) in self.hands.iter().enumerate().filter(|(i, _)| usize::from(*i > 0) == k) {
+                    let (start, d) = (rest(index), hand.path(t));
+                    let target = std::array::from_fn(|x| start[x] + d[x]);
+                    match grabs[index] {
+                        None => {
+                            grabs[index] = peers[k]
+                                .begin_grab(BODY, hand.vertex, hand.radius, target, GrabConfig::default())
+                                .ok()
+                        }
+                        Some(grab) => peers[k].set_target(grab, target)?,
+                    }
+                }
+                let stepped = peers[k].update(now);
+                if k == 1
+                    && let (Some(clock), Some(began)) = (self.cpu_clock, began)
+                {
+                    spent += clock().saturating_sub(began);
+                }
+                while peers[k].poll_event().is_some() {}
+                if k == 1
+                    && stepped > 0
+                    && now >= SETTLED
+                    && let Some(body) = peers[1].body(BODY)
+                {
+                    let reactions = body.grabs().iter().map(|g| (g.key.user, g.reaction)).collect();
+                    seen.insert(peers[1].tick(), Seen { at: now, q: body.shown().q.clone(), reactions });
+                }
+                while let Some(out) = peers[k].poll_output() {
+                    let channel = usize::from(out.channel == Channel::Message);
+                    if k == 0 && channel == 0 && now >= SETTLED {
+                        sent = (sent.0 + 1, sent.1 + out.bytes.len() as u64);
+                    }
+                    links[k][channel].send(now, out.bytes.to_vec(), out.bytes.len());
+                }
+            }
+            // What both know is true from now on: peer 1's own state of it.
+            let confirmed = peers[0].confirmed();
+            for tick in confirmed.saturating_sub(8)..=confirmed {
+                if let Some(state) = peers[0].state_at(BODY, tick) {
+                    truth.insert(tick, state.q.clone());
+                    if let Some(r) = peers[0].reactions_at(BODY, tick) {
+                        reactions.insert(tick, r);
+                    }
+                }
+            }
+            now += LOOK;
+        }
+        Ok(self.peer_figures(&seen, &truth, &reactions, &links[0][0], spent, sent))
+    }
+
+    fn peer_figures(
+        &self,
+        seen: &BTreeMap<Tick, Seen>,
+        truth: &BTreeMap<Tick, Vec<f64>>,
+        reactions: &BTreeMap<Tick, Vec<(UserId, [f64; 3])>>,
+        link: &Link,
+        spent: Duration,
+        sent: (u64, u64),
+    ) -> Figures {
+        // Taking hold is not part of what is measured.
+        let first = seen.keys().next().copied().unwrap_or(0);
+        let truth: BTreeMap<Tick, &Vec<f64>> = truth.range(first..).map(|(t, q)| (*t, q)).collect();
+        let reactions: BTreeMap<Tick, &Vec<(UserId, [f64; 3])>> =
+            reactions.range(first..).map(|(t, r)| (*t, r)).collect();
+        let shape = ShapeError::new(&self.model);
+        let scale = truth.values().map(|q| shape.compare(q, &[]).1.sqrt()).fold(0.0, f64::max);
+        let all = || reactions.values().copied().flatten().map(|r| norm(r.1));
+        let force_scale = all().fold(0.0, f64::max);
+        let mut f = Figures { scale, force_scale, lost: link.counts().lost, ..Figures::default() };
+        let (mut sum, mut largest, mut last) = (0.0, 0.0_f64, 0.0);
+        let (mut force, mut forces) = (0.0, 0_u64);
+        let (mut above, mut longest) = (None, Duration::ZERO);
+        let mut hash = 0xCBF2_9CE4_8422_2325;
+        for (tick, s) in seen {
+            let Some(q) = truth.get(tick) else { continue };
+            let (total, most) = shape.compare(&s.q, q);
+            sum += total;
+            largest = largest.max(most);
+            last = most;
+            f.ticks += 1;
+            if most.sqrt() > RECOVERED * scale {
+                let from: &mut Duration = above.get_or_insert(s.at);
+                longest = longest.max(s.at.saturating_sub(*from));
+            } else {
+                above = None;
+            }
+            for (user, real) in reactions.get(tick).copied().into_iter().flatten() {
+                let Some((_, shown)) = s.reactions.iter().find(|r| r.0 == *user) else { continue };
+                force += (0..3).map(|k| (shown[k] - real[k]).powi(2)).sum::<f64>();
+                forces += 1;
+            }
+            for q in &s.q {
+                hash = fold(hash, &q.to_bits().to_le_bytes());
+            }
+        }
+        let second = |series: Vec<[f64; 3]>| {
+            let all =
+                series.windows(3).map(|w| norm(std::array::from_fn(|k| w[2][k] - 2.0 * w[1][k] + w[0][k])));
+            all.fold(0.0, f64::max)
+        };
+        let of_first = |r: &[(UserId, [f64; 3])]| r.iter().find(|r| r.0 == UserId(1)).map(|r| r.1);
+        let percent = |x: f64, scale: f64| if scale > 0.0 { 100.0 * x / scale } else { 0.0 };
+        let ticks = f.ticks.max(1) as f64;
+        f.rms_percent = percent((sum / ticks / shape.places()).sqrt(), scale);
+        f.max_percent = percent(largest.sqrt(), scale);
+        f.end_percent = percent(last.sqrt(), scale);
+        f.force_rms_percent = percent((force / forces.max(1) as f64).sqrt(), force_scale);
+        f.force_ringing =
+            second(seen.values().filter_map(|s| of_first(&s.reactions)).collect()) / force_scale.max(1e-12);
+        f.true_ringing =
+            second(reactions.values().filter_map(|r| of_first(r)).collect()) / force_scale.max(1e-12);
+        f.hand_to_force_ms = 1e3 / self.rate;
+        f.recover_ms = longest.as_secs_f64() * 1e3;
+        f.bytes_per_frame = sent.1 as f64 / sent.0.max(1) as f64;
+        f.kbit_s = sent.1 as f64 * 8e-3 / self.seconds;
+        f.cpu_us_per_tick = 1e6 * spent.as_secs_f64() / ticks;
+        f.hash = fold(hash, &link.hash().to_le_bytes());
+        f
+    }
+}

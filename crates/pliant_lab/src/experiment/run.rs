@@ -1,0 +1,384 @@
+//! The world around a measured session: the true body, its hands, and what the guest is shown beside it.
+
+use std::collections::VecDeque;
+use std::time::Duration;
+
+use pliant_modal::{Body, GrabConfig, GrabId, Patch};
+use pliant_stream::{
+    GrabKey, GrabState, GuestSession, HostEvent, HostSession, Policy, Pose, TickState, UserId,
+};
+
+use super::{BODY, Experiment, Figures, Hand, RECOVERED, ShapeError, fold, norm};
+use crate::pair::World;
+
+/// Truth kept for comparison, ticks.
+const KEPT: usize = 4096;
+
+struct Held {
+    hand: Hand,
+    grab: Option<(GrabId, [f64; 3], f64)>,
+}
+
+struct Truth {
+    tick: u64,
+    at: Duration,
+    q: Vec<f64>,
+    reactions: Vec<(GrabKey, [f64; 3])>,
+}
+
+/// The world around the session: the true body, its hands, and the comparison.
+pub(super) struct Run {
+    body: Body,
+    h: f64,
+    hands: Vec<Held>,
+    truth: VecDeque<Truth>,
+    shape: ShapeError,
+    track_row: Vec<f64>,
+    keep_track: bool,
+    /// Who holds at the guest: the hand, and the grab once there is one.
+    guest_hand: Option<(Hand, Option<u16>)>,
+    /// When it last said its target.
+    guest_said: Duration,
+    own_hand_first: bool,
+    measuring: Option<Duration>,
+    sum: f64,
+    /// Ticks shown, and ticks shown or missed.
+    count: u64,
+    compared: u64,
+    missing: u64,
+    largest: f64,
+    last: f64,
+    hidden_last: f64,
+    scale: f64,
+    force_sum: f64,
+    force_count: u64,
+    force_scale: f64,
+    shown_force: Vec<([f64; 3], [f64; 3])>,
+    true_force: Vec<([f64; 3], [f64; 3])>,
+    shown_second: f64,
+    true_second: f64,
+    delay_sum: f64,
+    above: Vec<(Duration, f64)>,
+    hash: u64,
+    track: Vec<(u64, f64, f64)>,
+    last_tick: u64,
+    /// When it was shown, and what of: the picture that stands until the next one.
+    shown_at: Option<Duration>,
+    picture: Vec<f64>,
+    /// Ticks missed since then.
+    stalled: u64,
+    /// Ticks shown one after the other up to now.
+    in_row: u64,
+}
+
+impl Run {
+    pub(super) fn new(experiment: &Experiment, body: Body, h: f64) -> Self {
+        let model = &experiment.model;
+        let modes = model.mode_count();
+        let shape = ShapeError::new(model);
+        let track_row = experiment.hands.first().map_or(Vec::new(), |hand| {
+            let axis = (0..3).max_by(|a, b| hand.reach[*a].total_cmp(&hand.reach[*b])).unwrap_or(0);
+            (0..modes).map(|mode| f64::from(model.displacement_row(hand.vertex, axis, mode))).collect()
+        });
+        Self {
+            body,
+            h,
+            hands: experiment.hands.iter().map(|h| Held { hand: *h, grab: None }).collect(),
+            truth: VecDeque::with_capacity(KEPT),
+            shape,
+            track_row,
+            keep_track: experiment.keep_track,
+            guest_hand: experiment.hands.first().filter(|_| experiment.guest_hand).map(|hand| (*hand, None)),
+            guest_said: Duration::ZERO,
+            own_hand_first: matches!(experiment.recovery.policy, Policy::ForceDriven { .. }),
+            measuring: None,
+            sum: 0.0,
+            count: 0,
+            compared: 0,
+            missing: 0,
+            largest: 0.0,
+            last: 0.0,
+            hidden_last: 0.0,
+            scale: 0.0,
+            force_sum: 0.0,
+            force_count: 0,
+            force_scale: 0.0,
+            shown_force: Vec::new(),
+            true_force: Vec::new(),
+            shown_second: 0.0,
+            true_second: 0.0,
+            delay_sum: 0.0,
+            above: Vec::new(),
+            hash: 0xCBF2_9CE4_8422_2325,
+            track: Vec::new(),
+            last_tick: 0,
+            shown_at: None,
+            picture: Vec::new(),
+            stalled: 0,
+            in_row: 0,
+        }
+    }
+
+    /// The guest's own hand, on the path of the first one of the host.
+    fn hold_at_guest(&mut self, now: Duration, session: &mut GuestSession) {
+        let Some((hand, grab)) = &mut self.guest_hand else { return };
+        // Once a tick: a target that is said makes the session look again at once.
+        if now.saturating_sub(self.guest_said).as_secs_f64() < 0.9 * self.h {
+            return;
+        }
+        self.guest_said = now;
+        let place = self.body.model().surface().positions().get(hand.vertex as usize).copied();
+        let (rest, d) = (place.unwrap_or_default(), hand.path(now.as_secs_f64()));
+        let target = std::array::from_fn(|k| f64::from(rest[k]) + d[k]);
+        match grab {
+            // Refused before the body is there: again at the next tick.
+            None => {
+                let hold = GrabConfig::default();
+                *grab = session.begin_grab(now, BODY, hand.vertex, hand.radius, target, hold).ok();
+            }
+            // A finite hand's target is taken.
+            Some(grab) => drop(session.set_target(*grab, target)),
+        }
+    }
+
+    pub(super) fn begin(&mut self, now: Duration) {
+        self.measuring = Some(now);
+        // What stands still from here on is missed, whatever was shown before.
+        if self.shown_at.is_none() {
+            self.shown_at = Some(now);
+        }
+    }
+
+    /// Ticks that were still due when the measuring ended.
+    pub(super) fn end(&mut self, now: Duration) {
+        self.stand_still(now);
+    }
+
+    /// Counts the ticks that were due since the last one was shown and a half: one every step, compared with the picture that stands in their place.
+    fn stand_still(&mut self, now: Duration) {
+        let (Some(since), Some(_)) = (self.shown_at, self.measuring) else { return };
+        let due = (now.saturating_sub(since).as_secs_f64() / self.h - 0.5).max(0.0) as u64;
+        while self.stalled < due {
+            self.stalled += 1;
+            self.miss(now, self.last_tick + self.stalled);
+        }
+    }
+
+    /// A tick that was not shown: the picture that stood in its place against its truth.
+    fn miss(&mut self, now: Duration, tick: u64) {
+        let first = self.truth.front().map_or(u64::MAX, |truth| truth.tick);
+        let Some(truth) = tick.checked_sub(first).and_then(|i| self.truth.get(i as usize)) else { return };
+        // Who has only the first modes is asked for no more; who has nothing at all shows the body at rest.
+        let modes = if self.picture.is_empty() { truth.q.len() } else { self.picture.len() };
+        let (sum, largest) = self.shape.compare(&self.picture, &truth.q[..modes.min(truth.q.len())]);
+        if self.keep_track {
+            let dot = |q: &[f64]| q.iter().zip(&self.track_row).map(|(q, r)| q * r).sum::<f64>();
+            let entry = (tick, dot(&truth.q), dot(&self.picture));
+            self.track.push(entry);
+        }
+        self.missing += 1;
+        self.tell(now, sum, largest);
+    }
+
+    /// One tick's squared errors, shown or missed.
+    fn tell(&mut self, now: Duration, sum: f64, largest: f64) {
+        self.sum += sum;
+        self.compared += 1;
+        self.largest = self.largest.max(largest);
+        self.last = largest;
+        self.above.push((now, largest.sqrt()));
+    }
+
+    pub(super) fn figures(&self, session: &GuestSession) -> Figures {
+        let percent = |x: f64, scale: f64| if scale > 0.0 { 100.0 * x / scale } else { 0.0 };
+        let counts = session.body(BODY).map(|b| b.counts()).unwrap_or_default();
+        let places = self.shape.places();
+        let (ticks, compared) = (self.count.max(1) as f64, self.compared.max(1) as f64);
+        let ratio = |a: f64, b: f64| if b > 0.0 { a / b } else { 0.0 };
+        // The longest spell of shown error above the threshold.
+        let (mut longest, mut since) = (Duration::ZERO, None);
+        for (at, error) in &self.above {
+            if *error > RECOVERED * self.scale {
+                let from = *since.get_or_insert(*at);
+                longest = longest.max(*at - from);
+            } else {
+                since = None;
+            }
+        }
+        let delay = self.delay_sum / ticks;
+        Figures {
+            ticks: self.count,
+            missing: self.missing,
+            guessed: counts.guessed,
+            recovered: counts.repaired,
+            rms_percent: percent((self.sum / compared / places).sqrt(), self.scale),
+            max_percent: percent(self.largest.sqrt(), self.scale),
+            end_percent: percent(self.last.sqrt(), self.scale),
+            hidden_end_percent: percent(self.hidden_last.sqrt(), self.scale),
+            force_rms_percent: percent(
+                (self.force_sum / self.force_count.max(1) as f64).sqrt(),
+                self.force_scale,
+            ),
+            force_ringing: ratio(self.shown_second, self.force_scale),
+            true_ringing: ratio(self.true_second, self.force_scale),
+            hand_to_force_ms: 1e3
+                * if self.own_hand_first {
+                    // The guest's newer copy answers at its next tick.
+                    self.h
+                } else {
+                    // A target leaves with the guest's tick, waits for the host's next step (half a step on average),
+                    // and its reaction comes back and is shown.
+                    session.stats().round_trip.as_secs_f64() * 0.5 + 0.5 * self.h + delay
+                },
+            shown_delay_ms: 1e3 * delay,
+            recover_ms: longest.as_secs_f64() * 1e3,
+            hash: self.hash,
+            counts,
+            scale: self.scale,
+            force_scale: self.force_scale,
+            track: self.track.clone(),
+            ..Figures::default()
+        }
+    }
+}
+
+impl World for Run {
+    fn step(&mut self, now: Duration, tick: u64, host: &mut HostSession) {
+        let t = now.as_secs_f64();
+        for (index, held) in self.hands.iter_mut().enumerate() {
+            let holds = held.hand.holds.is_none_or(|(from, to)| (from..to).contains(&t));
+            match (&held.grab, holds) {
+                (None, true) => {
+                    let patch =
+                        Patch::around(self.body.model().surface(), held.hand.vertex, held.hand.radius);
+                    if let Ok(patch) = patch
+                        && let Ok(id) = self.body.grab(&patch, GrabConfig::default())
+                        && let Ok(start) = self.body.grab_position(id)
+                    {
+                        held.grab = Some((id, start, t));
+                    }
+                }
+                (Some((id, ..)), false) => {
+                    self.body.release(*id);
+                    held.grab = None;
+                }
+                _ => {}
+            }
+            if let Some((id, start, since)) = held.grab {
+                let d = held.hand.path(t - since + 0.1 * index as f64);
+                // A target out of range cannot come from finite hands.
+                let _ = self.body.set_target(id, std::array::from_fn(|k| start[k] + d[k]));
+            }
+        }
+        if self.body.step().is_err() {
+            return;
+        }
+        let grabs: Vec<GrabState> = self
+            .hands
+            .iter()
+            .enumerate()
+            .filter_map(|(index, held)| {
+                let (id, ..) = held.grab?;
+                Some(GrabState {
+                    key: GrabKey { user: UserId::HOST, grab: index as u16 },
+                    vertex: held.hand.vertex,
+                    radius: held.hand.radius,
+                    target: self.body.target(id).ok()?,
+                    reaction: self.body.reaction(id).ok()?,
+                })
+            })
+            .collect();
+        let pose = self.body.model().is_free().then(|| Pose::of(&self.body));
+        let state = TickState {
+            tick,
+            q: self.body.q(),
+            v: self.body.v(),
+            a: self.body.a(),
+            z: self.body.z(),
+            pose,
+            grabs: &grabs,
+            resting: false,
+        };
+        // A state that cannot be published shows as ticks that never arrive.
+        let _ = host.publish(now, BODY, &state);
+        if self.truth.len() >= KEPT {
+            self.truth.pop_front();
+        }
+        if self.measuring.is_some() {
+            let (_, largest) = self.shape.compare(self.body.q(), &[]);
+            self.scale = self.scale.max(largest.sqrt());
+            for g in &grabs {
+                self.force_scale = self.force_scale.max(norm(g.reaction));
+            }
+        }
+        self.truth.push_back(Truth {
+            tick,
+            at: now,
+            q: self.body.q().to_vec(),
+            reactions: grabs.iter().map(|g| (g.key, g.reaction)).collect(),
+        });
+    }
+
+    fn host_event(&mut self, _now: Duration, _event: HostEvent, _host: &mut HostSession) {}
+
+    fn guest_stepped(&mut self, now: Duration, _guest: usize, _stepped: u64, session: &mut GuestSession) {
+        self.hold_at_guest(now, session);
+        let Some(view) = session.body(BODY) else { return self.stand_still(now) };
+        let (Some(shown), Some(hidden)) = (view.shown(), view.hidden()) else { return self.stand_still(now) };
+        let tick = view.tick();
+        if tick <= self.last_tick {
+            return self.stand_still(now);
+        }
+        if self.measuring.is_none() {
+            (self.last_tick, self.shown_at) = (tick, Some(now));
+            self.picture.clone_from(&shown.q);
+            return;
+        }
+        // What a catch-up goes past was never shown: the picture before it stood in its place.
+        for passed in self.last_tick + self.stalled + 1..tick {
+            self.miss(now, passed);
+        }
+        // Second differences are taken of ticks that follow each other; a stall that is caught up with shows as error.
+        self.in_row = if tick == self.last_tick + 1 { self.in_row + 1 } else { 0 };
+        (self.last_tick, self.shown_at, self.stalled) = (tick, Some(now), 0);
+        self.picture.clone_from(&shown.q);
+        let Some(first) = self.truth.front().map(|t| t.tick) else { return };
+        let Some(truth) = tick.checked_sub(first).and_then(|i| self.truth.get(i as usize)) else { return };
+        let modes = shown.q.len();
+        let (sum, largest) = self.shape.compare(&shown.q, &truth.q[..modes]);
+        let (_, hidden_largest) = self.shape.compare(&hidden.q, &truth.q[..modes]);
+        let at = truth.at;
+        let (mut force, mut forces) = (0.0, 0);
+        self.shown_force.resize(view.grabs().len().max(self.shown_force.len()), ([0.0; 3], [0.0; 3]));
+        self.true_force.resize(self.shown_force.len(), ([0.0; 3], [0.0; 3]));
+        for (i, g) in view.grabs().iter().enumerate() {
+            let Some((_, reaction)) = truth.reactions.iter().find(|r| r.0 == g.key) else { continue };
+            force += (0..3).map(|k| (g.reaction[k] - reaction[k]).powi(2)).sum::<f64>();
+            forces += 1;
+            for (series, new, second) in [
+                (&mut self.shown_force[i], g.reaction, &mut self.shown_second),
+                (&mut self.true_force[i], *reaction, &mut self.true_second),
+            ] {
+                if self.in_row >= 2 {
+                    let d = std::array::from_fn(|k| new[k] - 2.0 * series.1[k] + series.0[k]);
+                    *second = second.max(norm(d));
+                }
+                *series = (series.1, new);
+            }
+        }
+        if self.keep_track {
+            let dot = |q: &[f64]| q.iter().zip(&self.track_row).map(|(q, r)| q * r).sum::<f64>();
+            let entry = (tick, dot(&truth.q), dot(&shown.q));
+            self.track.push(entry);
+        }
+        self.force_sum += force;
+        self.force_count += forces;
+        self.count += 1;
+        self.hidden_last = hidden_largest;
+        self.delay_sum += now.saturating_sub(at).as_secs_f64();
+        self.tell(now, sum, largest);
+        for q in &shown.q {
+            self.hash = fold(self.hash, &q.to_bits().to_le_bytes());
+        }
+    }
+}

@@ -1,0 +1,286 @@
+//! A host and its guests joined by emulated links in virtual time: for tests, demos and measurements. Nothing sleeps.
+//!
+//! Time jumps to the next thing that happens: a step of the host, an arrival, a guest's next tick. The caller's side is a
+//! [`World`]: what a game does around a session.
+
+use std::time::Duration;
+
+use pliant_stream::emulator::{Link, LinkConfig, Loss};
+use pliant_stream::{
+    Channel, GuestConfig, GuestEvent, GuestSession, HostConfig, HostEvent, HostSession, Output, PeerId,
+    StreamError,
+};
+
+/// What happens around the sessions. All methods may be left as they are but [`World::step`].
+pub trait World {
+    /// The host's step: simulate, then [`HostSession::publish`] every body with this tick.
+    fn step(&mut self, now: Duration, tick: u64, host: &mut HostSession);
+    /// Something happened at the host.
+    fn host_event(&mut self, _now: Duration, _event: HostEvent, _host: &mut HostSession) {}
+    /// Something happened at a guest.
+    fn guest_event(
+        &mut self,
+        _now: Duration,
+        _guest: usize,
+        _event: GuestEvent,
+        _session: &mut GuestSession,
+    ) {
+    }
+    /// A guest's bodies took `stepped` ticks (0 for a wake-up without one).
+    fn guest_stepped(&mut self, _now: Duration, _guest: usize, _stepped: u64, _session: &mut GuestSession) {}
+}
+
+/// The two directions between the host and one guest.
+#[derive(Debug, Clone, PartialEq)]
+pub struct PathConfig {
+    /// Host to guest.
+    pub down: LinkConfig,
+    /// Guest to host.
+    pub up: LinkConfig,
+    /// Bytes that a datagram may have.
+    pub max_datagram: usize,
+}
+
+impl PathConfig {
+    /// The same both ways, 1,200 bytes a datagram.
+    pub fn symmetric(link: LinkConfig) -> Self {
+        Self { down: link.clone(), up: link, max_datagram: 1200 }
+    }
+}
+
+/// One guest and its links.
+#[derive(Debug)]
+pub struct GuestEnd {
+    /// The session.
+    pub session: GuestSession,
+    /// Datagrams, host to guest.
+    pub down: Link,
+    /// Datagrams, guest to host.
+    pub up: Link,
+    reliable_down: Link,
+    reliable_up: Link,
+    connected: bool,
+}
+
+/// A host and its guests in virtual time.
+#[derive(Debug)]
+pub struct Pair {
+    /// The host's session.
+    pub host: HostSession,
+    /// The guests, in the order in which they were added; guest `k` is [`PeerId`] `k + 1` to the host.
+    pub guests: Vec<GuestEnd>,
+    now: Duration,
+    step: Duration,
+    next_step: Duration,
+    tick: u64,
+    paused: bool,
+    clock: Option<fn() -> Duration>,
+    spent: Duration,
+}
+
+impl Pair {
+    /// A host alone, its first step (tick 1) one step from now.
+    ///
+    /// # Errors
+    /// [`StreamError::Config`].
+    pub fn new(config: HostConfig) -> Result<Self, StreamError> {
+        let step = Duration::from_secs_f64(config.newmark.h.clamp(1e-5, 1.0));
+        let host = HostSession::new(config)?;
+        Ok(Self {
+            host,
+            guests: Vec::new(),
+            now: Duration::ZERO,
+            step,
+            next_step: step,
+            tick: 0,
+            paused: false,
+            clock: None,
+            spent: Duration::ZERO,
+        })
+    }
+
+    /// The time.
+    pub fn now(&self) -> Duration {
+        self.now
+    }
+
+    /// The host's last tick.
+    pub fn tick(&self) -> u64 {
+        self.tick
+    }
+
+    /// Measures with this clock what the guests' sessions cost: reading, correcting, stepping.
+    pub fn measure_guests(&mut self, clock: Option<fn() -> Duration>) {
+        self.clock = clock;
+        self.spent = Duration::ZERO;
+    }
+
+    /// What the guests' sessions have cost since [`Pair::measure_guests`].
+    pub fn guests_spent(&self) -> Duration {
+        self.spent
+    }
+
+    /// The host stops stepping, or goes on; its tick numbers stand still meanwhile and no step is caught up with.
+    pub fn pause(&mut self, paused: bool) {
+        self.paused = paused;
+        self.next_step = self.next_step.max(self.now);
+    }
+
+    /// Joins a guest over a path. What goes reliably arrives in order after the path's delay, and later by what resending
+    /// would cost on average.
+    ///
+    /// # Errors
+    /// [`StreamError`] as from [`GuestSession::new`] and [`HostSession::connect`].
+    pub fn join(&mut self, config: GuestConfig, path: PathConfig, seed: u64) -> Result<usize, StreamError> {
+        self.join_with(config, path, seed, |_| {})
+    }
+
+    /// As [`Pair::join`]; `prepare` sees the session before it says hello (cached models).
+    ///
+    /// # Errors
+    /// As [`Pair::join`].
+    pub fn join_with(
+        &mut self,
+        config: GuestConfig,
+        path: PathConfig,
+        seed: u64,
+        prepare: impl FnOnce(&mut GuestSession),
+    ) -> Result<usize, StreamError> {
+        let index = self.guests.len();
+        let peer = PeerId(index as u64 + 1);
+        let mut session = GuestSession::new(config, path.max_datagram)?;
+        prepare(&mut session);
+        self.host.connect(self.now, peer, path.max_datagram)?;
+        session.connect(self.now)?;
+        let reliable = |link: &LinkConfig| LinkConfig {
+            jitter: link.jitter
+                + match link.loss {
+                    Loss::Random(p) => link.delay.mul_f64(3.0 * p.clamp(0.0, 0.9)),
+                    _ => Duration::ZERO,
+                },
+            keep_order: true,
+            loss: Loss::None,
+            reorder: 0.0,
+            duplicate: 0.0,
+            queue_bytes: usize::MAX,
+            trace: None,
+            ..link.clone()
+        };
+        self.guests.push(GuestEnd {
+            session,
+            reliable_down: Link::new(reliable(&path.down), seed ^ 0x5157),
+            reliable_up: Link::new(reliable(&path.up), seed ^ 0x7515),
+            down: Link::new(path.down, seed),
+            up: Link::new(path.up, seed ^ 0xFFFF_0000),
+            connected: true,
+        });
+        Ok(index)
+    }
+
+    /// Cuts a guest off without a word, as when a process is killed: nothing passes any more.
+    pub fn cut(&mut self, guest: usize) {
+        if let Some(g) = self.guests.get_mut(guest) {
+            g.connected = false;
+        }
+    }
+
+    /// Runs until a time.
+    pub fn run_until(&mut self, until: Duration, world: &mut dyn World) {
+        loop {
+            self.exchange(world);
+            let Some(next) = self.next_time().filter(|t| *t <= until) else { break };
+            self.now = self.now.max(next);
+            if !self.paused && self.now >= self.next_step {
+                self.tick += 1;
+                self.next_step += self.step;
+                world.step(self.now, self.tick, &mut self.host);
+            }
+        }
+        self.now = self.now.max(until);
+    }
+
+    fn next_time(&self) -> Option<Duration> {
+        let mut next = if self.paused { None } else { Some(self.next_step.max(self.now)) };
+        let mut take = |t: Option<Duration>| {
+            next = match (next, t) {
+                (Some(a), Some(b)) => Some(a.min(b)),
+                (a, b) => a.or(b),
+            };
+        };
+        take(self.host.next_wakeup());
+        for g in self.guests.iter().filter(|g| g.connected) {
+            for link in [&g.down, &g.up, &g.reliable_down, &g.reliable_up] {
+                take(link.next_wakeup());
+            }
+            // A wake-up that has just been served would be served for ever at the same time.
+            take(g.session.next_wakeup(self.now).map(|t| t.max(self.now + Duration::from_micros(1))));
+        }
+        next
+    }
+
+    /// Delivers all that has arrived by now, and sends all that is to be sent.
+    fn exchange(&mut self, world: &mut dyn World) {
+        let now = self.now;
+        for (index, g) in self.guests.iter_mut().enumerate() {
+            let peer = PeerId(index as u64 + 1);
+            // Reliable first: a snapshot that arrives together with a frame comes before it.
+            while let Some(bytes) = g.reliable_up.poll(now) {
+                if g.connected {
+                    self.host.on_message(now, peer, &bytes);
+                }
+            }
+            while let Some(bytes) = g.up.poll(now) {
+                if g.connected {
+                    self.host.on_datagram(now, peer, &bytes);
+                }
+            }
+            let began = self.clock.map(|c| c());
+            while let Some(bytes) = g.reliable_down.poll(now) {
+                if g.connected {
+                    g.session.on_message(now, &bytes);
+                }
+            }
+            while let Some(bytes) = g.down.poll(now) {
+                if g.connected {
+                    g.session.on_datagram(now, &bytes);
+                }
+            }
+            if let (Some(clock), Some(began)) = (self.clock, began) {
+                self.spent += clock().saturating_sub(began);
+            }
+        }
+        self.host.update(now);
+        while let Some(event) = self.host.poll_event() {
+            world.host_event(now, event, &mut self.host);
+        }
+        for (index, g) in self.guests.iter_mut().enumerate().filter(|(_, g)| g.connected) {
+            let began = self.clock.map(|c| c());
+            let stepped = g.session.update(now);
+            if let (Some(clock), Some(began)) = (self.clock, began) {
+                self.spent += clock().saturating_sub(began);
+            }
+            while let Some(event) = g.session.poll_event() {
+                world.guest_event(now, index, event, &mut g.session);
+            }
+            world.guest_stepped(now, index, stepped, &mut g.session);
+            // Targets that were set just now leave with this.
+            g.session.update(now);
+            while let Some(Output { channel, bytes, .. }) = g.session.poll_output() {
+                let link = match channel {
+                    Channel::Datagram => &mut g.up,
+                    Channel::Message => &mut g.reliable_up,
+                };
+                link.send(now, bytes.to_vec(), bytes.len());
+            }
+        }
+        while let Some(Output { peer, channel, bytes }) = self.host.poll_output() {
+            let index = usize::try_from(peer.0.wrapping_sub(1)).unwrap_or(usize::MAX);
+            let Some(g) = self.guests.get_mut(index) else { continue };
+            let link = match channel {
+                Channel::Datagram => &mut g.down,
+                Channel::Message => &mut g.reliable_down,
+            };
+            link.send(now, bytes.to_vec(), bytes.len());
+        }
+    }
+}

@@ -1,0 +1,298 @@
+//! What the method costs and what it is off by, remade on this machine: tables, CSV, SVG, PNG and
+//! the words for them.
+
+mod frames;
+mod front;
+mod physics;
+mod plot;
+mod tables;
+mod warp;
+mod work;
+
+use std::{
+    fmt::Write,
+    path::{Path, PathBuf},
+    time::Instant,
+};
+
+use serde::Serialize;
+
+use crate::{LabError, machine, progress::Progress};
+use plot::Figure;
+
+/// A part of the report.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Part {
+    /// Elements and mesh size.
+    Elements,
+    /// Modes kept.
+    Modes,
+    /// Integrator and step.
+    Steps,
+    /// The warp against a nonlinear solution.
+    Warp,
+    /// Half precision of the basis.
+    Precision,
+    /// Quantised frames.
+    Frames,
+    /// Ways of repair on the paper's networks.
+    Network,
+    /// Everything together: what a user chooses from.
+    Front,
+    /// The paper's table 2.
+    Table2,
+    /// The paper's networks and what crosses them.
+    Table3,
+    /// The paper's figures 7 to 9.
+    Courses,
+    /// The default at run time, in words.
+    Default,
+}
+
+impl Part {
+    /// All of them, in the order of the report.
+    pub const ALL: [Self; 12] = [
+        Self::Elements,
+        Self::Modes,
+        Self::Steps,
+        Self::Warp,
+        Self::Precision,
+        Self::Frames,
+        Self::Network,
+        Self::Front,
+        Self::Table2,
+        Self::Table3,
+        Self::Courses,
+        Self::Default,
+    ];
+
+    /// Its name: lower case, such as `table-2`.
+    pub fn name(self) -> &'static str {
+        match self {
+            Self::Elements => "elements",
+            Self::Modes => "modes",
+            Self::Steps => "steps",
+            Self::Warp => "warp",
+            Self::Precision => "precision",
+            Self::Frames => "frames",
+            Self::Network => "network",
+            Self::Front => "front",
+            Self::Table2 => "table-2",
+            Self::Table3 => "table-3",
+            Self::Courses => "courses",
+            Self::Default => "default",
+        }
+    }
+
+    /// The part of this name.
+    pub fn by_name(name: &str) -> Option<Self> {
+        Self::ALL.into_iter().find(|part| part.name() == name)
+    }
+
+    fn title(self) -> &'static str {
+        match self {
+            Self::Elements => "a. Elements and mesh size",
+            Self::Modes => "b. Modes kept",
+            Self::Steps => "c. Integrator and step",
+            Self::Warp => "d. Warp against a nonlinear solution",
+            Self::Precision => "e. Precision",
+            Self::Frames => "e. Quantised frames",
+            Self::Network => "f. Network",
+            Self::Front => "g. All together",
+            Self::Table2 => "The paper's table 2",
+            Self::Table3 => "The paper's networks and what crosses them (its table 3)",
+            Self::Courses => "The paper's figures 7, 8 and 9",
+            Self::Default => "The default at run time, in words",
+        }
+    }
+}
+
+/// What to report on.
+#[derive(Debug, Clone)]
+pub struct Settings {
+    /// Parts to make, in this order.
+    pub parts: Vec<Part>,
+    /// Fewer points and shorter timings.
+    pub quick: bool,
+    /// The folder of surfaces that are measured when they are there: bunny.obj, armadillo.obj.
+    pub models: PathBuf,
+    /// The project's own body: a surface or a scene.
+    pub own: PathBuf,
+}
+
+/// A part as it was written.
+#[derive(Serialize, Debug, Clone)]
+pub struct Written {
+    /// Its name.
+    pub name: &'static str,
+    /// Names of its files within the folder.
+    pub files: Vec<String>,
+    /// What it took, s.
+    pub seconds: f64,
+}
+
+/// What was written.
+#[derive(Serialize, Debug, Clone)]
+pub struct Report {
+    /// The parts, in their order.
+    pub parts: Vec<Written>,
+    /// What all of it took, s.
+    pub seconds: f64,
+}
+
+/// Measures, and writes `report.md` with its figures (CSV, SVG and PNG) into a folder, which is made
+/// if it is not there.
+///
+/// # Errors
+/// [`LabError::Write`] or [`LabError::Plot`] for files, the others for what cannot be measured.
+pub fn write(folder: &Path, settings: &Settings, progress: &mut dyn Progress) -> Result<Report, LabError> {
+    std::fs::create_dir_all(folder)?;
+    let began = Instant::now();
+    let mut text = heading();
+    let load = machine::load();
+    let mut report = Report { parts: Vec::new(), seconds: 0.0 };
+    for &part in &settings.parts {
+        progress.report(part.name(), 0.0);
+        let start = Instant::now();
+        let (figures, words) = measure(part, settings, progress)?;
+        let mut files = Vec::new();
+        let _ = writeln!(text, "\n## {}\n", part.title());
+        for figure in &figures {
+            plot::write(folder, figure)?;
+            let _ = writeln!(text, "![{}]({}.svg)\n\n{}", figure.title, figure.file, figure.words);
+            if let Some(error) = figure.reference_error {
+                let _ = writeln!(text, "The reference itself is off by about {error:.1e}.");
+            }
+            let _ = writeln!(text, "\n{}", rows(figure));
+            files.extend(["csv", "svg", "png"].map(|e| format!("{}.{e}", figure.file)));
+        }
+        let _ = writeln!(text, "{words}");
+        report.parts.push(Written { name: part.name(), files, seconds: start.elapsed().as_secs_f64() });
+    }
+    report.seconds = began.elapsed().as_secs_f64();
+    let _ = writeln!(
+        text,
+        "\nMade in {:.0} s by `pliant report{}`. {}",
+        report.seconds,
+        if settings.quick { " --quick" } else { "" },
+        quiet(load, machine::load()),
+    );
+    std::fs::write(folder.join("report.md"), text)?;
+    Ok(report)
+}
+
+fn measure(
+    part: Part,
+    settings: &Settings,
+    progress: &mut dyn Progress,
+) -> Result<(Vec<Figure>, String), LabError> {
+    let Settings { quick, models, own, .. } = settings;
+    let quick = *quick;
+    Ok(match part {
+        Part::Elements => (physics::elements(quick)?, String::new()),
+        Part::Modes => (physics::modes(quick)?, String::new()),
+        Part::Steps => (physics::steps(quick)?, String::new()),
+        Part::Warp => (warp::warp(quick)?, String::new()),
+        Part::Precision => (vec![tables::precision()?], String::new()),
+        Part::Frames => (vec![frames::quantised(quick, progress)?], String::new()),
+        Part::Network => tables::networks(quick, progress)?,
+        Part::Front => front::all_together(quick, progress)?,
+        Part::Table2 => (Vec::new(), tables::table_2(models, own, if quick { 0.3 } else { 2.0 }, progress)?),
+        Part::Table3 => (Vec::new(), frames::table_3(quick, progress)?),
+        Part::Courses => (tables::courses()?, String::new()),
+        Part::Default => {
+            let tets = if quick { [12_000, 2_000] } else { [50_000, 12_000] };
+            (Vec::new(), tables::default_setting(models, own, tets, progress)?)
+        }
+    })
+}
+
+fn rows(figure: &Figure) -> String {
+    if !figure.logarithmic {
+        return String::new();
+    }
+    let timed = figure.series.iter().any(|series| !series.late.is_empty());
+    let (head, rule) = if timed { (" 99 % |", " --- |") } else { ("", "") };
+    let mut out = format!("| line | {} |{head} {} |\n| --- | --- |{rule} --- |\n", figure.x, figure.y);
+    // Settings beside each other are many: the words of such a figure hold a table of those that count, the CSV all.
+    for series in figure.series.iter().filter(|series| !series.scattered) {
+        for (index, (x, y)) in series.points.iter().enumerate() {
+            let late = series.late.get(index).map_or(String::new(), |late| format!(" {late:.4} |"));
+            let _ = writeln!(out, "| {} | {x:.4} |{late} {y:.2e} |", series.name);
+        }
+    }
+    out
+}
+
+/// What else the machine did meanwhile, as far as the system says.
+fn quiet(before: Option<f64>, after: Option<f64>) -> String {
+    let (Some(before), Some(after)) = (before, after) else { return String::new() };
+    format!(
+        "The machine's load (programs that want to run, mean over a minute) was {before:.1} when it began and {after:.1} at the end; the report itself is one of them, and bakes take all cores. Above that, times are \
+         too long, and ratios within a run are what holds."
+    )
+}
+
+fn heading() -> String {
+    let days = std::time::SystemTime::now()
+        .duration_since(std::time::UNIX_EPOCH)
+        .map_or(0, |since| since.as_secs() / 86_400);
+    let [y, m, d] = date(days as i64);
+    let cores = std::thread::available_parallelism().map_or(1, usize::from);
+    format!(
+        "# What Pliant costs and what it is off by\n\n{y:04}-{m:02}-{d:02}, Pliant {}, {cores} cores{}, {} {}, {}. Times are of one thread kept on one core, medians after a warm-up with the 99th percentile beside them (whiskers in the figures), unless it says otherwise.\n",
+        env!("CARGO_PKG_VERSION"),
+        match machine::processor() {
+            name if name.is_empty() => name,
+            name => format!(" of {name}"),
+        },
+        std::env::consts::ARCH,
+        std::env::consts::OS,
+        vectors(),
+    )
+}
+
+/// The widest vectors of this processor that the reconstruction knows.
+fn vectors() -> &'static str {
+    #[cfg(target_arch = "x86_64")]
+    {
+        if std::arch::is_x86_feature_detected!("avx512f") {
+            return "AVX-512";
+        }
+        if std::arch::is_x86_feature_detected!("avx2") && std::arch::is_x86_feature_detected!("fma") {
+            return "AVX2";
+        }
+    }
+    "portable vectors"
+}
+
+/// Year, month and day (UTC) of a number of days since 1970-01-01 in the Gregorian calendar.
+fn date(days: i64) -> [i64; 3] {
+    // H. Hinnant, "chrono-compatible low-level date algorithms": eras of 400 years that begin in March.
+    let z = days + 719_468;
+    let era = z.div_euclid(146_097);
+    let day = z.rem_euclid(146_097);
+    let year = (day - day / 1_460 + day / 36_524 - day / 146_096) / 365;
+    let of_year = day - (365 * year + year / 4 - year / 100);
+    let shifted = (5 * of_year + 2) / 153;
+    let month = if shifted < 10 { shifted + 3 } else { shifted - 9 };
+    [year + era * 400 + i64::from(month <= 2), month, of_year - (153 * shifted + 2) / 5 + 1]
+}
+
+#[cfg(test)]
+mod tests {
+    use super::Part;
+
+    #[test]
+    fn every_part_is_found_by_its_own_name() {
+        Part::ALL.iter().for_each(|part| assert_eq!(Part::by_name(part.name()), Some(*part)));
+        assert_eq!(Part::by_name("all"), None);
+    }
+
+    #[test]
+    fn dates_are_those_of_the_calendar() {
+        assert_eq!(super::date(0), [1970, 1, 1]);
+        assert_eq!(super::date(11_016), [2000, 2, 29]);
+        assert_eq!(super::date(20_819), [2027, 1, 1]);
+    }
+}

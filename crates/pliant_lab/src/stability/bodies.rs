@@ -1,0 +1,243 @@
+//! The bodies of the matrix, baked on the spot, and what is asked of them.
+
+use std::sync::Arc;
+
+use nalgebra::{DMatrix, DVector, Matrix3, Vector3};
+use pliant_bake::{Anchor, BakeConfig, Comparison, bake};
+use pliant_mesh::{TetMesh, shapes};
+use pliant_modal::{
+    Body, BodyConfig, Damping, Element, GrabConfig, GrabId, ModalModel, Patch, State, StepError,
+};
+
+use super::Bound;
+use crate::LabError;
+
+/// A bar along x with its corner in the origin.
+#[derive(Debug, Clone)]
+pub(super) struct Bar {
+    pub(super) cells: [usize; 3],
+    /// m.
+    pub(super) length: f64,
+    /// Width and height as shares of the length.
+    pub(super) section: [f64; 2],
+    pub(super) element: Element,
+    pub(super) modes: usize,
+    pub(super) young: f64,
+    pub(super) poisson: f64,
+    pub(super) density: f64,
+    /// Fraction of critical damping.
+    pub(super) zeta: f64,
+    /// Held at x = 0, or free.
+    pub(super) held: bool,
+}
+
+impl Default for Bar {
+    fn default() -> Self {
+        Self {
+            cells: [8, 2, 2],
+            length: 1.0,
+            section: [0.2, 0.2],
+            element: Element::Tet10,
+            modes: 20,
+            young: 1e5,
+            poisson: 0.4,
+            density: 1000.0,
+            zeta: 0.03,
+            held: true,
+        }
+    }
+}
+
+impl Bar {
+    fn size(&self) -> [f64; 3] {
+        [self.length, self.section[0] * self.length, self.section[1] * self.length]
+    }
+
+    pub(super) fn mesh(&self) -> Result<TetMesh, LabError> {
+        Ok(shapes::bar(self.cells, self.size())?)
+    }
+
+    pub(super) fn bake(&self) -> Result<Arc<ModalModel>, LabError> {
+        self.bake_mesh(&self.mesh()?)
+    }
+
+    pub(super) fn bake_mesh(&self, mesh: &TetMesh) -> Result<Arc<ModalModel>, LabError> {
+        let anchors = if self.held {
+            vec![Anchor { axis: 0, comparison: Comparison::Less, bound: 1e-9 * self.length }]
+        } else {
+            Vec::new()
+        };
+        let config = BakeConfig {
+            element: self.element,
+            modes: self.modes,
+            young: self.young,
+            poisson: self.poisson,
+            density: self.density,
+            damping: Damping::Ratio(self.zeta),
+            anchors,
+            sites: Some(48),
+            ..BakeConfig::default()
+        };
+        Ok(Arc::new(bake(mesh, None, &config, &mut |_, _| ())?.model))
+    }
+
+    /// The surface vertex nearest to a place given in shares of the bar's edges.
+    pub(super) fn vertex(&self, model: &ModalModel, share: [f64; 3]) -> u32 {
+        let size = self.size();
+        let at: [f64; 3] = std::array::from_fn(|k| share[k] * size[k]);
+        let away = |p: &[f32; 3]| (0..3).map(|k| (f64::from(p[k]) - at[k]).powi(2)).sum::<f64>();
+        let positions = model.surface().positions();
+        (0..positions.len() as u32)
+            .min_by(|a, b| away(&positions[*a as usize]).total_cmp(&away(&positions[*b as usize])))
+            .unwrap_or(0)
+    }
+
+    /// The patch in the middle of the free end.
+    pub(super) fn tip(&self, model: &ModalModel) -> Result<Patch, LabError> {
+        Ok(Patch::around(model.surface(), self.vertex(model, [1.0, 0.5, 0.5]), 0.12 * self.length)?)
+    }
+}
+
+/// A held body with a hand on its tip.
+pub(super) struct Held {
+    pub(super) model: Arc<ModalModel>,
+    pub(super) body: Body,
+    pub(super) patch: Patch,
+    pub(super) grab: GrabId,
+    pub(super) start: [f64; 3],
+}
+
+impl Held {
+    pub(super) fn new(bar: &Bar, config: BodyConfig, hand: GrabConfig) -> Result<Self, LabError> {
+        let model = bar.bake()?;
+        let patch = bar.tip(&model)?;
+        Self::of(model, patch, config, hand)
+    }
+
+    pub(super) fn of(
+        model: Arc<ModalModel>,
+        patch: Patch,
+        config: BodyConfig,
+        hand: GrabConfig,
+    ) -> Result<Self, LabError> {
+        let mut body = Body::new(model.clone(), config)?;
+        let grab = body.grab(&patch, hand)?;
+        let start = body.grab_position(grab)?;
+        Ok(Self { model, body, patch, grab, start })
+    }
+
+    /// Moves the target to `away` (m) from where it began.
+    pub(super) fn pull(&mut self, away: [f64; 3]) -> Result<(), StepError> {
+        self.body.set_target(self.grab, std::array::from_fn(|k| self.start[k] + away[k]))
+    }
+
+    pub(super) fn reaction(&self) -> Result<Vector3<f64>, StepError> {
+        Ok(self.body.reaction(self.grab)?.into())
+    }
+}
+
+/// Steps after which the slowest mode of a body has forgotten all but a hundred-thousandth.
+pub(super) fn settling(model: &ModalModel, step: f64) -> usize {
+    let rate = model.omega().iter().zip(model.damping()).map(|(omega, c)| {
+        let half = 0.5 * c;
+        // The slower of the two roots where a mode is overdamped.
+        if half > *omega { omega * omega / (half + (half * half - omega * omega).sqrt()) } else { half }
+    });
+    let slowest = rate.fold(f64::INFINITY, f64::min);
+    ((12.0 / (slowest * step)) as usize).clamp(200, 3_000_000)
+}
+
+/// `W^T Phi Lambda^-1 Phi^T W` of the kept modes, m/N: the static compliance of a patch without what the modes leave out.
+pub(super) fn modal_compliance(model: &ModalModel, patch: &Patch) -> Matrix3<f64> {
+    let mut sum = Matrix3::zeros();
+    for mode in 0..model.mode_count() {
+        let phi = patch.entries().iter().fold(Vector3::zeros(), |phi: Vector3<f64>, &(vertex, weight)| {
+            phi + weight * Vector3::from_fn(|axis, _| f64::from(model.displacement_row(vertex, axis, mode)))
+        });
+        sum += phi * phi.transpose() / model.omega()[mode].powi(2);
+    }
+    sum
+}
+
+/// The compliance that a hand feels at once, m/N.
+pub(super) fn compliance(body: &Body, grab: GrabId) -> Result<Matrix3<f64>, StepError> {
+    let c = body.compliance(grab)?;
+    Ok(Matrix3::from_fn(|i, j| c[i][j]))
+}
+
+/// The pull (N) that holds a patch `away` (m) from its rest: the static limit of a small displacement.
+pub(super) fn static_pull(held: &Held, away: [f64; 3]) -> Result<Vector3<f64>, StepError> {
+    let whole = compliance(&held.body, held.grab)? + modal_compliance(&held.model, &held.patch);
+    Ok(whole.try_inverse().map_or_else(|| Vector3::repeat(f64::NAN), |inverse| inverse * Vector3::from(away)))
+}
+
+/// From 0 to 1 in a second, with speed and acceleration zero at both ends.
+pub(super) fn smooth(t: f64) -> f64 {
+    let t = t.clamp(0.0, 1.0);
+    t * t * t * (10.0 - 15.0 * t + 6.0 * t * t)
+}
+
+/// max |second difference of F| / max |F|: 4 for a force that flips its sign each step.
+pub(super) fn ringing(forces: &[Vector3<f64>]) -> f64 {
+    let largest = forces.iter().fold(0.0f64, |m, f| m.max(f.norm()));
+    let second = forces.windows(3).map(|w| (w[2] - 2.0 * w[1] + w[0]).norm()).fold(0.0, f64::max);
+    if largest > 0.0 { second / largest } else { 0.0 }
+}
+
+/// The largest growth of the energy in a step, as a share of the energy at the start, and all of it left at the end.
+pub(super) fn energy_growth(body: &mut Body, steps: usize) -> Result<[f64; 2], StepError> {
+    let start = body.energy().max(f64::MIN_POSITIVE);
+    let (mut last, mut growth) = (start, 0.0f64);
+    for _ in 0..steps {
+        body.step()?;
+        let now = body.energy();
+        growth = growth.max((now - last) / start);
+        last = now;
+    }
+    Ok([growth, last / start])
+}
+
+/// The bound on [`energy_growth`]: rounding. Generalized-alpha conserves another norm, equivalent to the energy within a factor.
+pub(super) fn no_growth(growth: f64) -> Bound {
+    Bound::new("largest growth of the energy in a step / energy", growth, 1e-9)
+}
+
+/// A state from coordinates and velocities; accelerations that belong to them.
+pub(super) fn state(body: &Body, q: Vec<f64>, v: Vec<f64>) -> State {
+    let mut state = body.state().clone();
+    let model = body.model();
+    let damping = body.config().settings.damping_scale;
+    state.a = (0..q.len())
+        .map(|i| -model.damping()[i] * damping * v[i] - model.omega()[i].powi(2) * q[i])
+        .collect();
+    (state.q, state.v) = (q, v);
+    state
+}
+
+/// The modal coordinates whose linear displacement of the surface comes nearest to a field (least squares).
+pub(super) fn nearest(model: &ModalModel, field: impl Fn([f64; 3]) -> [f64; 3]) -> Vec<f64> {
+    let positions = model.surface().positions();
+    let modes = model.mode_count();
+    let rows = DMatrix::from_fn(3 * positions.len(), modes, |row, mode| {
+        f64::from(model.displacement_row((row / 3) as u32, row % 3, mode))
+    });
+    let wanted =
+        DVector::from_fn(3 * positions.len(), |row, _| field(positions[row / 3].map(f64::from))[row % 3]);
+    let normal = rows.transpose() * &rows;
+    let right = rows.transpose() * wanted;
+    normal.lu().solve(&right).map_or_else(|| vec![0.0; modes], |q| q.iter().copied().collect())
+}
+
+/// splitmix64 as numbers from -1 to 1.
+pub(super) struct Dice(pub(super) u64);
+
+impl Dice {
+    pub(super) fn roll(&mut self) -> f64 {
+        self.0 = self.0.wrapping_add(0x9E37_79B9_7F4A_7C15);
+        let mut z = self.0;
+        z = (z ^ (z >> 30)).wrapping_mul(0xBF58_476D_1CE4_E5B9);
+        z = (z ^ (z >> 27)).wrapping_mul(0x94D0_49BB_1331_11EB);
+        z ^= z >> 31;
+        (z >> 11) as f64 / (1u64 << 52) as f64 - 1.0
+    }
+}

@@ -1,0 +1,273 @@
+//! Stiffness, Poisson ratio, density, damping, size, element shape, number of modes: what a body is made of.
+
+use nalgebra::Vector3;
+use pliant_mesh::TetMesh;
+use pliant_modal::{BodyConfig, Element, GrabConfig, Integrator, Patch, StepSettings};
+
+use super::{
+    Bound, Case, Expected, Outcome,
+    bodies::{Bar, Held, energy_growth, no_growth, ringing, settling, smooth, static_pull},
+    plain,
+};
+use crate::LabError;
+
+/// How far a dragged patch may go, in drags: overshoot is physics, ten times the way is not.
+const EXCURSION: f64 = 10.0;
+
+const TOO_THIN: &str = "the bake refuses the mesh by name: the stiffness of its thinnest elements, times the rounding of a double, is more than a ten-millionth of what the slowest modes weigh";
+
+pub(super) fn cases(out: &mut Vec<Case>) {
+    for exponent in 2..=12 {
+        let young = 10.0_f64.powi(exponent);
+        for step in [1e-4, 1.0 / 60.0, 0.1] {
+            let name = format!("E 1e{exponent} Pa, h {step:.4} s, tip dragged");
+            out.push(Case::new("stiffness", name, move || {
+                drag(&Bar { young, ..Bar::default() }, BodyConfig { step, ..BodyConfig::default() })
+            }));
+        }
+        let name = format!("E 1e{exponent} Pa, reaction held");
+        out.push(Case::new("stiffness", name, move || {
+            hold(&Bar { young, zeta: 0.3, ..Bar::default() }, 1.0 / 60.0)
+        }));
+    }
+    for integrator in [Integrator::Newmark, Integrator::GeneralizedAlpha { rho_inf: 0.5 }] {
+        for young in [1e3, 1e6, 1e12] {
+            let name = format!("E {young:.0e} Pa, {}, tip dragged", word(integrator));
+            out.push(Case::new("stiffness", name, move || {
+                drag(
+                    &Bar { young, ..Bar::default() },
+                    BodyConfig::from(StepSettings { integrator, ..Default::default() }),
+                )
+            }));
+        }
+    }
+    for element in [Element::Tet4, Element::Tet10] {
+        for poisson in [0.0, 0.3, 0.45, 0.49, 0.499, 0.4999] {
+            let name = format!("nu {poisson}, {element}, reaction held");
+            let bar = Bar { poisson, element, zeta: 0.3, ..Bar::default() };
+            out.push(Case::new("Poisson ratio", name, move || hold(&bar, 1.0 / 60.0)));
+        }
+    }
+    for density in [1.0, 10.0, 100.0, 1e3, 2e4] {
+        let bar = Bar { density, ..Bar::default() };
+        out.push(Case::new("density", format!("{density} kg/m^3, tip dragged"), move || {
+            drag(&bar, BodyConfig::default())
+        }));
+    }
+    for zeta in [0.0, 1e-3, 0.03, 0.5, 1.0, 2.0, 10.0] {
+        for integrator in
+            [Integrator::Exact, Integrator::Newmark, Integrator::GeneralizedAlpha { rho_inf: 0.5 }]
+        {
+            let name = format!("{zeta} of critical, {}, struck", word(integrator));
+            let bar = Bar { zeta, ..Bar::default() };
+            out.push(Case::new("damping", name, move || struck(&bar, 1.0 / 60.0, integrator)));
+        }
+        if zeta > 0.0 {
+            let bar = Bar { zeta, ..Bar::default() };
+            let name = format!("{zeta} of critical, reaction held");
+            out.push(Case::new("damping", name, move || hold(&bar, 1.0 / 60.0)));
+        }
+    }
+    for exponent in -3..=3 {
+        let length = 10.0_f64.powi(exponent);
+        let bar = Bar { length, zeta: 0.3, ..Bar::default() };
+        let again = bar.clone();
+        out.push(Case::new("size", format!("1e{exponent} m, tip dragged"), move || {
+            drag(&again, BodyConfig::default())
+        }));
+        out.push(Case::new("size", format!("1e{exponent} m, reaction held"), move || hold(&bar, 1.0 / 60.0)));
+    }
+    for step in [1e-4, 1e-3, 1.0 / 240.0, 1.0 / 40.0, 0.1] {
+        let name = format!("h {step:.4} s, struck without damping");
+        out.push(Case::new("step", name, move || {
+            struck(&Bar { zeta: 0.0, ..Bar::default() }, step, Integrator::Exact)
+        }));
+    }
+    for (name, cells, section, refused) in [
+        ("needles, edges 10 : 1", [4, 4, 4], [0.1, 0.1], false),
+        ("needles, edges 40 : 1", [4, 4, 4], [0.025, 0.025], true),
+        ("plates, edges 10 : 1", [4, 4, 1], [1.0, 0.025], false),
+        ("plates, edges 50 : 1", [4, 4, 1], [1.0, 0.005], true),
+        ("plates across, edges 40 : 1", [40, 1, 1], [1.0, 1.0], false),
+    ] {
+        let bar = Bar { cells, section, zeta: 0.3, ..Bar::default() };
+        out.push(shaped("element shape", format!("{name}, reaction held"), refused, move || {
+            bar.mesh().map(|m| (bar.clone(), m))
+        }));
+    }
+    for (name, share, refused) in
+        [("a hundredth", 0.99, false), ("a thousandth", 0.999, false), ("a millionth", 0.999_999, true)]
+    {
+        let name = format!("slivers, {name} of the height, reaction held");
+        out.push(shaped("element shape", name, refused, move || {
+            let bar = Bar { zeta: 0.3, ..Bar::default() };
+            Ok((bar.clone(), slivers(bar.mesh()?, share)))
+        }));
+    }
+    for (ratio, refused) in [(1e3, false), (1e4, false), (1e6, true)] {
+        let name = format!("slices of a bar {ratio:.0e} : 1, reaction held");
+        out.push(shaped("mass ratio", name, refused, move || {
+            let bar = Bar { zeta: 0.3, ..Bar::default() };
+            Ok((bar.clone(), graded(&bar, ratio)?))
+        }));
+    }
+    for (modes, cells) in [(1, [8, 2, 2]), (500, [10, 3, 3])] {
+        let bar = Bar { modes, cells, zeta: 0.1, ..Bar::default() };
+        let [held, dragged, struck_one] = [bar.clone(), bar.clone(), bar];
+        out.push(Case::new("modes", format!("{modes}, reaction held"), move || hold(&held, 1.0 / 60.0)));
+        out.push(Case::new("modes", format!("{modes}, tip dragged"), move || {
+            drag(&dragged, BodyConfig::default())
+        }));
+        out.push(Case::new("modes", format!("{modes}, struck"), move || {
+            struck(&struck_one, 1.0 / 60.0, Integrator::Exact)
+        }));
+    }
+}
+
+/// A mesh of thin elements: `refused` by the bake, by name, where they are too thin.
+fn shaped(
+    group: &'static str,
+    name: String,
+    refused: bool,
+    made: impl Fn() -> Result<(Bar, TetMesh), LabError> + Send + Sync + 'static,
+) -> Case {
+    let case = Case::new(group, name, move || {
+        let (bar, mesh) = made()?;
+        hold_mesh(&bar, &mesh, 1.0 / 60.0)
+    });
+    if refused { case.limited(TOO_THIN, Expected::Inaccurate) } else { case }
+}
+
+pub(super) fn word(integrator: Integrator) -> &'static str {
+    match integrator {
+        Integrator::Exact => "exact",
+        Integrator::Newmark => "Newmark",
+        _ => "generalized-alpha 0.5",
+    }
+}
+
+/// A smooth drag by a twentieth of the length in a second (or forty steps) and as long a hold. The force must not ring; a body far slower than the step is
+/// still under way and is held to less.
+fn drag(bar: &Bar, config: BodyConfig) -> Result<Outcome, LabError> {
+    let step = config.step;
+    let mut held = Held::new(bar, config, GrabConfig::default())?;
+    let seconds = (40.0 * step).max(1.0);
+    let steps = (2.0 * seconds / step) as usize;
+    let reach = 0.05 * bar.length;
+    let away = move |i: usize| {
+        let s = smooth((i + 1) as f64 * step / seconds) * reach;
+        [0.2 * s, 0.8 * s, -0.5 * s]
+    };
+    let mut forces = Vec::with_capacity(steps);
+    let mut farthest = 0.0f64;
+    for i in 0..steps {
+        held.pull(away(i))?;
+        held.body.step()?;
+        forces.push(held.reaction()?);
+        let at = Vector3::from(held.body.grab_position(held.grab)?) - Vector3::from(held.start);
+        farthest = farthest.max(at.norm());
+    }
+    let bound = if held.model.omega()[0] * step > 0.05 { 0.1 } else { 0.5 };
+    Ok(Outcome {
+        bounds: vec![
+            Bound::new("ringing of the reaction (4: a flip each step)", ringing(&forces), bound),
+            Bound::new("farthest the patch goes / the drag", farthest / reach, EXCURSION),
+        ],
+        plain: Some(plain::beside(&held.model, step, &[held.patch], steps, |i| vec![away(i)])?),
+    })
+}
+
+/// Held a millionth of the length away until all is quiet: the reaction is the static one. (A bar that bends by `d` also shortens by `d^2 / L`, which its axial
+/// stiffness answers: at a ten-thousandth that is half a percent already.)
+fn hold(bar: &Bar, step: f64) -> Result<Outcome, LabError> {
+    hold_mesh(bar, &bar.mesh()?, step)
+}
+
+fn hold_mesh(bar: &Bar, mesh: &TetMesh, step: f64) -> Result<Outcome, LabError> {
+    let model = bar.bake_mesh(mesh)?;
+    let patch = bar.tip(&model)?;
+    hold_patch(
+        bar,
+        Held::of(model, patch, BodyConfig { step, ..BodyConfig::default() }, GrabConfig::default())?,
+    )
+}
+
+fn hold_patch(bar: &Bar, mut held: Held) -> Result<Outcome, LabError> {
+    let away = [0.0, 1e-6 * bar.length, 0.5e-6 * bar.length];
+    held.pull(away)?;
+    for _ in 0..settling(&held.model, held.body.config().step) {
+        held.body.step()?;
+    }
+    let want = static_pull(&held, away)?;
+    let got = -held.reaction()?;
+    Ok(Outcome::of(vec![Bound::new("|reaction - static| / static", (got - want).norm() / want.norm(), 2e-3)]))
+}
+
+/// Struck at the tip and left alone for 5,000 steps: the energy never grows.
+fn struck(bar: &Bar, step: f64, integrator: Integrator) -> Result<Outcome, LabError> {
+    let held = Held::new(
+        bar,
+        BodyConfig {
+            step,
+            settings: StepSettings { integrator, ..Default::default() },
+            ..BodyConfig::default()
+        },
+        GrabConfig::default(),
+    )?;
+    let mut body = held.body;
+    body.release(held.grab);
+    let impulse = 0.05 * bar.length * held.model.omega()[0] * held.model.mass();
+    body.strike(Patch::center(&held.patch), [0.3 * impulse, impulse, -0.7 * impulse])?;
+    // Generalized-alpha loses energy of fast modes in a norm of its own, which the energy lies within a factor of.
+    if matches!(integrator, Integrator::GeneralizedAlpha { .. }) {
+        let start = body.energy();
+        let mut most = 0.0f64;
+        for _ in 0..5_000 {
+            body.step()?;
+            most = most.max(body.energy() / start);
+        }
+        return Ok(Outcome::of(vec![Bound::new("largest energy / energy at the start", most, 1.5)]));
+    }
+    let [growth, _] = energy_growth(&mut body, 5_000)?;
+    Ok(Outcome::of(vec![no_growth(growth)]))
+}
+
+/// One node in the middle of the bar is moved towards the face of a tetrahedron opposite to it, so that only `1 - share` of its height is left.
+fn slivers(mut mesh: TetMesh, share: f64) -> TetMesh {
+    let [low, high] = mesh.bounds();
+    let inside = |p: &[f64; 3]| (0..3).all(|k| p[k] > low[k] + 1e-9 && p[k] < high[k] - 1e-9);
+    let tets = mesh.tets.clone();
+    let mut moved = vec![false; mesh.nodes.len()];
+    for tet in tets {
+        let node = tet[0] as usize;
+        let others = [1, 2, 3].map(|k| tet[k] as usize);
+        if !inside(&mesh.nodes[node]) || moved[node] || others.iter().any(|&n| moved[n]) {
+            continue;
+        }
+        let face = others.map(|n| Vector3::from(mesh.nodes[n]));
+        let foot = (face[0] + face[1] + face[2]) / 3.0;
+        let old = mesh.nodes[node];
+        let at = Vector3::from(old);
+        let normal = (face[1] - face[0]).cross(&(face[2] - face[0])).normalize();
+        // Along the normal only: the other tetrahedra of the node stay the right way round for as long as they can.
+        mesh.nodes[node] = (at - normal * (at - foot).dot(&normal) * share).into();
+        if mesh.check().is_err() {
+            mesh.nodes[node] = old;
+        } else {
+            moved[node] = true;
+        }
+    }
+    mesh
+}
+
+/// The bar with slices that grow along it: the last is `ratio` times as heavy as the first.
+fn graded(bar: &Bar, ratio: f64) -> Result<TetMesh, LabError> {
+    let mut mesh = Bar { cells: [16, 2, 2], ..bar.clone() }.mesh()?;
+    let growth = ratio.powf(1.0 / 15.0);
+    let whole = growth.powi(16) - 1.0;
+    for node in &mut mesh.nodes {
+        let slice = (node[0] / bar.length * 16.0).round() as i32;
+        node[0] = bar.length * (growth.powi(slice) - 1.0) / whole;
+    }
+    Ok(mesh)
+}

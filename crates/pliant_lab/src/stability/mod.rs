@@ -1,0 +1,356 @@
+//! A matrix of stiff, extreme and unfair cases, each with the bound that it has to keep and the
+//! margin that it keeps it by.
+//!
+//! A bound is a number measured against a limit. The margin is `limit / measured` of the tightest
+//! bound of a case, cut at a million million: 1 just holds, 10 holds ten times over. Where hands
+//! pull, the paper's plain scheme (average acceleration, hands as rigid position constraints) runs
+//! through the same script, and what it did stands beside.
+
+mod bodies;
+mod device;
+mod hands;
+mod inputs;
+mod material;
+mod motion;
+mod network;
+mod plain;
+
+use std::{
+    panic::{AssertUnwindSafe, catch_unwind},
+    sync::Mutex,
+    time::Instant,
+};
+
+use pliant_bake::BakeError;
+use rayon::prelude::*;
+use serde::Serialize;
+
+use crate::{LabError, progress::Progress};
+
+/// Threads that work on cases at most.
+const MOST_THREADS: usize = 64;
+
+/// Which cases to run, and how.
+#[derive(Debug, Clone, Default)]
+pub struct Settings {
+    /// Only cases whose group or name holds this text. Default: all.
+    pub only: Option<String>,
+    /// One case in eight. Default: false.
+    pub short: bool,
+    /// Threads to use, at most 64. Default: one a core.
+    pub threads: Option<usize>,
+}
+
+/// A number that must stay at or below a limit.
+#[derive(Serialize, Debug, Clone, Copy)]
+pub struct Bound {
+    /// What was measured, with its unit where it has one.
+    pub what: &'static str,
+    /// The number.
+    pub measured: f64,
+    /// What it may be at most.
+    pub limit: f64,
+}
+
+impl Bound {
+    fn new(what: &'static str, measured: f64, limit: f64) -> Self {
+        Self { what, measured: measured.abs(), limit }
+    }
+
+    /// `limit / measured`; 0 for what is not finite.
+    pub fn margin(&self) -> f64 {
+        const MOST: f64 = 1e12;
+        if !self.measured.is_finite() {
+            0.0
+        } else if self.measured * MOST <= self.limit {
+            MOST
+        } else {
+            self.limit / self.measured
+        }
+    }
+
+    /// In words: name, number and limit.
+    pub fn text(&self) -> String {
+        format!("{} {:.3e} <= {:.3e}", self.what, self.measured, self.limit)
+    }
+}
+
+/// What a case came to.
+#[derive(Debug, Default)]
+struct Outcome {
+    bounds: Vec<Bound>,
+    /// What the paper's plain scheme did with the same script.
+    plain: Option<String>,
+}
+
+impl Outcome {
+    fn of(bounds: Vec<Bound>) -> Self {
+        Self { bounds, plain: None }
+    }
+}
+
+/// A case that does not keep its bound for a reason that lies in the method: why, and what then happens instead. Whatever else happens is a failure,
+/// and so is a limit that is none any more: then this has to be taken away.
+#[derive(Debug, Clone, Copy)]
+struct Limit {
+    why: &'static str,
+    expected: Expected,
+}
+
+#[derive(Debug, Clone, Copy)]
+enum Expected {
+    /// The bake refuses the mesh: its modes do not solve the equation well enough ([`BakeError::Inaccurate`]).
+    Inaccurate,
+    /// Bounds of these names are broken by numbers between these two (one at least), and every other bound holds.
+    Measured(&'static [(&'static str, f64, f64)]),
+}
+
+impl Expected {
+    fn holds(self, came: &Result<Outcome, LabError>) -> bool {
+        match (self, came) {
+            (Self::Inaccurate, Err(LabError::Bake(BakeError::Inaccurate { .. }))) => true,
+            (Self::Measured(known), Ok(outcome)) => {
+                let broken = || outcome.bounds.iter().filter(|bound| bound.margin() < 1.0);
+                let is_known = |b: &Bound| {
+                    known
+                        .iter()
+                        .any(|(what, low, high)| b.what == *what && (*low..=*high).contains(&b.measured))
+                };
+                broken().next().is_some() && broken().all(is_known)
+            }
+            _ => false,
+        }
+    }
+}
+
+/// One case of the matrix.
+struct Case {
+    group: &'static str,
+    name: String,
+    known_limit: Option<Limit>,
+    run: Box<dyn Fn() -> Result<Outcome, LabError> + Send + Sync>,
+}
+
+impl Case {
+    fn new(
+        group: &'static str,
+        name: String,
+        run: impl Fn() -> Result<Outcome, LabError> + Send + Sync + 'static,
+    ) -> Self {
+        Self { group, name, known_limit: None, run: Box::new(run) }
+    }
+
+    fn limited(self, why: &'static str, expected: Expected) -> Self {
+        Self { known_limit: Some(Limit { why, expected }), ..self }
+    }
+}
+
+/// What became of a case.
+#[derive(Serialize, Debug, Clone)]
+pub struct Verdict {
+    /// Its name, unique within its group.
+    pub name: String,
+    /// Its group.
+    pub group: &'static str,
+    /// It keeps all its bounds.
+    pub passed: bool,
+    /// `limit / measured` of the tightest bound: 1 just holds. 0 where nothing was measured.
+    pub margin: f64,
+    /// The tightest of the bounds in words, or why nothing was measured.
+    pub bound: String,
+    /// All of them.
+    pub bounds: Vec<Bound>,
+    /// Why it does not pass, where that is known and what happened is what was expected.
+    pub known_limit: Option<&'static str>,
+    /// It was listed as a known limit, and passes: the list is out of date, which counts as broken.
+    pub limit_gone: bool,
+    /// What the paper's plain scheme did with the same script.
+    pub plain: Option<String>,
+    /// What it took, s.
+    pub seconds: f64,
+}
+
+impl Verdict {
+    /// It fails without being a known limit, or is listed as one and passes.
+    pub fn broken(&self) -> bool {
+        self.limit_gone || (!self.passed && self.known_limit.is_none())
+    }
+}
+
+/// What became of all cases.
+#[derive(Serialize, Debug, Clone)]
+pub struct Report {
+    /// In the order of the matrix.
+    pub cases: Vec<Verdict>,
+    /// What all of it took, s.
+    pub seconds: f64,
+}
+
+impl Report {
+    /// Cases that are broken.
+    pub fn broken(&self) -> usize {
+        self.cases.iter().filter(|case| case.broken()).count()
+    }
+}
+
+/// All cases, in the order in which they are told.
+fn all() -> Vec<Case> {
+    let mut cases = Vec::new();
+    material::cases(&mut cases);
+    motion::cases(&mut cases);
+    hands::cases(&mut cases);
+    inputs::cases(&mut cases);
+    network::cases(&mut cases);
+    device::cases(&mut cases);
+    cases
+}
+
+/// Runs the chosen cases of the matrix; the report is empty where none has such a name.
+///
+/// # Errors
+/// [`LabError::Threads`]; what goes wrong in a case is told as its verdict.
+pub fn run(settings: &Settings, progress: &mut dyn Progress) -> Result<Report, LabError> {
+    let began = Instant::now();
+    let wanted = |case: &Case| {
+        settings
+            .only
+            .as_ref()
+            .is_none_or(|text| case.group.contains(text.as_str()) || case.name.contains(text.as_str()))
+    };
+    let chosen: Vec<Case> = all()
+        .into_iter()
+        .enumerate()
+        .filter(|(index, case)| wanted(case) && (!settings.short || index % 8 == 0))
+        .map(|(_, case)| case)
+        .collect();
+    let threads = settings.threads.unwrap_or(0);
+    let pool = rayon::ThreadPoolBuilder::new()
+        .num_threads(threads.min(MOST_THREADS))
+        .build()
+        .map_err(|_| LabError::Threads { got: threads, most: MOST_THREADS })?;
+    let progress = Mutex::new((progress, 0usize));
+    let cases: Vec<Verdict> = pool.install(|| {
+        chosen
+            .par_iter()
+            // One case at a time is handed out: they differ a thousandfold in length.
+            .with_max_len(1)
+            .map(|case| {
+                let verdict = judge(case);
+                if let Ok(mut progress) = progress.lock() {
+                    progress.1 += 1;
+                    let share = progress.1 as f64 / chosen.len() as f64;
+                    progress.0.report("stability", share);
+                }
+                verdict
+            })
+            .collect()
+    });
+    Ok(Report { cases, seconds: began.elapsed().as_secs_f64() })
+}
+
+fn judge(case: &Case) -> Verdict {
+    let began = Instant::now();
+    // A panic is this case's failure, not the end of all others; nothing of it is used afterwards.
+    let came = catch_unwind(AssertUnwindSafe(|| (case.run)()));
+    let expected = |came: &Result<Outcome, LabError>| {
+        case.known_limit.filter(|limit| limit.expected.holds(came)).map(|limit| limit.why)
+    };
+    let (margin, bound, bounds, plain, known_limit) = match came {
+        Ok(came) => {
+            let known_limit = expected(&came);
+            match came {
+                Ok(outcome) => {
+                    let tightest = outcome.bounds.iter().min_by(|a, b| a.margin().total_cmp(&b.margin()));
+                    let margin = tightest.map_or(0.0, Bound::margin);
+                    let text = tightest.map_or_else(|| "nothing measured".to_owned(), Bound::text);
+                    (margin, text, outcome.bounds, outcome.plain, known_limit)
+                }
+                Err(error) => (0.0, error.to_string(), Vec::new(), None, known_limit),
+            }
+        }
+        Err(payload) => {
+            let words = payload.downcast_ref::<String>().map(String::as_str);
+            let words = words.or_else(|| payload.downcast_ref::<&str>().copied()).unwrap_or("no words");
+            (0.0, format!("panicked: {words}"), Vec::new(), None, None)
+        }
+    };
+    let passed = margin >= 1.0;
+    Verdict {
+        name: case.name.clone(),
+        group: case.group,
+        passed,
+        margin,
+        bound,
+        bounds,
+        known_limit,
+        limit_gone: passed && case.known_limit.is_some(),
+        plain,
+        seconds: began.elapsed().as_secs_f64(),
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_margin_says_how_far_below_its_limit_a_number_is() {
+        assert_eq!(Bound::new("x", 0.5, 1.0).margin(), 2.0);
+        assert_eq!(Bound::new("x", -2.0, 1.0).margin(), 0.5);
+        assert_eq!(Bound::new("x", f64::NAN, 1.0).margin(), 0.0);
+        assert_eq!(Bound::new("x", f64::INFINITY, 1.0).margin(), 0.0);
+        assert_eq!(Bound::new("x", 0.0, 1.0).margin(), 1e12);
+    }
+
+    #[test]
+    fn the_matrix_has_at_least_150_cases_with_names_of_their_own() {
+        let cases = all();
+        assert!(cases.len() >= 150, "{}", cases.len());
+        let mut names: Vec<String> = cases.iter().map(|c| format!("{}: {}", c.group, c.name)).collect();
+        names.sort();
+        names.windows(2).for_each(|w| assert_ne!(w[0], w[1]));
+    }
+
+    #[test]
+    fn a_case_that_breaks_its_bound_is_told_so() {
+        let broken = Case::new("g", "n".into(), || Ok(Outcome::of(vec![Bound::new("x", 3.0, 1.0)])));
+        let told = judge(&broken);
+        assert!(!told.passed && (told.margin - 1.0 / 3.0).abs() < 1e-12, "{told:?}");
+        let failed = Case::new("g", "n".into(), || Err(LabError::Threads { got: 0, most: 1 }));
+        assert!(!judge(&failed).passed);
+    }
+
+    #[test]
+    fn a_known_limit_is_one_outcome_and_any_other_fails() {
+        let case = |measured: f64, other: f64| {
+            let run =
+                move || Ok(Outcome::of(vec![Bound::new("x", measured, 1.0), Bound::new("y", other, 1.0)]));
+            let expected = Expected::Measured(&[("x", 2.0, 4.0)]);
+            judge(&Case::new("g", "n".into(), run).limited("known", expected))
+        };
+        let limit = case(3.0, 0.5);
+        assert!(!limit.broken() && !limit.passed && limit.known_limit == Some("known"), "{limit:?}");
+        // Worse or better than known, another bound broken too, not a number.
+        for (measured, other) in [(5.0, 0.5), (1.5, 0.5), (3.0, 2.0), (f64::NAN, 0.5), (0.5, 3.0)] {
+            let told = case(measured, other);
+            assert!(told.broken() && told.known_limit.is_none(), "{told:?}");
+        }
+        let gone = case(0.5, 0.5);
+        assert!(gone.passed && gone.limit_gone && gone.broken(), "{gone:?}");
+        // Refused is not the same as measured, and refused for another reason is not refused for this one.
+        let refused = |expected| {
+            let run = || Err(LabError::Threads { got: 0, most: 1 });
+            judge(&Case::new("g", "n".into(), run).limited("known", expected))
+        };
+        assert!(refused(Expected::Inaccurate).broken());
+        assert!(refused(Expected::Measured(&[("x", 0.0, 1e9)])).broken());
+    }
+
+    #[test]
+    fn a_case_that_panics_is_told_and_is_the_only_one_lost() {
+        let none: Vec<f64> = Vec::new();
+        let run = move || Ok(Outcome::of(vec![Bound::new("x", none[0], 1.0)]));
+        let told = judge(&Case::new("g", "n".into(), run));
+        assert!(told.broken() && told.bound.starts_with("panicked: index out of bounds"), "{told:?}");
+    }
+}

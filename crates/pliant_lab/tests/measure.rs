@@ -1,0 +1,435 @@
+//! Whole sessions over emulated paths against the bars of the design: 40 Hz, 120 modes.
+//!
+//! `cargo test -p pliant_lab --test measure -- --ignored --nocapture` runs the long form: ten minutes, many seeds, and
+//! all policies side by side.
+#![allow(clippy::unwrap_used, clippy::expect_used, clippy::panic, reason = "a failed test should panic")]
+
+mod support;
+
+use std::sync::{Arc, OnceLock};
+use std::time::{Duration, Instant};
+
+use pliant_lab::experiment::{Experiment, Figures};
+use pliant_modal::{Integrator, ModalModel};
+use pliant_stream::emulator::{LinkConfig, Loss, Preset};
+use pliant_stream::peer::Repair;
+use pliant_stream::wire::AccelerationCoding;
+use pliant_stream::{Newmark, Policy, Predict, RecoveryConfig};
+use support::bar;
+
+fn paper1(loss: Loss) -> LinkConfig {
+    LinkConfig { loss, ..LinkConfig::preset(Preset::Paper1) }
+}
+
+/// The design's conditions: name, path, and the bars for rms and max in percent.
+fn conditions() -> [(&'static str, LinkConfig, f64, f64); 4] {
+    [
+        ("paper-1", LinkConfig::preset(Preset::Paper1), 0.2, 3.0),
+        ("burst:12", paper1(Loss::Burst { first: 140, count: 12 }), f64::INFINITY, 5.0),
+        ("gilbert:4", paper1(Loss::gilbert(0.09, 4.0, Duration::from_millis(25))), 2.0, f64::INFINITY),
+        ("every:50", paper1(Loss::Every { first: 135, every: 50 }), 0.05, f64::INFINITY),
+    ]
+}
+
+/// The bar, or the model that the variable MODEL names.
+fn body() -> Arc<ModalModel> {
+    static BODY: OnceLock<Arc<ModalModel>> = OnceLock::new();
+    let made = || match std::env::var("MODEL") {
+        Ok(path) => Arc::new(ModalModel::read(path).unwrap()),
+        Err(_) => bar(120, 0.05),
+    };
+    BODY.get_or_init(made).clone()
+}
+
+fn run(link: &LinkConfig, policy: &str, seconds: f64, seed: u64) -> Figures {
+    let mut e = Experiment::new(body(), link.clone(), RecoveryConfig::by_name(policy).unwrap());
+    (e.seconds, e.seed) = (seconds, seed);
+    e.cpu_clock = Some(clock);
+    if !matches!(e.recovery.policy, Policy::ForceDriven { .. }) {
+        // What is streamed and predicted are accelerations that obey Newmark's formulas: the fair host for the paper.
+        e.integrator = Integrator::GeneralizedAlpha { rho_inf: 0.5 };
+    }
+    e.run().unwrap()
+}
+
+fn run_peers(link: &LinkConfig, repair: Repair, seconds: f64) -> Figures {
+    let mut e = Experiment::new(body(), link.clone(), RecoveryConfig::default());
+    e.seconds = seconds;
+    e.cpu_clock = Some(clock);
+    e.run_peers(repair).unwrap()
+}
+
+fn clock() -> Duration {
+    static START: OnceLock<Instant> = OnceLock::new();
+    START.get_or_init(Instant::now).elapsed()
+}
+
+fn show(name: &str, f: &Figures) {
+    println!(
+        "{name:<26} lost {:>4} guessed {:>4} rms {:.4}% max {:.3}% end {:.1e}% hidden {:.1e}% force {:.3}% ringing {:.4} (true {:.4}) \
+         delay {:.0} ms hand-force {:.0} ms recover {:.0} ms {:.0} B {:.1} kbit/s {:.1} us/tick",
+        f.lost,
+        f.guessed,
+        f.rms_percent,
+        f.max_percent,
+        f.end_percent,
+        f.hidden_end_percent,
+        f.force_rms_percent,
+        f.force_ringing,
+        f.true_ringing,
+        f.shown_delay_ms,
+        f.hand_to_force_ms,
+        f.recover_ms,
+        f.bytes_per_frame,
+        f.kbit_s,
+        f.cpu_us_per_tick
+    );
+}
+
+fn hold_bars(name: &str, seed: u64, f: &Figures, rms: f64, max: f64) {
+    assert!(f.rms_percent <= rms, "{name}, seed {seed}: rms {} % above {rms} %", f.rms_percent);
+    assert!(f.max_percent <= max, "{name}, seed {seed}: max {} % above {max} %", f.max_percent);
+    assert!(f.kbit_s <= 100.0, "{name}, seed {seed}: {} kbit/s", f.kbit_s);
+    // As without loss; a flip of sign in each step would be 4. (The scripted hands tremble: it is not 0 in truth either.)
+    let (shown, real) = (f.force_ringing, f.true_ringing);
+    assert!(shown < 1.1 * real, "{name}, seed {seed}: ringing {shown}, true {real}");
+    assert_eq!(f.counts.too_late, 0, "{name}, seed {seed}: data that came too late");
+}
+
+#[test]
+fn default_policy_holds_its_bars() {
+    for (name, link, rms, max) in conditions() {
+        for seed in 1..=2 {
+            let f = run(&link, "default", 60.0, seed);
+            show(name, &f);
+            hold_bars(name, seed, &f, rms, max);
+        }
+    }
+}
+
+#[test]
+fn burst_is_recovered_within_200_ms_of_the_first_arrival() {
+    let mut e = Experiment::new(
+        bar(120, 0.05),
+        paper1(Loss::Burst { first: 140, count: 12 }),
+        RecoveryConfig::default(),
+    );
+    (e.seconds, e.keep_track) = (20.0, true);
+    let f = e.run().unwrap();
+    // Shown ticks that were guessed end where the first frame after the burst arrives; the hand's patch tells the rest.
+    let scale = f.track.iter().map(|t| t.1.abs()).fold(0.0, f64::max);
+    let off: Vec<u64> = f.track.iter().filter(|t| (t.1 - t.2).abs() > 0.005 * scale).map(|t| t.0).collect();
+    let (Some(first), Some(last)) = (off.first(), off.last()) else { return };
+    // Twelve ticks are lost; one of playout and three of repeats make nine or fewer of guessing.
+    let after = (last - first) as f64 * 25.0 - 12.0 * 25.0;
+    assert!(after <= 200.0, "{after} ms after the first arrival: ticks {first} to {last}");
+}
+
+#[test]
+fn peers_see_one_shape_over_the_papers_worst_network() {
+    let link = LinkConfig::preset(Preset::Paper1);
+    let f = run_peers(&link, Repair::Rollback, 30.0);
+    show("p2p rollback", &f);
+    assert!(f.ticks > 1100, "{}", f.ticks);
+    assert!(f.rms_percent < 2.0 && f.end_percent < 10.0, "rms {} %, end {} %", f.rms_percent, f.end_percent);
+    assert_eq!(f.hash, run_peers(&link, Repair::Rollback, 30.0).hash, "same seed, same session");
+}
+
+#[test]
+fn same_seed_same_hash() {
+    let link = LinkConfig::preset(Preset::Paper1);
+    let go = |seed| run(&link, "default", 5.0, seed).hash;
+    assert_eq!(go(7), go(7));
+    assert_ne!(go(7), go(8));
+}
+
+/// The paper's figures 7 to 9: losses, resent 50 ticks later, blended over 1 and 50 ticks.
+#[test]
+fn papers_figures_end_without_error() {
+    let random: Vec<u64> = (0..22_u64).map(|k| 135 + (k * 7919) % 300).collect();
+    let losses = [
+        ("22 random", {
+            let mut r = random;
+            r.sort_unstable();
+            r.dedup();
+            Loss::Listed(r)
+        }),
+        ("12 in a row", Loss::Burst { first: 140, count: 12 }),
+        ("one in 50", Loss::Every { first: 135, every: 50 }),
+    ];
+    for (name, loss) in losses {
+        for predict in [Predict::Zero, Predict::Hold, Predict::Linear] {
+            for blend in [1, 50] {
+                let mut recovery = RecoveryConfig::paper_with(predict, blend);
+                recovery.coding = AccelerationCoding::F64;
+                // The paper's system: average acceleration at both ends, so that its accelerations are the streamed ones.
+                let link =
+                    LinkConfig { delay: Duration::from_millis(10), loss: loss.clone(), ..Default::default() };
+                let mut e = Experiment::new(bar(20, 0.05), link, recovery);
+                e.integrator = Integrator::Newmark;
+                e.newmark = Newmark::average(0.025);
+                e.resend_after = Duration::from_secs_f64(50.0 * 0.025);
+                e.seconds = 18.0;
+                if name == "one in 50" {
+                    // Eleven losses, and then time to repair the last.
+                    e.down.loss = Loss::Listed((0..11).map(|k| 135 + 50 * k).collect());
+                }
+                let f = e.run().unwrap();
+                show(&format!("{name} {predict:?} {blend}"), &f);
+                assert!(f.counts.guessed >= 10, "{name}: {:?}", f.counts);
+                assert_eq!(f.counts.guessed, f.counts.repaired);
+                assert!(f.end_percent < 1e-7, "{name} {predict:?} {blend}: ends at {} %", f.end_percent);
+            }
+        }
+        let mut e = Experiment::new(
+            bar(20, 0.05),
+            LinkConfig { delay: Duration::from_millis(10), loss, ..Default::default() },
+            RecoveryConfig { coding: AccelerationCoding::F64, ..RecoveryConfig::none() },
+        );
+        (e.integrator, e.newmark, e.seconds) = (Integrator::Newmark, Newmark::average(0.025), 18.0);
+        let f = e.run().unwrap();
+        assert!(f.end_percent > 1.0, "{name}: without compensation the error stays: {} %", f.end_percent);
+    }
+}
+
+/// The worst of many seeds, two at a time.
+fn worst(link: &LinkConfig, policy: &str, seconds: f64, seeds: u64) -> Figures {
+    let next = std::sync::atomic::AtomicU64::new(1);
+    let worst = std::sync::Mutex::new(Figures::default());
+    std::thread::scope(|scope| {
+        for _ in 0..2 {
+            scope.spawn(|| {
+                loop {
+                    let seed = next.fetch_add(1, std::sync::atomic::Ordering::Relaxed);
+                    if seed > seeds {
+                        return;
+                    }
+                    let f = run(link, policy, seconds, seed);
+                    let mut w = worst.lock().unwrap();
+                    w.lost += f.lost;
+                    w.guessed += f.guessed;
+                    w.recovered += f.recovered;
+                    w.rms_percent = w.rms_percent.max(f.rms_percent);
+                    w.max_percent = w.max_percent.max(f.max_percent);
+                    w.hidden_end_percent = w.hidden_end_percent.max(f.hidden_end_percent);
+                    w.recover_ms = w.recover_ms.max(f.recover_ms);
+                    w.kbit_s = w.kbit_s.max(f.kbit_s);
+                    w.force_rms_percent = w.force_rms_percent.max(f.force_rms_percent);
+                    w.force_ringing = w.force_ringing.max(f.force_ringing);
+                    w.true_ringing = w.true_ringing.max(f.true_ringing);
+                    w.shown_delay_ms = w.shown_delay_ms.max(f.shown_delay_ms);
+                    w.counts.too_late += f.counts.too_late;
+                }
+            });
+        }
+    });
+    worst.into_inner().unwrap()
+}
+
+#[test]
+#[ignore = "minutes: the long form of the bars"]
+fn default_policy_holds_its_bars_for_ten_minutes_on_many_seeds() {
+    let number =
+        |name: &str, default: f64| std::env::var(name).ok().and_then(|s| s.parse().ok()).unwrap_or(default);
+    let (seeds, seconds) = (number("SEEDS", 100.0) as u64, number("SECONDS", 600.0));
+    println!("worst of {seeds} seeds, {seconds} s each (paper: of {} seeds)", seeds.div_ceil(10));
+    println!(
+        "| network | policy | rms % | max % | end % | above 0.5 % ms | force rms % | ringing | true | kbit/s |"
+    );
+    println!("| --- | --- | --- | --- | --- | --- | --- | --- | --- | --- |");
+    let line = |name: &str, policy: &str, f: &Figures| {
+        println!(
+            "| {name} | {policy} | {:.4} | {:.3} | {:.1e} | {:.0} | {:.3} | {:.4} | {:.4} | {:.1} |",
+            f.rms_percent,
+            f.max_percent,
+            f.hidden_end_percent,
+            f.recover_ms,
+            f.force_rms_percent,
+            f.force_ringing,
+            f.true_ringing,
+            f.kbit_s
+        );
+    };
+    let mut missed = Vec::new();
+    for (name, link, rms, max) in conditions() {
+        let ours = worst(&link, "default", seconds, seeds);
+        line(name, "default", &ours);
+        let paper = worst(&link, "paper", seconds, seeds.div_ceil(10));
+        line(name, "paper", &paper);
+        let times = (paper.rms_percent / ours.rms_percent, paper.max_percent / ours.max_percent);
+        println!("| {name} | times better | {:.0} | {:.0} |  |  |  |  |  |  |", times.0, times.1);
+        if ours.rms_percent > rms || ours.max_percent > max || ours.kbit_s > 100.0 {
+            missed.push(format!(
+                "{name}: rms {} % of {rms}, max {} % of {max}",
+                ours.rms_percent, ours.max_percent
+            ));
+        }
+        if ours.force_ringing > 1.1 * ours.true_ringing || ours.counts.too_late > 0 {
+            missed.push(format!("{name}: ringing {}, too late {}", ours.force_ringing, ours.counts.too_late));
+        }
+    }
+    assert!(missed.is_empty(), "{missed:?}");
+}
+
+#[test]
+#[ignore = "a minute: an hour of streaming"]
+fn an_hour_does_not_drift() {
+    let short = run(&LinkConfig::preset(Preset::Paper1), "default", 120.0, 1);
+    let long = run(&LinkConfig::preset(Preset::Paper1), "default", 3600.0, 1);
+    show("two minutes", &short);
+    show("one hour", &long);
+    assert!(long.rms_percent < 1.5 * short.rms_percent);
+    assert!(long.hidden_end_percent < 0.02, "{} %", long.hidden_end_percent);
+}
+
+#[test]
+#[ignore = "a minute: all policies side by side"]
+fn all_policies_side_by_side() {
+    let perfect =
+        ("perfect", LinkConfig { delay: Duration::from_millis(20), ..Default::default() }, 0.0, 0.0);
+    for (network, link, ..) in std::iter::once(perfect).chain(conditions()) {
+        println!("== {network}");
+        for policy in RecoveryConfig::NAMES {
+            show(policy, &run(&link, policy, 60.0, 1));
+        }
+        for (name, repair) in [("p2p rollback", Repair::Rollback), ("p2p compensated", Repair::Compensate)] {
+            show(name, &run_peers(&link, repair, 60.0));
+        }
+    }
+}
+
+/// The tick at which a hand lets go or takes hold is lost, with its neighbours: no forecast has it, so it is said often.
+#[test]
+fn a_lost_release_or_grab_makes_no_spike() {
+    for (what, holds) in [("release", (0.0, 8.0)), ("grab", (8.0, 1e9))] {
+        for (count, bar) in [(1, 0.5), (2, 2.0), (3, 2.0)] {
+            let (mut worst, mut at) = (0.0_f64, 0);
+            // Which datagram tells of it is tried out: those around the moment, one after the other.
+            for first in 164..=184 {
+                let link = paper1(Loss::Listed((first..first + count).collect()));
+                let mut e = Experiment::new(body(), link, RecoveryConfig::default());
+                e.seconds = 6.0;
+                e.hands[1].holds = Some(holds);
+                let f = e.run().unwrap();
+                (worst, at) = if f.max_percent > worst { (f.max_percent, first) } else { (worst, at) };
+            }
+            println!("{what}, {count} datagrams lost: at worst {worst:.2} %, from datagram {at}");
+            assert!(worst < bar, "{what}, {count} lost from {at}: {worst} %");
+        }
+    }
+}
+
+/// What one body costs a tick at 120 modes and two hands, with 9 % of the frames lost and asked for again: the host's
+/// encoder, and a guest's reading, correcting and stepping. Run with `--release`.
+#[test]
+#[ignore = "a timing: means something with --release only"]
+fn cost_of_a_tick() {
+    use pliant_modal::{Body, BodyConfig, GrabConfig, Patch};
+    use pliant_stream::encoder::Encoder;
+    use pliant_stream::recovery::Receiver;
+    use pliant_stream::wire::Datagram;
+    use pliant_stream::{BodyId, GrabKey, GrabState, StepSettings, TickState, UserId};
+    let model = body();
+    let h = 0.025;
+    let newmark = Newmark { h, beta: 4.0 / 9.0, gamma: 5.0 / 6.0 };
+    for policy in ["default", "paper"] {
+        let recovery = RecoveryConfig::by_name(policy).unwrap();
+        let mut truth = Body::new(model.clone(), BodyConfig { step: h, ..Default::default() }).unwrap();
+        let hands = Experiment::default_hands(&model);
+        let held: Vec<_> = hands
+            .iter()
+            .map(|x| {
+                let patch = Patch::around(model.surface(), x.vertex, x.radius).unwrap();
+                let id = truth.grab(&patch, GrabConfig::default()).unwrap();
+                (id, truth.grab_position(id).unwrap())
+            })
+            .collect();
+        let (id, settings) = (BodyId(1), StepSettings::default());
+        let mut encoder =
+            Encoder::new(id, model.clone(), &settings, newmark, recovery.wish(None), 1200).unwrap();
+        let mut receiver: Option<Receiver> = None;
+        let (mut encode, mut decode) = (Vec::new(), Vec::new());
+        let mut chance = 88_172_645_463_325_252;
+        // What was lost comes again 8 ticks later: a round trip of the paper's.
+        let mut lost = std::collections::VecDeque::new();
+        for tick in 1..=2000_u64 {
+            let t = tick as f64 * h;
+            for ((id, start), hand) in held.iter().zip(&hands) {
+                let d = hand.path(t);
+                truth.set_target(*id, std::array::from_fn(|k| start[k] + d[k])).unwrap();
+            }
+            truth.step().unwrap();
+            let grabs: Vec<GrabState> = held
+                .iter()
+                .zip(&hands)
+                .enumerate()
+                .map(|(k, ((id, _), hand))| GrabState {
+                    key: GrabKey { user: UserId(k as u16), grab: 0 },
+                    vertex: hand.vertex,
+                    radius: hand.radius,
+                    target: truth.target(*id).unwrap(),
+                    reaction: truth.reaction(*id).unwrap(),
+                })
+                .collect();
+            let (q, v, a) = (truth.q(), truth.v(), truth.a());
+            let state = TickState { tick, q, v, a, z: &[], pose: None, grabs: &grabs, resting: false };
+            if receiver.is_none() {
+                encoder.restart(&state);
+                let snapshot = encoder.snapshot(false);
+                let modes = encoder.modes();
+                receiver = Some(
+                    Receiver::new(model.clone(), settings, modes, newmark, &recovery, &snapshot).unwrap(),
+                );
+                continue;
+            }
+            let receiver = receiver.as_mut().unwrap();
+            let began = Instant::now();
+            let body = encoder.encode(&state);
+            encode.push(began.elapsed());
+            let wrap = |body: &[u8]| [&[1, 0, 0], body].concat();
+            let mut arrived = Vec::new();
+            if lost.front().is_some_and(|at| at + 8 <= tick) {
+                arrived
+                    .extend(lost.pop_front().into_iter().flat_map(|at| encoder.resend(at)).map(|b| wrap(&b)));
+            }
+            if support::random(&mut chance) % 100 < 9 {
+                lost.push_back(tick);
+            } else {
+                arrived.push(wrap(&body.first));
+            }
+            let began = Instant::now();
+            for bytes in &arrived {
+                let Datagram::Frame(frame) = Datagram::decode(bytes).unwrap().1 else { unreachable!() };
+                receiver.accept(&frame);
+            }
+            receiver.advance();
+            decode.push(began.elapsed());
+        }
+        let counts = receiver.as_ref().unwrap().counts();
+        assert!(counts.repaired > 50, "there must have been something to put right: {counts:?}");
+        let median = |times: &mut Vec<Duration>| {
+            times.sort_unstable();
+            times[times.len() / 2].as_secs_f64() * 1e6
+        };
+        println!(
+            "{policy}: encode {:.1} us, decode and step {:.1} us a tick",
+            median(&mut encode),
+            median(&mut decode)
+        );
+    }
+}
+
+#[test]
+fn what_is_not_shown_counts_as_missing_and_as_wrong() {
+    let link = |loss| LinkConfig { loss, delay: Duration::from_millis(10), ..LinkConfig::default() };
+    let whole = run(&link(Loss::None), "default", 10.0, 1);
+    assert!(whole.missing == 0 && whole.ticks >= 399 && whole.max_percent < 0.1, "{whole:?}");
+    // Nothing arrives any more: after a second and a bit of guessing the picture stands still, and every tick from then on is missed and compared.
+    let none = run(&link(Loss::Burst { first: 0, count: 100_000 }), "default", 10.0, 1);
+    assert!(none.missing > 300 && none.ticks + none.missing >= 398, "{none:?}");
+    assert!(none.rms_percent > 10.0 && none.end_percent > 1.0, "{none:?}");
+    // A second without frames: some ticks are missed while it lasts, and what is caught up with is not taken for shown.
+    let gap = run(&link(Loss::Burst { first: 100, count: 60 }), "default", 10.0, 1);
+    assert!((5..=60).contains(&gap.missing) && gap.max_percent > 1.0, "{gap:?}");
+    assert!(gap.ticks + gap.missing >= 398, "{gap:?}");
+}

@@ -1,0 +1,148 @@
+//! Own hand first.
+#![allow(clippy::unwrap_used, clippy::expect_used, clippy::panic, reason = "a failed test should panic")]
+
+mod support;
+
+use std::time::Duration;
+
+use pliant_lab::pair::{Pair, PathConfig, World};
+use pliant_stream::emulator::{LinkConfig, Preset};
+use pliant_stream::{
+    GuestConfig, GuestEvent, GuestSession, HostConfig, HostEvent, HostSession, Pose, StepSettings,
+};
+use support::scene::{BODY, S, Scene, cached, circling, start};
+use support::{bar, loose_bar};
+
+#[test]
+fn own_hand_does_not_wait_for_the_round_trip() {
+    // The guest's newer copy against what the host makes of the same ticks later.
+    for (preset, bar_shape, bar_force) in
+        [(Preset::Paper4, 0.002, 0.005), (Preset::Paper2, 0.02, 0.1), (Preset::Paper1, 0.02, 0.1)]
+    {
+        let model = bar(40, 0.05);
+        let (mut pair, scene) = start(&model);
+        struct Watch {
+            scene: Scene,
+            seen: Vec<(u64, Vec<f64>, [f64; 3])>,
+            forces: Vec<(u64, [f64; 3])>,
+            leads: Vec<usize>,
+            other: bool,
+        }
+        impl World for Watch {
+            fn step(&mut self, now: Duration, tick: u64, host: &mut HostSession) {
+                self.scene.step(now, tick, host);
+                if let Some(g) = self.scene.grabs.first() {
+                    self.forces.push((tick, self.scene.body.reaction(g.1).unwrap()));
+                }
+            }
+            fn host_event(&mut self, now: Duration, event: HostEvent, host: &mut HostSession) {
+                self.scene.host_event(now, event, host);
+            }
+            fn guest_event(&mut self, now: Duration, guest: usize, event: GuestEvent, s: &mut GuestSession) {
+                self.scene.guest_event(now, guest, event, s);
+            }
+            fn guest_stepped(
+                &mut self,
+                now: Duration,
+                guest: usize,
+                stepped: u64,
+                session: &mut GuestSession,
+            ) {
+                self.scene.guest_stepped(now, guest, stepped, session);
+                let Some(own) = session.body(BODY).and_then(|b| b.own_hand()) else { return };
+                if guest == 0 && stepped > 0 && now > 8 * S {
+                    let reaction = own.reaction(0).expect("the grab is held");
+                    self.seen.push((own.tick(), own.shown().q.clone(), reaction));
+                    self.leads.push(own.lead());
+                } else if guest == 1 {
+                    self.other = true;
+                }
+            }
+        }
+        let mut watch =
+            Watch { scene, seen: Vec::new(), forces: Vec::new(), leads: Vec::new(), other: false };
+        watch.scene.hand = circling();
+        let path = PathConfig::symmetric(LinkConfig::preset(preset));
+        for seed in [3, 4] {
+            pair.join_with(GuestConfig::default(), path.clone(), seed, cached(&model)).unwrap();
+        }
+        pair.run_until(40 * S, &mut watch);
+        assert!(!watch.other, "a guest that holds nothing has no newer copy");
+        let size = watch.scene.size();
+        let strongest =
+            watch.forces.iter().map(|f| f.1.iter().map(|x| x * x).sum::<f64>().sqrt()).fold(0.0, f64::max);
+        let (mut shape, mut force, mut count) = (0.0, 0.0, 0.0);
+        for (tick, q, reaction) in &watch.seen {
+            let Some((_, truth)) = watch.scene.truth.iter().find(|t| t.0 == *tick) else { continue };
+            let Some((_, real)) = watch.forces.iter().find(|f| f.0 == *tick) else { continue };
+            shape += q.iter().zip(truth).map(|(a, b)| (a - b).powi(2)).sum::<f64>();
+            force += (0..3).map(|k| (reaction[k] - real[k]).powi(2)).sum::<f64>();
+            count += 1.0;
+        }
+        assert!(count > 1000.0, "{count} ticks compared");
+        let (shape, force) = ((shape / count).sqrt() / size, (force / count).sqrt() / strongest);
+        let lead = watch.leads[watch.leads.len() / 2];
+        println!(
+            "{}: ahead by {lead} ticks, shape off {:.3} %, reaction off {:.3} %",
+            preset.name(),
+            shape * 100.0,
+            force * 100.0
+        );
+        // Round trip and playout in ticks, rounded up by the host's and the guest's steps.
+        let whole = (preset.round_trip().as_secs_f64() / 0.025) as usize;
+        assert!(
+            (whole + 1..=whole + 4).contains(&lead),
+            "{}: lead {lead} for {whole} ticks of round trip",
+            preset.name()
+        );
+        assert!(shape < bar_shape, "{}: shape {shape}", preset.name());
+        assert!(force < bar_force, "{}: reaction {force}", preset.name());
+    }
+}
+
+#[test]
+fn own_hand_on_a_free_body_takes_its_frame_along() {
+    // A free body falls slowly and is dragged: the copy's frame against the host's of the same ticks later.
+    let model = loose_bar(24, 0.05);
+    let settings = StepSettings { gravity: [0.0, 0.0, -0.3], ..Default::default() };
+    let mut pair = Pair::new(HostConfig::default()).unwrap();
+    pair.host.add_body(BODY, "bar", model.clone(), settings).unwrap();
+    struct Watch(Scene, Vec<(u64, Pose)>, Vec<(u64, Pose)>);
+    impl World for Watch {
+        fn step(&mut self, now: Duration, tick: u64, host: &mut HostSession) {
+            self.0.step(now, tick, host);
+        }
+        fn host_event(&mut self, now: Duration, event: HostEvent, host: &mut HostSession) {
+            self.0.host_event(now, event, host);
+        }
+        fn guest_stepped(&mut self, now: Duration, guest: usize, stepped: u64, session: &mut GuestSession) {
+            self.0.guest_stepped(now, guest, stepped, session);
+            let Some(view) = session.body(BODY).filter(|_| stepped > 0 && now > 6 * S) else { return };
+            self.2.extend(view.pose().map(|pose| (view.tick(), pose)));
+            let Some(own) = view.own_hand() else { return };
+            self.1.push((own.tick(), own.pose().expect("a free body has a frame")));
+        }
+    }
+    let mut watch = Watch(Scene::with(&model, &settings), Vec::new(), Vec::new());
+    watch.0.hand = circling();
+    let path = PathConfig::symmetric(LinkConfig::preset(Preset::Paper2));
+    pair.join_with(GuestConfig::default(), path, 3, cached(&model)).unwrap();
+    pair.run_until(25 * S, &mut watch);
+    let off = |seen: &[(u64, Pose)]| {
+        let (mut sum, mut count) = (0.0, 0.0_f64);
+        for (tick, pose) in seen {
+            let Some((_, truth)) = watch.0.poses.iter().find(|p| p.0 == *tick) else { continue };
+            sum += (0..3).map(|k| (pose.position[k] - truth.position[k]).powi(2)).sum::<f64>();
+            count += 1.0;
+        }
+        assert!(count > 500.0, "{count} ticks compared");
+        (sum / count).sqrt()
+    };
+    let moved = watch.0.poses.iter().map(|p| p.1.position.iter().map(|x| x * x).sum::<f64>().sqrt());
+    let moved = moved.fold(0.0, f64::max);
+    let (own, shown) = (off(&watch.1), off(&watch.2));
+    println!("moved by {moved:.3} m; own copy off by {own:.5} m, shown by {shown:.5} m");
+    assert!(moved > 0.1);
+    assert!(own < 0.02 * moved, "{own} m of {moved} m");
+    assert!(shown < 0.01 * moved, "{shown} m of {moved} m");
+}

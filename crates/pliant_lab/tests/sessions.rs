@@ -1,0 +1,173 @@
+//! Sessions: joining, late joining, leaving, models, bodies that come and go.
+#![allow(clippy::unwrap_used, clippy::expect_used, clippy::panic, reason = "a failed test should panic")]
+
+mod support;
+
+use std::time::Duration;
+
+use pliant_lab::pair::{Pair, PathConfig, World};
+use pliant_modal::{Body, BodyConfig};
+use pliant_stream::emulator::LinkConfig;
+use pliant_stream::{
+    BodyId, EndReason, GuestConfig, GuestEvent, GuestSession, HostConfig, HostEvent, HostSession, PeerId,
+    StepSettings, UserId,
+};
+use support::bar;
+use support::scene::{BODY, MS, S, Scene, cached, circling, paper1, start, start_with};
+
+#[test]
+fn model_is_sent_in_pieces_to_those_who_lack_it_only() {
+    let model = bar(20, 0.05);
+    let bytes = model.to_bytes().len() as u64;
+    let (mut pair, mut scene) = start(&model);
+    pair.join(GuestConfig::default(), paper1(), 1).unwrap();
+    pair.join_with(GuestConfig::default(), paper1(), 2, cached(&model)).unwrap();
+    pair.run_until(5 * S, &mut scene);
+    for g in &pair.guests {
+        assert!(g.session.body(BODY).unwrap().is_ready());
+        assert_eq!(g.session.body(BODY).unwrap().model().unwrap().hash(), model.hash());
+    }
+    let got = |k: usize| pair.guests[k].session.stats().message_bytes_in;
+    assert!(got(0) > bytes && got(0) < bytes + bytes / 10 + 20_000, "{} for a model of {bytes}", got(0));
+    assert!(got(1) < 5_000, "{} without the model", got(1));
+    assert!(
+        scene.saw(0, |e| matches!(e, GuestEvent::ModelProgress { received, total, .. } if received == total))
+    );
+}
+
+#[test]
+fn late_joiner_has_the_right_picture_within_a_second() {
+    let model = bar(40, 0.05);
+    let (mut pair, mut scene) = start(&model);
+    scene.hand = circling();
+    let fast = PathConfig::symmetric(LinkConfig { delay: 50 * MS, ..Default::default() });
+    pair.join_with(GuestConfig::default(), fast.clone(), 1, cached(&model)).unwrap();
+    pair.run_until(10 * S, &mut scene);
+    pair.join_with(GuestConfig::default(), fast, 2, cached(&model)).unwrap();
+    pair.run_until(11 * S, &mut scene);
+    let late = &pair.guests[1].session;
+    assert!(late.body(BODY).unwrap().is_ready());
+    let error = scene.error(late) / scene.size();
+    assert!(error < 1e-3, "{error}");
+}
+
+#[test]
+fn goodbyes_and_bodies_that_go() {
+    let model = bar(20, 0.05);
+    let (mut pair, mut scene) = start(&model);
+    scene.hand = circling();
+    pair.join_with(GuestConfig::default(), paper1(), 1, cached(&model)).unwrap();
+    pair.run_until(3 * S, &mut scene);
+    let second = BodyId(9);
+    pair.host.add_body(second, "other", model.clone(), StepSettings::default()).unwrap();
+    pair.run_until(4 * S, &mut scene);
+    assert!(scene.saw(0, |e| matches!(e, GuestEvent::BodyAnnounced { body: BodyId(9), .. })));
+    pair.host.remove_body(second);
+    pair.run_until(5 * S, &mut scene);
+    assert!(scene.saw(0, |e| matches!(e, GuestEvent::BodyGone { body: BodyId(9) })));
+    pair.guests[0].session.leave();
+    pair.run_until(6 * S, &mut scene);
+    assert!(scene.host_events.iter().any(|e| matches!(e, HostEvent::Left { reason: EndReason::Left, .. })));
+    assert!(scene.saw(0, |e| matches!(e, GuestEvent::Closed { reason: EndReason::Left })));
+    assert!(scene.grabs.is_empty(), "a guest's grabs end with it");
+}
+
+#[test]
+fn a_closed_house_asks_before_it_lets_in() {
+    struct Door(Scene, bool);
+    impl World for Door {
+        fn step(&mut self, now: Duration, tick: u64, host: &mut HostSession) {
+            self.0.step(now, tick, host);
+        }
+        fn host_event(&mut self, now: Duration, event: HostEvent, host: &mut HostSession) {
+            if let HostEvent::JoinRequest { peer, name } = &event {
+                if name == "friend" && self.1 {
+                    host.accept(now, *peer).unwrap();
+                } else {
+                    host.refuse(*peer);
+                }
+            }
+            self.0.host_event(now, event, host);
+        }
+        fn guest_event(&mut self, now: Duration, guest: usize, event: GuestEvent, s: &mut GuestSession) {
+            self.0.guest_event(now, guest, event, s);
+        }
+    }
+    let model = bar(20, 0.05);
+    let mut pair = Pair::new(HostConfig { open: false, ..Default::default() }).unwrap();
+    pair.host.add_body(BODY, "bar", model.clone(), StepSettings::default()).unwrap();
+    let mut door = Door(Scene::new(&model), true);
+    for (seed, name) in [(1, "friend"), (2, "stranger")] {
+        let config = GuestConfig { name: name.into(), ..Default::default() };
+        pair.join_with(config, paper1(), seed, cached(&model)).unwrap();
+    }
+    pair.run_until(3 * S, &mut door);
+    assert!(pair.guests[0].session.body(BODY).unwrap().is_ready());
+    assert!(door.0.saw(1, |e| matches!(e, GuestEvent::Closed { reason: EndReason::Refused })));
+}
+
+#[test]
+fn the_same_seed_gives_the_same_session() {
+    let go = |seed| {
+        let model = bar(20, 0.05);
+        let (mut pair, mut scene) = start(&model);
+        scene.hand = circling();
+        pair.join_with(GuestConfig::default(), paper1(), seed, cached(&model)).unwrap();
+        pair.run_until(6 * S, &mut scene);
+        let g = &pair.guests[0];
+        let bits: Vec<u64> =
+            g.session.body(BODY).unwrap().shown().unwrap().q.iter().map(|q| q.to_bits()).collect();
+        (g.down.hash(), g.up.hash(), bits)
+    };
+    assert_eq!(go(1), go(1));
+    assert_ne!(go(1).0, go(2).0);
+}
+
+#[test]
+fn a_body_that_goes_while_its_model_is_on_the_way_harms_nobody() {
+    let model = bar(40, 0.05);
+    let (mut pair, mut scene) =
+        start_with(&bar(6, 0.05), HostConfig { model_rate: 50e3, ..Default::default() });
+    scene.body = Body::new(bar(6, 0.05), BodyConfig { step: 0.025, ..Default::default() }).unwrap();
+    pair.join(GuestConfig::default(), paper1(), 1).unwrap();
+    pair.run_until(3 * S, &mut scene);
+    let second = BodyId(9);
+    pair.host.add_body(second, "brief", model.clone(), StepSettings::default()).unwrap();
+    pair.run_until(4 * S, &mut scene);
+    pair.host.remove_body(second);
+    pair.run_until(5 * S, &mut scene);
+    pair.host.add_body(second, "again", model, StepSettings::default()).unwrap();
+    pair.run_until(40 * S, &mut scene);
+    assert!(!pair.guests[0].session.is_closed());
+    assert!(pair.guests[0].session.body(second).unwrap().model().is_some(), "the model came after all");
+}
+
+#[test]
+fn sessions_are_shared_between_threads_as_they_are() {
+    fn shared<T: Send + Sync>() {}
+    shared::<GuestSession>();
+    shared::<HostSession>();
+    shared::<Box<dyn pliant_stream::recovery::Recovery>>();
+}
+
+#[test]
+fn guest_that_is_killed_is_let_go_with_its_grabs() {
+    let model = bar(20, 0.05);
+    let (mut pair, mut scene) = start(&model);
+    scene.hand = circling();
+    pair.join_with(GuestConfig::default(), paper1(), 1, cached(&model)).unwrap();
+    pair.join_with(GuestConfig::default(), paper1(), 2, cached(&model)).unwrap();
+    pair.run_until(5 * S, &mut scene);
+    assert_eq!(scene.grabs.len(), 1);
+    pair.cut(0);
+    pair.run_until(16 * S, &mut scene);
+    assert!(scene.grabs.is_empty());
+    assert!(
+        scene
+            .host_events
+            .iter()
+            .any(|e| matches!(e, HostEvent::Left { peer: PeerId(1), reason: EndReason::Silent, .. }))
+    );
+    assert!(scene.saw(1, |e| matches!(e, GuestEvent::UserLeft { user: UserId(1) })));
+    assert_eq!(pair.guests[1].session.user(), Some(UserId(2)));
+}
