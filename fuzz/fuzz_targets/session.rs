@@ -7,8 +7,8 @@ use std::time::Duration;
 use libfuzzer_sys::fuzz_target;
 use pliant_modal::{BakeInfo, Damping, Element, ModalModel, ModelParts, SurfaceMesh};
 use pliant_stream::{
-    BodyId, StepSettings, Channel, GuestConfig, GuestSession, HostConfig, HostSession, PeerId, RecoveryConfig,
-    TickState,
+    BodyId, Channel, GuestConfig, GuestSession, HostConfig, HostSession, PeerId, RecoveryConfig,
+    StepSettings, TickState,
 };
 
 const BODY: BodyId = BodyId(1);

@@ -81,38 +81,45 @@ pub(crate) mod x86 {
     #[derive(Clone, Copy)]
     pub(crate) struct Avx512(__m512);
 
-    // SAFETY of the bodies: the trait's contract is that AVX-512F is there; loads and stores go through references to 16 numbers.
     impl Lanes for Avx512 {
         #[inline(always)]
         unsafe fn splat(x: f32) -> Self {
+            // SAFETY: the caller has seen that AVX-512F is there; a reference is to 16 numbers.
             Self(unsafe { _mm512_set1_ps(x) })
         }
         #[inline(always)]
         unsafe fn load(from: &[f32; BLOCK]) -> Self {
+            // SAFETY: the caller has seen that AVX-512F is there; a reference is to 16 numbers.
             Self(unsafe { _mm512_loadu_ps(from.as_ptr()) })
         }
         #[inline(always)]
         unsafe fn load_half(from: &[f16; BLOCK]) -> Self {
+            // SAFETY: the caller has seen that AVX-512F is there; a reference is to 16 numbers.
             Self(unsafe { _mm512_cvtph_ps(_mm256_loadu_si256(from.as_ptr().cast())) })
         }
         #[inline(always)]
         unsafe fn store(self, to: &mut [f32; BLOCK]) {
+            // SAFETY: the caller has seen that AVX-512F is there; a reference is to 16 numbers.
             unsafe { _mm512_storeu_ps(to.as_mut_ptr(), self.0) }
         }
         #[inline(always)]
         unsafe fn mul_add(self, by: Self, plus: Self) -> Self {
+            // SAFETY: the caller has seen that AVX-512F is there; a reference is to 16 numbers.
             Self(unsafe { _mm512_fmadd_ps(self.0, by.0, plus.0) })
         }
         #[inline(always)]
         unsafe fn neg_mul_add(self, by: Self, minus: Self) -> Self {
+            // SAFETY: the caller has seen that AVX-512F is there; a reference is to 16 numbers.
             Self(unsafe { _mm512_fnmadd_ps(self.0, by.0, minus.0) })
         }
         #[inline(always)]
         unsafe fn mul(self, by: Self) -> Self {
+            // SAFETY: the caller has seen that AVX-512F is there; a reference is to 16 numbers.
             Self(unsafe { _mm512_mul_ps(self.0, by.0) })
         }
         #[inline(always)]
         unsafe fn all_at_most(self, limit: f32) -> bool {
+            // SAFETY: the caller has seen that AVX-512F is there; a reference is to 16 numbers.
             unsafe { _mm512_cmp_ps_mask::<_CMP_LE_OQ>(self.0, _mm512_set1_ps(limit)) == u16::MAX }
         }
     }
@@ -121,21 +128,23 @@ pub(crate) mod x86 {
     #[derive(Clone, Copy)]
     pub(crate) struct Avx2(__m256, __m256);
 
-    // SAFETY of the bodies: the trait's contract is that AVX2, FMA and F16C are there; both halves of a reference to 16 numbers lie inside it.
     impl Lanes for Avx2 {
         #[inline(always)]
         unsafe fn splat(x: f32) -> Self {
+            // SAFETY: the caller has seen that AVX2, FMA and F16C are there; a reference is to 16.
             let x = unsafe { _mm256_set1_ps(x) };
             Self(x, x)
         }
         #[inline(always)]
         unsafe fn load(from: &[f32; BLOCK]) -> Self {
             let p = from.as_ptr();
+            // SAFETY: the caller has seen that AVX2, FMA and F16C are there; a reference is to 16.
             unsafe { Self(_mm256_loadu_ps(p), _mm256_loadu_ps(p.add(8))) }
         }
         #[inline(always)]
         unsafe fn load_half(from: &[f16; BLOCK]) -> Self {
             let p = from.as_ptr();
+            // SAFETY: the caller has seen that AVX2, FMA and F16C are there; a reference is to 16.
             unsafe {
                 Self(
                     _mm256_cvtph_ps(_mm_loadu_si128(p.cast())),
@@ -146,6 +155,7 @@ pub(crate) mod x86 {
         #[inline(always)]
         unsafe fn store(self, to: &mut [f32; BLOCK]) {
             let p = to.as_mut_ptr();
+            // SAFETY: the caller has seen that AVX2, FMA and F16C are there; a reference is to 16.
             unsafe {
                 _mm256_storeu_ps(p, self.0);
                 _mm256_storeu_ps(p.add(8), self.1);
@@ -153,18 +163,22 @@ pub(crate) mod x86 {
         }
         #[inline(always)]
         unsafe fn mul_add(self, by: Self, plus: Self) -> Self {
+            // SAFETY: the caller has seen that AVX2, FMA and F16C are there; a reference is to 16.
             unsafe { Self(_mm256_fmadd_ps(self.0, by.0, plus.0), _mm256_fmadd_ps(self.1, by.1, plus.1)) }
         }
         #[inline(always)]
         unsafe fn neg_mul_add(self, by: Self, minus: Self) -> Self {
+            // SAFETY: the caller has seen that AVX2, FMA and F16C are there; a reference is to 16.
             unsafe { Self(_mm256_fnmadd_ps(self.0, by.0, minus.0), _mm256_fnmadd_ps(self.1, by.1, minus.1)) }
         }
         #[inline(always)]
         unsafe fn mul(self, by: Self) -> Self {
+            // SAFETY: the caller has seen that AVX2, FMA and F16C are there; a reference is to 16.
             unsafe { Self(_mm256_mul_ps(self.0, by.0), _mm256_mul_ps(self.1, by.1)) }
         }
         #[inline(always)]
         unsafe fn all_at_most(self, limit: f32) -> bool {
+            // SAFETY: the caller has seen that AVX2, FMA and F16C are there; a reference is to 16.
             unsafe {
                 let limit = _mm256_set1_ps(limit);
                 let both = _mm256_and_ps(
