@@ -185,3 +185,41 @@ fn restarts_when_its_space_is_full() {
     let (residual, _) = crate::bake::accuracy(&matrix, &modes);
     assert!(residual < 1e-8, "{residual:e}");
 }
+
+/// A free body, whose rigid motion is kept out, among equal parts that are held.
+#[test]
+fn rigid_modes_are_counted_as_such() {
+    let (copies, wanted, cells) = (33, 50, [4, 1, 1]);
+    let alone = |p: [f64; 3]| p[1] < 1.0;
+    let fe = FeMesh::new(&bars(copies, cells), Element::Tet4);
+    let held: Vec<bool> = fe.nodes.iter().map(|&p| p[0] == 0.0 && !alone(p)).collect();
+    let (number, ordered) = elimination_order(&fe, &fe.graph(false), &held);
+    let law = Law { lambda: 1.0, mu: 1.0, density: 1.0, average_pressure: false };
+    let matrix = fe.assemble(&law, &number, &ordered);
+    let mut positions = vec![[0.0; 3]; matrix.nodes()];
+    for ((&row, &p), _) in number.iter().zip(&fe.nodes).zip(&held).filter(|(_, held)| !**held) {
+        positions[row as usize] = p;
+    }
+    let one = FeMesh::new(&bars(1, cells), Element::Tet4);
+    let mut rigid = MassProperties::new(&one, law.density).rigid_modes(positions.iter().copied());
+    for (rows, &p) in rigid.chunks_exact_mut(18).zip(&positions) {
+        if !alone(p) {
+            rows.fill(0.0);
+        }
+    }
+    let mut expected = copied(&modes_of(&bars(1, cells), 12, |p| p[0] == 0.0), copies - 1, 300);
+    expected.extend(modes_of(&bars(1, cells), 12, |_| false));
+    expected.sort_by(f64::total_cmp);
+    let solver = Solver::new(&matrix, Symbolic::new(&ordered), Some(rigid)).unwrap();
+    let got = lowest(&solver, wanted, &mut |_| ()).unwrap();
+    assert_eq!(wrong(&got.lambda, &expected[..wanted]), 0, "{:?}", got.lambda);
+}
+
+/// A rod so slender that its first mode drowns in rounding has no count, and no modes that nobody can vouch for.
+#[test]
+fn what_cannot_be_counted_is_an_error() {
+    let (matrix, symbolic, _) = matrices(&bars(1, [3000, 1, 1]), |p| p[0] == 0.0);
+    let solver = Solver::new(&matrix, symbolic, None).unwrap();
+    let failure = lowest(&solver, 1, &mut |_| ()).unwrap_err();
+    assert!(matches!(failure, Failure::Uncounted { .. }), "{failure:?}");
+}
