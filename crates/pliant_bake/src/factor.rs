@@ -345,7 +345,8 @@ fn front(
     Ok(if supernode.parent == ROOT { Vec::new() } else { update })
 }
 
-/// One front of `K - shift M` with what its children have left for it, in `block` and the update matrix.
+/// One front of `K - shift M` with what its children have left for it, in `block` and the update
+/// matrix.
 pub(crate) fn assemble_front(
     symbolic: &Symbolic,
     s: usize,
@@ -505,8 +506,8 @@ fn factor_front(block: &mut [f64], update: &mut [f64], width: usize, below: usiz
     Ok(())
 }
 
-/// `strip -= lower right^T`, on and below the diagonal only. The product is symmetric there: `right` is the head of
-/// `lower`, its columns perhaps with other signs.
+/// `strip -= lower right^T`, on and below the diagonal only. The product is symmetric there:
+/// `right` is the head of `lower`, its columns perhaps with other signs.
 pub(crate) fn subtract_product(strip: MatMut<'_, f64>, lower: MatRef<'_, f64>, right: MatRef<'_, f64>) {
     let columns = strip.ncols();
     let (on, under) = strip.split_at_row_mut(columns);

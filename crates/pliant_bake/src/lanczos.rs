@@ -4,9 +4,10 @@
 //! The operator is `K^-1 M`, whose largest eigenvalues are `1 / lambda`. For a free body K is singular: `K^-1` is the
 //! inertia-relief pseudo-inverse of [`Solver`], and the rigid modes are deflated, so only elastic modes come out.
 //!
-//! A block of eight vectors knows eight directions of an eigenspace; more come in only by rounding, if in time.
-//! Converged modes are therefore counted against the inertia of `K - mu M` (`sturm.rs`), and where some are missing the
-//! block gets random vectors for them and the iteration goes on. Bodies that lack none come out as they would without.
+//! A block of eight vectors knows eight directions of an eigenspace; more come in only by rounding,
+//! if in time. Converged modes are therefore counted against the inertia of `K - mu M`
+//! (`sturm.rs`), and where some are missing the block gets random vectors for them and the
+//! iteration goes on. Bodies that lack none come out as they would without.
 
 use faer::Mat;
 
@@ -17,8 +18,8 @@ use crate::sturm::Count;
 /// Stop when every wanted Ritz pair has this residual, relative to its own eigenvalue, in the M-norm.
 const TOLERANCE: f64 = 4e-9;
 
-/// The modes are counted up to this share below the last one. What is nearer to it than that, or to others that are,
-/// is as good as it.
+/// The modes are counted up to this share below the last one. What is nearer to it than that, or to
+/// others that are, is as good as it.
 const NEAR: f64 = 1e-6;
 
 /// Where rounding asks for more than [`NEAR`], up to this.
@@ -147,7 +148,8 @@ impl<'a> Lanczos<'a> {
             let ahead = if 4 * converged < self.wanted { 3 } else { 1 };
             check_at = self.done + ahead * self.width;
             report(0.7 + 0.3 * converged as f64 / self.wanted as f64);
-            // Ritz values come up from below the operator's: those that were missed are not to be expected at once.
+            // Ritz values come up from below the operator's: those that were missed are not to be
+            // expected at once.
             let appeared = missed.is_none_or(|below| {
                 let last = below.modes.min(self.wanted) - 1;
                 values[last] * below.lambda * (1.0 + 0.5 * NEAR) >= 1.0
@@ -182,8 +184,9 @@ impl<'a> Lanczos<'a> {
         if keep < self.wanted { Err(Failure::NoConvergence) } else { Ok(keep) }
     }
 
-    /// How many elastic modes there are below the last wanted one, and those that are as good as it, and how many of
-    /// them are found. Counting just below needs no gap above: a cluster may go on past the wanted modes.
+    /// How many elastic modes there are below the last wanted one, and those that are as good as
+    /// it, and how many of them are found. Counting just below needs no gap above: a cluster may go
+    /// on past the wanted modes.
     fn count(&self, values: &[f64], ritz: &Ritz) -> Result<Below, Failure> {
         let rigid = if self.solver.rigid.is_some() { 6 } else { 0 };
         let lambda = |mode: usize| 1.0 / values[mode];
@@ -203,7 +206,8 @@ impl<'a> Lanczos<'a> {
             {
                 return Ok(Below { lambda: shift, modes: count.below - rigid, found });
             }
-            // Another place has other pivots; less than is there was counted only if rounding is worse than thought.
+            // Another place has other pivots; less than is there was counted only if rounding is
+            // worse than thought.
             near = if blur.is_finite() { (2.0 * near).max(4.0 * blur) } else { 2.0 * near };
             if near > FAR {
                 break;
@@ -212,10 +216,12 @@ impl<'a> Lanczos<'a> {
         Err(Failure::Uncounted { lambda: lambda(self.wanted - 1) })
     }
 
-    /// Restarts with random vectors added to the next block, for eigenvectors that the space so far knows nothing of. What
-    /// the operator makes of the kept ones is in the next block's old part, as in any restart.
+    /// Restarts with random vectors added to the next block, for eigenvectors that the space so far
+    /// knows nothing of. What the operator makes of the kept ones is in the next block's old part,
+    /// as in any restart.
     fn widen(&mut self, values: &[f64], vectors: &Mat<f64>, missing: usize) -> Result<(), Failure> {
-        // Two blocks and the wanted vectors must have room, and no more copies are wanted than modes.
+        // Two blocks and the wanted vectors must have room, and no more copies are wanted than
+        // modes.
         let room = ((self.stride - self.wanted) / 2).saturating_sub(self.width);
         let fresh = missing.min(self.wanted).max(8).min(room);
         if fresh == 0 {

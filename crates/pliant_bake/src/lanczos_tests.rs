@@ -36,13 +36,15 @@ fn modes_of(mesh: &TetMesh, wanted: usize, held: impl Fn([f64; 3]) -> bool) -> V
     modes.lambda
 }
 
-/// How many of the values are not what theory says. The solver tells none apart that are nearer than its tolerance.
+/// How many of the values are not what theory says. The solver tells none apart that are nearer
+/// than its tolerance.
 fn wrong(got: &[f64], expected: &[f64]) -> usize {
     assert_eq!(got.len(), expected.len());
     got.iter().zip(expected).filter(|(a, b)| (*a / *b - 1.0).abs() > 1e-8).count()
 }
 
-/// `count` equal bars side by side, not connected. Places are multiples of a quarter: the bars are equal to the bit.
+/// `count` equal bars side by side, not connected. Places are multiples of a quarter: the bars are
+/// equal to the bit.
 fn bars(count: usize, cells: [usize; 3]) -> TetMesh {
     let one = shapes::bar(cells, cells.map(|c| c as f64 / 4.0)).unwrap();
     let mut out = TetMesh::default();
@@ -215,7 +217,8 @@ fn rigid_modes_are_counted_as_such() {
     assert_eq!(wrong(&got.lambda, &expected[..wanted]), 0, "{:?}", got.lambda);
 }
 
-/// A rod so slender that its first mode drowns in rounding has no count, and no modes that nobody can vouch for.
+/// A rod so slender that its first mode drowns in rounding has no count, and no modes that nobody
+/// can vouch for.
 #[test]
 fn what_cannot_be_counted_is_an_error() {
     let (matrix, symbolic, _) = matrices(&bars(1, [3000, 1, 1]), |p| p[0] == 0.0);

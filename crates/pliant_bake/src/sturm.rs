@@ -1,12 +1,15 @@
-//! How many eigenvalues of `K x = lambda M x` lie below a shift: as many as `K - shift M` has negative pivots (Sylvester's
-//! law of inertia). An eigensolver that has found as many has missed none.
+//! How many eigenvalues of `K x = lambda M x` lie below a shift: as many as `K - shift M` has
+//! negative pivots (Sylvester's law of inertia). An eigensolver that has found as many has missed
+//! none.
 //!
-//! The fronts are those of the Cholesky factorisation, and most are positive definite here as well: nested dissection
-//! eliminates small parts first, held by their neighbours, whose lowest eigenvalues are far above the body's. A front's
-//! diagonal block that is not goes through Bunch and Kaufman's pivots of one and two columns. Rows are not moved out
-//! of their block, so pivots may be small and what is subtracted large. How large is known afterwards: row i of the
-//! factors has the square `A_ii + 2 (its part in negative pivots)`, and rounding moves the matrix by so much times the
-//! machine's precision. [`Count::blur`] is what that means for an eigenvalue. A count whose blur is too large is not used.
+//! The fronts are those of the Cholesky factorisation, and most are positive definite here as well:
+//! nested dissection eliminates small parts first, held by their neighbours, whose lowest
+//! eigenvalues are far above the body's. A front's diagonal block that is not goes through Bunch
+//! and Kaufman's pivots of one and two columns. Rows are not moved out of their block, so pivots
+//! may be small and what is subtracted large. How large is known afterwards: row i of the factors
+//! has the square `A_ii + 2 (its part in negative pivots)`, and rounding moves the matrix by so
+//! much times the machine's precision. [`Count::blur`] is what that means for an eigenvalue. A
+//! count whose blur is too large is not used.
 
 use faer::diag::Diag;
 use faer::dyn_stack::{MemBuffer, MemStack};
@@ -20,7 +23,8 @@ use crate::factor::{STRIP, assemble_front, subtract_product};
 use crate::sparse::BlockCsr;
 use crate::symbolic::{ROOT, Supernode, Symbolic};
 
-/// Sums of many terms round more than once. Counts were seen to be wrong no farther from an eigenvalue than this says.
+/// Sums of many terms round more than once. Counts were seen to be wrong no farther from an
+/// eigenvalue than this says.
 const ROUNDINGS: f64 = 32.0;
 
 /// The eigenvalues below a shift.
@@ -82,9 +86,9 @@ impl Count {
         }
     }
 
-    /// How far, as a share of `shift`, rounding may have moved the eigenvalues: to first order by `phi^T E phi` of
-    /// an M-normalised mode, and the entries of E are `sqrt(squares_i squares_j)` times the precision. `modes` are
-    /// `width` of them; the largest counts.
+    /// How far, as a share of `shift`, rounding may have moved the eigenvalues: to first order by
+    /// `phi^T E phi` of an M-normalised mode, and the entries of E are `sqrt(squares_i squares_j)`
+    /// times the precision. `modes` are `width` of them; the largest counts.
     pub(crate) fn blur(&self, modes: &[f64], width: usize, shift: f64) -> f64 {
         let mut sums = vec![0.0; width];
         for (row, square) in modes.chunks_exact(width).zip(&self.squares) {
@@ -127,7 +131,8 @@ fn front(
     Ok(if supernode.parent == ROOT { Vec::new() } else { update })
 }
 
-/// As `factor_front`, with columns of `L |D|^1/2` in place of those of L, and the signs of D in the products.
+/// As `factor_front`, with columns of `L |D|^1/2` in place of those of L, and the signs of D in the
+/// products.
 fn eliminate(
     supernode: &Supernode,
     block: &mut [f64],
@@ -235,7 +240,8 @@ fn signed(columns: MatRef<'_, f64>, negative: &[bool]) -> Option<Mat<f64>> {
 struct Pivots {
     /// Row i of the permuted block is row `permutation[i]` of the block.
     permutation: Vec<usize>,
-    /// Of the first column of each pivot: does the next one belong to it, and cosine and sine of its Q?
+    /// Of the first column of each pivot: does the next one belong to it, and cosine and sine of
+    /// its Q?
     turn: Vec<Option<(f64, f64)>>,
     /// Eigenvalues of D.
     values: Vec<f64>,
@@ -266,7 +272,8 @@ impl Pivots {
                 values.push(a);
                 continue;
             }
-            // The larger eigenvalue by its size first, the other from the determinant: no digits are lost.
+            // The larger eigenvalue by its size first, the other from the determinant: no digits
+            // are lost.
             let d = block[(j + 1, j + 1)];
             let (middle, half) = (0.5 * (a + d), 0.5 * (a - d));
             let radius = half.hypot(b);

@@ -4,7 +4,8 @@ use crate::factor::tests::bar;
 use crate::lanczos;
 use crate::solver::Solver;
 
-/// A relative distance from an eigenvalue at which counts were seen to be right, and the blur that was told there.
+/// A relative distance from an eigenvalue at which counts were seen to be right, and the blur that
+/// was told there.
 fn margins(cells: [usize; 3], element: Element, average: bool) -> Vec<(usize, f64, f64)> {
     let (_, matrix, symbolic) = bar(cells, element, average);
     let solver = Solver::new(&matrix, symbolic, None).unwrap();
@@ -57,7 +58,8 @@ fn numbers(seed: u64) -> impl FnMut() -> f64 {
     }
 }
 
-/// Shifts anywhere in the spectrum, where half of the pivots are negative and fronts are indefinite from the first on.
+/// Shifts anywhere in the spectrum, where half of the pivots are negative and fronts are indefinite
+/// from the first on.
 #[test]
 fn counts_are_those_of_all_eigenvalues() {
     for (cells, element, average) in [
