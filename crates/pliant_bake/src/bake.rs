@@ -8,7 +8,7 @@ use pliant_modal::{BakeInfo, ModalModel, ModelParts};
 use crate::blocks::{self, Tall};
 use crate::element::Element;
 use crate::fem::{ANCHORED, FeMesh, LOCKING_POISSON, Law, Lists};
-use crate::lanczos::{self, Modes, NoConvergence};
+use crate::lanczos::{self, Failure, Modes};
 use crate::ordering;
 use crate::rigid::MassProperties;
 use crate::solver::Solver;
@@ -82,7 +82,7 @@ pub fn bake(
 
     progress(Stage::Modes, 0.0);
     let mut modes = lanczos::lowest(&solver, config.modes, &mut |share| progress(Stage::Modes, share))
-        .map_err(|NoConvergence| BakeError::NoConvergence)?;
+        .map_err(no_modes)?;
     canonical::settle(&mut modes, &matrix, &number);
     let (residual_max, orthonormality_max) = accuracy(&matrix, &modes);
     check_accuracy("|K phi - lambda M phi| / |K phi|", residual_max, RESIDUAL_LIMIT)?;
@@ -133,6 +133,17 @@ pub fn bake(
     times.total = times.assemble + times.factor + times.modes + times.surface;
     progress(Stage::Surface, 1.0);
     Ok(Bake { model, times })
+}
+
+fn no_modes(failure: Failure) -> BakeError {
+    let hertz = |lambda: f64| lambda.sqrt() / std::f64::consts::TAU;
+    match failure {
+        Failure::NoConvergence => BakeError::NoConvergence,
+        Failure::Missed { lambda, modes, found } => {
+            BakeError::MissedModes { modes, found, hertz: hertz(lambda) }
+        }
+        Failure::Uncounted { lambda } => BakeError::UncountedModes { hertz: hertz(lambda) },
+    }
 }
 
 struct Clock(Instant);

@@ -12,7 +12,7 @@ use pliant_modal::{Damping, FORMAT_VERSION, ModalModel};
 use crate::{Bake, BakeConfig, BakeError, BakeTimes, Stage, bake};
 
 /// Version of the method: part of every key. Whoever changes what a bake of the same input comes out as raises it.
-pub const METHOD_VERSION: u32 = 4;
+pub const METHOD_VERSION: u32 = 5;
 
 /// A writer that was killed leaves its unfinished file; after so long nobody is writing it any more.
 const ABANDONED: Duration = Duration::from_secs(3600);

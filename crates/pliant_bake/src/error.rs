@@ -112,6 +112,22 @@ pub enum BakeError {
     /// The eigensolver gave up.
     #[error("the modes did not converge")]
     NoConvergence,
+    /// The eigensolver has missed modes, and did not find them in several rounds either.
+    #[error("the modes: there are {modes} below {hertz} Hz, and {found} were found")]
+    MissedModes {
+        /// How many there are.
+        modes: usize,
+        /// How many of them were found.
+        found: usize,
+        /// Below which frequency, Hz.
+        hertz: f64,
+    },
+    /// Rounding hides whether the eigensolver has missed modes.
+    #[error("the modes up to {hertz} Hz cannot be counted: the mesh is too ill-shaped for these modes")]
+    UncountedModes {
+        /// The frequency of the last mode, Hz.
+        hertz: f64,
+    },
     /// The modes are not as accurate as every bake must be.
     #[error("{what} is {got:e}: expected at most {expected:e}; the mesh is too ill-shaped for these modes")]
     Inaccurate {

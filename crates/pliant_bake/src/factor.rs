@@ -16,7 +16,7 @@ use crate::sparse::BlockCsr;
 use crate::symbolic::{ROOT, Supernode, Symbolic};
 
 /// Columns per strip and panel of dense work.
-const STRIP: usize = 128;
+pub(crate) const STRIP: usize = 128;
 
 /// Rows per strip of a tall product.
 const TALL_STRIP: usize = 512;
@@ -339,6 +339,25 @@ fn front(
     spare: &mut Vec<Vec<f64>>,
 ) -> Result<Vec<f64>, NotPositive> {
     let supernode = &symbolic.supernodes[s];
+    let mut update = assemble_front(symbolic, s, block, matrix, 0.0, springs, children, spare);
+    factor_front(block, &mut update, supernode.width(), supernode.below())
+        .map_err(|dof| NotPositive { node: supernode.first + dof / 3 })?;
+    Ok(if supernode.parent == ROOT { Vec::new() } else { update })
+}
+
+/// One front of `K - shift M` with what its children have left for it, in `block` and the update
+/// matrix.
+pub(crate) fn assemble_front(
+    symbolic: &Symbolic,
+    s: usize,
+    block: &mut [f64],
+    matrix: &BlockCsr,
+    shift: f64,
+    springs: &[(usize, f64)],
+    children: Vec<(usize, Vec<f64>)>,
+    spare: &mut Vec<Vec<f64>>,
+) -> Vec<f64> {
+    let supernode = &symbolic.supernodes[s];
     let (width, below) = (supernode.width(), supernode.below());
     let height = width + below;
     let end = supernode.first + supernode.columns;
@@ -366,6 +385,12 @@ fn front(
                     block[(column + l) * height + row + m] += k[3 * l + m];
                 }
             }
+            if shift != 0.0 {
+                let mass = shift * matrix.mass[at];
+                for l in 0..3 {
+                    block[(column + l) * height + row + l] -= mass;
+                }
+            }
         }
     }
     for &(dof, spring) in springs {
@@ -383,9 +408,7 @@ fn front(
     }
     // The largest is taken first.
     spare.sort_by_key(Vec::capacity);
-    factor_front(block, &mut update, width, below)
-        .map_err(|dof| NotPositive { node: supernode.first + dof / 3 })?;
-    Ok(if supernode.parent == ROOT { Vec::new() } else { update })
+    update
 }
 
 /// Adds a child's update matrix to its parent's front.
@@ -465,7 +488,8 @@ fn factor_front(block: &mut [f64], update: &mut [f64], width: usize, below: usiz
                 let first = index * STRIP;
                 let columns = strip.len() / height;
                 let strip = MatMut::from_column_major_slice_mut(strip, height, columns);
-                subtract_product(strip.split_at_row_mut(end + first).1, under.subrows(first, rows - first));
+                let lower = under.subrows(first, rows - first);
+                subtract_product(strip.split_at_row_mut(end + first).1, lower, lower.subrows(0, columns));
             },
         );
     }
@@ -475,14 +499,16 @@ fn factor_front(block: &mut [f64], update: &mut [f64], width: usize, below: usiz
             let first = index * STRIP;
             let columns = strip.len() / below;
             let strip = MatMut::from_column_major_slice_mut(strip, below, columns);
-            subtract_product(strip.split_at_row_mut(first).1, bottom.subrows(first, below - first));
+            let lower = bottom.subrows(first, below - first);
+            subtract_product(strip.split_at_row_mut(first).1, lower, lower.subrows(0, columns));
         });
     }
     Ok(())
 }
 
-/// `strip -= lower lower[..columns]^T`, on and below the diagonal only.
-fn subtract_product(strip: MatMut<'_, f64>, lower: MatRef<'_, f64>) {
+/// `strip -= lower right^T`, on and below the diagonal only. The product is symmetric there:
+/// `right` is the head of `lower`, its columns perhaps with other signs.
+pub(crate) fn subtract_product(strip: MatMut<'_, f64>, lower: MatRef<'_, f64>, right: MatRef<'_, f64>) {
     let columns = strip.ncols();
     let (on, under) = strip.split_at_row_mut(columns);
     let (head, tail) = lower.split_at_row(columns);
@@ -492,12 +518,12 @@ fn subtract_product(strip: MatMut<'_, f64>, lower: MatRef<'_, f64>) {
         Accum::Add,
         head,
         BlockStructure::Rectangular,
-        head.transpose(),
+        right.transpose(),
         BlockStructure::Rectangular,
         -1.0,
         Par::Seq,
     );
-    matmul(under, Accum::Add, tail, head.transpose(), -1.0, Par::Seq);
+    matmul(under, Accum::Add, tail, right.transpose(), -1.0, Par::Seq);
 }
 
 #[cfg(test)]

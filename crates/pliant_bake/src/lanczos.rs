@@ -3,14 +3,30 @@
 //!
 //! The operator is `K^-1 M`, whose largest eigenvalues are `1 / lambda`. For a free body K is singular: `K^-1` is the
 //! inertia-relief pseudo-inverse of [`Solver`], and the rigid modes are deflated, so only elastic modes come out.
+//!
+//! A block of eight vectors knows eight directions of an eigenspace; more come in only by rounding,
+//! if in time. Converged modes are therefore counted against the inertia of `K - mu M`
+//! (`sturm.rs`), and where some are missing the block gets random vectors for them and the
+//! iteration goes on. Bodies that lack none come out as they would without.
 
 use faer::Mat;
 
 use crate::blocks::{self, Tall};
 use crate::solver::Solver;
+use crate::sturm::Count;
 
 /// Stop when every wanted Ritz pair has this residual, relative to its own eigenvalue, in the M-norm.
 const TOLERANCE: f64 = 4e-9;
+
+/// The modes are counted up to this share below the last one. What is nearer to it than that, or to
+/// others that are, is as good as it.
+const NEAR: f64 = 1e-6;
+
+/// Where rounding asks for more than [`NEAR`], up to this.
+const FAR: f64 = 1e-2;
+
+/// How often missing modes are looked for.
+const ROUNDS: usize = 8;
 
 /// Problems of at most this many degrees of freedom, or of fewer than three for each wanted mode, are solved densely.
 const DENSE: usize = 300;
@@ -22,22 +38,39 @@ pub(crate) struct Modes {
     pub(crate) phi: Vec<f64>,
 }
 
-/// The iteration did not converge, or a small eigenproblem failed.
+/// Why there are no modes.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub(crate) enum Failure {
+    /// The iteration did not converge, or a small eigenproblem failed.
+    NoConvergence,
+    /// Modes are missing below `lambda`, and the iteration did not find them.
+    Missed { lambda: f64, modes: usize, found: usize },
+    /// Whether modes are missing below `lambda` cannot be told in floating point arithmetic.
+    Uncounted { lambda: f64 },
+}
+
+/// A number of elastic modes below a place.
 #[derive(Clone, Copy, Debug)]
-pub(crate) struct NoConvergence;
+struct Below {
+    lambda: f64,
+    modes: usize,
+    found: usize,
+}
 
 /// The `wanted` lowest elastic modes. `report` hears how far the iteration is, 0 to 1.
-pub(crate) fn lowest(
-    solver: &Solver,
-    wanted: usize,
-    report: &mut dyn FnMut(f64),
-) -> Result<Modes, NoConvergence> {
+pub(crate) fn lowest(solver: &Solver, wanted: usize, report: &mut dyn FnMut(f64)) -> Result<Modes, Failure> {
     let n = solver.dofs();
     if n <= DENSE || n < 3 * wanted + 6 {
         return dense(solver, wanted);
     }
     let ritz = Lanczos::new(solver, wanted).run(report)?;
     polish(solver, &ritz, wanted)
+}
+
+impl Below {
+    fn missed(self) -> Failure {
+        Failure::Missed { lambda: self.lambda, modes: self.modes, found: self.found }
+    }
 }
 
 struct Lanczos<'a> {
@@ -92,12 +125,17 @@ impl<'a> Lanczos<'a> {
         }
     }
 
-    fn run(mut self, report: &mut dyn FnMut(f64)) -> Result<Ritz, NoConvergence> {
+    fn run(mut self, report: &mut dyn FnMut(f64)) -> Result<Ritz, Failure> {
         // Each restart improves; a hundred expansions of the space per mode means that something is wrong.
         let most_blocks = 100 + 100 * self.wanted / self.width.max(1);
         self.start()?;
         let mut check_at = 3 * self.wanted;
-        for _ in 0..most_blocks {
+        // What the last count has missed.
+        let mut missed: Option<Below> = None;
+        let mut rounds = 0;
+        let mut blocks = 0;
+        while blocks < most_blocks {
+            blocks += 1;
             let remainder = self.expand()?;
             let full = self.done + self.width > self.stride;
             if self.done < check_at.min(self.stride - self.width) && !full {
@@ -107,26 +145,120 @@ impl<'a> Lanczos<'a> {
             let (values, vectors) = self.ritz()?;
             let converged = self.converged(&values, &vectors, &remainder);
             // The small eigenproblem is not free: look less often while most pairs are still far off.
-            let blocks = if 4 * converged < self.wanted { 3 } else { 1 };
-            check_at = self.done + blocks * self.width;
+            let ahead = if 4 * converged < self.wanted { 3 } else { 1 };
+            check_at = self.done + ahead * self.width;
             report(0.7 + 0.3 * converged as f64 / self.wanted as f64);
-            if converged >= self.wanted {
-                return Ok(self.finish(&values, &vectors, &remainder));
+            // Ritz values come up from below the operator's: those that were missed are not to be
+            // expected at once.
+            let appeared = missed.is_none_or(|below| {
+                let last = below.modes.min(self.wanted) - 1;
+                values[last] * below.lambda * (1.0 + 0.5 * NEAR) >= 1.0
+            });
+            if converged >= self.wanted && appeared {
+                let ritz = self.finish(&values, &vectors, &remainder);
+                let below = self.count(&values, &ritz)?;
+                if below.modes == below.found {
+                    return Ok(ritz);
+                }
+                if rounds == ROUNDS {
+                    return Err(below.missed());
+                }
+                (rounds, blocks, missed) = (rounds + 1, 0, Some(below));
+                self.widen(&values, &vectors, below.modes - below.found)?;
+                check_at = self.done + 2 * self.width;
+                continue;
             }
             if full {
-                let keep = (self.wanted + self.width + (self.stride - self.wanted) / 4)
-                    .min(self.stride.saturating_sub(2 * self.width));
-                if keep < self.wanted {
-                    return Err(NoConvergence);
-                }
+                let keep = self.keep(self.width)?;
                 self.restart(&values, &vectors, keep);
             }
         }
-        Err(NoConvergence)
+        Err(missed.map_or(Failure::NoConvergence, |below| below.missed()))
     }
 
-    fn start(&mut self) -> Result<(), NoConvergence> {
-        let mut block = vec![0.0; self.solver.dofs() * self.width];
+    /// How many Ritz vectors a restart keeps, with room for two blocks of that width.
+    fn keep(&self, width: usize) -> Result<usize, Failure> {
+        let keep = (self.wanted + width + (self.stride - self.wanted) / 4)
+            .min(self.stride.saturating_sub(2 * width))
+            .min(self.done);
+        if keep < self.wanted { Err(Failure::NoConvergence) } else { Ok(keep) }
+    }
+
+    /// How many elastic modes there are below the last wanted one, and those that are as good as
+    /// it, and how many of them are found. Counting just below needs no gap above: a cluster may go
+    /// on past the wanted modes.
+    fn count(&self, values: &[f64], ritz: &Ritz) -> Result<Below, Failure> {
+        let rigid = if self.solver.rigid.is_some() { 6 } else { 0 };
+        let lambda = |mode: usize| 1.0 / values[mode];
+        let mut near = NEAR;
+        for _ in 0..4 {
+            let mut found = self.wanted - 1;
+            while found > 0 && lambda(found - 1) >= (1.0 - 2.0 * near) * lambda(found) {
+                found -= 1;
+            }
+            let shift = (1.0 - near) * lambda(found);
+            let counted = Count::new(&self.solver.factor.symbolic, self.solver.matrix, shift);
+            let blur =
+                counted.as_ref().map_or(f64::INFINITY, |count| count.blur(&ritz.vectors, self.wanted, shift));
+            if let Ok(count) = counted
+                && blur <= near
+                && count.below >= rigid + found
+            {
+                return Ok(Below { lambda: shift, modes: count.below - rigid, found });
+            }
+            // Another place has other pivots; less than is there was counted only if rounding is
+            // worse than thought.
+            near = if blur.is_finite() { (2.0 * near).max(4.0 * blur) } else { 2.0 * near };
+            if near > FAR {
+                break;
+            }
+        }
+        Err(Failure::Uncounted { lambda: lambda(self.wanted - 1) })
+    }
+
+    /// Restarts with random vectors added to the next block, for eigenvectors that the space so far
+    /// knows nothing of. What the operator makes of the kept ones is in the next block's old part,
+    /// as in any restart.
+    fn widen(&mut self, values: &[f64], vectors: &Mat<f64>, missing: usize) -> Result<(), Failure> {
+        // Two blocks and the wanted vectors must have room, and no more copies are wanted than
+        // modes.
+        let room = ((self.stride - self.wanted) / 2).saturating_sub(self.width);
+        let fresh = missing.min(self.wanted).max(8).min(room);
+        if fresh == 0 {
+            return Err(Failure::NoConvergence);
+        }
+        let keep = self.keep(self.width + fresh)?;
+        self.restart(values, vectors, keep);
+        let mut block = self.random(fresh);
+        // Against the next block, too: for so long it belongs to the basis.
+        blocks::put(&mut self.basis, self.stride, self.done, &self.next, self.width);
+        self.done += self.width;
+        self.orthogonalise(&mut block, fresh, 0);
+        self.done -= self.width;
+        let (block, Remainder { width: fresh, .. }) =
+            normalise(self.solver, block, fresh).ok_or(Failure::NoConvergence)?;
+        let width = self.width + fresh;
+        let mut next = vec![0.0; self.solver.dofs() * width];
+        blocks::put(&mut next, width, 0, &self.next, self.width);
+        if fresh > 0 {
+            blocks::put(&mut next, width, self.width, &block, fresh);
+        }
+        (self.next, self.width) = (next, width);
+        Ok(())
+    }
+
+    fn start(&mut self) -> Result<(), Failure> {
+        let mut block = self.random(self.width);
+        self.orthogonalise(&mut block, self.width, 0);
+        let (next, remainder) = normalise(self.solver, block, self.width).ok_or(Failure::NoConvergence)?;
+        self.next = next;
+        self.width = remainder.width;
+        if self.width == 0 { Err(Failure::NoConvergence) } else { Ok(()) }
+    }
+
+    /// Random vectors without rigid motion.
+    fn random(&mut self, width: usize) -> Vec<f64> {
+        let mut block = vec![0.0; self.solver.dofs() * width];
         for x in &mut block {
             // splitmix64: the same start in every run.
             self.seed = self.seed.wrapping_add(0x9E37_79B9_7F4A_7C15);
@@ -136,16 +268,12 @@ impl<'a> Lanczos<'a> {
             z ^= z >> 31;
             *x = (z >> 11) as f64 / (1u64 << 53) as f64 - 0.5;
         }
-        self.solver.remove_rigid(&mut block, self.width);
-        self.orthogonalise(&mut block, self.width, 0);
-        let (next, remainder) = normalise(self.solver, block, self.width).ok_or(NoConvergence)?;
-        self.next = next;
-        self.width = remainder.width;
-        if self.width == 0 { Err(NoConvergence) } else { Ok(()) }
+        self.solver.remove_rigid(&mut block, width);
+        block
     }
 
     /// Takes the next block into the basis, applies the operator to it and orthogonalises the image.
-    fn expand(&mut self) -> Result<Remainder, NoConvergence> {
+    fn expand(&mut self) -> Result<Remainder, Failure> {
         let width = self.width;
         let at = self.done;
         blocks::put(&mut self.basis, self.stride, at, &self.next, width);
@@ -168,9 +296,9 @@ impl<'a> Lanczos<'a> {
             }
         }
         if !scale.is_finite() {
-            return Err(NoConvergence);
+            return Err(Failure::NoConvergence);
         }
-        let (next, remainder) = normalise(self.solver, image, width).ok_or(NoConvergence)?;
+        let (next, remainder) = normalise(self.solver, image, width).ok_or(Failure::NoConvergence)?;
         if remainder.width == 0 {
             // The space is invariant: go on with new directions.
             self.width = width;
@@ -204,9 +332,9 @@ impl<'a> Lanczos<'a> {
     }
 
     /// Ritz values, descending, and their vectors in basis coordinates.
-    fn ritz(&self) -> Result<(Vec<f64>, Mat<f64>), NoConvergence> {
+    fn ritz(&self) -> Result<(Vec<f64>, Mat<f64>), Failure> {
         let projected = self.projected.as_ref().submatrix(0, 0, self.done, self.done);
-        let (mut values, vectors) = blocks::symmetric_eigen(projected).ok_or(NoConvergence)?;
+        let (mut values, vectors) = blocks::symmetric_eigen(projected).ok_or(Failure::NoConvergence)?;
         values.reverse();
         let vectors = Mat::from_fn(self.done, self.done, |i, j| vectors[(i, self.done - 1 - j)]);
         Ok((values, vectors))
@@ -289,7 +417,7 @@ fn normalise(solver: &Solver, mut block: Vec<f64>, width: usize) -> Option<(Vec<
 
 /// One step of inverse subspace iteration, `x = K^-1 M phi`, and Rayleigh-Ritz. It damps what is left of the high modes,
 /// which the stiffness would blow up in the residual `K phi - lambda M phi`. The iteration knows `x` already.
-fn polish(solver: &Solver, ritz: &Ritz, wanted: usize) -> Result<Modes, NoConvergence> {
+fn polish(solver: &Solver, ritz: &Ritz, wanted: usize) -> Result<Modes, Failure> {
     let mut loads = vec![0.0; ritz.vectors.len()];
     solver.matrix.mass_times(&ritz.vectors, wanted, &mut loads);
     let x = &ritz.images;
@@ -299,7 +427,7 @@ fn polish(solver: &Solver, ritz: &Ritz, wanted: usize) -> Result<Modes, NoConver
     let mut mass_x = vec![0.0; x.len()];
     solver.matrix.mass_times(x, wanted, &mut mass_x);
     let mass = blocks::gram(tall, Tall::new(&mass_x, wanted));
-    let (lambda, turn) = generalised(stiffness, mass).ok_or(NoConvergence)?;
+    let (lambda, turn) = generalised(stiffness, mass).ok_or(Failure::NoConvergence)?;
     Ok(Modes { lambda, phi: blocks::product(tall, turn.as_ref()) })
 }
 
@@ -323,7 +451,7 @@ fn generalised(a: Mat<f64>, b: Mat<f64>) -> Option<(Vec<f64>, Mat<f64>)> {
 }
 
 /// All modes of a small problem, the lowest elastic ones kept: the rigid modes of a free body come first and go.
-fn dense(solver: &Solver, wanted: usize) -> Result<Modes, NoConvergence> {
+fn dense(solver: &Solver, wanted: usize) -> Result<Modes, Failure> {
     let n = solver.dofs();
     let mut identity = vec![0.0; n * n];
     identity.iter_mut().step_by(n + 1).for_each(|x| *x = 1.0);
@@ -332,7 +460,7 @@ fn dense(solver: &Solver, wanted: usize) -> Result<Modes, NoConvergence> {
     solver.matrix.mass_times(&identity, n, &mut m);
     let stiffness = Mat::from_fn(n, n, |i, j| k[i * n + j]);
     let mass = Mat::from_fn(n, n, |i, j| m[i * n + j]);
-    let (lambda, y) = generalised(stiffness, mass).ok_or(NoConvergence)?;
+    let (lambda, y) = generalised(stiffness, mass).ok_or(Failure::NoConvergence)?;
     let skip = if solver.rigid.is_some() { 6 } else { 0 };
     let mut phi = Vec::with_capacity(n * wanted);
     for i in 0..n {

@@ -6,7 +6,7 @@
 //!    incompressibility (Poisson ratio above 0.45) the pressure is averaged over nodes, so that nothing locks;
 //! 2. nested dissection by coordinate bisection and a multifrontal Cholesky factorisation (dense work by faer);
 //! 3. shift-invert block Lanczos with the M-inner product, full reorthogonalisation and thick restart; a body without
-//!    anchors keeps its six rigid modes out analytically;
+//!    anchors keeps its six rigid modes out analytically; a Sturm count makes sure that none is missed;
 //! 4. what a body needs at its surface: mode shapes and their rotations at the vertices, gravity's participation, mass
 //!    properties, damping, and the *residual flexibility* of patches: what the kept modes leave out of the
 //!    compliance that a hand feels.
@@ -48,6 +48,7 @@ mod ordering;
 mod rigid;
 mod solver;
 mod sparse;
+mod sturm;
 mod support;
 mod surface;
 mod symbolic;

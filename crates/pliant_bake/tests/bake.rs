@@ -48,6 +48,27 @@ fn the_same_bits_whatever_the_threads() {
     }
 }
 
+/// Thirty-two equal bars: every mode of one bar comes 32 times, and the lowest twenty are all its lowest.
+#[test]
+fn equal_parts_have_equal_modes_all_of_them() {
+    let one = shapes::bar([4, 1, 1], [1.0, 0.25, 0.25]).unwrap();
+    let mut many = TetMesh::default();
+    for copy in 0..32 {
+        let first = many.nodes.len() as u32;
+        many.nodes.extend(one.nodes.iter().map(|&[x, y, z]| [x, y + f64::from(copy), z]));
+        many.tets.extend(one.tets.iter().map(|tet| tet.map(|node| first + node)));
+    }
+    let config = BakeConfig { modes: 20, anchors: anchor("x<0.001"), ..BakeConfig::default() };
+    let lowest = run(&one, &config).unwrap().model.omega()[0];
+    let first = run(&many, &config).unwrap().model;
+    for omega in first.omega() {
+        assert!((omega / lowest - 1.0).abs() < 1e-9, "{omega} {lowest}");
+    }
+    let pool = rayon::ThreadPoolBuilder::new().num_threads(1).build().unwrap();
+    let again = pool.install(|| run(&many, &config).unwrap().model);
+    assert_eq!(first.hash(), again.hash());
+}
+
 #[test]
 fn mass_properties_are_those_of_the_bar() {
     let config = BakeConfig { modes: 4, density: 500.0, ..BakeConfig::default() };
