@@ -176,7 +176,7 @@ impl Body {
         &self.state.a
     }
 
-    /// Modal flows, kg^1/2 m; empty where the material does not relax. See [`Relaxation`].
+    /// Modal flows, kg^1/2 m; empty where the material does not relax. See [`Relaxation`](crate::Relaxation).
     pub fn z(&self) -> &[f64] {
         &self.state.z
     }
@@ -304,7 +304,7 @@ impl Body {
     }
 
     /// The compliance of a grab within one step (3x3, m/N, body axes): residual flexibility of the patch plus the hand's own spring. Where
-    /// the material relaxes, the first is multiplied by [`Relaxation::creep`] of one step.
+    /// the material relaxes, the first is multiplied by [`Relaxation::creep`](crate::Relaxation::creep) of one step.
     ///
     /// # Errors
     /// No such grab.
