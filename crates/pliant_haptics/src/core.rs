@@ -5,7 +5,7 @@ use thiserror::Error;
 
 use crate::{
     Coupling, CouplingConfig, DeviceInfo, Fault, InfoError, LocalModel, ModalLocal, Port, Safety,
-    SafetyConfig, Sample, StaleConfig, ToolMap, Wanted, Wrench,
+    SafetyConfig, Sample, ToolMap, Wanted, Wrench,
     held::{Change, Felt, Held, When},
     intake::{Believed, Intake},
     safety::{Slew, clamp_magnitude},
@@ -298,7 +298,6 @@ impl LoopCore {
         }
         let holding = self.good && self.heard > 0 && model.count > 0;
         let silent = if holding { (now - self.heard_at).max(0.0) } else { 0.0 };
-        let silent = StaleConfig::counted(silent, model.interval);
 
         let felt = if holding {
             let when = When { now, dt, period: 1.0 / self.config.rate };
@@ -329,6 +328,7 @@ impl LoopCore {
             growing: felt.growing,
             holding,
             silent,
+            interval: model.interval,
             fault,
             stop: std::mem::take(&mut self.stop),
         });

@@ -116,7 +116,7 @@ pub struct ModelWriter {
     worked: f64,
     targets: Vec<(GrabId, Vector3<f64>)>,
     /// Potential energy of the body in gravity, J, as of the last word.
-    potential: Option<f64>,
+    potential: Option<(f64, [f64; 3])>,
     supplied: f64,
 }
 
@@ -267,9 +267,14 @@ impl ModelWriter {
         }
         self.targets.retain(|(known, _)| body.grabs().any(|id| id == *known));
         // Of an anchored body too: it bends under its own weight as a hand lifts and lowers it.
-        let potential = body.potential_energy();
-        work += self.potential.unwrap_or(potential) - potential;
-        self.potential = Some(potential);
+        let (potential, gravity) = (body.potential_energy(), body.config().settings.gravity);
+        // Gravity that changes is nobody's work here: what it makes of the height is counted from now on.
+        if let Some((before, under)) = self.potential
+            && under == gravity
+        {
+            work += before - potential;
+        }
+        self.potential = Some((potential, gravity));
         Ok(work)
     }
 }

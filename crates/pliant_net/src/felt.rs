@@ -1,7 +1,8 @@
 //! Where a held patch is on a shape that somebody else steps.
 
 use bevy::math::DVec3;
-use pliant_modal::{ModalModel, ModelError, Patch, warp};
+use pliant_body::Grab;
+use pliant_modal::{GrabConfig, ModalModel, ModelError, Patch, warp};
 
 /// The mean of a patch over its vertices, as a function of the modal coordinates.
 #[derive(Debug, Clone)]
@@ -48,4 +49,9 @@ impl PatchPoint {
         let bent = warp(sum(&self.rotation).into(), displacement.into());
         self.rest + DVec3::from(bent)
     }
+}
+
+/// A hand's own spring and damper.
+pub(crate) fn hold_of(grab: &Grab) -> GrabConfig {
+    GrabConfig { stiffness: grab.stiffness, relaxation: grab.relaxation }
 }

@@ -242,6 +242,52 @@ fn peers_that_have_lost_everybody_find_each_other_again_and_one_that_comes_late_
 }
 
 #[test]
+fn a_peer_that_steps_the_body_otherwise_is_not_let_in_and_is_told() {
+    let _alone = alone();
+    let (mut a, _) = peer("a", None);
+    run_until(&mut [&mut a], "the first begins", |apps| {
+        matches!(apps[0].world().resource::<NetPeer>().state(), PeerState::In { .. })
+    });
+    let (mut b, body) = peer("bb", Some(a.world().resource::<NetPeer>().invite()));
+    b.world_mut().get_mut::<ModalBody>(body).unwrap().settings.stiffness_scale = 2.0;
+    run_until(&mut [&mut a, &mut b], "it is told why", |apps| {
+        matches!(
+            apps[1].world().resource::<NetPeer>().state(),
+            PeerState::Closed { reason } if reason.contains("other bodies")
+        )
+    });
+    assert_eq!(users(&mut a), ["a"]);
+}
+
+#[test]
+fn a_hand_whose_spring_changes_is_felt_with_the_new_one_by_all() {
+    let _alone = alone();
+    let (mut a, body_a) = peer("a", None);
+    run_until(&mut [&mut a], "the first begins", |apps| {
+        matches!(apps[0].world().resource::<NetPeer>().state(), PeerState::In { .. })
+    });
+    let (mut b, body_b) = peer("bb", Some(a.world().resource::<NetPeer>().invite()));
+    run_until(&mut [&mut a, &mut b], "the second is in", |apps| users(apps[1]).len() == 2);
+    let place = a.world().get::<Transform>(body_a).unwrap().translation.as_dvec3();
+    let grab = Grab::new(TIP, 0.3, place + DVec3::new(0.9, 0.3, 0.0));
+    let hand = a.world_mut().spawn((grab, GrabOf(body_a))).id();
+    let pulled = |apps: &mut [&mut App]| {
+        let shapes = [q(apps[0], body_a), q(apps[1], body_b)];
+        agree(&shapes, 0.01)?;
+        must!(still(apps[0], body_a), "it still moves");
+        Ok(shapes[1][0].abs())
+    };
+    let firm = run_until(&mut [&mut a, &mut b], "a firm hand", pulled);
+    // A soft one gives way.
+    a.world_mut().get_mut::<Grab>(hand).unwrap().stiffness = Some(2.0);
+    run_until(&mut [&mut a, &mut b], "a soft hand", |apps| {
+        let soft = pulled(apps)?;
+        must!(soft < 0.5 * firm, "{soft} of {firm}");
+        Ok(())
+    });
+}
+
+#[test]
 fn a_peer_with_another_body_is_not_let_in() {
     let _alone = alone();
     let (mut a, _) = peer("a", None);

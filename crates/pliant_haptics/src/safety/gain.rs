@@ -119,7 +119,7 @@ impl Gain {
         config: &SafetyConfig,
         dt: f64,
         speed: f64,
-        silent: f64,
+        [silent, interval]: [f64; 2],
         fault: Option<Fault>,
         stop: bool,
     ) -> (f64, Option<Fault>) {
@@ -137,7 +137,7 @@ impl Gain {
             config.ramp.map_or(1.0, |ramp| (self.value + dt / ramp).min(1.0))
         };
         if let Some(stale) = &config.stale {
-            let allowed = stale.allows(silent);
+            let allowed = stale.allows(StaleConfig::counted(silent, interval));
             if allowed < 1.0 {
                 found = Some(Fault::Stale(silent));
             }

@@ -132,6 +132,8 @@ pub struct Wanted {
     pub holding: bool,
     /// Time since the simulation's last word, s.
     pub silent: f64,
+    /// How often it speaks, s.
+    pub interval: f64,
     /// Something is wrong with the sample or the model: fade.
     pub fault: Option<Fault>,
     /// Somebody pressed the emergency stop.
@@ -276,8 +278,8 @@ impl Safety {
             self.passivity = Passivity::new(self.config.passivity.unwrap_or_default());
         }
         self.slew.hold(&force);
-        let (gain, cut) =
-            self.gain.tick(&self.config, w.dt, w.velocity.norm(), w.silent, w.fault.or(fault), w.stop);
+        let (speed, silence) = (w.velocity.norm(), [w.silent, w.interval]);
+        let (gain, cut) = self.gain.tick(&self.config, w.dt, speed, silence, w.fault.or(fault), w.stop);
         fault = fault.or(cut);
         // Times zero a number may still be one with a sign.
         let felt = |f: Vector3<f64>| if gain > 0.0 { f * gain } else { zero };

@@ -21,6 +21,7 @@ fn wanted(force: f64) -> Wanted {
         growing: false,
         holding: true,
         silent: 0.0,
+        interval: 0.0,
         fault: None,
         stop: false,
     }

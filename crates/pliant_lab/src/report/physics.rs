@@ -378,7 +378,7 @@ pub(super) fn steps(quick: bool) -> Result<Vec<Figure>, LabError> {
             "reaction error, rms / rms",
             held,
             Some(held_own),
-            format!("The same bar dragged and held. {order} The exact step takes the hand's force as constant over a step: that is first order, and under a hand it is the least exact of the three at every step; the other two are second order."),
+            format!("The same bar dragged and held. {order} All three are of second order: the exact step tells the force at a step's end by those in the middle of this one and the last."),
         ),
         figure(
             "c-steps-held-shape",

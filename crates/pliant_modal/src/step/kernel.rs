@@ -467,9 +467,9 @@ impl Kernel {
                 ..Solving::default()
             };
             if let Hold::Target { target, velocity, config } = hand.hold {
-                // Targets may teleport: a hand that is a body's length away from where its patch belongs
-                // pulls no harder than from there.
-                let reach = self.model.size();
+                // Targets may teleport. No patch of an anchored body gets farther from its rest than two
+                // lengths of it, so a hand beyond that pulls no harder than from there.
+                let reach = 2.0 * self.model.size();
                 let rest = self.before.frame.to_world(hand.patch.rest());
                 let way = target - rest;
                 solving.target = rest + way.cap_magnitude(reach);

@@ -2,7 +2,7 @@
 
 use serde::{Deserialize, Serialize};
 
-use crate::{Integrator, ModalModel, Relaxation, StepError, error::finite};
+use crate::{Integrator, ModalModel, Relaxation, StepError};
 
 /// How a body is stepped: everything that the host, its guests and peers have to agree on, besides
 /// the model and the length of a step.
@@ -21,11 +21,11 @@ pub struct StepSettings {
     /// grows when it turns. Default: `true`.
     pub warp: bool,
     /// Newton corrections of the hands in one step, 1 to [`StepSettings::MOST_CORRECTIONS`]. They
-    /// only matter under warp and on a free body. Default: 2.
+    /// only matter under warp. Default: 2.
     pub corrections: u8,
-    /// Uniform acceleration, m/s^2, world axes. Default: none.
+    /// Uniform acceleration, m/s^2, world axes, each at most 1e9. Default: none.
     pub gravity: [f64; 3],
-    /// Factor on all damping coefficients, 0 or more. Default: 1.
+    /// Factor on all damping coefficients, 0 to 1e6. Default: 1.
     pub damping_scale: f64,
     /// Factor on the material's stiffness, 1e-6 to 1e6: the body as it would be with so many times
     /// the baked Young's modulus. Frequencies go with its root, compliances (those of held patches,
@@ -61,12 +61,7 @@ impl StepSettings {
     /// [`StepError::Input`] with the value that is not finite or not in its range.
     pub fn check(&self) -> Result<(), StepError> {
         let Self { damping_scale: damping, stiffness_scale: stiffness, .. } = *self;
-        StepError::check(
-            "damping_scale",
-            "finite, 0 or more",
-            damping.is_finite() && damping >= 0.0,
-            damping,
-        )?;
+        StepError::check("damping_scale", "0 to 1e6", (0.0..=1e6).contains(&damping), damping)?;
         let sound = (1e-6..=1e6).contains(&stiffness);
         StepError::check("stiffness_scale", "1e-6 to 1e6", sound, stiffness)?;
         let corrections = self.corrections;
@@ -78,7 +73,24 @@ impl StepSettings {
         if let Some(relaxation) = &self.relaxation {
             relaxation.check()?;
         }
-        finite("gravity", &self.gravity)
+        let beyond = self.gravity.iter().find(|x| x.is_nan() || x.abs() > 1e9);
+        StepError::check("gravity", "-1e9 to 1e9", beyond.is_none(), beyond.copied().unwrap_or(0.0))
+    }
+
+    /// The same bytes for the same settings, on every machine: for digests.
+    pub fn to_bytes(&self) -> Vec<u8> {
+        let Self { integrator, second_order, warp, corrections, gravity, .. } = *self;
+        let (kind, rho_inf) = match integrator {
+            Integrator::Exact => (0, 0.0),
+            Integrator::Newmark => (1, 0.0),
+            Integrator::GeneralizedAlpha { rho_inf } => (2, rho_inf),
+        };
+        let (ratio, time) = self.relaxation.map_or((0.0, 0.0), |r| (r.ratio, r.time));
+        let numbers = [rho_inf, self.damping_scale, self.stiffness_scale, ratio, time];
+        let mut out =
+            vec![kind, second_order.into(), warp.into(), corrections, self.relaxation.is_some().into()];
+        out.extend(numbers.iter().chain(&gravity).flat_map(|number| number.to_le_bytes()));
+        out
     }
 
     /// By how much more than the force over a step the force at its end counts, less that of the step

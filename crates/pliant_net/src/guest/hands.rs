@@ -9,7 +9,7 @@ use pliant_modal::GrabConfig;
 use pliant_stream::BodyId;
 
 use super::NetGuest;
-use crate::felt::PatchPoint;
+use crate::felt::{PatchPoint, hold_of};
 use crate::place::Place;
 use crate::seen::RemoteBody;
 
@@ -18,6 +18,7 @@ pub(super) struct SentGrab {
     pub(super) body: BodyId,
     vertex: u32,
     radius: f64,
+    hold: GrabConfig,
     /// As last said, in session coordinates, and how many ticks it has been said for.
     target: [f64; 3],
     times: u8,
@@ -41,7 +42,7 @@ pub(crate) fn send_hands(
     let Some(session) = guest.session.as_mut().filter(|session| session.user().is_some()) else { return };
     guest.grabs.retain(|&entity, sent| {
         let stays = grabs.get(entity).is_ok_and(|(_, grab, of)| {
-            let same = grab.vertex == sent.vertex && grab.radius == sent.radius;
+            let same = grab.vertex == sent.vertex && grab.radius == sent.radius && hold_of(grab) == sent.hold;
             same && bodies.get(of.0).is_ok_and(|(body, ..)| body.0 == sent.body)
         });
         if let (false, Some(number)) = (stays, sent.number) {
@@ -55,7 +56,7 @@ pub(crate) fn send_hands(
         let target = place.point_to_session(grab.target);
         match guest.grabs.get_mut(&entity) {
             None => {
-                let hold = GrabConfig { stiffness: grab.stiffness, relaxation: grab.relaxation };
+                let hold = hold_of(grab);
                 let begun = session.begin_grab(now, body.0, grab.vertex, grab.radius, target, hold);
                 if let Err(error) = &begun {
                     debug!("a grab was not sent: {error}");
@@ -65,6 +66,7 @@ pub(crate) fn send_hands(
                     body: body.0,
                     vertex: grab.vertex,
                     radius: grab.radius,
+                    hold,
                     target,
                     times: 0,
                     path: HandPath(VecDeque::from([(now, target)])),

@@ -149,7 +149,11 @@ impl NetGuest {
             return;
         }
         let may_come_back = match reason {
-            CloseReason::ByPeer { .. } | CloseReason::TimedOut | CloseReason::Failed { .. } => true,
+            // The goodbye that said so may have been lost on the way.
+            CloseReason::ByPeer { reason, .. } => {
+                !matches!(reason, EndReason::Refused | EndReason::Version | EndReason::Path)
+            }
+            CloseReason::TimedOut | CloseReason::Failed { .. } => true,
             // Who was in finds a place again when the house has sorted itself out.
             CloseReason::NoRoom => self.retry.was_in,
             // We have hung up on a host that had fallen silent.

@@ -302,7 +302,7 @@ impl NetPeer {
         let (endpoint, number) = self.way(peer);
         endpoint.close(number, reason, why);
         if let Some(session) = &mut self.session {
-            session.disconnect(peer, EndReason::Protocol);
+            session.disconnect(peer, reason);
         }
     }
 

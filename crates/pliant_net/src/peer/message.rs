@@ -20,7 +20,8 @@ pub(super) const MOST_BODIES: usize = 256;
 pub(super) const MOST_PEERS: usize = 64;
 const LONGEST_INVITE: usize = 512;
 
-/// What all peers must have alike: the step (ns) and the bodies, each with its model's hash.
+/// What all peers must have alike: the step (ns) and the bodies, each with the digest of its
+/// model and of how it is stepped.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub(super) struct Scene {
     pub(super) step_ns: u64,

@@ -309,7 +309,7 @@ impl NetPeer {
         }
         self.scene = Scene {
             step_ns: u64::try_from(step.as_nanos()).unwrap_or(0),
-            bodies: found.iter().map(|(&id, played)| (id, played.model.hash().0)).collect(),
+            bodies: found.iter().map(|(&id, played)| (id, played.digest())).collect(),
         };
         self.bodies = found;
         true

@@ -9,7 +9,7 @@ use pliant_modal::{Body, GrabConfig, ModalModel};
 use pliant_stream::{BodyId, GrabKey, Pose, StepSettings, UserId};
 
 use super::{NetPeer, PeerState};
-use crate::felt::PatchPoint;
+use crate::felt::{PatchPoint, hold_of};
 use crate::phase::Phase;
 use crate::place::{Place, set_pose};
 use crate::seen::{SeenHand, SeenHands};
@@ -26,6 +26,11 @@ pub(super) struct PlayedBody {
 }
 
 impl PlayedBody {
+    /// Digest of its model and of how it is stepped: all peers have the same.
+    pub(super) fn digest(&self) -> [u8; 32] {
+        pliant_stream::peer::digest(&self.model, &self.settings)
+    }
+
     pub(super) fn new(entity: Entity, model: Arc<ModalModel>, settings: StepSettings) -> Self {
         Self {
             entity,
@@ -42,13 +47,17 @@ impl PlayedBody {
 /// The settings that all peers step this body with: its own, with gravity in the axes that they step
 /// it in. Those of an anchored body are its own, wherever each of them puts it.
 pub(super) fn agreed_settings(body: &Body) -> StepSettings {
+    /// How fine gravity is, m/s^2: settings are compared, and a turn in single precision differs in its
+    /// last digits from machine to machine.
+    const FINE: f64 = 1e-3;
     let settings = body.config().settings;
-    if body.model().is_free() {
-        return settings;
+    let mut gravity = DVec3::from(settings.gravity);
+    if !body.model().is_free() {
+        gravity = DQuat::from_array(body.frame().orientation()).inverse() * gravity;
     }
-    let turned = DQuat::from_array(body.frame().orientation()).inverse() * DVec3::from(settings.gravity);
-    // Settings are compared by their bytes: a negative zero becomes zero.
-    StepSettings { gravity: (turned + DVec3::ZERO).into(), ..settings }
+    // A negative zero becomes zero.
+    let gravity = gravity.to_array().map(|x| (x / FINE).round() * FINE + 0.0);
+    StepSettings { gravity, ..settings }
 }
 
 /// An own grab as the session knows it.
@@ -56,6 +65,7 @@ pub(super) struct SaidGrab {
     body: BodyId,
     vertex: u32,
     radius: f64,
+    hold: GrabConfig,
     /// `None`: it was not taken.
     number: Option<u16>,
     point: Option<PatchPoint>,
@@ -77,7 +87,7 @@ pub(crate) fn tell_hands(
         |entity: Entity| net.bodies.iter().find(|(_, played)| played.entity == entity).map(|(&id, _)| id);
     net.grabs.retain(|&entity, said| {
         let stays = grabs.get(entity).is_ok_and(|(_, grab, of)| {
-            let same = grab.vertex == said.vertex && grab.radius == said.radius;
+            let same = grab.vertex == said.vertex && grab.radius == said.radius && hold_of(grab) == said.hold;
             same && number_of(of.0) == Some(said.body)
         });
         if let (false, Some(number)) = (stays, said.number) {
@@ -92,12 +102,12 @@ pub(crate) fn tell_hands(
         let moved = match net.grabs.get(&entity) {
             Some(said) => said.number.map(|number| session.set_target(number, target)).transpose(),
             None => {
-                let hold = GrabConfig { stiffness: grab.stiffness, relaxation: grab.relaxation };
+                let hold = hold_of(grab);
                 let begun = session.begin_grab(id, grab.vertex, grab.radius, target, hold);
                 let point = PatchPoint::new(state.model(), grab.vertex, grab.radius).ok();
                 let (vertex, radius) = (grab.vertex, grab.radius);
                 let number = begun.as_ref().ok().copied();
-                net.grabs.insert(entity, SaidGrab { body: id, vertex, radius, number, point });
+                net.grabs.insert(entity, SaidGrab { body: id, vertex, radius, hold, number, point });
                 begun.map(|_| None)
             }
         };

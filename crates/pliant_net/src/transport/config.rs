@@ -14,7 +14,7 @@ use super::identity::{AnyGuest, Identity, PinnedHost};
 use super::invite::Token;
 
 /// The application protocol and its version, negotiated in the handshake: another version is refused there.
-pub const ALPN: &[u8] = b"pliant/1";
+pub const ALPN: &[u8] = b"pliant/2";
 
 /// What a user may do.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Hash, PartialOrd, Ord)]

@@ -228,9 +228,8 @@ impl PeerBody {
         if told.is_some() != self.model.is_free() {
             return false;
         }
-        // Integrators that remember no force may leave it out.
-        let f = if state.force.is_empty() { vec![0.0; self.state.modes()] } else { state.force.clone() };
         let (q, v, a, z) = (state.q.clone(), state.v.clone(), state.a.clone(), state.z.clone());
+        let f = state.force.clone();
         let told = State { q, v, a, f, z, frame: told.unwrap_or(self.state.frame) };
         if self.replica.kernel().check(&told).is_err() {
             return false;

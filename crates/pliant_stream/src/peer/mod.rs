@@ -17,7 +17,7 @@ mod wire;
 
 pub use body::{PeerBody, Repair};
 pub use config::{PeerConfig, PeerEvent};
-pub use session::PeerSession;
+pub use session::{PeerSession, digest};
 pub use wire::{
     HeldAt, InputTick, PeerBodyState, PeerDatagram, PeerFrame, PeerGrip, PeerMessage, StateCheck,
 };

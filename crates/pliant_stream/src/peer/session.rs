@@ -32,6 +32,14 @@ const SLEW: f64 = 0.01;
 /// Pause between questions for the same tick.
 const ASK_AGAIN: Duration = Duration::from_millis(150);
 
+/// What peers have to have alike of a body: a digest of its model and of how it is stepped.
+pub fn digest(model: &ModalModel, settings: &StepSettings) -> [u8; 32] {
+    let mut hasher = blake3::Hasher::new();
+    hasher.update(&model.hash().0);
+    hasher.update(&settings.to_bytes());
+    hasher.finalize().into()
+}
+
 /// One of several equal peers: a state machine without sockets or clock.
 #[derive(Debug)]
 pub struct PeerSession {
@@ -123,9 +131,7 @@ impl PeerSession {
         hasher.update(&self.config.step.to_bits().to_le_bytes());
         for (id, body) in &self.bodies {
             hasher.update(&id.0.to_le_bytes());
-            hasher.update(&body.model().hash().0);
-            // Into memory, and of plain numbers: it does not fail.
-            hasher.update(&postcard::to_allocvec(body.settings()).unwrap_or_default());
+            hasher.update(&digest(body.model(), body.settings()));
         }
         let mut first = [0; 8];
         first.copy_from_slice(&hasher.finalize().as_bytes()[..8]);
@@ -325,10 +331,12 @@ impl PeerSession {
 
     /// Something arrived reliably. What breaks the protocol ends the connection.
     pub fn on_message(&mut self, now: Duration, peer: PeerId, bytes: &[u8]) {
-        let own = self.scene();
+        let message = PeerMessage::decode(bytes);
+        // It takes a while, and only a Hello asks for it.
+        let own = matches!(message, Ok(PeerMessage::Hello { .. })).then(|| self.scene());
         let Some(other) = self.others.get_mut(&peer) else { return };
         other.link.receive_message(now, bytes.len());
-        match PeerMessage::decode(bytes) {
+        match message {
             Ok(PeerMessage::Hello { version, user, name, joining, scene }) => {
                 let user = UserId(user);
                 let taken = user == self.config.user || self.inputs.users.get(&user).is_some_and(|u| !u.gone);
@@ -337,7 +345,7 @@ impl PeerSession {
                 } else if other.user.is_some() || user != other.expected || taken {
                     Some(EndReason::Protocol)
                 } else {
-                    (scene != own).then_some(EndReason::Scene)
+                    (Some(scene) != own).then_some(EndReason::Scene)
                 };
                 if let Some(reason) = refused {
                     self.message(peer, &PeerMessage::Goodbye { reason });

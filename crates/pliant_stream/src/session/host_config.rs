@@ -96,7 +96,7 @@ pub enum HostEvent {
         radius: f64,
         /// Where the hand is, world, m.
         target: [f64; 3],
-        /// How the hand holds: its own spring and damper, within 1e12 N/m and 10 s.
+        /// How the hand holds: its own spring and damper, at most 1e5 N/m and 1 s.
         hold: GrabConfig,
     },
     /// A hand moves.

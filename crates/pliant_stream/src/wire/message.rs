@@ -275,10 +275,6 @@ impl HostMessage {
                 if let Err(error) = settings.check() {
                     check("settings", false, error, "settings in their ranges")?;
                 }
-                let scale = settings.damping_scale;
-                check("damping_scale", scale <= 1e6, scale, "0..=1e6")?;
-                let gravity = &settings.gravity;
-                check("gravity", in_range(gravity), format!("{gravity:?}"), "finite m/s^2")?;
             }
             Self::Snapshot(s) => {
                 check("snapshot tick", s.tick < TICK_LIMIT, s.tick, "below 2^48")?;
