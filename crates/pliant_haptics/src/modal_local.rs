@@ -28,7 +28,9 @@ pub struct ModalLocal {
     past: Vec<f64>,
     frames: Vec<(f64, Frame)>,
     head: usize,
+    /// The last word of the simulation: its tick, and when it came.
     heard: u64,
+    heard_at: f64,
     scratch: State,
 }
 
@@ -58,20 +60,27 @@ impl ModalLocal {
             period,
             head: 0,
             heard: 0,
+            heard_at: 0.0,
         })
     }
 
     /// Steps the copy with the tool where it is. `false`: it could not be, and the proxy model has to do.
     pub(crate) fn advance(&mut self, now: f64, steps: usize, tool: &Tool, model: &LocalModel) -> bool {
         if model.tick != self.heard {
-            self.heard = model.tick;
+            (self.heard, self.heard_at) = (model.tick, now);
             if !self.correct(model) {
                 return false;
             }
         }
-        // Whoever else holds the body goes where the simulation has seen them go.
+        // Whoever else holds the body goes where the simulation has seen them go, and takes as long: a
+        // target that jumped within one short step would have its damper pull many times too hard.
+        let left = self.heard_at + model.period - now;
+        let passed = steps as f64 * self.period;
+        let share = if left > passed { passed / left } else { 1.0 };
         for &(id, target) in &model.others {
-            self.body.set_target(id, target).ok();
+            let Ok(from) = self.body.target(id).map(Vector3::from) else { continue };
+            let target = from + share * (Vector3::from(target) - from);
+            self.body.set_target(id, target.into()).ok();
         }
         for grab in self.held.iter().flatten() {
             let target = (tool.position + tool.orientation * Vector3::from(grab.offset)) / self.scale;
@@ -272,8 +281,18 @@ mod tests {
         body.step().unwrap();
         let mut model = LocalModel::sized_for(&body);
         ModelWriter::new().write(&body, &[held], &coupling(), 1.0, 0.0, &mut model).unwrap();
-        assert!(copy.advance(1e-3, 1, &Tool::new(ToolMap::default()), &model));
-        assert_eq!(copy.body.target(other).unwrap(), [x + 0.01, y, z]);
+        let ticks = (model.period * 1000.0).round() as usize;
+        assert!(ticks > 10, "{} s a word", model.period);
+        let mut last = x;
+        for tick in 0..ticks {
+            assert!(copy.advance(tick as f64 * 1e-3, 1, &Tool::new(ToolMap::default()), &model));
+            let now = copy.body.target(other).unwrap();
+            let way = now[0] - last;
+            assert!(way > 0.0 && way < 1.5 * 0.01 / ticks as f64, "tick {tick}: {way} m at once");
+            assert_eq!([now[1], now[2]], [y, z]);
+            last = now[0];
+        }
+        assert!((last - x - 0.01).abs() < 1e-9, "{last}, {x}");
     }
 
     #[test]
