@@ -8,6 +8,8 @@ use pliant_modal::{
 };
 
 use crate::replica::Replica;
+use crate::state::{GrabKey, GrabState, UserId};
+use crate::wire::FrameGrab;
 
 /// Largest difference as a share of the largest number of its kind in the run.
 const SAME: f64 = 1e-12;
@@ -170,4 +172,75 @@ fn under_gravity() {
     let tip = end(&pip, [0.0, 1.0, 0.0]);
     let config = BodyConfig::from(StepSettings { gravity: [0.0, -9.81, 0.0], ..Default::default() });
     compare("gravity", &pip, config, &[hand(tip, 0.02, [0.02, 0.0, 0.0])], 64);
+}
+
+/// Steps a body with hands, and a copy by what a frame says of them: places and reactions. The second
+/// hand begins after a while. Returns the largest difference of a coordinate, as a share of the largest.
+fn told(model: &Arc<ModalModel>, settings: StepSettings, cases: &[Case; 2]) -> f64 {
+    let mut body = Body::new(model.clone(), settings.into()).unwrap();
+    let mut copy = Replica::new(model.clone(), settings, model.mode_count(), body.config().step).unwrap();
+    let mut state = copy.kernel().at_rest();
+    let (mut grabs, mut means) = (Vec::new(), Vec::new());
+    let (mut largest, mut off) = (0.0f64, 0.0f64);
+    for step in 0..120 {
+        for (number, case) in cases.iter().enumerate() {
+            if step == 40 * number {
+                let patch = Patch::around(model.surface(), case.vertex, case.radius).unwrap();
+                let id = body.grab(&patch, case.config).unwrap();
+                grabs.push((id, Vector3::from(body.target(id).unwrap()), case));
+            }
+        }
+        for (number, (id, at, case)) in grabs.iter().enumerate() {
+            let share = ((step - 40 * number) as f64 / 60.0).min(1.0);
+            body.set_target(*id, (at + share * Vector3::from(case.way)).into()).unwrap();
+        }
+        body.step().unwrap();
+        let frame: Vec<FrameGrab> = grabs
+            .iter()
+            .enumerate()
+            .map(|(number, (id, _, case))| FrameGrab {
+                state: GrabState {
+                    key: GrabKey { user: UserId(1), grab: number as u16 },
+                    vertex: case.vertex,
+                    radius: case.radius,
+                    target: body.target(*id).unwrap(),
+                    reaction: body.reaction(*id).unwrap(),
+                },
+                displacement: copy.displacement(body.q(), case.vertex, case.radius),
+                held: true,
+            })
+            .collect();
+        copy.step_measured(&mut state, &frame, &vec![0.0; model.mode_count()], &mut means);
+        for (a, b) in body.q().iter().zip(&state.q) {
+            (largest, off) = (largest.max(a.abs()), off.max((a - b).abs()));
+        }
+    }
+    assert!(largest > 0.0, "nothing was held");
+    off / largest
+}
+
+#[test]
+fn places_and_reactions_tell_the_same_as_targets() {
+    let pip = model("pip.modal");
+    let size = pip.size();
+    let (right, left) = (end(&pip, [1.0, 0.0, 0.0]), end(&pip, [-1.0, 0.0, 0.0]));
+    let soft = GrabConfig { stiffness: Some(200.0), relaxation: 0.02 };
+    let cases = [
+        hand(right, 0.08 * size, [0.2 * size, 0.1 * size, 0.0]),
+        Case { config: soft, ..hand(left, 0.05 * size, [0.0, 0.2 * size, -0.1 * size]) },
+    ];
+    let relaxation = Some(Relaxation { ratio: 0.5, time: 0.2 });
+    let alpha = Integrator::GeneralizedAlpha { rho_inf: 0.5 };
+    let plain = StepSettings::default();
+    for (settings, most) in [
+        (StepSettings { warp: false, ..plain }, SAME),
+        (StepSettings { warp: false, second_order: false, ..plain }, SAME),
+        (StepSettings { warp: false, integrator: alpha, ..plain }, SAME),
+        (StepSettings { warp: false, relaxation, ..plain }, SAME),
+        (plain, 1e-4),
+    ] {
+        let off = told(&pip, settings, &cases);
+        println!("{settings:?}: {off:.1e}");
+        assert!(off < most, "{settings:?}: {off:.1e}");
+    }
 }
