@@ -14,8 +14,9 @@ use pliant_net::{
     Access, Emulation, Fingerprint, Grant, HostOptions, Invite, NetPeer, NetPlugin, PeerConfig, PeerState,
     SharedBody, Token, User,
 };
-use pliant_stream::PeerId;
 use pliant_stream::emulator::{LinkConfig, Loss};
+use pliant_stream::peer::digest;
+use pliant_stream::{PeerId, StepSettings};
 use support::{alone, app, bar, must, run_until, wait_for};
 
 const INTRODUCE: u8 = 16;
@@ -59,7 +60,7 @@ fn introduction(app: &App, body: Entity, invite: &Invite) -> Bytes {
     bytes.put_u64_le(25_000_000);
     bytes.put_u16_le(1);
     bytes.put_u16_le(number.0);
-    bytes.put_slice(&bar().hash().0);
+    bytes.put_slice(&digest(&bar(), &StepSettings::default()));
     bytes.put_u16_le(words.len() as u16);
     bytes.put_slice(words.as_bytes());
     bytes.freeze()
