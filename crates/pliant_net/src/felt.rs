@@ -55,3 +55,9 @@ impl PatchPoint {
 pub(crate) fn hold_of(grab: &Grab) -> GrabConfig {
     GrabConfig { stiffness: grab.stiffness, relaxation: grab.relaxation }
 }
+
+/// Whether a grab still holds so. By bits: what is not a number is told, and refused, once.
+pub(crate) fn holds_so(grab: &Grab, hold: &GrabConfig) -> bool {
+    let bits = |hold: &GrabConfig| (hold.stiffness.map(f64::to_bits), hold.relaxation.to_bits());
+    bits(&hold_of(grab)) == bits(hold)
+}

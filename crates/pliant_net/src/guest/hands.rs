@@ -9,7 +9,7 @@ use pliant_modal::GrabConfig;
 use pliant_stream::BodyId;
 
 use super::NetGuest;
-use crate::felt::{PatchPoint, hold_of};
+use crate::felt::{PatchPoint, hold_of, holds_so};
 use crate::place::Place;
 use crate::seen::RemoteBody;
 
@@ -42,7 +42,7 @@ pub(crate) fn send_hands(
     let Some(session) = guest.session.as_mut().filter(|session| session.user().is_some()) else { return };
     guest.grabs.retain(|&entity, sent| {
         let stays = grabs.get(entity).is_ok_and(|(_, grab, of)| {
-            let same = grab.vertex == sent.vertex && grab.radius == sent.radius && hold_of(grab) == sent.hold;
+            let same = grab.vertex == sent.vertex && grab.radius == sent.radius && holds_so(grab, &sent.hold);
             same && bodies.get(of.0).is_ok_and(|(body, ..)| body.0 == sent.body)
         });
         if let (false, Some(number)) = (stays, sent.number) {

@@ -9,7 +9,7 @@ use pliant_modal::{Body, GrabConfig, ModalModel};
 use pliant_stream::{BodyId, GrabKey, Pose, StepSettings, UserId};
 
 use super::{NetPeer, PeerState};
-use crate::felt::{PatchPoint, hold_of};
+use crate::felt::{PatchPoint, hold_of, holds_so};
 use crate::phase::Phase;
 use crate::place::{Place, set_pose};
 use crate::seen::{SeenHand, SeenHands};
@@ -87,7 +87,7 @@ pub(crate) fn tell_hands(
         |entity: Entity| net.bodies.iter().find(|(_, played)| played.entity == entity).map(|(&id, _)| id);
     net.grabs.retain(|&entity, said| {
         let stays = grabs.get(entity).is_ok_and(|(_, grab, of)| {
-            let same = grab.vertex == said.vertex && grab.radius == said.radius && hold_of(grab) == said.hold;
+            let same = grab.vertex == said.vertex && grab.radius == said.radius && holds_so(grab, &said.hold);
             same && number_of(of.0) == Some(said.body)
         });
         if let (false, Some(number)) = (stays, said.number) {
