@@ -399,6 +399,21 @@ fn late_joiner_takes_the_state_of_another_and_follows() {
 }
 
 #[test]
+fn those_who_come_before_the_first_step_get_a_state_too() {
+    let mut mesh = Mesh::new(3, &LinkConfig::preset(Preset::Lan), 5);
+    for peer in 0..3 {
+        mesh.start(peer, Repair::Rollback, peer == 0);
+    }
+    mesh.run(3 * S);
+    let ticks: Vec<u64> = mesh.peers.iter().flatten().map(PeerSession::tick).collect();
+    assert!(ticks.iter().all(|tick| tick.abs_diff(120) <= 2), "{ticks:?}");
+    let confirmed: Vec<u64> = mesh.peers.iter().flatten().map(PeerSession::confirmed).collect();
+    assert!(confirmed.iter().all(|tick| *tick > 110), "{confirmed:?}");
+    assert_eq!(mesh.agree(0, 1), 0.0);
+    assert_eq!(mesh.agree(0, 2), 0.0);
+}
+
+#[test]
 fn clocks_that_differ_by_years_change_nothing_among_peers() {
     let year = Duration::from_secs(365 * 86_400);
     let go = |began: [Duration; 3]| {
