@@ -46,6 +46,9 @@ struct Beside {
 
 const ROOT: &str = concat!(env!("CARGO_MANIFEST_DIR"), "/../..");
 
+/// What the example beside one that is run has printed.
+const BESIDE: &str = "beside.txt";
+
 /// The longest that any of them may take, also on a busy machine.
 const LONGEST: Duration = Duration::from_secs(600);
 
@@ -174,8 +177,15 @@ impl Drop for Started {
     }
 }
 
-/// Runs one of them; says what was wrong.
+/// Runs one of them; says what was wrong, and what the one beside it has printed.
 fn try_run(run: &Run, folder: &Path) -> Result<(), String> {
+    run_in(run, folder).map_err(|why| match fs::read_to_string(folder.join(BESIDE)) {
+        Ok(printed) => format!("{why}\nThe one beside it has printed:\n{printed}"),
+        Err(_) => why,
+    })
+}
+
+fn run_in(run: &Run, folder: &Path) -> Result<(), String> {
     fs::create_dir_all(folder).unwrap();
     let assets = fs::canonicalize(format!("{ROOT}/assets")).unwrap().display().to_string();
     let with = |arguments: &[String], invite: &str| -> Vec<String> {
@@ -184,7 +194,7 @@ fn try_run(run: &Run, folder: &Path) -> Result<(), String> {
     let beside = run
         .beside
         .as_ref()
-        .map(|beside| Started::new(&beside.example, &with(&beside.arguments, ""), folder, "beside.txt"));
+        .map(|beside| Started::new(&beside.example, &with(&beside.arguments, ""), folder, BESIDE));
     let invite = beside.as_ref().map(Started::invite).transpose()?.unwrap_or_default();
     let mut started = Started::new(&run.example, &with(&run.arguments, &invite), folder, "output.txt");
     let began = Instant::now();

@@ -95,13 +95,15 @@ fn setup(
     }
 }
 
-/// The first of the others is here.
+/// The first of the others is here, and has told where the bodies are.
 fn meet(
     mut commands: Commands,
+    net: Option<Res<pliant::net::NetPeer>>,
     awaited: Query<Entity, With<stage::Awaited>>,
     others: Query<(), (With<UserLink>, Without<Yourself>)>,
 ) {
-    if !others.is_empty() {
+    let steps = net.is_some_and(|net| net.session().is_some_and(|session| session.tick() > 0));
+    if steps && !others.is_empty() {
         awaited.iter().for_each(|entity| commands.entity(entity).despawn());
     }
 }

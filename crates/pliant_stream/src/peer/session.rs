@@ -353,9 +353,13 @@ impl PeerSession {
                 }
                 other.user = Some(user);
                 other.wants_state = joining && self.started;
-                // Founders start together and expect each other from the start; a joiner's hands come later.
-                let first =
-                    if joining { self.tick + 1 } else { 1.max(self.tick.saturating_sub(WINDOW as u64 / 2)) };
+                // Founders start together and expect each other from the start; a joiner's hands come
+                // later. The first state that can be given to it is that of tick 1.
+                let first = if joining {
+                    self.tick.max(1) + 1
+                } else {
+                    1.max(self.tick.saturating_sub(WINDOW as u64 / 2))
+                };
                 self.inputs.expect(user, first);
                 self.event(PeerEvent::Joined { user, name });
             }
