@@ -58,7 +58,7 @@ enum Part {
 struct Account {
     /// Momentum when it was opened, kg m/s; `None` before.
     opening: Option<DVec3>,
-    /// Angular momentum about its own centre then, kg m^2/s.
+    /// Angular momentum about its own center then, kg m^2/s.
     spin: DVec3,
     /// What hands, blows and gravity have put in since, N s.
     applied: DVec3,
@@ -70,7 +70,7 @@ fn spawn(mut commands: Commands, assets: Res<AssetServer>, mut materials: ResMut
         (Part::Struck, 0.0, Color::srgb(0.42, 0.66, 0.58)),
         (Part::Held, -0.62, Color::srgb(0.86, 0.68, 0.34)),
     ];
-    for (part, x, colour) in parts {
+    for (part, x, color) in parts {
         let mut body = ModalBody::new(assets.load("jack.modal"));
         body.settings.gravity = if part == Part::Struck { [0.0; 3] } else { GRAVITY.into() };
         commands.spawn((
@@ -80,7 +80,7 @@ fn spawn(mut commands: Commands, assets: Res<AssetServer>, mut materials: ResMut
             MeshMaterial3d(materials.add(StandardMaterial {
                 perceptual_roughness: 0.45,
                 clearcoat: 0.3,
-                ..colour.into()
+                ..color.into()
             })),
             Transform::from_xyz(x, if part == Part::Thrown { LOW as f32 } else { 0.0 }, 0.0),
         ));
@@ -114,7 +114,7 @@ fn hit(
     time: Res<Time>,
     keys: Res<ButtonInput<KeyCode>>,
     mut bodies: Query<(Entity, &Part, &BodyState, &mut Account)>,
-    mut strikes: MessageWriter<Strike>,
+    mut strikes: MessageWriter<Impulse>,
     mut blows: Local<u32>,
 ) {
     let due = time.elapsed_secs_f64() > 0.4 + 1.5 * f64::from(*blows);
@@ -130,7 +130,7 @@ fn hit(
         let home = -DVec3::from(state.body().frame().origin());
         let blow = -DVec3::from(momentum) + 0.18 * home + 0.04 * DVec3::new(0.3, 1.0, 0.6);
         let side = [Vec3::X, Vec3::Y, Vec3::NEG_X, Vec3::NEG_Y][*blows as usize % 4];
-        strikes.write(Strike { body, vertex: farthest(state, side), impulse: blow });
+        strikes.write(Impulse { body, vertex: farthest(state, side), impulse: blow });
         account.applied += blow;
     }
 }

@@ -70,8 +70,8 @@ fn plant(
     mut meshes: ResMut<Assets<Mesh>>,
     mut materials: ResMut<Assets<StandardMaterial>>,
 ) {
-    let colours = [(0.95, 0.50, 0.36), (0.96, 0.66, 0.34), (0.90, 0.40, 0.46), (0.93, 0.76, 0.52)];
-    let skins = colours.map(|(red, green, blue)| {
+    let colors = [(0.95, 0.50, 0.36), (0.96, 0.66, 0.34), (0.90, 0.40, 0.46), (0.93, 0.76, 0.52)];
+    let skins = colors.map(|(red, green, blue)| {
         materials.add(StandardMaterial { perceptual_roughness: 0.5, ..Color::srgb(red, green, blue).into() })
     });
     let model = assets.load("bud.modal");
@@ -120,7 +120,7 @@ fn roll(time: Res<Time>, mut balls: Query<(&mut Transform, &Ball)>) {
 /// Pushes the heads of the buds out of the ball.
 fn part(
     balls: Query<(&Transform, &Ball)>,
-    mut bodies: Query<(&mut BodyState, &ShownState, &GlobalTransform)>,
+    mut bodies: Query<(&mut BodyState, &VisualState, &GlobalTransform)>,
     mut top: Local<Option<u32>>,
 ) -> Result {
     for (ball, Ball { radius }) in &balls {
@@ -167,7 +167,7 @@ fn shake(
     if keys.just_pressed(KeyCode::KeyS) || (meadow.shake && tick.0.is_multiple_of(32)) {
         for mut state in &mut bodies {
             let head = highest(&state);
-            state.body_mut().strike(head, [0.02, 0.0, 0.01])?;
+            state.body_mut().apply_impulse(head, [0.02, 0.0, 0.01])?;
         }
     }
     Ok(())

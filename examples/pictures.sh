@@ -49,7 +49,7 @@ is_wanted() {
     return 1
 }
 
-# As many colours as there is room for, or give up.
+# As many colors as there is room for, or give up.
 smaller() {
     if python3 -c 'import PIL' 2>/dev/null; then
         python3 - "$1" "$most" <<'PYTHON'
@@ -57,8 +57,8 @@ import os, sys
 from PIL import Image
 file, most = sys.argv[1], int(sys.argv[2])
 picture = Image.open(file).convert("RGB")
-for colours in 256, 192, 128:
-    picture.quantize(colours, dither=Image.Dither.NONE).save(file, optimize=True)
+for colors in 256, 192, 128:
+    picture.quantize(colors, dither=Image.Dither.NONE).save(file, optimize=True)
     if os.path.getsize(file) <= most:
         break
 PYTHON

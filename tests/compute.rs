@@ -26,7 +26,7 @@ use bevy::{
     winit::WinitPlugin,
 };
 use pliant::{
-    body::{DrawnSurface, Driven, ShownState, SurfaceDeformation, SurfaceDetail},
+    body::{DrawnSurface, Driven, SurfaceDeformation, SurfaceDetail, VisualState},
     modal::ModalModel,
     prelude::*,
 };
@@ -150,7 +150,7 @@ fn the_same_shapes(mut app: App) {
     for (body, turns) in bodies.iter().zip([0.1, 1.0, 4.5]) {
         let q: Vec<f64> =
             (0..modes).map(|k| turns * turn * (0.7f64).powi(k as i32) * [1.0, -1.0][k % 2]).collect();
-        app.world_mut().get_mut::<ShownState>(*body).unwrap().snap(&q).unwrap();
+        app.world_mut().get_mut::<VisualState>(*body).unwrap().snap(&q).unwrap();
     }
     let meshes: Vec<AssetId<Mesh>> =
         bodies.iter().map(|body| app.world().get::<Mesh3d>(*body).unwrap().id()).collect();
@@ -197,8 +197,8 @@ fn the_same_shapes(mut app: App) {
     // Far away, in a picture of 64 pixels, most modes are left out of it, and nobody can tell.
     let world = app.world_mut();
     world.entity_mut(bodies[0]).insert(SurfaceDetail::default());
-    let q: Vec<f64> = world.get::<ShownState>(bodies[0]).unwrap().q().to_vec();
-    world.get_mut::<ShownState>(bodies[0]).unwrap().snap(&q).unwrap();
+    let q: Vec<f64> = world.get::<VisualState>(bodies[0]).unwrap().q().to_vec();
+    world.get_mut::<VisualState>(bodies[0]).unwrap().snap(&q).unwrap();
     app.update();
     let error = farthest(&in_asset(&app, meshes[0]).0, &computed[0].0);
     // 45 degrees of view over 64 pixels, three metres away less the body's own radius.

@@ -94,7 +94,7 @@ fn a_body_at_rest_takes_no_step_and_changes_nothing() {
     let last = |app: &mut App| {
         let world = app.world_mut();
         let mut query =
-            world.query::<(Ref<BodyState>, Ref<ShownState>, Ref<Transform>, Ref<GlobalTransform>)>();
+            world.query::<(Ref<BodyState>, Ref<VisualState>, Ref<Transform>, Ref<GlobalTransform>)>();
         let (state, shown, place, seen) = query.get(world, body).unwrap();
         [state.last_changed(), shown.last_changed(), place.last_changed(), seen.last_changed()]
             .map(|t| t.get())
@@ -103,7 +103,7 @@ fn a_body_at_rest_takes_no_step_and_changes_nothing() {
     frames(&mut app, 600);
     assert_eq!(last(&mut app), before, "no component of a resting body is written");
     assert_eq!(steps(&app), (0.0, timed), "no body was awake and no step was timed");
-    app.world_mut().write_message(Strike {
+    app.world_mut().write_message(Impulse {
         body,
         vertex: 0,
         impulse: bevy::math::DVec3::new(0.0, 0.01, 0.0),

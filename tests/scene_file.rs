@@ -502,7 +502,7 @@ fn a_guest_s_view_of_a_baked_body_is_of_the_host_s_model_and_rests_with_it() {
         .add_plugins(pliant::body::BakePlugin { cache: None })
         .add_plugins(SceneFilePlugin::open(SceneFile::from_ron(&text, "my.ron").unwrap()).unwrap());
     let view = |world: &mut World| {
-        let mut views = world.query::<(&Name, &pliant::body::ShownState, &ModalBody)>();
+        let mut views = world.query::<(&Name, &pliant::body::VisualState, &ModalBody)>();
         let found = views.iter(world).find(|(name, ..)| name.as_str() == "bud (guest)");
         found.map(|(_, shown, body)| {
             (shown.version(), shown.q().iter().fold(0.0_f64, |most, q| most.max(q.abs())), body.model.id())
@@ -550,7 +550,7 @@ fn a_guest_in_the_same_process_pulls_the_host_s_body_and_sees_it() {
             .map(|felt| felt.force.length())
             .collect();
         pulled = forces.into_iter().fold(pulled, f64::max);
-        let mut views = world.query::<(&Name, &Transform, &pliant::body::ShownState)>();
+        let mut views = world.query::<(&Name, &Transform, &pliant::body::VisualState)>();
         let moved = views.iter(world).any(|(name, place, shown)| {
             name.as_str() == "pip (guest)"
                 && place.translation.x == 1.0
@@ -734,8 +734,8 @@ fn stiffness_and_the_basis_of_a_body_are_the_scene_s() {
 
 #[cfg(feature = "rerun")]
 #[test]
-fn a_recording_s_rates_and_colour_are_the_scene_s() {
-    use pliant::rerun::{RerunColour, RerunRecording};
+fn a_recording_s_rates_and_color_are_the_scene_s() {
+    use pliant::rerun::{RerunColor, RerunRecording};
     let folder = format!("pliant-recordings-{}", std::process::id());
     std::fs::create_dir(&folder).unwrap();
     let made = |fields: &str| {
@@ -746,27 +746,26 @@ fn a_recording_s_rates_and_colour_are_the_scene_s() {
         *app.world().resource::<RerunRecording>()
     };
     assert_eq!(made(""), RerunRecording::default());
-    let all = made(
-        ", shapes_hz: 5, figures_hz: 30, hands_hz: 0, modes_hz: 2.5, colour: Stress, device_loops: true",
-    );
+    let all =
+        made(", shapes_hz: 5, metrics_hz: 30, hands_hz: 0, modes_hz: 2.5, color: Stress, device_loops: true");
     let expected = RerunRecording {
         on: true,
         shapes_hz: 5.0,
-        figures_hz: 30.0,
+        metrics_hz: 30.0,
         hands_hz: 0.0,
         modes_hz: 2.5,
-        colour: RerunColour::Stress,
+        color: RerunColor::Stress,
         device_loops: true,
     };
     assert_eq!(all, expected);
     std::fs::remove_dir_all(&folder).unwrap();
-    for (field, place) in [("modes_hz: NaN", 44), ("figures_hz: -1", 46), ("hands_hz: inf", 44)] {
+    for (field, place) in [("modes_hz: NaN", 44), ("metrics_hz: -1", 46), ("hands_hz: inf", 44)] {
         let error = with("title: \"one\"", &format!("recording: (file: \"out.rrd\", {field})"));
         assert_eq!(error.position, Some((2, place)), "{error}");
         assert!(error.message.starts_with("expected Hz from 0 to "), "{error}");
     }
-    let error = with("title: \"one\"", "recording: (file: \"out.rrd\", colour: Strain)");
-    assert!(error.message.starts_with("unknown value `Strain` in Colour; "), "{error}");
+    let error = with("title: \"one\"", "recording: (file: \"out.rrd\", color: Strain)");
+    assert!(error.message.starts_with("unknown value `Strain` in Color; "), "{error}");
 }
 
 #[test]

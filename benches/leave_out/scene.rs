@@ -232,11 +232,11 @@ fn shake(
     work: Res<Work>,
     mut tick: Local<u32>,
     bodies: Query<(Entity, &BodyState)>,
-    mut blows: MessageWriter<Strike>,
+    mut blows: MessageWriter<Impulse>,
 ) {
     *tick += 1;
     if work.0 && tick.is_multiple_of(6) {
-        blows.write_batch(bodies.iter().map(|(body, state)| Strike {
+        blows.write_batch(bodies.iter().map(|(body, state)| Impulse {
             body,
             vertex: ear(state.model()),
             impulse: DVec3::new(1e-3, 0.0, 5e-4),

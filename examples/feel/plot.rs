@@ -30,7 +30,7 @@ pub struct Traces {
 /// The force of one device.
 pub struct Trace {
     pub device: DeviceId,
-    pub colour: Color,
+    pub color: Color,
     points: VecDeque<(f64, f64)>,
     last: Option<[f64; 3]>,
     fresh: Vec<Record>,
@@ -41,10 +41,10 @@ pub struct Trace {
 }
 
 impl Trace {
-    pub fn new(device: DeviceId, colour: Color) -> Self {
+    pub fn new(device: DeviceId, color: Color) -> Self {
         Self {
             device,
-            colour,
+            color,
             points: VecDeque::new(),
             last: None,
             fresh: Vec::new(),
@@ -157,7 +157,7 @@ fn draw(
     }
     for trace in &traces.traces {
         let Some(newest) = trace.points.back().map(|p| p.0) else { continue };
-        let [r, g, b, _] = trace.colour.to_srgba().to_u8_array();
+        let [r, g, b, _] = trace.color.to_srgba().to_u8_array();
         let mut before: Option<(usize, usize)> = None;
         for &(now, force) in &trace.points {
             let x = ((1.0 - (newest - now) / SPAN).clamp(0.0, 1.0) * (WIDTH - 1) as f64) as usize;

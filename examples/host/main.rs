@@ -88,11 +88,11 @@ fn change_network(
     }
 }
 
-/// The guests' hands, each in its colour.
+/// The guests' hands, each in its color.
 fn draw_hands(hands: Query<(&Grab, &GrabForce, &HandOf)>, users: Query<&User>, mut gizmos: Gizmos) {
     for (grab, felt, of) in &hands {
         let Ok(user) = users.get(of.0) else { continue };
-        stage::draw_hand(&mut gizmos, grab.target, Some(felt.point), -felt.force, user.colour);
+        stage::draw_hand(&mut gizmos, grab.target, Some(felt.point), -felt.force, user.color);
     }
 }
 

@@ -200,7 +200,7 @@ fn tell(
     mut closed: MessageReader<SessionClosed>,
     mut exit: MessageWriter<AppExit>,
     guest: Res<NetGuest>,
-    shown: Query<&SharedBody, (With<RemoteBody>, Added<ShownState>)>,
+    shown: Query<&SharedBody, (With<RemoteBody>, Added<VisualState>)>,
 ) {
     let now = time.elapsed_secs_f64();
     for joined in joined.read() {

@@ -3,7 +3,7 @@
 use std::error::Error;
 
 use bevy::prelude::*;
-use pliant::net::{NetPlugin, NetStats, RemoteBody, SeenHands, User, colour_of};
+use pliant::net::{NetPlugin, NetStats, RemoteBody, RemoteHands, User, color_of};
 use pliant::prelude::*;
 
 use crate::{Options, finish, stage};
@@ -36,10 +36,10 @@ fn dress(
     }
 }
 
-/// The others' hands, each in its colour, and how hard they pull.
-fn draw_hands(bodies: Query<&SeenHands>, mut gizmos: Gizmos) {
+/// The others' hands, each in its color, and how hard they pull.
+fn draw_hands(bodies: Query<&RemoteHands>, mut gizmos: Gizmos) {
     for hand in bodies.iter().flat_map(|seen| &seen.0) {
-        stage::draw_hand(&mut gizmos, hand.target, None, -hand.reaction, colour_of(hand.user));
+        stage::draw_hand(&mut gizmos, hand.target, None, -hand.reaction, color_of(hand.user));
     }
 }
 

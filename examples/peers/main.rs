@@ -17,7 +17,7 @@ use std::net::SocketAddr;
 use bevy::prelude::*;
 use clap::Parser;
 use pliant::net::{
-    HostOptions, Invite, NetPlugin, PeerConfig, SeenHands, SharedBody, User, UserLink, Yourself, colour_of,
+    HostOptions, Invite, NetPlugin, PeerConfig, RemoteHands, SharedBody, User, UserLink, Yourself, color_of,
 };
 use pliant::prelude::*;
 use pliant::stream::emulator::Preset;
@@ -108,9 +108,9 @@ fn meet(
     }
 }
 
-fn draw_hands(bodies: Query<&SeenHands>, mut gizmos: Gizmos) {
+fn draw_hands(bodies: Query<&RemoteHands>, mut gizmos: Gizmos) {
     for hand in bodies.iter().flat_map(|seen| &seen.0) {
-        stage::draw_hand(&mut gizmos, hand.target, None, -hand.reaction, colour_of(hand.user));
+        stage::draw_hand(&mut gizmos, hand.target, None, -hand.reaction, color_of(hand.user));
     }
 }
 

@@ -75,7 +75,7 @@ pub fn write_shown(
     for body in &bodies {
         let mut written = Ok(());
         if let Some(view) = guest.body(*body)
-            && let Some(streamed) = view.shown()
+            && let Some(streamed) = view.visual()
             && view.tick() > trace.last
         {
             trace.last = view.tick();

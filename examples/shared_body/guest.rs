@@ -20,7 +20,7 @@ use bevy::{
 };
 use pliant::{
     modal::{ModalModel, warp},
-    net::{GuestState, NetGuest, NetPlugin, NetStats, RemoteBody, SeenHands, SharedBody, User, colour_of},
+    net::{GuestState, NetGuest, NetPlugin, NetStats, RemoteBody, RemoteHands, SharedBody, User, color_of},
     prelude::*,
     rerun::{RerunPlugin, RerunScalars},
 };
@@ -200,15 +200,15 @@ fn measure(
     meters.reaction = meters.reaction.max(figures.reaction);
     for (remote, state) in &bodies {
         let Some(view) = guest.body(*remote) else { continue };
-        let Some(streamed) = view.shown() else { continue };
+        let Some(streamed) = view.visual() else { continue };
         figures.joined = true;
         run.since.get_or_insert(time.elapsed_secs_f64());
         meters.streamed.show(view.tick(), &streamed.q);
         figures.ahead = 0.0;
-        if let Some(own) = view.own_hand() {
+        if let Some(own) = view.predicted_hand() {
             // This is as of a tick that the host has yet to reach; it is compared when it has.
             figures.ahead = own.tick().saturating_sub(view.tick()) as f64 / RATE;
-            meters.own_hand.show(own.tick(), &own.shown().q);
+            meters.predicted_hand.show(own.tick(), &own.visual().q);
             meters.waiting.show(own.tick(), &streamed.q);
         }
         meters.compare(state.model(), &truth);
@@ -217,7 +217,10 @@ fn measure(
 
 /// All hands on the body: the others' from the stream, the own from its entity.
 fn gather_hands(
-    mut bodies: Query<(&SeenHands, &BodyState, &ShownState, &GlobalTransform, &mut HeldBy), With<GuestBody>>,
+    mut bodies: Query<
+        (&RemoteHands, &BodyState, &VisualState, &GlobalTransform, &mut HeldBy),
+        With<GuestBody>,
+    >,
     own: Query<(&Grab, &GrabForce), Without<PointerHeld>>,
     you: Query<&User, With<pliant::net::Yourself>>,
 ) {
@@ -230,12 +233,12 @@ fn gather_hands(
                 target: hand.target,
                 point,
                 force: hand.reaction,
-                colour: colour_of(hand.user),
+                color: color_of(hand.user),
             });
         }
-        let colour = you.iter().next().map_or(Color::WHITE, |user| user.colour);
+        let color = you.iter().next().map_or(Color::WHITE, |user| user.color);
         for (grab, force) in &own {
-            held.0.push(DrawnHand { target: grab.target, point: force.point, force: force.force, colour });
+            held.0.push(DrawnHand { target: grab.target, point: force.point, force: force.force, color });
         }
     }
 }
@@ -257,7 +260,7 @@ fn record(figures: Res<Figures>, meters: Res<Meters>, mut scalars: ResMut<RerunS
     if !figures.joined {
         return;
     }
-    for (name, meter) in [("streamed", &meters.streamed), ("own hand first", &meters.own_hand)] {
+    for (name, meter) in [("streamed", &meters.streamed), ("own hand first", &meters.predicted_hand)] {
         scalars.set(format!("error/{name}"), "%", meter.percent(meter.now));
     }
     scalars.set("error/streamed, rms", "%", meters.streamed.percent(meters.streamed.rms()));

@@ -43,7 +43,7 @@ pub struct Meters {
     pub streamed: Meter,
     /// The newer copy that is shown while the own hand holds the body, against what the host made of its tick later. What the other's hand did
     /// on the way nobody here could know.
-    pub own_hand: Meter,
+    pub predicted_hand: Meter,
     /// The streamed body at those same moments, had it been shown instead: what waiting for the host's word would have cost.
     pub waiting: Meter,
     /// Largest reaction that this guest's own hand felt, N.
@@ -53,7 +53,7 @@ pub struct Meters {
 impl Meters {
     /// Compares all that was shown with the host's shapes of the same ticks, as far as the host is.
     pub fn compare(&mut self, model: &ModalModel, truth: &Truth) {
-        for meter in [&mut self.streamed, &mut self.own_hand, &mut self.waiting] {
+        for meter in [&mut self.streamed, &mut self.predicted_hand, &mut self.waiting] {
             meter.compare(model, truth);
         }
     }

@@ -39,7 +39,7 @@ pub fn print(options: &Options, host: &HostReport, you: &GuestReport, other: &Gu
     };
     errors("streamed error", &|g| g.meters.streamed.clone());
     println!("while the own hand holds it, against what the host made of that tick later:");
-    errors("  own hand first", &|g| g.meters.own_hand.clone());
+    errors("  own hand first", &|g| g.meters.predicted_hand.clone());
     errors("  had it waited for the host", &|g| g.meters.waiting.clone());
     row("largest reaction, N", &|g| format!("{:.2}", g.meters.reaction));
     println!(

@@ -83,7 +83,7 @@ fn dress(
 fn ghost_follows(
     truth: Res<Truth>,
     on: Res<GhostOn>,
-    mut ghosts: Query<(&mut ShownState, &mut Visibility), With<Ghost>>,
+    mut ghosts: Query<(&mut VisualState, &mut Visibility), With<Ghost>>,
 ) {
     for (mut shown, mut visibility) in &mut ghosts {
         visibility.set_if_neq(if on.0 { Visibility::Inherited } else { Visibility::Hidden });
@@ -125,8 +125,8 @@ fn draw_hands(mut gizmos: Gizmos, bodies: Query<(&HeldBy, &BodyState), With<Gues
         let size = state.model().size() as f32;
         for hand in &held.0 {
             let (target, point) = (hand.target.as_vec3(), hand.point.as_vec3());
-            gizmos.sphere(target, 0.02 * size, hand.colour);
-            gizmos.line(target, point, hand.colour);
+            gizmos.sphere(target, 0.02 * size, hand.color);
+            gizmos.line(target, point, hand.color);
             let force = hand.force.as_vec3();
             if force.length() > 0.05 {
                 // Fifty newtons are a body's length; what is stronger is drawn no longer.
@@ -165,7 +165,7 @@ pub struct DrawnHand {
     pub target: bevy::math::DVec3,
     pub point: bevy::math::DVec3,
     pub force: bevy::math::DVec3,
-    pub colour: Color,
+    pub color: Color,
 }
 
 /// The hands on a body as this guest knows them.

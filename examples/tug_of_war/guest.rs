@@ -112,7 +112,7 @@ fn pull(
 
 fn tell(
     other: Res<Other>,
-    bodies: Query<&ShownState, With<RemoteBody>>,
+    bodies: Query<&VisualState, With<RemoteBody>>,
     hands: Query<(&Grab, &GrabForce)>,
     mut exit: MessageWriter<AppExit>,
 ) {

@@ -2,7 +2,7 @@
 //! the arrow keys. Each half shows what its user sees, and the right one is a whole guest of its own, on a thread, over QUIC.
 //!
 //! What to learn here: the host plays in its own session; two views of one body agree although one of them is 200 ms and 9 % of its packets away; a
-//! body that somebody else moves is drawn by [`ShownState::snap`].
+//! body that somebody else moves is drawn by [`VisualState::snap`].
 //!
 //! ```sh
 //! cargo run --release --example tug_of_war
@@ -188,7 +188,7 @@ fn steer(
 }
 
 /// What the guest shows is shown on the right.
-fn mirror(other: Res<Other>, mut bodies: Query<&mut ShownState, With<Mirrored>>) {
+fn mirror(other: Res<Other>, mut bodies: Query<&mut VisualState, With<Mirrored>>) {
     let seen = other.seen();
     for mut shown in &mut bodies {
         // One that rests is not drawn anew.
@@ -231,7 +231,7 @@ const LONG: f64 = 1.5;
 
 fn score(
     time: Res<Time>,
-    bodies: Query<(&BodyState, &ShownState), With<SharedBody>>,
+    bodies: Query<(&BodyState, &VisualState), With<SharedBody>>,
     forces: Query<(&GrabForce, Has<HandOf>), With<Grab>>,
     links: Query<&UserLink, (With<User>, Without<Yourself>)>,
     other: Res<Other>,

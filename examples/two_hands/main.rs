@@ -34,7 +34,7 @@ use stage::{Readout, Stage};
 /// Ticks of the simulation a second.
 const RATE: f64 = 120.0;
 
-/// The hands: where they take hold, and their colours.
+/// The hands: where they take hold, and their colors.
 const SIDES: [(&str, Vec3, Color); 2] = [
     ("left", Vec3::new(-1.0, 0.55, 0.0), Color::srgb(0.30, 0.65, 1.0)),
     ("right", Vec3::new(1.0, 0.55, 0.0), Color::srgb(0.95, 0.35, 0.3)),
@@ -93,7 +93,7 @@ fn run(options: Arguments) -> Result<AppExit, Box<dyn Error>> {
         Ok((id, opened.mover, force_scale))
     };
     let hands = [add(options.left)?, add(options.right)?];
-    let traces = hands.iter().zip(SIDES).map(|((id, ..), (.., colour))| Trace::new(*id, colour)).collect();
+    let traces = hands.iter().zip(SIDES).map(|((id, ..), (.., color))| Trace::new(*id, color)).collect();
     app.insert_resource(Time::<Fixed>::from_hz(RATE))
         .insert_resource(Traces { top: 6.0, traces })
         .insert_resource(Hands { hands, modal: options.modal })
@@ -121,7 +121,7 @@ fn hold_out(
     bodies: Query<(&BodyState, &GlobalTransform), Added<BodyState>>,
 ) {
     let Ok((state, place)) = bodies.single() else { return };
-    for ((device, _, force_scale), (side, toward, colour)) in hands.hands.iter().zip(SIDES) {
+    for ((device, _, force_scale), (side, toward, color)) in hands.hands.iter().zip(SIDES) {
         let along = |p: &&[f32; 3]| Vec3::from(**p).dot(toward);
         let positions = state.model().surface().positions();
         let Some(farthest) = positions.iter().max_by(|a, b| along(a).total_cmp(&along(b))) else { return };
@@ -129,12 +129,7 @@ fn hold_out(
             Name::new(side),
             HapticTool { modal: hands.modal, force_scale: *force_scale, ..HapticTool::new(*device) },
             ToolGrip::default(),
-            ForceArrow {
-                radius: 0.02 * state.model().size() as f32,
-                tool: colour,
-                color: colour,
-                ..default()
-            },
+            ForceArrow { radius: 0.02 * state.model().size() as f32, tool: color, color: color, ..default() },
             Transform::from_translation(place.transform_point(Vec3::from(*farthest))),
         ));
     }

@@ -93,7 +93,7 @@ fuzz_target!(|bytes: &[u8]| {
             guest.on_datagram(now, chunk);
             host.on_datagram(now, PeerId(1), chunk);
         }
-        if let Some(shown) = guest.body(BODY).and_then(|b| b.shown()) {
+        if let Some(shown) = guest.body(BODY).and_then(|b| b.visual()) {
             assert!(shown.is_finite());
         }
     }

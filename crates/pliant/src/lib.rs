@@ -130,10 +130,10 @@ impl PluginGroup for PliantPlugins {
 pub mod prelude {
     pub use crate::PliantPlugins;
     pub use crate::body::{
-        BodyRefused, BodyState, Driven, Grab, GrabForce, GrabOf, Grabs, Integrator, ModalAsset, ModalBody,
-        NoPointerGrab, PliantBodyPlugin, PliantDisplaySystems, PliantSystems, PliantTick, PointerGrab,
-        PointerGrabPlugin, PointerGrabSystems, PointerHeld, Push, Relaxation, ShownState, SingleSteps,
-        StepSettings, Strike,
+        BodyRefused, BodyState, Driven, Grab, GrabForce, GrabOf, Grabs, Impulse, Integrator, ModalAsset,
+        ModalBody, NoPointerGrab, PliantBodyPlugin, PliantDisplaySystems, PliantSystems, PliantTick,
+        PointerGrab, PointerGrabPlugin, PointerGrabSystems, PointerHeld, Push, Relaxation, SingleSteps,
+        StepSettings, VisualState,
     };
     #[cfg(feature = "render")]
     pub use crate::body::{SurfaceDeformation, SurfaceDetail, SurfaceShading};

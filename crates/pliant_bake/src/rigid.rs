@@ -5,14 +5,14 @@ use nalgebra::{Matrix3, SymmetricEigen, Vector3};
 use crate::element::cross;
 use crate::fem::FeMesh;
 
-/// Mass, centre and inertia of the body at rest.
+/// Mass, center and inertia of the body at rest.
 #[derive(Clone, Copy, Debug)]
 pub(crate) struct MassProperties {
     /// kg.
     pub(crate) mass: f64,
     /// m.
     pub(crate) center: [f64; 3],
-    /// About the centre, kg m^2.
+    /// About the center, kg m^2.
     pub(crate) inertia: [[f64; 3]; 3],
 }
 
@@ -48,7 +48,7 @@ impl MassProperties {
     }
 
     /// The six rigid modes at `positions`, mass-normalised, as a block of six columns: three translations, then
-    /// rotations about the principal axes through the centre of mass.
+    /// rotations about the principal axes through the center of mass.
     pub(crate) fn rigid_modes(&self, positions: impl ExactSizeIterator<Item = [f64; 3]>) -> Vec<f64> {
         let inertia = Matrix3::from_fn(|i, j| self.inertia[i][j]);
         let principal = SymmetricEigen::new(inertia);

@@ -128,7 +128,7 @@ pub enum Driven {
     /// This app steps it.
     #[default]
     Local,
-    /// Somebody else writes its [`ShownState`](crate::ShownState) and its grabs' [`GrabForce`](crate::GrabForce): the network, a
+    /// Somebody else writes its [`VisualState`](crate::VisualState) and its grabs' [`GrabForce`](crate::GrabForce): the network, a
     /// recording, a script. It is not stepped here.
     Remote,
 }

@@ -37,19 +37,19 @@ pub enum BodyError {
     /// A step failed; the state before it is kept.
     #[error("the step was refused: {0}")]
     Step(StepError),
-    /// A [`Strike`](crate::Strike) or [`Push`](crate::Push) at a vertex that the body lacks, with a number that is NaN or infinite, or so
+    /// A [`Impulse`](crate::Impulse) or [`Push`](crate::Push) at a vertex that the body lacks, with a number that is NaN or infinite, or so
     /// hard that the body's velocity is no number any more.
     #[error("the blow was refused: {0}")]
     Blow(StepError),
-    /// A [`Strike`](crate::Strike) or [`Push`](crate::Push) at an entity that is no body, or whose model is not there yet.
+    /// A [`Impulse`](crate::Impulse) or [`Push`](crate::Push) at an entity that is no body, or whose model is not there yet.
     #[error("the blow was refused: this entity is no body, or its model is not there yet")]
     NoBody,
-    /// A [`Strike`](crate::Strike) or [`Push`](crate::Push) at a body that somebody else moves.
+    /// A [`Impulse`](crate::Impulse) or [`Push`](crate::Push) at a body that somebody else moves.
     #[error("the blow was refused: this body is driven remotely and is not stepped here")]
     NotLocal,
     /// A shown state with the wrong number of modes.
     #[error("a shown state needs {expected} modal coordinates, got {found}")]
-    ShownLength {
+    VisualLength {
         /// Modes of the body.
         expected: usize,
         /// Coordinates that came.
@@ -57,7 +57,7 @@ pub enum BodyError {
     },
     /// A shown state with a coordinate that is NaN or infinite.
     #[error("modal coordinate {mode} of a shown state must be finite, got {value}")]
-    ShownNotFinite {
+    VisualNotFinite {
         /// The first mode that is not finite.
         mode: usize,
         /// Its value, kg^1/2 m.

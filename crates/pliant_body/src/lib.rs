@@ -16,9 +16,9 @@
 //! | Written by you | Read by you |
 //! | --- | --- |
 //! | [`ModalBody`]: the model and how it is stepped | [`BodyState`]: the simulated body |
-//! | `Transform`: where it is | [`ShownState`]: what is on screen |
+//! | `Transform`: where it is | [`VisualState`]: what is on screen |
 //! | [`Grab`] and [`GrabOf`] on an entity of their own: a hold on a patch | [`GrabForce`]: the reaction, N; [`Grabs`] on the body |
-//! | [`Strike`], [`Push`] as messages: a blow, N s; a force for one tick, N | [`BodyState::body`]: what came of it |
+//! | [`Impulse`], [`Push`] as messages: a blow, N s; a force for one tick, N | [`BodyState::body`]: what came of it |
 //! | [`Driven::Remote`]: somebody else moves it | [`PliantTick`]: the number of the step |
 //! | `SurfaceShading`, `SurfaceDetail`, `SurfaceDeformation`: edges, level of detail, graphics card or processor (feature `render`) | [`BodyRefused`]: what was refused, and why |
 //!
@@ -39,20 +39,20 @@
 mod asset;
 #[cfg(feature = "bake")]
 mod bake;
-mod blow;
 mod body;
 #[cfg(feature = "render")]
 mod deform;
 mod error;
 mod grab;
+mod impulse;
 mod pause;
 mod pick;
 mod pointer;
-mod shown;
 mod step;
 #[cfg(test)]
 mod tests;
 mod under_pointer;
+mod visual;
 
 use bevy::{
     asset::AssetEventSystems,
@@ -66,19 +66,19 @@ pub use asset::{ModalAsset, ModalAssetError, ModalAssetLoader};
 pub use bake::{
     BakeBodyError, BakeFailed, BakePlugin, BakeProgress, BakeRequest, BakeShape, BakeSkin, BakeStage,
 };
-pub use blow::{Push, Strike};
 pub use body::{BodyState, Driven, ModalBody, NoPointerGrab};
 #[cfg(feature = "render")]
 pub use deform::{DrawnSurface, SurfaceDeformation, SurfaceDetail, SurfaceShading};
 pub use error::{BodyError, BodyRefused};
 pub use grab::{Grab, GrabForce, GrabOf, Grabs};
+pub use impulse::{Impulse, Push};
 pub use pause::SingleSteps;
 pub use pick::{SurfaceHit, pick_surface};
 pub use pliant_modal::{Integrator, Relaxation, StepSettings};
 pub use pointer::{PointerGrab, PointerGrabPlugin, PointerGrabSystems, PointerHeld};
-pub use shown::{Pose, ShownState};
 pub use step::PliantTick;
 pub use under_pointer::{PointerHit, UnderPointer};
+pub use visual::{Pose, VisualState};
 
 /// Diagnostic: time of one tick's steps of all bodies that are awake, ms.
 pub const STEP_TIME: DiagnosticPath = DiagnosticPath::const_new("pliant/step");
@@ -92,12 +92,12 @@ pub const DEFORM_TIME: DiagnosticPath = DiagnosticPath::const_new("pliant/deform
 /// A tick, in this order, in the schedule that [`PliantBodyPlugin`] was given. None of it runs while the schedule's time stands still.
 #[derive(SystemSet, Debug, Clone, PartialEq, Eq, Hash)]
 pub enum PliantSystems {
-    /// Places, grabs and blows are taken over. Whoever moves a [`Grab`] or sends a [`Strike`] or [`Push`] once a tick (a script, a session) does
+    /// Places, grabs and blows are taken over. Whoever moves a [`Grab`] or sends a [`Impulse`] or [`Push`] once a tick (a script, a session) does
     /// so before this set.
     Input,
     /// Local bodies are stepped.
     Step,
-    /// [`ShownState`] and [`GrabForce`] are written. Sources of remote bodies call [`ShownState::push`] in this set; readers run after it.
+    /// [`VisualState`] and [`GrabForce`] are written. Sources of remote bodies call [`VisualState::push`] in this set; readers run after it.
     Publish,
 }
 
@@ -156,14 +156,14 @@ impl Plugin for PliantBodyPlugin {
             .register_type::<Pose>()
             .register_type::<PliantTick>()
             .register_type::<BodyState>()
-            .register_type::<ShownState>()
+            .register_type::<VisualState>()
             .register_type::<BodyRefused>()
             .register_type::<SingleSteps>()
-            .register_type::<Strike>()
+            .register_type::<Impulse>()
             .register_type::<Push>()
             .add_message::<BodyRefused>()
             .add_message::<SingleSteps>()
-            .add_message::<Strike>()
+            .add_message::<Impulse>()
             .add_message::<Push>()
             .init_resource::<PliantTick>()
             .insert_resource(step::Stepping { fixed })
@@ -192,10 +192,10 @@ impl Plugin for PliantBodyPlugin {
                 (
                     (
                         step::count_tick,
-                        shown::begin_tick,
+                        visual::begin_tick,
                         step::place_bodies,
                         step::hold_bodies,
-                        blow::hit_bodies,
+                        impulse::hit_bodies,
                     )
                         .chain()
                         .in_set(PliantSystems::Input),
@@ -207,7 +207,7 @@ impl Plugin for PliantBodyPlugin {
             .add_systems(
                 PostUpdate,
                 (
-                    shown::interpolate.in_set(PliantDisplaySystems::Interpolate),
+                    visual::interpolate.in_set(PliantDisplaySystems::Interpolate),
                     // After the transforms are known, so that no body is ever stepped where it is not.
                     step::build_bodies
                         .after(TransformSystems::Propagate)

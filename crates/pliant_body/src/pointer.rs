@@ -30,7 +30,7 @@ pub struct PointerGrab {
     pub button: MouseButton,
     /// Radius of the patch as a part of the model's size (its largest extent). Default: `0.06`.
     pub radius: f64,
-    /// Colour of the target and of the line to it. Default: a warm yellow; nothing is drawn when it is fully transparent.
+    /// Color of the target and of the line to it. Default: a warm yellow; nothing is drawn when it is fully transparent.
     pub color: Color,
 }
 

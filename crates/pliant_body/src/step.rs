@@ -15,7 +15,7 @@ use pliant_modal::{Body, BodyConfig, GrabConfig, ModalModel, Patch, StepError};
 
 use crate::{
     AWAKE_BODIES, BodyError, BodyRefused, BodyState, Driven, Grab, GrabForce, GrabOf, Grabs, ModalAsset,
-    ModalBody, Pose, STEP_TIME, ShownState, body::Held,
+    ModalBody, Pose, STEP_TIME, VisualState, body::Held,
 };
 
 /// The tick: how many steps the schedule of the bodies has made. It counts on while bodies rest, and stands while time is paused.
@@ -91,7 +91,7 @@ pub(crate) fn build_bodies(
                             Some(old) if Arc::ptr_eq(old.model(), model) => carry_over(&name, &old.body, new),
                             _ => new,
                         };
-                        let shown = ShownState::new(new.q());
+                        let shown = VisualState::new(new.q());
                         // Somebody may have despawned it in this very frame.
                         commands
                             .entity(name.entity)
@@ -133,7 +133,7 @@ fn carry_over(name: &NameOrEntityItem, old: &Body, mut new: Body) -> Body {
 /// An entity whose [`ModalBody`] is taken away keeps nothing of the simulation.
 pub(crate) fn drop_states(removed: On<Remove, ModalBody>, mut commands: Commands) {
     if let Ok(mut entity) = commands.get_entity(removed.entity) {
-        entity.try_remove::<(BodyState, ShownState, BuildRefused)>();
+        entity.try_remove::<(BodyState, VisualState, BuildRefused)>();
     }
 }
 
@@ -167,7 +167,7 @@ pub(crate) fn count_tick(mut tick: ResMut<PliantTick>) {
 pub(crate) fn place_bodies(
     mut refusals: Refusals,
     mut bodies: Query<
-        (NameOrEntity, &Transform, &GlobalTransform, &mut BodyState, &mut ShownState),
+        (NameOrEntity, &Transform, &GlobalTransform, &mut BodyState, &mut VisualState),
         With<ModalBody>,
     >,
 ) {
@@ -348,7 +348,7 @@ fn is_relaxing(body: &Body, limit: f64) -> bool {
 }
 
 pub(crate) fn publish(
-    mut bodies: Query<(NameOrEntity, &BodyState, &mut ShownState)>,
+    mut bodies: Query<(NameOrEntity, &BodyState, &mut VisualState)>,
     mut forces: Query<&mut GrabForce>,
 ) {
     for (name, state, mut shown) in &mut bodies {

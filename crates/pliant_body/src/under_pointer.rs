@@ -9,7 +9,7 @@ use bevy::{
     window::PrimaryWindow,
 };
 
-use crate::{BodyState, NoPointerGrab, ShownState, SurfaceHit, pick_surface};
+use crate::{BodyState, NoPointerGrab, SurfaceHit, VisualState, pick_surface};
 
 type Cameras<'w, 's> = Query<
     'w,
@@ -21,7 +21,7 @@ type Cameras<'w, 's> = Query<
 type Touchable = (
     Entity,
     &'static BodyState,
-    &'static ShownState,
+    &'static VisualState,
     &'static GlobalTransform,
     Option<&'static InheritedVisibility>,
     Option<&'static RenderLayers>,
@@ -89,7 +89,7 @@ impl UnderPointer<'_, '_> {
     }
 
     /// The shape of a body that may be under the pointer, and its place.
-    pub(crate) fn shape(&self, body: Entity) -> Option<(&BodyState, &ShownState, &GlobalTransform)> {
+    pub(crate) fn shape(&self, body: Entity) -> Option<(&BodyState, &VisualState, &GlobalTransform)> {
         let (_, state, shown, place, ..) = self.bodies.get(body).ok()?;
         Some((state, shown, place))
     }

@@ -8,7 +8,7 @@ use std::{
 };
 
 use clap::{Args, ValueEnum};
-use pliant_lab::experiment::{Experiment, Figures};
+use pliant_lab::experiment::{Experiment, Metrics};
 use pliant_modal::{Integrator, ModalModel, Relaxation};
 use pliant_stream::{
     Policy, RecoveryConfig,
@@ -105,7 +105,7 @@ struct Told {
 }
 
 impl Told {
-    fn new(recovery: &str, figures: &Figures) -> Self {
+    fn new(recovery: &str, figures: &Metrics) -> Self {
         Self {
             recovery: recovery.into(),
             ticks: figures.ticks,

@@ -6,10 +6,10 @@ use thiserror::Error;
 use crate::{
     Coupling, CouplingConfig, DeviceInfo, Fault, InfoError, LocalModel, ModalLocal, Port, Safety,
     SafetyConfig, Sample, ToolMap, Wanted, Wrench,
-    held::{Change, Felt, Held, When},
-    intake::{Believed, Intake},
+    held_patches::{Change, HeldPatches, PatchForces, When},
     safety::{Slew, clamp_magnitude},
     tool::{Tool, masked},
+    validation::{Believed, SampleValidation},
 };
 
 /// A loop that was not run for longer than this has stalled, s.
@@ -137,11 +137,11 @@ pub struct LoopCore {
     info: DeviceInfo,
     config: LoopConfig,
     coupling: Coupling,
-    intake: Intake,
+    validation: SampleValidation,
     tool: Tool,
     safety: Safety,
     torque: Slew,
-    held: Held,
+    held: HeldPatches,
     /// Last word of the simulation: its tick, when it came, what others had supplied, whether it was finite.
     heard: u64,
     heard_at: f64,
@@ -182,11 +182,11 @@ impl LoopCore {
             Coupling::clamp(&config.coupling, &info, config.rate, config.delay, round_trip)
         };
         Ok(Self {
-            intake: Intake::new(&info),
+            validation: SampleValidation::new(&info),
             tool: Tool::new(config.tool),
             safety: Safety::new(safety, info.mass),
             torque: Slew::default(),
-            held: Held::new(safety.ramp),
+            held: HeldPatches::new(safety.ramp),
             heard: 0,
             heard_at: 0.0,
             supplied: 0.0,
@@ -256,12 +256,12 @@ impl LoopCore {
 
     /// The device was lost: its buttons are up, and where it is next is not a jump. The force fades as for any fault.
     pub fn lose(&mut self) {
-        self.intake.forget();
+        self.validation.forget();
     }
 
     /// A device is there: the first force comes by the ramp.
     pub fn engage(&mut self) {
-        self.intake.forget();
+        self.validation.forget();
         self.safety.engage();
     }
 
@@ -269,13 +269,13 @@ impl LoopCore {
     pub fn tick(&mut self, now: f64, dt: f64, sample: &Sample, model: &LocalModel) -> Wrench {
         let dt = positive(dt);
         let force = self.safety.force().norm();
-        let believed = self.intake.take(now, dt, sample, force);
+        let believed = self.validation.take(now, dt, sample, force);
         self.run(now, dt, believed, model)
     }
 
     /// One period without a sample: what the device said instead.
     pub fn miss(&mut self, now: f64, dt: f64, fault: Fault, model: &LocalModel) -> Wrench {
-        let believed = self.intake.hold(fault);
+        let believed = self.validation.hold(fault);
         self.run(now, positive(dt), believed, model)
     }
 
@@ -304,7 +304,7 @@ impl LoopCore {
             self.held.forces(when, hand.fault.is_none(), &self.tool, model)
         } else {
             self.held.rest();
-            Felt::default()
+            PatchForces::default()
         };
         let scale = self.tool.energy_scale();
         let axes = self.info.force_axes;
@@ -387,7 +387,7 @@ impl LoopCore {
     ///
     /// Beyond that it is only clamped and slewed: its work is not counted at the port, and the stiffness that turns a handle is not held to what the
     /// device closes. So a device that pushes somebody gets none.
-    fn torque_to_hand(&mut self, felt: &Felt, dt: f64, gain: f64, share: f64) -> Vector3<f64> {
+    fn torque_to_hand(&mut self, felt: &PatchForces, dt: f64, gain: f64, share: f64) -> Vector3<f64> {
         if !self.info.simulated || gain <= 0.0 {
             self.torque = Slew::default();
             return Vector3::zeros();

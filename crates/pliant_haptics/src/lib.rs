@@ -46,23 +46,23 @@ mod coupling;
 mod cycle;
 mod device;
 mod find;
-mod follow;
 mod hand;
-mod held;
+mod held_patches;
 mod histogram;
-mod intake;
 #[cfg(feature = "inverse")]
 mod inverse;
 mod local;
 mod modal_local;
-mod pace;
+mod pacing;
 #[cfg(feature = "plugin")]
 mod plugin;
 mod positioned;
+mod proxy;
 mod record;
 mod runner;
 mod safety;
 mod tool;
+mod validation;
 #[cfg(feature = "vendor")]
 mod vendor;
 mod virtual_device;
@@ -71,17 +71,16 @@ pub use core::{LoopConfig, LoopCore, StartError, Tick};
 pub use coupling::{Coupling, CouplingConfig, CouplingLimit};
 pub use cycle::{Cycle, LoopEvent, LoopReport, LoopState, Record, Sink};
 pub use device::{
-    Calibration, DeviceInfo, Fault, HapticDevice, InfoError, Pace, Pacing, Period, Sample, VibrationOutput,
-    Wrench,
+    Calibration, DeviceInfo, Fault, HapticDevice, InfoError, Pacing, Period, Sample, VibrationOutput, Wrench,
 };
 pub use find::{FindConfig, Found, OpenError, find_devices};
 pub use hand::Hand;
 pub use histogram::Histogram;
 #[cfg(feature = "inverse")]
 pub use inverse::{Inverse, InverseConfig, InverseError, Spelling};
-pub use local::{Contact, FeltGrab, HeldGrab, LocalModel, MAX_CONTACTS, ModelWriter};
+pub use local::{Contact, HeldGrab, LocalModel, MAX_CONTACTS, ModelWriter, PublishedGrab};
 pub use modal_local::ModalLocal;
-pub use pace::{LoopClock, RealPace, VirtualPace};
+pub use pacing::{LoopClock, RealPacing, VirtualPacing};
 #[cfg(feature = "render")]
 pub use plugin::ForceArrow;
 #[cfg(feature = "gamepad")]

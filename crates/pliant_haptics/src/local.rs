@@ -91,7 +91,7 @@ pub struct HeldGrab {
 
 /// A grab on a body that is stepped elsewhere: what was published of it.
 #[derive(Debug, Clone, Copy, PartialEq, Default)]
-pub struct FeltGrab {
+pub struct PublishedGrab {
     /// Tells this grab from others, for as long as it lasts.
     pub key: u64,
     /// The held point from the tool point, tool axes, m of the world.
@@ -201,7 +201,7 @@ impl ModelWriter {
     /// grabs: that much it was at least.
     pub fn write_forces(
         &mut self,
-        felt: &[FeltGrab],
+        felt: &[PublishedGrab],
         relaxation: f64,
         stored: f64,
         period: f64,

@@ -8,7 +8,7 @@ use std::sync::{
 use nalgebra::Vector3;
 use pliant_modal::{Coefficients, Integrator};
 
-use crate::{DeviceInfo, Fault, Hand, HapticDevice, InfoError, Pace, Sample, Wrench};
+use crate::{DeviceInfo, Fault, Hand, HapticDevice, InfoError, Pacing, Sample, Wrench};
 
 /// What a virtual device is made of.
 #[derive(Debug, Clone, PartialEq)]
@@ -366,8 +366,8 @@ impl HapticDevice for VirtualDevice {
         self.config.info()
     }
 
-    fn exchange(&mut self, wrench: &Wrench, pace: &mut dyn Pace) -> Result<Sample, Fault> {
-        let period = pace.wait();
+    fn exchange(&mut self, wrench: &Wrench, pacing: &mut dyn Pacing) -> Result<Sample, Fault> {
+        let period = pacing.wait();
         if self.handle.shared.gone.load(Ordering::Relaxed) {
             self.advance([0.0; 3], period.dt);
             return Err(Fault::Gone);

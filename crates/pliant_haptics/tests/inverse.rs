@@ -14,7 +14,7 @@ use std::{
 
 use pliant_haptics::{
     Cycle, Fault, HapticDevice, Inverse, InverseConfig, InverseError, LocalModel, LoopConfig, LoopEvent,
-    RealPace, Sample, Spelling, VirtualPace, Wrench,
+    RealPacing, Sample, Spelling, VirtualPacing, Wrench,
 };
 use serde_json::{Value, json};
 use tungstenite::{Message, WebSocket, accept};
@@ -200,8 +200,8 @@ fn check(text: &str, new: bool, first: bool) -> Result<[f64; 3], String> {
     Ok([number("x")?, number("y")?, number("z")?])
 }
 
-fn pace() -> RealPace {
-    RealPace::new(pliant_haptics::LoopClock::start(), 1000.0)
+fn pacing() -> RealPacing {
+    RealPacing::new(pliant_haptics::LoopClock::start(), 1000.0)
 }
 
 fn second(config: InverseConfig) -> InverseConfig {
@@ -219,7 +219,7 @@ fn both_spellings_and_the_axes() {
         assert_eq!(device.spelling(), want);
         // 1 N right, 2 N up, 3 N toward the user are 1 right, -3 away, 2 up.
         let sample =
-            device.exchange(&Wrench { force: [1.0, 2.0, 3.0], ..Wrench::ZERO }, &mut pace()).unwrap();
+            device.exchange(&Wrench { force: [1.0, 2.0, 3.0], ..Wrench::ZERO }, &mut pacing()).unwrap();
         assert_eq!(service.desk().forces, [[1.0, -3.0, 2.0]]);
         assert_eq!(sample.position, [0.01, 0.03, -0.02]);
         assert_eq!(sample.velocity, Some([0.1, 0.3, -0.2]));
@@ -237,7 +237,7 @@ fn a_wrong_guess_is_put_right() {
     for (inventory, new, want) in [(true, false, Spelling::Values), (false, true, Spelling::Vector)] {
         let service = Service::speaking(inventory, new);
         let mut device = Inverse::open(second(service.config())).unwrap();
-        assert!(device.exchange(&Wrench { force: [1.0, 0.0, 0.0], ..Wrench::ZERO }, &mut pace()).is_ok());
+        assert!(device.exchange(&Wrench { force: [1.0, 0.0, 0.0], ..Wrench::ZERO }, &mut pacing()).is_ok());
         assert_eq!(device.spelling(), want);
         assert_eq!(service.desk().forces, [[1.0, -0.0, 0.0]]);
         assert_eq!(service.desk().refused.len(), 1);
@@ -246,7 +246,7 @@ fn a_wrong_guess_is_put_right() {
     let service = Service::start(true);
     let told = InverseConfig { spelling: Some(Spelling::Values), ..second(service.config()) };
     let mut device = Inverse::open(told).unwrap();
-    assert!(device.exchange(&Wrench::ZERO, &mut pace()).is_err());
+    assert!(device.exchange(&Wrench::ZERO, &mut pacing()).is_err());
     assert_eq!(device.spelling(), Spelling::Values);
 }
 
@@ -257,13 +257,13 @@ fn the_loop_feels_a_spring_through_it() {
     let device = Inverse::open(second(service.config())).unwrap();
     let mut cycle = Cycle::new(device, LoopConfig::default()).unwrap();
     // In virtual time: an answer is in time however long a busy machine takes for it.
-    let mut pace = VirtualPace::new(1000.0);
+    let mut pacing = VirtualPacing::new(1000.0);
     let mut events: Vec<LoopEvent> = Vec::new();
     let mut model = LocalModel { count: 1, period: 0.01, ..LocalModel::default() };
     model.contacts[0].stiffness = [[100.0, 0.0, 0.0], [0.0, 100.0, 0.0], [0.0, 0.0, 100.0]];
     let mut step = |cycle: &mut Cycle<Inverse>, events: &mut Vec<LoopEvent>| {
         model.tick += 1;
-        cycle.step(&mut pace, &model, events);
+        cycle.step(&mut pacing, &model, events);
         cycle.core().last().wrench.force[0]
     };
     for _ in 0..400 {
@@ -301,8 +301,8 @@ fn nonsense_and_silence() {
     let service = Service::start(true);
     let config = second(service.config());
     let mut device = Inverse::open(config.clone()).unwrap();
-    let mut pace = pace();
-    assert!(device.exchange(&Wrench::ZERO, &mut pace).is_ok());
+    let mut pacing = pacing();
+    assert!(device.exchange(&Wrench::ZERO, &mut pacing).is_ok());
     for (nonsense, want) in [
         ("not json", Fault::Malformed),
         ("{\"inverse3\": 3}", Fault::Gone),
@@ -314,14 +314,14 @@ fn nonsense_and_silence() {
         ),
     ] {
         service.desk().say = Some(nonsense.into());
-        assert_eq!(device.exchange(&Wrench::ZERO, &mut pace).unwrap_err(), want, "{nonsense}");
+        assert_eq!(device.exchange(&Wrench::ZERO, &mut pacing).unwrap_err(), want, "{nonsense}");
     }
     service.desk().say = None;
     drop(device);
     let mut device = hasty(&service);
     assert!(answer(&mut device).position[0].abs() < 1e-9);
     service.desk().mute = true;
-    assert_eq!(device.exchange(&Wrench::ZERO, &mut pace).unwrap_err(), Fault::Timeout(HASTE));
+    assert_eq!(device.exchange(&Wrench::ZERO, &mut pacing).unwrap_err(), Fault::Timeout(HASTE));
     drop(device);
     service.desk().mute = false;
     let missing = Inverse::open(InverseConfig { device: Some("FFFF".into()), ..config });
@@ -346,7 +346,7 @@ fn hasty(service: &Service) -> Inverse {
 /// Asks until there is an answer in time. The loop's part: a device that is gone is looked for.
 fn answer(device: &mut Inverse) -> Sample {
     machine::until("an answer in time", || {
-        let answer = device.exchange(&Wrench::ZERO, &mut pace());
+        let answer = device.exchange(&Wrench::ZERO, &mut pacing());
         answer.inspect_err(|_| {
             let _ = device.reopen();
         })
@@ -359,7 +359,7 @@ fn a_late_answer_is_not_taken_for_the_next_one() {
     let mut device = hasty(&service);
     answer(&mut device);
     service.desk().late = true;
-    assert_eq!(device.exchange(&Wrench::ZERO, &mut pace()).unwrap_err(), Fault::Timeout(HASTE));
+    assert_eq!(device.exchange(&Wrench::ZERO, &mut pacing()).unwrap_err(), Fault::Timeout(HASTE));
     service.send_late();
     for k in 1..=100 {
         let x = 1e-4 * f64::from(k);

@@ -250,7 +250,7 @@ fn a_remote_body_that_turns_softer_is_felt_so() {
         HeldBy(s.tool),
         GrabForce { point: at, force: DVec3::ZERO },
     ));
-    s.app.add_systems(PostUpdate, |mut shown: Query<&mut pliant_body::ShownState>| {
+    s.app.add_systems(PostUpdate, |mut shown: Query<&mut pliant_body::VisualState>| {
         for mut shown in &mut shown {
             let q = shown.current().to_vec();
             shown.snap(&q).unwrap();
@@ -310,12 +310,15 @@ fn a_remote_body_is_felt_through_its_published_force_until_the_network_is_gone()
     #[derive(Resource)]
     struct Network(bool);
     s.app.insert_resource(Network(true)).insert_resource(Heard::default());
-    s.app.add_systems(PostUpdate, |network: Res<Network>, mut shown: Query<&mut pliant_body::ShownState>| {
-        for mut shown in shown.iter_mut().filter(|_| network.0) {
-            let q = shown.current().to_vec();
-            shown.snap(&q).unwrap();
-        }
-    });
+    s.app.add_systems(
+        PostUpdate,
+        |network: Res<Network>, mut shown: Query<&mut pliant_body::VisualState>| {
+            for mut shown in shown.iter_mut().filter(|_| network.0) {
+                let q = shown.current().to_vec();
+                shown.snap(&q).unwrap();
+            }
+        },
+    );
     s.app.add_systems(Update, |mut faults: MessageReader<HapticFault>, mut heard: ResMut<Heard>| {
         heard.0.extend(faults.read().filter_map(|f| f.fault));
     });
@@ -378,10 +381,10 @@ fn a_driver_that_panics_is_told_and_lets_go() {
         fn exchange(
             &mut self,
             wrench: &pliant_haptics::Wrench,
-            pace: &mut dyn pliant_haptics::Pace,
+            pacing: &mut dyn pliant_haptics::Pacing,
         ) -> Result<pliant_haptics::Sample, Fault> {
             assert!(!self.1.load(std::sync::atomic::Ordering::Acquire), "the driver's own bug, on purpose");
-            self.0.exchange(wrench, pace)
+            self.0.exchange(wrench, pacing)
         }
         fn safe_stop(&mut self) {
             self.0.safe_stop();

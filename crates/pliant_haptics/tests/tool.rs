@@ -2,8 +2,8 @@
 #![allow(clippy::unwrap_used, clippy::expect_used, clippy::panic, reason = "a failed test should panic")]
 
 use pliant_haptics::{
-    Contact, Coupling, DeviceInfo, FeltGrab, Hand, HapticDevice, LocalModel, LoopConfig, LoopCore,
-    ModelWriter, Sample, ToolMap, VirtualConfig, VirtualDevice,
+    Contact, Coupling, DeviceInfo, Hand, HapticDevice, LocalModel, LoopConfig, LoopCore, ModelWriter,
+    PublishedGrab, Sample, ToolMap, VirtualConfig, VirtualDevice,
 };
 
 #[path = "rig/machine.rs"]
@@ -114,7 +114,7 @@ fn a_body_elsewhere_is_felt_through_what_is_published() {
     let mut writer = ModelWriter::new();
     let mut word = LocalModel::default();
     let stiffness = [[k, 0.0, 0.0], [0.0, k, 0.0], [0.0, 0.0, k]];
-    let felt = |x: f64| FeltGrab { key: 5, point: [x, 0.0, 0.0], stiffness, ..FeltGrab::default() };
+    let felt = |x: f64| PublishedGrab { key: 5, point: [x, 0.0, 0.0], stiffness, ..PublishedGrab::default() };
     writer.write_forces(&[felt(0.0)], relaxation, 0.0, 0.01, 0.0, &mut word);
     assert!(
         (word.contacts()[0].damping - coupling.damping).abs() < 1e-12,
@@ -125,7 +125,7 @@ fn a_body_elsewhere_is_felt_through_what_is_published() {
     assert!((word.contacts()[0].velocity[0] - 0.1).abs() < 1e-12 && word.tick == 2);
     assert!((word.contacts()[0].stiffness[1][1] - k).abs() < 1e-12);
     // The body stores 3 mJ, 1 mJ of it by this hand (1 N over 1 mm into the body): others have put in 2 mJ.
-    let pushed = FeltGrab { force: [-1.0, 0.0, 0.0], ..felt(0.002) };
+    let pushed = PublishedGrab { force: [-1.0, 0.0, 0.0], ..felt(0.002) };
     writer.write_forces(&[pushed], relaxation, 3e-3, 0.01, 0.02, &mut word);
     assert!((word.stored - 3e-3).abs() < 1e-15 && (word.supplied - 2e-3).abs() < 1e-15, "{}", word.supplied);
     assert!(word.partial);

@@ -13,8 +13,8 @@ use std::{
 use libloading::Library;
 use pliant_haptics::{
     Calibration, Cycle, Fault, ForceDimension, ForceDimensionConfig, HapticDevice, LocalModel, LoopClock,
-    LoopConfig, LoopEvent, LoopState, OpenHaptics, OpenHapticsConfig, Pace, Period, RealPace, VendorError,
-    Wrench,
+    LoopConfig, LoopEvent, LoopState, OpenHaptics, OpenHapticsConfig, Pacing, Period, RealPacing,
+    VendorError, Wrench,
 };
 
 #[path = "rig/machine.rs"]
@@ -66,8 +66,8 @@ fn force(library: &Library) -> [f64; 3] {
     [out[0], out[1], out[2]]
 }
 
-fn pace() -> RealPace {
-    RealPace::new(LoopClock::start(), 1000.0)
+fn pacing() -> RealPacing {
+    RealPacing::new(LoopClock::start(), 1000.0)
 }
 
 fn hd(path: &Path) -> OpenHapticsConfig {
@@ -78,7 +78,7 @@ fn hd(path: &Path) -> OpenHapticsConfig {
 #[derive(Default)]
 struct Quick(Period);
 
-impl Pace for Quick {
+impl Pacing for Quick {
     fn wait(&mut self) -> Period {
         self.0 = Period { now: self.0.now + 1e-3, dt: 1e-3, ..Period::default() };
         self.0
@@ -129,7 +129,7 @@ fn open_haptics_units_axes_and_sizes() {
     place(&library, [10.0, -20.0, 30.0], 250.0);
     call!(library, "fake_buttons", fn(c_int), 0b10);
     call!(library, "fake_quarter_turn", fn(),);
-    let sample = device.exchange(&Wrench { force: [0.5, -1.0, 1.5], ..Wrench::ZERO }, &mut pace()).unwrap();
+    let sample = device.exchange(&Wrench { force: [0.5, -1.0, 1.5], ..Wrench::ZERO }, &mut pacing()).unwrap();
     assert_eq!(force(&library), [0.5, -1.0, 1.5]);
     for (got, want) in sample.position.into_iter().zip([0.01, -0.02, 0.03]) {
         assert!((got - want).abs() < 1e-15);
@@ -156,21 +156,21 @@ fn open_haptics_calibration_fault_and_return() {
     let device = OpenHaptics::open(hd(&path)).unwrap();
     let mut cycle = Cycle::new(device, LoopConfig::default()).unwrap();
     let mut events: Vec<LoopEvent> = Vec::new();
-    let mut pace = Quick::default();
+    let mut pacing = Quick::default();
     let mut model = LocalModel { count: 1, period: 0.01, ..LocalModel::default() };
     model.contacts[0].stiffness = [[100.0, 0.0, 0.0], [0.0, 100.0, 0.0], [0.0, 0.0, 100.0]];
     place(&library, [5.0, 0.0, 0.0], 0.0);
     let mut ticks = 0;
     let mut run = |cycle: &mut Cycle<OpenHaptics>, events: &mut Vec<LoopEvent>, seconds: f64| {
-        let start = (pace.last().now, ticks);
-        let until = pace.last().now + seconds;
-        while pace.last().now < until {
+        let start = (pacing.last().now, ticks);
+        let until = pacing.last().now + seconds;
+        while pacing.last().now < until {
             model.tick += 1;
             // The real scheduler waits for its servo tick; the fake does not, and the loop must not spin on it.
-            cycle.step(&mut pace, &model, events);
+            cycle.step(&mut pacing, &model, events);
             ticks += 1;
         }
-        let rate = f64::from(ticks - start.1) / (pace.last().now - start.0);
+        let rate = f64::from(ticks - start.1) / (pacing.last().now - start.0);
         assert!(rate < 2500.0, "at most every other period is short: {rate} Hz");
     };
     run(&mut cycle, &mut events, 0.1);
@@ -240,7 +240,7 @@ fn force_dimension_units_and_axes() {
     // 1 cm toward the user, 2 cm right, 3 cm up.
     place(&library, [0.01, 0.02, 0.03], 0.5);
     call!(library, "fake_turn_up", fn(),);
-    let sample = device.exchange(&Wrench { force: [1.0, 2.0, 3.0], ..Wrench::ZERO }, &mut pace()).unwrap();
+    let sample = device.exchange(&Wrench { force: [1.0, 2.0, 3.0], ..Wrench::ZERO }, &mut pacing()).unwrap();
     assert_eq!(sample.position, [0.02, 0.03, 0.01]);
     assert_eq!(sample.velocity, Some([0.0, 0.0, 0.5]));
     // 1 N right, 2 N up, 3 N toward the user are (3, 1, 2) of theirs.
@@ -264,14 +264,14 @@ fn force_dimension_faults_and_versions() {
     assert!(matches!(device.calibration(), Calibration::Needed(_)));
     call!(library, "fake_reset", fn(c_int), 1);
     assert_eq!(device.calibration(), Calibration::Ready);
-    let mut pace = pace();
+    let mut pacing = pacing();
     call!(library, "fake_gone", fn(c_int), 1);
-    assert_eq!(device.exchange(&Wrench::ZERO, &mut pace).unwrap_err(), Fault::Driver(1009));
+    assert_eq!(device.exchange(&Wrench::ZERO, &mut pacing).unwrap_err(), Fault::Driver(1009));
     assert_eq!(device.reopen().unwrap_err(), Fault::Gone);
-    assert_eq!(device.exchange(&Wrench::ZERO, &mut pace).unwrap_err(), Fault::Gone);
+    assert_eq!(device.exchange(&Wrench::ZERO, &mut pacing).unwrap_err(), Fault::Gone);
     call!(library, "fake_gone", fn(c_int), 0);
     assert!(device.reopen().is_ok());
-    assert!(device.exchange(&Wrench::ZERO, &mut pace).is_ok());
+    assert!(device.exchange(&Wrench::ZERO, &mut pacing).is_ok());
     drop(device);
     let absent = ForceDimension::open(ForceDimensionConfig { index: 3, ..dhd(&path) });
     assert!(matches!(absent, Err(VendorError::Device { code: 1003, .. })), "{absent:?}");
@@ -300,11 +300,11 @@ fn force_dimension_finds_its_reference_by_itself_if_it_is_told_to() {
     assert_eq!((drives(), device.calibration()), (1, Calibration::Ready));
     assert_eq!(call!(library, "fake_driving", fn() -> c_int,), 0);
     assert_eq!(call!(library, "fake_enabled", fn() -> c_int,), 1);
-    assert!(device.exchange(&Wrench { force: [1.0, 2.0, 3.0], ..Wrench::ZERO }, &mut pace()).is_ok());
+    assert!(device.exchange(&Wrench { force: [1.0, 2.0, 3.0], ..Wrench::ZERO }, &mut pacing()).is_ok());
     assert_eq!(force(&library), [3.0, 1.0, 2.0]);
     // Pulled out and put back, it has forgotten, and finds it again.
     call!(library, "fake_gone", fn(c_int), 1);
-    assert!(device.exchange(&Wrench::ZERO, &mut pace()).is_err());
+    assert!(device.exchange(&Wrench::ZERO, &mut pacing()).is_err());
     call!(library, "fake_reset", fn(c_int), 0);
     call!(library, "fake_gone", fn(c_int), 0);
     assert!(device.reopen().is_ok());

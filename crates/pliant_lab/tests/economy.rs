@@ -7,7 +7,7 @@ use std::time::Duration;
 
 use pliant_lab::pair::PathConfig;
 use pliant_stream::emulator::LinkConfig;
-use pliant_stream::{EndReason, GuestConfig, GuestEvent, HostConfig, PeerId, RecoveryConfig};
+use pliant_stream::{DisconnectReason, GuestConfig, GuestEvent, HostConfig, PeerId, RecoveryConfig};
 use support::bar;
 use support::scene::{BODY, MS, S, cached, circling, path_for, start, start_with};
 
@@ -35,7 +35,7 @@ fn resting_body_sends_next_to_nothing_and_wakes_right() {
         assert!(sent <= 21, "{name}: {sent} datagrams in 10 s of rest, clock answers only");
         let view = pair.guests[0].session.body(BODY).unwrap();
         assert!(view.is_resting() && !view.is_stalled());
-        let shown = &view.shown().unwrap().q;
+        let shown = &view.visual().unwrap().q;
         let rest: f64 = still.q.iter().zip(shown).map(|(a, b)| (a - b).powi(2)).sum::<f64>().sqrt();
         assert!(rest < 1e-6 * scene.size(), "{name}: {rest}");
         scene.resting = false;
@@ -84,7 +84,7 @@ fn weak_guests_take_fewer_modes_and_small_paths_fewer_still() {
     pair.join_with(paper.clone(), path, 3, cached(&model)).unwrap();
     pair.join_with(paper, thin, 4, cached(&model)).unwrap();
     pair.run_until(4 * S, &mut scene);
-    let modes = |k: usize| pair.guests[k].session.body(BODY).unwrap().shown().unwrap().modes();
+    let modes = |k: usize| pair.guests[k].session.body(BODY).unwrap().visual().unwrap().modes();
     assert_eq!(modes(0), 12);
     assert_eq!(modes(1), 500, "the force stream carries any number of modes");
     assert_eq!(
@@ -101,10 +101,10 @@ fn weak_guests_take_fewer_modes_and_small_paths_fewer_still() {
     // And when the path shrinks while streaming.
     pair.host.set_max_datagram(PeerId(3), 300);
     pair.run_until(6 * S, &mut scene);
-    assert_eq!(pair.guests[2].session.body(BODY).unwrap().shown().unwrap().modes(), 91);
+    assert_eq!(pair.guests[2].session.body(BODY).unwrap().visual().unwrap().modes(), 91);
     pair.host.set_max_datagram(PeerId(3), 100);
     pair.run_until(7 * S, &mut scene);
-    assert!(scene.saw(2, |e| matches!(e, GuestEvent::Closed { reason: EndReason::Path })));
+    assert!(scene.saw(2, |e| matches!(e, GuestEvent::Closed { reason: DisconnectReason::Path })));
 }
 
 #[test]

@@ -7,14 +7,14 @@ mod support;
 use std::fmt::Write as _;
 use std::time::Duration;
 
-use pliant_lab::experiment::{Experiment, Figures};
+use pliant_lab::experiment::{Experiment, Metrics};
 use pliant_modal::Integrator;
 use pliant_stream::emulator::{LinkConfig, Loss};
 use pliant_stream::wire::AccelerationCoding;
 use pliant_stream::{Newmark, Predict, RecoveryConfig};
 use support::bar;
 
-fn run(lost: &[u64], mut recovery: RecoveryConfig) -> Figures {
+fn run(lost: &[u64], mut recovery: RecoveryConfig) -> Metrics {
     recovery.coding = AccelerationCoding::F64;
     let loss = Loss::Listed(lost.to_vec());
     let link = LinkConfig { delay: Duration::from_millis(10), loss, ..Default::default() };
@@ -31,7 +31,7 @@ fn run(lost: &[u64], mut recovery: RecoveryConfig) -> Figures {
 const WIDE: f64 = 900.0;
 const HIGH: f64 = 170.0;
 
-fn panel(out: &mut String, top: f64, title: &str, curves: &[(&str, &str, &Figures)]) {
+fn panel(out: &mut String, top: f64, title: &str, curves: &[(&str, &str, &Metrics)]) {
     let first = curves[0].2.track[0].0;
     let scale = curves[0].2.track.iter().map(|t| t.1.abs()).fold(1e-9, f64::max);
     let x = |tick: u64| 60.0 + (tick - first) as f64 / 740.0 * (WIDE - 80.0);
@@ -49,15 +49,15 @@ fn panel(out: &mut String, top: f64, title: &str, curves: &[(&str, &str, &Figure
         writeln!(out, r##"<line x1="60" x2="{:.0}" y1="{at:.1}" y2="{at:.1}" stroke="#eee"/>"##, WIDE - 20.0)
             .unwrap();
     }
-    let mut line = |colour: &str, dash: &str, points: &mut dyn Iterator<Item = (u64, f64)>| {
+    let mut line = |color: &str, dash: &str, points: &mut dyn Iterator<Item = (u64, f64)>| {
         let mut d = String::new();
         for (tick, u) in points {
             write!(d, "{:.1},{:.1} ", x(tick), y(u)).unwrap();
         }
-        writeln!(out, r#"<polyline fill="none" stroke="{colour}" stroke-width="1.3" stroke-dasharray="{dash}" points="{d}"/>"#).unwrap();
+        writeln!(out, r#"<polyline fill="none" stroke="{color}" stroke-width="1.3" stroke-dasharray="{dash}" points="{d}"/>"#).unwrap();
     };
-    for (_, colour, f) in curves {
-        line(colour, "", &mut f.track.iter().map(|t| (t.0, t.2)));
+    for (_, color, f) in curves {
+        line(color, "", &mut f.track.iter().map(|t| (t.0, t.2)));
     }
     line("#000", "4 3", &mut curves[0].2.track.iter().map(|t| (t.0, t.1)));
 }
@@ -84,24 +84,24 @@ fn draw() {
         let height = 40.0 + 3.0 * (HIGH + 34.0) + 20.0;
         writeln!(svg, r#"<svg xmlns="http://www.w3.org/2000/svg" width="{WIDE}" height="{height}" font-family="sans-serif">"#).unwrap();
         writeln!(svg, r#"<rect width="100%" height="100%" fill="white"/>"#).unwrap();
-        let colours = [
+        let colors = [
             ("zero", "#d95f02", Predict::Zero),
             ("hold", "#1b9e77", Predict::Hold),
             ("linear", "#7570b3", Predict::Linear),
         ];
         let mut x = 60.0;
-        for (name, colour) in [("without loss (dashed)", "#000"), ("not compensated", "#e7298a")]
+        for (name, color) in [("without loss (dashed)", "#000"), ("not compensated", "#e7298a")]
             .into_iter()
-            .chain(colours.map(|c| (c.0, c.1)))
+            .chain(colors.map(|c| (c.0, c.1)))
         {
-            writeln!(svg, r#"<text x="{x}" y="18" font-size="12" fill="{colour}">{name}</text>"#).unwrap();
+            writeln!(svg, r#"<text x="{x}" y="18" font-size="12" fill="{color}">{name}</text>"#).unwrap();
             x += 9.0 * name.len() as f64 + 20.0;
         }
         let none = run(&lost, RecoveryConfig::none());
         panel(&mut svg, 50.0, &format!("{title}: not compensated"), &[("none", "#e7298a", &none)]);
         for (k, blend) in [1, 50].into_iter().enumerate() {
-            let runs = colours.map(|c| run(&lost, RecoveryConfig::paper_with(c.2, blend)));
-            let curves: Vec<_> = colours.iter().zip(&runs).map(|(c, f)| (c.0, c.1, f)).collect();
+            let runs = colors.map(|c| run(&lost, RecoveryConfig::paper_with(c.2, blend)));
+            let curves: Vec<_> = colors.iter().zip(&runs).map(|(c, f)| (c.0, c.1, f)).collect();
             for (name, _, f) in &curves {
                 assert!(f.end_percent < 1e-7, "{name} blend {blend} ends at {} %", f.end_percent);
             }

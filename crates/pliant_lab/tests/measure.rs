@@ -9,7 +9,7 @@ mod support;
 use std::sync::{Arc, OnceLock};
 use std::time::{Duration, Instant};
 
-use pliant_lab::experiment::{Experiment, Figures};
+use pliant_lab::experiment::{Experiment, Metrics};
 use pliant_modal::{Integrator, ModalModel};
 use pliant_stream::emulator::{LinkConfig, Loss, Preset};
 use pliant_stream::peer::Repair;
@@ -41,7 +41,7 @@ fn body() -> Arc<ModalModel> {
     BODY.get_or_init(made).clone()
 }
 
-fn run(link: &LinkConfig, policy: &str, seconds: f64, seed: u64) -> Figures {
+fn run(link: &LinkConfig, policy: &str, seconds: f64, seed: u64) -> Metrics {
     let mut e = Experiment::new(body(), link.clone(), RecoveryConfig::by_name(policy).unwrap());
     (e.seconds, e.seed) = (seconds, seed);
     e.cpu_clock = Some(clock);
@@ -52,7 +52,7 @@ fn run(link: &LinkConfig, policy: &str, seconds: f64, seed: u64) -> Figures {
     e.run().unwrap()
 }
 
-fn run_peers(link: &LinkConfig, repair: Repair, seconds: f64) -> Figures {
+fn run_peers(link: &LinkConfig, repair: Repair, seconds: f64) -> Metrics {
     let mut e = Experiment::new(body(), link.clone(), RecoveryConfig::default());
     e.seconds = seconds;
     e.cpu_clock = Some(clock);
@@ -64,7 +64,7 @@ fn clock() -> Duration {
     START.get_or_init(Instant::now).elapsed()
 }
 
-fn show(name: &str, f: &Figures) {
+fn show(name: &str, f: &Metrics) {
     println!(
         "{name:<26} lost {:>4} guessed {:>4} rms {:.4}% max {:.3}% end {:.1e}% hidden {:.1e}% force {:.3}% ringing {:.4} (true {:.4}) \
          delay {:.0} ms hand-force {:.0} ms recover {:.0} ms {:.0} B {:.1} kbit/s {:.1} us/tick",
@@ -86,7 +86,7 @@ fn show(name: &str, f: &Figures) {
     );
 }
 
-fn hold_bars(name: &str, seed: u64, f: &Figures, rms: f64, max: f64) {
+fn hold_bars(name: &str, seed: u64, f: &Metrics, rms: f64, max: f64) {
     assert!(f.rms_percent <= rms, "{name}, seed {seed}: rms {} % above {rms} %", f.rms_percent);
     assert!(f.max_percent <= max, "{name}, seed {seed}: max {} % above {max} %", f.max_percent);
     assert!(f.kbit_s <= 100.0, "{name}, seed {seed}: {} kbit/s", f.kbit_s);
@@ -193,9 +193,9 @@ fn papers_figures_end_without_error() {
 }
 
 /// The worst of many seeds, two at a time.
-fn worst(link: &LinkConfig, policy: &str, seconds: f64, seeds: u64) -> Figures {
+fn worst(link: &LinkConfig, policy: &str, seconds: f64, seeds: u64) -> Metrics {
     let next = std::sync::atomic::AtomicU64::new(1);
-    let worst = std::sync::Mutex::new(Figures::default());
+    let worst = std::sync::Mutex::new(Metrics::default());
     std::thread::scope(|scope| {
         for _ in 0..2 {
             scope.spawn(|| {
@@ -237,7 +237,7 @@ fn default_policy_holds_its_bars_for_ten_minutes_on_many_seeds() {
         "| network | policy | rms % | max % | end % | above 0.5 % ms | force rms % | ringing | true | kbit/s |"
     );
     println!("| --- | --- | --- | --- | --- | --- | --- | --- | --- | --- |");
-    let line = |name: &str, policy: &str, f: &Figures| {
+    let line = |name: &str, policy: &str, f: &Metrics| {
         println!(
             "| {name} | {policy} | {:.4} | {:.3} | {:.1e} | {:.0} | {:.3} | {:.4} | {:.4} | {:.1} |",
             f.rms_percent,
@@ -346,7 +346,7 @@ fn cost_of_a_tick() {
             .collect();
         let (id, settings) = (BodyId(1), StepSettings::default());
         let mut encoder =
-            Encoder::new(id, model.clone(), &settings, newmark, recovery.wish(None), 1200).unwrap();
+            Encoder::new(id, model.clone(), &settings, newmark, recovery.subscription(None), 1200).unwrap();
         let mut receiver: Option<Receiver> = None;
         let (mut encode, mut decode) = (Vec::new(), Vec::new());
         let mut chance = 88_172_645_463_325_252;

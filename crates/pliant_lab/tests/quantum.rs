@@ -5,12 +5,12 @@ mod support;
 
 use std::time::Duration;
 
-use pliant_lab::experiment::{Experiment, Figures};
+use pliant_lab::experiment::{Experiment, Metrics};
 use pliant_stream::RecoveryConfig;
 use pliant_stream::emulator::LinkConfig;
 use support::bar;
 
-fn run(change: impl Fn(&mut Experiment)) -> Figures {
+fn run(change: impl Fn(&mut Experiment)) -> Metrics {
     let link = LinkConfig { delay: Duration::from_millis(10), ..Default::default() };
     let mut e = Experiment::new(bar(6, 0.05), link, RecoveryConfig::default());
     e.seconds = 5.0;

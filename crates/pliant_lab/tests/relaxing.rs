@@ -92,7 +92,8 @@ fn wrong_flow(recovery: &RecoveryConfig, ticks: u64) -> Vec<(f64, f64)> {
     let (beta, gamma) = integrator.newmark().unwrap_or((4.0 / 9.0, 5.0 / 6.0));
     let newmark = Newmark { h: H, beta, gamma };
     let mut encoder =
-        Encoder::new(BodyId(1), model.clone(), &settings, newmark, recovery.wish(None), 1200).unwrap();
+        Encoder::new(BodyId(1), model.clone(), &settings, newmark, recovery.subscription(None), 1200)
+            .unwrap();
     let mut receiver: Option<Receiver> = None;
     let mut errors = Vec::new();
     for tick in 1..=200 + ticks {
@@ -129,7 +130,8 @@ fn wrong_flow(recovery: &RecoveryConfig, ticks: u64) -> Vec<(f64, f64)> {
         receiver.advance();
         let distance = |of: fn(&State) -> &Vec<f64>, truth: &[f64]| {
             let size = truth.iter().map(|x| x * x).sum::<f64>().sqrt();
-            of(receiver.hidden()).iter().zip(truth).map(|(a, b)| (a - b).powi(2)).sum::<f64>().sqrt() / size
+            of(receiver.confirmed()).iter().zip(truth).map(|(a, b)| (a - b).powi(2)).sum::<f64>().sqrt()
+                / size
         };
         errors.push((distance(|s| &s.q, q), distance(|s| &s.z, z)));
     }
@@ -168,7 +170,7 @@ fn a_guest_joins_follows_rests_and_feels_a_relaxing_body() {
     pair.run_until(20 * S, &mut scene);
     let worst = scene.worst / scene.size();
     assert!(worst < 0.05, "{worst}");
-    let own = pair.guests[0].session.body(BODY).unwrap().own_hand().expect("it holds the body");
+    let own = pair.guests[0].session.body(BODY).unwrap().predicted_hand().expect("it holds the body");
     // The copy is ahead by the round trip: its reaction against the host's of the same tick, a slow hand's.
     let truth = scene.body.reaction(scene.grabs[0].1).unwrap();
     let felt = own.reaction(0).unwrap();
@@ -177,7 +179,7 @@ fn a_guest_joins_follows_rests_and_feels_a_relaxing_body() {
     println!("worst {worst:.4}, own reaction off by {:.3} of {size:.2} N", off / size);
     assert!(off < 0.3 * size, "{felt:?} and {truth:?}");
     let view = pair.guests[1].session.body(BODY).unwrap();
-    assert!(view.hidden().unwrap().z.iter().any(|z| *z != 0.0));
+    assert!(view.confirmed().unwrap().z.iter().any(|z| *z != 0.0));
     assert_eq!(view.counts().mismatches, 0, "the checksum counts the flow");
     assert!(pair.now() >= Duration::from_secs(20));
 }

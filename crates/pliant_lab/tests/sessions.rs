@@ -9,8 +9,8 @@ use pliant_lab::pair::{Pair, PathConfig, World};
 use pliant_modal::{Body, BodyConfig};
 use pliant_stream::emulator::LinkConfig;
 use pliant_stream::{
-    BodyId, EndReason, GuestConfig, GuestEvent, GuestSession, HostConfig, HostEvent, HostSession, PeerId,
-    StepSettings, UserId,
+    BodyId, DisconnectReason, GuestConfig, GuestEvent, GuestSession, HostConfig, HostEvent, HostSession,
+    PeerId, StepSettings, UserId,
 };
 use support::bar;
 use support::scene::{BODY, MS, S, Scene, cached, circling, paper1, start, start_with};
@@ -67,8 +67,10 @@ fn goodbyes_and_bodies_that_go() {
     assert!(scene.saw(0, |e| matches!(e, GuestEvent::BodyGone { body: BodyId(9) })));
     pair.guests[0].session.leave();
     pair.run_until(6 * S, &mut scene);
-    assert!(scene.host_events.iter().any(|e| matches!(e, HostEvent::Left { reason: EndReason::Left, .. })));
-    assert!(scene.saw(0, |e| matches!(e, GuestEvent::Closed { reason: EndReason::Left })));
+    assert!(
+        scene.host_events.iter().any(|e| matches!(e, HostEvent::Left { reason: DisconnectReason::Left, .. }))
+    );
+    assert!(scene.saw(0, |e| matches!(e, GuestEvent::Closed { reason: DisconnectReason::Left })));
     assert!(scene.grabs.is_empty(), "a guest's grabs end with it");
 }
 
@@ -103,7 +105,7 @@ fn a_closed_house_asks_before_it_lets_in() {
     }
     pair.run_until(3 * S, &mut door);
     assert!(pair.guests[0].session.body(BODY).unwrap().is_ready());
-    assert!(door.0.saw(1, |e| matches!(e, GuestEvent::Closed { reason: EndReason::Refused })));
+    assert!(door.0.saw(1, |e| matches!(e, GuestEvent::Closed { reason: DisconnectReason::Refused })));
 }
 
 #[test]
@@ -116,7 +118,7 @@ fn the_same_seed_gives_the_same_session() {
         pair.run_until(6 * S, &mut scene);
         let g = &pair.guests[0];
         let bits: Vec<u64> =
-            g.session.body(BODY).unwrap().shown().unwrap().q.iter().map(|q| q.to_bits()).collect();
+            g.session.body(BODY).unwrap().visual().unwrap().q.iter().map(|q| q.to_bits()).collect();
         (g.down.hash(), g.up.hash(), bits)
     };
     assert_eq!(go(1), go(1));
@@ -166,7 +168,7 @@ fn guest_that_is_killed_is_let_go_with_its_grabs() {
         scene
             .host_events
             .iter()
-            .any(|e| matches!(e, HostEvent::Left { peer: PeerId(1), reason: EndReason::Silent, .. }))
+            .any(|e| matches!(e, HostEvent::Left { peer: PeerId(1), reason: DisconnectReason::Silent, .. }))
     );
     assert!(scene.saw(1, |e| matches!(e, GuestEvent::UserLeft { user: UserId(1) })));
     assert_eq!(pair.guests[1].session.user(), Some(UserId(2)));

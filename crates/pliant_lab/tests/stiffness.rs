@@ -35,7 +35,7 @@ fn after_a_change(told: bool, scale: f64) -> f64 {
     assert_eq!(changes.count(), usize::from(told), "told once");
     let view = pair.guests[0].session.body(BODY).unwrap();
     assert_eq!(view.info().settings.stiffness_scale, if told { scale } else { 1.0 });
-    assert!(view.own_hand().is_some(), "the guest's hand is still on it");
+    assert!(view.predicted_hand().is_some(), "the guest's hand is still on it");
     assert_eq!(scene.grabs.len(), 1, "at the host too");
     assert!(!scene.saw(0, |e| matches!(e, GuestEvent::BodyGone { .. })));
     assert!(pair.guests[0].session.user().is_some(), "and the guest in the session");

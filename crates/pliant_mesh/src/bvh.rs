@@ -29,8 +29,8 @@ struct Node {
     second: u32,
     /// Sum of the triangles' area vectors, m^2, and where it is taken to act.
     area: Vector3<f64>,
-    centre: Vector3<f64>,
-    /// All triangles lie within this distance of `centre`.
+    center: Vector3<f64>,
+    /// All triangles lie within this distance of `center`.
     radius: f64,
 }
 
@@ -54,9 +54,9 @@ pub(crate) struct Closest {
 impl Bvh {
     pub(crate) fn new(triangles: &[Triangle]) -> Self {
         let mut numbers: Vec<u32> = (0..triangles.len() as u32).collect();
-        let centres: Vec<Vector3<f64>> = triangles.iter().map(|t| (t[0] + t[1] + t[2]) / 3.0).collect();
+        let centers: Vec<Vector3<f64>> = triangles.iter().map(|t| (t[0] + t[1] + t[2]) / 3.0).collect();
         let mut nodes = Vec::with_capacity(triangles.len());
-        build(&mut nodes, triangles, &centres, &mut numbers, 0);
+        build(&mut nodes, triangles, &centers, &mut numbers, 0);
         let triangles = numbers.iter().map(|&n| triangles[n as usize]).collect();
         Self { nodes, triangles, numbers }
     }
@@ -109,7 +109,7 @@ impl Bvh {
             top -= 1;
             let index = stack[top];
             let node = &self.nodes[index as usize];
-            let away = node.centre - p;
+            let away = node.center - p;
             let squared = away.norm_squared();
             if squared > (FAR * node.radius).powi(2) {
                 angle += node.area.dot(&away) / (squared * squared.sqrt());
@@ -167,7 +167,7 @@ impl Node {
 fn build(
     nodes: &mut Vec<Node>,
     triangles: &[Triangle],
-    centres: &[Vector3<f64>],
+    centers: &[Vector3<f64>],
     numbers: &mut [u32],
     first: usize,
 ) {
@@ -175,37 +175,37 @@ fn build(
     let low = corners().fold(Vector3::repeat(f64::INFINITY), |a, b| a.inf(&b));
     let high = corners().fold(Vector3::repeat(f64::NEG_INFINITY), |a, b| a.sup(&b));
     let mut area = Vector3::zeros();
-    let (mut centre, mut weight) = (Vector3::zeros(), 0.0);
+    let (mut center, mut weight) = (Vector3::zeros(), 0.0);
     for &n in numbers.iter() {
         let [a, b, c] = triangles[n as usize];
         let vector = 0.5 * (b - a).cross(&(c - a));
         area += vector;
-        centre += vector.norm() * centres[n as usize];
+        center += vector.norm() * centers[n as usize];
         weight += vector.norm();
     }
-    let centre = if weight > 0.0 { centre / weight } else { (low + high) / 2.0 };
-    let radius = corners().map(|p| (p - centre).norm()).fold(0.0, f64::max);
+    let center = if weight > 0.0 { center / weight } else { (low + high) / 2.0 };
+    let radius = corners().map(|p| (p - center).norm()).fold(0.0, f64::max);
     let index = nodes.len();
     let count = numbers.len();
-    nodes.push(Node { low, high, first: first as u32, count: count as u32, second: 0, area, centre, radius });
+    nodes.push(Node { low, high, first: first as u32, count: count as u32, second: 0, area, center, radius });
     if count <= LEAF {
         return;
     }
     let axis = numbers
         .iter()
-        .map(|&n| centres[n as usize])
+        .map(|&n| centers[n as usize])
         .fold((Vector3::repeat(f64::INFINITY), Vector3::repeat(f64::NEG_INFINITY)), |(l, h), c| {
             (l.inf(&c), h.sup(&c))
         });
     let axis = (axis.1 - axis.0).imax();
     let half = count / 2;
     numbers.select_nth_unstable_by(half, |&a, &b| {
-        centres[a as usize][axis].total_cmp(&centres[b as usize][axis]).then(a.cmp(&b))
+        centers[a as usize][axis].total_cmp(&centers[b as usize][axis]).then(a.cmp(&b))
     });
     let (left, right) = numbers.split_at_mut(half);
-    build(nodes, triangles, centres, left, first);
+    build(nodes, triangles, centers, left, first);
     nodes[index].second = nodes.len() as u32;
-    build(nodes, triangles, centres, right, first + half);
+    build(nodes, triangles, centers, right, first + half);
 }
 
 /// The closest point of a triangle and the part of it on which that lies, by the Voronoi regions of its features

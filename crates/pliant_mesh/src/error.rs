@@ -95,7 +95,7 @@ pub enum MeshError {
         nodes: [u32; 4],
         /// Its signed volume in m^3.
         volume: f64,
-        /// Its centre in m.
+        /// Its center in m.
         at: [f64; 3],
     },
     /// A triangle has no area.
@@ -105,7 +105,7 @@ pub enum MeshError {
         triangle: usize,
         /// Its area in m^2.
         area: f64,
-        /// Its centre in m.
+        /// Its center in m.
         at: [f64; 3],
     },
     /// The surface has holes: edges with a triangle on one side only.

@@ -37,7 +37,7 @@ pub fn cube(cells: usize, side: f64) -> Result<TetMesh, MeshError> {
 /// A ball of `radius` metres around the origin: a cube of `cells` cells to an edge, each concentric cube of it pulled
 /// onto a sphere. Boundary nodes lie on the sphere to rounding.
 ///
-/// The cells are cut along diagonals that point away from the centre, so that no tetrahedron has two of its faces
+/// The cells are cut along diagonals that point away from the center, so that no tetrahedron has two of its faces
 /// on the sphere where an edge of the cube was (they would be nearly coplanar there).
 ///
 /// # Errors

@@ -161,7 +161,7 @@ fn many_bodies() {
     let bodies: Vec<Body> = (0..1_000)
         .map(|k| {
             let mut body = Body::new(model.clone(), BodyConfig::default()).unwrap();
-            body.strike(k % 300, [0.1, 0.2, 0.0]).unwrap();
+            body.apply_impulse(k % 300, [0.1, 0.2, 0.0]).unwrap();
             body
         })
         .collect();

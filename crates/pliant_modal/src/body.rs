@@ -318,15 +318,15 @@ impl Body {
     ///
     /// # Errors
     /// No such grab.
-    pub fn grab_flow(&self, id: GrabId) -> Result<[f64; 3], StepError> {
+    pub fn grab_viscoelastic_state(&self, id: GrabId) -> Result<[f64; 3], StepError> {
         Ok(self.hands[self.find(id)?].flow.into())
     }
 
-    /// Sets what [`grab_flow`](Self::grab_flow) tells; nothing where the material does not relax.
+    /// Sets what [`grab_viscoelastic_state`](Self::grab_viscoelastic_state) tells; nothing where the material does not relax.
     ///
     /// # Errors
     /// No such grab, a number that is not finite.
-    pub fn set_grab_flow(&mut self, id: GrabId, flow: [f64; 3]) -> Result<(), StepError> {
+    pub fn set_grab_viscoelastic_state(&mut self, id: GrabId, flow: [f64; 3]) -> Result<(), StepError> {
         finite("grab flow", &flow)?;
         let index = self.find(id)?;
         if self.config.settings.relaxation.is_some() {
@@ -356,7 +356,7 @@ impl Body {
     /// # Errors
     /// An impulse that is not finite or brings a velocity or an acceleration beyond 1e100, a vertex that is not on the surface; the body
     /// then stays as it was.
-    pub fn strike(&mut self, vertex: u32, impulse: [f64; 3]) -> Result<(), StepError> {
+    pub fn apply_impulse(&mut self, vertex: u32, impulse: [f64; 3]) -> Result<(), StepError> {
         finite("impulse", &impulse)?;
         let impulse = Vector3::from(impulse);
         let mut gained = std::mem::take(&mut self.resisted);
@@ -384,7 +384,7 @@ impl Body {
     }
 
     /// Adds the modal force of a force (N, world axes) on a surface vertex, through the derivative of
-    /// where the vertex is; its arm from the centre of mass in world axes, m.
+    /// where the vertex is; its arm from the center of mass in world axes, m.
     fn press(&self, vertex: u32, force: &Vector3<f64>, modal: &mut [f64]) -> Result<Vector3<f64>, StepError> {
         let model = self.model();
         let surface = model.surface().positions();

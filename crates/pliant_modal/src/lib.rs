@@ -57,7 +57,7 @@ pub use integrator::{Coefficients, Integrator};
 pub use limit::streaming_sum;
 pub use model::{BakeInfo, Damping, Element, FlexibilitySite, ModalModel, ModelHash, ModelParts};
 pub use patch::Patch;
-pub use relaxation::{Flow, Relaxation};
+pub use relaxation::{Relaxation, ViscoelasticCoefficients};
 pub use step::{
     Frame, GrabConfig, Hand, HeldPatch, Hold, ImpliedPulls, Kernel, Load, RigidMotion, State, StepReport,
     StepSettings,

@@ -129,9 +129,9 @@ pub struct ModelParts {
     pub free: bool,
     /// Total mass, kg.
     pub mass: f64,
-    /// Centre of mass at rest, m.
+    /// Center of mass at rest, m.
     pub center_of_mass: [f64; 3],
-    /// Inertia about the centre of mass at rest, kg m^2, symmetric.
+    /// Inertia about the center of mass at rest, kg m^2, symmetric.
     pub inertia: [[f64; 3]; 3],
     /// Residual flexibility of patches spread over the surface; may be empty (the grab then falls back on a contact estimate).
     pub sites: Vec<FlexibilitySite>,
@@ -248,12 +248,12 @@ impl ModalModel {
         self.parts.mass
     }
 
-    /// Centre of mass at rest, m, body axes.
+    /// Center of mass at rest, m, body axes.
     pub fn center_of_mass(&self) -> [f64; 3] {
         self.parts.center_of_mass
     }
 
-    /// Inertia about the centre of mass at rest, kg m^2, body axes.
+    /// Inertia about the center of mass at rest, kg m^2, body axes.
     pub fn inertia(&self) -> [[f64; 3]; 3] {
         self.parts.inertia
     }

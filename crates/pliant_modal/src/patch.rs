@@ -6,7 +6,7 @@ use std::collections::VecDeque;
 
 use crate::{ModelError, SurfaceMesh};
 
-/// Weighted surface vertices around a centre; the weights are positive and sum to one.
+/// Weighted surface vertices around a center; the weights are positive and sum to one.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Patch {
     center: u32,
@@ -17,8 +17,8 @@ pub struct Patch {
 impl Patch {
     /// The patch of `radius` (m) around surface vertex `vertex`, at rest.
     ///
-    /// Weight = area around the vertex x `(1 - d^2 / r^2)^2`, `d` its distance from the centre. Only vertices that are reached over edges
-    /// within the radius count, so that two fingers that touch at rest stay two fingers. A radius below the edge length leaves the centre alone.
+    /// Weight = area around the vertex x `(1 - d^2 / r^2)^2`, `d` its distance from the center. Only vertices that are reached over edges
+    /// within the radius count, so that two fingers that touch at rest stay two fingers. A radius below the edge length leaves the center alone.
     ///
     /// # Errors
     /// A vertex that the surface does not have; a radius that is not finite or is negative.

@@ -63,7 +63,7 @@ impl Relaxation {
 /// z1         = free [q0 v0 a0 f0] + carry z0 + response f1
 /// ```
 #[derive(Debug, Clone, Copy, PartialEq)]
-pub struct Flow {
+pub struct ViscoelasticCoefficients {
     /// What a unit of old flow adds to the new `q`, `v`, `a`.
     pub onto: [f64; 3],
     /// What the old `q`, `v`, `a` and modal force give the new flow.
@@ -74,7 +74,7 @@ pub struct Flow {
     pub response: f64,
 }
 
-impl Flow {
+impl ViscoelasticCoefficients {
     /// The flow after one step from `[q0, v0, a0]` and `z0`, with old force `f0` and new force `f1`.
     #[inline]
     pub fn step(&self, state: [f64; 3], z0: f64, f0: f64, f1: f64) -> f64 {
@@ -105,7 +105,7 @@ impl Coefficients {
         c: f64,
         relaxation: Relaxation,
         h: f64,
-    ) -> Result<(Self, Flow), StepError> {
+    ) -> Result<(Self, ViscoelasticCoefficients), StepError> {
         relaxation.check()?;
         // The elastic mode's checks are this one's.
         Self::new(integrator, omega, c, h)?;
@@ -133,7 +133,7 @@ impl Coefficients {
     }
 }
 
-fn exact(omega: f64, c: f64, relaxation: Relaxation, h: f64) -> (Coefficients, Flow) {
+fn exact(omega: f64, c: f64, relaxation: Relaxation, h: f64) -> (Coefficients, ViscoelasticCoefficients) {
     let Relaxation { ratio, time } = relaxation;
     let k = omega * omega;
     // Coordinates (q, v / s, z) and time in steps: the entries of a fast mode are then comparable.
@@ -154,7 +154,15 @@ fn exact(omega: f64, c: f64, relaxation: Relaxation, h: f64) -> (Coefficients, F
         free: [[q[0], q[1], 0.0, 0.0], [v[0], v[1], 0.0, 0.0], [a[0], a[1], 0.0, 0.0]],
         response: [q[3], v[3], a[3]],
     };
-    (table, Flow { onto: [q[2], v[2], a[2]], free: [z[0], z[1], 0.0, 0.0], carry: z[2], response: z[3] })
+    (
+        table,
+        ViscoelasticCoefficients {
+            onto: [q[2], v[2], a[2]],
+            free: [z[0], z[1], 0.0, 0.0],
+            carry: z[2],
+            response: z[3],
+        },
+    )
 }
 
 fn alpha(
@@ -163,7 +171,7 @@ fn alpha(
     relaxation: Relaxation,
     h: f64,
     [am, af, beta, gamma]: [f64; 4],
-) -> (Coefficients, Flow) {
+) -> (Coefficients, ViscoelasticCoefficients) {
     let k = omega * omega;
     let flowing = k * relaxation.ratio;
     let x = h / relaxation.time;
@@ -190,7 +198,7 @@ fn alpha(
     let q = [1.0 + bh * a[0], h + bh * a[1], ph + bh * a[2], bh * a[3]];
     let v = [gh * a[0], 1.0 + gh * a[1], mh + gh * a[2], gh * a[3]];
     let table = Coefficients { free: [q, v, a], response: [bh * r, gh * r, r] };
-    let flow = Flow {
+    let flow = ViscoelasticCoefficients {
         onto: [bh * a_z, gh * a_z, a_z],
         free: [w0 + w1 * q[0], w1 * q[1], w1 * q[2], w1 * q[3]],
         carry: e + w1 * bh * a_z,

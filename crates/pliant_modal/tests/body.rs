@@ -152,7 +152,7 @@ fn unforced_energy_never_grows() {
             },
         )
         .unwrap();
-        body.strike(tip(), [3.0, 0.0, 0.0]).unwrap();
+        body.apply_impulse(tip(), [3.0, 0.0, 0.0]).unwrap();
         let start = body.energy();
         let mut last = start;
         for _ in 0..5_000 {
@@ -202,7 +202,7 @@ fn bad_numbers_are_refused_and_change_nothing() {
     assert_eq!(body.target(grab).unwrap(), target);
     assert!(body.push(0, [f64::INFINITY, 0.0, 0.0]).is_err());
     assert!(matches!(body.push(9_999, [0.0; 3]), Err(StepError::Vertex { .. })));
-    assert!(body.strike(0, [0.0, f64::NAN, 0.0]).is_err());
+    assert!(body.apply_impulse(0, [0.0, f64::NAN, 0.0]).is_err());
     let mut state = body.state().clone();
     state.q[0] = f64::NAN;
     assert!(body.set_state(&state).is_err());
@@ -239,10 +239,10 @@ fn no_blow_or_push_stops_a_body_for_good() {
     for free in [false, true] {
         let model = Arc::new(rod(1e5, 5, 0.01, free));
         let mut body = Body::new(model, BodyConfig::default()).unwrap();
-        body.strike(tip(), [0.3, 0.2, -0.1]).unwrap();
+        body.apply_impulse(tip(), [0.3, 0.2, -0.1]).unwrap();
         let before = body.state().clone();
         for impulse in [[f64::MAX; 3], [1e308, 0.0, 0.0], [1e160, 0.0, 0.0]] {
-            let error = body.strike(tip(), impulse).unwrap_err();
+            let error = body.apply_impulse(tip(), impulse).unwrap_err();
             assert!(matches!(error, StepError::Input { what: "impulse", .. }), "{error}");
             assert_eq!(*body.state(), before, "what is refused changes nothing");
             body.clone().step().unwrap();
@@ -311,8 +311,8 @@ fn free_flight_keeps_its_momenta_and_two_hands_account_for_every_newton() {
     let model = Arc::new(rod(1e6, 8, 0.01, true));
     let config = BodyConfig { step: 1.0 / 240.0, ..Default::default() };
     let mut body = Body::new(model.clone(), config).unwrap();
-    body.strike(tip(), [3.0, 20.0, -7.0]).unwrap();
-    body.strike(2, [-1.0, 4.0, 9.0]).unwrap();
+    body.apply_impulse(tip(), [3.0, 20.0, -7.0]).unwrap();
+    body.apply_impulse(2, [-1.0, 4.0, 9.0]).unwrap();
     let (p0, l0) = body.momentum();
     for _ in 0..240 * 60 {
         body.step().unwrap();
@@ -392,7 +392,7 @@ fn a_strike_and_a_push_bring_their_momentum_and_its_moment() {
     let impulse = [0.3, -2.0, 0.7];
     let moment =
         |f: [f64; 3]| [at[1] * f[2] - at[2] * f[1], at[2] * f[0] - at[0] * f[2], at[0] * f[1] - at[1] * f[0]];
-    body.strike(tip(), impulse).unwrap();
+    body.apply_impulse(tip(), impulse).unwrap();
     let (p, l) = body.momentum();
     for k in 0..3 {
         assert!((p[k] - impulse[k]).abs() < 1e-9, "{p:?}");

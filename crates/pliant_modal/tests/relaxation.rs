@@ -7,8 +7,8 @@ use std::sync::Arc;
 
 use nalgebra::{Complex, Matrix4, Vector4};
 use pliant_modal::{
-    Body, BodyConfig, Coefficients, Flow, GrabConfig, Integrator, ModalModel, Patch, Relaxation, StepError,
-    StepSettings,
+    Body, BodyConfig, Coefficients, GrabConfig, Integrator, ModalModel, Patch, Relaxation, StepError,
+    StepSettings, ViscoelasticCoefficients,
 };
 use rod::{AREA, DENSITY, LENGTH, rod, tip};
 
@@ -20,12 +20,18 @@ const ALL: [Integrator; 4] = [
 ];
 const HARD: [f64; 5] = [0.0, 1e-9, 0.4, 0.95, 1.0 - 1e-9];
 
-fn made(integrator: Integrator, omega: f64, c: f64, relaxation: Relaxation, h: f64) -> (Coefficients, Flow) {
+fn made(
+    integrator: Integrator,
+    omega: f64,
+    c: f64,
+    relaxation: Relaxation,
+    h: f64,
+) -> (Coefficients, ViscoelasticCoefficients) {
     Coefficients::relaxing(integrator, omega, c, relaxation, h).unwrap()
 }
 
 /// The recurrence as one matrix on `(q, v, a, z)` and what unit forces add, at the old and at the new time.
-fn matrix(made: &(Coefficients, Flow)) -> (Matrix4<f64>, Vector4<f64>, Vector4<f64>) {
+fn matrix(made: &(Coefficients, ViscoelasticCoefficients)) -> (Matrix4<f64>, Vector4<f64>, Vector4<f64>) {
     let (c, f) = made;
     let m = Matrix4::from_fn(|i, j| match (i, j) {
         (3, 3) => f.carry,
@@ -345,12 +351,12 @@ fn the_state_carries_the_flow() {
     }
     assert_eq!(body.z().len(), 8);
     assert!(body.z()[0] > 0.0 && body.z()[0] < body.q()[0]);
-    assert!(body.grab_flow(grab).unwrap()[0] > 0.0);
+    assert!(body.grab_viscoelastic_state(grab).unwrap()[0] > 0.0);
     // A second body that takes over state and grab goes on alike.
     let mut other = Body::new(model.clone(), config).unwrap();
     let hand = other.grab(&tip_patch(&model), GrabConfig::default()).unwrap();
     other.set_state(body.state()).unwrap();
-    other.set_grab_flow(hand, body.grab_flow(grab).unwrap()).unwrap();
+    other.set_grab_viscoelastic_state(hand, body.grab_viscoelastic_state(grab).unwrap()).unwrap();
     other.set_mean_reaction(hand, body.mean_reaction(grab).unwrap()).unwrap();
     other.set_target(hand, body.target(grab).unwrap()).unwrap();
     for _ in 0..30 {
@@ -364,7 +370,7 @@ fn the_state_carries_the_flow() {
     assert!(matches!(body.set_state(&bad), Err(StepError::Input { what: "z", .. })));
     bad.z.clear();
     assert!(matches!(body.set_state(&bad), Err(StepError::Length { what: "z", expected: 8, got: 0 })));
-    assert!(body.set_grab_flow(grab, [f64::NAN, 0.0, 0.0]).is_err());
+    assert!(body.set_grab_viscoelastic_state(grab, [f64::NAN, 0.0, 0.0]).is_err());
     // Elastic again, and back: nothing relaxed is left.
     let held = body.config().clone();
     body.reconfigure(BodyConfig {

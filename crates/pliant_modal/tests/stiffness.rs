@@ -151,7 +151,7 @@ fn a_change_on_the_way_keeps_the_motion_and_the_balance_of_forces() {
     for (relaxation, after) in cases {
         let before = BodyConfig { settings: StepSettings { relaxation, ..plain.settings }, ..plain.clone() };
         let mut body = Body::new(Arc::new(rod(YOUNG, 4, 0.03, false)), before.clone()).unwrap();
-        body.strike(tip(), [0.5, 0.0, 0.0]).unwrap();
+        body.apply_impulse(tip(), [0.5, 0.0, 0.0]).unwrap();
         for _ in 0..37 {
             body.step().unwrap();
         }

@@ -32,7 +32,7 @@
 //! | [`HostConfig`], [`JoinConfig`], [`PeerConfig`] | [`User`], [`UserLink`], [`Hands`]: who is there, how well reached, holding what |
 //! | [`Holding`] on a host's body: whose hands may be on it | [`BodyArrived`], [`BodyLeft`], [`UserJoined`], [`UserLeft`], [`GrabRefused`]: messages |
 //! | [`Interest`] on a guest's body: how many modes it wants | [`SessionJoined`], [`SessionLost`], [`SessionClosed`]: messages |
-//! | | [`SeenHands`] on a guest's bodies: where the others' hands are |
+//! | | [`RemoteHands`] on a guest's bodies: where the others' hands are |
 //!
 //! Whoever is dragged by the pointer, by a script or by a device on a guest's [`Driven::Remote`](pliant_body::Driven::Remote) body makes a
 //! [`Grab`](pliant_body::Grab) as for a body of its own; this plugin sends it and writes the force.
@@ -49,21 +49,21 @@
     allow(clippy::unwrap_used, clippy::expect_used, clippy::panic, reason = "a failed test should panic")
 )]
 
-mod felt;
-mod figures;
 mod guest;
 mod host;
+mod metrics;
+mod patch_kinematics;
 mod peer;
 mod phase;
-mod place;
 mod plugin;
 mod recording;
+mod remote;
 mod scene;
-mod seen;
+mod session_transform;
 pub mod transport;
 mod user;
 
-pub use figures::{
+pub use metrics::{
     DROPPED, JITTER, LOSS_IN, LOSS_OUT, NACKS, NetStats, QUEUE, RATE_IN, RATE_OUT, RECOVERED, ROUND_TRIP,
     SHOWN_OFFSET,
 };
@@ -75,26 +75,26 @@ pub use host::{Holding, HostConfig, NetHost};
 pub use peer::{NetPeer, PeerConfig, PeerState};
 pub use plugin::{NetError, NetPlugin, NetSystems};
 pub use recording::{Recording, RecordingError};
-pub use scene::SharedBody;
-pub use seen::{
-    BodyArrived, BodyLeft, GrabRefused, RemoteBody, SeenHand, SeenHands, SessionClosed, SessionJoined,
+pub use remote::{
+    BodyArrived, BodyLeft, GrabRefused, RemoteBody, RemoteHand, RemoteHands, SessionClosed, SessionJoined,
     SessionLost,
 };
+pub use scene::SharedBody;
 pub use transport::{
     Access, Emulation, Fingerprint, Grant, HostOptions, Identity, Invite, JoinOptions, Role, Token,
 };
-pub use user::{HandOf, Hands, User, UserJoined, UserLeft, UserLink, Yourself, colour_of};
+pub use user::{HandOf, Hands, User, UserJoined, UserLeft, UserLink, Yourself, color_of};
 
 /// What the end of a connection is to the session.
-fn end_of(reason: &transport::CloseReason) -> pliant_stream::EndReason {
-    use pliant_stream::EndReason;
+fn end_of(reason: &transport::CloseReason) -> pliant_stream::DisconnectReason {
+    use pliant_stream::DisconnectReason;
     use transport::CloseReason;
     match reason {
-        CloseReason::ByUs => EndReason::Left,
+        CloseReason::ByUs => DisconnectReason::Left,
         CloseReason::ByPeer { reason, .. } => *reason,
-        CloseReason::TimedOut => EndReason::Silent,
-        CloseReason::Protocol { .. } => EndReason::Protocol,
-        CloseReason::Refused { .. } => EndReason::Refused,
-        _ => EndReason::Lost,
+        CloseReason::TimedOut => DisconnectReason::Silent,
+        CloseReason::Protocol { .. } => DisconnectReason::Protocol,
+        CloseReason::Refused { .. } => DisconnectReason::Refused,
+        _ => DisconnectReason::Lost,
     }
 }

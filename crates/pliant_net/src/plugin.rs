@@ -9,13 +9,13 @@ use bevy::prelude::*;
 use pliant_body::{PliantDisplaySystems, PliantSystems};
 use thiserror::Error;
 
-use crate::figures::{self, NetStats, RateMarks};
 use crate::guest::{self, JoinConfig, NetGuest};
 use crate::host::{self, HostConfig, NetHost};
+use crate::metrics::{self, NetStats, RateMarks};
 use crate::peer::{self, NetPeer, PeerConfig};
 use crate::recording::{Recording, RecordingError};
+use crate::remote;
 use crate::scene::SharedBody;
-use crate::seen;
 use crate::transport::{Endpoint, Invite, TransportError};
 use crate::user::{UserJoined, UserLeft};
 
@@ -122,7 +122,7 @@ impl Plugin for NetPlugin {
             error!("a NetPlugin can be added to one app only; this app has no network");
             return;
         };
-        figures::register(app);
+        metrics::register(app);
         app.init_resource::<NetStats>()
             .init_resource::<RateMarks>()
             .register_type::<SharedBody>()
@@ -150,7 +150,7 @@ impl Plugin for NetPlugin {
                     .add_systems(PostUpdate, host::finish);
             }
             Start::Join(guest) => {
-                seen::register(app);
+                remote::register(app);
                 app.insert_resource(*guest)
                     .add_systems(PreUpdate, guest::receive.in_set(NetSystems::Receive))
                     .add_systems(
@@ -166,7 +166,7 @@ impl Plugin for NetPlugin {
                     );
             }
             Start::Peer(peer) => {
-                seen::register(app);
+                remote::register(app);
                 app.insert_resource(*peer)
                     .add_systems(PreUpdate, peer::receive.in_set(NetSystems::Receive))
                     .add_systems(
@@ -190,8 +190,8 @@ fn measure(
     mut marks: ResMut<RateMarks>,
     mut diagnostics: Diagnostics,
 ) {
-    let new = host.map(|mut host| host.figures()).or_else(|| guest.map(|mut guest| guest.figures()));
-    let new = new.or_else(|| peer.map(|mut peer| peer.figures()));
+    let new = host.map(|mut host| host.metrics()).or_else(|| guest.map(|mut guest| guest.metrics()));
+    let new = new.or_else(|| peer.map(|mut peer| peer.metrics()));
     let mut new = new.unwrap_or_default();
     new.keep_rates(&stats, &mut marks, &mut diagnostics);
     new.measure(&mut diagnostics);

@@ -14,15 +14,15 @@ pub struct User {
     pub id: UserId,
     /// What the user is called, at most 64 bytes. From outside: show it, do not trust it.
     pub name: String,
-    /// A colour of the user's own, the same in every app.
-    pub colour: Color,
+    /// A color of the user's own, the same in every app.
+    pub color: Color,
     /// What the user may do.
     pub role: Role,
 }
 
 impl User {
     pub(crate) fn new(id: UserId, name: &str, role: Role) -> Self {
-        Self { id, name: printable(name), colour: colour_of(id), role }
+        Self { id, name: printable(name), color: color_of(id), role }
     }
 }
 
@@ -31,8 +31,8 @@ pub(crate) fn printable(name: &str) -> String {
     name.chars().filter(|c| !c.is_control()).collect()
 }
 
-/// The colour of a user: hues a golden angle apart, so that neighbours by number differ well however many come.
-pub fn colour_of(user: UserId) -> Color {
+/// The color of a user: hues a golden angle apart, so that neighbours by number differ well however many come.
+pub fn color_of(user: UserId) -> Color {
     const GOLDEN_ANGLE: f32 = 137.507_76;
     Color::hsl((200.0 + GOLDEN_ANGLE * f32::from(user.0)) % 360.0, 0.7, 0.55)
 }
@@ -94,7 +94,7 @@ mod tests {
 
     #[test]
     fn neighbours_differ_in_hue_and_names_hold_no_control_characters() {
-        let hue = |n| Hsla::from(colour_of(UserId(n))).hue;
+        let hue = |n| Hsla::from(color_of(UserId(n))).hue;
         for n in 0..20 {
             for m in n + 1..20 {
                 let apart = (hue(n) - hue(m)).abs();

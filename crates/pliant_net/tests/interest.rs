@@ -10,7 +10,7 @@ use bevy::camera::CameraProjection;
 use bevy::camera::primitives::Frustum;
 use bevy::math::DVec3;
 use bevy::prelude::*;
-use pliant_body::{BodyState, Grab, GrabOf, ModalAsset, ModalBody, PliantSystems, ShownState};
+use pliant_body::{BodyState, Grab, GrabOf, ModalAsset, ModalBody, PliantSystems, VisualState};
 use pliant_modal::ModalModel;
 use pliant_net::{CameraInterest, HostConfig, Interest, Invite, JoinConfig, NetHost, NetPlugin, SharedBody};
 use pliant_stream::PeerId;
@@ -105,7 +105,7 @@ fn what_the_camera_does_not_see_is_not_sent_and_comes_back_when_it_does() {
     });
     let far = run_until(&mut [&mut host, &mut guest], "all ticks come, far away", far);
     run_until(&mut [&mut host, &mut guest], "four modes are shown, and no more", |apps| {
-        let shown = apps[1].world().get::<ShownState>(there).unwrap().q();
+        let shown = apps[1].world().get::<VisualState>(there).unwrap().q();
         must!(shown[4..].iter().all(|q| *q == 0.0) && shown[0] != 0.0, "{shown:?}");
         Ok(())
     });
@@ -118,7 +118,7 @@ fn what_the_camera_does_not_see_is_not_sent_and_comes_back_when_it_does() {
     host.world_mut().insert_resource(Still);
     run_until(&mut [&mut host, &mut guest], "the body is shown as it is", |apps| {
         let truth = apps[0].world().get::<BodyState>(body).unwrap().body().q();
-        let shown = apps[1].world().get::<ShownState>(there).unwrap().q();
+        let shown = apps[1].world().get::<VisualState>(there).unwrap().q();
         let size = truth.iter().fold(0.0_f64, |size, q| size.max(q.abs()));
         let off = truth.iter().zip(shown).map(|(a, b)| (a - b).abs()).fold(0.0, f64::max) / size;
         must!(shown[4..].iter().any(|q| *q != 0.0) && rests(apps[0], body, size), "it still moves");

@@ -66,14 +66,14 @@ fn introduction(app: &App, body: Entity, invite: &Invite) -> Bytes {
     bytes.freeze()
 }
 
-struct Stranger {
+struct UnauthenticatedPeer {
     endpoint: Endpoint,
     connected: bool,
     closed: Option<String>,
     messages: Vec<Bytes>,
 }
 
-impl Stranger {
+impl UnauthenticatedPeer {
     fn at(invite: &Invite) -> Self {
         let endpoint = Endpoint::join(invite, JoinOptions::default()).unwrap();
         Self { endpoint, connected: false, closed: None, messages: Vec::new() }
@@ -102,7 +102,7 @@ fn who_was_sent_away_from_among_peers_gets_in_by_no_message_that_follows() {
     let (mut a, body, invite) = first(Access::Tokens(vec![Grant::hold(hold), Grant::watch(watch)]), limits());
     let hello = introduction(&a, body, &invite);
     // Rightly: the words are those that let in.
-    let mut right = Stranger::at(&invite.clone().with_token(hold));
+    let mut right = UnauthenticatedPeer::at(&invite.clone().with_token(hold));
     let mut said = false;
     run_until(&mut [&mut a], "who may hold is let in", |_| {
         right.listen();
@@ -115,7 +115,7 @@ fn who_was_sent_away_from_among_peers_gets_in_by_no_message_that_follows() {
     drop(right);
     // By a token to watch, and after a message that breaks the protocol.
     for (token, before) in [(watch, &[][..]), (hold, &[99_u8][..])] {
-        let mut wrong = Stranger::at(&invite.clone().with_token(token));
+        let mut wrong = UnauthenticatedPeer::at(&invite.clone().with_token(token));
         // The transport lets it in by itself; all is said before the peers' app hears of it and hangs up.
         wait_for("it connects", || {
             wrong.listen();
@@ -139,11 +139,11 @@ fn who_connects_and_does_not_say_who_it_is_keeps_no_place() {
     let _alone = alone();
     let (mut a, body, invite) = first(Access::Anyone, limits());
     let hello = introduction(&a, body, &invite);
-    let mut silent: Vec<Stranger> = (0..4).map(|_| Stranger::at(&invite)).collect();
+    let mut silent: Vec<UnauthenticatedPeer> = (0..4).map(|_| UnauthenticatedPeer::at(&invite)).collect();
     // The last says what it has and not, in the session, who it is.
     let mut said = false;
     run_until(&mut [&mut a], "all are hung up on", |_| {
-        silent.iter_mut().for_each(Stranger::listen);
+        silent.iter_mut().for_each(UnauthenticatedPeer::listen);
         if let Some(last) = silent.last_mut().filter(|last| last.connected && !said) {
             last.endpoint.send_message(PeerId::HOST, hello.clone()).unwrap();
             said = true;
@@ -155,7 +155,7 @@ fn who_connects_and_does_not_say_who_it_is_keeps_no_place() {
     // Who does say it stays, for longer than one that comes after it and does not.
     let (mut b, _) = peer("b", Some(invite.clone()), Access::Anyone, limits());
     run_until(&mut [&mut a, &mut b], "a peer gets in", |apps| users(apps[0]) == 2 && users(apps[1]) == 2);
-    let mut later = Stranger::at(&invite);
+    let mut later = UnauthenticatedPeer::at(&invite);
     run_until(&mut [&mut a, &mut b], "a later one is hung up on", |_| {
         later.listen();
         later.connected && later.closed.is_some()

@@ -8,11 +8,11 @@ use std::time::Duration;
 
 use bevy::math::DVec3;
 use bevy::prelude::*;
-use pliant_body::{Grab, GrabForce, GrabOf, ModalAsset, ModalBody, ShownState};
+use pliant_body::{Grab, GrabForce, GrabOf, ModalAsset, ModalBody, VisualState};
 use pliant_modal::{Body, ModalModel, StepSettings};
 use pliant_net::transport::Limits;
 use pliant_net::{
-    Emulation, HostOptions, Invite, NetPeer, NetPlugin, NetStats, PeerConfig, PeerState, SeenHands,
+    Emulation, HostOptions, Invite, NetPeer, NetPlugin, NetStats, PeerConfig, PeerState, RemoteHands,
     SharedBody, User, UserLeft,
 };
 use pliant_stream::emulator::{LinkConfig, Loss, Preset};
@@ -52,14 +52,14 @@ fn users(app: &mut App) -> Vec<String> {
 }
 
 fn q(app: &App, body: Entity) -> Vec<f64> {
-    app.world().get::<ShownState>(body).unwrap().q().to_vec()
+    app.world().get::<VisualState>(body).unwrap().q().to_vec()
 }
 
 /// Is the body where the hands pull it to, and not on its way there?
 fn still(app: &App, body: Entity) -> bool {
     let net = app.world().resource::<NetPeer>();
     let played = net.session().unwrap().body(net.body_of(body).unwrap()).unwrap();
-    played.shown().v.iter().all(|v| v.abs() < 0.02)
+    played.visual().v.iter().all(|v| v.abs() < 0.02)
 }
 
 /// Do others show the shape that the first shows? It is none at rest.
@@ -139,7 +139,7 @@ fn three_peers_hold_one_body_and_agree_and_one_that_goes_is_missed_by_nobody() {
         let forces =
             [(0, of_a), (2, of_c)].map(|(at, hand)| *apps[at].world().get::<GrabForce>(hand).unwrap());
         must!(forces.iter().all(|felt| felt.force.length() > 0.1), "{forces:?}");
-        let hands = |at: usize, body| apps[at].world().get::<SeenHands>(body).unwrap().0.len();
+        let hands = |at: usize, body| apps[at].world().get::<RemoteHands>(body).unwrap().0.len();
         must!(hands(1, body_b) == 2, "the one without a hand sees both");
         must!(hands(0, body_a) == 1 && hands(2, body_c) == 1, "who holds sees the other");
         must!(still(apps[0], body_a), "it still moves");
@@ -160,7 +160,7 @@ fn three_peers_hold_one_body_and_agree_and_one_that_goes_is_missed_by_nobody() {
     });
     c.world_mut().despawn(of_c);
     run_until(&mut [&mut a, &mut c], "the hand is let go of everywhere", |apps| {
-        apps[0].world().get::<SeenHands>(body_a).unwrap().0.is_empty()
+        apps[0].world().get::<RemoteHands>(body_a).unwrap().0.is_empty()
     });
 }
 
@@ -227,7 +227,7 @@ fn peers_that_have_lost_everybody_find_each_other_again_and_one_that_comes_late_
         apps.iter_mut().all(|app| users(app) == ["a", "bb", "ccc", "dddd"])
     });
     run_until(&mut [&mut a, &mut b, &mut c, &mut d], "it has the shape", |apps| {
-        let seen = apps[3].world().get::<SeenHands>(body_d).is_some_and(|hands| hands.0.len() == 1);
+        let seen = apps[3].world().get::<RemoteHands>(body_d).is_some_and(|hands| hands.0.len() == 1);
         must!(seen, "it sees the hand");
         agree(&[q(apps[0], body_a), q(apps[3], body_d)], 0.02)
     });

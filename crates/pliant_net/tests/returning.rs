@@ -9,7 +9,7 @@ use std::time::{Duration, Instant, SystemTime};
 
 use bevy::math::DVec3;
 use bevy::prelude::*;
-use pliant_body::{BodyState, Grab, GrabForce, GrabOf, ModalAsset, ModalBody, ShownState};
+use pliant_body::{BodyState, Grab, GrabForce, GrabOf, ModalAsset, ModalBody, VisualState};
 use pliant_modal::ModalModel;
 use pliant_net::transport::Limits;
 use pliant_net::{
@@ -67,7 +67,7 @@ fn is_right(apps: &[&mut App], body: Entity, there: Entity, within: f64) -> Resu
 /// How far the guest's picture is from the host's body, as a part of the body's largest coordinate.
 fn apart(host: &App, body: Entity, guest: &App, there: Entity) -> f64 {
     let truth = host.world().get::<BodyState>(body).unwrap().body().q();
-    let shown = guest.world().get::<ShownState>(there).unwrap().q();
+    let shown = guest.world().get::<VisualState>(there).unwrap().q();
     let size = truth.iter().fold(1e-9_f64, |size, q| size.max(q.abs()));
     truth.iter().zip(shown).map(|(a, b)| (a - b).abs()).fold(0.0, f64::max) / size
 }

@@ -8,11 +8,11 @@ use std::time::{Duration, SystemTime};
 
 use bevy::math::DVec3;
 use bevy::prelude::*;
-use pliant_body::{BodyState, Grab, GrabForce, GrabOf, ModalAsset, ModalBody, ShownState};
+use pliant_body::{BodyState, Grab, GrabForce, GrabOf, ModalAsset, ModalBody, VisualState};
 use pliant_net::{
     Access, GrabRefused, Grant, GuestState, HandOf, Holding, HostConfig, HostOptions, Interest, Invite,
-    JoinConfig, NetGuest, NetPlugin, NetStats, Recording, Role, SeenHands, SessionClosed, SharedBody, Token,
-    User, UserLink,
+    JoinConfig, NetGuest, NetPlugin, NetStats, Recording, RemoteHands, Role, SessionClosed, SharedBody,
+    Token, User, UserLink,
 };
 use support::{
     Came, TIP, alone, app, arrival, bar, body_of, guest, host, messages, must, only, rests, run_until, tick,
@@ -63,7 +63,7 @@ fn a_watcher_sees_and_does_not_hold_and_all_know_who_is_who() {
         &mut [&mut host, &mut holder, &mut watcher],
         "the watcher sees the hand, and how all are reached",
         |apps| {
-            let seen = apps[2].world().get::<SeenHands>(there).is_some_and(|hands| hands.0.len() == 1);
+            let seen = apps[2].world().get::<RemoteHands>(there).is_some_and(|hands| hands.0.len() == 1);
             let mut links = apps[2].world_mut().query::<(&User, &UserLink)>();
             let holder = links.iter(apps[2].world()).find(|(user, _)| user.name == "holder");
             seen && holder.is_some_and(|(_, link)| !link.round_trip.is_zero())
@@ -136,7 +136,7 @@ fn what_is_not_wanted_is_not_sent() {
     *guest.world_mut().get_mut::<Interest>(there).unwrap() = Interest::Modes(2);
     run_until(&mut [&mut host, &mut guest], "half of the modes", |apps| {
         let truth = apps[0].world().get::<BodyState>(body).unwrap().body().q();
-        let shown = apps[1].world().get::<ShownState>(there).unwrap().q();
+        let shown = apps[1].world().get::<VisualState>(there).unwrap().q();
         let size = truth.iter().fold(0.0_f64, |size, q| size.max(q.abs()));
         must!(shown[2..] == [0.0, 0.0] && size > 0.05, "{shown:?} for {truth:?}");
         must!((0..2).all(|k| (truth[k] - shown[k]).abs() < 0.25 * size), "{shown:?} for {truth:?}");
@@ -144,7 +144,7 @@ fn what_is_not_wanted_is_not_sent() {
     });
     *guest.world_mut().get_mut::<Interest>(there).unwrap() = Interest::All;
     run_until(&mut [&mut host, &mut guest], "all modes again", |apps| {
-        let shown = apps[1].world().get::<ShownState>(there).unwrap().q();
+        let shown = apps[1].world().get::<VisualState>(there).unwrap().q();
         must!(shown[2].abs() + shown[3].abs() > 0.0, "{shown:?}");
         Ok(())
     });
@@ -162,7 +162,7 @@ fn a_recorded_session_is_seen_again_as_it_was() {
     let there = body_of(&mut seen).unwrap();
     run_until(&mut [&mut host, &mut seen], "the body rests where it is held", |apps| {
         let truth = apps[0].world().get::<BodyState>(body).unwrap().body().q();
-        let shown = apps[1].world().get::<ShownState>(there).unwrap().q();
+        let shown = apps[1].world().get::<VisualState>(there).unwrap().q();
         let size = truth.iter().fold(0.0_f64, |size, q| size.max(q.abs()));
         let off = truth.iter().zip(shown).map(|(a, b)| (a - b).abs()).fold(0.0, f64::max);
         must!(size > 0.1 && off < 0.005 * size && rests(apps[0], body, 0.05 * size), "{off} of {size}");
@@ -172,7 +172,7 @@ fn a_recorded_session_is_seen_again_as_it_was() {
     // same.
     let still = tick(&host);
     run_until(&mut [&mut host, &mut seen], "two seconds", |apps| tick(apps[0]) > still + 80);
-    let shown = seen.world().get::<ShownState>(there).unwrap().q().to_vec();
+    let shown = seen.world().get::<VisualState>(there).unwrap().q().to_vec();
     drop(seen);
     drop(host);
 
@@ -181,7 +181,7 @@ fn a_recorded_session_is_seen_again_as_it_was() {
     run_until(&mut [&mut again], "the recording is over", |apps| {
         !messages::<SessionClosed>(apps[0]).is_empty()
     });
-    let mut bodies = again.world_mut().query::<&ShownState>();
+    let mut bodies = again.world_mut().query::<&VisualState>();
     let replayed = bodies.single(again.world()).unwrap().q();
     let size = shown.iter().fold(0.0_f64, |size, q| size.max(q.abs()));
     let off = shown.iter().zip(replayed).map(|(a, b)| (a - b).abs()).fold(0.0, f64::max) / size;

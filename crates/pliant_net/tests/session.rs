@@ -10,12 +10,12 @@ use bevy::math::{DQuat, DVec3};
 use bevy::prelude::*;
 use bytes::Bytes;
 use pliant_body::{
-    BodyState, Driven, Grab, GrabForce, GrabOf, ModalAsset, PliantSystems, PliantTick, ShownState,
+    BodyState, Driven, Grab, GrabForce, GrabOf, ModalAsset, PliantSystems, PliantTick, VisualState,
 };
 use pliant_net::transport::{Emulation, Endpoint, Event, JoinOptions, PeerId};
 use pliant_net::{
     BodyLeft, GrabRefused, GuestState, HandOf, Holding, HostConfig, JoinConfig, NetGuest, NetStats,
-    RemoteBody, SeenHands, SharedBody, User, UserLeft, UserLink,
+    RemoteBody, RemoteHands, SharedBody, User, UserLeft, UserLink,
 };
 use pliant_stream::UserId;
 use pliant_stream::emulator::Preset;
@@ -70,10 +70,10 @@ fn a_guest_sees_holds_and_feels_the_hosts_body() {
     run_until(&mut [&mut host, &mut guest], "the guest sees the shape and the host's hand", |apps| {
         let truth = state(apps[0], body).body().q();
         must!(size(truth) > 0.1 && rests(apps[0], body, size(truth)), "the tip is far aside: {truth:?}");
-        let shown = apps[1].world().get::<ShownState>(there).unwrap().q();
+        let shown = apps[1].world().get::<VisualState>(there).unwrap().q();
         must!(distance(truth, shown) < 0.01 * size(truth), "shown {shown:?}, true {truth:?}");
         // And where the host's hand is.
-        let seen = &apps[1].world().get::<SeenHands>(there).unwrap().0;
+        let seen = &apps[1].world().get::<RemoteHands>(there).unwrap().0;
         must!(seen.len() == 1, "{seen:?}");
         must!((seen[0].user, seen[0].vertex) == (UserId::HOST, TIP), "{seen:?}");
         must!(seen[0].target.distance(beside(0.9, 0.3, 0.2)) < 1e-3, "{seen:?}");
@@ -98,7 +98,7 @@ fn a_guest_sees_holds_and_feels_the_hosts_body() {
         must!(felt.force.length() > 1.0, "the body resists: {felt:?}");
         must!(own.force.distance(felt.force) < 0.02 * felt.force.length(), "{own:?}, true {felt:?}");
         must!(own.point.distance(felt.point) < 1e-3, "patch at {own:?}, truly at {felt:?}");
-        let seen = &apps[1].world().get::<SeenHands>(there).unwrap().0;
+        let seen = &apps[1].world().get::<RemoteHands>(there).unwrap().0;
         must!(seen.len() == 1, "the own hand is not among the others': {seen:?}");
         Ok(of.0)
     });
@@ -356,7 +356,7 @@ fn a_guest_that_talks_nonsense_is_sent_away_and_the_others_notice_nothing() {
     // true. And what was refused stays counted though those who said it are gone.
     run_until(&mut [&mut host, &mut good], "the good guest sees what is true", |apps| {
         let truth = self::state(apps[0], body).body().q();
-        let shown = apps[1].world().get::<ShownState>(there).unwrap().q();
+        let shown = apps[1].world().get::<VisualState>(there).unwrap().q();
         must!(size(truth) > 0.1 && distance(truth, shown) < 0.02 * size(truth), "{shown:?}, truly {truth:?}");
         let rejected = rejected(apps[0]);
         must!(rejected >= 3, "{rejected} of the host");

@@ -7,7 +7,7 @@ use std::time::Duration;
 
 use bevy::math::DVec3;
 use bevy::prelude::*;
-use pliant_body::{BodyState, Grab, GrabForce, GrabOf, ModalBody, ShownState};
+use pliant_body::{BodyState, Grab, GrabForce, GrabOf, ModalBody, VisualState};
 use pliant_net::{
     BodyArrived, BodyLeft, GuestState, HandOf, HostConfig, JoinConfig, NetGuest, NetHost, UserLeft,
 };
@@ -33,7 +33,7 @@ fn a_guest_follows_a_body_that_its_host_makes_stiffer_and_keeps_its_hand_on_it()
     // What the guest feels and what is true, once the body rests and the guest sees it as it is.
     let felt_at_rest = |apps: &mut [&mut App]| {
         let truth = apps[0].world().get::<BodyState>(body).unwrap().body().q();
-        let shown = apps[1].world().get::<ShownState>(there).unwrap().q();
+        let shown = apps[1].world().get::<VisualState>(there).unwrap().q();
         let size = truth.iter().map(|q| q * q).sum::<f64>().sqrt();
         let off = truth.iter().zip(shown).map(|(a, b)| (a - b).powi(2)).sum::<f64>().sqrt();
         must!(size > 0.05 && off < 0.02 * size, "{off} of {size}");

@@ -5,7 +5,7 @@ use pliant_body::StepSettings;
 
 use crate::{
     knob::knob,
-    trace::{Trace, colour, dot, plot, short},
+    trace::{Trace, color, dot, plot, short},
 };
 
 /// A body as the panel shows it. What a knob changes is changed here; the caller takes it over.
@@ -45,8 +45,8 @@ pub struct BodyView {
 pub struct HandView {
     /// Whose it is.
     pub name: String,
-    /// The colour of whose it is, sRGB; `None` takes one of the plot's own.
-    pub colour: Option<[u8; 3]>,
+    /// The color of whose it is, sRGB; `None` takes one of the plot's own.
+    pub color: Option<[u8; 3]>,
     /// It is held from here, and "Let go" takes it off.
     pub releasable: bool,
     /// Magnitude of the reaction, N.
@@ -111,13 +111,13 @@ fn body_knobs(ui: &mut Ui, index: usize, body: &mut BodyView) {
             body.release = true;
         }
     });
-    plot(ui, &format!("pliant energy {index}"), "J", [("energy", &body.energies, colour(0))]);
-    let colour_of = |index: usize, hand: &HandView| {
-        hand.colour.map_or_else(|| colour(index), |[r, g, b]| Color32::from_rgb(r, g, b))
+    plot(ui, &format!("pliant energy {index}"), "J", [("energy", &body.energies, color(0))]);
+    let color_of = |index: usize, hand: &HandView| {
+        hand.color.map_or_else(|| color(index), |[r, g, b]| Color32::from_rgb(r, g, b))
     };
     for (hand_index, hand) in body.hands.iter().enumerate() {
         ui.horizontal(|ui| {
-            dot(ui, colour_of(hand_index, hand));
+            dot(ui, color_of(hand_index, hand));
             ui.label(format!("{}: {} N", hand.name, short(hand.force)));
         });
     }
@@ -126,6 +126,6 @@ fn body_knobs(ui: &mut Ui, index: usize, body: &mut BodyView) {
         ui,
         &format!("pliant forces {index}"),
         "N",
-        hands.map(|(i, hand)| (hand.name.as_str(), &hand.forces, colour_of(i, hand))),
+        hands.map(|(i, hand)| (hand.name.as_str(), &hand.forces, color_of(i, hand))),
     );
 }

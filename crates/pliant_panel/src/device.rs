@@ -4,7 +4,7 @@ use bevy_egui::egui::{Button, Color32, RichText, Ui, Vec2};
 
 use crate::{
     knob::knob,
-    trace::{Trace, colour, plot, short},
+    trace::{Trace, color, plot, short},
 };
 
 /// The devices as the panel shows them.
@@ -94,7 +94,7 @@ pub fn show_devices(ui: &mut Ui, view: &mut DevicesView) {
         if let Some(fault) = &device.fault {
             ui.colored_label(Color32::from_rgb(255, 170, 80), fault);
         }
-        plot(ui, &format!("pliant device {index}"), "N", [("force", &device.forces, colour(4))]);
+        plot(ui, &format!("pliant device {index}"), "N", [("force", &device.forces, color(4))]);
         if let Some(scale) = &mut device.force_scale {
             knob(ui, scale, 0.0..=1.0, |slider| slider.text("force").max_decimals(2))
                 .on_hover_text("Share of the body's force that reaches the hand.");

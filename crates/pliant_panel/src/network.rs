@@ -4,7 +4,7 @@ use bevy_egui::egui::{Color32, ComboBox, DragValue, Grid, Ui};
 
 use crate::{
     knob::knob,
-    trace::{Trace, colour, dot, plot, short},
+    trace::{Trace, color, dot, plot, short},
 };
 
 /// The session as the panel shows it.
@@ -55,8 +55,8 @@ pub struct NetworkView {
 pub struct UserView {
     /// What the user is called; from outside.
     pub name: String,
-    /// The user's colour, sRGB.
-    pub colour: [u8; 3],
+    /// The user's color, sRGB.
+    pub color: [u8; 3],
     /// Oneself.
     pub yourself: bool,
     /// Hands on bodies.
@@ -130,7 +130,7 @@ pub fn show(ui: &mut Ui, network: &mut NetworkView) {
     }
     for user in &network.users {
         ui.horizontal(|ui| {
-            let [r, g, b] = user.colour;
+            let [r, g, b] = user.color;
             dot(ui, Color32::from_rgb(r, g, b));
             let who = if user.yourself { format!("{} (you)", user.name) } else { user.name.clone() };
             ui.label(who);
@@ -188,8 +188,8 @@ pub fn show(ui: &mut Ui, network: &mut NetworkView) {
             );
         }
     });
-    plot(ui, "pliant round trip", "ms", [("round trip", &network.round_trips, colour(2))]);
-    plot(ui, "pliant rate", "kbit/s", [("received", &network.rates, colour(3))]);
+    plot(ui, "pliant round trip", "ms", [("round trip", &network.round_trips, color(2))]);
+    plot(ui, "pliant rate", "kbit/s", [("received", &network.rates, color(3))]);
     if let Some(emulator) = &mut network.emulator {
         emulator_knobs(ui, emulator);
     }

@@ -19,7 +19,7 @@ pub struct RecordingView {
     pub shapes_hz: f64,
     /// Drawings of the modes' energies and spectra a second. A knob.
     pub modes_hz: f64,
-    /// Surfaces are coloured by stress, not by displacement. A knob.
+    /// Surfaces are colored by stress, not by displacement. A knob.
     pub stress: bool,
 }
 
@@ -43,6 +43,6 @@ pub fn show(ui: &mut Ui, recording: &mut RecordingView) {
         .on_hover_text(format!("Shapes drawn in the recording, {every}."));
     knob(ui, &mut recording.modes_hz, 0.0..=20.0, |slider| slider.text("bars a second").max_decimals(0))
         .on_hover_text("The energies of the modes and the spectrum; zero leaves them out.");
-    ui.checkbox(&mut recording.stress, "colour by stress")
-        .on_hover_text("Off, surfaces are coloured by displacement.");
+    ui.checkbox(&mut recording.stress, "color by stress")
+        .on_hover_text("Off, surfaces are colored by displacement.");
 }

@@ -4,7 +4,7 @@ use bevy_egui::egui::Ui;
 
 use crate::{
     knob::knob,
-    trace::{Trace, colour, plot, short},
+    trace::{Trace, color, plot, short},
 };
 
 /// The clock as the panel shows it.
@@ -45,6 +45,6 @@ pub fn show(ui: &mut Ui, time: &mut TimeView) {
         ui,
         "pliant cost",
         "ms",
-        [("step", &time.step_ms, colour(0)), ("surfaces", &time.deform_ms, colour(1))],
+        [("step", &time.step_ms, color(0)), ("surfaces", &time.deform_ms, color(1))],
     );
 }

@@ -72,7 +72,7 @@ pub fn plot<'a>(
     let lines: Vec<(String, Vec<[f64; 2]>, Color32)> = traces
         .into_iter()
         .filter(|(_, trace, _)| !trace.is_empty())
-        .map(|(name, trace, colour)| (name.to_owned(), trace.points.iter().copied().collect(), colour))
+        .map(|(name, trace, color)| (name.to_owned(), trace.points.iter().copied().collect(), color))
         .collect();
     let Some(newest) = lines.iter().filter_map(|line| line.1.last()).map(|p| p[0]).reduce(f64::max) else {
         return;
@@ -95,8 +95,8 @@ pub fn plot<'a>(
         plot = plot.legend(Legend::default().position(egui_plot::Corner::LeftTop).background_alpha(0.4));
     }
     plot.show(ui, |plot| {
-        for (name, points, colour) in lines {
-            plot.line(Line::new(name, PlotPoints::from(points)).color(colour).width(1.5));
+        for (name, points, color) in lines {
+            plot.line(Line::new(name, PlotPoints::from(points)).color(color).width(1.5));
         }
     });
 }
@@ -117,15 +117,15 @@ pub(crate) fn short(value: f64) -> String {
     }
 }
 
-/// A dot of a colour, drawn: the sign for it is not in the font.
-pub(crate) fn dot(ui: &mut Ui, colour: Color32) {
+/// A dot of a color, drawn: the sign for it is not in the font.
+pub(crate) fn dot(ui: &mut Ui, color: Color32) {
     let side = 0.7 * ui.text_style_height(&TextStyle::Body);
     let (place, _) = ui.allocate_exact_size(Vec2::splat(side), Sense::hover());
-    ui.painter().circle_filled(place.center(), 0.45 * side, colour);
+    ui.painter().circle_filled(place.center(), 0.45 * side, color);
 }
 
-/// A colour for the `index`th of several lines.
-pub(crate) fn colour(index: usize) -> Color32 {
+/// A color for the `index`th of several lines.
+pub(crate) fn color(index: usize) -> Color32 {
     // Hues a golden angle apart: neighbours differ, however many there are.
     let hue = (0.56 + 0.381_966 * index as f32).fract();
     egui::ecolor::Hsva::new(hue, 0.6, 0.95, 1.0).into()

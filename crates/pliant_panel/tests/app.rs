@@ -257,7 +257,7 @@ fn it_fits_the_screen_at_any_scale_and_is_gone_when_it_is_closed() {
 #[cfg(feature = "rerun")]
 #[test]
 fn the_recording_is_switched_off_and_thinned_and_otherwise_as_it_was() {
-    use pliant_rerun::{RerunColour, RerunRecording, RerunStats};
+    use pliant_rerun::{RerunColor, RerunRecording, RerunStats};
 
     let odd = RerunRecording { shapes_hz: f64::INFINITY, modes_hz: 1.0 / 3.0, ..default() };
     let mut shown = show(app(|app| {
@@ -272,8 +272,8 @@ fn the_recording_is_switched_off_and_thinned_and_otherwise_as_it_was() {
     assert!(now(&shown).shapes_hz <= 60.0);
     nudge(&mut shown, "bars a second", Key::ArrowRight);
     assert!(now(&shown).modes_hz > 1.0 / 3.0);
-    click(&mut shown, "colour by stress");
-    assert_eq!(now(&shown).colour, RerunColour::Stress);
+    click(&mut shown, "color by stress");
+    assert_eq!(now(&shown).color, RerunColor::Stress);
 }
 
 #[cfg(feature = "haptics")]

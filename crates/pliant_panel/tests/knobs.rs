@@ -315,7 +315,7 @@ fn a_recording_is_switched_off_and_thinned() {
     assert!(harness.state().shapes_hz < 20.0);
     nudge(&mut harness, "bars a second", Key::ArrowRight);
     assert!(harness.state().modes_hz > 4.0);
-    harness.get_by_label("colour by stress").click();
+    harness.get_by_label("color by stress").click();
     harness.run();
     assert!(harness.state().stress);
 }

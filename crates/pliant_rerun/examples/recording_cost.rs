@@ -23,7 +23,7 @@ use std::{
 use bevy::{math::DVec3, prelude::*, time::TimeUpdateStrategy, transform::TransformPlugin};
 use pliant_body::{Grab, GrabOf, ModalAsset, ModalBody, PliantBodyPlugin, PliantSystems};
 use pliant_modal::ModalModel;
-use pliant_rerun::{RerunColour, RerunPlugin, RerunRecording, RerunStats};
+use pliant_rerun::{RerunColor, RerunPlugin, RerunRecording, RerunStats};
 
 const HZ: f64 = 60.0;
 const SPIN: Duration = Duration::from_millis(4);
@@ -67,13 +67,13 @@ fn main() {
             "file, no shapes, figures 10 Hz",
             &model,
             scratch("few"),
-            RerunRecording { shapes_hz: 0.0, figures_hz: 10.0, hands_hz: 10.0, modes_hz: 0.0, ..rates() },
+            RerunRecording { shapes_hz: 0.0, metrics_hz: 10.0, hands_hz: 10.0, modes_hz: 0.0, ..rates() },
         ),
         file(
             "file, stress",
             &model,
             scratch("stress"),
-            RerunRecording { colour: RerunColour::Stress, ..rates() },
+            RerunRecording { color: RerunColor::Stress, ..rates() },
         ),
     ];
     if let Some(viewer) = &viewer {

@@ -12,11 +12,11 @@ use bevy::{
     prelude::*,
 };
 use crossbeam_channel::Receiver;
-use pliant_body::{BodyRefused, BodyState, Driven, Grab, GrabForce, PliantTick, ShownState};
+use pliant_body::{BodyRefused, BodyState, Driven, Grab, GrabForce, PliantTick, VisualState};
 
 use crate::{
     RerunRecording, RerunScalars, RerunStats, RerunStyle,
-    frame::{Drawn, Figure, Frame, Hand, Place, Shape},
+    frame::{Drawn, Frame, Hand, Metric, Place, Shape},
     log_lines::LogLines,
     worker::Worker,
 };
@@ -27,7 +27,7 @@ pub(crate) struct Collector {
     /// Frames that have been logged, to be filled again: what is recorded every tick takes no memory anew.
     spare: Receiver<Frame>,
     shapes: Due,
-    figures: Due,
+    metrics: Due,
     hands: Due,
     modes: Due,
     words: Due,
@@ -45,7 +45,7 @@ pub(crate) struct Collector {
 struct Measured {
     /// When it was last measured.
     newest: Instant,
-    figure: Arc<Figure>,
+    figure: Arc<Metric>,
 }
 
 /// A hand's name as it was given, and as it is recorded.
@@ -68,7 +68,7 @@ pub(crate) struct Hands {
 pub(crate) struct Whose {
     pub name: String,
     /// sRGB.
-    pub colour: [u8; 3],
+    pub color: [u8; 3],
 }
 
 /// When something was due last, s of simulated time.
@@ -95,7 +95,7 @@ impl Due {
 #[derive(Resource, Debug, Default, Clone, Copy)]
 pub(crate) struct Wanted {
     draw: bool,
-    figures: bool,
+    metrics: bool,
     hands: bool,
     /// A sample for the spectrum.
     sample: bool,
@@ -124,7 +124,7 @@ impl Collector {
             workers,
             spare,
             shapes: Due::NEVER,
-            figures: Due::NEVER,
+            metrics: Due::NEVER,
             hands: Due::NEVER,
             modes: Due::NEVER,
             words: Due::NEVER,
@@ -142,15 +142,15 @@ pub(crate) fn somebody_listens(collector: Res<Collector>, recording: Res<RerunRe
     recording.on && collector.workers.iter().any(Worker::listens)
 }
 
-pub(crate) fn wants_figures(wanted: Res<Wanted>) -> bool {
-    wanted.figures
+pub(crate) fn wants_metrics(wanted: Res<Wanted>) -> bool {
+    wanted.metrics
 }
 
 pub(crate) fn wants_hands(wanted: Res<Wanted>) -> bool {
     wanted.hands
 }
 
-pub(crate) fn wants_words(wanted: Res<Wanted>) -> bool {
+pub(crate) fn wants_text(wanted: Res<Wanted>) -> bool {
     wanted.words
 }
 
@@ -160,7 +160,7 @@ pub(crate) fn forget(
     mut wanted: ResMut<Wanted>,
     lines: Option<Res<LogLines>>,
 ) {
-    own.forget_figures();
+    own.forget_metrics();
     own.lines.clear();
     *wanted = Wanted::default();
     if let Some(lines) = lines {
@@ -178,15 +178,15 @@ pub(crate) fn decide(
     time: Res<Time>,
 ) {
     let collector = &mut *collector;
-    if recording.figures_hz.is_nan() || recording.figures_hz <= 0.0 {
+    if recording.metrics_hz.is_nan() || recording.metrics_hz <= 0.0 {
         // Nobody takes them; later they would be of another time.
-        own.forget_figures();
+        own.forget_metrics();
     }
     if collector.workers.iter().all(Worker::is_full) {
         // Nobody has room for it, so it is not made. What is due stays due.
         collector.workers.iter_mut().for_each(Worker::miss);
         collector.bodies.values_mut().for_each(|followed| followed.complete = false);
-        own.forget_figures();
+        own.forget_metrics();
         stats.dropped = collector.workers.iter().map(Worker::dropped).sum();
         *wanted = Wanted::default();
         return;
@@ -194,7 +194,7 @@ pub(crate) fn decide(
     let now = time.elapsed_secs_f64();
     *wanted = Wanted {
         draw: collector.shapes.at(now, recording.shapes_hz),
-        figures: collector.figures.at(now, recording.figures_hz),
+        metrics: collector.metrics.at(now, recording.metrics_hz),
         hands: collector.hands.at(now, recording.hands_hz),
         sample: recording.modes_hz > 0.0,
         bars: collector.modes.at(now, recording.modes_hz),
@@ -216,7 +216,7 @@ type Bodies<'w, 's> = Query<
         Entity,
         Option<&'static Name>,
         &'static BodyState,
-        &'static ShownState,
+        &'static VisualState,
         &'static Driven,
         &'static GlobalTransform,
         Option<&'static RerunStyle>,
@@ -255,7 +255,7 @@ pub(crate) fn collect(
     frame.tick = tick.0;
     frame.time = time.elapsed_secs_f64();
     frame.wall = SystemTime::UNIX_EPOCH.elapsed().map_or(0.0, |since| since.as_secs_f64());
-    frame.colour = recording.colour;
+    frame.color = recording.color;
     std::mem::swap(&mut frame.lines, &mut own.lines);
     if let Some(logged) = logged {
         frame.lines.extend(logged.0.try_iter());
@@ -264,7 +264,7 @@ pub(crate) fn collect(
     if wanted.hands {
         gather_hands(collector, &mut frame, &grabs, &session);
     }
-    if wanted.figures {
+    if wanted.metrics {
         std::mem::swap(&mut frame.scalars, &mut own.scalars);
         std::mem::swap(&mut frame.samples, &mut own.samples);
         std::mem::swap(&mut frame.measured, &mut own.measured);
@@ -322,7 +322,7 @@ fn follow_bodies(collector: &mut Collector, frame: &mut Frame, bodies: &Bodies, 
         if !moved && shown.is_settled() && (followed.complete || !draw) {
             continue;
         }
-        if !(draw || wanted.figures || wanted.sample) {
+        if !(draw || wanted.metrics || wanted.sample) {
             // What moves goes on counting as moved until somebody wants it.
             continue;
         }
@@ -331,7 +331,7 @@ fn follow_bodies(collector: &mut Collector, frame: &mut Frame, bodies: &Bodies, 
         followed.complete = draw && shown.is_settled();
         let from = frame.coordinates.len();
         frame.coordinates.extend(shown.current().iter().map(|&q| q as f32));
-        let energies = (wanted.figures || wanted.bars).then(|| {
+        let energies = (wanted.metrics || wanted.bars).then(|| {
             let from = frame.energies.len();
             energies(&mut frame.energies, state, driven, shown, wanted.tick);
             from..frame.energies.len()
@@ -343,7 +343,7 @@ fn follow_bodies(collector: &mut Collector, frame: &mut Frame, bodies: &Bodies, 
             place,
             stiffness: state.body().config().settings.stiffness_scale as f32,
             draw,
-            figures: wanted.figures,
+            metrics: wanted.metrics,
             sample: wanted.sample,
             energies,
             bars: wanted.bars,
@@ -363,7 +363,7 @@ fn free_path(bodies: &HashMap<Entity, Followed>, entity: Entity, name: Option<&N
 
 /// Adds kinetic and elastic energy of each mode, J, to `to`. Of a body that somebody else steps the velocities are those of its shape over
 /// the last tick of `tick` seconds.
-fn energies(to: &mut Vec<f64>, state: &BodyState, driven: &Driven, shown: &ShownState, tick: f64) {
+fn energies(to: &mut Vec<f64>, state: &BodyState, driven: &Driven, shown: &VisualState, tick: f64) {
     let body = state.body();
     let scale = state.scale() * state.scale();
     let of = |omega: f64, q: f64, v: f64| 0.5 * scale * (v * v + (omega * q).powi(2));
@@ -399,7 +399,7 @@ fn gather_hands(collector: &mut Collector, frame: &mut Frame, grabs: &Grabs, ses
         }
         hands.push(Hand {
             name: called.name.clone(),
-            colour: whose.map(|whose| whose.colour),
+            color: whose.map(|whose| whose.color),
             force: force.force.into(),
             point: force.point.into(),
             target: grab.target.into(),
@@ -424,7 +424,7 @@ const AREAS: [(&str, &str); 3] =
 fn measure(
     measured: &mut HashMap<DiagnosticPath, Measured>,
     diagnostics: &DiagnosticsStore,
-    to: &mut Vec<(Arc<Figure>, f64)>,
+    to: &mut Vec<(Arc<Metric>, f64)>,
 ) {
     for diagnostic in diagnostics.iter() {
         let Some(measurement) = diagnostic.measurement() else { continue };
@@ -441,7 +441,7 @@ fn measure(
             true => rest.to_owned(),
             false => format!("figures/{rest}"),
         });
-        let figure = Arc::new(Figure { path, unit: diagnostic.suffix.trim().to_owned() });
+        let figure = Arc::new(Metric { path, unit: diagnostic.suffix.trim().to_owned() });
         to.push((figure.clone(), measurement.value));
         measured.insert(diagnostic.path().clone(), Measured { newest: measurement.time, figure });
     }

@@ -109,7 +109,7 @@ pub(crate) struct HandColumns {
     points: Vec<[f32; 3]>,
     targets: Vec<[f32; 3]>,
     labels: Vec<String>,
-    colours: Vec<Color>,
+    colors: Vec<Color>,
 }
 
 impl HandColumns {
@@ -119,14 +119,14 @@ impl HandColumns {
         self.counts.push(0);
     }
 
-    pub fn push(&mut self, arrow: [f32; 3], point: [f32; 3], target: [f32; 3], label: String, colour: Color) {
+    pub fn push(&mut self, arrow: [f32; 3], point: [f32; 3], target: [f32; 3], label: String, color: Color) {
         let Some(count) = self.counts.last_mut() else { return };
         *count += 1;
         self.arrows.push(arrow);
         self.points.push(point);
         self.targets.push(target);
         self.labels.push(label);
-        self.colours.push(colour);
+        self.colors.push(color);
     }
 
     pub fn send(&mut self, stream: &RecordingStream) -> Result<(), RecordingStreamError> {
@@ -137,14 +137,14 @@ impl HandColumns {
         let lengths = || counts.iter().copied();
         let times = self.moments.take();
         let lines = self.points.iter().zip(&self.targets).map(|(&from, &to)| [from, to]);
-        let lines = LineStrips3D::new(lines).with_colors(self.colours.iter().copied()).columns(lengths())?;
+        let lines = LineStrips3D::new(lines).with_colors(self.colors.iter().copied()).columns(lengths())?;
         stream.send_columns("world/hands/lines", times.clone(), lines)?;
-        let targets = Points3D::new(self.targets.drain(..)).with_colors(self.colours.iter().copied());
+        let targets = Points3D::new(self.targets.drain(..)).with_colors(self.colors.iter().copied());
         stream.send_columns("world/hands/targets", times.clone(), targets.columns(lengths())?)?;
         let arrows = Arrows3D::from_vectors(self.arrows.drain(..))
             .with_origins(self.points.drain(..))
             .with_labels(self.labels.drain(..))
-            .with_colors(self.colours.drain(..));
+            .with_colors(self.colors.drain(..));
         stream.send_columns("world/hands/reactions", times, arrows.columns(lengths())?)
     }
 }

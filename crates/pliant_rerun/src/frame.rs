@@ -21,11 +21,11 @@ pub(crate) struct Frame {
     pub coordinates: Vec<f32>,
     /// Energies of the modes of the shapes that have them, J, one after the other.
     pub energies: Vec<f64>,
-    pub colour: crate::RerunColour,
+    pub color: crate::RerunColor,
     /// All hands of the tick; `None` when they are not due, and when there are none and were none before.
     pub hands: Option<Vec<Hand>>,
     /// Diagnostics that were measured since the last tick.
-    pub measured: Vec<(Arc<Figure>, f64)>,
+    pub measured: Vec<(Arc<Metric>, f64)>,
     pub scalars: Vec<Scalar>,
     /// Figures that came faster than ticks.
     pub samples: Vec<Samples>,
@@ -113,7 +113,7 @@ pub(crate) struct Shape {
     /// What is wanted of it now: its picture,
     pub draw: bool,
     /// its figures,
-    pub figures: bool,
+    pub metrics: bool,
     /// and a sample for its spectrum.
     pub sample: bool,
     /// Where the energies of its modes are in the frame's.
@@ -135,7 +135,7 @@ pub(crate) struct Place {
 pub(crate) struct Hand {
     pub name: Arc<str>,
     /// Of whose hand it is, sRGB; `None` takes one of the recording's own.
-    pub colour: Option<[u8; 3]>,
+    pub color: Option<[u8; 3]>,
     /// Reaction, N.
     pub force: [f64; 3],
     pub point: [f64; 3],
@@ -151,7 +151,7 @@ pub(crate) struct Scalar {
 
 /// A figure by its path, and its unit.
 #[derive(Debug)]
-pub(crate) struct Figure {
+pub(crate) struct Metric {
     pub path: String,
     pub unit: String,
 }

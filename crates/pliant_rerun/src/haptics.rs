@@ -10,7 +10,7 @@ use pliant_haptics::{DeviceId, HapticDevices, LoopState};
 
 use crate::{
     RerunRecording, RerunScalars,
-    frame::{Figure, Samples},
+    frame::{Metric, Samples},
 };
 
 /// What each device is called: by its name, and the second of one name by its number, too.
@@ -27,16 +27,16 @@ fn names(devices: &HapticDevices) -> Vec<(DeviceId, String)> {
 }
 
 /// The figures of each device, made once: they are set every tick.
-type Figures = Vec<(DeviceId, [Arc<Figure>; 4])>;
+type Metrics = Vec<(DeviceId, [Arc<Metric>; 4])>;
 
 pub(crate) fn see_devices(
     devices: Res<HapticDevices>,
     mut own: ResMut<RerunScalars>,
-    mut figures: Local<Figures>,
+    mut metrics: Local<Metrics>,
 ) {
-    if !devices.iter().map(|(id, _)| id).eq(figures.iter().map(|(id, _)| *id)) {
+    if !devices.iter().map(|(id, _)| id).eq(metrics.iter().map(|(id, _)| *id)) {
         let figure = |name: &str, what: &str, unit: &str| {
-            Arc::new(Figure { path: format!("device/{name}/{what}"), unit: unit.to_owned() })
+            Arc::new(Metric { path: format!("device/{name}/{what}"), unit: unit.to_owned() })
         };
         let of = |name: &str| {
             [
@@ -46,9 +46,9 @@ pub(crate) fn see_devices(
                 figure(name, "given to the hand", "J"),
             ]
         };
-        *figures = names(&devices).iter().map(|(id, name)| (*id, of(name))).collect();
+        *metrics = names(&devices).iter().map(|(id, name)| (*id, of(name))).collect();
     }
-    for ((_, status), (_, [force, late, missed, given])) in devices.iter().zip(&*figures) {
+    for ((_, status), (_, [force, late, missed, given])) in devices.iter().zip(&*metrics) {
         let report = &status.report;
         let newton = report.tick.wrench.force.iter().map(|f| f * f).sum::<f64>().sqrt();
         own.measured(force, newton);

@@ -12,12 +12,12 @@
 //!
 //! | Path | What |
 //! | --- | --- |
-//! | `world/NAME` | the deformed surface of every body, coloured by displacement or stress ([`RerunColour`]); connectivity once, then positions |
+//! | `world/NAME` | the deformed surface of every body, colored by displacement or stress ([`RerunColor`]); connectivity once, then positions |
 //! | `world/hands` | every grab: its reaction as an arrow, its target, the line between |
-//! | `reaction/NAME` | magnitude of the reaction, N, in the colour of the hand's user |
+//! | `reaction/NAME` | magnitude of the reaction, N, in the color of the hand's user |
 //! | `displacement/NAME` | largest displacement of the surface, m |
 //! | `energy/NAME` | kinetic and elastic energy of all modes together, J |
-//! | `stress/NAME` | largest von Mises stress in the skin, Pa, when that is the colour |
+//! | `stress/NAME` | largest von Mises stress in the skin, Pa, when that is the color |
 //! | `modes/NAME` | energy of each mode, J, as bars |
 //! | `spectrum/NAME` | how far the loosest point of the body swings at each frequency, m over Hz, in the last 256 ticks |
 //! | `AREA/NAME` | every Bevy diagnostic under `pliant/AREA/`, as the network has them; the body crate's are `time/step` (ms a tick), `frame/deform` (ms a frame) and `bodies/awake` |
@@ -61,9 +61,7 @@ mod tests_streams;
 mod worker;
 
 pub use log_lines::log_layer;
-pub use plugin::{
-    RerunColour, RerunError, RerunPlugin, RerunRecording, RerunStats, RerunStyle, RerunSystems,
-};
+pub use plugin::{RerunColor, RerunError, RerunPlugin, RerunRecording, RerunStats, RerunStyle, RerunSystems};
 pub use scalars::RerunScalars;
 
 /// Timeline: the tick, [`PliantTick`](pliant_body::PliantTick).

@@ -3,9 +3,9 @@
 //! Most of its figures (round trip, loss, rates, NACKs) need nothing here: they are diagnostics, and are recorded like all others.
 
 use bevy::{math::DVec3, prelude::*};
-use pliant_body::{BodyState, Grab, ShownState};
+use pliant_body::{BodyState, Grab, VisualState};
 use pliant_net::{
-    GrabRefused, GuestState, HandOf, NetGuest, NetHost, NetPeer, NetStats, PeerState, SeenHands,
+    GrabRefused, GuestState, HandOf, NetGuest, NetHost, NetPeer, NetStats, PeerState, RemoteHands,
     SessionClosed, User, UserJoined, UserLeft, Yourself,
 };
 
@@ -91,7 +91,7 @@ pub(crate) struct Counted {
 }
 
 /// The connection's state as a figure, how uneven its line is, what waits in its queues and what they let go; once a second.
-pub(crate) fn say_its_figures(
+pub(crate) fn log_metrics(
     host: Option<Res<NetHost>>,
     guest: Option<Res<NetGuest>>,
     peer: Option<Res<NetPeer>>,
@@ -121,7 +121,7 @@ pub(crate) fn say_its_figures(
     counted.let_go = let_go;
 }
 
-/// Name and colour of whose hand each grab here is.
+/// Name and color of whose hand each grab here is.
 pub(crate) fn see_whose_hands(
     mut hands: ResMut<Hands>,
     grabs: Query<(Entity, Option<&HandOf>), With<Grab>>,
@@ -135,14 +135,14 @@ pub(crate) fn see_whose_hands(
             None => you.iter().next(),
         };
         if let Some(user) = user {
-            hands.whose.insert(grab, Whose { name: user.name.clone(), colour: srgb(user.colour) });
+            hands.whose.insert(grab, Whose { name: user.name.clone(), color: srgb(user.color) });
         }
     }
 }
 
 pub(crate) fn see_other_hands(
     mut others: ResMut<Hands>,
-    bodies: Query<(&SeenHands, &BodyState, &ShownState, &GlobalTransform)>,
+    bodies: Query<(&RemoteHands, &BodyState, &VisualState, &GlobalTransform)>,
     users: Query<&User>,
 ) {
     others.others.clear();
@@ -154,7 +154,7 @@ pub(crate) fn see_other_hands(
                 place.affine().transform_point3(surface_point(state, hand.vertex, shown.current()).as_vec3());
             others.others.push(Hand {
                 name: name.replace('/', " ").into(),
-                colour: user.map(|user| srgb(user.colour)),
+                color: user.map(|user| srgb(user.color)),
                 force: hand.reaction.into(),
                 point: point.as_dvec3().into(),
                 target: hand.target.into(),
@@ -179,7 +179,7 @@ fn surface_point(state: &BodyState, vertex: u32, q: &[f64]) -> DVec3 {
     Vec3::from(*rest).as_dvec3() + DVec3::from(moved)
 }
 
-fn srgb(colour: Color) -> [u8; 3] {
-    let colour = colour.to_srgba();
-    [colour.red, colour.green, colour.blue].map(|x| (x.clamp(0.0, 1.0) * 255.0).round() as u8)
+fn srgb(color: Color) -> [u8; 3] {
+    let color = color.to_srgba();
+    [color.red, color.green, color.blue].map(|x| (x.clamp(0.0, 1.0) * 255.0).round() as u8)
 }

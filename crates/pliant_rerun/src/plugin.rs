@@ -105,17 +105,17 @@ impl RerunPlugin {
         self
     }
 
-    /// Every rate, and what the colour of a surface says. Default: [`RerunRecording::default`].
+    /// Every rate, and what the color of a surface says. Default: [`RerunRecording::default`].
     #[must_use]
     pub fn with_rates(mut self, rates: RerunRecording) -> Self {
         self.rates = rates;
         self
     }
 
-    /// What the colour of a surface says. Default: [`RerunColour::Displacement`].
+    /// What the color of a surface says. Default: [`RerunColor::Displacement`].
     #[must_use]
-    pub fn with_colour(mut self, colour: RerunColour) -> Self {
-        self.rates.colour = colour;
+    pub fn with_color(mut self, color: RerunColor) -> Self {
+        self.rates.color = color;
         self
     }
 
@@ -138,7 +138,7 @@ impl RerunPlugin {
 #[derive(Component, Reflect, Debug, Default, Clone, Copy, PartialEq, Eq)]
 #[reflect(Component, Default, Clone, PartialEq)]
 pub enum RerunStyle {
-    /// As a shaded surface, coloured by displacement.
+    /// As a shaded surface, colored by displacement.
     #[default]
     Surface,
     /// As its vertices only: a ghost through which another body is seen.
@@ -162,13 +162,13 @@ pub struct RerunRecording {
     /// How often shapes are drawn. Default: `20.0`.
     pub shapes_hz: f64,
     /// How often figures are recorded. Default: infinite, every tick.
-    pub figures_hz: f64,
+    pub metrics_hz: f64,
     /// How often hands are drawn, with their reactions. Default: infinite, every tick.
     pub hands_hz: f64,
     /// How often the energies of the modes and the spectrum are drawn. Default: `4.0`.
     pub modes_hz: f64,
-    /// What the colour of a surface says. Default: [`RerunColour::Displacement`].
-    pub colour: RerunColour,
+    /// What the color of a surface says. Default: [`RerunColor::Displacement`].
+    pub color: RerunColor,
     /// Whether every period of the devices' loops is recorded (`device/NAME/loop/`, with the feature `haptics`) while figures are: at 1 kHz about
     /// 70 kB a second and device. The recording then takes what `HapticDevices::records` would give to others. Default: `false`.
     pub device_loops: bool,
@@ -179,23 +179,23 @@ impl Default for RerunRecording {
         Self {
             on: true,
             shapes_hz: 20.0,
-            figures_hz: f64::INFINITY,
+            metrics_hz: f64::INFINITY,
             hands_hz: f64::INFINITY,
             modes_hz: 4.0,
-            colour: RerunColour::default(),
+            color: RerunColor::default(),
             device_loops: false,
         }
     }
 }
 
-/// What the colour of a recorded surface says.
+/// What the color of a recorded surface says.
 #[derive(Reflect, Debug, Default, Clone, Copy, PartialEq, Eq)]
 #[reflect(Default, Clone, PartialEq)]
-pub enum RerunColour {
-    /// How far each point is from where it rests: the last colour at 0.3 of the body's size.
+pub enum RerunColor {
+    /// How far each point is from where it rests: the last color at 0.3 of the body's size.
     #[default]
     Displacement,
-    /// Von Mises stress in the skin, in plane stress from how the triangles are stretched: the last colour at 0.2 of Young's modulus.
+    /// Von Mises stress in the skin, in plane stress from how the triangles are stretched: the last color at 0.2 of Young's modulus.
     Stress,
 }
 
@@ -287,8 +287,8 @@ impl Plugin for RerunPlugin {
                             .and_then(resource_exists::<Messages<pliant_net::SessionClosed>>),
                     )
                     .run_if(collect::somebody_listens),
-                crate::net::say_how_it_stands.run_if(collect::wants_words),
-                crate::net::say_its_figures.run_if(collect::wants_figures),
+                crate::net::say_how_it_stands.run_if(collect::wants_text),
+                crate::net::log_metrics.run_if(collect::wants_metrics),
                 (crate::net::see_whose_hands, crate::net::see_other_hands).run_if(collect::wants_hands),
             )
                 .in_set(Gathering),
@@ -297,9 +297,9 @@ impl Plugin for RerunPlugin {
         app.add_systems(
             self.schedule,
             (
-                crate::haptics::say_how_they_are.run_if(collect::wants_words),
-                crate::haptics::see_devices.run_if(collect::wants_figures),
-                crate::haptics::take_samples.run_if(collect::wants_figures),
+                crate::haptics::say_how_they_are.run_if(collect::wants_text),
+                crate::haptics::see_devices.run_if(collect::wants_metrics),
+                crate::haptics::take_samples.run_if(collect::wants_metrics),
             )
                 .in_set(Gathering)
                 .run_if(resource_exists::<pliant_haptics::HapticDevices>),

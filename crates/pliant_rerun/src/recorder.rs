@@ -13,7 +13,7 @@ use rerun::{
 };
 
 use crate::{
-    RerunColour, RerunStyle, SIM_TIME, TICK, WALL_TIME,
+    RerunColor, RerunStyle, SIM_TIME, TICK, WALL_TIME,
     blueprint::Plots,
     columns::{Columns, HandColumns, Moment},
     frame::{Drawn, Frame, Hand, Line, Owed, Place, Shape},
@@ -21,10 +21,10 @@ use crate::{
     stress::Skin,
 };
 
-/// A displacement of this part of the body's size has the last colour of the scale.
+/// A displacement of this part of the body's size has the last color of the scale.
 const FULL_COLOUR: f32 = 0.3;
 
-/// A stress of this part of Young's modulus has the last colour of the scale.
+/// A stress of this part of Young's modulus has the last color of the scale.
 const FULL_STRESS: f32 = 0.2;
 
 /// The longest arrow yet, as a part of the largest body's size.
@@ -33,7 +33,7 @@ const LONGEST_ARROW: f64 = 0.5;
 /// A new plot waits this long for others that come with it before the layout is sent again.
 const LAYOUT_PAUSE: Duration = Duration::from_millis(700);
 
-/// Colours of hands and series, told apart also by those who see red and green alike (Okabe and Ito).
+/// Colors of hands and series, told apart also by those who see red and green alike (Okabe and Ito).
 const COLOURS: [[u8; 3]; 7] = [
     [230, 159, 0],
     [86, 180, 233],
@@ -71,8 +71,8 @@ pub(crate) struct Recorder {
     hand_columns: HandColumns,
     /// The size that arrows, targets and lines were last drawn for, m.
     drawn_for: f64,
-    /// The colour that each line of a plot was given.
-    colours: HashMap<String, Color>,
+    /// The color that each line of a plot was given.
+    colors: HashMap<String, Color>,
     /// Hands of the last tick that had any, by name.
     held: HashSet<String>,
     started: bool,
@@ -103,7 +103,7 @@ impl Recorder {
             columns: Columns::default(),
             hand_columns: HandColumns::default(),
             drawn_for: 0.0,
-            colours: HashMap::new(),
+            colors: HashMap::new(),
             held: HashSet::new(),
             started: false,
         }
@@ -232,7 +232,7 @@ impl Recorder {
 
     fn shape(&mut self, shape: &Shape, frame: &Frame) -> Result<(), RecordingStreamError> {
         self.modes(shape, frame)?;
-        if !(shape.draw || shape.figures) {
+        if !(shape.draw || shape.metrics) {
             return Ok(());
         }
         let Some(known) = self.bodies.get_mut(&shape.body.path) else { return Ok(()) };
@@ -253,10 +253,10 @@ impl Recorder {
         model.basis().reconstruct(frame.coordinates(shape), shape.warped, &mut self.positions);
         let full = FULL_COLOUR * model.size() as f32;
         let mut largest = 0.0f32;
-        let by_displacement = shape.draw && frame.colour == RerunColour::Displacement;
-        let mut colours = Vec::with_capacity(if shape.draw { self.positions.len() } else { 0 });
+        let by_displacement = shape.draw && frame.color == RerunColor::Displacement;
+        let mut colors = Vec::with_capacity(if shape.draw { self.positions.len() } else { 0 });
         let mut most_stress = None;
-        if frame.colour == RerunColour::Stress {
+        if frame.color == RerunColor::Stress {
             let skin = known.skin.get_or_insert_with(|| Skin::new(surface));
             // A scaled body keeps its stiffness in N/m while its lengths grow: it is of a softer material, E L is what stays.
             let young = model.info().young as f32 * shape.stiffness / shape.place.scale.abs();
@@ -264,7 +264,7 @@ impl Recorder {
             let poisson = model.info().poisson as f32;
             most_stress = Some(skin.stress(surface, &self.positions, young, poisson, &mut self.stresses));
             if shape.draw {
-                colours.extend(self.stresses.iter().map(|stress| colour(stress / (FULL_STRESS * young))));
+                colors.extend(self.stresses.iter().map(|stress| color(stress / (FULL_STRESS * young))));
             }
         }
         for (p, rest) in self.positions.iter().zip(surface.positions()) {
@@ -272,7 +272,7 @@ impl Recorder {
             let distance = moved.iter().map(|x| x * x).sum::<f32>().sqrt();
             largest = largest.max(distance);
             if by_displacement {
-                colours.push(colour(distance / full));
+                colors.push(color(distance / full));
             }
         }
         let largest = f64::from(largest * shape.place.scale);
@@ -284,7 +284,7 @@ impl Recorder {
                     let mesh = Mesh3D::update_fields()
                         .with_vertex_positions(self.positions.iter().copied())
                         .with_vertex_normals(self.normals.iter().copied())
-                        .with_vertex_colors(colours);
+                        .with_vertex_colors(colors);
                     // Who is a neighbour of whom is told once.
                     let known = self.bodies.get_mut(&shape.body.path);
                     let first = known.is_some_and(|known| !std::mem::replace(&mut known.meshed, true));
@@ -305,7 +305,7 @@ impl Recorder {
                 RerunStyle::Hidden => {}
             }
         }
-        if shape.figures {
+        if shape.metrics {
             if let Some(stress) = most_stress {
                 self.scalar(&format!("stress/{}", shape.body.path), "Pa", f64::from(stress))?;
             }
@@ -356,8 +356,8 @@ impl Recorder {
         self.force = hands.iter().map(|hand| magnitude(&hand.force)).fold(self.force, f64::max);
         let metres_a_newton = if self.force > 0.0 { LONGEST_ARROW * self.size / self.force } else { 0.0 };
         let single = |p: [f64; 3]| p.map(|x| x as f32);
-        let colour_at = |index: usize, hand: &Hand| {
-            hand.colour.map_or_else(|| colour_of(index), |[r, g, b]| Color::from_rgb(r, g, b))
+        let color_at = |index: usize, hand: &Hand| {
+            hand.color.map_or_else(|| color_of(index), |[r, g, b]| Color::from_rgb(r, g, b))
         };
         if self.drawn_for != self.size {
             self.drawn_for = self.size;
@@ -376,7 +376,7 @@ impl Recorder {
                 single(hand.point),
                 single(hand.target),
                 format!("{} {:.3} N", hand.name, magnitude(&hand.force)),
-                colour_at(index, hand),
+                color_at(index, hand),
             );
         }
 
@@ -387,9 +387,9 @@ impl Recorder {
                 .map(|n| if n == 1 { hand.name.to_string() } else { format!("{} {n}", hand.name) })
                 .find(|name| !used.contains(name))
                 .unwrap_or_default();
-            // The line in the plot has the colour of the arrow.
-            let colour = colour_at(used.len(), hand);
-            self.coloured_scalar(&format!("reaction/{name}"), "N", magnitude(&hand.force), Some(colour))?;
+            // The line in the plot has the color of the arrow.
+            let color = color_at(used.len(), hand);
+            self.colored_scalar(&format!("reaction/{name}"), "N", magnitude(&hand.force), Some(color))?;
             used.insert(name);
         }
         // The line of a hand that let go ends there, and does not run on to where it takes hold again.
@@ -400,49 +400,49 @@ impl Recorder {
     }
 
     fn scalar(&mut self, name: &str, unit: &str, value: f64) -> Result<(), RecordingStreamError> {
-        self.coloured_scalar(name, unit, value, None)
+        self.colored_scalar(name, unit, value, None)
     }
 
-    fn coloured_scalar(
+    fn colored_scalar(
         &mut self,
         name: &str,
         unit: &str,
         value: f64,
-        colour: Option<Color>,
+        color: Option<Color>,
     ) -> Result<(), RecordingStreamError> {
-        self.introduce(name, unit, colour)?;
+        self.introduce(name, unit, color)?;
         self.columns.push(name, self.now, value);
         Ok(())
     }
 
-    /// Gives a line its place in the layout, its name and its colour, where those are new.
+    /// Gives a line its place in the layout, its name and its color, where those are new.
     fn introduce(
         &mut self,
         name: &str,
         unit: &str,
-        colour: Option<Color>,
+        color: Option<Color>,
     ) -> Result<(), RecordingStreamError> {
-        let recoloured = colour.is_some_and(|colour| self.colours.get(name) != Some(&colour));
-        if let (true, Some(colour)) = (recoloured, colour) {
-            self.colours.insert(name.to_owned(), colour);
+        let recolored = color.is_some_and(|color| self.colors.get(name) != Some(&color));
+        if let (true, Some(color)) = (recolored, color) {
+            self.colors.insert(name.to_owned(), color);
         }
-        if self.plots.note(name, unit) || recoloured {
+        if self.plots.note(name, unit) || recolored {
             let label = name.split_once('/').map_or(name, |(_, rest)| rest);
             let series = SeriesLines::new().with_names([label]).with_widths([1.5]);
-            let series = colour.map_or(series.clone(), |colour| series.with_colors([colour]));
+            let series = color.map_or(series.clone(), |color| series.with_colors([color]));
             self.stream.log_static(path(name), &series)?;
         }
         Ok(())
     }
 }
 
-fn colour_of(index: usize) -> Color {
+fn color_of(index: usize) -> Color {
     let [r, g, b] = COLOURS[index % COLOURS.len()];
     Color::from_rgb(r, g, b)
 }
 
 /// Teal at rest over sand to red at a displacement of one.
-fn colour(t: f32) -> Color {
+fn color(t: f32) -> Color {
     const STOPS: [[f32; 3]; 3] = [[58.0, 140.0, 150.0], [235.0, 200.0, 120.0], [215.0, 60.0, 50.0]];
     let t = if t.is_finite() { t.clamp(0.0, 1.0) * 2.0 } else { 0.0 };
     let (from, to) = if t < 1.0 { (STOPS[0], STOPS[1]) } else { (STOPS[1], STOPS[2]) };

@@ -4,10 +4,10 @@ use std::{borrow::Cow, sync::Arc};
 
 use bevy::prelude::*;
 
-use crate::frame::{Figure, Line, Samples, Scalar};
+use crate::frame::{Line, Metric, Samples, Scalar};
 
 /// Figures to be plotted over time, and lines for the log. Written by whoever has them, taken by [`RerunPlugin`](crate::RerunPlugin) every
-/// tick for which figures are due ([`RerunRecording::figures_hz`](crate::RerunRecording::figures_hz)); while they are off, or nothing is recorded, what is
+/// tick for which figures are due ([`RerunRecording::metrics_hz`](crate::RerunRecording::metrics_hz)); while they are off, or nothing is recorded, what is
 /// set is forgotten. Systems of a crate that should work without the plugin ask for `Option<ResMut<RerunScalars>>`.
 ///
 /// ```
@@ -24,7 +24,7 @@ pub struct RerunScalars {
     pub(crate) scalars: Vec<Scalar>,
     pub(crate) lines: Vec<Line>,
     /// Figures whose names are kept by those who set them.
-    pub(crate) measured: Vec<(Arc<Figure>, f64)>,
+    pub(crate) measured: Vec<(Arc<Metric>, f64)>,
     /// Of the devices' own loops.
     pub(crate) samples: Vec<Samples>,
 }
@@ -60,14 +60,14 @@ impl RerunScalars {
     }
 
     #[cfg(feature = "haptics")]
-    pub(crate) fn measured(&mut self, figure: &Arc<Figure>, value: f64) {
+    pub(crate) fn measured(&mut self, figure: &Arc<Metric>, value: f64) {
         if self.measured.len() < Self::LIMIT {
             self.measured.push((figure.clone(), value));
         }
     }
 
     /// Forgets figures that nobody took at their time.
-    pub(crate) fn forget_figures(&mut self) {
+    pub(crate) fn forget_metrics(&mut self) {
         self.scalars.clear();
         self.measured.clear();
         self.samples.clear();

@@ -7,7 +7,7 @@ use std::{
 };
 
 use bevy::{math::DVec3, prelude::*, time::TimeUpdateStrategy, transform::TransformPlugin};
-use pliant_body::{Driven, Grab, GrabOf, ModalAsset, ModalBody, PliantBodyPlugin, ShownState};
+use pliant_body::{Driven, Grab, GrabOf, ModalAsset, ModalBody, PliantBodyPlugin, VisualState};
 use pliant_modal::{BakeInfo, Damping, Element, ModalModel, ModelParts, SurfaceMesh};
 use rerun::{
     RecordingStreamBuilder,
@@ -97,7 +97,7 @@ pub(crate) fn frame(tick: u64, body: &Arc<Drawn>, q: f32) -> Frame {
         place: HERE,
         stiffness: 1.0,
         draw: true,
-        figures: true,
+        metrics: true,
         sample: true,
         energies: None,
         bars: false,
@@ -152,20 +152,20 @@ pub(crate) fn numbers(messages: &[LogMsg], path: &str, component: &str) -> Vec<f
     values
 }
 
-/// The colours that a path was given, row by row, red, green and blue.
-pub(crate) fn bytes_of_colours(messages: &[LogMsg], path: &str) -> Vec<[u8; 3]> {
-    let mut colours = Vec::new();
+/// The colors that a path was given, row by row, red, green and blue.
+pub(crate) fn bytes_of_colors(messages: &[LogMsg], path: &str) -> Vec<[u8; 3]> {
+    let mut colors = Vec::new();
     for chunk in chunks(messages, path) {
         for column in chunk.components().values() {
             if column.descriptor.to_string().ends_with("colors") {
                 let array = column.list_array.values();
                 let array = array.as_any().downcast_ref::<rerun::external::arrow::array::UInt32Array>();
                 let rgba = array.unwrap().values().iter().map(|rgba| rgba.to_be_bytes());
-                colours.extend(rgba.map(|[r, g, b, _]| [r, g, b]));
+                colors.extend(rgba.map(|[r, g, b, _]| [r, g, b]));
             }
         }
     }
-    colours
+    colors
 }
 
 #[test]
@@ -217,7 +217,7 @@ fn figures_have_their_values_and_the_displacement_is_in_the_world() {
 fn hands_of_one_name_are_two_lines_and_an_empty_hand_clears_the_arrows() {
     let (mut recorder, stream, storage) = recorder();
     let hand =
-        Hand { name: "hand".into(), colour: None, force: [3.0, 4.0, 0.0], point: [0.0; 3], target: [0.0; 3] };
+        Hand { name: "hand".into(), color: None, force: [3.0, 4.0, 0.0], point: [0.0; 3], target: [0.0; 3] };
     let line = Line { warning: true, text: "watch out".into() };
     recorder
         .log(&Frame { tick: 1, hands: Some(vec![hand.clone(), hand]), lines: vec![line], ..Frame::default() })
@@ -377,9 +377,9 @@ fn a_viewer_that_does_not_read_drops_ticks_and_never_holds_the_app_up() {
         // The SDK takes in what the viewer does not read: three queues of 50 MiB, and a hundred
         // messages. Long lines fill those soon; a tick of this app alone has about a kilobyte. While
         // ticks are dropped the last line waits, and no other is added.
-        app.add_systems(Update, |mut figures: ResMut<RerunScalars>| {
-            if figures.lines.is_empty() {
-                figures.say("x".repeat(1 << 20));
+        app.add_systems(Update, |mut metrics: ResMut<RerunScalars>| {
+            if metrics.lines.is_empty() {
+                metrics.say("x".repeat(1 << 20));
             }
         });
         // A worker that is only late drops some of the ticks. One that is stuck drops all of them.
@@ -407,12 +407,12 @@ fn a_path_that_cannot_be_written_leaves_the_app_running() {
     app.update();
     assert_eq!(app.world().resource::<RerunStats>().collected, 0);
     // Figures that nobody takes do not pile up.
-    let mut figures = app.world_mut().resource_mut::<RerunScalars>();
+    let mut metrics = app.world_mut().resource_mut::<RerunScalars>();
     for i in 0..10_000 {
-        figures.set(format!("a/{i}"), "", 1.0);
-        figures.say("b");
+        metrics.set(format!("a/{i}"), "", 1.0);
+        metrics.say("b");
     }
-    assert!(figures.scalars.len() <= 4096 && figures.lines.len() <= 4096);
+    assert!(metrics.scalars.len() <= 4096 && metrics.lines.len() <= 4096);
 }
 
 #[test]
@@ -427,7 +427,7 @@ fn a_resting_body_is_not_sent() {
     let after = *app.world().resource::<RerunStats>();
     assert_eq!((after.collected, after.shapes), (before.collected + 400, before.shapes));
     // One state is one shape: drawn in the next drawing at the latest, and then no more.
-    app.world_mut().get_mut::<ShownState>(body).unwrap().snap(&[0.1]).unwrap();
+    app.world_mut().get_mut::<VisualState>(body).unwrap().snap(&[0.1]).unwrap();
     (0..400).for_each(|_| app.update());
     let shapes = app.world().resource::<RerunStats>().shapes - after.shapes;
     assert_eq!(app.world().resource::<RerunStats>().dropped, 0, "what was dropped would be sent again");

@@ -132,7 +132,7 @@ fn what_is_set_while_nothing_is_recorded_is_not_recorded_later() {
         app.world_mut().resource_mut::<RerunScalars>().say(format!("{value}"));
         app.update();
     };
-    app.world_mut().resource_mut::<RerunRecording>().figures_hz = 0.0;
+    app.world_mut().resource_mut::<RerunRecording>().metrics_hz = 0.0;
     set(&mut app, 1.0);
     app.world_mut().resource_mut::<RerunRecording>().on = false;
     set(&mut app, 2.0);

@@ -10,11 +10,11 @@ use rerun::{
 };
 
 use crate::{
-    RerunColour, RerunPlugin, RerunRecording, RerunScalars, RerunStats, RerunStyle,
+    RerunColor, RerunPlugin, RerunRecording, RerunScalars, RerunStats, RerunStyle,
     frame::{Frame, Hand, Samples},
     motion::Motion,
     stress::Skin,
-    tests::{app, body, bytes_of_colours, chunks, frame, numbers, recorder, rows, scratch, square},
+    tests::{app, body, bytes_of_colors, chunks, frame, numbers, recorder, rows, scratch, square},
 };
 
 #[test]
@@ -106,11 +106,11 @@ fn the_energy_of_each_mode_is_a_bar() {
 }
 
 #[test]
-fn a_hand_has_its_users_colour_in_the_plot_and_in_the_scene_and_its_line_ends_with_it() {
+fn a_hand_has_its_users_color_in_the_plot_and_in_the_scene_and_its_line_ends_with_it() {
     let (mut recorder, stream, storage) = recorder();
-    let hand = |colour| Hand {
+    let hand = |color| Hand {
         name: "Ann".into(),
-        colour: Some(colour),
+        color: Some(color),
         force: [3.0, 4.0, 0.0],
         point: [0.0; 3],
         target: [0.0; 3],
@@ -125,38 +125,38 @@ fn a_hand_has_its_users_colour_in_the_plot_and_in_the_scene_and_its_line_ends_wi
     drop(stream);
     let messages = storage.take();
     assert_eq!(numbers(&messages, "/reaction/Ann", "scalars"), [5.0; 3]);
-    let plotted = bytes_of_colours(&messages, "/reaction/Ann");
+    let plotted = bytes_of_colors(&messages, "/reaction/Ann");
     assert_eq!(plotted, [[10, 200, 30], [200, 10, 30]], "told once each");
-    let drawn = bytes_of_colours(&messages, "/world/hands/reactions");
+    let drawn = bytes_of_colors(&messages, "/world/hands/reactions");
     assert_eq!(drawn, [[10, 200, 30], [10, 200, 30], [200, 10, 30]]);
     assert_eq!(rows(&messages, "/reaction/Ann", "is_recursive"), 1, "the line ends where the hand let go");
 }
 
 #[test]
-fn the_colour_says_displacement_or_stress() {
-    let stressed = |colour, scale| {
+fn the_color_says_displacement_or_stress() {
+    let stressed = |color, scale| {
         let (mut recorder, stream, storage) = recorder();
         let body = body();
         let mut one = frame(1, &body, 0.3);
-        one.colour = colour;
+        one.color = color;
         one.shapes[0].place.scale = scale;
         recorder.log(&one).unwrap();
         recorder.end();
         drop(stream);
         let messages = storage.take();
         let stress = numbers(&messages, "/stress/my\\ body", "scalars");
-        (bytes_of_colours(&messages, "/world/my\\ body"), stress)
+        (bytes_of_colors(&messages, "/world/my\\ body"), stress)
     };
-    let (by_displacement, none) = stressed(RerunColour::Displacement, 1.0);
-    let (by_stress, largest) = stressed(RerunColour::Stress, 1.0);
+    let (by_displacement, none) = stressed(RerunColor::Displacement, 1.0);
+    let (by_stress, largest) = stressed(RerunColor::Stress, 1.0);
     assert_eq!((by_displacement.len(), by_stress.len(), none.len(), largest.len()), (4, 4, 0, 1));
     assert_ne!(by_displacement[0], by_displacement[2], "the near side rests, the far side is lifted");
     assert_ne!(by_displacement, by_stress);
     assert!(largest[0] > 0.0);
     // Twice as large with the same stiffness in N/m: twice the displacement, the same strain, half the stress.
-    let (same, half) = stressed(RerunColour::Stress, 2.0);
+    let (same, half) = stressed(RerunColor::Stress, 2.0);
     assert!((half[0] / largest[0] - 0.5).abs() < 1e-6, "{half:?} Pa for half of {largest:?} Pa");
-    assert_eq!(same, by_stress, "the colour is relative to Young's modulus");
+    assert_eq!(same, by_stress, "the color is relative to Young's modulus");
 }
 
 #[test]
@@ -223,7 +223,7 @@ fn collected(rates: RerunRecording, name: &str, style: RerunStyle) -> (RerunStat
 fn a_stream_with_a_rate_of_zero_is_not_gathered_and_not_in_the_file() {
     let off = RerunRecording {
         shapes_hz: 0.0,
-        figures_hz: 0.0,
+        metrics_hz: 0.0,
         hands_hz: 0.0,
         modes_hz: f64::NAN,
         ..RerunRecording::default()
@@ -261,7 +261,7 @@ fn a_stream_with_a_rate_of_zero_is_not_gathered_and_not_in_the_file() {
 #[test]
 fn the_log_of_a_tick_whose_figures_are_not_due_is_kept_and_so_are_the_figures() {
     let path = scratch("kept");
-    let rates = RerunRecording { figures_hz: 1.0, ..RerunRecording::default() };
+    let rates = RerunRecording { metrics_hz: 1.0, ..RerunRecording::default() };
     let mut app = app(RerunPlugin::file(&path).with_rates(rates));
     for tick in 0..10 {
         let mut own = app.world_mut().resource_mut::<RerunScalars>();

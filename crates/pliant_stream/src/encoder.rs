@@ -17,7 +17,7 @@ use crate::replica::{self, Mean, Replica};
 use crate::state::{BodyId, GrabKey, GrabState, State, Tick, TickState};
 use crate::wire::{
     AccelerationCoding, Accelerations, Frame, FrameGrab, MAX_PARTS, Payload, Repeat, RepeatGrab, Slice,
-    SliceEntry, SnapshotBytes, StreamWish, Writer, round24,
+    SliceEntry, SnapshotBytes, StreamSubscription, Writer, round24,
 };
 
 /// Frames kept for resending.
@@ -74,7 +74,7 @@ impl Encoded {
 #[derive(Debug)]
 pub struct Encoder {
     body: BodyId,
-    wish: StreamWish,
+    subscription: StreamSubscription,
     modes: usize,
     limit: usize,
     newmark: Newmark,
@@ -115,11 +115,11 @@ impl Encoder {
         model: Arc<ModalModel>,
         settings: &StepSettings,
         newmark: Newmark,
-        wish: StreamWish,
+        subscription: StreamSubscription,
         limit: usize,
     ) -> Result<Self, StreamError> {
-        let visible = Quanta::visible_of(&model, Self::modes_for(&wish, model.mode_count(), limit));
-        Self::with_visible(body, model, settings, newmark, wish, limit, &visible)
+        let visible = Quanta::visible_of(&model, Self::modes_for(&subscription, model.mode_count(), limit));
+        Self::with_visible(body, model, settings, newmark, subscription, limit, &visible)
     }
 
     /// As [`Encoder::new`], with the visible amplitudes of all that may be wanted of the model's modes.
@@ -128,12 +128,12 @@ impl Encoder {
         model: Arc<ModalModel>,
         settings: &StepSettings,
         newmark: Newmark,
-        wish: StreamWish,
+        subscription: StreamSubscription,
         limit: usize,
         visible: &[f64],
     ) -> Result<Self, StreamError> {
         newmark.check()?;
-        let modes = Self::modes_for(&wish, model.mode_count(), limit);
+        let modes = Self::modes_for(&subscription, model.mode_count(), limit);
         if modes == 0 {
             return Err(StreamError::Config {
                 what: "datagram size",
@@ -149,7 +149,7 @@ impl Encoder {
         Ok(Self {
             flow,
             body,
-            wish,
+            subscription,
             modes,
             limit,
             newmark,
@@ -185,9 +185,9 @@ impl Encoder {
 
     /// How many modes a stream carries: what is wished, what the model has, and (accelerations) what fits beside four
     /// grabs and a pose into one datagram.
-    pub fn modes_for(wish: &StreamWish, model_modes: usize, limit: usize) -> usize {
-        let wanted = usize::from(wish.modes).min(model_modes);
-        match wish.payload {
+    pub fn modes_for(subscription: &StreamSubscription, model_modes: usize, limit: usize) -> usize {
+        let wanted = usize::from(subscription.modes).min(model_modes);
+        match subscription.payload {
             Payload::Forces => wanted,
             Payload::Accelerations(coding) => {
                 let fixed = 3 + 12 + 4 * 34 + 46 + 7 + 4 + 1;
@@ -263,7 +263,7 @@ impl Encoder {
     pub fn encode(&mut self, state: &TickState<'_>) -> Encoded {
         replica::place(&mut self.mirror, self.replica.model(), state.pose.as_ref());
         self.truth.frame = self.mirror.frame;
-        let forces = self.wish.payload == Payload::Forces;
+        let forces = self.subscription.payload == Payload::Forces;
         let grabs: Vec<FrameGrab> = state
             .grabs
             .iter()
@@ -284,7 +284,7 @@ impl Encoder {
             })
             .collect();
         let unit = self.unit(state);
-        let accelerations = match self.wish.payload {
+        let accelerations = match self.subscription.payload {
             Payload::Accelerations(coding) => Some(self.step_accelerations(coding, state, unit)),
             Payload::Forces => {
                 self.step_forces(&grabs, state);
@@ -339,7 +339,7 @@ impl Encoder {
         let count = self.modes.min(state.q.len());
         let now = self.quanta.visible(&state.q[..count], &state.v[..count]);
         self.visible = now.max(self.visible * VISIBLE_KEEP);
-        let finer = if self.wish.payload == Payload::Forces { 1.0 } else { FINER };
+        let finer = if self.subscription.payload == Payload::Forces { 1.0 } else { FINER };
         let share = self.quantum / finer;
         let unit = (self.visible * share) as f32;
         if unit.is_finite() { unit.clamp(1e-30, 1e6) } else { 1e6 }
@@ -476,10 +476,10 @@ impl Encoder {
     /// Adds absolute state and takes it into the mirror: the modes that are most wrong in the mirror, and some in turn,
     /// for those receivers that missed what the mirror got.
     fn refresh(&mut self, frame: &mut Frame, state: &TickState<'_>, unit: f32, room: usize) {
-        if self.wish.refresh == 0 {
+        if self.subscription.refresh == 0 {
             return;
         }
-        let share = self.modes.div_ceil(usize::from(self.wish.refresh)).min(255);
+        let share = self.modes.div_ceil(usize::from(self.subscription.refresh)).min(255);
         let truth = |slice: &[f64], k: usize| slice.get(k).copied().unwrap_or(0.0);
         // In turn: a third; the rest by how wrong the mirror is, velocity counted as the displacement it leads to.
         let turn = share.div_ceil(3);
@@ -538,7 +538,7 @@ impl Encoder {
 
     /// Adds the last ticks again, and the grabs that ended within them.
     fn repeat(&mut self, frame: &mut Frame) {
-        for sent in self.sent.iter().rev().take(usize::from(self.wish.repeats)) {
+        for sent in self.sent.iter().rev().take(usize::from(self.subscription.repeats)) {
             let Ok(back) = u8::try_from(frame.tick - sent.tick) else { break };
             let mut grabs = Vec::with_capacity(sent.frames.first().map_or(0, |f| f.grabs.len()));
             for g in sent.grabs() {

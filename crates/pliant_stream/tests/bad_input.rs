@@ -19,8 +19,8 @@ use pliant_stream::wire::{
     Targets,
 };
 use pliant_stream::{
-    BodyId, Channel, EndReason, GuestConfig, GuestEvent, GuestSession, HostConfig, HostEvent, HostSession,
-    Newmark, PeerId, Pose, RecoveryConfig, StepSettings, StreamError, TickState,
+    BodyId, Channel, DisconnectReason, GuestConfig, GuestEvent, GuestSession, HostConfig, HostEvent,
+    HostSession, Newmark, PeerId, Pose, RecoveryConfig, StepSettings, StreamError, TickState,
 };
 use proptest::prelude::*;
 use support::bar;
@@ -119,8 +119,8 @@ fn not_a_number_is_refused_by_name() {
 }
 
 fn finite(guest: &GuestSession) {
-    if let Some(shown) = guest.body(BODY).and_then(|b| b.shown()) {
-        assert!(shown.is_finite());
+    if let Some(visual) = guest.body(BODY).and_then(|b| b.visual()) {
+        assert!(visual.is_finite());
     }
 }
 
@@ -371,7 +371,7 @@ fn a_tick_of_the_near_future_costs_a_snapshot_and_no_more() {
         }
         let view = guest.body(BODY).unwrap();
         assert!((150..=160).contains(&view.tick()), "{name}: tick {}", view.tick());
-        let q = &view.hidden().unwrap().q;
+        let q = &view.confirmed().unwrap().q;
         let truth = |k: usize| 0.01 * (0.002 * view.tick() as f64 + k as f64).sin();
         for (k, q) in q.iter().enumerate() {
             // No reaction explains this shape: the force-driven receiver holds it by the load that it is told.
@@ -405,12 +405,12 @@ fn a_guest_that_breaks_the_protocol_is_shown_out_with_a_reason() {
     host.on_message(now, PeerId(1), &[0xFF; 40]);
     let mut ended = false;
     while let Some(e) = host.poll_event() {
-        ended |= matches!(e, HostEvent::Left { reason: EndReason::Protocol, .. });
+        ended |= matches!(e, HostEvent::Left { reason: DisconnectReason::Protocol, .. });
     }
     assert!(ended);
     let goodbye = host.poll_output().unwrap();
     let said = HostMessage::decode(&goodbye.bytes).unwrap();
-    assert_eq!(said, HostMessage::Goodbye { reason: EndReason::Protocol });
+    assert_eq!(said, HostMessage::Goodbye { reason: DisconnectReason::Protocol });
 }
 
 #[test]
@@ -442,7 +442,7 @@ fn a_host_that_sends_a_false_model_is_left() {
             reason = Some(r);
         }
     }
-    assert_eq!(reason, Some(EndReason::Protocol));
+    assert_eq!(reason, Some(DisconnectReason::Protocol));
 }
 
 #[test]
@@ -452,12 +452,12 @@ fn another_version_is_told_so() {
     let hello = GuestMessage::Hello {
         version: 999,
         name: "old".into(),
-        wish: RecoveryConfig::default().wish(None),
+        subscription: RecoveryConfig::default().subscription(None),
         cached: Vec::new(),
     };
     host.on_message(Duration::ZERO, PeerId(1), &hello.encode());
     let said = HostMessage::decode(&host.poll_output().unwrap().bytes).unwrap();
-    assert_eq!(said, HostMessage::Goodbye { reason: EndReason::Version });
+    assert_eq!(said, HostMessage::Goodbye { reason: DisconnectReason::Version });
 }
 
 #[test]

@@ -20,7 +20,7 @@ const YEAR: Duration = Duration::from_secs(365 * 86_400);
 const MS: Duration = Duration::from_millis(1);
 
 /// What a guest shows of each tick, and what was true, over the paper's first network, when the two clocks say such times at the beginning.
-fn shown(
+fn visual(
     host_clock: Duration,
     guest_clock: Duration,
 ) -> (BTreeMap<u64, Vec<f64>>, BTreeMap<u64, Vec<f64>>, f64) {
@@ -82,7 +82,7 @@ fn shown(
             link.send(passed, o.bytes.to_vec(), o.bytes.len());
         }
         if let Some(view) = guest.body(BODY).filter(|view| view.is_ready()) {
-            let q = view.shown().unwrap().q.clone();
+            let q = view.visual().unwrap().q.clone();
             seen.insert(view.tick(), q);
         }
         passed += 5 * MS;
@@ -96,10 +96,10 @@ fn shown(
 
 #[test]
 fn a_guest_and_a_host_whose_clocks_differ_by_years_see_the_same() {
-    let (same, truth, _) = shown(Duration::ZERO, Duration::ZERO);
+    let (same, truth, _) = visual(Duration::ZERO, Duration::ZERO);
     let size = truth.values().flatten().fold(0.0_f64, |size, q| size.max(q.abs()));
     for (host, guest) in [(40 * YEAR, Duration::ZERO), (Duration::ZERO, 40 * YEAR), (70 * YEAR, 30 * YEAR)] {
-        let (seen, _, offset) = shown(host, guest);
+        let (seen, _, offset) = visual(host, guest);
         let expected = host.as_secs_f64() - guest.as_secs_f64();
         assert!((offset - expected).abs() < 0.02, "{offset} s between the clocks, truly {expected}");
         // Two seconds to find the clock and the hand; then every tick that is shown is right, as it is without the years.

@@ -95,13 +95,13 @@ fn every_late_acceleration_takes_its_error_out_exactly() {
                     largest = largest.max(whole.q[1].abs()).max(whole.q[0].abs());
                 }
                 for k in 0..2 {
-                    let error = (receiver.hidden().q[k] - whole.q[k]).abs() / largest;
+                    let error = (receiver.confirmed().q[k] - whole.q[k]).abs() / largest;
                     assert!(
                         error < 1e-9,
                         "{predict:?} beta {beta}: {error:e} of the scale after the last repair"
                     );
                 }
-                let drift = (drifting.hidden().q[1] - whole.q[1]).abs() / largest;
+                let drift = (drifting.confirmed().q[1] - whole.q[1]).abs() / largest;
                 assert!(drift > 1e-5, "without compensation the error stays: {drift:e}");
             }
         }
@@ -126,6 +126,6 @@ fn a_wrong_velocity_that_stays_drifts_linearly() {
         let a = |n| if n == 20 { 2.0 } else { 0.0 };
         (q, v) = newmark.step(q, v, a(n - 1), a(n));
     }
-    assert!((v - receiver.hidden().v[0] - 0.025 * 2.0).abs() < 1e-15);
-    assert!((q - receiver.hidden().q[0] - 100.0 * 0.025 * 0.025 * 2.0).abs() < 1e-13);
+    assert!((v - receiver.confirmed().v[0] - 0.025 * 2.0).abs() < 1e-15);
+    assert!((q - receiver.confirmed().q[0] - 100.0 * 0.025 * 0.025 * 2.0).abs() < 1e-13);
 }

@@ -8,8 +8,8 @@ use std::time::Duration;
 use pliant_stream::peer::{PeerConfig, PeerDatagram, PeerEvent, PeerSession};
 use pliant_stream::wire::{BodyInfo, GuestMessage, HostMessage, PROTOCOL_VERSION};
 use pliant_stream::{
-    Channel, EndReason, GuestConfig, GuestEvent, GuestSession, HostSession, Newmark, PeerId, StepSettings,
-    StreamError,
+    Channel, DisconnectReason, GuestConfig, GuestEvent, GuestSession, HostSession, Newmark, PeerId,
+    StepSettings, StreamError,
 };
 use support::bar;
 use support::direct::{BODY, pass, peers, publish, random, session};
@@ -55,7 +55,7 @@ fn a_host_cannot_make_a_guest_hold_more_than_its_bound() {
         assert_eq!(guest.is_closed(), fits < 2, "room for {room} of {size}");
         let closed = std::iter::from_fn(|| guest.poll_event())
             .find_map(|e| if let GuestEvent::Closed { reason } = e { Some(reason) } else { None });
-        assert_eq!(closed, (fits < 2).then_some(EndReason::Full));
+        assert_eq!(closed, (fits < 2).then_some(DisconnectReason::Full));
     }
 }
 
@@ -83,7 +83,7 @@ fn hands_that_are_not_numbers_are_refused_and_the_old_target_stays() {
     }
     let body = peer.body(BODY).unwrap();
     assert_eq!(body.grabs()[0].target, [1.0, 0.0, 0.0]);
-    assert!(body.shown().is_finite());
+    assert!(body.visual().is_finite());
 }
 
 #[test]
@@ -101,7 +101,7 @@ fn peers_survive_a_hundred_thousand_damaged_datagrams() {
             let old = last.len().saturating_sub(12);
             last.drain(1..1.max(old));
             for p in &mut all {
-                assert!(p.body(BODY).unwrap().shown().is_finite(), "round {round}");
+                assert!(p.body(BODY).unwrap().visual().is_finite(), "round {round}");
                 while let Some(e) = p.poll_event() {
                     assert!(!matches!(e, PeerEvent::Left { .. }), "round {round}: {e:?}");
                 }
@@ -145,7 +145,7 @@ struct Jump {
 }
 
 /// Ten seconds of a session whose clocks jump after five of them; how the guest's session ended, if it did.
-fn through(jump: &Jump) -> (Option<EndReason>, HostSession, GuestSession, u64) {
+fn through(jump: &Jump) -> (Option<DisconnectReason>, HostSession, GuestSession, u64) {
     let (mut host, mut guest, start) = session("default");
     while guest.poll_event().is_some() {}
     let (mut ended, mut tick) = (None, 60);
@@ -212,7 +212,7 @@ fn clocks_that_jump_an_hour_are_followed_or_end_the_session_with_a_reason() {
         // Who looks at its clock first has heard nothing for an hour, and says so.
         let jump = Jump { hears_first: false, ..jump };
         let (ended, ..) = through(&jump);
-        assert_eq!(ended, Some(EndReason::Silent), "{host_jumps:?} {guest_jumps:?}");
+        assert_eq!(ended, Some(DisconnectReason::Silent), "{host_jumps:?} {guest_jumps:?}");
     }
 }
 
@@ -230,7 +230,7 @@ fn a_peer_whose_clock_jumps_an_hour_comes_back_or_says_why_not() {
     pass(&mut all, now, |_, _, _| {});
     for (k, p) in all.iter_mut().enumerate() {
         let left = std::iter::from_fn(|| p.poll_event())
-            .filter(|e| matches!(e, PeerEvent::Left { reason: EndReason::Silent, .. }))
+            .filter(|e| matches!(e, PeerEvent::Left { reason: DisconnectReason::Silent, .. }))
             .count();
         // (The first looks first; what it sends is heard by the others before they look.)
         assert!(left == 2 || k > 0, "peer {}: {left}", k + 1);
@@ -242,5 +242,5 @@ fn a_peer_whose_clock_jumps_an_hour_comes_back_or_says_why_not() {
         pass(&mut all, now, |_, _, _| {});
     }
     assert!((before + 35..=before + 45).contains(&all[0].tick()), "it goes on alone at its own pace");
-    assert!(all.iter().all(|p| p.body(BODY).unwrap().shown().is_finite()));
+    assert!(all.iter().all(|p| p.body(BODY).unwrap().visual().is_finite()));
 }

@@ -116,7 +116,7 @@ fn a_body_that_is_not_looked_at_costs_nothing_and_comes_back_whole() {
     (0..40).for_each(|_| room.step());
     let state = |room: &Room, guest: usize| {
         let view = room.guests[guest].1.body(BODY).unwrap();
-        (view.tick(), view.shown().unwrap().clone())
+        (view.tick(), view.visual().unwrap().clone())
     };
     assert_eq!(state(&room, 1).1.modes(), 3);
 
@@ -176,7 +176,7 @@ fn who_comes_back_gets_the_number_they_had_if_it_is_free() {
     };
     assert_eq!(ask(&mut room, PeerId(1), None), UserId(1));
     assert_eq!(ask(&mut room, PeerId(2), None), UserId(2));
-    room.host.disconnect(PeerId(1), pliant_stream::EndReason::Lost);
+    room.host.disconnect(PeerId(1), pliant_stream::DisconnectReason::Lost);
     assert_eq!(ask(&mut room, PeerId(3), Some(UserId(1))), UserId(1));
     // In use, or the host's: another one.
     assert_eq!(ask(&mut room, PeerId(4), Some(UserId(2))), UserId(3));
@@ -202,7 +202,7 @@ fn guests_that_want_all_kinds_of_numbers_of_modes_share_few_encoders() {
     assert!(kinds <= most && kinds >= 3, "{kinds} encoders for {all} modes");
     // Nobody gets less than asked for.
     for (peer, guest) in &room.guests {
-        let modes = guest.body(BODY).unwrap().shown().unwrap().modes() as u64;
+        let modes = guest.body(BODY).unwrap().visual().unwrap().modes() as u64;
         assert!(modes > peer.0 % u64::from(all), "{modes} modes for guest {}", peer.0);
     }
 }

@@ -31,9 +31,9 @@ fn no_frame_is_longer_than_the_path_carries_and_none_of_its_hands_is_lost() {
     let newmark = Newmark { h: H, beta: 4.0 / 9.0, gamma: 5.0 / 6.0 };
     for name in ["default", "paper", "paper-repeats", "force-driven"] {
         for limit in [256, 400, 1200] {
-            let wish = RecoveryConfig::by_name(name).unwrap().wish(None);
+            let subscription = RecoveryConfig::by_name(name).unwrap().subscription(None);
             let mut encoder =
-                Encoder::new(BodyId(1), model.clone(), &settings, newmark, wish, limit).unwrap();
+                Encoder::new(BodyId(1), model.clone(), &settings, newmark, subscription, limit).unwrap();
             let modes = encoder.modes();
             if name == "default" || limit == 1200 {
                 assert_eq!(modes, 500, "{name} at {limit} bytes");
@@ -87,8 +87,8 @@ fn no_frame_is_longer_than_the_path_carries_and_none_of_its_hands_is_lost() {
 fn a_tick_whose_part_is_missing_is_not_known() {
     let (model, settings) = (bar(20, 0.05), StepSettings::default());
     let newmark = Newmark { h: H, beta: 4.0 / 9.0, gamma: 5.0 / 6.0 };
-    let wish = RecoveryConfig::default().wish(None);
-    let mut encoder = Encoder::new(BodyId(1), model.clone(), &settings, newmark, wish, 400).unwrap();
+    let subscription = RecoveryConfig::default().subscription(None);
+    let mut encoder = Encoder::new(BodyId(1), model.clone(), &settings, newmark, subscription, 400).unwrap();
     let quanta = Quanta::new(&model, 20, &newmark);
     let (q, grabs) = ([0.01; 20], hands(20));
     let state =
@@ -116,9 +116,9 @@ fn a_tick_whose_part_is_missing_is_not_known() {
 fn a_step_moves_the_surface_alike_in_every_mode() {
     let model = bar(60, 0.05);
     let newmark = Newmark { h: H, beta: 4.0 / 9.0, gamma: 5.0 / 6.0 };
-    let wish = RecoveryConfig::default().wish(None);
+    let subscription = RecoveryConfig::default().subscription(None);
     let settings = StepSettings::default();
-    let mut encoder = Encoder::new(BodyId(1), model.clone(), &settings, newmark, wish, 1200).unwrap();
+    let mut encoder = Encoder::new(BodyId(1), model.clone(), &settings, newmark, subscription, 1200).unwrap();
     let q: Vec<f64> = (0..60).map(|k| 0.21 / (1.0 + f64::from(k)).powi(2)).collect();
     let v = vec![0.0; 60];
     let state =

@@ -13,7 +13,7 @@ use pliant_stream::peer::{
     StateCheck,
 };
 use pliant_stream::wire::PROTOCOL_VERSION;
-use pliant_stream::{BodyId, Channel, EndReason, PeerId, StepSettings, UserId};
+use pliant_stream::{BodyId, Channel, DisconnectReason, PeerId, StepSettings, UserId};
 use proptest::prelude::*;
 use support::{bar, loose_bar};
 
@@ -124,7 +124,7 @@ impl Mesh {
                 }
                 if stepped > 0 {
                     let body = p.body(BODY).unwrap();
-                    self.seen.push((k, p.tick(), body.shown().q.clone()));
+                    self.seen.push((k, p.tick(), body.visual().q.clone()));
                 }
                 while let Some(o) = p.poll_output() {
                     let link = &mut self.links[k][o.peer.0 as usize];
@@ -285,7 +285,7 @@ fn compensation_puts_the_history_right_with_the_state_of_now() {
         for look in 1..=100 {
             mesh.run(50 * MS * look);
             for p in mesh.peers.iter().flatten() {
-                let (now, past) = (p.body(BODY).unwrap().hidden(), p.state_at(BODY, p.tick()).unwrap());
+                let (now, past) = (p.body(BODY).unwrap().confirmed(), p.state_at(BODY, p.tick()).unwrap());
                 assert_eq!(
                     (&now.q, &now.v, now.frame),
                     (&past.q, &past.v, past.frame),
@@ -377,7 +377,7 @@ fn peers_with_other_settings_are_turned_away() {
     mesh.start(1, Repair::Rollback, true);
     mesh.run(S);
     let turned = |k: usize| {
-        let away = |e: &(usize, PeerEvent)| matches!(e, (at, PeerEvent::TurnedAway { reason: EndReason::Scene, .. }) if *at == k);
+        let away = |e: &(usize, PeerEvent)| matches!(e, (at, PeerEvent::TurnedAway { reason: DisconnectReason::Scene, .. }) if *at == k);
         mesh.events.iter().any(away)
     };
     assert!(turned(0) && turned(1), "{:?}", mesh.events);
@@ -448,7 +448,7 @@ fn a_peer_that_dies_lets_go() {
     mesh.peers[2] = None;
     mesh.run(20 * S);
     let left = |e: &(usize, PeerEvent)| {
-        matches!(e.1, PeerEvent::Left { user: UserId(3), reason: EndReason::Silent })
+        matches!(e.1, PeerEvent::Left { user: UserId(3), reason: DisconnectReason::Silent })
     };
     assert_eq!(mesh.events.iter().filter(|e| left(e)).count(), 2);
     assert_eq!(mesh.peers[0].as_ref().unwrap().body(BODY).unwrap().grabs().len(), 2);
@@ -496,11 +496,11 @@ fn a_state_that_nobody_asked_for_is_not_taken() {
         };
         let tick = p.confirmed();
         let lie = PeerMessage::State { tick, now: p.tick(), bodies: vec![body] }.encode();
-        let before = p.body(BODY).unwrap().hidden().q.clone();
+        let before = p.body(BODY).unwrap().confirmed().q.clone();
         for _ in 0..50 {
             p.on_message(mesh.now, PeerId(liar), &lie);
         }
-        assert_eq!(p.body(BODY).unwrap().hidden().q, before);
+        assert_eq!(p.body(BODY).unwrap().confirmed().q, before);
         mesh.run(8 * S);
         assert!(!mesh.events.iter().any(|e| matches!(e.1, PeerEvent::Resynced { .. })), "{:?}", mesh.events);
         assert_eq!(mesh.agree(0, 1), 0.0);
@@ -583,7 +583,7 @@ fn a_peer_under_another_number_than_the_one_it_was_given_is_turned_away() {
             scene,
         };
         p.on_message(MS, PeerId(7), &hello(claimed).encode());
-        let turned = PeerEvent::TurnedAway { peer: PeerId(7), reason: EndReason::Protocol };
+        let turned = PeerEvent::TurnedAway { peer: PeerId(7), reason: DisconnectReason::Protocol };
         assert_eq!(p.poll_event(), Some(turned), "as {claimed}");
         // Nor by saying it again, rightly.
         p.on_message(MS, PeerId(7), &hello(8).encode());
@@ -606,7 +606,7 @@ fn a_peer_that_never_says_hello_is_told_of_when_it_goes() {
     p.update(9 * S);
     assert_eq!(p.poll_event(), None);
     p.update(11 * S);
-    let turned = PeerEvent::TurnedAway { peer: PeerId(7), reason: EndReason::Silent };
+    let turned = PeerEvent::TurnedAway { peer: PeerId(7), reason: DisconnectReason::Silent };
     assert_eq!(p.poll_event(), Some(turned));
 }
 

@@ -209,7 +209,7 @@ fn settings(body: &BodyEntry, at: &dyn Fn(&'static str) -> [Step; 3]) -> Checked
     point(&inner("place", "at"), "metres", &body.place.at)?;
     each(&inner("place", "turn"), "degrees", &body.place.turn, &(-3600.0..=3600.0))?;
     within(&inner("place", "scale"), "a scale", body.place.scale, 1e-3..=1e3)?;
-    each(&at("colour"), "a part of red, green and blue", &body.colour, &(0.0..=1.0))?;
+    each(&at("color"), "a part of red, green and blue", &body.color, &(0.0..=1.0))?;
     within(&at("roughness"), "a roughness", body.roughness, 0.0..=1.0)?;
     if let Some(modes) = body.modes {
         within(&at("modes"), "a number of modes", modes as f64, 1.0..=100_000.0)?;
@@ -448,7 +448,7 @@ fn recording(scene: &SceneDescription) -> Checked {
     let at = |field| [Field("recording"), Field(field)];
     within(&at("shapes_hz"), "Hz", recording.shapes_hz, 0.0..=1000.0)?;
     within(&at("modes_hz"), "Hz", recording.modes_hz, 0.0..=1000.0)?;
-    for (field, hz) in [("figures_hz", recording.figures_hz), ("hands_hz", recording.hands_hz)] {
+    for (field, hz) in [("metrics_hz", recording.metrics_hz), ("hands_hz", recording.hands_hz)] {
         hz.map_or(Ok(()), |hz| within(&at(field), "Hz", hz, 0.0..=1e6))?;
     }
     let Some(file) = &recording.file else {

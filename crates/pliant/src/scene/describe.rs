@@ -74,13 +74,13 @@ pub struct BodyEntry {
     pub bake: Option<BakeEntry>,
     /// Where it is, with its anchors. Default: at the origin.
     #[serde(default)]
-    pub place: PlaceEntry,
+    pub place: TransformEntry,
     /// Several of it, in rows: each is called `NAME.0`, `NAME.1`, row after row. Default: `None`, one called `NAME`.
     #[serde(default)]
     pub copies: Option<CopiesEntry>,
     /// Red, green, blue, 0 to 1 (sRGB); seen with the feature `render`. Default: a warm clay.
-    #[serde(default = "colour")]
-    pub colour: [f64; 3],
+    #[serde(default = "color")]
+    pub color: [f64; 3],
     /// How rough its surface looks, 0 to 1. Default: 0.45.
     #[serde(default = "roughness")]
     pub roughness: f64,
@@ -106,7 +106,7 @@ pub struct BodyEntry {
     pub shared: Option<bool>,
 }
 
-fn colour() -> [f64; 3] {
+fn color() -> [f64; 3] {
     [0.95, 0.50, 0.36]
 }
 
@@ -179,7 +179,7 @@ fn damping_ratio() -> f64 {
 /// Where something is.
 #[derive(Debug, Clone, Copy, PartialEq, Deserialize)]
 #[serde(rename = "Place", deny_unknown_fields)]
-pub struct PlaceEntry {
+pub struct TransformEntry {
     /// m. Default: the origin.
     #[serde(default)]
     pub at: [f64; 3],
@@ -191,7 +191,7 @@ pub struct PlaceEntry {
     pub scale: f64,
 }
 
-impl Default for PlaceEntry {
+impl Default for TransformEntry {
     fn default() -> Self {
         Self { at: [0.0; 3], turn: [0.0; 3], scale: 1.0 }
     }
@@ -486,16 +486,16 @@ pub struct RecordingEntry {
     pub shapes_hz: f64,
     /// How often figures are recorded, Hz, 0 to 1e6. Default: `None`, every tick.
     #[serde(default)]
-    pub figures_hz: Option<f64>,
+    pub metrics_hz: Option<f64>,
     /// How often hands are drawn, with their reactions, Hz, 0 to 1e6. Default: `None`, every tick.
     #[serde(default)]
     pub hands_hz: Option<f64>,
     /// How often the energies of the modes and the spectrum are drawn, Hz, 0 to 1000. Default: 4.
     #[serde(default = "modes_hz")]
     pub modes_hz: f64,
-    /// What the colour of a surface says. Default: `Displacement`.
+    /// What the color of a surface says. Default: `Displacement`.
     #[serde(default)]
-    pub colour: ColourEntry,
+    pub color: ColorEntry,
     /// Whether every period of a device's loop is recorded (`RerunRecording::device_loops`). Default: false.
     #[serde(default)]
     pub device_loops: bool,
@@ -509,13 +509,13 @@ fn modes_hz() -> f64 {
     4.0
 }
 
-/// What the colour of a recorded surface says.
+/// What the color of a recorded surface says.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Deserialize)]
-#[serde(rename = "Colour")]
-pub enum ColourEntry {
-    /// How far each point is from where it rests: the last colour at 0.3 of the body's size.
+#[serde(rename = "Color")]
+pub enum ColorEntry {
+    /// How far each point is from where it rests: the last color at 0.3 of the body's size.
     #[default]
     Displacement,
-    /// Von Mises stress in the skin: the last colour at 0.2 of Young's modulus.
+    /// Von Mises stress in the skin: the last color at 0.2 of Young's modulus.
     Stress,
 }

@@ -6,7 +6,7 @@ use std::fmt;
 ///
 /// ```text
 /// scenes/solo.ron:5:34: unknown field `modle` in Body; did you mean `model`?
-///   5 |         (name: "pip", colour: (1, 0, 0), modle: "pip.modal"),
+///   5 |         (name: "pip", color: (1, 0, 0), modle: "pip.modal"),
 ///     |                                          ^
 /// ```
 #[derive(Debug, Clone, PartialEq, Eq)]

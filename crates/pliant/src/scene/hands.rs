@@ -6,7 +6,7 @@ use super::locate::Step::Field;
 use super::motion::smooth;
 use super::spawn::{self, PartOf, SceneBody, SceneClock, Source};
 use super::{GrabEntry, PatchEntry, SceneError, SceneErrorKind};
-use crate::body::{BodyState, Grab, GrabForce, GrabOf, ShownState};
+use crate::body::{BodyState, Grab, GrabForce, GrabOf, VisualState};
 use crate::modal::{ModalModel, Patch};
 
 /// A hand of a scene, between its times a [`Grab`].
@@ -62,7 +62,7 @@ const RADIUS: f64 = 0.06;
 fn take_hold(
     entry: &GrabEntry,
     state: &BodyState,
-    shown: &ShownState,
+    shown: &VisualState,
     place: &GlobalTransform,
 ) -> Result<(u32, f64, DVec3), String> {
     let model = state.model();
@@ -83,7 +83,7 @@ pub(super) fn play(
     mut commands: Commands,
     time: Res<Time>,
     clocks: Query<(&SceneClock, &GlobalTransform)>,
-    bodies: Query<(Entity, &Name, &PartOf, &BodyState, &ShownState, &GlobalTransform), With<SceneBody>>,
+    bodies: Query<(Entity, &Name, &PartOf, &BodyState, &VisualState, &GlobalTransform), With<SceneBody>>,
     mut hands: Query<(Entity, &mut ScriptedHand, &PartOf, &Source, Option<&mut Grab>)>,
 ) {
     for (entity, mut hand, part, source, grab) in &mut hands {

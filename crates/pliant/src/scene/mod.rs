@@ -5,7 +5,7 @@
 //!     title: "a hand on a dragon",
 //!     step_hz: 120,
 //!     bodies: [
-//!         (name: "pip", model: "pip.modal", colour: (0.95, 0.5, 0.36)),
+//!         (name: "pip", model: "pip.modal", color: (0.95, 0.5, 0.36)),
 //!     ],
 //!     grabs: [
 //!         (name: "hand", body: "pip", patch: Toward((1, 0.55, 0)), pull: (0.06, 0.02, 0)),
@@ -43,9 +43,9 @@ mod spawn;
 mod syntax;
 
 pub use describe::{
-    BakeEntry, BodyEntry, By, ColourEntry, CopiesEntry, DeviceEntry, GrabEntry, Grip, GuestEntry, Like,
-    Motion, NetworkEntry, PatchEntry, PlaceEntry, PointEntry, RecordingEntry, SceneDescription, TouchEntry,
-    ViewEntry,
+    BakeEntry, BodyEntry, By, ColorEntry, CopiesEntry, DeviceEntry, GrabEntry, Grip, GuestEntry, Like,
+    Motion, NetworkEntry, PatchEntry, PointEntry, RecordingEntry, SceneDescription, TouchEntry,
+    TransformEntry, ViewEntry,
 };
 pub use error::{SceneError, SceneErrorKind};
 pub use file::{SceneFile, SceneFileLoader};

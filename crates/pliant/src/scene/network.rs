@@ -18,7 +18,7 @@ use super::locate::Step::Field;
 use super::plugin::{AssetRoot, SceneFilePlugin};
 use super::spawn::{PartOf, SceneBody};
 use super::{GuestEntry, NetworkEntry, SceneError, SceneErrorKind, SceneFile};
-use crate::body::{BodyState, Driven, ModalBody, NoPointerGrab, PliantBodyPlugin, Pose, ShownState};
+use crate::body::{BodyState, Driven, ModalBody, NoPointerGrab, PliantBodyPlugin, Pose, VisualState};
 use crate::modal::ModalModel;
 use crate::net::{
     Access, Emulation, Grant, HostConfig, HostOptions, Invite, JoinConfig, JoinOptions, NetPlugin,
@@ -161,7 +161,7 @@ fn run_guest(
 }
 
 /// In the guest: what is on its screen.
-fn tell(seen: Res<Seen>, bodies: Query<(&Name, &ShownState, &BodyState, &Transform), With<SceneBody>>) {
+fn tell(seen: Res<Seen>, bodies: Query<(&Name, &VisualState, &BodyState, &Transform), With<SceneBody>>) {
     let mut seen = seen.0.lock().unwrap_or_else(PoisonError::into_inner);
     for (name, shown, state, place) in &bodies {
         let free = state
@@ -208,7 +208,7 @@ pub(super) fn spawn_views(world: &mut World, instance: Entity, file: &SceneFile,
             #[cfg(feature = "render")]
             if let Some(mut materials) = world.get_resource_mut::<Assets<StandardMaterial>>() {
                 // A cooler shade of the same, so that nobody takes it for the truth.
-                let [r, g, b] = body.colour.map(|part| part as f32);
+                let [r, g, b] = body.color.map(|part| part as f32);
                 let material = materials.add(StandardMaterial {
                     base_color: Color::srgb(0.45 * r + 0.05, 0.45 * g + 0.20, 0.45 * b + 0.45),
                     perceptual_roughness: body.roughness as f32,
@@ -235,7 +235,7 @@ fn lend(
     }
 }
 
-fn show(seen: Res<Seen>, mut views: Query<(&mut GuestsView, &mut ShownState)>) {
+fn show(seen: Res<Seen>, mut views: Query<(&mut GuestsView, &mut VisualState)>) {
     let seen = seen.0.lock().unwrap_or_else(PoisonError::into_inner);
     for (mut view, mut shown) in &mut views {
         let Some((q, pose)) = seen.get(&view.name).filter(|(q, _)| q.len() == shown.q().len()) else {

@@ -1,7 +1,7 @@
 //! The recording that a scene asks for.
 
-use super::{ColourEntry, RecordingEntry};
-use crate::rerun::{RerunColour, RerunPlugin, RerunRecording};
+use super::{ColorEntry, RecordingEntry};
+use crate::rerun::{RerunColor, RerunPlugin, RerunRecording};
 
 impl RecordingEntry {
     /// The plugin, not yet in an app.
@@ -21,12 +21,12 @@ impl RecordingEntry {
         RerunRecording {
             on: true,
             shapes_hz: self.shapes_hz,
-            figures_hz: self.figures_hz.unwrap_or(f64::INFINITY),
+            metrics_hz: self.metrics_hz.unwrap_or(f64::INFINITY),
             hands_hz: self.hands_hz.unwrap_or(f64::INFINITY),
             modes_hz: self.modes_hz,
-            colour: match self.colour {
-                ColourEntry::Displacement => RerunColour::Displacement,
-                ColourEntry::Stress => RerunColour::Stress,
+            color: match self.color {
+                ColorEntry::Displacement => RerunColor::Displacement,
+                ColorEntry::Stress => RerunColor::Stress,
             },
             device_loops: self.device_loops,
         }

@@ -7,7 +7,7 @@ use super::needs::compiled;
 #[cfg(feature = "bake")]
 use super::plugin::AssetRoot;
 use super::plugin::Role;
-use super::{BodyEntry, By, NetworkEntry, PlaceEntry, SceneError, SceneErrorKind, SceneFile};
+use super::{BodyEntry, By, NetworkEntry, SceneError, SceneErrorKind, SceneFile, TransformEntry};
 use crate::body::{BodyRefused, BodyState, ModalAsset, ModalBody, NoPointerGrab};
 
 /// A scene in the world: spawn it, and the scene's bodies, hands and tools come as soon as the file is loaded, where this entity is. They are
@@ -392,7 +392,7 @@ fn spawn_body(
     }
     #[cfg(feature = "render")]
     if let Some(mut materials) = world.get_resource_mut::<Assets<StandardMaterial>>() {
-        let [r, g, b] = body.colour.map(|part| part as f32);
+        let [r, g, b] = body.color.map(|part| part as f32);
         let material = materials.add(StandardMaterial {
             base_color: Color::srgb(r, g, b),
             perceptual_roughness: body.roughness as f32,
@@ -402,7 +402,7 @@ fn spawn_body(
     }
 }
 
-impl PlaceEntry {
+impl TransformEntry {
     /// As Bevy has it: turned about x, then y, then z.
     pub fn transform(&self) -> Transform {
         let [x, y, z] = self.turn.map(|degrees| degrees.to_radians() as f32);

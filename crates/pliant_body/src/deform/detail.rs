@@ -100,12 +100,12 @@ impl Views {
     /// Metres (world) that a pixel covers where the body is nearest, in the view where that is least; `None` when nobody looks.
     pub fn metres_per_pixel(&self, bounds: &Aabb, place: &GlobalTransform) -> Option<f32> {
         let affine = place.affine();
-        let centre = affine.transform_point3a(bounds.center);
+        let center = affine.transform_point3a(bounds.center);
         let radius = place.radius_vec3a(bounds.half_extents);
         self.0
             .iter()
             .map(|view| {
-                let distance = (centre.distance(view.eye) - radius).max(view.near);
+                let distance = (center.distance(view.eye) - radius).max(view.near);
                 if view.perspective { view.metres * distance } else { view.metres }
             })
             .reduce(f32::min)

@@ -24,7 +24,7 @@ use bevy::{
 };
 use pliant_modal::ModalModel;
 
-use crate::{BodyState, DEFORM_TIME, ModalBody, PliantDisplaySystems, ShownState};
+use crate::{BodyState, DEFORM_TIME, ModalBody, PliantDisplaySystems, VisualState};
 use detail::{Detail, Views};
 use drawing::{Drawing, Drawings};
 use gpu::{Compute, GpuShape};
@@ -109,7 +109,7 @@ fn make_meshes(
     mut commands: Commands,
     mut drawings: ResMut<Drawings>,
     mut meshes: ResMut<Assets<Mesh>>,
-    bodies: Query<(Entity, &BodyState, &ShownState, &SurfaceShading, Option<&DrawnSurface>)>,
+    bodies: Query<(Entity, &BodyState, &VisualState, &SurfaceShading, Option<&DrawnSurface>)>,
 ) {
     for (entity, state, shown, shading, drawn) in &bodies {
         let model = state.model();
@@ -196,7 +196,7 @@ fn deform_surfaces(
     mut bodies: Query<(
         Entity,
         &BodyState,
-        &ShownState,
+        &VisualState,
         &SurfaceDetail,
         &GlobalTransform,
         &Mesh3d,
@@ -289,7 +289,7 @@ fn deform_surfaces(
     }
 }
 
-/// A mesh that was changed (somebody gave it vertex colours) goes to the device again with the shape it was made with: ours goes over it.
+/// A mesh that was changed (somebody gave it vertex colors) goes to the device again with the shape it was made with: ours goes over it.
 fn write_again(mut events: MessageReader<AssetEvent<Mesh>>, mut shapes: Query<&mut GpuShape>) {
     let modified: Vec<AssetId<Mesh>> = events
         .read()

@@ -10,7 +10,7 @@ use bevy::{
 };
 
 use super::{app, model, spawn, spawn_with, state, steps};
-use crate::{BodyState, DrawnSurface, Driven, ModalBody, ShownState, SurfaceShading};
+use crate::{BodyState, DrawnSurface, Driven, ModalBody, SurfaceShading, VisualState};
 
 fn drawn_app() -> App {
     let mut app = app();
@@ -38,7 +38,7 @@ fn the_mesh_is_the_shown_shape_with_the_normals_of_a_bent_bar() {
     see(&mut app, body);
     // Warped pure-ish bending: compare with the model's own reconstruction, vertex by vertex.
     let q = [2.0, 0.5, 0.1, 0.2];
-    app.world_mut().get_mut::<ShownState>(body).unwrap().snap(&q).unwrap();
+    app.world_mut().get_mut::<VisualState>(body).unwrap().snap(&q).unwrap();
     steps(&mut app, 1);
     let positions = attribute(&app, body, Mesh::ATTRIBUTE_POSITION);
     let expected = state(&app, body).positions_at(&q);
@@ -66,7 +66,7 @@ fn the_normals_of_a_gently_bent_bar_turn_with_its_slope() {
     see(&mut app, body);
     let amplitude = 0.02;
     let s = (5.0 / model::MASS).sqrt();
-    app.world_mut().get_mut::<ShownState>(body).unwrap().snap(&[amplitude / s, 0.0, 0.0, 0.0]).unwrap();
+    app.world_mut().get_mut::<VisualState>(body).unwrap().snap(&[amplitude / s, 0.0, 0.0, 0.0]).unwrap();
     steps(&mut app, 1);
     let positions = attribute(&app, body, Mesh::ATTRIBUTE_POSITION);
     let normals = attribute(&app, body, Mesh::ATTRIBUTE_NORMAL);
@@ -90,7 +90,7 @@ fn a_body_that_nobody_sees_is_not_written_but_its_bounds_follow() {
     app.world_mut().entity_mut(body).insert((ViewVisibility::HIDDEN, InheritedVisibility::VISIBLE));
     let rest = attribute(&app, body, Mesh::ATTRIBUTE_POSITION);
     let q = [3.0, -1.0, 0.3, 0.5];
-    app.world_mut().get_mut::<ShownState>(body).unwrap().snap(&q).unwrap();
+    app.world_mut().get_mut::<VisualState>(body).unwrap().snap(&q).unwrap();
     steps(&mut app, 1);
     assert_eq!(attribute(&app, body, Mesh::ATTRIBUTE_POSITION), rest);
     let aabb = *app.world().get::<Aabb>(body).unwrap();
@@ -196,7 +196,7 @@ fn a_surface_in_half_precision_is_off_by_its_rounding() {
                     |body: &mut ModalBody| (body.half_basis, body.settings.warp) = (half_basis, warp);
                 let body = spawn_with(&mut app, model::bar(), settings, Driven::Remote);
                 see(&mut app, body);
-                app.world_mut().get_mut::<ShownState>(body).unwrap().snap(&q).unwrap();
+                app.world_mut().get_mut::<VisualState>(body).unwrap().snap(&q).unwrap();
                 steps(&mut app, 1);
                 (
                     attribute(&app, body, Mesh::ATTRIBUTE_POSITION),

@@ -1,10 +1,10 @@
 //! Apps with time by hand and a bar whose modes are written down, so that every number has an outside value.
 
 mod baking;
-mod blows;
-mod crowd;
 mod display;
 mod grabs;
+mod impulses;
+mod load;
 pub mod model;
 mod pausing;
 mod pointer;

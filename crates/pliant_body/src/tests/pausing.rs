@@ -1,14 +1,14 @@
 use bevy::{math::DVec3, prelude::*};
 
 use super::{app, frames_of, model, spawn, spawn_with, state, steps, tick};
-use crate::{Grab, GrabForce, GrabOf, ShownState, SingleSteps};
+use crate::{Grab, GrabForce, GrabOf, SingleSteps, VisualState};
 
 fn pause(app: &mut App) {
     app.world_mut().resource_mut::<Time<Virtual>>().pause();
 }
 
 fn version(app: &App, body: Entity) -> u64 {
-    app.world().get::<ShownState>(body).unwrap().version()
+    app.world().get::<VisualState>(body).unwrap().version()
 }
 
 #[test]

@@ -6,7 +6,7 @@ use bevy::{
 };
 
 use super::{app, model, spawn_with, state, steps};
-use crate::{Driven, Grab, GrabOf, NoPointerGrab, PointerGrab, PointerGrabPlugin, PointerHeld, ShownState};
+use crate::{Driven, Grab, GrabOf, NoPointerGrab, PointerGrab, PointerGrabPlugin, PointerHeld, VisualState};
 
 /// A camera over the whole window.
 fn camera(order: isize) -> Camera {
@@ -58,7 +58,7 @@ fn the_pointer_takes_the_surface_where_it_is_now_and_drags_it_in_the_plane_that_
     let (mut app, window, body) = scene();
     // Bent up until the tip is half a metre higher: where the rest shape was, there is nothing to take.
     let q = 0.5 / (5.0 / model::MASS).sqrt();
-    app.world_mut().get_mut::<ShownState>(body).unwrap().snap(&[q, 0.0, 0.0, 0.0]).unwrap();
+    app.world_mut().get_mut::<VisualState>(body).unwrap().snap(&[q, 0.0, 0.0, 0.0]).unwrap();
     point(&mut app, window, Vec2::new(-0.02, 0.0), true);
     assert_eq!(held(&mut app), None);
     point(&mut app, window, Vec2::new(-0.02, 0.0), false);

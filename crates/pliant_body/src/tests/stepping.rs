@@ -1,7 +1,9 @@
 use bevy::{asset::LoadState, math::DVec3, prelude::*};
 
 use super::{app, frames_of, model, refusals, spawn, spawn_with, state, steps, tick};
-use crate::{Driven, Grab, GrabOf, ModalAsset, ModalBody, PliantBodyPlugin, PliantSystems, Pose, ShownState};
+use crate::{
+    Driven, Grab, GrabOf, ModalAsset, ModalBody, PliantBodyPlugin, PliantSystems, Pose, VisualState,
+};
 
 #[test]
 fn a_body_under_its_own_weight_hangs_by_participation_over_stiffness() {
@@ -69,7 +71,7 @@ fn a_body_whose_component_is_taken_away_keeps_nothing_and_may_have_it_again() {
     let settings = app.world_mut().entity_mut(body).take::<ModalBody>().unwrap();
     steps(&mut app, 2);
     assert!(app.world().get::<crate::BodyState>(body).is_none());
-    assert!(app.world().get::<ShownState>(body).is_none());
+    assert!(app.world().get::<VisualState>(body).is_none());
     app.world_mut().entity_mut(body).insert(settings);
     steps(&mut app, 3);
     assert!(state(&app, body).body().q()[0] < 0.0);
@@ -99,20 +101,20 @@ fn a_still_body_rests_after_half_a_second_and_a_touch_wakes_it() {
     assert!(!state(&app, body).is_resting());
     steps(&mut app, 2);
     assert!(state(&app, body).is_resting(), "0.5 s are 20 steps");
-    let version = app.world().get::<ShownState>(body).unwrap().version();
+    let version = app.world().get::<VisualState>(body).unwrap().version();
     steps(&mut app, 50);
     // No step and nothing for the picture to do.
-    assert_eq!(app.world().get::<ShownState>(body).unwrap().version(), version);
+    assert_eq!(app.world().get::<VisualState>(body).unwrap().version(), version);
 
     app.world_mut()
         .get_mut::<crate::BodyState>(body)
         .unwrap()
         .body_mut()
-        .strike(model::tip(), [0.0, 1.0, 0.0])
+        .apply_impulse(model::tip(), [0.0, 1.0, 0.0])
         .unwrap();
     steps(&mut app, 1);
     assert!(state(&app, body).body().q()[0] > 0.0);
-    assert!(app.world().get::<ShownState>(body).unwrap().version() > version);
+    assert!(app.world().get::<VisualState>(body).unwrap().version() > version);
 }
 
 #[test]
@@ -149,7 +151,7 @@ fn the_picture_stands_between_the_last_two_steps() {
     let mut seen = Vec::new();
     for _ in 0..8 {
         app.update();
-        let shown = app.world().get::<ShownState>(body).unwrap();
+        let shown = app.world().get::<VisualState>(body).unwrap();
         let fraction = app.world().resource::<Time<Fixed>>().overstep_fraction_f64();
         let expected = shown.previous()[0] + (shown.current()[0] - shown.previous()[0]) * fraction;
         assert_eq!(shown.q()[0], expected, "at {fraction} of a step");
@@ -169,18 +171,18 @@ fn a_remote_body_shows_what_is_pushed_and_is_not_stepped() {
 
     app.add_systems(
         FixedUpdate,
-        (|mut shown: Single<&mut ShownState>, tick: Res<crate::PliantTick>| {
+        (|mut shown: Single<&mut VisualState>, tick: Res<crate::PliantTick>| {
             shown.push(&[tick.0 as f64, 0.0, 0.0, 0.0]).unwrap();
         })
         .in_set(PliantSystems::Publish),
     );
     frames_of(&mut app, 0.5);
     steps(&mut app, 9);
-    let shown = app.world().get::<ShownState>(body).unwrap();
+    let shown = app.world().get::<VisualState>(body).unwrap();
     let fraction = app.world().resource::<Time<Fixed>>().overstep_fraction_f64();
     assert_eq!(shown.q()[0], (tick(&app) - 1) as f64 + fraction);
 
-    let mut shown = app.world_mut().get_mut::<ShownState>(body).unwrap();
+    let mut shown = app.world_mut().get_mut::<VisualState>(body).unwrap();
     assert!(shown.push(&[0.0; 3]).unwrap_err().to_string().contains("needs 4 modal coordinates, got 3"));
     assert!(shown.push(&[0.0, f64::NAN, 0.0, 0.0]).unwrap_err().to_string().contains("modal coordinate 1"));
     assert!(shown.push_at(&[0.0; 4], Pose { origin: DVec3::NAN, orientation: Default::default() }).is_err());
@@ -198,7 +200,7 @@ fn in_another_schedule_the_step_is_the_frame() {
     steps(&mut app, 9);
     assert_eq!(tick(&app), 10, "the first update of an app has no time in it");
     assert_eq!(state(&app, body).body().config().step, 0.005);
-    let shown = app.world().get::<ShownState>(body).unwrap();
+    let shown = app.world().get::<VisualState>(body).unwrap();
     assert_eq!(shown.q(), state(&app, body).body().q());
 }
 
@@ -356,7 +358,7 @@ fn a_reflecting_tool_finds_every_component_and_reads_how_a_body_stands() {
     let components = [
         TypeId::of::<ModalBody>(),
         TypeId::of::<crate::BodyState>(),
-        TypeId::of::<ShownState>(),
+        TypeId::of::<VisualState>(),
         TypeId::of::<Driven>(),
         TypeId::of::<crate::Grab>(),
         TypeId::of::<crate::GrabOf>(),
@@ -370,7 +372,7 @@ fn a_reflecting_tool_finds_every_component_and_reads_how_a_body_stands() {
     let messages = [
         TypeId::of::<crate::BodyRefused>(),
         TypeId::of::<crate::SingleSteps>(),
-        TypeId::of::<crate::Strike>(),
+        TypeId::of::<crate::Impulse>(),
         TypeId::of::<crate::Push>(),
     ];
     for id in messages {

@@ -44,8 +44,8 @@ pub(crate) struct Entry {
     /// The tick of the loop whose tool position the simulation has, s.
     pub(crate) seen: f64,
     /// What the body that the loop steps itself was made for; the default: it has none.
-    pub(crate) modal_for: super::word::CopyOf,
-    pub(crate) elsewhere: super::word::Elsewhere,
+    pub(crate) modal_for: super::local_model::CopyOf,
+    pub(crate) elsewhere: super::local_model::Elsewhere,
     /// Buttons that the app has been told are down.
     pressed: u32,
     stop: StopSwitch,
@@ -111,8 +111,8 @@ impl HapticDevices {
             writer: ModelWriter::new(),
             map: None,
             seen: 0.0,
-            modal_for: super::word::CopyOf::default(),
-            elsewhere: super::word::Elsewhere::default(),
+            modal_for: super::local_model::CopyOf::default(),
+            elsewhere: super::local_model::Elsewhere::default(),
             pressed: 0,
         });
         Ok(id)

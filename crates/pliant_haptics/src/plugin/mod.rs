@@ -21,13 +21,13 @@
 //! ```
 
 mod devices;
+mod local_model;
 #[cfg(feature = "rumble")]
 mod rumble;
 #[cfg(feature = "render")]
 mod show;
 mod source;
 mod tool;
-mod word;
 
 use bevy::{
     ecs::schedule::{InternedScheduleLabel, ScheduleLabel},
@@ -106,7 +106,7 @@ impl Plugin for HapticsPlugin {
                     .after(InputSystems),
             )
             .add_systems(self.schedule, tool::follow.in_set(HapticSystems::Move))
-            .add_systems(self.schedule, word::publish.in_set(HapticSystems::Word));
+            .add_systems(self.schedule, local_model::publish.in_set(HapticSystems::Word));
         #[cfg(feature = "gamepad")]
         app.add_systems(PreUpdate, source::steer.after(tool::grip).after(InputSystems));
         #[cfg(feature = "render")]

@@ -15,9 +15,9 @@ pub struct ForceArrow {
     pub longest: f32,
     /// Radius of the ball at the tool point, m. Default: `0.008`.
     pub radius: f32,
-    /// Colour of the arrow. Default: red.
+    /// Color of the arrow. Default: red.
     pub color: Color,
-    /// Colour of the tool and of the lines to what it holds. Default: a warm yellow.
+    /// Color of the tool and of the lines to what it holds. Default: a warm yellow.
     pub tool: Color,
 }
 

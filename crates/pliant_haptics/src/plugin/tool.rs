@@ -4,7 +4,7 @@ use bevy::{
     math::{DQuat, DVec3},
     prelude::*,
 };
-use pliant_body::{BodyState, Driven, Grab, GrabOf, ShownState};
+use pliant_body::{BodyState, Driven, Grab, GrabOf, VisualState};
 use pliant_modal::Patch;
 
 use super::{DeviceId, HapticButton, HapticDevices};
@@ -203,7 +203,7 @@ pub(crate) fn grip(
     mut buttons: MessageReader<HapticButton>,
     devices: Res<HapticDevices>,
     tools: Query<(Entity, &HapticTool, &ToolGrip, &ToolPose, Option<&ToolGrabs>)>,
-    bodies: Query<(Entity, &BodyState, &ShownState, &GlobalTransform, &Driven)>,
+    bodies: Query<(Entity, &BodyState, &VisualState, &GlobalTransform, &Driven)>,
 ) {
     for press in buttons.read() {
         for (tool, held_by, grip, pose, held) in

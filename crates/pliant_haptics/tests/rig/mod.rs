@@ -8,12 +8,12 @@ pub mod scene;
 
 use pliant_haptics::{
     Contact, CouplingConfig, Cycle, Hand, LocalModel, LoopConfig, LoopEvent, SafetyConfig, VirtualConfig,
-    VirtualDevice, VirtualPace,
+    VirtualDevice, VirtualPacing,
 };
 
 pub struct Rig {
     pub cycle: Cycle<VirtualDevice>,
-    pub pace: VirtualPace,
+    pub pacing: VirtualPacing,
     pub model: LocalModel,
     pub events: Vec<LoopEvent>,
 }
@@ -24,7 +24,7 @@ impl Rig {
         let rate = config.rate;
         Self {
             cycle: Cycle::new(device, config).unwrap(),
-            pace: VirtualPace::new(rate),
+            pacing: VirtualPacing::new(rate),
             model: LocalModel::default(),
             events: Vec::new(),
         }
@@ -52,7 +52,7 @@ impl Rig {
     /// One period in which the simulation says the same again: a spring of `stiffness` to the middle, with `damping`.
     pub fn spring(&mut self, stiffness: f64, damping: f64) {
         self.model.tick += 1;
-        self.model.stamp = self.pace.now();
+        self.model.stamp = self.pacing.now();
         self.model.period = 1e-3;
         self.model.count = 1;
         let k = stiffness;
@@ -66,6 +66,6 @@ impl Rig {
 
     /// One period in which the simulation says nothing new.
     pub fn step(&mut self) {
-        self.cycle.step(&mut self.pace, &self.model, &mut self.events);
+        self.cycle.step(&mut self.pacing, &self.model, &mut self.events);
     }
 }

@@ -56,7 +56,7 @@ pub struct Experiment {
     pub hands: Vec<Hand>,
     /// [`HostConfig::quantum`]. Default: 2^-14.
     pub quantum: f64,
-    /// A clock for the time that decoding, correcting and stepping take; `None` leaves [`Figures::cpu_us_per_tick`] 0.
+    /// A clock for the time that decoding, correcting and stepping take; `None` leaves [`Metrics::cpu_us_per_tick`] 0.
     pub cpu_clock: Option<fn() -> Duration>,
     /// The guest holds the body, too, where the first hand does, and sends its target every tick: for counting what goes up. The host does not
     /// act on it, so what is shown is not compared with anything then: the errors mean nothing. Default: false.
@@ -68,7 +68,7 @@ pub struct Experiment {
 /// A scripted hand: it circles about where it took hold on a smooth path that never repeats, and trembles a little.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Hand {
-    /// Centre of the patch.
+    /// Center of the patch.
     pub vertex: u32,
     /// Radius of the patch, m.
     pub radius: f64,
@@ -102,7 +102,7 @@ impl Hand {
 
 /// What a run showed. Percentages are of the largest true displacement (reactions: of the largest true reaction).
 #[derive(Debug, Clone, PartialEq, Default, serde::Serialize)]
-pub struct Figures {
+pub struct Metrics {
     /// Ticks that the guest was shown.
     pub ticks: u64,
     /// Ticks that it was not shown in time: the picture stood still, or went past them. In the errors each counts as the picture that stood in its
@@ -129,7 +129,7 @@ pub struct Figures {
     /// The same of the true reaction.
     pub true_ringing: f64,
     /// From a hand's motion to the force that answers it, ms; reckoned, not timed. Where the policy owns the model it is one
-    /// tick by construction (the guest's own copy answers at its next step, see [`pliant_stream::BodyView::own_hand`]), else the round trip and the delays on the way.
+    /// tick by construction (the guest's own copy answers at its next step, see [`pliant_stream::BodyView::predicted_hand`]), else the round trip and the delays on the way.
     pub hand_to_force_ms: f64,
     /// How far the shown tick lies behind its step at the host, ms, mean.
     pub shown_delay_ms: f64,
@@ -142,7 +142,7 @@ pub struct Figures {
     /// Mean bytes of a datagram up, and bits up in a second: kbit/s. Clock, loss reports and NACKs; targets only with
     /// [`Experiment::guest_hand`].
     pub bytes_per_datagram_up: f64,
-    /// See [`Figures::bytes_per_datagram_up`].
+    /// See [`Metrics::bytes_per_datagram_up`].
     pub kbit_s_up: f64,
     /// Time for decoding, correcting and stepping a tick at the guest, us.
     pub cpu_us_per_tick: f64,
@@ -220,7 +220,7 @@ impl Experiment {
     ///
     /// # Errors
     /// [`StreamError::Config`] for settings out of range, [`StreamError::Model`] when the body cannot be stepped.
-    pub fn run(&self) -> Result<Figures, StreamError> {
+    pub fn run(&self) -> Result<Metrics, StreamError> {
         let h = 1.0 / self.rate;
         let newmark = Newmark { h, ..self.newmark };
         let mut pair = Pair::new(HostConfig {

@@ -8,7 +8,7 @@ use pliant_stream::emulator::{Link, LinkConfig, Loss};
 use pliant_stream::peer::{PeerConfig, PeerSession, Repair};
 use pliant_stream::{Channel, PeerId, StreamError, Tick, UserId};
 
-use super::{BODY, Experiment, Figures, RECOVERED, ShapeError, fold, norm};
+use super::{BODY, Experiment, Metrics, RECOVERED, ShapeError, fold, norm};
 
 /// How often a peer's application looks at its session.
 const LOOK: Duration = Duration::from_millis(5);
@@ -29,7 +29,7 @@ impl Experiment {
     ///
     /// # Errors
     /// [`StreamError::Config`] for settings out of range or a free body, [`StreamError::Model`].
-    pub fn run_peers(&self, repair: Repair) -> Result<Figures, StreamError> {
+    pub fn run_peers(&self, repair: Repair) -> Result<Metrics, StreamError> {
         let h = 1.0 / self.rate;
         let settings =
             StepSettings { integrator: self.integrator, relaxation: self.relaxation, ..Default::default() };
@@ -98,7 +98,7 @@ impl Experiment {
                     && let Some(body) = peers[1].body(BODY)
                 {
                     let reactions = body.grabs().iter().map(|g| (g.key.user, g.reaction)).collect();
-                    seen.insert(peers[1].tick(), Seen { at: now, q: body.shown().q.clone(), reactions });
+                    seen.insert(peers[1].tick(), Seen { at: now, q: body.visual().q.clone(), reactions });
                 }
                 while let Some(out) = peers[k].poll_output() {
                     let channel = usize::from(out.channel == Channel::Message);
@@ -131,7 +131,7 @@ impl Experiment {
         link: &Link,
         spent: Duration,
         sent: (u64, u64),
-    ) -> Figures {
+    ) -> Metrics {
         // Taking hold is not part of what is measured.
         let first = seen.keys().next().copied().unwrap_or(0);
         let truth: BTreeMap<Tick, &Vec<f64>> = truth.range(first..).map(|(t, q)| (*t, q)).collect();
@@ -141,7 +141,7 @@ impl Experiment {
         let scale = truth.values().map(|q| shape.compare(q, &[]).1.sqrt()).fold(0.0, f64::max);
         let all = || reactions.values().copied().flatten().map(|r| norm(r.1));
         let force_scale = all().fold(0.0, f64::max);
-        let mut f = Figures { scale, force_scale, lost: link.counts().lost, ..Figures::default() };
+        let mut f = Metrics { scale, force_scale, lost: link.counts().lost, ..Metrics::default() };
         let (mut sum, mut largest, mut last) = (0.0, 0.0_f64, 0.0);
         let (mut force, mut forces) = (0.0, 0_u64);
         let (mut above, mut longest) = (None, Duration::ZERO);

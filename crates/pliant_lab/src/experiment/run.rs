@@ -8,7 +8,7 @@ use pliant_stream::{
     GrabKey, GrabState, GuestSession, HostEvent, HostSession, Policy, Pose, TickState, UserId,
 };
 
-use super::{BODY, Experiment, Figures, Hand, RECOVERED, ShapeError, fold, norm};
+use super::{BODY, Experiment, Hand, Metrics, RECOVERED, ShapeError, fold, norm};
 use crate::pair::World;
 
 /// Truth kept for comparison, ticks.
@@ -39,7 +39,7 @@ pub(super) struct Run {
     guest_hand: Option<(Hand, Option<u16>)>,
     /// When it last said its target.
     guest_said: Duration,
-    own_hand_first: bool,
+    predict_own_hand: bool,
     measuring: Option<Duration>,
     sum: f64,
     /// Ticks shown, and ticks shown or missed.
@@ -90,7 +90,7 @@ impl Run {
             keep_track: experiment.keep_track,
             guest_hand: experiment.hands.first().filter(|_| experiment.guest_hand).map(|hand| (*hand, None)),
             guest_said: Duration::ZERO,
-            own_hand_first: matches!(experiment.recovery.policy, Policy::ForceDriven { .. }),
+            predict_own_hand: matches!(experiment.recovery.policy, Policy::ForceDriven { .. }),
             measuring: None,
             sum: 0.0,
             count: 0,
@@ -189,7 +189,7 @@ impl Run {
         self.above.push((now, largest.sqrt()));
     }
 
-    pub(super) fn figures(&self, session: &GuestSession) -> Figures {
+    pub(super) fn figures(&self, session: &GuestSession) -> Metrics {
         let percent = |x: f64, scale: f64| if scale > 0.0 { 100.0 * x / scale } else { 0.0 };
         let counts = session.body(BODY).map(|b| b.counts()).unwrap_or_default();
         let places = self.shape.places();
@@ -206,7 +206,7 @@ impl Run {
             }
         }
         let delay = self.delay_sum / ticks;
-        Figures {
+        Metrics {
             ticks: self.count,
             missing: self.missing,
             guessed: counts.guessed,
@@ -222,7 +222,7 @@ impl Run {
             force_ringing: ratio(self.shown_second, self.force_scale),
             true_ringing: ratio(self.true_second, self.force_scale),
             hand_to_force_ms: 1e3
-                * if self.own_hand_first {
+                * if self.predict_own_hand {
                     // The guest's newer copy answers at its next tick.
                     self.h
                 } else {
@@ -237,7 +237,7 @@ impl Run {
             scale: self.scale,
             force_scale: self.force_scale,
             track: self.track.clone(),
-            ..Figures::default()
+            ..Metrics::default()
         }
     }
 }
@@ -324,7 +324,9 @@ impl World for Run {
     fn guest_stepped(&mut self, now: Duration, _guest: usize, _stepped: u64, session: &mut GuestSession) {
         self.hold_at_guest(now, session);
         let Some(view) = session.body(BODY) else { return self.stand_still(now) };
-        let (Some(shown), Some(hidden)) = (view.shown(), view.hidden()) else { return self.stand_still(now) };
+        let (Some(shown), Some(hidden)) = (view.visual(), view.confirmed()) else {
+            return self.stand_still(now);
+        };
         let tick = view.tick();
         if tick <= self.last_tick {
             return self.stand_still(now);

@@ -15,7 +15,7 @@ use super::{
 };
 use crate::{
     LabError,
-    experiment::{Experiment, Figures},
+    experiment::{Experiment, Metrics},
     progress::Progress,
 };
 
@@ -96,7 +96,7 @@ pub(super) fn table_3(quick: bool, progress: &mut dyn Progress) -> Result<String
             let recovery = RecoveryConfig::by_name(name).unwrap_or_default();
             let mut made = experiment(120, LinkConfig::preset(preset), recovery)?;
             made.seconds = if quick { 20.0 } else { 60.0 };
-            let f: Figures = made.run()?;
+            let f: Metrics = made.run()?;
             made.guest_hand = true;
             made.seconds = 10.0;
             let up = made.run()?;

@@ -309,7 +309,7 @@ pub(super) fn steps(quick: bool) -> Result<Vec<Figure>, LabError> {
         let per = (1.0 / 60.0 / config.step).round() as usize;
         let mut body = Body::new(model.clone(), config)?;
         let vertex = farthest(&model, [1.0, 0.01, 0.02]);
-        body.strike(vertex, [0.2, 1.0, -0.5])?;
+        body.apply_impulse(vertex, [0.2, 1.0, -0.5])?;
         let (mut tip, mut q) = (Vec::new(), Vec::new());
         for i in 1..=60 * per {
             body.step()?;

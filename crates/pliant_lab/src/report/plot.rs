@@ -59,7 +59,7 @@ pub(super) struct Figure {
 
 const SIZE: (u32, u32) = (860, 520);
 
-fn colour(index: usize) -> RGBColor {
+fn color(index: usize) -> RGBColor {
     const COLOURS: [RGBColor; 8] = [
         RGBColor(27, 158, 119),
         RGBColor(217, 95, 2),
@@ -141,7 +141,7 @@ fn draw<B: DrawingBackend>(
                 .label_style(("sans-serif", 14))
                 .draw()?;
             for (index, series) in figure.series.iter().enumerate() {
-                let colour = colour(index);
+                let color = color(index);
                 let points: Vec<(f64, f64)> = series
                     .points
                     .iter()
@@ -151,20 +151,18 @@ fn draw<B: DrawingBackend>(
                     .collect();
                 let joined = if series.scattered { &points[..0] } else { &points[..] };
                 chart
-                    .draw_series(LineSeries::new(joined.iter().copied(), colour.stroke_width(2)))?
+                    .draw_series(LineSeries::new(joined.iter().copied(), color.stroke_width(2)))?
                     .label(&series.name)
-                    .legend(move |(x, y)| {
-                        PathElement::new(vec![(x, y), (x + 18, y)], colour.stroke_width(2))
-                    });
+                    .legend(move |(x, y)| PathElement::new(vec![(x, y), (x + 18, y)], color.stroke_width(2)));
                 // A whisker from the median to the 99th percentile.
                 for (point, late) in series.points.iter().zip(&series.late) {
                     if point.1 > 0.0 {
                         let y = point.1.clamp(ys.start, ys.end);
-                        chart.draw_series(LineSeries::new([(point.0, y), (*late, y)], colour.mix(0.5)))?;
+                        chart.draw_series(LineSeries::new([(point.0, y), (*late, y)], color.mix(0.5)))?;
                     }
                 }
                 if figure.logarithmic {
-                    chart.draw_series(points.iter().map(|p| Circle::new(*p, 3, colour.filled())))?;
+                    chart.draw_series(points.iter().map(|p| Circle::new(*p, 3, color.filled())))?;
                 }
             }
             if let Some(error) = reference {

@@ -19,7 +19,7 @@ use super::{
 };
 use crate::{
     LabError, bench,
-    experiment::{Experiment, Figures},
+    experiment::{Experiment, Metrics},
     fill::fill,
     machine::{self, Pinned},
     progress::Progress,
@@ -181,7 +181,7 @@ pub(super) fn courses() -> Result<Vec<Figure>, LabError> {
     ];
     let mut out = Vec::new();
     for (number, title, lost) in cases {
-        let run = |mut recovery: RecoveryConfig, late: bool| -> Result<Figures, LabError> {
+        let run = |mut recovery: RecoveryConfig, late: bool| -> Result<Metrics, LabError> {
             recovery.coding = AccelerationCoding::F64;
             let link = LinkConfig {
                 delay: Duration::from_millis(10),

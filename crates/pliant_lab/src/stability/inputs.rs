@@ -41,11 +41,11 @@ fn refused(bad: f64) -> Result<Outcome, LabError> {
     let accepted = [
         body.set_target(grab, [bad, 0.0, 0.0]).is_ok(),
         body.push(0, [0.0, bad, 0.0]).is_ok(),
-        body.strike(0, [0.0, 0.0, bad]).is_ok(),
+        body.apply_impulse(0, [0.0, 0.0, bad]).is_ok(),
         body.set_state(&spoilt).is_ok(),
         body.set_pose([bad, 0.0, 0.0], [0.0, 0.0, 0.0, 1.0]).is_ok(),
         body.set_pose([0.0; 3], [0.0, bad, 0.0, 1.0]).is_ok(),
-        body.set_grab_flow(grab, [bad, 0.0, 0.0]).is_ok(),
+        body.set_grab_viscoelastic_state(grab, [bad, 0.0, 0.0]).is_ok(),
         Body::new(model.clone(), BodyConfig { step: bad, ..BodyConfig::default() }).is_ok(),
         Body::new(model.clone(), BodyConfig::from(StepSettings { damping_scale: bad, ..Default::default() }))
             .is_ok(),

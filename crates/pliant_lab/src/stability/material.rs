@@ -217,7 +217,7 @@ fn struck(bar: &Bar, step: f64, integrator: Integrator) -> Result<Outcome, LabEr
     let mut body = held.body;
     body.release(held.grab);
     let impulse = 0.05 * bar.length * held.model.omega()[0] * held.model.mass();
-    body.strike(Patch::center(&held.patch), [0.3 * impulse, impulse, -0.7 * impulse])?;
+    body.apply_impulse(Patch::center(&held.patch), [0.3 * impulse, impulse, -0.7 * impulse])?;
     // Generalized-alpha loses energy of fast modes in a norm of its own, which the energy lies within a factor of.
     if matches!(integrator, Integrator::GeneralizedAlpha { .. }) {
         let start = body.energy();

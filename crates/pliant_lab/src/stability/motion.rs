@@ -152,8 +152,8 @@ fn flight(step: f64) -> Result<Outcome, LabError> {
     let bar = free(1e6);
     let model = bar.bake()?;
     let mut body = Body::new(model.clone(), BodyConfig { step, ..BodyConfig::default() })?;
-    body.strike(bar.vertex(&model, [1.0, 0.5, 0.5]), [3.0, 20.0, -7.0])?;
-    body.strike(bar.vertex(&model, [0.0, 1.0, 0.0]), [-1.0, 4.0, 9.0])?;
+    body.apply_impulse(bar.vertex(&model, [1.0, 0.5, 0.5]), [3.0, 20.0, -7.0])?;
+    body.apply_impulse(bar.vertex(&model, [0.0, 1.0, 0.0]), [-1.0, 4.0, 9.0])?;
     let momentum = |body: &Body| {
         let (p, l) = body.momentum();
         (Vector3::from(p), Vector3::from(l))
@@ -234,7 +234,7 @@ fn relaxing_energy(relaxation: Relaxation) -> Result<Outcome, LabError> {
         BodyConfig::from(StepSettings { relaxation: Some(relaxation), ..Default::default() }),
     )?;
     let impulse = 0.05 * model.omega()[0] * model.mass();
-    body.strike(bar.vertex(&model, [1.0, 0.5, 0.5]), [0.3 * impulse, impulse, -0.7 * impulse])?;
+    body.apply_impulse(bar.vertex(&model, [1.0, 0.5, 0.5]), [0.3 * impulse, impulse, -0.7 * impulse])?;
     let [growth, _] = energy_growth(&mut body, 5_000)?;
     Ok(Outcome::of(vec![no_growth(growth)]))
 }

@@ -11,7 +11,7 @@ use pliant_stream::{
 
 use super::{Bound, Case, Expected, Outcome, bodies::Bar};
 use crate::LabError;
-use crate::experiment::{Experiment, Figures};
+use crate::experiment::{Experiment, Metrics};
 
 /// At 40 Hz.
 const TICK: Duration = Duration::from_millis(25);
@@ -97,11 +97,11 @@ fn guest(link: &LinkConfig, rate: f64, rms: f64, max: f64) -> Result<Outcome, La
 }
 
 /// Ticks not shown in time, or never.
-fn missing(f: &Figures, ticks: f64) -> f64 {
+fn missing(f: &Metrics, ticks: f64) -> f64 {
     (f.missing as f64).max(ticks - f.ticks as f64)
 }
 
-fn words(f: &Figures) -> String {
+fn words(f: &Metrics) -> String {
     format!("rms {:.3} %, largest {:.1} %", f.rms_percent, f.max_percent)
 }
 

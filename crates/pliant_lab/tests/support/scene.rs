@@ -69,7 +69,7 @@ impl Scene {
     pub fn error(&self, session: &GuestSession) -> f64 {
         let view = session.body(BODY).unwrap();
         let (_, truth) = self.truth.iter().rev().find(|t| t.0 == view.tick()).expect("a tick of the host");
-        let shown = &view.shown().unwrap().q;
+        let shown = &view.visual().unwrap().q;
         truth.iter().zip(shown).map(|(a, b)| (a - b).powi(2)).sum::<f64>().sqrt()
     }
 

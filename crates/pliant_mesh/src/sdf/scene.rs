@@ -352,7 +352,7 @@ mod tests {
                 .contains("blend of 0 m")
         );
         assert!(message(&scene("shape: Cube(side: 1)")).contains("RON, line 2"));
-        assert!(message(&scene("shape: Sphere(center: (0, 0, 0), radius: 1), colour: 3")).contains("colour"));
+        assert!(message(&scene("shape: Sphere(center: (0, 0, 0), radius: 1), color: 3")).contains("color"));
         let limb = |path: &str| scene(&format!("shape: Limb(path: {path}, radii: [0.1])"));
         assert!(message(&limb("[(0, 0, 0)]")).contains("a path of 2 to 1000 points, found 1"));
         assert!(

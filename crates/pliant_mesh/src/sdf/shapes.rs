@@ -121,7 +121,7 @@ mod tests {
             assert!((distance.abs() - nearest).abs() < 2e-3, "{p:?}: {distance} {nearest}");
             assert_eq!(distance < 0.0, p.component_div(&radii).norm() < 1.0);
         }
-        // Centre and poles, where formulas like to break.
+        // Center and poles, where formulas like to break.
         assert!((ellipsoid(Vector3::zeros(), radii) + 0.3).abs() < 1e-9);
         assert!((ellipsoid(Vector3::new(0.0, 1.5, 0.0), radii) - 0.5).abs() < 1e-9);
         assert!(ellipsoid(Vector3::new(0.5, 0.0, 0.0), radii).abs() < 1e-9);

@@ -1,8 +1,8 @@
-//! The body-centred cubic lattice around a shape: signs at its points, cut points on its edges, and the warp.
+//! The body-centered cubic lattice around a shape: signs at its points, cut points on its edges, and the warp.
 //!
-//! Lattice points have whole coordinates that are all even (corners of cells) or all odd (centres); one unit is half a
+//! Lattice points have whole coordinates that are all even (corners of cells) or all odd (centers); one unit is half a
 //! cell. A *long* edge joins two points of one kind, two units apart along an axis; a *short* edge joins a corner and a
-//! centre, one unit apart along every axis. Only blocks of cells that the shape reaches are stored.
+//! center, one unit apart along every axis. Only blocks of cells that the shape reaches are stored.
 
 use nalgebra::Vector3;
 use rayon::prelude::*;
@@ -11,9 +11,9 @@ use crate::{MeshError, sdf::SignedDistance};
 
 /// Cells along the edge of a block.
 const BLOCK: i32 = 8;
-/// Points of a block: a corner and a centre for each cell.
+/// Points of a block: a corner and a center for each cell.
 const POINTS: usize = 2 * (BLOCK * BLOCK * BLOCK) as usize;
-/// Edges that a point owns: three long ones and, if it is a centre, eight short ones.
+/// Edges that a point owns: three long ones and, if it is a center, eight short ones.
 const EDGES: usize = 11;
 /// Places for blocks in the box around the shape: a thin shape in a wide box can ask for more.
 const MAX_PLACES: i64 = 1 << 25;
@@ -179,8 +179,8 @@ impl<'a> Lattice<'a> {
             for i in at[0]..at[0] + size {
                 for j in at[1]..at[1] + size {
                     for k in at[2]..at[2] + size {
-                        for centre in 0..2 {
-                            let point: Point = std::array::from_fn(|a| 2 * (cell[a] + [i, j, k][a]) + centre);
+                        for center in 0..2 {
+                            let point: Point = std::array::from_fn(|a| 2 * (cell[a] + [i, j, k][a]) + center);
                             distances[local(point)] = match sure {
                                 Some(Side::Inside) => f64::NEG_INFINITY,
                                 Some(_) => f64::INFINITY,
@@ -281,7 +281,7 @@ impl<'a> Lattice<'a> {
         cuts.binary_search_by_key(&key, |c| c.0).ok().map(|i| cuts[i].1)
     }
 
-    /// Block and key of an edge. The owner of a long edge is its lower end, of a short one its centre.
+    /// Block and key of an edge. The owner of a long edge is its lower end, of a short one its center.
     fn cut_key(&self, a: Point, b: Point) -> Option<(usize, u32)> {
         let step = sub(b, a);
         let forward = if is_long(step) { step.iter().sum::<i32>() > 0 } else { a[0] & 1 == 1 };
@@ -313,27 +313,27 @@ impl<'a> Lattice<'a> {
         self.block_of(point).map_or(Side::Outside, |block| self.blocks[block].sides[local(point)])
     }
 
-    /// All tetrahedra of the lattice with a corner inside, in a fixed order: around each long edge between two centres
+    /// All tetrahedra of the lattice with a corner inside, in a fixed order: around each long edge between two centers
     /// (the first two corners) stand four, each closed by a long edge between two corners.
     pub(super) fn for_each_tet(&self, mut visit: impl FnMut([Point; 4])) {
         for block in &self.blocks {
-            // A tetrahedron whose first centre is in a block that is not stored is outside: that block and all its
+            // A tetrahedron whose first center is in a block that is not stored is outside: that block and all its
             // neighbouring points are.
             for cell in 0..BLOCK * BLOCK * BLOCK {
                 let ijk = [cell / (BLOCK * BLOCK), cell / BLOCK % BLOCK, cell % BLOCK];
-                let centre: Point = std::array::from_fn(|a| 2 * (block.cell[a] + ijk[a]) + 1);
+                let center: Point = std::array::from_fn(|a| 2 * (block.cell[a] + ijk[a]) + 1);
                 for axis in 0..3 {
-                    let next = add(centre, long(axis, 2));
+                    let next = add(center, long(axis, 2));
                     let (u, v) = ((axis + 1) % 3, (axis + 2) % 3);
                     let ring = [(-1, -1), (1, -1), (1, 1), (-1, 1)].map(|(du, dv)| {
-                        let mut corner = centre;
+                        let mut corner = center;
                         corner[axis] += 1;
                         corner[u] += du;
                         corner[v] += dv;
                         corner
                     });
                     for i in 0..4 {
-                        let tet = [centre, next, ring[i], ring[(i + 1) % 4]];
+                        let tet = [center, next, ring[i], ring[(i + 1) % 4]];
                         if tet.iter().any(|&p| self.side(p) == Side::Inside) {
                             visit(tet);
                         }
@@ -360,9 +360,9 @@ impl<'a> Lattice<'a> {
     }
 
     fn point(&self, block: usize, index: usize) -> Point {
-        let (cell, centre) = ((index / 2) as i32, (index % 2) as i32);
+        let (cell, center) = ((index / 2) as i32, (index % 2) as i32);
         let ijk = [cell / (BLOCK * BLOCK), cell / BLOCK % BLOCK, cell % BLOCK];
-        std::array::from_fn(|a| 2 * (self.blocks[block].cell[a] + ijk[a]) + centre)
+        std::array::from_fn(|a| 2 * (self.blocks[block].cell[a] + ijk[a]) + center)
     }
 }
 

@@ -1,7 +1,7 @@
 //! Isosurface stuffing: tetrahedra with good angles inside any closed surface.
 //!
 //! F. Labelle and J. R. Shewchuk, *Isosurface Stuffing: Fast Tetrahedral Meshes with Good Dihedral Angles*, ACM Trans.
-//! Graphics 26(3), 2007, the uniform form: a body-centred cubic lattice is laid over the shape, lattice points near the
+//! Graphics 26(3), 2007, the uniform form: a body-centered cubic lattice is laid over the shape, lattice points near the
 //! surface are pulled onto it, and the tetrahedra that cross it are cut by a handful of stencils.
 
 mod lattice;

@@ -48,8 +48,8 @@ impl Foam {
         // Weyl sequences: even, and different for each seed.
         let x = |n: u32, a: f64| (f64::from(n + 100 * seed) * a).fract();
         let ball = |n| {
-            let centre = Vector3::new(x(n, 0.819_172_513), x(n, 0.671_043_606), x(n, 0.549_700_478));
-            (centre, 0.04 + 0.12 * x(n, 0.754_877_666))
+            let center = Vector3::new(x(n, 0.819_172_513), x(n, 0.671_043_606), x(n, 0.549_700_478));
+            (center, 0.04 + 0.12 * x(n, 0.754_877_666))
         };
         Self((1..60).map(ball).collect())
     }

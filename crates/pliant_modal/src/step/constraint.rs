@@ -109,7 +109,7 @@ impl Hand {
 /// `time y' = d - y`; see [`Relaxation`]. With the pull held over a step `y1 = carry y0 + gain C pull`
 /// and `d1 = at_once C pull + ratio carry y0`.
 #[derive(Debug, Clone, Copy)]
-pub(crate) struct Creep {
+pub(crate) struct ViscoelasticPatch {
     ratio: f64,
     carry: f64,
     gain: f64,
@@ -119,7 +119,7 @@ pub(crate) struct Creep {
     softness: f64,
 }
 
-impl Creep {
+impl ViscoelasticPatch {
     pub(crate) fn new(material: Option<Relaxation>, stiffness_scale: f64, h: f64) -> Self {
         let softness = 1.0 / stiffness_scale;
         let Some(material) = material else {

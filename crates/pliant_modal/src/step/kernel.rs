@@ -6,12 +6,12 @@ use nalgebra::{Matrix3, Vector3};
 
 use super::{
     Frame, Hand, Hold, RigidMotion, State, StepSettings,
-    constraint::Creep,
+    constraint::ViscoelasticPatch,
+    gravity::between,
     modes::Modes,
     patch::{Grams, Six, Tangent, tangent},
-    place::Place,
+    predicted_frame::PredictedFrame,
     solve::System,
-    weight::between,
 };
 use crate::{ModalModel, StepError};
 
@@ -29,7 +29,7 @@ pub struct Load<'a> {
     pub modal: &'a [f64],
     /// Force on the frame of a free body, N, world axes.
     pub force: Vector3<f64>,
-    /// Torque on it about the centre of mass, N m, world axes.
+    /// Torque on it about the center of mass, N m, world axes.
     pub torque: Vector3<f64>,
     /// The frame of a free body is known from elsewhere and stays where the state has it.
     pub frame_is_given: bool,
@@ -57,7 +57,7 @@ struct Solving {
     beyond: f64,
     /// How far the patch gives way in this step because it was pulled before, m, body axes.
     crept: Vector3<f64>,
-    /// From the centre of mass, m, body axes.
+    /// From the center of mass, m, body axes.
     arm: Vector3<f64>,
     /// Force on the body over the step, N, body axes.
     pull: Vector3<f64>,
@@ -78,7 +78,7 @@ pub struct Kernel {
     settings: StepSettings,
     h: f64,
     modes: Modes,
-    creep: Creep,
+    creep: ViscoelasticPatch,
     before: State,
     /// Modal forces: of everything but hands, then of hands.
     force: Vec<f64>,
@@ -113,7 +113,7 @@ impl Kernel {
         let modes = Modes::new(&model, &settings, modes, h)?;
         let zero = vec![0.0; modes.count()];
         let mut kernel = Self {
-            creep: Creep::new(settings.relaxation, settings.stiffness_scale, h),
+            creep: ViscoelasticPatch::new(settings.relaxation, settings.stiffness_scale, h),
             before: State::default(),
             force: zero.clone(),
             pulls: zero.clone(),
@@ -143,7 +143,7 @@ impl Kernel {
     pub fn reconfigure(&mut self, settings: StepSettings, h: f64) -> Result<(), StepError> {
         settings.check()?;
         self.modes = Modes::new(&self.model, &settings, self.modes.count(), h)?;
-        self.creep = Creep::new(settings.relaxation, settings.stiffness_scale, h);
+        self.creep = ViscoelasticPatch::new(settings.relaxation, settings.stiffness_scale, h);
         (self.settings, self.h) = (settings, h);
         self.before = self.at_rest();
         self.prepare_weight();
@@ -403,7 +403,7 @@ impl Kernel {
         let most = StepSettings::MOST_CORRECTIONS;
         let rounds = if self.settings.warp { self.settings.corrections.clamp(1, most) } else { 1 };
         let mut report = StepReport::default();
-        let mut place = Place::unheld(state.frame);
+        let mut place = PredictedFrame::unheld(state.frame);
         for round in 0..rounds {
             let center = Vector3::from(self.model.center_of_mass());
             for (solving, hand) in self.solving.iter_mut().zip(hands.iter()) {
@@ -489,7 +489,13 @@ impl Kernel {
     }
 
     /// One round: the pulls on the tangent, for a frame in `place`. `unheld`: the frame without hands.
-    fn solve(&mut self, unheld: &Frame, hands: &[Hand], place: &Place, rigid: Option<&RigidMotion>) -> usize {
+    fn solve(
+        &mut self,
+        unheld: &Frame,
+        hands: &[Hand],
+        place: &PredictedFrame,
+        rigid: Option<&RigidMotion>,
+    ) -> usize {
         let relaxations = || self.solving.iter().map(|s| s.relaxation);
         let damped = relaxations().any(|r| r > 0.0);
         let first = relaxations().next().unwrap_or(0.0);
@@ -554,8 +560,8 @@ impl Kernel {
         lost
     }
 
-    /// Force (N) and torque about the centre of mass (N m) of the hands, world axes.
-    fn total(&self, place: &Place) -> [Vector3<f64>; 2] {
+    /// Force (N) and torque about the center of mass (N m) of the hands, world axes.
+    fn total(&self, place: &PredictedFrame) -> [Vector3<f64>; 2] {
         self.solving.iter().fold([Vector3::zeros(); 2], |[force, torque], solving| {
             let pull = place.turn * solving.pull;
             [force + pull, torque + (place.turn * solving.arm).cross(&pull)]

@@ -1,16 +1,16 @@
 //! The step of a body: one kernel for bodies, guests, predictions, peers and devices.
 
 mod constraint;
+mod gravity;
 mod implied;
 mod kernel;
 mod modes;
 mod patch;
-mod place;
+mod predicted_frame;
 mod rigid;
 mod settings;
 mod solve;
 mod state;
-mod weight;
 
 pub use constraint::{GrabConfig, Hand, Hold};
 pub use implied::ImpliedPulls;
@@ -20,5 +20,5 @@ pub use rigid::{Frame, RigidMotion};
 pub use settings::StepSettings;
 pub use state::State;
 
+pub(crate) use gravity::MassSites;
 pub(crate) use patch::{Six, tangent};
-pub(crate) use weight::MassSites;

@@ -21,7 +21,7 @@ pub(crate) struct Modes {
     viscous: Option<Viscous>,
 }
 
-/// What viscoelasticity adds; see [`crate::Flow`].
+/// What viscoelasticity adds; see [`crate::ViscoelasticCoefficients`].
 #[derive(Debug, Clone)]
 struct Viscous {
     onto: [Vec<f64>; 3],

@@ -4,15 +4,15 @@ use nalgebra::{Matrix3, Quaternion, UnitQuaternion, Vector3};
 
 use crate::{ModalModel, StepError, error::finite};
 
-/// Pose and momentum of a body. The point that it carries is the centre of mass at rest.
+/// Pose and momentum of a body. The point that it carries is the center of mass at rest.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Frame {
-    /// Centre of mass at rest, in body axes, m: what `position` is the image of.
+    /// Center of mass at rest, in body axes, m: what `position` is the image of.
     pivot: Vector3<f64>,
     position: Vector3<f64>,
     rotation: UnitQuaternion<f64>,
     velocity: Vector3<f64>,
-    /// About the centre of mass, world axes, kg m^2/s: kept instead of the angular velocity, so that flight conserves it to rounding.
+    /// About the center of mass, world axes, kg m^2/s: kept instead of the angular velocity, so that flight conserves it to rounding.
     spin: Vector3<f64>,
 }
 
@@ -35,7 +35,7 @@ impl Frame {
         (self.position - self.rotation * self.pivot).into()
     }
 
-    /// World position of the centre of mass, m.
+    /// World position of the center of mass, m.
     pub fn center(&self) -> [f64; 3] {
         self.position.into()
     }
@@ -46,17 +46,17 @@ impl Frame {
         [q.i, q.j, q.k, q.w]
     }
 
-    /// Velocity of the centre of mass, m/s, world axes.
+    /// Velocity of the center of mass, m/s, world axes.
     pub fn velocity(&self) -> [f64; 3] {
         self.velocity.into()
     }
 
-    /// Angular momentum about the centre of mass, kg m^2/s, world axes.
+    /// Angular momentum about the center of mass, kg m^2/s, world axes.
     pub fn spin(&self) -> [f64; 3] {
         self.spin.into()
     }
 
-    /// A frame from its parts: centre of mass (m), orientation (x, y, z, w), velocity (m/s), spin (kg m^2/s), all in world axes.
+    /// A frame from its parts: center of mass (m), orientation (x, y, z, w), velocity (m/s), spin (kg m^2/s), all in world axes.
     ///
     /// # Errors
     /// A number that is not finite, a quaternion of length zero.
@@ -215,7 +215,7 @@ pub struct RigidMotion {
 
 impl RigidMotion {
     /// Advances the frame by `h` (s) as if no hand held it, under `gravity` (m/s^2) and a force (N) and torque (N m) about the
-    /// centre of mass, all in world axes.
+    /// center of mass, all in world axes.
     pub fn predict(
         frame: &mut Frame,
         model: &ModalModel,
@@ -265,7 +265,7 @@ impl RigidMotion {
         self.step * (Matrix3::identity() * self.inverse_mass + turning)
     }
 
-    /// By how much a force (N) moves the centre of mass within the step, m.
+    /// By how much a force (N) moves the center of mass within the step, m.
     pub(crate) fn way(&self, force: Vector3<f64>) -> Vector3<f64> {
         self.step * self.step * self.inverse_mass * force
     }

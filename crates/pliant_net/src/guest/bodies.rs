@@ -9,8 +9,8 @@ use pliant_stream::{BodyId, BodyView, Pose, StepSettings};
 
 use super::{Interest, NetGuest, shown_of};
 use crate::phase::Phase;
+use crate::remote::{BodyArrived, BodyLeft, RemoteBody, RemoteHands};
 use crate::scene::{Placement, SharedBody};
-use crate::seen::{BodyArrived, BodyLeft, RemoteBody, SeenHands};
 
 /// A body of the host, as it was shown last.
 pub(super) struct FollowedBody {
@@ -97,7 +97,7 @@ impl NetGuest {
                 target.insert(ModalBody { modes, settings, ..new });
             }
         }
-        target.insert((Driven::Remote, RemoteBody(id), SeenHands::default()));
+        target.insert((Driven::Remote, RemoteBody(id), RemoteHands::default()));
         target.entry::<Interest>().or_default();
         self.bodies.insert(
             id,
@@ -141,7 +141,7 @@ impl NetGuest {
         self.wanted.clear();
         for (_, followed) in std::mem::take(&mut self.bodies) {
             if let Ok(mut entity) = world.get_entity_mut(followed.entity) {
-                entity.remove::<(RemoteBody, SeenHands)>();
+                entity.remove::<(RemoteBody, RemoteHands)>();
             }
             self.orphans.push(followed);
         }
@@ -158,7 +158,7 @@ impl NetGuest {
         if followed.made_here {
             world.try_despawn(followed.entity).ok();
         } else if let Ok(mut entity) = world.get_entity_mut(followed.entity) {
-            entity.remove::<(RemoteBody, SeenHands)>();
+            entity.remove::<(RemoteBody, RemoteHands)>();
         }
         world.write_message(BodyLeft { entity: followed.entity, name: followed.name });
     }
@@ -179,7 +179,7 @@ impl FollowedBody {
         self.settled = false;
         std::mem::swap(&mut self.previous, &mut self.current);
         self.current.0.clone_from(&shown.q);
-        self.current.1 = match view.own_hand() {
+        self.current.1 = match view.predicted_hand() {
             Some(own) => own.pose(),
             None => view.pose(),
         };

@@ -9,9 +9,9 @@ use pliant_modal::GrabConfig;
 use pliant_stream::BodyId;
 
 use super::NetGuest;
-use crate::felt::{PatchPoint, hold_of, holds_so};
-use crate::place::Place;
-use crate::seen::RemoteBody;
+use crate::patch_kinematics::{PatchPoint, hold_of, holds_so};
+use crate::remote::RemoteBody;
+use crate::session_transform::SessionTransform;
 
 /// A grab of ours as the host was told of it.
 pub(super) struct SentGrab {
@@ -52,7 +52,7 @@ pub(crate) fn send_hands(
     });
     for (entity, grab, of) in &grabs {
         let Ok((body, state, transform)) = bodies.get(of.0) else { continue };
-        let Some(place) = Place::of_body(transform, state) else { continue };
+        let Some(place) = SessionTransform::of_body(transform, state) else { continue };
         let target = place.point_to_session(grab.target);
         match guest.grabs.get_mut(&entity) {
             None => {

@@ -8,8 +8,8 @@ use bevy::prelude::*;
 use pliant_body::{BodyState, Grabs};
 
 use super::NetGuest;
+use crate::remote::RemoteBody;
 use crate::scene::Wanted;
-use crate::seen::RemoteBody;
 
 /// How much of a body a guest wants to be sent. On every body that follows a host's; written by the app, or by [`CameraInterest`].
 ///

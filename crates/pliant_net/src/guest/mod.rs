@@ -3,9 +3,9 @@
 mod bodies;
 mod hands;
 mod interest;
-mod line;
 mod session;
 mod show;
+mod source;
 
 use std::collections::BTreeMap;
 use std::path::PathBuf;
@@ -17,13 +17,13 @@ use bevy::tasks::Task;
 use pliant_modal::ModalModel;
 use pliant_stream::{BodyId, BodyView, GuestSession, LinkStats, PeerId, RecoveryConfig, State, Tick, UserId};
 
-use crate::figures::{Ledger, NetStats};
+use crate::metrics::{Ledger, NetStats};
+use crate::remote::RemoteBody;
 use crate::scene::{Person, Reach};
-use crate::seen::RemoteBody;
 use crate::transport::{Emulation, Endpoint, JoinOptions, Role};
 use bodies::FollowedBody;
 use hands::SentGrab;
-use line::Line;
+use source::Source;
 
 pub(crate) use hands::send_hands;
 pub use interest::{CameraInterest, Interest};
@@ -46,7 +46,7 @@ pub struct JoinConfig {
     pub modes: Option<u16>,
     /// Show and feel the own hands at once: a body that this guest holds is stepped on to where the hands are now, instead of shown as the
     /// host had it half a round trip ago. Default: true.
-    pub own_hand_first: bool,
+    pub predict_own_hand: bool,
     /// Most force that one of the own hands is told of, N, whatever the host says; the direction stays. Default: 1000.
     pub most_force: f64,
     /// Ask for no more of each body than the cameras see. Default `None`: everything, unless an [`Interest`] says otherwise.
@@ -66,7 +66,7 @@ impl Default for JoinConfig {
             transport: JoinOptions::default(),
             recovery: RecoveryConfig::default(),
             modes: None,
-            own_hand_first: true,
+            predict_own_hand: true,
             most_force: 1000.0,
             interest: None,
             rejoin: Duration::from_secs(60),
@@ -101,7 +101,7 @@ pub enum GuestState {
 /// The session that this app has joined.
 #[derive(Resource)]
 pub struct NetGuest {
-    line: Line,
+    line: Source,
     config: JoinConfig,
     began: Instant,
     state: GuestState,
@@ -132,14 +132,14 @@ pub struct NetGuest {
 impl NetGuest {
     pub(crate) fn join(mut config: JoinConfig, endpoint: Endpoint) -> Result<Self, RecordingError> {
         let recorder = config.record.take().map(|path| Recorder::create(&path)).transpose()?;
-        Ok(Self::new(config, Line::Quic { endpoint, recorder }))
+        Ok(Self::new(config, Source::Quic { endpoint, recorder }))
     }
 
     pub(crate) fn replay(config: JoinConfig, recording: Recording) -> Self {
-        Self::new(config, Line::replay(recording))
+        Self::new(config, Source::replay(recording))
     }
 
-    fn new(config: JoinConfig, line: Line) -> Self {
+    fn new(config: JoinConfig, line: Source) -> Self {
         Self {
             line,
             config,
@@ -187,7 +187,7 @@ impl NetGuest {
     }
 
     /// The state that a body is shown in, and the tick it stands for: that of the newer copy while this guest's own hand holds it
-    /// ([`BodyView::own_hand`]), that of the confirmed stream otherwise. The host's tick of a newer copy may still be to come.
+    /// ([`BodyView::predicted_hand`]), that of the confirmed stream otherwise. The host's tick of a newer copy may still be to come.
     pub fn shown(&self, body: RemoteBody) -> Option<(Tick, &State)> {
         let view = self.body(body)?;
         shown_of(view)
@@ -227,7 +227,7 @@ impl NetGuest {
         }
     }
 
-    pub(crate) fn figures(&mut self) -> NetStats {
+    pub(crate) fn metrics(&mut self) -> NetStats {
         let mut stats = NetStats::default();
         let line = self.line.stats();
         let mut links = self.before;
@@ -244,7 +244,7 @@ impl NetGuest {
             stats.recovered += counts.repaired;
             stats.snapshots += counts.snapshots;
             let followed = self.bodies.get(&view.id());
-            if let (Some(shown), Some(hidden), Some(followed)) = (view.shown(), view.hidden(), followed)
+            if let (Some(shown), Some(hidden), Some(followed)) = (view.visual(), view.confirmed(), followed)
                 && followed.peak > 0.0
             {
                 let off = shown.q.iter().zip(&hidden.q).map(|(a, b)| (a - b).powi(2)).sum::<f64>().sqrt();
@@ -256,8 +256,8 @@ impl NetGuest {
 }
 
 fn shown_of(view: &BodyView) -> Option<(Tick, &State)> {
-    match view.own_hand() {
-        Some(own) => Some((own.tick(), own.shown())),
-        None => Some((view.tick(), view.shown()?)),
+    match view.predicted_hand() {
+        Some(own) => Some((own.tick(), own.visual())),
+        None => Some((view.tick(), view.visual()?)),
     }
 }

@@ -7,12 +7,12 @@ use bevy::prelude::*;
 use bevy::tasks::{AsyncComputeTaskPool, block_on, poll_once};
 use pliant_body::ModalAsset;
 use pliant_modal::ModalModel;
-use pliant_stream::{EndReason, GuestEvent, GuestSession, StreamError, UserId};
+use pliant_stream::{DisconnectReason, GuestEvent, GuestSession, StreamError, UserId};
 
-use super::line::Came;
+use super::source::Came;
 use super::{GuestState, NetGuest};
+use crate::remote::{GrabRefused, SessionClosed, SessionJoined, SessionLost};
 use crate::scene::{self, Person, Reliable};
-use crate::seen::{GrabRefused, SessionClosed, SessionJoined, SessionLost};
 use crate::transport::{CloseReason, Role};
 use crate::user::{User, UserJoined, UserLeft, UserLink, Yourself};
 
@@ -96,7 +96,7 @@ impl NetGuest {
             name: scene::shortened(&self.config.name).to_owned(),
             recovery: self.config.recovery,
             modes: self.config.modes,
-            own_hand_first: self.config.own_hand_first,
+            predict_own_hand: self.config.predict_own_hand,
             idle_timeout: self.config.transport.limits.idle_timeout,
             models_apart: true,
             ..pliant_stream::GuestConfig::default()
@@ -150,9 +150,10 @@ impl NetGuest {
         }
         let may_come_back = match reason {
             // The goodbye that said so may have been lost on the way.
-            CloseReason::ByPeer { reason, .. } => {
-                !matches!(reason, EndReason::Refused | EndReason::Version | EndReason::Path)
-            }
+            CloseReason::ByPeer { reason, .. } => !matches!(
+                reason,
+                DisconnectReason::Refused | DisconnectReason::Version | DisconnectReason::Path
+            ),
             CloseReason::TimedOut | CloseReason::Failed { .. } => true,
             // Who was in finds a place again when the house has sorted itself out.
             CloseReason::NoRoom => self.retry.was_in,
@@ -259,11 +260,11 @@ impl NetGuest {
                     }
                 }
                 // Both ends have stopped hearing each other: the connection is tried anew, not given up.
-                GuestEvent::Closed { reason: EndReason::Silent | EndReason::Lost } => {
+                GuestEvent::Closed { reason: DisconnectReason::Silent | DisconnectReason::Lost } => {
                     self.flush();
                     self.line.close();
                     let now = self.now();
-                    self.lost(world, now, EndReason::Silent.to_string());
+                    self.lost(world, now, DisconnectReason::Silent.to_string());
                 }
                 GuestEvent::Closed { reason } => self.close(world, reason.to_string()),
                 _ => {}

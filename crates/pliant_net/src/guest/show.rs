@@ -1,12 +1,12 @@
 //! What the session shows, written for the eye and the hand.
 
 use bevy::prelude::*;
-use pliant_body::{BodyState, GrabForce, ShownState};
+use pliant_body::{BodyState, GrabForce, VisualState};
 use pliant_stream::GrabKey;
 
 use super::NetGuest;
-use crate::place::{Place, set_pose};
-use crate::seen::{SeenHand, SeenHands};
+use crate::remote::{RemoteHand, RemoteHands};
+use crate::session_transform::{SessionTransform, set_pose};
 use crate::user::UserLink;
 
 type FollowedBodies<'w, 's> = Query<
@@ -14,8 +14,8 @@ type FollowedBodies<'w, 's> = Query<
     's,
     (
         &'static BodyState,
-        &'static mut ShownState,
-        &'static mut SeenHands,
+        &'static mut VisualState,
+        &'static mut RemoteHands,
         &'static mut Transform,
         &'static GlobalTransform,
     ),
@@ -60,22 +60,22 @@ pub(crate) fn show(
                 set_pose(&mut transform, &from, &to, fraction, state.scale());
             }
         }
-        let Some(place) = Place::of_body(global, state) else { continue };
+        let Some(place) = SessionTransform::of_body(global, state) else { continue };
         let pose = followed.current.1;
-        let hand = |grab: &pliant_stream::GrabState| SeenHand {
+        let hand = |grab: &pliant_stream::GrabState| RemoteHand {
             user: grab.key.user,
             vertex: grab.vertex,
             target: place.point_to_world(grab.target),
             reaction: place.force_to_world(grab.reaction),
         };
         let others = view.grabs().iter().filter(|grab| Some(grab.key.user) != user).map(hand);
-        seen.set_if_neq(SeenHands(others.collect()));
+        seen.set_if_neq(RemoteHands(others.collect()));
         for (&entity, sent) in guest.grabs.iter().filter(|(_, sent)| sent.body == id) {
             let Ok(mut force) = forces.get_mut(entity) else { continue };
             let felt = sent.number.zip(user).and_then(|(grab, user)| {
                 let key = GrabKey { user, grab };
                 let confirmed = || Some(view.grabs().iter().find(|grab| grab.key == key)?.reaction);
-                let reaction = match view.own_hand() {
+                let reaction = match view.predicted_hand() {
                     Some(own) => own.reaction(grab).or_else(confirmed)?,
                     None => confirmed()?,
                 };

@@ -4,7 +4,7 @@ use std::collections::{BTreeMap, BTreeSet};
 use std::time::Duration;
 
 use bevy::prelude::*;
-use pliant_stream::{EndReason, GrabKey, HostEvent, PeerId, UserId};
+use pliant_stream::{DisconnectReason, GrabKey, HostEvent, PeerId, UserId};
 
 use super::hands::GuestGrab;
 use super::{Known, NetHost};
@@ -63,7 +63,7 @@ pub(crate) fn receive(world: &mut World) {
                     host.guests.insert(peer, Guest::new(fingerprint, role));
                     let most = host.endpoint.max_datagram_size(peer).unwrap_or(0);
                     if let Err(error) = host.session.connect(now, peer, most) {
-                        host.endpoint.close(peer, EndReason::Full, &error.to_string());
+                        host.endpoint.close(peer, DisconnectReason::Full, &error.to_string());
                     }
                 }
                 Event::Datagram { peer, at, bytes } => {
@@ -76,7 +76,7 @@ pub(crate) fn receive(world: &mut World) {
                     // Of the rest a guest has nothing to say.
                     Some(Reliable::Placement(_) | Reliable::People(_) | Reliable::Reaches(_)) | None => {
                         host.rejected += 1;
-                        host.session.kick(peer, EndReason::Protocol);
+                        host.session.kick(peer, DisconnectReason::Protocol);
                     }
                 },
                 Event::Closed { peer, reason } => {
@@ -118,12 +118,12 @@ impl NetHost {
             .collect();
         for other in older {
             debug!("guest {other} has come anew as {peer}");
-            self.session.kick(other, EndReason::Left);
+            self.session.kick(other, DisconnectReason::Left);
         }
         let before = self.known.get(&key).map(|known| known.user).or_else(|| self.free_number());
         if let Err(error) = self.session.accept_as(now, peer, before) {
             debug!("guest {peer} was not let in: {error}");
-            self.session.kick(peer, EndReason::Refused);
+            self.session.kick(peer, DisconnectReason::Refused);
         }
         // The older one's leave comes before the newer one's arrival.
         self.take_events(world);

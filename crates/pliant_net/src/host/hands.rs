@@ -8,7 +8,7 @@ use pliant_stream::{BodyId, GrabKey, PeerId};
 
 use super::NetHost;
 use super::playout::HandPlayout;
-use crate::place::Place;
+use crate::session_transform::SessionTransform;
 use crate::transport::Role;
 use crate::user::{HandOf, User};
 
@@ -47,7 +47,7 @@ impl NetHost {
     pub(super) fn target_in_world(&self, world: &World, body: BodyId, target: [f64; 3]) -> Option<DVec3> {
         let entity = self.entity_of(body)?;
         let state = world.get::<BodyState>(entity)?;
-        let place = Place::of_body(world.get::<GlobalTransform>(entity)?, state)?;
+        let place = SessionTransform::of_body(world.get::<GlobalTransform>(entity)?, state)?;
         let model = state.model();
         let middle = if model.is_free() {
             DVec3::from(state.body().frame().center())

@@ -13,9 +13,9 @@ use bevy::prelude::*;
 use bevy::tasks::Task;
 use bytes::Bytes;
 use pliant_modal::ModalModel;
-use pliant_stream::{Channel, EndReason, GrabKey, GrabState, HostSession, LinkStats, PeerId, UserId};
+use pliant_stream::{Channel, DisconnectReason, GrabKey, GrabState, HostSession, LinkStats, PeerId, UserId};
 
-use crate::figures::{Ledger, NetStats};
+use crate::metrics::{Ledger, NetStats};
 use crate::scene::{self, Placement};
 use crate::transport::{
     Access, Emulation, Endpoint, Fingerprint, HostOptions, Invite, PeerStats, Role, SendError,
@@ -163,7 +163,7 @@ impl NetHost {
         self.endpoint.set_access(Access::Tokens(Vec::new()));
         let peers: Vec<PeerId> = self.guests.keys().copied().collect();
         for peer in peers {
-            self.session.kick(peer, EndReason::Left);
+            self.session.kick(peer, DisconnectReason::Left);
         }
         self.flush();
     }
@@ -213,7 +213,7 @@ impl NetHost {
     pub fn kick(&mut self, guest: Entity) -> bool {
         let found = self.guests.iter().find(|(_, one)| one.entity == Some(guest));
         let Some(peer) = found.map(|(&peer, _)| peer) else { return false };
-        self.session.kick(peer, EndReason::Refused);
+        self.session.kick(peer, DisconnectReason::Refused);
         true
     }
 
@@ -244,8 +244,8 @@ impl NetHost {
     fn send_message(&mut self, peer: PeerId, message: Bytes) {
         if let Err(error @ SendError::QueueFull { .. }) = self.endpoint.send_message(peer, message) {
             debug!("guest {peer} is sent away: {error}");
-            self.session.disconnect(peer, EndReason::Lost);
-            self.endpoint.close(peer, EndReason::Lost, "messages are not read");
+            self.session.disconnect(peer, DisconnectReason::Lost);
+            self.endpoint.close(peer, DisconnectReason::Lost, "messages are not read");
         }
     }
 
@@ -275,7 +275,7 @@ impl NetHost {
         Some((link, transport))
     }
 
-    pub(crate) fn figures(&mut self) -> NetStats {
+    pub(crate) fn metrics(&mut self) -> NetStats {
         let mut sum = NetStats::default();
         let inside = self.guests.iter().filter(|(_, guest)| guest.entity.is_some());
         for (link, transport) in inside.filter_map(|(&peer, _)| self.link(peer)) {

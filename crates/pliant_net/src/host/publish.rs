@@ -12,8 +12,8 @@ use pliant_stream::{BodyId, GrabKey, GrabState, Pose, StepSettings, TickState, U
 
 use super::NetHost;
 use super::hands::GuestGrab;
-use crate::place::Place;
 use crate::scene::{self, Placement, Reach, SharedBody};
+use crate::session_transform::SessionTransform;
 use crate::user::{User, UserLink};
 
 pub(super) struct HostedBody {
@@ -74,7 +74,7 @@ pub(crate) fn publish(
         if *driven == Driven::Remote {
             continue;
         }
-        let Some(place) = Place::of_body(transform, state) else { continue };
+        let Some(place) = SessionTransform::of_body(transform, state) else { continue };
         let Some(id) = host.announced(entity, shared, state, transform) else { continue };
         let mut streamed = std::mem::take(&mut host.scratch);
         streamed.clear();

@@ -6,11 +6,11 @@ use std::time::Duration;
 use bevy::prelude::*;
 use bytes::Bytes;
 use pliant_stream::peer::PeerEvent;
-use pliant_stream::{Channel, EndReason, PeerId, UserId};
+use pliant_stream::{Channel, DisconnectReason, PeerId, UserId};
 
 use super::message::{MOST_PEERS, Mesh, Scene};
 use super::{NetPeer, PeerState};
-use crate::seen::{SessionClosed, SessionJoined};
+use crate::remote::{SessionClosed, SessionJoined};
 use crate::transport::{CloseReason, Endpoint, Event, Fingerprint, Invite, Role};
 use crate::user::{User, UserJoined, UserLeft, UserLink};
 
@@ -111,7 +111,7 @@ impl NetPeer {
                 self.others.insert(peer, other);
                 if role == Role::Watch && opened.is_none() {
                     // Every peer steps the bodies with its own hands: there is no place for one that may not hold.
-                    return self.hang_up(peer, EndReason::Refused, "among equals everybody holds");
+                    return self.hang_up(peer, DisconnectReason::Refused, "among equals everybody holds");
                 }
                 // The first that we have come to is asked; the others are told.
                 if let (Some(_), PeerState::In { user }) = (opened, &self.state) {
@@ -143,7 +143,7 @@ impl NetPeer {
                 self.others.remove(&peer);
                 self.introduced.remove(&peer);
                 // Its thread may wait for the other end's last packets: not here.
-                self.ending.extend(self.opened.remove(&peer).and_then(Endpoint::let_go));
+                self.ending.extend(self.opened.remove(&peer).and_then(Endpoint::close_detached));
                 if opened.is_some() && self.session.is_none() {
                     self.close(world, reason.to_string());
                 }
@@ -166,16 +166,16 @@ impl NetPeer {
                         self.let_in(peer);
                     }
                 } else {
-                    self.hang_up(peer, EndReason::Protocol, "introduced twice");
+                    self.hang_up(peer, DisconnectReason::Protocol, "introduced twice");
                 }
             }
             Some(Mesh::Member { number, scene, invite }) if !opened => {
                 let known = self.others.values().any(|other| other.number == Some(number));
                 let own = if let PeerState::In { user } = self.state { user } else { UserId::HOST };
                 if scene != self.scene {
-                    self.hang_up(peer, EndReason::Scene, "other bodies, or another step");
+                    self.hang_up(peer, DisconnectReason::Scene, "other bodies, or another step");
                 } else if known || number == UserId::HOST || number == own || self.session.is_none() {
-                    self.hang_up(peer, EndReason::Refused, "no place under this number");
+                    self.hang_up(peer, DisconnectReason::Refused, "no place under this number");
                 } else if let Some(other) = self.others.get_mut(&peer) {
                     other.number = Some(number);
                     other.invite = Some(other.seen_from_here(invite));
@@ -210,7 +210,7 @@ impl NetPeer {
             }
             _ => {
                 self.rejected += 1;
-                self.hang_up(peer, EndReason::Protocol, "a message that is none");
+                self.hang_up(peer, DisconnectReason::Protocol, "a message that is none");
             }
         }
     }
@@ -232,12 +232,12 @@ impl NetPeer {
             return;
         };
         if scene != self.scene {
-            return self.hang_up(peer, EndReason::Scene, "other bodies, or another step");
+            return self.hang_up(peer, DisconnectReason::Scene, "other bodies, or another step");
         }
         let others: Vec<(UserId, Invite)> =
             self.others.values().filter_map(|other| Some((other.number?, other.invite.clone()?))).collect();
         if self.others.len() > MOST_PEERS {
-            return self.hang_up(peer, EndReason::Full, "no room");
+            return self.hang_up(peer, DisconnectReason::Full, "no room");
         }
         let Some(key) = self.others.get(&peer).map(|other| other.key) else { return };
         let present: BTreeSet<UserId> = self.others.values().filter_map(|other| other.number).collect();
@@ -247,7 +247,7 @@ impl NetPeer {
             self.numbers.values().copied().chain(present).chain([own, UserId::HOST]).collect();
         // The first that nobody has or had: one peer's word for its own number, however large, leaves room for all others.
         let Some(number) = before.or_else(|| (1..=u16::MAX).map(UserId).find(|n| !taken.contains(n))) else {
-            return self.hang_up(peer, EndReason::Full, "no number is left");
+            return self.hang_up(peer, DisconnectReason::Full, "no number is left");
         };
         self.remember(key, number);
         if let Some(other) = self.others.get_mut(&peer) {
@@ -267,7 +267,7 @@ impl NetPeer {
             && let Some(user) = self.others.get(&peer).and_then(|other| other.number)
             && let Err(error) = session.connect(now, peer, user, most)
         {
-            self.hang_up(peer, EndReason::Refused, &error.to_string());
+            self.hang_up(peer, DisconnectReason::Refused, &error.to_string());
         }
     }
 
@@ -275,7 +275,7 @@ impl NetPeer {
         let (endpoint, number) = self.way(peer);
         if let Err(error) = endpoint.send_message(number, message.to_message()) {
             debug!("not sent to peer {peer}: {error}");
-            endpoint.close(number, EndReason::Lost, "messages are not read");
+            endpoint.close(number, DisconnectReason::Lost, "messages are not read");
         }
     }
 
@@ -290,11 +290,11 @@ impl NetPeer {
         };
         let silent: Vec<PeerId> = self.others.iter().filter(silent).map(|(&peer, _)| peer).collect();
         for peer in silent {
-            self.hang_up(peer, EndReason::Refused, "has not said who it is");
+            self.hang_up(peer, DisconnectReason::Refused, "has not said who it is");
         }
     }
 
-    fn hang_up(&mut self, peer: PeerId, reason: EndReason, why: &str) {
+    fn hang_up(&mut self, peer: PeerId, reason: DisconnectReason, why: &str) {
         debug!("peer {peer} is sent away: {why}");
         if let Some(other) = self.others.get_mut(&peer) {
             (other.sent_away, other.waits) = (true, None);
@@ -357,7 +357,7 @@ impl NetPeer {
                         .map(|(&peer, _)| peer)
                         .collect();
                     for peer in gone {
-                        if reason == EndReason::Silent {
+                        if reason == DisconnectReason::Silent {
                             self.miss(now, peer, &CloseReason::TimedOut);
                         }
                         let (endpoint, number) = self.way(peer);

@@ -3,10 +3,10 @@
 //! Each peer listens and each connects: who comes with the invite of any of them is told of all the others, and joins them too. One that goes
 //! leaves the others connected.
 
-mod again;
 mod mesh;
 mod message;
 mod play;
+mod reconnect;
 
 use std::collections::BTreeMap;
 use std::thread::JoinHandle;
@@ -17,17 +17,17 @@ use pliant_body::{BodyState, Driven, ModalBody};
 use pliant_stream::peer::{PeerConfig as SessionConfig, PeerSession, Repair};
 use pliant_stream::{BodyId, LinkStats, PeerId, UserId};
 
-use crate::figures::{Ledger, NetStats};
+use crate::metrics::{Ledger, NetStats};
 use crate::scene::{self, SharedBody};
 use crate::transport::{
     Emulation, Endpoint, Fingerprint, HostOptions, Identity, Invite, JoinOptions, Limits, PeerStats, Role,
     TransportError,
 };
 use crate::user::{User, UserLink, Yourself};
-use again::Missed;
 use mesh::Other;
 use message::Scene;
-use play::{PlayedBody, SaidGrab};
+use play::{PlayedBody, SentGrab};
+use reconnect::Missed;
 
 pub(crate) use mesh::receive;
 pub(crate) use play::{show, tell_hands};
@@ -109,7 +109,7 @@ pub struct NetPeer {
     /// Who has which key, to be the same again.
     numbers: BTreeMap<Fingerprint, UserId>,
     users: BTreeMap<UserId, Entity>,
-    grabs: BTreeMap<Entity, SaidGrab>,
+    grabs: BTreeMap<Entity, SentGrab>,
     scratch: Vec<f64>,
     ledger: Ledger,
     /// Messages that no peer has to say.
@@ -223,7 +223,7 @@ impl NetPeer {
         }
     }
 
-    pub(crate) fn figures(&mut self) -> NetStats {
+    pub(crate) fn metrics(&mut self) -> NetStats {
         let mut stats = NetStats::default();
         let line = |&peer: &PeerId| {
             let (endpoint, number) = self.way(peer);
@@ -305,7 +305,7 @@ impl NetPeer {
             return false;
         }
         for played in found.values() {
-            world.entity_mut(played.entity).insert((Driven::Remote, crate::seen::SeenHands::default()));
+            world.entity_mut(played.entity).insert((Driven::Remote, crate::remote::RemoteHands::default()));
         }
         self.scene = Scene {
             step_ns: u64::try_from(step.as_nanos()).unwrap_or(0),
@@ -321,7 +321,7 @@ impl Drop for NetPeer {
     fn drop(&mut self) {
         self.listening.signal();
         let opened = std::mem::take(&mut self.opened).into_values();
-        self.ending.extend(opened.filter_map(Endpoint::let_go));
+        self.ending.extend(opened.filter_map(Endpoint::close_detached));
         for thread in self.ending.drain(..) {
             // A panic of that thread has been reported there.
             let _ = thread.join();

@@ -4,15 +4,15 @@ use std::sync::Arc;
 
 use bevy::math::{DQuat, DVec3};
 use bevy::prelude::*;
-use pliant_body::{BodyState, Grab, GrabForce, GrabOf, ShownState};
+use pliant_body::{BodyState, Grab, GrabForce, GrabOf, VisualState};
 use pliant_modal::{Body, GrabConfig, ModalModel};
 use pliant_stream::{BodyId, GrabKey, Pose, StepSettings, UserId};
 
 use super::{NetPeer, PeerState};
-use crate::felt::{PatchPoint, hold_of, holds_so};
+use crate::patch_kinematics::{PatchPoint, hold_of, holds_so};
 use crate::phase::Phase;
-use crate::place::{Place, set_pose};
-use crate::seen::{SeenHand, SeenHands};
+use crate::remote::{RemoteHand, RemoteHands};
+use crate::session_transform::{SessionTransform, set_pose};
 
 /// A body of the peers, and what is shown of it.
 pub(super) struct PlayedBody {
@@ -61,7 +61,7 @@ pub(super) fn agreed_settings(body: &Body) -> StepSettings {
 }
 
 /// An own grab as the session knows it.
-pub(super) struct SaidGrab {
+pub(super) struct SentGrab {
     body: BodyId,
     vertex: u32,
     radius: f64,
@@ -97,7 +97,7 @@ pub(crate) fn tell_hands(
     });
     for (entity, grab, of) in &grabs {
         let (Some(id), Ok((state, transform))) = (number_of(of.0), bodies.get(of.0)) else { continue };
-        let Some(place) = Place::of_body(transform, state) else { continue };
+        let Some(place) = SessionTransform::of_body(transform, state) else { continue };
         let target = place.point_to_session(grab.target);
         let moved = match net.grabs.get(&entity) {
             Some(said) => said.number.map(|number| session.set_target(number, target)).transpose(),
@@ -107,7 +107,7 @@ pub(crate) fn tell_hands(
                 let point = PatchPoint::new(state.model(), grab.vertex, grab.radius).ok();
                 let (vertex, radius) = (grab.vertex, grab.radius);
                 let number = begun.as_ref().ok().copied();
-                net.grabs.insert(entity, SaidGrab { body: id, vertex, radius, hold, number, point });
+                net.grabs.insert(entity, SentGrab { body: id, vertex, radius, hold, number, point });
                 begun.map(|_| None)
             }
         };
@@ -120,7 +120,7 @@ pub(crate) fn tell_hands(
 /// `PostUpdate`: the session is brought to now, and what it shows is written.
 pub(crate) fn show(
     net: Option<ResMut<NetPeer>>,
-    mut bodies: Query<(&BodyState, &mut ShownState, &mut SeenHands, &mut Transform, &GlobalTransform)>,
+    mut bodies: Query<(&BodyState, &mut VisualState, &mut RemoteHands, &mut Transform, &GlobalTransform)>,
     mut forces: Query<&mut GrabForce>,
 ) {
     let Some(mut net) = net else { return };
@@ -135,11 +135,11 @@ pub(crate) fn show(
         let Ok((state, mut shown, mut seen, mut place, transform)) = bodies.get_mut(played.entity) else {
             continue;
         };
-        let first = played.current.0.len() != view.shown().modes();
+        let first = played.current.0.len() != view.visual().modes();
         if view.tick() != played.tick || first {
             played.tick = view.tick();
             std::mem::swap(&mut played.previous, &mut played.current);
-            played.current.0.clone_from(&view.shown().q);
+            played.current.0.clone_from(&view.visual().q);
             played.current.1 = view.pose();
             if first {
                 played.previous.clone_from(&played.current);
@@ -158,15 +158,15 @@ pub(crate) fn show(
         {
             debug!("a state was not shown: {error}");
         }
-        let Some(place) = Place::of_body(transform, state) else { continue };
-        let hand = |grab: &pliant_stream::GrabState| SeenHand {
+        let Some(place) = SessionTransform::of_body(transform, state) else { continue };
+        let hand = |grab: &pliant_stream::GrabState| RemoteHand {
             user: grab.key.user,
             vertex: grab.vertex,
             target: place.point_to_world(grab.target),
             reaction: place.force_to_world(grab.reaction),
         };
         let others = view.grabs().iter().filter(|grab| grab.key.user != user).map(hand);
-        seen.set_if_neq(SeenHands(others.collect()));
+        seen.set_if_neq(RemoteHands(others.collect()));
         for (&entity, said) in net.grabs.iter().filter(|(_, said)| said.body == id) {
             let Ok(mut force) = forces.get_mut(entity) else { continue };
             let felt = said.number.and_then(|grab| felt(view.grabs(), user, grab)).and_then(|reaction| {

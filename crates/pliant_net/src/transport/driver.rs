@@ -10,7 +10,7 @@ use std::task::Poll;
 use std::time::{Duration, Instant, SystemTime};
 
 use bytes::Bytes;
-use pliant_stream::{EndReason, PeerId};
+use pliant_stream::{DisconnectReason, PeerId};
 use quinn::{
     ClientConfig, Connection, ConnectionError, EndpointConfig, Incoming, RecvStream, Runtime,
     SendDatagramError, SendStream, ServerConfig, TokioRuntime, TransportErrorCode, VarInt,
@@ -36,11 +36,11 @@ const GOODBYE: u32 = 0;
 const REFUSED: u32 = 1;
 /// The other end broke the rules.
 const PROTOCOL: u32 = 2;
-/// The session is over: this and the number of its [`EndReason`].
+/// The session is over: this and the number of its [`DisconnectReason`].
 const SESSION: u32 = 16;
 
 /// The code with which a connection is closed whose session is over.
-pub(super) fn code_of(reason: EndReason) -> u32 {
+pub(super) fn code_of(reason: DisconnectReason) -> u32 {
     SESSION + u32::from(reason.code())
 }
 
@@ -128,7 +128,7 @@ async fn accept(shared: &Arc<Shared>, endpoint: &quinn::Endpoint) {
         };
         let open = handshakes.load(Ordering::Relaxed);
         let address = incoming.remote_address();
-        if lock(&shared.peers).len() + open >= shared.limits.peers || shared.inbox.crowded() {
+        if lock(&shared.peers).len() + open >= shared.limits.peers || shared.inbox.overloaded() {
             debug!(%address, "refused a guest: no room");
             incoming.refuse();
         } else if open >= HANDSHAKES_BEFORE_RETRY
@@ -335,7 +335,8 @@ fn reason_of(error: ConnectionError, refused: Option<CloseReason>) -> CloseReaso
                 code => {
                     let reason = code.ok().and_then(|code| u8::try_from(code.checked_sub(SESSION)?).ok());
                     // A later version may have more reasons.
-                    let reason = reason.and_then(EndReason::from_code).unwrap_or(EndReason::Left);
+                    let reason =
+                        reason.and_then(DisconnectReason::from_code).unwrap_or(DisconnectReason::Left);
                     CloseReason::ByPeer { reason, words }
                 }
             }
@@ -372,7 +373,7 @@ impl Open {
             let datagrams_in = pin!(read_datagrams(shared, id, &connection, &peer));
             let messages_out = pin!(write_messages(&connection, &peer, &bucket, &mut send));
             let datagrams_out = pin!(write_datagrams(&connection, &peer, &bucket));
-            let figures = pin!(keep_figures(&connection, &peer));
+            let metrics = pin!(keep_figures(&connection, &peer));
             let hung_up = pin!(hang_up(&connection, &peer));
             tokio::select! {
                 reason = messages_in => reason,
@@ -381,7 +382,7 @@ impl Open {
                 error = connection.closed() => reason_of(error, None),
                 () = datagrams_in => unreachable_end(),
                 () = datagrams_out => unreachable_end(),
-                () = figures => unreachable_end(),
+                () = metrics => unreachable_end(),
             }
         };
         debug!(peer = id.0, %reason, "connection closed");

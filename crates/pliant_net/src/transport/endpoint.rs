@@ -9,7 +9,7 @@ use std::thread::JoinHandle;
 use std::time::{Duration, Instant};
 
 use bytes::Bytes;
-use pliant_stream::{EndReason, PeerId};
+use pliant_stream::{DisconnectReason, PeerId};
 use thiserror::Error;
 use tokio::sync::Notify;
 
@@ -73,7 +73,7 @@ pub enum CloseReason {
     #[error("the other end left: {words}")]
     ByPeer {
         /// Why, by the code that came.
-        reason: EndReason,
+        reason: DisconnectReason,
         /// Its words, shortened and without control characters.
         words: String,
     },
@@ -409,7 +409,7 @@ impl Endpoint {
 
     /// Closes a connection once its queued messages are out (it waits at most a second for that).
     /// `reason` reaches the peer as a code, `words` as they are, for people.
-    pub fn close(&self, peer: PeerId, reason: EndReason, words: &str) {
+    pub fn close(&self, peer: PeerId, reason: DisconnectReason, words: &str) {
         if let Some(peer) = self.peer(peer) {
             peer.outbox.close(driver::code_of(reason), words.to_owned());
         }
@@ -437,7 +437,7 @@ impl Endpoint {
     }
 
     /// Says goodbye without waiting until it is said. The thread has ended when the handle says so.
-    pub(crate) fn let_go(mut self) -> Option<JoinHandle<()>> {
+    pub(crate) fn close_detached(mut self) -> Option<JoinHandle<()>> {
         self.signal();
         self.thread.take()
     }

@@ -22,7 +22,7 @@ pub(super) struct Inbox(Mutex<InboxState>);
 
 #[derive(Debug, Default)]
 struct InboxState {
-    /// Arrivals, messages and departures, in order. Bounded: messages by each peer's share, the rest by [`Inbox::crowded`].
+    /// Arrivals, messages and departures, in order. Bounded: messages by each peer's share, the rest by [`Inbox::overloaded`].
     events: VecDeque<Event>,
     peers: BTreeMap<PeerId, FromPeer>,
     /// The peer whose datagram was read last: the next read begins after it, so that a flood from one does not hide the others.
@@ -57,7 +57,7 @@ impl Inbox {
         state.events.push_back(Event::Closed { peer, reason });
     }
 
-    pub(super) fn crowded(&self) -> bool {
+    pub(super) fn overloaded(&self) -> bool {
         lock(&self.0).events.len() >= MOST_EVENTS
     }
 

@@ -8,11 +8,11 @@ use pliant_net::transport::{
     CloseReason, Emulation, Endpoint, Event, HostOptions, Identity, Invite, JoinOptions, Limits, PeerId,
     RateCap, SendError,
 };
-use pliant_stream::EndReason;
+use pliant_stream::DisconnectReason;
 use pliant_stream::emulator::{LinkConfig, Preset};
 
 use crate::endpoints::{closed, connected, datagram, guest, host, message, patient};
-use crate::patience::{must, wait_for};
+use crate::wait::{must, wait_for};
 
 #[test]
 fn datagrams_and_messages_cross_both_ways_and_a_goodbye_is_heard() {
@@ -62,9 +62,12 @@ fn datagrams_and_messages_cross_both_ways_and_a_goodbye_is_heard() {
     assert_eq!(message(&host), "thanks");
 
     guest.send_message(at_guest, Bytes::from_static(b"said before leaving")).unwrap();
-    guest.close(at_guest, EndReason::Silent, "bye\n\u{7}now");
+    guest.close(at_guest, DisconnectReason::Silent, "bye\n\u{7}now");
     assert_eq!(message(&host), "said before leaving");
-    assert_eq!(closed(&host), CloseReason::ByPeer { reason: EndReason::Silent, words: "byenow".into() });
+    assert_eq!(
+        closed(&host),
+        CloseReason::ByPeer { reason: DisconnectReason::Silent, words: "byenow".into() }
+    );
     assert_eq!(closed(&guest), CloseReason::ByUs);
     assert_eq!(host.send_datagram(at_host, Bytes::new()), Err(SendError::NotConnected));
     assert!(host.peers().is_empty());

@@ -7,7 +7,7 @@ use pliant_net::transport::{
     CloseReason, Endpoint, Event, Fingerprint, HostOptions, Invite, JoinOptions, Limits, PeerId,
 };
 
-use crate::patience::wait_for;
+use crate::wait::wait_for;
 
 /// The next event that `wanted` accepts; others are passed over.
 pub fn next<T>(endpoint: &Endpoint, mut wanted: impl FnMut(Event) -> Option<T>) -> T {

@@ -10,7 +10,7 @@ use pliant_net::transport::{
 };
 
 use crate::endpoints::{closed, connected, guest, host, is_first_heard_of, next};
-use crate::stranger::Stranger;
+use crate::unauthenticated::UnauthenticatedPeer;
 
 #[test]
 fn another_key_than_the_invites_is_refused() {
@@ -95,7 +95,7 @@ fn a_full_host_refuses_the_next_guest() {
 #[test]
 fn another_version_is_refused_in_the_handshake() {
     let host = host();
-    let error = Stranger::new(b"pliant/0", true).connect(&host).unwrap_err();
+    let error = UnauthenticatedPeer::new(b"pliant/0", true).connect(&host).unwrap_err();
     assert!(error.to_string().contains("120"), "no_application_protocol is alert 120: {error}");
     is_first_heard_of(&host);
 }
@@ -103,7 +103,7 @@ fn another_version_is_refused_in_the_handshake() {
 #[test]
 fn a_guest_without_a_key_is_refused() {
     let host = host();
-    let stranger = Stranger::new(ALPN, false);
+    let stranger = UnauthenticatedPeer::new(ALPN, false);
     // The client's side of the handshake is over before the host refuses.
     if let Ok(connection) = stranger.connect(&host) {
         let error = stranger.runtime.block_on(connection.closed()).to_string();
@@ -118,7 +118,7 @@ fn a_guest_without_a_key_is_refused() {
 #[test]
 fn datagrams_before_the_token_do_not_count_and_garbage_after_it_is_the_applications() {
     let host = host();
-    let stranger = Stranger::new(ALPN, true);
+    let stranger = UnauthenticatedPeer::new(ALPN, true);
     let connection = stranger.connect(&host).unwrap();
     connection.send_datagram(Bytes::from_static(b"early")).unwrap();
     // It is out before the stream is opened, and on loopback nothing overtakes.

@@ -5,6 +5,6 @@ mod crossing;
 mod endpoints;
 mod entering;
 mod misbehaving;
-#[path = "../support/patience.rs"]
-mod patience;
-mod stranger;
+mod unauthenticated;
+#[path = "../support/wait.rs"]
+mod wait;

@@ -8,11 +8,11 @@ use pliant_net::transport::{
     ALPN, CloseReason, Endpoint, Event, HostOptions, Identity, Invite, JoinOptions, Limits, PeerId, RateCap,
     SendError,
 };
-use pliant_stream::EndReason;
+use pliant_stream::DisconnectReason;
 
 use crate::endpoints::{closed, connected, datagram, guest, host, message, patient, quick};
-use crate::patience::{must, wait_for};
-use crate::stranger::Stranger;
+use crate::unauthenticated::UnauthenticatedPeer;
+use crate::wait::{must, wait_for};
 
 #[test]
 fn a_message_over_the_limit_ends_the_connection_of_its_sender_only() {
@@ -68,7 +68,7 @@ fn a_guest_that_dies_without_a_word_is_noticed_after_the_idle_timeout() {
         Endpoint::host(HostOptions { limits: quick(Limits::host()), ..HostOptions::default() }).unwrap();
     let patient = crate::endpoints::host();
     let start = Instant::now();
-    let stranger = Stranger::new(ALPN, true);
+    let stranger = UnauthenticatedPeer::new(ALPN, true);
     let connections = [&patient, &host].map(|host| {
         let connection = stranger.connect(host).unwrap();
         stranger.runtime.block_on(async {
@@ -151,7 +151,7 @@ fn a_guest_that_never_reads_costs_a_bounded_queue() {
     // Its messages hold up the goodbye too: it is let go all the same, a second later. Nothing else
     // would end this connection, since the guest's own thread answers as long as the guest is
     // there.
-    host.close(peer, EndReason::Lost, "messages are not read");
+    host.close(peer, DisconnectReason::Lost, "messages are not read");
     assert_eq!(closed(&host), CloseReason::ByUs);
 }
 
@@ -169,7 +169,7 @@ fn a_thousand_connections_from_one_address_cost_the_others_nothing() {
     connected(&good);
     connected(&host);
     // Another address of this machine, as a stranger's would be: 1,000 handshakes, none of which says a word after it.
-    let stranger = Stranger::new(ALPN, true);
+    let stranger = UnauthenticatedPeer::new(ALPN, true);
     let target = SocketAddr::from(([127, 0, 0, 1], port));
     let (open, refused) = stranger.runtime.block_on(async {
         let socket = UdpSocket::bind("127.0.0.2:0").unwrap();

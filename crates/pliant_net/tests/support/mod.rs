@@ -1,7 +1,7 @@
 //! Apps that share a body over loopback, and a body whose modes are known in closed form.
 #![allow(dead_code, unused_imports, reason = "each test uses its part")]
 
-mod patience;
+mod wait;
 
 use std::f64::consts::{FRAC_PI_2, TAU};
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
@@ -12,12 +12,12 @@ use bevy::{
     ecs::message::{MessageRegistry, ShouldUpdateMessages},
     prelude::*,
 };
-use pliant_body::{BodyState, ModalAsset, ModalBody, PliantBodyPlugin, PliantTick, ShownState};
+use pliant_body::{BodyState, ModalAsset, ModalBody, PliantBodyPlugin, PliantTick, VisualState};
 use pliant_modal::{BakeInfo, Damping, Element, FlexibilitySite, ModalModel, ModelParts, Patch, SurfaceMesh};
 use pliant_net::{HostConfig, Invite, JoinConfig, NetPlugin, NetStats, RemoteBody, SharedBody};
 
-pub(crate) use patience::must;
-pub use patience::{Look, PATIENCE, wait_for};
+pub(crate) use wait::must;
+pub use wait::{Look, PATIENCE, wait_for};
 
 /// Cells along the bar.
 const CELLS: u32 = 16;
@@ -233,7 +233,7 @@ pub fn tick(app: &App) -> u64 {
 
 /// The host's body that a guest is shown, once it is.
 pub fn body_of(guest: &mut App) -> Option<Entity> {
-    only::<RemoteBody>(guest).filter(|&body| guest.world().get::<ShownState>(body).is_some())
+    only::<RemoteBody>(guest).filter(|&body| guest.world().get::<VisualState>(body).is_some())
 }
 
 /// Waits for the host's body on a guest.

@@ -1,7 +1,7 @@
 //! Whose hand is whose, and the hands that are on other machines.
 
 use bevy::{ecs::system::SystemParam, prelude::*};
-use pliant_net::{HandOf, SeenHands, User, Yourself};
+use pliant_net::{HandOf, RemoteHands, User, Yourself};
 
 use super::scene::HandKey;
 use crate::bodies::HandView;
@@ -10,17 +10,17 @@ use crate::bodies::HandView;
 pub(super) struct People<'w, 's> {
     users: Query<'w, 's, (&'static User, Has<Yourself>)>,
     hands: Query<'w, 's, &'static HandOf>,
-    seen: Query<'w, 's, &'static SeenHands>,
+    seen: Query<'w, 's, &'static RemoteHands>,
 }
 
 impl People<'_, '_> {
-    /// Name and colour of whose hand a grab is: a guest's at its host, one's own anywhere else. `None` outside a session.
+    /// Name and color of whose hand a grab is: a guest's at its host, one's own anywhere else. `None` outside a session.
     pub fn whose(&self, grab: Entity) -> Option<(String, [u8; 3])> {
         let user = match self.hands.get(grab) {
             Ok(of) => self.users.get(of.0).ok()?.0,
             Err(_) => self.users.iter().find(|(_, yourself)| *yourself)?.0,
         };
-        Some((user.name.clone(), srgb(user.colour)))
+        Some((user.name.clone(), srgb(user.color)))
     }
 
     /// The hands that others have on a body, as the session shows them, each with what tells it from the others.
@@ -33,7 +33,7 @@ impl People<'_, '_> {
             let nth = views.iter().filter(|(key, _)| of_user(key)).count();
             let view = HandView {
                 name: user.map_or_else(|| format!("user {number}"), |user| user.name.clone()),
-                colour: user.map(|user| srgb(user.colour)),
+                color: user.map(|user| srgb(user.color)),
                 force: hand.reaction.length(),
                 ..default()
             };
@@ -43,8 +43,8 @@ impl People<'_, '_> {
     }
 }
 
-/// A colour's bytes.
-pub(super) fn srgb(colour: Color) -> [u8; 3] {
-    let colour = colour.to_srgba();
-    [colour.red, colour.green, colour.blue].map(|x| (x.clamp(0.0, 1.0) * 255.0).round() as u8)
+/// A color's bytes.
+pub(super) fn srgb(color: Color) -> [u8; 3] {
+    let color = color.to_srgba();
+    [color.red, color.green, color.blue].map(|x| (x.clamp(0.0, 1.0) * 255.0).round() as u8)
 }

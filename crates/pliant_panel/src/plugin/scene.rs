@@ -9,8 +9,8 @@ use bevy::{
 };
 use bevy_egui::egui::Ui;
 use pliant_body::{
-    BodyState, DEFORM_TIME, Driven, Grab, GrabForce, Grabs, ModalBody, PliantTick, STEP_TIME, ShownState,
-    SingleSteps,
+    BodyState, DEFORM_TIME, Driven, Grab, GrabForce, Grabs, ModalBody, PliantTick, STEP_TIME, SingleSteps,
+    VisualState,
 };
 
 use crate::{
@@ -58,7 +58,7 @@ pub(super) struct Scene<'w, 's> {
             &'static mut ModalBody,
             &'static mut BodyState,
             &'static Driven,
-            Option<&'static ShownState>,
+            Option<&'static VisualState>,
             Option<&'static Grabs>,
         ),
     >,
@@ -138,12 +138,12 @@ impl Scene<'_, '_> {
                     let whose = self.people.whose(grab);
                     #[cfg(not(feature = "net"))]
                     let whose: Option<(String, [u8; 3])> = None;
-                    let (whose, colour) = whose.unzip();
+                    let (whose, color) = whose.unzip();
                     let own = name.name.map(|name| name.as_str().to_owned());
                     keys_here.push(HandKey::Grab(grab));
                     view.hands.push(HandView {
                         name: own.or(whose).unwrap_or_else(|| "hand".into()),
-                        colour,
+                        color,
                         releasable: true,
                         force: force.force.length(),
                         ..default()
@@ -192,7 +192,7 @@ fn model_name(file: &str, entity: Entity) -> String {
 }
 
 /// Kinetic and elastic energy, J of the world; of a body that somebody else steps only the shape is known, and only its elastic energy.
-fn energy_of(state: &BodyState, driven: &Driven, shown: Option<&ShownState>) -> f64 {
+fn energy_of(state: &BodyState, driven: &Driven, shown: Option<&VisualState>) -> f64 {
     let energy = match (driven, shown) {
         (Driven::Remote, Some(shown)) => {
             let modes = shown.current().iter().zip(state.body().omega());
@@ -234,7 +234,7 @@ impl Recording<'_> {
     }
 
     pub fn show(&mut self, ui: &mut Ui) {
-        use pliant_rerun::RerunColour;
+        use pliant_rerun::RerunColor;
 
         let (Some(stats), Some(settings)) = (&self.stats, &mut self.settings) else { return };
         let mut view = crate::recording::RecordingView {
@@ -244,15 +244,15 @@ impl Recording<'_> {
             dropped: stats.dropped,
             shapes_hz: settings.shapes_hz,
             modes_hz: settings.modes_hz,
-            stress: settings.colour == RerunColour::Stress,
+            stress: settings.color == RerunColor::Stress,
         };
         crate::recording::show(ui, &mut view);
-        let colour = if view.stress { RerunColour::Stress } else { RerunColour::Displacement };
+        let color = if view.stress { RerunColor::Stress } else { RerunColor::Displacement };
         let wanted = pliant_rerun::RerunRecording {
             on: view.on,
             shapes_hz: view.shapes_hz,
             modes_hz: view.modes_hz,
-            colour,
+            color,
             ..**settings
         };
         if wanted != **settings {

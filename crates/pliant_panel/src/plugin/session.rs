@@ -73,7 +73,7 @@ impl Session<'_, '_> {
                 .into_iter()
                 .map(|(user, yourself, hands, link)| UserView {
                     name: user.name.clone(),
-                    colour: srgb(user.colour),
+                    color: srgb(user.color),
                     yourself,
                     hands: hands.map_or(0, |hands| hands.iter().count()),
                     round_trip_ms: link

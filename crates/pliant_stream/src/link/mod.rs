@@ -26,7 +26,7 @@ pub(crate) struct Link {
     peer: PeerId,
     /// Bytes that a datagram may have.
     pub(crate) max_datagram: usize,
-    heard: Duration,
+    received_at: Duration,
     sequence: u16,
     received: Tally,
     round_trip: RoundTrip,
@@ -40,7 +40,7 @@ impl Link {
         Self {
             peer,
             max_datagram,
-            heard: now,
+            received_at: now,
             sequence: 0,
             received: Tally::default(),
             round_trip: RoundTrip::default(),
@@ -50,23 +50,23 @@ impl Link {
     }
 
     /// The other side has said something, or is given time anew.
-    pub(crate) fn heard(&mut self, now: Duration) {
-        self.heard = now;
+    pub(crate) fn received_at(&mut self, now: Duration) {
+        self.received_at = now;
     }
 
     /// Whether nothing came for longer than `patience`.
     pub(crate) fn is_silent(&self, now: Duration, patience: Duration) -> bool {
-        now.saturating_sub(self.heard) > patience
+        now.saturating_sub(self.received_at) > patience
     }
 
     /// When it will have been silent for longer than `patience`.
     pub(crate) fn silent_at(&self, patience: Duration) -> Duration {
-        self.heard + patience + Duration::from_millis(1)
+        self.received_at + patience + Duration::from_millis(1)
     }
 
     /// Takes in a datagram that could be read; false for a copy of one that has come before.
     pub(crate) fn receive_datagram(&mut self, now: Duration, sequence: u16, bytes: usize) -> bool {
-        self.heard = now;
+        self.received_at = now;
         let arrival = self.received.take(sequence);
         if arrival == Arrival::New {
             self.stats.datagrams_in += 1;
@@ -77,7 +77,7 @@ impl Link {
 
     /// Takes in a message, which may yet turn out to make no sense.
     pub(crate) fn receive_message(&mut self, now: Duration, bytes: usize) {
-        self.heard = now;
+        self.received_at = now;
         self.stats.message_bytes_in += bytes as u64;
     }
 

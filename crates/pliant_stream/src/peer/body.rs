@@ -64,7 +64,7 @@ pub struct PeerBody {
     held: Vec<(UserId, HeldAt)>,
     blend: Blend,
     pose_blend: PoseBlend,
-    shown: State,
+    visual: State,
     pose: Option<Pose>,
     grabs: Vec<GrabState>,
     restepped: u64,
@@ -98,7 +98,7 @@ impl PeerBody {
             past: vec![Past::default(); WINDOW],
             held: Vec::new(),
             blend: Blend::new(h, blend_ticks),
-            shown: rest,
+            visual: rest,
             grabs: Vec::new(),
             restepped: 0,
         };
@@ -128,13 +128,13 @@ impl PeerBody {
     }
 
     /// Best estimate of what all peers will agree on.
-    pub fn hidden(&self) -> &State {
+    pub fn confirmed(&self) -> &State {
         &self.state
     }
 
     /// What the eye and the hand get: continuous in position and velocity.
-    pub fn shown(&self) -> &State {
-        &self.shown
+    pub fn visual(&self) -> &State {
+        &self.visual
     }
 
     /// The rigid frame of a free body as it is shown; `None` for an anchored one.
@@ -430,8 +430,8 @@ impl PeerBody {
     }
 
     fn show(&mut self) {
-        self.shown.clone_from(&self.state);
-        self.blend.apply(&mut self.shown.q, &mut self.shown.v);
+        self.visual.clone_from(&self.state);
+        self.blend.apply(&mut self.visual.q, &mut self.visual.v);
         let pose = self.model.is_free().then(|| Pose::of_frame(&self.model, &self.state.frame));
         self.pose = pose.map(|pose| self.pose_blend.apply(&pose));
         self.grabs.clear();

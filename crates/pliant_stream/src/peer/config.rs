@@ -3,7 +3,7 @@
 use std::time::Duration;
 
 use super::body::Repair;
-use crate::session::EndReason;
+use crate::session::DisconnectReason;
 use crate::state::{PeerId, UserId};
 
 /// Settings of a peer.
@@ -60,7 +60,7 @@ pub enum PeerEvent {
         /// Number.
         user: UserId,
         /// Why.
-        reason: EndReason,
+        reason: DisconnectReason,
     },
     /// A connection is over before its peer was let in: it said no hello in time, or one that does not hold. No
     /// [`PeerEvent::Joined`] came before. Close the connection.
@@ -68,7 +68,7 @@ pub enum PeerEvent {
         /// Which connection.
         peer: PeerId,
         /// Why.
-        reason: EndReason,
+        reason: DisconnectReason,
     },
     /// Another peer's state was taken over.
     Resynced {

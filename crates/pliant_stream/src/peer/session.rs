@@ -15,7 +15,7 @@ use super::other::Other;
 use super::wire::{HeldAt, InputTick, MAX_HELD, MAX_TICKS, PeerDatagram, PeerMessage, StateCheck};
 use crate::StreamError;
 use crate::link::Events;
-use crate::session::{EndReason, LinkStats, Output};
+use crate::session::{DisconnectReason, LinkStats, Output};
 use crate::state::{BodyId, PeerId, Tick, UserId, in_range};
 use crate::wire::{MAX_NAME, PROTOCOL_VERSION};
 
@@ -52,7 +52,7 @@ pub struct PeerSession {
     tick: Tick,
     started: bool,
     next_step: Option<Duration>,
-    dirty: Option<Tick>,
+    rollback_from: Option<Tick>,
     /// The tick of the last state taken over: what was before it is not gone back to.
     taken: Tick,
     out: VecDeque<Output>,
@@ -95,7 +95,7 @@ impl PeerSession {
             tick: 0,
             started,
             next_step: None,
-            dirty: None,
+            rollback_from: None,
             taken: 0,
             out: VecDeque::new(),
             events: Events::default(),
@@ -170,14 +170,15 @@ impl PeerSession {
     }
 
     /// A connection closed.
-    pub fn disconnect(&mut self, peer: PeerId, reason: EndReason) {
+    pub fn disconnect(&mut self, peer: PeerId, reason: DisconnectReason) {
         let Some(other) = self.others.remove(&peer) else { return };
         self.gone.add_counts(&other.link.stats);
         let Some(user) = other.user else { return self.event(PeerEvent::TurnedAway { peer, reason }) };
         if let Some(inputs) = self.inputs.users.get_mut(&user) {
             // All hear the same last input or forecast the same hands a little on; then the hands let go.
             inputs.gone = true;
-            self.dirty = Some(self.dirty.map_or(inputs.highest + 1, |d| d.min(inputs.highest + 1)));
+            self.rollback_from =
+                Some(self.rollback_from.map_or(inputs.highest + 1, |d| d.min(inputs.highest + 1)));
             self.inputs.forget_gone(self.tick);
         }
         self.event(PeerEvent::Left { user, reason });
@@ -318,7 +319,7 @@ impl PeerSession {
                         continue;
                     }
                     if self.inputs.put(user, input) && tick <= self.tick {
-                        self.dirty = Some(self.dirty.map_or(tick, |d| d.min(tick)));
+                        self.rollback_from = Some(self.rollback_from.map_or(tick, |d| d.min(tick)));
                     }
                 }
                 if let Some(check) = check {
@@ -341,11 +342,11 @@ impl PeerSession {
                 let user = UserId(user);
                 let taken = user == self.config.user || self.inputs.users.get(&user).is_some_and(|u| !u.gone);
                 let refused = if version != PROTOCOL_VERSION {
-                    Some(EndReason::Version)
+                    Some(DisconnectReason::Version)
                 } else if other.user.is_some() || user != other.expected || taken {
-                    Some(EndReason::Protocol)
+                    Some(DisconnectReason::Protocol)
                 } else {
-                    (Some(scene) != own).then_some(EndReason::Scene)
+                    (Some(scene) != own).then_some(DisconnectReason::Scene)
                 };
                 if let Some(reason) = refused {
                     self.message(peer, &PeerMessage::Goodbye { reason });
@@ -376,8 +377,8 @@ impl PeerSession {
             Ok(PeerMessage::Goodbye { reason }) => self.disconnect(peer, reason),
             Err(_) => {
                 other.link.reject();
-                self.message(peer, &PeerMessage::Goodbye { reason: EndReason::Protocol });
-                self.disconnect(peer, EndReason::Protocol);
+                self.message(peer, &PeerMessage::Goodbye { reason: DisconnectReason::Protocol });
+                self.disconnect(peer, DisconnectReason::Protocol);
             }
         }
     }
@@ -391,12 +392,12 @@ impl PeerSession {
             .map(|(p, _)| *p)
             .collect();
         for peer in silent {
-            self.disconnect(peer, EndReason::Silent);
+            self.disconnect(peer, DisconnectReason::Silent);
         }
         if !self.started {
             return 0;
         }
-        self.settle();
+        self.roll_back();
         let mut stepped = 0;
         let due = *self.next_step.get_or_insert(now + Duration::from_secs_f64(self.config.step));
         let mut due = due;
@@ -433,8 +434,8 @@ impl PeerSession {
     }
 
     /// Goes back to the earliest tick for which something new is known.
-    fn settle(&mut self) {
-        let Some(from) = self.dirty.take() else { return };
+    fn roll_back(&mut self) {
+        let Some(from) = self.rollback_from.take() else { return };
         // Whoever gave a state knew all inputs up to it: late ones are in it.
         let from = from.max(self.taken + 1);
         let mut too_late = false;

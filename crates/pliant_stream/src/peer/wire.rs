@@ -5,7 +5,7 @@ use serde::{Deserialize, Serialize};
 use pliant_modal::GrabConfig;
 
 use crate::StreamError;
-use crate::session::{EndReason, MAX_MESSAGE};
+use crate::session::{DisconnectReason, MAX_MESSAGE};
 use crate::state::{BodyId, GrabKey, MAX_MODES, TICK_LIMIT, Tick, UserId, in_range};
 use crate::wire::{Reader, Writer};
 
@@ -27,7 +27,7 @@ pub struct HeldAt {
     pub body: BodyId,
     /// The user's number for the grab.
     pub grab: u16,
-    /// Centre of the patch.
+    /// Center of the patch.
     pub vertex: u32,
     /// Radius of the patch, m.
     pub radius: f64,
@@ -248,11 +248,11 @@ impl PeerDatagram {
 /// The rigid frame of a free body in a [`PeerBodyState`], world axes.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 pub struct PeerFrame {
-    /// Centre of mass, m.
+    /// Center of mass, m.
     pub center: [f64; 3],
     /// Body to world, unit quaternion x, y, z, w.
     pub orientation: [f64; 4],
-    /// Velocity of the centre of mass, m/s.
+    /// Velocity of the center of mass, m/s.
     pub velocity: [f64; 3],
     /// Angular momentum about it, kg m^2/s.
     pub spin: [f64; 3],
@@ -326,7 +326,7 @@ pub enum PeerMessage {
     /// The last message.
     Goodbye {
         /// Why.
-        reason: EndReason,
+        reason: DisconnectReason,
     },
 }
 

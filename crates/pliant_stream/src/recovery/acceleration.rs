@@ -147,7 +147,7 @@ impl Recovery for AccelerationDriven {
         }
     }
 
-    fn hidden(&self) -> &State {
+    fn confirmed(&self) -> &State {
         &self.state
     }
 

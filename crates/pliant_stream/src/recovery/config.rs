@@ -2,7 +2,7 @@
 
 use std::time::Duration;
 
-use crate::wire::{AccelerationCoding, Payload, StreamWish};
+use crate::wire::{AccelerationCoding, Payload, StreamSubscription};
 use crate::{StreamError, state::MAX_MODES};
 
 /// What stands in for an acceleration that has not arrived.
@@ -133,13 +133,13 @@ impl RecoveryConfig {
         ["default", "none", "paper", "paper-zero", "paper-hold", "paper-repeats", "force-driven"];
 
     /// What this repair asks of the host's encoder.
-    pub fn wish(&self, modes: Option<u16>) -> StreamWish {
+    pub fn subscription(&self, modes: Option<u16>) -> StreamSubscription {
         let payload = match self.policy {
             Policy::ForceDriven { .. } => Payload::Forces,
             Policy::None | Policy::Paper { .. } => Payload::Accelerations(self.coding),
         };
         let modes = modes.unwrap_or(MAX_MODES as u16).max(1);
-        StreamWish { payload, modes, repeats: self.repeats.min(7), refresh: self.refresh }
+        StreamSubscription { payload, modes, repeats: self.repeats.min(7), refresh: self.refresh }
     }
 
     /// Checks the ranges.

@@ -122,7 +122,7 @@ impl Recovery for ForceDriven {
         // Slices are part of stepping to their tick.
     }
 
-    fn hidden(&self) -> &State {
+    fn confirmed(&self) -> &State {
         &self.state
     }
 

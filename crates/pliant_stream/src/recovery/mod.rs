@@ -18,7 +18,7 @@ pub use forecast::Forecast;
 pub use history::{HISTORY, History, TickData};
 pub use passivity::PassivityGuard;
 pub use pose_blend::PoseBlend;
-pub use receiver::{Arrival, Receiver, RepairCounts, ShownGrab};
+pub use receiver::{Arrival, Receiver, RepairCounts, VisualGrab};
 
 use nalgebra::Vector3;
 
@@ -44,7 +44,7 @@ pub trait Recovery: Send + Sync {
     fn refresh(&mut self, tick: Tick, history: &History);
 
     /// The best estimate of the truth at the tick reached.
-    fn hidden(&self) -> &State;
+    fn confirmed(&self) -> &State;
 
     /// Modal forces that the reactions do not explain, as far as they are known; empty for none.
     fn load(&self) -> &[f64] {

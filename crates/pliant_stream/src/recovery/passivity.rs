@@ -79,22 +79,22 @@ impl PassivityGuard {
     }
 
     /// A correction moved the hidden state under the shown one: no energy was put in, and the excess is what it is now.
-    pub fn corrected(&mut self, hidden: &State, shown: &State) {
-        self.excess = self.energy(shown) - self.energy(hidden);
+    pub fn corrected(&mut self, confirmed: &State, visual: &State) {
+        self.excess = self.energy(visual) - self.energy(confirmed);
     }
 
     /// A tick has passed: the share of the offset `shown - hidden` that may stay, 0 to 1.
-    pub fn admit(&mut self, hidden: &State, shown: &State) -> f64 {
-        let lost = self.lost(hidden);
+    pub fn admit(&mut self, confirmed: &State, visual: &State) -> f64 {
+        let lost = self.lost(confirmed);
         self.dissipated += lost;
-        self.largest = self.largest.max(self.energy(hidden));
+        self.largest = self.largest.max(self.energy(confirmed));
         let cap = TANK * self.largest;
         self.level = (self.level + lost).min(cap);
         let (mut linear, mut square) = (0.0, 0.0);
-        for (k, stiffness) in self.stiffness.iter().enumerate().take(hidden.modes()) {
-            let (oq, ov) = (shown.q[k] - hidden.q[k], shown.v[k] - hidden.v[k]);
-            let stretch = hidden.q[k] - self.relaxing.0 * hidden.z.get(k).copied().unwrap_or(0.0);
-            linear += hidden.v[k] * ov + stiffness * stretch * oq;
+        for (k, stiffness) in self.stiffness.iter().enumerate().take(confirmed.modes()) {
+            let (oq, ov) = (visual.q[k] - confirmed.q[k], visual.v[k] - confirmed.v[k]);
+            let stretch = confirmed.q[k] - self.relaxing.0 * confirmed.z.get(k).copied().unwrap_or(0.0);
+            linear += confirmed.v[k] * ov + stiffness * stretch * oq;
             square += 0.5 * (ov * ov + stiffness * oq * oq);
         }
         let allowed = self.excess + self.level;
@@ -153,14 +153,14 @@ mod tests {
         let mut last_excess = 0.0;
         for n in 0..4000 {
             let t = f64::from(n) * h;
-            let hidden = State {
+            let confirmed = State {
                 q: (0..2).map(|k| 0.1 * (omega[k] * t).sin() * (-0.05 * t).exp()).collect(),
                 v: (0..2).map(|k| 0.1 * omega[k] * (omega[k] * t).cos() * (-0.05 * t).exp()).collect(),
                 ..State::zero(2, false)
             };
             let with = |oq: &[f64; 2], ov: &[f64; 2]| State {
-                q: (0..2).map(|k| hidden.q[k] + oq[k]).collect(),
-                v: (0..2).map(|k| hidden.v[k] + ov[k]).collect(),
+                q: (0..2).map(|k| confirmed.q[k] + oq[k]).collect(),
+                v: (0..2).map(|k| confirmed.v[k] + ov[k]).collect(),
                 ..State::zero(2, false)
             };
             if n % 7 == 0 {
@@ -168,7 +168,7 @@ mod tests {
                     offset_q[k] += 0.3 * (f64::from(n) * 0.77 + k as f64).sin();
                     offset_v[k] += 5.0 * (f64::from(n) * 1.31 + k as f64).cos();
                 }
-                guard.corrected(&hidden, &with(&offset_q, &offset_v));
+                guard.corrected(&confirmed, &with(&offset_q, &offset_v));
                 last_excess = guard.excess;
             }
             // An ill-behaved fade that grows.
@@ -176,13 +176,13 @@ mod tests {
                 offset_q[k] *= 1.05;
                 offset_v[k] *= 1.05;
             }
-            let share = guard.admit(&hidden, &with(&offset_q, &offset_v));
+            let share = guard.admit(&confirmed, &with(&offset_q, &offset_v));
             for k in 0..2 {
                 offset_q[k] *= share;
                 offset_v[k] *= share;
             }
-            let shown = with(&offset_q, &offset_v);
-            let excess = guard.energy(&shown) - guard.energy(&hidden);
+            let visual = with(&offset_q, &offset_v);
+            let excess = guard.energy(&visual) - guard.energy(&confirmed);
             put_in += excess - last_excess;
             last_excess = excess;
             assert!(
@@ -203,12 +203,12 @@ mod tests {
     #[test]
     fn a_fading_offset_at_rest_is_let_pass() {
         let mut guard = PassivityGuard::new(&[5.0], &[0.1], 0.01);
-        let hidden = State::zero(1, false);
+        let confirmed = State::zero(1, false);
         let at = |q: f64| State { q: vec![q], ..State::zero(1, false) };
-        guard.corrected(&hidden, &at(1.0));
+        guard.corrected(&confirmed, &at(1.0));
         for n in 1..100 {
             assert_eq!(
-                guard.admit(&hidden, &at(1.0 - f64::from(n) * 0.01)),
+                guard.admit(&confirmed, &at(1.0 - f64::from(n) * 0.01)),
                 1.0,
                 "losing energy needs no leave"
             );

@@ -69,13 +69,13 @@ mod tests {
         let now = Pose { linear: [0.5, 0.0, 0.0], ..Pose::default() };
         let mut blend = PoseBlend::new(0.025, 8);
         blend.add(&before, &now);
-        let shown = blend.apply(&now);
+        let visual = blend.apply(&now);
         for (a, b) in
-            shown.position.iter().chain(&shown.rotation).zip(before.position.iter().chain(&before.rotation))
+            visual.position.iter().chain(&visual.rotation).zip(before.position.iter().chain(&before.rotation))
         {
             assert!((a - b).abs() < 1e-12, "{shown:?}");
         }
-        assert!(shown.linear[0].abs() < 1e-12, "velocity is continuous too: {shown:?}");
+        assert!(visual.linear[0].abs() < 1e-12, "velocity is continuous too: {shown:?}");
         (0..8).for_each(|_| blend.advance());
         assert_eq!(blend.apply(&now), now);
     }

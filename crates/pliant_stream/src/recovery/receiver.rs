@@ -25,7 +25,7 @@ const CHECK_TOLERANCE: f64 = 2e-3;
 const REACTION_FADE: f64 = 2.5;
 
 /// A grab as it is shown: its reaction belongs to the shape that is shown with it.
-pub type ShownGrab = GrabState;
+pub type VisualGrab = GrabState;
 
 /// What a frame brought.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
@@ -67,11 +67,11 @@ pub struct Receiver {
     blend: Blend,
     guard: Option<PassivityGuard>,
     tick: Tick,
-    shown: State,
-    grabs: Vec<ShownGrab>,
+    visual: State,
+    grabs: Vec<VisualGrab>,
     /// The tick of `grabs`, and what was shown at the two ticks before it, the newer first.
     grabs_at: Tick,
-    trail: [Vec<ShownGrab>; 2],
+    trail: [Vec<VisualGrab>; 2],
     /// The forces over the steps to this tick and to the one before, where they are computed.
     implied: [Vec<Mean>; 2],
     /// The best estimate of the rigid frame at the shown tick, and what is shown of it.
@@ -145,7 +145,7 @@ impl Receiver {
             blend: Blend::new(newmark.h, blend_ticks),
             guard,
             tick: snapshot.tick,
-            shown: rest.clone(),
+            visual: rest.clone(),
             grabs: Vec::new(),
             grabs_at: snapshot.tick,
             trail: [Vec::new(), Vec::new()],
@@ -164,7 +164,7 @@ impl Receiver {
             blend_ticks,
         };
         receiver.policy.restart(snapshot.tick, &state_of(snapshot), &snapshot.load, &means_of(snapshot));
-        receiver.shown.clone_from(receiver.policy.hidden());
+        receiver.visual.clone_from(receiver.policy.confirmed());
         Ok(receiver)
     }
 
@@ -179,8 +179,8 @@ impl Receiver {
     }
 
     /// Best estimate of the truth.
-    pub fn hidden(&self) -> &State {
-        self.policy.hidden()
+    pub fn confirmed(&self) -> &State {
+        self.policy.confirmed()
     }
 
     /// Best estimate of the rigid frame at the shown tick, where the body is free.
@@ -197,12 +197,12 @@ impl Receiver {
     }
 
     /// What the eye and the hand get.
-    pub fn shown(&self) -> &State {
-        &self.shown
+    pub fn visual(&self) -> &State {
+        &self.visual
     }
 
     /// The grabs at the shown tick with their reactions.
-    pub fn grabs(&self) -> &[ShownGrab] {
+    pub fn grabs(&self) -> &[VisualGrab] {
         &self.grabs
     }
 
@@ -300,10 +300,10 @@ impl Receiver {
             self.blend_from_before();
         }
         if let Some(guard) = &mut self.guard {
-            let hidden = self.policy.hidden();
-            self.shown.clone_from(hidden);
-            self.blend.apply(&mut self.shown.q, &mut self.shown.v);
-            let share = guard.admit(hidden, &self.shown);
+            let confirmed = self.policy.confirmed();
+            self.visual.clone_from(confirmed);
+            self.blend.apply(&mut self.visual.q, &mut self.visual.v);
+            let share = guard.admit(confirmed, &self.visual);
             if share < 1.0 {
                 self.blend.scale(share);
             }
@@ -315,7 +315,7 @@ impl Receiver {
     /// Takes the state of a snapshot over and steps again from its tick with all that has arrived since; the shown state
     /// fades over. A snapshot of the future moves the receiver there.
     pub fn restart(&mut self, snapshot: &SnapshotBytes) {
-        if snapshot.q.len() != self.shown.modes() {
+        if snapshot.q.len() != self.visual.modes() {
             return;
         }
         self.remember_before();
@@ -357,7 +357,7 @@ impl Receiver {
         if tick <= self.tick {
             return;
         }
-        self.before.clone_from(self.policy.hidden());
+        self.before.clone_from(self.policy.confirmed());
         let rest = State {
             q: self.before.q.clone(),
             z: self.before.z.clone(),
@@ -379,25 +379,25 @@ impl Receiver {
     }
 
     fn remember_before(&mut self) {
-        self.before.clone_from(self.policy.hidden());
+        self.before.clone_from(self.policy.confirmed());
     }
 
     fn blend_from_before(&mut self) {
-        let now = self.policy.hidden();
+        let now = self.policy.confirmed();
         self.blend.add(
             self.before.q.iter().zip(&now.q).map(|(b, n)| b - n),
             self.before.v.iter().zip(&now.v).map(|(b, n)| b - n),
         );
         if let Some(guard) = &mut self.guard {
-            self.shown.clone_from(now);
-            self.blend.apply(&mut self.shown.q, &mut self.shown.v);
-            guard.corrected(now, &self.shown);
+            self.visual.clone_from(now);
+            self.blend.apply(&mut self.visual.q, &mut self.visual.v);
+            guard.corrected(now, &self.visual);
         }
     }
 
     fn show(&mut self) {
-        self.shown.clone_from(self.policy.hidden());
-        self.blend.apply(&mut self.shown.q, &mut self.shown.v);
+        self.visual.clone_from(self.policy.confirmed());
+        self.blend.apply(&mut self.visual.q, &mut self.visual.v);
         if self.tick != self.grabs_at {
             self.trail.swap(0, 1);
             std::mem::swap(&mut self.trail[0], &mut self.grabs);
@@ -421,15 +421,15 @@ impl Receiver {
             for g in &mut self.grabs {
                 if let Some(now) = self.history.grab(g.key, self.tick, &forecast) {
                     *g = now.state;
-                } else if let Some(shown) = self.trail[0].iter().find(|p| p.key == g.key) {
+                } else if let Some(visual) = self.trail[0].iter().find(|p| p.key == g.key) {
                     // Beyond what a forecast is good for the hand is felt as it was last.
-                    g.reaction = shown.reaction;
+                    g.reaction = visual.reaction;
                 }
             }
             self.blend_reactions();
         } else {
-            replica::place(&mut self.shown, self.replica.model(), self.pose.as_ref());
-            self.replica.reactions(&self.shown, &mut self.grabs);
+            replica::place(&mut self.visual, self.replica.model(), self.pose.as_ref());
+            self.replica.reactions(&self.visual, &mut self.grabs);
             // An acceleration has the force over its step in it; what is felt is the force at the end.
             for g in &mut self.grabs {
                 let mean = -nalgebra::Vector3::from(g.reaction);
@@ -470,7 +470,7 @@ impl Receiver {
 
     fn compare_check(&mut self) {
         let Some(told) = self.history.head(self.tick).and_then(|d| d.check) else { return };
-        let state = self.policy.hidden();
+        let state = self.policy.confirmed();
         let size = state.q.iter().chain(&state.z).map(|q| q * q).sum::<f64>().sqrt();
         let own = checksum(self.tick, state);
         if (own - f64::from(told)).abs() <= CHECK_TOLERANCE * size + 1e-7 {

@@ -4,7 +4,7 @@ use std::sync::Arc;
 
 use pliant_modal::ModalModel;
 
-use super::EndReason;
+use super::DisconnectReason;
 use super::guest::GuestSession;
 use super::guest_config::GuestEvent;
 
@@ -30,12 +30,12 @@ impl GuestSession {
             && received + bytes.len() as u64 <= total
             && !bytes.is_empty();
         if !fits {
-            return self.break_off(EndReason::Protocol);
+            return self.break_off(DisconnectReason::Protocol);
         }
         // What a model will take counts from its first piece on: no two unfinished ones share the same room.
         let more = if received == 0 { total } else { 0 };
         if more > self.config.model_bytes.saturating_sub(self.model_bytes) {
-            return self.break_off(EndReason::Full);
+            return self.break_off(DisconnectReason::Full);
         }
         self.model_bytes += more;
         download.total = total;
@@ -78,7 +78,7 @@ impl GuestSession {
                     self.event(GuestEvent::BodyReady { body, model: model.clone() });
                 }
             }
-            _ => self.break_off(EndReason::Protocol),
+            _ => self.break_off(DisconnectReason::Protocol),
         }
     }
 }

@@ -10,7 +10,7 @@ use super::download::Download;
 use super::guest_body::BodyView;
 use super::guest_config::{GuestConfig, GuestEvent};
 use super::guest_hands::OwnGrab;
-use super::{EndReason, LinkStats, MIN_DATAGRAM, Output};
+use super::{DisconnectReason, LinkStats, MIN_DATAGRAM, Output};
 use crate::StreamError;
 use crate::clock::ClockEstimate;
 use crate::link::{Events, Link, micros};
@@ -116,11 +116,11 @@ impl GuestSession {
             return Err(StreamError::State { what, state, needed: "a new session" });
         }
         self.standing = Standing::Greeted;
-        self.link.heard(now);
+        self.link.received_at(now);
         let hello = GuestMessage::Hello {
             version: PROTOCOL_VERSION,
             name: self.config.name.clone(),
-            wish: self.config.recovery.wish(self.config.modes),
+            subscription: self.config.recovery.subscription(self.config.modes),
             cached: self.models.keys().copied().collect(),
         };
         self.message(&hello);
@@ -135,8 +135,8 @@ impl GuestSession {
     /// Says goodbye. The session is closed.
     pub fn leave(&mut self) {
         if self.standing != Standing::Closed {
-            self.message(&GuestMessage::Goodbye { reason: EndReason::Left });
-            self.close(EndReason::Left);
+            self.message(&GuestMessage::Goodbye { reason: DisconnectReason::Left });
+            self.close(DisconnectReason::Left);
         }
     }
 
@@ -223,12 +223,12 @@ impl GuestSession {
         self.link.receive_message(now, bytes.len());
         let Ok(message) = HostMessage::decode(bytes) else {
             self.link.reject();
-            return self.break_off(EndReason::Protocol);
+            return self.break_off(DisconnectReason::Protocol);
         };
         match (message, self.standing) {
             (HostMessage::Welcome { version, user, step_ns, beta, gamma, users }, Standing::Greeted) => {
                 if version != PROTOCOL_VERSION {
-                    return self.close(EndReason::Version);
+                    return self.close(DisconnectReason::Version);
                 }
                 self.newmark = Newmark { h: step_ns as f64 * 1e-9, beta, gamma };
                 self.standing = Standing::In(UserId(user));
@@ -238,7 +238,7 @@ impl GuestSession {
             }
             (HostMessage::Goodbye { reason }, _) => self.close(reason),
             (message, Standing::In(_)) => self.in_session(now, message),
-            _ => self.break_off(EndReason::Protocol),
+            _ => self.break_off(DisconnectReason::Protocol),
         }
     }
 
@@ -249,21 +249,21 @@ impl GuestSession {
                 if let Some(view) = self.bodies.get_mut(&body) {
                     // The same body, stepped otherwise from the snapshot on that follows.
                     if !view.change(info) {
-                        return self.break_off(EndReason::Protocol);
+                        return self.break_off(DisconnectReason::Protocol);
                     }
                     return;
                 }
                 if self.bodies.len() >= MAX_BODIES {
-                    return self.break_off(EndReason::Protocol);
+                    return self.break_off(DisconnectReason::Protocol);
                 }
                 let name = info.name.clone();
                 if self.announced.len() >= 16 * MAX_BODIES {
-                    return self.break_off(EndReason::Protocol);
+                    return self.break_off(DisconnectReason::Protocol);
                 }
                 self.announced.insert(info.hash);
                 let model = self.models.get(&info.hash).cloned();
                 let mut view =
-                    BodyView::new(info, self.newmark, self.config.recovery, self.config.own_hand_first);
+                    BodyView::new(info, self.newmark, self.config.recovery, self.config.predict_own_hand);
                 if let Some(model) = model {
                     view.set_model(model);
                 }
@@ -310,7 +310,9 @@ impl GuestSession {
                     self.event(GuestEvent::GrabRefused { grab });
                 }
             }
-            HostMessage::Welcome { .. } | HostMessage::Goodbye { .. } => self.break_off(EndReason::Protocol),
+            HostMessage::Welcome { .. } | HostMessage::Goodbye { .. } => {
+                self.break_off(DisconnectReason::Protocol)
+            }
         }
     }
 
@@ -320,13 +322,13 @@ impl GuestSession {
         let Some(user) = self.user() else {
             let waits = self.standing == Standing::Greeted;
             if waits && self.link.is_silent(now, self.config.idle_timeout) {
-                self.close(EndReason::Silent);
+                self.close(DisconnectReason::Silent);
             }
             return 0;
         };
         if self.link.is_silent(now, self.config.idle_timeout) {
-            self.message(&GuestMessage::Goodbye { reason: EndReason::Silent });
-            self.close(EndReason::Silent);
+            self.message(&GuestMessage::Goodbye { reason: DisconnectReason::Silent });
+            self.close(DisconnectReason::Silent);
             return 0;
         }
         let round_trip = self.link.round_trip().unwrap_or_default();
@@ -412,12 +414,12 @@ impl GuestSession {
         self.events.push(event);
     }
 
-    pub(super) fn break_off(&mut self, reason: EndReason) {
+    pub(super) fn break_off(&mut self, reason: DisconnectReason) {
         self.message(&GuestMessage::Goodbye { reason });
         self.close(reason);
     }
 
-    fn close(&mut self, reason: EndReason) {
+    fn close(&mut self, reason: DisconnectReason) {
         if self.standing != Standing::Closed {
             self.standing = Standing::Closed;
             self.grabs.clear();

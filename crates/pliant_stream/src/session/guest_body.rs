@@ -5,10 +5,10 @@ use std::time::Duration;
 
 use pliant_modal::ModalModel;
 
-use super::own_hand::OwnHand;
+use super::predicted_hand::PredictedHand;
 use crate::newmark::Newmark;
 use crate::playout::PlayoutClock;
-use crate::recovery::{HISTORY, Policy, Receiver, RecoveryConfig, RepairCounts, ShownGrab};
+use crate::recovery::{HISTORY, Policy, Receiver, RecoveryConfig, RepairCounts, VisualGrab};
 use crate::replica::Replica;
 use crate::state::{BodyId, Pose, State, Tick, UserId};
 use crate::wire::{BodyInfo, Frame, MAX_NACK_RUNS, Nack, NackRun, Payload, SnapshotBytes};
@@ -37,7 +37,7 @@ pub struct BodyView {
     pub(crate) model: Option<Arc<ModalModel>>,
     pub(crate) receiver: Option<Receiver>,
     pub(crate) playout: PlayoutClock,
-    pub(crate) own: Option<OwnHand>,
+    pub(crate) own: Option<PredictedHand>,
     own_first: bool,
     config: RecoveryConfig,
     newmark: Newmark,
@@ -49,7 +49,7 @@ pub struct BodyView {
     resting: bool,
     fade_at: Duration,
     stalled: bool,
-    heard: Duration,
+    received_at: Duration,
     snapshot_asked: Option<Duration>,
     pub(crate) wants_snapshot: bool,
     pub(crate) resynced: bool,
@@ -78,7 +78,7 @@ impl BodyView {
             resting: false,
             fade_at: Duration::ZERO,
             stalled: false,
-            heard: Duration::ZERO,
+            received_at: Duration::ZERO,
             snapshot_asked: None,
             wants_snapshot: false,
             resynced: false,
@@ -113,23 +113,23 @@ impl BodyView {
     }
 
     /// Best estimate of the truth at the shown tick: for the next step's physics, not for the eye.
-    pub fn hidden(&self) -> Option<&State> {
-        self.receiver.as_ref().map(Receiver::hidden)
+    pub fn confirmed(&self) -> Option<&State> {
+        self.receiver.as_ref().map(Receiver::confirmed)
     }
 
     /// What the eye and the hand get at the shown tick: continuous in position and velocity.
-    pub fn shown(&self) -> Option<&State> {
-        self.receiver.as_ref().map(Receiver::shown)
+    pub fn visual(&self) -> Option<&State> {
+        self.receiver.as_ref().map(Receiver::visual)
     }
 
     /// Everything that holds the body at the shown tick, with the reactions that belong to the shape shown.
-    pub fn grabs(&self) -> &[ShownGrab] {
+    pub fn grabs(&self) -> &[VisualGrab] {
         self.receiver.as_ref().map_or(&[], Receiver::grabs)
     }
 
     /// The newer copy of the body in which the guest's own hands have arrived already; `None` when it holds nothing, for
     /// policies that do not own the model, and for free bodies. Show this instead of [`BodyView::shown`] where it is there.
-    pub fn own_hand(&self) -> Option<&OwnHand> {
+    pub fn predicted_hand(&self) -> Option<&PredictedHand> {
         self.own.as_ref().filter(|own| own.is_active())
     }
 
@@ -176,13 +176,13 @@ impl BodyView {
     /// Takes a snapshot; true when the body became ready with it.
     pub(crate) fn take_snapshot(&mut self, now: Duration, snapshot: SnapshotBytes) -> bool {
         self.resting = snapshot.resting;
-        self.heard = now;
+        self.received_at = now;
         self.wants_snapshot = false;
         self.settled = self.settled.max(snapshot.tick);
         let modes = snapshot.q.len();
         let retuned = std::mem::take(&mut self.retuned);
         if let Some(receiver) = &mut self.receiver
-            && receiver.hidden().modes() == modes
+            && receiver.confirmed().modes() == modes
             && !retuned
         {
             receiver.restart(&snapshot);
@@ -215,7 +215,7 @@ impl BodyView {
         if let (Policy::ForceDriven { blend_ticks }, true) = (self.config.policy, self.own_first)
             && let Ok(replica) = Replica::new(model.clone(), self.info.settings, modes, self.newmark.h)
         {
-            let mut own = OwnHand::new(replica, blend_ticks);
+            let mut own = PredictedHand::new(replica, blend_ticks);
             if let Some(before) = self.own.take() {
                 own.take_grabs(before);
             }
@@ -227,9 +227,9 @@ impl BodyView {
     }
 
     pub(crate) fn take_frame(&mut self, now: Duration, frame: Frame) {
-        self.heard = now;
+        self.received_at = now;
         let highest = self.receiver.as_ref().map_or(0, |r| r.history().highest());
-        let modes = self.receiver.as_ref().map_or(0, |r| r.hidden().modes());
+        let modes = self.receiver.as_ref().map_or(0, |r| r.confirmed().modes());
         if let Some(a) = &frame.accelerations
             && self.receiver.is_some()
             && a.modes() != modes
@@ -274,7 +274,7 @@ impl BodyView {
             }
             return 0;
         }
-        let quiet = now.saturating_sub(self.heard) > self.config.stall_after;
+        let quiet = now.saturating_sub(self.received_at) > self.config.stall_after;
         let highest = receiver.history().highest();
         self.stalled = quiet && receiver.tick() >= highest;
         let guesses = (self.config.stall_after.as_secs_f64() / self.newmark.h) as u64 + 1;

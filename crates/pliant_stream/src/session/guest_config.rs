@@ -5,7 +5,7 @@ use std::time::Duration;
 
 use pliant_modal::ModalModel;
 
-use super::EndReason;
+use super::DisconnectReason;
 use crate::recovery::RecoveryConfig;
 use crate::state::{BodyId, UserId};
 
@@ -19,10 +19,10 @@ pub struct GuestConfig {
     /// Take at most so many modes of each body: for weak machines and thin links. Default: all.
     pub modes: Option<u16>,
     /// Step a newer copy of each body that this guest holds, in which its own hands do not wait for the round trip; see
-    /// [`BodyView::own_hand`](super::BodyView::own_hand). Default: true.
-    pub own_hand_first: bool,
+    /// [`BodyView::predicted_hand`](super::BodyView::predicted_hand). Default: true.
+    pub predict_own_hand: bool,
     /// Most bytes of models that a host may send, those that are here and those on their way together; a host that sends
-    /// more is left with [`EndReason::Full`]. Models that the application named itself do not count. Default: 1 GiB.
+    /// more is left with [`DisconnectReason::Full`]. Models that the application named itself do not count. Default: 1 GiB.
     pub model_bytes: u64,
     /// Models that have arrived are handed out as bytes ([`GuestEvent::ModelCame`]) for the caller to read elsewhere, and taken back by
     /// [`GuestSession::give_model`](super::GuestSession::give_model): reading one takes long for a frame. Default: false, they are read at once.
@@ -37,7 +37,7 @@ impl Default for GuestConfig {
             name: "guest".to_owned(),
             recovery: RecoveryConfig::default(),
             modes: None,
-            own_hand_first: true,
+            predict_own_hand: true,
             model_bytes: 1 << 30,
             models_apart: false,
             idle_timeout: Duration::from_secs(10),
@@ -124,6 +124,6 @@ pub enum GuestEvent {
     /// The session is over.
     Closed {
         /// Why.
-        reason: EndReason,
+        reason: DisconnectReason,
     },
 }

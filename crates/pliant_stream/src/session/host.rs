@@ -9,16 +9,16 @@ use pliant_modal::{ModalModel, StepSettings};
 use super::host_config::{HostConfig, HostEvent};
 use super::host_peer::{HeldGrab, MAX_GUEST_GRABS, Peer, Standing};
 use super::upload::Upload;
-use super::{EndReason, LinkStats, MIN_DATAGRAM, Output};
+use super::{DisconnectReason, LinkStats, MIN_DATAGRAM, Output};
 use crate::StreamError;
 use crate::encoder::Encoder;
 use crate::link::Events;
 use crate::newmark::Newmark;
 use crate::state::{BodyId, GrabKey, PeerId, Tick, UserId};
-use crate::wire::{BodyInfo, Datagram, GuestMessage, HostMessage, PROTOCOL_VERSION, StreamWish};
+use crate::wire::{BodyInfo, Datagram, GuestMessage, HostMessage, PROTOCOL_VERSION, StreamSubscription};
 
 /// A kind of receiver, and how many bytes its datagrams may have.
-pub(super) type StreamKey = (StreamWish, usize);
+pub(super) type StreamKey = (StreamSubscription, usize);
 
 #[derive(Debug)]
 pub(super) struct HostBody {
@@ -44,7 +44,8 @@ impl HostBody {
             body: self.id.0,
             name: self.name.clone(),
             hash: self.hash,
-            modes: Encoder::modes_for(&guest.wish?, self.model.mode_count(), guest.link.max_datagram) as u16,
+            modes: Encoder::modes_for(&guest.subscription?, self.model.mode_count(), guest.link.max_datagram)
+                as u16,
             settings: self.settings,
         })
     }
@@ -111,12 +112,12 @@ impl HostSession {
     }
 
     /// A connection closed.
-    pub fn disconnect(&mut self, peer: PeerId, reason: EndReason) {
+    pub fn disconnect(&mut self, peer: PeerId, reason: DisconnectReason) {
         self.drop_peer(peer, reason, false);
     }
 
     /// Ends a guest's session with a reason that they are told.
-    pub fn kick(&mut self, peer: PeerId, reason: EndReason) {
+    pub fn kick(&mut self, peer: PeerId, reason: DisconnectReason) {
         self.drop_peer(peer, reason, true);
     }
 
@@ -131,7 +132,7 @@ impl HostSession {
         let flowing = std::mem::take(&mut p.flowing);
         p.due.extend(flowing);
         if bytes < MIN_DATAGRAM && p.user().is_some() {
-            self.drop_peer(peer, EndReason::Path, true);
+            self.drop_peer(peer, DisconnectReason::Path, true);
         }
     }
 
@@ -168,7 +169,7 @@ impl HostSession {
 
     /// Turns a guest away that asked.
     pub fn refuse(&mut self, peer: PeerId) {
-        self.drop_peer(peer, EndReason::Refused, true);
+        self.drop_peer(peer, DisconnectReason::Refused, true);
     }
 
     /// Does not accept a guest's grab, or ends it: the guest is told. No event follows.
@@ -290,19 +291,21 @@ impl HostSession {
             Ok(m) if p.message_budget.spend(now, 1.0) => m,
             _ => {
                 p.link.reject();
-                return self.drop_peer(peer, EndReason::Protocol, true);
+                return self.drop_peer(peer, DisconnectReason::Protocol, true);
             }
         };
         match (message, p.user()) {
-            (GuestMessage::Hello { version, name, wish, cached }, None) if p.standing == Standing::Silent => {
+            (GuestMessage::Hello { version, name, subscription, cached }, None)
+                if p.standing == Standing::Silent =>
+            {
                 if version != PROTOCOL_VERSION {
-                    return self.drop_peer(peer, EndReason::Version, true);
+                    return self.drop_peer(peer, DisconnectReason::Version, true);
                 }
                 if p.link.max_datagram < MIN_DATAGRAM {
-                    return self.drop_peer(peer, EndReason::Path, true);
+                    return self.drop_peer(peer, DisconnectReason::Path, true);
                 }
                 p.name = name;
-                p.wish = Some(wish);
+                p.subscription = Some(subscription);
                 p.cached = cached.into_iter().collect();
                 p.standing = Standing::Asking;
                 if self.config.open {
@@ -342,7 +345,7 @@ impl HostSession {
             }
             _ => {
                 p.link.reject();
-                self.drop_peer(peer, EndReason::Protocol, true);
+                self.drop_peer(peer, DisconnectReason::Protocol, true);
             }
         }
     }
@@ -355,7 +358,7 @@ impl HostSession {
             self.resend_due(now, id);
             let Some(p) = self.peers.get_mut(&id) else { continue };
             if p.link.is_silent(now, self.config.idle_timeout) {
-                self.drop_peer(id, EndReason::Silent, true);
+                self.drop_peer(id, DisconnectReason::Silent, true);
                 continue;
             }
             let (bytes, round_trip) = (p.link.stats.bytes_out, p.link.least_round_trip());
@@ -421,7 +424,7 @@ impl HostSession {
             self.peers.values().filter_map(|p| p.user().map(|u| (u.0, p.name.clone()))).collect();
         let Some(p) = self.peers.get_mut(&peer) else { return };
         p.standing = Standing::Joined(user);
-        p.link.heard(now);
+        p.link.received_at(now);
         let Newmark { h, beta, gamma } = self.config.newmark;
         let step_ns = (h * 1e9).round() as u64;
         let welcome =
@@ -462,7 +465,7 @@ impl HostSession {
         }
     }
 
-    pub(super) fn drop_peer(&mut self, peer: PeerId, reason: EndReason, tell: bool) {
+    pub(super) fn drop_peer(&mut self, peer: PeerId, reason: DisconnectReason, tell: bool) {
         let Some(mut p) = self.peers.remove(&peer) else { return };
         if tell {
             p.say_goodbye(reason, &mut self.out);
@@ -492,15 +495,15 @@ fn step_up(modes: u16) -> u16 {
 /// The kind of stream that a guest takes of a body: what it wished, less what its path does not bear.
 pub(super) fn stream_key(peer: &Peer, body: &HostBody) -> Option<StreamKey> {
     let model_modes = body.model.mode_count();
-    let mut wish = peer.regulator.cut(peer.wish?, model_modes);
+    let mut subscription = peer.regulator.cut(peer.subscription?, model_modes);
     if let Some(&most) = peer.interest.get(&body.id) {
         if most == 0 {
             return None;
         }
-        wish.modes = wish.modes.min(step_up(most));
+        subscription.modes = subscription.modes.min(step_up(most));
     }
-    wish.modes = Encoder::modes_for(&wish, model_modes, peer.link.max_datagram) as u16;
-    Some((wish, peer.link.max_datagram))
+    subscription.modes = Encoder::modes_for(&subscription, model_modes, peer.link.max_datagram) as u16;
+    Some((subscription, peer.link.max_datagram))
 }
 
 #[cfg(test)]

@@ -4,7 +4,7 @@ use std::time::Duration;
 
 use pliant_modal::GrabConfig;
 
-use super::EndReason;
+use super::DisconnectReason;
 use crate::newmark::Newmark;
 use crate::state::{BodyId, GrabKey, PeerId, UserId};
 
@@ -82,7 +82,7 @@ pub enum HostEvent {
         /// Their number, if they had joined.
         user: Option<UserId>,
         /// Why.
-        reason: EndReason,
+        reason: DisconnectReason,
     },
     /// A hand takes hold: the application grabs its body, or says [`crate::HostSession::refuse_grab`].
     GrabBegan {
@@ -90,7 +90,7 @@ pub enum HostEvent {
         key: GrabKey,
         /// The body.
         body: BodyId,
-        /// Centre of the patch.
+        /// Center of the patch.
         vertex: u32,
         /// Radius of the patch, m.
         radius: f64,

@@ -5,10 +5,10 @@ use std::sync::Arc;
 use std::time::Duration;
 
 use super::regulator::Regulator;
-use super::{EndReason, Output};
+use super::{DisconnectReason, Output};
 use crate::link::{Budget, Link, micros};
 use crate::state::{BodyId, PeerId, Tick, UserId};
-use crate::wire::{Clock, Datagram, HostMessage, StreamWish};
+use crate::wire::{Clock, Datagram, HostMessage, StreamSubscription};
 
 /// Most grabs that one guest may hold.
 pub(crate) const MAX_GUEST_GRABS: usize = 16;
@@ -48,7 +48,7 @@ pub(crate) struct Peer {
     pub(crate) link: Link,
     pub(crate) standing: Standing,
     pub(crate) name: String,
-    pub(crate) wish: Option<StreamWish>,
+    pub(crate) subscription: Option<StreamSubscription>,
     pub(crate) cached: BTreeSet<[u8; 32]>,
     pub(crate) transfers: VecDeque<Transfer>,
     /// Bodies announced to the guest.
@@ -79,7 +79,7 @@ impl Peer {
             link: Link::new(id, now, max_datagram),
             standing: Standing::Silent,
             name: String::new(),
-            wish: None,
+            subscription: None,
             cached: BTreeSet::new(),
             transfers: VecDeque::new(),
             announced: BTreeSet::new(),
@@ -127,7 +127,7 @@ impl Peer {
         self.link.send_message(message.encode(), out);
     }
 
-    pub(crate) fn say_goodbye(&mut self, reason: EndReason, out: &mut VecDeque<Output>) {
+    pub(crate) fn say_goodbye(&mut self, reason: DisconnectReason, out: &mut VecDeque<Output>) {
         self.send_message(&HostMessage::Goodbye { reason }, out);
     }
 

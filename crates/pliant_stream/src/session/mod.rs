@@ -24,7 +24,7 @@ mod host;
 mod host_bodies;
 mod host_config;
 mod host_peer;
-mod own_hand;
+mod predicted_hand;
 mod publish;
 mod regulator;
 mod upload;
@@ -35,7 +35,7 @@ pub use guest_body::BodyView;
 pub use guest_config::{GuestConfig, GuestEvent};
 pub use host::HostSession;
 pub use host_config::{HostConfig, HostEvent};
-pub use own_hand::OwnHand;
+pub use predicted_hand::PredictedHand;
 
 use crate::state::PeerId;
 
@@ -68,7 +68,7 @@ pub struct Output {
 /// Why a session ended.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, serde::Serialize, serde::Deserialize, thiserror::Error)]
 #[non_exhaustive]
-pub enum EndReason {
+pub enum DisconnectReason {
     /// The other side said goodbye.
     #[error("left")]
     Left,
@@ -98,7 +98,7 @@ pub enum EndReason {
     Scene,
 }
 
-impl EndReason {
+impl DisconnectReason {
     /// All of them, each at the place of its number on the wire.
     const ALL: [Self; 9] = [
         Self::Left,
@@ -129,10 +129,10 @@ mod tests {
 
     #[test]
     fn each_end_has_the_same_number_in_messages_and_as_a_code() {
-        for (code, reason) in (0..).zip(EndReason::ALL) {
+        for (code, reason) in (0..).zip(DisconnectReason::ALL) {
             assert_eq!(postcard::to_allocvec(&reason).unwrap(), [code]);
-            assert_eq!((reason.code(), EndReason::from_code(code)), (code, Some(reason)));
+            assert_eq!((reason.code(), DisconnectReason::from_code(code)), (code, Some(reason)));
         }
-        assert_eq!(EndReason::from_code(9), None);
+        assert_eq!(DisconnectReason::from_code(9), None);
     }
 }

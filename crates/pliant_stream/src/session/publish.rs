@@ -3,7 +3,7 @@
 use std::collections::{BTreeMap, BTreeSet};
 use std::time::Duration;
 
-use super::EndReason;
+use super::DisconnectReason;
 use super::host::{HostBody, HostSession, StreamKey, stream_key};
 use super::host_peer::Peer;
 use crate::StreamError;
@@ -106,7 +106,7 @@ impl HostSession {
         }
         for (peer, key, due) in takers {
             let Some(Outgoing { frame, anew: fresh }) = frames.get(&key) else {
-                self.drop_peer(peer, EndReason::Path, true);
+                self.drop_peer(peer, DisconnectReason::Path, true);
                 continue;
             };
             let Some(p) = self.peers.get_mut(&peer) else { continue };

@@ -2,7 +2,7 @@
 
 use std::time::Duration;
 
-use crate::wire::{Payload, StreamWish};
+use crate::wire::{Payload, StreamSubscription};
 
 /// Judged this often.
 const WINDOW: Duration = Duration::from_secs(1);
@@ -72,23 +72,23 @@ impl Regulator {
     }
 
     /// What is left of a wish: repeats go first, then refreshes, then modes.
-    pub(crate) fn cut(&self, mut wish: StreamWish, model_modes: usize) -> StreamWish {
+    pub(crate) fn cut(&self, mut subscription: StreamSubscription, model_modes: usize) -> StreamSubscription {
         if self.level >= 1 {
-            wish.repeats = wish.repeats.min(1);
+            subscription.repeats = subscription.repeats.min(1);
         }
         if self.level >= 2 {
-            wish.repeats = 0;
+            subscription.repeats = 0;
         }
         if self.level >= 3 {
-            wish.refresh = wish.refresh.saturating_mul(2);
+            subscription.refresh = subscription.refresh.saturating_mul(2);
         }
         if self.level >= 4 {
-            let modes = usize::from(wish.modes).min(model_modes) >> (self.level - 3);
-            wish.modes = modes.max(8).min(usize::from(wish.modes)) as u16;
-            if wish.payload == Payload::Forces {
-                wish.refresh = wish.refresh.saturating_mul(2);
+            let modes = usize::from(subscription.modes).min(model_modes) >> (self.level - 3);
+            subscription.modes = modes.max(8).min(usize::from(subscription.modes)) as u16;
+            if subscription.payload == Payload::Forces {
+                subscription.refresh = subscription.refresh.saturating_mul(2);
             }
         }
-        wish
+        subscription
     }
 }

@@ -5,7 +5,7 @@ use serde::{Deserialize, Serialize};
 
 use super::AccelerationCoding;
 use crate::StreamError;
-use crate::session::{EndReason, MAX_MESSAGE};
+use crate::session::{DisconnectReason, MAX_MESSAGE};
 use crate::state::{MAX_GRABS, MAX_MODES, TICK_LIMIT, in_range};
 
 /// Longest name of a user or a body, bytes of UTF-8.
@@ -26,7 +26,7 @@ pub enum Payload {
 
 /// What a guest asks of the host's encoder.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, PartialOrd, Ord, Serialize, Deserialize)]
-pub struct StreamWish {
+pub struct StreamSubscription {
     /// What the frames carry.
     pub payload: Payload,
     /// At most so many modes (the first ones); the host lowers it to what the model has and the path carries.
@@ -85,7 +85,7 @@ pub enum GuestMessage {
         /// At most 64 bytes.
         name: String,
         /// What to stream.
-        wish: StreamWish,
+        subscription: StreamSubscription,
         /// Models that need not be sent.
         cached: Vec<[u8; 32]>,
     },
@@ -95,7 +95,7 @@ pub enum GuestMessage {
         grab: u16,
         /// Of which body.
         body: u16,
-        /// Centre of the patch.
+        /// Center of the patch.
         vertex: u32,
         /// Radius of the patch, m.
         radius: f64,
@@ -117,7 +117,7 @@ pub enum GuestMessage {
     /// The last message.
     Goodbye {
         /// Why.
-        reason: EndReason,
+        reason: DisconnectReason,
     },
 }
 
@@ -179,7 +179,7 @@ pub enum HostMessage {
     /// The last message.
     Goodbye {
         /// Why.
-        reason: EndReason,
+        reason: DisconnectReason,
     },
 }
 
@@ -226,11 +226,11 @@ impl GuestMessage {
     pub fn decode(bytes: &[u8]) -> Result<Self, StreamError> {
         let mut message: Self = decode("guest message", bytes)?;
         match &mut message {
-            Self::Hello { name, wish, cached, .. } => {
+            Self::Hello { name, subscription, cached, .. } => {
                 check("name", name.len() <= MAX_NAME, name.len(), "at most 64 bytes")?;
                 check("cached models", cached.len() <= MAX_CACHED, cached.len(), "at most 256")?;
-                check("repeats", wish.repeats <= 7, wish.repeats, "0..=7")?;
-                check("modes", wish.modes >= 1, wish.modes, "at least 1")?;
+                check("repeats", subscription.repeats <= 7, subscription.repeats, "0..=7")?;
+                check("modes", subscription.modes >= 1, subscription.modes, "at least 1")?;
             }
             Self::GrabBegin { radius, target, hold, .. } => {
                 check("radius", *radius >= 0.0 && in_range(&[*radius]), radius, "0..=1e9 m")?;

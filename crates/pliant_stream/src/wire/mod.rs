@@ -15,7 +15,7 @@ pub use datagram::{Clock, Datagram, Nack, NackRun, Report, TargetEntry, Targets}
 pub(crate) use datagram::{MAX_NACK_RUNS, MAX_TARGETS};
 pub(crate) use frame::MAX_PARTS;
 pub use frame::{AccelerationCoding, Accelerations, Frame, FrameGrab, Repeat, RepeatGrab};
-pub use message::{BodyInfo, GuestMessage, HostMessage, Payload, SnapshotBytes, StreamWish};
+pub use message::{BodyInfo, GuestMessage, HostMessage, Payload, SnapshotBytes, StreamSubscription};
 pub(crate) use message::{MAX_BODIES, MAX_CACHED, MAX_NAME};
 pub use slice::{Slice, SliceEntry};
 

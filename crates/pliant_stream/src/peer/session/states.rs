@@ -51,7 +51,7 @@ impl PeerSession {
 
     /// Only those with a lower number are believed.
     pub(super) fn compare(&mut self, peer: PeerId, user: UserId, check: StateCheck) {
-        let unsettled = self.dirty.is_some_and(|from| from <= check.tick);
+        let unsettled = self.rollback_from.is_some_and(|from| from <= check.tick);
         if user > self.config.user || unsettled || check.tick > self.confirmed() {
             return;
         }

@@ -2,7 +2,7 @@
 
 use std::time::Duration;
 
-use pliant_stream::{EndReason, PeerId, UserId};
+use pliant_stream::{DisconnectReason, PeerId, UserId};
 use tracing::debug;
 
 use super::{NetPeer, PeerState};
@@ -27,7 +27,7 @@ const MOST_MISSED: usize = 64;
 /// Did the other end go of its own will? One that has found us silent has not.
 fn has_left(reason: &CloseReason) -> bool {
     match reason {
-        CloseReason::ByPeer { reason, .. } => *reason != EndReason::Silent,
+        CloseReason::ByPeer { reason, .. } => *reason != DisconnectReason::Silent,
         CloseReason::Protocol { .. } | CloseReason::Refused { .. } | CloseReason::WrongFingerprint { .. } => {
             true
         }

@@ -10,7 +10,7 @@ pub struct RemoteBody(pub BodyId);
 
 /// Another user's hand on a body.
 #[derive(Debug, Clone, Copy, PartialEq)]
-pub struct SeenHand {
+pub struct RemoteHand {
     /// Whose.
     pub user: UserId,
     /// Surface vertex in the middle of the patch.
@@ -23,7 +23,7 @@ pub struct SeenHand {
 
 /// The hands of the others on a guest's body, at the tick that is shown. At most [`pliant_stream::MAX_GRABS`].
 #[derive(Component, Debug, Clone, Default, PartialEq)]
-pub struct SeenHands(pub Vec<SeenHand>);
+pub struct RemoteHands(pub Vec<RemoteHand>);
 
 /// A body of the host is here.
 #[derive(Message, Debug, Clone, PartialEq)]

@@ -32,7 +32,7 @@ pub(crate) struct Believed {
 }
 
 #[derive(Debug, Clone)]
-pub(crate) struct Intake {
+pub(crate) struct SampleValidation {
     resolution: f64,
     frozen_force: f64,
     last: Option<(Vector3<f64>, UnitQuaternion<f64>)>,
@@ -50,7 +50,7 @@ pub(crate) struct Intake {
     trusted: u32,
 }
 
-impl Intake {
+impl SampleValidation {
     pub(crate) fn new(info: &DeviceInfo) -> Self {
         Self {
             resolution: info.resolution,
@@ -200,20 +200,20 @@ mod tests {
     use super::*;
     use crate::VirtualConfig;
 
-    fn intake(resolution: f64) -> Intake {
-        Intake::new(&VirtualConfig { resolution, ..VirtualConfig::default() }.info())
+    fn validation(resolution: f64) -> SampleValidation {
+        SampleValidation::new(&VirtualConfig { resolution, ..VirtualConfig::default() }.info())
     }
 
     #[test]
     fn velocity_of_a_coarse_encoder_is_usable() {
         // 0.1 m/s on a 50 um encoder at 1 kHz: differences alone read 0.1 or 0.15 or 0.05; a slow 5 mm/s reads 0 or 50 mm/s.
         for speed in [0.1, 0.033, 0.005] {
-            let mut intake = intake(50e-6);
+            let mut validation = validation(50e-6);
             let (mut worst, mut sum, mut plain, mut last) = (0.0f64, 0.0, 0.0, 0.0);
             for k in 0..1050 {
                 let t = f64::from(k) * 1e-3;
                 let x = (speed * t / 50e-6).round() * 50e-6;
-                let b = intake.take(t, 1e-3, &Sample::at([x, 0.0, 0.0]), 0.0);
+                let b = validation.take(t, 1e-3, &Sample::at([x, 0.0, 0.0]), 0.0);
                 if k >= 50 {
                     worst = worst.max((b.velocity.x - speed).abs());
                     sum += (b.velocity.x - speed).powi(2);
@@ -226,7 +226,7 @@ mod tests {
             assert!(sum <= 0.3 * plain, "{speed}: {sum} of {plain}");
         }
         // Without an encoder's steps it is the plain difference: no lag beyond half a period.
-        let mut fine = intake(0.0);
+        let mut fine = validation(0.0);
         let mut last = 0.0;
         for k in 0..50 {
             let t = f64::from(k) * 1e-3;
@@ -237,15 +237,15 @@ mod tests {
 
     #[test]
     fn nonsense_is_not_believed() {
-        let mut intake = intake(0.0);
+        let mut validation = validation(0.0);
         let good = Sample::at([0.01, 0.02, 0.03]);
-        assert!(intake.take(0.0, 1e-3, &good, 0.0).fault.is_none());
+        assert!(validation.take(0.0, 1e-3, &good, 0.0).fault.is_none());
         for bad in [
             Sample::at([f64::NAN, 0.0, 0.0]),
             Sample { orientation: [0.0; 4], ..good },
             Sample { velocity: Some([f64::INFINITY, 0.0, 0.0]), ..good },
         ] {
-            let b = intake.take(0.001, 1e-3, &bad, 0.0);
+            let b = validation.take(0.001, 1e-3, &bad, 0.0);
             assert_eq!(b.fault, Some(Fault::NotFinite));
             assert_eq!(b.position, Vector3::from(good.position));
         }
@@ -253,7 +253,7 @@ mod tests {
         let far = Sample::at([1.01, 0.02, 0.03]);
         let mut refused = 0;
         let b = loop {
-            let b = intake.take(0.002, 1e-3, &far, 0.0);
+            let b = validation.take(0.002, 1e-3, &far, 0.0);
             if b.fault.is_none() {
                 break b;
             }
@@ -267,37 +267,37 @@ mod tests {
 
     #[test]
     fn a_velocity_that_no_hand_has_is_estimated_instead() {
-        let mut intake = intake(0.0);
+        let mut validation = validation(0.0);
         let at = |k: u32| f64::from(k) * 1e-3;
         let told = |k: u32, v| Sample { velocity: Some(v), ..Sample::at([0.1 * at(k), 0.0, 0.0]) };
         for k in 0..20 {
-            let b = intake.take(at(k), 1e-3, &told(k, [0.1, 0.0, 0.0]), 0.0);
+            let b = validation.take(at(k), 1e-3, &told(k, [0.1, 0.0, 0.0]), 0.0);
             assert_eq!((b.fault, b.velocity.x), (None, 0.1));
         }
         for (k, wild) in [(20, 1e200), (21, -f64::MAX), (22, 10.5)] {
-            let b = intake.take(at(k), 1e-3, &told(k, [0.0, wild, 0.0]), 0.0);
+            let b = validation.take(at(k), 1e-3, &told(k, [0.0, wild, 0.0]), 0.0);
             assert_eq!(b.fault, Some(Fault::TooFast(f64::abs(wild))));
             assert!((b.velocity - Vector3::new(0.1, 0.0, 0.0)).norm() < 1e-9, "{}", b.velocity);
         }
-        assert_eq!(intake.take(at(23), 1e-3, &told(23, [0.1, 0.0, 0.0]), 0.0).fault, None);
+        assert_eq!(validation.take(at(23), 1e-3, &told(23, [0.1, 0.0, 0.0]), 0.0).fault, None);
     }
 
     #[test]
     fn frozen_and_stuck() {
-        let mut intake = intake(0.0);
+        let mut validation = validation(0.0);
         let stuck = Sample { buttons: 0b11, ..Sample::default() };
         // Held since before the device came: believed only once seen open.
-        assert_eq!(intake.take(0.0, 1e-3, &stuck, 0.0).buttons, 0);
-        assert_eq!(intake.take(0.0, 1e-3, &Sample { buttons: 0b10, ..stuck }, 0.0).buttons, 0);
-        assert_eq!(intake.take(0.0, 1e-3, &stuck, 0.0).buttons, 0b01);
+        assert_eq!(validation.take(0.0, 1e-3, &stuck, 0.0).buttons, 0);
+        assert_eq!(validation.take(0.0, 1e-3, &Sample { buttons: 0b10, ..stuck }, 0.0).buttons, 0);
+        assert_eq!(validation.take(0.0, 1e-3, &stuck, 0.0).buttons, 0b01);
         // A still hand without force is no fault; under force it is, after half a second.
         for _ in 0..2000 {
-            assert!(intake.take(0.0, 1e-3, &stuck, 0.0).fault.is_none());
+            assert!(validation.take(0.0, 1e-3, &stuck, 0.0).fault.is_none());
         }
-        let fault = (0..501).find_map(|_| intake.take(0.0, 1e-3, &stuck, 1.0).fault);
+        let fault = (0..501).find_map(|_| validation.take(0.0, 1e-3, &stuck, 1.0).fault);
         assert!(matches!(fault, Some(Fault::Frozen(t)) if t > 0.49), "{fault:?}");
         // With a counter the still hand is told from the dead device, and sooner.
-        let mut counted = Intake::new(&VirtualConfig::default().info());
+        let mut counted = SampleValidation::new(&VirtualConfig::default().info());
         for k in 0..2000 {
             assert!(counted.take(0.0, 1e-3, &Sample { sequence: Some(k), ..stuck }, 1.0).fault.is_none());
         }

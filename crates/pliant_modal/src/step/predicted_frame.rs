@@ -8,7 +8,7 @@ use crate::ModalModel;
 /// Where a correction takes the frame to be: at first where it goes without hands, then where the
 /// pulls of the correction before brought it. Tension turns a body within a step, and the pulls with
 /// it: taken along a step late they would drive the modes that it bends.
-pub(crate) struct Place {
+pub(crate) struct PredictedFrame {
     frame: Frame,
     /// From body to world axes, and back.
     pub(crate) turn: Matrix3<f64>,
@@ -20,7 +20,7 @@ pub(crate) struct Place {
     turned: Vector3<f64>,
 }
 
-impl Place {
+impl PredictedFrame {
     /// Turns of a step beyond this (rad; a hand that leaps) are not to be taken for their tangent:
     /// such a step keeps to the unheld place.
     const FARTHEST: f64 = 0.25;

@@ -3,7 +3,7 @@
 use bevy::{diagnostic::DiagnosticsStore, prelude::*};
 
 use super::{app, model, steps};
-use crate::{AWAKE_BODIES, BodyState, ModalAsset, ModalBody, STEP_TIME, ShownState};
+use crate::{AWAKE_BODIES, BodyState, ModalAsset, ModalBody, STEP_TIME, VisualState};
 
 const CROWD: usize = 1_000;
 
@@ -30,7 +30,7 @@ fn a_thousand_bodies_at_rest_are_neither_stepped_nor_shown_anew_and_one_that_is_
     assert_eq!(measured(&app, &AWAKE_BODIES).0, Some(1_000.0));
     steps(&mut app, 25);
     let states = |app: &mut App| {
-        let mut query = app.world_mut().query::<(&BodyState, &ShownState)>();
+        let mut query = app.world_mut().query::<(&BodyState, &VisualState)>();
         query
             .iter(app.world())
             .map(|(state, shown)| (state.body().state().clone(), shown.version()))
@@ -46,7 +46,7 @@ fn a_thousand_bodies_at_rest_are_neither_stepped_nor_shown_anew_and_one_that_is_
 
     let one = bodies[417];
     let mut touched = app.world_mut().get_mut::<BodyState>(one).unwrap();
-    touched.body_mut().strike(model::tip(), [0.0, 0.5, 0.0]).unwrap();
+    touched.body_mut().apply_impulse(model::tip(), [0.0, 0.5, 0.0]).unwrap();
     steps(&mut app, 1);
     assert_eq!(measured(&app, &AWAKE_BODIES).0, Some(1.0));
     let moved = states(&mut app).iter().zip(&before).filter(|(now, before)| now != before).count();

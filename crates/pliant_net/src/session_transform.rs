@@ -10,13 +10,13 @@ use pliant_stream::Pose;
 
 /// The map between an app's world and session coordinates for one body: `world = rotation * session * scale + origin`.
 #[derive(Debug, Clone, Copy, PartialEq)]
-pub(crate) struct Place {
+pub(crate) struct SessionTransform {
     origin: DVec3,
     rotation: DQuat,
     scale: f64,
 }
 
-impl Place {
+impl SessionTransform {
     /// Where the body of an entity is, or `None` while its transform cannot place a body (`pliant_body` has refused and told it then).
     pub(crate) fn of(transform: &GlobalTransform, free: bool) -> Option<Self> {
         let (scale, rotation, origin) = transform.to_scale_rotation_translation();
@@ -84,7 +84,7 @@ mod tests {
             rotation: Quat::from_euler(EulerRot::XYZ, 0.3, -1.1, 2.0),
             scale: Vec3::splat(2.5),
         };
-        let place = Place::of(&GlobalTransform::from(transform), false).unwrap();
+        let place = SessionTransform::of(&GlobalTransform::from(transform), false).unwrap();
         let point = DVec3::new(0.4, 5.0, -0.6);
         // f32 transforms: seven digits.
         assert!(place.point_to_world(place.point_to_session(point)).distance(point) < 1e-6);
@@ -93,7 +93,7 @@ mod tests {
         assert!(place.point_to_world([0.0; 3]).distance(DVec3::new(1.0, -2.0, 3.0)) < 1e-6);
         // A force on a body twice as large is twice as large: N/m stays.
         assert!((place.force_to_world([0.0, 3.0, 0.0]).length() - 7.5).abs() < 1e-6);
-        let free = Place::of(&GlobalTransform::from(transform), true).unwrap();
+        let free = SessionTransform::of(&GlobalTransform::from(transform), true).unwrap();
         assert!(DVec3::from(free.point_to_session(point)).distance(point / 2.5) < 1e-6);
     }
 
@@ -106,7 +106,7 @@ mod tests {
             Transform::from_scale(Vec3::splat(-1.0)),
         ] {
             for free in [false, true] {
-                assert_eq!(Place::of(&GlobalTransform::from(bad), free), None, "{bad:?}");
+                assert_eq!(SessionTransform::of(&GlobalTransform::from(bad), free), None, "{bad:?}");
             }
         }
     }

@@ -7,7 +7,7 @@ use crate::{BodyError, BodyState, Driven, step::Refusals};
 
 /// A blow: an impulse at one vertex of a body, whose velocity changes at once.
 ///
-/// Sent with a `MessageWriter<Strike>` or `Commands::write_message` and taken by the next tick in
+/// Sent with a `MessageWriter<Impulse>` or `Commands::write_message` and taken by the next tick in
 /// [`PliantSystems::Input`](crate::PliantSystems::Input); a body at rest wakes. Blows of one tick add up. They act on a body that this app steps, and
 /// do not cross a session by themselves: a guest's go to nobody.
 ///
@@ -26,7 +26,7 @@ use crate::{BodyError, BodyState, Driven, step::Refusals};
 /// ```
 #[derive(Message, Reflect, Debug, Clone, Copy, PartialEq)]
 #[reflect(Debug, Clone, PartialEq)]
-pub struct Strike {
+pub struct Impulse {
     /// The entity of the [`ModalBody`](crate::ModalBody).
     pub body: Entity,
     /// Vertex of the model's surface that is hit.
@@ -37,7 +37,7 @@ pub struct Strike {
 
 /// A force at one vertex of a body for one tick; sent anew each tick, it is a force that lasts.
 ///
-/// Taken, scaled and refused as a [`Strike`]; forces of one tick add up. Over a tick of `h` s it brings in `force x h` N s.
+/// Taken, scaled and refused as a [`Impulse`]; forces of one tick add up. Over a tick of `h` s it brings in `force x h` N s.
 #[derive(Message, Reflect, Debug, Clone, Copy, PartialEq)]
 #[reflect(Debug, Clone, PartialEq)]
 pub struct Push {
@@ -51,7 +51,7 @@ pub struct Push {
 
 /// Hands the tick's blows and forces to the solver, in the order in which they were sent.
 pub(crate) fn hit_bodies(
-    mut strikes: MessageReader<Strike>,
+    mut strikes: MessageReader<Impulse>,
     mut pushes: MessageReader<Push>,
     mut refusals: Refusals,
     mut bodies: Query<(NameOrEntity, &Driven, &mut BodyState)>,
@@ -70,8 +70,8 @@ pub(crate) fn hit_bodies(
             Err(error) => refusals.tell(&name, entity, BodyError::Blow(error)),
         }
     };
-    for &Strike { body, vertex, impulse } in strikes.read() {
-        hit(body, &|body, scale| body.strike(vertex, (impulse / scale).into()));
+    for &Impulse { body, vertex, impulse } in strikes.read() {
+        hit(body, &|body, scale| body.apply_impulse(vertex, (impulse / scale).into()));
     }
     for &Push { body, vertex, force } in pushes.read() {
         hit(body, &|body, scale| body.push(vertex, (force / scale).into()));

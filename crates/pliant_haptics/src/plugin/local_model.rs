@@ -4,11 +4,11 @@ use std::sync::Arc;
 
 use bevy::{math::DVec3, prelude::*};
 use nalgebra::Matrix3;
-use pliant_body::{BodyState, Driven, Grab, GrabForce, GrabOf, ShownState};
+use pliant_body::{BodyState, Driven, Grab, GrabForce, GrabOf, VisualState};
 use pliant_modal::{BodyConfig, GrabConfig, GrabId, ModalModel, Patch};
 
 use super::{HapticDevices, HapticTool, ToolGrabs, ToolOffset};
-use crate::{Coupling, FeltGrab, HeldGrab, LocalModel, MAX_CONTACTS, ModalLocal};
+use crate::{Coupling, HeldGrab, LocalModel, MAX_CONTACTS, ModalLocal, PublishedGrab};
 
 /// A body that somebody else steps and of which nothing new has come for so long is one that the network has lost, s: four of its ticks at 40 Hz.
 const REMOTE_PATIENCE: f64 = 0.1;
@@ -17,7 +17,7 @@ type HeldItem<'w> = (Entity, &'w GrabOf, &'w Grab, &'w GrabForce, Option<&'w Too
 type HeldGrabs<'w, 's> =
     Query<'w, 's, (Entity, &'static GrabOf, &'static Grab, &'static GrabForce, Option<&'static ToolOffset>)>;
 type Bodies<'w, 's> =
-    Query<'w, 's, (&'static BodyState, &'static Driven, &'static ShownState, &'static GlobalTransform)>;
+    Query<'w, 's, (&'static BodyState, &'static Driven, &'static VisualState, &'static GlobalTransform)>;
 
 /// What a local copy of a body was made for and from. Any other one asks for another copy.
 #[derive(Default, PartialEq)]
@@ -141,7 +141,7 @@ pub(crate) fn publish(
             }
         } else if entry.elsewhere.is_alive(&held, &bodies, now) {
             entry.elsewhere.springs.retain(|(e, _)| entities.contains(e));
-            let felt: Vec<FeltGrab> = held
+            let felt: Vec<PublishedGrab> = held
                 .iter()
                 .filter_map(|(entity, of, grab, force, offset)| {
                     // Nothing is known of it yet, or any more: the session has not answered, or is over.
@@ -151,7 +151,7 @@ pub(crate) fn publish(
                     let (state, _, _, place) = bodies.get(of.0).ok()?;
                     let turn: Matrix3<f64> = world_axes(place);
                     let spring = turn * entry.elsewhere.spring(*entity, of.0, grab, state) * turn.transpose();
-                    Some(FeltGrab {
+                    Some(PublishedGrab {
                         key: key(*entity, of),
                         offset: offset.map_or(DVec3::ZERO, |o| o.0).into(),
                         point: force.point.into(),

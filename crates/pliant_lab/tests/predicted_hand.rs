@@ -49,10 +49,10 @@ fn own_hand_does_not_wait_for_the_round_trip() {
                 session: &mut GuestSession,
             ) {
                 self.scene.guest_stepped(now, guest, stepped, session);
-                let Some(own) = session.body(BODY).and_then(|b| b.own_hand()) else { return };
+                let Some(own) = session.body(BODY).and_then(|b| b.predicted_hand()) else { return };
                 if guest == 0 && stepped > 0 && now > 8 * S {
                     let reaction = own.reaction(0).expect("the grab is held");
-                    self.seen.push((own.tick(), own.shown().q.clone(), reaction));
+                    self.seen.push((own.tick(), own.visual().q.clone(), reaction));
                     self.leads.push(own.lead());
                 } else if guest == 1 {
                     self.other = true;
@@ -119,7 +119,7 @@ fn own_hand_on_a_free_body_takes_its_frame_along() {
             self.0.guest_stepped(now, guest, stepped, session);
             let Some(view) = session.body(BODY).filter(|_| stepped > 0 && now > 6 * S) else { return };
             self.2.extend(view.pose().map(|pose| (view.tick(), pose)));
-            let Some(own) = view.own_hand() else { return };
+            let Some(own) = view.predicted_hand() else { return };
             self.1.push((own.tick(), own.pose().expect("a free body has a frame")));
         }
     }

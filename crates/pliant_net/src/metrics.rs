@@ -99,7 +99,7 @@ impl NetStats {
     }
 
     /// Takes over the counts of all connections, those that are over included.
-    pub(crate) fn count(&mut self, links: &LinkStats, lines: &LineCounts) {
+    pub(crate) fn count(&mut self, links: &LinkStats, lines: &SourceCounts) {
         self.datagrams_out = links.datagrams_out;
         self.datagrams_in = links.datagrams_in;
         self.nacks = links.nacks;
@@ -110,13 +110,13 @@ impl NetStats {
 
 /// What the transport has counted.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
-pub(crate) struct LineCounts {
+pub(crate) struct SourceCounts {
     bytes_out: u64,
     bytes_in: u64,
     dropped: DropCounts,
 }
 
-impl LineCounts {
+impl SourceCounts {
     fn of(line: &PeerStats) -> Self {
         Self { bytes_out: line.sent_bytes, bytes_in: line.received_bytes, dropped: line.dropped }
     }
@@ -135,15 +135,15 @@ impl LineCounts {
 /// is not in it.
 #[derive(Debug, Default)]
 pub(crate) struct Ledger {
-    open: BTreeMap<PeerId, LineCounts>,
-    over: LineCounts,
+    open: BTreeMap<PeerId, SourceCounts>,
+    over: SourceCounts,
 }
 
 impl Ledger {
     /// The sums, with the connections that are open now.
-    pub(crate) fn sum(&mut self, open: impl Iterator<Item = (PeerId, PeerStats)>) -> LineCounts {
-        let now: BTreeMap<PeerId, LineCounts> =
-            open.map(|(peer, line)| (peer, LineCounts::of(&line))).collect();
+    pub(crate) fn sum(&mut self, open: impl Iterator<Item = (PeerId, PeerStats)>) -> SourceCounts {
+        let now: BTreeMap<PeerId, SourceCounts> =
+            open.map(|(peer, line)| (peer, SourceCounts::of(&line))).collect();
         for (peer, before) in std::mem::take(&mut self.open) {
             // A number may be that of a new connection: its bytes begin at none.
             if now.get(&peer).is_none_or(|now| now.bytes_out < before.bytes_out) {

@@ -10,7 +10,7 @@ use std::sync::{
 
 use pliant_haptics::{
     Contact, Cycle, DeviceInfo, Fault, Hand, HapticDevice, LocalModel, LoopConfig, LoopCore, LoopEvent,
-    LoopState, ModalLocal, Pace, SafetyConfig, Sample, VirtualConfig, VirtualDevice, VirtualPace, Wrench,
+    LoopState, ModalLocal, Pacing, SafetyConfig, Sample, VirtualConfig, VirtualDevice, VirtualPacing, Wrench,
 };
 use pliant_modal::{BodyConfig, StepSettings};
 use rig::scene::{Scene, SceneConfig};
@@ -139,8 +139,8 @@ impl HapticDevice for Changeling {
             _ => DeviceInfo { serial: "weaker".into(), max_stiffness: 100.0, ..info },
         }
     }
-    fn exchange(&mut self, wrench: &Wrench, pace: &mut dyn Pace) -> Result<Sample, Fault> {
-        self.inner.exchange(wrench, pace)
+    fn exchange(&mut self, wrench: &Wrench, pacing: &mut dyn Pacing) -> Result<Sample, Fault> {
+        self.inner.exchange(wrench, pacing)
     }
     fn safe_stop(&mut self) {
         self.inner.safe_stop();
@@ -160,10 +160,10 @@ fn another_device_gets_the_copy_or_it_is_handed_back() {
         let mut cycle = Cycle::new(device, LoopConfig::default()).unwrap();
         let copy = ModalLocal::new(&scene.body, &[scene.held], 1.0, 1000.0).unwrap();
         assert!(cycle.set_modal(Some(Box::new(copy))).is_none());
-        let (mut pace, mut events) = (VirtualPace::new(1000.0), Vec::<LoopEvent>::new());
+        let (mut pacing, mut events) = (VirtualPacing::new(1000.0), Vec::<LoopEvent>::new());
         let mut run = |cycle: &mut Cycle<Changeling>| {
             for _ in 0..1500 {
-                cycle.step(&mut pace, &LocalModel::default(), &mut events);
+                cycle.step(&mut pacing, &LocalModel::default(), &mut events);
             }
             cycle.report().state
         };

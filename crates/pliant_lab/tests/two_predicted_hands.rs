@@ -41,11 +41,11 @@ impl World for Watch {
         let Some(view) = session.body(BODY).filter(|_| guest == 0 && stepped > 0 && now > 4 * S) else {
             return;
         };
-        let Some(streamed) = view.shown() else { return };
+        let Some(streamed) = view.visual() else { return };
         self.streamed.push((view.tick(), streamed.q.clone()));
-        let Some(own) = view.own_hand() else { return };
+        let Some(own) = view.predicted_hand() else { return };
         if self.own.last().is_none_or(|last| last.0 < own.tick()) {
-            self.own.push((own.tick(), own.shown().q.clone()));
+            self.own.push((own.tick(), own.visual().q.clone()));
             self.waiting.push((own.tick(), streamed.q.clone()));
         }
     }

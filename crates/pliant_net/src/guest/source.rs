@@ -5,7 +5,7 @@ use std::time::{Duration, Instant};
 
 use bytes::Bytes;
 use pliant_modal::ModalModel;
-use pliant_stream::{Channel, EndReason, Output, PeerId};
+use pliant_stream::{Channel, DisconnectReason, Output, PeerId};
 use tracing::debug;
 
 use crate::recording::{Record, Recorder, Recording};
@@ -13,7 +13,7 @@ use crate::scene;
 use crate::transport::{CloseReason, Endpoint, Event, PeerStats, Role};
 
 /// The guest's end of the line.
-pub(crate) enum Line {
+pub(crate) enum Source {
     Quic { endpoint: Endpoint, recorder: Option<Recorder> },
     Replay { recording: Recording, max_datagram: usize, over: bool },
 }
@@ -26,7 +26,7 @@ pub(crate) enum Came {
     Closed { reason: CloseReason },
 }
 
-impl Line {
+impl Source {
     pub(crate) fn replay(recording: Recording) -> Self {
         Self::Replay { recording, max_datagram: 0, over: false }
     }
@@ -63,7 +63,7 @@ impl Line {
                     let ends = recording.is_over() && !std::mem::replace(over, true);
                     let words = "the recording is over".to_owned();
                     return ends.then_some(Came::Closed {
-                        reason: CloseReason::ByPeer { reason: EndReason::Left, words },
+                        reason: CloseReason::ByPeer { reason: DisconnectReason::Left, words },
                     });
                 };
                 Some(match record {
@@ -77,7 +77,7 @@ impl Line {
                         // One that went on after it has what follows.
                         if recording.is_over() {
                             *over = true;
-                            let reason = CloseReason::ByPeer { reason: EndReason::Left, words };
+                            let reason = CloseReason::ByPeer { reason: DisconnectReason::Left, words };
                             return Some(Came::Closed { reason });
                         }
                         Came::Closed { reason: CloseReason::Failed { words } }
@@ -144,7 +144,7 @@ impl Line {
 
     pub(crate) fn close(&self) {
         if let Self::Quic { endpoint, .. } = self {
-            endpoint.close(PeerId::HOST, EndReason::Left, "goodbye");
+            endpoint.close(PeerId::HOST, DisconnectReason::Left, "goodbye");
         }
     }
 

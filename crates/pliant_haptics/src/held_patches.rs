@@ -5,14 +5,14 @@
 
 use nalgebra::{Matrix3, Vector3};
 
-use crate::{LocalModel, MAX_CONTACTS, ModalLocal, follow::Follow, tool::Tool};
+use crate::{LocalModel, MAX_CONTACTS, ModalLocal, proxy::ProxyExtrapolation, tool::Tool};
 
 /// Time in which one local model's force becomes another's, s.
 const BLEND: f64 = 0.05;
 
 /// Forces before safety, world axes.
 #[derive(Debug, Clone, Copy, Default)]
-pub(crate) struct Felt {
+pub(crate) struct PatchForces {
     pub(crate) elastic: Vector3<f64>,
     pub(crate) damping: Vector3<f64>,
     pub(crate) torque: Vector3<f64>,
@@ -44,12 +44,12 @@ pub(crate) struct When {
 #[derive(Debug, Clone, Copy)]
 struct Slot {
     key: u64,
-    follow: Follow,
+    follow: ProxyExtrapolation,
     share: f64,
 }
 
 #[derive(Debug)]
-pub(crate) struct Held {
+pub(crate) struct HeldPatches {
     slots: [Slot; MAX_CONTACTS],
     count: usize,
     /// Time from nothing of a grab to all of it, s; `None`: at once.
@@ -62,11 +62,11 @@ pub(crate) struct Held {
     swapped: bool,
 }
 
-impl Held {
+impl HeldPatches {
     pub(crate) fn new(ramp: Option<f64>) -> Self {
         let zero = [Vector3::zeros(); 2];
         Self {
-            slots: [Slot { key: 0, follow: Follow::default(), share: 1.0 }; MAX_CONTACTS],
+            slots: [Slot { key: 0, follow: ProxyExtrapolation::default(), share: 1.0 }; MAX_CONTACTS],
             count: 0,
             ramp,
             modal: None,
@@ -104,8 +104,10 @@ impl Held {
             if let Some(j) = known {
                 taken[j] = true;
             }
-            self.slots[i] =
-                known.map_or(Slot { key: contact.key, follow: Follow::default(), share }, |j| before[j]);
+            self.slots[i] = known
+                .map_or(Slot { key: contact.key, follow: ProxyExtrapolation::default(), share }, |j| {
+                    before[j]
+                });
         }
         self.count = contacts.len();
         if self.count == 0 {
@@ -121,8 +123,8 @@ impl Held {
     }
 
     /// The forces of this tick. `well`: the hand's place is to be trusted, so the loop's own body may follow it.
-    pub(crate) fn forces(&mut self, when: When, well: bool, tool: &Tool, model: &LocalModel) -> Felt {
-        let mut felt = Felt { stored: model.stored, ..Felt::default() };
+    pub(crate) fn forces(&mut self, when: When, well: bool, tool: &Tool, model: &LocalModel) -> PatchForces {
+        let mut felt = PatchForces { stored: model.stored, ..PatchForces::default() };
         let stepped = match &mut self.modal {
             Some(modal) if well => {
                 let steps = (when.dt / when.period).round().clamp(1.0, 4.0) as usize;
@@ -167,7 +169,7 @@ impl Held {
         felt
     }
 
-    fn blend(&mut self, felt: &mut Felt, dt: f64) {
+    fn blend(&mut self, felt: &mut PatchForces, dt: f64) {
         if std::mem::take(&mut self.swapped) {
             self.offset = [self.last[0] - felt.elastic - felt.damping, self.last[1] - felt.torque];
             // What was not a number is not to be gone on from.

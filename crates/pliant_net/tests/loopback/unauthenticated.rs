@@ -6,10 +6,10 @@ use std::time::Duration;
 
 use pliant_net::transport::Endpoint;
 
-use crate::patience::{Look, wait_for};
+use crate::wait::{Look, wait_for};
 
 /// A guest made of bare quinn, which can do what ours never does.
-pub struct Stranger {
+pub struct UnauthenticatedPeer {
     pub runtime: tokio::runtime::Runtime,
     pub endpoint: quinn::Endpoint,
 }
@@ -53,7 +53,7 @@ impl rustls::client::danger::ServerCertVerifier for AnyHost {
     }
 }
 
-impl Stranger {
+impl UnauthenticatedPeer {
     pub fn new(alpn: &[u8], key: bool) -> Self {
         let runtime = tokio::runtime::Builder::new_current_thread().enable_all().build().unwrap();
         let provider = Arc::new(rustls::crypto::ring::default_provider());

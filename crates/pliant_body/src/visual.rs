@@ -25,7 +25,7 @@ pub struct Pose {
 /// Lengths: one coordinate per kept mode, kg^1/2 m.
 #[derive(Component, Reflect, Debug)]
 #[reflect(Component, from_reflect = false)]
-pub struct ShownState {
+pub struct VisualState {
     // Their lengths agree; nothing from outside may change one of them.
     #[reflect(ignore)]
     previous: Vec<f64>,
@@ -43,7 +43,7 @@ pub struct ShownState {
     poses: Option<[Pose; 2]>,
 }
 
-impl ShownState {
+impl VisualState {
     pub(crate) fn new(q: &[f64]) -> Self {
         Self {
             previous: q.to_vec(),
@@ -60,7 +60,7 @@ impl ShownState {
     /// Makes `q` the newest state; the picture moves from the one before to it during the coming tick.
     ///
     /// # Errors
-    /// [`BodyError::ShownLength`] when there is not one coordinate per mode, [`BodyError::ShownNotFinite`] when one is NaN or
+    /// [`BodyError::VisualLength`] when there is not one coordinate per mode, [`BodyError::VisualNotFinite`] when one is NaN or
     /// infinite. The state is then as it was.
     pub fn push(&mut self, q: &[f64]) -> Result<(), BodyError> {
         self.check(q)?;
@@ -135,10 +135,10 @@ impl ShownState {
 
     fn check(&self, q: &[f64]) -> Result<(), BodyError> {
         if q.len() != self.current.len() {
-            return Err(BodyError::ShownLength { expected: self.current.len(), found: q.len() });
+            return Err(BodyError::VisualLength { expected: self.current.len(), found: q.len() });
         }
         match q.iter().position(|x| !x.is_finite()) {
-            Some(mode) => Err(BodyError::ShownNotFinite { mode, value: q[mode] }),
+            Some(mode) => Err(BodyError::VisualNotFinite { mode, value: q[mode] }),
             None => Ok(()),
         }
     }
@@ -167,7 +167,7 @@ impl ShownState {
     }
 }
 
-pub(crate) fn begin_tick(mut states: Query<&mut ShownState>) {
+pub(crate) fn begin_tick(mut states: Query<&mut VisualState>) {
     for mut state in &mut states {
         // Not a change that a reader of the component needs to see.
         state.bypass_change_detection().begin_tick();
@@ -178,7 +178,7 @@ pub(crate) fn begin_tick(mut states: Query<&mut ShownState>) {
 pub(crate) fn interpolate(
     fixed: Option<Res<Time<Fixed>>>,
     stepping: Res<Stepping>,
-    mut bodies: Query<(&mut ShownState, &mut BodyState, &mut Transform)>,
+    mut bodies: Query<(&mut VisualState, &mut BodyState, &mut Transform)>,
 ) {
     let fraction = match &fixed {
         Some(fixed) if stepping.fixed => fixed.overstep_fraction_f64().clamp(0.0, 1.0),

@@ -46,7 +46,7 @@ struct OwnGrab {
 
 /// A guest's newer copy of a body that it holds.
 #[derive(Debug)]
-pub struct OwnHand {
+pub struct PredictedHand {
     replica: Replica,
     grabs: Vec<OwnGrab>,
     lead: usize,
@@ -57,7 +57,7 @@ pub struct OwnHand {
     /// The forces over the last step of all hands of `state`, N, world axes.
     means: Vec<Mean>,
     expected: State,
-    shown: State,
+    visual: State,
     blend: Blend,
     /// The confirmed frame of the tick before, where the body is free.
     last_frame: Option<Frame>,
@@ -72,7 +72,7 @@ pub struct OwnHand {
     own: Vec<usize>,
 }
 
-impl OwnHand {
+impl PredictedHand {
     pub(crate) fn new(replica: Replica, blend_ticks: u16) -> Self {
         let (rest, h) = (replica.kernel().at_rest(), replica.kernel().h());
         Self {
@@ -85,7 +85,7 @@ impl OwnHand {
             state: rest.clone(),
             means: Vec::new(),
             expected: rest.clone(),
-            shown: rest,
+            visual: rest,
             blend: Blend::new(h, blend_ticks),
             last_frame: None,
             pose: None,
@@ -110,11 +110,11 @@ impl OwnHand {
     }
 
     /// The body as its holder is to see it: continuous in position and velocity.
-    pub fn shown(&self) -> &State {
-        &self.shown
+    pub fn visual(&self) -> &State {
+        &self.visual
     }
 
-    /// The rigid frame that belongs to [`OwnHand::shown`], where the body is free.
+    /// The rigid frame that belongs to [`PredictedHand::shown`], where the body is free.
     pub fn pose(&self) -> Option<Pose> {
         self.pose
     }
@@ -174,7 +174,7 @@ impl OwnHand {
     /// A tick of the confirmed state has passed. `guess`: the lead to begin with, ticks.
     pub(crate) fn step(&mut self, receiver: &Receiver, user: UserId, guess: usize) {
         let confirmed_frame = receiver.frame().and_then(|p| p.frame(self.replica.model()));
-        if self.state.modes() != receiver.hidden().modes()
+        if self.state.modes() != receiver.confirmed().modes()
             || self.replica.model().is_free() != confirmed_frame.is_some()
         {
             self.active = false;
@@ -201,9 +201,9 @@ impl OwnHand {
         if !self.active {
             self.active = true;
             self.lead = guess.min(REMEMBERED - 1);
-            self.take(receiver.shown());
+            self.take(receiver.visual());
             replica::place(&mut self.state, self.replica.model(), receiver.pose().as_ref());
-            self.shown.clone_from(&self.state);
+            self.visual.clone_from(&self.state);
             self.blend.clear();
             self.pose_blend.clear();
         }
@@ -220,7 +220,7 @@ impl OwnHand {
         }
 
         let mut state = std::mem::take(&mut self.state);
-        state.clone_from(receiver.hidden());
+        state.clone_from(receiver.confirmed());
         if let Some(frame) = confirmed_frame {
             state.frame = frame;
         }
@@ -396,7 +396,7 @@ impl OwnHand {
     /// The guest holds nothing any more: the shown state goes over into the confirmed one.
     fn fall_back(&mut self, receiver: &Receiver) {
         self.blend.advance();
-        let new = receiver.shown();
+        let new = receiver.visual();
         let h = self.replica.kernel().h();
         let old = &self.state;
         self.blend.add(
@@ -416,14 +416,14 @@ impl OwnHand {
         }
         self.show();
         // From here on the confirmed state is followed without new offsets.
-        let offset = self.shown.q.iter().zip(&new.q).map(|(a, b)| (a - b).abs()).fold(0.0, f64::max);
+        let offset = self.visual.q.iter().zip(&new.q).map(|(a, b)| (a - b).abs()).fold(0.0, f64::max);
         let size = new.q.iter().fold(1e-12_f64, |m, q| m.max(q.abs()));
         self.active = offset > 1e-6 * size || !self.pose_blend.is_empty();
     }
 
     fn show(&mut self) {
-        self.shown.clone_from(&self.state);
-        self.blend.apply(&mut self.shown.q, &mut self.shown.v);
+        self.visual.clone_from(&self.state);
+        self.blend.apply(&mut self.visual.q, &mut self.visual.v);
         let pose = self.frame_of(&self.state).map(|frame| Pose::of_frame(self.replica.model(), &frame));
         self.pose = pose.map(|pose| self.pose_blend.apply(&pose));
     }

@@ -6,7 +6,7 @@ use bevy::{
 };
 
 use super::{STEP, app, model, refusals, spawn, state, steps};
-use crate::{Driven, Push, Strike};
+use crate::{Driven, Impulse, Push};
 
 const VERTEX: u32 = 31;
 
@@ -50,8 +50,8 @@ const J: DVec3 = DVec3::new(0.7, -1.1, 0.4);
 fn a_strike_changes_momentum_by_itself_and_spin_by_its_moment() {
     for scale in [1.0, 2.5] {
         changes_by(scale, J, |world, body| {
-            world.write_message(Strike { body, vertex: VERTEX, impulse: 3.0 * J });
-            world.write_message(Strike { body, vertex: VERTEX, impulse: -2.0 * J });
+            world.write_message(Impulse { body, vertex: VERTEX, impulse: 3.0 * J });
+            world.write_message(Impulse { body, vertex: VERTEX, impulse: -2.0 * J });
         });
     }
 }
@@ -81,7 +81,7 @@ fn a_resting_body_is_woken_by_a_blow_or_a_push_and_not_by_a_refused_one() {
         if pushed {
             app.world_mut().write_message(Push { body, vertex: model::tip(), force: up / STEP });
         } else {
-            app.world_mut().write_message(Strike { body, vertex: model::tip(), impulse: up });
+            app.world_mut().write_message(Impulse { body, vertex: model::tip(), impulse: up });
         }
         steps(&mut app, 1);
         assert!(!state(&app, body).is_resting());
@@ -96,7 +96,7 @@ fn a_strike_gives_a_mode_its_shape_times_the_impulse() {
         let mut app = app();
         let body = spawn(&mut app, model::bar(), Transform::from_scale(Vec3::splat(scale)));
         steps(&mut app, 1);
-        app.world_mut().write_message(Strike { body, vertex: model::tip(), impulse: DVec3::Y });
+        app.world_mut().write_message(Impulse { body, vertex: model::tip(), impulse: DVec3::Y });
         steps(&mut app, 1);
         // q'' + 2 zeta w q' + w^2 q = 0 from q' = J phi: exact over the step.
         let w = std::f64::consts::TAU * model::FREQUENCIES[0];
@@ -128,7 +128,7 @@ fn what_cannot_be_struck_is_refused_by_name_and_changes_nothing() {
         (gone, VERTEX, DVec3::Y, "no body"),
     ];
     for (entity, vertex, impulse, word) in wrong {
-        app.world_mut().write_message(Strike { body: entity, vertex, impulse });
+        app.world_mut().write_message(Impulse { body: entity, vertex, impulse });
         steps(&mut app, 2);
         let told = refusals(&mut app);
         assert!(told.len() == 1 && told[0].0 == entity && told[0].1.contains(word), "{word}: {told:?}");
@@ -145,7 +145,7 @@ fn what_cannot_be_struck_is_refused_by_name_and_changes_nothing() {
     steps(&mut app, 3);
     assert_eq!(refusals(&mut app).len(), 1);
     assert_eq!(state(&app, body).body().q(), before.q);
-    app.world_mut().write_message(Strike { body, vertex: VERTEX, impulse: DVec3::Y });
+    app.world_mut().write_message(Impulse { body, vertex: VERTEX, impulse: DVec3::Y });
     steps(&mut app, 1);
     assert!(state(&app, body).body().frame().velocity()[1] > 0.0);
 }

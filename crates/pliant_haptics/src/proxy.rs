@@ -8,7 +8,7 @@ use crate::{Contact, LocalModel};
 const LONGEST: f64 = 0.05;
 
 #[derive(Debug, Clone, Copy, Default)]
-pub(crate) struct Follow {
+pub(crate) struct ProxyExtrapolation {
     tick: u64,
     /// The newest word: where the proxy was, m, and how fast, m/s.
     told: Vector3<f64>,
@@ -21,7 +21,7 @@ pub(crate) struct Follow {
     interval: f64,
 }
 
-impl Follow {
+impl ProxyExtrapolation {
     /// Where the proxy is now (m) and how fast (m/s).
     ///
     /// Told: `p + v t`, for as long as it takes from word to word and no longer. Shown: the same plus what it was off when the last word came, taken out over as
@@ -73,7 +73,7 @@ mod tests {
 
     #[test]
     fn shown_proxy_is_continuous_and_arrives() {
-        let mut follow = Follow::default();
+        let mut follow = ProxyExtrapolation::default();
         let mut model = LocalModel { tick: 1, period: 0.025, count: 1, ..LocalModel::default() };
         let mut last = None::<f64>;
         let mut now = 0.0;
@@ -101,7 +101,7 @@ mod tests {
     fn a_word_every_period_is_taken_at_its_word() {
         // A simulation as fast as the loop, or faster: the proxy moves at 0.1 m/s and says so.
         for period in [1e-3, 0.5e-3] {
-            let mut follow = Follow::default();
+            let mut follow = ProxyExtrapolation::default();
             let mut model = LocalModel { period, count: 1, ..LocalModel::default() };
             for tick in 1..=100u64 {
                 let now = tick as f64 * 1e-3;
@@ -117,7 +117,7 @@ mod tests {
     #[test]
     fn words_that_come_in_bursts_are_carried_on_from_burst_to_burst() {
         // 120 steps a second, told 30 times a second: a proxy at 0.1 m/s is shown moving evenly, not for 8 ms in every 33.
-        let mut follow = Follow::default();
+        let mut follow = ProxyExtrapolation::default();
         let mut model = LocalModel { period: 1.0 / 120.0, count: 1, ..LocalModel::default() };
         let (mut last, mut worst) = (0.0, 0.0f64);
         for k in 0..1000u32 {
