@@ -29,7 +29,7 @@
 //! | [`HapticDevice`] | takes a wrench, holds it for a period, says where the hand is: [`VirtualDevice`], [`Positioned`], [`Replay`], `Inverse`, `OpenHaptics`, `ForceDimension` |
 //! | [`LoopCore`] | a sample and a [`LocalModel`] in, a [`Wrench`] out: no clock, no thread, no allocation |
 //! | [`Cycle`] | the core and a device, period by period: loss and return, calibration, buttons, counters; in real or virtual time |
-//! | [`HapticLoop`] | a cycle on its thread, absolute pacing, FIFO priority where allowed; lock-free ends for the app |
+//! | [`HapticLoop`] | a cycle on its thread, absolute scheduler, FIFO priority where allowed; lock-free ends for the app |
 //! | `HapticsPlugin` | Bevy: devices as a resource, tools and grabs as components (feature `plugin`) |
 //!
 //! # Features
@@ -41,46 +41,36 @@
     allow(clippy::unwrap_used, clippy::expect_used, clippy::panic, reason = "a failed test should panic")
 )]
 
-mod core;
-mod coupling;
-mod cycle;
+mod control_loop;
 mod device;
-mod find;
-mod hand;
-mod held_patches;
-mod histogram;
-#[cfg(feature = "inverse")]
-mod inverse;
-mod local;
-mod modal_local;
-mod pacing;
 #[cfg(feature = "plugin")]
 mod plugin;
-mod positioned;
-mod proxy;
-mod record;
-mod runner;
 mod safety;
-mod tool;
-mod validation;
 #[cfg(feature = "vendor")]
 mod vendor;
-mod virtual_device;
 
-pub use core::{LoopConfig, LoopCore, StartError, Tick};
-pub use coupling::{Coupling, CouplingConfig, CouplingLimit};
-pub use cycle::{Cycle, LoopEvent, LoopReport, LoopState, Record, Sink};
-pub use device::{
-    Calibration, DeviceInfo, Fault, HapticDevice, InfoError, Pacing, Period, Sample, VibrationOutput, Wrench,
+pub use control_loop::core::{LoopConfig, LoopCore, StartError, Tick};
+pub use control_loop::coupling::{Coupling, CouplingConfig, CouplingLimit};
+pub use control_loop::cycle::{Cycle, LoopEvent, LoopReport, LoopState, Record, Sink};
+pub use control_loop::histogram::Histogram;
+pub use control_loop::local_body::ModalLocal;
+pub use control_loop::local_model::{
+    Contact, HeldGrab, LocalModel, MAX_CONTACTS, ModelWriter, PublishedGrab,
 };
-pub use find::{FindConfig, Found, OpenError, find_devices};
-pub use hand::Hand;
-pub use histogram::Histogram;
+pub use control_loop::runner::{HapticLoop, StopSwitch};
+pub use control_loop::scheduler::{LoopClock, RealScheduler, VirtualScheduler};
+pub use control_loop::tool::ToolMap;
+pub use device::find::{FindConfig, Found, OpenError, find_devices};
+pub use device::hand::Hand;
 #[cfg(feature = "inverse")]
-pub use inverse::{Inverse, InverseConfig, InverseError, Spelling};
-pub use local::{Contact, HeldGrab, LocalModel, MAX_CONTACTS, ModelWriter, PublishedGrab};
-pub use modal_local::ModalLocal;
-pub use pacing::{LoopClock, RealPacing, VirtualPacing};
+pub use device::inverse::{Inverse, InverseConfig, InverseError, Spelling};
+pub use device::positioned::{Positioned, PositionedHandle};
+pub use device::record::{RecordError, Recorder, Replay};
+pub use device::virtual_device::{VirtualConfig, VirtualDevice, VirtualHandle};
+pub use device::{
+    Calibration, DeviceInfo, Fault, HapticDevice, InfoError, Pacing, Period, Sample, Scheduler,
+    VibrationOutput, Wrench,
+};
 #[cfg(feature = "render")]
 pub use plugin::ForceArrow;
 #[cfg(feature = "gamepad")]
@@ -93,14 +83,9 @@ pub use plugin::{
 };
 #[cfg(feature = "rumble")]
 pub use plugin::{GamepadVibration, Rumble, ToolRumble};
-pub use positioned::{Positioned, PositionedHandle};
-pub use record::{RecordError, Recorder, Replay};
-pub use runner::{HapticLoop, StopSwitch};
 pub use safety::{
     Allowed, Gain, Passivity, PassivityConfig, Port, Safety, SafetyConfig, Slew, StaleConfig, Thermal,
     ThermalConfig, VelocityCutConfig, Wanted, cap_damping, clamp_magnitude, stable_damping,
 };
-pub use tool::ToolMap;
 #[cfg(feature = "vendor")]
 pub use vendor::{ForceDimension, ForceDimensionConfig, OpenHaptics, OpenHapticsConfig, VendorError};
-pub use virtual_device::{VirtualConfig, VirtualDevice, VirtualHandle};

@@ -76,9 +76,9 @@ fn ticks(modal: bool, least: &mut [f64], yardstick: &mut f64) -> u64 {
     for (k, least) in least.iter_mut().enumerate() {
         let word = &mut words[k / 8 % 64];
         word.tick = 1_000_000 + (k / 8) as u64;
-        word.stamp = scene.pacing.now();
+        word.stamp = scene.scheduler.now();
         let begun = cpu_time();
-        scene.cycle.step(&mut scene.pacing, word, &mut events as &mut Vec<LoopEvent>);
+        scene.cycle.step(&mut scene.scheduler, word, &mut events as &mut Vec<LoopEvent>);
         *least = least.min(cpu_time() - begun);
         if k % 100 == 0 {
             let begun = cpu_time();

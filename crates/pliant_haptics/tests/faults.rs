@@ -14,7 +14,7 @@ use std::{
 
 use pliant_haptics::{
     Calibration, Cycle, DeviceInfo, Fault, Hand, HapticDevice, HapticLoop, LoopConfig, LoopEvent, LoopReport,
-    LoopState, Pacing, SafetyConfig, Sample, VirtualConfig, VirtualDevice, VirtualPacing, Wrench,
+    LoopState, SafetyConfig, Sample, Scheduler, VirtualConfig, VirtualDevice, VirtualScheduler, Wrench,
 };
 use rig::{
     Rig, machine,
@@ -106,7 +106,7 @@ fn simulation_late_by_a_second() {
 #[test]
 fn breakpoint_in_the_whole_process() {
     let mut scene = holding();
-    scene.pacing.stall(3.0);
+    scene.scheduler.stall(3.0);
     scene.tick();
     assert!(has(&scene, |f| matches!(f, Fault::Stalled(t) if *t > 2.9)));
     scene.run(1.0);
@@ -127,7 +127,7 @@ fn a_word_that_is_not_a_number() {
         bad.tick += 1_000_000;
         bad.contacts[0].proxy[1] = f64::NAN;
         let good = std::mem::replace(&mut scene.model, bad);
-        scene.cycle.step(&mut scene.pacing, &scene.model, &mut scene.events);
+        scene.cycle.step(&mut scene.scheduler, &scene.model, &mut scene.events);
         scene.model = good;
         assert!(scene.cycle.core().last().wrench.force.iter().all(|x| x.is_finite()));
     }
@@ -175,11 +175,11 @@ impl HapticDevice for Liar {
     fn calibration(&mut self) -> Calibration {
         self.inner.calibration()
     }
-    fn exchange(&mut self, wrench: &Wrench, pacing: &mut dyn Pacing) -> Result<Sample, Fault> {
+    fn exchange(&mut self, wrench: &Wrench, scheduler: &mut dyn Scheduler) -> Result<Sample, Fault> {
         if self.lie.get() == Lie::ErrorAtOnce {
             return Err(Fault::Driver(7));
         }
-        let sample = self.inner.exchange(wrench, pacing)?;
+        let sample = self.inner.exchange(wrench, scheduler)?;
         match self.lie.get() {
             Lie::NotANumber => Ok(Sample { position: [f64::NAN; 3], ..sample }),
             Lie::Elsewhere => {
@@ -207,7 +207,7 @@ fn told(lie: Lie, ticks: usize) -> (Cycle<Liar>, Vec<LoopEvent>, f64, f64) {
     let mut cycle =
         Cycle::new(Liar { inner: device, lie: Cell::new(Lie::None) }, LoopConfig::default()).unwrap();
     let mut rig = Rig::bare(VirtualConfig::default(), Hand::NONE);
-    let mut pacing = VirtualPacing::new(1000.0);
+    let mut scheduler = VirtualScheduler::new(1000.0);
     let mut events = Vec::new();
     let (mut last, mut step) = ([0.0f64; 3], 0.0f64);
     let mut lowest = f64::INFINITY;
@@ -215,7 +215,7 @@ fn told(lie: Lie, ticks: usize) -> (Cycle<Liar>, Vec<LoopEvent>, f64, f64) {
         let lying = (1000..1000 + ticks).contains(&k);
         cycle.device().lie.set(if lying { lie } else { Lie::None });
         rig.spring(200.0, 0.0);
-        cycle.step(&mut pacing, &rig.model, &mut events);
+        cycle.step(&mut scheduler, &rig.model, &mut events);
         let force = cycle.core().last().wrench.force;
         step = step.max((0..3).map(|i| (force[i] - last[i]).powi(2)).sum::<f64>().sqrt());
         last = force;
@@ -245,7 +245,7 @@ fn a_velocity_that_overflows() {
         assert!(cycle.core().last().wrench.force[0] < -1.0, "and back: {:?}", cycle.core().last().wrench);
         assert!(step <= slew_per_tick() * 1.000_001, "{step}");
         cycle.emergency_stop();
-        cycle.step(&mut VirtualPacing::new(1000.0), &pliant_haptics::LocalModel::default(), &mut ());
+        cycle.step(&mut VirtualScheduler::new(1000.0), &pliant_haptics::LocalModel::default(), &mut ());
         assert_eq!(cycle.core().last().wrench, Wrench::ZERO);
     }
 }
@@ -287,8 +287,8 @@ fn a_real_device_is_not_run_without_its_safety() {
         fn info(&self) -> DeviceInfo {
             DeviceInfo { simulated: false, ..self.0.info() }
         }
-        fn exchange(&mut self, wrench: &Wrench, pacing: &mut dyn Pacing) -> Result<Sample, Fault> {
-            self.0.exchange(wrench, pacing)
+        fn exchange(&mut self, wrench: &Wrench, scheduler: &mut dyn Scheduler) -> Result<Sample, Fault> {
+            self.0.exchange(wrench, scheduler)
         }
         fn safe_stop(&mut self) {}
     }
@@ -315,9 +315,9 @@ impl HapticDevice for Bomb {
     fn info(&self) -> DeviceInfo {
         self.inner.info()
     }
-    fn exchange(&mut self, wrench: &Wrench, pacing: &mut dyn Pacing) -> Result<Sample, Fault> {
+    fn exchange(&mut self, wrench: &Wrench, scheduler: &mut dyn Scheduler) -> Result<Sample, Fault> {
         assert!(!self.panic.load(Ordering::Acquire), "the driver's own bug, on purpose");
-        self.inner.exchange(wrench, pacing)
+        self.inner.exchange(wrench, scheduler)
     }
     fn safe_stop(&mut self) {
         self.inner.safe_stop();

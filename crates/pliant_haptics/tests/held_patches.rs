@@ -10,7 +10,8 @@ use std::sync::{
 
 use pliant_haptics::{
     Contact, Cycle, DeviceInfo, Fault, Hand, HapticDevice, LocalModel, LoopConfig, LoopCore, LoopEvent,
-    LoopState, ModalLocal, Pacing, SafetyConfig, Sample, VirtualConfig, VirtualDevice, VirtualPacing, Wrench,
+    LoopState, ModalLocal, SafetyConfig, Sample, Scheduler, VirtualConfig, VirtualDevice, VirtualScheduler,
+    Wrench,
 };
 use pliant_modal::{BodyConfig, StepSettings};
 use rig::scene::{Scene, SceneConfig};
@@ -139,8 +140,8 @@ impl HapticDevice for Changeling {
             _ => DeviceInfo { serial: "weaker".into(), max_stiffness: 100.0, ..info },
         }
     }
-    fn exchange(&mut self, wrench: &Wrench, pacing: &mut dyn Pacing) -> Result<Sample, Fault> {
-        self.inner.exchange(wrench, pacing)
+    fn exchange(&mut self, wrench: &Wrench, scheduler: &mut dyn Scheduler) -> Result<Sample, Fault> {
+        self.inner.exchange(wrench, scheduler)
     }
     fn safe_stop(&mut self) {
         self.inner.safe_stop();
@@ -160,10 +161,10 @@ fn another_device_gets_the_copy_or_it_is_handed_back() {
         let mut cycle = Cycle::new(device, LoopConfig::default()).unwrap();
         let copy = ModalLocal::new(&scene.body, &[scene.held], 1.0, 1000.0).unwrap();
         assert!(cycle.set_modal(Some(Box::new(copy))).is_none());
-        let (mut pacing, mut events) = (VirtualPacing::new(1000.0), Vec::<LoopEvent>::new());
+        let (mut scheduler, mut events) = (VirtualScheduler::new(1000.0), Vec::<LoopEvent>::new());
         let mut run = |cycle: &mut Cycle<Changeling>| {
             for _ in 0..1500 {
-                cycle.step(&mut pacing, &LocalModel::default(), &mut events);
+                cycle.step(&mut scheduler, &LocalModel::default(), &mut events);
             }
             cycle.report().state
         };

@@ -14,7 +14,7 @@ use std::{
 
 use pliant_haptics::{
     Cycle, Fault, HapticDevice, Inverse, InverseConfig, InverseError, LocalModel, LoopConfig, LoopEvent,
-    RealPacing, Sample, Spelling, VirtualPacing, Wrench,
+    RealScheduler, Sample, Spelling, VirtualScheduler, Wrench,
 };
 use serde_json::{Value, json};
 use tungstenite::{Message, WebSocket, accept};
@@ -200,8 +200,8 @@ fn check(text: &str, new: bool, first: bool) -> Result<[f64; 3], String> {
     Ok([number("x")?, number("y")?, number("z")?])
 }
 
-fn pacing() -> RealPacing {
-    RealPacing::new(pliant_haptics::LoopClock::start(), 1000.0)
+fn pacing() -> RealScheduler {
+    RealScheduler::new(pliant_haptics::LoopClock::start(), 1000.0)
 }
 
 fn second(config: InverseConfig) -> InverseConfig {
@@ -257,13 +257,13 @@ fn the_loop_feels_a_spring_through_it() {
     let device = Inverse::open(second(service.config())).unwrap();
     let mut cycle = Cycle::new(device, LoopConfig::default()).unwrap();
     // In virtual time: an answer is in time however long a busy machine takes for it.
-    let mut pacing = VirtualPacing::new(1000.0);
+    let mut scheduler = VirtualScheduler::new(1000.0);
     let mut events: Vec<LoopEvent> = Vec::new();
     let mut model = LocalModel { count: 1, period: 0.01, ..LocalModel::default() };
     model.contacts[0].stiffness = [[100.0, 0.0, 0.0], [0.0, 100.0, 0.0], [0.0, 0.0, 100.0]];
     let mut step = |cycle: &mut Cycle<Inverse>, events: &mut Vec<LoopEvent>| {
         model.tick += 1;
-        cycle.step(&mut pacing, &model, events);
+        cycle.step(&mut scheduler, &model, events);
         cycle.core().last().wrench.force[0]
     };
     for _ in 0..400 {
@@ -301,8 +301,8 @@ fn nonsense_and_silence() {
     let service = Service::start(true);
     let config = second(service.config());
     let mut device = Inverse::open(config.clone()).unwrap();
-    let mut pacing = pacing();
-    assert!(device.exchange(&Wrench::ZERO, &mut pacing).is_ok());
+    let mut scheduler = pacing();
+    assert!(device.exchange(&Wrench::ZERO, &mut scheduler).is_ok());
     for (nonsense, want) in [
         ("not json", Fault::Malformed),
         ("{\"inverse3\": 3}", Fault::Gone),
@@ -314,14 +314,14 @@ fn nonsense_and_silence() {
         ),
     ] {
         service.desk().say = Some(nonsense.into());
-        assert_eq!(device.exchange(&Wrench::ZERO, &mut pacing).unwrap_err(), want, "{nonsense}");
+        assert_eq!(device.exchange(&Wrench::ZERO, &mut scheduler).unwrap_err(), want, "{nonsense}");
     }
     service.desk().say = None;
     drop(device);
     let mut device = hasty(&service);
     assert!(answer(&mut device).position[0].abs() < 1e-9);
     service.desk().mute = true;
-    assert_eq!(device.exchange(&Wrench::ZERO, &mut pacing).unwrap_err(), Fault::Timeout(HASTE));
+    assert_eq!(device.exchange(&Wrench::ZERO, &mut scheduler).unwrap_err(), Fault::Timeout(HASTE));
     drop(device);
     service.desk().mute = false;
     let missing = Inverse::open(InverseConfig { device: Some("FFFF".into()), ..config });

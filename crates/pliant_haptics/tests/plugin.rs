@@ -381,10 +381,10 @@ fn a_driver_that_panics_is_told_and_lets_go() {
         fn exchange(
             &mut self,
             wrench: &pliant_haptics::Wrench,
-            pacing: &mut dyn pliant_haptics::Pacing,
+            scheduler: &mut dyn pliant_haptics::Scheduler,
         ) -> Result<pliant_haptics::Sample, Fault> {
             assert!(!self.1.load(std::sync::atomic::Ordering::Acquire), "the driver's own bug, on purpose");
-            self.0.exchange(wrench, pacing)
+            self.0.exchange(wrench, scheduler)
         }
         fn safe_stop(&mut self) {
             self.0.safe_stop();

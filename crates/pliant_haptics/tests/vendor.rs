@@ -13,7 +13,7 @@ use std::{
 use libloading::Library;
 use pliant_haptics::{
     Calibration, Cycle, Fault, ForceDimension, ForceDimensionConfig, HapticDevice, LocalModel, LoopClock,
-    LoopConfig, LoopEvent, LoopState, OpenHaptics, OpenHapticsConfig, Pacing, Period, RealPacing,
+    LoopConfig, LoopEvent, LoopState, OpenHaptics, OpenHapticsConfig, Period, RealScheduler, Scheduler,
     VendorError, Wrench,
 };
 
@@ -66,8 +66,8 @@ fn force(library: &Library) -> [f64; 3] {
     [out[0], out[1], out[2]]
 }
 
-fn pacing() -> RealPacing {
-    RealPacing::new(LoopClock::start(), 1000.0)
+fn pacing() -> RealScheduler {
+    RealScheduler::new(LoopClock::start(), 1000.0)
 }
 
 fn hd(path: &Path) -> OpenHapticsConfig {
@@ -78,7 +78,7 @@ fn hd(path: &Path) -> OpenHapticsConfig {
 #[derive(Default)]
 struct Quick(Period);
 
-impl Pacing for Quick {
+impl Scheduler for Quick {
     fn wait(&mut self) -> Period {
         self.0 = Period { now: self.0.now + 1e-3, dt: 1e-3, ..Period::default() };
         self.0
@@ -156,21 +156,21 @@ fn open_haptics_calibration_fault_and_return() {
     let device = OpenHaptics::open(hd(&path)).unwrap();
     let mut cycle = Cycle::new(device, LoopConfig::default()).unwrap();
     let mut events: Vec<LoopEvent> = Vec::new();
-    let mut pacing = Quick::default();
+    let mut scheduler = Quick::default();
     let mut model = LocalModel { count: 1, period: 0.01, ..LocalModel::default() };
     model.contacts[0].stiffness = [[100.0, 0.0, 0.0], [0.0, 100.0, 0.0], [0.0, 0.0, 100.0]];
     place(&library, [5.0, 0.0, 0.0], 0.0);
     let mut ticks = 0;
     let mut run = |cycle: &mut Cycle<OpenHaptics>, events: &mut Vec<LoopEvent>, seconds: f64| {
-        let start = (pacing.last().now, ticks);
-        let until = pacing.last().now + seconds;
-        while pacing.last().now < until {
+        let start = (scheduler.last().now, ticks);
+        let until = scheduler.last().now + seconds;
+        while scheduler.last().now < until {
             model.tick += 1;
             // The real scheduler waits for its servo tick; the fake does not, and the loop must not spin on it.
-            cycle.step(&mut pacing, &model, events);
+            cycle.step(&mut scheduler, &model, events);
             ticks += 1;
         }
-        let rate = f64::from(ticks - start.1) / (pacing.last().now - start.0);
+        let rate = f64::from(ticks - start.1) / (scheduler.last().now - start.0);
         assert!(rate < 2500.0, "at most every other period is short: {rate} Hz");
     };
     run(&mut cycle, &mut events, 0.1);
@@ -264,14 +264,14 @@ fn force_dimension_faults_and_versions() {
     assert!(matches!(device.calibration(), Calibration::Needed(_)));
     call!(library, "fake_reset", fn(c_int), 1);
     assert_eq!(device.calibration(), Calibration::Ready);
-    let mut pacing = pacing();
+    let mut scheduler = pacing();
     call!(library, "fake_gone", fn(c_int), 1);
-    assert_eq!(device.exchange(&Wrench::ZERO, &mut pacing).unwrap_err(), Fault::Driver(1009));
+    assert_eq!(device.exchange(&Wrench::ZERO, &mut scheduler).unwrap_err(), Fault::Driver(1009));
     assert_eq!(device.reopen().unwrap_err(), Fault::Gone);
-    assert_eq!(device.exchange(&Wrench::ZERO, &mut pacing).unwrap_err(), Fault::Gone);
+    assert_eq!(device.exchange(&Wrench::ZERO, &mut scheduler).unwrap_err(), Fault::Gone);
     call!(library, "fake_gone", fn(c_int), 0);
     assert!(device.reopen().is_ok());
-    assert!(device.exchange(&Wrench::ZERO, &mut pacing).is_ok());
+    assert!(device.exchange(&Wrench::ZERO, &mut scheduler).is_ok());
     drop(device);
     let absent = ForceDimension::open(ForceDimensionConfig { index: 3, ..dhd(&path) });
     assert!(matches!(absent, Err(VendorError::Device { code: 1003, .. })), "{absent:?}");

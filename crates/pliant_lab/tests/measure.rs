@@ -325,7 +325,7 @@ fn a_lost_release_or_grab_makes_no_spike() {
 #[ignore = "a timing: means something with --release only"]
 fn cost_of_a_tick() {
     use pliant_modal::{Body, BodyConfig, GrabConfig, Patch};
-    use pliant_stream::encoder::Encoder;
+    use pliant_stream::codec::encoder::Encoder;
     use pliant_stream::recovery::Receiver;
     use pliant_stream::wire::Datagram;
     use pliant_stream::{BodyId, GrabKey, GrabState, StepSettings, TickState, UserId};

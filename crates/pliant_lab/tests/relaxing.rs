@@ -7,8 +7,8 @@ use std::time::Duration;
 
 use pliant_lab::experiment::Experiment;
 use pliant_modal::{Body, BodyConfig, GrabConfig, Integrator, Patch, Relaxation};
+use pliant_stream::codec::encoder::Encoder;
 use pliant_stream::emulator::{LinkConfig, Loss, Preset};
-use pliant_stream::encoder::Encoder;
 use pliant_stream::peer::Repair;
 use pliant_stream::recovery::Receiver;
 use pliant_stream::wire::Datagram;

@@ -65,8 +65,7 @@
 //! | [`session`] | [`HostSession`] and [`GuestSession`]: hello, models by hash, snapshot, streaming, resync, goodbye |
 //! | [`peer`] | peer to peer: every peer steps, only targets cross, late ones are stepped again |
 //! | [`recovery`] | what a receiver does about loss: the paper's prediction and compensation, and the force-driven way |
-//! | [`encoder`] | frames in a closed loop: rounding does not add up |
-//! | [`quanta`] | how coarse each mode may be |
+//! | [`codec`] | frames in a closed loop, so that rounding does not add up; how coarse each mode may be |
 //! | [`wire`] | the bytes; every parser takes anything |
 //! | [`emulator`] | a seeded bad network |
 //! | [`newmark`] | the identities that make compensation exact |
@@ -76,16 +75,14 @@
     allow(clippy::unwrap_used, clippy::expect_used, clippy::panic, reason = "a failed test should panic")
 )]
 
-pub mod check;
 pub mod clock;
+pub mod codec;
 pub mod emulator;
-pub mod encoder;
 mod error;
 mod link;
 pub mod newmark;
 pub mod peer;
 pub mod playout;
-pub mod quanta;
 pub mod recovery;
 mod replica;
 pub mod session;

@@ -12,7 +12,7 @@ use pliant_stream::peer::{
     HeldAt, InputTick, PeerBodyState, PeerDatagram, PeerFrame, PeerGrip, PeerMessage, StateCheck,
 };
 
-use pliant_stream::quanta::Quanta;
+use pliant_stream::codec::quantization::Quanta;
 use pliant_stream::wire::{
     AccelerationCoding, Accelerations, BodyInfo, Clock, Datagram, Frame, FrameGrab, GuestMessage,
     HostMessage, Nack, NackRun, Repeat, RepeatGrab, Report, Slice, SliceEntry, SnapshotBytes, TargetEntry,

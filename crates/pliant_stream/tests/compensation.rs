@@ -1,7 +1,7 @@
 //! The paper's compensation against direct integration.
 #![allow(clippy::unwrap_used, clippy::expect_used, clippy::panic, reason = "a failed test should panic")]
 
-use pliant_stream::quanta::Quanta;
+use pliant_stream::codec::quantization::Quanta;
 use pliant_stream::recovery::{AccelerationDriven, History, Recovery};
 use pliant_stream::wire::{Accelerations, Frame};
 use pliant_stream::{BodyId, Newmark, Predict, State};

@@ -3,8 +3,8 @@
 
 mod support;
 
-use pliant_stream::encoder::Encoder;
-use pliant_stream::quanta::Quanta;
+use pliant_stream::codec::encoder::Encoder;
+use pliant_stream::codec::quantization::Quanta;
 use pliant_stream::recovery::History;
 use pliant_stream::wire::Datagram;
 use pliant_stream::{

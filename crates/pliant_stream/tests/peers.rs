@@ -300,7 +300,7 @@ fn compensation_puts_the_history_right_with_the_state_of_now() {
 /// What `check` has to say of a body that agrees.
 fn agreeing(p: &PeerSession, body: BodyId) -> StateCheck {
     let tick = p.confirmed();
-    let value = pliant_stream::check::checksum(tick, p.state_at(body, tick).unwrap()) as f32;
+    let value = pliant_stream::codec::checksum::checksum(tick, p.state_at(body, tick).unwrap()) as f32;
     StateCheck { body, tick, value }
 }
 

@@ -101,7 +101,8 @@ impl SafetyConfig {
 /// Most damping on a measured velocity that `device` closes at `rate` (Hz) with `delay` (s) beyond its own, N s/m: a third of `M / lag`, the lag being
 /// the period, the delays, and half of the window that a velocity is taken from.
 pub fn stable_damping(device: &DeviceInfo, rate: f64, delay: f64) -> f64 {
-    let window = if device.resolution > 0.0 { 0.5 * crate::validation::WINDOW as f64 } else { 0.0 };
+    let window =
+        if device.resolution > 0.0 { 0.5 * crate::control_loop::validation::WINDOW as f64 } else { 0.0 };
     device.mass / 3.0 / ((1.0 + window) / rate + device.delay + delay.max(0.0))
 }
 

@@ -12,7 +12,7 @@ use libloading::Library;
 use nalgebra::{Matrix3, Rotation3, UnitQuaternion};
 
 use super::{VendorError, functions, load, text};
-use crate::{Calibration, DeviceInfo, Fault, HapticDevice, Pacing, Sample, Wrench};
+use crate::{Calibration, DeviceInfo, Fault, HapticDevice, Sample, Scheduler, Wrench};
 
 functions! {
     /// DHD, as dhdc.h declares it.
@@ -247,16 +247,16 @@ impl HapticDevice for ForceDimension {
         }
     }
 
-    fn exchange(&mut self, wrench: &Wrench, pacing: &mut dyn Pacing) -> Result<Sample, Fault> {
+    fn exchange(&mut self, wrench: &Wrench, scheduler: &mut dyn Scheduler) -> Result<Sample, Fault> {
         let Some(id) = self.id else {
-            pacing.wait();
+            scheduler.wait();
             return Err(Fault::Gone);
         };
         let [fx, fy, fz] = to_device(wrench.force);
         let [tx, ty, tz] = to_device(wrench.torque);
         // SAFETY: plain values.
         let set = unsafe { (self.api.wrench)(fx, fy, fz, tx, ty, tz, id) };
-        pacing.wait();
+        scheduler.wait();
         self.check(set)?;
         let (mut p, mut v) = ([f64::NAN; 3], [0.0f64; 3]);
         let mut frame = [[0.0f64; 3]; 3];

@@ -13,7 +13,7 @@ use libloading::Library;
 use nalgebra::{Matrix3, Rotation3, UnitQuaternion};
 
 use super::{VendorError, functions, load, text};
-use crate::{Calibration, DeviceInfo, Fault, HapticDevice, Pacing, Sample, Wrench};
+use crate::{Calibration, DeviceInfo, Fault, HapticDevice, Pacing, Sample, Scheduler, Wrench};
 
 /// Handle of a device.
 type Handle = c_uint;
@@ -359,9 +359,9 @@ impl HapticDevice for OpenHaptics {
         }
     }
 
-    fn exchange(&mut self, wrench: &Wrench, pacing: &mut dyn Pacing) -> Result<Sample, Fault> {
+    fn exchange(&mut self, wrench: &Wrench, scheduler: &mut dyn Scheduler) -> Result<Sample, Fault> {
         let sample = self.frame(wrench.force);
-        pacing.note();
+        scheduler.note();
         sample
     }
 

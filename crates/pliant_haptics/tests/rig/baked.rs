@@ -17,7 +17,7 @@ pub fn pip() -> ModalModel {
 pub fn made_of(model: &ModalModel, young: f64, size: f64) -> ModalModel {
     let parts = model.parts();
     let (s, e) = (size / model.size(), young / parts.info.young);
-    let pacing = e.sqrt() / s;
+    let scheduler = e.sqrt() / s;
     let scaled = |values: &[f32], by: f64| values.iter().map(|x| (f64::from(*x) * by) as f32).collect();
     let surface = &parts.surface;
     let positions = surface.positions().iter().map(|p| p.map(|x| (f64::from(x) * s) as f32)).collect();
@@ -26,8 +26,8 @@ pub fn made_of(model: &ModalModel, young: f64, size: f64) -> ModalModel {
         info: pliant_modal::BakeInfo { young, ..parts.info.clone() },
         surface: SurfaceMesh::new(positions, surface.triangles().to_vec(), None, surface.anchored().to_vec())
             .unwrap(),
-        omega: parts.omega.iter().map(|w| w * pacing).collect(),
-        damping: parts.damping.iter().map(|c| c * pacing).collect(),
+        omega: parts.omega.iter().map(|w| w * scheduler).collect(),
+        damping: parts.damping.iter().map(|c| c * scheduler).collect(),
         displacement: scaled(&parts.displacement, s.powf(-1.5)),
         rotation: scaled(&parts.rotation, s.powf(-2.5)),
         participation: parts.participation.iter().map(|p| p.map(|x| x * s.powf(1.5))).collect(),

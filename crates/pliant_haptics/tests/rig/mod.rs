@@ -8,12 +8,12 @@ pub mod scene;
 
 use pliant_haptics::{
     Contact, CouplingConfig, Cycle, Hand, LocalModel, LoopConfig, LoopEvent, SafetyConfig, VirtualConfig,
-    VirtualDevice, VirtualPacing,
+    VirtualDevice, VirtualScheduler,
 };
 
 pub struct Rig {
     pub cycle: Cycle<VirtualDevice>,
-    pub pacing: VirtualPacing,
+    pub scheduler: VirtualScheduler,
     pub model: LocalModel,
     pub events: Vec<LoopEvent>,
 }
@@ -24,7 +24,7 @@ impl Rig {
         let rate = config.rate;
         Self {
             cycle: Cycle::new(device, config).unwrap(),
-            pacing: VirtualPacing::new(rate),
+            scheduler: VirtualScheduler::new(rate),
             model: LocalModel::default(),
             events: Vec::new(),
         }
@@ -52,7 +52,7 @@ impl Rig {
     /// One period in which the simulation says the same again: a spring of `stiffness` to the middle, with `damping`.
     pub fn spring(&mut self, stiffness: f64, damping: f64) {
         self.model.tick += 1;
-        self.model.stamp = self.pacing.now();
+        self.model.stamp = self.scheduler.now();
         self.model.period = 1e-3;
         self.model.count = 1;
         let k = stiffness;
@@ -66,6 +66,6 @@ impl Rig {
 
     /// One period in which the simulation says nothing new.
     pub fn step(&mut self) {
-        self.cycle.step(&mut self.pacing, &self.model, &mut self.events);
+        self.cycle.step(&mut self.scheduler, &self.model, &mut self.events);
     }
 }

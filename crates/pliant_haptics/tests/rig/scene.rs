@@ -4,7 +4,7 @@ use std::{collections::VecDeque, sync::Arc};
 
 use pliant_haptics::{
     Cycle, Hand, HeldGrab, LocalModel, LoopConfig, LoopEvent, ModalLocal, ModelWriter, ToolMap,
-    VirtualConfig, VirtualDevice, VirtualHandle, VirtualPacing,
+    VirtualConfig, VirtualDevice, VirtualHandle, VirtualScheduler,
 };
 use pliant_modal::{Body, BodyConfig, ModalModel, Patch};
 
@@ -19,7 +19,7 @@ pub struct Scene {
     writer: ModelWriter,
     pub cycle: Cycle<VirtualDevice>,
     pub hand: VirtualHandle,
-    pub pacing: VirtualPacing,
+    pub scheduler: VirtualScheduler,
     pub model: LocalModel,
     pub events: Vec<LoopEvent>,
     step: f64,
@@ -112,7 +112,7 @@ impl Scene {
             writer: ModelWriter::new(),
             cycle,
             hand,
-            pacing: VirtualPacing::new(c.rate),
+            scheduler: VirtualScheduler::new(c.rate),
             model: LocalModel::default(),
             events: Vec::new(),
             step,
@@ -130,7 +130,7 @@ impl Scene {
 
     /// One period of the loop, and of everything that falls into it.
     pub fn tick(&mut self) {
-        let now = self.pacing.now();
+        let now = self.scheduler.now();
         let newest = self.cycle.core().last();
         self.targets.push_back((now + self.one_way, newest.now, newest.tool));
         while now >= self.next_step - 1e-12 {
@@ -155,7 +155,7 @@ impl Scene {
         while self.models.front().is_some_and(|(at, _)| *at <= now) {
             self.model = self.models.pop_front().unwrap().1;
         }
-        self.cycle.step(&mut self.pacing, &self.model, &mut self.events);
+        self.cycle.step(&mut self.scheduler, &self.model, &mut self.events);
         let force = self.cycle.core().last().wrench.force;
         let change: f64 = force.iter().zip(self.last_force).map(|(a, b)| (a - b).powi(2)).sum();
         self.largest_step = self.largest_step.max(change.sqrt());

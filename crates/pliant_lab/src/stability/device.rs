@@ -4,7 +4,7 @@ use std::{collections::VecDeque, sync::Arc};
 
 use pliant_haptics::{
     Contact, Cycle, Hand, HeldGrab, LocalModel, LoopConfig, LoopEvent, ModelWriter, SafetyConfig, ToolMap,
-    VirtualConfig, VirtualDevice, VirtualPacing,
+    VirtualConfig, VirtualDevice, VirtualScheduler,
 };
 use pliant_modal::{Body, BodyConfig, GrabConfig};
 
@@ -45,7 +45,7 @@ pub(super) fn cases(out: &mut Vec<Case>) {
 fn calms(device: &VirtualConfig, k: f64) -> Result<bool, LabError> {
     let config = LoopConfig { safety: Some(SafetyConfig::bare()), ..LoopConfig::default() };
     let mut cycle = Cycle::new(VirtualDevice::new(device.clone(), Hand::NONE)?, config)?;
-    let mut pace = VirtualPacing::new(RATE);
+    let mut pace = VirtualScheduler::new(RATE);
     let mut events: Vec<LoopEvent> = Vec::new();
     let mut word = LocalModel::default();
     cycle.device_mut().place([1e-3, 0.0, 0.0], [0.0; 3]);
@@ -91,7 +91,7 @@ struct Scene {
     held: HeldGrab,
     writer: ModelWriter,
     cycle: Cycle<VirtualDevice>,
-    pace: VirtualPacing,
+    pace: VirtualScheduler,
     word: LocalModel,
     events: Vec<LoopEvent>,
     step: f64,
@@ -125,7 +125,7 @@ impl Scene {
             held: HeldGrab { key: 0, id, offset: [0.0; 3] },
             writer: ModelWriter::new(),
             cycle,
-            pace: VirtualPacing::new(RATE),
+            pace: VirtualScheduler::new(RATE),
             word: LocalModel::default(),
             events: Vec::new(),
             step,

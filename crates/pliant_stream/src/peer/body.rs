@@ -8,7 +8,7 @@ use pliant_modal::{Frame, Hand, Hold, Load, ModalModel, StepSettings};
 use super::inputs::{InputLog, WINDOW};
 use super::wire::{HeldAt, PeerBodyState, PeerFrame, PeerGrip};
 use crate::StreamError;
-use crate::check::{checksum, projection};
+use crate::codec::checksum::{checksum, projection};
 use crate::newmark::{FlowFilter, Newmark};
 use crate::recovery::{Blend, Forecast, PoseBlend};
 use crate::replica::Replica;

@@ -68,7 +68,7 @@ pub struct StateCheck {
     pub body: BodyId,
     /// Which tick.
     pub tick: Tick,
-    /// [`crate::check::projection`] of its coordinates.
+    /// [`crate::codec::checksum::projection`] of its coordinates.
     pub value: f32,
 }
 

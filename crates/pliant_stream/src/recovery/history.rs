@@ -1,6 +1,6 @@
 //! What has arrived, tick by tick: a ring of fixed length.
 
-use crate::quanta::Quanta;
+use crate::codec::quantization::Quanta;
 use crate::state::{GrabKey, GrabState, MAX_GRABS, Pose, Tick};
 use crate::wire::{Frame, FrameGrab, SliceEntry};
 

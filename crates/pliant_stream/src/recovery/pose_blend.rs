@@ -73,9 +73,9 @@ mod tests {
         for (a, b) in
             visual.position.iter().chain(&visual.rotation).zip(before.position.iter().chain(&before.rotation))
         {
-            assert!((a - b).abs() < 1e-12, "{shown:?}");
+            assert!((a - b).abs() < 1e-12, "{visual:?}");
         }
-        assert!(visual.linear[0].abs() < 1e-12, "velocity is continuous too: {shown:?}");
+        assert!(visual.linear[0].abs() < 1e-12, "velocity is continuous too: {visual:?}");
         (0..8).for_each(|_| blend.advance());
         assert_eq!(blend.apply(&now), now);
     }

@@ -9,9 +9,9 @@ use super::{
 };
 use super::{Forecast, PassivityGuard, PoseBlend};
 use crate::StreamError;
-use crate::check::checksum;
+use crate::codec::checksum::checksum;
+use crate::codec::quantization::Quanta;
 use crate::newmark::Newmark;
-use crate::quanta::Quanta;
 use crate::replica::{self, Mean, Replica};
 use crate::state::{GrabKey, GrabState, Pose, State, Tick, UserId};
 use crate::wire::{Frame, SnapshotBytes};

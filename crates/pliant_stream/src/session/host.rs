@@ -11,7 +11,7 @@ use super::host_peer::{HeldGrab, MAX_GUEST_GRABS, Peer, Standing};
 use super::upload::Upload;
 use super::{DisconnectReason, LinkStats, MIN_DATAGRAM, Output};
 use crate::StreamError;
-use crate::encoder::Encoder;
+use crate::codec::encoder::Encoder;
 use crate::link::Events;
 use crate::newmark::Newmark;
 use crate::state::{BodyId, GrabKey, PeerId, Tick, UserId};

@@ -48,7 +48,7 @@ impl Default for HostConfig {
             models_rate: 8e6,
             guest_rate: 1e6,
             resend_after: Duration::ZERO,
-            quantum: crate::encoder::QUANTUM,
+            quantum: crate::codec::encoder::QUANTUM,
             open: true,
         }
     }

@@ -7,8 +7,8 @@ use super::DisconnectReason;
 use super::host::{HostBody, HostSession, StreamKey, stream_key};
 use super::host_peer::Peer;
 use crate::StreamError;
-use crate::encoder::{Encoded, Encoder};
-use crate::quanta::Quanta;
+use crate::codec::encoder::{Encoded, Encoder};
+use crate::codec::quantization::Quanta;
 use crate::state::{BodyId, MAX_GRABS, PeerId, TICK_LIMIT, TickState, in_range};
 use crate::wire::WIDE_LIMIT;
 

@@ -5,7 +5,7 @@ use serde::{Deserialize, Serialize};
 use super::bits::{BitReader, BitWriter, WIDTH_BITS, whole, width};
 use super::{Reader, Slice, Writer};
 use crate::StreamError;
-use crate::quanta::Quanta;
+use crate::codec::quantization::Quanta;
 use crate::state::{BodyId, GrabKey, GrabState, MAX_GRABS, MAX_MODES, Pose, Tick, UserId};
 
 const POSE: u8 = 1;

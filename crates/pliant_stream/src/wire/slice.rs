@@ -3,7 +3,7 @@
 use super::bits::{BitReader, BitWriter, WIDTH_BITS, whole, width};
 use super::{Reader, Writer};
 use crate::StreamError;
-use crate::quanta::Quanta;
+use crate::codec::quantization::Quanta;
 
 /// Bits of a mode's number.
 const MODE_BITS: u32 = 12;

@@ -8,7 +8,7 @@ use std::sync::{
 use nalgebra::Vector3;
 use pliant_modal::{Coefficients, Integrator};
 
-use crate::{DeviceInfo, Fault, Hand, HapticDevice, InfoError, Pacing, Sample, Wrench};
+use crate::{DeviceInfo, Fault, Hand, HapticDevice, InfoError, Sample, Scheduler, Wrench};
 
 /// What a virtual device is made of.
 #[derive(Debug, Clone, PartialEq)]
@@ -366,8 +366,8 @@ impl HapticDevice for VirtualDevice {
         self.config.info()
     }
 
-    fn exchange(&mut self, wrench: &Wrench, pacing: &mut dyn Pacing) -> Result<Sample, Fault> {
-        let period = pacing.wait();
+    fn exchange(&mut self, wrench: &Wrench, scheduler: &mut dyn Scheduler) -> Result<Sample, Fault> {
+        let period = scheduler.wait();
         if self.handle.shared.gone.load(Ordering::Relaxed) {
             self.advance([0.0; 3], period.dt);
             return Err(Fault::Gone);

@@ -12,7 +12,7 @@ use std::io::{self, Read, Write};
 
 use thiserror::Error;
 
-use crate::{DeviceInfo, Fault, HapticDevice, Pacing, Record, Sample, Wrench};
+use crate::{DeviceInfo, Fault, HapticDevice, Record, Sample, Scheduler, Wrench};
 
 const MAGIC: [u8; 4] = *b"PLHR";
 const VERSION: u16 = 1;
@@ -195,8 +195,8 @@ impl HapticDevice for Replay {
         self.info.clone()
     }
 
-    fn exchange(&mut self, _: &Wrench, pacing: &mut dyn Pacing) -> Result<Sample, Fault> {
-        pacing.wait();
+    fn exchange(&mut self, _: &Wrench, scheduler: &mut dyn Scheduler) -> Result<Sample, Fault> {
+        scheduler.wait();
         if self.next >= self.records.len() && self.repeat {
             self.next = 0;
         }
@@ -212,7 +212,7 @@ impl HapticDevice for Replay {
 mod tests {
     use super::*;
     use crate::{
-        Cycle, Hand, LocalModel, LoopConfig, LoopEvent, Sink, VirtualConfig, VirtualDevice, VirtualPacing,
+        Cycle, Hand, LocalModel, LoopConfig, LoopEvent, Sink, VirtualConfig, VirtualDevice, VirtualScheduler,
     };
 
     struct Write<'a>(&'a mut Recorder<Vec<u8>>);
@@ -229,12 +229,12 @@ mod tests {
         let hand = device.handle();
         let mut recorder = Recorder::new(Vec::new(), &device.info()).unwrap();
         let mut cycle = Cycle::new(device, LoopConfig::default()).unwrap();
-        let mut pacing = VirtualPacing::new(1000.0);
+        let mut scheduler = VirtualScheduler::new(1000.0);
         let mut path = Vec::new();
         for k in 0..300 {
             hand.set_target([0.01 * (f64::from(k) * 0.05).sin(), 0.0, 0.0]);
             hand.set_buttons(u32::from(k > 100));
-            cycle.step(&mut pacing, &LocalModel::default(), &mut Write(&mut recorder));
+            cycle.step(&mut scheduler, &LocalModel::default(), &mut Write(&mut recorder));
             path.push(cycle.core().last().position);
         }
         let bytes = recorder.finish().unwrap();
@@ -242,13 +242,13 @@ mod tests {
         assert_eq!(replay.records().len(), 300);
         let mut cycle = Cycle::new(replay, LoopConfig::default()).unwrap();
         let mut events: Vec<LoopEvent> = Vec::new();
-        let mut pacing = VirtualPacing::new(1000.0);
+        let mut scheduler = VirtualScheduler::new(1000.0);
         for want in path {
-            cycle.step(&mut pacing, &LocalModel::default(), &mut events);
+            cycle.step(&mut scheduler, &LocalModel::default(), &mut events);
             assert_eq!(cycle.core().last().position, want);
         }
         assert!(events.contains(&LoopEvent::Pressed(0)));
-        cycle.step(&mut pacing, &LocalModel::default(), &mut events);
+        cycle.step(&mut scheduler, &LocalModel::default(), &mut events);
         assert!(events.contains(&LoopEvent::Lost), "at the end of the recording there is no device");
         // Cut anywhere it is still a recording or an error, never a panic.
         for cut in 0..bytes.len().min(2000) {

@@ -7,7 +7,7 @@ use std::sync::{
 
 use nalgebra::Vector3;
 
-use crate::{DeviceInfo, Fault, HapticDevice, Pacing, Sample, Wrench};
+use crate::{DeviceInfo, Fault, HapticDevice, Sample, Scheduler, Wrench};
 
 /// How fast it goes where its handle says, rad/s: critically damped, there to a hundredth after 80 ms.
 const PACE: f64 = 80.0;
@@ -120,8 +120,8 @@ impl HapticDevice for Positioned {
         }
     }
 
-    fn exchange(&mut self, wrench: &Wrench, pacing: &mut dyn Pacing) -> Result<Sample, Fault> {
-        let period = pacing.wait();
+    fn exchange(&mut self, wrench: &Wrench, scheduler: &mut dyn Scheduler) -> Result<Sample, Fault> {
+        let period = scheduler.wait();
         // A pointer moves once a frame and nobody is pushed: were its owner just writing, the last place is as good.
         if let Ok(wanted) = self.handle.0.wanted.try_lock() {
             self.wanted = *wanted;
@@ -148,14 +148,14 @@ impl HapticDevice for Positioned {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::{Contact, Cycle, LocalModel, LoopConfig, LoopEvent, VirtualPacing};
+    use crate::{Contact, Cycle, LocalModel, LoopConfig, LoopEvent, VirtualScheduler};
 
     #[test]
     fn a_stop_waits_for_nobody() {
         let mut device = Positioned::new("pointer");
         let handle = device.handle();
         let push = Wrench { force: [1.0, 2.0, 3.0], torque: [4.0, 5.0, 6.0] };
-        device.exchange(&push, &mut VirtualPacing::new(1000.0)).unwrap();
+        device.exchange(&push, &mut VirtualScheduler::new(1000.0)).unwrap();
         assert_eq!(handle.wrench(), push);
         // Whoever moves the pointer is in the middle of it, for as long as it takes.
         let moving = handle.0.wanted.lock().unwrap();
@@ -176,7 +176,7 @@ mod tests {
         let mut device = Positioned::new("pointer");
         device.handle().set([0.0; 3], 1);
         device.handle().set([f64::NAN, 0.0, 0.0], 0);
-        let sample = device.exchange(&Wrench::ZERO, &mut VirtualPacing::new(1000.0)).unwrap();
+        let sample = device.exchange(&Wrench::ZERO, &mut VirtualScheduler::new(1000.0)).unwrap();
         assert_eq!((sample.buttons, sample.position), (0, [0.0; 3]));
     }
 
@@ -185,7 +185,7 @@ mod tests {
         let device = Positioned::new("pointer");
         let handle = device.handle();
         let mut cycle = Cycle::new(device, LoopConfig::default()).unwrap();
-        let mut pacing = VirtualPacing::new(1000.0);
+        let mut scheduler = VirtualScheduler::new(1000.0);
         let mut events: Vec<LoopEvent> = Vec::new();
         let k = 100.0;
         let mut model = LocalModel { period: 0.01, count: 1, ..LocalModel::default() };
@@ -195,7 +195,7 @@ mod tests {
         let mut run = |cycle: &mut Cycle<Positioned>, events: &mut Vec<LoopEvent>, ticks: usize| {
             for _ in 0..ticks {
                 model.tick += 1;
-                cycle.step(&mut pacing, &model, events);
+                cycle.step(&mut scheduler, &model, events);
                 fastest = fastest.max(cycle.core().last().velocity[0].abs());
             }
         };

@@ -1,6 +1,6 @@
-//! Time: a clock that threads share, pacing to absolute times, and the virtual kind for tests.
+//! Time: a clock that threads share, scheduler to absolute times, and the virtual kind for tests.
 
-use crate::{Pacing, Period};
+use crate::{Period, Scheduler};
 
 /// Seconds since it was made, monotonic; copies agree.
 #[derive(Debug, Clone, Copy)]
@@ -23,14 +23,14 @@ impl LoopClock {
 /// Pacing by the machine's clock: sleeps to absolute times, so that lateness does not add up, and leaves out whole periods when it is late by
 /// more than one.
 #[derive(Debug)]
-pub struct RealPacing {
+pub struct RealScheduler {
     clock: LoopClock,
     period: f64,
     next: f64,
     last: Period,
 }
 
-impl RealPacing {
+impl RealScheduler {
     /// Periods of `1 / rate` seconds on `clock`, the first from now.
     pub fn new(clock: LoopClock, rate: f64) -> Self {
         let now = clock.now();
@@ -38,7 +38,7 @@ impl RealPacing {
     }
 }
 
-impl Pacing for RealPacing {
+impl Scheduler for RealScheduler {
     fn wait(&mut self) -> Period {
         self.next += self.period;
         let mut now = self.clock.now();
@@ -72,13 +72,13 @@ impl Pacing for RealPacing {
 
 /// Pacing in virtual time: every period takes exactly what it should, or what a test says.
 #[derive(Debug, Clone)]
-pub struct VirtualPacing {
+pub struct VirtualScheduler {
     period: f64,
     gap: f64,
     last: Period,
 }
 
-impl VirtualPacing {
+impl VirtualScheduler {
     /// Periods of `1 / rate` seconds.
     pub fn new(rate: f64) -> Self {
         Self { period: 1.0 / rate, gap: 0.0, last: Period::default() }
@@ -95,7 +95,7 @@ impl VirtualPacing {
     }
 }
 
-impl Pacing for VirtualPacing {
+impl Scheduler for VirtualScheduler {
     fn wait(&mut self) -> Period {
         let late = std::mem::take(&mut self.gap);
         let dt = self.period + late;
@@ -183,27 +183,30 @@ mod tests {
     #[test]
     fn real_periods_do_not_drift_and_missed_ones_are_counted() {
         let clock = LoopClock::start();
-        let mut pacing = RealPacing::new(clock, 1000.0);
-        let start = pacing.last().now;
+        let mut scheduler = RealScheduler::new(clock, 1000.0);
+        let start = scheduler.last().now;
         let mut periods = 0;
         for _ in 0..50 {
-            periods += 1 + pacing.wait().missed;
+            periods += 1 + scheduler.wait().missed;
         }
         // However late a single wake-up was, the fiftieth is not early, and all of the time is accounted for.
-        let gone = pacing.last().now - start;
+        let gone = scheduler.last().now - start;
         assert!(gone >= 0.05 - 1e-9, "{gone}");
-        assert!((gone - f64::from(periods) * 1e-3 - pacing.last().late).abs() < 1e-6, "{gone} for {periods}");
+        assert!(
+            (gone - f64::from(periods) * 1e-3 - scheduler.last().late).abs() < 1e-6,
+            "{gone} for {periods}"
+        );
         std::thread::sleep(std::time::Duration::from_millis(20));
-        assert!(pacing.wait().missed >= 18);
+        assert!(scheduler.wait().missed >= 18);
     }
 
     #[test]
     fn virtual_time_is_exact() {
-        let mut pacing = VirtualPacing::new(500.0);
-        pacing.stall(0.1);
-        let long = pacing.wait();
+        let mut scheduler = VirtualScheduler::new(500.0);
+        scheduler.stall(0.1);
+        let long = scheduler.wait();
         assert_eq!((long.late, long.missed), (0.1, 50));
         assert!((long.dt - 0.102).abs() < 1e-12 && long.now == long.dt);
-        assert_eq!(pacing.wait().dt, 0.002);
+        assert_eq!(scheduler.wait().dt, 0.002);
     }
 }

@@ -1,5 +1,13 @@
 //! What a haptic device is to this crate: something that takes a wrench, holds it for a while, and says where the hand is.
 
+pub(crate) mod find;
+pub(crate) mod hand;
+#[cfg(feature = "inverse")]
+pub(crate) mod inverse;
+pub(crate) mod positioned;
+pub(crate) mod record;
+pub(crate) mod virtual_device;
+
 use serde::{Deserialize, Serialize};
 use thiserror::Error;
 
@@ -150,7 +158,7 @@ pub struct InfoError {
 /// Who keeps the time.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub enum Pacing {
-    /// The loop: [`HapticDevice::exchange`] is to wait by the [`Pacing`] it is given.
+    /// The loop: [`HapticDevice::exchange`] is to wait by the [`Scheduler`] it is given.
     Loop,
     /// The device: `exchange` returns when its own servo has ticked, at about this rate, Hz.
     Device(f64),
@@ -253,7 +261,7 @@ pub struct Period {
 }
 
 /// Time, real or virtual: the loop's own, lent to the device for the length of an exchange.
-pub trait Pacing {
+pub trait Scheduler {
     /// Waits until the next period begins, and says how long the last one was.
     fn wait(&mut self) -> Period;
 
@@ -279,12 +287,12 @@ pub trait HapticDevice: Send {
         Calibration::Ready
     }
 
-    /// Hands over `wrench`, to be held from now on; lets one period pass (`pacing.wait()`, or the device's own servo and then `pacing.note()`);
+    /// Hands over `wrench`, to be held from now on; lets one period pass (`scheduler.wait()`, or the device's own servo and then `scheduler.note()`);
     /// returns the state of the device at its end. In this order a force never waits a period for its turn.
     ///
     /// # Errors
     /// What went wrong; the loop fades what it asks for and calls again, so a device that is gone for good says so each time.
-    fn exchange(&mut self, wrench: &Wrench, pacing: &mut dyn Pacing) -> Result<Sample, Fault>;
+    fn exchange(&mut self, wrench: &Wrench, scheduler: &mut dyn Scheduler) -> Result<Sample, Fault>;
 
     /// Takes all force off at once. Called at the end, after a loss and at an emergency stop; does nothing on a device that is gone.
     /// An implementation calls it when it is dropped.

@@ -15,7 +15,7 @@ use serde_json::{Value, json};
 use thiserror::Error;
 use tungstenite::{Message, WebSocket, client::client_with_config, protocol::WebSocketConfig};
 
-use crate::{DeviceInfo, Fault, HapticDevice, Pacing, Sample, Wrench};
+use crate::{DeviceInfo, Fault, HapticDevice, Sample, Scheduler, Wrench};
 
 /// Where and which device.
 #[derive(Debug, Clone, PartialEq)]
@@ -192,8 +192,8 @@ impl HapticDevice for Inverse {
         }
     }
 
-    fn exchange(&mut self, wrench: &Wrench, pacing: &mut dyn Pacing) -> Result<Sample, Fault> {
-        pacing.wait();
+    fn exchange(&mut self, wrench: &Wrench, scheduler: &mut dyn Scheduler) -> Result<Sample, Fault> {
+        scheduler.wait();
         let answer = match self.ask(wrench.force) {
             // The first command was refused: the service may know the field by its other name.
             Err(Fault::Gone | Fault::Malformed) if !self.confirmed => {

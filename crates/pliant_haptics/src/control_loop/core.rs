@@ -6,10 +6,10 @@ use thiserror::Error;
 use crate::{
     Coupling, CouplingConfig, DeviceInfo, Fault, InfoError, LocalModel, ModalLocal, Port, Safety,
     SafetyConfig, Sample, ToolMap, Wanted, Wrench,
-    held_patches::{Change, HeldPatches, PatchForces, When},
+    control_loop::held_patches::{Change, HeldPatches, PatchForces, When},
+    control_loop::tool::{Tool, masked},
+    control_loop::validation::{Believed, SampleValidation},
     safety::{Slew, clamp_magnitude},
-    tool::{Tool, masked},
-    validation::{Believed, SampleValidation},
 };
 
 /// A loop that was not run for longer than this has stalled, s.

@@ -14,7 +14,8 @@ use triple_buffer::TripleBuffer;
 
 use crate::{
     Coupling, Cycle, DeviceInfo, Fault, HapticDevice, LocalModel, LoopClock, LoopConfig, LoopEvent,
-    LoopReport, LoopState, ModalLocal, RealPacing, Record, StartError, ToolMap, Wrench, cycle::Sink,
+    LoopReport, LoopState, ModalLocal, RealScheduler, Record, StartError, ToolMap, Wrench,
+    control_loop::cycle::Sink,
 };
 
 /// Events that wait to be read at most; more are dropped and counted.
@@ -292,7 +293,7 @@ impl<D: HapticDevice> Inner<D> {
 
     fn go_round(&mut self, clock: LoopClock, rate: f64) {
         self.cycle.set_realtime(raise_priority());
-        let mut pacing = RealPacing::new(clock, rate);
+        let mut scheduler = RealScheduler::new(clock, rate);
         while !self.quit.load(Ordering::Acquire) {
             // A switch that is pressed wins over a reset that is still in the queue.
             while !self.trash.is_full()
@@ -308,7 +309,7 @@ impl<D: HapticDevice> Inner<D> {
             {
                 let _ = self.trash.push(old);
             }
-            let report = *self.cycle.step(&mut pacing, self.model.read(), &mut self.queues);
+            let report = *self.cycle.step(&mut scheduler, self.model.read(), &mut self.queues);
             self.report.write(report);
         }
     }

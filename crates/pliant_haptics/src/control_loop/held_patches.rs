@@ -5,7 +5,9 @@
 
 use nalgebra::{Matrix3, Vector3};
 
-use crate::{LocalModel, MAX_CONTACTS, ModalLocal, proxy::ProxyExtrapolation, tool::Tool};
+use crate::{
+    LocalModel, MAX_CONTACTS, ModalLocal, control_loop::proxy::ProxyExtrapolation, control_loop::tool::Tool,
+};
 
 /// Time in which one local model's force becomes another's, s.
 const BLEND: f64 = 0.05;

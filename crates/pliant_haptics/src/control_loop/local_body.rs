@@ -8,7 +8,7 @@
 use nalgebra::Vector3;
 use pliant_modal::{Body, Coefficients, Frame, Integrator, State, StepError};
 
-use crate::{HeldGrab, LocalModel, MAX_CONTACTS, tool::Tool};
+use crate::{HeldGrab, LocalModel, MAX_CONTACTS, control_loop::tool::Tool};
 
 /// How far back the copy remembers itself, s.
 const MEMORY: f64 = 0.3;
@@ -230,7 +230,7 @@ mod tests {
     use pliant_modal::{BodyConfig, GrabConfig, ModalModel, Patch, StepSettings};
 
     use super::*;
-    use crate::{Coupling, CouplingLimit, ToolMap, local::ModelWriter};
+    use crate::{Coupling, CouplingLimit, ToolMap, control_loop::local_model::ModelWriter};
 
     fn pip(gravity: [f64; 3]) -> Body {
         let path = Path::new(env!("CARGO_MANIFEST_DIR")).join("../../assets/pip.modal");

@@ -4,7 +4,7 @@ use std::time::Instant;
 
 use crate::{
     Calibration, Coupling, Fault, HapticDevice, Histogram, LocalModel, LoopConfig, LoopCore, ModalLocal,
-    Pacing, Sample, StartError, Tick, ToolMap, Wrench,
+    Sample, Scheduler, StartError, Tick, ToolMap, Wrench,
 };
 
 /// A device whose driver fails for so long counts as lost, s.
@@ -219,43 +219,48 @@ impl<D: HapticDevice> Cycle<D> {
     }
 
     /// One period.
-    pub fn step(&mut self, pacing: &mut dyn Pacing, model: &LocalModel, sink: &mut dyn Sink) -> &LoopReport {
-        let before = pacing.last().now;
+    pub fn step(
+        &mut self,
+        scheduler: &mut dyn Scheduler,
+        model: &LocalModel,
+        sink: &mut dyn Sink,
+    ) -> &LoopReport {
+        let before = scheduler.last().now;
         if self.report.state == LoopState::Lost {
-            pacing.wait();
-            self.look_for(pacing.last().now, sink);
+            scheduler.wait();
+            self.look_for(scheduler.last().now, sink);
             let fault = if self.report.state == LoopState::Lost { Fault::Gone } else { Fault::NotCalibrated };
-            self.finish(pacing, Err(fault), model, sink, Instant::now());
+            self.finish(scheduler, Err(fault), model, sink, Instant::now());
             return &self.report;
         }
         if !self.calibrated {
             self.calibrate(before, sink);
         }
         let wrench = if self.calibrated { self.wrench } else { Wrench::ZERO };
-        let answer = self.device.exchange(&wrench, pacing);
+        let answer = self.device.exchange(&wrench, scheduler);
         let begun = Instant::now();
-        if pacing.last().now <= before || pacing.last().dt < 0.25 / self.config.rate {
+        if scheduler.last().now <= before || scheduler.last().dt < 0.25 / self.config.rate {
             // A driver that fails does not wait, nor does one that has lost its clock: a thread of this priority must not spin on them.
-            pacing.wait();
+            scheduler.wait();
         }
         let answer = match answer {
             Ok(sample) if self.calibrated => Ok(sample),
             Ok(_) => Err(Fault::NotCalibrated),
             Err(fault) => Err(fault),
         };
-        self.finish(pacing, answer, model, sink, begun);
+        self.finish(scheduler, answer, model, sink, begun);
         &self.report
     }
 
     fn finish(
         &mut self,
-        pacing: &mut dyn Pacing,
+        scheduler: &mut dyn Scheduler,
         answer: Result<Sample, Fault>,
         model: &LocalModel,
         sink: &mut dyn Sink,
         begun: Instant,
     ) {
-        let period = pacing.last();
+        let period = scheduler.last();
         let (now, dt) = (period.now, period.dt);
         self.wrench = match &answer {
             Ok(sample) => {
@@ -396,8 +401,8 @@ impl<D: HapticDevice + ?Sized> HapticDevice for Box<D> {
     fn calibration(&mut self) -> Calibration {
         (**self).calibration()
     }
-    fn exchange(&mut self, wrench: &Wrench, pacing: &mut dyn Pacing) -> Result<Sample, Fault> {
-        (**self).exchange(wrench, pacing)
+    fn exchange(&mut self, wrench: &Wrench, scheduler: &mut dyn Scheduler) -> Result<Sample, Fault> {
+        (**self).exchange(wrench, scheduler)
     }
     fn safe_stop(&mut self) {
         (**self).safe_stop();

@@ -10,9 +10,9 @@ use nalgebra::Vector3;
 use pliant_modal::{ModalModel, StepSettings};
 
 use crate::StreamError;
-use crate::check::checksum;
+use crate::codec::checksum::checksum;
+use crate::codec::quantization::Quanta;
 use crate::newmark::{FlowFilter, Newmark};
-use crate::quanta::Quanta;
 use crate::replica::{self, Mean, Replica};
 use crate::state::{BodyId, GrabKey, GrabState, State, Tick, TickState};
 use crate::wire::{

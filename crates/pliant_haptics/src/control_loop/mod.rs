@@ -1,0 +1,14 @@
+//! The loop at device rate: from a sample and the simulation's local model to a wrench.
+
+pub(crate) mod core;
+pub(crate) mod coupling;
+pub(crate) mod cycle;
+pub(crate) mod held_patches;
+pub(crate) mod histogram;
+pub(crate) mod local_body;
+pub(crate) mod local_model;
+pub(crate) mod proxy;
+pub(crate) mod runner;
+pub(crate) mod scheduler;
+pub(crate) mod tool;
+pub(crate) mod validation;
