@@ -9,10 +9,11 @@ use bevy::{
 use pliant_modal::{FileError, ModalModel};
 use thiserror::Error;
 
-/// A baked body: the modes, the surface and what the bake measured, shared by every [`ModalBody`](crate::ModalBody) that shows it.
+/// A baked body, shared by every [`ModalBody`](crate::ModalBody) that shows it.
 ///
-/// Made by the loader from a `.modal` file (`asset_server.load("bodies/imp.modal")`), or in code from a model that was
-/// baked or received: `assets.add(ModalAsset::from(model))`.
+/// The asset holds the modes, the surface and the quantities measured by the bake. The loader makes
+/// it from a `.modal` file (`asset_server.load("bodies/imp.modal")`). Code makes it from a baked or
+/// received model: `assets.add(ModalAsset::from(model))`.
 #[derive(Asset, TypePath, Clone, Debug)]
 pub struct ModalAsset(pub Arc<ModalModel>);
 
@@ -28,18 +29,18 @@ impl From<Arc<ModalModel>> for ModalAsset {
     }
 }
 
-/// Loads `.modal` files: version, hash and every number are checked by [`ModalModel::from_bytes`].
+/// Loads `.modal` files. [`ModalModel::from_bytes`] checks the version, the hash and every number.
 #[derive(Default, TypePath)]
 pub struct ModalAssetLoader;
 
-/// Why a `.modal` file did not become a [`ModalAsset`].
+/// The reason why a `.modal` file could not be loaded as a [`ModalAsset`].
 #[derive(Debug, Error)]
 #[non_exhaustive]
 pub enum ModalAssetError {
     /// The bytes could not be read.
     #[error("the file could not be read: {0}")]
     Read(#[from] std::io::Error),
-    /// The bytes are not a model of this version, are cut, or were altered.
+    /// The bytes are not a model of this version, are truncated, or were altered.
     #[error("not a usable .modal file: {0}")]
     Model(#[from] FileError),
 }

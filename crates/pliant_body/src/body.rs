@@ -1,4 +1,5 @@
-//! The body as components: what a user writes ([`ModalBody`], [`Driven`]) and what the plugin keeps ([`BodyState`]).
+//! The components of a body: [`ModalBody`] and [`Driven`] for the user, [`BodyState`] for the
+//! plugin.
 
 use std::sync::Arc;
 
@@ -7,7 +8,9 @@ use pliant_modal::{Body, BodyConfig, GrabId, Integrator, ModalModel, Precision, 
 
 use crate::{ModalAsset, grab::Hold};
 
-/// A soft body: the model it is made of and how it is stepped. Spawn it; the rest comes by itself.
+/// A soft body: its model and its step settings.
+///
+/// The plugin adds all other components after the entity is spawned.
 ///
 /// ```
 /// # use bevy::prelude::*;
@@ -17,51 +20,59 @@ use crate::{ModalAsset, grab::Hold};
 /// }
 /// ```
 ///
-/// With the feature `render`, add a `MeshMaterial3d` and the deformed surface is drawn with it.
+/// With the feature `render`, add a `MeshMaterial3d` to draw the deformed surface with that
+/// material.
 ///
-/// The entity's `GlobalTransform` places the body: rotation, translation and a positive, uniform scale. The scale multiplies
-/// lengths and forces; masses, stiffness (N/m) and frequencies stay as baked. Moving the transform of an anchored body moves its
-/// anchors without inertia (quasi-static). A free body writes its own motion into its `Transform` each frame and must have no
-/// parent; writing the transform puts it elsewhere with its velocity kept.
+/// The entity's `GlobalTransform` places the body by a rotation, a translation and a positive,
+/// uniform scale. The scale multiplies lengths and forces. Masses, stiffness (N/m) and frequencies
+/// keep their baked values. Moving the transform of an anchored body moves its anchors without
+/// inertia (quasi-static). A free body writes its own motion into its `Transform` in each frame and
+/// must have no parent. Writing the transform of a free body moves the body there and keeps its
+/// velocity.
 ///
-/// A change of a field takes effect at the end of the frame; the shape and its motion are kept where the model is the same. A change that
-/// makes no body is refused once ([`BodyRefused`](crate::BodyRefused)), and the body goes on with the settings it had.
+/// A change of a field takes effect at the end of the frame. The shape and the motion are kept if
+/// the model stays the same. A change that cannot make a body is refused once
+/// ([`BodyRefused`](crate::BodyRefused)), and the body keeps its previous settings.
 #[derive(Component, Reflect, Debug, Clone, PartialEq)]
 #[reflect(Component, Default, Clone, PartialEq)]
 #[require(Transform, Visibility, Driven)]
 pub struct ModalBody {
-    /// The baked body. Swapping the handle, or the asset behind it, makes a new body at rest; grabs whose vertex it has stay.
+    /// The baked body. A new handle, or a new asset behind the handle, makes a new body at rest.
+    /// Grabs stay if the new model has their vertex.
     pub model: Handle<ModalAsset>,
-    /// How it is stepped: integrator, warp, gravity, damping, stiffness, relaxation. Gravity is in
+    /// Step settings: integrator, warping, gravity, damping, stiffness, relaxation. Gravity is in
     /// world axes and world lengths.
     #[reflect(remote = ReflectedSettings)]
     pub settings: StepSettings,
-    /// How many of the model's modes are kept, lowest first: the level of detail. Default: `None`, all.
+    /// Level of detail: number of the model's modes that are kept, lowest first. Default: `None`,
+    /// all modes.
     pub modes: Option<usize>,
-    /// Whether the processor writes the surface (see `SurfaceDeformation`) from a basis in half
-    /// precision: in half the time where the surface is large, and off by some 5e-5 of the body's
-    /// size where it is pulled by a fifth of it. Default: `false`.
+    /// Whether the CPU computes the surface (see `SurfaceDeformation`) from a basis in half
+    /// precision. This takes half the time where the surface is large. The error is some 5e-5 of
+    /// the body's size where the body is pulled by a fifth of its size. Default: `false`.
     pub half_basis: bool,
-    /// The body rests once the root mean square speed of its mass stays below this, m/s of the model,
-    /// for half a second with nobody holding it: it is then neither stepped nor uploaded until
-    /// something touches it. Zero never rests. Default: `1e-4`.
+    /// Speed below which the body rests, m/s of the model. The body rests after the root mean
+    /// square speed of its mass has stayed below this speed for half a second without a grab. A
+    /// resting body is neither stepped nor uploaded until something touches it. With zero the body
+    /// never rests. Default: `1e-4`.
     pub rest_speed: f64,
 }
 
 impl Default for ModalBody {
-    /// Every setting at its default, and no model yet.
+    /// Returns a body with all default settings and no model.
     fn default() -> Self {
         Self::new(Handle::default())
     }
 }
 
 impl ModalBody {
-    /// A body of `model` with every setting at its default.
+    /// Returns a body of `model` with all default settings.
     pub fn new(model: Handle<ModalAsset>) -> Self {
         Self { model, settings: StepSettings::default(), modes: None, half_basis: false, rest_speed: 1e-4 }
     }
 
-    /// What the solver is told, for a step of `step` seconds under a uniform scale of `scale`.
+    /// Returns the solver's configuration for a step of `step` seconds under a uniform scale of
+    /// `scale`.
     pub(crate) fn config(&self, step: f64, scale: f64) -> BodyConfig {
         BodyConfig {
             settings: StepSettings {
@@ -75,8 +86,8 @@ impl ModalBody {
     }
 }
 
-// The solver's types know no engine. Reflection sees their fields through these, which the compiler
-// holds to be the same.
+// The solver's types do not depend on an engine. Reflection accesses their fields through the
+// following types. The compiler checks that both declarations agree.
 
 #[reflect_remote(StepSettings)]
 #[derive(Debug, Default, Clone, Copy, PartialEq)]
@@ -121,58 +132,61 @@ pub(crate) struct ReflectedRelaxation {
     time: f64,
 }
 
-/// Who moves a body. Default: [`Local`](Self::Local).
+/// Selects what moves a body. Default: [`Local`](Self::Local).
 #[derive(Component, Reflect, Debug, Default, Clone, Copy, PartialEq, Eq)]
 #[reflect(Component, Default, Clone, PartialEq)]
 pub enum Driven {
-    /// This app steps it.
+    /// This app steps the body.
     #[default]
     Local,
-    /// Somebody else writes its [`VisualState`](crate::VisualState) and its grabs' [`GrabForce`](crate::GrabForce): the network, a
-    /// recording, a script. It is not stepped here.
+    /// Another source writes the body's [`VisualState`](crate::VisualState) and its grabs'
+    /// [`GrabForce`](crate::GrabForce): the network, a recording or a script. This app does not
+    /// step the body.
     Remote,
 }
 
-/// The pointer passes through this body: a ghost, a backdrop.
+/// Makes the pointer ignore this body, for example a ghost or a backdrop.
 #[derive(Component, Reflect, Debug, Default, Clone, Copy, PartialEq, Eq)]
 #[reflect(Component, Default, Clone, PartialEq)]
 pub struct NoPointerGrab;
 
-/// A body that has its model and is simulated; the plugin adds it to a [`ModalBody`] once the asset is there.
+/// A simulated body.
 ///
-/// Reflection shows how it stands, not the solver, which is [`body`](Self::body)'s to show.
+/// The plugin adds this component to a [`ModalBody`] when the model's asset is loaded. Reflection
+/// shows the state flags but not the solver, which [`body`](Self::body) returns.
 #[derive(Component, Reflect, Debug)]
 #[reflect(Component, from_reflect = false)]
 pub struct BodyState {
-    /// Its world is the entity's world divided by `scale`.
+    /// The solver's body. Its world is the entity's world divided by `scale`.
     #[reflect(ignore)]
     pub(crate) body: Body,
     #[reflect(ignore)]
     pub(crate) scale: f64,
-    /// The transform that was last looked at: taken, refused, or written by the body itself.
+    /// The transform that was processed last: accepted, refused, or written by the body itself.
     #[reflect(ignore)]
     pub(crate) placed: Option<Affine3A>,
     #[reflect(ignore)]
     pub(crate) held: Vec<Held>,
-    /// A step was refused and the warning given.
+    /// Whether a step was refused and the warning was logged.
     pub(crate) faulted: bool,
-    /// Seconds for which it has been slower than the rest speed.
+    /// Time for which the body has been slower than its rest speed, s.
     pub(crate) quiet: f64,
     pub(crate) resting: bool,
-    /// There is a new state to publish.
+    /// Whether there is a new state to publish.
     pub(crate) stepped: bool,
 }
 
-/// A grab as the solver has it.
+/// The solver's record of a grab.
 #[derive(Debug)]
 pub(crate) struct Held {
     pub entity: Entity,
-    /// `None`: refused, and the refusal was told.
+    /// The solver's grab. `None` if the grab was refused and the refusal was reported.
     pub id: Option<GrabId>,
     pub hold: Hold,
-    /// Refused only because the body had no place left; it is tried again when one is free.
+    /// Whether the grab was refused only because the body had the maximum number of grabs. Such a
+    /// grab is tried again when a slot is free.
     pub waiting: bool,
-    /// The current target was refused and the warning given.
+    /// Whether the current target was refused and the warning was logged.
     pub refusing: bool,
 }
 
@@ -190,69 +204,76 @@ impl BodyState {
         }
     }
 
-    /// Whether this transform was looked at before (one with NaN in it, too).
+    /// Whether this transform was processed before. The comparison of bits also works for NaN.
     pub(crate) fn is_placed(&self, affine: &Affine3A) -> bool {
         let bits = |affine: &Affine3A| affine.to_cols_array().map(f32::to_bits);
         self.placed.is_some_and(|placed| bits(&placed) == bits(affine))
     }
 
-    /// Whether the entity's transform has been taken over, which the first tick does.
+    /// Whether the entity's transform has been processed. The first tick does this.
     pub fn has_place(&self) -> bool {
         self.placed.is_some()
     }
 
-    /// The simulated body: its modal state, its frame, its grabs.
+    /// Returns the simulated body with its modal state, its frame and its grabs.
     pub fn body(&self) -> &Body {
         &self.body
     }
 
-    /// The simulated body, to be changed: it wakes. What is configured here holds until a field of the [`ModalBody`] changes, which sets all
-    /// of them again. Grabs made here are the caller's to release; those of [`Grab`](crate::Grab) entities
-    /// are not to be touched.
+    /// Returns the simulated body for changes, and wakes it.
+    ///
+    /// Configuration changes made here last until a field of the [`ModalBody`] changes, which sets
+    /// all of the configuration again. The caller must release grabs that the caller made here.
+    /// Grabs of [`Grab`](crate::Grab) entities must not be changed here.
     pub fn body_mut(&mut self) -> &mut Body {
         self.wake();
         &mut self.body
     }
 
-    /// The solver's name for the grab that a [`Grab`](crate::Grab) entity is, to ask [`body`](Self::body) about it. `None` before the first
-    /// tick of the grab, when it was refused or waits for a place, and on a body that somebody else moves.
+    /// Returns the solver's identifier of a [`Grab`](crate::Grab) entity's grab, for queries to
+    /// [`body`](Self::body).
+    ///
+    /// Returns `None` before the grab's first tick, for a grab that was refused or waits for a free
+    /// slot, and on a remote body.
     pub fn grab_id(&self, grab: Entity) -> Option<GrabId> {
         self.held.iter().find(|held| held.entity == grab)?.id
     }
 
-    /// The baked model.
+    /// Returns the baked model.
     pub fn model(&self) -> &Arc<ModalModel> {
         self.body.model()
     }
 
-    /// Whether the shape is bent by modal warping.
+    /// Whether modal warping bends the shape.
     pub fn warps(&self) -> bool {
         self.body.config().settings.warp
     }
 
-    /// What the surface is written from on the processor.
+    /// Returns the precision of the basis from which the CPU computes the surface.
     pub fn precision(&self) -> Precision {
         self.body.config().precision
     }
 
-    /// The uniform scale that the entity's transform gives the body.
+    /// Returns the uniform scale from the entity's transform.
     pub fn scale(&self) -> f64 {
         self.scale
     }
 
-    /// Whether it is at rest and left alone.
+    /// Whether the body is at rest and not stepped.
     pub fn is_resting(&self) -> bool {
         self.resting
     }
 
-    /// Steps it again until it comes to rest by itself.
+    /// Wakes the body: it is stepped until it comes to rest again.
     pub fn wake(&mut self) {
         self.quiet = 0.0;
         self.resting = false;
     }
 
-    /// The surface at modal coordinates `q`: positions in body axes, m, one a surface vertex. For a question now and then (a click); the
-    /// drawn surface has a faster way.
+    /// Returns the surface at modal coordinates `q`: one position per surface vertex, m, body axes.
+    ///
+    /// The function allocates and suits occasional queries such as a click. The drawn surface is
+    /// computed by a faster path.
     pub fn positions_at(&self, q: &[f64]) -> Vec<[f32; 3]> {
         let coordinates: Vec<f32> = q.iter().map(|&q| q as f32).collect();
         let mut positions = self.model().surface().positions().to_vec();

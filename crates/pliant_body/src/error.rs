@@ -1,23 +1,23 @@
-//! What this plugin refuses, and how it says so.
+//! The inputs that this plugin refuses, and their errors.
 
 use bevy::prelude::*;
 use pliant_modal::{ModelError, StepError};
 use thiserror::Error;
 
-/// Why an input to a body was refused. The body goes on from its last good state.
+/// The reason why an input to a body was refused. The body continues from its last valid state.
 #[derive(Debug, Error)]
 #[non_exhaustive]
 pub enum BodyError {
-    /// A grab's target is NaN or infinite.
+    /// The target of a grab is NaN or infinite.
     #[error("the target of a grab must be finite metres, got {target:?}; it keeps its last good one")]
     TargetNotFinite {
-        /// The target that came, m.
+        /// The refused target, m.
         target: [f64; 3],
     },
-    /// A grab of a patch that the model does not have.
+    /// The model does not have the patch of the grab.
     #[error("this grab holds nothing: {0}")]
     Patch(ModelError),
-    /// A grab that the body does not take.
+    /// The body refused the grab.
     #[error("the grab was refused: {0}")]
     Grab(StepError),
     /// The entity's transform cannot place a body.
@@ -26,60 +26,63 @@ pub enum BodyError {
          it stays where it was"
     )]
     Placement {
-        /// Translation that came, m.
+        /// The refused translation, m.
         translation: Vec3,
-        /// Scale that came.
+        /// The refused scale.
         scale: Vec3,
     },
     /// The settings of a [`ModalBody`](crate::ModalBody) do not make a body of this model.
     #[error("the body could not be made from its model and settings: {0}")]
     Build(StepError),
-    /// A step failed; the state before it is kept.
+    /// A step failed. The body keeps the state before it.
     #[error("the step was refused: {0}")]
     Step(StepError),
-    /// A [`Impulse`](crate::Impulse) or [`Push`](crate::Push) at a vertex that the body lacks, with a number that is NaN or infinite, or so
-    /// hard that the body's velocity is no number any more.
+    /// The vertex of an [`Impulse`](crate::Impulse) or a [`Push`](crate::Push) does not exist, a
+    /// number is NaN or infinite, or the resulting velocity of the body is not finite.
     #[error("the blow was refused: {0}")]
     Blow(StepError),
-    /// A [`Impulse`](crate::Impulse) or [`Push`](crate::Push) at an entity that is no body, or whose model is not there yet.
+    /// The entity of an [`Impulse`](crate::Impulse) or a [`Push`](crate::Push) is not a body, or
+    /// its model is not loaded yet.
     #[error("the blow was refused: this entity is no body, or its model is not there yet")]
     NoBody,
-    /// A [`Impulse`](crate::Impulse) or [`Push`](crate::Push) at a body that somebody else moves.
+    /// The body of an [`Impulse`](crate::Impulse) or a [`Push`](crate::Push) is remote.
     #[error("the blow was refused: this body is driven remotely and is not stepped here")]
     NotLocal,
-    /// A shown state with the wrong number of modes.
+    /// A visual state has the wrong number of modes.
     #[error("a shown state needs {expected} modal coordinates, got {found}")]
     VisualLength {
-        /// Modes of the body.
+        /// Number of modes of the body.
         expected: usize,
-        /// Coordinates that came.
+        /// Number of coordinates in the refused state.
         found: usize,
     },
-    /// A shown state with a coordinate that is NaN or infinite.
+    /// A modal coordinate of a visual state is NaN or infinite.
     #[error("modal coordinate {mode} of a shown state must be finite, got {value}")]
     VisualNotFinite {
-        /// The first mode that is not finite.
+        /// Index of the first mode that is not finite.
         mode: usize,
-        /// Its value, kg^1/2 m.
+        /// The value of that mode, kg^1/2 m.
         value: f64,
     },
-    /// A pose with a number that is NaN or infinite.
+    /// A number of a pose is NaN or infinite.
     #[error("the pose of a body must be finite, got origin {origin:?} m and orientation {orientation:?}")]
     PoseNotFinite {
-        /// The origin that came, m.
+        /// The refused origin, m.
         origin: [f64; 3],
-        /// The quaternion that came, x, y, z, w.
+        /// The refused quaternion, x, y, z, w.
         orientation: [f64; 4],
     },
 }
 
-/// Sent (and logged once, with the entity's name) when something that a user or a remote wrote was refused.
+/// Reports a refused input of a user or a remote source.
+///
+/// The plugin writes this message and logs it once with the entity's name.
 #[derive(Message, Reflect, Debug)]
 #[reflect(from_reflect = false)]
 pub struct BodyRefused {
-    /// The entity whose component was refused, or that a message named: a body or a grab.
+    /// The entity of the refused component, or the entity that a message named: a body or a grab.
     pub entity: Entity,
-    /// What was expected and what came.
+    /// The error: the expected and the actual input.
     #[reflect(ignore)]
     pub error: BodyError,
 }

@@ -1,8 +1,11 @@
-//! Grabs: what ties a patch of a body's surface to a target in the world, and the force that is felt there.
+//! Grabs, which tie a patch of a body's surface to a target in the world, and the force on the
+//! hand.
 
 use bevy::{math::DVec3, prelude::*};
 
-/// A hold on a patch of a body's surface. Spawn it on an entity of its own, related to the body by [`GrabOf`]:
+/// A grab of a patch of a body's surface.
+///
+/// Spawn the grab on a separate entity and relate it to the body by [`GrabOf`]:
 ///
 /// ```
 /// # use bevy::{math::DVec3, prelude::*};
@@ -12,35 +15,41 @@ use bevy::{math::DVec3, prelude::*};
 /// # }
 /// ```
 ///
-/// The hand is compliant and implicit: it follows the target as far as the body's stiffness and the patch's own compliance
-/// let it, at any stiffness and step. Despawning the entity (or removing [`GrabOf`]) lets go. The force is in [`GrabForce`].
+/// The hand is compliant and implicit. The patch tracks the target as closely as the body's
+/// stiffness and the patch's own compliance allow, at any stiffness and step. Despawning the
+/// entity, or removing [`GrabOf`], releases the patch. [`GrabForce`] holds the force.
 ///
-/// A grab on a [`Driven::Remote`](crate::Driven::Remote) body is not acted on here: whoever drives the body reads it, and writes the force.
+/// This app does not act on a grab of a [`Driven::Remote`](crate::Driven::Remote) body. The source
+/// that drives the body reads the grab and writes the force.
 #[derive(Component, Reflect, Debug, Clone, Copy, PartialEq)]
 #[reflect(Component, Clone, PartialEq)]
 #[require(GrabForce)]
 pub struct Grab {
     /// Surface vertex at the middle of the patch: an index into the model's surface positions.
     pub vertex: u32,
-    /// Radius of the patch around that vertex, measured on the rest shape, m (of the model, before the entity's scale).
-    /// Zero is the vertex alone; a patch is better, as the compliance of a point depends on the mesh.
+    /// Radius of the patch around that vertex, measured on the rest shape, m (of the model, before
+    /// the entity's scale). Zero selects the vertex alone. A patch with area is better, because the
+    /// compliance of a point depends on the mesh.
     pub radius: f64,
-    /// Where the patch is wanted, m, in world axes. A value that is not finite is refused: the last good one stays.
+    /// Target position of the patch, m, world axes. A value that is not finite is refused, and the
+    /// last valid target stays.
     pub target: DVec3,
-    /// Stiffness of the hand's own spring (a device's coupling), N/m above 0, in series with the patch's compliance.
-    /// Default: `None`, as stiff as the patch allows.
+    /// Stiffness of the hand's own spring (a device's coupling), N/m, above 0, in series with the
+    /// patch's compliance. Default: `None`, as stiff as the patch allows.
     pub stiffness: Option<f64>,
     /// Relaxation time of the coupling's damper, s, 0 or more. Default: `0.0`.
     pub relaxation: f64,
 }
 
 impl Grab {
-    /// A grab of the patch within `radius` (m, of the model) of surface vertex `vertex`, pulled to `target` (m, world).
+    /// Returns a grab of the patch within `radius` (m, model) of surface vertex `vertex`, pulled to
+    /// `target` (m, world).
     pub fn new(vertex: u32, radius: f64, target: DVec3) -> Self {
         Self { vertex, radius, target, stiffness: None, relaxation: 0.0 }
     }
 
-    /// What the solver is told about the hold; a change of any of it makes the hold anew.
+    /// Returns the solver's settings of the grab. A change of any of them makes a new grab in the
+    /// solver.
     pub(crate) fn hold(&self) -> Hold {
         Hold {
             vertex: self.vertex,
@@ -61,7 +70,7 @@ pub(crate) struct Hold {
 }
 
 impl Hold {
-    /// Equality by bits: a NaN that was refused once is the same NaN in the next tick.
+    /// Compares the bits, so that a refused NaN equals the same NaN in the next tick.
     pub fn is(&self, other: &Self) -> bool {
         let bits = |hold: &Self| {
             (hold.vertex, hold.radius.to_bits(), hold.stiffness.map(f64::to_bits), hold.relaxation.to_bits())
@@ -76,25 +85,28 @@ impl Hold {
 #[relationship(relationship_target = Grabs)]
 pub struct GrabOf(#[entities] pub Entity);
 
-/// The grabs on a body, oldest first. They are despawned with it.
+/// The grabs on a body, oldest first. Despawning the body also despawns its grabs.
 #[derive(Component, Reflect, Debug, Default)]
 #[reflect(Component)]
 #[relationship_target(relationship = GrabOf, linked_spawn)]
 pub struct Grabs(Vec<Entity>);
 
 impl Grabs {
-    /// The grabs' entities, oldest first.
+    /// Returns the entities of the grabs, oldest first.
     pub fn entities(&self) -> &[Entity] {
         &self.0
     }
 }
 
-/// What a hand feels: published every tick for every [`Grab`], zero while the body is not there yet.
+/// The force on the hand, published in every tick for every [`Grab`].
+///
+/// The values are zero while the body does not exist.
 #[derive(Component, Reflect, Debug, Default, Clone, Copy, PartialEq)]
 #[reflect(Component, Default, Clone, PartialEq)]
 pub struct GrabForce {
-    /// The reaction: the force that the body exerts on the hand, N, in world axes. Default: zero.
+    /// The reaction: the force that the body exerts on the hand, N, world axes. Default: zero.
     pub force: DVec3,
-    /// Where the middle of the patch is now (the weighted mean of its vertices), m, in world axes. Default: the origin.
+    /// Current middle of the patch (the weighted mean of its vertices), m, world axes. Default: the
+    /// origin.
     pub point: DVec3,
 }

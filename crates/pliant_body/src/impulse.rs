@@ -1,21 +1,24 @@
-//! Blows and forces from outside: messages that the coming tick takes.
+//! Messages for external impulses and forces, which the next tick applies.
 
 use bevy::{math::DVec3, prelude::*};
 use pliant_modal::{Body, StepError};
 
 use crate::{BodyError, BodyState, Driven, step::Refusals};
 
-/// A blow: an impulse at one vertex of a body, whose velocity changes at once.
+/// An impulse at one vertex of a body, which changes the body's velocity at once.
 ///
-/// Sent with a `MessageWriter<Impulse>` or `Commands::write_message` and taken by the next tick in
-/// [`PliantSystems::Input`](crate::PliantSystems::Input); a body at rest wakes. Blows of one tick add up. They act on a body that this app steps, and
-/// do not cross a session by themselves: a guest's go to nobody.
+/// Write the message with a `MessageWriter<Impulse>` or `Commands::write_message`. The next tick
+/// applies it in [`PliantSystems::Input`](crate::PliantSystems::Input) and wakes a resting body.
+/// Impulses of one tick add up. They act only on a body that this app steps. A session does not
+/// transmit impulses: an impulse that is written on a guest reaches no other peer.
 ///
-/// On an entity of scale `s` the body's world is `s` times as large in lengths and forces, and its mass stays: an impulse of `J` N s changes
-/// `mass x velocity`, both as seen in the entity's world, by `J`.
+/// On an entity of scale `s` the body's world is `s` times as large in lengths and forces, and its
+/// mass stays the same. An impulse of `J` N s changes `mass x velocity`, both measured in the
+/// entity's world, by `J`.
 ///
-/// Refused by [`BodyRefused`](crate::BodyRefused), with the entity in `body`: one with NaN or infinity, a vertex or an entity that is not there, a
-/// body that is [`Driven::Remote`], an impulse beyond what numbers hold.
+/// [`BodyRefused`](crate::BodyRefused), with the entity in `body`, reports an impulse with NaN or
+/// infinity, a vertex or an entity that does not exist, a body that is [`Driven::Remote`], and an
+/// impulse that makes the velocity overflow.
 ///
 /// ```
 /// # use bevy::{math::DVec3, prelude::*};
@@ -29,27 +32,29 @@ use crate::{BodyError, BodyState, Driven, step::Refusals};
 pub struct Impulse {
     /// The entity of the [`ModalBody`](crate::ModalBody).
     pub body: Entity,
-    /// Vertex of the model's surface that is hit.
+    /// Vertex of the model's surface at which the impulse acts.
     pub vertex: u32,
     /// Impulse, N s, world axes.
     pub impulse: DVec3,
 }
 
-/// A force at one vertex of a body for one tick; sent anew each tick, it is a force that lasts.
+/// A force at one vertex of a body for one tick.
 ///
-/// Taken, scaled and refused as a [`Impulse`]; forces of one tick add up. Over a tick of `h` s it brings in `force x h` N s.
+/// A force that is written in every tick acts continuously. Forces are applied, scaled and refused
+/// like an [`Impulse`], and forces of one tick add up. Over a tick of `h` s a force adds an impulse
+/// of `force x h` N s.
 #[derive(Message, Reflect, Debug, Clone, Copy, PartialEq)]
 #[reflect(Debug, Clone, PartialEq)]
 pub struct Push {
     /// The entity of the [`ModalBody`](crate::ModalBody).
     pub body: Entity,
-    /// Vertex of the model's surface that is pushed.
+    /// Vertex of the model's surface at which the force acts.
     pub vertex: u32,
     /// Force, N, world axes.
     pub force: DVec3,
 }
 
-/// Hands the tick's blows and forces to the solver, in the order in which they were sent.
+/// Passes the tick's impulses and forces to the solver, in the order in which they were written.
 pub(crate) fn hit_bodies(
     mut strikes: MessageReader<Impulse>,
     mut pushes: MessageReader<Push>,
@@ -64,7 +69,7 @@ pub(crate) fn hit_bodies(
             return refusals.tell(&name, entity, BodyError::NotLocal);
         }
         let scale = state.scale;
-        // What is refused wakes nobody.
+        // A refused impulse or force does not wake the body.
         match apply(&mut state.body, scale) {
             Ok(()) => state.wake(),
             Err(error) => refusals.tell(&name, entity, BodyError::Blow(error)),

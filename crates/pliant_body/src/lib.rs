@@ -1,4 +1,7 @@
-//! The Bevy plugin for modal soft bodies: assets, components, fixed-step systems, grabs, the pointer, and the deformed surface.
+//! The Bevy plugin for modal soft bodies.
+//!
+//! The plugin provides assets, components, fixed-step systems, grabs, pointer dragging and the
+//! deformed surface.
 //!
 //! ```no_run
 //! use bevy::prelude::*;
@@ -15,22 +18,24 @@
 //!
 //! | Written by you | Read by you |
 //! | --- | --- |
-//! | [`ModalBody`]: the model and how it is stepped | [`BodyState`]: the simulated body |
-//! | `Transform`: where it is | [`VisualState`]: what is on screen |
-//! | [`Grab`] and [`GrabOf`] on an entity of their own: a hold on a patch | [`GrabForce`]: the reaction, N; [`Grabs`] on the body |
-//! | [`Impulse`], [`Push`] as messages: a blow, N s; a force for one tick, N | [`BodyState::body`]: what came of it |
-//! | [`Driven::Remote`]: somebody else moves it | [`PliantTick`]: the number of the step |
-//! | `SurfaceShading`, `SurfaceDetail`, `SurfaceDeformation`: edges, level of detail, graphics card or processor (feature `render`) | [`BodyRefused`]: what was refused, and why |
+//! | [`ModalBody`]: the model and its step settings | [`BodyState`]: the simulated body |
+//! | `Transform`: the body's position, rotation and scale | [`VisualState`]: the state on screen |
+//! | [`Grab`] and [`GrabOf`] on a separate entity: a grab of a patch | [`GrabForce`]: the reaction, N; [`Grabs`] on the body |
+//! | [`Impulse`], [`Push`] as messages: an impulse, N s; a force for one tick, N | [`BodyState::body`]: the result |
+//! | [`Driven::Remote`]: another source moves the body | [`PliantTick`]: the number of the step |
+//! | `SurfaceShading`, `SurfaceDetail`, `SurfaceDeformation`: sharp edges, level of detail, GPU or CPU (feature `render`) | [`BodyRefused`]: a refused input with its error |
 //!
-//! The crate knows no network, device, viewer or panel; they stand on it. Time is Bevy's: pausing `Time<Virtual>` pauses the bodies, and
-//! [`SingleSteps`] lets steps pass meanwhile.
+//! The crate does not depend on a network, a device, a viewer or a panel. Those crates depend on
+//! this one. The bodies follow Bevy's time: pausing `Time<Virtual>` pauses them, and
+//! [`SingleSteps`] runs single steps during the pause.
 //!
 //! # Features
 //!
-//! `render`: the deformed surface as a mesh with normals, and the pointer's target drawn. Without it no renderer is compiled.
+//! `render`: draws the deformed surface as a mesh with normals, and draws the pointer's target.
+//! Without this feature no renderer is compiled.
 //!
-//! `bake`: `BakePlugin`, which meshes and bakes bodies in the game itself from a `BakeRequest`. Without it bodies come from `.modal` files and
-//! nothing of a solver is compiled.
+//! `bake`: adds `BakePlugin`, which meshes and bakes bodies inside the game from a `BakeRequest`.
+//! Without this feature bodies are loaded from `.modal` files and no part of the bake is compiled.
 #![cfg_attr(
     test,
     allow(clippy::unwrap_used, clippy::expect_used, clippy::panic, reason = "a failed test should panic")
@@ -80,54 +85,60 @@ pub use step::PliantTick;
 pub use under_pointer::{PointerHit, UnderPointer};
 pub use visual::{Pose, VisualState};
 
-/// Diagnostic: time of one tick's steps of all bodies that are awake, ms.
+/// Diagnostic: time of one tick's steps of all awake bodies, ms.
 pub const STEP_TIME: DiagnosticPath = DiagnosticPath::const_new("pliant/step");
 
-/// Diagnostic: how many bodies were stepped in a tick.
+/// Diagnostic: number of bodies stepped in a tick.
 pub const AWAKE_BODIES: DiagnosticPath = DiagnosticPath::const_new("pliant/awake");
 
-/// Diagnostic: time of writing the surfaces that changed in a frame, ms (feature `render`).
+/// Diagnostic: time of updating the surfaces that changed in a frame, ms (feature `render`).
 pub const DEFORM_TIME: DiagnosticPath = DiagnosticPath::const_new("pliant/deform");
 
-/// A tick, in this order, in the schedule that [`PliantBodyPlugin`] was given. None of it runs while the schedule's time stands still.
+/// The system sets of a tick, in this order, in the schedule given to [`PliantBodyPlugin`].
+///
+/// No set runs while the schedule's time stands still.
 #[derive(SystemSet, Debug, Clone, PartialEq, Eq, Hash)]
 pub enum PliantSystems {
-    /// Places, grabs and blows are taken over. Whoever moves a [`Grab`] or sends a [`Impulse`] or [`Push`] once a tick (a script, a session) does
-    /// so before this set.
+    /// Reads transforms, grabs, impulses and forces. A script or a session that moves a [`Grab`] or
+    /// writes an [`Impulse`] or a [`Push`] once per tick must run before this set.
     Input,
-    /// Local bodies are stepped.
+    /// Steps the local bodies.
     Step,
-    /// [`VisualState`] and [`GrabForce`] are written. Sources of remote bodies call [`VisualState::push`] in this set; readers run after it.
+    /// Writes [`VisualState`] and [`GrabForce`]. Sources of remote bodies call
+    /// [`VisualState::push`] in this set. Systems that read the results run after this set.
     Publish,
 }
 
-/// A frame, in this order, in `PostUpdate`.
+/// The system sets of a frame, in this order, in `PostUpdate`.
 #[derive(SystemSet, Debug, Clone, PartialEq, Eq, Hash)]
 pub enum PliantDisplaySystems {
-    /// Shown states move to where this frame falls between two ticks.
+    /// Interpolates the visual states to this frame's time between two ticks.
     Interpolate,
-    /// Surfaces are written from them.
+    /// Updates the surfaces from the visual states.
     Deform,
 }
 
-/// Bodies, grabs and, with the feature `render`, their surfaces.
+/// Adds bodies, grabs and, with the feature `render`, their surfaces.
 ///
-/// Needs Bevy's asset, time and transform plugins (`DefaultPlugins` has them; headless: `MinimalPlugins`, `AssetPlugin`,
-/// `TransformPlugin`).
+/// The plugin needs Bevy's asset, time and transform plugins. `DefaultPlugins` contains them. A
+/// headless app needs `MinimalPlugins`, `AssetPlugin` and `TransformPlugin`.
 pub struct PliantBodyPlugin {
     schedule: InternedScheduleLabel,
 }
 
 impl PliantBodyPlugin {
-    /// Steps the bodies in `schedule`, by the time that runs there. In a schedule of the fixed loop (`FixedUpdate` and its neighbours) the
-    /// picture is interpolated between steps; in any other one (`Update`) the step is as long as the frame.
+    /// Steps the bodies in `schedule`, with that schedule's time step.
+    ///
+    /// In a schedule of the fixed loop (`FixedUpdate` and its neighbors) the visual states are
+    /// interpolated between steps. In any other schedule (`Update`) the step is as long as the
+    /// frame.
     pub fn new(schedule: impl ScheduleLabel) -> Self {
         Self { schedule: schedule.intern() }
     }
 }
 
 impl Default for PliantBodyPlugin {
-    /// In `FixedUpdate`.
+    /// Steps the bodies in `FixedUpdate`.
     fn default() -> Self {
         Self::new(FixedUpdate)
     }
@@ -208,7 +219,8 @@ impl Plugin for PliantBodyPlugin {
                 PostUpdate,
                 (
                     visual::interpolate.in_set(PliantDisplaySystems::Interpolate),
-                    // After the transforms are known, so that no body is ever stepped where it is not.
+                    // This runs after transform propagation, so that no body is stepped with an
+                    // outdated transform.
                     step::build_bodies
                         .after(TransformSystems::Propagate)
                         .before(PliantDisplaySystems::Deform),

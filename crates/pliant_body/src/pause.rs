@@ -1,9 +1,11 @@
-//! Single steps while time is held.
+//! Single steps while time is paused.
 
 use bevy::prelude::*;
 
-/// Lets so many fixed steps pass in the next frame, while Bevy's `Time<Virtual>` is paused. Needs bodies that are stepped in the fixed loop,
-/// as they are unless [`PliantBodyPlugin::new`](crate::PliantBodyPlugin::new) was told otherwise.
+/// Runs this number of fixed steps in the next frame while Bevy's `Time<Virtual>` is paused.
+///
+/// The bodies must be stepped in the fixed loop, which is the default. See
+/// [`PliantBodyPlugin::new`](crate::PliantBodyPlugin::new).
 ///
 /// ```
 /// # use bevy::prelude::*;
@@ -18,15 +20,17 @@ use bevy::prelude::*;
 /// }
 /// ```
 ///
-/// Pausing `Time<Virtual>` is all that holding the time takes: no tick is counted, no body stepped, no surface written, and targets that are moved
-/// meanwhile are acted on in the next step. A single step runs the whole fixed loop once, with the game's own systems in it. While time runs
-/// nothing is added to it: the message is then forgotten. More than [`SingleSteps::MOST`] steps a frame are cut to that number.
+/// Pausing `Time<Virtual>` is enough to pause the bodies: no tick is counted, no body is stepped
+/// and no surface is written. Targets that move during the pause take effect in the next step. A
+/// single step runs the whole fixed loop once, together with the game's own systems in it. While
+/// time runs, the message has no effect and is dropped. A frame runs at most [`SingleSteps::MOST`]
+/// steps.
 #[derive(Message, Reflect, Debug, Clone, Copy, PartialEq, Eq)]
 #[reflect(Clone, PartialEq)]
 pub struct SingleSteps(pub u32);
 
 impl SingleSteps {
-    /// Most steps that pass in one frame.
+    /// Maximum number of steps in one frame.
     pub const MOST: u32 = 1_000;
 }
 

@@ -1,23 +1,25 @@
-//! A ray against the surface as it is now, not as it was at rest.
+//! Intersection of a ray with the deformed surface.
 
-/// Where a ray first meets a surface.
+/// The first intersection of a ray with a surface.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct SurfaceHit {
-    /// Triangle that was hit: an index into the surface's triangles.
+    /// Index of the intersected triangle in the surface's triangles.
     pub triangle: usize,
-    /// The vertex of that triangle nearest to the hit.
+    /// Vertex of that triangle that is nearest to the intersection.
     pub vertex: u32,
     /// Distance along the ray, in lengths of its direction.
     pub distance: f64,
-    /// The point that was hit, m, in the axes of the positions.
+    /// Intersection point, m, in the axes of the positions.
     pub point: [f64; 3],
 }
 
-/// The nearest triangle that the ray from `origin` along `direction` meets in front of it, from either side.
+/// Returns the nearest triangle that the ray from `origin` along `direction` intersects.
 ///
-/// Every triangle is tried (10,000 take some tens of microseconds, on a click): the shape moves each frame, so a tree would be refitted
-/// more often than it is asked. Möller and Trumbore, *Fast, Minimum Storage Ray/Triangle Intersection*, 1997, in double precision.
-/// Triangles with an index beyond `positions` are passed over.
+/// Triangles behind the origin are ignored. Both sides of a triangle count. The function tests
+/// every triangle (10,000 take some tens of microseconds), because the shape changes in each frame:
+/// a tree would need a refit more often than a click queries it. The test follows Möller and
+/// Trumbore, *Fast, Minimum Storage Ray/Triangle Intersection*, 1997, in double precision.
+/// Triangles with an index beyond `positions` are skipped.
 pub fn pick_surface(
     positions: &[[f32; 3]],
     triangles: &[[u32; 3]],
@@ -54,7 +56,8 @@ fn corners(positions: &[[f32; 3]], triangle: &[u32; 3]) -> Option<[[f64; 3]; 3]>
     Some(corners)
 }
 
-/// Distance along the ray to the triangle; `None` behind the origin, beside it, or in its plane.
+/// Returns the distance along the ray to the triangle. Returns `None` if the triangle is behind the
+/// origin, if the ray misses it, or if the ray is parallel to its plane.
 fn intersect([a, b, c]: &[[f64; 3]; 3], origin: [f64; 3], direction: [f64; 3]) -> Option<f64> {
     let (ab, ac) = (sub(*b, *a), sub(*c, *a));
     let p = cross(direction, ac);
@@ -102,7 +105,7 @@ mod tests {
     #[test]
     fn the_nearer_of_two_sheets_is_hit_at_its_nearest_corner() {
         let hit = pick_surface(&SQUARE, &TRIANGLES, [0.9, 0.2, 3.0], [0.0, 0.0, -0.5]).unwrap();
-        // The sheet at z = 0, three metres away: six lengths of a direction half a metre long.
+        // The sheet at z = 0 is three meters away: six lengths of a direction of half a meter.
         assert_eq!((hit.triangle, hit.vertex, hit.distance), (2, 1, 6.0));
         assert_eq!(hit.point, [0.9, 0.2, 0.0]);
     }

@@ -5,10 +5,14 @@ use pliant_modal::Patch;
 
 use crate::{Grab, GrabOf, PointerHit, UnderPointer};
 
-/// Lets the pointer drag bodies: press on the deformed surface, drag in the plane that faces the camera through the place that was hit,
-/// let go to release. The grab it makes is an ordinary [`Grab`], on remote bodies too.
+/// Lets the pointer drag bodies.
 ///
-/// An interface that wants the pointer for itself gates the press and only the press, so that a drag always ends:
+/// A press on the deformed surface grabs the body. A drag moves the target in the plane that faces
+/// the camera and contains the pressed point. Releasing the button releases the body. The plugin
+/// makes an ordinary [`Grab`], on remote bodies too.
+///
+/// An interface that needs the pointer should disable only the press set, so that a drag always
+/// ends:
 ///
 /// ```
 /// # use bevy::prelude::*;
@@ -24,13 +28,14 @@ pub struct PointerGrabPlugin;
 #[derive(Resource, Reflect, Debug, Clone, Copy, PartialEq)]
 #[reflect(Resource, Default, Clone, PartialEq)]
 pub struct PointerGrab {
-    /// Off: nothing is grabbed, and what is held is let go. Default: `true`.
+    /// Whether the pointer can grab. `false` also releases a grabbed body. Default: `true`.
     pub enabled: bool,
-    /// The button that grabs. Default: the left one.
+    /// Button that grabs. Default: the left button.
     pub button: MouseButton,
-    /// Radius of the patch as a part of the model's size (its largest extent). Default: `0.06`.
+    /// Radius of the patch as a fraction of the model's size (its largest extent). Default: `0.06`.
     pub radius: f64,
-    /// Color of the target and of the line to it. Default: a warm yellow; nothing is drawn when it is fully transparent.
+    /// Color of the target and of the line to it. A fully transparent color draws nothing. Default:
+    /// a warm yellow.
     pub color: Color,
 }
 
@@ -40,24 +45,26 @@ impl Default for PointerGrab {
     }
 }
 
-/// Where pointer grabs are made, moved and let go, in `PreUpdate` after the input of the frame.
+/// The system sets that make, move and release pointer grabs, in `PreUpdate` after the frame's
+/// input.
 #[derive(SystemSet, Debug, Clone, PartialEq, Eq, Hash)]
 pub enum PointerGrabSystems {
     /// A press on a body makes a grab.
     Press,
-    /// The target follows the pointer; the button going up despawns the grab.
+    /// The target tracks the pointer. Releasing the button despawns the grab.
     Drag,
 }
 
-/// On a grab that the pointer made: the plane its target moves in.
+/// Marks a grab that the pointer made, and defines the plane in which its target moves.
 #[derive(Component, Reflect, Debug, Clone, Copy, PartialEq)]
 #[reflect(Component, Clone, PartialEq)]
 pub struct PointerHeld {
-    /// The camera that was looked through.
+    /// The camera through which the pointer grabbed.
     pub camera: Entity,
-    /// A point of the plane: where the surface was hit, m, in world axes.
+    /// A point of the plane: the pressed point of the surface, m, world axes.
     pub hit: Vec3,
-    /// From the pointer's place in the plane to the target, m: the middle of the patch is seldom right under the pointer.
+    /// Offset from the pointer's position in the plane to the target, m. The middle of the patch is
+    /// rarely exactly under the pointer.
     pub offset: DVec3,
     /// Radius of the sphere drawn at the target, m.
     pub mark: f32,
@@ -131,7 +138,7 @@ fn drag(
             commands.entity(entity).despawn();
             continue;
         }
-        // Outside the window the target waits at its last place.
+        // While the pointer is outside the window, the target stays at its last position.
         let Some((ray, camera)) = cameras.through(pointer.camera) else { continue };
         let facing = InfinitePlane3d::new(camera.forward());
         if let Some(distance) = ray.intersect_plane(pointer.hit, facing) {

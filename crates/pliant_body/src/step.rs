@@ -1,4 +1,4 @@
-//! The fixed step: bodies are made, placed, held, stepped, and what came of it is published.
+//! The fixed step: builds, places, grabs and steps the bodies, and publishes the results.
 
 use std::{
     sync::{Arc, Weak},
@@ -18,23 +18,26 @@ use crate::{
     ModalBody, Pose, STEP_TIME, VisualState, body::Held,
 };
 
-/// The tick: how many steps the schedule of the bodies has made. It counts on while bodies rest, and stands while time is paused.
+/// The tick: the number of steps that the schedule of the bodies has made.
+///
+/// The number increases while bodies rest, and stays constant while time is paused.
 #[derive(Resource, Reflect, Debug, Default, Clone, Copy, PartialEq, Eq)]
 #[reflect(Resource, Default, Clone, PartialEq)]
 pub struct PliantTick(pub u64);
 
-/// How the bodies' schedule runs.
+/// Describes how the bodies' schedule runs.
 #[derive(Resource, Debug, Clone, Copy)]
 pub(crate) struct Stepping {
-    /// By `Time<Fixed>`, so that frames fall between steps.
+    /// Whether the schedule runs by `Time<Fixed>`, so that frames fall between steps.
     pub fixed: bool,
 }
 
-/// The body of this entity was refused with this model; it is tried again when its [`ModalBody`] or the asset behind it changes.
+/// Marks an entity whose body was refused with this model. The build is tried again when the
+/// entity's [`ModalBody`] or the asset behind it changes.
 #[derive(Component)]
 pub(crate) struct BuildRefused(Weak<ModalModel>);
 
-/// Seconds for which a body must be slow before it rests.
+/// Time for which a body must be slow before it rests, s.
 const REST_AFTER: f64 = 0.5;
 
 #[derive(SystemParam)]
@@ -49,7 +52,7 @@ impl Refusals<'_> {
     }
 }
 
-/// A body as it is asked for, and as it is.
+/// The requested body and the existing body of an entity.
 type Buildable =
     (NameOrEntity, Ref<'static, ModalBody>, Option<&'static mut BodyState>, Option<&'static BuildRefused>);
 
@@ -66,7 +69,7 @@ pub(crate) fn build_bodies(
         _ => 1.0 / 60.0,
     };
     for (name, body, state, refused) in &mut bodies {
-        // A handle whose asset is not there yet leaves the old body, if there is one.
+        // While the asset of a new handle is not loaded, the old body stays, if there is one.
         let Some(ModalAsset(model)) = models.get(&body.model) else { continue };
         let modes = body.modes.unwrap_or(usize::MAX).min(model.mode_count());
         match state {
@@ -86,13 +89,14 @@ pub(crate) fn build_bodies(
                 }
                 match Body::new(model.clone(), body.config(step, 1.0)) {
                     Ok(new) => {
-                        // Fewer or more modes of one model: the motion of those that stay goes on.
+                        // If only the number of modes changed, the motion of the common modes
+                        // continues.
                         let new = match state {
                             Some(old) if Arc::ptr_eq(old.model(), model) => carry_over(&name, &old.body, new),
                             _ => new,
                         };
                         let shown = VisualState::new(new.q());
-                        // Somebody may have despawned it in this very frame.
+                        // The entity may have been despawned in this frame.
                         commands
                             .entity(name.entity)
                             .try_insert((BodyState::new(new), shown))
@@ -123,26 +127,27 @@ fn carry_over(name: &NameOrEntityItem, old: &Body, mut new: Body) -> Body {
         }
     }
     state.frame = from.frame;
-    // A state that the old body had is finite; were it not, the new one stays at rest.
+    // The state of the old body is finite, so this should not fail. If it does, the new body starts
+    // at rest.
     if let Err(error) = new.set_state(&state) {
         warn!("{name}: the motion of the body was not carried over: {error}");
     }
     new
 }
 
-/// An entity whose [`ModalBody`] is taken away keeps nothing of the simulation.
+/// Removes the simulation components of an entity whose [`ModalBody`] was removed.
 pub(crate) fn drop_states(removed: On<Remove, ModalBody>, mut commands: Commands) {
     if let Ok(mut entity) = commands.get_entity(removed.entity) {
         entity.try_remove::<(BodyState, VisualState, BuildRefused)>();
     }
 }
 
-/// A grab that is taken off its body feels nothing any more.
+/// Sets the force of a grab that was removed from its body to zero.
 pub(crate) fn let_go(removed: On<Remove, GrabOf>, mut forces: Query<&mut GrabForce>) {
     feel_nothing(removed.entity, &mut forces);
 }
 
-/// Nor do the grabs on a body that is not there any more.
+/// Sets the forces of the grabs on a removed body to zero.
 pub(crate) fn lose_body(
     removed: On<Remove, BodyState>,
     grabs: Query<&Grabs>,
@@ -163,7 +168,7 @@ pub(crate) fn count_tick(mut tick: ResMut<PliantTick>) {
     tick.0 += 1;
 }
 
-/// Takes the place of every body whose transform changed.
+/// Applies the transform of every body whose transform changed.
 pub(crate) fn place_bodies(
     mut refusals: Refusals,
     mut bodies: Query<
@@ -172,7 +177,8 @@ pub(crate) fn place_bodies(
     >,
 ) {
     for (name, local, global, mut state, mut shown) in &mut bodies {
-        // A free body has no parent; what was written into its transform since the last frame is not in the global one yet.
+        // A free body has no parent. Its `GlobalTransform` does not contain the changes to
+        // `Transform` since the last frame.
         let transform = if state.model().is_free() { GlobalTransform::from(*local) } else { *global };
         let affine = transform.affine();
         if state.is_placed(&affine) {
@@ -187,7 +193,8 @@ pub(crate) fn place_bodies(
         }
         let scale = f64::from(scale.x);
         if scale != state.scale {
-            // From what the body runs with, not from its component, whose fields may have been refused.
+            // The running configuration is the base, because the component's fields may have been
+            // refused.
             let mut running = state.body.config().clone();
             let shrink = state.scale / scale;
             running.settings.gravity = running.settings.gravity.map(|acceleration| acceleration * shrink);
@@ -202,15 +209,15 @@ pub(crate) fn place_bodies(
         let origin = translation.as_dvec3() / scale;
         let rotation = rotation.as_dquat().normalize();
         match state.body_mut().set_pose(origin.into(), rotation.into()) {
-            // It did not fly here: the picture has nothing to pass through.
+            // The body jumped to this pose, so the visual state must not interpolate toward it.
             Ok(()) => shown.bypass_change_detection().forget_pose(),
             Err(error) => refusals.tell(&name, name.entity, BodyError::Step(error)),
         }
     }
 }
 
-/// Makes the solver's grabs those of the entities: new ones are held, gone ones are let go, targets are handed over.
-/// One that found the body full waits, and is held once a place is free.
+/// Synchronizes the solver's grabs with the grab entities: adds new grabs, releases removed grabs
+/// and passes on the targets. A grab that finds the body full waits until a slot is free.
 pub(crate) fn hold_bodies(
     mut refusals: Refusals,
     mut bodies: Query<(&mut BodyState, &Driven, Option<&Grabs>)>,
@@ -254,14 +261,15 @@ pub(crate) fn hold_bodies(
                 held.id = taken.map_err(|error| refusals.tell(&name, entity, error)).ok();
             }
             let Some(id) = held.id else { continue };
-            // Not finite is the only way in which a target can be wrong.
+            // A target can be invalid only by being not finite.
             let refused = body.set_target(id, (grab.target / *scale).into()).is_err();
             if refused && !held.refusing {
                 refusals.tell(&name, entity, BodyError::TargetNotFinite { target: grab.target.into() });
             }
             held.refusing = refused;
         }
-        // A hand keeps the body awake, and so does letting go for as long as it moves; a hand that was refused touches nothing.
+        // A grab keeps the body awake. A release wakes the body until it comes to rest. A refused
+        // grab has no effect.
         if let_go || held.iter().any(|held| held.id.is_some()) {
             (*quiet, *resting) = (0.0, false);
         }
@@ -293,7 +301,8 @@ pub(crate) fn step_bodies(
         }
         stepped += 1;
         let state = &mut *state;
-        // From what the body runs with: the component's fields may have been refused.
+        // The running configuration is the base, because the component's fields may have been
+        // refused.
         let lengthened = match state.body.config() {
             running if running.step == step => Ok(()),
             running => state.body.reconfigure(BodyConfig { step, ..running.clone() }),
@@ -318,11 +327,13 @@ pub(crate) fn step_bodies(
     }
 }
 
-/// Whether the root mean square speed of the mass is below `limit` (m/s). Modes are mass-normalised: twice their kinetic energy is `sum v^2`.
+/// Whether the root mean square speed of the mass is below `limit` (m/s).
+///
+/// The modes are mass-normalized: twice their kinetic energy is `sum v^2`.
 fn is_slow(body: &Body, limit: f64) -> bool {
     let mass = body.model().mass();
     let modes: f64 = body.v().iter().map(|v| v * v).sum();
-    // A limit that is NaN lets nothing rest.
+    // With a limit of NaN no body rests.
     let below = modes < limit * limit * mass;
     if !below || is_relaxing(body, limit) {
         return false;
@@ -336,10 +347,11 @@ fn is_slow(body: &Body, limit: f64) -> bool {
     velocity.length() < limit && spin.length() < limit * mass * body.model().size()
 }
 
-/// Whether a viscoelastic body has still farther to go than it would at this speed (m/s) in the time
-/// after which it rests. However slowly it goes there, it is not where it will be.
+/// Whether a viscoelastic body is still farther from its final shape than it would move at the
+/// speed `limit` (m/s) during `REST_AFTER`. Such a body must not rest, however slowly it moves.
 ///
-/// Unmoved, `omega^2 (q - ratio z) = f` and in the end `q = z`: what is left is `ratio / (1 - ratio) (z - q)`.
+/// Without motion, `omega^2 (q - ratio z) = f`, and finally `q = z`. The remaining distance is
+/// `ratio / (1 - ratio) (z - q)`.
 fn is_relaxing(body: &Body, limit: f64) -> bool {
     let Some(relaxation) = body.config().settings.relaxation else { return false };
     let share = relaxation.ratio / (1.0 - relaxation.ratio);

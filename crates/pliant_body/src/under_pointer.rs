@@ -1,4 +1,4 @@
-//! What lies under the pointer, through whichever camera sees a body there.
+//! The body under the pointer, across all cameras of a window.
 
 use std::cmp::Reverse;
 
@@ -17,7 +17,7 @@ type Cameras<'w, 's> = Query<
     (Entity, &'static Camera, &'static RenderTarget, &'static GlobalTransform, Option<&'static RenderLayers>),
 >;
 
-/// A body as the pointer sees it.
+/// The components of a body that the pointer query reads.
 type Touchable = (
     Entity,
     &'static BodyState,
@@ -29,8 +29,9 @@ type Touchable = (
 
 /// The cameras that show a window, and the bodies under its pointer.
 ///
-/// A window may show several cameras, one over the other: the scene, and over it an interface that has no body in it. So no camera alone
-/// answers for the pointer; they are asked in turn.
+/// A window may show several cameras on top of each other, for example a scene and an interface
+/// without bodies. No single camera can therefore answer the query, and the cameras are tried in
+/// turn.
 #[derive(SystemParam)]
 pub struct UnderPointer<'w, 's> {
     cameras: Cameras<'w, 's>,
@@ -42,25 +43,32 @@ pub struct UnderPointer<'w, 's> {
 /// A body under the pointer.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct PointerHit {
-    /// The camera that it is seen through.
+    /// The camera that sees the body under the pointer.
     pub camera: Entity,
-    /// From that camera through the pointer, world axes, m.
+    /// The ray from that camera through the pointer, world axes, m.
     pub ray: Ray3d,
     /// The body's entity.
     pub body: Entity,
-    /// Where its surface as it is shown is hit: `distance` along `ray`, m, and `point` in the body's axes.
+    /// The intersection with the drawn surface: `distance` along `ray`, m, and `point` in the
+    /// body's axes.
     pub hit: SurfaceHit,
 }
 
 impl UnderPointer<'_, '_> {
-    /// The ray through the pointer of the camera's window, wherever in it the pointer is, and the camera's place. `None` for a camera that shows
-    /// no window, and while the pointer is outside of it.
+    /// Returns the ray through the pointer, anywhere in the camera's window, and the camera's
+    /// transform.
+    ///
+    /// Returns `None` for a camera that does not show a window, and while the pointer is outside
+    /// the window.
     pub fn through(&self, camera: Entity) -> Option<(Ray3d, &GlobalTransform)> {
         let (_, camera, target, place, _) = self.cameras.get(camera).ok()?;
         Some((camera.viewport_to_world(place, self.cursor(target)?).ok()?, place))
     }
 
-    /// The active cameras in whose viewport the pointer is, front-most (highest order) first, with the ray through it.
+    /// Returns the active cameras whose viewport contains the pointer, each with the ray through
+    /// it.
+    ///
+    /// The front-most camera (highest order) comes first.
     pub fn rays(&self) -> impl Iterator<Item = (Entity, Ray3d)> {
         let mut cameras: Vec<_> = self
             .cameras
@@ -76,8 +84,11 @@ impl UnderPointer<'_, '_> {
         cameras.into_iter().filter_map(|(_, camera)| Some((camera, self.through(camera)?.0)))
     }
 
-    /// The nearest body under the pointer, through the front-most camera that has one there: a camera sees the bodies whose [`RenderLayers`] it
-    /// shares. `camera` asks that one only. Hidden bodies and those with [`NoPointerGrab`] are passed through.
+    /// Returns the nearest body under the pointer, through the front-most camera that sees a body
+    /// there.
+    ///
+    /// A camera sees the bodies that share its [`RenderLayers`]. `camera` restricts the query to
+    /// one camera. Hidden bodies and bodies with [`NoPointerGrab`] are ignored.
     pub fn body(&self, camera: Option<Entity>) -> Option<PointerHit> {
         self.rays().filter(|(entity, _)| camera.is_none_or(|camera| camera == *entity)).find_map(
             |(camera, ray)| {
@@ -88,7 +99,8 @@ impl UnderPointer<'_, '_> {
         )
     }
 
-    /// The shape of a body that may be under the pointer, and its place.
+    /// Returns the state, the visual state and the transform of a body that may be under the
+    /// pointer.
     pub(crate) fn shape(&self, body: Entity) -> Option<(&BodyState, &VisualState, &GlobalTransform)> {
         let (_, state, shown, place, ..) = self.bodies.get(body).ok()?;
         Some((state, shown, place))
@@ -100,7 +112,8 @@ impl UnderPointer<'_, '_> {
         });
         let hits = seen.filter_map(|(entity, state, shown, place, ..)| {
             let inverse = place.affine().inverse();
-            // The direction keeps its length in the body's axes, so that distances along it compare between bodies.
+            // The direction keeps its world length in the body's axes, so that distances along the
+            // ray are comparable between bodies.
             let origin = inverse.transform_point3(ray.origin).as_dvec3();
             let direction = inverse.transform_vector3(*ray.direction).as_dvec3();
             let positions = state.positions_at(shown.q());
@@ -110,7 +123,7 @@ impl UnderPointer<'_, '_> {
         hits.min_by(|a, b| a.1.distance.total_cmp(&b.1.distance))
     }
 
-    /// Where in the window that `target` is the pointer stands, logical pixels.
+    /// Returns the position of the pointer in the window of `target`, logical pixels.
     fn cursor(&self, target: &RenderTarget) -> Option<Vec2> {
         let NormalizedRenderTarget::Window(window) = target.normalize(self.primary.single().ok())? else {
             return None;

@@ -1,4 +1,4 @@
-//! What the eye gets: the last two states of a body and the one between them that is on screen.
+//! The visual state of a body: its last two states and the interpolated state on screen.
 
 use bevy::{
     math::{DQuat, DVec3},
@@ -7,26 +7,28 @@ use bevy::{
 
 use crate::{BodyError, BodyState, step::Stepping};
 
-/// Where a free body is, in world axes.
+/// The pose of a free body, in world axes.
 #[derive(Reflect, Debug, Clone, Copy, PartialEq)]
 pub struct Pose {
     /// World position of the model's origin, m.
     pub origin: DVec3,
-    /// Rotation from body to world axes.
+    /// Rotation from body axes to world axes.
     pub orientation: DQuat,
 }
 
-/// The shown state of a body: its modal coordinates (and the pose of a free one) between the last two ticks.
+/// The visual state of a body: modal coordinates, and a free body's pose, between the last two
+/// ticks.
 ///
-/// A body that is [`Driven::Local`](crate::Driven::Local) gets it from its own steps. For a
-/// [`Driven::Remote`](crate::Driven::Remote) body somebody else (the network, a replay, a script) calls [`push`](Self::push)
-/// once a tick, or [`snap`](Self::snap) as often as wanted; the surface is then drawn from it exactly as for a local body.
+/// The steps of a [`Driven::Local`](crate::Driven::Local) body write this state. For a
+/// [`Driven::Remote`](crate::Driven::Remote) body another source (the network, a replay, a script)
+/// calls [`push`](Self::push) once per tick, or [`snap`](Self::snap) at any time. The surface is
+/// drawn from this state in the same way as for a local body.
 ///
-/// Lengths: one coordinate per kept mode, kg^1/2 m.
+/// Every state has one coordinate per kept mode, kg^1/2 m.
 #[derive(Component, Reflect, Debug)]
 #[reflect(Component, from_reflect = false)]
 pub struct VisualState {
-    // Their lengths agree; nothing from outside may change one of them.
+    // The three vectors have the same length. Nothing outside may change the length of one of them.
     #[reflect(ignore)]
     previous: Vec<f64>,
     #[reflect(ignore)]
@@ -36,10 +38,10 @@ pub struct VisualState {
     /// Ticks since the last push: 0 in the tick of the push.
     age: u8,
     settled: bool,
-    /// Where between the last two states it stands, since the last push.
+    /// Fraction of the tick to which the state was interpolated since the last push.
     at: Option<f64>,
     version: u64,
-    /// Previous and current pose of a free body; an anchored one is where its transform is.
+    /// Previous and current pose of a free body. An anchored body is at its transform.
     poses: Option<[Pose; 2]>,
 }
 
@@ -57,11 +59,14 @@ impl VisualState {
         }
     }
 
-    /// Makes `q` the newest state; the picture moves from the one before to it during the coming tick.
+    /// Makes `q` the newest state.
+    ///
+    /// During the coming tick the picture moves from the state before it to `q`.
     ///
     /// # Errors
-    /// [`BodyError::VisualLength`] when there is not one coordinate per mode, [`BodyError::VisualNotFinite`] when one is NaN or
-    /// infinite. The state is then as it was.
+    /// Returns [`BodyError::VisualLength`] if `q` does not have one coordinate per mode, and
+    /// [`BodyError::VisualNotFinite`] if a coordinate is NaN or infinite. The state then stays
+    /// unchanged.
     pub fn push(&mut self, q: &[f64]) -> Result<(), BodyError> {
         self.check(q)?;
         std::mem::swap(&mut self.previous, &mut self.current);
@@ -72,10 +77,12 @@ impl VisualState {
         Ok(())
     }
 
-    /// Shows `q` at once, without interpolation (a cut, a reset, a source that interpolates by itself).
+    /// Shows `q` at once, without interpolation.
+    ///
+    /// This suits a cut, a reset or a source that interpolates by itself.
     ///
     /// # Errors
-    /// As [`push`](Self::push).
+    /// Returns the errors of [`push`](Self::push).
     pub fn snap(&mut self, q: &[f64]) -> Result<(), BodyError> {
         self.check(q)?;
         self.previous.copy_from_slice(q);
@@ -87,10 +94,11 @@ impl VisualState {
         Ok(())
     }
 
-    /// [`push`](Self::push) for a free body, with the place it is at.
+    /// Pushes the newest state of a free body together with its pose, see [`push`](Self::push).
     ///
     /// # Errors
-    /// As [`push`](Self::push); [`BodyError::PoseNotFinite`] for a pose with NaN or infinity.
+    /// Returns the errors of [`push`](Self::push), and [`BodyError::PoseNotFinite`] if the pose
+    /// contains NaN or infinity.
     pub fn push_at(&mut self, q: &[f64], pose: Pose) -> Result<(), BodyError> {
         if !pose.origin.is_finite() || !pose.orientation.is_finite() {
             return Err(BodyError::PoseNotFinite {
@@ -103,32 +111,35 @@ impl VisualState {
         Ok(())
     }
 
-    /// What is on screen in this frame: one coordinate a kept mode, kg^1/2 m.
+    /// Returns the state on screen in this frame: one coordinate per kept mode, kg^1/2 m.
     pub fn q(&self) -> &[f64] {
         &self.shown
     }
 
-    /// The newest state that was pushed: one coordinate a kept mode, kg^1/2 m.
+    /// Returns the newest pushed state: one coordinate per kept mode, kg^1/2 m.
     pub fn current(&self) -> &[f64] {
         &self.current
     }
 
-    /// The state pushed before [`current`](Self::current), kg^1/2 m; the same one where a tick passed without a push.
+    /// Returns the state pushed before [`current`](Self::current), kg^1/2 m. Both are equal after a
+    /// tick without a push.
     pub fn previous(&self) -> &[f64] {
         &self.previous
     }
 
-    /// Grows with every change of [`q`](Self::q); a reader that keeps the last one it saw knows whether there is work.
+    /// Returns a number that grows with every change of [`q`](Self::q).
+    ///
+    /// A reader that stores the last number can tell whether `q` changed.
     pub fn version(&self) -> u64 {
         self.version
     }
 
-    /// Whether the picture stands still: nothing was pushed for a tick.
+    /// Whether the state on screen is constant, because nothing was pushed for a tick.
     pub fn is_settled(&self) -> bool {
         self.settled
     }
 
-    /// The next pose is where it is shown at once: there is none to come from.
+    /// Removes the poses, so that the next pose is shown at once without interpolation.
     pub(crate) fn forget_pose(&mut self) {
         self.poses = None;
     }
@@ -146,13 +157,15 @@ impl VisualState {
     fn begin_tick(&mut self) {
         self.age = self.age.saturating_add(1);
         if self.age == 1 && !self.settled {
-            // Nobody has pushed yet in this tick. If nobody does, the picture stays at the newest state.
+            // Nothing was pushed yet in this tick. Without a push the picture stays at the newest
+            // state.
             self.previous.copy_from_slice(&self.current);
             self.poses = self.poses.map(|[_, current]| [current; 2]);
         }
     }
 
-    /// Whether it is to be moved to `fraction` of the tick; not when it stands there already, as in every frame of a pause.
+    /// Whether the state must be interpolated to `fraction` of the tick. It must not if it is
+    /// already there, as in every frame of a pause.
     fn is_behind(&self, fraction: f64) -> bool {
         !self.settled && (self.age > 0 || self.at != Some(fraction))
     }
@@ -169,12 +182,13 @@ impl VisualState {
 
 pub(crate) fn begin_tick(mut states: Query<&mut VisualState>) {
     for mut state in &mut states {
-        // Not a change that a reader of the component needs to see.
+        // Readers of the component do not need to see this change.
         state.bypass_change_detection().begin_tick();
     }
 }
 
-/// `PostUpdate`: moves the shown states to the fraction of a tick that this frame is at, and free bodies to where they are seen.
+/// Interpolates the visual states, and the transforms of free bodies, to this frame's fraction of a
+/// tick. Runs in `PostUpdate`.
 pub(crate) fn interpolate(
     fixed: Option<Res<Time<Fixed>>>,
     stepping: Res<Stepping>,
@@ -182,7 +196,7 @@ pub(crate) fn interpolate(
 ) {
     let fraction = match &fixed {
         Some(fixed) if stepping.fixed => fixed.overstep_fraction_f64().clamp(0.0, 1.0),
-        // Stepped once a frame: the newest state is the frame's own.
+        // With one step per frame, the newest state belongs to this frame.
         _ => 1.0,
     };
     for (mut shown, mut state, mut transform) in &mut bodies {
@@ -191,12 +205,12 @@ pub(crate) fn interpolate(
         }
         shown.interpolate(fraction);
         if let Some([from, to]) = shown.poses
-            // Somebody has put it elsewhere since: the next tick takes that.
+            // If the transform was changed from outside, the next tick applies that change instead.
             && state.is_placed(&transform.compute_affine())
         {
             transform.translation = from.origin.lerp(to.origin, fraction).as_vec3();
             transform.rotation = from.orientation.slerp(to.orientation, fraction).normalize().as_quat();
-            // So that the body does not take its own writing for somebody else's.
+            // This keeps the body from treating its own change as a change from outside.
             state.placed = Some(transform.compute_affine());
         }
     }

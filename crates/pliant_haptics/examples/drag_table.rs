@@ -1,9 +1,12 @@
-//! Drags a body with a virtual device: body stiffness, grip, simulation rate and round trip against what the hand feels. Prints Markdown.
+//! Drags a body with a virtual device and prints a Markdown table: body stiffness, grip, simulation
+//! rate and round trip against the resulting forces.
 //!
-//! `cargo run --release -p pliant_haptics --example drag_table -- [BODY.modal] [modal] [touch | premium | omega | slippery] [summary]`
+//! `cargo run --release -p pliant_haptics --example drag_table -- [BODY.modal] [modal] [touch |
+//! premium | omega | slippery] [summary]`
 //!
-//! Without a body it drags a block whose modes are known in closed form. A body is made 15 cm large and of each stiffness in turn, and is dragged by its top.
-//! `slippery` is the Touch without any friction: the hardest case. `summary` prints the last line alone.
+//! Without a body, the example drags a block whose modes are known in closed form. A body is scaled
+//! to 15 cm, gets each stiffness in turn, and is dragged by its top. `slippery` is the Touch
+//! without any friction, which is the hardest case. `summary` prints the last line only.
 #![allow(clippy::unwrap_used, clippy::expect_used, reason = "an experiment may stop at a surprise")]
 
 #[path = "../tests/rig/mod.rs"]

@@ -1,7 +1,10 @@
-//! Feel it: the haptic device layer of Pliant. Whoever owns a device plugs it in and feels the body; whoever owns none has a virtual one.
+//! Haptic devices for Pliant: a player holds a soft body with a force feedback device and feels the
+//! body's reaction. A virtual device replaces the hardware where none is present.
 //!
-//! The force is closed at device rate, on a thread of its own, from the simulation's last word: a spring from the hand to where the held patch is, in
-//! series with what the patch gives. Between the spring and the hand stands the [`Safety`] pipeline.
+//! The force loop runs at the rate of the device on its own thread. The loop computes the force
+//! from the last [`LocalModel`] that the simulation published: a spring from the hand to the held
+//! patch, in series with the compliance of the body at the patch. The force passes through the
+//! [`Safety`] pipeline before the device applies the force to the hand.
 //!
 //! ```
 //! use pliant_haptics::{Hand, HapticLoop, LoopConfig, VirtualDevice, VirtualConfig};
@@ -26,16 +29,21 @@
 //!
 //! | Layer | What it is |
 //! | --- | --- |
-//! | [`HapticDevice`] | takes a wrench, holds it for a period, says where the hand is: [`VirtualDevice`], [`Positioned`], [`Replay`], `Inverse`, `OpenHaptics`, `ForceDimension` |
-//! | [`LoopCore`] | a sample and a [`LocalModel`] in, a [`Wrench`] out: no clock, no thread, no allocation |
-//! | [`Cycle`] | the core and a device, period by period: loss and return, calibration, buttons, counters; in real or virtual time |
-//! | [`HapticLoop`] | a cycle on its thread, absolute scheduler, FIFO priority where allowed; lock-free ends for the app |
-//! | `HapticsPlugin` | Bevy: devices as a resource, tools and grabs as components (feature `plugin`) |
+//! | [`HapticDevice`] | applies a wrench for one period and reports the hand's pose: [`VirtualDevice`], [`Positioned`], [`Replay`], `Inverse`, `OpenHaptics`, `ForceDimension` |
+//! | [`LoopCore`] | computes a [`Wrench`] from a sample and a [`LocalModel`], without a clock, a thread or an allocation |
+//! | [`Cycle`] | runs the core and a device period by period in real or virtual time: loss and return, calibration, buttons, counters |
+//! | [`HapticLoop`] | runs a cycle on its own thread with an absolute scheduler, FIFO priority where allowed and lock-free ends for the app |
+//! | `HapticsPlugin` | Bevy plugin: devices as a resource, tools and grabs as components (feature `plugin`) |
 //!
 //! # Features
 //!
-//! `inverse` (default): the Haply Inverse3. `vendor` (default): 3D Systems and Force Dimension, libraries loaded at run time. `plugin`: Bevy; without it no
-//! engine is compiled. `gamepad`, on top of it: gamepads as position sources; `rumble`: gamepads that buzz; `render`: the force drawn as an arrow.
+//! - `inverse` (default): the Haply Inverse3.
+//! - `vendor` (default): 3D Systems and Force Dimension devices. The vendor libraries are loaded at
+//!   run time.
+//! - `plugin`: the Bevy plugin. No engine is compiled without this feature.
+//! - `gamepad` (includes `plugin`): gamepads as position sources.
+//! - `rumble` (includes `gamepad`): vibration of gamepads.
+//! - `render` (includes `plugin`): draws the force as an arrow.
 #![cfg_attr(
     test,
     allow(clippy::unwrap_used, clippy::expect_used, clippy::panic, reason = "a failed test should panic")

@@ -1,4 +1,4 @@
-//! What a tick costs: no allocation, ever, and little time; and what the loop does on its own
+//! Cost of a tick: no allocation ever and little time, and the behavior of the loop on its own
 //! thread.
 #![allow(clippy::unwrap_used, clippy::expect_used, clippy::panic, reason = "a failed test should panic")]
 #![allow(unsafe_code, reason = "counting allocations needs a global allocator")]
@@ -24,16 +24,17 @@ thread_local! {
     static ALLOCATIONS: Cell<u64> = const { Cell::new(0) };
 }
 
-// SAFETY: every call goes on to the system's allocator unchanged; the counter is a plain thread-local cell without a destructor.
+// SAFETY: every call goes on to the system's allocator unchanged. The counter is a plain
+// thread-local cell without a destructor.
 unsafe impl GlobalAlloc for Counting {
     unsafe fn alloc(&self, layout: Layout) -> *mut u8 {
         ALLOCATIONS.with(|n| n.set(n.get() + 1));
-        // SAFETY: as the caller promised.
+        // SAFETY: the caller guarantees the conditions.
         unsafe { System.alloc(layout) }
     }
     unsafe fn dealloc(&self, at: *mut u8, layout: Layout) {
         ALLOCATIONS.with(|n| n.set(n.get() + 1));
-        // SAFETY: as the caller promised.
+        // SAFETY: the caller guarantees the conditions.
         unsafe { System.dealloc(at, layout) }
     }
 }
@@ -41,7 +42,8 @@ unsafe impl GlobalAlloc for Counting {
 #[global_allocator]
 static COUNTING: Counting = Counting;
 
-/// The processor's time of this thread, s: a test beside compilers is to measure the loop, not them.
+/// Returns the CPU time of this thread, s. With compilers running at the same time, this clock
+/// still measures only the loop.
 #[cfg(any(target_os = "linux", target_os = "android", target_os = "freebsd"))]
 fn cpu_time() -> f64 {
     let t = rustix::time::clock_gettime(rustix::time::ClockId::ThreadCPUTime);
@@ -55,13 +57,15 @@ fn cpu_time() -> f64 {
     START.get_or_init(Instant::now).elapsed().as_secs_f64()
 }
 
-/// Periods of which each is run in every round.
+/// Number of different periods. Every round runs each of them once.
 const PERIODS: usize = 4000;
 const ROUNDS: usize = 10;
 
-/// Allocations and deallocations in [`PERIODS`] of the loop, with words of the simulation coming in
-/// between. Lowers `least`, what each period's work takes, the simulated device's with it, s, and
-/// `yardstick`.
+/// Counts allocations and deallocations in [`PERIODS`] of the loop with local model updates in
+/// between.
+///
+/// The function lowers `least`, the work time of each period including the simulated device, s, and
+/// `yardstick`, the time of [`multiply_and_add`], s.
 fn ticks(modal: bool, least: &mut [f64], yardstick: &mut f64) -> u64 {
     let mut scene = Scene::new(SceneConfig { modal, hand: Hand::LIGHT, ..SceneConfig::default() });
     scene.hand.set_target([0.01, 0.01, 0.0]);
@@ -89,7 +93,8 @@ fn ticks(modal: bool, least: &mut [f64], yardstick: &mut f64) -> u64 {
     ALLOCATIONS.with(Cell::get) - before
 }
 
-/// Ten thousand multiplications and additions, each of which waits for the one before: some 17 us.
+/// Runs ten thousand multiplications and additions, each of which depends on the previous one. They
+/// take about 17 us.
 #[inline(never)]
 fn multiply_and_add() {
     let mut x = black_box(0.5f64);
@@ -100,9 +105,11 @@ fn multiply_and_add() {
     black_box(x);
 }
 
-/// p99.9 of a period's work, in times of [`multiply_and_add`] in the same run: how fast the machine
-/// is and what else it does is not the loop's work. In virtual time a period does the same in every
-/// round, so that its least is what it needs.
+/// Returns p99.9 of a period's work, as a multiple of the time of [`multiply_and_add`] in the same
+/// run.
+///
+/// The ratio removes the speed of the machine and its other load. In virtual time a period does the
+/// same work in every round, so its least time is the time that it needs.
 fn work(modal: bool) -> f64 {
     let (mut least, mut yardstick) = (vec![f64::INFINITY; PERIODS], f64::INFINITY);
     for _ in 0..ROUNDS {
@@ -149,7 +156,8 @@ fn on_its_own_thread() {
     };
     let mut tick = 0;
     let mut events = Vec::new();
-    // Words of the simulation until it is so; a busy machine stutters, so what must come is waited for.
+    // The closure publishes local model updates until the condition holds. A busy machine stutters,
+    // so the test waits instead of counting periods.
     let mut until = |running: &mut HapticLoop, what: &str, so: &mut dyn FnMut(&mut HapticLoop) -> bool| {
         machine::until(what, || {
             tick += 1;
@@ -180,9 +188,9 @@ fn on_its_own_thread() {
         report.work.percentile(0.999) * 1e6,
         report.realtime,
     );
-    // It never runs faster than it should, and what it did not run it was late for. A hundred
-    // percentiles are an upper bound of all lateness; a period that would begin when the next one
-    // is almost due is one with it.
+    // The loop never runs faster than its rate, and missing periods appear as lateness. The sum
+    // over a hundred percentiles is an upper bound of the total lateness. A period that would begin
+    // when the next one is almost due merges with the next one.
     let (ticks, due) = ((report.ticks - first.ticks) as f64, 1000.0 * (report.tick.now - first.tick.now));
     let late: f64 = (1..=100).map(|p| report.lateness.percentile(0.01 * f64::from(p))).sum();
     let late = 1000.0 * 0.01 * report.ticks as f64 * late;
@@ -210,14 +218,14 @@ fn on_its_own_thread() {
         events.iter().any(|e| matches!(e, LoopEvent::Fault(pliant_haptics::Fault::EmergencyStop))),
         "{events:?}"
     );
-    // The simulation is silent: the force goes, after the two seconds that this loop is patient
-    // for.
+    // Without local model updates, the force fades after the two seconds for which this loop waits.
     machine::until("no force", || {
         std::thread::sleep(Duration::from_millis(5));
         let tick = running.report().tick;
         if tick.wrench.force == [0.0; 3] { Ok(()) } else { Err(Box::new(tick)) }
     });
-    // A loop that does not stop when it is dropped never does.
+    // A loop that does not stop when it is dropped would never stop, so the test fails at the
+    // limit.
     let drops = std::thread::spawn(move || drop(running));
     machine::until("stopped when dropped", || {
         std::thread::sleep(Duration::from_millis(5));

@@ -1,4 +1,5 @@
-//! Dragging a body with the virtual device: what is promised for every cell of the table (`--example drag_table`), for some of them.
+//! Dragging a body with the virtual device. The tests check the guarantees of the table
+//! (`--example drag_table`) for some of its cells.
 #![allow(clippy::unwrap_used, clippy::expect_used, clippy::panic, reason = "a failed test should panic")]
 
 mod rig;
@@ -119,7 +120,8 @@ fn a_baked_body_is_calm_in_every_hand() {
 
 #[test]
 fn another_size_and_stiffness_of_a_bake_scales_as_it_must() {
-    // The compliance of a patch is that of its size and material: 1 / (E L). Ten times as stiff and half as large: a fifth.
+    // The compliance of a patch scales with size and material as 1 / (E L). Ten times the modulus
+    // at half the size gives a fifth of the compliance.
     let pip = baked::pip();
     let patch = |m: &pliant_modal::ModalModel| {
         pliant_modal::Patch::around(m.surface(), baked::top(m), 0.05 * m.size()).unwrap()
@@ -143,8 +145,9 @@ fn another_size_and_stiffness_of_a_bake_scales_as_it_must() {
 
 #[test]
 fn the_hand_feels_the_body() {
-    // Static force of the block's tip in the hand: body, coupling and arm in series. With E = 1e4 Pa the block has E A / L = 160 N/m, the arm 150
-    // N/m, the coupling what the clamp leaves; the pull is 30 mm long.
+    // Static force on the hand from the block's tip: body, coupling and arm are in series. With E =
+    // 1e4 Pa the block has E A / L = 160 N/m, the arm 150 N/m, and the coupling what the clamp
+    // leaves. The drag is 30 mm long.
     for modal in [false, true] {
         let d = holds(SceneConfig { young: 1e4, hand: Hand::LIGHT, modal, ..SceneConfig::default() });
         let device = VirtualConfig { friction: 0.0, ..VirtualConfig::touch() };
@@ -152,9 +155,9 @@ fn the_hand_feels_the_body() {
             drag(SceneConfig { young: 1e4, hand: Hand::LIGHT, modal, device, ..SceneConfig::default() });
         let coupling = 0.7 * 400.0;
         let want = 0.03 / (1.0 / 160.0 + 1.0 / 150.0 + 1.0 / coupling);
-        // Above the 0.88 N that the motors bear for ever, the thermal budget has its say only after seconds.
+        // The thermal budget limits a force above the permanent 0.88 N only after seconds.
         assert!((free.force / want - 1.0).abs() < 0.03, "{} N for {want} N", free.force);
-        // Friction (0.26 N) holds part of it back.
+        // Friction (0.26 N) holds a part of the force back.
         assert!((d.force - want).abs() < 0.26, "{} N for {want} N", d.force);
     }
 }
@@ -179,7 +182,8 @@ fn a_slow_loop_and_a_fast_one() {
                     ..SceneConfig::default()
                 });
             }
-            // And the hand feels what it would at 1000 Hz: body, arm and the coupling that this rate allows, in series.
+            // The force equals that at 1000 Hz: body, arm and the coupling that this rate allows,
+            // in series.
             let device = VirtualConfig { friction: 0.0, ..VirtualConfig::touch() };
             let coupling =
                 Coupling::clamp(&CouplingConfig::default(), &device.info(), rate, 0.0, 0.0).stiffness;
@@ -187,7 +191,7 @@ fn a_slow_loop_and_a_fast_one() {
             let d = holds(SceneConfig { young: 1e4, hand, device, rate, modal, ..SceneConfig::default() });
             let want = 0.03 / (1.0 / 160.0 + 1.0 / 150.0 + 1.0 / coupling);
             assert!((d.force / want - 1.0).abs() < 0.03, "{rate} Hz: {} N for {want} N", d.force);
-            // The slew limit is one in newtons a second, whatever the rate: the whole force in 5 ms.
+            // The slew limit is in newtons per second at any rate: full force in 5 ms.
             assert!((d.step[1] * rate * 5e-3 - 3.3).abs() < 1e-9, "{rate} Hz: {} N a period", d.step[1]);
         }
     }

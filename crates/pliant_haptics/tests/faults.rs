@@ -1,4 +1,5 @@
-//! Everything that goes wrong with a device, a driver, a game or a network. The force fades, never kicks, and comes back by ramp.
+//! Faults of a device, a driver, a game or a network. The force fades, never kicks, and comes back
+//! by the ramp.
 #![allow(clippy::unwrap_used, clippy::expect_used, clippy::panic, reason = "a failed test should panic")]
 
 mod rig;
@@ -21,7 +22,7 @@ use rig::{
     scene::{Scene, SceneConfig},
 };
 
-/// A light hand that has pulled the block two centimetres to the side and holds it there.
+/// Creates a scene in which a firm hand has dragged the block 2 cm to the side and holds it there.
 fn holding() -> Scene {
     let mut scene =
         Scene::new(SceneConfig { young: 1e5, modes: 12, hand: Hand::FIRM, ..SceneConfig::default() });
@@ -87,7 +88,8 @@ fn simulation_late_by_a_second() {
     let mut scene = holding();
     scene.silent = true;
     let before = scene.force();
-    // The last word was at most a step (8.3 ms) ago; 30 ms later patience ends, and 50 ms after the word there is nothing.
+    // The last update is at most one step (8.3 ms) old. The fade begins 30 ms after the update, and
+    // the force is zero 50 ms after it.
     scene.run(0.020);
     assert!(scene.force() > 0.9 * before);
     scene.run(0.031);
@@ -152,7 +154,7 @@ fn emergency_stop_is_latched() {
     assert!(scene.force() > 0.5 && scene.largest_step <= slew_per_tick() * 1.000_001);
 }
 
-/// A device that lies as the test says.
+/// A device that falsifies its samples as the test demands.
 struct Liar {
     inner: VirtualDevice,
     lie: Cell<Lie>,
@@ -199,7 +201,8 @@ impl HapticDevice for Liar {
     }
 }
 
-/// Runs a spring of 200 N/m, 1 cm stretched by a firm hand, into `lie` for `ticks` and out again.
+/// Runs a spring of 200 N/m that a firm hand stretches by 1 cm, with `lie` for `ticks` periods and
+/// without it before and after.
 fn told(lie: Lie, ticks: usize) -> (Cycle<Liar>, Vec<LoopEvent>, f64, f64) {
     let device = VirtualDevice::new(VirtualConfig::touch(), Hand::FIRM).unwrap();
     let hand = device.handle();
@@ -237,7 +240,7 @@ fn not_a_number_from_the_device() {
 
 #[test]
 fn a_velocity_that_overflows() {
-    // Finite, but its square is not: one such sample sent NaN to the motors for good. One, and many.
+    // The velocity is finite, but its square is not. Both one such sample and many are tested.
     for ticks in [1, 60] {
         let (mut cycle, events, lowest, step) = told(Lie::Wild, ticks);
         assert!(events.iter().any(|e| matches!(e, LoopEvent::Fault(Fault::TooFast(v)) if *v == 1e200)));
@@ -256,7 +259,8 @@ fn a_jump_of_a_metre() {
     assert!(events.iter().any(|e| matches!(e, LoopEvent::Fault(Fault::Jump(d)) if (d - 1.0).abs() < 0.01)));
     assert!(lowest < 1e-9);
     assert!(step <= slew_per_tick() * 1.000_001, "{step}");
-    // The new place was taken over without the tool moving: the spring never saw a metre.
+    // The new position was taken over without moving the tool, so the spring was never stretched by
+    // 1 m.
     let tool = cycle.core().last().tool;
     assert!(tool[0].abs() < 0.02, "{tool:?}");
 }
@@ -302,12 +306,12 @@ fn a_real_device_is_not_run_without_its_safety() {
     }
 }
 
-/// A device whose driver panics when it is told to.
+/// A device whose driver panics on demand.
 struct Bomb {
     inner: VirtualDevice,
     panic: Arc<AtomicBool>,
     stopped: Arc<AtomicU32>,
-    /// And once more while it is being stopped.
+    /// Whether the driver panics once more when it is stopped.
     twice: bool,
 }
 
@@ -374,7 +378,7 @@ fn a_driver_that_panics() {
             [LoopEvent::Released(0), LoopEvent::Fault(Fault::Panicked), LoopEvent::Lost],
             "{heard:?}"
         );
-        // Told once, and for good.
+        // The events are sent only once, and the state is final.
         heard.clear();
         until(&mut running, &mut heard, "another look", &|_| true);
         assert_eq!(heard, []);

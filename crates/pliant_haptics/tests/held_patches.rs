@@ -1,4 +1,5 @@
-//! What is held changes under a hand that feels it: other grabs, other copies of the body, another device. Nothing is cut, nothing jumps.
+//! Changes of the held patches during a grab: other grabs, another copy of the body, another
+//! device. The force is neither cut nor does it jump.
 #![allow(clippy::unwrap_used, clippy::expect_used, clippy::panic, reason = "a failed test should panic")]
 
 mod rig;
@@ -16,7 +17,7 @@ use pliant_haptics::{
 use pliant_modal::{BodyConfig, StepSettings};
 use rig::scene::{Scene, SceneConfig};
 
-/// A firm hand that has pulled the block to the side and holds it there.
+/// Creates a scene in which a firm hand has dragged the block to the side and holds it there.
 fn holding(modal: bool, pull: f64) -> Scene {
     let hand = Hand::FIRM;
     let mut scene = Scene::new(SceneConfig { young: 1e5, modes: 12, hand, modal, ..SceneConfig::default() });
@@ -31,7 +32,7 @@ fn holding(modal: bool, pull: f64) -> Scene {
     scene
 }
 
-/// Smallest and largest force over `seconds`, N.
+/// Returns the smallest and largest force over `seconds`, N.
 fn range(scene: &mut Scene, seconds: f64) -> [f64; 2] {
     (0..(seconds * 1000.0) as usize).fold([f64::INFINITY, 0.0f64], |[low, high], _| {
         scene.tick();
@@ -44,14 +45,15 @@ fn a_new_copy_of_the_body_takes_over_without_letting_go() {
     for modal in [false, true] {
         let mut scene = holding(modal, 0.02);
         let before = scene.force();
-        // Ten times in a quarter of a second, as a slider does that is dragged.
+        // The copy changes ten times in a quarter of a second, as it does while a user drags a
+        // slider.
         for _ in 0..10 {
             let copy = ModalLocal::new(&scene.body, &[scene.held], 1.0, 1000.0).unwrap();
             scene.cycle.set_modal(Some(Box::new(copy)));
             let [low, high] = range(&mut scene, 0.025);
             assert!(low > 0.9 * before && high < 1.1 * before, "{low} to {high} N of {before}");
         }
-        // And back to the proxy.
+        // The last change goes back to the proxy.
         scene.cycle.set_modal(None);
         let [low, high] = range(&mut scene, 0.4);
         assert!(low > 0.9 * before && high < 1.1 * before, "{low} to {high} N of {before}");
@@ -83,7 +85,8 @@ fn spring(key: u64, proxy: [f64; 3], k: f64) -> Contact {
     Contact { key, proxy, stiffness: [[k, 0.0, 0.0], [0.0, k, 0.0], [0.0, 0.0, k]], ..Contact::default() }
 }
 
-/// A still hand, told of `contacts` for `ticks`, 100 words a second; the force along x at the end, and its largest change in a tick, N.
+/// Runs a hand at rest for `ticks` periods with `contacts`, at 100 local model updates per second.
+/// Returns the force along x at the end and its largest change in a tick, N.
 fn told(core: &mut LoopCore, word: &mut LocalModel, contacts: &[Contact], ticks: u64) -> [f64; 2] {
     word.count = contacts.len();
     word.contacts[..contacts.len()].copy_from_slice(contacts);
@@ -105,29 +108,33 @@ fn a_grab_in_the_place_of_another_comes_by_a_ramp() {
     let (mut core, mut word) = (new(), LocalModel::default());
     let [first, _] = told(&mut core, &mut word, &[spring(1, [0.0, 0.0, 0.0], 200.0)], 600);
     assert_eq!(first, 0.0);
-    // Another one, 5 mm away: a newton, in the ramp's 300 ms and from where it is, not in a tick and from where the first was.
+    // Another grab is 5 mm away, which gives 1 N. The force must rise over the 300 ms of the ramp
+    // and not within a tick. The proxy must start at its own position and not at that of the first
+    // grab.
     let [half, step] = told(&mut core, &mut word, &[spring(2, [5e-3, 0.0, 0.0], 200.0)], 150);
     assert!((half - 0.5).abs() < 0.02, "half of it after half of the ramp: {half} N");
     assert!(step < 1.5 / 300.0, "a step of {step} N");
     let [whole, _] = told(&mut core, &mut word, &[spring(2, [5e-3, 0.0, 0.0], 200.0)], 600);
     assert!((whole - 1.0).abs() < 0.02, "{whole} N");
-    // A second one beside it is ramped alone; the first is felt as before.
+    // A second grab beside it has a ramp of its own, and the force of the first grab does not
+    // change.
     let both = [spring(3, [5e-3, 0.0, 0.0], 100.0), spring(2, [5e-3, 0.0, 0.0], 200.0)];
     let [now, step] = told(&mut core, &mut word, &both, 1);
     assert!((now - whole).abs() < 0.01, "{now} N after {whole} N");
     let [both, further] = told(&mut core, &mut word, &both, 900);
     assert!((both - 1.5).abs() < 0.03 && step.max(further) < 1.0 / 300.0, "{both} N, {step} N");
-    // The same grab told of elsewhere is no other: it goes there within a word's time.
+    // A new position of the same grab is not a new grab. The proxy moves there within one update
+    // interval.
     let (mut core, mut word) = (new(), LocalModel::default());
     told(&mut core, &mut word, &[spring(1, [0.0; 3], 200.0)], 600);
     let [moved, _] = told(&mut core, &mut word, &[spring(1, [2e-3, 0.0, 0.0], 200.0)], 20);
     assert!((moved - 0.4).abs() < 0.01, "{moved} N");
 }
 
-/// A device in whose place another one comes back.
+/// A device that another device can replace when it comes back.
 struct Changeling {
     inner: VirtualDevice,
-    /// 0 the first, 1 one like it, 2 a weaker one.
+    /// The present device: 0 for the first one, 1 for one like it, 2 for a weaker one.
     which: Arc<AtomicU32>,
 }
 

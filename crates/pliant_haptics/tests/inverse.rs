@@ -1,4 +1,5 @@
-//! The Inverse against a service that plays the real one, strictly: what the vendor's documentation does not allow, it refuses.
+//! The Inverse against a fake service. The service is strict and refuses everything that the
+//! vendor's documentation does not allow.
 #![allow(clippy::unwrap_used, clippy::expect_used, clippy::panic, reason = "a failed test should panic")]
 #![cfg(feature = "inverse")]
 
@@ -19,17 +20,18 @@ use pliant_haptics::{
 use serde_json::{Value, json};
 use tungstenite::{Message, WebSocket, accept};
 
-/// What the service saw and is to do.
+/// Records and commands of the fake service.
 #[derive(Default)]
 struct Desk {
     forces: Vec<[f64; 3]>,
     refused: Vec<String>,
     position: [f64; 3],
     buttons: bool,
-    /// Answer with this instead.
+    /// The service sends this text instead of a state.
     say: Option<String>,
     mute: bool,
-    /// The next answer is held back until this is taken away again; then it was `sent`.
+    /// The service holds the next answer back while `late` is set. `sent` is set once it has sent
+    /// that answer.
     late: bool,
     sent: bool,
     quit: bool,
@@ -43,12 +45,12 @@ struct Service {
 }
 
 impl Service {
-    /// A service of the new kind or the old.
+    /// Starts a service of the new or the old version.
     fn start(new: bool) -> Self {
         Self::speaking(new, new)
     }
 
-    /// With the inventory of one kind and the commands of another.
+    /// Starts a service with the inventory of one version and the commands of another.
     fn speaking(inventory: bool, new: bool) -> Self {
         let listener = TcpListener::bind("127.0.0.1:0").unwrap();
         let address = listener.local_addr().unwrap().to_string();
@@ -60,8 +62,8 @@ impl Service {
                 match listener.accept() {
                     Ok((stream, _)) => {
                         stream.set_nonblocking(false).unwrap();
-                        // Who has connected says hello or goes away, and takes what time it needs
-                        // for either.
+                        // A client that has connected either starts the handshake or disconnects,
+                        // and may take any time for it.
                         if let Ok(socket) = accept(stream) {
                             let end = socket.get_ref();
                             end.set_read_timeout(Some(Duration::from_millis(20))).unwrap();
@@ -75,13 +77,13 @@ impl Service {
         Self { address, desk, thread: Some(thread) }
     }
 
-    /// With the longest timeout that counts: nothing that comes is late, and a refusal comes at
-    /// once.
+    /// Returns a configuration with the longest effective timeout. No answer is late, and a refusal
+    /// is still immediate.
     fn config(&self) -> InverseConfig {
         InverseConfig { address: self.address.clone(), timeout: 10.0, ..InverseConfig::default() }
     }
 
-    /// Sends the answer that was held back, to whoever still listens.
+    /// Releases the answer that was held back and waits until it is sent.
     fn send_late(&self) {
         self.desk().late = false;
         machine::until("the late answer is sent", || {
@@ -123,7 +125,8 @@ fn state(desk: &Desk, new: bool) -> Value {
     message
 }
 
-/// One connection: an inventory, then exactly one state a command. A command that is not as documented ends it.
+/// Serves one connection: an inventory, then exactly one state per command. A command that differs
+/// from the documentation ends the connection.
 fn serve(mut socket: WebSocket<TcpStream>, shared: &Mutex<Desk>, inventory: bool, new: bool) {
     let inventory = state(&shared.lock().unwrap(), inventory).to_string();
     if socket.send(Message::text(inventory)).is_err() {
@@ -171,14 +174,15 @@ fn serve(mut socket: WebSocket<TcpStream>, shared: &Mutex<Desk>, inventory: bool
     }
 }
 
-/// The one command that is taken: every key known, every number there, the device one of ours.
+/// Accepts only the documented command: every key is known, every number is present, and the device
+/// is one of the service's.
 fn check(text: &str, new: bool, first: bool) -> Result<[f64; 3], String> {
     let message: Value = serde_json::from_str(text).map_err(|e| e.to_string())?;
     let keys =
         |v: &Value| -> Vec<String> { v.as_object().map(|m| m.keys().cloned().collect()).unwrap_or_default() };
     let field = if new { "vector" } else { "values" };
     for key in keys(&message) {
-        // A session is configured in the first message only, and only newer services know it.
+        // The first message alone may configure a session, and only newer services know this key.
         if key != "inverse3" && !(key == "session" && new && first) {
             return Err(format!("unknown key {key}"));
         }
@@ -217,7 +221,7 @@ fn both_spellings_and_the_axes() {
         service.desk().buttons = true;
         let mut device = Inverse::open(second(service.config())).unwrap();
         assert_eq!(device.spelling(), want);
-        // 1 N right, 2 N up, 3 N toward the user are 1 right, -3 away, 2 up.
+        // A force of 1 N right, 2 N up, 3 N toward the user is (1, -3, 2) for the service.
         let sample =
             device.exchange(&Wrench { force: [1.0, 2.0, 3.0], ..Wrench::ZERO }, &mut pacing()).unwrap();
         assert_eq!(service.desk().forces, [[1.0, -3.0, 2.0]]);
@@ -233,7 +237,8 @@ fn both_spellings_and_the_axes() {
 
 #[test]
 fn a_wrong_guess_is_put_right() {
-    // Services that call the field by the name that their inventory does not suggest: the first command is refused, the second is not.
+    // These services use another field name than their inventory suggests. They refuse the first
+    // command and accept the second.
     for (inventory, new, want) in [(true, false, Spelling::Values), (false, true, Spelling::Vector)] {
         let service = Service::speaking(inventory, new);
         let mut device = Inverse::open(second(service.config())).unwrap();
@@ -242,7 +247,7 @@ fn a_wrong_guess_is_put_right() {
         assert_eq!(service.desk().forces, [[1.0, -0.0, 0.0]]);
         assert_eq!(service.desk().refused.len(), 1);
     }
-    // What the user says counts, right or wrong.
+    // The user's setting applies, whether it is right or wrong.
     let service = Service::start(true);
     let told = InverseConfig { spelling: Some(Spelling::Values), ..second(service.config()) };
     let mut device = Inverse::open(told).unwrap();
@@ -256,7 +261,7 @@ fn the_loop_feels_a_spring_through_it() {
     service.desk().position = [0.004, 0.0, 0.0];
     let device = Inverse::open(second(service.config())).unwrap();
     let mut cycle = Cycle::new(device, LoopConfig::default()).unwrap();
-    // In virtual time: an answer is in time however long a busy machine takes for it.
+    // In virtual time an answer is in time, however long a busy machine takes for it.
     let mut scheduler = VirtualScheduler::new(1000.0);
     let mut events: Vec<LoopEvent> = Vec::new();
     let mut model = LocalModel { count: 1, period: 0.01, ..LocalModel::default() };
@@ -272,7 +277,7 @@ fn the_loop_feels_a_spring_through_it() {
     assert_eq!((cycle.core().last().gain, cycle.core().last().fault), (1.0, None), "after the ramp");
     let force = cycle.core().last().wrench.force;
     assert!((force[0] + 0.4).abs() < 1e-3, "100 N/m over 4 mm: {force:?}");
-    // Gone in the middle of it, and back by itself.
+    // The device disappears in the middle of the grab and comes back by itself.
     service.desk().hang_up = true;
     let lost = (0..200).any(|_| {
         step(&mut cycle, &mut events);
@@ -291,7 +296,7 @@ fn the_loop_feels_a_spring_through_it() {
         largest = largest.max(last - force);
         last = force;
     }
-    // 0.4 N in 300 ms are 1.3 mN a period.
+    // 0.4 N in 300 ms are 1.3 mN per period.
     assert!(last < -0.3 && largest < 0.002, "comes back by the ramp: {last} N, steps of {largest} N");
     assert_eq!(service.desk().refused, [""; 0]);
 }
@@ -334,16 +339,17 @@ fn nonsense_and_silence() {
     assert!(matches!(nobody, Err(InverseError::Connect { .. })), "{nobody:?}");
 }
 
-/// A timeout that is waited for, s.
+/// Timeout for tests that wait until it expires, s.
 const HASTE: f64 = 0.2;
 
-/// A device that waits no longer than [`HASTE`]: a busy service may need more than one try.
+/// Opens a device with the timeout [`HASTE`]. A busy service may need more than one try.
 fn hasty(service: &Service) -> Inverse {
     let config = InverseConfig { timeout: HASTE, ..second(service.config()) };
     machine::until("a connection in time", || Inverse::open(config.clone()))
 }
 
-/// Asks until there is an answer in time. The loop's part: a device that is gone is looked for.
+/// Exchanges until an answer comes in time. As the loop does, the function reopens a device that is
+/// gone.
 fn answer(device: &mut Inverse) -> Sample {
     machine::until("an answer in time", || {
         let answer = device.exchange(&Wrench::ZERO, &mut pacing());
@@ -367,7 +373,7 @@ fn a_late_answer_is_not_taken_for_the_next_one() {
         let off = (answer(&mut device).position[0] - x).abs();
         assert!(off < 1e-9, "where the hand is now, not an exchange ago: off by {off} m");
     }
-    // A stop whose answer is late leaves no answer behind either.
+    // A stop whose answer is late must not leave that answer behind either.
     service.desk().late = true;
     device.safe_stop();
     service.send_late();

@@ -20,7 +20,8 @@ mod block;
 #[path = "rig/machine.rs"]
 mod machine;
 
-/// Fixed steps of a hundredth of a second in real time: the loop's thread has its own clock.
+/// Creates an app with fixed steps of 0.01 s in real time, because the loop's thread uses a real
+/// clock.
 fn app() -> App {
     app_in(FixedUpdate)
 }
@@ -46,11 +47,11 @@ struct Scene {
     tool: Entity,
     hand: VirtualHandle,
     frames: u32,
-    /// No two frames are of one length.
+    /// Whether every frame has another length.
     uneven: bool,
 }
 
-/// A block with its tip at the middle of the workspace, a firm hand there.
+/// Creates a block with its tip at the center of the workspace, and a firm hand there.
 fn scene(modal: bool) -> Scene {
     scene_in(app(), modal, false)
 }
@@ -70,7 +71,7 @@ fn scene_in(mut app: App, modal: bool, uneven: bool) -> Scene {
     scene
 }
 
-/// A virtual device in a firm hand that rests.
+/// Adds a virtual device with a firm hand at rest.
 fn add_device(app: &mut App) -> (DeviceId, VirtualHandle) {
     let device = VirtualDevice::new(VirtualConfig::touch(), Hand::FIRM).unwrap();
     let hand = device.handle();
@@ -78,7 +79,8 @@ fn add_device(app: &mut App) -> (DeviceId, VirtualHandle) {
 }
 
 impl Scene {
-    /// Frames at their own pace: the loop carries what it is told on from one to the next.
+    /// Runs frames in real time, because the loop extrapolates the local model from one frame to
+    /// the next.
     fn run(&mut self, frames: usize) {
         for _ in 0..frames {
             self.frames += 1;
@@ -96,8 +98,8 @@ fn force(scene: &Scene) -> DVec3 {
     devices.get(scene.device).unwrap().report.tick.wrench.force.into()
 }
 
-/// Runs until it is so. The loop's clock is the real one and a busy machine stutters: what must
-/// come is waited for.
+/// Runs until the condition holds. The loop uses a real clock and a busy machine stutters, so the
+/// test waits instead of counting frames.
 fn until(s: &mut Scene, what: &str, mut so: impl FnMut(&mut Scene) -> bool) {
     machine::until(what, || {
         if so(s) {
@@ -109,8 +111,8 @@ fn until(s: &mut Scene, what: &str, mut so: impl FnMut(&mut Scene) -> bool) {
     });
 }
 
-/// It stays so: for thirty frames, and as many periods of every loop as a force needs to come back
-/// by its ramp and more.
+/// Checks that the condition holds for thirty frames, and for more periods of every loop than the
+/// ramp of the force takes.
 fn stays(s: &mut Scene, what: &str, mut so: impl FnMut(&mut Scene) -> bool) {
     let ticks = |s: &Scene| -> Vec<u64> {
         s.app.world().resource::<HapticDevices>().iter().map(|(_, d)| d.report.ticks).collect()
@@ -122,8 +124,8 @@ fn stays(s: &mut Scene, what: &str, mut so: impl FnMut(&mut Scene) -> bool) {
     });
 }
 
-/// Runs until there is a body and the loop says that the tool is where it was put. A press before
-/// that would hold nothing, for good.
+/// Runs until there is a body and the loop reports the tool at its position. An earlier press would
+/// grab nothing and would not be repeated.
 fn in_place(s: &mut Scene, tool: Entity) {
     until(s, "a body, and the tool in its place", |s| {
         let bodies = s.app.world_mut().query::<&BodyState>().iter(s.app.world()).count();
@@ -136,7 +138,8 @@ fn in_place(s: &mut Scene, tool: Entity) {
 #[test]
 fn a_slow_world_is_felt_as_well() {
     let mut s = scene(false);
-    // As sessions step: 40 Hz, at a quarter of the speed every tenth of a second.
+    // The step is that of a session: 40 Hz, which at a quarter of the speed is one step every 0.1
+    // s.
     s.app.insert_resource(Time::<Fixed>::from_hz(40.0));
     s.hand.set_buttons(1);
     until(&mut s, "it is held", |s| grabs(&mut s.app).len() == 1);
@@ -166,7 +169,8 @@ fn a_press_holds_and_the_hand_feels_the_body() {
             held[0].0
         );
         s.hand.set_target([0.02, 0.0, 0.0]);
-        // The block has E A / L = 1600 N/m, the coupling 280, the arm 500: 2 cm of them in series are 3.1 N, of which friction may hold back 0.26.
+        // The block has E A / L = 1600 N/m, the coupling 280 N/m, the arm 500 N/m. In series, 2 cm
+        // of them give 3.1 N, of which friction may hold back 0.26 N.
         until(&mut s, "3 N, and the body says the same as the hand gets", |s| {
             let (pull, body) = (force(s), grabs(&mut s.app)[0].1.force);
             (-3.3..-2.7).contains(&pull.x) && pull.y.abs() < 0.1 && (body.x / pull.x - 1.0).abs() < 0.1
@@ -206,7 +210,8 @@ fn pause_fades_and_stop_is_latched() {
     assert_eq!(state(&s), LoopState::Stopped);
     s.app.world_mut().resource_mut::<HapticDevices>().reset_stop();
     until(&mut s, "runs again", |s| state(s) == LoopState::Running && force(s).length() > 1.0);
-    // Taken away with its button down: the body is let go of, and whoever listens to the button is told.
+    // The device is removed while its button is down. The tool must release the body, and the app
+    // must get the message of the button.
     #[derive(Resource, Default)]
     struct Buttons(Vec<HapticButton>);
     s.app.init_resource::<Buttons>();
@@ -228,7 +233,8 @@ fn pause_fades_and_stop_is_latched() {
 
 #[test]
 fn a_copy_of_the_body_stands_steps_of_changing_length() {
-    // In a schedule that runs once a picture no two steps are the same, and the loop's copy of the body is not made anew for that.
+    // In a schedule that runs once per frame, all steps differ. The loop's copy of the body must
+    // not be rebuilt for that.
     let mut s = scene_in(app_in(Update), true, true);
     s.hand.set_buttons(1);
     until(&mut s, "gripped", |s| grabs(&mut s.app).len() == 1);
@@ -257,7 +263,8 @@ fn a_remote_body_that_turns_softer_is_felt_so() {
         }
     });
     s.hand.set_target([0.01, 0.0, 0.0]);
-    // What four modes an axis leave out of L / (E A), in series with the coupling and the arm; friction may hold back 0.26 N.
+    // The stiffness is the part of L / (E A) that four modes per axis leave out, in series with the
+    // coupling and the arm. Friction may hold back 0.26 N.
     let left_out = |scale: f64| {
         let kept: f64 = (0..4).map(|k| 8.0 / (std::f64::consts::PI * f64::from(2 * k + 1)).powi(2)).sum();
         block::LENGTH / (scale * 1e5 * 0.0016) * (1.0 - kept)
@@ -304,7 +311,8 @@ fn a_remote_body_is_felt_through_its_published_force_until_the_network_is_gone()
     let at = world.get::<Transform>(s.tool).unwrap().translation.as_dvec3();
     let hold = Grab { stiffness: Some(280.0), ..Grab::new(block::tip(), 0.01, at) };
     let grab = world.spawn((hold, pliant_body::GrabOf(body), HeldBy(s.tool))).id();
-    // What a session would write: the patch stays where it is, and a state comes every frame.
+    // The test writes what a session would write: the patch stays where it is, and a state comes
+    // every frame.
     let known = GrabForce { point: at, force: DVec3::ZERO };
     world.entity_mut(grab).insert(known);
     #[derive(Resource)]
@@ -323,12 +331,14 @@ fn a_remote_body_is_felt_through_its_published_force_until_the_network_is_gone()
         heard.0.extend(faults.read().filter_map(|f| f.fault));
     });
     s.hand.set_target([0.01, 0.0, 0.0]);
-    // The coupling's 280 N/m (what the patch itself gives is a hundredth of that) and the arm's 500 in series over 1 cm; friction may hold back 0.26 N.
+    // The coupling (280 N/m) and the arm (500 N/m) are in series over 1 cm. The compliance of the
+    // patch itself is a hundredth of that. Friction may hold back 0.26 N.
     let want = -0.01 / (1.0 / 280.0 + 1.0 / 500.0);
     until(&mut s, "the coupling's force", |s| (force(s).x - want).abs() < 0.3);
     let target = s.app.world().get::<Grab>(grab).unwrap().target;
     assert!(target.x > at.x + 1e-3, "and the session is told where the hand is: {target}");
-    // Until the session knows of the grab, and once it is over, the force says nothing: that is no patch at the origin.
+    // Until the session knows the grab, and after the session is over, the force is unknown. The
+    // default value must not count as a patch at the origin.
     s.app.world_mut().entity_mut(grab).insert(GrabForce::default());
     stays(&mut s, "no more than before", |s| force(s).length() < 2.5);
     until(&mut s, "let go", |s| force(s) == DVec3::ZERO);
@@ -360,13 +370,14 @@ fn two_devices_on_one_body_feel_each_other() {
         let devices = s.app.world().resource::<HapticDevices>();
         [s.device, other].map(|id| DVec3::from(devices.get(id).unwrap().report.tick.wrench.force))
     };
-    // One pulls; the other holds still and is pulled along: the same force the other way, less what the block's own 1600 N/m takes.
+    // One hand drags the block. The other hand holds still and is pulled along: its force is
+    // opposite, less the part that the block's own 1600 N/m takes.
     s.hand.set_target([0.02, 0.0, 0.0]);
     until(&mut s, "the still hand is pulled towards the one that pulls", |s| {
         let [puller, holder] = devices(s);
         puller.x < -1.0 && holder.x > 0.2
     });
-    // And lets go: the other one is alone with the block.
+    // The first hand releases the block, and the other one then holds it alone.
     s.hand.set_buttons(0);
     until(&mut s, "alone", |s| grabs(&mut s.app).len() == 1 && devices(s)[1].length() < 0.3);
 }
@@ -429,7 +440,7 @@ fn a_driver_that_panics_is_told_and_lets_go() {
     assert_eq!((state(&s), force(&s)), (LoopState::Ended, DVec3::ZERO));
     assert_eq!(count(s.app.world()), 1, "told once");
     assert_eq!(s.app.world().resource::<Notices>().0, [pliant_haptics::LoopEvent::Lost]);
-    // The app goes on, and a new device takes the place of the dead one.
+    // The app continues, and a new device replaces the dead one.
     assert!(s.app.world_mut().resource_mut::<HapticDevices>().remove(s.device));
     let device = VirtualDevice::new(VirtualConfig::touch(), Hand::FIRM).unwrap();
     s.device = s.app.world_mut().resource_mut::<HapticDevices>().add(device, LoopConfig::default()).unwrap();

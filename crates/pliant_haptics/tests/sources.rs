@@ -1,4 +1,5 @@
-//! Bevy's input goes in, the device's position comes out of its loop.
+//! Bevy's input moves a device through its source, and the tests read the position from the
+//! device's loop.
 #![cfg(feature = "plugin")]
 #![allow(clippy::unwrap_used, clippy::panic, reason = "a failed test should panic")]
 
@@ -28,7 +29,7 @@ mod block;
 #[path = "rig/machine.rs"]
 mod machine;
 
-/// Seconds a frame, whatever the machine takes for it.
+/// Simulated time of a frame, s, whatever real time the machine takes.
 const FRAME: f64 = 0.01;
 
 struct Scene {
@@ -36,7 +37,8 @@ struct Scene {
     device: DeviceId,
 }
 
-/// An app with Bevy's own input, and a device that goes where it is put; its tool is `place`d with what `source` makes of its handle.
+/// Creates an app with Bevy's own input and a [`Positioned`] device. Its tool is at `place`, with
+/// the component that `source` makes of the device's handle.
 fn scene<S: Component>(place: Transform, motion_scale: f64, source: impl Fn(PositionedHandle) -> S) -> Scene {
     let mut app = App::new();
     app.add_plugins((
@@ -71,7 +73,7 @@ impl Scene {
         self.app.world().resource::<HapticDevices>().get(self.device).unwrap().report.tick
     }
 
-    /// Periods that the loop has run.
+    /// Returns the number of periods that the loop has run.
     fn ticks(&self) -> u64 {
         self.app.world().resource::<HapticDevices>().get(self.device).unwrap().report.ticks
     }
@@ -80,7 +82,7 @@ impl Scene {
         self.tick().position.into()
     }
 
-    /// It stays so for twenty frames, in which the loop has had the time to say otherwise.
+    /// Checks that the condition holds for twenty frames and 200 periods of the loop.
     #[track_caller]
     fn stays(&mut self, what: &str, so: impl Fn(&Self) -> bool) {
         let begun = self.ticks();
@@ -94,11 +96,12 @@ impl Scene {
         });
     }
 
-    /// Runs until the device is at `place` (m, device axes) to `near`, and then for a while, in which it is to stay there.
+    /// Runs until the device is within `near` of `place` (m, device axes), and then checks that it
+    /// stays there for a while.
     #[track_caller]
     fn comes_to_rest_at(&mut self, place: DVec3, near: f64) {
         let there = |s: &Self| s.position().distance(place) < near;
-        // The loop's clock is the real one and a busy machine stutters.
+        // The loop uses a real clock, and a busy machine stutters.
         machine::until("the device comes to its place", || {
             if there(self) {
                 return Ok(());
@@ -120,7 +123,7 @@ impl Scene {
         });
     }
 
-    /// A window of 800 x 600 and a camera two metres in front of the origin.
+    /// Creates a window of 800 x 600 and a camera 2 m in front of the origin.
     fn window(&mut self) -> Entity {
         let window = Window { resolution: (800, 600).into(), ..Default::default() };
         let size = RenderTargetInfo { physical_size: UVec2::new(800, 600), scale_factor: 1.0 };
@@ -131,7 +134,7 @@ impl Scene {
         world.spawn((window, PrimaryWindow)).id()
     }
 
-    /// Puts the pointer at `at`, m from the middle of the view in the plane z = 0.
+    /// Puts the pointer at `at`, m from the center of the view in the plane z = 0.
     fn point(&mut self, window: Entity, at: Option<Vec2>) {
         let pixels_a_metre = 300.0 / (2.0 * 0.5f32.tan());
         let cursor = at.map(|at| Vec2::new(400.0, 300.0) + Vec2::new(at.x, -at.y) * pixels_a_metre);
@@ -148,7 +151,8 @@ fn the_pointer_moves_the_device_to_where_it_points() {
     let turned = Transform::from_rotation(Quat::from_rotation_z(std::f32::consts::FRAC_PI_2));
     for (place, scale, want) in [
         (Transform::IDENTITY, 1.0, DVec3::new(0.1, 0.05, 0.0)),
-        // A quarter turn about z takes the device's x to the world's y, and a metre of the hand is two of the world.
+        // A quarter turn about z takes the device's x axis to the world's y axis. 1 m of the hand
+        // is 2 m of the world.
         (turned, 2.0, DVec3::new(0.025, -0.05, 0.0)),
     ] {
         let mut s = scene(place, scale, PointerSource::new);
@@ -159,7 +163,7 @@ fn the_pointer_moves_the_device_to_where_it_points() {
         s.press(window, MouseButton::Left, ButtonState::Pressed);
         s.press(window, MouseButton::Middle, ButtonState::Pressed);
         s.buttons_become(0b101);
-        // Out of the window: the hand waits where it is, and lets go.
+        // The pointer leaves the window. The hand stays where it is, and its buttons come up.
         s.point(window, None);
         s.press(window, MouseButton::Left, ButtonState::Released);
         s.press(window, MouseButton::Middle, ButtonState::Released);
@@ -180,7 +184,8 @@ fn a_press_that_is_somebody_elses_is_not_the_tools_and_one_that_is_ends() {
     s.point(window, Some(Vec2::ZERO));
     s.press(window, MouseButton::Left, ButtonState::Pressed);
     s.stays("the panel's", |s| s.tick().buttons == 0);
-    // Held on the way out of the panel it is still the panel's.
+    // The button was pressed on the panel, so it still belongs to the panel after the pointer has
+    // left the panel.
     s.app.world_mut().resource_mut::<Panel>().0 = false;
     s.stays("still the panel's", |s| s.tick().buttons == 0);
     s.press(window, MouseButton::Right, ButtonState::Pressed);
@@ -203,7 +208,8 @@ fn buttons_come_up_where_the_pointer_points_at_nothing() {
     s.point(window, Some(Vec2::new(0.1, 0.05)));
     s.press(window, MouseButton::Left, ButtonState::Pressed);
     s.buttons_become(1);
-    // The camera goes on by four metres: the tool is behind it, and no ray meets a plane there.
+    // The camera moves on by 4 m. The tool is then behind the camera, and no ray meets a plane
+    // there.
     let world = s.app.world_mut();
     let camera = world.query_filtered::<Entity, With<Camera>>().single(world).unwrap();
     world.get_mut::<Transform>(camera).unwrap().translation.z = -2.0;
@@ -220,7 +226,8 @@ fn with_empty_hands_the_pointer_lies_on_the_surface() {
     let handle = s.app.world_mut().resource_mut::<Assets<ModalAsset>>().add(model);
     s.app.world_mut().spawn((ModalBody::new(handle), InheritedVisibility::VISIBLE));
     s.run(5);
-    // The block is 4 cm thick and so its face 2 cm nearer, where the ray is a hundredth nearer to the middle of the view.
+    // The block is 4 cm thick, so its face is 2 cm nearer to the camera. The ray there is 1 %
+    // nearer to the center of the view.
     s.point(window, Some(Vec2::new(0.05, 0.0)));
     s.comes_to_rest_at(DVec3::new(0.0495, 0.0, 0.02), 1e-4);
 }
@@ -247,7 +254,7 @@ fn the_gamepad_moves_the_device_as_long_as_a_stick_is_held() {
     s.app.world_mut().write_message(GamepadConnectionEvent::new(pad, connected));
     s.comes_to_rest_at(DVec3::ZERO, 1e-9);
 
-    // Twenty frames of 10 ms at 0.15 m/s.
+    // The motion is twenty frames of 10 ms at 0.15 m/s.
     let moved = 20.0 * FRAME * 0.15;
     let mut want = DVec3::ZERO;
     for (stick, way) in [
@@ -261,7 +268,7 @@ fn the_gamepad_moves_the_device_as_long_as_a_stick_is_held() {
         want += way * moved;
         s.comes_to_rest_at(want, 1e-4);
     }
-    // Half way is half as fast, with what Bevy leaves for the dead zone (0.05 by default).
+    // Half of the range outside Bevy's dead zone (0.05 by default) gives half of the speed.
     axis(&mut s, GamepadAxis::LeftStickX, -0.525);
     s.run(20);
     axis(&mut s, GamepadAxis::LeftStickX, 0.0);
@@ -271,7 +278,7 @@ fn the_gamepad_moves_the_device_as_long_as_a_stick_is_held() {
     button(&mut s, GamepadButton::South, 1.0);
     button(&mut s, GamepadButton::RightTrigger2, 1.0);
     s.buttons_become(0b100001);
-    // Pulled out with a stick held: it stays, and nobody presses anything.
+    // The gamepad is unplugged while a stick is deflected. The device stays, and no button is down.
     let stays = s.position();
     let gone = GamepadConnectionEvent::new(pad, GamepadConnection::Disconnected);
     axis(&mut s, GamepadAxis::LeftStickX, 1.0);

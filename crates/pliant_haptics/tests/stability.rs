@@ -1,4 +1,5 @@
-//! Limits that control theory names, found again by experiment: the same loop body, in virtual time.
+//! Stability limits of control theory, reproduced by experiment with the real loop core in virtual
+//! time.
 #![allow(clippy::unwrap_used, clippy::expect_used, clippy::panic, reason = "a failed test should panic")]
 
 mod rig;
@@ -6,7 +7,8 @@ mod rig;
 use pliant_haptics::{Hand, VirtualConfig};
 use rig::Rig;
 
-/// Whether a free device on a bare spring of `k` (and damper `b`) calms down: the energy of the last tenth against that of the second.
+/// Returns whether the motion of a free device on a bare spring of `k` (and damper `b`) decays. The
+/// function compares the energy in the last tenth of the time to that in the second tenth.
 fn calms(device: &VirtualConfig, k: f64, b: f64, seconds: f64) -> bool {
     let mut rig = Rig::bare(device.clone(), Hand::NONE);
     rig.cycle.device_mut().place([1e-3, 0.0, 0.0], [0.0; 3]);
@@ -71,7 +73,8 @@ fn delayed_spring_is_stable_to_the_known_limit() {
     }
 }
 
-/// A wall at three times what the device closes, met at 0.2 m/s: largest speed in the last half second, m/s.
+/// Returns the largest speed in the last half second, m/s, for a device that meets a wall at 0.2
+/// m/s. The wall is three times as stiff as the device renders stably.
 fn speed_at_wall(controlled: bool, resolution: f64, push: f64) -> f64 {
     let device =
         VirtualConfig { mass: 0.2, damping: 0.5, resolution, peak_force: 30.0, ..VirtualConfig::default() };
@@ -84,13 +87,14 @@ fn speed_at_wall(controlled: bool, resolution: f64, push: f64) -> f64 {
             s.max_damping = None;
         }
     });
-    // A weight of `push` newtons into the wall is a hand that leans on it.
+    // A weight of `push` newtons into the wall acts like a hand that leans on it.
     let map = pliant_haptics::ToolMap { mass: push / 9.806_65, ..pliant_haptics::ToolMap::default() };
     assert!(rig.cycle.set_tool(map));
     rig.cycle.device_mut().place([0.0, 1e-3, 0.0], [0.0, -0.2, 0.0]);
     let mut worst = 0.0f64;
     for t in 0..4000 {
-        // One-sided: outside there is no force. The encoder's word decides, as it would in a game.
+        // The wall is one-sided, so outside there is no force. The measured position decides, as it
+        // would in a game.
         let inside = rig.cycle.core().last().position[1] < 0.0;
         rig.spring(if inside { 3000.0 } else { 0.0 }, 0.0);
         if t >= 3500 {
@@ -117,7 +121,7 @@ fn passivity_control_calms_a_wall_at_three_times_the_limit() {
 
 #[test]
 fn damped_spring_two_sided_too() {
-    // The two-sided spring at three times the limit, 50 um encoder.
+    // The spring is two-sided at three times the limit, with a 50 um encoder.
     let device = VirtualConfig { resolution: 50e-6, peak_force: 30.0, ..VirtualConfig::default() };
     let run = |controlled: bool| {
         let mut rig = Rig::with(device.clone(), Hand::NONE, |s| {

@@ -1,4 +1,5 @@
-//! What a tool does with what it holds: torque from several grabs, masks, scales, weight, a body turned in the world.
+//! Behavior of a tool with held patches: torque from several grabs, masks, scales, weight, a body
+//! that is stepped elsewhere, two devices.
 #![allow(clippy::unwrap_used, clippy::expect_used, clippy::panic, reason = "a failed test should panic")]
 
 use pliant_haptics::{
@@ -9,7 +10,7 @@ use pliant_haptics::{
 #[path = "rig/machine.rs"]
 mod machine;
 
-/// A device of six degrees of freedom that a test moves.
+/// Returns a device of six degrees of freedom that the test moves.
 fn six() -> DeviceInfo {
     DeviceInfo { peak_torque: 0.5, torque_axes: [true; 3], resolution: 0.0, ..VirtualConfig::touch().info() }
 }
@@ -18,7 +19,7 @@ fn spring(offset: [f64; 3], proxy: [f64; 3], k: f64) -> Contact {
     Contact { offset, proxy, stiffness: [[k, 0.0, 0.0], [0.0, k, 0.0], [0.0, 0.0, k]], ..Contact::default() }
 }
 
-/// Holds still at `sample` until ramp and slew are over.
+/// Holds the device still at `sample` until the ramp and the slew are over.
 fn settle(core: &mut LoopCore, sample: &Sample, contacts: &[Contact]) -> ([f64; 3], [f64; 3]) {
     let mut model = LocalModel { period: 0.01, count: contacts.len(), ..LocalModel::default() };
     model.contacts[..contacts.len()].copy_from_slice(contacts);
@@ -40,7 +41,8 @@ fn near(got: [f64; 3], want: [f64; 3], what: &str) {
 #[test]
 fn two_grabs_on_a_tool_turn_it() {
     let mut core = LoopCore::new(six(), LoopConfig::default()).unwrap();
-    // A couple: held 5 cm to either side, one proxy 1 cm up, the other 1 cm down. F = 100 N/m x 1 cm = 1 N, torque 2 x 0.05 m x 1 N about z.
+    // The grabs form a couple: they are held 5 cm to either side, with one proxy 1 cm up and the
+    // other 1 cm down. F = 100 N/m x 1 cm = 1 N, and the torque is 2 x 0.05 m x 1 N about z.
     let right = spring([0.05, 0.0, 0.0], [0.05, 0.01, 0.0], 100.0);
     let left = spring([-0.05, 0.0, 0.0], [-0.05, -0.01, 0.0], 100.0);
     let (force, torque) = settle(&mut core, &Sample::default(), &[right, left]);
@@ -50,7 +52,7 @@ fn two_grabs_on_a_tool_turn_it() {
     let blind = DeviceInfo { torque_axes: [true, true, false], ..six() };
     let mut core = LoopCore::new(blind, LoopConfig::default()).unwrap();
     near(settle(&mut core, &Sample::default(), &[right, left]).1, [0.0; 3], "masked");
-    // More than the motors have is cut.
+    // A torque above the motors' peak is clamped.
     let mut core = LoopCore::new(six(), LoopConfig::default()).unwrap();
     let strong = |c: Contact| Contact { stiffness: c.stiffness.map(|r| r.map(|x| 50.0 * x)), ..c };
     near(settle(&mut core, &Sample::default(), &[strong(right), strong(left)]).1, [0.0, 0.0, 0.5], "clamped");
@@ -58,13 +60,14 @@ fn two_grabs_on_a_tool_turn_it() {
 
 #[test]
 fn a_torque_is_cut_as_its_force_is_and_real_motors_get_none() {
-    // 10 N on an arm of 5 cm, of which the device has 3.3 N: 0.165 N m, not the 0.5 that the motors have.
+    // The spring wants 10 N on an arm of 5 cm, but the device gives 3.3 N. The torque is therefore
+    // 0.165 N m and not the motors' 0.5 N m.
     let pull = spring([0.05, 0.0, 0.0], [0.05, 0.01, 0.0], 1000.0);
     let mut core = LoopCore::new(six(), LoopConfig::default()).unwrap();
     let (force, torque) = settle(&mut core, &Sample::default(), &[pull]);
     near(force, [0.0, 3.3, 0.0], "the peak");
     near(torque, [0.0, 0.0, 0.05 * 3.3], "and its torque");
-    // A stop takes both, in one tick.
+    // An emergency stop cuts both in one tick.
     core.emergency_stop();
     let now = core.last().now + 1e-3;
     let stopped = core.tick(
@@ -74,7 +77,8 @@ fn a_torque_is_cut_as_its_force_is_and_real_motors_get_none() {
         &LocalModel::default(),
     );
     assert_eq!(stopped, pliant_haptics::Wrench::ZERO);
-    // Nobody has shown that a handle turned by a stiff spring is calm: motors that turn somebody's hand are not driven.
+    // The stability of a handle that a stiff spring turns is not proven, so the loop does not drive
+    // the torque motors of real devices.
     let real = DeviceInfo { simulated: false, ..six() };
     let mut core = LoopCore::new(real, LoopConfig::default()).unwrap();
     let (force, torque) = settle(&mut core, &Sample::default(), &[pull]);
@@ -85,7 +89,8 @@ fn a_torque_is_cut_as_its_force_is_and_real_motors_get_none() {
 #[test]
 fn scale_masks_and_weight() {
     let half = std::f64::consts::FRAC_1_SQRT_2;
-    // Twice the motion, half the force, turned by a quarter about z: the device's x is the world's y.
+    // The tool has twice the motion, half the force and a quarter turn about z: the device's x axis
+    // is the world's y axis.
     let tool = ToolMap {
         rotation: [0.0, 0.0, half, half],
         motion_scale: 2.0,
@@ -97,7 +102,7 @@ fn scale_masks_and_weight() {
     let mut core = LoopCore::new(six(), LoopConfig { tool, ..LoopConfig::default() }).unwrap();
     let sample = Sample::at([0.005, 0.0, 0.01]);
     let (force, _) = settle(&mut core, &sample, &[spring([0.0; 3], [0.0; 3], 100.0)]);
-    // 1 cm along y in the world, 1 N; 2 x 0.5 at the hand. And 50 g pull down.
+    // 1 cm along y in the world gives 1 N, times 2 x 0.5 at the hand. The mass of 50 g pulls down.
     near(force, [-1.0, -0.05 * 9.806_65, 0.0], "scaled, masked and weighed");
     let tool = core.last().tool;
     near(tool, [0.0, 0.01, 0.02], "the tool in the world");
@@ -105,7 +110,7 @@ fn scale_masks_and_weight() {
 
 #[test]
 fn a_body_elsewhere_is_felt_through_what_is_published() {
-    // Somebody else steps it: point and force come over the network.
+    // The body is stepped elsewhere, and its point and force come over the network.
     let device = VirtualDevice::new(VirtualConfig::touch(), Hand::NONE).unwrap();
     let config = LoopConfig::default();
     let coupling = Coupling::clamp(&config.coupling, &device.info(), config.rate, 0.0, 0.0);
@@ -124,12 +129,13 @@ fn a_body_elsewhere_is_felt_through_what_is_published() {
     writer.write_forces(&[felt(0.001)], relaxation, 0.0, 0.01, 0.01, &mut word);
     assert!((word.contacts()[0].velocity[0] - 0.1).abs() < 1e-12 && word.tick == 2);
     assert!((word.contacts()[0].stiffness[1][1] - k).abs() < 1e-12);
-    // The body stores 3 mJ, 1 mJ of it by this hand (1 N over 1 mm into the body): others have put in 2 mJ.
+    // The body stores 3 mJ. This hand put in 1 mJ of it (1 N over 1 mm into the body), so others
+    // have put in 2 mJ.
     let pushed = PublishedGrab { force: [-1.0, 0.0, 0.0], ..felt(0.002) };
     writer.write_forces(&[pushed], relaxation, 3e-3, 0.01, 0.02, &mut word);
     assert!((word.stored - 3e-3).abs() < 1e-15 && (word.supplied - 2e-3).abs() < 1e-15, "{}", word.supplied);
     assert!(word.partial);
-    // It swings through and back: nobody has put in anything.
+    // The body swings through and back, and nobody puts in energy.
     for stored in [0.0, 3e-3, 1e-3, 3e-3] {
         writer.write_forces(&[pushed], relaxation, stored, 0.01, 0.02, &mut word);
     }

@@ -1,5 +1,5 @@
-//! The vendors' libraries, played by small ones that this test builds with the system's C compiler,
-//! which the workspace needs anyway.
+//! Fake vendor libraries. The test builds them with the system's C compiler, which the workspace
+//! needs anyway.
 #![allow(clippy::unwrap_used, clippy::expect_used, clippy::panic, reason = "a failed test should panic")]
 #![cfg(all(feature = "vendor", unix))]
 #![allow(unsafe_code, reason = "the fake libraries are steered through C functions")]
@@ -20,11 +20,12 @@ use pliant_haptics::{
 #[path = "rig/machine.rs"]
 mod machine;
 
-/// Builds `tests/fake/<source>.c`; every test has a library, and so a state, of its own.
+/// Builds `tests/fake/<source>.c`. Every test has its own library and so its own state.
 fn fake(source: &str, test: &str, options: &[&str]) -> PathBuf {
     let from = Path::new(env!("CARGO_MANIFEST_DIR")).join("tests/fake").join(source).with_extension("c");
     let to = Path::new(env!("CARGO_TARGET_TMPDIR")).join(format!("lib{source}_{test}.so"));
-    // Put into its place whole: another run of these tests may have the one that is there open.
+    // The file is renamed into place, because another run of these tests may have the existing one
+    // open.
     let built = to.with_extension(std::process::id().to_string());
     let is_there = |compiler: &&str| Command::new(compiler).arg("--version").output().is_ok();
     let compiler = ["cc", "gcc", "clang"].into_iter().find(is_there);
@@ -52,7 +53,7 @@ macro_rules! call {
 }
 
 fn open_fake(path: &Path) -> Library {
-    // SAFETY: our own library without initialisers.
+    // SAFETY: the test's own library has no initializers.
     unsafe { Library::new(path).unwrap() }
 }
 
@@ -74,7 +75,7 @@ fn hd(path: &Path) -> OpenHapticsConfig {
     OpenHapticsConfig { library: Some(path.to_path_buf()), ..OpenHapticsConfig::default() }
 }
 
-/// Virtual time of a device that keeps it: an exchange takes 10 us, and a wait ends when it should.
+/// Virtual time of a device that does the timing: an exchange takes 10 us, and a wait ends on time.
 #[derive(Default)]
 struct Quick(Period);
 
@@ -94,12 +95,13 @@ impl Scheduler for Quick {
     }
 }
 
-/// So many tries at most, each of which passes virtual time.
+/// Tries at most 100 times. Each try passes virtual time.
 fn until(what: &str, so: &mut dyn FnMut() -> bool) {
     assert!((0..100).any(|_| so()), "never: {what}");
 }
 
-/// One at a time: the scheduler's count is the process's, as the real library's scheduler is.
+/// These tests run one at a time, because the count of open devices is global to the process, like
+/// the scheduler of the real library.
 static ONE_HD: std::sync::Mutex<()> = std::sync::Mutex::new(());
 
 #[test]
@@ -112,13 +114,13 @@ fn open_haptics_units_axes_and_sizes() {
     let mut device = OpenHaptics::open(hd(&path)).unwrap();
     let info = device.info();
     assert_eq!((info.name.as_str(), info.serial.as_str()), ("Fake Omni", "0042"));
-    // 0.7 N/mm and 0.005 N s/mm.
+    // The library reports 0.7 N/mm and 0.005 N s/mm.
     assert!((info.max_stiffness - 700.0).abs() < 1e-9 && (info.max_damping - 5.0).abs() < 1e-9, "{info:?}");
     assert_eq!((info.peak_force, info.continuous_force), (3.3, 0.88));
     assert_eq!(info.workspace, [[-0.08, -0.06, -0.035], [0.08, 0.06, 0.035]]);
     assert!(!info.simulated && info.check().is_ok());
     assert_eq!(device.calibration(), Calibration::Ready);
-    // Of two devices each is asked for itself, whichever was asked last.
+    // With two devices, each one is queried itself, whichever was queried last.
     call!(library, "fake_calibration", fn(c_int), 0x5002);
     call!(library, "fake_another_is_current", fn(),);
     assert_eq!(device.calibration(), Calibration::Needed("put the stylus into its inkwell"));
@@ -151,7 +153,7 @@ fn open_haptics_calibration_fault_and_return() {
     let _one = ONE_HD.lock().unwrap_or_else(|e| e.into_inner());
     let path = fake("hd", "faults", &[]);
     let library = open_fake(&path);
-    // Needs the hand.
+    // The calibration needs the user's hand.
     call!(library, "fake_calibration", fn(c_int), 0x5002);
     let device = OpenHaptics::open(hd(&path)).unwrap();
     let mut cycle = Cycle::new(device, LoopConfig::default()).unwrap();
@@ -166,7 +168,8 @@ fn open_haptics_calibration_fault_and_return() {
         let until = scheduler.last().now + seconds;
         while scheduler.last().now < until {
             model.tick += 1;
-            // The real scheduler waits for its servo tick; the fake does not, and the loop must not spin on it.
+            // The real scheduler waits for its servo tick. The fake does not wait, and the loop
+            // must not spin on it.
             cycle.step(&mut scheduler, &model, events);
             ticks += 1;
         }
@@ -176,14 +179,15 @@ fn open_haptics_calibration_fault_and_return() {
     run(&mut cycle, &mut events, 0.1);
     assert!(events.contains(&LoopEvent::Calibrate("put the stylus into its inkwell")), "{events:?}");
     assert_eq!((cycle.report().state, force(&library)), (LoopState::Calibrating, [0.0; 3]));
-    // It only needs to be told.
+    // This calibration needs only a call to the library.
     call!(library, "fake_calibration", fn(c_int), 0x5001);
     until("100 N/m over 5 mm", &mut || {
         run(&mut cycle, &mut events, 0.1);
         (force(&library)[0] + 0.5).abs() < 1e-6
     });
     assert_eq!(cycle.report().state, LoopState::Running);
-    // A device fault each frame: the force fades within 20 ms, after 100 ms it counts as lost, then it comes back.
+    // The driver returns a fault each frame. The force fades within 20 ms, the device counts as
+    // lost after 100 ms, and then it comes back.
     call!(library, "fake_error", fn(c_uint), 0x302);
     until("no force", &mut || {
         run(&mut cycle, &mut events, 0.03);
@@ -237,15 +241,15 @@ fn force_dimension_units_and_axes() {
     let info = device.info();
     assert_eq!((info.name.as_str(), info.serial.as_str(), info.peak_force), ("omega.6", "1234", 12.0));
     assert!(info.check().is_ok());
-    // 1 cm toward the user, 2 cm right, 3 cm up.
+    // The position is 1 cm toward the user, 2 cm right, 3 cm up.
     place(&library, [0.01, 0.02, 0.03], 0.5);
     call!(library, "fake_turn_up", fn(),);
     let sample = device.exchange(&Wrench { force: [1.0, 2.0, 3.0], ..Wrench::ZERO }, &mut pacing()).unwrap();
     assert_eq!(sample.position, [0.02, 0.03, 0.01]);
     assert_eq!(sample.velocity, Some([0.0, 0.0, 0.5]));
-    // 1 N right, 2 N up, 3 N toward the user are (3, 1, 2) of theirs.
+    // A force of 1 N right, 2 N up, 3 N toward the user is (3, 1, 2) in the vendor's axes.
     assert_eq!(force(&library), [3.0, 1.0, 2.0]);
-    // A quarter turn about their z is one about our y.
+    // A quarter turn about the vendor's z axis is one about Bevy's y axis.
     let half = std::f64::consts::FRAC_1_SQRT_2;
     for (got, want) in sample.orientation.into_iter().zip([0.0, half, 0.0, half]) {
         assert!((got - want).abs() < 1e-12, "{:?}", sample.orientation);
@@ -289,20 +293,22 @@ fn force_dimension_finds_its_reference_by_itself_if_it_is_told_to() {
     let path = fake("dhd", "robotic", &["-DWITH_DRD"]);
     let library = open_fake(&path);
     let drives = || call!(library, "fake_drives", fn() -> c_int,);
-    // Nobody asked it to: it does not move by itself.
+    // Without the setting, the device does not move by itself.
     call!(library, "fake_reset", fn(c_int), 0);
     let mut device = ForceDimension::open(dhd(&path)).unwrap();
     assert!(matches!(device.calibration(), Calibration::Needed(_)));
     drop(device);
     assert_eq!(drives(), 0);
-    // Asked, it does, once, and then the motors are ours: its own loop has ended, the forces are on.
+    // With the setting, the device moves once. The library's own control loop has then ended, and
+    // the forces are enabled.
     let mut device = ForceDimension::open(told(&path)).unwrap();
     assert_eq!((drives(), device.calibration()), (1, Calibration::Ready));
     assert_eq!(call!(library, "fake_driving", fn() -> c_int,), 0);
     assert_eq!(call!(library, "fake_enabled", fn() -> c_int,), 1);
     assert!(device.exchange(&Wrench { force: [1.0, 2.0, 3.0], ..Wrench::ZERO }, &mut pacing()).is_ok());
     assert_eq!(force(&library), [3.0, 1.0, 2.0]);
-    // Pulled out and put back, it has forgotten, and finds it again.
+    // After it was unplugged and plugged in, the device has forgotten its position and finds it
+    // again.
     call!(library, "fake_gone", fn(c_int), 1);
     assert!(device.exchange(&Wrench::ZERO, &mut pacing()).is_err());
     call!(library, "fake_reset", fn(c_int), 0);
@@ -310,7 +316,8 @@ fn force_dimension_finds_its_reference_by_itself_if_it_is_told_to() {
     assert!(device.reopen().is_ok());
     assert_eq!((drives(), device.calibration()), (2, Calibration::Ready));
     drop(device);
-    // One that knows its place is not driven; one that cannot move is refused and closed.
+    // A device that knows its position does not move. A device that cannot move is refused and
+    // closed.
     drop(ForceDimension::open(told(&path)).unwrap());
     assert_eq!(drives(), 2);
     call!(library, "fake_reset", fn(c_int), 0);

@@ -1,4 +1,6 @@
-//! Reconstruction and step against the limit that memory sets, measured in the same run: a plain sum over a buffer of the same size.
+//! Reconstruction and step, compared with the limit that memory sets.
+//!
+//! The limit is a plain sum over a buffer of the same size, measured in the same run.
 //!
 //! `cargo bench -p pliant_modal --bench reconstruct`
 #![allow(clippy::unwrap_used, missing_docs, reason = "a bench may stop")]
@@ -10,7 +12,8 @@ use pliant_modal::{
     StepSettings, SurfaceMesh, streaming_sum,
 };
 
-/// A strip of triangles with smooth, meaningless modes: the cost does not depend on the shape.
+/// Makes a strip of triangles with smooth but meaningless modes, because the cost does not depend
+/// on the shape.
 fn model(vertices: usize, modes: usize) -> ModalModel {
     let positions: Vec<[f32; 3]> = (0..vertices)
         .map(|i| [i as f32 * 1e-3, (i % 2) as f32 * 0.01, ((i / 2) % 2) as f32 * 0.01])
@@ -47,7 +50,7 @@ fn model(vertices: usize, modes: usize) -> ModalModel {
     .unwrap()
 }
 
-/// Median and 99th percentile of the time of `work`, us.
+/// Returns the median and the 99th percentile of the duration of `work`, us.
 fn time(mut work: impl FnMut()) -> [f64; 2] {
     let mut samples: Vec<f64> = Vec::new();
     let begun = Instant::now();
@@ -60,8 +63,10 @@ fn time(mut work: impl FnMut()) -> [f64; 2] {
     [samples[samples.len() / 2], samples[samples.len() * 99 / 100]]
 }
 
-/// As [`time`] for two works in turns of eight: whatever else the machine does slows both alike. The first of a turn, for which the caches are full of
-/// the other, is not counted.
+/// Measures two functions like [`time`], in alternating turns of eight calls.
+///
+/// Other load on the machine then slows both alike. The first call of each turn does not count,
+/// because the caches still hold the data of the other function.
 fn by_turns(mut a: impl FnMut(), mut b: impl FnMut()) -> [[f64; 2]; 2] {
     let once = |work: &mut dyn FnMut()| {
         let start = Instant::now();
@@ -134,7 +139,8 @@ fn main() {
     many_bodies();
 }
 
-/// What PyBullet does in one call: step, warp and reconstruct a body of 1,036 vertices and 20 modes that is held.
+/// Measures the work of one PyBullet call: step, warp and reconstruction of a held body with 1,036
+/// vertices and 20 modes.
 fn whole_step() {
     let model = Arc::new(model(1_036, 20));
     let mut body = Body::new(model.clone(), BodyConfig::default()).unwrap();
@@ -155,7 +161,7 @@ fn whole_step() {
     );
 }
 
-/// A thousand bodies of twenty modes in motion, on one core.
+/// Measures a step of a thousand moving bodies with twenty modes on one core.
 fn many_bodies() {
     let model = Arc::new(model(300, 20));
     let bodies: Vec<Body> = (0..1_000)

@@ -1,8 +1,9 @@
-//! Reconstruction: from modal coordinates to the deformed surface.
+//! Reconstruction of the deformed surface from modal coordinates.
 //!
-//! Bound by memory bandwidth, so the layout is the algorithm: vertices in blocks of 16; for each block and mode six rows
-//! (displacement x y z, rotation x y z) of 16 contiguous numbers. One pass reads the basis once, front to back, and a model with
-//! fewer modes reads a prefix of every block.
+//! Memory bandwidth limits reconstruction, so the data layout decides the speed. Vertices are
+//! stored in blocks of 16. Each block has six rows per mode (displacement x, y, z and rotation x,
+//! y, z) of 16 contiguous numbers. One pass reads the basis once, from front to back. A
+//! reconstruction with fewer modes reads a prefix of every block.
 
 use half::f16;
 
@@ -11,20 +12,20 @@ use crate::{
     warp::{SERIES_A, SERIES_B, SERIES_TERMS, WARP_SERIES_LIMIT, closed_f32},
 };
 
-/// Vertices a block.
+/// Number of vertices per block.
 pub const BLOCK: usize = 16;
 
-/// Rows a vertex and mode: three of displacement, three of rotation.
+/// Number of rows per vertex and mode: three for displacement and three for rotation.
 pub const ROWS: usize = 6;
 
 type Row<S> = [S; BLOCK];
 
-/// What a basis number is stored as.
+/// The number type in which basis entries are stored.
 ///
 /// # Safety
-/// As [`Lanes`]: `load` may only be called where the instruction set of `L` is there.
+/// As for [`Lanes`]: `load` may only be called where the instruction set of `L` is available.
 trait Stored: Copy {
-    /// Are rows stored divided by a factor of their mode?
+    /// Whether stored rows are divided by a factor per mode.
     const SCALED: bool;
     unsafe fn load<L: Lanes>(row: &Row<Self>) -> L;
 }
@@ -33,7 +34,7 @@ impl Stored for f32 {
     const SCALED: bool = false;
     #[inline(always)]
     unsafe fn load<L: Lanes>(row: &Row<Self>) -> L {
-        // SAFETY: the caller's.
+        // SAFETY: The caller guarantees that the instruction set of `L` is available.
         unsafe { L::load(row) }
     }
 }
@@ -42,44 +43,51 @@ impl Stored for f16 {
     const SCALED: bool = true;
     #[inline(always)]
     unsafe fn load<L: Lanes>(row: &Row<Self>) -> L {
-        // SAFETY: the caller's.
+        // SAFETY: The caller guarantees that the instruction set of `L` is available.
         unsafe { L::load_half(row) }
     }
 }
 
-/// How finely the numbers of a [`Basis`] are stored.
+/// Precision in which the numbers of a [`Basis`] are stored.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, Default)]
 pub enum Precision {
-    /// 32 bits.
+    /// 32 bits per number.
     #[default]
     Single,
-    /// 16 bits, scaled by mode: half the memory to read, which is what bounds the time of a large surface. Each entry is off by at most 2^-11 of the
-    /// largest of its mode; a bar pulled aside by a fifth of its length by 5e-5 of the length at most.
+    /// 16 bits per number, scaled per mode.
+    ///
+    /// This halves the memory that a reconstruction reads, which limits the time for a large
+    /// surface. The error of each entry is at most 2^-11 of the largest entry of its mode. For a
+    /// bar pulled aside by a fifth of its length, the error is at most 5e-5 of the length.
     Half,
 }
 
 #[derive(Debug, Clone, PartialEq)]
 enum Rows {
     Single(Vec<[Row<f32>; ROWS]>),
-    /// Half precision has a narrow range, so every mode's rows are stored divided by their largest entry.
+    /// Half precision has a narrow range, so the rows of every mode are divided by their largest
+    /// entry.
     Half(Vec<[Row<f16>; ROWS]>),
 }
 
-/// The modes at the surface, blocked for reconstruction.
+/// The modes at the surface, in blocks for reconstruction.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Basis {
     vertices: usize,
     modes: usize,
-    /// `[block][mode][row][lane]`.
+    /// Layout: `[block][mode][row][lane]`.
     rows: Rows,
-    /// By mode, for displacement and for rotation: what stored rows are to be multiplied by.
+    /// Factors per mode for displacement and rotation, by which stored rows must be multiplied.
     scales: Vec<[f32; 2]>,
-    /// `[block][axis][lane]`, m.
+    /// Rest positions, `[block][axis][lane]`, m.
     rest: Vec<[Row<f32>; 3]>,
 }
 
 impl Basis {
-    /// Blocks `displacement` and `rotation`, both `[mode][vertex][axis]` of `3 x vertices x modes` entries (missing ones are zero).
+    /// Arranges `displacement` and `rotation` in blocks.
+    ///
+    /// Both are `[mode][vertex][axis]` with `3 x vertices x modes` entries. Missing entries are
+    /// zero.
     pub(crate) fn new(positions: &[[f32; 3]], modes: usize, displacement: &[f32], rotation: &[f32]) -> Self {
         let vertices = positions.len();
         let blocks = vertices.div_ceil(BLOCK);
@@ -103,9 +111,11 @@ impl Basis {
         Self { vertices, modes, rows: Rows::Single(rows), scales: vec![[1.0; 2]; modes], rest }
     }
 
-    /// The same modes in half precision: half the memory and, where memory is the limit, half the time.
+    /// Returns the same modes in half precision.
     ///
-    /// Each entry is off by at most 2^-11 of the largest entry of its mode (displacement and rotation apart).
+    /// This halves the memory and, where memory is the limit, the time. The error of each entry is
+    /// at most 2^-11 of the largest entry of its mode (displacement and rotation have separate
+    /// scales).
     pub fn to_half(&self) -> Self {
         let Rows::Single(single) = &self.rows else { return self.clone() };
         let mut scales = vec![[0.0f32; 2]; self.modes];
@@ -129,24 +139,26 @@ impl Basis {
         Self { rows: Rows::Half(half), scales, rest: self.rest.clone(), ..*self }
     }
 
-    /// Surface vertices.
+    /// Number of surface vertices.
     pub fn vertices(&self) -> usize {
         self.vertices
     }
 
-    /// Modes.
+    /// Number of modes.
     pub fn modes(&self) -> usize {
         self.modes
     }
 
-    /// Bytes that one warped reconstruction with `modes` modes reads and writes: the floor under its time.
+    /// Bytes that one warped reconstruction with `modes` modes reads and writes. They set a lower
+    /// bound on its time.
     pub fn traffic_bytes(&self, modes: usize) -> usize {
         let number = if matches!(self.rows, Rows::Single(_)) { 4 } else { 2 };
         let rows = modes.min(self.modes) * ROWS * number;
         self.rest.len() * (rows + 3 * 4) * BLOCK + self.vertices * 12
     }
 
-    /// The blocked rows, `[block][mode][row][lane]`, for a device that reconstructs on its own (a GPU); `None` in half precision.
+    /// The rows, `[block][mode][row][lane]`, for a device that reconstructs by itself (a GPU).
+    /// Returns `None` in half precision.
     pub fn rows(&self) -> Option<&[[[f32; BLOCK]; ROWS]]> {
         match &self.rows {
             Rows::Single(rows) => Some(rows),
@@ -154,20 +166,25 @@ impl Basis {
         }
     }
 
-    /// Writes the deformed positions (m, body axes) for modal coordinates `q`, which may have fewer entries than there are modes.
+    /// Writes the deformed positions (m, body axes) for modal coordinates `q`.
     ///
-    /// `warped`: bend by modal warping; else the plain linear sum. Vertices beyond `out`'s length are not written.
+    /// `q` may have fewer entries than there are modes. With `warped` the shape bends by modal
+    /// warping, otherwise it is the plain linear sum. Vertices beyond the length of `out` are not
+    /// written.
     pub fn reconstruct(&self, q: &[f32], warped: bool, out: &mut [[f32; 3]]) {
         self.reconstruct_all(warped, &mut [(q, out)]);
     }
 
-    /// [`reconstruct`](Self::reconstruct) for several bodies of one model in one pass over the basis: for each its modal coordinates and where its
-    /// positions go. Past the first body the basis comes from the cache.
+    /// Reconstructs several bodies of one model in one pass over the basis, like
+    /// [`reconstruct`](Self::reconstruct).
+    ///
+    /// Each entry of `bodies` holds the modal coordinates of a body and the slice for its
+    /// positions. From the second body on, the basis comes from the cache.
     pub fn reconstruct_all(&self, warped: bool, bodies: &mut [(&[f32], &mut [[f32; 3]])]) {
         #[cfg(target_arch = "x86_64")]
         {
             if std::arch::is_x86_feature_detected!("avx512f") {
-                // SAFETY: the processor has just said that it has AVX-512F.
+                // SAFETY: The check above found AVX-512F.
                 unsafe { self.reconstruct_avx512(warped, bodies) };
                 return;
             }
@@ -175,34 +192,34 @@ impl Basis {
                 && std::arch::is_x86_feature_detected!("fma")
                 && std::arch::is_x86_feature_detected!("f16c")
             {
-                // SAFETY: the processor has just said that it has AVX2, FMA and F16C.
+                // SAFETY: The checks above found AVX2, FMA and F16C.
                 unsafe { self.reconstruct_avx2(warped, bodies) };
                 return;
             }
         }
-        // SAFETY: portable lanes ask nothing of the processor.
+        // SAFETY: Portable lanes have no processor requirements.
         unsafe { self.reconstruct_with::<Portable>(warped, bodies) }
     }
 
     #[cfg(target_arch = "x86_64")]
     #[target_feature(enable = "avx512f")]
     fn reconstruct_avx512(&self, warped: bool, bodies: &mut [(&[f32], &mut [[f32; 3]])]) {
-        // SAFETY: this function's own feature list.
+        // SAFETY: The `target_feature` attribute of this function enables the instruction set.
         unsafe { self.reconstruct_with::<crate::simd::x86::Avx512>(warped, bodies) }
     }
 
     #[cfg(target_arch = "x86_64")]
     #[target_feature(enable = "avx2,fma,f16c")]
     fn reconstruct_avx2(&self, warped: bool, bodies: &mut [(&[f32], &mut [[f32; 3]])]) {
-        // SAFETY: this function's own feature list.
+        // SAFETY: The `target_feature` attribute of this function enables the instruction set.
         unsafe { self.reconstruct_with::<crate::simd::x86::Avx2>(warped, bodies) }
     }
 
     /// # Safety
-    /// As [`Lanes`]: the instruction set of `L` is there.
+    /// As for [`Lanes`]: the instruction set of `L` must be available.
     #[inline(always)]
     unsafe fn reconstruct_with<L: Lanes>(&self, warped: bool, bodies: &mut [(&[f32], &mut [[f32; 3]])]) {
-        // SAFETY: the caller's.
+        // SAFETY: The caller guarantees that the instruction set of `L` is available.
         unsafe {
             match &self.rows {
                 Rows::Single(rows) => self.reconstruct_rows::<L, f32>(rows, warped, bodies),
@@ -211,10 +228,10 @@ impl Basis {
         }
     }
 
-    /// The one kernel.
+    /// The reconstruction kernel, shared by all instruction sets and precisions.
     ///
     /// # Safety
-    /// As [`Lanes`].
+    /// As for [`Lanes`]: the instruction set of `L` must be available.
     #[inline(always)]
     unsafe fn reconstruct_rows<L: Lanes, S: Stored>(
         &self,
@@ -227,7 +244,7 @@ impl Basis {
             for (q, out) in bodies.iter_mut() {
                 let start = (block * BLOCK).min(out.len());
                 let end = (start + BLOCK).min(out.len());
-                // SAFETY: the caller's.
+                // SAFETY: The caller guarantees that the instruction set of `L` is available.
                 let position = unsafe {
                     if warped {
                         warped_block::<L, S>(rows, q, &self.scales, rest)
@@ -243,10 +260,10 @@ impl Basis {
     }
 }
 
-/// `rest + sum of q x displacement`.
+/// Computes `rest + sum of q x displacement` for one block.
 ///
 /// # Safety
-/// As [`Lanes`].
+/// As for [`Lanes`]: the instruction set of `L` must be available.
 #[inline(always)]
 unsafe fn linear_block<L: Lanes, S: Stored>(
     rows: &[[Row<S>; ROWS]],
@@ -254,7 +271,7 @@ unsafe fn linear_block<L: Lanes, S: Stored>(
     scales: &[[f32; 2]],
     rest: &[Row<f32>; 3],
 ) -> [Row<f32>; 3] {
-    // SAFETY: the caller's.
+    // SAFETY: The caller guarantees that the instruction set of `L` is available.
     unsafe {
         let (mut x, mut y, mut z) = (L::load(&rest[0]), L::load(&rest[1]), L::load(&rest[2]));
         for ((row, &q), scale) in rows.iter().zip(q).zip(scales) {
@@ -271,10 +288,11 @@ unsafe fn linear_block<L: Lanes, S: Stored>(
     }
 }
 
-/// `rest + R~(w) d` with `d`, `w` the sums of displacement and rotation rows.
+/// Computes `rest + R~(w) d` for one block, where `d` and `w` are the sums of displacement and
+/// rotation rows.
 ///
 /// # Safety
-/// As [`Lanes`].
+/// As for [`Lanes`]: the instruction set of `L` must be available.
 #[inline(always)]
 unsafe fn warped_block<L: Lanes, S: Stored>(
     rows: &[[Row<S>; ROWS]],
@@ -282,7 +300,7 @@ unsafe fn warped_block<L: Lanes, S: Stored>(
     scales: &[[f32; 2]],
     rest: &[Row<f32>; 3],
 ) -> [Row<f32>; 3] {
-    // SAFETY: the caller's.
+    // SAFETY: The caller guarantees that the instruction set of `L` is available.
     unsafe {
         let zero = L::splat(0.0);
         let (mut dx, mut dy, mut dz, mut wx, mut wy, mut wz) = (zero, zero, zero, zero, zero, zero);
@@ -302,7 +320,7 @@ unsafe fn warped_block<L: Lanes, S: Stored>(
         }
         let s = wx.mul_add(wx, wy.mul_add(wy, wz.mul(wz)));
         let (a, b) = if s.all_at_most(WARP_SERIES_LIMIT) {
-            // Horner's rule on the nine-term series: no sine, no division, no branch.
+            // Horner's rule on the nine-term series needs no sine, no division and no branch.
             let last = SERIES_TERMS - 1;
             let (mut a, mut b) = (L::splat(SERIES_A[last]), L::splat(SERIES_B[last]));
             for k in (0..last).rev() {
@@ -311,7 +329,7 @@ unsafe fn warped_block<L: Lanes, S: Stored>(
             }
             (a, b)
         } else {
-            // More than half a turn somewhere in the block.
+            // At least one vertex of the block turns by more than half a turn.
             let mut squares = [0.0; BLOCK];
             s.store(&mut squares);
             let (mut a, mut b) = ([0.0; BLOCK], [0.0; BLOCK]);
@@ -339,7 +357,8 @@ unsafe fn warped_block<L: Lanes, S: Stored>(
 mod tests {
     use super::*;
 
-    /// Every instruction set that this processor has gives the plain double-precision answer, also beyond half a turn and for a last, partial block.
+    /// Every instruction set of this processor gives the plain double-precision result, also beyond
+    /// half a turn and for a last, partial block.
     #[test]
     fn all_instruction_sets_agree_with_the_formula() {
         let (vertices, modes) = (37, 5);
@@ -374,7 +393,7 @@ mod tests {
         let mut out = vec![[0.0; 3]; vertices];
         basis.reconstruct(&q, true, &mut out);
         check("chosen", &out);
-        // SAFETY: portable lanes ask nothing of the processor.
+        // SAFETY: Portable lanes have no processor requirements.
         unsafe { basis.reconstruct_with::<Portable>(true, &mut [(&q[..], &mut out[..])]) };
         check("portable", &out);
         let mut second = vec![[0.0; 3]; vertices];
@@ -385,14 +404,15 @@ mod tests {
             && std::arch::is_x86_feature_detected!("fma")
             && std::arch::is_x86_feature_detected!("f16c")
         {
-            // SAFETY: just asked.
+            // SAFETY: The checks above found AVX2, FMA and F16C.
             unsafe { basis.reconstruct_avx2(true, &mut [(&q[..], &mut out[..])]) };
             check("avx2", &out);
         }
     }
     #[test]
     fn half_precision_is_off_by_its_rounding_only() {
-        // A tiny body has huge mass-normalised rows, far beyond half precision's largest number: the scales take care of that.
+        // A tiny body has huge mass-normalized rows, far beyond the largest number of half
+        // precision. The scales per mode bring these rows into range.
         let (vertices, modes) = (50, 4);
         let positions = vec![[0.0f32; 3]; vertices];
         let displacement: Vec<f32> =
@@ -406,7 +426,8 @@ mod tests {
             basis.reconstruct(&q, warped, &mut want);
             half.reconstruct(&q, warped, &mut got);
             let largest = want.as_flattened().iter().fold(0.0f32, |m, x| m.max(x.abs()));
-            // 2^-11 a mode, four modes; the warp turns by up to 9e9 * 4e-10 = 3.6 rad and adds its own share.
+            // The error is 2^-11 per mode with four modes. The warp turns by up to 9e9 * 4e-10 =
+            // 3.6 rad, which adds to the error.
             let bound = if warped { 5e-3 } else { 2e-3 };
             for (g, w) in got.as_flattened().iter().zip(want.as_flattened()) {
                 assert!((g - w).abs() <= bound * largest, "{g} and {w} of {largest}");

@@ -1,4 +1,4 @@
-//! A body in motion: its state, the hands on it by name, and what pushes it.
+//! A moving body: its state, its grabs and the forces on it.
 
 use std::sync::Arc;
 
@@ -11,22 +11,24 @@ use crate::{
     step::{Six, tangent},
 };
 
-/// Names a grab on its body. Never used twice by the same body.
+/// Identifier of a grab on a body. A body never uses an identifier twice.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, PartialOrd, Ord)]
 pub struct GrabId(pub(crate) u64);
 
-/// What one copy of a body is made with. Its copies elsewhere share the [`StepSettings`]; the rest is
-/// each one's own.
+/// Configuration of one copy of a body.
+///
+/// All copies of a body share the [`StepSettings`]. The other fields may differ between copies.
 #[derive(Debug, Clone, PartialEq)]
 pub struct BodyConfig {
-    /// How it is stepped.
+    /// Settings of the step, the same for all copies.
     pub settings: StepSettings,
     /// Length of a step, s. Default: 1/60.
     pub step: f64,
-    /// Keep only so many modes, lowest first: the level of detail. Default: `None`, all.
+    /// Number of modes to keep, lowest frequencies first (level of detail). Default: `None`, all
+    /// modes.
     pub modes: Option<usize>,
-    /// Precision of the basis that [`Body::reconstruct`] reads. Steps, grabs and forces are in double
-    /// precision either way. Default: [`Precision::Single`].
+    /// Precision of the basis that [`Body::reconstruct`] reads. Steps, grabs and forces use double
+    /// precision in either case. Default: [`Precision::Single`].
     pub precision: Precision,
 }
 
@@ -37,29 +39,30 @@ impl Default for BodyConfig {
 }
 
 impl From<StepSettings> for BodyConfig {
-    /// A body that is stepped so, the rest as by default.
+    /// Makes a configuration with these step settings and defaults for the other fields.
     fn from(settings: StepSettings) -> Self {
         Self { settings, step: 1.0 / 60.0, modes: None, precision: Precision::default() }
     }
 }
 
-/// A deformable body: an [`Arc`] to its model, its state, and the hands on it.
+/// A deformable body: an [`Arc`] to its model, its state and the grabs on it.
 ///
-/// A step costs a few operations a mode and 3 rows a grab, allocates nothing, and leaves the body in its last good state when it fails.
+/// A step costs a few operations per mode and a system with three rows per grab. A step allocates
+/// nothing. If a step fails, the body keeps its last good state.
 #[derive(Debug, Clone)]
 pub struct Body {
     config: BodyConfig,
     kernel: Kernel,
     state: State,
-    /// Modal force of everything but hands and gravity, held for one step.
+    /// Modal force from [`Body::push`], constant over one step.
     pushes: Vec<f64>,
     push_force: Vector3<f64>,
     push_torque: Vector3<f64>,
-    /// The hands, and by which name each of them is known.
+    /// The hands. `grabs` holds their identifiers in the same order.
     hands: Vec<Hand>,
     grabs: Vec<Grab>,
     next_grab: u64,
-    /// Scratch: a state, and one entry a mode.
+    /// Scratch: a state and one entry per mode.
     spare: State,
     resisted: Vec<f64>,
     single: Vec<f32>,
@@ -69,19 +72,19 @@ pub struct Body {
 struct Grab {
     id: GrabId,
     target: Vector3<f64>,
-    /// The target of the step before; none of a hand that has just taken hold.
+    /// The target of the previous step, or `None` before the first step of the grab.
     last_target: Option<Vector3<f64>>,
     config: GrabConfig,
 }
 
 impl Body {
-    /// Most grabs that one body takes.
+    /// Maximum number of grabs on one body.
     pub const MAX_GRABS: usize = 32;
 
-    /// A body at rest, in its model's own place.
+    /// Makes a body at rest, in the pose in which its model was baked.
     ///
     /// # Errors
-    /// A configuration value that is not finite or not in its range.
+    /// Returns an error if a configuration value is not finite or out of range.
     pub fn new(model: Arc<ModalModel>, config: BodyConfig) -> Result<Self, StepError> {
         let modes = config.modes.unwrap_or(usize::MAX);
         let kernel = Kernel::new(model, config.settings, modes, config.step)?;
@@ -103,41 +106,46 @@ impl Body {
         })
     }
 
-    /// The model it is made of.
+    /// The model of the body.
     pub fn model(&self) -> &Arc<ModalModel> {
         self.kernel.model()
     }
 
-    /// How it is stepped.
+    /// The configuration of the body.
     pub fn config(&self) -> &BodyConfig {
         &self.config
     }
 
-    /// Number of modes kept.
+    /// Number of modes that the body keeps.
     pub fn mode_count(&self) -> usize {
         self.state.q.len()
     }
 
-    /// Angular frequencies of the kept modes as they are stepped, rad/s: the model's, with the scale of stiffness.
+    /// Angular frequencies of the kept modes as stepped, rad/s: the values of the model, scaled by
+    /// the stiffness scale.
     pub fn omega(&self) -> &[f64] {
         self.kernel.omega()
     }
 
-    /// Damping coefficients of the kept modes as they are stepped, 1/s: the model's, with the scales of stiffness and damping.
+    /// Damping coefficients of the kept modes as stepped, 1/s: the values of the model, scaled by
+    /// the stiffness and damping scales.
     pub fn damping(&self) -> &[f64] {
         self.kernel.damping()
     }
 
-    /// Changes step size, integrator, warp, gravity, damping, stiffness or relaxation; coordinates and velocities go on, and accelerations change
-    /// by as much as the elastic and damping forces. The number of modes stays as it was made.
-    /// A material that begins to relax begins with nothing relaxed; one that ceases to forgets what had.
+    /// Changes step size, integrator, warp, gravity, damping, stiffness or relaxation.
+    ///
+    /// Coordinates and velocities stay. Accelerations change by as much as the elastic and damping
+    /// forces. The number of modes stays as it was at construction. If relaxation is switched on,
+    /// the viscoelastic state starts at zero. If relaxation is switched off, the viscoelastic state
+    /// is dropped.
     ///
     /// # Errors
-    /// As [`Body::new`]; the old configuration then stays.
+    /// Returns the errors of [`Body::new`]. The old configuration then stays.
     pub fn reconfigure(&mut self, config: BodyConfig) -> Result<(), StepError> {
         let before = *self.kernel.settings();
-        // `a = f - c v - omega^2 (q - ratio z)`: the acceleration belongs to the state. What has not
-        // changed cancels to the bit.
+        // The acceleration belongs to the state: `a = f - c v - omega^2 (q - ratio z)`. Terms that
+        // have not changed cancel to the bit.
         let resisted = |kernel: &Kernel, state: &State, settings: &StepSettings, i: usize| {
             let ratio = settings.relaxation.map_or(0.0, |r| r.ratio);
             let stretch = state.q[i] - ratio * state.z.get(i).copied().unwrap_or(0.0);
@@ -176,44 +184,51 @@ impl Body {
         &self.state.a
     }
 
-    /// Modal flows, kg^1/2 m; empty where the material does not relax. See [`Relaxation`](crate::Relaxation).
+    /// Viscoelastic modal state, kg^1/2 m. Empty where the material does not relax. See
+    /// [`Relaxation`](crate::Relaxation).
     pub fn z(&self) -> &[f64] {
         &self.state.z
     }
 
-    /// The whole state.
+    /// The complete state.
     pub fn state(&self) -> &State {
         &self.state
     }
 
-    /// Where the body is.
+    /// Pose and rigid motion of the body.
     pub fn frame(&self) -> &Frame {
         &self.state.frame
     }
 
-    /// Puts the body into a state of the same number of modes.
+    /// Sets the state of the body. The state must have the same number of modes.
     ///
     /// # Errors
-    /// A slice of another length, a number that is not finite; the body then stays as it was.
+    /// Returns an error if a slice has another length or a number is not finite. The body then
+    /// stays as it was.
     pub fn set_state(&mut self, state: &State) -> Result<(), StepError> {
         self.kernel.check(state)?;
         self.state.clone_from(state);
         Ok(())
     }
 
-    /// Places the body: position of the model's origin (m) and rotation (unit quaternion x, y, z, w; normalised here), world axes.
-    /// Modal coordinates and velocities stay.
+    /// Sets the pose of the body: position of the model's origin (m) and rotation, in world axes.
+    ///
+    /// The rotation is a quaternion x, y, z, w, which this method normalizes. Modal coordinates and
+    /// velocities stay.
     ///
     /// # Errors
-    /// A number that is not finite, a quaternion of length zero.
+    /// Returns an error if a number is not finite or the quaternion has length zero.
     pub fn set_pose(&mut self, position: [f64; 3], rotation: [f64; 4]) -> Result<(), StepError> {
         self.state.frame.set_pose(self.kernel.model(), position, rotation)
     }
 
-    /// Holds a patch of the body; its target begins where the patch is now, so that grabbing moves nothing.
+    /// Grabs a patch of the body.
+    ///
+    /// The target starts at the current position of the patch, so the grab itself moves nothing.
     ///
     /// # Errors
-    /// A vertex that is not on the surface, a configuration out of range, too many grabs.
+    /// Returns an error if a vertex is not on the surface, if the configuration is out of range, or
+    /// if the body already has [`Body::MAX_GRABS`] grabs.
     pub fn grab(&mut self, patch: &Patch, config: GrabConfig) -> Result<GrabId, StepError> {
         if self.grabs.len() >= Self::MAX_GRABS {
             return Err(StepError::TooManyGrabs { limit: Self::MAX_GRABS });
@@ -231,7 +246,7 @@ impl Body {
         Ok(id)
     }
 
-    /// Lets go. Letting go twice is no error.
+    /// Releases a grab. Releasing a grab twice is not an error.
     pub fn release(&mut self, id: GrabId) {
         if let Ok(index) = self.find(id) {
             self.grabs.remove(index);
@@ -245,10 +260,11 @@ impl Body {
         self.grabs.iter().map(|g| g.id)
     }
 
-    /// Moves a grab's target (m, world axes).
+    /// Moves the target of a grab (m, world axes).
     ///
     /// # Errors
-    /// A target that is not finite (the old one stays), or no such grab.
+    /// Returns an error if the target is not finite (the old target then stays) or if there is no
+    /// such grab.
     pub fn set_target(&mut self, id: GrabId, target: [f64; 3]) -> Result<(), StepError> {
         finite("grab target", &target)?;
         let index = self.find(id)?;
@@ -256,46 +272,51 @@ impl Body {
         Ok(())
     }
 
-    /// Where the grab is being pulled to, m, world axes.
+    /// The target of a grab, m, world axes.
     ///
     /// # Errors
-    /// No such grab.
+    /// Returns [`StepError::NoGrab`] if there is no such grab.
     pub fn target(&self, id: GrabId) -> Result<[f64; 3], StepError> {
         Ok(self.grabs[self.find(id)?].target.into())
     }
 
-    /// Where the held patch is now, m, world axes.
+    /// Current position of the grabbed patch, m, world axes.
     ///
     /// # Errors
-    /// No such grab.
+    /// Returns [`StepError::NoGrab`] if there is no such grab.
     pub fn grab_position(&self, id: GrabId) -> Result<[f64; 3], StepError> {
         let patch = &self.hands[self.find(id)?].patch;
         let local = patch.rest() + patch.displacement(&self.state.q, self.config.settings.warp);
         Ok(self.state.frame.to_world(local).into())
     }
 
-    /// The reaction: the force that the body exerts on the hand, N, world axes, as of the last step.
+    /// The reaction at the end of the last step: the force that the body exerts on the hand, N,
+    /// world axes.
     ///
     /// # Errors
-    /// No such grab.
+    /// Returns [`StepError::NoGrab`] if there is no such grab.
     pub fn reaction(&self, id: GrabId) -> Result<[f64; 3], StepError> {
         Ok((-self.hands[self.find(id)?].pull).into())
     }
 
-    /// The force over the last step that the body exerted on the hand, N, world axes: times the step it
-    /// is the impulse that the hand got. [`reaction`](Self::reaction) is the force at the step's end.
+    /// The force that the body exerted on the hand over the last step, N, world axes.
+    ///
+    /// This force times the step length is the impulse on the hand. [`reaction`](Self::reaction) is
+    /// the force at the end of the step.
     ///
     /// # Errors
-    /// No such grab.
+    /// Returns [`StepError::NoGrab`] if there is no such grab.
     pub fn mean_reaction(&self, id: GrabId) -> Result<[f64; 3], StepError> {
         Ok((-self.hands[self.find(id)?].mean).into())
     }
 
-    /// Sets what [`mean_reaction`](Self::mean_reaction) tells, which the next step looks at. A copy of a
-    /// body that takes over a [`State`] takes over this too.
+    /// Sets the value that [`mean_reaction`](Self::mean_reaction) returns. The next step uses this
+    /// value.
+    ///
+    /// A copy of a body that takes over a [`State`] must take over this value too.
     ///
     /// # Errors
-    /// No such grab, a number that is not finite.
+    /// Returns an error if there is no such grab or a number is not finite.
     pub fn set_mean_reaction(&mut self, id: GrabId, force: [f64; 3]) -> Result<(), StepError> {
         finite("mean reaction", &force)?;
         let index = self.find(id)?;
@@ -303,29 +324,37 @@ impl Body {
         Ok(())
     }
 
-    /// The compliance of a grab within one step (3x3, m/N, body axes): residual flexibility of the patch plus the hand's own spring. Where
-    /// the material relaxes, the first is multiplied by [`Relaxation::creep`](crate::Relaxation::creep) of one step.
+    /// The compliance of a grab within one step (3x3, m/N, body axes).
+    ///
+    /// It is the residual flexibility of the patch plus the compliance of the hand's own spring.
+    /// Where the material relaxes, the residual flexibility is multiplied by
+    /// [`Relaxation::creep`](crate::Relaxation::creep) of one step.
     ///
     /// # Errors
-    /// No such grab.
+    /// Returns [`StepError::NoGrab`] if there is no such grab.
     pub fn compliance(&self, id: GrabId) -> Result<[[f64; 3]; 3], StepError> {
         let c = self.kernel.compliance(&self.hands[self.find(id)?]);
         Ok(std::array::from_fn(|i| std::array::from_fn(|j| c[(i, j)])))
     }
 
-    /// How far the residual flexibility under a grab has flown (m, body axes): the `z` of what the modes leave out, with `creep` of the
-    /// pulls so far. Zero where the material does not relax. A copy of a body that takes over a [`State`] takes over this too.
+    /// Viscoelastic state of the residual flexibility under a grab, m, body axes.
+    ///
+    /// It is the `z` of the compliance that the modes leave out, and holds the creep under the
+    /// forces so far. It is zero where the material does not relax. A copy of a body that takes
+    /// over a [`State`] must take over this value too.
     ///
     /// # Errors
-    /// No such grab.
+    /// Returns [`StepError::NoGrab`] if there is no such grab.
     pub fn grab_viscoelastic_state(&self, id: GrabId) -> Result<[f64; 3], StepError> {
         Ok(self.hands[self.find(id)?].flow.into())
     }
 
-    /// Sets what [`grab_viscoelastic_state`](Self::grab_viscoelastic_state) tells; nothing where the material does not relax.
+    /// Sets the value that [`grab_viscoelastic_state`](Self::grab_viscoelastic_state) returns.
+    ///
+    /// This does nothing where the material does not relax.
     ///
     /// # Errors
-    /// No such grab, a number that is not finite.
+    /// Returns an error if there is no such grab or a number is not finite.
     pub fn set_grab_viscoelastic_state(&mut self, id: GrabId, flow: [f64; 3]) -> Result<(), StepError> {
         finite("grab flow", &flow)?;
         let index = self.find(id)?;
@@ -338,7 +367,7 @@ impl Body {
     /// Pushes a surface vertex with `force` (N, world axes) during the next step only.
     ///
     /// # Errors
-    /// A force that is not finite, a vertex that is not on the surface.
+    /// Returns an error if the force is not finite or the vertex is not on the surface.
     pub fn push(&mut self, vertex: u32, force: [f64; 3]) -> Result<(), StepError> {
         finite("force", &force)?;
         let force = Vector3::from(force);
@@ -351,11 +380,11 @@ impl Body {
         Ok(())
     }
 
-    /// Strikes a surface vertex with `impulse` (N s, world axes): velocities change at once.
+    /// Applies `impulse` (N s, world axes) to a surface vertex. Velocities change at once.
     ///
     /// # Errors
-    /// An impulse that is not finite or brings a velocity or an acceleration beyond 1e100, a vertex that is not on the surface; the body
-    /// then stays as it was.
+    /// Returns an error if the impulse is not finite, if it brings a velocity or an acceleration
+    /// above 1e100, or if the vertex is not on the surface. The body then stays as it was.
     pub fn apply_impulse(&mut self, vertex: u32, impulse: [f64; 3]) -> Result<(), StepError> {
         finite("impulse", &impulse)?;
         let impulse = Vector3::from(impulse);
@@ -368,13 +397,15 @@ impl Body {
         for i in 0..self.mode_count() {
             let dv = self.resisted[i];
             self.state.v[i] += dv;
-            // The acceleration belongs to the state: damping answers the new velocity.
+            // The acceleration belongs to the state, so it includes the damping force of the new
+            // velocity.
             self.state.a[i] -= self.kernel.damping()[i] * dv;
         }
         if self.model().is_free() {
             self.state.frame.add_momentum(self.kernel.model(), impulse, arm.cross(&impulse));
         }
-        // What has overflowed here no step would put right: it goes back to the state before it, which is this one.
+        // An overflow must be rejected here. A later step that fails would only restore the state
+        // before that step, which is this state.
         if self.state.is_moderate() {
             return Ok(());
         }
@@ -383,8 +414,10 @@ impl Body {
         Err(StepError::Input { what: "impulse", expected, got: impulse.norm() })
     }
 
-    /// Adds the modal force of a force (N, world axes) on a surface vertex, through the derivative of
-    /// where the vertex is; its arm from the center of mass in world axes, m.
+    /// Adds the modal force of a force (N, world axes) on a surface vertex to `modal`.
+    ///
+    /// The modal force uses the derivative of the vertex position. Returns the arm of the vertex
+    /// from the center of mass, m, world axes.
     fn press(&self, vertex: u32, force: &Vector3<f64>, modal: &mut [f64]) -> Result<Vector3<f64>, StepError> {
         let model = self.model();
         let surface = model.surface().positions();
@@ -414,8 +447,10 @@ impl Body {
         Ok(rotation * (at - Vector3::from(model.center_of_mass())))
     }
 
-    /// Kinetic plus elastic energy of the modes, and of the rigid motion of a free body, J. Potential energy in gravity is not in it.
-    /// Where the material relaxes, both springs of each mode count: `omega^2 ((1 - ratio) q^2 + ratio (q - z)^2) / 2`.
+    /// Kinetic plus elastic energy of the modes, and of the rigid motion of a free body, J.
+    ///
+    /// Potential energy in gravity is not included. Where the material relaxes, both springs of
+    /// each mode count: `omega^2 ((1 - ratio) q^2 + ratio (q - z)^2) / 2`.
     pub fn energy(&self) -> f64 {
         let ratio = self.config.settings.relaxation.map_or(0.0, |r| r.ratio);
         let modes: f64 = (0..self.mode_count())
@@ -434,21 +469,26 @@ impl Body {
         modes + if self.model().is_free() { self.state.frame.kinetic_energy(self.model()) } else { 0.0 }
     }
 
-    /// Potential energy in gravity, J: of the deformation of an anchored body (0 when undeformed), of the
-    /// place of a free one (0 at the world's origin).
+    /// Potential energy in gravity, J.
+    ///
+    /// For an anchored body it is that of the deformation (0 when undeformed). For a free body it
+    /// is that of the position (0 at the world origin).
     pub fn potential_energy(&self) -> f64 {
         self.kernel.potential_energy(&self.state)
     }
 
-    /// Linear (kg m/s) and angular momentum about the world's origin (kg m^2/s) of a free body's rigid motion; zero for an anchored one.
+    /// Linear momentum (kg m/s) and angular momentum about the world origin (kg m^2/s) of a free
+    /// body's rigid motion. Both are zero for an anchored body.
     pub fn momentum(&self) -> ([f64; 3], [f64; 3]) {
         if self.model().is_free() { self.state.frame.momentum(self.model()) } else { ([0.0; 3], [0.0; 3]) }
     }
 
-    /// Writes the deformed surface (m, body axes): multiply by the frame, or by an engine's transform, to place it.
+    /// Writes the deformed surface (m, body axes) to `out`.
+    ///
+    /// Multiply by the frame, or by an engine's transform, to place the surface in the world.
     ///
     /// # Errors
-    /// `out` is shorter than the surface.
+    /// Returns an error if `out` is shorter than the surface.
     pub fn reconstruct(&mut self, out: &mut [[f32; 3]]) -> Result<(), StepError> {
         let expected = self.model().surface().positions().len();
         if out.len() < expected {
@@ -465,14 +505,15 @@ impl Body {
         Ok(())
     }
 
-    /// One step of the configured length; see [`Kernel`].
+    /// Performs one step of the configured length. See [`Kernel`].
     ///
     /// # Errors
-    /// [`StepError::Diverged`] when the result would not be finite; the body is then in the state it had before, unless that is one that nothing can be
-    /// stepped from (with a number beyond 1e100 in it): then it is at rest where its frame is.
+    /// Returns [`StepError::Diverged`] if the result would not be finite. The body then returns to
+    /// its state before the step. If that state contains a number above 1e100, the body is set to
+    /// rest, undeformed, at the pose of its frame.
     pub fn step(&mut self) -> Result<StepReport, StepError> {
         for (hand, grab) in self.hands.iter_mut().zip(&mut self.grabs) {
-            // A hand that has just taken hold has not moved.
+            // A hand has no velocity in the first step of its grab.
             let way = grab.last_target.map_or_else(Vector3::zeros, |last| grab.target - last);
             let (target, config) = (grab.target, grab.config);
             hand.hold = Hold::Target { target, velocity: way / self.config.step, config };
@@ -492,5 +533,5 @@ impl Body {
     }
 }
 
-/// Rows of the basis: of a vertex, an axis and a mode.
+/// Accessor for basis rows, with the arguments vertex, axis and mode.
 type Row = fn(&ModalModel, u32, usize, usize) -> f32;

@@ -1,13 +1,14 @@
-//! What a model must be before it is one.
+//! Validity checks on the parts of a model.
 
 use nalgebra::Matrix3;
 
 use crate::{BakeInfo, Coefficients, FlexibilitySite, Integrator, ModalModel, ModelError, ModelParts};
 
-/// What rounding may do to the symmetry of an inertia, as a share of its largest entry.
+/// Rounding tolerance for the symmetry of an inertia, as a share of its largest entry.
 const INERTIA_ROUNDING: f64 = 1e-9;
 
-/// What rounding may do to a residual flexibility, as a share of the compliances that it is the difference of.
+/// Rounding tolerance for a residual flexibility, as a share of the compliances whose difference it
+/// is.
 const FLEXIBILITY_ROUNDING: f64 = 1e-7;
 
 pub(crate) fn check_parts(parts: &ModelParts) -> Result<(), ModelError> {
@@ -39,7 +40,7 @@ pub(crate) fn check_parts(parts: &ModelParts) -> Result<(), ModelError> {
     let not_negative = |x: f64| x >= 0.0;
     let info = &parts.info;
     check_texts(info)?;
-    // The square is the mode's stiffness, which is divided by.
+    // The square is the stiffness of the mode, which is used as a divisor.
     each(
         "omega",
         "rad/s above 0, with a square above 0 and finite",
@@ -49,7 +50,8 @@ pub(crate) fn check_parts(parts: &ModelParts) -> Result<(), ModelError> {
     each("omega", "ascending", &mut parts.omega.windows(2).map(|w| w[1] - w[0]), &not_negative)?;
     each("damping", "1/s, 0 or more", &mut parts.damping.iter().copied(), &not_negative)?;
     for (index, (&omega, &c)) in parts.omega.iter().zip(&parts.damping).enumerate() {
-        // A step is made of the roots of `s^2 + c s + omega^2`: the squares of both must be finite, and all that comes of them.
+        // A step uses the roots of `s^2 + c s + omega^2`. The squares of `c` and `omega`, and all
+        // coefficients of the step, must be finite.
         if !(c * c).is_finite() || Coefficients::new(Integrator::Exact, omega, c, 1.0 / 60.0).is_err() {
             let expected = "1/s that a step can be made of";
             return Err(ModelError::Value { what: "damping", index, expected, got: c });
@@ -76,7 +78,10 @@ pub(crate) fn check_parts(parts: &ModelParts) -> Result<(), ModelError> {
     Ok(())
 }
 
-/// Cholesky reads one triangle only: what a step makes of the other would turn a body by itself.
+/// Checks that the inertia is symmetric and positive definite.
+///
+/// Cholesky reads one triangle only, so symmetry needs its own check. A step with an asymmetric
+/// inertia would turn a body by itself.
 fn check_inertia(inertia: &[[f64; 3]; 3]) -> Result<(), ModelError> {
     let inertia = Matrix3::from_fn(|i, j| inertia[i][j]);
     let wrong = |expected, got| Err(ModelError::Value { what: "inertia", index: 0, expected, got });
@@ -99,8 +104,10 @@ fn check_texts(info: &BakeInfo) -> Result<(), ModelError> {
     info.anchors.iter().try_for_each(|anchor| most("anchor", "bytes", ModalModel::MAX_TEXT, anchor.len()))
 }
 
-/// A residual flexibility is symmetric and gives way along a force, never against it. It is a small difference of two
-/// compliances, so what rounding may do to it goes by the compliance of the kept modes too.
+/// Checks that a residual flexibility is symmetric and positive semi-definite.
+///
+/// It is a small difference of two compliances, so the tolerance also depends on the compliance of
+/// the kept modes.
 fn check_flexibility(parts: &ModelParts, site: usize) -> Result<(), ModelError> {
     let FlexibilitySite { vertex, flexibility, .. } = &parts.sites[site];
     let f = Matrix3::from_fn(|i, j| flexibility[i][j]);

@@ -1,86 +1,86 @@
-//! What can go wrong, and what was expected instead.
+//! Errors of models, files and steps.
 
 use thiserror::Error;
 
-/// A model whose parts do not fit together, or a patch that does not fit its model.
+/// Error of a model whose parts do not match, or of a patch that does not match its model.
 #[derive(Debug, Clone, PartialEq, Error)]
 #[non_exhaustive]
 pub enum ModelError {
-    /// An array has another length than the counts ask for.
+    /// An array has another length than the counts require.
     #[error("{what}: expected {expected} entries, got {got}")]
     Length {
-        /// Which array.
+        /// Name of the array.
         what: &'static str,
-        /// The length that the counts ask for.
+        /// Length that the counts require.
         expected: usize,
-        /// The length it has.
+        /// Length of the array.
         got: usize,
     },
     /// A number is NaN, infinite or out of its range.
     #[error("{what}[{index}]: expected {expected}, got {got}")]
     Value {
-        /// Which quantity.
+        /// Name of the quantity.
         what: &'static str,
-        /// Its place in the array (0 for a scalar).
+        /// Index in the array (0 for a scalar).
         index: usize,
-        /// The range that is allowed.
+        /// The allowed range.
         expected: &'static str,
-        /// What came.
+        /// The value that was given.
         got: f64,
     },
-    /// A triangle or a site names a vertex that is not there.
+    /// A triangle or a site names a vertex that does not exist.
     #[error("{what}[{index}] names vertex {vertex}, but the surface has {count}")]
     Vertex {
-        /// Which list.
+        /// Name of the list.
         what: &'static str,
-        /// The entry.
+        /// Index of the entry in the list.
         index: usize,
-        /// The vertex it names.
+        /// The vertex that the entry names.
         vertex: u32,
-        /// How many there are.
+        /// Number of vertices of the surface.
         count: usize,
     },
-    /// A text or a list is longer than a model keeps.
+    /// A text or a list exceeds the maximum length in a model.
     #[error("{what}: expected at most {most} {unit}, got {got}")]
     TooLong {
-        /// Which one.
+        /// Name of the text or list.
         what: &'static str,
-        /// The longest that is kept.
+        /// Maximum length.
         most: usize,
-        /// What is counted.
+        /// Unit of the length.
         unit: &'static str,
-        /// Its length.
+        /// Length of the text or list.
         got: usize,
     },
-    /// Nothing to simulate or nothing to see.
+    /// The model has no mode, no surface vertex or no triangle.
     #[error("a model needs at least one {0}")]
     Empty(&'static str),
 }
 
-/// A `.modal` file that cannot be read or written.
+/// Error of reading or writing a `.modal` file.
 #[derive(Debug, Error)]
 #[non_exhaustive]
 pub enum FileError {
-    /// The operating system refused.
+    /// The operating system reported an error.
     #[error("{path}: {source}")]
     Io {
-        /// The file.
+        /// Path of the file.
         path: String,
-        /// Why.
+        /// Error of the operating system.
         source: std::io::Error,
     },
-    /// What the file holds is no model.
+    /// The content of the file is not a valid model.
     #[error("{path}: {source}")]
     In {
-        /// The file.
+        /// Path of the file.
         path: String,
-        /// What is wrong with it.
+        /// Error in the content.
         source: Box<FileError>,
     },
     /// The first bytes are not those of a `.modal` file.
     #[error("not a .modal file: expected it to begin with \"PLIANTMB\", got {0:?}")]
     Magic(Vec<u8>),
-    /// A `.modal` file of another version of the format.
+    /// The file has another version of the format.
     #[error(".modal format version {got}; this build reads version {expected}: bake the body again")]
     Version {
         /// The version that this build reads.
@@ -88,77 +88,78 @@ pub enum FileError {
         /// The version of the file.
         got: u32,
     },
-    /// The file ends early or goes on too long.
+    /// The file is too short or too long.
     #[error("cut or padded .modal file: expected {expected} bytes of {what}, got {got}")]
     Truncated {
-        /// Which part.
+        /// Name of the part.
         what: &'static str,
-        /// Bytes that the header promises.
+        /// Number of bytes that the header promises.
         expected: u64,
-        /// Bytes that are there.
+        /// Number of bytes present.
         got: u64,
     },
-    /// The content is not what was written.
+    /// The content does not match the hash in the header.
     #[error("altered .modal file: its content hashes to {got}, its header says {expected}")]
     Hash {
         /// The hash in the header.
         expected: String,
-        /// The hash of what came.
+        /// The hash of the content.
         got: String,
     },
-    /// The description inside cannot be decoded.
+    /// The description inside the file cannot be decoded.
     #[error("the .modal file's description cannot be decoded: {0}")]
     Decode(String),
-    /// The parts do not fit together.
+    /// The parts of the model do not match.
     #[error("the .modal file's content is inconsistent: {0}")]
     Model(#[from] ModelError),
 }
 
-/// A body that cannot be made, touched or stepped.
+/// Error of making, changing or stepping a body.
 #[derive(Debug, Clone, PartialEq, Error)]
 #[non_exhaustive]
 pub enum StepError {
-    /// A number from outside is NaN, infinite or out of its range; the body keeps its last good state.
+    /// An input is NaN, infinite or out of range. The body keeps its last good state.
     #[error("{what}: expected {expected}, got {got}")]
     Input {
-        /// Which input.
+        /// Name of the input.
         what: &'static str,
-        /// What is allowed.
+        /// The allowed range.
         expected: &'static str,
-        /// What came.
+        /// The value that was given.
         got: f64,
     },
-    /// The state became non-finite in a step; the body was put back to the state before it (see [`Body::step`](crate::Body::step)).
+    /// The state became non-finite in a step. The body returned to the state before the step (see
+    /// [`Body::step`](crate::Body::step)).
     #[error("the step made {what} non-finite; the body was put back to the state before it")]
     Diverged {
-        /// What became non-finite.
+        /// Name of the quantity that became non-finite.
         what: &'static str,
     },
-    /// A grab that is not (or no longer) on this body.
+    /// The grab does not exist on this body, or was released.
     #[error("no such grab on this body")]
     NoGrab,
-    /// More grabs than a body takes.
+    /// The body already has the maximum number of grabs.
     #[error("a body takes at most {limit} grabs")]
     TooManyGrabs {
-        /// The limit.
+        /// Maximum number of grabs.
         limit: usize,
     },
     /// A vertex that the surface does not have.
     #[error("vertex {vertex} is not on the surface, which has {count}")]
     Vertex {
-        /// The vertex named.
+        /// The vertex that was given.
         vertex: u32,
-        /// How many there are.
+        /// Number of vertices of the surface.
         count: usize,
     },
-    /// A slice of another length than the body's modes or vertices.
+    /// The length of a slice does not match the modes or vertices of the body.
     #[error("{what}: expected {expected} entries, got {got}")]
     Length {
-        /// Which slice.
+        /// Name of the slice.
         what: &'static str,
-        /// The length expected.
+        /// The expected length.
         expected: usize,
-        /// The length that came.
+        /// The length that was given.
         got: usize,
     },
 }

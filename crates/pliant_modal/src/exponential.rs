@@ -1,11 +1,15 @@
 //! The exponential of a 3 x 3 matrix and its integral, by scaling and squaring.
 //!
-//! Squaring doubles the relative error each time, and a stiff mode takes forty squarings: in double precision a third of the digits would be
-//! left, and an undamped mode would gain or lose energy. In pairs of doubles (106 bits) nothing of that is seen in the result.
-//! Sources: C. Moler, C. Van Loan, *Nineteen dubious ways to compute the exponential of a matrix*, SIAM Review 45(1), 2003, method 3;
-//! T. J. Dekker, *A floating-point technique for extending the available precision*, Numer. Math. 18, 1971.
+//! Each squaring doubles the relative error, and a stiff mode takes forty squarings. Double
+//! precision would keep a third of the digits, and an undamped mode would gain or lose energy. With
+//! pairs of doubles (106 bits) the error does not appear in the result.
+//!
+//! Sources: C. Moler, C. Van Loan, *Nineteen dubious ways to compute the exponential of a matrix*,
+//! SIAM Review 45(1), 2003, method 3; T. J. Dekker, *A floating-point technique for extending the
+//! available precision*, Numer. Math. 18, 1971.
 
-/// An unevaluated sum of two doubles, the second at most half a unit in the last place of the first.
+/// An unevaluated sum of two doubles. The second is at most half a unit in the last place of the
+/// first.
 #[derive(Clone, Copy, Default)]
 struct Pair(f64, f64);
 
@@ -47,7 +51,9 @@ fn image(a: &Square, x: &[Pair; 3]) -> [Pair; 3] {
     std::array::from_fn(|i| (0..3).fold(Pair::default(), |sum, k| sum.plus(a[i][k].times(x[k]))))
 }
 
-/// `exp(A)` and `integral from 0 to 1 of exp(A s) ds b`, for a finite `A` whose exponential does not grow.
+/// Computes `exp(A)` and `integral from 0 to 1 of exp(A s) ds b`.
+///
+/// `A` must be finite and its exponential must not grow.
 pub(crate) fn exponential(a: [[f64; 3]; 3], b: [f64; 3]) -> ([[f64; 3]; 3], [f64; 3]) {
     let norm = a.iter().map(|row| row.iter().map(|x| x.abs()).sum::<f64>()).fold(0.0, f64::max);
     let mut squarings = 0;
@@ -58,7 +64,7 @@ pub(crate) fn exponential(a: [[f64; 3]; 3], b: [f64; 3]) -> ([[f64; 3]; 3], [f64
     }
     let a: Square = a.map(|row| row.map(|x| Pair(x * scale, 0.0)));
     let b: [Pair; 3] = b.map(|x| Pair(x * scale, 0.0));
-    // Taylor: at a norm of 1/8 the seventeenth term is below 1e-30.
+    // In the Taylor series at a norm of 1/8, the seventeenth term is below 1e-30.
     let mut term: Square =
         std::array::from_fn(|i| std::array::from_fn(|j| Pair(f64::from(u8::from(i == j)), 0.0)));
     let mut e = term;

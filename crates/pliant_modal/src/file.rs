@@ -1,4 +1,4 @@
-//! The `.modal` file.
+//! The `.modal` file format.
 //!
 //! ```text
 //! 8   magic "PLIANTMB"
@@ -11,7 +11,8 @@
 //!   ..  surface positions f32 x 3 n, triangles u32 x 3 t, texture coordinates f32 x 2 n (when there), anchored u8 x n
 //!   ..  displacement f32 x 3 n m, rotation f32 x 3 n m, both [mode][vertex][axis]
 //! ```
-//! All numbers little-endian. A reader checks magic, version, length and hash before it looks at anything inside.
+//! All numbers are little-endian. A reader checks magic, version, length and hash before it decodes
+//! the payload.
 
 use std::{
     fs, io,
@@ -66,7 +67,7 @@ pub(crate) fn encode(parts: &ModelParts) -> Vec<u8> {
         inertia: parts.inertia,
         sites: parts.sites.clone(),
     };
-    // Writing plain data to memory cannot fail; an empty description would be refused by every reader.
+    // Serializing plain data to memory cannot fail. Every reader would refuse an empty description.
     let description = postcard::to_stdvec(&description).unwrap_or_default();
     let mut bytes = vec![0; HEADER];
     bytes.extend((description.len() as u32).to_le_bytes());
@@ -98,7 +99,7 @@ pub(crate) fn stored_hash(bytes: &[u8]) -> crate::ModelHash {
     crate::ModelHash(hash)
 }
 
-/// Takes `count` little-endian words off the front of `bytes`.
+/// Splits `count` little-endian words off the front of `bytes`.
 fn words<'a, const N: usize>(
     what: &'static str,
     bytes: &mut &'a [u8],
@@ -119,16 +120,19 @@ fn triples<T: Copy + Default>(flat: impl Iterator<Item = T>) -> Vec<[T; 3]> {
 }
 
 impl ModalModel {
-    /// The model as the content of a `.modal` file.
+    /// Encodes the model as the content of a `.modal` file.
     pub fn to_bytes(&self) -> Vec<u8> {
         encode(self.parts())
     }
 
-    /// Reads the content of a `.modal` file.
+    /// Decodes the content of a `.modal` file.
+    ///
+    /// This function never panics and allocates no more than a small multiple of the size of
+    /// `bytes`.
     ///
     /// # Errors
-    /// Another kind of file, another version, cut short, padded, altered, or inconsistent inside: each by name. Never panics,
-    /// and allocates no more than a small multiple of `bytes`.
+    /// Returns a separate error for content that is another kind of file, has another version, is
+    /// cut short, padded, altered, or inconsistent.
     pub fn from_bytes(bytes: &[u8]) -> Result<Self, FileError> {
         let magic = bytes.get(..8).unwrap_or(bytes);
         if magic != MAGIC {
@@ -165,7 +169,8 @@ impl ModalModel {
     /// Reads a `.modal` file.
     ///
     /// # Errors
-    /// The file cannot be opened, or [`FileError::In`] around what [`ModalModel::from_bytes`] says; both name the file.
+    /// Returns [`FileError::Io`] if the file cannot be read, or [`FileError::In`] around the error
+    /// of [`ModalModel::from_bytes`]. Both name the file.
     pub fn read(path: impl AsRef<Path>) -> Result<Self, FileError> {
         let path = path.as_ref();
         let name = || path.display().to_string();
@@ -173,11 +178,14 @@ impl ModalModel {
         Self::from_bytes(&bytes).map_err(|source| FileError::In { path: name(), source: Box::new(source) })
     }
 
-    /// Writes a `.modal` file: to a neighbour first, which is then renamed, so that a reader never finds half of it.
-    /// A link to a file stays one; what is no regular file (a device, a pipe) is written into.
+    /// Writes a `.modal` file.
+    ///
+    /// The data are written to a temporary file in the same folder, which is then renamed, so a
+    /// reader never sees half a file. A link to a file stays a link. If the path is not a regular
+    /// file (a device, a pipe), the data are written directly into it.
     ///
     /// # Errors
-    /// The operating system refused.
+    /// Returns [`FileError::Io`] if the operating system refuses.
     pub fn write(&self, path: impl AsRef<Path>) -> Result<(), FileError> {
         let path = path.as_ref();
         write_whole(path, &self.to_bytes())
@@ -186,13 +194,13 @@ impl ModalModel {
 }
 
 fn write_whole(path: &Path, bytes: &[u8]) -> io::Result<()> {
-    // What is not there yet has no other name.
+    // `canonicalize` fails for a file that does not exist yet. Such a path is used as it is.
     let goal = fs::canonicalize(path).unwrap_or_else(|_| path.to_owned());
     if fs::metadata(&goal).is_ok_and(|goal| !goal.is_file()) {
         return fs::OpenOptions::new().write(true).open(&goal)?.write_all(bytes);
     }
     let mut partial = goal.file_name().ok_or(io::ErrorKind::InvalidFilename)?.to_owned();
-    // Two threads that write one file each write their own neighbour: the last to end wins.
+    // Two threads that write the same file use separate temporary files. The last rename wins.
     static WRITES: AtomicU64 = AtomicU64::new(0);
     let write = WRITES.fetch_add(1, Ordering::Relaxed);
     partial.push(format!(".{}.{write}.partial", std::process::id()));
@@ -201,7 +209,8 @@ fn write_whole(path: &Path, bytes: &[u8]) -> io::Result<()> {
         .and_then(|mut file| file.write_all(bytes).and_then(|()| file.sync_all()))
         .and_then(|()| fs::rename(&partial, &goal))
         .inspect_err(|_| {
-            // The first error is the one to report; a leftover that cannot be removed says nothing more.
+            // The first error is the one to report. A failure to remove the temporary file adds no
+            // information.
             let _ = fs::remove_file(&partial);
         })
 }

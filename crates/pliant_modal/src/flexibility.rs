@@ -1,26 +1,29 @@
-//! The residual flexibility of any patch, from the baked ones.
+//! Residual flexibility of any patch, interpolated from the baked sites.
 
 use nalgebra::Matrix3;
 
 use crate::{ModalModel, ModelError, Patch, SurfaceMesh};
 
-/// Sites that are blended where none lies at the patch itself.
+/// Number of sites to blend if no site lies at the center of the patch.
 const NEAREST: usize = 4;
 
-/// Vertices up to which every pair of a patch counts in its sharpness.
+/// Largest number of vertices for which the sharpness of a patch sums over all vertex pairs.
 const PAIRS: usize = 200;
 
 impl ModalModel {
-    /// Residual flexibility (3x3, m/N, body axes) of a patch, with `kept` of the modes kept.
+    /// Residual flexibility (3x3, m/N, body axes) of a patch if the first `kept` modes are kept.
     ///
-    /// Exact at the baked places and radii. Between two radii it is linear in the patch's sharpness (one over its extent, as its vertices and
-    /// their weights make it), which is what the compliance of a loaded patch goes by (Boussinesq: `(1 - nu^2) / (E a)` for a patch of
-    /// extent `a`); between places, the four nearest are blended by inverse squared distance, each scaled to the patch's
-    /// sharpness. What modes beyond `kept` would have given is added.
-    /// A model without sites gets the half-space estimate `(1 - nu^2) / (2 E r)`.
+    /// The result is exact at the baked places and radii. Between two baked radii it is linear in
+    /// the sharpness of the patch. The sharpness is one over the extent, computed from the vertices
+    /// and weights. The compliance of a loaded patch is proportional to it (Boussinesq:
+    /// `(1 - nu^2) / (E a)` for a patch of extent `a`). Between baked places, the four nearest
+    /// sites are blended by inverse squared distance, each scaled to the sharpness of the patch.
+    /// The contribution of the modes beyond `kept` is added. A model without sites gets the
+    /// half-space estimate `(1 - nu^2) / (2 E r)`.
     ///
     /// # Errors
-    /// [`ModelError::Vertex`]: the patch is one of another surface, with a vertex that this one does not have.
+    /// Returns [`ModelError::Vertex`] if the patch belongs to another surface and has a vertex that
+    /// this surface does not have.
     pub fn residual_flexibility(&self, patch: &Patch, kept: usize) -> Result<[[f64; 3]; 3], ModelError> {
         let count = self.surface().positions().len();
         match patch.entries().iter().enumerate().find(|(_, (vertex, _))| *vertex as usize >= count) {
@@ -29,7 +32,8 @@ impl ModalModel {
         }
     }
 
-    /// [`residual_flexibility`](Self::residual_flexibility) of a patch whose vertices are known to be there.
+    /// Computes [`residual_flexibility`](Self::residual_flexibility) without checking the vertices
+    /// of the patch.
     pub(crate) fn flexibility_of(&self, patch: &Patch, kept: usize) -> [[f64; 3]; 3] {
         let mut flexibility = self.baked_flexibility(patch);
         for mode in kept..self.mode_count() {
@@ -51,14 +55,15 @@ impl ModalModel {
             let radius = patch.radius().max(1e-3 * self.size()).max(f64::MIN_POSITIVE);
             Matrix3::identity() * ((1.0 - info.poisson * info.poisson) / (2.0 * info.young * radius))
         };
-        // The pair of baked radii around the patch's own, or the two at the end that it lies beyond.
+        // The two baked radii around the radius of the patch. Beyond the largest or smallest baked
+        // radius these are the two nearest.
         let above = radii.partition_point(|&r| r < patch.radius());
         let (a, b) = match radii.len() {
             0 => return estimate(),
             1 => (0, 0),
             n => (above.clamp(1, n - 1) - 1, above.clamp(1, n - 1)),
         };
-        // Sharpnesses are compared with one another, so all are measured alike.
+        // Sharpnesses are compared with one another, so all must be measured in the same way.
         let vertices =
             Patch::around(self.surface(), patch.center(), radii[b]).map_or(0, |p| p.entries().len());
         let pairs = vertices.max(patch.entries().len()) <= PAIRS;
@@ -69,16 +74,17 @@ impl ModalModel {
             return estimate();
         };
         if above == 0 || above == radii.len() || sa <= sb * (1.0 + 1e-9) {
-            // Beyond the ends, or radii so small that both patches are the one vertex: in proportion.
+            // The radius is beyond the baked radii, or both radii are so small that the patches are
+            // the same single vertex. The flexibility is then proportional to the sharpness.
             let (s, f) = if above == 0 { (sa, fa) } else { (sb, fb) };
             return f * (sharpness / s).clamp(0.125, 8.0);
         }
         let t = ((sharpness - sb) / (sa - sb)).clamp(0.0, 1.0);
-        // A mean of two positive semi-definite matrices is one.
+        // A mean of two positive semi-definite matrices is positive semi-definite.
         fa * t + fb * (1.0 - t)
     }
 
-    /// For one of the baked radii: the sharpness of a patch of that radius here, and its flexibility.
+    /// Returns the sharpness of a patch of the baked `radius` at this place and its flexibility.
     fn baked_at(&self, patch: &Patch, radius: f64, pairs: bool) -> Option<(f64, Matrix3<f64>)> {
         let sites = &self.parts().sites;
         let positions = self.surface().positions();
@@ -111,9 +117,12 @@ impl ModalModel {
     }
 }
 
-/// How sharp a patch is, 1/m. By `pairs` the energy of its weights under the kernel of the half-space, `sum w w' / d`, each vertex with itself as the
-/// disc of its area (`16 / (3 pi a)`, so `3 / sqrt(A)`); else, for large patches, one over the root of the area that
-/// carries the force, `sqrt(sum w^2 / A)`. What lies on an anchor is pressed in vain and does not count.
+/// Sharpness of a patch, 1/m.
+///
+/// With `pairs` it is the energy of the weights under the kernel of the half-space, `sum w w' / d`.
+/// The term of a vertex with itself is that of a disc with the area of the vertex (`16 / (3 pi a)`,
+/// so `3 / sqrt(A)`). Without `pairs`, for large patches, it is one over the root of the area that
+/// carries the force, `sqrt(sum w^2 / A)`. Anchored vertices cannot move and do not count.
 fn sharpness(surface: &SurfaceMesh, patch: &Patch, pairs: bool) -> f64 {
     let moving = || patch.entries().iter().filter(|(v, _)| !surface.anchored()[*v as usize]);
     let at = |v: u32| surface.positions()[v as usize].map(f64::from);

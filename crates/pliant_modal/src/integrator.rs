@@ -1,31 +1,40 @@
 //! One step of one mode, `q'' + c q' + omega^2 q = f`, as a linear recurrence.
 //!
-//! Every integrator here is the same kernel with other numbers: what the step makes of the old state, plus a response to the force at the
-//! new time. A constraint needs only the response.
+//! All integrators use the same kernel with different coefficients. The new state is a linear
+//! function of the old state plus a response to the force at the new time. A constraint needs only
+//! the response.
 
 use crate::StepError;
 
-/// How the modes are stepped.
+/// Time integration method of the modes.
 #[derive(Debug, Clone, Copy, PartialEq, Default, serde::Serialize, serde::Deserialize)]
 #[serde(deny_unknown_fields)]
 pub enum Integrator {
-    /// The oscillator's closed form, exact when the force is constant over the step. The default: no period error at any step.
+    /// The closed form of the oscillator, exact if the force is constant over the step. This is the
+    /// default. It has no period error at any step length.
     #[default]
     Exact,
-    /// Newmark's method (beta = 1/4, gamma = 1/2: average acceleration): the paper's. No damping of its own; its period error is
-    /// `(omega h / 2) / atan(omega h / 2)`.
+    /// Newmark's method (beta = 1/4, gamma = 1/2: average acceleration), as in Tang et al. 2013.
+    ///
+    /// It adds no damping of its own. Its period error is `(omega h / 2) / atan(omega h / 2)`.
     Newmark,
-    /// Generalized-alpha (Chung and Hulbert 1993): second order, and of infinitely fast modes only `rho_inf` is left after a step. The form whose
+    /// Generalized-alpha (Chung and Hulbert 1993), of second order.
+    ///
+    /// Of infinitely fast modes only `rho_inf` is left after a step. This is the method whose
     /// accelerations are streamed.
     GeneralizedAlpha {
-        /// Spectral radius at infinite frequency, 0 to 1. 1 conserves, 0 forgets in one step; 0.5 suits hands.
+        /// Spectral radius at infinite frequency, 0 to 1. A value of 1 conserves fast modes, 0
+        /// removes them in one step. A value of 0.5 suits hands.
         rho_inf: f64,
     },
 }
 
 impl Integrator {
-    /// Newmark's `(beta, gamma)`: a step obeys `v1 = v0 + h ((1 - gamma) a0 + gamma a1)` and
-    /// `q1 = q0 + h v0 + h^2 ((1/2 - beta) a0 + beta a1)`. `None` for [`Integrator::Exact`], whose accelerations do not integrate to its state.
+    /// Returns Newmark's `(beta, gamma)`.
+    ///
+    /// A step obeys `v1 = v0 + h ((1 - gamma) a0 + gamma a1)` and
+    /// `q1 = q0 + h v0 + h^2 ((1/2 - beta) a0 + beta a1)`. Returns `None` for
+    /// [`Integrator::Exact`], whose accelerations do not integrate to its state.
     pub fn newmark(self) -> Option<(f64, f64)> {
         match self {
             Self::Exact => None,
@@ -39,7 +48,7 @@ impl Integrator {
     }
 }
 
-/// The recurrence of one mode and one step size.
+/// The recurrence of one mode for one step length.
 ///
 /// ```text
 /// [q1]   [      ] [q0]
@@ -47,20 +56,22 @@ impl Integrator {
 /// [a1]   [      ] [a0]
 ///                 [f0]
 /// ```
-/// `f0`, `f1`: modal force at the old and the new time; [`Integrator::Exact`] takes `f1` as constant over the step.
+/// `f0` and `f1` are the modal forces at the old and the new time. [`Integrator::Exact`] takes `f1`
+/// as constant over the step.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Coefficients {
-    /// Rows `q`, `v`, `a`; columns `q0`, `v0`, `a0`, `f0`.
+    /// Factors on the old state. Rows: `q`, `v`, `a`. Columns: `q0`, `v0`, `a0`, `f0`.
     pub free: [[f64; 4]; 3],
-    /// What a unit modal force at the new time adds to `q`, `v`, `a`.
+    /// Change of `q`, `v`, `a` per unit modal force at the new time.
     pub response: [f64; 3],
 }
 
 impl Coefficients {
-    /// For a mode of angular frequency `omega` (rad/s, 0 or more) and damping coefficient `c` (1/s, 0 or more) at step `h` (s).
+    /// Computes the coefficients for a mode of angular frequency `omega` (rad/s, 0 or more) and
+    /// damping coefficient `c` (1/s, 0 or more) at step length `h` (s).
     ///
     /// # Errors
-    /// A number that is not finite or not in its range.
+    /// Returns an error if a number is not finite or out of range.
     pub fn new(integrator: Integrator, omega: f64, c: f64, h: f64) -> Result<Self, StepError> {
         StepError::check("omega", "finite rad/s, 0 or more", omega.is_finite() && omega >= 0.0, omega)?;
         StepError::check("damping coefficient", "finite 1/s, 0 or more", c.is_finite() && c >= 0.0, c)?;
@@ -75,7 +86,8 @@ impl Coefficients {
                 Self::alpha(omega, c, h, am, af, (gamma + 0.5).powi(2) / 4.0, gamma)
             }
         };
-        // An absurd frequency (1e200 rad/s) overflows its square: say so instead of handing out NaN.
+        // The square of an absurd frequency (1e200 rad/s) overflows. This must be an error instead
+        // of NaN.
         let finite = made.free.iter().flatten().chain(&made.response).all(|x| x.is_finite());
         StepError::check("omega", "a frequency whose square is finite", finite, omega)?;
         Ok(made)
@@ -86,7 +98,9 @@ impl Coefficients {
         let sigma = 0.5 * c;
         let delta = (omega - sigma) * (omega + sigma);
         let x = delta.abs() * h * h;
-        // ec, es: exp(-sigma h) cosh|cos(sqrt|delta| h) and exp(-sigma h) sinh|sin(..)/sqrt|delta|. r: integral of es from 0 to h.
+        // ec = exp(-sigma h) cosh|cos(sqrt|delta| h),
+        // es = exp(-sigma h) sinh|sin(..)/sqrt|delta|.
+        // r is the integral of es from 0 to h.
         let (ec, es);
         let mut r;
         if x < 1e-8 {
@@ -111,7 +125,8 @@ impl Coefficients {
             r = (one(slow) - one(fast)) / (2.0 * w);
         }
         if omega * h < 1e-2 && sigma * h < 1e-2 {
-            // 1 - a cancels here: Taylor of the impulse response b(s), integrated; b'' = -c b' - k b, b(0) = 0, b'(0) = 1.
+            // 1 - a cancels here. The Taylor series of the impulse response b(s) is integrated
+            // instead, with b'' = -c b' - k b, b(0) = 0, b'(0) = 1.
             let derivatives = {
                 let mut b = [0.0, 1.0, 0.0, 0.0, 0.0, 0.0, 0.0];
                 for i in 2..b.len() {
@@ -130,7 +145,7 @@ impl Coefficients {
         let q = [ec + sigma * es, es, 0.0, 0.0];
         let v = [-k * es, ec - sigma * es, 0.0, 0.0];
         let response = [r, es];
-        // a1 = f1 - c v1 - k q1, so that the acceleration belongs to the state it comes with.
+        // a1 = f1 - c v1 - k q1, so that the acceleration matches the new state.
         let a = [-c * v[0] - k * q[0], -c * v[1] - k * q[1], 0.0, 0.0];
         Self {
             free: [q, v, a],
@@ -141,7 +156,8 @@ impl Coefficients {
     fn alpha(omega: f64, c: f64, h: f64, am: f64, af: f64, beta: f64, gamma: f64) -> Self {
         let k = omega * omega;
         let d = (1.0 - am) + (1.0 - af) * (c * gamma * h + k * beta * h * h);
-        // (1 - am) a1 + am a0 + (1 - af)(c v1 + k q1) + af (c v0 + k q0) = (1 - af) f1 + af f0, solved for a1.
+        // This solves the following equation for a1:
+        // (1 - am) a1 + am a0 + (1 - af)(c v1 + k q1) + af (c v0 + k q0) = (1 - af) f1 + af f0.
         let a = [
             -k / d,
             -(c + (1.0 - af) * k * h) / d,
@@ -155,7 +171,7 @@ impl Coefficients {
         Self { free: [q, v, a], response: [bh * r, gh * r, r] }
     }
 
-    /// The state after one step from `[q0, v0, a0]` with old force `f0` and new force `f1`.
+    /// Returns the state after one step from `[q0, v0, a0]` with old force `f0` and new force `f1`.
     #[inline]
     pub fn step(&self, state: [f64; 3], f0: f64, f1: f64) -> [f64; 3] {
         std::array::from_fn(|i| {
@@ -169,7 +185,7 @@ impl Coefficients {
 mod tests {
     use super::*;
 
-    /// Classical Runge-Kutta with very many substeps: the value from outside.
+    /// Classical Runge-Kutta integration with very many substeps, as an independent reference.
     fn reference(omega: f64, c: f64, h: f64, f: f64, mut q: f64, mut v: f64) -> [f64; 2] {
         let n = 40_000;
         let dt = h / f64::from(n);
@@ -221,14 +237,16 @@ mod tests {
 
     #[test]
     fn exact_static_limit_of_stiff_modes() {
-        // Over-damped and far beyond the step: the mode follows the force, q = f / omega^2.
+        // The mode is over-damped and far faster than the step, so `q = f / omega^2` tracks the
+        // force.
         let c = Coefficients::new(Integrator::Exact, 1e7, 2e8, 0.025).unwrap();
         assert!((c.response[0] * 1e14 - 1.0).abs() < 1e-9, "{}", c.response[0] * 1e14);
     }
 
     #[test]
     fn newmark_period_error_is_the_known_one() {
-        // One step of average acceleration turns the phase by 2 atan(omega h / 2): its trace is twice the cosine of that.
+        // One step of average acceleration turns the phase by 2 atan(omega h / 2). The trace of the
+        // step is twice the cosine of this angle.
         let (omega, h) = (2.0 * std::f64::consts::PI * 5.0, 1.0 / 40.0);
         let c = Coefficients::new(Integrator::Newmark, omega, 0.0, h).unwrap();
         let k = -omega * omega;
@@ -242,12 +260,13 @@ mod tests {
     fn generalized_alpha_forgets_infinite_frequencies_at_rho() {
         for rho in [0.0, 0.3, 0.5, 0.9, 1.0] {
             let c = Coefficients::new(Integrator::GeneralizedAlpha { rho_inf: rho }, 1e9, 0.0, 0.01).unwrap();
-            // In units where the entries are comparable: state (q, h v, h^2 a).
+            // The state (q, h v, h^2 a) has comparable entries.
             let h = 0.01f64;
             let scale = [1.0, h, h * h];
             let m = nalgebra::Matrix3::from_fn(|i, j| c.free[i][j] * scale[i] / scale[j]);
             let radius = m.complex_eigenvalues().iter().map(|z| z.norm()).fold(0.0, f64::max);
-            // The eigenvalue is (nearly) triple, so rounding shows as its cube root: (1e-16)^(1/3) = 5e-6, times the conditioning.
+            // The eigenvalue is (nearly) triple, so rounding enters as its cube root,
+            // `(1e-16)^(1/3) = 5e-6`, times the conditioning.
             assert!((radius - rho).abs() < 1e-4, "rho {rho}: {radius}");
         }
     }

@@ -1,7 +1,10 @@
-//! Modal soft bodies without an engine: the baked [`ModalModel`] and its `.modal` file, and the [`Body`] that steps it,
-//! is grabbed, reports its reaction in newtons, bends by modal warping and writes its surface.
+//! Modal soft bodies without an engine.
 //!
-//! A body is baked once into a few vibration modes; at run time only the modal coordinates `q` move:
+//! The crate holds the baked [`ModalModel`], its `.modal` file and the [`Body`]. A body steps its
+//! model, takes grabs, reports reactions in newtons, bends by modal warping and writes its deformed
+//! surface.
+//!
+//! A bake reduces a body to a few vibration modes. At run time only the modal coordinates `q` move:
 //!
 //! ```text
 //! q'' + c q' + omega^2 q = f        one scalar equation a mode, mass-normalised (phi^T M phi = 1)
@@ -26,7 +29,7 @@
 //! # }
 //! ```
 //!
-//! The crate knows no engine, no clock and no network; a step allocates nothing.
+//! The crate depends on no engine, clock or network. A step allocates nothing.
 #![cfg_attr(
     test,
     allow(clippy::unwrap_used, clippy::expect_used, clippy::panic, reason = "a failed test should panic")

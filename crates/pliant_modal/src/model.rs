@@ -1,4 +1,4 @@
-//! The baked model: what a body is, independent of where it is and how it moves.
+//! The baked model: the data of a body that do not depend on its pose and motion.
 
 use std::sync::{Arc, OnceLock};
 
@@ -7,14 +7,15 @@ use serde::{Deserialize, Serialize};
 use crate::step::MassSites;
 use crate::{Basis, ModelError, Precision, SurfaceMesh, check::check_parts};
 
-/// The finite element that a body was baked with.
+/// The finite element of a bake.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "lowercase")]
 #[non_exhaustive]
 pub enum Element {
-    /// 4-node (linear) tetrahedra: the paper's. 20-40 % too stiff in bending on coarse meshes.
+    /// 4-node (linear) tetrahedra, as in Tang et al. 2013. They are 20-40 % too stiff in bending on
+    /// coarse meshes.
     Tet4,
-    /// 10-node (quadratic) tetrahedra: the default.
+    /// 10-node (quadratic) tetrahedra, the default.
     Tet10,
 }
 
@@ -27,7 +28,8 @@ impl std::fmt::Display for Element {
     }
 }
 
-/// How the modes lose energy. Mode `i` has the damping coefficient `c_i` of `q'' + c q' + omega^2 q = f`.
+/// Damping law of the modes. Mode `i` has the damping coefficient `c_i` of
+/// `q'' + c q' + omega^2 q = f`.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
 #[non_exhaustive]
@@ -39,12 +41,13 @@ pub enum Damping {
         /// Stiffness-proportional part, s.
         beta: f64,
     },
-    /// `c = 2 zeta omega`: the same fraction of critical damping in every mode.
+    /// `c = 2 zeta omega`: the same fraction of critical damping in every mode. The field is
+    /// `zeta`.
     Ratio(f64),
 }
 
 impl Damping {
-    /// `c_i` in 1/s for a mode of angular frequency `omega` (rad/s).
+    /// Damping coefficient `c_i`, 1/s, of a mode with angular frequency `omega` (rad/s).
     pub fn coefficient(self, omega: f64) -> f64 {
         match self {
             Self::Rayleigh { alpha, beta } => alpha + beta * omega * omega,
@@ -53,16 +56,16 @@ impl Damping {
     }
 }
 
-/// Where a model came from, and how good its bake was.
+/// Origin of a model and quality of its bake.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct BakeInfo {
-    /// A name for people: the file it was made from.
+    /// Name for display: the file from which the model was made.
     pub name: String,
-    /// Tetrahedra of the simulation mesh.
+    /// Number of tetrahedra of the simulation mesh.
     pub tets: usize,
-    /// Nodes of the simulation mesh, mid-edge nodes counted.
+    /// Number of nodes of the simulation mesh, including mid-edge nodes.
     pub nodes: usize,
-    /// The element used.
+    /// Finite element of the bake.
     pub element: Element,
     /// Young's modulus, Pa.
     pub young: f64,
@@ -72,7 +75,7 @@ pub struct BakeInfo {
     pub density: f64,
     /// Damping law.
     pub damping: Damping,
-    /// The anchors as they were given (`x<0.01`); empty for a free body.
+    /// The anchors as given by the user (`x<0.01`). Empty for a free body.
     pub anchors: Vec<String>,
     /// Largest `|K phi - lambda M phi| / |K phi|` over the modes.
     pub residual_max: f64,
@@ -80,19 +83,24 @@ pub struct BakeInfo {
     pub orthonormality_max: f64,
 }
 
-/// The residual flexibility of one patch: what the kept modes leave out of its static compliance,
-/// `W^T (K^-1 - Phi Lambda^-1 Phi^T) W` (m/N, body axes, symmetric and positive semi-definite).
+/// The residual flexibility of one patch: the part of its static compliance that the kept modes
+/// leave out.
+///
+/// It is `W^T (K^-1 - Phi Lambda^-1 Phi^T) W` (m/N, body axes), symmetric and positive
+/// semi-definite.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 pub struct FlexibilitySite {
-    /// Surface vertex in the middle of the patch.
+    /// Surface vertex at the center of the patch.
     pub vertex: u32,
     /// Patch radius, m.
     pub radius: f64,
-    /// 3x3, m/N.
+    /// Residual flexibility, 3x3, m/N.
     pub flexibility: [[f64; 3]; 3],
 }
 
-/// Content hash of a model (BLAKE3 of its `.modal` payload): two machines with the same hash have the same body, bit for bit.
+/// Content hash of a model: the BLAKE3 hash of its `.modal` payload.
+///
+/// Two machines with the same hash have the same body, bit for bit.
 #[derive(Clone, Copy, PartialEq, Eq, Hash, PartialOrd, Ord, Serialize, Deserialize)]
 pub struct ModelHash(pub [u8; 32]);
 
@@ -108,24 +116,28 @@ impl std::fmt::Debug for ModelHash {
     }
 }
 
-/// Everything that a bake hands over. `m` modes, `n` surface vertices.
+/// All output of a bake. The model has `m` modes and `n` surface vertices.
 #[derive(Debug, Clone, PartialEq)]
 pub struct ModelParts {
-    /// Where it came from.
+    /// Origin of the model and quality of its bake.
     pub info: BakeInfo,
     /// The visible surface at rest.
     pub surface: SurfaceMesh,
-    /// Angular frequencies of the elastic modes, rad/s, ascending, positive; `m` entries.
+    /// Angular frequencies of the elastic modes, rad/s, positive and ascending, with `m` entries.
     pub omega: Vec<f64>,
-    /// Damping coefficients `c_i`, 1/s, not negative; `m` entries.
+    /// Damping coefficients `c_i`, 1/s, not negative, with `m` entries.
     pub damping: Vec<f64>,
-    /// Mass-normalised mode shapes at the surface, `[mode][vertex][axis]`, kg^-1/2; `3 n m` entries.
+    /// Mass-normalized mode shapes at the surface, `[mode][vertex][axis]`, kg^-1/2, with `3 n m`
+    /// entries.
     pub displacement: Vec<f32>,
-    /// Half the curl of each mode at the surface, `[mode][vertex][axis]`, kg^-1/2 m^-1; `3 n m` entries.
+    /// Half the curl of each mode at the surface, `[mode][vertex][axis]`, kg^-1/2 m^-1, with
+    /// `3 n m` entries.
     pub rotation: Vec<f32>,
-    /// `Phi^T M 1_axis`, kg^1/2: how a uniform acceleration (gravity) drives each mode; `m` entries. Zero for a free body's elastic modes.
+    /// `Phi^T M 1_axis`, kg^1/2: how a uniform acceleration (gravity) drives each mode. It has `m`
+    /// entries, which are zero for the elastic modes of a free body.
     pub participation: Vec<[f64; 3]>,
-    /// No anchors: the body also has the six rigid modes, which a [`Frame`](crate::Frame) carries.
+    /// Whether the body has no anchors. A free body also has the six rigid modes, which a
+    /// [`Frame`](crate::Frame) carries.
     pub free: bool,
     /// Total mass, kg.
     pub mass: f64,
@@ -133,47 +145,49 @@ pub struct ModelParts {
     pub center_of_mass: [f64; 3],
     /// Inertia about the center of mass at rest, kg m^2, symmetric.
     pub inertia: [[f64; 3]; 3],
-    /// Residual flexibility of patches spread over the surface; may be empty (the grab then falls back on a contact estimate).
+    /// Residual flexibility of patches that are spread over the surface. It may be empty. A grab
+    /// then uses a contact estimate.
     pub sites: Vec<FlexibilitySite>,
 }
 
-/// A baked body, immutable; share it as `Arc<ModalModel>` between all bodies that look alike.
+/// A baked, immutable body. Bodies of the same shape and material share it as `Arc<ModalModel>`.
 #[derive(Debug, Clone)]
 pub struct ModalModel {
     parts: ModelParts,
     basis: Basis,
-    /// Made when it is first asked for.
+    /// The basis in half precision, made at the first request.
     half: OnceLock<Basis>,
-    /// Made when gravity first pulls on a bent body.
+    /// The mass sites for gravity on a bent body, made at the first request.
     mass_sites: OnceLock<Arc<MassSites>>,
     size: f64,
     hash: ModelHash,
     bytes: usize,
-    /// Radii of the sites, ascending, each once.
+    /// Radii of the sites, ascending and without duplicates.
     site_radii: Vec<f64>,
 }
 
 impl PartialEq for ModalModel {
-    /// By what it was made from; whether the half-precision basis was asked for makes no difference.
+    /// Compares the parts only. Whether the half-precision basis has been made makes no difference.
     fn eq(&self, other: &Self) -> bool {
         self.parts == other.parts
     }
 }
 
 impl ModalModel {
-    /// Most modes that a model may have.
+    /// Maximum number of modes of a model.
     pub const MAX_MODES: usize = 4096;
 
-    /// Longest name, and longest text of one anchor, that a model keeps: bytes.
+    /// Maximum length of the name and of each anchor text, bytes.
     pub const MAX_TEXT: usize = 256;
 
-    /// Most anchors that a model keeps.
+    /// Maximum number of anchors that a model keeps.
     pub const MAX_ANCHORS: usize = 64;
 
     /// Checks the parts and builds the run-time layout.
     ///
     /// # Errors
-    /// A length that does not fit the counts, a number that is not finite or not in its range, a vertex that is not there.
+    /// Returns an error if a length does not match the counts, if a number is not finite or out of
+    /// range, or if a vertex index is not on the surface.
     pub fn from_parts(parts: ModelParts) -> Result<Self, ModelError> {
         check_parts(&parts)?;
         let bytes = crate::file::encode(&parts);
@@ -213,7 +227,7 @@ impl ModalModel {
         &self.site_radii
     }
 
-    /// The parts it was made from.
+    /// The parts from which the model was made.
     pub fn parts(&self) -> &ModelParts {
         &self.parts
     }
@@ -233,12 +247,12 @@ impl ModalModel {
         &self.parts.damping
     }
 
-    /// 6 for a free body, 0 for an anchored one.
+    /// Number of rigid modes: 6 for a free body, 0 for an anchored body.
     pub fn rigid_modes(&self) -> usize {
         if self.parts.free { 6 } else { 0 }
     }
 
-    /// Is the body without anchors?
+    /// Whether the body has no anchors.
     pub fn is_free(&self) -> bool {
         self.parts.free
     }
@@ -258,9 +272,13 @@ impl ModalModel {
         self.parts.inertia
     }
 
-    /// Angular frequency (rad/s) and damping coefficient (1/s) of a mode of the same body made of a material `scale` times as stiff: what a
-    /// bake with `scale` times the Young's modulus would give, as `K` is proportional to it and `M` knows nothing of it: the same shapes, `omega sqrt(scale)`,
-    /// and damping by the same law at that frequency. At a scale of 1 both are the baked ones to the bit.
+    /// Angular frequency (rad/s) and damping coefficient (1/s) of a mode if the material were
+    /// `scale` times as stiff.
+    ///
+    /// The values are those of a bake with `scale` times the Young's modulus: `K` is proportional
+    /// to it and `M` does not depend on it. The shapes stay, the frequency is `omega sqrt(scale)`,
+    /// and the damping follows the same law at that frequency. At a scale of 1 both values are the
+    /// baked values to the bit.
     pub fn stiffened(&self, mode: usize, scale: f64) -> (f64, f64) {
         let (Some(&omega), Some(&c)) = (self.omega().get(mode), self.damping().get(mode)) else {
             return (0.0, 0.0);
@@ -270,13 +288,14 @@ impl ModalModel {
         }
         let stiff = omega * scale.sqrt();
         let law = self.parts.info.damping;
-        // A model's coefficients need not be those of its law: they keep their ratio to it.
+        // The coefficients of a model may differ from its damping law. Their ratio to the law
+        // stays.
         let before = law.coefficient(omega);
         let c = if before > 0.0 { c * (law.coefficient(stiff) / before) } else { c };
         (stiff, c)
     }
 
-    /// How a uniform acceleration drives each mode, kg^1/2.
+    /// Participation of each mode in a uniform acceleration, kg^1/2.
     pub fn participation(&self) -> &[[f64; 3]] {
         &self.parts.participation
     }
@@ -286,12 +305,15 @@ impl ModalModel {
         &self.parts.surface
     }
 
-    /// Modes at the surface in the layout that reconstruction reads.
+    /// The modes at the surface in the layout for reconstruction.
     pub fn basis(&self) -> &Basis {
         &self.basis
     }
 
-    /// The same in another precision. In half precision it is made when it is first asked for, and kept: half as much memory again.
+    /// The basis in the given precision.
+    ///
+    /// The half-precision basis is made at the first request and then kept, which takes half as
+    /// much memory again.
     pub fn basis_in(&self, precision: Precision) -> &Basis {
         match precision {
             Precision::Single => &self.basis,
@@ -299,32 +321,33 @@ impl ModalModel {
         }
     }
 
-    /// Largest extent of the rest shape's bounds, m: what errors are measured against.
+    /// Largest extent of the bounds of the rest shape, m. It is the reference length for errors.
     pub fn size(&self) -> f64 {
         self.size
     }
 
-    /// Content hash.
+    /// Content hash of the model.
     pub fn hash(&self) -> ModelHash {
         self.hash
     }
 
-    /// Size as a `.modal` file, bytes.
+    /// Size of the model as a `.modal` file, bytes.
     pub fn file_bytes(&self) -> usize {
         self.bytes
     }
 
-    /// Where it came from.
+    /// Origin of the model and quality of its bake.
     pub fn info(&self) -> &BakeInfo {
         &self.parts.info
     }
 
-    /// Mode shape `mode` at `vertex` along `axis`, kg^-1/2; zero outside the model.
+    /// Mode shape `mode` at `vertex` along `axis`, kg^-1/2. Zero for indices outside the model.
     pub fn displacement_row(&self, vertex: u32, axis: usize, mode: usize) -> f32 {
         self.parts.displacement.get(self.row(vertex, axis, mode)).copied().unwrap_or(0.0)
     }
 
-    /// Half the curl of mode `mode` at `vertex` about `axis`, kg^-1/2 m^-1; zero outside the model.
+    /// Half the curl of mode `mode` at `vertex` about `axis`, kg^-1/2 m^-1. Zero for indices
+    /// outside the model.
     pub fn rotation_row(&self, vertex: u32, axis: usize, mode: usize) -> f32 {
         self.parts.rotation.get(self.row(vertex, axis, mode)).copied().unwrap_or(0.0)
     }

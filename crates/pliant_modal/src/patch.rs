@@ -1,12 +1,13 @@
-//! A patch: the bit of surface that a hand holds.
+//! A patch: the area of the surface that a hand holds.
 //!
-//! Never one vertex: the compliance at a point of an elastic body is infinite in the continuum, so on a mesh it measures the mesh.
+//! A hand holds an area instead of a single vertex. The compliance at a point of an elastic
+//! continuum is infinite, so on a mesh the compliance of a single vertex would depend on the mesh.
 
 use std::collections::VecDeque;
 
 use crate::{ModelError, SurfaceMesh};
 
-/// Weighted surface vertices around a center; the weights are positive and sum to one.
+/// Weighted surface vertices around a center. The weights are positive and sum to one.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Patch {
     center: u32,
@@ -15,13 +16,16 @@ pub struct Patch {
 }
 
 impl Patch {
-    /// The patch of `radius` (m) around surface vertex `vertex`, at rest.
+    /// Makes the patch of `radius` (m) around surface vertex `vertex`, on the rest shape.
     ///
-    /// Weight = area around the vertex x `(1 - d^2 / r^2)^2`, `d` its distance from the center. Only vertices that are reached over edges
-    /// within the radius count, so that two fingers that touch at rest stay two fingers. A radius below the edge length leaves the center alone.
+    /// The weight of a vertex is the area around the vertex times `(1 - d^2 / r^2)^2`, where `d` is
+    /// its distance from the center. Only vertices that can be reached over edges within the radius
+    /// count, so two fingers that touch at rest stay separate. If the radius is below the edge
+    /// length, the patch is the center vertex alone.
     ///
     /// # Errors
-    /// A vertex that the surface does not have; a radius that is not finite or is negative.
+    /// Returns an error if the surface does not have the vertex, or if the radius is negative or
+    /// not finite.
     pub fn around(surface: &SurfaceMesh, vertex: u32, radius: f64) -> Result<Self, ModelError> {
         let count = surface.positions().len();
         if vertex as usize >= count {
@@ -74,17 +78,17 @@ impl Patch {
         Ok(Self { center: vertex, radius, entries })
     }
 
-    /// The vertex in the middle.
+    /// The vertex at the center of the patch.
     pub fn center(&self) -> u32 {
         self.center
     }
 
-    /// The radius asked for, m.
+    /// The radius that was requested, m.
     pub fn radius(&self) -> f64 {
         self.radius
     }
 
-    /// Surface vertices and their weights, by rising vertex; the weights sum to one.
+    /// Surface vertices and their weights, in ascending order of vertex. The weights sum to one.
     pub fn entries(&self) -> &[(u32, f64)] {
         &self.entries
     }

@@ -1,62 +1,77 @@
-//! Viscoelastic bodies: a standard linear solid in every mode.
+//! Viscoelastic bodies: every mode is a standard linear solid.
 
 use crate::{Coefficients, Integrator, StepError, exponential::exponential};
 
-/// A material that relaxes: the standard linear solid (Zener), a spring beside a Maxwell branch (a spring and a dashpot in series), of
-/// one relaxation time. The baked Young's modulus is the instantaneous one, `E`; held for long, `(1 - ratio) E` is left.
+/// A relaxing material: the standard linear solid (Zener) with one relaxation time.
+///
+/// The solid is a spring beside a Maxwell branch (a spring and a dashpot in series). The baked
+/// Young's modulus `E` is the instantaneous one. Under a strain held for long, `(1 - ratio) E` is
+/// left.
 ///
 /// ```text
 /// q'' + c q' + omega^2 (q - ratio z) = f        z: the modal flow, how far the dashpot has gone
 /// time z' = q - z
 /// ```
 ///
-/// so the stress under a held strain falls as [`modulus`](Self::modulus), and the strain under a held stress grows as
-/// [`creep`](Self::creep). The branch stores `ratio omega^2 (q - z)^2 / 2` and loses `ratio omega^2 (q - z)^2 / time`.
+/// Here `z` is the viscoelastic state of the mode (the modal flow). The stress under a held strain
+/// falls as [`modulus`](Self::modulus), and the strain under a held stress grows as
+/// [`creep`](Self::creep). The branch stores `ratio omega^2 (q - z)^2 / 2` and loses
+/// `ratio omega^2 (q - z)^2 / time`.
 ///
-/// Source: C. Zener, *Elasticity and Anelasticity of Metals*, 1948; R. M. Christensen, *Theory of Viscoelasticity*, 2nd ed. 1982, ch. 1.
+/// Source: C. Zener, *Elasticity and Anelasticity of Metals*, 1948; R. M. Christensen, *Theory of
+/// Viscoelasticity*, 2nd ed. 1982, ch. 1.
 #[derive(Debug, Clone, Copy, PartialEq, serde::Serialize, serde::Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct Relaxation {
-    /// Share of the instantaneous stiffness that relaxes away, 0 or more and below 1: at 1 the body would be a fluid and flow for ever.
+    /// Share of the instantaneous stiffness that relaxes away, 0 or more and below 1. At 1 the body
+    /// would be a fluid and flow forever.
     pub ratio: f64,
     /// Relaxation time under a held strain, s, above 0.
     pub time: f64,
 }
 
 impl Relaxation {
+    /// Checks both values.
+    ///
     /// # Errors
-    /// A ratio outside `[0, 1)`, a time that is not finite or not above 0.
+    /// Returns an error if the ratio is outside `[0, 1)` or the time is not finite or not above 0.
     pub fn check(&self) -> Result<(), StepError> {
         let Self { ratio, time } = *self;
         StepError::check("relaxation ratio", "0 or more, below 1", (0.0..1.0).contains(&ratio), ratio)?;
         StepError::check("relaxation time", "finite seconds above 0", time.is_finite() && time > 0.0, time)
     }
 
-    /// Relaxation modulus: stress at `t` s after a unit step of strain, as a share of the instantaneous one,
-    /// `1 - ratio (1 - exp(-t / time))`.
+    /// Relaxation modulus: the stress at `t` s after a unit step of strain, as a share of the
+    /// instantaneous stress.
+    ///
+    /// It is `1 - ratio (1 - exp(-t / time))`.
     pub fn modulus(&self, t: f64) -> f64 {
         1.0 + self.ratio * (-t / self.time).exp_m1()
     }
 
-    /// Creep compliance: strain at `t` s after a unit step of stress, as a multiple of the instantaneous one,
-    /// `(1 - ratio exp(-(1 - ratio) t / time)) / (1 - ratio)`.
+    /// Creep compliance: the strain at `t` s after a unit step of stress, as a multiple of the
+    /// instantaneous strain.
+    ///
+    /// It is `(1 - ratio exp(-(1 - ratio) t / time)) / (1 - ratio)`.
     pub fn creep(&self, t: f64) -> f64 {
         let left = 1.0 - self.ratio;
         1.0 - self.ratio * (-left * t / self.time).exp_m1() / left
     }
 
-    /// Storage and loss modulus at `omega` rad/s, as shares of the instantaneous modulus:
-    /// `1 - ratio / (1 + x^2)` and `ratio x / (1 + x^2)` with `x = omega time`.
+    /// Storage and loss modulus at `omega` rad/s, as shares of the instantaneous modulus.
+    ///
+    /// They are `1 - ratio / (1 + x^2)` and `ratio x / (1 + x^2)` with `x = omega time`.
     pub fn complex_modulus(&self, omega: f64) -> [f64; 2] {
         let x = omega * self.time;
-        // Not x / (1 + x^2): the square may overflow.
+        // The form x / (1 + x^2) is avoided for large x because the square may overflow.
         let share = if x > 1.0 { self.ratio / (x + 1.0 / x) } else { self.ratio * x / (1.0 + x * x) };
         let lost = if x > 0.0 { share / x } else { self.ratio };
         [1.0 - lost, share]
     }
 }
 
-/// What the modal flow `z` adds to the recurrence of a mode; [`Coefficients`] holds the rest.
+/// Terms that the viscoelastic state `z` adds to the recurrence of a mode. [`Coefficients`] holds
+/// the other terms.
 ///
 /// ```text
 /// [q1 v1 a1] = Coefficients + onto z0
@@ -64,18 +79,19 @@ impl Relaxation {
 /// ```
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct ViscoelasticCoefficients {
-    /// What a unit of old flow adds to the new `q`, `v`, `a`.
+    /// Change of the new `q`, `v`, `a` per unit of the old `z`.
     pub onto: [f64; 3],
-    /// What the old `q`, `v`, `a` and modal force give the new flow.
+    /// Factors of the old `q`, `v`, `a` and modal force in the new `z`.
     pub free: [f64; 4],
-    /// What is left of the old flow.
+    /// Factor of the old `z` in the new `z`.
     pub carry: f64,
-    /// What a unit modal force at the new time adds to the flow.
+    /// Change of the new `z` per unit modal force at the new time.
     pub response: f64,
 }
 
 impl ViscoelasticCoefficients {
-    /// The flow after one step from `[q0, v0, a0]` and `z0`, with old force `f0` and new force `f1`.
+    /// Returns `z` after one step from `[q0, v0, a0]` and `z0`, with old force `f0` and new force
+    /// `f1`.
     #[inline]
     pub fn step(&self, state: [f64; 3], z0: f64, f0: f64, f1: f64) -> f64 {
         let [q, v, a, f] = self.free;
@@ -83,22 +99,26 @@ impl ViscoelasticCoefficients {
     }
 }
 
-/// Largest `rate x step` that a relaxing mode is stepped at. A faster mode has no digits left of its phase.
+/// Largest `rate x step` of a relaxing mode. The phase of a faster mode has no correct digits left.
 const FASTEST: f64 = 1e12;
 
 impl Coefficients {
-    /// As [`Coefficients::new`], for a mode of a material that relaxes.
+    /// Computes the coefficients as [`Coefficients::new`] does, for a mode of a relaxing material.
     ///
-    /// [`Integrator::Exact`] is exact for a force that is constant over the step (the exponential of the 3 x 3 system, in twice double
-    /// precision). [`Integrator::Newmark`] and [`Integrator::GeneralizedAlpha`] treat the branch's stress as they treat the elastic one,
-    /// implicitly, and let it relax exactly for a strain that goes linearly over the step:
-    /// `s1 = e^-x s0 + omega^2 ratio (1 - e^-x)/x (q1 - q0)` with `s = omega^2 ratio (q - z)`, `x = h / time`. Under average
-    /// acceleration this is passive at any step: the energy with the branch's share multiplied by `(x/2) coth(x/2)` never grows unforced
-    /// (the energy itself may for one step where a state was put in by hand whose branch is far from relaxed although `time` is far
-    /// below `h`).
+    /// [`Integrator::Exact`] is exact for a force that is constant over the step. It uses the
+    /// exponential of the 3 x 3 system in twice double precision.
+    ///
+    /// [`Integrator::Newmark`] and [`Integrator::GeneralizedAlpha`] treat the stress of the branch
+    /// implicitly, like the elastic stress. The stress relaxes exactly for a strain that is linear
+    /// over the step: `s1 = e^-x s0 + omega^2 ratio (1 - e^-x)/x (q1 - q0)` with
+    /// `s = omega^2 ratio (q - z)` and `x = h / time`. Under average acceleration this is passive
+    /// at any step: without a force, the energy with the branch's share multiplied by
+    /// `(x/2) coth(x/2)` never grows. The energy itself may grow for one step if a state was set by
+    /// hand whose branch is far from relaxed although `time` is far below `h`.
     ///
     /// # Errors
-    /// A number that is not finite or not in its range; `omega h` or `c h` above 1e12.
+    /// Returns an error if a number is not finite or out of range, or if `omega h` or `c h` is
+    /// above 1e12.
     pub fn relaxing(
         integrator: Integrator,
         omega: f64,
@@ -107,7 +127,7 @@ impl Coefficients {
         h: f64,
     ) -> Result<(Self, ViscoelasticCoefficients), StepError> {
         relaxation.check()?;
-        // The elastic mode's checks are this one's.
+        // The checks of the elastic mode apply here too.
         Self::new(integrator, omega, c, h)?;
         let fastest = (omega * h).max(c * h);
         StepError::check(
@@ -136,10 +156,11 @@ impl Coefficients {
 fn exact(omega: f64, c: f64, relaxation: Relaxation, h: f64) -> (Coefficients, ViscoelasticCoefficients) {
     let Relaxation { ratio, time } = relaxation;
     let k = omega * omega;
-    // Coordinates (q, v / s, z) and time in steps: the entries of a fast mode are then comparable.
+    // The state is (q, v / s, z) and time is in steps, so that the entries of a fast mode are
+    // comparable.
     let s = omega.max(1e-3 / h);
     let stiffness = k / s * h;
-    // A branch that relaxes in a 1e-12th of a step has relaxed.
+    // A branch with a relaxation time of 1e-12 steps is fully relaxed within a step.
     let rate = (h / time).min(FASTEST);
     let system = [[0.0, s * h, 0.0], [-stiffness, -c * h, ratio * stiffness], [rate, 0.0, -rate]];
     let (e, g) = exponential(system, [0.0, 1.0, 0.0]);
@@ -147,7 +168,7 @@ fn exact(omega: f64, c: f64, relaxation: Relaxation, h: f64) -> (Coefficients, V
     let q = [e[0][0], e[0][1] / s, e[0][2], g[0] * push];
     let v = [e[1][0] * s, e[1][1], e[1][2] * s, g[1] * h];
     let z = [e[2][0], e[2][1] / s, e[2][2], g[2] * push];
-    // a1 = f1 - c v1 - k (q1 - ratio z1), so that the acceleration belongs to the state it comes with.
+    // a1 = f1 - c v1 - k (q1 - ratio z1), so that the acceleration matches the new state.
     let a: [f64; 4] =
         std::array::from_fn(|i| f64::from(u8::from(i == 3)) - c * v[i] - k * (q[i] - ratio * z[i]));
     let table = Coefficients {
@@ -175,7 +196,7 @@ fn alpha(
     let k = omega * omega;
     let flowing = k * relaxation.ratio;
     let x = h / relaxation.time;
-    // The flow under a strain that goes linearly over the step: z1 = e z0 + w0 q0 + w1 q1.
+    // For a strain that is linear over the step: z1 = e z0 + w0 q0 + w1 q1.
     let e = (-x).exp();
     let gone = -(-x).exp_m1();
     let w1 =
@@ -183,7 +204,9 @@ fn alpha(
     let w0 = gone - w1;
     let (bh, gh) = (beta * h * h, gamma * h);
     let (ph, mh) = (h * h * (0.5 - beta), h * (1.0 - gamma));
-    // (1 - am) a1 + am a0 + (1 - af)(c v1 + k q1 - flowing z1) + af (c v0 + k q0 - flowing z0) = (1 - af) f1 + af f0, solved for a1.
+    // This solves the following equation for a1:
+    // (1 - am) a1 + am a0 + (1 - af)(c v1 + k q1 - flowing z1) + af (c v0 + k q0 - flowing z0)
+    // = (1 - af) f1 + af f0.
     let (new, old) = (1.0 - af, af);
     let held = k - flowing * w1;
     let d = (1.0 - am) + new * (c * gh + held * bh);

@@ -1,31 +1,33 @@
-//! Sixteen single-precision numbers at once, in whatever the processor has.
+//! Sixteen single-precision numbers at once, in the widest registers of the processor.
 //!
-//! The compiler turns plain loops over `[[f32; 16]; 6]` accumulators into scalar code; naming the registers keeps them in registers. One kernel is
-//! written over [`Lanes`]; the instruction set is chosen at run time.
+//! The compiler turns plain loops over `[[f32; 16]; 6]` accumulators into scalar code. Explicit
+//! register types keep the accumulators in registers. Kernels are written once over [`Lanes`], and
+//! the instruction set is chosen at run time.
 
 use half::f16;
 
 use crate::basis::BLOCK;
 
-/// A register (or two, or an array) of [`BLOCK`] numbers.
+/// [`BLOCK`] numbers in one register, two registers or an array.
 ///
 /// # Safety
-/// The methods of an implementation may only be called where its instruction set is known to be there.
+/// The methods of an implementation may only be called if its instruction set is known to be
+/// available.
 pub(crate) trait Lanes: Copy {
     unsafe fn splat(x: f32) -> Self;
     unsafe fn load(from: &[f32; BLOCK]) -> Self;
     unsafe fn load_half(from: &[f16; BLOCK]) -> Self;
     unsafe fn store(self, to: &mut [f32; BLOCK]);
-    /// `self * by + plus`
+    /// Computes `self * by + plus`.
     unsafe fn mul_add(self, by: Self, plus: Self) -> Self;
-    /// `minus - self * by`
+    /// Computes `minus - self * by`.
     unsafe fn neg_mul_add(self, by: Self, minus: Self) -> Self;
     unsafe fn mul(self, by: Self) -> Self;
-    /// Are all lanes at most `limit`? NaN lanes may answer either way.
+    /// Returns whether all lanes are at most `limit`. With NaN lanes the result may be either.
     unsafe fn all_at_most(self, limit: f32) -> bool;
 }
 
-/// Any processor: an array that the compiler vectorises as far as it can.
+/// An array for any processor, which the compiler vectorizes as far as it can.
 #[derive(Clone, Copy)]
 pub(crate) struct Portable([f32; BLOCK]);
 
@@ -84,42 +86,42 @@ pub(crate) mod x86 {
     impl Lanes for Avx512 {
         #[inline(always)]
         unsafe fn splat(x: f32) -> Self {
-            // SAFETY: the caller has seen that AVX-512F is there; a reference is to 16 numbers.
+            // SAFETY: The caller has checked for AVX-512F. References are to 16 numbers.
             Self(unsafe { _mm512_set1_ps(x) })
         }
         #[inline(always)]
         unsafe fn load(from: &[f32; BLOCK]) -> Self {
-            // SAFETY: the caller has seen that AVX-512F is there; a reference is to 16 numbers.
+            // SAFETY: The caller has checked for AVX-512F. References are to 16 numbers.
             Self(unsafe { _mm512_loadu_ps(from.as_ptr()) })
         }
         #[inline(always)]
         unsafe fn load_half(from: &[f16; BLOCK]) -> Self {
-            // SAFETY: the caller has seen that AVX-512F is there; a reference is to 16 numbers.
+            // SAFETY: The caller has checked for AVX-512F. References are to 16 numbers.
             Self(unsafe { _mm512_cvtph_ps(_mm256_loadu_si256(from.as_ptr().cast())) })
         }
         #[inline(always)]
         unsafe fn store(self, to: &mut [f32; BLOCK]) {
-            // SAFETY: the caller has seen that AVX-512F is there; a reference is to 16 numbers.
+            // SAFETY: The caller has checked for AVX-512F. References are to 16 numbers.
             unsafe { _mm512_storeu_ps(to.as_mut_ptr(), self.0) }
         }
         #[inline(always)]
         unsafe fn mul_add(self, by: Self, plus: Self) -> Self {
-            // SAFETY: the caller has seen that AVX-512F is there; a reference is to 16 numbers.
+            // SAFETY: The caller has checked for AVX-512F. References are to 16 numbers.
             Self(unsafe { _mm512_fmadd_ps(self.0, by.0, plus.0) })
         }
         #[inline(always)]
         unsafe fn neg_mul_add(self, by: Self, minus: Self) -> Self {
-            // SAFETY: the caller has seen that AVX-512F is there; a reference is to 16 numbers.
+            // SAFETY: The caller has checked for AVX-512F. References are to 16 numbers.
             Self(unsafe { _mm512_fnmadd_ps(self.0, by.0, minus.0) })
         }
         #[inline(always)]
         unsafe fn mul(self, by: Self) -> Self {
-            // SAFETY: the caller has seen that AVX-512F is there; a reference is to 16 numbers.
+            // SAFETY: The caller has checked for AVX-512F. References are to 16 numbers.
             Self(unsafe { _mm512_mul_ps(self.0, by.0) })
         }
         #[inline(always)]
         unsafe fn all_at_most(self, limit: f32) -> bool {
-            // SAFETY: the caller has seen that AVX-512F is there; a reference is to 16 numbers.
+            // SAFETY: The caller has checked for AVX-512F. References are to 16 numbers.
             unsafe { _mm512_cmp_ps_mask::<_CMP_LE_OQ>(self.0, _mm512_set1_ps(limit)) == u16::MAX }
         }
     }
@@ -131,20 +133,20 @@ pub(crate) mod x86 {
     impl Lanes for Avx2 {
         #[inline(always)]
         unsafe fn splat(x: f32) -> Self {
-            // SAFETY: the caller has seen that AVX2, FMA and F16C are there; a reference is to 16.
+            // SAFETY: The caller has checked for AVX2, FMA and F16C. References are to 16 numbers.
             let x = unsafe { _mm256_set1_ps(x) };
             Self(x, x)
         }
         #[inline(always)]
         unsafe fn load(from: &[f32; BLOCK]) -> Self {
             let p = from.as_ptr();
-            // SAFETY: the caller has seen that AVX2, FMA and F16C are there; a reference is to 16.
+            // SAFETY: The caller has checked for AVX2, FMA and F16C. References are to 16 numbers.
             unsafe { Self(_mm256_loadu_ps(p), _mm256_loadu_ps(p.add(8))) }
         }
         #[inline(always)]
         unsafe fn load_half(from: &[f16; BLOCK]) -> Self {
             let p = from.as_ptr();
-            // SAFETY: the caller has seen that AVX2, FMA and F16C are there; a reference is to 16.
+            // SAFETY: The caller has checked for AVX2, FMA and F16C. References are to 16 numbers.
             unsafe {
                 Self(
                     _mm256_cvtph_ps(_mm_loadu_si128(p.cast())),
@@ -155,7 +157,7 @@ pub(crate) mod x86 {
         #[inline(always)]
         unsafe fn store(self, to: &mut [f32; BLOCK]) {
             let p = to.as_mut_ptr();
-            // SAFETY: the caller has seen that AVX2, FMA and F16C are there; a reference is to 16.
+            // SAFETY: The caller has checked for AVX2, FMA and F16C. References are to 16 numbers.
             unsafe {
                 _mm256_storeu_ps(p, self.0);
                 _mm256_storeu_ps(p.add(8), self.1);
@@ -163,22 +165,22 @@ pub(crate) mod x86 {
         }
         #[inline(always)]
         unsafe fn mul_add(self, by: Self, plus: Self) -> Self {
-            // SAFETY: the caller has seen that AVX2, FMA and F16C are there; a reference is to 16.
+            // SAFETY: The caller has checked for AVX2, FMA and F16C. References are to 16 numbers.
             unsafe { Self(_mm256_fmadd_ps(self.0, by.0, plus.0), _mm256_fmadd_ps(self.1, by.1, plus.1)) }
         }
         #[inline(always)]
         unsafe fn neg_mul_add(self, by: Self, minus: Self) -> Self {
-            // SAFETY: the caller has seen that AVX2, FMA and F16C are there; a reference is to 16.
+            // SAFETY: The caller has checked for AVX2, FMA and F16C. References are to 16 numbers.
             unsafe { Self(_mm256_fnmadd_ps(self.0, by.0, minus.0), _mm256_fnmadd_ps(self.1, by.1, minus.1)) }
         }
         #[inline(always)]
         unsafe fn mul(self, by: Self) -> Self {
-            // SAFETY: the caller has seen that AVX2, FMA and F16C are there; a reference is to 16.
+            // SAFETY: The caller has checked for AVX2, FMA and F16C. References are to 16 numbers.
             unsafe { Self(_mm256_mul_ps(self.0, by.0), _mm256_mul_ps(self.1, by.1)) }
         }
         #[inline(always)]
         unsafe fn all_at_most(self, limit: f32) -> bool {
-            // SAFETY: the caller has seen that AVX2, FMA and F16C are there; a reference is to 16.
+            // SAFETY: The caller has checked for AVX2, FMA and F16C. References are to 16 numbers.
             unsafe {
                 let limit = _mm256_set1_ps(limit);
                 let both = _mm256_and_ps(

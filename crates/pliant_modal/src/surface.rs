@@ -1,17 +1,18 @@
-//! The visible surface at rest: triangles, texture coordinates, and who neighbours whom.
+//! The visible surface at rest: triangles, texture coordinates and vertex adjacency.
 
 use std::collections::HashMap;
 
 use crate::ModelError;
 
-/// A triangle surface at rest, in the body's own axes (m), with the adjacency that patches and normals need.
+/// A triangle surface at rest in body axes (m), with the adjacency that patches and normals need.
 #[derive(Debug, Clone, PartialEq)]
 pub struct SurfaceMesh {
     positions: Vec<[f32; 3]>,
     triangles: Vec<[u32; 3]>,
     uvs: Option<Vec<[f32; 2]>>,
     anchored: Vec<bool>,
-    /// Vertices at the same place (texture seams) share one welded number: normals and patches must not see the seam.
+    /// Index of the welded vertex of each vertex. Vertices at the same place (texture seams) share
+    /// one welded vertex, so that normals and patches do not depend on seams.
     welded: Vec<u32>,
     welded_count: usize,
     /// Triangles around each welded vertex, compressed: `ring[ring_start[w]..ring_start[w + 1]]`.
@@ -22,10 +23,12 @@ pub struct SurfaceMesh {
 impl SurfaceMesh {
     /// Checks and indexes a surface.
     ///
-    /// `uvs` and `anchored` have one entry a vertex; an empty `anchored` means that no vertex is fixed.
+    /// `uvs` and `anchored` have one entry per vertex. An empty `anchored` means that no vertex is
+    /// fixed.
     ///
     /// # Errors
-    /// No vertex or triangle, a length that does not fit, a non-finite position, a triangle that names a missing vertex.
+    /// Returns an error if there is no vertex or no triangle, if a length does not match, if a
+    /// position or texture coordinate is not finite, or if a triangle names a missing vertex.
     pub fn new(
         positions: Vec<[f32; 3]>,
         triangles: Vec<[u32; 3]>,
@@ -65,7 +68,7 @@ impl SurfaceMesh {
         let mut seen: HashMap<[u32; 3], u32> = HashMap::with_capacity(count);
         let mut welded = Vec::with_capacity(count);
         for p in &positions {
-            // Adding 0.0 makes -0.0 and 0.0 one place.
+            // Adding 0.0 turns -0.0 into 0.0, so that both have the same key.
             let key = p.map(|x| (x + 0.0).to_bits());
             let next = seen.len() as u32;
             welded.push(*seen.entry(key).or_insert(next));
@@ -98,32 +101,33 @@ impl SurfaceMesh {
         &self.positions
     }
 
-    /// Vertex triples, counter-clockwise seen from outside.
+    /// Vertex triples of the triangles, counter-clockwise seen from outside.
     pub fn triangles(&self) -> &[[u32; 3]] {
         &self.triangles
     }
 
-    /// Texture coordinates, one a vertex, where the skin has them.
+    /// Texture coordinates, one per vertex, if the surface has them.
     pub fn uvs(&self) -> Option<&[[f32; 2]]> {
         self.uvs.as_deref()
     }
 
-    /// For each vertex: is it held fixed by an anchor?
+    /// Whether each vertex is fixed by an anchor.
     pub fn anchored(&self) -> &[bool] {
         &self.anchored
     }
 
-    /// For each vertex its welded number: vertices at one place (texture seams) share it.
+    /// Index of the welded vertex of each vertex. Vertices at the same place (texture seams) share
+    /// one.
     pub fn welded(&self) -> &[u32] {
         &self.welded
     }
 
-    /// How many different places the vertices have.
+    /// Number of welded vertices, which is the number of distinct vertex positions.
     pub fn welded_count(&self) -> usize {
         self.welded_count
     }
 
-    /// The triangles around welded vertex `w`; empty when there is no such vertex.
+    /// The triangles around welded vertex `w`. Empty if there is no such vertex.
     pub fn ring(&self, w: u32) -> &[u32] {
         let w = w as usize;
         if w >= self.welded_count {
@@ -132,7 +136,8 @@ impl SurfaceMesh {
         &self.ring[self.ring_start[w] as usize..self.ring_start[w + 1] as usize]
     }
 
-    /// A third of the triangles around a vertex, m^2; what is welded to it counted in.
+    /// A third of the area of the triangles around a vertex, m^2, including the triangles of
+    /// vertices that are welded to it.
     pub(crate) fn area_around(&self, vertex: u32) -> f64 {
         let area = |&t: &u32| {
             let [a, b, c] = self.triangles[t as usize].map(|v| self.positions[v as usize].map(f64::from));
@@ -144,7 +149,7 @@ impl SurfaceMesh {
         self.ring(self.welded[vertex as usize]).iter().map(area).sum::<f64>() / 3.0
     }
 
-    /// Least and greatest corner of the rest shape, m.
+    /// Smallest and largest corner of the bounds of the rest shape, m.
     pub fn bounds(&self) -> [[f32; 3]; 2] {
         let mut low = [f32::INFINITY; 3];
         let mut high = [f32::NEG_INFINITY; 3];
@@ -157,16 +162,19 @@ impl SurfaceMesh {
         [low, high]
     }
 
-    /// Largest extent of the rest shape's bounds, m.
+    /// Largest extent of the bounds of the rest shape, m.
     pub fn size(&self) -> f64 {
         let [low, high] = self.bounds();
         (0..3).map(|k| f64::from(high[k]) - f64::from(low[k])).fold(0.0, f64::max)
     }
 
-    /// Area-weighted vertex normals of a deformed shape of this surface, smooth over texture seams; unit length, or zero where every
-    /// triangle around a vertex has collapsed. `scratch` is kept by the caller so that a frame allocates nothing.
+    /// Computes area-weighted vertex normals of a deformed shape of this surface, smooth over
+    /// texture seams.
     ///
-    /// Slices of a wrong length are left alone beyond the shorter of the two.
+    /// A normal has unit length, or is zero where every triangle around a vertex has collapsed. The
+    /// caller keeps `scratch`, so that a frame allocates nothing. If `positions` is shorter than
+    /// the surface, nothing is written. Otherwise as many normals are written as `normals` and the
+    /// surface both have.
     pub fn normals(&self, positions: &[[f32; 3]], normals: &mut [[f32; 3]], scratch: &mut Vec<[f32; 3]>) {
         if positions.len() < self.positions.len() {
             return;
@@ -186,7 +194,8 @@ impl SurfaceMesh {
             }
         }
         for sum in scratch.iter_mut() {
-            // Scaling by the largest part first keeps tiny triangles from vanishing when squared.
+            // Dividing by the largest component first keeps the squares of tiny triangles from
+            // underflowing.
             let largest = sum.iter().fold(0.0f32, |m, x| m.max(x.abs()));
             if largest > 0.0 && largest.is_finite() {
                 let s = sum.map(|x| x / largest);

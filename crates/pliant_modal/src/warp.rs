@@ -1,13 +1,16 @@
-//! Modal warping (Choi and Ko 2005): `u = R~(w) d`, `R~` the integral of the rotation from 0 to `w`.
+//! Modal warping (Choi and Ko 2005): `u = R~(w) d`, where `R~` is the integral of the rotation from
+//! 0 to `w`.
 //!
-//! `R~(w) d = d + A (w x d) + B (w x (w x d))` with `A = (1 - cos t)/t^2`, `B = (t - sin t)/t^3`, `t = |w|`.
+//! `R~(w) d = d + A (w x d) + B (w x (w x d))` with `A = (1 - cos t)/t^2`, `B = (t - sin t)/t^3`,
+//! `t = |w|`.
 
 use nalgebra::{Matrix3, Vector3};
 
-/// Terms of the series of `A` and `B`: rounding below `s = 1/2`, where the closed forms cancel.
+/// Number of terms of the series of `A` and `B`. They reach rounding error below `s = 1/2`, where
+/// the closed forms cancel.
 const TERMS: usize = 9;
 
-/// `1 / (2k + first)!`
+/// Computes `1 / (2k + first)!` for each term `k`.
 const fn inverse_factorials(first: usize) -> [f64; TERMS] {
     let mut out = [0.0; TERMS];
     let mut k = 0;
@@ -24,13 +27,13 @@ const fn inverse_factorials(first: usize) -> [f64; TERMS] {
     out
 }
 
-/// `A = sum (-s)^k / (2k + 2)!`, `B = sum (-s)^k / (2k + 3)!`
+/// `A = sum (-s)^k / (2k + 2)!`, `B = sum (-s)^k / (2k + 3)!`.
 const COEFFICIENTS: [[f64; TERMS]; 2] = [inverse_factorials(2), inverse_factorials(3)];
 
-/// `A(s)`, `B(s)` and their derivatives by `s = |w|^2`.
+/// Returns `A(s)`, `B(s)` and their derivatives with respect to `s = |w|^2`.
 pub(crate) fn coefficients(s: f64) -> [f64; 4] {
     if s < 0.5 {
-        // Horner's rule for the value and the derivative at once.
+        // Horner's rule for the values and the derivatives together.
         let [mut a, mut b, mut da, mut db] = [0.0; 4];
         for (of_a, of_b) in COEFFICIENTS[0].iter().zip(&COEFFICIENTS[1]).rev() {
             (da, db) = (-a - s * da, -b - s * db);
@@ -48,7 +51,8 @@ pub(crate) fn coefficients(s: f64) -> [f64; 4] {
     }
 }
 
-/// The warped displacement `R~(w) d` (m) of a node with rotation vector `w` (rad) and linear modal displacement `d` (m).
+/// Returns the warped displacement `R~(w) d` (m) of a node with rotation vector `w` (rad) and
+/// linear modal displacement `d` (m).
 pub fn warp(w: [f64; 3], d: [f64; 3]) -> [f64; 3] {
     let (w, d) = (Vector3::from(w), Vector3::from(d));
     let [a, b, _, _] = coefficients(w.norm_squared());
@@ -56,7 +60,8 @@ pub fn warp(w: [f64; 3], d: [f64; 3]) -> [f64; 3] {
     (d + a * c + b * w.cross(&c)).into()
 }
 
-/// The warped displacement and its derivatives: `(R~ d, d(R~ d)/dd = R~, d(R~ d)/dw)`; the matrices are row-major.
+/// Returns the warped displacement and its derivatives, `(R~ d, d(R~ d)/dd = R~, d(R~ d)/dw)`. The
+/// matrices are row-major.
 pub fn warp_jacobian(w: [f64; 3], d: [f64; 3]) -> ([f64; 3], [[f64; 3]; 3], [[f64; 3]; 3]) {
     let (value, by_d, by_w) = warp_with_jacobian(Vector3::from(w), Vector3::from(d));
     let rows = |m: Matrix3<f64>| std::array::from_fn(|i| std::array::from_fn(|j| m[(i, j)]));
@@ -79,10 +84,11 @@ pub(crate) fn warp_with_jacobian(
     (d + a * c + b * cc, by_d, by_w)
 }
 
-/// Terms of the series of `A` and `B` in `s`: single precision up to [`WARP_SERIES_LIMIT`].
+/// Number of terms of the series of `A` and `B` in `s`, for single precision up to
+/// [`WARP_SERIES_LIMIT`].
 pub(crate) const SERIES_TERMS: usize = 9;
 
-/// `A = sum (-s)^k / (2k+2)!`
+/// `A = sum (-s)^k / (2k+2)!`.
 pub(crate) const SERIES_A: [f32; SERIES_TERMS] = [
     1.0 / 2.0,
     -1.0 / 24.0,
@@ -95,7 +101,7 @@ pub(crate) const SERIES_A: [f32; SERIES_TERMS] = [
     1.0 / 6_402_373_705_728_000.0,
 ];
 
-/// `B = sum (-s)^k / (2k+3)!`
+/// `B = sum (-s)^k / (2k+3)!`.
 pub(crate) const SERIES_B: [f32; SERIES_TERMS] = [
     1.0 / 6.0,
     -1.0 / 120.0,
@@ -108,10 +114,10 @@ pub(crate) const SERIES_B: [f32; SERIES_TERMS] = [
     1.0 / 121_645_100_408_832_000.0,
 ];
 
-/// Half a turn, squared: up to here nine terms are exact to single precision.
+/// Square of half a turn. Up to this value of `s` nine terms are exact to single precision.
 pub(crate) const WARP_SERIES_LIMIT: f32 = 9.87;
 
-/// `A` and `B` for any `s`, in single precision.
+/// Returns `A` and `B` for any `s` in single precision.
 pub(crate) fn closed_f32(s: f32) -> (f32, f32) {
     let [a, b, _, _] = coefficients(f64::from(s));
     (a as f32, b as f32)
@@ -123,7 +129,8 @@ mod tests {
 
     #[test]
     fn matches_the_integral_of_the_rotation() {
-        // R~ = integral over tau in [0, 1] of exp(tau [w]x): Simpson's rule on 2,000 intervals is good to 1e-13 here.
+        // R~ is the integral over tau in [0, 1] of exp(tau [w]x). Simpson's rule on 2,000 intervals
+        // has an error of 1e-13 here.
         let (w, d) = (Vector3::new(0.7, -1.9, 1.1), Vector3::new(0.3, 0.2, -0.5));
         let n = 2_000;
         let mut sum = Vector3::zeros();

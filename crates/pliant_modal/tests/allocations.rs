@@ -1,4 +1,5 @@
-//! A step allocates nothing. A test binary of its own, as it counts through the global allocator.
+//! Tests that a step allocates nothing. They have their own test binary because they count through
+//! the global allocator.
 #![allow(clippy::unwrap_used, reason = "a failed test should panic")]
 #![allow(unsafe_code, reason = "counting allocations needs a global allocator")]
 
@@ -19,16 +20,17 @@ thread_local! {
     static CALLS: Cell<u64> = const { Cell::new(0) };
 }
 
-// SAFETY: every call goes on to the system's allocator unchanged; the counter is a plain thread-local cell without a destructor.
+// SAFETY: Every call goes to the system allocator unchanged. The counter is a plain thread-local
+// cell without a destructor.
 unsafe impl GlobalAlloc for Counting {
     unsafe fn alloc(&self, layout: Layout) -> *mut u8 {
         CALLS.with(|n| n.set(n.get() + 1));
-        // SAFETY: as the caller promised.
+        // SAFETY: The caller upholds the contract of `alloc`.
         unsafe { System.alloc(layout) }
     }
     unsafe fn dealloc(&self, at: *mut u8, layout: Layout) {
         CALLS.with(|n| n.set(n.get() + 1));
-        // SAFETY: as the caller promised.
+        // SAFETY: The caller upholds the contract of `dealloc`.
         unsafe { System.dealloc(at, layout) }
     }
 }
@@ -51,7 +53,7 @@ fn a_step_with_two_grabs_under_warp_allocates_nothing() {
             let mut body = Body::new(model.clone(), config).unwrap();
             let grabs = [tip(), tip() / 2].map(|vertex| {
                 let patch = Patch::around(model.surface(), vertex, 0.06).unwrap();
-                // Dampers of their own: their rows make the system non-symmetric.
+                // The hands have different dampers, which makes the system non-symmetric.
                 let relaxation = if vertex == tip() { 0.02 } else { 0.0 };
                 let grab = body.grab(&patch, GrabConfig { relaxation, ..GrabConfig::default() }).unwrap();
                 (grab, body.grab_position(grab).unwrap())

@@ -1,4 +1,5 @@
-//! A body held, pulled, thrown and mistreated, against a rod that is known in closed form.
+//! Tests of a body that is held, pulled, thrown and given bad inputs, against a rod with
+//! closed-form solutions.
 #![allow(clippy::unwrap_used, clippy::expect_used, reason = "a failed test should panic")]
 
 mod rod;
@@ -14,7 +15,7 @@ fn tip_patch(model: &ModalModel) -> Patch {
     Patch::around(model.surface(), tip(), 0.01).unwrap()
 }
 
-/// max |second difference of F| / max |F|: 4 for a sign flip each step.
+/// Returns max |second difference of F| / max |F|. A sign flip in each step gives 4.
 fn ringing(force: &[f64]) -> f64 {
     let largest = force.iter().fold(0.0f64, |m, f| m.max(f.abs()));
     force.windows(3).map(|w| (w[2] - 2.0 * w[1] + w[0]).abs()).fold(0.0, f64::max) / largest
@@ -27,7 +28,8 @@ fn smooth(t: f64) -> f64 {
 
 #[test]
 fn reaction_reaches_the_static_value() {
-    // Pulled by d, the rod answers with -E A d / L whatever the number of modes: the residual flexibility makes up for the rest.
+    // For a displacement d the rod reacts with -E A d / L for any number of modes, because the
+    // residual flexibility replaces the missing modes.
     for modes in [1, 3, 12] {
         for integrator in
             [Integrator::Exact, Integrator::Newmark, Integrator::GeneralizedAlpha { rho_inf: 0.5 }]
@@ -47,7 +49,8 @@ fn reaction_reaches_the_static_value() {
             }
             let want = -2e5 * AREA * 0.02 / LENGTH;
             let got = body.reaction(grab).unwrap();
-            // The contact floor of a grab is a hundredth of the patch's own, here 1e-2 x 0.91 / (2 E 0.01) of 1 / (E A / L): 0.5 %.
+            // The contact floor of a grab is a hundredth of the contact compliance of the patch.
+            // Here it is `1e-2 x 0.91 / (2 E 0.01)` relative to `1 / (E A / L)`, which is 0.5 %.
             assert!(
                 (got[0] / want - 1.0).abs() < 0.006,
                 "{integrator:?}, {modes} modes: {got:?}, wanted {want}"
@@ -81,7 +84,8 @@ fn a_dragged_reaction_does_not_ring_at_any_stiffness_or_step() {
                     body.step().unwrap();
                     force.push(body.reaction(grab).unwrap()[0]);
                 }
-                // A body slower than the step cannot answer a step smoothly: only bodies that live within it are held to the bound.
+                // A body with periods longer than the step cannot react smoothly to a step. The
+                // tight bound applies only to the other bodies.
                 let bound = if model.omega()[0] * step > 0.05 { 0.1 } else { 0.5 };
                 let got = ringing(&force);
                 assert!(got < bound, "E {young}, h {step}, {integrator:?}: ringing {got}");
@@ -92,9 +96,10 @@ fn a_dragged_reaction_does_not_ring_at_any_stiffness_or_step() {
 
 #[test]
 fn a_damped_hand_comes_to_rest_at_any_stiffness_step_and_damper() {
-    // A damper on the velocity at the end of a step drives the modes that turn by more than half a period within it: with the exact step and a
-    // relaxation time above the step's, energies grew a thousandfold. Every one of these comes to rest.
-    // Newmark's own ringing under a hard hand dies slowly whatever the damper.
+    // A damper on the velocity at the end of a step drives the modes that turn by more than half a
+    // period within it. With the exact step and a relaxation time above the step length, energies
+    // would then grow a thousandfold. Every case here must come to rest. Newmark is left out,
+    // because its own ringing under a stiff hand decays slowly with any damper.
     for integrator in [Integrator::Exact, Integrator::GeneralizedAlpha { rho_inf: 0.5 }] {
         for young in [1e3, 1e5, 3e5, 1e6, 3e6, 1e7, 1e9, 1e11] {
             let model = Arc::new(rod(young, 12, 0.05, false));
@@ -111,8 +116,9 @@ fn a_damped_hand_comes_to_rest_at_any_stiffness_step_and_damper() {
                         let grab = body.grab(&tip_patch(&model), hand).unwrap();
                         let start = body.grab_position(grab).unwrap();
                         body.set_target(grab, [start[0] + 0.01, start[1], start[2]]).unwrap();
-                        // So long that the slowest mode forgets and a soft hand on a large damper has arrived; where that is a matter of more
-                        // than 20,000 steps nothing is stiff, and nothing is to be shown.
+                        // The duration is long enough for the slowest mode to decay and for a soft
+                        // hand on a large damper to arrive. Where this takes more than 20,000 steps
+                        // nothing is stiff, so the case is skipped.
                         let seconds = 12.0 * (relaxation + 2.0 / model.damping()[0]);
                         let steps = ((seconds / step) as usize).max(200);
                         if steps > 20_000 {
@@ -157,7 +163,8 @@ fn unforced_energy_never_grows() {
         let mut last = start;
         for _ in 0..5_000 {
             body.step().unwrap();
-            // Exact and average acceleration never gain; generalized-alpha holds another norm, equivalent to the energy within a factor.
+            // Exact and average acceleration never gain energy. Generalized-alpha is bounded in
+            // another norm, which is equivalent to the energy within a factor.
             let bound = if matches!(integrator, Integrator::GeneralizedAlpha { .. }) {
                 1.5 * start
             } else {
@@ -166,15 +173,16 @@ fn unforced_energy_never_grows() {
             assert!(body.energy() <= bound, "{integrator:?}: {} after {last}", body.energy());
             last = body.energy();
         }
-        // Average acceleration stretches the periods of modes far above the step rate, so these decay slowest: exp(-2 zeta omega' t) with
-        // omega' = 2 / h^2 omega.
+        // Average acceleration stretches the periods of modes far above the step rate, so these
+        // modes decay slowest: `exp(-2 zeta omega' t)` with `omega' = 2 / h^2 omega`.
         assert!(last < 0.05 * start, "{integrator:?}: {last} of {start}");
     }
 }
 
 #[test]
 fn hanging_rod_stretches_as_the_textbook_says() {
-    // rho g L^2 / (2 E); 60 modes leave out sum_{k > 60} of a series that falls as k^-3.
+    // The elongation is `rho g L^2 / (2 E)`. With 60 modes, `sum_{k > 60}` of a series that falls
+    // as `k^-3` is missing.
     let young = 1e6;
     let model = Arc::new(rod(young, 60, 1.0, false));
     let mut body = Body::new(
@@ -247,7 +255,8 @@ fn no_blow_or_push_stops_a_body_for_good() {
             assert_eq!(*body.state(), before, "what is refused changes nothing");
             body.clone().step().unwrap();
         }
-        // A force that a step takes, or the steps after it only, or none: whichever, the body goes on.
+        // The step with this force may fail, a later step may fail, or none. In each case the body
+        // must recover.
         for exponent in [100, 150, 155, 200, 290, 300, 304, 306, 307, 308] {
             let mut body = body.clone();
             body.push(tip(), [10f64.powi(exponent), -10f64.powi(exponent), 0.0]).unwrap();
@@ -255,7 +264,7 @@ fn no_blow_or_push_stops_a_body_for_good() {
             assert!(refused <= 2, "free: {free}, 1e{exponent} N: {refused} steps were refused");
             assert!(body.q().iter().chain(body.v()).all(|x| x.is_finite()));
         }
-        // A state from outside that nothing can be stepped from.
+        // A state from outside from which no step is possible.
         for huge in [1e150, 1e300, f64::MAX] {
             let mut state = before.clone();
             (state.q[0], state.v[1], state.a[2]) = (huge, -huge, huge);
@@ -275,9 +284,10 @@ fn teleporting_targets_coincident_hands_and_hands_on_anchors() {
     let anchor = body.grab(&Patch::around(model.surface(), 0, 0.0).unwrap(), GrabConfig::default()).unwrap();
     let size = model.size();
     let softest = body.compliance(anchor).unwrap()[1][1];
-    // Each is pulled from a body's length away at most, and the patch itself is not farther than that.
+    // The kernel takes a target as at most two body lengths away from the rest position.
     let most = 2.0 * size / softest;
-    // The six ask for +-100 m and the tip is at 1 m: their middle is a hundredth of a length away, and the tip swings to twice that.
+    // The six targets are at +-100 m and the tip is at 1 m. The mean of the limited targets is a
+    // hundredth of a length away from the tip, and the tip swings to twice that.
     let swing = 0.5 * 2e6 * AREA / LENGTH * (0.02 * size).powi(2);
     for i in 0..400 {
         let far = if i % 7 == 0 { 100.0 } else { -100.0 };
@@ -291,7 +301,8 @@ fn teleporting_targets_coincident_hands_and_hands_on_anchors() {
             let pull = body.reaction(*hand).unwrap().iter().map(|x| x * x).sum::<f64>().sqrt();
             assert!(pull > 0.1 * most && pull < most, "step {i}: {pull} N, at most {most} N");
         }
-        // What is anchored does not move: the whole of the way is the skin's.
+        // The anchored vertex does not move, so the compliance of the skin takes the whole
+        // displacement.
         let pull = body.reaction(anchor).unwrap()[0] * softest;
         assert!((pull + 0.3).abs() < 1e-9, "step {i}: the skin on the anchor gives way by {pull} m");
         assert!(body.energy() < swing, "step {i}: {} J, at most {swing} J", body.energy());
@@ -346,8 +357,11 @@ fn free_flight_keeps_its_momenta_and_two_hands_account_for_every_newton() {
     assert!(body.energy().is_finite());
 }
 
-/// `dL = sum of r x F dt`: the step takes each arm where the body would be without its hands, so the sum with the arms of the shape it ends in differs
-/// by the step's own motion, and by half as much in half the step.
+/// The angular momentum obeys `dL = sum of r x F dt`.
+///
+/// The step takes each arm at the position of the body without hands. The sum here uses the arms of
+/// the shape at the end of the step, so it differs by the motion within a step. Half the step
+/// halves this difference.
 #[test]
 fn the_torques_of_two_hands_account_for_the_angular_momentum() {
     let model = Arc::new(rod(1e6, 8, 0.05, true));
@@ -369,7 +383,7 @@ fn the_torques_of_two_hands_account_for_the_angular_momentum() {
             }
             body.step().unwrap();
             for id in [a, b] {
-                // The reaction is what the hand gets: the body gets the opposite.
+                // The reaction acts on the hand, and the opposite force acts on the body.
                 let torque = cross(body.grab_position(id).unwrap(), body.reaction(id).unwrap());
                 (0..3).for_each(|k| sum[k] -= torque[k] * h);
             }
@@ -398,7 +412,7 @@ fn a_strike_and_a_push_bring_their_momentum_and_its_moment() {
         assert!((p[k] - impulse[k]).abs() < 1e-9, "{p:?}");
         assert!((l[k] - moment(impulse)[k]).abs() < 1e-6, "{l:?}, expected {:?}", moment(impulse));
     }
-    // A force over one step, on a body at rest.
+    // A force over one step acts on a body at rest.
     let mut body = Body::new(model.clone(), BodyConfig { step: h, ..Default::default() }).unwrap();
     let force = [40.0, 10.0, -5.0];
     body.push(tip(), force).unwrap();
@@ -416,7 +430,8 @@ fn a_strike_and_a_push_bring_their_momentum_and_its_moment() {
 
 #[test]
 fn a_tumbling_body_keeps_energy_and_momentum() {
-    // An explicit midpoint rule let the energy of a body that turns once a second grow sevenfold in half an hour, until it turned about its long axis.
+    // With an explicit midpoint rule, the energy of a body that turns once a second grew sevenfold
+    // in half an hour, until the body turned about its long axis.
     let model = Arc::new(rod(1e6, 2, 0.0, true));
     let norm = |a: [f64; 3]| a.iter().map(|x| x * x).sum::<f64>().sqrt();
     for turns in [1.0, 10.0, 100.0] {
@@ -440,7 +455,8 @@ fn a_tumbling_body_keeps_energy_and_momentum() {
             for _ in 0..if turns * step > 0.1 { 2_000 } else { 20_000 } {
                 body.step().unwrap();
             }
-            // Ten radians a step are cut into fewer pieces than the fixed point would like.
+            // Ten radians per step would need more pieces than the limit in the rotation step
+            // allows.
             let bound = if turns * step > 1.0 { 1e-5 } else { 1e-9 };
             let off = (body.energy() / start - 1.0).abs();
             assert!(off < bound, "{turns} turns, h {step}: off by {off}");
@@ -452,7 +468,7 @@ fn a_tumbling_body_keeps_energy_and_momentum() {
 
 #[test]
 fn a_symmetric_top_precesses_at_the_textbook_rate() {
-    // The rod's axis goes round the spin at L / I across, whatever the step.
+    // The axis of the rod circles the spin at the rate L / I, where I is the transverse inertia.
     let model = Arc::new(rod(1e6, 2, 0.0, true));
     let across = model.inertia()[1][1];
     let along = model.inertia()[0][0];
@@ -469,14 +485,15 @@ fn a_symmetric_top_precesses_at_the_textbook_rate() {
     for _ in 0..steps {
         body.step().unwrap();
     }
-    // Rodrigues about the spin.
+    // Rodrigues' rotation formula about the spin.
     let angle = rate * step * f64::from(steps);
     let length = (spin[0].powi(2) + spin[1].powi(2)).sqrt();
     let k = nalgebra::Vector3::from(spin) / length;
     let axis = nalgebra::Vector3::x();
     let want = axis * angle.cos() + k.cross(&axis) * angle.sin() + k * (k.dot(&axis) * (1.0 - angle.cos()));
     let got = body.frame().rotation() * axis;
-    // Second order: 6e-4 at a millisecond, a hundredth of that here.
+    // The method is of second order. The error is 6e-4 at a step of a millisecond and a hundredth
+    // of that here.
     assert!((got - want).norm() < 2e-5, "{got:?} and {want:?}");
 }
 
@@ -523,6 +540,7 @@ fn a_half_precision_surface_is_off_by_its_rounding_and_the_step_by_nothing() {
     assert_eq!(q, same);
     let off =
         single.iter().flatten().zip(half.iter().flatten()).map(|(a, b)| (a - b).abs()).fold(0.0, f32::max);
-    // 2^-11 of twelve modes that move 0.02 m together, and not nothing.
+    // Twelve modes that move 0.02 m together have an error of 2^-11 each. The error must not be
+    // zero.
     assert!(off > 0.0 && off < 12.0 * 0.02 / 2048.0, "{off} m");
 }

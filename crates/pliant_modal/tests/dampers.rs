@@ -1,4 +1,4 @@
-//! Hands with dampers: a damper has no static force, and takes energy.
+//! Hands with dampers: a damper has no static force and removes energy.
 #![allow(clippy::unwrap_used, missing_docs, reason = "a failed test should panic")]
 
 use std::sync::Arc;
@@ -11,7 +11,8 @@ fn pip() -> Arc<ModalModel> {
     Arc::new(ModalModel::read(path).unwrap())
 }
 
-/// Gravity on a bent body does the work of its potential: without damping nothing is lost or gained.
+/// The work of gravity on a bent body is that of its potential, so the total energy stays constant
+/// without damping.
 #[test]
 fn under_gravity_energy_stays() {
     let model = pip();
@@ -30,7 +31,7 @@ fn under_gravity_energy_stays() {
     assert!(most > 1.0 && off < 1e-5 * most, "{off} J of {most} J");
 }
 
-/// Two hands 2 cm apart, with their dampers' relaxation times (s).
+/// Makes a body with two hands 2 cm apart and the given relaxation times of their dampers (s).
 fn held(step: f64, integrator: Integrator, warp: bool, relaxations: [f64; 2]) -> (Body, [GrabId; 2]) {
     let model = pip();
     let config = BodyConfig {
@@ -46,7 +47,7 @@ fn held(step: f64, integrator: Integrator, warp: bool, relaxations: [f64; 2]) ->
     (body, grabs)
 }
 
-/// Both hands 2 cm to the side, and what the second one feels in the end.
+/// Moves both hands 2 cm sideways and compares the final reaction on the second hand.
 #[test]
 fn a_damper_has_no_static_force() {
     const EXPECTED: f64 = -1.134;
@@ -79,7 +80,7 @@ fn energy(body: &Body, grabs: &[GrabId]) -> f64 {
     body.energy() + grabs.iter().map(spring).sum::<f64>()
 }
 
-/// After the targets have come to rest nothing may gain energy, whatever the two dampers are.
+/// After the targets have come to rest, the energy must not grow for any pair of dampers.
 #[test]
 fn dampers_take_energy() {
     let times = [0.0, 0.01, 0.1, 0.5, 2.0, 10.0];

@@ -1,4 +1,4 @@
-//! The `.modal` file: round trip, and every way of being wrong.
+//! The `.modal` file: round trip and all kinds of invalid files.
 #![allow(clippy::unwrap_used, clippy::panic, reason = "a failed test should panic")]
 
 mod rod;
@@ -104,7 +104,7 @@ fn parts_that_cannot_be_stepped_or_told_are_refused_by_name() {
         change(&mut parts);
         ModalModel::from_parts(parts).unwrap_err().to_string()
     };
-    // 1e200 squared overflows, 1e-200 squared is zero: neither is a stiffness.
+    // The square of 1e200 overflows and that of 1e-200 is zero. Neither is a valid stiffness.
     assert!(refused(&|p| p.omega[2] = 1e200).contains("omega[2]"));
     assert!(refused(&|p| p.omega[0] = 1e-200).contains("omega[0]"));
     assert!(refused(&|p| p.damping[1] = 1e300).contains("damping[1]"));
@@ -115,7 +115,7 @@ fn parts_that_cannot_be_stepped_or_told_are_refused_by_name() {
     });
     assert!(not_definite.contains("semi-definite"), "{not_definite}");
     assert!(refused(&|p| p.sites[0].flexibility[2][2] = -1.0).contains("semi-definite"));
-    // Its lower triangle alone is positive definite.
+    // The lower triangle alone is positive definite.
     let skew = refused(&|p| p.inertia[0][1] = 0.3 * p.inertia[1][1]);
     assert!(skew.contains("inertia[0]: expected a symmetric matrix"), "{skew}");
     assert!(refused(&|p| p.inertia[1][1] *= -1.0).contains("positive definite"));
@@ -127,7 +127,7 @@ fn parts_that_cannot_be_stepped_or_told_are_refused_by_name() {
 }
 
 proptest! {
-    /// A payload whose hash is right but whose content is not (someone made it so) is refused or harmless; never a panic.
+    /// A forged payload with a correct hash is refused or harmless, and never causes a panic.
     #[test]
     fn forged_payloads_never_panic(position in 0usize..2_000, value: u8, cut in 0usize..200) {
         let mut bytes = rod::rod(1e6, 3, 0.02, false).to_bytes();

@@ -1,4 +1,5 @@
-//! The order of what a hand feels: against the modal equations integrated in very small steps.
+//! Order of accuracy of the reaction, compared with the modal equations integrated in very small
+//! steps.
 #![allow(clippy::unwrap_used, missing_docs, reason = "a failed test should panic")]
 
 mod rod;
@@ -9,11 +10,11 @@ use pliant_modal::{Body, BodyConfig, GrabConfig, ModalModel, Patch, StepSettings
 use rod::{rod, tip};
 
 const MODES: usize = 8;
-/// How long the hand moves, and how long it is watched, s.
+/// Durations of the hand's motion and of the whole run, s.
 const MOVES: f64 = 0.5;
 const WATCHED: f64 = 1.0;
 
-/// How far the hand has gone, m: smooth up to its third derivative.
+/// Displacement of the hand, m, smooth up to its third derivative.
 fn way(t: f64) -> f64 {
     let x = (t / MOVES).clamp(0.0, 1.0);
     0.05 * x.powi(4) * (35.0 - x * (84.0 - x * (70.0 - 20.0 * x)))
@@ -23,7 +24,7 @@ fn patch(model: &ModalModel) -> Patch {
     Patch::around(model.surface(), tip(), 0.1).unwrap()
 }
 
-/// Reaction along the rod at the end of each step, N.
+/// Returns the reaction along the rod at the end of each step, N.
 fn felt(model: &Arc<ModalModel>, hz: f64, second_order: bool) -> Vec<f64> {
     let config = BodyConfig {
         step: 1.0 / hz,
@@ -42,8 +43,9 @@ fn felt(model: &Arc<ModalModel>, hz: f64, second_order: bool) -> Vec<f64> {
         .collect()
 }
 
-/// The same of `q'' + c q' + omega^2 q = phi (target - phi . q) / C`, by Runge and Kutta's method in
-/// steps of 1/`fine` s, at multiples of 1/`hz` s.
+/// Returns the same reaction from `q'' + c q' + omega^2 q = phi (target - phi . q) / C`.
+///
+/// It uses the Runge-Kutta method in steps of 1/`fine` s and samples at multiples of 1/`hz` s.
 fn exact(model: &Arc<ModalModel>, hz: f64, fine: f64) -> Vec<f64> {
     let mut body = Body::new(model.clone(), BodyConfig::default()).unwrap();
     let patch = patch(model);
@@ -85,7 +87,7 @@ fn exact(model: &Arc<ModalModel>, hz: f64, fine: f64) -> Vec<f64> {
     out
 }
 
-/// Largest and mean square difference, as shares of the largest force.
+/// Returns the largest and the root mean square difference, as shares of the largest force.
 fn error(felt: &[f64], exact: &[f64]) -> (f64, f64) {
     let peak = exact.iter().fold(0.0f64, |peak, f| peak.max(f.abs()));
     let off = || felt.iter().zip(exact).map(|(a, b)| (a - b) / peak);

@@ -1,4 +1,4 @@
-//! Viscoelastic bodies against the closed forms of the standard linear solid.
+//! Viscoelastic bodies, compared with the closed forms of the standard linear solid.
 #![allow(clippy::unwrap_used, reason = "a failed test should panic")]
 
 mod rod;
@@ -30,7 +30,8 @@ fn made(
     Coefficients::relaxing(integrator, omega, c, relaxation, h).unwrap()
 }
 
-/// The recurrence as one matrix on `(q, v, a, z)` and what unit forces add, at the old and at the new time.
+/// Returns the recurrence as one matrix on `(q, v, a, z)`, and the responses to unit forces at the
+/// old and the new time.
 fn matrix(made: &(Coefficients, ViscoelasticCoefficients)) -> (Matrix4<f64>, Vector4<f64>, Vector4<f64>) {
     let (c, f) = made;
     let m = Matrix4::from_fn(|i, j| match (i, j) {
@@ -44,7 +45,7 @@ fn matrix(made: &(Coefficients, ViscoelasticCoefficients)) -> (Matrix4<f64>, Vec
     (m, old, new)
 }
 
-/// Classical Runge-Kutta with very many substeps.
+/// Classical Runge-Kutta integration with very many substeps.
 fn reference(omega: f64, c: f64, r: Relaxation, h: f64, f: f64, from: [f64; 3]) -> [f64; 3] {
     let n = 40_000;
     let dt = h / f64::from(n);
@@ -106,7 +107,8 @@ fn without_a_ratio_it_is_the_elastic_step() {
 
 #[test]
 fn a_held_force_creeps_by_the_closed_form() {
-    // A fast, critically damped mode follows its force at once: what is left is the solid's creep.
+    // A fast, critically damped mode tracks its force at once, so only the creep of the solid is
+    // left.
     let (omega, relaxation) = (1e5, Relaxation { ratio: 0.7, time: 0.5 });
     for (integrator, tolerance) in
         [(Integrator::Exact, 1e-4), (Integrator::GeneralizedAlpha { rho_inf: 0.5 }, 6e-3)]
@@ -120,7 +122,8 @@ fn a_held_force_creeps_by_the_closed_form() {
             z = flow.step(x, z, old, 1.0);
             (x, old) = (next, 1.0);
             let want = relaxation.creep(f64::from(n) * h) / (omega * omega);
-            // Generalized-alpha feels a force that sets in within a step for a third of a step less.
+            // For a force that starts within a step, generalized-alpha counts a third of a step
+            // less.
             if n > 20 {
                 assert!(
                     (x[0] / want - 1.0).abs() < tolerance,
@@ -140,12 +143,14 @@ fn storage_and_loss_are_those_of_the_standard_linear_solid() {
     for integrator in ALL {
         let (m, old, new) = matrix(&made(integrator, mode, 0.0, relaxation, h));
         for at in [0.5, 5.0, 20.0, 100.0, 400.0f64] {
-            // The answer to a force e^(i at t): (e^(i at h) - M) x = old + new e^(i at h). The exact step takes its force as held.
+            // The response to a force `e^(i at t)` solves
+            // `(e^(i at h) - M) x = old + new e^(i at h)`. The exact step takes its force as
+            // constant over the step.
             let turn = Complex::from_polar(1.0, at * h);
             let held = integrator == Integrator::Exact;
             let push = old.map(Complex::from) + new.map(Complex::from) * turn;
             let system = Matrix4::from_diagonal_element(turn) - m.map(Complex::from);
-            // Scaled so that rows and columns are comparable.
+            // The scaling makes rows and columns comparable.
             let s = Vector4::new(1.0, at, at * at, 1.0).map(Complex::from);
             let scaled = Matrix4::from_fn(|i, j| system[(i, j)] / s[i] * s[j]);
             let x = scaled.lu().solve(&push.component_div(&s)).unwrap();
@@ -182,8 +187,10 @@ fn no_step_grows_at_any_stiffness_ratio_time_or_step() {
     }
 }
 
-/// Two hundred free steps from states of every kind: the energy, with the branch's share as the integrator keeps it, never grows; that of
-/// generalized-alpha never again reaches the largest of the first hundred.
+/// Checks two hundred steps without forces from different initial states.
+///
+/// The energy, with the branch's share as the integrator weights it, never grows. With
+/// generalized-alpha the energy never exceeds the largest value of the first hundred steps again.
 fn grows(integrator: Integrator, h: f64, omega: f64, zeta: f64, relaxation: Relaxation) {
     let c = 2.0 * zeta * omega;
     let (table, flow) = made(integrator, omega, c, relaxation, h);
@@ -208,11 +215,13 @@ fn grows(integrator: Integrator, h: f64, omega: f64, zeta: f64, relaxation: Rela
             z = flow.step(state, z, 0.0, 0.0);
             state = next;
             let now = energy(state, z);
-            // Newmark's accelerations of a mode far beyond the step are large, and so is their rounding.
+            // Newmark's accelerations of a mode far above the step rate are large, and so are their
+            // rounding errors.
             let bound = match integrator {
                 Integrator::Exact => last + 1e-11 * first,
                 Integrator::Newmark => last + (1e-12 + 1e-15 * omega * h * (omega + c) * h) * first,
-                // Stable in its spectrum, not step by step in this norm: a first step may overshoot.
+                // Generalized-alpha is stable in its spectrum but not step by step in this norm, so
+                // the first steps may overshoot.
                 _ if n < 100 => f64::MAX,
                 _ => largest * (1.0 + 1e-9),
             };
@@ -234,7 +243,8 @@ fn tip_patch(model: &ModalModel) -> Patch {
 
 #[test]
 fn a_fast_pull_feels_the_instantaneous_stiffness_and_a_long_one_the_relaxed() {
-    // Every mode and what the modes leave out relax alike, so the rod held at its tip relaxes as the material does.
+    // Every mode and the residual flexibility relax alike, so a rod held at its tip relaxes as the
+    // material does.
     let (young, pulled) = (2e5, 0.02);
     let relaxation = Relaxation { ratio: 0.6, time: 1.0 };
     for modes in [1, 3, 12] {
@@ -253,11 +263,11 @@ fn a_fast_pull_feels_the_instantaneous_stiffness_and_a_long_one_the_relaxed() {
             let instantaneous = -young * AREA * pulled / LENGTH;
             for n in 1..=480 * 12 {
                 body.step().unwrap();
-                // The pull is a step in time, and takes the rod a few periods (0.3 s) to settle under.
+                // The pull is a step in time, and the rod takes a few periods (0.3 s) to settle.
                 let t = f64::from(n) * h;
                 if t > 0.8 {
                     let got = body.reaction(grab).unwrap()[0] / instantaneous;
-                    // The contact floor of a grab is half a percent of this rod's compliance.
+                    // The contact floor of a grab is half a percent of the compliance of this rod.
                     assert!(
                         (got / relaxation.modulus(t) - 1.0).abs() < 0.012,
                         "{integrator:?}, {modes} modes, {t} s: {got} and {}",
@@ -269,7 +279,7 @@ fn a_fast_pull_feels_the_instantaneous_stiffness_and_a_long_one_the_relaxed() {
             assert!((end / 0.4 - 1.0).abs() < 0.006, "{integrator:?}, {modes} modes: ends at {end}");
         }
     }
-    // A material that takes a year to relax is elastic to a hand.
+    // A material that takes a year to relax reacts elastically to a hand.
     let model = Arc::new(rod(young, 12, 0.5, false));
     let relaxation = Some(Relaxation { ratio: 0.6, time: 3e7 });
     let mut body =
@@ -311,7 +321,8 @@ fn held_reactions_stay_smooth_and_finite_at_every_extreme() {
                             force.push(body.reaction(grab).unwrap()[0]);
                         }
                         let largest = force.iter().fold(0.0f64, |m, f| m.max(f.abs()));
-                        // A pull is answered by stiffness and, when fast, by the rod's wave impedance.
+                        // The reaction consists of stiffness and, for a fast pull, the wave
+                        // impedance of the rod.
                         let speed = 1.5 * 0.05 / (300.0 * step);
                         let most = young * AREA * 0.05 / LENGTH + (young * DENSITY).sqrt() * AREA * speed;
                         assert!(largest <= 1.3 * most, "{largest} of {most}");
@@ -319,7 +330,7 @@ fn held_reactions_stay_smooth_and_finite_at_every_extreme() {
                         let ringing = flips.fold(0.0, f64::max) / largest.max(1e-12);
                         let what = format!("{integrator:?}, E {young}, h {step}, {relaxation:?}");
                         assert!(largest < 1e-9 || ringing < 0.5, "{what}: ringing {ringing}");
-                        // Let go: what it has, it only loses.
+                        // After the release the body can only lose energy.
                         body.release(grab);
                         let before = body.energy();
                         for _ in 0..50 {
@@ -352,7 +363,7 @@ fn the_state_carries_the_flow() {
     assert_eq!(body.z().len(), 8);
     assert!(body.z()[0] > 0.0 && body.z()[0] < body.q()[0]);
     assert!(body.grab_viscoelastic_state(grab).unwrap()[0] > 0.0);
-    // A second body that takes over state and grab goes on alike.
+    // A second body that takes over the state and the grab moves in the same way.
     let mut other = Body::new(model.clone(), config).unwrap();
     let hand = other.grab(&tip_patch(&model), GrabConfig::default()).unwrap();
     other.set_state(body.state()).unwrap();
@@ -371,7 +382,7 @@ fn the_state_carries_the_flow() {
     bad.z.clear();
     assert!(matches!(body.set_state(&bad), Err(StepError::Length { what: "z", expected: 8, got: 0 })));
     assert!(body.set_grab_viscoelastic_state(grab, [f64::NAN, 0.0, 0.0]).is_err());
-    // Elastic again, and back: nothing relaxed is left.
+    // A switch to an elastic material and back clears the viscoelastic state.
     let held = body.config().clone();
     body.reconfigure(BodyConfig {
         settings: StepSettings { relaxation: None, ..held.settings },

@@ -1,4 +1,5 @@
-//! A body as many times as stiff: against a rod of as many times the Young's modulus, and against closed forms.
+//! The stiffness scale of a body, compared with a rod of the scaled Young's modulus and with closed
+//! forms.
 #![allow(clippy::unwrap_used, reason = "a failed test should panic")]
 
 mod rod;
@@ -22,7 +23,7 @@ fn config(integrator: Integrator, stiffness_scale: f64) -> BodyConfig {
     }
 }
 
-/// Where a hand that wanders leads a body: tip and reaction, step by step.
+/// Drags a body with a moving hand and returns tip position, reaction and energy for each step.
 fn dragged(mut body: Body) -> Vec<f64> {
     let patch = Patch::around(body.model().surface(), tip(), 0.01).unwrap();
     let hand = body.grab(&patch, GrabConfig { stiffness: Some(500.0), relaxation: 0.01 }).unwrap();
@@ -73,14 +74,15 @@ fn twice_as_stiff_it_sinks_half_as_far_and_swings_root_two_faster() {
     let phi = (2.0 / (DENSITY * AREA * LENGTH)).sqrt();
     for stiffness in [1.0, 2.0, 0.5] {
         let omega = quarter_wave * (YOUNG * stiffness / DENSITY).sqrt();
-        // Changed while it runs, not only made so.
+        // The scale also has to work if it changes on an existing body.
         let mut body = Body::new(model.clone(), config(Integrator::Exact, 1.0)).unwrap();
         body.reconfigure(BodyConfig {
             settings: StepSettings { damping_scale: 0.0, ..config(Integrator::Exact, stiffness).settings },
             ..config(Integrator::Exact, stiffness)
         })
         .unwrap();
-        // A load that is there all at once: it swings about where it would hang, phi^2 F / omega^2, from nought to twice that.
+        // Under a load that starts at once, the rod swings about its static position
+        // `phi^2 F / omega^2`, from zero to twice that position.
         let (mut crossings, mut before, mut mean, mut most) = (Vec::new(), 0.0, 0.0, 0.0_f64);
         let hangs = phi * phi * 2.0 / (omega * omega);
         let steps = 8_000;
@@ -156,7 +158,8 @@ fn a_change_on_the_way_keeps_the_motion_and_the_balance_of_forces() {
             body.step().unwrap();
         }
         let (q, v) = (body.q().to_vec(), body.v().to_vec());
-        // Nobody pushes: a + c v + omega^2 (q - ratio z) is what is left over, small as the integrator's error is.
+        // Without external forces `a + c v + omega^2 (q - ratio z)` is the residual, which is as
+        // small as the error of the integrator.
         let left_over = |body: &Body| -> Vec<f64> {
             let ratio = body.config().settings.relaxation.map_or(0.0, |r| r.ratio);
             (0..4)
@@ -172,7 +175,7 @@ fn a_change_on_the_way_keeps_the_motion_and_the_balance_of_forces() {
         assert_eq!(body.a(), resisted, "another step is no other force");
         body.reconfigure(after).unwrap();
         assert_eq!((body.q(), body.v()), (&q[..], &v[..]));
-        // What begins to relax has not flown yet.
+        // The viscoelastic state starts at zero when relaxation is switched on.
         let begins = relaxation.is_none() && body.config().settings.relaxation.is_some();
         assert_eq!(body.a() == resisted, begins);
         for (then, now) in unbalanced.iter().zip(left_over(&body)) {
@@ -193,7 +196,7 @@ fn a_patch_of_another_surface_has_no_flexibility_here() {
     assert_eq!(body.grab(&patch, GrabConfig::default()), Err(StepError::Vertex { vertex: 200, count: 84 }));
 }
 
-/// A surface with more vertices than that of `model`: three of it, one beside the other.
+/// Makes a surface with more vertices than that of `model`: three copies of it side by side.
 fn three_of_it(model: &ModalModel) -> SurfaceMesh {
     let (mut positions, mut triangles) = (Vec::new(), Vec::new());
     for copy in 0..3 {

@@ -1,18 +1,23 @@
-//! A free body that two hands hold too far apart: their tension keeps it in line between them, and it comes to rest.
+//! A free body between two hands that pull apart. The tension keeps the body in line between the
+//! hands, and the body comes to rest.
 #![allow(clippy::unwrap_used, missing_docs, reason = "a failed test should panic")]
 
 use std::sync::Arc;
 
 use pliant_modal::{Body, BodyConfig, GrabConfig, Integrator, ModalModel, Patch, StepSettings};
 
-/// The free jack that `free_bodies` throws: 0.41 m, 0.66 kg, three moments of inertia, knobs on thin arms.
+/// The free jack of the example `free_bodies`: 0.41 m, 0.66 kg, three different moments of inertia
+/// and knobs on thin arms.
 fn jack() -> Arc<ModalModel> {
     let path = concat!(env!("CARGO_MANIFEST_DIR"), "/../../assets/jack.modal");
     Arc::new(ModalModel::read(path).unwrap())
 }
 
-/// Both ends pulled apart by `part` of the size over two seconds, with a tremble aside, and held until 10 s. The last three: the largest
-/// deviation of the tension from its mean, as a part of it, the mean (N), and the largest difference between the hands (N).
+/// Pulls both ends apart by `part` of the size over two seconds, with a sideways tremble, and holds
+/// until 10 s.
+///
+/// Returns values for the last three seconds: the largest deviation of the tension from its mean as
+/// a share of the mean, the mean (N), and the largest difference between the hands (N).
 fn tension(
     model: &Arc<ModalModel>,
     integrator: Integrator,
@@ -67,7 +72,8 @@ fn a_free_body_stretched_between_two_hands_comes_to_rest() {
     let alpha = Integrator::GeneralizedAlpha { rho_inf: 0.5 };
     let exact = Integrator::Exact;
     let (coarse, fine) = (1.0 / 64.0, 1.0 / 250.0);
-    // With the frame taken a step late the exact step is wild at 33 %, with two rounds and with eight.
+    // If the frame lagged by one step, the exact step would be unstable at 33 % with two and with
+    // eight rounds.
     for (integrator, step, corrections, part) in [
         (exact, coarse, 2, 0.20),
         (exact, coarse, 2, 0.27),
@@ -84,7 +90,7 @@ fn a_free_body_stretched_between_two_hands_comes_to_rest() {
         println!(
             "{integrator:?} {step}, {corrections} rounds: {part} apart, {force:.2} N, wobble {off:.2e}, hands differ by {apart:.2e} N"
         );
-        // What a fine step makes of it.
+        // Reference from a fine step.
         let (_, fine, _) = tension(&model, alpha, 1.0 / 500.0, 2, part);
         assert!((force / fine - 1.0).abs() < 1e-3, "{force} N, {fine} N in fine steps");
         assert!(off < 1e-3, "{integrator:?} {step}, {corrections}: {part} apart: {off}");

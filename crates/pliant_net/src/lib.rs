@@ -1,7 +1,8 @@
-//! Bevy plugin that carries Pliant's streaming sessions over QUIC: soft bodies that several people hold at the same time.
+//! Bevy plugin for Pliant sessions over QUIC, in which several people hold the same soft bodies.
 //!
-//! A host steps the bodies (and may play too); guests see them, take hold of them and feel them. Among peers ([`NetPlugin::peer`]) every one steps
-//! them. All are one plugin:
+//! A host steps the bodies and may also hold them. Guests see the bodies, hold them and feel their
+//! forces. Among peers ([`NetPlugin::peer`]) every peer steps the bodies. One plugin covers all
+//! three cases:
 //!
 //! ```no_run
 //! use bevy::prelude::*;
@@ -25,25 +26,28 @@
 //! # Ok(()) }
 //! ```
 //!
-//! | Written by you | Read by you |
+//! | You write | You read |
 //! | --- | --- |
-//! | [`SharedBody`] on a body (host) | [`NetStats`]: round trip, loss, repair, rates |
-//! | [`Grab`](pliant_body::Grab) and [`GrabOf`](pliant_body::GrabOf), on guests as on a host | [`GrabForce`](pliant_body::GrabForce): the reaction, in step with what is shown |
-//! | [`HostConfig`], [`JoinConfig`], [`PeerConfig`] | [`User`], [`UserLink`], [`Hands`]: who is there, how well reached, holding what |
+//! | [`SharedBody`] on a body of the host | [`NetStats`]: round trip, loss, repair, rates |
+//! | [`Grab`](pliant_body::Grab) and [`GrabOf`](pliant_body::GrabOf), on guests and on the host | [`GrabForce`](pliant_body::GrabForce): the reaction, in step with the displayed shape |
+//! | [`HostConfig`], [`JoinConfig`], [`PeerConfig`] | [`User`], [`UserLink`], [`Hands`]: the users, the quality of their connections, their grabs |
 //! | [`Holding`] on a host's body: whose hands may be on it | [`BodyArrived`], [`BodyLeft`], [`UserJoined`], [`UserLeft`], [`GrabRefused`]: messages |
-//! | [`Interest`] on a guest's body: how many modes it wants | [`SessionJoined`], [`SessionLost`], [`SessionClosed`]: messages |
-//! | | [`RemoteHands`] on a guest's bodies: where the others' hands are |
+//! | [`Interest`] on a guest's body: how many modes the guest wants | [`SessionJoined`], [`SessionLost`], [`SessionClosed`]: messages |
+//! | | [`RemoteHands`] on a guest's bodies: where the other users' hands are |
 //!
-//! Whoever is dragged by the pointer, by a script or by a device on a guest's [`Driven::Remote`](pliant_body::Driven::Remote) body makes a
-//! [`Grab`](pliant_body::Grab) as for a body of its own; this plugin sends it and writes the force.
+//! A pointer, a script or a device drags a guest's [`Driven::Remote`](pliant_body::Driven::Remote)
+//! body with a [`Grab`](pliant_body::Grab), like a local body. This plugin sends the grab and
+//! writes the force.
 //!
-//! A guest that loses its host waits and joins again ([`JoinConfig::rejoin`]), under the number it had: its key is its lasting name. What it receives may
-//! be recorded ([`JoinConfig::record`]) and played again ([`NetPlugin::replay`]).
+//! A guest that loses its host waits and joins again ([`JoinConfig::rejoin`]). The guest keeps its
+//! user number, because its key identifies it permanently. The guest can record the data that it
+//! receives ([`JoinConfig::record`]), and [`NetPlugin::replay`] plays such a recording.
 //!
-//! Nothing that comes from outside stops an app: it is checked, counted ([`NetStats::rejected`]) and logged at debug. What is defended and
-//! what is not is in `THREATS.md`.
+//! No data from the network stops an app: invalid data is counted ([`NetStats::rejected`]) and
+//! logged at debug level. `THREATS.md` lists the attacks that the crate defends against and those
+//! that it does not.
 //!
-//! [`transport`] is the layer below, which knows neither bodies nor Bevy.
+//! [`transport`] is the layer below. It knows neither bodies nor Bevy.
 #![cfg_attr(
     test,
     allow(clippy::unwrap_used, clippy::expect_used, clippy::panic, reason = "a failed test should panic")
@@ -67,7 +71,7 @@ pub use metrics::{
     DROPPED, JITTER, LOSS_IN, LOSS_OUT, NACKS, NetStats, QUEUE, RATE_IN, RATE_OUT, RECOVERED, ROUND_TRIP,
     SHOWN_OFFSET,
 };
-/// The networks that an [`Emulation`] is made of.
+/// Network models for an [`Emulation`].
 pub use pliant_stream::emulator;
 
 pub use guest::{CameraInterest, GuestState, Interest, JoinConfig, NetGuest};
@@ -85,7 +89,7 @@ pub use transport::{
 };
 pub use user::{HandOf, Hands, User, UserJoined, UserLeft, UserLink, Yourself, color_of};
 
-/// What the end of a connection is to the session.
+/// Converts the end of a connection to the session's reason for a disconnect.
 fn end_of(reason: &transport::CloseReason) -> pliant_stream::DisconnectReason {
     use pliant_stream::DisconnectReason;
     use transport::CloseReason;

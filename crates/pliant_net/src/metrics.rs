@@ -1,4 +1,4 @@
-//! What the network does, in numbers: a resource for games, diagnostics for everything that shows them.
+//! Network metrics, as a resource for games and as diagnostics for tools that display them.
 
 use std::collections::BTreeMap;
 use std::time::{Duration, Instant};
@@ -9,13 +9,14 @@ use pliant_stream::{LinkStats, PeerId};
 
 use crate::transport::{DropCounts, PeerStats};
 
-/// Diagnostic: smoothed round trip, ms. On a host: the longest of its guests'.
+/// Diagnostic: smoothed round trip, ms. On a host, the longest of all guests.
 pub const ROUND_TRIP: DiagnosticPath = DiagnosticPath::const_new("pliant/net/round_trip");
-/// Diagnostic: smoothed deviation of the round trip, ms; among peers of the way here. Of several the largest.
+/// Diagnostic: smoothed deviation of the round trip, ms. Among peers, of the one-way delay to this
+/// peer. The largest of all connections.
 pub const JITTER: DiagnosticPath = DiagnosticPath::const_new("pliant/net/jitter");
-/// Diagnostic: how long packets wait in queues on the way, ms: [`NetStats::queue`].
+/// Diagnostic: how long packets wait in queues on the path, ms: [`NetStats::queue`].
 pub const QUEUE: DiagnosticPath = DiagnosticPath::const_new("pliant/net/queue");
-/// Diagnostic: datagrams that this end let go ([`NetStats::dropped`]), a second.
+/// Diagnostic: datagrams that this end dropped ([`NetStats::dropped`]), per second.
 pub const DROPPED: DiagnosticPath = DiagnosticPath::const_new("pliant/net/dropped");
 /// Diagnostic: share of the other side's datagrams that do not arrive here, %.
 pub const LOSS_IN: DiagnosticPath = DiagnosticPath::const_new("pliant/net/loss_in");
@@ -25,26 +26,31 @@ pub const LOSS_OUT: DiagnosticPath = DiagnosticPath::const_new("pliant/net/loss_
 pub const RATE_IN: DiagnosticPath = DiagnosticPath::const_new("pliant/net/rate_in");
 /// Diagnostic: UDP payload sent, kbit/s.
 pub const RATE_OUT: DiagnosticPath = DiagnosticPath::const_new("pliant/net/rate_out");
-/// Diagnostic: ticks asked for again, a second.
+/// Diagnostic: ticks requested again (NACKs), per second.
 pub const NACKS: DiagnosticPath = DiagnosticPath::const_new("pliant/net/nacks");
-/// Diagnostic: ticks that were shown on a guess and then put right, a second.
+/// Diagnostic: ticks that were displayed with a prediction and then corrected, per second.
 pub const RECOVERED: DiagnosticPath = DiagnosticPath::const_new("pliant/net/recovered");
-/// Diagnostic: how far the shown state of a guest's bodies is known to be from the estimate of the truth, % of the state's size.
+/// Diagnostic: known distance of a guest's visual state from the estimate of the true state, % of
+/// the state's size.
 pub const SHOWN_OFFSET: DiagnosticPath = DiagnosticPath::const_new("pliant/net/shown_offset");
 
-/// The network's figures, refreshed every frame. Counts are since the app began and never fall: connections that are over stay counted. A
-/// host adds up its guests, a peer the others, and gives the worst of their round trips and the mean of their losses.
+/// Network metrics, refreshed every frame.
+///
+/// Counts start when the app starts and never fall: closed connections stay counted. A host adds up
+/// its guests, and a peer adds up the other peers. Both report the worst round trip and the mean
+/// loss.
 #[derive(Resource, Debug, Clone, Copy, Default, PartialEq)]
 pub struct NetStats {
-    /// Connections that are open.
+    /// Number of open connections.
     pub peers: usize,
-    /// Smoothed round trip between the sessions; zero before the first measurement.
+    /// Smoothed round trip between the sessions. Zero before the first measurement.
     pub round_trip: Duration,
-    /// Smoothed deviation of the round trip; among peers of the time that the way here takes. The largest of all.
+    /// Smoothed deviation of the round trip. Among peers, of the one-way delay to this peer. The
+    /// largest of all connections.
     pub jitter: Duration,
     /// Share of the other side's datagrams that do not arrive here, 0 to 1.
     pub loss_in: f64,
-    /// Share of this side's datagrams that do not arrive there, 0 to 1, as the other side says.
+    /// Share of this side's datagrams that do not arrive there, 0 to 1, as the other side reports.
     pub loss_out: f64,
     /// Datagrams of the session sent.
     pub datagrams_out: u64,
@@ -54,37 +60,40 @@ pub struct NetStats {
     pub bytes_out: u64,
     /// UDP payload received, bytes.
     pub bytes_in: u64,
-    /// UDP payload sent in the last second, bytes a second.
+    /// UDP payload sent in the last second, bytes per second.
     pub bytes_out_per_s: f64,
-    /// UDP payload received in the last second, bytes a second.
+    /// UDP payload received in the last second, bytes per second.
     pub bytes_in_per_s: f64,
-    /// NACKs sent (guest) or received (host); among peers, questions for inputs that were sent.
+    /// NACKs sent (guest) or received (host). Among peers, requests sent for missing inputs.
     pub nacks: u64,
-    /// Guest: ticks whose data was not there when they were shown.
+    /// Guest: ticks whose data was missing when they were displayed.
     pub guessed: u64,
-    /// Guest: of these, put right when their data came.
+    /// Guest: the part of these that was corrected when their data arrived.
     pub recovered: u64,
-    /// Guest: ticks shown.
+    /// Guest: ticks displayed.
     pub shown: u64,
     /// Guest: states taken over from snapshots.
     pub snapshots: u64,
-    /// Datagrams and messages from outside that made no sense.
+    /// Invalid datagrams and messages received.
     pub rejected: u64,
-    /// Datagrams that this end let go, and why.
+    /// Datagrams that this end dropped, by reason.
     pub dropped: DropCounts,
-    /// QUIC's own count of packets sent and lost on the way there, 0 to 1.
+    /// Share of the sent packets that QUIC counts as lost on the path to the other side, 0 to 1.
     pub packet_loss: f64,
-    /// How much longer the round trip is than the shortest one seen: packets wait so long in queues. Of several the longest.
+    /// How much longer the round trip is than the shortest one seen, which is how long packets wait
+    /// in queues. The longest of all connections.
     pub queue: Duration,
-    /// A peer's round trip has grown by more than 50 ms: packets wait in a queue, and less should be sent.
+    /// Whether a peer's round trip has grown by more than 50 ms. Packets then wait in a queue, and
+    /// the app should send less.
     pub queueing: bool,
-    /// Guest: how far what is shown is from the best estimate of the truth, the largest of all bodies, as a share of the state's size (0 to 1
-    /// and beyond). It is the part of the error that the receiver knows of: what a correction has found and the blend has not yet taken out.
+    /// Guest: distance of the visual state from the best estimate of the true state, as a share of
+    /// the state's size (0 to 1 and beyond). The largest of all bodies. It is the part of the error
+    /// that the receiver knows: what corrections have found and the blend has not yet removed.
     pub shown_offset: f64,
 }
 
 impl NetStats {
-    /// Adds how one open connection does; its counts come by [`NetStats::count`].
+    /// Adds the metrics of one open connection. [`NetStats::count`] adds its counts.
     pub(crate) fn add(&mut self, link: &LinkStats, transport: &PeerStats) {
         let before = self.peers as f64;
         let mean = |old: f64, new: f64| (old * before + new) / (before + 1.0);
@@ -98,7 +107,7 @@ impl NetStats {
         self.peers += 1;
     }
 
-    /// Takes over the counts of all connections, those that are over included.
+    /// Takes over the counts of all connections, including closed ones.
     pub(crate) fn count(&mut self, links: &LinkStats, lines: &SourceCounts) {
         self.datagrams_out = links.datagrams_out;
         self.datagrams_in = links.datagrams_in;
@@ -108,7 +117,7 @@ impl NetStats {
     }
 }
 
-/// What the transport has counted.
+/// The transport's counts.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
 pub(crate) struct SourceCounts {
     bytes_out: u64,
@@ -131,8 +140,8 @@ impl SourceCounts {
     }
 }
 
-/// Keeps what connections have counted when they are over, so that sums never fall. What a connection does after the last frame that saw it
-/// is not in it.
+/// Keeps the counts of closed connections, so that sums never fall. Traffic of a connection after
+/// the last frame that saw it open is not included.
 #[derive(Debug, Default)]
 pub(crate) struct Ledger {
     open: BTreeMap<PeerId, SourceCounts>,
@@ -140,12 +149,12 @@ pub(crate) struct Ledger {
 }
 
 impl Ledger {
-    /// The sums, with the connections that are open now.
+    /// Returns the sums, including the connections that are open now.
     pub(crate) fn sum(&mut self, open: impl Iterator<Item = (PeerId, PeerStats)>) -> SourceCounts {
         let now: BTreeMap<PeerId, SourceCounts> =
             open.map(|(peer, line)| (peer, SourceCounts::of(&line))).collect();
         for (peer, before) in std::mem::take(&mut self.open) {
-            // A number may be that of a new connection: its bytes begin at none.
+            // The number may belong to a new connection, whose byte counts start at zero.
             if now.get(&peer).is_none_or(|now| now.bytes_out < before.bytes_out) {
                 self.over.add(&before);
             }
@@ -157,7 +166,7 @@ impl Ledger {
     }
 }
 
-/// What the rates are measured from.
+/// Counts at the last measurement of the rates.
 #[derive(Resource, Debug, Default)]
 pub(crate) struct RateMarks {
     since: Option<Instant>,
@@ -168,11 +177,11 @@ pub(crate) struct RateMarks {
     dropped: u64,
 }
 
-/// Rates are refreshed so often.
+/// Interval between two measurements of the rates.
 const RATE_WINDOW: Duration = Duration::from_secs(1);
 
 impl NetStats {
-    /// Takes the rates over from the frame before, or measures them anew once a second.
+    /// Takes the rates over from the previous frame, or measures them anew once a second.
     pub(crate) fn keep_rates(&mut self, before: &Self, marks: &mut RateMarks, diagnostics: &mut Diagnostics) {
         self.bytes_in_per_s = before.bytes_in_per_s;
         self.bytes_out_per_s = before.bytes_out_per_s;

@@ -1,10 +1,10 @@
-//! Where a held patch is on a shape that somebody else steps.
+//! Patch kinematics: the position of a held patch on a shape that another app steps.
 
 use bevy::math::DVec3;
 use pliant_body::Grab;
 use pliant_modal::{GrabConfig, ModalModel, ModelError, Patch, warp};
 
-/// The mean of a patch over its vertices, as a function of the modal coordinates.
+/// The mean position of a patch's vertices as a function of the modal coordinates.
 #[derive(Debug, Clone)]
 pub(crate) struct PatchPoint {
     rest: DVec3,
@@ -37,7 +37,8 @@ impl PatchPoint {
         Ok(point)
     }
 
-    /// The mean position, in body axes, m. With warp `u = R~(w) d` of the patch's mean displacement and rotation.
+    /// Returns the patch's mean position in body axes, m. With `warped`, the displacement is
+    /// `u = R~(w) d`, where `d` and `w` are the patch's mean displacement and rotation.
     pub(crate) fn at(&self, q: &[f64], warped: bool) -> DVec3 {
         let sum = |columns: &[DVec3]| {
             columns.iter().zip(q).fold(DVec3::ZERO, |sum, (column, &q)| sum + *column * q)
@@ -51,12 +52,13 @@ impl PatchPoint {
     }
 }
 
-/// A hand's own spring and damper.
+/// Returns the spring and damper parameters of a grab.
 pub(crate) fn hold_of(grab: &Grab) -> GrabConfig {
     GrabConfig { stiffness: grab.stiffness, relaxation: grab.relaxation }
 }
 
-/// Whether a grab still holds so. By bits: what is not a number is told, and refused, once.
+/// Returns whether a grab still has the parameters `hold`. The comparison is by bits, so that a NaN
+/// value is sent, and refused, only once.
 pub(crate) fn holds_so(grab: &Grab, hold: &GrabConfig) -> bool {
     let bits = |hold: &GrabConfig| (hold.stiffness.map(f64::to_bits), hold.relaxation.to_bits());
     bits(&hold_of(grab)) == bits(hold)

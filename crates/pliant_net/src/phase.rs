@@ -1,19 +1,21 @@
-//! Where between two ticks a frame falls.
+//! Position of a frame between two ticks.
 
 use std::time::Duration;
 
-/// Follows the session's playout clock from outside: it is only seen which tick is shown after each update.
+/// Estimates the session's playout clock from the tick that is displayed after each update.
 ///
-/// If tick `n` is the newest at time `now`, tick 0 was due at some `e` with `e + n h <= now < e + (n + 1) h`. Holding `e` within these
-/// bounds, frame after frame, finds it to within the smallest remainder that a frame happened to have, and follows the clock when it is
-/// slewed. The error moves the picture by that part of a tick, evenly; it never jumps as the frame's own time would.
+/// If tick `n` is the newest at time `now`, tick 0 was due at some `e` with
+/// `e + n h <= now < e + (n + 1) h`. The estimate of `e` is clamped to these bounds in every frame.
+/// Its error therefore falls to the smallest remainder of a tick that a frame has had, and the
+/// estimate tracks the clock when the clock is slewed. The error shifts the picture evenly by that
+/// part of a tick, without the jumps that the frame's own time would cause.
 #[derive(Debug, Clone, Copy, Default)]
 pub(crate) struct Phase {
     zero: Option<f64>,
 }
 
 impl Phase {
-    /// The fraction of a tick, 0 to 1, that has passed since `tick` was due.
+    /// Returns the fraction of a tick, 0 to 1, that has passed since `tick` was due.
     pub(crate) fn fraction(&mut self, tick: u64, step: f64, now: Duration) -> f64 {
         let latest = now.as_secs_f64() - tick as f64 * step;
         let zero = self.zero.unwrap_or(latest).clamp(latest - step, latest);
@@ -28,7 +30,8 @@ mod tests {
 
     #[test]
     fn the_picture_moves_evenly_though_frames_and_ticks_beat() {
-        // Ticks at 40 Hz, due 7 ms after the full; frames at 60 Hz with 3 ms of jitter.
+        // The ticks run at 40 Hz and are due 7 ms after the full second. The frames run at 60 Hz
+        // with 3 ms of jitter.
         let (step, due) = (0.025, 0.007);
         let mut phase = Phase::default();
         let mut jitter = 1u64;
@@ -39,12 +42,12 @@ mod tests {
             let tick = ((now - due) / step).floor();
             let shown = tick + phase.fraction(tick as u64, step, Duration::from_secs_f64(now));
             let error = shown - (now - due) / step;
-            // A second to settle in.
+            // The estimate gets one second to converge.
             if frame > 60 {
                 worst = worst.max(error.abs());
             }
         }
-        // A remainder below 0.06 of a tick comes by within a second.
+        // A remainder below 0.06 of a tick occurs within one second.
         assert!(worst < 0.1, "the shown time is off by {worst} of a tick");
     }
 

@@ -1,4 +1,4 @@
-//! The plugin, and when its systems run.
+//! The network plugin and its system sets.
 
 use std::sync::{Mutex, PoisonError};
 
@@ -23,19 +23,21 @@ use crate::user::{UserJoined, UserLeft};
 #[derive(Debug, Error)]
 #[non_exhaustive]
 pub enum NetError {
-    /// The socket or the keys.
+    /// The socket or the keys could not be set up.
     #[error(transparent)]
     Transport(#[from] TransportError),
-    /// The file to record to or to play.
+    /// The file to record to, or to play, could not be used.
     #[error(transparent)]
     Recording(#[from] RecordingError),
 }
 
-/// Hosts a session, joins one, plays among peers, or plays a recording. Add it after [`PliantBodyPlugin`](pliant_body::PliantBodyPlugin).
+/// Hosts a session, joins one, plays among peers, or plays a recording. Add it after
+/// [`PliantBodyPlugin`](pliant_body::PliantBodyPlugin).
 ///
-/// The socket is open from the constructor on, so that a host's invite can be shown before the app runs; nobody is let in before it does.
-/// When the app ends (closed, or by Ctrl-C where Bevy's `TerminalCtrlCHandlerPlugin` makes an exit of it), or [`NetHost`], [`NetGuest`] or
-/// [`NetPeer`] is removed, the others are told.
+/// The constructor opens the socket, so that a host's invite can be shown before the app runs. The
+/// host admits no guest before the app runs. The other participants receive a goodbye when the app
+/// ends (closed, or by Ctrl-C if Bevy's `TerminalCtrlCHandlerPlugin` turns it into an exit), or
+/// when [`NetHost`], [`NetGuest`] or [`NetPeer`] is removed.
 pub struct NetPlugin {
     start: Mutex<Option<Start>>,
     invite: Option<Invite>,
@@ -48,19 +50,20 @@ enum Start {
     Peer(Box<NetPeer>),
 }
 
-/// The plugin's systems.
+/// System sets of the plugin.
 #[derive(SystemSet, Debug, Clone, PartialEq, Eq, Hash)]
 pub enum NetSystems {
-    /// `PreUpdate`: what came is taken in; users, bodies and grabs come and go.
+    /// `PreUpdate`: received data is processed, and users, bodies and grabs are added and removed.
     Receive,
     /// Host, in the bodies' schedule, after [`PliantSystems::Publish`]: the step is sent.
     Send,
-    /// Guest and peer, `PostUpdate`, before the surfaces are written: own hands are sent, shapes and forces are shown.
+    /// Guest and peer, `PostUpdate`, before the surfaces are written: the local hands are sent, and
+    /// shapes and forces are displayed.
     Show,
 }
 
 impl NetPlugin {
-    /// Hosts a session. Guests are let in once the app runs.
+    /// Hosts a session. Guests are admitted once the app runs.
     ///
     /// # Errors
     /// [`NetError::Transport`] when the socket or the keys cannot be set up.
@@ -70,11 +73,12 @@ impl NetPlugin {
         Ok(Self::new(Start::Host(Box::new(config), endpoint), invite))
     }
 
-    /// Joins the session of an invite. That the host is there and lets us in shows later: [`NetGuest::state`],
-    /// [`SessionJoined`](crate::SessionJoined), [`SessionClosed`](crate::SessionClosed).
+    /// Joins the session of an invite. The outcome is known later, from [`NetGuest::state`],
+    /// [`SessionJoined`](crate::SessionJoined) and [`SessionClosed`](crate::SessionClosed).
     ///
     /// # Errors
-    /// [`NetError::Transport`] when the socket or the keys cannot be set up, [`NetError::Recording`] when the file to record to cannot be made.
+    /// [`NetError::Transport`] when the socket or the keys cannot be set up,
+    /// [`NetError::Recording`] when the file to record to cannot be created.
     pub fn join(invite: &Invite, mut config: JoinConfig) -> Result<Self, NetError> {
         let limits = config.transport.limits.clone();
         let endpoint = Endpoint::join(invite, std::mem::take(&mut config.transport))?;
@@ -82,14 +86,16 @@ impl NetPlugin {
         Ok(Self::new(Start::Join(Box::new(NetGuest::join(config, endpoint)?)), None))
     }
 
-    /// Plays a recorded session into a guest, at the speed at which it was recorded: bodies, users and hands come and go as they did. Nothing is
-    /// sent, and grabs of this app hold nothing.
+    /// Plays a recorded session in a guest, at the speed at which it was recorded. Bodies, users
+    /// and hands appear and disappear as they did in the recorded session. Nothing is sent, and
+    /// this app's own grabs have no effect.
     pub fn replay(recording: Recording, mut config: JoinConfig) -> Self {
         config.models.extend(recording.models.iter().cloned());
         Self::new(Start::Join(Box::new(NetGuest::replay(config, recording))), None)
     }
 
-    /// Plays among peers, of which every one steps the bodies: begins ([`PeerConfig::join`] is `None`), or comes to those who are there.
+    /// Plays among peers, each of which steps the bodies. Starts a new session if
+    /// [`PeerConfig::join`] is `None`, otherwise joins the peers of the invite.
     ///
     /// # Errors
     /// [`NetError::Transport`] when a socket or the keys cannot be set up.
@@ -103,13 +109,13 @@ impl NetPlugin {
         Self { start: Mutex::new(Some(start)), invite, schedule: FixedUpdate.intern() }
     }
 
-    /// The schedule in which the bodies are stepped, where it is not `FixedUpdate`.
+    /// Sets the schedule in which the bodies are stepped. Default: `FixedUpdate`.
     pub fn in_schedule(mut self, schedule: impl ScheduleLabel) -> Self {
         self.schedule = schedule.intern();
         self
     }
 
-    /// What others paste to join this host or peer. `None` for a guest.
+    /// Returns the invite to this host or peer. `None` for a guest.
     pub fn invite(&self) -> Option<&Invite> {
         self.invite.as_ref()
     }
@@ -181,7 +187,7 @@ impl Plugin for NetPlugin {
     }
 }
 
-/// `Last`: the figures of this frame.
+/// `Last`: updates the metrics of this frame.
 fn measure(
     host: Option<ResMut<NetHost>>,
     guest: Option<ResMut<NetGuest>>,

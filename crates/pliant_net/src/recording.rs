@@ -1,7 +1,9 @@
-//! A session on disk: everything that a guest received, with its times, to be played into a guest again.
+//! A recorded session: everything that a guest received, with the times, for replay in a guest.
 //!
-//! The file is eight bytes that say what it is, then one zstd stream of records: `u8` kind, `u64` time since the guest began (us), `u32` length, and
-//! so many bytes; little end first. What a guest sent is not in it: the session is one that follows, and it follows the same way again.
+//! The file starts with eight magic bytes. One zstd stream of records follows. Each record is a
+//! `u8` kind, a `u64` time since the guest began (us), a `u32` length, and that many bytes, all
+//! little-endian. The guest's own outgoing data is not recorded, because the session only depends
+//! on what the guest received.
 
 use std::fs::File;
 use std::io::{self, BufReader, Read, Write};
@@ -20,15 +22,16 @@ use thiserror::Error;
 use crate::transport::Role;
 
 const MAGIC: &[u8; 8] = b"PLIANT\x01R";
-/// Of zstd: fast enough to be nothing beside a step.
+/// zstd compression level. Its cost is negligible beside a simulation step.
 const LEVEL: i32 = 3;
-/// What is in the encoder reaches the file so often, so that a crash costs no more.
+/// Interval at which the encoder's data is flushed to the file, so that a crash loses no more than
+/// this.
 const FLUSH_EVERY: Duration = Duration::from_secs(1);
-/// A recording of a day at a megabit a second.
+/// Largest recording, bytes before compression. This is about a day at 1 Mbit/s.
 const MOST_BYTES: u64 = 12 << 30;
-/// No record is longer: a model at most.
+/// Largest record, bytes. The largest records are models.
 const LONGEST: u32 = 1 << 30;
-/// zstd's window is at most 2^27 bytes: no file makes a reader take more.
+/// Largest zstd window is 2^27 bytes, so that no file makes a reader allocate more.
 const WINDOW_LOG: u32 = 27;
 
 const CONNECTED: u8 = 0;
@@ -37,24 +40,24 @@ const MESSAGE: u8 = 2;
 const MODEL: u8 = 3;
 const CLOSED: u8 = 4;
 
-/// Something that reached the guest.
+/// A piece of data that the guest received.
 #[derive(Debug, Clone, PartialEq)]
 pub(crate) enum Record {
-    /// The connection is open, for this role and datagrams of at most so many bytes.
+    /// The connection is open, with this role and datagrams of at most `max_datagram` bytes.
     Connected {
         role: Role,
         max_datagram: u16,
     },
     Datagram(Bytes),
     Message(Bytes),
-    /// A model that was in the guest's cache, as a `.modal` file.
+    /// A model from the guest's cache, as a `.modal` file.
     Model(Bytes),
-    /// The connection ended, in words.
+    /// The connection ended. The string is the reason.
     Closed(String),
 }
 
 impl Record {
-    /// What it holds in memory, bytes.
+    /// Size of the record's data in memory, bytes.
     fn len(&self) -> usize {
         match self {
             Self::Connected { .. } => 0,
@@ -71,43 +74,44 @@ pub enum RecordingError {
     /// The file cannot be read or written.
     #[error("{}: {source}", path.display())]
     File {
-        /// Which.
+        /// Path of the file.
         path: PathBuf,
-        /// What the system says.
+        /// Error of the operating system.
         source: io::Error,
     },
-    /// The file is no recording of this version.
+    /// The file is not a recording of this version.
     #[error("{} is no recording of a Pliant session, or one of another version", path.display())]
     Kind {
-        /// Which.
+        /// Path of the file.
         path: PathBuf,
     },
 }
 
 type Encoder = zstd::stream::write::Encoder<'static, File>;
 
-/// What waits for the recorder's thread at most: records, and bytes in them (models not counted, they are held anyway).
+/// Most records, and most bytes in them, that may wait for the recorder's thread. Models are not
+/// counted, because they are in memory anyway.
 const MOST_WAITING: usize = 8192;
 const MOST_WAITING_BYTES: usize = 64 << 20;
 
-/// What is kept.
+/// Data for the recorder's thread.
 enum Kept {
     Record(Record),
-    /// To be written as a file on the way.
+    /// A model, which the recorder's thread encodes as a file.
     Model(Arc<ModalModel>),
 }
 
-/// Writes a recording on a thread of its own, so that no frame waits for a disk; it is whole when this is dropped, and but for a second when the
-/// process is killed.
+/// Writes a recording on its own thread, so that no frame waits for a disk. The file is complete
+/// when the recorder is dropped. If the process is killed, about the last second is missing.
 pub(crate) struct Recorder {
-    /// None after a failure.
+    /// `None` after a failure.
     to: Option<SyncSender<(Duration, Kept)>>,
     waiting: Arc<AtomicUsize>,
     thread: Option<JoinHandle<()>>,
     path: PathBuf,
 }
 
-/// The thread's side.
+/// The recorder's state on its thread.
 struct Writer {
     encoder: Encoder,
     waiting: Arc<AtomicUsize>,
@@ -127,7 +131,7 @@ impl Recorder {
         let named = path.to_owned();
         let write = move || {
             if let Err(error) = writer.write_all(&from) {
-                // The session is worth more than its recording.
+                // A failed recording must not end the session.
                 error!("{}: {error}; the recording ends here", named.display());
             }
         };
@@ -139,7 +143,7 @@ impl Recorder {
         self.send(at, record.len(), Kept::Record(record.clone()));
     }
 
-    /// A model of the guest's cache, which never comes over the line.
+    /// Records a model of the guest's cache, which the host never sends.
     pub(crate) fn put_model(&mut self, at: Duration, model: &Arc<ModalModel>) {
         self.send(at, 0, Kept::Model(model.clone()));
     }
@@ -155,7 +159,7 @@ impl Recorder {
                 error!("{}: the disk does not keep up; the recording ends here", self.path.display());
                 self.to = None;
             }
-            // The thread has said why.
+            // The thread has logged the error.
             Err(TrySendError::Disconnected(_)) => self.to = None,
         }
     }
@@ -225,10 +229,11 @@ pub struct Recording {
 }
 
 impl Recording {
-    /// Opens a recording. Reads it through once, for the models in it.
+    /// Opens a recording. Reads the whole file once, to find its models.
     ///
     /// # Errors
-    /// [`RecordingError`]. A file that ends too soon is no error: it is played as far as it goes.
+    /// [`RecordingError`] when the file cannot be read or is not a recording of this version. A
+    /// truncated file is not an error: it is played as far as it goes.
     pub fn open(path: impl AsRef<Path>) -> Result<Self, RecordingError> {
         let path = path.as_ref();
         let mut first = open(path)?;
@@ -246,7 +251,8 @@ impl Recording {
         Ok(Self { decoder, models, next })
     }
 
-    /// What was received up to `now`, one record a call.
+    /// Returns the next record that was received up to `now`. Call it repeatedly to get all of
+    /// them.
     pub(crate) fn poll(&mut self, now: Duration) -> Option<(Duration, Record)> {
         if self.next.as_ref()?.0 > now {
             return None;
@@ -256,7 +262,7 @@ impl Recording {
         due
     }
 
-    /// Everything has been played.
+    /// Returns whether everything has been played.
     pub(crate) fn is_over(&self) -> bool {
         self.next.is_none()
     }
@@ -274,7 +280,8 @@ fn open(path: &Path) -> Result<zstd::stream::read::Decoder<'static, BufReader<Fi
     Ok(decoder)
 }
 
-/// The next record; `None` at the end, and at the first that is cut off or makes no sense.
+/// Reads the next record. Returns `None` at the end of the file and at the first truncated or
+/// invalid record.
 fn read(from: &mut impl Read) -> Option<(Duration, Record)> {
     let mut head = [0; 13];
     from.read_exact(&mut head).ok()?;
@@ -285,7 +292,7 @@ fn read(from: &mut impl Read) -> Option<(Duration, Record)> {
     if length > LONGEST {
         return None;
     }
-    // Memory grows with what is there, not with what is announced.
+    // Memory grows with the bytes that are present, not with the announced length.
     let mut bytes = Vec::new();
     from.by_ref().take(u64::from(length)).read_to_end(&mut bytes).ok()?;
     if bytes.len() != length as usize {
@@ -348,7 +355,8 @@ mod tests {
         let bytes = std::fs::read(&path).unwrap();
         let raw: usize = records.len() * 213;
         assert!(bytes.len() < raw, "{} bytes of {raw}", bytes.len());
-        // Every cut, and every byte turned about, is played as far as it goes and no further.
+        // A truncated file is played up to the cut. A file with a corrupt byte is read without a
+        // panic.
         for cut in (0..bytes.len()).step_by(97) {
             std::fs::write(&path, &bytes[..cut]).unwrap();
             match Recording::open(&path) {

@@ -1,76 +1,82 @@
-//! What a guest's app sees of the session: components on the bodies that follow the host's, and messages.
+//! Components and messages through which a guest's app sees the session.
 
 use bevy::math::DVec3;
 use bevy::prelude::*;
 use pliant_stream::{BodyId, UserId};
 
-/// The session's body that this entity follows.
+/// The session's body that this entity tracks.
 #[derive(Component, Debug, Clone, Copy, PartialEq, Eq)]
 pub struct RemoteBody(pub BodyId);
 
 /// Another user's hand on a body.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct RemoteHand {
-    /// Whose.
+    /// The user whose hand this is.
     pub user: UserId,
-    /// Surface vertex in the middle of the patch.
+    /// Surface vertex at the center of the patch.
     pub vertex: u32,
-    /// Where the hand is, m, world.
+    /// Position of the hand, m, world.
     pub target: DVec3,
-    /// The force that the body exerts on it, N, world.
+    /// The force that the body exerts on the hand, N, world.
     pub reaction: DVec3,
 }
 
-/// The hands of the others on a guest's body, at the tick that is shown. At most [`pliant_stream::MAX_GRABS`].
+/// The hands of the other users on a guest's body at the displayed tick. At most
+/// [`pliant_stream::MAX_GRABS`].
 #[derive(Component, Debug, Clone, Default, PartialEq)]
 pub struct RemoteHands(pub Vec<RemoteHand>);
 
-/// A body of the host is here.
+/// A body of the host has arrived.
 #[derive(Message, Debug, Clone, PartialEq)]
 pub struct BodyArrived {
-    /// The entity it arrived on: with [`RemoteBody`], [`ModalBody`](pliant_body::ModalBody) and [`SharedBody`](crate::SharedBody).
+    /// The entity of the body, with [`RemoteBody`], [`ModalBody`](pliant_body::ModalBody) and
+    /// [`SharedBody`](crate::SharedBody).
     pub entity: Entity,
-    /// Its name.
+    /// Name of the body.
     pub name: String,
 }
 
-/// The host has taken a body out of the session. An entity that was made for it is gone; one that the app had made stays, as it was last seen.
+/// The host has removed a body from the session. An entity that the plugin spawned for the body is
+/// despawned. An entity of the app stays, in the state in which it was last displayed.
 #[derive(Message, Debug, Clone, PartialEq)]
 pub struct BodyLeft {
-    /// The entity.
+    /// The entity of the body.
     pub entity: Entity,
-    /// Its name.
+    /// Name of the body.
     pub name: String,
 }
 
-/// The host has not let one of our grabs hold, or has taken it off the body. Despawn it, or change its vertex or radius to try again.
+/// The host has refused one of this app's grabs, or has taken it off the body. Despawn the grab, or
+/// change its vertex or radius to try again.
 #[derive(Message, Debug, Clone, PartialEq)]
 pub struct GrabRefused {
-    /// The grab.
+    /// The entity of the grab.
     pub entity: Entity,
 }
 
-/// The host cannot be heard any more. Bodies stand as they were last seen, the others' users are gone, and joining is tried again
+/// The guest has lost its connection to the host. Bodies keep their last displayed state, the
+/// entities of the other users are despawned, and the guest tries to join again
 /// ([`JoinConfig::rejoin`](crate::JoinConfig::rejoin)).
 #[derive(Message, Debug, Clone, PartialEq)]
 pub struct SessionLost {
-    /// Why, in words.
+    /// Reason, as text.
     pub reason: String,
 }
 
-/// In the session: for the first time, or again.
+/// This app has joined the session, for the first time or again.
 #[derive(Message, Debug, Clone, Copy, PartialEq, Eq)]
 pub struct SessionJoined {
-    /// Our number: the same as before, where the host remembers us.
+    /// The number of this app's user. It is the same as before if the host remembers this user's
+    /// key.
     pub user: UserId,
-    /// After a [`SessionLost`].
+    /// Whether the guest was in the session before, as after a [`SessionLost`].
     pub again: bool,
 }
 
 /// The session is over.
 #[derive(Message, Debug, Clone, PartialEq)]
 pub struct SessionClosed {
-    /// Why, in words.
+    /// Reason, as text.
     pub reason: String,
 }
 

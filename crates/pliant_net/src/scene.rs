@@ -1,7 +1,7 @@
-//! What the apps tell each other beside the session: where the host has placed its bodies, who the people are and how they are reached, and what a
-//! guest wants to see.
+//! Reliable messages between the apps beside the session: the host's body transforms, the users and
+//! their links, and the guests' subscriptions.
 //!
-//! Every reliable message begins with a byte that says whose it is. All kinds share the one ordered stream.
+//! The first byte of every reliable message is its kind. All kinds share one ordered stream.
 
 use std::sync::Arc;
 use std::time::Duration;
@@ -13,55 +13,58 @@ use pliant_stream::{BodyId, UserId};
 use crate::transport::Role;
 use crate::user::UserLink;
 
-/// A body that everybody in the session sees and may hold.
+/// A body that all users of the session see and may hold.
 ///
-/// On a host, next to a [`ModalBody`](pliant_body::ModalBody): the body is streamed. On a guest, on an entity that the app has made for the
-/// body of this name: the body arrives there, wherever the entity is, with what else is on it (a material, say). A guest without such an entity gets
-/// one made, where the host has it.
+/// On a host, next to a [`ModalBody`](pliant_body::ModalBody), this component streams the body. On
+/// a guest, the app may put it on an entity for the body of this name. The body then arrives on
+/// that entity, which keeps its transform and its other components (a material, for example). If
+/// there is no such entity, the plugin spawns one at the host's transform.
 #[derive(Component, Debug, Clone, PartialEq, Eq, Reflect)]
 #[reflect(Component, Clone, PartialEq)]
 pub struct SharedBody {
-    /// What the body is called in the session, at most 64 bytes. Two bodies of one name are met in the order in which they arrive.
+    /// Name of the body in the session, at most 64 bytes. Bodies of the same name are matched in
+    /// the order in which they arrive.
     pub name: String,
 }
 
 impl SharedBody {
-    /// A body called `name`.
+    /// Creates a shared body called `name`.
     pub fn named(name: impl Into<String>) -> Self {
         Self { name: name.into() }
     }
 }
 
-/// A message of the session.
+/// Kind: a message of the session.
 const SESSION: u8 = 0;
-/// A [`Placement`].
+/// Kind: a [`Placement`].
 const PLACEMENT: u8 = 1;
-/// [`Person`]s, from the host.
+/// Kind: [`Person`]s, sent by the host.
 const PEOPLE: u8 = 2;
-/// [`Reach`]es, from the host.
+/// Kind: [`Reach`]es, sent by the host.
 const REACHES: u8 = 3;
-/// A [`Wanted`], from a guest.
+/// Kind: a [`Wanted`], sent by a guest.
 const WANTED: u8 = 4;
 
 /// Longest name, bytes.
 pub(crate) const LONGEST_NAME: usize = 64;
 
-/// Somebody in the session.
+/// A user of the session.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub(crate) struct Person {
     pub(crate) user: UserId,
     pub(crate) role: Role,
-    /// At most [`LONGEST_NAME`] bytes.
+    /// Name of the user, at most [`LONGEST_NAME`] bytes.
     pub(crate) name: String,
 }
 
-/// How the host reaches somebody.
+/// Quality of the host's link to a user.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub(crate) struct Reach {
     pub(crate) user: UserId,
-    /// us.
+    /// Round trip, us.
     pub(crate) round_trip: u32,
-    /// Of what they send and of what is sent to them; 255 is all.
+    /// Loss of the user's datagrams (`loss_in`) and of the datagrams to the user (`loss_out`); 255
+    /// is total loss.
     pub(crate) loss_in: u8,
     pub(crate) loss_out: u8,
 }
@@ -86,7 +89,8 @@ impl Reach {
     }
 }
 
-/// How many modes of a body a guest wants: 0 none, [`Wanted::ALL`] all that it takes anyway.
+/// A guest's subscription to a body, as a number of modes. Zero means none and [`Wanted::ALL`]
+/// means all modes that the guest accepts.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(crate) struct Wanted {
     pub(crate) body: BodyId,
@@ -119,7 +123,7 @@ pub(crate) fn people_message(people: &[Person]) -> Bytes {
     message.freeze()
 }
 
-/// As much of a name as is sent.
+/// Cuts a name to the length that is sent.
 pub(crate) fn shortened(name: &str) -> &str {
     let end = (0..=LONGEST_NAME.min(name.len())).rev().find(|&end| name.is_char_boundary(end));
     &name[..end.unwrap_or(0)]
@@ -176,14 +180,14 @@ fn wanted_from(bytes: &[u8]) -> Option<Wanted> {
     Some(Wanted { body: BodyId(u16::from_le_bytes([a, b])), modes: u16::from_le_bytes([c, d]) })
 }
 
-/// Where the host has a body.
+/// The host's transform of a body.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub(crate) struct Placement {
     pub(crate) body: BodyId,
     pub(crate) transform: Transform,
 }
 
-/// A reliable message, by whose it is.
+/// A reliable message, by kind.
 #[derive(Debug, PartialEq)]
 pub(crate) enum Reliable<'a> {
     Session(&'a [u8]),
@@ -201,7 +205,7 @@ pub(crate) fn session_message(bytes: &Arc<[u8]>) -> Bytes {
 }
 
 impl Placement {
-    /// Of a body at `transform`; its scale is uniform.
+    /// The placement of a body at `transform`, whose scale is uniform.
     pub(crate) fn new(body: BodyId, transform: &GlobalTransform) -> Self {
         let (scale, rotation, translation) = transform.to_scale_rotation_translation();
         Self { body, transform: Transform { translation, rotation, scale: Vec3::splat(scale.x) } }
@@ -242,7 +246,7 @@ impl Placement {
     }
 }
 
-/// Reads any bytes. `None`: of no kind that this version knows, or with a number out of range.
+/// Reads any bytes. Returns `None` for an unknown kind or a number out of range.
 pub(crate) fn read(message: &[u8]) -> Option<Reliable<'_>> {
     match message.split_first()? {
         (&SESSION, rest) => Some(Reliable::Session(rest)),
@@ -274,7 +278,7 @@ mod tests {
         for cut in 0..message.len() {
             assert_eq!(read(&message[..cut]), None, "cut to {cut} bytes");
         }
-        // Each number in turn is NaN, infinite and absurd.
+        // Each number in turn is NaN, infinite and far out of range.
         for number in 0..8 {
             for bad in [f32::NAN, f32::INFINITY, 1e30] {
                 let mut message = message.to_vec();
@@ -307,13 +311,13 @@ mod tests {
                 assert_eq!(read(&message[..cut]), None, "cut to {cut} bytes of {message:?}");
             }
         }
-        // A role and a name that are none, and more people announced than are there.
+        // An invalid role, an invalid name, and a count of more people than the message holds.
         for (at, byte) in [(5, 2), (6, 65), (7, 0xff), (1, 3)] {
             let mut wrong = message.to_vec();
             wrong[at] = byte;
             assert_eq!(read(&wrong), None, "byte {at} is {byte}");
         }
-        // A name that is too long is cut between two letters.
+        // A name that is too long is cut at a character boundary.
         let long = person(1, Role::Hold, &"ä".repeat(40));
         let Some(Reliable::People(cut)) = read(&people_message(&[long])) else { panic!("not read") };
         assert_eq!(cut[0].name, "ä".repeat(32));

@@ -1,14 +1,17 @@
-//! Session coordinates: where points and forces of a body are said to be when they cross the network.
+//! Session coordinates, in which points and forces of a body are sent over the network.
 //!
-//! An anchored body is streamed in its own axes, so each app may place it anywhere and scale it, and hands meet on the same spot of the
-//! surface. A free body carries its pose in the stream and is streamed in world axes.
+//! An anchored body is streamed in its own axes. Each app may therefore place and scale it freely,
+//! and hands still meet on the same spot of the surface. A free body is streamed in world axes,
+//! together with its pose.
 
 use bevy::math::{DQuat, DVec3};
 use bevy::prelude::*;
 use pliant_body::BodyState;
 use pliant_stream::Pose;
 
-/// The map between an app's world and session coordinates for one body: `world = rotation * session * scale + origin`.
+/// The map between an app's world and session coordinates for one body:
+///
+/// `world = rotation * session * scale + origin`.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub(crate) struct SessionTransform {
     origin: DVec3,
@@ -17,7 +20,8 @@ pub(crate) struct SessionTransform {
 }
 
 impl SessionTransform {
-    /// Where the body of an entity is, or `None` while its transform cannot place a body (`pliant_body` has refused and told it then).
+    /// Returns the session transform of an entity's body. Returns `None` while the entity's
+    /// transform cannot place a body, in which case `pliant_body` has refused and reported it.
     pub(crate) fn of(transform: &GlobalTransform, free: bool) -> Option<Self> {
         let (scale, rotation, origin) = transform.to_scale_rotation_translation();
         if !(scale.x > 0.0 && scale.is_finite() && rotation.is_finite() && origin.is_finite()) {
@@ -30,7 +34,7 @@ impl SessionTransform {
         })
     }
 
-    /// The place of a body that is simulated here.
+    /// Returns the session transform of a body that has a local simulation state.
     pub(crate) fn of_body(transform: &GlobalTransform, state: &BodyState) -> Option<Self> {
         Self::of(transform, state.model().is_free())
     }
@@ -43,7 +47,7 @@ impl SessionTransform {
         self.rotation * (DVec3::from(session) * self.scale) + self.origin
     }
 
-    /// A point in body axes, in this app's world; `pose`: of a free body.
+    /// Converts a point in body axes to this app's world. `pose` is the pose of a free body.
     pub(crate) fn body_point_to_world(&self, pose: Option<Pose>, point: DVec3) -> DVec3 {
         let session = match pose {
             None => point,
@@ -52,7 +56,7 @@ impl SessionTransform {
         self.point_to_world(session.into())
     }
 
-    /// Forces scale like lengths: stiffness (N/m) stays as baked.
+    /// Forces scale like lengths, because the stiffness (N/m) stays as baked.
     pub(crate) fn force_to_session(&self, world: DVec3) -> [f64; 3] {
         (self.rotation.inverse() * world / self.scale).into()
     }
@@ -62,7 +66,7 @@ impl SessionTransform {
     }
 }
 
-/// Puts a free body between two poses of the session.
+/// Places a free body between two session poses.
 pub(crate) fn set_pose(transform: &mut Transform, from: &Pose, to: &Pose, fraction: f64, scale: f64) {
     let origin = DVec3::from(from.position).lerp(DVec3::from(to.position), fraction) * scale;
     let [from, to] = [from, to].map(|pose| DQuat::from_array(pose.rotation).normalize());
@@ -86,12 +90,13 @@ mod tests {
         };
         let place = SessionTransform::of(&GlobalTransform::from(transform), false).unwrap();
         let point = DVec3::new(0.4, 5.0, -0.6);
-        // f32 transforms: seven digits.
+        // Transforms are in `f32`, which has seven digits.
         assert!(place.point_to_world(place.point_to_session(point)).distance(point) < 1e-6);
         assert!(place.force_to_world(place.force_to_session(point)).distance(point) < 1e-6);
-        // The body's own origin is where the entity is.
+        // The body's own origin is at the entity's position.
         assert!(place.point_to_world([0.0; 3]).distance(DVec3::new(1.0, -2.0, 3.0)) < 1e-6);
-        // A force on a body twice as large is twice as large: N/m stays.
+        // A force on a body twice as large is twice as large, because the stiffness in N/m stays
+        // the same.
         assert!((place.force_to_world([0.0, 3.0, 0.0]).length() - 7.5).abs() < 1e-6);
         let free = SessionTransform::of(&GlobalTransform::from(transform), true).unwrap();
         assert!(DVec3::from(free.point_to_session(point)).distance(point / 2.5) < 1e-6);
@@ -102,7 +107,7 @@ mod tests {
         for bad in [
             Transform::from_scale(Vec3::ZERO),
             Transform::from_xyz(f32::NAN, 0.0, 0.0),
-            // A mirror: no rotation and no scale.
+            // A mirrored scale is neither a rotation nor a scale.
             Transform::from_scale(Vec3::splat(-1.0)),
         ] {
             for free in [false, true] {

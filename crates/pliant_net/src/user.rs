@@ -1,4 +1,4 @@
-//! The people of a session, as entities.
+//! The users of a session, as entities.
 
 use std::time::Duration;
 
@@ -7,14 +7,15 @@ use pliant_stream::UserId;
 
 use crate::transport::Role;
 
-/// A user of the session. Every app has an entity for each, itself included ([`Yourself`]).
+/// A user of the session. Every app has one entity for each user, including its own ([`Yourself`]).
 #[derive(Component, Debug, Clone, PartialEq)]
 pub struct User {
-    /// The number that the host gave. The user at the host is [`UserId::HOST`].
+    /// The number that the host gave the user. The user at the host is [`UserId::HOST`].
     pub id: UserId,
-    /// What the user is called, at most 64 bytes. From outside: show it, do not trust it.
+    /// Name of the user, at most 64 bytes. The name comes from the network: display it, but do not
+    /// trust it.
     pub name: String,
-    /// A color of the user's own, the same in every app.
+    /// The user's color, the same in every app.
     pub color: Color,
     /// What the user may do.
     pub role: Role,
@@ -26,12 +27,13 @@ impl User {
     }
 }
 
-/// A name from outside, fit for a screen.
+/// Removes the control characters from a name, so that it can be displayed.
 pub(crate) fn printable(name: &str) -> String {
     name.chars().filter(|c| !c.is_control()).collect()
 }
 
-/// The color of a user: hues a golden angle apart, so that neighbours by number differ well however many come.
+/// Returns the color of a user. Consecutive users' hues are a golden angle apart, so that users
+/// with consecutive numbers differ well, whatever their count.
 pub fn color_of(user: UserId) -> Color {
     const GOLDEN_ANGLE: f32 = 137.507_76;
     Color::hsl((200.0 + GOLDEN_ANGLE * f32::from(user.0)) % 360.0, 0.7, 0.55)
@@ -41,11 +43,14 @@ pub fn color_of(user: UserId) -> Color {
 #[derive(Component, Debug, Clone, Copy, PartialEq, Eq)]
 pub struct Yourself;
 
-/// How well a user is reached. On the host: on every guest's entity. On a guest: on its own entity, for the way to the host, and on the other guests', as the
-/// host says about once a second. Among peers: on every other peer's.
+/// Quality of the link to a user.
+///
+/// A host has it on every guest's entity. A guest has it on its own entity for the link to the
+/// host, and on the other guests' entities with the host's values, which arrive about once a
+/// second. A peer has it on every other peer's entity.
 #[derive(Component, Debug, Clone, Copy, PartialEq, Default)]
 pub struct UserLink {
-    /// Smoothed round trip; zero before the first measurement.
+    /// Smoothed round trip. Zero before the first measurement.
     pub round_trip: Duration,
     /// Share of that user's datagrams that do not arrive here, 0 to 1.
     pub loss_in: f64,
@@ -53,38 +58,38 @@ pub struct UserLink {
     pub loss_out: f64,
 }
 
-/// The user whose hand a [`Grab`](pliant_body::Grab) is. Despawned on a host, a guest's grab lets go, and the guest is told
-/// ([`GrabRefused`](crate::GrabRefused)).
+/// The user whose hand a [`Grab`](pliant_body::Grab) is. Despawning the entity on a host ends a
+/// guest's grab, and the guest receives [`GrabRefused`](crate::GrabRefused).
 #[derive(Component, Debug, Clone, Copy, PartialEq, Eq)]
 #[relationship(relationship_target = Hands)]
 pub struct HandOf(#[entities] pub Entity);
 
-/// The grabs of a user, oldest first. They are despawned with it: who leaves lets go.
+/// The grabs of a user, oldest first. They are despawned with the user.
 #[derive(Component, Debug, Default)]
 #[relationship_target(relationship = HandOf, linked_spawn)]
 pub struct Hands(Vec<Entity>);
 
-/// Somebody has joined.
+/// A user has joined.
 #[derive(Message, Debug, Clone, PartialEq)]
 pub struct UserJoined {
     /// The user's entity, with [`User`].
     pub entity: Entity,
-    /// Its number.
+    /// The user's number.
     pub id: UserId,
-    /// Its name.
+    /// The user's name.
     pub name: String,
-    /// The same user was here before, under the same number: by its key.
+    /// Whether the same user, recognized by its key, was here before under the same number.
     pub back: bool,
 }
 
-/// Somebody has left. The entity is gone.
+/// A user has left. The entity is despawned.
 #[derive(Message, Debug, Clone, PartialEq)]
 pub struct UserLeft {
-    /// The number it had.
+    /// The number that the user had.
     pub id: UserId,
-    /// The name it had.
+    /// The name that the user had.
     pub name: String,
-    /// Why, in words.
+    /// Reason, as text.
     pub reason: String,
 }
 
@@ -98,7 +103,8 @@ mod tests {
         for n in 0..20 {
             for m in n + 1..20 {
                 let apart = (hue(n) - hue(m)).abs();
-                // Twenty points of the golden-angle sequence are nowhere nearer than this on the circle.
+                // On the hue circle no two of the first twenty points of the golden-angle sequence
+                // are closer.
                 assert!(apart.min(360.0 - apart) > 7.0, "users {n} and {m}: {apart} degrees");
             }
         }

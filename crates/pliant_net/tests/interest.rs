@@ -1,4 +1,5 @@
-//! A scene with a camera: what it sees is sent, what it does not see is not, and what is far away comes coarser.
+//! Tests of a scene with a camera: visible bodies are sent, invisible ones are not, and distant
+//! ones are sent with fewer modes.
 #![allow(clippy::unwrap_used, clippy::expect_used, clippy::panic, reason = "a failed test should panic")]
 
 mod support;
@@ -18,24 +19,24 @@ use support::{
     Came, alone, app, arrival, body_of, guest, must, rests, run_frames, run_until, tick, wait_for, window,
 };
 
-/// The shipped body: 30 modes, a third of a metre high.
+/// The shipped body, with 30 modes and a height of a third of a meter.
 fn pip() -> Arc<ModalModel> {
     let file = Path::new(concat!(env!("CARGO_MANIFEST_DIR"), "/../../assets/pip.modal"));
     Arc::new(ModalModel::read(file).unwrap())
 }
 
-/// The host's hand rests.
+/// While this resource exists, the host's hand rests.
 #[derive(Resource)]
 struct Still;
 
-/// A host whose body is always in motion.
+/// Creates a host whose body is always in motion.
 fn moving() -> (App, Invite, Entity) {
     let net = NetPlugin::host(HostConfig::default()).unwrap();
     let invite = net.invite().unwrap().clone();
     let mut host = app(net);
     let handle = host.world_mut().resource_mut::<Assets<ModalAsset>>().add(ModalAsset(pip()));
     let body = host.world_mut().spawn((ModalBody::new(handle), SharedBody::named("pip"))).id();
-    // By the top of its head, a tenth of its height each way.
+    // The hand holds the top of the head and moves it by a tenth of the height each way.
     let model = pip();
     let positions = model.surface().positions();
     let top = (0..positions.len()).max_by(|&a, &b| positions[a][1].total_cmp(&positions[b][1])).unwrap();
@@ -53,12 +54,13 @@ fn watcher(invite: &Invite, interest: Option<CameraInterest>) -> App {
     guest(invite, JoinConfig { models: vec![pip()], interest, ..JoinConfig::default() })
 }
 
-/// A camera as an app has one, with what Bevy would compute for it: there is no renderer here that does.
+/// Sets a camera of an app, with the components that Bevy would compute, because no renderer here
+/// does so.
 fn look(app: &mut App, camera: Entity, from: Vec3, at: Vec3) {
     let place = GlobalTransform::from(Transform::from_translation(from).looking_at(at, Vec3::Y));
     let lens = PerspectiveProjection { fov: 0.8, aspect_ratio: 1.6, ..default() };
     let frustum: Frustum = lens.compute_frustum(&place);
-    // No `Transform`: nothing propagates over what is set here.
+    // The camera has no `Transform`, so propagation does not overwrite these components.
     app.world_mut().entity_mut(camera).insert((place, Projection::Perspective(lens), frustum));
 }
 
@@ -76,13 +78,13 @@ fn what_the_camera_does_not_see_is_not_sent_and_comes_back_when_it_does() {
     assert_eq!(interest(&guest), Interest::All);
     let seen = run_until(&mut [&mut host, &mut guest], "all ticks come", window(Came::ticks_come));
 
-    // It turns around. A second of patience, then nothing but the clock.
+    // The camera turns around. After one second of patience only the clock's datagrams arrive.
     look(&mut guest, camera, near, Vec3::Z * 9.0);
     run_until(&mut [&mut host, &mut guest], "patience is over", |apps| {
         interest(apps[1]) == Interest::Nothing
     });
-    // (Ticks cost bytes in sight, and time does out of it: a machine that is slow makes few of the
-    // ones in much of the other.)
+    // In view, ticks cost bytes. Out of view, time does. A slow machine makes few ticks in much
+    // time.
     let unseen = window(|came| {
         let unseen = came.only_the_clock()?;
         must!(10.0 * unseen.bytes_in_a_second() < seen.bytes_in_40_ticks(), "{unseen:?}, in sight {seen:?}");
@@ -90,14 +92,16 @@ fn what_the_camera_does_not_see_is_not_sent_and_comes_back_when_it_does() {
     });
     let unseen = run_until(&mut [&mut host, &mut guest], "nothing but the clock comes", unseen);
 
-    // From far away it is a fiftieth of the view's height: an eighth of the modes, but never fewer than four.
+    // From far away the body takes a fiftieth of the view's height. It gets an eighth of its modes,
+    // but never fewer than four.
     look(&mut guest, camera, Vec3::new(0.0, 0.2, 30.0), Vec3::Y * 0.15);
     run_until(&mut [&mut host, &mut guest], "four of 30 modes are asked for", |apps| {
         let interest = interest(apps[1]);
         must!(interest == Interest::Modes(4), "{interest:?}");
         Ok(())
     });
-    // (The default stream is mostly hands and repeats: fewer modes are less work for both sides, and hardly fewer bytes.)
+    // The default stream is mostly hands and repeats. Fewer modes are less work for both sides, but
+    // hardly fewer bytes.
     let far = window(|came| {
         let far = came.ticks_come()?;
         must!(far.bytes_in_40_ticks() < 1.1 * seen.bytes_in_40_ticks(), "{far:?} far away, {seen:?} near");
@@ -110,7 +114,7 @@ fn what_the_camera_does_not_see_is_not_sent_and_comes_back_when_it_does() {
         Ok(())
     });
 
-    // Near again: more is asked for at once, and the whole shape is right.
+    // Near the body, more modes are requested at once, and the whole shape is right.
     look(&mut guest, camera, near, Vec3::Y * 0.15);
     run_until(&mut [&mut host, &mut guest], "all is asked for", |apps| interest(apps[1]) == Interest::All);
     let again = run_until(&mut [&mut host, &mut guest], "all ticks come again", window(Came::ticks_come));
@@ -125,7 +129,7 @@ fn what_the_camera_does_not_see_is_not_sent_and_comes_back_when_it_does() {
         must!(off < 0.05, "off by {off}");
         Ok(())
     });
-    // A camera that is switched off sees nothing.
+    // An inactive camera sees nothing.
     guest.world_mut().get_mut::<Camera>(camera).unwrap().is_active = false;
     run_until(&mut [&mut host, &mut guest], "it sees nothing", |apps| interest(apps[1]) == Interest::Nothing);
 }
@@ -133,8 +137,8 @@ fn what_the_camera_does_not_see_is_not_sent_and_comes_back_when_it_does() {
 #[test]
 fn one_who_watches_costs_its_datagrams_and_no_work_of_the_encoder() {
     let _alone = alone();
-    // A guest that a busy machine answers late is taken for one behind a queue and cut down for a
-    // while, which makes its stream another one: then all begin anew.
+    // If a busy machine makes a guest answer late, the host assumes a queue and reduces that
+    // guest's stream for a while. The guests' streams then differ, and the test starts over.
     wait_for("two seconds in which two guests have the same stream", cost_of_watching);
 }
 

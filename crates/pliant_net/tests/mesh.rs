@@ -1,4 +1,4 @@
-//! Peers, and somebody at their door who is none: it speaks the peers' messages by itself.
+//! Tests of peers with an unauthenticated peer, which writes the peers' messages itself.
 #![allow(clippy::unwrap_used, clippy::expect_used, clippy::panic, reason = "a failed test should panic")]
 
 mod support;
@@ -22,7 +22,8 @@ use support::{alone, app, bar, must, run_until, wait_for};
 const INTRODUCE: u8 = 16;
 const WELCOME: u8 = 17;
 
-/// Misses the others after half a minute, and gives a newcomer five seconds to say who it is.
+/// Limits with which peers time out after half a minute, and a new peer has five seconds to
+/// introduce itself.
 fn limits() -> Limits {
     let (idle_timeout, handshake) = (Duration::from_secs(30), Duration::from_secs(5));
     Limits { idle_timeout, handshake, ..Limits::host() }
@@ -51,7 +52,7 @@ fn users(app: &mut App) -> usize {
     app.world_mut().query::<&User>().iter(app.world()).count()
 }
 
-/// What a newcomer with the right body says first.
+/// The first message of a new peer with the right body.
 fn introduction(app: &App, body: Entity, invite: &Invite) -> Bytes {
     let number = app.world().resource::<NetPeer>().body_of(body).unwrap();
     let words = invite.to_string();
@@ -101,7 +102,7 @@ fn who_was_sent_away_from_among_peers_gets_in_by_no_message_that_follows() {
     let (hold, watch) = (Token([1; 16]), Token([2; 16]));
     let (mut a, body, invite) = first(Access::Tokens(vec![Grant::hold(hold), Grant::watch(watch)]), limits());
     let hello = introduction(&a, body, &invite);
-    // Rightly: the words are those that let in.
+    // First the correct order, to check that these messages are accepted.
     let mut right = UnauthenticatedPeer::at(&invite.clone().with_token(hold));
     let mut said = false;
     run_until(&mut [&mut a], "who may hold is let in", |_| {
@@ -113,10 +114,11 @@ fn who_was_sent_away_from_among_peers_gets_in_by_no_message_that_follows() {
         right.welcomed()
     });
     drop(right);
-    // By a token to watch, and after a message that breaks the protocol.
+    // Then with a token to watch, and with a message that violates the protocol first.
     for (token, before) in [(watch, &[][..]), (hold, &[99_u8][..])] {
         let mut wrong = UnauthenticatedPeer::at(&invite.clone().with_token(token));
-        // The transport lets it in by itself; all is said before the peers' app hears of it and hangs up.
+        // The transport admits the connection by itself. All messages are sent before the peer's
+        // app processes the connection and closes it.
         wait_for("it connects", || {
             wrong.listen();
             wrong.connected
@@ -140,7 +142,7 @@ fn who_connects_and_does_not_say_who_it_is_keeps_no_place() {
     let (mut a, body, invite) = first(Access::Anyone, limits());
     let hello = introduction(&a, body, &invite);
     let mut silent: Vec<UnauthenticatedPeer> = (0..4).map(|_| UnauthenticatedPeer::at(&invite)).collect();
-    // The last says what it has and not, in the session, who it is.
+    // The last one sends its scene but does not introduce itself in the session.
     let mut said = false;
     run_until(&mut [&mut a], "all are hung up on", |_| {
         silent.iter_mut().for_each(UnauthenticatedPeer::listen);
@@ -152,7 +154,7 @@ fn who_connects_and_does_not_say_who_it_is_keeps_no_place() {
     });
     assert!(silent[3].welcomed(), "the last was given a number");
     assert!(silent.iter().all(|stranger| stranger.connected));
-    // Who does say it stays, for longer than one that comes after it and does not.
+    // A peer that introduces itself stays connected, for longer than a later one that does not.
     let (mut b, _) = peer("b", Some(invite.clone()), Access::Anyone, limits());
     run_until(&mut [&mut a, &mut b], "a peer gets in", |apps| users(apps[0]) == 2 && users(apps[1]) == 2);
     let mut later = UnauthenticatedPeer::at(&invite);
@@ -163,7 +165,7 @@ fn who_connects_and_does_not_say_who_it_is_keeps_no_place() {
     assert_eq!((users(&mut a), users(&mut b)), (2, 2));
 }
 
-/// Nothing gets through, either way.
+/// A link that loses all packets in both directions.
 fn cut() -> Option<Emulation> {
     let link = LinkConfig { loss: Loss::Random(1.0), ..LinkConfig::default() };
     Some(Emulation { outgoing: link.clone(), incoming: link, seed: 1 })
@@ -181,11 +183,11 @@ fn who_has_lost_two_peers_looks_for_both() {
         apps.iter_mut().all(|app| users(app) == 3)
     });
     c.world_mut().resource_mut::<NetPeer>().set_emulation(cut());
-    // It has the highest number and calls both, in vain.
+    // The third peer has the highest number, so it calls both others, without success.
     run_until(&mut [&mut a, &mut b, &mut c], "the last is alone", |apps| {
         users(apps[2]) == 1 && apps[2].world().resource::<NetPeer>().looked_for() == 2
     });
-    // After a call that has failed it calls again. The pause between two is a second.
+    // After a failed call the peer calls again. The pause between two calls is a second.
     let since = Instant::now();
     run_until(&mut [&mut a, &mut b, &mut c], "each was called twice", |_| {
         since.elapsed() > 2 * (handshake + Duration::from_secs(1))
@@ -193,11 +195,11 @@ fn who_has_lost_two_peers_looks_for_both() {
     assert_eq!(c.world().resource::<NetPeer>().looked_for(), 2);
 }
 
-/// Calls under way to others that never answer.
+/// Connection attempts under way to peers that never answer.
 const CALLS: u16 = 20;
 
-/// A peer that has just been let in, and told of so many others, by one that goes on listening at
-/// `door`.
+/// Creates a peer that has just been admitted and has received the invites of [`CALLS`] other
+/// peers. The peer at `door` admits it and keeps listening.
 fn calling(door: &Endpoint, silent: &UdpSocket, limits: Limits) -> App {
     let (mut app, _) = peer("caller", Some(door.invite()), Access::Anyone, limits);
     let asks = run_until(&mut [&mut app], "it asks to come in", |_| {
@@ -218,15 +220,15 @@ fn calling(door: &Endpoint, silent: &UdpSocket, limits: Limits) -> App {
         welcome.put_slice(words.as_bytes());
     }
     door.send_message(asks, welcome.freeze()).unwrap();
-    // The others are called in the frame in which it gets in.
+    // The peer connects to the others in the frame in which it is admitted.
     run_until(&mut [&mut app], "it gets in", |apps| {
         matches!(apps[0].world().resource::<NetPeer>().state(), PeerState::In { .. })
     });
     app
 }
 
-/// A connection that nobody answers takes a second to end. Twenty of them, one after another, take
-/// twenty.
+/// An unanswered connection takes a second to end. Twenty of them, one after another, would take
+/// twenty seconds.
 const TOO_LONG: Duration = Duration::from_secs(10);
 
 #[test]
@@ -234,11 +236,11 @@ fn calls_in_vain_freeze_no_frame_and_an_end_waits_for_all_of_them_at_once() {
     let _alone = alone();
     let door = Endpoint::host(HostOptions::default()).unwrap();
     let silent = UdpSocket::bind("127.0.0.1:0").unwrap();
-    // A call that a frame waits for freezes it for a second, each time. A busy machine freezes one
-    // now and then: a round of calls without is waited for.
+    // A connection attempt that blocks a frame freezes it for a second each time. A busy machine
+    // also freezes a frame now and then, so the test waits for a round without a freeze.
     wait_for("no frame waits for a call", || {
-        // All calls are given up after two seconds, about when it has waited as long for the one at
-        // the door to say more.
+        // All attempts are given up after two seconds. About then the peer has also waited that
+        // long for the peer at `door` to introduce itself.
         let limits = Limits { handshake: Duration::from_secs(2), ..limits() };
         let mut app = calling(&door, &silent, limits);
         let (began, mut longest, mut hung_up) = (Instant::now(), Duration::ZERO, false);
@@ -254,7 +256,7 @@ fn calls_in_vain_freeze_no_frame_and_an_end_waits_for_all_of_them_at_once() {
         must!(longest < Duration::from_millis(500), "a frame of {longest:?}");
         Ok(())
     });
-    // In the middle of its calls.
+    // The app ends while its connection attempts are under way.
     let app = calling(&door, &silent, Limits { handshake: Duration::from_secs(600), ..limits() });
     let end = Instant::now();
     drop(app);

@@ -1,4 +1,4 @@
-//! Three equal apps over real QUIC.
+//! Tests of three equal apps over real QUIC.
 #![allow(clippy::unwrap_used, clippy::expect_used, clippy::panic, reason = "a failed test should panic")]
 
 mod support;
@@ -26,13 +26,14 @@ fn placed(config: PeerConfig) -> (App, Entity) {
     let x = config.name.len() as f32;
     let mut app = app(NetPlugin::peer(config).unwrap());
     let handle = app.world_mut().resource_mut::<Assets<ModalAsset>>().add(ModalAsset(bar()));
-    // Each where it likes.
+    // Each app places its body elsewhere.
     let place = Transform::from_xyz(0.0, x, 0.0);
     let body = app.world_mut().spawn((ModalBody::new(handle), SharedBody::named("bar"), place)).id();
     (app, body)
 }
 
-/// One that misses the others after three seconds, in which also a busy machine says something.
+/// Creates a peer with a timeout of three seconds, within which a busy machine also sends
+/// something.
 fn quick_peer(name: &str, join: Option<Invite>) -> (App, Entity) {
     let limits = Limits {
         idle_timeout: Duration::from_secs(3),
@@ -55,14 +56,14 @@ fn q(app: &App, body: Entity) -> Vec<f64> {
     app.world().get::<VisualState>(body).unwrap().q().to_vec()
 }
 
-/// Is the body where the hands pull it to, and not on its way there?
+/// Returns whether the body is at rest where the hands pull it.
 fn still(app: &App, body: Entity) -> bool {
     let net = app.world().resource::<NetPeer>();
     let played = net.session().unwrap().body(net.body_of(body).unwrap()).unwrap();
     played.visual().v.iter().all(|v| v.abs() < 0.02)
 }
 
-/// Do others show the shape that the first shows? It is none at rest.
+/// Checks that the others show the same shape as the first one, which must be bent.
 fn agree(shapes: &[Vec<f64>], within: f64) -> Result<(), String> {
     must!(shapes[0].iter().any(|q| q.abs() > 0.02), "the body is bent: {shapes:?}");
     must!(shapes[1..].iter().all(|other| apart(&shapes[0], other) < within), "{shapes:?}");
@@ -81,7 +82,7 @@ fn a_turned_body_hangs_among_peers_as_it_does_alone() {
     let bud = Arc::new(ModalModel::read(bud).unwrap());
     let turn = Quat::from_rotation_x(std::f32::consts::FRAC_PI_2);
     let settings = StepSettings { gravity: [0.0, -9.81, 0.0], ..StepSettings::default() };
-    // The same body by itself, until it hangs still; and one that stands upright.
+    // The same body steps alone until it hangs still, both turned and upright.
     let hung = |turn: Quat| {
         let mut body = Body::new(bud.clone(), settings.into()).unwrap();
         body.set_pose([0.0; 3], turn.as_dquat().normalize().into()).unwrap();
@@ -118,13 +119,13 @@ fn three_peers_hold_one_body_and_agree_and_one_that_goes_is_missed_by_nobody() {
     let invite = a.world().resource::<NetPeer>().invite();
     let (mut b, body_b) = peer("bb", Some(invite.clone()));
     run_until(&mut [&mut a, &mut b], "the second is in", |apps| users(apps[1]).len() == 2);
-    // The third comes through the second, and is told of the first.
+    // The third peer joins through the second one, which sends it the first one's invite.
     let through = b.world().resource::<NetPeer>().invite();
     let (mut c, body_c) = peer("ccc", Some(through));
     run_until(&mut [&mut a, &mut b, &mut c], "all know all", |apps| {
         apps.iter_mut().all(|app| users(app) == ["a", "bb", "ccc"])
     });
-    // One of them over the paper's third network: 3 % and 60 ms.
+    // One of them is on the paper's third network, with 3 % loss and 60 ms.
     c.world_mut().resource_mut::<NetPeer>().set_emulation(Some(Emulation::preset(Preset::Paper3, 7)));
 
     let hold = |app: &mut App, body: Entity, vertex: u32, x: f64, up: f64| {
@@ -146,7 +147,7 @@ fn three_peers_hold_one_body_and_agree_and_one_that_goes_is_missed_by_nobody() {
         Ok(shapes[0].clone())
     });
 
-    // The middle one, through which the third came, goes: the others go on together.
+    // The second peer, through which the third one joined, leaves. The others continue together.
     drop(b);
     run_until(&mut [&mut a, &mut c], "both notice", |apps| {
         apps.iter().all(|app| messages::<UserLeft>(app).iter().any(|left| left.name == "bb"))
@@ -164,7 +165,7 @@ fn three_peers_hold_one_body_and_agree_and_one_that_goes_is_missed_by_nobody() {
     });
 }
 
-/// Nothing gets through, either way.
+/// A link that loses all packets in both directions.
 fn cut() -> Option<Emulation> {
     let link = LinkConfig { loss: Loss::Random(1.0), ..LinkConfig::default() };
     Some(Emulation { outgoing: link.clone(), incoming: link, seed: 1 })
@@ -192,7 +193,7 @@ fn peers_that_have_lost_everybody_find_each_other_again_and_one_that_comes_late_
         agree(&[q(apps[0], body_a), q(apps[1], body_b), q(apps[2], body_c)], 0.02)
     });
 
-    // Every line is down: each is alone, and plays on alone.
+    // Every connection fails, and each peer continues alone.
     for app in [&mut a, &mut b, &mut c] {
         app.world_mut().resource_mut::<NetPeer>().set_emulation(cut());
     }
@@ -220,7 +221,8 @@ fn peers_that_have_lost_everybody_find_each_other_again_and_one_that_comes_late_
     });
     println!("one shape again {:.2} s after the lines", up.elapsed().as_secs_f64());
 
-    // One more, after all that, through the last: it finds everybody, the shape and the hand.
+    // One more peer joins afterwards through the third one, and gets the users, the shape and the
+    // hand.
     let through = c.world().resource::<NetPeer>().invite();
     let (mut d, body_d) = quick_peer("dddd", Some(through));
     run_until(&mut [&mut a, &mut b, &mut c, &mut d], "all know the late one, and it them", |apps| {
@@ -231,7 +233,7 @@ fn peers_that_have_lost_everybody_find_each_other_again_and_one_that_comes_late_
         must!(seen, "it sees the hand");
         agree(&[q(apps[0], body_a), q(apps[3], body_d)], 0.02)
     });
-    // Who says goodbye is not looked for, also when the end of its connection is heard.
+    // A peer that says goodbye is not tracked as lost, not even when its connection ends.
     drop(d);
     run_until(&mut [&mut a, &mut b, &mut c], "it has left, and its connections are over", |apps| {
         apps.iter_mut()
@@ -278,7 +280,7 @@ fn a_hand_whose_spring_changes_is_felt_with_the_new_one_by_all() {
         Ok(shapes[1][0].abs())
     };
     let firm = run_until(&mut [&mut a, &mut b], "a firm hand", pulled);
-    // A soft one gives way.
+    // A soft hand yields.
     a.world_mut().get_mut::<Grab>(hand).unwrap().stiffness = Some(2.0);
     run_until(&mut [&mut a, &mut b], "a soft hand", |apps| {
         let soft = pulled(apps)?;

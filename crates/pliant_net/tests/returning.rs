@@ -1,4 +1,4 @@
-//! Guests and hosts that go and come back, one way or another.
+//! Tests of guests and hosts that leave or fail, and come back.
 #![allow(clippy::unwrap_used, clippy::expect_used, clippy::panic, reason = "a failed test should panic")]
 
 mod support;
@@ -32,7 +32,7 @@ fn is_in(app: &App) -> bool {
     matches!(state_of(app), GuestState::In { .. })
 }
 
-/// Nothing gets through, either way.
+/// A link that loses all packets in both directions.
 fn cut() -> Option<Emulation> {
     let link = LinkConfig { loss: Loss::Random(1.0), ..LinkConfig::default() };
     Some(Emulation { outgoing: link.clone(), incoming: link, seed: 1 })
@@ -42,7 +42,7 @@ fn quick(limits: Limits, idle_timeout: Duration) -> Limits {
     Limits { idle_timeout, keep_alive: Duration::from_millis(200), ..limits }
 }
 
-/// A host and a guest that miss each other after so long.
+/// Creates a host and a guest with the given timeout.
 fn quick_pair(idle_timeout: Duration) -> (App, Entity, App) {
     let session = pliant_stream::HostConfig { idle_timeout, ..Default::default() };
     let limits = quick(Limits::host(), idle_timeout);
@@ -54,7 +54,7 @@ fn quick_pair(idle_timeout: Duration) -> (App, Entity, App) {
     (host, body, guest)
 }
 
-/// Does the guest show the host's body as it is, where a hand holds it?
+/// Checks that the guest shows the host's body correctly, at rest in a hand.
 fn is_right(apps: &[&mut App], body: Entity, there: Entity, within: f64) -> Result<(), String> {
     let truth = apps[0].world().get::<BodyState>(body).unwrap().body().q();
     let size = truth.iter().fold(0.0_f64, |size, q| size.max(q.abs()));
@@ -64,7 +64,8 @@ fn is_right(apps: &[&mut App], body: Entity, there: Entity, within: f64) -> Resu
     Ok(())
 }
 
-/// How far the guest's picture is from the host's body, as a part of the body's largest coordinate.
+/// Returns the largest difference of the guest's visual state from the host's body, as a part of
+/// the body's largest coordinate.
 fn apart(host: &App, body: Entity, guest: &App, there: Entity) -> f64 {
     let truth = host.world().get::<BodyState>(body).unwrap().body().q();
     let shown = guest.world().get::<VisualState>(there).unwrap().q();
@@ -90,12 +91,12 @@ fn a_network_that_is_away_for_longer_than_the_timeout_costs_the_time_and_nothing
         matches!(state_of(apps[1]), GuestState::Lost { .. }) && only::<HandOf>(apps[0]).is_none()
     });
     let noticed = cut_at.elapsed().as_secs_f64();
-    // What was last heard came a little before the cut. That the timeout is the one that was set,
-    // and no longer, is tested by the order of two of them (loopback).
+    // The last packet arrived a little before the cut. The loopback tests check, by the order of
+    // two timeouts, that the timeout is not longer than set.
     assert!(noticed > 2.0, "the timeout is 3 s, noticed after {noticed} s");
     assert_eq!(messages::<SessionLost>(&guest).len(), 1);
     assert!(guest.world().get_entity(there).is_ok() && guest.world().get_entity(own).is_ok());
-    // The host's body goes on without.
+    // The host's body continues without the guest's hand.
     host.world_mut().spawn((Grab::new(TIP, 0.3, DVec3::new(0.9, 2.8, -0.3)), GrabOf(body)));
     run_until(&mut [&mut host, &mut guest], "the picture is of the past", |apps| {
         let off = apart(apps[0], body, apps[1], there);
@@ -186,7 +187,7 @@ fn a_number_is_given_to_nobody_else_also_after_the_host_was_started_anew() {
         apps.iter().all(|app| matches!(state_of(app), GuestState::Lost { .. }))
     });
 
-    // Somebody who was never here is the first at the door; the others come back later.
+    // A new guest joins first, and the earlier guests come back later.
     let (mut second, invite, _) = start(address, known);
     let mut new = join(&invite, "Cy");
     run_until(&mut [&mut second, &mut new], "Cy is in", |apps| is_in(apps[1]));
@@ -203,7 +204,7 @@ fn a_number_is_given_to_nobody_else_also_after_the_host_was_started_anew() {
 fn two_of_one_token_are_two_users() {
     let _alone = alone();
     let token = Token::generate().unwrap();
-    // It expires in an hour of the host's clock. That of a guest is never asked.
+    // The grant expires in an hour of the host's clock. The guest's clock is never used.
     let access =
         Access::Tokens(vec![Grant::hold(token).until(SystemTime::now() + Duration::from_secs(3600))]);
     let transport = HostOptions { access, ..HostOptions::default() };
@@ -218,7 +219,7 @@ fn two_of_one_token_are_two_users() {
     });
     let numbers = [state_of(&one), state_of(&two)];
     assert!(numbers[0] != numbers[1], "{numbers:?}");
-    // Both hold, and neither's hand is taken for the other's.
+    // Both guests hold the body, and the host does not confuse their hands.
     for app in [&mut one, &mut two] {
         let there = body_of(app).unwrap();
         app.world_mut().spawn((Grab::new(TIP, 0.3, DVec3::new(1.2, 2.4, 0.4)), GrabOf(there)));
@@ -228,7 +229,7 @@ fn two_of_one_token_are_two_users() {
         let of: Vec<Entity> = hands.iter(apps[0].world()).map(|hand| hand.0).collect();
         of.len() == 2 && of[0] != of[1]
     });
-    // One goes; the other, of the same token, stays and holds on.
+    // One guest leaves. The other one, with the same token, stays and keeps its grab.
     drop(one);
     run_until(&mut [&mut host, &mut two], "one has left", |apps| {
         apps[0].world().resource::<NetHost>().guests().count() == 1
@@ -244,7 +245,7 @@ fn two_connections_of_one_key_are_one_user_the_newer() {
     let join = |name: &str| {
         let identity = Some(Identity::from_pkcs8(&key).unwrap());
         let transport = JoinOptions { identity, ..JoinOptions::default() };
-        // It would come back and send the other away in turn.
+        // Otherwise this guest would join again and displace the other one in turn.
         let rejoin = Duration::ZERO;
         guest(
             &invite,
@@ -259,7 +260,7 @@ fn two_connections_of_one_key_are_one_user_the_newer() {
     });
     assert_eq!(state_of(&new), GuestState::In { user: UserId(1) }, "under the same number");
     assert_eq!(host.world().resource::<NetHost>().guests().count(), 1);
-    // Two of one token, but each with a key of its own, are two users.
+    // Another guest with its own key is another user.
     let mut other = guest(&invite, JoinConfig { models: vec![bar()], ..JoinConfig::default() });
     run_until(&mut [&mut host, &mut new, &mut other], "another one", |apps| is_in(apps[2]));
     assert_eq!(host.world().resource::<NetHost>().guests().count(), 2);
@@ -277,7 +278,8 @@ fn a_guest_that_is_sent_away_does_not_come_back() {
     run_until(&mut [&mut host, &mut guest], "it is told", |apps| {
         matches!(state_of(apps[1]), GuestState::Closed { .. })
     });
-    // It would be back before another one has joined and has its body.
+    // The time until another guest has joined and has its body is enough for the kicked guest to
+    // come back.
     let mut other = support::guest(&invite, JoinConfig::default());
     run_until(&mut [&mut host, &mut other, &mut guest], "another one joins", |apps| body_of(apps[1]));
     run_frames(&mut [&mut host, &mut other, &mut guest], 100);
@@ -286,14 +288,14 @@ fn a_guest_that_is_sent_away_does_not_come_back() {
     assert!(messages::<BodyArrived>(&guest).len() <= 1);
 }
 
-/// There and back. The machine's own time for a join, which is work and not way, is little beside
-/// ten of these.
+/// Round trip, s. The machine's own time for a join is small beside ten of these.
 const ROUND_TRIP: f64 = 0.6;
-/// A join is done in ten round trips: over 100 ms in a second.
+/// Longest time of a join, s: ten round trips, which is one second at 100 ms.
 const JOIN: f64 = 10.0 * ROUND_TRIP;
 
-/// Seconds until a guest shows a body as it is. Guests join until one is there within `most`: other
-/// work on the machine makes it slower, nothing makes it faster.
+/// Returns the seconds until a guest shows a body correctly. Guests join until one of them succeeds
+/// within `most`, because other work on the machine makes a guest slower, and nothing makes it
+/// faster.
 fn first_picture(
     host: &mut App,
     body: Entity,
@@ -332,7 +334,7 @@ fn joining_takes_less_than_ten_round_trips_and_the_models_bytes() {
     let (mut host, invite, body) = host(HostConfig::default());
     host.world_mut().spawn((Grab::new(TIP, 0.3, DVec3::new(1.2, 2.4, 0.4)), GrabOf(body)));
     let cached = first_picture(&mut host, body, &invite, &[bar()], JOIN);
-    // A host's default is 1 MB/s for models.
+    // The default rate of a host, which also carries models, is 1 MB/s.
     let bytes = bar().file_bytes() as f64;
     let sent = first_picture(&mut host, body, &invite, &[], JOIN + bytes / 1e6);
     println!("first right picture after {cached:.2} s, after {sent:.2} s with a model of {bytes} bytes");
@@ -362,11 +364,12 @@ fn joining_the_shipped_body_takes_less_than_ten_round_trips_and_the_models_bytes
 #[test]
 fn bodies_stay_while_a_host_that_was_lost_twice_is_waited_for() {
     let _alone = alone();
-    // Soon lost: bodies are waited for for five seconds after a return.
+    // The timeout is short, because after a return the bodies are only awaited for five seconds.
     let (mut host, _, mut guest) = quick_pair(Duration::from_secs(1));
     let there = arrival(&mut host, &mut guest);
     let lost = |app: &App| matches!(state_of(app), GuestState::Lost { .. });
-    // A body that rests comes by messages alone; a busy machine takes a while to send anything else.
+    // A body at rest may arrive through messages alone, and a busy machine takes a while to send
+    // anything else.
     run_until(&mut [&mut host, &mut guest], "a datagram", |apps| {
         apps[1].world().resource::<NetStats>().datagrams_in > 0
     });
@@ -374,7 +377,7 @@ fn bodies_stay_while_a_host_that_was_lost_twice_is_waited_for() {
     run_until(&mut [&mut host, &mut guest], "it is lost", |apps| lost(apps[1]));
     guest.world().resource::<NetGuest>().set_emulation(None);
     run_until(&mut [&mut host, &mut guest], "it is back", |apps| is_in(apps[1]));
-    // Lost again, before the time is over in which the bodies of the first session are waited for.
+    // The connection fails again while the bodies of the first session are still awaited.
     guest.world().resource::<NetGuest>().set_emulation(cut());
     run_until(&mut [&mut host, &mut guest], "it is lost again", |apps| lost(apps[1]));
     let since = Instant::now();
@@ -384,7 +387,7 @@ fn bodies_stay_while_a_host_that_was_lost_twice_is_waited_for() {
     assert!(lost(&guest));
     assert!(guest.world().get_entity(there).is_ok(), "what was there stays as it was last seen");
     assert!(messages::<BodyLeft>(&guest).is_empty());
-    // Counts never fall, though this is the third connection's turn.
+    // Counts never fall, even with the third connection.
     let before = *guest.world().resource::<NetStats>();
     assert!(before.datagrams_in > 0 && before.bytes_in > 0, "{before:?}");
     guest.world().resource::<NetGuest>().set_emulation(None);

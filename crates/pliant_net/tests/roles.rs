@@ -1,4 +1,4 @@
-//! Who may do what, who sees how much, and what is kept of it.
+//! Tests of roles, subscriptions and recordings.
 #![allow(clippy::unwrap_used, clippy::expect_used, clippy::panic, reason = "a failed test should panic")]
 
 mod support;
@@ -105,7 +105,8 @@ fn a_host_takes_a_guests_hand_off_and_the_guest_knows() {
     run_until(&mut [&mut host, &mut guest], "the guest is told", |apps| {
         messages::<GrabRefused>(apps[1]) == [GrabRefused { entity: grab }]
     });
-    // The targets that it still says move nothing, and another hand of its may hold.
+    // Targets that the guest still sends have no effect, and another hand of the guest may hold the
+    // body.
     guest.world_mut().get_mut::<Grab>(grab).unwrap().target.y += 0.1;
     let heard = |host: &App| host.world().resource::<NetStats>().datagrams_in;
     let before = heard(&host);
@@ -132,7 +133,8 @@ fn what_is_not_wanted_is_not_sent() {
     run_until(&mut [&mut host, &mut guest], "all ticks come", window(Came::ticks_come));
     *guest.world_mut().get_mut::<Interest>(there).unwrap() = Interest::Nothing;
     run_until(&mut [&mut host, &mut guest], "nothing but the clock's answers", window(Came::only_the_clock));
-    // Half of the four modes: the shape of those, the rest at rest.
+    // Half of the four modes are subscribed. Their shape is displayed, and the other modes are at
+    // rest.
     *guest.world_mut().get_mut::<Interest>(there).unwrap() = Interest::Modes(2);
     run_until(&mut [&mut host, &mut guest], "half of the modes", |apps| {
         let truth = apps[0].world().get::<BodyState>(body).unwrap().body().q();
@@ -155,7 +157,8 @@ fn a_recorded_session_is_seen_again_as_it_was() {
     let _alone = alone();
     let path = std::env::temp_dir().join(format!("pliant-session-{}.rec", std::process::id()));
     let (mut host, invite, body) = host(HostConfig { name: "Hanna".into(), ..HostConfig::default() });
-    // The model is in the guest's cache: it never crosses, and is in the recording all the same.
+    // The model is in the guest's cache, so the host does not send it. The recording must contain
+    // it anyway.
     let mut seen = guest(&invite, JoinConfig { record: Some(path.clone()), ..cached() });
     run_until(&mut [&mut host, &mut seen], "the body arrives", |apps| body_of(apps[1]).is_some());
     host.world_mut().spawn((Grab::new(TIP, 0.3, DVec3::new(1.2, 2.5, 0.4)), GrabOf(body)));
@@ -168,8 +171,8 @@ fn a_recorded_session_is_seen_again_as_it_was() {
         must!(size > 0.1 && off < 0.005 * size && rests(apps[0], body, 0.05 * size), "{off} of {size}");
         Ok(())
     });
-    // It stands still for a while: a replay whose last frames come late has seen its end all the
-    // same.
+    // The body stands still for a while, so that a replay with late last frames still shows the end
+    // state.
     let still = tick(&host);
     run_until(&mut [&mut host, &mut seen], "two seconds", |apps| tick(apps[0]) > still + 80);
     let shown = seen.world().get::<VisualState>(there).unwrap().q().to_vec();
@@ -185,10 +188,10 @@ fn a_recorded_session_is_seen_again_as_it_was() {
     let replayed = bodies.single(again.world()).unwrap().q();
     let size = shown.iter().fold(0.0_f64, |size, q| size.max(q.abs()));
     let off = shown.iter().zip(replayed).map(|(a, b)| (a - b).abs()).fold(0.0, f64::max) / size;
-    // The body stands still under a steady hand: the end of the one is the end of the other.
+    // The body stands still under a steady hand, so both end states must be the same.
     assert!(off < 0.01, "{replayed:?}, not {shown:?}");
     std::fs::remove_file(&path).unwrap();
-    // Who was there is there: the host, by its name.
+    // At the end of the recorded session its users are despawned.
     let mut users = again.world_mut().query::<&User>();
     let names: Vec<&str> = users.iter(again.world()).map(|user| user.name.as_str()).collect();
     assert!(names.is_empty(), "the session is over: {names:?}");
@@ -208,7 +211,8 @@ fn a_body_that_is_full_says_so_and_one_user_leaves_room_for_the_next() {
         (1..4).all(|at| body_of(apps[at]).is_some())
     });
     let hands = |host: &mut App| host.world_mut().query::<&HandOf>().iter(host.world()).count();
-    // As many as a guest may hold at all, each with a patch of its own; half of what is left; one.
+    // First as many grabs as a guest may hold at all, each with its own patch, then half of the
+    // free places, then one.
     for (guest, asked, held) in [(0, 16, 16), (1, 16, 24), (2, 1, 25)] {
         let there = body_of(&mut guests[guest]).unwrap();
         for k in 0..asked {
@@ -220,7 +224,8 @@ fn a_body_that_is_full_says_so_and_one_user_leaves_room_for_the_next() {
             hands(apps[0]) == held && refused == asked as usize + [0, 16, 24][guest] - held
         });
     }
-    // The host's own hands are not bound: the body fills, and the next guest's is refused instead of waiting unheard.
+    // The limit does not apply to the host's own hands. They fill the body, and the next guest's
+    // grab is refused instead of waiting without notice.
     for _ in 0..7 {
         host.world_mut().spawn((Grab::new(TIP, 0.3, DVec3::new(0.9, 1.9, 0.0)), GrabOf(body)));
     }
@@ -243,7 +248,7 @@ fn a_hand_is_told_of_no_more_force_than_it_may_be() {
         forces.iter(app.world()).map(|felt| felt.force.length()).fold(0.0, f64::max)
     };
     run_until(&mut [&mut host, &mut guest], "the host's body pulls back", |apps| strongest(apps[0]) > 1.0);
-    // As much as may be, never more, for forty steps.
+    // For forty steps the force must be at its limit and never above.
     let mut since = None;
     run_until(&mut [&mut host, &mut guest], "the guest feels its most, in the force's direction", |apps| {
         let most = strongest(apps[1]);
@@ -268,7 +273,7 @@ fn a_body_that_goes_while_a_guest_holds_it_takes_the_hand_with_it() {
     run_until(&mut [&mut host, &mut guest], "it is gone", |apps| {
         body_of(apps[1]).is_none() && only::<HandOf>(apps[0]).is_none()
     });
-    // The session goes on: another body comes and is held.
+    // The session continues, and another body arrives and is held.
     let handle = host.world_mut().resource_mut::<Assets<ModalAsset>>().add(ModalAsset(bar()));
     host.world_mut().spawn((ModalBody::new(handle), SharedBody::named("bar")));
     run_until(&mut [&mut host, &mut guest], "another comes", |apps| body_of(apps[1]).is_some());

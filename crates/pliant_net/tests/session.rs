@@ -1,4 +1,4 @@
-//! Two and three apps that hold one body over real QUIC on loopback.
+//! Tests of two and three apps that hold one body over real QUIC on loopback.
 #![allow(clippy::unwrap_used, clippy::expect_used, clippy::panic, reason = "a failed test should panic")]
 
 mod support;
@@ -24,7 +24,8 @@ use support::{
     run_until, tick,
 };
 
-/// A place `y` and `z` (m, of the model) beside the middle of the bar's section at `x`, in the world of [`support::host`].
+/// Returns the world position, in [`support::host`], of a point beside the center of the bar's
+/// section at `x`. `y` and `z` are offsets in the model, m.
 fn beside(x: f64, y: f64, z: f64) -> DVec3 {
     DVec3::Y + DQuat::from_rotation_z(0.5) * (2.0 * DVec3::new(x, y, z))
 }
@@ -52,7 +53,7 @@ fn a_guest_sees_holds_and_feels_the_hosts_body() {
     let mut guest = guest(&invite, JoinConfig { name: "Ann\n".into(), ..JoinConfig::default() });
     let there = arrival(&mut host, &mut guest);
 
-    // The body is whole, moved by the host, and where the host has it.
+    // The body is complete, driven remotely, and at the host's transform.
     assert_eq!(state(&guest, there).model().hash(), bar().hash());
     assert_eq!(guest.world().get::<Driven>(there), Some(&Driven::Remote));
     assert_eq!(guest.world().get::<SharedBody>(there).unwrap().name, "bar");
@@ -65,14 +66,14 @@ fn a_guest_sees_holds_and_feels_the_hosts_body() {
     };
     assert!(users.contains(&"Ann".to_string()), "{users:?}");
 
-    // The host pulls the tip aside and holds it there: the guest sees the same shape.
+    // The host pulls the tip aside and holds it there, and the guest must see the same shape.
     let at_host = host.world_mut().spawn((Grab::new(TIP, 0.3, beside(0.9, 0.3, 0.2)), GrabOf(body))).id();
     run_until(&mut [&mut host, &mut guest], "the guest sees the shape and the host's hand", |apps| {
         let truth = state(apps[0], body).body().q();
         must!(size(truth) > 0.1 && rests(apps[0], body, size(truth)), "the tip is far aside: {truth:?}");
         let shown = apps[1].world().get::<VisualState>(there).unwrap().q();
         must!(distance(truth, shown) < 0.01 * size(truth), "shown {shown:?}, true {truth:?}");
-        // And where the host's hand is.
+        // The guest must also see the host's hand in its position.
         let seen = &apps[1].world().get::<RemoteHands>(there).unwrap().0;
         must!(seen.len() == 1, "{seen:?}");
         must!((seen[0].user, seen[0].vertex) == (UserId::HOST, TIP), "{seen:?}");
@@ -82,7 +83,8 @@ fn a_guest_sees_holds_and_feels_the_hosts_body() {
         Ok(())
     });
 
-    // The guest takes hold of the middle: the host's body has a second hand on it, and the guest feels what the host computes.
+    // The guest grabs the middle of the bar. The host's body then has a second hand on it, and the
+    // guest must get the force that the host computes.
     let grab = guest.world_mut().spawn((Grab::new(MIDDLE, 0.3, beside(0.5, 0.0, -0.1)), GrabOf(there))).id();
     run_until(&mut [&mut host, &mut guest], "the hand takes hold", |apps| only::<HandOf>(apps[0]));
     let target = beside(0.5, 0.1, -0.2);
@@ -103,7 +105,7 @@ fn a_guest_sees_holds_and_feels_the_hosts_body() {
         Ok(of.0)
     });
 
-    // The shares and the smoothed times forget what a busy machine has done to the first of them.
+    // The loss and the smoothed times recover from early disturbances on a busy machine.
     run_until(&mut [&mut host, &mut guest], "the figures of a line without a fault", |apps| {
         let stats = *apps[1].world().resource::<NetStats>();
         assert_eq!(stats.rejected, 0, "{stats:?}");
@@ -115,7 +117,8 @@ fn a_guest_sees_holds_and_feels_the_hosts_body() {
     assert_eq!(host.world().resource::<NetStats>().peers, 1);
     assert!(host.world().get::<UserLink>(user).is_some());
 
-    // Letting go reaches the host; so does leaving, which takes the user and what it holds away.
+    // Despawning a grab must reach the host. When the guest leaves, its user and its grabs must
+    // disappear.
     guest.world_mut().despawn(grab);
     run_until(&mut [&mut host, &mut guest], "the hand lets go", |apps| only::<HandOf>(apps[0]).is_none());
     guest.world_mut().spawn((Grab::new(MIDDLE, 0.3, DVec3::ZERO), GrabOf(there)));
@@ -128,11 +131,12 @@ fn a_guest_sees_holds_and_feels_the_hosts_body() {
     assert_eq!(messages::<UserLeft>(&host)[0].name, "Ann");
 }
 
-/// What the host's body does, by tick: all of them, also where a late frame makes several.
+/// The states of the host's body by tick. All ticks are included, even if a late frame makes
+/// several.
 #[derive(Resource, Default)]
 struct Truth(BTreeMap<u64, Vec<f64>>);
 
-/// The host's hand rests.
+/// While this resource exists, the host's hand rests.
 #[derive(Resource)]
 struct Still;
 
@@ -146,10 +150,10 @@ fn over_the_papers_first_network_the_shape_stays_right() {
     let there = arrival(&mut host, &mut guest);
     let remote = *guest.world().get::<RemoteBody>(there).unwrap();
 
-    // Around where the patch is at rest: this bar does not stretch.
+    // The hand moves around the patch's rest position, because this bar does not stretch.
     let [x, y, z] = patch_at_rest(TIP, 0.3);
     host.world_mut().spawn((Grab::new(TIP, 0.3, beside(x, y, z)), GrabOf(body)));
-    // Moved once a tick, as a hand that is read in the fixed loop is.
+    // The hand moves once per tick, like a hand that is read in the fixed loop.
     let drag = move |tick: Res<PliantTick>, still: Option<Res<Still>>, mut grab: Single<&mut Grab>| {
         let t = if still.is_some() { 0.75 } else { tick.0 as f64 / 40.0 };
         grab.target = beside(x, y + 0.12 * (2.1 * t).sin(), z + 0.1 * (3.3 * t).sin());
@@ -168,8 +172,8 @@ fn over_the_papers_first_network_the_shape_stays_right() {
         }
         shown.clone()
     };
-    // Root mean square and largest error of the last `count` ticks seen, as parts of the largest
-    // truth.
+    // Root mean square error and largest error of the last `count` ticks that were displayed, as
+    // parts of the largest true state.
     let off = |host: &App, shown: &BTreeMap<u64, Vec<f64>>, count: usize| {
         let truth = &host.world().resource::<Truth>().0;
         let largest = truth.values().map(|q| size(q)).fold(0.0, f64::max);
@@ -184,20 +188,21 @@ fn over_the_papers_first_network_the_shape_stays_right() {
             let stats = *apps[1].world().resource::<NetStats>();
             assert_eq!(stats.dropped.send_queue_full, 0);
             must!(tick(apps[0]) > begin + 240 && seen.len() > 60, "{} ticks seen", seen.len());
-            // The path as the emulator was told: 9 % and 196 ms. Its gaps are noticed and filled.
+            // The path has the emulator's settings, 9 % loss and 196 ms. Gaps are noticed and
+            // repaired.
             must!((0.03..0.18).contains(&stats.loss_in), "{stats:?}");
             must!((190..300).contains(&stats.round_trip.as_millis()), "{stats:?}");
             must!(stats.recovered > 0, "{stats:?}");
-            // A busy machine adds to the errors by coming late: a second and a half in which it did
-            // not is waited for. The sessions' own tests (pliant_lab) hold all of them against
-            // their bounds, in virtual time.
+            // A busy machine that runs late adds to the errors, so the test waits for a second and
+            // a half without such delays. The sessions' own tests (pliant_lab) check all ticks
+            // against their bounds, in virtual time.
             let (rms, max) = off(apps[0], &seen, 60);
             must!(rms < 0.01 && max < 0.05, "rms {rms}, max {max}");
             Ok(seen)
         });
     let (rms, max) = off(&host, &seen, usize::MAX);
     println!("{} ticks, rms {:.3} %, max {:.2} %", seen.len(), 100.0 * rms, 100.0 * max);
-    // Here the shape must be right when the hand rests, over the same line.
+    // When the hand rests, the shape must be right over the same network.
     host.insert_resource(Still);
     let still = tick(&host);
     run_until(&mut [&mut host, &mut guest], "the shape is right, tick after tick", |apps| {
@@ -209,7 +214,7 @@ fn over_the_papers_first_network_the_shape_stays_right() {
     });
 }
 
-/// What the host's hand feels, by tick.
+/// The forces on the host's hand by tick.
 #[derive(Resource, Default)]
 struct Pulls(BTreeMap<u64, DVec3>);
 
@@ -229,27 +234,28 @@ fn a_guests_hand_over_the_papers_first_network_does_not_jerk() {
     };
     guest.add_systems(FixedUpdate, drag.before(PliantSystems::Input));
     let grab = run_until(&mut [&mut host, &mut guest], "the hand takes hold", |apps| only::<HandOf>(apps[0]));
-    // Every tick of the host, also where a late frame steps two of them.
+    // All ticks of the host are included, even if a late frame makes two of them.
     host.init_resource::<Pulls>();
     let keep = move |tick: Res<PliantTick>, forces: Query<&GrabForce>, mut pulls: ResMut<Pulls>| {
         pulls.0.insert(tick.0, forces.get(grab).unwrap().force);
     };
     host.add_systems(FixedUpdate, keep.after(PliantSystems::Publish));
-    // A force that flips its sign at each step gives 4; 0.1 here on a machine that has the time.
+    // A force that changes its sign at each step gives 4. The test gives 0.1 on a machine that is
+    // not busy.
     let ringing = |forces: &BTreeMap<u64, DVec3>| {
         let forces: Vec<(u64, DVec3)> = forces.iter().map(|(&tick, &force)| (tick, force)).collect();
         let most = forces.iter().map(|f| f.1.length()).fold(0.0, f64::max);
-        // Ticks that follow each other: a frame that is late leaves some out, and a longer step is
-        // a larger difference.
+        // Only consecutive ticks are compared. A late frame skips some ticks, and a longer step
+        // gives a larger difference.
         let even = forces.windows(3).rev().filter(|f| f[0].0 + 2 == f[2].0);
-        // The last of them, two and a half seconds' worth: how the hand has come to the body is
-        // forgotten.
+        // The last 100 values cover two and a half seconds, so the beginning of the grab is not
+        // included.
         let jerks = even.map(|f| (f[0].1 - 2.0 * f[1].1 + f[2].1).length()).take(100);
         let mut jerks: Vec<f64> = jerks.collect();
         must!(jerks.len() == 100, "{} steps that follow each other", jerks.len());
         must!(most > 1.0, "{most} N");
         jerks.sort_by(f64::total_cmp);
-        // Of twenty the largest is left out.
+        // The largest one of every twenty values is ignored.
         Ok(jerks[95] / most)
     };
     let begin = tick(&host);
@@ -297,9 +303,9 @@ fn one_at_a_time_means_one_at_a_time() {
 fn bodies_that_go_and_hosts_that_end_are_told() {
     let _alone = alone();
     let (mut host, invite, body) = host(HostConfig::default());
-    // One that does not wait for a host that has gone.
+    // This guest does not wait for a host that has left.
     let mut guest = guest(&invite, JoinConfig { rejoin: Duration::ZERO, ..JoinConfig::default() });
-    // The app has made an entity for the body itself.
+    // The guest's app has made an entity for the body itself.
     let own = guest.world_mut().spawn((SharedBody::named("bar"), Transform::from_xyz(5.0, 0.0, 0.0))).id();
     let there = arrival(&mut host, &mut guest);
     assert_eq!(there, own);
@@ -342,7 +348,8 @@ fn a_guest_that_talks_nonsense_is_sent_away_and_the_others_notice_nothing() {
                 let noise: Vec<u8> = (0..state >> 56).map(|k| (state >> (k % 56)) as u8 ^ k as u8).collect();
                 endpoint.send_datagram(PeerId::HOST, Bytes::from(noise)).ok();
             }
-            // Of the session, unreadable; of no kind; a placement, which no guest may send.
+            // An unreadable message of the session, a message of an unknown kind, and a placement,
+            // which no guest may send.
             let message = [&b"\x00\xff\xff\xff"[..], b"\x63nonsense", b"\x01\x01\x00"][i];
             endpoint.send_message(PeerId::HOST, Bytes::copy_from_slice(message)).ok();
             while let Some(event) = endpoint.poll() {
@@ -352,8 +359,8 @@ fn a_guest_that_talks_nonsense_is_sent_away_and_the_others_notice_nothing() {
         closed == [true; 3]
     });
     host.world_mut().spawn((Grab::new(TIP, 0.3, DVec3::new(1.2, 2.6, 0.3)), GrabOf(body)));
-    // A guest is a few ticks behind: when the body is nearly at rest, what it shows is what is
-    // true. And what was refused stays counted though those who said it are gone.
+    // A guest is a few ticks behind, so it shows the true state when the body is nearly at rest.
+    // Rejected data stays counted after its senders are gone.
     run_until(&mut [&mut host, &mut good], "the good guest sees what is true", |apps| {
         let truth = self::state(apps[0], body).body().q();
         let shown = apps[1].world().get::<VisualState>(there).unwrap().q();
@@ -372,14 +379,15 @@ fn targets_out_of_reach_are_drawn_in() {
     let mut guest = guest(&invite, JoinConfig::default());
     let there = arrival(&mut host, &mut guest);
     guest.world_mut().spawn((Grab::new(TIP, 0.2, DVec3::new(1e8, 0.0, 0.0)), GrabOf(there)));
-    // The bar is 1 m long and shown at twice that; its middle is 1 m from the origin of its entity.
+    // The bar is 1 m long and displayed at twice that length. Its center is 1 m from the origin of
+    // its entity.
     let drawn_in = |host: &mut App| {
         let grab = only::<HandOf>(host)?;
         let away = host.world().get::<Grab>(grab).unwrap().target.distance(DVec3::Y);
         assert!(away <= 1.0 + 2.0 + 0.1, "{away} m");
         Some(away)
     };
-    // As far as it may, and it stays there.
+    // The hand moves as far as its reach, and stays there.
     run_until(&mut [&mut host, &mut guest], "the hand goes to the end of its reach", |apps| {
         drawn_in(apps[0]).is_some_and(|away| away > 1.9)
     });
@@ -388,7 +396,7 @@ fn targets_out_of_reach_are_drawn_in() {
         drawn_in(apps[0]).is_some() && tick(apps[0]) > arrived + 20
     });
     assert!(size(state(&host, body).body().q()).is_finite());
-    // A second hand with a patch as large as a house is refused.
+    // A second hand with a patch of 50 m radius is refused.
     let refused = guest.world_mut().spawn((Grab::new(TIP, 50.0, DVec3::Y), GrabOf(there))).id();
     run_until(&mut [&mut host, &mut guest], "the patch is refused", |apps| {
         messages::<GrabRefused>(apps[1]) == [GrabRefused { entity: refused }]
@@ -407,8 +415,8 @@ fn the_guests_assets_are_the_cache() {
         handle,
         "the loaded asset is used"
     );
-    // The messages, of which the model would be one: the stream's datagrams are as many as the
-    // machine has taken ticks.
+    // Only message bytes are compared, because the model would be a message, and the number of
+    // datagrams depends on how many ticks the machine has made.
     let bytes = guest.world().resource::<NetGuest>().session().unwrap().stats().message_bytes_in;
     assert!(bytes < bar().file_bytes() as u64, "{bytes} bytes came, the model has {}", bar().file_bytes());
 }

@@ -1,4 +1,5 @@
-//! A body whose settings change while it is shared, and sessions that are left.
+//! Tests of bodies whose settings change while they are shared, and of sessions that end
+//! deliberately.
 #![allow(clippy::unwrap_used, clippy::expect_used, clippy::panic, reason = "a failed test should panic")]
 
 mod support;
@@ -30,7 +31,8 @@ fn a_guest_follows_a_body_that_its_host_makes_stiffer_and_keeps_its_hand_on_it()
     let there = arrival(&mut host, &mut guest);
     let own = guest.world_mut().spawn((Grab::new(TIP, 0.3, DVec3::new(1.2, 2.4, 0.4)), GrabOf(there))).id();
     let hand = run_until(&mut [&mut host, &mut guest], "the hand takes hold", |apps| only::<HandOf>(apps[0]));
-    // What the guest feels and what is true, once the body rests and the guest sees it as it is.
+    // The force that the guest displays must match the host's force, once the body rests and the
+    // guest shows it correctly.
     let felt_at_rest = |apps: &mut [&mut App]| {
         let truth = apps[0].world().get::<BodyState>(body).unwrap().body().q();
         let shown = apps[1].world().get::<VisualState>(there).unwrap().q();
@@ -45,13 +47,13 @@ fn a_guest_follows_a_body_that_its_host_makes_stiffer_and_keeps_its_hand_on_it()
     };
     let soft = run_until(&mut [&mut host, &mut guest], "the guest feels the soft body", felt_at_rest);
 
-    // A slider that is dragged: another number in every frame, and only the last of them counts.
+    // Dragging a slider changes the value in every frame, and only the last value counts.
     for step in 0..40 {
         host.world_mut().get_mut::<ModalBody>(body).unwrap().settings.stiffness_scale =
             1.0 + 3.0 * f64::from(step) / 39.0;
         run_frames(&mut [&mut host, &mut guest], 1);
     }
-    // The hand pulls as far: against springs that are all four times as stiff.
+    // The hand pulls as far as before, against springs that are all four times as stiff.
     run_until(&mut [&mut host, &mut guest], "the guest feels the stiff body", |apps| {
         must!(apps[1].world().get::<ModalBody>(there).unwrap().settings.stiffness_scale == 4.0);
         must!(
@@ -78,7 +80,8 @@ fn a_guest_that_leaves_is_gone_at_once_and_does_not_come_back() {
     });
     assert_eq!(closed(&guest).as_deref(), Some("left"));
     assert_eq!(messages::<UserLeft>(&host)[0].reason, "left");
-    // It would be back before another one has joined and has its body.
+    // The time until another guest has joined and has its body is enough for the first guest to
+    // come back.
     let mut other = support::guest(&invite, JoinConfig::default());
     run_until(&mut [&mut host, &mut other, &mut guest], "another one joins", |apps| body_of(apps[1]));
     run_frames(&mut [&mut host, &mut other, &mut guest], 100);

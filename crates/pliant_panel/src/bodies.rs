@@ -8,54 +8,57 @@ use crate::{
     trace::{Trace, color, dot, plot, short},
 };
 
-/// A body as the panel shows it. What a knob changes is changed here; the caller takes it over.
+/// A body as the panel shows it.
+///
+/// A knob changes its field here. The caller applies the change.
 #[derive(Debug, Clone, Default)]
 pub struct BodyView {
-    /// What it is called.
+    /// Name of the body.
     pub name: String,
-    /// Modes that are kept. A knob.
+    /// Number of kept modes. A knob.
     pub modes: usize,
-    /// Modes that its model has.
+    /// Number of modes of the model.
     pub all_modes: usize,
     /// Frequency of the slowest mode, Hz.
     pub lowest_hz: f64,
-    /// How it is stepped. Stiffness, damping and warp have knobs.
+    /// Step settings. Stiffness, damping and warping have knobs.
     pub settings: StepSettings,
-    /// Stepped by this app; else somebody else moves it, and its knobs are theirs.
+    /// Whether this app steps the body. A remote body has no usable knobs here.
     pub local: bool,
-    /// At rest: not stepped, sent or drawn anew.
+    /// Whether the body rests: it is neither stepped nor sent nor drawn again.
     pub resting: bool,
     /// Kinetic and elastic energy, J.
     pub energy: f64,
     /// Energy over the last seconds, J.
     pub energies: Trace,
-    /// The hands on it.
+    /// The hands on the body.
     pub hands: Vec<HandView>,
-    /// Its header is closed: what stands under it need not be filled in. Set by [`show`], for the next frame; a body that comes folded is first shown
-    /// so.
+    /// Whether the body's header is closed, so that the fields shown below the header need not be
+    /// filled in. [`show`] sets this for the next frame. A body that is folded when it is first
+    /// shown starts with a closed header.
     pub folded: bool,
-    /// Somebody pressed "Wake".
+    /// Set when "Wake" was pressed.
     pub wake: bool,
-    /// Somebody pressed "Let go".
+    /// Set when "Let go" was pressed.
     pub release: bool,
 }
 
 /// A hand on a body.
 #[derive(Debug, Clone, Default)]
 pub struct HandView {
-    /// Whose it is.
+    /// Name of the hand's user.
     pub name: String,
-    /// The color of whose it is, sRGB; `None` takes one of the plot's own.
+    /// Color of the hand's user, sRGB. `None` selects one of the plot's own colors.
     pub color: Option<[u8; 3]>,
-    /// It is held from here, and "Let go" takes it off.
+    /// Whether this app holds the grab, so that "Let go" can release it.
     pub releasable: bool,
     /// Magnitude of the reaction, N.
     pub force: f64,
-    /// The same over the last seconds.
+    /// Magnitude of the reaction over the last seconds, N.
     pub forces: Trace,
 }
 
-/// Shows `bodies`, each under a header of its own.
+/// Shows `bodies`, each under its own header.
 pub fn show(ui: &mut Ui, bodies: &mut [BodyView]) {
     if bodies.is_empty() {
         ui.weak("No bodies.");
@@ -72,7 +75,8 @@ pub fn show(ui: &mut Ui, bodies: &mut [BodyView]) {
             .id_salt(("pliant body", index))
             .default_open(!many && !folded)
             .show(ui, |ui| {
-                // Just opened: there is nothing to show yet, and nothing that a knob could change.
+                // The header was opened in this frame: its fields are not filled in, and no knob
+                // can have changed.
                 if !folded {
                     body_knobs(ui, index, body);
                 }

@@ -10,13 +10,13 @@ use crate::{
 /// The devices as the panel shows them.
 #[derive(Debug, Clone, Default)]
 pub struct DevicesView {
-    /// All that are plugged in.
+    /// All connected devices.
     pub devices: Vec<DeviceView>,
-    /// The emergency stop is latched.
+    /// Whether the emergency stop is latched.
     pub stopped: bool,
-    /// Somebody pressed "Stop".
+    /// Set when "Stop" was pressed.
     pub stop: bool,
-    /// Somebody pressed "Release the stop".
+    /// Set when "Release the stop" was pressed.
     pub reset: bool,
 }
 
@@ -25,21 +25,22 @@ pub struct DevicesView {
 pub struct DeviceView {
     /// Vendor and model.
     pub name: String,
-    /// Force that goes to the hand, N.
+    /// Force on the hand, N.
     pub force: f64,
-    /// Largest force that it may give, N.
+    /// Maximum force of the device, N.
     pub limit: f64,
-    /// Exchanges a second, Hz.
+    /// Exchanges per second, Hz.
     pub rate: f64,
-    /// 99th percentile of how late an exchange was, us.
+    /// 99th percentile of the lateness of an exchange, us.
     pub jitter_us: f64,
-    /// Energy that the hand got beyond what it gave, J.
+    /// Energy that the hand received minus the energy that it gave, J.
     pub energy: f64,
-    /// Multiplies what the tools that it moves give back, 0 to 1 on its knob; `None` where it moves none. A knob.
+    /// Factor on the force of the tools that this device moves, 0 to 1 on its knob. `None` if the
+    /// device moves no tool. A knob.
     pub force_scale: Option<f64>,
-    /// What is to be done by hand before its positions can be trusted.
+    /// Calibration step that the user must perform before the positions are valid.
     pub calibrate: Option<String>,
-    /// What is wrong, if something is.
+    /// Fault of the device. `None` without a fault.
     pub fault: Option<String>,
     /// Force over the last seconds, N.
     pub forces: Trace,
@@ -51,12 +52,14 @@ pub fn show(ui: &mut Ui, view: &mut DevicesView) {
     show_devices(ui, view);
 }
 
-/// The emergency stop alone, for a place where it is always in sight: it can be pressed whatever state the devices are in, and its release stands beside
-/// it while it is latched.
+/// Shows only the emergency stop, for a place where it is always visible.
+///
+/// The stop can be pressed in every state of the devices. While the stop is latched, its release
+/// button is beside it.
 pub fn show_stop(ui: &mut Ui, view: &mut DevicesView) {
     ui.horizontal(|ui| {
         let release = view.stopped.then(|| Button::new("Release the stop").min_size(Vec2::new(0.0, 26.0)));
-        // Beside it there is room for the release's words.
+        // The reserved width leaves room for the label of the release button.
         let width = ui.available_width() - if release.is_some() { 130.0 } else { 0.0 };
         let stop = Button::new(RichText::new("STOP").strong().color(Color32::WHITE))
             .fill(Color32::from_rgb(190, 40, 30))
@@ -73,7 +76,7 @@ pub fn show_stop(ui: &mut Ui, view: &mut DevicesView) {
     }
 }
 
-/// The devices without the stop.
+/// Shows the devices without the stop.
 pub fn show_devices(ui: &mut Ui, view: &mut DevicesView) {
     if view.devices.is_empty() {
         ui.weak("No device.");

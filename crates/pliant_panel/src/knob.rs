@@ -1,11 +1,14 @@
-//! Sliders that change nothing by being looked at.
+//! Sliders that change a value only when the user edits it.
 
 use std::ops::RangeInclusive;
 
 use bevy_egui::egui::{Response, Slider, SliderClamping, Ui, emath::Numeric};
 
-/// A slider over `value`, which only somebody's hand or word changes: what lies outside `range`, or between the decimals shown, stays as it is until then.
-/// Egui's own clamps and rounds in every frame, and a field that the focus passes through gives back what it shows.
+/// Adds a slider over `value`, which changes only by the user's input.
+///
+/// A value outside `range`, or between the shown decimals, stays as it is until then. Egui's own
+/// slider clamps and rounds in every frame, and its field writes back the shown text when the focus
+/// passes through it.
 pub(crate) fn knob<N: Numeric>(
     ui: &mut Ui,
     value: &mut N,
@@ -14,7 +17,8 @@ pub(crate) fn knob<N: Numeric>(
 ) -> Response {
     let mut moved = *value;
     let response = ui.add(dress(Slider::new(&mut moved, range).clamping(SliderClamping::Edits)));
-    // What was typed was taken as it was typed: all that comes when the field is left is its own rounded text.
+    // A typed value was already applied while it was typed. The change on leaving the field is only
+    // its rounded text.
     if response.changed() && !response.lost_focus() {
         *value = moved;
     }

@@ -1,4 +1,4 @@
-//! The live panel over a scene: bodies, users and network, devices, time and the recording, with their knobs and plots.
+//! The live panel over a scene: bodies, users, network, devices, time and the recording.
 //!
 //! ```no_run
 //! use bevy::prelude::*;
@@ -10,17 +10,21 @@
 //! }
 //! ```
 //!
-//! `F1` opens and closes it; Tab and the arrow keys reach every knob. While it has the pointer, neither the pointer nor a tool that the pointer moves grabs
-//! a body through it; what else pointer and keys do in a scene is asked of [`wants_pointer`] and [`wants_keyboard`]. It shows what other plugins
-//! publish, and a section appears once its plugin is there: nothing of the network, a device or a recording is asked for by this one. Closed, it
-//! gathers and draws nothing; of a body whose header is closed it gathers name and state.
+//! `F1` opens and closes the panel. Tab and the arrow keys reach every knob. While the panel has
+//! the pointer, neither the pointer nor a tool that the pointer moves grabs a body through the
+//! panel. For other uses of the pointer and the keys in a scene see [`wants_pointer`] and
+//! [`wants_keyboard`]. The panel shows what other plugins publish, and a section appears when its
+//! plugin is there. The panel itself needs no network, device or recording. A closed panel gathers
+//! and draws nothing. For a body whose header is closed the panel gathers only the name and the
+//! state.
 //!
-//! Each part is a function over [`egui::Ui`] and a plain struct, for a panel of your own: [`bodies::show`], [`time::show`], [`network::show`], [`device::show`],
-//! [`recording::show`]. A knob changes its field of the struct; taking it over is up to you, as [`PanelPlugin`] does.
+//! Each part is a function over [`egui::Ui`] with a plain struct, which other panels can use:
+//! [`bodies::show`], [`time::show`], [`network::show`], [`device::show`], [`recording::show`]. A
+//! knob changes its field of the struct. The caller applies the change, as [`PanelPlugin`] does.
 //!
 //! # Features
 //!
-//! `net`, `haptics`, `rerun`: the sections about them.
+//! `net`, `haptics`, `rerun`: the sections for the session, the devices and the recording.
 #![cfg_attr(
     test,
     allow(clippy::unwrap_used, clippy::expect_used, clippy::panic, reason = "a failed test should panic")

@@ -10,99 +10,107 @@ use crate::{
 /// The session as the panel shows it.
 #[derive(Debug, Clone, Default)]
 pub struct NetworkView {
-    /// What this app is in the session, in a word or two: "host", "guest, joined".
+    /// Role of this app in the session in a word or two, for example "host" or "guest, joining".
     pub role: String,
-    /// What others paste to join; only a host has one.
+    /// The invite that other users paste to join. A host and a peer have one, a guest has none.
     pub invite: Option<String>,
     /// Round trip, ms.
     pub round_trip_ms: f64,
     /// Smoothed deviation of the round trip, ms.
     pub jitter_ms: f64,
-    /// Share of datagrams lost on the way here and there, %.
+    /// Share of datagrams lost on the incoming and on the outgoing path, %.
     pub loss: [f64; 2],
-    /// Received and sent, kbit/s.
+    /// Received and sent data rate, kbit/s.
     pub rate: [f64; 2],
-    /// Ticks shown on a guess, and put right since; `None` where nobody's word is waited for.
+    /// Number of ticks shown before their data arrived, and number of ticks corrected since. `None`
+    /// on a host, which does not wait for data.
     pub repaired: Option<[u64; 2]>,
-    /// Ticks that were asked for again: by a guest, of a host.
+    /// Number of requests for repeated ticks, sent by a guest or received by a host.
     pub asked_again: u64,
-    /// States taken over whole, from snapshots.
+    /// Number of complete states applied from snapshots.
     pub snapshots: u64,
-    /// Datagrams that this end let go because a queue was full or the path too narrow.
+    /// Number of datagrams that this end dropped because a queue was full or the path too narrow.
     pub dropped: u64,
-    /// Packets wait in a queue on their way: the round trip has grown, and less should be sent.
+    /// Whether packets wait in a queue on the path. The round trip has then grown, and less should
+    /// be sent.
     pub queueing: bool,
-    /// How far what is shown is from the best estimate of the truth, %; `None` where the truth is here.
+    /// Distance of the visual state from the best estimate of the true state, %. `None` except on a
+    /// guest.
     pub shown_offset: Option<f64>,
     /// Round trip over the last seconds, ms.
     pub round_trips: Trace,
-    /// Received over the last seconds, kbit/s.
+    /// Received data rate over the last seconds, kbit/s.
     pub rates: Trace,
-    /// Everybody.
+    /// All users of the session.
     pub users: Vec<UserView>,
-    /// The emulated link under the session, where one may be put.
+    /// The emulated link of the session. `None` if it cannot be emulated.
     pub emulator: Option<EmulatorView>,
-    /// Somebody pressed "Copy" at the invite.
+    /// Set when "Copy" was pressed beside the invite.
     pub copy: bool,
-    /// What the button says that ends one's part in the session: "Leave", "End the session"; `None` where there is nothing to leave.
+    /// Label of the button that leaves or ends the session: "Leave" or "End the session". `None` if
+    /// there is nothing to leave.
     pub way_out: Option<&'static str>,
-    /// Somebody pressed it.
+    /// Set when that button was pressed.
     pub leave: bool,
 }
 
 /// A user of the session.
 #[derive(Debug, Clone, Default)]
 pub struct UserView {
-    /// What the user is called; from outside.
+    /// Name of the user, which is untrusted input.
     pub name: String,
-    /// The user's color, sRGB.
+    /// Color of the user, sRGB.
     pub color: [u8; 3],
-    /// Oneself.
+    /// Whether this is the local user.
     pub yourself: bool,
-    /// Hands on bodies.
+    /// Number of the user's hands on bodies.
     pub hands: usize,
-    /// Round trip, ms; `None` where it is not known here.
+    /// Round trip, ms. `None` if it is not known here.
     pub round_trip_ms: Option<f64>,
-    /// Share of datagrams lost on the way here from the user and there, %; `None` where it is not known here.
+    /// Share of datagrams lost on the path from the user and to the user, %. `None` if it is not
+    /// known here.
     pub loss: Option<[f64; 2]>,
 }
 
-/// The knobs of the link emulator: both ways alike. What is moved away from a preset makes it another network ([`other`](Self::other)), whose finer
-/// traits have knobs too.
+/// The knobs of the link emulator, equal for both directions.
+///
+/// Moving a knob away from a preset makes the network another network ([`other`](Self::other)),
+/// which has knobs for the finer properties too.
 #[derive(Debug, Clone, Default, PartialEq)]
 pub struct EmulatorView {
-    /// Names of the presets; the first is no emulation, the last none of the others.
+    /// Names of the presets. The first means no emulation, the last means another network.
     pub presets: Vec<String>,
-    /// The one in use. A knob.
+    /// Index of the preset in use. A knob.
     pub preset: usize,
-    /// A recorded path stands in for delay, jitter and loss, whose knobs are off.
+    /// Whether a recorded path replaces delay, jitter and loss. Their knobs are then disabled.
     pub recorded: bool,
     /// Loss, %. A knob.
     pub loss: f64,
     /// Round trip, ms. A knob.
     pub round_trip_ms: f64,
-    /// Mean of what is added to the way of a packet at random, ms. A knob.
+    /// Mean of the random delay added to the one-way delay of a packet, ms. A knob.
     pub jitter_ms: f64,
-    /// How long a burst of losses lasts on average, ms; 0 loses each packet for itself. A knob, off while nothing is lost.
+    /// Mean length of a burst of losses, ms. 0 loses each packet independently. A knob, disabled
+    /// without loss.
     pub burst_ms: f64,
-    /// What the line carries, Mbit/s; 0: as much as one likes. A knob.
+    /// Bandwidth, Mbit/s. 0 means unlimited. A knob.
     pub rate_mbit: f64,
-    /// What may wait for the line, KiB; what does not fit is dropped. A knob.
+    /// Size of the queue, KiB. Packets that do not fit are dropped. A knob.
     pub queue_kib: f64,
-    /// Packets that are held back, and so overtaken, %. A knob.
+    /// Share of packets that are held back and therefore overtaken, %. A knob.
     pub reordered: f64,
-    /// How long those are held back, and how much later a copy comes at most, ms. A knob.
+    /// Time for which these packets are held back, and maximum delay of a copy, ms. A knob.
     pub held_back_ms: f64,
-    /// Packets that arrive twice, %. A knob.
+    /// Share of packets that arrive twice, %. A knob.
     pub duplicated: f64,
-    /// Jitter lets no packet overtake another. A knob.
+    /// Whether jitter keeps the order of the packets. A knob.
     pub keep_order: bool,
-    /// Of all chances. A knob.
+    /// Seed of all random numbers. A knob.
     pub seed: u64,
 }
 
 impl EmulatorView {
-    /// Whether the network in use is none of the presets.
+    /// Whether the network in use is not one of the presets.
     pub fn other(&self) -> bool {
         self.preset > 0 && self.preset + 1 == self.presets.len()
     }
@@ -123,7 +131,7 @@ pub fn show(ui: &mut Ui, network: &mut NetworkView) {
             if ui.button("Copy").on_hover_text("Copies the invite: others paste it to join.").clicked() {
                 network.copy = true;
             }
-            // The token in it is for those who are invited: it is not for the screen.
+            // The token in the invite is secret, so it is not shown on the screen.
             let shown = invite.split(['#', '?']).next().unwrap_or_default();
             ui.label(shown);
         });

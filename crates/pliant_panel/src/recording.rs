@@ -7,19 +7,19 @@ use crate::{knob::knob, trace::short};
 /// The recording as the panel shows it.
 #[derive(Debug, Clone, Default)]
 pub struct RecordingView {
-    /// Records. A knob.
+    /// Whether data is recorded. A knob.
     pub on: bool,
-    /// Sinks that listen: the file, the viewer.
+    /// Number of connected sinks: the file, the viewer.
     pub sinks: usize,
-    /// Ticks recorded.
+    /// Number of recorded ticks.
     pub ticks: u64,
-    /// Ticks that a sink had no room for.
+    /// Number of ticks dropped because a sink's queue was full.
     pub dropped: u64,
-    /// Shapes a second. A knob.
+    /// Drawings of shapes per second, Hz. A knob.
     pub shapes_hz: f64,
-    /// Drawings of the modes' energies and spectra a second. A knob.
+    /// Drawings of mode energies and spectra per second, Hz. A knob.
     pub modes_hz: f64,
-    /// Surfaces are colored by stress, not by displacement. A knob.
+    /// Whether surfaces are colored by stress instead of displacement. A knob.
     pub stress: bool,
 }
 

@@ -10,19 +10,19 @@ use crate::{
 /// The clock as the panel shows it.
 #[derive(Debug, Clone, Default)]
 pub struct TimeView {
-    /// Stands still. A knob.
+    /// Whether time is paused. A knob.
     pub paused: bool,
-    /// Simulated seconds a second. A knob.
+    /// Simulated seconds per second. A knob.
     pub speed: f64,
     /// Length of a step, s.
     pub step: f64,
-    /// The number of the newest step.
+    /// Number of the newest step.
     pub tick: u64,
-    /// Somebody asked for one step.
+    /// Set when a single step was requested.
     pub step_once: bool,
-    /// What the steps of all bodies took in a tick, ms, over the last seconds.
+    /// Time of the steps of all bodies in a tick, ms, over the last seconds.
     pub step_ms: Trace,
-    /// What writing the surfaces took in a frame, ms.
+    /// Time of updating the surfaces in a frame, ms.
     pub deform_ms: Trace,
 }
 

@@ -1,11 +1,13 @@
-//! The last stretch of a figure, and its plot.
+//! The recent values of a metric, and their plot.
 
 use std::collections::VecDeque;
 
 use bevy_egui::egui::{self, Color32, Sense, TextStyle, Ui, Vec2};
 use egui_plot::{Legend, Line, Plot, PlotPoints};
 
-/// A figure over the last seconds: at most so many points, the oldest forgotten first.
+/// The values of a metric over the last seconds, with a maximum number of points.
+///
+/// The oldest points are dropped first.
 #[derive(Debug, Clone)]
 pub struct Trace {
     points: VecDeque<[f64; 2]>,
@@ -14,12 +16,15 @@ pub struct Trace {
 }
 
 impl Trace {
-    /// Keeps `span` seconds, and `most` points at the most.
+    /// Makes an empty trace that keeps `span` seconds and at most `most` points.
     pub fn new(span: f64, most: usize) -> Self {
         Self { points: VecDeque::new(), span, most: most.max(2) }
     }
 
-    /// Adds `value` at `time` (s). What is not finite is passed over; a time before the last starts anew.
+    /// Adds `value` at `time` (s).
+    ///
+    /// A time or a value that is not finite is ignored. A time before the last one clears the trace
+    /// first.
     pub fn push(&mut self, time: f64, value: f64) {
         if !time.is_finite() || !value.is_finite() {
             return;
@@ -39,30 +44,31 @@ impl Trace {
         }
     }
 
-    /// The newest value.
+    /// Returns the newest value.
     pub fn last(&self) -> Option<f64> {
         self.points.back().map(|point| point[1])
     }
 
-    /// How many points are kept.
+    /// Returns the number of points.
     pub fn len(&self) -> usize {
         self.points.len()
     }
 
-    /// Whether nothing was pushed yet.
+    /// Whether there are no points.
     pub fn is_empty(&self) -> bool {
         self.points.is_empty()
     }
 }
 
 impl Default for Trace {
-    /// Ten seconds, 600 points.
+    /// Returns a trace of ten seconds and 600 points.
     fn default() -> Self {
         Self::new(10.0, 600)
     }
 }
 
-/// A small plot of traces over time; `unit` stands at the values. Nothing is drawn while there are no points.
+/// Draws a small plot of traces over time, with `unit` at the values. Draws nothing if there are no
+/// points.
 pub fn plot<'a>(
     ui: &mut Ui,
     id: &str,
@@ -101,7 +107,7 @@ pub fn plot<'a>(
     });
 }
 
-/// A number in at most three figures.
+/// Formats a number with at most three significant digits.
 pub(crate) fn short(value: f64) -> String {
     let size = value.abs();
     if size == 0.0 {
@@ -117,16 +123,16 @@ pub(crate) fn short(value: f64) -> String {
     }
 }
 
-/// A dot of a color, drawn: the sign for it is not in the font.
+/// Draws a dot in a color, because the font has no glyph for it.
 pub(crate) fn dot(ui: &mut Ui, color: Color32) {
     let side = 0.7 * ui.text_style_height(&TextStyle::Body);
     let (place, _) = ui.allocate_exact_size(Vec2::splat(side), Sense::hover());
     ui.painter().circle_filled(place.center(), 0.45 * side, color);
 }
 
-/// A color for the `index`th of several lines.
+/// Returns a color for the line number `index` of several lines.
 pub(crate) fn color(index: usize) -> Color32 {
-    // Hues a golden angle apart: neighbours differ, however many there are.
+    // Hues a golden angle apart differ between neighbors, for any number of lines.
     let hue = (0.56 + 0.381_966 * index as f32).fract();
     egui::ecolor::Hsva::new(hue, 0.6, 0.95, 1.0).into()
 }

@@ -1,4 +1,5 @@
-//! The panel in an app: what is pressed and moved in it, by accessible names, is done to components and resources.
+//! Tests of the panel in an app: presses and moves of its controls, found by their accessible
+//! names, change components and resources.
 #![allow(clippy::unwrap_used, clippy::panic, missing_docs, reason = "a failed test should panic")]
 
 use std::{
@@ -23,10 +24,11 @@ use pliant_panel::{Panel, PanelPlugin};
 
 type Shown = Harness<'static, App>;
 
-/// How long anything that must come may take. Only what never comes takes longer.
+/// Time limit for all waits. Only a failure takes longer.
 const LIMIT: Duration = Duration::from_secs(60);
 
-/// Looks until it sees what is waited for. `look` goes on by a frame, and says what it saw instead.
+/// Calls `look` until it succeeds. `look` advances by a frame, and its error says what it saw
+/// instead.
 #[track_caller]
 fn until<L: Debug>(what: &str, mut look: impl FnMut() -> Result<(), L>) {
     let begun = Instant::now();
@@ -36,7 +38,8 @@ fn until<L: Debug>(what: &str, mut look: impl FnMut() -> Result<(), L>) {
     }
 }
 
-/// An app without a window, a hundredth of a second a frame, with Pip in it and the panel open.
+/// Returns an app without a window, with frames of a hundredth of a second, Pip, and the open
+/// panel.
 fn app(more: impl FnOnce(&mut App)) -> App {
     let mut app = App::new();
     app.add_plugins((
@@ -74,7 +77,7 @@ fn find<C: Component>(app: &mut App) -> Option<Entity> {
     world.query_filtered::<Entity, With<C>>().iter(world).next()
 }
 
-/// The panel on a bare egui context: each frame of it is one of the app.
+/// Shows the panel on a bare egui context. Each frame of the context is a frame of the app.
 fn show(app: App) -> Shown {
     sized(app, [420.0, 2400.0])
 }
@@ -122,7 +125,7 @@ fn settings(body: &ModalBody) -> (Option<usize>, f64, f64, bool) {
 fn a_bodys_knobs_change_the_body_and_only_when_they_are_moved() {
     let mut app = app(|_| {});
     let entity = find::<ModalBody>(&mut app).unwrap();
-    // Beyond what the sliders reach, and between what they show.
+    // The values are beyond the range of the sliders and between the decimals that they show.
     let mut odd = app.world_mut().get_mut::<ModalBody>(entity).unwrap();
     (odd.settings.damping_scale, odd.settings.stiffness_scale) = (20.0, 1.0 / 3.0);
     let mut shown = show(app);
@@ -169,7 +172,7 @@ fn let_go_takes_off_what_is_held_here_and_wake_wakes() {
     click(&mut shown, "Pause");
     click(&mut shown, "Wake");
     assert!(!shown.state().world().get::<BodyState>(pip).unwrap().is_resting());
-    // Somebody else's body is not ours to set.
+    // The panel must not change a remote body.
     shown.state_mut().world_mut().entity_mut(pip).insert(Driven::Remote);
     shown.run_steps(2);
     assert!(shown.get_by_role_and_label(Role::Slider, "modes").accesskit_node().is_disabled());
@@ -242,7 +245,8 @@ fn it_fits_the_screen_at_any_scale_and_is_gone_when_it_is_closed() {
         let mut keys = shown.state_mut().world_mut().resource_mut::<ButtonInput<KeyCode>>();
         keys.release(KeyCode::F1);
         keys.press(KeyCode::F1);
-        // Pressed in the frame that the app runs now: its own input begins each frame by forgetting it.
+        // The press belongs to the frame that the app runs here, because the app's own input starts
+        // each frame by clearing itself.
         shown.state_mut().world_mut().run_schedule(Update);
         shown.run_steps(4);
     };
@@ -297,7 +301,8 @@ fn the_stop_and_the_force_of_a_device_are_its_own() {
     assert!(!stopped(&shown) && scale(&shown) == 2.0, "looked at, and left as it is");
     click(&mut shown, "STOP");
     assert!(stopped(&shown));
-    // Another comes, and the only one that was stopped goes: it is stopped still, and can be pressed and released.
+    // Another device connects, and the only stopped device disconnects. The stop stays latched, and
+    // can be pressed and released.
     let later = VirtualDevice::new(VirtualConfig::touch(), Hand::FIRM).unwrap();
     let mut devices = shown.state_mut().world_mut().resource_mut::<HapticDevices>();
     devices.add(later, LoopConfig::default()).unwrap();

@@ -1,4 +1,4 @@
-//! Every knob does what it says: pressed and moved by its accessible name, on a bare egui context.
+//! Tests of every knob: it is pressed and moved by its accessible name, on a bare egui context.
 #![allow(clippy::unwrap_used, missing_docs, reason = "a failed test should panic")]
 
 use bevy_egui::egui::{self, Key, accesskit::Role};
@@ -137,7 +137,8 @@ fn the_emergency_stop_is_one_press_and_its_release_another() {
     harness.get_by_label("Release the stop").click();
     harness.run();
     assert!(harness.state().reset && !harness.state().stop);
-    // One device may be stopped, and another come since: the stop can be pressed at any time, with no device there too.
+    // A device may have connected after the stop. The stop can be pressed at any time, also without
+    // a device.
     harness.get_by_label("STOP").click();
     harness.run();
     assert!(std::mem::take(&mut harness.state_mut().stop));
@@ -195,7 +196,7 @@ fn the_emulated_network_is_chosen_by_name_and_its_loss_moved() {
     harness.get_by_label("wifi").click();
     harness.run();
     assert_eq!(harness.state().emulator.as_ref().unwrap().preset, 2);
-    // Off: its knobs go with it.
+    // Without emulation there are no knobs.
     harness.get_by_role(Role::ComboBox).click();
     harness.run();
     harness.get_by_label("none").click();
@@ -343,7 +344,7 @@ fn tab_alone_reaches_every_knob_of_a_body() {
     assert_eq!(reached.len(), 5, "{reached:?}");
 }
 
-/// Shows `view`, passes the focus through all that is in it, and expects it to be what it was.
+/// Shows `view`, moves the focus through all of its controls, and checks that it stays unchanged.
 fn untouched<S: Clone + std::fmt::Debug>(view: S, show: fn(&mut egui::Ui, &mut S), words: &str) {
     let before = format!("{view:?}");
     let mut harness = Harness::builder()
@@ -400,7 +401,7 @@ fn what_nobody_touches_stays_as_it_is_whatever_it_is() {
 fn what_is_typed_is_taken() {
     let mut harness =
         Harness::new_ui_state(|ui, bodies: &mut Vec<BodyView>| bodies::show(ui, bodies), vec![body()]);
-    // The field beside the slider has its name too, and comes after it.
+    // The field beside the slider has the same name and comes after the slider.
     let field = || "damping";
     harness.get_by_role_and_label(Role::SpinButton, field()).focus();
     harness.run();

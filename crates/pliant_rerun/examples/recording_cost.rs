@@ -1,10 +1,13 @@
-//! What a recording costs the app that is recorded, a frame, and how large it grows.
+//! Measures the cost of a recording per frame of the recorded app, and the size of the recording.
 //!
-//! `cargo run --release -p pliant_rerun --example recording_cost -- [SECONDS]`, the default is 20 s for each case.
+//! `cargo run --release -p pliant_rerun --example recording_cost -- [SECONDS]`. The default is 20 s
+//! for each case.
 //!
-//! One app for each case, all alike: the shipped body with two hands that never rest, a tick a frame, 60 frames a second. They take turns, a
-//! second each, so that what else the machine does falls on all of them. A frame is `App::update` (no renderer) and a spin of 4 ms in place of what a game
-//! does besides. The viewer that reads is `rerun --save`, where `rerun` is installed; the slow one accepts a connection and never reads.
+//! Each case has its own app, and all apps are equal: the shipped body with two hands that never
+//! rest, one tick per frame, 60 frames per second. The apps take turns of one second, so that other
+//! load of the machine affects all of them. A frame is `App::update` (without a renderer) and a
+//! busy wait of 4 ms in place of the rest of a game. The viewer that reads is `rerun --save`, if
+//! `rerun` is installed. The slow viewer accepts a connection and never reads.
 #![allow(
     clippy::unwrap_used,
     clippy::expect_used,
@@ -27,13 +30,13 @@ use pliant_rerun::{RerunColor, RerunPlugin, RerunRecording, RerunStats};
 
 const HZ: f64 = 60.0;
 const SPIN: Duration = Duration::from_millis(4);
-/// Frames of a turn.
+/// Frames per turn.
 const TURN: usize = 60;
 
 struct Case {
     name: &'static str,
     app: App,
-    /// What the file or the viewer wrote.
+    /// The output of the file sink or the viewer.
     file: Option<PathBuf>,
     updates: Vec<f64>,
     frames: Vec<f64>,
@@ -82,7 +85,7 @@ fn main() {
         println!("`rerun` is not installed: the viewer that reads is left out");
     }
 
-    // The first second is for caches, connections and the bodies to load.
+    // The first second is for warming caches, opening connections and loading bodies.
     for turn in 0..=seconds {
         for case in &mut cases {
             case.turn(turn > 0);
@@ -122,7 +125,7 @@ fn viewer_at(port: u16) -> RerunPlugin {
     RerunPlugin::viewer().with_viewer_port(port).with_spawn(false)
 }
 
-/// A port that was free a moment ago.
+/// Returns a port that was free a moment ago.
 fn free_port() -> u16 {
     TcpListener::bind("127.0.0.1:0").unwrap().local_addr().unwrap().port()
 }
@@ -188,7 +191,7 @@ impl Case {
     }
 }
 
-/// Where a hand took hold, m.
+/// Position at which a hand grabbed, m.
 #[derive(Component)]
 struct At(DVec3);
 
@@ -201,7 +204,7 @@ fn move_hands(time: Res<Time>, mut hands: Query<(&mut Grab, &At)>) {
     }
 }
 
-/// `rerun --save`: takes everything in and writes it down.
+/// A `rerun --save` process, which receives everything and writes it to a file.
 struct Viewer {
     port: u16,
     process: Child,

@@ -1,4 +1,5 @@
-//! The layout that ships with a recording: the scene on the left with the modes' bars and the log under it, plots on the right.
+//! The layout in a recording: the scene on the left with the mode bars and the log below it, plots
+//! on the right.
 
 use std::collections::{BTreeMap, BTreeSet, HashMap};
 
@@ -15,55 +16,59 @@ use rerun::{
 
 use crate::recorder::path;
 
-/// Plots that have a place of their own; those beyond share the last one, as tabs.
+/// Maximum number of places for plots. Further plots share the last place, as tabs.
 const MOST_CELLS: usize = 8;
 
-/// Bodies whose bars have a tab; the others' are there to be opened by hand.
+/// Maximum number of bodies whose bars have a tab. The bars of other bodies can be opened manually.
 const MOST_TABS: usize = 12;
 
-/// How the program runs, not what bodies, hands and the network do: one place, in tabs.
+/// Areas about how the program runs, as opposed to bodies, hands and the network. They share one
+/// place, in tabs.
 const HOUSEKEEPING: [&str; 3] = ["time", "frame", "bodies"];
 
-/// What is looked at first comes first; areas that are not named here, a game's own, are where the gap is.
+/// Areas whose plots come first. Areas that are named neither here nor in `LAST`, such as a game's
+/// own areas, come between them.
 const FIRST: [&str; 2] = ["reaction", "displacement"];
 const LAST: [&str; 5] = ["energy", "stress", "device", "net", "time"];
 
-/// Of the units of one area, those whose tab is in front.
+/// Units whose tabs come first within an area.
 const UNITS: [&str; 4] = ["ms", "N", "%", "kbit/s"];
 
-/// One plot: figures with one first part of their path and one unit.
+/// One plot: metrics with the same first part of their path and the same unit.
 #[derive(Debug, Clone, PartialEq)]
 pub(crate) struct Plot {
     pub title: String,
     pub area: String,
     pub contents: Vec<String>,
-    /// Lines in it.
+    /// Number of lines in the plot.
     pub lines: usize,
 }
 
-/// The plots of a recording: figures with one first part of their path and one unit share an axis.
+/// The plots of a recording. Metrics with the same first part of their path and the same unit share
+/// an axis.
 #[derive(Debug, Clone, Default)]
 pub(crate) struct Plots {
     titles: BTreeMap<String, String>,
-    /// Area, unit, paths.
+    /// Noted paths by area and unit.
     seen: BTreeMap<(String, String), BTreeSet<String>>,
-    /// The unit of each path that was noted.
+    /// The unit of each noted path.
     known: HashMap<String, String>,
-    /// Bar charts: area, names.
+    /// Bar charts: names by area.
     bars: BTreeMap<&'static str, BTreeSet<String>>,
     changed: bool,
     log: bool,
 }
 
 impl Plots {
-    /// `titles`: names of plots for the first part of a figure's path, where that is not a good one itself.
+    /// Makes an empty layout. `titles` maps the first part of a metric's path to the title of its
+    /// plot.
     pub fn new(titles: impl IntoIterator<Item = (String, String)>) -> Self {
         Self { titles: titles.into_iter().collect(), ..Self::default() }
     }
 
-    /// Notes a figure; `true` when it is a new one.
+    /// Notes a metric. Returns `true` if it is new.
     pub fn note(&mut self, path: &str, unit: &str) -> bool {
-        // Asked for every figure of every tick.
+        // This runs for every metric of every tick, so a known metric returns early.
         if self.known.get(path).is_some_and(|known| known == unit) {
             return false;
         }
@@ -82,18 +87,18 @@ impl Plots {
         }
     }
 
-    /// Notes that there are lines of text.
+    /// Notes that there are log lines.
     pub fn note_log(&mut self) {
         self.changed |= !self.log;
         self.log = true;
     }
 
-    /// Whether the layout is another one since this was last asked.
+    /// Whether the layout has changed since the last call.
     pub fn take_changed(&mut self) -> bool {
         std::mem::take(&mut self.changed)
     }
 
-    /// The plots of each place, in the order of the places: those of one area share one.
+    /// Returns the plots of each place, in order. The plots of one area share a place.
     pub fn cells(&self) -> Vec<Vec<Plot>> {
         let mut cells: BTreeMap<(usize, &str), Vec<(usize, Plot)>> = BTreeMap::new();
         for ((area, unit), paths) in &self.seen {
@@ -101,7 +106,7 @@ impl Plots {
             let title = if unit.is_empty() { title } else { format!("{title} ({unit})") };
             let alone = self.seen.keys().filter(|(other, _)| other == area).count() == 1;
             let contents = if alone {
-                // Figures that are yet to come find their place by themselves.
+                // With this pattern, later metrics of the area appear in the plot by themselves.
                 vec![format!("{}/**", path(area))]
             } else {
                 paths.iter().map(|p| path(p).to_string()).collect()
@@ -128,7 +133,7 @@ impl Plots {
         cells
     }
 
-    /// The bar charts of an area: one, or a tab for each body.
+    /// Returns the bar charts of an area: a single chart, or a tab for each body.
     fn bar_views(&self, area: &str, title: &str) -> Option<ContainerLike> {
         let names = self.bars.get(area)?;
         let view = |title: String, name: &str| {
@@ -161,7 +166,7 @@ impl Plots {
                 plots => Tabs::new(plots.iter().map(view).collect::<Vec<_>>()).into(),
             })
             .collect();
-        // Bars and text want the width: they go under the scene.
+        // Bars and text need the width, so they are below the scene.
         let bars = [("modes", "Energy of each mode (J)"), ("spectrum", "Spectrum (m over Hz)")];
         let bars: Vec<_> = bars.iter().filter_map(|(area, title)| self.bar_views(area, title)).collect();
         let (mut left, mut shares): (Vec<ContainerLike>, Vec<f32>) = (vec![scene.into()], vec![4.0]);
@@ -179,7 +184,8 @@ impl Plots {
             1..=3 => Horizontal::new([left.into(), Vertical::new(plots).into()])
                 .with_column_shares([3.0, 2.0])
                 .into(),
-            // In pairs, and one that is left over has a row of its own: a grid would leave a hole beside it.
+            // Plots stand in pairs, and a remaining plot has its own row. A grid would leave a hole
+            // beside it.
             count => {
                 let rows = count.div_ceil(2);
                 let mut plots = plots.into_iter();
@@ -194,13 +200,15 @@ impl Plots {
             .with_blueprint_panel(BlueprintPanel::from_state(PanelState::Collapsed))
             .with_selection_panel(SelectionPanel::from_state(PanelState::Collapsed))
             .with_time_panel(
-                // At the newest: a live viewer keeps up, and a file opens on a scene that is all there.
+                // The time panel follows the newest data: a live viewer stays current, and a file
+                // opens on a complete scene.
                 TimePanel::new()
                     .with_state(PanelState::Collapsed)
                     .with_timeline(crate::SIM_TIME)
                     .with_play_state(PlayState::Following),
             );
-        // By way of a memory, as the SDK's own blueprints have no legends.
+        // The blueprint passes through a memory stream, because the SDK's own blueprints have no
+        // legends.
         let application = recording.store_info().map(|info| info.application_id().clone());
         let Some(application) = application else { return Ok(()) };
         let (stream, memory) = RecordingStreamBuilder::new(application).memory()?;
@@ -224,8 +232,10 @@ impl Plots {
     }
 }
 
-/// The legend of the plot that this message of a blueprint is about, if it is one: none where there is one line only, whose name the title
-/// tells, and else where lines begin and not where they go on.
+/// Returns the legend of the plot that this blueprint message describes, if it describes a plot.
+///
+/// A plot with a single line has no visible legend, because its title names the line. In other
+/// plots the legend is where lines begin, not where they continue.
 fn legend(message: &LogMsg, single: &BTreeSet<&str>) -> Option<LogMsg> {
     let LogMsg::ArrowMsg(store, data) = message else { return None };
     let chunk = Chunk::from_arrow_msg(data).ok()?;
@@ -240,7 +250,7 @@ fn legend(message: &LogMsg, single: &BTreeSet<&str>) -> Option<LogMsg> {
         return None;
     }
     let title = text("display_name")?;
-    // The SDK does not export this archetype by its type.
+    // The SDK does not export the type of this archetype.
     let legend = DynamicArchetype::new("rerun.blueprint.archetypes.PlotLegend")
         .with_component::<Corner2D>("corner", [Corner2D::LeftTop])
         .with_component::<Visible>("visible", [!single.contains(&*title)]);

@@ -1,4 +1,4 @@
-//! The app's side: reads what others published and offers it to the workers.
+//! The app's side of the recording: reads the published data and offers it to the workers.
 
 use std::{
     collections::{HashMap, HashSet},
@@ -24,7 +24,7 @@ use crate::{
 #[derive(Resource)]
 pub(crate) struct Collector {
     workers: Vec<Worker>,
-    /// Frames that have been logged, to be filled again: what is recorded every tick takes no memory anew.
+    /// Logged frames whose memory is reused, so that recording every tick allocates nothing new.
     spare: Receiver<Frame>,
     shapes: Due,
     metrics: Due,
@@ -32,56 +32,57 @@ pub(crate) struct Collector {
     modes: Due,
     words: Due,
     bodies: HashMap<Entity, Followed>,
-    /// Bodies came that no frame has told of.
+    /// Whether there are new bodies that no frame contains yet.
     untold: bool,
     had_hands: bool,
     /// The diagnostics that were recorded.
     measured: HashMap<DiagnosticPath, Measured>,
-    /// Grabs in the order in which they are drawn, and what they are called.
+    /// Grabs in the order of their drawing. `names` holds their names.
     order: Vec<Entity>,
     names: EntityHashMap<Called>,
 }
 
 struct Measured {
-    /// When it was last measured.
+    /// Time of the newest measurement.
     newest: Instant,
     figure: Arc<Metric>,
 }
 
-/// A hand's name as it was given, and as it is recorded.
+/// The given name of a hand and its recorded name.
 struct Called {
     given: String,
     name: Arc<str>,
 }
 
-/// What a session says of hands.
+/// The session's data about hands.
 #[derive(Resource, Default)]
 pub(crate) struct Hands {
-    /// Those that are not entities here: of a session's other users.
+    /// Hands of the session's other users that are not entities of this app.
     pub others: Vec<Hand>,
-    /// Whose those are that are.
+    /// The users of the hands that are entities of this app.
     pub whose: EntityHashMap<Whose>,
 }
 
-/// The user behind a hand.
+/// The user of a hand.
 #[derive(Debug, Clone)]
 pub(crate) struct Whose {
     pub name: String,
-    /// sRGB.
+    /// Color, sRGB.
     pub color: [u8; 3],
 }
 
-/// When something was due last, s of simulated time.
+/// Simulated time at which something was last due, s.
 #[derive(Debug, Clone, Copy)]
 struct Due(f64);
 
 impl Due {
     const NEVER: Self = Self(f64::NEG_INFINITY);
 
-    /// Whether it is due at simulated time `time`, so often as `hz` says.
+    /// Whether something with rate `hz` is due at simulated time `time`.
     fn at(&mut self, time: f64, hz: f64) -> bool {
         let period = 1.0 / hz;
-        // A millionth of a second of slack: 20 Hz in 40 Hz of ticks is every second one, whatever the rounding. Time that went back is a new run.
+        // With the tolerance of a microsecond, 20 Hz is exactly every second tick at 40 Hz,
+        // whatever the rounding. Time that goes back starts a new run.
         if hz.is_nan() || hz <= 0.0 || (time + 1e-6 < self.0 + period && time >= self.0) {
             return false;
         }
@@ -91,30 +92,31 @@ impl Due {
     }
 }
 
-/// What of a tick is wanted now. Decided before anybody gathers anything, so that a stream that is off costs nothing.
+/// The data that is recorded of the current tick. The decision comes before the gathering, so that
+/// a stream that is off costs nothing.
 #[derive(Resource, Debug, Default, Clone, Copy)]
 pub(crate) struct Wanted {
     draw: bool,
     metrics: bool,
     hands: bool,
-    /// A sample for the spectrum.
+    /// Whether a sample for the spectrum is taken.
     sample: bool,
-    /// The energies of the modes as bars.
+    /// Whether the energies of the modes are drawn as bars.
     bars: bool,
-    /// What is said in words when it changes; looked at a few times a second.
+    /// Whether states that are logged as text are checked for changes, a few times per second.
     words: bool,
     /// Length of a tick, s.
     tick: f64,
 }
 
-/// How often it is looked for what is said in words, Hz of simulated time.
+/// Rate of checks for states that are logged as text, Hz of simulated time.
 const WORDS_HZ: f64 = 10.0;
 
 struct Followed {
     drawn: Arc<Drawn>,
     version: u64,
     place: Option<Place>,
-    /// The newest shape was drawn.
+    /// Whether the newest shape was drawn.
     complete: bool,
 }
 
@@ -154,7 +156,8 @@ pub(crate) fn wants_text(wanted: Res<Wanted>) -> bool {
     wanted.words
 }
 
-/// Nobody listens or nothing is recorded: what was set meanwhile is of another time than what is recorded next.
+/// Drops gathered data while no sink is open or the recording is off, because this data does not
+/// belong to the time that is recorded next.
 pub(crate) fn forget(
     mut own: ResMut<RerunScalars>,
     mut wanted: ResMut<Wanted>,
@@ -168,7 +171,7 @@ pub(crate) fn forget(
     }
 }
 
-/// What is wanted of this tick.
+/// Decides what is recorded of this tick.
 pub(crate) fn decide(
     mut collector: ResMut<Collector>,
     mut wanted: ResMut<Wanted>,
@@ -179,11 +182,11 @@ pub(crate) fn decide(
 ) {
     let collector = &mut *collector;
     if recording.metrics_hz.is_nan() || recording.metrics_hz <= 0.0 {
-        // Nobody takes them; later they would be of another time.
+        // The metrics are not recorded now, and would have a wrong time later.
         own.forget_metrics();
     }
     if collector.workers.iter().all(Worker::is_full) {
-        // Nobody has room for it, so it is not made. What is due stays due.
+        // No queue has room, so no frame is made. What is due stays due.
         collector.workers.iter_mut().for_each(Worker::miss);
         collector.bodies.values_mut().for_each(|followed| followed.complete = false);
         own.forget_metrics();
@@ -248,7 +251,7 @@ pub(crate) fn collect(
         own.warn(format!("{}: {}", refused.entity, refused.error));
     }
     if collector.workers.iter().all(Worker::is_full) && collector.workers.iter().any(Worker::listens) {
-        // `decide` has counted it. The lines wait.
+        // `decide` has counted this tick. The lines wait for a later frame.
         return;
     }
     let mut frame = collector.spare.try_recv().unwrap_or_default();
@@ -286,7 +289,7 @@ pub(crate) fn collect(
         missed |= !worker.offer(&frame, all) && worker.listens();
     }
     if missed {
-        // A frame that was dropped may have drawn the last shape of a body: draw it again.
+        // The dropped frame may hold the last shape of a body, so the shape must be drawn again.
         collector.bodies.values_mut().for_each(|followed| followed.complete = false);
     }
     stats.dropped = collector.workers.iter().map(Worker::dropped).sum();
@@ -323,7 +326,7 @@ fn follow_bodies(collector: &mut Collector, frame: &mut Frame, bodies: &Bodies, 
             continue;
         }
         if !(draw || wanted.metrics || wanted.sample) {
-            // What moves goes on counting as moved until somebody wants it.
+            // The body still counts as moved until its data is wanted.
             continue;
         }
         followed.version = shown.version();
@@ -351,7 +354,7 @@ fn follow_bodies(collector: &mut Collector, frame: &mut Frame, bodies: &Bodies, 
     }
 }
 
-/// The entity's name, or a number; made different from the names in use.
+/// Returns the entity's name, or a number, made different from the names in use.
 fn free_path(bodies: &HashMap<Entity, Followed>, entity: Entity, name: Option<&Name>) -> Arc<str> {
     let name = name.map_or_else(|| format!("body {entity}"), |name| name.as_str().replace('/', " "));
     if bodies.values().any(|followed| *followed.drawn.path == *name) {
@@ -361,8 +364,10 @@ fn free_path(bodies: &HashMap<Entity, Followed>, entity: Entity, name: Option<&N
     }
 }
 
-/// Adds kinetic and elastic energy of each mode, J, to `to`. Of a body that somebody else steps the velocities are those of its shape over
-/// the last tick of `tick` seconds.
+/// Adds the kinetic and elastic energy of each mode, J, to `to`.
+///
+/// The velocities of a remote body are computed from the change of its shape over the last tick of
+/// `tick` seconds.
 fn energies(to: &mut Vec<f64>, state: &BodyState, driven: &Driven, shown: &VisualState, tick: f64) {
     let body = state.body();
     let scale = state.scale() * state.scale();
@@ -416,7 +421,7 @@ fn gather_hands(collector: &mut Collector, frame: &mut Frame, grabs: &Grabs, ses
     }
 }
 
-/// Where the diagnostics of `pliant_body` go, which have no area of their own in their path: each with those of its kind.
+/// Paths of the diagnostics of `pliant_body`, whose own paths contain no area.
 const AREAS: [(&str, &str); 3] =
     [("step", "time/step"), ("awake", "bodies/awake"), ("deform", "frame/deform")];
 

@@ -1,4 +1,5 @@
-//! Figures and hands of several ticks, sent as columns: one message a line of a plot in place of one a value.
+//! Metrics and hands of several ticks, sent as columns: one message per line of a plot instead of
+//! one per value.
 
 use std::collections::HashMap;
 
@@ -13,9 +14,9 @@ use crate::{SIM_TIME, TICK, WALL_TIME, frame::Frame, recorder::path};
 #[derive(Debug, Default, Clone, Copy)]
 pub(crate) struct Moment {
     pub tick: u64,
-    /// s.
+    /// Simulated time, s.
     pub time: f64,
-    /// s since the epoch.
+    /// Wall time, s since the epoch.
     pub wall: f64,
 }
 
@@ -24,7 +25,7 @@ impl Moment {
         Self { tick: frame.tick, time: frame.time, wall: frame.wall }
     }
 
-    /// So many seconds before, in the same tick.
+    /// Returns the moment that is `seconds` earlier in the same tick.
     pub fn before(self, seconds: f64) -> Self {
         Self { time: self.time - seconds, wall: self.wall - seconds, ..self }
     }
@@ -55,7 +56,7 @@ struct Series {
     values: Vec<f64>,
 }
 
-/// The figures that wait to be sent.
+/// The metrics that wait to be sent.
 #[derive(Debug, Default)]
 pub(crate) struct Columns {
     series: HashMap<String, Series>,
@@ -63,7 +64,7 @@ pub(crate) struct Columns {
 }
 
 impl Columns {
-    /// So many values are sent, whatever the time.
+    /// Number of waiting values at which they are sent, regardless of the time.
     const MOST: usize = 1 << 14;
 
     pub fn push(&mut self, name: &str, at: Moment, value: f64) {
@@ -78,7 +79,7 @@ impl Columns {
         }
     }
 
-    /// Whether no more should wait.
+    /// Whether the values should be sent now.
     pub fn is_full(&self) -> bool {
         self.waiting >= Self::MOST
     }
@@ -92,7 +93,7 @@ impl Columns {
             let sent = columns
                 .map_err(RecordingStreamError::from)
                 .and_then(|columns| stream.send_columns(series.entity.clone(), times, columns));
-            // One that cannot be sent does not hold up the others.
+            // A series that cannot be sent does not hold up the others.
             result = result.and(sent);
         }
         result
@@ -103,7 +104,7 @@ impl Columns {
 #[derive(Debug, Default)]
 pub(crate) struct HandColumns {
     moments: Moments,
-    /// How many hands each tick had.
+    /// Number of hands of each tick.
     counts: Vec<usize>,
     arrows: Vec<[f32; 3]>,
     points: Vec<[f32; 3]>,
@@ -113,7 +114,7 @@ pub(crate) struct HandColumns {
 }
 
 impl HandColumns {
-    /// Begins a tick, which the hands that follow belong to.
+    /// Begins a tick, to which the following hands belong.
     pub fn begin(&mut self, at: Moment) {
         self.moments.0.push(at);
         self.counts.push(0);

@@ -1,10 +1,10 @@
-//! What goes from the app to a worker: everything of one tick in one message, and nothing that borrows from the app.
+//! The messages from the app to a worker: all data of one tick, without borrows from the app.
 
 use std::{borrow::Cow, ops::Range, sync::Arc};
 
 use pliant_modal::ModalModel;
 
-/// One tick.
+/// The data of one tick.
 #[derive(Debug, Default)]
 pub(crate) struct Frame {
     pub tick: u64,
@@ -12,30 +12,31 @@ pub(crate) struct Frame {
     pub time: f64,
     /// Wall time, s since the epoch.
     pub wall: f64,
-    /// Bodies that this worker may not know yet; a worker that does passes them over.
+    /// Bodies that a worker may not know yet. A worker ignores the bodies that it knows.
     pub arrived: Vec<Arc<Drawn>>,
-    /// Paths of bodies that are gone.
+    /// Paths of removed bodies.
     pub left: Vec<Arc<str>>,
     pub shapes: Vec<Shape>,
-    /// The modal coordinates of all shapes, one after the other.
+    /// The modal coordinates of all shapes, in sequence.
     pub coordinates: Vec<f32>,
-    /// Energies of the modes of the shapes that have them, J, one after the other.
+    /// Energies of the modes of the shapes that have them, J, in sequence.
     pub energies: Vec<f64>,
     pub color: crate::RerunColor,
-    /// All hands of the tick; `None` when they are not due, and when there are none and were none before.
+    /// All hands of the tick. `None` if hands are not due, and if there are none now and were none
+    /// before.
     pub hands: Option<Vec<Hand>>,
     /// Diagnostics that were measured since the last tick.
     pub measured: Vec<(Arc<Metric>, f64)>,
     pub scalars: Vec<Scalar>,
-    /// Figures that came faster than ticks.
+    /// Metrics that are sampled faster than ticks.
     pub samples: Vec<Samples>,
     pub lines: Vec<Line>,
-    /// Room for the hands of the frame that this one will be used for again.
+    /// Reused memory for the hands of a later tick.
     pub room: Vec<Hand>,
 }
 
 impl Frame {
-    /// The frame without what is in it, but with the memory that it had.
+    /// Returns an empty frame that keeps the memory of this one.
     pub fn cleared(mut self) -> Self {
         if let Some(hands) = self.hands.take() {
             self.room = hands;
@@ -53,34 +54,34 @@ impl Frame {
         self
     }
 
-    /// An empty list of hands, in memory that was one before.
+    /// Returns an empty list of hands in reused memory.
     pub fn take_room(&mut self) -> Vec<Hand> {
         std::mem::take(&mut self.room)
     }
 
-    /// The modal coordinates of a shape.
+    /// Returns the modal coordinates of a shape.
     pub fn coordinates(&self, shape: &Shape) -> &[f32] {
         self.coordinates.get(shape.coordinates.clone()).unwrap_or_default()
     }
 
-    /// The energies of a shape's modes, J.
+    /// Returns the energies of a shape's modes, J.
     pub fn energies(&self, shape: &Shape) -> Option<&[f64]> {
         self.energies.get(shape.energies.clone()?)
     }
 }
 
-/// What a worker had no room for, and has to be told with the next frame.
+/// The data that a worker missed because its queue was full, sent with the next frame.
 #[derive(Debug, Default)]
 pub(crate) struct Owed {
-    /// All bodies that there are; those that are not among them are gone.
+    /// All existing bodies. Bodies that are not in this list were removed.
     pub bodies: Vec<Arc<Drawn>>,
     pub lines: Vec<Line>,
-    /// The last hands that it missed were none: what it draws is gone.
+    /// Whether the last missed list of hands was empty, so that the drawn hands must be removed.
     pub no_hands: bool,
 }
 
 impl Owed {
-    /// Most lines that are kept.
+    /// Maximum number of lines that are kept.
     const LINES: usize = 1024;
 
     pub fn add(&mut self, missed: &Frame) {
@@ -92,7 +93,7 @@ impl Owed {
     }
 }
 
-/// A body as it is drawn.
+/// A drawn body.
 #[derive(Debug)]
 pub(crate) struct Drawn {
     pub path: Arc<str>,
@@ -104,29 +105,29 @@ pub(crate) struct Drawn {
 #[derive(Debug)]
 pub(crate) struct Shape {
     pub body: Arc<Drawn>,
-    /// Where its modal coordinates are in the frame's.
+    /// Range of the body's modal coordinates in those of the frame.
     pub coordinates: Range<usize>,
     pub warped: bool,
     pub place: Place,
-    /// Stiffness as a multiple of the baked one.
+    /// Stiffness as a multiple of the baked stiffness.
     pub stiffness: f32,
-    /// What is wanted of it now: its picture,
+    /// Whether the shape is drawn in this tick.
     pub draw: bool,
-    /// its figures,
+    /// Whether metrics are recorded in this tick.
     pub metrics: bool,
-    /// and a sample for its spectrum.
+    /// Whether a sample for the spectrum is taken in this tick.
     pub sample: bool,
-    /// Where the energies of its modes are in the frame's.
+    /// Range of the mode energies in those of the frame.
     pub energies: Option<Range<usize>>,
-    /// Whether those are drawn as bars.
+    /// Whether the energies are drawn as bars.
     pub bars: bool,
 }
 
-/// Where a body is.
+/// The pose and the scale of a body.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub(crate) struct Place {
     pub translation: [f32; 3],
-    /// x, y, z, w.
+    /// Quaternion x, y, z, w.
     pub rotation: [f32; 4],
     pub scale: f32,
 }
@@ -134,7 +135,7 @@ pub(crate) struct Place {
 #[derive(Debug, Clone)]
 pub(crate) struct Hand {
     pub name: Arc<str>,
-    /// Of whose hand it is, sRGB; `None` takes one of the recording's own.
+    /// Color of the hand's user, sRGB. `None` selects one of the recording's own colors.
     pub color: Option<[u8; 3]>,
     /// Reaction, N.
     pub force: [f64; 3],
@@ -149,19 +150,19 @@ pub(crate) struct Scalar {
     pub value: f64,
 }
 
-/// A figure by its path, and its unit.
+/// The path and the unit of a metric.
 #[derive(Debug)]
 pub(crate) struct Metric {
     pub path: String,
     pub unit: String,
 }
 
-/// A figure at moments of its own, oldest first.
+/// Values of a metric at their own times, oldest first.
 #[derive(Debug)]
 pub(crate) struct Samples {
     pub path: String,
     pub unit: &'static str,
-    /// How long before the tick, s, and the value.
+    /// Time before the tick, s, and the value.
     pub values: Vec<(f64, f64)>,
 }
 

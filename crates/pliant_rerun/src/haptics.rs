@@ -1,4 +1,5 @@
-//! What the devices do: their force, how late their loops are, what the hand got, what is wrong, and every period of their loops.
+//! Data of the devices: force, lateness of the loops, energy given to the hand, faults, and every
+//! period of the loops.
 
 use std::{
     collections::{HashMap, HashSet},
@@ -13,7 +14,7 @@ use crate::{
     frame::{Metric, Samples},
 };
 
-/// What each device is called: by its name, and the second of one name by its number, too.
+/// Returns the name of each device. A second device of the same name also gets a number.
 fn names(devices: &HapticDevices) -> Vec<(DeviceId, String)> {
     let mut names = Vec::new();
     let mut seen: Vec<&str> = Vec::new();
@@ -26,7 +27,7 @@ fn names(devices: &HapticDevices) -> Vec<(DeviceId, String)> {
     names
 }
 
-/// The figures of each device, made once: they are set every tick.
+/// The metrics of each device. They are made once, because they are set in every tick.
 type Metrics = Vec<(DeviceId, [Arc<Metric>; 4])>;
 
 pub(crate) fn see_devices(
@@ -58,7 +59,7 @@ pub(crate) fn see_devices(
     }
 }
 
-/// What was said last of a device: its state, and its fault in words.
+/// The last logged state and fault of each device.
 type Said = HashMap<DeviceId, (LoopState, Option<String>)>;
 
 pub(crate) fn say_how_they_are(
@@ -84,7 +85,7 @@ pub(crate) fn say_how_they_are(
     }
 }
 
-/// Every period of the devices' loops, where that is asked for ([`RerunRecording::device_loops`]).
+/// Records every period of the device loops, if [`RerunRecording::device_loops`] is set.
 pub(crate) fn take_samples(
     mut devices: ResMut<HapticDevices>,
     recording: Res<RerunRecording>,

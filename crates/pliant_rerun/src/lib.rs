@@ -1,4 +1,6 @@
-//! Streams what Pliant does to the [rerun](https://rerun.io) viewer or to a file: shapes, reactions, figures, lines of text.
+//! Records what Pliant does to the [rerun](https://rerun.io) viewer or to a file.
+//!
+//! The recording contains shapes, reactions, metrics and log lines.
 //!
 //! ```no_run
 //! use bevy::prelude::*;
@@ -8,31 +10,35 @@
 //! App::new().add_plugins((DefaultPlugins, PliantBodyPlugin::default(), RerunPlugin::file("session.rrd"))).run();
 //! ```
 //!
-//! What is recorded, on the timelines [`TICK`], [`SIM_TIME`] and [`WALL_TIME`]:
+//! The recording uses the timelines [`TICK`], [`SIM_TIME`] and [`WALL_TIME`]. It contains:
 //!
-//! | Path | What |
+//! | Path | Content |
 //! | --- | --- |
 //! | `world/NAME` | the deformed surface of every body, colored by displacement or stress ([`RerunColor`]); connectivity once, then positions |
 //! | `world/hands` | every grab: its reaction as an arrow, its target, the line between |
 //! | `reaction/NAME` | magnitude of the reaction, N, in the color of the hand's user |
 //! | `displacement/NAME` | largest displacement of the surface, m |
 //! | `energy/NAME` | kinetic and elastic energy of all modes together, J |
-//! | `stress/NAME` | largest von Mises stress in the skin, Pa, when that is the color |
+//! | `stress/NAME` | largest von Mises stress in the skin, Pa, if the color shows the stress |
 //! | `modes/NAME` | energy of each mode, J, as bars |
-//! | `spectrum/NAME` | how far the loosest point of the body swings at each frequency, m over Hz, in the last 256 ticks |
-//! | `AREA/NAME` | every Bevy diagnostic under `pliant/AREA/`, as the network has them; the body crate's are `time/step` (ms a tick), `frame/deform` (ms a frame) and `bodies/awake` |
-//! | any other | what anybody sets in [`RerunScalars`] |
-//! | `log` | what was refused, what is written with [`RerunScalars::say`], and what the app logs, with [`log_layer`] |
+//! | `spectrum/NAME` | amplitude of the body's most compliant point at each frequency, m over Hz, in the last 256 ticks |
+//! | `AREA/NAME` | every Bevy diagnostic under `pliant/AREA/`, such as those of the network; those of the body crate are `time/step` (ms per tick), `frame/deform` (ms per frame) and `bodies/awake` |
+//! | any other | values set in [`RerunScalars`] |
+//! | `log` | refused inputs, lines written with [`RerunScalars::say`], and the app's log lines, with [`log_layer`] |
 //!
-//! With the feature `net`, the hands of a session's other users are among the hands, and who comes and goes and how the connection stands
-//! is in the log. With the feature `haptics`, `device/NAME/` has the force, lateness and energy of every device, and the log its faults; with
-//! [`RerunRecording::device_loops`] `device/NAME/loop/` has every period of its loop.
+//! With the feature `net`, the hands include those of the session's other users, and the log
+//! includes users who join or leave and the state of the connection. With the feature `haptics`,
+//! `device/NAME/` holds the force, lateness and energy of every device, and the log includes the
+//! faults of the devices. With [`RerunRecording::device_loops`], `device/NAME/loop/` holds every
+//! period of the device loop.
 //!
-//! A layout comes with the recording: the scene beside a plot for each kind of figure.
+//! The recording includes a layout: the scene beside a plot for each kind of metric.
 //!
-//! The app never waits: one thread of low priority a sink logs from a bounded queue, which drops and counts what it has no room for
-//! ([`RerunStats`]). Bodies that rest are not sent, and what [`RerunRecording`] gives a rate of zero is not gathered. A viewer that is not there, or is closed, is no error, and costs nothing from then on.
-//! The recording is whole after [`AppExit`](bevy::app::AppExit), when the app is dropped, and when a panic unwinds it.
+//! The app never waits. Each sink has one thread of low priority, which logs from a bounded queue.
+//! A full queue drops ticks and counts them ([`RerunStats`]). Resting bodies are not sent. Data
+//! whose rate in [`RerunRecording`] is zero is not gathered. A missing or closed viewer is not an
+//! error, and then costs nothing. The recording is complete after [`AppExit`](bevy::app::AppExit),
+//! when the app is dropped, and when a panic unwinds it.
 #![cfg_attr(
     test,
     allow(clippy::unwrap_used, clippy::expect_used, clippy::panic, reason = "a failed test should panic")
@@ -64,11 +70,11 @@ pub use log_lines::log_layer;
 pub use plugin::{RerunColor, RerunError, RerunPlugin, RerunRecording, RerunStats, RerunStyle, RerunSystems};
 pub use scalars::RerunScalars;
 
-/// Timeline: the tick, [`PliantTick`](pliant_body::PliantTick).
+/// Timeline of the tick, [`PliantTick`](pliant_body::PliantTick).
 pub const TICK: &str = "tick";
 
-/// Timeline: simulated time, s.
+/// Timeline of simulated time, s.
 pub const SIM_TIME: &str = "sim_time";
 
-/// Timeline: wall time.
+/// Timeline of wall time.
 pub const WALL_TIME: &str = "wall_time";

@@ -1,4 +1,4 @@
-//! The app's own log lines, for the recording's.
+//! The app's own log lines for the recording's log.
 
 use bevy::{
     log::{
@@ -12,18 +12,21 @@ use crossbeam_channel::{Receiver, Sender, bounded};
 
 use crate::frame::Line;
 
-/// Lines that wait for a tick at most; those beyond are left out.
+/// Maximum number of lines that wait for a tick. Further lines are dropped.
 const MOST: usize = 1024;
 
-/// Letters of a line at most.
+/// Maximum number of characters of a line.
 const LONGEST: usize = 2000;
 
-/// What was logged since the last tick.
+/// The lines logged since the last tick.
 #[derive(Resource)]
 pub(crate) struct LogLines(pub Receiver<Line>);
 
-/// A layer for `LogPlugin`: what Bevy, Pliant and the game log (`info!` and above, as far as `LogPlugin` lets it through) is then in the
-/// recording's `log`, at the tick at which it was logged. Lines that no recording takes are forgotten, and more than 1024 a tick left out.
+/// A layer for `LogPlugin` that adds the app's log lines to the recording's `log`.
+///
+/// The layer records what Bevy, Pliant and the game log (`info!` and above, subject to the filter
+/// of `LogPlugin`), at the tick of the log call. Lines are dropped if nothing is recorded, and
+/// beyond 1024 lines per tick.
 ///
 /// ```no_run
 /// use bevy::{log::LogPlugin, prelude::*};
@@ -36,13 +39,14 @@ pub fn log_layer(app: &mut App) -> Option<BoxedLayer> {
     Some(Box::new(Lines(lines)))
 }
 
-/// Puts events in the queue; never waits.
+/// Puts log events into the queue without waiting.
 pub(crate) struct Lines(pub Sender<Line>);
 
 impl<S: Subscriber> Layer<S> for Lines {
     fn on_event(&self, event: &Event<'_>, _: Context<'_, S>) {
         let data = event.metadata();
-        // The recorder's own threads would otherwise record what they say of their recording.
+        // Lines of the recorder's own threads are left out, because they would record the
+        // recording.
         if *data.level() > Level::INFO || data.target().starts_with("re_") || self.0.is_full() {
             return;
         }
@@ -64,7 +68,7 @@ impl Visit for Text {
     fn record_debug(&mut self, field: &bevy::log::tracing::field::Field, value: &dyn std::fmt::Debug) {
         match field.name() {
             "message" => self.message = format!("{value:?}"),
-            // What the `log` crate's events carry of their place.
+            // Events of the `log` crate carry their source location in these fields.
             name if name.starts_with("log.") => {}
             name => self.fields += &format!(" {name}={value:?}"),
         }

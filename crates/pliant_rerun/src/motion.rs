@@ -1,19 +1,20 @@
-//! How a body swings: where its loosest point was over the last seconds, and at which frequencies.
+//! The motion of a body's most compliant point over the last seconds, and its spectrum.
 
 use std::{collections::VecDeque, f64::consts::TAU};
 
 use pliant_modal::ModalModel;
 
-/// Samples in the window of a spectrum: 6.4 s of 40 ticks a second.
+/// Number of samples in the window of a spectrum: 6.4 s at 40 ticks per second.
 const WINDOW: usize = 256;
 
 /// The displacement of one point of a body, tick by tick.
 #[derive(Debug)]
 pub(crate) struct Motion {
-    /// The point that the modes move most, each mode as a load on it would: `max sum phi^2 / omega^2`.
+    /// The vertex that the modes move most, each mode weighted as a load on the vertex excites it:
+    /// `max sum phi^2 / omega^2`.
     vertex: u32,
     points: VecDeque<[f64; 3]>,
-    /// The newest sample's tick and simulated time.
+    /// Tick and simulated time of the newest sample.
     newest: Option<(u64, f64)>,
     /// Length of a tick, s.
     tick: f64,
@@ -34,7 +35,8 @@ impl Motion {
         Self { vertex: loosest.unwrap_or(0), points: VecDeque::new(), newest: None, tick: 0.0 }
     }
 
-    /// Adds where the point is at modal coordinates `q`, at simulated time `time` (s). Ticks that were left out are those of a body that stood still.
+    /// Adds the point's displacement at modal coordinates `q` and simulated time `time` (s). For
+    /// missing ticks the body is taken as unmoved.
     pub fn push(&mut self, model: &ModalModel, q: &[f32], tick: u64, time: f64) {
         let passed = match self.newest {
             Some((before, then)) if tick > before && time > then => {
@@ -50,7 +52,8 @@ impl Motion {
         if let Some(&stood) = self.points.back() {
             self.points.extend(std::iter::repeat_n(stood, passed.saturating_sub(1)));
         }
-        // Without the warp: it bends the way of a point, not its frequencies, and costs rotations that nobody else needs.
+        // Warping is left out. It bends the path of a point, does not change its frequencies, and
+        // needs rotations that nothing else here needs.
         let along = |axis: usize| {
             let modes = q.iter().enumerate();
             modes.map(|(mode, &q)| f64::from(q * model.displacement_row(self.vertex, axis, mode))).sum()
@@ -61,8 +64,12 @@ impl Motion {
         }
     }
 
-    /// Frequencies (Hz, from 0 to half the tick rate) and the amplitude at each (m of the model), once the window is full: the mean taken
-    /// out, a Hann window, the three axes as the root of the sum of their squares. A sine of amplitude `a` between two frequencies gives at least 0.85 `a`.
+    /// Returns the frequencies (Hz, from 0 to half the tick rate) and the amplitude at each (m of
+    /// the model) once the window is full.
+    ///
+    /// The mean is removed, a Hann window is applied, and the three axes are combined as the root
+    /// of the sum of their squares. A sine of amplitude `a` between two frequencies gives at least
+    /// 0.85 `a`.
     pub fn spectrum(&self) -> Option<(Vec<f64>, Vec<f64>)> {
         let n = self.points.len();
         if n < WINDOW || self.tick <= 0.0 {
@@ -88,7 +95,7 @@ impl Motion {
                     sum[1] -= x * sin[turn];
                 }
             }
-            // The window's mean is one half.
+            // The factor contains the mean of the window, which is one half.
             4.0 / n as f64 * sums.iter().flatten().map(|x| x * x).sum::<f64>().sqrt()
         };
         let bins = 0..n / 2;

@@ -1,6 +1,8 @@
-//! What the network tells: who comes and goes, how the session stands, whose hand is whose, and the hands of the others.
+//! Data of the session: users who join or leave, the session's state, the users of the hands, and
+//! the hands of other users.
 //!
-//! Most of its figures (round trip, loss, rates, NACKs) need nothing here: they are diagnostics, and are recorded like all others.
+//! Most network metrics (round trip, loss, rates, NACKs) are diagnostics, which are recorded like
+//! all others without code here.
 
 use bevy::{math::DVec3, prelude::*};
 use pliant_body::{BodyState, Grab, VisualState};
@@ -36,7 +38,8 @@ pub(crate) fn say_who_comes_and_goes(
     }
 }
 
-/// How the session stands, in words, and whether this end is in it; `None` where there is no session.
+/// Returns the state of the session in words, and whether this app is in it. Returns `None` without
+/// a session.
 fn standing(
     host: Option<&NetHost>,
     guest: Option<&NetGuest>,
@@ -60,7 +63,7 @@ fn standing(
     })
 }
 
-/// The connection's state, when it becomes another one.
+/// Logs the state of the connection when it changes.
 pub(crate) fn say_how_it_stands(
     host: Option<Res<NetHost>>,
     guest: Option<Res<NetGuest>>,
@@ -82,15 +85,16 @@ pub(crate) fn say_how_it_stands(
     *told = standing;
 }
 
-/// When the session's figures were recorded last, and what they were counted from.
+/// The time of the last session metrics and the counters at that time.
 #[derive(Default)]
 pub(crate) struct Counted {
     let_go: u64,
-    /// s of simulated time.
+    /// Simulated time of the last metrics, s.
     second: Option<f64>,
 }
 
-/// The connection's state as a figure, how uneven its line is, what waits in its queues and what they let go; once a second.
+/// Records the state of the connection, its jitter, whether it is queueing, and the rate of dropped
+/// datagrams, once per second.
 pub(crate) fn log_metrics(
     host: Option<Res<NetHost>>,
     guest: Option<Res<NetGuest>>,
@@ -121,7 +125,7 @@ pub(crate) fn log_metrics(
     counted.let_go = let_go;
 }
 
-/// Name and color of whose hand each grab here is.
+/// Finds the name and the color of the user of each grab in this app.
 pub(crate) fn see_whose_hands(
     mut hands: ResMut<Hands>,
     grabs: Query<(Entity, Option<&HandOf>), With<Grab>>,
@@ -163,7 +167,8 @@ pub(crate) fn see_other_hands(
     }
 }
 
-/// Where a vertex is in body axes, m: the middle of a patch of which only that is known.
+/// Returns the position of a vertex in body axes, m. It stands for the middle of a patch of which
+/// only the vertex is known.
 fn surface_point(state: &BodyState, vertex: u32, q: &[f64]) -> DVec3 {
     let model = state.model();
     let Some(rest) = model.surface().positions().get(vertex as usize) else { return DVec3::ZERO };

@@ -1,4 +1,4 @@
-//! The plugin: sinks, rates, and the systems' place in the app.
+//! The plugin: sinks, rates and the schedule of the systems.
 
 use std::path::PathBuf;
 
@@ -16,7 +16,7 @@ use crate::{
     worker::{Target, Worker},
 };
 
-/// Records what Pliant does. Add it after `PliantBodyPlugin`.
+/// Records what Pliant does. Add this plugin after `PliantBodyPlugin`.
 pub struct RerunPlugin {
     application: String,
     file: Option<PathBuf>,
@@ -29,15 +29,16 @@ pub struct RerunPlugin {
 }
 
 impl RerunPlugin {
-    /// The port that a viewer listens on by default.
+    /// Default port of a viewer.
     pub const VIEWER_PORT: u16 = rerun::DEFAULT_SERVER_PORT;
 
-    /// Records to `path` (`.rrd`), anew.
+    /// Records to the file `path` (`.rrd`) and overwrites it.
     pub fn file(path: impl Into<PathBuf>) -> Self {
         Self { file: Some(path.into()), ..Self::none() }
     }
 
-    /// Streams to the viewer on this machine, started if none runs and `rerun` is installed.
+    /// Streams to the viewer on this machine. Starts a viewer if none runs and `rerun` is
+    /// installed.
     pub fn viewer() -> Self {
         Self { viewer: Some(Self::VIEWER_PORT), ..Self::none() }
     }
@@ -47,7 +48,7 @@ impl RerunPlugin {
         Self { viewer: Some(Self::VIEWER_PORT), ..Self::file(path) }
     }
 
-    /// Records nothing: the plugin then adds no system, and nothing is collected.
+    /// Records nothing. The plugin then adds no systems and collects nothing.
     pub fn none() -> Self {
         Self {
             application: "pliant".into(),
@@ -70,63 +71,67 @@ impl RerunPlugin {
         }
     }
 
-    /// Collects in `schedule`, which has to be that of the bodies. Default: `FixedUpdate`.
+    /// Sets the schedule of the collection, which must be the schedule of the bodies. Default:
+    /// `FixedUpdate`.
     #[must_use]
     pub fn in_schedule(mut self, schedule: impl ScheduleLabel) -> Self {
         self.schedule = schedule.intern();
         self
     }
 
-    /// The name under which viewers list the recording. Default: `"pliant"`.
+    /// Sets the name under which viewers list the recording. Default: `"pliant"`.
     #[must_use]
     pub fn with_application(mut self, name: impl Into<String>) -> Self {
         self.application = name.into();
         self
     }
 
-    /// The viewer's port. Default: [`VIEWER_PORT`](Self::VIEWER_PORT).
+    /// Sets the viewer's port. Default: [`VIEWER_PORT`](Self::VIEWER_PORT).
     #[must_use]
     pub fn with_viewer_port(mut self, port: u16) -> Self {
         self.viewer = self.viewer.map(|_| port);
         self
     }
 
-    /// Whether to start a viewer where none runs. Default: `true`.
+    /// Sets whether to start a viewer if none runs. Default: `true`.
     #[must_use]
     pub fn with_spawn(mut self, spawn: bool) -> Self {
         self.spawn = spawn;
         self
     }
 
-    /// How often shapes are drawn, Hz of simulated time ([`RerunRecording::shapes_hz`]). Zero or less draws none. Default: `20.0`. A body of 3,500 vertices takes about 100 kB a drawing before compression.
+    /// Sets how often shapes are drawn, Hz of simulated time ([`RerunRecording::shapes_hz`]).
+    ///
+    /// Zero or less draws none. A body of 3,500 vertices takes about 100 kB per drawing before
+    /// compression. Default: `20.0`.
     #[must_use]
     pub fn with_shapes_hz(mut self, hz: f64) -> Self {
         self.rates.shapes_hz = hz;
         self
     }
 
-    /// Every rate, and what the color of a surface says. Default: [`RerunRecording::default`].
+    /// Sets all rates and the color of surfaces. Default: [`RerunRecording::default`].
     #[must_use]
     pub fn with_rates(mut self, rates: RerunRecording) -> Self {
         self.rates = rates;
         self
     }
 
-    /// What the color of a surface says. Default: [`RerunColor::Displacement`].
+    /// Sets the quantity that colors a surface. Default: [`RerunColor::Displacement`].
     #[must_use]
     pub fn with_color(mut self, color: RerunColor) -> Self {
         self.rates.color = color;
         self
     }
 
-    /// How many ticks may wait for a sink before one is dropped. Default: `256`.
+    /// Sets how many ticks may wait for a sink before ticks are dropped. Default: `256`.
     #[must_use]
     pub fn with_queue(mut self, ticks: usize) -> Self {
         self.queue = ticks;
         self
     }
 
-    /// Titles the plot of the figures under `area/`.
+    /// Sets the title of the plot of the metrics under `area/`.
     #[must_use]
     pub fn with_title(mut self, area: impl Into<String>, title: impl Into<String>) -> Self {
         self.titles.push((area.into(), title.into()));
@@ -134,43 +139,52 @@ impl RerunPlugin {
     }
 }
 
-/// How a body is recorded. Default: [`Surface`](Self::Surface), also without this component.
+/// Selects how a body is recorded. Default: [`Surface`](Self::Surface), also without this
+/// component.
 #[derive(Component, Reflect, Debug, Default, Clone, Copy, PartialEq, Eq)]
 #[reflect(Component, Default, Clone, PartialEq)]
 pub enum RerunStyle {
-    /// As a shaded surface, colored by displacement.
+    /// Draws a shaded surface, colored by displacement or stress.
     #[default]
     Surface,
-    /// As its vertices only: a ghost through which another body is seen.
+    /// Draws the vertices only, so that another body is visible through this one.
     Points,
-    /// Not drawn; its figures are plotted.
+    /// Does not draw the body. Its metrics are still plotted.
     Hidden,
 }
 
-/// The plugin's place in a tick: after [`PliantSystems::Publish`]. Whoever sets [`RerunScalars`] in the same tick does so before.
+/// The system set of the plugin in a tick, after [`PliantSystems::Publish`].
+///
+/// Systems that set [`RerunScalars`] for the same tick must run before this set.
 #[derive(SystemSet, Debug, Clone, PartialEq, Eq, Hash)]
 pub struct RerunSystems;
 
-/// Whether a recording goes on, and how finely; may be changed at any time. There only while a [`RerunPlugin`] has a sink.
+/// Settings of the recording, which may be changed at any time.
 ///
-/// Rates are in Hz of simulated time: one above that of the ticks (also an infinite one) is every tick, zero or less (or NaN) is none, and nothing is gathered for it.
+/// The resource exists only if a [`RerunPlugin`] has a sink.
+///
+/// Rates are in Hz of simulated time. A rate above that of the ticks, or an infinite rate, means
+/// every tick. Zero, a negative rate or NaN means never, and nothing is gathered.
 #[derive(Resource, Reflect, Debug, Clone, Copy, PartialEq)]
 #[reflect(Resource, Default, Clone, PartialEq)]
 pub struct RerunRecording {
-    /// Off: nothing is collected, and the recording has a gap. Default: `true`.
+    /// Whether to record. `false` collects nothing and leaves a gap in the recording. Default:
+    /// `true`.
     pub on: bool,
-    /// How often shapes are drawn. Default: `20.0`.
+    /// Rate of drawings of shapes, Hz. Default: `20.0`.
     pub shapes_hz: f64,
-    /// How often figures are recorded. Default: infinite, every tick.
+    /// Rate of metrics, Hz. Default: infinite, every tick.
     pub metrics_hz: f64,
-    /// How often hands are drawn, with their reactions. Default: infinite, every tick.
+    /// Rate of drawings of hands with their reactions, Hz. Default: infinite, every tick.
     pub hands_hz: f64,
-    /// How often the energies of the modes and the spectrum are drawn. Default: `4.0`.
+    /// Rate of drawings of mode energies and spectra, Hz. Default: `4.0`.
     pub modes_hz: f64,
-    /// What the color of a surface says. Default: [`RerunColor::Displacement`].
+    /// Quantity that colors a surface. Default: [`RerunColor::Displacement`].
     pub color: RerunColor,
-    /// Whether every period of the devices' loops is recorded (`device/NAME/loop/`, with the feature `haptics`) while figures are: at 1 kHz about
-    /// 70 kB a second and device. The recording then takes what `HapticDevices::records` would give to others. Default: `false`.
+    /// Whether to record every period of the device loops (`device/NAME/loop/`, with the feature
+    /// `haptics`) while metrics are recorded. At 1 kHz this takes about 70 kB per second and
+    /// device. The recording then consumes the records that `HapticDevices::records` would return
+    /// to other readers. Default: `false`.
     pub device_loops: bool,
 }
 
@@ -188,50 +202,52 @@ impl Default for RerunRecording {
     }
 }
 
-/// What the color of a recorded surface says.
+/// The quantity that colors a recorded surface.
 #[derive(Reflect, Debug, Default, Clone, Copy, PartialEq, Eq)]
 #[reflect(Default, Clone, PartialEq)]
 pub enum RerunColor {
-    /// How far each point is from where it rests: the last color at 0.3 of the body's size.
+    /// The distance of each point from its rest position. The last color stands for 0.3 of the
+    /// body's size.
     #[default]
     Displacement,
-    /// Von Mises stress in the skin, in plane stress from how the triangles are stretched: the last color at 0.2 of Young's modulus.
+    /// The von Mises stress in the skin, computed in plane stress from the strain of the triangles.
+    /// The last color stands for 0.2 of Young's modulus.
     Stress,
 }
 
-/// What became of the frames.
+/// Counters of the recording.
 #[derive(Resource, Reflect, Debug, Default, Clone, Copy, PartialEq, Eq)]
 #[reflect(Resource, Default, Clone, PartialEq)]
 pub struct RerunStats {
-    /// Ticks collected.
+    /// Number of collected ticks.
     pub collected: u64,
-    /// Shapes of bodies in them.
+    /// Number of shapes of bodies in the collected ticks.
     pub shapes: u64,
-    /// Ticks that a sink had no room for, summed over sinks.
+    /// Number of ticks dropped because a sink's queue was full, summed over all sinks.
     pub dropped: u64,
-    /// Sinks that still listen.
+    /// Number of connected sinks.
     pub sinks: usize,
 }
 
-/// Why a recording could not be started.
+/// The reason why a recording could not be started.
 #[derive(Debug, Error)]
 #[non_exhaustive]
 pub enum RerunError {
     /// The file cannot be written.
     #[error("cannot record to {path}: {source}")]
     File {
-        /// The path that was asked for.
+        /// The requested path.
         path: PathBuf,
-        /// What the system says.
+        /// Error of the operating system.
         source: std::io::Error,
     },
-    /// The name of the recording is not one.
+    /// The application name of the recording is empty.
     #[error("a recording's application name must not be empty, got {name:?}")]
     Application {
-        /// The name that was asked for.
+        /// The requested name.
         name: String,
     },
-    /// No thread.
+    /// The thread could not be started.
     #[error("cannot start the recording thread: {0}")]
     Thread(std::io::Error),
 }
@@ -249,7 +265,7 @@ impl Plugin for RerunPlugin {
         for target in targets.into_iter().flatten() {
             match Worker::start(&self.application, &target, self.queue, plots.clone(), spare.clone()) {
                 Ok(worker) => workers.push(worker),
-                // A game without its recording is better than no game.
+                // A game without its recording is better than no game, so the error is only logged.
                 Err(error) => error!("{error}"),
             }
         }
@@ -307,10 +323,10 @@ impl Plugin for RerunPlugin {
     }
 }
 
-/// What is wanted of a tick is decided,
+/// The set that decides what is recorded of a tick.
 #[derive(SystemSet, Debug, Clone, PartialEq, Eq, Hash)]
 struct Deciding;
 
-/// and gathered by those who have it, before the frame is made in [`RerunSystems`].
+/// The set that gathers the data, before [`RerunSystems`] makes the frame.
 #[derive(SystemSet, Debug, Clone, PartialEq, Eq, Hash)]
 struct Gathering;

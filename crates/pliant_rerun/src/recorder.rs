@@ -1,4 +1,5 @@
-//! From frames to rerun's archetypes. Runs on a worker; knows nothing of Bevy.
+//! Converts frames to rerun's archetypes. Runs on a worker thread, without access to the app's
+//! world.
 
 use std::{
     collections::{HashMap, HashSet},
@@ -21,19 +22,20 @@ use crate::{
     stress::Skin,
 };
 
-/// A displacement of this part of the body's size has the last color of the scale.
+/// Displacement with the last color of the scale, as a fraction of the body's size.
 const FULL_COLOUR: f32 = 0.3;
 
-/// A stress of this part of Young's modulus has the last color of the scale.
+/// Stress with the last color of the scale, as a fraction of Young's modulus.
 const FULL_STRESS: f32 = 0.2;
 
-/// The longest arrow yet, as a part of the largest body's size.
+/// Length of the arrow of the largest force so far, as a fraction of the largest body's size.
 const LONGEST_ARROW: f64 = 0.5;
 
-/// A new plot waits this long for others that come with it before the layout is sent again.
+/// Time for which a new plot waits for further new plots before the layout is sent again.
 const LAYOUT_PAUSE: Duration = Duration::from_millis(700);
 
-/// Colors of hands and series, told apart also by those who see red and green alike (Okabe and Ito).
+/// Colors of hands and series, which are also distinguishable with red-green color blindness (Okabe
+/// and Ito).
 const COLOURS: [[u8; 3]; 7] = [
     [230, 159, 0],
     [86, 180, 233],
@@ -44,7 +46,7 @@ const COLOURS: [[u8; 3]; 7] = [
     [0, 114, 178],
 ];
 
-/// A path from its parts, which may hold any letters.
+/// Returns the path for text with parts separated by `/`, which may contain any letters.
 pub(crate) fn path(text: &str) -> EntityPath {
     text.split('/').filter(|part| !part.is_empty()).map(EntityPathPart::new).collect::<Vec<_>>().into()
 }
@@ -58,22 +60,22 @@ pub(crate) struct Recorder {
     plots: Plots,
     layout_due: Option<Instant>,
     bodies: HashMap<Arc<str>, Known>,
-    /// Size of the largest body yet, m, and the largest force yet, N: what arrows are scaled by.
+    /// Size of the largest body so far, m, and the largest force so far, N, which scale the arrows.
     size: f64,
     force: f64,
     positions: Vec<[f32; 3]>,
     normals: Vec<[f32; 3]>,
     sums: Vec<[f32; 3]>,
     stresses: Vec<f32>,
-    /// What is logged now belongs to this moment.
+    /// The moment of the data that is logged.
     now: Moment,
     columns: Columns,
     hand_columns: HandColumns,
-    /// The size that arrows, targets and lines were last drawn for, m.
+    /// The size for which arrows, targets and lines were last drawn, m.
     drawn_for: f64,
-    /// The color that each line of a plot was given.
+    /// The color of each line of a plot.
     colors: HashMap<String, Color>,
-    /// Hands of the last tick that had any, by name.
+    /// Names of the hands in the last frame with hand data.
     held: HashSet<String>,
     started: bool,
 }
@@ -143,11 +145,11 @@ impl Recorder {
         self.lay_out(false)
     }
 
-    /// The moment of everything that is logged next.
+    /// Sets the moment of all data that is logged next.
     fn at(&mut self, frame: &Frame) -> Result<(), RecordingStreamError> {
         if !self.started {
             self.started = true;
-            // The times are the app's own, not those of the worker.
+            // The app's own times are used, not those of the worker.
             self.stream.set_log_time_enabled(false);
             self.stream.set_log_tick_enabled(false);
             self.stream.log_static("world", &ViewCoordinates::RIGHT_HAND_Y_UP())?;
@@ -159,7 +161,7 @@ impl Recorder {
         Ok(())
     }
 
-    /// Tells what was missed between the last frame and `next`, which is logged after it.
+    /// Logs what was missed between the last frame and `next`, which is logged afterward.
     pub fn catch_up(&mut self, next: &Frame, owed: &Owed) -> Result<(), RecordingStreamError> {
         self.at(next)?;
         let gone = self.bodies.keys().filter(|path| !owed.bodies.iter().any(|body| body.path == **path));
@@ -175,7 +177,7 @@ impl Recorder {
         self.lines(&owed.lines)
     }
 
-    /// Sends the figures and hands that wait.
+    /// Sends the waiting metrics and hands.
     pub fn send(&mut self) -> Result<(), RecordingStreamError> {
         self.columns.send(&self.stream).and(self.hand_columns.send(&self.stream))
     }
@@ -207,7 +209,7 @@ impl Recorder {
         Ok(())
     }
 
-    /// Sends the final layout and everything that is buffered.
+    /// Sends the final layout and all buffered data.
     pub fn end(mut self) {
         let laid_out = self.send().and(self.lay_out(true));
         let flushed = self.stream.flush_blocking();
@@ -258,7 +260,8 @@ impl Recorder {
         let mut most_stress = None;
         if frame.color == RerunColor::Stress {
             let skin = known.skin.get_or_insert_with(|| Skin::new(surface));
-            // A scaled body keeps its stiffness in N/m while its lengths grow: it is of a softer material, E L is what stays.
+            // A scaled body keeps its stiffness in N/m while its lengths grow. `E L` is constant,
+            // so Young's modulus is divided by the scale.
             let young = model.info().young as f32 * shape.stiffness / shape.place.scale.abs();
             let young = if young.is_finite() { young } else { 0.0 };
             let poisson = model.info().poisson as f32;
@@ -285,7 +288,7 @@ impl Recorder {
                         .with_vertex_positions(self.positions.iter().copied())
                         .with_vertex_normals(self.normals.iter().copied())
                         .with_vertex_colors(colors);
-                    // Who is a neighbour of whom is told once.
+                    // The triangles are sent only with the first mesh.
                     let known = self.bodies.get_mut(&shape.body.path);
                     let first = known.is_some_and(|known| !std::mem::replace(&mut known.meshed, true));
                     let mesh = if first {
@@ -317,7 +320,7 @@ impl Recorder {
         Ok(())
     }
 
-    /// Energies of the modes and the spectrum, as bars.
+    /// Logs the energies of the modes and the spectrum as bars.
     fn modes(&mut self, shape: &Shape, frame: &Frame) -> Result<(), RecordingStreamError> {
         let Some(known) = self.bodies.get_mut(&shape.body.path) else { return Ok(()) };
         let model = &shape.body.model;
@@ -382,7 +385,7 @@ impl Recorder {
 
         let mut used = HashSet::new();
         for hand in hands {
-            // Two hands of one name are two lines in the plot.
+            // Two hands of the same name get two lines in the plot.
             let name = (1..)
                 .map(|n| if n == 1 { hand.name.to_string() } else { format!("{} {n}", hand.name) })
                 .find(|name| !used.contains(name))
@@ -392,7 +395,7 @@ impl Recorder {
             self.colored_scalar(&format!("reaction/{name}"), "N", magnitude(&hand.force), Some(color))?;
             used.insert(name);
         }
-        // The line of a hand that let go ends there, and does not run on to where it takes hold again.
+        // A `Clear` ends the line of a released hand, so that it is not connected to a later grab.
         for name in std::mem::replace(&mut self.held, used).difference(&self.held) {
             self.stream.log(path(&format!("reaction/{name}")), &Clear::flat())?;
         }
@@ -415,7 +418,7 @@ impl Recorder {
         Ok(())
     }
 
-    /// Gives a line its place in the layout, its name and its color, where those are new.
+    /// Adds a new line to the layout and logs its name and color if they are new.
     fn introduce(
         &mut self,
         name: &str,
@@ -441,7 +444,7 @@ fn color_of(index: usize) -> Color {
     Color::from_rgb(r, g, b)
 }
 
-/// Teal at rest over sand to red at a displacement of one.
+/// Returns a color from teal at zero over sand to red at one.
 fn color(t: f32) -> Color {
     const STOPS: [[f32; 3]; 3] = [[58.0, 140.0, 150.0], [235.0, 200.0, 120.0], [215.0, 60.0, 50.0]];
     let t = if t.is_finite() { t.clamp(0.0, 1.0) * 2.0 } else { 0.0 };

@@ -1,4 +1,4 @@
-//! Figures and lines of text from anybody.
+//! Metrics and log lines from any system.
 
 use std::{borrow::Cow, sync::Arc};
 
@@ -6,9 +6,12 @@ use bevy::prelude::*;
 
 use crate::frame::{Line, Metric, Samples, Scalar};
 
-/// Figures to be plotted over time, and lines for the log. Written by whoever has them, taken by [`RerunPlugin`](crate::RerunPlugin) every
-/// tick for which figures are due ([`RerunRecording::metrics_hz`](crate::RerunRecording::metrics_hz)); while they are off, or nothing is recorded, what is
-/// set is forgotten. Systems of a crate that should work without the plugin ask for `Option<ResMut<RerunScalars>>`.
+/// Metrics to plot over time, and lines for the log.
+///
+/// Any system may write them. [`RerunPlugin`](crate::RerunPlugin) takes them in every tick for
+/// which metrics are due ([`RerunRecording::metrics_hz`](crate::RerunRecording::metrics_hz)). While
+/// metrics are off or nothing is recorded, the values are dropped. Systems that should also work
+/// without the plugin use `Option<ResMut<RerunScalars>>`.
 ///
 /// ```
 /// # use bevy::prelude::*;
@@ -18,23 +21,26 @@ use crate::frame::{Line, Metric, Samples, Scalar};
 /// }
 /// ```
 ///
-/// The first part of the path names the plot: figures with the same first part and the same unit share one.
+/// The first part of the path selects the plot: metrics with the same first part and the same unit
+/// share one plot.
 #[derive(Resource, Debug, Default)]
 pub struct RerunScalars {
     pub(crate) scalars: Vec<Scalar>,
     pub(crate) lines: Vec<Line>,
-    /// Figures whose names are kept by those who set them.
+    /// Metrics whose names are stored by the systems that set them.
     pub(crate) measured: Vec<(Arc<Metric>, f64)>,
-    /// Of the devices' own loops.
+    /// Samples of the device loops.
     pub(crate) samples: Vec<Samples>,
 }
 
 impl RerunScalars {
-    /// Most entries that are kept when nobody takes them.
+    /// Maximum number of entries that are kept until they are taken.
     const LIMIT: usize = 4096;
 
-    /// Plots `value` (in `unit`, which may be empty) at this tick as `path`, parts divided by `/`. Of several values for one path in a tick the
-    /// last one counts; one that is not finite leaves a gap.
+    /// Plots `value` at this tick as `path`, in `unit`, which may be empty.
+    ///
+    /// Parts of the path are separated by `/`. If a path gets several values in a tick, the last
+    /// one counts. A value that is not finite leaves a gap.
     pub fn set(
         &mut self,
         path: impl Into<Cow<'static, str>>,
@@ -49,12 +55,12 @@ impl RerunScalars {
         }
     }
 
-    /// Writes a line into the recording's log.
+    /// Writes a line to the recording's log.
     pub fn say(&mut self, text: impl Into<String>) {
         self.line(false, text.into());
     }
 
-    /// Writes a warning into the recording's log.
+    /// Writes a warning to the recording's log.
     pub fn warn(&mut self, text: impl Into<String>) {
         self.line(true, text.into());
     }
@@ -66,7 +72,7 @@ impl RerunScalars {
         }
     }
 
-    /// Forgets figures that nobody took at their time.
+    /// Drops metrics that were not taken at their time.
     pub(crate) fn forget_metrics(&mut self) {
         self.scalars.clear();
         self.measured.clear();

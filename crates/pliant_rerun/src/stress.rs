@@ -1,13 +1,14 @@
-//! The stress in a body's skin, from how its triangles are stretched.
+//! The stress in a body's skin, computed from the strain of its triangles.
 
 use pliant_modal::SurfaceMesh;
 
 /// The rest shape of a surface's triangles, from which strains are measured.
 ///
-/// Nothing presses on a free surface, so its skin is in plane stress, and the strain within its triangles says all: with `F` the
-/// deformation of a triangle in its own plane, Green's strain `E = (F^T F - 1) / 2`, which no rotation changes, and Hooke's law in two dimensions
-/// `s_xx = Y / (1 - nu^2) (E_xx + nu E_yy)`, `s_xy = Y / (1 + nu) E_xy` (Y: Young's modulus).
-/// Under a hand, where something does press, it is a part of the stress only.
+/// A free surface carries no pressure, so its skin is in plane stress, and the strain within a
+/// triangle is sufficient. `F` is the deformation of a triangle in its own plane. Green's strain
+/// `E = (F^T F - 1) / 2` does not depend on rotations. Hooke's law in two dimensions gives
+/// `s_xx = Y / (1 - nu^2) (E_xx + nu E_yy)` and `s_xy = Y / (1 + nu) E_xy` (Y: Young's modulus).
+/// Under a hand, where the surface carries a pressure, this is only a part of the stress.
 #[derive(Debug)]
 pub(crate) struct Skin {
     triangles: Vec<Option<Rest>>,
@@ -15,7 +16,8 @@ pub(crate) struct Skin {
     around: Vec<f32>,
 }
 
-/// A triangle at rest in its own plane: the inverse of its edges, which is an upper triangular matrix, and its area.
+/// A triangle at rest in its own plane: the inverse of its edges, which is an upper triangular
+/// matrix, and its area.
 #[derive(Debug, Clone, Copy)]
 struct Rest {
     inverse: [f32; 3],
@@ -40,12 +42,12 @@ impl Skin {
             .map(|corners| {
                 let [a, b, c] = corners.map(at);
                 let (e, f) = (minus(b, a), minus(c, a));
-                // In the plane: e = (x, 0), f = (y, z).
+                // In the plane of the triangle, e = (x, 0) and f = (y, z).
                 let x = dot(e, e).sqrt();
                 let y = dot(e, f) / x;
                 let z = (dot(f, f) - y * y).max(0.0).sqrt();
                 let area = 0.5 * x * z;
-                // Slivers say nothing about strain.
+                // Slivers give no usable strain.
                 let sound = area.is_finite() && area > 1e-6 * dot(e, e).max(dot(f, f));
                 sound.then(|| {
                     for &v in corners {
@@ -60,7 +62,10 @@ impl Skin {
         Self { triangles, around }
     }
 
-    /// Von Mises stress at each vertex, Pa, the mean of the triangles around it, written to `out`; returns the largest.
+    /// Writes the von Mises stress at each vertex, Pa, the mean of the adjacent triangles, to
+    /// `out`.
+    ///
+    /// Returns the largest stress.
     pub fn stress(
         &self,
         surface: &SurfaceMesh,

@@ -23,10 +23,10 @@ use crate::{
     worker::{Target, Worker},
 };
 
-/// How long anything that must come may take. Only what never comes takes longer.
+/// Time limit for all waits. Only a failure takes longer.
 const LIMIT: Duration = Duration::from_secs(60);
 
-/// Looks until it sees what is waited for; `look` says what it saw instead.
+/// Calls `look` until it succeeds. Its error says what it saw instead.
 #[track_caller]
 pub(crate) fn until<T, L: Debug>(what: &str, mut look: impl FnMut() -> Result<T, L>) -> T {
     let begun = Instant::now();
@@ -39,14 +39,15 @@ pub(crate) fn until<T, L: Debug>(what: &str, mut look: impl FnMut() -> Result<T,
     }
 }
 
-/// A frame of the app, and then its figures if they are as wanted.
+/// Runs a frame of the app, and then returns whether its counters satisfy `so`.
 pub(crate) fn update_to(app: &mut App, so: impl Fn(&RerunStats) -> bool) -> Result<(), RerunStats> {
     app.update();
     let stats = *app.world().resource::<RerunStats>();
     if so(&stats) { Ok(()) } else { Err(stats) }
 }
 
-/// A unit square in the plane z = 0 on which one mode lifts the far side (y = 1) by q metres.
+/// Returns a unit square in the plane z = 0 on which one mode lifts the far side (y = 1) by q
+/// meters.
 pub(crate) fn square() -> ModalModel {
     let positions = vec![[0.0, 0.0, 0.0], [1.0, 0.0, 0.0], [1.0, 1.0, 0.0], [0.0, 1.0, 0.0]];
     let surface = SurfaceMesh::new(positions, vec![[0, 1, 2], [0, 2, 3]], None, Vec::new()).unwrap();
@@ -118,7 +119,7 @@ pub(crate) fn recorder() -> (Recorder, rerun::RecordingStream, MemorySinkStorage
     (Recorder::new(stream.clone(), Plots::default()), stream, storage)
 }
 
-/// The chunks of the recording itself (not of its layout) for one path, in order.
+/// Returns the chunks of the recording itself (not of its layout) for one path, in order.
 pub(crate) fn chunks(messages: &[LogMsg], path: &str) -> Vec<Chunk> {
     let data = messages.iter().filter_map(|message| match message {
         LogMsg::ArrowMsg(store, data) if store.is_recording() => Some(Chunk::from_arrow_msg(data).unwrap()),
@@ -127,7 +128,7 @@ pub(crate) fn chunks(messages: &[LogMsg], path: &str) -> Vec<Chunk> {
     data.filter(|chunk| chunk.entity_path().to_string() == path).collect()
 }
 
-/// How many rows have the component whose name ends so.
+/// Returns the number of rows with the component whose name ends with `component`.
 pub(crate) fn rows(messages: &[LogMsg], path: &str, component: &str) -> usize {
     let of = |chunk: &Chunk| {
         let found =
@@ -137,7 +138,7 @@ pub(crate) fn rows(messages: &[LogMsg], path: &str, component: &str) -> usize {
     chunks(messages, path).iter().map(of).sum()
 }
 
-/// All numbers of a component whose name ends so, row by row.
+/// Returns all numbers of the component whose name ends with `component`, row by row.
 pub(crate) fn numbers(messages: &[LogMsg], path: &str, component: &str) -> Vec<f64> {
     let mut values = Vec::new();
     for chunk in chunks(messages, path) {
@@ -152,7 +153,7 @@ pub(crate) fn numbers(messages: &[LogMsg], path: &str, component: &str) -> Vec<f
     values
 }
 
-/// The colors that a path was given, row by row, red, green and blue.
+/// Returns the colors of a path, row by row: red, green and blue.
 pub(crate) fn bytes_of_colors(messages: &[LogMsg], path: &str) -> Vec<[u8; 3]> {
     let mut colors = Vec::new();
     for chunk in chunks(messages, path) {
@@ -203,7 +204,7 @@ fn figures_have_their_values_and_the_displacement_is_in_the_world() {
     drop(stream);
     let messages = storage.take();
     let values = |path: &str| numbers(&messages, path, "scalars");
-    // One mode lifts the far side by q; the body is drawn twice as large.
+    // One mode lifts the far side by q, and the body is drawn at twice its size.
     assert_eq!(values("/displacement/my\\ body"), [0.5, 1.0, 1.5, 2.0]);
     assert_eq!(values("/net/round\\ trip"), [196.0; 4]);
     assert_eq!(
@@ -304,7 +305,7 @@ pub(crate) fn scratch(name: &str) -> PathBuf {
     std::env::temp_dir().join(format!("pliant_rerun_{}_{name}.rrd", std::process::id()))
 }
 
-/// A whole recording ends with the footer that its encoder writes last.
+/// Whether the file ends with the footer that the encoder of a recording writes last.
 fn is_whole(path: &Path) -> bool {
     let bytes = std::fs::read(path).unwrap();
     bytes.starts_with(b"RRF2")
@@ -349,8 +350,7 @@ fn a_file_is_whole_after_a_panic() {
 
 #[test]
 fn without_a_viewer_nothing_is_lost_but_the_recording() {
-    // Nobody listens on this port, nor can anybody begin to: it is the near end of a connection
-    // that stays.
+    // The port belongs to the near end of an open connection, so no process can listen on it.
     let listener = TcpListener::bind("127.0.0.1:0").unwrap();
     let stream = TcpStream::connect(listener.local_addr().unwrap()).unwrap();
     let port = stream.local_addr().unwrap().port();
@@ -359,7 +359,7 @@ fn without_a_viewer_nothing_is_lost_but_the_recording() {
     let collected = app.world().resource::<RerunStats>().collected;
     (0..20).for_each(|_| app.update());
     assert_eq!(app.world().resource::<RerunStats>().collected, collected, "nothing is collected for nobody");
-    // The end does not wait for a viewer either: the worker has ended before anybody asks it to.
+    // The end does not wait for a viewer either: the worker ends by itself.
     let target = Target::Viewer { port, spawn: false };
     let (spare, _logged) = crossbeam_channel::bounded(1);
     let worker = Worker::start("pliant_test", &target, 1, Plots::default(), spare).unwrap();
@@ -368,21 +368,22 @@ fn without_a_viewer_nothing_is_lost_but_the_recording() {
 
 #[test]
 fn a_viewer_that_does_not_read_drops_ticks_and_never_holds_the_app_up() {
-    // It listens and accepts, and then says nothing: the worst kind.
+    // This viewer listens and accepts, but never reads.
     let listener = TcpListener::bind("127.0.0.1:0").unwrap();
     let port = listener.local_addr().unwrap().port();
     let (full, filled) = crossbeam_channel::bounded(1);
     let run = std::thread::spawn(move || {
         let mut app = app(RerunPlugin::viewer().with_viewer_port(port).with_spawn(false).with_queue(4));
-        // The SDK takes in what the viewer does not read: three queues of 50 MiB, and a hundred
-        // messages. Long lines fill those soon; a tick of this app alone has about a kilobyte. While
-        // ticks are dropped the last line waits, and no other is added.
+        // The SDK buffers data that the viewer does not read: three queues of 50 MiB and a hundred
+        // messages. Long lines fill these buffers soon, while a tick of this app alone has about a
+        // kilobyte. While ticks are dropped, the last line waits and no other is added.
         app.add_systems(Update, |mut metrics: ResMut<RerunScalars>| {
             if metrics.lines.is_empty() {
                 metrics.say("x".repeat(1 << 20));
             }
         });
-        // A worker that is only late drops some of the ticks. One that is stuck drops all of them.
+        // A worker that is only late drops some of the ticks. A worker that is stuck drops all of
+        // them.
         let mut stuck = 0;
         let mut last = 0;
         while stuck < 200 {
@@ -396,7 +397,7 @@ fn a_viewer_that_does_not_read_drops_ticks_and_never_holds_the_app_up() {
         drop(listener);
     });
     until("the queue is full and stays full", || filled.try_recv());
-    // What the limit is for is a wait for the viewer: for ever, or a short one in each tick.
+    // The limit detects a wait for the viewer, either an endless wait or a short wait in each tick.
     until("five hundred ticks beside it", || if run.is_finished() { Ok(()) } else { Err("held up") });
     run.join().unwrap();
 }
@@ -406,7 +407,7 @@ fn a_path_that_cannot_be_written_leaves_the_app_running() {
     let mut app = app(RerunPlugin::file("/nonexistent/folder/x.rrd"));
     app.update();
     assert_eq!(app.world().resource::<RerunStats>().collected, 0);
-    // Figures that nobody takes do not pile up.
+    // Metrics that are not taken do not accumulate.
     let mut metrics = app.world_mut().resource_mut::<RerunScalars>();
     for i in 0..10_000 {
         metrics.set(format!("a/{i}"), "", 1.0);
@@ -426,7 +427,7 @@ fn a_resting_body_is_not_sent() {
     (0..400).for_each(|_| app.update());
     let after = *app.world().resource::<RerunStats>();
     assert_eq!((after.collected, after.shapes), (before.collected + 400, before.shapes));
-    // One state is one shape: drawn in the next drawing at the latest, and then no more.
+    // A new state is drawn in the next drawing at the latest, and then not again.
     app.world_mut().get_mut::<VisualState>(body).unwrap().snap(&[0.1]).unwrap();
     (0..400).for_each(|_| app.update());
     let shapes = app.world().resource::<RerunStats>().shapes - after.shapes;

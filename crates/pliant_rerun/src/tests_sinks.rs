@@ -1,4 +1,4 @@
-//! What a sink that is slow, closed or off is told, and what it costs.
+//! Tests of what a slow, closed or disabled sink receives, and of what it costs.
 
 use std::{
     io::Read,
@@ -29,7 +29,7 @@ use crate::{
     worker::{Message, Worker},
 };
 
-/// An app whose sinks are queues that the test empties.
+/// Returns an app whose sinks are queues that the test empties.
 fn app_to(name: &str, queues: &[usize]) -> (App, Vec<Receiver<Message>>) {
     let path = scratch(name);
     let mut app = app(RerunPlugin::file(&path));
@@ -40,7 +40,7 @@ fn app_to(name: &str, queues: &[usize]) -> (App, Vec<Receiver<Message>>) {
     (app, inboxes)
 }
 
-/// Logs what a queue holds.
+/// Logs the messages of a queue and returns the recording.
 fn played(inbox: &Receiver<Message>) -> Vec<rerun::log::LogMsg> {
     let (mut recorder, stream, storage) = recorder();
     for Message { frame, owed } in inbox.try_iter() {
@@ -56,7 +56,8 @@ fn played(inbox: &Receiver<Message>) -> Vec<rerun::log::LogMsg> {
 
 #[test]
 fn what_went_in_a_tick_without_room_is_made_up_for() {
-    // Alone the slow sink's ticks are not even made; beside another they are, and it is owed what was in them.
+    // If the slow sink is alone, its ticks are not even made. Beside another sink they are made,
+    // and the slow sink gets the missed data later.
     for queues in [&[2][..], &[2, 1000][..]] {
         let (mut app, inboxes) = app_to(&format!("owed{}", queues.len()), queues);
         let slow = &inboxes[0];
@@ -68,7 +69,8 @@ fn what_went_in_a_tick_without_room_is_made_up_for() {
             app.update();
             seen.extend(slow.try_iter());
         }
-        // It reads no more, and its two places fill; then hand and body go, and somebody says so.
+        // The sink stops reading, and its two places fill. Then the hand and the body are removed,
+        // and lines are logged.
         app.update();
         app.update();
         let gone: Vec<Entity> = app
@@ -180,8 +182,8 @@ fn a_viewer_that_is_closed_is_noticed() {
         guests.len()
     });
     let mut app = app(RerunPlugin::viewer().with_viewer_port(port).with_spawn(false).with_queue(1000));
-    // HTTP/2 begins with 24 bytes that are the same for everybody. With more than those the
-    // connection is made, and not to be tried again.
+    // HTTP/2 begins with 24 fixed bytes. More bytes show that the connection is established and is
+    // not tried again.
     until("it is streamed to", || {
         let streams = |_: &RerunStats| taken.load(Ordering::Relaxed) > 24;
         update_to(&mut app, streams).map_err(|stats| (stats, taken.load(Ordering::Relaxed)))
@@ -198,12 +200,12 @@ fn a_viewer_that_is_closed_is_noticed() {
 #[cfg(target_os = "linux")]
 #[test]
 fn the_threads_of_a_recording_give_way() {
-    // `id (name) state ppid ...`: the 19th field is the nice value.
+    // In `id (name) state ppid ...` the 19th field is the nice value.
     let of = |stat: &str| stat.rsplit(')').next()?.split_whitespace().nth(16)?.parse::<i32>().ok();
     let own = of(&std::fs::read_to_string("/proc/self/stat").unwrap()).unwrap();
     let path = scratch("nice");
     let mut app = app(RerunPlugin::file(&path));
-    // The SDK's thread that writes the file, made by the worker.
+    // The worker makes the SDK's thread that writes the file.
     let nice = until("a thread that writes the file", || {
         app.update();
         let threads = std::fs::read_dir("/proc/self/task").unwrap().flatten();
@@ -211,7 +213,7 @@ fn the_threads_of_a_recording_give_way() {
         let (writers, others): (Vec<_>, Vec<_>) = stats.partition(|stat| stat.contains("(file_writer)"));
         if writers.is_empty() { Err(others) } else { Ok(writers) }
     });
-    // Tests that were told to give way more than that need no more.
+    // If the test process itself has a nice value above 9, any value of 9 or more is right.
     let right = |nice| if own <= 9 { nice == 9 } else { nice >= 9 };
     assert!(nice.iter().all(|stat| of(stat).is_some_and(right)), "{nice:?}");
     drop(app);

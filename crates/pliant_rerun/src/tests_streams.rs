@@ -1,4 +1,4 @@
-//! What each stream says, and what it costs when it is off.
+//! Tests of the content of each stream, and of the cost of a stream that is off.
 
 use std::collections::BTreeSet;
 
@@ -24,7 +24,7 @@ fn a_skin_that_is_stretched_and_turned_has_the_stress_of_the_closed_form() {
     let skin = Skin::new(surface);
     let (young, nu) = (2e5_f32, 0.3_f32);
     let mut out = Vec::new();
-    // At rest, and turned by any angle: none.
+    // There is no stress at rest and after any rotation.
     let turned = |stretch: [f32; 2], shear: f32, angle: f32| -> Vec<[f32; 3]> {
         let (s, c) = angle.sin_cos();
         let positions = surface.positions().iter();
@@ -36,18 +36,20 @@ fn a_skin_that_is_stretched_and_turned_has_the_stress_of_the_closed_form() {
             .collect()
     };
     assert!(skin.stress(surface, &turned([1.0, 1.0], 0.0, 1.1), young, nu, &mut out) < 1e-6 * young);
-    // Stretched by a tenth along x, and let in by nu a tenth along y: one stress only, E times Green's strain.
+    // The triangle is stretched by a tenth along x and contracted by nu times a tenth along y. Only
+    // one stress remains, E times Green's strain.
     let green = |stretch: f32| 0.5 * (stretch * stretch - 1.0);
     let across = (1.0 - 2.0 * nu * green(1.1)).sqrt();
     let largest = skin.stress(surface, &turned([1.1, across], 0.0, 0.7), young, nu, &mut out);
     let expected = young * green(1.1);
     assert!((largest / expected - 1.0).abs() < 1e-4, "{largest} Pa for {expected} Pa");
     assert!(out.iter().all(|stress| (stress / expected - 1.0).abs() < 1e-4), "the same everywhere: {out:?}");
-    // Stretched alike both ways: s = E e / (1 - nu), and von Mises of (s, s, 0) is s.
+    // With equal stretch in both directions s = E e / (1 - nu), and the von Mises stress of
+    // (s, s, 0) is s.
     let largest = skin.stress(surface, &turned([1.02, 1.02], 0.0, 0.0), young, nu, &mut out);
     let expected = young * green(1.02) / (1.0 - nu);
     assert!((largest / expected - 1.0).abs() < 1e-3, "{largest} Pa for {expected} Pa");
-    // Sheared a little by g: sqrt(3) G g, with G = E / 2 (1 + nu).
+    // A small shear g gives sqrt(3) G g, with G = E / 2 (1 + nu).
     let largest = skin.stress(surface, &turned([1.0, 1.0], 0.001, 0.0), young, nu, &mut out);
     let expected = 3f32.sqrt() * young / (2.0 * (1.0 + nu)) * 0.001;
     assert!((largest / expected - 1.0).abs() < 2e-3, "{largest} Pa for {expected} Pa");
@@ -72,7 +74,8 @@ fn a_swing_of_a_known_frequency_and_amplitude_is_in_the_spectrum_there_and_so_hi
     assert!((amplitudes[highest] - 0.05).abs() < 5e-4, "{} m", amplitudes[highest]);
     assert!(amplitudes[0] < 1e-6, "where it hangs is not a swing");
     assert!(amplitudes[highest + 3..].iter().all(|a| *a < 1e-3), "nothing elsewhere");
-    // It stood still for a whole window: nothing is left of the swing but the step at its end.
+    // The body stood still for a whole window. The first push leaves only a step at the window's
+    // end, and the second push leaves a constant window.
     motion.push(&model, &[0.2], 1000, 1000.0 * tick);
     motion.push(&model, &[0.2], 1400, 1400.0 * tick);
     let (_, still) = motion.spectrum().unwrap();
@@ -119,7 +122,7 @@ fn a_hand_has_its_users_color_in_the_plot_and_in_the_scene_and_its_line_ends_wit
     recorder.log(&at(1, vec![hand([10, 200, 30])])).unwrap();
     recorder.log(&at(2, vec![hand([10, 200, 30])])).unwrap();
     recorder.log(&at(3, Vec::new())).unwrap();
-    // Another Ann.
+    // This is another hand with the name Ann.
     recorder.log(&at(4, vec![hand([200, 10, 30])])).unwrap();
     recorder.end();
     drop(stream);
@@ -153,7 +156,8 @@ fn the_color_says_displacement_or_stress() {
     assert_ne!(by_displacement[0], by_displacement[2], "the near side rests, the far side is lifted");
     assert_ne!(by_displacement, by_stress);
     assert!(largest[0] > 0.0);
-    // Twice as large with the same stiffness in N/m: twice the displacement, the same strain, half the stress.
+    // At twice the size and the same stiffness in N/m, the displacement doubles, the strain stays
+    // the same, and the stress is halved.
     let (same, half) = stressed(RerunColor::Stress, 2.0);
     assert!((half[0] / largest[0] - 0.5).abs() < 1e-6, "{half:?} Pa for half of {largest:?} Pa");
     assert_eq!(same, by_stress, "the color is relative to Young's modulus");
@@ -194,7 +198,8 @@ fn energies_are_a_line_and_what_comes_faster_than_ticks_has_its_own_times() {
     );
 }
 
-/// Two hundred frames of an app at these rates: what was collected, and what is in the file.
+/// Runs two hundred frames of an app at these rates. Returns what was collected and the content of
+/// the file.
 fn collected(rates: RerunRecording, name: &str, style: RerunStyle) -> (RerunStats, Vec<LogMsg>) {
     let path = scratch(name);
     let mut app = app(RerunPlugin::file(&path).with_rates(rates).with_queue(2048));
@@ -228,7 +233,7 @@ fn a_stream_with_a_rate_of_zero_is_not_gathered_and_not_in_the_file() {
         modes_hz: f64::NAN,
         ..RerunRecording::default()
     };
-    // How large a file is hangs on how often its worker gets to write; what is told in it does not.
+    // The size of a file depends on how often its worker writes, but the content does not.
     let told = |messages: &[LogMsg]| -> BTreeSet<String> {
         let of = |message: &LogMsg| match message {
             LogMsg::ArrowMsg(store, data) if store.is_recording() => {

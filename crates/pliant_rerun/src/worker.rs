@@ -1,4 +1,7 @@
-//! The thread that logs. It may wait for a disk or a viewer; the app never does: it offers a frame, and a full queue drops it.
+//! The worker thread that logs.
+//!
+//! The worker may wait for a disk or a viewer. The app never waits: it offers a frame, and a full
+//! queue drops the frame.
 
 use std::{
     any::Any,
@@ -27,40 +30,43 @@ use crate::{
     recorder::Recorder,
 };
 
-/// How long a viewer may take to start.
+/// Time that a viewer may take to start.
 const VIEWER_START: Duration = Duration::from_secs(10);
 
-/// How long the end of an app waits for a worker: a file is written to its end; a viewer that has stopped reading is given up.
+/// Time that the end of an app waits for a worker. A file may take long until it is complete. A
+/// viewer that does not read is abandoned sooner.
 const FILE_END: Duration = Duration::from_secs(60);
 const VIEWER_END: Duration = Duration::from_secs(5);
 
-/// Where one worker's recording goes.
+/// The destination of one worker's recording.
 #[derive(Debug, Clone, PartialEq)]
 pub(crate) enum Target {
     File(PathBuf),
     Viewer { port: u16, spawn: bool },
 }
 
-/// How long a worker lets ticks gather before it logs them: it is woken a few times a second and not by every tick.
+/// Time for which ticks gather before a worker logs them, so that it wakes a few times per second
+/// and not in every tick.
 const PAUSE: Duration = Duration::from_millis(100);
 
-/// Figures are sent so often to a viewer, which shows them as they come, and to a file, where fewer and longer columns are smaller.
+/// Interval at which metrics are sent. A viewer shows them as they arrive. In a file, fewer and
+/// longer columns are smaller.
 const VIEWER_COLUMNS: Duration = Duration::from_millis(90);
 const FILE_COLUMNS: Duration = Duration::from_millis(500);
 
-/// How often it is looked whether the viewer is still there.
+/// Interval of the checks whether the viewer is still connected.
 const WATCH: Duration = Duration::from_secs(1);
 
-/// One tick on its way to a worker.
+/// One tick for a worker.
 pub(crate) struct Message {
     pub frame: Arc<Frame>,
     pub owed: Option<Owed>,
 }
 
-/// One worker as the app sees it.
+/// The app's handle of a worker.
 pub(crate) struct Worker {
     frames: Option<Sender<Message>>,
-    /// Wakes the worker; dropped, it tells it to end.
+    /// Wakes the worker. Dropping the sender ends the worker.
     nudge: Option<Sender<()>>,
     thread: Option<JoinHandle<()>>,
     ended: Receiver<()>,
@@ -70,8 +76,10 @@ pub(crate) struct Worker {
 }
 
 impl Worker {
-    /// Starts a worker with room for `queue` frames. A file is created here, so that a wrong path is told at once. Frames that have been
-    /// logged go to `spare`, for their memory.
+    /// Starts a worker with room for `queue` frames.
+    ///
+    /// The file is created here, so that a wrong path is reported at once. Logged frames go to
+    /// `spare`, so that their memory is reused.
     pub fn start(
         application: &str,
         target: &Target,
@@ -98,11 +106,12 @@ impl Worker {
         let thread = std::thread::Builder::new()
             .name("pliant rerun".into())
             .spawn(move || {
-                // Before there is a stream: the threads that it makes inherit it.
+                // This comes before the stream starts its threads, so that they inherit the
+                // priority.
                 give_way();
                 match target.open(builder) {
                     Some(stream) => record(&stream, &target, Inbox { frames: inbox, nudged, spare }, plots),
-                    // Dropping the inbox tells the app that nobody listens.
+                    // Dropping the inbox shows the app that the sink is closed.
                     None => drop(inbox),
                 }
                 drop(end);
@@ -119,7 +128,7 @@ impl Worker {
         })
     }
 
-    /// A worker whose frames a test takes.
+    /// Returns a worker whose frames a test receives.
     #[cfg(test)]
     pub fn held(queue: usize) -> (Self, Receiver<Message>) {
         let (frames, inbox) = bounded(queue);
@@ -130,24 +139,26 @@ impl Worker {
         (worker, inbox)
     }
 
-    /// Whether the thread has ended by itself, so that closing waits for nothing.
+    /// Whether the thread has ended by itself, so that closing does not wait.
     #[cfg(test)]
     pub fn has_ended(&self) -> bool {
         self.ended.try_recv() == Err(crossbeam_channel::TryRecvError::Disconnected)
     }
 
-    /// Offers a frame without waiting; `false` when it was not taken. A worker that has ended takes nothing and drops nothing. One that
-    /// missed something is told of `bodies`, all that there are.
+    /// Offers a frame without waiting. Returns `false` if the frame was not accepted.
+    ///
+    /// A worker that has ended accepts and drops nothing. A worker that missed something also gets
+    /// the list of all bodies from `bodies`.
     pub fn offer(&mut self, frame: &Arc<Frame>, bodies: impl FnOnce() -> Vec<Arc<Drawn>>) -> bool {
         let Some(frames) = &self.frames else { return false };
         let owed = self.owed.take().map(|owed| Owed { bodies: bodies(), ..owed });
         match frames.try_send(Message { frame: frame.clone(), owed }) {
             Ok(()) => {
-                // A queue that fills faster than the worker looks.
+                // The queue fills faster than the worker wakes, so the worker is woken early.
                 if frames.capacity().is_some_and(|room| 2 * frames.len() >= room)
                     && let Some(nudge) = &self.nudge
                 {
-                    // Full: it is being woken.
+                    // If this channel is full, the worker is already being woken.
                     nudge.try_send(()).ok();
                 }
                 true
@@ -166,12 +177,12 @@ impl Worker {
         }
     }
 
-    /// Whether a frame would not be taken.
+    /// Whether a frame would not be accepted.
     pub fn is_full(&self) -> bool {
         self.frames.as_ref().is_none_or(Sender::is_full)
     }
 
-    /// Counts a frame that was not even made, as nobody had room for it.
+    /// Counts a frame that was not made because all queues were full.
     pub fn miss(&mut self) {
         if self.frames.is_some() {
             self.dropped += 1;
@@ -179,17 +190,17 @@ impl Worker {
         }
     }
 
-    /// Whether anybody still listens.
+    /// Whether the sink is still open.
     pub fn listens(&self) -> bool {
         self.frames.is_some()
     }
 
-    /// Frames that were not taken because the queue was full.
+    /// Returns the number of frames dropped because the queue was full.
     pub fn dropped(&self) -> u64 {
         self.dropped
     }
 
-    /// Lets the worker log what is queued and close its recording.
+    /// Lets the worker log the queued frames and close its recording.
     pub fn close(&mut self) {
         self.frames = None;
         self.nudge = None;
@@ -213,12 +224,13 @@ impl Drop for Worker {
     }
 }
 
-/// Lowers the priority of this thread: what it does can wait, and a frame cannot. On Linux the threads that it starts inherit that.
+/// Lowers the priority of this thread, because frames of the app are more urgent.
 ///
-/// Not as far as `SCHED_IDLE`: on a machine that is busy all the time a recording would never come to its end.
+/// On Linux, threads started by this thread inherit the priority. The policy is not `SCHED_IDLE`:
+/// on a machine that is always busy the recording would then never end.
 fn give_way() {
     use thread_priority::{ThreadPriority, ThreadPriorityValue};
-    // A quarter of the way up; on Linux that is a nice value of 9.
+    // The value is a quarter of the range, which is a nice value of 9 on Linux.
     let Ok(priority) = ThreadPriorityValue::try_from(25_u8).map(ThreadPriority::Crossplatform) else {
         return;
     };
@@ -228,7 +240,7 @@ fn give_way() {
             NormalThreadSchedulePolicy, ThreadSchedulePolicy, set_thread_priority_and_policy,
             thread_native_id,
         };
-        // A batch thread that wakes up does not push another off its core.
+        // A batch thread that wakes up does not preempt another thread.
         let policy = ThreadSchedulePolicy::Normal(NormalThreadSchedulePolicy::Batch);
         set_thread_priority_and_policy(thread_native_id(), priority, policy)
     };
@@ -239,14 +251,15 @@ fn give_way() {
     }
 }
 
-/// What a worker takes from, and gives back to.
+/// The worker's ends of its channels.
 struct Inbox {
     frames: Receiver<Message>,
     nudged: Receiver<()>,
     spare: Sender<Frame>,
 }
 
-/// Logs until the app ends or the viewer is gone. Owns the inbox: dropping it tells the app that nobody listens.
+/// Logs until the app ends or the viewer is closed. The function owns the inbox: dropping the inbox
+/// shows the app that the sink is closed.
 fn record(stream: &RecordingStream, target: &Target, inbox: Inbox, plots: Plots) {
     let mut recorder = Recorder::new(stream.clone(), plots);
     let mut failing = false;
@@ -260,10 +273,11 @@ fn record(stream: &RecordingStream, target: &Target, inbox: Inbox, plots: Plots)
             logged = logged.and(recorder.log(&frame));
             tell(logged, frame.tick, &mut failing);
             if let Some(frame) = Arc::into_inner(frame) {
-                // No room: enough of them wait already.
+                // If there is no room, enough spare frames are waiting.
                 inbox.spare.try_send(frame.cleared()).ok();
             }
-            // The SDK takes in what a closed viewer does not, so that has to be asked for; also between ticks, as there may be many.
+            // The SDK accepts data for a closed viewer, so the connection must be checked. The
+            // check also runs between ticks, because many ticks may wait.
             if let Target::Viewer { port, .. } = target
                 && watched.elapsed() >= WATCH
             {
@@ -272,7 +286,7 @@ fn record(stream: &RecordingStream, target: &Target, inbox: Inbox, plots: Plots)
                 stream.inspect_sink(move |sink| seen.store(is_lost(sink), Ordering::Relaxed));
                 if lost.load(Ordering::Relaxed) {
                     info!("the rerun viewer on port {port} was closed: going on without it");
-                    // The app hears of it before the SDK has tidied up.
+                    // The app is notified before the SDK cleans up.
                     drop(inbox);
                     return;
                 }
@@ -305,7 +319,8 @@ fn is_lost(sink: &dyn LogSink) -> bool {
 }
 
 impl Target {
-    /// A stream to something that is there. The SDK's own connection would wait for a viewer for ever, and at its end, too.
+    /// Opens a stream to an existing destination. The SDK's own connection would wait for a viewer
+    /// forever, also at its end.
     fn open(&self, builder: RecordingStreamBuilder) -> Option<RecordingStream> {
         let (port, spawn) = match self {
             Self::File(path) => {
@@ -338,7 +353,7 @@ impl Target {
                 std::thread::sleep(Duration::from_millis(100));
             }
         }
-        // The SDK's own choice is to flush its rows every 8 ms.
+        // The SDK's default is to flush its rows every 8 ms.
         match builder
             .batcher_config(ChunkBatcherConfig { flush_tick: PAUSE, ..ChunkBatcherConfig::DEFAULT })
             .connect_grpc_opts(format!("rerun+http://127.0.0.1:{port}/proxy"))

@@ -1,17 +1,20 @@
-//! The offset between two clocks from four timestamps.
+//! Estimates the offset between two clocks from four timestamps.
 
 use std::collections::VecDeque;
 use std::time::Duration;
 
-/// Exchanges looked back on.
+/// Number of exchanges that the estimate uses.
 const WINDOW: usize = 16;
-/// The offset follows a better estimate by at most this share of the time that passes.
+/// Slew rate of the offset towards a better estimate, as a share of the time that passes.
 const SLEW: f64 = 0.01;
-/// An exchange farther off than this and half its round trip shows that a clock jumped, s.
+/// Smallest offset error that counts as a clock jump, s, on top of half the round trip of the
+/// exchange.
 const JUMP: f64 = 0.5;
 
-/// Estimates `host clock - own clock`: of the last 16 exchanges the one with the smallest round trip counts, and the
-/// offset is slewed towards it by at most 1 %.
+/// Estimates `host clock - own clock`.
+///
+/// Of the last 16 exchanges, the one with the smallest round trip counts. The offset is slewed
+/// towards its value by at most 1 %.
 ///
 /// `offset = ((t2 - t1) + (t3 - t4)) / 2`, `round trip = (t4 - t1) - (t3 - t2)` (Mills, RFC 5905).
 #[derive(Debug, Clone, Default)]
@@ -22,7 +25,10 @@ pub struct ClockEstimate {
 }
 
 impl ClockEstimate {
-    /// Takes an exchange, all in microseconds; returns its round trip, or `None` when the stamps make no sense.
+    /// Adds an exchange and returns its round trip.
+    ///
+    /// All timestamps are in microseconds. The result is `None` when the timestamps contradict each
+    /// other.
     pub fn sample(&mut self, t1: u64, t2: u64, t3: u64, t4: u64) -> Option<Duration> {
         let spent = t3.checked_sub(t2)?;
         let round = t4.checked_sub(t1)?.checked_sub(spent)?;
@@ -30,8 +36,8 @@ impl ClockEstimate {
         let offset = 0.5 * (difference(t2, t1) + difference(t3, t4));
         let round_s = round as f64 * 1e-6;
         if self.offset.is_some_and(|old| (offset - old).abs() > JUMP + 0.5 * round_s) {
-            // An exchange is never off by more than half its round trip: a clock jumped, and the older exchanges tell of
-            // another one.
+            // An exchange is never off by more than half its round trip. A larger difference means
+            // that a clock jumped, and the older exchanges describe the clock before the jump.
             self.samples.clear();
             self.offset = None;
         }
@@ -65,7 +71,7 @@ mod tests {
     #[test]
     fn symmetric_path_gives_the_offset_exactly() {
         let mut clock = ClockEstimate::default();
-        // Host clock is 5 s ahead, 100 ms each way, 2 ms spent at the host.
+        // The host clock is 5 s ahead, each direction takes 100 ms and the host spends 2 ms.
         let rtt = clock.sample(1_000_000, 6_100_000, 6_102_000, 1_202_000);
         assert_eq!(rtt, Some(Duration::from_millis(200)));
         assert!((clock.offset().unwrap() - 5.0).abs() < 1e-9);
@@ -74,10 +80,12 @@ mod tests {
     #[test]
     fn the_shortest_round_trip_counts_and_moves_the_offset_slowly() {
         let mut clock = ClockEstimate::default();
-        clock.sample(0, 150_000, 150_000, 200_000); // delayed on the way out: offset +50 ms
+        // The request is delayed by 150 ms: the offset is +50 ms.
+        clock.sample(0, 150_000, 150_000, 200_000);
         assert!((clock.offset().unwrap() - 0.05).abs() < 1e-9);
-        clock.sample(1_000_000, 1_010_000, 1_010_000, 1_020_000); // clean: offset 0
-        // 0.82 s later, 1 %: 8.2 ms nearer.
+        // Both directions take 10 ms: the offset is 0.
+        clock.sample(1_000_000, 1_010_000, 1_010_000, 1_020_000);
+        // After 0.82 s at 1 % the offset is 8.2 ms closer.
         assert!((clock.offset().unwrap() - (0.05 - 0.0082)).abs() < 1e-6);
     }
 

@@ -1,31 +1,31 @@
-//! What can go wrong, and what was expected.
+//! Errors of this crate.
 
 use crate::{BodyId, PeerId};
 
-/// Why a call was refused or bytes could not be read.
+/// Says why a call was refused or bytes could not be decoded.
 #[derive(Debug, Clone, PartialEq, thiserror::Error)]
 #[non_exhaustive]
 pub enum StreamError {
-    /// Bytes from outside ended too early.
+    /// Received bytes ended too early.
     #[error("{what}: needs {needed} bytes at offset {offset}, {left} are left")]
     Truncated {
         /// The field that was being read.
         what: &'static str,
-        /// Where it starts.
+        /// Byte offset at which the field starts.
         offset: usize,
-        /// How many bytes it needs.
+        /// Number of bytes that the field needs.
         needed: usize,
-        /// How many there are.
+        /// Number of bytes that are left.
         left: usize,
     },
-    /// Bytes from outside hold a value that the format does not allow.
+    /// Received bytes hold a value that the format does not allow.
     #[error("{what}: {found}, expected {expected}")]
     Invalid {
         /// The field.
         what: &'static str,
-        /// What it held.
+        /// The value found.
         found: String,
-        /// What it may hold.
+        /// The allowed values.
         expected: &'static str,
     },
     /// A setting is outside its range.
@@ -33,34 +33,34 @@ pub enum StreamError {
     Config {
         /// The setting.
         what: &'static str,
-        /// Its value.
+        /// The value found.
         found: String,
-        /// Its range.
+        /// The allowed range.
         expected: &'static str,
     },
     /// A number is NaN or infinite.
     #[error("{what} is not finite")]
     NotFinite {
-        /// The number's name.
+        /// Name of the number.
         what: &'static str,
     },
     /// A slice has the wrong length.
     #[error("{what}: {found} values, expected {expected}")]
     Length {
-        /// The slice's name.
+        /// Name of the slice.
         what: &'static str,
-        /// Its length.
+        /// Length of the slice.
         found: usize,
-        /// The length it must have.
+        /// The length that the slice must have.
         expected: usize,
     },
-    /// A body that this session does not stream.
+    /// The session does not stream this body.
     #[error("body {0} is not part of this session")]
     UnknownBody(BodyId),
-    /// A peer that this session does not know.
+    /// The session does not know this peer.
     #[error("peer {0} is not part of this session")]
     UnknownPeer(PeerId),
-    /// A grab that is not held.
+    /// No grab with this number is held.
     #[error("grab {0} is not held")]
     UnknownGrab(u16),
     /// A bounded table is full.
@@ -68,28 +68,28 @@ pub enum StreamError {
     Full {
         /// The table.
         what: &'static str,
-        /// Its bound.
+        /// Largest number of entries.
         limit: usize,
     },
-    /// A tick that does not follow the last one.
+    /// A published tick does not exceed the last one.
     #[error("tick {found} published after tick {last}: ticks ascend")]
     TickOrder {
         /// The last tick published.
         last: u64,
-        /// The tick offered.
+        /// The tick given.
         found: u64,
     },
-    /// The session is not in a state in which the call makes sense.
+    /// The session's state does not allow the call.
     #[error("session is {state}: {what} needs {needed}")]
     State {
-        /// What was asked.
+        /// The call.
         what: &'static str,
-        /// The state it is in.
+        /// The state of the session.
         state: &'static str,
-        /// The state it must be in.
+        /// The state that the call needs.
         needed: &'static str,
     },
-    /// The modal model or one of its patches refused.
+    /// The modal model or one of its patches or settings was rejected.
     #[error("modal model: {0}")]
     Model(String),
 }

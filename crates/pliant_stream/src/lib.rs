@@ -1,10 +1,12 @@
-//! What crosses the network, and what repairs it when some of it does not arrive.
+//! Streams soft bodies over a network that loses packets, and repairs the loss at the receiver.
 //!
-//! A host steps soft bodies and streams them; guests follow, hold on to them and feel them. Everything here is a state
-//! machine: no socket, no clock, no thread, no randomness without a seed. `(now, datagrams in) -> (datagrams out, state)`.
+//! A host steps the bodies and streams them. Guests track the bodies, hold them and receive the
+//! forces on their hands. Every type in this crate is a state machine: it owns no socket, no clock,
+//! no thread and no randomness without a seed, and maps
+//! `(now, datagrams in) -> (datagrams out, state)`.
 //!
-//! A host and a guest over a network that loses packets, in virtual time. The caller carries the
-//! bytes, here through the [`emulator`]; [`session`] says when to call what:
+//! The example runs a host and a guest over a lossy network in virtual time. The caller carries the
+//! bytes, here through the [`emulator`]. The module [`session`] says when to call which function:
 //!
 //! ```
 //! use std::{sync::Arc, time::Duration};
@@ -60,14 +62,14 @@
 //! # }
 //! ```
 //!
-//! | module | what it holds |
+//! | module | contents |
 //! | --- | --- |
-//! | [`session`] | [`HostSession`] and [`GuestSession`]: hello, models by hash, snapshot, streaming, resync, goodbye |
-//! | [`peer`] | peer to peer: every peer steps, only targets cross, late ones are stepped again |
-//! | [`recovery`] | what a receiver does about loss: the paper's prediction and compensation, and the force-driven way |
-//! | [`codec`] | frames in a closed loop, so that rounding does not add up; how coarse each mode may be |
-//! | [`wire`] | the bytes; every parser takes anything |
-//! | [`emulator`] | a seeded bad network |
+//! | [`session`] | [`HostSession`], [`GuestSession`]: handshake, models, snapshots, streaming, resync |
+//! | [`peer`] | peer to peer: every peer steps, only hand targets are sent, late ones are stepped again |
+//! | [`recovery`] | loss repair: prediction and compensation after the paper, and force-driven recovery |
+//! | [`codec`] | closed-loop frame encoding, in which rounding does not add up; quantization per mode |
+//! | [`wire`] | byte formats; every parser accepts arbitrary bytes |
+//! | [`emulator`] | a seeded emulator of a bad network |
 //! | [`newmark`] | the identities that make compensation exact |
 
 #![cfg_attr(

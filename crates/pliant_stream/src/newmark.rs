@@ -1,40 +1,43 @@
-//! Newmark's method read as a linear filter of the acceleration stream.
+//! Newmark's method as a linear filter of the acceleration stream.
 //!
 //! ```text
 //! v_{n+1} = v_n + h ((1 - gamma) a_n + gamma a_{n+1})
 //! q_{n+1} = q_n + h v_n + h^2 ((1/2 - beta) a_n + beta a_{n+1})
 //! ```
 //!
-//! The filter is linear, so an acceleration that was wrong by `da` at tick `i` leaves, at tick `j`, exactly
+//! The filter is linear. An acceleration that was wrong by `da` at tick `i` therefore leaves, at
+//! tick `j`, exactly
 //!
 //! ```text
 //! j = i:  dv = gamma h da,   dq = beta h^2 da
 //! j > i:  dv = h da,         dq = (j - i + gamma - 1/2) h^2 da
 //! ```
 //!
-//! (equations (8) and (9) of Tang et al. 2013 for beta = 1/4, gamma = 1/2, here for any pair). Proof: a wrong `a_i` enters
-//! `v_i` with weight `gamma h` and `v_{i+1}` with `(1 - gamma) h` more, `h` in all, and is never touched again; `q_i` gets
-//! `beta h^2`, `q_{i+1}` gets `h v_i` = `gamma h^2` and `(1/2 - beta) h^2` more, `(gamma + 1/2) h^2` in all, and every later
-//! step adds `h dv = h^2`.
+//! These are equations (8) and (9) of Tang et al. 2013 for beta = 1/4, gamma = 1/2, stated here for
+//! any pair. Proof: a wrong `a_i` enters `v_i` with weight `gamma h` and `v_{i+1}` with
+//! `(1 - gamma) h` more. The sum is `h`, and later steps do not change it. `q_i` gets `beta h^2`.
+//! `q_{i+1}` gets `h v_i` = `gamma h^2` and `(1/2 - beta) h^2` more, which sums to
+//! `(gamma + 1/2) h^2`. Every later step adds `h dv = h^2`.
 
 use pliant_modal::Relaxation;
 
 use crate::StreamError;
 use crate::state::State;
 
-/// A member of Newmark's family and its step.
+/// A member of Newmark's family with its step.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Newmark {
     /// Length of a step, s.
     pub h: f64,
-    /// Weight of the new acceleration in the displacement. Default of the sessions: 1/4 (average acceleration).
+    /// Weight of the new acceleration in the displacement. The default of [`crate::HostConfig`] is
+    /// 4/9.
     pub beta: f64,
-    /// Weight of the new acceleration in the velocity. Default of the sessions: 1/2.
+    /// Weight of the new acceleration in the velocity. The default of [`crate::HostConfig`] is 5/6.
     pub gamma: f64,
 }
 
 impl Newmark {
-    /// Average acceleration (beta = 1/4, gamma = 1/2): the paper's.
+    /// Average acceleration (beta = 1/4, gamma = 1/2), the method of the paper.
     pub fn average(h: f64) -> Self {
         Self { h, beta: 0.25, gamma: 0.5 }
     }
@@ -42,7 +45,7 @@ impl Newmark {
     /// Checks the ranges: `h` 10 us to 1 s, `beta` and `gamma` 0 to 1.
     ///
     /// # Errors
-    /// [`StreamError::Config`].
+    /// Returns [`StreamError::Config`] for a value outside its range.
     pub fn check(&self) -> Result<(), StreamError> {
         let fail = |what, found: f64, expected| {
             Err(StreamError::Config { what, found: found.to_string(), expected })
@@ -59,7 +62,7 @@ impl Newmark {
         Ok(())
     }
 
-    /// One step of one coordinate: `(q, v)` after it.
+    /// Steps one coordinate and returns the new `(q, v)`.
     pub fn step(&self, q: f64, v: f64, a_old: f64, a_new: f64) -> (f64, f64) {
         let h = self.h;
         (
@@ -76,7 +79,8 @@ impl Newmark {
         }
     }
 
-    /// Displacement and velocity that an acceleration wrong by 1 leaves `age` = j - i ticks later: the equations above.
+    /// Returns the displacement and velocity that an acceleration wrong by 1 leaves `age` = j - i
+    /// ticks later, by the equations of the module.
     pub fn response(&self, age: u64) -> (f64, f64) {
         let h = self.h;
         if age == 0 {
@@ -87,13 +91,16 @@ impl Newmark {
     }
 }
 
-/// The flow of a relaxing body (`time z' = q - z`) as a filter of its coordinates, exact where they go linearly over a step:
+/// Viscoelastic state of a body (`time z' = q - z`) as a filter of its coordinates.
+///
+/// The filter is exact where the coordinates are linear over a step:
 ///
 /// ```text
 /// z1 = e^-x z0 + (g - e^-x) q0 + (1 - g) q1,   x = h / time, g = (1 - e^-x) / x
 /// ```
 ///
-/// A stream of accelerations gives the coordinates; the flow follows from them, and an error of it dies by `e^-x` a step.
+/// A stream of accelerations gives the coordinates, and the viscoelastic state follows from the
+/// coordinates. An error of the viscoelastic state decays by `e^-x` per step.
 #[derive(Debug, Clone, PartialEq)]
 pub struct FlowFilter {
     /// Share of the stiffness that relaxes away.
@@ -105,7 +112,8 @@ pub struct FlowFilter {
 }
 
 impl FlowFilter {
-    /// For a material; `ages`: how many ticks back an acceleration may be put right.
+    /// Creates the filter for a material. `ages` says how many ticks back an acceleration may be
+    /// corrected.
     pub fn new(relaxation: Relaxation, newmark: &Newmark, ages: usize) -> Self {
         let x = newmark.h / relaxation.time;
         let keep = (-x).exp();
@@ -122,26 +130,28 @@ impl FlowFilter {
         made
     }
 
-    /// The flow after a step over which the coordinate went from `q0` to `q1`.
+    /// Returns the viscoelastic state after a step in which the coordinate moved from `q0` to `q1`.
     pub fn step(&self, z0: f64, q0: f64, q1: f64) -> f64 {
         self.keep * z0 + self.by_old * q0 + self.by_new * q1
     }
 
-    /// The first half of a step of all flows, before the coordinates go on: the old coordinates' part.
+    /// Does the first half of a step of all viscoelastic states, from the old coordinates. Call it
+    /// before the coordinates are stepped.
     pub(crate) fn begin(&self, state: &mut State) {
         for (z, q) in state.z.iter_mut().zip(&state.q) {
             *z = self.step(*z, *q, 0.0);
         }
     }
 
-    /// The second half: the new coordinates' part.
+    /// Does the second half of the step, from the new coordinates.
     pub(crate) fn finish(&self, state: &mut State) {
         for (z, q) in state.z.iter_mut().zip(&state.q) {
             *z += self.by_new * q;
         }
     }
 
-    /// What an acceleration wrong by 1 leaves in the flow `age` ticks later; 0 beyond the ages that it was made for.
+    /// Returns the change that an acceleration wrong by 1 leaves in the viscoelastic state `age`
+    /// ticks later, or 0 beyond the ages given to [`FlowFilter::new`].
     pub fn response(&self, age: u64) -> f64 {
         usize::try_from(age).ok().and_then(|age| self.responses.get(age)).copied().unwrap_or(0.0)
     }

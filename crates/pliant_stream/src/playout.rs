@@ -1,4 +1,4 @@
-//! When a guest shows which tick.
+//! Decides when a guest shows which tick.
 
 use std::collections::VecDeque;
 use std::time::Duration;
@@ -6,24 +6,28 @@ use std::time::Duration;
 use crate::recovery::Playout;
 use crate::state::Tick;
 
-/// Arrivals that the estimate looks back on.
+/// Number of arrivals that the estimate uses.
 const WINDOW: usize = 128;
-/// The schedule is drawn towards the estimate at this rate, so that nobody sees it: 1 %.
+/// Slew rate of the schedule towards the estimate, 1 %. Slewing keeps the change invisible.
 const SLEW: f64 = 0.01;
-/// An estimate farther off than this is taken over at once, s: the path or the host's clock has jumped.
+/// Error beyond which the estimate is adopted at once, s. It means that the path or the host's
+/// clock has jumped.
 const JUMP: f64 = 0.25;
-/// So many frames in a row later than `SHIFTED` ticks behind the line mean that the line has moved: the host paused.
+/// Number of consecutive frames later than `SHIFTED` ticks behind the line after which the line
+/// itself has moved, because the host paused.
 const LATE_ROW: usize = 8;
 const SHIFTED: f64 = 3.0;
-/// Least and most room for scattered arrivals on top of a fixed delay, in ticks.
+/// Smallest and largest margin for scattered arrivals on top of a fixed delay, ticks.
 const MARGIN: f64 = 0.25;
 const MOST_SCATTER: f64 = 2.0;
-/// Share of frames that may come too late.
+/// Share of frames that may arrive too late.
 const LATE_SHARE: f64 = 0.02;
 
-/// Maps ticks to the guest's clock by when their frames arrive: the earliest arrivals of the last 128 frames mark a line
-/// `t = offset + tick h`; a tick is shown some ticks behind it. No clock of the host is needed, and one that jumps does
-/// no harm.
+/// Maps ticks to the guest's clock by the arrival times of their frames.
+///
+/// The earliest arrivals of the last 128 frames mark a line `t = offset + tick h`. A tick is shown
+/// some ticks behind this line. The estimate needs no clock of the host, and a host clock that
+/// jumps does no harm.
 #[derive(Debug, Clone)]
 pub struct PlayoutClock {
     h: f64,
@@ -35,7 +39,7 @@ pub struct PlayoutClock {
 }
 
 impl PlayoutClock {
-    /// For ticks of `h` seconds.
+    /// Creates a clock for ticks of `h` seconds.
     pub fn new(h: f64, playout: Playout) -> Self {
         Self {
             h,
@@ -47,12 +51,12 @@ impl PlayoutClock {
         }
     }
 
-    /// A frame that is newer than all before has arrived.
+    /// Adds the arrival of a frame that is newer than all frames before.
     pub fn arrived(&mut self, now: Duration, tick: Tick) {
         let now = now.as_secs_f64();
         let sample = now - tick as f64 * self.h;
         if self.samples.back().is_some_and(|last| (sample - last).abs() > 10.0 * JUMP) {
-            // The host paused, or numbered on from elsewhere: what was learnt is void.
+            // The host paused or restarted its tick numbers, so the older samples do not apply.
             self.samples.clear();
         }
         let earliest = self.samples.iter().copied().fold(f64::INFINITY, f64::min);
@@ -76,12 +80,13 @@ impl PlayoutClock {
         self.at = now;
     }
 
-    /// Where the line plus the delay should be.
+    /// Computes the time to which the line plus the delay should move.
     fn target(&mut self) -> f64 {
         let earliest = self.samples.iter().copied().fold(f64::INFINITY, f64::min);
         self.scratch.clear();
         self.scratch.extend(self.samples.iter().map(|s| (s - earliest) / self.h));
-        // Both sides work frame by frame of their pictures: arrivals scatter by that even on a perfect path.
+        // Host and guest both run once per rendered frame, which scatters arrivals even on a
+        // perfect path.
         let last = self.scratch.len().saturating_sub(1);
         let index = ((self.scratch.len() as f64 * (1.0 - LATE_SHARE)) as usize).min(last);
         let late = match self.scratch.get_mut(..) {
@@ -95,13 +100,13 @@ impl PlayoutClock {
         earliest + ticks * self.h
     }
 
-    /// When a tick is to be shown, on the guest's clock; `None` before the first frame.
+    /// Time at which a tick is shown, on the guest's clock; `None` before the first frame.
     pub fn due(&self, tick: Tick) -> Option<Duration> {
         let t = self.offset? + tick as f64 * self.h;
         Duration::try_from_secs_f64(t.max(0.0)).ok()
     }
 
-    /// How far the shown tick lies behind its earliest arrival, s.
+    /// Delay of the shown tick behind its earliest arrival, s.
     pub fn delay(&self) -> f64 {
         let earliest = self.samples.iter().copied().fold(f64::INFINITY, f64::min);
         self.offset.map_or(0.0, |o| (o - earliest).max(0.0))

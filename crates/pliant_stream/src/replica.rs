@@ -1,5 +1,4 @@
-//! A copy of a body: the kernel that steps it, and its patches by the names that the stream has for
-//! them.
+//! A copy of a body: the kernel that steps it, and its patches by vertex and radius.
 
 use std::sync::Arc;
 
@@ -12,21 +11,21 @@ use crate::StreamError;
 use crate::state::{GrabKey, GrabState, Pose};
 use crate::wire::FrameGrab;
 
-/// Patches remembered at a time; a new one beyond that empties the table.
+/// Largest number of cached patches. One more empties the table.
 const PATCHES: usize = 256;
 
-/// The force of a hand on a body over the last step, N, world axes; see [`Hand::mean`].
+/// The mean force of a hand on a body over the last step, N, world axes; see [`Hand::mean`].
 pub(crate) type Mean = (GrabKey, Vector3<f64>);
 
-/// Of a hand, zero where there is none yet.
+/// Returns the mean force of a hand, or zero for a hand without one.
 pub(crate) fn mean_of(means: &[Mean], key: GrabKey) -> Vector3<f64> {
     means.iter().find(|(known, _)| *known == key).map_or_else(Vector3::zeros, |(_, mean)| *mean)
 }
 
-/// Names a patch: vertex, bits of the radius.
+/// Key of a patch: the vertex and the bits of the radius.
 type Key = (u32, u64);
 
-/// What steps copies of one body.
+/// Steps copies of one body.
 #[derive(Debug)]
 pub(crate) struct Replica {
     kernel: Kernel,
@@ -37,7 +36,7 @@ pub(crate) struct Replica {
 }
 
 impl Replica {
-    /// For the first `modes` of a model at step `h` (s).
+    /// Creates a replica for the first `modes` of a model at step `h` (s).
     pub(crate) fn new(
         model: Arc<ModalModel>,
         settings: StepSettings,
@@ -57,7 +56,8 @@ impl Replica {
         self.kernel.model()
     }
 
-    /// A patch of the body, made when it is new; `None` for a vertex that the model has not got.
+    /// Returns a patch of the body and makes it on first use. The result is `None` for a vertex
+    /// that the model lacks.
     pub(crate) fn patch(&mut self, vertex: u32, radius: f64) -> Option<Arc<HeldPatch>> {
         let wanted = (vertex, radius.to_bits());
         if let Some((_, patch)) = self.patches.iter().find(|(key, _)| *key == wanted) {
@@ -72,30 +72,33 @@ impl Replica {
         Some(patch)
     }
 
-    /// One step of a state with hands. A step that would not be finite leaves the state as it was.
+    /// Steps a state with hands once. A step whose result would not be finite leaves the state
+    /// unchanged.
     pub(crate) fn step(&mut self, state: &mut State, hands: &mut [Hand], load: &Load<'_>) {
-        // The sizes are this replica's own, and a receiver has nobody to tell of a state that it
-        // cannot step on from: a checksum or a snapshot puts it right.
+        // The error is ignored on purpose. The sizes match by construction, and a receiver cannot
+        // report a state that it cannot step. A checksum or a snapshot repairs the state.
         self.kernel.step(state, hands, load).ok();
     }
 
-    /// A hand as the stream tells of it.
+    /// Builds a hand from the displacement and reaction in a frame.
     pub(crate) fn measured(&mut self, g: &FrameGrab) -> Option<Hand> {
         let patch = self.patch(g.state.vertex, g.state.radius)?;
         let hand = Hand::new(patch, Hold::Measured(g.displacement.into()));
         Some(Hand { pull: -Vector3::from(g.state.reaction), ..hand })
     }
 
-    /// One step with the reactions, drawn to where the host's patches were; the frame stays where the
-    /// state has it.
+    /// Steps a state with the streamed reactions and patch displacements. The rigid frame stays
+    /// where the state has it.
     ///
-    /// Reaction and place together say where the hand must have been, `place + C pull` with `C` the
-    /// hand's compliance; the step is then the body's own. The reactions alone would be a dead load: a
-    /// bent body under a load that pushes is unstable (it buckles), although the same body held in
-    /// place is not, and a small error would grow. This way the receiver is an observer: the pull is
-    /// the measured one when the state is right, and otherwise draws the patches to their places as the
-    /// grab does, so errors die as they would in the held body. A grab whose vertex the model has not
-    /// got pulls nothing. `means`: the hands' forces over the step before, and then over this one.
+    /// Reaction and displacement together say where the hand must have been, `place + C pull`, with
+    /// `place` the position of the patch and `C` the hand's compliance. The step is then the body's
+    /// own. The reactions alone would be a dead load: a bent body under a load that pushes is
+    /// unstable (it buckles), although the same body held in place is stable, and a small error
+    /// would grow. With the displacements the receiver is an observer. The constraint force is the
+    /// measured one when the state is right. Otherwise it draws the patches to their positions as
+    /// the grab does, so errors decay as they would in the held body. A grab whose vertex the model
+    /// lacks exerts no force. `means` holds the mean forces of the hands over the step before, and
+    /// over this step on return.
     pub(crate) fn step_measured(
         &mut self,
         state: &mut State,
@@ -119,29 +122,30 @@ impl Replica {
         (self.hands, self.keys) = (hands, keys);
     }
 
-    /// The force of a hand at the end of a step from those over this step and the one `before`, N.
+    /// Extrapolates the force of a hand at the end of a step from its mean over this step and the
+    /// mean `before` over the step before, N.
     pub(crate) fn end(&self, mean: Vector3<f64>, before: Vector3<f64>) -> Vector3<f64> {
         let beyond = self.kernel.settings().extrapolation(self.kernel.model());
         mean + beyond * (mean - before)
     }
 
-    /// The force over a step of a hand whose force at the end of it is told (N, world axes), as it was
-    /// `before` over the step before.
+    /// Returns the mean force of a hand over a step from its force at the `end` of the step and the
+    /// mean `before` over the step before (N, world axes).
     pub(crate) fn mean(&self, end: Vector3<f64>, before: Vector3<f64>) -> Vector3<f64> {
         let beyond = self.kernel.settings().extrapolation(self.kernel.model());
         (end + beyond * before) / (1.0 + beyond)
     }
 
-    /// Where a patch is at `q`, as displacement from rest in body axes, m; zero for a vertex that the
-    /// model has not got. Modes that `q` lacks do not move.
+    /// Displacement of a patch from rest at `q` in body axes, m. It is zero for a vertex that the
+    /// model lacks. Modes that `q` lacks do not move.
     pub(crate) fn displacement(&mut self, q: &[f64], vertex: u32, radius: f64) -> [f64; 3] {
         let warp = self.kernel.settings().warp;
         self.patch(vertex, radius).map_or([0.0; 3], |patch| patch.displacement(q, warp).into())
     }
 
-    /// The modal force per mode that a step from the true state `from` lacks to reach the true
-    /// coordinates and velocities `to`: by least squares over displacement and velocity, in units of
-    /// the mode's own amplitude. Steps `from`.
+    /// Computes the modal force per mode that a step from the true state `from` lacks to reach the
+    /// true coordinates and velocities `to`. The fit is least squares over displacement and
+    /// velocity, in units of the mode's own amplitude. The call steps `from`.
     pub(crate) fn lacking(
         &mut self,
         from: &mut State,
@@ -186,8 +190,9 @@ impl Replica {
     }
 }
 
-/// Takes over as many of another state's coordinates, velocities, accelerations and flows as there
-/// are; missing ones are 0, and so are the forces of the last step. Sizes and frame stay.
+/// Copies coordinates, velocities, accelerations and viscoelastic states into a state, as far as
+/// both sides have them. Missing values become 0, and so do the forces of the last step. The sizes
+/// and the rigid frame stay.
 pub(crate) fn fill(state: &mut State, from: [&[f64]; 4]) {
     let mine = [&mut state.q, &mut state.v, &mut state.a, &mut state.z];
     for (mine, theirs) in mine.into_iter().zip(from) {
@@ -198,7 +203,7 @@ pub(crate) fn fill(state: &mut State, from: [&[f64]; 4]) {
     state.f.fill(0.0);
 }
 
-/// Puts the frame of a state where a pose has it; a pose that is none leaves it.
+/// Sets the rigid frame of a state to a pose. Without a valid pose the frame stays.
 pub(crate) fn place(state: &mut State, model: &ModalModel, pose: Option<&Pose>) {
     if let Some(frame) = pose.and_then(|pose| pose.frame(model)) {
         state.frame = frame;

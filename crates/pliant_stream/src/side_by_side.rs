@@ -1,4 +1,4 @@
-//! A body and a receiver's copy of it, side by side: the same inputs give the same states.
+//! Compares a body with a receiver's copy of it: the same inputs must give the same states.
 
 use std::{path::Path, sync::Arc};
 
@@ -11,7 +11,7 @@ use crate::replica::Replica;
 use crate::state::{GrabKey, GrabState, UserId};
 use crate::wire::FrameGrab;
 
-/// Largest difference as a share of the largest number of its kind in the run.
+/// Largest allowed difference, as a share of the largest value of the same kind in the run.
 const SAME: f64 = 1e-12;
 
 fn model(name: &str) -> Arc<ModalModel> {
@@ -19,7 +19,7 @@ fn model(name: &str) -> Arc<ModalModel> {
     Arc::new(ModalModel::read(assets.join(name)).unwrap())
 }
 
-/// The surface vertex that is farthest along an axis.
+/// Returns the surface vertex that is farthest along an axis.
 fn end(model: &ModalModel, axis: [f32; 3]) -> u32 {
     let along = |p: &[f32; 3]| p[0] * axis[0] + p[1] * axis[1] + p[2] * axis[2];
     let positions = model.surface().positions();
@@ -27,7 +27,7 @@ fn end(model: &ModalModel, axis: [f32; 3]) -> u32 {
     (0..positions.len()).max_by(far).unwrap() as u32
 }
 
-/// A hand of a case: where it holds, how, and how far (m) its target goes until it rests.
+/// A hand of a test case: its patch, its hold, and the total displacement of its target (m).
 struct Case {
     vertex: u32,
     radius: f64,
@@ -39,7 +39,7 @@ fn hand(vertex: u32, radius: f64, way: [f64; 3]) -> Case {
     Case { vertex, radius, config: GrabConfig::default(), way }
 }
 
-/// Steps both for so many steps, and compares states and reactions after each.
+/// Steps the body and its copy `steps` times and compares states and reactions after each step.
 fn compare(name: &str, model: &Arc<ModalModel>, config: BodyConfig, cases: &[Case], steps: usize) {
     let h = config.step;
     let settings = config.settings;
@@ -174,8 +174,9 @@ fn under_gravity() {
     compare("gravity", &pip, config, &[hand(tip, 0.02, [0.02, 0.0, 0.0])], 64);
 }
 
-/// Steps a body with hands, and a copy by what a frame says of them: places and reactions. The second
-/// hand begins after a while. Returns the largest difference of a coordinate, as a share of the largest.
+/// Steps a body with hands, and a copy of the body with the displacements and reactions that a
+/// frame carries. The second hand begins 40 steps later. Returns the largest difference of a
+/// coordinate as a share of the largest coordinate.
 fn told(model: &Arc<ModalModel>, settings: StepSettings, cases: &[Case; 2]) -> f64 {
     let mut body = Body::new(model.clone(), settings.into()).unwrap();
     let mut copy = Replica::new(model.clone(), settings, model.mode_count(), body.config().step).unwrap();

@@ -1,4 +1,4 @@
-//! Names and plain data that cross the crate's border.
+//! Identifiers and plain data of the public interface.
 
 use std::fmt;
 
@@ -6,49 +6,52 @@ use nalgebra::{Matrix3, Quaternion, UnitQuaternion, Vector3};
 pub use pliant_modal::State;
 use pliant_modal::{Body, Frame, ModalModel};
 
-/// A numbered step of the host. Ticks ascend by one per step of `h` seconds.
+/// Number of a step of the host. Ticks ascend by one per step of `h` seconds.
 pub type Tick = u64;
 
-/// Ticks on the wire are below this (2^48): 8,900 years at 1 kHz.
+/// Upper bound of ticks on the wire, exclusive (2^48): 8,900 years at 1 kHz.
 pub const TICK_LIMIT: Tick = 1 << 48;
 
-/// At most so many grabs are streamed for one body and tick.
+/// Largest number of grabs that are streamed for one body and tick.
 pub const MAX_GRABS: usize = 64;
 
-/// At most so many modes are streamed for one body.
+/// Largest number of modes that are streamed for one body.
 pub const MAX_MODES: usize = 4096;
 
-/// Positions (m), displacements, reactions (N) and speeds beyond this are refused as damage.
+/// Largest magnitude of positions and displacements (m), reactions (N) and speeds. Larger values
+/// are refused as corrupt.
 pub const MAGNITUDE_LIMIT: f64 = 1e9;
 
-/// A connection as the transport names it. The caller chooses it; the session only repeats it.
+/// Identifies a connection of the transport. The caller chooses the number, and the session returns
+/// it unchanged.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash, Default)]
 pub struct PeerId(pub u64);
 
 impl PeerId {
-    /// The peer that a guest talks to.
+    /// The host, as a guest addresses it.
     pub const HOST: Self = Self(0);
 }
 
-/// A person in the session. The host numbers its guests from 1; 0 is a user at the host itself.
+/// Identifies a user in the session. The host numbers its guests from 1; 0 is a user at the host
+/// itself.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash, Default)]
 pub struct UserId(pub u16);
 
 impl UserId {
-    /// The user who sits at the host.
+    /// The user at the host itself.
     pub const HOST: Self = Self(0);
 }
 
-/// A body of the session, numbered by the host.
+/// Identifies a body of the session. The host assigns the numbers.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash, Default)]
 pub struct BodyId(pub u16);
 
-/// A grab, unique within the session: whose, and which of theirs.
+/// Identifies a grab within the session.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash, Default)]
 pub struct GrabKey {
-    /// Whose hand.
+    /// The user whose hand holds.
     pub user: UserId,
-    /// Which of the user's grabs; numbers are not reused within 65,536 grabs.
+    /// The user's number for the grab. Numbers are not reused within 65,536 grabs.
     pub grab: u16,
 }
 
@@ -78,19 +81,19 @@ pub struct Pose {
 }
 
 impl Default for Pose {
-    /// At the origin, unrotated, at rest.
+    /// Returns the pose at the origin, unrotated and at rest.
     fn default() -> Self {
         Self { position: [0.0; 3], rotation: [0.0, 0.0, 0.0, 1.0], linear: [0.0; 3], angular: [0.0; 3] }
     }
 }
 
 impl Pose {
-    /// The frame of a body: the model's origin, and how it moves.
+    /// Returns the pose of a body: the frame at the model's origin and its twist.
     pub fn of(body: &Body) -> Self {
         Self::of_frame(body.model(), body.frame())
     }
 
-    /// The same of a frame alone.
+    /// Returns the pose of a frame of `model`.
     pub fn of_frame(model: &ModalModel, frame: &Frame) -> Self {
         let angular = frame.angular_velocity(model);
         let origin = Vector3::from(frame.origin());
@@ -104,7 +107,7 @@ impl Pose {
         }
     }
 
-    /// The frame of a body in this pose; `None` when a number is not finite.
+    /// Returns the frame of a body in this pose, or `None` when a number is not finite.
     pub fn frame(&self, model: &ModalModel) -> Option<Frame> {
         let turn = self.turn()?;
         let arm = turn * Vector3::from(model.center_of_mass());
@@ -121,7 +124,8 @@ impl Pose {
         UnitQuaternion::try_new(Quaternion::new(w, x, y, z), 1e-12)
     }
 
-    /// True when every number is finite and within [`MAGNITUDE_LIMIT`] and the quaternion is not zero.
+    /// True when every number is finite and within [`MAGNITUDE_LIMIT`] and the quaternion is not
+    /// zero.
     pub fn is_valid(&self) -> bool {
         let norm: f64 = self.rotation.iter().map(|x| x * x).sum();
         in_range(&self.position)
@@ -132,50 +136,52 @@ impl Pose {
     }
 }
 
-/// A grab as it was at one tick.
+/// State of a grab at one tick.
 #[derive(Debug, Clone, Copy, PartialEq, Default)]
 pub struct GrabState {
-    /// Whose and which.
+    /// Identifies the grab.
     pub key: GrabKey,
-    /// Surface vertex in the middle of the patch.
+    /// Surface vertex at the center of the patch.
     pub vertex: u32,
     /// Radius of the patch on the rest surface, m.
     pub radius: f64,
-    /// Where the hand is, world, m.
+    /// Position of the hand, world, m.
     pub target: [f64; 3],
     /// Force that the body exerts on the hand, world, N.
     pub reaction: [f64; 3],
 }
 
 impl GrabState {
-    /// True when every number is finite and within [`MAGNITUDE_LIMIT`] and the radius is not negative.
+    /// True when every number is finite and within [`MAGNITUDE_LIMIT`] and the radius is not
+    /// negative.
     pub fn is_valid(&self) -> bool {
         in_range(&self.target) && in_range(&self.reaction) && (0.0..=MAGNITUDE_LIMIT).contains(&self.radius)
     }
 }
 
-/// What the host knows of one body after one step: the input of [`crate::HostSession::publish`].
+/// State of one body after one step of the host: the input of [`crate::HostSession::publish`].
 #[derive(Debug, Clone, Copy)]
 pub struct TickState<'a> {
-    /// The step's number. Must exceed the last one published for the body.
+    /// Number of the step. It must exceed the last one published for the body.
     pub tick: Tick,
-    /// Modal coordinates, kg^1/2 m; one per mode of the model (or of its first modes).
+    /// Modal coordinates, kg^1/2 m, one per mode of the model (or of its first modes).
     pub q: &'a [f64],
-    /// Their velocities.
+    /// Velocities of the modal coordinates.
     pub v: &'a [f64],
-    /// Their accelerations.
+    /// Accelerations of the modal coordinates.
     pub a: &'a [f64],
-    /// Modal flows of a body that relaxes, kg^1/2 m, as many as `q`; empty for an elastic one.
+    /// Viscoelastic state of a body that relaxes, kg^1/2 m, as many values as `q`; empty for an
+    /// elastic body.
     pub z: &'a [f64],
     /// The rigid frame of a free body; `None` for an anchored one.
     pub pose: Option<Pose>,
-    /// Everything that holds the body, at most [`MAX_GRABS`].
+    /// All grabs of the body, at most [`MAX_GRABS`].
     pub grabs: &'a [GrabState],
-    /// The body sleeps: nothing is sent until this is false again, except a slow reminder.
+    /// The body sleeps. The session sends nothing but a slow reminder until this is false again.
     pub resting: bool,
 }
 
-/// True when all are finite and at most [`MAGNITUDE_LIMIT`].
+/// True when all values are finite and at most [`MAGNITUDE_LIMIT`] in magnitude.
 pub(crate) fn in_range(values: &[f64]) -> bool {
     values.iter().all(|x| x.abs() <= MAGNITUDE_LIMIT)
 }

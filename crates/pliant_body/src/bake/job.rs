@@ -30,16 +30,17 @@ pub(super) enum Outcome {
 }
 
 pub(super) struct Job {
-    /// Whose it is; `None` once nobody waits for it.
+    /// Entity of the request. `None` after the request was dropped.
     pub entity: Option<Entity>,
     task: Task<Outcome>,
     shared: Arc<Shared>,
 }
 
-/// What the bake tells while it runs, and is told.
+/// State shared between the bake and the main thread.
 #[derive(Default)]
 struct Shared {
-    /// The stage's number in the upper half, its share in millionths in the lower one.
+    /// The number of the stage in the upper half, the stage's progress in millionths in the lower
+    /// half.
     progress: AtomicU64,
     cancelled: AtomicBool,
 }
@@ -86,9 +87,10 @@ impl Job {
 
 fn run(request: &BakeRequest, cache: Option<&BakeCache>, shared: &Shared) -> Result<Outcome, BakeBodyError> {
     let start = Instant::now();
-    // Cheap refusals before the long work.
+    // Invalid requests are refused before the long work starts.
     request.config.check()?;
-    // The other half is the game's: a bake on every core would take the frames' time.
+    // The bake uses half of the cores, because a bake on all cores would slow down the game's
+    // frames.
     let cores = std::thread::available_parallelism().map_or(1, usize::from);
     let threads = rayon::ThreadPoolBuilder::new()
         .num_threads((cores / 2).max(1))
@@ -123,7 +125,8 @@ fn run(request: &BakeRequest, cache: Option<&BakeCache>, shared: &Shared) -> Res
     })
 }
 
-/// The tetrahedra, the surface that is worn over them if it is not their boundary, and what was mended.
+/// Returns the tetrahedra, the visible surface if it is not their boundary, and the repair of the
+/// input.
 fn mesh(
     request: &BakeRequest,
     shared: &Shared,
@@ -150,7 +153,7 @@ fn read(path: &Path) -> Result<Input, BakeBodyError> {
     Ok(io::read(path)?)
 }
 
-/// What a shape is called, and the surface that it is, if it is one.
+/// The name of a shape's kind, and its surface if the shape is a surface.
 struct Own(&'static str, Option<Surface>);
 
 fn fill(

@@ -1,4 +1,4 @@
-//! Baking in the game itself, beside its frames.
+//! Baking inside the running game.
 
 mod job;
 mod request;
@@ -13,16 +13,21 @@ pub use request::{BakeBodyError, BakeFailed, BakeProgress, BakeRequest, BakeShap
 use crate::{ModalAsset, ModalBody};
 use job::{Job, Outcome};
 
-/// Bakes what [`BakeRequest`]s ask for: meshing, finite elements and modes on threads of their own, while the game goes on.
+/// Bakes the bodies of [`BakeRequest`]s on separate threads while the game runs.
 ///
-/// One bake runs at a time, on half of the cores, the others wait in the order in which they came. Its [`BakeProgress`] stands on the
-/// entity; when it is done the entity's [`ModalBody`] has its model. Changing the request starts again; removing it or despawning the
-/// entity cancels: what waits is forgotten, what runs ends after the part that it is in, and nobody hears of it.
+/// A bake consists of meshing, finite elements and modes. One bake runs at a time, on half of the
+/// cores. The other requests wait in the order of their arrival. The entity's [`BakeProgress`]
+/// shows the progress, and the entity's [`ModalBody`] gets the model when the bake is done.
+/// Changing the request starts a new bake. Removing the request or despawning the entity cancels
+/// the bake: a waiting request is dropped, and a running bake ends after its current part without a
+/// message.
 ///
-/// Finished bakes are kept on disk by the hash of what was asked for, so that an unchanged one is only read.
+/// Finished bakes are kept on disk under the hash of the request, so that an unchanged request is
+/// only read.
 #[derive(Debug, Clone)]
 pub struct BakePlugin {
-    /// Where finished bakes are kept. Default: the user's own cache, the one that `pliant bake` uses; `None` keeps nothing.
+    /// Cache of finished bakes. Default: the user's cache, which `pliant bake` also uses. `None`
+    /// keeps nothing.
     pub cache: Option<BakeCache>,
 }
 
@@ -45,7 +50,7 @@ impl Plugin for BakePlugin {
     }
 }
 
-/// What is being baked and what waits.
+/// The running bake and the waiting requests.
 #[derive(Resource)]
 struct Bakery {
     cache: Option<BakeCache>,
@@ -66,7 +71,8 @@ impl Bakery {
         if let Some(job) = &mut self.running
             && job.entity == Some(entity)
         {
-            // No thread can be stopped from outside: it ends by itself, for nobody.
+            // A thread cannot be stopped from outside. The bake ends by itself and its result is
+            // dropped.
             job.cancel();
         }
     }
@@ -90,7 +96,7 @@ fn work(
     mut failures: MessageWriter<BakeFailed>,
     mut requests: Query<(NameOrEntity, &BakeRequest, &mut BakeProgress, Option<&mut ModalBody>)>,
 ) {
-    // Nothing waits and nothing runs in nearly every frame of a game.
+    // In nearly every frame of a game no bake waits and none runs.
     if bakery.running.is_none() && bakery.waiting.is_empty() {
         return;
     }

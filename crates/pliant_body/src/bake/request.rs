@@ -1,4 +1,4 @@
-//! What is asked for, how far it is, and why it did not work.
+//! Bake requests, their progress and their errors.
 
 use std::{fmt, path::PathBuf, sync::Arc};
 
@@ -19,44 +19,47 @@ use thiserror::Error;
 /// }
 /// ```
 ///
-/// The [`ModalBody`](crate::ModalBody) beside it may have any settings, its model is written when there is one; without a `ModalBody`
-/// one is added. A new model replaces an old one as any swap of the handle does: the body begins at rest, grabs stay.
+/// The [`ModalBody`](crate::ModalBody) on the same entity may have any settings. The bake writes
+/// its model when the model is ready, and adds a `ModalBody` if there is none. A new model replaces
+/// an old one like any change of the handle: the body begins at rest, and grabs stay.
 #[derive(Component, Reflect, Debug, Clone)]
 #[reflect(opaque)]
 #[reflect(Component, Debug, Clone, from_reflect = false)]
 #[require(BakeProgress)]
 pub struct BakeRequest {
-    /// What is filled with tetrahedra.
+    /// The shape that is filled with tetrahedra.
     pub shape: BakeShape,
-    /// About how many tetrahedra, where the shape has none of its own. Default: 10,000.
+    /// Approximate number of tetrahedra, for a shape without its own tetrahedra. Default: 10,000.
     pub tets: usize,
-    /// What is seen. Default: [`BakeSkin::Tetrahedra`].
+    /// The visible surface. Default: [`BakeSkin::Tetrahedra`].
     pub skin: BakeSkin,
-    /// The material, the number of modes, what is held fixed. Default: [`BakeConfig::default`], a free body of soft silicone.
+    /// The material, the number of modes and the anchors. Default: [`BakeConfig::default`], a free
+    /// body of soft silicone.
     pub config: BakeConfig,
 }
 
 impl BakeRequest {
-    /// A bake of `shape` with everything else at its default.
+    /// Returns a request for `shape` with all other fields at their defaults.
     pub fn new(shape: BakeShape) -> Self {
         Self { shape, tets: 10_000, skin: BakeSkin::default(), config: BakeConfig::default() }
     }
 
-    /// A bake of a file; see [`BakeShape::File`].
+    /// Returns a request for a file, see [`BakeShape::File`].
     pub fn file(path: impl Into<PathBuf>) -> Self {
         Self::new(BakeShape::File(path.into()))
     }
 }
 
-/// What a body is made of before it is baked.
+/// The shape of a body before its bake.
 #[derive(Clone)]
 pub enum BakeShape {
-    /// A file on disk: a surface, mended if it is dirty (`.obj`, `.stl`, `.ply`, `.gltf`, `.glb`), a scene of rounded parts (`.ron`) or tetrahedra (`.msh`,
-    /// `.vtk`, `.mesh`, `.veg`). A relative path begins in the working directory, not in the folder of assets.
+    /// A file on disk: a surface (`.obj`, `.stl`, `.ply`, `.gltf`, `.glb`), a scene of rounded
+    /// parts (`.ron`) or tetrahedra (`.msh`, `.vtk`, `.mesh`, `.veg`). A defective surface is
+    /// repaired. A relative path starts in the working directory, not in the asset folder.
     File(PathBuf),
-    /// A surface, a scene or tetrahedra that are there already.
+    /// A surface, a scene or tetrahedra in memory.
     Input(Arc<Input>),
-    /// A signed distance, written in code.
+    /// A signed distance function in code.
     Distance(Arc<dyn SignedDistance + Send + Sync>),
 }
 
@@ -82,47 +85,48 @@ impl fmt::Debug for BakeShape {
     }
 }
 
-/// The visible surface of a body that is baked.
+/// The visible surface of a baked body.
 #[derive(Clone, Debug, Default)]
 pub enum BakeSkin {
     /// The boundary of the tetrahedra.
     #[default]
     Tetrahedra,
-    /// The surface that was filled, with its texture coordinates. A shape that is no surface has none: refused.
+    /// The surface that was filled, with its texture coordinates. A shape that is not a surface is
+    /// refused.
     Shape,
     /// Another surface file, embedded in the tetrahedra.
     File(PathBuf),
-    /// Another surface.
+    /// Another surface in memory.
     Surface(Arc<Surface>),
 }
 
-/// How far a [`BakeRequest`] is.
+/// The progress of a [`BakeRequest`].
 #[derive(Component, Reflect, Debug, Default, Clone, PartialEq)]
 #[reflect(Component, Default, Clone, PartialEq)]
 pub enum BakeProgress {
-    /// Others are before it.
+    /// Other requests are before this one.
     #[default]
     Waiting,
-    /// It is being made.
+    /// The bake is running.
     Running {
-        /// Which part of the work.
+        /// Current part of the work.
         stage: BakeStage,
-        /// How much of that part is done, 0 to 1.
+        /// Completed fraction of that part, 0 to 1.
         share: f32,
     },
     /// The [`ModalBody`](crate::ModalBody) has its model.
     Done {
-        /// How long it took, s.
+        /// Duration of the bake, s.
         seconds: f64,
-        /// It was not baked but read: the same had been baked before.
+        /// Whether the model was read from the cache of earlier bakes.
         cached: bool,
-        /// What was mended of a dirty surface before it was filled. `None`: nothing had to be.
+        /// Repair of a defective surface before it was filled. `None` if no repair was necessary.
         #[reflect(ignore)]
         repair: Option<Repair>,
     },
-    /// There is no model. The error itself is in [`BakeFailed`].
+    /// The bake gave no model. [`BakeFailed`] holds the error.
     Failed {
-        /// What was expected and what came.
+        /// Text of the error: the expected and the actual input.
         reason: String,
     },
 }
@@ -131,46 +135,49 @@ pub enum BakeProgress {
 #[derive(Reflect, Debug, Clone, Copy, PartialEq, Eq)]
 #[reflect(Clone, PartialEq)]
 pub enum BakeStage {
-    /// Reading, and filling with tetrahedra.
+    /// Reading the shape and filling it with tetrahedra.
     Mesh,
     /// Elements, ordering, stiffness and mass.
     Assemble,
-    /// The sparse factorisation.
+    /// The sparse factorization.
     Factor,
     /// The modes.
     Modes,
-    /// The visible surface and what a hand feels there.
+    /// The visible surface and the data for contact with a hand on it.
     Surface,
 }
 
-/// Why a body could not be baked.
+/// The reason why a body could not be baked.
 #[derive(Debug, Error)]
 #[non_exhaustive]
 pub enum BakeBodyError {
-    /// The shape or the skin could not be read, or not be filled with tetrahedra.
+    /// The shape or the skin could not be read, or the shape could not be filled with tetrahedra.
     #[error("the body could not be meshed: {0}")]
     Mesh(#[from] MeshError),
     /// The bake was refused.
     #[error("the body could not be baked: {0}")]
     Bake(#[from] BakeError),
-    /// [`BakeSkin::Shape`] of something that is no surface.
+    /// The skin is [`BakeSkin::Shape`], but the shape is not a surface.
     #[error("the body cannot wear its shape as a skin: expected a surface, got {got}")]
     NoSurface {
-        /// What the shape is.
+        /// The kind of the shape.
         got: &'static str,
     },
-    /// The system gave no threads.
+    /// The operating system provided no threads.
     #[error("the body could not be baked: no threads were to be had: {0}")]
     Threads(String),
 }
 
-/// Sent, and logged with the entity's name, when a [`BakeRequest`] gave no model. The entity keeps the body it had.
+/// Reports a [`BakeRequest`] that gave no model.
+///
+/// The plugin writes this message and logs it with the entity's name. The entity keeps its previous
+/// body.
 #[derive(Message, Reflect, Debug)]
 #[reflect(from_reflect = false)]
 pub struct BakeFailed {
     /// The entity of the request.
     pub entity: Entity,
-    /// What was expected and what came.
+    /// The error: the expected and the actual input.
     #[reflect(ignore)]
     pub error: BakeBodyError,
 }

@@ -1,12 +1,14 @@
-//! Writes the deformed surface into the mesh asset on the processor. It allocates nothing once its buffers have grown; Bevy then copies
-//! the mesh for its render world.
+//! Writes the deformed surface into the mesh asset on the CPU.
+//!
+//! The code allocates nothing once its buffers have grown. Bevy then copies the mesh for its render
+//! world.
 
 use bevy::{camera::primitives::Aabb, mesh::VertexAttributeValues, prelude::*};
 use pliant_modal::{ModalModel, Precision};
 
 use super::topology::Topology;
 
-/// Buffers that are kept from body to body and frame to frame.
+/// Buffers that are reused for all bodies and frames.
 #[derive(Default)]
 pub(super) struct Scratch {
     q: Vec<f32>,
@@ -14,8 +16,10 @@ pub(super) struct Scratch {
     normals: Vec<Vec3>,
 }
 
-/// Writes positions (m, body axes), from the basis in `precision`, and area-weighted normals at modal coordinates `q` into `mesh`, which was made for `topology`;
-/// returns the bounds, or `None` when the mesh is not of this topology (somebody replaced it), which is then left alone.
+/// Writes positions (m, body axes) and area-weighted normals at modal coordinates `q` into `mesh`.
+///
+/// The basis is read in `precision`. `mesh` must have been made for `topology`. Returns the bounds.
+/// Returns `None` for a mesh that was replaced by one of another topology, which is left alone.
 pub(super) fn write(
     model: &ModalModel,
     precision: Precision,
@@ -39,7 +43,8 @@ pub(super) fn write(
         high = high.max(Vec3::from(*drawn));
     }
 
-    // The cross product of two edges is the face normal times twice the area: summing it weights by area.
+    // The cross product of two edges is the face normal times twice the area, so the sum weights
+    // each normal by its area.
     normals.clear();
     normals.resize(topology.normals, Vec3::ZERO);
     for triangle in &topology.triangles {
@@ -50,7 +55,8 @@ pub(super) fn write(
         }
     }
     for normal in normals.iter_mut() {
-        // Scaled by the largest part first: the square of a tiny triangle's area would vanish in single precision.
+        // Division by the largest component comes first, because the square of a tiny triangle's
+        // area would vanish in single precision.
         *normal = (*normal / normal.abs().max_element()).normalize_or(Vec3::Y);
     }
     let drawn = float3(mesh, Mesh::ATTRIBUTE_NORMAL.id, topology.source.len())?;

@@ -1,30 +1,33 @@
-// Deforms modal surfaces where they are drawn from: positions first, then the normals that follow from them.
+// Deforms modal surfaces in the drawn vertex buffer: first the positions, then the normals from
+// them.
 //
-// Both entry points run for all bodies of one model at once: x counts vertices, y counts bodies.
+// Both entry points run for all bodies of one dispatch at once: x counts vertices, y counts bodies.
 
 struct Surface {
-    // Vertices of the surface, and of the mesh that draws it (a sharp edge is drawn twice).
+    // Number of vertices of the surface, and of the mesh that draws it (a sharp edge is drawn
+    // twice).
     vertices: u32,
     drawn: u32,
-    // Modes that the basis was stored with: the pitch of its blocks.
+    // Number of modes with which the basis was stored: the pitch of its blocks.
     modes: u32,
-    // Where in `topology` the list of corners of each normal begins, and the corners.
+    // Offsets in `topology` of the list where each normal's corners begin, and of the corners.
     starts: u32,
     corners: u32,
-    // The first of this dispatch's bodies.
+    // Index of the first body of this dispatch in `jobs`.
     first: u32,
     pad_a: u32,
     pad_b: u32,
 }
 
 struct Job {
-    // Its modal coordinates in `coordinates`.
+    // Offset of the body's modal coordinates in `coordinates`.
     q: u32,
     modes: u32,
     warped: u32,
-    // Its positions in `positions`.
+    // Offset of the body's positions in `positions`.
     positions: u32,
-    // Its first vertex in `mesh`, the length of one, and where in it position and normal are: all in words.
+    // Offset of the body's first vertex in `mesh`, size of a vertex, and offsets of position and
+    // normal in a vertex, all in words.
     start: u32,
     stride: u32,
     position: u32,
@@ -34,9 +37,11 @@ struct Job {
 @group(0) @binding(0) var<uniform> surface: Surface;
 // [vertex][axis], m.
 @group(0) @binding(1) var<storage, read> rest: array<f32>;
-// [block][mode][row][lane]: three rows of displacement and three of rotation, 16 vertices a block.
+// [block][mode][row][lane]: three rows of displacement and three of rotation, 16 vertices per
+// block.
 @group(0) @binding(2) var<storage, read> basis: array<f32>;
-// For each drawn vertex its vertex and its normal; for each normal where its corners begin; corners, three vertices each.
+// For each drawn vertex its surface vertex and its normal, for each normal the start of its
+// corners, then the corners with three vertices each.
 @group(0) @binding(3) var<storage, read> topology: array<u32>;
 @group(0) @binding(4) var<storage, read> jobs: array<Job>;
 @group(0) @binding(5) var<storage, read> coordinates: array<f32>;
@@ -46,7 +51,7 @@ struct Job {
 const BLOCK: u32 = 16u;
 const ROWS: u32 = 6u;
 const TAU: f32 = 6.283185307179586;
-// Up to half a turn, |w|^2 <= pi^2, the series below are good to single precision.
+// Up to half a turn, |w|^2 <= pi^2, the series below are accurate to single precision.
 const SERIES_LIMIT: f32 = 9.87;
 
 // (1 - cos t) / t^2 and (t - sin t) / t^3 as series in s = t^2.
@@ -72,8 +77,8 @@ fn series(s: f32) -> vec2<f32> {
     return vec2(a, b);
 }
 
-// The two coefficients of modal warping for any rotation vector of squared length s. Sine and cosine come from the series too: the
-// built-in ones may be off by 5e-4.
+// Returns the two coefficients of modal warping for any rotation vector of squared length s. Sine
+// and cosine come from the series too, because the built-in functions may be off by 5e-4.
 fn coefficients(s: f32) -> vec2<f32> {
     if s <= SERIES_LIMIT {
         return series(s);
@@ -132,7 +137,8 @@ fn write_mesh(@builtin(global_invocation_id) id: vec3<u32>) {
     }
     let job = jobs[surface.first + id.y];
     let group = topology[2u * drawn + 1u];
-    // The cross product of two edges is the face normal times twice the area: summing it weights by area.
+    // The cross product of two edges is the face normal times twice the area, so the sum weights
+    // each normal by its area.
     var sum = vec3(0.0);
     let end = topology[surface.starts + group + 1u];
     for (var corner = topology[surface.starts + group]; corner < end; corner++) {
@@ -142,7 +148,8 @@ fn write_mesh(@builtin(global_invocation_id) id: vec3<u32>) {
         let c = position_of(job, topology[at + 2u]);
         sum += cross(b - a, c - a);
     }
-    // Scaled by the largest part first: the square of a tiny triangle's area would vanish in single precision.
+    // Division by the largest component comes first, because the square of a tiny triangle's area
+    // would vanish in single precision.
     let largest = max(max(abs(sum.x), abs(sum.y)), abs(sum.z));
     var normal = vec3(0.0, 1.0, 0.0);
     if largest > 0.0 {

@@ -1,4 +1,5 @@
-//! Level of detail: as many modes as can be seen, and warping only where it shows.
+//! Level of detail: draws only the modes that are visible, and warps only where the warping is
+//! visible.
 
 use bevy::{
     camera::{Camera, primitives::Aabb},
@@ -8,14 +9,17 @@ use bevy::{
 
 use super::drawing::Drawing;
 
-/// How finely a body is drawn. Every [`ModalBody`](crate::ModalBody) has one.
+/// The level of detail of a body's surface. Every [`ModalBody`](crate::ModalBody) has one.
 ///
-/// Modes are left out of the picture, the fastest first, and warping too, as long as no vertex moves by more than [`tolerance`](Self::tolerance)
-/// in any view: a body far away, or one whose fast modes are still, is drawn with fewer. What is simulated, felt and sent is not touched.
+/// The fastest modes, and the warping, are omitted as long as this moves no vertex by more than
+/// [`tolerance`](Self::tolerance) in any view. A body that is far away, or whose fast modes do not
+/// move, is drawn with fewer modes. The simulation, the force on the hand and the network are not
+/// affected.
 #[derive(Component, Reflect, Debug, Clone, Copy, PartialEq)]
 #[reflect(Component, Default, Clone, PartialEq)]
 pub struct SurfaceDetail {
-    /// How far the drawn surface may be from the exact one, in pixels of the view that shows it largest. Zero draws all modes. Default: `0.1`.
+    /// Largest distance of the drawn surface from the exact surface, in pixels of the view that
+    /// shows the body largest. Zero draws all modes. Default: `0.1`.
     pub tolerance: f32,
 }
 
@@ -25,26 +29,31 @@ impl Default for SurfaceDetail {
     }
 }
 
-/// What of a body's modes is drawn.
+/// The part of a body's modes that is drawn.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(super) struct Detail {
-    /// The first this many modes.
+    /// Number of drawn modes, from the first.
     pub modes: usize,
-    /// Bent by modal warping.
+    /// Whether modal warping is applied.
     pub warped: bool,
 }
 
 impl Detail {
-    /// Whether a picture with this detail is good enough where `needed` is asked for.
+    /// Whether a picture with this detail is sufficient where `needed` is required.
     pub fn covers(self, needed: Self) -> bool {
         self.modes >= needed.modes && (self.warped || !needed.warped)
     }
 
-    /// The least detail at which no vertex is farther than `error` (m, body axes) from where all modes and warping (if the body `warps`) put it.
+    /// Returns the least detail that keeps every vertex within `error` (m, body axes) of its exact
+    /// position.
     ///
-    /// The warp is the mean of the rotations from 0 to `w`, `R~(w) = int_0^1 exp(t [w]x) dt`; as `exp` turns no faster than its argument,
-    /// `|R~(w) - R~(w')| <= |w - w'| / 2`, and no singular value of `R~` exceeds one. Leaving out mode `k` therefore moves a vertex by at most
-    /// `|q_k| (reach_k + turn_k |d| / 2)`, and leaving out the warp by `|w| |d| / 2`, with `|d| <= sum |q_k| reach_k` and `|w| <= sum |q_k| turn_k`.
+    /// The exact position uses all modes, and warping if the body `warps`.
+    ///
+    /// The warp is the mean of the rotations from 0 to `w`, `R~(w) = int_0^1 exp(t [w]x) dt`. As
+    /// `exp` turns no faster than its argument, `|R~(w) - R~(w')| <= |w - w'| / 2`, and no singular
+    /// value of `R~` exceeds one. Omitting mode `k` therefore moves a vertex by at most
+    /// `|q_k| (reach_k + turn_k |d| / 2)`, and omitting the warp by at most `|w| |d| / 2`, with
+    /// `|d| <= sum |q_k| reach_k` and `|w| <= sum |q_k| turn_k`.
     pub fn needed(drawing: &Drawing, q: &[f64], warps: bool, error: f64) -> Self {
         let sum = |by: &[f32]| -> f64 { q.iter().zip(by).map(|(q, &by)| q.abs() * f64::from(by)).sum() };
         let whole = sum(&drawing.reach);
@@ -65,27 +74,29 @@ impl Detail {
     }
 }
 
-/// The views of a frame, as far as sizes on screen go.
+/// The views of a frame, reduced to what sizes on screen need.
 pub(super) struct Views(Vec<View>);
 
 struct View {
     eye: Vec3A,
     near: f32,
-    /// Metres that a pixel covers: at one metre's distance in perspective, anywhere in an orthographic view.
+    /// Meters that a pixel covers: at a distance of one meter in perspective, anywhere in an
+    /// orthographic view.
     metres: f32,
     perspective: bool,
 }
 
 impl Views {
-    /// Views of the cameras that are on.
+    /// Returns the views of the active cameras.
     pub fn new<'a>(cameras: impl Iterator<Item = (&'a Camera, &'a GlobalTransform)>) -> Self {
         let view = |(camera, place): (&Camera, &GlobalTransform)| {
             let height = camera.physical_viewport_size()?.y as f32;
             let matrix = camera.clip_from_view();
-            // Half the picture's height is one of clip space.
+            // Half of the picture's height is one unit of clip space.
             let metres = 2.0 / (matrix.y_axis.y.abs() * height);
             let perspective = matrix.w_axis.w == 0.0;
-            // Reversed depth without a far end: the near distance stands in the last column.
+            // In a reversed-depth projection without a far plane, the last column holds the near
+            // distance.
             let near = if perspective { matrix.w_axis.z.abs().max(1e-6) } else { 0.0 };
             (camera.is_active && metres.is_finite() && metres > 0.0).then_some(View {
                 eye: place.translation_vec3a(),
@@ -97,7 +108,8 @@ impl Views {
         Self(cameras.filter_map(view).collect())
     }
 
-    /// Metres (world) that a pixel covers where the body is nearest, in the view where that is least; `None` when nobody looks.
+    /// Returns the meters (world) that a pixel covers at the nearest point of the body, as the
+    /// least over all views. Returns `None` if there is no view.
     pub fn metres_per_pixel(&self, bounds: &Aabb, place: &GlobalTransform) -> Option<f32> {
         let affine = place.affine();
         let center = affine.transform_point3a(bounds.center);
@@ -120,7 +132,7 @@ mod tests {
     use super::*;
     use crate::tests::model;
 
-    /// The farthest that leaving out what `detail` leaves out moves any vertex.
+    /// Returns the largest distance by which the parts omitted by `detail` move any vertex.
     fn moved(drawing: &Drawing, q: &[f64], detail: Detail) -> f64 {
         let shape = |q: &[f64], warped: bool| {
             let q: Vec<f32> = q.iter().map(|&q| q as f32).collect();
@@ -144,12 +156,13 @@ mod tests {
                 let q = [amplitude, 0.3 * amplitude, -0.05 * amplitude, 0.002 * amplitude];
                 let detail = Detail::needed(&drawing, &q, true, error);
                 let off = moved(&drawing, &q, detail);
-                // A rounding of single precision at one metre.
+                // The margin is a rounding error of single precision at one meter.
                 assert!(off <= error + 2e-7, "{off} m for {error}, {detail:?}");
                 kinds.insert((detail.modes, detail.warped));
             }
         }
-        // The test saw bodies drawn with none of the modes, with some and with all, with and without warping.
+        // The test covers bodies drawn with no modes, with some modes and with all modes, with and
+        // without warping.
         let has = |test: &dyn Fn(&(usize, bool)) -> bool| kinds.iter().any(test);
         assert!(has(&|k| k.0 == 0) && has(&|k| k.0 == 4) && has(&|k| (1..4).contains(&k.0)));
         assert!(has(&|k| k.1) && has(&|k| !k.1 && k.0 > 0), "{kinds:?}");
@@ -161,7 +174,7 @@ mod tests {
         let detail = Detail::needed(&drawing, &[1e-3, 0.0, 0.0, 1e-9], true, 0.0);
         assert_eq!(detail, Detail { modes: 4, warped: true });
         assert_eq!(Detail::needed(&drawing, &[0.0; 4], true, 0.0), Detail { modes: 0, warped: false });
-        // An unsound scale asks for NaN: then everything is drawn.
+        // An invalid scale gives an error of NaN, for which everything is drawn.
         assert_eq!(Detail::needed(&drawing, &[1e-3; 4], true, f64::NAN).modes, 4);
     }
 }

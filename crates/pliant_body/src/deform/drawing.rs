@@ -1,4 +1,4 @@
-//! What drawing a model needs besides its modes; shared by the bodies that look alike.
+//! The data besides the modes that drawing a model needs, shared by bodies that are drawn alike.
 
 use std::{
     collections::HashMap,
@@ -10,23 +10,25 @@ use pliant_modal::{ModalModel, ModelHash};
 
 use super::topology::Topology;
 
-/// Parts along each axis that a surface is cut into for its bounds.
+/// Number of parts along each axis into which a surface is divided for its bounds.
 const PARTS: usize = 2;
 
-/// A model as it is drawn.
+/// The drawing data of a model.
 #[derive(Debug)]
 pub(super) struct Drawing {
     pub model: Arc<ModalModel>,
     pub topology: Topology,
-    /// For each mode the farthest that a unit of its coordinate moves any vertex, kg^-1/2: `|u| <= sum |q_k| reach_k`, warped or not,
-    /// as no singular value of `R~` exceeds one.
+    /// For each mode, the largest displacement of any vertex per unit of the modal coordinate,
+    /// kg^-1/2: `|u| <= sum |q_k| reach_k`, with or without warping, because no singular value of
+    /// `R~` exceeds one.
     pub reach: Vec<f32>,
-    /// For each mode the most that a unit of its coordinate turns any vertex, rad / (kg^1/2 m).
+    /// For each mode, the largest rotation of any vertex per unit of the modal coordinate,
+    /// rad / (kg^1/2 m).
     pub turn: Vec<f32>,
     parts: Vec<Part>,
 }
 
-/// A piece of the surface: its box at rest, and its own reach.
+/// A part of the surface with its box at rest and its own reach.
 #[derive(Debug)]
 struct Part {
     low: Vec3A,
@@ -43,7 +45,7 @@ impl Drawing {
         let part_of = |p: &[f32; 3]| {
             (0..3).fold(0, |part, axis| {
                 let across = (p[axis] - low[axis]) / (high[axis] - low[axis]);
-                // NaN of a flat surface goes to the first part.
+                // A flat surface gives NaN here, which selects the first part.
                 part * PARTS + ((across * PARTS as f32) as usize).min(PARTS - 1)
             })
         };
@@ -75,7 +77,8 @@ impl Drawing {
         }
     }
 
-    /// Bounds that hold the surface whatever its shape at `q`, at the cost of a few numbers a mode.
+    /// Returns bounds that contain the surface at `q`, with or without warping, at the cost of a
+    /// few numbers per mode.
     pub fn bounds(&self, q: &[f64]) -> Aabb {
         let (mut low, mut high) = (Vec3A::INFINITY, Vec3A::NEG_INFINITY);
         for part in &self.parts {
@@ -87,7 +90,7 @@ impl Drawing {
     }
 }
 
-/// The drawings in use, by model and crease angle.
+/// The drawing data in use, by model and crease angle.
 #[derive(Resource, Default)]
 pub(super) struct Drawings(HashMap<(ModelHash, u32), Weak<Drawing>>);
 

@@ -1,8 +1,8 @@
-//! The compute pass: writes the deformed surface straight into the vertex buffer that the mesh is drawn from.
+//! The compute pass, which writes the deformed surface into the vertex buffer of the drawn mesh.
 //!
-//! The main world hands over modal coordinates (a [`GpuShape`] a body, when the picture has to change) and nothing else; the basis lies on the
-//! device once a model. Bodies that share a model and a buffer go in one dispatch. Every material, shadow and prepass reads the same
-//! vertices as ever.
+//! The main world passes only modal coordinates, as one [`GpuShape`] per body, when the picture
+//! must change. The basis is on the GPU once per model. Bodies that share a model and a buffer use
+//! one dispatch. Every material, shadow pass and prepass reads the usual vertex buffer.
 
 use std::{
     collections::HashMap,
@@ -36,13 +36,14 @@ use bevy::{
 
 use super::drawing::Drawing;
 
-/// Bytes of scratch positions that one dispatch may take; more bodies than fit go in further ones.
+/// Maximum size of the scratch positions of one dispatch, bytes. Bodies beyond it need further
+/// dispatches.
 const SCRATCH_BYTES: u64 = 64 << 20;
 
-/// Threads of a workgroup in the shader.
+/// Threads per workgroup in the shader.
 const WORKGROUP: u32 = 64;
 
-/// The shape that a body's vertex buffer is to hold.
+/// The shape that the vertex buffer of a body must hold.
 #[derive(Component, Clone)]
 pub(super) struct GpuShape {
     pub drawing: Arc<Drawing>,
@@ -51,16 +52,17 @@ pub(super) struct GpuShape {
     pub warped: bool,
 }
 
-/// Main world: whether there is a device that computes, and what it can bind.
+/// The limits of the compute device. This resource is in the main world and only exists if the
+/// device can run the compute pass.
 #[derive(Resource)]
 pub(super) struct Compute {
     limits: WgpuLimits,
-    /// The device is the processor itself, in disguise.
+    /// Whether the device is a software renderer on the CPU.
     pub software: bool,
 }
 
 impl Compute {
-    /// Whether all that a model needs fits into this device's bindings.
+    /// Whether all data of a model fits into the bindings of this device.
     pub fn takes(&self, drawing: &Drawing) -> bool {
         let basis = drawing.model.basis();
         let Some(rows) = basis.rows() else { return false };
@@ -69,13 +71,13 @@ impl Compute {
         let buffer = largest.min(self.limits.max_buffer_size);
         size_of_val(rows) as u64 <= buffer
             && 4 * drawing.topology.words() as u64 <= buffer
-            // Twelve floats a vertex is more than any mesh of this plugin has.
+            // Twelve floats per vertex are more than any mesh of this plugin has.
             && vertices * 48 <= largest
             && vertices.div_ceil(u64::from(WORKGROUP)) <= u64::from(self.limits.max_compute_workgroups_per_dimension)
     }
 }
 
-/// First frame: looks at the device that the renderer has got.
+/// Inspects the renderer's device, in the first frame.
 pub(super) fn find(
     mut commands: Commands,
     device: Option<Res<RenderDevice>>,
@@ -93,7 +95,7 @@ pub(super) fn find(
     }
 }
 
-/// Adds the pass to the render world, if there is one.
+/// Adds the compute pass to the render world, if there is one.
 pub(super) fn finish(app: &mut App) {
     if app.get_sub_app(RenderApp).is_none() {
         return;
@@ -114,13 +116,14 @@ pub(super) fn finish(app: &mut App) {
         .add_systems(RenderGraph, dispatch.before(camera_driver));
 }
 
-/// Render world: the newest shape of every body, and which of them the vertex buffers hold.
+/// The newest shape of every body, and whether its vertex buffer holds that shape. This resource is
+/// in the render world.
 #[derive(Resource, Default)]
 struct Shapes(EntityHashMap<Shape>);
 
 struct Shape {
     wanted: GpuShape,
-    /// The buffer and vertex that `wanted` was written to.
+    /// The buffer and the vertex offset to which `wanted` was written.
     written: Option<(BufferId, u32)>,
 }
 
@@ -148,7 +151,7 @@ fn extract(
     }
 }
 
-/// As in `deform.wgsl`.
+/// The struct `Surface` of `deform.wgsl`.
 #[derive(ShaderType, Clone, Copy)]
 struct Surface {
     vertices: u32,
@@ -160,7 +163,7 @@ struct Surface {
     pad: UVec2,
 }
 
-/// As in `deform.wgsl`.
+/// The struct `Job` of `deform.wgsl`.
 #[derive(ShaderType, Clone, Copy)]
 struct Job {
     q: u32,
@@ -173,13 +176,13 @@ struct Job {
     normal: u32,
 }
 
-/// What lies on the device for a model.
+/// The GPU data of a model.
 struct Resident {
     of: Weak<Drawing>,
     rest: Buffer,
     basis: Buffer,
     topology: Buffer,
-    /// `first` is yet to be filled in.
+    /// The surface data, in which `first` is filled in per dispatch.
     surface: Surface,
 }
 
@@ -188,7 +191,7 @@ impl Resident {
         let buffer = |label: &str, contents: &[u8]| {
             device.create_buffer_with_data(&BufferInitDescriptor {
                 label: Some(label),
-                // An empty binding is no binding.
+                // An empty buffer cannot be bound.
                 contents: if contents.is_empty() { &[0; 4] } else { contents },
                 usage: BufferUsages::STORAGE,
             })
@@ -222,7 +225,7 @@ impl Resident {
     }
 }
 
-/// All that is lost with the device, and made anew with the next one.
+/// All data that is lost with the GPU device and made again with the next device.
 #[derive(Resource)]
 struct Device {
     residents: HashMap<usize, Resident>,
@@ -235,7 +238,7 @@ struct Device {
 
 impl FromWorld for Device {
     fn from_world(world: &mut World) -> Self {
-        // Buffers of a lost device hold nothing.
+        // The buffers of a lost device hold nothing.
         for shape in world.resource_mut::<Shapes>().0.values_mut() {
             shape.written = None;
         }
@@ -299,7 +302,7 @@ fn queue_pipelines(mut commands: Commands, assets: Res<AssetServer>, cache: Res<
     commands.insert_resource(Pipelines { layout, positions, mesh });
 }
 
-/// Where a mesh's vertices are, in bytes and in words.
+/// The location of a mesh's vertices, in bytes and in words.
 struct Place {
     buffer: Buffer,
     first: u32,
@@ -317,7 +320,7 @@ fn place(
 ) -> Option<Place> {
     let layout = &meshes.get(mesh)?.layout.0;
     let slice = allocator.mesh_vertex_slice(&mesh)?;
-    // A mesh that somebody has replaced by another one is left alone.
+    // A mesh that was replaced from outside is left alone.
     if slice.range.len() != drawn {
         return None;
     }
@@ -349,14 +352,16 @@ fn prepare(
 ) {
     let device = device.into_inner();
     device.dispatches.clear();
-    // In every frame: a model that nobody draws any more gives its memory back though nothing else moves.
+    // This runs in every frame, so that the memory of a model without drawn bodies is freed even if
+    // nothing moves.
     device.residents.retain(|_, resident| resident.of.strong_count() > 0);
     if cache.get_compute_pipeline(pipelines.positions).is_none()
         || cache.get_compute_pipeline(pipelines.mesh).is_none()
     {
         return;
     }
-    // What has to be written, beside where: bodies of one model in one buffer follow each other, by their place in it.
+    // The work consists of the shapes to write and their locations. Bodies of one model in one
+    // buffer are adjacent, sorted by their location in the buffer.
     let mut work: Vec<(usize, Place, &mut Shape)> = shapes
         .0
         .values_mut()
@@ -384,7 +389,8 @@ fn prepare(
     let largest = limits.max_storage_buffer_binding_size;
     let most_bodies = u64::from(limits.max_compute_workgroups_per_dimension);
 
-    /// Bodies of one dispatch: their model, first job and number, and the bytes of the vertex buffer that they lie in.
+    /// Bodies of one dispatch: their model, the offset of their surface data, their number, and
+    /// their byte range in the vertex buffer.
     struct Batch {
         drawing: usize,
         surface: u32,
@@ -437,7 +443,7 @@ fn prepare(
         scratch_needed = scratch_needed.max(batch.bodies * scratch);
         shape.written = Some((place.buffer.id(), place.first));
     }
-    // A body drawn with no modes at all still needs something to bind.
+    // A body that is drawn with no modes still needs a buffer to bind.
     device.coordinates.push(0.0);
     if device.scratch.as_ref().is_none_or(|buffer| buffer.size() < scratch_needed) {
         device.scratch = Some(render_device.create_buffer(&BufferDescriptor {
@@ -530,7 +536,7 @@ mod tests {
 
     #[test]
     fn a_model_goes_to_a_device_that_holds_each_of_its_buffers() {
-        // Of one mode: what its triangles take is more than what the basis does.
+        // With one mode, the triangles take more memory than the basis.
         let mut parts = model::bar().parts().clone();
         let rows = parts.displacement.len() / parts.omega.len();
         parts.displacement.truncate(rows);

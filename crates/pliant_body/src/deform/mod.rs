@@ -1,8 +1,9 @@
-//! The deformed surface on screen: a [`Mesh`] a body, rewritten when its shown state moved and somebody sees it.
+//! The deformed surface on screen: one [`Mesh`] per body, updated when its visible shape changes.
 //!
-//! The mesh is an ordinary one, so every material, shadow and prepass works on it unchanged. This module decides *what* is to be drawn
-//! again, how finely ([`detail`]), and keeps the bounds right; [`gpu`] writes the vertices where they are drawn from, [`cpu`] where there is no
-//! such device.
+//! The mesh is an ordinary mesh, so that every material, shadow pass and prepass works with it.
+//! This module selects the surfaces to update and their level of detail ([`detail`]), and maintains
+//! the bounds. [`gpu`] writes the vertices into the vertex buffer. [`cpu`] writes them where no
+//! suitable GPU is available.
 
 mod cpu;
 mod detail;
@@ -32,12 +33,13 @@ use topology::Topology;
 
 pub use detail::SurfaceDetail;
 
-/// How a body's surface is shaded. Every [`ModalBody`] has one.
+/// The shading of a body's surface. Every [`ModalBody`] has one.
 #[derive(Component, Reflect, Debug, Clone, Copy, PartialEq)]
 #[reflect(Component, Default, Clone, PartialEq)]
 pub struct SurfaceShading {
-    /// Edges of the rest shape that bend by more than this angle (rad) are drawn sharp, all others smooth. Pi or more smooths
-    /// everything. Default: `0.9` (52 degrees: the edges of a box stay edges).
+    /// Edges of the rest shape that bend by more than this angle are drawn sharp, all others
+    /// smooth, rad. Pi or more smooths everything. Default: `0.9` (52 degrees, which keeps the
+    /// edges of a box sharp).
     pub crease: f32,
 }
 
@@ -47,31 +49,33 @@ impl Default for SurfaceShading {
     }
 }
 
-/// Who writes the vertices of deformed surfaces. May be changed at any time.
+/// Selects whether the GPU or the CPU writes the deformed surfaces. May be changed at any time.
 #[derive(Resource, Reflect, Debug, Clone, Copy, Default, PartialEq, Eq)]
 #[reflect(Resource, Default, Clone, PartialEq)]
 pub enum SurfaceDeformation {
-    /// A compute shader where the renderer has a graphics card, the processor elsewhere: without a renderer, without compute shaders, where
-    /// the "card" is the processor in disguise, for a model that does not fit into the card's bindings.
+    /// Uses a compute shader if the renderer has a GPU, and the CPU otherwise. The CPU is used
+    /// without a renderer, without compute shaders, with a software renderer, and for a model that
+    /// does not fit into the GPU's bindings.
     #[default]
     Auto,
-    /// The processor, always. The [`Mesh`] asset then holds the deformed shape, for whoever reads it there.
+    /// Always uses the CPU. The [`Mesh`] asset then holds the deformed shape for other readers.
     Processor,
-    /// A compute shader wherever there is one, a software one too. The [`Mesh`] asset keeps the shape it was made with.
+    /// Uses a compute shader wherever there is one, including a software renderer. The [`Mesh`]
+    /// asset keeps the shape with which it was made.
     Compute,
 }
 
-/// Marks a body whose surface is on screen, and remembers which state of it.
+/// Marks a body whose surface is drawn, and stores which state is drawn.
 #[derive(Component, Debug)]
 pub struct DrawnSurface {
     model: Arc<ModalModel>,
     drawing: Arc<Drawing>,
-    /// The mesh that was made for it.
+    /// The mesh that was made for this body.
     mesh: AssetId<Mesh>,
     crease: f32,
     version: u64,
     detail: Detail,
-    /// By the compute shader.
+    /// Whether the compute shader wrote the surface.
     computed: bool,
 }
 
@@ -91,12 +95,14 @@ pub(crate) fn build(app: &mut App) {
                 (make_meshes, deform_surfaces)
                     .chain()
                     .in_set(PliantDisplaySystems::Deform)
-                    // It asks who was seen in the frame before; from here on visibility is found anew.
+                    // These systems read the visibility of the frame before. Bevy computes the
+                    // visibility of this frame after them.
                     .before(VisibilitySystems::VisibilityPropagate)
                     .before(VisibilitySystems::CalculateBounds),
                 write_again.after(AssetEventSystems).run_if(resource_exists::<Compute>),
             )
-                // A server is built with this feature when its neighbour in the workspace draws: it has no meshes.
+                // Another crate of the workspace that draws can enable this feature for a headless
+                // server, which has no mesh assets.
                 .run_if(resource_exists::<Assets<Mesh>>),
         );
 }
@@ -113,7 +119,7 @@ fn make_meshes(
 ) {
     for (entity, state, shown, shading, drawn) in &bodies {
         let model = state.model();
-        // By bits: an angle that is NaN is the same NaN in the next frame.
+        // The comparison uses bits, so that a NaN angle equals the same NaN in the next frame.
         let same = |drawn: &DrawnSurface| {
             Arc::ptr_eq(&drawn.model, model) && drawn.crease.to_bits() == shading.crease.to_bits()
         };
@@ -134,7 +140,7 @@ fn make_meshes(
             &mut scratch,
         );
         let mesh = meshes.add(mesh);
-        // Somebody may have despawned it in this very frame.
+        // The entity may have been despawned in this frame.
         commands
             .entity(entity)
             .try_insert((
@@ -155,7 +161,8 @@ fn make_meshes(
     }
 }
 
-/// An entity whose [`ModalBody`] is taken away is not drawn any more; a mesh that somebody has given it since stays.
+/// Removes the drawing of an entity whose [`ModalBody`] was removed. A mesh that was set from
+/// outside stays.
 fn take_down(
     removed: On<Remove, ModalBody>,
     mut commands: Commands,
@@ -227,7 +234,8 @@ fn deform_surfaces(
             continue;
         }
         if !view.get() {
-            // Out of every view: only the bounds follow, so that it is seen when it comes back in.
+            // The body is in no view. Only its bounds are updated, so that the body is found when
+            // it comes back into a view.
             aabb.set_if_neq(drawn.drawing.bounds(shown.q()));
             continue;
         }
@@ -236,7 +244,7 @@ fn deform_surfaces(
                 let error = f64::from(metres * allowed.tolerance.max(0.0)) / state.scale();
                 Detail::needed(&drawn.drawing, shown.q(), full.warped, error)
             }
-            // Seen by nothing but a light, or in a test.
+            // No camera sees the body, only a light, or this is a test.
             None => full,
         };
         if !moved && drawn.detail.covers(detail) {
@@ -289,7 +297,9 @@ fn deform_surfaces(
     }
 }
 
-/// A mesh that was changed (somebody gave it vertex colors) goes to the device again with the shape it was made with: ours goes over it.
+/// Writes the surface again after its mesh was changed from outside, for example by adding vertex
+/// colors. Bevy uploads a changed mesh with the shape of the asset, so the compute pass must
+/// overwrite it.
 fn write_again(mut events: MessageReader<AssetEvent<Mesh>>, mut shapes: Query<&mut GpuShape>) {
     let modified: Vec<AssetId<Mesh>> = events
         .read()

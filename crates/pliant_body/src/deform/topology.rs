@@ -1,31 +1,34 @@
-//! How a surface is cut up for drawing: which vertices are one in the picture, and which share a normal.
+//! The division of a surface for drawing: drawn vertices and the vertices that share a normal.
 
 use std::collections::HashMap;
 
 use pliant_modal::SurfaceMesh;
 
-/// The drawn mesh of a surface. A vertex of the surface is drawn once for every smooth side of it: twice on the edge of a box, once on
-/// a sphere. Its copies have one position, so that there is never a crack.
+/// The drawn mesh of a surface.
+///
+/// Each smooth side of a surface vertex has its own drawn vertex: two on the edge of a box, one on
+/// a sphere. All copies have the same position, so that there are no cracks.
 #[derive(Debug)]
 pub(super) struct Topology {
-    /// For each drawn vertex: the vertex of the surface that it shows.
+    /// For each drawn vertex, the vertex of the surface that it shows.
     pub source: Vec<u32>,
-    /// For each drawn vertex: the normal that it has.
+    /// For each drawn vertex, the index of its normal.
     pub normal: Vec<u32>,
-    /// How many normals there are.
+    /// Number of normals.
     pub normals: usize,
-    /// Drawn triangles.
+    /// Triangles of drawn vertices.
     pub triangles: Vec<[u32; 3]>,
 }
 
 impl Topology {
-    /// How many numbers it is on the device: two a drawn vertex, where each normal's corners begin, nine a triangle.
+    /// Returns the number of words on the GPU: two per drawn vertex, the start of each normal's
+    /// corners, and nine per triangle.
     pub fn words(&self) -> usize {
         2 * self.source.len() + self.normals + 1 + 9 * self.triangles.len()
     }
 
-    /// The corners at each normal: where each normal's begin (one more than there are normals), and for each corner the triangle's three
-    /// vertices of the surface.
+    /// Returns the corners at each normal: the start of each normal's corners (one more entry than
+    /// there are normals), and for each corner the three surface vertices of its triangle.
     pub fn corners(&self) -> (Vec<u32>, Vec<[u32; 3]>) {
         let mut starts = vec![0u32; self.normals + 1];
         for &v in self.triangles.iter().flatten() {
@@ -47,7 +50,8 @@ impl Topology {
         (starts, corners)
     }
 
-    /// Cuts `surface` along the edges where the rest shape bends by more than `crease` (rad). Texture seams stay smooth.
+    /// Divides `surface` along the edges where the rest shape bends by more than `crease` (rad).
+    /// Texture seams stay smooth.
     pub fn new(surface: &SurfaceMesh, crease: f32) -> Self {
         let triangles = surface.triangles();
         let welded = surface.welded();
@@ -55,7 +59,8 @@ impl Topology {
             triangles.iter().map(|t| face_normal(surface.positions(), t)).collect();
         let flattest = crease.cos();
 
-        // A corner is a triangle at one of its vertices. Corners that meet across a smooth edge share a normal.
+        // A corner is a triangle at one of its vertices. Corners that meet across a smooth edge
+        // share a normal.
         let mut sets = DisjointSets::new(triangles.len() * 3);
         let mut edges: HashMap<[u32; 2], (usize, usize, usize)> = HashMap::with_capacity(triangles.len() * 2);
         for (index, triangle) in triangles.iter().enumerate() {
@@ -141,7 +146,7 @@ mod tests {
     fn a_cube_has_three_sides_at_each_corner_and_one_normal_a_face() {
         let topology = Topology::new(&cube(), FRAC_PI_2 * 0.9);
         assert_eq!((topology.source.len(), topology.triangles.len()), (24, 12));
-        // One normal for each face at each of its corners.
+        // Each face has one normal at each of its corners.
         assert_eq!(topology.normals, 24);
         for (drawn, plain) in topology.triangles.iter().zip(cube().triangles()) {
             assert_eq!(&drawn.map(|v| topology.source[v as usize]), plain);

@@ -15,7 +15,7 @@ fn baking_app(cache: Option<BakeCache>) -> App {
     app
 }
 
-/// A bar of 1 m, held at one end, that bakes in about a tenth of a second.
+/// Returns a bar of 1 m, fixed at one end, that bakes in about a tenth of a second.
 fn bar(modes: usize) -> BakeRequest {
     let config = BakeConfig {
         name: "bar".into(),
@@ -31,12 +31,12 @@ fn progress(app: &App, entity: Entity) -> BakeProgress {
     app.world().get::<BakeProgress>(entity).expect("a request has its progress").clone()
 }
 
-/// Runs frames until the bake of `entity` is over, and returns what was seen in each of them.
+/// Runs frames until the bake of `entity` is over, and returns the progress in each frame.
 fn wait(app: &mut App, entity: Entity) -> Vec<BakeProgress> {
     wait_with(app, entity, |_| ())
 }
 
-/// As [`wait`], looking at the app after each frame.
+/// Does the same as [`wait`], and calls `look` with the app after each frame.
 fn wait_with(app: &mut App, entity: Entity, mut look: impl FnMut(&App)) -> Vec<BakeProgress> {
     let (start, mut seen) = (Instant::now(), Vec::new());
     loop {
@@ -61,8 +61,8 @@ fn a_request_becomes_a_body_while_the_frames_go_on() {
     let entity = app.world_mut().spawn((bar(6), settings)).id();
     let before = tick(&app);
     let seen = wait(&mut app, entity);
-    // The ticks went on, one a frame, while it was baked elsewhere: the frame in which the bake
-    // began did not wait for its end.
+    // There was one tick per frame during the bake, so the frame in which the bake began did not
+    // wait for its end.
     assert_eq!(tick(&app) - before, seen.len() as u64);
     assert!(matches!(seen[0], BakeProgress::Running { .. }), "{seen:?}");
     assert!(
@@ -70,7 +70,7 @@ fn a_request_becomes_a_body_while_the_frames_go_on() {
         "{seen:?}"
     );
     app.update();
-    // The same as a bake by hand, and the settings that stood beside the request are kept.
+    // The result equals that of a direct bake, and the settings beside the request are kept.
     let by_hand = pliant_bake::bake(
         &shapes::bar([12, 3, 3], [1.0, 0.2, 0.2]).unwrap(),
         None,
@@ -89,7 +89,8 @@ fn an_unchanged_bake_is_read_and_a_changed_request_is_baked_again() {
     let mut app = baking_app(Some(cache.clone()));
     let [first, second] = [0, 1].map(|_| app.world_mut().spawn(bar(5)).id());
     wait(&mut app, second);
-    // One at a time, in the order in which they came: the second found what the first had made.
+    // Bakes run one at a time, in the order of the requests. The second found the result of the
+    // first.
     assert!(matches!(progress(&app, first), BakeProgress::Done { cached: false, .. }));
     assert!(matches!(progress(&app, second), BakeProgress::Done { cached: true, .. }));
     app.update();

@@ -36,7 +36,8 @@ fn the_mesh_is_the_shown_shape_with_the_normals_of_a_bent_bar() {
     let mut app = drawn_app();
     let body = spawn(&mut app, model::bar(), Driven::Remote);
     see(&mut app, body);
-    // Warped pure-ish bending: compare with the model's own reconstruction, vertex by vertex.
+    // The shape is nearly pure bending with warping. It is compared with the model's own
+    // reconstruction, vertex by vertex.
     let q = [2.0, 0.5, 0.1, 0.2];
     app.world_mut().get_mut::<VisualState>(body).unwrap().snap(&q).unwrap();
     steps(&mut app, 1);
@@ -45,7 +46,8 @@ fn the_mesh_is_the_shown_shape_with_the_normals_of_a_bent_bar() {
     for p in &positions {
         assert!(expected.iter().any(|e| Vec3::from(*e) == *p), "{p} is not on the surface");
     }
-    // A box has twelve sharp edges: each of its 8 corners is drawn three times, each inner vertex of an edge twice.
+    // A box has twelve sharp edges: each of its 8 corners is drawn three times, each inner vertex
+    // of an edge twice.
     let inner: usize = [20, 4, 4].iter().map(|cells| 4 * (cells - 1)).sum();
     assert_eq!(positions.len(), expected.len() + 2 * 8 + inner);
 
@@ -72,7 +74,7 @@ fn the_normals_of_a_gently_bent_bar_turn_with_its_slope() {
     let normals = attribute(&app, body, Mesh::ATTRIBUTE_NORMAL);
     let mut seen = 0;
     for (p, n) in positions.iter().zip(&normals) {
-        // The upper side, away from its ends: y = a x^2 has the slope 2 a x.
+        // On the upper side, away from its ends, y = a x^2 has the slope 2 a x.
         if n.y > 0.9 && (0.1..0.9).contains(&p.x) {
             let slope = 2.0 * amplitude as f32 * p.x;
             let expected = Vec3::new(-slope, 1.0, 0.0).normalize();
@@ -145,7 +147,7 @@ fn a_body_whose_component_is_taken_away_is_not_drawn_any_more() {
     let [body, other] = [(); 2].map(|()| spawn(&mut app, model::bar(), ()));
     steps(&mut app, 2);
     assert!(app.world().get::<Aabb>(body).is_some());
-    // The other was given a mesh of its own meanwhile, which is not the plugin's to take.
+    // The other body received a mesh from outside, which the plugin must not remove.
     let own = app.world_mut().resource_mut::<Assets<Mesh>>().add(Cuboid::default());
     app.world_mut().entity_mut(other).insert(Mesh3d(own.clone()));
     for entity in [body, other] {
@@ -180,7 +182,8 @@ fn a_body_that_is_despawned_in_the_frame_in_which_it_is_first_drawn_is_no_accide
 
 #[test]
 fn a_surface_in_half_precision_is_off_by_its_rounding() {
-    // A tip pulled aside by a fifth of the length, an end twisted, and all at once, which goes farther. Single precision is off by 1e-7.
+    // The shapes are a tip pulled aside by a fifth of the length, a twisted end, and all modes
+    // together, which gives a larger error. Single precision is off by 1e-7.
     let fifth = 0.2 * (model::MASS / 5.0).sqrt();
     let shapes = [
         ([fifth, 0.0, 0.0, 0.0], 5.5e-5),

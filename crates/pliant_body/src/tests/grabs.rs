@@ -15,7 +15,8 @@ fn force(app: &App, grab: Entity) -> GrabForce {
     *app.world().get::<GrabForce>(grab).unwrap()
 }
 
-/// Pull over displacement at the tip, N/m, with a hand of compliance `c`: the modes are springs in series.
+/// Returns the stiffness at the tip, N/m, with a hand of compliance `c`: the modes are springs in
+/// series.
 fn tip_stiffness(axis: usize, c: f64) -> f64 {
     let (mode, phi) =
         [(3, (3.0 / model::MASS).sqrt()), (0, (5.0 / model::MASS).sqrt()), (1, (5.0 / model::MASS).sqrt())]
@@ -42,7 +43,7 @@ fn a_held_tip_pushes_back_with_its_static_stiffness() {
         felt.force.y
     );
     assert!(felt.force.x.abs() < 1e-9 && felt.force.z.abs() < 1e-9);
-    // The patch is where target and pull leave it.
+    // The patch is where the target and the force leave it.
     assert!((felt.point - DVec3::new(1.0, 0.05 + c * felt.force.y, 0.0)).length() < 1e-7, "{}", felt.point);
 }
 
@@ -61,7 +62,8 @@ fn turning_moving_and_scaling_the_entity_turns_moves_and_scales_what_is_felt() {
         .with_rotation(Quat::from_rotation_z(0.7))
         .with_scale(Vec3::splat(2.0));
     let moved = felt(placed);
-    // Transforms are in single precision. Twice the size at the same stiffness: twice the way, twice the force.
+    // Transforms are in single precision. Twice the size at the same stiffness gives twice the
+    // displacement and twice the force.
     let expected = placed.rotation.as_dquat() * plain.force * 2.0;
     assert!(
         (moved.force - expected).length() < 1e-4 * expected.length(),
@@ -193,7 +195,7 @@ fn a_body_swapped_while_held_is_held_on_in_its_new_shape() {
     assert_eq!(state(&app, body).body().grabs().count(), 1);
     assert!(force(&app, hand).force.length() > 0.0);
 
-    // Removing the component while held leaves nothing behind that could be stepped.
+    // Removing the component of a grabbed body leaves nothing that could be stepped.
     app.world_mut().entity_mut(body).remove::<ModalBody>();
     steps(&mut app, 3);
     assert!(app.world().get::<BodyState>(body).is_none());
@@ -262,7 +264,7 @@ fn a_hand_that_lost_its_body_feels_nothing() {
         steps(&mut app, 1);
         assert_eq!(force(&app, hand), GrabForce::default(), "{way}");
     }
-    // On a body that somebody else drives, whose hands' forces are that one's to write.
+    // On a remote body, the source that drives the body writes the forces of the hands.
     for lose in [ways[0].1, ways[2].1] {
         let mut app = app();
         let body = spawn(&mut app, model::bar(), Driven::Remote);

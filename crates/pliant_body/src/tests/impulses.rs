@@ -1,4 +1,4 @@
-//! Impulses and forces sent as messages.
+//! Tests of impulses and forces sent as messages.
 
 use bevy::{
     math::{DQuat, DVec3},
@@ -10,7 +10,8 @@ use crate::{Driven, Impulse, Push};
 
 const VERTEX: u32 = 31;
 
-/// Linear and angular momentum (about the world's origin) of a free body, and where its vertex is; all in the entity's world.
+/// Returns the linear and angular momentum (about the world's origin) of a free body and the
+/// position of its vertex, all in the entity's world.
 fn motion(app: &App, body: Entity) -> (DVec3, DVec3, DVec3) {
     let state = state(app, body);
     let (linear, angular) = state.body().momentum();
@@ -21,7 +22,8 @@ fn motion(app: &App, body: Entity) -> (DVec3, DVec3, DVec3) {
     (DVec3::from(linear) * scale, DVec3::from(angular) * scale * scale, at * scale)
 }
 
-/// A free body placed anyhow, in its first step, and the impulse that it got from what was sent.
+/// Sends messages to a free body with an arbitrary transform after its first step, and checks the
+/// impulse that the body receives.
 fn changes_by(scale: f32, impulse: DVec3, send: impl FnOnce(&mut World, Entity)) {
     let mut app = app();
     let place = Transform::from_xyz(0.4, -1.3, 2.0)
@@ -37,7 +39,7 @@ fn changes_by(scale: f32, impulse: DVec3, send: impl FnOnce(&mut World, Entity))
         let (after, turning, _) = motion(&app, body);
         assert!((after - linear - impulse).length() < 1e-9, "{after}");
         assert!((turning - angular - at.cross(impulse)).length() < 1e-9, "{turning}");
-        // Once, and no more of it afterwards.
+        // The impulse acts once and has no later effect.
         steps(&mut app, 20);
     }
     assert!(state(&app, body).body().v().iter().any(|v| *v != 0.0), "it also bends");
@@ -91,14 +93,15 @@ fn a_resting_body_is_woken_by_a_blow_or_a_push_and_not_by_a_refused_one() {
 
 #[test]
 fn a_strike_gives_a_mode_its_shape_times_the_impulse() {
-    // Bending along y: phi(tip) = sqrt(5/m); an entity of scale 2 has half of the impulse in the body's own world.
+    // For bending along y, phi(tip) = sqrt(5/m). An entity of scale 2 receives half of the impulse
+    // in the body's own world.
     for scale in [1.0, 2.0] {
         let mut app = app();
         let body = spawn(&mut app, model::bar(), Transform::from_scale(Vec3::splat(scale)));
         steps(&mut app, 1);
         app.world_mut().write_message(Impulse { body, vertex: model::tip(), impulse: DVec3::Y });
         steps(&mut app, 1);
-        // q'' + 2 zeta w q' + w^2 q = 0 from q' = J phi: exact over the step.
+        // The solution of q'' + 2 zeta w q' + w^2 q = 0 from q' = J phi is exact over the step.
         let w = std::f64::consts::TAU * model::FREQUENCIES[0];
         let (decay, damped) = (0.2 * w, w * (1.0 - 0.04_f64).sqrt());
         let start = (5.0 / model::MASS).sqrt() / f64::from(scale);
@@ -140,7 +143,7 @@ fn what_cannot_be_struck_is_refused_by_name_and_changes_nothing() {
         }
         assert_eq!(*state(&app, body).body().state(), before);
     }
-    // A force beyond what numbers hold: the step is refused, once, and the next one is good again.
+    // The force overflows: the step is refused once, and the next step is valid again.
     app.world_mut().write_message(Push { body, vertex: VERTEX, force: DVec3::splat(f64::MAX) });
     steps(&mut app, 3);
     assert_eq!(refusals(&mut app).len(), 1);

@@ -1,4 +1,4 @@
-//! A thousand bodies of one model.
+//! Tests of a thousand bodies of one model.
 
 use bevy::{diagnostic::DiagnosticsStore, prelude::*};
 
@@ -16,7 +16,7 @@ fn crowd(app: &mut App, bundle: impl Bundle + Clone) -> Vec<Entity> {
     bodies
 }
 
-/// The newest measurement, and how many there are.
+/// Returns the newest measurement and the number of measurements.
 fn measured(app: &App, path: &bevy::diagnostic::DiagnosticPath) -> (Option<f64>, usize) {
     let found = app.world().resource::<DiagnosticsStore>().get(path).unwrap();
     (found.measurement().map(|newest| newest.value), found.history_len())

@@ -1,4 +1,5 @@
-//! Apps with time by hand and a bar whose modes are written down, so that every number has an outside value.
+//! Test apps with manual time, and a bar whose modes have a closed form, so that every number has
+//! an independent value.
 
 mod baking;
 mod display;
@@ -18,15 +19,15 @@ use pliant_modal::ModalModel;
 
 use crate::{BodyRefused, BodyState, ModalAsset, ModalBody, PliantBodyPlugin, PliantTick};
 
-/// Seconds a step.
+/// Length of a step, s.
 pub const STEP: f64 = 1.0 / 40.0;
 
-/// An app without a renderer whose every update is one step.
+/// Returns an app without a renderer whose every update is one step.
 pub fn app() -> App {
     app_in(FixedUpdate)
 }
 
-/// As [`app`], with bodies that are stepped in `schedule`.
+/// Returns the same app as [`app`], with bodies that are stepped in `schedule`.
 pub fn app_in(schedule: impl ScheduleLabel) -> App {
     let mut app = App::new();
     app.add_plugins((MinimalPlugins, AssetPlugin::default(), TransformPlugin))
@@ -44,7 +45,7 @@ pub fn app_in(schedule: impl ScheduleLabel) -> App {
 #[derive(Resource, Default)]
 struct Told(Vec<(Entity, String)>);
 
-/// Spawns a body with the rest of `bundle`; its first step is the next update's.
+/// Spawns a body together with `bundle`. Its first step is in the next update.
 pub fn spawn(app: &mut App, model: ModalModel, bundle: impl Bundle) -> Entity {
     spawn_with(app, model, |_| {}, bundle)
 }
@@ -69,7 +70,7 @@ pub fn steps(app: &mut App, count: usize) {
     }
 }
 
-/// Whole steps of time a frame, as a fraction: 0.5 is two frames a step.
+/// Sets the length of a frame as a fraction of a step: 0.5 means two frames per step.
 pub fn frames_of(app: &mut App, fraction: f64) {
     let frame = Duration::from_secs_f64(STEP * fraction);
     app.insert_resource(TimeUpdateStrategy::ManualDuration(frame));
@@ -83,7 +84,7 @@ pub fn tick(app: &App) -> u64 {
     app.world().resource::<PliantTick>().0
 }
 
-/// What was refused since the last call, as text.
+/// Returns the refusals since the last call, as text.
 pub fn refusals(app: &mut App) -> Vec<(Entity, String)> {
     std::mem::take(&mut app.world_mut().resource_mut::<Told>().0)
 }

@@ -1,4 +1,5 @@
-//! A bar of 1 x 0.2 x 0.2 m and 40 kg along x, clamped at x = 0, with four assumed modes in closed form.
+//! A bar of 1 x 0.2 x 0.2 m and 40 kg along x, clamped at x = 0, with four assumed modes in closed
+//! form.
 
 use pliant_modal::{BakeInfo, Damping, Element, ModalModel, ModelParts, SurfaceMesh};
 use std::f64::consts::TAU;
@@ -8,10 +9,10 @@ pub const SIDE: f64 = 0.2;
 pub const MASS: f64 = 40.0;
 const CELLS: [usize; 3] = [20, 4, 4];
 
-/// Hz: bending along y, along z, twist, stretch.
+/// Frequencies of bending along y, bending along z, twist and stretch, Hz.
 pub const FREQUENCIES: [f64; 4] = [1.0, 1.2, 5.0, 8.0];
 
-/// The vertex in the middle of the end face: (1, 0, 0).
+/// Returns the vertex in the middle of the end face: (1, 0, 0).
 pub fn tip() -> u32 {
     let model = bar();
     let positions = model.surface().positions();
@@ -22,22 +23,23 @@ pub fn bar() -> ModalModel {
     bar_with(false, 1.0)
 }
 
-/// The same elastic shapes on a body without anchors.
+/// Returns a body with the same elastic shapes and without anchors.
 pub fn free_bar() -> ModalModel {
     bar_with(true, 1.0)
 }
 
-/// The bar with frequencies `factor` times as high.
+/// Returns the bar with frequencies that are `factor` times as high.
 pub fn stiff_bar(factor: f64) -> ModalModel {
     bar_with(false, factor)
 }
 
-/// Displacement and rotation of a mode at a point, for its scale.
+/// Displacement and rotation of a mode at a point, for the mode's scale.
 type Shape = fn([f64; 3], f64) -> ([f64; 3], [f64; 3]);
 
 fn bar_with(free: bool, factor: f64) -> ModalModel {
     let surface = surface();
-    // Mass-normalised: the integral of rho |phi|^2 over the bar is 1, sections staying plane and turning inertia left out.
+    // The modes are mass-normalized: the integral of rho |phi|^2 over the bar is 1, with plane
+    // sections and without rotational inertia.
     let bend = (5.0 / MASS).sqrt();
     let stretch = (3.0 / MASS).sqrt();
     let twist = (18.0 / (MASS * SIDE * SIDE)).sqrt();
@@ -57,7 +59,7 @@ fn bar_with(free: bool, factor: f64) -> ModalModel {
     }
     let omega: Vec<f64> = FREQUENCIES.iter().map(|f| TAU * f * factor).collect();
     let damping = omega.iter().map(|w| Damping::Ratio(0.2).coefficient(*w)).collect();
-    // The integral of rho phi: a third of the tip for bending, a half for stretch.
+    // The integral of rho phi is a third of the tip value for bending and a half for stretch.
     let participation = [
         [0.0, bend * MASS / 3.0, 0.0],
         [0.0, 0.0, bend * MASS / 3.0],
@@ -94,7 +96,7 @@ fn bar_with(free: bool, factor: f64) -> ModalModel {
     .unwrap()
 }
 
-/// The six faces of the bar as a welded grid.
+/// Returns the six faces of the bar as a welded grid.
 fn surface() -> SurfaceMesh {
     let mut positions: Vec<[f32; 3]> = Vec::new();
     let mut index = std::collections::HashMap::new();

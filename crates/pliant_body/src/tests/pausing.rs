@@ -16,7 +16,8 @@ fn a_pause_steps_nothing_shows_nothing_new_and_acts_on_no_hand() {
     let mut app = app();
     let body = spawn_with(&mut app, model::bar(), |body| body.settings.gravity = [0.0, -1.0, 0.0], ());
     let hand = app.world_mut().spawn((Grab::new(model::tip(), 0.05, DVec3::X), GrabOf(body))).id();
-    // Frames that end between two steps: the picture of a pause stands there, too.
+    // The frames end between two steps, so the picture also stands between two steps during a
+    // pause.
     frames_of(&mut app, 0.4);
     steps(&mut app, 12);
     pause(&mut app);

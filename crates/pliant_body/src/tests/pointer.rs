@@ -8,7 +8,7 @@ use bevy::{
 use super::{app, model, spawn_with, state, steps};
 use crate::{Driven, Grab, GrabOf, NoPointerGrab, PointerGrab, PointerGrabPlugin, PointerHeld, VisualState};
 
-/// A camera over the whole window.
+/// Returns a camera over the whole window.
 fn camera(order: isize) -> Camera {
     let size = RenderTargetInfo { physical_size: UVec2::new(800, 600), scale_factor: 1.0 };
     let clip_from_view = Mat4::perspective_infinite_reverse_rh(1.0, 800.0 / 600.0, 0.1);
@@ -16,7 +16,9 @@ fn camera(order: isize) -> Camera {
     Camera { computed, order, ..Default::default() }
 }
 
-/// A camera two metres from the tip of the bar, looking along -z at a window of 800 x 600, and the bar, driven by hand.
+/// Returns an app with a camera and the bar as a remote body.
+///
+/// The camera is two meters from the tip of the bar and looks along -z at a window of 800 x 600.
 fn scene() -> (App, Entity, Entity) {
     let mut app = app();
     app.add_plugins(PointerGrabPlugin).init_resource::<ButtonInput<MouseButton>>();
@@ -32,8 +34,10 @@ fn scene() -> (App, Entity, Entity) {
     (app, window, body)
 }
 
-/// Presses or releases the left button with the pointer at `at` (m from the middle of the view in the plane z = 0.1, in front of which
-/// the camera stands by two metres).
+/// Presses or releases the left button with the pointer at `at`.
+///
+/// `at` is in meters from the middle of the view in the plane z = 0.1, two meters in front of the
+/// camera.
 fn point(app: &mut App, window: Entity, at: Vec2, down: bool) {
     let pixels_a_metre = 300.0 / (2.0 * 0.5f32.tan());
     let cursor = Vec2::new(400.0, 300.0) + Vec2::new(at.x, -at.y) * pixels_a_metre;
@@ -56,7 +60,8 @@ fn held(app: &mut App) -> Option<(Entity, Grab, GrabOf)> {
 #[test]
 fn the_pointer_takes_the_surface_where_it_is_now_and_drags_it_in_the_plane_that_faces_the_camera() {
     let (mut app, window, body) = scene();
-    // Bent up until the tip is half a metre higher: where the rest shape was, there is nothing to take.
+    // The bar is bent up until the tip is half a meter higher, so that nothing is left to grab at
+    // the rest shape.
     let q = 0.5 / (5.0 / model::MASS).sqrt();
     app.world_mut().get_mut::<VisualState>(body).unwrap().snap(&[q, 0.0, 0.0, 0.0]).unwrap();
     point(&mut app, window, Vec2::new(-0.02, 0.0), true);
@@ -70,7 +75,8 @@ fn the_pointer_takes_the_surface_where_it_is_now_and_drags_it_in_the_plane_that_
     let at = state(&app, body).model().surface().positions()[grab.vertex as usize];
     assert!(at[0] > 0.8 && at[2] == 0.1, "the nearest vertex is on the side that faces the camera: {at:?}");
 
-    // The target starts at the patch, not at the pointer, and follows by as much as the pointer goes.
+    // The target starts at the patch, not at the pointer, and moves by the same distance as the
+    // pointer.
     let start = grab.target;
     point(&mut app, window, Vec2::new(0.1, 0.52), true);
     let (_, moved, _) = held(&mut app).unwrap();
@@ -125,7 +131,8 @@ fn a_camera_with_no_body_under_the_pointer_leaves_it_to_the_one_behind() {
     let here = Transform::from_xyz(1.0, 0.0, 2.1);
     let away = here.looking_to(Vec3::Z, Vec3::Y);
     let all = RenderLayers::layer(0);
-    // An interface that looks elsewhere, or at the same place but at other layers; a second camera of the scene; the scene on a layer of its own.
+    // The cases are an interface that looks elsewhere, one that looks at the same place but at
+    // other layers, a second camera of the scene, and the scene on its own layer.
     for (front, layers, of_scene, of_body, through_front) in [
         (away, &all, &all, &all, Some(false)),
         (here, &RenderLayers::layer(5), &all, &all, Some(false)),
@@ -144,7 +151,7 @@ fn a_camera_with_no_body_under_the_pointer_leaves_it_to_the_one_behind() {
         let through = held(&mut app).map(|(grab, ..)| app.world().get::<PointerHeld>(grab).unwrap().camera);
         assert_eq!(through, through_front.map(|through| if through { front } else { back }));
         let Some(start) = held(&mut app).map(|(_, grab, _)| grab.target) else { continue };
-        // It is dragged through the camera that took it.
+        // The drag uses the camera through which the body was grabbed.
         point(&mut app, window, Vec2::new(0.05, 0.0), true);
         let way = held(&mut app).unwrap().1.target - start;
         assert!((way - DVec3::new(0.1, 0.0, 0.0)).length() < 1e-3, "{way}");

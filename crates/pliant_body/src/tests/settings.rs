@@ -1,4 +1,4 @@
-//! Settings that are changed, mended and refused while bodies run.
+//! Tests of settings that are changed, corrected and refused while bodies run.
 
 use std::time::Duration;
 
@@ -13,7 +13,8 @@ fn settings(app: &mut App, body: Entity) -> Mut<'_, ModalBody> {
     app.world_mut().get_mut::<ModalBody>(body).unwrap()
 }
 
-/// Two bodies fall alike; one is given settings that make no body, and the tick's length changes: it goes on as the other one.
+/// Checks that a body with refused settings moves exactly like an equal body, also when the length
+/// of the tick changes. Both bodies fall.
 fn goes_on_with_the_settings_it_had(mut app: App, lengthen: impl Fn(&mut App, Duration)) {
     let falls = |body: &mut ModalBody| body.settings.gravity = [0.0, -1.0, 0.0];
     let good = spawn_with(&mut app, model::bar(), falls, ());
@@ -25,7 +26,7 @@ fn goes_on_with_the_settings_it_had(mut app: App, lengthen: impl Fn(&mut App, Du
     {
         let mut bad = settings(&mut app, bad);
         bad.settings.damping_scale = f64::NAN;
-        // Refused with the rest.
+        // This change is refused together with the invalid one.
         bad.settings.gravity = [0.0; 3];
     }
     for millis in [25, 20, 10, 30, 10] {
@@ -43,7 +44,7 @@ fn goes_on_with_the_settings_it_had(mut app: App, lengthen: impl Fn(&mut App, Du
     assert_ne!(state(&app, good).body().q(), same.q, "it moves");
     assert_eq!(state(&app, bad).body().state(), state(&app, good).body().state());
 
-    // Twice as large, and still with the settings it had: gravity in the body's own world is half.
+    // At twice the size and with the kept settings, gravity in the body's own world is halved.
     app.world_mut().entity_mut(bad).insert(Transform::from_scale(Vec3::splat(2.0)));
     steps(&mut app, 3);
     assert_eq!(refusals(&mut app), []);
@@ -80,7 +81,7 @@ fn a_material_set_on_the_component_relaxes_and_stays_through_other_steps() {
         &mut app,
         model::bar(),
         |body| {
-            // What is expected is said of the straight body.
+            // The expected value belongs to the body without warping.
             body.settings.warp = false;
             body.settings.gravity = [0.0, -1.0, 0.0];
             body.settings.relaxation = Some(material);
@@ -93,7 +94,8 @@ fn a_material_set_on_the_component_relaxes_and_stays_through_other_steps() {
     let config = state(&app, body).body().config();
     assert_eq!((config.step, config.settings.corrections), (STEP / 2.0, 5));
     assert_eq!(config.settings.relaxation, Some(pliant_modal::Relaxation { ratio: 0.5, time: 0.2 }));
-    // Half of the stiffness is left: it hangs twice as low as an elastic one, 5/3 g / omega^2.
+    // Half of the stiffness is left, so the tip hangs twice as low as with an elastic material,
+    // 5/3 g / omega^2.
     let expected = 2.0 * 5.0 / 3.0 / (std::f64::consts::TAU * model::FREQUENCIES[0]).powi(2);
     let tip = (5.0 / model::MASS).sqrt() * state(&app, body).body().q()[0];
     assert!((tip + expected).abs() < 1e-3 * expected, "sank {tip} m, expected -{expected} m");
@@ -114,7 +116,7 @@ fn a_body_made_twice_as_stiff_while_it_hangs_hangs_half_as_low_and_swings_root_t
         &mut app,
         model::bar(),
         |body| {
-            // What is expected is said of the straight body.
+            // The expected value belongs to the body without warping.
             body.settings.warp = false;
             body.settings.gravity = [0.0, -1.0, 0.0];
             body.rest_speed = 0.0;
@@ -123,12 +125,13 @@ fn a_body_made_twice_as_stiff_while_it_hangs_hangs_half_as_low_and_swings_root_t
     );
     let tip = |app: &App| (5.0 / model::MASS).sqrt() * state(app, body).body().q()[0];
     let hangs = |stiffness: f64| {
-        // 5/3 g / omega^2
+        // The tip hangs at 5/3 g / omega^2.
         -5.0 / 3.0 / (stiffness * (std::f64::consts::TAU * model::FREQUENCIES[0]).powi(2))
     };
     steps(&mut app, 2_000);
     assert!((tip(&app) / hangs(1.0) - 1.0).abs() < 1e-3, "{} m", tip(&app));
-    // Undamped from here on: it swings about where it would hang, up from where it hung.
+    // Without damping, the body swings about its new rest position, upward from its old rest
+    // position.
     settings(&mut app, body).settings.stiffness_scale = 2.0;
     settings(&mut app, body).settings.damping_scale = 0.0;
     let (mut crossings, mut before, mut highest) = (Vec::new(), f64::NAN, f64::NEG_INFINITY);
@@ -178,7 +181,7 @@ fn what_was_configured_on_the_body_itself_stays_when_the_step_and_the_scale_chan
 #[test]
 fn a_model_that_was_refused_is_tried_again_when_its_asset_changes() {
     let mut app = app();
-    // Too fast for a material that relaxes: omega h above 1e12.
+    // The frequency is too high for a viscoelastic material: omega h is above 1e12.
     let material = Some(Relaxation { ratio: 0.5, time: 1.0 });
     let body = spawn_with(&mut app, model::stiff_bar(1e13), |body| body.settings.relaxation = material, ());
     steps(&mut app, 3);

@@ -8,12 +8,13 @@ use crate::{
 #[test]
 fn a_body_under_its_own_weight_hangs_by_participation_over_stiffness() {
     let mut app = app();
-    // What is expected is said of the straight body.
+    // The expected value belongs to the body without warping.
     let falls =
         |body: &mut ModalBody| (body.settings.warp, body.settings.gravity) = (false, [0.0, -9.81, 0.0]);
     let body = spawn_with(&mut app, model::bar(), falls, ());
     steps(&mut app, 400);
-    // One mode of bending along y, phi = sqrt(5/m) x^2: q = g Gamma / omega^2, and the tip sinks by phi(1) q = 5/3 g / omega^2.
+    // For one mode of bending along y, phi = sqrt(5/m) x^2 and q = g Gamma / omega^2, so the tip
+    // sinks by phi(1) q = 5/3 g / omega^2.
     let expected = 5.0 / 3.0 * 9.81 / (2.0 * std::f64::consts::PI * model::FREQUENCIES[0]).powi(2);
     let tip = (5.0 / model::MASS).sqrt() * state(&app, body).body().q()[0];
     assert!((tip + expected).abs() < 1e-4 * expected, "sank {tip} m, expected -{expected} m");
@@ -21,7 +22,8 @@ fn a_body_under_its_own_weight_hangs_by_participation_over_stiffness() {
 
 #[test]
 fn the_shape_is_the_same_to_the_bit_whatever_the_order_of_spawning() {
-    // Three bodies of one frame, two of them with one model and held by hands, whose states are told in the same order however they were spawned.
+    // Three bodies are spawned in one frame, each with two hands. Two of them share a model. The
+    // states are returned in the same order for every order of spawning.
     let run = |order: [usize; 3]| {
         let mut app = app();
         let mut models = app.world_mut().resource_mut::<Assets<ModalAsset>>();
@@ -57,7 +59,7 @@ fn a_body_that_is_despawned_in_the_frame_in_which_it_is_made_is_no_accident() {
     let kill = move |mut commands: Commands, bodies: Query<Entity, With<ModalBody>>| {
         bodies.iter().for_each(|body| commands.entity(body).try_despawn());
     };
-    // Carried out at the same point as what the plugin asks for, and before it.
+    // The commands of `kill` are applied at the same point as those of the plugin, and before them.
     app.add_systems(PostUpdate, kill.before_ignore_deferred(crate::step::build_bodies));
     steps(&mut app, 2);
     assert!([refused, made].iter().all(|body| app.world().get_entity(*body).is_err()));
@@ -103,7 +105,7 @@ fn a_still_body_rests_after_half_a_second_and_a_touch_wakes_it() {
     assert!(state(&app, body).is_resting(), "0.5 s are 20 steps");
     let version = app.world().get::<VisualState>(body).unwrap().version();
     steps(&mut app, 50);
-    // No step and nothing for the picture to do.
+    // There was no step, and the picture did not change.
     assert_eq!(app.world().get::<VisualState>(body).unwrap().version(), version);
 
     app.world_mut()
@@ -120,11 +122,11 @@ fn a_still_body_rests_after_half_a_second_and_a_touch_wakes_it() {
 #[test]
 fn a_body_that_creeps_back_does_not_rest_while_it_is_bent() {
     let mut app = app();
-    // It goes back within some 40 s, and always slower than what counts as rest.
+    // The body returns within some 40 s, always slower than its rest speed.
     let relaxation = pliant_modal::Relaxation { ratio: 0.5, time: 20.0 };
     let slow = |body: &mut ModalBody| (body.settings.relaxation, body.rest_speed) = (Some(relaxation), 0.01);
     let body = spawn_with(&mut app, model::bar(), slow, ());
-    // Held aside for long, and let go.
+    // The state is that of a body that was held aside for long and then released.
     let mut entity = app.world_mut().get_mut::<crate::BodyState>(body).unwrap();
     let mut bent = entity.body().state().clone();
     (bent.q[0], bent.z[0]) = (0.05, 0.1);
@@ -218,7 +220,7 @@ fn settings_that_make_no_body_are_refused_by_name_and_may_be_mended() {
     app.world_mut().get_mut::<ModalBody>(body).unwrap().settings.damping_scale = 1.0;
     steps(&mut app, 1);
     assert!(app.world().get::<crate::BodyState>(body).is_some());
-    // A change for the worse leaves the running body as it was.
+    // An invalid change leaves the running body as it was.
     app.world_mut().get_mut::<ModalBody>(body).unwrap().settings.damping_scale = -1.0;
     steps(&mut app, 1);
     assert_eq!(state(&app, body).body().config().settings.damping_scale, 1.0);
@@ -255,7 +257,8 @@ fn a_free_body_falls_by_its_own_transform_and_can_be_put_elsewhere() {
     let body =
         spawn_with(&mut app, model::free_bar(), |body| body.settings.gravity = [0.0, -10.0, 0.0], start);
     steps(&mut app, 40);
-    // One second, and as every update is a whole step, the picture is one step behind: s = g t^2 / 2.
+    // The time is one second minus one step: every update is a whole step, so the picture is one
+    // step behind. s = g t^2 / 2.
     let t = 39.0 * super::STEP;
     let y = app.world().get::<Transform>(body).unwrap().translation.y;
     assert!((f64::from(y) - (10.0 - 5.0 * t * t)).abs() < 1e-4, "{y}");
@@ -280,7 +283,7 @@ fn a_free_body_that_is_put_elsewhere_is_seen_there_and_nowhere_between() {
     for frame in 0..12 {
         app.update();
         let seen = app.world().get::<Transform>(body).unwrap();
-        // It falls on with its velocity: under 0.3 s of 1 m/s^2.
+        // The body continues to fall with its velocity, for less than 0.3 s at 1 m/s^2.
         let off = seen.translation.distance(to.translation);
         assert!(off < 0.1, "frame {frame}: {} instead of {}", seen.translation, to.translation);
         assert!(seen.rotation.angle_between(to.rotation) < 1e-3, "frame {frame}: {}", seen.rotation);
@@ -299,7 +302,8 @@ fn a_modal_file_loads_and_one_that_is_cut_altered_or_of_another_version_says_why
         altered[at] = altered[at].wrapping_add(by);
         altered
     };
-    // What is wrong with a file, and what it is told by. The version is a number at byte 8.
+    // Each case is a defective file and the expected text of its error. The version is a number at
+    // byte 8.
     let wrong = [
         ("cut", bytes[..bytes.len() / 2].to_vec(), "cut or padded .modal file"),
         ("altered", altered(bytes.len() - 9, 1), "altered"),

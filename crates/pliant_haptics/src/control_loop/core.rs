@@ -1,4 +1,5 @@
-//! The loop's body without a clock, a thread or a device: a sample and the simulation's last word in, a wrench out.
+//! The core of the loop without a clock, a thread or a device. It computes a wrench from a sample
+//! and the last local model update.
 
 use nalgebra::Vector3;
 use thiserror::Error;
@@ -12,28 +13,31 @@ use crate::{
     safety::{Slew, clamp_magnitude},
 };
 
-/// A loop that was not run for longer than this has stalled, s.
+/// Length of a period above which the loop counts as stalled, s.
 const STALL: f64 = 0.02;
-/// For so long after a stall the force stays faded, s.
+/// Time after a stall during which the force stays faded, s.
 const AFTER_STALL: f64 = 0.05;
 
-/// How a loop is run.
+/// Settings of a loop.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct LoopConfig {
-    /// Periods a second, 500 to 8000 Hz. Default: 1000.
+    /// Periods per second, 500 to 8000 Hz. Default: 1000.
     pub rate: f64,
-    /// Coupling between hand and body. Default: as stiff as the device closes.
+    /// Coupling between the hand and the body. Default: as stiff as the device renders stably.
     pub coupling: CouplingConfig,
-    /// Delay of the force beyond what the device itself declares, s. Default: 0.
+    /// Delay of the force beyond the delay that the device declares, s. Default: 0.
     pub delay: f64,
-    /// Round trip to the simulation and back, s: from the hand's position to the word that has seen it, beyond the simulation's own step.
-    /// Clamps the coupling, unless `modal`. Default: 0.
+    /// Round trip to the simulation, s: from the hand's position to the local model update that
+    /// contains it, beyond the simulation's own step. The round trip limits the coupling, unless
+    /// `modal` is set. Default: 0.
     pub round_trip: f64,
-    /// The loop will be given a body to step itself ([`ModalLocal`]): it feels the body at once, whatever the round trip. Default: `false`.
+    /// Whether the loop will step a copy of the body itself ([`ModalLocal`]). The body then
+    /// responds to the hand without the delay of the round trip. Default: `false`.
     pub modal: bool,
-    /// Stages of the safety pipeline; `None`: all of them, with limits for the device. Default: `None`.
+    /// Stages of the safety pipeline. With `None` the loop uses all stages, with limits for the
+    /// device. Default: `None`.
     pub safety: Option<SafetyConfig>,
-    /// Where the workspace is in the world. Default: its middle at the origin, metre for metre.
+    /// Pose of the workspace in the world. Default: the center at the origin, at a scale of 1.
     pub tool: ToolMap,
 }
 
@@ -51,62 +55,62 @@ impl Default for LoopConfig {
     }
 }
 
-/// Why a loop does not start.
+/// Reason why a loop does not start.
 #[derive(Debug, Clone, PartialEq, Error)]
 #[non_exhaustive]
 pub enum StartError {
-    /// A rate outside of what is supported.
+    /// The rate is outside of the supported range.
     #[error("the loop's rate must be 500 to 8000 Hz, got {0}")]
     Rate(f64),
-    /// A delay that is not one.
+    /// The delay or the round trip is negative or not finite.
     #[error("the loop's delay must be finite seconds, 0 or more, got {0}")]
     Delay(f64),
-    /// A tool map with a number out of range.
+    /// The tool map has a number that is out of range.
     #[error("the tool's map has a number that is not finite or a scale that is not positive")]
     Tool,
-    /// The device says something impossible about itself.
+    /// The device reports invalid properties.
     #[error(transparent)]
     Device(#[from] InfoError),
-    /// A device that exerts forces on people is not run without the whole safety pipeline.
+    /// A device that exerts real forces lacks a part of the safety pipeline.
     #[error(
         "{0} exerts real forces: every stage of the safety pipeline must be there and within the device's limits"
     )]
     Unsafe(String),
-    /// The thread could not be made.
+    /// The thread could not be created.
     #[error("the loop's thread could not be started: {0}")]
     Thread(String),
 }
 
-/// What a tick saw and did.
+/// Input and output of one tick.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Tick {
-    /// Loop clock, s.
+    /// Time on the loop's clock, s.
     pub now: f64,
-    /// The hand in device axes, m.
+    /// Position of the hand, m, device axes.
     pub position: [f64; 3],
-    /// Its velocity, m/s, device axes.
+    /// Velocity of the hand, m/s, device axes.
     pub velocity: [f64; 3],
-    /// The tool in the world, m.
+    /// Position of the tool, m, world axes.
     pub tool: [f64; 3],
-    /// Its velocity, m/s, world axes.
+    /// Velocity of the tool, m/s, world axes.
     pub tool_velocity: [f64; 3],
-    /// Its orientation, unit quaternion x, y, z, w, world axes.
+    /// Orientation of the tool, unit quaternion x, y, z, w, world axes.
     pub tool_orientation: [f64; 4],
-    /// The tool is lifted off the world by its clutch.
+    /// Whether the clutch detaches the tool from the hand.
     pub clutched: bool,
-    /// Buttons that are believed to be down.
+    /// Buttons that are validated as down, as bits.
     pub buttons: u32,
-    /// What was sent to the device.
+    /// The wrench sent to the device.
     pub wrench: Wrench,
-    /// Force on the hand before safety, N, device axes.
+    /// Force on the hand before the safety pipeline, N, device axes.
     pub wanted: [f64; 3],
-    /// Part of the force that is felt, 0 to 1.
+    /// The gain of the force, 0 to 1.
     pub gain: f64,
-    /// Energy at the port.
+    /// Energies at the port.
     pub port: Port,
-    /// What is wrong now.
+    /// The present fault.
     pub fault: Option<Fault>,
-    /// Time since the simulation's last word, s; 0 while nothing is held.
+    /// Time since the last local model update, s. It is 0 while nothing is held.
     pub silent: f64,
 }
 
@@ -131,7 +135,8 @@ impl Default for Tick {
     }
 }
 
-/// The loop's body. Allocates nothing, knows no clock, and is the same in a thread and in a test.
+/// The core of the loop. It does not allocate, reads no clock, and behaves the same in a thread and
+/// in a test.
 #[derive(Debug)]
 pub struct LoopCore {
     info: DeviceInfo,
@@ -142,7 +147,8 @@ pub struct LoopCore {
     safety: Safety,
     torque: Slew,
     held: HeldPatches,
-    /// Last word of the simulation: its tick, when it came, what others had supplied, whether it was finite.
+    /// The last local model update: its tick, its time of arrival, the energy that others had
+    /// supplied, and whether it was finite.
     heard: u64,
     heard_at: f64,
     supplied: f64,
@@ -155,10 +161,11 @@ pub struct LoopCore {
 }
 
 impl LoopCore {
-    /// For a device and a configuration.
+    /// Creates the core for a device and a configuration.
     ///
     /// # Errors
-    /// A number out of range; a device that is not simulated with a stage of the safety pipeline missing.
+    /// Returns an error if a number is out of range, or if a device that is not simulated lacks a
+    /// stage of the safety pipeline.
     pub fn new(info: DeviceInfo, config: LoopConfig) -> Result<Self, StartError> {
         info.check()?;
         if !(500.0..=8000.0).contains(&config.rate) {
@@ -202,70 +209,72 @@ impl LoopCore {
         })
     }
 
-    /// The device as it was described.
+    /// Returns the description of the device.
     pub fn info(&self) -> &DeviceInfo {
         &self.info
     }
 
-    /// How it is run.
+    /// Returns the settings of the loop.
     pub fn config(&self) -> &LoopConfig {
         &self.config
     }
 
-    /// The coupling in force, and what was wanted.
+    /// Returns the coupling in force and the wanted coupling.
     pub fn coupling(&self) -> &Coupling {
         &self.coupling
     }
 
-    /// What the last tick saw and did.
+    /// Returns the input and output of the last tick.
     pub fn last(&self) -> &Tick {
         &self.last
     }
 
-    /// Moves the workspace in the world. An invalid map is refused and the old one stays.
+    /// Moves the workspace in the world. An invalid map is refused, and the old map stays.
     pub fn set_tool(&mut self, map: ToolMap) -> bool {
         self.tool.set_map(map)
     }
 
-    /// Gives the loop a body to step itself, or takes it away; the one before comes back, to be dropped elsewhere. The force goes over from the
-    /// one's to the other's within 50 ms.
+    /// Sets or removes the body that the loop steps itself, and returns the previous one to be
+    /// dropped elsewhere. The force blends from the old model to the new one within 50 ms.
     pub fn set_modal(&mut self, modal: Option<Box<ModalLocal>>) -> Option<Box<ModalLocal>> {
         self.held.set_modal(modal)
     }
 
-    /// Whether there is a body to step.
+    /// Returns whether the loop has a body to step.
     pub fn has_modal(&self) -> bool {
         self.held.has_modal()
     }
 
-    /// No force from the next tick on, until [`reset_stop`](Self::reset_stop).
+    /// Stops the force from the next tick on, until [`reset_stop`](Self::reset_stop).
     pub fn emergency_stop(&mut self) {
         self.stop = true;
     }
 
-    /// Whether the emergency stop is latched.
+    /// Returns whether the emergency stop is latched.
     pub fn is_stopped(&self) -> bool {
         self.stop || self.safety.is_stopped()
     }
 
-    /// Unlatches the emergency stop; force comes back by the ramp.
+    /// Unlatches the emergency stop. The force then rises by the ramp.
     pub fn reset_stop(&mut self) {
         self.stop = false;
         self.safety.reset_stop();
     }
 
-    /// The device was lost: its buttons are up, and where it is next is not a jump. The force fades as for any fault.
+    /// Handles the loss of the device. Its buttons are released, and its next position does not
+    /// count as a jump. The force fades as for any fault.
     pub fn lose(&mut self) {
         self.validation.forget();
     }
 
-    /// A device is there: the first force comes by the ramp.
+    /// Handles the start or return of a device. The first force rises by the ramp.
     pub fn engage(&mut self) {
         self.validation.forget();
         self.safety.engage();
     }
 
-    /// One period with a sample from its end. `now`: the loop's clock, s; `dt`: length of the period as measured, s.
+    /// Runs one period with the sample from its end. `now` is the time on the loop's clock, s. `dt`
+    /// is the measured length of the period, s.
     pub fn tick(&mut self, now: f64, dt: f64, sample: &Sample, model: &LocalModel) -> Wrench {
         let dt = positive(dt);
         let force = self.safety.force().norm();
@@ -273,7 +282,7 @@ impl LoopCore {
         self.run(now, dt, believed, model)
     }
 
-    /// One period without a sample: what the device said instead.
+    /// Runs one period without a sample, with the `fault` that the device returned instead.
     pub fn miss(&mut self, now: f64, dt: f64, fault: Fault, model: &LocalModel) -> Wrench {
         let believed = self.validation.hold(fault);
         self.run(now, positive(dt), believed, model)
@@ -315,7 +324,7 @@ impl LoopCore {
         ]
         .map(|force| masked(force, axes));
         let allowed = self.safety.tick(&Wanted {
-            // Memory of what came before is not run faster after a stall: a fade takes its ticks.
+            // A stall must not speed up the stages with memory: a fade takes its ticks.
             dt: dt.min(2.0 / self.config.rate),
             moved,
             velocity: hand.velocity,
@@ -360,7 +369,8 @@ impl LoopCore {
         wrench
     }
 
-    /// Takes note of a new word. Returns what others have supplied since the last, J of the world.
+    /// Registers a new local model update. Returns the energy that others have supplied since the
+    /// last one, J of the world.
     fn hear(&mut self, now: f64, model: &LocalModel) -> f64 {
         if model.tick == self.heard {
             return 0.0;
@@ -376,17 +386,21 @@ impl LoopCore {
         if change == Change::First {
             self.safety.engage();
         }
-        // What is told of other grabs, and so perhaps of another body, does not go on from what was told of these.
+        // An update for other grabs, and so perhaps for another body, does not continue the count
+        // of the previous grabs.
         let goes_on = !first_word && change == Change::None;
         let supplied = if goes_on { model.supplied - self.supplied } else { 0.0 };
         self.supplied = model.supplied;
         supplied
     }
 
-    /// The torque of what is held, cut as the force was: `share` of the force that was asked for is felt, and `gain` of a couple, which asks for none.
+    /// Returns the torque of the held patches, reduced as the force was: by `share`, the part of
+    /// the wanted force that was let through, and at most to `gain`. A pure couple wants no force
+    /// and is reduced by `gain` alone.
     ///
-    /// Beyond that it is only clamped and slewed: its work is not counted at the port, and the stiffness that turns a handle is not held to what the
-    /// device closes. So a device that pushes somebody gets none.
+    /// Beyond that, the torque is only clamped and slewed. Its work is not counted at the port, and
+    /// its stiffness is not limited to what the device renders stably. Devices that exert real
+    /// forces therefore get no torque.
     fn torque_to_hand(&mut self, felt: &PatchForces, dt: f64, gain: f64, share: f64) -> Vector3<f64> {
         if !self.info.simulated || gain <= 0.0 {
             self.torque = Slew::default();
@@ -399,7 +413,7 @@ impl LoopCore {
         } else {
             Vector3::zeros()
         };
-        // The whole torque in 5 ms, as for the force.
+        // As for the force, the full torque is reached in 5 ms.
         let torque = self.torque.limit(&torque, peak / 0.005 * dt.min(2.0 / self.config.rate));
         self.torque.hold(&torque);
         torque

@@ -1,16 +1,19 @@
-//! The spring between the hand and the body: how stiff it may be on this device at this rate.
+//! The spring between the hand and the body, and the stiffness that a device allows at a given
+//! rate.
 
 use crate::DeviceInfo;
 
-/// The weakest spring that a grab is made of, N/m: a newton over a thousand kilometres. A grab of the body has no spring of nothing.
+/// Stiffness of the weakest spring of a grab, N/m (1 N over 1000 km). A grab of the body cannot
+/// have a stiffness of 0.
 const WEAKEST: f64 = 1e-6;
 
-/// What is wanted of the coupling, and how much room to leave.
+/// The wanted coupling and its stability margin.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct CouplingConfig {
-    /// Stiffness between the hand and the body, N/m in device space. Default: infinite, as stiff as the device closes.
+    /// Stiffness between the hand and the body, N/m in device space. Default: infinite, which means
+    /// as stiff as the device renders stably.
     pub stiffness: f64,
-    /// Damping of the same, N s/m. Default: 0.5.
+    /// Damping between the hand and the body, N s/m. Default: 0.5.
     pub damping: f64,
     /// Part of the theoretical limit that is used, 0 to 1. Default: 0.7.
     pub headroom: f64,
@@ -22,28 +25,28 @@ impl Default for CouplingConfig {
     }
 }
 
-/// Which of the limits was the tightest.
+/// The tightest limit of the coupling.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 #[non_exhaustive]
 pub enum CouplingLimit {
-    /// None: it is as wanted.
+    /// There is no limit: the coupling is as wanted.
     None,
     /// Damping against the delay of hold and device, `K < (b + B) / (T/2 + d)`.
     Rate,
     /// Damping against the round trip to the simulation.
     RoundTrip,
-    /// What the maker says.
+    /// The limits that the maker of the device states.
     Device,
 }
 
 /// The coupling in force.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Coupling {
-    /// N/m, device space.
+    /// Stiffness, N/m, device space.
     pub stiffness: f64,
-    /// N s/m, device space.
+    /// Damping, N s/m, device space.
     pub damping: f64,
-    /// What was wanted, N/m and N s/m.
+    /// Wanted stiffness and damping, N/m and N s/m.
     pub wanted: [f64; 2],
     /// What limited the stiffness.
     pub stiffness_limit: CouplingLimit,
@@ -52,14 +55,24 @@ pub struct Coupling {
 }
 
 impl Coupling {
-    /// The stiffest coupling not above what is wanted that `device` closes at `rate` (Hz) with `delay` (s) beyond the device's own, to a body that
-    /// answers after `round_trip` (s).
+    /// Returns the stiffest coupling, not above the wanted one, that `device` renders stably at
+    /// `rate` (Hz). `delay` (s) adds to the device's own delay, and the body answers after
+    /// `round_trip` (s).
     ///
-    /// The limit of a sampled spring with delay, `K < (b + B) / (T/2 + d)` (`2 b / T` when `B = d = 0`); that of a virtual damper whose
-    /// velocity is measured, a third of `M / lag` (see [`stable_damping`](crate::stable_damping)); and the
-    /// maker's own numbers. A body far away that follows the hand entirely is a spring to where the hand was: `M x'' + (b + B) x' + K (x - x(t - t_r)) = 0`
-    /// is stable below `K = (b + B)^2 / (2 M cos^2 x)`, `x` the root of `tan x = -2 x M / ((b + B) t_r)` between pi/2 and pi (its characteristic equation on the
-    /// imaginary axis); `(b + B)^2 / M` where that is less, or as a spring with that much delay, whichever is larger. Numbers that are not finite or not in their range count as the default.
+    /// The limits are:
+    ///
+    /// - A sampled spring with delay: `K < (b + B) / (T/2 + d)` (`2 b / T` when `B = d = 0`).
+    /// - A virtual damper on a measured velocity: a third of `M / lag`, see
+    ///   [`stable_damping`](crate::stable_damping).
+    /// - The limits that the maker states.
+    /// - The round trip. A remote body that follows the hand entirely is a spring to a past
+    ///   position of the hand: `M x'' + (b + B) x' + K (x - x(t - t_r)) = 0`. It is stable below
+    ///   `K = (b + B)^2 / (2 M cos^2 x)`, with `x` the root of `tan x = -2 x M / ((b + B) t_r)`
+    ///   between pi/2 and pi (the characteristic equation on the imaginary axis). This limit is at
+    ///   most `(b + B)^2 / M`. If the limit of a sampled spring with that much delay is larger,
+    ///   that limit applies.
+    ///
+    /// Settings that are not finite or out of range count as the default.
     pub fn clamp(
         config: &CouplingConfig,
         device: &DeviceInfo,
@@ -97,17 +110,21 @@ impl Coupling {
         Self { stiffness, damping, wanted: [wanted, wanted_damping], stiffness_limit, damping_limit }
     }
 
-    /// Whether anything had to give.
+    /// Returns whether a limit reduced the stiffness or the damping.
     pub fn is_clamped(&self) -> bool {
         self.stiffness_limit != CouplingLimit::None || self.damping_limit != CouplingLimit::None
     }
 
-    /// How a grab on the body is to be configured so that body and loop hold the same spring; `force_scale` and `motion_scale` are the
-    /// tool's: a spring of `K` in the world feels like `motion_scale^2 force_scale K` in the hand. Infinitely stiff only where the coupling is, or where
-    /// the hand feels nothing of it; a coupling that a device closes with 0 N/m is one of 1e-6.
+    /// Returns the settings of a grab on the body, so that the body and the loop use the same
+    /// spring.
+    ///
+    /// `force_scale` and `motion_scale` are those of the tool: a spring of `K` in the world acts
+    /// like `motion_scale^2 force_scale K` at the hand. The grab is infinitely stiff only if the
+    /// coupling is, or if the scales make the force at the hand zero. A coupling of 0 N/m becomes
+    /// 1e-6 N/m.
     pub fn grab_config(&self, motion_scale: f64, force_scale: f64) -> pliant_modal::GrabConfig {
         let felt = motion_scale * motion_scale * force_scale;
-        // Nothing of nothing is nothing, and not NaN.
+        // A stiffness of zero with a scale of zero must give 0 and not NaN.
         let stiffness = if self.stiffness > 0.0 { self.stiffness / felt } else { 0.0 };
         pliant_modal::GrabConfig {
             stiffness: (!stiffness.is_infinite()).then_some(stiffness.max(WEAKEST)),
@@ -141,12 +158,12 @@ impl std::fmt::Display for Coupling {
     }
 }
 
-/// `tan x = -2 r x` between pi/2 and pi.
+/// Finds the root of `tan x = -2 r x` between pi/2 and pi.
 fn first_root(r: f64) -> f64 {
     let (mut low, mut high) = (std::f64::consts::FRAC_PI_2, std::f64::consts::PI);
     for _ in 0..60 {
         let x = 0.5 * (low + high);
-        // Without the pole at pi/2: sin x + 2 r x cos x falls through zero once.
+        // The form `sin x + 2 r x cos x` has no pole at pi/2 and crosses zero once.
         if x.sin() + 2.0 * r * x * x.cos() > 0.0 { low = x } else { high = x }
     }
     0.5 * (low + high)
@@ -167,14 +184,14 @@ mod tests {
     fn the_limits_are_the_known_ones() {
         let device = VirtualConfig { mass: 0.2, damping: 0.5, ..VirtualConfig::default() }.info();
         let open = CouplingConfig { stiffness: 1e9, damping: 0.0, headroom: 1.0 };
-        // 2 b / T of the reference: m = 0.2 kg, b = 0.5 N s/m, T = 1 ms give 1000 N/m.
+        // Reference value for `2 b / T`: m = 0.2 kg, b = 0.5 N s/m and T = 1 ms give 1000 N/m.
         let c = Coupling::clamp(&open, &device, 1000.0, 0.0, 0.0);
         assert!((c.stiffness - 1000.0).abs() < 1e-9, "{c}");
         assert_eq!(c.stiffness_limit, CouplingLimit::Rate);
-        // (b + B) / (T/2 + d) with B = 0.5, d = 4.5 ms: 1 / 5 ms.
+        // `(b + B) / (T/2 + d)` with B = 0.5 N s/m and d = 4.5 ms is 1 N s/m / 5 ms.
         let c = Coupling::clamp(&CouplingConfig { damping: 0.5, ..open }, &device, 1000.0, 4.5e-3, 0.0);
         assert!((c.stiffness - 200.0).abs() < 1e-9, "{c}");
-        // The maker's word counts where it is the tighter one.
+        // The maker's limit applies where it is the tighter one.
         let touch = VirtualConfig::touch().info();
         let c = Coupling::clamp(
             &CouplingConfig { headroom: 1.0, damping: 1.0, ..open },
@@ -184,7 +201,7 @@ mod tests {
             0.0,
         );
         assert_eq!((c.stiffness, c.stiffness_limit), (400.0, CouplingLimit::Device));
-        // Nothing to clamp.
+        // This coupling needs no clamping.
         let c = Coupling::clamp(
             &CouplingConfig { stiffness: 50.0, damping: 0.1, headroom: 0.7 },
             &touch,
@@ -193,7 +210,7 @@ mod tests {
             0.0,
         );
         assert!(!c.is_clamped(), "{c}");
-        // Nonsense is the default, not a crash.
+        // Invalid settings count as the default and do not panic.
         let c = Coupling::clamp(
             &CouplingConfig { stiffness: f64::NAN, damping: -1.0, headroom: 9.0 },
             &touch,
@@ -206,7 +223,7 @@ mod tests {
 
     #[test]
     fn a_coupling_of_nothing_holds_with_nothing() {
-        // A device without damping of its own, and none wanted: 2 b / T = 0.
+        // The device has no damping of its own, and none is wanted: 2 b / T = 0.
         let device = VirtualConfig { damping: 0.0, ..VirtualConfig::default() }.info();
         let wanted = CouplingConfig { damping: 0.0, ..CouplingConfig::default() };
         let c = Coupling::clamp(&wanted, &device, 1000.0, 0.0, 0.0);
@@ -221,7 +238,8 @@ mod tests {
         assert_eq!(Coupling { stiffness: f64::INFINITY, ..c }.grab_config(1.0, 1.0).stiffness, None);
     }
 
-    /// Whether `M x'' + c x' + K (x - x(t - t_r)) = 0` calms down, by stepping it: an independent check of the limit.
+    /// Returns whether the motion `M x'' + c x' + K (x - x(t - t_r)) = 0` decays. The function
+    /// steps the equation, as an independent check of the limit.
     fn calms(m: f64, c: f64, k: f64, round_trip: f64) -> bool {
         let dt = 5e-4;
         let late = (round_trip / dt).round() as usize;
@@ -247,14 +265,16 @@ mod tests {
     fn a_round_trip_clamps_below_what_is_stable() {
         let free = CouplingConfig { stiffness: 1e9, damping: 0.5, headroom: 1.0 };
         let device = VirtualConfig { mass: 0.2, damping: 0.5, ..VirtualConfig::default() }.info();
-        // M 0.2 kg, b + B 1 N s/m: 1 / 10.5 ms; (b + B)^2 / M = 5 N/m; and half of that as the trip grows for ever.
+        // With M = 0.2 kg and b + B = 1 N s/m the limits are 1 / 10.5 ms, then (b + B)^2 / M = 5
+        // N/m, and half of that for an infinite round trip.
         for (trip, want, near) in [(0.01, 95.24, 0.01), (0.4, 5.0, 1e-9), (2000.0, 2.5, 0.01)] {
             let c = Coupling::clamp(&free, &device, 1000.0, 0.0, trip);
             assert_eq!(c.stiffness_limit, CouplingLimit::RoundTrip, "{c}");
             assert!((c.stiffness - want).abs() < near, "{trip} s: {c}");
         }
         assert!(Coupling::clamp(&free, &device, 1000.0, 0.0, 0.4).to_string().contains("round trip"));
-        // And stepped: what the clamp leaves calms down, for devices from light to heavy and trips from short to very long.
+        // The stepped motion decays under the clamped coupling, for light to heavy devices and
+        // short to very long round trips.
         for (m, b) in [(0.045, 0.3), (0.2, 0.5), (0.2, 1.5)] {
             let device = VirtualConfig { mass: m, damping: b, ..VirtualConfig::default() }.info();
             for trip in [0.05, 0.196, 1.0, 4.0] {
@@ -265,9 +285,11 @@ mod tests {
                 );
             }
         }
-        // The check can fail: c^2 / M = 5 N/m is too much for four seconds, as twice what theory allows for 0.2 s (36 N/m) is.
+        // The check can fail: c^2 / M = 5 N/m is too stiff for 4 s, and so is a value above the
+        // theoretical limit for 0.2 s (36 N/m).
         assert!(!calms(0.2, 1.0, 5.0, 4.0) && !calms(0.2, 1.0, 45.0, 0.2) && calms(0.2, 1.0, 30.0, 0.2));
-        // The paper's first network on the devices that the tables name: what small gain leaves, which the trip is too short to undercut.
+        // This is the first network of the paper, on the devices that the tables name. The round
+        // trip is too short to fall below the small-gain limit.
         for device in [VirtualConfig::touch(), VirtualConfig::premium(), VirtualConfig::omega3()] {
             let c = Coupling::clamp(&free, &device.info(), 1000.0, 0.0, 0.196);
             let calming = device.damping + c.damping;

@@ -1,4 +1,5 @@
-//! One period of the loop with a device: exchange, tick, bookkeeping, loss and return. The thread runs it in real time, tests in virtual.
+//! One period of the loop with a device: exchange, tick, bookkeeping, loss and return. The thread
+//! runs it in real time, and tests run it in virtual time.
 
 use std::time::Instant;
 
@@ -7,92 +8,94 @@ use crate::{
     Sample, Scheduler, StartError, Tick, ToolMap, Wrench,
 };
 
-/// A device whose driver fails for so long counts as lost, s.
+/// Time of continuous driver errors after which a device counts as lost, s.
 const PATIENCE: f64 = 0.1;
-/// How often a lost device is looked for, s.
+/// Interval of the attempts to reopen a lost device, s.
 const RETRY: f64 = 1.0;
 
-/// How the loop and its device are doing.
+/// State of the loop and its device.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 #[non_exhaustive]
 pub enum LoopState {
-    /// Forces flow.
+    /// The loop sends forces.
     #[default]
     Running,
-    /// The device waits for its calibration: no force.
+    /// The device waits for its calibration. There is no force.
     Calibrating,
-    /// The device is lost and looked for: no force.
+    /// The device is lost, and the loop tries to reopen it. There is no force.
     Lost,
-    /// The emergency stop is latched: no force.
+    /// The emergency stop is latched. There is no force.
     Stopped,
-    /// The driver has panicked and the loop is over: no force, until the device is taken into use anew.
+    /// The driver has panicked, and the loop has ended. There is no force until the device is added
+    /// again.
     Ended,
 }
 
-/// What the loop says about itself, once a period.
+/// Report of the loop about itself, once per period.
 #[derive(Debug, Clone, Copy, PartialEq, Default)]
 pub struct LoopReport {
     /// The newest tick.
     pub tick: Tick,
-    /// How the loop and its device are doing.
+    /// State of the loop and its device.
     pub state: LoopState,
-    /// Periods so far.
+    /// Number of periods so far.
     pub ticks: u64,
-    /// Periods left out so far.
+    /// Number of missed periods so far.
     pub missed: u64,
-    /// Periods a second over the last half second, Hz; 0 in the first.
+    /// Periods per second over the last half second, Hz. It is 0 in the first half second.
     pub rate: f64,
-    /// How late periods ended.
+    /// Lateness of the ends of the periods.
     pub lateness: Histogram,
-    /// The loop's own work a period: from the sample to the wrench.
+    /// Work time of the loop per period, from the sample to the wrench.
     pub work: Histogram,
-    /// The thread has a real-time priority.
+    /// Whether the thread has real-time priority.
     pub realtime: bool,
-    /// How often each kind of fault has begun, by [`Fault::kind`].
+    /// Number of times that each kind of fault has begun, indexed by [`Fault::kind`].
     pub faults: [u32; Fault::KINDS],
     /// The coupling in force.
     pub coupling: Option<Coupling>,
 }
 
-/// What happened, in order.
+/// An event of the loop, in order of occurrence.
 #[derive(Debug, Clone, Copy, PartialEq)]
 #[non_exhaustive]
 pub enum LoopEvent {
-    /// A button (its bit's number) went down.
+    /// The button with this bit number went down.
     Pressed(u32),
-    /// A button (its bit's number) came up, or its device was lost.
+    /// The button with this bit number came up, or its device was lost.
     Released(u32),
     /// A fault began.
     Fault(Fault),
-    /// The last fault is over; the force ramps up.
+    /// The last fault is over, and the force ramps up.
     Clear,
-    /// The device was lost and is looked for; after a [`Fault::Panicked`] it is not.
+    /// The device was lost, and the loop tries to reopen it. After a [`Fault::Panicked`] the loop
+    /// does not.
     Lost,
-    /// It came back.
+    /// The device came back.
     Returned,
-    /// Something must be done by hand before positions can be trusted: what.
+    /// The user must do something by hand before positions are valid, as the text says.
     Calibrate(&'static str),
 }
 
-/// One period as it is written down.
+/// The record of one period.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Record {
-    /// Loop clock, s.
+    /// Time on the loop's clock, s.
     pub now: f64,
     /// Length of the period, s.
     pub dt: f64,
-    /// What the device said.
+    /// The sample that the device returned.
     pub sample: Sample,
-    /// What it was told next.
+    /// The wrench that the device gets next.
     pub wrench: Wrench,
 }
 
-/// Who takes events and records; the thread's queues, or a test's lists.
+/// Receiver of events and records: the queues of the thread, or the lists of a test.
 pub trait Sink {
     /// Takes an event. Must not block.
     fn event(&mut self, event: LoopEvent);
 
-    /// Takes a period's record. Must not block.
+    /// Takes the record of a period. Must not block.
     fn record(&mut self, record: &Record);
 }
 
@@ -123,15 +126,15 @@ pub struct Cycle<D> {
     told: Option<&'static str>,
     stopped: bool,
     counted_from: (f64, u64),
-    /// A copy of a body that the loop does not want any more.
+    /// A copy of a body that the loop has discarded.
     trash: Option<Box<ModalLocal>>,
 }
 
 impl<D: HapticDevice> Cycle<D> {
-    /// For a device and a configuration; nothing is exchanged yet.
+    /// Creates a cycle for a device and a configuration. Nothing is exchanged yet.
     ///
     /// # Errors
-    /// As [`LoopCore::new`].
+    /// Returns the errors of [`LoopCore::new`].
     pub fn new(device: D, config: LoopConfig) -> Result<Self, StartError> {
         let core = LoopCore::new(device.info(), config)?;
         let report = LoopReport { coupling: Some(*core.coupling()), ..LoopReport::default() };
@@ -153,22 +156,22 @@ impl<D: HapticDevice> Cycle<D> {
         })
     }
 
-    /// The loop's body.
+    /// Returns the core of the loop.
     pub fn core(&self) -> &LoopCore {
         &self.core
     }
 
-    /// The device.
+    /// Returns the device.
     pub fn device(&self) -> &D {
         &self.device
     }
 
-    /// The device, to play tricks on it in a test.
+    /// Returns mutable access to the device, which serves to manipulate the device in a test.
     pub fn device_mut(&mut self) -> &mut D {
         &mut self.device
     }
 
-    /// What the loop says about itself.
+    /// Returns the report of the loop.
     pub fn report(&self) -> &LoopReport {
         &self.report
     }
@@ -177,7 +180,7 @@ impl<D: HapticDevice> Cycle<D> {
         self.report.realtime = realtime;
     }
 
-    /// Cuts the force, now and until [`reset_stop`](Self::reset_stop).
+    /// Cuts the force at once and until [`reset_stop`](Self::reset_stop).
     pub fn emergency_stop(&mut self) {
         self.core.emergency_stop();
         if !self.stopped {
@@ -193,7 +196,7 @@ impl<D: HapticDevice> Cycle<D> {
         self.core.reset_stop();
     }
 
-    /// Moves the workspace in the world. An invalid map is refused and the old one stays.
+    /// Moves the workspace in the world. An invalid map is refused, and the old map stays.
     pub fn set_tool(&mut self, map: ToolMap) -> bool {
         let ok = self.core.set_tool(map);
         if ok {
@@ -202,23 +205,24 @@ impl<D: HapticDevice> Cycle<D> {
         ok
     }
 
-    /// Gives the loop a body to step itself, or takes it away; the one before comes back.
+    /// Sets or removes the body that the loop steps itself, and returns the previous one.
     pub fn set_modal(&mut self, modal: Option<Box<ModalLocal>>) -> Option<Box<ModalLocal>> {
         self.core.set_modal(modal)
     }
 
-    /// A copy of a body that the loop gave up by itself (another device came back, with another coupling), to be dropped where that may take its
-    /// time. A new one is to be given to it.
+    /// Returns a copy of a body that the loop discarded by itself, because another device with
+    /// another coupling came back. The caller should drop the copy where the drop may take time,
+    /// and give the loop a new copy.
     pub fn take_trash(&mut self) -> Option<Box<ModalLocal>> {
         self.trash.take()
     }
 
-    /// Whether the loop has a body to step itself.
+    /// Returns whether the loop has a body to step.
     pub fn has_modal(&self) -> bool {
         self.core.has_modal()
     }
 
-    /// One period.
+    /// Runs one period.
     pub fn step(
         &mut self,
         scheduler: &mut dyn Scheduler,
@@ -240,7 +244,8 @@ impl<D: HapticDevice> Cycle<D> {
         let answer = self.device.exchange(&wrench, scheduler);
         let begun = Instant::now();
         if scheduler.last().now <= before || scheduler.last().dt < 0.25 / self.config.rate {
-            // A driver that fails does not wait, nor does one that has lost its clock: a thread of this priority must not spin on them.
+            // A failing driver does not wait, nor does a driver that has lost its clock. A thread
+            // of this priority must not spin on either.
             scheduler.wait();
         }
         let answer = match answer {
@@ -302,7 +307,7 @@ impl<D: HapticDevice> Cycle<D> {
         }
     }
 
-    /// Changes of buttons and faults, as events.
+    /// Sends changes of buttons and faults as events.
     fn tell(&mut self, sink: &mut dyn Sink) {
         let tick = *self.core.last();
         let changed = tick.buttons ^ self.report.tick.buttons;
@@ -363,12 +368,14 @@ impl<D: HapticDevice> Cycle<D> {
         }
         let info = self.device.info();
         if info != *self.core.info() {
-            // Another device on the same plug: its own limits, or it stays lost. A stop stays latched.
+            // The returned device is a different one. The loop runs with its limits, or the device
+            // stays lost. An emergency stop stays latched.
             let Ok(mut core) = LoopCore::new(info, self.config) else { return };
             if self.core.is_stopped() {
                 core.emergency_stop();
             }
-            // The copy of the body goes with it, unless its hand's spring is another device's: then the proxy does until somebody gives a new one.
+            // The copy of the body stays, unless the coupling of the new device differs. In that
+            // case the proxy serves until the app sets a new copy.
             let copy = self.core.set_modal(None);
             if core.coupling() == self.core.coupling() {
                 core.set_modal(copy);

@@ -1,7 +1,9 @@
-//! The forces of what the tool holds, before safety: one spring a grab, or the reactions of a body that the loop steps itself.
+//! Forces of the held patches before the safety pipeline: one spring per grab, or the reactions of
+//! a body that the loop steps itself.
 //!
-//! Nothing here is cut. A grab that takes another's place comes by a ramp of its own, and where one local model takes over from another (a new copy of
-//! the body, the proxy after the copy) the force begins where the last one was and leaves it within [`BLEND`] seconds.
+//! No force is limited here. A grab that replaces another one rises by a ramp of its own. Where one
+//! local model replaces another (a new copy of the body, or the proxy after the copy), the force
+//! starts at its last value and blends to the new one within [`BLEND`] seconds.
 
 use nalgebra::{Matrix3, Vector3};
 
@@ -9,32 +11,33 @@ use crate::{
     LocalModel, MAX_CONTACTS, ModalLocal, control_loop::proxy::ProxyExtrapolation, control_loop::tool::Tool,
 };
 
-/// Time in which one local model's force becomes another's, s.
+/// Time in which the force blends from one local model to another, s.
 const BLEND: f64 = 0.05;
 
-/// Forces before safety, world axes.
+/// Forces before the safety pipeline, world axes.
 #[derive(Debug, Clone, Copy, Default)]
 pub(crate) struct PatchForces {
     pub(crate) elastic: Vector3<f64>,
     pub(crate) damping: Vector3<f64>,
     pub(crate) torque: Vector3<f64>,
     pub(crate) stored: f64,
-    /// Springs are coming up, and are stretched by more than is felt of them.
+    /// Whether springs are still ramping up or blending, so that they are stretched further than
+    /// the force on the hand shows.
     pub(crate) growing: bool,
 }
 
-/// What a new word changed about what is held.
+/// The change of the grabs by a local model update.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(crate) enum Change {
-    /// The same grabs as before.
+    /// The grabs are the same as before.
     None,
-    /// Others, or more, or fewer.
+    /// Grabs were added, removed or replaced.
     Other,
-    /// The first after nothing.
+    /// The first grabs after none.
     First,
 }
 
-/// When a tick is: loop clock, length, the loop's own period, s.
+/// Times of a tick, s: the loop's clock, the length of the period, and the loop's nominal period.
 #[derive(Debug, Clone, Copy)]
 pub(crate) struct When {
     pub(crate) now: f64,
@@ -42,7 +45,7 @@ pub(crate) struct When {
     pub(crate) period: f64,
 }
 
-/// One contact and how much of it is felt.
+/// One contact and the share of its force on the hand.
 #[derive(Debug, Clone, Copy)]
 struct Slot {
     key: u64,
@@ -54,10 +57,13 @@ struct Slot {
 pub(crate) struct HeldPatches {
     slots: [Slot; MAX_CONTACTS],
     count: usize,
-    /// Time from nothing of a grab to all of it, s; `None`: at once.
+    /// Time in which a grab's force rises from zero to full, s. With `None` the force is full at
+    /// once.
     ramp: Option<f64>,
     modal: Option<Box<ModalLocal>>,
-    /// The force and torque of the last tick; what the local model before felt more than this one, and how much of that is left, 1 to 0.
+    /// `last` is the force and torque of the last tick. `offset` is the excess of the previous
+    /// local model's force and torque over the present one's. `left` is the part of `offset` that
+    /// remains, from 1 to 0.
     last: [Vector3<f64>; 2],
     offset: [Vector3<f64>; 2],
     left: f64,
@@ -79,7 +85,8 @@ impl HeldPatches {
         }
     }
 
-    /// The one before comes back. What is felt goes over from its force to the new one's.
+    /// Replaces the body that the loop steps, and returns the previous one. The force blends from
+    /// the old model to the new one.
     pub(crate) fn set_modal(&mut self, modal: Option<Box<ModalLocal>>) -> Option<Box<ModalLocal>> {
         self.swapped = self.count > 0;
         std::mem::replace(&mut self.modal, modal)
@@ -89,7 +96,8 @@ impl HeldPatches {
         self.modal.is_some()
     }
 
-    /// Takes note of the grabs of a word. Those that stay keep what they know, whichever place they have now.
+    /// Registers the grabs of a local model update. Grabs that stay keep their state, whichever
+    /// slot they have in the update.
     pub(crate) fn take(&mut self, model: &LocalModel) -> Change {
         let contacts = model.contacts();
         let old = &self.slots[..self.count];
@@ -97,7 +105,7 @@ impl HeldPatches {
             return Change::None;
         }
         let first = self.count == 0;
-        // The first come by the ramp of the whole force.
+        // The first grabs need no ramp of their own, because the whole force ramps up.
         let share = if first || self.ramp.is_none() { 1.0 } else { 0.0 };
         let (before, mut taken) = (self.slots, [false; MAX_CONTACTS]);
         for (i, contact) in contacts.iter().enumerate() {
@@ -118,13 +126,14 @@ impl HeldPatches {
         if first { Change::First } else { Change::Other }
     }
 
-    /// Nothing is felt: what comes next begins at nothing.
+    /// Resets the blend while no force acts, so that the next force starts without an offset.
     pub(crate) fn rest(&mut self) {
         self.last = [Vector3::zeros(); 2];
         (self.left, self.swapped) = (0.0, false);
     }
 
-    /// The forces of this tick. `well`: the hand's place is to be trusted, so the loop's own body may follow it.
+    /// Returns the forces of this tick. `well` says whether the hand's position is valid, so that
+    /// the loop's own body may follow it.
     pub(crate) fn forces(&mut self, when: When, well: bool, tool: &Tool, model: &LocalModel) -> PatchForces {
         let mut felt = PatchForces { stored: model.stored, ..PatchForces::default() };
         let stepped = match &mut self.modal {
@@ -162,7 +171,8 @@ impl HeldPatches {
             felt.torque += arm.cross(&(elastic + damping)) * slot.share;
         }
         if tool.is_clutched() {
-            // A tool that is off the world is not dragged by it; what is held stays where it is held.
+            // The clutch detaches the tool from the hand, so the body must not drag the hand. The
+            // held patches stay where they are.
             (felt.elastic, felt.damping, felt.torque) = Default::default();
             self.rest();
             return felt;
@@ -174,7 +184,7 @@ impl HeldPatches {
     fn blend(&mut self, felt: &mut PatchForces, dt: f64) {
         if std::mem::take(&mut self.swapped) {
             self.offset = [self.last[0] - felt.elastic - felt.damping, self.last[1] - felt.torque];
-            // What was not a number is not to be gone on from.
+            // An offset that is not finite is discarded.
             self.left = if self.offset.iter().flatten().all(|x| x.is_finite()) { 1.0 } else { 0.0 };
         }
         if self.left > 0.0 {

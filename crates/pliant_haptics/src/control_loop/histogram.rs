@@ -1,6 +1,8 @@
-//! Times in fixed buckets: nothing is allocated, and counting one costs a few instructions.
+//! A histogram of durations with fixed buckets. It does not allocate, and adding a value costs a
+//! few instructions.
 
-/// Durations from 0 to about 17 s in nanoseconds, 8 buckets an octave: percentiles are right to 12 %.
+/// Durations from 0 to about 17 s in nanoseconds, with 8 buckets per octave. Percentiles are
+/// accurate to 12 %.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct Histogram {
     counts: [u32; Self::BUCKETS],
@@ -10,13 +12,14 @@ pub struct Histogram {
 
 impl Histogram {
     const PER_OCTAVE: usize = 8;
-    /// Below `2^SHIFT` ns everything is one octave of plain buckets.
+    /// All durations below `2^SHIFT` ns fall in one octave of equal buckets.
     const SHIFT: u32 = 7;
     const BUCKETS: usize = 28 * Self::PER_OCTAVE;
 
-    /// Counts `seconds`; negative ones and NaN count as none, the longest bucket takes what is longer.
+    /// Adds a duration of `seconds`. Negative values and NaN count as 0. Durations above the range
+    /// fall in the last bucket.
     pub fn add(&mut self, seconds: f64) {
-        // A saturating cast: NaN becomes 0.
+        // The saturating cast turns NaN into 0.
         let ns = (seconds * 1e9) as u64;
         let bucket = &mut self.counts[Self::bucket(ns)];
         *bucket = bucket.saturating_add(1);
@@ -35,7 +38,7 @@ impl Histogram {
         index.min(Self::BUCKETS - 1)
     }
 
-    /// Lower end of a bucket, ns.
+    /// Returns the lower end of a bucket, ns.
     fn floor(bucket: usize) -> u64 {
         let (octave, within) = (bucket / Self::PER_OCTAVE, (bucket % Self::PER_OCTAVE) as u64);
         if octave == 0 {
@@ -45,7 +48,8 @@ impl Histogram {
         }
     }
 
-    /// The time that the part `p` (0 to 1) of all counted ones does not exceed, s: the upper end of its bucket, but never above the largest.
+    /// Returns the time that the part `p` (0 to 1) of all values does not exceed, s. The result is
+    /// the upper end of its bucket, but never above the largest value.
     pub fn percentile(&self, p: f64) -> f64 {
         let wanted = (p.clamp(0.0, 1.0) * self.total as f64).ceil() as u64;
         let mut seen = 0u64;
@@ -58,12 +62,12 @@ impl Histogram {
         self.largest as f64 * 1e-9
     }
 
-    /// How many were counted.
+    /// Returns the number of values.
     pub fn count(&self) -> u64 {
         self.total
     }
 
-    /// The longest, s.
+    /// Returns the largest value, s.
     pub fn largest(&self) -> f64 {
         self.largest as f64 * 1e-9
     }
@@ -90,7 +94,7 @@ mod tests {
             assert!(got >= want * 0.999 && got <= want * 1.13, "{p}: {got} for {want}");
         }
         assert!((h.percentile(1.0) - 0.01).abs() < 1e-9);
-        // Every bucket's floor is in it, and they ascend.
+        // The floor of every bucket lies in this bucket, and the floors ascend.
         for b in 1..Histogram::BUCKETS - 1 {
             assert_eq!(Histogram::bucket(Histogram::floor(b)), b);
             assert!(Histogram::floor(b) > Histogram::floor(b - 1));

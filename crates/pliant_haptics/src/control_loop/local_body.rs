@@ -1,44 +1,49 @@
-//! The modal local model: the loop steps the touched body itself, at device rate.
+//! The modal local model: the loop steps a copy of the held body itself, at device rate.
 //!
-//! The proxy model knows one spring to a place that moves at the simulation's rate; what the body does between two words of the
-//! simulation is guessed. Here the loop has a copy of the body with the tool's grabs, steps it with the hand's position at device rate, and
-//! lets the simulation's word correct it: the copy of *then* is compared with the word about *then*, and the difference, swung on, is
-//! taken out of the copy of *now* bit by bit.
+//! The proxy model knows only one spring, to a position that moves at the simulation's rate, and
+//! extrapolates between two local model updates. Here the loop has a copy of the body with the
+//! tool's grabs, and steps the copy with the hand's position at device rate. Each local model
+//! update corrects the copy: the past state of the copy at the time of the update is compared with
+//! the update. The difference evolves as free vibration up to the present, and a part of it is then
+//! removed from the present copy.
 
 use nalgebra::Vector3;
 use pliant_modal::{Body, Coefficients, Frame, Integrator, State, StepError};
 
 use crate::{HeldGrab, LocalModel, MAX_CONTACTS, control_loop::tool::Tool};
 
-/// How far back the copy remembers itself, s.
+/// Time span for which the copy stores its past states, s.
 const MEMORY: f64 = 0.3;
-/// Time in which a difference to the simulation's word is taken out, s.
+/// Time constant in which a difference from the simulation is corrected, s.
 const CORRECTION: f64 = 0.03;
-/// The same at a distance, as its ratio to the age of the word: delay times rate must stay well below 1.
+/// Bound of the correction with delay: the age of the update divided by this ratio is the least
+/// time constant. The product of delay and correction rate must stay well below 1.
 const PATIENCE: f64 = 0.3;
 
-/// A copy of a body for the loop. Made on the simulation's side, where memory may be had; stepped on the loop's.
+/// A copy of a body for the loop. The simulation side creates it, because creation allocates. The
+/// loop steps it.
 #[derive(Debug, Clone)]
 pub struct ModalLocal {
     body: Body,
     held: [Option<HeldGrab>; MAX_CONTACTS],
     scale: f64,
     period: f64,
-    /// Ring of past coordinates, `q` then `v` a slot.
+    /// Ring of past modal coordinates, `q` then `v` in each slot.
     past: Vec<f64>,
     frames: Vec<(f64, Frame)>,
     head: usize,
-    /// The last word of the simulation: its tick, and when it came.
+    /// The last local model update: its tick and its time of arrival.
     heard: u64,
     heard_at: f64,
     scratch: State,
 }
 
 impl ModalLocal {
-    /// A copy of `body` with the tool's grabs on it, for a loop of `rate` Hz. `scale`: world metres per metre of the body.
+    /// Creates a copy of `body` with the tool's grabs on it, for a loop of `rate` Hz. `scale` is in
+    /// world meters per meter of the body.
     ///
     /// # Errors
-    /// A rate that is not positive, a grab that is not on the body.
+    /// Returns an error if the rate is not positive, or if a grab is not on the body.
     pub fn new(body: &Body, held: &[HeldGrab], scale: f64, rate: f64) -> Result<Self, StepError> {
         let period = 1.0 / rate;
         let mut copy = body.clone();
@@ -64,7 +69,8 @@ impl ModalLocal {
         })
     }
 
-    /// Steps the copy with the tool where it is. `false`: it could not be, and the proxy model has to do.
+    /// Steps the copy with the tool at its present pose. Returns `false` if the copy could not be
+    /// stepped. The proxy model must then serve.
     pub(crate) fn advance(&mut self, now: f64, steps: usize, tool: &Tool, model: &LocalModel) -> bool {
         if model.tick != self.heard {
             (self.heard, self.heard_at) = (model.tick, now);
@@ -72,8 +78,9 @@ impl ModalLocal {
                 return false;
             }
         }
-        // Whoever else holds the body goes where the simulation has seen them go, and takes as long: a
-        // target that jumped within one short step would have its damper pull many times too hard.
+        // The remote hands on the body move to their targets over one simulation step. A target
+        // that jumped within one short step of the loop would make its damper pull many times too
+        // hard.
         let left = self.heard_at + model.period - now;
         let passed = steps as f64 * self.period;
         let share = if left > passed { passed / left } else { 1.0 };
@@ -97,20 +104,20 @@ impl ModalLocal {
         true
     }
 
-    /// Reaction of the tool's grab `index`, N, world axes.
+    /// Returns the reaction of the tool's grab `index`, N, world axes.
     pub(crate) fn reaction(&self, index: usize) -> Vector3<f64> {
         let grab = self.held.get(index).copied().flatten();
         let reaction = grab.and_then(|g| self.body.reaction(g.id).ok()).unwrap_or([0.0; 3]);
         Vector3::from(reaction) * self.scale
     }
 
-    /// Where the copy has the patch of the tool's grab `index`, m, world axes.
+    /// Returns the position of the patch of the tool's grab `index` in the copy, m, world axes.
     pub(crate) fn proxy(&self, index: usize) -> Option<Vector3<f64>> {
         let grab = self.held.get(index).copied().flatten()?;
         Some(Vector3::from(self.body.grab_position(grab.id).ok()?) * self.scale)
     }
 
-    /// Energy that the copy could give back, J of the world.
+    /// Returns the energy that the copy could give back, J of the world.
     pub(crate) fn energy(&self) -> f64 {
         self.body.energy() * self.scale * self.scale
     }
@@ -128,14 +135,14 @@ impl ModalLocal {
         self.frames[self.head] = (now, *self.body.frame());
     }
 
-    /// The slot whose time is nearest to one that the copy remembers. A loop that missed periods has
-    /// fewer slots than periods.
+    /// Returns the slot whose time is nearest to `time`, if the ring covers that time. After missed
+    /// periods there are fewer slots than periods.
     fn remembered(&self, time: f64) -> Option<usize> {
         let slots = self.slots();
         let mut newer = None;
         for at in (0..slots).map(|back| (self.head + slots - back) % slots) {
             let off = time - self.frames[at].0;
-            // Not written yet, or not a number.
+            // The slot has not been written yet, or `time` is not finite.
             if !off.is_finite() {
                 return None;
             }
@@ -152,24 +159,27 @@ impl ModalLocal {
         None
     }
 
-    /// Takes the simulation's word about the time of its stamp.
+    /// Corrects the copy by the simulation's state at the time of its stamp.
     fn correct(&mut self, model: &LocalModel) -> bool {
         let modes = self.body.mode_count();
         if model.state.q.len() != modes || model.state.v.len() != modes {
             return false;
         }
-        // The memory of that time; none: the word is about the time before the copy, or the first.
+        // If the ring has no slot for that time, the update is older than the copy, or it is the
+        // first. The copy then takes the whole state.
         let Some(at) = self.remembered(model.stamp) else {
             return self.body.set_state(&model.state).is_ok();
         };
-        // A difference that is taken out faster than it can be seen to go is taken out twice.
+        // The effect of a correction shows only after the delay. A correction that is faster than
+        // the delay is applied twice.
         let age = self.frames[self.head].0 - self.frames[at].0;
         let gain = 1.0 - (-model.period.max(0.0) / CORRECTION.max(age / PATIENCE)).exp();
         self.scratch.q.copy_from_slice(self.body.q());
         self.scratch.v.copy_from_slice(self.body.v());
         self.scratch.a.copy_from_slice(self.body.a());
         self.scratch.f.copy_from_slice(&self.body.state().f);
-        // What has relaxed changes slowly: it is drawn to the word without asking of when the word is.
+        // The viscoelastic state changes slowly, so it is corrected without regard to the age of
+        // the update.
         self.scratch.z.clone_from(&self.body.state().z);
         for (z, told) in self.scratch.z.iter_mut().zip(&model.state.z) {
             *z += gain * (told - *z);
@@ -177,7 +187,7 @@ impl ModalLocal {
         let then = &self.past[at * 2 * modes..][..2 * modes];
         for i in 0..modes {
             let (eq, ev) = (model.state.q[i] - then[i], model.state.v[i] - then[modes + i]);
-            // The difference of then has swung on since, as a mode does that nobody holds.
+            // Since then, the difference has evolved as a mode that nothing holds.
             let (omega, damping) = (self.body.omega()[i], self.body.damping()[i]);
             let [eq, ev, _] = match Coefficients::new(Integrator::Exact, omega, damping, age.max(self.period))
             {
@@ -198,7 +208,7 @@ impl ModalLocal {
         self.body.set_state(&self.scratch).is_ok()
     }
 
-    /// The time of a slot, as a test looks at it.
+    /// Returns the time of a slot, for tests.
     #[cfg(test)]
     fn time_of(&self, slot: usize) -> f64 {
         self.frames[slot].0
@@ -210,7 +220,8 @@ impl ModalLocal {
             std::array::from_fn(|i| now[i] + gain * (told[i] - then[i]))
         };
         let (a, b, c) = (now.orientation(), told.orientation(), then.orientation());
-        // Quaternions of one half of the sphere; for the small differences here the sum is as good as the product.
+        // The sign puts both quaternions in the same hemisphere. For these small differences, the
+        // sum is as accurate as the product.
         let sign = if (0..4).map(|i| b[i] * c[i]).sum::<f64>() < 0.0 { -1.0 } else { 1.0 };
         let orientation = std::array::from_fn(|i| a[i] + gain * (sign * b[i] - c[i]));
         Frame::from_motion(
@@ -254,7 +265,7 @@ mod tests {
     fn a_word_is_about_its_time_whatever_periods_were_missed() {
         let mut copy = ModalLocal::new(&pip([0.0; 3]), &[], 1.0, 1000.0).unwrap();
         let model = LocalModel::default();
-        // Every third time four periods at once.
+        // Every third call takes four periods at once.
         let mut now = 0.0;
         for k in 0..120 {
             let steps = if k % 3 == 0 { 4 } else { 1 };
@@ -263,7 +274,7 @@ mod tests {
         }
         for back in [0.0, 0.013, 0.050, 0.1, 0.2] {
             let slot = copy.remembered(now - back).unwrap();
-            // Between two slots there are up to four periods.
+            // Two slots are up to four periods apart.
             assert!((copy.time_of(slot) - (now - back)).abs() <= 2.001e-3, "{back} s ago");
         }
         assert_eq!(copy.remembered(now + 0.01), None, "the future");

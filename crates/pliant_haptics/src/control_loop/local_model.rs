@@ -1,72 +1,81 @@
-//! What the simulation tells the device loop once a step: enough to close the spring at device rate until the next word.
+//! The local model that the simulation publishes once per step. It holds everything that the device
+//! loop needs to close the spring at device rate until the next local model update.
 
 use nalgebra::{Matrix3, Quaternion, UnitQuaternion, Vector3};
 use pliant_modal::{Body, GrabId, State, StepError};
 
 use crate::Coupling;
 
-/// Most grabs that one tool holds at once.
+/// Maximum number of grabs that one tool holds at once.
 pub const MAX_CONTACTS: usize = 4;
 
-/// One grab as the loop sees it: a spring from a point of the tool to the *proxy*, the place where the held patch is.
+/// One grab as the loop sees it: a spring from a point of the tool to the *proxy*, the position of
+/// the held patch.
 #[derive(Debug, Clone, Copy, PartialEq, Default)]
 pub struct Contact {
-    /// Tells the grab from others, for as long as it lasts: one of another key is another, and comes by a ramp.
+    /// Key of the grab, unique for as long as the grab lasts. A contact with another key is another
+    /// grab, and its force rises by a ramp.
     pub key: u64,
-    /// The held point from the tool point, in tool axes, m of the world.
+    /// Offset of the held point from the tool point, in tool axes, m of the world.
     pub offset: [f64; 3],
-    /// Where the patch was when the model was written, m, world axes.
+    /// Position of the patch when the model was written, m, world axes.
     pub proxy: [f64; 3],
-    /// How fast it moved, m/s, world axes.
+    /// Velocity of the patch, m/s, world axes.
     pub velocity: [f64; 3],
-    /// Stiffness of the spring from proxy to hand, N/m, world axes: residual flexibility of the patch and coupling in series, symmetric.
+    /// Stiffness of the spring from the proxy to the hand, N/m, world axes, symmetric: residual
+    /// flexibility of the patch and coupling in series.
     pub stiffness: [[f64; 3]; 3],
-    /// Damping of the same, N s/m.
+    /// Damping of the spring from the proxy to the hand, N s/m.
     pub damping: f64,
-    /// The body's reaction in the step that this comes from, N, world axes.
+    /// The body's reaction in the step that this contact comes from, N, world axes.
     pub reaction: [f64; 3],
 }
 
-/// The simulation's word. Overwritten in place once a step: neither side allocates.
+/// The local model of one simulation step. It is overwritten in place once per step, so that
+/// neither side allocates.
 #[derive(Debug, Clone, PartialEq, Default)]
 pub struct LocalModel {
-    /// Counts the simulation's steps from 1; 0 has never been written.
+    /// Number of the simulation step, from 1. A model with 0 has never been written.
     pub tick: u64,
-    /// Which hand the simulation had seen: the time, on the loop's clock, of the tick whose tool position was the newest target, s.
+    /// Time on the loop's clock of the tick whose tool position was the newest target of the step,
+    /// s.
     pub stamp: f64,
-    /// Time that a step of the simulation covers, s.
+    /// Simulated time that one step covers, s.
     pub period: f64,
-    /// Real time between two words, as far as the simulation knows it, s; 0 where it does not.
+    /// Real time between two local model updates as far as the simulation knows it, s. It is 0 if
+    /// unknown.
     pub interval: f64,
-    /// The first `count` are in use.
+    /// The contacts. The first `count` are in use.
     pub contacts: [Contact; MAX_CONTACTS],
     /// Number of grabs that the tool holds.
     pub count: usize,
-    /// Energy that the body could give back, J: elastic and kinetic.
+    /// Energy that the body could give back, elastic and kinetic, J.
     pub stored: f64,
-    /// `stored` is the least that it could be: of a body elsewhere only the shape is known.
+    /// Whether `stored` is only a lower bound. Of a body that is stepped elsewhere, only the shape
+    /// is known.
     pub partial: bool,
-    /// Energy that others (other hands, gravity) have put into the body so far, J, net.
+    /// Net energy that others (other hands, gravity) have put into the body so far, J.
     pub supplied: f64,
-    /// Where the other hands on the body are, m, the body's world.
+    /// Targets of the other hands on the body, m, in the body's world.
     pub others: Vec<(GrabId, [f64; 3])>,
-    /// The body's state, for a loop that steps it itself. Empty: there is none.
+    /// The body's state, for a loop that steps the body itself. It is empty if there is no state.
     pub state: State,
 }
 
 impl LocalModel {
-    /// The contacts in use.
+    /// Returns the contacts in use.
     pub fn contacts(&self) -> &[Contact] {
         &self.contacts[..self.count.min(MAX_CONTACTS)]
     }
 
-    /// Room for the state of `body`, so that the first write allocates nothing either.
+    /// Creates a model with room for the state of `body`, so that the first write does not allocate
+    /// either.
     pub fn sized_for(body: &Body) -> Self {
         let others = Vec::with_capacity(Body::MAX_GRABS);
         Self { others, state: body.state().clone(), ..Self::default() }
     }
 
-    /// No number in it is NaN or infinite.
+    /// Returns whether no scalar and no contact in use contains a NaN or an infinity.
     pub fn is_finite(&self) -> bool {
         let scalars = [self.stamp, self.period, self.interval, self.stored, self.supplied];
         scalars.iter().all(|x| x.is_finite())
@@ -78,62 +87,70 @@ impl LocalModel {
     }
 }
 
-/// A grab of the tool: which one, and where on the tool.
+/// A grab of the tool, with its position on the tool.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct HeldGrab {
-    /// Tells this grab from others, on whatever body, for as long as it lasts.
+    /// Key of the grab, unique among the grabs on all bodies for as long as the grab lasts.
     pub key: u64,
     /// The grab on the body.
     pub id: GrabId,
-    /// The held point from the tool point, tool axes, m of the world.
+    /// Offset of the held point from the tool point, tool axes, m of the world.
     pub offset: [f64; 3],
 }
 
-/// A grab on a body that is stepped elsewhere: what was published of it.
+/// The published quantities of a grab on a body that is stepped elsewhere.
 #[derive(Debug, Clone, Copy, PartialEq, Default)]
 pub struct PublishedGrab {
-    /// Tells this grab from others, for as long as it lasts.
+    /// Key of the grab, unique for as long as the grab lasts.
     pub key: u64,
-    /// The held point from the tool point, tool axes, m of the world.
+    /// Offset of the held point from the tool point, tool axes, m of the world.
     pub offset: [f64; 3],
-    /// Where the held patch is, m, world axes.
+    /// Position of the held patch, m, world axes.
     pub point: [f64; 3],
     /// The reaction, N, world axes.
     pub force: [f64; 3],
-    /// Stiffness of the spring from patch to hand, N/m, world axes: what whoever steps the body ties the patch with, the patch's residual flexibility and
-    /// the coupling in series.
+    /// Stiffness of the spring from the patch to the hand, N/m, world axes. The side that steps the
+    /// body uses this spring: the patch's residual flexibility and the coupling in series.
     pub stiffness: [[f64; 3]; 3],
 }
 
-/// Writes [`LocalModel`]s from a body: keeps what it needs of the step before.
+/// Writes [`LocalModel`]s from a body and keeps the values of the previous step that it needs.
 #[derive(Debug, Clone, Default)]
 pub struct ModelWriter {
     tick: u64,
     proxies: [Option<(u64, Vector3<f64>)>; MAX_CONTACTS],
     points: [Option<(u64, Vector3<f64>)>; MAX_CONTACTS],
-    /// Of bodies elsewhere: what they stored when the first word of them was written, J, and the work of the tool's grabs on them since.
+    /// For bodies that are stepped elsewhere: `stored` is the energy that they stored at the first
+    /// update, less the energy supplied before that, J. `worked` is the work of the tool's grabs on
+    /// them since then, J.
     stored: Option<f64>,
     worked: f64,
     targets: Vec<(GrabId, Vector3<f64>)>,
-    /// Potential energy of the body in gravity, J, as of the last word.
+    /// Potential energy of the body in gravity at the last update, J, and the gravity of that
+    /// update.
     potential: Option<(f64, [f64; 3])>,
     supplied: f64,
 }
 
 impl ModelWriter {
-    /// A writer that has seen no step yet.
+    /// Creates a writer that has not seen a step yet.
     pub fn new() -> Self {
         Self::default()
     }
 
-    /// Writes what the loop needs to know of `body` after a step, into `out`.
+    /// Writes the local model of `body` after a step into `out`.
     ///
-    /// `held`: the tool's grabs, the first [`MAX_CONTACTS`] count. `scale`: the body's lengths and forces times this are the world's.
-    /// `stamp`: the [`Tick::now`](crate::Tick::now) of the tool position that the step had for a target. The proxy is where the solver has the patch, so at the target of the step the spring gives exactly the
-    /// reaction: `C lambda = target - proxy`.
+    /// - `held`: the tool's grabs, of which the first [`MAX_CONTACTS`] count.
+    /// - `scale`: factor from the body's lengths and forces to those of the world.
+    /// - `stamp`: the [`Tick::now`](crate::Tick::now) of the tool position that was the target of
+    ///   the step.
+    ///
+    /// The proxy is the position of the patch in the solver. At the target of the step, the spring
+    /// therefore gives exactly the reaction: `C lambda = target - proxy`.
     ///
     /// # Errors
-    /// A grab that is not on the body; `out` then has no contacts, and the loop lets go gently.
+    /// Returns an error if a grab is not on the body. `out` then has only the contacts before this
+    /// grab.
     pub fn write(
         &mut self,
         body: &Body,
@@ -172,7 +189,8 @@ impl ModelWriter {
             let stiffness = turn * compliance.try_inverse().unwrap_or_else(Matrix3::zeros) * turn.transpose();
             let stiffness = 0.5 * (stiffness + stiffness.transpose());
             let reaction = Vector3::from(body.reaction(grab.id)?) * scale;
-            // The damper in world space: the coupling's relaxation time is the same on both sides of the tool's scale.
+            // The damper acts in world space. The relaxation time of the coupling is the same on
+            // both sides of the tool's scale.
             let relaxation = if coupling.stiffness > 0.0 && coupling.stiffness.is_finite() {
                 coupling.damping / coupling.stiffness
             } else {
@@ -194,11 +212,15 @@ impl ModelWriter {
         Ok(())
     }
 
-    /// Writes the same from published forces alone, for a body that somebody else steps.
+    /// Writes the same from published forces alone, for a body that is stepped elsewhere.
     ///
-    /// `relaxation`: of the coupling's damper, s; `stored`: elastic energy of the bodies as they are shown, J of the world; `period`: time between two
-    /// words, s. A stiffness that is not finite is none. What others have put in is the most that the bodies ever stored beyond the work of these
-    /// grabs: that much it was at least.
+    /// - `relaxation`: relaxation time of the coupling's damper, s.
+    /// - `stored`: elastic energy of the bodies in their visual state, J of the world.
+    /// - `period`: time between two local model updates, s.
+    ///
+    /// A stiffness that is not finite counts as zero. The energy supplied by others is estimated as
+    /// a lower bound: the largest energy that the bodies ever stored beyond the work of these
+    /// grabs.
     pub fn write_forces(
         &mut self,
         felt: &[PublishedGrab],
@@ -238,7 +260,8 @@ impl ModelWriter {
         if !self.worked.is_finite() {
             (self.worked, self.stored) = (0.0, None);
         }
-        // The sum from the beginning, not of the gains: what swings between speed and shape is not put in twice.
+        // The balance is taken from the beginning and not as a sum of gains. Energy that alternates
+        // between velocity and shape would otherwise count as supplied more than once.
         let before = *self.stored.get_or_insert_with(|| {
             self.worked = 0.0;
             stored - self.supplied
@@ -249,7 +272,7 @@ impl ModelWriter {
         (out.stored, out.supplied) = (stored, self.supplied);
     }
 
-    /// Work that other hands and gravity did in the last step, J of the body.
+    /// Returns the work of other hands and gravity in the last step, J of the body.
     fn work_of_others(&mut self, body: &Body, held: &[HeldGrab]) -> Result<f64, StepError> {
         let mut work = 0.0;
         for id in body.grabs() {
@@ -266,9 +289,11 @@ impl ModelWriter {
             }
         }
         self.targets.retain(|(known, _)| body.grabs().any(|id| id == *known));
-        // Of an anchored body too: it bends under its own weight as a hand lifts and lowers it.
+        // An anchored body counts too, because it bends under its own weight when a hand lifts and
+        // lowers it.
         let (potential, gravity) = (body.potential_energy(), body.config().settings.gravity);
-        // Gravity that changes is nobody's work here: what it makes of the height is counted from now on.
+        // A change of gravity does no work here. The potential energy counts under the new gravity
+        // from this update on.
         if let Some((before, under)) = self.potential
             && under == gravity
         {

@@ -1,4 +1,5 @@
-//! The loop at device rate: from a sample and the simulation's local model to a wrench.
+//! The loop at device rate. It computes a wrench from a sample and the local model that the
+//! simulation publishes.
 
 pub(crate) mod core;
 pub(crate) mod coupling;

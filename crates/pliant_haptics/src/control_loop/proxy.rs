@@ -1,32 +1,36 @@
-//! The proxy between two words of the simulation: carried on with its velocity, and never seen to jump.
+//! Extrapolation of the proxy between two local model updates: with its velocity and without a
+//! visible jump.
 
 use nalgebra::Vector3;
 
 use crate::{Contact, LocalModel};
 
-/// The longest that a proxy is carried on with its last velocity, and the longest that a correction takes, s.
+/// Longest time that a proxy is extrapolated with its last velocity, and longest time that a
+/// correction takes, s.
 const LONGEST: f64 = 0.05;
 
 #[derive(Debug, Clone, Copy, Default)]
 pub(crate) struct ProxyExtrapolation {
     tick: u64,
-    /// The newest word: where the proxy was, m, and how fast, m/s.
+    /// The last local model update: position of the proxy, m, and its velocity, m/s.
     told: Vector3<f64>,
     speed: Vector3<f64>,
-    /// When it came, on the loop's clock, s.
+    /// Time of arrival of the update on the loop's clock, s.
     since: f64,
-    /// Shown minus told at that time, m.
+    /// Offset of the shown position from the received one at that time, m.
     offset: Vector3<f64>,
-    /// How long it takes from word to word, s: a game steps two or four times for a picture, and its words come in one.
+    /// Time between updates, s. A game may run two or four steps per frame, so that several updates
+    /// arrive as one.
     interval: f64,
 }
 
 impl ProxyExtrapolation {
-    /// Where the proxy is now (m) and how fast (m/s).
+    /// Returns the present position (m) and velocity (m/s) of the proxy.
     ///
-    /// Told: `p + v t`, for as long as it takes from word to word and no longer. Shown: the same plus what it was off when the last word came, taken out over as
-    /// long, of which this period of `dt` seconds is already a part: with a word in every period nothing is left of it, and the proxy is where it was
-    /// told to be.
+    /// The received position is extrapolated as `p + v t` for at most one update interval. The
+    /// shown position adds the offset at the last update, and this offset decays to zero over one
+    /// update interval. This period of `dt` seconds already counts as a part of the decay. With an
+    /// update in every period the offset is zero, and the proxy is at its received position.
     pub(crate) fn advance(
         &mut self,
         now: f64,
@@ -38,7 +42,7 @@ impl ProxyExtrapolation {
             let fresh = self.tick == 0;
             let would = self.shown(now, dt);
             let period = if model.period.is_finite() { model.period.clamp(0.0, LONGEST) } else { 0.0 };
-            // A longer wait counts at once, a shorter one little by little.
+            // A longer interval counts at once, and a shorter one gradually.
             let waited = if fresh { period } else { (now - self.since).clamp(0.0, LONGEST) };
             self.interval = period.max(waited.max(self.interval + 0.1 * (waited - self.interval)));
             (self.told, self.speed) = (contact.proxy.into(), contact.velocity.into());
@@ -46,7 +50,8 @@ impl ProxyExtrapolation {
             (self.tick, self.since) = (model.tick, now);
         }
         let mut velocity = if self.age(now) < self.interval { self.speed } else { Vector3::zeros() };
-        // A correction that is spread over less than two periods is a step, not a motion: no damper is to see it.
+        // A correction that is spread over less than two periods is a step and not a motion. The
+        // damper must not see it.
         if self.left(now, dt) > 0.0 && self.interval > 2.0 * dt {
             velocity -= self.offset / self.interval;
         }
@@ -57,7 +62,7 @@ impl ProxyExtrapolation {
         (now - self.since).max(0.0)
     }
 
-    /// Part of the offset that is still to be taken out at the end of this period.
+    /// Returns the part of the offset that remains at the end of this period.
     fn left(&self, now: f64, dt: f64) -> f64 {
         if self.interval > 0.0 { (1.0 - (self.age(now) + dt) / self.interval).max(0.0) } else { 0.0 }
     }
@@ -79,12 +84,12 @@ mod tests {
         let mut now = 0.0;
         for tick in 1..=8u64 {
             model.tick = tick;
-            // A proxy that jumps by a centimetre each word, told with no velocity.
+            // The proxy jumps by 1 cm with each update and is sent without a velocity.
             model.contacts[0].proxy = [0.01 * tick as f64, 0.0, 0.0];
             for _ in 0..25 {
                 let (p, _) = follow.advance(now, 1e-3, &model, &model.contacts[0].clone());
                 if let Some(last) = last {
-                    // One centimetre over the 25 periods of a word.
+                    // The proxy moves by 1 cm over the 25 periods between two updates.
                     assert!((p.x - last).abs() < 0.01 / 25.0 + 1e-12, "{} after {last}", p.x);
                 }
                 last = Some(p.x);
@@ -99,7 +104,8 @@ mod tests {
     }
     #[test]
     fn a_word_every_period_is_taken_at_its_word() {
-        // A simulation as fast as the loop, or faster: the proxy moves at 0.1 m/s and says so.
+        // The simulation is as fast as the loop, or faster. The proxy moves at 0.1 m/s, and the
+        // updates contain this velocity.
         for period in [1e-3, 0.5e-3] {
             let mut follow = ProxyExtrapolation::default();
             let mut model = LocalModel { period, count: 1, ..LocalModel::default() };
@@ -116,7 +122,8 @@ mod tests {
 
     #[test]
     fn words_that_come_in_bursts_are_carried_on_from_burst_to_burst() {
-        // 120 steps a second, told 30 times a second: a proxy at 0.1 m/s is shown moving evenly, not for 8 ms in every 33.
+        // The simulation runs 120 steps per second and publishes 30 times per second. A proxy at
+        // 0.1 m/s must move evenly, and not for only 8 ms of every 33 ms.
         let mut follow = ProxyExtrapolation::default();
         let mut model = LocalModel { period: 1.0 / 120.0, count: 1, ..LocalModel::default() };
         let (mut last, mut worst) = (0.0, 0.0f64);
@@ -132,7 +139,8 @@ mod tests {
             }
             last = p.x;
         }
-        // Words fall on whole milliseconds, 33 or 34 apart: a quarter of a period's motion at most is out of step.
+        // Updates fall on whole milliseconds, 33 or 34 ms apart. The motion is off by at most a
+        // quarter of a period's motion.
         assert!(worst < 2.5e-5, "{worst} m");
     }
 }

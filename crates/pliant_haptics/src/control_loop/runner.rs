@@ -18,11 +18,12 @@ use crate::{
     control_loop::cycle::Sink,
 };
 
-/// Events that wait to be read at most; more are dropped and counted.
+/// Maximum number of events that wait to be read. Further events are dropped, but the fault
+/// counters of the report still count.
 const EVENTS: usize = 256;
-/// Records that wait to be read at most: a second at 8 kHz.
+/// Maximum number of records that wait to be read: one second at 8 kHz.
 const RECORDS: usize = 8192;
-/// Commands that wait to be taken at most.
+/// Maximum number of commands that wait to be processed.
 const COMMANDS: usize = 64;
 
 enum Command {
@@ -37,23 +38,27 @@ enum Command {
 pub struct StopSwitch(Arc<AtomicBool>);
 
 impl StopSwitch {
-    /// No force from the loop's next period on. Latched until [`HapticLoop::reset_stop`].
+    /// Cuts the force from the loop's next period on. The stop is latched until
+    /// [`HapticLoop::reset_stop`].
     pub fn press(&self) {
         self.0.store(true, Ordering::Release);
     }
 
-    /// Whether it is pressed.
+    /// Returns whether the stop is pressed.
     pub fn is_pressed(&self) -> bool {
         self.0.load(Ordering::Acquire)
     }
 }
 
-/// A device and its loop, running. Dropping it stops both.
+/// A running device and its loop. Dropping the value stops both.
 ///
-/// The app writes the simulation's word with [`publish`](Self::publish) and reads [`report`](Self::report); neither ever waits for the other side,
-/// and the loop neither locks, nor allocates, nor drops shared memory (a body that it steps itself is handed back to be dropped here). What a
-/// driver does within `exchange` is the driver's; one that panics ends its loop and nothing else: the report says [`LoopState::Ended`] and
-/// [`Fault::Panicked`] from then on, without a force, and events tell it once.
+/// The app writes the local model with [`publish`](Self::publish) and reads the
+/// [`report`](Self::report). Neither side ever waits for the other. The loop does not lock,
+/// allocate or drop shared memory: a body that it stepped goes back to the app to be dropped.
+///
+/// The driver is responsible for what it does within `exchange`. A driver that panics ends only its
+/// own loop. From then on, the report contains [`LoopState::Ended`] and [`Fault::Panicked`] without
+/// a force, and the events are sent once.
 pub struct HapticLoop {
     model: triple_buffer::Input<LocalModel>,
     report: triple_buffer::Output<LoopReport>,
@@ -64,7 +69,8 @@ pub struct HapticLoop {
     stop: StopSwitch,
     quit: Arc<AtomicBool>,
     thread: Option<JoinHandle<()>>,
-    /// The thread has ended without having been asked to, and what there was to be said about it is in `last_words`.
+    /// `dead` is set if the thread has ended by itself. `last_words` then holds the events about
+    /// its end.
     dead: bool,
     last_words: VecDeque<LoopEvent>,
     clock: LoopClock,
@@ -74,10 +80,12 @@ pub struct HapticLoop {
 }
 
 impl HapticLoop {
-    /// Starts the loop of `device` on a thread of its own, with FIFO priority where the system allows it and a warning where not.
+    /// Starts the loop of `device` on its own thread, with FIFO priority where the system allows it
+    /// and with a warning where the system does not.
     ///
     /// # Errors
-    /// A number out of range, a real device without its whole safety pipeline, no thread to be had.
+    /// Returns an error if a number is out of range, if a real device lacks a part of the safety
+    /// pipeline, or if no thread could be created.
     pub fn start(device: impl HapticDevice + 'static, config: LoopConfig) -> Result<Self, StartError> {
         let cycle = Cycle::new(device, config)?;
         let info = cycle.core().info().clone();
@@ -127,41 +135,44 @@ impl HapticLoop {
         })
     }
 
-    /// The device as it described itself when the loop started.
+    /// Returns the device's description of itself at the start of the loop.
     pub fn info(&self) -> &DeviceInfo {
         &self.info
     }
 
-    /// The coupling in force when the loop started, and what was wanted.
+    /// Returns the coupling that was in force when the loop started, and the wanted coupling.
     pub fn coupling(&self) -> &Coupling {
         &self.coupling
     }
 
-    /// Periods a second that it was started with, Hz.
+    /// Returns the rate that the loop was started with, Hz.
     pub fn rate(&self) -> f64 {
         self.rate
     }
 
-    /// The loop's clock, s: what [`LocalModel::stamp`] is given in.
+    /// Returns the time on the loop's clock, s. [`LocalModel::stamp`] is in this time.
     pub fn now(&self) -> f64 {
         self.clock.now()
     }
 
-    /// Gives the simulation's word: `write` fills the model in place (it has the content of some earlier one), then it goes to the loop.
+    /// Publishes a local model update. `write` fills the model in place, which still has the
+    /// content of some earlier update. The model then goes to the loop.
     pub fn publish<R>(&mut self, write: impl FnOnce(&mut LocalModel) -> R) -> R {
         let result = write(self.model.input_buffer_mut());
         self.model.publish();
         result
     }
 
-    /// What the loop says about itself: the newest there is.
+    /// Returns the newest report of the loop.
     pub fn report(&mut self) -> &LoopReport {
         while self.trash.pop().is_ok() {}
         self.look_after();
         if self.dead { self.report.output_buffer() } else { self.report.read() }
     }
 
-    /// Notices that the thread has ended by itself: the driver has panicked. Its last report says that all is well, and nobody is left to write another.
+    /// Detects that the thread has ended because the driver panicked. The thread can no longer
+    /// write a report, and its last report shows no fault. This method therefore writes the final
+    /// one.
     fn look_after(&mut self) {
         let ended = self.thread.as_ref().is_some_and(JoinHandle::is_finished);
         if self.dead || !ended || self.quit.load(Ordering::Acquire) {
@@ -187,44 +198,49 @@ impl HapticLoop {
         tick.fault = Some(Fault::Panicked);
     }
 
-    /// What has happened since the last call, oldest first.
+    /// Returns the events since the last call, oldest first.
     pub fn events(&mut self) -> impl Iterator<Item = LoopEvent> + '_ {
         self.look_after();
         std::iter::from_fn(|| self.events.pop().ok().or_else(|| self.last_words.pop_front()))
     }
 
-    /// Moves the workspace in the world. `false`: the map is invalid or the loop has not taken earlier commands yet; ask again.
+    /// Moves the workspace in the world. Returns `false` if the map is invalid, or if the queue is
+    /// full because the loop has not processed earlier commands yet. In the latter case the caller
+    /// should retry.
     pub fn set_tool(&mut self, map: ToolMap) -> bool {
         map.is_valid() && self.commands.push(Command::Tool(map)).is_ok()
     }
 
-    /// Gives the loop a body to step itself, or takes it away. `false`: the loop has not taken earlier commands yet; ask again.
+    /// Sets or removes the body that the loop steps itself. Returns `false` if the queue is full
+    /// because the loop has not processed earlier commands yet. The caller should then retry.
     pub fn set_modal(&mut self, modal: Option<Box<ModalLocal>>) -> bool {
         self.commands.push(Command::Modal(modal)).is_ok()
     }
 
-    /// Cuts the force, at the loop's next period. Latched.
+    /// Cuts the force at the loop's next period. The stop is latched.
     pub fn emergency_stop(&self) {
         self.stop.press();
     }
 
-    /// The switch, for other threads.
+    /// Returns the emergency stop switch, for other threads.
     pub fn stop_switch(&self) -> StopSwitch {
         self.stop.clone()
     }
 
-    /// Unlatches the emergency stop; force comes back by the ramp. `false`: ask again.
+    /// Unlatches the emergency stop. The force then rises by the ramp. If the result is `false`,
+    /// the caller should retry.
     pub fn reset_stop(&mut self) -> bool {
         self.stop.0.store(false, Ordering::Release);
         self.commands.push(Command::ResetStop).is_ok()
     }
 
-    /// Begins or ends the writing down of every period; see [`records`](Self::records).
+    /// Starts or stops the recording of every period, see [`records`](Self::records).
     pub fn set_recording(&mut self, on: bool) -> bool {
         self.commands.push(Command::Record(on)).is_ok()
     }
 
-    /// What has been written down since the last call, oldest first. Not read for a second or so, the newest are lost.
+    /// Returns the records since the last call, oldest first. If they are not read for a second or
+    /// so, the newest records are lost.
     pub fn records(&mut self) -> impl Iterator<Item = Record> + '_ {
         std::iter::from_fn(|| self.records.pop().ok())
     }
@@ -260,7 +276,7 @@ struct Queues {
 
 impl Sink for Queues {
     fn event(&mut self, event: LoopEvent) {
-        // Full: nobody reads them. The counters in the report still count.
+        // A full queue means that nobody reads it. The fault counters of the report still count.
         let _ = self.events.push(event);
     }
 
@@ -283,10 +299,11 @@ struct Inner<D> {
 }
 
 impl<D: HapticDevice> Inner<D> {
-    /// Until it is told to quit or the driver panics; in either case the last thing is that the force is taken off.
+    /// Runs until the app asks the thread to quit or the driver panics. In both cases the force is
+    /// cut at the end.
     fn run(mut self, clock: LoopClock, rate: f64) {
-        // What a panic leaves behind is only stopped and dropped, each on its own: a driver that panics at that too must not take the process with it,
-        // as a panic within a panic would.
+        // After a panic the device is only stopped and dropped, each in its own call. A driver that
+        // panics again there must not abort the process, as a panic within a panic would.
         let _ = catch_unwind(AssertUnwindSafe(|| self.go_round(clock, rate)));
         let _ = catch_unwind(AssertUnwindSafe(|| self.cycle.device_mut().safe_stop()));
     }
@@ -295,7 +312,7 @@ impl<D: HapticDevice> Inner<D> {
         self.cycle.set_realtime(raise_priority());
         let mut scheduler = RealScheduler::new(clock, rate);
         while !self.quit.load(Ordering::Acquire) {
-            // A switch that is pressed wins over a reset that is still in the queue.
+            // A pressed switch takes precedence over a reset that is still in the queue.
             while !self.trash.is_full()
                 && let Ok(command) = self.commands.pop()
             {
@@ -321,7 +338,7 @@ impl<D: HapticDevice> Inner<D> {
             }
             Command::Modal(modal) => {
                 if let Some(old) = self.cycle.set_modal(modal) {
-                    // There is room: it was looked at before the command was taken.
+                    // The queue has room: the caller checked it before it took the command.
                     let _ = self.trash.push(old);
                 }
             }
@@ -331,7 +348,8 @@ impl<D: HapticDevice> Inner<D> {
     }
 }
 
-/// FIFO priority for this thread, above everything ordinary; `false`, with a warning that says what to do, where it is not allowed.
+/// Raises this thread to FIFO priority, above all ordinary threads. Returns `false`, with a warning
+/// that says what to do, if this is not allowed.
 fn raise_priority() -> bool {
     #[cfg(unix)]
     let result = {
@@ -340,7 +358,7 @@ fn raise_priority() -> bool {
             set_thread_priority_and_policy, thread_native_id,
         };
         let policy = ThreadSchedulePolicy::Realtime(RealtimeThreadSchedulePolicy::Fifo);
-        // Half way up: above the desktop, below the kernel's own threads.
+        // The middle of the range is above the desktop and below the kernel's own threads.
         match thread_priority::ThreadPriorityValue::try_from(50u8) {
             Ok(value) => set_thread_priority_and_policy(
                 thread_native_id(),

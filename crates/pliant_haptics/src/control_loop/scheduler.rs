@@ -1,27 +1,30 @@
-//! Time: a clock that threads share, scheduler to absolute times, and the virtual kind for tests.
+//! Timing: a clock that threads share, a scheduler to absolute times, and a virtual scheduler for
+//! tests.
 
 use crate::{Period, Scheduler};
 
-/// Seconds since it was made, monotonic; copies agree.
+/// Monotonic clock in seconds since its creation. All copies agree.
 #[derive(Debug, Clone, Copy)]
 pub struct LoopClock {
     origin: imp::Stamp,
 }
 
 impl LoopClock {
-    /// A clock that starts now.
+    /// Creates a clock that starts at 0.
     pub fn start() -> Self {
         Self { origin: imp::now() }
     }
 
-    /// Seconds since the start.
+    /// Returns the seconds since the start.
     pub fn now(&self) -> f64 {
         imp::since(self.origin)
     }
 }
 
-/// Pacing by the machine's clock: sleeps to absolute times, so that lateness does not add up, and leaves out whole periods when it is late by
-/// more than one.
+/// Scheduler on the machine's clock.
+///
+/// The scheduler sleeps to absolute times, so that lateness does not accumulate. It skips whole
+/// periods if it is late by more than one period.
 #[derive(Debug)]
 pub struct RealScheduler {
     clock: LoopClock,
@@ -31,7 +34,7 @@ pub struct RealScheduler {
 }
 
 impl RealScheduler {
-    /// Periods of `1 / rate` seconds on `clock`, the first from now.
+    /// Creates periods of `1 / rate` seconds on `clock`, starting at the present time.
     pub fn new(clock: LoopClock, rate: f64) -> Self {
         let now = clock.now();
         Self { clock, period: 1.0 / rate, next: now, last: Period { now, ..Period::default() } }
@@ -70,7 +73,7 @@ impl Scheduler for RealScheduler {
     }
 }
 
-/// Pacing in virtual time: every period takes exactly what it should, or what a test says.
+/// Scheduler in virtual time. Every period has its exact length, or the length that a test sets.
 #[derive(Debug, Clone)]
 pub struct VirtualScheduler {
     period: f64,
@@ -79,17 +82,17 @@ pub struct VirtualScheduler {
 }
 
 impl VirtualScheduler {
-    /// Periods of `1 / rate` seconds.
+    /// Creates periods of `1 / rate` seconds.
     pub fn new(rate: f64) -> Self {
         Self { period: 1.0 / rate, gap: 0.0, last: Period::default() }
     }
 
-    /// Makes the next period longer by `seconds`: a debugger's breakpoint.
+    /// Makes the next period longer by `seconds`, like a debugger's breakpoint.
     pub fn stall(&mut self, seconds: f64) {
         self.gap += seconds;
     }
 
-    /// Seconds since the start.
+    /// Returns the seconds since the start.
     pub fn now(&self) -> f64 {
         self.last.now
     }
@@ -141,7 +144,7 @@ mod imp {
             at.tv_nsec -= 1_000_000_000;
             at.tv_sec += 1;
         }
-        // A signal ends the sleep early; an absolute time is simply slept to again.
+        // A signal ends the sleep early. With an absolute time, the call can simply be repeated.
         while clock_nanosleep_absolute(ClockId::Monotonic, &at) == Err(Errno::INTR) {}
     }
 }
@@ -152,7 +155,8 @@ mod imp {
 
     pub(super) type Stamp = Instant;
 
-    /// Sleeps are late by up to a timer's tick here: the rest is waited out awake.
+    /// Time to spin before the end of a sleep. Sleeps on these systems are late by up to a timer
+    /// tick.
     const AWAKE: Duration = Duration::from_micros(300);
 
     pub(super) fn now() -> Stamp {
@@ -189,7 +193,8 @@ mod tests {
         for _ in 0..50 {
             periods += 1 + scheduler.wait().missed;
         }
-        // However late a single wake-up was, the fiftieth is not early, and all of the time is accounted for.
+        // The fiftieth period is never early, however late a single wake-up was, and all of the
+        // time is accounted for.
         let gone = scheduler.last().now - start;
         assert!(gone >= 0.05 - 1e-9, "{gone}");
         assert!(

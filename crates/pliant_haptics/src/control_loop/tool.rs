@@ -1,26 +1,27 @@
-//! The tool: what the device's handle is in the world.
+//! The tool: the representation of the device's handle in the world.
 
 use nalgebra::{Quaternion, UnitQuaternion, Vector3};
 
-/// How the device's workspace lies in the world.
+/// Mapping of the device's workspace to the world.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct ToolMap {
-    /// Where the middle of the workspace is, m, world axes.
+    /// Position of the workspace's center, m, world axes.
     pub origin: [f64; 3],
     /// Rotation from device to world axes, unit quaternion x, y, z, w.
     pub rotation: [f64; 4],
-    /// World metres per metre of the hand, above 0.
+    /// World meters per meter of the hand, above 0.
     pub motion_scale: f64,
-    /// Newtons at the hand per newton in the world, beyond what the motion's scale asks for, 0 or more. At 1 the hand does the work that
-    /// is done in the world.
+    /// Additional scale of the force at the hand, beyond the motion scale, 0 or more. At 1 the hand
+    /// does the same work as the tool does in the world.
     pub force_scale: f64,
-    /// Which axes of the force the hand gets, device axes.
+    /// Force axes that the hand gets, device axes.
     pub force_axes: [bool; 3],
-    /// Which axes of the torque the hand gets, device axes.
+    /// Torque axes that the hand gets, device axes.
     pub torque_axes: [bool; 3],
-    /// Mass of the tool as felt at the hand, kg: its weight pulls down (-y of the device). Default: 0.
+    /// Mass of the tool at the hand, kg. Its weight pulls down (-y of the device). Default: 0.
     pub mass: f64,
-    /// Buttons (as bits) that lift the tool off the world while held: the hand moves, the tool stays. Default: 0, none.
+    /// Buttons (as bits) that detach the tool from the hand while they are down. The hand moves and
+    /// the tool stays. Default: 0, none.
     pub clutch: u32,
 }
 
@@ -40,7 +41,7 @@ impl Default for ToolMap {
 }
 
 impl ToolMap {
-    /// Whether every number can be worked with.
+    /// Returns whether all numbers are finite and in range.
     pub fn is_valid(&self) -> bool {
         let finite = self.origin.iter().chain(&self.rotation).all(|x| x.is_finite());
         let length: f64 = self.rotation.iter().map(|x| x * x).sum();
@@ -58,13 +59,13 @@ impl ToolMap {
 /// Standard gravity, m/s^2.
 const GRAVITY: f64 = 9.806_65;
 
-/// The tool in motion: the map, where the clutch has carried the origin, and the pose that comes of it.
+/// The moving tool: the map, the origin as shifted by the clutch, and the resulting pose.
 #[derive(Debug, Clone, Copy)]
 pub(crate) struct Tool {
     map: ToolMap,
     rotation: UnitQuaternion<f64>,
     origin: Vector3<f64>,
-    /// Orientation that the clutch has left between hand and tool.
+    /// Orientation offset between the hand and the tool that the clutch has left.
     grip: UnitQuaternion<f64>,
     pub(crate) position: Vector3<f64>,
     pub(crate) velocity: Vector3<f64>,
@@ -88,7 +89,7 @@ impl Tool {
         tool
     }
 
-    /// An invalid map is refused; the old one stays.
+    /// Sets the map. An invalid map is refused, and the old map stays.
     pub(crate) fn set_map(&mut self, map: ToolMap) -> bool {
         if !map.is_valid() {
             return false;
@@ -100,7 +101,8 @@ impl Tool {
         true
     }
 
-    /// Takes the hand's pose. `hold`: the tool stays where it is whatever the hand does (a clutch, a jump of the measurement).
+    /// Updates the tool from the hand's pose. With `hold` the tool stays where it is whatever the
+    /// hand does (a jump of the measurement).
     pub(crate) fn follow(
         &mut self,
         position: Vector3<f64>,
@@ -127,14 +129,15 @@ impl Tool {
         self.clutched
     }
 
-    /// World force to device force: the same work (times the force scale) for the same motion.
+    /// Converts a world force to a device force. The force does the same work (times the force
+    /// scale) for the same motion.
     pub(crate) fn force_to_hand(&self, force: Vector3<f64>) -> Vector3<f64> {
         let f = self.rotation.inverse() * force * (self.map.motion_scale * self.map.force_scale);
         masked(f, self.map.force_axes)
     }
 
     pub(crate) fn torque_to_hand(&self, torque: Vector3<f64>) -> Vector3<f64> {
-        // Angles are not scaled, so the torque does the same work without the motion's scale.
+        // Angles are not scaled, so the torque does the same work without the motion scale.
         masked(self.rotation.inverse() * torque * self.map.force_scale, self.map.torque_axes)
     }
 
@@ -142,7 +145,7 @@ impl Tool {
         masked(Vector3::new(0.0, -GRAVITY * self.map.mass, 0.0), self.map.force_axes)
     }
 
-    /// World energy to energy at the hand.
+    /// Factor from world energy to energy at the hand.
     pub(crate) fn energy_scale(&self) -> f64 {
         self.map.motion_scale * self.map.motion_scale * self.map.force_scale
     }
@@ -164,7 +167,7 @@ mod tests {
     #[test]
     fn scale_keeps_work_and_clutch_keeps_place() {
         let half = std::f64::consts::FRAC_1_SQRT_2;
-        // A quarter turn about y: the device's x is the world's -z.
+        // With a quarter turn about y, the device's x axis is the world's -z axis.
         let map = ToolMap {
             origin: [1.0, 2.0, 3.0],
             rotation: [0.0, half, 0.0, half],
@@ -177,15 +180,17 @@ mod tests {
         for (got, want) in p.into_iter().zip([1.0, 2.0, 2.6]) {
             assert!((got - want).abs() < 1e-12, "{p:?}");
         }
-        // Work: 5 N along -z over 0.4 m in the world is 20 N along x over 0.1 m at the hand.
+        // The work is the same: 5 N along -z over 0.4 m in the world is 20 N along x over 0.1 m at
+        // the hand.
         let f = tool.force_to_hand(Vector3::new(0.0, 0.0, -5.0));
         assert!((f - Vector3::new(20.0, 0.0, 0.0)).norm() < 1e-12, "{f}");
-        // Clutched, the hand goes back and the tool stays; unclutched, it goes on from there.
+        // While clutched, the hand moves back and the tool stays. After the release, the tool
+        // continues from its position.
         assert_eq!(still(&mut tool, [0.1, 0.0, 0.0], 2), p);
         assert_eq!(still(&mut tool, [0.0, 0.0, 0.0], 2), p);
         let q = still(&mut tool, [0.1, 0.0, 0.0], 0);
         assert!((q[2] - 2.2).abs() < 1e-12, "{q:?}");
-        // A map of nonsense is refused.
+        // An invalid map is refused.
         assert!(!tool.set_map(ToolMap { motion_scale: f64::NAN, ..map }));
         assert_eq!(tool.map.motion_scale, 4.0);
     }

@@ -1,23 +1,27 @@
-//! What is believed of a sample: finite, plausible, alive. And the velocity that the positions say.
+//! Sample validation: a sample must be finite, plausible and alive. The velocity is estimated from
+//! the positions.
 
 use nalgebra::{Quaternion, UnitQuaternion, Vector3};
 
 use crate::{DeviceInfo, Fault, Sample, clamp_magnitude};
 
-/// No hand is faster, m/s: more is a jump of the measurement, or a filter of the device's gone wild.
+/// Highest plausible speed of a hand, m/s. A higher speed is a jump of the measurement or an
+/// instability of the device's filter.
 const FASTEST: f64 = 10.0;
-/// So long must a new place hold before it is believed, s.
+/// Time that a new position must hold before it is accepted, s.
 const SETTLE: f64 = 0.02;
-/// A measurement counter that stands still for so long is a frozen device, s.
+/// Time without a change of the measurement counter after which the device counts as frozen, s.
 const FROZEN_COUNT: f64 = 0.05;
-/// Without a counter: bit-equal positions under a force for so long, s.
+/// Time of bit-equal positions under a force after which a device without a counter counts as
+/// frozen, s.
 const FROZEN_BITS: f64 = 0.5;
-/// How far a sample may lie off the line, in steps of the encoder: rounding makes a half.
+/// Largest distance of a sample from the fitted line, in steps of the encoder. Rounding alone makes
+/// 0.5.
 const TOLERANCE: f64 = 0.6;
-/// Samples that a velocity is estimated from, at most.
+/// Maximum number of samples for the velocity estimate.
 pub(crate) const WINDOW: usize = 16;
 
-/// A sample that has been looked at.
+/// A validated sample.
 #[derive(Debug, Clone, Copy)]
 pub(crate) struct Believed {
     pub(crate) position: Vector3<f64>,
@@ -25,9 +29,10 @@ pub(crate) struct Believed {
     pub(crate) orientation: UnitQuaternion<f64>,
     pub(crate) buttons: u32,
     pub(crate) fault: Option<Fault>,
-    /// The position was taken over from a new place: displacement since the last tick means nothing.
+    /// Whether the position was taken over from a new position. The displacement since the last
+    /// tick is then meaningless.
     pub(crate) jumped: bool,
-    /// And the tool is not to follow it there: it was the measurement that jumped, not the hand.
+    /// Whether the measurement jumped and not the hand. The tool must then not follow the position.
     pub(crate) shifted: bool,
 }
 
@@ -36,7 +41,7 @@ pub(crate) struct SampleValidation {
     resolution: f64,
     frozen_force: f64,
     last: Option<(Vector3<f64>, UnitQuaternion<f64>)>,
-    /// The next sample is believed wherever it is.
+    /// Whether the next sample is accepted at any position.
     fresh: bool,
     raw: Option<Vector3<f64>>,
     settling: f64,
@@ -46,7 +51,7 @@ pub(crate) struct SampleValidation {
     filled: usize,
     head: usize,
     buttons: u32,
-    /// Buttons that have been seen open since the device came: others may be stuck.
+    /// Buttons that have been seen open since the device appeared. Other buttons may be stuck.
     trusted: u32,
 }
 
@@ -69,7 +74,8 @@ impl SampleValidation {
         }
     }
 
-    /// After a loss: nothing of before counts but the place to stay at until there is a sample, and every button must be seen open again.
+    /// Resets the state after a loss of the device. Only the last position and orientation stay
+    /// until there is a sample, and every button must be seen open again.
     pub(crate) fn forget(&mut self) {
         self.fresh = true;
         self.raw = None;
@@ -80,7 +86,7 @@ impl SampleValidation {
         self.trusted = 0;
     }
 
-    /// No sample came: the last one stands.
+    /// Returns the last pose with a fault, for a period without a valid sample.
     pub(crate) fn hold(&mut self, fault: Fault) -> Believed {
         let (position, orientation) = self.last.unwrap_or((Vector3::zeros(), UnitQuaternion::identity()));
         self.filled = 0;
@@ -134,7 +140,8 @@ impl SampleValidation {
         let frozen = self.frozen(dt, sample, force);
         self.note(now, raw);
         let told = sample.velocity.map(Vector3::from);
-        // By its largest component: the square of a number like 1e200 is not finite, and no such number is to go any further.
+        // The largest component is tested because the square of a number like 1e200 is not finite,
+        // and such a number must not pass.
         let wild = told.map(|v| v.amax()).filter(|speed| *speed > FASTEST);
         let velocity = match told {
             Some(v) if wild.is_none() => v,
@@ -162,15 +169,19 @@ impl SampleValidation {
         (self.same >= limit).then_some(Fault::Frozen(self.same))
     }
 
-    /// Remembers where it was and when, for [`estimate`](Self::estimate).
+    /// Stores a position and its time for [`estimate`](Self::estimate).
     fn note(&mut self, now: f64, position: Vector3<f64>) {
         self.head = (self.head + 1) % WINDOW;
         self.window[self.head] = (now, position);
         self.filled = (self.filled + 1).min(WINDOW);
     }
 
-    /// First-order adaptive windowing (Janabi-Sharifi, Hayward and Chen 2000): the longest window over which a straight line explains every
-    /// sample to within its rounding, axis by axis. Low noise when slow, no lag when fast.
+    /// Estimates the velocity with first-order adaptive windowing (Janabi-Sharifi, Hayward and Chen
+    /// 2000).
+    ///
+    /// For each axis, the method uses the longest window over which a straight line explains every
+    /// sample to within its rounding. The noise is low at slow motion, and there is no lag at fast
+    /// motion.
     fn estimate(&self, now: f64, position: Vector3<f64>) -> Vector3<f64> {
         let at = |back: usize| self.window[(self.head + WINDOW - back) % WINDOW];
         Vector3::from_fn(|axis, _| {
@@ -206,7 +217,8 @@ mod tests {
 
     #[test]
     fn velocity_of_a_coarse_encoder_is_usable() {
-        // 0.1 m/s on a 50 um encoder at 1 kHz: differences alone read 0.1 or 0.15 or 0.05; a slow 5 mm/s reads 0 or 50 mm/s.
+        // At 0.1 m/s with a 50 um encoder at 1 kHz, plain differences give 0.1, 0.15 or 0.05 m/s. A
+        // slow 5 mm/s gives 0 or 50 mm/s.
         for speed in [0.1, 0.033, 0.005] {
             let mut validation = validation(50e-6);
             let (mut worst, mut sum, mut plain, mut last) = (0.0f64, 0.0, 0.0, 0.0);
@@ -221,11 +233,13 @@ mod tests {
                 }
                 last = x;
             }
-            // Never farther off than one step over two periods, and about half as noisy as differences.
+            // The estimate is never off by more than one encoder step over two periods. Its squared
+            // error is at most 0.3 of that of plain differences.
             assert!(worst <= 50e-6 / 2e-3 + 1e-9, "{speed}: off by {worst}");
             assert!(sum <= 0.3 * plain, "{speed}: {sum} of {plain}");
         }
-        // Without an encoder's steps it is the plain difference: no lag beyond half a period.
+        // Without encoder steps the estimate is the plain difference, with no lag beyond half a
+        // period.
         let mut fine = validation(0.0);
         let mut last = 0.0;
         for k in 0..50 {
@@ -249,7 +263,8 @@ mod tests {
             assert_eq!(b.fault, Some(Fault::NotFinite));
             assert_eq!(b.position, Vector3::from(good.position));
         }
-        // A metre in a millisecond is refused, until the new place has held for 20 ms; then it is taken over as a jump.
+        // A leap of 1 m in 1 ms is refused until the new position has held for 20 ms. The position
+        // is then taken over as a jump.
         let far = Sample::at([1.01, 0.02, 0.03]);
         let mut refused = 0;
         let b = loop {
@@ -286,17 +301,18 @@ mod tests {
     fn frozen_and_stuck() {
         let mut validation = validation(0.0);
         let stuck = Sample { buttons: 0b11, ..Sample::default() };
-        // Held since before the device came: believed only once seen open.
+        // These buttons were down before the device appeared. They count only after they have been
+        // seen open.
         assert_eq!(validation.take(0.0, 1e-3, &stuck, 0.0).buttons, 0);
         assert_eq!(validation.take(0.0, 1e-3, &Sample { buttons: 0b10, ..stuck }, 0.0).buttons, 0);
         assert_eq!(validation.take(0.0, 1e-3, &stuck, 0.0).buttons, 0b01);
-        // A still hand without force is no fault; under force it is, after half a second.
+        // A hand at rest without force is no fault. Under force it is a fault after half a second.
         for _ in 0..2000 {
             assert!(validation.take(0.0, 1e-3, &stuck, 0.0).fault.is_none());
         }
         let fault = (0..501).find_map(|_| validation.take(0.0, 1e-3, &stuck, 1.0).fault);
         assert!(matches!(fault, Some(Fault::Frozen(t)) if t > 0.49), "{fault:?}");
-        // With a counter the still hand is told from the dead device, and sooner.
+        // With a counter, a hand at rest differs from a dead device, and the fault comes sooner.
         let mut counted = SampleValidation::new(&VirtualConfig::default().info());
         for k in 0..2000 {
             assert!(counted.take(0.0, 1e-3, &Sample { sequence: Some(k), ..stuck }, 1.0).fault.is_none());

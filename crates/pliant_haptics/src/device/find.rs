@@ -1,4 +1,4 @@
-//! What is plugged in.
+//! Search for connected devices.
 
 #[cfg(feature = "vendor")]
 use crate::{ForceDimension, ForceDimensionConfig, OpenHaptics, OpenHapticsConfig};
@@ -6,21 +6,21 @@ use crate::{Hand, HapticDevice, VirtualConfig, VirtualDevice};
 #[cfg(feature = "inverse")]
 use crate::{Inverse, InverseConfig};
 
-/// Where to look. Defaults: the vendors' usual places.
+/// Settings of the search. Defaults: the usual locations of the vendors.
 #[derive(Debug, Clone, PartialEq, Default)]
 pub struct FindConfig {
-    /// The Inverse's service.
+    /// Settings of the Inverse's service.
     #[cfg(feature = "inverse")]
     pub inverse: InverseConfig,
-    /// 3D Systems' library; its default device is looked for.
+    /// Settings of 3D Systems' library. The search tries the device that they name.
     #[cfg(feature = "vendor")]
     pub open_haptics: OpenHapticsConfig,
-    /// Force Dimension's library.
+    /// Settings of Force Dimension's library.
     #[cfg(feature = "vendor")]
     pub force_dimension: ForceDimensionConfig,
 }
 
-/// A device that is there, or seemed to be when it was looked for.
+/// A device that was present when the search ran.
 #[derive(Debug, Clone, PartialEq)]
 #[non_exhaustive]
 pub enum Found {
@@ -33,18 +33,18 @@ pub enum Found {
     /// A Force Dimension device.
     #[cfg(feature = "vendor")]
     ForceDimension(ForceDimensionConfig),
-    /// None of them: the simulated Touch, which always is.
+    /// The simulated Touch, which is always present.
     Virtual,
 }
 
-/// Why a found device could not be opened after all, in its maker's words.
+/// Reason why a found device could not be opened, in the words of its driver.
 pub type OpenError = Box<dyn std::error::Error + Send + Sync>;
 
 impl Found {
-    /// Opens it.
+    /// Opens the device.
     ///
     /// # Errors
-    /// It has gone since, or somebody else has it.
+    /// Returns an error if the device has gone since, or if another program uses it.
     pub fn open(&self) -> Result<Box<dyn HapticDevice>, OpenError> {
         Ok(match self {
             #[cfg(feature = "inverse")]
@@ -58,9 +58,12 @@ impl Found {
     }
 }
 
-/// Looks for devices: real ones first, the simulated one last. What is not installed is no error; what was in the way is logged.
+/// Searches for devices and returns real devices first and the simulated device last. A library
+/// that is not installed is no error. Other errors are only logged.
 ///
-/// Takes as long as the Inverse's timeout, and opens and closes a 3D Systems device, whose library cannot be asked otherwise: not for every frame.
+/// The call takes up to the Inverse's timeout. It also opens and closes a 3D Systems device,
+/// because its library has no other way to query it. The call is therefore not suitable for every
+/// frame.
 pub fn find_devices(config: &FindConfig) -> Vec<Found> {
     let mut found = Vec::new();
     #[cfg(feature = "inverse")]

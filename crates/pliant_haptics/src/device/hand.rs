@@ -1,25 +1,28 @@
-//! The hand on a virtual device: mass, damping and a spring to where the arm wants it (Hogan 1989; values in Kuchenbecker, Park and Niemeyer 2003).
+//! Model of the hand on a virtual device: a mass with a damper and a spring to the target of the
+//! arm (Hogan 1989; values in Kuchenbecker, Park and Niemeyer 2003).
 
-/// A grip. The ranges of the literature: mass 0.05 to 0.6 kg, damping 1 to 10 N s/m, stiffness 50 to 500 N/m; and the hard cases, a loose
-/// grip and no hand at all.
+/// A grip of the hand.
+///
+/// The ranges of the literature are: mass 0.05 to 0.6 kg, damping 1 to 10 N s/m, stiffness 50 to
+/// 500 N/m. The presets include the hard cases, a loose grip and no hand at all.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Hand {
     /// Mass that moves with the handle, kg.
     pub mass: f64,
-    /// Damping to where the arm wants the hand, N s/m.
+    /// Damping toward the target of the arm, N s/m.
     pub damping: f64,
-    /// Stiffness of the same, N/m.
+    /// Stiffness toward the target of the arm, N/m.
     pub stiffness: f64,
 }
 
 impl Hand {
     /// A fist around the handle.
     pub const FIRM: Self = Self { mass: 0.3, damping: 10.0, stiffness: 500.0 };
-    /// A pen's grip.
+    /// The grip of a pen.
     pub const LIGHT: Self = Self { mass: 0.1, damping: 3.0, stiffness: 150.0 };
     /// Two fingertips.
     pub const LOOSE: Self = Self { mass: 0.05, damping: 1.0, stiffness: 50.0 };
-    /// Nobody holds the device.
+    /// No hand on the device.
     pub const NONE: Self = Self { mass: 0.0, damping: 0.0, stiffness: 0.0 };
 
     /// All presets by name.

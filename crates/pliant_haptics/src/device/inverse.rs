@@ -1,10 +1,13 @@
-//! The Haply Inverse3, through the WebSocket of its service (port 10001): JSON, one state for each message sent.
+//! The Haply Inverse3, through the WebSocket of its service (port 10001). The protocol is JSON with
+//! one state for each message sent.
 //!
-//! On connecting the service sends an inventory of what is plugged in; from then on it answers every command with one state. The service's axes are
-//! x right, y away from the user, z up, in metres and newtons; Bevy's are (x, z, -y). Versions of the service differ in the name of the force's field,
-//! `vector` (from 3.5 on) or `values` (before): the one that the inventory suggests is tried first, the other if that is refused.
+//! On connection, the service sends an inventory of the connected devices. After that, it answers
+//! every command with one state. The service's axes are x right, y away from the user, z up, in
+//! meters and newtons. Bevy's axes are (x, z, -y). The name of the force field depends on the
+//! version of the service: `vector` (from 3.5 on) or `values` (before). The driver tries the name
+//! that the inventory suggests first, and the other one if the service refuses the first.
 //!
-//! JSON and sockets allocate: unlike the loop around it, `exchange` does.
+//! JSON and sockets allocate. Unlike the loop around it, `exchange` therefore allocates.
 
 use std::{
     net::{TcpStream, ToSocketAddrs},
@@ -17,18 +20,19 @@ use tungstenite::{Message, WebSocket, client::client_with_config, protocol::WebS
 
 use crate::{DeviceInfo, Fault, HapticDevice, Sample, Scheduler, Wrench};
 
-/// Where and which device.
+/// Address of the service and choice of the device.
 #[derive(Debug, Clone, PartialEq)]
 pub struct InverseConfig {
     /// Host and port of the service. Default: `127.0.0.1:10001`.
     pub address: String,
-    /// The device's id; `None` takes the first. Default: `None`.
+    /// The device's id. With `None` the first device is used. Default: `None`.
     pub device: Option<String>,
-    /// How long an answer may take, s. Default: 0.1.
+    /// Maximum time for an answer, s. Default: 0.1.
     pub timeout: f64,
-    /// Rate of the loop that it will be used in, Hz: a force waits one period for its turn, and the device declares that. Default: 1000.
+    /// Rate of the loop, Hz. The device declares a delay of one period, because a force waits that
+    /// long for its turn. Default: 1000.
     pub rate: f64,
-    /// What the force's field is called; `None` finds out. Default: `None`.
+    /// Name of the force field. With `None` the driver finds it out. Default: `None`.
     pub spelling: Option<Spelling>,
 }
 
@@ -38,12 +42,12 @@ impl Default for InverseConfig {
     }
 }
 
-/// Name of the force's field in a command.
+/// Name of the force field in a command.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Spelling {
     /// `vector`: services from 3.5 on.
     Vector,
-    /// `values`: services before.
+    /// `values`: services before 3.5.
     Values,
 }
 
@@ -63,75 +67,77 @@ impl Spelling {
     }
 }
 
-/// Why there is no Inverse.
+/// Reason why no Inverse could be opened.
 #[derive(Debug, Error)]
 #[non_exhaustive]
 pub enum InverseError {
-    /// Nobody listens.
+    /// The connection to the service failed.
     #[error("no Inverse service at {address}: {reason}")]
     Connect {
-        /// Where.
+        /// Address of the service.
         address: String,
-        /// Why.
+        /// Reason.
         reason: String,
     },
-    /// It talks, but not as an Inverse service does.
+    /// The connected service does not follow the protocol of an Inverse service.
     #[error("the service at {address} does not speak as an Inverse service does: {reason}")]
     Protocol {
-        /// Where.
+        /// Address of the service.
         address: String,
-        /// What came.
+        /// Reason.
         reason: String,
     },
-    /// The service is there, the device is not.
+    /// The service does not have the device.
     #[error("the service at {address} has no Inverse3 {wanted:?}; it has {found:?}")]
     NoDevice {
-        /// Where.
+        /// Address of the service.
         address: String,
-        /// The id asked for, if any.
+        /// The wanted id, if any.
         wanted: Option<String>,
-        /// The ids that there are.
+        /// The ids of the connected devices.
         found: Vec<String>,
     },
 }
 
-/// An Inverse3, with the grip that may be on it.
+/// An Inverse3, with the grip that may be attached.
 pub struct Inverse {
     config: InverseConfig,
     socket: Option<WebSocket<TcpStream>>,
     id: String,
     spelling: Spelling,
-    /// The spelling is known to be right: a state has come back for it.
+    /// Whether the field name is known to be right, because a state has come back for it.
     confirmed: bool,
     last: Sample,
     sequence: u64,
 }
 
 impl Inverse {
-    /// The ids of the Inverse3s at a service: what is plugged in.
+    /// Returns the ids of the Inverse3 devices that are connected to a service.
     ///
     /// # Errors
-    /// No service, or not one that speaks as an Inverse service does.
+    /// Returns an error if there is no service, or if it does not follow the protocol of an Inverse
+    /// service.
     pub fn list(config: &InverseConfig) -> Result<Vec<String>, InverseError> {
         let (_, inventory) = connect(config)?;
         Ok(ids(&inventory))
     }
 
-    /// Connects to the service and picks the device.
+    /// Connects to the service and selects the device.
     ///
     /// # Errors
-    /// No service, not one that speaks as an Inverse service does, or no such device.
+    /// Returns an error if there is no service, if it does not follow the protocol of an Inverse
+    /// service, or if it does not have the device.
     pub fn open(config: InverseConfig) -> Result<Self, InverseError> {
         let (socket, inventory) = connect(&config)?;
         let (id, last) = pick(&config, &inventory)?;
-        // The session's number came with 3.5, as did the field's new name.
+        // The session id came with version 3.5, as did the new name of the field.
         let guess = if inventory.get("session_id").is_some() { Spelling::Vector } else { Spelling::Values };
         let spelling = config.spelling.unwrap_or(guess);
         let confirmed = config.spelling.is_some();
         Ok(Self { config, socket: Some(socket), id, spelling, confirmed, last, sequence: 0 })
     }
 
-    /// Name of the force's field that the service takes.
+    /// Returns the name of the force field that the service accepts.
     pub fn spelling(&self) -> Spelling {
         self.spelling
     }
@@ -150,10 +156,11 @@ impl Inverse {
         message.to_string()
     }
 
-    /// One command, one answer.
+    /// Sends one command and reads one answer.
     ///
-    /// A connection on which an answer did not come, or not whole, is given up: nothing in an answer says which command it belongs to, so the late one
-    /// would be taken for the next one's, and every position from then on would be an exchange old.
+    /// A connection on which an answer was missing or incomplete is closed. An answer does not say
+    /// which command it belongs to. A late answer would count as the next one, and every position
+    /// from then on would be one exchange old.
     fn ask(&mut self, force: [f64; 3]) -> Result<Value, Fault> {
         let command = self.command(force, self.sequence == 0);
         let socket = self.socket.as_mut().ok_or(Fault::Gone)?;
@@ -173,7 +180,8 @@ impl HapticDevice for Inverse {
         DeviceInfo {
             name: "Haply Inverse3".into(),
             serial: self.id.clone(),
-            // The maker's data sheet: 10 N at the peak. The rest is a cautious estimate, nobody here has measured one.
+            // The maker's data sheet states a peak of 10 N. The rest is a cautious estimate without
+            // measurements.
             peak_force: 10.0,
             continuous_force: 3.0,
             peak_torque: 0.0,
@@ -195,7 +203,7 @@ impl HapticDevice for Inverse {
     fn exchange(&mut self, wrench: &Wrench, scheduler: &mut dyn Scheduler) -> Result<Sample, Fault> {
         scheduler.wait();
         let answer = match self.ask(wrench.force) {
-            // The first command was refused: the service may know the field by its other name.
+            // The first command was refused, so the service may know the field by its other name.
             Err(Fault::Gone | Fault::Malformed) if !self.confirmed => {
                 self.spelling = self.spelling.other();
                 self.confirmed = true;
@@ -216,7 +224,8 @@ impl HapticDevice for Inverse {
 
     fn safe_stop(&mut self) {
         if self.socket.is_some() {
-            // The service holds a force only as long as it is renewed; saying zero is for now, closing for ever.
+            // The service holds a force only as long as it is renewed. The zero acts at once, and
+            // the closed connection keeps it.
             let _ = self.ask([0.0; 3]);
         }
     }
@@ -249,7 +258,7 @@ impl std::fmt::Debug for Inverse {
     }
 }
 
-/// Connects and takes the inventory.
+/// Connects and reads the inventory.
 fn connect(config: &InverseConfig) -> Result<(WebSocket<TcpStream>, Value), InverseError> {
     let address = || config.address.clone();
     let refused = |reason: String| InverseError::Connect { address: address(), reason };
@@ -265,7 +274,7 @@ fn connect(config: &InverseConfig) -> Result<(WebSocket<TcpStream>, Value), Inve
         stream.set_write_timeout(Some(timeout))
     };
     set(&stream).map_err(|e| refused(e.to_string()))?;
-    // An inventory of a few devices is some kilobytes; a service that sends megabytes is none.
+    // An inventory of a few devices has some kilobytes. A service that sends megabytes is invalid.
     let limits = WebSocketConfig::default().max_message_size(Some(1 << 20)).max_frame_size(Some(1 << 20));
     let (mut socket, _) = client_with_config(format!("ws://{}/", config.address), stream, Some(limits))
         .map_err(|e| refused(e.to_string()))?;
@@ -279,7 +288,7 @@ fn connect(config: &InverseConfig) -> Result<(WebSocket<TcpStream>, Value), Inve
     }
 }
 
-/// The next message as JSON; `None`: it is none.
+/// Reads the next message as JSON. The result is `None` if the message is not JSON.
 fn read(socket: &mut WebSocket<TcpStream>) -> Result<Option<Value>, tungstenite::Error> {
     loop {
         match socket.read()? {
@@ -329,12 +338,13 @@ fn find<'a>(answer: &'a Value, id: &str) -> Option<&'a Value> {
     answer["inverse3"].as_array()?.iter().find(|d| d["device_id"] == id)
 }
 
-/// A state as a sample. Parts that the service leaves out stay as they were.
+/// Converts a state to a sample. Parts that the service leaves out keep their last values.
 fn sample(device: &Value, answer: &Value, last: &Sample) -> Option<Sample> {
     let state = &device["state"];
     let position = from_service(vector(&state["cursor_position"])?);
     let velocity = vector(&state["cursor_velocity"]).map(from_service);
-    // A grip, wired or not, gives orientation and buttons; without one there are none.
+    // A wired or wireless grip gives the orientation and the buttons. Without a grip there are
+    // none.
     let grip =
         ["wireless_verse_grip", "verse_grip"].iter().find_map(|kind| answer[*kind].as_array()?.first());
     let grip = grip.map(|g| &g["state"]);
@@ -345,7 +355,7 @@ fn sample(device: &Value, answer: &Value, last: &Sample) -> Option<Sample> {
         velocity,
         orientation,
         buttons: pressed.unwrap_or(last.buttons),
-        // The service counts nothing that tells a frozen device from a still hand.
+        // The service has no counter that distinguishes a frozen device from a hand at rest.
         sequence: None,
     })
 }
@@ -359,7 +369,7 @@ fn quaternion(value: &Value) -> Option<[f64; 4]> {
     Some([x, y, z, value["w"].as_f64()?])
 }
 
-/// `a`, `b`, `c` or `button_0` .. in the order of their names.
+/// Reads the buttons `a`, `b`, `c` or `button_0` .. in the order of their names.
 fn buttons(value: &Value) -> u32 {
     let Some(map) = value.as_object() else { return 0 };
     let mut names: Vec<_> = map.iter().filter(|(_, v)| v.is_boolean()).collect();
@@ -368,7 +378,7 @@ fn buttons(value: &Value) -> u32 {
     down.fold(0, |bits, (i, _)| bits | 1 << i)
 }
 
-/// (x right, y away, z up) to (x right, y up, z toward the user).
+/// Converts (x right, y away, z up) to (x right, y up, z toward the user).
 fn from_service([x, y, z]: [f64; 3]) -> [f64; 3] {
     [x, z, -y]
 }

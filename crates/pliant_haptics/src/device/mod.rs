@@ -1,4 +1,5 @@
-//! What a haptic device is to this crate: something that takes a wrench, holds it for a while, and says where the hand is.
+//! The interface to haptic devices. A device applies a wrench for one period and reports the hand's
+//! pose.
 
 pub(crate) mod find;
 pub(crate) mod hand;
@@ -11,37 +12,42 @@ pub(crate) mod virtual_device;
 use serde::{Deserialize, Serialize};
 use thiserror::Error;
 
-/// What a device is told to exert on the hand. Device axes are Bevy's: x right, y up, z toward the user.
+/// Force and torque that a device exerts on the hand. Device axes are Bevy's: x right, y up, z
+/// toward the user.
 #[derive(Debug, Clone, Copy, PartialEq, Default, Serialize, Deserialize)]
 pub struct Wrench {
-    /// Force on the hand, N. Default: none.
+    /// Force on the hand, N. Default: zero.
     pub force: [f64; 3],
-    /// Torque on the hand about the tool point, N m; devices of three degrees of freedom ignore it, and real ones are sent none. Default: none.
+    /// Torque on the hand about the tool point, N m. Devices of three degrees of freedom ignore it,
+    /// and real devices are sent none. Default: zero.
     pub torque: [f64; 3],
 }
 
 impl Wrench {
-    /// No force, no torque.
+    /// A wrench without force and torque.
     pub const ZERO: Self = Self { force: [0.0; 3], torque: [0.0; 3] };
 }
 
-/// What a device says at the end of a period. Device axes are Bevy's.
+/// State of a device at the end of a period. Device axes are Bevy's.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 pub struct Sample {
-    /// Where the tool point is, m, from the middle of the workspace.
+    /// Position of the tool point, m, from the center of the workspace.
     pub position: [f64; 3],
-    /// Orientation of the tool as a unit quaternion x, y, z, w; identity for devices of three degrees of freedom.
+    /// Orientation of the tool as a unit quaternion x, y, z, w. It is the identity for devices of
+    /// three degrees of freedom.
     pub orientation: [f64; 4],
-    /// Velocity as the device's own filter has it, m/s; `None`: the loop estimates it from positions.
+    /// Velocity from the device's own filter, m/s. With `None` the loop estimates the velocity from
+    /// positions.
     pub velocity: Option<[f64; 3]>,
-    /// One bit a button, the lowest is the main one.
+    /// Buttons that are down, one bit each. The lowest bit is the main button.
     pub buttons: u32,
-    /// Counts the device's own measurements, where it has such a count: tells a frozen device from a still hand.
+    /// Count of the device's own measurements, where the device has such a count. It distinguishes
+    /// a frozen device from a hand at rest.
     pub sequence: Option<u64>,
 }
 
 impl Default for Sample {
-    /// In the middle of the workspace, no button pressed.
+    /// Returns a sample in the center of the workspace with no button down.
     fn default() -> Self {
         Self {
             position: [0.0; 3],
@@ -54,34 +60,37 @@ impl Default for Sample {
 }
 
 impl Sample {
-    /// A sample at `position` (m), everything else at its default.
+    /// Creates a sample at `position` (m), with defaults for everything else.
     pub fn at(position: [f64; 3]) -> Self {
         Self { position, ..Self::default() }
     }
 }
 
-/// What is known about a device: its limits are where the safety pipeline begins.
+/// Properties of a device. The safety pipeline is based on their limits.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct DeviceInfo {
-    /// The model's name.
+    /// Name of the model.
     pub name: String,
-    /// Serial number or other mark that tells two of a kind apart; may be empty.
+    /// Serial number or other mark that distinguishes two devices of a kind. It may be empty.
     pub serial: String,
-    /// Largest force for a moment, N.
+    /// Maximum momentary force, N.
     pub peak_force: f64,
-    /// Largest force for ever, N: what the motors bear without heating up.
+    /// Maximum permanent force, N. The motors withstand this force without overheating.
     pub continuous_force: f64,
-    /// Largest torque, N m; 0 without motors for it.
+    /// Maximum torque, N m. It is 0 without motors for torque.
     pub peak_torque: f64,
-    /// Which axes of position have motors.
+    /// Position axes that have motors.
     pub force_axes: [bool; 3],
-    /// Which axes of rotation have motors.
+    /// Rotation axes that have motors.
     pub torque_axes: [bool; 3],
-    /// Stiffness that the maker names as the most that the device closes stably, N/m; infinite when not known.
+    /// Maximum stiffness that the device renders stably according to its maker, N/m. It is infinite
+    /// if unknown.
     pub max_stiffness: f64,
-    /// Damping that the maker names as the most that the device closes stably, N s/m; infinite when not known.
+    /// Maximum damping that the device renders stably according to its maker, N s/m. It is infinite
+    /// if unknown.
     pub max_damping: f64,
-    /// The device's own viscous damping at the tool, N s/m: the `b` of `K < 2 b / T`. A cautious guess is better than a high one.
+    /// The device's own viscous damping at the tool, N s/m: the `b` of `K < 2 b / T`. A low
+    /// estimate is safer than a high one.
     pub damping: f64,
     /// The device's own Coulomb friction at the tool, N.
     pub friction: f64,
@@ -89,21 +98,22 @@ pub struct DeviceInfo {
     pub mass: f64,
     /// Smallest step that the position measurement resolves, m.
     pub resolution: f64,
-    /// From a measurement to the force that answers it, beyond the hold itself, s.
+    /// Delay from a measurement to the force that answers it, beyond the hold itself, s.
     pub delay: f64,
-    /// Corners of the reachable box, m, smallest then largest.
+    /// Corners of the reachable box, m, smallest corner first.
     pub workspace: [[f64; 3]; 2],
     /// Number of buttons.
     pub buttons: u32,
-    /// Exerts forces on nobody: only such a device may be run with parts of the safety pipeline left out.
+    /// Whether the device exerts no real forces. Only such a device may run without parts of the
+    /// safety pipeline.
     pub simulated: bool,
 }
 
 impl DeviceInfo {
-    /// Every number is one that the loop can work with.
+    /// Checks that the loop can work with every number.
     ///
     /// # Errors
-    /// The first that is not.
+    /// Returns the first number that is out of range.
     pub fn check(&self) -> Result<(), InfoError> {
         let refuse = |what, expected, got| Err(InfoError { what, expected, got });
         let positive = [
@@ -147,38 +157,40 @@ impl DeviceInfo {
 #[derive(Debug, Clone, PartialEq, Error)]
 #[error("{what} of the device: expected {expected}, got {got}")]
 pub struct InfoError {
-    /// Which number.
+    /// Name of the number.
     pub what: &'static str,
-    /// What is allowed.
+    /// Allowed range.
     pub expected: &'static str,
-    /// What came.
+    /// The value.
     pub got: f64,
 }
 
-/// Who keeps the time.
+/// Says whether the loop or the device does the timing.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub enum Pacing {
-    /// The loop: [`HapticDevice::exchange`] is to wait by the [`Scheduler`] it is given.
+    /// The loop does the timing. [`HapticDevice::exchange`] must wait by the given [`Scheduler`].
     Loop,
-    /// The device: `exchange` returns when its own servo has ticked, at about this rate, Hz.
+    /// The device does the timing. `exchange` returns when the device's own servo has ticked, at
+    /// about this rate, Hz.
     Device(f64),
 }
 
-/// Whether positions can be trusted yet.
+/// State of the calibration: whether positions are valid yet.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 #[non_exhaustive]
 pub enum Calibration {
-    /// Yes.
+    /// Positions are valid.
     Ready,
-    /// Not yet, and the user must do something: what, in words.
+    /// Positions are not valid yet, and the user must act. The text says what to do.
     Needed(&'static str),
 }
 
-/// What went wrong in a period. Everything but the emergency stop fades the force and, once it is over, ramps it up again.
+/// Fault in a period. Every fault except the emergency stop fades the force. After its end, the
+/// force ramps up again.
 #[derive(Debug, Clone, Copy, PartialEq, Error, Serialize, Deserialize)]
 #[non_exhaustive]
 pub enum Fault {
-    /// The device is not there any more.
+    /// The device is not connected any more.
     #[error("the device is gone")]
     Gone,
     /// The device did not answer in time.
@@ -190,40 +202,43 @@ pub enum Fault {
     /// The device's answer could not be read.
     #[error("the device sent something that could not be read")]
     Malformed,
-    /// A position, orientation or velocity that is NaN or infinite, or a force that came out so.
+    /// A position, orientation or velocity is NaN or infinite, or the computed force is.
     #[error("a measurement, or the force that answers it, is a number that is not finite")]
     NotFinite,
-    /// The position jumped farther than a hand can.
+    /// The position jumped farther than a hand can move.
     #[error("the position jumped by {0} m in one period")]
     Jump(f64),
     /// The device repeats its last measurement.
     #[error("the device has sent the same measurement for {0} s")]
     Frozen(f64),
-    /// The hand is faster than the cut-out allows, or than any hand, as the device has it.
+    /// The hand is faster than the cut-out allows, or the device reports a speed that no hand
+    /// reaches.
     #[error("the hand moves at {0} m/s")]
     TooFast(f64),
-    /// The simulation has been silent for so long, s.
+    /// No local model update has arrived for this long, s.
     #[error("the simulation has been silent for {0} s")]
     Stale(f64),
-    /// A local model with a number that is not finite.
+    /// A local model contains a number that is not finite.
     #[error("the simulation sent a number that is not finite")]
     BadModel,
-    /// The loop itself was not run for so long (a debugger, a suspended machine), s.
+    /// The loop itself was not run for this long (a debugger, a suspended machine), s.
     #[error("the loop was not run for {0} s")]
     Stalled(f64),
-    /// Positions cannot be trusted until the device is calibrated.
+    /// Positions are not valid until the device is calibrated.
     #[error("the device needs calibration")]
     NotCalibrated,
     /// Somebody pressed the emergency stop.
     #[error("emergency stop")]
     EmergencyStop,
-    /// The driver panicked, and the loop with it: this device does not come back until it is added anew.
+    /// The driver panicked, and its loop has ended. The device does not come back until the app
+    /// adds it again.
     #[error("the driver panicked; its loop is over")]
     Panicked,
 }
 
 impl Fault {
-    /// A small number for each kind, in the order of the variants: an index into counters.
+    /// Returns a small number for each kind, in the order of the variants. It serves as an index
+    /// into counters.
     pub fn kind(&self) -> usize {
         match self {
             Self::Gone => 0,
@@ -243,75 +258,84 @@ impl Fault {
         }
     }
 
-    /// How many kinds there are.
+    /// Number of kinds of faults.
     pub const KINDS: usize = 14;
 }
 
-/// One period of the loop, as it was and not as it should have been.
+/// One period of the loop with its measured times.
 #[derive(Debug, Clone, Copy, PartialEq, Default)]
 pub struct Period {
-    /// Seconds since the loop began, at its end.
+    /// Time of the period's end since the loop began, s.
     pub now: f64,
-    /// How long it was, s.
+    /// Length of the period, s.
     pub dt: f64,
-    /// How late it ended, s.
+    /// Lateness of the period's end, s.
     pub late: f64,
-    /// Whole periods that were left out to catch up.
+    /// Number of whole periods that were skipped to catch up.
     pub missed: u32,
 }
 
-/// Time, real or virtual: the loop's own, lent to the device for the length of an exchange.
+/// Real or virtual time of the loop. The loop lends the scheduler to the device for the length of
+/// an exchange.
 pub trait Scheduler {
-    /// Waits until the next period begins, and says how long the last one was.
+    /// Waits until the next period begins, and returns the period that ended.
     fn wait(&mut self) -> Period;
 
-    /// The period that [`wait`](Self::wait) ended last.
+    /// Returns the last period that [`wait`](Self::wait) or [`note`](Self::note) ended.
     fn last(&self) -> Period;
 
-    /// For a device that keeps the time itself: takes the time of now as a period's end.
+    /// Ends the period at the present time, for a device that does the timing itself.
     fn note(&mut self) -> Period;
 }
 
-/// A haptic device. It lives on the loop's thread and is called by nobody else.
+/// A haptic device. The device lives on the loop's thread, and only this thread calls it.
 pub trait HapticDevice: Send {
-    /// What it is. Asked once when the loop starts and again after a [`reopen`](Self::reopen).
+    /// Returns the properties of the device. The loop calls this method when it starts and again
+    /// after a [`reopen`](Self::reopen).
     fn info(&self) -> DeviceInfo;
 
-    /// Who keeps the time.
+    /// Says whether the loop or the device does the timing.
     fn pacing(&self) -> Pacing {
         Pacing::Loop
     }
 
-    /// Whether positions can be trusted yet; asked until they can.
+    /// Returns the state of the calibration. The loop calls this method until positions are valid.
     fn calibration(&mut self) -> Calibration {
         Calibration::Ready
     }
 
-    /// Hands over `wrench`, to be held from now on; lets one period pass (`scheduler.wait()`, or the device's own servo and then `scheduler.note()`);
-    /// returns the state of the device at its end. In this order a force never waits a period for its turn.
+    /// Applies `wrench`, waits for one period (`scheduler.wait()`, or the device's own servo and
+    /// then `scheduler.note()`) and returns the state of the device at its end. The wrench is held
+    /// from the start of the call. In this order a force never waits a period for its turn.
     ///
     /// # Errors
-    /// What went wrong; the loop fades what it asks for and calls again, so a device that is gone for good says so each time.
+    /// Returns the fault. The loop fades the force and calls again, so a device that is gone
+    /// permanently must return its fault each time.
     fn exchange(&mut self, wrench: &Wrench, scheduler: &mut dyn Scheduler) -> Result<Sample, Fault>;
 
-    /// Takes all force off at once. Called at the end, after a loss and at an emergency stop; does nothing on a device that is gone.
-    /// An implementation calls it when it is dropped.
+    /// Cuts all force at once. The loop calls this method at the end, after a loss and at an
+    /// emergency stop. It does nothing on a device that is gone. An implementation must call it
+    /// when the device is dropped.
     fn safe_stop(&mut self);
 
-    /// Tries to get a lost device back; called about once a second while it is lost, and may take its time.
+    /// Tries to reopen a lost device. The loop calls this method about once per second while the
+    /// device is lost, and the call may block.
     ///
     /// # Errors
-    /// [`Fault::Gone`] as long as it is not there. A device that cannot come back always says so, which is the default.
+    /// Returns [`Fault::Gone`] as long as the device is not there. A device that cannot come back
+    /// always returns this fault, which is the default.
     fn reopen(&mut self) -> Result<(), Fault> {
         Err(Fault::Gone)
     }
 }
 
-/// An output that can buzz but not push: a gamepad's motors, a phone. Honest about it: there is no position and no force in newtons.
+/// An output that vibrates without a position and without a force in newtons: a gamepad's motors or
+/// a phone.
 pub trait VibrationOutput: Send {
-    /// Buzzes with `strong` (low frequency) and `weak` (high frequency) at 0 to 1 for `seconds`; values outside are clamped, NaN is 0.
+    /// Vibrates with `strong` (low frequency) and `weak` (high frequency) at 0 to 1 for `seconds`.
+    /// Values outside are clamped, and NaN counts as 0.
     fn vibrate(&mut self, strong: f64, weak: f64, seconds: f64);
 
-    /// Stops at once.
+    /// Stops the vibration at once.
     fn stop(&mut self);
 }

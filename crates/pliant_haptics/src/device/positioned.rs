@@ -1,4 +1,4 @@
-//! A position without motors: pointer, gamepad, script. The force is there to be shown, nobody feels it.
+//! A position without motors: pointer, gamepad or script. The force is only drawn.
 
 use std::sync::{
     Arc, Mutex, PoisonError,
@@ -9,12 +9,14 @@ use nalgebra::Vector3;
 
 use crate::{DeviceInfo, Fault, HapticDevice, Sample, Scheduler, Wrench};
 
-/// How fast it goes where its handle says, rad/s: critically damped, there to a hundredth after 80 ms.
+/// Natural frequency of the motion to the target, rad/s. The motion is critically damped and within
+/// 1 % after 80 ms.
 const PACE: f64 = 80.0;
-/// No faster than this, m/s: a pointer that leaps is a hand that hurries, not a measurement that fails.
+/// Maximum speed, m/s. A pointer that leaps then looks like a fast hand and not like a failed
+/// measurement.
 const FASTEST: f64 = 4.0;
 
-/// A device that goes where its handle says, as a hand would: smoothly, and not at once.
+/// A device that moves smoothly to the target of its handle, as a hand would.
 #[derive(Debug)]
 pub struct Positioned {
     name: String,
@@ -32,12 +34,14 @@ pub struct PositionedHandle(Arc<Shared>);
 #[derive(Debug, Default)]
 struct Shared {
     wanted: Mutex<Sample>,
-    /// Force and torque, each number by itself: it is drawn, and the loop waits for nobody who draws.
+    /// Force and torque, each number in its own atomic. The wrench is only drawn, and the loop must
+    /// not wait for the reader.
     wrench: [AtomicU64; 6],
 }
 
 impl PositionedHandle {
-    /// Puts the device somewhere (m, device axes), with these buttons down. A place that is not finite is refused; the buttons count all the same.
+    /// Sets the target position (m, device axes) and the buttons that are down. A position that is
+    /// not finite is refused, but the buttons still count.
     pub fn set(&self, position: [f64; 3], buttons: u32) {
         let mut wanted = self.0.wanted.lock().unwrap_or_else(PoisonError::into_inner);
         wanted.buttons = buttons;
@@ -46,12 +50,12 @@ impl PositionedHandle {
         }
     }
 
-    /// Presses these buttons and no others, wherever the device is.
+    /// Presses exactly these buttons, wherever the device is.
     pub fn set_buttons(&self, buttons: u32) {
         self.0.wanted.lock().unwrap_or_else(PoisonError::into_inner).buttons = buttons;
     }
 
-    /// The wrench that a hand would feel: to be shown.
+    /// Returns the wrench on the hand, to be drawn.
     pub fn wrench(&self) -> Wrench {
         let n = |i: usize| f64::from_bits(self.0.wrench[i].load(Ordering::Relaxed));
         Wrench { force: [n(0), n(1), n(2)], torque: [n(3), n(4), n(5)] }
@@ -65,7 +69,7 @@ impl PositionedHandle {
 }
 
 impl Positioned {
-    /// A device of this name in the middle of its workspace.
+    /// Creates a device of this name in the center of its workspace.
     pub fn new(name: impl Into<String>) -> Self {
         Self {
             name: name.into(),
@@ -77,12 +81,13 @@ impl Positioned {
         }
     }
 
-    /// To move it with while the loop has it.
+    /// Returns the handle that moves the device while the loop owns it.
     pub fn handle(&self) -> PositionedHandle {
         self.handle.clone()
     }
 
-    /// A critically damped spring to where it is wanted, in closed form over `dt` seconds.
+    /// Moves the position over `dt` seconds by a critically damped spring to the target, in closed
+    /// form.
     fn go(&mut self, dt: f64) {
         let off = self.position - Vector3::from(self.wanted.position);
         let lean = self.velocity + off * PACE;
@@ -101,7 +106,8 @@ impl HapticDevice for Positioned {
         DeviceInfo {
             name: self.name.clone(),
             serial: String::new(),
-            // Nobody is pushed: these are what an arrow on the screen is scaled by.
+            // The device exerts no real force. The limits only serve to scale an arrow on the
+            // screen.
             peak_force: 20.0,
             continuous_force: 20.0,
             peak_torque: 0.0,
@@ -122,7 +128,8 @@ impl HapticDevice for Positioned {
 
     fn exchange(&mut self, wrench: &Wrench, scheduler: &mut dyn Scheduler) -> Result<Sample, Fault> {
         let period = scheduler.wait();
-        // A pointer moves once a frame and nobody is pushed: were its owner just writing, the last place is as good.
+        // A pointer moves once per frame and exerts no force. If its owner is just writing, the
+        // last target will do.
         if let Ok(wanted) = self.handle.0.wanted.try_lock() {
             self.wanted = *wanted;
         }
@@ -130,7 +137,7 @@ impl HapticDevice for Positioned {
         if period.dt > 0.0 {
             self.go(period.dt.min(0.05));
         }
-        // It measures nothing that could freeze: the counter says that a still pointer is one.
+        // There is no measurement that could freeze. The counter marks a pointer at rest as alive.
         self.sequence += 1;
         Ok(Sample {
             position: self.position.into(),
@@ -157,11 +164,11 @@ mod tests {
         let push = Wrench { force: [1.0, 2.0, 3.0], torque: [4.0, 5.0, 6.0] };
         device.exchange(&push, &mut VirtualScheduler::new(1000.0)).unwrap();
         assert_eq!(handle.wrench(), push);
-        // Whoever moves the pointer is in the middle of it, for as long as it takes.
+        // Another thread holds the lock of the target for an unlimited time.
         let moving = handle.0.wanted.lock().unwrap();
         let stopped = std::thread::spawn(move || device.safe_stop());
-        // A thread that waits for the lock never ends; one that a busy machine leaves out for a
-        // while does.
+        // A thread that waits for the lock never ends. A thread that a busy machine delays does
+        // end.
         let begun = std::time::Instant::now();
         while !stopped.is_finished() {
             assert!(begun.elapsed().as_secs() < 60, "the loop's thread waits for a lock");
@@ -200,11 +207,11 @@ mod tests {
             }
         };
         run(&mut cycle, &mut events, 500);
-        // 15 cm between two frames.
+        // The pointer moves by 15 cm between two frames.
         handle.set([0.15, 0.0, 0.0], 1);
         run(&mut cycle, &mut events, 150);
         assert!((cycle.core().last().position[0] - 0.15).abs() < 1e-4, "{:?}", cycle.core().last().position);
-        // And then it is held still for three seconds, with 15 N on the screen.
+        // The pointer then stays still for three seconds, with a force of 15 N on the screen.
         run(&mut cycle, &mut events, 3000);
         assert!((handle.wrench().force[0] + 15.0).abs() < 0.05, "{:?}", handle.wrench());
         assert!(events.contains(&LoopEvent::Pressed(0)));

@@ -1,6 +1,7 @@
-//! What a device said, written down and played again.
+//! Recording and replay of a device's samples.
 //!
-//! A recording is a header (the device's info) and one fixed-size record a period, all numbers little-endian:
+//! A recording is a header (the device's info) and one fixed-size record per period. All numbers
+//! are little-endian:
 //!
 //! ```text
 //! "PLHR" | version u16 | info: length u32, postcard bytes
@@ -18,26 +19,26 @@ const MAGIC: [u8; 4] = *b"PLHR";
 const VERSION: u16 = 1;
 const NUMBERS: usize = 18;
 const RECORD: usize = NUMBERS * 8 + 4 + 8;
-/// An info longer than this is not one.
+/// Maximum length of the info, bytes. A longer info is invalid.
 const LONGEST_INFO: u32 = 64 * 1024;
 
-/// Why a recording cannot be read or written.
+/// Reason why a recording cannot be read or written.
 #[derive(Debug, Error)]
 #[non_exhaustive]
 pub enum RecordError {
     /// The file or stream failed.
     #[error("the recording: {0}")]
     Io(#[from] io::Error),
-    /// Something else than a recording.
+    /// The data is not a recording.
     #[error("a recording begins with PLHR, this with {0:?}")]
     Magic([u8; 4]),
-    /// Of another version.
+    /// The recording has another version.
     #[error("the recording has version {0}, this reads version 1")]
     Version(u16),
     /// The header's description of the device cannot be read.
     #[error("the recording's header is damaged: {0}")]
     Header(String),
-    /// A record with a number that is not finite, or a time that runs backwards.
+    /// A record has a number that is not finite, or a time that runs backwards.
     #[error("record {0} of the recording is damaged")]
     Damaged(usize),
 }
@@ -49,10 +50,10 @@ pub struct Recorder<W: Write> {
 }
 
 impl<W: Write> Recorder<W> {
-    /// Writes the header.
+    /// Creates a recorder and writes the header.
     ///
     /// # Errors
-    /// The stream's own.
+    /// Returns errors of the stream, and an error if the info cannot be encoded.
     pub fn new(mut out: W, info: &DeviceInfo) -> Result<Self, RecordError> {
         let info = postcard::to_stdvec(info).map_err(|e| RecordError::Header(e.to_string()))?;
         out.write_all(&MAGIC)?;
@@ -62,10 +63,10 @@ impl<W: Write> Recorder<W> {
         Ok(Self { out })
     }
 
-    /// Writes one period.
+    /// Writes the record of one period.
     ///
     /// # Errors
-    /// The stream's own.
+    /// Returns errors of the stream.
     pub fn write(&mut self, record: &Record) -> Result<(), RecordError> {
         let s = &record.sample;
         let velocity = s.velocity.unwrap_or([f64::NAN; 3]);
@@ -87,17 +88,17 @@ impl<W: Write> Recorder<W> {
         Ok(())
     }
 
-    /// Flushes and gives the stream back.
+    /// Flushes the stream and returns it.
     ///
     /// # Errors
-    /// The stream's own.
+    /// Returns errors of the stream.
     pub fn finish(mut self) -> Result<W, RecordError> {
         self.out.flush()?;
         Ok(self.out)
     }
 }
 
-/// Plays a recording as a device: the hand goes where it went, whatever force it is given.
+/// Replays a recording as a device. The hand follows the recorded path and ignores the force.
 #[derive(Debug, Clone)]
 pub struct Replay {
     info: DeviceInfo,
@@ -107,10 +108,10 @@ pub struct Replay {
 }
 
 impl Replay {
-    /// Reads a whole recording; a last record that was cut short is left out.
+    /// Reads a whole recording. A last record that was cut short is left out.
     ///
     /// # Errors
-    /// Not a recording, damaged, or the stream's own.
+    /// Returns an error if the data is not a recording or is damaged, and errors of the stream.
     pub fn read(mut from: impl Read) -> Result<Self, RecordError> {
         let mut head = [0u8; 10];
         from.read_exact(&mut head)?;
@@ -131,7 +132,7 @@ impl Replay {
         let mut info: DeviceInfo =
             postcard::from_bytes(&info).map_err(|e| RecordError::Header(e.to_string()))?;
         info.check().map_err(|e| RecordError::Header(e.to_string()))?;
-        // It moves nobody's hand, whatever it was recorded from.
+        // A replay exerts no force, whatever device it was recorded from.
         info.simulated = true;
         let mut records: Vec<Record> = Vec::new();
         let mut bytes = [0u8; RECORD];
@@ -153,12 +154,12 @@ impl Replay {
         Ok(Self { info, records, next: 0, repeat: false })
     }
 
-    /// Begins again at the end, instead of being gone.
+    /// Makes the replay start again at its end instead of being gone.
     pub fn repeating(self) -> Self {
         Self { repeat: true, ..self }
     }
 
-    /// What was written down.
+    /// Returns the records.
     pub fn records(&self) -> &[Record] {
         &self.records
     }
@@ -250,7 +251,7 @@ mod tests {
         assert!(events.contains(&LoopEvent::Pressed(0)));
         cycle.step(&mut scheduler, &LocalModel::default(), &mut events);
         assert!(events.contains(&LoopEvent::Lost), "at the end of the recording there is no device");
-        // Cut anywhere it is still a recording or an error, never a panic.
+        // A recording that is cut at any byte gives a recording or an error, but never a panic.
         for cut in 0..bytes.len().min(2000) {
             let _ = Replay::read(&bytes[..cut]);
         }

@@ -1,4 +1,4 @@
-//! A device that nobody owns, and the hand on it: what stability is measured on.
+//! A simulated device with a hand on it, which serves to measure stability.
 
 use std::sync::{
     Arc,
@@ -10,10 +10,10 @@ use pliant_modal::{Coefficients, Integrator};
 
 use crate::{DeviceInfo, Fault, Hand, HapticDevice, InfoError, Sample, Scheduler, Wrench};
 
-/// What a virtual device is made of.
+/// Properties of a virtual device.
 #[derive(Debug, Clone, PartialEq)]
 pub struct VirtualConfig {
-    /// Its name. Default: "virtual".
+    /// Name of the device. Default: "virtual".
     pub name: &'static str,
     /// Apparent mass at the tool, kg. Default: 0.2.
     pub mass: f64,
@@ -21,19 +21,19 @@ pub struct VirtualConfig {
     pub damping: f64,
     /// Coulomb friction, N. Default: 0.
     pub friction: f64,
-    /// Step of the position measurement, m; 0 measures exactly. Default: 0.
+    /// Step of the position measurement, m. With 0 the measurement is exact. Default: 0.
     pub resolution: f64,
-    /// Largest force, N; more is cut, as motors do. Default: 10.
+    /// Maximum force, N. Larger forces are cut, as in real motors. Default: 10.
     pub peak_force: f64,
-    /// Force for ever, N. Default: 3.
+    /// Maximum permanent force, N. Default: 3.
     pub continuous_force: f64,
-    /// What the maker would say, N/m. Default: infinite.
+    /// Maximum stiffness as a maker would state it, N/m. Default: infinite.
     pub max_stiffness: f64,
-    /// What the maker would say, N s/m. Default: infinite.
+    /// Maximum damping as a maker would state it, N s/m. Default: infinite.
     pub max_damping: f64,
-    /// From a command to the force, beyond the hold, in whole periods; at most 63. Default: 0.
+    /// Delay from a command to the force beyond the hold, in whole periods, at most 63. Default: 0.
     pub delay_periods: usize,
-    /// Length of a period that is assumed when the delay is declared, s. Default: 0.001.
+    /// Length of a period that the declared delay assumes, s. Default: 0.001.
     pub period: f64,
     /// Integration rate, Hz, at least 20,000. Default: 20,000.
     pub integration_rate: f64,
@@ -59,7 +59,8 @@ impl Default for VirtualConfig {
 }
 
 impl VirtualConfig {
-    /// Like a 3D Systems Touch: 3.3 N, 400 N/m, 4 N s/m. Mass, damping, friction and encoder are estimates.
+    /// Properties like a 3D Systems Touch: 3.3 N, 400 N/m, 4 N s/m. Mass, damping, friction and
+    /// encoder are estimates.
     pub fn touch() -> Self {
         Self {
             name: "virtual Touch",
@@ -75,12 +76,12 @@ impl VirtualConfig {
         }
     }
 
-    /// Like a PHANTOM Omni: 3.3 N, 700 N/m, 5 N s/m. The rest is estimated.
+    /// Properties like a PHANTOM Omni: 3.3 N, 700 N/m, 5 N s/m. The rest is estimated.
     pub fn omni() -> Self {
         Self { name: "virtual Omni", max_stiffness: 700.0, max_damping: 5.0, ..Self::touch() }
     }
 
-    /// Like a PHANTOM Premium 1.5: 8.5 N, 800 N/m, 5 N s/m. The rest is estimated.
+    /// Properties like a PHANTOM Premium 1.5: 8.5 N, 800 N/m, 5 N s/m. The rest is estimated.
     pub fn premium() -> Self {
         Self {
             name: "virtual Premium 1.5",
@@ -96,7 +97,7 @@ impl VirtualConfig {
         }
     }
 
-    /// Like an omega.3: 12 N, 5000 N/m, 30 N s/m. The rest is estimated.
+    /// Properties like an omega.3: 12 N, 5000 N/m, 30 N s/m. The rest is estimated.
     pub fn omega3() -> Self {
         Self {
             name: "virtual omega.3",
@@ -112,7 +113,7 @@ impl VirtualConfig {
         }
     }
 
-    /// What the device would say of itself.
+    /// Returns the properties as the device reports them.
     pub fn info(&self) -> DeviceInfo {
         DeviceInfo {
             name: self.name.into(),
@@ -136,7 +137,7 @@ impl VirtualConfig {
     }
 }
 
-/// Moves the hand of a [`VirtualDevice`] device from another thread, and plays tricks on it.
+/// Moves the hand of a [`VirtualDevice`] from another thread and simulates failures of the device.
 #[derive(Debug, Clone, Default)]
 pub struct VirtualHandle {
     shared: Arc<Shared>,
@@ -151,7 +152,7 @@ struct Shared {
 }
 
 impl VirtualHandle {
-    /// Where the arm wants the hand, m, device axes. A number that is not finite is refused.
+    /// Sets the target of the arm, m, device axes. A target that is not finite is refused.
     pub fn set_target(&self, target: [f64; 3]) {
         if target.iter().all(|x| x.is_finite()) {
             for (cell, x) in self.shared.target.iter().zip(target) {
@@ -160,31 +161,33 @@ impl VirtualHandle {
         }
     }
 
-    /// Where the arm wants the hand, m, device axes.
+    /// Returns the target of the arm, m, device axes.
     pub fn target(&self) -> [f64; 3] {
         std::array::from_fn(|i| f64::from_bits(self.shared.target[i].load(Ordering::Relaxed)))
     }
 
-    /// Presses these buttons (bits) and no others.
+    /// Presses exactly these buttons (bits).
     pub fn set_buttons(&self, buttons: u32) {
         self.shared.buttons.store(buttons, Ordering::Relaxed);
     }
 
-    /// Pulls the plug, or puts it back.
+    /// Unplugs the device or plugs it in again.
     pub fn set_gone(&self, gone: bool) {
         self.shared.gone.store(gone, Ordering::Relaxed);
     }
 
-    /// Lets the measurement stand still while the device goes on.
+    /// Freezes the measurement while the device keeps moving.
     pub fn set_frozen(&self, frozen: bool) {
         self.shared.frozen.store(frozen, Ordering::Relaxed);
     }
 }
 
-/// A device and the hand on it, in simulation: `(M + m) x'' = F + f - b x' + B (v0 - x') + K (x0 - x)`, friction `f`, held force `F`.
+/// A simulated device with a hand: `(M + m) x'' = F + f - b x' + B (v0 - x') + K (x0 - x)`, with
+/// the friction `f` and the held force `F`.
 ///
-/// Integrated in closed form between the substeps (20 kHz or more), so that without friction nothing is lost or gained by integration: what is
-/// unstable here is unstable by the loop's own doing.
+/// The motion is integrated in closed form between the substeps (20 kHz or more). Without friction,
+/// the integration therefore neither loses nor gains energy, and any instability comes from the
+/// loop.
 #[derive(Debug)]
 pub struct VirtualDevice {
     config: VirtualConfig,
@@ -194,7 +197,7 @@ pub struct VirtualDevice {
     velocity: Vector3<f64>,
     last_target: Option<Vector3<f64>>,
     coefficients: Option<(f64, Coefficients)>,
-    /// Commands on their way to the motors.
+    /// Commands that have not reached the motors yet.
     line: [Vector3<f64>; 64],
     head: usize,
     force: Vector3<f64>,
@@ -204,10 +207,10 @@ pub struct VirtualDevice {
 }
 
 impl VirtualDevice {
-    /// A device at rest in the middle of its workspace.
+    /// Creates a device at rest in the center of its workspace.
     ///
     /// # Errors
-    /// A number that cannot be worked with, in the device or the hand.
+    /// Returns an error if a number of the device or the hand is out of range.
     pub fn new(config: VirtualConfig, hand: Hand) -> Result<Self, InfoError> {
         config.info().check()?;
         if !(config.integration_rate.is_finite() && config.integration_rate >= 20_000.0) {
@@ -239,43 +242,44 @@ impl VirtualDevice {
         })
     }
 
-    /// To move its hand with while the loop has the device.
+    /// Returns the handle that moves the hand while the loop owns the device.
     pub fn handle(&self) -> VirtualHandle {
         self.handle.clone()
     }
 
-    /// Where the handle really is, m.
+    /// Returns the true position of the handle, m.
     pub fn position(&self) -> [f64; 3] {
         self.position.into()
     }
 
-    /// How fast it really is, m/s.
+    /// Returns the true velocity of the handle, m/s.
     pub fn velocity(&self) -> [f64; 3] {
         self.velocity.into()
     }
 
-    /// Force of the motors in the last period, N.
+    /// Returns the force of the motors in the last period, N.
     pub fn force(&self) -> [f64; 3] {
         self.force.into()
     }
 
-    /// Work that the motors have done on the hand, J: exact, as the force is constant within a period.
+    /// Returns the work that the motors have done on the hand, J. The value is exact because the
+    /// force is constant within a period.
     pub fn work(&self) -> f64 {
         self.work
     }
 
-    /// Kinetic energy of handle and hand, J.
+    /// Returns the kinetic energy of handle and hand, J.
     pub fn kinetic_energy(&self) -> f64 {
         0.5 * (self.config.mass + self.hand.mass) * self.velocity.norm_squared()
     }
 
-    /// Puts it somewhere, with a velocity.
+    /// Sets the position and the velocity of the handle.
     pub fn place(&mut self, position: [f64; 3], velocity: [f64; 3]) {
         self.position = position.into();
         self.velocity = velocity.into();
     }
 
-    /// Another grip.
+    /// Changes the grip. An invalid grip is refused.
     pub fn set_hand(&mut self, hand: Hand) {
         if hand.is_valid() {
             self.hand = hand;
@@ -283,7 +287,7 @@ impl VirtualDevice {
         }
     }
 
-    /// The measurement: where the handle is, rounded to the encoder's step.
+    /// Returns the measured position, rounded to the encoder's step.
     fn measured(&self) -> Vector3<f64> {
         let step = self.config.resolution;
         if step > 0.0 { self.position.map(|x| (x / step).round() * step) } else { self.position }
@@ -294,7 +298,7 @@ impl VirtualDevice {
         if !(dt.is_finite() && dt > 0.0) {
             return;
         }
-        // A second of standstill is enough for anybody: nothing is gained by integrating a night in the debugger.
+        // A longer standstill, such as a night in the debugger, is not worth integrating.
         let dt = dt.min(1.0);
         let command = Vector3::from(force).map(|x| if x.is_finite() { x } else { 0.0 });
         self.head = (self.head + 1) % self.line.len();
@@ -305,7 +309,7 @@ impl VirtualDevice {
         let target = Vector3::from(self.handle.target());
         let from = self.last_target.unwrap_or(target);
         self.last_target = Some(target);
-        // Nothing but held forces: the closed form needs no substeps.
+        // With only held forces, the closed form needs no substeps.
         let exact =
             self.config.friction == 0.0 && (target == from || self.hand.stiffness + self.hand.damping == 0.0);
         let steps = if exact { 1.0 } else { (dt * self.config.integration_rate).ceil().max(1.0) };
@@ -316,7 +320,7 @@ impl VirtualDevice {
             _ => {
                 let omega = (self.hand.stiffness / mass).sqrt();
                 let damping = (self.config.damping + self.hand.damping) / mass;
-                // Checked in `new`: the numbers are finite and not negative.
+                // `new` has checked that the numbers are finite and not negative.
                 let Ok(c) = Coefficients::new(Integrator::Exact, omega, damping, h) else { return };
                 self.coefficients = Some((h, c));
                 c
@@ -326,7 +330,7 @@ impl VirtualDevice {
         let start = self.position;
         let steps = steps as usize;
         for k in 0..steps {
-            // The arm moves on evenly within the period.
+            // The arm moves evenly within the period.
             let arm = from + (target - from) * ((k as f64 + 0.5) / steps as f64);
             let push = (self.force + self.hand.stiffness * arm + self.hand.damping * arm_speed) / mass;
             let before = (self.position, self.velocity);
@@ -336,7 +340,7 @@ impl VirtualDevice {
                 self.velocity[i] = v;
             }
             if self.config.friction > 0.0 {
-                // Coulomb: takes at most f h / M of speed, and stops what it can stop.
+                // Coulomb friction reduces the speed by at most f h / M, and does not reverse it.
                 let most = self.config.friction * h / mass;
                 let speed = self.velocity.norm();
                 let lost = if speed > most { self.velocity * (most / speed) } else { self.velocity };
@@ -392,7 +396,8 @@ mod tests {
 
     #[test]
     fn energy_is_exact() {
-        // No damping, no friction, no hand: what the motors put in is what the handle has.
+        // Without damping, friction and a hand, the energy from the motors is the kinetic energy of
+        // the handle.
         let mut device =
             VirtualDevice::new(VirtualConfig { damping: 0.0, ..VirtualConfig::default() }, Hand::NONE)
                 .unwrap();
@@ -411,9 +416,9 @@ mod tests {
         for _ in 0..2000 {
             device.advance([1.0, 0.0, 0.0], 1e-3);
         }
-        // x0 + F / K = 10 mm + 2 mm.
+        // The position is x0 + F / K = 10 mm + 2 mm.
         assert!((device.position()[0] - 0.012).abs() < 1e-9, "{:?}", device.position());
-        // Friction holds against a force below it.
+        // Friction holds against a force that is smaller.
         let config = VirtualConfig { friction: 0.3, ..VirtualConfig::default() };
         let mut device = VirtualDevice::new(config, Hand::NONE).unwrap();
         for _ in 0..100 {

@@ -1,4 +1,4 @@
-//! The devices that are running, and what they say.
+//! The running devices and their status.
 
 use std::sync::atomic::{AtomicBool, Ordering};
 
@@ -9,29 +9,30 @@ use crate::{
     Record, StartError, StopSwitch, ToolMap,
 };
 
-/// Names a device among the [`HapticDevices`]. Never used twice.
+/// Identifies a device among the [`HapticDevices`]. An identifier is never used twice.
 #[derive(Reflect, Debug, Clone, Copy, PartialEq, Eq, Hash, PartialOrd, Ord)]
 pub struct DeviceId(u32);
 
-/// The haptic devices in use. Each runs its loop on a thread of its own until it is removed.
+/// The haptic devices in use. Each device runs its loop on its own thread until the app removes the
+/// device.
 #[derive(Resource, Default)]
 pub struct HapticDevices {
     entries: Vec<Entry>,
     next: u32,
-    /// The emergency stop, for devices that come later too.
+    /// Whether the emergency stop is latched. It also applies to devices that are added later.
     stopped: AtomicBool,
-    /// Buttons of devices that have been taken away while they were down.
+    /// Release messages for buttons that were down when their device was removed.
     left_down: Vec<HapticButton>,
 }
 
-/// What is known of a device, as of this frame.
+/// Status of a device in this frame.
 #[derive(Debug, Clone)]
 pub struct DeviceStatus {
-    /// What it is.
+    /// Description of the device.
     pub info: DeviceInfo,
-    /// Coupling in force, what was wanted and what clamped it.
+    /// The coupling in force, the wanted coupling and the limits that apply.
     pub coupling: Coupling,
-    /// State, wrench, rate, jitter, energy, faults.
+    /// State, wrench, rate, jitter, energy and faults.
     pub report: LoopReport,
 }
 
@@ -41,12 +42,12 @@ pub(crate) struct Entry {
     pub(crate) status: DeviceStatus,
     pub(crate) writer: ModelWriter,
     pub(crate) map: Option<ToolMap>,
-    /// The tick of the loop whose tool position the simulation has, s.
+    /// Time of the loop's tick whose tool position the simulation has, s.
     pub(crate) seen: f64,
-    /// What the body that the loop steps itself was made for; the default: it has none.
+    /// Inputs of the body copy that the loop steps itself. The default means that there is no copy.
     pub(crate) modal_for: super::local_model::CopyOf,
     pub(crate) elsewhere: super::local_model::Elsewhere,
-    /// Buttons that the app has been told are down.
+    /// Buttons that are down according to the messages so far.
     pressed: u32,
     stop: StopSwitch,
 }
@@ -54,38 +55,39 @@ pub(crate) struct Entry {
 /// A button of a device went down or came up.
 #[derive(Message, Debug, Clone, Copy, PartialEq)]
 pub struct HapticButton {
-    /// Whose.
+    /// The device.
     pub device: DeviceId,
-    /// Which, from 0.
+    /// The button, from 0.
     pub button: u32,
-    /// Down.
+    /// Whether the button is down.
     pub pressed: bool,
 }
 
-/// A fault of a device began; the force fades and comes back by itself once it is over.
+/// A fault of a device began or ended. The force fades, and it comes back by itself after the end
+/// of the fault.
 #[derive(Message, Debug, Clone, Copy, PartialEq)]
 pub struct HapticFault {
-    /// Whose.
+    /// The device.
     pub device: DeviceId,
-    /// What; `None`: the last one is over.
+    /// The fault. `None` means that the last fault is over.
     pub fault: Option<Fault>,
 }
 
-/// A device was lost, came back, or needs a hand.
+/// A device was lost, came back or needs manual calibration.
 #[derive(Message, Debug, Clone, Copy, PartialEq)]
 pub struct HapticNotice {
-    /// Which.
+    /// The device.
     pub device: DeviceId,
-    /// [`LoopEvent::Lost`], [`LoopEvent::Returned`] or [`LoopEvent::Calibrate`].
+    /// The event: [`LoopEvent::Lost`], [`LoopEvent::Returned`] or [`LoopEvent::Calibrate`].
     pub event: LoopEvent,
 }
 
 impl HapticDevices {
-    /// Takes a device into use: its loop starts at once. Under a latched [`estop`](Self::estop) it gives no force until the
-    /// [`reset_stop`](Self::reset_stop).
+    /// Adds a device and starts its loop at once. While an [`estop`](Self::estop) is latched, the
+    /// device gives no force until [`reset_stop`](Self::reset_stop).
     ///
     /// # Errors
-    /// As [`HapticLoop::start`].
+    /// Returns the errors of [`HapticLoop::start`].
     pub fn add(
         &mut self,
         device: impl HapticDevice + 'static,
@@ -93,7 +95,7 @@ impl HapticDevices {
     ) -> Result<DeviceId, StartError> {
         let mut running = HapticLoop::start(device, config)?;
         if self.is_stopped() {
-            // It has no word of the simulation yet, and so no force either.
+            // The loop has no local model yet, and so it exerts no force before the stop.
             running.emergency_stop();
         }
         let id = DeviceId(self.next);
@@ -118,8 +120,8 @@ impl HapticDevices {
         Ok(id)
     }
 
-    /// Stops a device and gives it back to nobody: its buttons come up, and its tools let go of what they hold in the next frame. `false`: there is
-    /// none of that name.
+    /// Stops and removes a device. Its buttons come up, and its tools release their grabs in the
+    /// next frame. Returns `false` if there is no such device.
     pub fn remove(&mut self, id: DeviceId) -> bool {
         let Some(entry) = self.entries.iter().position(|e| e.id == id) else { return false };
         let down = self.entries.remove(entry).pressed;
@@ -131,18 +133,19 @@ impl HapticDevices {
         true
     }
 
-    /// What is known of a device.
+    /// Returns the status of a device.
     pub fn get(&self, id: DeviceId) -> Option<&DeviceStatus> {
         self.entries.iter().find(|e| e.id == id).map(|e| &e.status)
     }
 
-    /// All devices, oldest first.
+    /// Returns all devices, oldest first.
     pub fn iter(&self) -> impl Iterator<Item = (DeviceId, &DeviceStatus)> {
         self.entries.iter().map(|e| (e.id, &e.status))
     }
 
-    /// Emergency stop: no force on any device from its loop's next period on, nor on any that is added later. Latched until
-    /// [`reset_stop`](Self::reset_stop).
+    /// Presses the emergency stop of all devices. Each loop exerts no force from its next period
+    /// on. The stop is latched until [`reset_stop`](Self::reset_stop), and it also applies to
+    /// devices that are added later.
     pub fn estop(&self) {
         self.stopped.store(true, Ordering::Release);
         for entry in &self.entries {
@@ -150,12 +153,13 @@ impl HapticDevices {
         }
     }
 
-    /// Whether the emergency stop is latched.
+    /// Returns whether the emergency stop is latched.
     pub fn is_stopped(&self) -> bool {
         self.stopped.load(Ordering::Acquire)
     }
 
-    /// Unlatches the emergency stop of all devices; forces come back by their ramps. It stays latched where a loop was too busy to be told.
+    /// Unlatches the emergency stop of all devices. The forces then rise by their ramps. The stop
+    /// stays latched if the queue of a loop was full.
     pub fn reset_stop(&mut self) {
         self.stopped.store(false, Ordering::Release);
         for entry in &mut self.entries {
@@ -166,12 +170,13 @@ impl HapticDevices {
         }
     }
 
-    /// Begins or ends the writing down of a device's periods. `false`: no such device, or its loop is busy.
+    /// Starts or stops the recording of a device's periods. Returns `false` if there is no such
+    /// device or the queue of its loop is full.
     pub fn set_recording(&mut self, id: DeviceId, on: bool) -> bool {
         self.entry(id).is_some_and(|e| e.running.get().set_recording(on))
     }
 
-    /// What has been written down since the last call.
+    /// Returns the records since the last call.
     pub fn records(&mut self, id: DeviceId) -> Vec<Record> {
         self.entry(id).map(|e| e.running.get().records().collect()).unwrap_or_default()
     }

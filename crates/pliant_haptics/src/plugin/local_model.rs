@@ -1,4 +1,4 @@
-//! After a tick: what the simulation tells each device's loop.
+//! Publishes the local model to each device's loop after a tick.
 
 use std::sync::Arc;
 
@@ -10,7 +10,8 @@ use pliant_modal::{BodyConfig, GrabConfig, GrabId, ModalModel, Patch};
 use super::{HapticDevices, HapticTool, ToolGrabs, ToolOffset};
 use crate::{Coupling, HeldGrab, LocalModel, MAX_CONTACTS, ModalLocal, PublishedGrab};
 
-/// A body that somebody else steps and of which nothing new has come for so long is one that the network has lost, s: four of its ticks at 40 Hz.
+/// Time without a new state after which a body that is stepped elsewhere counts as lost, s: four of
+/// its ticks at 40 Hz.
 const REMOTE_PATIENCE: f64 = 0.1;
 
 type HeldItem<'w> = (Entity, &'w GrabOf, &'w Grab, &'w GrabForce, Option<&'w ToolOffset>);
@@ -19,15 +20,17 @@ type HeldGrabs<'w, 's> =
 type Bodies<'w, 's> =
     Query<'w, 's, (&'static BodyState, &'static Driven, &'static VisualState, &'static GlobalTransform)>;
 
-/// What a local copy of a body was made for and from. Any other one asks for another copy.
+/// Inputs of a local copy of a body. A change of any of them requires a new copy.
 #[derive(Default, PartialEq)]
 pub(crate) struct CopyOf {
     grabs: Vec<u64>,
-    /// All grabs on the body: the copy has the others' too, and they come and go.
+    /// All grabs on the body. The copy also has the grabs of others, which come and go.
     all: Vec<GrabId>,
-    /// The model by its place in memory, which the copy that has it keeps from being another's.
+    /// Address of the model. The copy keeps the model alive, so no other model can have this
+    /// address.
     model: usize,
-    /// Without the step, which the loop has its own of: in a schedule of the picture's rate it differs each time.
+    /// Settings without the step, because the loop has a step of its own. In a schedule at frame
+    /// rate, the step differs each time.
     config: Option<BodyConfig>,
     coupling: Option<Coupling>,
 }
@@ -44,7 +47,8 @@ impl CopyOf {
     }
 }
 
-/// A grab on a body elsewhere, the body as it was when its spring was found, and the spring.
+/// A grab on a body that is stepped elsewhere, the body's model and settings when its spring was
+/// computed, and the spring.
 struct Spring {
     of: Entity,
     grab: Grab,
@@ -53,17 +57,17 @@ struct Spring {
     stiffness: Matrix3<f64>,
 }
 
-/// What is known of the tool's grabs on bodies that are stepped elsewhere.
+/// State of the tool's grabs on bodies that are stepped elsewhere.
 #[derive(Default)]
 pub(crate) struct Elsewhere {
     springs: Vec<(Entity, Spring)>,
-    /// The newest of the held bodies' shown states, and when it came, s.
+    /// Version of the held bodies' visual states, and the time of its last change, s.
     version: u64,
     at: f64,
 }
 
 impl Elsewhere {
-    /// Whether something new of the held bodies has come lately.
+    /// Returns whether the held bodies have received a new state recently.
     fn is_alive(&mut self, held: &[HeldItem], bodies: &Bodies, now: f64) -> bool {
         let remote = held.iter().filter_map(|(_, of, ..)| bodies.get(of.0).ok());
         let mut remote = remote.filter(|(_, driven, ..)| **driven == Driven::Remote).peekable();
@@ -78,7 +82,8 @@ impl Elsewhere {
         now - self.at <= REMOTE_PATIENCE
     }
 
-    /// The spring that ties a patch to the hand there, N/m, body axes: as a grab of that kind on a copy of the body would have it.
+    /// Returns the stiffness of the spring that ties a patch to the hand, N/m, body axes. The
+    /// spring is that of such a grab on a copy of the body.
     fn spring(&mut self, entity: Entity, of: Entity, grab: &Grab, state: &BodyState) -> Matrix3<f64> {
         let config = BodyConfig { step: 0.0, ..state.body().config().clone() };
         let same = |known: &Spring| {
@@ -116,7 +121,7 @@ pub(crate) fn publish(
 ) {
     let period = time.delta_secs_f64();
     if period <= 0.0 {
-        // Paused: the simulation is silent, and the loop fades.
+        // While the game is paused, no updates are published and the loop fades the force.
         return;
     }
     let speed = simulated.map_or(1.0, |time| f64::from(time.relative_speed()));
@@ -144,7 +149,7 @@ pub(crate) fn publish(
             let felt: Vec<PublishedGrab> = held
                 .iter()
                 .filter_map(|(entity, of, grab, force, offset)| {
-                    // Nothing is known of it yet, or any more: the session has not answered, or is over.
+                    // The force is unknown: the session has not answered yet, or it is over.
                     if **force == GrabForce::default() {
                         return None;
                     }
@@ -169,7 +174,8 @@ pub(crate) fn publish(
             entry.running.get().publish(write);
         }
 
-        // A body for the loop to step itself: made here, where memory may be had, whenever what is held changes.
+        // The copy of the body for the loop is created here, where allocation is allowed, whenever
+        // the held grabs change.
         let local = local.filter(|_| tool.modal);
         let wanted = local.as_ref().map_or_else(CopyOf::default, |(s, ids)| CopyOf::new(s, ids, &coupling));
         if wanted != entry.modal_for {
@@ -190,7 +196,8 @@ pub(crate) fn publish(
     }
 }
 
-/// What the held bodies could give back, J: the elastic energy of the shapes shown, as nothing else is known of a body elsewhere.
+/// Returns the energy that the held bodies could give back, J. For a body that is stepped
+/// elsewhere, this is the elastic energy of its visual state, because nothing else is known.
 fn stored(held: &[HeldItem], bodies: &Bodies) -> f64 {
     let mut counted: Vec<Entity> = Vec::new();
     let mut sum = 0.0;
@@ -211,7 +218,8 @@ fn stored(held: &[HeldItem], bodies: &Bodies) -> f64 {
     sum
 }
 
-/// A grab's name for the loop: another entity is another grab, and so is the same one on another body.
+/// Returns the loop's key of a grab. The key differs for another entity, and also for the same
+/// entity on another body.
 fn key(grab: Entity, of: &GrabOf) -> u64 {
     grab.to_bits() ^ of.0.to_bits().rotate_left(23)
 }
@@ -221,7 +229,7 @@ fn world_axes(place: &GlobalTransform) -> Matrix3<f64> {
     Matrix3::from_column_slice(&m)
 }
 
-/// The one body that everything is held on, if it is one and stepped here, and the solver's names of the grabs.
+/// Returns the body and the solver's grabs, if all grabs are on one body and it is stepped here.
 fn single_body<'a>(held: &[HeldItem], bodies: &'a Bodies) -> Option<(&'a BodyState, Vec<HeldGrab>)> {
     let (_, of, ..) = held.first()?;
     if held.iter().any(|(_, other, ..)| other.0 != of.0) {

@@ -1,4 +1,5 @@
-//! The Bevy plugin: devices as a resource, tools and what they hold as components, buttons and faults as messages.
+//! The Bevy plugin: devices as a resource, tools and grabs as components, buttons and faults as
+//! messages.
 //!
 //! ```no_run
 //! use bevy::prelude::*;
@@ -46,30 +47,32 @@ pub use source::GamepadSource;
 pub use source::{PointerSource, PointerToolSystems};
 pub use tool::{HapticTool, HeldBy, ToolGrabs, ToolGrip, ToolOffset, ToolPose};
 
-/// What the plugin does in a tick, around [`PliantSystems`].
+/// The steps of the plugin in a tick, around [`PliantSystems`].
 #[derive(SystemSet, Debug, Clone, PartialEq, Eq, Hash)]
 pub enum HapticSystems {
-    /// Before [`PliantSystems::Input`]: tools take the devices' places, and what they hold takes theirs.
+    /// Before [`PliantSystems::Input`]: tools take the poses of their devices, and grabs take their
+    /// targets from the tools.
     Move,
-    /// After [`PliantSystems::Publish`]: each device's loop gets the simulation's word.
+    /// After [`PliantSystems::Publish`]: each device's loop gets the local model update.
     Word,
 }
 
-/// Haptic devices, their tools and grabs. Needs `PliantBodyPlugin`; on bodies that somebody else steps (a session over a network) a hand feels
-/// what that session publishes.
+/// Adds haptic devices, their tools and grabs. The plugin needs `PliantBodyPlugin`. On a body that
+/// is stepped elsewhere (a session over a network), the force on the hand comes from what the
+/// session publishes.
 pub struct HapticsPlugin {
     schedule: InternedScheduleLabel,
 }
 
 impl HapticsPlugin {
-    /// In the schedule that the bodies are stepped in.
+    /// Creates the plugin for the schedule that steps the bodies.
     pub fn new(schedule: impl ScheduleLabel) -> Self {
         Self { schedule: schedule.intern() }
     }
 }
 
 impl Default for HapticsPlugin {
-    /// In `FixedUpdate`.
+    /// Creates the plugin for `FixedUpdate`.
     fn default() -> Self {
         Self::new(FixedUpdate)
     }
@@ -91,7 +94,7 @@ impl Plugin for HapticsPlugin {
             .add_message::<HapticNotice>()
             .configure_sets(self.schedule, HapticSystems::Move.before(PliantSystems::Input))
             .configure_sets(self.schedule, HapticSystems::Word.after(PliantSystems::Publish))
-            // Every frame, whether the game is paused or not: buttons, faults and states.
+            // Buttons, faults and states are read every frame, even while the game is paused.
             .add_systems(
                 PreUpdate,
                 (

@@ -1,4 +1,4 @@
-//! Gamepads that buzz: Bevy's rumble as a [`VibrationOutput`].
+//! Vibration of gamepads: Bevy's rumble as a [`VibrationOutput`].
 
 use std::{
     sync::mpsc::{Receiver, Sender, channel},
@@ -14,7 +14,7 @@ use bevy::{
 use super::{HapticDevices, HapticTool};
 use crate::VibrationOutput;
 
-/// Where vibrations are asked for; requests go out once a frame.
+/// Source of [`GamepadVibration`] outputs. Their requests are sent once per frame.
 #[derive(Resource)]
 pub struct Rumble {
     sender: Sender<GamepadRumbleRequest>,
@@ -29,13 +29,13 @@ impl Default for Rumble {
 }
 
 impl Rumble {
-    /// The motors of `gamepad`. To be kept by whoever makes it buzz, on any thread.
+    /// Returns the vibration output of `gamepad`. The caller keeps it and may use it on any thread.
     pub fn output(&self, gamepad: Entity) -> GamepadVibration {
         GamepadVibration { gamepad, sender: self.sender.clone() }
     }
 }
 
-/// A gamepad's motors.
+/// The motors of a gamepad.
 #[derive(Debug, Clone)]
 pub struct GamepadVibration {
     gamepad: Entity,
@@ -48,7 +48,7 @@ impl VibrationOutput for GamepadVibration {
         let part = |x: f64| within(x, 1.0) as f32;
         let duration = Duration::from_secs_f64(within(seconds, 60.0));
         let intensity = GamepadRumbleIntensity { strong_motor: part(strong), weak_motor: part(weak) };
-        // Nobody listens any more: the app is ending.
+        // A send error means that the receiver is gone because the app is ending.
         let _ = self.sender.send(GamepadRumbleRequest::Add { duration, intensity, gamepad: self.gamepad });
     }
 
@@ -57,24 +57,25 @@ impl VibrationOutput for GamepadVibration {
     }
 }
 
-/// On a tool: a gamepad that buzzes as hard as the tool pulls. No force, and no direction: a hint of one.
+/// Makes a gamepad vibrate in proportion to the force of its tool. The vibration is only a hint of
+/// the force and has no direction.
 #[derive(Component, Reflect, Debug, Clone, Copy, PartialEq)]
 #[reflect(Component, Clone, PartialEq)]
 pub struct ToolRumble {
     /// The gamepad's entity.
     pub gamepad: Entity,
-    /// Force at which it buzzes with all it has, N. Default: 3.
+    /// Force at which the gamepad vibrates at full strength, N. Default: 3.
     pub full: f64,
 }
 
 impl ToolRumble {
-    /// Of `gamepad`, all it has at 3 N.
+    /// Creates the component for `gamepad`, with full strength at 3 N.
     pub fn new(gamepad: Entity) -> Self {
         Self { gamepad, full: 3.0 }
     }
 }
 
-/// Time between two words to the motors, s: they are slower than that.
+/// Interval of the requests to the motors, s. The motors respond more slowly than this interval.
 const EVERY: f64 = 0.05;
 
 pub(crate) fn follow_force(

@@ -1,23 +1,23 @@
-//! The force on screen, for hands that cannot feel it and for people who look over one's shoulder.
+//! Drawing of the force on screen, for players without force feedback and for spectators.
 
 use bevy::{math::DVec3, prelude::*};
 use pliant_body::{Grab, GrabForce};
 
 use super::{HapticTool, ToolGrabs, ToolPose};
 
-/// On a tool: its place, its springs and its force are drawn.
+/// Draws the position, the springs and the force of its tool.
 #[derive(Component, Reflect, Debug, Clone, Copy, PartialEq)]
 #[reflect(Component, Default, Clone, PartialEq)]
 pub struct ForceArrow {
-    /// Length of the arrow for a newton, m of the world. Default: `0.05`.
+    /// Length of the arrow per newton, m of the world. Default: `0.05`.
     pub per_newton: f32,
-    /// Longest arrow, m. Default: `0.5`.
+    /// Maximum length of the arrow, m. Default: `0.5`.
     pub longest: f32,
     /// Radius of the ball at the tool point, m. Default: `0.008`.
     pub radius: f32,
     /// Color of the arrow. Default: red.
     pub color: Color,
-    /// Color of the tool and of the lines to what it holds. Default: a warm yellow.
+    /// Color of the tool and of the lines to the held patches. Default: a warm yellow.
     pub tool: Color,
 }
 
@@ -34,7 +34,8 @@ impl Default for ForceArrow {
 }
 
 impl ForceArrow {
-    /// The arrow of a force `force` (N, device axes) on a tool turned by `rotation`: from the tool point, m of the world.
+    /// Returns the arrow of the force `force` (N, device axes) on a tool turned by `rotation`. The
+    /// arrow starts at the tool point and is in m of the world.
     pub fn arrow(&self, rotation: Quat, force: DVec3) -> Vec3 {
         let arrow = rotation * (force.as_vec3() * self.per_newton);
         if arrow.is_finite() { arrow.clamp_length_max(self.longest.max(0.0)) } else { Vec3::ZERO }

@@ -1,4 +1,5 @@
-//! Pointer and gamepad as hands: they move a [`Positioned`](crate::Positioned) device, and the force is shown where nobody can feel it.
+//! Pointer and gamepad as hands. They move a [`Positioned`](crate::Positioned) device, and the
+//! force is only drawn.
 
 use bevy::{
     math::{DQuat, DVec3},
@@ -9,29 +10,33 @@ use pliant_body::UnderPointer;
 use super::{HapticDevices, HapticTool, ToolGrabs, ToolPose};
 use crate::PositionedHandle;
 
-/// On a tool: the pointer moves it.
+/// Lets the pointer move its tool.
 ///
-/// With its hands empty the tool lies on the surface under the pointer; holding something, it moves in the plane that faces the camera. The left, right and middle buttons are 0, 1 and 2. A scene with a
-/// [`PointerGrabPlugin`](pliant_body::PointerGrabPlugin) switches that off (`PointerGrab::enabled`), or both take hold.
+/// While the tool holds nothing, it lies on the surface under the pointer. While it holds
+/// something, it moves in the plane that faces the camera. The left, right and middle buttons are
+/// 0, 1 and 2. A scene with a [`PointerGrabPlugin`](pliant_body::PointerGrabPlugin) must disable
+/// that plugin (`PointerGrab::enabled`), or both grab the body.
 #[derive(Component, Debug, Clone)]
 pub struct PointerSource {
     handle: PositionedHandle,
-    /// The camera that is looked through. Default: the front-most active one of the window with a body under the pointer; where there is none,
-    /// the one before.
+    /// The camera of the view. Default: the front-most active camera of the window with a body
+    /// under the pointer. If there is none, the previous camera stays.
     pub camera: Option<Entity>,
-    /// The camera that a body was last seen through.
+    /// The camera that last showed a body under the pointer.
     through: Option<Entity>,
 }
 
 impl PointerSource {
-    /// For the device that `handle` moves.
+    /// Creates the component for the device that `handle` moves.
     pub fn new(handle: PositionedHandle) -> Self {
         Self { handle, camera: None, through: None }
     }
 }
 
-/// How the pointer moves tools, in `PreUpdate` after the input of the frame. An interface that wants the pointer for itself gates the press and only the
-/// press, so that what is held is always let go:
+/// System sets of the pointer's tools, in `PreUpdate` after the input of the frame.
+///
+/// A user interface that takes the pointer should gate the `Press` set and no other, so that held
+/// patches are always released:
 ///
 /// ```
 /// # use bevy::prelude::*;
@@ -42,13 +47,14 @@ impl PointerSource {
 /// ```
 #[derive(SystemSet, Debug, Clone, PartialEq, Eq, Hash)]
 pub enum PointerToolSystems {
-    /// A button that goes down in the scene is the tools' until it comes up.
+    /// A button that goes down in the scene belongs to the tools until it comes up.
     Press,
-    /// The tools follow the pointer, with the buttons that are theirs.
+    /// The tools follow the pointer, with the buttons that belong to them.
     Move,
 }
 
-/// The pointer's buttons that went down in the scene and are held still, the left, right and middle one in the lowest bits.
+/// The pointer buttons that went down in the scene and are still down. The left, right and middle
+/// buttons are the lowest bits.
 #[derive(Resource, Default, PartialEq)]
 pub(crate) struct PointerButtons(u32);
 
@@ -63,12 +69,13 @@ pub(crate) fn press(buttons: Option<Res<ButtonInput<MouseButton>>>, mut taken: R
     taken.set_if_neq(PointerButtons(taken.0 | pressed));
 }
 
-/// On a tool: a gamepad moves it. The left stick moves right and away, the right stick up; buttons South, East, West, North and the triggers are 0 to 5.
+/// Lets a gamepad move its tool. The left stick moves the tool right and away, the right stick up.
+/// The buttons South, East, West, North and the triggers are 0 to 5.
 #[cfg(feature = "gamepad")]
 #[derive(Component, Debug, Clone)]
 pub struct GamepadSource {
     handle: PositionedHandle,
-    /// The gamepad's entity. Default: the first there is.
+    /// The gamepad's entity. Default: the first gamepad.
     pub gamepad: Option<Entity>,
     /// Speed at full deflection, m/s of the device. Default: `0.15`.
     pub speed: f64,
@@ -77,7 +84,7 @@ pub struct GamepadSource {
 
 #[cfg(feature = "gamepad")]
 impl GamepadSource {
-    /// For the device that `handle` moves.
+    /// Creates the component for the device that `handle` moves.
     pub fn new(handle: PositionedHandle) -> Self {
         Self { handle, gamepad: None, speed: 0.15, place: DVec3::ZERO }
     }
@@ -107,13 +114,13 @@ pub(crate) fn point(
                 .map(|(camera, _)| camera)
                 .find(|camera| wanted.is_none_or(|wanted| wanted == *camera))
         };
-        // Until a body was seen any camera is as good as the other.
+        // Until a body was under the pointer, any camera will do.
         let front = match source.camera {
             None => source.through.and_then(|last| under(Some(last))).or_else(|| under(None)),
             wanted => under(wanted),
         };
         let Some((ray, camera)) = front.and_then(|camera| pointer.through(camera)) else {
-            // Outside the window the hand waits where it is; its buttons still come up.
+            // Outside the window the hand stays where it is, but its buttons still come up.
             source.handle.set_buttons(bits);
             continue;
         };
@@ -123,11 +130,13 @@ pub(crate) fn point(
         };
         let hit = hit.map(|hit| hit.ray.get_point(hit.hit.distance as f32));
         let Some(wanted) = hit.or_else(plane) else {
-            // A tool behind the camera, or a look along its plane: no place, but the buttons are what they are.
+            // The tool is behind the camera, or the view is along its plane. There is no position,
+            // but the buttons still count.
             source.handle.set_buttons(bits);
             continue;
         };
-        // From where the tool is to where it is wanted, so that a clutch or a jump that moved the origin does not matter.
+        // The motion is relative to the tool's position, so that an origin shifted by a clutch or a
+        // jump does not matter.
         let turn: DQuat = place.rotation().as_dquat().normalize();
         let way = turn.inverse() * (wanted.as_dvec3() - DVec3::from(tick.tool)) / tool.motion_scale;
         source.handle.set((at + way).into(), bits);
@@ -155,7 +164,7 @@ pub(crate) fn steer(
         let Some((_, pad)) =
             gamepads.iter().filter(|(e, _)| wanted.is_none_or(|w| w == *e)).min_by_key(|(e, _)| *e)
         else {
-            // Pulled out in the middle of a grab: nobody presses its buttons any more.
+            // The gamepad was unplugged, perhaps during a grab, so none of its buttons is down.
             source.handle.set_buttons(0);
             continue;
         };
@@ -166,7 +175,7 @@ pub(crate) fn steer(
             axis(GamepadAxis::RightStickY),
             -axis(GamepadAxis::LeftStickY),
         );
-        // A frame that took long is not made up for by a leap.
+        // A long frame must not cause a leap.
         let moved = way * source.speed * time.delta_secs_f64().min(0.1);
         if moved.is_finite() {
             let [low, high] = status.info.workspace.map(DVec3::from);

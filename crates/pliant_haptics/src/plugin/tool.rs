@@ -1,4 +1,4 @@
-//! Tools: what devices are in the world, and what they hold.
+//! Tools: the representation of devices in the world, and the grabs that they hold.
 
 use bevy::{
     math::{DQuat, DVec3},
@@ -10,32 +10,36 @@ use pliant_modal::Patch;
 use super::{DeviceId, HapticButton, HapticDevices};
 use crate::ToolMap;
 
-/// A device's tool. The entity's transform says where the middle of the device's workspace lies in the world, and how it is turned; its scale
-/// does not count, [`motion_scale`](Self::motion_scale) does.
+/// The tool of a device.
+///
+/// The entity's transform places the center of the device's workspace in the world and turns it.
+/// The transform's scale has no effect, see [`motion_scale`](Self::motion_scale).
 #[derive(Component, Reflect, Debug, Clone, Copy, PartialEq)]
 #[reflect(Component, Clone, PartialEq)]
 #[require(Transform, ToolPose)]
 pub struct HapticTool {
     /// The device.
     pub device: DeviceId,
-    /// World metres per metre of the hand, above 0. Default: `1.0`.
+    /// World meters per meter of the hand, above 0. Default: `1.0`.
     pub motion_scale: f64,
-    /// Newtons at the hand per newton in the world, beyond what the motion's scale asks for, 0 or more. Default: `1.0`.
+    /// Additional scale of the force at the hand, beyond the motion scale, 0 or more. Default:
+    /// `1.0`.
     pub force_scale: f64,
-    /// Which axes of the force the hand gets, device axes. Default: all.
+    /// Force axes that the hand gets, device axes. Default: all.
     pub force_axes: [bool; 3],
-    /// Which axes of the torque the hand gets, device axes. Default: all.
+    /// Torque axes that the hand gets, device axes. Default: all.
     pub torque_axes: [bool; 3],
-    /// Mass of the tool as felt at the hand, kg. Default: `0.0`.
+    /// Mass of the tool at the hand, kg. Default: `0.0`.
     pub mass: f64,
-    /// Buttons (bits) that lift the tool off the world while held. Default: none.
+    /// Buttons (as bits) that detach the tool from the hand while they are down. Default: none.
     pub clutch: u32,
-    /// The loop steps a copy of the held body itself: finer to the touch, and immune to the simulation's rate. Default: `false`.
+    /// Whether the loop steps a copy of the held body itself. This gives finer forces that do not
+    /// depend on the simulation's rate. Default: `false`.
     pub modal: bool,
 }
 
 impl HapticTool {
-    /// The tool of `device`, every setting at its default.
+    /// Creates the tool of `device` with default settings.
     pub fn new(device: DeviceId) -> Self {
         Self {
             device,
@@ -64,57 +68,60 @@ impl HapticTool {
     }
 }
 
-/// Where a tool is and what it feels, as of the last tick.
+/// Pose and force of a tool in the last tick.
 #[derive(Component, Reflect, Debug, Default, Clone, Copy, PartialEq)]
 #[reflect(Component, Default, Clone, PartialEq)]
 pub struct ToolPose {
-    /// The tool point, m, world axes.
+    /// Position of the tool point, m, world axes.
     pub position: DVec3,
-    /// Its velocity, m/s, world axes.
+    /// Velocity of the tool point, m/s, world axes.
     pub velocity: DVec3,
-    /// Its orientation.
+    /// Orientation of the tool.
     pub orientation: DQuat,
-    /// The force that the hand is given, N, device axes.
+    /// The force on the hand, N, device axes.
     pub force: DVec3,
-    /// Part of the wanted force that is felt, 0 to 1.
+    /// The gain of the force, 0 to 1.
     pub gain: f64,
-    /// Lifted off the world by its clutch.
+    /// Whether the clutch detaches the tool from the hand.
     pub clutched: bool,
     /// Buttons that are down.
     pub buttons: u32,
 }
 
-/// The tool that holds a [`Grab`]. The grab's target, stiffness and relaxation are then the plugin's to write.
+/// The tool that holds a [`Grab`]. The plugin then writes the grab's target, stiffness and
+/// relaxation.
 #[derive(Component, Reflect, Debug, Clone, Copy, PartialEq, Eq)]
 #[reflect(Component, Clone, PartialEq)]
 #[relationship(relationship_target = ToolGrabs)]
 pub struct HeldBy(#[entities] pub Entity);
 
-/// What a tool holds, oldest first; the first [`MAX_CONTACTS`](crate::MAX_CONTACTS) are felt. Despawned with it.
+/// The grabs of a tool, oldest first. The first [`MAX_CONTACTS`](crate::MAX_CONTACTS) exert a
+/// force. All of them are despawned with the tool.
 #[derive(Component, Reflect, Debug, Default)]
 #[reflect(Component)]
 #[relationship_target(relationship = HeldBy, linked_spawn)]
 pub struct ToolGrabs(Vec<Entity>);
 
 impl ToolGrabs {
-    /// The grabs' entities, oldest first.
+    /// Returns the grabs' entities, oldest first.
     pub fn entities(&self) -> &[Entity] {
         &self.0
     }
 }
 
-/// Where on the tool a grab is held, m from the tool point, tool axes. Default: at the tool point.
+/// Position on the tool at which a grab is held, m from the tool point, tool axes. Default: the
+/// tool point.
 #[derive(Component, Reflect, Debug, Default, Clone, Copy, PartialEq)]
 #[reflect(Component, Default, Clone, PartialEq)]
 pub struct ToolOffset(pub DVec3);
 
-/// A tool that holds the nearest body while a button is down.
+/// Lets a tool grab the nearest body while a button is down.
 #[derive(Component, Reflect, Debug, Clone, Copy, PartialEq)]
 #[reflect(Component, Default, Clone, PartialEq)]
 pub struct ToolGrip {
     /// The button, from 0. Default: `0`.
     pub button: u32,
-    /// How far from the tool point a surface may be, m. Default: `0.02`.
+    /// Maximum distance of a surface from the tool point, m. Default: `0.02`.
     pub reach: f64,
     /// Radius of the patch as a part of the model's size. Default: `0.06`.
     pub radius: f64,
@@ -126,7 +133,7 @@ impl Default for ToolGrip {
     }
 }
 
-/// Tells the loops where their workspaces are.
+/// Sends the workspace transforms to the loops.
 pub(crate) fn place(
     mut devices: ResMut<HapticDevices>,
     tools: Query<(NameOrEntity, &HapticTool, &GlobalTransform)>,
@@ -140,14 +147,14 @@ pub(crate) fn place(
         if !map.is_valid() {
             warn!("{name}: a tool needs finite numbers and a positive motion scale; it stays as it was");
         } else if !entry.running.get().set_tool(map) {
-            // The loop is busy: asked again in the next frame.
+            // The queue of the loop is full, so the next frame retries.
             continue;
         }
         entry.map = Some(map);
     }
 }
 
-/// Before a tick: tools and what they hold are where the hands are.
+/// Before a tick: moves the tools and the targets of their grabs to the hands.
 pub(crate) fn follow(
     mut devices: ResMut<HapticDevices>,
     mut tools: Query<(&HapticTool, &mut ToolPose, Option<&ToolGrabs>)>,
@@ -178,7 +185,7 @@ pub(crate) fn follow(
     }
 }
 
-/// A tool whose device has been taken away is nobody's hand: it lets go, and feels nothing.
+/// Releases the grabs of a tool whose device was removed, and resets its force.
 pub(crate) fn let_go(
     mut commands: Commands,
     devices: Res<HapticDevices>,
@@ -197,7 +204,8 @@ pub(crate) fn let_go(
     }
 }
 
-/// A press holds the nearest surface within reach; letting go lets go.
+/// Grabs the nearest surface within reach on a press, and releases the grabs when the button comes
+/// up.
 pub(crate) fn grip(
     mut commands: Commands,
     mut buttons: MessageReader<HapticButton>,
@@ -236,11 +244,13 @@ pub(crate) fn grip(
             let Some((body, vertex, radius, middle, _)) = within.min_by(|a, b| a.4.total_cmp(&b.4)) else {
                 continue;
             };
-            // As the device holds, from the first moment: whoever steps the body elsewhere is told once.
+            // The grab has the device's coupling from the start, so that a peer that steps the body
+            // gets it only once.
             let coupling = devices.get(press.device).map(|status| status.coupling);
             let hold = coupling.map(|c| c.grab_config(held_by.motion_scale, held_by.force_scale));
             let hold = hold.unwrap_or_default();
-            // Held where it is: grabbing moves nothing and pushes nobody.
+            // The offset puts the target where the patch is, so that the grab moves nothing and
+            // exerts no force.
             let offset = pose.orientation.inverse() * (middle - pose.position);
             commands.spawn((
                 Name::new("tool grab"),

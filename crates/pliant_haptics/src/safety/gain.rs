@@ -1,17 +1,19 @@
-//! Stages that scale the force as a whole: engage ramp, velocity cut-out, stale fade, faults, emergency stop.
+//! Stages that scale the whole force: engage ramp, velocity cut-out, stale fade, faults, emergency
+//! stop.
 //!
-//! One gain for all of them. Each stage names the most that it allows; the gain falls to the smallest at once (each falls at a bounded rate
-//! itself) and rises again only by the ramp. So whatever fades a force, it comes back gently.
+//! One gain serves all of them. Each stage sets an upper limit of the gain. The gain falls to the
+//! smallest limit at once, and each limit itself falls at a bounded rate (except the emergency
+//! stop). The gain rises only by the ramp, so that the force always comes back gently.
 
 use super::SafetyConfig;
 use crate::Fault;
 
-/// When the hand is too fast.
+/// Limits of the hand's speed.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct VelocityCutConfig {
     /// Speed at which the force begins to fade, m/s. Default: 1.5.
     pub limit: f64,
-    /// Speed below which it may come back, m/s. Default: 0.75.
+    /// Speed below which the force may come back, m/s. Default: 0.75.
     pub release: f64,
 }
 
@@ -27,14 +29,17 @@ impl VelocityCutConfig {
     }
 }
 
-/// When the simulation is silent. The limits are for one that speaks every 25 ms or more often; where
-/// it is known to speak more seldom (simulated time runs slower than real time) they are longer in
-/// proportion, at most four times.
+/// Limits of the time without a local model update.
+///
+/// The limits apply to a simulation that publishes every 25 ms or more often. Where it is known to
+/// publish less often (simulated time runs slower than real time), the limits are longer in
+/// proportion, by a factor of at most four.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct StaleConfig {
-    /// Silence that is taken for granted, s: a step at 40 Hz and its jitter. Default: 0.030.
+    /// Time without an update at which the fade begins, s: a step at 40 Hz and its jitter. Default:
+    /// 0.030.
     pub patience: f64,
-    /// Silence after which there is no force, s. Default: 0.050.
+    /// Time without an update after which there is no force, s. Default: 0.050.
     pub limit: f64,
 }
 
@@ -45,15 +50,16 @@ impl Default for StaleConfig {
 }
 
 impl StaleConfig {
-    /// How often the simulation speaks for which the limits are, s.
+    /// Longest update interval for which the limits apply unscaled, s.
     const EVERY: f64 = 0.025;
-    /// Most times that they are longer.
+    /// Largest factor by which the limits grow.
     const MOST: f64 = 4.0;
 
-    /// A silence (s) as it counts where the simulation speaks every `interval` s.
+    /// Scales the time without an update, `silent` (s), for a simulation that publishes every
+    /// `interval` s.
     pub(crate) fn counted(silent: f64, interval: f64) -> f64 {
         let slower = interval / Self::EVERY;
-        // Not `clamp`: what is not a number changes nothing.
+        // `clamp` does not fit here: an interval that is NaN must leave the time unchanged.
         if slower > 1.0 { silent / slower.min(Self::MOST) } else { silent }
     }
 
@@ -61,7 +67,8 @@ impl StaleConfig {
         self.patience >= 0.0 && self.limit.is_finite() && self.limit > self.patience
     }
 
-    /// 1 while patient, 0 from the limit on, a straight line between.
+    /// Returns the largest gain allowed: 1 up to `patience`, 0 from `limit` on, and linear in
+    /// between.
     pub fn allows(&self, silent: f64) -> f64 {
         ((self.limit - silent) / (self.limit - self.patience)).clamp(0.0, 1.0)
     }
@@ -75,15 +82,15 @@ fn a_slow_simulation_is_waited_for_within_bounds() {
     for interval in [0.0, 0.016, 0.025, f64::NAN, -1.0] {
         assert_eq!((allowed(0.029, interval), allowed(0.050, interval)), (1.0, 0.0), "every {interval} s");
     }
-    // A quarter of the speed at 40 Hz.
+    // The simulated time runs at a quarter of the speed at 40 Hz.
     assert_eq!((allowed(0.119, 0.1), allowed(0.2, 0.1)), (1.0, 0.0));
-    // However slow it is, a fifth of a second is the most.
+    // The limit is at most 0.2 s, however slow the simulation is.
     for interval in [1.0, 1e300, f64::INFINITY] {
         assert_eq!(allowed(0.2, interval), 0.0, "every {interval} s");
     }
 }
 
-/// Part of the force that is felt.
+/// The gain that scales the whole force, 0 to 1.
 #[derive(Debug, Clone, Copy)]
 pub struct Gain {
     value: f64,
@@ -130,7 +137,8 @@ impl Gain {
                 found = Some(Fault::TooFast(speed));
             }
         }
-        // From where it is, not from one: a fault that comes and goes each tick must fade the force as well.
+        // The fade starts at the current value and not at one. A fault that appears and disappears
+        // every tick must fade the force as well.
         self.value = if fault.is_some() || self.cutting {
             config.fade.map_or(0.0, |fade| (self.value - dt / fade).max(0.0))
         } else {

@@ -1,19 +1,19 @@
-//! The safety pipeline: what stands between a force that somebody computed and a hand.
+//! The safety pipeline between the computed force and the device.
 //!
-//! In this order, each stage small and for itself:
+//! The stages run in this order, and each stage is small and independent:
 //!
 //! | Stage | What it does |
 //! | --- | --- |
-//! | finite check | a number that is not finite counts as none, and as a fault; before the other stages, and once more after them |
-//! | [`Passivity`] | counts the energy at the port exactly; damps what leaks, and lets no more out than went in plus a tank |
-//! | damping cap | no more damping than device and rate close stably |
-//! | [`Slew`] | the force changes by so many newtons a second and no faster |
-//! | magnitude clamp | no more than the device's peak, direction kept |
-//! | [`Thermal`] | what the motors bear for long |
-//! | engage ramp | after a start, a grab or a fault, force comes back slowly |
-//! | velocity cut-out | a hand that flies off gets no push |
-//! | stale fade | 50 ms after the simulation's last word there is no force |
-//! | emergency stop | latched; the only one that cuts instead of fading |
+//! | finite check | replaces a force that is not finite by zero and reports a fault, before the other stages and once more after them |
+//! | [`Passivity`] | counts the energy at the port exactly, damps leaked energy, and lets no more energy out than went in plus a tank |
+//! | damping cap | limits the damping to what the device can render stably at the loop rate |
+//! | [`Slew`] | limits the change of the force, N/s |
+//! | magnitude clamp | limits the force to the peak of the device and keeps the direction |
+//! | [`Thermal`] | limits the force to what the motors withstand over time |
+//! | engage ramp | raises the force slowly after a start, a grab or a fault |
+//! | velocity cut-out | fades the force of a hand that is too fast |
+//! | stale fade | fades the force to zero by 50 ms after the last local model update |
+//! | emergency stop | latched, and the only stage that cuts the force instead of fading |
 
 mod gain;
 mod passivity;
@@ -27,37 +27,39 @@ pub use shape::{Slew, Thermal, ThermalConfig, cap_damping, clamp_magnitude};
 
 use crate::{DeviceInfo, Fault};
 
-/// Which stages there are, and their limits. `None` leaves a stage out, which only a simulated device is allowed.
+/// The stages of the safety pipeline and their limits. `None` leaves a stage out, which is allowed
+/// only for a simulated device.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct SafetyConfig {
     /// Energy accounting at the port.
     pub passivity: Option<PassivityConfig>,
-    /// Most damping of the whole force, N s/m.
+    /// Maximum damping of the whole force, N s/m.
     pub max_damping: Option<f64>,
-    /// Most change of the force, N/s.
+    /// Maximum rate of change of the force, N/s.
     pub slew: Option<f64>,
-    /// Most force, N.
+    /// Maximum force, N.
     pub peak: Option<f64>,
-    /// What the motors bear.
+    /// Thermal limit of the motors.
     pub thermal: Option<ThermalConfig>,
-    /// Time from no force to all of it after a start, a grab or a fault, s.
+    /// Duration of the ramp from zero to full force after a start, a grab or a fault, s.
     pub ramp: Option<f64>,
-    /// Time in which a fault fades the force, s.
+    /// Duration in which a fault fades the force, s.
     pub fade: Option<f64>,
-    /// When the hand is too fast.
+    /// Limits of the hand's speed.
     pub velocity: Option<VelocityCutConfig>,
-    /// When the simulation has been silent.
+    /// Limits of the time without a local model update.
     pub stale: Option<StaleConfig>,
 }
 
 impl SafetyConfig {
-    /// All stages, with the limits that suit `device` at `rate` (Hz).
+    /// Enables all stages, with the limits that suit `device` at `rate` (Hz).
     pub fn for_device(device: &DeviceInfo, rate: f64) -> Self {
         let max_damping = device.max_damping.min(stable_damping(device, rate, 0.0));
         Self {
             passivity: Some(PassivityConfig { max_damping, ..PassivityConfig::default() }),
             max_damping: Some(max_damping),
-            // The whole of the force in 5 ms: a wall met at half a metre a second is not rounded off, a kick is.
+            // The full force is reached in 5 ms. This limit does not round off a wall met at 0.5
+            // m/s, but it does round off a kick.
             slew: Some(device.peak_force / 0.005),
             peak: Some(device.peak_force),
             thermal: Some(ThermalConfig { continuous: device.continuous_force, ..ThermalConfig::default() }),
@@ -68,7 +70,8 @@ impl SafetyConfig {
         }
     }
 
-    /// No stage at all but the finite check and the emergency stop: for measuring what a bare loop does to a simulated device.
+    /// Leaves out all stages except the finite check and the emergency stop. This configuration
+    /// serves to measure the effect of a bare loop on a simulated device.
     pub fn bare() -> Self {
         Self {
             passivity: None,
@@ -83,7 +86,8 @@ impl SafetyConfig {
         }
     }
 
-    /// Every stage is there, with limits that are finite, positive and not above what the device can do.
+    /// Returns whether every stage is present, with limits that are finite, positive and not above
+    /// what the device can do.
     pub fn is_complete(&self, device: &DeviceInfo) -> bool {
         let within = |value: Option<f64>, most: f64| value.is_some_and(|v| v > 0.0 && v <= most);
         self.passivity.is_some_and(|p| p.is_valid())
@@ -98,15 +102,18 @@ impl SafetyConfig {
     }
 }
 
-/// Most damping on a measured velocity that `device` closes at `rate` (Hz) with `delay` (s) beyond its own, N s/m: a third of `M / lag`, the lag being
-/// the period, the delays, and half of the window that a velocity is taken from.
+/// Maximum damping on a measured velocity that `device` renders stably at `rate` (Hz) with an extra
+/// `delay` (s), N s/m.
+///
+/// The limit is a third of `M / lag`. The lag is the sum of the period, the delays and half of the
+/// window over which the velocity is measured.
 pub fn stable_damping(device: &DeviceInfo, rate: f64, delay: f64) -> f64 {
     let window =
         if device.resolution > 0.0 { 0.5 * crate::control_loop::validation::WINDOW as f64 } else { 0.0 };
     device.mass / 3.0 / ((1.0 + window) / rate + device.delay + delay.max(0.0))
 }
 
-/// What a tick knows when it comes to the pipeline. Device axes.
+/// Input of the pipeline for one tick, in device axes.
 #[derive(Debug, Clone, Copy)]
 pub struct Wanted {
     /// Time since the last force was sent, s.
@@ -115,46 +122,48 @@ pub struct Wanted {
     pub moved: Vector3<f64>,
     /// Velocity of the hand, m/s.
     pub velocity: Vector3<f64>,
-    /// Force of springs (or of the body that the loop steps), N.
+    /// Force of the springs, or of the body that the loop steps, N.
     pub elastic: Vector3<f64>,
-    /// Force of dampers, N.
+    /// Force of the dampers, N.
     pub damping: Vector3<f64>,
-    /// Constant load of the tool, N: conservative, so not part of the energy accounting.
+    /// Constant weight of the tool, N. This force is conservative and therefore not part of the
+    /// energy accounting.
     pub weight: Vector3<f64>,
     /// Energy that the springs and the body could give back, J at the hand.
     pub stored: f64,
-    /// `stored` is the least that it could be.
+    /// Whether `stored` is only a lower bound.
     pub partial: bool,
-    /// Energy that others have put in since the last tick, J at the hand.
+    /// Energy that other participants supplied since the last tick, J at the hand.
     pub supplied: f64,
-    /// Springs are coming up by ramps of their own: what they store without being felt has not leaked.
+    /// Whether springs are engaging by ramps of their own. Energy that such a spring stores while
+    /// the hand does not feel its force has not leaked.
     pub growing: bool,
-    /// The tool holds something.
+    /// Whether the tool holds something.
     pub holding: bool,
-    /// Time since the simulation's last word, s.
+    /// Time since the last local model update, s.
     pub silent: f64,
-    /// How often it speaks, s.
+    /// Interval of the local model updates, s.
     pub interval: f64,
-    /// Something is wrong with the sample or the model: fade.
+    /// Fault of the sample or of the local model. A fault fades the force.
     pub fault: Option<Fault>,
-    /// Somebody pressed the emergency stop.
+    /// Whether somebody pressed the emergency stop.
     pub stop: bool,
 }
 
-/// What the pipeline makes of it.
+/// Output of the pipeline for one tick.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Allowed {
     /// The force that goes to the hand, N.
     pub force: Vector3<f64>,
-    /// Part of it that is felt, 0 to 1: ramp, fades and cut-out together.
+    /// The gain of the force, 0 to 1: ramp, fades and cut-out together.
     pub gain: f64,
-    /// What the pipeline itself found wrong.
+    /// The fault that the pipeline itself found.
     pub fault: Option<Fault>,
-    /// Energy at the port.
+    /// Energies at the port.
     pub port: Port,
 }
 
-/// The stages in a row, with their memory.
+/// The stages of the pipeline with their state.
 #[derive(Debug, Clone)]
 pub struct Safety {
     config: SafetyConfig,
@@ -168,7 +177,7 @@ pub struct Safety {
 }
 
 impl Safety {
-    /// A pipeline with nothing engaged yet: the first force comes by the ramp.
+    /// Creates a pipeline that has not engaged yet, so that the first force rises by the ramp.
     ///
     /// `mass`: the device's apparent mass, kg.
     pub fn new(config: SafetyConfig, mass: f64) -> Self {
@@ -184,32 +193,33 @@ impl Safety {
         }
     }
 
-    /// The stages and limits.
+    /// Returns the stages and their limits.
     pub fn config(&self) -> &SafetyConfig {
         &self.config
     }
 
-    /// The last force let out, N.
+    /// Returns the last force that the pipeline let out, N.
     pub fn force(&self) -> Vector3<f64> {
         self.last
     }
 
-    /// Whether the emergency stop is latched.
+    /// Returns whether the emergency stop is latched.
     pub fn is_stopped(&self) -> bool {
         self.gain.is_stopped()
     }
 
-    /// Unlatches the emergency stop; force comes back by the ramp.
+    /// Unlatches the emergency stop. The force then rises by the ramp.
     pub fn reset_stop(&mut self) {
         self.gain.reset_stop();
     }
 
-    /// The next force comes by the ramp: called at a grab and after a loss.
+    /// Restarts the ramp for the next force. Call this method at a grab and after a loss.
     pub fn engage(&mut self) {
         self.gain.engage();
     }
 
-    /// What the slew stage allows, N/s: the limit less what the fades behind it can add, so that the sum of both keeps to it.
+    /// Returns the limit of the slew stage, N/s. The limit of the configuration is reduced by the
+    /// rate that the later fades can add, so that both together keep to it.
     fn slew_rate(&self) -> f64 {
         let Some(limit) = self.config.slew else { return f64::INFINITY };
         let peak = self.config.peak.unwrap_or(0.0);
@@ -217,7 +227,8 @@ impl Safety {
         (limit - fades).max(0.25 * limit)
     }
 
-    /// One tick. Whatever it is given, what it lets out is finite; no force at a gain of 0 is exactly that.
+    /// Runs one tick. The output force is finite for every input, and at a gain of 0 it is exactly
+    /// zero.
     pub fn tick(&mut self, wanted: &Wanted) -> Allowed {
         let zero = Vector3::zeros();
         let mut fault = None;
@@ -236,7 +247,8 @@ impl Safety {
             (w.moved, w.velocity, w.dt, w.silent) = (zero, zero, 0.0, f64::INFINITY);
         }
 
-        // Energy first of what was really held since the last tick.
+        // The energy accounting comes first. It counts the work of the force that was applied since
+        // the last tick.
         let interaction = self.last - self.last_weight;
         self.passivity.observe(&interaction, &w.moved, w.supplied, w.stored, w.partial, w.holding);
         if self.gain.value() < 1.0 || w.growing {
@@ -272,7 +284,8 @@ impl Safety {
             force = clamp_magnitude(&force, limit);
         }
         if !is_finite(&force) {
-            // None of the stages is to let such a force through; if one does, it goes no further, and none of them remembers it.
+            // No stage should let a force through that is not finite. If one does, the force stops
+            // here and the stages that remember forces are reset.
             fault = fault.or(Some(Fault::NotFinite));
             force = zero;
             self.slew = Slew::default();
@@ -282,7 +295,7 @@ impl Safety {
         let (speed, silence) = (w.velocity.norm(), [w.silent, w.interval]);
         let (gain, cut) = self.gain.tick(&self.config, w.dt, speed, silence, w.fault.or(fault), w.stop);
         fault = fault.or(cut);
-        // Times zero a number may still be one with a sign.
+        // A multiplication by zero could leave a negative zero.
         let felt = |f: Vector3<f64>| if gain > 0.0 { f * gain } else { zero };
         let force = felt(force);
         if let Some(thermal) = &self.config.thermal {

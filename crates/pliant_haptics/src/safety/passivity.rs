@@ -1,16 +1,19 @@
-//! Energy at the port between loop and hand: counted exactly, and kept from being made out of nothing.
+//! Passivity control: exact accounting of the energy at the port between the loop and the hand.
 
 use nalgebra::Vector3;
 
 /// Settings of [`Passivity`].
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct PassivityConfig {
-    /// Energy that may leave before any has come in, J, in each engagement (from no force to the next time that there is none). Default: 0.005.
+    /// Energy that may leave before any has come in, J, for each engagement (from one moment
+    /// without force to the next). Default: 0.005.
     pub tank: f64,
-    /// Most damping that the controller adds, N s/m. Default: 5.
+    /// Maximum damping that the controller adds, N s/m. Default: 5.
     pub max_damping: f64,
-    /// After a fade: power at which the energy is given back that a spring gained while it was not felt, W; 0 never gives it back. A hand that rests
-    /// would otherwise feel less than the body pulls for as long as it rests. Default: 0.01.
+    /// Power at which energy is repaid after a fade, W. A spring that is stretched during a fade
+    /// gains energy that the hand has not put in. A hand at rest would otherwise feel less than the
+    /// body's force for as long as the hand rests. With 0 the energy is never repaid. Default:
+    /// 0.01.
     pub repay: f64,
 }
 
@@ -29,16 +32,16 @@ impl PassivityConfig {
 /// Energies at the port, J.
 #[derive(Debug, Clone, Copy, PartialEq, Default)]
 pub struct Port {
-    /// What may still be given to the hand.
+    /// Energy that may still be given to the hand.
     pub available: f64,
-    /// What the hand has put in since the loop began: sum of all `-F dx` that are positive.
+    /// Energy that the hand has put in since the loop began: the sum of all positive `-F dx`.
     pub taken: f64,
-    /// What the hand has been given since: sum of all `F dx` that are positive.
+    /// Energy that the hand has received since the loop began: the sum of all positive `F dx`.
     pub given: f64,
-    /// What others have put in since, net.
+    /// Net energy that other participants have put in since the loop began.
     pub supplied: f64,
-    /// What has been given back after fades: never more than springs had gained in them, never more than the tank holds at a time, and no faster than
-    /// [`PassivityConfig::repay`].
+    /// Energy repaid after fades. It is never more than the springs gained during the fades, never
+    /// more than the tank holds at a time, and not faster than [`PassivityConfig::repay`].
     pub repaid: f64,
     /// Force times displacement that the controller has held back or damped away, for diagnosis.
     pub dissipated: f64,
@@ -46,25 +49,28 @@ pub struct Port {
 
 /// Time-domain passivity observer and controller (Hannaford and Ryu 2002).
 ///
-/// A held force does exactly the work `F[k-1] . (x[k] - x[k-1])`, so energy is counted without approximation (Stramigioli et al. 2005):
-/// `E[k] = E[k-1] - F[k-1] . (x[k] - x[k-1])`. What has been absorbed counts only as far as springs and body can store it: a hand that dragged
-/// through honey for a minute has nothing to its credit.
+/// A held force does exactly the work `F[k-1] . (x[k] - x[k-1])`, so the energy is counted without
+/// approximation (Stramigioli et al. 2005): `E[k] = E[k-1] - F[k-1] . (x[k] - x[k-1])`. Absorbed
+/// energy counts only as far as the springs and the body can store it. Energy that the hand spends
+/// against viscous drag is therefore not credited.
 ///
-/// Two remedies. [`dissipate`](Self::dissipate) answers what has leaked out (sampling, delay, a coarse encoder) with damping, as much as pays it back and
-/// no more than the device closes. [`restrain`](Self::restrain) is the hard bound: the force is cut so that what is
-/// available is not overdrawn, even while the force still needs its slew limit's time to go away.
+/// The controller has two remedies. [`dissipate`](Self::dissipate) damps leaked energy away (from
+/// sampling, delay or a coarse encoder), with at most the damping that the device renders stably.
+/// [`restrain`](Self::restrain) is the hard bound: it cuts the force so that the available energy
+/// is not overdrawn, even while the force still needs time to fall at its slew limit.
 #[derive(Debug, Clone, Copy)]
 pub struct Passivity {
     config: PassivityConfig,
     port: Port,
-    /// What would be available had nothing leaked, J.
+    /// Energy that would be available if nothing had leaked, J.
     full: f64,
-    /// What is missing although nothing has leaked: springs that were stretched while they could not be felt.
+    /// Energy that is missing although nothing has leaked, J. Springs that were stretched while the
+    /// hand could not feel them account for it.
     forgiven: f64,
 }
 
 impl Passivity {
-    /// With a full tank.
+    /// Creates the state with a full tank.
     pub fn new(config: PassivityConfig) -> Self {
         Self {
             config,
@@ -74,13 +80,17 @@ impl Passivity {
         }
     }
 
-    /// Energies so far.
+    /// Returns the energies so far.
     pub fn port(&self) -> Port {
         self.port
     }
 
-    /// Counts the work of the `force` (N) held while the hand `moved` (m), and what others `supplied` (J) in that time. `stored`: what springs
-    /// and body could give back (J), the least that it could be if that is known only in part (`partial`); then everything absorbed counts. Not `holding` anything, the tank is filled up: the next grab begins anew.
+    /// Counts the work of the `force` (N) that was held while the hand `moved` (m), and the energy
+    /// that others `supplied` (J) in that time.
+    ///
+    /// `stored` is the energy that the springs and the body could give back (J). If `partial` is
+    /// set, `stored` is only a lower bound and all absorbed energy counts. While `holding` is
+    /// `false`, the tank is refilled, so that the next grab starts with a full tank.
     pub fn observe(
         &mut self,
         force: &Vector3<f64>,
@@ -97,7 +107,8 @@ impl Passivity {
         self.port.given += given.max(0.0);
         self.port.taken += (-given).max(0.0);
         self.port.supplied += supplied;
-        // What springs and body hold now can have come from nowhere but the hand, the tank or others: anything less available has leaked.
+        // The energy stored in the springs and the body can only come from the hand, the tank or
+        // others. If less is available, the difference has leaked.
         self.full = if holding { self.config.tank + stored.max(0.0) } else { self.config.tank };
         let balance = self.port.available - given + supplied;
         self.port.available = match (holding, partial) {
@@ -107,18 +118,19 @@ impl Passivity {
         };
     }
 
-    /// Nothing is felt now: what comes next is a new engagement, and begins with a full tank.
+    /// Fills the tank for a new engagement. Call this method while the gain is zero.
     pub fn refill(&mut self) {
         self.port.available = self.port.available.max(self.config.tank);
     }
 
-    /// What is missing now has not leaked: a spring was stretched while a fade or a ramp kept it from being felt. It is not to be damped away; it
-    /// is not available either.
+    /// Marks the missing energy as not leaked, because a fade or a ramp kept the hand from feeling
+    /// a stretched spring. The energy is not to be damped away, but it is not available either.
     pub fn forgive(&mut self) {
         self.forgiven = (self.full - self.port.available).max(0.0);
     }
 
-    /// A fade is over and `dt` (s) has passed: some of what was [forgiven](Self::forgive) is available again, until the tank is full.
+    /// Repays energy after a fade, for a time step of `dt` (s). A part of the
+    /// [forgiven](Self::forgive) energy becomes available again, until the tank is full.
     pub fn repay(&mut self, dt: f64) {
         let room = (self.config.tank - self.port.available).min(self.forgiven);
         let back = (self.config.repay * dt).min(room);
@@ -129,7 +141,8 @@ impl Passivity {
         }
     }
 
-    /// The damping force (N) that pays back what has leaked, at `velocity` (m/s) over `dt` (s).
+    /// Returns the damping force (N) that recovers leaked energy, at `velocity` (m/s) over `dt`
+    /// (s).
     pub fn dissipate(&mut self, velocity: &Vector3<f64>, dt: f64) -> Vector3<f64> {
         let gap = self.full - self.port.available;
         self.forgiven = self.forgiven.min(gap).max(0.0);
@@ -143,10 +156,13 @@ impl Passivity {
         -velocity * damping
     }
 
-    /// The force (N), cut so that what is available covers the work that it can do before it is gone again; its direction is kept.
+    /// Returns the force (N), cut so that the available energy covers its work until it can be
+    /// taken away. The direction is kept.
     ///
-    /// Held for `dt` and then taken down at the slew limit `S` (N/s), a force `f` has the impulse `I = f dt + f^2 / (2 S)`; on a handle of mass `M` that
-    /// already moves along it at `v` it does at most the work `v I + I^2 / (2 M)`. `M` is the device's alone: a hand on it only makes that less.
+    /// A force `f` that is held for `dt` and then reduced at the slew limit `S` (N/s) has the
+    /// impulse `I = f dt + f^2 / (2 S)`. On a handle of mass `M` that already moves along the force
+    /// at `v`, the force does at most the work `v I + I^2 / (2 M)`. `M` is the mass of the device
+    /// alone. A hand on the device only reduces the work.
     pub fn restrain(
         &mut self,
         force: &Vector3<f64>,
@@ -161,14 +177,15 @@ impl Passivity {
         }
         let speed = velocity.dot(&(force / size));
         let energy = self.port.available.max(0.0);
-        // The root of I^2 / (2 M) + v I = E, without the cancellation of a fast handle.
+        // This is the root of `I^2 / (2 M) + v I = E`, written without the cancellation of a fast
+        // handle.
         let root = speed.hypot((2.0 * energy / mass).sqrt());
         let impulse = if speed > 0.0 { 2.0 * energy / (root + speed) } else { mass * (root - speed) };
         if impulse == f64::INFINITY {
             return *force;
         }
         let most = if slew.is_finite() {
-            // The root of f^2 / (2 S) + f dt = I.
+            // This is the root of `f^2 / (2 S) + f dt = I`.
             2.0 * impulse / (dt + (dt * dt + 2.0 * impulse / slew).sqrt())
         } else {
             impulse / dt

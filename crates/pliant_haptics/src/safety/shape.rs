@@ -2,43 +2,45 @@
 
 use nalgebra::Vector3;
 
-/// The damping force cut to what `limit` (N s/m) would give at this velocity, its direction kept.
+/// Cuts the damping force to what `limit` (N s/m) gives at this velocity, and keeps its direction.
 ///
-/// A damper on a measured velocity is stable to about `M / (T + d)`; above that it shakes the hand that it should calm.
+/// A damper on a measured velocity is stable up to about `M / (T + d)`. Above that limit the damper
+/// shakes the hand instead of calming it.
 pub fn cap_damping(force: &Vector3<f64>, velocity: &Vector3<f64>, limit: f64) -> Vector3<f64> {
     clamp_magnitude(force, limit * velocity.norm())
 }
 
-/// The force cut to `limit` (N), its direction kept.
+/// Cuts the force to `limit` (N) and keeps its direction.
 pub fn clamp_magnitude(force: &Vector3<f64>, limit: f64) -> Vector3<f64> {
     let norm = force.norm();
     if norm > limit { force * (limit / norm) } else { *force }
 }
 
-/// Limits how fast a force changes.
+/// Limits the rate of change of a force.
 #[derive(Debug, Clone, Copy, Default)]
 pub struct Slew {
     last: Vector3<f64>,
 }
 
 impl Slew {
-    /// `force`, or as near to it as `most` newtons from the last one allow.
+    /// Returns `force`, or the nearest force that differs from the last force by at most `most`
+    /// newtons.
     pub fn limit(&self, force: &Vector3<f64>, most: f64) -> Vector3<f64> {
         self.last + clamp_magnitude(&(force - self.last), most)
     }
 
-    /// The force that the next one is measured from.
+    /// Sets the last force, from which the next change is measured.
     pub fn hold(&mut self, force: &Vector3<f64>) {
         self.last = *force;
     }
 }
 
-/// How long motors bear more than they bear for ever.
+/// Thermal limits of the motors.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct ThermalConfig {
-    /// Force that is borne for ever, N.
+    /// Force that the motors withstand permanently, N. Default: 1.
     pub continuous: f64,
-    /// How long the peak is borne from cold, s. Default: 5.
+    /// Time that cold motors withstand the peak force, s. Default: 5.
     pub peak_seconds: f64,
 }
 
@@ -55,17 +57,19 @@ impl ThermalConfig {
     }
 }
 
-/// Heat in the motors: current is as force, heating as its square.
+/// Heat in the motors. The motor current is proportional to the force, and the heating to its
+/// square.
 ///
-/// `h' = F^2 - Fc^2`, `h >= 0`; from half of the budget `(Fp^2 - Fc^2) t_peak` on the limit comes down from the peak `Fp` to the continuous
-/// `Fc`, which it reaches when the budget is spent: no step in the force.
+/// `h' = F^2 - Fc^2`, `h >= 0`. The budget is `(Fp^2 - Fc^2) t_peak`. When half of the budget is
+/// spent, the limit begins to fall from the peak `Fp`. It reaches the continuous force `Fc` when
+/// the whole budget is spent, so the force makes no step.
 #[derive(Debug, Clone, Copy, Default)]
 pub struct Thermal {
     heat: f64,
 }
 
 impl Thermal {
-    /// Most force now, N.
+    /// Returns the maximum force at the current heat, N.
     pub fn limit(&self, config: &ThermalConfig, peak: f64) -> f64 {
         let continuous = config.continuous.min(peak);
         let span = peak * peak - continuous * continuous;
@@ -77,7 +81,7 @@ impl Thermal {
         (continuous * continuous + span * left).sqrt()
     }
 
-    /// Takes a force of `force` newtons for `dt` seconds.
+    /// Adds the heat of a force of `force` newtons that lasts `dt` seconds.
     pub fn heat(&mut self, config: &ThermalConfig, peak: f64, force: f64, dt: f64) {
         let continuous = config.continuous.min(peak);
         let budget = (peak * peak - continuous * continuous) * config.peak_seconds;

@@ -27,7 +27,7 @@ fn wanted(force: f64) -> Wanted {
     }
 }
 
-/// Runs to where the ramp is over.
+/// Runs until the ramp is over.
 fn engaged(force: f64) -> Safety {
     let mut safety = Safety::new(SafetyConfig::for_device(&info(), 1000.0), 0.045);
     for _ in 0..400 {
@@ -59,7 +59,8 @@ fn magnitude_is_clamped_and_direction_kept() {
 
 #[test]
 fn slew_holds_whatever_happens() {
-    // Full force back and forth, a fault, a stale model, a fast hand, all at once: no step above the limit but the emergency stop's.
+    // Full force back and forth, a fault, a stale model and a fast hand come at once. No step may
+    // exceed the limit, except that of the emergency stop.
     let config = SafetyConfig::for_device(&info(), 1000.0);
     let most = config.slew.unwrap() * 1e-3;
     let mut safety = engaged(3.0);
@@ -105,13 +106,13 @@ fn no_number_poisons_the_pipeline() {
         ("damping", |w, v| w.damping = v),
         ("energies", |w, v| (w.stored, w.supplied) = (v.x, v.y)),
         ("silence", |w, v| w.silent = v.x),
-        // A long period is one, and heats; one of less than nothing is none.
+        // A long period is valid and heats the motors, so this case tests negative periods only.
         ("period", |w, v| w.dt = if v.x.is_finite() { -v.x.abs() } else { v.x }),
     ];
     for (what, poison) in poisons {
         for value in [huge, -huge, nan, Vector3::repeat(f64::INFINITY), Vector3::repeat(f64::MAX)] {
             let mut safety = engaged(1.0);
-            // With a leak that is to be damped away, and without.
+            // Both cases are covered: with leaked energy to damp away, and without.
             safety.tick(&Wanted { moved: Vector3::new(2e-3, 0.0, 0.0), ..wanted(1.0) });
             for _ in 0..3 {
                 let mut w = wanted(1.0);
@@ -123,7 +124,7 @@ fn no_number_poisons_the_pipeline() {
                     out.force
                 );
             }
-            // And it is over with the next grab, whatever has been counted in this one.
+            // The next grab recovers, whatever was counted in this one.
             safety.tick(&Wanted { holding: false, ..wanted(0.0) });
             let out = (0..1500).map(|_| safety.tick(&wanted(1.0))).last().unwrap();
             assert!((out.force.x - 1.0).abs() < 1e-6, "{what} {value:?}: {:?} N", out.force);
@@ -151,9 +152,9 @@ fn thermal_budget_ends_at_the_continuous_force() {
             "a minute of pushing ends at what is borne for ever: {limit}"
         );
     }
-    // Half the budget at full force: 2.5 s.
+    // Half of the budget lasts 2.5 s at full force.
     assert!((2490..=2510).contains(&at_peak), "{at_peak}");
-    // And it cools: 1 N^2 of margin against 40 N^2 s.
+    // The motors cool: the margin is 1 N^2 against 40 N^2 s.
     for _ in 0..60_000 {
         thermal.heat(&config, 3.0, 0.0, 1e-3);
     }
@@ -233,17 +234,19 @@ fn energy_of_a_held_force_is_exact() {
     let port = p.port();
     assert!((port.available - (0.01 - sum)).abs() < 1e-15);
     assert!((port.given - port.taken - sum).abs() < 1e-15);
-    // What cannot be stored is not owed: 1 J pushed into honey leaves a tank and the spring's 2 mJ.
+    // Energy that cannot be stored is not credited. The hand puts in 1 J, and what remains is the
+    // tank and the 2 mJ of the spring.
     p.observe(&Vector3::new(-1.0, 0.0, 0.0), &Vector3::new(1.0, 0.0, 0.0), 0.0, 0.002, false, true);
     assert!((p.port().available - 0.012).abs() < 1e-15);
-    // Where only part of what is stored is known, all that was put in stays to the hand's credit.
+    // If the stored energy is known only in part, the whole input is credited to the hand.
     p.observe(&Vector3::new(-1.0, 0.0, 0.0), &Vector3::new(1.0, 0.0, 0.0), 0.0, 0.002, true, true);
     assert!((p.port().available - 1.012).abs() < 1e-15);
 }
 
 #[test]
 fn no_more_comes_out_than_went_in_plus_the_tank() {
-    // A hand carried along at half a metre a second by a force that never ends: it gets the tank and not a microjoule more.
+    // A constant force carries a hand along at 0.5 m/s. The hand receives at most the energy of the
+    // tank.
     let tank = 0.005;
     let config = SafetyConfig::for_device(&info(), 1000.0);
     let mut safety = Safety::new(SafetyConfig { ramp: Some(1e-3), ..config }, 0.045);
@@ -262,8 +265,9 @@ fn no_more_comes_out_than_went_in_plus_the_tank() {
 
 #[test]
 fn a_spring_stretched_in_a_fade_is_felt_again_by_a_hand_that_rests() {
-    // While the simulation's word was missing a hand stretched a spring to 3 N and 30 mJ, and then rests. Nothing was felt, so nothing is available but
-    // a tank at most: the force comes back all the same, no faster than the repayment's power.
+    // While the local model is faulty, a hand stretches a spring to 3 N and 30 mJ, and then rests.
+    // The hand felt no force, so at most the tank is available. The force still comes back, at most
+    // at the power of the repayment.
     let config = PassivityConfig::default();
     let mut safety = Safety::new(SafetyConfig::for_device(&info(), 1000.0), 0.045);
     let rests = || Wanted { stored: 0.03, ..wanted(3.0) };
@@ -276,7 +280,8 @@ fn a_spring_stretched_in_a_fade_is_felt_again_by_a_hand_that_rests() {
         let stretching = Wanted { moved, stored: 0.03 * share * share, ..wanted(3.0 * share) };
         safety.tick(&Wanted { fault: Some(Fault::BadModel), ..stretching });
     }
-    // A hand carried along spends the tank that a fade leaves: 3 N over 1.6 mm.
+    // A hand that is carried along spends the energy of the tank that is left after the fade: 3 N
+    // over 1.6 mm.
     let mut port = Port::default();
     let mut spent = 0.0;
     let mut last = Vector3::zeros();

@@ -1,7 +1,9 @@
-//! Force Dimension devices (omega, delta, sigma, lambda; Novint Falcon) through the maker's DHD library, version 3; its DRD library, which
-//! holds the same functions and those of the robotic kind, where the device is to find its reference by itself.
+//! Force Dimension devices (omega, delta, sigma, lambda; Novint Falcon) through the vendor's DHD
+//! library, version 3.
 //!
-//! The loop keeps the time. The maker's axes are x toward the user, y right, z up, in metres and newtons; Bevy's are (y, z, x).
+//! If the device is to find its reference by itself, the driver uses the vendor's DRD library,
+//! which has the same functions and additional robotic ones. The loop does the timing. The vendor's
+//! axes are x toward the user, y right, z up, in meters and newtons. Bevy's axes are (y, z, x).
 
 use std::{
     ffi::{c_char, c_int, c_uchar, c_uint},
@@ -36,7 +38,7 @@ functions! {
 }
 
 functions! {
-    /// DRD's own, as drdc.h declares them.
+    /// DRD's own functions, as drdc.h declares them.
     struct Robotic {
         open_id = "drdOpenID": fn(c_char) -> c_int;
         close = "drdClose": fn(c_char) -> c_int;
@@ -47,21 +49,26 @@ functions! {
     }
 }
 
-/// Where the status says that the device knows its position.
+/// Index in the status that says whether the device knows its position.
 const STATUS_RESET: usize = 3;
-/// More than any version of the library writes.
+/// Length of the status array. It is more than any version of the library writes.
 const STATUS_ROOM: usize = 64;
 
-/// Which device, and through which library.
+/// Choice of the device and of the library.
 #[derive(Debug, Clone, PartialEq, Eq, Default)]
 pub struct ForceDimensionConfig {
-    /// The library's path; `None` looks for it by its usual names. Default: `None`.
+    /// Path of the library. With `None` the library is searched by its usual names. Default:
+    /// `None`.
     pub library: Option<PathBuf>,
-    /// Let a device that does not know its position find it by itself, when it is opened and when it comes back: **it drives through its workspace with its
-    /// own motors**, for some seconds, and no emergency stop of ours reaches it meanwhile. Hands off, and a thumb on the device's own switch. Needs the maker's
-    /// DRD library. Default: `false`, it is moved by hand.
+    /// Whether a device that does not know its position finds it by itself, when it is opened and
+    /// when it comes back.
+    ///
+    /// **The device then drives through its workspace with its own motors** for some seconds, and
+    /// Pliant's emergency stop does not reach it meanwhile. Keep hands off, and keep a thumb on the
+    /// device's own switch. This setting needs the vendor's DRD library. Default: `false`, the user
+    /// moves the device by hand.
     pub auto_init: bool,
-    /// Which of the devices that are plugged in, from 0. Default: 0.
+    /// Index of the device among the connected devices, from 0. Default: 0.
     pub index: u8,
 }
 
@@ -72,22 +79,24 @@ pub struct ForceDimension {
     config: ForceDimensionConfig,
     id: Option<c_char>,
     info: DeviceInfo,
-    /// Last, so that it is unloaded after everything that calls into it.
+    /// This field comes last, so that the library is unloaded after everything that calls into it.
     _library: Library,
 }
 
 impl ForceDimension {
-    /// Loads the library and opens the device. Forces are switched on; they are zero until the loop runs.
+    /// Loads the library and opens the device. The forces are enabled, and they are zero until the
+    /// loop runs.
     ///
     /// # Errors
-    /// No library, one older than 3, one that lacks a function, no such device, or one that was to find its reference by itself and did not.
+    /// Returns an error if there is no library, if it is older than 3 or lacks a function, if there
+    /// is no such device, or if the device could not find its reference by itself as requested.
     pub fn open(config: ForceDimensionConfig) -> Result<Self, VendorError> {
         let names = if config.auto_init { ROBOTIC_NAMES } else { NAMES };
         let (library, path) = load(config.library.as_ref(), names)?;
         let api = Api::from(&library, &path)?;
         let robotic = if config.auto_init { Some(Robotic::from(&library, &path)?) } else { None };
         let mut v = [0 as c_int; 4];
-        // SAFETY: four integers, as the header says.
+        // SAFETY: the header specifies four integers.
         unsafe {
             let at = v.as_mut_ptr();
             (api.version)(at, at.add(1), at.add(2), at.add(3));
@@ -102,20 +111,20 @@ impl ForceDimension {
         Ok(device)
     }
 
-    /// How many devices are plugged in.
+    /// Returns the number of connected devices.
     ///
     /// # Errors
-    /// No library, or one that lacks a function.
+    /// Returns an error if there is no library or it lacks a function.
     pub fn count(config: &ForceDimensionConfig) -> Result<usize, VendorError> {
         let (library, path) = load(config.library.as_ref(), NAMES)?;
         let api = Api::from(&library, &path)?;
-        // SAFETY: takes nothing, keeps nothing.
+        // SAFETY: the function takes nothing and keeps nothing.
         Ok(unsafe { (api.count)() }.max(0) as usize)
     }
 
     fn connect(&mut self) -> Result<(), VendorError> {
         let api = self.api;
-        // SAFETY: plain values in, plain values out, strings are the library's own.
+        // SAFETY: arguments and results are plain values. The library owns the strings.
         unsafe {
             let refused = |what| VendorError::Device {
                 what,
@@ -137,7 +146,8 @@ impl ForceDimension {
                 && !(robotic.initialized)(id)
             {
                 let found = (robotic.auto_init)(id);
-                // Its control loop is ended whatever came of it, with the forces left on for ours.
+                // The control loop of the library is stopped in any case. The forces stay enabled
+                // for Pliant's own loop.
                 let stopped = (robotic.stop)(true, id);
                 if found < 0 || stopped < 0 {
                     let error = refused("drdAutoInit");
@@ -160,7 +170,7 @@ impl ForceDimension {
 
     fn disconnect(&mut self) {
         if let Some(id) = self.id.take() {
-            // SAFETY: the id is ours and is not used again.
+            // SAFETY: this value owns the id and does not use it again.
             unsafe {
                 match &self.robotic {
                     Some(robotic) => (robotic.close)(id),
@@ -170,12 +180,13 @@ impl ForceDimension {
         }
     }
 
-    /// A result below zero is an error; zero and the time guard's one are not.
+    /// Turns a result into an error if it is below zero. Zero and the time guard's one are no
+    /// errors.
     fn check(&self, result: c_int) -> Result<(), Fault> {
         if result >= 0 {
             return Ok(());
         }
-        // SAFETY: takes nothing, keeps nothing.
+        // SAFETY: the function takes nothing and keeps nothing.
         Err(Fault::Driver(unsafe { (self.api.error)() }.into()))
     }
 }
@@ -194,7 +205,8 @@ const ROBOTIC_NAMES: &[&str] = &["libdrd.dylib", "libdrd.3.dylib"];
 #[cfg(not(any(windows, target_os = "macos")))]
 const ROBOTIC_NAMES: &[&str] = &["libdrd.so", "libdrd.so.3"];
 
-/// The library does not say what a device can do: these are the makers' data sheets by name, and a cautious guess for the rest.
+/// Returns the properties of a device. The library does not report them, so they come from the
+/// vendors' data sheets by name, with a cautious estimate for the rest.
 fn describe(name: &str, serial: u16, active_wrist: bool) -> DeviceInfo {
     let lower = name.to_lowercase();
     let (force, stiffness, damping, mass) = [
@@ -236,7 +248,7 @@ impl HapticDevice for ForceDimension {
     fn calibration(&mut self) -> Calibration {
         let Some(id) = self.id else { return Calibration::Needed("connect the device") };
         let mut status = [0 as c_int; STATUS_ROOM];
-        // SAFETY: room for more than any version writes.
+        // SAFETY: the array has room for more than any version writes.
         let result = unsafe { (self.api.status)(status.as_mut_ptr(), id) };
         if result >= 0 && status[STATUS_RESET] != 0 {
             Calibration::Ready
@@ -254,13 +266,13 @@ impl HapticDevice for ForceDimension {
         };
         let [fx, fy, fz] = to_device(wrench.force);
         let [tx, ty, tz] = to_device(wrench.torque);
-        // SAFETY: plain values.
+        // SAFETY: all arguments are plain values.
         let set = unsafe { (self.api.wrench)(fx, fy, fz, tx, ty, tz, id) };
         scheduler.wait();
         self.check(set)?;
         let (mut p, mut v) = ([f64::NAN; 3], [0.0f64; 3]);
         let mut frame = [[0.0f64; 3]; 3];
-        // SAFETY: three doubles each and a row-major 3x3 matrix, as the header says.
+        // SAFETY: the header specifies three doubles each and a row-major 3x3 matrix.
         unsafe {
             let at = p.as_mut_ptr();
             self.check((self.api.pose)(at, at.add(1), at.add(2), frame.as_mut_ptr(), id))?;
@@ -269,7 +281,7 @@ impl HapticDevice for ForceDimension {
         }
         let [a, b, c] = frame;
         let rotation = Matrix3::new(a[0], a[1], a[2], b[0], b[1], b[2], c[0], c[1], c[2]);
-        // From the maker's axes to Bevy's on both sides.
+        // Both sides change from the vendor's axes to Bevy's.
         let axes = Matrix3::new(0.0, 1.0, 0.0, 0.0, 0.0, 1.0, 1.0, 0.0, 0.0);
         let turned = axes * rotation * axes.transpose();
         let q = if turned.determinant() > 0.5 {
@@ -281,7 +293,7 @@ impl HapticDevice for ForceDimension {
             position: from_device(p),
             orientation: [q.i, q.j, q.k, q.w],
             velocity: Some(from_device(v)),
-            // SAFETY: a plain value.
+            // SAFETY: the argument is a plain value.
             buttons: unsafe { (self.api.buttons)(id) },
             sequence: None,
         })
@@ -289,7 +301,7 @@ impl HapticDevice for ForceDimension {
 
     fn safe_stop(&mut self) {
         if let Some(id) = self.id {
-            // SAFETY: plain values.
+            // SAFETY: all arguments are plain values.
             unsafe {
                 (self.api.wrench)(0.0, 0.0, 0.0, 0.0, 0.0, 0.0, id);
             }
@@ -302,7 +314,7 @@ impl HapticDevice for ForceDimension {
     }
 }
 
-/// (x toward the user, y right, z up) to (x right, y up, z toward the user).
+/// Converts (x toward the user, y right, z up) to (x right, y up, z toward the user).
 fn from_device([x, y, z]: [f64; 3]) -> [f64; 3] {
     [y, z, x]
 }

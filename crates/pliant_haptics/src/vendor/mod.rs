@@ -1,4 +1,5 @@
-//! Devices whose makers' libraries are loaded at run time: nothing is linked, nothing is needed to build, and a machine without them says so.
+//! Devices with vendor libraries that are loaded at run time. The build links nothing and needs
+//! nothing, and without the libraries an error is returned at run time.
 
 mod force_dimension;
 mod open_haptics;
@@ -11,24 +12,25 @@ use thiserror::Error;
 pub use force_dimension::{ForceDimension, ForceDimensionConfig};
 pub use open_haptics::{OpenHaptics, OpenHapticsConfig};
 
-/// Why a vendor's device cannot be had.
+/// Reason why a vendor's device could not be opened.
 #[derive(Debug, Error)]
 #[non_exhaustive]
 pub enum VendorError {
-    /// No library under any of its names.
+    /// No library could be loaded under any of its names.
     #[error("none of {tried:?} could be loaded: {reason}")]
     Library {
-        /// The names tried.
+        /// The names that were tried.
         tried: Vec<PathBuf>,
-        /// What the loader said of the last.
+        /// The loader's message for the last name.
         reason: String,
     },
-    /// The library is there and lacks a function: of another version, or something else by the same name.
+    /// The library lacks a function. It has another version, or it is another library of the same
+    /// name.
     #[error("{library:?} has no {symbol}: it is of another version, or another library")]
     Symbol {
         /// The library.
         library: PathBuf,
-        /// The function that is missing.
+        /// The missing function.
         symbol: &'static str,
     },
     /// The library is too old.
@@ -36,24 +38,24 @@ pub enum VendorError {
     Version {
         /// The library.
         library: PathBuf,
-        /// What it says.
+        /// The version of the library.
         found: String,
-        /// What is needed.
+        /// The needed version.
         needed: &'static str,
     },
-    /// The library has no device for us.
+    /// The library could not open a device.
     #[error("no device: {what} failed with code {code:#x} ({text})")]
     Device {
         /// The call that failed.
         what: &'static str,
-        /// The maker's code.
+        /// The vendor's error code.
         code: i64,
-        /// The maker's words, if any.
+        /// The vendor's error text, if any.
         text: String,
     },
 }
 
-/// Loads the first of `names` that there is, or `given` and nothing else.
+/// Loads the first available library of `names`, or only `given` if there is one.
 fn load(given: Option<&PathBuf>, names: &[&str]) -> Result<(Library, PathBuf), VendorError> {
     let tried: Vec<PathBuf> = match given {
         Some(path) => vec![path.clone()],
@@ -61,8 +63,8 @@ fn load(given: Option<&PathBuf>, names: &[&str]) -> Result<(Library, PathBuf), V
     };
     let mut reason = String::from("no names");
     for name in &tried {
-        // SAFETY: loading runs the library's initialisers. These are the makers' own libraries by their own names, or the path that the
-        // user gave.
+        // SAFETY: loading runs the library's initializers. These are the vendors' own libraries by
+        // their own names, or the path that the user gave.
         match unsafe { Library::new(name) } {
             Ok(library) => return Ok((library, name.clone())),
             Err(error) => reason = error.to_string(),
@@ -71,7 +73,8 @@ fn load(given: Option<&PathBuf>, names: &[&str]) -> Result<(Library, PathBuf), V
     Err(VendorError::Library { tried, reason })
 }
 
-/// Declares a table of functions and how it is filled from a library: one list, so that name, signature and symbol cannot drift apart.
+/// Declares a table of functions and how a library fills it. One list serves for both, so that
+/// name, signature and symbol cannot diverge.
 macro_rules! functions {
     ($(#[$meta:meta])* struct $name:ident { $($field:ident = $symbol:literal: fn($($arg:ty),*) $(-> $ret:ty)?;)* }) => {
         $(#[$meta])*
@@ -81,7 +84,7 @@ macro_rules! functions {
         impl $name {
             fn from(library: &libloading::Library, path: &std::path::Path) -> Result<Self, crate::vendor::VendorError> {
                 $(
-                    // SAFETY: the signature is that of the maker's public header.
+                    // SAFETY: the signature is that of the vendor's public header.
                     let $field = unsafe {
                         library.get::<unsafe extern "system" fn($($arg),*) $(-> $ret)?>(concat!($symbol, "\0").as_bytes())
                     };
@@ -97,7 +100,7 @@ macro_rules! functions {
 }
 use functions;
 
-/// A C string of the library's, or nothing.
+/// Copies a C string of the library. A null pointer gives an empty string.
 ///
 /// # Safety
 /// `text` is null or a C string that lives long enough to be copied.
@@ -105,6 +108,6 @@ unsafe fn text(text: *const std::ffi::c_char) -> String {
     if text.is_null() {
         return String::new();
     }
-    // SAFETY: as the caller promised.
+    // SAFETY: the caller guarantees it.
     unsafe { std::ffi::CStr::from_ptr(text) }.to_string_lossy().into_owned()
 }

@@ -1,7 +1,9 @@
-//! 3D Systems devices (Touch, Touch X, Omni, Premium) through OpenHaptics' HDAPI, `libHD.so` or `hd.dll`, version 3.
+//! 3D Systems devices (Touch, Touch X, Omni, Premium) through OpenHaptics' HDAPI, `libHD.so` or
+//! `hd.dll`, version 3.
 //!
-//! The library's own servo thread paces the loop: each exchange is one callback, scheduled and waited for. Device axes are Bevy's already (x right,
-//! y up, z toward the user); lengths are millimetres, forces newtons.
+//! The library's own servo thread does the timing of the loop: each exchange schedules one callback
+//! and waits for it. The device axes already are Bevy's (x right, y up, z toward the user). Lengths
+//! are in millimeters, forces in newtons.
 
 use std::{
     ffi::{CString, c_char, c_int, c_uint, c_ulong, c_ushort, c_void},
@@ -30,7 +32,7 @@ struct ErrorInfo {
 
 const _: () = assert!(size_of::<ErrorInfo>() == 12, "HDErrorInfo is three 32-bit words");
 
-// From hdDefines.h.
+// These values come from hdDefines.h.
 const CURRENT_BUTTONS: c_uint = 0x2000;
 const CURRENT_POSITION: c_uint = 0x2050;
 const CURRENT_VELOCITY: c_uint = 0x2051;
@@ -79,15 +81,18 @@ functions! {
     }
 }
 
-/// Devices that are open in this process: there is one scheduler for all of them, started with the first and stopped with the last.
+/// Number of open devices in this process. One scheduler serves all of them. It starts with the
+/// first device and stops with the last.
 static OPEN: Mutex<usize> = Mutex::new(0);
 
-/// Which device, and through which library.
+/// Choice of the device and of the library.
 #[derive(Debug, Clone, PartialEq)]
 pub struct OpenHapticsConfig {
-    /// The library's path; `None` looks for it by its usual names. Default: `None`.
+    /// Path of the library. With `None` the library is searched by its usual names. Default:
+    /// `None`.
     pub library: Option<PathBuf>,
-    /// The device's name in the maker's setup; `None` takes the default device. Default: `None`.
+    /// Name of the device in the vendor's setup. With `None` the default device is used. Default:
+    /// `None`.
     pub device: Option<String>,
     /// Rate of the library's servo thread, Hz: 500 or 1000 on most devices. Default: 1000.
     pub rate: f64,
@@ -105,32 +110,33 @@ pub struct OpenHaptics {
     config: OpenHapticsConfig,
     handle: Option<Handle>,
     info: DeviceInfo,
-    /// Last, so that it is unloaded after everything that calls into it.
+    /// This field comes last, so that the library is unloaded after everything that calls into it.
     _library: Library,
 }
 
-/// What goes into a callback and comes out.
+/// Input and output of a callback.
 struct Frame {
     api: Api,
     device: Handle,
     force: [f64; 3],
     position: [f64; 3],
     velocity: [f64; 3],
-    /// Column-major, millimetres.
+    /// Transform, column-major, millimeters.
     transform: [f64; 16],
     buttons: c_int,
     error: ErrorInfo,
 }
 
-/// One frame on the library's servo thread: force out, state in.
+/// Runs one frame on the library's servo thread: writes the force and reads the state.
 ///
 /// # Safety
-/// `data` is a `Frame` that nobody else touches until this has returned.
+/// `data` is a `Frame` that nothing else accesses until this function has returned.
 unsafe extern "system" fn servo(data: *mut c_void) -> c_uint {
     // SAFETY: `OpenHaptics::frame` passes its own frame and waits.
     let frame = unsafe { &mut *data.cast::<Frame>() };
     let api = frame.api;
-    // SAFETY: the calls and the lengths of their arrays are those of the header; between begin and end, as it asks.
+    // SAFETY: the calls and the lengths of their arrays are those of the header, and the calls lie
+    // between begin and end, as the header requires.
     unsafe {
         (api.begin)(frame.device);
         (api.set_double)(CURRENT_FORCE, frame.force.as_ptr());
@@ -145,10 +151,12 @@ unsafe extern "system" fn servo(data: *mut c_void) -> c_uint {
 }
 
 impl OpenHaptics {
-    /// Loads the library and opens the device. Forces are switched on; they are zero until the loop runs.
+    /// Loads the library and opens the device. The forces are enabled, and they are zero until the
+    /// loop runs.
     ///
     /// # Errors
-    /// No library, one without the functions of version 3, or no device.
+    /// Returns an error if there is no library, if it lacks a function of version 3 or is older, or
+    /// if there is no device.
     pub fn open(config: OpenHapticsConfig) -> Result<Self, VendorError> {
         let names =
             if cfg!(windows) { &["hd.dll"][..] } else { &["libHD.so", "libHD.so.3", "libHD.so.3.4"][..] };
@@ -156,7 +164,7 @@ impl OpenHaptics {
         let api = Api::from(&library, &path)?;
         let mut device = Self { api, handle: None, info: describe(&config), config, _library: library };
         device.connect()?;
-        // SAFETY: a static string of the library's.
+        // SAFETY: the library returns a static string.
         let version = unsafe { text((api.get_string)(VERSION)) };
         if version.split('.').next().and_then(|n| n.parse::<u32>().ok()).is_some_and(|major| major < 3) {
             return Err(VendorError::Version { library: path, found: version, needed: "3" });
@@ -170,7 +178,8 @@ impl OpenHaptics {
         })?;
         let api = self.api;
         let mut open = OPEN.lock().unwrap_or_else(|poisoned| poisoned.into_inner());
-        // SAFETY: a C string or null, which is the default device; the rest follows the order of the maker's examples.
+        // SAFETY: the name is a C string, or null for the default device. The rest follows the
+        // order of the vendor's examples.
         unsafe {
             let handle = (api.init)(name.as_ref().map_or(std::ptr::null(), |n| n.as_ptr()));
             let error = (api.get_error)();
@@ -187,7 +196,7 @@ impl OpenHaptics {
             (api.enable)(FORCE_OUTPUT);
             if *open == 0 {
                 (api.set_rate)(self.config.rate.clamp(100.0, 8000.0) as c_ulong);
-                // A rate that the device does not have is an error that leaves the old one standing.
+                // A rate that the device does not support is an error that keeps the old rate.
                 let _ = (api.get_error)();
                 (api.start)();
             }
@@ -207,7 +216,7 @@ impl OpenHaptics {
         let Some(handle) = self.handle.take() else { return };
         let mut open = OPEN.lock().unwrap_or_else(|poisoned| poisoned.into_inner());
         *open = open.saturating_sub(1);
-        // SAFETY: the handle is ours and is not used again.
+        // SAFETY: this value owns the handle and does not use it again.
         unsafe {
             if *open == 0 {
                 (self.api.stop)();
@@ -229,7 +238,8 @@ impl OpenHaptics {
             buttons: 0,
             error: ErrorInfo::default(),
         };
-        // SAFETY: the call returns when the callback has; the frame lives that long and nobody else has it.
+        // SAFETY: the call returns after the callback, the frame lives that long, and nothing else
+        // accesses it.
         unsafe { (self.api.run)(servo, (&raw mut frame).cast(), PRIORITY) };
         match frame.error.code {
             0 => {}
@@ -251,7 +261,7 @@ impl OpenHaptics {
     }
 }
 
-/// Before the device has been asked.
+/// Returns the assumed properties before the device was queried.
 fn describe(config: &OpenHapticsConfig) -> DeviceInfo {
     DeviceInfo {
         name: "3D Systems device".into(),
@@ -275,7 +285,7 @@ fn describe(config: &OpenHapticsConfig) -> DeviceInfo {
     }
 }
 
-/// What the current device says of itself, where it says something usable.
+/// Reads the properties of the current device. Values that are not usable keep the assumed ones.
 ///
 /// # Safety
 /// A device is current, and `api` is that of a loaded library.
@@ -291,14 +301,14 @@ unsafe fn read_info(api: &Api, config: &OpenHapticsConfig) -> DeviceInfo {
         let value = value[0] * scale;
         if error.code == 0 && value.is_finite() && value > 0.0 { value } else { or }
     };
-    // Stiffness is in N/mm, damping in N s/mm.
+    // The library gives the stiffness in N/mm and the damping in N s/mm.
     info.max_stiffness = double(NOMINAL_MAX_STIFFNESS, 1e3, info.max_stiffness);
     info.max_damping = double(NOMINAL_MAX_DAMPING, 1e3, info.max_damping);
     info.peak_force = double(NOMINAL_MAX_FORCE, 1.0, info.peak_force);
     info.continuous_force =
         double(NOMINAL_MAX_CONTINUOUS_FORCE, 1.0, info.continuous_force).min(info.peak_force);
     let mut box_mm = [0.0f64; 16];
-    // SAFETY: six doubles, smallest corner first; strings are the library's own.
+    // SAFETY: the library writes six doubles, smallest corner first. It owns the strings.
     unsafe {
         (api.get_double)(USABLE_WORKSPACE_DIMENSIONS, box_mm.as_mut_ptr());
         let error = (api.get_error)();
@@ -331,7 +341,8 @@ impl HapticDevice for OpenHaptics {
         let Some(handle) = self.handle else {
             return Calibration::Needed("connect the device");
         };
-        // SAFETY: the device is ours and open. What is asked below names no device and means the current one, which may be another of this process.
+        // SAFETY: this value owns the open device. The calls below use the current device, which
+        // may be another one of this process, so this device is made current first.
         unsafe {
             (self.api.make_current)(handle);
             match (self.api.check_calibration)() {

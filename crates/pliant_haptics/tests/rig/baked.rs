@@ -1,19 +1,22 @@
-//! A baked body made of another material and at another size: geometry and shapes stay, everything else follows by dimension.
+//! A baked body with another material and size. The geometry and the mode shapes stay, and
+//! everything else scales by dimension.
 
 use std::path::Path;
 
 use pliant_modal::{FlexibilitySite, ModalModel, ModelParts, SurfaceMesh};
 
-/// The body that the project ships.
+/// Reads the body that the project ships.
 pub fn pip() -> ModalModel {
     let path = Path::new(env!("CARGO_MANIFEST_DIR")).join("../../assets/pip.modal");
     ModalModel::read(path).unwrap()
 }
 
-/// `model` with Young's modulus `young` (Pa) and its largest extent `size` (m), of the same density, Poisson ratio and damping ratio.
+/// Returns `model` with Young's modulus `young` (Pa) and the largest extent `size` (m). Density,
+/// Poisson ratio and damping ratio stay.
 ///
-/// With lengths times `s` and stiffness times `e`: masses go as `s^3`, stiffnesses as `e s`, so frequencies as `sqrt(e) / s`, mass-normalised shapes as
-/// `s^-3/2` and compliances as `1 / (e s)`.
+/// With lengths scaled by `s` and Young's modulus by `e`, masses scale as `s^3` and stiffnesses as
+/// `e s`. Frequencies therefore scale as `sqrt(e) / s`, mass-normalized shapes as `s^-3/2` and
+/// compliances as `1 / (e s)`.
 pub fn made_of(model: &ModalModel, young: f64, size: f64) -> ModalModel {
     let parts = model.parts();
     let (s, e) = (size / model.size(), young / parts.info.young);
@@ -48,7 +51,7 @@ pub fn made_of(model: &ModalModel, young: f64, size: f64) -> ModalModel {
     .unwrap()
 }
 
-/// The highest surface vertex: an ear, a head.
+/// Returns the highest surface vertex, such as an ear or a head.
 pub fn top(model: &ModalModel) -> u32 {
     let positions = model.surface().positions();
     (0..positions.len()).max_by(|&a, &b| positions[a][1].total_cmp(&positions[b][1])).unwrap() as u32

@@ -1,5 +1,6 @@
-//! A block whose modes are known in closed form: a rod's axial modes, the same on all three axes.
-//! Fixed at x = 0, free at x = L: phi_k = sqrt(2 / m) sin(k_k x), k_k = (2k - 1) pi / (2L), omega_k = k_k sqrt(E / rho).
+//! A block whose modes are known in closed form: the axial modes of a rod, the same on all three
+//! axes. The rod is fixed at x = 0 and free at x = L: `phi_k = sqrt(2 / m) sin(k_k x)`,
+//! `k_k = (2k - 1) pi / (2L)`, `omega_k = k_k sqrt(E / rho)`.
 
 use pliant_modal::{BakeInfo, Damping, Element, FlexibilitySite, ModalModel, ModelParts, SurfaceMesh};
 
@@ -12,7 +13,7 @@ pub fn tip() -> u32 {
     (STATIONS as u32 - 1) * 4
 }
 
-/// `modes` in all, a third of them along each axis.
+/// Creates a block with `modes` modes in total, a third of them along each axis.
 pub fn block(young: f64, modes: usize) -> ModalModel {
     let zeta = 0.05;
     let side = AREA.sqrt() as f32;

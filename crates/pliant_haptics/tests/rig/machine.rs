@@ -1,4 +1,4 @@
-//! What tests need of the machine, however busy it is and whatever else runs on it.
+//! Helpers that make tests robust on a busy machine.
 #![allow(dead_code, reason = "every test uses its own part of it")]
 
 use std::{
@@ -9,11 +9,11 @@ use std::{
 
 use pliant_haptics::{LoopConfig, SafetyConfig, StaleConfig, VirtualConfig};
 
-/// How long anything that must come may take. Only what never comes takes longer.
+/// Time limit for every expected event. The limit is long, so that only an event that never happens
+/// exceeds it.
 pub const LIMIT: Duration = Duration::from_secs(60);
 
-/// Looks until it sees what is waited for. Time passes within `look`, which says what it saw
-/// instead.
+/// Calls `look` until it succeeds. `look` lets time pass and returns what it saw if it fails.
 #[track_caller]
 pub fn until<T, L: Debug>(what: &str, mut look: impl FnMut() -> Result<T, L>) -> T {
     let begun = Instant::now();
@@ -25,11 +25,11 @@ pub fn until<T, L: Debug>(what: &str, mut look: impl FnMut() -> Result<T, L>) ->
     }
 }
 
-/// A loop in real time whose force comes and stays, although the machine leaves the loop or the
-/// game out for a while.
+/// Returns settings of a real-time loop whose force stays, even if the machine suspends the loop or
+/// the game for a while.
 ///
-/// A second of silence is no reason to fade, a stall only keeps the ramp from going on, and motors
-/// do not get hot while somebody waits. What those stages do by default is tested in virtual time.
+/// A second without updates causes no fade, a stall only pauses the ramp, and the motors have no
+/// thermal limit. Tests in virtual time cover the defaults of these stages.
 pub fn patient() -> LoopConfig {
     let safety = SafetyConfig {
         stale: Some(StaleConfig { patience: 1.0, limit: 2.0 }),
@@ -40,8 +40,8 @@ pub fn patient() -> LoopConfig {
     LoopConfig { safety: Some(safety), ..LoopConfig::default() }
 }
 
-/// An address where nobody listens and nobody can begin to: the port is the near end of a
-/// connection that stays.
+/// An address that refuses connections. Its port is the local end of an open connection, so no
+/// other process can listen there.
 pub struct Nobody {
     pub address: String,
     _ends: (TcpListener, TcpStream),

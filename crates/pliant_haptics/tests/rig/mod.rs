@@ -30,13 +30,14 @@ impl Rig {
         }
     }
 
-    /// No stage of the safety pipeline at all.
+    /// Creates a rig without any optional stage of the safety pipeline.
     pub fn bare(device: VirtualConfig, hand: Hand) -> Self {
         let config = LoopConfig { safety: Some(SafetyConfig::bare()), ..LoopConfig::default() };
         Self::new(device, hand, config)
     }
 
-    /// Without what the whole pipeline takes at the start: ramp and coupling clamp are not what is measured.
+    /// Creates a rig whose safety settings are those for the device, modified by `change`. A test
+    /// can leave out stages that it does not measure, such as the ramp.
     pub fn with(device: VirtualConfig, hand: Hand, change: impl FnOnce(&mut SafetyConfig)) -> Self {
         let mut safety = SafetyConfig::for_device(&device.info(), 1000.0);
         change(&mut safety);
@@ -49,7 +50,8 @@ impl Rig {
         self.cycle.device()
     }
 
-    /// One period in which the simulation says the same again: a spring of `stiffness` to the middle, with `damping`.
+    /// Runs one period with a new local model update: a spring of `stiffness` to the center, with
+    /// `damping`.
     pub fn spring(&mut self, stiffness: f64, damping: f64) {
         self.model.tick += 1;
         self.model.stamp = self.scheduler.now();
@@ -64,7 +66,7 @@ impl Rig {
         self.step();
     }
 
-    /// One period in which the simulation says nothing new.
+    /// Runs one period without a new local model update.
     pub fn step(&mut self) {
         self.cycle.step(&mut self.scheduler, &self.model, &mut self.events);
     }

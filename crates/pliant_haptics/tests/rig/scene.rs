@@ -1,4 +1,5 @@
-//! A body stepped at the game's rate, a network of a fixed delay, and the loop with a virtual device: all in virtual time.
+//! A body stepped at the game's rate, a network of a fixed delay, and the loop with a virtual
+//! device, all in virtual time.
 
 use std::{collections::VecDeque, sync::Arc};
 
@@ -28,21 +29,21 @@ pub struct Scene {
     targets: VecDeque<(f64, f64, [f64; 3])>,
     seen: f64,
     models: VecDeque<(f64, LocalModel)>,
-    /// The simulation does nothing: the game is paused, late, or gone.
+    /// Whether the simulation is suspended: the game is paused, late or gone.
     pub silent: bool,
     /// Largest change of the force in a period, N.
     pub largest_step: f64,
-    /// Most that the motors have ever done more than was put in, J.
+    /// Largest excess so far of the motors' work over the supplied energy, J.
     pub most_given: f64,
     last_force: [f64; 3],
 }
 
-/// What is dragged.
+/// The body that is dragged.
 #[derive(Clone)]
 pub enum Subject {
-    /// The block whose modes are known in closed form, by its tip.
+    /// The block whose modes are known in closed form, dragged by its tip.
     Block,
-    /// A baked body made 15 cm large, by its top.
+    /// A baked body scaled to 15 cm, dragged by its top.
     Baked(Arc<ModalModel>),
 }
 
@@ -87,7 +88,7 @@ impl Scene {
         let device = VirtualDevice::new(c.device, c.hand).unwrap();
         let hand = device.handle();
         let patch = Patch::around(model.surface(), vertex, radius).unwrap();
-        // The middle of the workspace lies on the patch, so that grabbing moves nothing.
+        // The center of the workspace lies on the patch, so that grabbing moves nothing.
         let origin = {
             let mut probe = body.clone();
             let id = probe.grab(&patch, pliant_modal::GrabConfig::default()).unwrap();
@@ -128,7 +129,7 @@ impl Scene {
         }
     }
 
-    /// One period of the loop, and of everything that falls into it.
+    /// Runs one period of the loop, with the simulation steps and the messages that are due in it.
     pub fn tick(&mut self) {
         let now = self.scheduler.now();
         let newest = self.cycle.core().last();
@@ -178,7 +179,7 @@ impl Scene {
         self.cycle.core().last().wrench.force.iter().map(|v| v * v).sum::<f64>().sqrt()
     }
 
-    /// Largest speed of the hand over `seconds`, m/s.
+    /// Returns the largest speed of the hand over `seconds`, m/s.
     pub fn largest_speed(&mut self, seconds: f64) -> f64 {
         let mut worst = 0.0f64;
         for _ in 0..(seconds * self.cycle.core().config().rate) as usize {
@@ -189,34 +190,37 @@ impl Scene {
     }
 }
 
-/// What a drag came to.
+/// Result of a drag.
 pub struct Drag {
     /// Largest speed in two windows of half a second, 1 and 3 s after the hand stopped, m/s.
     pub speeds: [f64; 2],
-    /// Most that the motors had done beyond what was put in, J.
+    /// Largest excess of the motors' work over the supplied energy, J.
     pub given: f64,
-    /// Largest change of force in a period, N, and the limit.
+    /// Largest change of the force in a period, N, and the limit.
     pub step: [f64; 2],
     /// Force at the end, N.
     pub force: f64,
 }
 
 impl Drag {
-    /// Sustained: still moving, and not much slower than two seconds before, or as fast as no hand at rest is, however fast it was.
+    /// Returns whether the oscillation is sustained. The hand still moves and is not much slower
+    /// than two seconds before, or it is faster than a hand at rest can be.
     pub fn oscillates(&self) -> bool {
         let [early, late] = self.speeds;
-        // Not the other way round: what is not a number is not calm.
+        // The condition tests for calm, so that a NaN does not count as calm.
         let calm = late <= 5e-3 || (late <= 0.7 * early && late <= 20e-3);
         !calm
     }
 
-    /// No sustained oscillation, no energy beyond what was put in and the tank, no force step above the slew limit.
+    /// Returns whether there is no sustained oscillation, no energy beyond the supplied energy and
+    /// the tank, and no force step above the slew limit.
     pub fn keeps_its_promises(&self) -> bool {
         !self.oscillates() && self.given <= 5e-3 && self.step[0] <= self.step[1] * 1.000_001
     }
 }
 
-/// Pulls 3 cm to the side in half a second and stays there; nobody's hand gives the free device a push instead.
+/// Drags 3 cm to the side in half a second and holds still. Without a hand, the free device gets an
+/// initial velocity instead.
 pub fn drag(config: SceneConfig) -> Drag {
     let free = config.hand == Hand::NONE;
     let mut scene = Scene::new(config);

@@ -1,4 +1,4 @@
-//! A hand: a patch tied to a target by a compliant, implicit constraint.
+//! A hand: a compliant, implicit constraint that ties a patch to a target.
 
 use std::sync::Arc;
 
@@ -8,13 +8,16 @@ use serde::{Deserialize, Serialize};
 use super::HeldPatch;
 use crate::{Relaxation, StepError};
 
-/// How a hand holds.
+/// Spring and damper between a hand and its patch.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 pub struct GrabConfig {
-    /// Stiffness of the hand's own spring (the device's coupling), N/m, in series with the patch's residual flexibility.
-    /// `None`: the hand is as stiff as the patch it holds allows. Default: `None`.
+    /// Stiffness of the hand's own spring (the coupling of the device), N/m, in series with the
+    /// residual flexibility of the patch.
+    ///
+    /// With `None` the hand is as stiff as the patch allows. Default: `None`.
     pub stiffness: Option<f64>,
-    /// Relaxation time of the coupling's damper, s: the coupling is `lambda = C^-1 (gap + relaxation d(gap)/dt)`. 0 or more. Default: 0.
+    /// Relaxation time of the coupling's damper, s, 0 or more. The coupling is
+    /// `lambda = C^-1 (gap + relaxation d(gap)/dt)`. Default: 0.
     pub relaxation: f64,
 }
 
@@ -25,28 +28,29 @@ impl Default for GrabConfig {
 }
 
 impl GrabConfig {
-    /// Stiffest spring that is taken from a network, N/m: twenty times that of the stiffest devices
-    /// (5,000 N/m), for tools that scale forces up.
+    /// Largest stiffness accepted from a network, N/m. It is twenty times that of the stiffest
+    /// devices (5,000 N/m), for tools that scale forces up.
     pub const MOST_STIFFNESS: f64 = 1e5;
-    /// Longest relaxation time of a damper that is taken from a network, s: the strongest dampers of
+    /// Longest relaxation time of a damper accepted from a network, s. The strongest dampers of
     /// devices (30 N s/m) on the softest hands (50 N/m) have 0.6 s.
     pub const MOST_RELAXATION: f64 = 1.0;
 
-    /// The same within what real devices have, and as single precision has it: what crosses a network.
+    /// Returns the configuration limited to the range of real devices and rounded to single
+    /// precision, for transmission over a network.
     #[must_use]
     pub fn capped(self) -> Self {
         let cap = |x: f64, most: f64| f64::from(x.min(most) as f32);
         Self {
-            // A spring too soft for single precision is still a spring.
+            // A spring that is too soft for single precision must remain a spring.
             stiffness: self.stiffness.map(|k| cap(k, Self::MOST_STIFFNESS).max(f64::from(f32::MIN_POSITIVE))),
             relaxation: cap(self.relaxation, Self::MOST_RELAXATION),
         }
     }
 
-    /// Checks both ranges.
+    /// Checks the ranges of both values.
     ///
     /// # Errors
-    /// [`StepError::Input`] with the value that is not finite or not in its range.
+    /// Returns [`StepError::Input`] for a value that is not finite or out of range.
     pub fn check(&self) -> Result<(), StepError> {
         if let Some(k) = self.stiffness {
             StepError::check("grab stiffness", "finite N/m above 0", k.is_finite() && k > 0.0, k)?;
@@ -59,44 +63,46 @@ impl GrabConfig {
 /// One hand in a step.
 #[derive(Debug, Clone)]
 pub struct Hand {
-    /// What is held. Of as many modes as are stepped.
+    /// The held patch. It must have as many modes as the kernel steps.
     pub patch: Arc<HeldPatch>,
-    /// By what it is held.
+    /// How the patch is held.
     pub hold: Hold,
-    /// Force on the body at the end of the last step, N, world axes; minus the reaction.
+    /// Force on the body at the end of the last step, N, world axes. It is minus the reaction.
     pub pull: Vector3<f64>,
-    /// Force on the body over the last step, which is held constant over it, N, world axes.
+    /// Force on the body over the last step, N, world axes. It is constant over the step.
     pub mean: Vector3<f64>,
-    /// How far the patch's residual flexibility has flown, m, body axes: the `z` of what the modes
-    /// leave out. Zero where the material is elastic.
+    /// Viscoelastic state of the patch's residual flexibility, m, body axes: the `z` of the
+    /// compliance that the modes leave out. Zero where the material is elastic.
     pub flow: Vector3<f64>,
 }
 
-/// By what a patch is held.
+/// What holds a patch.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub enum Hold {
-    /// A hand at a target.
+    /// A hand at a target position.
     Target {
-        /// Where the hand is, m, world axes.
+        /// Position of the hand, m, world axes.
         target: Vector3<f64>,
-        /// How fast it moves, m/s, world axes. Only a damper looks at it.
+        /// Velocity of the hand, m/s, world axes. Only the damper uses this value.
         velocity: Vector3<f64>,
-        /// Its spring and damper.
+        /// Spring and damper of the hand.
         config: GrabConfig,
     },
-    /// A patch that was measured elsewhere: it ends at this displacement from rest (m, body axes)
-    /// when it is pulled by the hand's `pull`, as told before the step.
+    /// A patch whose position was measured elsewhere.
+    ///
+    /// The value is the displacement from rest (m, body axes) at which the patch ends the step
+    /// under the hand's `pull`, as set before the step.
     Measured(Vector3<f64>),
 }
 
 impl Hand {
-    /// A hand that has not pulled yet.
+    /// Makes a hand without any force so far.
     pub fn new(patch: Arc<HeldPatch>, hold: Hold) -> Self {
         let zero = Vector3::zeros();
         Self { patch, hold, pull: zero, mean: zero, flow: zero }
     }
 
-    /// Spring and damper; those of a measured patch play no part.
+    /// Spring and damper of the hand. A measured patch returns the default, which has no effect.
     pub fn config(&self) -> GrabConfig {
         match self.hold {
             Hold::Target { config, .. } => config,
@@ -105,15 +111,17 @@ impl Hand {
     }
 }
 
-/// How the residual flexibility of a patch answers in a viscoelastic material: `d = C pull + ratio y`,
-/// `time y' = d - y`; see [`Relaxation`]. With the pull held over a step `y1 = carry y0 + gain C pull`
-/// and `d1 = at_once C pull + ratio carry y0`.
+/// Viscoelastic response of the residual flexibility of a patch: `d = C pull + ratio y` with
+/// `time y' = d - y` (see [`Relaxation`]).
+///
+/// With a constant force over a step, `y1 = carry y0 + gain C pull` and
+/// `d1 = at_once C pull + ratio carry y0`.
 #[derive(Debug, Clone, Copy)]
 pub(crate) struct ViscoelasticPatch {
     ratio: f64,
     carry: f64,
     gain: f64,
-    /// Compliance within a step, as a multiple of the instantaneous one.
+    /// Compliance within a step, as a multiple of the instantaneous compliance.
     at_once: f64,
     /// Residual flexibility as a multiple of the baked one.
     softness: f64,
@@ -136,18 +144,18 @@ impl ViscoelasticPatch {
         }
     }
 
-    /// Residual flexibility and the hand's spring in series as they answer within a step, m/N.
+    /// Compliance of the residual flexibility and the hand's spring in series within a step, m/N.
     pub(crate) fn compliance(&self, hand: &Hand) -> Matrix3<f64> {
         let spring = hand.config().stiffness.map_or(0.0, |k| 1.0 / k);
         hand.patch.residual() * (self.softness * self.at_once) + Matrix3::identity() * spring
     }
 
-    /// How far a patch gives way in a step before anyone pulls, because it was pulled before, m.
+    /// Displacement of a patch in a step that is due to earlier forces alone, m.
     pub(crate) fn crept(&self, flow: &Vector3<f64>) -> Vector3<f64> {
         self.ratio * self.carry * flow
     }
 
-    /// The flow after a step under a pull (N, body axes).
+    /// Returns the viscoelastic state after a step under a force `pull` (N, body axes).
     pub(crate) fn step(&self, hand: &Hand, pull: &Vector3<f64>) -> Vector3<f64> {
         self.carry * hand.flow + self.gain * (self.softness * (hand.patch.residual() * pull))
     }

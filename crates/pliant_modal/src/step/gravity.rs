@@ -5,24 +5,24 @@ use nalgebra::Vector3;
 use crate::ModalModel;
 use crate::warp::coefficients;
 
-/// Into so many parts a body's mass is divided.
+/// Number of parts into which the mass of a body is divided.
 const SITES: usize = 16;
 
-/// One number for each part.
+/// One number per part.
 type Each = [f64; SITES];
 
-/// A body's mass in parts, each where its bit of the surface is.
+/// The mass of a body, divided into parts around sites on the surface.
 ///
-/// The modal force of gravity on the undeformed shape is known to rounding: the participations. On a
-/// bent one it is `sum m J(q)^T g`, `J` the derivative of where each part is. The parts only tell what
-/// that is more: `sum m (J(q) - J(0))^T g`. So the force stays the gradient of a potential, and a part's
-/// place needs no more than the accuracy of a bend.
+/// The participations give the modal force of gravity on the undeformed shape up to rounding. On a
+/// bent shape this force is `sum m J(q)^T g`, where `J` is the derivative of the position of each
+/// part. The parts supply only the difference, `sum m (J(q) - J(0))^T g`. The force thus stays the
+/// gradient of a potential, and the position of a part needs only the accuracy of a bend.
 #[derive(Debug)]
 pub(crate) struct MassSites {
-    /// kg; none for parts that are not there.
+    /// Mass of each part, kg. Zero for unused parts.
     mass: Each,
-    /// For each mode how it moves (x, y, z) and turns (x, y, z) each part: the parts side by side, so that
-    /// one instruction does several.
+    /// Displacement (x, y, z) and rotation (x, y, z) of each part per mode. The parts are stored
+    /// side by side, so that one instruction handles several.
     modes: Vec<[Each; 6]>,
 }
 
@@ -31,7 +31,7 @@ impl MassSites {
         let surface = model.surface();
         let positions: Vec<Vector3<f64>> =
             surface.positions().iter().map(|p| Vector3::from(p.map(f64::from))).collect();
-        // The farthest vertex from all sites so far is the next one.
+        // Each next site is the vertex farthest from all sites so far.
         let mut nearest = vec![(f64::INFINITY, 0); positions.len()];
         let mut next = 0;
         for site in 0..SITES.min(positions.len()) {
@@ -72,13 +72,15 @@ impl MassSites {
         Self { mass, modes }
     }
 
-    /// The work of that on the way from rest to the shape `q`, J, for gravity in body axes, m/s^2.
+    /// Work of gravity beyond that of the undeformed shape's force, from rest to the shape `q`, J.
+    /// `gravity` is in body axes, m/s^2.
     pub(crate) fn work(&self, gravity: &Vector3<f64>, q: &[f64]) -> f64 {
         let mut six = self.reduce(q);
         self.work_and_forces(gravity, &mut six)
     }
 
-    /// The same, and adds the modal force that does it: the work's gradient.
+    /// Returns the same work as [`MassSites::work`] and adds its gradient, the modal force, to
+    /// `force`.
     pub(crate) fn add(&self, gravity: &Vector3<f64>, q: &[f64], force: &mut [f64]) -> f64 {
         let mut six = self.reduce(q);
         let work = self.work_and_forces(gravity, &mut six);
@@ -94,7 +96,7 @@ impl MassSites {
         work
     }
 
-    /// How far the linear modes move each part (m) and turn it (rad).
+    /// Linear displacement (m) and rotation (rad) of each part.
     fn reduce(&self, q: &[f64]) -> [Each; 6] {
         let mut six = [[0.0; SITES]; 6];
         for (q, rows) in q.iter().zip(&self.modes) {
@@ -107,10 +109,11 @@ impl MassSites {
         six
     }
 
-    /// The work at these six numbers of each part; they become its derivatives by themselves.
+    /// Returns the work for the six numbers of each part and replaces these numbers by the
+    /// derivatives of the work.
     ///
-    /// A part's way beyond the straight one is `A w x u + B w x (w x u)` (Choi and Ko 2005), so the work
-    /// is `m (A g.(w x u) + B ((g.w)(w.u) - (w.w)(g.u)))`.
+    /// The nonlinear part of a part's displacement is `A w x u + B w x (w x u)` (Choi and Ko 2005),
+    /// so the work is `m (A g.(w x u) + B ((g.w)(w.u) - (w.w)(g.u)))`.
     fn work_and_forces(&self, gravity: &Vector3<f64>, six: &mut [Each; 6]) -> f64 {
         let mut work = 0.0;
         for (i, mass) in self.mass.iter().enumerate() {
@@ -131,16 +134,19 @@ impl MassSites {
     }
 }
 
-/// The force of gravity's bend over a step, kg^1/2 m/s^2: the discrete gradient of Gonzalez (J. Nonlinear
-/// Sci. 6, 1996) round the mean of the forces at both ends, so that `force . (to - from)` is the work
-/// between them to rounding. A force taken at the step's beginning would feed a swinging body, step by
-/// step. `force` is that mean and becomes the result; `work` is that from one end to the other, J.
+/// Computes the bend force of gravity over a step, kg^1/2 m/s^2.
+///
+/// This is the discrete gradient of Gonzalez (J. Nonlinear Sci. 6, 1996) around the mean of the
+/// forces at both ends. `force . (to - from)` then equals the work between both ends up to
+/// rounding. A force taken at the beginning of the step would add energy to a swinging body in
+/// every step. On entry `force` is that mean, on return it is the result. `work` is the work
+/// between both ends, J.
 pub(crate) fn between(from: &[f64], to: &[f64], work: f64, force: &mut [f64]) {
     let way = || from.iter().zip(to).map(|(from, to)| to - from);
     let square: f64 = way().map(|way| way * way).sum();
     let along: f64 = way().zip(&*force).map(|(way, force)| way * force).sum();
     let share = (work - along) / square;
-    // Of no way there is no work.
+    // Without any motion there is no work, and the division yields no finite number.
     if share.is_finite() {
         force.iter_mut().zip(way()).for_each(|(force, way)| *force += share * way);
     }

@@ -1,4 +1,4 @@
-//! Which pulls a state implies: equation (10) of Tang et al. 2013.
+//! The hands' forces that a state implies: equation (10) of Tang et al. 2013.
 
 use nalgebra::Vector3;
 
@@ -8,13 +8,14 @@ use super::{
     solve::System,
 };
 
-/// The pulls that a state with its accelerations implies: the modal force
-/// `f = a + c v + omega^2 (q - ratio z)` less gravity, laid on the hands' patches by least squares,
-/// `min |f - sum rows^T pull|^2`. Modes are weighed by their compliance, as the forces of stiff ones
-/// are least certain and would drown the others.
+/// Computes the hands' forces that a state with its accelerations implies.
+///
+/// The modal force `f = a + c v + omega^2 (q - ratio z)` minus gravity is distributed over the
+/// hands' patches by least squares, `min |f - sum rows^T pull|^2`. Modes are weighted by their
+/// compliance. The forces of stiff modes are the least certain and would otherwise dominate.
 #[derive(Debug, Clone)]
 pub struct ImpliedPulls {
-    /// `1 / omega^2`.
+    /// Weight of each mode, `1 / omega^2`.
     softness: Vec<f64>,
     force: Vec<f64>,
     weight: Vec<f64>,
@@ -24,7 +25,7 @@ pub struct ImpliedPulls {
 }
 
 impl ImpliedPulls {
-    /// For the states that a kernel steps.
+    /// Makes a solver for the states of a kernel.
     pub fn new(kernel: &Kernel) -> Self {
         let softness: Vec<f64> = kernel.omega().iter().map(|w| 1.0 / w.powi(2).max(1e-12)).collect();
         let (force, weight) = (softness.clone(), softness.clone());
@@ -32,8 +33,10 @@ impl ImpliedPulls {
         Self { softness, force, weight, grams, tangents, system }
     }
 
-    /// Writes the pulls (N, world axes) into the hands. Those whose rows are dependent share. Hands of
-    /// another number of modes, or a state of one, leave everything as it is.
+    /// Writes the forces on the body (N, world axes) into the `pull` of each hand.
+    ///
+    /// Hands with linearly dependent rows share the force. If a hand or the state has another
+    /// number of modes, nothing changes.
     pub fn solve(&mut self, kernel: &Kernel, state: &State, hands: &mut [Hand]) {
         let (modes, settings) = (self.softness.len(), kernel.settings());
         if hands.is_empty()

@@ -1,4 +1,5 @@
-//! One step of a body: the modes and the frame without hands, then all hands at once, implicitly.
+//! One step of a body: first the modes and the frame without hands, then all hands together,
+//! implicitly.
 
 use std::sync::Arc;
 
@@ -15,63 +16,69 @@ use super::{
 };
 use crate::{ModalModel, StepError};
 
-/// What one step did.
+/// Result of one step.
 #[derive(Debug, Clone, Copy, PartialEq, Default)]
 pub struct StepReport {
-    /// Directions in which hands were linearly dependent and had to be regularised.
+    /// Number of directions in which hands were linearly dependent and had to be regularized.
     pub regularised: usize,
 }
 
-/// What acts on a body in one step besides its hands and gravity.
+/// Forces on a body in one step besides its hands and gravity.
 #[derive(Debug, Clone, Copy, PartialEq, Default)]
 pub struct Load<'a> {
-    /// Modal force, kg^1/2 m/s^2, of the first so many modes.
+    /// Modal force, kg^1/2 m/s^2. It may cover only the first modes.
     pub modal: &'a [f64],
     /// Force on the frame of a free body, N, world axes.
     pub force: Vector3<f64>,
-    /// Torque on it about the center of mass, N m, world axes.
+    /// Torque on the frame of a free body about the center of mass, N m, world axes.
     pub torque: Vector3<f64>,
-    /// The frame of a free body is known from elsewhere and stays where the state has it.
+    /// Whether the frame of a free body is known from elsewhere. The step then leaves the frame as
+    /// it is in the state.
     pub frame_is_given: bool,
 }
 
-/// A hand in the step under way.
+/// Data of a hand during one step.
 #[derive(Debug, Clone, Default)]
 struct Solving {
-    /// Where the patch's six numbers go without hands.
+    /// The patch's six numbers after the step without hands.
     free: Six,
-    /// The same for their velocities; only where the hand has a damper.
+    /// Velocities of the six numbers without hands. Only set if the hand has a damper.
     speed: Six,
-    /// Where the tangent was taken.
+    /// The six numbers at which the tangent is taken.
     from: Six,
-    /// Displacement and its derivative there, m, body axes.
+    /// Displacement of the patch at `from`, m, body axes. `tangent` is its derivative there.
     at: Vector3<f64>,
     tangent: Tangent,
     compliance: Matrix3<f64>,
     /// Relaxation time of the damper, s.
     relaxation: f64,
-    /// Where the hand is to be taken to be, m, and its velocity times the relaxation, m, world axes.
+    /// Target position that the solve uses, m, and the target velocity times the relaxation time,
+    /// m, both in world axes.
     target: Vector3<f64>,
     lead: Vector3<f64>,
-    /// By how much more the force over the step counts in that at its end, less that of the step before.
+    /// Extrapolation factor `x` of [`StepSettings::extrapolation`]: the force at the end of the
+    /// step is `(1 + x) F - x F_before`.
     beyond: f64,
-    /// How far the patch gives way in this step because it was pulled before, m, body axes.
+    /// Displacement of the patch in this step that is due to earlier forces alone, m, body axes.
     crept: Vector3<f64>,
-    /// From the center of mass, m, body axes.
+    /// Position of the patch relative to the center of mass, m, body axes.
     arm: Vector3<f64>,
     /// Force on the body over the step, N, body axes.
     pull: Vector3<f64>,
 }
 
-/// Steps states of one model: the only place that does. It holds tables and workspace and no state,
-/// so that one kernel may step any number of copies of the body.
+/// Steps states of one model. No other type steps bodies.
 ///
-/// Hands are compliant and implicit. With `x = x* + A pull` the patches' positions after the step, the
-/// pulls (N) solve `(A + C) pull = target - x*`, `C` the compliance of each: what the modes leave out of
-/// the patch, and the hand's spring. A damper adds its relaxation time times the velocities. Under warp
-/// rows are corrected by Newton's method, and so is the place of a free body's frame.
+/// A kernel holds tables and workspace and no state, so one kernel may step any number of copies of
+/// the body.
 ///
-/// A step allocates nothing after [`Kernel::prepare`] was called with the same hands.
+/// Hands are compliant and implicit. With the patch positions after the step `x = x* + A pull`, the
+/// forces `pull` (N) solve `(A + C) pull = target - x*`. `C` is the compliance of each hand: the
+/// part of the patch's compliance that the modes leave out, and the hand's spring. A damper adds
+/// its relaxation time times the velocities. Under warp, Newton's method corrects the rows and the
+/// pose of a free body's frame.
+///
+/// A step allocates nothing after a call of [`Kernel::prepare`] with the same hands.
 #[derive(Debug, Clone)]
 pub struct Kernel {
     model: Arc<ModalModel>,
@@ -80,18 +87,20 @@ pub struct Kernel {
     modes: Modes,
     creep: ViscoelasticPatch,
     before: State,
-    /// Modal forces: of everything but hands, then of hands.
+    /// Modal forces of gravity and loads, and at the end of a step those of the hands too. `pulls`
+    /// holds the modal forces of the hands.
     force: Vec<f64>,
     pulls: Vec<f64>,
-    /// What gravity does to the bend: over the step, and at its beginning.
+    /// Modal forces that gravity adds on the bent shape: over the step, and at the beginning of the
+    /// step.
     bend: Vec<f64>,
     start: Vec<f64>,
-    /// By how much that was off in the round before, and what came out of it.
+    /// Error of the bend force in the previous round, and the force which that round computed.
     rounds: Vec<[f64; 2]>,
-    /// Modal velocities as dampers see them.
+    /// Modal velocities as dampers use them.
     velocity: Vec<f64>,
     solving: Vec<Solving>,
-    /// The hands' forces on their patches' six numbers.
+    /// Forces of the hands on the six numbers of their patches.
     forces: Vec<Six>,
     responses: Grams,
     dampers: Grams,
@@ -99,10 +108,10 @@ pub struct Kernel {
 }
 
 impl Kernel {
-    /// For the first `modes` modes of a model at steps of `h` seconds.
+    /// Makes a kernel for the first `modes` modes of a model at steps of `h` seconds.
     ///
     /// # Errors
-    /// A setting or step that is not finite or not in its range.
+    /// Returns an error if a setting or the step length is not finite or out of range.
     pub fn new(
         model: Arc<ModalModel>,
         settings: StepSettings,
@@ -136,10 +145,10 @@ impl Kernel {
         Ok(kernel)
     }
 
-    /// Changes settings and the length of a step; the number of modes stays.
+    /// Changes the settings and the step length. The number of modes stays.
     ///
     /// # Errors
-    /// As [`Kernel::new`]; the old ones then stay.
+    /// Returns the errors of [`Kernel::new`]. The old settings and step length then stay.
     pub fn reconfigure(&mut self, settings: StepSettings, h: f64) -> Result<(), StepError> {
         settings.check()?;
         self.modes = Modes::new(&self.model, &settings, self.modes.count(), h)?;
@@ -152,12 +161,12 @@ impl Kernel {
         Ok(())
     }
 
-    /// The body's model.
+    /// The model of the body.
     pub fn model(&self) -> &Arc<ModalModel> {
         &self.model
     }
 
-    /// How it is stepped.
+    /// The step settings.
     pub fn settings(&self) -> &StepSettings {
         &self.settings
     }
@@ -182,21 +191,22 @@ impl Kernel {
         &self.modes.damping
     }
 
-    /// What a unit modal force adds to coordinate, velocity and acceleration of each mode in a step.
+    /// Change of coordinate, velocity and acceleration of each mode per unit modal force in a step.
     pub fn responses(&self) -> [&[f64]; 3] {
         self.modes.response.each_ref().map(Vec::as_slice)
     }
 
-    /// A state of the body at rest, in its model's own place.
+    /// Makes a state of the body at rest, in the pose in which its model was baked.
     pub fn at_rest(&self) -> State {
         let frame = Frame::at_rest(&self.model);
         State { frame, ..State::zero(self.modes.count(), self.modes.is_viscous()) }
     }
 
-    /// Whether a state has as many numbers as this kernel steps, all of them finite.
+    /// Checks that a state has as many numbers as this kernel steps and that all of them are
+    /// finite.
     ///
     /// # Errors
-    /// A slice of another length, a number that is not finite.
+    /// Returns an error if a slice has another length or a number is not finite.
     pub fn check(&self, state: &State) -> Result<(), StepError> {
         self.check_lengths(state)?;
         let slices = [("q", &state.q), ("v", &state.v), ("a", &state.a), ("f", &state.f), ("z", &state.z)];
@@ -217,19 +227,23 @@ impl Kernel {
         if got == expected { Ok(()) } else { Err(StepError::Length { what: "z", expected, got }) }
     }
 
-    /// What a hand gives way by within one step besides the modes: residual flexibility of its patch
-    /// plus its own spring, 3x3, m/N, body axes. Where the material is viscoelastic, the first is
-    /// multiplied by [`Relaxation::creep`](crate::Relaxation::creep) of one step.
+    /// Compliance of a hand within one step besides the modes, 3x3, m/N, body axes.
+    ///
+    /// It is the residual flexibility of the patch plus the compliance of the hand's own spring.
+    /// Where the material is viscoelastic, the residual flexibility is multiplied by
+    /// [`Relaxation::creep`](crate::Relaxation::creep) of one step.
     pub fn compliance(&self, hand: &Hand) -> Matrix3<f64> {
         self.creep.compliance(hand)
     }
 
-    /// The flow of a hand's patch after one step under a pull (N, body axes).
+    /// Returns the viscoelastic state of a hand's patch after one step under a force `pull`
+    /// (N, body axes).
     pub fn flow(&self, hand: &Hand, pull: Vector3<f64>) -> Vector3<f64> {
         self.creep.step(hand, &pull)
     }
 
-    /// Makes what the steps with these hands need, so that they allocate nothing.
+    /// Makes the tables and workspace for steps with these hands, so that the steps allocate
+    /// nothing.
     pub fn prepare(&mut self, hands: &[Hand]) {
         self.responses.prepare(hands, &self.modes.response[0]);
         if hands.iter().any(|hand| hand.config().relaxation > 0.0) {
@@ -240,13 +254,15 @@ impl Kernel {
         self.system.reserve(hands.len());
     }
 
-    /// One step of a state with these hands.
+    /// Performs one step of a state with these hands.
     ///
     /// # Errors
-    /// [`StepError::Length`] for a state or a patch of another size, which nothing is done with.
-    /// [`StepError::Diverged`] when the result would not be finite: the state is then as it was before,
-    /// unless it is one that nothing can be stepped from (with a number beyond 1e100 in it), and then it
-    /// is at rest where its frame is; the hands pull nothing.
+    /// - Returns [`StepError::Length`] if the state or a patch has another size. Nothing then
+    ///   changes.
+    /// - Returns [`StepError::Diverged`] if the result would not be finite. The state then returns
+    ///   to that before the step, and the forces and viscoelastic states of the hands become zero.
+    ///   If that state contains a number above 1e100, it is instead set to rest at the pose of its
+    ///   frame.
     pub fn step(
         &mut self,
         state: &mut State,
@@ -275,14 +291,14 @@ impl Kernel {
         Err(StepError::Diverged { what })
     }
 
-    /// Makes what gravity needs, so that the first step does not have to.
+    /// Prepares the data that gravity needs, so that the first step does not allocate them.
     fn prepare_weight(&self) {
         if self.bends_under_gravity() {
             self.model.mass_sites();
         }
     }
 
-    /// Modal force of gravity on an anchored body, kg^1/2 m/s^2, into `force`.
+    /// Writes the modal force of gravity on an anchored body, kg^1/2 m/s^2, to `force`.
     pub(crate) fn weight(&self, frame: &Frame, q: &[f64], force: &mut [f64]) {
         self.weight_at_rest(frame, force);
         if self.bends_under_gravity() {
@@ -291,12 +307,12 @@ impl Kernel {
         }
     }
 
-    /// Whether gravity does other work on the deformed shape than on the one at rest.
+    /// Whether the work of gravity on the deformed shape differs from that on the rest shape.
     fn bends_under_gravity(&self) -> bool {
         self.settings.warp && !self.model.is_free() && self.settings.gravity != [0.0; 3]
     }
 
-    /// Modal force of gravity on the undeformed shape.
+    /// Writes the modal force of gravity on the undeformed shape to `force`.
     fn weight_at_rest(&self, frame: &Frame, force: &mut [f64]) {
         force.fill(0.0);
         let gravity = Vector3::from(self.settings.gravity);
@@ -309,16 +325,19 @@ impl Kernel {
         }
     }
 
-    /// Adds to the step without hands what gravity does on the way between its two shapes.
+    /// Adds the effect of gravity on the bend between both shapes of the step to the step without
+    /// hands.
     fn bend_under_gravity(&mut self, state: &mut State) {
-        /// The force moves the end of the step, and that the force.
+        /// Maximum number of rounds. The force changes the end of the step, which changes the
+        /// force.
         const MOST_ROUNDS: usize = 12;
-        /// Of the largest force that may be left wrong.
+        /// Tolerance of the bend force, as a share of the largest force.
         const SHARE: f64 = 1e-6;
         let local = state.frame.rotation().inverse() * Vector3::from(self.settings.gravity);
         let sites = self.model.mass_sites();
         let enough = SHARE * self.force.iter().fold(0.0f64, |most, f| most.max(f.abs()));
-        // At first as though it stayed what it is; `pulls` is what is new in a round.
+        // The first round takes the force at the beginning as constant. `pulls` is the change of a
+        // round.
         self.start.fill(0.0);
         let before = sites.add(&local, &self.before.q, &mut self.start);
         self.bend.copy_from_slice(&self.start);
@@ -337,8 +356,8 @@ impl Kernel {
                 (along, square) = (along + off * turn, square + turn * turn);
                 change = change.max(off.abs());
             }
-            // What is off shrinks from round to round along much the same line: where on it nothing would
-            // be off (Anderson 1965, of depth one).
+            // The error shrinks from round to round along nearly the same line. This extrapolates
+            // to the point of the line with zero error (Anderson 1965, of depth one).
             let back = if round > 0 && square > 0.0 { (along / square).clamp(-4.0, 4.0) } else { 0.0 };
             let here = self.bend.iter_mut().zip(&mut self.pulls).zip(&mut self.rounds);
             for ((bend, now), [last_off, last_now]) in here {
@@ -356,7 +375,8 @@ impl Kernel {
         }
     }
 
-    /// Potential energy in gravity, J: of the deformation of an anchored body, of the place of a free one.
+    /// Potential energy in gravity, J: of the deformation of an anchored body, of the position of a
+    /// free body.
     pub fn potential_energy(&self, state: &State) -> f64 {
         let gravity = Vector3::from(self.settings.gravity);
         if gravity == Vector3::zeros() {
@@ -396,7 +416,7 @@ impl Kernel {
         report
     }
 
-    /// Solves for the pulls of all hands and adds what they do to the state.
+    /// Solves for the forces of all hands and adds their effect to the state.
     fn hold(&mut self, state: &mut State, hands: &mut [Hand], mut rigid: Option<RigidMotion>) -> StepReport {
         self.prepare(hands);
         self.begin(state, hands);
@@ -407,10 +427,11 @@ impl Kernel {
         for round in 0..rounds {
             let center = Vector3::from(self.model.center_of_mass());
             for (solving, hand) in self.solving.iter_mut().zip(hands.iter()) {
-                // Linearise where the last round ended.
+                // Each round linearizes where the previous round ended.
                 (solving.at, solving.tangent) = tangent(&solving.from, self.settings.warp);
                 solving.arm = hand.patch.rest() + solving.at - center;
-                // The pulls of the round before, at first those of the step before, which are in world axes.
+                // The forces of the previous round change axes here. In the first round these are
+                // the forces of the previous step, in world axes.
                 solving.pull = place.axes * solving.pull;
             }
             if let Some(rigid) = &mut rigid {
@@ -440,7 +461,7 @@ impl Kernel {
         }
         for (hand, solving) in hands.iter_mut().zip(&self.solving) {
             hand.flow = self.creep.step(hand, &solving.pull);
-            // Solved in body axes; hands live in the world's.
+            // The solve uses body axes, and hands use world axes.
             let mean = place.turn * solving.pull;
             hand.pull = mean + solving.beyond * (mean - hand.mean);
             hand.mean = mean;
@@ -448,7 +469,8 @@ impl Kernel {
         report
     }
 
-    /// What the rounds of a step begin with: where the patches are, and where they go without hands.
+    /// Initializes the rounds of a step: the patch positions, and those after the step without
+    /// hands.
     fn begin(&mut self, state: &State, hands: &[Hand]) {
         let warp = self.settings.warp;
         let damped = hands.iter().any(|hand| hand.config().relaxation > 0.0);
@@ -467,13 +489,14 @@ impl Kernel {
                 ..Solving::default()
             };
             if let Hold::Target { target, velocity, config } = hand.hold {
-                // Targets may teleport. No patch of an anchored body gets farther from its rest than two
-                // lengths of it, so a hand beyond that pulls no harder than from there.
+                // Targets may teleport. No patch of an anchored body gets farther from its rest
+                // than two lengths of the body, so a target beyond that distance is moved to that
+                // distance.
                 let reach = 2.0 * self.model.size();
                 let rest = self.before.frame.to_world(hand.patch.rest());
                 let way = target - rest;
                 solving.target = rest + way.cap_magnitude(reach);
-                // Nor is its force one that could be extrapolated.
+                // The force towards such a target is not smooth and cannot be extrapolated.
                 if way.norm() > reach {
                     solving.beyond = 0.0;
                 }
@@ -488,7 +511,8 @@ impl Kernel {
         }
     }
 
-    /// One round: the pulls on the tangent, for a frame in `place`. `unheld`: the frame without hands.
+    /// Solves one round for the forces on the tangent, for a frame in `place`. `unheld` is the
+    /// frame without hands. Returns the number of linearly dependent directions.
     fn solve(
         &mut self,
         unheld: &Frame,
@@ -502,10 +526,11 @@ impl Kernel {
         self.system.clear(3 * hands.len(), relaxations().all(|r| r == first));
         let right = self.system.right().as_chunks_mut::<3>().0;
         for ((hand, solving), right) in hands.iter().zip(&self.solving).zip(right) {
-            // Project the unheld step onto the tangent plane.
+            // Projects the step without hands onto the tangent plane.
             let along = solving.at + solving.tangent * (solving.free - solving.from);
             let gap = match hand.hold {
-                // Where the hand must have been: one that pulls so from there leaves the patch where it was.
+                // A hand at this position with this force leaves the patch at the measured
+                // displacement.
                 Hold::Measured(there) => there + solving.compliance * (place.back * hand.pull) - along,
                 Hold::Target { config, .. } => {
                     let ahead = hand.patch.rest() + along;
@@ -521,7 +546,8 @@ impl Kernel {
                     place.back * gap
                 }
             };
-            // What gives way does so under the force at the end, `(1 + x) F - x F_before`.
+            // The compliance responds to the force at the end of the step,
+            // `(1 + x) F - x F_before`.
             let gap = gap + solving.beyond * (solving.compliance * (place.back * hand.mean));
             right.copy_from_slice(gap.as_slice());
         }
@@ -540,7 +566,7 @@ impl Kernel {
                 }
                 for x in 0..3 {
                     for y in 0..3 {
-                        // A damper is in its own hand's rows.
+                        // The relaxation time of a damper scales the rows of its own hand.
                         let (row, column) = (3 * i + x, 3 * j + y);
                         let (position, velocity) = (position[(x, y)], velocity[(x, y)]);
                         self.system.set(row, column, position + a.relaxation * velocity);
@@ -560,7 +586,8 @@ impl Kernel {
         lost
     }
 
-    /// Force (N) and torque about the center of mass (N m) of the hands, world axes.
+    /// Returns the total force (N) and torque about the center of mass (N m) of the hands, world
+    /// axes.
     fn total(&self, place: &PredictedFrame) -> [Vector3<f64>; 2] {
         self.solving.iter().fold([Vector3::zeros(); 2], |[force, torque], solving| {
             let pull = place.turn * solving.pull;

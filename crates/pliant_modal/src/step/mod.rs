@@ -1,4 +1,4 @@
-//! The step of a body: one kernel for bodies, guests, predictions, peers and devices.
+//! The step of a body. Bodies, guests, predictions, peers and devices share one kernel.
 
 mod constraint;
 mod gravity;

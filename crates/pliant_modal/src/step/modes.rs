@@ -1,27 +1,28 @@
-//! The recurrences of all modes, column by column, so that loops over the modes vectorize.
+//! The recurrences of all modes, stored by column, so that loops over the modes vectorize.
 
 use super::{State, StepSettings};
 use crate::{Coefficients, Integrator, ModalModel, StepError};
 
-/// What one step makes of every mode.
+/// Coefficients of one step for every mode.
 #[derive(Debug, Clone)]
 pub(crate) struct Modes {
     /// Angular frequencies as stepped, rad/s.
     pub(crate) omega: Vec<f64>,
     /// Damping coefficients as stepped, 1/s.
     pub(crate) damping: Vec<f64>,
-    /// `free[row][column]`: rows q, v, a; columns q, v, a, force of the last step.
+    /// Factors on the old state, `free[row][column]`. Rows: q, v, a. Columns: q, v, a, force of the
+    /// last step.
     free: [[Vec<f64>; 4]; 3],
-    /// What a unit modal force adds to q, v, a.
+    /// Change of q, v, a per unit modal force.
     pub(crate) response: [Vec<f64>; 3],
-    /// What a unit modal force adds to the velocity that a damper sees, see [`Modes::velocities`].
+    /// Change of the velocity that a damper uses per unit modal force, see [`Modes::velocities`].
     pub(crate) damper: Vec<f64>,
-    /// The step looks at the old acceleration and force too.
+    /// Whether the step also uses the old acceleration and force.
     memory: bool,
     viscous: Option<Viscous>,
 }
 
-/// What viscoelasticity adds; see [`crate::ViscoelasticCoefficients`].
+/// Additional coefficients of a viscoelastic material, see [`crate::ViscoelasticCoefficients`].
 #[derive(Debug, Clone)]
 struct Viscous {
     onto: [Vec<f64>; 3],
@@ -31,7 +32,7 @@ struct Viscous {
 }
 
 impl Modes {
-    /// For the first `count` modes of a model at a step of `h` seconds.
+    /// Computes the coefficients of the first `count` modes of a model at a step of `h` seconds.
     pub(crate) fn new(
         model: &ModalModel,
         settings: &StepSettings,
@@ -81,7 +82,7 @@ impl Modes {
         self.viscous.is_some()
     }
 
-    /// The step of all modes from `before` under a modal force, into `after`.
+    /// Steps all modes from `before` under a modal force and writes the result to `after`.
     pub(crate) fn advance(&self, before: &State, force: &[f64], after: &mut State) {
         let n = self.count();
         let (q, v, a, f) = (&before.q[..n], &before.v[..n], &before.a[..n], &before.f[..n]);
@@ -116,7 +117,7 @@ impl Modes {
         }
     }
 
-    /// Adds what a further modal force does within the step.
+    /// Adds the response to a further modal force within the step.
     pub(crate) fn respond(&self, force: &[f64], state: &mut State) {
         let viscous = self.viscous.as_ref().map(|viscous| &viscous.response);
         let rows = [&mut state.q, &mut state.v, &mut state.a, &mut state.z];
@@ -127,11 +128,12 @@ impl Modes {
         }
     }
 
-    /// How fast the modes move as a damper on them is to see it.
+    /// Computes the modal velocities that dampers use.
     ///
-    /// Of each mode the velocity at the end of the step, or the mean over the step, whichever answers
-    /// a push more. A mode that turns by more than half a period within a step answers with an end
-    /// velocity the other way: a damper on that would drive it.
+    /// For each mode this is the velocity at the end of the step or the mean over the step,
+    /// whichever responds more to a force. A mode that turns by more than half a period within a
+    /// step responds with an end velocity in the opposite direction, and a damper on this velocity
+    /// would add energy.
     pub(crate) fn velocities(&self, before: &State, after: &State, h: f64, out: &mut [f64]) {
         for (k, out) in out.iter_mut().enumerate().take(self.count()) {
             let at_end = self.response[1][k] >= self.response[0][k] / h;

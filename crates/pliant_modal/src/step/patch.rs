@@ -1,8 +1,9 @@
-//! A patch of a body as a step sees it.
+//! A patch of a body as used in a step.
 //!
-//! Where a patch is depends on six sums over the modes only: its mean displacement and its mean
-//! rotation. A step works in these six numbers a patch. It goes through the modes once for the step
-//! without hands and once for what the hands do, however many corrections there are.
+//! The position of a patch depends on only six sums over the modes: its mean displacement and its
+//! mean rotation. A step works with these six numbers per patch. It visits the modes once for the
+//! step without hands and once for the effect of the hands, regardless of the number of
+//! corrections.
 
 use std::sync::Arc;
 
@@ -11,14 +12,15 @@ use nalgebra::{Matrix3, SMatrix, SVector, Vector3};
 use super::Hand;
 use crate::{ModalModel, Patch, StepError, warp::warp_with_jacobian};
 
-/// Displacement (0..3) and rotation (3..6) of a patch, or the forces that belong to them.
+/// Displacement (0..3) and rotation (3..6) of a patch, or the conjugate forces.
 pub(crate) type Six = SVector<f64, 6>;
-/// Derivative of a patch's place by its six numbers.
+/// Derivative of a patch's position with respect to its six numbers.
 pub(crate) type Tangent = SMatrix<f64, 3, 6>;
-/// How two patches' six numbers answer each other's forces.
+/// Response of one patch's six numbers to forces on the six numbers of another patch.
 type Block = SMatrix<f64, 6, 6>;
 
-/// Sums run in so many lanes: a fixed order, so equal on all machines, and wide.
+/// Number of partial sums of a dot product. The fixed order gives equal results on all machines and
+/// vectorizes.
 const LANES: usize = 4;
 
 fn dot(row: &[f64], x: &[f64]) -> f64 {
@@ -33,7 +35,7 @@ fn dot(row: &[f64], x: &[f64]) -> f64 {
     (sums[0] + sums[1]) + (sums[2] + sums[3]) + rest
 }
 
-/// Three rows at once: the loads of `x` are shared and the sums do not wait for each other.
+/// Computes three dot products at once. They share the loads of `x` and do not wait for each other.
 fn dot3(rows: [&[f64]; 3], x: &[f64]) -> [f64; 3] {
     let n = x.len().min(rows[0].len());
     let rows = rows.map(|r| r[..n].as_chunks::<LANES>());
@@ -53,12 +55,14 @@ fn dot3(rows: [&[f64]; 3], x: &[f64]) -> [f64; 3] {
     out
 }
 
-/// Rows of the mean displacement and of the mean rotation of some vertices, one entry a mode.
+/// Rows of the mean displacement and mean rotation of some vertices, with one entry per mode.
 #[derive(Debug, Clone)]
 pub(crate) struct MeanRows([Vec<f64>; 6]);
 
-/// A patch of a model with what its steps need: the weighted means of its vertices' modes, and how
-/// the patch gives way besides them. Made once, shared by all copies of the body.
+/// A patch of a model with the data for its steps: the weighted means of its vertices' modes and
+/// its residual flexibility.
+///
+/// A held patch is made once and shared by all copies of the body.
 #[derive(Debug, Clone)]
 pub struct HeldPatch {
     rows: MeanRows,
@@ -68,10 +72,10 @@ pub struct HeldPatch {
 }
 
 impl HeldPatch {
-    /// Of the first `modes` modes of a model.
+    /// Makes the patch for the first `modes` modes of a model.
     ///
     /// # Errors
-    /// [`StepError::Vertex`] for a patch of another surface.
+    /// Returns [`StepError::Vertex`] if the patch belongs to another surface.
     pub fn new(model: &ModalModel, patch: &Patch, modes: usize) -> Result<Self, StepError> {
         let modes = modes.min(model.mode_count());
         let residual = residual(model, patch, modes)?;
@@ -81,12 +85,12 @@ impl HeldPatch {
         Ok(Self { rows: MeanRows::new(model, patch.entries(), modes), rest, residual })
     }
 
-    /// Where the patch is at rest, m, body axes.
+    /// Position of the patch at rest, m, body axes.
     pub fn rest(&self) -> Vector3<f64> {
         self.rest
     }
 
-    /// What the modes leave out of the patch's flexibility at the baked stiffness: 3x3, m/N, body axes.
+    /// Residual flexibility at the baked stiffness, which the modes leave out: 3x3, m/N, body axes.
     pub fn residual(&self) -> Matrix3<f64> {
         self.residual
     }
@@ -96,7 +100,7 @@ impl HeldPatch {
         self.rows.0[0].len()
     }
 
-    /// How far the patch is from its rest at the coordinates `q`, m, body axes.
+    /// Displacement of the patch from rest at the coordinates `q`, m, body axes.
     pub fn displacement(&self, q: &[f64], warped: bool) -> Vector3<f64> {
         displacement(&self.rows.reduce(q, warped), warped)
     }
@@ -107,7 +111,7 @@ impl HeldPatch {
 }
 
 impl MeanRows {
-    /// Of surface vertices with weights whose sum is 1.
+    /// Computes the rows for surface vertices with weights whose sum is 1.
     pub(crate) fn new(model: &ModalModel, entries: &[(u32, f64)], modes: usize) -> Self {
         let mut rows: [Vec<f64>; 6] = std::array::from_fn(|_| vec![0.0; modes]);
         for &(vertex, weight) in entries {
@@ -123,7 +127,7 @@ impl MeanRows {
         Self(rows)
     }
 
-    /// The six sums `B x`. Without warp the rotation plays no part and stays zero.
+    /// Returns the six sums `B x`. Without warp the rotation has no effect and stays zero.
     pub(crate) fn reduce(&self, x: &[f64], warped: bool) -> Six {
         let [a, b, c, d, e, f] = &self.0;
         let u = dot3([a, b, c], x);
@@ -131,7 +135,7 @@ impl MeanRows {
         Six::new(u[0], u[1], u[2], w[0], w[1], w[2])
     }
 
-    /// `out += B^T forces`.
+    /// Computes `out += B^T forces`.
     pub(crate) fn spread(&self, forces: &Six, warped: bool, out: &mut [f64]) {
         let n = out.len();
         let [a, b, c, d, e, f] = self.0.each_ref().map(|r| &r[..n]);
@@ -148,7 +152,7 @@ impl MeanRows {
         }
     }
 
-    /// `B_self diag(weight) B_other^T`.
+    /// Returns `B_self diag(weight) B_other^T`.
     fn gram(&self, other: &Self, weight: &[f64], scratch: &mut Vec<f64>) -> Block {
         let mut block = Block::zeros();
         for (i, mine) in self.0.iter().enumerate() {
@@ -162,7 +166,7 @@ impl MeanRows {
     }
 }
 
-/// How a patch gives way at once at the baked stiffness besides its modes, m/N, body axes.
+/// Instantaneous residual flexibility of a patch at the baked stiffness, m/N, body axes.
 fn residual(model: &ModalModel, patch: &Patch, modes: usize) -> Result<Matrix3<f64>, StepError> {
     let count = model.surface().positions().len();
     if let Some(&(vertex, _)) = patch.entries().iter().find(|&&(v, _)| v as usize >= count) {
@@ -170,21 +174,21 @@ fn residual(model: &ModalModel, patch: &Patch, modes: usize) -> Result<Matrix3<f
     }
     let residual = model.flexibility_of(patch, modes);
     let residual = Matrix3::from_fn(|i, j| residual[i][j]);
-    // A patch on an anchor has no flexibility at all, and a hand on it would pull with an infinite
-    // force: skin and fingertip give a hundredth of the patch's own contact compliance.
+    // A patch on an anchor has no flexibility, so the force of a hand on it would be infinite. Skin
+    // and fingertip therefore add a hundredth of the patch's own contact compliance.
     let info = model.info();
     let radius = patch.radius().max(1e-2 * model.size());
     let contact = 1e-2 * (1.0 - info.poisson * info.poisson) / (2.0 * info.young * radius);
     Ok(0.5 * (residual + residual.transpose()) + Matrix3::identity() * contact.max(f64::MIN_POSITIVE))
 }
 
-/// Displacement of a patch from its six numbers, body axes, m.
+/// Returns the displacement of a patch for its six numbers, m, body axes.
 pub(crate) fn displacement(six: &Six, warped: bool) -> Vector3<f64> {
     let d = Vector3::new(six[0], six[1], six[2]);
     if warped { crate::warp([six[3], six[4], six[5]], d.into()).into() } else { d }
 }
 
-/// Displacement and its derivative by the six numbers.
+/// Returns the displacement (m) and its derivative with respect to the six numbers.
 pub(crate) fn tangent(six: &Six, warped: bool) -> (Vector3<f64>, Tangent) {
     let d = Vector3::new(six[0], six[1], six[2]);
     let mut tangent = Tangent::zeros();
@@ -198,7 +202,7 @@ pub(crate) fn tangent(six: &Six, warped: bool) -> (Vector3<f64>, Tangent) {
     (u, tangent)
 }
 
-/// [`MeanRows::gram`] of all pairs of held patches, lower triangle; kept while the patches stay.
+/// [`MeanRows::gram`] of all pairs of held patches (lower triangle), cached while the patches stay.
 #[derive(Debug, Clone, Default)]
 pub(crate) struct Grams {
     patches: Vec<Arc<HeldPatch>>,
@@ -207,13 +211,13 @@ pub(crate) struct Grams {
 }
 
 impl Grams {
-    /// Makes the blocks for the hands' patches, unless they are there.
+    /// Computes the blocks for the hands' patches unless the cache holds them.
     pub(crate) fn prepare(&mut self, hands: &[Hand], weight: &[f64]) {
         let same = self.patches.len() == hands.len();
         if same && hands.iter().zip(&self.patches).all(|(hand, patch)| Arc::ptr_eq(&hand.patch, patch)) {
             return;
         }
-        // What two patches are to each other does not change when others come or go.
+        // The block of two patches does not change if other patches are added or removed.
         let known = |hand: &Hand| self.patches.iter().position(|patch| Arc::ptr_eq(&hand.patch, patch));
         let old: Vec<Option<usize>> = hands.iter().map(known).collect();
         let mut blocks = Vec::with_capacity(hands.len() * (hands.len() + 1) / 2);
@@ -231,18 +235,18 @@ impl Grams {
         self.patches.extend(hands.iter().map(|hand| hand.patch.clone()));
     }
 
-    /// Forgets all blocks, as their weights have changed.
+    /// Drops all blocks because their weights have changed.
     pub(crate) fn forget(&mut self) {
         self.patches.clear();
         self.blocks.clear();
     }
 
-    /// The block of two hands, `j` at most `i`.
+    /// Returns the block of two hands. `j` must be at most `i`.
     pub(crate) fn at(&self, i: usize, j: usize) -> &Block {
         &self.blocks[i * (i + 1) / 2 + j]
     }
 
-    /// `sum over j of block(i, j) forces[j]`.
+    /// Returns `sum over j of block(i, j) forces[j]`.
     pub(crate) fn answer(&self, i: usize, forces: &[Six]) -> Six {
         let mut sum = Six::zeros();
         for (j, f) in forces.iter().enumerate() {

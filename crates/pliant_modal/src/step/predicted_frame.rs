@@ -1,28 +1,32 @@
-//! Where a correction of a step takes a free body's frame to be.
+//! Prediction of a free body's frame for the corrections of a step.
 
 use nalgebra::{Matrix3, Vector3};
 
 use super::{Frame, RigidMotion};
 use crate::ModalModel;
 
-/// Where a correction takes the frame to be: at first where it goes without hands, then where the
-/// pulls of the correction before brought it. Tension turns a body within a step, and the pulls with
-/// it: taken along a step late they would drive the modes that it bends.
+/// The predicted frame of a free body in one correction of a step.
+///
+/// In the first correction it is the frame without hands. In later corrections it is the frame to
+/// which the forces of the previous correction moved the body. Tension turns a body within a step,
+/// and the forces turn with the body. A frame that lags by one step would drive the modes that the
+/// tension bends.
 pub(crate) struct PredictedFrame {
     frame: Frame,
-    /// From body to world axes, and back.
+    /// Rotation from body to world axes. `back` is the inverse.
     pub(crate) turn: Matrix3<f64>,
     pub(crate) back: Matrix3<f64>,
-    /// From the axes that the pulls are still told in to these body axes.
+    /// Rotation of the previous correction's forces to the body axes of this frame.
     pub(crate) axes: Matrix3<f64>,
-    /// By what the pulls have moved it, m, world axes, and all of the turn since the unheld one, rad, body axes.
+    /// Translation due to the forces, m, world axes. `turned` is the whole turn relative to the
+    /// frame without hands, rad, body axes.
     way: Vector3<f64>,
     turned: Vector3<f64>,
 }
 
 impl PredictedFrame {
-    /// Turns of a step beyond this (rad; a hand that leaps) are not to be taken for their tangent:
-    /// such a step keeps to the unheld place.
+    /// Largest turn of a step, rad, for which the tangent is valid. Beyond it (a target that jumps)
+    /// the step keeps the frame without hands.
     const FARTHEST: f64 = 0.25;
 
     fn at(frame: Frame, pulls: &Matrix3<f64>, way: Vector3<f64>, turned: Vector3<f64>) -> Self {
@@ -31,12 +35,13 @@ impl PredictedFrame {
         Self { frame, turn, back, axes: back * pulls, way, turned }
     }
 
-    /// Where the frame goes without hands.
+    /// Makes the prediction without hands.
     pub(crate) fn unheld(frame: Frame) -> Self {
         Self::at(frame, &Matrix3::identity(), Vector3::zeros(), Vector3::zeros())
     }
 
-    /// Where force (N) and torque (N m, world axes) of the hands bring the unheld frame.
+    /// Predicts the frame from the force (N) and torque (N m, world axes) of the hands on the frame
+    /// without hands.
     pub(crate) fn moved(
         &self,
         unheld: &Frame,
@@ -54,13 +59,13 @@ impl PredictedFrame {
         }
     }
 
-    /// What is to be added to a torque (N m, world axes) that is told for this place already, where
-    /// the rigid motion takes it for that of the unheld one.
+    /// Torque (N m, world axes) to add to a torque computed at this frame, because the rigid motion
+    /// expects the torque at the frame without hands.
     pub(crate) fn slack(&self, rigid: &RigidMotion) -> Vector3<f64> {
         self.turn * rigid.slack(&self.turned)
     }
 
-    /// Where a point (m, body axes) is, to first order about this place, when nobody pulls: m, world axes.
+    /// World position (m) of a point (m, body axes) without hands, to first order about this frame.
     pub(crate) fn unheld_position(
         &self,
         model: &ModalModel,

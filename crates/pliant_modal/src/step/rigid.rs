@@ -1,18 +1,22 @@
-//! Where a body is. An anchored body's frame stays where it is put; a free body's frame is its rigid motion.
+//! Pose and rigid motion of a body.
+//!
+//! The frame of an anchored body stays in its given pose. The frame of a free body is its rigid
+//! motion.
 
 use nalgebra::{Matrix3, Quaternion, UnitQuaternion, Vector3};
 
 use crate::{ModalModel, StepError, error::finite};
 
-/// Pose and momentum of a body. The point that it carries is the center of mass at rest.
+/// Pose and momentum of a body. The reference point is the center of mass at rest.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Frame {
-    /// Center of mass at rest, in body axes, m: what `position` is the image of.
+    /// Center of mass at rest, m, body axes. `position` is the world position of this point.
     pivot: Vector3<f64>,
     position: Vector3<f64>,
     rotation: UnitQuaternion<f64>,
     velocity: Vector3<f64>,
-    /// About the center of mass, world axes, kg m^2/s: kept instead of the angular velocity, so that flight conserves it to rounding.
+    /// Angular momentum about the center of mass, kg m^2/s, world axes. It is stored instead of the
+    /// angular velocity, so that flight conserves it up to rounding.
     spin: Vector3<f64>,
 }
 
@@ -24,7 +28,7 @@ impl Default for Frame {
 }
 
 impl Frame {
-    /// The frame in which the body stands as its model was baked.
+    /// Makes the frame in which the model was baked.
     pub fn at_rest(model: &ModalModel) -> Self {
         let pivot = Vector3::from(model.center_of_mass());
         Self { pivot, position: pivot, ..Self::default() }
@@ -40,7 +44,7 @@ impl Frame {
         self.position.into()
     }
 
-    /// Rotation from body to world axes as a unit quaternion x, y, z, w.
+    /// Rotation from body to world axes, as a unit quaternion x, y, z, w.
     pub fn orientation(&self) -> [f64; 4] {
         let q = self.rotation.quaternion();
         [q.i, q.j, q.k, q.w]
@@ -56,10 +60,11 @@ impl Frame {
         self.spin.into()
     }
 
-    /// A frame from its parts: center of mass (m), orientation (x, y, z, w), velocity (m/s), spin (kg m^2/s), all in world axes.
+    /// Makes a frame from center of mass (m), orientation (x, y, z, w), velocity (m/s) and spin
+    /// (kg m^2/s), all in world axes.
     ///
     /// # Errors
-    /// A number that is not finite, a quaternion of length zero.
+    /// Returns an error if a number is not finite or the quaternion has length zero.
     pub fn from_motion(
         model: &ModalModel,
         center: [f64; 3],
@@ -92,7 +97,8 @@ impl Frame {
         Ok(())
     }
 
-    /// Neither moves nor turns; where it is farther away than `most` (m) it is back at the origin.
+    /// Sets velocity and spin to zero. If the position is farther away than `most` (m), the frame
+    /// returns to the origin.
     pub(crate) fn stop(&mut self, most: f64) {
         self.velocity = Vector3::zeros();
         self.spin = Vector3::zeros();
@@ -113,12 +119,12 @@ impl Frame {
         &self.rotation
     }
 
-    /// World position of a point of the body, m.
+    /// World position (m) of a point (m, body axes).
     pub fn to_world(self, local: Vector3<f64>) -> Vector3<f64> {
         self.position + self.rotation * (local - self.pivot)
     }
 
-    /// World velocity of a point of the body that moves with the frame, m/s.
+    /// World velocity of a point that is fixed to the frame, m/s. The point is in body axes, m.
     pub fn velocity_at(&self, model: &ModalModel, local: Vector3<f64>) -> Vector3<f64> {
         self.velocity + self.angular_velocity(model).cross(&(self.rotation * (local - self.pivot)))
     }
@@ -128,17 +134,20 @@ impl Frame {
         self.rotation * (inverse_inertia(model) * (self.rotation.inverse() * self.spin))
     }
 
-    /// Turns freely for `h` s with the spin held. In body axes the spin `l` obeys `l' = l x w`, `w = I^-1 l`; the step is
+    /// Turns the frame freely for `h` s with constant spin. In body axes the spin `l` obeys
+    /// `l' = l x w` with `w = I^-1 l`. The step is
     ///
     /// ```text
     /// R1 = R0 exp(h w),  l1 = exp(-h w) l0,  w = I^-1 (l0 + l1) / 2
     /// ```
     ///
-    /// A rotation about `w` leaves the part of `l` along `w` as it is, so `(l1 - l0) . w = 0`: the kinetic energy `l . I^-1 l / 2` is kept, and so is
-    /// `R l`, to rounding. (With `w` taken at the middle of an explicit step the energy creeps up: a body that turns once a second ends up turning about
-    /// its axis of least inertia.)
+    /// A rotation about `w` keeps the part of `l` along `w`, so `(l1 - l0) . w = 0`. The kinetic
+    /// energy `l . I^-1 l / 2` and `R l` are thus conserved up to rounding. (With `w` taken at the
+    /// middle of an explicit step the energy grows slowly: a body that turns once a second ends up
+    /// turning about its axis of least inertia.)
     fn turn(&mut self, model: &ModalModel, h: f64) {
-        /// Most that `|I^-1| |l| h` may be in one piece: the fixed point below then closes in by a factor of two or more a round.
+        /// Largest value of `|I^-1| |l| h` in one piece. The fixed point below then converges by a
+        /// factor of two or more per round.
         const PIECE: f64 = 1.0;
         const MOST_PIECES: f64 = 64.0;
         const ROUNDS: usize = 40;
@@ -193,29 +202,33 @@ fn unit(orientation: [f64; 4]) -> Result<UnitQuaternion<f64>, StepError> {
 
 fn inverse_inertia(model: &ModalModel) -> Matrix3<f64> {
     let i = model.inertia();
-    // The model was refused unless this is positive definite.
+    // The model checks guarantee that this matrix is positive definite.
     Matrix3::from_fn(|r, c| i[r][c]).try_inverse().unwrap_or_else(Matrix3::zeros)
 }
 
-/// What a pull does to the rigid motion within one step.
+/// Response of the rigid motion to forces within one step.
 ///
-/// Velocities first, then positions with the new velocities (symplectic Euler): a stiff hand on a light body is then critically damped, where the
-/// average-acceleration rule would ring for ever. Constant forces are integrated exactly.
+/// The step updates velocities first and then positions with the new velocities (symplectic Euler).
+/// A stiff hand on a light body is then critically damped, where the average-acceleration rule
+/// would ring forever. Constant forces are integrated exactly.
 #[derive(Debug, Clone, Copy)]
 pub struct RigidMotion {
     step: f64,
     inverse_mass: f64,
-    /// Body axes.
+    /// Inverse of the inertia, body axes.
     inverse_inertia: Matrix3<f64>,
-    /// The same with what the pulls themselves add, see [`RigidMotion::tighten`].
+    /// Inverse of the inertia including the stiffness of the forces, see [`RigidMotion::tighten`].
     turning: Matrix3<f64>,
-    /// Torque by which tight pulls answer a turn, N m/rad, body axes: the `K` of [`RigidMotion::tighten`].
+    /// Torque with which tension resists a turn, N m/rad, body axes: the `K` of
+    /// [`RigidMotion::tighten`].
     tightness: Matrix3<f64>,
 }
 
 impl RigidMotion {
-    /// Advances the frame by `h` (s) as if no hand held it, under `gravity` (m/s^2) and a force (N) and torque (N m) about the
-    /// center of mass, all in world axes.
+    /// Advances the frame by `h` (s) without hands.
+    ///
+    /// `gravity` (m/s^2), `force` (N) and `torque` (N m, about the center of mass) are in world
+    /// axes.
     pub fn predict(
         frame: &mut Frame,
         model: &ModalModel,
@@ -234,10 +247,14 @@ impl RigidMotion {
         Self { step: h, inverse_mass, inverse_inertia, turning: inverse_inertia, tightness }
     }
 
-    /// Takes into account how `pulls` (N) at their arms (m, both body axes) turn with the body: two hands that pull apart keep it in line
-    /// between them, as a weight keeps a pendulum. To a turn by `t` they answer with the torque `-K t`,
-    /// `K = sum (p . a) 1 - (p a^T + a p^T) / 2`, and the turn of a step is that of the inertia `I + h^2 K`. What would drive the body
-    /// out of line (hands that press) is left to the steps, which follow it.
+    /// Takes into account that the forces of the hands turn with the body.
+    ///
+    /// `pulls` yields the arm (m) and force (N) of each hand, both in body axes. Two hands that
+    /// pull apart keep the body in line between them, as gravity keeps a pendulum. The forces
+    /// respond to a turn `t` with the torque `-K t`, where
+    /// `K = sum (p . a) 1 - (p a^T + a p^T) / 2`, and the turn of a step is that of the inertia
+    /// `I + h^2 K`. Negative eigenvalues of `K` (hands that press) would turn the body out of line.
+    /// They are set to zero here, and the steps follow their effect.
     pub fn tighten(&mut self, model: &ModalModel, pulls: impl Iterator<Item = (Vector3<f64>, Vector3<f64>)>) {
         let mut k = Matrix3::zeros();
         for (arm, pull) in pulls {
@@ -258,35 +275,37 @@ impl RigidMotion {
         self.turning = tight.try_inverse().unwrap_or(self.inverse_inertia);
     }
 
-    /// How fast a unit pull at arm `b` makes the point at arm `a` within the step: 3x3, m/s/N, body
-    /// axes. It moves it by so much times the step.
+    /// Velocity of the point at arm `a` per unit force at arm `b` within the step: 3x3, m/s/N, body
+    /// axes. The displacement is this value times the step.
     pub(crate) fn velocity_response(&self, a: &Vector3<f64>, b: &Vector3<f64>) -> Matrix3<f64> {
         let turning = a.cross_matrix() * self.turning * b.cross_matrix().transpose();
         self.step * (Matrix3::identity() * self.inverse_mass + turning)
     }
 
-    /// By how much a force (N) moves the center of mass within the step, m.
+    /// Displacement of the center of mass by a force (N) within the step, m.
     pub(crate) fn way(&self, force: Vector3<f64>) -> Vector3<f64> {
         self.step * self.step * self.inverse_mass * force
     }
 
-    /// The torque (N m, body axes) by which tight pulls have answered a turn (rad) already.
+    /// Torque (N m, body axes) with which tension has already resisted the turn `turned` (rad).
     pub(crate) fn slack(&self, turned: &Vector3<f64>) -> Vector3<f64> {
         self.tightness * turned
     }
 
-    /// The turn (rad, body axes) that a step whose pulls are told at `turned` makes when they are none.
+    /// Turn (rad, body axes) of a step without forces, if the forces are computed at `turned`.
     pub(crate) fn unpulled(&self, turned: &Vector3<f64>) -> Vector3<f64> {
         self.step * self.step * (self.turning * self.slack(turned))
     }
 
-    /// Adds the pulls' total force and torque (world axes) to the predicted frame.
+    /// Adds the total force (N) and torque (N m) of the hands, in world axes, to the predicted
+    /// frame.
     pub fn apply(&self, frame: &mut Frame, model: &ModalModel, force: Vector3<f64>, torque: Vector3<f64>) {
         let h = self.step;
         frame.velocity += h * force * self.inverse_mass;
         frame.position += h * h * force * self.inverse_mass;
         let turn = h * h * (self.turning * (frame.rotation.inverse() * torque));
-        // The torque that is left at the end of that turn is what the spin gains: h torque where nothing is tight.
+        // The spin gains the torque that is left at the end of this turn, which is `h torque`
+        // without tension.
         let i = model.inertia();
         let inertia = Matrix3::from_fn(|r, c| i[r][c]);
         frame.spin += frame.rotation * (inertia * turn) / h;

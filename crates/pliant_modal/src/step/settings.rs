@@ -1,38 +1,46 @@
-//! How a body is stepped, wherever a copy of it is.
+//! Step settings, the same for all copies of a body.
 
 use serde::{Deserialize, Serialize};
 
 use crate::{Integrator, ModalModel, Relaxation, StepError};
 
-/// How a body is stepped: everything that the host, its guests and peers have to agree on, besides
-/// the model and the length of a step.
+/// Step settings of a body.
+///
+/// The host, its guests and peers must agree on these settings, on the model and on the step
+/// length.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 #[serde(default, deny_unknown_fields)]
 pub struct StepSettings {
-    /// How the modes are integrated. Default: [`Integrator::Exact`].
+    /// Integrator of the modes. Default: [`Integrator::Exact`].
     pub integrator: Integrator,
-    /// Take a hand's force over a step for that of the step's middle, which it is, and tell the
-    /// reaction at the end as `1.5 F - 0.5 F_before`: what is felt is then of second order in the step.
-    /// Without it the force over the step is told as it is, of first order. Only the exact integrator
-    /// has a choice, the others take the force at the end anyway; and only on anchored bodies, as the
-    /// frame of a free one moves by a first-order step. Default: `true`.
+    /// Whether reactions are of second order in the step. Default: `true`.
+    ///
+    /// If true, the force over a step is taken as the force at the middle of the step, and the
+    /// reaction at the end is `1.5 F - 0.5 F_before`. If false, the reaction is the force over the
+    /// step, which is of first order. This only affects the exact integrator, as the others use the
+    /// force at the end in any case. It only affects anchored bodies, because the frame of a free
+    /// body moves by a first-order step.
     pub second_order: bool,
-    /// Bend by modal warping (Choi and Ko 2005). Without it displacements stay linear, and the body
-    /// grows when it turns. Default: `true`.
+    /// Whether the shape bends by modal warping (Choi and Ko 2005). Without warp displacements stay
+    /// linear, and the body grows when it turns. Default: `true`.
     pub warp: bool,
-    /// Newton corrections of the hands in one step, 1 to [`StepSettings::MOST_CORRECTIONS`]. They
-    /// only matter under warp. Default: 2.
+    /// Number of Newton corrections of the hands in one step, 1 to
+    /// [`StepSettings::MOST_CORRECTIONS`]. They only have an effect with warp. Default: 2.
     pub corrections: u8,
-    /// Uniform acceleration, m/s^2, world axes, each at most 1e9. Default: none.
+    /// Uniform acceleration, m/s^2, world axes. Each component is at most 1e9 in magnitude.
+    /// Default: zero.
     pub gravity: [f64; 3],
     /// Factor on all damping coefficients, 0 to 1e6. Default: 1.
     pub damping_scale: f64,
-    /// Factor on the material's stiffness, 1e-6 to 1e6: the body as it would be with so many times
-    /// the baked Young's modulus. Frequencies go with its root, compliances (those of held patches,
-    /// too) with its inverse; damping as [`ModalModel::stiffened`] says. Default: 1.
+    /// Factor on the material's stiffness, 1e-6 to 1e6. The body then behaves as with this multiple
+    /// of the baked Young's modulus.
+    ///
+    /// Frequencies scale with the square root of the factor. Compliances, including those of held
+    /// patches, scale with its inverse. Damping scales as described at [`ModalModel::stiffened`].
+    /// Default: 1.
     pub stiffness_scale: f64,
-    /// A viscoelastic material: every mode, and the flexibility under every hand, is a standard
-    /// linear solid. Default: none, elastic.
+    /// Parameters of a viscoelastic material: every mode, and the flexibility under every hand, is
+    /// a standard linear solid. Default: `None`, elastic.
     pub relaxation: Option<Relaxation>,
 }
 
@@ -52,13 +60,13 @@ impl Default for StepSettings {
 }
 
 impl StepSettings {
-    /// Most Newton corrections in one step.
+    /// Maximum number of Newton corrections in one step.
     pub const MOST_CORRECTIONS: u8 = 8;
 
-    /// Checks all ranges, also those of settings that came from a network.
+    /// Checks all ranges, also for settings from a network.
     ///
     /// # Errors
-    /// [`StepError::Input`] with the value that is not finite or not in its range.
+    /// Returns [`StepError::Input`] for a value that is not finite or out of range.
     pub fn check(&self) -> Result<(), StepError> {
         let Self { damping_scale: damping, stiffness_scale: stiffness, .. } = *self;
         StepError::check("damping_scale", "0 to 1e6", (0.0..=1e6).contains(&damping), damping)?;
@@ -77,7 +85,7 @@ impl StepSettings {
         StepError::check("gravity", "-1e9 to 1e9", beyond.is_none(), beyond.copied().unwrap_or(0.0))
     }
 
-    /// The same bytes for the same settings, on every machine: for digests.
+    /// Encodes the settings for digests. Equal settings give the same bytes on every machine.
     pub fn to_bytes(&self) -> Vec<u8> {
         let Self { integrator, second_order, warp, corrections, gravity, .. } = *self;
         let (kind, rho_inf) = match integrator {
@@ -93,14 +101,16 @@ impl StepSettings {
         out
     }
 
-    /// By how much more than the force over a step the force at its end counts, less that of the step
-    /// before: `F_end = (1 + x) F - x F_before`.
+    /// Returns the extrapolation factor `x` of the force at the end of a step:
+    /// `F_end = (1 + x) F - x F_before`.
+    ///
+    /// `F` is the force over the step and `F_before` that over the previous step.
     pub fn extrapolation(&self, model: &ModalModel) -> f64 {
         let second = self.second_order && self.integrator == Integrator::Exact && !model.is_free();
         if second { 0.5 } else { 0.0 }
     }
 
-    /// Angular frequency (rad/s) and damping coefficient (1/s) of a mode as it is stepped.
+    /// Angular frequency (rad/s) and damping coefficient (1/s) of a mode as stepped.
     pub fn mode(&self, model: &ModalModel, mode: usize) -> (f64, f64) {
         let (omega, damping) = model.stiffened(mode, self.stiffness_scale);
         (omega, damping * self.damping_scale)

@@ -1,9 +1,9 @@
-//! The system of all hands, `(A + r B + C) pull = gap`, three rows a hand.
+//! The linear system of all hands, `(A + r B + C) pull = gap`, with three rows per hand.
 
 /// Workspace of the solve. It grows when hands are added.
 #[derive(Debug, Clone, Default)]
 pub(crate) struct System {
-    /// Row-major, `n x n`.
+    /// Matrix in row-major order, `n x n`.
     matrix: Vec<f64>,
     right: Vec<f64>,
     pivots: Vec<usize>,
@@ -11,10 +11,11 @@ pub(crate) struct System {
 }
 
 impl System {
-    /// A pivot below this share of its diagonal has been eaten by rounding: two hands on one spot, more rows than modes.
+    /// A pivot below this share of its diagonal consists of rounding errors. This happens with two
+    /// hands at one place, or with more rows than modes.
     const LOST: f64 = 1e-13;
 
-    /// Makes room for so many hands, so that a step needs no memory.
+    /// Reserves memory for this number of hands, so that a step allocates nothing.
     pub(crate) fn reserve(&mut self, hands: usize) {
         let n = 3 * hands;
         self.matrix.reserve((n * n).saturating_sub(self.matrix.len()));
@@ -22,7 +23,7 @@ impl System {
         self.pivots.reserve(n.saturating_sub(self.pivots.len()));
     }
 
-    /// An empty system of so many rows; of a `symmetric` one only the lower triangle needs to be set.
+    /// Sets the system to `n` rows of zeros. A `symmetric` system uses only the lower triangle.
     pub(crate) fn clear(&mut self, n: usize, symmetric: bool) {
         self.matrix.clear();
         self.matrix.resize(n * n, 0.0);
@@ -40,13 +41,14 @@ impl System {
         &mut self.right
     }
 
-    /// Replaces the right side by the solution. Returns in how many directions the system had lost its
-    /// rank: these get no share of their own and leave the solution of the others standing.
+    /// Replaces the right side by the solution and returns the number of directions without rank.
+    ///
+    /// These directions get no share of the solution and do not change that of the others.
     pub(crate) fn solve(&mut self) -> usize {
         if self.symmetric { self.cholesky() } else { self.eliminate() }
     }
 
-    /// `L L^T` of the lower triangle, in place.
+    /// Factors the lower triangle in place as `L L^T` and solves.
     fn cholesky(&mut self) -> usize {
         let n = self.right.len();
         let (m, x) = (&mut self.matrix, &mut self.right);
@@ -57,7 +59,7 @@ impl System {
             let pivot = diagonal - square;
             if pivot <= Self::LOST * diagonal.abs() {
                 lost += 1;
-                // The direction is a combination of earlier ones: a huge pivot gives it no share.
+                // The direction is a combination of earlier ones. A huge pivot gives it no share.
                 for i in j + 1..n {
                     m[i * n + j] = 0.0;
                 }
@@ -84,15 +86,15 @@ impl System {
         lost
     }
 
-    /// Gaussian elimination with row exchange, in place. A column without a pivot is an unknown
-    /// without a share.
+    /// Solves by Gaussian elimination with row exchange, in place. The unknown of a column without
+    /// a pivot is zero.
     fn eliminate(&mut self) -> usize {
         let n = self.right.len();
         let (m, x) = (&mut self.matrix, &mut self.right);
         self.pivots.clear();
         for j in 0..n {
             let row = self.pivots.len();
-            // What is left of the column is compared with what it was.
+            // The pivot is compared with the largest entry of the column.
             let scale = (0..n).fold(0.0f64, |scale, i| scale.max(m[i * n + j].abs()));
             let mut best = row;
             for i in row + 1..n {
@@ -122,8 +124,8 @@ impl System {
             }
             self.pivots.push(j);
         }
-        // From the last pivot up. A solution goes where its column is, which is never above its row,
-        // so that no right side is lost before it is used.
+        // Back substitution starts at the last pivot. Each solution is stored at the index of its
+        // column, which is never above its row, so no right side is overwritten before its use.
         let lost = n - self.pivots.len();
         x[self.pivots.len()..].fill(0.0);
         for (row, &j) in self.pivots.iter().enumerate().rev() {
@@ -153,7 +155,7 @@ mod tests {
         system
     }
 
-    /// Solves, and compares `full x` with the right side.
+    /// Solves the system and compares `full x` with the right side.
     fn solved(full: &[f64], right: &[f64], symmetric: bool) -> usize {
         let mut system = system(full, right, symmetric);
         let lost = system.solve();
@@ -180,7 +182,7 @@ mod tests {
 
     #[test]
     fn lost_rank_leaves_a_solution_standing() {
-        // Rows 0 and 2 are the same row: their shares must still solve it.
+        // Rows 0 and 2 are equal. The solution must still satisfy both.
         let full = [4.0, 1.0, 4.0, 1.0, 3.0, 1.0, 4.0, 1.0, 4.0];
         for symmetric in [true, false] {
             assert_eq!(solved(&full, &[1.0, 2.0, 1.0], symmetric), 1);
@@ -189,7 +191,7 @@ mod tests {
 
     #[test]
     fn a_column_without_a_pivot_does_not_cost_an_equation() {
-        // The first two unknowns only count together, and all three equations are consistent.
+        // The first two unknowns only occur as their sum, and all three equations are consistent.
         let full = [1.0, 1.0, 2.0, 1.0, 1.0, 3.0, 2.0, 2.0, 5.0];
         assert_eq!(solved(&full, &[1.0, 2.0, 3.0], false), 1);
     }

@@ -1,9 +1,10 @@
-//! What moves.
+//! The dynamic state of a body.
 
 use super::Frame;
 
-/// The state of a body at one tick. All slices have one entry a stepped mode; `z` has none where
-/// the material is elastic.
+/// The state of a body at one tick.
+///
+/// All slices have one entry per stepped mode. `z` is empty where the material is elastic.
 #[derive(Debug, PartialEq, Default)]
 pub struct State {
     /// Modal coordinates, kg^1/2 m.
@@ -12,17 +13,17 @@ pub struct State {
     pub v: Vec<f64>,
     /// Modal accelerations as the integrator defines them, kg^1/2 m/s^2.
     pub a: Vec<f64>,
-    /// Modal forces of the last step, kg^1/2 m/s^2 (generalized-alpha remembers them).
+    /// Modal forces of the last step, kg^1/2 m/s^2. Generalized-alpha uses these in the next step.
     pub f: Vec<f64>,
-    /// Modal flows, kg^1/2 m: how far the dashpot of each mode's Maxwell branch has gone; see
-    /// [`Relaxation`](crate::Relaxation).
+    /// Viscoelastic modal state (modal flow), kg^1/2 m: the displacement of the dashpot of each
+    /// mode's Maxwell branch. See [`Relaxation`](crate::Relaxation).
     pub z: Vec<f64>,
-    /// Where the body is.
+    /// Pose and rigid motion of the body.
     pub frame: Frame,
 }
 
 impl State {
-    /// All zero, in the default frame. A `viscous` material has a `z`.
+    /// Makes a state of zeros in the default frame. A `viscous` material has a `z`.
     pub fn zero(modes: usize, viscous: bool) -> Self {
         let zero = vec![0.0; modes];
         let z = if viscous { zero.clone() } else { Vec::new() };
@@ -39,10 +40,11 @@ impl State {
         self.non_finite().is_none()
     }
 
-    /// Beyond this, kg^1/2 m and its like, squares of coordinates and velocities may overflow in a step.
+    /// Limit on the magnitude of all numbers (kg^1/2 m and similar units). Above it, squares of
+    /// coordinates and velocities may overflow in a step.
     const MOST: f64 = 1e100;
 
-    /// Whether coordinates, velocities and forces are such that a step without hands and pushes stays finite.
+    /// Whether all numbers are small enough that a step without hands and pushes stays finite.
     pub(crate) fn is_moderate(&self) -> bool {
         let frame = &self.frame;
         let rigid = frame.velocity().into_iter().chain(frame.spin()).chain(frame.center());
@@ -50,7 +52,8 @@ impl State {
         modes.chain(rigid).all(|x| x.abs() <= Self::MOST)
     }
 
-    /// At rest and undeformed, where the frame is (or at the origin, where that is nowhere).
+    /// Sets the body to rest, undeformed, at the pose of its frame. The frame returns to the origin
+    /// if its position is beyond the limit.
     pub(crate) fn stop(&mut self) {
         for slice in [&mut self.q, &mut self.v, &mut self.a, &mut self.f, &mut self.z] {
             slice.fill(0.0);
@@ -58,7 +61,7 @@ impl State {
         self.frame.stop(Self::MOST);
     }
 
-    /// What is not finite, if anything is.
+    /// Name of the first quantity that is not finite, if any.
     pub(crate) fn non_finite(&self) -> Option<&'static str> {
         let named = [
             ("modal coordinates", &self.q),
@@ -78,8 +81,8 @@ impl Clone for State {
         copy
     }
 
-    /// Keeps the allocations of `self`: a step saves its state without any (a derived `clone_from`
-    /// would make new ones).
+    /// Keeps the allocations of `self`, so that a step saves its state without allocating. A
+    /// derived `clone_from` would allocate.
     fn clone_from(&mut self, from: &Self) {
         let Self { q, v, a, f, z, frame } = from;
         self.q.clone_from(q);

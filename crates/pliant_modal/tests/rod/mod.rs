@@ -1,6 +1,7 @@
-//! A rod whose axial modes are known in closed form: fixed at x = 0, free at x = L, cross-section A.
+//! A rod with axial modes in closed form: fixed at x = 0, free at x = L, cross-section A.
 //!
-//! phi_k(x) = sqrt(2 / (rho A L)) sin(k_k x), k_k = (2k - 1) pi / (2L), omega_k = k_k sqrt(E / rho); tip compliance L / (E A).
+//! The modes are `phi_k(x) = sqrt(2 / (rho A L)) sin(k_k x)` with `k_k = (2k - 1) pi / (2L)` and
+//! `omega_k = k_k sqrt(E / rho)`. The tip compliance is `L / (E A)`.
 
 use pliant_modal::{BakeInfo, Damping, Element, FlexibilitySite, ModalModel, ModelParts, SurfaceMesh};
 
@@ -8,7 +9,7 @@ pub const LENGTH: f64 = 1.0;
 pub const AREA: f64 = 0.01;
 pub const DENSITY: f64 = 1000.0;
 
-/// Stations along the rod; each has the four corners of the square cross-section.
+/// Number of stations along the rod. Each station has the four corners of the square cross-section.
 const STATIONS: usize = 21;
 
 pub fn tip() -> u32 {

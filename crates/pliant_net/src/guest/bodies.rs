@@ -1,4 +1,4 @@
-//! The host's bodies, and the entities that follow them.
+//! The host's bodies, and the entities that track them.
 
 use std::sync::Arc;
 
@@ -12,25 +12,26 @@ use crate::phase::Phase;
 use crate::remote::{BodyArrived, BodyLeft, RemoteBody, RemoteHands};
 use crate::scene::{Placement, SharedBody};
 
-/// A body of the host, as it was shown last.
+/// A body of the host and its last displayed states.
 pub(super) struct FollowedBody {
     pub(super) entity: Entity,
-    /// Made here, not by the app: goes when the body goes, and is where the host has it.
+    /// Whether this plugin spawned the entity. Such an entity is despawned with the body and gets
+    /// the host's transform.
     made_here: bool,
     pub(super) name: String,
     pub(super) phase: Phase,
     pub(super) tick: u64,
     pub(super) previous: (Vec<f64>, Option<Pose>),
     pub(super) current: (Vec<f64>, Option<Pose>),
-    /// The newest state is on screen and nothing has come since.
+    /// Whether the newest state is displayed and no newer one has arrived.
     pub(super) settled: bool,
-    /// Largest size of the state so far, the scale of the shown offset.
+    /// Largest size of the state so far, the scale of the visual state's offset.
     pub(super) peak: f64,
 }
 
 impl NetGuest {
     pub(super) fn place(&mut self, world: &mut World, placement: Placement) {
-        // As many as the session may have bodies.
+        // This is the largest number of bodies of a session.
         if self.placements.len() >= 1024 && !self.placements.contains_key(&placement.body) {
             return;
         }
@@ -43,13 +44,14 @@ impl NetGuest {
         }
     }
 
-    /// Model and state of a body are here: it gets its entity.
+    /// Gives a body its entity, when its model and its state have arrived.
     pub(super) fn body_ready(&mut self, world: &mut World, id: BodyId, model: Arc<ModalModel>) {
         let Some(view) = self.session.as_ref().and_then(|session| session.body(id)) else { return };
         let info = view.info();
         let name = info.name.clone();
         let settings = info.settings;
-        // How many of them the stream carries may change; the picture has room for all that we would take.
+        // The stream's number of modes may change. The display has room for all modes that this
+        // guest accepts.
         let modes = self.config.modes.map(usize::from).filter(|&modes| modes < model.mode_count());
         let now = self.now();
         self.line.keep_model(now, &model);
@@ -71,7 +73,7 @@ impl NetGuest {
                     waiting.iter(world).find(|(_, shared)| shared.name == name).map(|(entity, _)| entity);
                 match waiting {
                     Some(entity) => {
-                        // It may have been followed before the session was lost.
+                        // The entity may have tracked a body of the lost session.
                         let before = self.orphans.iter().position(|orphan| orphan.entity == entity);
                         let before = before.map(|index| self.orphans.swap_remove(index));
                         (entity, before.is_some_and(|before| before.made_here))
@@ -116,7 +118,8 @@ impl NetGuest {
         world.write_message(BodyArrived { entity, name });
     }
 
-    /// The host steps it otherwise: what is shown of it here (its energy, its knobs) goes by the same settings.
+    /// Takes over changed settings from the host, because the energy and the knobs that are
+    /// displayed here use the same settings.
     pub(super) fn body_changed(&mut self, world: &mut World, id: BodyId) {
         let Some(view) = self.session.as_ref().and_then(|session| session.body(id)) else { return };
         let settings = view.info().settings;
@@ -135,7 +138,7 @@ impl NetGuest {
         Self::take_leave(world, followed);
     }
 
-    /// All bodies stand still: the session is lost.
+    /// Stops all bodies when the session is lost.
     pub(super) fn orphan_bodies(&mut self, world: &mut World) {
         self.placements.clear();
         self.wanted.clear();
@@ -147,7 +150,7 @@ impl NetGuest {
         }
     }
 
-    /// The session is there again, and these bodies are not in it any more.
+    /// Removes the bodies that the session does not have after a reconnect.
     pub(super) fn forget_orphans(&mut self, world: &mut World) {
         for followed in std::mem::take(&mut self.orphans) {
             Self::take_leave(world, followed);
@@ -165,14 +168,15 @@ impl NetGuest {
 }
 
 impl FollowedBody {
-    /// Takes over what the session shows now.
+    /// Takes over the state that the session displays.
     pub(super) fn take(&mut self, view: &BodyView) {
-        // The newer copy steps with the confirmed one, so the ticks of that one say when.
+        // The predicted copy steps together with the confirmed one, whose ticks determine the time.
         let Some((_, shown)) = shown_of(view) else { return };
         let tick = view.tick();
         let first = self.current.0.len() != shown.modes();
         if tick == self.tick && !first {
-            // A snapshot may have moved the state of a tick; its blend begins at what was shown.
+            // A snapshot may have moved the state of this tick, but the blend begins at the
+            // displayed state.
             return;
         }
         self.tick = tick;
@@ -189,7 +193,8 @@ impl FollowedBody {
         self.peak = self.peak.max(shown.q.iter().map(|q| q * q).sum::<f64>().sqrt());
     }
 
-    /// The state between the last two, for a picture of so many modes: those that the stream does not carry are at rest.
+    /// Interpolates the last two states, for a display with this number of modes. Modes that the
+    /// stream does not carry are at rest.
     pub(super) fn between(&self, fraction: f64, modes: usize, out: &mut Vec<f64>) {
         out.clear();
         out.extend(
@@ -199,8 +204,8 @@ impl FollowedBody {
     }
 }
 
-/// A guest's copy is stepped as the host says. Gravity stays the copy's own: what crosses is in the
-/// axes of the stream.
+/// Returns the host's settings for a guest's copy of a body. Gravity stays the copy's own, because
+/// the network carries states in the axes of the stream.
 fn stepped_as(settings: &StepSettings, body: &ModalBody) -> StepSettings {
     StepSettings { gravity: body.settings.gravity, ..*settings }
 }

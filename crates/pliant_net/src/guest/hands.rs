@@ -1,4 +1,4 @@
-//! The app's own hands on the session's bodies.
+//! The app's local hands on the session's bodies.
 
 use std::collections::VecDeque;
 use std::time::Duration;
@@ -13,24 +13,25 @@ use crate::patch_kinematics::{PatchPoint, hold_of, holds_so};
 use crate::remote::RemoteBody;
 use crate::session_transform::SessionTransform;
 
-/// A grab of ours as the host was told of it.
+/// A local grab as it was sent to the host.
 pub(super) struct SentGrab {
     pub(super) body: BodyId,
     vertex: u32,
     radius: f64,
     hold: GrabConfig,
-    /// As last said, in session coordinates, and how many ticks it has been said for.
+    /// The target that was last sent, in session coordinates, and for how many ticks it has been
+    /// sent.
     target: [f64; 3],
     times: u8,
     path: HandPath,
-    /// The body's tick when the target was said.
+    /// The body's tick when the target was sent.
     tick: u64,
-    /// The session's number; `None`: refused.
+    /// The session's number of the grab. `None`: refused.
     pub(super) number: Option<u16>,
     pub(super) point: Option<PatchPoint>,
 }
 
-/// `PostUpdate`: the app's own grabs on the session's bodies are told to the host.
+/// `PostUpdate`: sends the app's own grabs on the session's bodies to the host.
 pub(crate) fn send_hands(
     guest: Option<ResMut<NetGuest>>,
     bodies: Query<(&RemoteBody, &BodyState, &GlobalTransform)>,
@@ -81,13 +82,14 @@ pub(crate) fn send_hands(
     }
 }
 
-/// Where a hand was lately, as the app's frames had it.
+/// Recent positions of a hand, one per frame of the app.
 ///
-/// Frames, the app's fixed steps and the session's ticks beat against each other: a hand that is read at the ticks moves by none, one or two of its
-/// steps, and a stiff hold makes force of that. The mean over a tick moves evenly, half a tick later.
+/// Frames, the app's fixed steps and the session's ticks have different rates. A hand that is
+/// sampled at the ticks moves by zero, one or two of its steps per tick, and a stiff grab turns
+/// this into force. The mean over a tick moves evenly, with a delay of half a tick.
 struct HandPath(VecDeque<(Duration, [f64; 3])>);
 
-/// A tick of a tenth of a second at 240 frames a second, and some.
+/// Longest history: a tick of 0.1 s at 240 frames per second, with some margin.
 const PLACES: usize = 32;
 
 impl HandPath {
@@ -98,11 +100,12 @@ impl HandPath {
         self.0.push_back((at, place));
     }
 
-    /// The mean place in the time `span` before `at`; from one place to the next the hand went straight.
+    /// Returns the mean position in the time `span` before `at`. The hand is assumed to move
+    /// straight between positions.
     fn mean(&self, at: Duration, span: Duration) -> [f64; 3] {
         let (Some(first), Some(last)) = (self.0.front(), self.0.back()) else { return [0.0; 3] };
         let from = at.saturating_sub(span);
-        // It was at the first place before, and is at the last one after.
+        // The hand was at the first position before that, and is at the last position after that.
         let ends = [(from.min(first.0), first.1), (at.max(last.0), last.1)];
         let corners = || [ends[0]].into_iter().chain(self.0.iter().copied()).chain([ends[1]]);
         let mut sum = (0.0, [0.0; 3]);
@@ -116,22 +119,23 @@ impl HandPath {
             sum.0 += passed.as_secs_f64();
             (0..3).for_each(|i| sum.1[i] += passed.as_secs_f64() * (here[i] + (there[i] - here[i]) * middle));
         }
-        // A hand at rest is exactly where it is.
+        // A hand at rest must give its exact position.
         if rests || sum.0 <= 0.0 { last.1 } else { sum.1.map(|x| x / sum.0) }
     }
 }
 
-/// A target that stays is said so often, tick by tick, before there is silence: until then the host knows that the hand stands still, and does not
-/// have to guess.
+/// Number of ticks for which an unchanged target is sent. The host then knows that the hand stands
+/// still, and need not extrapolate.
 const SAID: u8 = 6;
-/// Hands are read so often a tick.
+/// Samples of the hands per tick.
 const READS: f64 = 4.0;
-/// A frame that has taken longer is not gone through bit by bit.
+/// Longest frame that is divided into parts, s.
 const LONGEST_FRAME: f64 = 0.25;
 
 impl NetGuest {
-    /// Brings the session to now. The hands are read along the way from where they were to where they are, and each says one target for each tick of
-    /// its body, whatever the frames: the host plays them back one a tick.
+    /// Brings the session to `now`. Each hand is sampled along its path and sends one target for
+    /// each tick of its body, whatever the frame rate, because the host plays back one target per
+    /// tick.
     pub(super) fn advance(&mut self, now: Duration) {
         let Some(session) = &mut self.session else { return };
         let from = std::mem::replace(&mut self.advanced, now);
@@ -151,7 +155,8 @@ impl NetGuest {
             for sent in self.grabs.values_mut() {
                 let Some(number) = sent.number else { continue };
                 let Some(view) = session.body(sent.body) else { continue };
-                // A body that rests or stands still has no ticks: once a frame, so that a hand wakes it.
+                // A body that rests or has stalled has no ticks. Its hands send once a frame, so
+                // that a hand can wake it.
                 let steps = !view.is_resting() && !view.is_stalled();
                 let due = if steps { view.tick() != sent.tick } else { k == parts };
                 let target = sent.path.mean(at, tick);
@@ -182,7 +187,8 @@ mod tests {
 
     #[test]
     fn a_hand_that_moves_in_the_apps_steps_is_read_evenly() {
-        // Steps of 1 mm at 40 Hz, seen by frames of 7 ms; read at 40 Hz, out of step.
+        // The hand moves in steps of 1 mm at 40 Hz, seen by frames of 7 ms, and is sampled at 40 Hz
+        // out of phase.
         let ms = Duration::from_millis;
         let mut path = HandPath(VecDeque::new());
         let mut read = Vec::new();
@@ -196,9 +202,10 @@ mod tests {
         }
         let bends = read.windows(3).skip(2).map(|w| (w[0] - 2.0 * w[1] + w[2]).abs());
         let worst = bends.fold(0.0, f64::max);
-        // Read as it is, the hand stands still in one tick and moves by two steps in the next: 2 mm.
+        // Without the mean, the hand stands still in one tick and moves by two steps in the next,
+        // which is 2 mm.
         assert!(worst < 0.6e-3, "{worst}");
-        // At rest it is where it is, to the bit.
+        // A hand at rest must give its position to the bit.
         let place = [0.1, 0.2, 0.3];
         (0..PLACES as u64).for_each(|k| path.push(ms(10_000 + k), place));
         assert_eq!(path.mean(ms(10_040), ms(5)), place);

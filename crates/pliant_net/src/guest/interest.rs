@@ -1,4 +1,5 @@
-//! How much of each body is asked for: what is not looked at, or is far away, need not come.
+//! Subscriptions: how much of each body a guest requests. A body that is out of view or far away
+//! needs less data.
 
 use std::time::Duration;
 
@@ -11,28 +12,34 @@ use super::NetGuest;
 use crate::remote::RemoteBody;
 use crate::scene::Wanted;
 
-/// How much of a body a guest wants to be sent. On every body that follows a host's; written by the app, or by [`CameraInterest`].
+/// How much of a body the host sends to a guest. Every body that tracks a host's body has it. The
+/// app writes it, or [`CameraInterest`] does.
 ///
-/// Fewer modes are fewer bytes and less work, and a coarser shape: modes are ordered, the first are the largest motions.
+/// Fewer modes need fewer bytes and less work, and give a coarser shape. Modes are ordered: the
+/// first are the largest motions.
 #[derive(Component, Debug, Clone, Copy, Default, PartialEq, Eq, Hash)]
 pub enum Interest {
-    /// All modes that this guest takes. Default.
+    /// All modes that this guest accepts. Default.
     #[default]
     All,
-    /// So many, taken up to the next of 1, 2, 3, 4, 6, 8, 12 and so on; at least one, and no more than this guest takes.
+    /// This number of modes, rounded up to the next of 1, 2, 3, 4, 6, 8, 12 and so on. It is at
+    /// least one, and no more than this guest accepts.
     Modes(u16),
-    /// Nothing: the body stands still as it was last seen.
+    /// No modes: the body keeps its last displayed state.
     Nothing,
 }
 
-/// Asks for what the cameras see: nothing of a body outside of every view, a quarter or half of the modes of a small one.
+/// Requests only what the cameras see.
 ///
-/// More is asked for at once, less when it has been enough for `patience`. A body that this guest holds comes whole.
+/// A body outside all views gets no modes, and a small body gets half, a quarter or an eighth of
+/// its modes, but at least four. A request for more modes is sent at once, a request for fewer
+/// modes only after `patience`. A body that this guest holds gets all modes.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct CameraInterest {
-    /// A body whose height is at least this part of the view's comes whole. Default: 0.15.
+    /// A body whose height is at least this part of the view's height gets all modes. Default:
+    /// 0.15.
     pub whole: f32,
-    /// Default: 1 s.
+    /// How long fewer modes must have been enough before fewer are requested. Default: 1 s.
     pub patience: Duration,
 }
 
@@ -43,7 +50,8 @@ impl Default for CameraInterest {
 }
 
 impl CameraInterest {
-    /// What a body of so many modes, whose height is such a part of the view's (`None`: not seen), is worth.
+    /// Returns the interest in a body with this number of modes, whose height is the part `height`
+    /// of the view's height (`None`: out of view).
     fn worth(&self, height: Option<f32>, modes: usize) -> Interest {
         let Some(height) = height else { return Interest::Nothing };
         let share = [(1.0, 1), (0.5, 2), (0.25, 4)].into_iter().find(|(part, _)| height >= self.whole * part);
@@ -54,11 +62,11 @@ impl CameraInterest {
     }
 }
 
-/// What the host was told.
+/// The subscription that the host has received.
 #[derive(Debug, Clone, Copy)]
 pub(super) struct Said {
     modes: u16,
-    /// The camera has seen less since.
+    /// Time since which the cameras see less than is subscribed.
     less_since: Option<Duration>,
 }
 
@@ -72,7 +80,7 @@ impl Interest {
     }
 }
 
-/// `PostUpdate`: the cameras decide, where the app has left it to them.
+/// `PostUpdate`: sets the interests from the cameras, if [`CameraInterest`] is on.
 pub(crate) fn look(
     guest: Option<ResMut<NetGuest>>,
     cameras: Query<(&Camera, &Projection, &GlobalTransform, &Frustum)>,
@@ -89,7 +97,7 @@ pub(crate) fn look(
         let middle = place.transform_point(0.5 * (Vec3::from(low) + Vec3::from(high)));
         let heights =
             cameras.iter().filter(|(camera, ..)| camera.is_active).filter_map(|(_, lens, at, frustum)| {
-                // A body bends out of its bounds at rest.
+                // A bent body leaves its bounds at rest.
                 let seen = Sphere { center: Vec3A::from(middle), radius: 1.5 * radius };
                 frustum
                     .intersects_sphere(&seen, true)
@@ -110,17 +118,17 @@ pub(crate) fn look(
     }
 }
 
-/// The part of the view's height that a sphere takes.
+/// Returns the part of the view's height that a sphere takes.
 fn height_in(lens: &Projection, distance: f32, radius: f32) -> f32 {
     match lens {
         Projection::Perspective(lens) => radius / (distance.max(1e-6) * (0.5 * lens.fov).tan()),
         Projection::Orthographic(lens) => 2.0 * radius / lens.area.height().max(1e-6),
-        // Of a lens that we do not know we know nothing: whole.
+        // The size under an unknown projection is unknown, so all modes are requested.
         Projection::Custom(_) => f32::INFINITY,
     }
 }
 
-/// `PostUpdate`, after [`look`]: the host is told what has changed.
+/// `PostUpdate`, after [`look`]: sends changed subscriptions to the host.
 pub(crate) fn say_interest(guest: Option<ResMut<NetGuest>>, bodies: Query<(&RemoteBody, &Interest)>) {
     let Some(mut guest) = guest else { return };
     let guest = &mut *guest;
@@ -155,7 +163,8 @@ mod tests {
             fov: std::f32::consts::FRAC_PI_2,
             ..PerspectiveProjection::default()
         });
-        // The view is 2 m high at 1 m; a ball of 0.5 m across is a quarter of it.
+        // The view is 2 m high at a distance of 1 m, and a ball of 0.5 m diameter is a quarter of
+        // it.
         assert!((height_in(&lens, 1.0, 0.25) - 0.25).abs() < 1e-6);
         assert!((height_in(&lens, 10.0, 0.25) - 0.025).abs() < 1e-6);
     }

@@ -1,4 +1,5 @@
-//! A guest's side in Bevy: bodies arrive and follow the host's, own hands are sent, what they feel is written.
+//! The guest's side in Bevy: bodies arrive and track the host's bodies, the local hands are sent,
+//! and the forces on them are written.
 
 mod bodies;
 mod hands;
@@ -36,26 +37,32 @@ use crate::recording::{Recorder, Recording, RecordingError};
 /// How to join a session.
 #[derive(Debug)]
 pub struct JoinConfig {
-    /// What this user is called, at most 64 bytes. Default: `guest`.
+    /// Name of this user, at most 64 bytes. Default: `guest`.
     pub name: String,
     /// Key, limits, emulated link.
     pub transport: JoinOptions,
     /// How loss is repaired. Default: [`RecoveryConfig::default`].
     pub recovery: RecoveryConfig,
-    /// Take at most so many modes of each body: for weak machines and thin links. Default: all.
+    /// Most modes to accept of each body, for weak machines and slow links. Default: all.
     pub modes: Option<u16>,
-    /// Show and feel the own hands at once: a body that this guest holds is stepped on to where the hands are now, instead of shown as the
-    /// host had it half a round trip ago. Default: true.
+    /// Whether to show the local hands, and report their forces, without the network's delay. A
+    /// body that this guest holds is then stepped ahead to the current positions of the hands,
+    /// instead of shown in the host's state of half a round trip ago. Default: true.
     pub predict_own_hand: bool,
-    /// Most force that one of the own hands is told of, N, whatever the host says; the direction stays. Default: 1000.
+    /// Largest force on one of the local hands that is reported, N, whatever the host sends. The
+    /// direction is kept. Default: 1000.
     pub most_force: f64,
-    /// Ask for no more of each body than the cameras see. Default `None`: everything, unless an [`Interest`] says otherwise.
+    /// Request no more of each body than the cameras see. Default `None`: everything, unless an
+    /// [`Interest`] says otherwise.
     pub interest: Option<CameraInterest>,
-    /// When the host cannot be heard any more, or is not there yet, joining is tried again for so long. Zero: never. Default: 60 s.
+    /// How long the guest tries to join again after it has lost the host or cannot reach it. Zero:
+    /// it does not try. Default: 60 s.
     pub rejoin: Duration,
-    /// Models that need not be sent, beside those that are in `Assets<ModalAsset>` when the connection opens. Default: none.
+    /// Models that the host need not send, in addition to those in `Assets<ModalAsset>` when the
+    /// connection opens. Default: none.
     pub models: Vec<Arc<ModalModel>>,
-    /// Write everything that comes to this file, for [`NetPlugin::replay`](crate::NetPlugin::replay). Default: no.
+    /// File to which all received data is written, for
+    /// [`NetPlugin::replay`](crate::NetPlugin::replay). Default: none.
     pub record: Option<PathBuf>,
 }
 
@@ -76,24 +83,25 @@ impl Default for JoinConfig {
     }
 }
 
-/// Where a guest stands.
+/// Connection state of a guest.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub enum GuestState {
-    /// The host has not let us in yet.
+    /// The host has not admitted this guest yet.
     Joining,
-    /// In the session.
+    /// The guest is in the session.
     In {
-        /// Our number.
+        /// The guest's user number.
         user: UserId,
     },
-    /// The host cannot be heard; joining is tried again. Bodies stand as they were last seen.
+    /// The connection to the host is lost, and the guest tries to join again. Bodies keep their
+    /// last displayed state.
     Lost {
-        /// Why, in words.
+        /// Reason, as text.
         reason: String,
     },
-    /// It is over, or never began; bodies stay as they were last seen.
+    /// The session is over, or never began. Bodies keep their last displayed state.
     Closed {
-        /// Why, in words.
+        /// Reason, as text.
         reason: String,
     },
 }
@@ -108,24 +116,24 @@ pub struct NetGuest {
     role: Role,
     session: Option<GuestSession>,
     bodies: BTreeMap<BodyId, FollowedBody>,
-    /// Bodies of a session that was lost: the next one may have them again.
+    /// Bodies of a lost session, which the next session may have again.
     orphans: Vec<FollowedBody>,
     placements: BTreeMap<BodyId, Transform>,
     users: BTreeMap<UserId, Entity>,
     people: BTreeMap<UserId, Person>,
     reaches: Vec<Reach>,
     grabs: BTreeMap<Entity, SentGrab>,
-    /// The session was brought to this time.
+    /// Time up to which the session has been updated.
     advanced: Duration,
-    /// Somebody asked to leave.
+    /// Whether the app has asked to leave the session.
     leaving: bool,
     wanted: BTreeMap<BodyId, interest::Said>,
     retry: session::Retry,
     scratch: Vec<f64>,
     ledger: Ledger,
-    /// Models that have come and are being read.
+    /// Received models that are being decoded.
     being_read: Vec<([u8; 32], Task<Option<Arc<ModalModel>>>)>,
-    /// The counts of sessions that are over.
+    /// The counts of earlier sessions.
     before: LinkStats,
 }
 
@@ -165,53 +173,56 @@ impl NetGuest {
         }
     }
 
-    /// Where we stand.
+    /// Returns the connection state.
     pub fn state(&self) -> &GuestState {
         &self.state
     }
 
-    /// What our token lets us do; [`Role::Hold`] before the host has said.
+    /// Returns what this guest's token permits. [`Role::Hold`] before the host has sent the role.
     pub fn role(&self) -> Role {
         self.role
     }
 
-    /// The session, for those who want to know more: ticks, repairs, hidden states, playout delay. `None` before the connection is
-    /// open.
+    /// Returns the session, with details such as ticks, repairs, confirmed states and the playout
+    /// delay. `None` before the connection is open.
     pub fn session(&self) -> Option<&GuestSession> {
         self.session.as_ref()
     }
 
-    /// The session's view of the body that an entity follows.
+    /// Returns the session's view of the body that an entity tracks.
     pub fn body(&self, body: RemoteBody) -> Option<&BodyView> {
         self.session.as_ref()?.body(body.0)
     }
 
-    /// The state that a body is shown in, and the tick it stands for: that of the newer copy while this guest's own hand holds it
-    /// ([`BodyView::predicted_hand`]), that of the confirmed stream otherwise. The host's tick of a newer copy may still be to come.
+    /// Returns the displayed state of a body and its tick. While this guest's own hand holds the
+    /// body, the state is the predicted copy ([`BodyView::predicted_hand`]). Otherwise it is the
+    /// visual state of the confirmed stream. The host may not have reached the tick of a predicted
+    /// copy yet.
     pub fn shown(&self, body: RemoteBody) -> Option<(Tick, &State)> {
         let view = self.body(body)?;
         shown_of(view)
     }
 
-    /// Leaves the session: the host is told, the connection is closed, and it is not tried again. The state is
-    /// [`GuestState::Closed`] from the next frame on; bodies stay as they were last seen.
+    /// Leaves the session. The host receives a goodbye, the connection is closed, and the guest
+    /// does not join again. The state is [`GuestState::Closed`] from the next frame on, and bodies
+    /// keep their last displayed state.
     pub fn leave(&mut self) {
         self.leaving = true;
     }
 
-    /// The emulated link under the session, if there is one.
+    /// Returns the emulated link under the session, if there is one.
     pub fn emulation(&self) -> Option<Emulation> {
         self.line.endpoint().and_then(Endpoint::emulation)
     }
 
-    /// Puts an emulated link under the session, another one, or none, at any time.
+    /// Sets, replaces or removes the emulated link under the session, at any time.
     pub fn set_emulation(&self, emulation: Option<Emulation>) {
         if let Some(endpoint) = self.line.endpoint() {
             endpoint.set_emulation(emulation);
         }
     }
 
-    /// The transport below; `None` for a replay.
+    /// Returns the transport endpoint. `None` for a replay.
     pub fn endpoint(&self) -> Option<&Endpoint> {
         self.line.endpoint()
     }

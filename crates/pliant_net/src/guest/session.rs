@@ -1,4 +1,4 @@
-//! The course of a guest's session: joining, being let in, losing the host, coming back.
+//! The course of a guest's session: joining, being admitted, losing the host and joining again.
 
 use std::sync::Arc;
 use std::time::Duration;
@@ -16,27 +16,28 @@ use crate::scene::{self, Person, Reliable};
 use crate::transport::{CloseReason, Role};
 use crate::user::{User, UserJoined, UserLeft, UserLink, Yourself};
 
-/// When joining is tried again.
+/// When the guest tries to join again.
 #[derive(Debug, Default)]
 pub(super) struct Retry {
-    /// The host was let go of at this time.
+    /// Time at which the connection to the host was lost.
     since: Option<Duration>,
-    /// The next attempt is due then; `None` while one is under way.
+    /// Time of the next attempt. `None` while an attempt is under way or none is needed.
     next: Option<Duration>,
     pause: Duration,
-    /// We were in once.
+    /// Whether the guest has been in the session before.
     was_in: bool,
-    /// Bodies that are not back by then are gone.
+    /// Bodies that have not arrived again by this time are removed.
     orphans_until: Option<Duration>,
 }
 
-/// The first attempt follows at once, the next ones after a pause that doubles up to this.
+/// The first attempt follows after `FIRST_PAUSE`. The pause doubles with each attempt, up to this
+/// length.
 const LONGEST_PAUSE: Duration = Duration::from_secs(2);
 const FIRST_PAUSE: Duration = Duration::from_millis(100);
-/// So long after the welcome a body may take to come again, before it counts as gone.
+/// How long after the welcome a body may take to arrive again, before it is removed.
 const ORPHANS: Duration = Duration::from_secs(5);
 
-/// `PreUpdate`: what came from the host.
+/// `PreUpdate`: processes the data from the host.
 pub(crate) fn receive(world: &mut World) {
     world.try_resource_scope(|world, mut guest: Mut<NetGuest>| {
         let guest = &mut *guest;
@@ -66,14 +67,14 @@ pub(crate) fn receive(world: &mut World) {
                     (Some(Reliable::Placement(placement)), _) => guest.place(world, placement),
                     (Some(Reliable::People(people)), _) => guest.know(world, people),
                     (Some(Reliable::Reaches(reaches)), _) => guest.reaches = reaches,
-                    // A later host may have more to say.
+                    // A host of a later version may have more kinds.
                     _ => {
                         guest.before.rejected += 1;
                         debug!("a message of no known kind from the host");
                     }
                 },
                 Came::Closed { reason } => {
-                    // A goodbye of the session came before this and says more.
+                    // A goodbye of the session arrived earlier and has the more precise reason.
                     guest.take_events(world);
                     guest.ended(world, now, &reason);
                 }
@@ -89,7 +90,7 @@ pub(crate) fn receive(world: &mut World) {
 }
 
 impl NetGuest {
-    /// The connection is open: says hello.
+    /// Starts a session on an open connection.
     fn greet(&mut self, world: &World, now: Duration) -> Result<(), StreamError> {
         let most = self.line.max_datagram_size().unwrap_or(0);
         let config = pliant_stream::GuestConfig {
@@ -113,7 +114,7 @@ impl NetGuest {
         Ok(())
     }
 
-    /// A model is read elsewhere, since a large one takes longer than a frame.
+    /// Decodes a model on the task pool, because a large one takes longer than a frame.
     fn read_model(&mut self, hash: [u8; 32], bytes: Arc<[u8]>) {
         let read = move || ModalModel::from_bytes(&bytes).ok().map(Arc::new);
         match (AsyncComputeTaskPool::try_get(), &mut self.session) {
@@ -123,7 +124,7 @@ impl NetGuest {
         }
     }
 
-    /// The models that have been read since.
+    /// Hands over the models that have been decoded.
     fn take_models(&mut self) {
         let Some(session) = &mut self.session else { return };
         self.being_read.retain_mut(|(hash, task)| match block_on(poll_once(task)) {
@@ -135,7 +136,7 @@ impl NetGuest {
         });
     }
 
-    /// What a session has counted stays counted.
+    /// Ends the session and keeps its counts.
     fn end_session(&mut self) {
         self.being_read.clear();
         if let Some(session) = self.session.take() {
@@ -143,21 +144,21 @@ impl NetGuest {
         }
     }
 
-    /// The connection has ended, or there was none.
+    /// Handles the end of a connection, or a failed attempt.
     fn ended(&mut self, world: &mut World, now: Duration, reason: &CloseReason) {
         if matches!(self.state, GuestState::Closed { .. }) {
             return;
         }
         let may_come_back = match reason {
-            // The goodbye that said so may have been lost on the way.
+            // The session's goodbye with this reason may have been lost.
             CloseReason::ByPeer { reason, .. } => !matches!(
                 reason,
                 DisconnectReason::Refused | DisconnectReason::Version | DisconnectReason::Path
             ),
             CloseReason::TimedOut | CloseReason::Failed { .. } => true,
-            // Who was in finds a place again when the house has sorted itself out.
+            // A guest that was in the session may find a free place later.
             CloseReason::NoRoom => self.retry.was_in,
-            // We have hung up on a host that had fallen silent.
+            // This guest has closed the connection to a host that had fallen silent.
             CloseReason::ByUs => matches!(self.state, GuestState::Lost { .. }),
             _ => false,
         };
@@ -168,7 +169,7 @@ impl NetGuest {
         }
     }
 
-    /// The host is not to be heard: what is here stands still, and joining is tried again.
+    /// Stops the bodies and schedules the next attempt to join, when the host is lost.
     fn lost(&mut self, world: &mut World, now: Duration, reason: String) {
         self.retry.orphans_until = None;
         let since = *self.retry.since.get_or_insert(now);
@@ -197,7 +198,7 @@ impl NetGuest {
             self.retry.next = None;
             self.line.rejoin();
         }
-        // While the host cannot be heard, nothing says that its bodies are gone.
+        // While the connection is lost, nothing says that the host has removed its bodies.
         let inside = matches!(self.state, GuestState::In { .. });
         if inside && self.retry.orphans_until.is_some_and(|until| now >= until) {
             self.retry.orphans_until = None;
@@ -205,7 +206,7 @@ impl NetGuest {
         }
     }
 
-    /// Grabs are not held any more, the others are not seen any more.
+    /// Ends the grabs and removes the other users.
     fn leave_session(&mut self, world: &mut World) {
         self.grabs.clear();
         self.orphan_bodies(world);
@@ -259,7 +260,7 @@ impl NetGuest {
                         world.write_message(GrabRefused { entity });
                     }
                 }
-                // Both ends have stopped hearing each other: the connection is tried anew, not given up.
+                // Both ends have stopped receiving from each other, so the guest connects again.
                 GuestEvent::Closed { reason: DisconnectReason::Silent | DisconnectReason::Lost } => {
                     self.flush();
                     self.line.close();
@@ -284,10 +285,11 @@ impl NetGuest {
         (entity, name)
     }
 
-    /// The host says who is who: their names and roles, its own among them.
+    /// Takes over the names and roles of the users from the host, including the guest's own.
     fn know(&mut self, world: &mut World, people: Vec<Person>) {
         for person in people {
-            // As many as there are numbers; the session tells who leaves.
+            // The map is bounded by the number of user numbers. The session reports which users
+            // leave.
             let known = self.users.get(&person.user).and_then(|&entity| world.get_mut::<User>(entity));
             if let Some(mut user) = known {
                 user.set_if_neq(User::new(person.user, &person.name, person.role));

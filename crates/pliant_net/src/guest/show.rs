@@ -1,4 +1,4 @@
-//! What the session shows, written for the eye and the hand.
+//! Writes the displayed state of the session to the bodies and the forces to the hands.
 
 use bevy::prelude::*;
 use pliant_body::{BodyState, GrabForce, VisualState};
@@ -21,7 +21,7 @@ type FollowedBodies<'w, 's> = Query<
     ),
 >;
 
-/// `PostUpdate`: the session is brought to now, and what it shows is written.
+/// `PostUpdate`: brings the session to the current time and writes what it displays.
 pub(crate) fn show(
     guest: Option<ResMut<NetGuest>>,
     mut bodies: FollowedBodies,
@@ -30,7 +30,7 @@ pub(crate) fn show(
 ) {
     let Some(mut guest) = guest else { return };
     let guest = &mut *guest;
-    // Not a number and below zero are no bound: no force then.
+    // NaN and negative limits give no force.
     let most_force = guest.config.most_force.max(0.0);
     let now = guest.now();
     let Some(session) = guest.session.as_mut() else { return };
@@ -39,7 +39,7 @@ pub(crate) fn show(
     }
     guest.advance(now);
     let Some(session) = guest.session.as_mut() else { return };
-    // Nobody's hand is one's own in a replay: all are shown.
+    // In a replay no hand is local, so all hands are shown as remote.
     let user = session.user().filter(|_| !guest.line.is_replay());
     let step = session.step();
     for (&id, followed) in &mut guest.bodies {

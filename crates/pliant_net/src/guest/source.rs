@@ -1,4 +1,4 @@
-//! Where a guest's session comes from: a host over QUIC, or a recording of one.
+//! Source of a guest's session: a host over QUIC, or a recording of one.
 
 use std::sync::Arc;
 use std::time::{Duration, Instant};
@@ -12,13 +12,13 @@ use crate::recording::{Record, Recorder, Recording};
 use crate::scene;
 use crate::transport::{CloseReason, Endpoint, Event, PeerStats, Role};
 
-/// The guest's end of the line.
+/// The guest's transport source.
 pub(crate) enum Source {
     Quic { endpoint: Endpoint, recorder: Option<Recorder> },
     Replay { recording: Recording, max_datagram: usize, over: bool },
 }
 
-/// What came, and when it did.
+/// A received event, with its time of arrival where the session needs it.
 pub(crate) enum Came {
     Connected { role: Role },
     Datagram { at: Duration, bytes: Bytes },
@@ -31,7 +31,7 @@ impl Source {
         Self::Replay { recording, max_datagram: 0, over: false }
     }
 
-    /// The next thing that came by `now`, both since `began`.
+    /// Returns the next event that arrived by `now`. `now` and the event's time count from `began`.
     pub(crate) fn poll(&mut self, began: Instant, now: Duration) -> Option<Came> {
         match self {
             Self::Quic { endpoint, recorder } => {
@@ -74,7 +74,7 @@ impl Source {
                     Record::Datagram(bytes) => Came::Datagram { at, bytes },
                     Record::Message(bytes) => Came::Message { bytes },
                     Record::Closed(words) => {
-                        // One that went on after it has what follows.
+                        // The recording goes on after a close if the recorded guest joined again.
                         if recording.is_over() {
                             *over = true;
                             let reason = CloseReason::ByPeer { reason: DisconnectReason::Left, words };
@@ -82,7 +82,7 @@ impl Source {
                         }
                         Came::Closed { reason: CloseReason::Failed { words } }
                     }
-                    // Taken up when the recording was opened.
+                    // [`Recording::open`] has already read the models.
                     Record::Model(_) => return self.poll(began, now),
                 })
             }
@@ -91,7 +91,7 @@ impl Source {
 
     pub(crate) fn send(&self, output: Output) {
         let Self::Quic { endpoint, .. } = self else { return };
-        // A host that does not read our few messages is as good as gone; the idle timeout will say so.
+        // A host that does not read these few messages is lost, which the idle timeout will report.
         let sent = match output.channel {
             Channel::Datagram => endpoint.send_datagram(PeerId::HOST, Bytes::from_owner(output.bytes)),
             Channel::Message => endpoint.send_message(PeerId::HOST, scene::session_message(&output.bytes)),
@@ -109,7 +109,7 @@ impl Source {
         }
     }
 
-    /// A model of the cache is used: a recording must have it, as it never comes over the line.
+    /// Adds a cached model that the session uses to the recording, because the host never sends it.
     pub(crate) fn keep_model(&mut self, now: Duration, model: &Arc<ModalModel>) {
         if let Self::Quic { recorder: Some(recorder), .. } = self {
             recorder.put_model(now, model);
@@ -134,7 +134,7 @@ impl Source {
         }
     }
 
-    /// The connection's figures; a recording has none of its own.
+    /// Returns the connection's metrics. A recording has none of its own.
     pub(crate) fn stats(&self) -> Option<PeerStats> {
         match self {
             Self::Quic { endpoint, .. } => endpoint.stats(PeerId::HOST),

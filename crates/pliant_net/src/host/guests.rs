@@ -1,4 +1,4 @@
-//! Guests come, are who they were, say what they want, and go.
+//! Guests on the host: joining, recognition by key, subscriptions and leaving.
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::time::Duration;
@@ -12,22 +12,23 @@ use crate::scene::{self, Person, Placement, Reliable, Wanted};
 use crate::transport::{Event, Fingerprint, Role};
 use crate::user::{User, UserJoined, UserLeft, UserLink};
 
-/// A connection.
+/// A guest's connection.
 #[derive(Debug)]
 pub(super) struct Guest {
     pub(super) key: Fingerprint,
     pub(super) role: Role,
-    /// The user, once it is in.
+    /// The user's entity, once the guest is in the session.
     pub(super) entity: Option<Entity>,
-    /// Changes of interest that are still taken, and when that was counted.
+    /// Subscription changes that the guest may still make, and the time of that count.
     wishes: (f64, Duration),
 }
 
-/// A guest may change its mind so often, a second, and so often at once: once for each of the most bodies there may be.
+/// Subscription changes per second that the host accepts from a guest (`WISHES_PER_S`), and the
+/// largest burst (`WISHES`), one for each of the most bodies that a session may have.
 const WISHES_PER_S: f64 = 100.0;
 const WISHES: f64 = 1024.0;
 
-/// So many who have left are remembered; who was seen longest ago is forgotten first.
+/// Most keys that the host remembers. The key whose last join is longest ago is forgotten first.
 const MOST_KNOWN: usize = 4096;
 
 impl Guest {
@@ -44,14 +45,15 @@ impl Guest {
     }
 }
 
-/// Those whom the application remembers from an earlier run; of two with one number the first has it.
+/// Converts the users of an earlier run, as the app gives them. If two have the same number, the
+/// first keeps it.
 pub(super) fn known_before(known: &[(Fingerprint, UserId)]) -> BTreeMap<Fingerprint, Known> {
     let mut taken = BTreeSet::from([UserId::HOST]);
     let fresh = known.iter().take(MOST_KNOWN).filter(|(_, user)| taken.insert(*user));
     fresh.map(|&(key, user)| (key, Known { user, seen: Duration::ZERO })).collect()
 }
 
-/// `PreUpdate`: what came from the guests.
+/// `PreUpdate`: processes the data from the guests.
 pub(crate) fn receive(world: &mut World) {
     world.try_resource_scope(|world, mut host: Mut<NetHost>| {
         let host = &mut *host;
@@ -73,7 +75,7 @@ pub(crate) fn receive(world: &mut World) {
                 Event::Message { peer, bytes } => match scene::read(&bytes) {
                     Some(Reliable::Session(bytes)) => host.session.on_message(now, peer, bytes),
                     Some(Reliable::Wanted(wanted)) => host.wanted(now, peer, wanted),
-                    // Of the rest a guest has nothing to say.
+                    // A guest may not send the other kinds.
                     Some(Reliable::Placement(_) | Reliable::People(_) | Reliable::Reaches(_)) | None => {
                         host.rejected += 1;
                         host.session.kick(peer, DisconnectReason::Protocol);
@@ -86,7 +88,8 @@ pub(crate) fn receive(world: &mut World) {
                     host.guests.remove(&peer);
                 }
             }
-            // At once: the session keeps so many events and drops the oldest, and one guest's flood must not cost another its goodbye.
+            // Events are processed at once. The session keeps a limited number of them and drops
+            // the oldest, and one guest's flood must not drop another guest's goodbye.
             host.take_events(world);
         }
         for peer in host.endpoint.peers() {
@@ -105,11 +108,13 @@ impl NetHost {
         }
     }
 
-    /// Somebody has said hello, and the transport has seen key and token: in they come, under the number they had.
+    /// Admits a guest that has sent a join request and whose key and token the transport has
+    /// checked. The guest gets the number that it had before.
     fn let_in(&mut self, world: &mut World, peer: PeerId) {
         let now = self.now();
         let Some(key) = self.guests.get(&peer).map(|guest| guest.key) else { return };
-        // One key is one user: who comes anew takes the place of a connection that has not been missed yet.
+        // One key is one user. A new connection replaces an older one whose loss has not been
+        // noticed yet.
         let older: Vec<PeerId> = self
             .guests
             .iter()
@@ -125,11 +130,11 @@ impl NetHost {
             debug!("guest {peer} was not let in: {error}");
             self.session.kick(peer, DisconnectReason::Refused);
         }
-        // The older one's leave comes before the newer one's arrival.
+        // The older connection's leave must come before the new one's join.
         self.take_events(world);
     }
 
-    /// A number that nobody has or had, as far as is remembered.
+    /// Returns a number that no present or remembered user has.
     fn free_number(&mut self) -> Option<UserId> {
         let had: BTreeSet<UserId> = self.known.values().map(|known| known.user).collect();
         for _ in 0..=u16::MAX {
@@ -158,7 +163,7 @@ impl NetHost {
         }
         info!("{name} {}", if back { "is back" } else { "has joined" });
         world.write_message(UserJoined { entity, id, name, back });
-        // All of the newcomer, and the newcomer of all.
+        // The new guest receives all users, and all guests receive the new user.
         let inside = self.guests.values().filter_map(|guest| guest.entity).chain([self.you]);
         let people: Vec<Person> = inside.filter_map(|entity| world.get::<User>(entity)).map(person).collect();
         self.send_message(peer, scene::people_message(&people));
@@ -171,7 +176,7 @@ impl NetHost {
         }
     }
 
-    /// A guest says how much of a body it wants.
+    /// Applies a guest's subscription to a body.
     fn wanted(&mut self, now: Duration, peer: PeerId, wanted: Wanted) {
         if self.guests.get_mut(&peer).is_some_and(|guest| guest.may_wish(now)) {
             let modes = (wanted.modes != Wanted::ALL).then_some(wanted.modes);
@@ -184,7 +189,8 @@ impl NetHost {
             HostEvent::JoinRequest { peer, .. } => self.let_in(world, peer),
             HostEvent::Joined { peer, user, name, .. } => self.joined(world, peer, user, &name),
             HostEvent::Left { peer, user, reason } => {
-                // The session's goodbye says more than the end of the connection.
+                // The session's goodbye is more precise than the end of the connection, so it is
+                // sent first.
                 self.flush();
                 self.endpoint.close(peer, reason, &reason.to_string());
                 let entity = self.guests.get_mut(&peer).and_then(|guest| guest.entity.take());
@@ -212,7 +218,7 @@ impl NetHost {
             }
             HostEvent::GrabEnded { key, .. } => {
                 if let Some(entity) = self.grabs.remove(&key) {
-                    // It may have gone with its body or its user.
+                    // The entity may have been despawned with its body or its user.
                     world.try_despawn(entity).ok();
                 }
             }
@@ -221,7 +227,7 @@ impl NetHost {
     }
 }
 
-/// All grabs of a user.
+/// Returns the range of all grabs of a user.
 fn hands_of(user: UserId) -> std::ops::RangeInclusive<GrabKey> {
     GrabKey { user, grab: 0 }..=GrabKey { user, grab: u16::MAX }
 }

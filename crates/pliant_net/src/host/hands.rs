@@ -12,16 +12,18 @@ use crate::session_transform::SessionTransform;
 use crate::transport::Role;
 use crate::user::{HandOf, User};
 
-/// Whose hands may be on a body at the same time. As a component on a host's body: for this one; else [`HostConfig::holding`](super::HostConfig::holding)
-/// says it. A change lets nobody go.
+/// Whose hands may be on a body at the same time. As a component on a host's body, it applies to
+/// that body. Otherwise [`HostConfig::holding`](super::HostConfig::holding) applies. A change ends
+/// no existing grab.
 #[derive(Component, Debug, Default, Clone, Copy, PartialEq, Eq, Hash)]
 pub enum Holding {
-    /// Anybody's: the paper's cooperative mode. Default.
+    /// Any user's hands: the paper's cooperative mode. Default.
     #[default]
     Together,
-    /// One user's at a time; another's grab is refused until the first lets go: the paper's collaborative mode.
+    /// One user's hands at a time: the paper's collaborative mode. Another user's grab is refused
+    /// until the first user releases the body.
     OneAtATime,
-    /// No guest's: they watch.
+    /// No guest's hands: the guests watch.
     HostOnly,
 }
 
@@ -31,11 +33,12 @@ pub(crate) struct GuestGrab {
     pub(super) key: GrabKey,
     pub(super) hand: HandPlayout,
     peer: PeerId,
-    /// The farthest it may move in a tick, m.
+    /// Largest speed of the hand, m/s.
     most: f64,
 }
 
-/// A hand crosses a body of the size of this app's world in a twentieth of a second at most.
+/// Largest speed of a hand, in body sizes per second: the hand crosses the body in a twentieth of a
+/// second.
 const SPEED: f64 = 20.0;
 
 impl NetHost {
@@ -43,7 +46,7 @@ impl NetHost {
         self.bodies.iter().find(|(_, hosted)| hosted.id == body).map(|(&entity, _)| entity)
     }
 
-    /// A guest's target in this app's world, within reach of the body.
+    /// Converts a guest's target to this app's world and limits it to the reach around the body.
     pub(super) fn target_in_world(&self, world: &World, body: BodyId, target: [f64; 3]) -> Option<DVec3> {
         let entity = self.entity_of(body)?;
         let state = world.get::<BodyState>(entity)?;
@@ -84,8 +87,9 @@ impl NetHost {
         let holding = world.get::<Holding>(entity).copied().unwrap_or(self.holding);
         let held = world.get::<Grabs>(entity).map(|grabs| grabs.entities().to_vec()).unwrap_or_default();
         let others = |other: &Entity| world.get::<HandOf>(*other).is_none_or(|hand| hand.0 != user);
-        // A grab that finds no place would wait, and its hand would hold nothing without knowing why. One user takes at most half of what is
-        // left: five must come together to fill a body, and there is still a place for a sixth.
+        // A grab without a place on the body would wait, and its guest would not know why it holds
+        // nothing. One user gets at most half of the free places. Five users together can then fill
+        // a body except for one place, which is left for a sixth.
         let free = Body::MAX_GRABS.saturating_sub(held.len());
         let own = held.iter().filter(|other| !others(other)).count();
         if free == 0 {
@@ -117,7 +121,7 @@ impl NetHost {
     }
 }
 
-/// Before the bodies' step: guests' hands move to their targets of this tick.
+/// Runs before the bodies' step. Moves guests' hands to their targets of this tick.
 pub(crate) fn move_hands(
     host: Option<Res<NetHost>>,
     time: Res<Time>,
@@ -136,7 +140,9 @@ pub(crate) fn move_hands(
     }
 }
 
-/// Ticks by which a movement is held back: twice the way's jitter, and one more where a lost target comes with the next; at most `most` seconds.
+/// Returns the playout delay of a movement in ticks: one tick, twice the jitter, and one more tick
+/// if the round trip is longer than a step, because a lost target then arrives with the next one.
+/// At most `most` seconds.
 fn depth(round_trip: f64, jitter: f64, step: f64, most: f64) -> usize {
     if step <= 0.0 {
         return 1;

@@ -1,4 +1,5 @@
-//! The host's side in Bevy: guests' grabs become [`Grab`](pliant_body::Grab) entities, steps of [`SharedBody`](crate::SharedBody)s become frames.
+//! The host's side in Bevy: guests' grabs become [`Grab`](pliant_body::Grab) entities, and steps of
+//! [`SharedBody`](crate::SharedBody)s become frames.
 
 mod guests;
 mod hands;
@@ -32,21 +33,27 @@ pub(crate) use publish::{finish, publish};
 /// How to host a session.
 #[derive(Debug)]
 pub struct HostConfig {
-    /// What the user at the host is called, at most 64 bytes; guests see it. Default: `host`.
+    /// Name of the user at the host, at most 64 bytes. Guests see it. Default: `host`.
     pub name: String,
     /// Socket, key, who may join, limits, emulated link.
     pub transport: HostOptions,
-    /// The session's settings. The step is always that of `Time<Fixed>`, and who asks is let in: who may is [`HostOptions::access`].
+    /// The session's settings. The step is always that of `Time<Fixed>`. [`HostOptions::access`]
+    /// determines who may join.
     pub session: pliant_stream::HostConfig,
-    /// Whose hands may be on a body at the same time, where the body has no [`Holding`] of its own.
+    /// Whose hands may be on a body at the same time, for bodies without their own [`Holding`].
     pub holding: Holding,
-    /// How long at most a guest's hand is held back, s, so that its targets, which come late, unevenly and with gaps, are played one a tick: a
-    /// stiff hold would turn every unevenness into force. It is a tick, one more over a distance, and twice the way's jitter. Default: 0.1.
+    /// Longest playout delay of a guest's hand, s. Default: 0.1.
+    ///
+    /// A guest's targets arrive late, unevenly and with gaps. The host delays them to play one per
+    /// tick, because a stiff grab would turn every unevenness into force. The delay is one tick,
+    /// one more tick if the round trip is longer than a tick, and twice the link's jitter.
     pub smoothing: f64,
-    /// How far from a body's middle a guest's target may be, in sizes of the body; a target beyond is drawn in to that distance. Default: 4.
+    /// Largest distance of a guest's target from a body's center, in sizes of the body. A target
+    /// beyond is moved in to that distance. Default: 4.
     pub reach: f64,
-    /// Who had which number when this host ran before ([`NetHost::known`]): the same key gets the same number, and nobody else does. At most
-    /// 4,096; the host's own number is nobody's. Default: none, and numbers begin at 1.
+    /// User numbers by key from an earlier run of this host ([`NetHost::known`]). The same key gets
+    /// the same number again, and no other key gets it. At most 4,096 entries are used, and the
+    /// host's own number is ignored. Default: none, and numbers begin at 1.
     pub known: Vec<(Fingerprint, UserId)>,
 }
 
@@ -77,12 +84,12 @@ pub struct NetHost {
     you: Entity,
     bodies: BTreeMap<Entity, HostedBody>,
     next_body: u16,
-    /// Connections, whether they have said hello or not.
+    /// Open connections, with or without a completed join.
     guests: BTreeMap<PeerId, Guest>,
-    /// Who has which key: somebody who comes back is who they were.
+    /// User numbers by key, so that a guest that joins again keeps its number.
     known: BTreeMap<Fingerprint, Known>,
     numbers: BTreeMap<UserId, Entity>,
-    /// The number that was given last.
+    /// The number that was assigned last.
     next_user: u16,
     grabs: BTreeMap<GrabKey, Entity>,
     own_grabs: BTreeMap<Entity, u16>,
@@ -90,13 +97,13 @@ pub struct NetHost {
     reaches_said: Duration,
     scratch: Vec<GrabState>,
     ledger: Ledger,
-    /// Messages that no guest has to say.
+    /// Number of received messages that a guest may not send.
     rejected: u64,
-    /// Bodies that come, and their models' files, which are being made.
+    /// New bodies, with their models and the tasks that encode the models' files.
     files: BTreeMap<Entity, (Arc<ModalModel>, Task<Arc<[u8]>>)>,
 }
 
-/// Somebody who was here, or is.
+/// A user who is or was in the session.
 #[derive(Debug, Clone, Copy)]
 struct Known {
     user: UserId,
@@ -109,7 +116,8 @@ impl NetHost {
         endpoint: Endpoint,
         config: &HostConfig,
     ) -> Result<(), pliant_stream::StreamError> {
-        // The key that came with a connection says which number it gets.
+        // The host app admits each guest itself, because the key of the connection determines the
+        // user number.
         let mut settings = pliant_stream::HostConfig { open: false, ..config.session };
         if let Some(fixed) = world.get_resource::<Time<Fixed>>() {
             settings.newmark.h = fixed.timestep().as_secs_f64();
@@ -147,17 +155,19 @@ impl NetHost {
         Ok(())
     }
 
-    /// What guests paste to join, with the first token if there are any.
+    /// Returns the invite for guests, with the first token if there is one.
     pub fn invite(&self) -> Invite {
         self.endpoint.invite()
     }
 
-    /// Changes who may join from now on; who is in stays in, and in the same role.
+    /// Changes who may join from this call on. Connected guests stay connected and keep their
+    /// roles.
     pub fn set_access(&self, access: Access) {
         self.endpoint.set_access(access);
     }
 
-    /// Ends the session: everybody is told and sent away, and nobody is let in any more. Bodies go on here.
+    /// Ends the session. All guests receive a goodbye and are disconnected, and the host admits no
+    /// more guests. The bodies go on in this app.
     pub fn end(&mut self) {
         self.ended = true;
         self.endpoint.set_access(Access::Tokens(Vec::new()));
@@ -168,48 +178,51 @@ impl NetHost {
         self.flush();
     }
 
-    /// Whether [`end`](Self::end) was called.
+    /// Returns whether [`end`](Self::end) was called.
     pub fn has_ended(&self) -> bool {
         self.ended
     }
 
-    /// The emulated link under the session, if there is one.
+    /// Returns the emulated link under the session, if there is one.
     pub fn emulation(&self) -> Option<Emulation> {
         self.endpoint.emulation()
     }
 
-    /// Puts an emulated link under the session, another one, or none, at any time.
+    /// Sets, replaces or removes the emulated link under the session, at any time.
     pub fn set_emulation(&self, emulation: Option<Emulation>) {
         self.endpoint.set_emulation(emulation);
     }
 
-    /// The transport below.
+    /// Returns the transport endpoint.
     pub fn endpoint(&self) -> &Endpoint {
         &self.endpoint
     }
 
-    /// The session, for those who want to know more.
+    /// Returns the session, with more details.
     pub fn session(&self) -> &HostSession {
         &self.session
     }
 
-    /// The entities of the guests that are in.
+    /// Returns the entities of the guests in the session.
     pub fn guests(&self) -> impl Iterator<Item = Entity> + '_ {
         self.guests.values().filter_map(|guest| guest.entity)
     }
 
-    /// The key of a guest: its lasting name. `None` for an entity that is no guest.
+    /// Returns the key of a guest, which identifies the guest permanently. `None` for an entity
+    /// that is not a guest.
     pub fn key_of(&self, guest: Entity) -> Option<Fingerprint> {
         self.guests.values().find(|one| one.entity == Some(guest)).map(|one| one.key)
     }
 
-    /// Who has, or had, which number, by key. Kept in a file and given to the next run ([`HostConfig::known`]), guests are who they were also after
-    /// the host was started anew; without that a number is as good as the run of its host, and only the key says who somebody is.
+    /// Returns the present and earlier users' numbers by key. An app can keep them in a file and
+    /// give them to the next run ([`HostConfig::known`]), so that guests keep their numbers after a
+    /// restart of the host. Otherwise a number is only valid during one run of the host, and only
+    /// the key identifies a user.
     pub fn known(&self) -> impl Iterator<Item = (Fingerprint, UserId)> + '_ {
         self.known.iter().map(|(&key, known)| (key, known.user))
     }
 
-    /// Sends a guest away. False for an entity that is no guest.
+    /// Kicks a guest. Returns false for an entity that is not a guest.
     pub fn kick(&mut self, guest: Entity) -> bool {
         let found = self.guests.iter().find(|(_, one)| one.entity == Some(guest));
         let Some(peer) = found.map(|(&peer, _)| peer) else { return false };
@@ -223,7 +236,7 @@ impl NetHost {
 
     fn flush(&mut self) {
         let now = self.now();
-        // A model is handed over no faster than the line takes it.
+        // A model is handed over no faster than the connection sends it.
         let fetching: Vec<PeerId> = self.session.fetching().collect();
         for peer in fetching {
             self.session.set_unsent(peer, self.endpoint.unsent(peer));
@@ -231,7 +244,7 @@ impl NetHost {
         self.session.update(now);
         while let Some(output) = self.session.poll_output() {
             match output.channel {
-                // A datagram that is not taken is a datagram lost: counted by the transport, repaired by the session.
+                // The transport counts a dropped datagram, and the session repairs the loss.
                 Channel::Datagram => {
                     let _ = self.endpoint.send_datagram(output.peer, Bytes::from_owner(output.bytes));
                 }
@@ -240,7 +253,8 @@ impl NetHost {
         }
     }
 
-    /// A guest that does not read its messages is sent away: without them it cannot follow.
+    /// Sends a message to a guest. A guest that does not read its messages is disconnected, because
+    /// it cannot stay in the session without them.
     fn send_message(&mut self, peer: PeerId, message: Bytes) {
         if let Err(error @ SendError::QueueFull { .. }) = self.endpoint.send_message(peer, message) {
             debug!("guest {peer} is sent away: {error}");
@@ -249,7 +263,7 @@ impl NetHost {
         }
     }
 
-    /// Tells all guests that are in.
+    /// Sends a message to all guests in the session.
     fn tell_all(&mut self, message: &Bytes) {
         let inside: Vec<PeerId> =
             self.guests.iter().filter(|(_, guest)| guest.entity.is_some()).map(|(&peer, _)| peer).collect();
@@ -258,7 +272,7 @@ impl NetHost {
         }
     }
 
-    /// Tells guests where a body is: all of them, or one that has come.
+    /// Sends a body's transform to all guests, or to one that has just joined.
     fn tell_place(&mut self, placement: Placement, to: Option<PeerId>) {
         match to {
             None => self.tell_all(&placement.to_message()),
@@ -268,7 +282,8 @@ impl NetHost {
 
     fn link(&self, peer: PeerId) -> Option<(LinkStats, PeerStats)> {
         let (mut link, transport) = (self.session.stats(peer)?, self.endpoint.stats(peer)?);
-        // The session measures the round trip on the guest's side; QUIC does on both.
+        // The session measures the round trip on the guest's side only. QUIC measures it on both
+        // sides.
         if link.round_trip.is_zero() {
             link.round_trip = transport.round_trip;
         }

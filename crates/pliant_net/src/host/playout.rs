@@ -1,23 +1,26 @@
-//! A guest's hand, tick by tick, out of targets that come late, unevenly and with gaps.
+//! Plays out a guest's hand, one target per tick, from targets that arrive late, unevenly and with
+//! gaps.
 
 use std::collections::VecDeque;
 
 use bevy::math::DVec3;
 
-/// Targets that wait at most; older ones go.
+/// Most targets that wait. Older ones are dropped.
 const MOST_WAITING: usize = 64;
-/// A gap of more ticks is a pause, not a loss.
+/// Longest gap in targets that counts as a loss. A longer gap is a pause.
 const LONGEST_GAP: u32 = 8;
-/// A correction fades by this factor a tick: to a twentieth in six.
+/// Factor by which a correction fades per tick. After six ticks about a twentieth is left.
 const FADE: f64 = 0.6;
-/// A hand of which nothing comes goes on, slower by this factor each tick.
+/// Factor by which an extrapolated hand slows down per tick while no target arrives.
 const SLOWING: f64 = 0.7;
 
-/// Plays a guest's targets back one a tick, as they were said one a tick.
+/// Plays back a guest's targets one per tick, as the guest sent them.
 ///
-/// The first of a movement is held back by `depth` ticks; what comes a little late then still comes in time, and the hand here does exactly what the
-/// guest's did, that much later: the guest finds its own targets again in the frames, and knows how far ahead its hand is. When nothing is there in
-/// the middle of a movement the hand goes on and slows down; what that was wrong by, like every jump, fades instead of jerking.
+/// The first target of a movement is delayed by `depth` ticks. Targets that arrive slightly late
+/// are then still in time, and the hand repeats the guest's movement exactly, with that delay. The
+/// guest therefore recognizes its own targets in the frames, and knows how far ahead its hand is.
+/// If a target is missing during a movement, the hand goes on and slows down. The error of this
+/// extrapolation fades, like every jump, so that the hand does not jerk.
 #[derive(Debug, Clone)]
 pub(super) struct HandPlayout {
     queue: VecDeque<DVec3>,
@@ -25,12 +28,12 @@ pub(super) struct HandPlayout {
     /// Ticks until the first waiting target is played.
     wait: usize,
     playing: bool,
-    /// The last tick was a guess.
+    /// Whether the last tick was extrapolated.
     guessed: bool,
-    /// The target played last, and where the hand is.
+    /// The target that was played last (`said`), and the position of the hand (`shown`).
     said: DVec3,
     shown: DVec3,
-    /// A tick's.
+    /// Velocity of the hand, meters per tick.
     velocity: DVec3,
 }
 
@@ -48,8 +51,8 @@ impl HandPlayout {
         }
     }
 
-    /// A target has come. `input` counts all targets of the guest, `hands` of which it moves at a time: what is missing between two is filled in
-    /// evenly.
+    /// Takes a received target. `input` numbers all targets of the guest, which moves `hands` hands
+    /// at a time. Missing targets between two received ones are interpolated linearly.
     pub(super) fn take(&mut self, input: u32, hands: usize, target: DVec3) {
         let step = self.newest.map_or(1, |newest| input.wrapping_sub(newest)) / hands.max(1) as u32;
         self.newest = Some(input);
@@ -63,7 +66,8 @@ impl HandPlayout {
         }
     }
 
-    /// The next tick. `depth`: ticks to hold a movement back by; `most`: the hand moves no farther than this, m.
+    /// Returns the hand's position in the next tick. `depth` is the delay of a movement in ticks,
+    /// and `most` is the farthest that the hand may move, m.
     pub(super) fn next(&mut self, depth: usize, most: f64) -> DVec3 {
         let expected = self.shown + self.velocity;
         if !self.playing && !self.queue.is_empty() {
@@ -75,7 +79,8 @@ impl HandPlayout {
         }
         let mut to = self.shown;
         if self.playing {
-            // A burst after a gap, or a guest whose clock is faster: one more than its turn, until the queue is what it should be.
+            // After a burst, or with a guest whose clock is faster, one target is skipped per tick
+            // until the queue has its proper length.
             let skipped = if self.queue.len() > depth + 2 { self.queue.pop_front() } else { None };
             match self.queue.pop_front() {
                 Some(target) => {
@@ -101,19 +106,19 @@ impl HandPlayout {
             }
         }
         if !self.playing {
-            // A guest that rests says so a few times only: what is left of a correction fades in
-            // silence, too.
+            // A resting guest repeats its target only a few times, so the rest of a correction must
+            // also fade without new targets.
             to = self.said + faded(self.shown - self.said, most);
         }
-        // However wild the targets, the hand moves no faster than a hand.
+        // The speed of the hand is limited, whatever the targets.
         let way = to - self.shown;
         self.shown = if way.length() <= most { to } else { self.shown + way.clamp_length_max(most) };
         self.shown
     }
 }
 
-/// What is left of a correction after a tick. One so small is none: then the guest recognises its
-/// own targets.
+/// Returns the part of a correction that is left after a tick. A very small one becomes zero, so
+/// that the guest recognizes its own targets.
 fn faded(offset: DVec3, most: f64) -> DVec3 {
     let offset = offset * FADE;
     if offset.length() < 1e-4 * most { DVec3::ZERO } else { offset }
@@ -125,13 +130,14 @@ mod tests {
 
     const MOST: f64 = 0.5;
 
-    /// A hand that circles, 40 targets a second.
+    /// A hand that moves on a circle, with 40 targets per second.
     fn circle(tick: u32) -> DVec3 {
         let t = f64::from(tick) / 40.0;
         DVec3::new(0.1 * (3.0 * t).sin(), 0.1 * (3.0 * t).cos() - 0.1, 0.0)
     }
 
-    /// What arrives, as (the host's tick, the target's number): played, and the largest second difference of it, m.
+    /// Plays `arrivals`, pairs of the host's tick and the target's number. Returns the positions
+    /// and their largest second difference, m.
     fn play(arrivals: &[(u32, u32)], ticks: u32, depth: usize) -> (Vec<DVec3>, f64) {
         let mut hand = HandPlayout::new(DVec3::ZERO);
         let mut played = Vec::new();
@@ -146,18 +152,19 @@ mod tests {
         (played, worst)
     }
 
-    /// Of the circle itself: 0.1 m (3 / 40)^2, and the start from rest, 0.1 m x 3 / 40.
+    /// Bound on the second difference of the circle itself, m: 0.1 m (3 / 40)^2, and 0.1 m x 3 / 40
+    /// for the start from rest.
     const EVEN: f64 = 0.0076;
 
     #[test]
     fn targets_that_come_unevenly_are_played_evenly_and_exactly() {
-        // Up to three at once, then none for two ticks.
+        // Up to three targets arrive at once, then none for two ticks.
         let arrivals: Vec<(u32, u32)> = (0..200).map(|input| ((input / 3) * 3 + 3, input)).collect();
         let (played, worst) = play(&arrivals, 190, 3);
         assert!(worst < EVEN, "{worst}");
         let first = played.iter().position(|at| *at == circle(0) || *at == circle(1)).unwrap() as u32;
         for tick in 20..180 {
-            // Every target in its turn, to the bit.
+            // Every target is played in its turn, exact to the bit.
             let at = played[tick as usize];
             assert!((0..12).any(|lag| at == circle(tick - lag)), "tick {tick}, begun at {first}");
         }
@@ -165,13 +172,13 @@ mod tests {
 
     #[test]
     fn gaps_and_bursts_bend_the_path_and_do_not_break_it() {
-        // Ten targets are late together by half a second; twelve others are lost.
+        // Ten targets arrive together, up to half a second late. Twelve others are lost.
         let arrivals: Vec<(u32, u32)> = (0..300)
             .filter(|input| !(150..162).contains(input))
             .map(|input| (if (80..90).contains(&input) { 100 } else { input + 2 }, input))
             .collect();
         let (played, worst) = play(&arrivals, 300, 2);
-        // A jump to where the hand is by then would be 20 x 0.0075 m.
+        // A jump to the hand's position by then would be 20 x 0.0075 m.
         assert!(worst < 0.06, "{worst}");
         let lag = (0..10).find(|lag| played[299] == circle(299 - lag));
         assert!(lag.is_some(), "and it is found again exactly");
@@ -200,14 +207,14 @@ mod tests {
             assert!(next.distance(at) <= MOST * 1.000_001);
             at = next;
         }
-        // Far more than may wait: the oldest go.
+        // Many more targets than may wait arrive, and the oldest are dropped.
         for input in 0..10_000 {
             hand.take(input, 1, circle(input));
         }
         assert!(hand.queue.len() <= MOST_WAITING);
     }
 
-    /// A guest that rests says so six times and is silent then.
+    /// A resting guest sends its target six times and is then silent.
     #[test]
     fn a_silent_hand_comes_to_rest_where_it_was_said() {
         let mut hand = HandPlayout::new(DVec3::ZERO);
@@ -215,7 +222,8 @@ mod tests {
             hand.take(input, 1, DVec3::X * 0.01 * f64::from(input));
             hand.next(1, MOST);
         }
-        // A tick without a target is guessed, so what comes next is a correction that fades.
+        // A tick without a target is extrapolated, so the next target causes a correction that
+        // fades.
         hand.next(1, MOST);
         let end = DVec3::Y * 0.3;
         for input in 5..11 {
@@ -243,7 +251,7 @@ mod tests {
         for _ in 0..60 {
             hand.next(2, MOST);
         }
-        // It went on a little when nothing came, and went back.
+        // The hand went on a little when no target arrived, and then returned.
         assert_eq!(hand.next(2, MOST), end);
         for input in 11..80 {
             hand.take(input, 1, end);

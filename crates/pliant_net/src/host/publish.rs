@@ -1,4 +1,4 @@
-//! From the bodies' steps to the guests.
+//! Publishes the steps of the bodies to the guests.
 
 use std::collections::BTreeSet;
 use std::sync::Arc;
@@ -20,14 +20,15 @@ pub(super) struct HostedBody {
     pub(super) id: BodyId,
     model: Arc<ModalModel>,
     settings: StepSettings,
-    /// When the guests were told of the settings.
+    /// When the settings were last sent to the guests.
     told: Duration,
     pub(super) placed: GlobalTransform,
-    /// A refusal to publish was logged; once is enough.
+    /// Whether the current fault was logged, so that it is logged only once.
     faulted: bool,
 }
 
-/// A body's settings are told to the guests at most so often: a slider that is dragged changes them every frame, and each change begins the streams anew.
+/// Shortest interval between two changes of a body's settings that are sent to the guests. Dragging
+/// a slider changes the settings every frame, and each change restarts the streams.
 const SETTINGS_EVERY: Duration = Duration::from_millis(250);
 
 type SharedBodies<'w, 's> = Query<
@@ -43,7 +44,8 @@ type SharedBodies<'w, 's> = Query<
     ),
 >;
 
-/// After the bodies' step: new bodies are announced, gone ones taken out, and the step of each is sent.
+/// Runs after the bodies' step. Announces new bodies, removes bodies that are gone, and sends the
+/// step of each body.
 pub(crate) fn publish(
     host: Option<ResMut<NetHost>>,
     tick: Res<PliantTick>,
@@ -62,7 +64,7 @@ pub(crate) fn publish(
             host.session.remove_body(body.id);
         }
     }
-    // A guest's hand whose grab the app has despawned is off: its guest is told.
+    // The app has despawned these guests' grabs, so their guests are notified.
     let off: Vec<GrabKey> =
         host.grabs.iter().filter(|(_, grab)| !grabs.contains(**grab)).map(|(&key, _)| key).collect();
     for key in off {
@@ -123,7 +125,8 @@ pub(crate) fn publish(
 }
 
 impl NetHost {
-    /// The body's number in the session; it is announced, announced anew with another model, and its settings are told, when there is need.
+    /// Returns the body's number in the session. Announces the body if it is new or has another
+    /// model, and sends changed settings.
     fn announced(
         &mut self,
         entity: Entity,
@@ -132,7 +135,8 @@ impl NetHost {
         transform: &GlobalTransform,
     ) -> Option<BodyId> {
         let config = state.body().config();
-        // An anchored body's weight turns with its entity: the stream learns it.
+        // The gravity of an anchored body turns with its entity, so the stream learns it from the
+        // states instead.
         let gravity = if state.model().is_free() { config.settings.gravity } else { [0.0; 3] };
         let settings = StepSettings { gravity, ..config.settings };
         let model = state.model();
@@ -140,14 +144,15 @@ impl NetHost {
         if let Some(hosted) = self.bodies.get_mut(&entity) {
             if Arc::ptr_eq(&hosted.model, model) {
                 let id = hosted.id;
-                // Until they are told the stream learns of it from the state, as of any force that is not known.
+                // Until the settings are sent, the stream learns the change from the states, like
+                // any unknown force.
                 if hosted.settings != settings && now.saturating_sub(hosted.told) >= SETTINGS_EVERY {
                     (hosted.settings, hosted.told) = (settings, now);
                     if let Err(error) = self.session.set_settings(id, settings) {
                         warn_once!("a body's settings are not shared: {error}");
                     }
                 }
-                // A free body's place is in its frames.
+                // The frames of a free body contain its pose.
                 if hosted.placed != *transform && !model.is_free() {
                     hosted.placed = *transform;
                     self.tell_place(Placement::new(id, transform), None);
@@ -158,7 +163,7 @@ impl NetHost {
             self.bodies.remove(&entity);
         }
         let bytes = self.file_of(entity, model)?;
-        // Numbers go round; one that is in use is refused, and the next tick tries the next.
+        // Numbers wrap around. A number in use is refused, and the next tick tries the next number.
         let id = BodyId(self.next_body);
         self.next_body = self.next_body.wrapping_add(1);
         match self.session.add_body_as(id, &shared.name, Arc::clone(model), bytes, settings) {
@@ -178,7 +183,8 @@ impl NetHost {
         }
     }
 
-    /// The file of a body's model, for guests that have it not; `None` while it is being made, since that takes long for a step.
+    /// Returns the file of a body's model, for guests that do not have the model. Returns `None`
+    /// while the file is being encoded, which takes too long for a step.
     fn file_of(&mut self, entity: Entity, model: &Arc<ModalModel>) -> Option<Arc<[u8]>> {
         let Some(pool) = AsyncComputeTaskPool::try_get() else { return Some(model.to_bytes().into()) };
         let begin = || {
@@ -194,7 +200,7 @@ impl NetHost {
         Some(bytes)
     }
 
-    /// The session's name for a grab made at the host.
+    /// Returns the session's key for a grab made at the host.
     fn own_key(&mut self, entity: Entity) -> GrabKey {
         let next = &mut self.next_own_grab;
         let grab = *self.own_grabs.entry(entity).or_insert_with(|| {
@@ -205,7 +211,7 @@ impl NetHost {
     }
 }
 
-/// The end of a frame: what is due is sent, and how each guest is reached is written.
+/// Runs at the end of a frame. Sends what is due and writes the state of each guest's link.
 pub(crate) fn finish(host: Option<ResMut<NetHost>>, mut links: Query<(&User, &mut UserLink)>) {
     let Some(mut host) = host else { return };
     let host = &mut *host;
@@ -219,7 +225,8 @@ pub(crate) fn finish(host: Option<ResMut<NetHost>>, mut links: Query<(&User, &mu
             shown.set_if_neq(new);
         }
     }
-    // The more there are to tell of and to, the less often: a guest gets at most 256 bytes of this a second.
+    // The interval grows with the number of users, so that a guest receives at most 256 bytes of
+    // this per second.
     let now = host.now();
     let pause = Duration::from_secs(1).mul_f64((host.numbers.len() as f64 / 32.0).max(1.0));
     if now.saturating_sub(host.reaches_said) >= pause && host.numbers.len() > 2 {

@@ -1,4 +1,4 @@
-//! Who is connected with whom, and the session's traffic.
+//! Connections among the peers, and the session's traffic.
 
 use std::collections::BTreeSet;
 use std::time::Duration;
@@ -14,34 +14,36 @@ use crate::remote::{SessionClosed, SessionJoined};
 use crate::transport::{CloseReason, Endpoint, Event, Fingerprint, Invite, Role};
 use crate::user::{User, UserJoined, UserLeft, UserLink};
 
-/// Keys whose numbers are kept.
+/// Most keys whose user numbers are remembered.
 const MOST_REMEMBERED: usize = 4096;
 
-/// Somebody that this peer is connected with.
+/// Another peer that this peer is connected with.
 #[derive(Debug)]
 pub(super) struct Other {
     pub(super) key: Fingerprint,
     address: std::net::IpAddr,
-    /// Given, or said; the session knows it from then on.
+    /// The peer's user number, which this peer assigned or the other peer sent. The session then
+    /// uses it.
     pub(super) number: Option<UserId>,
-    /// Where it listens, for those who come later.
+    /// Where the peer listens, for peers that join later.
     pub(super) invite: Option<Invite>,
-    /// It has come with our invite, and waits for its number until our own session is there.
+    /// The join request of a peer that came with this peer's invite. It waits for its number until
+    /// this peer's session has begun.
     waits: Option<(Scene, Invite)>,
-    /// When it came.
+    /// When the peer connected.
     since: Duration,
-    /// It has been hung up on: what it still says, until its line is down, is not heard.
+    /// Whether this peer has closed the connection. Data that still arrives is ignored.
     sent_away: bool,
 }
 
 impl Other {
-    /// Where it listens, by the address that it has come from.
+    /// Replaces the invite's host with the address from which the peer has connected.
     fn seen_from_here(&self, invite: Invite) -> Invite {
         Invite { host: self.address.to_string(), ..invite }
     }
 }
 
-/// `PreUpdate`: what came from the peers.
+/// `PreUpdate`: processes the data from the peers.
 pub(crate) fn receive(world: &mut World) {
     world.try_resource_scope(|world, mut peer: Mut<NetPeer>| {
         let net = &mut *peer;
@@ -50,14 +52,15 @@ pub(crate) fn receive(world: &mut World) {
         }
         net.start(world);
         let mut came: Vec<(Option<PeerId>, Event)> = Vec::new();
-        // An unread queue drops its oldest datagrams, so all of it is taken.
+        // An unread queue drops its oldest datagrams, so this reads all of them.
         came.extend(std::iter::from_fn(|| net.listening.poll()).map(|event| (None, event)));
         for (&peer, endpoint) in &net.opened {
             came.extend(std::iter::from_fn(|| endpoint.poll()).map(|event| (Some(peer), event)));
         }
         for (opened, event) in came {
             net.take(world, opened, event);
-            // At once: the session keeps so many events only, and one peer's flood must not cost another its goodbye.
+            // Events are processed at once. The session keeps a limited number of them, and one
+            // peer's flood must not drop another peer's goodbye.
             net.take_events(world);
         }
         net.take_events(world);
@@ -69,7 +72,7 @@ pub(crate) fn receive(world: &mut World) {
 }
 
 impl NetPeer {
-    /// Begins when the bodies are here: alone, or by asking to come in.
+    /// Starts the session when the bodies are loaded: begins a new one, or asks to join.
     fn start(&mut self, world: &mut World) {
         if self.scene.bodies.is_empty() && !self.gather(world) {
             return;
@@ -85,12 +88,12 @@ impl NetPeer {
         if self.session.is_some() {
             waiting.into_iter().for_each(|peer| self.let_in(peer));
         }
-        // The connection to the first may have been there before the bodies.
+        // The connection to the first peer may have opened before the bodies were loaded.
         if self.session.is_none() {
             let asked: Vec<PeerId> = self.opened.keys().copied().collect();
             for peer in asked {
                 if let Some(other) = self.others.get_mut(&peer).filter(|other| other.number.is_none()) {
-                    // Asked once: the answer gives the number.
+                    // The number marks the request as sent. The answer brings the real number.
                     other.number = Some(UserId::HOST);
                     let (scene, invite) = (self.scene.clone(), self.listening.invite());
                     self.tell(peer, &Mesh::Introduce { scene, invite });
@@ -110,17 +113,19 @@ impl NetPeer {
                 let other = Other { key: fingerprint, address, number, invite, waits, since, sent_away };
                 self.others.insert(peer, other);
                 if role == Role::Watch && opened.is_none() {
-                    // Every peer steps the bodies with its own hands: there is no place for one that may not hold.
+                    // Every peer steps the bodies with its own hands, so the mesh has no place for
+                    // a watcher.
                     return self.hang_up(peer, DisconnectReason::Refused, "among equals everybody holds");
                 }
-                // The first that we have come to is asked; the others are told.
+                // This peer sends a join request to the first peer only, and introduces itself to
+                // the others.
                 if let (Some(_), PeerState::In { user }) = (opened, &self.state) {
                     let (number, scene, invite) = (*user, self.scene.clone(), self.listening.invite());
                     self.tell(peer, &Mesh::Member { number, scene, invite });
                     self.talk_to(now, peer);
                 }
             }
-            // Its line stays open for its last words from us.
+            // The connection only stays open to send this peer's goodbye.
             Event::Datagram { peer, .. } | Event::Message { peer, .. }
                 if self.others.get(&opened.unwrap_or(peer)).is_none_or(|other| other.sent_away) => {}
             Event::Datagram { peer, at, bytes } => {
@@ -142,7 +147,8 @@ impl NetPeer {
                 }
                 self.others.remove(&peer);
                 self.introduced.remove(&peer);
-                // Its thread may wait for the other end's last packets: not here.
+                // The endpoint's thread may wait for the other end's last packets, which must not
+                // block a frame.
                 self.ending.extend(self.opened.remove(&peer).and_then(Endpoint::close_detached));
                 if opened.is_some() && self.session.is_none() {
                     self.close(world, reason.to_string());
@@ -215,7 +221,8 @@ impl NetPeer {
         }
     }
 
-    /// Whose number this is, for when it comes back; of those who are gone so many are remembered.
+    /// Remembers the user number of a key for a reconnect. The number of remembered keys is
+    /// limited, and keys of absent peers are forgotten first.
     pub(super) fn remember(&mut self, key: Fingerprint, number: UserId) {
         if self.numbers.len() >= MOST_REMEMBERED && !self.numbers.contains_key(&key) {
             let here: BTreeSet<Fingerprint> = self.others.values().map(|other| other.key).collect();
@@ -225,7 +232,7 @@ impl NetPeer {
         self.numbers.insert(key, number);
     }
 
-    /// Gives a newcomer its number and tells it of all the others.
+    /// Gives a new peer its number and the invites of all other peers.
     fn let_in(&mut self, peer: PeerId) {
         let now = self.now();
         let Some((scene, invite)) = self.others.get_mut(&peer).and_then(|other| other.waits.take()) else {
@@ -245,7 +252,8 @@ impl NetPeer {
         let PeerState::In { user: own } = self.state else { return };
         let taken: BTreeSet<UserId> =
             self.numbers.values().copied().chain(present).chain([own, UserId::HOST]).collect();
-        // The first that nobody has or had: one peer's word for its own number, however large, leaves room for all others.
+        // The number is the first one that no present or remembered peer has. A peer that claims a
+        // large number therefore leaves room for all others.
         let Some(number) = before.or_else(|| (1..=u16::MAX).map(UserId).find(|n| !taken.contains(n))) else {
             return self.hang_up(peer, DisconnectReason::Full, "no number is left");
         };
@@ -259,7 +267,7 @@ impl NetPeer {
         self.talk_to(now, peer);
     }
 
-    /// The session begins on a connection.
+    /// Starts the session on a connection.
     fn talk_to(&mut self, now: Duration, peer: PeerId) {
         let (endpoint, number) = self.way(peer);
         let most = endpoint.max_datagram_size(number).unwrap_or(0);
@@ -279,12 +287,14 @@ impl NetPeer {
         }
     }
 
-    /// Hangs up on those who connect and then do not say who they are: each would keep a place from somebody else.
+    /// Disconnects peers that connect without introducing themselves, because each of them would
+    /// occupy a place.
     fn hang_up_on_the_silent(&mut self) {
         let Some(session) = &self.session else { return };
         let (now, most) = (self.now(), self.limits.handshake);
         let silent = |(peer, other): &(&PeerId, &Other)| {
-            // Who came while our own bodies were being loaded could not be answered before.
+            // A peer that connected while this peer's bodies were being loaded could not be
+            // answered earlier.
             let since = other.since.max(self.began_at);
             !other.sent_away && now.saturating_sub(since) > most && session.user_of(**peer).is_none()
         };
@@ -314,7 +324,7 @@ impl NetPeer {
             match output.channel {
                 Channel::Datagram => {
                     let (endpoint, number) = self.way(output.peer);
-                    // One that is not taken is one that is lost: said again with the next.
+                    // A datagram that is not taken is lost. The next one repeats its content.
                     let _ = endpoint.send_datagram(number, Bytes::from_owner(output.bytes));
                 }
                 Channel::Message => {
@@ -368,7 +378,8 @@ impl NetPeer {
                     }
                 }
                 PeerEvent::TurnedAway { peer, reason } => {
-                    // The session's goodbye says more than the end of the connection.
+                    // The session's goodbye is more precise than the end of the connection, so it
+                    // is sent first.
                     self.flush();
                     self.hang_up(peer, reason, &reason.to_string());
                 }
@@ -376,7 +387,7 @@ impl NetPeer {
                 _ => {}
             }
         }
-        // How each is reached, as QUIC says.
+        // QUIC measures the round trip and the outgoing loss of each link.
         for (&peer, other) in &self.others {
             let (endpoint, number) = self.way(peer);
             let entity = other.number.and_then(|user| self.users.get(&user).copied());

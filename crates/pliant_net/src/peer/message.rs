@@ -1,27 +1,28 @@
-//! What peers tell each other beside their sessions: who is to talk to whom, and that they have the same bodies.
+//! Messages among peers beside their sessions: introductions, and the check that all peers have the
+//! same bodies.
 
 use bytes::{Buf, BufMut, Bytes, BytesMut};
 use pliant_stream::{BodyId, UserId};
 
 use crate::transport::Invite;
 
-/// A message of the peers' session.
+/// Kind: a message of the peers' session.
 const SESSION: u8 = 0;
-/// From who has come to the peer of the invite: where it listens, and what it has.
+/// Kind: a new peer's join request to the peer of the invite, with its own invite and scene.
 const INTRODUCE: u8 = 16;
-/// The answer: its number, and who else is there.
+/// Kind: the answer to the join request, with the new peer's number and the other peers.
 const WELCOME: u8 = 17;
-/// From who has come to the others.
+/// Kind: a new peer's introduction to the other peers.
 const MEMBER: u8 = 18;
 
 /// Most bodies among peers.
 pub(super) const MOST_BODIES: usize = 256;
-/// Most peers beside oneself, as in [`pliant_stream::peer`].
+/// Most other peers, as in [`pliant_stream::peer`].
 pub(super) const MOST_PEERS: usize = 64;
 const LONGEST_INVITE: usize = 512;
 
-/// What all peers must have alike: the step (ns) and the bodies, each with the digest of its
-/// model and of how it is stepped.
+/// What all peers must have in common: the step (ns) and the bodies, each with the digest of its
+/// model and step settings.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub(super) struct Scene {
     pub(super) step_ns: u64,
@@ -70,7 +71,7 @@ impl Mesh {
         to.freeze()
     }
 
-    /// Reads any bytes.
+    /// Reads any bytes. Returns `None` for an invalid message.
     pub(super) fn read(mut bytes: Bytes) -> Option<Self> {
         let from = &mut bytes;
         let message = match from.try_get_u8().ok()? {
@@ -160,7 +161,8 @@ mod tests {
             for cut in 0..bytes.len() {
                 assert_eq!(Mesh::read(bytes.slice(..cut)), None, "cut to {cut} of {message:?}");
             }
-            // Any byte turned about: read as something else or refused, and no panic.
+            // A message with any byte changed is refused or read as something else, and never
+            // panics.
             for at in 0..bytes.len() {
                 let mut wrong = bytes.to_vec();
                 wrong[at] ^= 0xa5;

@@ -1,7 +1,9 @@
-//! Equal peers in Bevy: every app steps every body, and only the hands cross ([`pliant_stream::peer`]).
+//! Equal peers in Bevy: every app steps every body, and the peers only exchange their hands
+//! ([`pliant_stream::peer`]).
 //!
-//! Each peer listens and each connects: who comes with the invite of any of them is told of all the others, and joins them too. One that goes
-//! leaves the others connected.
+//! Each peer both listens and connects. A peer that joins with the invite of any other peer
+//! receives the invites of all others, and connects to them too. When a peer leaves, the others
+//! stay connected.
 
 mod mesh;
 mod message;
@@ -32,19 +34,22 @@ use reconnect::Missed;
 pub(crate) use mesh::receive;
 pub(crate) use play::{show, tell_hands};
 
-/// How to play among equals.
+/// How to play among peers.
 #[derive(Debug)]
 pub struct PeerConfig {
-    /// What this user is called, at most 64 bytes. Default: `peer`.
+    /// Name of this user, at most 64 bytes. Default: `peer`.
     pub name: String,
-    /// The invite of a peer that is there already. Default `None`: this is the first, and begins.
+    /// The invite of a peer in the session. Default `None`: this is the first peer, and it starts
+    /// the session.
     pub join: Option<Invite>,
-    /// Where this peer listens, its key, who may join through it, limits, emulated link (on all its connections).
+    /// Where this peer listens, its key, who may join through it, limits, and the emulated link on
+    /// all its connections.
     pub transport: HostOptions,
-    /// How a late hand is put right. Default: [`Repair::Rollback`].
+    /// How the session corrects for late hands. Default: [`Repair::Rollback`].
     pub repair: Repair,
-    /// A peer that cannot be heard any more, without having said goodbye, is looked for again for so long, where it last listened; of the two the
-    /// one with the higher number calls, and takes over the other's state. Zero: never. Default: 60 s.
+    /// How long this peer tries to reconnect to a peer that was lost without a goodbye, at the
+    /// address where that peer last listened. Of the two peers, the one with the higher number
+    /// connects and takes over the other's state. Zero: it does not try. Default: 60 s.
     pub rejoin: Duration,
 }
 
@@ -60,64 +65,67 @@ impl Default for PeerConfig {
     }
 }
 
-/// Where a peer stands.
+/// Connection state of a peer.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub enum PeerState {
     /// Models are being loaded, or the first peer has not answered yet.
     Joining,
-    /// Among the peers.
+    /// The peer is in the session.
     In {
-        /// Our number.
+        /// The peer's user number.
         user: UserId,
     },
-    /// It is over, or never began; bodies stay as they were last seen.
+    /// The session is over, or never began. Bodies keep their last displayed state.
     Closed {
-        /// Why, in words.
+        /// Reason, as text.
         reason: String,
     },
 }
 
-/// The peers' session of this app.
+/// The session of this app among peers.
 ///
-/// The bodies are all [`SharedBody`] entities with a model that are there when the session begins; all peers must have the same ones, by name and
-/// model. They are [`Driven::Remote`]: their steps are this resource's, at the rate of `Time<Fixed>`. A free body begins where its model
-/// has it, with its weight; an anchored one is where each app has placed it.
+/// The session's bodies are all [`SharedBody`] entities with a model that exist when the session
+/// begins. All peers must have the same bodies, by name and model. The bodies are
+/// [`Driven::Remote`]: this resource steps them, at the rate of `Time<Fixed>`. A free body begins
+/// in its model's pose, with its weight. An anchored body stays where each app has placed it.
 #[derive(Resource)]
 pub struct NetPeer {
     listening: Endpoint,
     /// Connections that this peer has opened.
     opened: BTreeMap<PeerId, Endpoint>,
-    /// Threads of connections that are over and still say goodbye: no frame waits for them.
+    /// Threads of closed connections that are still sending their goodbye. No frame waits for them.
     ending: Vec<JoinHandle<()>>,
-    /// The key, to show it on those too.
+    /// The private key in PKCS #8 form, which the opened connections use too.
     key: Vec<u8>,
     config: PeerConfig,
     limits: Limits,
     emulation: Option<Emulation>,
     began: Instant,
-    /// When the session began, on the clock of `began`.
+    /// When the session began, measured from `began`.
     began_at: Duration,
     state: PeerState,
     session: Option<PeerSession>,
     scene: Scene,
     bodies: BTreeMap<BodyId, PlayedBody>,
     others: BTreeMap<PeerId, Other>,
-    /// Whom we are on the way to, as the first peer has told.
+    /// Numbers and invites of the peers that this peer is connecting to, as the first peer sent
+    /// them.
     introduced: BTreeMap<PeerId, (UserId, Invite)>,
-    /// Who was lost, and is looked for.
+    /// Lost peers that this peer tries to reach.
     missed: Vec<Missed>,
-    /// Who has which key, to be the same again.
+    /// User numbers by key, so that a peer that reconnects keeps its number.
     numbers: BTreeMap<Fingerprint, UserId>,
     users: BTreeMap<UserId, Entity>,
     grabs: BTreeMap<Entity, SentGrab>,
     scratch: Vec<f64>,
     ledger: Ledger,
-    /// Messages that no peer has to say.
+    /// Number of received messages that a peer may not send.
     rejected: u64,
     next_opened: u64,
 }
 
-/// Numbers of connections that this peer has opened begin here; those of its listening socket never come so far.
+/// First number of the connections that this peer opens. Connection numbers of the listening socket
+/// never get this large.
 const OPENED: u64 = 1 << 48;
 
 impl NetPeer {
@@ -174,37 +182,39 @@ impl NetPeer {
         Ok(peer)
     }
 
-    /// Where we stand.
+    /// Returns the connection state.
     pub fn state(&self) -> &PeerState {
         &self.state
     }
 
-    /// What others paste to join through this peer.
+    /// Returns the invite with which others join through this peer.
     pub fn invite(&self) -> Invite {
         self.listening.invite()
     }
 
-    /// The session below, for those who want to know more. `None` until the models are here and a number is given.
+    /// Returns the session, with more details. `None` until the models are loaded and this peer has
+    /// a number.
     pub fn session(&self) -> Option<&PeerSession> {
         self.session.as_ref()
     }
 
-    /// Peers that were lost and that this one calls ([`PeerConfig::rejoin`]).
+    /// Returns the number of lost peers that this peer tries to reach ([`PeerConfig::rejoin`]).
     pub fn looked_for(&self) -> usize {
         self.missed.len()
     }
 
-    /// The session's number of the body of a name.
+    /// Returns the session's number of an entity's body.
     pub fn body_of(&self, entity: Entity) -> Option<BodyId> {
         self.bodies.iter().find(|(_, played)| played.entity == entity).map(|(&id, _)| id)
     }
 
-    /// The emulated link under every connection of this peer, if there is one.
+    /// Returns the emulated link under every connection of this peer, if there is one.
     pub fn emulation(&self) -> Option<&Emulation> {
         self.emulation.as_ref()
     }
 
-    /// Puts an emulated link under every connection of this peer, another one, or none, at any time.
+    /// Sets, replaces or removes the emulated link under every connection of this peer, at any
+    /// time.
     pub fn set_emulation(&mut self, emulation: Option<Emulation>) {
         self.listening.set_emulation(emulation.clone());
         self.opened.values().for_each(|endpoint| endpoint.set_emulation(emulation.clone()));
@@ -215,7 +225,7 @@ impl NetPeer {
         self.began.elapsed()
     }
 
-    /// The endpoint that a connection belongs to, and the connection's number there.
+    /// Returns the endpoint of a connection, and the connection's number in that endpoint.
     fn way(&self, peer: PeerId) -> (&Endpoint, PeerId) {
         match self.opened.get(&peer) {
             Some(endpoint) => (endpoint, PeerId::HOST),
@@ -232,7 +242,7 @@ impl NetPeer {
         let lines: Vec<(PeerId, PeerStats)> = self.others.keys().filter_map(line).collect();
         for (peer, transport) in &lines {
             let link = self.session.as_ref().and_then(|session| session.stats(*peer)).unwrap_or_default();
-            // Both ways' times and the way there are QUIC's to tell.
+            // QUIC measures the round trip and the loss on the path to the other peer.
             let (round_trip, loss_out) = (transport.round_trip, transport.loss());
             stats.add(&LinkStats { round_trip, loss_out, ..link }, transport);
         }
@@ -251,7 +261,8 @@ impl NetPeer {
         stats
     }
 
-    /// Makes the session, when the scene's bodies are here. `founds`: it begins with this peer.
+    /// Creates the session when the scene's bodies are loaded. With `founds`, this peer starts a
+    /// new session.
     fn begin(&mut self, world: &mut World, user: UserId, founds: bool) -> bool {
         let step = Duration::from_nanos(self.scene.step_ns).as_secs_f64();
         let config = SessionConfig {
@@ -285,7 +296,8 @@ impl NetPeer {
         true
     }
 
-    /// Finds the scene's bodies; false while one of them is not loaded yet.
+    /// Finds the scene's bodies. Returns false while there are none, or one of them is not loaded
+    /// yet.
     fn gather(&mut self, world: &mut World) -> bool {
         let step =
             world.get_resource::<Time<Fixed>>().map_or(Duration::from_millis(25), Time::<Fixed>::timestep);
@@ -317,7 +329,8 @@ impl NetPeer {
 }
 
 impl Drop for NetPeer {
-    /// Says goodbye to all at once, which takes a second at most however many there are.
+    /// Says goodbye on all connections at the same time. This takes at most a second, whatever
+    /// their number.
     fn drop(&mut self) {
         self.listening.signal();
         let opened = std::mem::take(&mut self.opened).into_values();
@@ -329,7 +342,8 @@ impl Drop for NetPeer {
     }
 }
 
-/// All peers find the same number for a name: FNV-1a of its bytes, folded to 16 bits.
+/// Returns the number of a body name: FNV-1a of its bytes, folded to 16 bits. All peers therefore
+/// find the same number.
 fn number_of(name: &str) -> BodyId {
     let hash =
         name.bytes().fold(0x811c_9dc5_u32, |hash, byte| (hash ^ u32::from(byte)).wrapping_mul(0x0100_0193));

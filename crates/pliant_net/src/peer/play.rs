@@ -1,4 +1,4 @@
-//! The own hands, and what is shown and felt.
+//! The local hands, and the displayed state and the forces.
 
 use std::sync::Arc;
 
@@ -14,7 +14,7 @@ use crate::phase::Phase;
 use crate::remote::{RemoteHand, RemoteHands};
 use crate::session_transform::{SessionTransform, set_pose};
 
-/// A body of the peers, and what is shown of it.
+/// A body of the peers and its displayed states.
 pub(super) struct PlayedBody {
     pub(super) entity: Entity,
     pub(super) model: Arc<ModalModel>,
@@ -26,7 +26,7 @@ pub(super) struct PlayedBody {
 }
 
 impl PlayedBody {
-    /// Digest of its model and of how it is stepped: all peers have the same.
+    /// Digest of the body's model and step settings, which all peers must have in common.
     pub(super) fn digest(&self) -> [u8; 32] {
         pliant_stream::peer::digest(&self.model, &self.settings)
     }
@@ -44,34 +44,35 @@ impl PlayedBody {
     }
 }
 
-/// The settings that all peers step this body with: its own, with gravity in the axes that they step
-/// it in. Those of an anchored body are its own, wherever each of them puts it.
+/// Returns the settings with which all peers step this body. They are the body's own settings, with
+/// gravity in the axes in which the peers step the body. For an anchored body these are its own
+/// axes, wherever each peer places it.
 pub(super) fn agreed_settings(body: &Body) -> StepSettings {
-    /// How fine gravity is, m/s^2: settings are compared, and a turn in single precision differs in its
-    /// last digits from machine to machine.
+    /// Resolution of gravity, m/s^2. Peers compare the settings, and a rotation in single precision
+    /// differs in its last digits between machines.
     const FINE: f64 = 1e-3;
     let settings = body.config().settings;
     let mut gravity = DVec3::from(settings.gravity);
     if !body.model().is_free() {
         gravity = DQuat::from_array(body.frame().orientation()).inverse() * gravity;
     }
-    // A negative zero becomes zero.
+    // Adding zero turns a negative zero into zero.
     let gravity = gravity.to_array().map(|x| (x / FINE).round() * FINE + 0.0);
     StepSettings { gravity, ..settings }
 }
 
-/// An own grab as the session knows it.
+/// A local grab as the session knows it.
 pub(super) struct SentGrab {
     body: BodyId,
     vertex: u32,
     radius: f64,
     hold: GrabConfig,
-    /// `None`: it was not taken.
+    /// The session's number of the grab. `None`: the session did not take it.
     number: Option<u16>,
     point: Option<PatchPoint>,
 }
 
-/// `PostUpdate`: the app's own grabs are told to the session.
+/// `PostUpdate`: passes the app's own grabs to the session.
 pub(crate) fn tell_hands(
     net: Option<ResMut<NetPeer>>,
     bodies: Query<(&BodyState, &GlobalTransform)>,
@@ -117,7 +118,7 @@ pub(crate) fn tell_hands(
     }
 }
 
-/// `PostUpdate`: the session is brought to now, and what it shows is written.
+/// `PostUpdate`: brings the session to the current time and writes what it displays.
 pub(crate) fn show(
     net: Option<ResMut<NetPeer>>,
     mut bodies: Query<(&BodyState, &mut VisualState, &mut RemoteHands, &mut Transform, &GlobalTransform)>,

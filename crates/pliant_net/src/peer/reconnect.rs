@@ -1,4 +1,4 @@
-//! Peers that have lost each other find each other again.
+//! Reconnects peers that have lost each other.
 
 use std::time::Duration;
 
@@ -8,23 +8,24 @@ use tracing::debug;
 use super::{NetPeer, PeerState};
 use crate::transport::{CloseReason, Invite};
 
-/// Somebody who cannot be heard any more and has not said goodbye.
+/// A lost peer that has not said goodbye.
 #[derive(Debug, Clone)]
 pub(super) struct Missed {
     pub(super) number: UserId,
     invite: Invite,
     since: Duration,
     next: Duration,
-    /// The connection that is being tried.
+    /// The connection attempt under way.
     calling: Option<PeerId>,
 }
 
-/// Between two calls.
+/// Pause between two attempts to connect.
 const PAUSE: Duration = Duration::from_secs(1);
-/// So many are looked for at most; who has been missed longest is given up first.
+/// Most lost peers that are tracked. The one that was lost first is given up first.
 const MOST_MISSED: usize = 64;
 
-/// Did the other end go of its own will? One that has found us silent has not.
+/// Returns whether the other end left deliberately. A peer that closed because this peer was silent
+/// did not.
 fn has_left(reason: &CloseReason) -> bool {
     match reason {
         CloseReason::ByPeer { reason, .. } => *reason != DisconnectReason::Silent,
@@ -36,10 +37,11 @@ fn has_left(reason: &CloseReason) -> bool {
 }
 
 impl NetPeer {
-    /// A connection is gone: is it to be made again, and by us?
+    /// Tracks a peer whose connection is gone, if this peer is the one that must reconnect.
     pub(super) fn miss(&mut self, now: Duration, peer: PeerId, reason: &CloseReason) {
         if let Some(missed) = self.missed.iter_mut().find(|missed| missed.calling == Some(peer)) {
-            // Whatever the other says now (it may not have noticed yet that we were gone), only the time decides.
+            // The other peer may not have noticed the loss yet, so its answer does not matter. Only
+            // the time limit ends the attempts.
             (missed.calling, missed.next) = (None, now + PAUSE);
             return;
         }
@@ -61,12 +63,12 @@ impl NetPeer {
         self.missed.push(Missed { number, invite, since: now, next: now + PAUSE, calling: None });
     }
 
-    /// Somebody is here, again or for the first time.
+    /// Stops tracking a peer that has connected, again or for the first time.
     pub(super) fn found(&mut self, number: UserId) {
         self.missed.retain(|missed| missed.number != number);
     }
 
-    /// Calls those whose turn it is, and gives up on those missed for too long.
+    /// Connects to the lost peers whose attempts are due, and gives up those lost for too long.
     pub(super) fn look_for_the_missed(&mut self) {
         let now = self.now();
         let most = self.config.rejoin;

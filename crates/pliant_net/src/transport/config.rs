@@ -1,4 +1,4 @@
-//! What a host and a guest may be told, and the QUIC settings that follow from it.
+//! Options of hosts and guests, and the QUIC settings that follow from them.
 
 use std::net::{Ipv4Addr, SocketAddr};
 use std::sync::Arc;
@@ -13,16 +13,18 @@ use super::endpoint::TransportError;
 use super::identity::{AnyGuest, Identity, PinnedHost};
 use super::invite::Token;
 
-/// The application protocol and its version, negotiated in the handshake: another version is refused there.
+/// The application protocol and its version. The handshake negotiates it and refuses another
+/// version.
 pub const ALPN: &[u8] = b"pliant/2";
 
 /// What a user may do.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Hash, PartialOrd, Ord)]
 pub enum Role {
-    /// See the bodies and take hold of them. Default.
+    /// The user may see the bodies and hold them. Default.
     #[default]
     Hold,
-    /// See them only: a grab is refused. A watcher costs its datagrams and nothing else.
+    /// The user may only see the bodies, and its grabs are refused. A watcher costs its datagrams
+    /// and nothing else.
     Watch,
 }
 
@@ -43,29 +45,30 @@ impl Role {
     }
 }
 
-/// What a token lets in to, and until when.
+/// The role that a token grants, and the time of expiry.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Grant {
-    /// The secret; put it in the [`Invite`](super::Invite).
+    /// The secret, to be put in the [`Invite`](super::Invite).
     pub token: Token,
-    /// What its bearers may do.
+    /// What guests with this token may do.
     pub role: Role,
-    /// The moment from which it lets in nobody more; who is in stays in. `None`: as long as the host runs.
+    /// The time from which the token admits no more guests. Connected guests stay connected.
+    /// `None`: valid as long as the host runs.
     pub expires: Option<SystemTime>,
 }
 
 impl Grant {
-    /// Lets in to see and hold, without end.
+    /// Creates a grant to see and hold, without expiry.
     pub fn hold(token: Token) -> Self {
         Self { token, role: Role::Hold, expires: None }
     }
 
-    /// Lets in to see, without end.
+    /// Creates a grant to see only, without expiry.
     pub fn watch(token: Token) -> Self {
         Self { token, role: Role::Watch, expires: None }
     }
 
-    /// The same until a moment.
+    /// Returns the grant with a time of expiry.
     pub fn until(self, moment: SystemTime) -> Self {
         Self { expires: Some(moment), ..self }
     }
@@ -74,21 +77,23 @@ impl Grant {
 /// Who may join.
 #[derive(Clone, Debug, Default)]
 pub enum Access {
-    /// Anyone who knows the address, to hold. Default.
+    /// Anyone who knows the address, with the role to hold. Default.
     #[default]
     Anyone,
-    /// Only who shows one of these tokens. The first is the one in [`Endpoint::invite`](super::Endpoint::invite).
+    /// Only guests that present one of these tokens. [`Endpoint::invite`](super::Endpoint::invite)
+    /// contains the first one.
     Tokens(Vec<Grant>),
 }
 
 impl Access {
-    /// What `shown` lets in to at `now`, or why not, in words for the guest.
+    /// Returns the role that the token `shown` grants at `now`, or the reason for a refusal, as
+    /// text for the guest.
     pub(super) fn role(&self, shown: Option<Token>, now: SystemTime) -> Result<Role, &'static str> {
         match (self, shown) {
             (Self::Anyone, _) => Ok(Role::Hold),
             (Self::Tokens(_), None) => Err("this host asks for a token and the invite has none"),
             (Self::Tokens(grants), Some(shown)) => {
-                // All are looked at, so that the time taken tells nothing of which one it was.
+                // All grants are compared, so that timing does not reveal which one matched.
                 let found = grants.iter().fold(None, |found, grant| {
                     let same = grant.token == shown;
                     found.or(same.then_some(grant))
@@ -112,33 +117,37 @@ impl Access {
     }
 }
 
-/// Bounds on what one peer may cost. Every queue of the transport is in here.
+/// Bounds on the cost of one peer. They include every queue of the transport.
 #[derive(Clone, Debug)]
 pub struct Limits {
-    /// Peers at one time; the next is refused. Default: 256.
+    /// Most peers at one time. The next one is refused. Default: 256.
     pub peers: usize,
-    /// Peers and handshakes from one IP address at one time; the next is refused. Default: 64.
+    /// Most peers and handshakes from one IP address at one time. The next one is refused. Default:
+    /// 64.
     pub per_address: usize,
-    /// Longest message accepted from a peer, bytes; a longer one closes the connection. Default: 1 MiB for a host, 256 MiB for a guest
-    /// (models come that way).
+    /// Longest message accepted from a peer, bytes. A longer message closes the connection.
+    /// Default: 1 MiB for a host, 256 MiB for a guest (because models are sent as messages).
     pub message: usize,
-    /// Messages not yet sent or not yet read, bytes for each peer and direction. One message is always let through, however long.
-    /// Default: 64 MiB towards the peer is the bound of [`SendError::QueueFull`](super::SendError::QueueFull); from the peer, flow control.
+    /// Most bytes of messages that are not yet sent or not yet read, for each peer and direction. A
+    /// single message is accepted whatever its length. Towards the peer, a full queue gives
+    /// [`SendError::QueueFull`](super::SendError::QueueFull). From the peer, flow control applies.
+    /// Default: 64 MiB.
     pub queued_messages: usize,
-    /// Datagrams not yet sent, or not yet read, for each peer and direction; more drop the oldest. Default: 64.
+    /// Most datagrams that are not yet sent, or not yet read, for each peer and direction. A full
+    /// queue drops its oldest datagram. Default: 64.
     pub queued_datagrams: usize,
-    /// Most that is sent to one peer. Default: 8 Mbit/s.
+    /// Largest rate to one peer. Default: 8 Mbit/s.
     pub rate: RateCap,
-    /// A peer that is silent for so long is gone. Default: 10 s. At least 1 s.
+    /// Time after which a silent peer counts as gone. At least 1 s. Default: 10 s.
     pub idle_timeout: Duration,
-    /// A quiet connection says that it lives so often. Default: 1 s.
+    /// Interval at which a quiet connection sends a sign of life. At least 0.1 s. Default: 1 s.
     pub keep_alive: Duration,
-    /// From the first packet to the accepted token. Default: 10 s.
+    /// Longest time from the first packet to the accepted token. Default: 10 s.
     pub handshake: Duration,
 }
 
 impl Limits {
-    /// The defaults of a host.
+    /// Returns the defaults of a host.
     pub fn host() -> Self {
         Self {
             peers: 256,
@@ -153,7 +162,7 @@ impl Limits {
         }
     }
 
-    /// The defaults of a guest.
+    /// Returns the defaults of a guest.
     pub fn guest() -> Self {
         Self { peers: 1, message: 256 << 20, ..Self::host() }
     }
@@ -162,15 +171,17 @@ impl Limits {
 /// How to host.
 #[derive(Debug)]
 pub struct HostOptions {
-    /// Where to listen. Default: any free port on 127.0.0.1; a host for others binds `0.0.0.0:PORT` or `[::]:PORT`.
+    /// Address to listen on. Default: any free port on 127.0.0.1. A host for other machines binds
+    /// `0.0.0.0:PORT` or `[::]:PORT`.
     pub bind: SocketAddr,
-    /// The host's key. Default `None`: a new one, so that invites are good as long as this host runs.
+    /// The host's key. Default `None`: a new key, so that invites are valid as long as this host
+    /// runs.
     pub identity: Option<Identity>,
     /// Who may join.
     pub access: Access,
-    /// What a guest may cost.
+    /// Bounds on the cost of a guest.
     pub limits: Limits,
-    /// A lossy link put under the socket, for demonstrations and tests. Default: none.
+    /// Emulated lossy link under the socket, for demonstrations and tests. Default: none.
     pub emulation: Option<Emulation>,
 }
 
@@ -189,13 +200,14 @@ impl Default for HostOptions {
 /// How to join.
 #[derive(Debug)]
 pub struct JoinOptions {
-    /// The guest's key, which is its lasting name. Default `None`: a new one.
+    /// The guest's key, which identifies the guest permanently. Default `None`: a new key.
     pub identity: Option<Identity>,
-    /// What the host may cost.
+    /// Bounds on the cost of the host.
     pub limits: Limits,
-    /// A lossy link put under the socket, for demonstrations and tests. Default: none.
+    /// Emulated lossy link under the socket, for demonstrations and tests. Default: none.
     pub emulation: Option<Emulation>,
-    /// The own address. Default `None`: any free port, on loopback for a host there, else on every interface.
+    /// The guest's own address. Default `None`: any free port, on loopback for a host on loopback,
+    /// otherwise on every interface.
     pub bind: Option<SocketAddr>,
 }
 
@@ -205,7 +217,8 @@ impl Default for JoinOptions {
     }
 }
 
-/// quinn's buffer of datagrams that wait for the congestion window. Its default of 1 MiB turned a 40 Hz stream into a queue of 3 s.
+/// quinn's buffer of datagrams that wait for the congestion window, bytes. With its default of 1
+/// MiB, a 40 Hz stream built up a queue of 3 s.
 const DATAGRAM_SEND_BUFFER: usize = 4 << 10;
 const DATAGRAM_RECEIVE_BUFFER: usize = 64 << 10;
 
@@ -224,16 +237,18 @@ fn transport(limits: &Limits, from_peer: u32) -> Result<Arc<TransportConfig>, Tr
         .keep_alive_interval(Some(limits.keep_alive.max(Duration::from_millis(100))))
         .datagram_send_buffer_size(DATAGRAM_SEND_BUFFER)
         .datagram_receive_buffer_size(Some(DATAGRAM_RECEIVE_BUFFER))
-        // Jitter reorders datagrams at will: a packet is late, not lost, until sixteen have overtaken it or 9/8 of the round trip are over.
+        // Jitter reorders datagrams. A packet counts as lost only when sixteen later packets have
+        // overtaken it or 9/8 of the round trip have passed.
         .packet_threshold(16)
         .enable_segmentation_offload(false)
-        // Every QUIC path carries 1,200 bytes, and a frame is far below that: larger packets would only bring black holes to detect.
+        // Every QUIC path carries 1,200 bytes, and frames are far smaller. Larger packets would
+        // only require the detection of black holes.
         .mtu_discovery_config(None)
         .congestion_controller_factory(Arc::new(RateController::new(limits.rate)));
     Ok(Arc::new(config))
 }
 
-/// The most handshakes quinn holds before the host has looked at them.
+/// Most handshakes that quinn holds before the host has processed them.
 const PENDING_HANDSHAKES: usize = 256;
 
 pub(super) fn server(identity: &Identity, limits: &Limits) -> Result<ServerConfig, TransportError> {
@@ -247,7 +262,7 @@ pub(super) fn server(identity: &Identity, limits: &Limits) -> Result<ServerConfi
         .with_single_cert(chain, key)
         .map_err(TransportError::tls)?;
     tls.alpn_protocols = vec![ALPN.to_vec()];
-    // Early data could be replayed, and a ticket would skip the pinned key.
+    // Early data could be replayed, and a ticket would bypass the pinned key.
     tls.max_early_data_size = 0;
     tls.send_tls13_tickets = 0;
     let crypto = QuicServerConfig::try_from(tls).map_err(TransportError::tls)?;

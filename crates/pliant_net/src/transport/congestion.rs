@@ -1,8 +1,10 @@
-//! How much may be sent: a cap on the bit rate instead of a window that guesses.
+//! Congestion control with a cap on the bit rate, instead of a window that estimates the link.
 //!
-//! Loss on a wireless link is no sign of a queue. At 9 % loss and a round trip of 196 ms, Cubic's window holds about 200 kbit/s, whatever
-//! the link could carry. Here the window follows from the cap and the round trip, isolated loss changes nothing, and the sign of a queue is
-//! the round trip that grows ([`PeerStats::queueing`](super::PeerStats::queueing)): the application then sends fewer modes.
+//! Loss on a wireless link is no sign of a queue. At 9 % loss and a round trip of 196 ms, Cubic's
+//! window holds about 200 kbit/s, whatever the link could carry. Here the window follows from the
+//! cap and the round trip, and isolated loss changes nothing. A growing round trip is the sign of a
+//! queue ([`PeerStats::queueing`](super::PeerStats::queueing)), in which case the application sends
+//! fewer modes.
 
 use std::any::Any;
 use std::sync::Arc;
@@ -11,18 +13,18 @@ use std::time::{Duration, Instant};
 use quinn::congestion::{Controller, ControllerFactory};
 use quinn_proto::RttEstimator;
 
-/// The most that may be sent to one peer, bytes a second. Never below 1,200 bytes a second.
+/// The largest rate to one peer, bytes per second. Never below 1,200 bytes per second.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct RateCap(u64);
 
 impl RateCap {
-    /// A cap in megabits a second. What is not a positive number becomes the smallest cap.
+    /// Creates a cap in megabits per second. NaN, zero and negative rates become the smallest cap.
     pub fn from_mbit_per_s(rate: f64) -> Self {
         // A float-to-integer cast saturates and takes NaN to zero.
         Self(((rate * 125_000.0) as u64).max(SMALLEST))
     }
 
-    /// Bytes a second.
+    /// Returns the cap in bytes per second.
     pub fn bytes_per_s(self) -> u64 {
         self.0
     }
@@ -30,7 +32,8 @@ impl RateCap {
 
 const SMALLEST: u64 = 1200;
 
-/// Window of max(8 packets, 2 x cap x smoothed round trip); 8 packets while nothing at all gets through.
+/// Congestion controller with a window of max(8 packets, 2 x cap x smoothed round trip), and of 8
+/// packets while nothing at all gets through.
 #[derive(Clone, Debug)]
 pub(super) struct RateController {
     cap: RateCap,
@@ -56,7 +59,8 @@ impl Controller for RateController {
     }
 
     fn on_congestion_event(&mut self, _now: Instant, _sent: Instant, persistent: bool, _lost_bytes: u64) {
-        // All packets of several round trips lost: the link is down, not lossy. Probe it gently until something comes back.
+        // If all packets of several round trips are lost, the link is down, not lossy. The sender
+        // then probes it gently until an acknowledgment arrives.
         self.stalled |= persistent;
     }
 
@@ -91,8 +95,8 @@ impl ControllerFactory for RateController {
     }
 }
 
-/// A token bucket that both kinds of traffic draw from. Datagrams may take all of it and go into debt by one; messages only take what leaves
-/// half of it, so that a model on its way does not hold up a frame.
+/// A token bucket for both kinds of traffic. Datagrams may take all of it and go into debt by one
+/// datagram. Messages must leave half of it, so that a model transfer does not delay a frame.
 #[derive(Debug)]
 pub(super) struct Bucket {
     rate: f64,
@@ -101,9 +105,9 @@ pub(super) struct Bucket {
     filled: Instant,
 }
 
-/// What UDP, IP and QUIC add to a payload, bytes.
+/// Bytes that UDP, IP and QUIC add to a payload.
 const OVERHEAD: f64 = 60.0;
-/// The bucket holds so many seconds of the cap, and at least `SMALLEST_BURST` bytes.
+/// Capacity of the bucket in seconds of the cap, and at least `SMALLEST_BURST` bytes.
 const BURST_SECONDS: f64 = 0.05;
 const SMALLEST_BURST: f64 = 4096.0;
 
@@ -114,12 +118,12 @@ impl Bucket {
         Self { rate, burst, level: burst, filled: now }
     }
 
-    /// Takes `bytes` for a datagram, or says how long to wait.
+    /// Takes `bytes` for a datagram, or returns how long to wait.
     pub(super) fn take_datagram(&mut self, bytes: usize, now: Instant) -> Result<(), Duration> {
         self.take(bytes, 0.0, now)
     }
 
-    /// Takes `bytes` for a part of a message, or says how long to wait.
+    /// Takes `bytes` for a part of a message, or returns how long to wait.
     pub(super) fn take_message(&mut self, bytes: usize, now: Instant) -> Result<(), Duration> {
         self.take(bytes, self.burst / 2.0, now)
     }
@@ -132,7 +136,8 @@ impl Bucket {
             self.level -= bytes as f64 + OVERHEAD;
             return Ok(());
         }
-        // Long enough to be above the reserve, and a millisecond at least: the timer is no finer.
+        // The wait is long enough to rise above the reserve, and at least a millisecond, because
+        // the timer is no finer.
         Err(Duration::from_secs_f64(((reserve - self.level) / self.rate).clamp(0.001, 1.0)))
     }
 }
@@ -146,7 +151,7 @@ mod tests {
         let now = Instant::now();
         let mut controller = RateController::new(RateCap::from_mbit_per_s(2.0));
         controller.round_trip = Duration::from_millis(196);
-        // 2 x 250,000 B/s x 0.196 s
+        // The window is 2 x 250,000 B/s x 0.196 s.
         assert_eq!(controller.window(), 98_000);
         for _ in 0..1000 {
             controller.on_congestion_event(now, now, false, 1200);
@@ -172,7 +177,8 @@ mod tests {
         let start = Instant::now();
         let mut bucket = Bucket::new(RateCap::from_mbit_per_s(2.0), start);
         let (mut sent, mut late) = (0.0, 0);
-        // Ten seconds in steps of a millisecond: messages whenever they may, a datagram of 300 bytes every 25 ms.
+        // Ten seconds in steps of a millisecond, with messages whenever the bucket allows them, and
+        // a datagram of 300 bytes every 25 ms.
         for ms in 0..10_000u64 {
             let now = start + Duration::from_millis(ms);
             while bucket.take_message(1000, now).is_ok() {

@@ -1,4 +1,4 @@
-//! The network's side of an endpoint: what runs on its thread.
+//! The network thread's side of an endpoint.
 
 use std::future::{Future, poll_fn};
 use std::net::{IpAddr, Ipv4Addr, Ipv6Addr, SocketAddr, UdpSocket};
@@ -30,24 +30,24 @@ use super::queue::{Next, lock};
 use super::stats::PeerStats;
 use super::wire::{self, ReadMessageError, TOKEN_MESSAGE};
 
-/// An endpoint ends.
+/// Close code: the endpoint has ended.
 const GOODBYE: u32 = 0;
-/// The host does not let the guest in.
+/// Close code: the host does not admit the guest.
 const REFUSED: u32 = 1;
-/// The other end broke the rules.
+/// Close code: the other end violated the protocol.
 const PROTOCOL: u32 = 2;
-/// The session is over: this and the number of its [`DisconnectReason`].
+/// Close code: the session is over. The number of the [`DisconnectReason`] is added to it.
 const SESSION: u32 = 16;
 
-/// The code with which a connection is closed whose session is over.
+/// Returns the code that closes a connection whose session is over.
 pub(super) fn code_of(reason: DisconnectReason) -> u32 {
     SESSION + u32::from(reason.code())
 }
 
-/// So long the last words may take to get through.
+/// Longest time to deliver the last messages before a close.
 const GRACE: Duration = Duration::from_secs(1);
 
-/// What this endpoint is for.
+/// The role of this endpoint.
 #[derive(Debug)]
 pub(super) enum Side {
     Host { server: ServerConfig },
@@ -68,7 +68,7 @@ pub(super) async fn run(
     let endpoint = match open(&shared, socket, server) {
         Ok(endpoint) => endpoint,
         Err(error) => {
-            // Nobody to tell means that the application is gone as well.
+            // If the receiver is gone, the application is gone as well.
             let _ = ready.send(Err(error));
             return;
         }
@@ -82,7 +82,7 @@ pub(super) async fn run(
                 () = shared.stop.notified() => break,
                 () = joined => {}
             }
-            // The next attempt is the application's decision.
+            // The application decides when the next attempt begins.
             tokio::select! {
                 () = shared.stop.notified() => break,
                 () = shared.again.notified() => {}
@@ -90,11 +90,12 @@ pub(super) async fn run(
         },
     }
     endpoint.close(VarInt::from_u32(GOODBYE), GOODBYE_WORDS);
-    // Close packets are repeated while the other end still sends. It must not hold up an application that ends.
+    // QUIC repeats close packets while the other end still sends. This must not delay an
+    // application that ends.
     let _ = timeout(Duration::from_secs(1), endpoint.wait_idle()).await;
 }
 
-/// What an endpoint that ends says to all.
+/// Text that an ending endpoint sends to all peers.
 const GOODBYE_WORDS: &[u8] = b"goodbye";
 
 fn open(
@@ -107,13 +108,14 @@ fn open(
     Ok(quinn::Endpoint::new_with_abstract_socket(EndpointConfig::default(), server, socket, runtime)?)
 }
 
-/// Goes on from another socket: the host sees the guest move. Must be called on the network's runtime.
+/// Continues on another socket, which the host sees as a migration of the guest. Must be called on
+/// the network runtime.
 pub(super) fn move_to(shared: &Shared, endpoint: &quinn::Endpoint, socket: UdpSocket) -> std::io::Result<()> {
     let socket = TokioRuntime.wrap_udp_socket(socket)?;
     endpoint.rebind_abstract(Emulated::under(socket, &shared.emulator))
 }
 
-/// With so many handshakes open, a newcomer must first prove that its address is its own.
+/// Number of open handshakes above which a new guest must first prove its address.
 const HANDSHAKES_BEFORE_RETRY: usize = 16;
 
 async fn accept(shared: &Arc<Shared>, endpoint: &quinn::Endpoint) {
@@ -161,7 +163,7 @@ async fn accept(shared: &Arc<Shared>, endpoint: &quinn::Endpoint) {
     endpoint.close(VarInt::from_u32(GOODBYE), b"the host has left");
 }
 
-/// Counts a connection of an address for as long as it is kept.
+/// Counts a connection of an address while the value is alive.
 struct From {
     shared: Arc<Shared>,
     address: IpAddr,
@@ -191,7 +193,7 @@ impl Drop for From {
     }
 }
 
-/// An open connection that both ends have agreed to.
+/// An open connection after a complete handshake.
 struct Open {
     peer: PeerId,
     role: Role,
@@ -233,7 +235,7 @@ async fn welcome(shared: &Shared, incoming: Incoming) -> Result<Open, CloseReaso
     Ok(Open { peer, role, fingerprint, connection, send, recv })
 }
 
-/// The guest's half: one attempt, told as an event either way.
+/// The guest's half of the handshake: one attempt, whose result is reported as an event.
 async fn join(
     shared: &Shared,
     endpoint: &quinn::Endpoint,
@@ -260,7 +262,8 @@ async fn enter(
         .map_err(|error| failed(format!("`{}` does not resolve: {error}", invite.host)))?
         .next()
         .ok_or_else(|| failed(format!("`{}` has no address", invite.host)))?;
-    // The socket was bound before the name was known: an IPv4 address goes over an IPv6 socket in its mapped form.
+    // The socket was bound before the name was resolved. On an IPv6 socket, an IPv4 address is used
+    // in its mapped form.
     let address = match (address, endpoint.local_addr()) {
         (SocketAddr::V4(v4), Ok(SocketAddr::V6(_))) => {
             SocketAddr::from((v4.ip().to_ipv6_mapped(), v4.port()))
@@ -290,7 +293,7 @@ async fn enter(
     let role = match welcomed.map(|message| message.first().copied().and_then(Role::from_byte)) {
         Ok(Some(role)) => role,
         Ok(None) => return Err(CloseReason::Protocol { words: "a welcome without a role".into() }),
-        // A refusal closes the connection, and it has the words.
+        // A refusal closes the connection, and the reason is in the close.
         Err(words) => {
             let closed = timeout(Duration::from_millis(200), connection.closed()).await;
             return Err(closed.map_or(failed(words), reason));
@@ -299,7 +302,7 @@ async fn enter(
     Ok(Open { peer: PeerId::HOST, role, fingerprint: invite.fingerprint, connection, send, recv })
 }
 
-/// Where to bind a socket that will talk to the host of `invite`.
+/// Returns the address to which a socket for the host of `invite` is bound.
 pub(super) fn address_for_joining(invite: &Invite) -> SocketAddr {
     match invite.host.parse::<IpAddr>() {
         Ok(IpAddr::V4(host)) if host.is_loopback() => (Ipv4Addr::LOCALHOST, 0).into(),
@@ -314,13 +317,13 @@ fn fingerprint_of(connection: &Connection) -> Option<Fingerprint> {
     Fingerprint::of_certificate(chain.first()?).ok()
 }
 
-/// Words from outside, fit for a log and a screen.
+/// Removes control characters from text of the other end and cuts it, for logs and displays.
 fn clean(words: &[u8]) -> String {
     let words: String = String::from_utf8_lossy(words).chars().filter(|c| !c.is_control()).collect();
     shortened(&words)
 }
 
-/// The alert of a host that knows no protocol in common (RFC 7301).
+/// The TLS alert of a host that has no protocol in common with the guest (RFC 7301).
 const NO_APPLICATION_PROTOCOL: u8 = 120;
 
 fn reason_of(error: ConnectionError, refused: Option<CloseReason>) -> CloseReason {
@@ -349,7 +352,7 @@ fn reason_of(error: ConnectionError, refused: Option<CloseReason>) -> CloseReaso
         ConnectionError::ConnectionClosed(close)
             if close.error_code == TransportErrorCode::crypto(NO_APPLICATION_PROTOCOL) =>
         {
-            // Trying again does not change that.
+            // Another attempt would be refused too.
             CloseReason::Refused { words: "it speaks another version of the protocol".into() }
         }
         other => {
@@ -359,7 +362,8 @@ fn reason_of(error: ConnectionError, refused: Option<CloseReason>) -> CloseReaso
 }
 
 impl Open {
-    /// Carries the connection's traffic until it ends, and tells the application of its beginning and end.
+    /// Carries the connection's traffic until it ends, and reports its beginning and end to the
+    /// application.
     async fn serve(self, shared: &Shared) {
         let Self { peer: id, role, fingerprint, connection, mut send, mut recv } = self;
         let peer = Arc::new(Peer::default());
@@ -396,7 +400,8 @@ fn unreachable_end() -> CloseReason {
     CloseReason::Failed { words: "the connection's task ended".into() }
 }
 
-/// Nothing that came before the welcome counts. Takes what is there and does not wait for more.
+/// Discards datagrams that arrived before the welcome. Takes those that are there and does not wait
+/// for more.
 async fn discard_early(connection: &Connection) {
     loop {
         let mut read = pin!(connection.read_datagram());
@@ -455,7 +460,8 @@ async fn read_messages(
                 connection.close(VarInt::from_u32(PROTOCOL), words.as_bytes());
                 return CloseReason::Protocol { words };
             }
-            // The other end has said all it will say, or the connection is gone: the end of the connection has the reason.
+            // The other end has finished its stream, or the connection is gone. The end of the
+            // connection carries the reason.
             Err(ReadMessageError::Ended(_)) => std::future::pending().await,
         }
     }
@@ -471,7 +477,8 @@ async fn read_datagrams(shared: &Shared, id: PeerId, connection: &Connection, pe
     std::future::pending().await
 }
 
-/// Messages go in parts, so that the rate cap applies within a long one.
+/// Messages are written in parts of this size, bytes, so that the rate cap applies within a long
+/// message.
 const MESSAGE_PART: usize = 2048;
 
 async fn write_messages(
@@ -488,7 +495,7 @@ async fn write_messages(
                 }
             }
             Some(Next::Close(code, words)) => {
-                // Already closed streams and connections need no goodbye.
+                // A stream or connection that is already closed needs no goodbye.
                 let _ = send.finish();
                 let _ = timeout(GRACE, send.stopped()).await;
                 connection.close(VarInt::from_u32(code), words.as_bytes());
@@ -499,7 +506,8 @@ async fn write_messages(
     }
 }
 
-/// A peer that does not read holds up the messages before the goodbye; the connection is closed all the same.
+/// Closes the connection after [`GRACE`], even if a peer that does not read delays the messages
+/// before the goodbye.
 async fn hang_up(connection: &Connection, peer: &Peer) -> CloseReason {
     let (code, words) = peer.outbox.closing().await;
     sleep(GRACE).await;
@@ -541,7 +549,8 @@ async fn write_datagrams(connection: &Connection, peer: &Peer, bucket: &Mutex<Bu
             continue;
         }
         let Some(bytes) = peer.outbox.pop_datagram() else { continue };
-        // Waits for room in quinn's small buffer, so that what must go goes from our queue, oldest first, and is counted.
+        // This waits for room in quinn's small buffer. Excess datagrams are then dropped from this
+        // crate's queue, oldest first, and counted.
         match connection.send_datagram_wait(bytes).await {
             Ok(()) => {}
             Err(SendDatagramError::TooLarge) => {

@@ -1,4 +1,5 @@
-//! A socket over an emulated link: real QUIC over a network that loses, delays and reorders, on one machine and from a seed.
+//! A socket over an emulated link: real QUIC over a network that loses, delays and reorders
+//! packets, on one machine and with a seed.
 
 use std::fmt;
 use std::io::{self, IoSliceMut};
@@ -18,36 +19,37 @@ use tokio::time::{Sleep, sleep_until};
 
 use super::queue::lock;
 
-/// A link for each direction of one endpoint, and the seed of their chances.
+/// An emulated link for each direction of one endpoint, and the seed of their random numbers.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Emulation {
-    /// For what this endpoint sends.
+    /// The link for packets that this endpoint sends.
     pub outgoing: LinkConfig,
-    /// For what it receives.
+    /// The link for packets that this endpoint receives.
     pub incoming: LinkConfig,
-    /// Of all chances on the two links. With real sockets the packets' times differ from run to run, and so does what is lost.
+    /// Seed of all random numbers on the two links. With real sockets the times of the packets
+    /// differ from run to run, and so do the lost packets.
     pub seed: u64,
 }
 
 impl Emulation {
-    /// A named network: both directions alike.
+    /// Creates a named network with the same link in both directions.
     pub fn preset(preset: Preset, seed: u64) -> Self {
         let link = LinkConfig::preset(preset);
         Self { outgoing: link.clone(), incoming: link, seed }
     }
 }
 
-/// A packet on its way.
+/// A packet on a link.
 #[derive(Debug, Clone)]
 struct Packet {
-    /// Where to, or where from.
+    /// Destination of an outgoing packet, source of an incoming one.
     address: SocketAddr,
-    /// Which of our addresses it came to.
+    /// The local address at which an incoming packet arrived.
     to: Option<IpAddr>,
     bytes: Bytes,
 }
 
-/// One direction, in real time.
+/// One direction of the emulation, in real time.
 #[derive(Debug)]
 struct Direction {
     link: Link<Packet>,
@@ -64,7 +66,7 @@ impl Direction {
         self.link.send(now.saturating_duration_since(self.began), packet, bytes.len());
     }
 
-    /// When the next packet arrives. A time beyond the clock's range never comes.
+    /// Returns when the next packet arrives. A time beyond the clock's range counts as never.
     fn due(&self) -> Option<Instant> {
         self.began.checked_add(self.link.next_wakeup()?)
     }
@@ -74,27 +76,28 @@ impl Direction {
     }
 }
 
-/// The links of one endpoint, which may be put in and taken out while it runs.
+/// The emulated links of one endpoint, which may be set and removed while it runs.
 #[derive(Debug, Default)]
 pub(super) struct Emulator {
     outgoing: Mutex<Option<Direction>>,
     incoming: Mutex<Option<Direction>>,
-    /// What was put in.
+    /// The current emulation.
     emulation: Mutex<Option<Emulation>>,
-    /// A packet has entered, or the socket has changed.
+    /// Notified when a packet has entered or the socket has changed.
     changed: Notify,
-    /// Which socket is in use.
+    /// Number of the socket in use.
     generation: AtomicU64,
 }
 
 impl Emulator {
-    /// What was put in last.
+    /// Returns the current emulation.
     pub(super) fn get(&self) -> Option<Emulation> {
         lock(&self.emulation).clone()
     }
 
-    /// Puts links in, others in their place, or none. What is on its way on the old ones is lost, but for links of the same seed, which go on under
-    /// the new settings.
+    /// Sets, replaces or removes the links. Packets on the old links are lost. If the new links
+    /// have the same seed, the old links continue with the new settings instead, and their packets
+    /// arrive.
     pub(super) fn set(&self, emulation: Option<Emulation>) {
         let before = std::mem::replace(&mut *lock(&self.emulation), emulation.clone());
         let began = Instant::now();
@@ -121,7 +124,7 @@ impl Emulator {
     }
 }
 
-/// The real socket with a link on either side of it, or with none.
+/// The real socket with a link in each direction, or with none.
 pub(super) struct Emulated {
     socket: Arc<dyn AsyncUdpSocket>,
     emulator: Arc<Emulator>,
@@ -130,7 +133,7 @@ pub(super) struct Emulated {
 
 struct Reading {
     alarm: Pin<Box<Sleep>>,
-    /// Made when a link is first there.
+    /// Buffers for received packets, allocated when the first link is set.
     buffers: Vec<Vec<u8>>,
 }
 
@@ -140,12 +143,12 @@ impl fmt::Debug for Emulated {
     }
 }
 
-/// Largest UDP payload.
+/// Largest UDP payload, bytes.
 const LARGEST: usize = 65_535;
 
 impl Emulated {
-    /// Puts `emulator` under `socket`, in place of the socket it was under before. Must be called on the network's runtime, which carries the
-    /// packets from then on.
+    /// Puts `emulator` under `socket`, instead of the socket that it was under before. Must be
+    /// called on the network runtime, which then carries the packets.
     pub(super) fn under(
         socket: Arc<dyn AsyncUdpSocket>,
         emulator: &Arc<Emulator>,
@@ -162,20 +165,21 @@ impl Emulated {
 /// Packets read from the real socket at a time.
 const BATCH: usize = 8;
 
-/// Hands packets to the real socket when they have crossed the link, until another socket takes its place.
+/// Sends packets on the real socket when they leave the link, until another socket replaces this
+/// one.
 async fn carry(socket: Arc<dyn AsyncUdpSocket>, emulator: Arc<Emulator>, generation: u64) {
     loop {
         let due = lock(&emulator.outgoing).as_ref().and_then(Direction::due);
         match due {
             None => emulator.changed.notified().await,
-            // A packet with a shorter delay may enter meanwhile.
+            // A packet with a shorter delay may enter while this waits.
             Some(due) => tokio::select! {
                 () = sleep_until(due.into()) => {}
                 () = emulator.changed.notified() => {}
             },
         }
         if emulator.generation.load(Ordering::Acquire) != generation {
-            // What woke this one was meant for its successor.
+            // The notification was meant for the task of the next socket.
             emulator.changed.notify_one();
             return;
         }
@@ -189,13 +193,14 @@ async fn carry(socket: Arc<dyn AsyncUdpSocket>, emulator: Arc<Emulator>, generat
                 segment_size: None,
                 src_ip: None,
             };
-            // A full or failing socket is one more way to lose a packet.
+            // A full or failing socket loses the packet, like the link.
             let _ = socket.try_send(&transmit);
         }
     }
 }
 
-/// A link takes whatever comes, as its own queue decides what is lost; without one the socket decides.
+/// Reports whether a packet can be sent. A link accepts every packet, because its own queue
+/// determines the losses. Without a link, the socket reports it.
 #[derive(Debug)]
 struct Poller {
     emulator: Arc<Emulator>,
@@ -250,7 +255,8 @@ impl AsyncUdpSocket for Emulated {
             let segments = self.socket.max_receive_segments().max(1);
             *buffers = vec![vec![0; LARGEST.max(segments * 1500)]; BATCH];
         }
-        // Everything that the real socket has goes onto the link; its waker is registered when it has no more.
+        // All packets of the real socket are put on the link. The socket registers its waker when
+        // it has no more.
         loop {
             let mut metas = [RecvMeta::default(); BATCH];
             let mut slices: Vec<IoSliceMut<'_>> = buffers.iter_mut().map(|b| IoSliceMut::new(b)).collect();
@@ -272,7 +278,8 @@ impl AsyncUdpSocket for Emulated {
         let mut count = 0;
         for (buffer, meta) in bufs.iter_mut().zip(meta.iter_mut()) {
             let Some(packet) = direction.leave(now) else { break };
-            // What does not fit is not a QUIC packet of ours; it arrives empty and is ignored.
+            // A packet that does not fit is not a QUIC packet of this protocol. It is delivered
+            // empty and ignored.
             let len = if packet.bytes.len() <= buffer.len() { packet.bytes.len() } else { 0 };
             buffer[..len].copy_from_slice(&packet.bytes[..len]);
             *meta = RecvMeta { addr: packet.address, len, stride: len, ecn: None, dst_ip: packet.to };

@@ -22,42 +22,42 @@ use super::invite::{Invite, Token};
 use super::queue::{Inbox, Outbox, lock};
 use super::stats::{DropCounts, PeerStats};
 
-/// What happened, in order for each peer: `Connected`, then its datagrams and messages, then `Closed`.
+/// A network event. For each peer the order is `Connected`, its datagrams and messages, `Closed`.
 #[derive(Clone, Debug)]
 #[non_exhaustive]
 pub enum Event {
-    /// A peer has shown its key and its token, and may be talked to.
+    /// A peer has presented its key and its token, and can receive data.
     Connected {
         /// The new peer.
         peer: PeerId,
-        /// Its key: the same user has the same one after a reconnect.
+        /// The peer's key. The same user has the same key after a reconnect.
         fingerprint: Fingerprint,
-        /// Where it is; may change later (QUIC migration): [`Endpoint::address`].
+        /// The peer's address. It may change later (QUIC migration): [`Endpoint::address`].
         address: SocketAddr,
-        /// What its token lets it do; at a guest: what this guest may do.
+        /// What the peer's token permits. On a guest: what this guest may do.
         role: Role,
     },
     /// An unreliable, unordered datagram.
     Datagram {
-        /// From whom.
+        /// The sender.
         peer: PeerId,
-        /// When the network's thread read it.
+        /// When the network thread read the datagram.
         at: Instant,
-        /// What.
+        /// The datagram's content.
         bytes: Bytes,
     },
     /// A reliable, ordered message.
     Message {
-        /// From whom.
+        /// The sender.
         peer: PeerId,
-        /// What.
+        /// The message's content.
         bytes: Bytes,
     },
-    /// A peer is gone, or a host could not be reached. Nothing more comes from it.
+    /// A peer is gone, or a host could not be reached. Nothing more arrives from the peer.
     Closed {
-        /// Who.
+        /// The peer.
         peer: PeerId,
-        /// Why.
+        /// The reason.
         reason: CloseReason,
     },
 }
@@ -66,76 +66,78 @@ pub enum Event {
 #[derive(Clone, Debug, PartialEq, Eq, Error)]
 #[non_exhaustive]
 pub enum CloseReason {
-    /// This end closed it.
+    /// This end closed the connection.
     #[error("closed by this end")]
     ByUs,
-    /// The other end closed it.
+    /// The other end closed the connection.
     #[error("the other end left: {words}")]
     ByPeer {
-        /// Why, by the code that came.
+        /// The reason, from the close code.
         reason: DisconnectReason,
-        /// Its words, shortened and without control characters.
+        /// The other end's text, shortened and without control characters.
         words: String,
     },
-    /// Nothing came for the idle timeout, or for the time that a handshake may take.
+    /// Nothing arrived within the idle timeout, or the handshake took too long.
     #[error("nothing was heard from the other end in time")]
     TimedOut,
-    /// The host has another key than the invite says: another host, or someone between.
+    /// The host has another key than the invite names: it is another host, or a man in the middle.
     #[error("the host shows the key {found}, the invite says {expected}")]
     WrongFingerprint {
-        /// In the invite.
+        /// The key in the invite.
         expected: Fingerprint,
-        /// Shown.
+        /// The key that the host presented.
         found: Fingerprint,
     },
-    /// The host does not let this guest in.
+    /// The host does not admit this guest.
     #[error("refused by the host: {words}")]
     Refused {
-        /// Its words, shortened and without control characters.
+        /// The host's text, shortened and without control characters.
         words: String,
     },
-    /// The host has no room for this guest now.
+    /// The host has no room for this guest at present.
     #[error("the host has no room")]
     NoRoom,
-    /// The peer broke the rules of the stream.
+    /// The peer violated the stream's protocol.
     #[error("the other end broke the protocol: {words}")]
     Protocol {
-        /// How.
+        /// What the violation was.
         words: String,
     },
-    /// The name does not resolve, the versions differ, the peer restarted, the handshake failed.
+    /// The connection failed: for example, the name does not resolve, the versions differ, the peer
+    /// restarted or the handshake failed.
     #[error("the connection failed: {words}")]
     Failed {
-        /// How.
+        /// What failed.
         words: String,
     },
 }
 
-/// Why something was not taken for sending.
+/// Why data was not accepted for sending.
 #[derive(Debug, Error, Clone, PartialEq, Eq)]
 #[non_exhaustive]
 pub enum SendError {
-    /// No such peer, or not any more.
+    /// The peer is not connected, or no longer connected.
     #[error("the peer is not connected")]
     NotConnected,
-    /// The datagram does not fit the path now: [`Endpoint::max_datagram_size`].
+    /// The datagram is larger than the path carries at present: [`Endpoint::max_datagram_size`].
     #[error("a datagram of {len} bytes where the path carries {most}")]
     TooLarge {
-        /// Its length, bytes.
+        /// The datagram's length, bytes.
         len: usize,
-        /// What the path carries, bytes.
+        /// The largest datagram that the path carries, bytes.
         most: usize,
     },
-    /// The peer does not read as fast as messages are sent. Try again later, or close the connection.
+    /// The peer's message queue is full, because the peer reads slower than messages are sent. Try
+    /// again later, or close the connection.
     #[error("{len} bytes do not fit the peer's message queue")]
     QueueFull {
         /// The message's length, bytes.
         len: usize,
     },
-    /// A message cannot be that long.
+    /// The message is longer than a message can be.
     #[error("a message of {len} bytes, at most {} are possible", u32::MAX)]
     TooLong {
-        /// Its length, bytes.
+        /// The message's length, bytes.
         len: usize,
     },
 }
@@ -149,22 +151,22 @@ pub enum TransportError {
     Bind {
         /// The address asked for.
         address: SocketAddr,
-        /// What the system says.
+        /// Error of the operating system.
         source: io::Error,
     },
-    /// The socket or the network's thread cannot be set up.
+    /// The socket or the network thread cannot be set up.
     #[error("cannot set up the network's thread: {0}")]
     Thread(#[from] io::Error),
-    /// No key.
+    /// The key cannot be made.
     #[error(transparent)]
     Identity(#[from] IdentityError),
-    /// The keys are not accepted by TLS.
+    /// TLS does not accept the keys.
     #[error("cannot set up TLS: {0}")]
     Tls(String),
     /// The idle timeout does not fit QUIC's counter of milliseconds.
     #[error("an idle timeout of {given:?} is too long")]
     IdleTimeout {
-        /// As given.
+        /// The given timeout.
         given: Duration,
     },
 }
@@ -175,7 +177,7 @@ impl TransportError {
     }
 }
 
-/// One peer, as both threads see it.
+/// One peer, shared by both threads.
 #[derive(Debug, Default)]
 pub(super) struct Peer {
     pub(super) outbox: Outbox,
@@ -185,7 +187,7 @@ pub(super) struct Peer {
     pub(super) address: Mutex<Option<SocketAddr>>,
 }
 
-/// What the application and the network's thread share.
+/// State that the application and the network thread share.
 #[derive(Debug)]
 pub(super) struct Shared {
     pub(super) inbox: Inbox,
@@ -194,10 +196,10 @@ pub(super) struct Shared {
     pub(super) next_peer: AtomicU64,
     pub(super) stopping: AtomicBool,
     pub(super) stop: Notify,
-    /// A guest is to join once more.
+    /// Notified when a guest is to join again.
     pub(super) again: Notify,
     pub(super) access: Mutex<Arc<Access>>,
-    /// Connections and handshakes by where they come from.
+    /// Number of connections and handshakes by IP address.
     pub(super) addresses: Mutex<BTreeMap<IpAddr, usize>>,
     pub(super) emulator: Arc<Emulator>,
 }
@@ -223,9 +225,9 @@ impl Shared {
     }
 }
 
-/// A UDP socket with QUIC on it, on a thread of its own: a host with its guests, or a guest with its host.
+/// A UDP socket with QUIC on its own thread: a host with its guests, or a guest with its host.
 ///
-/// Dropping it says goodbye to every peer, which takes a few round trips and at most a second.
+/// Dropping it sends a goodbye to every peer, which takes a few round trips and at most a second.
 #[derive(Debug)]
 pub struct Endpoint {
     shared: Arc<Shared>,
@@ -248,10 +250,11 @@ impl Endpoint {
         Self::start(bind, identity.fingerprint(), shared, emulation, Side::Host { server })
     }
 
-    /// Joins the host of an invite. Returns at once: the first event is [`Event::Connected`], or [`Event::Closed`] with the reason why not.
+    /// Joins the host of an invite. Returns at once. The first event is [`Event::Connected`], or
+    /// [`Event::Closed`] with the reason for the failure.
     ///
     /// # Errors
-    /// As [`Endpoint::host`].
+    /// The same as for [`Endpoint::host`].
     pub fn join(invite: &Invite, options: JoinOptions) -> Result<Self, TransportError> {
         let JoinOptions { identity, limits, emulation, bind } = options;
         let identity = identity.map_or_else(Identity::generate, Ok)?;
@@ -284,7 +287,7 @@ impl Endpoint {
         let for_thread = Arc::clone(&shared);
         let thread = std::thread::Builder::new().name("pliant-net".into()).spawn(move || {
             runtime.block_on(driver::run(for_thread, socket, side, ready));
-            // A name that is still being looked up, on a thread of the runtime's own, holds up nobody.
+            // A name lookup that still runs, on a thread of the runtime, must not delay the end.
             runtime.shutdown_background();
         })?;
         let ended =
@@ -293,19 +296,20 @@ impl Endpoint {
         Ok(Self { shared, thread: Some(thread), runtime: handle, quic, fingerprint })
     }
 
-    /// The socket's own address.
+    /// Returns the address of the socket.
     pub fn local_address(&self) -> SocketAddr {
-        // The socket is bound: a system that cannot say where has said it before.
+        // The socket is bound, and a system that cannot give its address would have failed earlier.
         self.quic.local_addr().unwrap_or_else(|_| SocketAddr::from(([0, 0, 0, 0], 0)))
     }
 
-    /// This end's key.
+    /// Returns the fingerprint of this end's key.
     pub fn fingerprint(&self) -> Fingerprint {
         self.fingerprint
     }
 
-    /// The invite to this host. When it listens on every address, the one that the system would use to go out is named; behind a router
-    /// replace [`Invite::host`] with what others see. Its token is the first of [`Access::Tokens`].
+    /// Returns the invite to this host. If the host listens on every address, the invite names the
+    /// address from which the system would send. Behind a router, replace [`Invite::host`] with the
+    /// public address. The token is the first one of [`Access::Tokens`].
     pub fn invite(&self) -> Invite {
         let mut address = self.local_address();
         if address.ip().is_unspecified() {
@@ -319,34 +323,38 @@ impl Endpoint {
         }
     }
 
-    /// Changes who may join from now on. Who is in stays in.
+    /// Changes who may join from this call on. Connected guests stay connected.
     pub fn set_access(&self, access: Access) {
         *lock(&self.shared.access) = Arc::new(access);
     }
 
-    /// The lossy link under the socket, if there is one.
+    /// Returns the emulated lossy link under the socket, if there is one.
     pub fn emulation(&self) -> Option<Emulation> {
         self.shared.emulator.get()
     }
 
-    /// Puts a lossy link under the socket, another one, or none: at any time, under any session. What is on its way on the old one is lost,
-    /// unless the new one has the same seed: then it is the same link under other settings, and what is on its way arrives.
+    /// Sets, replaces or removes an emulated lossy link under the socket, at any time and under any
+    /// session. Packets on the old link are lost. If the new link has the same seed, the old link
+    /// continues with the new settings instead, and its packets arrive.
     pub fn set_emulation(&self, emulation: Option<Emulation>) {
         self.shared.emulator.set(emulation);
     }
 
-    /// A guest whose connection has ended joins once more, with the same key and from the same socket; told as an event like the first time. Does
-    /// nothing while the connection is open, and for a host.
+    /// Joins again with a guest whose connection has ended, with the same key and from the same
+    /// socket. Events report the result as for the first attempt. Does nothing while the connection
+    /// is open, and for a host.
     pub fn rejoin(&self) {
         if self.peers().is_empty() {
             self.shared.again.notify_one();
         }
     }
 
-    /// Goes on from another address of this machine: connections stay open (QUIC migration). A host's guests do not learn of it by themselves.
+    /// Moves to another address of this machine, with open connections (QUIC migration). A host's
+    /// guests do not learn the new address by themselves.
     ///
     /// # Errors
-    /// [`TransportError::Bind`]: the old socket is still in use.
+    /// [`TransportError::Bind`] when the new address cannot be used. The old socket then stays in
+    /// use.
     pub fn rebind(&self, address: SocketAddr) -> Result<(), TransportError> {
         let bound = |source| TransportError::Bind { address, source };
         let socket = UdpSocket::bind(address).map_err(bound)?;
@@ -354,17 +362,17 @@ impl Endpoint {
         driver::move_to(&self.shared, &self.quic, socket).map_err(bound)
     }
 
-    /// Where a peer is now. `None`: not connected.
+    /// Returns the present address of a peer. `None`: not connected.
     pub fn address(&self, peer: PeerId) -> Option<SocketAddr> {
         *lock(&self.peer(peer)?.address)
     }
 
-    /// The next thing that happened, if any. Never waits.
+    /// Returns the next event, if there is one. Never waits.
     pub fn poll(&self) -> Option<Event> {
         self.shared.inbox.pop()
     }
 
-    /// The peers that are connected, in the order in which they came.
+    /// Returns the connected peers, in the order in which they connected.
     pub fn peers(&self) -> Vec<PeerId> {
         lock(&self.shared.peers).keys().copied().collect()
     }
@@ -373,7 +381,7 @@ impl Endpoint {
         lock(&self.shared.peers).get(&peer).cloned()
     }
 
-    /// Queues a datagram. When the queue is full its oldest datagram goes, and is counted. Never waits.
+    /// Queues a datagram. A full queue drops its oldest datagram and counts it. Never waits.
     pub fn send_datagram(&self, peer: PeerId, bytes: Bytes) -> Result<(), SendError> {
         let peer = self.peer(peer).ok_or(SendError::NotConnected)?;
         let most = peer.max_datagram.load(Ordering::Relaxed);
@@ -388,7 +396,7 @@ impl Endpoint {
         Ok(())
     }
 
-    /// Queues a message. Never waits, and never drops one that was taken.
+    /// Queues a message. Never waits, and never drops a message that it has accepted.
     pub fn send_message(&self, peer: PeerId, bytes: Bytes) -> Result<(), SendError> {
         let len = bytes.len();
         if u32::try_from(len).is_err() {
@@ -402,25 +410,27 @@ impl Endpoint {
         }
     }
 
-    /// Bytes of messages to a peer that wait to be sent, without what QUIC has taken (at most 1 MiB). 0 where it is not connected.
+    /// Returns the bytes of messages to a peer that wait to be sent, without those that QUIC has
+    /// taken (at most 1 MiB). 0 if the peer is not connected.
     pub fn unsent(&self, peer: PeerId) -> usize {
         self.peer(peer).map_or(0, |peer| peer.outbox.message_bytes())
     }
 
-    /// Closes a connection once its queued messages are out (it waits at most a second for that).
-    /// `reason` reaches the peer as a code, `words` as they are, for people.
+    /// Closes a connection once its queued messages are sent, or after at most a second. The peer
+    /// receives `reason` as a code, and `words` as text for people.
     pub fn close(&self, peer: PeerId, reason: DisconnectReason, words: &str) {
         if let Some(peer) = self.peer(peer) {
             peer.outbox.close(driver::code_of(reason), words.to_owned());
         }
     }
 
-    /// The largest datagram that the path to a peer carries now, bytes; may shrink. `None`: not connected.
+    /// Returns the largest datagram that the path to a peer carries at present, bytes. It may
+    /// shrink. `None`: not connected.
     pub fn max_datagram_size(&self, peer: PeerId) -> Option<usize> {
         self.peer(peer).map(|peer| peer.max_datagram.load(Ordering::Relaxed))
     }
 
-    /// A connection's figures. `None`: not connected.
+    /// Returns the metrics of a connection. `None`: not connected.
     pub fn stats(&self, peer: PeerId) -> Option<PeerStats> {
         let peer = self.peer(peer)?;
         let dropped = *lock(&peer.dropped);
@@ -430,13 +440,13 @@ impl Endpoint {
 }
 
 impl Endpoint {
-    /// Tells the network's thread to say goodbye and end; does not wait for it.
+    /// Asks the network thread to say goodbye and end, and does not wait for it.
     pub(crate) fn signal(&self) {
         self.shared.stopping.store(true, Ordering::Release);
         self.shared.stop.notify_one();
     }
 
-    /// Says goodbye without waiting until it is said. The thread has ended when the handle says so.
+    /// Says goodbye without waiting for it. The returned handle tells when the thread has ended.
     pub(crate) fn close_detached(mut self) -> Option<JoinHandle<()>> {
         self.signal();
         self.thread.take()
@@ -453,7 +463,8 @@ impl Drop for Endpoint {
     }
 }
 
-/// The address that the system would send from. No packet is sent: connecting a UDP socket only looks up the route.
+/// Returns the address from which the system would send. Connecting a UDP socket only looks up the
+/// route, so no packet is sent.
 fn address_going_out(local: SocketAddr) -> std::net::IpAddr {
     let (any, anywhere, loopback): (SocketAddr, SocketAddr, std::net::IpAddr) = if local.is_ipv6() {
         let documentation = std::net::Ipv6Addr::new(0x2001, 0xdb8, 0, 0, 0, 0, 0, 1);

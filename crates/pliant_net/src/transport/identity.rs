@@ -1,4 +1,4 @@
-//! Who is who: Ed25519 keys, their fingerprints, and the checks made in the TLS handshake.
+//! Identities: Ed25519 keys, their fingerprints, and the checks made in the TLS handshake.
 
 use std::fmt;
 use std::str::FromStr;
@@ -17,9 +17,10 @@ use rustls::{
 };
 use thiserror::Error;
 
-/// The SHA-256 hash of a public key (its X.509 `SubjectPublicKeyInfo`), 32 bytes, written as 64 lower-case hexadecimal digits.
+/// The SHA-256 hash of a public key (its X.509 `SubjectPublicKeyInfo`), 32 bytes, written as 64
+/// lower-case hexadecimal digits.
 ///
-/// The same number as `openssl x509 -pubkey | openssl pkey -pubin -outform der | sha256sum` gives.
+/// `openssl x509 -pubkey | openssl pkey -pubin -outform der | sha256sum` gives the same number.
 #[derive(Clone, Copy, PartialEq, Eq, Hash, PartialOrd, Ord)]
 pub struct Fingerprint(pub [u8; 32]);
 
@@ -76,7 +77,7 @@ pub(super) fn parse_hex<const N: usize>(text: &str) -> Option<[u8; N]> {
     Some(bytes)
 }
 
-/// The first characters of something from outside, for an error message that stays short whatever came.
+/// Cuts text from the network, so that an error message stays short whatever its input.
 pub(super) fn shortened(text: &str) -> String {
     const MOST: usize = 80;
     match text.char_indices().nth(MOST) {
@@ -98,14 +99,15 @@ pub enum IdentityError {
     /// The given text is not a fingerprint.
     #[error("expected a fingerprint of 64 hexadecimal digits, found `{found}`")]
     Fingerprint {
-        /// What was there instead, shortened.
+        /// The text that was found instead, shortened.
         found: String,
     },
 }
 
 /// An Ed25519 key and the self-signed certificate that presents it in the handshake.
 ///
-/// Keep [`Identity::to_pkcs8`] to be the same user, or the same host behind the same invite, tomorrow.
+/// Store [`Identity::to_pkcs8`] to stay the same user, or the same host behind the same invite, in
+/// later runs.
 pub struct Identity {
     certificate: CertificateDer<'static>,
     key: KeyPair,
@@ -113,33 +115,34 @@ pub struct Identity {
 }
 
 impl fmt::Debug for Identity {
-    /// Without the private key.
+    /// Formats the identity without the private key.
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         f.debug_struct("Identity").field("fingerprint", &self.fingerprint).finish_non_exhaustive()
     }
 }
 
 impl Identity {
-    /// A new key from the system's random source.
+    /// Creates a new key from the system's random source.
     pub fn generate() -> Result<Self, IdentityError> {
         let key = KeyPair::generate_for(&PKCS_ED25519)
             .map_err(|error| IdentityError::Generate(error.to_string()))?;
         Self::from_key(key)
     }
 
-    /// The identity kept by [`Identity::to_pkcs8`].
+    /// Restores an identity from the bytes of [`Identity::to_pkcs8`].
     pub fn from_pkcs8(der: &[u8]) -> Result<Self, IdentityError> {
         let key = KeyPair::from_pkcs8_der_and_sign_algo(&PrivatePkcs8KeyDer::from(der), &PKCS_ED25519)
             .map_err(|error| IdentityError::Key(error.to_string()))?;
         Self::from_key(key)
     }
 
-    /// The private key in PKCS #8 form (DER). A secret: who has it is this user.
+    /// Returns the private key in PKCS #8 form (DER). Keep it secret: anyone who has it can act as
+    /// this user.
     pub fn to_pkcs8(&self) -> Vec<u8> {
         self.key.serialize_der()
     }
 
-    /// The hash of the public key, which an [`Invite`](super::Invite) pins.
+    /// Returns the hash of the public key, which an [`Invite`](super::Invite) pins.
     pub fn fingerprint(&self) -> Fingerprint {
         self.fingerprint
     }
@@ -160,11 +163,12 @@ impl Identity {
 /// The name in every certificate and handshake. Trust comes from the pinned key, not from a name.
 pub(super) const SERVER_NAME: &str = "pliant";
 
-/// Checks the host's key against the one pinned by the invite, and its signature over the handshake.
+/// Checks that the host's key is the one in the invite, and checks its signature over the
+/// handshake.
 #[derive(Debug)]
 pub(super) struct PinnedHost {
     pub(super) pinned: Fingerprint,
-    /// The key that came, if it was another one: for the error message.
+    /// The key that the host presented, if it was another one. The error message contains it.
     pub(super) refused: Arc<Mutex<Option<Fingerprint>>>,
     pub(super) algorithms: WebPkiSupportedAlgorithms,
 }
@@ -215,7 +219,8 @@ impl ServerCertVerifier for PinnedHost {
     }
 }
 
-/// Lets in any guest that proves it owns the key it shows. Who may join is the token's matter; the key is the guest's lasting name.
+/// Accepts any guest that proves that it owns the key it presents. The token determines who may
+/// join, and the key identifies the guest permanently.
 #[derive(Debug)]
 pub(super) struct AnyGuest {
     pub(super) algorithms: WebPkiSupportedAlgorithms,
@@ -275,7 +280,8 @@ mod tests {
     fn the_fingerprint_is_the_hash_of_the_certificates_public_key() {
         let identity = Identity::generate().unwrap();
         assert_eq!(Fingerprint::of_certificate(&identity.certificate).unwrap(), identity.fingerprint());
-        // RFC 8410: an Ed25519 SubjectPublicKeyInfo is these 12 bytes and the 32 of the key.
+        // In RFC 8410, an Ed25519 SubjectPublicKeyInfo is these 12 bytes and the 32 bytes of the
+        // key.
         let mut spki = vec![0x30, 0x2a, 0x30, 0x05, 0x06, 0x03, 0x2b, 0x65, 0x70, 0x03, 0x21, 0x00];
         spki.extend_from_slice(identity.key.public_key_raw());
         assert_eq!(Fingerprint::of_public_key(&spki), identity.fingerprint());

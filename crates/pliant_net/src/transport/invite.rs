@@ -1,4 +1,4 @@
-//! The line a host prints and a guest pastes.
+//! The invite: the line that a host prints and a guest pastes.
 
 use std::fmt;
 use std::net::{Ipv6Addr, SocketAddr};
@@ -9,12 +9,13 @@ use thiserror::Error;
 
 use super::identity::{Fingerprint, parse_hex, shortened, write_hex};
 
-/// A secret of 16 random bytes that a guest shows to be let in, written as 32 hexadecimal digits.
+/// A secret of 16 random bytes that a guest presents to be admitted, written as 32 hexadecimal
+/// digits.
 #[derive(Clone, Copy)]
 pub struct Token(pub [u8; 16]);
 
 impl Token {
-    /// A token from the system's random source.
+    /// Creates a token from the system's random source.
     pub fn generate() -> Result<Self, InviteError> {
         let mut bytes = [0; 16];
         SystemRandom::new().fill(&mut bytes).map_err(|_| InviteError::NoRandomness)?;
@@ -23,7 +24,7 @@ impl Token {
 }
 
 impl PartialEq for Token {
-    /// Takes the same time wherever the two differ, so that a guess learns nothing from the clock.
+    /// Takes the same time wherever the two differ, so that timing reveals nothing about the token.
     fn eq(&self, other: &Self) -> bool {
         self.0.iter().zip(&other.0).fold(0, |differ, (a, b)| differ | (a ^ b)) == 0
     }
@@ -32,33 +33,33 @@ impl PartialEq for Token {
 impl Eq for Token {}
 
 impl fmt::Debug for Token {
-    /// Without the secret: tokens must not reach the log.
+    /// Formats the token without the secret, because tokens must not reach the log.
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         f.write_str("Token(…)")
     }
 }
 
-/// Where a host is, which key it must show, and the token that it asks for: `pliant://host:port#fingerprint` or, with a token,
-/// `pliant://host:port/token#fingerprint`.
+/// The address of a host, the key that it must present, and the token that it asks for. Written as
+/// `pliant://host:port#fingerprint` or, with a token, `pliant://host:port/token#fingerprint`.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct Invite {
     /// Name or address of the host, without brackets.
     pub host: String,
     /// UDP port.
     pub port: u16,
-    /// The host's key.
+    /// Fingerprint of the host's key.
     pub fingerprint: Fingerprint,
-    /// What the host asks for, if it does not let in anyone.
+    /// The token that the host asks for. `None` if the host admits anyone.
     pub token: Option<Token>,
 }
 
 impl Invite {
-    /// An invite to the host at `address` that shows the key `fingerprint` and lets in anyone.
+    /// Creates an invite, without a token, to the host at `address` with the key `fingerprint`.
     pub fn new(address: SocketAddr, fingerprint: Fingerprint) -> Self {
         Self { host: address.ip().to_string(), port: address.port(), fingerprint, token: None }
     }
 
-    /// The same with a token.
+    /// Returns the invite with a token.
     pub fn with_token(mut self, token: Token) -> Self {
         self.token = Some(token);
         self
@@ -130,7 +131,7 @@ pub enum InviteError {
     Malformed {
         /// The part that is missing or wrong.
         expected: &'static str,
-        /// What was there, shortened.
+        /// The text that was found instead, shortened.
         found: String,
     },
     /// The system's random source failed.

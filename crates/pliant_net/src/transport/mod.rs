@@ -1,15 +1,21 @@
-//! QUIC endpoints that carry datagrams and messages between a host and its guests; nothing here knows of bodies or of Bevy.
+//! QUIC endpoints that carry datagrams and messages between a host and its guests. Nothing here
+//! depends on bodies or on Bevy.
 //!
-//! An [`Endpoint`] is one UDP socket on a thread of its own. The application talks to it through bounded queues and never waits for it:
+//! An [`Endpoint`] is one UDP socket on its own thread. The application exchanges data with it
+//! through bounded queues and never waits for it:
 //!
-//! * **Datagrams** are unreliable and unordered. A full queue drops its *oldest* datagram and counts it: a new state is worth more than an
-//!   old one.
-//! * **Messages** are reliable and ordered, on one bidirectional stream, each with a length prefix. They are never dropped: a full queue
-//!   is an error to the sender ([`SendError::QueueFull`]) or, on the receiving side, flow control that reaches the sender.
-//! * **Events** ([`Event`]) say who came, what came and who left why.
+//! * **Datagrams** are unreliable and unordered. A full queue drops its *oldest* datagram and
+//!   counts the loss, because a new state is worth more than an old one.
+//! * **Messages** are reliable and ordered, on one bidirectional stream, each with a length prefix.
+//!   They are never dropped. A full queue is an error for the sender ([`SendError::QueueFull`]) or,
+//!   on the receiving side, flow control that reaches the sender.
+//! * **Events** ([`Event`]) report connections, received data, and closed connections with their
+//!   reasons.
 //!
-//! Both ends have an Ed25519 [`Identity`]; a guest pins the host's key by the [`Fingerprint`] in its [`Invite`], and every handshake
-//! signature is verified. A guest presents its [`Token`] on the first stream, and nothing it sends counts before the host has accepted it.
+//! Both ends have an Ed25519 [`Identity`]. A guest pins the host's key by the [`Fingerprint`] in
+//! its [`Invite`], and every handshake signature is verified. A guest presents its [`Token`] on the
+//! first stream, and the host ignores everything else from the guest until it has accepted the
+//! token.
 
 mod config;
 mod congestion;

@@ -1,4 +1,4 @@
-//! The bounded queues between the application and the network's thread.
+//! The bounded queues between the application and the network thread.
 
 use std::collections::{BTreeMap, VecDeque};
 use std::ops::Bound;
@@ -11,7 +11,8 @@ use tokio::sync::Notify;
 
 use super::endpoint::{CloseReason, Event};
 
-/// A lock that a panic elsewhere does not poison: the queues hold plain data that is whole between calls.
+/// Locks a mutex, even if another thread has panicked while it held the lock. The queues hold plain
+/// data that is valid between calls.
 pub(super) fn lock<T>(mutex: &Mutex<T>) -> MutexGuard<'_, T> {
     mutex.lock().unwrap_or_else(PoisonError::into_inner)
 }
@@ -22,10 +23,12 @@ pub(super) struct Inbox(Mutex<InboxState>);
 
 #[derive(Debug, Default)]
 struct InboxState {
-    /// Arrivals, messages and departures, in order. Bounded: messages by each peer's share, the rest by [`Inbox::overloaded`].
+    /// New connections, messages and closed connections, in order. Each peer's share bounds the
+    /// messages, and [`Inbox::overloaded`] bounds the rest.
     events: VecDeque<Event>,
     peers: BTreeMap<PeerId, FromPeer>,
-    /// The peer whose datagram was read last: the next read begins after it, so that a flood from one does not hide the others.
+    /// The peer whose datagram was read last. The next read begins after this peer, so that a flood
+    /// from one peer does not hide the others.
     last: Option<PeerId>,
 }
 
@@ -36,9 +39,9 @@ struct FromPeer {
     room: Arc<Notify>,
 }
 
-/// Departures and arrivals that may wait unread before new guests are turned away.
+/// Most events that may wait unread before the host refuses new guests.
 const MOST_EVENTS: usize = 4096;
-/// What a queued message costs beside its bytes: bounds the number of empty ones.
+/// Cost of a queued message beside its bytes, bytes. It bounds the number of empty messages.
 const MESSAGE_COST: usize = 64;
 
 impl Inbox {
@@ -61,7 +64,7 @@ impl Inbox {
         lock(&self.0).events.len() >= MOST_EVENTS
     }
 
-    /// Queues a datagram. Returns how many older ones had to go.
+    /// Queues a datagram. Returns how many datagrams were dropped.
     pub(super) fn push_datagram(&self, peer: PeerId, at: Instant, bytes: Bytes, most: usize) -> u64 {
         let mut state = lock(&self.0);
         let Some(queue) = state.peers.get_mut(&peer) else { return 1 };
@@ -74,7 +77,7 @@ impl Inbox {
         dropped
     }
 
-    /// Queues a message, or gives it back when the peer's share is full.
+    /// Queues a message, or returns it when the peer's share is full.
     pub(super) fn push_message(&self, peer: PeerId, bytes: Bytes, most: usize) -> Result<(), Bytes> {
         let mut state = lock(&self.0);
         let Some(queue) = state.peers.get_mut(&peer) else { return Ok(()) };
@@ -126,13 +129,13 @@ struct OutboxState {
     datagrams: VecDeque<Bytes>,
     messages: VecDeque<Bytes>,
     message_bytes: usize,
-    /// Code and words to close with, once the messages are out.
+    /// Code and text of the close, until the message writer takes them after the last message.
     closing: Option<(u32, String)>,
-    /// The same, and it stays.
+    /// The same code and text, which stay set.
     hung_up: Option<(u32, String)>,
 }
 
-/// What the message writer does next.
+/// The next task of the message writer.
 #[derive(Debug)]
 pub(super) enum Next {
     Message(Bytes),
@@ -140,7 +143,7 @@ pub(super) enum Next {
 }
 
 impl Outbox {
-    /// Queues a datagram. Returns how many older ones had to go.
+    /// Queues a datagram. Returns how many older datagrams were dropped.
     pub(super) fn push_datagram(&self, bytes: Bytes, most: usize) -> u64 {
         let mut state = lock(&self.state);
         state.datagrams.push_back(bytes);
@@ -154,7 +157,8 @@ impl Outbox {
         dropped
     }
 
-    /// Queues a message. Returns false, and takes nothing, when there is no room.
+    /// Queues a message. Returns false, and queues nothing, when there is no room or the connection
+    /// is closing.
     pub(super) fn push_message(&self, bytes: Bytes, most: usize) -> bool {
         let mut state = lock(&self.state);
         let cost = bytes.len() + MESSAGE_COST;
@@ -168,7 +172,7 @@ impl Outbox {
         true
     }
 
-    /// Bytes of messages that wait, and what they cost beside.
+    /// Returns the bytes of the messages that wait, including [`MESSAGE_COST`] for each.
     pub(super) fn message_bytes(&self) -> usize {
         lock(&self.state).message_bytes
     }
@@ -184,7 +188,7 @@ impl Outbox {
         self.close_waits.notify_one();
     }
 
-    /// Waits for [`Outbox::close`].
+    /// Waits for [`Outbox::close`] and returns its code and text.
     pub(super) async fn closing(&self) -> (u32, String) {
         loop {
             if let Some(asked) = lock(&self.state).hung_up.clone() {
@@ -259,7 +263,7 @@ mod tests {
         let peer = PeerId(3);
         inbox.open(peer, left(peer));
         let large = Bytes::from(vec![0; 5000]);
-        // The first goes through however long it is; the second waits for room.
+        // The first message is accepted whatever its length, and the second waits for room.
         assert!(inbox.push_message(peer, large.clone(), 1000).is_ok());
         assert_eq!(inbox.push_message(peer, large.clone(), 1000).unwrap_err().len(), 5000);
         while inbox.pop().is_some() {}
@@ -269,7 +273,7 @@ mod tests {
         assert!(!outbox.push_message(large.clone(), 1000));
         assert!(matches!(outbox.next(), Some(Next::Message(_))));
         assert!(outbox.push_message(large, 1000));
-        // What was queued goes out before the close; nothing is taken after it.
+        // Queued messages go out before the close, and no message is accepted after it.
         outbox.close(0, "bye".into());
         assert!(!outbox.push_message(bytes(0), 1000));
         assert!(matches!(outbox.next(), Some(Next::Message(_))));

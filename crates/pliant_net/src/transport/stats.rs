@@ -1,30 +1,31 @@
-//! What a connection has done, for people and for diagnostics.
+//! Metrics of a connection.
 
 use std::time::Duration;
 
-/// Datagrams that never reached the other application because this end let them go, and why. What the network lost is
-/// [`PeerStats::lost_packets`].
+/// Counts of datagrams that this end dropped, by reason. They do not include packets that the
+/// network lost ([`PeerStats::lost_packets`]).
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 #[non_exhaustive]
 pub struct DropCounts {
-    /// To the peer: the queue was full (the rate cap, or a link slower than the application) and the oldest went.
+    /// To the peer: the queue was full (because of the rate cap, or a link slower than the
+    /// application), so the oldest was dropped.
     pub send_queue_full: u64,
     /// To the peer: larger than the path carries.
     pub too_large: u64,
-    /// To the peer: it takes no datagrams or is gone.
+    /// To the peer: the peer accepts no datagrams or is gone.
     pub not_connected: u64,
-    /// From the peer: the application did not read in time and the oldest went.
+    /// From the peer: the application did not read in time, so the oldest was dropped.
     pub receive_queue_full: u64,
 }
 
 impl DropCounts {
-    /// All of them.
+    /// Returns the sum of all counts.
     pub fn all(&self) -> u64 {
         self.send_queue_full + self.too_large + self.not_connected + self.receive_queue_full
     }
 }
 
-/// A connection's figures, refreshed ten times a second.
+/// Metrics of a connection, refreshed ten times a second.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
 #[non_exhaustive]
 pub struct PeerStats {
@@ -46,19 +47,21 @@ pub struct PeerStats {
     pub sent_datagrams: u64,
     /// Datagrams of the application received.
     pub received_datagrams: u64,
-    /// Bytes that may be in flight.
+    /// Congestion window, bytes that may be in flight.
     pub window: u64,
-    /// Datagrams let go by this end.
+    /// Datagrams that this end dropped.
     pub dropped: DropCounts,
 }
 
 impl PeerStats {
-    /// Part of the sent packets that were lost, 0 to 1, over the whole connection. 0 before anything was sent.
+    /// Returns the share of the sent packets that were lost, 0 to 1, over the whole connection. 0
+    /// before anything was sent.
     pub fn loss(&self) -> f64 {
         if self.sent_packets == 0 { 0.0 } else { self.lost_packets as f64 / self.sent_packets as f64 }
     }
 
-    /// The round trip is more than 50 ms above its smallest: packets wait in a queue somewhere, and the application should send less.
+    /// Returns whether the round trip is more than 50 ms above its smallest value. Packets then
+    /// wait in a queue on the path, and the application should send less.
     pub fn queueing(&self) -> bool {
         self.round_trip > self.min_round_trip + Duration::from_millis(50)
     }

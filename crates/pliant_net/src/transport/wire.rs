@@ -1,7 +1,8 @@
-//! Messages on the stream: four bytes of length, little end first, then so many bytes.
+//! Messages on the stream. Each is a length of four bytes, little-endian, and then that many bytes.
 //!
-//! The guest opens the one bidirectional stream and sends its token (16 bytes, or none) as the first message. The host answers with one
-//! byte, the guest's role (0 hold, 1 watch); from then on messages and datagrams belong to the application.
+//! The guest opens the one bidirectional stream and sends its token (16 bytes, or none) as the
+//! first message. The host answers with a message of one byte, the guest's role (0 hold, 1 watch).
+//! From then on, messages and datagrams belong to the application.
 
 use bytes::{Bytes, BytesMut};
 use quinn::{ReadExactError, RecvStream, SendStream, WriteError};
@@ -12,7 +13,7 @@ use super::invite::Token;
 /// Why no message could be read.
 #[derive(Debug, Error)]
 pub(super) enum ReadMessageError {
-    /// The peer announced more than is allowed.
+    /// The peer announced a message longer than allowed.
     #[error("a message of {announced} bytes where at most {most} are allowed")]
     TooLong {
         /// Bytes announced.
@@ -25,7 +26,8 @@ pub(super) enum ReadMessageError {
     Ended(#[from] ReadExactError),
 }
 
-/// Memory grows with what has arrived, not with what was announced.
+/// Step in which the message buffer grows, bytes. Memory grows with the bytes that have arrived,
+/// not with the announced length.
 const READ_STEP: usize = 64 << 10;
 
 pub(super) async fn read_message(stream: &mut RecvStream, most: usize) -> Result<Bytes, ReadMessageError> {
@@ -45,7 +47,7 @@ pub(super) async fn read_message(stream: &mut RecvStream, most: usize) -> Result
 }
 
 pub(super) async fn write_prefix(stream: &mut SendStream, length: usize) -> Result<(), WriteError> {
-    // `Endpoint::send_message` lets nothing longer through.
+    // `Endpoint::send_message` refuses longer messages.
     let length = u32::try_from(length).unwrap_or(u32::MAX);
     stream.write_all(&length.to_le_bytes()).await
 }
@@ -54,7 +56,7 @@ pub(super) fn token_to_message(token: Option<Token>) -> Vec<u8> {
     token.map(|token| token.0.to_vec()).unwrap_or_default()
 }
 
-/// The token in a first message, or `Err` if it is none.
+/// Returns the token in a first message, or `Err` if the message is not a token.
 pub(super) fn token_from_message(message: &[u8]) -> Result<Option<Token>, ()> {
     match message.len() {
         0 => Ok(None),

@@ -1,4 +1,4 @@
-//! What is sent arrives, over good links and bad ones, from here and from elsewhere.
+//! Tests of delivery, over good and bad links, and after a change of address.
 
 use std::net::SocketAddr;
 use std::time::{Duration, Instant};
@@ -36,8 +36,8 @@ fn datagrams_and_messages_cross_both_ways_and_a_goodbye_is_heard() {
     host.send_datagram(at_host, Bytes::from(vec![7; most])).unwrap();
     assert_eq!(datagram(&guest).len(), most);
 
-    // So little fits every buffer of the system, however late a thread comes to empty it: nothing
-    // is lost.
+    // This little data fits every buffer of the system, however late a thread empties it, so
+    // nothing is lost.
     wait_for("the figures", || {
         let stats = host.stats(at_host).unwrap();
         must!((stats.sent_datagrams, stats.received_datagrams) == (2, 1), "{stats:?}");
@@ -47,7 +47,8 @@ fn datagrams_and_messages_cross_both_ways_and_a_goodbye_is_heard() {
         Ok(())
     });
 
-    // Three megabytes at 8 Mbit/s take three seconds; half of one is enough to see order and wholeness.
+    // Three megabytes at 8 Mbit/s take three seconds. Half a megabyte is enough to check order and
+    // completeness.
     let start = Instant::now();
     let model: Bytes = (0..500_000u32).map(|i| (i.wrapping_mul(2_654_435_761) >> 24) as u8).collect();
     host.send_message(at_host, model.clone()).unwrap();
@@ -79,7 +80,7 @@ fn dropping_an_endpoint_says_goodbye() {
     let guest = guest(&host.invite());
     connected(&guest);
     connected(&host);
-    // It is said: the idle timeout would be another reason.
+    // The close reason shows that the goodbye arrived. The idle timeout would give another reason.
     drop(guest);
     assert!(matches!(closed(&host), CloseReason::ByPeer { .. }));
     let guest = self::guest(&host.invite());
@@ -88,7 +89,8 @@ fn dropping_an_endpoint_says_goodbye() {
     assert!(matches!(closed(&guest), CloseReason::ByPeer { words, .. } if words.contains("host")));
 }
 
-/// Datagrams that an endpoint has let come so far.
+/// Returns how many datagrams an endpoint has delivered since the last call, and adds the lengths
+/// of its messages to `whole`.
 fn arrived(endpoint: &Endpoint, whole: &mut Vec<usize>) -> usize {
     let datagram = |event| match event {
         Event::Datagram { .. } => 1,
@@ -103,9 +105,9 @@ fn arrived(endpoint: &Endpoint, whole: &mut Vec<usize>) -> usize {
 
 #[test]
 fn a_lossy_link_loses_its_share_of_datagrams_and_no_message() {
-    // The link has no rate and the endpoints have a low one, and queues for all: what a thread that
-    // comes late finds fits every buffer, so that only the link loses, and as much at whatever
-    // speed.
+    // The link has no rate limit, and the endpoints have a low rate and queues for all datagrams.
+    // The data that waits for a late thread then fits every buffer, so that only the link loses
+    // packets, and equally many at any speed.
     let slow = |limits: Limits| {
         let (queued_datagrams, rate) = (2000, RateCap::from_mbit_per_s(2.0));
         patient(Limits { queued_datagrams, rate, ..limits })
@@ -121,7 +123,8 @@ fn a_lossy_link_loses_its_share_of_datagrams_and_no_message() {
     let model = Bytes::from(vec![5; 100_000]);
     host.send_message(peer, model.clone()).unwrap();
     let sent = 1000;
-    // Two of them do not fit one packet, which would make the loss of one that of the other.
+    // Two of these datagrams do not fit one packet. Otherwise the loss of one would also lose the
+    // other.
     for _ in 0..sent {
         host.send_datagram(peer, Bytes::from(vec![0; 700])).unwrap();
         guest.send_datagram(PeerId::HOST, Bytes::from(vec![0; 700])).unwrap();
@@ -137,7 +140,7 @@ fn a_lossy_link_loses_its_share_of_datagrams_and_no_message() {
         listen();
         out(&host, peer) && out(&guest, PeerId::HOST)
     });
-    // The last word comes after all that is not lost.
+    // The last message arrives after all datagrams that are not lost.
     host.send_message(peer, Bytes::from_static(b"end")).unwrap();
     guest.send_message(PeerId::HOST, Bytes::from_static(b"end")).unwrap();
     let (at_host, at_guest) = wait_for("the last words", || {
@@ -151,9 +154,9 @@ fn a_lossy_link_loses_its_share_of_datagrams_and_no_message() {
         assert!((loss - 0.09).abs() < 0.04, "lost {loss}: {stats:?}");
     }
     assert_eq!(stats.dropped.all() + guest.stats(PeerId::HOST).unwrap().dropped.all(), 0);
-    // One that backs off at a loss has come down to some 5 kB by now: 200 kbit/s.
+    // A controller that backs off at a loss would be at about 5 kB by now, which is 200 kbit/s.
     assert!(stats.window > 50_000, "{stats:?}");
-    // Of a connection that lives on the round trip is measured on.
+    // The open connection continues to measure the round trip.
     wait_for("196 ms and the acknowledgement's delay, QUIC's own count of the loss", || {
         let stats = host.stats(peer).unwrap();
         must!((0.19..0.30).contains(&stats.round_trip.as_secs_f64()), "{stats:?}");
@@ -172,7 +175,8 @@ fn a_guest_that_changes_its_address_stays_connected() {
     guest.rebind("127.0.0.1:0".parse().unwrap()).unwrap();
     let after = guest.local_address();
     assert_ne!(before, after);
-    // Datagrams and messages go on, both ways, and nobody was told of an end.
+    // Datagrams and messages continue in both directions, and neither side reports a closed
+    // connection.
     wait_for("the host sees where the guest is now", || {
         guest.send_datagram(PeerId::HOST, Bytes::from_static(b"moved")).unwrap();
         host.send_datagram(peer, Bytes::from_static(b"seen")).unwrap();
@@ -199,9 +203,9 @@ fn a_link_is_put_under_an_open_session_and_taken_out_again() {
         assert_eq!(datagram(&guest), "pong");
         start.elapsed().as_secs_f64()
     };
-    // A busy machine makes a round longer and nothing makes it shorter than its link. So the
-    // medians of nine are taken until one is short enough: with the link none ever is as short as
-    // without it.
+    // A busy machine makes a round trip longer, and nothing makes it shorter than its link. The
+    // test therefore takes medians of nine until one is short enough. With the link, none is ever
+    // as short as without it.
     let median = |longest: f64| {
         let nine = || {
             let mut times: [f64; 9] = std::array::from_fn(|_| round());
@@ -212,7 +216,8 @@ fn a_link_is_put_under_an_open_session_and_taken_out_again() {
         wait_for("nine rounds of which most are short enough", nine)
     };
     median(0.010);
-    // The fourth network: no loss, 20 ms there and back. It stands on the guest's side only, for both directions.
+    // The fourth network has no loss and a round trip of 20 ms. The emulation is only on the
+    // guest's side, for both directions.
     guest.set_emulation(Some(Emulation::preset(Preset::Paper4, 1)));
     let with = median(0.040);
     assert!(with[0] > 0.019, "a round over 20 ms took {} s", with[0]);
@@ -238,7 +243,7 @@ fn a_guest_joins_again_after_its_host_has_come_back() {
     guest.rejoin();
     connected(&guest);
     assert_eq!(connected(&second).1, key, "the same key, so the same user");
-    // While it is in, joining again means nothing.
+    // A call of `rejoin` on an open connection has no effect.
     guest.rejoin();
     second.send_message(PeerId(1), Bytes::from_static(b"hello again")).unwrap();
     assert_eq!(message(&guest), "hello again");

@@ -1,4 +1,4 @@
-//! A host, a guest, and the next thing that happened to them.
+//! A host, a guest, and access to their next events.
 
 use std::time::Duration;
 
@@ -9,18 +9,18 @@ use pliant_net::transport::{
 
 use crate::wait::wait_for;
 
-/// The next event that `wanted` accepts; others are passed over.
+/// Waits for the next event that `wanted` accepts, and skips the others.
 pub fn next<T>(endpoint: &Endpoint, mut wanted: impl FnMut(Event) -> Option<T>) -> T {
     wait_for("an event of the kind", || std::iter::from_fn(|| endpoint.poll()).find_map(&mut wanted))
 }
 
-/// The very next event.
+/// Waits for the next event.
 pub fn first(endpoint: &Endpoint) -> Event {
     wait_for("an event", || endpoint.poll())
 }
 
-/// A guest comes in, and its coming is the first that the application of `host` hears: of nobody
-/// before.
+/// Connects a guest, and checks that its connection is the first event that the application of
+/// `host` receives.
 pub fn is_first_heard_of(host: &Endpoint) -> Endpoint {
     let guest = guest(&host.invite());
     let heard = first(host);
@@ -61,12 +61,13 @@ pub fn datagram(endpoint: &Endpoint) -> Bytes {
     })
 }
 
-/// Misses a silent peer after two seconds.
+/// Limits with which a silent peer times out after two seconds.
 pub fn quick(limits: Limits) -> Limits {
     Limits { idle_timeout: Duration::from_secs(2), keep_alive: Duration::from_millis(200), ..limits }
 }
 
-/// Takes a peer that a busy machine keeps silent for one that is there, and measures often.
+/// Limits with which a busy machine's silent peer does not time out, and the round trip is measured
+/// often.
 pub fn patient(limits: Limits) -> Limits {
     let half_a_minute = Duration::from_secs(30);
     let keep_alive = Duration::from_millis(200);

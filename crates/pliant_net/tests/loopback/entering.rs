@@ -1,4 +1,4 @@
-//! Who comes in and who does not.
+//! Tests of which guests are admitted.
 
 use std::net::UdpSocket;
 use std::time::{Duration, SystemTime};
@@ -20,7 +20,7 @@ fn another_key_than_the_invites_is_refused() {
     let guest = guest(&invite);
     let expected = CloseReason::WrongFingerprint { expected: invite.fingerprint, found: host.fingerprint() };
     assert_eq!(closed(&guest), expected);
-    // The host's application never hears of it.
+    // The host's application receives no event of that guest.
     is_first_heard_of(&host);
 }
 
@@ -38,7 +38,7 @@ fn tokens_are_asked_for_and_say_the_role() {
     let role = |endpoint: &Endpoint| {
         next(endpoint, |event| match event {
             Event::Connected { role, .. } => Some(role),
-            // Of the guest before, at the host.
+            // Other events belong to the previous guest, at the host.
             _ => None,
         })
     };
@@ -52,7 +52,7 @@ fn tokens_are_asked_for_and_say_the_role() {
     }
     let late = guest(&Invite { token: Some(spent), ..invite.clone() });
     assert_eq!(closed(&late), CloseReason::Refused { words: "the token has expired".into() });
-    // The door is shut while the house is open: who is in stays, nobody else comes.
+    // With no valid token left, connected guests stay and no new guest is admitted.
     let inside = guest(&invite);
     connected(&inside);
     host.set_access(Access::Tokens(Vec::new()));
@@ -72,8 +72,8 @@ fn a_host_that_is_not_there_is_reported() {
     let invite = Invite::new(silent.local_addr().unwrap(), Fingerprint([0; 32]));
     let guest = Endpoint::join(&invite, JoinOptions { limits, ..JoinOptions::default() }).unwrap();
     assert_eq!(closed(&guest), CloseReason::TimedOut);
-    // No part of a name is longer than 63 letters: the resolver knows that without asking any
-    // network.
+    // No part of a name may be longer than 63 characters, so the resolver rejects this name without
+    // asking the network.
     let nowhere = Invite { host: format!("no-such-host-{}", "x".repeat(64)), ..invite };
     let guest = self::guest(&nowhere);
     assert!(matches!(closed(&guest), CloseReason::Failed { words } if words.contains("no-such-host")));
@@ -104,7 +104,7 @@ fn another_version_is_refused_in_the_handshake() {
 fn a_guest_without_a_key_is_refused() {
     let host = host();
     let stranger = UnauthenticatedPeer::new(ALPN, false);
-    // The client's side of the handshake is over before the host refuses.
+    // The client's side of the handshake completes before the host refuses.
     if let Ok(connection) = stranger.connect(&host) {
         let error = stranger.runtime.block_on(connection.closed()).to_string();
         assert!(
@@ -121,10 +121,10 @@ fn datagrams_before_the_token_do_not_count_and_garbage_after_it_is_the_applicati
     let stranger = UnauthenticatedPeer::new(ALPN, true);
     let connection = stranger.connect(&host).unwrap();
     connection.send_datagram(Bytes::from_static(b"early")).unwrap();
-    // It is out before the stream is opened, and on loopback nothing overtakes.
+    // The datagram is sent before the stream is opened, and packets on loopback stay in order.
     let out = || connection.stats().frame_tx.datagram == 1;
     stranger.live_until("the early datagram is sent", out);
-    // Not let in before its token.
+    // The guest is not admitted before its token.
     let _other = is_first_heard_of(&host);
     stranger.runtime.block_on(async {
         let (mut send, mut recv) = connection.open_bi().await.unwrap();
@@ -138,7 +138,7 @@ fn datagrams_before_the_token_do_not_count_and_garbage_after_it_is_the_applicati
     let came = stranger.live_until("the first datagram that counts", || host.poll());
     assert!(matches!(&came, Event::Datagram { bytes, .. } if bytes == &b"\xff\x00garbage"[..]), "{came:?}");
 
-    // A first message that is no token.
+    // The first message is not a token.
     let second = stranger.connect(&host).unwrap();
     let error = stranger.runtime.block_on(async {
         let (mut send, _recv) = second.open_bi().await.unwrap();

@@ -1,4 +1,5 @@
-//! Endpoints on loopback: what arrives, what is refused, and who notices when someone is gone.
+//! Tests of endpoints on loopback: what arrives, what is refused, and who notices that a peer is
+//! gone.
 #![allow(clippy::unwrap_used, clippy::expect_used, clippy::panic, reason = "a failed test should panic")]
 
 mod crossing;

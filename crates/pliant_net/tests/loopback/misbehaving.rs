@@ -1,4 +1,4 @@
-//! Guests that break the rules, or just break.
+//! Tests with guests that violate the protocol or fail.
 
 use std::net::{SocketAddr, UdpSocket};
 use std::time::{Duration, Instant};
@@ -51,8 +51,8 @@ fn garbage_on_the_port_disturbs_nobody() {
             .collect();
         socket.send_to(&bytes, host.local_address()).unwrap();
     }
-    // The system drops what comes while the garbage fills the host's socket, so it is said until it
-    // is heard.
+    // The system drops packets while the garbage fills the host's socket, so the guest repeats the
+    // datagram until it arrives.
     let heard = wait_for("a datagram gets through", || {
         guest.send_datagram(PeerId::HOST, Bytes::from_static(b"through")).unwrap();
         host.poll()
@@ -82,9 +82,10 @@ fn a_guest_that_dies_without_a_word_is_noticed_after_the_idle_timeout() {
     });
     let (peer, _) = connected(&host);
     connected(&patient);
-    // From here on nobody drives the stranger's side: as if its process had been killed.
+    // From here on nothing drives this guest's side, as if its process had been killed.
     assert_eq!(closed(&host), CloseReason::TimedOut);
-    // It was heard last after `start`, and by the patient host, whose timeout is 30 s, before that.
+    // The host last received from the guest after `start`. The patient host, whose timeout is 30 s,
+    // last received before that.
     let after = start.elapsed().as_secs_f64();
     assert!(after > 2.0, "the idle timeout is 2 s, noticed after {after} s");
     let event = patient.poll();
@@ -95,8 +96,7 @@ fn a_guest_that_dies_without_a_word_is_noticed_after_the_idle_timeout() {
 
 #[test]
 fn a_guest_that_never_reads_costs_a_bounded_queue() {
-    // The rate is low, so that what waits in the system's buffers for a thread that comes late is
-    // little.
+    // At a low rate, little data waits in the system's buffers for a thread that runs late.
     let slow = |limits| Limits { rate: RateCap::from_mbit_per_s(1.0), ..patient(limits) };
     let limits = Limits { queued_messages: 1 << 20, ..slow(Limits::host()) };
     let host = Endpoint::host(HostOptions { limits, ..HostOptions::default() }).unwrap();
@@ -118,11 +118,11 @@ fn a_guest_that_never_reads_costs_a_bounded_queue() {
         assert!(taken < 200, "20 MB queued for a guest that reads nothing");
     };
     assert_eq!(error, SendError::QueueFull { len: part.len() });
-    // Datagrams are not held up by the messages that wait, and the oldest make room for the newest.
+    // Waiting messages do not delay datagrams, and the oldest datagrams make room for the newest.
     for i in 0..200u8 {
         host.send_datagram(peer, Bytes::copy_from_slice(&[i])).unwrap();
     }
-    // All that were not dropped are there, and wait unread.
+    // All datagrams that were not dropped have arrived, and wait unread.
     wait_for("all datagrams are on one side or the other", || {
         let host = host.stats(peer).ok_or("the guest is gone")?;
         let guest = guest.stats(PeerId::HOST).ok_or("the guest is not in yet")?;
@@ -148,9 +148,9 @@ fn a_guest_that_never_reads_costs_a_bounded_queue() {
         "{} read, {dropped} not sent, {unread} not read",
         got.len()
     );
-    // Its messages hold up the goodbye too: it is let go all the same, a second later. Nothing else
-    // would end this connection, since the guest's own thread answers as long as the guest is
-    // there.
+    // The guest's waiting messages delay the goodbye too, and the host closes the connection a
+    // second later anyway. Nothing else would end this connection, since the guest's thread answers
+    // as long as the guest exists.
     host.close(peer, DisconnectReason::Lost, "messages are not read");
     assert_eq!(closed(&host), CloseReason::ByUs);
 }
@@ -158,8 +158,8 @@ fn a_guest_that_never_reads_costs_a_bounded_queue() {
 #[cfg_attr(not(target_os = "linux"), ignore = "needs 127.0.0.2 on the loopback interface")]
 #[test]
 fn a_thousand_connections_from_one_address_cost_the_others_nothing() {
-    // Who has got as far as a handshake keeps its place until the test is over, however long that
-    // takes.
+    // Connections that have reached the handshake keep their places until the test is over, however
+    // long it takes.
     let long = Duration::from_secs(600);
     let limits = Limits { per_address: 8, handshake: long, idle_timeout: long, ..Limits::host() };
     let bind = "0.0.0.0:0".parse().unwrap();
@@ -168,7 +168,8 @@ fn a_thousand_connections_from_one_address_cost_the_others_nothing() {
     let good = guest(&Invite::new(SocketAddr::from(([127, 0, 0, 1], port)), host.fingerprint()));
     connected(&good);
     connected(&host);
-    // Another address of this machine, as a stranger's would be: 1,000 handshakes, none of which says a word after it.
+    // Another address of this machine stands for an attacker's address. It opens 1,000 handshakes,
+    // and none of them sends anything afterwards.
     let stranger = UnauthenticatedPeer::new(ALPN, true);
     let target = SocketAddr::from(([127, 0, 0, 1], port));
     let (open, refused) = stranger.runtime.block_on(async {
@@ -189,7 +190,7 @@ fn a_thousand_connections_from_one_address_cost_the_others_nothing() {
     assert!(open.len() <= 8 && refused >= 992, "{} got as far as a handshake", open.len());
     good.send_message(PeerId::HOST, Bytes::from_static(b"as ever")).unwrap();
     assert_eq!(message(&host), "as ever");
-    // A second guest from the first one's address comes in at once.
+    // A second guest from the first guest's address is admitted at once.
     let another = guest(&Invite::new(target, host.fingerprint()));
     connected(&another);
 }

@@ -1,4 +1,4 @@
-//! A guest made of bare quinn.
+//! A guest built directly on quinn.
 
 use std::net::SocketAddr;
 use std::sync::Arc;
@@ -8,7 +8,7 @@ use pliant_net::transport::Endpoint;
 
 use crate::wait::{Look, wait_for};
 
-/// A guest made of bare quinn, which can do what ours never does.
+/// A guest built directly on quinn, which can do things that this crate's guests never do.
 pub struct UnauthenticatedPeer {
     pub runtime: tokio::runtime::Runtime,
     pub endpoint: quinn::Endpoint,
@@ -82,7 +82,7 @@ impl UnauthenticatedPeer {
         Self { runtime, endpoint }
     }
 
-    /// Lives on until `look` finds what is awaited: nobody else drives its side.
+    /// Drives this guest's runtime until `look` succeeds, because nothing else drives it.
     pub fn live_until<L: Look>(&self, awaited: &str, mut look: impl FnMut() -> L) -> L::Found {
         wait_for(awaited, || {
             self.runtime.block_on(async { tokio::time::sleep(Duration::from_millis(1)).await });

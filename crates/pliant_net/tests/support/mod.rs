@@ -24,12 +24,13 @@ const CELLS: u32 = 16;
 
 /// A vertex at the tip of [`bar`].
 pub const TIP: u32 = 4 * CELLS;
-/// A vertex in the middle of it.
+/// A vertex at half of the bar's length.
 pub const MIDDLE: u32 = 4 * (CELLS / 2);
 
 const GIVE: [[f64; 3]; 3] = [[2e-3, 0.0, 0.0], [0.0, 2e-3, 0.0], [0.0, 0.0, 2e-3]];
 
-/// A square bar of 1 m and 2 kg along x, fixed at x = 0, that shears in y and z with shapes sin((2k - 1) pi x / 2).
+/// A square bar of 1 m and 2 kg along x, fixed at x = 0. It shears in y and z with the mode shapes
+/// sin((2k - 1) pi x / 2).
 pub fn bar() -> Arc<ModalModel> {
     let half = 0.08;
     let mut positions: Vec<[f32; 3]> = Vec::new();
@@ -85,7 +86,8 @@ pub fn bar() -> Arc<ModalModel> {
         mass: 2.0,
         center_of_mass: [0.5, 0.0, 0.0],
         inertia: [[0.01, 0.0, 0.0], [0.0, 0.17, 0.0], [0.0, 0.0, 0.17]],
-        // What the modes left out give way by, m/N: without it a hold would be stiffer than any body of four modes can bear at 40 Hz.
+        // Residual flexibility of the truncated modes, m/N. Without it a grab would be stiffer than
+        // a body of four modes can bear at 40 Hz.
         sites: [TIP, MIDDLE]
             .map(|vertex| FlexibilitySite { vertex, radius: 0.3, flexibility: GIVE })
             .to_vec(),
@@ -93,7 +95,7 @@ pub fn bar() -> Arc<ModalModel> {
     Arc::new(ModalModel::from_parts(parts).unwrap())
 }
 
-/// The middle of a patch of the bar at rest.
+/// Returns the center of a patch of the bar at rest.
 pub fn patch_at_rest(vertex: u32, radius: f64) -> [f64; 3] {
     let model = bar();
     let patch = Patch::around(model.surface(), vertex, radius).unwrap();
@@ -105,13 +107,13 @@ pub fn patch_at_rest(vertex: u32, radius: f64) -> [f64; 3] {
     middle
 }
 
-/// Apps run in real time: those of one test at a time.
+/// Runs one test at a time, because the apps run in real time.
 pub fn alone() -> MutexGuard<'static, ()> {
     static ALONE: Mutex<()> = Mutex::new(());
     ALONE.lock().unwrap_or_else(PoisonError::into_inner)
 }
 
-/// An app without a renderer at 40 steps a second of real time.
+/// Creates an app without a renderer, with 40 steps per second of real time.
 pub fn app(net: NetPlugin) -> App {
     let mut app = App::new();
     app.add_plugins((MinimalPlugins, AssetPlugin::default(), TransformPlugin))
@@ -121,12 +123,13 @@ pub fn app(net: NetPlugin) -> App {
     app
 }
 
-/// A test asks what has been said so far, at whatever time: nothing said is dropped.
+/// Keeps all messages, because a test reads them at any later time.
 fn keep_messages(mut registry: ResMut<MessageRegistry>) {
     registry.should_update = ShouldUpdateMessages::Waiting;
 }
 
-/// A host that shares `bar` at 1 m above the origin: the app, its invite, the body.
+/// Creates a host that shares [`bar`] at 1 m above the origin. Returns the app, its invite and the
+/// body.
 pub fn host(config: HostConfig) -> (App, Invite, Entity) {
     let net = NetPlugin::host(config).unwrap();
     let invite = net.invite().unwrap().clone();
@@ -143,8 +146,8 @@ pub fn guest(invite: &Invite, config: JoinConfig) -> App {
     app(NetPlugin::join(invite, config).unwrap())
 }
 
-/// Runs the apps, at some 150 frames a second where the machine has the time, until `look` finds
-/// what is awaited. Panics, saying what is still off, after [`PATIENCE`].
+/// Runs the apps, at about 150 frames per second if the machine can, until `look` succeeds. Panics
+/// after [`PATIENCE`], with what is still wrong.
 pub fn run_until<L: Look>(
     apps: &mut [&mut App],
     awaited: &str,
@@ -157,8 +160,8 @@ pub fn run_until<L: Look>(
     })
 }
 
-/// Runs the apps for so many frames, to see that nothing comes of it. What must come is waited for
-/// instead.
+/// Runs the apps for a number of frames, to check that nothing happens. For an event that must
+/// happen, use [`run_until`].
 pub fn run_frames(apps: &mut [&mut App], frames: usize) {
     let mut left = frames;
     run_until(apps, "the frames are over", |_| {
@@ -167,7 +170,7 @@ pub fn run_frames(apps: &mut [&mut App], frames: usize) {
     });
 }
 
-/// What has come to a guest while its host has made so many steps, in so many seconds.
+/// What a guest has received while its host made `ticks` steps, in `seconds`.
 #[derive(Debug, Clone, Copy)]
 pub struct Came {
     pub datagrams: u64,
@@ -177,33 +180,33 @@ pub struct Came {
 }
 
 impl Came {
-    /// Bytes in as many ticks as there should be in a second.
+    /// Bytes per 40 ticks, which nominally take a second.
     pub fn bytes_in_40_ticks(&self) -> f64 {
         40.0 * self.bytes as f64 / self.ticks as f64
     }
 
-    /// Bytes in a second, or in less than one.
+    /// Bytes per second, or in total if less than a second has passed.
     pub fn bytes_in_a_second(&self) -> f64 {
         self.bytes as f64 / self.seconds.max(1.0)
     }
 
-    /// A datagram for nearly every tick: 30 in 40.
+    /// Checks that nearly every tick brings a datagram: more than 30 in 40.
     pub fn ticks_come(self) -> Result<Self, String> {
         must!(40 * self.datagrams > 30 * self.ticks, "{self:?}");
         Ok(self)
     }
 
-    /// What nobody looks at does not come. The clock's answers are two a second, however many ticks
-    /// the host makes.
+    /// Checks that an unwanted body is not sent. The clock's answers are two per second, however
+    /// many ticks the host makes.
     pub fn only_the_clock(self) -> Result<Self, String> {
         must!(self.datagrams as f64 <= 5.0 * self.seconds.max(1.0), "{self:?}");
         Ok(self)
     }
 }
 
-/// For [`run_until`] with a host and a guest: what comes while the host makes forty steps, again
-/// and again until `look` finds it right. What was on its way before then does not matter, nor what
-/// a busy machine drops now and then.
+/// A check for [`run_until`] with a host and a guest. It collects what the guest receives while the
+/// host makes forty steps, and repeats this until `look` accepts it. Packets that were sent
+/// earlier, and occasional drops on a busy machine, therefore do not matter.
 pub fn window<T>(
     look: impl Fn(Came) -> Result<T, String>,
 ) -> impl FnMut(&mut [&mut App]) -> Result<T, String> {
@@ -226,12 +229,12 @@ pub fn window<T>(
     }
 }
 
-/// The steps that an app's bodies have made.
+/// Number of steps of an app's bodies.
 pub fn tick(app: &App) -> u64 {
     app.world().resource::<PliantTick>().0
 }
 
-/// The host's body that a guest is shown, once it is.
+/// Returns the host's body on a guest, once it is displayed.
 pub fn body_of(guest: &mut App) -> Option<Entity> {
     only::<RemoteBody>(guest).filter(|&body| guest.world().get::<VisualState>(body).is_some())
 }
@@ -241,20 +244,20 @@ pub fn arrival(host: &mut App, guest: &mut App) -> Entity {
     run_until(&mut [host, guest], "the body arrives", |apps| body_of(apps[1]))
 }
 
-/// Has a body come to rest? It is so slow that in a tenth of a second it moves by less than a
-/// hundredth of `size`.
+/// Returns whether a body has come to rest: at its speed it moves by less than a hundredth of
+/// `size` in a tenth of a second.
 pub fn rests(app: &App, body: Entity, size: f64) -> bool {
     let speed = app.world().get::<BodyState>(body).unwrap().body().v().iter().map(|v| v * v).sum::<f64>();
     speed.sqrt() < 0.1 * size
 }
 
-/// The messages of a kind so far.
+/// Returns all messages of a kind so far.
 pub fn messages<M: Message + Clone>(app: &App) -> Vec<M> {
     let messages = app.world().resource::<Messages<M>>();
     messages.get_cursor().read(messages).cloned().collect()
 }
 
-/// The only entity with a component.
+/// Returns the only entity with a component.
 pub fn only<C: Component>(app: &mut App) -> Option<Entity> {
     let mut query = app.world_mut().query_filtered::<Entity, With<C>>();
     query.iter(app.world()).next()

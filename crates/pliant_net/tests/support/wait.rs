@@ -1,15 +1,16 @@
-//! The one way in which these tests wait.
+//! Waiting, shared by all these tests.
 
 use std::time::{Duration, Instant};
 
-/// So long a test waits for anything that must come. It measures nothing: a busy machine makes a
-/// test slow and never red, so it is far longer than anything here takes on a machine that is idle.
+/// Longest time that a test waits for an event that must happen. It measures nothing. It is far
+/// longer than anything here takes on an idle machine, so that a busy machine makes a test slow but
+/// never fail.
 pub const PATIENCE: Duration = Duration::from_secs(60);
 
-/// Between two looks at what is awaited.
+/// Pause between two checks of a condition.
 const PAUSE: Duration = Duration::from_millis(1);
 
-/// What a look at something awaited finds: that it is there, or what is still off.
+/// Result of a check: the value that was awaited, or what is still wrong.
 pub trait Look {
     type Found;
     fn found(self) -> Result<Self::Found, String>;
@@ -36,8 +37,8 @@ impl<T> Look for Result<T, String> {
     }
 }
 
-/// Looks again and again until it is there. Panics after [`PATIENCE`], saying what was awaited and
-/// what the last look has found off.
+/// Repeats a check until it succeeds. Panics after [`PATIENCE`], with what was awaited and what the
+/// last check found wrong.
 pub fn wait_for<L: Look>(awaited: &str, mut look: impl FnMut() -> L) -> L::Found {
     let start = Instant::now();
     loop {
@@ -49,8 +50,8 @@ pub fn wait_for<L: Look>(awaited: &str, mut look: impl FnMut() -> L) -> L::Found
     }
 }
 
-/// For a look that returns a `Result`: what must be so, and is not yet, is what the panic says if
-/// it never is.
+/// Asserts a condition in a check that returns a `Result`. A condition that does not hold yet
+/// becomes the check's error, which the panic prints if it never holds.
 macro_rules! must {
     ($so:expr) => {
         let so: bool = $so;

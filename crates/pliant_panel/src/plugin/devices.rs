@@ -11,11 +11,11 @@ use crate::{
     device::{self, DeviceView, DevicesView},
 };
 
-/// What the panel remembers of the devices.
+/// Data of the devices that the panel keeps between frames.
 #[derive(Resource, Default)]
 pub(super) struct Histories {
     forces: HashMap<DeviceId, Trace>,
-    /// What each has asked to be done by hand.
+    /// The calibration step that each device has asked the user for.
     calibrate: HashMap<DeviceId, &'static str>,
 }
 
@@ -29,12 +29,12 @@ pub(super) struct Devices<'w, 's> {
 }
 
 impl Devices<'_, '_> {
-    /// There is a device, or a stop that the next one will obey.
+    /// Whether there is a device, or a latched stop that also applies to the next device.
     pub fn are_there(&self) -> bool {
         self.devices.as_ref().is_some_and(|devices| devices.is_stopped() || devices.iter().next().is_some())
     }
 
-    /// The emergency stop, which is in sight whatever else is rolled up or scrolled away.
+    /// Shows the emergency stop, which stays visible when sections are folded or scrolled away.
     pub fn show_stop(&mut self, ui: &mut Ui) {
         let Some(devices) = &mut self.devices else { return };
         let one_is = devices.iter().any(|(_, status)| status.report.state == LoopState::Stopped);

@@ -1,4 +1,4 @@
-//! From the emulator's knobs to links, and back.
+//! Conversion between the emulator's knobs and links.
 
 use std::time::Duration;
 
@@ -9,13 +9,16 @@ use pliant_net::{
 
 use crate::network::EmulatorView;
 
-/// Shown where the links are none of the presets.
+/// Index of the preset that is shown if the links are not a preset.
 const OTHER: usize = Preset::ALL.len() + 1;
 
-/// The seed of links that the panel puts in: one seed is one link, whose settings change under the packets that are on their way.
+/// Seed of the links that the panel adds. Settings that change while the seed stays the same apply
+/// to the same link, also for packets in flight.
 const SEED: u64 = 1;
 
-/// What the knobs show of the links in use. `other`: it is to be called another network, though its traits may still be those of a preset.
+/// Returns the knobs for the links in use.
+///
+/// `other` shows them as another network even if their settings are those of a preset.
 pub(super) fn view_of(emulation: Option<&Emulation>, other: bool) -> EmulatorView {
     let mut presets = vec!["none".to_owned()];
     presets.extend(Preset::ALL.iter().map(|preset| preset.name().to_owned()));
@@ -47,7 +50,7 @@ pub(super) fn view_of(emulation: Option<&Emulation>, other: bool) -> EmulatorVie
     }
 }
 
-/// The links that the knobs, moved from `before` to `wanted`, ask for in place of those in use.
+/// Returns the links for knobs that were moved from `before` to `wanted`, based on those in use.
 pub(super) fn emulation_of(
     before: &EmulatorView,
     wanted: &EmulatorView,
@@ -57,7 +60,8 @@ pub(super) fn emulation_of(
     if wanted.preset != before.preset {
         return match wanted.preset {
             0 => None,
-            // The network in use, with all its knobs; where there was none, a perfect one.
+            // The new network starts as the network in use, or as a perfect network if there is
+            // none.
             OTHER => Some(now.cloned().unwrap_or_else(|| Emulation {
                 outgoing: LinkConfig::default(),
                 incoming: LinkConfig::default(),
@@ -68,7 +72,7 @@ pub(super) fn emulation_of(
     }
     let mut new = now?.clone();
     new.seed = wanted.seed;
-    // Only what was moved is taken over, and then both ways alike: the knobs know of one way only.
+    // Only the moved knobs are applied, to both directions, because a knob has one value for both.
     let moved = |of: fn(&EmulatorView) -> f64| (of(wanted) != of(before)).then(|| of(wanted));
     for link in [&mut new.outgoing, &mut new.incoming] {
         if let Some(percent) = moved(|view| view.loss) {
@@ -109,7 +113,8 @@ fn milliseconds(ms: f64) -> Duration {
     Duration::try_from_secs_f64(ms.clamp(0.0, 1e5) * 1e-3).unwrap_or_default()
 }
 
-/// The share of packets that is lost in the long run, 0 to 1; of single events, none.
+/// Returns the share of packets that are lost in the long run, 0 to 1. Single events count as no
+/// loss.
 fn share(loss: &Loss) -> f64 {
     match loss {
         Loss::Random(share) => *share,
@@ -123,7 +128,7 @@ fn share(loss: &Loss) -> f64 {
     }
 }
 
-/// How long a burst lasts on average; of packets that are lost each for itself, no time.
+/// Returns the mean length of a burst, which is zero for packets that are lost independently.
 fn burst(loss: &Loss) -> Duration {
     match loss {
         Loss::GilbertElliott { bad, .. } => *bad,
@@ -131,7 +136,8 @@ fn burst(loss: &Loss) -> Duration {
     }
 }
 
-/// The same kind of loss with another share: bursts stay as long as they are and come more or less often, also by way of no loss at all.
+/// Returns the same kind of loss with another share. Bursts keep their length and change their
+/// frequency, also after the share was zero.
 fn with_share(loss: &Loss, share: f64) -> Loss {
     let share = share.clamp(0.0, 1.0);
     match loss {
@@ -139,7 +145,7 @@ fn with_share(loss: &Loss, share: f64) -> Loss {
             Loss::GilbertElliott { good: *bad, bad: *bad, loss_good: 0.0, loss_bad: 0.0 }
         }
         Loss::GilbertElliott { bad, loss_bad, .. } => {
-            // What the bad state loses is kept where it can be.
+            // The loss in the bad state is kept if possible.
             let loss_bad = if share < *loss_bad { *loss_bad } else { 1.0 };
             in_bursts(share, *bad, loss_bad)
         }
@@ -148,7 +154,8 @@ fn with_share(loss: &Loss, share: f64) -> Loss {
     }
 }
 
-/// Loss of a share in bursts that last so long on average, in which everything is lost; each packet for itself where that is no time.
+/// Returns a loss of `share` in bursts of mean length `bad`, in which everything is lost. Bursts
+/// without length lose each packet independently.
 fn with_bursts(share: f64, bad: Duration) -> Loss {
     if bad < Duration::from_micros(1) { with_share(&Loss::None, share) } else { in_bursts(share, bad, 1.0) }
 }
@@ -181,7 +188,7 @@ mod tests {
             let off = EmulatorView { preset: 0, ..shown.clone() };
             assert!(emulation_of(&shown, &off, Some(&put_in)).is_none());
         }
-        // The paper's first network, and bursts of 20 ms that take 1 % in all.
+        // The paper's first network, and bursts of 20 ms with a loss of 1 % in total.
         let paper = view_of(Some(&Emulation::preset(Preset::Paper1, 1)), false);
         assert!((paper.loss - 9.0).abs() < 1e-12 && (paper.round_trip_ms - 196.0).abs() < 1e-9);
         let wifi = view_of(Some(&Emulation::preset(Preset::Wifi, 1)), false);
@@ -257,12 +264,12 @@ mod tests {
             let moved = emulation_of(&before, &wanted, Some(&running)).unwrap();
             assert_eq!(moved, expected);
             moved.outgoing.check().unwrap();
-            // And is shown as it was asked for.
+            // The view shows the requested values.
             assert_eq!(view_of(Some(&moved), true), wanted);
         }
         let wanted = EmulatorView { burst_ms: 100.0, ..before.clone() };
         let long = emulation_of(&before, &wanted, Some(&running)).unwrap();
-        // Gilbert: bad / (good + bad) is the share, 1 %.
+        // In the Gilbert model, bad / (good + bad) is the share, 1 %.
         let Loss::GilbertElliott { good, bad, .. } = long.outgoing.loss else { panic!("{long:?}") };
         assert_eq!(bad, Duration::from_millis(100));
         assert!((good.as_secs_f64() - 9.9).abs() < 1e-6, "{good:?}");

@@ -1,4 +1,4 @@
-//! Whose hand is whose, and the hands that are on other machines.
+//! The users of the hands, and the remote hands.
 
 use bevy::{ecs::system::SystemParam, prelude::*};
 use pliant_net::{HandOf, RemoteHands, User, Yourself};
@@ -14,7 +14,10 @@ pub(super) struct People<'w, 's> {
 }
 
 impl People<'_, '_> {
-    /// Name and color of whose hand a grab is: a guest's at its host, one's own anywhere else. `None` outside a session.
+    /// Returns the name and the color of the user of a grab.
+    ///
+    /// On a host this is the guest for a guest's grab. For all other grabs it is the local user.
+    /// Returns `None` outside a session.
     pub fn whose(&self, grab: Entity) -> Option<(String, [u8; 3])> {
         let user = match self.hands.get(grab) {
             Ok(of) => self.users.get(of.0).ok()?.0,
@@ -23,7 +26,7 @@ impl People<'_, '_> {
         Some((user.name.clone(), srgb(user.color)))
     }
 
-    /// The hands that others have on a body, as the session shows them, each with what tells it from the others.
+    /// Returns the remote hands on a body, each with its key.
     pub fn others(&self, body: Entity) -> Vec<(HandKey, HandView)> {
         let mut views: Vec<(HandKey, HandView)> = Vec::new();
         for hand in self.seen.get(body).into_iter().flat_map(|seen| &seen.0) {
@@ -43,7 +46,7 @@ impl People<'_, '_> {
     }
 }
 
-/// A color's bytes.
+/// Returns the bytes of a color.
 pub(super) fn srgb(color: Color) -> [u8; 3] {
     let color = color.to_srgba();
     [color.red, color.green, color.blue].map(|x| (x.clamp(0.0, 1.0) * 255.0).round() as u8)

@@ -1,4 +1,4 @@
-//! The plugin: gathers what others published, shows it, takes the knobs over.
+//! The plugin: gathers published data, shows it, and applies the knobs.
 
 mod scene;
 
@@ -15,14 +15,14 @@ use bevy::prelude::*;
 use bevy_egui::{EguiContexts, EguiPlugin, EguiPrimaryContextPass, egui, input::EguiWantsInput};
 use pliant_body::PointerGrabSystems;
 
-/// The panel as a window over the scene. Adds [`EguiPlugin`] where nobody has.
+/// Shows the panel as a window over the scene. Adds [`EguiPlugin`] if it is missing.
 #[derive(Debug, Clone, Copy)]
 pub struct PanelPlugin {
-    /// Opens and closes the panel. Default: `F1`.
+    /// Key that opens and closes the panel. Default: `F1`.
     pub key: KeyCode,
-    /// Open from the start. Default: `true`.
+    /// Whether the panel is open from the start. Default: `true`.
     pub open: bool,
-    /// The one section that is unfolded at first. Default: `None`, all of them.
+    /// The only section that is unfolded at first. Default: `None`, all sections.
     pub only: Option<PanelSection>,
 }
 
@@ -30,11 +30,11 @@ pub struct PanelPlugin {
 #[derive(Reflect, Debug, Clone, Copy, PartialEq, Eq, Hash)]
 #[reflect(Clone, PartialEq)]
 pub enum PanelSection {
-    /// Pause, steps, speed, cost.
+    /// Pause, single steps, speed and step time.
     Time,
     /// The bodies and the hands on them.
     Bodies,
-    /// Users, network, emulator.
+    /// Users, network and emulator.
     Session,
     /// Haptic devices.
     Devices,
@@ -48,18 +48,19 @@ impl Default for PanelPlugin {
     }
 }
 
-/// The panel's own settings; may be changed at any time.
+/// The panel's own settings, which may be changed at any time.
 #[derive(Resource, Reflect, Debug, Clone, Copy, PartialEq)]
 #[reflect(Resource, Default, Clone, PartialEq)]
 pub struct Panel {
-    /// Whether it is there. Default: `true`.
+    /// Whether the panel is open. Default: `true`.
     pub open: bool,
-    /// Magnifies it, over the window's own scale factor. Default: `1.0`.
+    /// Magnification of the panel, multiplied by the window's scale factor. Default: `1.0`.
     pub zoom: f32,
-    /// Opens and closes it. Default: `F1`.
+    /// Key that opens and closes the panel. Default: `F1`.
     #[reflect(ignore)]
     pub key: KeyCode,
-    /// The one section that is unfolded when the panel is first shown. Default: `None`, all of them.
+    /// The only section that is unfolded when the panel is first shown. Default: `None`, all
+    /// sections.
     pub only: Option<PanelSection>,
 }
 
@@ -79,7 +80,7 @@ impl Plugin for PanelPlugin {
             .init_resource::<scene::Histories>()
             .add_systems(Update, toggle.run_if(resource_exists::<ButtonInput<KeyCode>>))
             .add_systems(EguiPrimaryContextPass, draw.run_if(|panel: Res<Panel>| panel.open))
-            // What is pressed in the panel is not pressed in the scene behind it.
+            // A press in the panel must not grab a body in the scene behind it.
             .configure_sets(PreUpdate, PointerGrabSystems::Press.run_if(not(wants_pointer)));
         #[cfg(feature = "haptics")]
         app.init_resource::<devices::Histories>()
@@ -89,8 +90,10 @@ impl Plugin for PanelPlugin {
     }
 }
 
-/// Run condition: the pointer is over the panel, or something in it is being dragged. For what the wheel and the buttons do in the scene; bodies and tools
-/// are not grabbed through the panel anyway. `false` where there is no panel.
+/// Run condition: the pointer is over the panel, or a part of the panel is being dragged.
+///
+/// Use it for the wheel and the buttons in the scene. Grabs of bodies and tools through the panel
+/// are already prevented. Returns `false` without a panel.
 ///
 /// ```
 /// # use bevy::prelude::*;
@@ -102,7 +105,9 @@ pub fn wants_pointer(wants: Option<Res<EguiWantsInput>>) -> bool {
     wants.is_some_and(|wants| wants.wants_any_pointer_input())
 }
 
-/// Run condition: something in the panel has the keyboard's focus, as a number that is typed. For the keys of the scene; `false` where there is no panel.
+/// Run condition: a part of the panel has the keyboard focus, for example a number field.
+///
+/// Use it for the keys of the scene. Returns `false` without a panel.
 pub fn wants_keyboard(wants: Option<Res<EguiWantsInput>>) -> bool {
     wants.is_some_and(|wants| wants.wants_any_keyboard_input())
 }
@@ -134,7 +139,7 @@ fn draw(
             .show(ui, show);
     };
     egui::Window::new("Pliant")
-        // The height is that of what is in it: this only leaves it room.
+        // The height of the window follows its content. This size only leaves room for it.
         .default_size([300.0, 4096.0])
         .constrain_to(screen.shrink(12.0))
         .default_pos([screen.right() - 330.0, screen.top() + 12.0])
@@ -144,7 +149,7 @@ fn draw(
             if devices.are_there() {
                 devices.show_stop(ui);
             }
-            // As high as what is in it, and no higher than the screen.
+            // The area is as high as its content, but not higher than the screen.
             egui::ScrollArea::vertical().auto_shrink([false, true]).max_height(screen.height() - 90.0).show(
                 ui,
                 |ui| {

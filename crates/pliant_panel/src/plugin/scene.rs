@@ -1,4 +1,4 @@
-//! Bodies, time and the recording of a scene.
+//! The bodies, the time and the recording of a scene.
 
 use std::collections::HashMap;
 
@@ -19,7 +19,7 @@ use crate::{
     time::{self, TimeView},
 };
 
-/// What the panel remembers of the scene, for its plots.
+/// Data of the scene that the panel keeps between frames, for its plots.
 #[derive(Resource, Default)]
 pub(super) struct Histories {
     energies: EntityHashMap<Trace>,
@@ -30,12 +30,12 @@ pub(super) struct Histories {
     deform_ms: Trace,
 }
 
-/// Tells a hand from all others.
+/// Identifies a hand.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
 pub(super) enum HandKey {
-    /// A grab of this app.
+    /// A grab entity of this app.
     Grab(Entity),
-    /// Held elsewhere: on which body, by whom, and which of that user's hands there.
+    /// A remote hand: its body, its user, and its number among that user's hands on the body.
     #[cfg(feature = "net")]
     Seen { body: Entity, user: u16, nth: usize },
 }
@@ -103,7 +103,8 @@ impl Scene<'_, '_> {
 
     pub fn show_bodies(&mut self, ui: &mut Ui) {
         let now = self.real_time.elapsed_secs_f64();
-        // What is not shown in this frame is not put back: bodies that are gone, hands that let go, users that left.
+        // Histories that are not shown in this frame are dropped: those of removed bodies, released
+        // hands and users who left.
         let mut energies = std::mem::take(&mut self.histories.energies);
         let mut forces = std::mem::take(&mut self.histories.forces);
         let folded = std::mem::take(&mut self.histories.folded);
@@ -174,7 +175,7 @@ impl Scene<'_, '_> {
             }
             take_over(&view, body, state);
             if view.release {
-                // A guest whose hand this was is told by the session.
+                // If the hand belongs to a guest, the session notifies that guest.
                 for &grab in grabs.map(Grabs::entities).unwrap_or_default() {
                     self.commands.entity(grab).despawn();
                 }
@@ -185,13 +186,16 @@ impl Scene<'_, '_> {
     }
 }
 
-/// What a body without a name of its own is called: as the file that it was baked from.
+/// Returns the name of a body without a name of its own: the name of the file from which it was
+/// baked.
 fn model_name(file: &str, entity: Entity) -> String {
     let file = std::path::Path::new(file).file_stem();
     file.map_or_else(|| format!("body {entity}"), |stem| stem.to_string_lossy().into_owned())
 }
 
-/// Kinetic and elastic energy, J of the world; of a body that somebody else steps only the shape is known, and only its elastic energy.
+/// Returns the kinetic and elastic energy, J, in the world's scale.
+///
+/// For a remote body only the shape is known, so that the result is its elastic energy.
 fn energy_of(state: &BodyState, driven: &Driven, shown: Option<&VisualState>) -> f64 {
     let energy = match (driven, shown) {
         (Driven::Remote, Some(shown)) => {
@@ -207,7 +211,8 @@ fn take_over(view: &BodyView, mut body: Mut<ModalBody>, mut state: Mut<BodyState
     if !view.local {
         return;
     }
-    // Written only where something differs: a change makes the body look at its settings anew.
+    // The component is written only if a value differs, because a change makes the body check its
+    // settings again.
     let kept = state.body().mode_count();
     if view.modes != kept {
         body.modes = (view.modes < view.all_modes).then_some(view.modes.max(1));

@@ -1,4 +1,4 @@
-//! The session: its users, its network.
+//! The session: its users and its network.
 
 use bevy::{ecs::system::SystemParam, prelude::*};
 use bevy_egui::egui::Ui;
@@ -12,12 +12,12 @@ use crate::{
     network::{self, NetworkView, UserView},
 };
 
-/// What the panel remembers of the network.
+/// Data of the network that the panel keeps between frames.
 #[derive(Resource, Default)]
 pub(super) struct Histories {
     round_trips: Trace,
     rates: Trace,
-    /// "other" was chosen among the emulated networks.
+    /// Whether "other" was chosen among the emulated networks.
     other: bool,
 }
 
@@ -98,7 +98,8 @@ impl Session<'_, '_> {
             && before != wanted
         {
             let now = self.emulation();
-            // Moved away from its preset, or called so: another network until a preset is chosen again.
+            // A network that was changed from its preset, or chosen as "other", is shown as "other"
+            // until a preset is chosen again.
             self.histories.other = wanted.other() || (wanted.preset == before.preset && wanted.preset > 0);
             self.emulate(emulator::emulation_of(&before, &wanted, now.as_ref()));
         }
@@ -146,7 +147,7 @@ impl Session<'_, '_> {
         }
     }
 
-    /// A recording that is played again has no network under it.
+    /// Whether the session has a network to emulate. The playback of a recording has none.
     fn may_emulate(&self) -> bool {
         self.host.is_some()
             || self.peer.is_some()

@@ -1,4 +1,4 @@
-//! Rates that are held to.
+//! Rate limits.
 
 use std::time::Duration;
 
@@ -12,7 +12,7 @@ pub(crate) struct Budget {
 }
 
 impl Budget {
-    /// `rate` a second, at most `most` at once; full at the beginning.
+    /// Creates a full bucket that gains `rate` per second and holds at most `most`.
     pub(crate) fn new(rate: f64, most: f64) -> Self {
         Self { rate, most, left: most, at: Duration::ZERO }
     }
@@ -23,13 +23,13 @@ impl Budget {
         self.at = self.at.max(now);
     }
 
-    /// Whether `amount` is there.
+    /// Returns whether `amount` is available.
     pub(crate) fn has(&mut self, now: Duration, amount: f64) -> bool {
         self.refill(now);
         self.left >= amount
     }
 
-    /// Takes `amount` if it is there.
+    /// Takes `amount` if it is available, and returns whether it was.
     pub(crate) fn spend(&mut self, now: Duration, amount: f64) -> bool {
         let there = self.has(now, amount);
         if there {
@@ -38,7 +38,7 @@ impl Budget {
         there
     }
 
-    /// When `amount` will be there.
+    /// Returns the time at which `amount` will be available.
     pub(crate) fn ready_at(&self, amount: f64) -> Duration {
         let missing = (amount.min(self.most) - self.left).max(0.0);
         self.at

@@ -1,11 +1,11 @@
-//! What happened, until the application asks.
+//! A bounded queue of events for the application.
 
 use std::collections::VecDeque;
 
-/// Most events that wait for the application.
+/// Largest number of events that wait for the application.
 const MOST: usize = 4096;
 
-/// Events in order. When too many wait, the oldest is dropped and counted.
+/// Events in order. When the queue is full, the oldest event is dropped and counted.
 #[derive(Debug)]
 pub(crate) struct Events<T> {
     waiting: VecDeque<T>,
@@ -31,7 +31,7 @@ impl<T> Events<T> {
         self.waiting.pop_front()
     }
 
-    /// Events that nobody fetched in time.
+    /// Number of events that were dropped before the application fetched them.
     pub(crate) fn dropped(&self) -> u64 {
         self.dropped
     }

@@ -1,4 +1,4 @@
-//! One connection's books: the same for a host's guest, a guest's host and a peer's peer.
+//! State of one connection, the same for a host's guest, a guest's host and a peer's peer.
 
 mod budget;
 mod events;
@@ -19,19 +19,19 @@ use crate::wire::{Clock, Report};
 use round_trip::RoundTrip;
 use tally::{Arrival, Tally, loss_of};
 
-/// The state of a connection: sequence numbers, what was lost, the round trip, when the other side was
-/// last heard, and counts.
+/// State of a connection: sequence numbers, loss, round trip, time of the last reception, and
+/// counts.
 #[derive(Debug)]
 pub(crate) struct Link {
     peer: PeerId,
-    /// Bytes that a datagram may have.
+    /// Largest size of a datagram, bytes.
     pub(crate) max_datagram: usize,
     received_at: Duration,
     sequence: u16,
     received: Tally,
     round_trip: RoundTrip,
     last_round_trips: [Duration; 2],
-    /// Counts, and what only one role measures. [`Link::stats`] has the rest too.
+    /// Counts, and values that only one role measures. [`Link::stats`] adds the other values.
     pub(crate) stats: LinkStats,
 }
 
@@ -49,22 +49,22 @@ impl Link {
         }
     }
 
-    /// The other side has said something, or is given time anew.
+    /// Restarts the idle timeout, because the other side sent something or is given more time.
     pub(crate) fn received_at(&mut self, now: Duration) {
         self.received_at = now;
     }
 
-    /// Whether nothing came for longer than `patience`.
+    /// Returns whether nothing was received for longer than `patience`.
     pub(crate) fn is_silent(&self, now: Duration, patience: Duration) -> bool {
         now.saturating_sub(self.received_at) > patience
     }
 
-    /// When it will have been silent for longer than `patience`.
+    /// Time at which the connection will have been silent for longer than `patience`.
     pub(crate) fn silent_at(&self, patience: Duration) -> Duration {
         self.received_at + patience + Duration::from_millis(1)
     }
 
-    /// Takes in a datagram that could be read; false for a copy of one that has come before.
+    /// Counts a datagram that could be decoded. Returns false for a duplicate.
     pub(crate) fn receive_datagram(&mut self, now: Duration, sequence: u16, bytes: usize) -> bool {
         self.received_at = now;
         let arrival = self.received.take(sequence);
@@ -75,18 +75,18 @@ impl Link {
         arrival != Arrival::Copy
     }
 
-    /// Takes in a message, which may yet turn out to make no sense.
+    /// Counts a message. The message may still turn out to be invalid.
     pub(crate) fn receive_message(&mut self, now: Duration, bytes: usize) {
         self.received_at = now;
         self.stats.message_bytes_in += bytes as u64;
     }
 
-    /// Counts what could not be read or made no sense.
+    /// Counts bytes that could not be decoded or were invalid.
     pub(crate) fn reject(&mut self) {
         self.stats.rejected += 1;
     }
 
-    /// Sends a datagram, which is encoded with its sequence number.
+    /// Sends the datagram that `encode` makes from its sequence number.
     pub(crate) fn send_datagram(&mut self, encode: impl FnOnce(u16) -> Vec<u8>, out: &mut VecDeque<Output>) {
         let bytes = encode(self.sequence);
         self.sequence = self.sequence.wrapping_add(1);
@@ -95,7 +95,7 @@ impl Link {
         out.push_back(Output { peer: self.peer, channel: Channel::Datagram, bytes: bytes.into() });
     }
 
-    /// Does not send a datagram for which there is no room: to the other side it is lost.
+    /// Skips a datagram for which the output queue has no room. The other side counts it as lost.
     pub(crate) fn drop_datagram(&mut self) {
         self.sequence = self.sequence.wrapping_add(1);
     }
@@ -106,34 +106,34 @@ impl Link {
         out.push_back(Output { peer: self.peer, channel: Channel::Message, bytes: bytes.into() });
     }
 
-    /// What the other side says of the datagrams that it had from here.
+    /// Stores the other side's report on the datagrams sent from here.
     pub(crate) fn take_report(&mut self, report: Report) {
         self.stats.loss_out = loss_of(report);
     }
 
-    /// What a clock exchange says beside its times.
+    /// Returns a clock exchange with the report and the last round trip, without timestamps.
     pub(crate) fn clock(&self) -> Clock {
         let round_trip = u32::try_from(micros(self.last_round_trips[1])).unwrap_or(u32::MAX);
         Clock { report: self.received.report(), round_trip, ..Clock::default() }
     }
 
-    /// A round trip was measured, here or by the other side.
+    /// Adds a round trip that this side or the other side measured.
     pub(crate) fn sample_round_trip(&mut self, sample: Duration) {
         self.round_trip.sample(sample);
         self.last_round_trips = [self.last_round_trips[1], sample];
     }
 
-    /// The smoothed round trip; `None` before the first was measured.
+    /// The smoothed round trip; `None` before the first measurement.
     pub(crate) fn round_trip(&self) -> Option<Duration> {
         self.round_trip.known().map(|[smooth, _]| smooth)
     }
 
-    /// The lesser of the last two round trips, unsmoothed; zero before there are two.
+    /// The smaller of the last two unsmoothed round trips; zero before there are two.
     pub(crate) fn least_round_trip(&self) -> Duration {
         self.last_round_trips[0].min(self.last_round_trips[1])
     }
 
-    /// How the connection does.
+    /// Returns all metrics of the connection.
     pub(crate) fn stats(&self) -> LinkStats {
         let mut stats = self.stats;
         stats.loss_in = self.received.loss();

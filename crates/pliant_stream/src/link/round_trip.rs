@@ -1,4 +1,4 @@
-//! How long it takes there and back.
+//! Smoothed round-trip time.
 
 use std::time::Duration;
 

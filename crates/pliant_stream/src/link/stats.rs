@@ -1,19 +1,20 @@
-//! Counts and times of a connection, for people.
+//! Metrics of a connection.
 
 use std::time::Duration;
 
-/// How well the path and the repair are doing, as one side sees it. Counts are since the session began.
+/// Metrics of a connection and of its loss repair, as one side sees them. Counts start with the
+/// session.
 #[derive(Debug, Clone, Copy, PartialEq, Default)]
 pub struct LinkStats {
     /// Smoothed round trip; zero before the first measurement.
     pub round_trip: Duration,
     /// Smoothed deviation of the round trip.
     pub jitter: Duration,
-    /// Datagrams sent.
+    /// Number of datagrams sent.
     pub datagrams_out: u64,
-    /// Datagrams received and accepted.
+    /// Number of datagrams received and accepted.
     pub datagrams_in: u64,
-    /// Bytes of datagrams sent, without the transport's own.
+    /// Bytes of datagrams sent, without the transport's overhead.
     pub bytes_out: u64,
     /// Bytes of datagrams received.
     pub bytes_in: u64,
@@ -23,19 +24,20 @@ pub struct LinkStats {
     pub message_bytes_in: u64,
     /// Share of the other side's datagrams that did not arrive here, 0..1.
     pub loss_in: f64,
-    /// Share of this side's datagrams that did not arrive there, 0..1, as the other side reports.
+    /// Share of this side's datagrams that did not arrive at the other side, 0..1, as the other
+    /// side reports.
     pub loss_out: f64,
-    /// NACKs sent (guest) or received (host).
+    /// Number of NACKs sent (guest) or received (host).
     pub nacks: u64,
-    /// Datagrams that could not be read or made no sense.
+    /// Number of datagrams and messages that could not be decoded or were invalid.
     pub rejected: u64,
-    /// Host only: how far this guest's stream is cut down, 0 (not at all) to 6; see
+    /// Reduction level of this guest's stream, 0 (none) to 6. Host only; see
     /// [`HostConfig::guest_rate`](crate::session::HostConfig::guest_rate).
     pub level: u8,
 }
 
 impl LinkStats {
-    /// Adds another connection's counts; times, shares and the level stay.
+    /// Adds another connection's counts. Times, shares and the level stay unchanged.
     pub fn add_counts(&mut self, other: &Self) {
         self.datagrams_out += other.datagrams_out;
         self.datagrams_in += other.datagrams_in;

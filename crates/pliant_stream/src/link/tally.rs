@@ -1,26 +1,27 @@
-//! What arrives of what was sent, by sequence numbers.
+//! Loss statistics from sequence numbers.
 
 use crate::wire::Report;
 
-/// What a sequence number says of its datagram.
+/// Classifies a datagram by its sequence number.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(crate) enum Arrival {
-    /// Its first copy.
+    /// The first copy of the datagram.
     New,
-    /// It has arrived before.
+    /// A duplicate.
     Copy,
-    /// So far behind that nobody knows. It is not counted: the number may be garbage.
+    /// A number too far behind to tell whether it is a duplicate. It is not counted, since it may
+    /// be garbage.
     Old,
 }
 
-/// Counts what arrives from one sender by its sequence numbers.
+/// Counts the datagrams of one sender by their sequence numbers.
 #[derive(Debug, Clone, Default)]
 pub(crate) struct Tally {
     started: bool,
     first: u64,
     highest: u64,
     received: u64,
-    /// Bit i: sequence `highest - i` has arrived. A second copy is not counted.
+    /// Bit i is set when sequence `highest - i` has arrived. Duplicates are not counted.
     window: u64,
 }
 
@@ -34,7 +35,7 @@ impl Tally {
             self.received = 1;
             return Arrival::New;
         }
-        // The full number nearest to the highest seen.
+        // The full number is the one nearest to the highest number seen.
         let delta = i64::from(sequence.wrapping_sub(self.highest as u16) as i16);
         let full = self.highest.saturating_add_signed(delta);
         if full > self.highest {
@@ -60,13 +61,13 @@ impl Tally {
         Report { received: self.received as u32, highest: sent as u32 }
     }
 
-    /// Share of what was sent up to the highest number that has not arrived.
+    /// Share of the datagrams up to the highest number that did not arrive.
     pub(crate) fn loss(&self) -> f64 {
         loss_of(self.report())
     }
 }
 
-/// The share lost according to a report.
+/// Returns the lost share according to a report.
 pub(crate) fn loss_of(report: Report) -> f64 {
     if report.highest == 0 {
         0.0

@@ -1,4 +1,4 @@
-//! One body at a peer: stepped at once, and stepped again when a late input says otherwise.
+//! One body at a peer: stepped at once, and stepped again when a late input arrives.
 
 use std::sync::Arc;
 
@@ -14,28 +14,30 @@ use crate::recovery::{Blend, Forecast, PoseBlend};
 use crate::replica::Replica;
 use crate::state::{BodyId, GrabKey, GrabState, Pose, State, Tick, UserId};
 
-/// How a late input is put right.
+/// Correction of the state for a late input.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 pub enum Repair {
-    /// Back to the tick before it, and step again with what is known now: exact. The default.
+    /// Rolls back to the tick before the input and steps again with all known inputs. This is
+    /// exact, and the default.
     #[default]
     Rollback,
-    /// The paper's: the acceleration that the late target would have made at its tick, less the one that was made, moves
-    /// displacement and velocity by equations (8) and (9). Cheaper by the number of ticks, and right only as far as the
-    /// body does not answer within them.
+    /// Compensates as in the paper. The acceleration that the late target would have caused at its
+    /// tick, less the one that was used, changes displacement and velocity by equations (8) and
+    /// (9). This is cheaper by the number of ticks, and accurate only as far as the body does not
+    /// respond within them.
     Compensate,
 }
 
-/// What a grab did in a step.
+/// Force and target of a grab in a step.
 #[derive(Debug, Clone, Copy, PartialEq)]
 struct Grip {
     key: GrabKey,
-    /// At the end of the step, and over it, world axes, N.
+    /// Force on the body at the end of the step (`pull`) and over it (`mean`), world axes, N.
     pull: Vector3<f64>,
     mean: Vector3<f64>,
-    /// Where the hand was, world, m.
+    /// Position of the hand, world, m.
     target: Vector3<f64>,
-    /// How far the residual flexibility of its patch has flown, body axes, m.
+    /// Viscoelastic state of the patch's residual flexibility, body axes, m.
     flow: Vector3<f64>,
 }
 
@@ -102,60 +104,60 @@ impl PeerBody {
             grabs: Vec::new(),
             restepped: 0,
         };
-        // The beginning can be gone back to like any other tick.
+        // A rollback can return to the initial state like to any other tick.
         made.remember();
         Ok(made)
     }
 
-    /// Its number.
+    /// Number of the body.
     pub fn id(&self) -> BodyId {
         self.id
     }
 
-    /// Its model.
+    /// The model of the body.
     pub fn model(&self) -> &Arc<ModalModel> {
         &self.model
     }
 
-    /// How it is stepped.
+    /// The step settings of the body.
     pub fn settings(&self) -> &StepSettings {
         self.replica.kernel().settings()
     }
 
-    /// The tick that it has reached.
+    /// The tick that the body has reached.
     pub fn tick(&self) -> Tick {
         self.tick
     }
 
-    /// Best estimate of what all peers will agree on.
+    /// The confirmed state: the best estimate of the state on which all peers will agree.
     pub fn confirmed(&self) -> &State {
         &self.state
     }
 
-    /// What the eye and the hand get: continuous in position and velocity.
+    /// The visual state for display and hands. It is continuous in position and velocity.
     pub fn visual(&self) -> &State {
         &self.visual
     }
 
-    /// The rigid frame of a free body as it is shown; `None` for an anchored one.
+    /// The visual rigid frame of a free body; `None` for an anchored one.
     pub fn pose(&self) -> Option<Pose> {
         self.pose
     }
 
-    /// The rigid frame of a free body after a tick that is still remembered.
+    /// The rigid frame of a free body after a remembered tick.
     pub(crate) fn past_pose(&self, tick: Tick) -> Option<Pose> {
         self.past(tick)?;
         let past = &self.past[(tick % WINDOW as u64) as usize];
         self.model.is_free().then(|| Pose::of_frame(&self.model, &past.state.frame))
     }
 
-    /// The checksum's value of a tick that is still remembered, and the size that it is compared by.
+    /// Returns the checksum of a remembered tick and the magnitude that scales its tolerance.
     pub(crate) fn check(&self, tick: Tick) -> Option<(f64, f64)> {
         let state = self.past(tick)?;
         let mut size = state.q.iter().chain(&state.z).map(|q| q * q).sum::<f64>();
         let mut sum = checksum(tick, state);
         if let Some(pose) = self.past_pose(tick) {
-            // Place and turn in the units of the coordinates.
+            // Position and rotation are scaled to the units of the modal coordinates.
             let (mass, span) = (self.model.mass().sqrt(), self.model.size());
             let sign = if pose.rotation[3] < 0.0 { -span } else { span };
             let turn = pose.rotation.map(|x| x * sign);
@@ -166,23 +168,23 @@ impl PeerBody {
         Some((sum, size.sqrt()))
     }
 
-    /// Everything that holds the body, with its reactions.
+    /// All grabs of the body, with their reactions.
     pub fn grabs(&self) -> &[GrabState] {
         &self.grabs
     }
 
-    /// Ticks that were stepped again.
+    /// Number of ticks that were stepped again.
     pub fn restepped(&self) -> u64 {
         self.restepped
     }
 
-    /// The state after a tick that is still remembered.
+    /// The state after a remembered tick.
     pub(crate) fn past(&self, tick: Tick) -> Option<&State> {
         let past = &self.past[(tick % WINDOW as u64) as usize];
         (past.tick == tick && tick <= self.tick && past.state.modes() > 0).then_some(&past.state)
     }
 
-    /// The reactions (N) of the hands at a tick that is still remembered, with whose they are.
+    /// Reactions (N) of the hands at a remembered tick, with their users.
     pub(crate) fn reactions_at(&self, tick: Tick) -> Option<Vec<(UserId, [f64; 3])>> {
         self.past(tick)?;
         let past = &self.past[(tick % WINDOW as u64) as usize];
@@ -219,7 +221,8 @@ impl PeerBody {
         })
     }
 
-    /// Takes a state over and steps on from it to the tick reached.
+    /// Takes a state and steps from it to the tick `to`. Returns false when the state does not fit
+    /// the body.
     pub(crate) fn import(&mut self, tick: Tick, to: Tick, state: &PeerBodyState, inputs: &InputLog) -> bool {
         let told = state
             .frame
@@ -267,7 +270,8 @@ impl PeerBody {
         self.show();
     }
 
-    /// Puts right what inputs for `from` and later say, from `from` on. False when that is too long ago.
+    /// Corrects the state for new inputs at tick `from` and later. Returns false when `from` is not
+    /// remembered.
     pub(crate) fn correct(&mut self, from: Tick, inputs: &InputLog) -> bool {
         if from > self.tick {
             return true;
@@ -295,7 +299,8 @@ impl PeerBody {
         true
     }
 
-    /// Equations (8) and (9) for every tick from `from` on whose inputs are not what was used.
+    /// Applies equations (8) and (9) to every tick from `from` on whose known inputs differ from
+    /// those used.
     fn compensate(&mut self, from: Tick, inputs: &InputLog) {
         let mut held = Vec::new();
         for tick in from..=self.tick {
@@ -313,7 +318,8 @@ impl PeerBody {
             let used = std::mem::take(&mut self.past[index].used);
             Self::press(&mut self.replica, &mut with, &mut pulls, &held);
             Self::press(&mut self.replica, &mut without, &mut old_pulls, &used);
-            // The history is put right like the state of now: later corrections and checks are against it.
+            // The history is corrected like the present state, because later corrections and checks
+            // use it.
             for t in tick..=self.tick {
                 let at = (t % WINDOW as u64) as usize;
                 if self.past[at].tick != t {
@@ -329,7 +335,7 @@ impl PeerBody {
                 let state = &mut self.past[at].state;
                 for k in 0..state.modes() {
                     let da = with.a[k] - without.a[k];
-                    // At its own tick the difference is known.
+                    // The difference at the tick itself is known exactly.
                     let own = t == tick;
                     state.q[k] += if own { with.q[k] - without.q[k] } else { to_q * da };
                     state.v[k] += if own { with.v[k] - without.v[k] } else { to_v * da };
@@ -352,8 +358,8 @@ impl PeerBody {
         self.pulls.clone_from(&now.pulls);
     }
 
-    /// The frame as it would be, had it gone `there` instead of `here` so many seconds ago: what was different then in
-    /// velocity and spin has led on since.
+    /// Returns the frame as it would be if the body had been at `there` instead of `here` `seconds`
+    /// ago. The difference in velocity and spin has acted since.
     fn moved(&self, frame: &Frame, there: &Frame, here: &Frame, seconds: f64) -> Frame {
         let of = |f: fn(&Frame) -> [f64; 3]| Vector3::from(f(there)) - Vector3::from(f(here));
         let (faster, spin) = (of(Frame::velocity), of(Frame::spin));
@@ -377,12 +383,13 @@ impl PeerBody {
         self.remember();
     }
 
-    /// One step of a state with hands; the pulls that acted (N, world axes) come out.
+    /// Steps a state with hands once and replaces `pulls` by the grabs of this step.
     fn press(replica: &mut Replica, state: &mut State, pulls: &mut Vec<Grip>, held: &[(UserId, HeldAt)]) {
         let mut hands = Vec::with_capacity(held.len());
         let mut keys = Vec::with_capacity(held.len());
         for (user, g) in held {
-            // All peers leave out the same: one that is larger than the body costs a look at every vertex of it.
+            // All peers ignore the same patches. A patch larger than the body would visit every
+            // vertex of the body.
             if g.radius > replica.model().size() {
                 continue;
             }
@@ -390,7 +397,7 @@ impl PeerBody {
             let key = g.key(*user);
             let (target, config) = (Vector3::from(g.target), g.hold);
             let before = pulls.iter().find(|p| p.key == key);
-            // A hand that has just taken hold has not moved.
+            // A new hand has not moved yet.
             let way = before.map_or_else(Vector3::zeros, |before| target - before.target);
             let velocity = way / replica.kernel().h();
             let hand = Hand::new(patch, Hold::Target { target, velocity, config });

@@ -9,21 +9,23 @@ use crate::state::{PeerId, UserId};
 /// Settings of a peer.
 #[derive(Debug, Clone, PartialEq)]
 pub struct PeerConfig {
-    /// This peer's number; all have different ones, and the lowest is right when states disagree.
+    /// Number of this peer. Every peer has a different one, and the lowest number is right when
+    /// states disagree.
     pub user: UserId,
-    /// A name for people, at most 64 bytes.
+    /// Display name, at most 64 bytes.
     pub name: String,
     /// Length of a step, s. Default: 1/40.
     pub step: f64,
-    /// Default: [`Repair::Rollback`].
+    /// Repair of late inputs. Default: [`Repair::Rollback`].
     pub repair: Repair,
-    /// Ticks over which the shown error fades. Default: 6.
+    /// Number of ticks over which the visible error fades. Default: 6.
     pub blend_ticks: u16,
-    /// Earlier ticks that each datagram repeats, at most 15. Default: 4.
+    /// Number of earlier ticks that each datagram repeats, at most 15. Default: 4.
     pub repeats: usize,
-    /// A peer that is silent for so long is gone. Default: 10 s.
+    /// Silence after which a peer counts as gone. Default: 10 s.
     pub idle_timeout: Duration,
-    /// Begin with a state of one's own (the first peer) or wait for another's. Default: true.
+    /// Starts with this peer's own state (the first peer) instead of waiting for another's.
+    /// Default: true.
     pub founds: bool,
 }
 
@@ -42,37 +44,37 @@ impl Default for PeerConfig {
     }
 }
 
-/// What happened at a peer.
+/// An event at a peer.
 #[derive(Debug, Clone, PartialEq)]
 #[non_exhaustive]
 pub enum PeerEvent {
     /// This peer has a state and steps.
     Started,
-    /// Another peer is here.
+    /// Another peer joined.
     Joined {
-        /// Number.
+        /// User number.
         user: UserId,
-        /// Name.
+        /// Display name.
         name: String,
     },
-    /// Another peer is gone.
+    /// Another peer left.
     Left {
-        /// Number.
+        /// User number.
         user: UserId,
-        /// Why.
+        /// The reason.
         reason: DisconnectReason,
     },
-    /// A connection is over before its peer was let in: it said no hello in time, or one that does not hold. No
-    /// [`PeerEvent::Joined`] came before. Close the connection.
+    /// A connection ended before its peer was accepted, because its hello was missing or invalid.
+    /// No [`PeerEvent::Joined`] preceded this event. Close the connection.
     TurnedAway {
-        /// Which connection.
+        /// The connection.
         peer: PeerId,
-        /// Why.
+        /// The reason.
         reason: DisconnectReason,
     },
-    /// Another peer's state was taken over.
+    /// This peer took another peer's state.
     Resynced {
-        /// Whose.
+        /// User number of the other peer.
         from: UserId,
     },
 }

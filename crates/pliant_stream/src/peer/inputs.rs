@@ -1,4 +1,4 @@
-//! What all users' hands did, tick by tick.
+//! The inputs of all users' hands, tick by tick.
 
 use std::collections::BTreeMap;
 
@@ -6,20 +6,20 @@ use super::wire::{HeldAt, InputTick};
 use crate::recovery::Forecast;
 use crate::state::{BodyId, Tick, UserId};
 
-/// Ticks remembered.
+/// Number of ticks remembered.
 pub(crate) const WINDOW: usize = 128;
 
-/// One user's inputs.
+/// Inputs of one user.
 #[derive(Debug)]
 pub(crate) struct UserInputs {
     slots: Vec<Option<InputTick>>,
-    /// Inputs are expected from here on.
+    /// The first tick for which inputs are expected.
     pub(crate) first: Tick,
-    /// The newest tick known.
+    /// The newest known tick.
     pub(crate) highest: Tick,
-    /// All ticks up to here are known.
+    /// All ticks up to this one are known.
     pub(crate) complete: Tick,
-    /// The user has gone: after `highest` nothing is held.
+    /// The user has left. Nothing is held after `highest`.
     pub(crate) gone: bool,
 }
 
@@ -47,7 +47,8 @@ impl UserInputs {
         true
     }
 
-    /// What the user held at a tick, known or forecast; the flag is true when it is known.
+    /// Appends what the user held at a tick, known or extrapolated. Returns true when the input is
+    /// known.
     fn held(&self, tick: Tick, forecast: &Forecast, out: &mut Vec<HeldAt>) -> bool {
         if tick < self.first || (self.gone && tick > self.highest) {
             return true;
@@ -76,7 +77,7 @@ impl UserInputs {
     }
 }
 
-/// All users' inputs.
+/// Inputs of all users.
 #[derive(Debug, Default)]
 pub(crate) struct InputLog {
     pub(crate) users: BTreeMap<UserId, UserInputs>,
@@ -88,8 +89,9 @@ impl InputLog {
         self.users.insert(user, UserInputs::new(first));
     }
 
-    /// Forgets users that have gone and whose last input is older than the window: nothing is stepped again from that far
-    /// back, and after its last input a gone user holds nothing.
+    /// Forgets users that have left and whose last input is older than the window. Nothing is
+    /// stepped again from that far back, and a user that has left holds nothing after the last
+    /// input.
     pub(crate) fn forget_gone(&mut self, tick: Tick) {
         self.users.retain(|_, u| {
             let said_nothing = u.highest < u.first;
@@ -97,12 +99,12 @@ impl InputLog {
         });
     }
 
-    /// Takes an input in; true when it is news.
+    /// Adds an input. Returns true when it is new.
     pub(crate) fn put(&mut self, user: UserId, input: InputTick) -> bool {
         self.users.get_mut(&user).is_some_and(|u| u.put(input))
     }
 
-    /// Everything that holds a body at a tick, by user and grab; true when all of it is known.
+    /// Collects all grabs of a body at a tick, by user. Returns true when all inputs are known.
     pub(crate) fn held(
         &self,
         tick: Tick,
@@ -144,11 +146,11 @@ mod tests {
                 u.gone = true;
             }
             log.forget_gone(tick);
-            // Ten ticks apart: as many as fit in the window are left.
+            // The users are ten ticks apart, so as many remain as fit in the window.
             assert!(log.users.len() as u64 <= window / 10 + 1, "{}", log.users.len());
         }
         assert_eq!(log.users.len() as u64, window / 10 + 1);
-        // Who said nothing is forgotten at once, who stays never.
+        // A user without inputs is forgotten at once, and a user that stays is never forgotten.
         log.expect(UserId(2000), 10_001);
         if let Some(u) = log.users.get_mut(&UserId(2000)) {
             u.gone = true;

@@ -1,12 +1,15 @@
-//! Peer to peer: every peer steps every body, and only the hands' targets cross.
+//! Peer to peer: every peer steps every body, and the peers exchange the targets of their hands.
 //!
-//! A peer steps at once, with its own hands as they are and the others' as they are forecast; when their targets arrive,
-//! late, it goes back and steps again ([`Repair::Rollback`]), or takes the difference out by the paper's equations
-//! ([`Repair::Compensate`]). Its own hand never waits. Each datagram says the last few ticks again; what is still missing
-//! is asked for. Checksums of ticks for which all inputs are known are compared: the peer with the lowest number is right,
-//! and the others take its state over when they disagree. A late joiner begins with its state too.
+//! A peer steps at once, with its own hands as they are and the remote hands extrapolated. When
+//! late targets arrive, the peer rolls back and steps again ([`Repair::Rollback`]), or removes the
+//! difference by the paper's equations ([`Repair::Compensate`]). Its own hand never waits. Each
+//! datagram repeats the last few ticks, and ticks that are still missing are requested. Peers
+//! compare checksums of ticks for which all inputs are known. The peer with the lowest number is
+//! right, and the others take its state when the checksums disagree. A late joiner starts with its
+//! state too.
 //!
-//! Free bodies are stepped with their rigid frames, bodies that relax with their flows.
+//! Free bodies are stepped with their rigid frames, and bodies that relax with their viscoelastic
+//! state.
 
 mod body;
 mod config;

@@ -1,4 +1,4 @@
-//! What a peer knows of another.
+//! The state that a peer keeps of another peer.
 
 use std::collections::BTreeMap;
 use std::time::Duration;
@@ -6,33 +6,33 @@ use std::time::Duration;
 use crate::link::{Budget, Link};
 use crate::state::{BodyId, PeerId, Tick, UserId};
 
-/// Disagreements in a row before the other's state is taken over.
+/// Number of consecutive mismatches after which the other peer's state is taken.
 const CHECKS: u32 = 3;
 
 #[derive(Debug)]
 pub(super) struct Other {
     pub(super) link: Link,
-    /// Who it is, once it has said so.
+    /// User number of the peer, after its hello.
     pub(super) user: Option<UserId>,
-    /// Who it must be.
+    /// User number that the peer must have.
     pub(super) expected: UserId,
-    /// How early datagrams come, s: own clock less their ticks' time, the mean of it.
+    /// Mean of the local clock minus the time of the sender's tick, at arrival, s.
     pub(super) way: Option<f64>,
-    /// Running mean of: own tick less theirs at arrival.
+    /// Running mean of this peer's tick minus the other's tick, at arrival here, ticks.
     pub(super) ahead: Option<f64>,
-    /// The same as they see it.
+    /// The same mean as the other peer reports it, ticks.
     pub(super) theirs: Option<f64>,
     pub(super) asked: BTreeMap<Tick, Duration>,
-    /// Checks in a row that disagreed, for each body.
+    /// Number of consecutive checks that disagreed, per body.
     pub(super) mismatched: BTreeMap<BodyId, u32>,
-    /// What it said came too late to be of use: only a state can help.
+    /// The peer's inputs arrived too late or are missing too long, so only a state can help.
     pub(super) lost: bool,
     pub(super) wants_state: bool,
-    /// We have asked it for its state and it has not answered.
+    /// This peer has requested the other's state and has no answer yet.
     pub(super) asked_state: bool,
-    /// Ticks that it may have said again.
+    /// Budget of ticks that are sent again to the peer.
     pub(super) answer_budget: Budget,
-    /// States that it may have.
+    /// Budget of states that are sent to the peer.
     pub(super) state_budget: Budget,
 }
 
@@ -50,28 +50,30 @@ impl Other {
             lost: false,
             wants_state: false,
             asked_state: false,
-            // All of the window, asked for again every 150 ms, is 853 ticks a second: nobody honest asks for more.
+            // A request for the whole window every 150 ms is 853 ticks a second. A well-behaved
+            // peer requests no more.
             answer_budget: Budget::new(1000.0, 1000.0),
             state_budget: Budget::new(2.0, 16.0),
         }
     }
 
-    /// Whether a body of ours lastingly differs from this peer's.
+    /// Returns whether a body lastingly differs from the other peer's.
     pub(super) fn is_apart(&self) -> bool {
         self.lost || self.mismatched.values().any(|count| *count >= CHECKS)
     }
 
-    /// Forgets what differed.
+    /// Clears all recorded differences.
     pub(super) fn agreed(&mut self) {
         self.mismatched.clear();
         self.lost = false;
     }
 
-    /// Takes in when a datagram came that was sent at `theirs` (s of the sender's ticks): how unevenly the way takes (RFC 3550, 6.4.1).
+    /// Records the arrival of a datagram that was sent at `theirs` (s of the sender's ticks), for
+    /// the jitter (RFC 3550, 6.4.1).
     pub(super) fn came(&mut self, now: Duration, theirs: f64) {
         let early = now.as_secs_f64() - theirs;
         let off = early - *self.way.get_or_insert(early);
-        // Far off: one of the clocks has jumped.
+        // A difference this large means that one of the clocks has jumped.
         if off.abs() > 10.0 {
             self.way = Some(early);
             return;

@@ -1,4 +1,4 @@
-//! The session of one peer with all the others.
+//! The session of one peer with all other peers.
 
 mod states;
 
@@ -19,20 +19,22 @@ use crate::session::{DisconnectReason, LinkStats, Output};
 use crate::state::{BodyId, PeerId, Tick, UserId, in_range};
 use crate::wire::{MAX_NAME, PROTOCOL_VERSION};
 
-/// Most peers beside oneself.
+/// Largest number of other peers.
 const MAX_PEERS: usize = 64;
-/// Most datagrams that wait to be fetched; newer ones are dropped, as a path would drop them.
+/// Largest number of outputs that wait to be fetched before new datagrams are dropped, as a path
+/// would drop them.
 const MAX_OUT: usize = 16_384;
-/// Ticks between checks.
+/// Number of ticks between checks.
 const CHECK_EVERY: u64 = 16;
-/// Share of the state's size by which checks may differ: peers' machines round differently.
+/// Tolerance of checks as a share of the state's magnitude. Machines of different peers round
+/// differently.
 const CHECK_TOLERANCE: f64 = 1e-3;
-/// A peer's tick is drawn towards the others' at most at this rate.
+/// Largest share by which a peer's step is stretched or shortened to match the other peers' ticks.
 const SLEW: f64 = 0.01;
-/// Pause between questions for the same tick.
+/// Pause between requests for the same tick.
 const ASK_AGAIN: Duration = Duration::from_millis(150);
 
-/// What peers have to have alike of a body: a digest of its model and of how it is stepped.
+/// Digest of a body's model and step settings. Peers must have the same digest for a body.
 pub fn digest(model: &ModalModel, settings: &StepSettings) -> [u8; 32] {
     let mut hasher = blake3::Hasher::new();
     hasher.update(&model.hash().0);
@@ -53,21 +55,22 @@ pub struct PeerSession {
     started: bool,
     next_step: Option<Duration>,
     rollback_from: Option<Tick>,
-    /// The tick of the last state taken over: what was before it is not gone back to.
+    /// The tick of the last state taken. Rollback never goes to an earlier tick.
     taken: Tick,
     out: VecDeque<Output>,
     events: Events<PeerEvent>,
     requested: Option<Duration>,
     last_check: Option<StateCheck>,
-    /// The counts of those who are gone.
+    /// Counts of the connections that have ended.
     gone: LinkStats,
 }
 
 impl PeerSession {
-    /// A peer alone.
+    /// Creates a peer without connections.
     ///
     /// # Errors
-    /// [`StreamError::Config`], also for the user number 0, which is a host's.
+    /// Returns [`StreamError::Config`] for a setting out of range, and for the user number 0, which
+    /// is the host's.
     pub fn new(config: PeerConfig) -> Result<Self, StreamError> {
         let fail = |what, found: String, expected| Err(StreamError::Config { what, found, expected });
         if config.user == UserId::HOST {
@@ -105,10 +108,11 @@ impl PeerSession {
         })
     }
 
-    /// Adds a body; all peers add the same ones under the same numbers, before they start.
+    /// Adds a body. All peers add the same bodies under the same numbers before they start.
     ///
     /// # Errors
-    /// [`StreamError::Config`] for a number in use; [`StreamError::Model`].
+    /// Returns [`StreamError::Config`] for a number in use and [`StreamError::Model`] for a model
+    /// or settings that cannot be stepped.
     pub fn add_body(
         &mut self,
         id: BodyId,
@@ -125,7 +129,7 @@ impl PeerSession {
         Ok(())
     }
 
-    /// Digest of the bodies, their models and how they are stepped, and of the length of a step.
+    /// Digest of the bodies, their models and step settings, and the step length.
     pub fn scene(&self) -> u64 {
         let mut hasher = blake3::Hasher::new();
         hasher.update(&self.config.step.to_bits().to_le_bytes());
@@ -138,11 +142,14 @@ impl PeerSession {
         u64::from_le_bytes(first)
     }
 
-    /// A connection to another peer opened; says hello. `user` is the number that the peer has been given: under another one it is not
-    /// let in, since the lowest number is believed.
+    /// Adds a connection to another peer and sends a hello.
+    ///
+    /// `user` is the number that the other peer was given. A peer with another number is not
+    /// accepted, because the lowest number is trusted.
     ///
     /// # Errors
-    /// [`StreamError::Full`] beyond 64; [`StreamError::Config`] for the number 0, which no peer has, or one's own.
+    /// Returns [`StreamError::Full`] beyond 64 peers and [`StreamError::Config`] for the number 0,
+    /// which no peer has, or this peer's own number.
     pub fn connect(
         &mut self,
         now: Duration,
@@ -169,13 +176,14 @@ impl PeerSession {
         Ok(())
     }
 
-    /// A connection closed.
+    /// Removes a connection.
     pub fn disconnect(&mut self, peer: PeerId, reason: DisconnectReason) {
         let Some(other) = self.others.remove(&peer) else { return };
         self.gone.add_counts(&other.link.stats);
         let Some(user) = other.user else { return self.event(PeerEvent::TurnedAway { peer, reason }) };
         if let Some(inputs) = self.inputs.users.get_mut(&user) {
-            // All hear the same last input or forecast the same hands a little on; then the hands let go.
+            // All peers received the same last input, or extrapolate the same hands a little
+            // further. After that the hands are released.
             inputs.gone = true;
             self.rollback_from =
                 Some(self.rollback_from.map_or(inputs.highest + 1, |d| d.min(inputs.highest + 1)));
@@ -184,13 +192,16 @@ impl PeerSession {
         self.event(PeerEvent::Left { user, reason });
     }
 
-    /// Takes hold of a body at the next tick, as `hold` says: with the hand's own spring and damper,
-    /// capped at what devices have, or as stiffly as the patch allows ([`GrabConfig::default`]).
+    /// Grabs a body at the next tick and returns the number of the grab.
+    ///
+    /// `hold` gives the hand's own spring and damper, capped at what devices have, or a grab as
+    /// stiff as the patch allows ([`GrabConfig::default`]).
     ///
     /// # Errors
-    /// [`StreamError::UnknownBody`], [`StreamError::NotFinite`], [`StreamError::Model`] for a vertex that is not there or a radius
-    /// larger than the body,
-    /// [`StreamError::Full`] beyond 16 grabs.
+    /// Returns [`StreamError::UnknownBody`] for an unknown body, [`StreamError::NotFinite`] for a
+    /// target or radius out of range, [`StreamError::Config`] for a spring or damper out of range,
+    /// [`StreamError::Model`] for a vertex that the model lacks or a radius larger than the body,
+    /// and [`StreamError::Full`] beyond 16 grabs.
     pub fn begin_grab(
         &mut self,
         body: BodyId,
@@ -210,7 +221,7 @@ impl PeerSession {
         if vertex as usize >= b.model().surface().positions().len() {
             return Err(StreamError::Model(format!("vertex {vertex} is not on the surface")));
         }
-        // As it crosses.
+        // The comparison uses the radius as the wire format rounds it.
         if f64::from(radius as f32) > b.model().size() {
             return Err(StreamError::Model(format!("a radius of {radius} m is larger than the body")));
         }
@@ -226,10 +237,11 @@ impl PeerSession {
         Ok(grab)
     }
 
-    /// Moves a hand; it is felt at the next tick.
+    /// Moves a hand. The body receives the new target at the next tick.
     ///
     /// # Errors
-    /// [`StreamError::UnknownGrab`], [`StreamError::NotFinite`].
+    /// Returns [`StreamError::UnknownGrab`] for an unknown grab and [`StreamError::NotFinite`] for
+    /// a target out of range.
     pub fn set_target(&mut self, grab: u16, target: [f64; 3]) -> Result<(), StreamError> {
         if !in_range(&target) {
             return Err(StreamError::NotFinite { what: "target" });
@@ -239,31 +251,35 @@ impl PeerSession {
         Ok(())
     }
 
-    /// Lets go at the next tick.
+    /// Ends a grab at the next tick.
     pub fn end_grab(&mut self, grab: u16) {
         self.own.remove(&grab);
     }
 
-    /// How a path does: what came and went, the share that did not arrive here, how unevenly the way here takes (`jitter`), questions for
-    /// inputs (`nacks`), what could not be read. The round trip and the share lost on the way there are the transport's to tell. `None` for no
-    /// connection.
+    /// Metrics of a connection; `None` for an unknown connection.
+    ///
+    /// They are the traffic in both directions, the share of datagrams lost on the path to this
+    /// peer, the jitter of that path (`jitter`), the requests for inputs (`nacks`) and the rejected
+    /// datagrams. Only the transport knows the round trip and the loss on the path to the other
+    /// peer.
     pub fn stats(&self, peer: PeerId) -> Option<LinkStats> {
         self.others.get(&peer).map(|other| other.link.stats())
     }
 
-    /// The counts of all paths, of those who are gone too: they never fall.
+    /// Counts of all connections, including those that have ended, so they never decrease.
     pub fn totals(&self) -> LinkStats {
         let mut sum = self.gone;
         self.others.values().for_each(|other| sum.add_counts(&other.link.stats));
         sum
     }
 
-    /// Who a connection's peer is; `None` before its hello, and for no connection.
+    /// The user number of a connection's peer; `None` before its hello, and for an unknown
+    /// connection.
     pub fn user_of(&self, peer: PeerId) -> Option<UserId> {
         self.others.get(&peer)?.user
     }
 
-    /// A body.
+    /// Returns a body of the session.
     pub fn body(&self, id: BodyId) -> Option<&PeerBody> {
         self.bodies.get(&id)
     }
@@ -273,27 +289,27 @@ impl PeerSession {
         self.tick
     }
 
-    /// The newest tick for which all inputs are known: its state does not change any more.
+    /// The newest tick for which all inputs are known. Its state is final.
     pub fn confirmed(&self) -> Tick {
         self.inputs.complete().min(self.tick)
     }
 
-    /// The state of a body after a tick of the last 128.
+    /// The state of a body after one of the last 128 ticks.
     pub fn state_at(&self, body: BodyId, tick: Tick) -> Option<&crate::State> {
         self.bodies.get(&body)?.past(tick)
     }
 
-    /// The reactions (N) of the hands on a body at a tick of the last 128, with whose they are.
+    /// Reactions (N) of the hands on a body at one of the last 128 ticks, with their users.
     pub fn reactions_at(&self, body: BodyId, tick: Tick) -> Option<Vec<(UserId, [f64; 3])>> {
         self.bodies.get(&body)?.reactions_at(tick)
     }
 
-    /// The rigid frame of a free body after a tick of the last 128.
+    /// The rigid frame of a free body after one of the last 128 ticks.
     pub fn pose_at(&self, body: BodyId, tick: Tick) -> Option<crate::Pose> {
         self.bodies.get(&body)?.past_pose(tick)
     }
 
-    /// Something arrived unreliably; any bytes will do.
+    /// Processes a received datagram. Any bytes are allowed.
     pub fn on_datagram(&mut self, now: Duration, peer: PeerId, bytes: &[u8]) {
         let Some(other) = self.others.get_mut(&peer) else { return };
         let (Some(user), Ok((sequence, datagram))) = (other.user, PeerDatagram::decode(bytes)) else {
@@ -314,7 +330,8 @@ impl PeerSession {
                 }
                 for input in ticks {
                     let tick = input.tick;
-                    // The far future is not remembered: it would push out what is needed.
+                    // A tick in the far future is not stored, since it would displace ticks that
+                    // are needed.
                     if tick > self.tick + WINDOW as u64 / 2 {
                         continue;
                     }
@@ -330,10 +347,10 @@ impl PeerSession {
         }
     }
 
-    /// Something arrived reliably. What breaks the protocol ends the connection.
+    /// Processes a received message. A message that breaks the protocol ends the connection.
     pub fn on_message(&mut self, now: Duration, peer: PeerId, bytes: &[u8]) {
         let message = PeerMessage::decode(bytes);
-        // It takes a while, and only a Hello asks for it.
+        // The digest takes a while to compute, and only a hello needs it.
         let own = matches!(message, Ok(PeerMessage::Hello { .. })).then(|| self.scene());
         let Some(other) = self.others.get_mut(&peer) else { return };
         other.link.receive_message(now, bytes.len());
@@ -354,8 +371,9 @@ impl PeerSession {
                 }
                 other.user = Some(user);
                 other.wants_state = joining && self.started;
-                // Founders start together and expect each other from the start; a joiner's hands come
-                // later. The first state that can be given to it is that of tick 1.
+                // Founding peers start together and expect each other from the start. The hands of
+                // a joining peer come later. The first state that can be given to it is that of
+                // tick 1.
                 let first = if joining {
                     self.tick.max(1) + 1
                 } else {
@@ -367,8 +385,9 @@ impl PeerSession {
             Ok(PeerMessage::StateRequest) => other.wants_state = true,
             Ok(PeerMessage::State { tick, now: theirs, bodies }) => {
                 let Some(user) = other.user else { return };
-                // A joiner has asked everybody by its hello. After that nobody's word is taken unasked, nor a higher
-                // number's at all: whoever could send a state at will could put any shape into any peer.
+                // A joining peer has asked all peers by its hello. After that, a state is taken
+                // only on request and only from a lower number. A peer that could send a state at
+                // will could force any shape on any peer.
                 let asked = std::mem::take(&mut other.asked_state);
                 if !self.started || (asked && user < self.config.user) {
                     self.take_state(now, user, tick, theirs, &bodies);
@@ -383,7 +402,7 @@ impl PeerSession {
         }
     }
 
-    /// Steps to what is due by now and sends what is due. Returns the ticks taken.
+    /// Steps to the current time and sends what is due. Returns the number of ticks.
     pub fn update(&mut self, now: Duration) -> u64 {
         let silent: Vec<PeerId> = self
             .others
@@ -406,7 +425,8 @@ impl PeerSession {
             stepped += 1;
             due += Duration::from_secs_f64(self.config.step * (1.0 + self.drift()));
             if stepped == 8 && due <= now {
-                // Long asleep: ticks are not caught up with one by one; the others draw this peer on.
+                // After a long sleep the missed ticks are not stepped one by one. The drift
+                // correction brings this peer back to the others.
                 due = now + Duration::from_secs_f64(self.config.step);
             }
         }
@@ -416,34 +436,38 @@ impl PeerSession {
         stepped
     }
 
-    /// When to call [`PeerSession::update`] at the latest.
+    /// Latest time at which to call [`PeerSession::update`].
     pub fn next_wakeup(&self) -> Option<Duration> {
         self.next_step.filter(|_| self.started)
     }
 
-    /// The next thing to send. At most 16,384 datagrams wait here, newer ones are dropped. Messages are never dropped:
-    /// beside the first and the last of each connection they are questions, at most one a second, and states, at most
-    /// 16 and two a second for each peer and none while the queue is full.
+    /// Returns the next datagram or message to send.
+    ///
+    /// Once 16,384 outputs wait here, new datagrams are dropped. Messages are never dropped.
+    /// Besides the first and the last message of each connection, messages are requests for a
+    /// state, at most one a second, and states. Each peer gets at most 16 states at once and two a
+    /// second, and none while the queue is full.
     pub fn poll_output(&mut self) -> Option<Output> {
         self.out.pop_front()
     }
 
-    /// The next thing that happened.
+    /// Returns the next event.
     pub fn poll_event(&mut self) -> Option<PeerEvent> {
         self.events.pop()
     }
 
-    /// Goes back to the earliest tick for which something new is known.
+    /// Rolls back to the earliest tick for which a new input is known.
     fn roll_back(&mut self) {
         let Some(from) = self.rollback_from.take() else { return };
-        // Whoever gave a state knew all inputs up to it: late ones are in it.
+        // The peer that gave a state knew all inputs up to its tick, so the state contains late
+        // inputs.
         let from = from.max(self.taken + 1);
         let mut too_late = false;
         for body in self.bodies.values_mut() {
             too_late |= !body.correct(from, &self.inputs);
         }
         if too_late {
-            // Only a state can help; it is asked for with what else is missing.
+            // Only a state can help. It is requested together with the missing inputs.
             self.others.values_mut().for_each(|o| o.lost = true);
         }
     }
@@ -460,7 +484,7 @@ impl PeerSession {
         let due = confirmed - confirmed % CHECK_EVERY;
         let mut check = None;
         if self.last_check.is_none_or(|c| c.tick < due) && due > 0 {
-            // One body a time, in turn.
+            // Each check covers one body, in turn.
             let index = (due / CHECK_EVERY) as usize % self.bodies.len().max(1);
             check =
                 self.bodies.values().nth(index).and_then(|b| {
@@ -510,7 +534,7 @@ impl PeerSession {
         }
     }
 
-    /// Asks each peer for those of its inputs that are missing and that no repeat will bring.
+    /// Requests from each peer the inputs that are missing and that no repeat will bring.
     fn ask(&mut self, now: Duration) {
         let mut questions = Vec::new();
         for (peer, other) in &mut self.others {
@@ -547,10 +571,12 @@ impl PeerSession {
         }
     }
 
-    /// How much longer than `step` a step takes, to stay with the others: positive when this peer is ahead.
+    /// Share by which a step is longer than `step`, to stay with the other peers; positive when
+    /// this peer is ahead.
     ///
-    /// Each side sees the other late by the way: with `d` the true lead and `w` the way in ticks this side sees `d + w`
-    /// and the other `w - d`, so half the difference is `d`.
+    /// Each side sees the other late by the one-way delay. With `d` the true lead and `w` the
+    /// one-way delay in ticks, this side sees `d + w` and the other `w - d`, so half the difference
+    /// is `d`.
     fn drift(&self) -> f64 {
         let leads: Vec<f64> =
             self.others.values().filter_map(|o| Some(0.5 * (o.ahead? - o.theirs?))).collect();

@@ -1,4 +1,4 @@
-//! What equal peers say to each other; see `docs/protocol.md`.
+//! Datagrams and messages between peers; see `docs/protocol.md`.
 
 use serde::{Deserialize, Serialize};
 
@@ -11,39 +11,39 @@ use crate::wire::{Reader, Writer};
 
 const INPUTS: u8 = 6;
 const ASK: u8 = 7;
-/// Most ticks in one datagram.
+/// Largest number of ticks in one datagram.
 pub(crate) const MAX_TICKS: usize = 16;
-/// Most grabs of one user at one tick.
+/// Largest number of grabs of one user at one tick.
 pub(crate) const MAX_HELD: usize = 16;
-/// Bytes of one grab.
+/// Bytes of one grab without spring and damper.
 const HELD_BYTES: usize = 25;
-/// Bytes of its spring, and as many of its damper, where it has one.
+/// Bytes of the spring of a grab, and of its damper, if present.
 const HOLD_BYTES: usize = 4;
 
-/// A hand at one tick.
+/// A grab at one tick.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct HeldAt {
-    /// Which body.
+    /// The body.
     pub body: BodyId,
     /// The user's number for the grab.
     pub grab: u16,
-    /// Center of the patch.
+    /// Surface vertex at the center of the patch.
     pub vertex: u32,
     /// Radius of the patch, m.
     pub radius: f64,
-    /// Where the hand is, world, m.
+    /// Position of the hand, world, m.
     pub target: [f64; 3],
     /// The hand's own spring and damper, within what devices have ([`GrabConfig::capped`]).
     pub hold: GrabConfig,
 }
 
 impl HeldAt {
-    /// The grab's name among all users'.
+    /// Key of the grab among all users.
     pub fn key(&self, user: UserId) -> GrabKey {
         GrabKey { user, grab: self.grab }
     }
 
-    /// As it will be read at the other end.
+    /// Rounds the values as the wire format does.
     pub(crate) fn rounded(mut self) -> Self {
         self.radius = f64::from(self.radius as f32);
         self.target = self.target.map(|x| f64::from(x as f32));
@@ -52,49 +52,51 @@ impl HeldAt {
     }
 }
 
-/// Everything that one user's hands do at one tick.
+/// All grabs of one user at one tick.
 #[derive(Debug, Clone, PartialEq, Default)]
 pub struct InputTick {
-    /// Which tick.
+    /// The tick.
     pub tick: Tick,
-    /// At most 16 grabs.
+    /// The grabs, at most 16.
     pub held: Vec<HeldAt>,
 }
 
-/// A checksum of one body at a tick for which the sender knows all inputs.
+/// Checksum of one body at a tick for which the sender knows all inputs.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct StateCheck {
-    /// Which body.
+    /// The body.
     pub body: BodyId,
-    /// Which tick.
+    /// The tick.
     pub tick: Tick,
-    /// [`crate::codec::checksum::projection`] of its coordinates.
+    /// Sum of [`crate::codec::checksum::projection`] over the coordinates, the viscoelastic state
+    /// and the rigid frame, as far as the body has them.
     pub value: f32,
 }
 
-/// Unreliable, between peers.
+/// Unreliable datagrams between peers.
 #[derive(Debug, Clone, PartialEq)]
 pub enum PeerDatagram {
     /// The sender's own inputs.
     Inputs {
         /// The tick that the sender has reached.
         now: Tick,
-        /// Mean of the sender's tick less the receiver's as it arrived there, where known.
+        /// Mean of the sender's tick minus the receiver's tick, at arrival at the sender, ticks;
+        /// `None` when unknown.
         ahead: Option<f64>,
-        /// At most 16 ticks.
+        /// The inputs, at most 16 ticks.
         ticks: Vec<InputTick>,
-        /// At most one.
+        /// A checksum, at most one.
         check: Option<StateCheck>,
     },
-    /// Inputs of the receiver that the sender misses: first tick and count.
+    /// Requests inputs of the receiver that the sender lacks.
     Ask {
-        /// At most 16 runs.
+        /// Runs of missing ticks as first tick and count, at most 16.
         runs: Vec<(Tick, u8)>,
     },
 }
 
 impl PeerDatagram {
-    /// The bytes.
+    /// Encodes this datagram.
     pub fn encode(&self, sequence: u16) -> Vec<u8> {
         let mut w = Writer::with_capacity(128);
         match self {
@@ -102,7 +104,7 @@ impl PeerDatagram {
                 w.u8(INPUTS);
                 w.u16(sequence);
                 w.tick(*now);
-                // 1/64 tick; a float-to-int cast saturates.
+                // The unit is 1/64 tick. A float-to-int cast saturates.
                 w.i16(ahead.map_or(i16::MIN, |a| ((a * 64.0).round() as i16).max(-i16::MAX)));
                 let ticks = &ticks[..ticks.len().min(MAX_TICKS)];
                 w.u8(ticks.len() as u8);
@@ -147,7 +149,7 @@ impl PeerDatagram {
         w.into_bytes()
     }
 
-    /// Bytes that inputs with these grabs at their ticks take.
+    /// Number of bytes of an inputs datagram with these grabs at its ticks.
     pub(crate) fn bytes_of<'a>(ticks: impl Iterator<Item = &'a [HeldAt]>) -> usize {
         let one = |g: &HeldAt| {
             let parts = usize::from(g.hold.stiffness.is_some()) + usize::from(g.hold.relaxation != 0.0);
@@ -157,10 +159,11 @@ impl PeerDatagram {
         3 + 6 + 2 + 1 + 1 + 12 + ticks.map(tick).sum::<usize>()
     }
 
-    /// Reads any bytes.
+    /// Decodes arbitrary bytes into the sequence number and the datagram.
     ///
     /// # Errors
-    /// [`StreamError::Truncated`], [`StreamError::Invalid`] and [`StreamError::NotFinite`], naming the field.
+    /// Returns [`StreamError::Truncated`], [`StreamError::Invalid`] or [`StreamError::NotFinite`],
+    /// with the name of the field.
     pub fn decode(bytes: &[u8]) -> Result<(u16, Self), StreamError> {
         let mut r = Reader::new(bytes);
         let kind = r.u8("datagram kind")?;
@@ -254,14 +257,14 @@ pub struct PeerFrame {
     pub orientation: [f64; 4],
     /// Velocity of the center of mass, m/s.
     pub velocity: [f64; 3],
-    /// Angular momentum about it, kg m^2/s.
+    /// Angular momentum about the center of mass, kg m^2/s.
     pub spin: [f64; 3],
 }
 
-/// One body's state in a [`PeerMessage::State`].
+/// State of one body in a [`PeerMessage::State`].
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct PeerBodyState {
-    /// Which body.
+    /// Number of the body.
     pub body: u16,
     /// Modal coordinates, kg^1/2 m.
     pub q: Vec<f64>,
@@ -269,54 +272,54 @@ pub struct PeerBodyState {
     pub v: Vec<f64>,
     /// Accelerations.
     pub a: Vec<f64>,
-    /// Flows of a body that relaxes; empty for an elastic one.
+    /// Viscoelastic state of a body that relaxes; empty for an elastic body.
     pub z: Vec<f64>,
     /// Modal forces of the last step, as many as coordinates.
     pub force: Vec<f64>,
     /// The rigid frame of a free body.
     pub frame: Option<PeerFrame>,
-    /// The hands on it, as of the last step.
+    /// The hands on the body in the last step.
     pub pulls: Vec<PeerGrip>,
 }
 
-/// What one hand did in the last step of a [`PeerBodyState`].
+/// Force and target of one hand in the last step of a [`PeerBodyState`].
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 pub struct PeerGrip {
-    /// Whose hand.
+    /// User of the hand.
     pub user: u16,
-    /// Which of the user's.
+    /// The user's number for the grab.
     pub grab: u16,
     /// Force on the body at the end of the step, N, world axes.
     pub pull: [f64; 3],
-    /// Force on it over the step, N, world axes.
+    /// Force on the body over the step, N, world axes.
     pub mean: [f64; 3],
-    /// Where the hand was, world, m.
+    /// Position of the hand, world, m.
     pub target: [f64; 3],
-    /// How far the residual flexibility of the patch has flown, m, body axes.
+    /// Viscoelastic state of the patch's residual flexibility, m, body axes.
     pub flow: [f64; 3],
 }
 
-/// Reliable, between peers.
+/// Reliable messages between peers.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub enum PeerMessage {
-    /// The first message each way.
+    /// The first message in each direction.
     Hello {
         /// [`crate::wire::PROTOCOL_VERSION`].
         version: u16,
-        /// The sender's number; all peers have different ones.
+        /// The sender's number. Every peer has a different one.
         user: u16,
-        /// At most 64 bytes.
+        /// Display name, at most 64 bytes.
         name: String,
         /// The sender has no state yet and wants one.
         joining: bool,
-        /// Digest of its bodies and of how it steps them; all peers have the same.
+        /// Digest of the sender's bodies and step settings. It must be the same for all peers.
         scene: u64,
     },
-    /// Send me your state: checks disagree, or too much is missing.
+    /// Requests the receiver's state, because checks disagree or too many inputs are missing.
     StateRequest,
     /// The state after a tick for which the sender knows all inputs.
     State {
-        /// After which tick.
+        /// The tick after which the state holds.
         tick: u64,
         /// The tick that the sender has reached.
         now: u64,
@@ -325,22 +328,22 @@ pub enum PeerMessage {
     },
     /// The last message.
     Goodbye {
-        /// Why.
+        /// The reason.
         reason: DisconnectReason,
     },
 }
 
 impl PeerMessage {
-    /// The bytes.
+    /// Encodes this message.
     pub fn encode(&self) -> Vec<u8> {
-        // Plain data: serialising it to a growing buffer cannot fail.
+        // The message is plain data, so serializing it to a growing buffer cannot fail.
         postcard::to_stdvec(self).unwrap_or_default()
     }
 
-    /// Reads any bytes and checks every bound.
+    /// Decodes arbitrary bytes and checks every bound.
     ///
     /// # Errors
-    /// [`StreamError::Invalid`], naming the field.
+    /// Returns [`StreamError::Invalid`] with the name of the field.
     pub fn decode(bytes: &[u8]) -> Result<Self, StreamError> {
         let invalid = |what, found: String, expected| Err(StreamError::Invalid { what, found, expected });
         if bytes.len() > MAX_MESSAGE {

@@ -1,4 +1,4 @@
-//! Models that arrive in pieces.
+//! Assembles models that arrive in pieces.
 
 use std::sync::Arc;
 
@@ -19,7 +19,8 @@ impl GuestSession {
         if self.models.contains_key(&hash) || self.being_read.contains(&hash) {
             return;
         }
-        // Also of a body that has gone since: the host counts the model as known here once it has sent it.
+        // The body may be gone already. The host counts a model as known to the guest once it has
+        // sent it, so the download still completes.
         let wanted = self.announced.contains(&hash);
         let download = self.downloads.entry(hash).or_default();
         let received = download.bytes.len() as u64;
@@ -32,14 +33,15 @@ impl GuestSession {
         if !fits {
             return self.break_off(DisconnectReason::Protocol);
         }
-        // What a model will take counts from its first piece on: no two unfinished ones share the same room.
+        // The whole size of a model counts from its first piece on, so that no two unfinished
+        // models share the same room.
         let more = if received == 0 { total } else { 0 };
         if more > self.config.model_bytes.saturating_sub(self.model_bytes) {
             return self.break_off(DisconnectReason::Full);
         }
         self.model_bytes += more;
         download.total = total;
-        // Grows with what has arrived: a false total reserves nothing.
+        // The buffer grows with the received bytes, so a false total reserves no memory.
         download.bytes.extend_from_slice(bytes);
         let received = download.bytes.len() as u64;
         self.event(GuestEvent::ModelProgress { hash, received, total });
@@ -55,8 +57,11 @@ impl GuestSession {
         self.take_model(hash, read);
     }
 
-    /// What has been read of the bytes of a [`GuestEvent::ModelCame`]; `None` where they are no model, which ends the session, as another model than
-    /// the announced one does. Nothing for a model that is not waited for.
+    /// Returns a decoded model after a [`GuestEvent::ModelCame`].
+    ///
+    /// `None` says that the bytes are not a valid model. `None`, or a model with another hash than
+    /// the announced one, ends the session. The call has no effect for a model that the session
+    /// does not wait for.
     pub fn give_model(&mut self, hash: [u8; 32], model: Option<Arc<ModalModel>>) {
         if self.being_read.remove(&hash) && !self.is_closed() {
             self.take_model(hash, model);

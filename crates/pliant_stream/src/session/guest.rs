@@ -1,4 +1,4 @@
-//! A guest's side: it follows the host and moves its own hands.
+//! The guest's side of a session: tracks the host's bodies and moves the guest's own hands.
 
 use std::collections::{BTreeMap, BTreeSet, VecDeque};
 use std::sync::Arc;
@@ -20,9 +20,9 @@ use crate::wire::{
     Clock, Datagram, GuestMessage, HostMessage, MAX_BODIES, MAX_CACHED, MAX_NAME, PROTOCOL_VERSION,
 };
 
-/// Clock requests come this far apart once the first eight have been answered.
+/// Interval of clock requests after the first eight.
 const PING_EVERY: Duration = Duration::from_millis(500);
-/// The first clock requests.
+/// Interval of the first clock requests.
 const PING_SOON: Duration = Duration::from_millis(100);
 
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -42,9 +42,9 @@ pub struct GuestSession {
     newmark: Newmark,
     pub(super) models: BTreeMap<[u8; 32], Arc<ModalModel>>,
     pub(super) downloads: BTreeMap<[u8; 32], Download>,
-    /// Models that the caller reads.
+    /// Models that the caller is decoding.
     pub(super) being_read: BTreeSet<[u8; 32]>,
-    /// Bytes that downloads and downloaded models take together, see [`GuestConfig::model_bytes`].
+    /// Bytes of downloads and downloaded models together, see [`GuestConfig::model_bytes`].
     pub(super) model_bytes: u64,
     /// Hashes of all models that the host has named, at most 16,384 (512 KiB).
     pub(super) announced: BTreeSet<[u8; 32]>,
@@ -62,10 +62,10 @@ pub struct GuestSession {
 }
 
 impl GuestSession {
-    /// A guest whose path carries datagrams of so many bytes.
+    /// Creates a guest whose path carries datagrams of at most `max_datagram` bytes.
     ///
     /// # Errors
-    /// [`StreamError::Config`] for a name, path or repair out of range.
+    /// Returns [`StreamError::Config`] for a name, datagram size or recovery setting out of range.
     pub fn new(config: GuestConfig, max_datagram: usize) -> Result<Self, StreamError> {
         let fail = |what, found: String, expected| Err(StreamError::Config { what, found, expected });
         config.recovery.check()?;
@@ -99,17 +99,18 @@ impl GuestSession {
         })
     }
 
-    /// Names a model that need not be sent. Before [`GuestSession::connect`]; at most 256.
+    /// Adds a model that the host need not send. Call this before [`GuestSession::connect`]. Models
+    /// beyond 256 are ignored.
     pub fn add_cached_model(&mut self, model: Arc<ModalModel>) {
         if self.models.len() < MAX_CACHED {
             self.models.insert(model.hash().0, model);
         }
     }
 
-    /// The connection is open: says hello.
+    /// Sends the hello message. Call this when the connection is open.
     ///
     /// # Errors
-    /// [`StreamError::State`] when hello was said before.
+    /// Returns [`StreamError::State`] when the session was connected before.
     pub fn connect(&mut self, now: Duration) -> Result<(), StreamError> {
         if self.standing != Standing::New {
             let (what, state) = ("connect", "not new");
@@ -127,12 +128,12 @@ impl GuestSession {
         Ok(())
     }
 
-    /// The path's datagrams have another size now. (Everything a guest sends fits the smallest.)
+    /// Sets a new datagram size of the path. Everything that a guest sends fits the smallest size.
     pub fn set_max_datagram(&mut self, bytes: usize) {
         self.link.max_datagram = bytes;
     }
 
-    /// Says goodbye. The session is closed.
+    /// Sends a goodbye message and closes the session.
     pub fn leave(&mut self) {
         if self.standing != Standing::Closed {
             self.message(&GuestMessage::Goodbye { reason: DisconnectReason::Left });
@@ -140,7 +141,7 @@ impl GuestSession {
         }
     }
 
-    /// Our number, once the host has let us in.
+    /// The guest's user number, after the host has accepted the guest.
     pub fn user(&self) -> Option<UserId> {
         match self.standing {
             Standing::In(user) => Some(user),
@@ -148,32 +149,32 @@ impl GuestSession {
         }
     }
 
-    /// True after the end.
+    /// Returns whether the session is over.
     pub fn is_closed(&self) -> bool {
         self.standing == Standing::Closed
     }
 
-    /// The host's step, s; 1/40 before the host has said.
+    /// Length of the host's step, s; 1/40 before the host's welcome.
     pub fn step(&self) -> f64 {
         self.newmark.h
     }
 
-    /// A body.
+    /// Returns a body of the session.
     pub fn body(&self, body: BodyId) -> Option<&BodyView> {
         self.bodies.get(&body)
     }
 
-    /// All bodies.
+    /// Iterates over all bodies.
     pub fn bodies(&self) -> impl Iterator<Item = &BodyView> {
         self.bodies.values()
     }
 
-    /// The others in the session.
+    /// Iterates over the other users in the session.
     pub fn users(&self) -> impl Iterator<Item = (UserId, &str)> {
         self.users.iter().map(|(u, n)| (*u, n.as_str()))
     }
 
-    /// How the path does.
+    /// Metrics of the connection.
     pub fn stats(&self) -> LinkStats {
         self.link.stats()
     }
@@ -183,7 +184,7 @@ impl GuestSession {
         self.clock.offset()
     }
 
-    /// Something arrived unreliably. Any bytes will do: what makes no sense is counted and forgotten.
+    /// Processes a received datagram. Any bytes are allowed; invalid ones are counted and dropped.
     pub fn on_datagram(&mut self, now: Duration, bytes: &[u8]) {
         if self.user().is_none() {
             return;
@@ -215,7 +216,7 @@ impl GuestSession {
         }
     }
 
-    /// Something arrived reliably. A message that breaks the protocol ends the session.
+    /// Processes a received message. A message that breaks the protocol ends the session.
     pub fn on_message(&mut self, now: Duration, bytes: &[u8]) {
         if self.standing == Standing::Closed {
             return;
@@ -247,7 +248,8 @@ impl GuestSession {
             HostMessage::BodyAdded(info) => {
                 let body = BodyId(info.body);
                 if let Some(view) = self.bodies.get_mut(&body) {
-                    // The same body, stepped otherwise from the snapshot on that follows.
+                    // The host changes the step settings of a known body, from the snapshot that
+                    // follows.
                     if !view.change(info) {
                         return self.break_off(DisconnectReason::Protocol);
                     }
@@ -316,8 +318,11 @@ impl GuestSession {
         }
     }
 
-    /// Steps all bodies to what is due by now, and sends what is due: targets, questions, clock requests. Call once a
-    /// frame and at [`GuestSession::next_wakeup`]. Returns how many ticks all bodies took together.
+    /// Steps all bodies to the current time and sends targets, NACKs, snapshot requests and clock
+    /// requests that are due.
+    ///
+    /// Call this once a frame and at [`GuestSession::next_wakeup`]. Returns the number of ticks of
+    /// all bodies together.
     pub fn update(&mut self, now: Duration) -> u64 {
         let Some(user) = self.user() else {
             let waits = self.standing == Standing::Greeted;
@@ -357,8 +362,8 @@ impl GuestSession {
         stepped
     }
 
-    /// When to call [`GuestSession::update`] at the latest, if nothing happens before: the next tick of a body, a
-    /// question to repeat, a clock request, the idle timeout.
+    /// Latest time at which to call [`GuestSession::update`] if nothing happens before: the next
+    /// tick of a body, a NACK to repeat, a target to send, a clock request or the idle timeout.
     pub fn next_wakeup(&self, now: Duration) -> Option<Duration> {
         if matches!(self.standing, Standing::New | Standing::Closed) {
             return None;
@@ -377,13 +382,16 @@ impl GuestSession {
         Some(next.max(now))
     }
 
-    /// The next thing to send. Nothing is dropped here; each [`GuestSession::update`] adds one question a body, one
-    /// datagram of targets and one clock request at most, each message of the host at most one answer.
+    /// Returns the next datagram or message to send.
+    ///
+    /// Nothing is dropped here. Each [`GuestSession::update`] adds at most one NACK and one
+    /// snapshot request per body, one datagram of targets and one clock request. Each message of
+    /// the host adds at most one answer.
     pub fn poll_output(&mut self) -> Option<Output> {
         self.out.pop_front()
     }
 
-    /// The next thing that happened.
+    /// Returns the next event.
     pub fn poll_event(&mut self) -> Option<GuestEvent> {
         self.events.pop()
     }

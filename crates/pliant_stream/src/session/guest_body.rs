@@ -1,4 +1,4 @@
-//! One body at a guest: waiting for model and snapshot, then shown tick by tick.
+//! One body at a guest: waits for the model and a snapshot, then plays tick by tick.
 
 use std::sync::Arc;
 use std::time::Duration;
@@ -13,13 +13,13 @@ use crate::replica::Replica;
 use crate::state::{BodyId, Pose, State, Tick, UserId};
 use crate::wire::{BodyInfo, Frame, MAX_NACK_RUNS, Nack, NackRun, Payload, SnapshotBytes};
 
-/// Frames that wait for the snapshot.
+/// Largest number of frames that wait for the snapshot.
 const WAITING: usize = HISTORY;
-/// A missing tick is asked for at most so often.
+/// Largest number of NACKs for one missing tick.
 const ASKS: u8 = 12;
-/// Ticks older than this are not asked for any more.
+/// Age beyond which a missing tick is not requested, ticks.
 const ASK_WITHIN: u64 = 200;
-/// More ticks than this are not caught up with in one update: a snapshot is quicker.
+/// Backlog beyond which the receiver does not catch up tick by tick, ticks. A snapshot is faster.
 const CATCH_UP: u64 = 120;
 
 #[derive(Debug, Clone, Copy, Default)]
@@ -29,7 +29,7 @@ struct Ask {
     next: Duration,
 }
 
-/// What a guest sees of a body.
+/// A body as the guest shows it.
 #[derive(Debug)]
 pub struct BodyView {
     pub(crate) id: BodyId,
@@ -44,7 +44,7 @@ pub struct BodyView {
     waiting: Vec<Frame>,
     snapshot: Option<SnapshotBytes>,
     asks: Vec<Ask>,
-    /// Ticks up to here need no asking: before the run, or before the snapshot.
+    /// Ticks up to here need no NACK: they are known, or lie before the run or the snapshot.
     settled: Tick,
     resting: bool,
     fade_at: Duration,
@@ -53,9 +53,9 @@ pub struct BodyView {
     snapshot_asked: Option<Duration>,
     pub(crate) wants_snapshot: bool,
     pub(crate) resynced: bool,
-    /// The host steps it otherwise from the next snapshot on.
+    /// The host steps the body with other settings from the next snapshot on.
     retuned: bool,
-    /// It was made anew for that, and nobody was told yet.
+    /// The receiver was rebuilt for new settings, and no event has reported it yet.
     pub(crate) changed: bool,
 }
 
@@ -87,48 +87,54 @@ impl BodyView {
         }
     }
 
-    /// Its number in the session.
+    /// Number of the body in the session.
     pub fn id(&self) -> BodyId {
         self.id
     }
 
-    /// What the host told of it.
+    /// Description of the body by the host.
     pub fn info(&self) -> &BodyInfo {
         &self.info
     }
 
-    /// Its model, once it is here.
+    /// The model of the body, after its download.
     pub fn model(&self) -> Option<&Arc<ModalModel>> {
         self.model.as_ref()
     }
 
-    /// Model and snapshot are here: the rest of the view means something.
+    /// Returns whether model and snapshot have arrived. Before that the view holds no state.
     pub fn is_ready(&self) -> bool {
         self.receiver.is_some()
     }
 
-    /// The tick that is shown; 0 before the body is ready.
+    /// The shown tick; 0 before the body is ready.
     pub fn tick(&self) -> Tick {
         self.receiver.as_ref().map_or(0, Receiver::tick)
     }
 
-    /// Best estimate of the truth at the shown tick: for the next step's physics, not for the eye.
+    /// The confirmed state: the best estimate of the true state at the shown tick. The physics of
+    /// the next step uses it. Display and hands use [`BodyView::visual`].
     pub fn confirmed(&self) -> Option<&State> {
         self.receiver.as_ref().map(Receiver::confirmed)
     }
 
-    /// What the eye and the hand get at the shown tick: continuous in position and velocity.
+    /// The visual state at the shown tick, for display and hands. It is continuous in position and
+    /// velocity.
     pub fn visual(&self) -> Option<&State> {
         self.receiver.as_ref().map(Receiver::visual)
     }
 
-    /// Everything that holds the body at the shown tick, with the reactions that belong to the shape shown.
+    /// All grabs of the body at the shown tick, with the reactions that belong to the visual state.
     pub fn grabs(&self) -> &[VisualGrab] {
         self.receiver.as_ref().map_or(&[], Receiver::grabs)
     }
 
-    /// The newer copy of the body in which the guest's own hands have arrived already; `None` when it holds nothing, for
-    /// policies that do not own the model, and for free bodies. Show this instead of [`BodyView::shown`] where it is there.
+    /// The newer copy of the body with the guest's own hands at their present targets.
+    ///
+    /// The result is `None` unless the guest holds the body or the copy still fades to the
+    /// confirmed state. The copy needs [`Policy::ForceDriven`] and
+    /// [`crate::GuestConfig::predict_own_hand`]. Show it instead of [`BodyView::visual`] when it
+    /// exists.
     pub fn predicted_hand(&self) -> Option<&PredictedHand> {
         self.own.as_ref().filter(|own| own.is_active())
     }
@@ -138,22 +144,23 @@ impl BodyView {
         self.receiver.as_ref().and_then(Receiver::pose)
     }
 
-    /// What became of the ticks.
+    /// Counts of stepped, guessed and repaired ticks.
     pub fn counts(&self) -> RepairCounts {
         self.receiver.as_ref().map(Receiver::counts).unwrap_or_default()
     }
 
-    /// The host says that the body sleeps.
+    /// Returns whether the host reports that the body sleeps.
     pub fn is_resting(&self) -> bool {
         self.resting
     }
 
-    /// Frames have failed for longer than prediction makes sense: the body stands still.
+    /// Returns whether frames have been missing for longer than prediction is useful. The body then
+    /// stands still.
     pub fn is_stalled(&self) -> bool {
         self.stalled
     }
 
-    /// How far the shown tick lies behind the earliest arrivals, s.
+    /// Delay of the shown tick behind the earliest arrivals, s.
     pub fn shown_delay(&self) -> f64 {
         self.playout.delay()
     }
@@ -163,7 +170,8 @@ impl BodyView {
         self.begin();
     }
 
-    /// Another way to be stepped, from the next snapshot on; false where it is another body.
+    /// Takes new settings of the body, valid from the next snapshot on. Returns false when the
+    /// information is about another body.
     pub(crate) fn change(&mut self, info: BodyInfo) -> bool {
         let same = self.info.hash == info.hash && self.info.name == info.name;
         if same {
@@ -173,7 +181,7 @@ impl BodyView {
         same
     }
 
-    /// Takes a snapshot; true when the body became ready with it.
+    /// Takes a snapshot. Returns true when the body became ready with it.
     pub(crate) fn take_snapshot(&mut self, now: Duration, snapshot: SnapshotBytes) -> bool {
         self.resting = snapshot.resting;
         self.received_at = now;
@@ -189,7 +197,7 @@ impl BodyView {
             self.resynced = true;
             return false;
         }
-        // Another number of modes, or another way to be stepped: the receiver is made anew.
+        // The receiver is rebuilt for another number of modes or other step settings.
         let again = self.receiver.take().is_some();
         self.snapshot = Some(snapshot);
         let ready = self.begin();
@@ -234,7 +242,8 @@ impl BodyView {
             && self.receiver.is_some()
             && a.modes() != modes
         {
-            // From before or after a change of the mode count: its snapshot is on the way.
+            // The frame is from before or after a change of the mode count. The snapshot of the
+            // change is on its way.
             return;
         }
         let Some(receiver) = &mut self.receiver else {
@@ -245,7 +254,8 @@ impl BodyView {
             return;
         };
         if frame.tick > highest + 1_000_000 {
-            // The far future: no host runs ahead by hours. A real one sends a snapshot, and frames of a new run.
+            // No host runs ahead by hours, so this tick is invalid. A real host would send a
+            // snapshot and the frames of a new run.
             return;
         }
         if !frame.resent && frame.tick > highest {
@@ -255,7 +265,7 @@ impl BodyView {
         if frame.run < u16::MAX && before_run > self.settled {
             self.settled = before_run;
             if self.resting && !frame.resting {
-                // Waking: the sleeping state is the one before the run.
+                // The body wakes up: the sleeping state is the state before the run.
                 receiver.skip_to(before_run);
             }
         }
@@ -263,7 +273,7 @@ impl BodyView {
         receiver.accept(&frame);
     }
 
-    /// Steps to whatever is due by now. Returns the number of ticks.
+    /// Steps to all ticks that are due by now. Returns the number of ticks.
     pub(crate) fn advance(&mut self, now: Duration, user: UserId, round_trip: Duration) -> u64 {
         let Some(receiver) = &mut self.receiver else { return 0 };
         if self.resting {
@@ -280,7 +290,8 @@ impl BodyView {
         let guesses = (self.config.stall_after.as_secs_f64() / self.newmark.h) as u64 + 1;
         let mut stepped = 0;
         while let Some(due) = self.playout.due(receiver.tick() + 1) {
-            // Never far beyond what has been heard of, whatever the schedule says.
+            // Prediction never runs far beyond the newest received tick, whatever the schedule
+            // says.
             if due > now || (quiet && receiver.tick() >= highest) || receiver.tick() >= highest + guesses {
                 break;
             }
@@ -301,7 +312,7 @@ impl BodyView {
         stepped
     }
 
-    /// When the next tick is due.
+    /// Time at which the next tick is due.
     pub(crate) fn next_tick_due(&self, now: Duration) -> Option<Duration> {
         let receiver = self.receiver.as_ref()?;
         if self.resting {
@@ -316,7 +327,7 @@ impl BodyView {
         self.playout.due(receiver.tick() + 1).map(|t| t.max(now))
     }
 
-    /// True, at most once a second, when a snapshot is to be asked for.
+    /// Returns true, at most once a second, when a snapshot is to be requested.
     pub(crate) fn ask_snapshot(&mut self, now: Duration) -> bool {
         if !self.wants_snapshot {
             return false;
@@ -329,7 +340,7 @@ impl BodyView {
         true
     }
 
-    /// Ticks that are missing and due to be asked for.
+    /// Returns the missing ticks for which a NACK is due.
     pub(crate) fn missing(&mut self, now: Duration, round_trip: Duration) -> Option<Nack> {
         let receiver = self.receiver.as_ref()?;
         if !self.config.nack {
@@ -338,12 +349,13 @@ impl BodyView {
         let history = receiver.history();
         let highest = history.highest();
         let from = (self.settled + 1).max(highest.saturating_sub(ASK_WITHIN));
-        // What a repeat may still bring is not asked for.
+        // Ticks that a repeat in a later frame may still bring are not requested.
         let to = highest.saturating_sub(u64::from(self.config.repeats));
         let step = Duration::from_secs_f64(2.0 * self.newmark.h);
         let again = (round_trip.mul_f64(1.5) + step).max(Duration::from_millis(60));
         if self.settled + 1 < from {
-            // Ticks that nobody will say again. A stream of accelerations never gets over them.
+            // The host will not send these ticks again. A stream of accelerations cannot recover
+            // from their loss.
             let unknown = (self.settled + 1..from).any(|t| history.known(t).is_none());
             let integrates = !matches!(self.config.policy, Policy::ForceDriven { .. });
             self.wants_snapshot |= unknown && integrates && self.config.snapshots;
@@ -372,14 +384,15 @@ impl BodyView {
                 _ => break,
             }
             ask.times += 1;
-            // Patient after the fourth time: an answer may be slow rather than lost.
+            // The interval grows after the fourth request, since an answer may be slow rather than
+            // lost.
             ask.next = now + again.mul_f64(1.5_f64.powi(i32::from(ask.times.saturating_sub(4))));
         }
         self.settled = settled;
         (!runs.is_empty()).then_some(Nack { body: self.id, runs })
     }
 
-    /// When a missing tick is to be asked for again.
+    /// Time at which the next NACK is to be repeated.
     pub(crate) fn next_ask(&self) -> Option<Duration> {
         let receiver = self.receiver.as_ref().filter(|_| self.config.nack)?;
         let history = receiver.history();
@@ -394,7 +407,7 @@ impl BodyView {
             .min()
     }
 
-    /// Does the stream of this guest carry accelerations?
+    /// Returns what the frames of this guest's stream carry.
     pub fn payload(&self) -> Payload {
         match self.config.policy {
             Policy::ForceDriven { .. } => Payload::Forces,

@@ -12,22 +12,28 @@ use crate::state::{BodyId, UserId};
 /// Settings of a guest.
 #[derive(Debug, Clone, PartialEq)]
 pub struct GuestConfig {
-    /// A name for people, at most 64 bytes.
+    /// Display name, at most 64 bytes.
     pub name: String,
-    /// How loss is repaired. Default: [`RecoveryConfig::default`].
+    /// Loss repair. Default: [`RecoveryConfig::default`].
     pub recovery: RecoveryConfig,
-    /// Take at most so many modes of each body: for weak machines and thin links. Default: all.
+    /// Largest number of modes of each body that the guest receives, for slow machines and narrow
+    /// links. Default: all.
     pub modes: Option<u16>,
-    /// Step a newer copy of each body that this guest holds, in which its own hands do not wait for the round trip; see
-    /// [`BodyView::predicted_hand`](super::BodyView::predicted_hand). Default: true.
+    /// Steps a newer copy of each body that this guest holds, in which the guest's own hands do not
+    /// wait for the round trip; see [`BodyView::predicted_hand`](super::BodyView::predicted_hand).
+    /// Default: true.
     pub predict_own_hand: bool,
-    /// Most bytes of models that a host may send, those that are here and those on their way together; a host that sends
-    /// more is left with [`DisconnectReason::Full`]. Models that the application named itself do not count. Default: 1 GiB.
+    /// Largest number of bytes of models that a host may send, counting complete models and
+    /// downloads in progress. The guest leaves a host that exceeds the limit, with
+    /// [`DisconnectReason::Full`]. Models that the application added itself do not count. Default:
+    /// 1 GiB.
     pub model_bytes: u64,
-    /// Models that have arrived are handed out as bytes ([`GuestEvent::ModelCame`]) for the caller to read elsewhere, and taken back by
-    /// [`GuestSession::give_model`](super::GuestSession::give_model): reading one takes long for a frame. Default: false, they are read at once.
+    /// Passes downloaded models out as bytes ([`GuestEvent::ModelCame`]), so that the caller can
+    /// decode them elsewhere and return them by
+    /// [`GuestSession::give_model`](super::GuestSession::give_model). Decoding takes long compared
+    /// with a frame. Default: false, the session decodes at once.
     pub models_apart: bool,
-    /// A host that is silent for so long is gone. Default: 10 s.
+    /// Silence after which the host counts as gone. Default: 10 s.
     pub idle_timeout: Duration,
 }
 
@@ -45,85 +51,86 @@ impl Default for GuestConfig {
     }
 }
 
-/// What happened at a guest.
+/// An event at a guest.
 #[derive(Debug, Clone, PartialEq)]
 #[non_exhaustive]
 pub enum GuestEvent {
-    /// The host let us in.
+    /// The host accepted the guest.
     Welcomed {
-        /// Our number.
+        /// The guest's user number.
         user: UserId,
     },
-    /// The host announced a body; its model may still be on the way.
+    /// The host announced a body. Its model may still be missing.
     BodyAnnounced {
-        /// Which.
+        /// The body.
         body: BodyId,
-        /// Its name.
+        /// Name of the body.
         name: String,
     },
     /// Bytes of a model arrived.
     ModelProgress {
-        /// Which model.
+        /// Hash of the model.
         hash: [u8; 32],
-        /// Bytes that are here.
+        /// Number of bytes received.
         received: u64,
-        /// Bytes in all.
+        /// Total number of bytes.
         total: u64,
     },
-    /// A model is here, to be read ([`GuestConfig::models_apart`]).
+    /// A model has arrived and must be decoded ([`GuestConfig::models_apart`]).
     ModelCame {
-        /// Which model.
+        /// Hash of the model.
         hash: [u8; 32],
-        /// A `.modal` file, if the host is honest.
+        /// A `.modal` file. The bytes come from the host and are not checked.
         bytes: Arc<[u8]>,
     },
-    /// Model and state of a body are here: it can be shown.
+    /// Model and state of a body have arrived, and the body can be shown.
     BodyReady {
-        /// Which.
+        /// The body.
         body: BodyId,
-        /// Its model, for the caller's cache too.
+        /// Its model, which the caller may also cache.
         model: Arc<ModalModel>,
     },
-    /// The host steps a body otherwise from now on: [`BodyView::info`](super::BodyView::info) says how. Hands on it stay.
+    /// The host changed the step settings of a body. [`BodyView::info`](super::BodyView::info) has
+    /// the new settings. Hands on the body stay.
     BodyChanged {
-        /// Which.
+        /// The body.
         body: BodyId,
     },
     /// A body left the session.
     BodyGone {
-        /// Which.
+        /// The body.
         body: BodyId,
     },
-    /// The state of a body was taken over anew.
+    /// The state of a body was replaced by a snapshot.
     Resynced {
-        /// Which.
+        /// The body.
         body: BodyId,
     },
-    /// Frames of a body fail: it stands still until they come again.
+    /// Frames of a body are missing. The body stands still until frames arrive again.
     Stalled {
-        /// Which.
+        /// The body.
         body: BodyId,
     },
-    /// Somebody else came.
+    /// Another user joined.
     UserJoined {
-        /// Number.
+        /// User number.
         user: UserId,
-        /// Name.
+        /// Display name.
         name: String,
     },
-    /// Somebody else left.
+    /// Another user left.
     UserLeft {
-        /// Number.
+        /// User number.
         user: UserId,
     },
-    /// The host did not accept one of our grabs, or ended it.
+    /// The host refused or ended one of the guest's grabs.
     GrabRefused {
-        /// Our number for it.
+        /// The guest's number for the grab.
         grab: u16,
     },
     /// The session is over.
     Closed {
-        /// Why.
+        /// The reason.
         reason: DisconnectReason,
     },
 }

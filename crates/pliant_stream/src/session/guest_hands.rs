@@ -1,4 +1,4 @@
-//! A guest's own hands: what they hold, and how their targets are said.
+//! The guest's own hands: their grabs, and how their targets are sent.
 
 use std::collections::VecDeque;
 use std::time::Duration;
@@ -11,22 +11,22 @@ use crate::StreamError;
 use crate::state::{BodyId, in_range};
 use crate::wire::{Datagram, GuestMessage, MAX_TARGETS, TargetEntry, Targets};
 
-/// A held target that does not move is said again this often.
+/// Interval at which an unchanged target is sent again.
 const TARGET_EVERY: Duration = Duration::from_millis(250);
-/// Each datagram says the last so many targets of a grab.
+/// Number of recent targets of a grab in each datagram.
 const TARGET_REPEATS: usize = 3;
 
 #[derive(Debug)]
 pub(super) struct OwnGrab {
     pub(super) body: BodyId,
-    /// The newest last; at most three.
+    /// The recent targets, newest last, at most three.
     targets: VecDeque<TargetEntry>,
     fresh: bool,
     said: Duration,
 }
 
 impl OwnGrab {
-    /// When its target is to be said next, if it has one.
+    /// Time at which the target is to be sent next; `None` without a target.
     pub(super) fn due(&self, now: Duration) -> Option<Duration> {
         let due = if self.fresh { now } else { self.said + TARGET_EVERY };
         (!self.targets.is_empty()).then_some(due)
@@ -34,13 +34,18 @@ impl OwnGrab {
 }
 
 impl GuestSession {
-    /// Takes hold of a body, as `hold` says: with the hand's own spring and damper, or as stiffly as the patch allows
-    /// ([`GrabConfig::default`]); capped at what devices have. The number names the grab to the other calls; the host may answer
+    /// Grabs a body and returns the number of the grab.
+    ///
+    /// `hold` gives the hand's own spring and damper, capped at what devices have, or a grab as
+    /// stiff as the patch allows ([`GrabConfig::default`]). The other calls name the grab by its
+    /// number. The host may answer with
     /// [`GuestEvent::GrabRefused`](crate::GuestEvent::GrabRefused).
     ///
     /// # Errors
-    /// [`StreamError::State`] before the welcome, [`StreamError::UnknownBody`], [`StreamError::NotFinite`],
-    /// [`StreamError::Config`] for a spring or damper out of range, [`StreamError::Full`] beyond 16 grabs.
+    /// Returns [`StreamError::State`] before the welcome, [`StreamError::UnknownBody`] for an
+    /// unknown body, [`StreamError::NotFinite`] for a target or radius out of range,
+    /// [`StreamError::Config`] for a spring or damper out of range, and [`StreamError::Full`]
+    /// beyond 16 grabs.
     pub fn begin_grab(
         &mut self,
         now: Duration,
@@ -64,7 +69,7 @@ impl GuestSession {
             let expected = "a spring above 0 N/m, a damper of 0 s or more";
             return Err(StreamError::Config { what: "hold", found: error.to_string(), expected });
         }
-        // As the host will have it.
+        // The host applies the same limits.
         let hold = hold.capped();
         let limit = super::host_peer::MAX_GUEST_GRABS;
         if self.grabs.len() >= limit {
@@ -83,10 +88,12 @@ impl GuestSession {
         Ok(grab)
     }
 
-    /// Moves a hand. Sent with the next [`GuestSession::update`], and twice more with the targets after it.
+    /// Moves a hand. The target is sent with the next [`GuestSession::update`] and twice more with
+    /// the targets after it.
     ///
     /// # Errors
-    /// [`StreamError::UnknownGrab`], [`StreamError::NotFinite`] (the old target stays).
+    /// Returns [`StreamError::UnknownGrab`] for an unknown grab and [`StreamError::NotFinite`] for
+    /// a target out of range. The old target then stays.
     pub fn set_target(&mut self, grab: u16, target: [f64; 3]) -> Result<(), StreamError> {
         if !in_range(&target) {
             return Err(StreamError::NotFinite { what: "target" });
@@ -105,7 +112,7 @@ impl GuestSession {
         Ok(())
     }
 
-    /// Lets go. Letting go twice is no error.
+    /// Ends a grab. Ending it twice is not an error.
     pub fn end_grab(&mut self, grab: u16) {
         if let Some(own) = self.grabs.remove(&grab) {
             self.forget_own(own.body, grab);
@@ -113,7 +120,7 @@ impl GuestSession {
         }
     }
 
-    /// Our grabs: number and body.
+    /// Iterates over the guest's grabs: number and body.
     pub fn grabs(&self) -> impl Iterator<Item = (u16, BodyId)> {
         self.grabs.iter().map(|(k, g)| (*k, g.body))
     }

@@ -1,4 +1,4 @@
-//! The host's side: it steps the bodies, and every guest follows.
+//! The host's side of a session: streams the bodies to all guests.
 
 use std::collections::{BTreeMap, BTreeSet, VecDeque};
 use std::sync::{Arc, OnceLock};
@@ -17,7 +17,7 @@ use crate::newmark::Newmark;
 use crate::state::{BodyId, GrabKey, PeerId, Tick, UserId};
 use crate::wire::{BodyInfo, Datagram, GuestMessage, HostMessage, PROTOCOL_VERSION, StreamSubscription};
 
-/// A kind of receiver, and how many bytes its datagrams may have.
+/// Key of an encoder: the subscription and the datagram size in bytes.
 pub(super) type StreamKey = (StreamSubscription, usize);
 
 #[derive(Debug)]
@@ -31,14 +31,14 @@ pub(super) struct HostBody {
     pub(super) last: Option<Tick>,
     pub(super) resting: bool,
     pub(super) reminded: Duration,
-    /// The visible amplitudes of its modes, for its encoders.
+    /// The visible amplitudes of the modes, for the encoders.
     pub(super) visible: OnceLock<Vec<f64>>,
-    /// One encoder per kind of receiver and room in the datagram.
+    /// One encoder per subscription and datagram size.
     pub(super) streams: BTreeMap<StreamKey, Encoder>,
 }
 
 impl HostBody {
-    /// What a guest is told of it; `None` before the guest has said what it wants.
+    /// Describes the body to a guest; `None` before the guest has sent its subscription.
     pub(super) fn info(&self, guest: &Peer) -> Option<BodyInfo> {
         Some(BodyInfo {
             body: self.id.0,
@@ -62,15 +62,15 @@ pub struct HostSession {
     next_user: u16,
     pub(super) upload: Upload,
     pub(super) encoded: u64,
-    /// The counts of those who are gone.
+    /// Counts of the connections that have ended.
     gone: LinkStats,
 }
 
 impl HostSession {
-    /// A session without bodies or guests.
+    /// Creates a session without bodies or guests.
     ///
     /// # Errors
-    /// [`StreamError::Config`] for a setting out of range.
+    /// Returns [`StreamError::Config`] for a setting out of range.
     pub fn new(config: HostConfig) -> Result<Self, StreamError> {
         config.newmark.check()?;
         let upload = Upload::new(&config)?;
@@ -99,10 +99,10 @@ impl HostSession {
         &self.config
     }
 
-    /// A connection opened; its datagrams carry at most so many bytes.
+    /// Adds a connection whose datagrams carry at most `max_datagram` bytes.
     ///
     /// # Errors
-    /// [`StreamError::Full`] when there is no place; the caller closes the connection.
+    /// Returns [`StreamError::Full`] when there is no room. The caller then closes the connection.
     pub fn connect(&mut self, now: Duration, peer: PeerId, max_datagram: usize) -> Result<(), StreamError> {
         if self.peers.len() >= self.config.max_guests {
             return Err(StreamError::Full { what: "guests", limit: self.config.max_guests });
@@ -111,24 +111,24 @@ impl HostSession {
         Ok(())
     }
 
-    /// A connection closed.
+    /// Removes a connection that the transport closed.
     pub fn disconnect(&mut self, peer: PeerId, reason: DisconnectReason) {
         self.drop_peer(peer, reason, false);
     }
 
-    /// Ends a guest's session with a reason that they are told.
+    /// Ends a guest's session and sends the reason to the guest.
     pub fn kick(&mut self, peer: PeerId, reason: DisconnectReason) {
         self.drop_peer(peer, reason, true);
     }
 
-    /// The path's datagrams have another size now.
+    /// Sets a new datagram size of a guest's path.
     pub fn set_max_datagram(&mut self, peer: PeerId, bytes: usize) {
         let Some(p) = self.peers.get_mut(&peer) else { return };
         if p.link.max_datagram == bytes {
             return;
         }
         p.link.max_datagram = bytes;
-        // A new size is another encoder: its receivers begin from a snapshot.
+        // A new size means another encoder, whose receivers start from a snapshot.
         let flowing = std::mem::take(&mut p.flowing);
         p.due.extend(flowing);
         if bytes < MIN_DATAGRAM && p.user().is_some() {
@@ -136,19 +136,21 @@ impl HostSession {
         }
     }
 
-    /// Lets a guest in that asked.
+    /// Accepts a guest that has asked to join.
     ///
     /// # Errors
-    /// [`StreamError::UnknownPeer`]; [`StreamError::State`] when they have not asked.
+    /// Returns [`StreamError::UnknownPeer`] for an unknown connection and [`StreamError::State`]
+    /// when the guest has not asked to join.
     pub fn accept(&mut self, now: Duration, peer: PeerId) -> Result<UserId, StreamError> {
         self.accept_as(now, peer, None)
     }
 
-    /// Lets a guest in that asked, under the number it had `before`: somebody who comes back. A number that is in use, or the host's own, is
-    /// not given; a new one is.
+    /// Accepts a guest that has asked to join, under the number that it had `before`. This is for a
+    /// guest that reconnects. When the number is in use, or is the host's own, the guest gets a new
+    /// number.
     ///
     /// # Errors
-    /// As [`HostSession::accept`].
+    /// Returns the errors of [`HostSession::accept`].
     pub fn accept_as(
         &mut self,
         now: Duration,
@@ -167,12 +169,12 @@ impl HostSession {
         self.peers.get(&peer).and_then(Peer::user).ok_or(StreamError::UnknownPeer(peer))
     }
 
-    /// Turns a guest away that asked.
+    /// Refuses a guest that has asked to join.
     pub fn refuse(&mut self, peer: PeerId) {
         self.drop_peer(peer, DisconnectReason::Refused, true);
     }
 
-    /// Does not accept a guest's grab, or ends it: the guest is told. No event follows.
+    /// Refuses or ends a guest's grab and notifies the guest. No event follows.
     pub fn refuse_grab(&mut self, key: GrabKey) {
         for peer in self.peers.values_mut().filter(|p| p.user() == Some(key.user)) {
             if peer.grabs.remove(&key.grab).is_some() {
@@ -181,8 +183,12 @@ impl HostSession {
         }
     }
 
-    /// How many modes of a body a guest is sent: so many of what it takes anyway, taken up to the next of 1, 2, 3, 4, 6, 8, 12 and so on, so
-    /// that guests share encoders; none at all for 0, everything again for `None`. A change begins with a snapshot. False for a guest or body that is not there.
+    /// Limits how many modes of a body a guest receives.
+    ///
+    /// The limit is rounded up to the next of 1, 2, 3, 4, 6, 8, 12 and so on, so that guests share
+    /// encoders. It never raises what the guest subscribed to. With 0 the guest receives nothing of
+    /// the body, and `None` removes the limit. A change starts with a snapshot. Returns false for
+    /// an unknown guest, or a body that was not announced to the guest.
     pub fn set_interest(&mut self, peer: PeerId, body: BodyId, modes: Option<u16>) -> bool {
         let Some(p) = self.peers.get_mut(&peer).filter(|p| p.announced.contains(&body)) else { return false };
         let before = p.interest.get(&body).copied();
@@ -204,31 +210,32 @@ impl HostSession {
         true
     }
 
-    /// The guests that are in.
+    /// Iterates over the guests in the session.
     pub fn users(&self) -> impl Iterator<Item = (PeerId, UserId, &str)> {
         self.peers.values().filter_map(|p| p.user().map(|u| (p.id, u, p.name.as_str())))
     }
 
-    /// How a guest's path does.
+    /// Metrics of a guest's connection.
     pub fn stats(&self, peer: PeerId) -> Option<LinkStats> {
         self.peers.get(&peer).map(|p| p.link.stats())
     }
 
-    /// The counts of all paths, of those who are gone too: they never fall. Times, shares and the level are zero.
+    /// Counts of all connections, including those that have ended, so they never decrease. Times,
+    /// shares and the level are zero.
     pub fn totals(&self) -> LinkStats {
         let mut sum = self.gone;
         self.peers.values().for_each(|p| sum.add_counts(&p.link.stats));
         sum
     }
 
-    /// Something arrived unreliably. Any bytes will do: what makes no sense is counted and forgotten.
+    /// Processes a received datagram. Any bytes are allowed; invalid ones are counted and dropped.
     pub fn on_datagram(&mut self, now: Duration, peer: PeerId, bytes: &[u8]) {
         let Some(p) = self.peers.get_mut(&peer) else { return };
         let Ok((sequence, datagram)) = Datagram::decode(bytes) else {
             p.link.reject();
             return;
         };
-        // Nothing counts before the guest has been let in.
+        // Datagrams do not count before the guest has been accepted.
         let Some(user) = p.user() else {
             p.link.reject();
             return;
@@ -243,7 +250,8 @@ impl HostSession {
                 entries.sort_by_key(|e| (e.grab, e.input));
                 for e in entries {
                     let Some(held) = p.grabs.get_mut(&e.grab) else { continue };
-                    // Newer than the last by less than half the range: the counter may wrap.
+                    // The input is newer when it is ahead by less than half the range, since the
+                    // counter may wrap.
                     let newer = held.input.is_none_or(|last| (e.input.wrapping_sub(last) as i32) > 0);
                     if newer {
                         held.input = Some(e.input);
@@ -262,7 +270,7 @@ impl HostSession {
                 p.link.stats.nacks += 1;
                 for run in nack.runs {
                     for tick in run.first..run.first + u64::from(run.count) {
-                        // What is on its way anyway needs no second answer.
+                        // A tick that is already queued needs no second answer.
                         let waits = p.resends.iter().any(|r| r.1 == nack.body && r.2 == tick);
                         if !waits && p.flowing.contains(&nack.body) && p.nack_budget.spend(now, 1.0) {
                             p.queue_resend(now + self.config.resend_after, nack.body, tick);
@@ -273,7 +281,7 @@ impl HostSession {
             }
             Datagram::Ping(clock) => {
                 p.link.take_report(clock.report);
-                // Zero: the guest has measured none yet.
+                // Zero means that the guest has not measured a round trip yet.
                 if clock.round_trip > 0 {
                     p.link.sample_round_trip(Duration::from_micros(u64::from(clock.round_trip)));
                 }
@@ -283,7 +291,7 @@ impl HostSession {
         }
     }
 
-    /// Something arrived reliably. A message that breaks the protocol ends the guest's session.
+    /// Processes a received message. A message that breaks the protocol ends the guest's session.
     pub fn on_message(&mut self, now: Duration, peer: PeerId, bytes: &[u8]) {
         let Some(p) = self.peers.get_mut(&peer) else { return };
         p.link.receive_message(now, bytes.len());
@@ -319,7 +327,8 @@ impl HostSession {
             (GuestMessage::GrabBegin { grab, body, vertex, radius, target, hold }, Some(user)) => {
                 let body = BodyId(body);
                 let vertices = self.bodies.get(&body).map_or(0, |b| b.model.surface().positions().len());
-                // A new patch costs every encoder of the body a table of its own.
+                // The budget limits new patches, since each costs every encoder of the body a
+                // table.
                 let fits = (vertex as usize) < vertices
                     && p.grab_budget.spend(now, 1.0)
                     && p.grabs.len() < MAX_GUEST_GRABS
@@ -350,7 +359,7 @@ impl HostSession {
         }
     }
 
-    /// Sends what is due by now, and lets go of guests that are silent. Call once a frame and at
+    /// Sends what is due and drops guests that are silent. Call this once a frame and at
     /// [`HostSession::next_wakeup`].
     pub fn update(&mut self, now: Duration) {
         let ids: Vec<PeerId> = self.peers.keys().copied().collect();
@@ -368,7 +377,7 @@ impl HostSession {
         self.send_models(now);
     }
 
-    /// When to call [`HostSession::update`] at the latest, if nothing happens before.
+    /// Latest time at which to call [`HostSession::update`] if nothing happens before.
     pub fn next_wakeup(&self) -> Option<Duration> {
         let each = self.peers.values().flat_map(|p| {
             let model = self.upload.ready_at(p);
@@ -378,24 +387,27 @@ impl HostSession {
         each.flatten().min()
     }
 
-    /// The next thing to send. Nothing is dropped here: fetch it after each call. A guest adds no more by what it asks than
-    /// its budgets allow: 4,000 ticks, 2 snapshots and 200 messages a second (16 snapshots, 400 messages at once).
+    /// Returns the next datagram or message to send.
+    ///
+    /// Nothing is dropped here, so fetch the outputs after each call. The requests of one guest add
+    /// no more than its budgets allow: 4,000 ticks, 2 snapshots and 200 messages a second (16
+    /// snapshots and 400 messages at once).
     pub fn poll_output(&mut self) -> Option<Output> {
         self.out.pop_front()
     }
 
-    /// The next thing that happened.
+    /// Returns the next event.
     pub fn poll_event(&mut self) -> Option<HostEvent> {
         self.events.pop()
     }
 
-    /// Events that nobody fetched and that were dropped.
+    /// Number of events that were dropped because the application did not fetch them.
     pub fn dropped_events(&self) -> u64 {
         self.events.dropped()
     }
 
-    /// Frames that were encoded so far: one for each body and tick, and for each kind of receiver (payload, modes, room in the datagram), however many
-    /// guests it goes to.
+    /// Number of frames encoded so far. One frame is encoded for each body, tick and kind of
+    /// receiver (payload, modes, datagram size), however many guests receive it.
     pub fn encoded(&self) -> u64 {
         self.encoded
     }
@@ -410,7 +422,7 @@ impl HostSession {
         let number = match before.map(|user| user.0).filter(|&number| free(number)) {
             Some(number) => number,
             None => {
-                // At most 256 guests by default, 65,535 numbers: the search ends.
+                // The search ends: there are at most 256 guests by default and 65,535 numbers.
                 let mut number = self.next_user;
                 while !free(number) {
                     number = number.wrapping_add(1);
@@ -484,15 +496,16 @@ impl HostSession {
     }
 }
 
-/// The next of 1, 2, 3, 4, 6, 8, 12 and so on: however many guests change their minds, and however often, a body has two encoders at most for
-/// each doubling of its modes.
+/// Rounds up to the next of 1, 2, 3, 4, 6, 8, 12 and so on. However often guests change their
+/// limits, a body has at most two encoders for each doubling of its modes.
 fn step_up(modes: u16) -> u16 {
     let whole = modes.checked_next_power_of_two().unwrap_or(u16::MAX);
     let between = whole / 4 * 3;
     if between >= modes && between > 0 { between } else { whole }
 }
 
-/// The kind of stream that a guest takes of a body: what it wished, less what its path does not bear.
+/// Returns the stream of a body that a guest receives: its subscription, reduced to what its path
+/// carries. The result is `None` when the guest takes nothing of the body.
 pub(super) fn stream_key(peer: &Peer, body: &HostBody) -> Option<StreamKey> {
     let model_modes = body.model.mode_count();
     let mut subscription = peer.regulator.cut(peer.subscription?, model_modes);

@@ -1,4 +1,4 @@
-//! The bodies of a session: they come, change and go, and every guest is told.
+//! The bodies of a session: adding, changing and removing them notifies every guest.
 
 use std::collections::BTreeMap;
 use std::sync::{Arc, OnceLock};
@@ -14,11 +14,12 @@ use crate::state::{BodyId, GrabKey, MAX_MODES, PeerId};
 use crate::wire::HostMessage;
 
 impl HostSession {
-    /// Adds a body to the session; guests learn of it at once.
+    /// Adds a body to the session and announces it to the guests at once.
     ///
     /// # Errors
-    /// [`StreamError::Full`] beyond 1,024 bodies; [`StreamError::Config`] for a name over 64 bytes or a number in use;
-    /// [`StreamError::Model`] for settings out of their ranges.
+    /// Returns [`StreamError::Full`] beyond 1,024 bodies, [`StreamError::Config`] for a name over
+    /// 64 bytes, a model of more than 4,096 modes or a number in use, and [`StreamError::Model`]
+    /// for settings out of their ranges.
     pub fn add_body(
         &mut self,
         body: BodyId,
@@ -30,11 +31,12 @@ impl HostSession {
         self.add_body_as(body, name, model, bytes, settings)
     }
 
-    /// As [`HostSession::add_body`], with the model's file (`model.to_bytes()`), made elsewhere: that takes long for a frame. Guests leave a
-    /// session whose models are not what their hashes say.
+    /// Adds a body like [`HostSession::add_body`], with the bytes of the model's file
+    /// (`model.to_bytes()`) already made, since making them takes long compared with a frame.
+    /// Guests leave a session whose models do not match their hashes.
     ///
     /// # Errors
-    /// As [`HostSession::add_body`].
+    /// Returns the errors of [`HostSession::add_body`].
     pub fn add_body_as(
         &mut self,
         body: BodyId,
@@ -78,11 +80,14 @@ impl HostSession {
         Ok(())
     }
 
-    /// From the next tick on the body is stepped as `settings` say: who has it is told, and gets a snapshot. Hands on it stay. Not for many times a
-    /// second: every change begins every guest's stream anew.
+    /// Changes the step settings of a body from the next tick on.
+    ///
+    /// Guests that have the body are notified and receive a snapshot. Hands on the body stay. Do
+    /// not call this many times a second, since every change restarts every guest's stream.
     ///
     /// # Errors
-    /// [`StreamError::UnknownBody`], [`StreamError::Model`]; the old settings then stay.
+    /// Returns [`StreamError::UnknownBody`] for an unknown body and [`StreamError::Model`] for
+    /// settings out of their ranges. The old settings then stay.
     pub fn set_settings(&mut self, body: BodyId, settings: StepSettings) -> Result<(), StreamError> {
         settings.check().map_err(|e| StreamError::Model(e.to_string()))?;
         let entry = self.bodies.get_mut(&body).ok_or(StreamError::UnknownBody(body))?;
@@ -100,7 +105,7 @@ impl HostSession {
         Ok(())
     }
 
-    /// Takes a body out of the session. Grabs on it end.
+    /// Removes a body from the session. Its grabs end.
     pub fn remove_body(&mut self, body: BodyId) {
         if self.bodies.remove(&body).is_none() {
             return;

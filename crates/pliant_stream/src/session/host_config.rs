@@ -11,30 +11,38 @@ use crate::state::{BodyId, GrabKey, PeerId, UserId};
 /// Settings of a host.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct HostConfig {
-    /// The step and the filter by which acceleration streams are read. Default: 1/40 s, and beta 4/9, gamma 5/6
-    /// (generalized-alpha with 0.5), which follows any host integrator without ringing. For the paper's own method with a
-    /// host that steps by average acceleration: [`Newmark::average`].
+    /// The step, and the filter that reads acceleration streams.
+    ///
+    /// Default: 1/40 s, and beta 4/9, gamma 5/6 (generalized-alpha with 0.5), which tracks any host
+    /// integrator without ringing. For the paper's own method with a host that steps by average
+    /// acceleration, use [`Newmark::average`].
     pub newmark: Newmark,
-    /// Most guests. Default: 256.
+    /// Largest number of guests. Default: 256.
     pub max_guests: usize,
-    /// A guest that is silent for so long is gone. Default: 10 s.
+    /// Silence after which a guest counts as gone. Default: 10 s.
     pub idle_timeout: Duration,
-    /// Bytes a second at which models are sent to one guest. Default: 1 MB/s.
+    /// Rate at which models are sent to one guest, bytes/s. Default: 1 MB/s.
     pub model_rate: f64,
-    /// Bytes a second at which models are sent to all guests together, in turns of 16 KiB: however many fetch at once, each gets its part, and the
-    /// frames of the others have the rest of the line. Default: 8 MB/s.
+    /// Rate at which models are sent to all guests together, bytes/s. Guests take turns of 16 KiB,
+    /// so that each gets its share however many download at once, and the frames of the others have
+    /// the rest of the connection. Default: 8 MB/s.
     pub models_rate: f64,
-    /// Bits a second of datagrams that one guest may cost. Beyond it, or when a guest's round trip grows by 50 ms over its
-    /// least, the guest gets fewer repeats, then fewer refreshes, then fewer modes; no tick is dropped. Default: 1 Mbit/s.
+    /// Largest rate of datagrams to one guest, bit/s.
+    ///
+    /// Beyond this rate, or when a guest's round trip grows by 50 ms over its minimum, the guest
+    /// gets fewer repeats, then fewer refreshes, then fewer modes. No tick is dropped. Default: 1
+    /// Mbit/s.
     pub guest_rate: f64,
-    /// Answer a NACK only so much later: for remaking the paper's figures. Default: at once.
+    /// Delay of the answers to NACKs, to reproduce the figures of the paper. Default: 0, answers
+    /// are sent at once.
     pub resend_after: Duration,
-    /// What one step of a quantised number may move the surface by, as a share of how far the body is bent, 1e-9 to 0.1 (values outside are brought
-    /// there); streams of accelerations take a 64th of it. Default: 2^-14.
+    /// Displacement of the surface by one quantization step, as a share of how far the body is
+    /// bent. Values are clamped to 1e-9 to 0.1. Streams of accelerations use a 64th of it. Default:
+    /// 2^-14.
     pub quantum: f64,
-    /// Let everybody in who says hello; else [`HostEvent::JoinRequest`] asks and
-    /// [`crate::HostSession::accept`] answers. Who may come at all is the transport's to know. Default:
-    /// true.
+    /// Accepts every guest that sends a hello. Otherwise [`HostEvent::JoinRequest`] asks, and
+    /// [`crate::HostSession::accept`] answers. The transport decides who may connect at all.
+    /// Default: true.
     pub open: bool,
 }
 
@@ -54,65 +62,66 @@ impl Default for HostConfig {
     }
 }
 
-/// What happened at the host.
+/// An event at the host.
 #[derive(Debug, Clone, PartialEq)]
 #[non_exhaustive]
 pub enum HostEvent {
-    /// Somebody asks to come in; answer with [`crate::HostSession::accept`] or
-    /// [`crate::HostSession::refuse`]. Not with `open`.
+    /// A guest asks to join. Answer with [`crate::HostSession::accept`] or
+    /// [`crate::HostSession::refuse`]. This event does not occur with [`HostConfig::open`].
     JoinRequest {
-        /// Who.
+        /// The connection.
         peer: PeerId,
-        /// Their name.
+        /// Display name of the guest.
         name: String,
     },
-    /// A guest is in.
+    /// A guest joined.
     Joined {
         /// The connection.
         peer: PeerId,
-        /// Their number.
+        /// User number of the guest.
         user: UserId,
-        /// Their name.
+        /// Display name of the guest.
         name: String,
     },
-    /// A guest is gone; their grabs have ended ([`HostEvent::GrabEnded`] came before this).
+    /// A guest left. Its grabs have ended ([`HostEvent::GrabEnded`] precedes this event).
     Left {
         /// The connection.
         peer: PeerId,
-        /// Their number, if they had joined.
+        /// User number of the guest, if it had joined.
         user: Option<UserId>,
-        /// Why.
+        /// The reason.
         reason: DisconnectReason,
     },
-    /// A hand takes hold: the application grabs its body, or says [`crate::HostSession::refuse_grab`].
+    /// A guest grabs a body. The application grabs the body, or calls
+    /// [`crate::HostSession::refuse_grab`].
     GrabBegan {
-        /// Whose and which.
+        /// Identifies the grab.
         key: GrabKey,
         /// The body.
         body: BodyId,
-        /// Center of the patch.
+        /// Surface vertex at the center of the patch.
         vertex: u32,
         /// Radius of the patch, m.
         radius: f64,
-        /// Where the hand is, world, m.
+        /// Position of the hand, world, m.
         target: [f64; 3],
-        /// How the hand holds: its own spring and damper, at most 1e5 N/m and 1 s.
+        /// The hand's own spring and damper, at most 1e5 N/m and 1 s.
         hold: GrabConfig,
     },
-    /// A hand moves.
+    /// A hand moved.
     GrabMoved {
-        /// Whose and which.
+        /// Identifies the grab.
         key: GrabKey,
         /// The body.
         body: BodyId,
-        /// The guest's input counter; ascends.
+        /// The guest's input counter, which ascends.
         input: u32,
-        /// Where the hand is, world, m.
+        /// Position of the hand, world, m.
         target: [f64; 3],
     },
-    /// A hand lets go.
+    /// A grab ended.
     GrabEnded {
-        /// Whose and which.
+        /// Identifies the grab.
         key: GrabKey,
         /// The body.
         body: BodyId,

@@ -1,4 +1,4 @@
-//! What the host knows of one guest.
+//! The host's state of one guest.
 
 use std::collections::{BTreeMap, BTreeSet, VecDeque};
 use std::sync::Arc;
@@ -10,23 +10,23 @@ use crate::link::{Budget, Link, micros};
 use crate::state::{BodyId, PeerId, Tick, UserId};
 use crate::wire::{Clock, Datagram, HostMessage, StreamSubscription};
 
-/// Most grabs that one guest may hold.
+/// Largest number of grabs of one guest.
 pub(crate) const MAX_GUEST_GRABS: usize = 16;
-/// Most resends waiting for one guest.
+/// Largest number of queued resends for one guest.
 const MAX_RESENDS: usize = 512;
 
-/// Where a guest stands.
+/// Stage of a guest's join.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(crate) enum Standing {
-    /// Connected, has not said hello.
+    /// The guest is connected and has not sent a hello.
     Silent,
-    /// Has said hello and waits for the application's word.
+    /// The guest has sent a hello and waits for the application to accept it.
     Asking,
-    /// In the session.
+    /// The guest is in the session.
     Joined(UserId),
 }
 
-/// A model on its way.
+/// A model that is being sent.
 #[derive(Debug, Clone)]
 pub(crate) struct Transfer {
     pub(crate) hash: [u8; 32],
@@ -38,7 +38,7 @@ pub(crate) struct Transfer {
 #[derive(Debug, Clone, Copy)]
 pub(crate) struct HeldGrab {
     pub(crate) body: BodyId,
-    /// The newest input seen.
+    /// The newest input received.
     pub(crate) input: Option<u32>,
 }
 
@@ -51,23 +51,24 @@ pub(crate) struct Peer {
     pub(crate) subscription: Option<StreamSubscription>,
     pub(crate) cached: BTreeSet<[u8; 32]>,
     pub(crate) transfers: VecDeque<Transfer>,
-    /// Bodies announced to the guest.
+    /// Bodies that were announced to the guest.
     pub(crate) announced: BTreeSet<BodyId>,
     /// Bodies whose snapshot is due at their next tick.
     pub(crate) due: BTreeSet<BodyId>,
-    /// Bodies whose snapshot was sent: frames flow.
+    /// Bodies whose snapshot was sent and whose frames are streamed.
     pub(crate) flowing: BTreeSet<BodyId>,
-    /// Most modes that are sent of a body, where that is not all that the guest takes; 0: nothing is.
+    /// Limits of the modes that are sent per body; 0 sends nothing. A body without an entry has no
+    /// limit.
     pub(crate) interest: BTreeMap<BodyId, u16>,
     pub(crate) grabs: BTreeMap<u16, HeldGrab>,
     pub(crate) resends: VecDeque<(Duration, BodyId, Tick)>,
     pub(crate) model_budget: Budget,
-    /// Bytes of messages that the transport has taken and not sent, as it last said.
+    /// Bytes of messages that the transport has accepted and not sent, as last reported.
     pub(crate) unsent: usize,
     pub(crate) nack_budget: Budget,
     pub(crate) snapshot_budget: Budget,
     pub(crate) message_budget: Budget,
-    /// Grabs that it may begin.
+    /// Budget for new grabs.
     pub(crate) grab_budget: Budget,
     pub(crate) regulator: Regulator,
 }
@@ -90,12 +91,12 @@ impl Peer {
             resends: VecDeque::new(),
             model_budget: Budget::new(model_rate, 64.0 * 1024.0),
             unsent: 0,
-            // A guest may ask for 4,000 ticks a second: 60 Hz at full loss with every tick asked for eight times, and
-            // some bodies at once.
+            // A guest may request 4,000 ticks a second: this covers 60 Hz at full loss with every
+            // tick requested eight times, for several bodies at once.
             nack_budget: Budget::new(4000.0, 4000.0),
             snapshot_budget: Budget::new(2.0, 16.0),
             message_budget: Budget::new(200.0, 400.0),
-            // A hand that slides takes hold anew each tick; no more, and its hands at once.
+            // A sliding hand begins a new grab each tick. The budget covers this rate and a burst.
             grab_budget: Budget::new(60.0, 120.0),
             regulator: Regulator::default(),
         }
@@ -108,7 +109,8 @@ impl Peer {
         }
     }
 
-    /// Sends a frame that was encoded for several; false when it is longer than the path carries by now.
+    /// Sends a frame that was encoded for several guests. Returns false when the frame is longer
+    /// than the path carries.
     pub(crate) fn send_frame(&mut self, body: &[u8], out: &mut VecDeque<Output>) -> bool {
         if body.len() + 3 > self.link.max_datagram {
             return false;
@@ -117,7 +119,7 @@ impl Peer {
         true
     }
 
-    /// Answers a clock request that came, and is answered, at `now`.
+    /// Answers a clock request that arrived at `now`, and is answered at `now`.
     pub(crate) fn send_pong(&mut self, now: Duration, t1: u64, out: &mut VecDeque<Output>) {
         let clock = Clock { t1, t2: micros(now), t3: micros(now), round_trip: 0, ..self.link.clock() };
         self.link.send_datagram(|sequence| Datagram::Pong(clock).encode(sequence), out);
@@ -131,7 +133,7 @@ impl Peer {
         self.send_message(&HostMessage::Goodbye { reason }, out);
     }
 
-    /// Queues a resend, unless it waits already, in the order in which they are due.
+    /// Queues a resend in order of the due times, unless the same one is queued.
     pub(crate) fn queue_resend(&mut self, due: Duration, body: BodyId, tick: Tick) {
         let entry = (due, body, tick);
         if self.resends.len() < MAX_RESENDS && !self.resends.contains(&entry) {

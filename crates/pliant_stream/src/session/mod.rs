@@ -1,8 +1,9 @@
-//! Sessions as state machines: one host, many guests.
+//! Sessions as state machines: one host and many guests.
 //!
-//! Neither side owns a socket, a clock or a thread. The caller hands in what arrived with the time at which it did, asks
-//! for what is to be sent, and calls again at [`HostSession::next_wakeup`] / [`GuestSession::next_wakeup`] at the latest.
-//! Times are durations since any fixed moment of the caller's own; the two sides' clocks need not agree.
+//! Neither side owns a socket, a clock or a thread. The caller passes in what arrived and the time
+//! of its arrival, fetches what is to be sent, and calls again at [`HostSession::next_wakeup`] or
+//! [`GuestSession::next_wakeup`] at the latest. Times are durations since any fixed moment of the
+//! caller's choice. The clocks of the two sides need not agree.
 //!
 //! | caller | host | guest |
 //! | --- | --- | --- |
@@ -12,8 +13,9 @@
 //! | once a frame, and at `next_wakeup` | [`HostSession::update`] | [`GuestSession::update`] |
 //! | then, until `None` | `poll_output`, `poll_event` | the same |
 //!
-//! Messages are whole: the transport keeps their borders and their order (for QUIC: one stream each way, each message
-//! preceded by its length as four bytes, little-endian; at most [`MAX_MESSAGE`] bytes).
+//! Messages are whole: the transport keeps their boundaries and their order. For QUIC this is one
+//! stream in each direction, with the length of each message before the message as four bytes,
+//! little-endian. A message has at most [`MAX_MESSAGE`] bytes.
 
 mod download;
 mod guest;
@@ -39,37 +41,37 @@ pub use predicted_hand::PredictedHand;
 
 use crate::state::PeerId;
 
-/// No reliable message is longer than this, bytes.
+/// Largest size of a reliable message, bytes.
 pub const MAX_MESSAGE: usize = 256 * 1024;
 
-/// A path must carry datagrams of at least this many bytes.
+/// Smallest datagram size that a path must carry, bytes.
 pub const MIN_DATAGRAM: usize = 256;
 
-/// How something is to be sent.
+/// Delivery of an output.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Channel {
-    /// Unreliable and unordered; late is worse than never.
+    /// Unreliable and unordered. A late datagram is worse than a lost one.
     Datagram,
     /// Reliable and in order.
     Message,
 }
 
-/// Something to be sent.
+/// A datagram or message to be sent.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Output {
-    /// To whom. For a guest always [`PeerId::HOST`].
+    /// The receiver. For a guest this is always [`PeerId::HOST`].
     pub peer: PeerId,
-    /// How.
+    /// The channel to use.
     pub channel: Channel,
-    /// What. Shared: one frame goes to many peers without a copy.
+    /// The content. It is shared, so that one frame goes to many peers without a copy.
     pub bytes: std::sync::Arc<[u8]>,
 }
 
-/// Why a session ended.
+/// Says why a session ended.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, serde::Serialize, serde::Deserialize, thiserror::Error)]
 #[non_exhaustive]
 pub enum DisconnectReason {
-    /// The other side said goodbye.
+    /// The other side left.
     #[error("left")]
     Left,
     /// Nothing arrived for the idle timeout.
@@ -81,25 +83,25 @@ pub enum DisconnectReason {
     /// The other side broke the protocol.
     #[error("protocol broken")]
     Protocol,
-    /// The two sides speak different versions.
+    /// The two sides have different protocol versions.
     #[error("other protocol version")]
     Version,
     /// The host refused the guest.
     #[error("refused")]
     Refused,
-    /// The host has no place left.
+    /// The host has no room left, or a model exceeds [`GuestConfig::model_bytes`].
     #[error("full")]
     Full,
     /// The path's datagrams are too small, see [`MIN_DATAGRAM`].
     #[error("datagrams too small")]
     Path,
-    /// The two sides have other bodies, or step them in other ways.
+    /// The two sides have different bodies or different step settings.
     #[error("other bodies or settings")]
     Scene,
 }
 
 impl DisconnectReason {
-    /// All of them, each at the place of its number on the wire.
+    /// All reasons, each at the index of its number on the wire.
     const ALL: [Self; 9] = [
         Self::Left,
         Self::Silent,
@@ -112,12 +114,12 @@ impl DisconnectReason {
         Self::Scene,
     ];
 
-    /// Its number on the wire.
+    /// Number of the reason on the wire.
     pub fn code(self) -> u8 {
         self as u8
     }
 
-    /// The reason of this number; `None` for one that this version does not know.
+    /// Returns the reason with this number, or `None` for a number that this version does not know.
     pub fn from_code(code: u8) -> Option<Self> {
         Self::ALL.get(usize::from(code)).copied()
     }

@@ -1,13 +1,16 @@
-//! Own hand first: a guest's hand does not wait for the round trip.
+//! Predicted hand: a guest's own hand does not wait for the round trip.
 //!
-//! What a guest is shown of a body is confirmed, and old by the way back and the playout; what its own hand does reaches
-//! the host after the way out. A hand that feels its own motion that late feels it wrong. So the guest keeps a second,
-//! newer copy: from the confirmed state it steps on to the tick at which the host will apply the hand's present target, the
-//! own hands at the targets that are on their way, the others' where they are going. It starts anew from the confirmed state
-//! at every tick (a step costs microseconds), and what changed by that fades.
+//! The confirmed state of a body at a guest is old by the path from the host and the playout delay.
+//! The targets of the guest's own hand reach the host after the path to the host. A reaction with
+//! all these delays would be wrong for the hand that causes it. The guest therefore keeps a second,
+//! newer copy of the body. The copy starts from the confirmed state and steps to the tick at which
+//! the host will apply the hand's present target. The guest's own hands are at the targets that are
+//! on their way, and the remote hands are at their extrapolated targets. At every tick the copy is
+//! stepped again from the confirmed state (a step costs microseconds), and the resulting change
+//! fades.
 //!
-//! How many ticks to step ahead needs no clock: the host's frames say which target each hand had, and the guest knows how
-//! many ticks ago it said that one.
+//! The number of ticks to step ahead needs no clock: the host's frames say which target each hand
+//! had, and the guest knows how many ticks ago it sent that target.
 
 use std::collections::VecDeque;
 
@@ -18,11 +21,11 @@ use crate::recovery::{Blend, Forecast, PoseBlend, Receiver};
 use crate::replica::{self, Mean, Replica};
 use crate::state::{GrabKey, Pose, State, Tick, UserId};
 
-/// Targets remembered, and so the largest lead, ticks.
+/// Number of targets remembered, which also bounds the lead, ticks.
 const REMEMBERED: usize = 64;
-/// Frames that must agree on another lead before it is taken.
+/// Number of frames that must disagree with the lead before it changes.
 const VOTES: u32 = 4;
-/// How fast the estimate of what else pushes a free body follows.
+/// Smoothing gain of the estimate of unexplained forces on a free body.
 const LEARN: f64 = 0.25;
 
 #[derive(Debug)]
@@ -32,19 +35,20 @@ struct OwnGrab {
     radius: f64,
     hold: GrabConfig,
     target: Option<[f64; 3]>,
-    /// The target at each of the last ticks, newest last; none where it did not hold.
+    /// The target at each of the last ticks, newest last; `None` where the grab did not hold.
     past: VecDeque<Option<[f64; 3]>>,
-    /// World, N.
+    /// Force of the body on the hand, world, N.
     reaction: [f64; 3],
-    /// What the reaction would have become, had nothing new been learnt.
+    /// The reaction that would follow without new information, world, N.
     would: [f64; 3],
-    /// How far the residual flexibility under the hand has flown, body axes, m: at the confirmed tick, and in the copy.
+    /// Viscoelastic state of the residual flexibility under the hand, body axes, m. `flow` is its
+    /// value at the confirmed tick, `flowing` its value in the copy.
     flow: Vector3<f64>,
     flowing: Vector3<f64>,
     offset: [f64; 3],
 }
 
-/// A guest's newer copy of a body that it holds.
+/// A guest's newer copy of a body that the guest holds.
 #[derive(Debug)]
 pub struct PredictedHand {
     replica: Replica,
@@ -54,16 +58,16 @@ pub struct PredictedHand {
     tick: Tick,
     active: bool,
     state: State,
-    /// The forces over the last step of all hands of `state`, N, world axes.
+    /// The mean forces of all hands of `state` over the last step, N, world axes.
     means: Vec<Mean>,
     expected: State,
     visual: State,
     blend: Blend,
-    /// The confirmed frame of the tick before, where the body is free.
+    /// The confirmed frame of the tick before, for a free body.
     last_frame: Option<Frame>,
     pose: Option<Pose>,
     pose_blend: PoseBlend,
-    /// Force and torque on the frame that nothing told explains, world axes.
+    /// Force and torque on the frame that the stream does not explain, world axes.
     push: (Vector3<f64>, Vector3<f64>),
     forecast: Forecast,
     fade: f64,
@@ -99,38 +103,39 @@ impl PredictedHand {
         }
     }
 
-    /// The tick that the copy stands for: the host's when the present target will reach it.
+    /// The tick of the copy: the host's tick when the present target will reach the host.
     pub fn tick(&self) -> Tick {
         self.tick
     }
 
-    /// How many ticks the copy is ahead of the confirmed state.
+    /// Number of ticks by which the copy is ahead of the confirmed state.
     pub fn lead(&self) -> usize {
         self.lead
     }
 
-    /// The body as its holder is to see it: continuous in position and velocity.
+    /// The visual state for the user who holds the body. It is continuous in position and velocity.
     pub fn visual(&self) -> &State {
         &self.visual
     }
 
-    /// The rigid frame that belongs to [`PredictedHand::shown`], where the body is free.
+    /// The rigid frame that belongs to [`PredictedHand::visual`], for a free body.
     pub fn pose(&self) -> Option<Pose> {
         self.pose
     }
 
-    /// The reaction of one of the guest's own grabs at this moment, world, N.
+    /// The present reaction of one of the guest's own grabs, world, N.
     pub fn reaction(&self, grab: u16) -> Option<[f64; 3]> {
         let g = self.grabs.iter().find(|g| g.grab == grab && g.target.is_some())?;
         Some(std::array::from_fn(|k| g.reaction[k] + g.offset[k]))
     }
 
-    /// False when the guest does not hold the body and nothing fades any more: the confirmed state is what is shown.
+    /// Returns false when the guest does not hold the body and no offset fades. The confirmed state
+    /// is then shown.
     pub fn is_active(&self) -> bool {
         self.active
     }
 
-    /// Goes on with the grabs of another copy.
+    /// Takes over the grabs and the lead of another copy.
     pub(crate) fn take_grabs(&mut self, other: Self) {
         self.grabs = other.grabs;
         self.lead = other.lead;
@@ -141,7 +146,7 @@ impl PredictedHand {
         self.grabs.push(OwnGrab {
             grab,
             vertex,
-            // As the host's frames will say it.
+            // The host's frames carry the radius in single precision.
             radius: f64::from(radius as f32),
             hold,
             target: Some(target),
@@ -166,12 +171,12 @@ impl PredictedHand {
         }
     }
 
-    /// The rigid frame of a copy, where the body is free.
+    /// The rigid frame of a copy, for a free body.
     fn frame_of(&self, state: &State) -> Option<Frame> {
         self.replica.model().is_free().then_some(state.frame)
     }
 
-    /// A tick of the confirmed state has passed. `guess`: the lead to begin with, ticks.
+    /// Steps the copy after a tick of the confirmed state. `guess` is the initial lead, ticks.
     pub(crate) fn step(&mut self, receiver: &Receiver, user: UserId, guess: usize) {
         let confirmed_frame = receiver.frame().and_then(|p| p.frame(self.replica.model()));
         if self.state.modes() != receiver.confirmed().modes()
@@ -210,7 +215,7 @@ impl PredictedHand {
         self.vote(receiver, user);
         self.tick = confirmed + self.lead as u64;
 
-        // What the copy would have become, had nothing new been learnt.
+        // This is the state that the copy would have reached without new information.
         let mut expected = std::mem::take(&mut self.expected);
         expected.clone_from(&self.state);
         let mut means = std::mem::take(&mut self.means);
@@ -257,8 +262,8 @@ impl PredictedHand {
         self.show();
     }
 
-    /// What pushes the frame of a free body besides gravity and the hands that the stream tells of (contacts): from the last
-    /// two confirmed ticks, smoothed.
+    /// Estimates what drives the frame of a free body besides gravity and the streamed hands
+    /// (contacts), from the last two confirmed ticks, smoothed.
     fn learn_push(&mut self, receiver: &Receiver, now: Option<Frame>) {
         let last = std::mem::replace(&mut self.last_frame, now);
         let (Some(mut from), Some(to)) = (last, now) else { return };
@@ -286,7 +291,8 @@ impl PredictedHand {
         self.push.1 += LEARN * (turning - self.push.1);
     }
 
-    /// Lets the flow under the own hands go on by the confirmed pulls, where the body relaxes.
+    /// Advances the viscoelastic state under the guest's own hands by the confirmed forces, if the
+    /// body relaxes.
     fn learn_flow(&mut self, receiver: &Receiver, user: UserId) {
         if receiver.settings().relaxation.is_none() {
             return;
@@ -304,7 +310,8 @@ impl PredictedHand {
         }
     }
 
-    /// Steps to `j` ticks after the confirmed one, and leaves the own reactions in the grabs.
+    /// Steps to `j` ticks after the confirmed tick and stores the reactions of the guest's own
+    /// hands in the grabs.
     fn one_step(
         &mut self,
         state: &mut State,
@@ -324,7 +331,8 @@ impl PredictedHand {
             let Some(mut hand) = self.replica.measured(&g) else { continue };
             hand.mean = replica::mean_of(means, g.state.key);
             if free {
-                // The frame moves on from what is confirmed: the other's hand is where it goes, not where the patch was.
+                // The frame moves on from the confirmed one. The remote hand is therefore held at
+                // its extrapolated target, not where the patch was.
                 let (velocity, config) = (Vector3::zeros(), GrabConfig::default());
                 hand.hold = Hold::Target { target: g.state.target.into(), velocity, config };
             }
@@ -335,7 +343,7 @@ impl PredictedHand {
         let mut own = std::mem::take(&mut self.own);
         own.clear();
         for (index, g) in self.grabs.iter().enumerate() {
-            // Newest is the target that arrives `lead` ticks after the confirmed one.
+            // The newest target is the one that arrives `lead` ticks after the confirmed tick.
             let at = (g.past.len() + j).checked_sub(1 + self.lead);
             let target = at.and_then(|i| g.past.get(i).copied().flatten()).map(Vector3::from);
             let (Some(target), Some(patch)) = (target, self.replica.patch(g.vertex, g.radius)) else {
@@ -363,14 +371,15 @@ impl PredictedHand {
         (self.hands, self.keys) = (hands, keys);
     }
 
-    /// Takes a state over; the forces of the last step stay.
+    /// Copies the state except its frame and the forces of the last step.
     fn take(&mut self, from: &State) {
         let (frame, f) = (self.state.frame, std::mem::take(&mut self.state.f));
         self.state.clone_from(from);
         (self.state.frame, self.state.f) = (frame, f);
     }
 
-    /// Finds how many ticks ago the target was said that the host's frame of the confirmed tick shows.
+    /// Finds how many ticks ago the guest sent the target that the host's frame of the confirmed
+    /// tick shows.
     fn vote(&mut self, receiver: &Receiver, user: UserId) {
         let mut found = None;
         for g in &self.grabs {
@@ -393,7 +402,7 @@ impl PredictedHand {
         }
     }
 
-    /// The guest holds nothing any more: the shown state goes over into the confirmed one.
+    /// Fades from the copy to the confirmed state, because the guest no longer holds the body.
     fn fall_back(&mut self, receiver: &Receiver) {
         self.blend.advance();
         let new = receiver.visual();
@@ -408,14 +417,14 @@ impl PredictedHand {
         self.take(new);
         if let (true, Some(new)) = (self.replica.model().is_free(), receiver.pose()) {
             let model = self.replica.model();
-            // Where the copy would have been by now.
+            // This is the frame that the copy would have reached by this tick.
             let zero = Vector3::zeros();
             RigidMotion::predict(&mut old, model, h, zero, zero, zero);
             self.pose_blend.add(&Pose::of_frame(model, &old), &new);
             replica::place(&mut self.state, model, Some(&new));
         }
         self.show();
-        // From here on the confirmed state is followed without new offsets.
+        // The confirmed state is tracked without new offsets from here on.
         let offset = self.visual.q.iter().zip(&new.q).map(|(a, b)| (a - b).abs()).fold(0.0, f64::max);
         let size = new.q.iter().fold(1e-12_f64, |m, q| m.max(q.abs()));
         self.active = offset > 1e-6 * size || !self.pose_blend.is_empty();

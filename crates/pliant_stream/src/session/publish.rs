@@ -1,4 +1,4 @@
-//! From a step of the host to the frames of all its guests.
+//! Turns a step of the host into frames for all guests.
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::time::Duration;
@@ -12,18 +12,18 @@ use crate::codec::quantization::Quanta;
 use crate::state::{BodyId, MAX_GRABS, PeerId, TICK_LIMIT, TickState, in_range};
 use crate::wire::WIDE_LIMIT;
 
-/// A resting body is recalled to its guests this often.
+/// Interval at which guests are reminded of a resting body.
 const REMINDER: Duration = Duration::from_secs(1);
 
-/// A tick at which a hand takes hold or lets go is said again after these shares of a step: it cannot be forecast, and its
-/// repeat comes with the next tick only.
+/// Delays, as shares of a step, after which a tick that begins or ends a grab is sent again. Such a
+/// tick cannot be extrapolated, and its repeat arrives only with the next tick.
 const NEWS_AGAIN: [f64; 2] = [0.3, 0.65];
 
-/// What goes out to all takers of one kind of stream.
+/// The output for all receivers of one kind of stream.
 struct Outgoing {
-    /// The frame; none where a snapshot takes its place.
+    /// The frame; `None` when a snapshot replaces it.
     frame: Option<Encoded>,
-    /// All takers need a snapshot.
+    /// All receivers need a snapshot.
     anew: bool,
 }
 
@@ -31,8 +31,10 @@ impl HostSession {
     /// Streams one step of a body to all guests.
     ///
     /// # Errors
-    /// [`StreamError::UnknownBody`], [`StreamError::TickOrder`], [`StreamError::NotFinite`] (also for numbers that are
-    /// absurdly large), [`StreamError::Length`], [`StreamError::Full`]; nothing is sent then.
+    /// Returns [`StreamError::UnknownBody`] for an unknown body, [`StreamError::TickOrder`] for a
+    /// tick that does not ascend or is out of range, [`StreamError::NotFinite`] for a number that
+    /// is not finite or too large, [`StreamError::Length`] for a slice of the wrong length, and
+    /// [`StreamError::Full`] for too many grabs. Nothing is sent in these cases.
     pub fn publish(&mut self, now: Duration, body: BodyId, state: &TickState<'_>) -> Result<(), StreamError> {
         let entry = self.bodies.get_mut(&body).ok_or(StreamError::UnknownBody(body))?;
         check_state(entry, state)?;
@@ -43,7 +45,8 @@ impl HostSession {
         entry.last = Some(state.tick);
         entry.resting = state.resting;
         let hash = entry.hash;
-        // Who wants the state and has the model; who is still fetching it waits, and nobody else pays for that.
+        // A snapshot is due for guests that wait for the state and have the model. A guest that is
+        // still downloading the model waits, without cost to the others.
         let is_due = |p: &Peer| p.due.contains(&body) && !p.transfers.iter().any(|t| t.hash == hash);
         let reminds = stays && now.saturating_sub(entry.reminded) >= REMINDER;
         if reminds {
@@ -51,8 +54,8 @@ impl HostSession {
         } else if stays && !self.peers.values().any(is_due) {
             return Ok(());
         }
-        // A pause in the ticks, or falling asleep: everybody takes the truth over anew. Waking up goes on from the state
-        // that all have, so nothing but a new run begins.
+        // After a gap in the ticks, or when the body falls asleep, all guests take the state anew.
+        // Waking up continues from the state that all guests have, so only a new run begins.
         let anew = slept || (!follows && !woke && !stays);
         if slept {
             entry.reminded = now;
@@ -114,7 +117,7 @@ impl HostSession {
                 && p.flowing.contains(&body)
                 && !encoded.all().all(|bytes| p.send_frame(bytes, &mut self.out))
             {
-                // The path shrank since the key was taken; the next tick has the new size.
+                // The path shrank after the key was taken. The next tick uses the new size.
                 p.due.insert(body);
             }
             if frame.as_ref().is_some_and(|f| f.news) {

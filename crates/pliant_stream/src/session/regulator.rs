@@ -1,19 +1,20 @@
-//! How much a guest's stream is cut down so that its path bears it.
+//! Reduces a guest's stream to what its path carries.
 
 use std::time::Duration;
 
 use crate::wire::{Payload, StreamSubscription};
 
-/// Judged this often.
+/// Length of the window over which the stream is judged.
 const WINDOW: Duration = Duration::from_secs(1);
-/// A round trip that is longer than its least by this means a queue, s.
+/// Excess of the round trip over its minimum that indicates a queue, s.
 const QUEUE: f64 = 0.05;
-/// Quiet windows before more is tried again; doubles each time that it was too much.
+/// Number of quiet windows before the level is lowered again. It doubles each time that lowering it
+/// was too much.
 const PATIENCE: u32 = 5;
-/// The last level.
+/// The highest level, which reduces the stream most.
 const LAST: u8 = 6;
 
-/// Lowers and raises the level of one guest's stream.
+/// Sets the level of one guest's stream.
 #[derive(Debug, Clone)]
 pub(crate) struct Regulator {
     level: u8,
@@ -31,7 +32,8 @@ impl Default for Regulator {
 }
 
 impl Regulator {
-    /// Judges the last window. `bytes`: sent in all; `round_trip`: the lesser of the last two, unsmoothed; `rate`: bits a second that are allowed.
+    /// Judges the last window. `bytes` is the total sent so far, `round_trip` the smaller of the
+    /// last two unsmoothed round trips, and `rate` the allowed rate in bit/s.
     pub(crate) fn judge(&mut self, now: Duration, bytes: u64, round_trip: Duration, rate: f64) {
         let (from, before) = *self.since.get_or_insert((now, bytes));
         let passed = now.saturating_sub(from);
@@ -42,23 +44,23 @@ impl Regulator {
         let bits = 8.0 * bytes.saturating_sub(before) as f64 / passed.as_secs_f64();
         let round_trip = round_trip.as_secs_f64();
         if round_trip > 0.0 {
-            // The least is forgotten within a minute: routes change for longer ones too.
+            // The minimum is forgotten within a minute, since routes also change to longer ones.
             self.least = round_trip.min(self.least + 0.02 * (round_trip - self.least).clamp(0.0, 1.0));
         }
-        // A queue that shrinks by a third in a second is already being dealt with.
+        // A queue that shrinks by a third in a second is already being resolved.
         let excess = round_trip - self.least;
         let queued = excess > QUEUE && excess > 0.7 * self.last;
         self.last = excess;
         if bits > rate || queued {
             if self.calm > 0 && self.calm < self.patience {
-                // It was raised not long ago, and that was too much.
+                // The level was lowered recently, and that was too much.
                 self.patience = (self.patience * 2).min(600);
             }
             self.level = (self.level + 1).min(LAST);
             self.calm = 0;
         } else if self.level > 0 {
             self.calm += 1;
-            // The next level up costs less than half as much again.
+            // Lowering the level by one costs less than half as much again.
             if self.calm >= self.patience && bits < 0.6 * rate {
                 self.level -= 1;
                 self.calm = 1;
@@ -66,12 +68,12 @@ impl Regulator {
         }
     }
 
-    /// The present level; 0: everything that was wished.
+    /// The present level; 0 leaves the subscription as it is.
     pub(crate) fn level(&self) -> u8 {
         self.level
     }
 
-    /// What is left of a wish: repeats go first, then refreshes, then modes.
+    /// Reduces a subscription to the present level: first repeats, then refreshes, then modes.
     pub(crate) fn cut(&self, mut subscription: StreamSubscription, model_modes: usize) -> StreamSubscription {
         if self.level >= 1 {
             subscription.repeats = subscription.repeats.min(1);

@@ -1,4 +1,4 @@
-//! Models on their way to guests: one rate for each and one for all, shared in turns.
+//! Sends models to guests in turns, with one rate limit per guest and one for all.
 
 use std::collections::VecDeque;
 use std::ops::Bound;
@@ -15,16 +15,18 @@ use crate::wire::HostMessage;
 
 /// Bytes of a model in one message.
 const CHUNK: usize = 16 * 1024;
-/// More of a model is not handed over while the transport has so much unsent: 1 MB/s in eight calls a second.
+/// Unsent bytes in the transport beyond which no more of a model is sent: 1 MB/s in eight calls a
+/// second.
 const MOST_UNSENT: usize = 128 * 1024;
-/// What may be sent at once after a pause, s of the rate for all: an application of ten frames a second uses all of it.
+/// Burst after a pause, in seconds of the rate for all guests. An application that calls ten times
+/// a second uses the whole rate.
 const BURST: f64 = 0.1;
 
-/// Whose turn it is, and what all may still have.
+/// State of the turns, and the rate limit for all guests.
 #[derive(Debug)]
 pub(super) struct Upload {
     budget: Budget,
-    /// Who had the last piece.
+    /// The guest that received the last piece.
     last: Option<PeerId>,
 }
 
@@ -40,35 +42,40 @@ impl Upload {
         Ok(Self { budget: Budget::new(config.models_rate, burst), last: None })
     }
 
-    /// When the next piece for a guest can go; `None` when it waits for the transport, or for nothing.
+    /// Time at which the next piece for a guest can be sent; `None` when it waits for the transport
+    /// or has no transfer.
     pub(super) fn ready_at(&self, peer: &Peer) -> Option<Duration> {
         let next = next_piece(peer)? as f64;
         Some(peer.model_budget.ready_at(next).max(self.budget.ready_at(next)))
     }
 }
 
-/// Bytes of the piece that a guest could be given, if the transport has room.
+/// Size of the next piece for a guest, bytes, if the transport has room.
 fn next_piece(peer: &Peer) -> Option<usize> {
     let transfer = peer.transfers.front()?;
     (peer.unsent < MOST_UNSENT).then(|| (transfer.bytes.len() - transfer.offset).min(CHUNK))
 }
 
 impl HostSession {
-    /// Guests to whom a model is being sent.
+    /// Iterates over the guests to whom a model is being sent.
     pub fn fetching(&self) -> impl Iterator<Item = PeerId> + '_ {
         self.peers.values().filter(|p| !p.transfers.is_empty()).map(|p| p.id)
     }
 
-    /// Bytes of messages to a guest that the transport has taken and not sent yet. A guest of [`HostSession::fetching`] with 128 KiB and more
-    /// gets nothing more of its model until it is told of less: the line behind it may be slower than [`HostConfig::model_rate`], and what
-    /// is not sent is held in memory. Default: 0, for ever.
+    /// Sets the number of bytes of messages to a guest that the transport has accepted and not sent
+    /// yet.
+    ///
+    /// A guest of [`HostSession::fetching`] with 128 KiB or more gets nothing more of its model
+    /// until the caller reports less. The connection may be slower than [`HostConfig::model_rate`],
+    /// and unsent bytes are held in memory. Default: 0, which stays until the first call.
     pub fn set_unsent(&mut self, peer: PeerId, bytes: usize) {
         if let Some(p) = self.peers.get_mut(&peer) {
             p.unsent = bytes;
         }
     }
 
-    /// One piece each, in turns, as far as the rates reach. Nobody's turn is lost when the rate for all runs out.
+    /// Sends one piece to each guest in turn, as far as the rates allow. No guest loses its turn
+    /// when the rate for all is used up.
     pub(super) fn send_models(&mut self, now: Duration) {
         loop {
             let after = self.upload.last.map_or(Bound::Unbounded, Bound::Excluded);

@@ -1,22 +1,23 @@
-//! Whole numbers in as many bits as they need: least significant bit first, the last byte filled up with zeros.
+//! Integers in as many bits as they need. The least significant bit comes first, and zeros fill the
+//! last byte.
 
 use crate::StreamError;
 
 use super::{Reader, Writer};
 
-/// Bits of a width field.
+/// Number of bits of a width field.
 pub(crate) const WIDTH_BITS: u32 = 5;
-/// Numbers are at most this large: 30 bits and a sign.
+/// Largest magnitude of a number: 30 bits and a sign.
 pub(crate) const LARGEST: i32 = (1 << 30) - 1;
 
-/// Bits that a number needs in two's complement; 0 for 0.
+/// Number of bits that a number needs in two's complement; 0 for 0.
 pub(crate) fn width(x: i32) -> u32 {
     if x == 0 { 0 } else { 33 - (x ^ (x >> 31)).leading_zeros() }
 }
 
-/// The whole number nearest to `x`; NaN counts as 0.
+/// Returns the integer nearest to `x`; NaN counts as 0.
 pub(crate) fn whole(x: f64) -> i32 {
-    // A float-to-int cast saturates and takes NaN to 0.
+    // A float-to-int cast saturates and maps NaN to 0.
     (x.round() as i32).clamp(-LARGEST, LARGEST)
 }
 
@@ -32,7 +33,7 @@ impl<'a> BitWriter<'a> {
         Self { to, pending: 0, count: 0 }
     }
 
-    /// The lowest `bits` (at most 32) of a number.
+    /// Writes the lowest `bits` (at most 32) of a number.
     pub(crate) fn put(&mut self, x: u32, bits: u32) {
         let mask = (1_u64 << bits) - 1;
         self.pending |= (u64::from(x) & mask) << self.count;
@@ -44,7 +45,7 @@ impl<'a> BitWriter<'a> {
         }
     }
 
-    /// Fills the last byte up.
+    /// Fills the last byte with zeros.
     pub(crate) fn finish(self) {
         if self.count > 0 {
             self.to.u8(self.pending as u8);
@@ -64,7 +65,7 @@ impl<'r, 'a> BitReader<'r, 'a> {
         Self { from, pending: 0, count: 0 }
     }
 
-    /// The next `bits` (at most 32).
+    /// Reads the next `bits` (at most 32).
     pub(crate) fn take(&mut self, what: &'static str, bits: u32) -> Result<u32, StreamError> {
         while self.count < bits {
             self.pending |= u64::from(self.from.u8(what)?) << self.count;
@@ -76,7 +77,7 @@ impl<'r, 'a> BitReader<'r, 'a> {
         Ok(x as u32)
     }
 
-    /// A number of so many bits in two's complement.
+    /// Reads a number of `bits` bits in two's complement.
     pub(crate) fn signed(&mut self, what: &'static str, bits: u32) -> Result<i32, StreamError> {
         if bits == 0 {
             return Ok(0);
@@ -85,7 +86,7 @@ impl<'r, 'a> BitReader<'r, 'a> {
         Ok(((x << (32 - bits)) as i32) >> (32 - bits))
     }
 
-    /// Only zeros may fill the last byte up.
+    /// Checks that only zeros fill the last byte.
     pub(crate) fn finish(self, what: &'static str) -> Result<(), StreamError> {
         if self.pending == 0 {
             Ok(())

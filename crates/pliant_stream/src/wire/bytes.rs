@@ -1,4 +1,5 @@
-//! Bounded little-endian reading and writing. A reader never allocates and never reads past its slice.
+//! Bounded little-endian reading and writing. A reader never allocates and never reads past its
+//! slice.
 
 use crate::StreamError;
 use crate::state::{MAGNITUDE_LIMIT, TICK_LIMIT, Tick};
@@ -56,7 +57,7 @@ impl Writer {
         }
     }
 
-    /// A number in 3 bytes: sign, 8 bits of exponent, 15 of mantissa; see [`round24`].
+    /// Writes a number in 3 bytes: sign, 8 bits of exponent, 15 of mantissa; see [`round24`].
     pub(crate) fn f24(&mut self, x: f64) {
         let bits = (round24(x) as f32).to_bits();
         self.raw(&bits.to_le_bytes()[1..]);
@@ -68,20 +69,21 @@ impl Writer {
         }
     }
 
-    /// A tick in 6 bytes.
+    /// Writes a tick in 6 bytes.
     pub(crate) fn tick(&mut self, tick: Tick) {
         self.raw(&tick.to_le_bytes()[..6]);
     }
 }
 
-/// What a number becomes by crossing in 3 bytes: an `f32` whose last 8 mantissa bits are rounded away, relative error
-/// at most 2^-16. Numbers beyond [`MAGNITUDE_LIMIT`] and NaN do not come here: the session refuses them at entry.
+/// Rounds a number as its 3-byte form does: to an `f32` without its last 8 mantissa bits, with a
+/// relative error of at most 2^-16. Numbers beyond [`MAGNITUDE_LIMIT`] and NaN do not reach this
+/// function, since the session refuses them.
 pub(crate) fn round24(x: f64) -> f64 {
     let bits = (x as f32).to_bits();
     f64::from(f32::from_bits(bits.saturating_add(0x80) & 0xFFFF_FF00))
 }
 
-/// Takes little-endian numbers from a slice, each with its name for the error.
+/// Reads little-endian numbers from a slice. Each read names the field for its error.
 #[derive(Debug, Clone)]
 pub(crate) struct Reader<'a> {
     bytes: &'a [u8],
@@ -133,7 +135,7 @@ impl<'a> Reader<'a> {
         Ok(u64::from_le_bytes(self.array(what)?))
     }
 
-    /// A finite number within [`MAGNITUDE_LIMIT`].
+    /// Reads a finite number within [`MAGNITUDE_LIMIT`].
     pub(crate) fn f32(&mut self, what: &'static str) -> Result<f64, StreamError> {
         ranged(what, f64::from(f32::from_le_bytes(self.array(what)?)))
     }
@@ -142,7 +144,7 @@ impl<'a> Reader<'a> {
         Ok([self.f32(what)?, self.f32(what)?, self.f32(what)?])
     }
 
-    /// A finite number in 3 bytes, within [`MAGNITUDE_LIMIT`].
+    /// Reads a finite number in 3 bytes, within [`MAGNITUDE_LIMIT`].
     pub(crate) fn f24(&mut self, what: &'static str) -> Result<f64, StreamError> {
         let high: [u8; 3] = self.array(what)?;
         ranged(what, f64::from(f32::from_le_bytes([0, high[0], high[1], high[2]])))
@@ -152,12 +154,13 @@ impl<'a> Reader<'a> {
         Ok([self.f24(what)?, self.f24(what)?, self.f24(what)?])
     }
 
-    /// Any finite `f64` below 1e15: modal accelerations of stiff modes exceed [`MAGNITUDE_LIMIT`].
+    /// Reads a finite `f64` of magnitude up to 1e15. Modal accelerations of stiff modes exceed
+    /// [`MAGNITUDE_LIMIT`].
     pub(crate) fn wide(&mut self, what: &'static str) -> Result<f64, StreamError> {
         wide(what, f64::from_le_bytes(self.array(what)?))
     }
 
-    /// Any finite `f32` below 1e15.
+    /// Reads a finite `f32` of magnitude up to 1e15.
     pub(crate) fn wide32(&mut self, what: &'static str) -> Result<f32, StreamError> {
         let x = f32::from_le_bytes(self.array(what)?);
         wide(what, f64::from(x)).map(|_| x)
@@ -172,7 +175,8 @@ impl<'a> Reader<'a> {
         Ok(tick)
     }
 
-    /// A datagram must be used up: trailing bytes mean that it is not what it claims to be.
+    /// Checks that the datagram is used up. Trailing bytes mean that it is not of the kind that it
+    /// claims.
     pub(crate) fn finish(self, what: &'static str) -> Result<(), StreamError> {
         if self.left() == 0 {
             Ok(())

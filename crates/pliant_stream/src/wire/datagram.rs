@@ -1,4 +1,4 @@
-//! The kinds of datagram.
+//! The kinds of datagram between host and guest.
 
 use super::{Frame, Reader, Writer};
 use crate::StreamError;
@@ -10,74 +10,76 @@ const NACK: u8 = 3;
 const PING: u8 = 4;
 const PONG: u8 = 5;
 
-/// Most runs in one NACK.
+/// Largest number of runs in one NACK.
 pub(crate) const MAX_NACK_RUNS: usize = 32;
-/// Most target entries in one datagram.
+/// Largest number of target entries in one datagram.
 pub(crate) const MAX_TARGETS: usize = 64;
-/// Longest run of one NACK, ticks.
+/// Largest length of one run in a NACK, ticks.
 pub(crate) const MAX_NACK_RUN: u8 = 64;
 
-/// A run of ticks that are missing.
+/// A run of missing ticks.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct NackRun {
     /// The first missing tick.
     pub first: Tick,
-    /// How many from there, 1..=64.
+    /// Number of ticks in the run, 1..=64.
     pub count: u8,
 }
 
-/// Ticks of one body that a guest asks for again.
+/// Ticks of one body that a guest requests again.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Nack {
-    /// Whose frames.
+    /// The body.
     pub body: BodyId,
-    /// At most 32 runs.
+    /// The runs, at most 32.
     pub runs: Vec<NackRun>,
 }
 
-/// Where one hand of a guest was at one of the guest's input ticks.
+/// Target of one hand of a guest at one of the guest's input counts.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct TargetEntry {
-    /// Which of the guest's grabs.
+    /// The guest's number for the grab.
     pub grab: u16,
-    /// The guest's input counter; ascends by one for each `set_target` round.
+    /// The guest's input counter, which ascends by one for each `set_target` call.
     pub input: u32,
-    /// World, m.
+    /// Position of the hand, world, m.
     pub target: [f64; 3],
 }
 
-/// Targets of a guest's grabs, the newest and the two before it.
+/// Targets of a guest's grabs: the newest and the two before it.
 #[derive(Debug, Clone, PartialEq, Default)]
 pub struct Targets {
-    /// At most 64 entries.
+    /// The targets, at most 64.
     pub entries: Vec<TargetEntry>,
 }
 
-/// One side's account of what it received, so that the other knows its outgoing loss.
+/// Counts of what one side received, from which the other side computes its outgoing loss.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 pub struct Report {
     /// Datagrams received since the session began (low 32 bits).
     pub received: u32,
-    /// Highest extended sequence number seen (low 32 bits).
+    /// Number of datagrams up to the highest sequence number seen (low 32 bits).
     pub highest: u32,
 }
 
-/// Clock exchange with four timestamps (NTP): `t1` guest sends, `t2` host receives, `t3` host sends, `t4` guest receives.
+/// Clock exchange with four timestamps (NTP): `t1` guest sends, `t2` host receives, `t3` host
+/// sends, `t4` guest receives.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 pub struct Clock {
-    /// Guest's clock at sending, us.
+    /// Guest's clock when the guest sends, us.
     pub t1: u64,
-    /// Host's clock at receiving, us.
+    /// Host's clock when the host receives, us.
     pub t2: u64,
-    /// Host's clock at sending, us.
+    /// Host's clock when the host sends, us.
     pub t3: u64,
-    /// What the sender of this datagram has received.
+    /// Report on what the sender of this datagram has received.
     pub report: Report,
-    /// The last round trip that the guest measured, us; 0 when there is none yet.
+    /// The last round trip that the guest measured, us; 0 before the first.
     pub round_trip: u32,
 }
 
-/// Everything that crosses the link unreliably. The sequence number counts all datagrams from this sender to this receiver.
+/// All unreliable traffic between host and guest. The sequence number counts all datagrams from
+/// this sender to this receiver.
 #[derive(Debug, Clone, PartialEq)]
 #[expect(
     clippy::large_enum_variant,
@@ -86,7 +88,7 @@ pub struct Clock {
 pub enum Datagram {
     /// Host to guest: a tick of a body.
     Frame(Frame),
-    /// Guest to host: where the hands are.
+    /// Guest to host: targets of the guest's hands.
     Targets(Targets),
     /// Guest to host: ticks to send again.
     Nack(Nack),
@@ -97,13 +99,13 @@ pub enum Datagram {
 }
 
 impl Datagram {
-    /// Kind and sequence number, 3 bytes: what precedes every body.
+    /// Header of every datagram: kind and sequence number, 3 bytes.
     pub(crate) fn header(kind: u8, sequence: u16) -> [u8; 3] {
         let [a, b] = sequence.to_le_bytes();
         [kind, a, b]
     }
 
-    /// Puts a header before frame bytes that were encoded once for all peers.
+    /// Puts a header before the bytes of a frame that was encoded once for all peers.
     pub(crate) fn wrap_frame(sequence: u16, body: &[u8]) -> Vec<u8> {
         let mut out = Vec::with_capacity(body.len() + 3);
         out.extend_from_slice(&Self::header(FRAME, sequence));
@@ -111,7 +113,7 @@ impl Datagram {
         out
     }
 
-    /// The bytes of this datagram.
+    /// Encodes this datagram.
     pub fn encode(&self, sequence: u16) -> Vec<u8> {
         let mut w = Writer::with_capacity(64);
         match self {
@@ -158,10 +160,11 @@ impl Datagram {
         w.into_bytes()
     }
 
-    /// Reads any bytes: sequence number and content, or what is wrong with them.
+    /// Decodes arbitrary bytes into the sequence number and the datagram.
     ///
     /// # Errors
-    /// [`StreamError::Truncated`], [`StreamError::Invalid`] and [`StreamError::NotFinite`], naming the field.
+    /// Returns [`StreamError::Truncated`], [`StreamError::Invalid`] or [`StreamError::NotFinite`],
+    /// with the name of the field.
     pub fn decode(bytes: &[u8]) -> Result<(u16, Self), StreamError> {
         let mut r = Reader::new(bytes);
         let kind = r.u8("datagram kind")?;

@@ -1,4 +1,4 @@
-//! A frame: one tick of one body. Intra-coded: it is read without any other.
+//! A frame: one tick of one body. It is intra-coded, so it is decoded without any other frame.
 
 use serde::{Deserialize, Serialize};
 
@@ -19,25 +19,25 @@ const PART: u8 = 128;
 
 /// Bytes of one grab in a frame.
 const GRAB_BYTES: usize = 34;
-/// Most datagrams that one tick of a body may need.
+/// Largest number of datagrams for one tick of a body.
 pub(crate) const MAX_PARTS: u8 = 16;
-/// Most repeats in one frame.
+/// Largest number of repeats in one frame.
 pub(crate) const MAX_REPEATS: usize = 7;
 
-/// How modal accelerations are written.
+/// Encoding of modal accelerations.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, PartialOrd, Ord, Serialize, Deserialize)]
 pub enum AccelerationCoding {
-    /// Steps that look alike on the surface, in as many bits as each mode needs, in a closed loop; see [`Quanta`]. The
-    /// default.
+    /// Quantization steps of equal displacement on the surface, in as many bits as the modes need,
+    /// in a closed loop; see [`Quanta`]. This is the default.
     Visible,
-    /// 4 bytes a mode.
+    /// 4 bytes per mode.
     F32,
-    /// 8 bytes a mode: no rounding, for measurements.
+    /// 8 bytes per mode without rounding, for measurements.
     F64,
 }
 
 impl AccelerationCoding {
-    /// Bytes that one mode is reckoned to take.
+    /// Estimated number of bytes per mode.
     pub fn bytes_per_mode(self) -> usize {
         match self {
             Self::Visible => 1,
@@ -47,27 +47,28 @@ impl AccelerationCoding {
     }
 }
 
-/// Modes that share a width.
+/// Number of modes that share a width.
 const BLOCK: usize = 8;
 
-/// Modal accelerations as they cross.
+/// Modal accelerations in a frame.
 #[derive(Debug, Clone, PartialEq)]
 pub enum Accelerations {
     /// Value = unit x the mode's acceleration step (see [`Quanta`]) x whole number.
     Visible {
-        /// What one step moves the surface by, m.
+        /// Displacement of the surface by one quantization step, m.
         unit: f32,
-        /// Whole steps, one a mode.
+        /// Quantization steps, one per mode.
         steps: Vec<i32>,
     },
-    /// Plain.
+    /// Unquantized values in single precision.
     F32(Vec<f32>),
-    /// Plain.
+    /// Unquantized values in double precision.
     F64(Vec<f64>),
 }
 
 impl Accelerations {
-    /// Rounds values to what a coding can carry; `unit` (m) and `quanta` for [`AccelerationCoding::Visible`].
+    /// Rounds values to an encoding. `unit` (m) and `quanta` apply to
+    /// [`AccelerationCoding::Visible`].
     pub fn quantise(coding: AccelerationCoding, values: &[f64], unit: f32, quanta: &Quanta) -> Self {
         match coding {
             AccelerationCoding::Visible => {
@@ -89,7 +90,7 @@ impl Accelerations {
         }
     }
 
-    /// The value of one mode; zero beyond the last.
+    /// Returns the value of one mode, or zero beyond the last mode.
     pub fn get(&self, mode: usize, quanta: &Quanta) -> f64 {
         match self {
             Self::Visible { unit, steps } => match (steps.get(mode), quanta.acceleration.get(mode)) {
@@ -159,7 +160,8 @@ impl Accelerations {
         };
         match coding {
             0 => {
-                // At least a width for each block: what is reserved is in proportion to the bytes that are there.
+                // The bytes present hold at least a width for each block, so the reserved memory
+                // stays in proportion.
                 let mut steps =
                     Vec::with_capacity(fits(4 + count.div_ceil(BLOCK) * WIDTH_BITS as usize / 8)?);
                 let unit = r.f32("acceleration unit")? as f32;
@@ -200,14 +202,16 @@ fn block_width(block: &[i32]) -> u32 {
     block.iter().map(|&x| width(x)).max().unwrap_or(0)
 }
 
-/// A grab as a frame carries it. Reactions cross rounded to 16 bits of mantissa, targets and radius as `f32`.
+/// A grab in a frame. Reactions are rounded to 16 bits of mantissa, targets and radius to `f32`.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct FrameGrab {
-    /// The grab.
+    /// State of the grab.
     pub state: GrabState,
-    /// Where the patch is, as displacement from rest in body axes, m; zero in acceleration streams, which do not carry it.
+    /// Displacement of the patch from rest in body axes, m. It is zero in acceleration streams,
+    /// which do not carry it.
     pub displacement: [f64; 3],
-    /// Held at the frame's tick. Grabs that ended within the repeated ticks are listed too, with `false`.
+    /// The grab holds at the frame's tick. Grabs that ended within the repeated ticks are listed
+    /// with `false`.
     pub held: bool,
 }
 
@@ -216,41 +220,44 @@ pub struct FrameGrab {
 pub struct RepeatGrab {
     /// Index into the frame's grabs.
     pub index: u8,
-    /// Its reaction then, N.
+    /// Reaction at the repeated tick, N.
     pub reaction: [f64; 3],
-    /// Where its patch was then, as in [`FrameGrab`].
+    /// Displacement of the patch at the repeated tick, as in [`FrameGrab`].
     pub displacement: [f64; 3],
 }
 
-/// An earlier tick said again.
+/// A repeated earlier tick.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Repeat {
-    /// How many ticks before the frame's, 1..=255.
+    /// Number of ticks before the frame's tick, 1..=255.
     pub back: u8,
-    /// The grabs that held then.
+    /// The grabs that held at the repeated tick.
     pub grabs: Vec<RepeatGrab>,
-    /// The accelerations, where the stream carries them.
+    /// The accelerations, if the stream carries them.
     pub accelerations: Option<Accelerations>,
 }
 
 /// One tick of one body.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Frame {
-    /// Which body.
+    /// The body.
     pub body: BodyId,
-    /// Which tick.
+    /// The tick.
     pub tick: Tick,
-    /// How many ticks before this one were streamed without a break; more count as 65,535. What is older is not missing.
+    /// Number of ticks before this one that were streamed without a break, saturated at 65,535.
+    /// Older ticks are not missing.
     pub run: u16,
     /// The body sleeps from this tick on.
     pub resting: bool,
-    /// Sent again after a NACK.
+    /// The frame is a resend, for example after a NACK.
     pub resent: bool,
-    /// The grabs carry where their patches are: streams without accelerations.
+    /// The grabs carry the displacements of their patches. This is the case in streams without
+    /// accelerations.
     pub displacements: bool,
-    /// Which of how many datagrams of this tick this is: the grabs did not fit in one. `None`: the only one.
+    /// Index and number of the datagrams of this tick, when the grabs do not fit in one; `None` for
+    /// a single datagram.
     pub part: Option<(u8, u8)>,
-    /// Everything that holds the body, at most 64; of a part, those that are in it.
+    /// All grabs of the body, at most 64. In a part, the grabs of that part.
     pub grabs: Vec<FrameGrab>,
     /// Rigid frame of a free body.
     pub pose: Option<Pose>,
@@ -258,9 +265,10 @@ pub struct Frame {
     pub accelerations: Option<Accelerations>,
     /// A part of the absolute state.
     pub slice: Option<Slice>,
-    /// Checksum of the receiver's state after this tick: the sum of all coordinates with signs drawn from the tick.
+    /// Checksum of the receiver's state after this tick: the sum of all coordinates with signs
+    /// drawn from the tick.
     pub check: Option<f32>,
-    /// Earlier ticks said again, at most 7.
+    /// Repeated earlier ticks, at most 7.
     pub repeats: Vec<Repeat>,
 }
 

@@ -1,4 +1,4 @@
-//! Reliable messages: postcard bodies, checked after decoding.
+//! Reliable messages: encoded with postcard and checked after decoding.
 
 use pliant_modal::{GrabConfig, StepSettings};
 use serde::{Deserialize, Serialize};
@@ -10,54 +10,56 @@ use crate::state::{MAX_GRABS, MAX_MODES, TICK_LIMIT, in_range};
 
 /// Longest name of a user or a body, bytes of UTF-8.
 pub(crate) const MAX_NAME: usize = 64;
-/// Most models that a guest may name as cached.
+/// Largest number of models that a guest may name as cached.
 pub(crate) const MAX_CACHED: usize = 256;
-/// Most bodies of a session.
+/// Largest number of bodies in a session.
 pub(crate) const MAX_BODIES: usize = 1024;
 
-/// What the frames of a stream carry.
+/// Payload of the frames of a stream.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, PartialOrd, Ord, Serialize, Deserialize)]
 pub enum Payload {
-    /// The modal accelerations: the paper's stream.
+    /// The modal accelerations, as in the paper's stream.
     Accelerations(AccelerationCoding),
-    /// The grabs' reactions only: the receiver owns the model and steps it.
+    /// The reactions of the grabs. The receiver has the model and steps it.
     Forces,
 }
 
-/// What a guest asks of the host's encoder.
+/// The stream that a guest requests from the host's encoder.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, PartialOrd, Ord, Serialize, Deserialize)]
 pub struct StreamSubscription {
-    /// What the frames carry.
+    /// Payload of the frames.
     pub payload: Payload,
-    /// At most so many modes (the first ones); the host lowers it to what the model has and the path carries.
+    /// Largest number of modes (the first ones). The host lowers it to what the model has and the
+    /// path carries.
     pub modes: u16,
-    /// How many earlier ticks each frame repeats, 0..=7.
+    /// Number of earlier ticks that each frame repeats, 0..=7.
     pub repeats: u8,
-    /// A full refresh of (q, v) every so many frames, 0 for never.
+    /// Number of frames per full refresh of (q, v); 0 for no refresh.
     pub refresh: u8,
 }
 
 /// A body as the host announces it.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct BodyInfo {
-    /// Its number.
+    /// Number of the body.
     pub body: u16,
-    /// A name for people, at most 64 bytes.
+    /// Display name, at most 64 bytes.
     pub name: String,
     /// Hash of the model.
     pub hash: [u8; 32],
-    /// Modes that this guest's frames carry.
+    /// Number of modes in this guest's frames.
     pub modes: u16,
-    /// How the host steps it.
+    /// Step settings of the body at the host.
     pub settings: StepSettings,
 }
 
-/// The encoder's own image of the receiver at a tick: a receiver that takes it over has no error against the stream.
+/// The encoder's own copy of the receiver's state at a tick. A receiver that takes it has no error
+/// against the stream.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct SnapshotBytes {
-    /// Which body.
+    /// Number of the body.
     pub body: u16,
-    /// After which tick.
+    /// The tick after which the state holds.
     pub tick: u64,
     /// Modal coordinates, kg^1/2 m.
     pub q: Vec<f64>,
@@ -65,37 +67,38 @@ pub struct SnapshotBytes {
     pub v: Vec<f64>,
     /// Accelerations.
     pub a: Vec<f64>,
-    /// Flows of a body that relaxes; empty for an elastic one.
+    /// Viscoelastic state of a body that relaxes; empty for an elastic body.
     pub z: Vec<f64>,
-    /// Forces per mode that the streamed reactions do not explain (gravity, contacts); empty when they explain all.
+    /// Modal forces that the streamed reactions do not explain (gravity, contacts); empty when the
+    /// reactions explain all.
     pub load: Vec<f64>,
-    /// The force of each hand on the body over the last step, N, world axes: user, grab, force.
+    /// Mean force of each hand on the body over the last step, N, world axes: user, grab, force.
     pub means: Vec<(u16, u16, [f64; 3])>,
     /// The body sleeps from this tick on.
     pub resting: bool,
 }
 
-/// Guest to host.
+/// Messages from guest to host.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub enum GuestMessage {
     /// The first message.
     Hello {
         /// [`super::PROTOCOL_VERSION`].
         version: u16,
-        /// At most 64 bytes.
+        /// Display name, at most 64 bytes.
         name: String,
-        /// What to stream.
+        /// The requested stream.
         subscription: StreamSubscription,
-        /// Models that need not be sent.
+        /// Hashes of models that need not be sent.
         cached: Vec<[u8; 32]>,
     },
-    /// A hand takes hold.
+    /// A grab begins.
     GrabBegin {
         /// The guest's number for the grab.
         grab: u16,
-        /// Of which body.
+        /// The body.
         body: u16,
-        /// Center of the patch.
+        /// Surface vertex at the center of the patch.
         vertex: u32,
         /// Radius of the patch, m.
         radius: f64,
@@ -104,81 +107,82 @@ pub enum GuestMessage {
         /// The hand's own spring and damper, capped at what devices have ([`GrabConfig::capped`]).
         hold: GrabConfig,
     },
-    /// A hand lets go.
+    /// A grab ends.
     GrabEnd {
         /// The guest's number for the grab.
         grab: u16,
     },
-    /// Send the state of a body anew.
+    /// Requests a snapshot of a body.
     SnapshotRequest {
-        /// Which body.
+        /// The body.
         body: u16,
     },
     /// The last message.
     Goodbye {
-        /// Why.
+        /// The reason.
         reason: DisconnectReason,
     },
 }
 
-/// Host to guest.
+/// Messages from host to guest.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub enum HostMessage {
-    /// The answer to Hello.
+    /// The answer to [`GuestMessage::Hello`].
     Welcome {
         /// [`super::PROTOCOL_VERSION`].
         version: u16,
-        /// The guest's number.
+        /// The guest's user number.
         user: u16,
         /// Length of a step, ns.
         step_ns: u64,
         /// Newmark's beta of the acceleration streams.
         beta: f64,
-        /// Newmark's gamma.
+        /// Newmark's gamma of the acceleration streams.
         gamma: f64,
-        /// Users already here: number and name.
+        /// Users in the session: number and name.
         users: Vec<(u16, String)>,
     },
-    /// A body joins the session; its model follows if the guest has not got it, then a snapshot.
+    /// A body joins the session, or its step settings change. Its model follows if the guest lacks
+    /// it, then a snapshot.
     BodyAdded(BodyInfo),
-    /// A body leaves.
+    /// A body leaves the session.
     BodyRemoved {
-        /// Which.
+        /// The body.
         body: u16,
     },
     /// A piece of a model's bytes, in order.
     ModelChunk {
-        /// Of which model.
+        /// Hash of the model.
         hash: [u8; 32],
-        /// Where in the model's bytes it belongs.
+        /// Offset of the piece in the model's bytes.
         offset: u64,
-        /// Length of the whole.
+        /// Length of the whole model, bytes.
         total: u64,
         /// The piece.
         bytes: Vec<u8>,
     },
     /// The state of a body.
     Snapshot(SnapshotBytes),
-    /// Somebody came.
+    /// A user joined.
     UserJoined {
-        /// Number.
+        /// User number.
         user: u16,
-        /// Name.
+        /// Display name.
         name: String,
     },
-    /// Somebody left.
+    /// A user left.
     UserLeft {
-        /// Number.
+        /// User number.
         user: u16,
     },
-    /// The host did not accept a grab, or ended it.
+    /// The host refused or ended a grab.
     GrabRefused {
         /// The guest's number for the grab.
         grab: u16,
     },
     /// The last message.
     Goodbye {
-        /// Why.
+        /// The reason.
         reason: DisconnectReason,
     },
 }
@@ -200,7 +204,7 @@ fn decode<'a, M: Deserialize<'a>>(what: &'static str, bytes: &'a [u8]) -> Result
 }
 
 fn encode<M: Serialize>(message: &M) -> Vec<u8> {
-    // Every message is plain data: serialising it to a growing buffer cannot fail.
+    // Every message is plain data, so serializing it to a growing buffer cannot fail.
     postcard::to_stdvec(message).unwrap_or_default()
 }
 
@@ -214,15 +218,15 @@ fn check(
 }
 
 impl GuestMessage {
-    /// The bytes of this message.
+    /// Encodes this message.
     pub fn encode(&self) -> Vec<u8> {
         encode(self)
     }
 
-    /// Reads any bytes and checks every bound.
+    /// Decodes arbitrary bytes and checks every bound.
     ///
     /// # Errors
-    /// [`StreamError::Invalid`], naming the field.
+    /// Returns [`StreamError::Invalid`] with the name of the field.
     pub fn decode(bytes: &[u8]) -> Result<Self, StreamError> {
         let mut message: Self = decode("guest message", bytes)?;
         match &mut message {
@@ -247,15 +251,15 @@ impl GuestMessage {
 }
 
 impl HostMessage {
-    /// The bytes of this message.
+    /// Encodes this message.
     pub fn encode(&self) -> Vec<u8> {
         encode(self)
     }
 
-    /// Reads any bytes and checks every bound.
+    /// Decodes arbitrary bytes and checks every bound.
     ///
     /// # Errors
-    /// [`StreamError::Invalid`], naming the field.
+    /// Returns [`StreamError::Invalid`] with the name of the field.
     pub fn decode(bytes: &[u8]) -> Result<Self, StreamError> {
         let message: Self = decode("host message", bytes)?;
         match &message {

@@ -1,7 +1,9 @@
-//! The bytes: datagrams written by hand and described byte by byte in `docs/protocol.md`; reliable messages in postcard.
+//! Byte formats of datagrams and messages.
 //!
-//! Every parser takes any bytes at all: it checks lengths, finiteness and range, allocates at most in proportion to the
-//! bytes it was given, and returns an error instead of panicking.
+//! Datagrams are encoded by hand, and `docs/protocol.md` describes them byte by byte. Reliable
+//! messages use postcard. Every parser accepts arbitrary bytes: it checks lengths, finiteness and
+//! ranges, allocates at most in proportion to the bytes given, and returns an error instead of
+//! panicking.
 
 mod bits;
 mod bytes;
@@ -19,5 +21,5 @@ pub use message::{BodyInfo, GuestMessage, HostMessage, Payload, SnapshotBytes, S
 pub(crate) use message::{MAX_BODIES, MAX_CACHED, MAX_NAME};
 pub use slice::{Slice, SliceEntry};
 
-/// Version of everything in this module. The two sides of a session must agree.
+/// Version of the formats in this module. The two sides of a session must agree.
 pub const PROTOCOL_VERSION: u16 = 2;

@@ -1,20 +1,21 @@
-//! The absolute part of a frame: the state of some modes, in steps that look alike on the surface.
+//! The absolute part of a frame: the state of some modes, in quantization steps of equal
+//! displacement on the surface.
 
 use super::bits::{BitReader, BitWriter, WIDTH_BITS, whole, width};
 use super::{Reader, Writer};
 use crate::StreamError;
 use crate::codec::quantization::Quanta;
 
-/// Bits of a mode's number.
+/// Number of bits of a mode index.
 const MODE_BITS: u32 = 12;
-/// Bits of `parts`.
+/// Bits of the `parts` byte.
 const LOAD: u8 = 1;
 const FLOW: u8 = 2;
 
 /// One mode of a slice.
 #[derive(Debug, Clone, Copy, PartialEq, Default)]
 pub struct SliceEntry {
-    /// Which mode.
+    /// Index of the mode.
     pub mode: usize,
     /// Modal coordinate after the frame's tick.
     pub q: f64,
@@ -22,25 +23,25 @@ pub struct SliceEntry {
     pub v: f64,
     /// Modal force that the streamed reactions do not explain.
     pub load: f64,
-    /// Flow after the frame's tick, where the body relaxes.
+    /// Viscoelastic state after the frame's tick, for a body that relaxes.
     pub z: f64,
 }
 
 /// The absolute part of a frame: the state of some modes after the frame's tick.
 #[derive(Debug, Clone, PartialEq, Default)]
 pub struct Slice {
-    /// What one step moves the surface by, m; see [`Quanta`].
+    /// Displacement of the surface by one quantization step, m; see [`Quanta`].
     pub unit: f32,
-    /// Loads cross; else they are 0.
+    /// The slice carries loads. Otherwise they are 0.
     pub loads: bool,
-    /// Flows cross; else they are 0.
+    /// The slice carries viscoelastic states. Otherwise they are 0.
     pub flows: bool,
-    /// Mode, and whole steps of q, v, load and z; at most 255.
+    /// Mode index, and quantization steps of q, v, load and z; at most 255 entries.
     pub steps: Vec<(u16, [i32; 4])>,
 }
 
 impl Slice {
-    /// Rounds a state to what a slice can carry, at most 255 modes.
+    /// Quantizes a state for a slice, at most 255 modes.
     pub fn quantise(values: &[SliceEntry], unit: f32, loads: bool, flows: bool, quanta: &Quanta) -> Self {
         let mut made = Self { unit, loads, flows, steps: Vec::with_capacity(values.len().min(255)) };
         for e in values.iter().take(255).filter(|e| e.mode < quanta.modes()) {
@@ -55,7 +56,7 @@ impl Slice {
         made
     }
 
-    /// What the receiver reads, mode by mode; modes beyond the quanta's are left out.
+    /// Iterates over the decoded modes. Modes beyond those of `quanta` are left out.
     pub fn entries<'a>(&'a self, quanta: &'a Quanta) -> impl Iterator<Item = SliceEntry> + 'a {
         let unit = f64::from(self.unit);
         self.steps.iter().filter(|s| usize::from(s.0) < quanta.modes()).map(move |(mode, s)| {
@@ -78,7 +79,7 @@ impl Slice {
         }
     }
 
-    /// Bytes that the first `count` modes take.
+    /// Number of bytes of the first `count` modes.
     pub(crate) fn bytes_of(&self, count: usize) -> usize {
         let one = |s: &(u16, [i32; 4])| {
             let parts = s.1.iter().enumerate().filter(|(part, _)| self.crosses(*part));
@@ -87,7 +88,7 @@ impl Slice {
         6 + self.steps.iter().take(count).map(one).sum::<u32>().div_ceil(8) as usize
     }
 
-    /// Bytes in a frame.
+    /// Number of bytes in a frame.
     pub(crate) fn bytes(&self) -> usize {
         self.bytes_of(self.steps.len())
     }
@@ -116,7 +117,7 @@ impl Slice {
             return Err(StreamError::Invalid { what: "slice parts", found, expected: "bits 0 and 1 only" });
         }
         let unit = r.f32("slice unit")? as f32;
-        // A mode takes 22 bits at least.
+        // The capacity follows from the bytes present: a mode takes at least 22 bits.
         let steps = Vec::with_capacity(count.min(r.left() * 8 / 22));
         let mut made = Self { unit, loads: parts & LOAD != 0, flows: parts & FLOW != 0, steps };
         let mut bits = BitReader::new(r);

@@ -1,4 +1,4 @@
-//! Checks of states, and states that are taken and given.
+//! Comparison of states, and states that are received and sent.
 
 use std::time::Duration;
 
@@ -27,7 +27,7 @@ impl PeerSession {
                 inputs.first = inputs.first.max(tick + 1);
                 inputs.complete = inputs.complete.max(tick);
             }
-            // Nothing was held by us in the ticks that we were not there.
+            // This peer held nothing in the ticks before it joined.
             for t in tick + 1..=to {
                 self.inputs.put(self.config.user, InputTick { tick: t, held: Vec::new() });
             }
@@ -49,7 +49,7 @@ impl PeerSession {
         self.others.values_mut().for_each(Other::agreed);
     }
 
-    /// Only those with a lower number are believed.
+    /// Only checks of peers with a lower number count.
     pub(super) fn compare(&mut self, peer: PeerId, user: UserId, check: StateCheck) {
         let unsettled = self.rollback_from.is_some_and(|from| from <= check.tick);
         if user > self.config.user || unsettled || check.tick > self.confirmed() {
@@ -65,7 +65,8 @@ impl PeerSession {
         }
     }
 
-    /// Asks the peer with the lowest number, if that is not oneself, at most once a second.
+    /// Requests the state of the peer with the lowest number, unless that is this peer, at most
+    /// once a second.
     pub(super) fn request_state(&mut self, now: Duration) {
         if self.requested.is_some_and(|at| now.saturating_sub(at) <= Duration::from_secs(1)) {
             return;
@@ -83,7 +84,7 @@ impl PeerSession {
     pub(super) fn give_states(&mut self, now: Duration) {
         let wanting: Vec<PeerId> =
             self.others.iter().filter(|(_, o)| o.wants_state && o.user.is_some()).map(|(p, _)| *p).collect();
-        // Who has just come has no inputs yet and must not hold the confirmed tick back.
+        // A peer that has just joined has no inputs yet and must not hold the confirmed tick back.
         let each = self.inputs.users.values().filter(|u| !u.gone && u.first <= self.tick);
         let tick = each.map(|u| u.complete).min().unwrap_or(self.tick).min(self.tick);
         if wanting.is_empty() || tick == 0 || self.out.len() >= MAX_OUT {
@@ -96,7 +97,7 @@ impl PeerSession {
         let state = PeerMessage::State { tick, now: self.tick, bodies };
         for peer in wanting {
             let Some(other) = self.others.get_mut(&peer) else { continue };
-            // Who asks too often waits.
+            // A peer that asks too often waits.
             if other.state_budget.spend(now, 1.0) {
                 other.wants_state = false;
                 self.message(peer, &state);
