@@ -1,7 +1,11 @@
-//! A server: no window, no renderer compiled, one body that whoever is invited may see and hold.
+//! A server without a window or a renderer: invited users see and hold one body.
 //!
-//! What to learn here: a host is an app like any other, with the plugins that it needs and no more; tokens say who may do what; a kept key keeps the
-//! invite good when the server is started anew; Ctrl-C ends it in good order, and so does the SIGTERM of a service manager.
+//! What to learn here:
+//!
+//! - A host is an app like any other, with only the plugins that it needs.
+//! - Tokens decide what each user may do.
+//! - With a stored key, the invite stays valid when the server restarts.
+//! - Ctrl-C shuts the server down cleanly, and so does the SIGTERM of a service manager.
 //!
 //! ```sh
 //! cargo run --release -p pliant --no-default-features --features net --example dedicated_server -- --key server.key
@@ -27,27 +31,27 @@ struct Options {
     #[command(flatten)]
     serve: session::serve::Serve,
 
-    /// Steps a second.
+    /// Ticks per second.
     #[arg(long, default_value_t = 40.0, value_parser = rate)]
     hz: f64,
 
-    /// The body: a file, or one of assets/.
+    /// The body: a file, or a file name under assets/.
     #[arg(long, default_value = "pip.modal")]
     body: PathBuf,
 
-    /// Keep only the first so many modes.
+    /// Keep only this many modes, lowest first.
     #[arg(long)]
     modes: Option<usize>,
 
-    /// A hand of the server's own moves the body.
+    /// Let a hand of the server move the body.
     #[arg(long)]
     play: bool,
 
-    /// Most guests at one time, all together and from one address.
+    /// Maximum number of guests, in total and from one address.
     #[arg(long, default_value_t = 256)]
     guests: usize,
 
-    /// Most that is sent to a guest, Mbit/s.
+    /// Maximum rate to one guest, Mbit/s.
     #[arg(long, default_value_t = 8.0)]
     rate: f64,
 
@@ -55,7 +59,7 @@ struct Options {
     #[arg(long)]
     trace: Option<PathBuf>,
 
-    /// End after so many seconds.
+    /// End after this many seconds.
     #[arg(long)]
     seconds: Option<f64>,
 }
@@ -109,12 +113,12 @@ fn run(options: &Options) -> Result<(), Box<dyn Error>> {
     Ok(())
 }
 
-/// How long frames with a tick in them take: everything that the server does for it but what runs on the network's thread.
+/// Durations of the frames that contain a tick, without the work on the network's thread.
 #[derive(Resource, Default)]
 struct Log {
     began: Option<Instant>,
     tick: u64,
-    /// ms, since the last line.
+    /// Durations since the last line, ms.
     took: Vec<f64>,
     said: Option<(Instant, f64, u64, u64)>,
 }
@@ -123,7 +127,7 @@ fn begin_frame(mut log: ResMut<Log>) {
     log.began = Some(Instant::now());
 }
 
-/// Every ten seconds a line of figures.
+/// Prints a line of metrics every ten seconds.
 fn end_frame(
     mut log: ResMut<Log>,
     tick: Res<PliantTick>,

@@ -1,7 +1,8 @@
-//! Bodies that are fixed nowhere: one thrown spinning, one struck again and again, one held by two hands.
+//! Three bodies without anchors: one is thrown spinning, one is struck, one is held by two hands.
 //!
-//! What to learn here: a body baked without anchors flies, and moves its own `Transform`; gravity, blows and hands act on its flight and on its
-//! shape; what its momentum changes by is what was applied and nothing else: the table on screen sums both.
+//! What to learn here: a body baked without anchors moves freely, and so does its `Transform`.
+//! Gravity, impulses and hands act on its rigid motion and on its shape. The change of its momentum
+//! equals the sum of what was applied; the table on the screen shows both.
 //!
 //! ```sh
 //! cargo run --release --example free_bodies
@@ -16,10 +17,10 @@ use bevy::{
 use pliant::{modal::Frame, prelude::*};
 use stage::{Look, Readout, Stage};
 
-/// Weak, as on the moon, so that there is time to look.
+/// Weak gravity, as on the moon, gives time to watch the motion.
 const GRAVITY: DVec3 = DVec3::new(0.0, -1.62, 0.0);
 
-/// Height from which the first one is thrown, m.
+/// Height from which the first body is thrown, m.
 const LOW: f64 = -0.5;
 
 fn main() -> AppExit {
@@ -45,7 +46,7 @@ fn main() -> AppExit {
         .run()
 }
 
-/// What happens to a body.
+/// What is done to a body.
 #[derive(Component, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
 enum Part {
     Thrown,
@@ -53,14 +54,14 @@ enum Part {
     Held,
 }
 
-/// What was done to a body since its account was opened.
+/// The momentum of a body when its account was opened, and the momentum applied since.
 #[derive(Component, Default)]
 struct Account {
-    /// Momentum when it was opened, kg m/s; `None` before.
+    /// Momentum when the account was opened, kg m/s; `None` before.
     opening: Option<DVec3>,
-    /// Angular momentum about its own center then, kg m^2/s.
+    /// Angular momentum about the body's center at that time, kg m^2/s.
     spin: DVec3,
-    /// What hands, blows and gravity have put in since, N s.
+    /// Momentum applied by hands, impulses and gravity since then, N s.
     applied: DVec3,
 }
 
@@ -87,7 +88,7 @@ fn spawn(mut commands: Commands, assets: Res<AssetServer>, mut materials: ResMut
     }
 }
 
-/// Throws the first one up, spinning about no axis of its own, and again when it has come down.
+/// Throws the first body up each time it has fallen, spinning about none of its principal axes.
 fn throw(mut bodies: Query<(&Part, &mut BodyState, &mut Account)>) -> Result {
     for (part, mut state, mut account) in &mut bodies {
         let body = state.body();
@@ -109,7 +110,7 @@ fn throw(mut bodies: Query<(&Part, &mut BodyState, &mut Account)>) -> Result {
     Ok(())
 }
 
-/// Strikes the middle one: on a knob, back to its place.
+/// Strikes the second body on a knob, toward its place.
 fn hit(
     time: Res<Time>,
     keys: Res<ButtonInput<KeyCode>>,
@@ -135,20 +136,20 @@ fn hit(
     }
 }
 
-/// The surface vertex farthest along `toward`, body axes.
+/// Returns the surface vertex farthest along `toward`, in body axes.
 fn farthest(state: &BodyState, toward: Vec3) -> u32 {
     let positions = state.model().surface().positions();
     let along = |i: usize| Vec3::from(positions[i]).dot(toward);
     (0..positions.len()).max_by(|&a, &b| along(a).total_cmp(&along(b))).unwrap_or(0) as u32
 }
 
-/// A hand of the script, on the left or the right knob.
+/// A scripted hand on the left or the right knob.
 #[derive(Component)]
 struct Hand {
     side: f64,
 }
 
-/// Two hands take hold of the third one.
+/// Grabs the third body with two hands.
 fn take_hold(
     mut commands: Commands,
     bodies: Query<(Entity, &Part, &BodyState, &GlobalTransform), Added<BodyState>>,
@@ -165,12 +166,12 @@ fn take_hold(
     }
 }
 
-/// They pull, wring and swing it.
+/// Pulls, twists and swings the third body.
 fn move_hands(time: Res<Time>, mut hands: Query<(&Hand, &mut Grab)>) {
     let t = time.elapsed_secs_f64();
     let gently = (t / 1.5).min(1.0);
     let middle = DVec3::new(-0.62, 0.10 * gently * (1.9 * t).sin(), 0.08 * gently * (1.3 * t).sin());
-    // The hands turn about each other and pull it longer and shorter.
+    // The hands turn about each other, and their distance changes.
     let turned =
         DQuat::from_euler(EulerRot::YZX, gently * 0.9 * (1.1 * t).sin(), gently * 0.7 * (1.7 * t).sin(), 0.0);
     let half = 0.205 + 0.02 * gently * (2.6 * t).sin();
@@ -179,7 +180,7 @@ fn move_hands(time: Res<Time>, mut hands: Query<(&Hand, &mut Grab)>) {
     }
 }
 
-/// Sums what was applied in this tick.
+/// Sums the momentum that was applied in this tick.
 fn keep_account(
     time: Res<Time>,
     mut bodies: Query<(&BodyState, &ModalBody, &mut Account, Option<&Grabs>)>,
@@ -205,7 +206,7 @@ fn keep_account(
     }
 }
 
-/// Momentum as an arrow, spin as another, hands as balls.
+/// Draws momentum and angular momentum as arrows, and hands as balls.
 fn draw(
     mut gizmos: Gizmos,
     bodies: Query<(&BodyState, &GlobalTransform)>,

@@ -1,7 +1,7 @@
-//! The ten lines that a newcomer copies: a plugin group, a body, a material, a light, a camera. The pointer drags the body.
+//! The smallest example: a plugin group, a body, a material, a light and a camera.
 //!
-//! What to learn here: a body is one component, [`ModalBody`]; with a `MeshMaterial3d` beside it, it is drawn; it bends, rests and can be pulled
-//! without another line.
+//! What to learn here: a body is one component, [`ModalBody`]. A `MeshMaterial3d` beside it draws
+//! the body. The body bends and comes to rest, and the pointer drags it, without more code.
 //!
 //! ```sh
 //! cargo run --release --example hello_body
@@ -14,7 +14,8 @@ use pliant::prelude::*;
 
 fn main() -> AppExit {
     App::new()
-        // In a game `DefaultPlugins` stand here. The stage adds the keys on the screen and the command line of the examples.
+        // A game adds `DefaultPlugins` here. The stage adds the keys on the screen and the command
+        // line of the examples.
         .add_plugins(stage::Stage::new("hello, body").bare().key("left mouse: pull the body"))
         .add_plugins(PliantPlugins::default())
         .add_systems(Startup, setup)

@@ -1,7 +1,8 @@
-//! Makes the bodies of the other examples: the surface of a jelly with texture coordinates, its texture, and the baked models.
+//! Makes the assets of the other examples: the surface and the texture of a jelly, and baked
+//! models.
 //!
-//! What to learn here: how a surface or a description becomes a model in code, what a bake is asked for, and that the same input
-//! gives the same file to the bit.
+//! What to learn here: how code turns a surface or a description into a model, which settings a
+//! bake has, and that the same input gives a bit-identical file.
 //!
 //! ```sh
 //! cargo run --release --example make_models    # remakes everything in assets/ but Pip
@@ -45,7 +46,7 @@ fn main() -> Result<(), Box<dyn Error>> {
     let soft = BakeConfig { name: "soft jelly".into(), young: 4e3, ..jelly.clone() };
     let firm = BakeConfig { name: "firm jelly".into(), young: 4e4, ..jelly };
     for (file, config) in [("jelly-soft.modal", soft), ("jelly-firm.modal", firm)] {
-        // The tetrahedra fill the surface, and the surface with its texture coordinates is worn over them.
+        // The tetrahedra fill the surface. The textured surface itself is the skin of the body.
         make(&folder.join("jelly.obj"), 6_000, true, &config, &folder.join(file))?;
     }
     let bud = BakeConfig {
@@ -95,11 +96,12 @@ fn make(
     Ok(())
 }
 
-/// Vertices round the jelly, and from its middle below over the rim to its middle above.
+/// Number of vertices around the jelly, and number of rings from the center of the bottom to the
+/// center of the top.
 const ROUND: usize = 64;
 const RINGS: usize = 22;
 
-/// The surface of a fluted jelly as Wavefront OBJ: u runs once round it, v from below to above.
+/// Returns the surface of a fluted jelly as Wavefront OBJ; u runs around it, v from bottom to top.
 fn jelly_surface() -> Result<String, std::fmt::Error> {
     let mut text =
         String::from("# A jelly with texture coordinates; made by the example make_models. Metres, y up.\n");
@@ -117,7 +119,7 @@ fn jelly_surface() -> Result<String, std::fmt::Error> {
             writeln!(text, "vt {:.5} {:.5}", step as f64 / ROUND as f64, ring as f64 / RINGS as f64)?;
         }
     }
-    // OBJ counts from one.
+    // Indices of OBJ begin at 1.
     let vertex = |ring: usize, step: usize| match ring {
         0 => 1,
         RINGS => 2 + (RINGS - 1) * ROUND,
@@ -125,7 +127,7 @@ fn jelly_surface() -> Result<String, std::fmt::Error> {
     };
     let corner = |ring, step| format!("{}/{}", vertex(ring, step), 1 + ring * (ROUND + 1) + step);
     for ring in 0..RINGS {
-        // A quadrilateral is two triangles, of which one is left at a pole.
+        // A quadrilateral is two triangles; at a pole one of them remains.
         for step in 0..ROUND {
             let [a, b] = [corner(ring, step), corner(ring, step + 1)];
             let [c, d] = [corner(ring + 1, step), corner(ring + 1, step + 1)];
@@ -140,7 +142,9 @@ fn jelly_surface() -> Result<String, std::fmt::Error> {
     Ok(text)
 }
 
-/// Radius (m), height (m) and depth of the flutes at a share of the way from the middle below to the middle above.
+/// Returns the radius (m), the height (m) and the depth of the flutes at a position on the profile.
+///
+/// `t` is 0 at the center of the bottom and 1 at the center of the top.
 fn profile(t: f64) -> (f64, f64, f64) {
     const FLOOR: f64 = 0.2;
     const TOP: f64 = 0.78;
@@ -153,14 +157,14 @@ fn profile(t: f64) -> (f64, f64, f64) {
         let s = (t - FLOOR) / (TOP - FLOOR);
         (WIDE + (NARROW - WIDE) * s, HIGH * s, 0.07 * (1.0 - 0.55 * s))
     } else {
-        // A dome with a dimple in its middle.
+        // The top is a dome with a dimple in the center.
         let s = (t - TOP) / (1.0 - TOP);
         let across = 1.0 - s;
         (NARROW * across, HIGH + 0.016 * (PI * s).sin() - 0.004 * s, 0.0315 * across)
     }
 }
 
-/// Stripes that run up the flutes, with rings across: where the skin is stretched the squares are, too.
+/// Returns stripes along the flutes, crossed by rings; the squares stretch with the skin.
 fn jelly_texture() -> Image {
     let (width, height) = (256_u32, 128_u32);
     let mut bytes = Vec::with_capacity((4 * width * height) as usize);

@@ -1,7 +1,8 @@
-//! A meadow of a thousand buds, all of one model; a ball rolls through it.
+//! A meadow of a thousand buds that share one model, and a ball that rolls through it.
 //!
-//! What to learn here: bodies share their model, so a thousand cost the memory of one; a body that nobody touches rests, and is then
-//! neither stepped nor uploaded; what a tick and a frame cost is there to be read as diagnostics.
+//! What to learn here: bodies share their model, so a thousand bodies use the memory of one model.
+//! A body that nothing touches rests and is neither stepped nor uploaded. Diagnostics report the
+//! cost of a tick and of a frame.
 //!
 //! ```sh
 //! cargo run --release --example many_bodies
@@ -20,17 +21,17 @@ use stage::{Look, Readout, Stage};
 
 #[derive(Parser)]
 struct Options {
-    /// How many bodies.
+    /// Number of bodies.
     #[arg(long, default_value_t = 1000, value_parser = clap::value_parser!(u32).range(1..=20_000))]
     bodies: u32,
-    /// Shake all of them all the time, so that none rests.
+    /// Shake all bodies all the time, so that none rests.
     #[arg(long)]
     shake: bool,
     #[command(flatten)]
     stage: stage::Options,
 }
 
-/// Metres from bud to bud.
+/// Distance between buds, m.
 const APART: f32 = 0.22;
 
 fn main() -> AppExit {
@@ -57,7 +58,7 @@ struct Meadow {
     shake: bool,
 }
 
-/// What parts the buds.
+/// The ball that pushes the buds apart.
 #[derive(Component)]
 struct Ball {
     radius: f32,
@@ -75,7 +76,7 @@ fn plant(
         materials.add(StandardMaterial { perceptual_roughness: 0.5, ..Color::srgb(red, green, blue).into() })
     });
     let model = assets.load("bud.modal");
-    // As near to a circle as rows allow, from the middle outwards; each a little out of line.
+    // A disc of rows, sorted from the center outward; each bud is shifted a little at random.
     let side = (meadow.bodies as f32).sqrt().ceil() as i32 + 4;
     let mut places: Vec<Vec2> =
         (0..side * side).map(|i| IVec2::new(i % side - side / 2, i / side - side / 2).as_vec2()).collect();
@@ -108,7 +109,7 @@ fn plant(
     ));
 }
 
-/// The ball's way: loops that come by everywhere.
+/// Moves the ball on loops across the meadow.
 fn roll(time: Res<Time>, mut balls: Query<(&mut Transform, &Ball)>) {
     let t = 0.5 * time.elapsed_secs() - 0.6;
     for (mut place, ball) in &mut balls {
@@ -126,7 +127,7 @@ fn part(
     for (ball, Ball { radius }) in &balls {
         for (mut state, shown, place) in &mut bodies {
             let foot = place.translation();
-            // Only what may be reached is looked at more closely, and only what is pushed is woken.
+            // Only buds within reach are examined, and only pushed buds are woken.
             if foot.xz().distance(ball.translation.xz()) > radius + 0.3 {
                 continue;
             }
@@ -157,7 +158,7 @@ fn surface_point(state: &BodyState, vertex: u32, q: &[f64]) -> Vec3 {
     Vec3::from(model.surface().positions()[vertex as usize]) + moved.as_vec3()
 }
 
-/// A blow against every head.
+/// Applies an impulse to every head.
 fn shake(
     meadow: Res<Meadow>,
     tick: Res<PliantTick>,

@@ -1,7 +1,9 @@
-//! Three jellies of one shape: a soft and a firm one with a texture, and a soft one with a shader of its own, all pulled alike.
+//! Three jellies of one shape that are pulled alike: soft and firm with a texture, soft with a
+//! shader.
 //!
-//! What to learn here: a bent surface is an ordinary mesh, so any material works on it, a texture stays where it was painted, and a shader written for
-//! Bevy's `Material` needs to know nothing of bodies; stiffness is the material that was baked.
+//! What to learn here: the deformed surface is an ordinary mesh, so every material works on it. A
+//! texture stays where it was painted. A shader for Bevy's `Material` needs no knowledge of bodies.
+//! The stiffness comes from the material that was baked.
 //!
 //! ```sh
 //! cargo run --release --example materials
@@ -29,7 +31,7 @@ use stage::{Look, Readout, Stage};
 
 #[derive(Parser)]
 struct Options {
-    /// Bake the jellies from their surface at load, instead of loading what was baked.
+    /// Bake the jellies from their surface at start, instead of loading baked models.
     #[arg(long)]
     bake: bool,
     #[command(flatten)]
@@ -53,24 +55,24 @@ fn main() -> AppExit {
         .run()
 }
 
-/// Where the jellies come from.
+/// The source of the jellies.
 #[derive(Resource)]
 struct Source {
     bake: bool,
 }
 
-/// Bevy's own material, and light on top of it.
+/// Bevy's standard material with light added on top.
 type Glowing = ExtendedMaterial<StandardMaterial, Bands>;
 
-/// Bands of light along the texture's second coordinate. The layout is that of `shaders/bands.wgsl`.
+/// Bands of light along the texture's second coordinate; the layout matches `shaders/bands.wgsl`.
 #[derive(Asset, AsBindGroup, TypePath, Clone, Debug)]
 struct Bands {
     #[uniform(100)]
     glow: LinearRgba,
-    /// How many.
+    /// Number of bands.
     #[uniform(100)]
     count: f32,
-    /// Bands a second.
+    /// Speed of the bands, bands per second.
     #[uniform(100)]
     speed: f32,
 }
@@ -124,7 +126,7 @@ enum Skin {
     Glowing(Handle<Glowing>),
 }
 
-/// What the model files were made by, but here in the game: the surface is filled with tetrahedra and worn over them.
+/// Returns a request to bake a jelly in the game; its surface is filled and is also the skin.
 fn baked(young: f64) -> BakeRequest {
     BakeRequest {
         tets: 3_000,
@@ -143,11 +145,11 @@ fn baked(young: f64) -> BakeRequest {
     }
 }
 
-/// A hand of the script, and where it took hold.
+/// A scripted hand, and the point where it took hold.
 #[derive(Component)]
 struct Hand(DVec3);
 
-/// One hand on the top of each: a soft spring, so that all are pulled with nearly the same force.
+/// Grabs the top of each jelly with a soft spring, so that all are pulled with similar forces.
 fn take_hold(
     mut commands: Commands,
     bodies: Query<(Entity, &BodyState, &GlobalTransform), Added<BodyState>>,
@@ -162,7 +164,7 @@ fn take_hold(
     }
 }
 
-/// To and fro.
+/// Moves the hands back and forth.
 fn pull(time: Res<Time>, mut hands: Query<(&Hand, &mut Grab)>) {
     let t = time.elapsed_secs_f64();
     let reach = 0.20 * (t / 0.6).min(1.0);

@@ -1,5 +1,6 @@
-//! The compute pass against the processor: the vertex buffer that bodies are drawn from is read
-//! back and compared, vertex by vertex.
+//! Compares the compute pass with the processor, vertex by vertex.
+//!
+//! The vertex buffer that bodies are drawn from is read back from the device.
 #![allow(clippy::unwrap_used, clippy::panic, missing_docs, reason = "a failed test should panic")]
 
 mod drawing;
@@ -62,7 +63,7 @@ fn pip() -> ModalModel {
     ModalModel::read(PathBuf::from(env!("CARGO_MANIFEST_DIR")).join("../../assets/pip.modal")).unwrap()
 }
 
-/// Positions and normals of a mesh, from the buffer on the device.
+/// Returns positions and normals of a mesh from the buffer on the device.
 fn on_device(app: &App, mesh: AssetId<Mesh>) -> (Vec<Vec3>, Vec<Vec3>) {
     let world = app.sub_app(RenderApp).world();
     let layout = &world.resource::<RenderAssets<RenderMesh>>().get(mesh).unwrap().layout.0;
@@ -119,14 +120,14 @@ fn main() -> ExitCode {
 fn the_same_shapes(mut app: App) {
     let model = pip();
     let (size, modes) = (model.size() as f32, model.mode_count());
-    // The first mode's coordinate that turns some vertex by one radian.
+    // Value of the first mode's coordinate that turns some vertex by one radian.
     let turn = {
         let rotation = &model.parts().rotation[..model.surface().positions().len() * 3];
         1.0 / f64::from(rotation.chunks_exact(3).map(|w| Vec3::from_slice(w).length()).fold(0.0, f32::max))
     };
     let handle = app.world_mut().resource_mut::<Assets<ModalAsset>>().add(ModalAsset::from(model));
     let material = app.world_mut().resource_mut::<Assets<StandardMaterial>>().add(Color::WHITE);
-    // Something else lies in the same buffer.
+    // Another mesh must share the vertex buffer, to show that only the bodies are written.
     let other = app.world_mut().resource_mut::<Assets<Mesh>>().add(Torus::default());
     app.world_mut().spawn((Mesh3d(other.clone()), MeshMaterial3d(material.clone())));
     let torus = in_asset(&app, other.id());
@@ -146,7 +147,8 @@ fn the_same_shapes(mut app: App) {
     app.update();
     app.update();
 
-    // Gentle, strong, and beyond half a turn, where the series of the warp ends.
+    // The deformations are gentle, strong, and beyond half a turn, where the series of the warp
+    // ends.
     for (body, turns) in bodies.iter().zip([0.1, 1.0, 4.5]) {
         let q: Vec<f64> =
             (0..modes).map(|k| turns * turn * (0.7f64).powi(k as i32) * [1.0, -1.0][k % 2]).collect();
@@ -177,7 +179,7 @@ fn the_same_shapes(mut app: App) {
     }
     assert_eq!(on_device(&app, other.id()), torus, "a neighbour in the buffer was written to");
 
-    // The same shapes by the processor.
+    // The processor deforms the same shapes.
     app.insert_resource(SurfaceDeformation::Processor);
     app.update();
     app.update();
@@ -185,7 +187,7 @@ fn the_same_shapes(mut app: App) {
         let (expected, directions) = in_asset(&app, *mesh);
         let error = farthest(positions, &expected);
         assert!(error < 1e-5 * size, "off by {error} m of {size} m");
-        // A normal's error is the positions' over the length of an edge.
+        // The error of a normal is the error of the positions divided by the length of an edge.
         let error = farthest(normals, &directions);
         assert!(error < 1e-2, "normals off by {error}");
         println!(
@@ -194,25 +196,26 @@ fn the_same_shapes(mut app: App) {
         );
     }
 
-    // Far away, in a picture of 64 pixels, most modes are left out of it, and nobody can tell.
+    // In a picture of 64 pixels, most modes of a distant body are left out without a visible
+    // change.
     let world = app.world_mut();
     world.entity_mut(bodies[0]).insert(SurfaceDetail::default());
     let q: Vec<f64> = world.get::<VisualState>(bodies[0]).unwrap().q().to_vec();
     world.get_mut::<VisualState>(bodies[0]).unwrap().snap(&q).unwrap();
     app.update();
     let error = farthest(&in_asset(&app, meshes[0]).0, &computed[0].0);
-    // 45 degrees of view over 64 pixels, three metres away less the body's own radius.
+    // The view covers 45 degrees over 64 pixels, at three meters less the radius of the body.
     let pixel = 2.0 * 3.0 * (22.5f32).to_radians().tan() / 64.0;
     assert!(error > 1e-6 * size, "every mode is drawn: {error}");
     assert!(error < 0.1 * pixel, "{error} m off, a pixel is {pixel} m");
-    // Near enough, all that shows is drawn again, though the body has not moved.
+    // With a small tolerance, every visible mode is drawn again, though the body has not moved.
     let world = app.world_mut();
     world.entity_mut(bodies[0]).insert(SurfaceDetail { tolerance: 1e-5 });
     app.update();
     let finer = farthest(&in_asset(&app, meshes[0]).0, &computed[0].0);
     assert!(finer < error / 50.0, "{finer} m off after {error}");
 
-    // Back again; and a mesh that somebody changes keeps its shape.
+    // A mesh that other code changes keeps its shape under the compute pass.
     app.insert_resource(SurfaceDeformation::Compute);
     app.update();
     let count = computed[2].0.len();
@@ -225,7 +228,7 @@ fn the_same_shapes(mut app: App) {
     app.update();
     assert!(farthest(&on_device(&app, meshes[2]).0, &computed[2].0) < 1e-5 * size);
 
-    // Gone bodies leave nothing behind.
+    // Despawned bodies must leave no surface behind.
     for body in bodies {
         app.world_mut().entity_mut(body).despawn();
     }

@@ -1,11 +1,13 @@
-//! Every example without a window, as the files in `tests/examples` say: which one, with what arguments, what has to be printed and written.
+//! Runs every example without a window, as the files in `tests/examples` specify.
+//!
+//! Each file names an example, its arguments, and what the example must print and write.
 //!
 //! ```sh
 //! cargo test -p pliant                      # builds the examples first, as any `cargo test` of the package does
 //! PLIANT_RUN=join cargo test -p pliant      # those whose file's name begins like that
 //! ```
 //!
-//! They are run in a folder of their own, with no display and a cache of their own.
+//! Each example runs in its own folder, without a display and with its own cache.
 #![allow(clippy::unwrap_used, clippy::expect_used, clippy::panic, reason = "a failed test should panic")]
 
 use std::{
@@ -23,16 +25,17 @@ use serde::Deserialize;
 #[derive(Deserialize, Debug)]
 #[serde(deny_unknown_fields)]
 struct Run {
-    /// Its name.
+    /// Name of the example.
     example: String,
-    /// `{assets}` is the project's folder of assets, `{invite}` what the one beside it has printed.
+    /// Arguments. `{assets}` is the project's folder of assets, and `{invite}` is the invite that
+    /// the example in `beside` has printed.
     arguments: Vec<String>,
-    /// Another that is started before, and ended after.
+    /// Another example that is started before this one and ended after it.
     #[serde(default)]
     beside: Option<Beside>,
-    /// What has to be in its output, in this order.
+    /// Texts that the output must contain, in this order.
     prints: Vec<String>,
-    /// Files that have to be there afterwards, with something in them.
+    /// Files that must exist afterward and must not be empty.
     #[serde(default)]
     writes: Vec<String>,
 }
@@ -46,10 +49,10 @@ struct Beside {
 
 const ROOT: &str = concat!(env!("CARGO_MANIFEST_DIR"), "/../..");
 
-/// What the example beside one that is run has printed.
+/// File with the output of the example in `beside`.
 const BESIDE: &str = "beside.txt";
 
-/// The longest that any of them may take, also on a busy machine.
+/// Maximum duration of a run, also on a busy machine.
 const LONGEST: Duration = Duration::from_secs(600);
 
 fn runs() -> Vec<(String, Run)> {
@@ -67,7 +70,7 @@ fn runs() -> Vec<(String, Run)> {
     all
 }
 
-/// Examples by name, with whether they draw: those of the package that are in `examples/`.
+/// Returns the package's examples in `examples/` by name, and whether each needs a window.
 fn examples() -> Vec<(String, bool)> {
     let text = fs::read_to_string(concat!(env!("CARGO_MANIFEST_DIR"), "/Cargo.toml")).unwrap();
     let value = |part: &str, key: &str| {
@@ -94,7 +97,8 @@ fn every_example_has_a_run_and_those_that_draw_run_headless_for_so_many_frames()
         assert!(examples.iter().any(|(name, _)| *name == run.example), "there is no example {}", run.example);
     }
     for (name, draws) in &examples {
-        // `join` needs no window to be compiled, and has one; `make_models` needs what a window brings, and has none.
+        // `join` opens a window but compiles without the feature; `make_models` needs the feature
+        // but opens no window.
         let draws = (*draws || name == "join") && name != "make_models";
         let by_frames = |run: &Run| {
             let has = |argument: &str| run.arguments.iter().any(|given| given == argument);
@@ -105,14 +109,16 @@ fn every_example_has_a_run_and_those_that_draw_run_headless_for_so_many_frames()
     }
 }
 
-/// Where cargo puts the examples: beside the folder of this test.
+/// Returns the path of an example's program, in cargo's folder beside that of this test.
 fn program(example: &str) -> PathBuf {
     let test = std::env::current_exe().unwrap();
     let name = format!("{example}{}", std::env::consts::EXE_SUFFIX);
     test.parent().unwrap().with_file_name("examples").join(name)
 }
 
-/// Cargo builds them for a test of the whole package, and not for `--test examples` alone.
+/// Builds the examples if they are missing.
+///
+/// Cargo builds the examples for a test of the whole package, but not for `--test examples` alone.
 fn build_examples() {
     if examples().iter().all(|(name, _)| program(name).exists()) {
         return;
@@ -125,7 +131,7 @@ fn build_examples() {
     assert!(cargo.status().unwrap().success(), "the examples cannot be built");
 }
 
-/// A program that is ended when nobody needs it any more.
+/// A program that is killed when this value is dropped.
 struct Started {
     child: Child,
     output: PathBuf,
@@ -153,12 +159,12 @@ impl Started {
         String::from_utf8_lossy(&fs::read(&self.output).unwrap()).into_owned()
     }
 
-    /// The first invite that it prints.
+    /// Waits for the first invite that the program prints.
     fn invite(&self) -> Result<String, String> {
         let began = Instant::now();
         while began.elapsed() < LONGEST {
             let printed = self.printed();
-            // A line is whole when it has ended.
+            // The last line may be incomplete, so only lines that have ended count.
             let lines = printed.split_inclusive('\n').filter(|line| line.ends_with('\n'));
             let words = lines.flat_map(str::split_whitespace);
             if let Some(invite) = words.into_iter().find(|word| word.starts_with("pliant://")) {
@@ -177,7 +183,7 @@ impl Drop for Started {
     }
 }
 
-/// Runs one of them; says what was wrong, and what the one beside it has printed.
+/// Runs an example; an error includes the output of the example in `beside`.
 fn try_run(run: &Run, folder: &Path) -> Result<(), String> {
     run_in(run, folder).map_err(|why| match fs::read_to_string(folder.join(BESIDE)) {
         Ok(printed) => format!("{why}\nThe one beside it has printed:\n{printed}"),
@@ -235,7 +241,7 @@ fn every_example_runs_and_says_what_its_file_says() {
     assert!(!runs.is_empty(), "no file of tests/examples begins with {wanted:?}");
     let scratch = std::env::temp_dir().join(format!("pliant-examples-{}", std::process::id()));
     let next = AtomicUsize::new(0);
-    // Two at a time: what they wait for is the clock, mostly.
+    // Two examples run at a time, since they mostly wait for the clock.
     let work = || {
         let mut wrong = Vec::new();
         while let Some((name, run)) = runs.get(next.fetch_add(1, Ordering::Relaxed)) {

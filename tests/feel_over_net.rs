@@ -1,6 +1,7 @@
-//! A hand on a device that holds a body on another machine: real QUIC, the paper's first network in between, the device's own thread.
+//! Tests a hand on a device that holds a body on another machine.
 //!
-//! Everything runs in real time; what must come is waited for.
+//! The test uses real QUIC, the paper's first network as an emulated link, and the device loop's
+//! own thread. Everything runs in real time, and the test waits for each expected state.
 #![allow(clippy::unwrap_used, clippy::panic, missing_docs, reason = "a failed test should panic")]
 
 use std::{
@@ -52,7 +53,9 @@ struct Guest {
     hand: VirtualHandle,
 }
 
-/// A guest behind the paper's first network (9 % loss, 196 ms), with a device whose workspace is about the body's right side.
+/// Creates a guest with a device whose workspace lies on the body's right side.
+///
+/// The guest is behind the paper's first network (9 % loss, 196 ms).
 fn guest(model: &Arc<ModalModel>, invite: &Invite) -> Guest {
     let transport =
         JoinOptions { emulation: Some(Emulation::preset(Preset::Paper1, 7)), ..JoinOptions::default() };
@@ -66,7 +69,7 @@ fn guest(model: &Arc<ModalModel>, invite: &Invite) -> Guest {
         },
     );
     app.world_mut().spawn((SharedBody::named("pip"), Transform::default()));
-    // Without friction, so that the hand is where its springs say.
+    // Without friction, the hand is where its springs put it.
     let config = VirtualConfig { friction: 0.0, ..VirtualConfig::premium() };
     let device = VirtualDevice::new(config, Hand::FIRM).unwrap();
     let hand = device.handle();
@@ -85,7 +88,7 @@ fn guest(model: &Arc<ModalModel>, invite: &Invite) -> Guest {
     Guest { app, device, hand }
 }
 
-/// So long what must come is waited for: a busy machine makes the test slow and never red.
+/// Maximum time to wait for a state; a busy machine makes the test slow but does not fail it.
 const PATIENCE: Duration = Duration::from_secs(60);
 
 fn until(apps: &mut [&mut App], what: &str, mut so: impl FnMut(&mut [&mut App]) -> bool) {
@@ -97,7 +100,7 @@ fn until(apps: &mut [&mut App], what: &str, mut so: impl FnMut(&mut [&mut App]) 
     }
 }
 
-/// The reaction on the guest's hand as the host computes it.
+/// Returns the reaction on the guest's hand as the host computes it.
 fn at_host(host: &mut App) -> Option<DVec3> {
     let world = host.world_mut();
     world.query_filtered::<&GrabForce, With<HandOf>>().iter(world).next().map(|force| force.force)
@@ -116,7 +119,7 @@ fn a_hand_far_away_feels_the_body_at_once_and_nothing_when_the_network_is_gone()
     until(&mut [&mut host, &mut g.app], "the hand is on the host's body too", |apps| {
         at_host(apps[0]).is_some()
     });
-    // Some time with a still hand, so that the session has measured the way.
+    // The hand is still for some time, so that the session can measure the one-way delay.
     until(&mut [&mut host, &mut g.app], "two seconds are shown", |apps| {
         let stats = apps[1].world().resource::<NetStats>();
         stats.shown > 80 && !stats.round_trip.is_zero()
@@ -126,12 +129,12 @@ fn a_hand_far_away_feels_the_body_at_once_and_nothing_when_the_network_is_gone()
     let force = |app: &App| -> DVec3 {
         app.world().resource::<HapticDevices>().get(hand).unwrap().report.tick.wrench.force.into()
     };
-    // A pull is felt before the host's body has felt it. A busy machine may look too late to tell,
-    // so the hand goes back and pulls again until it was seen.
+    // The hand must feel a pull before the host's body reacts. A busy machine may look too late to
+    // observe this, so the hand moves back and pulls again until it is observed.
     let start = Instant::now();
     loop {
-        // Not far: a force that a late frame has faded must find what it takes to come back in the
-        // tank.
+        // The pull is short: after a late frame has faded the force, the energy tank must hold
+        // enough to restore it.
         g.hand.set_target([0.02, 0.007, 0.0]);
         let pulled = Instant::now();
         let mut first = None;
@@ -159,7 +162,7 @@ fn a_hand_far_away_feels_the_body_at_once_and_nothing_when_the_network_is_gone()
         });
     }
 
-    // The host's machine stops: no goodbye, nothing.
+    // The host's machine stops without a goodbye.
     std::mem::forget(host);
     g.app.world_mut().resource_mut::<Heard>().0.clear();
     let mut nothing = Instant::now();

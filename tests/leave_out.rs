@@ -1,4 +1,7 @@
-//! What a scene leaves out costs nothing: no system where there is no plugin, no step, state, message or mesh where nobody touches anything.
+//! Tests that unused parts of a scene cost nothing.
+//!
+//! A plugin that is left out adds no system. A body that nothing touches causes no step, state,
+//! message or mesh.
 #![allow(clippy::unwrap_used, clippy::panic, missing_docs, reason = "a failed test should panic")]
 
 use std::{path::PathBuf, time::Duration};
@@ -27,7 +30,7 @@ fn ready(app: &mut App) {
     app.update();
 }
 
-/// Systems in all schedules, after a frame.
+/// Returns the number of systems in all schedules after one frame.
 fn systems(mut app: App) -> usize {
     ready(&mut app);
     app.world().resource::<Schedules>().iter().map(|(_, schedule)| schedule.systems_len()).sum()
@@ -39,7 +42,7 @@ fn with(plugins: impl FnOnce(&mut App)) -> usize {
     systems(app)
 }
 
-/// The plugin alone, by what it adds to the engine; a plugin that is left out adds nothing, whatever is compiled.
+/// Counts what each plugin adds to the engine, whatever features are compiled.
 #[test]
 fn each_plugin_brings_its_own_systems_and_no_other() {
     let none = systems(engine());
@@ -47,7 +50,7 @@ fn each_plugin_brings_its_own_systems_and_no_other() {
     let body = with(|app| {
         app.add_plugins(PliantBodyPlugin::default());
     }) - none;
-    // It was 19 with its messages and assets; a new one is to be noticed, a few are welcome.
+    // The count was 19 with the plugin's messages and assets; the range allows a few more.
     assert!((10..=24).contains(&body), "{body} systems of the body plugin");
     let pointer = with(|app| {
         app.add_plugins((PliantBodyPlugin::default(), PointerGrabPlugin));
@@ -75,7 +78,8 @@ fn each_plugin_brings_its_own_systems_and_no_other() {
     }
 }
 
-/// A body that rests takes no step, writes no state and moves no component for ten seconds; a touch wakes it.
+/// Tests that a resting body is not stepped and no component of it written for ten seconds, and
+/// that a touch wakes it.
 #[test]
 fn a_body_at_rest_takes_no_step_and_changes_nothing() {
     let mut app = engine();

@@ -1,4 +1,4 @@
-//! What a user sees: the shipped body drawn by the real renderer into an image, at rest and pulled.
+//! Tests what a user sees: the real renderer draws a body into an image, at rest and pulled.
 #![allow(clippy::unwrap_used, clippy::panic, missing_docs, reason = "a failed test should panic")]
 
 mod drawing;
@@ -35,7 +35,8 @@ struct Picture(Arc<Mutex<Option<Vec<u8>>>>);
 #[derive(Resource)]
 struct Canvas(Handle<Image>);
 
-/// An app that draws the body from the front onto an image; a light from above left throws its shadow.
+/// Creates an app that draws the body from the front into an image, with a light from the upper
+/// left that casts its shadow.
 fn studio() -> App {
     let model =
         ModalModel::read(PathBuf::from(env!("CARGO_MANIFEST_DIR")).join("../../assets/pip.modal")).unwrap();
@@ -62,7 +63,7 @@ fn studio() -> App {
     let canvas = world.resource_mut::<Assets<Image>>().add(canvas);
     let body = world.resource_mut::<Assets<ModalAsset>>().add(ModalAsset::from(model));
     let mut materials = world.resource_mut::<Assets<StandardMaterial>>();
-    // The body is red and the ground is green, so that either can be told by its channel.
+    // The body is red and the ground is green, so that each is identified by its channel.
     let skin =
         materials.add(StandardMaterial { perceptual_roughness: 1.0, ..Color::srgb(1.0, 0.0, 0.0).into() });
     let floor =
@@ -102,7 +103,7 @@ fn shoot(app: &mut App, frames: usize) -> Vec<u8> {
     bytes
 }
 
-/// Pixels of the body, of the lit ground, and of the ground in shadow.
+/// Counts the pixels of the body, of the lit ground, and of the ground in shadow.
 fn count(picture: &[u8]) -> [usize; 3] {
     let mut counts = [0; 3];
     for pixel in picture.chunks_exact(4) {
@@ -128,20 +129,20 @@ fn main() -> ExitCode {
 fn drawn_shadowed_and_pulled(mut app: App) {
     let all = (WIDTH * HEIGHT) as usize;
     let mut before = Vec::new();
-    // The first frames compile the shaders; the picture is good when two in a row agree.
+    // The first frames compile the shaders; the picture is ready when two in a row agree.
     let rest = drawing::wait_for("the body and its shadow are drawn", || {
         let next = shoot(&mut app, 10);
         let still = next == before;
         before.clone_from(&next);
         let [body, lit, shadow] = count(&next);
         // 0.3 m of body at 0.9 m with a 45 degree lens is about a third of the height: a tenth of
-        // the picture, give or take a factor of three.
+        // the picture, within a factor of three.
         let right = (all / 30..all / 3).contains(&body) && lit > all / 10 && shadow > body / 20;
         let told = || format!("{body} pixels of body, {lit} of lit ground, {shadow} of shadow, of {all}");
         if still && right { Ok(next) } else { Err(told()) }
     });
 
-    // Pull an ear sideways by a quarter of the body's size.
+    // An ear is pulled sideways by a quarter of the body's size.
     let world = app.world_mut();
     let (entity, vertex, start, size) = {
         let mut bodies = world.query::<(Entity, &BodyState)>();

@@ -1,4 +1,4 @@
-//! What a person is told about a scene that is wrong, and what a right one becomes.
+//! Tests the errors for invalid scenes and the entities of valid ones.
 #![allow(clippy::unwrap_used, clippy::expect_used, clippy::panic, reason = "a failed test should panic")]
 
 use std::time::{Duration, Instant};
@@ -9,7 +9,7 @@ use pliant::body::{BodyState, Grab, GrabForce, ModalBody};
 use pliant::prelude::PliantPlugins;
 use pliant::scene::*;
 
-/// A scene that is right, line by line.
+/// A valid scene, line by line.
 const GOOD: &str = r#"(
     title: "one",
     bodies: [
@@ -26,7 +26,7 @@ fn refused(text: &str) -> SceneError {
     SceneFile::from_ron(text, "my.ron").expect_err("this scene is wrong")
 }
 
-/// The good scene with a part of it replaced.
+/// Returns the error of the valid scene with a part of it replaced.
 fn with(part: &str, by: &str) -> SceneError {
     assert!(GOOD.contains(part));
     refused(&GOOD.replacen(part, by, 1))
@@ -130,7 +130,7 @@ fn names_that_are_there_twice_or_not_at_all() {
         Some("my.ron:5:16: the body `pip` is there already, in line 4; every body needs a name of its own")
     );
     assert_eq!(error.kind, SceneErrorKind::Name);
-    // A copy's name is one, too.
+    // The name of a copy counts as a name, too.
     let copies = GOOD
         .replacen("name: \"bud\"", "name: \"b\", copies: (count: (2, 1), spacing: (1, 1))", 1)
         .replacen("name: \"pip\"", "name: \"b.1\"", 1);
@@ -212,7 +212,7 @@ fn a_mistake_in_a_scene_without_a_text_has_no_line() {
 
 #[test]
 fn no_input_panics_or_takes_long() {
-    // Deep, long, cut, and not text at all.
+    // The inputs are deeply nested, long, cut off, and not text.
     assert!(refused(&"(bodies: [".repeat(10_000)).message.len() < 400);
     assert!(refused(&format!("(title: {}", "[".repeat(100_000))).to_string().len() < 2000);
     assert!(refused(&format!("(bodies: {}", "(".repeat(100_000))).to_string().len() < 2000);
@@ -223,7 +223,7 @@ fn no_input_panics_or_takes_long() {
     for cut in (0..GOOD.len() - 1).filter(|&cut| GOOD.is_char_boundary(cut)) {
         assert_ne!(refused(&GOOD[..cut]).to_string(), "");
     }
-    // Every byte of it another one: no panic.
+    // Each byte is replaced in turn; nothing may panic.
     for at in 0..GOOD.len() {
         for byte in [b'(', b')', b'"', b'-', b'9', 0] {
             let mut bytes = GOOD.as_bytes().to_vec();
@@ -239,7 +239,8 @@ fn a_file_that_is_too_long_or_no_text_or_not_there() {
     let folder = std::env::temp_dir().join(format!("pliant-scene-{}", std::process::id()));
     std::fs::create_dir_all(&folder).unwrap();
     let file = folder.join("long.ron");
-    // Eight gigabytes, of which one megabyte is read. Elsewhere a hole takes room on the disk.
+    // One megabyte of the eight gigabytes is read. On other systems, a sparse file may use disk
+    // space.
     let bytes = if cfg!(target_os = "linux") { 1 << 33 } else { 2 << 20 };
     std::fs::File::create(&file).unwrap().set_len(bytes).unwrap();
     let error = SceneFile::read(&file).unwrap_err();
@@ -271,7 +272,7 @@ fn app() -> App {
     app
 }
 
-/// Runs until `done`, with files read on other threads, however long a busy machine takes for that.
+/// Runs the app until `done`, with time for files that are read on other threads.
 fn run_until(app: &mut App, what: &str, mut done: impl FnMut(&mut World) -> bool) {
     let start = Instant::now();
     loop {
@@ -302,7 +303,7 @@ fn a_scene_becomes_bodies_and_hands_that_hold_and_let_go() {
         hands.iter(world).find(|(own, ..)| own.as_str() == name).map(|(_, grab, force)| (*grab, *force))
     };
     run_until(&mut app, "the left hand", |world| hand(world, "left").is_some());
-    // 64 ticks a second: the right one waits for a quarter of a second.
+    // At 64 ticks per second, the right hand waits for 16 ticks, a quarter of a second.
     assert!(hand(app.world_mut(), "right").is_none());
     for _ in 0..16 {
         app.update();
@@ -315,7 +316,7 @@ fn a_scene_becomes_bodies_and_hands_that_hold_and_let_go() {
     assert_eq!(grab.stiffness, Some(200.0));
     assert!((grab.target - taken.target).length() <= 0.05 + 1e-6);
     assert!((grab.target.z - taken.target.z - 0.05).abs() < 0.01, "{grab:?} {taken:?}");
-    // It is pulled along, so the body pulls back, and no harder than the spring lets it.
+    // The body pulls back on the moved hand, but not harder than the hand's spring allows.
     assert!(force.force.z < -0.01 && force.force.length() <= 200.0 * 0.05, "{force:?}");
     for _ in 0..24 {
         app.update();
@@ -328,7 +329,7 @@ fn a_scene_becomes_bodies_and_hands_that_hold_and_let_go() {
         .map(|(name, place, _)| (name.to_string(), place.translation.x))
         .collect();
     assert!(places.contains(&("pip".into(), 0.0)) && places.contains(&("bud".into(), 0.5)), "{places:?}");
-    // With the instance goes all that it made.
+    // Despawning the instance despawns all its parts.
     let instance = world.query_filtered::<Entity, With<SceneInstance>>().single(world).unwrap();
     world.despawn(instance);
     assert_eq!(world.query::<&ModalBody>().iter(world).count(), 0);
@@ -350,7 +351,7 @@ fn a_file_of_the_scene_that_is_not_there_is_told_with_its_entry_and_line() {
     assert!(told.starts_with("my.ron:5:30: the body `bud` cannot be loaded: "), "{told}");
     assert!(told.contains("bad.modal"), "{told}");
     assert_eq!(errors[0].kind, SceneErrorKind::Asset);
-    // The other body is held all the same.
+    // The other body is held regardless of the failure.
     run_until(&mut app, "the hands", |world| world.query::<(&Grab, &GrabForce)>().iter(world).count() == 2);
 }
 
@@ -394,7 +395,7 @@ fn a_game_loads_scenes_as_assets_where_it_likes() {
         let body = world.query::<(&SceneBody, &BodyState, &GlobalTransform)>().iter(world).next();
         body.is_some_and(|(.., at)| at.translation().x > 1.0) && !errors.is_empty()
     });
-    // A description of a shape is another thing; the message has its line.
+    // The file describes a shape, not a scene; the message has the line of the mistake.
     assert_eq!(errors.len(), 1, "{errors:?}");
     assert!(errors[0].to_string().starts_with("pip.ron:"), "{}", errors[0]);
     assert!(errors[0].position.is_some());
@@ -402,7 +403,7 @@ fn a_game_loads_scenes_as_assets_where_it_likes() {
     assert!(!app.world().get::<SceneParts>(solo).unwrap().entities().is_empty());
 }
 
-/// Another copy of the file's text, as a watcher would bring it.
+/// Replaces the asset by another text, as a file watcher does.
 #[test]
 fn a_scene_that_changes_is_made_anew() {
     let mut app = app();
@@ -439,11 +440,11 @@ fn a_session_is_for_an_app_that_was_built_for_it() {
         "{}",
         errors[0]
     );
-    // What else is in it goes on.
+    // The rest of the scene exists.
     run_until(&mut app, "the hands", |world| world.query::<(&Grab, &GrabForce)>().iter(world).count() == 2);
 }
 
-/// What the game does not get is said, an error each, and the bodies are there with the hands on them.
+/// Tests that each unmet request gives one error, and that the bodies and their hands exist.
 #[cfg(all(feature = "net", feature = "rerun", feature = "haptics", feature = "bake"))]
 #[test]
 fn the_project_s_scenes_may_be_assets_of_a_game() {
@@ -482,13 +483,14 @@ fn the_project_s_scenes_may_be_assets_of_a_game() {
     let world = app.world_mut();
     let hands: Vec<String> =
         world.query_filtered::<&Name, With<GrabForce>>().iter(world).map(ToString::to_string).collect();
-    // That of shared.ron; of the other scene's two one is the guest's, and one is on the body that is not there.
+    // This is the hand of shared.ron. Of the other scene's two hands, one is the guest's and one
+    // belongs to the missing body.
     assert_eq!(hands, ["of the host"]);
     let bodies: Vec<Entity> = world.query_filtered::<Entity, With<BodyState>>().iter(world).collect();
     assert_eq!(bodies.len(), 2);
 }
 
-/// The guest beside a host shows baked bodies, too, and leaves alone what rests.
+/// Tests that the guest beside a host shows baked bodies, and that its view rests with the body.
 #[cfg(all(feature = "net", feature = "bake"))]
 #[test]
 fn a_guest_s_view_of_a_baked_body_is_of_the_host_s_model_and_rests_with_it() {
@@ -518,7 +520,7 @@ fn a_guest_s_view_of_a_baked_body_is_of_the_host_s_model_and_rests_with_it() {
     let world = app.world_mut();
     let hosts = world.query_filtered::<&ModalBody, With<SceneBody>>().single(world).unwrap();
     assert_eq!(hosts.model.id(), model, "one model in memory");
-    // It is let go of and comes to rest; then nobody writes the view any more.
+    // The body is released and comes to rest; after that, nothing writes the view.
     run_until(&mut app, "rest", |world| {
         world.query_filtered::<&BodyState, With<SceneBody>>().single(world).unwrap().is_resting()
     });
@@ -540,7 +542,7 @@ fn a_guest_in_the_same_process_pulls_the_host_s_body_and_sees_it() {
     let plugin = SceneFilePlugin::open(SceneFile::from_ron(&text, "my.ron").unwrap()).unwrap();
     assert!(plugin.invite().is_some());
     let mut app = app();
-    // A session's time is the wall's.
+    // A session runs in real time.
     app.insert_resource(TimeUpdateStrategy::Automatic).add_plugins(plugin);
     let mut pulled = 0.0_f64;
     run_until(&mut app, "the guest's hand and its view", |world| {
@@ -583,7 +585,8 @@ fn a_simulated_device_takes_hold_and_is_gone_with_its_scene() {
     assert_eq!(world.resource::<HapticDevices>().iter().count(), 0);
 }
 
-/// A field of the scene, what it is, where it is, and the feature that it needs.
+/// For each feature: the part of the scene to replace, its replacement, the position of the error,
+/// and the feature that is needed.
 const NEEDS: [(&str, &str, (usize, usize), &str); 4] = [
     ("title: \"one\"", "network: Host()", (2, 14), "net"),
     ("title: \"one\"", "device: Pointer(on: (body: \"pip\", patch: Vertex(0)))", (2, 13), "haptics"),
@@ -614,7 +617,8 @@ fn a_scene_that_the_program_was_not_compiled_for_is_not_opened() {
     let compiled =
         [cfg!(feature = "net"), cfg!(feature = "haptics"), cfg!(feature = "rerun"), cfg!(feature = "bake")];
     for ((part, by, _, feature), compiled) in NEEDS.into_iter().zip(compiled) {
-        // The folder of the recording is not there: what was compiled refuses that, and what was not says so first.
+        // The recording's folder does not exist. With the feature, this is the error; without the
+        // feature, the missing feature is reported first.
         let opened =
             SceneFilePlugin::open(SceneFile::from_ron(&GOOD.replacen(part, by, 1), "my.ron").unwrap());
         match (compiled, opened) {
@@ -641,7 +645,7 @@ fn a_recording_that_cannot_be_written_is_told_before_the_scene_plays() {
     assert_eq!(told[0].message, "cannot record to no/such folder/out.rrd: there is no folder no/such folder");
     #[cfg(feature = "rerun")]
     assert_eq!(SceneFilePlugin::open(file).err(), Some(told[0].clone()));
-    // Not below any folder that could be missing, but a folder itself.
+    // The path itself is a folder, and it has no parent folder that could be missing.
     let folder = format!("pliant-scene-{}.rrd", std::process::id());
     std::fs::create_dir(&folder).unwrap();
     let told = wrong(&folder).check_files(ASSETS);
@@ -676,7 +680,7 @@ fn missing_files_are_told_by_a_check_with_their_lines() {
     );
     assert!(lines[1].ends_with("; did you mean `jelly.obj`?"), "{}", lines[1]);
     assert!(told.iter().all(|error| error.kind == SceneErrorKind::Asset));
-    // One that is there and is none.
+    // The file exists, but it is not a model.
     let text = GOOD.replacen("model: \"bud.modal\"", "model: \"../Cargo.toml\"", 1);
     assert!(SceneFile::from_ron(&text, "my.ron").is_err());
     let folder = std::env::temp_dir().join(format!("pliant-models-{}", std::process::id()));
@@ -686,7 +690,7 @@ fn missing_files_are_told_by_a_check_with_their_lines() {
     let told = SceneFile::from_ron(GOOD, "my.ron").unwrap().check_files(&folder);
     std::fs::remove_dir_all(&folder).unwrap();
     assert_eq!((told.len(), told[0].position), (1, Some((4, 30))), "{told:?}");
-    // A vertex that the model does not have.
+    // The model does not have this vertex.
     let text = GOOD.replacen("Toward((1, 0, 0))", "Vertex(4000000)", 1);
     let told = SceneFile::from_ron(&text, "my.ron").unwrap().check_files(ASSETS);
     assert_eq!((told.len(), told[0].position), (1, Some((8, 44))), "{told:?}");
@@ -718,7 +722,7 @@ fn stiffness_and_the_basis_of_a_body_are_the_scene_s() {
         .collect();
     let of = |name: &str| bodies.iter().find(|body| body.0 == name).unwrap();
     assert_eq!((of("pip").1, of("pip").2), (4.0, true));
-    // Four times as stiff: twice the frequency.
+    // Four times the stiffness doubles the frequency.
     assert!((of("pip").3 - 2.0).abs() < 1e-9, "{bodies:?}");
     assert_eq!((of("bud").1, of("bud").2), (1.0, false));
     for (settings, column, told) in [

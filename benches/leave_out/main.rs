@@ -1,12 +1,16 @@
-//! What a scene costs, with what it does not need left out: six typical scenes, each compiled with its own features.
+//! Cost of a scene without the features that it does not need: six typical scenes, each compiled
+//! with its own features.
 //!
-//! `python3 benches/leave_out/run.py` builds all of them and makes the table. By hand, for one:
+//! `python3 benches/leave_out/run.py` builds all scenes and writes the table. To run one scene by
+//! hand:
 //!
 //! ```sh
 //! cargo run --release -p pliant --no-default-features --features window --example leave_out -- --scene solo
 //! ```
 //!
-//! No window and no graphics card: surfaces are written on the processor, to an image that nobody draws. Frames come sixty times a second, by the wall's clock, and each has a step.
+//! The program uses no window and no graphics card. Surfaces are written on the CPU, to an image
+//! that is never rendered. The program runs sixty frames a second in real time, and each frame has
+//! one step.
 
 #[cfg(feature = "net")]
 mod partner;
@@ -25,13 +29,14 @@ use scene::{Scene, Work};
 
 #[derive(Parser)]
 struct Options {
-    /// Which scene; those whose features were not compiled are refused.
+    /// The scene. A scene whose features were not compiled is refused.
     #[arg(long, value_enum)]
     scene: Scene,
-    /// Seconds that are measured, at rest and again at work.
+    /// Seconds to measure at rest and again at work.
     #[arg(long, default_value_t = 5.0)]
     seconds: f64,
-    /// For the other end of a session: join this invite (`host` to open one and print its invite) and stay until the input ends.
+    /// Run as the other end of a session: join this invite, or open a session and print its invite
+    /// (`host`), and stay until the input ends.
     #[arg(long, hide = true)]
     partner: Option<String>,
 }
@@ -59,7 +64,7 @@ fn run(options: &Options) -> Result<(), Box<dyn Error>> {
     if !(0.5..=600.0).contains(&options.seconds) {
         return Err(format!("--seconds: expected 0.5 to 600, got {}", options.seconds).into());
     }
-    // The engine alone first: what is beyond its systems is ours.
+    // Count the engine's systems alone first. All further systems belong to this project.
     let mut engine = App::new();
     scene::engine(&mut engine);
     let engine = systems(&mut engine);
@@ -70,7 +75,8 @@ fn run(options: &Options) -> Result<(), Box<dyn Error>> {
     let all = systems(&mut app);
     scene::spawn(options.scene, &mut app, &mut company)?;
 
-    // Long enough for bodies to come, to settle and to fall asleep, and for sessions to measure their way.
+    // Wait until bodies have loaded, settled and fallen asleep, and sessions have measured their
+    // path.
     frames(&mut app, 4.0);
     let rest = measure(&mut app, options.seconds);
     app.insert_resource(Work(true));
@@ -84,7 +90,7 @@ fn run(options: &Options) -> Result<(), Box<dyn Error>> {
     Ok(())
 }
 
-/// Readies an app, runs a frame of it, and counts the systems in its schedules.
+/// Initializes an app, runs one frame and counts the systems in its schedules.
 fn systems(app: &mut App) -> usize {
     while app.plugins_state() == PluginsState::Adding {
         bevy::tasks::tick_global_task_pools_on_main_thread();
@@ -95,7 +101,7 @@ fn systems(app: &mut App) -> usize {
     app.world().resource::<Schedules>().iter().map(|(_, schedule)| schedule.systems_len()).sum()
 }
 
-/// Runs frames at their pace; the time of each, ms.
+/// Runs frames at `HZ` and returns the time of each, ms.
 fn frames(app: &mut App, seconds: f64) -> Vec<f64> {
     let count = (seconds * HZ) as u32;
     let begun = Instant::now();
@@ -110,7 +116,7 @@ fn frames(app: &mut App, seconds: f64) -> Vec<f64> {
         .collect()
 }
 
-/// Frames measured: what they cost the thread of the app, and the whole program.
+/// Measures frames: the time on the app's thread and the CPU time of the whole program.
 fn measure(app: &mut App, seconds: f64) -> String {
     let before = processor();
     let (mut times, mut awake) = (Vec::new(), 0.0);
@@ -134,10 +140,11 @@ fn measure(app: &mut App, seconds: f64) -> String {
     )
 }
 
-/// Processor time of this program, all threads, s: of `/proc`, zero where there is none.
+/// CPU time of all threads of this program, s, from `/proc`. Zero on systems without it.
 fn processor() -> f64 {
     let Ok(tasks) = std::fs::read_dir("/proc/self/task") else { return 0.0 };
-    // The first number of `schedstat` is nanoseconds on a processor; the clock of `stat` ticks a hundred times a second only.
+    // The first number of `schedstat` is the time on a CPU in nanoseconds. The clock of `stat`
+    // ticks only a hundred times a second.
     let one = |path: std::path::PathBuf| -> Option<f64> {
         std::fs::read_to_string(path.join("schedstat")).ok()?.split(' ').next()?.parse().ok()
     };

@@ -1,4 +1,4 @@
-//! The other end of a session, in a program of its own, so that what it costs is not counted.
+//! The other end of a session, in a program of its own so that its cost is not measured.
 
 use std::{
     error::Error,
@@ -19,13 +19,13 @@ use pliant::{
 
 use crate::{HZ, scene};
 
-/// Ends when this is dropped: its input is closed.
+/// The process of the other end. Dropping it closes the input of the process and ends it.
 pub struct Partner(Child);
 
 impl Drop for Partner {
     fn drop(&mut self) {
         drop(self.0.stdin.take());
-        // It has nothing to lose.
+        // The process has no data to save.
         let _ = self.0.kill();
         let _ = self.0.wait();
     }
@@ -38,14 +38,14 @@ fn start(what: &str) -> Result<Child, Box<dyn Error>> {
 }
 
 impl Partner {
-    /// A guest elsewhere, and the plugin of the host here.
+    /// Starts a guest in another process and returns the host's plugin for this process.
     pub fn guest() -> Result<(Self, NetPlugin), Box<dyn Error>> {
         let net = NetPlugin::host(HostConfig::default())?;
         let invite = net.invite().ok_or("the host has no invite")?.to_string();
         Ok((Self(start(&invite)?), net))
     }
 
-    /// A host elsewhere, and the plugin of the guest here.
+    /// Starts a host in another process and returns the guest's plugin for this process.
     pub fn host() -> Result<(Self, NetPlugin), Box<dyn Error>> {
         let mut child = start("host")?;
         let mut line = String::new();
@@ -56,7 +56,7 @@ impl Partner {
     }
 }
 
-/// Plays that part until the input ends.
+/// Runs the other end until its input ends.
 pub fn play(part: &str) -> Result<(), Box<dyn Error>> {
     let mut app = App::new();
     app.add_plugins((MinimalPlugins, AssetPlugin::default(), TransformPlugin))
@@ -78,7 +78,7 @@ pub fn play(part: &str) -> Result<(), Box<dyn Error>> {
     let over = Arc::new(AtomicBool::new(false));
     let heard = over.clone();
     std::thread::spawn(move || {
-        // An error is an end, too.
+        // An error ends the program, too.
         let _ = std::io::stdin().read_to_end(&mut Vec::new());
         heard.store(true, Ordering::Relaxed);
     });

@@ -1,4 +1,4 @@
-//! The six scenes: their plugins, what is in them, and their work.
+//! The six scenes: their plugins, their content and their work.
 
 use std::{error::Error, path::Path, sync::Arc};
 
@@ -18,17 +18,17 @@ use crate::partner::Partner;
 /// A typical scene.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, ValueEnum)]
 pub enum Scene {
-    /// One body that is pulled and looked at (`window`).
+    /// One body that is pulled and rendered (`window`).
     Solo,
     /// A thousand bodies of one model (`window`).
     Many,
-    /// A server of one body, without a picture, with one guest (`net`).
+    /// A server of one body with one guest, without rendering (`net`).
     Host,
-    /// A guest that sees and holds the host's body (`window`, `net`).
+    /// A guest that renders and holds the host's body (`window`, `net`).
     Guest,
-    /// One body that is felt: a device on its own 1 kHz loop (`window`, `haptics`).
+    /// One body with a haptic device on its own 1 kHz loop (`window`, `haptics`).
     Haptics,
-    /// All features: a host that is seen, felt, recorded and bakes.
+    /// All features: a host with rendering, haptics, recording and baking.
     Everything,
 }
 
@@ -38,11 +38,11 @@ impl Scene {
     }
 }
 
-/// Is the scene at work? Else nobody touches anything.
+/// True while the scene is at work. Otherwise no hand touches a body.
 #[derive(Resource, Default)]
 pub struct Work(pub bool);
 
-/// What lives beside the app as long as it is measured.
+/// Resources that must live beside the app while it is measured.
 #[derive(Default)]
 pub struct Company {
     #[cfg(feature = "net")]
@@ -57,13 +57,14 @@ pub struct Company {
 impl Drop for Company {
     fn drop(&mut self) {
         if let Some(file) = &self.recording {
-            // It may never have been written.
+            // The recording may never have been written.
             let _ = std::fs::remove_file(file);
         }
     }
 }
 
-/// The engine as the scene has it: all that a windowed game has, without its window, or the least that bodies need.
+/// Adds the engine's plugins: those of a windowed game without its window, or the minimum for
+/// bodies.
 pub fn engine(app: &mut App) {
     #[cfg(feature = "window")]
     app.add_plugins(
@@ -90,10 +91,10 @@ fn missing(scene: Scene, features: &str) -> Box<dyn Error> {
     format!("{scene:?} needs the features {features}").into()
 }
 
-/// The plugins of a scene, and no more.
+/// Adds exactly the plugins that a scene needs.
 pub fn plugins(scene: Scene, app: &mut App) -> Result<Company, Box<dyn Error>> {
     let mut company = Company::default();
-    // Which of its parts there are is a matter of features.
+    // The features decide which fields exist, so `company` may stay unused.
     let _ = &mut company;
     if scene != Scene::Host && !cfg!(feature = "window") {
         return Err(missing(scene, "window"));
@@ -136,14 +137,14 @@ pub fn model(name: &str) -> Result<Arc<ModalModel>, Box<dyn Error>> {
     Ok(Arc::new(ModalModel::read(path)?))
 }
 
-/// The vertex that lies farthest to the right and up: an ear of the shipped body.
+/// The vertex farthest to the right and up: an ear of the shipped body.
 pub fn ear(model: &ModalModel) -> u32 {
     let positions = model.surface().positions();
     let far = |v: &usize| f64::from(positions[*v][0]) + 0.55 * f64::from(positions[*v][1]);
     (0..positions.len()).max_by(|a, b| far(a).total_cmp(&far(b))).unwrap_or(0) as u32
 }
 
-/// What is in a scene.
+/// Spawns the content of a scene.
 pub fn spawn(scene: Scene, app: &mut App, company: &mut Company) -> Result<(), Box<dyn Error>> {
     let pip = model("pip.modal")?;
     let side = ear(&pip);
@@ -188,7 +189,7 @@ pub fn spawn(scene: Scene, app: &mut App, company: &mut Company) -> Result<(), B
     Ok(())
 }
 
-/// A camera: bodies that nobody sees are not deformed.
+/// Adds a camera, because bodies that no camera sees are not deformed.
 #[cfg(feature = "window")]
 fn look(app: &mut App) {
     let canvas = Image::new_target_texture(1280, 720, TextureFormat::Rgba8UnormSrgb, None);
@@ -197,7 +198,7 @@ fn look(app: &mut App) {
     app.world_mut().spawn((Camera3d::default(), RenderTarget::from(canvas), eye));
 }
 
-/// A hand that pulls the ear about while there is work.
+/// A hand that moves the ear while there is work.
 #[derive(Resource)]
 struct Hand {
     vertex: u32,
@@ -227,7 +228,7 @@ fn pull(
     }
 }
 
-/// All bodies are struck ten times a second, so that none rests.
+/// Applies an impulse to every body ten times a second, so that none rests.
 fn shake(
     work: Res<Work>,
     mut tick: Local<u32>,
@@ -244,7 +245,7 @@ fn shake(
     }
 }
 
-/// A simulated device at the ear; its hand presses the button and moves while there is work.
+/// Adds a simulated device at the ear. Its hand presses the button and moves while there is work.
 #[cfg(feature = "haptics")]
 fn feel(app: &mut App, company: &mut Company, place: Vec3) -> Result<(), Box<dyn Error>> {
     use pliant::haptics::{Hand as Grip, LoopConfig, VirtualConfig, VirtualDevice};

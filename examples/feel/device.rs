@@ -1,4 +1,4 @@
-//! Which device an example takes into its hand.
+//! The choice of the device that an example uses.
 #![allow(dead_code, reason = "each example uses the part that it needs")]
 
 use std::error::Error;
@@ -12,13 +12,13 @@ use pliant::haptics::{
 /// The devices by name.
 #[derive(ValueEnum, Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Kind {
-    /// The first real one that is plugged in, else the virtual one.
+    /// The first real device that is plugged in, else the simulated device.
     Auto,
-    /// A simulated Premium in a simulated hand, which plays a script.
+    /// A simulated Premium in a simulated hand that plays a script.
     Virtual,
-    /// The mouse. The force is shown, nobody feels it.
+    /// The mouse. The force is shown but not felt.
     Pointer,
-    /// A gamepad. The force is shown, and it buzzes.
+    /// A gamepad. The force is shown, and the gamepad vibrates.
     Gamepad,
     /// Haply Inverse3, through its service.
     Inverse,
@@ -48,18 +48,18 @@ impl Grip {
     }
 }
 
-/// Who moves it.
+/// What moves the device.
 #[derive(Debug, Clone)]
 pub enum Mover {
-    /// A script, through this.
+    /// A script, through this handle.
     Script(VirtualHandle),
-    /// Mouse or gamepad, through this.
+    /// The mouse or a gamepad, through this handle.
     Input(PositionedHandle),
-    /// A person, or a recording of one.
+    /// A person, or a recording.
     Nobody,
 }
 
-/// A device, open.
+/// An open device and what moves it.
 pub struct Opened {
     pub device: Box<dyn HapticDevice>,
     pub mover: Mover,
@@ -88,8 +88,10 @@ pub fn open(kind: Kind, grip: Grip) -> Result<Opened, Box<dyn Error>> {
     })
 }
 
-/// How its loop is run. A real device always has the whole safety pipeline; where a software renderer is to draw a picture, a simulated hand waits
-/// longer for the next word than a person's would be kept waiting.
+/// Returns the configuration of the device loop.
+///
+/// A real device always has the whole safety pipeline. For a picture from a software renderer, the
+/// loop of a simulated hand waits longer for the next local model update.
 pub fn loop_config(device: &dyn HapticDevice, modal: bool, picture: bool) -> LoopConfig {
     let mut config = LoopConfig { modal, ..LoopConfig::default() };
     let info = device.info();

@@ -1,8 +1,10 @@
-//! Hold a body with a haptic device, and feel it: the mouse, a gamepad, a simulated device, or a real one.
+//! Hold and feel a body with a haptic device: the mouse, a gamepad, a simulated or a real device.
 //!
-//! What to learn here: a device is added to [`HapticDevices`], a tool is an entity with a [`HapticTool`] whose transform says where the device's workspace
-//! lies, a [`ToolGrip`] takes hold while a button is down. The force is closed on the device's own thread at 1 kHz from what the simulation says 120 times a
-//! second; the plot shows each of its periods.
+//! What to learn here: a device is added to [`HapticDevices`]. A tool is an entity with a
+//! [`HapticTool`], whose transform places the device's workspace in the scene. A [`ToolGrip`] grabs
+//! while a button is down. The device loop runs at 1 kHz on its own thread and computes the force
+//! from the local model, which the simulation updates 120 times per second. The plot shows every
+//! period of the device loop.
 //!
 //! ```sh
 //! cargo run --release --example feel                            # the mouse is the hand; the force is shown
@@ -31,16 +33,16 @@ use device::{Grip, Kind, Mover, Opened};
 use plot::{Trace, Traces};
 use stage::{Readout, Stage, Unattended};
 
-/// Ticks of the simulation a second.
+/// Ticks of the simulation per second.
 const RATE: f64 = 120.0;
 
-/// Hold a body with a haptic device, and feel it.
+/// Hold and feel a body with a haptic device.
 #[derive(Parser, Debug)]
 struct Arguments {
     #[command(flatten)]
     stage: stage::Options,
 
-    /// What holds the body. Default: the mouse; with nobody there, the simulated device.
+    /// The device that holds the body. Default: the mouse; without a window, the simulated device.
     #[arg(long, value_enum)]
     device: Option<Kind>,
 
@@ -48,11 +50,12 @@ struct Arguments {
     #[arg(long, value_enum, default_value_t = Grip::Firm)]
     grip: Grip,
 
-    /// Let the loop step a copy of the body itself, at device rate.
+    /// Let the device loop step its own copy of the body, at device rate.
     #[arg(long)]
     modal: bool,
 
-    /// Newtons in the hand for a newton in the world. Default: 1; on a real device 0.1, until you trust it.
+    /// Force in the hand per force in the world, N/N. Default: 1; on a real device 0.1, until you
+    /// trust it.
     #[arg(long)]
     force_scale: Option<f64>,
 
@@ -60,11 +63,11 @@ struct Arguments {
     #[arg(long, default_value = "pip.modal")]
     body: String,
 
-    /// Write down what the device says, each millisecond of it.
+    /// Record the samples of the device, one per millisecond, to this file.
     #[arg(long, value_name = "FILE")]
     record: Option<PathBuf>,
 
-    /// Play such a file instead of a device.
+    /// Play such a file instead of using a device.
     #[arg(long, value_name = "FILE", conflicts_with = "device")]
     replay: Option<PathBuf>,
 }
@@ -133,7 +136,7 @@ fn run(options: Arguments) -> Result<AppExit, Box<dyn Error>> {
         .add_systems(Startup, spawn)
         .add_systems(FixedUpdate, play.before(HapticSystems::Move))
         .add_systems(Update, (hold_out, read_out.after(plot::gather)))
-        // The stop is heard whatever has the keyboard.
+        // The stop keys work even if the panel has the keyboard.
         .add_systems(PreUpdate, stop_keys.after(bevy::input::InputSystems).before(stage::SceneKeys));
     Ok(app.run())
 }
@@ -153,11 +156,11 @@ fn spawn(
             ..default()
         })),
     ));
-    // The mouse is one hand or the other: the device's, or a second one that pulls by itself.
+    // If the mouse is not the device, it can grab bodies directly.
     pointer.enabled = scene.kind != Kind::Pointer;
 }
 
-/// Once the body is here: the tool, with the middle of the device's workspace on the body's side.
+/// Spawns the tool once the body exists: the center of the workspace lies on the body's side.
 fn hold_out(
     mut commands: Commands,
     scene: Res<Scene>,
@@ -183,7 +186,7 @@ fn hold_out(
     };
 }
 
-/// The simulated hand takes hold, pulls out and goes round.
+/// Moves the simulated hand: it grabs, pulls outward and circles.
 fn play(
     time: Res<Time>,
     scene: Res<Scene>,
@@ -196,7 +199,7 @@ fn play(
     }
     let now = time.elapsed_secs_f64();
     let t = now - *since.get_or_insert(now);
-    // A button counts once it has been seen open.
+    // A button counts only after the device loop has seen it open.
     hand.set_buttons(u32::from(t > 0.5));
     let smooth = |t: f64| {
         let t = t.clamp(0.0, 1.0);
@@ -255,7 +258,7 @@ fn read_out(
     );
 }
 
-/// Force, energy, and how well the loop keeps its time.
+/// Returns the force, the energy, and how well the device loop keeps its time.
 fn figures(report: &LoopReport) -> String {
     let tick = &report.tick;
     let norm = |v: [f64; 3]| v.iter().map(|x| x * x).sum::<f64>().sqrt();

@@ -1,4 +1,4 @@
-//! The force over time, as every period of the device's loop had it: a small picture in a corner of the window.
+//! A plot of the force over time in a corner of the window, with every period of the device loop.
 #![allow(dead_code, reason = "each example uses the part that it needs")]
 
 use std::collections::VecDeque;
@@ -12,17 +12,17 @@ use pliant::haptics::{DeviceId, HapticDevices, Record};
 
 const WIDTH: usize = 440;
 const HEIGHT: usize = 150;
-/// Seconds that the plot shows.
+/// Time span of the plot, s.
 const SPAN: f64 = 12.0;
-/// Newtons from one line to the next.
+/// Distance of the grid lines, N.
 const GRID: f64 = 1.0;
 const BACK: [u8; 3] = [15, 20, 28];
 const LINE: [u8; 3] = [48, 56, 68];
 
-/// What is plotted: one trace a device.
+/// The plotted data: one trace per device.
 #[derive(Resource)]
 pub struct Traces {
-    /// Newtons at the upper edge.
+    /// Force at the upper edge, N.
     pub top: f64,
     pub traces: Vec<Trace>,
 }
@@ -53,7 +53,7 @@ impl Trace {
         }
     }
 
-    /// The periods since the last frame, for whoever writes them down.
+    /// Returns the periods since the last frame, for a recorder.
     pub fn take_records(&mut self) -> Vec<Record> {
         std::mem::take(&mut self.fresh)
     }
@@ -62,7 +62,7 @@ impl Trace {
 #[derive(Component)]
 struct Picture;
 
-/// Fills the [`Traces`], and draws them where there is a window.
+/// Fills the [`Traces`], and draws them if there is a window.
 pub fn plugin(app: &mut App) {
     app.add_systems(Startup, (begin, spawn)).add_systems(Update, (gather, draw).chain());
 }
@@ -73,7 +73,7 @@ fn begin(mut devices: ResMut<HapticDevices>, traces: Res<Traces>) {
     }
 }
 
-/// Takes what the loops have written down since the last frame.
+/// Collects the records of the device loops since the last frame.
 pub fn gather(mut devices: ResMut<HapticDevices>, mut traces: ResMut<Traces>) {
     for trace in &mut traces.traces {
         trace.fresh = devices.records(trace.device);
@@ -162,7 +162,7 @@ fn draw(
         for &(now, force) in &trace.points {
             let x = ((1.0 - (newest - now) / SPAN).clamp(0.0, 1.0) * (WIDTH - 1) as f64) as usize;
             let y = row(force);
-            // From the last point up or down to this one, two pixels thick.
+            // A vertical line, two pixels thick, connects this point to the last one.
             let from = before.filter(|(last, _)| x - last <= 1).map_or(y, |(_, y)| y);
             for y in from.min(y)..=from.max(y) {
                 paint(x, y, [r, g, b]);

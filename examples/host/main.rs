@@ -1,6 +1,9 @@
-//! Hosts a session and plays in it: prints an invite, which `join` takes; you pull with the mouse, so do the guests.
+//! Hosts a session and plays in it.
 //!
-//! What to learn here: a body becomes everybody's by one component, [`SharedBody`]; the host's own grabs are ordinary ones; guests are entities.
+//! The host prints an invite for `join`. The host and the guests pull the body with the mouse.
+//!
+//! What to learn here: the component [`SharedBody`] shares a body with the session. The grabs of
+//! the host are ordinary grabs. Guests are entities.
 //!
 //! ```sh
 //! cargo run --release --example host
@@ -34,7 +37,7 @@ struct Options {
 fn main() -> Result<(), Box<dyn Error>> {
     let options = Options::parse();
     session::end_on_terminate();
-    // A hundred bots of `join` come from one machine.
+    // A hundred bots of `join` connect from one machine.
     let limits = Limits { per_address: 256, ..Limits::host() };
     let net = options.serve.open("host", limits)?;
     App::new()
@@ -73,7 +76,7 @@ fn setup(
 #[derive(Resource)]
 struct Network(Option<Preset>);
 
-/// N goes through the networks, under the running session.
+/// Changes the emulated network of the running session when N is pressed.
 fn change_network(
     keys: Option<Res<ButtonInput<KeyCode>>>,
     mut network: ResMut<Network>,
@@ -88,7 +91,7 @@ fn change_network(
     }
 }
 
-/// The guests' hands, each in its color.
+/// Draws the hands of the guests, each in the color of its user.
 fn draw_hands(hands: Query<(&Grab, &GrabForce, &HandOf)>, users: Query<&User>, mut gizmos: Gizmos) {
     for (grab, felt, of) in &hands {
         let Ok(user) = users.get(of.0) else { continue };

@@ -1,4 +1,4 @@
-//! Many guests in one process, for load: whole sessions without an app around them.
+//! Load test: many guests in one process, each a complete session without an app.
 
 use std::collections::BTreeSet;
 use std::error::Error;
@@ -13,29 +13,30 @@ use pliant::net::{Emulation, Invite};
 use pliant::stream::wire::Datagram;
 use pliant::stream::{Channel, GuestConfig, GuestEvent, GuestSession, PeerId, RecoveryConfig};
 
-/// What the bots are to do.
+/// Settings of the bots.
 pub struct Bots {
     pub number: usize,
-    /// How many of them hold the body and move it.
+    /// Number of bots that hold the body and move it.
     pub holders: usize,
-    /// They read what comes and count it, and step no body: the processor is the host's.
+    /// Whether bots that have joined only count frames and step no body, which leaves the processor
+    /// to the host.
     pub light: bool,
-    /// They have the model, so that it is not sent to them.
+    /// Whether the bots have the model, so that the host does not send it.
     pub cached: bool,
     pub seconds: f64,
     pub emulation: Option<Emulation>,
-    /// Stop before their time.
+    /// Set to stop the bots early.
     pub stopped: Arc<AtomicBool>,
 }
 
-/// A message of the session, as `pliant_net` marks it.
+/// Tag of session messages in `pliant_net`.
 const SESSION: u8 = 0;
 
 struct Bot {
     endpoint: Endpoint,
     session: Option<GuestSession>,
     began: Instant,
-    /// From the first packet to the first picture.
+    /// Time from the start of the bot to the first ready body.
     joined: Option<Duration>,
     grab: Option<u16>,
     ticks: BTreeSet<u64>,
@@ -62,7 +63,7 @@ pub fn run(invite: &Invite, model: &Arc<ModalModel>, bots: &Bots) -> Result<(), 
             bytes: 0,
             closed: None,
         });
-        // As many hands at a door as fit through it.
+        // The bots join one after another, 10 ms apart.
         let until = Instant::now() + Duration::from_millis(10);
         while Instant::now() < until {
             all.iter_mut().for_each(|bot| bot.turn(model, bots, start));
@@ -91,7 +92,7 @@ fn say(all: &[Bot], start: Instant) {
     let mut joins: Vec<f64> = all.iter().filter_map(|bot| Some(bot.joined?.as_secs_f64())).collect();
     joins.sort_by(f64::total_cmp);
     let median = joins.get(joins.len() / 2).copied().unwrap_or(0.0);
-    // Of each bot: the ticks between its first and its newest that never came.
+    // For each bot: the ticks between its first and its newest tick that never arrived.
     let missing: u64 = all
         .iter()
         .filter_map(|bot| Some(bot.ticks.last()? - bot.ticks.first()? + 1 - bot.ticks.len() as u64))
@@ -165,7 +166,7 @@ impl Bot {
         while let Some(event) = session.poll_event() {
             if let GuestEvent::BodyReady { body, .. } = event {
                 self.joined.get_or_insert(now);
-                // Numbered from 1, in the order of coming.
+                // Users are numbered from 1 in the order in which they join.
                 let holds = session.user().is_some_and(|user| usize::from(user.0) <= bots.holders);
                 if holds && !bots.light {
                     let positions = model.surface().positions();

@@ -1,8 +1,10 @@
-//! Joins a session: `join pliant://…`, pasted from what a host has printed. In a window you pull with the mouse; `--headless` a hand moves by itself,
-//! `--bots 100` makes load, `--replay FILE` shows a session that `--record FILE` has kept.
+//! Joins a session with an invite that a host has printed: `join pliant://…`.
 //!
-//! What to learn here: a guest needs one plugin and no scene of its own, the bodies arrive; the same app plays recordings; a host that goes and comes
-//! back is waited for.
+//! In a window, the mouse pulls the body. With `--headless`, a hand moves by itself. `--bots 100`
+//! makes load. `--replay FILE` shows a session that was recorded with `--record FILE`.
+//!
+//! What to learn here: a guest needs one plugin and no scene of its own, because the bodies arrive
+//! over the session. The same app plays recordings. The guest waits for a lost host and reconnects.
 //!
 //! ```sh
 //! cargo run --release --example join -- "pliant://127.0.0.1:4433#…"
@@ -15,7 +17,7 @@ mod session;
 #[cfg(feature = "window")]
 #[path = "../stage/mod.rs"]
 mod stage;
-// Without a window only its command line is left.
+// Without a window, only the command line of the stage is used.
 #[cfg(not(feature = "window"))]
 #[path = "../stage/options.rs"]
 #[expect(dead_code, reason = "no window has a size, a scale, a panel")]
@@ -45,15 +47,16 @@ pub struct Options {
     #[command(flatten)]
     stage: stage::Options,
 
-    /// What the host has printed.
+    /// The invite that the host has printed.
     #[arg(required_unless_present_any = ["replay", "compare"])]
     invite: Option<Invite>,
 
-    /// What you are called.
+    /// Your name in the session.
     #[arg(long, default_value = "guest")]
     name: String,
 
-    /// A file that keeps your key, made if it is not there: with it you are the same user tomorrow.
+    /// A file with your key, created if it does not exist; with the same key you are the same user
+    /// again.
     #[arg(long)]
     key: Option<PathBuf>,
 
@@ -61,31 +64,31 @@ pub struct Options {
     #[arg(long, default_value = "none", value_parser = session::network)]
     network: std::option::Option<Preset>,
 
-    /// Which packets the emulated network loses.
+    /// Seed that selects which packets the emulated network loses.
     #[arg(long, default_value_t = 1)]
     seed: u64,
 
-    /// Take at most so many modes of each body.
+    /// Use at most this many modes of each body.
     #[arg(long)]
     modes: Option<u16>,
 
-    /// Have the body's model at hand, so that it need not be sent.
+    /// Use the local model of the body, so that the host does not send it.
     #[arg(long)]
     cached: bool,
 
-    /// Which model that is: a file, or one of assets/.
+    /// The local model: a file, or a file name under assets/.
     #[arg(long, default_value = "pip.modal")]
     body: PathBuf,
 
-    /// Only look.
+    /// Only watch.
     #[arg(long)]
     still: bool,
 
-    /// Keep everything that comes in this file.
+    /// Record everything that is received to this file.
     #[arg(long)]
     record: Option<PathBuf>,
 
-    /// Show a session that was kept.
+    /// Show a recorded session.
     #[arg(long, conflicts_with = "record")]
     replay: Option<PathBuf>,
 
@@ -93,19 +96,20 @@ pub struct Options {
     #[arg(long)]
     trace: Option<PathBuf>,
 
-    /// Compare what a guest has shown with what the host computed: two files of --trace, the host's first.
+    /// Compare what a guest has shown with what the host computed: two files of --trace, the host's
+    /// first.
     #[arg(long, num_args = 2, value_names = ["HOST", "GUEST"])]
     compare: Vec<PathBuf>,
 
-    /// So many guests without an app, for load.
+    /// Run this many guests without an app, for load.
     #[arg(long)]
     bots: Option<usize>,
 
-    /// How many of the bots hold the body.
+    /// Number of bots that hold the body.
     #[arg(long, default_value_t = 0)]
     holders: usize,
 
-    /// The bots count what comes and step no body.
+    /// Let the bots count what they receive and step no body.
     #[arg(long)]
     light: bool,
 }
@@ -128,7 +132,7 @@ fn run(mut options: Options) -> Result<(), Box<dyn Error>> {
     let options = &options;
     let shipped = || session::model(&options.body);
     if let [host, guest] = options.compare.as_slice() {
-        // The first five seconds are for finding the clock and taking hold.
+        // The first five seconds contain the clock synchronization and the grab.
         return session::trace::compare(&*shipped()?, host, guest, 200);
     }
     let emulation = session::emulation(options.network, options.seed);
@@ -148,7 +152,8 @@ fn run(mut options: Options) -> Result<(), Box<dyn Error>> {
             ..default()
         },
         modes: options.modes,
-        // For a picture the camera is off until just before it, and would see nothing.
+        // In a screenshot run the camera is off until just before the picture, so its view says
+        // nothing.
         interest: Some(CameraInterest::default()).filter(|_| {
             cfg!(feature = "window") && !options.stage.headless && options.stage.screenshot.is_none()
         }),
@@ -171,7 +176,7 @@ fn run(mut options: Options) -> Result<(), Box<dyn Error>> {
     session::ended(&app.run())
 }
 
-/// What the app does with a window and without.
+/// Adds what the app does with a window and without.
 fn finish(app: &mut App, options: &Options) -> Result<(), Box<dyn Error>> {
     if let Some(file) = &options.trace {
         app.insert_resource(session::trace::Trace::create(file)?)
@@ -192,7 +197,7 @@ fn finish(app: &mut App, options: &Options) -> Result<(), Box<dyn Error>> {
     Ok(())
 }
 
-/// The course of the session, and the end of it.
+/// Prints the events of the session and ends the app with it.
 fn tell(
     time: Res<Time<Real>>,
     mut joined: MessageReader<SessionJoined>,
@@ -214,7 +219,7 @@ fn tell(
     }
     for closed in closed.read() {
         println!("{now:6.2} s  over: {}", closed.reason);
-        // A recording that was shown to its end has done what it was to do.
+        // The end of a recording is a success, not an error.
         exit.write(if guest.endpoint().is_none() { AppExit::Success } else { AppExit::error() });
     }
 }

@@ -1,4 +1,4 @@
-//! The window of a guest: the bodies as they arrive, and everybody's hands.
+//! The window of a guest: the bodies that arrive, and the hands of all users.
 
 use std::error::Error;
 
@@ -20,12 +20,12 @@ pub fn run(options: &Options, net: NetPlugin) -> Result<(), Box<dyn Error>> {
     .insert_resource(bevy::winit::WinitSettings::continuous())
     .add_systems(Update, (dress, draw_hands, read_out));
     finish(&mut app, options)?;
-    // The stage ends the run, after the picture if one is taken.
+    // The stage ends the run, after the picture if a picture is taken.
     app.insert_resource(crate::session::EndAfter::default());
     crate::session::ended(&app.run())
 }
 
-/// A body that has come is given a material.
+/// Gives each new body a material.
 fn dress(
     mut commands: Commands,
     bodies: Query<Entity, Added<RemoteBody>>,
@@ -36,7 +36,7 @@ fn dress(
     }
 }
 
-/// The others' hands, each in its color, and how hard they pull.
+/// Draws the remote hands, each in the color of its user, and how hard they pull.
 fn draw_hands(bodies: Query<&RemoteHands>, mut gizmos: Gizmos) {
     for hand in bodies.iter().flat_map(|seen| &seen.0) {
         stage::draw_hand(&mut gizmos, hand.target, None, -hand.reaction, color_of(hand.user));

@@ -1,5 +1,7 @@
-//! Equal peers: start it three times, the second and third with the invite that the first (or any other) has printed. Every process steps the body;
-//! only hands cross, and nobody is the host: whoever goes, the others play on.
+//! Equal peers: every process steps the body, and only the hands are sent.
+//!
+//! Start this example three times, the second and the third time with the invite that any running
+//! peer has printed. There is no host: when a peer leaves, the others play on.
 //!
 //! ```sh
 //! cargo run --release --example peers
@@ -22,24 +24,25 @@ use pliant::net::{
 use pliant::prelude::*;
 use pliant::stream::emulator::Preset;
 
-/// Plays among equals.
+/// Plays among equal peers.
 #[derive(Parser, Debug)]
 struct Options {
     #[command(flatten)]
     stage: stage::Options,
 
-    /// The invite of a peer that is there; without one this is the first.
+    /// The invite of a running peer; the first peer has none.
     invite: Option<Invite>,
 
-    /// What you are called.
+    /// Your name in the session.
     #[arg(long, default_value = "peer")]
     name: String,
 
-    /// Where to listen.
+    /// Address to listen on.
     #[arg(long, default_value = "127.0.0.1:0")]
     bind: SocketAddr,
 
-    /// An emulated network under all connections of this peer: none, paper-1 to paper-4, lan, wifi and others.
+    /// An emulated network under all connections of this peer: none, paper-1 to paper-4, lan, wifi
+    /// and others.
     #[arg(long, default_value = "none", value_parser = session::network)]
     network: std::option::Option<Preset>,
 }
@@ -95,7 +98,7 @@ fn setup(
     }
 }
 
-/// The first of the others is here, and has told where the bodies are.
+/// Starts the run once another peer has joined and the session has reached its first tick.
 fn meet(
     mut commands: Commands,
     net: Option<Res<pliant::net::NetPeer>>,

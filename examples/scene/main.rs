@@ -1,7 +1,9 @@
-//! Plays a scene file: bodies, hands, a session, a device and a recording, without a line of code.
+//! Plays a scene file: bodies, hands, a session, a device and a recording, without code.
 //!
-//! What to learn here: [`SceneFile::read`] reads and checks, [`SceneFilePlugin::open`] brings what the scene asks for; mistakes are told with line and
-//! column, [`SceneFile::check_files`] tells those of the files that it names, all before the window opens; what shows only later comes as [`SceneFailed`].
+//! What to learn here: [`SceneFile::read`] reads and checks a file, and [`SceneFilePlugin::open`]
+//! adds what the scene asks for. Mistakes are reported with line and column before the window
+//! opens. [`SceneFile::check_files`] reports mistakes in the files that the scene names. Mistakes
+//! that show later are sent as [`SceneFailed`].
 //!
 //! ```sh
 //! cargo run --release --example scene -- assets/scenes/everything.ron
@@ -34,16 +36,16 @@ struct Options {
     #[command(flatten)]
     stage: stage::Options,
 
-    /// Read the files and those that they name, say what is wrong with them, and play none.
+    /// Check the files and the files that they name, report mistakes, and play nothing.
     #[arg(long)]
     check: bool,
 
-    /// The scene; with --check, any number of them.
+    /// The scene file; with --check, any number of files.
     #[arg(required = true, value_name = "FILE.ron")]
     files: Vec<PathBuf>,
 }
 
-/// What the scene is called.
+/// Title of the scene.
 #[derive(Resource)]
 struct Title(String);
 
@@ -76,7 +78,7 @@ fn main() -> AppExit {
     if let Some(view) = description.view {
         stage = stage.look(look(&view));
     }
-    // Sessions and devices have clocks and threads of their own.
+    // Sessions and devices run on their own threads and in real time.
     if description.network.is_some() || description.device.is_some() {
         stage = stage.real_time();
     }
@@ -92,7 +94,7 @@ fn main() -> AppExit {
         .run()
 }
 
-/// The guest is in the host's session.
+/// Starts the run once the guest has joined the host's session.
 #[cfg(feature = "net")]
 fn meet(mut commands: Commands, awaited: Query<Entity, With<stage::Awaited>>, users: Query<(), With<User>>) {
     if users.iter().count() > 1 {
@@ -100,7 +102,7 @@ fn meet(mut commands: Commands, awaited: Query<Entity, With<stage::Awaited>>, us
     }
 }
 
-/// The scene, if it and the files that it names are right; else says what is wrong with them.
+/// Returns the scene if it and the files that it names are valid; otherwise prints the errors.
 fn read(file: &Path) -> Option<SceneFile> {
     let (scene, wrong) = match SceneFile::read(file) {
         Ok(scene) => {
@@ -113,7 +115,7 @@ fn read(file: &Path) -> Option<SceneFile> {
     scene.filter(|_| wrong.is_empty())
 }
 
-/// The stage's camera goes round where the scene says.
+/// Returns the camera of the stage for the view of the scene.
 fn look(view: &ViewEntry) -> Look {
     let [x, y, z] = view.middle.map(|v| v as f32);
     Look {
@@ -124,14 +126,14 @@ fn look(view: &ViewEntry) -> Look {
     }
 }
 
-/// The line with the mistake is logged; a scene that lacks a part of it is not played.
+/// Ends the app when a part of the scene has failed; the error is logged with its position.
 fn end_on_failure(mut failures: MessageReader<SceneFailed>, mut exit: MessageWriter<AppExit>) {
     if failures.read().count() > 0 {
         exit.write(AppExit::from_code(2));
     }
 }
 
-/// Hands of other users have no names of their own.
+/// Returns the name of a hand. The hands of other users have no name.
 fn called(hand: NameOrEntityItem) -> String {
     hand.name.map_or_else(|| "another's hand".to_owned(), ToString::to_string)
 }

@@ -1,4 +1,7 @@
-//! What the networked examples share: the body, a network by its name, a kept key, a hand that moves by itself, an app without a window.
+//! Shared parts of the networked examples.
+//!
+//! These are the body, emulated networks by name, stored keys, scripted hands, and an app without a
+//! window.
 #![allow(dead_code, reason = "each example uses the part that it needs")]
 
 pub mod serve;
@@ -22,10 +25,10 @@ use pliant::stream::emulator::Preset;
 /// The project's assets, from the crate that owns the examples.
 pub const ASSETS: &str = concat!(env!("CARGO_MANIFEST_DIR"), "/../../assets");
 
-/// The body's name in the session.
+/// The name of the body in the session.
 pub const BODY: &str = "pip";
 
-/// An emulated network by its name; `none` for the real one as it is.
+/// Returns an emulated network by its name; `none` is the real network.
 pub fn network(name: &str) -> Result<Option<Preset>, String> {
     if name == "none" {
         return Ok(None);
@@ -34,12 +37,14 @@ pub fn network(name: &str) -> Result<Option<Preset>, String> {
     Preset::by_name(name).map(Some).ok_or_else(|| format!("expected none, {}", names()))
 }
 
-/// The same as a link under a session; the seed says which packets it loses.
+/// Returns the network as a link under a session; the seed selects which packets it loses.
 pub fn emulation(network: Option<Preset>, seed: u64) -> Option<Emulation> {
     network.map(|preset| Emulation::preset(preset, seed))
 }
 
-/// The key of a file, which is made if it is not there: with it one is the same user, or the same host, tomorrow.
+/// Returns the key in a file, which is created if it does not exist.
+///
+/// With the same key, a user or a host keeps its identity in the next run.
 pub fn identity(file: Option<&Path>) -> Result<Option<Identity>, Box<dyn Error>> {
     let Some(file) = file else { return Ok(None) };
     if file.exists() {
@@ -55,13 +60,15 @@ pub fn identity(file: Option<&Path>) -> Result<Option<Identity>, Box<dyn Error>>
     Ok(Some(made))
 }
 
-/// A body of the project, or of a file.
+/// Reads a body from a file, or from the project's assets.
 pub fn model(file: &Path) -> Result<Arc<ModalModel>, Box<dyn Error>> {
     let path = if file.exists() { PathBuf::from(file) } else { Path::new(ASSETS).join(file) };
     Ok(Arc::new(ModalModel::read(path)?))
 }
 
-/// An app without a window or a renderer, that ends in good order on Ctrl-C, and on SIGTERM after [`end_on_terminate`].
+/// Creates an app without a window or a renderer.
+///
+/// The app ends cleanly on Ctrl-C, and on SIGTERM after [`end_on_terminate`].
 pub fn headless(level: Level) -> App {
     let mut app = App::new();
     app.add_plugins((
@@ -74,14 +81,18 @@ pub fn headless(level: Level) -> App {
     app
 }
 
-/// From here on a SIGTERM ends the app as Ctrl-C does: goodbyes are said, files are finished. To be called before any thread is made: those
-/// that are there already would end everything at once.
+/// Makes SIGTERM end the app cleanly, as Ctrl-C does: goodbyes are sent and files are finished.
+///
+/// Call this before any other thread is created. A thread that exists already would let the signal
+/// end the process at once.
 pub fn end_on_terminate() {
     #[cfg(unix)]
     on_signals(&[nix::sys::signal::Signal::SIGTERM], TerminalCtrlCHandlerPlugin::gracefully_exit);
 }
 
-/// The same for a program without an app: true from Ctrl-C or a SIGTERM on; a second one ends it at once.
+/// Returns a flag that Ctrl-C or SIGTERM sets, for a program without an app.
+///
+/// A second signal ends the process at once.
 pub fn stopped() -> Arc<AtomicBool> {
     let stopped = Arc::new(AtomicBool::new(false));
     #[cfg(unix)]
@@ -97,7 +108,7 @@ pub fn stopped() -> Arc<AtomicBool> {
     stopped
 }
 
-/// The signals are kept from all threads but one, which waits for them.
+/// Blocks the signals in all threads except one, which waits for them.
 #[cfg(unix)]
 fn on_signals(signals: &[nix::sys::signal::Signal], act: impl Fn() + Send + 'static) {
     let set: nix::sys::signal::SigSet = signals.iter().copied().collect();
@@ -110,10 +121,10 @@ fn on_signals(signals: &[nix::sys::signal::Signal], act: impl Fn() + Send + 'sta
     }
 }
 
-/// What Bevy ends an app with on Ctrl-C, by the custom of shells.
+/// Exit code of Bevy after Ctrl-C, by the convention of shells.
 const CTRL_C: u8 = 130;
 
-/// Is this how an app was to end? Ctrl-C is no failure.
+/// Returns an error if the app has failed. Ctrl-C is not a failure.
 pub fn ended(exit: &AppExit) -> Result<(), Box<dyn Error>> {
     match exit {
         AppExit::Error(code) if code.get() != CTRL_C => Err("the session is over".into()),
@@ -121,19 +132,19 @@ pub fn ended(exit: &AppExit) -> Result<(), Box<dyn Error>> {
     }
 }
 
-/// A hand that takes hold of the farthest point of a body in some direction and moves it about.
+/// A hand that grabs the farthest point of a body in some direction and moves it.
 #[derive(Component, Debug, Clone, Copy)]
 pub struct Script {
-    /// Which point: the one farthest this way, body axes.
+    /// Direction of the grabbed point, in body axes.
     pub toward: DVec3,
-    /// Where it pulls, as parts of the body's size.
+    /// Displacement of the hand, as fractions of the body's size.
     pub pull: DVec3,
-    /// Radians a second.
+    /// Angular frequency of the motion, rad/s.
     pub rate: f64,
 }
 
 impl Script {
-    /// A hand of one's own by one's number: each pulls elsewhere and otherwise.
+    /// Returns the script of one number; scripts of different numbers move differently.
     pub fn of(number: u64) -> Self {
         let angle = 2.4 * number as f64;
         let side = if number.is_multiple_of(2) { 1.0 } else { -1.0 };
@@ -145,7 +156,7 @@ impl Script {
     }
 }
 
-/// The grab that a script has made, and where its patch is at rest.
+/// The grab that a script has made, and the rest position of its patch.
 #[derive(Component, Debug, Clone, Copy)]
 pub struct Scripted {
     script: Script,
@@ -153,7 +164,7 @@ pub struct Scripted {
     began: f64,
 }
 
-/// Plays every [`Script`] on the body that it is on. In `FixedUpdate`, before [`PliantSystems::Input`].
+/// Plays every [`Script`] on its body; runs in `FixedUpdate`, before [`PliantSystems::Input`].
 pub fn play(
     mut commands: Commands,
     time: Res<Time>,
@@ -165,7 +176,8 @@ pub fn play(
         let mut own = grabs.iter_mut().filter(|(_, of, _)| of.0 == body);
         if let Some((mut grab, _, scripted)) = own.next() {
             let t = now - scripted.began;
-            // Slowly to where it pulls, and about there on a path that does not repeat soon.
+            // The hand moves slowly to its displacement, then about it on a path that does not
+            // repeat soon.
             let rise = 1.0 - (-t / 0.6).exp();
             let wave = |part: f64| 0.4 * ((script.rate * part * t).sin());
             let about = DVec3::new(wave(1.0), wave(1.37), wave(0.81)) * script.pull.length();
@@ -187,7 +199,7 @@ pub fn play(
     }
 }
 
-/// Once a second a line of what the network does, where nobody sees a window.
+/// Prints a line of network metrics once per second, for runs without a window.
 pub fn say(
     time: Res<Time<Real>>,
     stats: Res<NetStats>,
@@ -218,9 +230,9 @@ pub fn say(
 /// When the app ends by itself.
 #[derive(Resource, Clone, Copy, Debug, Default)]
 pub struct EndAfter {
-    /// From its start, s.
+    /// Seconds after the start.
     pub seconds: Option<f64>,
-    /// From when a body is there.
+    /// Frames after a body exists.
     pub frames: Option<u64>,
 }
 
@@ -239,10 +251,11 @@ pub fn end(
     }
 }
 
-/// Processor time and memory of this process: s, MB; where the system tells.
+/// Returns the processor time, s, and the memory, MB, of this process if the system reports them.
 pub fn used() -> Option<(f64, f64)> {
     let stat = std::fs::read_to_string("/proc/self/stat").ok()?;
-    // Behind the name in brackets, fields 14 and 15 are the ticks in user and system mode, a hundredth of a second each.
+    // After the name in parentheses, fields 14 and 15 are the ticks in user and in system mode, 10
+    // ms each.
     let fields: Vec<&str> = stat.rsplit_once(')')?.1.split_whitespace().collect();
     let ticks = |at: usize| fields.get(at)?.parse::<f64>().ok();
     let status = std::fs::read_to_string("/proc/self/status").ok()?;

@@ -1,4 +1,4 @@
-//! What every example that hosts is told on its command line, and the invites that it prints.
+//! The command line of every example that hosts, and the invites that it prints.
 
 use std::error::Error;
 use std::net::SocketAddr;
@@ -10,23 +10,24 @@ use pliant::net::transport::Limits;
 use pliant::net::{Access, Grant, Holding, HostConfig, HostOptions, Invite, NetPlugin, Token};
 use pliant::stream::emulator::Preset;
 
-/// Where to listen, and who may do what.
+/// The address to listen on, and the rights of the users.
 #[derive(Parser, Debug, Clone)]
 #[group(skip)]
 pub struct Serve {
-    /// Where to listen. 0.0.0.0:4433 for others than this machine; port 0 is any that is free.
+    /// Address to listen on. Use 0.0.0.0:4433 to accept other machines; port 0 is any free port.
     #[arg(long, default_value = "127.0.0.1:4433")]
     pub bind: SocketAddr,
 
-    /// A file that keeps the host's key, made if it is not there: invites stay good from run to run.
+    /// A file with the host's key, created if it does not exist; with it, invites stay valid from
+    /// run to run.
     #[arg(long)]
     pub key: Option<PathBuf>,
 
-    /// Let in only who has a token; prints an invite to hold and one to watch.
+    /// Accept only users with a token; print one invite to hold and one to watch.
     #[arg(long)]
     pub tokens: bool,
 
-    /// One user's hands at a time.
+    /// Let only one user at a time hold the body.
     #[arg(long)]
     pub one_at_a_time: bool,
 

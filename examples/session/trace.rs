@@ -1,6 +1,15 @@
-//! What the host computed and what a guest showed, tick by tick, in files: to be compared when both have ended, on whatever machines they ran.
+//! Trace files of what the host computed and what a guest showed, tick by tick.
 //!
-//! A record: `u64` tick, `u16` user (the host: the body as it is streamed, or the truth; a guest: as its own hand has it), 3 x `f32` reaction on that user's hand (N; NaN where it has none), `u16` number of modes, so many `f32`.
+//! The files can be compared after both runs have ended, wherever they ran. A record has these
+//! fields:
+//!
+//! - `u64` tick.
+//! - `u16` user. In the host's file, the host's id marks the true state, and a user's id marks the
+//!   true state with that user's reaction. In a guest's file, the host's id marks the streamed
+//!   body, and the guest's own id marks the body with its predicted hand.
+//! - 3 x `f32` reaction on that user's hand, N; NaN without a hand.
+//! - `u16` number of modes.
+//! - One `f32` per mode, the modal coordinates.
 
 use std::collections::BTreeMap;
 use std::error::Error;
@@ -15,7 +24,7 @@ use pliant::net::{HandOf, NetGuest, RemoteBody, SharedBody, User};
 use pliant::prelude::*;
 use pliant::stream::UserId;
 
-/// The file that is written.
+/// The trace file that is written.
 #[derive(Resource)]
 pub struct Trace {
     file: BufWriter<File>,
@@ -40,7 +49,7 @@ impl Trace {
     }
 }
 
-/// After each step of the host: the truth, once for every user that holds the body, or once.
+/// Writes the true state after each step of the host: once, and once more for every user's hand.
 pub fn write_truth(
     trace: Option<ResMut<Trace>>,
     tick: Res<PliantTick>,
@@ -63,7 +72,10 @@ pub fn write_truth(
     }
 }
 
-/// Each tick that a guest shows, as it was shown first: as it is streamed, and the newer copy with the reaction while its hand holds the body.
+/// Writes each tick that a guest shows, when it is first shown.
+///
+/// The streamed body is always written. While the guest's hand holds the body, the predicted body
+/// is written too, with the reaction.
 pub fn write_shown(
     trace: Option<ResMut<Trace>>,
     guest: Option<Res<NetGuest>>,
@@ -119,7 +131,7 @@ fn read(path: &Path) -> Result<BTreeMap<(u64, u16), Line>, Box<dyn Error>> {
     }
 }
 
-/// How far a shape is off, and how far its truth is from rest.
+/// Errors of shown shapes, and the largest true displacement.
 #[derive(Default)]
 struct Off {
     ticks: u64,
@@ -163,8 +175,11 @@ fn percent(x: f64, of: f64) -> f64 {
     if of > 0.0 { 100.0 * x / of } else { 0.0 }
 }
 
-/// Compares what a guest has shown with the truth of the same ticks: the streamed shapes over the surface, and those with its own hand first, as parts
-/// of the largest true displacement; the reactions as parts of the largest true one. The first `skip` ticks of the guest are left out.
+/// Prints how far the shapes and the reactions of a guest are from the truth of the same ticks.
+///
+/// The errors of the shapes are relative to the largest true displacement, separately for the
+/// streamed body and for the body with the predicted hand. The errors of the reactions are relative
+/// to the largest true reaction. The first `skip` ticks of the guest are left out.
 pub fn compare(model: &ModalModel, truth: &Path, shown: &Path, skip: usize) -> Result<(), Box<dyn Error>> {
     let (truth, shown) = (read(truth)?, read(shown)?);
     let (mut streamed, mut own) = (Off::default(), Off::default());
@@ -185,7 +200,7 @@ pub fn compare(model: &ModalModel, truth: &Path, shown: &Path, skip: usize) -> R
             force_most = force_most.max(f64::from(real.reaction.length()));
         }
     }
-    // From the first compared tick to the last one that was shown: what is not among them was never shown.
+    // Ticks between the first compared and the last shown tick that are missing were never shown.
     let last = shown.keys().rfind(|key| key.1 == host).map_or(first, |key| key.0);
     let span = last.saturating_sub(first) + 1;
     if streamed.ticks == 0 {

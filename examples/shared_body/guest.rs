@@ -1,4 +1,4 @@
-//! A guest: it sees the body that the host steps, holds it, and feels it. With a window or without.
+//! A guest that sees, holds and feels the host's body, with or without a window.
 
 use std::{
     path::PathBuf,
@@ -33,22 +33,23 @@ use crate::{
     view::{DrawnHand, HeldBy, ViewPlugin},
 };
 
-/// Everything that one guest needs to know.
+/// Settings of one guest.
 pub struct Guest {
     pub title: String,
     pub net: NetPlugin,
     pub truth: Truth,
-    /// What the hand does without a person.
+    /// The script of the hand if no person moves it.
     pub hand: Option<ScriptedHand>,
     pub rerun: Option<RerunPlugin>,
-    /// Seconds from the first picture of the body on; `None`: until told to stop, or the window is closed.
+    /// Seconds after the body is first shown. `None`: until told to stop, or until the window
+    /// closes.
     pub duration: Option<f64>,
     /// Frames, picture, window and panel.
     pub stage: stage::Options,
     pub stop: Arc<AtomicBool>,
 }
 
-/// What this guest saw, taken out of the app when it has ended.
+/// The results of a guest, kept after its app has ended.
 #[derive(Default, Clone)]
 pub struct GuestReport {
     pub meters: Meters,
@@ -57,39 +58,39 @@ pub struct GuestReport {
     pub failure: Option<String>,
 }
 
-/// The body as this guest has it.
+/// Marks the guest's copy of the body.
 #[derive(Component)]
 pub struct GuestBody;
 
-/// The newest figures, for the corner of the window and for the recording.
+/// The newest metrics, for the corner of the window and for the recording.
 #[derive(Resource, Default)]
 pub struct Figures {
     pub joined: bool,
     pub loss: f64,
     pub round_trip: f64,
-    /// Magnitude of the own hand's reaction, N.
+    /// Magnitude of the reaction on the local hand, N.
     pub reaction: f64,
     pub kbit_s: f64,
-    /// How far ahead of the host's word the body is shown because the own hand holds it, s.
+    /// How far the predicted body is ahead of the streamed body while the local hand holds it, s.
     pub ahead: f64,
 }
 
 #[derive(Resource)]
 struct Run {
     duration: Option<f64>,
-    /// Frames that are still to come, counted while the body is here.
+    /// Frames left, counted while the body exists.
     frames: Option<u64>,
     screenshot: Option<PathBuf>,
     stop: Arc<AtomicBool>,
-    /// When the body was first here, s.
+    /// Time at which the body was first shown, s.
     since: Option<f64>,
-    /// When the picture was asked for, s.
+    /// Time at which the screenshot was requested, s.
     asked: f64,
     picture: Picture,
     failure: Option<String>,
 }
 
-/// How far the picture of the window is, if one is asked for.
+/// State of the screenshot, if one is requested.
 #[derive(Clone, Copy, PartialEq, Eq)]
 enum Picture {
     Wanted,
@@ -97,10 +98,10 @@ enum Picture {
     Saved,
 }
 
-/// Seconds that a guest waits for the body before it gives up.
+/// Time that a guest waits for the body before it gives up, s.
 const PATIENCE: f64 = 30.0;
 
-/// Runs a guest with a window on this thread, which must be the main one.
+/// Runs a guest with a window on this thread, which must be the main thread.
 pub fn run_windowed(guest: Guest) -> GuestReport {
     let mut app = App::new();
     app.add_plugins(
@@ -116,13 +117,15 @@ pub fn run_windowed(guest: Guest) -> GuestReport {
             })
             .set(AssetPlugin { file_path: stage::ASSETS.into(), ..default() }),
     )
-    // The session goes on when the window is not looked at.
+    // The session continues while the window is not in focus.
     .insert_resource(WinitSettings::continuous())
     .add_plugins((PointerGrabPlugin, ViewPlugin { title: guest.title.clone() }, guest.stage.panel()));
     run(app, guest)
 }
 
-/// Runs a guest without a window on this thread. One app of a process prints what all of them log.
+/// Runs a guest without a window on this thread.
+///
+/// Only one app of a process may install the logger, which prints the messages of all of them.
 pub fn run_headless(guest: Guest, prints: bool) -> GuestReport {
     let mut app = App::new();
     app.add_plugins((
@@ -166,7 +169,7 @@ fn run(mut app: App, guest: Guest) -> GuestReport {
     kept.take()
 }
 
-/// The body arrives on this entity.
+/// Spawns the entity that receives the body.
 fn spawn(mut commands: Commands) {
     commands.spawn((
         Name::new(BODY),
@@ -177,7 +180,7 @@ fn spawn(mut commands: Commands) {
     ));
 }
 
-/// Compares what is here with the truth of the same ticks, and gathers the figures.
+/// Compares the shown shapes with the truth of the same ticks and gathers the metrics.
 fn measure(
     guest: Option<Res<NetGuest>>,
     stats: Res<NetStats>,
@@ -206,7 +209,7 @@ fn measure(
         meters.streamed.show(view.tick(), &streamed.q);
         figures.ahead = 0.0;
         if let Some(own) = view.predicted_hand() {
-            // This is as of a tick that the host has yet to reach; it is compared when it has.
+            // The host has yet to reach this tick; the shape is compared when it has.
             figures.ahead = own.tick().saturating_sub(view.tick()) as f64 / RATE;
             meters.predicted_hand.show(own.tick(), &own.visual().q);
             meters.waiting.show(own.tick(), &streamed.q);
@@ -215,7 +218,8 @@ fn measure(
     }
 }
 
-/// All hands on the body: the others' from the stream, the own from its entity.
+/// Collects all hands on the body: the remote hands from the stream, the local hand from its
+/// entity.
 fn gather_hands(
     mut bodies: Query<
         (&RemoteHands, &BodyState, &VisualState, &GlobalTransform, &mut HeldBy),
@@ -255,7 +259,7 @@ fn surface_point(model: &ModalModel, vertex: u32, q: &[f64]) -> Vec3 {
     Vec3::from(*rest) + DVec3::from(warp(w, d)).as_vec3()
 }
 
-/// The error, beside the shapes, forces and network figures that the plugin records by itself.
+/// Records the errors; the rerun plugin records shapes, forces and network metrics by itself.
 fn record(figures: Res<Figures>, meters: Res<Meters>, mut scalars: ResMut<RerunScalars>) {
     if !figures.joined {
         return;
@@ -266,7 +270,7 @@ fn record(figures: Res<Figures>, meters: Res<Meters>, mut scalars: ResMut<RerunS
     scalars.set("error/streamed, rms", "%", meters.streamed.percent(meters.streamed.rms()));
 }
 
-/// Seconds that a picture may take to be drawn and saved: software renderers are slow.
+/// Time limit for the screenshot, s; software renderers are slow.
 const PICTURE: f64 = 60.0;
 
 fn finish(
@@ -309,7 +313,7 @@ fn finish(
     }
 }
 
-/// What is left when the app is gone.
+/// The report that remains when the app has ended.
 #[derive(Resource, Clone, Default)]
 struct Kept(Arc<std::sync::Mutex<GuestReport>>);
 
@@ -322,7 +326,7 @@ impl Kept {
 fn keep(kept: Res<Kept>, meters: Res<Meters>, stats: Res<NetStats>, run: Res<Run>) {
     let mut report = kept.0.lock().unwrap_or_else(std::sync::PoisonError::into_inner);
     report.meters.clone_from(&meters);
-    // When the connection is closed its figures are gone: the last ones count.
+    // A closed connection has no metrics, so the last ones are kept.
     if stats.peers > 0 {
         report.stats = *stats;
     }

@@ -1,17 +1,18 @@
-//! Scripted hands: the second user, and yours when there is no window.
+//! Scripted hands: the second user's, and yours when there is no window.
 
 use bevy::{math::DVec3, prelude::*};
 use pliant::modal::SurfaceMesh;
 use pliant::prelude::*;
 
-/// A hand that takes hold of the farthest point of a body in some direction and moves it about, letting go now and then.
+/// A hand that grabs the farthest point of a body in some direction, moves it and releases it.
 #[derive(Resource, Clone, Debug)]
 pub struct ScriptedHand {
-    /// Which point: the one farthest this way, body axes.
+    /// Direction of the grabbed point, in body axes.
     pub toward: DVec3,
-    /// Where it pulls, as parts of the body's size: the path is a slow figure about this point.
+    /// Displacement of the hand, as fractions of the body's size; the hand moves slowly about this
+    /// point.
     pub pull: DVec3,
-    /// Seconds before it first takes hold.
+    /// Seconds before the first grab.
     pub wait: f64,
 }
 
@@ -19,14 +20,14 @@ pub struct ScriptedHand {
 const HOLD: f64 = 4.5;
 const PAUSE: f64 = 1.0;
 
-/// The grab that the script made.
+/// Marks the grab of the script.
 #[derive(Component)]
 pub struct Scripted {
     vertex_at_rest: DVec3,
     began: f64,
 }
 
-/// The surface vertex farthest along `toward`.
+/// Returns the surface vertex farthest along `toward`.
 pub fn farthest(surface: &SurfaceMesh, toward: DVec3) -> u32 {
     let along = |p: &[f32; 3]| Vec3::from_array(*p).as_dvec3().dot(toward);
     let positions = surface.positions();
@@ -34,13 +35,13 @@ pub fn farthest(surface: &SurfaceMesh, toward: DVec3) -> u32 {
         as u32
 }
 
-/// Rises from 0 to 1 with no jump in speed or acceleration.
+/// Rises from 0 to 1 with continuous velocity and acceleration.
 fn smooth(t: f64) -> f64 {
     let t = t.clamp(0.0, 1.0);
     t * t * t * (10.0 - 15.0 * t + 6.0 * t * t)
 }
 
-/// Takes hold of the body, pulls, lets go, and begins again.
+/// Grabs the body, pulls, releases it, and begins again.
 pub fn play(
     mut commands: Commands,
     time: Res<Time>,

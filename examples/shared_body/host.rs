@@ -1,4 +1,4 @@
-//! The host: it steps the body and streams it. No window.
+//! The host, which steps the body and streams it without a window.
 
 use std::{
     collections::VecDeque,
@@ -19,23 +19,23 @@ use pliant::{
 
 use crate::{BODY, RATE, meter::Truth};
 
-/// Steps whose times are kept: half an hour.
+/// Number of steps whose times are kept: half an hour.
 const STEPS: usize = 72_000;
 
-/// What the host has to say at the end.
+/// The results of the host.
 #[derive(Default, Clone, Debug)]
 pub struct HostReport {
-    /// Ticks stepped while a guest was there.
+    /// Ticks stepped while a guest was in the session.
     pub ticks: u64,
     /// Bytes sent to all guests.
     pub bytes_out: u64,
-    /// Seconds over which they were sent.
+    /// Seconds over which these bytes were sent.
     pub seconds: f64,
     /// Times of the newest steps, us; a resting body is not stepped.
     pub step_us: VecDeque<f64>,
 }
 
-/// The report as it grows, and the sign to stop.
+/// The report while it grows, and the flag that stops the host.
 #[derive(Resource, Clone, Default)]
 pub struct Shared {
     pub report: Arc<Mutex<HostReport>>,
@@ -54,7 +54,7 @@ struct Model(Arc<ModalModel>);
 #[derive(Resource)]
 struct Stepped(Integrator);
 
-/// Runs the host's app on this thread until it is told to stop.
+/// Runs the host's app on this thread until the flag stops it.
 pub fn run(model: Arc<ModalModel>, integrator: Integrator, net: NetPlugin, truth: Truth, shared: Shared) {
     App::new()
         .add_plugins((

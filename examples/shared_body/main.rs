@@ -1,10 +1,13 @@
 //! Two people hold one soft body over a network that loses packets.
 //!
-//! One process, three apps on three threads: a host that steps the body, you, and a scripted second user. They are joined by real QUIC on
-//! loopback; between each guest and the host lies one of the paper's networks (`--network 1` to `4`, or another by its name), emulated packet by packet.
+//! One process runs three apps on three threads: a host that steps the body, you, and a scripted
+//! second user. They are connected by real QUIC on loopback. Between each guest and the host lies
+//! one of the paper's networks (`--network 1` to `4`, or another by its name), emulated packet by
+//! packet.
 //!
-//! What to learn here: how a body is shared (`host.rs`, ten lines), how a guest sees and holds it (`guest.rs`), and what loss does to what you see
-//! and feel: the blue ghost is the host's newest truth.
+//! What to learn here: how a body is shared (`host.rs`, ten lines), how a guest sees and holds it
+//! (`guest.rs`), and how loss affects what you see and feel. The blue ghost is the newest true
+//! state of the host.
 //!
 //! ```sh
 //! cargo run --release --example shared_body
@@ -48,10 +51,10 @@ use hand::ScriptedHand;
 use meter::Truth;
 use options::{Options, Recovery};
 
-/// Ticks a second, as in the paper.
+/// Ticks per second, as in the paper.
 const RATE: f64 = 40.0;
 
-/// The body's name in the session.
+/// The name of the body in the session.
 const BODY: &str = "pip";
 
 fn main() -> ExitCode {
@@ -77,7 +80,8 @@ fn run(options: &Options) -> Result<(), Box<dyn Error>> {
     let shared = host::Shared::default();
     let host_thread = {
         let (model, truth, shared) = (model.clone(), truth.clone(), shared.clone());
-        // Streamed accelerations are read by Newmark's formulas, so the body is stepped by a method that obeys them; a stream of reactions has no such wish.
+        // The receiver reads streamed accelerations by Newmark's formulas, so the host steps the
+        // body by a method that satisfies them. A stream of reactions does not need this.
         let integrator = match options.recovery {
             Recovery::Default => Integrator::Exact,
             Recovery::Paper | Recovery::None => Integrator::GeneralizedAlpha { rho_inf: 0.5 },
@@ -119,7 +123,8 @@ fn run(options: &Options) -> Result<(), Box<dyn Error>> {
     let yours = if options.stage.headless {
         guest::run_headless(you, true)
     } else {
-        // Without a graphics driver the engine stops the thread: say what can be done instead.
+        // Without a graphics driver, the engine panics on this thread; the message offers an
+        // alternative.
         catch_unwind(AssertUnwindSafe(|| guest::run_windowed(you)))
             .map_err(|_| "the window could not be opened; --headless runs without one")?
     };
@@ -142,7 +147,7 @@ fn run(options: &Options) -> Result<(), Box<dyn Error>> {
     }
 }
 
-/// A guest with its own link to the host.
+/// Creates a guest with its own link to the host.
 fn guest(
     options: &Options,
     name: &str,
@@ -179,14 +184,14 @@ fn recorder(options: &Options) -> Result<Option<RerunPlugin>, Box<dyn Error>> {
         None => None,
         Some("viewer") => Some(RerunPlugin::viewer()),
         Some(file) => {
-            // The plugin would go on without its file; here the file is what was asked for.
+            // The plugin would continue without its file; here a missing file is an error.
             std::fs::File::create(file).map_err(|error| format!("--rerun {file}: {error}"))?;
             Some(RerunPlugin::file(file))
         }
     })
 }
 
-/// The file that is recorded to, if one is.
+/// Returns the file of the recording, if there is one.
 fn recording(options: &Options) -> Option<PathBuf> {
     options.rerun.as_deref().filter(|sink| *sink != "viewer").map(PathBuf::from)
 }
@@ -194,8 +199,8 @@ fn recording(options: &Options) -> Option<PathBuf> {
 fn failure(options: &Options, yours: &GuestReport, others: &GuestReport) -> Option<String> {
     let of = |who: &str, report: &GuestReport| report.failure.as_ref().map(|why| format!("{who}: {why}"));
     of("your session", yours).or_else(|| {
-        // The other guest is ended by us: its goodbye is no failure, a body that never came is.
-        // Nor is it one when a window is closed before the other came.
+        // This process ends the other guest, so its goodbye is not a failure. A body that never
+        // arrived is one, unless a window was closed first.
         (others.meters.streamed.ticks == 0
             && (options.duration().is_some() || options.stage.frames.is_some()))
         .then(|| of("the other session", others).unwrap_or("the other never saw the body".into()))

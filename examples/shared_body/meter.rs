@@ -1,4 +1,6 @@
-//! How far what a guest shows is from what the host computed for the same tick. Only a demo in one process can know this.
+//! Measures how far the shapes that a guest shows are from the host's shapes of the same ticks.
+//!
+//! The comparison is possible only because the host and the guests run in one process.
 
 use std::{
     collections::VecDeque,
@@ -8,12 +10,13 @@ use std::{
 use bevy::prelude::Resource;
 use pliant::modal::ModalModel;
 
-/// States of the host, by tick, for the last few seconds: written by the host's app, read by the guests'.
+/// The host's states of the last few seconds by tick, written by the host's app and read by the
+/// guests.
 #[derive(Resource, Clone, Default)]
 pub struct Truth(Arc<Mutex<VecDeque<(u64, Arc<[f64]>)>>>);
 
 impl Truth {
-    /// Ticks that are kept: 15 s at 40 Hz, many round trips.
+    /// Number of ticks that are kept: 15 s at 40 Hz, many round trips.
     const KEPT: usize = 600;
 
     pub fn push(&self, tick: u64, q: &[f64]) {
@@ -36,22 +39,26 @@ impl Truth {
     }
 }
 
-/// What one guest's pictures of the body are worth, against the host's body of the same ticks.
+/// The errors of one guest's shapes against the host's shapes of the same ticks.
 #[derive(Resource, Default, Clone)]
 pub struct Meters {
-    /// The body as it is streamed: what recovery is to get right.
+    /// Errors of the streamed body, which depend on the recovery policy.
     pub streamed: Meter,
-    /// The newer copy that is shown while the own hand holds the body, against what the host made of its tick later. What the other's hand did
-    /// on the way nobody here could know.
+    /// Errors of the predicted body that is shown while the local hand holds the body.
+    ///
+    /// The host computes the same tick later. The effect of the other user's hand in between cannot
+    /// be predicted here.
     pub predicted_hand: Meter,
-    /// The streamed body at those same moments, had it been shown instead: what waiting for the host's word would have cost.
+    /// Errors of the streamed body if it were shown at those moments instead: the cost of no
+    /// prediction.
     pub waiting: Meter,
-    /// Largest reaction that this guest's own hand felt, N.
+    /// Largest reaction on the guest's local hand, N.
     pub reaction: f64,
 }
 
 impl Meters {
-    /// Compares all that was shown with the host's shapes of the same ticks, as far as the host is.
+    /// Compares all shown shapes with the host's shapes of the same ticks, up to the host's newest
+    /// tick.
     pub fn compare(&mut self, model: &ModalModel, truth: &Truth) {
         for meter in [&mut self.streamed, &mut self.predicted_hand, &mut self.waiting] {
             meter.compare(model, truth);
@@ -59,13 +66,13 @@ impl Meters {
     }
 }
 
-/// How far one kind of picture is off, so far.
+/// Accumulated errors of one kind of shape.
 #[derive(Default, Clone)]
 pub struct Meter {
-    /// Shapes as they were shown, with the ticks they stand for, until the host's of the same ticks are there.
+    /// Shapes that were shown, with their ticks, until the host's shapes of these ticks exist.
     waiting: VecDeque<(u64, Vec<f64>)>,
     last_tick: u64,
-    /// Ticks compared.
+    /// Number of ticks compared.
     pub ticks: u64,
     /// Sum over ticks of how many ticks the host was ahead.
     behind: u64,
@@ -73,16 +80,18 @@ pub struct Meter {
     sum: f64,
     /// Largest error of any vertex in any tick, m.
     pub max: f64,
-    /// Error of the newest tick, root mean square over the surface, m.
+    /// Root mean square error of the surface in the newest tick, m.
     pub now: f64,
-    /// Largest true displacement of any vertex in any tick, m: what percentages are of.
+    /// Largest true displacement of any vertex in any tick, m; percentages refer to it.
     pub largest: f64,
     shown: Vec<[f32; 3]>,
     truth: Vec<[f32; 3]>,
 }
 
 impl Meter {
-    /// Takes note of the shape that is shown now, and of the tick that it stands for. A tick counts once, as it was shown first.
+    /// Records the shape that is shown and the tick that it stands for.
+    ///
+    /// A tick counts once, with the shape that was shown first.
     pub fn show(&mut self, tick: u64, shown: &[f64]) {
         if tick <= self.last_tick {
             return;
@@ -94,7 +103,8 @@ impl Meter {
         }
     }
 
-    /// Compares what was shown with the host's shapes of the same ticks, as far as the host is.
+    /// Compares the shown shapes with the host's shapes of the same ticks, up to the host's newest
+    /// tick.
     fn compare(&mut self, model: &ModalModel, truth: &Truth) {
         let Some((newest, _)) = truth.newest() else { return };
         while let Some((tick, shown)) = self.waiting.pop_front_if(|(tick, _)| *tick <= newest) {
@@ -129,17 +139,17 @@ impl Meter {
         self.largest = self.largest.max(moved.sqrt());
     }
 
-    /// Root mean square over ticks and surface, m.
+    /// Returns the root mean square error over ticks and surface, m.
     pub fn rms(&self) -> f64 {
         (self.sum / self.ticks.max(1) as f64).sqrt()
     }
 
-    /// How many ticks the host was ahead of what was shown, on average.
+    /// Returns the mean number of ticks by which the host was ahead of the shown shape.
     pub fn behind(&self) -> f64 {
         self.behind as f64 / self.ticks.max(1) as f64
     }
 
-    /// A length as a percentage of the largest true displacement.
+    /// Returns a length as a percentage of the largest true displacement.
     pub fn percent(&self, length: f64) -> f64 {
         if self.largest > 0.0 { 100.0 * length / self.largest } else { 0.0 }
     }

@@ -7,8 +7,9 @@ use crate::stage;
 
 /// Two people hold one soft body over a network that loses packets.
 ///
-/// One process: a host and two guests as separate apps on separate threads, joined by real QUIC on loopback through a seeded link emulator.
-/// You are the first guest; drag the body with the left mouse button.
+/// One process runs a host and two guests as separate apps on separate threads, connected by real
+/// QUIC on loopback through a seeded link emulator. You are the first guest; drag the body with the
+/// left mouse button.
 #[derive(Parser, Debug, Clone)]
 #[command(mut_arg("seconds", |seconds| seconds.help("Stop after so many seconds. Without a window the default is 10; with one, until it is closed")))]
 #[command(mut_arg("screenshot", |picture| picture.help("Save a picture of the window at the end (after 6 seconds, unless told otherwise) and stop")))]
@@ -16,8 +17,9 @@ pub struct Options {
     #[command(flatten)]
     pub stage: stage::Options,
 
-    /// What lies between host and guests: one of the paper's networks, 1 (9 % loss, 196 ms) to 4 (no loss, 20 ms), or another by name: paper-1 to
-    /// paper-4, lan, wifi, transatlantic, satellite.
+    /// The network between host and guests: one of the paper's networks, 1 (9 % loss, 196 ms) to 4
+    /// (no loss, 20 ms), or another by name: paper-1 to paper-4, lan, wifi, transatlantic,
+    /// satellite.
     #[arg(long, default_value = "paper-1", value_parser = network)]
     pub network: Preset,
 
@@ -25,7 +27,8 @@ pub struct Options {
     #[arg(long, value_enum, default_value_t = Recovery::Default)]
     pub recovery: Recovery,
 
-    /// Record for the rerun viewer: a file to write, or `viewer` for the viewer on this machine, which is started if it is installed and none runs.
+    /// Record for the rerun viewer: a file to write, or `viewer` for the viewer on this machine,
+    /// which is started if it is installed and none runs.
     #[arg(long, value_name = "FILE|viewer")]
     pub rerun: Option<String>,
 
@@ -38,19 +41,20 @@ pub struct Options {
     pub body: String,
 }
 
-/// The policies that the example offers by name; the library has more.
+/// The recovery policies that the example offers by name; the library has more.
 #[derive(ValueEnum, Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Recovery {
-    /// Reactions are streamed, the receiver steps the model: errors die out by themselves.
+    /// Reactions are streamed and the receiver steps the model, so errors decay by themselves.
     Default,
-    /// The paper's: accelerations are streamed, lost ones predicted, asked for again and compensated gradually.
+    /// The paper's policy: accelerations are streamed; lost ones are predicted, requested again and
+    /// compensated gradually.
     Paper,
-    /// Accelerations are streamed, and what is lost is lost.
+    /// Accelerations are streamed, and lost ones are not repaired.
     None,
 }
 
 impl Recovery {
-    /// The library's name for it.
+    /// Returns the library's name of the policy.
     pub fn name(self) -> &'static str {
         match self {
             Self::Default => "default",
@@ -60,7 +64,7 @@ impl Recovery {
     }
 }
 
-/// A network by its name, or by its number in the paper.
+/// Returns a network by its name or by its number in the paper.
 fn network(text: &str) -> Result<Preset, String> {
     let numbered = [Preset::Paper1, Preset::Paper2, Preset::Paper3, Preset::Paper4];
     let number = text.parse::<usize>().ok().and_then(|number| numbered.get(number.checked_sub(1)?).copied());
@@ -69,7 +73,7 @@ fn network(text: &str) -> Result<Preset, String> {
 }
 
 impl Options {
-    /// How long to run, s; `None`: by frames, or until the window is closed.
+    /// Returns the duration of the run, s. `None`: by frames, or until the window closes.
     pub fn duration(&self) -> Option<f64> {
         let stage = &self.stage;
         match (stage.seconds, &stage.screenshot) {

@@ -1,4 +1,4 @@
-//! The table at the end.
+//! The table at the end of a run.
 
 use crate::{guest::GuestReport, host::HostReport, meter::Meter, options::Options};
 

@@ -1,4 +1,4 @@
-//! The window: the body as this guest sees it, the host's truth as a ghost, hands, and the figures in a corner.
+//! The window: the guest's body, a ghost of the host's true state, hands, and metrics in a corner.
 
 use bevy::{
     light::{NotShadowCaster, NotShadowReceiver},
@@ -12,17 +12,17 @@ use crate::{
     stage::{Look, Readout, Setting},
 };
 
-/// The translucent body that shows the host's newest state, with no network between.
+/// A translucent body that shows the host's newest state without a network in between.
 #[derive(Component)]
 pub struct Ghost;
 
-/// Shown ghost or not.
+/// Whether the ghost is shown.
 #[derive(Resource)]
 struct GhostOn(bool);
 
-/// The stage of the examples, the body on it, the ghost and the hands.
+/// The stage of the examples, the body, the ghost and the hands.
 pub struct ViewPlugin {
-    /// Stands above the figures.
+    /// Title above the metrics.
     pub title: String,
 }
 
@@ -40,7 +40,7 @@ impl Plugin for ViewPlugin {
     }
 }
 
-/// Gives the body its skin once it is here, and the ghost beside it.
+/// Gives the body its material once it exists, and spawns the ghost.
 fn dress(
     mut commands: Commands,
     mut materials: ResMut<Assets<StandardMaterial>>,
@@ -70,7 +70,8 @@ fn dress(
                     base_color: Color::srgba(0.25, 0.55, 1.0, 0.26),
                     alpha_mode: AlphaMode::Blend,
                     unlit: true,
-                    // Where both agree the body is seen, not a mixture of the two.
+                    // Where both surfaces agree, the body covers the ghost; otherwise their colors
+                    // would mix.
                     depth_bias: -60_000.0,
                     ..default()
                 })),
@@ -79,7 +80,7 @@ fn dress(
     }
 }
 
-/// The ghost takes the host's newest state, without any network.
+/// Copies the host's newest state to the ghost, without a network.
 fn ghost_follows(
     truth: Res<Truth>,
     on: Res<GhostOn>,
@@ -88,10 +89,11 @@ fn ghost_follows(
     for (mut shown, mut visibility) in &mut ghosts {
         visibility.set_if_neq(if on.0 { Visibility::Inherited } else { Visibility::Hidden });
         if let Some((_, q)) = truth.newest()
-            // One that rests is not drawn and recorded anew.
+            // A resting ghost is not drawn and recorded again.
             && *shown.q() != *q
         {
-            // Another number of modes for a moment, while the body changes: the ghost waits.
+            // While the body changes, the number of modes can differ for a moment; the ghost then
+            // keeps its shape.
             shown.snap(&q).ok();
         }
     }
@@ -106,7 +108,7 @@ fn keys(input: Res<ButtonInput<KeyCode>>, mut ghost: ResMut<GhostOn>, mut exit: 
     }
 }
 
-/// Looks at the body, however large it is.
+/// Fits the camera to the size of the body.
 fn frame_body(
     bodies: Query<(&BodyState, &GlobalTransform), (With<GuestBody>, Added<BodyState>)>,
     mut look: ResMut<Look>,
@@ -119,7 +121,7 @@ fn frame_body(
     }
 }
 
-/// Every hand as a ball at its target, a line to the patch it holds, and the reaction as an arrow.
+/// Draws every hand: a ball at its target, a line to its patch, and the reaction as an arrow.
 fn draw_hands(mut gizmos: Gizmos, bodies: Query<(&HeldBy, &BodyState), With<GuestBody>>) {
     for (held, state) in &bodies {
         let size = state.model().size() as f32;
@@ -129,7 +131,8 @@ fn draw_hands(mut gizmos: Gizmos, bodies: Query<(&HeldBy, &BodyState), With<Gues
             gizmos.line(target, point, hand.color);
             let force = hand.force.as_vec3();
             if force.length() > 0.05 {
-                // Fifty newtons are a body's length; what is stronger is drawn no longer.
+                // 50 N are drawn as long as the body; the length is limited to 0.4 of the body's
+                // size.
                 let arrow = (force * 0.02 * size).clamp_length_max(0.4 * size);
                 gizmos.arrow(point, point + arrow, Color::srgb(0.85, 0.1, 0.15));
             }
@@ -168,6 +171,6 @@ pub struct DrawnHand {
     pub color: Color,
 }
 
-/// The hands on a body as this guest knows them.
+/// The hands on a body that this guest knows.
 #[derive(Component, Default)]
 pub struct HeldBy(pub Vec<DrawnHand>);

@@ -1,13 +1,16 @@
-//! Everybody's hands, as one sees them.
+//! Draws the hands of all users.
 
 use bevy::{math::DVec3, prelude::*};
 
-/// Metres of arrow for a newton.
+/// Length of an arrow per newton, m/N.
 const LONG: f32 = 0.012;
-/// The longest arrow, m.
+/// Maximum length of an arrow, m.
 const LONGEST: f32 = 0.15;
 
-/// Draws a hand at `at`, m, in its user's color: a ball, a thread to the patch that it holds, and the pull that it gives the body, N, as an arrow.
+/// Draws a hand at `at`, m, in the color of its user.
+///
+/// A ball marks the hand, a line leads to the patch that it holds, and an arrow shows the force on
+/// the body, N.
 pub fn draw_hand<C: GizmoConfigGroup>(
     gizmos: &mut Gizmos<C>,
     at: DVec3,

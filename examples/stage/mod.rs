@@ -1,5 +1,7 @@
-//! The stage that the examples share: window or none, light, floor, a camera to look around with, keys and figures on screen, and a
-//! command line. An example adds [`Stage`] where a game adds `DefaultPlugins`, and its own file shows only what it teaches.
+//! The stage that the examples share.
+//!
+//! The stage provides a window or none, light, a floor, a camera, keys and metrics on the screen,
+//! and a command line. An example adds [`Stage`] where a game adds `DefaultPlugins`.
 #![allow(dead_code, unused_imports, reason = "each example uses the part of the stage that it needs")]
 
 mod hands;
@@ -29,10 +31,11 @@ pub use view::Look;
 /// The project's assets, from the crate that owns the examples.
 pub const ASSETS: &str = concat!(env!("CARGO_MANIFEST_DIR"), "/../../assets");
 
-/// What an example stands on; a plugin group in place of `DefaultPlugins`.
+/// A plugin group for an example, in place of `DefaultPlugins`.
 ///
-/// With `--headless` there is no window and no renderer, and every frame is a sixtieth of a second however long it takes. With
-/// `--screenshot` frames are as long, so that the picture shows the same moment on a slow renderer and on a fast one.
+/// With `--headless` there is no window and no renderer, and every frame advances the time by 1/60
+/// s, however long it takes. With `--screenshot` the frames advance the time by the same step, so
+/// that slow and fast renderers picture the same moment.
 #[derive(Clone, Debug)]
 pub struct Stage {
     title: &'static str,
@@ -45,12 +48,12 @@ pub struct Stage {
 }
 
 impl Stage {
-    /// A stage for an example that has no options of its own.
+    /// Creates a stage for an example without options of its own.
     pub fn new(title: &'static str) -> Self {
         Self::with(title, Options::parse())
     }
 
-    /// A stage for an example that parsed the command line itself, the stage's [`Options`] flattened into its own.
+    /// Creates a stage for an example that has flattened the stage's [`Options`] into its own.
     pub fn with(title: &'static str, mut options: Options) -> Self {
         if let Err(error) = options.settle() {
             eprintln!("{title}: {error}");
@@ -67,37 +70,37 @@ impl Stage {
         }
     }
 
-    /// One more thing to say in the line of keys, such as `"left mouse: pull"`. Those of the stage itself follow.
+    /// Adds a key to the line of keys, such as `"left mouse: pull"`, before those of the stage.
     pub fn key(mut self, key: &'static str) -> Self {
         self.keys.push(key);
         self
     }
 
-    /// Where the camera looks from. Default: a body of a third of a metre, that stands on the floor.
+    /// Sets the position of the camera. Default: fits a body of a third of a meter on the floor.
     pub fn look(mut self, look: Look) -> Self {
         self.look = Some(look);
         self
     }
 
-    /// No floor.
+    /// Removes the floor.
     pub fn floating(mut self) -> Self {
         self.floor = false;
         self
     }
 
-    /// No camera, light or floor: the example brings its own.
+    /// Removes the camera, the light and the floor; the example has its own.
     pub fn bare(mut self) -> Self {
         self.look = None;
         self
     }
 
-    /// The clock is the wall's, without a window too: for what runs on threads of its own, such as a device.
+    /// Uses the wall clock, also without a window, for work on other threads such as a device loop.
     pub fn real_time(mut self) -> Self {
         self.real_time = true;
         self
     }
 
-    /// The moment that `--screenshot` shows when the command line names none, s from when the bodies are there. Default: 2.
+    /// Sets the default moment of `--screenshot`, s after the bodies exist. Default: 2.
     pub fn picture_at(mut self, seconds: f64) -> Self {
         self.picture_at = seconds;
         self
@@ -112,7 +115,7 @@ impl PluginGroup for Stage {
             plugins
                 .set(LogPlugin {
                     level: Level::WARN,
-                    // They warn that there is no renderer; that is what was asked for.
+                    // These crates would warn that there is no renderer, which is intended.
                     filter: format!("{DEFAULT_FILTER},bevy_render=off,bevy_gizmos_render=off"),
                     ..default()
                 })
@@ -138,7 +141,8 @@ impl PluginGroup for Stage {
                     }),
                     ..default()
                 })
-                // In a picture nothing may be missing because its shader is still being compiled.
+                // In a picture, no object may be missing because its shader is still being
+                // compiled.
                 .set(RenderPlugin {
                     synchronous_pipeline_compilation: self.options.screenshot.is_some(),
                     ..default()
@@ -148,7 +152,7 @@ impl PluginGroup for Stage {
     }
 }
 
-/// The window's pixels, however dense the screen.
+/// Returns the size of the window in pixels, with the scale factor of the options.
 pub fn resolution(options: &Options) -> WindowResolution {
     let resolution = WindowResolution::new(options.size.0, options.size.1);
     match options.scale {
@@ -157,13 +161,14 @@ pub fn resolution(options: &Options) -> WindowResolution {
     }
 }
 
-/// Light, floor, camera and words, for a window that is not a [`Stage`]'s: that of an app which runs by its own clock.
+/// Light, floor, camera and text for a window without a [`Stage`], such as an app with its own
+/// clock.
 pub struct Setting {
-    /// Stands above the [`Readout`].
+    /// Title above the [`Readout`].
     pub title: String,
-    /// Stand below, with those of the camera and Esc.
+    /// Keys shown below, with those of the camera and Esc.
     pub keys: Vec<&'static str>,
-    /// Where the camera looks from; `None`: no camera, light or floor.
+    /// Position of the camera; `None`: no camera, light or floor.
     pub look: Option<Look>,
     pub floor: bool,
 }
@@ -185,8 +190,9 @@ impl Plugin for Setting {
     }
 }
 
-/// In `PreUpdate`: what is typed into the panel is taken off `ButtonInput<KeyCode>`, but for the panel's own key. What must be heard whatever has the
-/// keyboard runs before.
+/// The systems in `PreUpdate` that remove keys typed into the panel from `ButtonInput<KeyCode>`.
+///
+/// The panel's own key stays. A system that must receive every key runs before this set.
 #[derive(SystemSet, Debug, Clone, PartialEq, Eq, Hash)]
 pub struct SceneKeys;
 
@@ -200,7 +206,7 @@ fn keep_typed_from_scene(mut keys: ResMut<ButtonInput<KeyCode>>, panel: Res<plia
     }
 }
 
-/// Run condition: the pointer is not the panel's.
+/// Run condition: the panel does not use the pointer.
 #[cfg(feature = "panel")]
 fn scene_has_pointer(panel: Option<Res<pliant::panel::bevy_egui::input::EguiWantsInput>>) -> bool {
     !pliant::panel::wants_pointer(panel)
@@ -217,7 +223,7 @@ impl Plugin for StagePlugin {
     fn build(&self, app: &mut App) {
         let stage = &self.0;
         if !stage.options.headless {
-            // The scene goes on when the window is not looked at.
+            // The scene continues while the window is not in focus.
             app.insert_resource(WinitSettings::continuous());
             #[cfg(feature = "panel")]
             app.add_plugins(stage.options.panel());

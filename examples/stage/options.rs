@@ -8,15 +8,16 @@ use clap::Parser;
 #[derive(Parser, Debug, Clone, Default)]
 #[group(skip)]
 pub struct Options {
-    /// No window: the scene plays by itself and prints its figures at the end.
+    /// Run without a window: the scene plays by itself and prints its metrics at the end.
     #[arg(long)]
     pub headless: bool,
 
-    /// Stop after so many frames, counted from when the bodies are there.
+    /// Stop after this many frames, counted from when the bodies exist.
     #[arg(long, value_parser = clap::value_parser!(u64).range(1..=1_000_000))]
     pub frames: Option<u64>,
 
-    /// Stop after so many seconds. Without a window the default is 5; with one, until it is closed.
+    /// Stop after this many seconds. Default: 5 without a window; with a window, until it is
+    /// closed.
     #[arg(long, value_parser = seconds, conflicts_with = "frames")]
     pub seconds: Option<f64>,
 
@@ -24,7 +25,7 @@ pub struct Options {
     #[arg(long, value_name = "FILE.png")]
     pub screenshot: Option<PathBuf>,
 
-    /// Open the live panel; F1 does it too. `--panel=SECTION` unfolds that section alone.
+    /// Open the live panel, as F1 does. `--panel=SECTION` unfolds only that section.
     #[arg(long, value_name = "SECTION", num_args = 0..=1, require_equals = true)]
     pub panel: Option<Option<Section>>,
 
@@ -32,7 +33,7 @@ pub struct Options {
     #[arg(long, value_name = "WIDTHxHEIGHT", default_value = "1280x720", value_parser = size)]
     pub size: Size,
 
-    /// Magnifies text and panel, for dense screens. Default: what the screen says.
+    /// Scale of text and panel, for dense screens. Default: the scale of the screen.
     #[arg(long, value_parser = clap::value_parser!(f32))]
     pub scale: Option<f32>,
 }
@@ -47,7 +48,7 @@ pub enum Section {
     Recording,
 }
 
-/// Pixels across and down.
+/// Width and height, pixels.
 #[derive(Debug, Clone, Copy)]
 pub struct Size(pub u32, pub u32);
 
@@ -71,7 +72,7 @@ fn seconds(text: &str) -> Result<f64, String> {
 }
 
 impl Options {
-    /// The panel as asked for: closed unless `--panel` is there.
+    /// Returns the panel, which is closed unless `--panel` is given.
     #[cfg(feature = "panel")]
     pub fn panel(&self) -> pliant::panel::PanelPlugin {
         use pliant::panel::PanelSection;
@@ -89,7 +90,7 @@ impl Options {
         }
     }
 
-    /// Falls back to no window where there is no display.
+    /// Falls back to no window if there is no display.
     pub fn settle(&mut self) -> Result<(), String> {
         if !self.headless && !display() {
             println!("No display is to be found: running --headless, and the scene plays by itself.");
@@ -99,14 +100,14 @@ impl Options {
             Some(_) if self.headless => {
                 Err("a screenshot needs a window, and there is none without a display".into())
             }
-            // Known before the scene is played, not after.
+            // A file that cannot be written is reported before the scene is played.
             Some(file) => std::fs::write(file, []).map_err(|error| format!("{}: {error}", file.display())),
             None => Ok(()),
         }
     }
 }
 
-/// Is there anything to open a window on?
+/// Returns whether a window can be opened.
 pub fn display() -> bool {
     if cfg!(any(target_os = "windows", target_os = "macos")) {
         return true;
@@ -115,7 +116,9 @@ pub fn display() -> bool {
     (set("DISPLAY") && x_answers()) || (cfg!(feature = "wayland") && set("WAYLAND_DISPLAY"))
 }
 
-/// Does the X server that DISPLAY names listen? One on another machine is taken at its word.
+/// Returns whether the X server that DISPLAY names is listening.
+///
+/// A server on another machine is assumed to listen.
 #[cfg(unix)]
 fn x_answers() -> bool {
     let display = std::env::var("DISPLAY").unwrap_or_default();

@@ -1,4 +1,4 @@
-//! The course of a run: when it begins, when it ends, and the picture of it.
+//! The course of a run: its start, its end, and its picture.
 
 use std::{path::PathBuf, time::Duration};
 
@@ -11,46 +11,49 @@ use pliant::prelude::*;
 
 use super::{Options, Readout};
 
-/// Nobody is at the mouse: the example plays the person's part. There for `--headless` and `--screenshot`.
+/// Present with `--headless` and `--screenshot`: no person is there, so the example plays the user.
 #[derive(Resource)]
 pub struct Unattended;
 
-/// Somebody or something that has yet to come. A run that nobody watches does not count its frames
-/// and seconds while there is an entity with this: how long others take is the machine's affair.
+/// Marks something that has yet to join or load.
+///
+/// An unattended run counts its frames and seconds only while no entity has this component, because
+/// the waiting time depends on the machine.
 #[derive(Component)]
 pub struct Awaited;
 
-/// Seconds of the scene that a frame is when nobody waits for it.
+/// Time step of an unattended frame, s.
 const FRAME: f64 = 1.0 / 60.0;
 
-/// Frames before the picture in which cameras draw: bodies are shaped when they were seen in the frame before.
+/// Number of frames before the picture in which the cameras draw; a body is deformed one frame
+/// after it was visible.
 const DRAWN: u64 = 5;
 
-/// How long others may take to come, s.
+/// Maximum time to wait for [`Awaited`] entities, s.
 const LONGEST_WAIT: f64 = 300.0;
 
-/// Frames that wait for the bodies to load, and for the picture to be written, before the run is given up.
+/// Maximum number of frames to wait for the bodies to load, and for the picture to be written.
 const PATIENCE: u64 = 100_000;
 
 #[derive(Resource)]
 struct Run {
     headless: bool,
-    /// How many frames to run from when the bodies are there.
+    /// Number of frames to run after the bodies exist.
     frames: Option<u64>,
-    /// As seconds of the clock.
+    /// Duration of the run after the bodies exist, s of the app's clock.
     seconds: Option<f64>,
     screenshot: Option<PathBuf>,
-    /// Frames and seconds since the bodies are there; `None` before.
+    /// Frames since the bodies exist, and the time at which they first did, s; `None` before.
     since: Option<(u64, f64)>,
-    /// When it began to wait for others, s of real time.
+    /// Time at which the run began to wait for others, s of real time.
     awaits_since: Option<f64>,
     waited: u64,
-    /// Frames in which the cameras have drawn.
+    /// Number of frames in which the cameras have drawn.
     drawn: u64,
     picture: Picture,
 }
 
-/// How far the picture of the window is, if one is asked for.
+/// State of the screenshot, if one is requested.
 #[derive(Clone, Copy, PartialEq, Eq)]
 enum Picture {
     Wanted,
@@ -88,7 +91,7 @@ pub(super) fn build(app: &mut App, options: &Options, real_time: bool, picture_a
     app.add_systems(First, begin.before(bevy::time::TimeSystems)).add_systems(Last, (draw_late, end).chain());
 }
 
-/// The clock of a run that nobody watches starts when all bodies are there, so that it shows the same each time.
+/// Starts the clock of an unattended run when all bodies exist, so that every run shows the same.
 fn begin(
     mut run: ResMut<Run>,
     unattended: Option<Res<Unattended>>,
@@ -111,7 +114,7 @@ fn begin(
     }
 }
 
-/// Space holds the time, the full stop lets one step pass.
+/// Pauses on Space, and steps once on the full stop.
 fn pause_and_step(
     keys: Res<ButtonInput<KeyCode>>,
     mut time: ResMut<Time<Virtual>>,
@@ -129,7 +132,7 @@ fn pause_and_step(
     }
 }
 
-/// A slow renderer need not draw what nobody looks at: the cameras of a picture are off until just before it.
+/// Turns the cameras of a picture on only just before the picture, for slow renderers.
 fn draw_late(mut run: ResMut<Run>, real: Res<Time<Real>>, mut cameras: Query<&mut Camera>) {
     if run.screenshot.is_none() {
         return;
@@ -188,7 +191,7 @@ fn end(
         return;
     };
     match run.picture {
-        // Frames may be longer than they were thought to be.
+        // Frames can take longer than expected.
         Picture::Wanted if run.drawn < DRAWN => {}
         Picture::Wanted => {
             time.pause();

@@ -1,9 +1,11 @@
-//! What is written on the window: the title and the scene's figures above, the keys below.
+//! Text on the window: the title and the metrics of the scene above, the keys below.
 
 use bevy::prelude::*;
 
-/// The figures of the scene, written under its title and printed at the end of a run without a window. Lines may be padded to align:
-/// the letters are of one width.
+/// The metrics of the scene, shown under its title and printed at the end of a run without a
+/// window.
+///
+/// Lines may be padded to align, because the font is monospaced.
 #[derive(Resource, Default)]
 pub struct Readout(pub String);
 

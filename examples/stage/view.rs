@@ -1,4 +1,4 @@
-//! Light, floor, and a camera that goes round the scene.
+//! Light, a floor, and a camera that orbits the scene.
 
 use std::f32::consts::PI;
 
@@ -8,12 +8,12 @@ use bevy::{
     prelude::*,
 };
 
-/// Where the camera is: it goes round `middle`.
+/// Position of the camera, which orbits `middle`.
 #[derive(Resource, Clone, Copy, Debug, PartialEq)]
 pub struct Look {
-    /// What it looks at, m.
+    /// Point that the camera looks at, m.
     pub middle: Vec3,
-    /// How far from there it is, m. Fog and shadows reach in proportion.
+    /// Distance of the camera from that point, m; fog and shadows scale with it.
     pub distance: f32,
     /// Angle about the vertical, rad; 0 looks along -z.
     pub yaw: f32,
@@ -34,7 +34,7 @@ impl Look {
     }
 }
 
-/// How near and far the wheel goes.
+/// Minimum and maximum distance for the wheel, m.
 #[derive(Resource)]
 struct Reach([f32; 2]);
 
@@ -99,7 +99,7 @@ fn lay_floor(
     ));
 }
 
-/// What is drawn with lines, such as hands and forces, is drawn over everything: a reaction points into the body.
+/// Draws lines, such as hands and forces, over everything, because a reaction points into the body.
 fn set_gizmos(mut store: ResMut<GizmoConfigStore>) {
     let (config, _) = store.config_mut::<DefaultGizmoConfigGroup>();
     config.depth_bias = -1.0;

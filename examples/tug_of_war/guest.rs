@@ -1,4 +1,4 @@
-//! The user on the right: a guest's app without a window, on a thread of its own.
+//! The user on the right: a guest's app without a window, on its own thread.
 
 use std::error::Error;
 use std::sync::atomic::{AtomicBool, Ordering};
@@ -13,22 +13,22 @@ use pliant::modal::ModalModel;
 use pliant::net::{Emulation, Invite, JoinConfig, JoinOptions, NetPlugin, RemoteBody};
 use pliant::prelude::*;
 
-/// What the two threads tell each other.
+/// The data that the two threads share.
 #[derive(Resource, Clone, Default)]
 pub struct Other {
     seen: Arc<Mutex<Seen>>,
     pub stop: Arc<AtomicBool>,
 }
 
-/// What the guest shows, and where its hand is to go.
+/// The visual state of the guest, and the input for its hand.
 #[derive(Default)]
 pub struct Seen {
     pub q: Vec<f64>,
-    /// Targets and patches of its own hands, m, and what they feel, N.
+    /// Targets and patches of the guest's hands, m, and the reactions on them, N.
     pub hands: Vec<(DVec3, DVec3, DVec3)>,
-    /// N.
+    /// Largest reaction on the guest's hands, N.
     pub felt: f64,
-    /// -1 to 1 each way; `None`: it lets go.
+    /// Position of the stick, -1 to 1 on each axis; `None` releases the body.
     pub stick: Option<DVec3>,
 }
 
@@ -67,14 +67,14 @@ pub fn start(
     Ok(thread::Builder::new().name("right".into()).spawn(run)?)
 }
 
-/// Where the patch was when it was taken hold of, and how far from there the hand is.
+/// The position of the patch when it was grabbed, and the displacement of the hand from there.
 #[derive(Component)]
 struct Pull {
     from: DVec3,
     away: DVec3,
 }
 
-/// The hand goes where the stick points, at the pace of a hand.
+/// Moves the hand to the position of the stick at a limited speed.
 fn pull(
     mut commands: Commands,
     other: Res<Other>,

@@ -1,8 +1,12 @@
-//! Two users, one body, one window: on the left the host, who pulls with the mouse; on the right a guest behind the paper's first network, who pulls with
-//! the arrow keys. Each half shows what its user sees, and the right one is a whole guest of its own, on a thread, over QUIC.
+//! Two users pull one body in one window, each half showing what one user sees.
 //!
-//! What to learn here: the host plays in its own session; two views of one body agree although one of them is 200 ms and 9 % of its packets away; a
-//! body that somebody else moves is drawn by [`VisualState::snap`].
+//! On the left, the host pulls with the mouse. On the right, a guest behind the paper's first
+//! network pulls with the arrow keys. The guest is a complete app on its own thread, connected over
+//! QUIC.
+//!
+//! What to learn here: the host plays in its own session. Two views of one body agree although the
+//! guest's link has 200 ms round trip and 9 % loss. [`VisualState::snap`] draws a body that other
+//! code moves.
 //!
 //! ```sh
 //! cargo run --release --example tug_of_war
@@ -28,13 +32,13 @@ use pliant::stream::emulator::Preset;
 
 use guest::Other;
 
-/// Two users pull at one body.
+/// Two users pull one body.
 #[derive(Parser, Debug)]
 struct Options {
     #[command(flatten)]
     stage: stage::Options,
 
-    /// What lies between the two: none, paper-1 to paper-4, lan, wifi and others.
+    /// The network between the two: none, paper-1 to paper-4, lan, wifi and others.
     #[arg(long, default_value = "paper-1", value_parser = session::network)]
     network: std::option::Option<Preset>,
 }
@@ -44,7 +48,7 @@ fn main() -> Result<(), Box<dyn Error>> {
     let net = NetPlugin::host(HostConfig { name: "left".into(), ..default() })?;
     let invite = net.invite().cloned().ok_or("no invite")?;
     let other = Other::default();
-    // What takes long over such a network is the model; here both have it.
+    // The model is the largest transfer over such a network, so both users have it already.
     let model = session::model("pip.modal".as_ref())?;
     let thread = guest::start(&invite, model, session::emulation(options.network, 5), other.clone())?;
     App::new()
@@ -71,7 +75,7 @@ fn main() -> Result<(), Box<dyn Error>> {
     Ok(())
 }
 
-/// The body as the other user sees it.
+/// Marks the body that shows the guest's view.
 #[derive(Component)]
 struct Mirrored;
 
@@ -136,7 +140,7 @@ fn setup(
             Half { right },
         ));
     }
-    // Above both halves: the words.
+    // This camera draws the text above both halves.
     commands.spawn((
         Camera2d,
         Camera { order: 2, clear_color: ClearColorConfig::None, ..default() },
@@ -146,11 +150,11 @@ fn setup(
     gizmos.config_mut::<RightGizmos>().0.render_layers = RenderLayers::layer(1);
 }
 
-/// Each camera has its half of the window, whatever its size.
+/// Gives each camera its half of the window, whatever the size.
 fn split(windows: Query<&Window>, mut cameras: Query<(&mut Camera, &Half)>) {
     let Ok(window) = windows.single() else { return };
     let size = window.physical_size();
-    // A line between them.
+    // The two halves leave a thin line between them.
     let half = UVec2::new((size.x / 2).saturating_sub(1).max(1), size.y.max(1));
     for (mut camera, part) in &mut cameras {
         let physical_position = UVec2::new(if part.right { size.x - half.x } else { 0 }, 0);
@@ -161,7 +165,7 @@ fn split(windows: Query<&Window>, mut cameras: Query<(&mut Camera, &Half)>) {
     }
 }
 
-/// The arrow keys move the guest's hand, over there.
+/// Moves the guest's hand with the arrow keys.
 fn steer(
     keys: Option<Res<ButtonInput<KeyCode>>>,
     other: Res<Other>,
@@ -187,11 +191,11 @@ fn steer(
     other.seen().stick = stick;
 }
 
-/// What the guest shows is shown on the right.
+/// Copies the guest's visual state to the body on the right.
 fn mirror(other: Res<Other>, mut bodies: Query<&mut VisualState, With<Mirrored>>) {
     let seen = other.seen();
     for mut shown in &mut bodies {
-        // One that rests is not drawn anew.
+        // A resting body is not drawn again.
         if seen.q.len() == shown.q().len()
             && seen.q != shown.q()
             && let Err(error) = shown.snap(&seen.q)
@@ -221,11 +225,11 @@ fn draw_hands(
 struct Score {
     left: u32,
     right: u32,
-    /// Seconds for which one has had the head on its side, and which.
+    /// Time for which one side has had the head, s, and that side.
     ahead: (f64, i8),
 }
 
-/// The head this far aside, in sizes of the body, for so many seconds is a point.
+/// Displacement of the head in sizes of the body, and the time to hold it, s, for a point.
 const ASIDE: f32 = 0.08;
 const LONG: f64 = 1.5;
 

@@ -1,7 +1,8 @@
-//! Two haptic devices on one body: each hand feels the other through it.
+//! Two haptic devices on one body: each hand feels the other through the body.
 //!
-//! What to learn here: two devices are two entries in [`HapticDevices`], each with a loop of its own, and two tools; nothing else changes. The left
-//! hand pulls and lets go, the right one holds still and feels it.
+//! What to learn here: two devices are two entries in [`HapticDevices`], each with its own device
+//! loop, and two tools. The left hand pulls and releases; the right hand holds still and feels the
+//! pull.
 //!
 //! ```sh
 //! cargo run --release --example two_hands
@@ -31,10 +32,10 @@ use device::{Grip, Kind, Mover};
 use plot::{Trace, Traces};
 use stage::{Readout, Stage};
 
-/// Ticks of the simulation a second.
+/// Ticks of the simulation per second.
 const RATE: f64 = 120.0;
 
-/// The hands: where they take hold, and their colors.
+/// The hands: where they grab, and their colors.
 const SIDES: [(&str, Vec3, Color); 2] = [
     ("left", Vec3::new(-1.0, 0.55, 0.0), Color::srgb(0.30, 0.65, 1.0)),
     ("right", Vec3::new(1.0, 0.55, 0.0), Color::srgb(0.95, 0.35, 0.3)),
@@ -54,7 +55,7 @@ struct Arguments {
     #[arg(long, value_enum, default_value_t = Kind::Virtual)]
     right: Kind,
 
-    /// Let the loops step copies of the body themselves, at device rate.
+    /// Let each device loop step its own copy of the body, at device rate.
     #[arg(long)]
     modal: bool,
 }
@@ -114,7 +115,7 @@ fn spawn(mut commands: Commands, assets: Res<AssetServer>, mut materials: ResMut
     ));
 }
 
-/// Once the body is here: a tool on either side of it.
+/// Spawns a tool on either side of the body once it exists.
 fn hold_out(
     mut commands: Commands,
     hands: Res<Hands>,
@@ -135,7 +136,7 @@ fn hold_out(
     }
 }
 
-/// Both take hold and pull apart; the left one lets its arm come and go, the right one's stays where it is.
+/// Makes both hands grab and pull apart; the left hand moves its arm, the right hand holds still.
 fn play(
     time: Res<Time>,
     hands: Res<Hands>,
@@ -153,7 +154,7 @@ fn play(
     };
     for (i, (_, mover, _)) in hands.hands.iter().enumerate() {
         let Mover::Script(hand) = mover else { continue };
-        // A button counts once it has been seen open.
+        // A button counts only after the device loop has seen it open.
         hand.set_buttons(u32::from(t > 0.5));
         let away = DVec3::new(if i == 0 { -0.06 } else { 0.06 }, 0.03, 0.02);
         let swing = if i == 0 { 0.65 + 0.35 * (2.2 * t).sin() } else { 1.0 };

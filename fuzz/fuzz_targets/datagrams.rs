@@ -1,4 +1,5 @@
-//! Datagrams of both directions. What is read is written and read again alike.
+//! Fuzzes datagrams of both directions. A datagram that was read must be writable and read back
+//! equal.
 #![no_main]
 
 use libfuzzer_sys::fuzz_target;
@@ -8,7 +9,8 @@ fuzz_target!(|bytes: &[u8]| {
     if let Ok((sequence, datagram)) = Datagram::decode(bytes) {
         let again = Datagram::decode(&datagram.encode(sequence));
         match &datagram {
-            // A rotation is made a unit quaternion as it is read: its last bit may differ the second time.
+            // Reading normalizes a rotation to a unit quaternion, so its last bit may differ the
+            // second time.
             Datagram::Frame(frame) if frame.pose.is_some() => assert!(again.is_ok()),
             _ => assert_eq!(again, Ok((sequence, datagram))),
         }

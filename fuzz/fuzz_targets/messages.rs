@@ -1,4 +1,4 @@
-//! Reliable messages of both directions, snapshots among them.
+//! Fuzzes the reliable messages of both directions, including snapshots.
 #![no_main]
 
 use libfuzzer_sys::fuzz_target;

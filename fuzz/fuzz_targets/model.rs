@@ -1,4 +1,4 @@
-//! `.modal` files. What is read is written and read again with the same hash.
+//! Fuzzes `.modal` files. A model that was read must be writable and readable with the same hash.
 #![no_main]
 
 use libfuzzer_sys::fuzz_target;

@@ -1,4 +1,4 @@
-//! What equal peers say to each other.
+//! Fuzzes the messages and datagrams between equal peers.
 #![no_main]
 
 use libfuzzer_sys::fuzz_target;

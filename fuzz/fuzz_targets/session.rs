@@ -1,4 +1,5 @@
-//! A host and a guest who hear, between each other's words, whatever the bytes say: nobody panics, the shown state stays finite.
+//! Fuzzes a host and a guest that receive arbitrary bytes between valid data. Neither may panic,
+//! and the visual state must stay finite.
 #![no_main]
 
 use std::sync::{Arc, OnceLock};
@@ -13,7 +14,7 @@ use pliant_stream::{
 
 const BODY: BodyId = BodyId(1);
 
-/// A tetrahedron with two made-up modes.
+/// A tetrahedron with two invented modes.
 fn model() -> Arc<ModalModel> {
     static MODEL: OnceLock<Arc<ModalModel>> = OnceLock::new();
     let made = || {

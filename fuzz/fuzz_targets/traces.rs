@@ -1,4 +1,4 @@
-//! Recorded networks, and losses in words.
+//! Fuzzes recorded networks and loss models in text form.
 #![no_main]
 
 use std::time::Duration;

@@ -1,6 +1,7 @@
-//! Runs tests that draw. Where there is no graphics driver, not even a software one, they are
-//! counted as ignored and one line says what is missing. `PLIANT_REQUIRE_PICTURES=1` makes them
-//! fail instead.
+//! Runs tests that draw.
+//!
+//! Without a graphics driver, even a software one, these tests are counted as ignored, and one line
+//! says what is missing. `PLIANT_REQUIRE_PICTURES=1` makes them fail instead.
 
 use std::{
     env,
@@ -12,8 +13,9 @@ use std::{
 use bevy::prelude::App;
 use libtest_mimic::{Arguments, Trial};
 
-/// The main function of a test program. `studio` makes an app that draws, and panics where that is
-/// not possible.
+/// The main function of a test program that draws.
+///
+/// `studio` creates an app that draws, and panics if that is not possible.
 pub fn main(studio: fn() -> App, tests: &[(&'static str, fn(App))]) -> ExitCode {
     let arguments = Arguments::from_args();
     let required = env::var_os("PLIANT_REQUIRE_PICTURES").is_some();
@@ -38,7 +40,7 @@ pub fn main(studio: fn() -> App, tests: &[(&'static str, fn(App))]) -> ExitCode 
 }
 
 fn can_draw(studio: fn() -> App) -> bool {
-    // The line above says it; the engine's panic would only alarm.
+    // The line above reports the missing driver; the panic message of the engine is suppressed.
     let hook = panic::take_hook();
     panic::set_hook(Box::new(|_| ()));
     let drawn = panic::catch_unwind(studio);
@@ -48,13 +50,15 @@ fn can_draw(studio: fn() -> App) -> bool {
     let words = words.or_else(|| reason.downcast_ref::<String>().map(String::as_str));
     match words {
         Some(words) if words.contains("Unable to find a GPU") => false,
-        // Another fault is no missing driver.
+        // Any other panic is a real fault.
         _ => resume_unwind(reason),
     }
 }
 
-/// Calls `frame` until it returns something. Shaders are compiled and pictures are read back on
-/// other threads, which takes long on a busy machine without a graphics card.
+/// Calls `frame` until it returns a value.
+///
+/// Shaders are compiled and pictures are read back on other threads, which takes long on a busy
+/// machine without a graphics card.
 pub fn wait_for<T>(what: &str, mut frame: impl FnMut() -> Result<T, String>) -> T {
     let start = Instant::now();
     loop {

@@ -1,4 +1,4 @@
-//! Soft bodies that several people can hold, feel and watch at once, over networks that lose packets.
+//! Soft bodies that several people hold, feel and watch at once, over networks that lose packets.
 //!
 //! ```no_run
 //! use bevy::prelude::*;
@@ -17,14 +17,14 @@
 //!
 //! # Plugins
 //!
-//! [`PliantPlugins`] holds what nearly every scene wants:
+//! [`PliantPlugins`] adds what nearly every scene needs:
 //!
 //! | Plugin | What it does | Without it |
 //! | --- | --- | --- |
-//! | [`PliantBodyPlugin`](body::PliantBodyPlugin) | `.modal` assets, [`ModalBody`](body::ModalBody), grabs, the fixed step, the deformed surface | nothing else runs |
-//! | [`PointerGrabPlugin`](body::PointerGrabPlugin) | the pointer drags bodies | grabs are made by code only |
+//! | [`PliantBodyPlugin`](body::PliantBodyPlugin) | `.modal` assets, [`ModalBody`](body::ModalBody), grabs, the fixed step, the deformed surface | no other plugin works |
+//! | [`PointerGrabPlugin`](body::PointerGrabPlugin) | the pointer drags bodies | only code makes grabs |
 //!
-//! These are added where they are wanted, each behind its feature:
+//! These plugins are added where they are needed, each behind its feature:
 //!
 //! | Plugin | Feature | What it does |
 //! | --- | --- | --- |
@@ -45,20 +45,21 @@
     doc = "| [`BakePlugin`](body::BakePlugin) | `bake` | surfaces and descriptions become bodies in the game, beside its frames |"
 )]
 //!
-//! A scene need not be code: [`scene`] reads bodies, hands, a session, a device and a recording from a file.
+//! A scene can also be a file: [`scene`] reads bodies, hands, a session, a device and a recording
+//! from a `.ron` file.
 //!
 //! # Features
 //!
-//! | Feature | Default | What it brings |
+//! | Feature | Default | What it adds |
 //! | --- | --- | --- |
-//! | `render` | yes | Bevy's renderer; bodies are drawn |
-//! | `window` | yes | what a windowed game usually has: winit on X11, user interface, text, PNG; leave it out to choose Bevy's features yourself |
-//! | `wayland` | no | native Wayland windows (needs the Wayland client headers when building) |
+//! | `render` | yes | Bevy's renderer, which draws the bodies |
+//! | `window` | yes | the usual parts of a windowed game: winit on X11, user interface, text, PNG; leave it out to choose Bevy's features yourself |
+//! | `wayland` | no | native Wayland windows (building needs the Wayland client headers) |
 //! | `net` | yes | sessions over QUIC |
-//! | `haptics` | yes | haptic devices and their loop |
-//! | `rerun` | yes | the rerun viewer's client |
+//! | `haptics` | yes | haptic devices and the device loop |
+//! | `rerun` | yes | the client of the rerun viewer |
 //! | `panel` | yes | the live panel (egui) |
-//! | `bake` | yes | meshing and baking in the game itself |
+//! | `bake` | yes | meshing and baking inside the game |
 
 #![cfg_attr(
     test,
@@ -90,7 +91,9 @@ pub use pliant_stream as stream;
 
 pub mod scene;
 
-/// What a scene with soft bodies needs; see the [crate page](crate#plugins) for what is in it and what may be added.
+/// The plugins that a scene with soft bodies needs.
+///
+/// The [crate page](crate#plugins) lists the plugins of the group and those that can be added.
 ///
 /// ```
 /// # use bevy::prelude::*;
@@ -105,14 +108,17 @@ pub struct PliantPlugins {
 }
 
 impl PliantPlugins {
-    /// Bodies are stepped in `schedule`: in the fixed loop by fixed steps and shown in between, elsewhere once by its own time.
+    /// Creates the group with bodies that are stepped in `schedule`.
+    ///
+    /// In the fixed loop, the steps have a fixed length and the visual state is interpolated
+    /// between them. In any other schedule, such as `Update`, a step is as long as the frame.
     pub fn new(schedule: impl ScheduleLabel) -> Self {
         Self { schedule: schedule.intern() }
     }
 }
 
 impl Default for PliantPlugins {
-    /// In `FixedUpdate`.
+    /// Steps the bodies in `FixedUpdate`.
     fn default() -> Self {
         Self::new(FixedUpdate)
     }
@@ -147,12 +153,12 @@ pub mod prelude {
     pub use crate::modal::{ModalModel, Patch};
 }
 
-/// The code in the README compiles.
+/// Compiles the code of the README.
 #[cfg(all(doctest, feature = "window", feature = "net", feature = "haptics"))]
 #[doc = include_str!("../../../README.md")]
 pub struct Readme;
 
-/// So does the code in the book, and what does not say `no_run` runs.
+/// Compiles the code of the book, and runs the blocks that are not marked `no_run`.
 #[cfg(all(
     doctest,
     feature = "window",

@@ -1,7 +1,10 @@
-//! How near the static stiffness that a hand feels at a patch comes to the full finite-element solution: the distribution over patches around
-//! every surface vertex, at radii that are not the baked ones, and a few patches by name.
+//! Compares the static stiffness under a hand at a patch with the full finite-element solution.
 //!
-//! `cargo run --release -p pliant_bake --example patch_stiffness -- bar | TETRAHEDRA.msh ANCHOR [tet4|tet10] [MODES]`
+//! The example prints the distribution over patches around every surface vertex, at radii between
+//! the baked ones, and the errors of a few named patches.
+//!
+//! `cargo run --release -p pliant_bake --example patch_stiffness --
+//! bar | TETRAHEDRA.msh ANCHOR [tet4|tet10] [MODES]`
 
 use std::{error::Error, time::Instant};
 
@@ -10,7 +13,7 @@ use pliant_bake::{BakeConfig, bake};
 use pliant_mesh::{TetMesh, io, shapes};
 use pliant_modal::{Element, ModalModel, Patch};
 
-/// `W^T Phi Lambda^-1 Phi^T W` of a patch, m/N.
+/// Returns `W^T Phi Lambda^-1 Phi^T W` of a patch, m/N.
 fn modal_compliance(model: &ModalModel, patch: &Patch) -> Matrix3<f64> {
     let mut out = Matrix3::zeros();
     for (mode, omega) in model.omega().iter().enumerate() {
@@ -29,7 +32,10 @@ fn square(m: [[f64; 3]; 3]) -> Matrix3<f64> {
     Matrix3::from_fn(|i, j| m[i][j])
 }
 
-/// The middle of the end in +x (a bar's tip: axial along x, bending along y and z), a place near the root, the highest vertex (a bunny's ear).
+/// Returns three named vertices.
+///
+/// They are the center of the end in +x (a bar's tip: axial along x, bending along y and z), a
+/// vertex near the root, and the highest vertex (a bunny's ear).
 fn named(model: &ModalModel) -> [(&'static str, u32); 3] {
     let positions = model.surface().positions();
     let [low, high] = model.surface().bounds();

@@ -1,22 +1,24 @@
-//! Anchors: the parts of a body that are held fixed, as half-spaces such as `x<0.01`.
+//! Anchors: half-spaces such as `x<0.01` that fix a part of a body.
 
 use std::fmt;
 use std::str::FromStr;
 
-/// How a coordinate is compared with the bound.
+/// Comparison between a coordinate and the bound.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Comparison {
-    /// `<`
+    /// The coordinate is less than the bound (`<`).
     Less,
-    /// `<=`
+    /// The coordinate is at most the bound (`<=`).
     LessOrEqual,
-    /// `>`
+    /// The coordinate is greater than the bound (`>`).
     Greater,
-    /// `>=`
+    /// The coordinate is at least the bound (`>=`).
     GreaterOrEqual,
 }
 
-/// All nodes whose coordinate along `axis` compares as asked with `bound` are fixed. Several anchors are a union.
+/// Half-space that fixes all nodes whose coordinate along `axis` satisfies the comparison.
+///
+/// Several anchors together fix the union of their nodes.
 ///
 /// ```
 /// let anchor: pliant_bake::Anchor = "x<0.01".parse()?;
@@ -25,16 +27,16 @@ pub enum Comparison {
 /// ```
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Anchor {
-    /// 0, 1, 2 for x, y, z.
+    /// Axis of the coordinate: 0, 1 or 2 for x, y or z.
     pub axis: usize,
-    /// Which side.
+    /// Comparison of the coordinate with `bound`.
     pub comparison: Comparison,
-    /// m.
+    /// Bound of the half-space, m.
     pub bound: f64,
 }
 
 impl Anchor {
-    /// Is the point (m) in the half-space?
+    /// Returns whether the point (m) lies in the half-space.
     #[must_use]
     pub fn holds(&self, point: [f64; 3]) -> bool {
         let x = point[self.axis.min(2)];
@@ -59,22 +61,25 @@ impl fmt::Display for Anchor {
     }
 }
 
-/// The text is not an anchor.
+/// Error for a text that is not an anchor.
 #[derive(Clone, Debug, PartialEq, Eq, thiserror::Error)]
 #[error(
     "anchor `{text}`: expected an axis, a comparison and a finite number of metres, such as `x<0.01`; {problem}"
 )]
 pub struct AnchorSyntax {
-    /// What came.
+    /// Received text.
     pub text: String,
-    /// What is wrong with it.
+    /// Description of the problem.
     pub problem: String,
 }
 
 impl FromStr for Anchor {
     type Err = AnchorSyntax;
 
-    /// `AXIS COMPARISON NUMBER`, spaces allowed: axis x, y or z; `<`, `<=`, `>` or `>=`; metres.
+    /// Parses `AXIS COMPARISON NUMBER`, for example `x<0.01`. Spaces are allowed.
+    ///
+    /// The axis is x, y or z, the comparison is `<`, `<=`, `>` or `>=`, and the number is in
+    /// meters.
     fn from_str(text: &str) -> Result<Self, Self::Err> {
         let wrong = |problem: String| AnchorSyntax { text: text.to_owned(), problem };
         let trimmed = text.trim();

@@ -1,4 +1,4 @@
-//! The whole way from tetrahedra to a model.
+//! The complete bake, from tetrahedra to a model.
 
 use std::time::Instant;
 
@@ -17,25 +17,29 @@ use crate::surface::Skin;
 use crate::symbolic::{self, Symbolic};
 use crate::{Bake, BakeConfig, BakeError, BakeTimes, Stage, canonical, flexibility, matrix_market, support};
 
-/// Largest `|K phi - lambda M phi| / |K phi|` that a bake may have.
+/// Largest `|K phi - lambda M phi| / |K phi|` that a bake accepts.
 const RESIDUAL_LIMIT: f64 = 1e-7;
 
-/// Largest entry of `|Phi^T M Phi - I|` that a bake may have.
+/// Largest entry of `|Phi^T M Phi - I|` that a bake accepts.
 const ORTHONORMALITY_LIMIT: f64 = 1e-9;
 
-/// Bakes a mesh: finite elements, the lowest elastic modes of `K phi = omega^2 M phi`, and what a body needs of them
-/// at its surface.
+/// Bakes a mesh into a modal model.
 ///
-/// The visible surface is `skin`, embedded in the tetrahedra with the modes interpolated to its own vertices, or the
-/// tetrahedra's boundary. Without anchors the body is free: its six rigid modes are known and left out.
-/// `progress` is told the stage and how much of it is done, 0 to 1.
+/// The model contains the lowest elastic modes of `K phi = omega^2 M phi` and the data that a body
+/// needs at its surface.
 ///
-/// The same input gives the same model to the bit, whatever the number of threads. Every bake checks
-/// `|K phi - lambda M phi| / |K phi|` and `|Phi^T M Phi - I|` and stores the largest of each.
+/// The visible surface is `skin` if there is one. It is embedded in the tetrahedra, and the modes
+/// are interpolated to its vertices. Otherwise the visible surface is the boundary of the
+/// tetrahedra. A body without anchors is free: its six rigid modes are known and left out.
+/// `progress` receives the stage and its completed fraction, 0 to 1.
+///
+/// The same input gives the same model to the bit, for any number of threads. Every bake checks
+/// `|K phi - lambda M phi| / |K phi|` and `|Phi^T M Phi - I|` and stores the largest value of each.
 ///
 /// # Errors
-/// See [`BakeError`]: every number out of its range, meshes and skins that are not sound, anchors that hold nothing,
-/// everything or too little, more modes than degrees of freedom, files that cannot be written.
+/// Returns [`BakeError`] for a number out of its range, for an invalid mesh or skin, for anchors
+/// that contain nothing, everything or too few nodes, for more modes than degrees of freedom, and
+/// for files that cannot be written.
 pub fn bake(
     mesh: &TetMesh,
     skin: Option<&Surface>,
@@ -125,7 +129,7 @@ pub fn bake(
         surface: skin.mesh,
     };
     let model = ModalModel::from_parts(parts)?;
-    // Of a bake that failed nothing is left.
+    // The matrices are written last, so that a failed bake leaves no files.
     if let Some(folder) = &config.export_matrices {
         matrix_market::export(folder, &matrix, &number)?;
     }
@@ -153,7 +157,7 @@ impl Clock {
         Self(Instant::now())
     }
 
-    /// Seconds since the last lap.
+    /// Returns the seconds since the last lap.
     fn lap(&mut self) -> f64 {
         let now = Instant::now();
         let seconds = (now - self.0).as_secs_f64();
@@ -162,7 +166,7 @@ impl Clock {
     }
 }
 
-/// Lame's constants: `lambda = E nu / ((1 + nu)(1 - 2 nu))`, `mu = E / (2 (1 + nu))`.
+/// Lame constants of the material: `lambda = E nu / ((1 + nu)(1 - 2 nu))`, `mu = E / (2 (1 + nu))`.
 pub(crate) fn law(config: &BakeConfig) -> Law {
     let (e, nu) = (config.young, config.poisson);
     Law {
@@ -180,7 +184,8 @@ fn check_mode_count(modes: usize, held: &[bool], free_body: bool) -> Result<(), 
     if modes > most { Err(BakeError::Modes { got: modes, most, dofs, rigid }) } else { Ok(()) }
 }
 
-/// The row of each node in elimination order (`ANCHORED` for those held), and the graph in that order.
+/// Returns the row of each node in elimination order and the graph in that order. The row of an
+/// anchored node is `ANCHORED`.
 pub(crate) fn elimination_order(fe: &FeMesh, graph: &Lists, held: &[bool]) -> (Vec<u32>, Lists) {
     let keep: Vec<bool> = held.iter().map(|held| !held).collect();
     let dissected = ordering::nested_dissection(graph, &fe.nodes, &keep);
@@ -196,7 +201,7 @@ pub(crate) fn elimination_order(fe: &FeMesh, graph: &Lists, held: &[bool]) -> (V
     (number, ordered)
 }
 
-/// Positions of the free nodes in the order of the matrix.
+/// Returns the positions of the free nodes in the row order of the matrix.
 fn by_row(fe: &FeMesh, number: &[u32]) -> Vec<[f64; 3]> {
     let free = number.iter().filter(|&&row| row != ANCHORED).count();
     let mut out = vec![[0.0; 3]; free];
@@ -208,7 +213,8 @@ fn by_row(fe: &FeMesh, number: &[u32]) -> Vec<[f64; 3]> {
     out
 }
 
-/// Largest `|K phi - lambda M phi| / |K phi|` and largest entry of `|Phi^T M Phi - I|`.
+/// Returns the largest `|K phi - lambda M phi| / |K phi|` and the largest entry of
+/// `|Phi^T M Phi - I|`.
 pub(crate) fn accuracy(matrix: &BlockCsr, modes: &Modes) -> (f64, f64) {
     let count = modes.lambda.len();
     let mut k = vec![0.0; modes.phi.len()];
@@ -233,7 +239,7 @@ pub(crate) fn accuracy(matrix: &BlockCsr, modes: &Modes) -> (f64, f64) {
     (worst, off)
 }
 
-/// The larger number; NaN stays NaN, so that it is noticed.
+/// Returns the larger number. A NaN stays NaN, so that the accuracy check rejects it.
 fn largest(a: f64, b: f64) -> f64 {
     if a.is_nan() || a > b { a } else { b }
 }
@@ -242,8 +248,10 @@ fn check_accuracy(what: &'static str, got: f64, expected: f64) -> Result<(), Bak
     if got <= expected { Ok(()) } else { Err(BakeError::Inaccurate { what, got, expected }) }
 }
 
-/// `Phi^T M 1_axis`: how a uniform acceleration drives each mode, kg^1/2. A free body's elastic modes are
-/// M-orthogonal to translations, so it is zero for them.
+/// Returns the participation `Phi^T M 1_axis` of each mode, kg^1/2.
+///
+/// The participation says how a uniform acceleration drives the mode. It is zero for a free body,
+/// because its elastic modes are M-orthogonal to translations.
 fn participation(fe: &FeMesh, modes: &Modes, number: &[u32], density: f64, free_body: bool) -> Vec<[f64; 3]> {
     let count = modes.lambda.len();
     let mut out = vec![[0.0; 3]; count];

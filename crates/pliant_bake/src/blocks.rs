@@ -1,6 +1,8 @@
-//! Products of tall blocks of vectors, stored row by row: entry (dof, column) at `dof * stride + column`.
+//! Products of tall blocks of vectors, stored row by row: entry (dof, column) is at
+//! `dof * stride + column`.
 //!
-//! Rows are cut into chunks of fixed size and partial sums are added in order: the same bits for any number of threads.
+//! The rows are split into chunks of fixed size, and the partial sums are added in order. The
+//! result is therefore the same to the bit for any number of threads.
 
 use faer::linalg::matmul::matmul;
 use faer::{Accum, Mat, MatMut, MatRef, Par};
@@ -14,13 +16,13 @@ const CHUNK: usize = 768;
 pub(crate) struct Tall<'a> {
     pub(crate) data: &'a [f64],
     pub(crate) stride: usize,
-    /// First column.
+    /// Index of the first column of the view.
     pub(crate) from: usize,
     pub(crate) columns: usize,
 }
 
 impl<'a> Tall<'a> {
-    /// A block whose rows follow one another without gaps.
+    /// Views a block whose rows are contiguous.
     pub(crate) fn new(data: &'a [f64], columns: usize) -> Self {
         Self { data, stride: columns, from: 0, columns }
     }
@@ -33,7 +35,7 @@ impl<'a> Tall<'a> {
     }
 }
 
-/// `a^T b`.
+/// Returns `a^T b`.
 pub(crate) fn gram(a: Tall<'_>, b: Tall<'_>) -> Mat<f64> {
     let rows = a.data.len() / a.stride.max(1);
     let parts: Vec<Mat<f64>> = (0..rows.div_ceil(CHUNK))
@@ -51,7 +53,7 @@ pub(crate) fn gram(a: Tall<'_>, b: Tall<'_>) -> Mat<f64> {
     sum
 }
 
-/// `out += alpha a c`; `out` has `c.ncols()` columns.
+/// Computes `out += alpha a c`. `out` has `c.ncols()` columns.
 pub(crate) fn add_product(out: &mut [f64], a: Tall<'_>, c: MatRef<'_, f64>, alpha: f64) {
     let columns = c.ncols();
     if columns == 0 || a.columns == 0 {
@@ -64,7 +66,7 @@ pub(crate) fn add_product(out: &mut [f64], a: Tall<'_>, c: MatRef<'_, f64>, alph
     });
 }
 
-/// `a c` as a new block.
+/// Returns `a c` as a new block.
 pub(crate) fn product(a: Tall<'_>, c: MatRef<'_, f64>) -> Vec<f64> {
     let mut out = vec![0.0; a.data.len() / a.stride.max(1) * c.ncols()];
     add_product(&mut out, a, c, 1.0);
@@ -80,7 +82,9 @@ pub(crate) fn put(wide: &mut [f64], stride: usize, at: usize, block: &[f64], col
     });
 }
 
-/// Eigenvalues (ascending) and eigenvectors (columns) of a small symmetric matrix; `None` when the iteration fails.
+/// Returns the eigenvalues (ascending) and the eigenvectors (columns) of a small symmetric matrix.
+///
+/// Returns `None` when the iteration fails.
 pub(crate) fn symmetric_eigen(a: MatRef<'_, f64>) -> Option<(Vec<f64>, Mat<f64>)> {
     use faer::diag::Diag;
     use faer::dyn_stack::{MemBuffer, MemStack};

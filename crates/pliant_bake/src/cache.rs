@@ -1,4 +1,5 @@
-//! A cache of bakes by content: what was baked before, from the same input by the same method, is read instead.
+//! Content-addressed cache of bakes. A model that was already baked from the same input by the same
+//! method is read from its file.
 
 use std::fs;
 use std::io::Write;
@@ -11,23 +12,28 @@ use pliant_modal::{Damping, FORMAT_VERSION, ModalModel};
 
 use crate::{Bake, BakeConfig, BakeError, BakeTimes, Stage, bake};
 
-/// Version of the method: part of every key. Whoever changes what a bake of the same input comes out as raises it.
+/// Version of the bake method, which is part of every key.
+///
+/// Raise the version with every change that alters the result of a bake of the same input.
 pub const METHOD_VERSION: u32 = 5;
 
-/// A writer that was killed leaves its unfinished file; after so long nobody is writing it any more.
+/// Age after which an unfinished file counts as abandoned by a writer that was killed.
 const ABANDONED: Duration = Duration::from_secs(3600);
 
-/// Names what a bake is made of: BLAKE3 over the bits of mesh and skin, every number of the configuration, and the versions of method and
-/// file format.
+/// Key that identifies the input of a bake.
+///
+/// The key is a BLAKE3 hash of the bits of mesh and skin, of every number of the configuration, and
+/// of the versions of the method and of the file format.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Hash)]
 pub struct BakeKey([u8; 32]);
 
 impl BakeKey {
-    /// The key of a bake. [`BakeConfig::export_matrices`] is left out: it changes nothing in the model.
+    /// Computes the key of a bake. [`BakeConfig::export_matrices`] is not part of the key, because
+    /// it does not change the model.
     pub fn new(mesh: &TetMesh, skin: Option<&Surface>, config: &BakeConfig) -> Self {
         let mut hash = Hasher(blake3::Hasher::new_derive_key("pliant bake"));
         hash.words(&[METHOD_VERSION, FORMAT_VERSION]);
-        // Taken apart, so that a field that is added cannot be forgotten here.
+        // The destructuring makes the compiler report a new field that is missing here.
         let BakeConfig {
             name,
             element,
@@ -108,11 +114,12 @@ impl Hasher {
     }
 }
 
-/// A folder of baked models, each a `.modal` file named by its [`BakeKey`].
+/// Folder of baked models, each a `.modal` file named by its [`BakeKey`].
 ///
-/// Any number of programs may use one folder at a time: a file appears whole or not at all. A file that was cut, altered or put in the place
-/// of another is not believed but baked again. The folder grows to [`limit`](Self::with_limit) bytes; then what was not used
-/// for longest goes.
+/// Any number of programs may use one folder at the same time, because a file appears either
+/// complete or not at all. A file that was truncated, altered or replaced by another is rejected,
+/// and the model is baked again. When the folder exceeds its [`limit`](Self::with_limit) in bytes,
+/// the least recently used files are removed.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct BakeCache {
     folder: PathBuf,
@@ -120,16 +127,18 @@ pub struct BakeCache {
 }
 
 impl BakeCache {
-    /// Bytes that a cache may grow to unless it is told otherwise: 1 GiB.
+    /// Default size limit of a cache, bytes: 1 GiB.
     pub const DEFAULT_LIMIT: u64 = 1 << 30;
 
-    /// A cache in `folder`, which is made when there is something to keep.
+    /// Makes a cache in `folder`. The folder is created when the cache first stores a model.
     pub fn new(folder: impl Into<PathBuf>) -> Self {
         Self { folder: folder.into(), limit: Self::DEFAULT_LIMIT }
     }
 
-    /// The user's own cache, shared by all programs: a folder `pliant/bakes` where the system keeps what can be made again. `None` where it
-    /// names no such place.
+    /// Returns the cache of the current user, which all programs share.
+    ///
+    /// The cache is the folder `pliant/bakes` in the system's folder for cached data. Returns
+    /// `None` when the environment names no such folder.
     pub fn of_user() -> Option<Self> {
         let folder = |name: &str| std::env::var_os(name).map(PathBuf::from).filter(|path| path.is_absolute());
         let base = if cfg!(windows) {
@@ -137,36 +146,37 @@ impl BakeCache {
         } else if cfg!(target_os = "macos") {
             folder("HOME").map(|home| home.join("Library/Caches"))
         } else {
-            // The XDG base directory specification.
+            // This follows the XDG base directory specification.
             folder("XDG_CACHE_HOME").or_else(|| folder("HOME").map(|home| home.join(".cache")))
         };
         base.map(|base| Self::new(base.join("pliant/bakes")))
     }
 
-    /// Keeps at most so many bytes; a single model that is larger is not kept.
+    /// Sets the size limit in bytes. A single model that is larger is not stored.
     #[must_use]
     pub fn with_limit(self, bytes: u64) -> Self {
         Self { limit: bytes, ..self }
     }
 
-    /// Where it is.
+    /// Returns the folder of the cache.
     pub fn folder(&self) -> &Path {
         &self.folder
     }
 
-    /// The file of a key, there or not.
+    /// Returns the path of the file for a key, whether or not the file exists.
     pub fn path(&self, key: BakeKey) -> PathBuf {
         self.folder.join(format!("{key}.modal"))
     }
 
-    /// The model of a key, when it is there and what it should be.
+    /// Reads the model of a key, if the file exists and matches the input.
     fn find(&self, key: BakeKey, mesh: &TetMesh, config: &BakeConfig) -> Option<ModalModel> {
         let path = self.path(key);
         let file = fs::metadata(&path).ok()?;
         if !file.is_file() || file.len() > self.limit {
             return None;
         }
-        // The file's own hash says that it is whole; that it is this bake's, what it says of itself.
+        // The hash inside the file proves that the file is complete. The comparison below shows
+        // that it belongs to this bake.
         let model = ModalModel::read(&path).ok()?;
         let info = model.info();
         let same = info.name == config.name
@@ -179,7 +189,8 @@ impl BakeCache {
         if !same {
             return None;
         }
-        // Used now: it goes last. A folder that may only be read serves all the same.
+        // The new modification time marks the file as recently used. A failure is ignored, so that
+        // a read-only folder works too.
         if let Ok(file) = fs::File::options().append(true).open(&path) {
             let _ = file.set_modified(SystemTime::now());
         }
@@ -193,21 +204,23 @@ impl BakeCache {
             return Ok(());
         }
         fs::create_dir_all(&self.folder)?;
-        // A name of this writer's own, in the same folder, so that the renaming is one act.
+        // The temporary name is unique to this writer. The file lies in the same folder, so that
+        // the rename is atomic.
         let number = NEXT.fetch_add(1, Ordering::Relaxed);
         let partial = self.folder.join(format!("{key}.{}.{number}.partial", std::process::id()));
         let written = fs::File::create(&partial)
             .and_then(|mut file| file.write_all(&bytes).and_then(|()| file.sync_all()))
             .and_then(|()| fs::rename(&partial, self.path(key)));
         if written.is_err() {
-            // The first error is the one that tells.
+            // The caller needs the first error, so a second error is ignored.
             let _ = fs::remove_file(&partial);
         }
         written?;
         self.prune(key)
     }
 
-    /// Removes what was not used for longest until the rest fits, and what killed writers left.
+    /// Removes the least recently used files until the rest fits, and the files that killed writers
+    /// left.
     fn prune(&self, newest: BakeKey) -> std::io::Result<()> {
         let now = SystemTime::now();
         let mut kept = Vec::new();
@@ -216,7 +229,7 @@ impl BakeCache {
             let (path, Ok(file)) = (entry.path(), entry.metadata()) else { continue };
             let used = file.modified().unwrap_or(SystemTime::UNIX_EPOCH);
             let name = entry.file_name().to_string_lossy().into_owned();
-            // Only what has the form of this cache's own names is ever removed.
+            // Only files whose names have the form of this cache's names may be removed.
             let ours = name.len() > 64 && name.as_bytes()[..64].iter().all(u8::is_ascii_hexdigit);
             if !file.is_file() || !ours {
                 continue;
@@ -234,7 +247,7 @@ impl BakeCache {
             if total <= self.limit {
                 break;
             }
-            // Another program may have removed it first.
+            // The error is ignored, because another program may have removed the file first.
             let _ = fs::remove_file(path);
             total -= bytes;
         }
@@ -242,22 +255,26 @@ impl BakeCache {
     }
 }
 
-/// What [`bake_cached`] gave.
+/// Result of [`bake_cached`].
 #[derive(Debug)]
 pub struct CachedBake {
-    /// The model; the times are those of this call, all in `total` when it was read.
+    /// Baked model and its times. When the model was read from the cache, `total` is the time of
+    /// the call and all other times are zero.
     pub bake: Bake,
-    /// Was it read rather than baked?
+    /// Whether the model was read from the cache.
     pub cached: bool,
-    /// Why it could not be kept for the next time, if so. The bake itself is sound.
+    /// Error that prevented the cache from storing the model, if any. The bake itself is valid.
     pub not_kept: Option<std::io::Error>,
 }
 
-/// As [`bake()`](crate::bake()), unless `cache` has it already from the same input. A cache that cannot be read or written costs nothing but the
-/// time of the bake. With [`BakeConfig::export_matrices`] it is always baked, as the matrices are wanted.
+/// Bakes as [`bake()`](crate::bake()) does, unless `cache` already has the model for the same
+/// input.
+///
+/// A cache that cannot be read or written only costs the time of the bake. With
+/// [`BakeConfig::export_matrices`] the mesh is always baked, because the matrices are needed.
 ///
 /// # Errors
-/// As [`bake()`](crate::bake()).
+/// Returns the errors of [`bake()`](crate::bake()).
 pub fn bake_cached(
     cache: &BakeCache,
     mesh: &TetMesh,
@@ -340,7 +357,7 @@ mod tests {
         assert_eq!(second.bake.model, first.bake.model);
         assert!(!made(&cache, &BakeConfig { young: 1.1e5, ..config() }).cached);
         assert_eq!(folder.files(), 2);
-        // Wanted matrices are made.
+        // An export of the matrices bypasses the cache.
         let export = BakeConfig { export_matrices: Some(folder.0.join("matrices")), ..config() };
         assert!(!made(&cache, &export).cached);
         assert!(folder.0.join("matrices/K.mtx").is_file());
@@ -405,7 +422,7 @@ mod tests {
             assert!(!again.cached && again.bake.model == truth);
             assert_eq!(fs::read(&path).unwrap(), good, "put right");
         }
-        // A folder in the file's place, and a file in the folder's.
+        // A folder takes the place of the file, and then a file takes the place of the folder.
         fs::remove_file(&path).unwrap();
         fs::create_dir(&path).unwrap();
         let kept = made(&cache, &config());
@@ -423,7 +440,7 @@ mod tests {
         let cache = BakeCache::new(&folder.0).with_limit(3 * one + one / 2);
         let at = |k: usize| BakeConfig { young: 1e5 + k as f64, ..config() };
         fs::write(folder.0.join("notes.txt"), "not ours").unwrap();
-        // The clock of some file systems is coarse: all files become a minute older.
+        // Some file systems have a coarse clock, so all files are made a minute older.
         let age = || {
             for entry in fs::read_dir(&folder.0).unwrap() {
                 let file = fs::File::options().append(true).open(entry.unwrap().path()).unwrap();
@@ -434,7 +451,7 @@ mod tests {
         for k in 1..6 {
             made(&cache, &at(k));
             age();
-            // The first is used all the time.
+            // The first model is used in every round.
             assert!(made(&cache, &config()).cached, "after {k}");
             age();
         }

@@ -1,4 +1,4 @@
-//! One choice among the many that an eigenproblem leaves open: bases of degenerate modes, and signs.
+//! Makes the modes unique: chooses the basis of degenerate modes and the sign of every mode.
 
 use faer::Mat;
 
@@ -7,13 +7,16 @@ use crate::fem::ANCHORED;
 use crate::lanczos::Modes;
 use crate::sparse::BlockCsr;
 
-/// Neighbouring eigenvalues that differ by at most this share count as one: turning their vectors within the plane
-/// changes no residual that matters.
+/// Relative difference up to which neighboring eigenvalues count as equal. Within a cluster this
+/// tight, a rotation of the vectors changes the residuals only negligibly.
 const CLUSTER: f64 = 1e-10;
 
-/// Turns the modes of a degenerate eigenvalue so that they diagonalise the mass weighted 1, 2, 3 along x, y, z (a round
-/// bar's bending modes end up in its axes), then makes the largest entry of each mode positive: the first in
-/// the order of the nodes of those within 1e-6 of the largest.
+/// Chooses one basis for each degenerate eigenvalue and one sign for each mode.
+///
+/// The modes of a degenerate eigenvalue are rotated so that they diagonalize the mass matrix
+/// weighted by 1, 2, 3 along x, y, z. The bending modes of a round bar then lie in the axes.
+/// Afterwards the largest entry of each mode becomes positive. Among entries within 1e-6 of the
+/// largest, the first in node order decides.
 pub(crate) fn settle(modes: &mut Modes, matrix: &BlockCsr, number: &[u32]) {
     let count = modes.lambda.len();
     let mut start = 0;
@@ -63,7 +66,8 @@ fn turn(modes: &mut Modes, matrix: &BlockCsr, start: usize, end: usize) {
     }
     let gram = blocks::gram(Tall::new(&block, width), Tall::new(&weighted, width));
     let symmetric = Mat::from_fn(width, width, |i, j| 0.5 * (gram[(i, j)] + gram[(j, i)]));
-    // Should the small problem fail, the modes stay as they are: every basis of the cluster is right.
+    // Every basis of the cluster is valid, so the modes stay unchanged when the small problem
+    // fails.
     if let Some((_, vectors)) = blocks::symmetric_eigen(symmetric.as_ref()) {
         let turned = blocks::product(Tall::new(&block, width), vectors.as_ref());
         blocks::put(&mut modes.phi, count, start, &turned, width);

@@ -1,9 +1,11 @@
-//! The static compliance of very many patches at once: `W^T A^-1 W = |L^-1 W|^2` for loads that overlap.
+//! Computes the static compliance `W^T A^-1 W = |L^-1 W|^2` of many overlapping patches at once.
 //!
-//! Patches around neighbouring vertices rest on the same nodes, so instead of three columns for each patch, each node that any patch touches gets
-//! its three unit loads, once, and a patch is a sum of such columns. A unit load is zero below the node's own place in the elimination
-//! tree: the columns that a front sees are those of its own subtree, which lie side by side. The forward substitution therefore goes
-//! up the tree as the factorisation did (the multifrontal method, Duff and Reid 1983), with dense blocks of right-hand sides.
+//! Patches around neighboring vertices load the same nodes. Instead of three columns per patch,
+//! each node that any patch touches therefore gets its three unit loads once, and a patch is a sum
+//! of such columns. A unit load is zero below the node's own position in the elimination tree. A
+//! front therefore sees only the columns of its own subtree, and these columns are contiguous. The
+//! forward substitution goes up the tree in the same way as the factorization (the multifrontal
+//! method, Duff and Reid 1983), with dense blocks of right-hand sides.
 
 use std::ops::Range;
 
@@ -18,20 +20,20 @@ use rayon::prelude::*;
 use crate::factor::Factor;
 use crate::symbolic::{Supernode, Symbolic};
 
-/// Columns of right-hand sides that are worked on together.
+/// Number of right-hand side columns that one task processes together.
 const STRIP: usize = 192;
 
-/// Loads whose squares are taken together, and rows of their columns at a time.
+/// Number of loads whose squares are computed together. `PIECE` is the number of rows per pass.
 const TOGETHER: usize = 48;
 const PIECE: usize = 128;
 
-/// A unit force on a patch, the same along each axis: rows of nodes, ascending, and their shares.
+/// Unit force on a patch, equal along each axis: node rows in ascending order with their shares.
 pub(crate) type Load = Vec<(usize, f64)>;
 
 /// Upper triangle of a symmetric 3 x 3 matrix: xx, xy, xz, yy, yz, zz.
 pub(crate) type Six = [f64; 6];
 
-/// The precision that right-hand sides are worked on in.
+/// Floating-point precision of the right-hand sides.
 trait Number: ComplexField + Copy + Default + std::ops::AddAssign + std::ops::Mul<Output = Self> {
     fn of(x: f64) -> Self;
     fn wide(self) -> f64;
@@ -55,21 +57,22 @@ impl Number for f32 {
     }
 }
 
-/// What a subtree hands to its parent.
+/// Contribution of a subtree to its parent.
 struct Update<T> {
-    /// `3 rows` by columns, column by column; the columns are those of the subtree's range of needed nodes.
+    /// Array of `3 rows` by columns, stored column by column. The columns are those of the
+    /// subtree's range of needed nodes.
     values: Vec<T>,
-    /// Loads that touch the subtree, ascending.
+    /// Loads that touch the subtree, in ascending order.
     loads: Vec<u32>,
 }
 
-/// The nodes that loads rest on, and where each subtree's begin and end among them.
+/// Nodes that the loads touch, and the range of these nodes in each subtree.
 pub(crate) struct Plan<'a> {
     factor: &'a Factor,
     loads: &'a [Load],
-    /// Nodes (in elimination order) that some load touches, ascending.
+    /// Nodes (in elimination order) that some load touches, in ascending order.
     needed: Vec<usize>,
-    /// By supernode: its subtree's part of `needed`.
+    /// For each supernode, the range of its subtree in `needed`.
     columns: Vec<Range<usize>>,
 }
 
@@ -81,7 +84,8 @@ impl<'a> Plan<'a> {
         let supernodes = &factor.symbolic.supernodes;
         let mut columns: Vec<Range<usize>> = Vec::with_capacity(supernodes.len());
         for s in supernodes {
-            // The elimination order is a postorder: a subtree's nodes are contiguous, its children's side by side.
+            // The elimination order is a postorder, so the nodes of a subtree are contiguous and
+            // the ranges of its children are adjacent.
             let start = s.children.iter().map(|&child| columns[child].start).min();
             let start = start.unwrap_or_else(|| needed.partition_point(|&row| row < s.first));
             let end = needed.partition_point(|&row| row < s.first + s.columns);
@@ -90,7 +94,7 @@ impl<'a> Plan<'a> {
         Self { factor, loads, needed, columns }
     }
 
-    /// Multiplications of the whole, about.
+    /// Estimates the total number of multiplications.
     pub(crate) fn cost(&self) -> f64 {
         let front = |(s, columns): (&Supernode, &Range<usize>)| {
             let (w, b) = (s.width() as f64, s.below() as f64);
@@ -99,14 +103,16 @@ impl<'a> Plan<'a> {
         self.factor.symbolic.supernodes.iter().zip(&self.columns).map(front).sum()
     }
 
-    /// Most numbers that one front's right-hand sides take.
+    /// Returns the largest count of numbers in the right-hand sides of one front.
     pub(crate) fn largest_block(&self) -> usize {
         let front = |(s, columns): (&Supernode, &Range<usize>)| (s.width() + s.below()) * 3 * columns.len();
         self.factor.symbolic.supernodes.iter().zip(&self.columns).map(front).max().unwrap_or(0)
     }
 
-    /// `W^T A^-1 W` of each load, in double or, `fast`, in single precision: half the time, and off by some 1e-6 of the compliance.
-    /// The same to the bit whatever the number of threads.
+    /// Returns `W^T A^-1 W` of each load, in double precision or, with `fast`, in single precision.
+    ///
+    /// Single precision takes half the time and has a relative error of about 1e-6. The result is
+    /// the same to the bit for any number of threads.
     pub(crate) fn compliances(&self, fast: bool, report: &mut dyn FnMut(f64)) -> Vec<Six> {
         if fast { self.compliances_in::<f32>(report) } else { self.compliances_in::<f64>(report) }
     }
@@ -150,7 +156,7 @@ impl<'a> Plan<'a> {
         out
     }
 
-    /// By needed node: the loads that touch it.
+    /// Returns for each needed node the loads that touch the node.
     fn touching(&self) -> Vec<Vec<u32>> {
         let mut out = vec![Vec::new(); self.needed.len()];
         for (index, load) in self.loads.iter().enumerate() {
@@ -161,7 +167,8 @@ impl<'a> Plan<'a> {
         out
     }
 
-    /// One front: what is left for the parent, and what each load's part of the solution adds to its square.
+    /// Processes one front. Returns the update for the parent and the contribution of the front's
+    /// part of the solution to the square of each load.
     fn front<T: Number>(
         &self,
         s: usize,
@@ -243,7 +250,7 @@ impl<'a> Plan<'a> {
     }
 }
 
-/// What the columns of a front's nodes became.
+/// Solved right-hand sides of the nodes of one front.
 struct Solved<'a, T> {
     x: &'a [T],
     height: usize,
@@ -252,10 +259,13 @@ struct Solved<'a, T> {
 }
 
 impl<T: Number> Solved<'_, T> {
-    /// `|sum of shares x columns|^2` of each load. Loads that lie side by side share nodes: their columns are read piece by piece, so that
-    /// the pieces stay in the cache.
+    /// Returns `|sum of shares x columns|^2` of each load.
+    ///
+    /// Neighboring loads share nodes. Their columns are read in pieces so that the pieces stay in
+    /// the cache.
     fn squares(&self, all: &[Load], loads: &[u32]) -> Vec<Six> {
-        // Compiled for every instruction set, chosen here; the same operations in the same order in each.
+        // The code is compiled for every instruction set, and the dispatch selects one at run time.
+        // Every variant does the same operations in the same order.
         Arch::new().dispatch(
             #[inline(always)]
             || self.squares_here(all, loads),
@@ -297,7 +307,7 @@ impl<T: Number> Solved<'_, T> {
     }
 }
 
-/// In eight running sums, so that the additions need not wait for one another.
+/// Uses eight running sums, so that the additions do not wait for one another.
 #[inline(always)]
 fn dot<T: Number>(a: &[T; PIECE], b: &[T; PIECE]) -> f64 {
     let mut lanes = [0.0; 8];
@@ -309,7 +319,7 @@ fn dot<T: Number>(a: &[T; PIECE], b: &[T; PIECE]) -> f64 {
     lanes.iter().sum()
 }
 
-/// The updates of a front's children, in order; those without any are left out.
+/// Returns the updates of a front's children in order. Children without an update are left out.
 fn children<T>(
     symbolic: &Symbolic,
     s: usize,

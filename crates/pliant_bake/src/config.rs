@@ -1,4 +1,4 @@
-//! What a bake is asked for.
+//! Input and output of a bake: the configuration, the stages and the times.
 
 use std::path::PathBuf;
 
@@ -11,33 +11,44 @@ const _: () = assert!(
     "the messages in `check` say so"
 );
 
-/// What to make of a mesh. All numbers in SI units.
+/// Configuration of a bake. All numbers are in SI units.
 #[derive(Clone, Debug, PartialEq)]
 pub struct BakeConfig {
-    /// A name for people, kept in the model; at most [`ModalModel::MAX_TEXT`] bytes. Default: empty.
+    /// Human-readable name that the model stores, at most [`ModalModel::MAX_TEXT`] bytes. Default:
+    /// empty.
     pub name: String,
-    /// The finite element. Default: [`Element::Tet10`].
+    /// Finite element. Default: [`Element::Tet10`].
     pub element: Element,
-    /// Elastic modes to keep. Default: 60.
+    /// Number of elastic modes to keep. Default: 60.
     pub modes: usize,
     /// Young's modulus, 1e-3 to 1e15 Pa. Default: 1e5, a soft silicone.
     pub young: f64,
-    /// Poisson ratio, -0.99 to 0.49999. Default: 0.4. Above 0.45 the pressure is averaged over nodes, so that
-    /// nothing locks.
+    /// Poisson ratio, -0.99 to 0.49999. Default: 0.4.
+    ///
+    /// Above 0.45 the pressure is averaged over nodes to avoid locking.
     pub poisson: f64,
     /// Density, 1e-6 to 1e7 kg/m^3. Default: 1000.
     pub density: f64,
-    /// How the modes lose energy: a ratio of 0 to 1000, or alpha of 0 to 1e9 1/s and beta of 0 to 1e3 s. Default: 3 % of critical damping in every mode.
+    /// Damping of the modes: a ratio of 0 to 1000, or alpha of 0 to 1e9 1/s and beta of 0 to 1e3 s.
+    ///
+    /// Default: 3 % of critical damping in every mode.
     pub damping: Damping,
-    /// What is held fixed; the union of all, at most [`ModalModel::MAX_ANCHORS`]. Default: none, a free body.
+    /// Anchors, at most [`ModalModel::MAX_ANCHORS`]. A node is fixed when any anchor contains it.
+    /// Default: none, a free body.
     pub anchors: Vec<Anchor>,
-    /// For how many places on the surface the residual flexibility is baked, spread evenly; at most one a vertex.
-    /// Default: `None`, one at every vertex; for very large bodies, where that would take long, 64 to 512.
+    /// Number of surface sites for which the residual flexibility is baked, at most one per vertex.
+    ///
+    /// The sites are spread evenly. Default: `None`, one site at every vertex. For very large
+    /// bodies, where that takes long, use 64 to 512.
     pub sites: Option<usize>,
-    /// Radii of the patches at each of these places, as shares of the body's largest extent. Between them the flexibility is interpolated.
-    /// Default: 0.02, 0.028, 0.04, 0.056, 0.08, 0.113, 0.16.
+    /// Radii of the patches at each site, as fractions of the body's largest extent.
+    ///
+    /// The flexibility is interpolated between these radii. Default: 0.02, 0.028, 0.04, 0.056,
+    /// 0.08, 0.113, 0.16.
     pub site_radii: Vec<f64>,
-    /// Folder that gets `K.mtx` and `M.mtx` (MatrixMarket); made when it is not there. Default: none.
+    /// Folder that receives `K.mtx` and `M.mtx` (MatrixMarket). Default: none.
+    ///
+    /// The bake creates the folder when it does not exist.
     pub export_matrices: Option<PathBuf>,
 }
 
@@ -60,20 +71,25 @@ impl Default for BakeConfig {
 }
 
 impl BakeConfig {
-    /// Checks the numbers that need no mesh. [`bake()`](crate::bake()) does so first; a program may before it makes a mesh.
+    /// Checks the numbers that do not depend on the mesh.
+    ///
+    /// [`bake()`](crate::bake()) runs this check first. A program may run the check before it makes
+    /// a mesh.
     ///
     /// # Errors
-    /// [`BakeError::Parameter`] for a number that is not finite or not in its range, for no modes
-    /// or more than [`ModalModel::MAX_MODES`] too.
+    /// Returns [`BakeError::Parameter`] for a number that is not finite or is out of its range.
+    /// Zero modes and more than [`ModalModel::MAX_MODES`] modes are out of range.
     pub fn check(&self) -> Result<(), BakeError> {
         let number = |name, expected, ok: bool, got| {
             if ok { Ok(()) } else { Err(BakeError::Parameter { name, expected, got }) }
         };
-        // Far beyond anything that exists, near enough for the arithmetic to be sound. NaN is in no range.
+        // The ranges extend far beyond real materials, yet the arithmetic stays sound within them.
+        // No range contains NaN.
         let young = self.young;
         number("Young's modulus", "1e-3 to 1e15 Pa", (1e-3..=1e15).contains(&young), young)?;
         let nu = self.poisson;
-        // At both ends one of the moduli vanishes against the other, and with it the digits of the modes.
+        // At both ends one of the moduli vanishes against the other, so the modes lose their
+        // digits.
         number(
             "Poisson ratio",
             "-0.99 to 0.49999 (it lies above -1 and below 0.5)",
@@ -89,7 +105,8 @@ impl BakeConfig {
             Damping::Ratio(zeta) => {
                 number("damping ratio", "0 to 1000", (0.0..=1e3).contains(&zeta), zeta)?;
             }
-            // A law that is younger than this crate: the model's own check has the last word on its coefficients.
+            // This crate does not know newer damping laws. The model's own check validates their
+            // coefficients.
             _ => {}
         }
         for &radius in &self.site_radii {
@@ -114,40 +131,40 @@ impl BakeConfig {
     }
 }
 
-/// The parts of a bake that report their progress.
+/// Stage of a bake that reports its progress.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Stage {
-    /// Elements, ordering, stiffness and mass.
+    /// Makes the elements and the ordering and assembles stiffness and mass.
     Assemble,
-    /// The sparse Cholesky factorisation.
+    /// Computes the sparse Cholesky factorization.
     Factor,
-    /// The eigensolver.
+    /// Runs the eigensolver.
     Modes,
-    /// Residual flexibility and what the surface needs.
+    /// Computes the residual flexibility and the surface data.
     Surface,
 }
 
-/// Seconds spent.
+/// Wall-clock time of each stage of a bake, s.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
 pub struct BakeTimes {
-    /// Elements, ordering, stiffness and mass.
+    /// Time for elements, ordering, stiffness and mass, s.
     pub assemble: f64,
-    /// Symbolic and numeric factorisation.
+    /// Time for the symbolic and numeric factorization, s.
     pub factor: f64,
-    /// The eigensolver.
+    /// Time for the eigensolver, s.
     pub modes: f64,
-    /// Residual flexibility, surface bases, the model itself.
+    /// Time for the residual flexibility, the surface bases and the model itself, s.
     pub surface: f64,
-    /// All of it.
+    /// Time of all stages together, s.
     pub total: f64,
 }
 
-/// A finished bake.
+/// Result of a finished bake.
 #[derive(Clone, Debug)]
 pub struct Bake {
-    /// The model.
+    /// Baked model.
     pub model: ModalModel,
-    /// How long it took.
+    /// Time that the bake took.
     pub times: BakeTimes,
 }
 
@@ -161,7 +178,7 @@ mod tests {
     use super::*;
     use crate::bake;
 
-    /// The corners of what `check` lets through are baked, held and stepped.
+    /// Extreme values that `check` accepts can be baked, grabbed and stepped.
     #[test]
     fn what_is_accepted_can_be_baked_and_stepped() {
         let mesh = shapes::bar([4, 2, 2], [0.4, 0.2, 0.2]).unwrap();

@@ -1,21 +1,22 @@
-//! Element matrices of straight-sided 4-node and 10-node tetrahedra, linear elasticity.
+//! Element matrices of straight-sided 4-node and 10-node tetrahedra for linear elasticity.
 //!
-//! Both elements are affine, so the barycentric gradients are constant and every integral below is exact:
-//! the stiffness integrand is at most quadratic (4-point rule of degree 2), the mass integrand is a polynomial
-//! in the barycentric coordinates, integrated in closed form by
-//! `int L1^a L2^b L3^c L4^d dV = 6 V a! b! c! d! / (a+b+c+d+3)!`.
+//! Both elements are affine, so the barycentric gradients are constant and every integral below is
+//! exact. The stiffness integrand is at most quadratic and is integrated by a 4-point rule of
+//! degree 2. The mass integrand is a polynomial in the barycentric coordinates and is integrated in
+//! closed form by `int L1^a L2^b L3^c L4^d dV = 6 V a! b! c! d! / (a+b+c+d+3)!`.
 
-/// Which tetrahedron the displacement is interpolated on.
+/// Tetrahedral element that interpolates the displacement.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(crate) enum Element {
-    /// 4 nodes, linear displacement.
+    /// Element with 4 nodes and linear displacement.
     Tet4,
-    /// 10 nodes, quadratic displacement: the four corners and the middles of the six edges, straight-sided.
+    /// Straight-sided element with 10 nodes and quadratic displacement. The nodes are the four
+    /// corners and the midpoints of the six edges.
     Tet10,
 }
 
 impl Element {
-    /// Nodes of one element: 4 or 10.
+    /// Returns the number of nodes of one element, 4 or 10.
     pub(crate) const fn node_count(self) -> usize {
         match self {
             Self::Tet4 => 4,
@@ -27,10 +28,10 @@ impl Element {
 /// Corner pairs of the six mid-edge nodes, in the order of nodes 4 to 9 of a 10-node element.
 pub(crate) const EDGES: [[usize; 2]; 6] = [[0, 1], [1, 2], [0, 2], [0, 3], [1, 3], [2, 3]];
 
-/// Largest number of nodes an element has.
+/// Largest number of nodes of an element.
 pub(crate) const MAX_NODES: usize = 10;
 
-/// One affine tetrahedron: its volume (m^3) and the gradients of its barycentric coordinates (1/m).
+/// Affine tetrahedron: its volume (m^3) and the gradients of its barycentric coordinates (1/m).
 #[derive(Clone, Copy, Debug)]
 pub(crate) struct Affine {
     pub(crate) volume: f64,
@@ -38,7 +39,9 @@ pub(crate) struct Affine {
 }
 
 impl Affine {
-    /// From the four corners. The volume is signed: positive when `(b-a) x (c-a) . (d-a) > 0`.
+    /// Makes the tetrahedron from its four corners.
+    ///
+    /// The volume is signed: it is positive when `(b-a) x (c-a) . (d-a) > 0`.
     pub(crate) fn new(corners: [[f64; 3]; 4]) -> Self {
         let [a, b, c, d] = corners;
         let (u, v, w) = (sub(b, a), sub(c, a), sub(d, a));
@@ -51,7 +54,7 @@ impl Affine {
         Self { volume: six_volume / 6.0, gradients: [g0, g1, g2, g3] }
     }
 
-    /// Gradients of the element's shape functions at barycentric coordinates `l`, 1/m.
+    /// Returns the gradients of the element's shape functions at barycentric coordinates `l`, 1/m.
     pub(crate) fn shape_gradients(&self, element: Element, l: [f64; 4]) -> [[f64; 3]; MAX_NODES] {
         let g = &self.gradients;
         let mut out = [[0.0; 3]; MAX_NODES];
@@ -70,7 +73,7 @@ impl Affine {
     }
 }
 
-/// Shape functions of the element at barycentric coordinates `l`.
+/// Returns the shape functions of the element at barycentric coordinates `l`.
 pub(crate) fn shape(element: Element, l: [f64; 4]) -> [f64; MAX_NODES] {
     let mut out = [0.0; MAX_NODES];
     match element {
@@ -87,10 +90,11 @@ pub(crate) fn shape(element: Element, l: [f64; 4]) -> [f64; MAX_NODES] {
     out
 }
 
-/// Points of the quadrature that integrates the stiffness exactly, and their common weight as a share of the volume.
+/// Returns the points of the quadrature that integrates the stiffness exactly, and their common
+/// weight as a fraction of the volume.
 pub(crate) fn stiffness_points(element: Element) -> (&'static [[f64; 4]], f64) {
     const CENTRE: [[f64; 4]; 1] = [[0.25; 4]];
-    // Degree 2: a = (5 + 3 sqrt 5) / 20, b = (5 - sqrt 5) / 20.
+    // Quadrature rule of degree 2: a = (5 + 3 sqrt 5) / 20, b = (5 - sqrt 5) / 20.
     const A: f64 = 0.585_410_196_624_968_5;
     const B: f64 = 0.138_196_601_125_010_5;
     const FOUR: [[f64; 4]; 4] = [[A, B, B, B], [B, A, B, B], [B, B, A, B], [B, B, B, A]];
@@ -100,11 +104,14 @@ pub(crate) fn stiffness_points(element: Element) -> (&'static [[f64; 4]], f64) {
     }
 }
 
-/// One element's stiffness as 3x3 blocks, row by row: block (i, j) at `(i * MAX_NODES + j) * 9`.
+/// Stiffness of one element as 3x3 blocks, row by row: block (i, j) is at
+/// `(i * MAX_NODES + j) * 9`.
 pub(crate) type Stiffness = [f64; MAX_NODES * MAX_NODES * 9];
 
-/// Stiffness with Lame constants `lambda` and `mu` (Pa):
-/// `K_ij[k][l] = int lambda d_k N_i d_l N_j + mu (d_l N_i d_k N_j + delta_kl grad N_i . grad N_j) dV`, N/m.
+/// Computes the element stiffness with the Lame constants `lambda` and `mu` (Pa), N/m.
+///
+/// The equation is `K_ij[k][l] =`
+/// `int lambda d_k N_i d_l N_j + mu (d_l N_i d_k N_j + delta_kl grad N_i . grad N_j) dV`.
 pub(crate) fn stiffness(element: Element, affine: &Affine, lambda: f64, mu: f64, out: &mut Stiffness) {
     let nodes = element.node_count();
     out.fill(0.0);
@@ -136,7 +143,8 @@ pub(crate) fn stiffness(element: Element, affine: &Affine, lambda: f64, mu: f64,
     }
 }
 
-/// `int N_a^lin grad N_i dV` for the four corners `a`: what the nodal-averaged pressure needs, m^2.
+/// Returns `int N_a^lin grad N_i dV` for the four corners `a`, m^2. The nodal-averaged pressure
+/// uses these integrals.
 pub(crate) fn pressure_gradients(element: Element, affine: &Affine) -> [[[f64; 3]; MAX_NODES]; 4] {
     let mut out = [[[0.0; 3]; MAX_NODES]; 4];
     let (points, weight) = stiffness_points(element);
@@ -154,8 +162,11 @@ pub(crate) fn pressure_gradients(element: Element, affine: &Affine) -> [[[f64; 3
     out
 }
 
-/// Consistent mass of a unit-density, unit-volume element: entry (i, j) at `i * MAX_NODES + j`. It is the same for
-/// every affine element up to the factor density x volume, and acts on each axis alike.
+/// Returns the consistent mass of an element of unit density and unit volume: entry (i, j) is at
+/// `i * MAX_NODES + j`.
+///
+/// The matrix is the same for every affine element up to the factor density x volume, and acts on
+/// each axis alike.
 pub(crate) fn unit_mass(element: Element) -> [f64; MAX_NODES * MAX_NODES] {
     let mut out = [0.0; MAX_NODES * MAX_NODES];
     for i in 0..element.node_count() {
@@ -174,7 +185,7 @@ pub(crate) fn unit_mass(element: Element) -> [f64; MAX_NODES * MAX_NODES] {
     out
 }
 
-/// A shape function as (coefficient, exponents of the barycentric coordinates).
+/// Returns a shape function as (coefficient, exponents of the barycentric coordinates) terms.
 fn monomials(element: Element, node: usize) -> Vec<(f64, [usize; 4])> {
     let power = |a: usize, n: usize| {
         let mut e = [0; 4];
@@ -247,7 +258,7 @@ mod tests {
                     xx += m[i * MAX_NODES + j] * position(i)[0] * position(j)[0];
                 }
             }
-            // int x^2 over a simplex = V/20 (sum x_i^2 + (sum x_i)^2).
+            // The exact integral over a simplex is int x^2 = V/20 (sum x_i^2 + (sum x_i)^2).
             let s: f64 = SKEW.iter().map(|p| p[0]).sum();
             let s2: f64 = SKEW.iter().map(|p| p[0] * p[0]).sum();
             assert!((total - 1.0).abs() < 1e-14, "{element:?}");
@@ -288,7 +299,7 @@ mod tests {
             };
             assert!(energy(&|_| [1.0, 2.0, 3.0]).abs() < 1e-12, "translation, {element:?}");
             assert!(energy(&|p| cross([0.3, -0.7, 0.2], p)).abs() < 1e-12, "rotation, {element:?}");
-            // u = (x, 0, 0): energy density lambda + 2 mu; u = (y, 0, 0): mu.
+            // The energy density is lambda + 2 mu for u = (x, 0, 0) and mu for u = (y, 0, 0).
             let stretch = energy(&|p| [p[0], 0.0, 0.0]) / affine.volume;
             let shear = energy(&|p| [p[1], 0.0, 0.0]) / affine.volume;
             assert!((stretch - (lambda + 2.0 * mu)).abs() < 1e-12, "{stretch}, {element:?}");

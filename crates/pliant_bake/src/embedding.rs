@@ -1,10 +1,12 @@
-//! Where a point lies in the tetrahedra: a uniform grid over their boxes.
+//! Locates points in the tetrahedra with a uniform grid over their bounding boxes.
 
 use crate::element::{dot, sub};
 use crate::fem::FeMesh;
 
-/// A place in an element: barycentric coordinates of the nearest point of it, and what is left from there to the
-/// point asked for, m (zero inside).
+/// Nearest point of an element to a query point.
+///
+/// `barycentric` holds the coordinates of the nearest point. `offset` is the vector from the
+/// nearest point to the query point, m, and is zero inside the element.
 #[derive(Clone, Copy, Debug)]
 pub(crate) struct Place {
     pub(crate) element: usize,
@@ -13,20 +15,20 @@ pub(crate) struct Place {
 }
 
 impl Place {
-    /// Distance from the element, m.
+    /// Returns the distance from the element, m.
     pub(crate) fn distance(&self) -> f64 {
         dot(self.offset, self.offset).sqrt()
     }
 }
 
-/// Finds the element that holds a point, or the nearest one.
+/// Finds the element that contains a point, or the nearest element.
 #[derive(Debug)]
 pub(crate) struct Locator<'a> {
     mesh: &'a FeMesh,
     low: [f64; 3],
     cell: f64,
     counts: [usize; 3],
-    /// Elements of each grid cell.
+    /// Start of each grid cell's list in `elements`.
     offsets: Vec<usize>,
     elements: Vec<u32>,
 }
@@ -42,7 +44,8 @@ impl<'a> Locator<'a> {
         }
         let extent = [0, 1, 2].map(|k| high[k] - low[k]);
         let count = mesh.affine.len().max(1) as f64;
-        // About two elements' edge; never more than 128 cells along an axis.
+        // A cell has about four times the mean volume of an element. No axis has more than 128
+        // cells.
         let volume: f64 = extent.iter().product();
         let cell = (4.0 * volume / count).cbrt().max(extent.iter().fold(0.0, |a: f64, &b| a.max(b)) / 128.0);
         let counts = extent.map(|e| ((e / cell).ceil() as usize).max(1));
@@ -78,14 +81,15 @@ impl<'a> Locator<'a> {
         [0, 1, 2].map(|k| (((p[k] - self.low[k]) / self.cell).max(0.0) as usize).min(self.counts[k] - 1))
     }
 
-    /// The nearest place; `None` only for a mesh without elements.
+    /// Returns the nearest place. Returns `None` only for a mesh without elements.
     pub(crate) fn find(&self, p: [f64; 3]) -> Option<Place> {
         let center = self.cell_of(p);
         let mut best: Option<Place> = None;
         let furthest = self.counts.iter().copied().max().unwrap_or(0);
         for ring in 0..=furthest {
             if let Some(place) = &best {
-                // Everything in this ring is at least so far from the cell that holds, or is nearest to, the point.
+                // Every element that only this ring or a later ring contains is at least `reach`
+                // away from the point.
                 let reach = (ring as f64 - 1.0) * self.cell;
                 if place.distance() <= reach.max(0.0) {
                     break;
@@ -125,7 +129,8 @@ impl<'a> Locator<'a> {
     fn barycentric(&self, element: usize, p: [f64; 3]) -> [f64; 4] {
         let corners = self.corners(element);
         let g = &self.mesh.affine[element].gradients;
-        // From the corner that each coordinate does not belong to: no cancellation for far-off origins.
+        // Each coordinate is measured from a corner where it vanishes. This avoids cancellation for
+        // meshes far from the origin.
         [0, 1, 2, 3].map(|a| dot(g[a], sub(p, corners[(a + 1) % 4])))
     }
 
@@ -147,7 +152,7 @@ impl<'a> Locator<'a> {
     }
 }
 
-/// Nearest point of a triangle (Ericson, Real-Time Collision Detection, 5.1.5).
+/// Returns the nearest point of a triangle (Ericson, Real-Time Collision Detection, 5.1.5).
 fn nearest_on_triangle([a, b, c]: [[f64; 3]; 3], p: [f64; 3]) -> [f64; 3] {
     let at = |u: f64, v: f64| [0, 1, 2].map(|k| a[k] + u * (b[k] - a[k]) + v * (c[k] - a[k]));
     let (ab, ac, ap) = (sub(b, a), sub(c, a), sub(p, a));

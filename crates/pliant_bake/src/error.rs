@@ -1,22 +1,22 @@
-//! Why a body cannot be baked.
+//! Errors of a bake.
 
 use std::path::PathBuf;
 
 use pliant_mesh::MeshError;
 use pliant_modal::ModelError;
 
-/// Why a body cannot be baked: what was expected, what came, and where.
+/// Reason why a body cannot be baked, with the expected value, the received value and the place.
 #[derive(Debug, thiserror::Error)]
 #[non_exhaustive]
 pub enum BakeError {
     /// A material or damping number is out of its range.
     #[error("{name}: expected {expected}, got {got}")]
     Parameter {
-        /// Which number.
+        /// Name of the number.
         name: &'static str,
-        /// Its range.
+        /// Accepted range of the number.
         expected: &'static str,
-        /// What came.
+        /// Received value.
         got: f64,
     },
     /// The number of modes does not fit the body.
@@ -24,25 +24,25 @@ pub enum BakeError {
         "modes: expected 1 to {most} for a body of {dofs} free degrees of freedom ({rigid} of them rigid), got {got}"
     )]
     Modes {
-        /// What came.
+        /// Requested number of modes.
         got: usize,
-        /// The largest number that would do.
+        /// Largest possible number of modes.
         most: usize,
         /// Degrees of freedom that are not anchored.
         dofs: usize,
-        /// 6 for a free body, 0 for an anchored one.
+        /// Number of rigid modes: 6 for a free body, 0 for an anchored one.
         rigid: usize,
     },
-    /// An element that this crate has no matrices for.
+    /// The crate has no matrices for this element.
     #[error("element: expected tet4 or tet10, got {got}")]
     Element {
-        /// What came.
+        /// Name of the requested element.
         got: String,
     },
-    /// The tetrahedra are no sound mesh.
+    /// The tetrahedra are not a valid mesh.
     #[error("the tetrahedra: {0}")]
     Mesh(#[source] MeshError),
-    /// The skin is no sound surface.
+    /// The skin is not a valid surface.
     #[error("the skin: {0}")]
     Skin(#[source] MeshError),
     /// A vertex of the skin lies too far from the tetrahedra to move with them.
@@ -50,55 +50,55 @@ pub enum BakeError {
         "skin vertex {vertex} at {at:?} is {distance} m away from the tetrahedra: expected at most {allowed} m"
     )]
     SkinFar {
-        /// The vertex.
+        /// Index of the vertex.
         vertex: usize,
-        /// Where it is, m.
+        /// Position of the vertex, m.
         at: [f64; 3],
-        /// Its distance, m.
+        /// Distance of the vertex from the tetrahedra, m.
         distance: f64,
-        /// A tenth of the body's largest extent, m.
+        /// Largest accepted distance, a tenth of the body's largest extent, m.
         allowed: f64,
     },
-    /// An anchor holds no node.
+    /// An anchor contains no node.
     #[error("anchor `{anchor}` holds nothing: the body spans {low} to {high} m along that axis")]
     AnchorHoldsNothing {
-        /// The anchor.
+        /// Text of the anchor.
         anchor: String,
         /// Lowest coordinate of the body along the anchor's axis, m.
         low: f64,
-        /// Highest coordinate, m.
+        /// Highest coordinate of the body along the anchor's axis, m.
         high: f64,
     },
-    /// The anchors hold every node.
+    /// The anchors contain every node.
     #[error("the anchors {anchors} hold all {nodes} nodes: expected some part of the body to be left free")]
     AnchorHoldsEverything {
-        /// The anchors.
+        /// Texts of the anchors.
         anchors: String,
-        /// Nodes of the body.
+        /// Number of nodes of the body.
         nodes: usize,
     },
-    /// The anchored nodes lie in one point or on one line: the body can still turn.
+    /// The anchored nodes of a part lie in one point or on one line, so the part can still turn.
     #[error(
         "the anchors {anchors} hold only {nodes} nodes, in a point or on a line near {at:?}: the part there can still turn; expected three nodes off a line at least"
     )]
     AnchorTooThin {
-        /// The anchors.
+        /// Texts of the anchors.
         anchors: String,
-        /// Nodes held.
+        /// Number of anchored nodes in the part.
         nodes: usize,
-        /// Where, m.
+        /// Mean position of these nodes, m.
         at: [f64; 3],
     },
-    /// The mesh falls into parts that are not connected, and a part has no anchor of its own.
+    /// The mesh has several parts that are not connected, and one part has no anchor of its own.
     #[error(
         "the mesh has {parts} parts that do not hang together; the one near {at:?} ({nodes} nodes) has no anchor: expected one part, or an anchor on each"
     )]
     LooseParts {
-        /// How many parts.
+        /// Number of connected parts.
         parts: usize,
-        /// A node of the loose one, m.
+        /// Position of one node of the loose part, m.
         at: [f64; 3],
-        /// Its nodes.
+        /// Number of nodes of the loose part.
         nodes: usize,
     },
     /// The stiffness matrix is not positive definite in floating point arithmetic.
@@ -106,47 +106,47 @@ pub enum BakeError {
         "the stiffness is not positive definite near {at:?}: tetrahedra there are too thin for the material"
     )]
     NotPositive {
-        /// The node where it was noticed, m.
+        /// Position of the node where the factorization failed, m.
         at: [f64; 3],
     },
-    /// The eigensolver gave up.
+    /// The eigensolver did not converge.
     #[error("the modes did not converge")]
     NoConvergence,
-    /// The eigensolver has missed modes, and did not find them in several rounds either.
+    /// The eigensolver missed modes and did not find them in several further rounds.
     #[error("the modes: there are {modes} below {hertz} Hz, and {found} were found")]
     MissedModes {
-        /// How many there are.
+        /// Number of modes below the frequency.
         modes: usize,
-        /// How many of them were found.
+        /// Number of these modes that the solver found.
         found: usize,
-        /// Below which frequency, Hz.
+        /// Frequency below which the modes were counted, Hz.
         hertz: f64,
     },
-    /// Rounding hides whether the eigensolver has missed modes.
+    /// Rounding errors prevent the check for missed modes.
     #[error("the modes up to {hertz} Hz cannot be counted: the mesh is too ill-shaped for these modes")]
     UncountedModes {
         /// The frequency of the last mode, Hz.
         hertz: f64,
     },
-    /// The modes are not as accurate as every bake must be.
+    /// The modes are less accurate than every bake requires.
     #[error("{what} is {got:e}: expected at most {expected:e}; the mesh is too ill-shaped for these modes")]
     Inaccurate {
-        /// `|K phi - lambda M phi| / |K phi|` or `|Phi^T M Phi - I|`.
+        /// Name of the error measure: `|K phi - lambda M phi| / |K phi|` or `|Phi^T M Phi - I|`.
         what: &'static str,
-        /// What came out.
+        /// Measured value.
         got: f64,
-        /// The limit.
+        /// Largest accepted value.
         expected: f64,
     },
     /// The matrices could not be written.
     #[error("cannot write {path}: {source}")]
     Export {
-        /// The file.
+        /// Path of the file.
         path: PathBuf,
-        /// What the system said.
+        /// Error of the operating system.
         source: std::io::Error,
     },
-    /// The parts do not make a model.
+    /// The baked parts do not form a valid model.
     #[error("the model: {0}")]
     Model(#[from] ModelError),
 }

@@ -1,7 +1,9 @@
-//! Sparse Cholesky factorisation by the multifrontal method (Duff and Reid 1983), dense work by faer's kernels.
+//! Sparse Cholesky factorization by the multifrontal method (Duff and Reid 1983). faer's kernels do
+//! the dense work.
 //!
-//! Subtrees of the elimination tree are factored in parallel; the fronts above them are cut into strips. Every number is
-//! computed by the same operations in the same order whatever the number of threads, so results are equal to the bit.
+//! The subtrees of the elimination tree are factored in parallel. The fronts above them are split
+//! into strips. Every number is computed by the same operations in the same order for any number of
+//! threads, so the results are equal to the bit.
 
 use faer::dyn_stack::{MemBuffer, MemStack};
 use faer::linalg::cholesky::llt::factor as dense_llt;
@@ -15,27 +17,27 @@ use rayon::prelude::*;
 use crate::sparse::BlockCsr;
 use crate::symbolic::{ROOT, Supernode, Symbolic};
 
-/// Columns per strip and panel of dense work.
+/// Number of columns per strip and per panel of dense work.
 pub(crate) const STRIP: usize = 128;
 
-/// Rows per strip of a tall product.
+/// Number of rows per strip of a tall product.
 const TALL_STRIP: usize = 512;
 
-/// `A = L L^T`, `A` symmetric positive definite in elimination order.
+/// Cholesky factor `A = L L^T` of a symmetric positive definite `A` in elimination order.
 #[derive(Clone, Debug)]
 pub(crate) struct Factor {
     pub(crate) symbolic: Symbolic,
     pub(crate) values: Vec<f64>,
 }
 
-/// A pivot that is not positive: the node (in elimination order) where it was met.
+/// Error for a pivot that is not positive, with its node in elimination order.
 #[derive(Clone, Copy, Debug)]
 pub(crate) struct NotPositive {
     pub(crate) node: usize,
 }
 
 impl Factor {
-    /// Factors the stiffness of `matrix` with `springs` (dof, N/m) added on its diagonal.
+    /// Factors the stiffness of `matrix` with `springs` (dof, N/m) added to its diagonal.
     pub(crate) fn new(
         symbolic: Symbolic,
         matrix: &BlockCsr,
@@ -43,7 +45,7 @@ impl Factor {
     ) -> Result<Self, NotPositive> {
         let mut values = vec![0.0; symbolic.values];
         let mut updates: Vec<Vec<f64>> = vec![Vec::new(); symbolic.supernodes.len()];
-        // Each task owns the values of its supernodes: they are contiguous.
+        // Each task owns the values of its supernodes, which are contiguous.
         let mut slices = Vec::with_capacity(symbolic.tasks.len());
         let mut rest: &mut [f64] = &mut values;
         let mut offset = 0;
@@ -97,13 +99,13 @@ impl Factor {
         MatRef::from_column_major_slice(values, s.width() + s.below(), s.width())
     }
 
-    /// `x := A^-1 x` for a block of `width` vectors stored row by row.
+    /// Computes `x := A^-1 x` for a block of `width` vectors stored row by row.
     pub(crate) fn solve(&self, x: &mut [f64], width: usize) {
         self.forward(x, width);
         self.backward(x, width);
     }
 
-    /// `x := L^-1 x`.
+    /// Computes `x := L^-1 x`.
     pub(crate) fn forward(&self, x: &mut [f64], width: usize) {
         let outsides: Vec<(usize, Vec<f64>)> = self
             .task_slices(x, width)
@@ -115,7 +117,7 @@ impl Factor {
                 for s in &self.symbolic.supernodes[task] {
                     let at = 3 * (s.first - first) * width;
                     let top = &mut own[at..at + s.width() * width];
-                    // A load on a few nodes leaves most subtrees at rest.
+                    // A load on a few nodes leaves most subtrees at zero.
                     if top.iter().all(|&x| x == 0.0) {
                         continue;
                     }
@@ -155,7 +157,7 @@ impl Factor {
         }
     }
 
-    /// `x := L^-T x`.
+    /// Computes `x := L^-T x`.
     pub(crate) fn backward(&self, x: &mut [f64], width: usize) {
         let mut scratch = Vec::new();
         for &s in self.symbolic.top.iter().rev() {
@@ -196,7 +198,7 @@ impl Factor {
         });
     }
 
-    /// The part of `x` that each task owns, with its first node.
+    /// Returns the part of `x` that each task owns, with the first node of that part.
     fn task_slices<'x>(&self, x: &'x mut [f64], width: usize) -> Vec<TaskSlice<'x>> {
         let mut out = Vec::with_capacity(self.symbolic.tasks.len());
         let mut rest = x;
@@ -214,8 +216,10 @@ impl Factor {
         out
     }
 
-    /// Solves with the front's triangle and leaves minus the rest's product in `below`, stored column by column: the
-    /// layout that dense products are fastest in.
+    /// Solves with the front's triangle and stores the negative product of the remaining rows in
+    /// `below`.
+    ///
+    /// `below` is stored column by column, because dense products are fastest in this layout.
     fn forward_front(&self, s: &Supernode, top: &mut [f64], below: &mut [f64], width: usize) {
         let block = self.block(s);
         let columns = s.width();
@@ -250,7 +254,7 @@ impl Factor {
         }
     }
 
-    /// Subtracts the product with what lies below and solves with the front's transposed triangle.
+    /// Subtracts the product with the rows below and solves with the front's transposed triangle.
     fn backward_front(&self, s: &Supernode, top: &mut [f64], below: &[f64], width: usize) {
         let block = self.block(s);
         let columns = s.width();
@@ -288,7 +292,7 @@ impl Factor {
 
 type TaskSlice<'x> = (std::ops::Range<usize>, usize, &'x mut [f64]);
 
-/// Strips of `STRIP` rows of a block of vectors, numbered.
+/// Splits a block of vectors into numbered strips of `STRIP` rows.
 fn strips(x: &mut [f64], width: usize) -> impl IndexedParallelIterator<Item = (usize, &mut [f64])> {
     x.par_chunks_mut(STRIP * width).enumerate()
 }
@@ -300,7 +304,7 @@ fn add_rows(to: &mut [f64], node: usize, from: &[f64], from_node: usize, width: 
     }
 }
 
-/// As [`add_rows`], from a block stored column by column with `height` rows.
+/// Adds rows as [`add_rows`] does, from a block of `height` rows stored column by column.
 fn add_from_columns(
     to: &mut [f64],
     node: usize,
@@ -327,8 +331,10 @@ fn value_range(symbolic: &Symbolic, task: &std::ops::Range<usize>) -> (usize, us
     (symbolic.supernodes[task.start].at, last.at + last.values())
 }
 
-/// Assembles and factors one front; returns the update matrix for its parent (column-major, lower triangle). `spare` keeps
-/// the memory of update matrices that have been used up.
+/// Assembles and factors one front. Returns the update matrix for the parent (column-major, lower
+/// triangle).
+///
+/// `spare` keeps the memory of used update matrices for reuse.
 fn front(
     symbolic: &Symbolic,
     s: usize,
@@ -345,8 +351,9 @@ fn front(
     Ok(if supernode.parent == ROOT { Vec::new() } else { update })
 }
 
-/// One front of `K - shift M` with what its children have left for it, in `block` and the update
-/// matrix.
+/// Assembles one front of `K - shift M` with the updates of its children.
+///
+/// Writes the eliminated columns into `block` and returns the update matrix.
 pub(crate) fn assemble_front(
     symbolic: &Symbolic,
     s: usize,
@@ -361,7 +368,7 @@ pub(crate) fn assemble_front(
     let (width, below) = (supernode.width(), supernode.below());
     let height = width + below;
     let end = supernode.first + supernode.columns;
-    // Original entries: lower triangle of the columns eliminated here.
+    // The original entries are the lower triangle of the columns that this front eliminates.
     for node in supernode.first..end {
         let column = 3 * (node - supernode.first);
         let mut place = 0;
@@ -378,7 +385,7 @@ pub(crate) fn assemble_front(
                 }
                 width + 3 * place
             };
-            // The stored block couples (node, other); its transpose belongs at (other, node).
+            // The stored block couples (node, other), so its transpose belongs at (other, node).
             let k = &matrix.stiffness[9 * at..][..9];
             for l in 0..3 {
                 for m in 0..3 {
@@ -406,7 +413,7 @@ pub(crate) fn assemble_front(
         extend_add(supernode, &symbolic.supernodes[child], &child_update, block, &mut update);
         spare.push(child_update);
     }
-    // The largest is taken first.
+    // The next front takes the buffer with the largest capacity first.
     spare.sort_by_key(Vec::capacity);
     update
 }
@@ -452,8 +459,10 @@ fn extend_add(parent: &Supernode, child: &Supernode, from: &[f64], block: &mut [
     }
 }
 
-/// Dense partial factorisation: `width` columns of height `width + below`, and the update `-= L21 L21^T`. On failure the
-/// local column.
+/// Computes the dense partial factorization of `width` columns of height `width + below` and the
+/// update `-= L21 L21^T`.
+///
+/// On failure returns the local column.
 fn factor_front(block: &mut [f64], update: &mut [f64], width: usize, below: usize) -> Result<(), usize> {
     let height = width + below;
     for start in (0..width).step_by(STRIP) {
@@ -482,7 +491,7 @@ fn factor_front(block: &mut [f64], update: &mut [f64], width: usize, below: usiz
             continue;
         }
         let under = under.into_const();
-        // Columns of this front still to come.
+        // These are the columns of this front that are not factored yet.
         rest[..(width - end) * height].par_chunks_mut(STRIP * height).enumerate().for_each(
             |(index, strip)| {
                 let first = index * STRIP;
@@ -506,8 +515,10 @@ fn factor_front(block: &mut [f64], update: &mut [f64], width: usize, below: usiz
     Ok(())
 }
 
-/// `strip -= lower right^T`, on and below the diagonal only. The product is symmetric there:
-/// `right` is the head of `lower`, its columns perhaps with other signs.
+/// Computes `strip -= lower right^T` on and below the diagonal only.
+///
+/// The product is symmetric there: `right` is the head of `lower`, possibly with other signs of its
+/// columns.
 pub(crate) fn subtract_product(strip: MatMut<'_, f64>, lower: MatRef<'_, f64>, right: MatRef<'_, f64>) {
     let columns = strip.ncols();
     let (on, under) = strip.split_at_row_mut(columns);

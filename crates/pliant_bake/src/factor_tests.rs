@@ -2,7 +2,7 @@ use super::*;
 use crate::element::Element;
 use crate::fem::{ANCHORED, FeMesh, Law};
 use crate::{ordering, symbolic};
-/// A bar with its face x = 0 anchored, in elimination order.
+/// Makes a bar with its face x = 0 anchored, in elimination order.
 pub(crate) fn bar(
     cells: [usize; 3],
     element: Element,

@@ -1,6 +1,7 @@
 //! The finite element mesh, its graph, and the assembly of stiffness and mass.
 //!
-//! Assembly is deterministic: element matrices are made in parallel, batch by batch, and added in element order.
+//! The assembly is deterministic: element matrices are computed in parallel, batch by batch, and
+//! added in element order.
 
 use pliant_mesh::TetMesh;
 use rayon::prelude::*;
@@ -8,27 +9,28 @@ use rayon::prelude::*;
 use crate::element::{self, Affine, EDGES, Element, MAX_NODES};
 use crate::sparse::BlockCsr;
 
-/// Marks an anchored node in a numbering.
+/// Row number that marks an anchored node.
 pub(crate) const ANCHORED: u32 = u32::MAX;
 
-/// Above this Poisson ratio the pressure is averaged over each node's neighbourhood.
+/// Poisson ratio above which the pressure is averaged over each node's neighborhood.
 pub(crate) const LOCKING_POISSON: f64 = 0.45;
 
-/// Nodes and elements of the chosen order. The corners keep the numbers of the tetrahedral mesh; mid-edge nodes follow.
+/// Nodes and elements of the chosen order. The corners keep their numbers of the tetrahedral mesh,
+/// and the mid-edge nodes follow.
 #[derive(Clone, Debug)]
 pub(crate) struct FeMesh {
     pub(crate) element: Element,
     pub(crate) nodes: Vec<[f64; 3]>,
-    /// How many of `nodes` are corners.
+    /// Number of corners, which are the first entries of `nodes`.
     pub(crate) corners: usize,
-    /// `element.node_count()` node numbers per element.
+    /// Node numbers of the elements, `element.node_count()` per element.
     pub(crate) connectivity: Vec<u32>,
     /// Volume and barycentric gradients of each element.
     pub(crate) affine: Vec<Affine>,
 }
 
 impl FeMesh {
-    /// The mesh must have passed `TetMesh::check`.
+    /// Makes the elements of a mesh that has passed `TetMesh::check`.
     pub(crate) fn new(mesh: &TetMesh, element: Element) -> Self {
         let corner = |i: u32| mesh.nodes[i as usize];
         let affine = mesh.tets.par_iter().map(|t| Affine::new(t.map(corner))).collect();
@@ -59,18 +61,21 @@ impl FeMesh {
         Self { element, nodes, corners, connectivity, affine }
     }
 
-    /// Node numbers of each element.
+    /// Iterates over the node numbers of each element.
     pub(crate) fn elements(&self) -> std::slice::ChunksExact<'_, u32> {
         self.connectivity.chunks_exact(self.element.node_count())
     }
 
-    /// For each node the elements it belongs to, ascending, as offsets and a flat list.
+    /// Returns for each node the elements that contain the node, in ascending order.
     pub(crate) fn elements_of_nodes(&self) -> Lists {
         Lists::invert(self.elements().map(|nodes| nodes.iter().copied()), self.nodes.len())
     }
 
-    /// The graph of the stiffness matrix: for each node the nodes it couples with, itself included, ascending.
-    /// With `wide`, nodes couple through each corner's whole neighbourhood, as nodal-averaged pressure needs.
+    /// Returns the graph of the stiffness matrix: for each node its coupled nodes, the node itself
+    /// included, in ascending order.
+    ///
+    /// With `wide`, nodes couple through the whole neighborhood of each corner, which the
+    /// nodal-averaged pressure requires.
     pub(crate) fn graph(&self, wide: bool) -> Lists {
         let around = self.elements_of_nodes();
         let per = self.element.node_count();
@@ -97,8 +102,10 @@ impl FeMesh {
         })
     }
 
-    /// Assembles stiffness (N/m) and consistent mass (kg) of the nodes that `number` does not mark as anchored; `graph`
-    /// is the pattern in that numbering.
+    /// Assembles stiffness (N/m) and consistent mass (kg) of the nodes that `number` does not mark
+    /// as anchored.
+    ///
+    /// `graph` is the sparsity pattern in that numbering.
     pub(crate) fn assemble(&self, law: &Law, number: &[u32], graph: &Lists) -> BlockCsr {
         const BATCH: usize = 512;
         let per = self.element.node_count();
@@ -139,10 +146,12 @@ impl FeMesh {
         out
     }
 
-    /// Volumetric stiffness with nodal-averaged pressure: `sum_a lambda / V_a d_a d_a^T`, where
-    /// `d_a . u = int N_a div u dV` and `V_a = int N_a dV` over the elements around corner `a`.
-    /// (Bonet and Burton 1998 for linear tetrahedra; for quadratic ones this is the Taylor-Hood pair with a lumped
-    /// pressure mass, so neither locks as the Poisson ratio goes to 1/2.)
+    /// Adds the volumetric stiffness with nodal-averaged pressure, `sum_a lambda / V_a d_a d_a^T`.
+    ///
+    /// Here `d_a . u = int N_a div u dV` and `V_a = int N_a dV` over the elements around corner
+    /// `a`. The method is due to Bonet and Burton (1998) for linear tetrahedra. For quadratic
+    /// tetrahedra it is the Taylor-Hood pair with a lumped pressure mass. Neither element therefore
+    /// locks as the Poisson ratio approaches 1/2.
     fn add_averaged_pressure(&self, lambda: f64, number: &[u32], out: &mut BlockCsr) {
         let around = self.elements_of_nodes();
         let per = self.element.node_count();
@@ -186,7 +195,8 @@ impl FeMesh {
         }
     }
 
-    /// `M 1` per node over all nodes, anchored ones included: the mass that a uniform field moves at each node, kg.
+    /// Returns `M 1` per node over all nodes, anchored nodes included: the mass that a uniform
+    /// field moves at each node, kg.
     pub(crate) fn nodal_mass(&self, density: f64) -> Vec<f64> {
         let unit_mass = element::unit_mass(self.element);
         let mut out = vec![0.0; self.nodes.len()];
@@ -199,26 +209,26 @@ impl FeMesh {
         out
     }
 
-    /// Volume of the mesh, m^3.
+    /// Returns the volume of the mesh, m^3.
     pub(crate) fn volume(&self) -> f64 {
         self.affine.iter().map(|a| a.volume).sum()
     }
 }
 
-/// What the assembly needs of the material.
+/// Material constants for the assembly.
 #[derive(Clone, Copy, Debug)]
 pub(crate) struct Law {
     /// First Lame constant, Pa.
     pub(crate) lambda: f64,
     /// Shear modulus, Pa.
     pub(crate) mu: f64,
-    /// kg/m^3.
+    /// Density, kg/m^3.
     pub(crate) density: f64,
-    /// Use nodal-averaged pressure.
+    /// Whether the pressure is averaged over nodes.
     pub(crate) average_pressure: bool,
 }
 
-/// Lists of numbers in one array: list `i` is `items[offsets[i]..offsets[i + 1]]`.
+/// Lists of numbers in one array. List `i` is `items[offsets[i]..offsets[i + 1]]`.
 #[derive(Clone, Debug, Default, PartialEq, Eq)]
 pub(crate) struct Lists {
     pub(crate) offsets: Vec<usize>,
@@ -226,17 +236,18 @@ pub(crate) struct Lists {
 }
 
 impl Lists {
-    /// How many lists.
+    /// Returns the number of lists.
     pub(crate) fn len(&self) -> usize {
         self.offsets.len() - 1
     }
 
-    /// List `i`.
+    /// Returns list `i`.
     pub(crate) fn of(&self, i: usize) -> &[u32] {
         &self.items[self.offsets[i]..self.offsets[i + 1]]
     }
 
-    /// For each member below `members`, the numbers of the groups that hold it, ascending.
+    /// Returns for each member below `members` the numbers of the groups that contain the member,
+    /// in ascending order.
     fn invert<G: Iterator<Item = u32>>(groups: impl Iterator<Item = G> + Clone, members: usize) -> Self {
         let mut offsets = vec![0; members + 1];
         for group in groups.clone() {
@@ -258,7 +269,7 @@ impl Lists {
         Self { offsets, items }
     }
 
-    /// List `i` is the sorted union of the slices that `each(i, visit)` visits.
+    /// Makes lists where list `i` is the sorted union of the slices that `each(i, visit)` visits.
     fn unions(count: usize, each: impl Fn(usize, &mut dyn FnMut(&[u32])) + Sync) -> Self {
         const CHUNK: usize = 1024;
         let chunks: Vec<(Vec<usize>, Vec<u32>)> = (0..count.div_ceil(CHUNK))
@@ -289,7 +300,8 @@ impl Lists {
         out
     }
 
-    /// The graph restricted to the nodes that `number` keeps, in the new numbering (`kept` nodes).
+    /// Restricts the graph to the nodes that `number` keeps and returns the graph in the new
+    /// numbering (`kept` nodes).
     pub(crate) fn renumber(&self, number: &[u32], kept: usize) -> Self {
         let mut old = vec![0usize; kept];
         for (i, &new) in number.iter().enumerate() {

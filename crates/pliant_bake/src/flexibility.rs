@@ -1,4 +1,5 @@
-//! Residual flexibility of patches: what the kept modes leave out of the static compliance at a hand.
+//! Residual flexibility of patches: the part of the static compliance under a hand that the kept
+//! modes leave out.
 
 use faer::Mat;
 use nalgebra::Matrix3;
@@ -12,31 +13,40 @@ use crate::lanczos::Modes;
 use crate::solver::Solver;
 use crate::surface::Skin;
 
-/// Multiplications that the sites may take unless their number is given: a second or two of two cores.
+/// Limit on the multiplications for the sites when their number is not given. This takes one to two
+/// seconds on two cores.
 const BUDGET: f64 = 1.3e11;
 
-/// Numbers that the right-hand sides of one front may take: half a gigabyte, in single precision a quarter.
+/// Limit on the numbers in the right-hand sides of one front: half a gigabyte in double precision,
+/// a quarter in single precision.
 const MEMORY: usize = 64 << 20;
 
-/// Above so many multiplications they are done in single precision: off by some 1e-6 of the compliance.
+/// Number of multiplications above which single precision is used, with a relative error of about
+/// 1e-6 in the compliance.
 const FAST: f64 = 1e10;
 
-/// Where it is much work, and very much, wide patches are baked around some vertices only: they are the costly ones, and hardly change from
-/// one vertex to the next. Radius from which on, as a share of the body's size, and one vertex in how many.
+/// Rules that thin out wide patches when the work is large and when it is very large.
+///
+/// Wide patches are the costly ones and hardly change from one vertex to the next, so they are
+/// baked around some vertices only. Each rule holds a number of multiplications and pairs of a
+/// radius, as a fraction of the body's size, and a stride: from that radius on, one vertex in so
+/// many is used.
 const THIN: [(f64, [(f64, usize); 2]); 2] =
     [(FAST, [(0.1, 4), (f64::MAX, 1)]), (6.0 * FAST, [(0.1, 8), (0.05, 2)])];
 
-/// Places that are baked where not all can be: from, to.
+/// Minimum and maximum number of sites when not all vertices can be baked.
 const SPREAD: [usize; 2] = [64, 512];
 
-/// Patches per group of right-hand sides where each has its own; three columns each.
+/// Number of patches per group when each patch has its own three right-hand side columns.
 const GROUP: usize = 8;
 
-/// Groups that are solved side by side.
+/// Number of groups that are solved in parallel.
 const WAVE: usize = 8;
 
-/// `W^T (K^-1 - Phi Lambda^-1 Phi^T) W` for patches of each radius (m) around `count` surface vertices spread evenly; when that is not
-/// given around all, if [`BUDGET`] and [`MEMORY`] allow.
+/// Returns `W^T (K^-1 - Phi Lambda^-1 Phi^T) W` for patches of each radius (m) around `count`
+/// evenly spread surface vertices.
+///
+/// Without `count`, all vertices are used if [`BUDGET`] and [`MEMORY`] allow.
 pub(crate) fn sites(
     solver: &Solver,
     modes: &Modes,
@@ -56,7 +66,8 @@ pub(crate) fn sites(
     if count.is_none()
         && let Some((_, thin)) = THIN.iter().rev().find(|(cost, _)| plan.cost() > *cost)
     {
-        // Each next one is the furthest from those before: any first part of them is spread evenly.
+        // Each vertex is the furthest from those before it, so any leading part of the order is
+        // spread evenly.
         let mut rank = vec![usize::MAX; skin.mesh.positions().len()];
         let order = spread_vertices(&skin.mesh, vertices.clone(), vertices.len().div_ceil(2));
         order.into_iter().enumerate().for_each(|(index, v)| rank[v as usize] = index);
@@ -70,7 +81,9 @@ pub(crate) fn sites(
     }
     let apart = 3.0 * solver.factor.symbolic.values as f64;
     if count.is_none() && (plan.cost() > BUDGET || plan.largest_block() > MEMORY) {
-        // Few places cost as much as many this way: their patches touch nearly all nodes. Each patch by itself then.
+        // With shared node columns, few sites cost as much as many, because their patches touch
+        // nearly all nodes. The number of sites is therefore limited to what separate solves can
+        // afford.
         let affordable = (0.1 * BUDGET / (apart * radii.len().max(1) as f64)) as usize;
         vertices = spread_vertices(&skin.mesh, vertices, affordable.clamp(SPREAD[0], SPREAD[1]));
         (patches, loads) = self::patches(skin, number, &mut vertices, radii, &|_, _| true)?;
@@ -78,7 +91,8 @@ pub(crate) fn sites(
     }
     let together = plan.cost() < apart * loads.len() as f64 && plan.largest_block() <= MEMORY;
     let whole = if together {
-        // A free body's springs let it move by far more than it bends, which is taken out again: no digits to spare.
+        // A free body needs double precision. On its springs the rigid motion is far larger than
+        // the deformation, and the removal of this motion cancels digits.
         plan.compliances(solver.rigid.is_none() && plan.cost() > FAST, report)
     } else {
         one_by_one(solver, &loads, report)
@@ -92,8 +106,9 @@ pub(crate) fn sites(
     Ok(patches.par_iter().zip(&loads).zip(&whole).map(finish).collect())
 }
 
-/// The patches of each radius around `vertices` and their loads. The vertices are brought into the order of their elimination, so that
-/// neighbours in the list touch the same nodes.
+/// Returns the patches of each radius around `vertices` and their loads.
+///
+/// Sorts the vertices by elimination order, so that neighbors in the list touch the same nodes.
 fn patches(
     skin: &Skin,
     number: &[u32],
@@ -113,7 +128,7 @@ fn patches(
     Ok((patches, loads))
 }
 
-/// `W^T A^-1 W = |L^-1 W|^2` with three columns for each load.
+/// Returns `W^T A^-1 W = |L^-1 W|^2` with three columns for each load.
 fn one_by_one(solver: &Solver, loads: &[Load], report: &mut dyn FnMut(f64)) -> Vec<Six> {
     let group = |loads: &[Load]| -> Vec<Six> {
         let width = 3 * loads.len();
@@ -153,7 +168,7 @@ fn load(patch: &Patch, skin: &Skin, number: &[u32]) -> Load {
         });
     }
     rows.sort_unstable_by_key(|&(row, _)| row);
-    // Vertices of a skin that lie in one element share its nodes.
+    // Skin vertices in the same element share its nodes, so their shares are added.
     rows.dedup_by(|from, to| {
         let same = from.0 == to.0;
         if same {
@@ -164,7 +179,7 @@ fn load(patch: &Patch, skin: &Skin, number: &[u32]) -> Load {
     rows
 }
 
-/// `X^T W` for a block X of `width` columns: `[column][axis]`.
+/// Returns `X^T W` for a block X of `width` columns as `[column][axis]`.
 fn project(load: &Load, x: &[f64], width: usize) -> Vec<[f64; 3]> {
     let mut out = vec![[0.0; 3]; width];
     for &(row, share) in load {
@@ -177,7 +192,8 @@ fn project(load: &Load, x: &[f64], width: usize) -> Vec<[f64; 3]> {
     out
 }
 
-/// What the pseudo-inverse of a free body adds to the factor: `Z = (K + springs)^-1 M R` and `R^T M Z`.
+/// Terms that the pseudo-inverse of a free body adds to the factor: `Z = (K + springs)^-1 M R` and
+/// `R^T M Z`.
 struct Held {
     free: Option<(Vec<f64>, Mat<f64>)>,
 }
@@ -193,9 +209,11 @@ impl Held {
         Self { free }
     }
 
-    /// The residual flexibility of a load whose `W^T A^-1 W` is `whole`, `A` the factored matrix.
+    /// Returns the residual flexibility of a load whose `W^T A^-1 W` is `whole`, where `A` is the
+    /// factored matrix.
     ///
-    /// For a free body, with `r = R^T W`: `W^T K^+ W = W^T A^-1 W - (W^T Z) r - r^T (Z^T W) + r^T (R^T M Z) r`.
+    /// For a free body, with `r = R^T W`, the compliance is
+    /// `W^T K^+ W = W^T A^-1 W - (W^T Z) r - r^T (Z^T W) + r^T (R^T M Z) r`.
     fn residual(&self, solver: &Solver, modes: &Modes, load: &Load, whole: &Six) -> [[f64; 3]; 3] {
         let along = project(load, &modes.phi, modes.lambda.len());
         let free = self
@@ -223,8 +241,10 @@ impl Held {
     }
 }
 
-/// Rounding must not make a compliance negative: where the kept modes say nearly all, what they leave may come out so.
-/// The nearest positive semi-definite matrix then has the negative eigenvalues set to zero.
+/// Makes a residual positive semi-definite.
+///
+/// Where the kept modes contain nearly all of the compliance, rounding can make the residual
+/// negative. The nearest positive semi-definite matrix has the negative eigenvalues set to zero.
 fn settle(residual: &Matrix3<f64>) -> [[f64; 3]; 3] {
     let eigen = residual.symmetric_eigen();
     let nearest = if eigen.eigenvalues.min() < 0.0 {
@@ -237,7 +257,8 @@ fn settle(residual: &Matrix3<f64>) -> [[f64; 3]; 3] {
     std::array::from_fn(|i| std::array::from_fn(|j| nearest[(i, j)]))
 }
 
-/// `count` of the candidates, spread over the surface: each next one is the furthest from those before.
+/// Selects `count` candidates spread over the surface. Each selected vertex is the furthest from
+/// those before it.
 fn spread_vertices(surface: &SurfaceMesh, candidates: Vec<u32>, count: usize) -> Vec<u32> {
     let positions = surface.positions();
     let distance2 = |v: u32, q: [f64; 3]| -> f64 {
@@ -246,7 +267,7 @@ fn spread_vertices(surface: &SurfaceMesh, candidates: Vec<u32>, count: usize) ->
     let n = candidates.len().max(1) as f64;
     let mean =
         [0, 1, 2].map(|k| candidates.iter().map(|&v| f64::from(positions[v as usize][k])).sum::<f64>() / n);
-    // The first is the furthest from the middle; ties go to the lower number.
+    // The first vertex is the furthest from the center. Among equal distances the lower index wins.
     let mut nearest: Vec<f64> = candidates.iter().map(|&v| distance2(v, mean)).collect();
     let mut out = Vec::with_capacity(count.min(candidates.len()));
     while out.len() < count.min(candidates.len()) {
@@ -282,7 +303,8 @@ mod tests {
     use crate::symbolic::Symbolic;
     use crate::{BakeConfig, support};
 
-    /// Columns of nodes, columns of patches, and single precision: the same compliances, on a skin whose vertices rest on several nodes too.
+    /// Node columns, patch columns and single precision give the same compliances within their
+    /// tolerances, also on a skin whose vertices depend on several nodes.
     #[test]
     fn every_way_gives_the_same_compliances() {
         let mesh = shapes::bar([8, 4, 4], [1.0, 0.4, 0.4]).unwrap();

@@ -1,13 +1,16 @@
-//! The lowest modes of `K phi = lambda M phi`: shift-invert block Lanczos with the M-inner product, full
-//! reorthogonalisation and thick restart (Grimes, Lewis and Simon 1994; Wu and Simon 2000).
+//! Computes the lowest modes of `K phi = lambda M phi` by shift-invert block Lanczos.
 //!
-//! The operator is `K^-1 M`, whose largest eigenvalues are `1 / lambda`. For a free body K is singular: `K^-1` is the
-//! inertia-relief pseudo-inverse of [`Solver`], and the rigid modes are deflated, so only elastic modes come out.
+//! The iteration uses the M-inner product, full reorthogonalization and thick restart (Grimes,
+//! Lewis and Simon 1994; Wu and Simon 2000). The operator is `K^-1 M`, whose largest eigenvalues
+//! are `1 / lambda`. For a free body K is singular. There `K^-1` is the inertia-relief
+//! pseudo-inverse of [`Solver`], and the rigid modes are deflated, so that only elastic modes
+//! remain.
 //!
-//! A block of eight vectors knows eight directions of an eigenspace; more come in only by rounding,
-//! if in time. Converged modes are therefore counted against the inertia of `K - mu M`
-//! (`sturm.rs`), and where some are missing the block gets random vectors for them and the
-//! iteration goes on. Bodies that lack none come out as they would without.
+//! A block of eight vectors contains eight directions of an eigenspace. Further directions enter
+//! only through rounding, which may be too late. Converged modes are therefore counted against the
+//! inertia of `K - mu M` (`sturm.rs`). Where modes are missing, the block receives random vectors
+//! for them and the iteration continues. The count does not change the result of a body that lacks
+//! no mode.
 
 use faer::Mat;
 
@@ -15,41 +18,46 @@ use crate::blocks::{self, Tall};
 use crate::solver::Solver;
 use crate::sturm::Count;
 
-/// Stop when every wanted Ritz pair has this residual, relative to its own eigenvalue, in the M-norm.
+/// Residual at which every wanted Ritz pair has converged, relative to its own eigenvalue, in the
+/// M-norm.
 const TOLERANCE: f64 = 4e-9;
 
-/// The modes are counted up to this share below the last one. What is nearer to it than that, or to
-/// others that are, is as good as it.
+/// Relative distance below the last wanted mode at which the modes are counted.
+///
+/// A mode that is closer to the last mode, directly or through a chain of close modes, is
+/// equivalent to the last mode.
 const NEAR: f64 = 1e-6;
 
-/// Where rounding asks for more than [`NEAR`], up to this.
+/// Largest such distance, where rounding demands more than [`NEAR`].
 const FAR: f64 = 1e-2;
 
-/// How often missing modes are looked for.
+/// Number of rounds that search for missing modes.
 const ROUNDS: usize = 8;
 
-/// Problems of at most this many degrees of freedom, or of fewer than three for each wanted mode, are solved densely.
+/// Number of degrees of freedom up to which a problem is solved densely. Problems with fewer than
+/// three per wanted mode are solved densely as well.
 const DENSE: usize = 300;
 
-/// Eigenpairs: eigenvalues ascending ((rad/s)^2), and M-orthonormal vectors as a block of that many columns.
+/// Eigenvalues in ascending order ((rad/s)^2) and M-orthonormal eigenvectors as a block with one
+/// column each.
 #[derive(Clone, Debug)]
 pub(crate) struct Modes {
     pub(crate) lambda: Vec<f64>,
     pub(crate) phi: Vec<f64>,
 }
 
-/// Why there are no modes.
+/// Reason why the eigensolver returns no modes.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub(crate) enum Failure {
     /// The iteration did not converge, or a small eigenproblem failed.
     NoConvergence,
     /// Modes are missing below `lambda`, and the iteration did not find them.
     Missed { lambda: f64, modes: usize, found: usize },
-    /// Whether modes are missing below `lambda` cannot be told in floating point arithmetic.
+    /// Floating-point arithmetic cannot decide whether modes are missing below `lambda`.
     Uncounted { lambda: f64 },
 }
 
-/// A number of elastic modes below a place.
+/// Number of elastic modes below `lambda`, and how many of them the iteration found.
 #[derive(Clone, Copy, Debug)]
 struct Below {
     lambda: f64,
@@ -57,7 +65,8 @@ struct Below {
     found: usize,
 }
 
-/// The `wanted` lowest elastic modes. `report` hears how far the iteration is, 0 to 1.
+/// Computes the `wanted` lowest elastic modes. `report` receives the progress of the iteration, 0
+/// to 1.
 pub(crate) fn lowest(solver: &Solver, wanted: usize, report: &mut dyn FnMut(f64)) -> Result<Modes, Failure> {
     let n = solver.dofs();
     if n <= DENSE || n < 3 * wanted + 6 {
@@ -76,29 +85,30 @@ impl Below {
 struct Lanczos<'a> {
     solver: &'a Solver<'a>,
     wanted: usize,
-    /// Basis vectors, `stride` columns reserved.
+    /// Basis vectors. The storage reserves `stride` columns.
     basis: Vec<f64>,
     stride: usize,
-    /// Filled columns whose images are known.
+    /// Number of filled columns whose images are known.
     done: usize,
-    /// Where the columns start that the next image has large parts along: the last block before, or everything after
-    /// a restart.
+    /// First column that the next image has large parts along: the start of the previous block, or
+    /// 0 after a restart.
     coupled: usize,
     /// Projected operator.
     projected: Mat<f64>,
-    /// The next block, M-orthonormal to the basis, and its width.
+    /// Next block, M-orthonormal to the basis. `width` is its number of columns.
     next: Vec<f64>,
     width: usize,
     seed: u64,
 }
 
-/// Converged Ritz vectors and what the operator makes of them, as blocks of the wanted number of columns.
+/// Converged Ritz vectors and their images under the operator, as blocks of the wanted number of
+/// columns.
 struct Ritz {
     vectors: Vec<f64>,
     images: Vec<f64>,
 }
 
-/// What one expansion leaves: the remainder's coefficients, `next = remainder coefficients^-1`.
+/// Coefficients of the remainder of one expansion: `next = remainder coefficients^-1`.
 struct Remainder {
     coefficients: Mat<f64>,
     width: usize,
@@ -107,8 +117,8 @@ struct Remainder {
 impl<'a> Lanczos<'a> {
     fn new(solver: &'a Solver<'a>, wanted: usize) -> Self {
         let n = solver.dofs();
-        // Wider blocks solve faster and converge later: 8 was the fastest of 4, 8, 12, 16 from 12,000 to 45,000
-        // degrees of freedom. 60 modes take about 250 vectors.
+        // Wider blocks solve faster and converge later. A width of 8 was the fastest of 4, 8, 12
+        // and 16 from 12,000 to 45,000 degrees of freedom. 60 modes take about 250 vectors.
         let block = 8;
         let stride = (5 * wanted + 8 * block).min(n - 6);
         Self {
@@ -126,11 +136,12 @@ impl<'a> Lanczos<'a> {
     }
 
     fn run(mut self, report: &mut dyn FnMut(f64)) -> Result<Ritz, Failure> {
-        // Each restart improves; a hundred expansions of the space per mode means that something is wrong.
+        // Each restart improves the result. More than about a hundred basis vectors per mode mean
+        // that something is wrong.
         let most_blocks = 100 + 100 * self.wanted / self.width.max(1);
         self.start()?;
         let mut check_at = 3 * self.wanted;
-        // What the last count has missed.
+        // This is the last count that found missing modes.
         let mut missed: Option<Below> = None;
         let mut rounds = 0;
         let mut blocks = 0;
@@ -144,12 +155,14 @@ impl<'a> Lanczos<'a> {
             }
             let (values, vectors) = self.ritz()?;
             let converged = self.converged(&values, &vectors, &remainder);
-            // The small eigenproblem is not free: look less often while most pairs are still far off.
+            // The small eigenproblem has a cost, so the checks are less frequent while most pairs
+            // are far from converged.
             let ahead = if 4 * converged < self.wanted { 3 } else { 1 };
             check_at = self.done + ahead * self.width;
             report(0.7 + 0.3 * converged as f64 / self.wanted as f64);
-            // Ritz values come up from below the operator's: those that were missed are not to be
-            // expected at once.
+            // Ritz values approach the operator's eigenvalues from below, so missed modes do not
+            // appear at once. The next count waits until enough Ritz values have passed the shift
+            // of the last count.
             let appeared = missed.is_none_or(|below| {
                 let last = below.modes.min(self.wanted) - 1;
                 values[last] * below.lambda * (1.0 + 0.5 * NEAR) >= 1.0
@@ -176,7 +189,8 @@ impl<'a> Lanczos<'a> {
         Err(missed.map_or(Failure::NoConvergence, |below| below.missed()))
     }
 
-    /// How many Ritz vectors a restart keeps, with room for two blocks of that width.
+    /// Returns the number of Ritz vectors that a restart keeps, with room for two blocks of
+    /// `width`.
     fn keep(&self, width: usize) -> Result<usize, Failure> {
         let keep = (self.wanted + width + (self.stride - self.wanted) / 4)
             .min(self.stride.saturating_sub(2 * width))
@@ -184,9 +198,11 @@ impl<'a> Lanczos<'a> {
         if keep < self.wanted { Err(Failure::NoConvergence) } else { Ok(keep) }
     }
 
-    /// How many elastic modes there are below the last wanted one, and those that are as good as
-    /// it, and how many of them are found. Counting just below needs no gap above: a cluster may go
-    /// on past the wanted modes.
+    /// Counts the elastic modes below the last wanted mode and its equivalents, and how many of
+    /// them were found.
+    ///
+    /// The shift lies just below these modes, so the count needs no gap above them: a cluster may
+    /// extend beyond the wanted modes.
     fn count(&self, values: &[f64], ritz: &Ritz) -> Result<Below, Failure> {
         let rigid = if self.solver.rigid.is_some() { 6 } else { 0 };
         let lambda = |mode: usize| 1.0 / values[mode];
@@ -206,8 +222,8 @@ impl<'a> Lanczos<'a> {
             {
                 return Ok(Below { lambda: shift, modes: count.below - rigid, found });
             }
-            // Another place has other pivots; less than is there was counted only if rounding is
-            // worse than thought.
+            // Another shift has other pivots. A count below the number of known modes means that
+            // rounding is worse than estimated.
             near = if blur.is_finite() { (2.0 * near).max(4.0 * blur) } else { 2.0 * near };
             if near > FAR {
                 break;
@@ -216,12 +232,13 @@ impl<'a> Lanczos<'a> {
         Err(Failure::Uncounted { lambda: lambda(self.wanted - 1) })
     }
 
-    /// Restarts with random vectors added to the next block, for eigenvectors that the space so far
-    /// knows nothing of. What the operator makes of the kept ones is in the next block's old part,
-    /// as in any restart.
+    /// Restarts with random vectors added to the next block, for eigenvectors that the current
+    /// space does not contain.
+    ///
+    /// The image of the kept vectors lies in the old part of the next block, as in any restart.
     fn widen(&mut self, values: &[f64], vectors: &Mat<f64>, missing: usize) -> Result<(), Failure> {
-        // Two blocks and the wanted vectors must have room, and no more copies are wanted than
-        // modes.
+        // The space must hold the wanted vectors and two blocks. There is no use for more new
+        // vectors than wanted modes.
         let room = ((self.stride - self.wanted) / 2).saturating_sub(self.width);
         let fresh = missing.min(self.wanted).max(8).min(room);
         if fresh == 0 {
@@ -230,7 +247,8 @@ impl<'a> Lanczos<'a> {
         let keep = self.keep(self.width + fresh)?;
         self.restart(values, vectors, keep);
         let mut block = self.random(fresh);
-        // Against the next block, too: for so long it belongs to the basis.
+        // The next block joins the basis temporarily, so that the random vectors become orthogonal
+        // to it as well.
         blocks::put(&mut self.basis, self.stride, self.done, &self.next, self.width);
         self.done += self.width;
         self.orthogonalise(&mut block, fresh, 0);
@@ -256,11 +274,11 @@ impl<'a> Lanczos<'a> {
         if self.width == 0 { Err(Failure::NoConvergence) } else { Ok(()) }
     }
 
-    /// Random vectors without rigid motion.
+    /// Returns random vectors without rigid motion.
     fn random(&mut self, width: usize) -> Vec<f64> {
         let mut block = vec![0.0; self.solver.dofs() * width];
         for x in &mut block {
-            // splitmix64: the same start in every run.
+            // The generator is splitmix64 and gives the same start vectors in every run.
             self.seed = self.seed.wrapping_add(0x9E37_79B9_7F4A_7C15);
             let mut z = self.seed;
             z = (z ^ (z >> 30)).wrapping_mul(0xBF58_476D_1CE4_E5B9);
@@ -272,7 +290,8 @@ impl<'a> Lanczos<'a> {
         block
     }
 
-    /// Takes the next block into the basis, applies the operator to it and orthogonalises the image.
+    /// Adds the next block to the basis, applies the operator to the block and orthogonalizes the
+    /// image.
     fn expand(&mut self) -> Result<Remainder, Failure> {
         let width = self.width;
         let at = self.done;
@@ -300,7 +319,7 @@ impl<'a> Lanczos<'a> {
         }
         let (next, remainder) = normalise(self.solver, image, width).ok_or(Failure::NoConvergence)?;
         if remainder.width == 0 {
-            // The space is invariant: go on with new directions.
+            // The space is invariant, so the iteration continues with new random directions.
             self.width = width;
             self.start()?;
             return Ok(Remainder { coefficients: Mat::zeros(self.width, width), width: self.width });
@@ -310,9 +329,11 @@ impl<'a> Lanczos<'a> {
         Ok(remainder)
     }
 
-    /// Makes the block M-orthogonal to the basis; returns the coefficients taken out. First the columns from `coupled`
-    /// on, along which it is large, then all of them: what is left there is rounding, so each is taken out twice
-    /// as far as it matters.
+    /// Makes the block M-orthogonal to the basis and returns the removed coefficients.
+    ///
+    /// The first pass covers the columns from `coupled` on, where the block has large parts. The
+    /// second pass covers all columns, and only rounding is left there. Each large part is
+    /// therefore removed twice.
     fn orthogonalise(&self, block: &mut [f64], width: usize, coupled: usize) -> Mat<f64> {
         let mut sum = Mat::zeros(self.done, width);
         if self.done == 0 {
@@ -331,7 +352,7 @@ impl<'a> Lanczos<'a> {
         sum
     }
 
-    /// Ritz values, descending, and their vectors in basis coordinates.
+    /// Returns the Ritz values in descending order and their vectors in basis coordinates.
     fn ritz(&self) -> Result<(Vec<f64>, Mat<f64>), Failure> {
         let projected = self.projected.as_ref().submatrix(0, 0, self.done, self.done);
         let (mut values, vectors) = blocks::symmetric_eigen(projected).ok_or(Failure::NoConvergence)?;
@@ -340,7 +361,7 @@ impl<'a> Lanczos<'a> {
         Ok((values, vectors))
     }
 
-    /// How many of the leading wanted Ritz pairs have converged.
+    /// Returns how many of the leading wanted Ritz pairs have converged.
     fn converged(&self, values: &[f64], vectors: &Mat<f64>, remainder: &Remainder) -> usize {
         let c = &remainder.coefficients;
         let first = self.done - c.ncols();
@@ -356,7 +377,8 @@ impl<'a> Lanczos<'a> {
             .count()
     }
 
-    /// The Ritz vectors `V s`, and their images `theta V s + next (coefficients s_last)`, which cost no solution.
+    /// Returns the Ritz vectors `V s` and their images `theta V s + next (coefficients s_last)`,
+    /// which need no further solve.
     fn finish(&self, values: &[f64], vectors: &Mat<f64>, remainder: &Remainder) -> Ritz {
         let wanted = self.wanted;
         let phi = self.combine(vectors, wanted);
@@ -376,8 +398,9 @@ impl<'a> Lanczos<'a> {
         blocks::product(basis, vectors.as_ref().subcols(0, count))
     }
 
-    /// Keeps the leading Ritz vectors as the new basis. Their coupling with the next block comes out of its
-    /// full orthogonalisation.
+    /// Keeps the leading Ritz vectors as the new basis.
+    ///
+    /// Their coupling with the next block results from the full orthogonalization of that block.
     fn restart(&mut self, values: &[f64], vectors: &Mat<f64>, keep: usize) {
         let kept = self.combine(vectors, keep);
         blocks::put(&mut self.basis, self.stride, 0, &kept, keep);
@@ -390,8 +413,10 @@ impl<'a> Lanczos<'a> {
     }
 }
 
-/// M-orthonormalises the columns of a block among themselves, dropping those that are combinations of the others.
-/// `block = result coefficients`. `None` when the small eigenproblem fails.
+/// M-orthonormalizes the columns of a block among themselves and drops linearly dependent columns.
+///
+/// The result satisfies `block = result coefficients`. Returns `None` when the small eigenproblem
+/// fails.
 fn normalise(solver: &Solver, mut block: Vec<f64>, width: usize) -> Option<(Vec<f64>, Remainder)> {
     let mut coefficients = Mat::<f64>::identity(width, width);
     let mut columns = width;
@@ -415,13 +440,15 @@ fn normalise(solver: &Solver, mut block: Vec<f64>, width: usize) -> Option<(Vec<
     Some((block, Remainder { coefficients, width: columns }))
 }
 
-/// One step of inverse subspace iteration, `x = K^-1 M phi`, and Rayleigh-Ritz. It damps what is left of the high modes,
-/// which the stiffness would blow up in the residual `K phi - lambda M phi`. The iteration knows `x` already.
+/// Does one step of inverse subspace iteration, `x = K^-1 M phi`, and a Rayleigh-Ritz projection.
+///
+/// The step damps the remaining high modes, which the stiffness would amplify in the residual
+/// `K phi - lambda M phi`. The iteration has already computed `x`.
 fn polish(solver: &Solver, ritz: &Ritz, wanted: usize) -> Result<Modes, Failure> {
     let mut loads = vec![0.0; ritz.vectors.len()];
     solver.matrix.mass_times(&ritz.vectors, wanted, &mut loads);
     let x = &ritz.images;
-    // K x = M phi, so x^T K x = x^T M phi needs no product with the stiffness.
+    // Since K x = M phi, x^T K x = x^T M phi needs no product with the stiffness.
     let tall = Tall::new(x, wanted);
     let stiffness = blocks::gram(tall, Tall::new(&loads, wanted));
     let mut mass_x = vec![0.0; x.len()];
@@ -431,10 +458,11 @@ fn polish(solver: &Solver, ritz: &Ritz, wanted: usize) -> Result<Modes, Failure>
     Ok(Modes { lambda, phi: blocks::product(tall, turn.as_ref()) })
 }
 
-/// `A y = lambda B y` for small symmetric A and positive definite B: ascending, `Y^T B Y = I`.
+/// Solves `A y = lambda B y` for small symmetric A and positive definite B. The eigenvalues are
+/// ascending and `Y^T B Y = I`.
 fn generalised(a: Mat<f64>, b: Mat<f64>) -> Option<(Vec<f64>, Mat<f64>)> {
     let n = a.nrows();
-    // Scaling first: the columns of inverse iteration differ in length as 1 / lambda.
+    // The columns of inverse iteration differ in length as 1 / lambda, so they are scaled first.
     let scale: Vec<f64> = (0..n).map(|i| 1.0 / b[(i, i)].sqrt()).collect();
     let scaled =
         |m: &Mat<f64>| Mat::from_fn(n, n, |i, j| 0.5 * (m[(i, j)] + m[(j, i)]) * scale[i] * scale[j]);
@@ -450,7 +478,8 @@ fn generalised(a: Mat<f64>, b: Mat<f64>) -> Option<(Vec<f64>, Mat<f64>)> {
     Some((lambda, Mat::from_fn(n, n, |i, j| scale[i] * turned[(i, j)])))
 }
 
-/// All modes of a small problem, the lowest elastic ones kept: the rigid modes of a free body come first and go.
+/// Computes all modes of a small problem and keeps the lowest elastic ones. The rigid modes of a
+/// free body come first and are dropped.
 fn dense(solver: &Solver, wanted: usize) -> Result<Modes, Failure> {
     let n = solver.dofs();
     let mut identity = vec![0.0; n * n];

@@ -9,7 +9,7 @@ use crate::rigid::MassProperties;
 use crate::sparse::BlockCsr;
 use crate::symbolic::Symbolic;
 
-/// Matrices of a mesh in elimination order, and the rigid modes if nothing is held.
+/// Returns the matrices of a mesh in elimination order, and the rigid modes if no node is held.
 fn matrices(mesh: &TetMesh, held: impl Fn([f64; 3]) -> bool) -> (BlockCsr, Symbolic, Option<Vec<f64>>) {
     let fe = FeMesh::new(mesh, Element::Tet4);
     let held: Vec<bool> = fe.nodes.iter().map(|&p| held(p)).collect();
@@ -26,7 +26,7 @@ fn matrices(mesh: &TetMesh, held: impl Fn([f64; 3]) -> bool) -> (BlockCsr, Symbo
     (matrix, Symbolic::new(&ordered), rigid)
 }
 
-/// The lowest modes of a mesh held where `held` says.
+/// Returns the lowest eigenvalues of a mesh that is held where `held` returns true.
 fn modes_of(mesh: &TetMesh, wanted: usize, held: impl Fn([f64; 3]) -> bool) -> Vec<f64> {
     let (matrix, symbolic, rigid) = matrices(mesh, held);
     let solver = Solver::new(&matrix, symbolic, rigid).unwrap();
@@ -36,15 +36,17 @@ fn modes_of(mesh: &TetMesh, wanted: usize, held: impl Fn([f64; 3]) -> bool) -> V
     modes.lambda
 }
 
-/// How many of the values are not what theory says. The solver tells none apart that are nearer
-/// than its tolerance.
+/// Returns how many values differ from the expected ones.
+///
+/// The solver does not separate eigenvalues that are closer than its tolerance.
 fn wrong(got: &[f64], expected: &[f64]) -> usize {
     assert_eq!(got.len(), expected.len());
     got.iter().zip(expected).filter(|(a, b)| (*a / *b - 1.0).abs() > 1e-8).count()
 }
 
-/// `count` equal bars side by side, not connected. Places are multiples of a quarter: the bars are
-/// equal to the bit.
+/// Makes `count` equal bars side by side that are not connected.
+///
+/// The coordinates are multiples of a quarter, so the bars are equal to the bit.
 fn bars(count: usize, cells: [usize; 3]) -> TetMesh {
     let one = shapes::bar(cells, cells.map(|c| c as f64 / 4.0)).unwrap();
     let mut out = TetMesh::default();
@@ -56,7 +58,7 @@ fn bars(count: usize, cells: [usize; 3]) -> TetMesh {
     out
 }
 
-/// The lowest values of a body of `copies` equal parts, from those of one part.
+/// Returns the lowest eigenvalues of a body of `copies` equal parts from those of one part.
 fn copied(one: &[f64], copies: usize, wanted: usize) -> Vec<f64> {
     one.iter().flat_map(|&x| std::iter::repeat_n(x, copies)).take(wanted).collect()
 }
@@ -65,7 +67,7 @@ fn copied(one: &[f64], copies: usize, wanted: usize) -> Vec<f64> {
 fn equal_bars_have_every_mode_as_often_as_there_are_bars() {
     let cells = [4, 1, 1];
     let held = |p: [f64; 3]| p[0] == 0.0;
-    // 48 degrees of freedom: solved densely.
+    // The bar has 48 degrees of freedom and is solved densely.
     let one = modes_of(&bars(1, cells), 12, held);
     let mut failed = Vec::new();
     for (count, wanted) in [(2, 20), (12, 20), (32, 20), (32, 60), (40, 100), (100, 30)] {
@@ -78,13 +80,13 @@ fn equal_bars_have_every_mode_as_often_as_there_are_bars() {
     assert!(failed.is_empty(), "{failed:#?}");
 }
 
-/// A diagonal pencil: three values on each node, of unlike masses.
+/// Makes a diagonal pencil with three eigenvalues on each node and different masses.
 fn diagonal(values: &[f64]) -> (BlockCsr, Symbolic) {
     let nodes = values.len() / 3;
     let graph = Lists { offsets: (0..=nodes).collect(), items: (0..nodes as u32).collect::<Vec<u32>>() };
     let mut matrix = BlockCsr::zeros(&graph);
     for (node, values) in values.chunks_exact(3).enumerate() {
-        // Powers of two: the quotients are the values to the bit.
+        // The masses are powers of two, so the quotients equal the values to the bit.
         let mass = [0.25, 0.5, 1.0, 2.0][node % 4];
         matrix.mass[node] = mass;
         for (axis, value) in values.iter().enumerate() {
@@ -109,7 +111,8 @@ fn known_multiplicities_come_out_whole() {
         let few = values.len();
         values.extend((0..900 - few).map(|i| 6.0 + 0.37 * i as f64));
         let expected = values.clone();
-        // Spread over the dofs: 900 and 497 have no common divisor.
+        // 900 and 497 have no common divisor, so this permutation spreads the values over the
+        // degrees of freedom.
         let spread: Vec<f64> = (0..900).map(|i| values[i * 497 % 900]).collect();
         let (matrix, symbolic) = diagonal(&spread);
         let solver = Solver::new(&matrix, symbolic, None).unwrap();
@@ -124,7 +127,7 @@ fn known_multiplicities_come_out_whole() {
     assert!(failed.is_empty(), "{failed:#?}");
 }
 
-/// A back with equal teeth.
+/// Makes a comb: a back with equal teeth.
 fn comb(teeth: usize, back: f64) -> TetMesh {
     let cells = [5, 2 * teeth - 1, 1];
     let mut mesh = shapes::bar(cells, cells.map(|c| c as f64)).unwrap();
@@ -143,7 +146,7 @@ fn a_body_with_equal_parts_equals_the_dense_solution() {
         (comb(2, 1.0), 12, 0.0),
         (comb(14, 1.0), 40, 0.0),
         (comb(14, 1.0), 60, 1.0),
-        // Free.
+        // A negative bound leaves the body free.
         (comb(14, 1.0), 40, -1.0),
         (comb(9, 2.0), 60, -1.0),
     ] {
@@ -174,7 +177,7 @@ fn restarts_when_its_space_is_full() {
     let (_, matrix, symbolic) = bar([9, 5, 5], Element::Tet4, false);
     let solver = Solver::new(&matrix, symbolic, None).unwrap();
     let mut lanczos = Lanczos::new(&solver, 12);
-    // Room for five blocks only: it must restart several times.
+    // The space has room for five blocks only, so the iteration must restart several times.
     lanczos.stride = 5 * lanczos.width;
     lanczos.basis.truncate(matrix.dofs() * lanczos.stride);
     lanczos.projected = Mat::zeros(lanczos.stride, lanczos.stride);
@@ -188,7 +191,7 @@ fn restarts_when_its_space_is_full() {
     assert!(residual < 1e-8, "{residual:e}");
 }
 
-/// A free body, whose rigid motion is kept out, among equal parts that are held.
+/// Tests a free body, whose rigid motion is deflated, among equal parts that are held.
 #[test]
 fn rigid_modes_are_counted_as_such() {
     let (copies, wanted, cells) = (33, 50, [4, 1, 1]);
@@ -217,8 +220,8 @@ fn rigid_modes_are_counted_as_such() {
     assert_eq!(wrong(&got.lambda, &expected[..wanted]), 0, "{:?}", got.lambda);
 }
 
-/// A rod so slender that its first mode drowns in rounding has no count, and no modes that nobody
-/// can vouch for.
+/// Tests a rod so slender that its first mode is lost in rounding. The solver must return an error
+/// instead of unverified modes.
 #[test]
 fn what_cannot_be_counted_is_an_error() {
     let (matrix, symbolic, _) = matrices(&bars(1, [3000, 1, 1]), |p| p[0] == 0.0);

@@ -1,17 +1,22 @@
-//! From a mesh to a modal model: finite elements, sparse factorisation and vibration modes.
+//! Turns a tetrahedral mesh into a modal model.
 //!
-//! [`bake()`] takes tetrahedra and a material and finds the lowest elastic modes of `K phi = omega^2 M phi`:
+//! [`bake()`] takes tetrahedra and a material and computes the lowest elastic modes of
+//! `K phi = omega^2 M phi` in four steps:
 //!
-//! 1. linear elasticity on 4-node or 10-node tetrahedra, consistent mass, all integrals exact; near
-//!    incompressibility (Poisson ratio above 0.45) the pressure is averaged over nodes, so that nothing locks;
-//! 2. nested dissection by coordinate bisection and a multifrontal Cholesky factorisation (dense work by faer);
-//! 3. shift-invert block Lanczos with the M-inner product, full reorthogonalisation and thick restart; a body without
-//!    anchors keeps its six rigid modes out analytically; a Sturm count makes sure that none is missed;
-//! 4. what a body needs at its surface: mode shapes and their rotations at the vertices, gravity's participation, mass
-//!    properties, damping, and the *residual flexibility* of patches: what the kept modes leave out of the
-//!    compliance that a hand feels.
+//! 1. The finite-element step assembles linear elasticity on 4-node or 10-node tetrahedra with the
+//!    consistent mass matrix. All integrals are exact. Near incompressibility (Poisson ratio above
+//!    0.45) the pressure is averaged over nodes to avoid locking.
+//! 2. Nested dissection by coordinate bisection orders the matrix, and a multifrontal Cholesky
+//!    factorization factors it. faer does the dense work.
+//! 3. Shift-invert block Lanczos with the M-inner product, full reorthogonalization and thick
+//!    restart computes the modes. The six rigid modes of a body without anchors are removed
+//!    analytically. A Sturm count verifies that no mode is missing.
+//! 4. The surface step computes the mode shapes and their rotations at the vertices, the
+//!    participation of gravity, the mass properties, the damping, and the *residual flexibility* of
+//!    patches, which is the part of the compliance under a hand that the kept modes leave out.
 //!
-//! Every bake checks its residuals and orthonormality, stores them, and gives the same bits for any number of threads.
+//! Every bake checks its residuals and its orthonormality and stores both. The result is the same
+//! to the bit for any number of threads.
 //!
 //! ```
 //! use pliant_bake::{BakeConfig, bake};

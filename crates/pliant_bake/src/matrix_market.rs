@@ -1,4 +1,4 @@
-//! Stiffness and mass as MatrixMarket files, for anyone to check.
+//! Writes stiffness and mass as MatrixMarket files for independent checks.
 
 use std::fs;
 use std::io::{BufWriter, Write};
@@ -10,16 +10,18 @@ use crate::BakeError;
 use crate::fem::ANCHORED;
 use crate::sparse::BlockCsr;
 
-/// Writes `K.mtx` (N/m) and `M.mtx` (kg) into `folder`: lower triangles, `coordinate real symmetric`, of the degrees of
-/// freedom that are not anchored, in the order of the nodes: row `3 i + axis + 1` for the `i`-th free node.
-/// Each file appears whole or not at all, and not one without the other.
+/// Writes `K.mtx` (N/m) and `M.mtx` (kg) into `folder`.
+///
+/// The files hold the lower triangles (`coordinate real symmetric`) for the degrees of freedom that
+/// are not anchored, in node order: row `3 i + axis + 1` for the `i`-th free node. Each file
+/// appears either complete or not at all, and neither appears without the other.
 pub(crate) fn export(folder: &Path, matrix: &BlockCsr, number: &[u32]) -> Result<(), BakeError> {
     let failed = |path: &Path| {
         let path = path.to_path_buf();
         move |source| BakeError::Export { path, source }
     };
     fs::create_dir_all(folder).map_err(failed(folder))?;
-    // Rank of each row of the matrix among the free nodes in natural order, and back.
+    // `free` holds the matrix row of each free node in natural order. `rank` is the inverse.
     let free: Vec<u32> = number.iter().copied().filter(|&n| n != ANCHORED).collect();
     let mut rank = vec![0usize; free.len()];
     for (natural, &row) in free.iter().enumerate() {
@@ -30,7 +32,7 @@ pub(crate) fn export(folder: &Path, matrix: &BlockCsr, number: &[u32]) -> Result
         let written = write_whole(path, |file| write(file, index == 0, matrix, &free, &rank));
         if let Err(source) = written {
             if index > 0 && paths[0].is_file() {
-                // The error that matters is the first one.
+                // The caller needs the first error, so a second error is ignored.
                 let _ = fs::remove_file(&paths[0]);
             }
             return Err(failed(path)(source));
@@ -39,7 +41,7 @@ pub(crate) fn export(folder: &Path, matrix: &BlockCsr, number: &[u32]) -> Result
     Ok(())
 }
 
-/// Refuses what cannot be a folder, before the long work and not after it.
+/// Refuses a path that cannot be a folder, before the long computation starts.
 pub(crate) fn check_folder(folder: &Path) -> Result<(), BakeError> {
     if folder.exists() && !folder.is_dir() {
         let source = std::io::ErrorKind::NotADirectory.into();
@@ -65,7 +67,7 @@ fn write(
     writeln!(file, "%%MatrixMarket matrix coordinate real symmetric")?;
     writeln!(file, "{n} {n} {entries}")?;
     each_entry(stiffness, matrix, free, rank, &mut |row, column, value| {
-        // `{:e}` writes the shortest text that reads back to the same number.
+        // `{:e}` writes the shortest text that parses back to the same number.
         writeln!(file, "{} {} {value:e}", row + 1, column + 1)
     })?;
     file.flush()

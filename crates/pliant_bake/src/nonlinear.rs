@@ -1,13 +1,17 @@
-//! A geometrically nonlinear solution of a held body under dead loads: what the warped modes are measured against.
+//! Geometrically nonlinear static solution of an anchored body under dead loads, as a reference for
+//! the warped modes.
 //!
-//! Total Lagrangian finite elements with the St. Venant-Kirchhoff law `S = lambda tr(E) I + 2 mu E`, `E = (F^T F - I) / 2`: the same moduli as the bake, exact for
-//! large rotations, and sound while strains stay moderate. Newton's method in load increments; the tangent is
+//! The method is total Lagrangian finite elements with the St. Venant-Kirchhoff law
+//! `S = lambda tr(E) I + 2 mu E`, `E = (F^T F - I) / 2`. The moduli are those of the bake. The law
+//! is exact for large rotations and valid while strains stay moderate. Newton's method runs in load
+//! increments. The tangent is
 //!
 //! ```text
 //! K_ij = int (g_i . S g_j) I + lambda a_i a_j^T + mu ((g_i . g_j) F F^T + a_j a_i^T) dV,   a = F g, g = grad N at rest
 //! ```
 //!
-//! (J. Bonet and R. D. Wood, *Nonlinear Continuum Mechanics for Finite Element Analysis*, 2nd ed. 2008, ch. 9). No game needs it at run time; it belongs to the report.
+//! (J. Bonet and R. D. Wood, *Nonlinear Continuum Mechanics for Finite Element Analysis*, 2nd ed.
+//! 2008, ch. 9). The solver serves the validation report. Games do not need it at run time.
 
 use nalgebra::{Matrix3, Vector3};
 use pliant_mesh::TetMesh;
@@ -23,43 +27,49 @@ use crate::surface::Skin;
 use crate::symbolic::Symbolic;
 use crate::{BakeConfig, BakeError, support};
 
-/// Newton rounds in one increment before it is halved.
+/// Number of Newton iterations in one increment before the increment is halved.
 const ROUNDS: usize = 12;
 
-/// Residual force, as a share of the load, at which an increment has converged.
+/// Residual force, as a fraction of the load, at which an increment has converged.
 const TOLERANCE: f64 = 1e-8;
 
-/// Increments below this share of the whole load are given up: the body has no stable shape there.
+/// Smallest increment, as a fraction of the whole load. Below it the solver gives up, because the
+/// body has no stable shape there.
 const SMALLEST: f64 = 1e-3;
 
-/// A force on a patch of the body's own surface (the tetrahedra's boundary), constant in direction.
+/// Force of constant direction on a patch of the body's own surface (the boundary of the
+/// tetrahedra).
 #[derive(Clone, Debug)]
 pub struct DeadLoad {
-    /// Where: its weights spread the force.
+    /// Patch whose weights distribute the force.
     pub patch: Patch,
-    /// N.
+    /// Force, N.
     pub force: [f64; 3],
 }
 
-/// A body at rest under its loads.
+/// Static equilibrium of a body under its loads.
 #[derive(Clone, Debug)]
 pub struct Deflection {
-    /// Displacement of each vertex of the tetrahedra's boundary, m, in the order of the baked surface.
+    /// Displacement of each vertex of the tetrahedra's boundary, m, in the order of the baked
+    /// surface.
     pub surface: Vec<[f64; 3]>,
-    /// The same by the linear theory, m.
+    /// Displacement of each vertex by the linear theory, m, in the same order.
     pub linear: Vec<[f64; 3]>,
     /// Displacement of each loaded patch, m.
     pub patches: Vec<[f64; 3]>,
-    /// Newton rounds in all.
+    /// Total number of Newton iterations.
     pub rounds: usize,
-    /// |load - inner forces| / |load| that is left, at most 1e-8: how far off this is as a solution on its mesh; 0 without a load.
+    /// Remaining |load - inner forces| / |load|, at most 1e-8, or 0 without a load.
+    ///
+    /// This is the error of the result as a solution on its mesh.
     pub residual: f64,
 }
 
-/// Solves for the shape of a body that `config` anchors, under dead loads.
+/// Solves for the shape of an anchored body under dead loads.
 ///
 /// # Errors
-/// As [`bake`](crate::bake()) for the mesh, the material and the anchors; [`BakeError::Parameter`] for a Poisson ratio above 0.45 (the nodal pressure has no
+/// Returns the errors of [`bake`](crate::bake()) for the mesh, the material and the anchors.
+/// Returns [`BakeError::Parameter`] for a Poisson ratio above 0.45 (the nodal pressure has no
 /// nonlinear form here), for a body without anchors, and when no stable shape is found ("load").
 pub fn deflect(mesh: &TetMesh, config: &BakeConfig, loads: &[DeadLoad]) -> Result<Deflection, BakeError> {
     config.check()?;
@@ -191,7 +201,7 @@ struct Problem<'a> {
 type Blocks = [f64; MAX_NODES * MAX_NODES * 9];
 
 impl Problem<'_> {
-    /// Tangent stiffness and inner forces at a displacement.
+    /// Returns the tangent stiffness and the inner forces at a displacement.
     fn tangent(&self, u: &[f64]) -> (BlockCsr, Vec<f64>) {
         const BATCH: usize = 512;
         let per = self.fe.element.node_count();
@@ -253,7 +263,8 @@ impl Problem<'_> {
                 .map(|g| Vector3::from(*g))
                 .collect();
             let w = share * affine.volume;
-            // From the displacement's gradient: `F^T F - I` would leave small strains no digits.
+            // The strain is computed from the displacement gradient, because `F^T F - I` would
+            // leave small strains no digits.
             let h = u.iter().zip(&g).fold(Matrix3::zeros(), |sum, (u, g)| sum + u * g.transpose());
             let deformation = Matrix3::identity() + h;
             let strain = 0.5 * (h + h.transpose() + h.transpose() * h);
@@ -287,7 +298,9 @@ mod tests {
 
     use super::*;
 
-    /// A slender cantilever, 1 m long and a thirtieth thick, nu = 0, under a dead load across its end of `p` = P L^2 / (E I).
+    /// Solves a slender cantilever under a dead load `p` = P L^2 / (E I) across its end.
+    ///
+    /// The cantilever is 1 m long and a thirtieth of that thick, with nu = 0.
     fn cantilever(p: f64) -> [f64; 3] {
         let thick = 1.0 / 30.0;
         let mesh = shapes::bar([30, 1, 1], [1.0, thick, thick]).unwrap();
@@ -318,7 +331,8 @@ mod tests {
 
     #[test]
     fn a_slender_cantilever_bends_as_the_elastica() {
-        // v / L and u / L of the elastica (Bisshopp and Drucker 1945); a bar of aspect 30 also shears, by 3 E I / (k G A L^2) ~ 0.3 % of v.
+        // The values are v / L and u / L of the elastica (Bisshopp and Drucker 1945). A bar of
+        // aspect ratio 30 also shears, by 3 E I / (k G A L^2) ~ 0.3 % of v.
         for (p, v, u) in [(1.0, 0.30172, 0.05643), (2.0, 0.49346, 0.16064)] {
             let tip = cantilever(p);
             assert!((tip[1] / v - 1.0).abs() < 0.01, "P L^2 / E I = {p}: {tip:?}");

@@ -1,19 +1,22 @@
-//! Fill-reducing ordering: nested dissection by coordinate bisection (George 1973, with the geometry at hand).
+//! Fill-reducing ordering: nested dissection by coordinate bisection (George 1973, with known
+//! geometry).
 //!
-//! A set of nodes is halved at the median of a coordinate. The edges that cross the cut form a bipartite graph;
-//! its smallest vertex cover (Koenig's theorem, from a maximum matching by Hopcroft and Karp) is the
-//! smallest separator of that cut. Both halves come first, each ordered the same way, the separator last.
+//! A set of nodes is halved at the median of a coordinate. The edges across the cut form a
+//! bipartite graph. Its smallest vertex cover (Koenig's theorem, from a maximum matching by
+//! Hopcroft and Karp) is the smallest separator of that cut. Both halves come first, each ordered
+//! recursively, and the separator comes last.
 
 use crate::fem::Lists;
 
-/// Sets of at most this many nodes are not cut further.
+/// Largest set that is not divided further.
 const LEAF: usize = 10;
 
-/// Sets larger than this try all three axes and keep the smallest separator.
+/// Size above which a set tries all three axes and keeps the smallest separator.
 const TRY_ALL_AXES: usize = 200;
 
-/// The order in which to eliminate the nodes: position to node. Only nodes with `keep` take part; `graph` is the whole
-/// graph.
+/// Returns the elimination order of the nodes: position to node.
+///
+/// Only nodes with `keep` take part. `graph` is the whole graph.
 pub(crate) fn nested_dissection(graph: &Lists, positions: &[[f64; 3]], keep: &[bool]) -> Vec<u32> {
     let nodes: Vec<u32> = (0..positions.len() as u32).filter(|&i| keep[i as usize]).collect();
     let mut order = Vec::with_capacity(nodes.len());
@@ -28,14 +31,15 @@ const NONE: u32 = u32::MAX;
 struct Dissection<'a> {
     graph: &'a Lists,
     positions: &'a [[f64; 3]],
-    /// 0 or 1: the side of the cut in progress; `NONE` outside it.
+    /// Side of the current cut, 0 or 1, or `NONE` for nodes outside the cut.
     part: Vec<u32>,
-    /// Number of a node among its side's border nodes, `NONE` for inner nodes.
+    /// Index of a node among the border nodes of its side, or `NONE` for inner nodes.
     local: Vec<u32>,
 }
 
 impl Dissection<'_> {
-    /// The depth is logarithmic: each call at least halves the set.
+    /// Orders a set recursively. Each call at least halves the set, so the recursion depth is
+    /// logarithmic.
     fn split(&mut self, mut nodes: Vec<u32>, order: &mut Vec<u32>) {
         if nodes.len() <= LEAF {
             order.append(&mut nodes);
@@ -47,7 +51,7 @@ impl Dissection<'_> {
         let tries = if nodes.len() > TRY_ALL_AXES { 3 } else { 1 };
         let mut best: Option<(Vec<u32>, usize)> = None;
         for &axis in &axes[..tries] {
-            // A far shorter axis cannot give the smaller cut.
+            // An axis that is much shorter than the longest one cannot give the smaller cut.
             if extent[axis] < 0.3 * extent[axes[0]] {
                 continue;
             }
@@ -103,7 +107,7 @@ impl Dissection<'_> {
         nodes.sort_unstable_by(self.compare(axis));
     }
 
-    /// The smallest vertex cover of the edges between the two halves along `axis`.
+    /// Returns the smallest vertex cover of the edges between the two halves along `axis`.
     fn separator(&mut self, nodes: &mut [u32], axis: usize) -> Vec<u32> {
         self.halve(nodes, axis);
         let half = nodes.len() / 2;
@@ -111,7 +115,7 @@ impl Dissection<'_> {
             self.part[node as usize] = u32::from(i >= half);
             self.local[node as usize] = NONE;
         }
-        // Border nodes of each side, and the crossing edges from left to right.
+        // These are the border nodes of each side and the crossing edges from left to right.
         let mut border: [Vec<u32>; 2] = [Vec::new(), Vec::new()];
         for &node in nodes.iter() {
             let side = self.part[node as usize];
@@ -144,7 +148,8 @@ impl Dissection<'_> {
     }
 }
 
-/// Smallest vertex cover of a bipartite graph: `edges` lists for each left vertex its right neighbours.
+/// Returns the smallest vertex cover of a bipartite graph. `edges` lists the right neighbors of
+/// each left vertex.
 fn smallest_cover(edges: &Lists, rights: usize) -> (Vec<bool>, Vec<bool>) {
     let lefts = edges.len();
     let (mut mate_left, mut mate_right) = (vec![NONE; lefts], vec![NONE; rights]);
@@ -157,7 +162,7 @@ fn smallest_cover(edges: &Lists, rights: usize) -> (Vec<bool>, Vec<bool>) {
     let mut depth = vec![0u32; lefts];
     let mut queue: Vec<u32> = Vec::with_capacity(lefts);
     loop {
-        // Breadth-first layers from the unmatched left vertices.
+        // The breadth-first search makes layers from the unmatched left vertices.
         queue.clear();
         for left in 0..lefts {
             depth[left] = if mate_left[left] == NONE {
@@ -192,7 +197,8 @@ fn smallest_cover(edges: &Lists, rights: usize) -> (Vec<bool>, Vec<bool>) {
             }
         }
     }
-    // Koenig: reached from unmatched left vertices by alternating paths. After the last sweep `depth` says which.
+    // Koenig's theorem needs the vertices that alternating paths reach from unmatched left
+    // vertices. `depth` marks them after the last sweep.
     let reached = |left: usize| depth[left] != NONE;
     let mut right_reached = vec![false; rights];
     for left in (0..lefts).filter(|&left| reached(left)) {
@@ -204,7 +210,7 @@ fn smallest_cover(edges: &Lists, rights: usize) -> (Vec<bool>, Vec<bool>) {
     (left_cover, right_reached)
 }
 
-/// Depth-first search for one augmenting path along the layers, with its own stack.
+/// Searches depth-first for one augmenting path along the layers, with an explicit stack.
 fn augment(
     edges: &Lists,
     root: usize,
@@ -224,7 +230,8 @@ fn augment(
         cursor[left] += 1;
         let next = mate_right[right as usize];
         if next == NONE {
-            // Flip the path from its end: each vertex takes the right vertex that its cursor has just passed.
+            // The path is flipped from its end. Each left vertex takes the right vertex that its
+            // cursor has just passed.
             for &left in path.iter().rev() {
                 let right = edges.items[cursor[left] - 1];
                 mate_left[left] = right;
@@ -244,7 +251,7 @@ mod tests {
 
     #[test]
     fn cover_is_as_large_as_the_matching_and_covers() {
-        // A star beside a path: the cover is 1 + 2.
+        // The graph is a star beside a path, so the cover has 1 + 2 vertices.
         let lists = [vec![0, 1, 2], vec![3], vec![3, 4], vec![4]];
         let mut edges = Lists { offsets: vec![0], items: Vec::new() };
         for list in &lists {

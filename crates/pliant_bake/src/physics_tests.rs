@@ -1,4 +1,5 @@
-//! Against values that no one here made up: Demarest's cube, Lamb's sphere, Timoshenko's beam, rods, and full solutions.
+//! Tests against published values and full solutions: Demarest's cube, Lamb's sphere, Timoshenko's
+//! beam and axial modes of rods.
 
 use pliant_mesh::{TetMesh, shapes};
 use pliant_modal::Patch;
@@ -12,7 +13,7 @@ use crate::surface::Skin;
 use crate::symbolic::Symbolic;
 use crate::{Anchor, BakeConfig, flexibility, lanczos, support};
 
-/// Angular frequencies of the lowest elastic modes.
+/// Returns the angular frequencies of the lowest elastic modes, rad/s.
 fn omegas(mesh: &TetMesh, element: Element, config: &BakeConfig, average: Option<bool>) -> Vec<f64> {
     let fe = FeMesh::new(mesh, element);
     let mut law = law(config);
@@ -35,7 +36,7 @@ fn omegas(mesh: &TetMesh, element: Element, config: &BakeConfig, average: Option
     modes.lambda.iter().map(|l| l.sqrt()).collect()
 }
 
-/// `mu = 1`, `rho = 1`.
+/// Makes a configuration with `mu = 1` and `rho = 1`.
 fn unit_shear(poisson: f64, modes: usize) -> BakeConfig {
     BakeConfig { young: 2.0 * (1.0 + poisson), poisson, density: 1.0, modes, ..BakeConfig::default() }
 }
@@ -44,8 +45,10 @@ fn worst(got: &[f64], expected: &[f64]) -> f64 {
     got.iter().zip(expected).map(|(g, e)| (g / e - 1.0).abs()).fold(0.0, f64::max)
 }
 
-/// Side 1, `mu = rho = 1`: omega is Demarest's Omega. The reference is Legendre-Ritz of order 12 (REFERENCES; the same
-/// program for 0.49 and 0.499).
+/// Tests a cube of side 1 with `mu = rho = 1`, where omega is Demarest's Omega.
+///
+/// The reference is Legendre-Ritz of order 12 (REFERENCES). The same program gave the values
+/// for 0.49 and 0.499.
 #[test]
 fn free_cube_has_demarests_frequencies_at_any_poisson_ratio() {
     for (nu, exact) in [
@@ -54,11 +57,12 @@ fn free_cube_has_demarests_frequencies_at_any_poisson_ratio() {
         (0.499, [2.85684, 3.88865, 3.92330, 4.44288, 5.02274]),
     ] {
         let expected = [0, 0, 1, 1, 1, 2, 2, 2, 3, 3, 3, 4, 4, 4].map(|i| exact[i]);
-        // 6,591 degrees of freedom; measured: 0.26 % at worst.
+        // The mesh has 6,591 degrees of freedom. The measured error is at most 0.26 %.
         let got = omegas(&shapes::cube(6, 1.0).unwrap(), Element::Tet10, &unit_shear(nu, 14), None);
         assert!(worst(&got, &expected) < 0.004, "tet10 at {nu}: {got:?}");
     }
-    // What averaging the pressure is for: the mean error of linear tetrahedra at 0.499, 13 % without it.
+    // Averaging the pressure must reduce the mean error of linear tetrahedra at 0.499, which is 13
+    // % without averaging.
     let mesh = shapes::cube(8, 1.0).unwrap();
     let expected = [2.85684, 2.85684, 3.88865, 3.88865, 3.88865, 3.92330, 3.92330, 3.92330];
     let mean = |got: &[f64]| {
@@ -69,8 +73,9 @@ fn free_cube_has_demarests_frequencies_at_any_poisson_ratio() {
     assert!(averaged < 0.04 && locked > 0.10, "{averaged} {locked}");
 }
 
-/// Radius 1, `mu = rho = 1`: omega is Lamb's eta. Straight-sided elements leave out 1 % of the ball: 0.35 % in
-/// frequency.
+/// Tests a sphere of radius 1 with `mu = rho = 1`, where omega is Lamb's eta.
+///
+/// Straight-sided elements leave out 1 % of the ball, which is 0.35 % in frequency.
 #[test]
 fn free_sphere_has_lambs_frequencies() {
     let mesh = shapes::sphere(10, 1.0).unwrap();
@@ -83,8 +88,12 @@ fn free_sphere_has_lambs_frequencies() {
     assert!(breathing < 0.005, "{got:?}");
 }
 
-/// Frequencies of a clamped-free Timoshenko beam (rad/s), from the transfer matrix of its equations:
-/// `w' = theta + V / (k G A)`, `theta' = M / (E I)`, `M' = -V - rho I w^2 theta`, `V' = -rho A w^2 w`.
+/// Returns the frequencies of a clamped-free Timoshenko beam (rad/s) from the transfer matrix of
+/// its equations.
+///
+/// The equations are
+/// `w' = theta + V / (k G A)`, `theta' = M / (E I)`, `M' = -V - rho I w^2 theta`,
+/// `V' = -rho A w^2 w`.
 fn timoshenko(young: f64, poisson: f64, density: f64, length: f64, side: f64, count: usize) -> Vec<f64> {
     let (area, second) = (side * side, side.powi(4) / 12.0);
     let shear = 10.0 * (1.0 + poisson) / (12.0 + 11.0 * poisson) * young / (2.0 * (1.0 + poisson)) * area;
@@ -119,7 +128,7 @@ fn timoshenko(young: f64, poisson: f64, density: f64, length: f64, side: f64, co
 
 #[test]
 fn the_beam_reference_tends_to_eulers() {
-    // beta L = 1.875104 and 4.694091 for a beam of aspect 1000.
+    // Euler's theory gives beta L = 1.875104 and 4.694091. The beam has an aspect ratio of 1000.
     let got = timoshenko(1e6, 0.3, 1e3, 10.0, 0.01, 2);
     let scale = (1e6 * 0.01f64.powi(2) / 12.0 / 1e3).sqrt() / 100.0;
     assert!((got[0] / (1.875104f64.powi(2) * scale) - 1.0).abs() < 1e-4);
@@ -140,13 +149,14 @@ fn cantilever_bends_as_timoshenko_says() {
     };
     let got = omegas(&mesh, Element::Tet10, &config, None);
     let exact = timoshenko(young, nu, density, 2.0, 0.15, 3);
-    // Each bending mode comes twice; the clamped root, which cannot contract, adds 0.2 %.
+    // Each bending mode occurs twice. The clamped root cannot contract, which adds 0.2 %.
     let pairs = [got[0], got[1], got[2], got[3]];
     assert!(worst(&pairs, &[exact[0], exact[0], exact[1], exact[1]]) < 0.005, "{got:?} {exact:?}");
     assert!((got[1] / got[0] - 1.0).abs() < 1e-3 && (got[3] / got[2] - 1.0).abs() < 1e-3, "{got:?}");
 }
 
-/// A rod that cannot contract sideways (nu = 0) has the exact axial modes `(2k - 1) / (4 L) sqrt(E / rho)`.
+/// Tests a rod that cannot contract sideways (nu = 0). Its exact axial modes are
+/// `(2k - 1) / (4 L) sqrt(E / rho)`.
 #[test]
 fn rod_has_its_axial_modes() {
     let (young, density, length): (f64, f64, f64) = (1e6, 1000.0, 1.0);
@@ -167,7 +177,8 @@ fn rod_has_its_axial_modes() {
     }
 }
 
-/// Modes and residual flexibility together are the full static solution at a patch: exactly, by their definition.
+/// Modes and residual flexibility together equal the full static solution at a patch, exactly by
+/// definition.
 #[test]
 fn modes_and_residual_flexibility_make_the_full_static_stiffness() {
     let mesh = shapes::bar([10, 3, 3], [1.0, 0.3, 0.3]).unwrap();
@@ -192,7 +203,7 @@ fn modes_and_residual_flexibility_make_the_full_static_stiffness() {
         let bake = |count, radii: &[f64]| {
             flexibility::sites(&solver, &modes, &skin, &number, count, radii, &mut |_| ()).unwrap()
         };
-        // Few places go through the factor one by one, all of them together.
+        // A few sites are solved one by one through the factor, and all sites are solved together.
         let mut sites = bake(Some(6), &[0.1, 0.25]);
         assert_eq!(sites.len(), 12);
         let every = bake(None, &[0.0, 0.1, 0.25]);
@@ -250,7 +261,7 @@ fn pseudo_inverse_of_a_free_body_ignores_rigid_motion() {
         positions[row as usize] = p;
     }
     let rigid = MassProperties::new(&fe, config.density).rigid_modes(positions.into_iter());
-    // M-orthonormal, and without elastic energy.
+    // The rigid modes are M-orthonormal and have no elastic energy.
     let (mut k, mut m) = (vec![0.0; rigid.len()], vec![0.0; rigid.len()]);
     matrix.stiffness_times(&rigid, 6, &mut k);
     matrix.mass_times(&rigid, 6, &mut m);
@@ -263,7 +274,7 @@ fn pseudo_inverse_of_a_free_body_ignores_rigid_motion() {
     let solver = Solver::new(&matrix, Symbolic::new(&ordered), Some(rigid)).unwrap();
     let largest = k.iter().fold(0.0f64, |a, x| a.max(x.abs()));
     assert!(largest < 1e-9 * config.young, "{largest:e}");
-    // K x gives x back, once the rigid part is out.
+    // The pseudo-inverse of K x returns x once the rigid part is removed.
     let mut x: Vec<f64> = (0..matrix.dofs()).map(|i| ((i * 37 % 101) as f64 - 50.0) / 50.0).collect();
     solver.remove_rigid(&mut x, 1);
     let mut f = vec![0.0; x.len()];

@@ -5,19 +5,22 @@ use nalgebra::{Matrix3, SymmetricEigen, Vector3};
 use crate::element::cross;
 use crate::fem::FeMesh;
 
-/// Mass, center and inertia of the body at rest.
+/// Mass, center of mass and inertia of the body at rest.
 #[derive(Clone, Copy, Debug)]
 pub(crate) struct MassProperties {
-    /// kg.
+    /// Mass, kg.
     pub(crate) mass: f64,
-    /// m.
+    /// Center of mass, m.
     pub(crate) center: [f64; 3],
-    /// About the center, kg m^2.
+    /// Inertia about the center of mass, kg m^2.
     pub(crate) inertia: [[f64; 3]; 3],
 }
 
 impl MassProperties {
-    /// Exact for the tetrahedra: over one of volume V, `int x_k x_l = V/20 (sum_a x_ak x_al + sum_a x_ak sum_b x_bl)`.
+    /// Computes the mass properties, exactly for the tetrahedra.
+    ///
+    /// The second moments of a tetrahedron of volume V are `int x_k x_l = V/20 (sum_a x_ak x_al +
+    /// sum_a x_ak sum_b x_bl)`.
     pub(crate) fn new(mesh: &FeMesh, density: f64) -> Self {
         let volume = mesh.volume();
         let mut first = [0.0; 3];
@@ -47,8 +50,10 @@ impl MassProperties {
         }
     }
 
-    /// The six rigid modes at `positions`, mass-normalised, as a block of six columns: three translations, then
-    /// rotations about the principal axes through the center of mass.
+    /// Returns the six mass-normalized rigid modes at `positions` as a block of six columns.
+    ///
+    /// The first three columns are translations. The last three are rotations about the principal
+    /// axes through the center of mass.
     pub(crate) fn rigid_modes(&self, positions: impl ExactSizeIterator<Item = [f64; 3]>) -> Vec<f64> {
         let inertia = Matrix3::from_fn(|i, j| self.inertia[i][j]);
         let principal = SymmetricEigen::new(inertia);
@@ -69,8 +74,10 @@ impl MassProperties {
     }
 }
 
-/// Six degrees of freedom that hold a rigid body without stressing it: rows of the rigid modes chosen by pivoted
-/// Gram-Schmidt, so that they are as independent as the body allows.
+/// Selects six degrees of freedom that hold a rigid body without stress.
+///
+/// Pivoted Gram-Schmidt selects rows of the rigid modes, so that they are as independent as the
+/// body allows.
 pub(crate) fn statically_determinate_dofs(modes: &[f64]) -> [usize; 6] {
     let mut rows: Vec<[f64; 6]> =
         modes.chunks_exact(6).map(|row| [0, 1, 2, 3, 4, 5].map(|r| row[r])).collect();

@@ -1,4 +1,4 @@
-//! Static solutions: `K^-1`, or for a free body the inertia-relief pseudo-inverse.
+//! Static solutions with `K^-1`, or with the inertia-relief pseudo-inverse for a free body.
 
 use crate::blocks::{self, Tall};
 use crate::factor::{Factor, NotPositive};
@@ -6,17 +6,17 @@ use crate::rigid;
 use crate::sparse::BlockCsr;
 use crate::symbolic::Symbolic;
 
-/// The rigid modes of a free body and their images under M, as blocks of six columns; M-orthonormal.
+/// Rigid modes of a free body, M-orthonormal, and their images under M, as blocks of six columns.
 #[derive(Clone, Debug)]
 pub(crate) struct Rigid {
     pub(crate) modes: Vec<f64>,
     pub(crate) mass_times_modes: Vec<f64>,
 }
 
-/// Factored stiffness with all that a static solution needs.
+/// Factored stiffness and rigid modes for static solutions.
 ///
-/// A free body is held by six springs at a statically determinate set of degrees of freedom. A load that is in
-/// equilibrium puts no force on such springs, so the answer to it is exact up to a rigid motion: with
+/// Six springs hold a free body at a statically determinate set of degrees of freedom. A load in
+/// equilibrium puts no force on these springs, so its solution is exact up to a rigid motion: with
 /// `P = I - R R^T M`, `K^+ = P (K + springs)^-1 P^T`.
 #[derive(Clone, Debug)]
 pub(crate) struct Solver<'a> {
@@ -26,7 +26,7 @@ pub(crate) struct Solver<'a> {
 }
 
 impl<'a> Solver<'a> {
-    /// `rigid_modes`: six M-orthonormal columns for a free body.
+    /// Factors the matrix. `rigid_modes` holds six M-orthonormal columns for a free body.
     pub(crate) fn new(
         matrix: &'a BlockCsr,
         symbolic: Symbolic,
@@ -47,12 +47,12 @@ impl<'a> Solver<'a> {
         Ok(Self { matrix, factor, rigid })
     }
 
-    /// Degrees of freedom.
+    /// Returns the number of degrees of freedom.
     pub(crate) fn dofs(&self) -> usize {
         self.matrix.dofs()
     }
 
-    /// `P x = x - R (M R)^T x`: takes the rigid motion out of displacements.
+    /// Removes the rigid motion from displacements: `P x = x - R (M R)^T x`.
     pub(crate) fn remove_rigid(&self, x: &mut [f64], width: usize) {
         if let Some(rigid) = &self.rigid {
             let along = blocks::gram(Tall::new(&rigid.mass_times_modes, 6), Tall::new(x, width));
@@ -60,7 +60,8 @@ impl<'a> Solver<'a> {
         }
     }
 
-    /// `P^T f = f - M R R^T f`: balances loads with the inertia of the rigid acceleration that they cause.
+    /// Balances loads with the inertia of the rigid acceleration that they cause:
+    /// `P^T f = f - M R R^T f`.
     pub(crate) fn balance(&self, f: &mut [f64], width: usize) {
         if let Some(rigid) = &self.rigid {
             let along = blocks::gram(Tall::new(&rigid.modes, 6), Tall::new(f, width));
@@ -68,14 +69,14 @@ impl<'a> Solver<'a> {
         }
     }
 
-    /// Loads become displacements: `K^-1 f`, or `K^+ f` for a free body.
+    /// Replaces loads by displacements: `K^-1 f`, or `K^+ f` for a free body.
     pub(crate) fn solve(&self, f: &mut [f64], width: usize) {
         self.balance(f, width);
         self.factor.solve(f, width);
         self.remove_rigid(f, width);
     }
 
-    /// `K^-1 M x`.
+    /// Returns `K^-1 M x`.
     pub(crate) fn operator(&self, x: &[f64], width: usize) -> Vec<f64> {
         let mut out = vec![0.0; x.len()];
         self.matrix.mass_times(x, width, &mut out);

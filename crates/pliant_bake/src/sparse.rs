@@ -1,23 +1,26 @@
 //! Symmetric block-sparse stiffness and mass, and their products with blocks of vectors.
 //!
-//! A block of vectors is stored row by row: entry (dof, column) at `dof * width + column`, dof = 3 node + axis.
+//! A block of vectors is stored row by row: entry (dof, column) is at `dof * width + column`, where
+//! dof = 3 node + axis.
 
 use rayon::prelude::*;
 
 use crate::fem::Lists;
 
-/// Stiffness (3x3 blocks, N/m) and mass (one number per node pair, kg: the mass acts on each axis alike) on one
-/// symmetric pattern, both triangles stored.
+/// Stiffness (3x3 blocks, N/m) and mass (kg) on one symmetric sparsity pattern, with both triangles
+/// stored.
+///
+/// The mass is one number per node pair, because it acts on each axis alike.
 #[derive(Clone, Debug)]
 pub(crate) struct BlockCsr {
     pub(crate) offsets: Vec<usize>,
     pub(crate) columns: Vec<u32>,
-    /// Nine numbers per stored block, row by row.
+    /// Stiffness values, nine per stored block, row by row.
     pub(crate) stiffness: Vec<f64>,
     pub(crate) mass: Vec<f64>,
 }
 
-/// Nodes per parallel task of a product.
+/// Number of nodes per parallel task of a product.
 const CHUNK: usize = 256;
 
 impl BlockCsr {
@@ -30,24 +33,24 @@ impl BlockCsr {
         }
     }
 
-    /// Nodes.
+    /// Returns the number of nodes.
     pub(crate) fn nodes(&self) -> usize {
         self.offsets.len() - 1
     }
 
-    /// Degrees of freedom.
+    /// Returns the number of degrees of freedom.
     pub(crate) fn dofs(&self) -> usize {
         3 * self.nodes()
     }
 
-    /// Where the block (row, column) is stored; the pair must be in the pattern.
+    /// Returns the storage index of the block (row, column). The pair must be in the pattern.
     pub(crate) fn position(&self, row: u32, column: u32) -> usize {
         let start = self.offsets[row as usize];
         let columns = &self.columns[start..self.offsets[row as usize + 1]];
         start + columns.partition_point(|&c| c < column)
     }
 
-    /// `out = K x` for blocks of `width` vectors.
+    /// Computes `out = K x` for blocks of `width` vectors.
     pub(crate) fn stiffness_times(&self, x: &[f64], width: usize, out: &mut [f64]) {
         self.rows(width, out, |at, column, y| {
             let k = &self.stiffness[9 * at..][..9];
@@ -63,9 +66,9 @@ impl BlockCsr {
         });
     }
 
-    /// `out = M x` for blocks of `width` vectors.
+    /// Computes `out = M x` for blocks of `width` vectors.
     pub(crate) fn mass_times(&self, x: &[f64], width: usize, out: &mut [f64]) {
-        // Eight sums at a time stay in registers while the row's neighbours go by.
+        // Eight sums at a time stay in registers during the loop over the row's neighbors.
         const LANES: usize = 8;
         out.par_chunks_mut(3 * width * CHUNK).enumerate().for_each(|(chunk, out)| {
             for (local, y) in out.chunks_exact_mut(3 * width).enumerate() {

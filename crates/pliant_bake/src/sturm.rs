@@ -1,15 +1,18 @@
-//! How many eigenvalues of `K x = lambda M x` lie below a shift: as many as `K - shift M` has
-//! negative pivots (Sylvester's law of inertia). An eigensolver that has found as many has missed
-//! none.
+//! Counts the eigenvalues of `K x = lambda M x` below a shift.
 //!
-//! The fronts are those of the Cholesky factorisation, and most are positive definite here as well:
-//! nested dissection eliminates small parts first, held by their neighbours, whose lowest
-//! eigenvalues are far above the body's. A front's diagonal block that is not goes through Bunch
-//! and Kaufman's pivots of one and two columns. Rows are not moved out of their block, so pivots
-//! may be small and what is subtracted large. How large is known afterwards: row i of the factors
-//! has the square `A_ii + 2 (its part in negative pivots)`, and rounding moves the matrix by so
-//! much times the machine's precision. [`Count::blur`] is what that means for an eigenvalue. A
-//! count whose blur is too large is not used.
+//! Their number is the number of negative pivots of `K - shift M` (Sylvester's law of inertia). An
+//! eigensolver that has found as many has missed none.
+//!
+//! The fronts are those of the Cholesky factorization, and most are positive definite here as well:
+//! nested dissection first eliminates small parts that their neighbors hold and whose lowest
+//! eigenvalues are far above those of the body. A diagonal block that is not positive definite is
+//! factored with the Bunch-Kaufman pivots of one and two columns. Rows stay in their block, so
+//! pivots may be small and the subtracted terms large.
+//!
+//! The size of these terms is known afterwards. Row i of the factors has the square
+//! `A_ii + 2 (its part in negative pivots)`, and rounding changes the matrix by this square times
+//! the machine precision. [`Count::blur`] is the resulting error of an eigenvalue. A count whose
+//! blur is too large is not used.
 
 use faer::diag::Diag;
 use faer::dyn_stack::{MemBuffer, MemStack};
@@ -23,27 +26,28 @@ use crate::factor::{STRIP, assemble_front, subtract_product};
 use crate::sparse::BlockCsr;
 use crate::symbolic::{ROOT, Supernode, Symbolic};
 
-/// Sums of many terms round more than once. Counts were seen to be wrong no farther from an
-/// eigenvalue than this says.
+/// Factor for the several rounding errors in sums of many terms.
+///
+/// Wrong counts were not observed farther from an eigenvalue than this factor allows.
 const ROUNDINGS: f64 = 32.0;
 
-/// The eigenvalues below a shift.
+/// Number of eigenvalues below a shift, with the data for its error estimate.
 #[derive(Clone, Debug)]
 pub(crate) struct Count {
     pub(crate) below: usize,
-    /// Squares of the factors' rows.
+    /// Squares of the rows of the factors.
     squares: Vec<f64>,
 }
 
-/// A pivot is zero, or so large that it is no number: the shift is an eigenvalue of a leading part.
+/// Error for a pivot that is zero or not finite: the shift is an eigenvalue of a leading part.
 #[derive(Clone, Copy, Debug)]
 pub(crate) struct Singular;
 
-/// What the fronts have found.
+/// Sums that the fronts accumulate.
 #[derive(Debug, Default)]
 struct Tally {
     negative: usize,
-    /// Row, and twice its square in negative pivots.
+    /// Row and twice the square of its part in negative pivots.
     grown: Vec<(usize, f64)>,
 }
 
@@ -86,9 +90,11 @@ impl Count {
         }
     }
 
-    /// How far, as a share of `shift`, rounding may have moved the eigenvalues: to first order by
-    /// `phi^T E phi` of an M-normalised mode, and the entries of E are `sqrt(squares_i squares_j)`
-    /// times the precision. `modes` are `width` of them; the largest counts.
+    /// Returns how far rounding may have moved the eigenvalues, as a fraction of `shift`.
+    ///
+    /// To first order an eigenvalue moves by `phi^T E phi` of an M-normalized mode. The entries of
+    /// E are `sqrt(squares_i squares_j)` times the precision. `modes` holds `width` modes, and the
+    /// largest value counts.
     pub(crate) fn blur(&self, modes: &[f64], width: usize, shift: f64) -> f64 {
         let mut sums = vec![0.0; width];
         for (row, square) in modes.chunks_exact(width).zip(&self.squares) {
@@ -96,13 +102,13 @@ impl Count {
                 *sum += square * x * x;
             }
         }
-        // NaN stays.
+        // This fold keeps a NaN.
         let largest = sums.into_iter().fold(0.0, |a: f64, b| if a > b { a } else { b });
         ROUNDINGS * f64::EPSILON * largest / shift
     }
 }
 
-/// The diagonal of K and that of `shift M`, added.
+/// Returns the sum of the absolute diagonals of K and `shift M`.
 fn diagonal(matrix: &BlockCsr, shift: f64) -> Vec<f64> {
     let mut out = Vec::with_capacity(matrix.dofs());
     for node in 0..matrix.nodes() {
@@ -113,7 +119,7 @@ fn diagonal(matrix: &BlockCsr, shift: f64) -> Vec<f64> {
     out
 }
 
-/// Assembles and eliminates one front; returns the update matrix for its parent.
+/// Assembles and eliminates one front. Returns the update matrix for the parent.
 fn front(
     symbolic: &Symbolic,
     s: usize,
@@ -131,8 +137,9 @@ fn front(
     Ok(if supernode.parent == ROOT { Vec::new() } else { update })
 }
 
-/// As `factor_front`, with columns of `L |D|^1/2` in place of those of L, and the signs of D in the
-/// products.
+/// Eliminates a front as `factor_front` does, with columns of `L |D|^1/2` in place of those of L.
+///
+/// The products include the signs of D.
 fn eliminate(
     supernode: &Supernode,
     block: &mut [f64],
@@ -187,7 +194,7 @@ fn eliminate(
         let under = under.into_const();
         let signed = signed(under, &negative[start..end]);
         let right = signed.as_ref().map_or(under, |signed| signed.as_ref());
-        // Columns of this front still to come.
+        // These are the columns of this front that are not eliminated yet.
         rest[..(width - end) * height].par_chunks_mut(STRIP * height).enumerate().for_each(
             |(index, strip)| {
                 let first = index * STRIP;
@@ -219,7 +226,7 @@ fn eliminate(
     Ok(())
 }
 
-/// The row of the matrix that a front's row stands for.
+/// Returns the matrix row of a front's row.
 fn row_of(supernode: &Supernode, local: usize) -> usize {
     match local.checked_sub(supernode.width()) {
         None => 3 * supernode.first + local,
@@ -227,7 +234,7 @@ fn row_of(supernode: &Supernode, local: usize) -> usize {
     }
 }
 
-/// The columns, those of negative pivots with their sign; `None` if there are none.
+/// Returns the columns with those of negative pivots negated, or `None` if no pivot is negative.
 fn signed(columns: MatRef<'_, f64>, negative: &[bool]) -> Option<Mat<f64>> {
     negative.contains(&true).then(|| {
         Mat::from_fn(columns.nrows(), columns.ncols(), |i, j| {
@@ -236,19 +243,19 @@ fn signed(columns: MatRef<'_, f64>, negative: &[bool]) -> Option<Mat<f64>> {
     })
 }
 
-/// The pivots of a diagonal block: `P A P^T = L D L^T` with `D = Q |D|^1/2 sign(D) |D|^1/2 Q^T`.
+/// Pivots of a diagonal block: `P A P^T = L D L^T` with `D = Q |D|^1/2 sign(D) |D|^1/2 Q^T`.
 struct Pivots {
-    /// Row i of the permuted block is row `permutation[i]` of the block.
+    /// Permutation of the rows. Row i of the permuted block is row `permutation[i]` of the block.
     permutation: Vec<usize>,
-    /// Of the first column of each pivot: does the next one belong to it, and cosine and sine of
-    /// its Q?
+    /// Cosine and sine of Q for the first column of each two-column pivot, and `None` for all other
+    /// columns.
     turn: Vec<Option<(f64, f64)>>,
     /// Eigenvalues of D.
     values: Vec<f64>,
 }
 
 impl Pivots {
-    /// Leaves L in the block.
+    /// Factors the block and leaves L in it.
     fn new(mut block: MatMut<'_, f64>) -> Result<Self, Singular> {
         let n = block.nrows();
         let mut subdiagonal = Diag::<f64>::zeros(n);
@@ -272,8 +279,8 @@ impl Pivots {
                 values.push(a);
                 continue;
             }
-            // The larger eigenvalue by its size first, the other from the determinant: no digits
-            // are lost.
+            // The eigenvalue of larger magnitude comes first and the other follows from the
+            // determinant, so that no digits are lost.
             let d = block[(j + 1, j + 1)];
             let (middle, half) = (0.5 * (a + d), 0.5 * (a - d));
             let radius = half.hypot(b);
@@ -281,19 +288,19 @@ impl Pivots {
             let near = (a * d - b * b) / far;
             let angle = 0.5 * b.atan2(half);
             turn[j] = Some((angle.cos(), angle.sin()));
-            // The turned first column belongs to the upper eigenvalue.
+            // The rotated first column belongs to the upper eigenvalue.
             values.extend(if middle < 0.0 { [near, far] } else { [far, near] });
         }
         let sound = values.iter().all(|&value| value != 0.0 && value.is_finite());
         if sound { Ok(Self { permutation, turn, values }) } else { Err(Singular) }
     }
 
-    /// Columns of negative eigenvalues.
+    /// Returns the columns of negative eigenvalues.
     fn negative(&self) -> impl Iterator<Item = usize> + '_ {
         (0..self.values.len()).filter(|&j| self.values[j] < 0.0)
     }
 
-    /// Turns a row of two columns of each wide pivot.
+    /// Rotates the two columns of each two-column pivot in a row.
     fn turned(&self, row: &mut [f64]) {
         for (j, turn) in self.turn.iter().enumerate() {
             if let Some((cos, sin)) = turn {
@@ -304,7 +311,7 @@ impl Pivots {
         }
     }
 
-    /// `rows := rows P^T L^-T Q |D|^-1/2`, columns of `L |D|^1/2` below the block.
+    /// Computes `rows := rows P^T L^-T Q |D|^-1/2`, the columns of `L |D|^1/2` below the block.
     fn apply(&self, triangle: MatRef<'_, f64>, mut rows: MatMut<'_, f64>) {
         let n = self.values.len();
         let mut work = Mat::from_fn(rows.nrows(), n, |i, j| rows[(i, self.permutation[j])]);
@@ -319,7 +326,7 @@ impl Pivots {
         }
     }
 
-    /// Twice the square of each of the block's own rows in negative pivots.
+    /// Returns twice the square of the part in negative pivots for each of the block's own rows.
     fn squares(&self, triangle: MatRef<'_, f64>) -> Vec<f64> {
         let n = self.values.len();
         let mut out = vec![0.0; n];

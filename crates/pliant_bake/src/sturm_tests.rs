@@ -4,8 +4,8 @@ use crate::factor::tests::bar;
 use crate::lanczos;
 use crate::solver::Solver;
 
-/// A relative distance from an eigenvalue at which counts were seen to be right, and the blur that
-/// was told there.
+/// Returns for each isolated mode the smallest relative distance from the eigenvalue at which the
+/// counts are right, and the blur there.
 fn margins(cells: [usize; 3], element: Element, average: bool) -> Vec<(usize, f64, f64)> {
     let (_, matrix, symbolic) = bar(cells, element, average);
     let solver = Solver::new(&matrix, symbolic, None).unwrap();
@@ -18,7 +18,7 @@ fn margins(cells: [usize; 3], element: Element, average: bool) -> Vec<(usize, f6
         if (mode > 0 && !apart(mode - 1)) || (mode + 1 < wanted && !apart(mode + 1)) {
             continue;
         }
-        // From afar to the place where the count is wrong.
+        // The distance decreases until a count is wrong.
         let (mut right, mut told) = (1.0, 0.0);
         for distance in (6..15).map(|digits| 10f64.powi(-digits)) {
             let shifts = [lambda * (1.0 - distance), lambda * (1.0 + distance)];
@@ -49,7 +49,7 @@ fn counts_are_right_as_near_to_an_eigenvalue_as_they_say() {
     }
 }
 
-/// A small generator of numbers in -1 to 1.
+/// Makes a small generator of numbers in -1 to 1.
 fn numbers(seed: u64) -> impl FnMut() -> f64 {
     let mut state = seed;
     move || {
@@ -58,8 +58,8 @@ fn numbers(seed: u64) -> impl FnMut() -> f64 {
     }
 }
 
-/// Shifts anywhere in the spectrum, where half of the pivots are negative and fronts are indefinite
-/// from the first on.
+/// Tests shifts anywhere in the spectrum, where up to half of the pivots are negative and already
+/// the first fronts are indefinite.
 #[test]
 fn counts_are_those_of_all_eigenvalues() {
     for (cells, element, average) in [
@@ -85,14 +85,14 @@ fn counts_are_those_of_all_eigenvalues() {
     }
 }
 
-/// The pivots multiply to the block, those of two columns as well.
+/// The pivots of one and two columns multiply to the block.
 #[test]
 fn pivots_make_the_block_again() {
     let mut random = numbers(3);
     for (n, filled) in [(1, true), (2, false), (7, true), (40, false), (128, true)] {
         let mut block = Mat::zeros(n, n);
         for i in 0..n {
-            // An empty diagonal asks for pivots of two columns.
+            // An empty diagonal requires pivots of two columns.
             for j in 0..if filled { i + 1 } else { i } {
                 let x = random();
                 (block[(i, j)], block[(j, i)]) = (x, x);
@@ -102,14 +102,14 @@ fn pivots_make_the_block_again() {
         let pivots = Pivots::new(factored.as_mut()).unwrap();
         let two = pivots.turn.iter().flatten().count();
         assert!(filled || two > 0);
-        // What lies below: any rows B give B A^-1 B^T.
+        // For any rows B below the block, the result must give B A^-1 B^T.
         let rows = Mat::from_fn(5, n, |_, _| random());
         let mut applied = rows.clone();
         pivots.apply(factored.as_ref(), applied.as_mut());
         let flags: Vec<bool> = pivots.values.iter().map(|&value| value < 0.0).collect();
         let right = signed(applied.as_ref(), &flags);
         let right = right.as_ref().unwrap_or(&applied);
-        // A^-1 B^T from all eigenvectors.
+        // The reference A^-1 B^T uses all eigenvectors.
         let (values, vectors) = crate::blocks::symmetric_eigen(block.as_ref()).unwrap();
         let along = &rows * &vectors;
         let negative = values.iter().filter(|&&value| value < 0.0).count();
@@ -125,7 +125,7 @@ fn pivots_make_the_block_again() {
             }
         }
         assert!(off < 1e-9 * size, "{n}: {off:e} of {size:e}");
-        // Rows of all pivots less twice those of the negative ones are the diagonal.
+        // The diagonal equals the squares of all pivots minus twice those of the negative ones.
         for (i, square) in pivots.squares(factored.as_ref()).into_iter().enumerate() {
             assert!(square >= -2.0 * block[(i, i)] - 1e-9, "{n}: {square} {}", block[(i, i)]);
         }
@@ -146,6 +146,8 @@ fn counts_are_equal_to_the_bit_whatever_the_threads() {
     }
 }
 
+/// Measures the time of a count.
+///
 /// `cargo test -p pliant_bake --lib what_counting_costs -- --ignored --nocapture`
 #[test]
 #[ignore = "a measurement"]

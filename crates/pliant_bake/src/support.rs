@@ -1,14 +1,15 @@
-//! What holds the body: which nodes are anchored, and whether that is neither too little nor too much.
+//! Finds the anchored nodes and checks that the anchors fix neither too little nor too much.
 
 use nalgebra::{Matrix3, SymmetricEigen, Vector3};
 
 use crate::fem::{FeMesh, Lists};
 use crate::{Anchor, BakeError};
 
-/// Anchored nodes that spread less than this share of the body's size off a line count as lying on it.
+/// Distance from a line, as a fraction of the body's size, below which anchored nodes count as
+/// lying on the line.
 const THIN: f64 = 1e-6;
 
-/// For each node: is it held? All false without anchors.
+/// Returns for each node whether it is anchored. All entries are false without anchors.
 pub(crate) fn anchored_nodes(fe: &FeMesh, anchors: &[Anchor]) -> Result<Vec<bool>, BakeError> {
     let mut held = vec![false; fe.nodes.len()];
     for anchor in anchors {
@@ -34,7 +35,8 @@ pub(crate) fn anchored_nodes(fe: &FeMesh, anchors: &[Anchor]) -> Result<Vec<bool
     Ok(held)
 }
 
-/// Each connected part must be held by nodes that are not all on one line; a free body must be one part.
+/// Checks that every connected part is fixed by nodes that are not all on one line. A free body
+/// must be a single part.
 pub(crate) fn check_connected(
     fe: &FeMesh,
     graph: &Lists,
@@ -89,7 +91,7 @@ fn loose(fe: &FeMesh, part: &[u32], parts: usize) -> BakeError {
     BakeError::LooseParts { parts, at: fe.nodes[part[0] as usize], nodes: part.len() }
 }
 
-/// Nodes of each part, the largest part first.
+/// Returns the nodes of each connected part, with the largest part first.
 fn connected_parts(graph: &Lists) -> Vec<Vec<u32>> {
     let mut seen = vec![false; graph.len()];
     let mut parts = Vec::new();

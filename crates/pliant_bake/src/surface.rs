@@ -1,4 +1,4 @@
-//! The visible surface and what the modes do there.
+//! The visible surface and the mode shapes on it.
 
 use pliant_mesh::{Surface, TetMesh};
 use pliant_modal::SurfaceMesh;
@@ -9,10 +9,11 @@ use crate::element::{self, MAX_NODES};
 use crate::embedding::Locator;
 use crate::fem::{ANCHORED, FeMesh, Lists};
 
-/// Furthest that a skin's vertex may lie from the tetrahedra, as a share of the body's largest extent.
+/// Largest distance between a skin vertex and the tetrahedra, as a fraction of the body's largest
+/// extent.
 const SKIN_REACH: f64 = 0.1;
 
-/// Each surface vertex as combinations of nodes: of their displacements, and of their rotations.
+/// Surface whose vertex displacements and rotations are linear combinations of nodal values.
 #[derive(Clone, Debug)]
 pub(crate) struct Skin {
     pub(crate) mesh: SurfaceMesh,
@@ -21,8 +22,10 @@ pub(crate) struct Skin {
 }
 
 impl Skin {
-    /// The boundary of the tetrahedra, or `skin` embedded in them: displacements are interpolated by the shape
-    /// functions, outside the tetrahedra continued linearly from the nearest point of them.
+    /// Uses the boundary of the tetrahedra, or embeds `skin` in them.
+    ///
+    /// The shape functions interpolate the displacements of an embedded skin. Outside the
+    /// tetrahedra the displacements are extrapolated linearly from the nearest point of the mesh.
     pub(crate) fn new(
         tets: &TetMesh,
         mesh: &FeMesh,
@@ -50,20 +53,23 @@ impl Skin {
         Ok(Self { mesh, displacement, rotation })
     }
 
-    /// The lowest row of the matrix that moves `vertex`; `ANCHORED` when none does.
+    /// Returns the lowest matrix row that moves `vertex`, or `ANCHORED` when no row does.
     pub(crate) fn first_row(&self, vertex: u32, number: &[u32]) -> u32 {
         let rows = self.displacement[vertex as usize].iter().map(|&(node, _)| number[node as usize]);
         rows.min().unwrap_or(ANCHORED)
     }
 
-    /// Adds a load of `weight` at `vertex` to nodal loads: `visit(node, share)`.
+    /// Distributes a load of `weight` at `vertex` over the nodes. Calls `visit(node, share)` for
+    /// each node.
     pub(crate) fn spread(&self, vertex: u32, weight: f64, visit: &mut dyn FnMut(u32, f64)) {
         for &(node, share) in &self.displacement[vertex as usize] {
             visit(node, weight * share);
         }
     }
 
-    /// Mode shapes at the vertices, `[mode][vertex][axis]`. `phi` has a row for each free dof and a column a mode.
+    /// Returns the mode shapes at the vertices as `[mode][vertex][axis]`.
+    ///
+    /// `phi` has one row per free degree of freedom and one column per mode.
     pub(crate) fn displacements(&self, phi: &[f64], modes: usize, number: &[u32]) -> Vec<f32> {
         let node = |node: u32, mode: usize, axis: usize| {
             let row = number[node as usize];
@@ -72,8 +78,10 @@ impl Skin {
         gather(&self.displacement, modes, &node)
     }
 
-    /// Half the curl of the mode shapes at the vertices, `[mode][vertex][axis]`: at each node the mean over its
-    /// elements weighted by volume, then interpolated as the corners are.
+    /// Returns half the curl of the mode shapes at the vertices as `[mode][vertex][axis]`.
+    ///
+    /// The value at a node is the volume-weighted mean over the node's elements. The corner values
+    /// are then interpolated linearly to the vertices.
     pub(crate) fn rotations(&self, mesh: &FeMesh, phi: &[f64], modes: usize, number: &[u32]) -> Vec<f32> {
         let around = mesh.elements_of_nodes();
         let mut place = vec![u32::MAX; mesh.nodes.len()];
@@ -107,7 +115,7 @@ fn gather(
     out
 }
 
-/// `1/2 curl u` of each mode at a node, three numbers a mode.
+/// Returns `1/2 curl u` of each mode at a node, three numbers per mode.
 fn half_curl(
     mesh: &FeMesh,
     around: &Lists,

@@ -1,74 +1,77 @@
-//! Symbolic Cholesky factorisation on the graph of nodes: elimination tree, supernodes, independent subtrees.
+//! Symbolic Cholesky factorization on the graph of nodes: elimination tree, supernodes and
+//! independent subtrees.
 //!
-//! Three degrees of freedom share each node, so everything here counts nodes; the numeric part triples it.
+//! Each node has three degrees of freedom. All counts in this module are nodes, and the numeric
+//! part multiplies them by three.
 
 use crate::fem::Lists;
 
-/// No parent.
+/// Marks a node or supernode without a parent.
 pub(crate) const ROOT: usize = usize::MAX;
 
-/// Subtrees of the elimination tree of at most this many nodes become one dense supernode.
+/// Largest number of nodes of an elimination subtree that becomes one dense supernode.
 const RELAXED_SUBTREE: usize = 8;
 
-/// A child is merged with its parent while the merged supernode has at most (.0) columns and at most the share (.1) of
-/// it are stored zeros.
+/// Limits for merging a child with its parent: at most (.0) columns in the merged supernode and at
+/// most the fraction (.1) of stored zeros.
 const MERGE: [(usize, f64); 4] = [(4, 1.0), (12, 0.5), (32, 0.15), (usize::MAX, 0.05)];
 
-/// Columns with one sparsity pattern, factored as a dense block.
+/// Columns with a common sparsity pattern, factored as a dense block.
 #[derive(Clone, Debug)]
 pub(crate) struct Supernode {
     /// First node.
     pub(crate) first: usize,
-    /// Nodes eliminated here: `first..first + columns`.
+    /// Number of nodes that this supernode eliminates: `first..first + columns`.
     pub(crate) columns: usize,
-    /// Nodes below that it couples with, ascending.
+    /// Coupled nodes below the supernode, in ascending order.
     pub(crate) rows: Vec<u32>,
     pub(crate) parent: usize,
     pub(crate) children: Vec<usize>,
-    /// Where its values start; column-major, `3 (columns + rows)` by `3 columns`.
+    /// Start of the supernode's values. They are column-major, `3 (columns + rows)` by `3 columns`.
     pub(crate) at: usize,
-    /// Rows inside the task's own subtree (all of them for supernodes of the top).
+    /// Number of rows inside the task's own subtree (all rows for supernodes of the top).
     pub(crate) inside: usize,
-    /// For the rows past `inside`: their places in the rows of the task's root.
+    /// Positions of the rows past `inside` in the rows of the task's root.
     pub(crate) outside: Vec<u32>,
 }
 
 impl Supernode {
-    /// Degrees of freedom eliminated here.
+    /// Returns the number of eliminated degrees of freedom.
     pub(crate) fn width(&self) -> usize {
         3 * self.columns
     }
 
-    /// Degrees of freedom coupled below.
+    /// Returns the number of coupled degrees of freedom below.
     pub(crate) fn below(&self) -> usize {
         3 * self.rows.len()
     }
 
-    /// Stored values.
+    /// Returns the number of stored values.
     pub(crate) fn values(&self) -> usize {
         (self.width() + self.below()) * self.width()
     }
 
-    /// Multiplications of the dense factorisation, about.
+    /// Estimates the multiplications of the dense factorization.
     fn cost(&self) -> f64 {
         let (w, b) = (self.width() as f64, self.below() as f64);
         w * w * w / 3.0 + w * w * b + w * b * b
     }
 }
 
-/// The supernodes in elimination order, cut into independent subtrees and the top that joins them.
+/// Supernodes in elimination order, divided into independent subtrees and the top that joins them.
 #[derive(Clone, Debug)]
 pub(crate) struct Symbolic {
     pub(crate) supernodes: Vec<Supernode>,
-    /// Ranges of supernodes: subtrees that do not depend on one another. In order, not overlapping.
+    /// Ranges of supernodes that form independent subtrees, in order and without overlap.
     pub(crate) tasks: Vec<std::ops::Range<usize>>,
-    /// The other supernodes, ascending.
+    /// All other supernodes, in ascending order.
     pub(crate) top: Vec<usize>,
-    /// Values of the whole factor.
+    /// Number of values of the whole factor.
     pub(crate) values: usize,
 }
 
-/// Parents in the elimination tree (Liu 1990), `ROOT` at the top. `graph` is in elimination order.
+/// Returns the parents in the elimination tree (Liu 1990), `ROOT` at the top. `graph` is in
+/// elimination order.
 fn elimination_tree(graph: &Lists) -> Vec<usize> {
     let n = graph.len();
     let (mut parent, mut ancestor) = (vec![ROOT; n], vec![ROOT; n]);
@@ -87,7 +90,8 @@ fn elimination_tree(graph: &Lists) -> Vec<usize> {
     parent
 }
 
-/// A postorder of the elimination tree: position to node. Subtrees become contiguous, the largest child comes last.
+/// Returns a postorder of the elimination tree: position to node. Subtrees become contiguous, and
+/// the largest child comes last.
 pub(crate) fn postorder(graph: &Lists) -> Vec<u32> {
     let parent = elimination_tree(graph);
     let n = parent.len();
@@ -103,7 +107,8 @@ pub(crate) fn postorder(graph: &Lists) -> Vec<u32> {
         }
     }
     let mut order = Vec::with_capacity(n);
-    // Reversed preorder: parent first, largest child next, then reverse.
+    // The loop makes a preorder with the parent first and the largest child next, and the result is
+    // reversed.
     let mut stack = roots;
     while let Some(j) = stack.pop() {
         order.push(j);
@@ -116,7 +121,7 @@ pub(crate) fn postorder(graph: &Lists) -> Vec<u32> {
 }
 
 impl Symbolic {
-    /// `graph` must be in a postordered elimination order.
+    /// Makes the symbolic factorization. `graph` must be in a postordered elimination order.
     pub(crate) fn new(graph: &Lists) -> Self {
         let parent = elimination_tree(graph);
         let patterns = column_patterns(graph, &parent);
@@ -156,7 +161,7 @@ impl Symbolic {
         out
     }
 
-    /// Chooses the tasks: subtrees of about a sixteenth of the work at most.
+    /// Selects the tasks: subtrees with at most about a sixteenth of the work.
     fn cut(&mut self) {
         let count = self.supernodes.len();
         let mut work: Vec<f64> = self.supernodes.iter().map(Supernode::cost).collect();
@@ -194,7 +199,7 @@ impl Symbolic {
     }
 }
 
-/// The pattern below the diagonal of each column of the factor, ascending.
+/// Returns the pattern below the diagonal of each column of the factor, in ascending order.
 fn column_patterns(graph: &Lists, parent: &[usize]) -> Lists {
     let n = graph.len();
     let mut out = Lists { offsets: vec![0], items: Vec::new() };
@@ -231,7 +236,7 @@ fn column_patterns(graph: &Lists, parent: &[usize]) -> Lists {
     out
 }
 
-/// First columns of the supernodes.
+/// Returns the first columns of the supernodes.
 fn partition(parent: &[usize], patterns: &Lists) -> Vec<usize> {
     let n = parent.len();
     let mut size = vec![1usize; n];
@@ -240,7 +245,8 @@ fn partition(parent: &[usize], patterns: &Lists) -> Vec<usize> {
             size[parent[j]] += size[j];
         }
     }
-    // (first column, stored values of the nodes' pattern); the last column is the next one's first minus one.
+    // Each entry holds (first column, stored values of the nodes' pattern). The last column is one
+    // before the first column of the next entry.
     let mut stack: Vec<(usize, f64)> = Vec::new();
     let length = |j: usize| patterns.of(j).len();
     let stored = |first: usize, last: usize| {
@@ -249,7 +255,7 @@ fn partition(parent: &[usize], patterns: &Lists) -> Vec<usize> {
     };
     let mut j = 0;
     let mut relaxed_end = vec![0usize; n];
-    // The largest relaxed subtree that starts at each column.
+    // This is the end of the largest relaxed subtree that starts at each column.
     for root in 0..n {
         if size[root] <= RELAXED_SUBTREE {
             relaxed_end[root + 1 - size[root]] = root + 1;

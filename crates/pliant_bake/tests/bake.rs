@@ -1,4 +1,5 @@
-//! The bake from outside: what a model holds, what is refused, and that the same input gives the same bits.
+//! Tests the public bake: the contents of a model, the refused inputs, and bit-identical results
+//! for the same input.
 
 #![expect(clippy::unwrap_used, reason = "a failed test should panic")]
 
@@ -18,7 +19,8 @@ fn bar() -> TetMesh {
     shapes::bar([10, 2, 2], [1.0, 0.2, 0.2]).unwrap()
 }
 
-/// Largest |difference| of two models' mode shapes at the given pairs of vertices, relative to the largest entry.
+/// Returns the largest |difference| of two models' mode shapes at the given vertex pairs, relative
+/// to the largest entry.
 fn shape_difference(a: &ModalModel, b: &ModalModel, pairs: &[(u32, u32)]) -> f64 {
     let (mut worst, mut largest): (f64, f64) = (0.0, 0.0);
     for mode in 0..a.mode_count() {
@@ -48,7 +50,8 @@ fn the_same_bits_whatever_the_threads() {
     }
 }
 
-/// Thirty-two equal bars: every mode of one bar comes 32 times, and the lowest twenty are all its lowest.
+/// Thirty-two equal bars have every mode of one bar 32 times, so their lowest twenty modes all
+/// equal its lowest mode.
 #[test]
 fn equal_parts_have_equal_modes_all_of_them() {
     let one = shapes::bar([4, 1, 1], [1.0, 0.25, 0.25]).unwrap();
@@ -77,7 +80,7 @@ fn mass_properties_are_those_of_the_bar() {
     for (got, expected) in model.center_of_mass().iter().zip([0.5, 0.1, 0.1]) {
         assert!((got - expected).abs() < 1e-12);
     }
-    // m (b^2 + c^2) / 12 about each axis.
+    // The inertia about each axis is m (b^2 + c^2) / 12.
     let inertia = model.inertia();
     for (axis, expected) in
         [20.0 * 0.08 / 12.0, 20.0 * 1.04 / 12.0, 20.0 * 1.04 / 12.0].into_iter().enumerate()
@@ -89,7 +92,9 @@ fn mass_properties_are_those_of_the_bar() {
     assert!(model.participation().iter().flatten().all(|&p| p == 0.0));
 }
 
-/// A hanging bar that cannot contract (nu = 0) stretches by `rho g L^2 / (2 E)` under its own weight; the modes give
+/// Tests the stretch of a hanging bar that cannot contract (nu = 0).
+///
+/// Under its own weight the bar stretches by `rho g L^2 / (2 E)`. The modes give
 /// `sum_i phi_i(tip) p_i g / omega_i^2`.
 #[test]
 fn gravity_participation_stretches_the_hanging_bar() {
@@ -125,7 +130,7 @@ fn rotation_basis_is_the_slope_of_the_bending_mode() {
         for (v, p) in model.surface().positions().iter().enumerate().filter(|(_, p)| p[0] > 2.999) {
             let row = |axis| f64::from(model.displacement_row(v as u32, axis, mode));
             let turn = |axis| f64::from(model.rotation_row(v as u32, axis, mode));
-            // w(x) along y turns about z by w', along z about -y.
+            // A deflection w(x) along y turns about z by w', and one along z turns about -y.
             for (deflection, slope) in [(row(1), turn(2)), (row(2), -turn(1))] {
                 let scale = row(1).hypot(row(2));
                 assert!((slope * 3.0 - 1.37650 * deflection).abs() < 0.02 * scale, "mode {mode} at {p:?}");
@@ -154,7 +159,8 @@ fn a_skin_moves_with_the_tetrahedra() {
     for element in [Element::Tet4, Element::Tet10] {
         let config = BakeConfig { element, modes: 8, anchors: anchor("x<0.001"), ..BakeConfig::default() };
         let plain = run(&mesh, &config).unwrap().model;
-        // The boundary itself as a skin, and after it the middles of its triangles' first edges, pushed out a little.
+        // The skin is the boundary itself, followed by the midpoints of the first edges of its
+        // triangles.
         let mut skin = boundary.clone();
         let first = skin.positions.len() as u32;
         for t in &boundary.triangles {
@@ -214,7 +220,7 @@ fn bad_numbers_are_refused_by_name() {
     }
     let tiny = shapes::cube(1, 1.0).unwrap();
     let all = BakeConfig { element: Element::Tet4, ..ok.clone() };
-    // 8 nodes: 24 degrees of freedom, 18 elastic modes.
+    // The cube has 8 nodes, so 24 degrees of freedom and 18 elastic modes.
     assert_eq!(run(&tiny, &BakeConfig { modes: 18, ..all.clone() }).unwrap().model.mode_count(), 18);
     assert!(matches!(
         run(&tiny, &BakeConfig { modes: 19, ..all.clone() }),
@@ -241,7 +247,7 @@ fn bad_meshes_and_anchors_are_refused_by_name() {
     assert!(matches!(run(&bar(), &with(&["x<0.001", "y>7"])), Err(BakeError::AnchorHoldsNothing { .. })));
     assert!(matches!(run(&bar(), &with(&["x<2"])), Err(BakeError::AnchorHoldsEverything { .. })));
     assert!(matches!(run(&bar(), &with(&["x<0.5", "x>=0.5"])), Err(BakeError::AnchorHoldsEverything { .. })));
-    // A prism stood on its edge: the anchor takes that edge only.
+    // The bar is rotated to stand on its edge, so that the anchor contains only that edge.
     let mut wedge = bar();
     for p in &mut wedge.nodes {
         *p = [p[0], p[1] - p[2], p[1] + p[2]];
@@ -277,7 +283,7 @@ fn exported_matrices_hold_the_mass_and_know_no_force_in_translation() {
             assert!(column <= row && row <= head[0]);
             let value: f64 = parts[2].parse().unwrap();
             count += 1;
-            // Translation along x: rows and columns 3 i + 1.
+            // A translation along x uses the rows and columns 3 i + 1.
             if row % 3 == 1 && column % 3 == 1 {
                 sum += if row == column { value } else { 2.0 * value };
             }

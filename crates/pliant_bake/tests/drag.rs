@@ -1,4 +1,5 @@
-//! The paper's bar, baked and dragged: the reaction is smooth where the rigid constraint of its equation (4) flips sign every step.
+//! Bakes and drags the paper's bar. The reaction must be smooth where the rigid constraint of the
+//! paper's equation (4) flips its sign in every step.
 #![allow(clippy::unwrap_used, missing_docs, reason = "a failed test should panic")]
 
 use std::sync::Arc;
@@ -9,7 +10,7 @@ use pliant_modal::{
     Body, BodyConfig, Damping, Element, GrabConfig, Integrator, ModalModel, Patch, StepSettings,
 };
 
-/// 20 x 3 x 3 cells, 1,080 tetrahedra, fixed at x = 0, 20 modes.
+/// Makes a bar of 20 x 3 x 3 cells, 1,080 tetrahedra and 20 modes, fixed at x = 0.
 fn bar(young: f64) -> Arc<ModalModel> {
     let mesh = shapes::bar([20, 3, 3], [1.0, 0.15, 0.15]).unwrap();
     assert_eq!(mesh.tets.len(), 1_080);
@@ -32,13 +33,16 @@ fn tip(model: &ModalModel) -> u32 {
         .unwrap() as u32
 }
 
-/// Rises from 0 to 1 in a second, smooth up to the acceleration.
+/// Rises from 0 to 1 in one second, with a smooth acceleration.
 fn path(t: f64) -> f64 {
     let t = t.clamp(0.0, 1.0);
     t * t * t * (10.0 - 15.0 * t + 6.0 * t * t)
 }
 
-/// max |second difference of F| / max |F| of the tip dragged sideways by a fifth of the length: 4 for a sign flip each step.
+/// Returns max |second difference of F| / max |F| for a tip that is dragged sideways by a fifth of
+/// the length.
+///
+/// A sign flip in every step gives 4.
 fn ringing(model: &Arc<ModalModel>, integrator: Integrator, step: f64) -> f64 {
     let mut body = Body::new(
         model.clone(),

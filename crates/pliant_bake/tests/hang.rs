@@ -1,4 +1,4 @@
-//! A slender bar held at one end, hanging under its own weight.
+//! Tests a slender bar that is fixed at one end and hangs under its own weight.
 #![allow(clippy::unwrap_used, missing_docs, reason = "a failed test should panic")]
 
 use std::sync::Arc;
@@ -11,7 +11,7 @@ const YOUNG: f64 = 2.9e6;
 const DENSITY: f64 = 1000.0;
 const SIDE: f64 = 0.05;
 
-/// 1 x 0.05 x 0.05 m of 40 x 2 x 2 cells, fixed at x = 0, 20 modes.
+/// Makes a bar of 1 x 0.05 x 0.05 m with 40 x 2 x 2 cells and 20 modes, fixed at x = 0.
 fn bar() -> Arc<ModalModel> {
     let mesh = shapes::bar([40, 2, 2], [1.0, SIDE, SIDE]).unwrap();
     let config = BakeConfig {
@@ -25,7 +25,7 @@ fn bar() -> Arc<ModalModel> {
     Arc::new(bake(&mesh, None, &config, &mut |_, _| {}).unwrap().model)
 }
 
-/// Where the middle of the end comes to rest under so many times the earth's gravity, m.
+/// Returns the rest position of the end's center under `times` the gravity of the earth, m.
 fn end_of(model: &Arc<ModalModel>, times: f64) -> [f64; 3] {
     let gravity = [0.0, -9.81 * times, 0.0];
     let mut body =
@@ -43,8 +43,10 @@ fn end_of(model: &Arc<ModalModel>, times: f64) -> [f64; 3] {
     (patch.rest() + patch.displacement(body.q(), true)).into()
 }
 
-/// The heavy elastica, `E I t'' = -w (L - s) cos t`, `t(0) = 0`, `t'(L) = 0`: where its end is, m, by
-/// Runge and Kutta's method and bisection of the curvature at the wall.
+/// Returns the end position of the heavy elastica, m.
+///
+/// The equation `E I t'' = -w (L - s) cos t` with `t(0) = 0`, `t'(L) = 0` is solved by the
+/// Runge-Kutta method and bisection of the curvature at the wall.
 fn elastica(times: f64) -> [f64; 2] {
     let stiffness = YOUNG * SIDE.powi(4) / 12.0;
     let weight = DENSITY * SIDE * SIDE * 9.81 * times;
@@ -65,7 +67,8 @@ fn elastica(times: f64) -> [f64; 2] {
         }
         y
     };
-    // Downwards is negative: the curvature at the wall is, and the more so the heavier the bar.
+    // Down is negative, so the curvature at the wall is negative and grows in magnitude with the
+    // weight.
     let (mut low, mut high) = (-weight / stiffness, 0.0);
     for _ in 0..200 {
         let middle = 0.5 * (low + high);

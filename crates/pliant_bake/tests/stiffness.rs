@@ -1,11 +1,11 @@
-//! The stiffness that a hand feels between the baked sites, against the full solution.
+//! Tests the static stiffness under a hand between the baked sites against the full solution.
 #![expect(clippy::unwrap_used, reason = "a failed test should panic")]
 
 use pliant_bake::{BakeConfig, bake};
 use pliant_mesh::{TetMesh, shapes};
 use pliant_modal::{ModalModel, Patch};
 
-/// `W^T Phi Lambda^-1 Phi^T W` of a patch, m/N.
+/// Returns `W^T Phi Lambda^-1 Phi^T W` of a patch, m/N.
 fn modal_compliance(model: &ModalModel, patch: &Patch) -> [[f64; 3]; 3] {
     let mut out = [[0.0; 3]; 3];
     for (mode, omega) in model.omega().iter().enumerate() {
@@ -24,7 +24,9 @@ fn modal_compliance(model: &ModalModel, patch: &Patch) -> [[f64; 3]; 3] {
     out
 }
 
-/// Errors of the compliance along each axis at every surface vertex, sorted: default sites against a bake with a site at each.
+/// Returns the sorted errors of the compliance along each axis at every surface vertex.
+///
+/// The errors compare the sites of `config` with a bake that has a site at every vertex.
 fn errors(mesh: &TetMesh, config: &BakeConfig, radius: f64) -> Vec<f64> {
     let model = bake(mesh, None, config, &mut |_, _| ()).unwrap().model;
     let share = radius / model.size();
@@ -49,8 +51,9 @@ fn a_hand_feels_the_full_stiffness_between_the_sites() {
     let mesh = shapes::bar([20, 3, 3], [1.0, 0.15, 0.15]).unwrap();
     let config = BakeConfig { modes: 60, anchors: vec!["x<0.001".parse().unwrap()], ..BakeConfig::default() };
     let at = |list: &[f64], share: f64| list[(share * (list.len() - 1) as f64) as usize];
-    // A site at every vertex: at a baked radius the answer is exact, between two it follows the patch's sharpness. Modes alone miss 5 %
-    // of the compliance in the median, 40 % at one vertex in ten and 89 % at worst.
+    // With a site at every vertex, the result is exact at a baked radius. Between two radii it
+    // follows the sharpness of the patch. Modes alone miss 5 % of the compliance in the median, 40
+    // % at one vertex in ten and 89 % at worst.
     let baked = errors(&mesh, &config, 0.056);
     assert!(at(&baked, 1.0) < 1e-5, "{baked:?}");
     for radius in [0.068, 0.095, 0.13] {
@@ -60,7 +63,7 @@ fn a_hand_feels_the_full_stiffness_between_the_sites() {
             "{radius}: {between:?}"
         );
     }
-    // Sites at half the vertices: blended with their neighbours too.
+    // With sites at half the vertices, the result is also interpolated between neighbors.
     let sparse = errors(&mesh, &BakeConfig { sites: Some(128), ..config }, 0.09);
     assert!(at(&sparse, 0.5) < 0.005 && at(&sparse, 0.9) < 0.04 && at(&sparse, 1.0) < 0.25, "{sparse:?}");
 }

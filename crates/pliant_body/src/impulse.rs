@@ -22,9 +22,9 @@ use crate::{BodyError, BodyState, Driven, step::Refusals};
 ///
 /// ```
 /// # use bevy::{math::DVec3, prelude::*};
-/// # use pliant_body::{ModalBody, Strike};
-/// fn poke(bodies: Query<Entity, With<ModalBody>>, mut blows: MessageWriter<Strike>) {
-///     blows.write_batch(bodies.iter().map(|body| Strike { body, vertex: 0, impulse: DVec3::new(0.0, 0.2, 0.0) }));
+/// # use pliant_body::{Impulse, ModalBody};
+/// fn poke(bodies: Query<Entity, With<ModalBody>>, mut impulses: MessageWriter<Impulse>) {
+///     impulses.write_batch(bodies.iter().map(|body| Impulse { body, vertex: 0, impulse: DVec3::new(0.0, 0.2, 0.0) }));
 /// }
 /// ```
 #[derive(Message, Reflect, Debug, Clone, Copy, PartialEq)]

@@ -1,4 +1,4 @@
-//! `pliant bake`.
+//! The command `pliant bake`.
 
 use std::path::PathBuf;
 use std::time::Instant;
@@ -18,9 +18,10 @@ const MAX_THREADS: usize = 1024;
 
 #[derive(Args, Debug)]
 pub(crate) struct BakeArgs {
-    /// A surface, mended if it is dirty (.obj, .stl, .ply, .gltf, .glb), a scene (.ron) or tetrahedra (.msh, .vtk, .mesh, .veg)
+    /// A surface, repaired if needed (.obj, .stl, .ply, .gltf, .glb), a scene (.ron) or tetrahedra
+    /// (.msh, .vtk, .mesh, .veg)
     input: PathBuf,
-    /// About how many tetrahedra to fill a surface or a scene with [default: 10000]
+    /// Approximate number of tetrahedra for a surface or a scene [default: 10000]
     #[arg(long, allow_negative_numbers = true)]
     tets: Option<usize>,
     /// Finite element: tet4 or tet10
@@ -44,28 +45,30 @@ pub(crate) struct BakeArgs {
     /// Fraction of critical damping in every mode [default: 0.03]
     #[arg(long, value_name = "Z", allow_hyphen_values = true)]
     damping_ratio: Option<f64>,
-    /// Holds the nodes of a half-space fixed, such as 'x<0.01' (m); may be given several times. None: a free body
+    /// Fixes the nodes of a half-space, such as 'x<0.01' (m). Repeatable. Without it the body is
+    /// free
     #[arg(long = "anchor", value_name = "AXIS<NUMBER", allow_hyphen_values = true)]
     anchors: Vec<Anchor>,
-    /// A surface to wear instead of the tetrahedra's boundary; it moves with them
+    /// A surface to use instead of the tetrahedra's boundary. The surface moves with the tetrahedra
     #[arg(long, value_name = "SURFACE")]
     skin: Option<PathBuf>,
-    /// Writes K.mtx and M.mtx (MatrixMarket) into this folder once the bake succeeded
+    /// Writes K.mtx and M.mtx (MatrixMarket) into this folder after the bake succeeded
     #[arg(long, value_name = "DIR")]
     export_matrices: Option<PathBuf>,
-    /// Where finished bakes are kept, so that an unchanged one is not done again [default: a folder `pliant` in the user's cache]
+    /// Folder of finished bakes, so that an unchanged bake is not repeated [default: a folder
+    /// `pliant` in the user's cache]
     #[arg(long, value_name = "DIR")]
     cache: Option<PathBuf>,
-    /// Bakes even if it was done before, and keeps nothing
+    /// Bakes even if the result is cached, and caches nothing
     #[arg(long, conflicts_with = "cache")]
     no_cache: bool,
-    /// Threads to use [default: one a core]. The result is the same to the bit
+    /// Number of threads [default: one per core]. The result is the same to the bit
     #[arg(long, allow_negative_numbers = true)]
     threads: Option<usize>,
     /// The model to write
     #[arg(short, long, value_name = "X.modal")]
     output: PathBuf,
-    /// Prints JSON: what `inspect --json` tells, what was mended and the seconds spent
+    /// Prints JSON: the output of `inspect --json`, the repairs and the seconds spent
     #[arg(long)]
     json: bool,
 }
@@ -89,9 +92,9 @@ fn rayleigh(text: &str) -> Result<[f64; 2], String> {
 struct Report {
     #[serde(flatten)]
     summary: Summary,
-    /// Read from the cache: only reading was paid for.
+    /// True if the bake was read from the cache, so that the times cover reading only.
     cached: bool,
-    /// What was mended of a dirty surface; null: nothing had to be.
+    /// Repairs of a defective surface. Null if none were necessary.
     repair: Option<Mended>,
     seconds: Seconds,
 }
@@ -155,7 +158,7 @@ pub(crate) fn run(args: BakeArgs) -> Result<(), CliError> {
         export_matrices: args.export_matrices,
         ..defaults
     };
-    // Cheap refusals before the long work.
+    // Perform the cheap checks before the long work.
     config.check()?;
     output::check_folder(&args.output)?;
 

@@ -1,4 +1,5 @@
-//! `pliant bench step`: what a body costs here, beside the limit that memory sets in the same run.
+//! The command `pliant bench step`: cost of a body on this machine, next to the memory bandwidth
+//! limit measured in the same run.
 
 use std::{path::PathBuf, sync::Arc};
 
@@ -16,7 +17,7 @@ pub(crate) struct BenchArgs {
 
 #[derive(Subcommand, Debug)]
 enum What {
-    /// Steps with one grab pulling, and reconstructions of the whole surface
+    /// Measures steps with one grab that pulls, and reconstructions of the whole surface
     Step {
         /// The model
         #[arg(value_name = "X.modal")]

@@ -1,4 +1,4 @@
-//! `pliant inspect`.
+//! The command `pliant inspect`.
 
 use std::path::PathBuf;
 

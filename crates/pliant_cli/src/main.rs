@@ -1,9 +1,10 @@
 //! The `pliant` program: meshes, bakes and inspects soft bodies.
 //!
-//! Whatever is wrong with the input ends in one message on stderr and exit code 2; an output file appears whole or not
-//! at all. Progress bars go to stderr when it is a terminal.
+//! Invalid input ends in one message on stderr and exit code 2. An output file appears completely
+//! or not at all. Progress bars go to stderr if stderr is a terminal.
 //!
-//! From nothing to a body that somebody else holds, over a network that loses packets:
+//! These commands start from nothing and end with a body that a guest holds over a network that
+//! loses packets:
 //!
 //! ```sh
 //! pliant mesh bar --cells 8,2,2 --size 1,0.2,0.2 -o bar.msh                  # a metre of tetrahedra
@@ -13,7 +14,7 @@
 //! pliant stream --model bar.modal --network paper-1 --seconds 5              # what a guest sees of it
 //! ```
 //!
-//! (`tests/start.rs` runs these lines.) `pliant COMMAND --help` tells the rest.
+//! The test `tests/start.rs` runs these lines. `pliant COMMAND --help` describes all options.
 
 mod bake;
 mod bench;
@@ -40,24 +41,24 @@ struct Cli {
 
 #[derive(Subcommand, Debug)]
 enum Command {
-    /// Makes tetrahedra: of a simple shape, or of what a surface or a scene encloses
+    /// Makes tetrahedra from a simple shape, a surface or a scene
     Mesh(mesh::MeshArgs),
     /// Bakes a surface, a scene or tetrahedra into a model
     Bake(bake::BakeArgs),
-    /// Tells what is in a model
+    /// Shows the content of a model
     Inspect(inspect::InspectArgs),
-    /// Measures what a body costs on this machine
+    /// Measures the cost of a body on this machine
     Bench(bench::BenchArgs),
-    /// Measures what the method costs and what it is off by, as tables and plots
+    /// Measures the cost and the errors of the method, as tables and plots
     Report(report::ReportArgs),
-    /// Runs stiff, extreme and unfair cases and says by what margin each keeps its bound
+    /// Runs stiff, extreme and unfair cases and prints the margin to the bound of each
     Stability(stability::StabilityArgs),
-    /// Streams a body over an emulated network and measures what a guest sees
+    /// Streams a body over an emulated network and measures the guest's view
     Stream(stream::StreamArgs),
 }
 
 fn main() -> ExitCode {
-    // Clap itself leaves with code 2 and its message when the arguments are wrong.
+    // Clap itself exits with code 2 and its message if the arguments are wrong.
     let done = match Cli::parse().command {
         Command::Mesh(args) => mesh::run(args),
         Command::Bake(args) => bake::run(args),
@@ -76,7 +77,7 @@ fn main() -> ExitCode {
     }
 }
 
-/// Why the program stops.
+/// The reason why the program stops.
 #[derive(Debug, thiserror::Error)]
 enum CliError {
     #[error("{0}")]
@@ -108,7 +109,7 @@ enum CliError {
 }
 
 impl From<LabError> for CliError {
-    /// What names an option is told in the program's own words.
+    /// Errors about an option get the program's own message, which names the option.
     fn from(error: LabError) -> Self {
         match error {
             LabError::TetsGiven(path) => Self::TetsGiven(path),

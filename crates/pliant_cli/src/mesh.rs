@@ -1,4 +1,4 @@
-//! `pliant mesh`.
+//! The command `pliant mesh`.
 
 use std::path::{Path, PathBuf};
 
@@ -14,11 +14,11 @@ use crate::{CliError, output};
 pub(crate) struct MeshArgs {
     #[command(subcommand)]
     shape: Option<Shape>,
-    /// A surface, mended if it is dirty (.obj, .stl, .ply, .gltf, .glb), a scene of rounded parts (.ron), or tetrahedra to write in
-    /// another format (.msh, .vtk, .mesh, .veg)
+    /// A surface, repaired if needed (.obj, .stl, .ply, .gltf, .glb), a scene of rounded parts
+    /// (.ron), or tetrahedra to write in another format (.msh, .vtk, .mesh, .veg)
     #[arg(required = true)]
     input: Option<PathBuf>,
-    /// About how many tetrahedra to fill it with, met within 5 % [default: 10000]
+    /// Approximate number of tetrahedra for the fill, met within 5 % [default: 10000]
     #[arg(long, allow_negative_numbers = true)]
     tets: Option<usize>,
     /// The file to write: .msh, .vtk, .mesh or .veg
@@ -30,14 +30,14 @@ pub(crate) struct MeshArgs {
 
 #[derive(Args, Debug)]
 struct Msh {
-    /// Version of Gmsh's format that a .msh is written in: 2.2 or 4.1 [default: 4.1]
+    /// Version of the Gmsh format for a .msh output: 2.2 or 4.1 [default: 4.1]
     #[arg(long, value_name = "VERSION", value_parser = msh_version)]
     msh_version: Option<io::MshVersion>,
 }
 
 #[derive(Subcommand, Debug)]
 enum Shape {
-    /// A bar with one corner at the origin, six tetrahedra to a cell
+    /// A bar with one corner at the origin, six tetrahedra per cell
     Bar {
         /// Cells along x, y and z
         #[arg(long, value_name = "NX,NY,NZ", value_parser = three::<usize>)]
@@ -65,9 +65,9 @@ enum Shape {
         #[command(flatten)]
         msh: Msh,
     },
-    /// A ball around the origin, its boundary nodes on the sphere
+    /// A ball around the origin with its boundary nodes on the sphere
     Sphere {
-        /// Cells across
+        /// Cells across the diameter
         #[arg(long, allow_negative_numbers = true)]
         cells: usize,
         /// Radius, m
@@ -81,7 +81,7 @@ enum Shape {
     },
 }
 
-/// Three numbers with commas between them.
+/// Parses three numbers separated by commas.
 fn three<T: std::str::FromStr>(text: &str) -> Result<[T; 3], String> {
     let parts: Vec<T> = text
         .split(',')
@@ -101,7 +101,7 @@ fn msh_version(text: &str) -> Result<io::MshVersion, String> {
 }
 
 impl Msh {
-    /// Cheap refusals before the long work.
+    /// Performs the cheap checks before the long work.
     fn check(&self, output: &Path) -> Result<(), CliError> {
         output::check_folder(output)?;
         let is_msh = output.extension().is_some_and(|name| name.eq_ignore_ascii_case("msh"));
@@ -135,7 +135,7 @@ pub(crate) fn run(args: MeshArgs) -> Result<(), CliError> {
             (shapes::sphere(cells, radius)?, output, msh)
         }
         None => {
-            // Clap asks for both where there is no shape.
+            // Clap requires both arguments if there is no shape.
             let (input, output) = (args.input.unwrap_or_default(), args.output.unwrap_or_default());
             args.msh.check(&output)?;
             (fill(&input, args.tets, &mut Bar::new())?.0, output, args.msh)

@@ -1,4 +1,4 @@
-//! What the program prints, and where its files may go.
+//! Output of the program, and checks of its output paths.
 
 use std::io::Write;
 use std::path::Path;
@@ -8,7 +8,7 @@ use serde::Serialize;
 
 use crate::CliError;
 
-/// What `inspect --json` tells.
+/// The output of `inspect --json`.
 #[derive(Debug, Serialize)]
 pub(crate) struct Summary {
     tets: usize,
@@ -49,7 +49,7 @@ pub(crate) fn print_json(value: &impl Serialize) -> Result<(), CliError> {
     print(&text)
 }
 
-/// Prints a text and a line end; a reader that went away is no error.
+/// Prints a text and a line end. A closed pipe is not an error.
 pub(crate) fn print(text: &str) -> Result<(), CliError> {
     match writeln!(std::io::stdout().lock(), "{text}") {
         Err(error) if error.kind() != std::io::ErrorKind::BrokenPipe => Err(error.into()),
@@ -57,7 +57,7 @@ pub(crate) fn print(text: &str) -> Result<(), CliError> {
     }
 }
 
-/// Refuses an output path whose folder is missing, before the long work and not after it.
+/// Rejects an output path whose folder is missing, before the long work starts.
 pub(crate) fn check_folder(path: &Path) -> Result<(), CliError> {
     match path.parent() {
         Some(folder) if !folder.as_os_str().is_empty() && !folder.is_dir() => {
@@ -106,7 +106,8 @@ pub(crate) fn table(model: &ModalModel) -> String {
     text
 }
 
-/// A text out of a file, fit for a terminal: control characters, and those that turn the direction of writing, escaped.
+/// Escapes text from a file for the terminal: control characters and those that change the writing
+/// direction.
 fn plain(text: &str) -> String {
     let tricky = |c: char| {
         c.is_control()

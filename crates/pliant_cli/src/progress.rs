@@ -1,11 +1,11 @@
-//! A progress bar on stderr where that is a terminal, silence elsewhere.
+//! A progress bar on stderr if stderr is a terminal. Otherwise nothing is drawn.
 
 use indicatif::{ProgressBar, ProgressDrawTarget, ProgressStyle};
 use pliant_lab::Progress;
 
 const STEPS: u64 = 1000;
 
-/// One bar that goes through the named stages of a job.
+/// One bar that runs through the named stages of a job.
 pub(crate) struct Bar {
     bar: ProgressBar,
     stage: &'static str,
@@ -13,7 +13,7 @@ pub(crate) struct Bar {
 
 impl Bar {
     pub(crate) fn new() -> Self {
-        // indicatif draws nothing when stderr is no terminal.
+        // indicatif draws nothing if stderr is not a terminal.
         let bar = ProgressBar::with_draw_target(Some(STEPS), ProgressDrawTarget::stderr());
         if let Ok(style) = ProgressStyle::with_template("{msg:>10} [{bar:40}] {percent:>3} % {elapsed}") {
             bar.set_style(style.progress_chars("=> "));
@@ -31,7 +31,7 @@ impl Progress for Bar {
         self.bar.set_position((share.clamp(0.0, 1.0) * STEPS as f64) as u64);
     }
 
-    /// One line on stderr that stays, whether there is a bar or not.
+    /// Prints one line on stderr that stays, with or without a bar.
     fn warn(&mut self, text: &str) {
         self.bar.suspend(|| eprintln!("pliant: warning: {text}"));
     }

@@ -1,4 +1,4 @@
-//! `pliant report`: what the method costs and what it is off by, remade on this machine.
+//! The command `pliant report`: the cost and the errors of the method, measured on this machine.
 
 use std::path::PathBuf;
 
@@ -7,18 +7,19 @@ use pliant_lab::report::{Part, Settings, write};
 
 use crate::{CliError, output, progress::Bar};
 
-/// The name of all parts together.
+/// The name that stands for all parts.
 const ALL: &str = "all";
 
 #[derive(Args, Debug)]
 pub(crate) struct ReportArgs {
-    /// Only one part: elements, modes, steps, warp, precision, frames, network, front, table-2, table-3, courses, default
+    /// Only one part: elements, modes, steps, warp, precision, frames, network, front, table-2,
+    /// table-3, courses, default
     #[arg(long, default_value = ALL)]
     only: String,
     /// Fewer points and shorter timings: within ten minutes on two cores
     #[arg(long)]
     quick: bool,
-    /// Surfaces that are measured when they are there: bunny.obj, armadillo.obj
+    /// Folder of the surfaces bunny.obj and armadillo.obj, which are measured if they exist
     #[arg(long, value_name = "DIR", default_value = "../shared/models")]
     models: PathBuf,
     /// The project's own body: a surface or a scene

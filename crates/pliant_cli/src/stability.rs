@@ -1,4 +1,5 @@
-//! `pliant stability`: stiff, extreme and unfair cases, each with its bound and its margin.
+//! The command `pliant stability`: stiff, extreme and unfair cases, each with its bound and its
+//! margin.
 
 use std::fmt::Write;
 
@@ -9,13 +10,13 @@ use crate::{CliError, output, progress::Bar};
 
 #[derive(Args, Debug)]
 pub(crate) struct StabilityArgs {
-    /// Only cases whose group or name holds this text
+    /// Only cases whose group or name contains this text
     #[arg(long, value_name = "TEXT")]
     only: Option<String>,
-    /// One case in eight, for the tests of the project: seconds
+    /// One case in eight, for the tests of the project. Takes seconds
     #[arg(long)]
     short: bool,
-    /// Threads to use [default: one a core]
+    /// Number of threads [default: one per core]
     #[arg(long)]
     threads: Option<usize>,
     /// Prints one line of JSON

@@ -1,4 +1,5 @@
-//! `pliant stream`: a session over an emulated network, measured; in virtual time, so that the same seed gives the same figures.
+//! The command `pliant stream`: measures a session over an emulated network. The session runs in
+//! virtual time, so that the same seed gives the same metrics.
 
 use std::{
     fmt::Write,
@@ -27,34 +28,37 @@ pub(crate) struct StreamArgs {
     /// The body
     #[arg(long, value_name = "X.modal")]
     model: PathBuf,
-    /// A network by name: paper-1 to paper-4, lan, wifi, transatlantic, satellite [default: paper-1]
+    /// A network preset: paper-1 to paper-4, lan, wifi, transatlantic, satellite [default: paper-1]
     #[arg(long, conflicts_with = "loss")]
     network: Option<String>,
-    /// A loss on a path without delay: none, 9%, random:22@135, burst:12@140, every:50@135, gilbert:9%:4
+    /// A loss model on a path without delay: none, 9%, random:22@135, burst:12@140, every:50@135,
+    /// gilbert:9%:4
     #[arg(long)]
     loss: Option<String>,
-    /// Answers NACKs only so many ticks later, for remaking the paper's figures
+    /// Answers NACKs this many ticks later, as in the paper's figures
     #[arg(long, default_value_t = 0, value_name = "TICKS")]
     resend_after: u32,
-    /// How loss is repaired: default, none, paper, paper-zero, paper-hold, paper-repeats, force-driven; without --json: all of them beside each other
+    /// The recovery policy: default, none, paper, paper-zero, paper-hold, paper-repeats,
+    /// force-driven. Without this option and without --json: all of them in one table
     #[arg(long)]
     recovery: Option<String>,
-    /// Ticks over which the paper's compensation is spread
+    /// Ticks over which the paper's compensation is blended
     #[arg(long, value_name = "TICKS")]
     blend: Option<u16>,
     /// Steps a second
     #[arg(long, default_value_t = 40.0, value_name = "HZ")]
     rate: f64,
-    /// How long
+    /// Measured time, s
     #[arg(long, default_value_t = 60.0)]
     seconds: f64,
-    /// Of everything that is left to chance
+    /// Seed of all random numbers
     #[arg(long, default_value_t = 1)]
     seed: u64,
-    /// A material that relaxes: the share of the stiffness that goes, and in what time, s: 0.5:0.4
+    /// A material that relaxes, such as 0.5:0.4: the share of the stiffness that relaxes, and the
+    /// time for it, s
     #[arg(long, value_name = "RATIO:TIME", value_parser = relaxation)]
     relax: Option<Relaxation>,
-    /// Who steps: the host only, or every peer
+    /// Who steps the body: only the host, or every peer
     #[arg(long, value_enum, default_value_t = Topology::Cs)]
     topology: Topology,
     /// Prints one line of JSON
@@ -62,7 +66,7 @@ pub(crate) struct StreamArgs {
     json: bool,
 }
 
-/// `0.5:0.4` as a material.
+/// Parses a material such as `0.5:0.4`.
 fn relaxation(words: &str) -> Result<Relaxation, String> {
     let expected = "expected RATIO:TIME, such as 0.5:0.4";
     let (ratio, time) = words.split_once(':').ok_or(expected)?;
@@ -72,19 +76,19 @@ fn relaxation(words: &str) -> Result<Relaxation, String> {
     Ok(made)
 }
 
-/// Who steps the body.
+/// Which side steps the body.
 #[derive(ValueEnum, Debug, Clone, Copy, PartialEq, Eq)]
 enum Topology {
-    /// Client-server: guests follow the host.
+    /// Client-server: guests track the host.
     Cs,
-    /// Peer-to-peer: everybody steps, targets cross.
+    /// Peer-to-peer: every peer steps, and only targets are sent.
     P2p,
 }
 
-/// The figures of one run.
+/// The metrics of one run.
 #[derive(Serialize, Debug)]
 struct Told {
-    /// Its name stands in the table; who asks for JSON has named it.
+    /// The policy's name is for the table only. A caller of `--json` has named the policy.
     #[serde(skip)]
     recovery: String,
     ticks: u64,
@@ -127,13 +131,13 @@ impl Told {
     }
 }
 
-/// Time since the first call: the experiment owns no clock.
+/// Time since the first call. The experiment itself owns no clock.
 fn clock() -> Duration {
     static BEGAN: OnceLock<Instant> = OnceLock::new();
     BEGAN.get_or_init(Instant::now).elapsed()
 }
 
-/// Names of peer-to-peer repairs.
+/// Names of the peer-to-peer repairs.
 const REPAIRS: [(&str, Repair); 2] = [("rollback", Repair::Rollback), ("compensate", Repair::Compensate)];
 
 pub(crate) fn run(args: &StreamArgs) -> Result<(), CliError> {
@@ -186,7 +190,8 @@ fn measure(args: &StreamArgs, model: &Arc<ModalModel>, name: &str) -> Result<Tol
             if let (Some(ticks), Policy::Paper { blend_ticks, .. }) = (args.blend, &mut recovery.policy) {
                 *blend_ticks = ticks;
             }
-            // Streamed accelerations obey Newmark's formulas: the host's integrator has to as well.
+            // Streamed accelerations follow Newmark's formulas, so the host's integrator must
+            // follow them as well.
             let integrator = match recovery.policy {
                 Policy::ForceDriven { .. } => Integrator::Exact,
                 _ => Integrator::GeneralizedAlpha { rho_inf: 0.5 },

@@ -33,14 +33,15 @@ fn a_stream_is_measured_and_the_same_seed_gives_the_same_figures() {
     let default = run("default", "7");
     assert_eq!(default["hash"], run("default", "7")["hash"]);
     assert_ne!(default["hash"], run("default", "8")["hash"]);
-    // 10 s at 40 Hz; 9 % of the datagrams are lost on average, 36 of 400: five standard deviations (5.7) either way.
+    // 10 s at 40 Hz. On average 9 % of the datagrams are lost, 36 of 400. The bounds are five
+    // standard deviations (5.7) either way.
     assert!((390.0..=410.0).contains(&number(&default, "ticks")));
     assert!((8.0..=65.0).contains(&number(&default, "lost")));
-    // The bars of the streaming method on this network.
+    // These are the bounds of the streaming method on this network.
     assert!(number(&default, "rms_percent") < 0.2, "{default}");
     assert!(number(&default, "max_percent") < 3.0, "{default}");
     assert!(number(&default, "kbit_s") < 100.0, "{default}");
-    // Without repair an acceleration stream never forgets an error.
+    // Without recovery, an acceleration stream never loses an error.
     assert!(number(&run("none", "7"), "rms_percent") > 100.0 * number(&default, "rms_percent"));
 
     let keys: Vec<&String> = default.as_object().unwrap().keys().collect();
@@ -50,7 +51,7 @@ fn a_stream_is_measured_and_the_same_seed_gives_the_same_figures() {
     promised.sort_unstable();
     assert_eq!(keys, promised);
 
-    // A relaxing material, the paper's resending, equal peers.
+    // Also run a relaxing material, the paper's resending, and equal peers.
     let more = |words: &str| {
         let mut all = vec!["stream", "--model", &model, "--seconds", "18", "--json"];
         all.extend(words.split_whitespace());
@@ -89,7 +90,8 @@ fn a_report_says_what_crosses_the_papers_networks() {
         succeeds(&["report", "--quick", "--only", name, "-o", &folder.file(name)]);
         std::fs::read_to_string(folder.0.join(name).join("report.md")).unwrap()
     };
-    // Far fewer bytes than the paper's 2,000 to 3,000 down and 1,000 to 2,000 up, on all four networks, and an error below its repair's.
+    // All four networks need far fewer bytes than the paper's 2,000 to 3,000 down and 1,000 to
+    // 2,000 up, with a smaller error than the paper's recovery.
     let text = part("table-3");
     let rows: Vec<Vec<&str>> = text
         .lines()
@@ -102,12 +104,12 @@ fn a_report_says_what_crosses_the_papers_networks() {
         assert!((50.0..600.0).contains(&number(6)) && (20.0..300.0).contains(&number(7)), "{row:?}");
     }
     let shown = |row: &[&str]| row[10].split(" / ").next().unwrap().parse::<f64>().unwrap();
-    // Against the better of the paper's two, too.
+    // The default must also beat the better of the paper's two policies.
     assert!(
         100.0 * shown(&rows[2]) < shown(&rows[1]) && shown(&rows[1]) < shown(&rows[0]),
         "9 % lost: {text}"
     );
-    // Coarser frames are smaller and worse, in each of the two lines.
+    // Coarser frames must be smaller and less accurate, in each of the two lines.
     let text = part("frames");
     let points: Vec<(&str, f64, f64)> = text
         .lines()
@@ -133,16 +135,17 @@ fn a_body_is_timed_against_the_memory() {
         let at = |part: &str| told[times][part].as_f64().unwrap();
         assert!(0.0 < at("p50") && at("p50") <= at("p99") && at("p99") <= at("p999"), "{told}");
     }
-    // Blocks of 16 vertices, (12 modes x 6 rows + 3 of rest) x 16 x 4 bytes each, and 12 bytes written a vertex.
+    // Blocks of 16 vertices, (12 modes x 6 rows + 3 of rest) x 16 x 4 bytes each, and 12 bytes
+    // written per vertex.
     let vertices = told["surface_vertices"].as_u64().unwrap();
     assert_eq!(
         told["bytes"].as_u64().unwrap(),
         vertices.div_ceil(16) * (12 * 6 + 3) * 16 * 4 + 12 * vertices
     );
-    // A bound: nothing in the run was faster.
+    // The limit bounds the speed: nothing in the run was faster.
     let [speed, limit] = ["bandwidth_gb_s", "bandwidth_limit_gb_s"].map(|key| told[key].as_f64().unwrap());
     assert!(0.0 < speed && speed <= limit, "{told}");
-    // A frame is a step and a surface.
+    // A frame consists of a step and a surface.
     let median = |times: &str| told[times]["p50"].as_f64().unwrap();
     assert!(median("frame_us") >= median("reconstruct_us"), "{told}");
     let half = json(&succeeds(&["bench", "step", &model, "--seconds", "0.05", "--half", "--json"]));
@@ -179,7 +182,7 @@ fn an_unchanged_bake_comes_from_the_cache() {
     assert!(told.contains("read from the cache"), "{told}");
     assert!(refused(&["bake", &mesh, "-o", &b, "--cache", &cache, "--no-cache"]).contains("--no-cache"));
 
-    // The user's own cache; one that cannot be is a word on stderr, not a failure.
+    // Use the user's own cache. An unusable cache gives a message on stderr and no failure.
     let with_home = |home: &str| {
         let output = program()
             .env("XDG_CACHE_HOME", home)
@@ -206,7 +209,8 @@ fn the_short_form_of_the_stability_matrix_keeps_its_bounds() {
     assert!(cases.len() >= 30, "{}", cases.len());
     let (mut with_the_papers_scheme, mut limits) = (0, 0);
     for case in cases {
-        // `known_limit` is told only where what happened is what the limit expects, and a limit that is none any more is told, too.
+        // `known_limit` is set only if the result is the one that the limit expects. A limit that
+        // does not apply any more is reported, too.
         let limit = case["known_limit"].is_string();
         assert!((case["passed"] == true) != limit && case["limit_gone"] == false, "{case}");
         assert_eq!(case["margin"].as_f64().unwrap() >= 1.0, !limit, "{case}");
@@ -215,7 +219,7 @@ fn the_short_form_of_the_stability_matrix_keeps_its_bounds() {
         with_the_papers_scheme += usize::from(case["plain"].is_string());
     }
     assert!(with_the_papers_scheme >= 5 && limits <= 2, "{with_the_papers_scheme}, {limits}");
-    // The meshes that the bake refuses, and no others.
+    // These are exactly the meshes that the bake rejects.
     let told = json(&succeeds(&["stability", "--only", "element shape", "--json"]));
     let limits: Vec<&str> = told["cases"]
         .as_array()
@@ -247,14 +251,15 @@ fn a_report_writes_its_words_numbers_and_pictures() {
     assert!(read("c-steps-free.png").starts_with(b"\x89PNG"));
     let text = String::from_utf8(read("report.md")).unwrap();
     assert!(text.contains("c-steps-held.svg") && text.contains("The reference itself is off by"), "{text}");
-    // The exact step needs no small steps: at 60 Hz a struck bar is off by rounding, Newmark by more than a percent.
+    // The exact integrator needs no small steps. At 60 Hz the error of a struck bar is rounding
+    // only, and Newmark's error is more than a percent.
     let csv = String::from_utf8(read("c-steps-free.csv")).unwrap();
     let error = |line: &str| {
         let row = csv.lines().find(|row| row.starts_with(&format!("\"{line}"))).unwrap();
         row.split(',').nth(2).unwrap().parse::<f64>().unwrap()
     };
     assert!(error("exact") < 1e-10 && error("Newmark") > 0.01, "{csv}");
-    // The load is read, not written by hand, where the system tells it.
+    // If the system reports its load, the report must contain the measured load.
     let measured = text.contains("The machine's load") || !std::path::Path::new("/proc/loadavg").exists();
     assert!(measured && text.contains("| 99 % |"), "{text}");
     let message = refused(&["report", "--only", "nothing", "-o", &folder.file("out")]);

@@ -1,4 +1,4 @@
-//! The program as a user runs it: meshing, baking, and what is refused.
+//! The program as a user runs it: meshing, baking and rejected input.
 
 #![expect(clippy::unwrap_used, reason = "a failed test should panic")]
 
@@ -71,7 +71,7 @@ fn a_bar_is_meshed_baked_and_inspected() {
     assert!(succeeds(&["inspect", &model]).contains("x<0.001"));
     assert_eq!(folder.names(), ["bar.modal", "bar.msh"]);
 
-    // The same again with another number of threads: the same bits.
+    // The same bake with another number of threads must give the same bits.
     let again = folder.file("again.modal");
     succeeds(&[
         "bake",
@@ -103,10 +103,11 @@ fn a_surface_is_filled_and_wears_a_skin() {
     let folder = Folder::new("surface");
     let surface = folder.write("octahedron.obj", OCTAHEDRON);
     let (mesh, model, matrices) = (folder.file("o.msh"), folder.file("o.modal"), folder.file("matrices"));
-    // So few tetrahedra round its edges and corners: 6 % of the 4/3 m^3, which is told with both volumes.
+    // So few tetrahedra round off edges and corners: 6 % of the 4/3 m^3. The warning names both
+    // volumes.
     let (_, word) = succeeds_with_a_word(&["mesh", &surface, "--tets", "1000", "-o", &mesh]);
     assert!(word.lines().count() == 1 && word.contains("warning") && word.contains("1.333333e0"), "{word}");
-    // 1.3 % with twice as many, and nothing is said.
+    // With twice as many tetrahedra 1.3 % is lost, and there is no warning.
     succeeds(&["mesh", &surface, "--tets", "2000", "-o", &mesh]);
     let (baked, _) = succeeds_with_a_word(&[
         "bake",
@@ -130,12 +131,13 @@ fn a_surface_is_filled_and_wears_a_skin() {
     let baked = json(&baked);
     assert_eq!(baked["surface_vertices"], 6);
     assert_eq!(baked["rigid_modes"], 6);
-    // Volume 4/3 m^3; so few tetrahedra round its edges and corners.
+    // The volume is 4/3 m^3, and so few tetrahedra round off edges and corners.
     assert!((baked["mass_kg"].as_f64().unwrap() / (4000.0 / 3.0) - 1.0).abs() < 0.1);
     assert!(Path::new(&matrices).join("K.mtx").exists() && Path::new(&matrices).join("M.mtx").exists());
 }
 
-/// The faces of a cube of 1 m around the origin, each a grid of 4 x 4 cells with vertices of its own.
+/// The faces of a cube of 1 m around the origin. Each is a grid of 4 x 4 cells with its own
+/// vertices.
 fn cube_faces() -> (String, Vec<String>) {
     let (mut vertices, mut faces) = (String::new(), Vec::new());
     for (face, (axis, side)) in (0..3).flat_map(|axis| [(axis, -0.5), (axis, 0.5)]).enumerate() {
@@ -188,7 +190,7 @@ fn a_dirty_surface_is_mended_and_a_sheet_is_refused() {
     let (sound, _) = bake(&clean);
     assert!(sound["repair"].is_null(), "{sound}");
     let (mended, word) = bake(&dirty);
-    // 6 x 25 vertices, of which a cube of 4 x 4 x 4 cells has 125 - 27 on its surface.
+    // 6 x 25 vertices. A cube of 4 x 4 x 4 cells has 125 - 27 vertices on its surface.
     let counts = serde_json::json!({
         "welded_vertices": 150 - 98, "dropped_triangles": 1, "turned_triangles": 1, "covered_holes": 1
     });
@@ -196,7 +198,7 @@ fn a_dirty_surface_is_mended_and_a_sheet_is_refused() {
     let words =
         "dirty.obj was mended: 52 vertices welded, 1 triangle dropped, 1 triangle turned, 1 hole covered";
     assert!(word.contains(words), "{word}");
-    // The same cube again.
+    // The repaired cube must be the same as the clean cube.
     let mass = |told: &serde_json::Value| told["mass_kg"].as_f64().unwrap();
     assert!((mass(&mended) / mass(&sound) - 1.0).abs() < 1e-6, "{mended} {sound}");
     std::fs::remove_file(&model).unwrap();
@@ -213,7 +215,8 @@ fn tetrahedra_are_written_in_another_format() {
     succeeds(&["mesh", &veg, "-o", &back]);
     assert_eq!(std::fs::read(&msh).unwrap(), std::fs::read(&back).unwrap());
     assert!(refused(&["mesh", &msh, "--tets", "500", "-o", &veg]).contains("tetrahedra already"));
-    // The older version of Gmsh's format, of a file and of a shape; the same nodes to the bit.
+    // Write the older version of Gmsh's format, from a file and from a shape. The nodes must be the
+    // same to the bit.
     let (old, again) = (folder.file("old.msh"), folder.file("again.msh"));
     let heads = |path: &str, version: &str| {
         std::fs::read_to_string(path).unwrap().starts_with(&format!("$MeshFormat\n{version} 0 8\n"))
@@ -239,11 +242,12 @@ fn matrices_are_left_by_a_bake_that_succeeded_only() {
             [&["bake", &mesh, "--modes", "3", "-o", &model, "--export-matrices", &matrices], more].concat();
         pliant(&all)
     };
-    // The skin is looked at last, long after the matrices are there.
+    // The skin is read last, long after the matrices have been written.
     let failed = bake(&["--skin", &far]);
     assert!(String::from_utf8_lossy(&failed.stderr).contains("skin"), "{failed:?}");
     assert_eq!(folder.names(), ["a.msh", "far.obj"]);
-    // A folder that holds something else under the name of the second file: nothing is left of the first.
+    // The folder already holds a directory with the name of the second file. Nothing of the first
+    // file may be left.
     std::fs::create_dir_all(Path::new(&matrices).join("M.mtx")).unwrap();
     assert_eq!(bake(&[]).status.code(), Some(2));
     assert!(!Path::new(&matrices).join("K.mtx").exists() && !Path::new(&model).exists());

@@ -1,4 +1,5 @@
-//! Each part of the report in its short form: what it writes, and that the numbers say what the words do.
+//! Runs each part of the report in its short form and checks its files and that the numbers match
+//! the text.
 
 #![expect(clippy::unwrap_used, reason = "a failed test should panic")]
 
@@ -6,7 +7,7 @@ mod support;
 
 use support::{Folder, json, succeeds};
 
-/// One part, run.
+/// One part of the report that has been run.
 struct Part {
     folder: Folder,
     text: String,
@@ -16,7 +17,7 @@ impl Part {
     fn of(name: &str) -> Self {
         let folder = Folder::new(&format!("part-{name}"));
         let out = folder.file("out");
-        // No surface of others: the project's own body takes their place where one is needed.
+        // Surfaces of others are not available, so the project's own body replaces them.
         let none = folder.file("none");
         let told = json(&succeeds(&[
             "report",
@@ -74,7 +75,8 @@ fn elements_come_nearer_to_a_far_finer_mesh() {
             assert!(line.windows(2).all(|pair| pair[1].1 < pair[0].1), "{figure}, {name}: {line:?}");
         }
     }
-    // Linear elements on this bar are tens of percent too stiff, quadratic ones of the same mesh are not.
+    // Linear elements on this bar are tens of percent too stiff. Quadratic elements on the same
+    // mesh are not.
     let (four, ten) = (part.line("a-bar-pull", "tet4"), part.line("a-bar-pull", "tet10"));
     assert!(four[0].1 > 0.1 && ten[0].1 < 0.05, "{four:?}, {ten:?}");
 }
@@ -87,7 +89,7 @@ fn modes_left_out_are_given_to_the_hand_by_their_flexibility() {
     for (with, without) in with.iter().zip(&without) {
         assert!(with.1 < 0.5 * without.1, "{with:?}, {without:?}");
     }
-    // Both lines are timed.
+    // Both lines must be timed separately.
     assert!(with.iter().zip(&without).any(|(with, without)| with.0 != without.0));
     let shape = part.line("b-modes-shape", "with residual flexibility (default)");
     assert!(last(&shape) < 0.01 && shape[0].1 > 0.02, "{shape:?}");
@@ -100,8 +102,9 @@ fn modes_left_out_are_given_to_the_hand_by_their_flexibility() {
 #[test]
 fn under_a_hand_all_steps_are_of_second_order() {
     let part = Part::of("steps");
-    // From 60 to 960 steps a second: of second order is 256 times better. The exact step has a small
-    // part of first order left, from the rows of a hand on a bent body, which are those of the step's end.
+    // From 60 to 960 steps a second, second order means 256 times smaller errors. The exact step
+    // has a small first-order part left. It comes from the rows of a hand on a bent body, which are
+    // those of the step's end.
     let gain = |name: &str| {
         let line = part.line("c-steps-held", name);
         line[0].1 / last(&line)
@@ -111,7 +114,7 @@ fn under_a_hand_all_steps_are_of_second_order() {
     let exact = part.line("c-steps-held", "exact (default)");
     assert!(exact[0].1 < 6e-3 && exact[1].1 < 6e-4, "at 60 and 240 steps a second: {exact:?}");
     assert!(gain("Newmark (the paper's)") > 60.0);
-    // A reference worth the name: at most a tenth of what is measured by it.
+    // The error of a usable reference is at most a tenth of the measured errors.
     let csv = std::fs::read_to_string(part.folder.0.join("out/c-steps-held.csv")).unwrap();
     let own: f64 = csv.lines().nth(1).unwrap().split(',').nth(3).unwrap().parse().unwrap();
     let least = part.points("c-steps-held").iter().map(|p| p.2).fold(f64::INFINITY, f64::min);
@@ -131,7 +134,7 @@ fn the_warp_is_told_where_it_loses() {
     let [with, without] =
         ["warped (default)", "linear, without warp"].map(|name| part.line("d-warp-twist", name));
     assert!(last(&with) < 0.5 * last(&without), "{with:?}, {without:?}");
-    // Solver's residuals, each figure its own.
+    // Each figure has its own residual of the solver.
     let own = |figure: &str| -> f64 {
         let csv = std::fs::read_to_string(part.folder.0.join(format!("out/{figure}.csv"))).unwrap();
         csv.lines().nth(1).unwrap().split(',').nth(3).unwrap().parse().unwrap()
@@ -145,7 +148,7 @@ fn the_warp_is_told_where_it_loses() {
 fn half_precision_is_off_by_its_rounding() {
     let part = Part::of("precision");
     let half = part.line("e-precision", "f16 basis")[0].1;
-    // 2^-11 of what moves by a fifth of the length.
+    // The bound is about 2^-11 of a motion by a fifth of the length.
     assert!((1e-6..2.0f64.powi(-11) * 0.3).contains(&half), "{half:e}");
 }
 
@@ -169,17 +172,17 @@ fn the_front_is_what_was_measured_and_so_is_the_advice() {
         let points = part.points(figure);
         let front: Vec<_> = points.iter().filter(|p| p.0.starts_with("the front")).collect();
         assert!(!front.is_empty(), "{figure}");
-        // The file has four digits: neighbours may look alike.
+        // The file has four digits, so neighbors may look alike.
         for pair in front.windows(2) {
             assert!(pair[0].1 <= pair[1].1 && pair[0].2 >= pair[1].2, "{figure}: {pair:?}");
         }
-        // Nothing lies below and left of the front.
+        // No point lies below and to the left of the front.
         for p in points.iter().filter(|p| !p.0.starts_with("the front")) {
             assert!(front.iter().any(|f| f.1 <= p.1 * 1.001 && f.2 <= p.2 * 1.001), "{figure}: {p:?}");
         }
     }
     assert!(part.text.contains("Which setting for which need, by these points: *a body that is looked at*"));
-    // More modes on the better element bring the eye nearer, down to some percent.
+    // More modes on the better element reduce the visual error, down to some percent.
     let eye = part.points("g-front-eye");
     let best =
         |name: &str| eye.iter().filter(|p| p.0.starts_with(name)).map(|p| p.2).fold(f64::INFINITY, f64::min);
@@ -198,7 +201,7 @@ fn courses_say_how_late_each_line_was_answered() {
         let peak = |name: &str| part.line(figure, name).iter().fold(0.0f64, |most, p| most.max(p.1.abs()));
         let [late, once] =
             ["the paper's, taken out over 50 ticks", "the paper's over 50 ticks, answered at once"].map(peak);
-        // As long as nothing is answered the error stays; at the end all of it is out.
+        // The error stays until an answer arrives, and is gone at the end.
         assert!(late > 0.0 && late >= once, "{figure}: {late} and {once}");
         assert!(last(&part.line(figure, "the paper's, taken out over 50 ticks")).abs() < 1e-6);
         assert!(peak("default") < late && peak("default, answered at once") < late, "{figure}");

@@ -1,13 +1,14 @@
-//! What each set of features compiles and which crates may not import what, by Cargo's own account.
+//! Checks with Cargo which crates each set of features compiles, and which imports are forbidden.
 //!
 //! Cargo reads the manifests of the crates that it lists. It downloads those that no build here has
-//! needed yet, so these tests need no used cargo home; without the network a used one is enough.
+//! needed yet, so these tests do not need a used cargo home. With a used cargo home they do not
+//! need the network.
 
 #![expect(clippy::unwrap_used, reason = "a failed test should panic")]
 
 use std::{collections::BTreeSet, process::Command};
 
-/// The crates that a package compiles for this platform with these arguments about features.
+/// The crates that a package compiles for this platform with these feature arguments.
 fn crates(package: &str, features: &[&str]) -> BTreeSet<String> {
     let output = Command::new(env!("CARGO"))
         .args(["tree", "--locked", "-p", package, "-e", "normal", "--prefix", "none"])
@@ -24,12 +25,12 @@ fn crates(package: &str, features: &[&str]) -> BTreeSet<String> {
     list
 }
 
-/// The crates of the face with these features and no others.
+/// The crates of the package `pliant` with these features and no others.
 fn with(features: &str) -> BTreeSet<String> {
     crates("pliant", &["--no-default-features", "--features", features])
 }
 
-/// Those of a list that a pattern means: a name, or with a star at its end a beginning.
+/// The names in a list that match a pattern: a whole name, or a prefix followed by a star.
 fn matching<'a>(list: &'a BTreeSet<String>, pattern: &str) -> Vec<&'a String> {
     list.iter()
         .filter(|name| match pattern.strip_suffix('*') {
@@ -48,7 +49,7 @@ fn lacks(list: &BTreeSet<String>, patterns: &[&str], who: &str) {
 
 const RENDERER: [&str; 6] = ["bevy_render", "bevy_pbr", "bevy_core_pipeline", "bevy_winit", "winit", "wgpu"];
 
-/// Name of the scene, its features, and what it must not compile.
+/// Name of the scene, its features, and the crates that it must not compile.
 const SCENES: [(&str, &str, &[&str]); 6] = [
     (
         "a body without a picture",
@@ -108,7 +109,7 @@ fn a_scene_compiles_nothing_that_it_does_not_need() {
     }
 }
 
-/// Each feature that has crates of its own, those crates, and features that cannot be without it.
+/// Each feature with crates of its own, those crates, and the features that need this feature.
 const FEATURES: [(&str, &[&str], &[&str]); 6] = [
     ("render", &["bevy_render", "bevy_pbr", "bevy_core_pipeline", "wgpu"], &["panel"]),
     ("net", &["pliant_net", "quinn*"], &[]),
@@ -143,12 +144,13 @@ fn the_crates_below_the_plugins_import_no_engine_runtime_or_viewer() {
 
 #[test]
 fn only_the_program_imports_the_laboratory() {
-    // The face with all its features compiles every crate that an app can have.
+    // The package `pliant` with all features compiles every crate that an app can have.
     for package in ["pliant", "pliant_mesh", "pliant_bake", "pliant_modal", "pliant_stream"] {
         lacks(&crates(package, &[]), &["pliant_lab"], package);
     }
     assert!(crates("pliant_cli", &[]).contains("pliant_lab"));
-    // The protocol knows no mesh and no bake; what measures knows neither plugins nor program.
+    // The protocol depends on no mesh and no bake. The laboratory depends neither on the plugins
+    // nor on the program.
     lacks(&crates("pliant_stream", &[]), &["pliant_mesh", "pliant_bake", "plotters"], "pliant_stream");
     lacks(&crates("pliant_lab", &[]), &["pliant_cli", "pliant_body", "clap"], "pliant_lab");
 }

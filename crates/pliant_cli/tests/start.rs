@@ -1,4 +1,4 @@
-//! The commands on the first page of the program's documentation run as they stand.
+//! Runs the commands of the program's documentation exactly as written.
 
 #![expect(clippy::unwrap_used, reason = "a failed test should panic")]
 
@@ -6,7 +6,7 @@ mod support;
 
 use support::{Folder, program};
 
-/// The words of a line as a shell has them: comments left out, single quotes taken off.
+/// Splits a line into words as a shell does, without comments and single quotes.
 fn words(line: &str) -> Vec<String> {
     let command = line.split(" #").next().unwrap_or_default();
     command.split_whitespace().map(|word| word.trim_matches('\'').to_owned()).collect()

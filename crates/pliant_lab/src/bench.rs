@@ -1,4 +1,4 @@
-//! What a body costs here, beside the limit that memory sets in the same run.
+//! Cost of a body on this machine, next to the memory bandwidth limit measured in the same run.
 
 use std::{hint::black_box, sync::Arc, time::Instant};
 
@@ -7,7 +7,7 @@ use serde::Serialize;
 
 use crate::{LabError, machine::Pinned};
 
-/// Percentiles of a time, us, on one core.
+/// Percentiles of a time on one core, us.
 #[derive(Serialize, Debug, Clone, Copy)]
 pub struct Percentiles {
     /// The median.
@@ -18,38 +18,38 @@ pub struct Percentiles {
     pub p999: f64,
 }
 
-/// What a body costs.
+/// Cost of a body.
 #[derive(Serialize, Debug, Clone)]
 pub struct Cost {
-    /// Elastic modes.
+    /// Number of elastic modes.
     pub modes: usize,
-    /// Vertices of the surface.
+    /// Number of surface vertices.
     pub surface_vertices: usize,
-    /// A step with one grab that pulls.
+    /// Time of a step with one grab that pulls.
     pub step_us: Percentiles,
-    /// A reconstruction of the whole surface.
+    /// Time of a reconstruction of the whole surface.
     pub reconstruct_us: Percentiles,
-    /// A step under a hand that moves and the whole surface of what it came to, one after the
-    /// other, as a frame does.
+    /// Time of a frame: a step with a moving hand, then the reconstruction of the resulting
+    /// surface.
     pub frame_us: Percentiles,
-    /// Read and written by one reconstruction.
+    /// Bytes read and written by one reconstruction.
     pub bytes: usize,
-    /// GB/s of the median reconstruction, as its turn in a frame: after a step, of a shape that is
-    /// new each time.
+    /// Bandwidth of the median reconstruction, GB/s. The reconstruction runs as in a frame: after a
+    /// step, with a new shape each time.
     pub bandwidth_gb_s: f64,
-    /// GB/s of the fastest pass over as many bytes in the same run: plain sums in the processor's
-    /// widest registers, and reconstructions.
+    /// Bandwidth of the fastest pass over as many bytes in the same run, GB/s. The passes are plain
+    /// sums in the CPU's widest registers, and reconstructions.
     pub bandwidth_limit_gb_s: f64,
 }
 
-/// Times a body on one core: steps for so many seconds, then frames for twice as long.
+/// Times a body on one core: steps for `seconds`, then frames for twice as long.
 ///
 /// # Errors
-/// [`LabError::Model`] or [`LabError::Step`] where the body cannot be held or stepped.
+/// Returns [`LabError::Model`] or [`LabError::Step`] when the body cannot be grabbed or stepped.
 pub fn measure(model: Arc<ModalModel>, seconds: f64, precision: Precision) -> Result<Cost, LabError> {
     let _pinned = Pinned::new();
     let mut body = Body::new(model.clone(), BodyConfig { precision, ..BodyConfig::default() })?;
-    // Where the first mode moves most: a body is pulled where it gives.
+    // The hand pulls where the first mode moves most, so that the body gives way.
     let moves = |v: u32| (0..3).map(|axis| model.displacement_row(v, axis, 0).powi(2)).sum::<f32>();
     let count = model.surface().positions().len() as u32;
     let vertex = (0..count).max_by(|&a, &b| moves(a).total_cmp(&moves(b))).unwrap_or(0);
@@ -87,10 +87,11 @@ pub fn measure(model: Arc<ModalModel>, seconds: f64, precision: Precision) -> Re
     if let Some(error) = failed.or(broken) {
         return Err(error.into());
     }
-    // The armadillo's surface has been read faster than it was summed: the bound is what memory gave at best, whoever read.
+    // A reconstruction can read memory faster than the sum does (as on the armadillo), so the limit
+    // is the fastest pass of either kind.
     let fastest = of_sum.iter().chain(&of_surface).copied().fold(f64::INFINITY, f64::min);
     let (frame_us, reconstruct_us) = (percentiles(of_frame), percentiles(of_surface));
-    // Bytes a microsecond are megabytes a second.
+    // Bytes per microsecond are megabytes per second.
     let gb_s = |us: f64| bytes as f64 / us.max(1e-9) * 1e-3;
     Ok(Cost {
         modes: model.mode_count(),
@@ -116,8 +117,10 @@ fn time(seconds: f64, mut work: impl FnMut()) -> Percentiles {
     percentiles(samples)
 }
 
-/// Frames (a step, then the surface) in turns of sixteen with plain sums, so that whatever else the machine does slows both alike; the first of each turn, for
-/// which the caches are still full of the other, is not counted. Samples, us: whole frames, their surfaces, sums.
+/// Times frames (a step, then the surface) in turns of sixteen with plain sums, so that other load
+/// on the machine slows both alike. The first frame of each turn is not counted, because the caches
+/// still hold the data of the sums. Returns the times of whole frames, of their surfaces and of the
+/// sums, us.
 fn by_turns<T>(
     seconds: f64,
     body: &mut T,
@@ -147,7 +150,7 @@ fn by_turns<T>(
     samples
 }
 
-/// us.
+/// Time of one call, us.
 fn once(work: &mut impl FnMut()) -> f64 {
     let start = Instant::now();
     work();

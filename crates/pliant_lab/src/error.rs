@@ -1,44 +1,44 @@
-//! What can go wrong in the laboratory.
+//! Errors of the laboratory.
 
 use std::path::PathBuf;
 
-/// Why a measurement stops.
+/// The reason why a measurement stops.
 #[derive(Debug, thiserror::Error)]
 #[non_exhaustive]
 pub enum LabError {
-    /// A mesh cannot be read or made.
+    /// A mesh cannot be read or generated.
     #[error("{0}")]
     Mesh(#[from] pliant_mesh::MeshError),
     /// A mesh cannot be baked.
     #[error("{0}")]
     Bake(#[from] pliant_bake::BakeError),
-    /// A model or one of its patches is refused.
+    /// A model or one of its patches was rejected.
     #[error("{0}")]
     Model(#[from] pliant_modal::ModelError),
     /// A body cannot be stepped.
     #[error("{0}")]
     Step(#[from] pliant_modal::StepError),
-    /// A session or a link is refused.
+    /// A session or a link was rejected.
     #[error("{0}")]
     Stream(#[from] pliant_stream::StreamError),
     /// The device loop does not start.
     #[error("{0}")]
     Device(#[from] pliant_haptics::StartError),
-    /// A virtual device is refused.
+    /// A virtual device was rejected.
     #[error("{0}")]
     DeviceInfo(#[from] pliant_haptics::InfoError),
-    /// A file holds tetrahedra where a shape was to be filled with a number of them.
+    /// A number of tetrahedra was requested for a file that already holds tetrahedra.
     #[error("{0} holds tetrahedra already; expected a surface or a scene")]
     TetsGiven(PathBuf),
-    /// So many threads cannot be started.
+    /// This number of threads cannot be started.
     #[error("threads: expected 1 to {most}, got {got}")]
     Threads {
-        /// How many were asked for; 0: one a core.
+        /// The requested number of threads. 0 means one per core.
         got: usize,
-        /// The most there may be.
+        /// The largest allowed number of threads.
         most: usize,
     },
-    /// A figure cannot be drawn into this file.
+    /// A plot cannot be drawn into this file.
     #[error("{0}: cannot be drawn")]
     Plot(PathBuf),
     /// A file of the report cannot be written.

@@ -1,4 +1,4 @@
-//! Tetrahedra out of a file, whatever it holds.
+//! Tetrahedral meshes from files of any supported kind.
 
 use std::path::Path;
 
@@ -6,18 +6,21 @@ use pliant_mesh::{Repair, StuffOptions, TetMesh, io};
 
 use crate::{LabError, progress::Progress};
 
-/// Tetrahedra that a surface or a scene is filled with unless told otherwise.
+/// Default number of tetrahedra for a surface or a scene.
 const DEFAULT_TETS: usize = 10_000;
 
-/// Share of a surface's volume that a fill may lose in silence.
+/// Share of a surface's volume that a fill may lose without a warning.
 const VOLUME_LOSS: f64 = 0.02;
 
-/// The tetrahedra that a file holds, or that its shape is filled with: about as many as `tets`, or
-/// 10,000. What was mended of a dirty surface is a warning and is returned; a fill so coarse that
-/// it rounds much of a surface away is a warning.
+/// Returns the tetrahedra that a file holds, or fills the file's shape with about `tets` tetrahedra
+/// (default: 10,000).
+///
+/// If a defective surface was repaired, the repair is reported as a warning and returned. A fill so
+/// coarse that it rounds off much of a surface is reported as a warning.
 ///
 /// # Errors
-/// [`LabError::Mesh`], or [`LabError::TetsGiven`] where `tets` is given for a file that has its own.
+/// Returns [`LabError::Mesh`] when the file cannot be read or filled, or [`LabError::TetsGiven`]
+/// when `tets` is given for a file that already holds tetrahedra.
 pub fn fill(
     input: &Path,
     tets: Option<usize>,
@@ -33,7 +36,8 @@ pub fn fill(
     let (mesh, repair) = read.into_tets(&options, &mut |share| progress.report("mesh", f64::from(share)))?;
     if let Some(repair) = repair {
         progress.warn(&format!("{} was mended: {repair}", input.display()));
-        // What a dirty surface encloses is no measure of the fill: holes, and parts that are counted twice.
+        // The volume of a defective surface does not measure the fill, because of holes and parts
+        // that count twice.
         return Ok((mesh, Some(repair)));
     }
     let filled = mesh.volume();

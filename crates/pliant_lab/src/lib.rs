@@ -1,8 +1,8 @@
-//! The laboratory: Pliant measured, in virtual time or on this machine. It is for the project's own
-//! tests, its report and the `pliant` program; no app needs it.
+//! The laboratory measures Pliant, in virtual time or on this machine. The project's own tests, its
+//! report and the `pliant` program use the laboratory. No app needs it.
 //!
-//! A whole session, a host and a guest and two hands over a network that loses packets, in virtual
-//! time:
+//! A whole session in virtual time, with a host, a guest and two hands over a network that loses
+//! packets:
 //!
 //! ```
 //! use std::sync::Arc;
@@ -21,15 +21,15 @@
 //! # }
 //! ```
 //!
-//! | module | what it holds |
+//! | module | content |
 //! | --- | --- |
 //! | [`pair`] | host and guests joined by emulated links in virtual time |
-//! | [`experiment`] | a session measured: errors, forces, bytes |
-//! | [`bench`](mod@bench) | what a body costs on this machine, beside the limit that memory sets |
-//! | [`report`] | what the method costs and what it is off by: tables, figures, words |
+//! | [`experiment`] | measures a session: errors, forces, bytes |
+//! | [`bench`](mod@bench) | cost of a body on this machine, next to the memory bandwidth limit |
+//! | [`report`] | cost and errors of the method, as tables, plots and text |
 //! | [`stability`] | stiff, extreme and unfair cases, each with its bound and its margin |
-//! | [`fill`](mod@fill) | tetrahedra out of a file, whatever it holds |
-//! | [`progress`] | who is told how far a measurement is |
+//! | [`fill`](mod@fill) | tetrahedral meshes from files of any supported kind |
+//! | [`progress`] | progress reports of long measurements |
 
 pub mod bench;
 mod error;

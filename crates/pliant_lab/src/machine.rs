@@ -1,7 +1,7 @@
-//! The machine that is measured on.
+//! The machine that runs the measurements.
 
-/// Keeps this thread on one core as long as it lives; what it starts meanwhile stays there, too. Elsewhere than on Linux, or where that is
-/// refused, nothing changes.
+/// Pins this thread to one core while the value lives. Threads that are started meanwhile stay on
+/// that core, too. On systems other than Linux, or where pinning is refused, nothing changes.
 pub(crate) struct Pinned {
     #[cfg(target_os = "linux")]
     before: Option<rustix::thread::CpuSet>,
@@ -27,13 +27,13 @@ impl Drop for Pinned {
     fn drop(&mut self) {
         #[cfg(target_os = "linux")]
         if let Some(before) = &self.before {
-            // It was its own a moment ago.
+            // Restoring the thread's previous set of cores should not fail.
             let _ = rustix::thread::sched_setaffinity(None, before);
         }
     }
 }
 
-/// Processor time of this thread; elsewhere than on Linux the time since the first call.
+/// CPU time of this thread. On systems other than Linux, the time since the first call.
 pub(crate) fn thread_time() -> std::time::Duration {
     #[cfg(target_os = "linux")]
     {
@@ -47,12 +47,12 @@ pub(crate) fn thread_time() -> std::time::Duration {
     }
 }
 
-/// Runnable programs, mean over a minute; `None` where the system does not say.
+/// Number of runnable programs, mean over a minute. `None` if the system does not report it.
 pub(crate) fn load() -> Option<f64> {
     std::fs::read_to_string("/proc/loadavg").ok()?.split(' ').next()?.parse().ok()
 }
 
-/// The processor's name; empty where the system does not say.
+/// The CPU's name. Empty if the system does not report it.
 pub(crate) fn processor() -> String {
     let told = std::fs::read_to_string("/proc/cpuinfo").unwrap_or_default();
     let line = told.lines().find_map(|line| line.strip_prefix("model name")?.split_once(':'));

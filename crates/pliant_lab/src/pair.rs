@@ -1,7 +1,8 @@
-//! A host and its guests joined by emulated links in virtual time: for tests, demos and measurements. Nothing sleeps.
+//! A host and its guests joined by emulated links in virtual time, for tests, demos and
+//! measurements.
 //!
-//! Time jumps to the next thing that happens: a step of the host, an arrival, a guest's next tick. The caller's side is a
-//! [`World`]: what a game does around a session.
+//! Nothing sleeps. Time jumps to the next event: a step of the host, an arrival or a guest's next
+//! tick. A [`World`] is the caller's side: what a game does around a session.
 
 use std::time::Duration;
 
@@ -11,13 +12,13 @@ use pliant_stream::{
     StreamError,
 };
 
-/// What happens around the sessions. All methods may be left as they are but [`World::step`].
+/// The caller's side of the sessions. All methods except [`World::step`] have a default.
 pub trait World {
-    /// The host's step: simulate, then [`HostSession::publish`] every body with this tick.
+    /// Runs the host's step: simulate, then [`HostSession::publish`] every body with this tick.
     fn step(&mut self, now: Duration, tick: u64, host: &mut HostSession);
-    /// Something happened at the host.
+    /// Handles an event of the host.
     fn host_event(&mut self, _now: Duration, _event: HostEvent, _host: &mut HostSession) {}
-    /// Something happened at a guest.
+    /// Handles an event of a guest.
     fn guest_event(
         &mut self,
         _now: Duration,
@@ -26,7 +27,7 @@ pub trait World {
         _session: &mut GuestSession,
     ) {
     }
-    /// A guest's bodies took `stepped` ticks (0 for a wake-up without one).
+    /// Called after a guest's bodies took `stepped` ticks (0 for a wake-up without a tick).
     fn guest_stepped(&mut self, _now: Duration, _guest: usize, _stepped: u64, _session: &mut GuestSession) {}
 }
 
@@ -37,12 +38,12 @@ pub struct PathConfig {
     pub down: LinkConfig,
     /// Guest to host.
     pub up: LinkConfig,
-    /// Bytes that a datagram may have.
+    /// Largest size of a datagram, bytes.
     pub max_datagram: usize,
 }
 
 impl PathConfig {
-    /// The same both ways, 1,200 bytes a datagram.
+    /// The same settings both ways, with datagrams of up to 1,200 bytes.
     pub fn symmetric(link: LinkConfig) -> Self {
         Self { down: link.clone(), up: link, max_datagram: 1200 }
     }
@@ -53,9 +54,9 @@ impl PathConfig {
 pub struct GuestEnd {
     /// The session.
     pub session: GuestSession,
-    /// Datagrams, host to guest.
+    /// Link for datagrams, host to guest.
     pub down: Link,
-    /// Datagrams, guest to host.
+    /// Link for datagrams, guest to host.
     pub up: Link,
     reliable_down: Link,
     reliable_up: Link,
@@ -67,7 +68,8 @@ pub struct GuestEnd {
 pub struct Pair {
     /// The host's session.
     pub host: HostSession,
-    /// The guests, in the order in which they were added; guest `k` is [`PeerId`] `k + 1` to the host.
+    /// The guests in the order in which they were added. Guest `k` is [`PeerId`] `k + 1` to the
+    /// host.
     pub guests: Vec<GuestEnd>,
     now: Duration,
     step: Duration,
@@ -79,10 +81,10 @@ pub struct Pair {
 }
 
 impl Pair {
-    /// A host alone, its first step (tick 1) one step from now.
+    /// Creates a host without guests. Its first step (tick 1) is one step away.
     ///
     /// # Errors
-    /// [`StreamError::Config`].
+    /// Returns [`StreamError::Config`] for settings out of range.
     pub fn new(config: HostConfig) -> Result<Self, StreamError> {
         let step = Duration::from_secs_f64(config.newmark.h.clamp(1e-5, 1.0));
         let host = HostSession::new(config)?;
@@ -99,7 +101,7 @@ impl Pair {
         })
     }
 
-    /// The time.
+    /// The current virtual time.
     pub fn now(&self) -> Duration {
         self.now
     }
@@ -109,33 +111,35 @@ impl Pair {
         self.tick
     }
 
-    /// Measures with this clock what the guests' sessions cost: reading, correcting, stepping.
+    /// Starts to measure the guests' sessions with this clock: decoding, correcting and stepping.
     pub fn measure_guests(&mut self, clock: Option<fn() -> Duration>) {
         self.clock = clock;
         self.spent = Duration::ZERO;
     }
 
-    /// What the guests' sessions have cost since [`Pair::measure_guests`].
+    /// Time spent in the guests' sessions since [`Pair::measure_guests`].
     pub fn guests_spent(&self) -> Duration {
         self.spent
     }
 
-    /// The host stops stepping, or goes on; its tick numbers stand still meanwhile and no step is caught up with.
+    /// Stops or continues the host's steps. A pause stops the tick numbers, and the host does not
+    /// catch up on steps.
     pub fn pause(&mut self, paused: bool) {
         self.paused = paused;
         self.next_step = self.next_step.max(self.now);
     }
 
-    /// Joins a guest over a path. What goes reliably arrives in order after the path's delay, and later by what resending
-    /// would cost on average.
+    /// Joins a guest over a path and returns its index. Reliable messages arrive in order after the
+    /// path's delay plus a random delay that stands for resending lost packets.
     ///
     /// # Errors
-    /// [`StreamError`] as from [`GuestSession::new`] and [`HostSession::connect`].
+    /// Returns the [`StreamError`] of [`GuestSession::new`] or [`HostSession::connect`].
     pub fn join(&mut self, config: GuestConfig, path: PathConfig, seed: u64) -> Result<usize, StreamError> {
         self.join_with(config, path, seed, |_| {})
     }
 
-    /// As [`Pair::join`]; `prepare` sees the session before it says hello (cached models).
+    /// Joins a guest as [`Pair::join`] does, but calls `prepare` with the session before the
+    /// session connects. `prepare` can add cached models.
     ///
     /// # Errors
     /// As [`Pair::join`].
@@ -177,14 +181,14 @@ impl Pair {
         Ok(index)
     }
 
-    /// Cuts a guest off without a word, as when a process is killed: nothing passes any more.
+    /// Cuts off a guest without notice, as when a process is killed. Nothing passes after that.
     pub fn cut(&mut self, guest: usize) {
         if let Some(g) = self.guests.get_mut(guest) {
             g.connected = false;
         }
     }
 
-    /// Runs until a time.
+    /// Runs until the time `until`.
     pub fn run_until(&mut self, until: Duration, world: &mut dyn World) {
         loop {
             self.exchange(world);
@@ -212,18 +216,20 @@ impl Pair {
             for link in [&g.down, &g.up, &g.reliable_down, &g.reliable_up] {
                 take(link.next_wakeup());
             }
-            // A wake-up that has just been served would be served for ever at the same time.
+            // Serving a wake-up does not change its time, so the next one must lie later to avoid
+            // an endless loop.
             take(g.session.next_wakeup(self.now).map(|t| t.max(self.now + Duration::from_micros(1))));
         }
         next
     }
 
-    /// Delivers all that has arrived by now, and sends all that is to be sent.
+    /// Delivers everything that has arrived by now, and sends all output.
     fn exchange(&mut self, world: &mut dyn World) {
         let now = self.now;
         for (index, g) in self.guests.iter_mut().enumerate() {
             let peer = PeerId(index as u64 + 1);
-            // Reliable first: a snapshot that arrives together with a frame comes before it.
+            // Poll the reliable link first, so that a snapshot is handled before a frame of the
+            // same arrival time.
             while let Some(bytes) = g.reliable_up.poll(now) {
                 if g.connected {
                     self.host.on_message(now, peer, &bytes);
@@ -263,7 +269,7 @@ impl Pair {
                 world.guest_event(now, index, event, &mut g.session);
             }
             world.guest_stepped(now, index, stepped, &mut g.session);
-            // Targets that were set just now leave with this.
+            // This update sends the targets that were just set.
             g.session.update(now);
             while let Some(Output { channel, bytes, .. }) = g.session.poll_output() {
                 let link = match channel {

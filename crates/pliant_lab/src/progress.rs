@@ -1,11 +1,11 @@
-//! What a long measurement tells while it runs.
+//! Progress reports of long measurements.
 
-/// Who is told how far a measurement is. `()` is told, too, and says nothing.
+/// Receives the progress of a measurement. The implementation for `()` ignores all reports.
 pub trait Progress: Send {
-    /// A share of this stage is done, 0 to 1.
+    /// Reports the share of a stage that is done, 0 to 1.
     fn report(&mut self, stage: &'static str, share: f64);
 
-    /// Something to know that stops nothing: one line without a line end.
+    /// Reports a warning that does not stop the measurement: one line without a line end.
     fn warn(&mut self, text: &str);
 }
 

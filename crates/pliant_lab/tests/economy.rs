@@ -1,4 +1,4 @@
-//! What a session costs: rest, weak guests, small paths, narrow lines.
+//! Cost of a session: resting bodies, weak guests, small datagrams and low bandwidth.
 #![allow(clippy::unwrap_used, clippy::expect_used, clippy::panic, reason = "a failed test should panic")]
 
 mod support;
@@ -22,7 +22,7 @@ fn resting_body_sends_next_to_nothing_and_wakes_right() {
             .unwrap();
         pair.run_until(5 * S, &mut scene);
         scene.resting = true;
-        // A sleeping body stands still.
+        // A sleeping body does not move.
         let mut still = scene.body.state().clone();
         still.v.fill(0.0);
         still.a.fill(0.0);
@@ -51,7 +51,7 @@ fn resting_body_sends_next_to_nothing_and_wakes_right() {
 #[test]
 fn who_fetches_a_resting_bodys_model_costs_nobody_else() {
     let model = bar(500, 0.2);
-    // So slowly that the model is still on its way at the end.
+    // The rates are so low that the model is still being sent at the end.
     let slow = HostConfig { model_rate: 2e4, models_rate: 2e4, ..Default::default() };
     let (mut pair, mut scene) = start_with(&model, slow);
     scene.resting = true;
@@ -65,7 +65,7 @@ fn who_fetches_a_resting_bodys_model_costs_nobody_else() {
     let fetched = pair.host.stats(PeerId(2)).unwrap().message_bytes_out;
     assert!(fetched > 100_000 && !pair.guests[1].session.body(BODY).unwrap().is_ready(), "{fetched} bytes");
     let sent = pair.host.stats(PeerId(1)).unwrap().message_bytes_out - before;
-    // A state of 500 modes is 12 kB; a resting body is recalled once a second.
+    // A state of 500 modes is 12 kB. The host sends the state of a resting body once a second.
     assert!(sent < 11 * 13_000, "{sent} bytes in 10 s of rest");
     assert!(sent > 0);
 }
@@ -98,7 +98,7 @@ fn weak_guests_take_fewer_modes_and_small_paths_fewer_still() {
         assert!(longest.sent > 50);
         assert!(g.session.body(BODY).unwrap().counts().guessed <= 2);
     }
-    // And when the path shrinks while streaming.
+    // The datagram size shrinks while streaming.
     pair.host.set_max_datagram(PeerId(3), 300);
     pair.run_until(6 * S, &mut scene);
     assert_eq!(pair.guests[2].session.body(BODY).unwrap().visual().unwrap().modes(), 91);
@@ -112,7 +112,8 @@ fn a_guest_that_may_cost_little_gets_less_of_everything_but_every_tick() {
     let model = bar(120, 0.05);
     for (rate, link) in [
         (50e3, LinkConfig { delay: 20 * MS, ..Default::default() }),
-        // The line itself is narrow, and the rate is not known: the queue tells.
+        // The path itself has low bandwidth, and the host does not know the rate. The queue shows
+        // it.
         (1e6, LinkConfig { delay: 20 * MS, bits_per_second: Some(55e3), ..Default::default() }),
     ] {
         let (mut pair, mut scene) = start_with(&model, HostConfig { guest_rate: rate, ..Default::default() });
@@ -138,7 +139,7 @@ fn a_guest_that_may_cost_little_gets_less_of_everything_but_every_tick() {
         assert!(bits < rate.min(60e3), "{bits} bit/s");
         let frames = after.0.datagrams_out - before.0.datagrams_out;
         assert!(frames >= 800, "{frames} datagrams in 800 ticks: none is dropped");
-        // Trying more makes a queue now and then; none stands.
+        // Probing for more bandwidth fills the queue now and then, but the queue empties again.
         round_trips.sort_unstable();
         assert!(round_trips[10] < 90 * MS, "no queue stands: {round_trips:?}");
         let error = scene.error(session) / scene.size();

@@ -1,5 +1,5 @@
-//! Remakes the paper's figures 7 to 9 as pictures: `cargo test -p pliant_lab --test figures -- --ignored` writes
-//! `docs/figures/stream-*.svg`.
+//! Draws the paper's figures 7 to 9 again: `cargo test -p pliant_lab --test figures -- --ignored`
+//! writes `docs/figures/stream-*.svg`.
 #![allow(clippy::unwrap_used, clippy::expect_used, clippy::panic, reason = "a failed test should panic")]
 
 mod support;
@@ -23,7 +23,7 @@ fn run(lost: &[u64], mut recovery: RecoveryConfig) -> Metrics {
     e.newmark = Newmark::average(0.025);
     e.resend_after = Duration::from_secs_f64(50.0 * 0.025);
     (e.seconds, e.keep_track) = (18.5, true);
-    // The paper's hands do not tremble.
+    // The paper's hands have no tremor.
     e.hands.iter_mut().for_each(|h| h.tremor = 0.0);
     e.run().unwrap()
 }

@@ -1,7 +1,7 @@
-//! Whole sessions over emulated paths against the bars of the design: 40 Hz, 120 modes.
+//! Whole sessions over emulated paths, checked against the bounds of the design: 40 Hz, 120 modes.
 //!
-//! `cargo test -p pliant_lab --test measure -- --ignored --nocapture` runs the long form: ten minutes, many seeds, and
-//! all policies side by side.
+//! `cargo test -p pliant_lab --test measure -- --ignored --nocapture` runs the long form: ten
+//! minutes, many seeds and all policies.
 #![allow(clippy::unwrap_used, clippy::expect_used, clippy::panic, reason = "a failed test should panic")]
 
 mod support;
@@ -21,7 +21,7 @@ fn paper1(loss: Loss) -> LinkConfig {
     LinkConfig { loss, ..LinkConfig::preset(Preset::Paper1) }
 }
 
-/// The design's conditions: name, path, and the bars for rms and max in percent.
+/// The design's conditions: name, path, and the bounds for rms and max in percent.
 fn conditions() -> [(&'static str, LinkConfig, f64, f64); 4] {
     [
         ("paper-1", LinkConfig::preset(Preset::Paper1), 0.2, 3.0),
@@ -31,7 +31,7 @@ fn conditions() -> [(&'static str, LinkConfig, f64, f64); 4] {
     ]
 }
 
-/// The bar, or the model that the variable MODEL names.
+/// The bar, or the model file that the variable MODEL names.
 fn body() -> Arc<ModalModel> {
     static BODY: OnceLock<Arc<ModalModel>> = OnceLock::new();
     let made = || match std::env::var("MODEL") {
@@ -46,7 +46,8 @@ fn run(link: &LinkConfig, policy: &str, seconds: f64, seed: u64) -> Metrics {
     (e.seconds, e.seed) = (seconds, seed);
     e.cpu_clock = Some(clock);
     if !matches!(e.recovery.policy, Policy::ForceDriven { .. }) {
-        // What is streamed and predicted are accelerations that obey Newmark's formulas: the fair host for the paper.
+        // The streamed and predicted accelerations follow Newmark's formulas, so a fair comparison
+        // with the paper needs such a host.
         e.integrator = Integrator::GeneralizedAlpha { rho_inf: 0.5 };
     }
     e.run().unwrap()
@@ -90,7 +91,8 @@ fn hold_bars(name: &str, seed: u64, f: &Metrics, rms: f64, max: f64) {
     assert!(f.rms_percent <= rms, "{name}, seed {seed}: rms {} % above {rms} %", f.rms_percent);
     assert!(f.max_percent <= max, "{name}, seed {seed}: max {} % above {max} %", f.max_percent);
     assert!(f.kbit_s <= 100.0, "{name}, seed {seed}: {} kbit/s", f.kbit_s);
-    // As without loss; a flip of sign in each step would be 4. (The scripted hands tremble: it is not 0 in truth either.)
+    // The ringing must be as without loss. A change of sign in each step would give 4. (The
+    // scripted hands have a tremor, so the true ringing is not 0 either.)
     let (shown, real) = (f.force_ringing, f.true_ringing);
     assert!(shown < 1.1 * real, "{name}, seed {seed}: ringing {shown}, true {real}");
     assert_eq!(f.counts.too_late, 0, "{name}, seed {seed}: data that came too late");
@@ -116,11 +118,13 @@ fn burst_is_recovered_within_200_ms_of_the_first_arrival() {
     );
     (e.seconds, e.keep_track) = (20.0, true);
     let f = e.run().unwrap();
-    // Shown ticks that were guessed end where the first frame after the burst arrives; the hand's patch tells the rest.
+    // The predicted ticks end where the first frame after the burst arrives. After that, the
+    // position of the hand's patch shows the error.
     let scale = f.track.iter().map(|t| t.1.abs()).fold(0.0, f64::max);
     let off: Vec<u64> = f.track.iter().filter(|t| (t.1 - t.2).abs() > 0.005 * scale).map(|t| t.0).collect();
     let (Some(first), Some(last)) = (off.first(), off.last()) else { return };
-    // Twelve ticks are lost; one of playout and three of repeats make nine or fewer of guessing.
+    // Twelve ticks are lost. One tick of playout delay and three repeats leave at most nine
+    // predicted ticks.
     let after = (last - first) as f64 * 25.0 - 12.0 * 25.0;
     assert!(after <= 200.0, "{after} ms after the first arrival: ticks {first} to {last}");
 }
@@ -143,7 +147,7 @@ fn same_seed_same_hash() {
     assert_ne!(go(7), go(8));
 }
 
-/// The paper's figures 7 to 9: losses, resent 50 ticks later, blended over 1 and 50 ticks.
+/// The paper's figures 7 to 9: losses are resent 50 ticks later and blended over 1 and 50 ticks.
 #[test]
 fn papers_figures_end_without_error() {
     let random: Vec<u64> = (0..22_u64).map(|k| 135 + (k * 7919) % 300).collect();
@@ -162,7 +166,8 @@ fn papers_figures_end_without_error() {
             for blend in [1, 50] {
                 let mut recovery = RecoveryConfig::paper_with(predict, blend);
                 recovery.coding = AccelerationCoding::F64;
-                // The paper's system: average acceleration at both ends, so that its accelerations are the streamed ones.
+                // The paper's system uses average acceleration at both ends, so that its
+                // accelerations are the streamed ones.
                 let link =
                     LinkConfig { delay: Duration::from_millis(10), loss: loss.clone(), ..Default::default() };
                 let mut e = Experiment::new(bar(20, 0.05), link, recovery);
@@ -171,7 +176,7 @@ fn papers_figures_end_without_error() {
                 e.resend_after = Duration::from_secs_f64(50.0 * 0.025);
                 e.seconds = 18.0;
                 if name == "one in 50" {
-                    // Eleven losses, and then time to repair the last.
+                    // Eleven losses leave time to repair the last.
                     e.down.loss = Loss::Listed((0..11).map(|k| 135 + 50 * k).collect());
                 }
                 let f = e.run().unwrap();
@@ -192,7 +197,7 @@ fn papers_figures_end_without_error() {
     }
 }
 
-/// The worst of many seeds, two at a time.
+/// The worst metrics of many seeds, run two at a time.
 fn worst(link: &LinkConfig, policy: &str, seconds: f64, seeds: u64) -> Metrics {
     let next = std::sync::atomic::AtomicU64::new(1);
     let worst = std::sync::Mutex::new(Metrics::default());
@@ -298,13 +303,15 @@ fn all_policies_side_by_side() {
     }
 }
 
-/// The tick at which a hand lets go or takes hold is lost, with its neighbours: no forecast has it, so it is said often.
+/// The tick of a grab or release is lost together with its neighbors. No forecast predicts the
+/// change, so the host sends it several times.
 #[test]
 fn a_lost_release_or_grab_makes_no_spike() {
     for (what, holds) in [("release", (0.0, 8.0)), ("grab", (8.0, 1e9))] {
         for (count, bar) in [(1, 0.5), (2, 2.0), (3, 2.0)] {
             let (mut worst, mut at) = (0.0_f64, 0);
-            // Which datagram tells of it is tried out: those around the moment, one after the other.
+            // Try all datagrams around that moment, because the one that carries the change is not
+            // known.
             for first in 164..=184 {
                 let link = paper1(Loss::Listed((first..first + count).collect()));
                 let mut e = Experiment::new(body(), link, RecoveryConfig::default());
@@ -319,8 +326,9 @@ fn a_lost_release_or_grab_makes_no_spike() {
     }
 }
 
-/// What one body costs a tick at 120 modes and two hands, with 9 % of the frames lost and asked for again: the host's
-/// encoder, and a guest's reading, correcting and stepping. Run with `--release`.
+/// Measures the cost of one body per tick with 120 modes, two hands and 9 % of the frames lost and
+/// requested again: the host's encoder, and a guest's decoding, correcting and stepping. Run with
+/// `--release`.
 #[test]
 #[ignore = "a timing: means something with --release only"]
 fn cost_of_a_tick() {
@@ -350,7 +358,7 @@ fn cost_of_a_tick() {
         let mut receiver: Option<Receiver> = None;
         let (mut encode, mut decode) = (Vec::new(), Vec::new());
         let mut chance = 88_172_645_463_325_252;
-        // What was lost comes again 8 ticks later: a round trip of the paper's.
+        // Lost frames arrive again 8 ticks later, after a round trip of the paper's network.
         let mut lost = std::collections::VecDeque::new();
         for tick in 1..=2000_u64 {
             let t = tick as f64 * h;
@@ -424,11 +432,13 @@ fn what_is_not_shown_counts_as_missing_and_as_wrong() {
     let link = |loss| LinkConfig { loss, delay: Duration::from_millis(10), ..LinkConfig::default() };
     let whole = run(&link(Loss::None), "default", 10.0, 1);
     assert!(whole.missing == 0 && whole.ticks >= 399 && whole.max_percent < 0.1, "{whole:?}");
-    // Nothing arrives any more: after a second and a bit of guessing the picture stands still, and every tick from then on is missed and compared.
+    // No frame arrives. After a bit more than a second of prediction the visual state stands still,
+    // and every later tick counts as missed and is compared.
     let none = run(&link(Loss::Burst { first: 0, count: 100_000 }), "default", 10.0, 1);
     assert!(none.missing > 300 && none.ticks + none.missing >= 398, "{none:?}");
     assert!(none.rms_percent > 10.0 && none.end_percent > 1.0, "{none:?}");
-    // A second without frames: some ticks are missed while it lasts, and what is caught up with is not taken for shown.
+    // A second without frames: some ticks are missed, and ticks that the catch-up skips do not
+    // count as shown.
     let gap = run(&link(Loss::Burst { first: 100, count: 60 }), "default", 10.0, 1);
     assert!((5..=60).contains(&gap.missing) && gap.max_percent > 1.0, "{gap:?}");
     assert!(gap.ticks + gap.missing >= 398, "{gap:?}");

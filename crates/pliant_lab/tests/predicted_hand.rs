@@ -1,4 +1,4 @@
-//! Own hand first.
+//! Tests of the predicted hand: the guest's own copy of a body that answers the local hand at once.
 #![allow(clippy::unwrap_used, clippy::expect_used, clippy::panic, reason = "a failed test should panic")]
 
 mod support;
@@ -15,7 +15,7 @@ use support::{bar, loose_bar};
 
 #[test]
 fn own_hand_does_not_wait_for_the_round_trip() {
-    // The guest's newer copy against what the host makes of the same ticks later.
+    // Compare the guest's predicted copy with the host's later results for the same ticks.
     for (preset, bar_shape, bar_force) in
         [(Preset::Paper4, 0.002, 0.005), (Preset::Paper2, 0.02, 0.1), (Preset::Paper1, 0.02, 0.1)]
     {
@@ -88,7 +88,7 @@ fn own_hand_does_not_wait_for_the_round_trip() {
             shape * 100.0,
             force * 100.0
         );
-        // Round trip and playout in ticks, rounded up by the host's and the guest's steps.
+        // Round trip and playout delay in ticks, rounded up by the steps of the host and the guest.
         let whole = (preset.round_trip().as_secs_f64() / 0.025) as usize;
         assert!(
             (whole + 1..=whole + 4).contains(&lead),
@@ -102,7 +102,8 @@ fn own_hand_does_not_wait_for_the_round_trip() {
 
 #[test]
 fn own_hand_on_a_free_body_takes_its_frame_along() {
-    // A free body falls slowly and is dragged: the copy's frame against the host's of the same ticks later.
+    // A free body falls slowly and is dragged. Compare the pose of the copy with the host's later
+    // pose of the same ticks.
     let model = loose_bar(24, 0.05);
     let settings = StepSettings { gravity: [0.0, 0.0, -0.3], ..Default::default() };
     let mut pair = Pair::new(HostConfig::default()).unwrap();

@@ -1,4 +1,4 @@
-//! What a frame's rounding costs and brings, and what a guest's hand says.
+//! Size and error of quantized frames, and the traffic of a guest's hand.
 #![allow(clippy::unwrap_used, clippy::expect_used, clippy::panic, reason = "a failed test should panic")]
 
 mod support;
@@ -26,9 +26,9 @@ fn coarser_steps_take_fewer_bytes_and_show_a_larger_error() {
     let rates = [fine.kbit_s, usual.kbit_s, coarse.kbit_s];
     assert!(rates[0] > rates[1] && rates[1] > rates[2], "{rates:?} kbit/s");
     assert!(fine.rms_percent < usual.rms_percent && 4.0 * usual.rms_percent < coarse.rms_percent);
-    // Half a step at each of the modes that a slice brings is the most that a frame moves the surface by.
+    // A frame moves the surface by at most half a step in each mode of its slice.
     assert!(coarse.rms_percent < 100.0 * 2.0f64.powi(-8), "{}", coarse.rms_percent);
-    // Out of range and not a number: brought into it.
+    // A quantum that is not a number or out of range is replaced or clamped.
     assert_eq!(at(f64::NAN).hash, usual.hash);
     assert!(at(1e9).rms_percent.is_finite());
 }
@@ -37,7 +37,8 @@ fn coarser_steps_take_fewer_bytes_and_show_a_larger_error() {
 fn a_hand_at_the_guest_says_its_target_every_tick() {
     let idle = run(|_| ());
     let holds = run(|e| e.guest_hand = true);
-    // A target is three numbers in double precision or fewer, said three times, forty times a second.
+    // A target has three numbers of at most double precision. It is sent three times, forty times a
+    // second.
     let more = holds.kbit_s_up - idle.kbit_s_up;
     assert!((3.0..40.0).contains(&more), "{more} kbit/s for the targets ({} without)", idle.kbit_s_up);
 }

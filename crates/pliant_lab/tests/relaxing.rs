@@ -1,4 +1,5 @@
-//! Bodies that relax: the flow streams, recovers and is forgotten like the rest of the state.
+//! Bodies that relax: the viscoelastic state streams, recovers and decays like the rest of the
+//! state.
 #![allow(clippy::unwrap_used, clippy::expect_used, clippy::panic, reason = "a failed test should panic")]
 
 mod support;
@@ -34,7 +35,8 @@ fn every_policy_streams_a_relaxing_body_as_well_as_an_elastic_one() {
     for name in RecoveryConfig::NAMES {
         let recovery = RecoveryConfig::by_name(name).unwrap();
         let run = |relaxation: Option<Relaxation>| {
-            // A burst of six, and time to forget it: what is left at the end is what does not die out.
+            // A burst of six losses and then time to recover. Any error at the end is one that does
+            // not decay.
             let link = LinkConfig {
                 loss: Loss::Burst { first: 140, count: 6 },
                 ..LinkConfig::preset(Preset::Paper1)
@@ -75,7 +77,8 @@ fn peers_step_a_relaxing_body_together() {
     assert!(f.rms_percent < 2.0, "{} %", f.rms_percent);
 }
 
-/// A receiver that begins with a flow that is wrong: how wrong its shape is, tick by tick, as a share of the largest.
+/// Errors of a receiver that starts with a wrong viscoelastic state: per tick, the relative errors
+/// of the shape and of the viscoelastic state.
 fn wrong_flow(recovery: &RecoveryConfig, ticks: u64) -> Vec<(f64, f64)> {
     let model = bar(24, 0.05);
     let integrator = integrator_for(recovery);
@@ -164,14 +167,15 @@ fn a_guest_joins_follows_rests_and_feels_a_relaxing_body() {
     scene.hand = circling();
     pair.join_with(GuestConfig::default(), paper1(), 1, cached(&model)).unwrap();
     pair.run_until(8 * S, &mut scene);
-    // Joins late: the flow comes with the snapshot.
+    // The second guest joins late and gets the viscoelastic state with the snapshot.
     pair.join_with(GuestConfig::default(), paper1(), 2, cached(&model)).unwrap();
     scene.settled = 10 * S;
     pair.run_until(20 * S, &mut scene);
     let worst = scene.worst / scene.size();
     assert!(worst < 0.05, "{worst}");
     let own = pair.guests[0].session.body(BODY).unwrap().predicted_hand().expect("it holds the body");
-    // The copy is ahead by the round trip: its reaction against the host's of the same tick, a slow hand's.
+    // The copy is ahead by the round trip. Compare its reaction with the host's current one, which
+    // changes little for a slow hand.
     let truth = scene.body.reaction(scene.grabs[0].1).unwrap();
     let felt = own.reaction(0).unwrap();
     let size = truth.iter().map(|x| x * x).sum::<f64>().sqrt();

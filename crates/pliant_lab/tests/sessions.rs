@@ -1,4 +1,4 @@
-//! Sessions: joining, late joining, leaving, models, bodies that come and go.
+//! Sessions: joining, joining late, leaving, models, and bodies that are added and removed.
 #![allow(clippy::unwrap_used, clippy::expect_used, clippy::panic, reason = "a failed test should panic")]
 
 mod support;

@@ -1,4 +1,4 @@
-//! A body whose stiffness changes while it is streamed: its guests are told, and follow with their hands on.
+//! A body whose stiffness changes while it is streamed: guests are notified and keep their grabs.
 #![allow(clippy::unwrap_used, clippy::expect_used, clippy::panic, reason = "a failed test should panic")]
 
 mod support;
@@ -8,7 +8,7 @@ use pliant_stream::{GuestConfig, GuestEvent, HostConfig};
 use support::bar;
 use support::scene::{BODY, S, Scene, cached, circling, paper1};
 
-/// The worst error of what is shown from a second after the change on, as a share of the largest shape; and how far the stream had got.
+/// The largest visual error from a second after the change on, as a share of the largest shape.
 fn after_a_change(told: bool, scale: f64) -> f64 {
     let model = bar(24, 0.05);
     let mut pair = pliant_lab::pair::Pair::new(HostConfig::default()).unwrap();
@@ -26,7 +26,7 @@ fn after_a_change(told: bool, scale: f64) -> f64 {
     scene.body.reconfigure(config).unwrap();
     if told {
         pair.host.set_settings(BODY, stiff).unwrap();
-        // Once more is nothing new.
+        // Setting the same settings again has no effect.
         pair.host.set_settings(BODY, stiff).unwrap();
     }
     scene.settled = 6 * S;

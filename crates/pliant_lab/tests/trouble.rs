@@ -1,4 +1,4 @@
-//! Sessions in bad luck: outages, pauses, scattering frames, unexplained forces.
+//! Sessions under disturbances: outages, pauses, scattered frames and unexplained forces.
 #![allow(clippy::unwrap_used, clippy::expect_used, clippy::panic, reason = "a failed test should panic")]
 
 mod support;
@@ -40,7 +40,7 @@ fn two_guests_over_the_papers_worst_network_see_one_shape() {
             assert_eq!(view.grabs()[0].key.user, UserId(1));
             let (key, ..) = scene.grabs[0];
             assert_eq!(view.grabs()[0].key, key);
-            // The reaction belongs to the tick that is shown.
+            // The reaction belongs to the tick that the guest shows.
             let at = |r: &&(u64, GrabKey, [f64; 3])| (r.0, r.1) == (view.tick(), key);
             let host = scene.reactions.iter().find(at).unwrap().2;
             let own = view.grabs()[0].reaction;
@@ -113,7 +113,8 @@ fn an_outage_of_ten_seconds_ends_in_a_resync() {
 
 #[test]
 fn frames_that_scatter_like_a_picture_rate_are_shown_evenly_and_without_guessing() {
-    // Both apps work at 60 pictures a second: arrivals scatter by up to 17 ms around the 25 ms of the ticks.
+    // Both apps run at 60 frames a second, so arrivals scatter by up to 17 ms around the 25 ms of
+    // the ticks.
     for name in ["default", "paper"] {
         let model = bar(20, 0.05);
         let (mut pair, mut scene) = start(&model);
@@ -141,7 +142,7 @@ fn a_force_that_the_stream_does_not_say_is_learnt() {
     scene.hand = circling();
     pair.join_with(GuestConfig::default(), paper1(), 6, cached(&model)).unwrap();
     pair.run_until(6 * S, &mut scene);
-    // As strong as the hand itself, from one tick to the next.
+    // The force is as strong as the hand's and starts from one tick to the next.
     scene.wind = [0.0, 3.0, -2.0];
     scene.settled = 12 * S;
     pair.run_until(30 * S, &mut scene);
@@ -162,7 +163,7 @@ fn adaptive_playout_waits_only_for_what_scatters() {
         let link = LinkConfig { delay: 60 * MS, jitter, ..Default::default() };
         let config = GuestConfig { recovery, ..Default::default() };
         pair.join_with(config, PathConfig::symmetric(link), 5, cached(&model)).unwrap();
-        // The schedule learns how arrivals scatter for the first seconds.
+        // The schedule learns the scatter of arrivals during the first seconds.
         pair.run_until(5 * S, &mut scene);
         let before = pair.guests[0].session.body(BODY).unwrap().counts();
         pair.run_until(25 * S, &mut scene);

@@ -1,7 +1,10 @@
-//! Two guests hold one body, each with its own hand first: what is gained by it, and what nobody can know.
+//! Two guests hold one body, each with its own predicted hand: the gain, and what cannot be
+//! predicted.
 //!
-//! Three pictures at one moment: the streamed one (old, and right), the newer copy with the own hand in its place, and, for comparison, the streamed
-//! one taken for the newer tick, which is what a game shows that waits for the host's word. The copy has no say in when the other lets go.
+//! The test compares three states at one moment: the streamed state (late but correct), the newer
+//! predicted copy with the local hand, and the streamed state taken for the newer tick, which is
+//! what a game without prediction shows. The copy cannot know when the other hand releases the
+//! body.
 #![allow(clippy::unwrap_used, clippy::expect_used, clippy::panic, reason = "a failed test should panic")]
 
 mod support;
@@ -16,7 +19,7 @@ use pliant_stream::{GuestConfig, GuestEvent, GuestSession, HostEvent, HostSessio
 use support::bar;
 use support::scene::{BODY, HandScript, S, Scene, cached, start};
 
-/// A shape and the tick it is said to be of.
+/// A shape, and the tick that the shape stands for.
 type Shown = (u64, Vec<f64>);
 
 struct Watch {
@@ -51,7 +54,8 @@ impl World for Watch {
     }
 }
 
-/// Off from the host's shapes of the same ticks over the surface, as shares of the largest displacement: rms, largest.
+/// Error against the host's shapes of the same ticks over the surface, root mean square and
+/// largest, as shares of the largest displacement.
 fn off(model: &ModalModel, truth: &[Shown], seen: &[Shown]) -> (f64, f64) {
     let rest = model.surface().positions();
     let (mut a, mut b) = (vec![[0.0f32; 3]; rest.len()], vec![[0.0f32; 3]; rest.len()]);
@@ -82,17 +86,18 @@ fn smooth(t: f64) -> f64 {
     t * t * t * (10.0 - 15.0 * t + 6.0 * t * t)
 }
 
-/// What the second hand does.
+/// Behavior of the second hand.
 #[derive(Clone, Copy, PartialEq)]
 enum Other {
     Nothing,
-    /// Takes hold once, and keeps it.
+    /// Grabs once and keeps the grab.
     Holds,
-    /// Lets go every five and a half seconds, as the first does.
+    /// Releases every five and a half seconds, as the first hand does.
     LetsGo,
 }
 
-/// Both hands pull, tremble a little, and the first lets go now and then; vertices 66 and 34 of the bar.
+/// Both hands pull with a small tremor, and the first hand releases now and then. They hold
+/// vertices 66 and 34 of the bar.
 fn hands(other: Other) -> HandScript {
     let mut grabs: [Option<(u16, f64)>; 2] = [None; 2];
     Box::new(move |now, guest, session| {
@@ -129,7 +134,8 @@ fn hands(other: Other) -> HandScript {
     })
 }
 
-/// Shares of the largest displacement: (streamed rms, largest), own hand first rms, waiting rms.
+/// Returns shares of the largest displacement: streamed (root mean square, largest), predicted hand
+/// (root mean square), waiting (root mean square).
 fn run(model: &Arc<ModalModel>, preset: Preset, other: Other) -> [f64; 4] {
     let (mut pair, scene) = start(model);
     let mut watch = Watch { scene, streamed: Vec::new(), own: Vec::new(), waiting: Vec::new() };
@@ -156,7 +162,8 @@ fn run(model: &Arc<ModalModel>, preset: Preset, other: Other) -> [f64; 4] {
 #[test]
 fn own_hand_first_is_nearer_to_the_host_than_waiting_for_it() {
     let model = bar(40, 0.05);
-    // (network, what the other does, own hand first at most, waiting at least so many times as far off)
+    // (network, the other hand, largest error of the predicted hand, least ratio of the waiting
+    // error to it)
     for (preset, other, most, times) in [
         (Preset::Paper1, Other::Nothing, 0.03, 8.0),
         (Preset::Paper1, Other::Holds, 0.03, 8.0),
@@ -165,7 +172,7 @@ fn own_hand_first_is_nearer_to_the_host_than_waiting_for_it() {
         (Preset::Paper4, Other::LetsGo, 0.025, 4.0),
     ] {
         let [streamed, worst, own, waiting] = run(&model, preset, other);
-        // What is streamed is held to the bars of streaming, whoever holds the body.
+        // The streamed state must stay within the bounds of streaming in every case.
         assert!(streamed < 1.5e-3 && worst < 0.05, "{}: {streamed}, {worst}", preset.name());
         assert!(own < most, "{}: {own}", preset.name());
         assert!(waiting > times * own, "{}: waiting {waiting}, own hand first {own}", preset.name());

@@ -1,4 +1,5 @@
-//! A tree of boxes over triangles: the closest point, the winding number, pairs of triangles that may touch.
+//! Bounding volume hierarchy over triangles: closest point, winding number and pairs of triangles
+//! that may touch.
 
 use nalgebra::Vector3;
 
@@ -6,14 +7,15 @@ type Triangle = [Vector3<f64>; 3];
 
 const LEAF: usize = 4;
 
-/// Beyond this many radii of a node its triangles are taken as one dipole (Barill et al. 2018 call it beta).
+/// Distance, in radii of a node, beyond which the node's triangles act as one dipole (beta in
+/// Barill et al. 2018).
 const FAR: f64 = 2.3;
 
-/// A tree over a non-empty list of triangles.
+/// Bounding volume hierarchy over a non-empty list of triangles.
 #[derive(Debug)]
 pub(crate) struct Bvh {
     nodes: Vec<Node>,
-    /// Triangles in the order of the leaves, with their own numbers.
+    /// Triangles in the order of the leaves. `numbers` holds their original indices.
     triangles: Vec<Triangle>,
     numbers: Vec<u32>,
 }
@@ -22,19 +24,20 @@ pub(crate) struct Bvh {
 struct Node {
     low: Vector3<f64>,
     high: Vector3<f64>,
-    /// Range of triangles below.
+    /// First triangle below the node. `count` is the number of these triangles.
     first: u32,
     count: u32,
-    /// The second child; the first one follows its parent. 0 for a leaf.
+    /// Index of the second child, or 0 for a leaf. The first child directly follows its parent.
     second: u32,
-    /// Sum of the triangles' area vectors, m^2, and where it is taken to act.
+    /// Sum of the triangles' area vectors, m^2. `center` is the point where the sum acts.
     area: Vector3<f64>,
     center: Vector3<f64>,
-    /// All triangles lie within this distance of `center`.
+    /// Radius around `center` that contains all triangles of the node.
     radius: f64,
 }
 
-/// The part of a triangle that a point is closest to; corners count from 0, edge `i` runs from corner `i` to the next.
+/// Part of a triangle that is closest to a point. Corners count from 0, and edge `i` runs from
+/// corner `i` to the next.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(crate) enum Feature {
     Face,
@@ -42,7 +45,7 @@ pub(crate) enum Feature {
     Corner(usize),
 }
 
-/// The closest point of the triangles.
+/// Closest point of the triangles.
 #[derive(Clone, Copy, Debug)]
 pub(crate) struct Closest {
     pub(crate) triangle: u32,
@@ -61,11 +64,13 @@ impl Bvh {
         Self { nodes, triangles, numbers }
     }
 
-    /// The point of the triangles that is closest to `p`; of several the one that comes first in the tree.
+    /// Returns the point of the triangles that is closest to `p`. Among equally close points, the
+    /// first in the tree wins.
     pub(crate) fn closest(&self, p: Vector3<f64>) -> Closest {
         let mut best = Closest { triangle: 0, feature: Feature::Face, point: p, distance: f64::INFINITY };
         let mut best_squared = f64::INFINITY;
-        // Depth is at most 2 log2(2^32 / LEAF): halves are halves.
+        // Each split halves the list exactly, so the stack holds at most 2 log2(2^32 / LEAF)
+        // entries.
         let mut stack = [(0_u32, 0.0_f64); 64];
         let mut top = 1;
         stack[0] = (0, self.nodes[0].distance_squared(p));
@@ -88,7 +93,7 @@ impl Bvh {
                 continue;
             }
             let children = [index + 1, node.second].map(|c| (c, self.nodes[c as usize].distance_squared(p)));
-            // The nearer one is looked at first: it goes on top.
+            // The nearer child goes on top of the stack, so that the loop visits it first.
             let [near, far] =
                 if children[0].1 <= children[1].1 { children } else { [children[1], children[0]] };
             stack[top] = far;
@@ -99,8 +104,11 @@ impl Bvh {
         best
     }
 
-    /// How often the triangles wind around `p`: 1 inside a closed, outward surface, 0 outside; the sum of their solid
-    /// angles over 4 pi (Jacobson et al. 2013), far triangles taken together (Barill et al. 2018).
+    /// Returns how often the triangles wind around `p`: 1 inside a closed, outward surface and 0
+    /// outside.
+    ///
+    /// The winding number is the sum of the triangles' solid angles over 4 pi (Jacobson et al.
+    /// 2013). Far triangles are evaluated together (Barill et al. 2018).
     pub(crate) fn winding_number(&self, p: Vector3<f64>) -> f64 {
         let mut angle = 0.0;
         let mut stack = [0_u32; 64];
@@ -125,7 +133,8 @@ impl Bvh {
         angle / (4.0 * std::f64::consts::PI)
     }
 
-    /// Calls `visit` with the numbers of all pairs of different triangles whose boxes overlap.
+    /// Calls `visit` with the indices of all pairs of different triangles whose leaves' boxes
+    /// overlap.
     pub(crate) fn for_each_overlap(&self, mut visit: impl FnMut(u32, u32)) {
         let mut stack = vec![(0_u32, 0_u32)];
         while let Some((a, b)) = stack.pop() {
@@ -145,7 +154,7 @@ impl Bvh {
                 (second, _) if a == b => stack.extend([(a + 1, a + 1), (second, second), (a + 1, second)]),
                 (0, second) => stack.extend([(a, b + 1), (a, second)]),
                 (second, 0) => stack.extend([(a + 1, b), (second, b)]),
-                // The larger one is opened.
+                // The larger node is opened first.
                 (second, _) if node_a.count >= node_b.count => stack.extend([(a + 1, b), (second, b)]),
                 (_, second) => stack.extend([(a, b + 1), (a, second)]),
             }
@@ -163,7 +172,7 @@ impl Node {
     }
 }
 
-/// Appends the tree over `numbers` (a part of the list that starts at `first`).
+/// Appends the tree over `numbers`, a part of the list that starts at `first`.
 fn build(
     nodes: &mut Vec<Node>,
     triangles: &[Triangle],
@@ -208,8 +217,10 @@ fn build(
     build(nodes, triangles, centers, right, first + half);
 }
 
-/// The closest point of a triangle and the part of it on which that lies, by the Voronoi regions of its features
-/// (Ericson, *Real-Time Collision Detection*, 5.1.5).
+/// Returns the closest point of a triangle and the feature on which it lies.
+///
+/// The method uses the Voronoi regions of the features (Ericson, *Real-Time Collision Detection*,
+/// 5.1.5).
 fn closest_on_triangle(p: Vector3<f64>, &[a, b, c]: &Triangle) -> (Vector3<f64>, Feature) {
     let (ab, ac, ap) = (b - a, c - a, p - a);
     let (d1, d2) = (ab.dot(&ap), ac.dot(&ap));
@@ -242,7 +253,8 @@ fn closest_on_triangle(p: Vector3<f64>, &[a, b, c]: &Triangle) -> (Vector3<f64>,
     (a + ab * (vb / sum) + ac * (vc / sum), Feature::Face)
 }
 
-/// Solid angle of a triangle seen from `p`, positive seen from behind (van Oosterom and Strackee 1983).
+/// Returns the solid angle of a triangle seen from `p`, positive from behind (van Oosterom and
+/// Strackee 1983).
 fn solid_angle(p: Vector3<f64>, t: &Triangle) -> f64 {
     let [a, b, c] = t.map(|v| v - p);
     let (la, lb, lc) = (a.norm(), b.norm(), c.norm());
@@ -260,7 +272,7 @@ mod tests {
         surface.triangles.iter().map(|t| t.map(|v| Vector3::from(surface.positions[v as usize]))).collect()
     }
 
-    /// Points in and around the unit ball.
+    /// Returns points in and around the unit ball.
     fn points() -> impl Iterator<Item = Vector3<f64>> {
         // The additive recurrence of the plastic number covers the box evenly.
         (1..400).map(|n| {
@@ -297,7 +309,7 @@ mod tests {
             if !(0.98..1.0).contains(&p.norm()) {
                 assert!((exact - inside).abs() < 1e-12, "{p:?}");
             }
-            // Barill et al. give a few per cent for dipoles.
+            // Barill et al. state an error of a few percent for dipoles.
             assert!((bvh.winding_number(p) - exact).abs() < 0.02, "{p:?}");
         }
     }
@@ -312,7 +324,7 @@ mod tests {
         pairs.sort_unstable();
         pairs.dedup();
         assert_eq!(pairs.len(), count);
-        // All neighbours are among them.
+        // The pairs must include all neighbors.
         assert!(triangles.iter().enumerate().all(|(i, t)| triangles[..i].iter().enumerate().all(
             |(j, u)| {
                 t.iter().all(|p| !u.contains(p)) || pairs.binary_search(&(j as u32, i as u32)).is_ok()

@@ -1,41 +1,41 @@
-//! What can be wrong with a mesh, a file or a request, each by name and with its place.
+//! Errors of meshes, files and requests, each with a name and a place.
 
 use std::path::PathBuf;
 
-/// Why a surface, a tetrahedral mesh, a description or a file was refused.
+/// Reason why a surface, a tetrahedral mesh, a description or a file was refused.
 #[derive(Debug, thiserror::Error)]
 #[non_exhaustive]
 pub enum MeshError {
     /// A file could not be read from disk.
     #[error("cannot read {path}: {source}")]
     Read {
-        /// The file.
+        /// Path of the file.
         path: PathBuf,
-        /// What the system said.
+        /// Error of the operating system.
         source: std::io::Error,
     },
-    /// A file could not be written; whatever stood under its name before is still there.
+    /// A file could not be written. An earlier file of the same name is still intact.
     #[error("cannot write {path}: {source}")]
     Write {
-        /// The file.
+        /// Path of the file.
         path: PathBuf,
-        /// What the system said.
+        /// Error of the operating system.
         source: std::io::Error,
     },
-    /// A file's extension names no format that is read or written here.
+    /// The extension of a file names no format that the crate reads or writes.
     #[error("{path}: the extension names no known format: expected {expected}")]
     UnknownFormat {
-        /// The file.
+        /// Path of the file.
         path: PathBuf,
-        /// The extensions that would do.
+        /// Accepted extensions.
         expected: &'static str,
     },
-    /// Something is wrong with the contents of a file.
+    /// The contents of a file are invalid.
     #[error("{path}: {source}")]
     InFile {
-        /// The file.
+        /// Path of the file.
         path: PathBuf,
-        /// What is wrong with it.
+        /// Error in the contents.
         source: Box<MeshError>,
     },
     /// The text or bytes do not follow the format.
@@ -43,117 +43,117 @@ pub enum MeshError {
     Parse {
         /// Name of the format.
         format: &'static str,
-        /// Where: a line or a byte offset.
+        /// Line or byte offset of the error.
         place: Place,
-        /// What the format asks for here.
+        /// Content that the format requires here.
         expected: String,
-        /// What stands there.
+        /// Content that was found instead.
         found: String,
     },
-    /// There are no elements of the kind that is needed.
+    /// There are no elements of the required kind.
     #[error("expected at least one {what}, found none")]
     Empty {
-        /// Kind of element, `"triangle"` say.
+        /// Kind of element, for example `"triangle"`.
         what: &'static str,
     },
     /// A coordinate is NaN or infinite.
     #[error("{what} {index}: expected finite coordinates, found {found:?}")]
     NotFinite {
-        /// Kind of element, `"node"` say.
+        /// Kind of element, for example `"node"`.
         what: &'static str,
-        /// Which one, counted from 0.
+        /// Index of the element, counted from 0.
         index: usize,
-        /// The coordinates.
+        /// Coordinates that were found.
         found: [f64; 3],
     },
-    /// An element refers to a node that is not there.
+    /// An element refers to a node that does not exist.
     #[error("{what} {element}: expected node indices below {count}, found {index}")]
     Index {
         /// Kind of element.
         what: &'static str,
-        /// Which element, counted from 0.
+        /// Index of the element, counted from 0.
         element: usize,
-        /// The index it holds.
+        /// Node index that was found.
         index: u64,
-        /// How many nodes there are.
+        /// Number of nodes.
         count: usize,
     },
-    /// Much of the surface has no inside on either side: it bounds no body.
+    /// Much of the surface has no inside on either side, so it bounds no body.
     #[error("surface that bounds no body: winding numbers find no inside along {:.0} % of its area: expected a closed surface or one with small holes", share * 100.0)]
     Undecided {
-        /// The share of the area, 0 to 1.
+        /// Fraction of the area without an inside, 0 to 1.
         share: f64,
     },
-    /// A tetrahedron has no volume, or is turned inside out.
+    /// A tetrahedron has no volume or is inside out.
     #[error(
         "tetrahedron {tet} with nodes {nodes:?} near {at:?}: expected a positive volume, found {volume:e} m^3"
     )]
     FlatTet {
-        /// Which tetrahedron, counted from 0.
+        /// Index of the tetrahedron, counted from 0.
         tet: usize,
-        /// Its nodes.
+        /// Node indices of the tetrahedron.
         nodes: [u32; 4],
-        /// Its signed volume in m^3.
+        /// Signed volume, m^3.
         volume: f64,
-        /// Its center in m.
+        /// Center of the tetrahedron, m.
         at: [f64; 3],
     },
     /// A triangle has no area.
     #[error("triangle {triangle} near {at:?}: expected a positive area, found {area:e} m^2")]
     FlatTriangle {
-        /// Which triangle, counted from 0.
+        /// Index of the triangle, counted from 0.
         triangle: usize,
-        /// Its area in m^2.
+        /// Area of the triangle, m^2.
         area: f64,
-        /// Its center in m.
+        /// Center of the triangle, m.
         at: [f64; 3],
     },
-    /// The surface has holes: edges with a triangle on one side only.
+    /// The surface has holes, which are edges with a triangle on one side only.
     #[error(
         "open surface: {edges} edges have a triangle on one side only, the first from {from:?} to {to:?}: expected a closed surface"
     )]
     Open {
-        /// How many such edges there are.
+        /// Number of such edges.
         edges: usize,
-        /// Start of the first one in m.
+        /// Start of the first such edge, m.
         from: [f64; 3],
-        /// End of the first one in m.
+        /// End of the first such edge, m.
         to: [f64; 3],
     },
-    /// More than two triangles meet in an edge.
+    /// More than two triangles meet at an edge.
     #[error("not a manifold: {triangles} triangles meet in the edge from {from:?} to {to:?}: expected 2")]
     NonManifoldEdge {
-        /// How many triangles.
+        /// Number of triangles at the edge.
         triangles: usize,
-        /// Start of the edge in m.
+        /// Start of the edge, m.
         from: [f64; 3],
-        /// End of the edge in m.
+        /// End of the edge, m.
         to: [f64; 3],
     },
-    /// Two neighbouring triangles are wound against each other.
+    /// Two neighboring triangles have opposite winding.
     #[error(
         "flipped faces: {edges} edges have triangles that are wound against each other, the first from {from:?} to {to:?}"
     )]
     Orientation {
-        /// How many such edges there are.
+        /// Number of such edges.
         edges: usize,
-        /// Start of the first one in m.
+        /// Start of the first such edge, m.
         from: [f64; 3],
-        /// End of the first one in m.
+        /// End of the first such edge, m.
         to: [f64; 3],
     },
-    /// The surface passes through itself.
+    /// The surface crosses itself.
     #[error(
         "self-crossing surface: {pairs} pairs of triangles cross, the first {first} and {second} near {at:?}"
     )]
     SelfCrossing {
-        /// How many pairs were found.
+        /// Number of crossing pairs.
         pairs: usize,
-        /// One triangle of the first pair, counted from 0.
+        /// Index of one triangle of the first pair, counted from 0.
         first: usize,
-        /// The other one.
+        /// Index of the other triangle of the first pair.
         second: usize,
-        /// Where, in m.
+        /// Position of the first crossing, m.
         at: [f64; 3],
     },
     /// No lattice gave the wanted number of tetrahedra.
@@ -161,17 +161,17 @@ pub enum MeshError {
         "number of tetrahedra: expected a mesh of {wanted} within 5 %, the nearest has {nearest}; ask for that or for more"
     )]
     TetCount {
-        /// The wanted number.
+        /// Wanted number of tetrahedra.
         wanted: usize,
-        /// The nearest number that was reached.
+        /// Nearest number that a lattice reached.
         nearest: usize,
     },
-    /// A mesh that was made here has angles that it should not have.
+    /// A mesh that this crate made has dihedral angles outside the guaranteed range.
     #[error("dihedral angles: expected {expected:?} degrees, found {found:?}")]
     Dihedral {
         /// Smallest and largest allowed angle, degrees.
         expected: [f64; 2],
-        /// Smallest and largest angle, degrees.
+        /// Smallest and largest angle that was found, degrees.
         found: [f64; 2],
     },
     /// A number in the description of a body is out of range.
@@ -179,9 +179,9 @@ pub enum MeshError {
     Part {
         /// Name of the part.
         part: String,
-        /// What would do.
+        /// Accepted range.
         expected: String,
-        /// What stands there.
+        /// Number that was found.
         found: f64,
     },
     /// A parameter is out of its range.
@@ -189,20 +189,20 @@ pub enum MeshError {
     Parameter {
         /// Name of the parameter.
         name: &'static str,
-        /// Its range.
+        /// Accepted range.
         expected: String,
-        /// What was given.
+        /// Value that was given.
         found: String,
     },
 }
 
-/// A place in a file.
+/// Place in a file.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 #[non_exhaustive]
 pub enum Place {
-    /// A line of text, counted from 1.
+    /// Line of text, counted from 1.
     Line(usize),
-    /// An offset in bytes from the start of the file.
+    /// Offset from the start of the file, bytes.
     Byte(usize),
 }
 

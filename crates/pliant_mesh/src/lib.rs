@@ -1,4 +1,5 @@
-//! Surfaces, signed distance fields and tetrahedra for Pliant: import, export, isosurface stuffing.
+//! Surfaces, signed distance fields and tetrahedra for Pliant: import, export and isosurface
+//! stuffing.
 //!
 //! ```
 //! use pliant_mesh::{StuffOptions, io, sdf::SurfaceDistance, shapes, stuff};
@@ -16,7 +17,7 @@
 //! # Ok::<(), pliant_mesh::MeshError>(())
 //! ```
 //!
-//! Lengths are in metres, coordinates are `f64`, indices are `u32` and count from 0.
+//! Lengths are in meters, coordinates are `f64`, and indices are `u32` and start at 0.
 #![cfg_attr(
     test,
     allow(clippy::unwrap_used, clippy::expect_used, clippy::panic, reason = "a failed test should panic")

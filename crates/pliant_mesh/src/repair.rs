@@ -1,4 +1,4 @@
-//! Dirty surfaces made into the boundary of a solid, where winding numbers decide what is inside.
+//! Repairs defective surfaces so that they bound a solid. Winding numbers decide what is inside.
 
 use std::{
     collections::{BTreeMap, HashMap},
@@ -9,31 +9,35 @@ use nalgebra::Vector3;
 
 use crate::{MeshError, Surface, bvh::Bvh, surface::Connected};
 
-/// Vertices closer than this share of the size become one.
+/// Distance, as a fraction of the size, within which vertices are merged.
 const WELD: f64 = 1e-7;
-/// Holes whose covers have more than this share of the surface's area are not holes but missing halves.
+/// Largest area of all hole covers, as a fraction of the surface's area. Larger openings are
+/// missing parts rather than holes.
 const MAX_COVERS: f64 = 0.1;
-/// So many of its triangles tell whether a part lies inside the others.
+/// Maximum number of triangles that are sampled to decide whether a part lies inside the others.
 const SAMPLES: usize = 100;
-/// At most this share of the area may bound nothing.
+/// Largest fraction of the area that may bound nothing.
 const MAX_UNDECIDED: f64 = 0.05;
 
-/// What [`Surface::repaired`] had to do.
+/// Changes that [`Surface::repaired`] made.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 #[non_exhaustive]
 pub struct Repair {
-    /// Vertices that were welded to others, texture seams and the corners of STL files among them.
+    /// Number of vertices that were welded to others. This includes texture seams and the corners
+    /// of STL files.
     pub welded_vertices: usize,
-    /// Triangles without area and second copies of triangles that were dropped.
+    /// Number of dropped triangles: those without area and second copies.
     pub dropped_triangles: usize,
-    /// Triangles that were turned around.
+    /// Number of triangles whose winding was reversed.
     pub turned_triangles: usize,
-    /// Holes that were covered.
+    /// Number of holes that were covered.
     pub covered_holes: usize,
 }
 
 impl fmt::Display for Repair {
-    /// What was done, in words: `8 vertices welded, 1 hole covered`; that parts cross, where there was nothing else.
+    /// Lists the changes in words, for example `8 vertices welded, 1 hole covered`.
+    ///
+    /// Without any change the text says that triangles cross each other.
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         let all = [
             (self.welded_vertices, "vertex", "vertices", "welded"),
@@ -54,14 +58,18 @@ impl fmt::Display for Repair {
 }
 
 impl Surface {
-    /// The surface as the boundary of a solid, mended: close vertices welded, triangles without area and copies
-    /// dropped, neighbours wound alike, parts that are inside out turned, holes covered from their rim to its middle.
-    /// Triangles may still cross each other: inside is where the winding number (Jacobson et al. 2013) is above 1/2, so
-    /// overlapping parts are one body. [`crate::sdf::SurfaceDistance::repaired`] goes by that.
+    /// Repairs the surface so that it bounds a solid.
+    ///
+    /// The repair welds close vertices, drops copies and triangles without area, gives neighbors
+    /// the same winding, turns parts that are inside out, and covers each hole from its rim to the
+    /// rim's center. Triangles may still cross each other. A point is inside where the winding
+    /// number (Jacobson et al. 2013) is above 1/2, so overlapping parts form one body.
+    /// [`crate::sdf::SurfaceDistance::repaired`] uses this rule.
     ///
     /// # Errors
-    /// What [`Surface::check`] says; [`MeshError::Empty`] if no triangle is left; [`MeshError::Open`] if the holes are
-    /// larger than a tenth of the surface; [`MeshError::Undecided`] if more than a twentieth of it bounds nothing.
+    /// Returns the errors of [`Surface::check`], [`MeshError::Empty`] if no triangle is left,
+    /// [`MeshError::Open`] if the holes are larger than a tenth of the surface, and
+    /// [`MeshError::Undecided`] if more than a twentieth of the surface bounds nothing.
     pub fn repaired(&self) -> Result<(Self, Repair), MeshError> {
         self.check()?;
         let mut repair = Repair::default();
@@ -93,7 +101,7 @@ impl Surface {
         Ok((surface, repair))
     }
 
-    /// Vertices within [`WELD`] of the size of each other become one, unused ones go.
+    /// Merges vertices within [`WELD`] times the size of each other and drops unused vertices.
     fn welded(&self) -> Self {
         let [low, high] = self.bounds().map(Vector3::from);
         let reach = (high - low).norm() * WELD;
@@ -108,7 +116,8 @@ impl Surface {
                 if vertex_of[v as usize] == u32::MAX {
                     let p = self.positions[v as usize];
                     let [x, y, z] = place(p);
-                    // The next places too: two close vertices may lie on either side of a border.
+                    // The search includes the neighboring cells, because two close vertices may lie
+                    // on either side of a cell border.
                     let near = (0..27)
                         .flat_map(|n| at.get(&[x + n % 3 - 1, y + n / 3 % 3 - 1, z + n / 9 - 1]))
                         .flatten();
@@ -128,7 +137,8 @@ impl Surface {
         welded
     }
 
-    /// Drops triangles without area, and of several with the same corners all but the first.
+    /// Drops triangles without area, and all but the first of several triangles with the same
+    /// corners.
     fn drop_useless(&mut self) {
         let mut seen = HashMap::new();
         let areas: Vec<bool> = self.corners().map(|c| crate::solid::has_area(&c)).collect();
@@ -142,7 +152,8 @@ impl Surface {
         });
     }
 
-    /// Triangles at each edge, with whether they run along it from its lower vertex.
+    /// Returns the triangles at each edge, with a flag for those that run along it from its lower
+    /// vertex.
     fn edges(&self) -> BTreeMap<[u32; 2], Vec<(u32, bool)>> {
         let mut edges: BTreeMap<[u32; 2], Vec<(u32, bool)>> = BTreeMap::new();
         for (t, &[a, b, c]) in (0..).zip(&self.triangles) {
@@ -153,7 +164,8 @@ impl Surface {
         edges
     }
 
-    /// Turns triangles until neighbours across an edge of two agree; in each piece as few as possible.
+    /// Turns triangles until neighbors across an edge of two triangles agree, as few as possible in
+    /// each piece. Returns the number of turned triangles.
     fn wind_alike(&mut self) -> usize {
         let mut neighbours = vec![Vec::new(); self.triangles.len()];
         for same in self.edges().values() {
@@ -162,7 +174,7 @@ impl Surface {
                 neighbours[b as usize].push((a as usize, x == y));
             }
         }
-        // Some(true): to be turned.
+        // Some(true) marks a triangle that is to be turned.
         let mut turn: Vec<Option<bool>> = vec![None; self.triangles.len()];
         for start in 0..self.triangles.len() {
             if turn[start].is_some() {
@@ -201,7 +213,8 @@ impl Surface {
         turned
     }
 
-    /// Closed ways along the edges that have more triangles running one way than the other, against the majority.
+    /// Returns closed paths along the edges where more triangles run one way than the other,
+    /// against the majority.
     fn rims(&self) -> Vec<Vec<u32>> {
         let mut next: BTreeMap<u32, Vec<u32>> = BTreeMap::new();
         for ([low, high], same) in self.edges() {
@@ -215,7 +228,7 @@ impl Surface {
             }
         }
         let mut rims = Vec::new();
-        // As many edges lead to a vertex as away from it, so every way comes back to its start.
+        // As many edges lead to a vertex as away from it, so every path returns to its start.
         while let Some((&start, _)) = next.first_key_value() {
             let mut way = vec![start];
             loop {
@@ -226,7 +239,7 @@ impl Surface {
                     next.remove(&at);
                 }
                 let Some(to) = to else { break };
-                // A way that meets itself has closed a rim.
+                // A path that meets itself has closed a rim.
                 if let Some(first) = way.iter().position(|&v| v == to) {
                     rims.push(way.split_off(first));
                     if first == 0 {
@@ -239,7 +252,7 @@ impl Surface {
         rims
     }
 
-    /// Triangles from a rim to the middle of its vertices.
+    /// Adds triangles from a rim to the center of its vertices.
     fn cover(&mut self, rim: &[u32]) {
         if let [a, b, c] = *rim {
             self.triangles.push([a, b, c]);
@@ -251,7 +264,8 @@ impl Surface {
         self.triangles.extend(rim.iter().zip(rim.iter().cycle().skip(1)).map(|(&a, &b)| [a, b, new]));
     }
 
-    /// Turns parts of negative volume that lie inside no other part: a hollow may face inwards, a body may not.
+    /// Turns parts of negative volume that lie inside no other part. A cavity may face inward, but
+    /// a body may not.
     fn turn_outwards(&mut self) -> usize {
         let mut parts = Connected::new(self.positions.len());
         for t in &self.triangles {
@@ -273,7 +287,8 @@ impl Surface {
                 let inside_another = || {
                     let own = of(**part);
                     let alone = Bvh::new(&own);
-                    // On its own triangles the part itself counts one half more or less, so it is taken out.
+                    // On its own triangles the part itself adds or removes one half, so its
+                    // contribution is subtracted.
                     let inside = |[a, b, c]: &[Vector3<f64>; 3]| {
                         let p = (a + b + c) / 3.0;
                         (all.winding_number(p) - alone.winding_number(p)).abs() > 0.5
@@ -287,7 +302,7 @@ impl Surface {
         self.turn_where(|t, _| wrong.contains(&part[t]))
     }
 
-    /// Which share of the area has no inside on either side.
+    /// Returns the fraction of the area that has no inside on either side.
     fn undecided(&self) -> f64 {
         let corners: Vec<[Vector3<f64>; 3]> = self.corners().collect();
         let bvh = Bvh::new(&corners);
@@ -341,7 +356,7 @@ mod tests {
     #[test]
     fn holes_flips_copies_and_loose_corners_are_mended() {
         let sound = ball(1.0, 0.0);
-        // Every triangle with corners of its own, a little off.
+        // Every triangle gets its own corners, which are slightly displaced.
         let mut dirty = Surface {
             positions: sound.triangles.iter().flatten().map(|&v| sound.positions[v as usize]).collect(),
             triangles: (0..sound.triangles.len() as u32).map(|t| [3 * t, 3 * t + 1, 3 * t + 2]).collect(),
@@ -393,7 +408,8 @@ mod tests {
                 assert_eq!(sdf.distance([x, 0.01, 0.02]) < 0.0, inside, "{x} {inside_out}");
             }
             let mesh = stuff(&sdf, &StuffOptions::with_target(4000), &mut |_| ()).unwrap();
-            // Two balls less the two caps of their lens (h from the plane of the common circle).
+            // The reference volume is that of two balls minus the two caps of their intersection (h
+            // from the plane of the common circle).
             let cap = |r: f64, h: f64| std::f64::consts::PI * h * h * (r - h / 3.0);
             let plane = (1.0 + 0.81 - 0.49) / 1.8;
             let ball = |r: f64| 4.0 / 3.0 * std::f64::consts::PI * r.powi(3);
@@ -416,7 +432,7 @@ mod tests {
         let positions = vec![[0.0, 0.0, 0.0], [1.0, 0.0, 0.0], [1.0, 1.0, 0.0], [0.0, 1.0, 0.0]];
         let sheet = Surface { positions, triangles: vec![[0, 1, 2], [0, 2, 3]], uvs: None };
         assert!(matches!(sheet.repaired(), Err(MeshError::Open { .. })));
-        // A book of sheets along one edge is balanced nowhere; a doubled sheet has no hole, and no inside either.
+        // A doubled sheet has no hole and no inside.
         let mut doubled = sheet.clone();
         doubled.triangles.extend([[1, 0, 3], [1, 3, 2]]);
         assert!(matches!(doubled.repaired(), Err(MeshError::Undecided { .. } | MeshError::Open { .. })));

@@ -1,24 +1,27 @@
-//! Structured meshes of simple bodies, six tetrahedra to a cell.
+//! Structured meshes of simple bodies, with six tetrahedra per cell.
 
 use nalgebra::Vector3;
 
 use crate::{MeshError, TetMesh};
 
-/// More cells than this are refused: 6e7 tetrahedra, about 1.5 GB of mesh.
+/// Largest number of cells: 6e7 tetrahedra, about 1.5 GB of mesh.
 const MAX_CELLS: u128 = 10_000_000;
 
-/// Half the edge of the cube that a ball's middle is mapped to, in radii: keeps the cells about equal in size and
-/// all dihedral angles of a ball between 30 and 112 degrees.
+/// Half the edge, in radii, of the cube that the center of a ball maps to.
+///
+/// The value keeps the cells about equal in size and all dihedral angles of a ball between 30 and
+/// 112 degrees.
 const SPHERE_CORE: f64 = 0.7;
 
-/// A rectangular bar with one corner at the origin and its edges along the axes: `cells` cells along x, y and z over
-/// `size` metres. `bar([20, 3, 3], ..)` has the 1,080 tetrahedra of the paper's bar.
+/// Makes a rectangular bar with one corner at the origin and its edges along the axes.
 ///
-/// Each cell is cut into Kuhn's six tetrahedra around its diagonal; all cells are cut alike.
+/// The bar has `cells` cells along x, y and z over `size` meters. `bar([20, 3, 3], ..)` has the
+/// 1,080 tetrahedra of the paper's bar. Each cell is divided into Kuhn's six tetrahedra around its
+/// diagonal, and all cells are divided alike.
 ///
 /// # Errors
-/// [`MeshError::Parameter`] when a count is 0, when there are more than ten million cells, or when a size is not
-/// positive and finite.
+/// Returns [`MeshError::Parameter`] when a count is 0, when there are more than ten million cells,
+/// or when a size is not positive and finite.
 pub fn bar(cells: [usize; 3], size: [f64; 3]) -> Result<TetMesh, MeshError> {
     for length in size {
         check_length("size", length)?;
@@ -26,22 +29,24 @@ pub fn bar(cells: [usize; 3], size: [f64; 3]) -> Result<TetMesh, MeshError> {
     grid(cells, |_, _| false, |t| [t[0] * size[0], t[1] * size[1], t[2] * size[2]])
 }
 
-/// A cube of edge `side` metres with one corner at the origin and `cells` cells to an edge.
+/// Makes a cube of edge `side` meters with one corner at the origin and `cells` cells along each
+/// edge.
 ///
 /// # Errors
-/// As [`bar`].
+/// Returns the errors of [`bar`].
 pub fn cube(cells: usize, side: f64) -> Result<TetMesh, MeshError> {
     bar([cells; 3], [side; 3])
 }
 
-/// A ball of `radius` metres around the origin: a cube of `cells` cells to an edge, each concentric cube of it pulled
-/// onto a sphere. Boundary nodes lie on the sphere to rounding.
+/// Makes a ball of `radius` meters around the origin.
 ///
-/// The cells are cut along diagonals that point away from the center, so that no tetrahedron has two of its faces
-/// on the sphere where an edge of the cube was (they would be nearly coplanar there).
+/// The ball is a cube of `cells` cells along each edge whose concentric cubes are mapped onto
+/// spheres. Boundary nodes lie on the sphere to rounding. The cells are divided along diagonals
+/// that point away from the center. No tetrahedron then has two faces on the sphere where an edge
+/// of the cube was (such faces would be nearly coplanar).
 ///
 /// # Errors
-/// As [`bar`].
+/// Returns the errors of [`bar`].
 pub fn sphere(cells: usize, radius: f64) -> Result<TetMesh, MeshError> {
     check_length("radius", radius)?;
     grid(
@@ -53,9 +58,11 @@ pub fn sphere(cells: usize, radius: f64) -> Result<TetMesh, MeshError> {
             if r == 0.0 {
                 return [0.0; 3];
             }
-            // Equal angles instead of equal lengths along the cube's faces: cells of like size on the sphere.
+            // Equal angles instead of equal lengths along the cube's faces give cells of similar
+            // size on the sphere.
             let on_sphere = (p / r).map(|x| (x * std::f64::consts::FRAC_PI_4).tan()).normalize();
-            // A cube in the middle, a sphere outside, and between them a smooth passage.
+            // The map is a cube at the center and a sphere at the surface, with a smooth transition
+            // between them.
             (radius * r * (r * on_sphere + (1.0 - r) * SPHERE_CORE * p / r)).into()
         },
     )
@@ -69,9 +76,12 @@ fn check_length(name: &'static str, length: f64) -> Result<(), MeshError> {
     }
 }
 
-/// Cells over the unit cube, cut into six tetrahedra each; `place` maps the unit cube to space and keeps orientation.
-/// Where `mirrored(axis, cell)` the diagonal of a cell runs against that axis; as it depends on one index only,
-/// neighbouring cells always agree on the diagonal of their common face.
+/// Divides the unit cube into cells of six tetrahedra each. `place` maps the unit cube to space and
+/// preserves orientation.
+///
+/// Where `mirrored(axis, cell)` is true, the diagonal of a cell runs against that axis. The flag
+/// depends on one index only, so neighboring cells always agree on the diagonal of their common
+/// face.
 fn grid(
     cells: [usize; 3],
     mirrored: impl Fn(usize, usize) -> bool,
@@ -98,7 +108,8 @@ fn grid(
         }
     }
 
-    // Orders in which a path along the cell's edges may take the three axes, and whether the order is odd.
+    // Each entry is an order in which a path along the cell's edges may take the three axes, and
+    // whether the order is odd.
     const PATHS: [([usize; 3], bool); 6] = [
         ([0, 1, 2], false),
         ([1, 2, 0], false),
@@ -146,7 +157,7 @@ mod tests {
         assert!((mesh.volume() - 0.24).abs() < 1e-13, "{}", mesh.volume());
         let (surface, nodes) = mesh.boundary();
         surface.check().unwrap();
-        // Two triangles to a cell's face.
+        // Each face of a cell has two triangles.
         assert_eq!(surface.triangles.len(), 2 * (4 * 20 * 3 + 2 * 3 * 3));
         assert_eq!(surface.euler_characteristic(), 2);
         assert!((surface.area() - 2.0 * (0.6 + 0.8 + 0.12)).abs() < 1e-12);

@@ -1,4 +1,4 @@
-//! Surfaces that bound a solid: closed, wound outwards, crossing themselves nowhere.
+//! Surfaces that bound a solid: closed, with outward winding and without self-crossings.
 
 use std::collections::HashMap;
 
@@ -6,19 +6,23 @@ use nalgebra::Vector3;
 
 use crate::{MeshError, Surface, bvh::Bvh};
 
-/// Below this share of its longest edge squared a triangle's area counts as nothing.
+/// Fraction of its longest edge squared below which a triangle's area counts as zero.
 const FLAT: f64 = 1e-12;
-/// Triangles must pass each other by this share of their size to count as crossing: less is rounding.
+/// Fraction of their size by which triangles must pass each other to count as crossing. Smaller
+/// overlaps are rounding errors.
 const CROSSING: f64 = 1e-10;
 
 impl Surface {
-    /// The surface as the boundary of a solid: vertices at the same position merged (texture seams, STL), unused ones and
-    /// texture coordinates left out, triangles outwards. Where several closed parts lie in each other, each must be
-    /// wound the right way round; a single part that is inside out is turned.
+    /// Returns the surface as the boundary of a solid.
+    ///
+    /// Vertices at the same position are merged (texture seams, STL). Unused vertices and texture
+    /// coordinates are left out, and triangles face outward. Where several closed parts lie inside
+    /// each other, each must have the right winding. A single part that is inside out is turned.
     ///
     /// # Errors
-    /// What [`Surface::check`] says; [`MeshError::FlatTriangle`], [`MeshError::Open`], [`MeshError::NonManifoldEdge`],
-    /// [`MeshError::Orientation`] or [`MeshError::SelfCrossing`], the last with the numbers that triangles have in `self`.
+    /// Returns the errors of [`Surface::check`], and [`MeshError::FlatTriangle`],
+    /// [`MeshError::Open`], [`MeshError::NonManifoldEdge`], [`MeshError::Orientation`] or
+    /// [`MeshError::SelfCrossing`]. The last error holds the triangle indices of `self`.
     pub fn closed(&self) -> Result<Self, MeshError> {
         self.check()?;
         let mut solid = self.merged();
@@ -33,14 +37,14 @@ impl Surface {
         Ok(solid)
     }
 
-    /// Vertices at the same position become one; the order of first use is kept.
+    /// Merges vertices at the same position and keeps the order of first use.
     pub(crate) fn merged(&self) -> Self {
         let mut vertex_at = HashMap::new();
         let mut merged = Self::default();
         for t in &self.triangles {
             merged.triangles.push(t.map(|v| {
                 let p = self.positions[v as usize];
-                // Adding 0 makes -0 and 0 the same.
+                // Adding 0 turns -0 into 0, so that both have the same bits.
                 *vertex_at.entry(p.map(|x| (x + 0.0).to_bits())).or_insert_with(|| {
                     merged.positions.push(p);
                     merged.positions.len() as u32 - 1
@@ -61,9 +65,10 @@ impl Surface {
         Ok(())
     }
 
-    /// Two triangles at each edge, wound alike.
+    /// Checks that each edge has two triangles with the same winding.
     pub(crate) fn check_edges(&self) -> Result<(), MeshError> {
-        // Each edge from its lower vertex, and whether its triangle runs along it that way.
+        // Each entry is an edge from its lower vertex and whether its triangle runs in this
+        // direction.
         let mut edges: Vec<([u32; 2], bool)> = self
             .triangles
             .iter()
@@ -120,14 +125,15 @@ impl Surface {
     }
 }
 
-/// Whether a triangle's area is finite and not negligible.
+/// Returns whether a triangle's area is finite and not negligible.
 pub(crate) fn has_area([a, b, c]: &[Vector3<f64>; 3]) -> bool {
     let area = 0.5 * (b - a).cross(&(c - a)).norm();
     let longest = (b - a).norm_squared().max((c - b).norm_squared()).max((a - c).norm_squared());
     area.is_finite() && area > FLAT * longest
 }
 
-/// Where an edge of triangle `a` passes through triangle `b`. Edges with a `shared` corner only touch it.
+/// Returns the point where an edge of triangle `a` passes through triangle `b`. Edges with a
+/// `shared` corner only touch `b`.
 fn crossing(a: &[Vector3<f64>; 3], shared: [bool; 3], b: &[Vector3<f64>; 3]) -> Option<Vector3<f64>> {
     let normal = (b[1] - b[0]).cross(&(b[2] - b[0]));
     for i in 0..3 {
@@ -136,7 +142,8 @@ fn crossing(a: &[Vector3<f64>; 3], shared: [bool; 3], b: &[Vector3<f64>; 3]) -> 
             continue;
         }
         let (p, q) = (a[i], a[j]);
-        // Six times the volumes of p and q with the triangle, and of the edge with each side of it.
+        // These values are six times the volumes of p and q with the triangle, and of the edge with
+        // each side of the triangle.
         let (height_p, height_q) = (normal.dot(&(p - b[0])), normal.dot(&(q - b[0])));
         let tolerance = CROSSING * normal.norm() * ((q - p).norm() + normal.norm().sqrt());
         if height_p.abs() <= tolerance || height_q.abs() <= tolerance || (height_p > 0.0) == (height_q > 0.0)
@@ -147,7 +154,8 @@ fn crossing(a: &[Vector3<f64>; 3], shared: [bool; 3], b: &[Vector3<f64>; 3]) -> 
             let (u, v) = (b[k] - p, b[(k + 1) % 3] - p);
             (q - p).dot(&u.cross(&v))
         });
-        // An edge that passes through an edge counts: meshes that mirror each other cross in such points only.
+        // An edge that passes through another edge counts, because meshes that mirror each other
+        // cross only in such points.
         if sides.iter().all(|&s| s > -tolerance) || sides.iter().all(|&s| s < tolerance) {
             return Some(p + (q - p) * (height_p / (height_p - height_q)));
         }
@@ -241,7 +249,7 @@ mod tests {
     #[test]
     fn a_spike_through_the_own_surface_is_a_crossing() {
         let mut spike = ball(6);
-        // One vertex of the right side is pulled out through the left side.
+        // One vertex of the right side is moved out through the left side.
         let top = (0..spike.positions.len())
             .max_by(|&a, &b| spike.positions[a][0].total_cmp(&spike.positions[b][0]));
         spike.positions[top.unwrap()] = [-0.8, 0.013, 0.017];

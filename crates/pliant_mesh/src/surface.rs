@@ -4,25 +4,28 @@ use nalgebra::Vector3;
 
 use crate::MeshError;
 
-/// Triangles in space: the skin of a body, or the shape that is to be filled with tetrahedra.
+/// Triangle surface: the skin of a body, or the shape to fill with tetrahedra.
 ///
-/// Triangles are counter-clockwise seen from outside. The fields are open; whoever is not sure that they are consistent
-/// calls [`Surface::check`] first: the other methods panic on a vertex index that is out of range.
+/// Triangles are counter-clockwise seen from outside. The fields are public, so they may be
+/// inconsistent. Call [`Surface::check`] first if in doubt: the other methods panic on a vertex
+/// index that is out of range.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct Surface {
-    /// Vertex positions in m.
+    /// Vertex positions, m.
     pub positions: Vec<[f64; 3]>,
-    /// Three vertex indices each.
+    /// Vertex indices of the triangles, three each.
     pub triangles: Vec<[u32; 3]>,
-    /// Texture coordinates, one per position, when the source had any.
+    /// Texture coordinates, one per position, if the source had any.
     pub uvs: Option<Vec<[f32; 2]>>,
 }
 
 impl Surface {
-    /// Finite coordinates, indices in range, one texture coordinate per position, at least one triangle.
+    /// Checks for finite coordinates, valid indices, one texture coordinate per position and at
+    /// least one triangle.
     ///
     /// # Errors
-    /// [`MeshError::Empty`], [`MeshError::NotFinite`], [`MeshError::Index`] or [`MeshError::Parameter`].
+    /// Returns [`MeshError::Empty`], [`MeshError::NotFinite`], [`MeshError::Index`] or
+    /// [`MeshError::Parameter`].
     pub fn check(&self) -> Result<(), MeshError> {
         check_positions("vertex", &self.positions)?;
         if self.triangles.is_empty() {
@@ -48,25 +51,30 @@ impl Surface {
         Ok(())
     }
 
-    /// Enclosed volume in m^3 by the divergence theorem; negative when the surface is inside out.
-    /// It means nothing when the surface is open.
+    /// Returns the enclosed volume by the divergence theorem, m^3.
+    ///
+    /// The volume is negative when the surface is inside out. It has no meaning when the surface is
+    /// open.
     pub fn volume(&self) -> f64 {
-        // Relative to a vertex of the surface, so that a far-away body loses no digits.
+        // Coordinates are relative to a vertex of the surface, so that a body far from the origin
+        // loses no digits.
         let origin = self.positions.first().copied().map_or_else(Vector3::zeros, Vector3::from);
         self.corners().map(|[a, b, c]| (a - origin).cross(&(b - origin)).dot(&(c - origin)) / 6.0).sum()
     }
 
-    /// Area in m^2.
+    /// Returns the area, m^2.
     pub fn area(&self) -> f64 {
         self.corners().map(|[a, b, c]| 0.5 * (b - a).cross(&(c - a)).norm()).sum()
     }
 
-    /// Lowest and highest corner of the box around the vertices, in m; zeros when there are none.
+    /// Returns the lowest and highest corner of the box around the vertices, m, or zeros when there
+    /// are no vertices.
     pub fn bounds(&self) -> [[f64; 3]; 2] {
         bounds(&self.positions)
     }
 
-    /// Vertices - edges + triangles of what the triangles use: 2 for anything like a sphere, 0 for a torus.
+    /// Returns vertices - edges + triangles of the used parts: 2 for a surface like a sphere, 0 for
+    /// a torus.
     pub fn euler_characteristic(&self) -> i64 {
         let mut edges: Vec<[u32; 2]> = self
             .triangles
@@ -82,7 +90,7 @@ impl Surface {
         vertices.len() as i64 - edges.len() as i64 + self.triangles.len() as i64
     }
 
-    /// How many pieces there are that have no vertex in common.
+    /// Returns the number of pieces that have no vertex in common.
     pub(crate) fn part_count(&self) -> usize {
         let mut parts = Connected::new(self.positions.len());
         for t in &self.triangles {
@@ -100,7 +108,7 @@ impl Surface {
     }
 }
 
-/// Which nodes hang together, as trees that point to a node of the part.
+/// Connected components of nodes, as trees that point to a representative node.
 pub(crate) struct Connected(Vec<u32>);
 
 impl Connected {
@@ -110,11 +118,11 @@ impl Connected {
 
     pub(crate) fn join(&mut self, a: u32, b: u32) {
         let (a, b) = (self.of(a), self.of(b));
-        // The lower number leads, so that the result depends on the mesh only.
+        // The lower index becomes the root, so that the result depends on the mesh only.
         self.0[a.max(b) as usize] = a.min(b);
     }
 
-    /// The node that stands for the part of `node`.
+    /// Returns the node that represents the component of `node`.
     pub(crate) fn of(&mut self, mut node: u32) -> u32 {
         while self.0[node as usize] != node {
             let above = self.0[node as usize];

@@ -7,22 +7,23 @@ use crate::{
     surface::{bounds, check_indices, check_positions},
 };
 
-/// Below this share of its longest edge cubed, six times a tetrahedron's volume counts as nothing.
+/// Fraction of its longest edge cubed below which six times a tetrahedron's volume counts as zero.
 const FLAT: f64 = 1e-12;
 
-/// Linear tetrahedra. Nodes a, b, c, d of each are positively oriented: (b - a) x (c - a) . (d - a) > 0.
+/// Mesh of linear tetrahedra.
 ///
-/// The fields are open; whoever is not sure that they are consistent calls [`TetMesh::check`] first: the other methods
-/// panic on a node index that is out of range.
+/// The nodes a, b, c, d of each tetrahedron are positively oriented: (b - a) x (c - a) . (d -
+/// a) > 0. The fields are public, so they may be inconsistent. Call [`TetMesh::check`] first if in
+/// doubt: the other methods panic on a node index that is out of range.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct TetMesh {
-    /// Node positions in m.
+    /// Node positions, m.
     pub nodes: Vec<[f64; 3]>,
-    /// Four node indices each.
+    /// Node indices of the tetrahedra, four each.
     pub tets: Vec<[u32; 4]>,
 }
 
-/// How well shaped the tetrahedra of a mesh are.
+/// Shape quality of the tetrahedra of a mesh.
 #[derive(Clone, Copy, Debug, PartialEq)]
 #[non_exhaustive]
 pub struct Quality {
@@ -37,10 +38,11 @@ pub struct Quality {
 }
 
 impl TetMesh {
-    /// Finite nodes, indices in range, at least one tetrahedron, each of positive volume.
+    /// Checks for finite nodes, valid indices, at least one tetrahedron and positive volumes.
     ///
     /// # Errors
-    /// [`MeshError::Empty`], [`MeshError::NotFinite`], [`MeshError::Index`] or [`MeshError::FlatTet`].
+    /// Returns [`MeshError::Empty`], [`MeshError::NotFinite`], [`MeshError::Index`] or
+    /// [`MeshError::FlatTet`].
     pub fn check(&self) -> Result<(), MeshError> {
         check_positions("node", &self.nodes)?;
         if self.tets.is_empty() {
@@ -50,7 +52,7 @@ impl TetMesh {
         for (tet, &nodes) in self.tets.iter().enumerate() {
             let corners = self.corners(nodes);
             let volume = signed_volume(corners);
-            // Asked this way round an overflow to infinity or NaN is refused too.
+            // This form of the comparison also refuses an overflow to infinity or NaN.
             let sound = volume.is_finite() && 6.0 * volume > FLAT * longest_edge(corners).powi(3);
             if !sound {
                 return Err(MeshError::FlatTet {
@@ -64,18 +66,21 @@ impl TetMesh {
         Ok(())
     }
 
-    /// Total volume in m^3.
+    /// Returns the total volume, m^3.
     pub fn volume(&self) -> f64 {
         self.tets.iter().map(|&t| signed_volume(self.corners(t))).sum()
     }
 
-    /// Lowest and highest corner of the box around the nodes, in m; zeros when there are none.
+    /// Returns the lowest and highest corner of the box around the nodes, m, or zeros when there
+    /// are no nodes.
     pub fn bounds(&self) -> [[f64; 3]; 2] {
         bounds(&self.nodes)
     }
 
-    /// The faces that belong to one tetrahedron only, counter-clockwise seen from outside, and for each vertex of
-    /// that surface the node it is. Vertices keep the order of the nodes.
+    /// Returns the surface of all faces that belong to one tetrahedron only, and the node of each
+    /// of its vertices.
+    ///
+    /// The faces are counter-clockwise seen from outside. The vertices keep the order of the nodes.
     pub fn boundary(&self) -> (Surface, Vec<u32>) {
         let mut faces: Vec<([u32; 3], [u32; 3])> = self
             .tets
@@ -105,7 +110,8 @@ impl TetMesh {
         (surface, nodes)
     }
 
-    /// Smallest and largest dihedral angle and volume over all tetrahedra; all NaN when there are none.
+    /// Returns the smallest and largest dihedral angle and volume over all tetrahedra. All values
+    /// are NaN when there are none.
     pub fn quality(&self) -> Quality {
         let mut quality = Quality {
             min_dihedral_deg: f64::NAN,
@@ -116,7 +122,8 @@ impl TetMesh {
         for &tet in &self.tets {
             let corners = self.corners(tet);
             for angle in dihedral_angles_deg(corners) {
-                // f64::min and max return the other operand when one is NaN.
+                // The NaN start values vanish, because f64::min and max return the other operand
+                // when one is NaN.
                 quality.min_dihedral_deg = quality.min_dihedral_deg.min(angle);
                 quality.max_dihedral_deg = quality.max_dihedral_deg.max(angle);
             }
@@ -127,7 +134,7 @@ impl TetMesh {
         quality
     }
 
-    /// Drops nodes that no tetrahedron uses; the others keep their order.
+    /// Drops nodes that no tetrahedron uses. The other nodes keep their order.
     pub fn drop_unused_nodes(&mut self) {
         let mut used = vec![false; self.nodes.len()];
         for &n in self.tets.iter().flatten() {
@@ -148,8 +155,9 @@ impl TetMesh {
         }
     }
 
-    /// Turns tetrahedra that are inside out by exchanging their last two nodes. Many writers of files do not keep
-    /// to one orientation.
+    /// Turns tetrahedra that are inside out by exchanging their last two nodes.
+    ///
+    /// Many file writers do not keep one orientation.
     pub fn orient(&mut self) {
         for tet in 0..self.tets.len() {
             if signed_volume(self.corners(self.tets[tet])) < 0.0 {
@@ -163,7 +171,7 @@ impl TetMesh {
     }
 }
 
-/// Signed volume in m^3: positive when (b - a) x (c - a) . (d - a) > 0.
+/// Returns the signed volume, m^3: positive when (b - a) x (c - a) . (d - a) > 0.
 pub(crate) fn signed_volume([a, b, c, d]: [Vector3<f64>; 4]) -> f64 {
     (b - a).cross(&(c - a)).dot(&(d - a)) / 6.0
 }
@@ -175,9 +183,10 @@ fn longest_edge(c: [Vector3<f64>; 4]) -> f64 {
         .fold(0.0, f64::max)
 }
 
-/// The six inner angles between the faces, degrees.
+/// Returns the six inner angles between the faces, degrees.
 pub(crate) fn dihedral_angles_deg(c: [Vector3<f64>; 4]) -> [f64; 6] {
-    // At the edge (i, j) the angle lies between the parts of the two other edges that are normal to it.
+    // The angle at edge (i, j) lies between the components of the two other edges that are normal
+    // to this edge.
     [(0, 1, 2, 3), (0, 2, 1, 3), (0, 3, 1, 2), (1, 2, 0, 3), (1, 3, 0, 2), (2, 3, 0, 1)].map(
         |(i, j, k, l)| {
             let edge = c[j] - c[i];

@@ -1,4 +1,5 @@
-//! Any bytes at all: no panic, no large allocation, and the session goes on or ends with a reason.
+//! Arbitrary bytes cause no panic and no large allocation. The session continues or ends with a
+//! reason.
 #![allow(clippy::unwrap_used, clippy::expect_used, clippy::panic, reason = "a failed test should panic")]
 
 mod support;
@@ -155,8 +156,8 @@ fn real() -> &'static Vec<Vec<u8>> {
 
 #[test]
 fn sessions_survive_a_hundred_thousand_damaged_datagrams() {
-    // Damage of what a real session says, so that most of it gets past the parser; both ways, all policies. The seed is
-    // the loop's counter.
+    // The test damages data of a real session, so that most of it passes the parser, in both
+    // directions and with all policies. The seed is the loop's counter.
     for name in RecoveryConfig::NAMES {
         let (mut host, mut guest, mut now) = session(name);
         let mut state = 88_172_645_463_325_252;
@@ -196,7 +197,7 @@ fn sessions_survive_a_hundred_thousand_damaged_datagrams() {
                 bytes[at] = next() as u8;
             }
             if bytes.len() > 3 {
-                // A sequence number that counts as new.
+                // Write a sequence number that counts as new.
                 let s = (next() as u16).to_le_bytes();
                 bytes[1] = s[0];
                 bytes[2] = s[1];
@@ -205,12 +206,12 @@ fn sessions_survive_a_hundred_thousand_damaged_datagrams() {
             host.on_datagram(now, PeerId(1), &bytes);
             finite(&guest);
         }
-        // Whatever a liar put in, a snapshot puts right.
+        // A snapshot corrects whatever the damaged data put in.
         assert!(!guest.is_closed(), "{name}");
     }
 }
 
-/// Real bytes of every kind that comes from outside.
+/// Valid bytes of every kind of external input.
 fn real_inputs() -> Vec<Vec<u8>> {
     let mut all: Vec<Vec<u8>> = samples().iter().map(|d| d.encode(3)).collect();
     let snapshot = SnapshotBytes {
@@ -286,15 +287,16 @@ fn real_inputs() -> Vec<Vec<u8>> {
     all
 }
 
-/// Every parser of the project that takes bytes from outside; how many of them could read these. What is read must be
-/// writable and readable again.
+/// Runs every parser of external bytes and returns how many could read `bytes`. A value that was
+/// read must be writable and readable again.
 fn parse_all(bytes: &[u8]) -> u32 {
     let mut read = 0;
     if let Ok((sequence, d)) = Datagram::decode(bytes) {
         read += 1;
         let again = Datagram::decode(&d.encode(sequence)).expect("what was read can be written");
         if !matches!(&d, Datagram::Frame(f) if f.pose.is_some()) {
-            // (A rotation is made a unit quaternion as it is read: its last bit may differ the second time.)
+            // (Reading normalizes a rotation to a unit quaternion, so its last bit may differ the
+            // second time.)
             assert_eq!(again, (sequence, d));
         }
     }
@@ -374,7 +376,8 @@ fn a_tick_of_the_near_future_costs_a_snapshot_and_no_more() {
         let q = &view.confirmed().unwrap().q;
         let truth = |k: usize| 0.01 * (0.002 * view.tick() as f64 + k as f64).sin();
         for (k, q) in q.iter().enumerate() {
-            // No reaction explains this shape: the force-driven receiver holds it by the load that it is told.
+            // No reaction explains this shape. The force-driven receiver holds it with the load
+            // that it received.
             assert!((q - truth(k)).abs() < 1e-3, "{name} mode {k}: {q} and {}", truth(k));
         }
     }
@@ -393,7 +396,7 @@ fn nack_flood_is_answered_within_bounds() {
     while host.poll_output().is_some() {
         answers += 1;
     }
-    // The budget is 4,000 ticks at once; all asked for in one moment.
+    // The budget is 4,000 ticks at once, and all requests arrive at one moment.
     assert!(answers <= 4000, "{answers} answers to ten million questions");
 }
 

@@ -1,4 +1,4 @@
-//! Clocks that differ by years: no session asks what time it is, only how much of it has passed.
+//! Clocks that differ by years. Sessions use only elapsed time, never absolute time.
 #![allow(clippy::unwrap_used, clippy::expect_used, clippy::panic, reason = "a failed test should panic")]
 
 mod support;
@@ -19,7 +19,9 @@ const GUEST: PeerId = PeerId(1);
 const YEAR: Duration = Duration::from_secs(365 * 86_400);
 const MS: Duration = Duration::from_millis(1);
 
-/// What a guest shows of each tick, and what was true, over the paper's first network, when the two clocks say such times at the beginning.
+/// Runs a session over the paper's first network with two clocks that begin at the given times.
+/// Returns the guest's visual coordinates per tick, the true coordinates per tick and the clock
+/// offset, s.
 fn visual(
     host_clock: Duration,
     guest_clock: Duration,
@@ -102,7 +104,8 @@ fn a_guest_and_a_host_whose_clocks_differ_by_years_see_the_same() {
         let (seen, _, offset) = visual(host, guest);
         let expected = host.as_secs_f64() - guest.as_secs_f64();
         assert!((offset - expected).abs() < 0.02, "{offset} s between the clocks, truly {expected}");
-        // Two seconds to find the clock and the hand; then every tick that is shown is right, as it is without the years.
+        // The guest needs two seconds to find the clock offset and the hand. After that every
+        // visual tick matches, as it does with equal clocks.
         let worst = |seen: &BTreeMap<u64, Vec<f64>>| {
             let late = seen.range(80..);
             late.map(|(tick, q)| q.iter().zip(&truth[tick]).map(|(a, b)| (a - b).abs()).fold(0.0, f64::max))

@@ -1,4 +1,4 @@
-//! The paper's compensation against direct integration.
+//! Tests the paper's compensation against direct integration.
 #![allow(clippy::unwrap_used, clippy::expect_used, clippy::panic, reason = "a failed test should panic")]
 
 use pliant_stream::codec::quantization::Quanta;
@@ -24,13 +24,14 @@ fn frame(tick: u64, a: &[f64]) -> Frame {
     }
 }
 
-/// Newmark pairs from the paper's to generalized-alpha's, and two odd ones.
+/// Newmark pairs (beta, gamma) from the paper's to generalized-alpha's, and two unusual ones.
 const PAIRS: [(f64, f64); 5] =
     [(0.25, 0.5), (4.0 / 9.0, 5.0 / 6.0), (1.0 / 6.0, 0.5), (0.3, 0.6), (0.0, 0.5)];
 
 #[test]
 fn equations_8_and_9_hold_to_rounding_for_any_newmark() {
-    // Integrate with and without a wrong acceleration at tick i; the difference at every later tick j is the identity's.
+    // Integrate with and without a wrong acceleration at tick i. At every later tick j the
+    // difference must match the identity.
     for (beta, gamma) in PAIRS {
         for h in [1.0 / 40.0, 1.0 / 1000.0] {
             let newmark = Newmark { h, beta, gamma };
@@ -66,7 +67,8 @@ fn equations_8_and_9_hold_to_rounding_for_any_newmark() {
 
 #[test]
 fn every_late_acceleration_takes_its_error_out_exactly() {
-    // The paper's three losses: 22 at random from 135, 12 in a row from 140, one in 50 from 135; each comes 50 ticks late.
+    // The paper's three loss patterns: 22 at random from 135, 12 in a row from 140, and one in 50
+    // from tick 135. Each acceleration arrives 50 ticks late.
     let random: Vec<u64> = (0..22).map(|k| 135 + (k * k * 7 + k * 13) % 500).collect();
     let burst: Vec<u64> = (140..152).collect();
     let every: Vec<u64> = (0..11).map(|k| 135 + 50 * k).collect();
@@ -110,7 +112,8 @@ fn every_late_acceleration_takes_its_error_out_exactly() {
 
 #[test]
 fn a_wrong_velocity_that_stays_drifts_linearly() {
-    // What the theorem says of an uncompensated loss: velocity error h da for ever, displacement growing by h^2 da a tick.
+    // The theorem for an uncompensated loss predicts a constant velocity error h da and a
+    // displacement error that grows by h^2 da per tick.
     let newmark = Newmark::average(0.025);
     let mut history = History::new(0);
     let mut receiver = AccelerationDriven::new(newmark, Predict::Zero, false, 1);
@@ -120,7 +123,7 @@ fn a_wrong_velocity_that_stays_drifts_linearly() {
         }
         receiver.advance(n, &history);
     }
-    // The truth had a = 2 at tick 20 only; the receiver had nothing.
+    // The true acceleration is 2 at tick 20 only. The receiver uses 0 throughout.
     let (mut q, mut v) = (0.0, 0.0);
     for n in 1..=120_u64 {
         let a = |n| if n == 20 { 2.0 } else { 0.0 };

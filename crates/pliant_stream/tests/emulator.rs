@@ -1,4 +1,4 @@
-//! The emulator against what its settings say.
+//! Checks that the network emulator matches its settings.
 #![allow(clippy::unwrap_used, clippy::expect_used, clippy::panic, reason = "a failed test should panic")]
 
 use std::time::Duration;
@@ -7,7 +7,8 @@ use pliant_stream::emulator::{Link, LinkConfig, Loss, Preset, Trace};
 
 const MS: Duration = Duration::from_millis(1);
 
-/// Sends `count` numbered packets `interval` apart and returns (number, arrival) of all that come.
+/// Sends `count` numbered packets `interval` apart and returns (number, arrival) of all that
+/// arrive.
 fn run(
     config: LinkConfig,
     seed: u64,
@@ -33,7 +34,8 @@ fn run(
 
 #[test]
 fn random_loss_is_what_it_says() {
-    // Binomial: 100,000 packets at 9 % have a standard deviation of 90.5; four of them are 0.36 %.
+    // Binomial: 100,000 packets at 9 % have a standard deviation of 90.5, and four of them are 0.36
+    // %.
     let (arrived, link) = run(LinkConfig::preset(Preset::Paper1), 1, 100_000, 25 * MS, 270);
     let loss = 1.0 - arrived.len() as f64 / 1e5;
     assert!((loss - 0.09).abs() < 0.0037, "{loss}");
@@ -67,8 +69,9 @@ fn scheduled_losses_hit_exactly_their_packets() {
 
 #[test]
 fn gilbert_loss_has_the_mean_and_the_bursts_of_the_reference() {
-    // REFERENCES.md: mean loss 9 %, mean burst 4 packets. In continuous time with exponential stays the packets of a bad
-    // stay of mean 4 intervals number 4 on average, stays without a packet counted: of those with one, 1/(1-e^(-1/4)) = 4.52.
+    // REFERENCES.md: mean loss 9 %, mean burst 4 packets. In continuous time with exponential
+    // stays, a bad stay with a mean of 4 intervals contains 4 packets on average, including stays
+    // without a packet. Stays with at least one packet contain 1/(1-e^(-1/4)) = 4.52 on average.
     let loss = Loss::gilbert(0.09, 4.0, 25 * MS);
     let (arrived, _) = run(LinkConfig { loss, ..Default::default() }, 11, 400_000, 25 * MS, 100);
     let mut bursts = Vec::new();
@@ -91,7 +94,7 @@ fn bandwidth_bounds_the_rate_and_the_queue() {
         overhead_bytes: 0,
         ..Default::default()
     };
-    // 1,000 bytes every ms are 8 Mb/s into 1 Mb/s: 8 ms each, one in eight passes.
+    // 1,000 bytes every ms are 8 Mb/s into 1 Mb/s. Each packet takes 8 ms, so one in eight passes.
     let (arrived, link) = run(config, 1, 1000, MS, 1000);
     for w in arrived.windows(2) {
         assert!(w[1].1 - w[0].1 >= 8 * MS);
@@ -186,7 +189,7 @@ fn words_for_losses_far_off_or_without_end_are_refused_or_say_what_is_done() {
     for far in ["random:1@18446744073709551615", "burst:3@18446744073709551615", "every:5@281474976710656"] {
         assert!(parse(far).is_err(), "{far}");
     }
-    // The last that may be, and shifted by more than there is.
+    // Use the largest allowed packet number and shift it beyond the range of the type.
     for last in ["random:500@281474976710655", "burst:3@281474976710655", "every:5@281474976710655"] {
         let loss = parse(last).unwrap();
         assert_eq!(loss.check(), Ok(()), "{last}");
@@ -196,7 +199,7 @@ fn words_for_losses_far_off_or_without_end_are_refused_or_say_what_is_done() {
     }
     let outage = Loss::Outage { from: MS, to: 2 * MS }.shifted(1, Duration::MAX);
     assert_eq!(outage, Loss::Outage { from: Duration::MAX, to: Duration::MAX });
-    // Everything is lost, however it is said: it used to be nothing.
+    // All packets are lost, in either notation.
     for words in ["gilbert:100%:4", "100%"] {
         let loss = parse(words).unwrap();
         assert_eq!(loss.check(), Ok(()), "{words}");

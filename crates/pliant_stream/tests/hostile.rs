@@ -1,4 +1,5 @@
-//! Others that lie and clocks that jump: memory stays bounded, sessions go on or end with a reason.
+//! Lying peers and jumping clocks. Memory stays bounded, and sessions continue or end with a
+//! reason.
 #![allow(clippy::unwrap_used, clippy::expect_used, clippy::panic, reason = "a failed test should panic")]
 
 mod support;
@@ -16,7 +17,8 @@ use support::direct::{BODY, pass, peers, publish, random, session};
 
 #[test]
 fn a_host_cannot_make_a_guest_hold_more_than_its_bound() {
-    // The real thing, on a small scale: one model fits, the same beside another download does not.
+    // A small-scale version of the real limit: one model fits, and a second download beside it does
+    // not.
     let model = bar(12, 0.05);
     let size = model.to_bytes().len() as u64;
     let info = |body: u16, hash: [u8; 32]| BodyInfo {
@@ -45,7 +47,8 @@ fn a_host_cannot_make_a_guest_hold_more_than_its_bound() {
             users,
         };
         guest.on_message(now, &welcome.encode());
-        // A whole model, then the first bytes of one that says to be as large: it counts as what it will be.
+        // Send a whole model, then the first bytes of a second model that claims the same size. A
+        // download counts with its claimed size.
         let hash = model.hash().0;
         guest.on_message(now, &HostMessage::BodyAdded(info(1, hash)).encode());
         guest.on_message(now, &HostMessage::BodyAdded(info(2, [9; 32])).encode());
@@ -123,7 +126,7 @@ fn peers_survive_a_hundred_thousand_damaged_datagrams() {
     }
     println!("{taken} of 100,000 damaged datagrams could be read");
     assert!(taken > 20_000, "{taken}");
-    // Once nobody damages anything any more, all agree again.
+    // After the damage ends, all peers agree again.
     for _ in 0..400 {
         now += Duration::from_millis(25);
         pass(&mut all, now, |_, _, _| {});
@@ -137,14 +140,16 @@ fn peers_survive_a_hundred_thousand_damaged_datagrams() {
     }
 }
 
-/// What the two clocks show when the true time is `t`, and whether a side hears before it looks at its clock.
+/// The times that both clocks show in addition to the true time, and the order in which a side
+/// receives data and reads its clock.
 struct Jump {
     host: Duration,
     guest: Duration,
     hears_first: bool,
 }
 
-/// Ten seconds of a session whose clocks jump after five of them; how the guest's session ended, if it did.
+/// Runs ten seconds of a session whose clocks jump after five seconds. Returns the reason with
+/// which the guest's session ended, if it ended.
 fn through(jump: &Jump) -> (Option<DisconnectReason>, HostSession, GuestSession, u64) {
     let (mut host, mut guest, start) = session("default");
     while guest.poll_event().is_some() {}
@@ -175,7 +180,8 @@ fn through(jump: &Jump) -> (Option<DisconnectReason>, HostSession, GuestSession,
             guest.set_target(grab, [1.0, 0.001 * f64::from(k), 0.0]).unwrap();
         }
         if jump.hears_first {
-            // The network's task was awake in between: both have just heard of each other, on the new clock.
+            // The network task ran in between, so both sides have just received data on the new
+            // clock.
             if k == 201 {
                 host.on_message(host_now, PeerId(1), &GuestMessage::SnapshotRequest { body: 1 }.encode());
             }
@@ -199,7 +205,7 @@ fn through(jump: &Jump) -> (Option<DisconnectReason>, HostSession, GuestSession,
 fn clocks_that_jump_an_hour_are_followed_or_end_the_session_with_a_reason() {
     let hour = Duration::from_secs(3600);
     for (host_jumps, guest_jumps) in [(hour, Duration::ZERO), (Duration::ZERO, hour), (hour, hour)] {
-        // (The stamps of the clock exchange jump with the host's and the guest's clocks.)
+        // (The time stamps of the clock exchange jump with the clocks of the host and the guest.)
         let jump = Jump { host: host_jumps, guest: guest_jumps, hears_first: true };
         let (ended, host, guest, tick) = through(&jump);
         assert_eq!(ended, None, "{host_jumps:?} {guest_jumps:?}");
@@ -209,7 +215,7 @@ fn clocks_that_jump_an_hour_are_followed_or_end_the_session_with_a_reason() {
         let off = guest.clock_offset().unwrap() - (host_jumps.as_secs_f64() - guest_jumps.as_secs_f64());
         assert!(off.abs() < 0.1, "the clocks' offset is known again: {off} s off");
         assert!(guest.stats().round_trip < Duration::from_secs(1), "{:?}", guest.stats().round_trip);
-        // Who looks at its clock first has heard nothing for an hour, and says so.
+        // A side that reads its clock first has received nothing for an hour and ends the session.
         let jump = Jump { hears_first: false, ..jump };
         let (ended, ..) = through(&jump);
         assert_eq!(ended, Some(DisconnectReason::Silent), "{host_jumps:?} {guest_jumps:?}");
@@ -225,14 +231,15 @@ fn a_peer_whose_clock_jumps_an_hour_comes_back_or_says_why_not() {
         now += Duration::from_millis(25);
         pass(&mut all, now, |_, _, _| {});
     }
-    // All clocks jump; nobody has heard anything for an hour. Each says that the others are silent.
+    // All clocks jump, so no peer has received anything for an hour. Each peer reports that the
+    // others are silent.
     now += hour;
     pass(&mut all, now, |_, _, _| {});
     for (k, p) in all.iter_mut().enumerate() {
         let left = std::iter::from_fn(|| p.poll_event())
             .filter(|e| matches!(e, PeerEvent::Left { reason: DisconnectReason::Silent, .. }))
             .count();
-        // (The first looks first; what it sends is heard by the others before they look.)
+        // (The first peer updates first. The others receive what it sends before they update.)
         assert!(left == 2 || k > 0, "peer {}: {left}", k + 1);
         assert!(p.tick() < 120, "no hour of ticks is caught up with: {}", p.tick());
     }

@@ -1,4 +1,4 @@
-//! What a guest does not look at is not sent, and who comes back is who they were.
+//! Bodies that a guest does not look at are not sent. A guest that reconnects gets its old number.
 #![allow(clippy::unwrap_used, clippy::expect_used, clippy::panic, reason = "a failed test should panic")]
 
 mod support;
@@ -15,7 +15,7 @@ use support::bar;
 const BODY: BodyId = BodyId(9);
 const TICK: Duration = Duration::from_millis(25);
 
-/// A host and guests that hear each other at once, and everything.
+/// A host and guests that receive everything at once.
 struct Room {
     host: HostSession,
     guests: Vec<(PeerId, GuestSession)>,
@@ -61,7 +61,7 @@ impl Room {
         }
     }
 
-    /// A tick of a body of which every mode moves.
+    /// Publishes a tick of a body in which every mode moves.
     fn step(&mut self) {
         self.now += TICK;
         self.tick += 1;
@@ -104,14 +104,14 @@ fn a_body_that_is_not_looked_at_costs_nothing_and_comes_back_whole() {
     (0..40).for_each(|_| room.step());
     assert!(room.guests.iter().all(|(_, g)| g.body(BODY).unwrap().is_ready()));
 
-    // Away: besides the answers to its clock, nothing comes; the other gets every tick.
+    // Away: only answers to the guest's clock requests arrive. The other guest gets every tick.
     assert!(room.host.set_interest(looks_away, BODY, Some(0)));
     let before = [room.datagrams(0), room.datagrams(1)];
     (0..80).for_each(|_| room.step());
     let (other, away) = (room.datagrams(0) - before[0], room.datagrams(1) - before[1]);
     assert!(other >= 80 && away <= 8, "{other} datagrams for who looks, {away} for who looks away");
 
-    // Far off: three modes are enough.
+    // Far away: three modes are enough.
     assert!(room.host.set_interest(looks_away, BODY, Some(3)));
     (0..40).for_each(|_| room.step());
     let state = |room: &Room, guest: usize| {
@@ -120,7 +120,7 @@ fn a_body_that_is_not_looked_at_costs_nothing_and_comes_back_whole() {
     };
     assert_eq!(state(&room, 1).1.modes(), 3);
 
-    // Near again: the whole shape, as the other has it.
+    // Near again: the guest has the whole shape, as the other guest has.
     assert!(room.host.set_interest(looks_away, BODY, None));
     (0..40).for_each(|_| room.step());
     let ((tick, full), (other_tick, back)) = (state(&room, 0), state(&room, 1));
@@ -143,7 +143,8 @@ fn a_frame_is_encoded_once_for_all_who_take_the_same_and_one_more_costs_its_data
         (room.host.encoded() - before.0, room.host.stats(PeerId(1)).unwrap().bytes_out - before.1)
     };
     assert_eq!(run(&mut room).0, 80, "two guests, one frame a tick");
-    // Thirty who only watch: not one frame more is encoded, and each is sent what the first is sent.
+    // Thirty more guests only watch. The host encodes no additional frame, and each guest gets the
+    // same bytes as the first guest.
     (3..=32).for_each(|peer| room.join(PeerId(peer), &model));
     (0..40).for_each(|_| room.step());
     let (encoded, first) = run(&mut room);
@@ -152,11 +153,11 @@ fn a_frame_is_encoded_once_for_all_who_take_the_same_and_one_more_costs_its_data
     (0..80).for_each(|_| room.step());
     let watcher = room.host.stats(PeerId(20)).unwrap().bytes_out - watcher;
     assert!(watcher.abs_diff(first) < first / 20, "{watcher} bytes for who watches, {first} for the first");
-    // One who takes fewer modes is one kind more.
+    // A guest with fewer modes needs one more encoder.
     assert!(room.host.set_interest(PeerId(7), BODY, Some(3)));
     (0..3).for_each(|_| room.step());
     assert_eq!(run(&mut room).0, 160);
-    // Ten more of that kind are none.
+    // Ten more guests with the same number of modes need no further encoder.
     (8..18).for_each(|peer| assert!(room.host.set_interest(PeerId(peer), BODY, Some(3))));
     (0..3).for_each(|_| room.step());
     assert_eq!(run(&mut room).0, 160);
@@ -178,7 +179,7 @@ fn who_comes_back_gets_the_number_they_had_if_it_is_free() {
     assert_eq!(ask(&mut room, PeerId(2), None), UserId(2));
     room.host.disconnect(PeerId(1), pliant_stream::DisconnectReason::Lost);
     assert_eq!(ask(&mut room, PeerId(3), Some(UserId(1))), UserId(1));
-    // In use, or the host's: another one.
+    // A number that is in use or belongs to the host gives another number.
     assert_eq!(ask(&mut room, PeerId(4), Some(UserId(2))), UserId(3));
     assert_eq!(ask(&mut room, PeerId(5), Some(UserId::HOST)), UserId(4));
 }
@@ -197,10 +198,10 @@ fn guests_that_want_all_kinds_of_numbers_of_modes_share_few_encoders() {
     let before = room.host.encoded();
     (0..40).for_each(|_| room.step());
     let kinds = (room.host.encoded() - before) / 40;
-    // Two for each doubling: 1, 2, 3, 4, 6, 8 and so on up to all.
+    // The host uses two encoders per doubling: 1, 2, 3, 4, 6, 8 modes and so on up to all.
     let most = 2 * u64::from(all.ilog2()) + 2;
     assert!(kinds <= most && kinds >= 3, "{kinds} encoders for {all} modes");
-    // Nobody gets less than asked for.
+    // No guest gets fewer modes than it asked for.
     for (peer, guest) in &room.guests {
         let modes = guest.body(BODY).unwrap().visual().unwrap().modes() as u64;
         assert!(modes > peer.0 % u64::from(all), "{modes} modes for guest {}", peer.0);
@@ -215,7 +216,8 @@ fn grabs_are_begun_no_faster_than_hands_can() {
     (0..40).for_each(|_| room.step());
     let mut begun = 0;
     let mut refused = 0;
-    // Each with a patch of its own, as fast as messages are taken: 100 a second, half of them to begin, for four seconds.
+    // Each grab has a patch of its own. The guest sends messages as fast as the host takes them:
+    // 100 a second, half of them to begin a grab, for four seconds.
     for k in 0..400_u32 {
         let now = room.now;
         let radius = 0.05 + 1e-5 * f64::from(k);
@@ -236,6 +238,6 @@ fn grabs_are_begun_no_faster_than_hands_can() {
             break;
         }
     }
-    // 120 at once and 60 a second, whatever was said.
+    // The limit is 120 grabs at once and 60 a second, whatever the guest sends.
     assert!((120..=125 + 60 * 2).contains(&begun), "{begun} begun, {refused} refused");
 }

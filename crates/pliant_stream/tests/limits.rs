@@ -1,4 +1,5 @@
-//! No datagram is longer than the path carries, whatever the modes, the hands and the policy; and the bits go where they are seen.
+//! No datagram exceeds the size limit of the path, for any number of modes and hands and any
+//! policy. Rounding errors are equal on the surface.
 #![allow(clippy::unwrap_used, clippy::expect_used, clippy::panic, reason = "a failed test should panic")]
 
 mod support;
@@ -48,7 +49,7 @@ fn no_frame_is_longer_than_the_path_carries_and_none_of_its_hands_is_lost() {
                 let v: Vec<f64> = (0..500).map(|k| 0.3 * (t * (1.0 + k as f64) + 0.7).cos()).collect();
                 let a: Vec<f64> =
                     (0..500).map(|k| -0.3 * (1.0 + k as f64) * (t * (1.0 + k as f64) + 0.7).sin()).collect();
-                // From no hands to as many as there may be, and back at once.
+                // The number of hands goes from none to the maximum and jumps back to none.
                 let grabs = hands((tick * 13 % 65) as u16);
                 let pose = (tick % 3 == 0).then(|| Pose { position: [1.0, 2.0, 3.0], ..Pose::default() });
                 let state =
@@ -74,7 +75,7 @@ fn no_frame_is_longer_than_the_path_carries_and_none_of_its_hands_is_lost() {
                 let known = history.known(tick).expect("all parts are here");
                 assert_eq!(known.grabs.len(), grabs.len(), "{name} at {limit}, tick {tick}");
                 assert_eq!(known.pose.is_some(), pose.is_some());
-                // Sent again, each part fits too.
+                // Each part that is sent again fits too.
                 assert!(encoder.resend(tick).all(|body| body.len() + 3 <= limit));
                 assert_eq!(encoder.resend(tick).count(), 1 + encoded.more.len());
             }
@@ -105,7 +106,7 @@ fn a_tick_whose_part_is_missing_is_not_known() {
         history.take(&frame, &quanta, |_, _| {});
         history.known(2).map(|d| d.grabs.len())
     };
-    // In any order, and some of them twice.
+    // Parts may arrive in any order, and some arrive twice.
     for body in all[1..].iter().rev().chain(&all[1..]) {
         assert_eq!(take(body), None);
     }
@@ -130,7 +131,7 @@ fn a_step_moves_the_surface_alike_in_every_mode() {
             |v: u32| (0..3).map(|x| f64::from(model.displacement_row(v, x, mode)).powi(2)).sum::<f64>();
         (0..model.surface().positions().len() as u32).map(size).fold(0.0, f64::max).sqrt()
     };
-    // The most visible mode is the first; the unit is a 16,384th of what it shows.
+    // The first mode is the most visible. The unit is a 16,384th of its displacement.
     let unit = 0.21 * visible(0) / 16_384.0;
     let (mut seen, mut widths) = (std::collections::BTreeSet::new(), Vec::new());
     for tick in 2..60 {

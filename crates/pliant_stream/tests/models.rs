@@ -1,4 +1,5 @@
-//! Models on their way to many guests at once: one rate for all, in fair turns, and no more than the line takes.
+//! Models sent to many guests at once: one rate for all, in fair turns, within each connection's
+//! capacity.
 #![allow(clippy::unwrap_used, clippy::expect_used, clippy::panic, reason = "a failed test should panic")]
 
 mod support;
@@ -17,7 +18,7 @@ const BODY: BodyId = BodyId(9);
 const GUESTS: u64 = 256;
 const FRAME: Duration = Duration::from_micros(16_667);
 
-/// The first words of a guest that has nothing.
+/// The first messages of a guest that has no model.
 fn hello() -> Vec<Vec<u8>> {
     let mut guest = GuestSession::new(GuestConfig::default(), 1200).unwrap();
     guest.connect(Duration::ZERO).unwrap();
@@ -30,7 +31,7 @@ fn hello() -> Vec<Vec<u8>> {
 fn host(config: HostConfig, guests: u64) -> (HostSession, u64) {
     let model = bar(40, 0.05);
     let bytes = model.to_bytes().len() as u64;
-    // They say nothing more while they wait, and are not let go for it.
+    // The guests send nothing while they wait, and the host must not disconnect them for it.
     let idle_timeout = Duration::from_secs(1000);
     let mut host = HostSession::new(HostConfig { idle_timeout, ..config }).unwrap();
     host.add_body(BodyId(1), "bar", model, StepSettings::default()).unwrap();
@@ -57,7 +58,8 @@ fn two_hundred_and_fifty_six_fetch_at_once_at_one_rate_and_in_turns() {
                 *got.entry(output.peer).or_default() += output.bytes.len() as u64;
             }
         }
-        // Never more than the rate and one burst of a tenth of a second; a guest's other messages are 20 kB with all who came.
+        // At most the rate plus one burst of a tenth of a second. A guest's other messages take 20
+        // kB, including the notices about all guests that joined.
         let sent: u64 = got.values().sum();
         let most = 2e6 * (now.as_secs_f64() + 0.1) + GUESTS as f64 * 20e3;
         assert!((sent as f64) < most, "{sent} bytes after {now:?}");
@@ -67,7 +69,7 @@ fn two_hundred_and_fifty_six_fetch_at_once_at_one_rate_and_in_turns() {
         }
         now += FRAME;
     }
-    // Whoever came first is at most one piece of 16 KiB and its other messages ahead.
+    // The first guest is ahead by at most one piece of 16 KiB and its other messages.
     assert!(widest < 16 * 1024 + 25_000, "one is {widest} bytes ahead of another");
     let ideal = (GUESTS * bytes) as f64 / 2e6;
     let took = now.as_secs_f64();
@@ -86,7 +88,7 @@ fn one_alone_has_its_own_rate_and_not_that_of_all() {
         while host.poll_output().is_some() {}
         now = wakes;
     }
-    // 64 KiB go at once.
+    // The host sends 64 KiB at once.
     let ideal = (bytes as f64 - 65_536.0) / 100e3;
     assert!((now.as_secs_f64() - ideal).abs() < 0.02 * ideal + 0.02, "{now:?} for {ideal} s");
 }
@@ -114,7 +116,7 @@ fn what_a_line_does_not_take_is_not_handed_over_and_holds_up_nobody_else() {
         if !host.fetching().any(|peer| peer == fast) {
             until_fast.get_or_insert(now);
         }
-        // 50 kB/s where the host would send 1 MB/s.
+        // The connection takes 50 kB/s where the host would send 1 MB/s.
         unsent = (unsent - 50e3 * FRAME.as_secs_f64()).max(0.0);
         now += FRAME;
     }
@@ -184,12 +186,12 @@ fn a_model_may_be_read_by_the_caller_and_another_one_ends_the_session() {
                     _ => {}
                 }
             }
-            // It takes its time, while frames come.
+            // The caller reads the model 20 ticks later, while frames arrive.
             if let Some((_, hash, bytes)) = came.take_if(|(at, ..)| *at + 20 < k) {
                 assert!(!ready, "without its model");
                 let read = ModalModel::from_bytes(&bytes).unwrap();
                 assert_eq!(read.hash(), model.hash());
-                // One that nobody has asked for changes nothing.
+                // A model that the guest did not request changes nothing.
                 guest.give_model([7; 32], Some(bar(4, 0.05)));
                 guest.give_model(hash, Some(if right { read.into() } else { bar(4, 0.05) }));
             }

@@ -1,4 +1,5 @@
-//! Three equal peers over bad paths: one shape, own hands at once, everything put right.
+//! Three equal peers over bad paths: they agree on one shape, apply their own hands at once and
+//! correct all errors.
 #![allow(clippy::unwrap_used, clippy::expect_used, clippy::panic, reason = "a failed test should panic")]
 
 mod support;
@@ -21,17 +22,17 @@ const BODY: BodyId = BodyId(1);
 const S: Duration = Duration::from_secs(1);
 const MS: Duration = Duration::from_millis(1);
 
-/// Peer `k` has number `k + 1`, and is `PeerId(k)` to the others.
+/// Peer `k` has user number `k + 1`, and the others know it as `PeerId(k)`.
 struct Mesh {
     peers: Vec<Option<PeerSession>>,
-    /// `[from][to]`: datagrams and messages.
+    /// `[from][to]`: the link for datagrams and the link for messages.
     links: Vec<Vec<(Link, Link)>>,
     events: Vec<(usize, PeerEvent)>,
     now: Duration,
-    /// What each one's clock said when the others' began.
+    /// Time of each peer's clock at the test's time zero.
     began: Vec<Duration>,
     grabs: Vec<Option<u16>>,
-    /// Peer, tick, shown.
+    /// Peer, tick and visual coordinates.
     seen: Vec<(usize, u64, Vec<f64>)>,
     model: Arc<ModalModel>,
     settings: StepSettings,
@@ -132,7 +133,7 @@ impl Mesh {
                     link.send(self.now, o.bytes.to_vec(), o.bytes.len());
                 }
             }
-            // Frames of a picture: peers look at their sessions every 5 ms.
+            // Peers update their sessions every 5 ms, as with rendered frames.
             self.now += 5 * MS;
         }
     }
@@ -145,12 +146,13 @@ impl Mesh {
         x.q.iter().zip(&y.q).map(|(a, b)| (a - b).powi(2)).sum::<f64>().sqrt() / size
     }
 
-    /// Shown against what peer 0 came to agree on for the same tick, relative to the largest: root mean square.
+    /// Root mean square difference between the visual coordinates and those that peer 0 confirmed
+    /// for the same tick, relative to the largest confirmed shape.
     fn shown_error(&self, settled: &[(u64, Vec<f64>)]) -> f64 {
         let size =
             settled.iter().map(|(_, q)| q.iter().map(|x| x * x).sum::<f64>().sqrt()).fold(0.0, f64::max);
         let (mut sum, mut count) = (0.0, 0);
-        // After the first five seconds: that somebody takes hold is forecast by nobody.
+        // Skip the first five seconds, because no forecast predicts the start of a grab.
         for (_, tick, q) in self.seen.iter().filter(|s| s.1 > 200) {
             if let Some((_, truth)) = settled.iter().find(|s| s.0 == *tick) {
                 sum += q.iter().zip(truth).map(|(a, b)| (a - b).powi(2)).sum::<f64>();
@@ -230,7 +232,8 @@ fn free_and_relaxing_bodies_agree_to_the_bit_and_late_joiners_with_them() {
         mesh.start(2, Repair::Rollback, false);
         mesh.run(14 * S);
         assert_eq!(mesh.agree(0, 1), 0.0, "free {free}, {settings:?}");
-        // The orientation is normalised as it arrives: the last bit of what follows from it may differ.
+        // The received orientation is normalized, so the last bit of the dependent values may
+        // differ.
         assert!(mesh.agree(0, 2) < 1e-9, "free {free}, {settings:?}: {}", mesh.agree(0, 2));
         let all: Vec<&PeerSession> = mesh.peers.iter().flatten().collect();
         let tick = all.iter().map(|p| p.confirmed()).min().unwrap();
@@ -248,7 +251,8 @@ fn free_and_relaxing_bodies_agree_to_the_bit_and_late_joiners_with_them() {
             let moved = (0..3).map(|k| pose.position[k].powi(2)).sum::<f64>().sqrt();
             assert!(moved > 0.01, "the hands must have moved the frame: {moved} m");
         }
-        // (The first seconds of a joiner may need one more state, which it then asks the lowest number for.)
+        // (In its first seconds a joining peer may need one more state, which it requests from the
+        // peer with the lowest number.)
         let resynced = |e: &(usize, PeerEvent)| matches!(e.1, PeerEvent::Resynced { .. });
         assert!(mesh.events.iter().filter(|e| e.0 == 2 && resynced(e)).count() <= 1, "{:?}", mesh.events);
         let resynced = |e: &(usize, PeerEvent)| e.0 < 2 && resynced(e);
@@ -297,7 +301,7 @@ fn compensation_puts_the_history_right_with_the_state_of_now() {
     }
 }
 
-/// What `check` has to say of a body that agrees.
+/// The state check of a body that agrees.
 fn agreeing(p: &PeerSession, body: BodyId) -> StateCheck {
     let tick = p.confirmed();
     let value = pliant_stream::codec::checksum::checksum(tick, p.state_at(body, tick).unwrap()) as f32;
@@ -317,7 +321,7 @@ fn a_body_that_differs_is_noticed_beside_one_that_agrees() {
         p.update(25 * MS * u32::from(tick));
         let check = match tick {
             0..10 => None,
-            // The first body agrees each time, the second never does.
+            // The first body agrees each time, and the second never does.
             _ if tick % 2 == 0 => Some(agreeing(&p, BODY)),
             _ => Some(StateCheck { value: 1e3, ..agreeing(&p, OTHER) }),
         };
@@ -335,14 +339,14 @@ fn copies_of_one_datagram_are_one_disagreement() {
         p.update(25 * MS * u32::from(tick));
         let wrong = StateCheck { value: 1e3, ..agreeing(&p, BODY) };
         let check = (tick > 10).then_some(wrong);
-        // From the eleventh on, the network copies that one.
+        // From the eleventh datagram on, the network repeats that datagram.
         let asked = asks(&mut p, tick, tick.min(11), check);
         assert!(!asked, "tick {tick}");
     }
     assert_eq!(p.stats(PeerId(1)).unwrap().datagrams_in, 11);
 }
 
-/// Lets the peer of the lowest number in.
+/// Connects the peer with the lowest number.
 fn greeted(p: &mut PeerSession) {
     p.connect(Duration::ZERO, PeerId(1), UserId(1), 1200).unwrap();
     let hello = PeerMessage::Hello {
@@ -355,7 +359,7 @@ fn greeted(p: &mut PeerSession) {
     p.on_message(Duration::ZERO, PeerId(1), &hello.encode());
 }
 
-/// Hears inputs of the lowest number; whether its state is then asked for.
+/// Delivers inputs of the peer with the lowest number. Returns whether `p` then requests its state.
 fn asks(p: &mut PeerSession, tick: u16, sequence: u16, check: Option<StateCheck>) -> bool {
     let ticks = vec![InputTick { tick: p.tick(), held: Vec::new() }];
     let datagram = PeerDatagram::Inputs { now: p.tick(), ahead: None, ticks, check };
@@ -422,7 +426,7 @@ fn clocks_that_differ_by_years_change_nothing_among_peers() {
         mesh.start(0, Repair::Rollback, true);
         mesh.start(1, Repair::Rollback, true);
         mesh.run(4 * S);
-        // The third comes late, from another age.
+        // The third peer joins late, with a clock that is decades off.
         mesh.start(2, Repair::Rollback, false);
         mesh.run(10 * S);
         assert_eq!((mesh.agree(0, 1), mesh.agree(0, 2)), (0.0, 0.0), "to the bit");
@@ -476,7 +480,7 @@ fn a_liar_is_not_believed_by_the_lowest_and_cannot_harm() {
 
 #[test]
 fn a_state_that_nobody_asked_for_is_not_taken() {
-    // Whoever lies: the higher number to the lower, and the lower to the higher.
+    // The higher number lies to the lower, and the lower to the higher.
     for (liar, victim) in [(1, 0), (0, 1)] {
         let mut mesh = Mesh::new(2, &LinkConfig { delay: 20 * MS, ..Default::default() }, 9);
         for k in 0..2 {
@@ -514,7 +518,8 @@ fn the_lowest_number_is_believed_when_it_was_asked() {
         mesh.start(k, Repair::Rollback, true);
     }
     mesh.run(5 * S);
-    // Checks of the lowest that do not agree: its state is asked for, comes, and is what it was.
+    // Checks of the lowest number disagree. The peer requests its state, receives it, and the state
+    // is the same as before.
     let p = mesh.peers[1].as_mut().unwrap();
     for s in 0..3_u16 {
         let check = Some(StateCheck { body: BODY, tick: p.confirmed(), value: 1e6 });
@@ -568,7 +573,7 @@ fn ask_floods_are_answered_within_bounds() {
 
 #[test]
 fn a_peer_under_another_number_than_the_one_it_was_given_is_turned_away() {
-    // Had it been let in under 1, its word would count for more than anybody's.
+    // Under number 1 the peer's state would override all others.
     for claimed in [0, 1, 3, 9] {
         let config = PeerConfig { user: UserId(3), ..Default::default() };
         let mut p = PeerSession::new(config).unwrap();
@@ -585,7 +590,7 @@ fn a_peer_under_another_number_than_the_one_it_was_given_is_turned_away() {
         p.on_message(MS, PeerId(7), &hello(claimed).encode());
         let turned = PeerEvent::TurnedAway { peer: PeerId(7), reason: DisconnectReason::Protocol };
         assert_eq!(p.poll_event(), Some(turned), "as {claimed}");
-        // Nor by saying it again, rightly.
+        // A second, correct hello does not help either.
         p.on_message(MS, PeerId(7), &hello(8).encode());
         assert_eq!((p.poll_event(), p.user_of(PeerId(7))), (None, None));
         p.connect(MS, PeerId(9), UserId(8), 1200).unwrap();
@@ -675,10 +680,10 @@ fn peers_tell_how_their_paths_do() {
     mesh.run(40 * S);
     let p = mesh.peers[0].as_mut().unwrap();
     let stats = p.stats(PeerId(1)).unwrap();
-    // Some 1,600 datagrams at 10 %: a standard deviation of 0.75 %.
+    // Some 1,600 datagrams at 10 % loss have a standard deviation of 0.75 %.
     assert!((stats.loss_in - 0.1).abs() < 0.03, "{stats:?}");
     assert!(stats.datagrams_in > 1200 && stats.datagrams_out > 1500, "{stats:?}");
-    // They look at their sessions every 5 ms: so evenly it comes.
+    // Peers update their sessions every 5 ms, so the jitter is about that large.
     assert!(stats.jitter < 10 * MS, "{stats:?}");
     assert_eq!(stats.rejected, 0);
     let before = p.totals();
@@ -694,13 +699,13 @@ fn peers_tell_how_their_paths_do() {
     );
 }
 
-/// A device's spring and damper on Pip, as a peer steps it and as the body does.
+/// Compares a device's spring and damper on Pip between a peer session and a body.
 #[test]
 fn a_peers_hand_has_its_own_spring_and_damper() {
     let path = std::path::Path::new(env!("CARGO_MANIFEST_DIR")).join("../../assets/pip.modal");
     let pip = Arc::new(ModalModel::read(path).unwrap());
     let (vertex, radius) = (76, f64::from(0.0216_f32));
-    // A Touch: 400 N/m and 4 N s/m.
+    // A Touch device: 400 N/m and 4 N s/m.
     let hold = GrabConfig { stiffness: Some(400.0), relaxation: 0.01 }.capped();
     let mut peer = PeerSession::new(PeerConfig::default()).unwrap();
     peer.add_body(BODY, pip.clone(), &StepSettings::default()).unwrap();

@@ -1,4 +1,4 @@
-//! What a scene may say beyond its types: ranges, names that are there once, names that are there.
+//! Checks of a scene beyond its types: ranges, unique names, and names that refer to something.
 
 use std::collections::HashMap;
 use std::ops::RangeInclusive;
@@ -11,13 +11,13 @@ use super::{
 };
 use crate::modal::StepError;
 
-/// What is wrong, and which value of the scene it is.
+/// An error, and the path of the value that it is about.
 #[derive(Debug)]
 pub(super) struct Fault {
     pub(super) path: Vec<Step>,
     pub(super) kind: SceneErrorKind,
     pub(super) message: String,
-    /// Another value that the message speaks of, as `{line}`, which becomes "line 7".
+    /// Another value that the message refers to; `{line}` in the message becomes its line.
     pub(super) other: Option<Vec<Step>>,
 }
 
@@ -27,13 +27,13 @@ fn fault(path: &[Step], kind: SceneErrorKind, message: impl Into<String>) -> Fau
     Fault { path: path.to_vec(), kind, message: message.into(), other: None }
 }
 
-/// No length, time or force of a scene is beyond.
+/// Largest length, time or force of a scene.
 const LARGEST: f64 = 1e6;
-/// A day, s.
+/// Longest time, s: one day.
 const LONGEST: f64 = 86_400.0;
 
 fn within(path: &[Step], what: &str, value: f64, range: RangeInclusive<f64>) -> Checked {
-    // NaN is in no range.
+    // A range never contains NaN.
     if range.contains(&value) {
         return Ok(());
     }
@@ -76,7 +76,7 @@ fn name(path: &[Step], name: &str) -> Checked {
     Err(fault(path, SceneErrorKind::Value, message))
 }
 
-/// A file under the folder of assets.
+/// Checks that a path stays under the folder of assets.
 fn asset(path: &[Step], file: &str, what: &str) -> Checked {
     let good = !file.is_empty()
         && file.len() <= 1024
@@ -95,7 +95,7 @@ fn asset(path: &[Step], file: &str, what: &str) -> Checked {
     ))
 }
 
-/// The whole scene.
+/// Checks the whole scene.
 pub(super) fn check(scene: &SceneDescription) -> Checked {
     if let Some(hz) = scene.step_hz {
         within(&[Field("step_hz")], "ticks a second", hz, 1.0..=2000.0)?;
@@ -114,7 +114,7 @@ pub(super) fn check(scene: &SceneDescription) -> Checked {
     recording(scene)
 }
 
-/// Returns the names of all bodies, copies too.
+/// Checks the bodies and returns the names of all of them, copies included.
 fn bodies(scene: &SceneDescription) -> Result<HashMap<String, usize>, Fault> {
     let mut names = HashMap::new();
     let mut count = 0_usize;
@@ -409,7 +409,7 @@ fn invite(path: &[Step], invite: &str) -> Checked {
     parsed.map(drop).map_err(|error| fault(path, SceneErrorKind::Value, error.to_string()))
 }
 
-/// Without the feature the scene is refused as a whole, later.
+/// Without the feature, the whole scene is refused later.
 #[cfg(not(feature = "net"))]
 fn network_link(_: &[Step], _: &Option<String>) -> Checked {
     Ok(())
@@ -459,7 +459,7 @@ fn recording(scene: &SceneDescription) -> Checked {
         return Err(fault(&[Field("recording")], SceneErrorKind::Field, message));
     };
     let path = std::path::Path::new(file);
-    // A scene that somebody sent must not write where it likes.
+    // A scene from someone else must not write outside the working directory.
     let below = path.components().all(|part| matches!(part, std::path::Component::Normal(_)));
     let good = below
         && !file.is_empty()
@@ -475,12 +475,12 @@ fn recording(scene: &SceneDescription) -> Checked {
 }
 
 impl BodyEntry {
-    /// How many bodies it is.
+    /// Returns the number of bodies that the entry makes.
     pub fn count(&self) -> usize {
         self.copies.map_or(1, |copies| copies.count[0].saturating_mul(copies.count[1]))
     }
 
-    /// The name of its copy of this number; without copies, the name.
+    /// Returns the name of one copy, or the name of the entry if it has no copies.
     pub fn name_of(&self, copy: usize) -> String {
         if self.copies.is_some() { format!("{}.{copy}", self.name) } else { self.name.clone() }
     }

@@ -1,23 +1,27 @@
-//! What a scene file says, word for word.
+//! The content of a scene file, field by field.
 
 use serde::Deserialize;
 
 use crate::modal::StepSettings;
 
-/// A scene: bodies, the hands on them, and what is to be added to the app for it.
+/// A scene: bodies, the hands on them, and what the app adds for the scene.
 ///
-/// Lengths are in m, times in s, y is up. Everything but `bodies` may be left out.
+/// Lengths are in m, times are in s, and y is up. Every field except `bodies` may be left out.
 #[derive(Debug, Clone, Default, PartialEq, Deserialize)]
 #[serde(rename = "Scene", deny_unknown_fields)]
 pub struct SceneDescription {
-    /// What the scene is called, for people. Default: empty.
+    /// Title of the scene, for people. Default: empty.
     #[serde(default)]
     pub title: String,
-    /// Ticks a second, 1 to 2000: the rate of `Time<Fixed>`. Set by [`SceneFilePlugin::open`](super::SceneFilePlugin::open) only: a game that
-    /// loads the scene as an asset keeps its own. Default: `None`, as the app has it.
+    /// Ticks per second, 1 to 2000: the rate of `Time<Fixed>`. Default: `None`, the rate of the
+    /// app.
+    ///
+    /// Only [`SceneFilePlugin::open`](super::SceneFilePlugin::open) sets the rate. A game that
+    /// loads the scene as an asset keeps its own rate.
     #[serde(default)]
     pub step_hz: Option<f64>,
-    /// Where to look from. The plugin makes no camera; whoever does may follow it. Default: `None`.
+    /// Suggested view of a camera. Default: `None`. The plugin spawns no camera; the app may apply
+    /// the view.
     #[serde(default)]
     pub view: Option<ViewEntry>,
     /// The soft bodies, at most [`MAX_BODIES`](super::MAX_BODIES) with their copies.
@@ -36,13 +40,13 @@ pub struct SceneDescription {
     pub recording: Option<RecordingEntry>,
 }
 
-/// A camera's place: round a point.
+/// A camera's position around a point.
 #[derive(Debug, Clone, Copy, PartialEq, Deserialize)]
 #[serde(rename = "View", deny_unknown_fields)]
 pub struct ViewEntry {
-    /// What is looked at, m.
+    /// Point that the camera looks at, m.
     pub middle: [f64; 3],
-    /// How far from there, m, above 0.
+    /// Distance of the camera from that point, m, above 0.
     pub distance: f64,
     /// Angle about the vertical, degrees; 0 looks along -z. Default: 25.
     #[serde(default = "yaw")]
@@ -60,48 +64,53 @@ fn pitch() -> f64 {
     13.0
 }
 
-/// A soft body. It is made of a `model` or of a `bake`; in a scene that joins a session neither is needed, as the host sends it.
+/// A soft body, made of a `model` or of a `bake`.
+///
+/// In a scene that joins a session, neither is needed, because the host sends the body.
 #[derive(Debug, Clone, PartialEq, Deserialize)]
 #[serde(rename = "Body", deny_unknown_fields)]
 pub struct BodyEntry {
-    /// Its name, 1 to 64 bytes, once in a scene; also its name in a session and in a recording.
+    /// Name of the body, 1 to 64 bytes, unique in the scene; also its name in a session and in a
+    /// recording.
     pub name: String,
-    /// A baked body: a `.modal` file, by its path under the folder of assets.
+    /// A baked body: the path of a `.modal` file under the folder of assets.
     #[serde(default)]
     pub model: Option<String>,
     /// A body that is baked when the scene begins (feature `bake`).
     #[serde(default)]
     pub bake: Option<BakeEntry>,
-    /// Where it is, with its anchors. Default: at the origin.
+    /// Transform of the body and its anchors. Default: at the origin.
     #[serde(default)]
     pub place: TransformEntry,
-    /// Several of it, in rows: each is called `NAME.0`, `NAME.1`, row after row. Default: `None`, one called `NAME`.
+    /// Several copies of the body in rows, named `NAME.0`, `NAME.1`, row after row. Default:
+    /// `None`, one body named `NAME`.
     #[serde(default)]
     pub copies: Option<CopiesEntry>,
-    /// Red, green, blue, 0 to 1 (sRGB); seen with the feature `render`. Default: a warm clay.
+    /// Red, green, blue, 0 to 1 (sRGB); drawn with the feature `render`. Default: a warm clay.
     #[serde(default = "color")]
     pub color: [f64; 3],
-    /// How rough its surface looks, 0 to 1. Default: 0.45.
+    /// Roughness of the surface's look, 0 to 1. Default: 0.45.
     #[serde(default = "roughness")]
     pub roughness: f64,
-    /// How it is stepped: `settings: (stiffness_scale: 4, gravity: (0, -9.81, 0))`. Default: all of
-    /// [`StepSettings`] at their defaults.
+    /// How the body is stepped: `settings: (stiffness_scale: 4, gravity: (0, -9.81, 0))`. Default:
+    /// all defaults of [`StepSettings`].
     #[serde(default)]
     pub settings: StepSettings,
-    /// How many modes are kept, at least 1. Default: `None`, all.
+    /// Number of modes that are kept, at least 1. Default: `None`, all.
     #[serde(default)]
     pub modes: Option<usize>,
-    /// Where the processor writes the surface, from a basis in half precision: [`ModalBody::half_basis`](crate::body::ModalBody::half_basis).
-    /// Default: false.
+    /// Whether the processor writes the surface from a basis in half precision
+    /// ([`ModalBody::half_basis`](crate::body::ModalBody::half_basis)). Default: false.
     #[serde(default)]
     pub half_basis: bool,
-    /// Below this speed it comes to rest, m/s; 0 never. Default: `None`, as [`ModalBody::rest_speed`](crate::body::ModalBody::rest_speed).
+    /// Speed below which the body comes to rest, m/s; 0 never rests. Default: `None`, the default
+    /// of [`ModalBody::rest_speed`](crate::body::ModalBody::rest_speed).
     #[serde(default)]
     pub rest_speed: Option<f64>,
-    /// Whether the pointer may pull it. Default: true.
+    /// Whether the pointer may pull the body. Default: true.
     #[serde(default = "yes")]
     pub pointer: bool,
-    /// Whether it is in the session. Default: `None`: it is where the scene has a `network`.
+    /// Whether the body is in the session. Default: `None`, true if the scene has a `network`.
     #[serde(default)]
     pub shared: Option<bool>,
 }
@@ -122,32 +131,34 @@ fn one() -> f64 {
     1.0
 }
 
-/// A body that is baked when the scene begins, and kept in the user's cache folder.
+/// A body that is baked when the scene begins and kept in the user's cache folder.
 #[derive(Debug, Clone, PartialEq, Deserialize)]
 #[serde(rename = "Bake", deny_unknown_fields)]
 pub struct BakeEntry {
-    /// A surface (`.obj`, `.stl`, `.ply`, `.gltf`, `.glb`), a body of rounded parts (`.ron`) or tetrahedra (`.msh`, `.vtk`, `.mesh`, `.veg`), by its
-    /// path under the folder of assets.
+    /// Path of the shape under the folder of assets.
+    ///
+    /// The shape is a surface (`.obj`, `.stl`, `.ply`, `.gltf`, `.glb`), a body of rounded parts
+    /// (`.ron`) or tetrahedra (`.msh`, `.vtk`, `.mesh`, `.veg`).
     pub shape: String,
-    /// About how many tetrahedra, 10 to 200,000. Default: 4000.
+    /// Approximate number of tetrahedra, 10 to 200,000. Default: 4000.
     #[serde(default = "tets")]
     pub tets: usize,
-    /// How many modes, 1 to 500. Default: 20.
+    /// Number of modes, 1 to 500. Default: 20.
     #[serde(default = "bake_modes")]
     pub modes: usize,
-    /// Young's modulus, Pa, above 0. Default: 1e5, a soft silicone.
+    /// Young's modulus, Pa, 1e-3 to 1e15. Default: 1e5, a soft silicone.
     #[serde(default = "young")]
     pub young: f64,
-    /// Poisson ratio, above -1 and below 0.5. Default: 0.4.
+    /// Poisson ratio, -0.99 to 0.49999. Default: 0.4.
     #[serde(default = "poisson")]
     pub poisson: f64,
-    /// Density, kg/m^3, above 0. Default: 1000.
+    /// Density, kg/m^3, 1e-6 to 1e7. Default: 1000.
     #[serde(default = "density")]
     pub density: f64,
-    /// Damping of every mode as a part of the critical one, 0 or more. Default: 0.03.
+    /// Damping ratio of every mode (1 is critical damping), 0 to 1000. Default: 0.03.
     #[serde(default = "damping_ratio")]
     pub damping_ratio: f64,
-    /// What is held fixed, such as `"y<0.02"`. Default: nothing: a free body.
+    /// Regions that are fixed, such as `"y<0.02"`. Default: none, which gives a free body.
     #[serde(default)]
     pub anchors: Vec<String>,
 }
@@ -176,17 +187,17 @@ fn damping_ratio() -> f64 {
     0.03
 }
 
-/// Where something is.
+/// A position, an orientation and a scale.
 #[derive(Debug, Clone, Copy, PartialEq, Deserialize)]
 #[serde(rename = "Place", deny_unknown_fields)]
 pub struct TransformEntry {
-    /// m. Default: the origin.
+    /// Position, m. Default: the origin.
     #[serde(default)]
     pub at: [f64; 3],
-    /// Degrees about x, then y, then z. Default: none.
+    /// Rotation about x, then y, then z, degrees. Default: none.
     #[serde(default)]
     pub turn: [f64; 3],
-    /// Times its baked size, 0.001 to 1000. Default: 1.
+    /// Scale relative to the baked size, 0.001 to 1000. Default: 1.
     #[serde(default = "one")]
     pub scale: f64,
 }
@@ -197,13 +208,13 @@ impl Default for TransformEntry {
     }
 }
 
-/// Bodies in rows and columns on the ground, the middle of them at the entry's place.
+/// Copies of a body in rows and columns on the ground, centered at the entry's place.
 #[derive(Debug, Clone, Copy, PartialEq, Deserialize)]
 #[serde(rename = "Copies", deny_unknown_fields)]
 pub struct CopiesEntry {
-    /// How many along x and along z, each 1 or more.
+    /// Number of copies along x and along z, each 1 or more.
     pub count: [usize; 2],
-    /// How far apart, m, along x and z.
+    /// Distance between copies along x and along z, m.
     pub spacing: [f64; 2],
 }
 
@@ -211,37 +222,39 @@ pub struct CopiesEntry {
 #[derive(Debug, Clone, PartialEq, Deserialize)]
 #[serde(rename = "Grab", deny_unknown_fields)]
 pub struct GrabEntry {
-    /// Its name, 1 to 64 bytes, once in a scene; messages, recordings and the panel use it.
+    /// Name of the grab, 1 to 64 bytes, unique in the scene; messages, recordings and the panel
+    /// show it.
     pub name: String,
-    /// The name of the body that it holds (`NAME.0` of one with copies).
+    /// Name of the body that the hand holds (`NAME.0` for a body with copies).
     pub body: String,
-    /// Which part of the surface.
+    /// The part of the surface that the hand holds.
     pub patch: PatchEntry,
-    /// Radius of the patch on the rest shape, m of the model. Default: `None`, 6 % of the body's size.
+    /// Radius of the patch on the rest shape, m of the model. Default: `None`, 6 % of the body's
+    /// size.
     #[serde(default)]
     pub radius: Option<f64>,
-    /// How far from where it took hold the hand pulls, m, in the scene's axes. Default: not at all.
+    /// Offset of the hand's target from where it took hold, m, in the scene's axes. Default: zero.
     #[serde(default)]
     pub pull: [f64; 3],
-    /// What it does about there. Default: `Still`.
+    /// Motion of the hand about that offset. Default: `Still`.
     #[serde(default)]
     pub motion: Motion,
-    /// When it takes hold, s from when all bodies of the scene are there. Default: 0.
+    /// Time at which the hand takes hold, s after all bodies of the scene exist. Default: 0.
     #[serde(default)]
     pub from: f64,
-    /// When it lets go, s, later than `from`. Default: `None`, never.
+    /// Time at which the hand releases the body, s, later than `from`. Default: `None`, never.
     #[serde(default)]
     pub until: Option<f64>,
-    /// How long it takes to get to its script from where it took hold, s. Default: 0.6.
+    /// Time in which the hand moves from where it took hold to its script, s. Default: 0.6.
     #[serde(default = "rise")]
     pub rise: f64,
-    /// Stiffness of the hand's own spring, N/m, above 0. Default: `None`, as stiff as the patch allows.
+    /// Stiffness of the hand's spring, N/m, above 0. Default: `None`, as stiff as the patch allows.
     #[serde(default)]
     pub stiffness: Option<f64>,
     /// Relaxation time of the hand's damper, s. Default: 0.
     #[serde(default)]
     pub relaxation: f64,
-    /// Whose hand it is. Default: `Here`.
+    /// The user that the hand belongs to. Default: `Here`.
     #[serde(default)]
     pub by: By,
 }
@@ -250,13 +263,13 @@ fn rise() -> f64 {
     0.6
 }
 
-/// Whose hand a grab is.
+/// The user that a grab belongs to.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Deserialize)]
 pub enum By {
-    /// Of this app.
+    /// The user of this app.
     #[default]
     Here,
-    /// Of the guest that `network: Host(guest: ..)` runs beside the host.
+    /// The guest that `network: Host(guest: ..)` runs beside the host.
     Guest,
 }
 
@@ -264,33 +277,34 @@ pub enum By {
 #[derive(Debug, Clone, Copy, PartialEq, Deserialize)]
 #[serde(rename = "Patch", deny_unknown_fields)]
 pub enum PatchEntry {
-    /// Round the vertex that is farthest in this direction, in the body's axes.
+    /// Around the vertex that is farthest in this direction, in the body's axes.
     Toward([f64; 3]),
-    /// Round the vertex that is nearest to this point, m in the body's axes.
+    /// Around the vertex that is nearest to this point, m in the body's axes.
     Near([f64; 3]),
-    /// Round the vertex of this number.
+    /// Around the vertex with this index.
     Vertex(u32),
 }
 
-/// What a hand does, as a distance from where it is held, m.
+/// Motion of a hand, as an offset from where it is held, m.
 #[derive(Debug, Clone, Default, PartialEq, Deserialize)]
 #[serde(rename = "Motion", deny_unknown_fields)]
 pub enum Motion {
-    /// Nothing.
+    /// No motion.
     #[default]
     Still,
-    /// To and fro: `size * sin(2 pi hz t)` along each axis.
+    /// Oscillation: `size * sin(2 pi hz t)` along each axis.
     Waves {
-        /// m.
+        /// Amplitude along each axis, m.
         size: [f64; 3],
-        /// Hz, 0 to 100.
+        /// Frequency along each axis, Hz, 0 to 100.
         hz: [f64; 3],
     },
-    /// From point to point, at rest at each of them.
+    /// Motion from point to point, with zero velocity at each point.
     Path {
-        /// In the order of their times. The path begins at no distance at time 0.
+        /// Points in the order of their times. The path begins at zero offset at time 0.
         points: Vec<PointEntry>,
-        /// Whether it begins anew after the last one, from there. Default: false, it stays there.
+        /// Whether the path repeats from its last point. Default: false, the hand stays at the last
+        /// point.
         #[serde(default)]
         repeat: bool,
     },
@@ -300,54 +314,59 @@ pub enum Motion {
 #[derive(Debug, Clone, Copy, PartialEq, Deserialize)]
 #[serde(rename = "Point", deny_unknown_fields)]
 pub struct PointEntry {
-    /// When it is reached, s from when the hand took hold, above 0.
+    /// Time at which the hand reaches the point, s after it took hold, above 0.
     pub at: f64,
-    /// Where it is, m.
+    /// Offset of the point, m.
     pub to: [f64; 3],
 }
 
 /// A session (feature `net`).
 ///
-/// A `link` is an emulated network under the socket: `paper-1` to `paper-4`, `lan`, `wifi`, `transatlantic` or `satellite`; without one the network
-/// is as it is.
+/// A `link` names an emulated network under the socket: `paper-1` to `paper-4`, `lan`, `wifi`,
+/// `transatlantic` or `satellite`. Without a link, the real network is used unchanged.
 #[derive(Debug, Clone, PartialEq, Deserialize)]
 #[serde(rename = "Network", deny_unknown_fields)]
 pub enum NetworkEntry {
-    /// This app hosts; its invite is logged and in [`SceneFilePlugin::invite`](super::SceneFilePlugin::invite).
+    /// This app hosts. The invite is logged and available as
+    /// [`SceneFilePlugin::invite`](super::SceneFilePlugin::invite).
     Host {
-        /// What the user here is called. Default: `host`.
+        /// Name of the user of this app. Default: `host`.
         #[serde(default = "host_name")]
         name: String,
-        /// Where to listen. One that others reach lets in only who has the invite. Default: `None`, a free port on this machine.
+        /// Address to listen on. Default: `None`, a free port on this machine.
+        ///
+        /// If other machines can reach the address, only guests with the invite are accepted.
         #[serde(default)]
         listen: Option<String>,
         /// An emulated network under all guests. Default: `None`.
         #[serde(default)]
         link: Option<String>,
-        /// A whole guest beside the host, in the same process, on a thread of its own. Default: `None`.
+        /// A complete guest beside the host, in the same process, on its own thread. Default:
+        /// `None`.
         #[serde(default)]
         guest: Option<GuestEntry>,
     },
-    /// This app joins; the bodies of the scene's names arrive at their places.
+    /// This app joins. Bodies that arrive with a name of the scene appear at the places of the
+    /// scene.
     Join {
-        /// What the host has printed.
+        /// The invite that the host has printed.
         invite: String,
-        /// What the user here is called. Default: `guest`.
+        /// Name of the user of this app. Default: `guest`.
         #[serde(default = "guest_name")]
         name: String,
         /// An emulated network. Default: `None`.
         #[serde(default)]
         link: Option<String>,
     },
-    /// This app is one of several equal ones. All must have the same bodies.
+    /// This app is one of several equal peers. All peers must have the same bodies.
     Peer {
-        /// The invite of one that is there already. Default: `None`, this is the first.
+        /// The invite of a peer that runs already. Default: `None`, this is the first peer.
         #[serde(default)]
         invite: Option<String>,
-        /// What the user here is called. Default: `peer`.
+        /// Name of the user of this app. Default: `peer`.
         #[serde(default = "peer_name")]
         name: String,
-        /// Where to listen, as for a host. Default: `None`.
+        /// Address to listen on, as for a host. Default: `None`.
         #[serde(default)]
         listen: Option<String>,
         /// An emulated network. Default: `None`.
@@ -368,64 +387,71 @@ fn peer_name() -> String {
     "peer".into()
 }
 
-/// A guest in the host's process: an app without a window behind a link, whose hands are the grabs that are `by: Guest`. What it shows is drawn in the
-/// host's window beside the truth.
+/// A guest in the host's process: an app without a window behind an emulated link.
+///
+/// Its hands are the grabs with `by: Guest`. The host's window draws the guest's visual state
+/// beside the host's bodies.
 #[derive(Debug, Clone, PartialEq, Deserialize)]
 #[serde(rename = "Guest", deny_unknown_fields)]
 pub struct GuestEntry {
-    /// What it is called. Default: `guest`.
+    /// Name of the guest. Default: `guest`.
     #[serde(default = "guest_name")]
     pub name: String,
-    /// The emulated network between it and the host. Default: `None`.
+    /// The emulated network between the guest and the host. Default: `None`.
     #[serde(default)]
     pub link: Option<String>,
-    /// Which packets that loses. Default: 0.
+    /// Seed that selects which packets the link loses. Default: 0.
     #[serde(default)]
     pub seed: u64,
-    /// How far from the host's bodies those of the guest are drawn, m. Default: at the same place.
+    /// Offset at which the guest's bodies are drawn from the host's, m. Default: zero.
     #[serde(default)]
     pub beside: [f64; 3],
 }
 
-/// A haptic device (feature `haptics`). Real ones are not opened by a file: that is for a person to do.
+/// A haptic device (feature `haptics`). A scene file cannot open a real device; only a person can.
 #[derive(Debug, Clone, PartialEq, Deserialize)]
 #[serde(rename = "Device", deny_unknown_fields)]
 pub enum DeviceEntry {
-    /// A simulated one in a simulated hand.
+    /// A simulated device in a simulated hand.
     Virtual {
-        /// What it is like. Default: `Premium`.
+        /// The device that is simulated. Default: `Premium`.
         #[serde(default)]
         like: Like,
-        /// How it is held. Default: `Firm`.
+        /// How the hand holds the device. Default: `Firm`.
         #[serde(default)]
         grip: Grip,
-        /// What it begins to touch: the middle of its workspace is there.
+        /// The patch at which the device begins: the center of its workspace lies there.
         on: TouchEntry,
-        /// What the hand does in the device's workspace, m from its middle. Default: `Still`.
+        /// Motion of the hand in the device's workspace, m from its center. Default: `Still`.
         #[serde(default)]
         motion: Motion,
-        /// When its button goes down, s from when all bodies are there, at least 0.2: a button counts once it has been seen open. Default: 0.5.
+        /// Time at which the button goes down, s after all bodies exist, at least 0.2. Default:
+        /// 0.5.
+        ///
+        /// A button counts only after the device loop has seen it open.
         #[serde(default = "press")]
         from: f64,
-        /// When it goes up, s. Default: `None`, never.
+        /// Time at which the button goes up, s. Default: `None`, never.
         #[serde(default)]
         until: Option<f64>,
-        /// Newtons in the hand for a newton in the world, 0 to 100. Default: 1.
+        /// Force in the hand per force in the world, N/N, 0 to 100. Default: 1.
         #[serde(default = "one")]
         force_scale: f64,
-        /// The loop steps a copy of the body itself. Default: false.
+        /// Whether the device loop steps its own copy of the body. Default: false.
         #[serde(default)]
         modal: bool,
-        /// How long the force waits for the simulation's next word before it fades, s, 0.01 to 60: for slow machines, as nobody's hand is on a
-        /// simulated device. Default: `None`, as for a real one.
+        /// Time for which the force waits for the next local model update before it fades, s, 0.01
+        /// to 60. Default: `None`, the time of a real device.
+        ///
+        /// Slow machines can use a longer time, since no person holds a simulated device.
         #[serde(default)]
         patience: Option<f64>,
     },
-    /// The pointer, as a device: its force is shown and nobody feels it.
+    /// The pointer as a device. Its force is shown but not felt.
     Pointer {
-        /// What it begins to touch.
+        /// The patch at which the device begins.
         on: TouchEntry,
-        /// Newtons in the hand for a newton in the world, 0 to 100. Default: 1.
+        /// Force in the hand per force in the world, N/N, 0 to 100. Default: 1.
         #[serde(default = "one")]
         force_scale: f64,
     },
@@ -435,17 +461,17 @@ fn press() -> f64 {
     0.5
 }
 
-/// Where a device's workspace is: on a body.
+/// The patch of a body at which a device's workspace lies.
 #[derive(Debug, Clone, PartialEq, Deserialize)]
 #[serde(rename = "Touch", deny_unknown_fields)]
 pub struct TouchEntry {
-    /// The body's name.
+    /// Name of the body.
     pub body: String,
-    /// Which part of its surface.
+    /// The part of its surface.
     pub patch: PatchEntry,
 }
 
-/// The devices that are simulated.
+/// The devices that can be simulated.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Deserialize)]
 pub enum Like {
     /// 3D Systems Touch: 3.3 N.
@@ -462,10 +488,10 @@ pub enum Like {
 /// How a simulated hand holds a simulated device.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Deserialize)]
 pub enum Grip {
-    /// As one holds a pen to write.
+    /// As firmly as a pen for writing.
     #[default]
     Firm,
-    /// As one points with it.
+    /// As lightly as a pen for pointing.
     Light,
     /// Barely.
     Loose,
@@ -478,25 +504,29 @@ pub struct RecordingEntry {
     /// A file that ends with `.rrd`, below the working directory. Default: `None`.
     #[serde(default)]
     pub file: Option<String>,
-    /// Whether to stream to the viewer on this machine, which is started if it is installed. Default: false.
+    /// Whether to stream to the viewer on this machine, which is started if it is installed.
+    /// Default: false.
     #[serde(default)]
     pub viewer: bool,
-    /// How often shapes are drawn, Hz, 0 to 1000. Default: 20.
+    /// Rate at which shapes are recorded, Hz, 0 to 1000. Default: 20.
     #[serde(default = "shapes_hz")]
     pub shapes_hz: f64,
-    /// How often figures are recorded, Hz, 0 to 1e6. Default: `None`, every tick.
+    /// Rate at which metrics are recorded, Hz, 0 to 1e6. Default: `None`, every tick.
     #[serde(default)]
     pub metrics_hz: Option<f64>,
-    /// How often hands are drawn, with their reactions, Hz, 0 to 1e6. Default: `None`, every tick.
+    /// Rate at which hands and their reactions are recorded, Hz, 0 to 1e6. Default: `None`, every
+    /// tick.
     #[serde(default)]
     pub hands_hz: Option<f64>,
-    /// How often the energies of the modes and the spectrum are drawn, Hz, 0 to 1000. Default: 4.
+    /// Rate at which the energies of the modes and the spectrum are recorded, Hz, 0 to 1000.
+    /// Default: 4.
     #[serde(default = "modes_hz")]
     pub modes_hz: f64,
-    /// What the color of a surface says. Default: `Displacement`.
+    /// Quantity that the color of a surface shows. Default: `Displacement`.
     #[serde(default)]
     pub color: ColorEntry,
-    /// Whether every period of a device's loop is recorded (`RerunRecording::device_loops`). Default: false.
+    /// Whether every period of a device loop is recorded (`RerunRecording::device_loops`). Default:
+    /// false.
     #[serde(default)]
     pub device_loops: bool,
 }
@@ -509,13 +539,13 @@ fn modes_hz() -> f64 {
     4.0
 }
 
-/// What the color of a recorded surface says.
+/// Quantity that the color of a recorded surface shows.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq, Deserialize)]
 #[serde(rename = "Color")]
 pub enum ColorEntry {
-    /// How far each point is from where it rests: the last color at 0.3 of the body's size.
+    /// Distance of each point from its rest position; the last color is at 0.3 of the body's size.
     #[default]
     Displacement,
-    /// Von Mises stress in the skin: the last color at 0.2 of Young's modulus.
+    /// Von Mises stress in the skin; the last color is at 0.2 of Young's modulus.
     Stress,
 }

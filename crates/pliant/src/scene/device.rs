@@ -12,7 +12,7 @@ use crate::haptics::{
     PositionedHandle, SafetyConfig, StaleConfig, ToolGrip, VirtualConfig, VirtualDevice, VirtualHandle,
 };
 
-/// The tool of a scene's device; it is in the world once the body that it begins at is there.
+/// The tool of a scene's device, which is placed once the body that it begins at exists.
 #[derive(Component, Debug)]
 pub(super) struct SceneTool {
     device: DeviceId,
@@ -78,7 +78,7 @@ pub(super) fn add(
     let device = devices
         .add(device, config)
         .map_err(|error| failed(SceneErrorKind::Open, format!("the device cannot be started: {error}")))?;
-    // The mouse is one hand or the other.
+    // The mouse either drives the device or grabs bodies, not both.
     if matches!(mover, Mover::Pointer(_))
         && let Some(mut pointer) = world.get_resource_mut::<PointerGrab>()
     {
@@ -93,7 +93,7 @@ pub(super) fn add(
     Ok(())
 }
 
-/// A tool that goes takes its device along.
+/// Removes the device of a despawned tool.
 pub(super) fn close(
     gone: On<Remove, SceneTool>,
     tools: Query<&SceneTool>,
@@ -104,7 +104,7 @@ pub(super) fn close(
     }
 }
 
-/// Before a tick: tools are put where the scene wants them, and simulated hands move.
+/// Before a tick, places the tools at their patches and moves the simulated hands.
 pub(super) fn play(
     mut commands: Commands,
     time: Res<Time>,

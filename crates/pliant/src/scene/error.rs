@@ -1,8 +1,8 @@
-//! What is wrong with a scene, where, and what was expected.
+//! Errors of a scene: what is wrong, where, and what was expected.
 
 use std::fmt;
 
-/// Why a scene was refused: the file, the line and the column where it says so, and in words what was expected.
+/// Why a scene was refused: the file, the line, the column and what was expected.
 ///
 /// ```text
 /// scenes/solo.ron:5:34: unknown field `modle` in Body; did you mean `model`?
@@ -11,15 +11,17 @@ use std::fmt;
 /// ```
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct SceneError {
-    /// The file, or what stood for one.
+    /// The path of the file, or the name of the text.
     pub file: String,
-    /// Line and column, from 1, in characters. `None` where there is no text: a file that cannot be read, a scene made in code.
+    /// Line and column, from 1, in characters.
+    ///
+    /// `None` without a text: for a file that cannot be read, or a scene made in code.
     pub position: Option<(usize, usize)>,
-    /// What kind of mistake it is.
+    /// The kind of the mistake.
     pub kind: SceneErrorKind,
-    /// What was expected and what came.
+    /// What was expected and what was found.
     pub message: String,
-    /// The line of the text, where there is one.
+    /// The line of the text, if there is a text.
     pub(super) line: String,
 }
 
@@ -27,35 +29,35 @@ pub struct SceneError {
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 #[non_exhaustive]
 pub enum SceneErrorKind {
-    /// The file cannot be read, or is no text, or too long.
+    /// The file cannot be read, is not text, or is too long.
     Read,
-    /// The text is no RON, or a value is of another type.
+    /// The text is not RON, or a value has the wrong type.
     Syntax,
-    /// A field or a variant that there is not, or one that is missing.
+    /// A field or a variant is unknown, or a field is missing.
     Field,
-    /// A value that is out of its range.
+    /// A value is out of its range.
     Value,
-    /// A name that is there twice, or names nothing.
+    /// A name is defined twice, or refers to nothing.
     Name,
-    /// Another file that the scene names, or what is in it.
+    /// A file that the scene names is missing or invalid.
     Asset,
-    /// The program, or the app, lacks what the scene asks for.
+    /// The program or the app lacks a feature that the scene asks for.
     Feature,
-    /// A socket, a device or a file could not be opened.
+    /// A socket, a device or a file cannot be opened.
     Open,
 }
 
-/// Longest part of a line that is shown.
+/// Maximum length of the part of a line that an error shows, characters.
 const SHOWN: usize = 100;
 
 impl SceneError {
-    /// An error at a byte of a text.
+    /// Creates an error at a byte of a text.
     pub(super) fn at(file: &str, text: &str, byte: usize, kind: SceneErrorKind, message: String) -> Self {
         let position = super::locate::line_and_column(text, byte);
         Self::at_position(file, text, position, kind, message)
     }
 
-    /// An error at a line and a column of a text.
+    /// Creates an error at a line and a column of a text.
     pub(super) fn at_position(
         file: &str,
         text: &str,
@@ -64,12 +66,12 @@ impl SceneError {
         message: String,
     ) -> Self {
         let line = text.lines().nth(position.0.saturating_sub(1)).unwrap_or_default();
-        // Kept as long as the caret needs it; a file of one endless line is not repeated.
+        // The line is cut after the caret, so that a file of one very long line is not copied.
         let line = line.chars().take(position.1.saturating_add(SHOWN)).collect();
         Self { file: file.into(), position: Some(position), kind, message, line }
     }
 
-    /// An error without a place in a text.
+    /// Creates an error without a position in a text.
     pub(super) fn without_place(file: &str, kind: SceneErrorKind, message: String) -> Self {
         Self { file: file.into(), position: None, kind, message, line: String::new() }
     }
@@ -84,7 +86,8 @@ impl fmt::Display for SceneError {
         if self.line.trim().is_empty() {
             return Ok(());
         }
-        // The part of a long line that holds the caret; tabs are one column wide here as they were counted.
+        // Shows the part of a long line around the caret. A tab counts as one column, as in the
+        // position.
         let from = (column - 1).saturating_sub(SHOWN - 20);
         let part: String =
             self.line.chars().skip(from).take(SHOWN).map(|c| if c.is_control() { ' ' } else { c }).collect();
@@ -97,14 +100,16 @@ impl fmt::Display for SceneError {
 
 impl std::error::Error for SceneError {}
 
-/// The one of `names` that `wrong` was most likely meant to be.
+/// Returns the one of `names` that `wrong` was most likely meant to be.
 pub(super) fn nearest<'a>(wrong: &str, names: impl IntoIterator<Item = &'a str>) -> Option<&'a str> {
     let most = (wrong.chars().count() / 3).clamp(1, 3);
     let distances = names.into_iter().take(1000).map(|name| (distance(wrong, name, most), name));
     distances.filter(|(distance, _)| *distance <= most).min().map(|(_, name)| name)
 }
 
-/// How many letters differ, are too many or missing or swapped with their neighbour (optimal string alignment), where that is at most `most`.
+/// Returns the optimal string alignment distance of two names if it is at most `most`.
+///
+/// Changed, extra and missing letters count, and so do swaps of neighboring letters.
 fn distance(a: &str, b: &str, most: usize) -> usize {
     let [a, b]: [Vec<char>; 2] = [a, b].map(|s| s.to_lowercase().chars().take(80).collect());
     if a.len().abs_diff(b.len()) > most {

@@ -1,4 +1,4 @@
-//! A scene that was read and checked; the loader of scene files.
+//! Scenes that are read and checked, and the asset loader for scene files.
 
 use std::{fs::File, io::Read, path::Path, sync::Arc};
 
@@ -28,16 +28,17 @@ use super::{MAX_BYTES, SceneDescription, SceneError, SceneErrorKind};
 #[derive(Asset, TypePath, Debug, Clone, PartialEq)]
 pub struct SceneFile {
     origin: Arc<str>,
-    /// For the places of mistakes that show later. Empty for a scene made in code.
+    /// The text, which locates mistakes that show later. Empty for a scene made in code.
     text: Arc<str>,
     scene: Arc<SceneDescription>,
 }
 
 impl SceneFile {
-    /// Reads a file.
+    /// Reads a scene file.
     ///
     /// # Errors
-    /// As [`from_ron`](Self::from_ron); [`SceneErrorKind::Read`] when it cannot be read, is no text, or is longer than [`MAX_BYTES`].
+    /// Returns the errors of [`from_ron`](Self::from_ron), and [`SceneErrorKind::Read`] if the file
+    /// cannot be read, is not text, or is longer than [`MAX_BYTES`].
     pub fn read(path: impl AsRef<Path>) -> Result<Self, SceneError> {
         let path = path.as_ref();
         let origin = path.display().to_string();
@@ -69,12 +70,15 @@ impl SceneFile {
         }
     }
 
-    /// Reads a text; `origin` is what errors call it.
+    /// Reads a scene from a text. `origin` is the name of the text in errors.
     ///
     /// # Errors
-    /// Says line, column, and what was expected, when the text is no RON ([`SceneErrorKind::Syntax`]), has unknown or missing fields
-    /// ([`Field`](SceneErrorKind::Field)), values out of their range ([`Value`](SceneErrorKind::Value)) or names that are there twice or not at all
-    /// ([`Name`](SceneErrorKind::Name)).
+    /// Each error has the line, the column and what was expected. The kinds are
+    /// [`Syntax`](SceneErrorKind::Syntax) for a text that is not RON,
+    /// [`Field`](SceneErrorKind::Field) for unknown or missing fields,
+    /// [`Value`](SceneErrorKind::Value) for values out of their range, and
+    /// [`Name`](SceneErrorKind::Name) for names that are defined twice or not at all. A text longer
+    /// than [`MAX_BYTES`] gives [`SceneErrorKind::Read`].
     pub fn from_ron(text: &str, origin: impl AsRef<str>) -> Result<Self, SceneError> {
         let origin = origin.as_ref();
         if text.len() > MAX_BYTES {
@@ -83,7 +87,9 @@ impl SceneFile {
         let text = text.strip_prefix('\u{feff}').unwrap_or(text);
         let options = ron::Options::default().with_default_extension(Extensions::IMPLICIT_SOME);
         let scene: SceneDescription = options.from_str(text).map_err(|error| {
-            // At the very end of a text the parser points to its last character, and behind that only where something follows.
+            // At the end of a text, the parser reports the position of the last character. It
+            // reports the position after that character only if more text follows, so the parse is
+            // repeated with a newline.
             let ended = format!("{text}\n");
             let again =
                 options.from_str::<SceneDescription>(&ended).err().filter(|_| !text.trim().is_empty());
@@ -92,10 +98,10 @@ impl SceneFile {
         Self::checked(scene, origin, text)
     }
 
-    /// A scene made in code.
+    /// Creates a scene from a description made in code.
     ///
     /// # Errors
-    /// As [`from_ron`](Self::from_ron), without lines.
+    /// Returns the errors of [`from_ron`](Self::from_ron) without lines and columns.
     pub fn new(scene: SceneDescription) -> Result<Self, SceneError> {
         Self::checked(scene, "a scene made in code", "")
     }
@@ -115,17 +121,17 @@ impl SceneFile {
         }
     }
 
-    /// What the scene says.
+    /// Returns the description of the scene.
     pub fn scene(&self) -> &SceneDescription {
         &self.scene
     }
 
-    /// What errors call it: the file.
+    /// Returns the name that errors use for the scene, usually the path of the file.
     pub fn origin(&self) -> &str {
         &self.origin
     }
 
-    /// An error about one of its values.
+    /// Creates an error about the value at `path`.
     pub(super) fn error(&self, path: &[Step], kind: SceneErrorKind, message: String) -> SceneError {
         if self.text.is_empty() {
             return SceneError::without_place(&self.origin, kind, message);

@@ -1,4 +1,4 @@
-//! Hands that play the scene's scripts.
+//! Hands that play the scripts of a scene.
 
 use bevy::{math::DVec3, prelude::*};
 
@@ -9,13 +9,13 @@ use super::{GrabEntry, PatchEntry, SceneError, SceneErrorKind};
 use crate::body::{BodyState, Grab, GrabForce, GrabOf, VisualState};
 use crate::modal::{ModalModel, Patch};
 
-/// A hand of a scene, between its times a [`Grab`].
+/// A hand of a scene, with a [`Grab`] between its start and its end.
 #[derive(Component, Debug)]
 pub(super) struct ScriptedHand {
     entry: GrabEntry,
-    /// Where the patch was when it took hold, m, and when that was, s of the scene.
+    /// Center of the patch when the hand took hold, m, and that time, s of the scene's clock.
     held: Option<(DVec3, f64)>,
-    /// It cannot hold what it is to hold, and that was said.
+    /// Whether the hand cannot hold its patch and the error was reported.
     refused: bool,
 }
 
@@ -25,7 +25,7 @@ impl ScriptedHand {
     }
 }
 
-/// The vertex that a patch is round.
+/// Returns the center vertex of a patch.
 pub(super) fn vertex_of(patch: &PatchEntry, model: &ModalModel) -> Result<u32, String> {
     let positions = model.surface().positions();
     let place = |p: &[f32; 3]| Vec3::from(*p).as_dvec3();
@@ -42,7 +42,7 @@ pub(super) fn vertex_of(patch: &PatchEntry, model: &ModalModel) -> Result<u32, S
     found.ok_or_else(|| "the body has no surface".into())
 }
 
-/// A vertex by its number, where there are so many.
+/// Checks that the surface has a vertex with this index.
 pub(super) fn vertex_there(vertex: u32, count: usize) -> Result<u32, String> {
     if (vertex as usize) < count {
         return Ok(vertex);
@@ -50,15 +50,15 @@ pub(super) fn vertex_there(vertex: u32, count: usize) -> Result<u32, String> {
     Err(format!("expected a vertex of the surface, 0 to {}, got {vertex}", count.saturating_sub(1)))
 }
 
-/// What is said of a hand that cannot hold what it is to hold.
+/// Returns the message for a hand that cannot hold its patch.
 pub(super) fn cannot_hold(grab: &GrabEntry, problem: &str) -> String {
     format!("the grab `{}` cannot hold `{}`: {problem}", grab.name, grab.body)
 }
 
-/// A patch's radius where the scene gives none, as a part of the body's size.
+/// Radius of a patch without a given radius, as a fraction of the body's size.
 const RADIUS: f64 = 0.06;
 
-/// A patch on a body as it is now: its vertex, its radius, and its middle in the world, m.
+/// Returns the vertex, the radius and the current center of a patch in the world, m.
 fn take_hold(
     entry: &GrabEntry,
     state: &BodyState,
@@ -78,7 +78,7 @@ fn take_hold(
     Ok((vertex, radius, place.transform_point(middle.as_vec3()).as_dvec3()))
 }
 
-/// In the bodies' schedule, before the tick: hands take hold, go where they are to be, let go.
+/// Grabs, moves and releases the hands; runs in the bodies' schedule before the tick.
 pub(super) fn play(
     mut commands: Commands,
     time: Res<Time>,
@@ -108,7 +108,7 @@ pub(super) fn play(
             (None, _) if holds && !hand.refused => {
                 let body =
                     bodies.iter().find(|(_, name, of, ..)| of.0 == part.0 && name.as_str() == entry.body);
-                // One that went is waited for: in a session it may come back.
+                // The hand waits for a missing body, which may return within a session.
                 let Some((body, _, _, state, shown, place)) = body else { continue };
                 match take_hold(entry, state, shown, place) {
                     Ok((vertex, radius, from)) => {
@@ -130,7 +130,7 @@ pub(super) fn play(
                     }
                 }
             }
-            // The body went, and the grab with it.
+            // The body was despawned, and its grab with it.
             (Some(_), None) => hand.held = None,
             (None, _) => {}
         }

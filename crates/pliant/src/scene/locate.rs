@@ -1,16 +1,21 @@
-//! Where in a RON text a value begins: parsers tell where the text is wrong, this tells where what it says is.
+//! Finds where a value begins in a RON text.
+//!
+//! A parser reports where the text is malformed. This module finds the position of a value that
+//! parsed well but fails a later check.
 
-/// A step from a value to one inside it.
+/// A step from a value to a value inside it.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(super) enum Step {
     /// The field of this name.
     Field(&'static str),
-    /// The element of this number in a list, a tuple or a variant's brackets.
+    /// The element of this index in a list, a tuple or a variant's brackets.
     Item(usize),
 }
 
-/// The byte at which the value at `path` begins in a well-formed text; if it is not there (it was left out), that of the value it would be in. Texts
-/// that are not well-formed give some byte.
+/// Returns the byte at which the value at `path` begins in a well-formed text.
+///
+/// If the value was left out, the result is the beginning of the innermost value of the path that
+/// exists. A malformed text gives some byte of the text.
 pub(super) fn locate(text: &str, path: &[Step]) -> usize {
     let mut cursor = Cursor { text, at: 0 };
     cursor.space();
@@ -28,7 +33,7 @@ pub(super) fn locate(text: &str, path: &[Step]) -> usize {
     found
 }
 
-/// Line and column of a byte, both from 1, in characters.
+/// Returns the line and the column of a byte, both from 1, in characters.
 pub(super) fn line_and_column(text: &str, at: usize) -> (usize, usize) {
     let mut at = at.min(text.len());
     while !text.is_char_boundary(at) {
@@ -61,7 +66,7 @@ impl<'a> Cursor<'a> {
         there
     }
 
-    /// Past white space and comments.
+    /// Skips white space and comments.
     fn space(&mut self) {
         loop {
             let rest = self.rest();
@@ -77,7 +82,7 @@ impl<'a> Cursor<'a> {
         }
     }
 
-    /// They nest.
+    /// Skips a block comment. Block comments nest.
     fn block_comment(&mut self) {
         let mut depth = 0_usize;
         while !self.rest().is_empty() {
@@ -96,7 +101,7 @@ impl<'a> Cursor<'a> {
         }
     }
 
-    /// `#![enable(..)]`.
+    /// Skips an attribute such as `#![enable(..)]`.
     fn attribute(&mut self) {
         self.at += self.rest().find(']').map_or(self.rest().len(), |end| end + 1);
     }
@@ -108,7 +113,7 @@ impl<'a> Cursor<'a> {
         &rest[..end]
     }
 
-    /// To the beginning of an inner value.
+    /// Moves to the beginning of an inner value.
     fn enter(&mut self, step: Step) -> Option<usize> {
         loop {
             let name = self.word();
@@ -117,7 +122,7 @@ impl<'a> Cursor<'a> {
                 return None;
             }
             self.space();
-            // The optional value is the value.
+            // `Some(..)` has no step of its own in a path.
             if name != "Some" {
                 break;
             }
@@ -152,7 +157,7 @@ impl<'a> Cursor<'a> {
         }
     }
 
-    /// Past a value, up to the comma or the bracket after it.
+    /// Skips a value, up to the comma or the bracket after it.
     fn skip(&mut self) {
         let mut depth = 0_usize;
         while let Some(c) = self.peek() {
@@ -171,7 +176,8 @@ impl<'a> Cursor<'a> {
                 }
                 'r' if self.raw_string() => continue,
                 c if c.is_alphanumeric() || c == '_' => {
-                    // A word's last letters are not the beginning of a raw string, unless it is that of bytes.
+                    // The rest of a word cannot begin a raw string, except after the `b` of a byte
+                    // string.
                     self.at += c.len_utf8();
                     if c != 'b' {
                         self.word();
@@ -210,7 +216,7 @@ impl<'a> Cursor<'a> {
         self.at += self.rest().find('\'').map_or(self.rest().len(), |end| end + 1);
     }
 
-    /// `r"…"`, `r#"…"#`; false for a word that begins with r.
+    /// Skips `r"…"` or `r#"…"#`; returns false for a word that begins with `r`.
     fn raw_string(&mut self) -> bool {
         let inside = self.rest().trim_start_matches('r').trim_start_matches('#');
         let hashes = self.rest().len() - 1 - inside.len();
@@ -284,7 +290,7 @@ Scene(
                 assert!(locate(text, path) <= text.len());
             }
         }
-        // A deep text takes no deep stack.
+        // The depth of the text does not use stack.
         let deep = "(".repeat(1_000_000);
         assert!(locate(&deep, &[Item(1)]) <= deep.len());
     }

@@ -1,4 +1,4 @@
-//! Scenes as files: bodies, hands with scripts, a session, a device and a recording, written down in a `.ron` file.
+//! Scenes as files: bodies, scripted hands, a session, a device and a recording in a `.ron` file.
 //!
 //! ```ron
 //! (
@@ -13,16 +13,21 @@
 //! )
 //! ```
 //!
-//! Run one with `cargo run --example scene -- assets/scenes/solo.ron`. An app that is there for one scene gives it to [`SceneFilePlugin::open`]; a
-//! game that loads scenes as it goes adds [`SceneFilePlugin::default`] and spawns [`SceneInstance`]s. What may be written is in
-//! [`SceneDescription`], field by field.
+//! Run a scene file with `cargo run --example scene -- assets/scenes/solo.ron`. An app that plays
+//! one scene passes it to [`SceneFilePlugin::open`]. A game that loads scenes while it runs adds
+//! [`SceneFilePlugin::default`] and spawns [`SceneInstance`]s. [`SceneDescription`] documents every
+//! field of the file.
 //!
-//! A mistake is told with its line and column, and what was expected ([`SceneError`]); one that shows only when the scene runs (a file that is not there, a
-//! vertex that the body does not have) as the message [`SceneFailed`]. A file that somebody else wrote may be opened: it is read up to
-//! [`MAX_BYTES`], every number is checked, it writes no file but a recording below the working directory, opens no real device, and a host that it makes
-//! lets in from other machines only who has the invite. It does open the network connection that it names.
+//! A mistake is reported with its line, its column and what was expected ([`SceneError`]). A
+//! mistake that shows only while the scene runs, such as a missing file or a vertex that the body
+//! does not have, is sent as the message [`SceneFailed`].
 //!
-//! A scene does not ask for a camera, a light or a floor; these are the app's.
+//! Opening a scene file from an untrusted source is bounded: at most [`MAX_BYTES`] are read, and
+//! every number is checked. The scene writes no file except a recording below the working
+//! directory, and it opens no real device. A host that the scene creates accepts guests from other
+//! machines only with the invite. The scene does open the network connection that it names.
+//!
+//! A scene does not describe a camera, a light or a floor; the app provides these.
 
 mod check;
 mod describe;
@@ -52,11 +57,11 @@ pub use file::{SceneFile, SceneFileLoader};
 pub use plugin::SceneFilePlugin;
 pub use spawn::{PartOf, SceneBody, SceneClock, SceneFailed, SceneInstance, SceneParts};
 
-/// Longest scene file that is read, bytes.
+/// Maximum length of a scene file, bytes.
 pub const MAX_BYTES: usize = 1 << 20;
 
-/// Most bodies of a scene, copies counted.
+/// Maximum number of bodies in a scene, copies included.
 pub const MAX_BODIES: usize = 4096;
 
-/// Most grabs of a scene.
+/// Maximum number of grabs in a scene.
 pub const MAX_GRABS: usize = 1024;

@@ -1,11 +1,13 @@
-//! Where a script's hand is.
+//! The position of a scripted hand over time.
 
 use bevy::math::DVec3;
 
 use super::Motion;
 
 impl Motion {
-    /// How far the hand is from where it is held, m, `t` seconds after it took hold; `Path` is smooth from point to point (`3 s^2 - 2 s^3`).
+    /// Returns the offset of the hand from where it is held, m, `t` seconds after it took hold.
+    ///
+    /// `Path` moves smoothly from point to point (`3 s^2 - 2 s^3`).
     pub fn at(&self, t: f64) -> DVec3 {
         let t = if t.is_finite() { t.max(0.0) } else { 0.0 };
         match self {
@@ -22,7 +24,7 @@ impl Motion {
                 let Some(to) = points.get(next) else { return last.to.into() };
                 let (from_time, from) = match next.checked_sub(1).and_then(|before| points.get(before)) {
                     Some(before) => (before.at, DVec3::from(before.to)),
-                    // A lap begins where the one before has ended.
+                    // A lap begins where the previous lap ended.
                     None if first_lap => (0.0, DVec3::ZERO),
                     None => (0.0, last.to.into()),
                 };
@@ -32,7 +34,7 @@ impl Motion {
     }
 }
 
-/// From 0 to 1, at rest at both ends.
+/// Rises from 0 to 1 with zero velocity at both ends.
 pub(super) fn smooth(s: f64) -> f64 {
     let s = if s.is_nan() { 1.0 } else { s.clamp(0.0, 1.0) };
     s * s * (3.0 - 2.0 * s)
@@ -65,7 +67,7 @@ mod tests {
             assert!((path(false).at(t).x - once).abs() < 1e-12, "{t}");
             assert!((path(true).at(t).x - again).abs() < 1e-12, "{t}");
         }
-        // At rest at a point: the way in a thousandth of a second is a millionth of the path.
+        // At rest at a point, the motion within a millisecond is below a millionth of a meter.
         assert!((path(false).at(1.001).x - 0.2).abs() < 1e-6);
         assert_eq!(path(true).at(f64::NAN), DVec3::ZERO);
         assert_eq!(Motion::Path { points: Vec::new(), repeat: true }.at(1.0), DVec3::ZERO);

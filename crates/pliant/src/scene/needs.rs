@@ -1,4 +1,4 @@
-//! What a scene needs of the program, and of the disk.
+//! What a scene needs of the program and of the disk.
 
 use std::{collections::HashMap, path::Path};
 
@@ -7,7 +7,7 @@ use super::locate::Step::{self, Field, Item};
 use super::{BakeEntry, PatchEntry, SceneError, SceneErrorKind, SceneFile, hands};
 use crate::modal::ModalModel;
 
-/// Whether this program was compiled with a feature of this crate that scenes may need.
+/// Returns whether this program was compiled with a feature of this crate that scenes may need.
 pub(super) fn compiled(feature: &str) -> bool {
     [
         ("net", cfg!(feature = "net")),
@@ -19,9 +19,12 @@ pub(super) fn compiled(feature: &str) -> bool {
 }
 
 impl SceneFile {
-    /// What the scene asks for of a program that was compiled with those features of this crate for which `has` is true, and does not get: a `network`
-    /// needs `net`, a `device` `haptics`, a `recording` `rerun`, a body's `bake` `bake`. One error ([`SceneErrorKind::Feature`]) for each of them, where
-    /// it stands.
+    /// Returns the requests of the scene that a program without some features cannot meet.
+    ///
+    /// `has` says for each feature of this crate whether the program was compiled with it. A
+    /// `network` needs `net`, a `device` needs `haptics`, a `recording` needs `rerun`, and the
+    /// `bake` of a body needs `bake`. Each unmet request gives one error
+    /// ([`SceneErrorKind::Feature`]) at its position.
     ///
     /// ```
     /// # use pliant::scene::SceneFile;
@@ -56,16 +59,20 @@ impl SceneFile {
         asked.into_iter().map(told).collect()
     }
 
-    /// Reads the files that the scene names under the folder of assets, and says which of them are not there or are not what they should be, before
-    /// anything is played: models whole, and that they have the vertices that hands hold by number; shapes too where the feature `bake` is compiled,
-    /// else whether they can be opened.
+    /// Reads the files that the scene names and reports those that are missing or invalid.
     ///
-    /// Each file is read once, however many bodies are made of it; it may be as long as a model is. Errors are [`SceneErrorKind::Asset`], and for a
-    /// `recording` whose folder is not there [`SceneErrorKind::Open`]; that one is looked for below the working directory, and not made.
+    /// Nothing is played. Files are looked up under the folder of assets. Models are read whole and
+    /// must have the vertices that hands hold by number. Shapes are read too if the feature `bake`
+    /// is compiled; otherwise they must only open.
+    ///
+    /// Each model file is read once, however many bodies use it; the files may be longer than
+    /// `MAX_BYTES`. Errors are [`SceneErrorKind::Asset`], and [`SceneErrorKind::Open`] for a
+    /// `recording` whose folder does not exist. The folder of the recording is looked up below the
+    /// working directory and is not created.
     pub fn check_files(&self, assets: impl AsRef<Path>) -> Vec<SceneError> {
         let (assets, scene) = (assets.as_ref(), self.scene());
         let mut wrong = Vec::new();
-        // How many vertices a model has, or what is wrong with it; and which model a body is made of.
+        // For each model file: its number of vertices, or its error. For each body: its model file.
         let mut read: HashMap<&str, Result<usize, String>> = HashMap::new();
         let mut models: HashMap<String, &str> = HashMap::new();
         for (entry, body) in scene.bodies.iter().enumerate() {
@@ -104,7 +111,10 @@ impl SceneFile {
         wrong
     }
 
-    /// What keeps the recording's file from being written, if it has one. With `make` it is there afterwards; what is in it stays.
+    /// Returns the error that keeps the recording's file from being written, if the scene has a
+    /// recording.
+    ///
+    /// With `make`, the file is created; the content of an existing file stays.
     pub(super) fn recording_writable(&self, make: bool) -> Option<SceneError> {
         let file = Path::new(self.scene().recording.as_ref()?.file.as_deref()?);
         let folder = file.parent().filter(|folder| !folder.as_os_str().is_empty());
@@ -113,7 +123,7 @@ impl SceneFile {
         } else if file.is_dir() {
             "it is a folder".to_owned()
         } else if make {
-            // Opened to append: a scene that is then not played has taken nothing away.
+            // Opening in append mode keeps the content, in case the scene is not played after all.
             std::fs::OpenOptions::new().append(true).create(true).open(file).err()?.to_string()
         } else {
             return None;
@@ -123,7 +133,7 @@ impl SceneFile {
     }
 }
 
-/// Whether there is such a file; if not, which one was meant.
+/// Checks that a file exists; otherwise the message suggests a similar name.
 fn there(assets: &Path, file: &str) -> Result<(), String> {
     let path = assets.join(file);
     if path.exists() {

@@ -1,4 +1,4 @@
-//! The session that a scene asks for, and the guest that it may have beside its host.
+//! The session that a scene asks for, and the optional guest beside its host.
 
 use std::{
     collections::HashMap,
@@ -36,7 +36,9 @@ fn emulation(link: &Option<String>, seed: u64) -> Option<Emulation> {
     Some(Emulation::preset(Preset::by_name(link.as_deref()?)?, seed))
 }
 
-/// Where a host or a peer listens: one that others reach lets in only who has the invite.
+/// Returns the options of a host's or a peer's socket.
+///
+/// An address that other machines can reach accepts only guests with the invite's token.
 fn options(
     listen: &Option<String>,
     link: &Option<String>,
@@ -79,11 +81,12 @@ pub(super) fn open(file: &SceneFile, entry: &NetworkEntry) -> Result<Opened, Sce
     Ok(Opened { net: net.map_err(|error| failed(&error))?, guest })
 }
 
-/// What the guest shows, body by body.
+/// The visual state of the guest: the modal coordinates, and the pose of a free body, per body
+/// name.
 #[derive(Resource, Clone, Default)]
 struct Seen(Arc<Mutex<HashMap<String, (Vec<f64>, Option<Pose>)>>>);
 
-/// The guest beside the host. It ends with the app.
+/// The thread of the guest beside the host, which ends with the app.
 #[derive(Resource)]
 struct GuestThread {
     stop: Arc<AtomicBool>,
@@ -123,7 +126,7 @@ pub(super) fn build(app: &mut App, opened: Opened, file: &SceneFile) {
     app.insert_resource(seen).add_systems(Update, (lend, show));
 }
 
-/// The guest's app, on its own thread.
+/// Runs the guest's app on its own thread.
 fn run_guest(
     invite: &Invite,
     guest: GuestEntry,
@@ -133,7 +136,8 @@ fn run_guest(
     stop: Arc<AtomicBool>,
 ) -> Result<(), crate::net::NetError> {
     let transport = JoinOptions { emulation: emulation(&guest.link, guest.seed), ..default() };
-    // What takes long over a poor network is the model. One that cannot be read here is sent.
+    // The model is the largest transfer over a poor network, so the guest reads it from the disk.
+    // The host sends a model that cannot be read here.
     let mut paths: Vec<PathBuf> =
         file.scene().bodies.iter().filter_map(|body| Some(root.join(body.model.as_ref()?))).collect();
     paths.sort();
@@ -160,7 +164,7 @@ fn run_guest(
     Ok(())
 }
 
-/// In the guest: what is on its screen.
+/// Publishes the visual states of the guest; runs in the guest's app.
 fn tell(seen: Res<Seen>, bodies: Query<(&Name, &VisualState, &BodyState, &Transform), With<SceneBody>>) {
     let mut seen = seen.0.lock().unwrap_or_else(PoisonError::into_inner);
     for (name, shown, state, place) in &bodies {
@@ -175,17 +179,17 @@ fn tell(seen: Res<Seen>, bodies: Query<(&Name, &VisualState, &BodyState, &Transf
     }
 }
 
-/// A body as the guest shows it.
+/// A body of the host's app that shows the guest's visual state.
 #[derive(Component)]
 pub(super) struct GuestsView {
     name: String,
     beside: DVec3,
     settings: ModalBody,
-    /// Where a free one was shown last.
+    /// The last shown pose of a free body.
     pose: Option<Pose>,
 }
 
-/// The guest's bodies, in the host's app.
+/// Spawns the views of the guest's bodies in the host's app.
 pub(super) fn spawn_views(world: &mut World, instance: Entity, file: &SceneFile, place: GlobalTransform) {
     let scene = file.scene();
     let Some(NetworkEntry::Host { guest: Some(guest), .. }) = &scene.network else { return };
@@ -207,7 +211,7 @@ pub(super) fn spawn_views(world: &mut World, instance: Entity, file: &SceneFile,
                 .id();
             #[cfg(feature = "render")]
             if let Some(mut materials) = world.get_resource_mut::<Assets<StandardMaterial>>() {
-                // A cooler shade of the same, so that nobody takes it for the truth.
+                // A cooler shade of the same color tells the guest's view from the host's body.
                 let [r, g, b] = body.color.map(|part| part as f32);
                 let material = materials.add(StandardMaterial {
                     base_color: Color::srgb(0.45 * r + 0.05, 0.45 * g + 0.20, 0.45 * b + 0.45),
@@ -222,7 +226,7 @@ pub(super) fn spawn_views(world: &mut World, instance: Entity, file: &SceneFile,
     }
 }
 
-/// What the guest shows is of the host's model, loaded or baked, as soon as there is one.
+/// Gives each view of the guest the host's model, loaded or baked, once the host's body has it.
 fn lend(
     mut commands: Commands,
     bodies: Query<(&Name, &PartOf, &ModalBody), (With<SceneBody>, Added<BodyState>)>,
@@ -241,7 +245,7 @@ fn show(seen: Res<Seen>, mut views: Query<(&mut GuestsView, &mut VisualState)>) 
         let Some((q, pose)) = seen.get(&view.name).filter(|(q, _)| q.len() == shown.q().len()) else {
             continue;
         };
-        // One that rests is not drawn, uploaded and recorded anew.
+        // A resting body must not be drawn, uploaded and recorded again.
         if shown.current() == q.as_slice() && view.pose == *pose {
             continue;
         }

@@ -1,4 +1,4 @@
-//! The plugin: scene files as assets, and whole scenes with what they need of an app.
+//! The plugin: scene files as assets, and apps that are built for one scene.
 
 use std::path::PathBuf;
 #[cfg(feature = "net")]
@@ -14,12 +14,18 @@ use super::needs::compiled;
 use super::{SceneError, SceneFailed, SceneFile, SceneFileLoader, SceneInstance, hands, spawn};
 use crate::body::PliantSystems;
 
-/// Scene files as assets; add it after [`PliantPlugins`](crate::PliantPlugins).
+/// Loads scene files as assets. Add it after [`PliantPlugins`](crate::PliantPlugins).
 ///
-/// By `default()` it only makes what a [`SceneInstance`] asks for: bodies and hands; baked bodies where the app has a `BakePlugin`, tools where it has a
-/// `HapticsPlugin`. A `network` and a `recording` are not opened then, which the message [`SceneFailed`] says, and the rest of the scene is there: an app
-/// has one session and one recording, from when it is built. Where the game has its own, the scene's bodies are in them, those that are `shared` in the
-/// session. A scene that is [opened](Self::open) is there from the start, with the session, the device and the recording that it asks for.
+/// The `default()` plugin spawns the bodies and the hands of each [`SceneInstance`]. Baked bodies
+/// need a `BakePlugin` in the app, and tools need a `HapticsPlugin`.
+///
+/// The default plugin does not open a `network` or a `recording`, because an app has one session
+/// and one recording, which are set up when the app is built. It sends [`SceneFailed`] for each of
+/// them and spawns the rest of the scene. If the game has its own session and recording, the bodies
+/// of the scene appear in them; in the session, only those that are `shared`.
+///
+/// A scene that is [opened](Self::open) exists from the start of the app, with the session, the
+/// device and the recording that it asks for.
 ///
 /// ```no_run
 /// use bevy::prelude::*;
@@ -40,15 +46,15 @@ pub struct SceneFilePlugin {
     invite: Option<crate::net::Invite>,
 }
 
-/// Whose an instance is.
+/// The owner of an instance.
 #[derive(Component, Debug, Default, Clone, Copy, PartialEq, Eq)]
 pub(super) enum Role {
-    /// A game's, which has its own session and recording, or none.
+    /// A game that has its own session and recording, or none.
     #[default]
     Asset,
-    /// The app was built for it.
+    /// An app that was built for the scene.
     Opened,
-    /// It is what the guest beside a host has.
+    /// The guest beside a host.
     Guest,
 }
 
@@ -61,7 +67,7 @@ pub(super) enum Role {
 pub(super) struct AssetRoot(pub(super) PathBuf);
 
 impl Default for SceneFilePlugin {
-    /// Scenes are loaded by the game; their hands move in `FixedUpdate`.
+    /// Creates a plugin for scenes that the game loads; their hands move in `FixedUpdate`.
     fn default() -> Self {
         Self {
             schedule: FixedUpdate.intern(),
@@ -76,18 +82,24 @@ impl Default for SceneFilePlugin {
 }
 
 impl SceneFilePlugin {
-    /// The app is for this scene: the session is opened now, so that its invite is known before the app runs; the device and the recording with
-    /// the app.
+    /// Creates a plugin for an app that plays one scene.
+    ///
+    /// The session is opened at once, so that its invite is known before the app runs. The device
+    /// and the recording are opened with the app.
     ///
     /// # Errors
-    /// [`SceneErrorKind::Feature`](super::SceneErrorKind::Feature) when the program was compiled without what the scene asks for, [`SceneErrorKind::Open`](super::SceneErrorKind::Open) when the session's
-    /// socket or the recording's file cannot be opened. The other files that it names are read with the app ([`SceneFailed`]);
-    /// [`SceneFile::check_files`] reads them before.
+    /// Returns [`SceneErrorKind::Feature`](super::SceneErrorKind::Feature) if the program was
+    /// compiled without a feature that the scene needs, and
+    /// [`SceneErrorKind::Open`](super::SceneErrorKind::Open) if the session's socket or the
+    /// recording's file cannot be opened. The other files of the scene are read when the app runs,
+    /// and their errors are sent as [`SceneFailed`]; [`SceneFile::check_files`] reads them
+    /// beforehand.
     pub fn open(file: SceneFile) -> Result<Self, SceneError> {
         if let Some(lacking) = file.lacking(compiled).into_iter().next() {
             return Err(lacking);
         }
-        // Before the session: nobody is invited to a scene that is not played.
+        // The recording is checked before the session opens, so that no invite is given for a scene
+        // that is not played.
         if let Some(error) = file.recording_writable(true) {
             return Err(error);
         }
@@ -105,19 +117,19 @@ impl SceneFilePlugin {
         })
     }
 
-    /// What a guest beside the host has of the scene.
+    /// Creates a plugin for the part of the scene that a guest beside the host has.
     #[cfg(feature = "net")]
     pub(super) fn guest(file: SceneFile) -> Self {
         Self { role: Role::Guest, file: Some(file), ..Self::default() }
     }
 
-    /// The schedule in which the bodies are stepped, where it is not `FixedUpdate`.
+    /// Sets the schedule in which the bodies are stepped. Default: `FixedUpdate`.
     pub fn in_schedule(mut self, schedule: impl ScheduleLabel) -> Self {
         self.schedule = schedule.intern();
         self
     }
 
-    /// What others paste to join a scene that hosts or is a peer.
+    /// Returns the invite of a scene that hosts or is a peer; others use it to join.
     #[cfg(feature = "net")]
     pub fn invite(&self) -> Option<&crate::net::Invite> {
         self.invite.as_ref()
@@ -183,7 +195,7 @@ impl Plugin for SceneFilePlugin {
 
 #[cfg(feature = "rerun")]
 impl SceneFilePlugin {
-    /// Adds the recording that the scene asks for; returns what keeps it from being made.
+    /// Adds the recording that the scene asks for; returns the error if the recording is not made.
     fn record(&self, app: &mut App, file: &SceneFile) -> Option<SceneError> {
         use super::{SceneErrorKind, locate::Step::Field};
         use crate::rerun::{RerunPlugin, RerunRecording};
@@ -197,7 +209,7 @@ impl SceneFilePlugin {
             );
         }
         app.add_plugins(recording.plugin(&scene.title).in_schedule(self.schedule));
-        // There while something records.
+        // The resource exists only while a recording is active.
         if app.world().contains_resource::<RerunRecording>() {
             return None;
         }

@@ -4,7 +4,7 @@ use super::{ColorEntry, RecordingEntry};
 use crate::rerun::{RerunColor, RerunPlugin, RerunRecording};
 
 impl RecordingEntry {
-    /// The plugin, not yet in an app.
+    /// Returns the plugin for the recording; the caller adds it to an app.
     pub(super) fn plugin(&self, title: &str) -> RerunPlugin {
         let plugin = match (&self.file, self.viewer) {
             (Some(file), true) => RerunPlugin::both(file),
@@ -16,7 +16,7 @@ impl RecordingEntry {
         plugin.with_application(name).with_rates(self.rates())
     }
 
-    /// How often what is recorded.
+    /// Returns how often each kind of data is recorded.
     fn rates(&self) -> RerunRecording {
         RerunRecording {
             on: true,

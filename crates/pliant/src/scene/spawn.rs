@@ -1,4 +1,4 @@
-//! A scene becomes entities: bodies, hands, tools.
+//! Spawns the entities of a scene: bodies, hands and tools.
 
 use bevy::{asset::AssetLoadFailedEvent, math::DVec3, prelude::*};
 
@@ -10,8 +10,11 @@ use super::plugin::Role;
 use super::{BodyEntry, By, NetworkEntry, SceneError, SceneErrorKind, SceneFile, TransformEntry};
 use crate::body::{BodyRefused, BodyState, ModalAsset, ModalBody, NoPointerGrab};
 
-/// A scene in the world: spawn it, and the scene's bodies, hands and tools come as soon as the file is loaded, where this entity is. They are
-/// its [`SceneParts`] and go with it. When the file changes (Bevy's `file_watcher`), all of them are made anew.
+/// A scene in the world.
+///
+/// Spawn this component, and the bodies, hands and tools of the scene are spawned at the transform
+/// of this entity once the file is loaded. They are its [`SceneParts`] and are despawned with it.
+/// When the file changes (Bevy's `file_watcher`), all parts are despawned and spawned again.
 ///
 /// ```
 /// # use bevy::prelude::*;
@@ -24,70 +27,76 @@ use crate::body::{BodyRefused, BodyState, ModalAsset, ModalBody, NoPointerGrab};
 #[require(Transform, Visibility, SceneClock)]
 pub struct SceneInstance(pub Handle<SceneFile>);
 
-/// The clock of a [`SceneInstance`]'s scripts: it begins when all bodies of the scene are there.
+/// The clock of a [`SceneInstance`]'s scripts, which starts when all bodies of the scene exist.
 #[derive(Component, Debug, Default, Clone, Copy, PartialEq)]
 pub struct SceneClock {
     pub(super) began: Option<f64>,
 }
 
 impl SceneClock {
-    /// Seconds since it began at `now`, the elapsed time of the schedule that the bodies are stepped in. `None`: not all bodies are there.
+    /// Returns the seconds between the start of the clock and `now`.
+    ///
+    /// `now` is the elapsed time of the schedule in which the bodies are stepped. The result is
+    /// `None` until all bodies exist.
     pub fn at(&self, now: f64) -> Option<f64> {
         self.began.map(|began| (now - began).max(0.0))
     }
 }
 
-/// The [`SceneInstance`] that an entity is of.
+/// The [`SceneInstance`] that an entity belongs to.
 #[derive(Component, Debug, Clone, Copy, PartialEq, Eq)]
 #[relationship(relationship_target = SceneParts)]
 pub struct PartOf(#[entities] pub Entity);
 
-/// What a [`SceneInstance`] has made. Despawned with it.
+/// The entities that a [`SceneInstance`] has spawned; they are despawned with it.
 #[derive(Component, Debug, Default)]
 #[relationship_target(relationship = PartOf, linked_spawn)]
 pub struct SceneParts(Vec<Entity>);
 
 impl SceneParts {
-    /// The entities: bodies, hands, tools.
+    /// Returns the entities: bodies, hands and tools.
     pub fn entities(&self) -> &[Entity] {
         &self.0
     }
 }
 
-/// A body of a scene; its `Name` is the entry's.
+/// A body of a scene. Its `Name` is the name of the entry.
 #[derive(Component, Debug, Clone, Copy, PartialEq, Eq)]
 pub struct SceneBody {
-    /// Its entry in [`SceneDescription::bodies`](super::SceneDescription::bodies).
+    /// Index of the body's entry in [`SceneDescription::bodies`](super::SceneDescription::bodies).
     pub entry: usize,
 }
 
-/// Sent, and logged, when a scene cannot be read, something that it names is not there, or the app lacks what it asks for. What else is in it goes on: the
-/// other bodies, and the hands on them.
+/// A part of a scene that failed; sent as a message and logged.
+///
+/// The cause is a scene that cannot be read, a missing file or object that the scene names, or a
+/// feature that the app lacks. The other bodies and the hands on them are not affected.
 #[derive(Message, Debug, Clone)]
 pub struct SceneFailed {
     /// The entity of the [`SceneInstance`].
     pub instance: Entity,
-    /// Where in the file, and what was expected.
+    /// The position in the file and what was expected.
     pub error: SceneError,
 }
 
-/// What a part of a scene was made from, to say where in the file a mistake is.
+/// The file and the path of the entry that a part was made from, for the position of errors.
 #[derive(Component, Debug, Clone)]
 pub(super) struct Source {
     pub(super) file: SceneFile,
     pub(super) path: Vec<Step>,
 }
 
-/// The model of a body that a host will send, so that it is known here.
+/// Keeps the model of a body that the host will send loaded, so that the host need not send the
+/// model.
 #[derive(Component)]
 #[expect(dead_code, reason = "held, so that the asset stays")]
 struct Kept(Handle<ModalAsset>);
 
-/// The file that an instance was made from.
+/// Marks an instance whose parts were spawned.
 #[derive(Component)]
 pub(super) struct Made;
 
-/// A body that does not come; nobody waits for it.
+/// Marks a body that failed to load or bake, so that the scene's clock does not wait for it.
 #[derive(Component)]
 pub(super) struct Lost;
 
@@ -96,7 +105,7 @@ pub(super) fn fail(world: &mut World, instance: Entity, error: SceneError) {
     world.write_message(SceneFailed { instance, error });
 }
 
-/// Instances whose file is there, or has changed, are made.
+/// Builds the instances whose file was loaded or has changed.
 pub(super) fn make(
     mut commands: Commands,
     mut changes: MessageReader<AssetEvent<SceneFile>>,
@@ -117,7 +126,7 @@ pub(super) fn make(
     }
 }
 
-/// A file that cannot be read, and models that are not there.
+/// Reports scene files and models that fail to load.
 pub(super) fn watch(
     mut commands: Commands,
     mut scenes: MessageReader<AssetLoadFailedEvent<SceneFile>>,
@@ -127,7 +136,7 @@ pub(super) fn watch(
 ) {
     for failed in scenes.read() {
         for (instance, _) in instances.iter().filter(|(_, handle)| handle.0.id() == failed.id) {
-            // The loader's own error is the one with the line.
+            // The error of the loader has the line and the column.
             let message = failed.error.to_string();
             let error = match &failed.error {
                 bevy::asset::AssetLoadError::AssetLoaderError(inner) => {
@@ -147,7 +156,7 @@ pub(super) fn watch(
             bodies.iter().filter(|(.., body, _)| body.model.id() == failed.id)
         {
             commands.entity(entity).try_insert(Lost);
-            // Once for all copies.
+            // One report covers all copies.
             if told.contains(&(part.0, body.entry)) {
                 continue;
             }
@@ -165,7 +174,7 @@ pub(super) fn watch(
     }
 }
 
-/// Bodies whose settings are refused.
+/// Reports bodies whose settings are refused.
 pub(super) fn watch_settings(
     mut commands: Commands,
     mut refused: MessageReader<BodyRefused>,
@@ -175,7 +184,7 @@ pub(super) fn watch_settings(
     for refused in refused.read() {
         let Ok((part, name, source)) = bodies.get(refused.entity) else { continue };
         commands.entity(refused.entity).try_insert(Lost);
-        // Once for all copies.
+        // One report covers all copies.
         if told.contains(&(part.0, &source.path)) {
             continue;
         }
@@ -187,7 +196,7 @@ pub(super) fn watch_settings(
     }
 }
 
-/// Bodies that cannot be baked.
+/// Reports bodies that fail to bake.
 #[cfg(feature = "bake")]
 pub(super) fn watch_bakes(
     mut commands: Commands,
@@ -205,7 +214,7 @@ pub(super) fn watch_bakes(
     }
 }
 
-/// The scripts' time begins when everybody is there who comes.
+/// Starts the clocks of the scripts once every body of the scene exists or has failed.
 pub(super) fn begin(
     time: Res<Time>,
     mut instances: Query<(&mut SceneClock, &SceneParts), With<Made>>,
@@ -222,13 +231,13 @@ pub(super) fn begin(
 
 fn build(world: &mut World, instance: Entity, file: &SceneFile) {
     let Ok(mut entity) = world.get_entity_mut(instance) else { return };
-    // A scene that is made anew.
+    // The file has changed and the scene is built again.
     entity.despawn_related::<SceneParts>();
     entity.insert((Made, SceneClock::default()));
     let place = entity.get::<GlobalTransform>().copied().unwrap_or_default();
     let role = entity.get::<Role>().copied().unwrap_or_default();
     let scene = file.scene();
-    // What a game that loads the scene as it goes does not get; an app that was built for it has it, or was refused.
+    // An app that was built for the scene has these plugins, or `SceneFilePlugin::open` has failed.
     if role == Role::Asset {
         for error in not_in_a_game(file) {
             fail(world, instance, error);
@@ -266,7 +275,7 @@ fn build(world: &mut World, instance: Entity, file: &SceneFile) {
     }
 }
 
-/// What the scene asks for and only an app that was built for it has.
+/// Returns an error for each request of the scene that only an app built for it can meet.
 fn not_in_a_game(file: &SceneFile) -> Vec<SceneError> {
     let scene = file.scene();
     let mut errors = file.lacking(compiled);
@@ -283,7 +292,7 @@ fn not_in_a_game(file: &SceneFile) -> Vec<SceneError> {
     errors
 }
 
-/// Whether a body of a scene is the host's: what a guest has comes from there.
+/// Returns whether the host owns a body, so that the body arrives over the session.
 fn is_hosts(world: &World, file: &SceneFile, role: Role, body: &BodyEntry) -> bool {
     let scene = file.scene();
     let shared = body.shared.unwrap_or(scene.network.is_some());
@@ -291,7 +300,7 @@ fn is_hosts(world: &World, file: &SceneFile, role: Role, body: &BodyEntry) -> bo
     match role {
         Role::Guest => true,
         Role::Opened => joins,
-        // In the session of the game, if it is a guest in one.
+        // The session belongs to the game. The host owns the body only if the game is a guest.
         #[cfg(feature = "net")]
         Role::Asset => joins && world.contains_resource::<crate::net::NetGuest>(),
         #[cfg(not(feature = "net"))]
@@ -302,7 +311,7 @@ fn is_hosts(world: &World, file: &SceneFile, role: Role, body: &BodyEntry) -> bo
     }
 }
 
-/// Refuses a body that would never come, with what is to be said about it if nobody has said it yet.
+/// Refuses a body that can never be made; the error is `None` if the cause was reported elsewhere.
 fn can_be_made(
     world: &World,
     file: &SceneFile,
@@ -312,7 +321,7 @@ fn can_be_made(
     if is_hosts(world, file, role, body) || body.model.is_some() {
         return Ok(());
     }
-    // It would have come from a host; that there is none has been said.
+    // The body would arrive from a host. The missing session was reported already.
     if body.bake.is_none() {
         return Err(None);
     }
@@ -361,7 +370,7 @@ fn spawn_body(
     if let Some(model) = body.model.clone() {
         let Some(assets) = world.get_resource::<AssetServer>() else { return };
         let model = assets.load(model);
-        // A model that is here need not be sent.
+        // A model that is loaded here need not be sent.
         let mut made = world.entity_mut(id);
         if guest {
             made.insert(Kept(model))
@@ -382,7 +391,7 @@ fn spawn_body(
             poisson: bake.poisson,
             density: bake.density,
             damping: Damping::Ratio(bake.damping_ratio),
-            // They were read before, by the check.
+            // The check of the scene has parsed these anchors before.
             anchors: bake.anchors.iter().filter_map(|anchor| anchor.parse::<Anchor>().ok()).collect(),
             ..default()
         };
@@ -403,7 +412,7 @@ fn spawn_body(
 }
 
 impl TransformEntry {
-    /// As Bevy has it: turned about x, then y, then z.
+    /// Returns the transform for Bevy, with rotations about x, then y, then z.
     pub fn transform(&self) -> Transform {
         let [x, y, z] = self.turn.map(|degrees| degrees.to_radians() as f32);
         Transform {
@@ -415,7 +424,7 @@ impl TransformEntry {
 }
 
 impl BodyEntry {
-    /// Where its copy of this number is, in the scene.
+    /// Returns the transform of one copy in the scene.
     pub fn transform(&self, copy: usize) -> Transform {
         let mut place = self.place.transform();
         if let Some(copies) = self.copies {
@@ -429,7 +438,7 @@ impl BodyEntry {
         place
     }
 
-    /// Its settings, without a model.
+    /// Returns the settings of the body, without a model.
     pub(super) fn modal(&self) -> ModalBody {
         let defaults = ModalBody::default();
         ModalBody {

@@ -1,11 +1,11 @@
-//! What the parser refuses, in words that a person who writes a scene knows.
+//! Turns the errors of the RON parser into messages for people who write scenes.
 
 use ron::{Error, error::SpannedError};
 
 use super::error::nearest;
 use super::{SceneError, SceneErrorKind};
 
-/// What the parser refused, in words.
+/// Returns the parser's error as a scene error with a readable message.
 pub(super) fn refused(origin: &str, text: &str, error: &SpannedError) -> SceneError {
     let start = error.span.start;
     let inside =
@@ -48,7 +48,9 @@ pub(super) fn refused(origin: &str, text: &str, error: &SpannedError) -> SceneEr
     SceneError::at_position(origin, text, (start.line, start.col), kind, message)
 }
 
-/// The text from a line and a column on, both from 1; with the sign that was read before a number was refused.
+/// Returns the text from a line and a column on, both from 1.
+///
+/// The result includes the minus sign that the parser has read before it refused a number.
 fn after(text: &str, line: usize, column: usize) -> &str {
     let begin: usize = text.split_inclusive('\n').take(line.saturating_sub(1)).map(str::len).sum();
     let rest = text.get(begin..).unwrap_or_default();
@@ -57,10 +59,10 @@ fn after(text: &str, line: usize, column: usize) -> &str {
     rest.get(skipped..).unwrap_or_default()
 }
 
-/// What was expected, and what stands there instead.
+/// Returns what was expected and what the text has instead.
 fn in_words(error: &Error, rest: &str) -> String {
     let expected = match error {
-        // A number was read up to its point.
+        // The parser has read the number up to its decimal point.
         Error::ExpectedComma if rest.starts_with('.') => "expected a whole number",
         Error::ExpectedComma => "expected a comma or a closing bracket",
         Error::ExpectedFloat => "expected a number",
@@ -78,7 +80,7 @@ fn in_words(error: &Error, rest: &str) -> String {
         Error::ExpectedMapColon => "expected a colon after the field's name",
         Error::ExpectedIdentifier => "expected a name",
         Error::Eof => return "the file ends too early; expected a value or a closing bracket".into(),
-        // Some repeat what they found, however long that is.
+        // Some errors repeat the text that they found, which can be very long.
         other => return other.to_string().chars().take(400).collect(),
     };
     let rest = rest.trim_start();

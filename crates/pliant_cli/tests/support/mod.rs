@@ -1,10 +1,10 @@
-//! The program, run in a folder of its own.
+//! Runs the program in a folder of its own.
 #![allow(dead_code, clippy::unwrap_used, reason = "each test file uses its part; a failed test should panic")]
 
 use std::path::PathBuf;
 use std::process::{Command, Output};
 
-/// A folder of its own for each test, gone at the end.
+/// A folder for one test, removed at the end.
 pub struct Folder(pub PathBuf);
 
 impl Folder {
@@ -23,7 +23,7 @@ impl Folder {
         self.file(name)
     }
 
-    /// Names of the files in it.
+    /// Names of the files in the folder.
     pub fn names(&self) -> Vec<String> {
         let mut names: Vec<String> = std::fs::read_dir(&self.0)
             .unwrap()
@@ -40,7 +40,7 @@ impl Drop for Folder {
     }
 }
 
-/// The program without a user's cache: every bake is a bake.
+/// The program without a user's cache, so that every bake really runs.
 pub fn program() -> Command {
     let mut command = Command::new(env!("CARGO_BIN_EXE_pliant"));
     for name in ["HOME", "XDG_CACHE_HOME", "LOCALAPPDATA"] {
@@ -59,7 +59,7 @@ pub fn succeeds(arguments: &[&str]) -> String {
     told
 }
 
-/// What it says on stdout and on stderr.
+/// Returns the output on stdout and on stderr.
 pub fn succeeds_with_a_word(arguments: &[&str]) -> (String, String) {
     let output = pliant(arguments);
     let message = String::from_utf8_lossy(&output.stderr).into_owned();
@@ -67,7 +67,7 @@ pub fn succeeds_with_a_word(arguments: &[&str]) -> (String, String) {
     (String::from_utf8(output.stdout).unwrap(), message)
 }
 
-/// Exit code 2, nothing on stdout, the message on stderr.
+/// Expects exit code 2 and no output on stdout. Returns the message on stderr.
 pub fn refused(arguments: &[&str]) -> String {
     let output = pliant(arguments);
     let message = String::from_utf8(output.stderr).unwrap();

@@ -1,6 +1,8 @@
-//! Streaming measured: one body, scripted hands, an emulated path, and the figures of what a guest was shown.
+//! Measures streaming: one body, scripted hands, an emulated path, and metrics of the guest's
+//! visual state.
 //!
-//! All in virtual time: ten minutes of a session take seconds, and the same seed gives the same figures and the same hash.
+//! Everything runs in virtual time. Ten minutes of a session take seconds, and the same seed gives
+//! the same metrics and the same hash.
 
 mod peers;
 mod run;
@@ -19,53 +21,58 @@ use crate::pair::{Pair, PathConfig};
 use run::Run;
 use shape_error::ShapeError;
 
-/// Shown error above which a body counts as not recovered, share of the largest displacement.
+/// Visual error above which a body counts as not recovered, as a share of the largest displacement.
 const RECOVERED: f64 = 0.005;
 
-/// What to measure.
+/// Settings of a measurement.
 #[derive(Debug, Clone)]
 pub struct Experiment {
     /// The body.
     pub model: Arc<ModalModel>,
-    /// How the guest repairs.
+    /// The guest's loss recovery.
     pub recovery: RecoveryConfig,
-    /// The path down, where frames travel.
+    /// The path from host to guest, which carries frames.
     pub down: LinkConfig,
-    /// The path up, where NACKs and targets travel.
+    /// The path from guest to host, which carries NACKs and targets.
     pub up: LinkConfig,
     /// Steps a second. Default: 40.
     pub rate: f64,
-    /// How long, s, after the guest has joined. Default: 30.
+    /// Measured time after the guest has joined, s. Default: 30.
     pub seconds: f64,
-    /// Default: 1.
+    /// Seed of the links. Default: 1.
     pub seed: u64,
-    /// Modes streamed. Default: all.
+    /// Number of streamed modes. Default: all.
     pub modes: Option<u16>,
     /// The host's integrator. Default: exact.
     pub integrator: Integrator,
-    /// A material that relaxes. Default: none, elastic.
+    /// Relaxation of the material. Default: none, elastic.
     pub relaxation: Option<Relaxation>,
-    /// The filter of acceleration streams; its `h` is taken from `rate`. Default: beta 4/9, gamma 5/6.
+    /// The filter of acceleration streams. Its `h` is taken from `rate`. Default: beta 4/9, gamma
+    /// 5/6.
     pub newmark: Newmark,
-    /// Answer NACKs only so much later. Default: at once.
+    /// Delay before the host answers a NACK. Default: none.
     pub resend_after: Duration,
-    /// The body moves for so long before the path is let loose on the stream; scheduled losses count from then on.
-    /// Default: 2 s.
+    /// Time for which the body moves before the down path gets its loss and jitter. Scheduled
+    /// losses count from the end of this time. Default: 2 s.
     pub warmup: Duration,
-    /// Hands, scripted. Default: [`Experiment::default_hands`].
+    /// The scripted hands. Default: [`Experiment::default_hands`].
     pub hands: Vec<Hand>,
-    /// [`HostConfig::quantum`]. Default: 2^-14.
+    /// See [`HostConfig::quantum`]. Default: 2^-14.
     pub quantum: f64,
-    /// A clock for the time that decoding, correcting and stepping take; `None` leaves [`Metrics::cpu_us_per_tick`] 0.
+    /// Clock for the time that decoding, correcting and stepping take. `None` leaves
+    /// [`Metrics::cpu_us_per_tick`] at 0.
     pub cpu_clock: Option<fn() -> Duration>,
-    /// The guest holds the body, too, where the first hand does, and sends its target every tick: for counting what goes up. The host does not
-    /// act on it, so what is shown is not compared with anything then: the errors mean nothing. Default: false.
+    /// The guest also holds the body, where the first hand does, and sends its target every tick.
+    /// This measures the traffic from guest to host. The host does not act on the hand, so the
+    /// errors are meaningless then. Default: false.
     pub guest_hand: bool,
-    /// Keep the shown and true position of the first hand's patch, tick by tick, for plots. Default: false.
+    /// Keep the visual and true position of the first hand's patch per tick, for plots. Default:
+    /// false.
     pub keep_track: bool,
 }
 
-/// A scripted hand: it circles about where it took hold on a smooth path that never repeats, and trembles a little.
+/// A scripted hand. It circles about the start of its grab on a smooth path that never repeats,
+/// with a small tremor.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Hand {
     /// Center of the patch.
@@ -74,19 +81,19 @@ pub struct Hand {
     pub radius: f64,
     /// Largest distance from the start along each axis, m.
     pub reach: [f64; 3],
-    /// Slowest frequency, Hz; the path adds two more at 1.618 and 2.414 times it.
+    /// Lowest frequency, Hz. The path adds two more at 1.618 and 2.414 times this frequency.
     pub frequency: f64,
-    /// Size of the tremor that every hand has, m: 9.3 and 11.7 Hz on top of the path.
+    /// Amplitude of the tremor, m: 9.3 and 11.7 Hz on top of the path.
     pub tremor: f64,
-    /// When it takes hold and lets go, s since the start; `None`: all the time.
+    /// Start and end of the grab, s since the start. `None` means all the time.
     pub holds: Option<(f64, f64)>,
 }
 
 impl Hand {
-    /// Displacement of the hand from where it took hold, m, at a time since then, s.
+    /// Displacement of the hand from the start of its grab, m, `t` seconds after it.
     pub fn path(&self, t: f64) -> [f64; 3] {
         let w = std::f64::consts::TAU * self.frequency * t;
-        // Starts from rest: the ramp has no corner.
+        // The ramp starts from rest and is smooth.
         let ramp = 1.0 - (-(t * 2.0).powi(2)).exp();
         let wave = |phase: f64| {
             (0.5 * (w + phase).sin() + 0.3 * (1.618 * w + 2.0 * phase).sin() + 0.2 * (2.414 * w).sin()) * ramp
@@ -100,69 +107,74 @@ impl Hand {
     }
 }
 
-/// What a run showed. Percentages are of the largest true displacement (reactions: of the largest true reaction).
+/// Results of a run. Percentages are relative to the largest true displacement, or for reactions to
+/// the largest true reaction.
 #[derive(Debug, Clone, PartialEq, Default, serde::Serialize)]
 pub struct Metrics {
-    /// Ticks that the guest was shown.
+    /// Ticks that the guest showed.
     pub ticks: u64,
-    /// Ticks that it was not shown in time: the picture stood still, or went past them. In the errors each counts as the picture that stood in its
-    /// place, against the truth of that tick. Between peers, which step on time by themselves, always 0.
+    /// Ticks that the guest did not show in time, because its state stood still or skipped them. In
+    /// the errors, each of these ticks compares the last visual state with the true state of that
+    /// tick. Always 0 between peers, which step on time by themselves.
     pub missing: u64,
     /// Frames that the path lost.
     pub lost: u64,
-    /// Ticks that were stepped on a guess.
+    /// Ticks that were stepped with a prediction.
     pub guessed: u64,
-    /// Of these the ones put right later.
+    /// Predicted ticks that were corrected later.
     pub recovered: u64,
-    /// Shown error, root mean square over ticks (the missing ones too) and places.
+    /// Visual error, root mean square over all ticks (including missing ones) and compared
+    /// vertices.
     pub rms_percent: f64,
-    /// Shown error, largest.
+    /// Largest visual error.
     pub max_percent: f64,
-    /// Shown error at the last tick, shown or missing.
+    /// Visual error at the last tick, shown or missing.
     pub end_percent: f64,
-    /// Hidden error at the last tick.
+    /// Error of the confirmed state at the last tick.
     pub hidden_end_percent: f64,
-    /// Error of the shown reactions, root mean square.
+    /// Error of the visual reactions, root mean square.
     pub force_rms_percent: f64,
-    /// max |second difference| / max |reaction| of the shown reaction.
+    /// Largest second difference of the visual reaction, as a share of the largest true reaction.
     pub force_ringing: f64,
-    /// The same of the true reaction.
+    /// Largest second difference of the true reaction, as a share of the largest true reaction.
     pub true_ringing: f64,
-    /// From a hand's motion to the force that answers it, ms; reckoned, not timed. Where the policy owns the model it is one
-    /// tick by construction (the guest's own copy answers at its next step, see [`pliant_stream::BodyView::predicted_hand`]), else the round trip and the delays on the way.
+    /// Time from a hand's motion to the force that answers it, ms, computed and not timed. If the
+    /// policy owns the model, this is one tick by construction: the guest's own copy answers at its
+    /// next step (see [`pliant_stream::BodyView::predicted_hand`]). Otherwise it is half the round
+    /// trip, half a step and the mean visual delay.
     pub hand_to_force_ms: f64,
-    /// How far the shown tick lies behind its step at the host, ms, mean.
+    /// Mean time from the host's step to the showing of its tick, ms.
     pub shown_delay_ms: f64,
-    /// Longest time for which the shown error stayed above 0.5 %, ms.
+    /// Longest time for which the visual error stayed above 0.5 %, ms.
     pub recover_ms: f64,
-    /// Mean bytes of a datagram down.
+    /// Mean size of a datagram from host to guest, bytes.
     pub bytes_per_frame: f64,
-    /// Bits down in a second, datagrams without the transport's own bytes, kbit/s.
+    /// Data rate from host to guest, datagrams without the transport's own bytes, kbit/s.
     pub kbit_s: f64,
-    /// Mean bytes of a datagram up, and bits up in a second: kbit/s. Clock, loss reports and NACKs; targets only with
-    /// [`Experiment::guest_hand`].
+    /// Mean size of a datagram from guest to host, bytes. These carry the clock, loss reports and
+    /// NACKs, and targets only with [`Experiment::guest_hand`].
     pub bytes_per_datagram_up: f64,
-    /// See [`Metrics::bytes_per_datagram_up`].
+    /// Data rate from guest to host, kbit/s. See [`Metrics::bytes_per_datagram_up`].
     pub kbit_s_up: f64,
     /// Time for decoding, correcting and stepping a tick at the guest, us.
     pub cpu_us_per_tick: f64,
-    /// Everything shown and every fate on the path, in one number.
+    /// Hash of all visual states and of the outcome of every packet.
     pub hash: u64,
     /// NACKs sent.
     pub nacks: u64,
-    /// What became of the ticks.
+    /// Tick counts of the guest's receiver.
     pub counts: RepairCounts,
     /// Largest true displacement, m.
     pub scale: f64,
     /// Largest true reaction, N.
     pub force_scale: f64,
-    /// Tick, true and shown displacement of the first hand's patch along its largest reach, m; see
+    /// Tick, true and visual displacement of the first hand's patch along its largest reach, m. See
     /// [`Experiment::keep_track`].
     pub track: Vec<(u64, f64, f64)>,
 }
 
 impl Experiment {
-    /// A model over a path that is alike both ways, with everything else by default.
+    /// An experiment with a path that is the same both ways and defaults for everything else.
     pub fn new(model: Arc<ModalModel>, link: LinkConfig, recovery: RecoveryConfig) -> Self {
         Self {
             hands: Self::default_hands(&model),
@@ -186,8 +198,9 @@ impl Experiment {
         }
     }
 
-    /// Two hands that drag slowly: one where the first mode moves most, one at least 0.4 of the body's size away from it,
-    /// where the first mode moves most there. The largest speed is about a tenth of the body's size a second.
+    /// Two hands that drag slowly. The first holds where the first mode moves most. The second
+    /// holds at least 0.4 of the body's size away from it, where the first mode moves most there.
+    /// The largest speed is about a tenth of the body's size a second.
     pub fn default_hands(model: &ModalModel) -> Vec<Hand> {
         let positions = model.surface().positions();
         let size = model.size();
@@ -216,10 +229,11 @@ impl Experiment {
         hands
     }
 
-    /// Runs it.
+    /// Runs the experiment.
     ///
     /// # Errors
-    /// [`StreamError::Config`] for settings out of range, [`StreamError::Model`] when the body cannot be stepped.
+    /// Returns [`StreamError::Config`] for settings out of range, and [`StreamError::Model`] when
+    /// the body cannot be stepped.
     pub fn run(&self) -> Result<Metrics, StreamError> {
         let h = 1.0 / self.rate;
         let newmark = Newmark { h, ..self.newmark };
@@ -239,7 +253,8 @@ impl Experiment {
         let path = PathConfig { down: perfect, up: self.up.clone(), max_datagram: 1200 };
         pair.join_with(guest, path, self.seed, |s| s.add_cached_model(self.model.clone()))?;
         let mut run = Run::new(self, body, h);
-        // Joining happens on the same path without loss: what is measured is streaming.
+        // The down path loses nothing until the guest has joined, because only streaming is
+        // measured.
         let joined = self.down.delay * 8 + Duration::from_secs(1) + self.warmup;
         pair.run_until(joined, &mut run);
         run.begin(joined);
@@ -251,7 +266,7 @@ impl Experiment {
         let before = pair.host.stats(PeerId(1)).unwrap_or_default();
         let until = joined + Duration::from_secs_f64(self.seconds.clamp(0.1, 1e6));
         pair.run_until(until, &mut run);
-        // A guest that the host has let go has no counts any more.
+        // The host has no counts for a guest that it has disconnected.
         let after = pair.host.stats(PeerId(1)).unwrap_or(before);
         let guest = &pair.guests[0];
         run.end(until);

@@ -1,4 +1,5 @@
-//! Peer to peer measured: two peers, each with one of the scripted hands, and what the second is shown.
+//! Measures two peers: each has some of the scripted hands, and the metrics describe the second
+//! peer.
 
 use std::collections::BTreeMap;
 use std::time::Duration;
@@ -10,9 +11,9 @@ use pliant_stream::{Channel, PeerId, StreamError, Tick, UserId};
 
 use super::{BODY, Experiment, Metrics, RECOVERED, ShapeError, fold, norm};
 
-/// How often a peer's application looks at its session.
+/// Interval at which a peer's application updates its session.
 const LOOK: Duration = Duration::from_millis(5);
-/// Both have joined and hold by then.
+/// Time by which both peers have joined and hold the body.
 const SETTLED: Duration = Duration::from_secs(3);
 
 struct Seen {
@@ -22,13 +23,16 @@ struct Seen {
 }
 
 impl Experiment {
-    /// Runs the experiment between two equal peers instead of host and guest: the first peer has the first hand, the
-    /// second the others, and the path between them is `up` and `down`. Truth is what both agree on once all inputs are
-    /// known; the figures are of what the second was shown before that. `recovery`, `modes`, `newmark` and `resend_after`
-    /// play no part.
+    /// Runs the experiment between two equal peers instead of host and guest.
+    ///
+    /// The first peer has the first hand, the second the others, and `up` and `down` are the path
+    /// between them. The true state is what both agree on once all inputs are known. The metrics
+    /// describe what the second peer showed before that. `recovery`, `modes`, `newmark` and
+    /// `resend_after` have no effect.
     ///
     /// # Errors
-    /// [`StreamError::Config`] for settings out of range or a free body, [`StreamError::Model`].
+    /// Returns [`StreamError::Config`] for settings out of range, and [`StreamError::Model`] when
+    /// the body cannot be stepped.
     pub fn run_peers(&self, repair: Repair) -> Result<Metrics, StreamError> {
         let h = 1.0 / self.rate;
         let settings =
@@ -43,7 +47,7 @@ impl Experiment {
         peers[0].connect(Duration::ZERO, PeerId(1), UserId(2), 1200)?;
         peers[1].connect(Duration::ZERO, PeerId(0), UserId(1), 1200)?;
         let reliable = |l: &LinkConfig| LinkConfig { loss: Loss::None, keep_order: true, ..l.clone() };
-        // links[k]: what peer k says; datagrams, then messages.
+        // links[k] carries the output of peer k: datagrams, then messages.
         let mut links: [[Link; 2]; 2] = [
             [Link::new(self.down.clone(), self.seed), Link::new(reliable(&self.down), self.seed ^ 0x51)],
             [
@@ -108,7 +112,7 @@ impl Experiment {
                     links[k][channel].send(now, out.bytes.to_vec(), out.bytes.len());
                 }
             }
-            // What both know is true from now on: peer 1's own state of it.
+            // The confirmed state of the first peer counts as the true state.
             let confirmed = peers[0].confirmed();
             for tick in confirmed.saturating_sub(8)..=confirmed {
                 if let Some(state) = peers[0].state_at(BODY, tick) {
@@ -132,7 +136,7 @@ impl Experiment {
         spent: Duration,
         sent: (u64, u64),
     ) -> Metrics {
-        // Taking hold is not part of what is measured.
+        // The start of the grabs is not measured.
         let first = seen.keys().next().copied().unwrap_or(0);
         let truth: BTreeMap<Tick, &Vec<f64>> = truth.range(first..).map(|(t, q)| (*t, q)).collect();
         let reactions: BTreeMap<Tick, &Vec<(UserId, [f64; 3])>> =

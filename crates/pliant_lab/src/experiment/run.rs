@@ -1,4 +1,5 @@
-//! The world around a measured session: the true body, its hands, and what the guest is shown beside it.
+//! The caller's side of a measured session: the true body, its hands and the comparison with the
+//! guest.
 
 use std::collections::VecDeque;
 use std::time::Duration;
@@ -11,7 +12,7 @@ use pliant_stream::{
 use super::{BODY, Experiment, Hand, Metrics, RECOVERED, ShapeError, fold, norm};
 use crate::pair::World;
 
-/// Truth kept for comparison, ticks.
+/// True states kept for comparison, ticks.
 const KEPT: usize = 4096;
 
 struct Held {
@@ -26,7 +27,7 @@ struct Truth {
     reactions: Vec<(GrabKey, [f64; 3])>,
 }
 
-/// The world around the session: the true body, its hands, and the comparison.
+/// The caller's side of the session: the true body, its hands and the comparison.
 pub(super) struct Run {
     body: Body,
     h: f64,
@@ -35,9 +36,9 @@ pub(super) struct Run {
     shape: ShapeError,
     track_row: Vec<f64>,
     keep_track: bool,
-    /// Who holds at the guest: the hand, and the grab once there is one.
+    /// The guest's hand, and its grab once it has begun.
     guest_hand: Option<(Hand, Option<u16>)>,
-    /// When it last said its target.
+    /// Time at which the guest last sent its target.
     guest_said: Duration,
     predict_own_hand: bool,
     measuring: Option<Duration>,
@@ -62,12 +63,13 @@ pub(super) struct Run {
     hash: u64,
     track: Vec<(u64, f64, f64)>,
     last_tick: u64,
-    /// When it was shown, and what of: the picture that stands until the next one.
+    /// Time of the last shown tick, and its coordinates. They stay visible until the next shown
+    /// tick.
     shown_at: Option<Duration>,
     picture: Vec<f64>,
     /// Ticks missed since then.
     stalled: u64,
-    /// Ticks shown one after the other up to now.
+    /// Number of consecutive ticks shown up to the last one.
     in_row: u64,
 }
 
@@ -119,10 +121,10 @@ impl Run {
         }
     }
 
-    /// The guest's own hand, on the path of the first one of the host.
+    /// Moves the guest's own hand on the path of the host's first hand.
     fn hold_at_guest(&mut self, now: Duration, session: &mut GuestSession) {
         let Some((hand, grab)) = &mut self.guest_hand else { return };
-        // Once a tick: a target that is said makes the session look again at once.
+        // Send once per tick, because a new target makes the session update again at once.
         if now.saturating_sub(self.guest_said).as_secs_f64() < 0.9 * self.h {
             return;
         }
@@ -131,30 +133,31 @@ impl Run {
         let (rest, d) = (place.unwrap_or_default(), hand.path(now.as_secs_f64()));
         let target = std::array::from_fn(|k| f64::from(rest[k]) + d[k]);
         match grab {
-            // Refused before the body is there: again at the next tick.
+            // The session refuses the grab until it has the body, so try again at the next tick.
             None => {
                 let hold = GrabConfig::default();
                 *grab = session.begin_grab(now, BODY, hand.vertex, hand.radius, target, hold).ok();
             }
-            // A finite hand's target is taken.
+            // The session accepts every finite target.
             Some(grab) => drop(session.set_target(*grab, target)),
         }
     }
 
     pub(super) fn begin(&mut self, now: Duration) {
         self.measuring = Some(now);
-        // What stands still from here on is missed, whatever was shown before.
+        // Ticks without a new state count as missed from here on.
         if self.shown_at.is_none() {
             self.shown_at = Some(now);
         }
     }
 
-    /// Ticks that were still due when the measuring ended.
+    /// Counts the ticks that were still due when the measurement ended.
     pub(super) fn end(&mut self, now: Duration) {
         self.stand_still(now);
     }
 
-    /// Counts the ticks that were due since the last one was shown and a half: one every step, compared with the picture that stands in their place.
+    /// Counts the ticks that are due since the last shown tick as missed: one per step, with a
+    /// tolerance of half a step. Each is compared with the last visual state.
     fn stand_still(&mut self, now: Duration) {
         let (Some(since), Some(_)) = (self.shown_at, self.measuring) else { return };
         let due = (now.saturating_sub(since).as_secs_f64() / self.h - 0.5).max(0.0) as u64;
@@ -164,11 +167,12 @@ impl Run {
         }
     }
 
-    /// A tick that was not shown: the picture that stood in its place against its truth.
+    /// Counts one missed tick and compares the last visual state with the true state of that tick.
     fn miss(&mut self, now: Duration, tick: u64) {
         let first = self.truth.front().map_or(u64::MAX, |truth| truth.tick);
         let Some(truth) = tick.checked_sub(first).and_then(|i| self.truth.get(i as usize)) else { return };
-        // Who has only the first modes is asked for no more; who has nothing at all shows the body at rest.
+        // A guest with fewer modes is compared in those modes only. A guest without any state shows
+        // the body at rest.
         let modes = if self.picture.is_empty() { truth.q.len() } else { self.picture.len() };
         let (sum, largest) = self.shape.compare(&self.picture, &truth.q[..modes.min(truth.q.len())]);
         if self.keep_track {
@@ -180,7 +184,7 @@ impl Run {
         self.tell(now, sum, largest);
     }
 
-    /// One tick's squared errors, shown or missed.
+    /// Adds the squared errors of one tick, shown or missed.
     fn tell(&mut self, now: Duration, sum: f64, largest: f64) {
         self.sum += sum;
         self.compared += 1;
@@ -195,7 +199,7 @@ impl Run {
         let places = self.shape.places();
         let (ticks, compared) = (self.count.max(1) as f64, self.compared.max(1) as f64);
         let ratio = |a: f64, b: f64| if b > 0.0 { a / b } else { 0.0 };
-        // The longest spell of shown error above the threshold.
+        // Find the longest time for which the visual error stayed above the threshold.
         let (mut longest, mut since) = (Duration::ZERO, None);
         for (at, error) in &self.above {
             if *error > RECOVERED * self.scale {
@@ -223,11 +227,11 @@ impl Run {
             true_ringing: ratio(self.true_second, self.force_scale),
             hand_to_force_ms: 1e3
                 * if self.predict_own_hand {
-                    // The guest's newer copy answers at its next tick.
+                    // The guest's own copy of the body answers at its next tick.
                     self.h
                 } else {
-                    // A target leaves with the guest's tick, waits for the host's next step (half a step on average),
-                    // and its reaction comes back and is shown.
+                    // A target leaves with the guest's tick and waits for the host's next step,
+                    // half a step on average. Then its reaction travels back and is shown.
                     session.stats().round_trip.as_secs_f64() * 0.5 + 0.5 * self.h + delay
                 },
             shown_delay_ms: 1e3 * delay,
@@ -266,7 +270,7 @@ impl World for Run {
             }
             if let Some((id, start, since)) = held.grab {
                 let d = held.hand.path(t - since + 0.1 * index as f64);
-                // A target out of range cannot come from finite hands.
+                // Scripted hands are finite, so their targets are in range.
                 let _ = self.body.set_target(id, std::array::from_fn(|k| start[k] + d[k]));
             }
         }
@@ -299,7 +303,7 @@ impl World for Run {
             grabs: &grabs,
             resting: false,
         };
-        // A state that cannot be published shows as ticks that never arrive.
+        // A state that cannot be published shows up as ticks that never arrive.
         let _ = host.publish(now, BODY, &state);
         if self.truth.len() >= KEPT {
             self.truth.pop_front();
@@ -336,11 +340,13 @@ impl World for Run {
             self.picture.clone_from(&shown.q);
             return;
         }
-        // What a catch-up goes past was never shown: the picture before it stood in its place.
+        // Ticks that a catch-up skips were never shown. The previous visual state stood in their
+        // place.
         for passed in self.last_tick + self.stalled + 1..tick {
             self.miss(now, passed);
         }
-        // Second differences are taken of ticks that follow each other; a stall that is caught up with shows as error.
+        // Second differences need consecutive ticks. A stall followed by a catch-up counts in the
+        // errors.
         self.in_row = if tick == self.last_tick + 1 { self.in_row + 1 } else { 0 };
         (self.last_tick, self.shown_at, self.stalled) = (tick, Some(now), 0);
         self.picture.clone_from(&shown.q);

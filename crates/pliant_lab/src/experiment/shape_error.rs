@@ -1,12 +1,12 @@
-//! How far two shapes are apart, where it is seen.
+//! Distance between two shapes on the surface.
 
 use pliant_modal::ModalModel;
 
-/// Surface vertices at which shapes are compared.
+/// Approximate number of surface vertices at which shapes are compared.
 const SAMPLES: usize = 48;
 
-/// Compares shapes at some surface vertices, evenly chosen; unwarped, so that the same difference of coordinates counts
-/// the same in every shape.
+/// Compares shapes at evenly chosen surface vertices. The shapes are unwarped, so that the same
+/// difference of coordinates counts the same in every shape.
 pub(super) struct ShapeError {
     rows: Vec<Vec<[f64; 3]>>,
 }
@@ -22,12 +22,13 @@ impl ShapeError {
         Self { rows: (0..vertices).step_by(step).map(|v| (0..modes).map(|m| row(v, m)).collect()).collect() }
     }
 
-    /// How many places there are.
+    /// Number of compared vertices.
     pub(super) fn places(&self) -> f64 {
         self.rows.len().max(1) as f64
     }
 
-    /// Squared differences at the places, m^2: sum and largest. Missing coordinates count as 0.
+    /// Sum and largest of the squared differences at the compared vertices, m^2. Missing
+    /// coordinates count as 0.
     pub(super) fn compare(&self, a: &[f64], b: &[f64]) -> (f64, f64) {
         let (mut sum, mut largest) = (0.0, 0.0_f64);
         for rows in &self.rows {

@@ -1,4 +1,4 @@
-//! What a frame's rounding costs and brings, and the paper's networks with what crosses them.
+//! Error and size of quantized frames, and the data sent over the paper's networks.
 
 use std::fmt::Write;
 
@@ -19,10 +19,10 @@ use crate::{
     progress::Progress,
 };
 
-/// Steps a second, as the paper's.
+/// Steps a second, as in the paper.
 const RATE: f64 = 40.0;
 
-/// As many modes as the paper's largest row.
+/// An experiment with a bar of `modes` modes. Callers use as many modes as the paper's largest row.
 fn experiment(modes: usize, link: LinkConfig, recovery: RecoveryConfig) -> Result<Experiment, LabError> {
     let mesh = shapes::bar([8, 2, 2], [1.0, 0.2, 0.2])?;
     let (model, _) = baked(&mesh, &config(Element::Tet10, modes, vec![anchor(0, 1e-9)]))?;
@@ -37,7 +37,7 @@ fn bytes_a_tick(kbit_s: f64) -> f64 {
     kbit_s * 1e3 / 8.0 / RATE
 }
 
-/// One source of error: how coarse the numbers of a frame are, without any loss.
+/// The error from the size of the quantization steps alone, without any loss.
 pub(super) fn quantised(quick: bool, progress: &mut dyn Progress) -> Result<Figure, LabError> {
     let powers: &[i32] = if quick { &[4, 8, 14, 20] } else { &[4, 6, 8, 10, 12, 14, 16, 18, 20, 24] };
     let mut series = Vec::new();
@@ -80,9 +80,11 @@ pub(super) fn quantised(quick: bool, progress: &mut dyn Progress) -> Result<Figu
     })
 }
 
-/// The paper's networks with what crosses them: its loss and bandwidth, and bytes beside those that it gives.
+/// The paper's networks with their loss and bandwidth, and the bytes sent beside the paper's
+/// numbers.
 pub(super) fn table_3(quick: bool, progress: &mut dyn Progress) -> Result<String, LabError> {
-    // Loss in % and bandwidth in Mb/s as the paper's; its round trips are in a figure only, but for the first.
+    // Loss in % and bandwidth in Mb/s are the paper's. Except for the first network, the paper
+    // gives the round trip only in a figure.
     const PAPER: [(Preset, f64, f64, &str); 4] = [
         (Preset::Paper1, 9.0, 2.0, "196"),
         (Preset::Paper2, 6.0, 4.0, "120 (assumed)"),

@@ -1,4 +1,4 @@
-//! Figure g: everything together on one dragged, moving body: what a user chooses from, and what a choice costs.
+//! Figure g: all settings together on one dragged, moving body, with the cost and error of each.
 
 use std::{fmt::Write, sync::Arc, time::Instant};
 
@@ -20,33 +20,34 @@ use crate::{LabError, experiment::Experiment, machine::Pinned, progress::Progres
 
 /// Surfaces a second.
 const PICTURES: f64 = 60.0;
-/// Seconds of motion.
+/// Duration of the motion, s.
 const SECONDS: f64 = 2.0;
 const ALPHA: Integrator = Integrator::GeneralizedAlpha { rho_inf: 0.5 };
 
-/// What a hand and an eye got, every 1/60 s, and what it took.
+/// Forces on the hand and positions on the surface every 1/60 s, and the times of the run.
 struct Run {
     force: Vec<[f64; 3]>,
-    /// Displacements of the places that every mesh has, m.
+    /// Displacements of the vertices that every mesh shares, m.
     places: Vec<Vec<[f64; 3]>>,
-    /// All steps and all surfaces, us.
+    /// Times of all steps and of all surfaces, us.
     step_us: Vec<f64>,
     surface_us: Vec<f64>,
 }
 
-/// A bar's places that all of the meshes share: the vertices of the coarsest.
+/// The vertices at `places`, which are the vertices of the coarsest mesh. `None` if one is missing.
 fn shared(model: &ModalModel, places: &[[f32; 3]]) -> Option<Vec<usize>> {
     let positions = model.surface().positions();
     let apart = |a: &[f32; 3], b: &[f32; 3]| (0..3).all(|k| (a[k] - b[k]).abs() < 1e-5);
     places.iter().map(|place| positions.iter().position(|p| apart(p, place))).collect()
 }
 
-/// Two seconds under a hand that circles, further and further out for the first of them.
+/// Runs two seconds under a hand that circles. The radius grows during the first second.
 fn moving(model: &Arc<ModalModel>, places: &[usize], config: BodyConfig) -> Result<Run, LabError> {
     let _pinned = Pinned::new();
     let (step, per) = (config.step, (1.0 / PICTURES / config.step).round().max(1.0) as usize);
     let mut body = Body::new(model.clone(), config)?;
-    // In the middle of the end, which is a vertex of every one of the meshes: a corner gives way by what the mesh makes of it.
+    // The hand holds the middle of the end, which is a vertex of every mesh. The compliance of a
+    // corner would depend on the mesh.
     let middle = [1.0f32, 0.1, 0.1];
     let away = |p: &[f32; 3]| (0..3).map(|k| (p[k] - middle[k]).powi(2)).sum::<f32>();
     let positions = model.surface().positions();
@@ -80,7 +81,7 @@ fn moving(model: &Arc<ModalModel>, places: &[usize], config: BodyConfig) -> Resu
     Ok(run)
 }
 
-/// Root mean square of the difference over that of the reference.
+/// Root mean square of the difference, relative to that of the reference.
 fn relative<'a>(got: impl Iterator<Item = &'a [f64; 3]>, want: impl Iterator<Item = &'a [f64; 3]>) -> f64 {
     let (mut off, mut size) = (0.0, 0.0);
     for (got, want) in got.zip(want) {
@@ -90,7 +91,8 @@ fn relative<'a>(got: impl Iterator<Item = &'a [f64; 3]>, want: impl Iterator<Ite
     (off / size.max(f64::MIN_POSITIVE)).sqrt()
 }
 
-/// A setting with what it costs (us of one core for a second of motion, median and 99th percentile) and what it is off by.
+/// A setting with its cost (us of one core for a second of motion, median and 99th percentile) and
+/// its errors.
 #[derive(Debug, Clone)]
 struct Choice {
     words: String,
@@ -102,7 +104,7 @@ struct Choice {
     default: bool,
 }
 
-/// Those that no cheaper one is as good as, cheapest first.
+/// The settings that have a smaller error than every cheaper setting, cheapest first.
 fn pareto(choices: &[Choice], error: impl Fn(&Choice) -> f64) -> Vec<&Choice> {
     let mut sorted: Vec<&Choice> = choices.iter().collect();
     sorted.sort_by(|a, b| a.cost[0].total_cmp(&b.cost[0]));
@@ -115,7 +117,7 @@ fn pareto(choices: &[Choice], error: impl Fn(&Choice) -> f64) -> Vec<&Choice> {
     sorted
 }
 
-/// In a sentence: what of the front to take for errors of so much at most.
+/// A sentence with the cheapest settings whose errors stay within given bounds.
 fn advice(front: &[&Choice], error: impl Fn(&Choice) -> f64, what: &str) -> String {
     let mut out = format!("*{what}*:");
     let mut last = "";
@@ -171,7 +173,8 @@ fn local(quick: bool, progress: &mut dyn Progress) -> Result<(Vec<Figure>, Strin
             got: places.len() as f64,
         }))
     };
-    // The reference: far finer mesh, twice the modes, far shorter steps of second order; and what it is off by, by a mesh between.
+    // The reference has a far finer mesh, twice the modes and far shorter steps of second order. A
+    // mesh in between estimates the error of the reference.
     let fine = |cells: [usize; 3], rate: f64| -> Result<Run, LabError> {
         let (model, _) = baked(&shapes::bar(cells, size)?, &held(Element::Tet10, 120))?;
         let places = every(&model)?;
@@ -209,7 +212,8 @@ fn local(quick: bool, progress: &mut dyn Progress) -> Result<(Vec<Figure>, Strin
                             precision,
                             settings: StepSettings { integrator, ..Default::default() },
                         };
-                        // Once to fill the caches; the times are of the runs after it, the errors of any.
+                        // One run fills the caches. The times come from the runs after it, and the
+                        // errors are the same in all runs.
                         moving(model, &places, setting.clone())?;
                         let (mut steps, mut surfaces) = (Vec::new(), Vec::new());
                         let mut run = moving(model, &places, setting.clone())?;
@@ -353,7 +357,7 @@ fn local(quick: bool, progress: &mut dyn Progress) -> Result<(Vec<Figure>, Strin
     Ok((figures, text))
 }
 
-/// The second front: how a guest is kept up to date over the paper's worst network.
+/// The second front: the guest's recovery settings over the paper's worst network.
 fn over_network(quick: bool, progress: &mut dyn Progress) -> Result<(Figure, String), LabError> {
     let (model, _) =
         baked(&shapes::bar([8, 2, 2], [1.0, 0.2, 0.2])?, &config(Element::Tet10, 60, vec![anchor(0, 1e-9)]))?;

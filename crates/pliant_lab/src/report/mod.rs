@@ -1,5 +1,5 @@
-//! What the method costs and what it is off by, remade on this machine: tables, CSV, SVG, PNG and
-//! the words for them.
+//! The report on the method's cost and errors, measured on this machine: tables, CSV, SVG, PNG and
+//! text.
 
 mod frames;
 mod front;
@@ -25,7 +25,7 @@ use plot::Figure;
 pub enum Part {
     /// Elements and mesh size.
     Elements,
-    /// Modes kept.
+    /// Number of modes.
     Modes,
     /// Integrator and step.
     Steps,
@@ -33,15 +33,15 @@ pub enum Part {
     Warp,
     /// Half precision of the basis.
     Precision,
-    /// Quantised frames.
+    /// Quantized frames.
     Frames,
-    /// Ways of repair on the paper's networks.
+    /// Recovery policies on the paper's networks.
     Network,
-    /// Everything together: what a user chooses from.
+    /// All settings together, for choosing one.
     Front,
     /// The paper's table 2.
     Table2,
-    /// The paper's networks and what crosses them.
+    /// The paper's networks and the data sent over them.
     Table3,
     /// The paper's figures 7 to 9.
     Courses,
@@ -50,7 +50,7 @@ pub enum Part {
 }
 
 impl Part {
-    /// All of them, in the order of the report.
+    /// All parts, in the order of the report.
     pub const ALL: [Self; 12] = [
         Self::Elements,
         Self::Modes,
@@ -66,7 +66,7 @@ impl Part {
         Self::Default,
     ];
 
-    /// Its name: lower case, such as `table-2`.
+    /// The name of the part: lower case, such as `table-2`.
     pub fn name(self) -> &'static str {
         match self {
             Self::Elements => "elements",
@@ -84,7 +84,7 @@ impl Part {
         }
     }
 
-    /// The part of this name.
+    /// Returns the part with this name.
     pub fn by_name(name: &str) -> Option<Self> {
         Self::ALL.into_iter().find(|part| part.name() == name)
     }
@@ -107,44 +107,45 @@ impl Part {
     }
 }
 
-/// What to report on.
+/// Settings of the report.
 #[derive(Debug, Clone)]
 pub struct Settings {
-    /// Parts to make, in this order.
+    /// Parts to write, in this order.
     pub parts: Vec<Part>,
-    /// Fewer points and shorter timings.
+    /// Use fewer points and shorter timings.
     pub quick: bool,
-    /// The folder of surfaces that are measured when they are there: bunny.obj, armadillo.obj.
+    /// Folder of the surfaces bunny.obj and armadillo.obj, which are measured if they exist.
     pub models: PathBuf,
     /// The project's own body: a surface or a scene.
     pub own: PathBuf,
 }
 
-/// A part as it was written.
+/// A written part.
 #[derive(Serialize, Debug, Clone)]
 pub struct Written {
-    /// Its name.
+    /// Name of the part.
     pub name: &'static str,
-    /// Names of its files within the folder.
+    /// Names of the part's files within the folder.
     pub files: Vec<String>,
-    /// What it took, s.
+    /// Time to measure and write the part, s.
     pub seconds: f64,
 }
 
-/// What was written.
+/// The written report.
 #[derive(Serialize, Debug, Clone)]
 pub struct Report {
     /// The parts, in their order.
     pub parts: Vec<Written>,
-    /// What all of it took, s.
+    /// Time to measure and write the whole report, s.
     pub seconds: f64,
 }
 
-/// Measures, and writes `report.md` with its figures (CSV, SVG and PNG) into a folder, which is made
-/// if it is not there.
+/// Measures, and writes `report.md` with its figures (CSV, SVG and PNG) into a folder. The folder
+/// is created if it does not exist.
 ///
 /// # Errors
-/// [`LabError::Write`] or [`LabError::Plot`] for files, the others for what cannot be measured.
+/// Returns [`LabError::Write`] or [`LabError::Plot`] for files, and the other errors for
+/// measurements that fail.
 pub fn write(folder: &Path, settings: &Settings, progress: &mut dyn Progress) -> Result<Report, LabError> {
     std::fs::create_dir_all(folder)?;
     let began = Instant::now();
@@ -214,7 +215,8 @@ fn rows(figure: &Figure) -> String {
     let timed = figure.series.iter().any(|series| !series.late.is_empty());
     let (head, rule) = if timed { (" 99 % |", " --- |") } else { ("", "") };
     let mut out = format!("| line | {} |{head} {} |\n| --- | --- |{rule} --- |\n", figure.x, figure.y);
-    // Settings beside each other are many: the words of such a figure hold a table of those that count, the CSV all.
+    // Scattered series have many points. The text of such a figure has a table of the important
+    // settings, and the CSV has all of them.
     for series in figure.series.iter().filter(|series| !series.scattered) {
         for (index, (x, y)) in series.points.iter().enumerate() {
             let late = series.late.get(index).map_or(String::new(), |late| format!(" {late:.4} |"));
@@ -224,7 +226,7 @@ fn rows(figure: &Figure) -> String {
     out
 }
 
-/// What else the machine did meanwhile, as far as the system says.
+/// A sentence about the other load on the machine, if the system reports it.
 fn quiet(before: Option<f64>, after: Option<f64>) -> String {
     let (Some(before), Some(after)) = (before, after) else { return String::new() };
     format!(
@@ -252,7 +254,7 @@ fn heading() -> String {
     )
 }
 
-/// The widest vectors of this processor that the reconstruction knows.
+/// The widest vector instructions of this CPU that the reconstruction supports.
 fn vectors() -> &'static str {
     #[cfg(target_arch = "x86_64")]
     {
@@ -268,7 +270,8 @@ fn vectors() -> &'static str {
 
 /// Year, month and day (UTC) of a number of days since 1970-01-01 in the Gregorian calendar.
 fn date(days: i64) -> [i64; 3] {
-    // H. Hinnant, "chrono-compatible low-level date algorithms": eras of 400 years that begin in March.
+    // H. Hinnant, "chrono-compatible low-level date algorithms": eras of 400 years that begin in
+    // March.
     let z = days + 719_468;
     let era = z.div_euclid(146_097);
     let day = z.rem_euclid(146_097);

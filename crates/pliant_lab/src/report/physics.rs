@@ -1,4 +1,4 @@
-//! Figures a to c: elements, modes, steps.
+//! Figures a to c: elements, modes and steps.
 
 use std::sync::Arc;
 
@@ -15,12 +15,13 @@ use super::{
 };
 use crate::LabError;
 
-/// Free cube, nu = 0.3: `omega L sqrt(rho / mu)` of its first eleven elastic modes (Legendre-Ritz, order 12; Demarest 1971; the last three are exact).
+/// Free cube, nu = 0.3: `omega L sqrt(rho / mu)` of its first eleven elastic modes (Legendre-Ritz,
+/// order 12; Demarest 1971; the last three are exact).
 const CUBE: [f64; 11] =
     [2.8561, 2.8561, 3.8460, 3.8460, 3.8460, 3.9113, 3.9113, 3.9113, 4.44288, 4.44288, 4.44288];
 
 pub(super) fn elements(quick: bool) -> Result<Vec<Figure>, LabError> {
-    // The first bake of a program pays for its threads.
+    // The first bake of a program also starts its threads, so it is not timed.
     baked(&shapes::cube(2, 1.0)?, &config(Element::Tet4, 11, Vec::new()))?;
     let mut series = Vec::new();
     for (element, cells) in [(Element::Tet4, vec![3, 5, 8, 12, 16]), (Element::Tet10, vec![2, 3, 4, 6, 8])] {
@@ -56,7 +57,8 @@ pub(super) fn elements(quick: bool) -> Result<Vec<Figure>, LabError> {
     Ok(vec![cube, frequencies, pull])
 }
 
-/// A held bar's first six frequencies, and how far its end gives way under a pull on it, against those of a far finer mesh of ten-node tetrahedra.
+/// Compares a bar held at one end with a far finer mesh of ten-node tetrahedra: its first six
+/// frequencies, and the static displacement of its end under a force.
 fn against_finer(quick: bool) -> Result<[Figure; 2], LabError> {
     let measure = |element: Element, n: usize| -> Result<(Vec<f64>, f64, f64), LabError> {
         let mesh = shapes::bar([5 * n, n, n], [1.0, 0.2, 0.2])?;
@@ -162,7 +164,7 @@ pub(super) fn smooth(t: f64) -> f64 {
     t * t * t * (10.0 - 15.0 * t + 6.0 * t * t)
 }
 
-/// A bar under a hand every 1/60 s.
+/// The motion of a bar under a hand, sampled every 1/60 s.
 struct Track {
     /// Reactions, N.
     force: Vec<[f64; 3]>,
@@ -170,7 +172,7 @@ struct Track {
     q: Vec<Vec<f64>>,
 }
 
-/// Drags the end of a bar to the side in a second and holds it for one more.
+/// Drags the end of a bar to the side within a second and holds it there for another second.
 fn dragged(model: &Arc<ModalModel>, config: BodyConfig) -> Result<Track, LabError> {
     let per = (1.0 / 60.0 / config.step).round().max(1.0) as usize;
     let step = config.step;
@@ -191,7 +193,7 @@ fn dragged(model: &Arc<ModalModel>, config: BodyConfig) -> Result<Track, LabErro
     Ok(out)
 }
 
-/// Root mean square of the difference over that of the reference.
+/// Root mean square of the difference, relative to that of the reference.
 fn relative(got: &[[f64; 3]], want: &[[f64; 3]]) -> f64 {
     let sum = |f: &dyn Fn(usize, usize) -> f64| -> f64 {
         (0..want.len()).map(|i| (0..3).map(|k| f(i, k).powi(2)).sum::<f64>()).sum()
@@ -205,7 +207,7 @@ fn bar() -> Result<TetMesh, LabError> {
 }
 
 pub(super) fn modes(quick: bool) -> Result<Vec<Figure>, LabError> {
-    // Every mode that the mesh has: nothing is left out.
+    // The reference keeps all modes of the mesh.
     let (full, _) = baked(&bar()?, &config(Element::Tet4, 216, vec![anchor(0, 1e-9)]))?;
     let elastic = BodyConfig::from(StepSettings { warp: false, ..Default::default() });
     let want = dragged(&full, elastic.clone())?;
@@ -276,7 +278,7 @@ pub(super) fn modes(quick: bool) -> Result<Vec<Figure>, LabError> {
     ])
 }
 
-/// The first modes alone, with nothing for those left out.
+/// A model with the first `kept` modes and no residual flexibility for the others.
 fn bare(model: &ModalModel, kept: usize) -> Result<ModalModel, LabError> {
     let mut parts: ModelParts = model.parts().clone();
     let per = 3 * parts.surface.positions().len();
@@ -304,7 +306,7 @@ pub(super) fn steps(quick: bool) -> Result<Vec<Figure>, LabError> {
         settings: StepSettings { integrator, ..Default::default() },
         ..BodyConfig::default()
     };
-    // Free: a closed form exists, which `exact` is at any step.
+    // The free motion has a closed form, which the `exact` integrator matches at any step.
     let ring = |config: BodyConfig| -> Result<(Vec<[f64; 3]>, Vec<Vec<f64>>), LabError> {
         let per = (1.0 / 60.0 / config.step).round() as usize;
         let mut body = Body::new(model.clone(), config)?;
@@ -326,7 +328,8 @@ pub(super) fn steps(quick: bool) -> Result<Vec<Figure>, LabError> {
     };
     let finest = 7680.0;
     let (free_truth, free_shape) = ring(at(finest, Integrator::Exact))?;
-    // Held: second order in the step, so the error of the finest is a third of what it differs from twice its step by (Richardson).
+    // The held motion is of second order in the step. By Richardson, the error of the finest step
+    // is a third of its difference to twice the step.
     let held_truth = dragged(&model, at(finest, alpha))?;
     let coarser = dragged(&model, at(finest / 2.0, alpha))?;
     let held_own = relative(&coarser.force, &held_truth.force) / 3.0;

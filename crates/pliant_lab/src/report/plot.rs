@@ -1,4 +1,4 @@
-//! Figures as SVG, PNG and CSV. The typeface is compiled in: none need be installed.
+//! Figures as SVG, PNG and CSV. The font is compiled in, so none needs to be installed.
 
 use std::{fmt::Write, path::Path, sync::OnceLock};
 
@@ -14,19 +14,19 @@ use crate::LabError;
 pub(super) struct Series {
     pub(super) name: String,
     pub(super) points: Vec<(f64, f64)>,
-    /// Where x is the median of a time: its 99th percentile at each point.
+    /// If x is the median of a time: the 99th percentile of that time at each point.
     pub(super) late: Vec<f64>,
-    /// Points that no line joins: settings beside each other, not one setting turned up.
+    /// Points without a line between them, for settings that are not steps of one parameter.
     pub(super) scattered: bool,
 }
 
 impl Series {
-    /// Without percentiles.
+    /// A series without percentiles.
     pub(super) fn new(name: impl Into<String>, points: Vec<(f64, f64)>) -> Self {
         Self { name: name.into(), points, late: Vec::new(), scattered: false }
     }
 
-    /// Points of a median time, its 99th percentile, and an error.
+    /// A series of points (median and 99th percentile of a time, error).
     pub(super) fn timed(name: impl Into<String>, points: Vec<([f64; 2], f64)>) -> Self {
         Self {
             name: name.into(),
@@ -41,19 +41,19 @@ impl Series {
     }
 }
 
-/// A figure: points with what they cost along x and what they are off by along y, or a course over time.
+/// A figure: points with cost along x and error along y, or curves over time.
 pub(super) struct Figure {
-    /// File name without ending.
+    /// File name without extension.
     pub(super) file: String,
     pub(super) title: String,
     pub(super) x: String,
     pub(super) y: String,
-    /// Both axes logarithmic, points marked; else lines over plain axes.
+    /// Draw both axes logarithmic with marked points. Otherwise draw lines over linear axes.
     pub(super) logarithmic: bool,
     pub(super) series: Vec<Series>,
-    /// How far off the reference itself is, in the unit of y.
+    /// Error of the reference itself, in the unit of y.
     pub(super) reference_error: Option<f64>,
-    /// What it says, in words.
+    /// The text below the figure.
     pub(super) words: String,
 }
 
@@ -73,7 +73,7 @@ fn color(index: usize) -> RGBColor {
     COLOURS[index % COLOURS.len()]
 }
 
-/// Writes all three files into a folder.
+/// Writes the figure as CSV, SVG and PNG into a folder.
 pub(super) fn write(folder: &Path, figure: &Figure) -> Result<(), LabError> {
     static FONT: OnceLock<bool> = OnceLock::new();
     FONT.get_or_init(|| {
@@ -121,13 +121,13 @@ fn draw<B: DrawingBackend>(
     let all = || figure.series.iter().flat_map(|s| s.points.iter().copied());
     let late = || figure.series.iter().flat_map(|s| s.late.iter().copied());
     let xs = range(all().map(|p| p.0).chain(late()), figure.logarithmic);
-    // A reference far below all that is drawn would squeeze it: its error is told in words.
+    // A reference error far below all points would squeeze the plot, so only the text states it.
     let least = all().map(|p| p.1).fold(f64::INFINITY, f64::min);
     let reference = figure.reference_error.filter(|error| *error > 0.1 * least);
     let ys = range(all().map(|p| p.1).chain(reference), figure.logarithmic);
     let mut chart = ChartBuilder::on(area);
     chart.caption(&figure.title, ("sans-serif", 20)).margin(12).x_label_area_size(44).y_label_area_size(72);
-    // The two coordinate systems are different types: the same lines for each.
+    // The two coordinate systems are different types, so a macro draws both.
     macro_rules! body {
         ($chart:expr) => {{
             let mut chart = $chart;
@@ -154,7 +154,7 @@ fn draw<B: DrawingBackend>(
                     .draw_series(LineSeries::new(joined.iter().copied(), color.stroke_width(2)))?
                     .label(&series.name)
                     .legend(move |(x, y)| PathElement::new(vec![(x, y), (x + 18, y)], color.stroke_width(2)));
-                // A whisker from the median to the 99th percentile.
+                // Draw a whisker from the median to the 99th percentile.
                 for (point, late) in series.points.iter().zip(&series.late) {
                     if point.1 > 0.0 {
                         let y = point.1.clamp(ys.start, ys.end);

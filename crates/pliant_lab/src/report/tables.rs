@@ -30,7 +30,7 @@ fn body() -> Result<Arc<ModalModel>, LabError> {
         .0)
 }
 
-/// Single against half precision of the basis, on a pose of every mode.
+/// Compares single and half precision of the basis, on a pose of every mode.
 pub(super) fn precision() -> Result<Figure, LabError> {
     let (model, _) = baked(
         &shapes::bar([60, 12, 12], [1.0, 0.2, 0.2])?,
@@ -38,7 +38,8 @@ pub(super) fn precision() -> Result<Figure, LabError> {
     )?;
     let single = model.basis().clone();
     let half = single.to_half();
-    // A pull of a fifth of the length, spread over the modes as a static load is: by 1 / omega^2.
+    // The pose displaces the tip by a fifth of the length. It is spread over the modes as a static
+    // load is, by 1 / omega^2.
     let tip = farthest(&model, [1.0, 0.01, 0.02]);
     let mut q: Vec<f32> = (0..60)
         .map(|k| (f64::from(model.displacement_row(tip, 1, k)) / model.omega()[k].powi(2)) as f32)
@@ -85,10 +86,12 @@ pub(super) fn precision() -> Result<Figure, LabError> {
     })
 }
 
-/// Every way of repair on the four networks of the paper, over bytes and over processor time; a guest's ways, and those between equal peers.
+/// Every recovery policy on the paper's four networks, over bytes and over CPU time: the policies
+/// of a guest, and those between equal peers.
 pub(super) fn networks(quick: bool, progress: &mut dyn Progress) -> Result<(Vec<Figure>, String), LabError> {
     let model = body()?;
-    // Pinned (after the bake, whose threads would stay here), and the thread's own time: what else the machine does is not in it.
+    // Pin the thread after the bake, whose threads would otherwise stay on this core. The thread's
+    // own clock leaves out other load on the machine.
     let _pinned = Pinned::new();
     let (mut over_bytes, mut over_time) = (Vec::new(), Vec::new());
     let mut table = "| network | repair | rms % | largest % | ticks missing | kbit/s | processor us a tick |\n| --- | --- | --- | --- | --- | --- | --- |\n".to_owned();
@@ -113,7 +116,8 @@ pub(super) fn networks(quick: bool, progress: &mut dyn Progress) -> Result<(Vec<
                 Some(repair) => experiment.run_peers(repair),
                 None => experiment.run(),
             };
-            // The first run fills the caches; the shortest of the others is what the work itself takes. All show the same.
+            // The first run fills the caches. The shortest of the other runs is the time of the
+            // work itself. All runs give the same metrics.
             let mut f = run()?;
             f.cpu_us_per_tick = f64::INFINITY;
             for _ in 0..3 {
@@ -169,7 +173,8 @@ pub(super) fn networks(quick: bool, progress: &mut dyn Progress) -> Result<(Vec<
     Ok((figures, table))
 }
 
-/// The paper's figures 7 to 9: losses that its compensation takes out again, and what the default way shows with the same losses.
+/// The paper's figures 7 to 9: losses that its compensation corrects, and the error of the default
+/// policy with the same losses.
 pub(super) fn courses() -> Result<Vec<Figure>, LabError> {
     let model = body()?;
     let mut random: Vec<u64> = (0..22u64).map(|k| 135 + (k * 7919 + 31) % 311).collect();
@@ -241,7 +246,7 @@ pub(super) fn courses() -> Result<Vec<Figure>, LabError> {
     Ok(out)
 }
 
-/// A row of the paper's table 2: name, tetrahedra, modes, its bake (s) and steps a second.
+/// A row of the paper's table 2: name, tetrahedra, modes, bake time (s) and steps a second.
 const PAPER: [(&str, usize, usize, f64, f64); 4] = [
     ("bar", 1_080, 20, 0.11, 1124.2),
     ("bunny", 50_000, 60, 14.7, 264.2),
@@ -249,7 +254,7 @@ const PAPER: [(&str, usize, usize, f64, f64); 4] = [
     ("dragon", 100_000, 100, 33.6, 56.8),
 ];
 
-/// Times the paper's steps a second that each row is to reach.
+/// Goal of each row as a multiple of the paper's steps a second.
 const BAR: f64 = 20.0;
 
 const BOUND: &str = "\nA frame is a step under a hand that moves and the whole surface of the shape that it came to, one after the other; steps a second are those of its median. What bounds it: a step takes a few \
@@ -259,7 +264,7 @@ const BOUND: &str = "\nA frame is a step under a hand that moves and the whole s
     pixel (`SurfaceDetail`, on by default in the picture, off here). The limit itself moves with what else the machine's memory serves. What differs from the paper: its processor (one core of a 2.93 GHz Core 2 \
     Duo of 2008), its meshes of the same sizes, and the warp, which is in our surface.\n";
 
-/// What a row says of the bar, in words.
+/// Says whether a row reaches the goal.
 fn verdict(single: f64, half: f64) -> String {
     match (single >= BAR, half >= BAR) {
         (true, _) => format!("reaches {BAR:.0}"),
@@ -268,7 +273,8 @@ fn verdict(single: f64, half: f64) -> String {
     }
 }
 
-/// Table 2 beside the paper's numbers. Surfaces that may not be shipped are taken from `models` when they are there.
+/// Table 2 beside the paper's numbers. Surfaces that may not be shipped are read from `models` if
+/// they exist.
 pub(super) fn table_2(
     models: &Path,
     own: &Path,
@@ -279,7 +285,7 @@ pub(super) fn table_2(
     for (name, tets, modes, paper_bake, paper_rate) in PAPER {
         let (source, label) = match name {
             "bar" => (None, "bar"),
-            // The dragon may not be changed by others: the project's own body stands in for it.
+            // The dragon may not be changed by others, so the project's own body stands in for it.
             "dragon" => (Some(own.to_path_buf()), "own body, for the dragon"),
             _ => (Some(models.join(format!("{name}.obj"))), name),
         };
@@ -323,8 +329,12 @@ pub(super) fn table_2(
     Ok(out)
 }
 
-/// The default setting at run time against the full nonlinear solution: the bunny by its ear, or the project's own body where the bunny is not there. Of four-node
-/// tetrahedra at the paper's size, and of the bake's default, ten-node ones, on fewer: a nonlinear solution on as many of those has no place in a report.
+/// Compares the default setting at run time with the full nonlinear solution, for the bunny pulled
+/// by its ear, or for the project's own body if the bunny does not exist.
+///
+/// The body has four-node tetrahedra at the paper's size, then ten-node tetrahedra (the default of
+/// the bake) in a smaller number, because a nonlinear solution with as many of those takes too
+/// long.
 pub(super) fn default_setting(
     models: &Path,
     own: &Path,
@@ -357,7 +367,7 @@ fn setting(
     progress.report("bake", 0.2);
     let (model, _) = baked(&mesh, &setting)?;
     let size = model.size();
-    // Where the first mode moves most: a body is pulled where it gives.
+    // The hand pulls where the first mode moves most, so that the body gives way.
     let moves = |v: u32| (0..3).map(|axis| model.displacement_row(v, axis, 0).powi(2)).sum::<f32>();
     let vertex = (0..model.surface().positions().len() as u32)
         .max_by(|a, b| moves(*a).total_cmp(&moves(*b)))

@@ -1,4 +1,4 @@
-//! Figure d: the warp against a geometrically nonlinear solution.
+//! Figure d: the warp compared with a geometrically nonlinear solution.
 
 use std::sync::Arc;
 
@@ -13,15 +13,16 @@ use super::{
 };
 use crate::LabError;
 
-/// A body held where a nonlinear solution has its patches, against that solution.
+/// Comparison of a held body with a nonlinear solution. The hands hold the body's patches at the
+/// positions of the nonlinear solution.
 pub(super) struct Held {
-    /// rms and largest error of the surface, m.
+    /// Root mean square and largest error of the surface, m.
     pub(super) shape: [f64; 2],
     /// |reaction - load| / load.
     pub(super) force: f64,
-    /// The same of the part along the load.
+    /// The same for the part of the reaction along the load.
     pub(super) along: f64,
-    /// Median and 99th percentile of a step, us.
+    /// Median and 99th percentile of the time of a step, us.
     pub(super) step_us: [f64; 2],
 }
 
@@ -38,7 +39,7 @@ pub(super) fn held_as(
         let start = body.grab_position(grab)?;
         grabs.push((grab, start, *moved));
     }
-    // Slowly, as a hand does.
+    // The targets move slowly, as a hand does.
     for i in 0..3_000 {
         let s = smooth(f64::from(i) / 600.0);
         for (grab, start, moved) in &grabs {
@@ -92,7 +93,8 @@ pub(super) fn warp(quick: bool) -> Result<Vec<Figure>, LabError> {
     let mut twist = [Vec::new(), Vec::new()];
     let mut force = [Vec::new(), Vec::new()];
     let mut whole = [Vec::new(), Vec::new()];
-    // How far the references are off as solutions on their own mesh, which is the model's, too: the force left over times how far it moves them.
+    // Errors of the references as solutions on their own mesh, which the model shares: the
+    // remaining relative force times the displacement.
     let (mut own, mut own_twist, mut finer) = (0.0f64, 0.0f64, 0.0f64);
     let loads: &[f64] = if quick { &[0.25, 1.0, 2.0] } else { &[0.1, 0.25, 0.5, 1.0, 2.0, 3.0] };
     for &p in loads {
@@ -200,7 +202,8 @@ fn nearest_end(model: &ModalModel, thick: f64) -> u32 {
     (0..positions.len() as u32).min_by(|a, b| away(*a).total_cmp(&away(*b))).unwrap_or(0)
 }
 
-/// The same load on a finer mesh: how far from the reference's patch it has its own.
+/// Applies the same load on a finer mesh. Returns the distance of its patch from the reference's
+/// patch.
 fn on_finer(setting: &BakeConfig, thick: f64, force: f64, truth: &Deflection) -> Result<f64, LabError> {
     let fine = shapes::bar([24, 4, 4], [1.0, thick, thick])?;
     let (model, _) = baked(&fine, &BakeConfig { modes: 4, ..setting.clone() })?;

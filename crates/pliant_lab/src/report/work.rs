@@ -1,4 +1,4 @@
-//! What the figures share: timings, bodies, errors.
+//! Shared parts of the figures: timings, bodies and errors.
 
 use std::{sync::Arc, time::Instant};
 
@@ -8,7 +8,7 @@ use pliant_modal::{Damping, Element, ModalModel};
 
 use crate::{LabError, machine::Pinned};
 
-/// Median and 99th percentile of a piece of work, us, after a warm-up, on one core.
+/// Median and 99th percentile of the time of `work` on one core after a warm-up, us.
 pub(super) fn time_us(
     repeats: usize,
     mut work: impl FnMut() -> Result<(), LabError>,
@@ -27,7 +27,7 @@ pub(super) fn time_us(
     Ok([samples[samples.len() / 2], samples[(samples.len() - 1) * 99 / 100]])
 }
 
-/// Held where `axis` is below `bound`.
+/// An anchor where `axis` is below `bound`.
 pub(super) fn anchor(axis: usize, bound: f64) -> Anchor {
     Anchor { axis, comparison: Comparison::Less, bound }
 }
@@ -44,7 +44,7 @@ pub(super) fn config(element: Element, modes: usize, anchors: Vec<Anchor>) -> Ba
     }
 }
 
-/// The model and the seconds that its bake took.
+/// The model, and the time of its bake, s.
 pub(super) fn baked(mesh: &TetMesh, config: &BakeConfig) -> Result<(Arc<ModalModel>, f64), LabError> {
     let made = bake(mesh, None, config, &mut |_, _| ())?;
     Ok((Arc::new(made.model), made.times.total))
@@ -68,9 +68,11 @@ pub(super) fn apart(a: &[[f64; 3]], b: &[[f64; 3]]) -> [f64; 2] {
     [(sum / a.len().max(1) as f64).sqrt(), most.sqrt()]
 }
 
-/// What a mass-weighted difference of two motions is at each sample, and its root mean square over all of them, both as shares of the root mean square of
-/// the second: the modes are orthonormal by mass, so `|q_a - q_b|^2 / mass` is the mean square distance over the whole body. What only one has counts as 0
-/// in the other.
+/// The mass-weighted difference of two motions at each sample, and its root mean square over all
+/// samples. Both are relative to the root mean square of `want`.
+///
+/// The modes are orthonormal by mass, so `|q_a - q_b|^2 / mass` is the mean square distance over
+/// the whole body. A coordinate that only one motion has counts as 0 in the other.
 pub(super) fn by_mass(got: &[Vec<f64>], want: &[Vec<f64>]) -> (Vec<f64>, f64) {
     let at = |q: &[f64], k: usize| q.get(k).copied().unwrap_or(0.0);
     let square = |a: &[f64], b: &[f64]| -> f64 {
@@ -91,7 +93,8 @@ mod tests {
     fn a_mass_weighted_error_is_a_share_of_the_motion() {
         let want = vec![vec![3.0, 4.0], vec![0.0, 5.0]];
         assert_eq!(by_mass(&want, &want), (vec![0.0, 0.0], 0.0));
-        // Without its second mode the first sample is off by 4 of 5, the other by all of it.
+        // Without the second mode the first sample misses 4 of 5, and the second sample misses
+        // everything.
         let (off, all) = by_mass(&[vec![3.0], vec![0.0]], &want);
         assert!((off[0] - 0.8).abs() < 1e-12 && (off[1] - 1.0).abs() < 1e-12, "{off:?}");
         assert!((all - (0.5f64 * (0.64 + 1.0)).sqrt()).abs() < 1e-12, "{all}");

@@ -1,4 +1,4 @@
-//! The bodies of the matrix, baked on the spot, and what is asked of them.
+//! The bodies of the matrix, baked when needed, and shared measurements.
 
 use std::sync::Arc;
 
@@ -12,11 +12,11 @@ use pliant_modal::{
 use super::Bound;
 use crate::LabError;
 
-/// A bar along x with its corner in the origin.
+/// A bar along x with a corner at the origin.
 #[derive(Debug, Clone)]
 pub(super) struct Bar {
     pub(super) cells: [usize; 3],
-    /// m.
+    /// Length, m.
     pub(super) length: f64,
     /// Width and height as shares of the length.
     pub(super) section: [f64; 2],
@@ -27,7 +27,7 @@ pub(super) struct Bar {
     pub(super) density: f64,
     /// Fraction of critical damping.
     pub(super) zeta: f64,
-    /// Held at x = 0, or free.
+    /// Held at x = 0 if true, free otherwise.
     pub(super) held: bool,
 }
 
@@ -81,7 +81,7 @@ impl Bar {
         Ok(Arc::new(bake(mesh, None, &config, &mut |_, _| ())?.model))
     }
 
-    /// The surface vertex nearest to a place given in shares of the bar's edges.
+    /// The surface vertex nearest to a position in shares of the bar's edges.
     pub(super) fn vertex(&self, model: &ModalModel, share: [f64; 3]) -> u32 {
         let size = self.size();
         let at: [f64; 3] = std::array::from_fn(|k| share[k] * size[k]);
@@ -126,7 +126,7 @@ impl Held {
         Ok(Self { model, body, patch, grab, start })
     }
 
-    /// Moves the target to `away` (m) from where it began.
+    /// Moves the target to `away` (m) from the start of the grab.
     pub(super) fn pull(&mut self, away: [f64; 3]) -> Result<(), StepError> {
         self.body.set_target(self.grab, std::array::from_fn(|k| self.start[k] + away[k]))
     }
@@ -136,18 +136,20 @@ impl Held {
     }
 }
 
-/// Steps after which the slowest mode of a body has forgotten all but a hundred-thousandth.
+/// Number of steps after which the slowest mode of a body has decayed to about a
+/// hundred-thousandth.
 pub(super) fn settling(model: &ModalModel, step: f64) -> usize {
     let rate = model.omega().iter().zip(model.damping()).map(|(omega, c)| {
         let half = 0.5 * c;
-        // The slower of the two roots where a mode is overdamped.
+        // An overdamped mode decays with the slower of its two roots.
         if half > *omega { omega * omega / (half + (half * half - omega * omega).sqrt()) } else { half }
     });
     let slowest = rate.fold(f64::INFINITY, f64::min);
     ((12.0 / (slowest * step)) as usize).clamp(200, 3_000_000)
 }
 
-/// `W^T Phi Lambda^-1 Phi^T W` of the kept modes, m/N: the static compliance of a patch without what the modes leave out.
+/// `W^T Phi Lambda^-1 Phi^T W` of the kept modes, m/N: the static compliance of a patch without
+/// residual flexibility.
 pub(super) fn modal_compliance(model: &ModalModel, patch: &Patch) -> Matrix3<f64> {
     let mut sum = Matrix3::zeros();
     for mode in 0..model.mode_count() {
@@ -159,19 +161,20 @@ pub(super) fn modal_compliance(model: &ModalModel, patch: &Patch) -> Matrix3<f64
     sum
 }
 
-/// The compliance that a hand feels at once, m/N.
+/// The immediate compliance at a hand, m/N.
 pub(super) fn compliance(body: &Body, grab: GrabId) -> Result<Matrix3<f64>, StepError> {
     let c = body.compliance(grab)?;
     Ok(Matrix3::from_fn(|i, j| c[i][j]))
 }
 
-/// The pull (N) that holds a patch `away` (m) from its rest: the static limit of a small displacement.
+/// The force (N) that holds a patch `away` (m) from its rest: the static limit of a small
+/// displacement.
 pub(super) fn static_pull(held: &Held, away: [f64; 3]) -> Result<Vector3<f64>, StepError> {
     let whole = compliance(&held.body, held.grab)? + modal_compliance(&held.model, &held.patch);
     Ok(whole.try_inverse().map_or_else(|| Vector3::repeat(f64::NAN), |inverse| inverse * Vector3::from(away)))
 }
 
-/// From 0 to 1 in a second, with speed and acceleration zero at both ends.
+/// A ramp from 0 to 1 within a second, with zero speed and acceleration at both ends.
 pub(super) fn smooth(t: f64) -> f64 {
     let t = t.clamp(0.0, 1.0);
     t * t * t * (10.0 - 15.0 * t + 6.0 * t * t)
@@ -184,7 +187,8 @@ pub(super) fn ringing(forces: &[Vector3<f64>]) -> f64 {
     if largest > 0.0 { second / largest } else { 0.0 }
 }
 
-/// The largest growth of the energy in a step, as a share of the energy at the start, and all of it left at the end.
+/// The largest growth of the energy in a step and the energy at the end, both as shares of the
+/// energy at the start.
 pub(super) fn energy_growth(body: &mut Body, steps: usize) -> Result<[f64; 2], StepError> {
     let start = body.energy().max(f64::MIN_POSITIVE);
     let (mut last, mut growth) = (start, 0.0f64);
@@ -197,12 +201,13 @@ pub(super) fn energy_growth(body: &mut Body, steps: usize) -> Result<[f64; 2], S
     Ok([growth, last / start])
 }
 
-/// The bound on [`energy_growth`]: rounding. Generalized-alpha conserves another norm, equivalent to the energy within a factor.
+/// The bound on [`energy_growth`], which leaves room for rounding only. Generalized-alpha conserves
+/// another norm, which equals the energy within a factor.
 pub(super) fn no_growth(growth: f64) -> Bound {
     Bound::new("largest growth of the energy in a step / energy", growth, 1e-9)
 }
 
-/// A state from coordinates and velocities; accelerations that belong to them.
+/// A state from coordinates and velocities, with the matching accelerations.
 pub(super) fn state(body: &Body, q: Vec<f64>, v: Vec<f64>) -> State {
     let mut state = body.state().clone();
     let model = body.model();
@@ -214,7 +219,8 @@ pub(super) fn state(body: &Body, q: Vec<f64>, v: Vec<f64>) -> State {
     state
 }
 
-/// The modal coordinates whose linear displacement of the surface comes nearest to a field (least squares).
+/// The modal coordinates whose linear displacement of the surface comes closest to a field (least
+/// squares).
 pub(super) fn nearest(model: &ModalModel, field: impl Fn([f64; 3]) -> [f64; 3]) -> Vec<f64> {
     let positions = model.surface().positions();
     let modes = model.mode_count();
@@ -228,7 +234,7 @@ pub(super) fn nearest(model: &ModalModel, field: impl Fn([f64; 3]) -> [f64; 3]) 
     normal.lu().solve(&right).map_or_else(|| vec![0.0; modes], |q| q.iter().copied().collect())
 }
 
-/// splitmix64 as numbers from -1 to 1.
+/// SplitMix64 as random numbers from -1 to 1.
 pub(super) struct Dice(pub(super) u64);
 
 impl Dice {

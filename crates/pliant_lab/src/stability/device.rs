@@ -1,4 +1,5 @@
-//! The haptic loop on a virtual device, in virtual time: known limits found again, and a body dragged by stiff, loose and absent hands.
+//! The haptic loop on a virtual device in virtual time: known limits, and a body dragged by stiff,
+//! loose and absent hands.
 
 use std::{collections::VecDeque, sync::Arc};
 
@@ -14,9 +15,9 @@ use super::{
 };
 use crate::LabError;
 
-/// Periods a second of the loop.
+/// Periods a second of the device loop.
 const RATE: f64 = 1000.0;
-/// What the loop may give beyond what was put in, J: its tank.
+/// Largest energy that the loop may give beyond its supply, J: the capacity of its tank.
 const TANK: f64 = 5e-3;
 
 pub(super) fn cases(out: &mut Vec<Case>) {
@@ -41,7 +42,7 @@ pub(super) fn cases(out: &mut Vec<Case>) {
     }
 }
 
-/// Does a free device on a bare spring of `k` (N/m) calm down?
+/// Returns whether a free device on a bare spring of `k` (N/m) comes to rest.
 fn calms(device: &VirtualConfig, k: f64) -> Result<bool, LabError> {
     let config = LoopConfig { safety: Some(SafetyConfig::bare()), ..LoopConfig::default() };
     let mut cycle = Cycle::new(VirtualDevice::new(device.clone(), Hand::NONE)?, config)?;
@@ -73,7 +74,8 @@ fn calms(device: &VirtualConfig, k: f64) -> Result<bool, LabError> {
     Ok(late < early)
 }
 
-/// The stiffest wall by bisection, beside the known limit of a sampled spring.
+/// Finds the stiffest stable wall by bisection and compares it with the known limit of a sampled
+/// spring.
 fn sampled_spring(mass: f64, damping: f64) -> Result<Outcome, LabError> {
     let device = VirtualConfig { mass, damping, peak_force: 1e6, ..VirtualConfig::default() };
     let want = 2.0 * damping * RATE;
@@ -85,7 +87,8 @@ fn sampled_spring(mass: f64, damping: f64) -> Result<Outcome, LabError> {
     Ok(Outcome::of(vec![Bound::new("|stiffest calm spring / (2 b / T) - 1|", low / want - 1.0, 0.02)]))
 }
 
-/// A body stepped at the game's rate, a network of a fixed delay, and the loop with a virtual Touch.
+/// A body stepped at the game's rate, a network with a fixed delay, and the device loop with a
+/// virtual Touch.
 struct Scene {
     body: Body,
     held: HeldGrab,
@@ -97,11 +100,11 @@ struct Scene {
     step: f64,
     one_way: f64,
     next_step: f64,
-    /// When they arrive, when they were seen, where the tool was.
+    /// Arrival time, sample time and position of the tool.
     targets: VecDeque<(f64, f64, [f64; 3])>,
     seen: f64,
     words: VecDeque<(f64, LocalModel)>,
-    /// Most that the motors have ever done more than was put in, J.
+    /// The largest energy that the motors have given beyond the supply, J.
     given: f64,
 }
 
@@ -138,7 +141,7 @@ impl Scene {
         })
     }
 
-    /// One period of the loop, and every step that falls into it.
+    /// Runs one period of the loop and every step that falls into it.
     fn tick(&mut self) -> Result<(), LabError> {
         let now = self.pace.now();
         let newest = self.cycle.core().last();
@@ -181,7 +184,8 @@ impl Scene {
     }
 }
 
-/// Pulls 3 cm to the side in half a second and stays there; nobody's hand gives the free device a push instead.
+/// Drags the tool 3 cm to the side within half a second and holds it there. Without a hand, the
+/// free device gets an initial velocity instead.
 fn drag(young: f64, hand: Hand, simulation: f64, round_trip: f64) -> Result<Outcome, LabError> {
     let mut scene = Scene::new(young, hand, simulation, round_trip)?;
     scene.largest_speed(0.5)?;
@@ -200,7 +204,8 @@ fn drag(young: f64, hand: Hand, simulation: f64, round_trip: f64) -> Result<Outc
     let early = scene.largest_speed(0.5)?;
     scene.largest_speed(1.5)?;
     let late = scene.largest_speed(0.5)?;
-    // Below half a centimetre a second nobody feels it move; above, it must be slower than two seconds before.
+    // Below half a centimeter a second nobody feels the motion. Above that, the motion must be
+    // slower than two seconds before.
     let allowed = (0.7 * early).max(5e-3);
     Ok(Outcome::of(vec![
         Bound::new("speed of the tool 3.5 s after the pull / m/s", late, allowed),

@@ -1,4 +1,5 @@
-//! Hands that do what no hand should: teleport, tremble, twist, oppose each other, share a spot, hold an anchor, outnumber the modes.
+//! Hands with extreme input: they teleport, tremble, twist, oppose each other, share a patch, hold
+//! an anchor, or outnumber the modes.
 
 use nalgebra::Vector3;
 use pliant_modal::{Body, BodyConfig, GrabConfig, GrabId, ModalModel, Patch, StepSettings};
@@ -29,9 +30,10 @@ pub(super) fn cases(out: &mut Vec<Case>) {
         for corrections in [2, 8] {
             let name = format!("two turns, E {young:.0e} Pa, {corrections} corrections a step");
             let case = Case::new("twist", name, move || twist(young, corrections));
-            // A metre of bar of a gigapascal; softer and stiffer ones come to rest with two.
+            // This is a bar of 1 m and 1 GPa. Softer and stiffer bars come to rest with two
+            // corrections.
             out.push(if corrections == 2 && young == 1e9 {
-                // At most 2: the hand is pulled to and fro by all that it feels.
+                // The largest possible value is 2, when the reaction changes its sign in full.
                 case.limited(
                     TOO_FEW_CORRECTIONS,
                     Expected::Measured(&[("change of a held reaction in a step / reaction", 0.1, 2.0)]),
@@ -120,7 +122,7 @@ pub(super) fn cases(out: &mut Vec<Case>) {
     }
 }
 
-/// Targets a hundred sizes away, to and fro, then let go.
+/// Moves the target to and fro a hundred sizes away, then releases the patch.
 fn teleport(young: f64, step: f64) -> Result<Outcome, LabError> {
     let bar = Bar { young, zeta: 0.05, ..Bar::default() };
     let mut held = Held::new(&bar, BodyConfig { step, ..BodyConfig::default() }, GrabConfig::default())?;
@@ -135,7 +137,7 @@ fn teleport(young: f64, step: f64) -> Result<Outcome, LabError> {
         force = force.max(held.reaction()?.norm());
         energy = energy.max(held.body.energy());
     }
-    // From a body's size away the hand's own compliance allows so much.
+    // The hand's own compliance allows this force from a body's size away.
     let softest = compliance(&held.body, held.grab)?.symmetric_eigenvalues().min();
     let allowed = held.model.size() / softest;
     held.body.release(held.grab);
@@ -152,7 +154,7 @@ fn teleport(young: f64, step: f64) -> Result<Outcome, LabError> {
     })
 }
 
-/// The target trembles by the step of a cheap encoder, a flip each step.
+/// Flips the target each step by the resolution of a cheap encoder.
 fn jitter(young: f64, step: f64) -> Result<Outcome, LabError> {
     let bar = Bar { young, length: 0.15, ..Bar::default() };
     let mut held = Held::new(&bar, BodyConfig { step, ..BodyConfig::default() }, GrabConfig::default())?;
@@ -181,7 +183,8 @@ fn jitter(young: f64, step: f64) -> Result<Outcome, LabError> {
     })
 }
 
-/// Four hands on the corners of the end turn it about the axis by two full turns, hold, and let go.
+/// Four hands on the corners of the end turn it about the axis by two full turns, hold it and
+/// release it.
 fn twist(young: f64, corrections: u8) -> Result<Outcome, LabError> {
     let bar = Bar { young, zeta: 0.05, modes: 30, ..Bar::default() };
     let model = bar.bake()?;
@@ -240,7 +243,7 @@ fn twist(young: f64, corrections: u8) -> Result<Outcome, LabError> {
     })
 }
 
-/// Two hands on either side of the end pull apart by a tenth of the length.
+/// Two hands on opposite sides of the end pull apart by a tenth of the length.
 fn opposed(young: f64, stiffness: Option<f64>) -> Result<Outcome, LabError> {
     let bar = Bar { young, zeta: 0.1, ..Bar::default() };
     let model = bar.bake()?;
@@ -273,7 +276,7 @@ fn opposed(young: f64, stiffness: Option<f64>) -> Result<Outcome, LabError> {
     })
 }
 
-/// Hands on one spot share what one hand of their joint compliance would feel.
+/// Hands on one patch must share the force that a single hand with their joint compliance gets.
 fn coincident(hands: usize) -> Result<Outcome, LabError> {
     let bar = Bar { zeta: 0.3, ..Bar::default() };
     let model = bar.bake()?;
@@ -308,7 +311,7 @@ fn coincident(hands: usize) -> Result<Outcome, LabError> {
     })
 }
 
-/// A hand on what cannot move feels its own contact compliance and nothing else.
+/// A hand on an anchor must get the force of its own contact compliance and nothing else.
 fn on_anchor(young: f64, beside: bool) -> Result<Outcome, LabError> {
     let bar = Bar { young, zeta: 0.3, ..Bar::default() };
     let model = bar.bake()?;
@@ -351,7 +354,7 @@ fn spread(bar: &Bar, model: &ModalModel, hands: usize) -> Result<Vec<Patch>, Lab
         .collect()
 }
 
-/// More rows than modes: the hands disagree, the body settles all the same.
+/// More rows than modes: the hands contradict each other, and the body must still come to rest.
 fn many(modes: usize, hands: usize) -> Result<Outcome, LabError> {
     let bar = Bar { modes, zeta: 0.2, ..Bar::default() };
     let model = bar.bake()?;
@@ -388,7 +391,7 @@ fn many(modes: usize, hands: usize) -> Result<Outcome, LabError> {
     })
 }
 
-/// A free body pulled to and fro: masses a million times apart under the same hand.
+/// Pulls a free body to and fro. The cases have masses a million times apart under the same hand.
 fn light_and_heavy(density: f64, stiffness: Option<f64>) -> Result<Outcome, LabError> {
     let bar = Bar { held: false, density, modes: 12, zeta: 0.1, ..Bar::default() };
     let model = bar.bake()?;

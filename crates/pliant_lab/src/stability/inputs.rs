@@ -1,4 +1,4 @@
-//! Numbers that are none: refused by name, and nothing has changed.
+//! Inputs that are not finite: the body rejects them by name, and nothing changes.
 
 use pliant_modal::{Body, BodyConfig, GrabConfig, Integrator, StepError, StepSettings};
 

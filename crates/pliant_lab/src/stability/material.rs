@@ -1,4 +1,5 @@
-//! Stiffness, Poisson ratio, density, damping, size, element shape, number of modes: what a body is made of.
+//! Material and mesh of a body: stiffness, Poisson ratio, density, damping, size, element shape and
+//! number of modes.
 
 use nalgebra::Vector3;
 use pliant_mesh::TetMesh;
@@ -11,7 +12,8 @@ use super::{
 };
 use crate::LabError;
 
-/// How far a dragged patch may go, in drags: overshoot is physics, ten times the way is not.
+/// Largest allowed excursion of a dragged patch, as a multiple of the drag. Overshoot is physical,
+/// but ten times the drag is not.
 const EXCURSION: f64 = 10.0;
 
 const TOO_THIN: &str = "the bake refuses the mesh by name: the stiffness of its thinnest elements, times the rounding of a double, is more than a ten-millionth of what the slowest modes weigh";
@@ -124,7 +126,8 @@ pub(super) fn cases(out: &mut Vec<Case>) {
     }
 }
 
-/// A mesh of thin elements: `refused` by the bake, by name, where they are too thin.
+/// A case with a mesh of thin elements. `refused` is true if the elements are so thin that the bake
+/// rejects the mesh by name.
 fn shaped(
     group: &'static str,
     name: String,
@@ -146,8 +149,9 @@ pub(super) fn word(integrator: Integrator) -> &'static str {
     }
 }
 
-/// A smooth drag by a twentieth of the length in a second (or forty steps) and as long a hold. The force must not ring; a body far slower than the step is
-/// still under way and is held to less.
+/// Drags the tip smoothly by a twentieth of the length within a second (or forty steps), then holds
+/// it for as long. The force must not ring. A body far slower than the step is still moving, so its
+/// bound is looser.
 fn drag(bar: &Bar, config: BodyConfig) -> Result<Outcome, LabError> {
     let step = config.step;
     let mut held = Held::new(bar, config, GrabConfig::default())?;
@@ -177,8 +181,9 @@ fn drag(bar: &Bar, config: BodyConfig) -> Result<Outcome, LabError> {
     })
 }
 
-/// Held a millionth of the length away until all is quiet: the reaction is the static one. (A bar that bends by `d` also shortens by `d^2 / L`, which its axial
-/// stiffness answers: at a ten-thousandth that is half a percent already.)
+/// Holds the tip a millionth of the length away until the body is at rest. The reaction must equal
+/// the static one. (A bar that bends by `d` also shortens by `d^2 / L`, against its axial
+/// stiffness. At a ten-thousandth of the length this is already half a percent.)
 fn hold(bar: &Bar, step: f64) -> Result<Outcome, LabError> {
     hold_mesh(bar, &bar.mesh()?, step)
 }
@@ -203,7 +208,7 @@ fn hold_patch(bar: &Bar, mut held: Held) -> Result<Outcome, LabError> {
     Ok(Outcome::of(vec![Bound::new("|reaction - static| / static", (got - want).norm() / want.norm(), 2e-3)]))
 }
 
-/// Struck at the tip and left alone for 5,000 steps: the energy never grows.
+/// Applies an impulse at the tip and runs 5,000 free steps. The energy must never grow.
 fn struck(bar: &Bar, step: f64, integrator: Integrator) -> Result<Outcome, LabError> {
     let held = Held::new(
         bar,
@@ -218,7 +223,8 @@ fn struck(bar: &Bar, step: f64, integrator: Integrator) -> Result<Outcome, LabEr
     body.release(held.grab);
     let impulse = 0.05 * bar.length * held.model.omega()[0] * held.model.mass();
     body.apply_impulse(Patch::center(&held.patch), [0.3 * impulse, impulse, -0.7 * impulse])?;
-    // Generalized-alpha loses energy of fast modes in a norm of its own, which the energy lies within a factor of.
+    // Generalized-alpha damps fast modes in a norm of its own that equals the energy within a
+    // factor.
     if matches!(integrator, Integrator::GeneralizedAlpha { .. }) {
         let start = body.energy();
         let mut most = 0.0f64;
@@ -232,7 +238,8 @@ fn struck(bar: &Bar, step: f64, integrator: Integrator) -> Result<Outcome, LabEr
     Ok(Outcome::of(vec![no_growth(growth)]))
 }
 
-/// One node in the middle of the bar is moved towards the face of a tetrahedron opposite to it, so that only `1 - share` of its height is left.
+/// Moves nodes inside the bar towards the opposite face of a tetrahedron, so that only `1 - share`
+/// of the height is left.
 fn slivers(mut mesh: TetMesh, share: f64) -> TetMesh {
     let [low, high] = mesh.bounds();
     let inside = |p: &[f64; 3]| (0..3).all(|k| p[k] > low[k] + 1e-9 && p[k] < high[k] - 1e-9);
@@ -249,7 +256,8 @@ fn slivers(mut mesh: TetMesh, share: f64) -> TetMesh {
         let old = mesh.nodes[node];
         let at = Vector3::from(old);
         let normal = (face[1] - face[0]).cross(&(face[2] - face[0])).normalize();
-        // Along the normal only: the other tetrahedra of the node stay the right way round for as long as they can.
+        // The node moves along the normal only, so that its other tetrahedra keep their orientation
+        // for as long as possible.
         mesh.nodes[node] = (at - normal * (at - foot).dot(&normal) * share).into();
         if mesh.check().is_err() {
             mesh.nodes[node] = old;
@@ -260,7 +268,7 @@ fn slivers(mut mesh: TetMesh, share: f64) -> TetMesh {
     mesh
 }
 
-/// The bar with slices that grow along it: the last is `ratio` times as heavy as the first.
+/// The bar with slices that grow along it. The last slice is `ratio` times as heavy as the first.
 fn graded(bar: &Bar, ratio: f64) -> Result<TetMesh, LabError> {
     let mut mesh = Bar { cells: [16, 2, 2], ..bar.clone() }.mesh()?;
     let growth = ratio.powf(1.0 / 15.0);

@@ -1,10 +1,9 @@
-//! A matrix of stiff, extreme and unfair cases, each with the bound that it has to keep and the
-//! margin that it keeps it by.
+//! A matrix of stiff, extreme and unfair cases, each with a bound and its margin.
 //!
-//! A bound is a number measured against a limit. The margin is `limit / measured` of the tightest
-//! bound of a case, cut at a million million: 1 just holds, 10 holds ten times over. Where hands
-//! pull, the paper's plain scheme (average acceleration, hands as rigid position constraints) runs
-//! through the same script, and what it did stands beside.
+//! A bound compares a measured number with a limit. The margin of a case is `limit / measured` of
+//! its tightest bound, at most 1e12: with 1 the bound just holds, with 10 it holds ten times over.
+//! In cases with hands, the paper's plain scheme (average acceleration, hands as rigid position
+//! constraints) runs the same script, and its result stands beside.
 
 mod bodies;
 mod device;
@@ -27,28 +26,28 @@ use serde::Serialize;
 
 use crate::{LabError, progress::Progress};
 
-/// Threads that work on cases at most.
+/// Largest number of threads that run cases.
 const MOST_THREADS: usize = 64;
 
-/// Which cases to run, and how.
+/// Settings of a run.
 #[derive(Debug, Clone, Default)]
 pub struct Settings {
-    /// Only cases whose group or name holds this text. Default: all.
+    /// Run only cases whose group or name contains this text. Default: all.
     pub only: Option<String>,
-    /// One case in eight. Default: false.
+    /// Run one case in eight. Default: false.
     pub short: bool,
-    /// Threads to use, at most 64. Default: one a core.
+    /// Number of threads, at most 64. Default: one per core.
     pub threads: Option<usize>,
 }
 
-/// A number that must stay at or below a limit.
+/// A number that must not exceed a limit.
 #[derive(Serialize, Debug, Clone, Copy)]
 pub struct Bound {
-    /// What was measured, with its unit where it has one.
+    /// Name of the measured number, with its unit if it has one.
     pub what: &'static str,
-    /// The number.
+    /// The measured number.
     pub measured: f64,
-    /// What it may be at most.
+    /// The limit.
     pub limit: f64,
 }
 
@@ -57,7 +56,7 @@ impl Bound {
         Self { what, measured: measured.abs(), limit }
     }
 
-    /// `limit / measured`; 0 for what is not finite.
+    /// Returns `limit / measured`, or 0 for a number that is not finite.
     pub fn margin(&self) -> f64 {
         const MOST: f64 = 1e12;
         if !self.measured.is_finite() {
@@ -69,17 +68,17 @@ impl Bound {
         }
     }
 
-    /// In words: name, number and limit.
+    /// Name, number and limit as text.
     pub fn text(&self) -> String {
         format!("{} {:.3e} <= {:.3e}", self.what, self.measured, self.limit)
     }
 }
 
-/// What a case came to.
+/// The result of a case.
 #[derive(Debug, Default)]
 struct Outcome {
     bounds: Vec<Bound>,
-    /// What the paper's plain scheme did with the same script.
+    /// The result of the paper's plain scheme with the same script.
     plain: Option<String>,
 }
 
@@ -89,8 +88,9 @@ impl Outcome {
     }
 }
 
-/// A case that does not keep its bound for a reason that lies in the method: why, and what then happens instead. Whatever else happens is a failure,
-/// and so is a limit that is none any more: then this has to be taken away.
+/// A known limit: the case breaks its bound for a reason in the method. `expected` is the only
+/// accepted result. Any other result is a failure. A case that passes despite its known limit fails
+/// too, so that the entry gets removed.
 #[derive(Debug, Clone, Copy)]
 struct Limit {
     why: &'static str,
@@ -99,9 +99,11 @@ struct Limit {
 
 #[derive(Debug, Clone, Copy)]
 enum Expected {
-    /// The bake refuses the mesh: its modes do not solve the equation well enough ([`BakeError::Inaccurate`]).
+    /// The bake rejects the mesh, because its modes do not solve the equation accurately enough
+    /// ([`BakeError::Inaccurate`]).
     Inaccurate,
-    /// Bounds of these names are broken by numbers between these two (one at least), and every other bound holds.
+    /// At least one bound of these names is broken, with numbers between these two, and every other
+    /// bound holds.
     Measured(&'static [(&'static str, f64, f64)]),
 }
 
@@ -145,55 +147,58 @@ impl Case {
     }
 }
 
-/// What became of a case.
+/// The verdict on a case.
 #[derive(Serialize, Debug, Clone)]
 pub struct Verdict {
-    /// Its name, unique within its group.
+    /// Name of the case, unique within its group.
     pub name: String,
-    /// Its group.
+    /// Group of the case.
     pub group: &'static str,
-    /// It keeps all its bounds.
+    /// True if the case keeps all its bounds.
     pub passed: bool,
-    /// `limit / measured` of the tightest bound: 1 just holds. 0 where nothing was measured.
+    /// `limit / measured` of the tightest bound: with 1 the bound just holds. 0 if nothing was
+    /// measured.
     pub margin: f64,
-    /// The tightest of the bounds in words, or why nothing was measured.
+    /// The tightest bound as text, or the reason why nothing was measured.
     pub bound: String,
-    /// All of them.
+    /// All bounds.
     pub bounds: Vec<Bound>,
-    /// Why it does not pass, where that is known and what happened is what was expected.
+    /// The reason why the case does not pass, if that is a known limit and the result is the
+    /// expected one.
     pub known_limit: Option<&'static str>,
-    /// It was listed as a known limit, and passes: the list is out of date, which counts as broken.
+    /// True if the case is listed as a known limit but passes. The list is out of date, so the case
+    /// counts as broken.
     pub limit_gone: bool,
-    /// What the paper's plain scheme did with the same script.
+    /// The result of the paper's plain scheme with the same script.
     pub plain: Option<String>,
-    /// What it took, s.
+    /// Run time of the case, s.
     pub seconds: f64,
 }
 
 impl Verdict {
-    /// It fails without being a known limit, or is listed as one and passes.
+    /// Returns true if the case fails without being a known limit, or is listed as one and passes.
     pub fn broken(&self) -> bool {
         self.limit_gone || (!self.passed && self.known_limit.is_none())
     }
 }
 
-/// What became of all cases.
+/// The verdicts of all cases.
 #[derive(Serialize, Debug, Clone)]
 pub struct Report {
-    /// In the order of the matrix.
+    /// The cases in the order of the matrix.
     pub cases: Vec<Verdict>,
-    /// What all of it took, s.
+    /// Run time of all cases, s.
     pub seconds: f64,
 }
 
 impl Report {
-    /// Cases that are broken.
+    /// Number of broken cases.
     pub fn broken(&self) -> usize {
         self.cases.iter().filter(|case| case.broken()).count()
     }
 }
 
-/// All cases, in the order in which they are told.
+/// All cases in the order of the report.
 fn all() -> Vec<Case> {
     let mut cases = Vec::new();
     material::cases(&mut cases);
@@ -205,10 +210,11 @@ fn all() -> Vec<Case> {
     cases
 }
 
-/// Runs the chosen cases of the matrix; the report is empty where none has such a name.
+/// Runs the chosen cases of the matrix. The report is empty if no case matches the settings.
 ///
 /// # Errors
-/// [`LabError::Threads`]; what goes wrong in a case is told as its verdict.
+/// Returns [`LabError::Threads`] if the threads cannot be started. Errors within a case become its
+/// verdict.
 pub fn run(settings: &Settings, progress: &mut dyn Progress) -> Result<Report, LabError> {
     let began = Instant::now();
     let wanted = |case: &Case| {
@@ -232,7 +238,8 @@ pub fn run(settings: &Settings, progress: &mut dyn Progress) -> Result<Report, L
     let cases: Vec<Verdict> = pool.install(|| {
         chosen
             .par_iter()
-            // One case at a time is handed out: they differ a thousandfold in length.
+            // Hand out one case at a time, because their run times differ by a factor of a
+            // thousand.
             .with_max_len(1)
             .map(|case| {
                 let verdict = judge(case);
@@ -250,7 +257,7 @@ pub fn run(settings: &Settings, progress: &mut dyn Progress) -> Result<Report, L
 
 fn judge(case: &Case) -> Verdict {
     let began = Instant::now();
-    // A panic is this case's failure, not the end of all others; nothing of it is used afterwards.
+    // A panic fails only its own case. Nothing of that case is used afterwards.
     let came = catch_unwind(AssertUnwindSafe(|| (case.run)()));
     let expected = |came: &Result<Outcome, LabError>| {
         case.known_limit.filter(|limit| limit.expected.holds(came)).map(|limit| limit.why)
@@ -330,14 +337,16 @@ mod tests {
         };
         let limit = case(3.0, 0.5);
         assert!(!limit.broken() && !limit.passed && limit.known_limit == Some("known"), "{limit:?}");
-        // Worse or better than known, another bound broken too, not a number.
+        // These are worse than known, better than known, another bound broken too, and not a
+        // number.
         for (measured, other) in [(5.0, 0.5), (1.5, 0.5), (3.0, 2.0), (f64::NAN, 0.5), (0.5, 3.0)] {
             let told = case(measured, other);
             assert!(told.broken() && told.known_limit.is_none(), "{told:?}");
         }
         let gone = case(0.5, 0.5);
         assert!(gone.passed && gone.limit_gone && gone.broken(), "{gone:?}");
-        // Refused is not the same as measured, and refused for another reason is not refused for this one.
+        // A rejection differs from a measured result, and a rejection for another reason does not
+        // count.
         let refused = |expected| {
             let run = || Err(LabError::Threads { got: 0, most: 1 });
             judge(&Case::new("g", "n".into(), run).limited("known", expected))

@@ -88,7 +88,8 @@ pub(super) fn cases(out: &mut Vec<Case>) {
     }
 }
 
-/// What is known to happen at 1/60 s to the held starts whose patch is lengths away: thrown about by a few times their energy, or not at rest at the end.
+/// The known results at 1/60 s of held starts whose patch is lengths away from its rest: the energy
+/// grows by a small factor, or the body is not at rest at the end.
 fn far_and_fast(shape: [f64; 3]) -> Option<Expected> {
     if shape[0] < 0.0 {
         return Some(Expected::Measured(&[("largest energy / energy at the start", 1.0, 10.0)]));
@@ -111,7 +112,8 @@ fn random(seed: u64, integrator: Integrator) -> Result<Outcome, LabError> {
     Ok(Outcome::of(vec![no_growth(growth)]))
 }
 
-/// The surface's points are multiplied by `scale` about the middle of the held end, as nearly as the modes can.
+/// Starts with the surface's points multiplied by `scale` about the middle of the held end, as
+/// closely as the modes can represent that.
 fn started(scale: [f64; 3], held: bool, warp: bool, step: f64) -> Result<Outcome, LabError> {
     let bar = Bar { zeta: 0.05, ..Bar::default() };
     let model = bar.bake()?;
@@ -165,12 +167,14 @@ fn flight(step: f64) -> Result<Outcome, LabError> {
     let (p1, l1) = momentum(&body);
     Ok(Outcome::of(vec![
         Bound::new("linear momentum lost / momentum", (p1 - p0).norm() / p0.norm(), 1e-9),
-        // It is about the world's origin: the body is up to a thousand lengths away by then, and rounding grows with that.
+        // Angular momentum is taken about the world's origin. The body is up to a thousand lengths
+        // away by then, and rounding errors grow with the distance.
         Bound::new("angular momentum lost / momentum", (l1 - l0).norm() / l0.norm(), 1e-6),
     ]))
 }
 
-/// Tumbling about no axis of its own for 100,000 steps: energy and spin stay.
+/// A tumble about an axis that is no principal axis, for 100,000 steps, must keep energy and
+/// angular momentum.
 fn spinning(turns: f64, step: f64) -> Result<Outcome, LabError> {
     let bar = Bar { section: [0.2, 0.3], ..free(1e6) };
     let model = bar.bake()?;
@@ -195,7 +199,7 @@ fn spinning(turns: f64, step: f64) -> Result<Outcome, LabError> {
     ]))
 }
 
-/// What two hands pull is what the momentum changes by.
+/// The change of momentum must equal the impulse of the two hands.
 fn counted(step: f64) -> Result<Outcome, LabError> {
     let bar = free(1e6);
     let model = bar.bake()?;
@@ -239,7 +243,7 @@ fn relaxing_energy(relaxation: Relaxation) -> Result<Outcome, LabError> {
     Ok(Outcome::of(vec![no_growth(growth)]))
 }
 
-/// Held for long, `1 - ratio` of the reaction is left.
+/// After a long hold, `1 - ratio` of the reaction must be left.
 fn relaxed_reaction(relaxation: Relaxation) -> Result<Outcome, LabError> {
     let bar = Bar { zeta: 0.3, ..Bar::default() };
     let elastic = Held::new(&bar, BodyConfig::default(), GrabConfig::default())?;

@@ -1,4 +1,5 @@
-//! A session over bad networks, in virtual time: the default way of repair within its bars, the paper's beside it.
+//! Sessions over bad networks in virtual time: the default recovery must stay within its bounds,
+//! and the results of the paper's recovery stand beside it.
 
 use std::time::Duration;
 
@@ -13,7 +14,7 @@ use super::{Bound, Case, Expected, Outcome, bodies::Bar};
 use crate::LabError;
 use crate::experiment::{Experiment, Metrics};
 
-/// At 40 Hz.
+/// One tick at 40 Hz.
 const TICK: Duration = Duration::from_millis(25);
 
 const RMS: &str = "shown error, rms, % of the largest displacement";
@@ -22,11 +23,12 @@ const TICKS: &str = "ticks missing";
 
 const SILENT: &str = "the line says nothing for longer than a guest goes on by guessing (`GuestConfig::stall_after`): then the picture stands still until the next frame, and is as far off as the hands have gone meanwhile";
 
-/// Share of the ticks that may not be shown in time.
+/// Share of the ticks that may be missing.
 const MISSING: f64 = 0.01;
 
 pub(super) fn cases(out: &mut Vec<Case>) {
-    // The bars of the design for the paper's first network; the others are asked for no less.
+    // The bounds are those of the design for the paper's first network. The other networks have the
+    // same bounds.
     for preset in Preset::ALL {
         let name = format!("{}, 30 s at 40 Hz", preset.name());
         out.push(Case::new("network", name, move || guest(&LinkConfig::preset(preset), 40.0, 0.2, 3.0)));
@@ -70,7 +72,8 @@ fn experiment(link: &LinkConfig, rate: f64, recovery: RecoveryConfig) -> Result<
     let mut experiment = Experiment::new(model, link.clone(), recovery);
     experiment.rate = rate;
     experiment.seconds = if rate > 40.0 { 10.0 } else { 30.0 };
-    // Streamed accelerations obey Newmark's formulas: the host's integrator has to as well.
+    // Streamed accelerations follow Newmark's formulas, so the host's integrator must follow them
+    // as well.
     if !matches!(recovery.policy, Policy::ForceDriven { .. }) {
         experiment.integrator = Integrator::GeneralizedAlpha { rho_inf: 0.5 };
     }
@@ -87,16 +90,18 @@ fn guest(link: &LinkConfig, rate: f64, rms: f64, max: f64) -> Result<Outcome, La
         bounds: vec![
             Bound::new(RMS, ours.rms_percent, rms),
             Bound::new(LARGEST, ours.max_percent, max),
-            // Whatever is not shown in time, and all that would be were nothing shown at all. Two may fall on the edges of the measured time.
+            // Counts the ticks that were not shown in time, or all ticks if nothing was shown at
+            // all. Two may fall on the edges of the measured time.
             Bound::new(TICKS, missing(&ours, ticks), (MISSING * ticks).max(2.0)),
-            // As smooth as without loss, or smooth by the bound that every dragged body here keeps.
+            // The reaction must be about as smooth as without loss, or within the bound of every
+            // dragged body here.
             Bound::new("ringing of the reaction", ours.force_ringing, (1.2 * ours.true_ringing).max(0.1)),
         ],
         plain: Some(format!("{}; without repair {}", words(&paper), words(&bare))),
     })
 }
 
-/// Ticks not shown in time, or never.
+/// Number of ticks that were shown late or never.
 fn missing(f: &Metrics, ticks: f64) -> f64 {
     (f.missing as f64).max(ticks - f.ticks as f64)
 }
@@ -109,7 +114,7 @@ fn peers(link: &LinkConfig) -> Result<Outcome, LabError> {
     let f = experiment(link, 40.0, RecoveryConfig::default())?.run_peers(Repair::Rollback)?;
     Ok(Outcome::of(vec![
         Bound::new(RMS, f.rms_percent, 2.0),
-        // Waking every 5 ms, a peer of 25 ms a step is on time or a look late.
+        // A peer with steps of 25 ms that wakes every 5 ms is on time or one wake-up late.
         Bound::new("ticks missing of 1,200", missing(&f, 1200.0), 100.0),
     ]))
 }

@@ -1,21 +1,22 @@
-//! The paper's scheme as it is printed: average acceleration, hands as rigid position constraints (its eq. 4), the warp's rotation taken from the last
-//! step. No compliance, no Newton correction, no regularisation.
+//! The paper's scheme as printed: average acceleration, hands as rigid position constraints (its
+//! eq. 4), and the warp's rotation taken from the last step. The scheme has no compliance, no
+//! Newton correction and no regularization.
 
 use nalgebra::{DMatrix, DVector, Matrix3, Vector3};
 use pliant_modal::{Coefficients, Integrator, ModalModel, Patch, StepError, warp_jacobian};
 
 use super::bodies::ringing;
 
-/// Why it could not go on.
+/// The reason why the scheme cannot continue.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(super) enum Broken {
-    /// The constraints' system has no solution, or none that solves it.
+    /// The constraint system has no solution, or the solver's result does not solve it.
     Singular,
     /// A number is no longer finite.
     NotFinite,
 }
 
-/// A body stepped as the paper says.
+/// A body stepped by the paper's scheme.
 pub(super) struct Plain {
     coefficients: Vec<Coefficients>,
     state: Vec<[f64; 3]>,
@@ -39,12 +40,12 @@ impl Plain {
         Ok(Self { coefficients, state: vec![[0.0; 3]; modes], force: vec![0.0; modes], hands })
     }
 
-    /// Where the hands took hold.
+    /// Positions at which the hands began to hold.
     pub(super) fn starts(&self) -> Vec<Vector3<f64>> {
         self.hands.iter().map(|hand| hand.rest).collect()
     }
 
-    /// One step with the hands exactly at their targets; the reactions (N).
+    /// Takes one step with the hands exactly at their targets. Returns the reactions (N).
     pub(super) fn step(&mut self, targets: &[Vector3<f64>]) -> Result<Vec<Vector3<f64>>, Broken> {
         let q: Vec<f64> = self.state.iter().map(|s| s[0]).collect();
         let free: Vec<[f64; 3]> = self
@@ -121,7 +122,7 @@ impl Hand {
         hand
     }
 
-    /// `R~ Phi` of the patch, with the rotation that `q` gives.
+    /// `R~ Phi` of the patch, with the rotation at `q`.
     fn rows(&self, q: &[f64]) -> Vec<Vector3<f64>> {
         let w = self.rotation.iter().zip(q).fold(Vector3::zeros(), |w, (psi, q)| w + psi * *q);
         let (_, turn, _) = warp_jacobian(w.into(), [0.0; 3]);
@@ -130,7 +131,8 @@ impl Hand {
     }
 }
 
-/// Runs a script and says in words what became of it: `away(step)` is how far each hand is from where it took hold, m.
+/// Runs a script and describes the result in words. `away(step)` is the displacement of each hand
+/// from the start of its grab, m.
 pub(super) fn beside(
     model: &ModalModel,
     step: f64,

@@ -1,9 +1,9 @@
-//! What these tests share: the bodies that the tests of the protocol have, and a scene around a session.
+//! Shared by these tests: the bodies of the protocol tests, and a scene around a session.
 #![allow(dead_code, unused_imports, reason = "each test uses its part")]
 
 pub mod scene;
 
-// One copy for both crates: the protocol's tests may not lean on the laboratory.
+// Both crates use this one copy. The protocol's tests may not depend on the laboratory.
 #[path = "../../../pliant_stream/tests/support/mod.rs"]
 mod protocol;
 

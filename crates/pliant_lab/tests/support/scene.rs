@@ -1,4 +1,4 @@
-//! A host with one body that its guests may grab, joined to them by emulated paths.
+//! A host with one body that its guests may grab, connected to them by emulated paths.
 #![allow(dead_code, reason = "each test uses its part")]
 
 use std::sync::Arc;
@@ -16,24 +16,24 @@ pub const BODY: BodyId = BodyId(3);
 pub const S: Duration = Duration::from_secs(1);
 pub const MS: Duration = Duration::from_millis(1);
 
-/// What a guest's hand does: time, guest, session.
+/// Script of the guests' hands. Arguments: time, guest, session.
 pub type HandScript = Box<dyn FnMut(Duration, usize, &mut GuestSession)>;
 
-/// A host with one body that its guests may grab; every event is kept.
+/// A host with one body that its guests may grab. The scene keeps every event.
 pub struct Scene {
     pub body: Body,
     pub grabs: Vec<(GrabKey, GrabId, u32, f64)>,
     pub truth: Vec<(u64, Vec<f64>)>,
     pub host_events: Vec<HostEvent>,
     pub guest_events: Vec<(usize, GuestEvent)>,
-    /// What each guest's hand does, given the time.
+    /// Script of the guests' hands.
     pub hand: HandScript,
     pub resting: bool,
-    /// A force on a vertex that the stream says nothing of, N.
+    /// A force on a vertex that the stream does not contain, N.
     pub wind: [f64; 3],
     pub worst: f64,
     pub settled: Duration,
-    /// The rigid frame of each tick, where the body is free.
+    /// The rigid pose at each tick, if the body is free.
     pub poses: Vec<(u64, Pose)>,
     /// The reaction of each hand at each tick, N.
     pub reactions: Vec<(u64, GrabKey, [f64; 3])>,
@@ -144,7 +144,7 @@ impl World for Scene {
     }
 }
 
-/// Guest 0 holds the tip from its first tick on and circles.
+/// Guest 0 grabs the tip as soon as possible and moves in a circle.
 pub fn circling() -> HandScript {
     let mut grab = None;
     Box::new(move |now, guest, session| {
@@ -181,8 +181,9 @@ pub fn paper1() -> PathConfig {
     PathConfig::symmetric(LinkConfig::preset(Preset::Paper1))
 }
 
-/// The paper's worst network; for the paper's own method without loss on the way up, since a target that is lost makes
-/// the true body jerk, and predicting a jerk linearly multiplies it: the method has no bound to hold there.
+/// The paper's worst network. For the paper's own method the path from guest to host has no loss: a
+/// lost target makes the true body jerk, and linear prediction multiplies a jerk, so the method has
+/// no bound there.
 pub fn path_for(name: &str) -> PathConfig {
     let mut path = paper1();
     if name.starts_with("paper") {

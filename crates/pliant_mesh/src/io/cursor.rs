@@ -1,10 +1,10 @@
-//! Reading words and numbers, as text or binary, with the place for the error.
+//! Reads words and numbers, as text or binary, and reports the place of an error.
 
 use std::{collections::HashMap, str::FromStr};
 
 use crate::{MeshError, Place};
 
-/// How numbers stand in the file.
+/// Encoding of the numbers in the file.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(super) enum Encoding {
     Text,
@@ -12,7 +12,7 @@ pub(super) enum Encoding {
     BigEndian,
 }
 
-/// Walks over the bytes of a file.
+/// Read position in the bytes of a file.
 pub(super) struct Cursor<'a> {
     format: &'static str,
     bytes: &'a [u8],
@@ -44,7 +44,7 @@ impl<'a> Cursor<'a> {
         parse_error(self.format, self.place(), expected, found)
     }
 
-    /// The current line, counted from 1.
+    /// Returns the number of the current line, counted from 1.
     pub(super) fn line(&self) -> usize {
         self.line
     }
@@ -53,7 +53,7 @@ impl<'a> Cursor<'a> {
         self.bytes.len() - self.at
     }
 
-    /// The next word of text, `None` at the end of the file.
+    /// Reads the next word of text. Returns `None` at the end of the file.
     pub(super) fn next_word(&mut self) -> Option<String> {
         while let Some(&byte) = self.bytes.get(self.at) {
             if byte.is_ascii_whitespace() {
@@ -71,7 +71,7 @@ impl<'a> Cursor<'a> {
         (length > 0).then(|| String::from_utf8_lossy(&rest[..length]).into_owned())
     }
 
-    /// The next word of text, which stays where it is.
+    /// Returns the next word of text without consuming it.
     pub(super) fn peek_word(&mut self) -> Option<String> {
         let (at, line) = (self.at, self.line);
         let word = self.next_word();
@@ -79,18 +79,18 @@ impl<'a> Cursor<'a> {
         word
     }
 
-    /// The next word of text, an error at the end of the file.
+    /// Reads the next word of text. Returns an error at the end of the file.
     pub(super) fn word(&mut self, expected: &str) -> Result<String, MeshError> {
         self.next_word().ok_or_else(|| self.error(expected, "the end of the file"))
     }
 
-    /// Asks for one word and nothing else.
+    /// Reads one word and returns an error if it is not `keyword`.
     pub(super) fn keyword(&mut self, keyword: &str) -> Result<(), MeshError> {
         let word = self.word(keyword)?;
         if word == keyword { Ok(()) } else { Err(self.error(keyword, word)) }
     }
 
-    /// The rest of the current line, without its end; `None` at the end of the file.
+    /// Reads the rest of the current line without its end. Returns `None` at the end of the file.
     pub(super) fn next_line(&mut self) -> Option<String> {
         if self.remaining() == 0 {
             return None;
@@ -102,7 +102,7 @@ impl<'a> Cursor<'a> {
         Some(String::from_utf8_lossy(&rest[..length]).trim_end_matches(['\r', '\n']).to_owned())
     }
 
-    /// Passes over everything up to and including a line that starts with `end`.
+    /// Skips everything up to and including the next occurrence of the text `end`.
     pub(super) fn skip_past(&mut self, end: &str) -> Result<(), MeshError> {
         let rest = &self.bytes[self.at..];
         match rest.windows(end.len()).position(|w| w == end.as_bytes()) {
@@ -115,13 +115,13 @@ impl<'a> Cursor<'a> {
         }
     }
 
-    /// A number written as a word.
+    /// Reads a number that is written as a word.
     pub(super) fn parse<T: FromStr>(&mut self, expected: &str) -> Result<T, MeshError> {
         let word = self.word(expected)?;
         word.parse().map_err(|_| self.error(expected, word))
     }
 
-    /// The next `N` raw bytes.
+    /// Reads the next `N` raw bytes.
     pub(super) fn raw<const N: usize>(&mut self, expected: &str) -> Result<[u8; N], MeshError> {
         match self.bytes[self.at..].first_chunk::<N>() {
             Some(&bytes) => {
@@ -132,7 +132,7 @@ impl<'a> Cursor<'a> {
         }
     }
 
-    /// A finite floating-point number, 8 bytes when binary.
+    /// Reads a finite floating-point number, 8 bytes when binary.
     pub(super) fn real(&mut self, expected: &str) -> Result<f64, MeshError> {
         let value = match self.encoding {
             Encoding::Text => self.parse(expected)?,
@@ -146,7 +146,7 @@ impl<'a> Cursor<'a> {
         }
     }
 
-    /// A finite floating-point number, 4 bytes when binary.
+    /// Reads a finite floating-point number, 4 bytes when binary.
     pub(super) fn short_real(&mut self, expected: &str) -> Result<f64, MeshError> {
         let value = match self.encoding {
             Encoding::Text => return self.real(expected),
@@ -160,12 +160,12 @@ impl<'a> Cursor<'a> {
         }
     }
 
-    /// A position in m.
+    /// Reads a position, m.
     pub(super) fn point(&mut self) -> Result<[f64; 3], MeshError> {
         Ok([self.real("coordinate x")?, self.real("coordinate y")?, self.real("coordinate z")?])
     }
 
-    /// A signed whole number, 4 bytes when binary.
+    /// Reads a signed integer, 4 bytes when binary.
     pub(super) fn int(&mut self, expected: &str) -> Result<i64, MeshError> {
         Ok(match self.encoding {
             Encoding::Text => self.parse(expected)?,
@@ -174,7 +174,7 @@ impl<'a> Cursor<'a> {
         })
     }
 
-    /// An unsigned whole number, 8 bytes when binary.
+    /// Reads an unsigned integer, 8 bytes when binary.
     pub(super) fn size(&mut self, expected: &str) -> Result<u64, MeshError> {
         Ok(match self.encoding {
             Encoding::Text => self.parse(expected)?,
@@ -183,8 +183,10 @@ impl<'a> Cursor<'a> {
         })
     }
 
-    /// Refuses a count of things that the rest of the file cannot hold when each takes at least `bytes_each` bytes, so
-    /// that memory for them may be set aside.
+    /// Refuses a count of items that the rest of the file cannot hold when each takes at least
+    /// `bytes_each` bytes.
+    ///
+    /// The caller may therefore reserve memory for an accepted count.
     pub(super) fn fits(&self, count: u64, bytes_each: usize, what: &str) -> Result<usize, MeshError> {
         let most = self.remaining() / bytes_each.max(1) + 1;
         usize::try_from(count).ok().filter(|&n| n <= most).ok_or_else(|| {
@@ -196,7 +198,7 @@ impl<'a> Cursor<'a> {
     }
 }
 
-/// What the format asks for at a place and what stands there instead.
+/// Makes an error from the content that the format requires at a place and the content found there.
 pub(super) fn parse_error(
     format: &'static str,
     place: Place,
@@ -214,7 +216,7 @@ fn shortened(text: String) -> String {
     text.chars().take(LONGEST).chain("...".chars()).collect()
 }
 
-/// The numbers that a file gives its nodes, and where each node stands in the list.
+/// Node numbers of a file with the index of each node in the list.
 pub(super) struct Tags(HashMap<u64, u32>);
 
 impl Tags {
@@ -222,7 +224,7 @@ impl Tags {
         Self(HashMap::with_capacity(count))
     }
 
-    /// Notes that the node `tag` stands at `index`.
+    /// Records that the node `tag` has the index `index`.
     pub(super) fn insert(&mut self, cursor: &Cursor<'_>, tag: u64, index: usize) -> Result<(), MeshError> {
         match self.0.insert(tag, index as u32) {
             None => Ok(()),

@@ -1,6 +1,8 @@
-//! glTF 2.0, `.gltf` and `.glb`: the triangles of the default scene (else of all scenes), placed by their nodes.
+//! Reads glTF 2.0, `.gltf` and `.glb`: the triangles of the default scene (otherwise of all
+//! scenes), placed by their nodes.
 //!
-//! The document is read here and not by the `gltf` crate, whose validation panics on some damaged documents.
+//! This module parses the document itself, because the validation of the `gltf` crate panics on
+//! some damaged documents.
 
 use std::{
     borrow::Cow,
@@ -14,12 +16,15 @@ use serde::{Deserialize, de::IgnoredAny};
 use super::cursor::parse_error;
 use crate::{MeshError, Place, Surface};
 
-/// Deeper trees of nodes are refused: they may be rings.
+/// Largest depth of the node tree. Deeper trees are refused, because they may contain cycles.
 const DEEPEST: usize = 200;
-/// More placed nodes, and primitives in them, than this are refused: nodes may share children, and their number grow without bound.
+/// Largest number of placed nodes and of their primitives. Nodes may share children, so their
+/// number could otherwise grow without bound.
 const MAX_NODES: usize = 100_000;
-/// Vertices and triangles that a document may place whatever its size: nodes may share a mesh, so a small file may ask for many. Beyond it,
-/// one a byte of what was read: a vertex takes twelve.
+/// Number of vertices and of triangles that a document of any size may place.
+///
+/// Nodes may share a mesh, so a small file may request many vertices. Each byte read allows one
+/// more vertex and one more triangle. A stored vertex takes twelve bytes.
 const ALWAYS_PLACED: usize = 1_000_000;
 
 const TRIANGLES: u32 = 4;
@@ -65,10 +70,10 @@ struct Node {
     #[serde(default)]
     children: Vec<usize>,
     mesh: Option<usize>,
-    /// By columns; in its place may stand the next three.
+    /// Transform matrix, column by column. The next three fields may replace it.
     matrix: Option<[f64; 16]>,
     translation: Option<[f64; 3]>,
-    /// A unit quaternion x, y, z, w.
+    /// Rotation as a unit quaternion x, y, z, w.
     rotation: Option<[f64; 4]>,
     scale: Option<[f64; 3]>,
 }
@@ -113,7 +118,7 @@ struct Buffer {
     uri: Option<String>,
 }
 
-/// `folder` is where files that the glTF names are looked for.
+/// Parses a document. `folder` contains the files that the document names.
 pub(super) fn parse(bytes: &[u8], folder: &Path) -> Result<Surface, MeshError> {
     let (json, blob) = chunks(bytes)?;
     let document: Document = serde_json::from_slice(json)
@@ -147,12 +152,12 @@ pub(super) fn parse(bytes: &[u8], folder: &Path) -> Result<Surface, MeshError> {
     Ok(reader.surface)
 }
 
-/// The document, and the binary data that may follow it in a `.glb`.
+/// Returns the document and the binary data that may follow it in a `.glb`.
 fn chunks(bytes: &[u8]) -> Result<(&[u8], Option<&[u8]>), MeshError> {
     if !bytes.starts_with(b"glTF") {
         return Ok((bytes, None));
     }
-    // Magic, version, length; then chunks of length, type, data.
+    // A `.glb` starts with magic, version and length. Chunks of length, type and data follow.
     let mut rest = bytes.get(12..).unwrap_or_default();
     let (mut json, mut blob) = (None, None);
     while let Some((head, data)) = rest.split_first_chunk::<8>() {
@@ -179,11 +184,11 @@ struct Reader<'a> {
     document: &'a Document,
     buffers: Vec<Cow<'a, [u8]>>,
     surface: Surface,
-    /// Given up when a mesh has none.
+    /// Texture coordinates. They are dropped when one mesh has none.
     uvs: Option<Vec<[f32; 2]>>,
-    /// Nodes and primitives so far.
+    /// Number of nodes and primitives so far.
     nodes: usize,
-    /// Vertices that may be placed, and triangles.
+    /// Largest number of placed vertices, and of placed triangles.
     most: usize,
 }
 
@@ -202,7 +207,7 @@ impl Reader<'_> {
             for primitive in primitives {
                 match primitive.mode.unwrap_or(TRIANGLES) {
                     TRIANGLES => self.triangles(primitive, place)?,
-                    // Points and lines.
+                    // Points and lines are ignored.
                     0..TRIANGLES => {}
                     other => return Err(wrong("lists of triangles, mode 4", format!("mode {other}"))),
                 }
@@ -219,7 +224,7 @@ impl Reader<'_> {
         let vertices = positions.len();
         let indices = primitive.indices.map(|indices| self.indices(indices)).transpose()?;
         let triangles = indices.as_ref().map_or(vertices, |indices| indices.len()) / 3;
-        // Before anything is read: that costs time and memory too.
+        // The check comes before any data is read, because reading takes time and memory too.
         let room = |has: usize, more: usize| has.checked_add(more).is_some_and(|all| all <= self.most);
         if !(room(self.surface.positions.len(), vertices) && room(self.surface.triangles.len(), triangles)) {
             let expected = format!("at most {} placed vertices, and triangles", self.most);
@@ -291,7 +296,8 @@ impl Reader<'_> {
         Ok(self.items(accessor, size)?.map(number))
     }
 
-    /// The bytes of each item of an accessor. All its numbers come from the file, so none is trusted.
+    /// Returns the bytes of each item of an accessor. All its numbers come from the file, so none
+    /// is trusted.
     fn items(
         &self,
         accessor: &Accessor,
@@ -331,18 +337,18 @@ impl Node {
     }
 }
 
-/// The files that a document names, each read once.
+/// Files that a document names, each read once.
 struct Files<'a> {
     folder: &'a Path,
     read: HashMap<PathBuf, Vec<u8>>,
-    /// Of all of them.
+    /// Total number of bytes of all files.
     bytes: usize,
 }
 
 impl Files<'_> {
     fn read(&mut self, buffer: &Buffer) -> Result<(), MeshError> {
         let Some(path) = buffer.file() else { return Ok(()) };
-        // A file beside the document, and nowhere else.
+        // Only files in the folder of the document are allowed.
         if !path.components().all(|part| matches!(part, Component::Normal(_))) {
             return Err(wrong("a file in the folder of the document", path.display().to_string()));
         }
@@ -361,7 +367,7 @@ impl Files<'_> {
 }
 
 impl Buffer {
-    /// Of a file that the document names.
+    /// Returns the path of the file that the document names for this buffer.
     fn file(&self) -> Option<&Path> {
         self.uri.as_deref().filter(|uri| !uri.starts_with("data:")).map(Path::new)
     }
@@ -417,7 +423,9 @@ fn wrong(expected: impl Into<String>, found: impl Into<String>) -> MeshError {
 pub(super) mod tests {
     use super::*;
 
-    /// A triangle of 36 bytes of positions and 6 bytes of indices, in a node that moves it by 5 and mirrors it.
+    /// Makes a document with one triangle: 36 bytes of positions and 6 bytes of indices.
+    ///
+    /// A node mirrors the triangle, and the first node moves by 5.
     pub(in super::super) fn document(uri: &str, count: &str, children: &str) -> String {
         format!(
             r#"{{"asset":{{"version":"2.0"}},"scene":0,"scenes":[{{"nodes":[0]}}],
@@ -458,7 +466,7 @@ pub(super) mod tests {
         assert!(message("glTF".into()).contains("a JSON chunk"));
     }
 
-    /// The document with its data behind it.
+    /// Makes a `.glb` of the document and its data.
     fn glb(text: &str, data: &[u8]) -> Vec<u8> {
         let mut glb = b"glTF\x02\0\0\0\0\0\0\0".to_vec();
         for (kind, chunk) in [(b"JSON", text.as_bytes()), (b"BIN\0", data)] {
@@ -471,7 +479,8 @@ pub(super) mod tests {
 
     #[test]
     fn a_file_takes_no_more_than_its_size_allows() {
-        // A thousand triangles, 1,024 times over a tree of ten doublings: 3 million corners of 36 kB.
+        // A tree of ten doublings places a thousand triangles 1,024 times: 3 million corners from
+        // 36 kB.
         let nodes: Vec<String> = (1..=10).map(|k| format!(r#"{{"children":[{k},{k}]}}"#)).collect();
         let text = |nodes: &str, buffers: &str| {
             format!(
@@ -486,7 +495,8 @@ pub(super) mod tests {
         let shared = format!("{},{}", nodes.join(","), r#"{"mesh":0}"#);
         let error = parse(&glb(&text(&shared, "{}"), &data), Path::new(".")).unwrap_err().to_string();
         assert!(error.contains("placed vertices"), "{error}");
-        // Half as many again as it may always place, once more than the limit without its bytes: 333 meshes of 3,000 are 999,000.
+        // 333 meshes of 3,000 vertices are 999,000, which is within the limit. 400 meshes exceed
+        // the limit.
         let many = |count: usize| {
             let nodes: Vec<String> = (1..=count).map(|k| k.to_string()).collect();
             let meshes = vec![r#"{"mesh":0}"#; count].join(",");
@@ -495,7 +505,8 @@ pub(super) mod tests {
         let placed = parse(&glb(&many(333), &data), Path::new(".")).unwrap();
         assert_eq!((placed.positions.len(), placed.triangles.len()), (999_000, 333_000));
         assert!(parse(&glb(&many(400), &data), Path::new(".")).is_err());
-        // Every buffer is the one blob, however many there are: borrowed, not copied (it would be 3.6 GB).
+        // Every buffer is the same blob. The blob must be borrowed, because copies would take 3.6
+        // GB.
         let buffers = vec!["{}"; 100_000].join(",");
         let one = parse(&glb(&text(r#"{"mesh":0}"#, &buffers), &data), Path::new(".")).unwrap();
         assert_eq!(one.triangles.len(), 1_000);

@@ -40,7 +40,7 @@ pub(super) fn parse(bytes: &[u8]) -> Result<TetMesh, MeshError> {
                 for _ in 0..count {
                     let mut tet = [0; 4];
                     for corner in &mut tet {
-                        // Numbers count from 1.
+                        // Vertex numbers count from 1.
                         let number: u64 = cursor.parse("a vertex")?;
                         if !(1..=nodes.len() as u64).contains(&number) {
                             return Err(cursor
@@ -54,7 +54,7 @@ pub(super) fn parse(bytes: &[u8]) -> Result<TetMesh, MeshError> {
                 tets = Some(list);
             }
             "End" => break,
-            // Other sections and their numbers.
+            // Other sections and their numbers are ignored.
             _ => {}
         }
     }
@@ -64,7 +64,7 @@ pub(super) fn parse(bytes: &[u8]) -> Result<TetMesh, MeshError> {
     }
 }
 
-/// The mesh as text. Numbers are written so that reading them gives the same bits.
+/// Returns the mesh as text. Reading the numbers back gives the same bits.
 pub(super) fn format(mesh: &TetMesh) -> String {
     let mut text = String::with_capacity(64 * (mesh.nodes.len() + mesh.tets.len()) + 512);
     // Writing to a string cannot fail.

@@ -1,6 +1,6 @@
-//! Files of surfaces, tetrahedra and descriptions of shapes.
+//! Reads and writes files of surfaces, tetrahedra and descriptions of shapes.
 //!
-//! A file's kind is told by its extension:
+//! The extension of a file determines its format:
 //!
 //! | Extension | Format | Read as | Written |
 //! | --- | --- | --- | --- |
@@ -14,7 +14,8 @@
 //! | `.mesh` | Medit, text | tetrahedra | text |
 //! | `.veg` | Vega FEM, text | tetrahedra | text |
 //!
-//! Whatever bytes a file holds, reading gives a mesh or an error, and takes memory in proportion to the file.
+//! For any bytes in a file, reading gives a mesh or an error and takes memory in proportion to the
+//! file.
 
 mod cursor;
 mod gltf;
@@ -41,7 +42,7 @@ use crate::{
 
 pub use msh::MshVersion;
 
-/// Larger files are refused, in bytes.
+/// Largest accepted file, bytes.
 const MAX_FILE: u64 = 1 << 30;
 
 const SURFACES: &str = ".obj, .stl, .ply, .gltf or .glb";
@@ -49,24 +50,26 @@ const SCENES: &str = ".ron";
 const TETS: &str = ".msh, .vtk, .mesh or .veg";
 const ALL: &str = ".obj, .stl, .ply, .gltf or .glb (a surface), .ron (a description), .msh, .vtk, .mesh or .veg (tetrahedra)";
 
-/// What a file holds.
+/// Contents of a file.
 #[derive(Clone, Debug)]
 #[non_exhaustive]
 pub enum Input {
-    /// Triangles.
+    /// Triangle surface.
     Surface(Surface),
-    /// The description of a body by rounded parts.
+    /// Description of a body by rounded parts.
     Sdf(Scene),
     /// Tetrahedra, ready to be baked.
     Tets(TetMesh),
 }
 
 impl Input {
-    /// The tetrahedra themselves, or what [`stuff`] makes of the shape. A dirty surface (holes, flipped faces, copies,
-    /// crossing parts) is mended first, and what was done is told beside the tetrahedra; `None`: it was sound.
+    /// Returns the tetrahedra of the file, or those that [`stuff`] makes of the shape.
+    ///
+    /// A defective surface (holes, flipped faces, copies, crossing parts) is repaired first. The
+    /// second value lists the repairs. `None` means that no repair was necessary.
     ///
     /// # Errors
-    /// What [`SurfaceDistance::mended`] and [`stuff`] say.
+    /// Returns the errors of [`SurfaceDistance::mended`] and [`stuff`].
     pub fn into_tets(
         self,
         options: &StuffOptions,
@@ -83,11 +86,11 @@ impl Input {
     }
 }
 
-/// Reads a file of any known kind; the extension decides.
+/// Reads a file of any known format. The extension determines the format.
 ///
 /// # Errors
-/// [`MeshError::UnknownFormat`] for an extension that is not in the table above, else as [`read_surface`] and
-/// [`read_tets`].
+/// Returns [`MeshError::UnknownFormat`] for an extension that is not in the module's table, and
+/// otherwise the errors of [`read_surface`], [`read_tets`] and [`read_sdf`].
 pub fn read(path: impl AsRef<Path>) -> Result<Input, MeshError> {
     let path = path.as_ref();
     match extension(path).as_str() {
@@ -98,13 +101,15 @@ pub fn read(path: impl AsRef<Path>) -> Result<Input, MeshError> {
     }
 }
 
-/// Reads a triangle surface: finite, with valid indices, but perhaps open or crossing itself (a visible skin may be;
-/// what is to be filled with tetrahedra is mended, see [`Surface::repaired`]).
+/// Reads a triangle surface with finite coordinates and valid indices.
 ///
-/// Polygons are cut into fans. Where a vertex has several texture coordinates it is split, one copy for each.
+/// The surface may be open or cross itself, which is acceptable for a visible skin.
+/// [`Surface::repaired`] repairs a surface that is to be filled with tetrahedra. Polygons are split
+/// into fans. A vertex with several texture coordinates is split into one copy for each.
 ///
 /// # Errors
-/// [`MeshError::UnknownFormat`], [`MeshError::Read`], or [`MeshError::InFile`] around what is wrong in the file.
+/// Returns [`MeshError::UnknownFormat`], [`MeshError::Read`], or [`MeshError::InFile`] with the
+/// error in the file.
 pub fn read_surface(path: impl AsRef<Path>) -> Result<Surface, MeshError> {
     let path = path.as_ref();
     let folder = path.parent().unwrap_or(Path::new(""));
@@ -123,12 +128,14 @@ pub fn read_surface(path: impl AsRef<Path>) -> Result<Surface, MeshError> {
     })
 }
 
-/// Reads a tetrahedral mesh. Of 10-node tetrahedra the corners are kept; elements of other kinds and nodes that no
-/// tetrahedron uses are passed over; tetrahedra that are inside out are turned. The result passes
-/// [`TetMesh::check`].
+/// Reads a tetrahedral mesh. The result passes [`TetMesh::check`].
+///
+/// Only the corners of 10-node tetrahedra are kept. Elements of other kinds and nodes that no
+/// tetrahedron uses are ignored. Tetrahedra that are inside out are turned.
 ///
 /// # Errors
-/// [`MeshError::UnknownFormat`], [`MeshError::Read`], or [`MeshError::InFile`] around what is wrong in the file.
+/// Returns [`MeshError::UnknownFormat`], [`MeshError::Read`], or [`MeshError::InFile`] with the
+/// error in the file.
 pub fn read_tets(path: impl AsRef<Path>) -> Result<TetMesh, MeshError> {
     let path = path.as_ref();
     let parse = match extension(path).as_str() {
@@ -151,7 +158,8 @@ pub fn read_tets(path: impl AsRef<Path>) -> Result<TetMesh, MeshError> {
 /// Reads the description of a body, see [`Scene`].
 ///
 /// # Errors
-/// [`MeshError::UnknownFormat`], [`MeshError::Read`], or [`MeshError::InFile`] around what [`Scene::from_ron`] says.
+/// Returns [`MeshError::UnknownFormat`], [`MeshError::Read`], or [`MeshError::InFile`] with the
+/// error of [`Scene::from_ron`].
 pub fn read_sdf(path: impl AsRef<Path>) -> Result<Scene, MeshError> {
     let path = path.as_ref();
     if extension(path) != "ron" {
@@ -161,20 +169,21 @@ pub fn read_sdf(path: impl AsRef<Path>) -> Result<Scene, MeshError> {
     in_file(path, || Scene::from_ron(&String::from_utf8_lossy(&bytes)))
 }
 
-/// Writes Gmsh MSH 4.1 as text. Reading it back gives the same mesh to the last bit.
+/// Writes Gmsh MSH 4.1 as text. Reading the file back gives the same mesh to the last bit.
 ///
-/// The file appears under its name when it is complete: an error leaves nothing, or what was there before.
+/// The file appears under its name only when it is complete. An error leaves no file, or the
+/// earlier file.
 ///
 /// # Errors
-/// What [`TetMesh::check`] says, or [`MeshError::Write`].
+/// Returns the errors of [`TetMesh::check`], or [`MeshError::Write`].
 pub fn write_msh(path: impl AsRef<Path>, mesh: &TetMesh) -> Result<(), MeshError> {
     write_msh_version(path, mesh, MshVersion::V4_1)
 }
 
-/// Writes Gmsh MSH as text in the wanted version, otherwise as [`write_msh`].
+/// Writes Gmsh MSH as text in the wanted version, otherwise as [`write_msh`] does.
 ///
 /// # Errors
-/// As [`write_msh`].
+/// Returns the errors of [`write_msh`].
 pub fn write_msh_version(
     path: impl AsRef<Path>,
     mesh: &TetMesh,
@@ -184,10 +193,10 @@ pub fn write_msh_version(
     write_text(path.as_ref(), &msh::format(mesh, version))
 }
 
-/// Writes tetrahedra in the format that the extension names, otherwise as [`write_msh`].
+/// Writes tetrahedra in the format of the extension, otherwise as [`write_msh`] does.
 ///
 /// # Errors
-/// [`MeshError::UnknownFormat`], else as [`write_msh`].
+/// Returns [`MeshError::UnknownFormat`] or the errors of [`write_msh`].
 pub fn write_tets(path: impl AsRef<Path>, mesh: &TetMesh) -> Result<(), MeshError> {
     let path = path.as_ref();
     let format: &dyn Fn(&TetMesh) -> String = match extension(path).as_str() {
@@ -228,23 +237,26 @@ fn write_text(path: &Path, text: &str) -> Result<(), MeshError> {
         .map_err(|source| MeshError::Write { path: path.to_owned(), source })
 }
 
-/// Writes a file whole or not at all: beside the goal, then renamed, so that no reader ever sees half of it.
-/// A link to a file stays one; what is no regular file (a device, a pipe) is written into.
+/// Writes a file either completely or not at all.
+///
+/// The function writes a temporary file in the same folder and then renames it, so that no reader
+/// sees a partial file. A link to a file stays a link. A path that is not a regular file (a device,
+/// a pipe) is written directly.
 ///
 /// # Errors
-/// What `write` or the operating system says; what stood there before is then still there.
+/// Returns the errors of `write` and of the operating system. An earlier file is then still intact.
 pub fn write_whole(
     path: &Path,
     write: impl FnOnce(&mut fs::File) -> std::io::Result<()>,
 ) -> std::io::Result<()> {
-    // What is not there yet has no other name.
+    // A file that does not exist yet has no other name.
     let goal = fs::canonicalize(path).unwrap_or_else(|_| path.to_owned());
     if fs::metadata(&goal).is_ok_and(|goal| !goal.is_file()) {
         return write(&mut fs::OpenOptions::new().write(true).open(&goal)?);
     }
     let mut part =
         goal.file_name().ok_or_else(|| std::io::Error::other("the path names no file"))?.to_owned();
-    // Two threads that write one file each write their own neighbour: the last to end wins.
+    // Two threads that write the same file use different temporary files, and the last rename wins.
     static WRITES: AtomicU64 = AtomicU64::new(0);
     let number = WRITES.fetch_add(1, Ordering::Relaxed);
     part.push(format!(".{}.{number}.part", std::process::id()));
@@ -256,7 +268,7 @@ pub fn write_whole(
         })
         .and_then(|()| fs::rename(&part, &goal))
         .inspect_err(|_| {
-            // The first error is the one to tell; the part may not even exist.
+            // The caller needs the first error, and the temporary file may not even exist.
             let _ = fs::remove_file(&part);
         })
 }
@@ -322,7 +334,7 @@ mod tests {
         let nowhere = folder.join("no/such/folder.msh");
         mesh.nodes[0][0] = 0.0;
         assert!(matches!(write_msh(&nowhere, &mesh), Err(MeshError::Write { .. })));
-        // A folder stands where the file should go: the part must not stay behind.
+        // A folder has the name of the file. The temporary file must not stay behind.
         fs::create_dir(folder.join("taken.msh")).unwrap();
         assert!(matches!(write_msh(folder.join("taken.msh"), &mesh), Err(MeshError::Write { .. })));
         assert_eq!(fs::read_dir(&folder).unwrap().count(), 2);
@@ -365,20 +377,20 @@ mod tests {
         let (sound, none) = filled(&text).unwrap();
         sound.check().unwrap();
         assert_eq!(none, None);
-        // Cut within the last line, and after the line before it.
+        // The text is cut within the last line, and after the line before it.
         let cut = text.len() - 8;
         assert!(matches!(filled(&text[..cut]), Err(MeshError::InFile { .. })));
         let cut = text.len() - faces[faces.len() - 1].len();
         let (mended, repair) = filled(&text[..cut]).unwrap();
         assert_eq!(repair, Some(Repair { covered_holes: 1, ..Repair::default() }));
         assert_eq!(repair.unwrap().to_string(), "1 hole covered");
-        // The very triangle that was missing covers the hole.
+        // The missing triangle itself covers the hole.
         assert!((mended.volume() / sound.volume() - 1.0).abs() < 1e-3, "{}", mended.volume());
-        // Every second triangle gone: more hole than ball.
+        // Without every second triangle the holes are too large a part of the ball.
         let half: String = ball.positions.iter().map(|[x, y, z]| format!("v {x} {y} {z}\n")).collect();
         let half = half + &faces.iter().step_by(2).cloned().collect::<String>();
         assert!(matches!(filled(&half), Err(MeshError::Open { .. })));
-        // Both sides of one triangle: closed, and nothing in it.
+        // Both sides of one triangle form a closed surface with nothing inside.
         let doubled = "v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 3\nf 1 3 2\n";
         assert!(matches!(filled(doubled), Err(MeshError::Parameter { name: "box around the shape", .. })));
         fs::remove_dir_all(folder).unwrap();
@@ -388,7 +400,7 @@ mod tests {
         use super::*;
         use proptest::{prelude::*, test_runner::RngSeed};
 
-        /// A real file with a few bytes replaced finds more than noise does.
+        /// A valid file with a few replaced bytes finds more errors than random bytes do.
         fn altered(text: String) -> impl Strategy<Value = Vec<u8>> {
             let length = text.len();
             proptest::collection::vec((0..length, any::<u8>()), 1..6).prop_map(move |changes| {

@@ -8,14 +8,15 @@ use crate::{MeshError, TetMesh};
 /// Version of Gmsh's format.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub enum MshVersion {
-    /// 2.2, which nearly every program reads.
+    /// Version 2.2, which nearly every program reads.
     V2_2,
-    /// 4.1, Gmsh's own since 2018.
+    /// Version 4.1, Gmsh's own format since 2018.
     #[default]
     V4_1,
 }
 
-/// Gmsh's numbers for the 4-node and the 10-node tetrahedron; the corners of the second come first.
+/// Gmsh's element type of the 4-node tetrahedron. `TET10` is the 10-node tetrahedron, whose corners
+/// come first.
 const TET4: i64 = 4;
 const TET10: i64 = 11;
 
@@ -105,7 +106,8 @@ fn elements_2(cursor: &mut Cursor<'_>, encoding: Encoding, tags: &Tags) -> Resul
     let mut tets = Vec::new();
     let mut done = 0;
     while done < count {
-        // Text: number, kind, tags, nodes. Binary: kind, how many follow, how many tags each; then the elements.
+        // Text holds number, kind, tags and nodes of each element. Binary holds kind, number of
+        // elements and number of tags each, followed by the elements.
         let (kind, group, tag_count) = if encoding == Encoding::Text {
             cursor.int("an element's number")?;
             (cursor.int("an element's kind")?, 1, cursor.int("the number of tags")?)
@@ -191,7 +193,7 @@ fn elements_4(cursor: &mut Cursor<'_>, encoding: Encoding, tags: &Tags) -> Resul
     Ok(tets)
 }
 
-/// Reads one element's nodes and keeps them if it is a tetrahedron.
+/// Reads the nodes of one element and keeps them if the element is a tetrahedron.
 fn tet(
     cursor: &mut Cursor<'_>,
     kind: i64,
@@ -230,7 +232,7 @@ fn start(cursor: &mut Cursor<'_>, encoding: Encoding) {
     }
 }
 
-/// The mesh as text. Numbers are written so that reading them gives the same bits.
+/// Returns the mesh as text. Reading the numbers back gives the same bits.
 pub(super) fn format(mesh: &TetMesh, version: MshVersion) -> String {
     let mut text = String::with_capacity(64 * (mesh.nodes.len() + mesh.tets.len()) + 512);
     // Writing to a string cannot fail.
@@ -248,7 +250,7 @@ fn write_text(text: &mut String, mesh: &TetMesh, version: MshVersion) -> std::fm
             }
             writeln!(text, "$EndNodes\n$Elements\n{tets}")?;
             for (tag, t) in (1..).zip(&mesh.tets) {
-                // Physical and geometrical entity 1.
+                // The two tags are the physical and the geometrical entity 1.
                 let [a, b, c, d] = t.map(|n| u64::from(n) + 1);
                 writeln!(text, "{tag} {TET4} 2 1 1 {a} {b} {c} {d}")?;
             }
@@ -282,7 +284,7 @@ mod tests {
     use super::*;
     use crate::shapes;
 
-    /// Two tetrahedra and a triangle the way Gmsh writes binary 4.1, with numbers that are not in order.
+    /// Makes two tetrahedra and a triangle as Gmsh writes binary 4.1, with unordered node numbers.
     fn binary_4_1() -> Vec<u8> {
         let mut b = b"$MeshFormat\n4.1 1 8\n".to_vec();
         let int = |b: &mut Vec<u8>, n: i32| b.extend(n.to_le_bytes());

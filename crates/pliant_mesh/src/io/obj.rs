@@ -1,4 +1,4 @@
-//! Wavefront OBJ: positions, texture coordinates and faces; everything else is passed over.
+//! Wavefront OBJ: positions, texture coordinates and faces. Everything else is ignored.
 
 use std::collections::HashMap;
 
@@ -9,7 +9,7 @@ pub(super) fn parse(bytes: &[u8]) -> Result<Surface, MeshError> {
     let mut cursor = Cursor::new("OBJ", bytes);
     let mut positions: Vec<[f64; 3]> = Vec::new();
     let mut uvs: Vec<[f32; 2]> = Vec::new();
-    // Corners as (position, texture coordinate), three to a triangle.
+    // Corners are (position, texture coordinate) pairs, three per triangle.
     let mut corners: Vec<(u32, Option<u32>)> = Vec::new();
     let mut polygon = Vec::new();
     loop {
@@ -55,7 +55,7 @@ pub(super) fn parse(bytes: &[u8]) -> Result<Surface, MeshError> {
     Ok(surface(&positions, &uvs, &corners))
 }
 
-/// One vertex for each pair of position and texture coordinate in use, in order of first use.
+/// Makes one vertex for each used pair of position and texture coordinate, in order of first use.
 fn surface(positions: &[[f64; 3]], uvs: &[[f32; 2]], corners: &[(u32, Option<u32>)]) -> Surface {
     let textured = !corners.is_empty() && corners.iter().all(|c| c.1.is_some());
     let mut vertex_of = HashMap::new();
@@ -84,7 +84,8 @@ fn numbers<'a, const N: usize>(mut words: impl Iterator<Item = &'a str>) -> Opti
     Some(numbers)
 }
 
-/// `v`, `v/vt`, `v/vt/vn` or `v//vn`; numbers count from 1, negative ones back from the last.
+/// Parses `v`, `v/vt`, `v/vt/vn` or `v//vn`. Numbers count from 1, and negative numbers count back
+/// from the last.
 fn corner(word: &str, position_count: usize, uv_count: usize) -> Option<(u32, Option<u32>)> {
     let index = |text: &str, count: usize| {
         let number: i64 = text.parse().ok()?;

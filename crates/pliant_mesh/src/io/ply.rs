@@ -1,9 +1,10 @@
-//! Stanford's PLY, text and binary: positions, texture coordinates and faces; everything else is passed over.
+//! Stanford PLY, text and binary: positions, texture coordinates and faces. Everything else is
+//! ignored.
 
 use super::cursor::{Cursor, Encoding};
 use crate::{MeshError, Surface};
 
-/// How a number stands in the file.
+/// Type of a number in the file.
 #[derive(Clone, Copy, PartialEq, Eq)]
 enum Scalar {
     I8,
@@ -19,7 +20,7 @@ enum Scalar {
 struct Property {
     name: String,
     scalar: Scalar,
-    /// How the length of a list stands in the file; none for a single number.
+    /// Type of the length of a list, or `None` for a single number.
     length: Option<Scalar>,
 }
 
@@ -40,7 +41,8 @@ pub(super) fn parse(bytes: &[u8]) -> Result<Surface, MeshError> {
     let mut surface = Surface::default();
     let mut uvs = Vec::new();
     for element in &elements {
-        // Each number takes at least a byte; an element without numbers takes nothing, and any count of it would do.
+        // Each number takes at least a byte. An element without numbers takes no bytes, so no limit
+        // would apply to its count.
         if element.properties.is_empty() {
             continue;
         }
@@ -162,7 +164,7 @@ fn face(cursor: &mut Cursor<'_>, element: &Element, triangles: &mut Vec<[u32; 3]
     Ok(())
 }
 
-/// Reads a property's number, or all of its list.
+/// Reads the number of a property, or all numbers of its list.
 fn numbers(cursor: &mut Cursor<'_>, property: &Property, mut take: impl FnMut(f64)) -> Result<(), MeshError> {
     let count = match property.length {
         None => 1,

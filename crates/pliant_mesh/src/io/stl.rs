@@ -3,13 +3,14 @@
 use super::cursor::{Cursor, Encoding};
 use crate::{MeshError, Surface};
 
-/// A binary file: 80 bytes of anything, the number of triangles, 50 bytes for each.
+/// Header size of a binary file: 80 arbitrary bytes and the number of triangles. Each triangle
+/// takes 50 bytes.
 const HEADER: usize = 84;
 const TRIANGLE: usize = 50;
 
 pub(super) fn parse(bytes: &[u8]) -> Result<Surface, MeshError> {
     let mut cursor = Cursor::new("STL", bytes);
-    // Many binary files start with the word of the text format, so their size decides.
+    // Many binary files start with the keyword of the text format, so the size decides.
     let count = bytes.get(80..HEADER).and_then(|b| b.first_chunk()).map(|b| u32::from_le_bytes(*b) as usize);
     let binary = count.is_some_and(|n| bytes.len() == HEADER + n * TRIANGLE);
     let corners = if binary || !bytes.trim_ascii_start().starts_with(b"solid") {
@@ -43,7 +44,7 @@ fn binary_corners(cursor: &mut Cursor<'_>) -> Result<Vec<[f64; 3]>, MeshError> {
 
 fn text_corners(cursor: &mut Cursor<'_>) -> Result<Vec<[f64; 3]>, MeshError> {
     let mut corners = Vec::new();
-    // One solid after another, each with any name.
+    // The file may hold several solids, each with any name.
     while let Some(word) = cursor.next_word() {
         if word != "solid" {
             return Err(cursor.error("solid", word));
@@ -57,7 +58,7 @@ fn text_corners(cursor: &mut Cursor<'_>) -> Result<Vec<[f64; 3]>, MeshError> {
             }
             cursor.keyword("normal")?;
             for _ in 0..3 {
-                // Normals follow from the corners; many files hold nonsense here.
+                // The corners determine the normal. Many files hold wrong values here.
                 cursor.word("a normal")?;
             }
             cursor.keyword("outer")?;

@@ -1,4 +1,5 @@
-//! Vega FEM's volumetric meshes (`.veg`), text: vertices and tetrahedra; materials and regions are passed over.
+//! Vega FEM volumetric meshes (`.veg`), text: vertices and tetrahedra. Materials and regions are
+//! ignored.
 
 use std::fmt::Write as _;
 
@@ -58,7 +59,7 @@ pub(super) fn parse(bytes: &[u8]) -> Result<TetMesh, MeshError> {
     }
 }
 
-/// The mesh as text. Numbers are written so that reading them gives the same bits.
+/// Returns the mesh as text. Reading the numbers back gives the same bits.
 pub(super) fn format(mesh: &TetMesh) -> String {
     let mut text = String::with_capacity(64 * (mesh.nodes.len() + mesh.tets.len()) + 512);
     // Writing to a string cannot fail.

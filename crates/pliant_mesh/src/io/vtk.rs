@@ -1,11 +1,12 @@
-//! VTK's legacy format, unstructured grids (versions up to 4.2, and 5.1 with its offsets).
+//! VTK legacy format, unstructured grids (versions up to 4.2, and 5.1 with its offsets).
 
 use std::fmt::Write as _;
 
 use super::cursor::{Cursor, Encoding};
 use crate::{MeshError, TetMesh};
 
-/// VTK's numbers for the 4-node and the 10-node tetrahedron; the corners of the second come first.
+/// VTK's cell type of the 4-node tetrahedron. The 10-node tetrahedron follows, and its corners come
+/// first.
 const TETRA: i64 = 10;
 const QUADRATIC_TETRA: i64 = 24;
 
@@ -16,7 +17,7 @@ pub(super) fn parse(bytes: &[u8]) -> Result<TetMesh, MeshError> {
     if !header.starts_with("# vtk DataFile Version") {
         return Err(cursor.error("# vtk DataFile Version", header));
     }
-    // The title: anything.
+    // The title may be any text.
     cursor.next_line();
     let encoding = match cursor.word("ASCII or BINARY")?.as_str() {
         "ASCII" => Encoding::Text,
@@ -97,7 +98,7 @@ fn points(cursor: &mut Cursor<'_>, encoding: Encoding) -> Result<Vec<[f64; 3]>, 
     Ok(nodes)
 }
 
-/// The nodes of each cell.
+/// Reads the nodes of each cell.
 fn connectivity(cursor: &mut Cursor<'_>, encoding: Encoding) -> Result<Vec<Vec<u64>>, MeshError> {
     let first: u64 = cursor.parse("the number of cells")?;
     let second: u64 = cursor.parse("the size of the list")?;
@@ -108,7 +109,8 @@ fn connectivity(cursor: &mut Cursor<'_>, encoding: Encoding) -> Result<Vec<Vec<u
         return Err(cursor.error("the end of the line", line));
     }
     if cursor.peek_word().as_deref() == Some("OFFSETS") {
-        // Version 5.1: where each cell starts and the last one ends; then all nodes.
+        // Version 5.1 lists the start of each cell and the end of the last one, followed by all
+        // nodes.
         let offsets = list(cursor, encoding, "OFFSETS", first)?;
         let nodes = list(cursor, encoding, "CONNECTIVITY", second)?;
         return offsets
@@ -156,7 +158,7 @@ fn begin(cursor: &mut Cursor<'_>, encoding: Encoding) {
     cursor.encoding = encoding;
 }
 
-/// The mesh as text, version 3.0. Numbers are written so that reading them gives the same bits.
+/// Returns the mesh as text, version 3.0. Reading the numbers back gives the same bits.
 pub(super) fn format(mesh: &TetMesh) -> String {
     let mut text = String::with_capacity(64 * (mesh.nodes.len() + mesh.tets.len()) + 512);
     // Writing to a string cannot fail.

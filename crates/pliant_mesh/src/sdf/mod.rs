@@ -1,4 +1,4 @@
-//! Shapes given by their distance.
+//! Shapes that are given by their signed distance.
 
 mod scene;
 mod shapes;
@@ -7,14 +7,16 @@ mod surface;
 pub use scene::Scene;
 pub use surface::SurfaceDistance;
 
-/// A solid shape that knows how far any point is from its surface.
+/// Solid shape that returns the distance of any point from its surface.
 pub trait SignedDistance: Sync {
-    /// Distance from `p` (m) to the surface in m: negative inside, positive outside, zero on the surface.
+    /// Returns the signed distance from `p` (m) to the surface, m: negative inside, positive
+    /// outside, zero on the surface.
     ///
-    /// The size may be less than the true distance, never more: whatever lies within it of `p` is on one side of the
-    /// surface. (A function that changes by at most 1 m a metre has this property.)
+    /// The magnitude may be less than the true distance but never more: all points within it of `p`
+    /// lie on the same side of the surface. (A function that changes by at most 1 m per meter has
+    /// this property.)
     fn distance(&self, p: [f64; 3]) -> f64;
 
-    /// Lowest and highest corner of a box, in m, that holds the whole shape.
+    /// Returns the lowest and highest corner of a box that contains the whole shape, m.
     fn bounds(&self) -> [[f64; 3]; 2];
 }

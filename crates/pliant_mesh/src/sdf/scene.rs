@@ -1,4 +1,4 @@
-//! Bodies described by a few rounded parts in a RON file.
+//! Bodies that a RON file describes as a few rounded parts.
 
 use nalgebra::{Rotation3, Vector3};
 use serde::Deserialize;
@@ -9,32 +9,33 @@ use super::{
 };
 use crate::{MeshError, Place};
 
-/// More parts than this are refused, and as many points of a limb.
+/// Largest number of parts, and of points of a limb.
 const MAX_PARTS: usize = 1000;
-/// A limb's curve is drawn with so many straight pieces between two of its points.
+/// Number of straight pieces between two points of a limb's curve.
 const PIECES: usize = 6;
 
-/// A body made of rounded parts that flow into each other, read from a text in RON.
+/// Body made of rounded parts with smooth transitions, read from a RON text.
 ///
-/// Lengths are in m, y is up. The parts are joined one after another; each may have a fillet to what was joined before, a
-/// mirror image across the plane x = 0, and may be carved out instead of added. What lies below the floor is cut off.
+/// Lengths are in m, and y is up. The parts are joined one after another. Each part may have a
+/// fillet to the parts before it and a mirror image across the plane x = 0, and may be carved out
+/// instead of added. The part of the body below the floor is cut off.
 ///
 /// | Field | Meaning | Default |
 /// | --- | --- | --- |
-/// | `name` | what the body is called | |
-/// | `floor` | `Some(height)`: all below is cut off | `None` |
-/// | `parts` | a list of parts | |
-/// | part: `name` | for the reader, and for errors | |
-/// | part: `shape` | see below | |
-/// | part: `mirror` | whether a second one stands across x = 0 | `false` |
+/// | `name` | name of the body | |
+/// | `floor` | `Some(height)`: everything below is cut off | `None` |
+/// | `parts` | list of parts | |
+/// | part: `name` | name for the reader and for errors | |
+/// | part: `shape` | one of the shapes below | |
+/// | part: `mirror` | whether a mirror image is added across x = 0 | `false` |
 /// | part: `blend` | width of the fillet | 0: a sharp seam |
-/// | part: `carve` | whether it is taken away | `false` |
+/// | part: `carve` | whether the part is removed instead of added | `false` |
 ///
 /// | Shape | Fields |
 /// | --- | --- |
 /// | `Sphere` | `center`, `radius` |
 /// | `Ellipsoid` | `center`, `radii`, `turn`: degrees about x, then y, then z, default none |
-/// | `Limb` | `path`: points that a smooth curve (Catmull and Rom) runs through, `radii`: one for each |
+/// | `Limb` | `path`: points on a smooth curve (Catmull and Rom), `radii`: one per point |
 ///
 /// ```
 /// use pliant_mesh::sdf::{Scene, SignedDistance};
@@ -57,14 +58,14 @@ pub struct Scene {
     parts: Vec<Part>,
 }
 
-/// A part, or its mirror image, ready to be measured.
+/// Part, or its mirror image, in the form that the distance function uses.
 #[derive(Clone, Debug)]
 struct Part {
     form: Form,
     mirrored: bool,
     blend: f64,
     carve: bool,
-    /// A ball that holds the part.
+    /// Center of a ball that contains the part. `radius` is the radius of this ball.
     center: Vector3<f64>,
     radius: f64,
 }
@@ -76,17 +77,17 @@ enum Form {
     Limb(Vec<Piece>),
 }
 
-/// A straight piece of a limb.
+/// Straight piece of a limb.
 #[derive(Clone, Debug)]
 struct Piece {
     ends: [Vector3<f64>; 2],
     radii: [f64; 2],
-    /// A ball that holds the piece.
+    /// Center of a ball that contains the piece. `reach` is the radius of this ball.
     center: Vector3<f64>,
     reach: f64,
 }
 
-/// The text, word for word.
+/// Contents of the RON text.
 #[derive(Deserialize)]
 #[serde(rename = "Scene", deny_unknown_fields)]
 struct SceneText {
@@ -129,11 +130,12 @@ enum ShapeText {
 }
 
 impl Scene {
-    /// Reads a description.
+    /// Parses a description.
     ///
     /// # Errors
-    /// [`MeshError::Parse`] with the line where the text is not such a description, [`MeshError::Empty`] without
-    /// parts, [`MeshError::Part`] when a number of a part is out of range.
+    /// Returns [`MeshError::Parse`] with the line where the text is not a valid description,
+    /// [`MeshError::Empty`] without parts, and [`MeshError::Part`] when a number of a part is out
+    /// of range.
     pub fn from_ron(text: &str) -> Result<Self, MeshError> {
         let scene: SceneText = ron::from_str(text).map_err(|error| MeshError::Parse {
             format: "RON",
@@ -161,7 +163,7 @@ impl Scene {
         Ok(Self { name: scene.name, floor: scene.floor, parts })
     }
 
-    /// What the body is called.
+    /// Returns the name of the body.
     pub fn name(&self) -> &str {
         &self.name
     }
@@ -226,8 +228,9 @@ impl PartText {
     }
 }
 
-/// Balls along a curve through the points (Catmull and Rom 1974; the ends are continued straight), close enough
-/// together to look smooth.
+/// Returns balls along a smooth curve through the points (Catmull and Rom 1974).
+///
+/// The ends are extrapolated linearly. The balls are close enough together to look smooth.
 fn curve(path: &[[f64; 3]], radii: &[f64]) -> Vec<(Vector3<f64>, f64)> {
     let balls: Vec<(Vector3<f64>, f64)> =
         path.iter().map(|&p| Vector3::from(p)).zip(radii.iter().copied()).collect();
@@ -246,7 +249,7 @@ fn curve(path: &[[f64; 3]], radii: &[f64]) -> Vec<(Vector3<f64>, f64)> {
     let mut fine = vec![balls[0]];
     for i in 0..last {
         let [a, b, c, d] = [-1, 0, 1, 2].map(|k| at(i as isize + k));
-        // The curve may swing a little below small radii.
+        // The curve may overshoot slightly below small radii, so its radii are clamped.
         let (low, high) = (b.1.min(c.1), b.1.max(c.1));
         for piece in 1..=PIECES {
             let t = piece as f64 / PIECES as f64;
@@ -270,7 +273,7 @@ impl Part {
             Form::Sphere => sphere(p, self.center, self.radius),
             Form::Ellipsoid { radii, from_world } => ellipsoid(from_world * (p - self.center), *radii),
             Form::Limb(pieces) => pieces.iter().fold(f64::INFINITY, |nearest, piece| {
-                // Most pieces are too far away to matter.
+                // The bounding ball skips most pieces, which are too far away to matter.
                 if sphere(p, piece.center, piece.reach) >= nearest {
                     nearest
                 } else {
@@ -288,7 +291,7 @@ impl SignedDistance for Scene {
         let mut distance = f64::INFINITY;
         for part in &self.parts {
             let p = if part.mirrored { mirrored } else { p };
-            // Most parts are too far away to matter: their ball says so.
+            // The bounding ball skips most parts, which are too far away to matter.
             let at_least = sphere(p, part.center, part.radius);
             if at_least - part.blend >= if part.carve { -distance } else { distance } {
                 continue;
@@ -306,7 +309,7 @@ impl SignedDistance for Scene {
     fn bounds(&self) -> [[f64; 3]; 2] {
         let mut low = Vector3::repeat(f64::INFINITY);
         let mut high = Vector3::repeat(f64::NEG_INFINITY);
-        // A union is fuller than its parts by up to a quarter of the blend.
+        // A smooth union may exceed its parts by up to a quarter of the blend.
         let mut fuller = 0.0;
         for part in self.parts.iter().filter(|p| !p.carve) {
             fuller += part.blend / 4.0;

@@ -1,21 +1,22 @@
-//! Shapes whose distance has a closed form, or nearly.
+//! Shapes whose distance has a closed form or needs a short iteration.
 
 use nalgebra::Vector3;
 
-/// Distance from a sphere.
+/// Returns the distance from a sphere.
 pub(super) fn sphere(p: Vector3<f64>, center: Vector3<f64>, radius: f64) -> f64 {
     (p - center).norm() - radius
 }
 
-/// Distance from the hull of two spheres: a capsule if the radii are equal.
+/// Returns the distance from the hull of two spheres, which is a capsule if the radii are equal.
 ///
-/// In the plane through the axis the sides are two straight lines. Their normal leans by asin((r0 - r1)/length); a point
-/// whose foot on such a line falls off its end is nearest to the sphere there.
+/// In the plane through the axis the sides are two straight lines whose normal leans by asin((r0 -
+/// r1)/length). A point whose foot falls off the end of such a line is nearest to the sphere at
+/// that end.
 pub(super) fn round_cone(p: Vector3<f64>, [from, to]: [Vector3<f64>; 2], [r0, r1]: [f64; 2]) -> f64 {
     let axis = to - from;
     let length = axis.norm();
     let lean = (r0 - r1) / length;
-    // One sphere holds the other.
+    // One sphere contains the other.
     if length <= (r0 - r1).abs() {
         return if r0 >= r1 { sphere(p, from, r0) } else { sphere(p, to, r1) };
     }
@@ -32,21 +33,24 @@ pub(super) fn round_cone(p: Vector3<f64>, [from, to]: [Vector3<f64>; 2], [r0, r1
     }
 }
 
-/// Distance from an ellipsoid around the origin with its axes along x, y and z.
+/// Returns the distance from an ellipsoid around the origin with its axes along x, y and z.
 ///
-/// The nearest point is r_i^2 p_i / (t + r_i^2) with the largest root t of sum (r_i p_i / (t + r_i^2))^2 = 1 (D. Eberly,
-/// *Distance from a Point to an Ellipse, an Ellipsoid, or a Hyperellipsoid*). Right of its last pole the sum falls and is
-/// convex, so Newton's method climbs from the left to the root and cannot pass it.
+/// The nearest point is r_i^2 p_i / (t + r_i^2) with the largest root t of sum (r_i p_i / (t +
+/// r_i^2))^2 = 1 (D. Eberly, *Distance from a Point to an Ellipse, an Ellipsoid, or a
+/// Hyperellipsoid*). Right of its last pole the sum is decreasing and convex, so Newton's method
+/// approaches the root from the left and cannot pass it.
 pub(super) fn ellipsoid(p: Vector3<f64>, radii: Vector3<f64>) -> f64 {
     let shortest = radii.imin();
     let mut p = p.abs();
-    // On the plane across the shortest axis the root may fall on the pole; beside the plane it does not.
+    // On the plane across the shortest axis the root may coincide with the pole. Beside this plane
+    // it does not.
     p[shortest] = p[shortest].max(1e-12 * radii[shortest]);
     let squares = radii.component_mul(&radii);
     let weighted = radii.component_mul(&p);
     let inside = p.component_div(&radii).norm_squared() < 1.0;
-    // Not t but its distance s from the pole, which may be tiny, is kept; the other denominators are s and a gap more.
-    // At the start the shortest axis alone makes the sum 1.
+    // The iteration stores the distance s of t from the pole, because s may be tiny. Each other
+    // denominator is s plus a gap. The start value makes the term of the shortest axis alone equal
+    // to 1.
     let gaps = squares.add_scalar(-squares[shortest]);
     let mut s = weighted[shortest];
     for _ in 0..100 {
@@ -65,8 +69,10 @@ pub(super) fn ellipsoid(p: Vector3<f64>, radii: Vector3<f64>) -> f64 {
     if inside { -distance } else { distance }
 }
 
-/// The union of two shapes, with a fillet where they are within `blend` metres of each other. Changes by at most 1 m a
-/// metre if both do.
+/// Returns the union of two shapes with a fillet where they are within `blend` meters of each
+/// other.
+///
+/// The result changes by at most 1 m per meter if both shapes do.
 pub(super) fn smooth_union(a: f64, b: f64, blend: f64) -> f64 {
     let overlap = (blend - (a - b).abs()).max(0.0);
     let fillet = if blend > 0.0 { overlap * overlap / (4.0 * blend) } else { 0.0 };
@@ -121,7 +127,7 @@ mod tests {
             assert!((distance.abs() - nearest).abs() < 2e-3, "{p:?}: {distance} {nearest}");
             assert_eq!(distance < 0.0, p.component_div(&radii).norm() < 1.0);
         }
-        // Center and poles, where formulas like to break.
+        // The formula is most likely to fail at the center and at the poles.
         assert!((ellipsoid(Vector3::zeros(), radii) + 0.3).abs() < 1e-9);
         assert!((ellipsoid(Vector3::new(0.0, 1.5, 0.0), radii) - 0.5).abs() < 1e-9);
         assert!(ellipsoid(Vector3::new(0.5, 0.0, 0.0), radii).abs() < 1e-9);

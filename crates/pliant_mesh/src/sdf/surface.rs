@@ -1,4 +1,4 @@
-//! The distance from a triangle surface.
+//! Signed distance from a triangle surface.
 
 use std::collections::HashMap;
 
@@ -10,12 +10,13 @@ use crate::{
     bvh::{Bvh, Feature},
 };
 
-/// The solid inside a closed triangle surface.
+/// Solid inside a closed triangle surface.
 ///
-/// The size of the distance is exact. The sign comes from the normal at the closest point (of the face, else the
-/// angle-weighted mean of the faces around the edge or vertex: Baerentzen and Aanaes 2005), which is exact for one
-/// closed surface; where the surface has several parts it comes from the winding number, so that parts inside
-/// of others are what their winding says: hollows if they face inwards, of no effect if they face outwards.
+/// The magnitude of the distance is exact. For a single closed surface the sign comes from the
+/// normal at the closest point and is exact. This is the face normal, or the angle-weighted mean of
+/// the faces around the edge or vertex (Baerentzen and Aanaes 2005). For a surface of several parts
+/// the sign comes from the winding number. The winding of a part inside others then decides its
+/// effect: an inward part is a cavity, and an outward part has no effect.
 #[derive(Debug)]
 pub struct SurfaceDistance {
     bvh: Bvh,
@@ -25,7 +26,7 @@ pub struct SurfaceDistance {
 
 #[derive(Debug)]
 enum Sign {
-    /// For each triangle the normals of its face, its three edges and its three corners, of any length.
+    /// Normals of each triangle's face, three edges and three corners, with arbitrary length.
     Normals(Vec<[Vector3<f64>; 7]>),
     Winding,
 }
@@ -34,7 +35,7 @@ impl SurfaceDistance {
     /// Prepares a surface that [`Surface::closed`] accepts.
     ///
     /// # Errors
-    /// What [`Surface::closed`] says.
+    /// Returns the errors of [`Surface::closed`].
     pub fn new(surface: &Surface) -> Result<Self, MeshError> {
         let solid = surface.closed()?;
         let corners: Vec<[Vector3<f64>; 3]> = solid.corners().collect();
@@ -43,23 +44,28 @@ impl SurfaceDistance {
         Ok(Self { bvh: Bvh::new(&corners), bounds: solid.bounds(), sign })
     }
 
-    /// Prepares a surface that [`Surface::repaired`] can mend, and says what was mended. Inside is where the winding
-    /// number is above 1/2.
+    /// Prepares a surface that [`Surface::repaired`] can repair and returns the list of repairs.
+    ///
+    /// A point is inside where the winding number is above 1/2.
     ///
     /// # Errors
-    /// What [`Surface::repaired`] says.
+    /// Returns the errors of [`Surface::repaired`].
     pub fn repaired(surface: &Surface) -> Result<(Self, Repair), MeshError> {
         let (solid, repair) = surface.repaired()?;
         let corners: Vec<[Vector3<f64>; 3]> = solid.corners().collect();
         Ok((Self { bvh: Bvh::new(&corners), bounds: solid.bounds(), sign: Sign::Winding }, repair))
     }
 
-    /// Prepares a surface as it is where [`SurfaceDistance::new`] takes it, else [`SurfaceDistance::repaired`]: what is
-    /// sound keeps its exact sign, what is dirty is mended and tells how. `None`: nothing had to be.
+    /// Prepares a surface with [`SurfaceDistance::new`] if possible, otherwise with
+    /// [`SurfaceDistance::repaired`].
+    ///
+    /// A valid surface keeps its exact sign. A defective surface is repaired, and the result lists
+    /// the repairs. `None` means that no repair was necessary.
     ///
     /// # Errors
-    /// What [`Surface::check`] says, and of a dirty surface what [`Surface::repaired`] says: it is refused only where
-    /// winding numbers cannot decide what is inside.
+    /// Returns the errors of [`Surface::check`] and, for a defective surface, those of
+    /// [`Surface::repaired`]. A defective surface is refused only where winding numbers cannot
+    /// decide what is inside.
     pub fn mended(surface: &Surface) -> Result<(Self, Option<Repair>), MeshError> {
         match Self::new(surface) {
             Ok(sound) => Ok((sound, None)),
@@ -74,7 +80,7 @@ impl SurfaceDistance {
         }
     }
 
-    /// How often the surface winds around `p`: 1 inside, 0 outside.
+    /// Returns how often the surface winds around `p`: 1 inside, 0 outside.
     pub fn winding_number(&self, p: [f64; 3]) -> f64 {
         self.bvh.winding_number(p.into())
     }

@@ -1,38 +1,44 @@
-//! The body-centered cubic lattice around a shape: signs at its points, cut points on its edges, and the warp.
+//! Body-centered cubic lattice around a shape: signs at its points, cut points on its edges, and
+//! the warp.
 //!
-//! Lattice points have whole coordinates that are all even (corners of cells) or all odd (centers); one unit is half a
-//! cell. A *long* edge joins two points of one kind, two units apart along an axis; a *short* edge joins a corner and a
-//! center, one unit apart along every axis. Only blocks of cells that the shape reaches are stored.
+//! Lattice points have integer coordinates that are all even (corners of cells) or all odd
+//! (centers). One unit is half a cell. A *long* edge joins two points of one kind, two units apart
+//! along an axis. A *short* edge joins a corner and a center, one unit apart along every axis. Only
+//! blocks of cells that the shape reaches are stored.
 
 use nalgebra::Vector3;
 use rayon::prelude::*;
 
 use crate::{MeshError, sdf::SignedDistance};
 
-/// Cells along the edge of a block.
+/// Number of cells along the edge of a block.
 const BLOCK: i32 = 8;
-/// Points of a block: a corner and a center for each cell.
+/// Number of points of a block: a corner and a center for each cell.
 const POINTS: usize = 2 * (BLOCK * BLOCK * BLOCK) as usize;
-/// Edges that a point owns: three long ones and, if it is a center, eight short ones.
+/// Largest number of edges that a point owns: three long ones and, for a center, eight short ones.
 const EDGES: usize = 11;
-/// Places for blocks in the box around the shape: a thin shape in a wide box can ask for more.
+/// Largest number of block slots in the box around the shape. A thin shape in a wide box can need
+/// more.
 const MAX_PLACES: i64 = 1 << 25;
-/// Blocks that are stored, 1.5e8 tetrahedra.
+/// Largest number of stored blocks, 1.5e8 tetrahedra.
 const MAX_BLOCKS: usize = 25_000;
 
-/// A cut point closer to a lattice point than this share of its edge pulls the lattice point onto it (Labelle and
-/// Shewchuk 2007). Over all stencils, cuts and displacements, wild fields included, these two shares give the best
-/// smallest angle, 9.32 degrees, and at most 161.65; surfaces that the lattice resolves stay between 13 and 156.
+/// Fraction of its edge within which a cut point moves the lattice point onto itself (Labelle and
+/// Shewchuk 2007).
+///
+/// Over all stencils, cuts and displacements, wild fields included, the fractions for long and
+/// short edges give the best smallest angle, 9.32 degrees, and at most 161.65 degrees. Surfaces
+/// that the lattice resolves stay between 13 and 156 degrees.
 const ALPHA_LONG: f64 = 0.24999;
 const ALPHA_SHORT: f64 = 0.41189;
 
-/// Roots on edges are found to this share of a cell.
+/// Tolerance for roots on edges, as a fraction of a cell.
 const ROOT_TOLERANCE: f64 = 1e-8;
 
-/// Whole coordinates of a lattice point.
+/// Integer coordinates of a lattice point.
 pub(super) type Point = [i32; 3];
 
-/// Where a lattice point lies, once the warp is done.
+/// Position of a lattice point relative to the surface after the warp.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(super) enum Side {
     Inside,
@@ -41,36 +47,37 @@ pub(super) enum Side {
 }
 
 struct Block {
-    /// Place of the first corner in cells.
+    /// Coordinates of the first corner, in cells.
     cell: Point,
     sides: Vec<Side>,
-    /// Positions of warped points.
+    /// Positions of warped points, by point index.
     warped: Vec<(u32, Vector3<f64>)>,
-    /// Cut points of owned edges, sorted by `point * EDGES + edge`.
+    /// Cut points of owned edges, sorted by the key `point * EDGES + edge`.
     cuts: Vec<(u32, Vector3<f64>)>,
 }
 
-/// See the module.
+/// Lattice around a shape, as the module documentation describes.
 pub(super) struct Lattice<'a> {
     sdf: &'a dyn SignedDistance,
     /// Length of a long edge, m.
     cell: f64,
-    /// Position of point (0, 0, 0).
+    /// Position of point (0, 0, 0), m.
     origin: Vector3<f64>,
-    /// Blocks along each axis; the first holds point (0, 0, 0).
+    /// Number of block slots along each axis. The first slot contains point (0, 0, 0).
     places: Point,
-    /// Which block stands in a place, `u32::MAX` for none.
+    /// Index of the block in each slot, or `u32::MAX` for none.
     block_at: Vec<u32>,
     blocks: Vec<Block>,
 }
 
 impl<'a> Lattice<'a> {
-    /// Signs and cut points of the lattice with cells of `cell` metres, warped. A corner of a cell lies in the middle of
-    /// the shape's box, moved by `shift` cells.
+    /// Makes the warped lattice with cells of `cell` meters, with signs and cut points.
+    ///
+    /// A corner of a cell lies at the center of the shape's box, moved by `shift` cells.
     pub(super) fn new(sdf: &'a dyn SignedDistance, cell: f64, shift: [f64; 3]) -> Result<Self, MeshError> {
         let [low, high] = sdf.bounds().map(Vector3::from);
-        // An even number of cells on each side of the box's middle, so that a symmetric shape meets a symmetric
-        // lattice, and two more around it that are outside for certain.
+        // The number of cells on each side of the box's center is an integer, so that a symmetric
+        // shape meets a symmetric lattice. Two more cells around the box are certainly outside.
         let half = ((high - low) / (2.0 * cell)).map(|n| n.ceil() + 2.0);
         let places = half.map(|n| (2.0 * n / f64::from(BLOCK)).ceil());
         if places.product() > MAX_PLACES as f64 {
@@ -113,8 +120,10 @@ impl<'a> Lattice<'a> {
         Ok(lattice)
     }
 
-    /// First cells of all blocks that hold a point inside or next to the surface, in a fixed order. Whole octants are
-    /// passed over by their distance to the surface.
+    /// Returns the first cells of all blocks with a point inside or next to the surface, in a fixed
+    /// order.
+    ///
+    /// Whole octants are skipped by their distance to the surface.
     fn reached_blocks(&self) -> Result<Vec<Point>, MeshError> {
         let largest = self.places.iter().copied().max().unwrap_or(1).max(1) as u32;
         let mut stack = vec![([0; 3], largest.next_power_of_two() as i32)];
@@ -146,11 +155,13 @@ impl<'a> Lattice<'a> {
         Ok(found)
     }
 
-    /// The side of all points from `first` over `extent` units along each axis, if the distance at their middle makes
-    /// it certain for them and their neighbours.
+    /// Returns the common side of all points from `first` over `extent` units along each axis.
+    ///
+    /// Returns `None` if the distance at the center does not decide the side for the points and
+    /// their neighbors.
     fn sure_side(&self, first: Point, extent: i32) -> Option<Side> {
         let middle = self.rest_position(first) + Vector3::repeat(f64::from(extent - 1) * self.cell / 4.0);
-        // From the middle to the farthest point, and one long edge more.
+        // The reach goes from the center to the farthest point, plus one long edge.
         let reach = self.cell * (3_f64.sqrt() * f64::from(extent - 1) / 4.0 + 1.0);
         let distance = self.sdf.distance(middle.into());
         if distance > reach {
@@ -162,7 +173,7 @@ impl<'a> Lattice<'a> {
         }
     }
 
-    /// Distances of a block's points; infinite where only the side is known.
+    /// Returns the distances of a block's points. They are infinite where only the side is known.
     fn distances(&self, cell: Point) -> Vec<f64> {
         let mut distances = vec![f64::INFINITY; POINTS];
         let mut stack = vec![([0; 3], BLOCK)];
@@ -194,7 +205,7 @@ impl<'a> Lattice<'a> {
         distances
     }
 
-    /// Cut points of the edges that a block's points own.
+    /// Returns the cut points of the edges that a block's points own.
     fn cut_edges(&self, block: usize, distances: &[Vec<f64>]) -> Vec<(u32, Vector3<f64>)> {
         let mut cuts = Vec::new();
         let distance = |p: Point| self.block_of(p).map_or(f64::INFINITY, |block| distances[block][local(p)]);
@@ -214,8 +225,10 @@ impl<'a> Lattice<'a> {
         cuts
     }
 
-    /// Where the surface crosses the edge between two points with these distances: false position in Illinois' form,
-    /// which keeps the bracket.
+    /// Returns the point where the surface crosses the edge between two points with these
+    /// distances.
+    ///
+    /// The method is false position in the Illinois form, which keeps the bracket.
     fn root(&self, ends: [Point; 2], [mut f0, mut f1]: [f64; 2]) -> Vector3<f64> {
         let [a, b] = ends.map(|p| self.rest_position(p));
         let value = |t: f64| self.sdf.distance((a + (b - a) * t).into());
@@ -223,7 +236,7 @@ impl<'a> Lattice<'a> {
         let mut t = 0.5;
         for _ in 0..60 {
             let secant = (t0 * f1 - t1 * f0) / (f1 - f0);
-            // Where the field jumps or is not finite the bracket is halved.
+            // The bracket is halved where the field jumps or is not finite.
             t = if secant > t0 && secant < t1 { secant } else { 0.5 * (t0 + t1) };
             let f = value(t);
             if f.abs() <= ROOT_TOLERANCE * self.cell || t1 - t0 <= ROOT_TOLERANCE {
@@ -240,8 +253,10 @@ impl<'a> Lattice<'a> {
         a + (b - a) * t
     }
 
-    /// Pulls each point of a block that a cut point is too close to onto the closest such cut point. The cut points of
-    /// its edges are gone then; the order of points is fixed, so the result is.
+    /// Moves each point of a block onto its closest cut point, if this cut point is too close.
+    ///
+    /// The move removes the cut points on the edges of the moved point. The result is
+    /// deterministic, because the order of points is fixed.
     fn warp(&mut self, block: usize) {
         for index in 0..POINTS {
             let point = self.point(block, index);
@@ -270,7 +285,7 @@ impl<'a> Lattice<'a> {
         }
     }
 
-    /// The cut point between two neighbours; none if an end was warped since.
+    /// Returns the cut point between two neighbors, or `None` if the warp has moved an end.
     pub(super) fn cut(&self, a: Point, b: Point) -> Option<Vector3<f64>> {
         let sides = [self.side(a), self.side(b)];
         if !matches!(sides, [Side::Inside, Side::Outside] | [Side::Outside, Side::Inside]) {
@@ -281,7 +296,8 @@ impl<'a> Lattice<'a> {
         cuts.binary_search_by_key(&key, |c| c.0).ok().map(|i| cuts[i].1)
     }
 
-    /// Block and key of an edge. The owner of a long edge is its lower end, of a short one its center.
+    /// Returns the block and the key of an edge. The lower end owns a long edge, and the center
+    /// owns a short edge.
     fn cut_key(&self, a: Point, b: Point) -> Option<(usize, u32)> {
         let step = sub(b, a);
         let forward = if is_long(step) { step.iter().sum::<i32>() > 0 } else { a[0] & 1 == 1 };
@@ -290,7 +306,8 @@ impl<'a> Lattice<'a> {
         Some((self.block_of(owner)?, (local(owner) * EDGES + edge) as u32))
     }
 
-    /// Numbers that identify a lattice point, and the edge between two: keys for the nodes of the mesh.
+    /// Returns a key that identifies a lattice point as a node of the mesh. `edge_key` does
+    /// so for an edge.
     pub(super) fn point_key(&self, point: Point) -> Option<u64> {
         Some((self.block_of(point)? * POINTS + local(point)) as u64)
     }
@@ -300,7 +317,7 @@ impl<'a> Lattice<'a> {
         Some(((self.blocks.len() + block * EDGES) * POINTS) as u64 + u64::from(key))
     }
 
-    /// Position of a point after the warp.
+    /// Returns the position of a point after the warp.
     pub(super) fn position(&self, point: Point) -> Vector3<f64> {
         let warped = self.block_of(point).and_then(|block| {
             let warped = &self.blocks[block].warped;
@@ -313,12 +330,14 @@ impl<'a> Lattice<'a> {
         self.block_of(point).map_or(Side::Outside, |block| self.blocks[block].sides[local(point)])
     }
 
-    /// All tetrahedra of the lattice with a corner inside, in a fixed order: around each long edge between two centers
-    /// (the first two corners) stand four, each closed by a long edge between two corners.
+    /// Visits all tetrahedra of the lattice with a corner inside, in a fixed order.
+    ///
+    /// Four tetrahedra surround each long edge between two centers (the first two corners). A long
+    /// edge between two corners closes each of them.
     pub(super) fn for_each_tet(&self, mut visit: impl FnMut([Point; 4])) {
         for block in &self.blocks {
-            // A tetrahedron whose first center is in a block that is not stored is outside: that block and all its
-            // neighbouring points are.
+            // If the block of a tetrahedron's first center is not stored, the tetrahedron is
+            // outside, because the block and all neighboring points are outside.
             for cell in 0..BLOCK * BLOCK * BLOCK {
                 let ijk = [cell / (BLOCK * BLOCK), cell / BLOCK % BLOCK, cell % BLOCK];
                 let center: Point = std::array::from_fn(|a| 2 * (block.cell[a] + ijk[a]) + 1);
@@ -366,7 +385,7 @@ impl<'a> Lattice<'a> {
     }
 }
 
-/// NaN counts as outside.
+/// Returns the side for a distance. NaN counts as outside.
 fn side(distance: f64) -> Side {
     if distance < 0.0 {
         Side::Inside
@@ -377,14 +396,14 @@ fn side(distance: f64) -> Side {
     }
 }
 
-/// Index of a point within its block.
+/// Returns the index of a point within its block.
 fn local(point: Point) -> usize {
     let [i, j, k] = point.map(|x| x.div_euclid(2).rem_euclid(BLOCK));
     (2 * ((i * BLOCK + j) * BLOCK + k) + (point[0] & 1)) as usize
 }
 
 const LONG: [Point; 6] = [[2, 0, 0], [0, 2, 0], [0, 0, 2], [-2, 0, 0], [0, -2, 0], [0, 0, -2]];
-/// Owned edges come first.
+/// Steps to the neighbors of a point. The owned edges come first.
 const STEPS: [Point; 14] = [
     LONG[0],
     LONG[1],

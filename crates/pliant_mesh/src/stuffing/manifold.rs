@@ -1,13 +1,15 @@
-//! Contacts of measure zero: two pieces of a mesh that share a node or an edge and no face.
+//! Removes contacts of measure zero, where two pieces of a mesh share a node or an edge but no
+//! face.
 
 use crate::{TetMesh, surface::Connected, tets::signed_volume};
 
-/// Makes the boundary a manifold; gives back how many tetrahedra were dropped for it.
+/// Makes the boundary a manifold. Returns the number of tetrahedra that were dropped for this.
 ///
-/// Lattice points that were pulled onto the surface can join pieces in a single node or along a single edge (the
-/// shape is thin there, or nearly touches itself). A node whose tetrahedra hang together in several groups becomes one
-/// node for each group. That loses nothing. Where groups share an edge within one node's group only the largest is kept,
-/// and where a hollow touches the outside in a single node the tetrahedra around that node are dropped; both are rare.
+/// Lattice points that were moved onto the surface can join pieces in a single node or along a
+/// single edge, where the shape is thin or nearly touches itself. If the tetrahedra around a node
+/// form several groups, each group gets a node of its own, which loses nothing. Where groups within
+/// one node's group share an edge, only the largest group is kept. Where a cavity touches the
+/// outside in a single node, the tetrahedra around that node are dropped. Both cases are rare.
 pub(super) fn part_contacts(mesh: &mut TetMesh, on_surface: &mut Vec<bool>) -> usize {
     let before = mesh.tets.len();
     loop {
@@ -21,12 +23,13 @@ pub(super) fn part_contacts(mesh: &mut TetMesh, on_surface: &mut Vec<bool>) -> u
         }
         let mut keep = dropped.iter().map(|d| !d);
         mesh.tets.retain(|_| keep.next().unwrap_or(true));
-        // A dropped tetrahedron lays bare nodes that were inside.
+        // A dropped tetrahedron exposes nodes that were inside.
         on_surface.fill(true);
     }
 }
 
-/// Gives each group of tetrahedra around a node, connected by faces at that node, a node of its own.
+/// Gives each group of tetrahedra around a node, connected by faces at that node, a node of its
+/// own.
 fn part_nodes(mesh: &mut TetMesh, on_surface: &mut Vec<bool>) {
     let around = tets_around(mesh);
     for node in 0..on_surface.len() {
@@ -49,7 +52,8 @@ fn part_nodes(mesh: &mut TetMesh, on_surface: &mut Vec<bool>) {
     }
 }
 
-/// Which tetrahedra to drop: where those around an edge hang together in several groups, all but the largest.
+/// Marks the tetrahedra to drop: if those around an edge form several groups, all groups but the
+/// largest.
 fn edge_contacts(mesh: &TetMesh, on_surface: &[bool]) -> Vec<bool> {
     const EDGES: [[usize; 2]; 6] = [[0, 1], [0, 2], [0, 3], [1, 2], [1, 3], [2, 3]];
     let mut around: Vec<([u32; 2], u32)> = Vec::new();
@@ -76,7 +80,8 @@ fn edge_contacts(mesh: &TetMesh, on_surface: &[bool]) -> Vec<bool> {
     dropped
 }
 
-/// Which tetrahedra to drop: those around a node at which the boundary has more than one fan of triangles.
+/// Marks the tetrahedra to drop: those around a node where the boundary has more than one fan of
+/// triangles.
 fn hollow_contacts(mesh: &TetMesh) -> Vec<bool> {
     let (surface, nodes) = mesh.boundary();
     let mut fans: Vec<Vec<[u32; 2]>> = vec![Vec::new(); surface.positions.len()];
@@ -87,7 +92,8 @@ fn hollow_contacts(mesh: &TetMesh) -> Vec<bool> {
     }
     let mut torn = vec![false; mesh.nodes.len()];
     for (fan, &node) in fans.iter().zip(&nodes) {
-        // Walk once around; edges have two triangles each by now, so the walk comes back.
+        // Each edge has two triangles at this stage, so the walk around the node returns to its
+        // start.
         let start = fan[0][0];
         let mut at = start;
         let mut turns = 0;
@@ -121,7 +127,8 @@ pub(super) fn keep_largest_part(mesh: &mut TetMesh) {
     mesh.tets.retain(|_| roots.next() == largest);
 }
 
-/// For each item the number of its group, counted from 0 by first appearance; `joined` items are in one group.
+/// Returns the group of each item, numbered from 0 by first appearance. Items that `joined`
+/// connects are in one group.
 fn groups(items: &[u32], joined: impl Fn(u32, u32) -> bool) -> Vec<u32> {
     let mut group = vec![u32::MAX; items.len()];
     let mut count = 0;
@@ -145,12 +152,12 @@ fn groups(items: &[u32], joined: impl Fn(u32, u32) -> bool) -> Vec<u32> {
     group
 }
 
-/// How many nodes two tetrahedra share.
+/// Returns the number of nodes that two tetrahedra share.
 fn shared(a: [u32; 4], b: [u32; 4]) -> usize {
     a.iter().filter(|n| b.contains(n)).count()
 }
 
-/// The tetrahedra at each node, in one list.
+/// Tetrahedra at each node, in one list.
 struct Around {
     start: Vec<u32>,
     tets: Vec<u32>,

@@ -1,8 +1,9 @@
-//! Isosurface stuffing: tetrahedra with good angles inside any closed surface.
+//! Isosurface stuffing: fills any closed surface with tetrahedra of good angles.
 //!
-//! F. Labelle and J. R. Shewchuk, *Isosurface Stuffing: Fast Tetrahedral Meshes with Good Dihedral Angles*, ACM Trans.
-//! Graphics 26(3), 2007, the uniform form: a body-centered cubic lattice is laid over the shape, lattice points near the
-//! surface are pulled onto it, and the tetrahedra that cross it are cut by a handful of stencils.
+//! The method is the uniform form of F. Labelle and J. R. Shewchuk, *Isosurface Stuffing: Fast
+//! Tetrahedral Meshes with Good Dihedral Angles*, ACM Trans. Graphics 26(3), 2007. A body-centered
+//! cubic lattice covers the shape, lattice points near the surface are moved onto it, and a few
+//! stencils cut the tetrahedra that cross the surface.
 
 mod lattice;
 mod manifold;
@@ -16,21 +17,22 @@ use stencil::{Node, fill};
 
 use crate::{MeshError, TetMesh, sdf::SignedDistance, tets::signed_volume};
 
-/// Every angle between two faces of a tetrahedron that [`stuff`] makes lies between these, degrees.
+/// Bounds of all angles between two faces of a tetrahedron that [`stuff`] makes, degrees.
 pub const DIHEDRAL_BOUNDS_DEG: [f64; 2] = [10.7, 164.8];
 
-/// [`stuff`] comes this close to the wanted number of tetrahedra, as a share of it.
+/// Largest deviation of [`stuff`] from the wanted number of tetrahedra, as a fraction of this
+/// number.
 pub const COUNT_TOLERANCE: f64 = 0.05;
 
 const MAX_TETS: usize = 100_000_000;
 
-/// What [`stuff`] should make.
+/// Options of [`stuff`].
 #[derive(Clone, Copy, Debug, PartialEq)]
 #[non_exhaustive]
 pub struct StuffOptions {
     /// Wanted number of tetrahedra, met within [`COUNT_TOLERANCE`]. Default: 10,000.
     pub target_tets: usize,
-    /// What to do with pieces that do not hang together. Default: [`Parts::Largest`].
+    /// Pieces to keep if the mesh is not connected. Default: [`Parts::Largest`].
     pub parts: Parts,
 }
 
@@ -41,36 +43,39 @@ impl Default for StuffOptions {
 }
 
 impl StuffOptions {
-    /// Defaults but for the number of tetrahedra.
+    /// Returns the default options with this number of tetrahedra.
     pub fn with_target(target_tets: usize) -> Self {
         Self { target_tets, ..Self::default() }
     }
 }
 
-/// Pieces of a mesh that have no face in common.
+/// Selection among the pieces of a mesh that have no face in common.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 #[non_exhaustive]
 pub enum Parts {
-    /// Keep the piece with the largest volume. Where a shape is thinner than the lattice crumbs break off: they would
-    /// be bodies of their own.
+    /// Keeps the piece with the largest volume.
+    ///
+    /// Where a shape is thinner than the lattice, small fragments separate from it. They would be
+    /// bodies of their own.
     #[default]
     Largest,
-    /// Keep all.
+    /// Keeps all pieces.
     All,
 }
 
 /// Fills a shape with about `options.target_tets` tetrahedra.
 ///
-/// The boundary of the mesh is a closed manifold whose nodes lie on the surface; all dihedral angles lie within
-/// [`DIHEDRAL_BOUNDS_DEG`]. Features thinner than the lattice are lost, sharp edges are rounded by up to a cell.
-/// The same shape and options give the same mesh to the bit, whatever the number of threads.
-/// `progress` is told a share from 0 to 1 now and then.
+/// The boundary of the mesh is a closed manifold whose nodes lie on the surface. All dihedral
+/// angles lie within [`DIHEDRAL_BOUNDS_DEG`]. Features thinner than the lattice are lost, and sharp
+/// edges are rounded by up to a cell. The same shape and options give the same mesh to the bit, for
+/// any number of threads. `progress` receives the completed fraction from 0 to 1 from time to time.
 ///
 /// # Errors
-/// [`MeshError::Parameter`] when the count is 0 or too large or the shape's box is not finite;
-/// [`MeshError::TetCount`] when no lattice gives a number close enough to the wanted one (it happens for a
-/// few hundred tetrahedra); [`MeshError::Dihedral`] when no place of the lattice gives good angles (a field so wild
-/// was not seen yet); [`MeshError::Empty`] when nothing is inside.
+/// Returns [`MeshError::Parameter`] when the count is 0 or too large or the shape's box is not
+/// finite, and [`MeshError::Empty`] when nothing is inside. Returns [`MeshError::TetCount`] when no
+/// lattice gives a number close enough to the wanted one, which happens for a few hundred
+/// tetrahedra. Returns [`MeshError::Dihedral`] when no position of the lattice gives good angles.
+/// No field that causes this error is known.
 pub fn stuff(
     sdf: &dyn SignedDistance,
     options: &StuffOptions,
@@ -89,8 +94,8 @@ pub fn stuff(
             format!("{:?} to {:?}", sdf.bounds()[0], sdf.bounds()[1]),
         ));
     }
-    // A look at a coarse lattice first; then the count goes about with the cell to the power -3, and two
-    // counts tell the power better.
+    // The first attempt uses a coarse lattice. The count is about proportional to the cell to the
+    // power -3, and two counts give a better estimate of the power.
     let mut cell = (size.product() / COARSE_CELLS.min(target as f64 / 3.0)).cbrt().min(size.max());
     let mut tried: Vec<(f64, usize)> = Vec::new();
     let mut nearest: Option<usize> = None;
@@ -98,14 +103,15 @@ pub fn stuff(
     let mut moved = false;
     for attempt in 0..MAX_ATTEMPTS {
         progress(attempt as f32 / (attempt + 2) as f32);
-        // Where symmetry makes the count jump (it goes in steps of up to 48) another place of the lattice helps.
+        // Where symmetry makes the count jump (in steps of up to 48), another position of the
+        // lattice helps.
         let shift = if attempt < SYMMETRIC_ATTEMPTS && !moved { 0.0 } else { attempt as f64 };
         let (mesh, dropped) = mesh(sdf, cell, SHIFT.map(|s| s * shift % 1.0))?;
         let mesh = keep_parts(mesh, options.parts);
         let count = mesh.tets.len();
         if count.abs_diff(target) as f64 <= COUNT_TOLERANCE * target as f64 {
-            // A mesh that lost tetrahedra, or whose angles go beyond the bounds, is set aside: another place of
-            // the lattice does better. Angles are never let through.
+            // A mesh that lost tetrahedra or whose angles exceed the bounds is rejected, because
+            // another position of the lattice does better. Bad angles are never accepted.
             let quality = mesh.quality();
             let bad_angles = quality.min_dihedral_deg < DIHEDRAL_BOUNDS_DEG[0]
                 || quality.max_dihedral_deg > DIHEDRAL_BOUNDS_DEG[1];
@@ -136,18 +142,18 @@ pub fn stuff(
     }
 }
 
-/// Cells of the first lattice.
+/// Number of cells of the first lattice.
 const COARSE_CELLS: f64 = 6000.0;
 const MAX_ATTEMPTS: usize = 40;
-/// For so many attempts a mesh is refused that lost tetrahedra to keep its boundary a manifold.
+/// Number of attempts that reject a mesh that lost tetrahedra to keep its boundary a manifold.
 const PATIENT_ATTEMPTS: usize = 12;
-/// The cell is halved as often to find something in a box that seems empty.
+/// Number of attempts with ever smaller cells in a box that seems empty.
 const EMPTY_ATTEMPTS: usize = 7;
 const SYMMETRIC_ATTEMPTS: usize = 6;
-/// Steps that cover the cell evenly: powers of the inverse plastic number.
+/// Shifts that cover the cell evenly: powers of the inverse plastic number.
 const SHIFT: [f64; 3] = [0.819_172_513, 0.671_043_606, 0.549_700_478];
 
-/// The cell at which the count should come out right, from what was tried.
+/// Returns the cell size that should give the wanted count, estimated from the attempts so far.
 fn next_cell(tried: &[(f64, usize)], target: usize) -> f64 {
     let log = |count: usize| (count as f64).ln();
     match *tried {
@@ -157,17 +163,18 @@ fn next_cell(tried: &[(f64, usize)], target: usize) -> f64 {
             let power = (log(y1) - log(y0)) / (x1.ln() - x0.ln());
             x1 * ((log(target) - log(y1)) / power.clamp(-6.0, -2.0)).exp()
         }
-        // Counts that jump (parts join and part as the cell changes) tell no power.
+        // Counts that jump (parts join and separate as the cell changes) give no power.
         [.., (cell, count)] => cell * (count as f64 / target as f64).cbrt(),
     }
 }
 
-/// All tetrahedra of the lattice with one size of cell, as a manifold, and how many were dropped to make it one.
+/// Makes a manifold of all tetrahedra of the lattice for one cell size. Returns the number of
+/// tetrahedra that were dropped for this.
 fn mesh(sdf: &dyn SignedDistance, cell: f64, shift: [f64; 3]) -> Result<(TetMesh, usize), MeshError> {
     let lattice = Lattice::new(sdf, cell, shift)?;
     let mut mesh = TetMesh::default();
     let mut index_of: HashMap<u64, u32> = HashMap::new();
-    // Points on the surface, where pieces may touch that do not hang together.
+    // These flags mark points on the surface, where unconnected pieces may touch.
     let mut on_surface = Vec::new();
     lattice.for_each_tet(|corners| {
         fill(corners, corners.map(|p| lattice.side(p)), |nodes| {

@@ -1,20 +1,22 @@
-//! What of one lattice tetrahedron lies inside the surface, as tetrahedra.
+//! Divides the inside part of one lattice tetrahedron into tetrahedra.
 
 use super::lattice::{Point, Side, is_long, sub};
 
-/// A node of the mesh: a lattice point or the cut point between two of them (the inside one first).
+/// Node of the mesh: a lattice point, or the cut point between two lattice points (the inside one
+/// first).
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(super) enum Node {
     Point(Point),
     Cut(Point, Point),
 }
 
-/// Calls `emit` for each tetrahedron that fills the inside part of a lattice tetrahedron with the given corners and
-/// sides. Orientation is left to the caller.
+/// Calls `emit` for each tetrahedron that fills the inside part of a lattice tetrahedron with these
+/// corners and sides.
 ///
-/// A corner inside is kept, one on the surface too; between a corner inside and one outside stands a cut point. What is
-/// left is a tetrahedron, a pyramid or a prism, and its quadrilaterals are cut as [`diagonal_starts_at_first`] says, so
-/// that neighbours agree.
+/// The caller fixes the orientation. Corners inside and on the surface are kept. A cut point lies
+/// between a corner inside and one outside. The remaining part is a tetrahedron, a pyramid or a
+/// prism. [`diagonal_starts_at_first`] selects the diagonals of the quadrilaterals, so that
+/// neighbors agree.
 pub(super) fn fill(corners: [Point; 4], sides: [Side; 4], mut emit: impl FnMut([Node; 4])) {
     let of = |side: Side| {
         let mut points = [[0; 3]; 4];
@@ -37,7 +39,7 @@ pub(super) fn fill(corners: [Point; 4], sides: [Side; 4], mut emit: impl FnMut([
         (1, 2) => emit([p, cut(0, 0), cut(0, 1), Node::Point(on[0])]),
         (1, _) => emit([p, cut(0, 0), cut(0, 1), cut(0, 2)]),
         (2, 1) => {
-            // A pyramid over the quadrilateral p, q, cut q, cut p.
+            // The rest is a pyramid over the quadrilateral p, q, cut q, cut p.
             let top = Node::Point(on[0]);
             let (from, to, rest) = if diagonal_starts_at_first(inside[0], inside[1], outside[0]) {
                 (p, cut(1, 0), [q, cut(0, 0)])
@@ -49,15 +51,16 @@ pub(super) fn fill(corners: [Point; 4], sides: [Side; 4], mut emit: impl FnMut([
             }
         }
         (2, _) => {
-            // A prism between the triangles at p and at q. The diagonal of its third side, on the surface, follows.
+            // The rest is a prism between the triangles at p and at q. The other two diagonals
+            // determine that of the third side, which lies on the surface.
             let first = |o| diagonal_starts_at_first(inside[0], inside[1], outside[o]);
             let (d01, d02) = (first(0), first(1));
-            // If both diagonals leave from the same end either third one would do.
+            // If both diagonals start at the same end, either choice is valid for the third one.
             let d12 = if d01 == d02 { true } else { d02 };
             prism([p, cut(0, 0), cut(0, 1)], [q, cut(1, 0), cut(1, 1)], [d01, d02, d12], emit);
         }
         (_, _) => {
-            // The corner outside is cut off; a prism is left.
+            // The corner outside is cut off, and a prism remains.
             let r = Node::Point(inside[2]);
             let first = |i: usize, j: usize| diagonal_starts_at_first(inside[i], inside[j], outside[0]);
             prism(
@@ -70,13 +73,15 @@ pub(super) fn fill(corners: [Point; 4], sides: [Side; 4], mut emit: impl FnMut([
     }
 }
 
-/// In a face with two corners `a` and `b` inside and the third, `out`, outside: whether the quadrilateral is cut from
-/// `a` to the cut point next to `b` (else from `b` to the one next to `a`).
+/// Selects the diagonal of a face with the corners `a` and `b` inside and the third, `out`,
+/// outside.
 ///
-/// A cut point on a long edge keeps the diagonal, as the angles are wider there. If both cut edges are short, parity
-/// decides: the number of coordinates in which an end of the long edge exceeds `out` is even for one end and odd for
-/// the other, and alternates from face to face around the edge, which keeps prisms from being twisted (Labelle and
-/// Shewchuk 2007, the parity rule).
+/// Returns true if the diagonal goes from `a` to the cut point next to `b`, and false if it goes
+/// from `b` to the cut point next to `a`. A cut point on a long edge keeps the diagonal, because
+/// the angles are wider there. If both cut edges are short, parity decides. The number of
+/// coordinates in which an end of the long edge exceeds `out` is even for one end and odd for the
+/// other. It alternates from face to face around the edge, which prevents twisted prisms (Labelle
+/// and Shewchuk 2007, the parity rule).
 fn diagonal_starts_at_first(a: Point, b: Point, out: Point) -> bool {
     if is_long(sub(a, out)) {
         false
@@ -87,11 +92,13 @@ fn diagonal_starts_at_first(a: Point, b: Point, out: Point) -> bool {
     }
 }
 
-/// Cuts the prism between the triangles `a` and `b` in three. `diagonals` say for the sides (0, 1), (0, 2) and (1, 2)
-/// whether the diagonal leaves from `a` at the first of the two; not all may turn the same way round.
+/// Divides the prism between the triangles `a` and `b` into three tetrahedra.
+///
+/// `diagonals` say for the sides (0, 1), (0, 2) and (1, 2) whether the diagonal starts from `a` at
+/// the first of the two indices. The diagonals must not all turn in the same direction.
 fn prism(a: [Node; 3], b: [Node; 3], diagonals: [bool; 3], mut emit: impl FnMut([Node; 4])) {
     let [d01, d02, d12] = diagonals.map(usize::from);
-    // How many diagonals leave from a[i]: 2, 1 and 0 in some order.
+    // The numbers of diagonals that start at each a[i] are 2, 1 and 0 in some order.
     let leaving = [d01 + d02, 1 - d01 + d12, 2 - d02 - d12];
     let at = |count| leaving.iter().position(|&n| n == count).unwrap_or(0);
     let (i, j, k) = (at(2), at(1), at(0));

@@ -27,7 +27,7 @@ impl SignedDistance for Torus {
     }
 }
 
-/// A box, by its half sizes.
+/// Box with these half extents.
 struct Cuboid([f64; 3]);
 
 impl SignedDistance for Cuboid {
@@ -40,12 +40,13 @@ impl SignedDistance for Cuboid {
     }
 }
 
-/// Many balls that touch, overlap and miss each other: thin necks, crumbs and hollows.
+/// Many balls that touch, overlap and miss each other. They form thin necks, fragments and
+/// cavities.
 struct Foam(Vec<(Vector3<f64>, f64)>);
 
 impl Foam {
     fn new(seed: u32) -> Self {
-        // Weyl sequences: even, and different for each seed.
+        // Weyl sequences are evenly distributed and differ for each seed.
         let x = |n: u32, a: f64| (f64::from(n + 100 * seed) * a).fract();
         let ball = |n| {
             let center = Vector3::new(x(n, 0.819_172_513), x(n, 0.671_043_606), x(n, 0.549_700_478));
@@ -68,17 +69,18 @@ fn stuffed(sdf: &dyn SignedDistance, target: usize) -> TetMesh {
     stuff(sdf, &StuffOptions::with_target(target), &mut |_| ()).unwrap()
 }
 
-/// What the module promises of every mesh. Gives back the boundary.
+/// Checks the guarantees of the module for a mesh. Returns the boundary.
 fn assert_sound(mesh: &TetMesh, sdf: &dyn SignedDistance, target: usize) -> Surface {
     mesh.check().unwrap();
     let count = mesh.tets.len();
     assert!(count.abs_diff(target) as f64 <= 0.05 * target as f64, "{count} tetrahedra, wanted {target}");
-    // Labelle and Shewchuk 2007 prove 10.78 and 164.83 degrees.
+    // Labelle and Shewchuk 2007 prove bounds of 10.78 and 164.83 degrees.
     let quality = mesh.quality();
     assert!(quality.min_dihedral_deg > 10.7, "{quality:?}");
     assert!(quality.max_dihedral_deg < 164.85, "{quality:?}");
     let (surface, _) = mesh.boundary();
-    // Not `closed`, which merges the nodes of pieces that were parted where they touched.
+    // `closed` is not suitable here, because it merges the nodes of pieces that were separated
+    // where they touched.
     surface.check_edges().unwrap();
     assert!((surface.volume() / mesh.volume() - 1.0).abs() < 1e-9, "the boundary bounds what is filled");
     assert_one_fan_at_each_vertex(&surface);
@@ -116,7 +118,8 @@ fn balls_are_filled_to_their_volume_with_the_wanted_count() {
         let mesh = stuffed(&ball, target);
         assert_eq!(assert_sound(&mesh, &ball, target).euler_characteristic(), 2);
         let volume = 4.0 / 3.0 * std::f64::consts::PI * 1.3_f64.powi(3);
-        // Chords of a sphere: the missing share falls with the square of the cell, count^(-2/3).
+        // The faces are chords of a sphere, so the missing fraction falls with the square of the
+        // cell, count^(-2/3).
         let missing = 1.0 - mesh.volume() / volume;
         assert!(missing > 0.0 && missing < 6.0 * (target as f64).powf(-2.0 / 3.0), "{target}: {missing}");
     }
@@ -143,7 +146,7 @@ fn foams_with_thin_necks_and_crumbs_stay_manifold() {
     for seed in 0..12 {
         let foam = Foam::new(seed);
         for target in [2500, 15_000] {
-            // All parts: which one is the largest changes with the cell.
+            // The test keeps all parts, because the largest part changes with the cell.
             let options = StuffOptions { target_tets: target, parts: Parts::All };
             assert_sound(&stuff(&foam, &options, &mut |_| ()).unwrap(), &foam, target);
         }

@@ -1,9 +1,11 @@
-//! The state's checksum: a projection that any lasting error shows in, and rounding does not upset.
+//! The checksum of a state: a projection that shows any lasting error and tolerates rounding.
 
 use crate::state::{State, Tick};
 
-/// Sum of all coordinates with signs drawn from the tick (SplitMix64). A hash would cry at the last bit; this is compared
-/// with a tolerance, and an error that one tick's signs hide the next tick's show.
+/// Sum of all coordinates with signs drawn from the tick (SplitMix64).
+///
+/// A hash would change with the last bit of any coordinate. This sum is compared with a tolerance
+/// instead. An error that the signs of one tick hide shows with the signs of the next tick.
 pub fn projection(tick: Tick, q: &[f64]) -> f64 {
     let mut sum = 0.0;
     let mut bits = 0;
@@ -16,7 +18,8 @@ pub fn projection(tick: Tick, q: &[f64]) -> f64 {
     sum
 }
 
-/// The checksum of a state: its coordinates, and where the body relaxes its flows under another tick's signs.
+/// The checksum of a state. It covers the coordinates, and for a body that relaxes the viscoelastic
+/// state with the signs of another tick.
 pub fn checksum(tick: Tick, state: &State) -> f64 {
     projection(tick, &state.q) + projection(!tick, &state.z)
 }

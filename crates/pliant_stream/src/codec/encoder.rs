@@ -1,7 +1,8 @@
 //! The host's encoder: one for all receivers of a body that take the same stream.
 //!
-//! It carries the receiver's own step along (the *mirror*) and quantises in a closed loop: each frame is chosen so that
-//! the mirror, which has only what was sent, meets the truth. Rounding therefore does not add up.
+//! The encoder keeps a copy of the receiver's state (the *mirror*) and quantizes in a closed loop:
+//! each frame is chosen so that the mirror, which uses only sent data, meets the true state.
+//! Rounding errors therefore do not add up.
 
 use std::collections::VecDeque;
 use std::sync::Arc;
@@ -20,29 +21,31 @@ use crate::wire::{
     SliceEntry, SnapshotBytes, StreamSubscription, Writer, round24,
 };
 
-/// Frames kept for resending.
+/// Number of ticks whose frames are kept for resending.
 pub(crate) const SENT: usize = 256;
 /// Ticks between checksums.
 const CHECK_EVERY: u64 = 8;
-/// Loads are sent from when their static effect first exceeds this share of the shape.
+/// The encoder starts to send loads when their static effect first exceeds this share of the shape.
 const LOAD_FLOOR: f64 = 2e-2;
-/// How fast the estimate of the unexplained load follows: about so many ticks.
+/// Time constant of the estimate of the unexplained load, ticks.
 const LOAD_TICKS: f64 = 8.0;
-/// The estimate costs a step of its own: it is made every so many ticks.
+/// Ticks between updates of that estimate. Each update costs an extra step of the model.
 const LOAD_EVERY: u64 = 4;
 
-/// One step moves the surface by this share of how far the body is bent.
+/// Displacement of the surface by one quantization step, as a share of the body's deformation.
 pub(crate) const QUANTUM: f64 = 1.0 / 16_384.0;
-/// An acceleration stream's steps are so much finer, since a prediction multiplies its rounding and integrates it twice.
+/// Acceleration streams use steps finer by this factor, because prediction multiplies their
+/// rounding error and the receiver integrates it twice.
 const FINER: f64 = 64.0;
-/// The memory of how far it was bent, a tick.
+/// Decay of the remembered deformation per tick.
 const VISIBLE_KEEP: f64 = 0.98;
 
-/// What was sent for a tick, for repeats and for resending.
+/// The frames that were sent for a tick, kept for repeats and resending.
 #[derive(Debug, Clone)]
 struct Sent {
     tick: Tick,
-    /// The frame without repeats, marked as resent; more than one where its grabs did not fit.
+    /// The frames without repeats, marked as resent. More than one if the grabs did not fit in one
+    /// frame.
     frames: Vec<Frame>,
 }
 
@@ -52,25 +55,26 @@ impl Sent {
     }
 }
 
-/// A tick's frames as they go out, without datagram headers: one, unless the grabs do not fit in one.
+/// The encoded frames of a tick without datagram headers. One frame, unless the grabs do not fit.
 #[derive(Debug, Clone)]
 pub struct Encoded {
     /// The frame, or its first part.
     pub first: Arc<[u8]>,
     /// The other parts.
     pub more: Vec<Arc<[u8]>>,
-    /// A hand took hold or let go at this tick: no forecast has that, so it is worth saying more than once.
+    /// True when the set of grabs changed at this tick. No forecast can predict such a change, so
+    /// the frame is worth sending more than once.
     pub news: bool,
 }
 
 impl Encoded {
-    /// All datagrams.
+    /// The bytes of all frames, one item per datagram.
     pub fn all(&self) -> impl Iterator<Item = &Arc<[u8]>> {
         std::iter::once(&self.first).chain(&self.more)
     }
 }
 
-/// Encodes one body for one kind of receiver.
+/// Encodes one body for one stream subscription.
 #[derive(Debug)]
 pub struct Encoder {
     body: BodyId,
@@ -78,12 +82,13 @@ pub struct Encoder {
     modes: usize,
     limit: usize,
     newmark: Newmark,
-    /// How receivers of accelerations get the flow of a body that relaxes.
+    /// Filter by which receivers of accelerations compute the viscoelastic state, if the body
+    /// relaxes.
     flow: Option<FlowFilter>,
     replica: Replica,
     mirror: State,
     truth: State,
-    /// The hands' forces over the last step, in the mirror and in truth.
+    /// The forces of the hands over the last step, in the mirror and in the true state.
     mirror_means: Vec<Mean>,
     truth_means: Vec<Mean>,
     load: Vec<f64>,
@@ -96,9 +101,9 @@ pub struct Encoder {
     sent: VecDeque<Sent>,
     scratch: Vec<f64>,
     quanta: Quanta,
-    /// Share of how far the body is bent that one step is.
+    /// Displacement of the surface by one quantization step, as a share of the body's deformation.
     quantum: f64,
-    /// How far the body is bent, for the steps' size, m.
+    /// Deformation of the body that sets the size of the quantization steps, m.
     visible: f64,
     chosen: Vec<u16>,
     wrong: Vec<(f64, u16)>,
@@ -106,10 +111,12 @@ pub struct Encoder {
 }
 
 impl Encoder {
-    /// For the first `wish.modes` of a model, in datagrams of at most `limit` bytes (with the 3 of the header).
+    /// Creates an encoder for the first `subscription.modes` modes of a model. Datagrams have at
+    /// most `limit` bytes, including the 3 bytes of the header.
     ///
     /// # Errors
-    /// [`StreamError::Config`] when not even one mode fits, [`StreamError::Model`].
+    /// Returns [`StreamError::Config`] when not even one mode fits or `newmark` is out of range,
+    /// and [`StreamError::Model`] for an unusable model.
     pub fn new(
         body: BodyId,
         model: Arc<ModalModel>,
@@ -122,7 +129,8 @@ impl Encoder {
         Self::with_visible(body, model, settings, newmark, subscription, limit, &visible)
     }
 
-    /// As [`Encoder::new`], with the visible amplitudes of all that may be wanted of the model's modes.
+    /// As [`Encoder::new`], with the visible amplitudes of at least as many modes as the stream
+    /// carries.
     pub(crate) fn with_visible(
         body: BodyId,
         model: Arc<ModalModel>,
@@ -176,15 +184,16 @@ impl Encoder {
         })
     }
 
-    /// What one step may move the surface by, as a share of how far the body is bent; see [`crate::HostConfig::quantum`].
+    /// Sets the displacement of the surface by one quantization step, as a share of the body's
+    /// deformation. See [`crate::HostConfig::quantum`].
     #[must_use]
     pub fn with_quantum(mut self, share: f64) -> Self {
         self.quantum = if share.is_finite() { share.clamp(1e-9, 0.1) } else { QUANTUM };
         self
     }
 
-    /// How many modes a stream carries: what is wished, what the model has, and (accelerations) what fits beside four
-    /// grabs and a pose into one datagram.
+    /// Number of modes that a stream carries. The limits are the subscription, the model and, for
+    /// accelerations, the room in one datagram beside four grabs and a pose.
     pub fn modes_for(subscription: &StreamSubscription, model_modes: usize, limit: usize) -> usize {
         let wanted = usize::from(subscription.modes).min(model_modes);
         match subscription.payload {
@@ -196,12 +205,12 @@ impl Encoder {
         }
     }
 
-    /// Number of modes carried.
+    /// Number of modes that the stream carries.
     pub fn modes(&self) -> usize {
         self.modes
     }
 
-    /// What the receivers have after the last tick, if they have all.
+    /// The state of a receiver that got all frames up to the last tick.
     pub fn snapshot(&self, resting: bool) -> SnapshotBytes {
         SnapshotBytes {
             body: self.body.0,
@@ -220,14 +229,15 @@ impl Encoder {
         }
     }
 
-    /// The frames of a tick for resending; none when it is not kept any more.
+    /// The frames of a tick for resending. Empty when the encoder does not keep that tick any more.
     pub fn resend(&self, tick: Tick) -> impl Iterator<Item = Arc<[u8]>> + '_ {
         let index = self.sent.front().and_then(|s| usize::try_from(tick.checked_sub(s.tick)?).ok());
         let sent = index.and_then(|index| self.sent.get(index)).filter(|s| s.tick == tick);
         sent.into_iter().flat_map(|s| &s.frames).map(write)
     }
 
-    /// Takes the truth over as it is: the next frame begins a new run, and receivers need a [`Encoder::snapshot`].
+    /// Takes over the true state as it is. The next frame begins a new run, and receivers need a
+    /// [`Encoder::snapshot`].
     pub fn restart(&mut self, state: &TickState<'_>) {
         replica::fill(&mut self.mirror, [state.q, state.v, state.a, state.z]);
         if state.resting {
@@ -235,7 +245,8 @@ impl Encoder {
             self.mirror.a.fill(0.0);
         }
         self.truth.clone_from(&self.mirror);
-        // What they were over the last step nobody says; a hand that changes slowly had nearly what it has.
+        // The mean forces over the last step are unknown. The current reactions are close to them
+        // for hands that change slowly.
         self.truth_means.clear();
         self.truth_means.extend(state.grabs.iter().map(|g| (g.key, -Vector3::from(g.reaction))));
         self.mirror_means.clone_from(&self.truth_means);
@@ -247,14 +258,14 @@ impl Encoder {
         self.last = state.tick;
     }
 
-    /// The next frame begins a new run after `tick`; the mirror stays as it is.
+    /// Begins a new run with the next frame, after `tick`. The mirror stays as it is.
     pub fn begin_run(&mut self, tick: Tick) {
         self.sent.clear();
         self.started = Some(tick);
         self.last = tick;
     }
 
-    /// True before the first [`Encoder::restart`].
+    /// Returns true before the first [`Encoder::restart`].
     pub fn is_fresh(&self) -> bool {
         self.started.is_none()
     }
@@ -317,7 +328,7 @@ impl Encoder {
         }
         self.refresh(&mut frame, state, unit, room);
         if frame.repeats.is_empty() {
-            // Those that ended within the repeats are listed for the repeats only.
+            // Grabs that ended within the repeated ticks are listed for the repeats only.
             frame.grabs.retain(|g| g.held);
         }
         if check {
@@ -334,7 +345,8 @@ impl Encoder {
         Encoded { first, more, news }
     }
 
-    /// What one step may move the surface by, m: a share of how far the body is bent or will be, falling slowly.
+    /// Displacement of the surface by one quantization step, m: a share of the current or expected
+    /// deformation. It decays slowly.
     fn unit(&mut self, state: &TickState<'_>) -> f32 {
         let count = self.modes.min(state.q.len());
         let now = self.quanta.visible(&state.q[..count], &state.v[..count]);
@@ -345,7 +357,7 @@ impl Encoder {
         if unit.is_finite() { unit.clamp(1e-30, 1e6) } else { 1e6 }
     }
 
-    /// Takes the grabs that do not fit out of a frame, into parts of their own.
+    /// Moves the grabs that do not fit out of a frame, into parts of their own.
     fn split(&self, frame: &mut Frame, room: usize) -> Vec<Frame> {
         let mut parts: Vec<Frame> = Vec::new();
         if 3 + frame.bytes() <= room {
@@ -353,7 +365,8 @@ impl Encoder {
         }
         let blank = Frame { grabs: Vec::new(), pose: None, accelerations: None, ..frame.clone() };
         let mut rest = std::mem::take(&mut frame.grabs).into_iter();
-        // The two bytes that say which part it is are in none of them yet.
+        // 5 bytes: the header of 3 bytes, and the part number and count that are not in any frame
+        // yet.
         let fill = |into: &mut Frame, rest: &mut std::vec::IntoIter<FrameGrab>| {
             while 5 + into.bytes() + Frame::grab_bytes(into.displacements) <= room {
                 let Some(g) = rest.next() else { return };
@@ -380,7 +393,7 @@ impl Encoder {
         frame.grabs.retain(|g| g.held);
         let tick = frame.tick;
         let mut frames = if self.sent.len() >= SENT {
-            // Its allocation is used again.
+            // This reuses the allocation of the oldest entry.
             self.sent.pop_front().map(|s| s.frames).unwrap_or_default()
         } else {
             Vec::new()
@@ -392,7 +405,7 @@ impl Encoder {
         self.sent.push_back(Sent { tick, frames });
     }
 
-    /// The mirror's step with accelerations chosen so that it meets the truth.
+    /// Steps the mirror with accelerations chosen so that the mirror meets the true state.
     fn step_accelerations(
         &mut self,
         coding: AccelerationCoding,
@@ -400,8 +413,9 @@ impl Encoder {
         unit: f32,
     ) -> Accelerations {
         let Newmark { h, beta, gamma } = self.newmark;
-        // The acceleration that meets the position exactly is a filter of it with both zeros at this place; outside
-        // the unit circle, or on it as for average acceleration, it rings for ever.
+        // The acceleration that meets the position exactly is a filter of the position with both
+        // zeros at `zero`. If `zero` lies outside the unit circle, or on it as for average
+        // acceleration, that acceleration oscillates for ever.
         let zero = if beta > 0.0 { (0.5 + gamma - 2.0 * beta) / (2.0 * beta) } else { f64::INFINITY };
         let exact = zero.abs() < 0.9 && ((gamma + 0.5).powi(2) / 4.0 - beta).abs() < 1e-9;
         let truth_at = |slice: &[f64], k: usize| slice.get(k).copied().unwrap_or(0.0);
@@ -412,15 +426,16 @@ impl Encoder {
             self.scratch.push(if exact {
                 (truth_at(state.q, k) - free_q) / (beta * h * h)
             } else {
-                // The host's own acceleration, plus what draws the mirror back: for average acceleration these gains put
-                // all three poles of the error within 0.62.
+                // Use the host's own acceleration plus a correction towards the true state. For
+                // average acceleration these gains put all three poles of the error within 0.62.
                 let (eq, ev) = (self.truth.q[k] - q, self.truth.v[k] - v);
                 truth_at(state.a, k) + 0.1 * eq / (h * h) + 0.5 * ev / h
             });
         }
         let mut accelerations = Accelerations::quantise(coding, &self.scratch, unit, &self.quanta);
-        // Coarser steps where the datagram is too small for these: the closed loop makes it good later. Grabs have less of
-        // a claim: those that do not fit get a datagram of their own.
+        // If the accelerations do not fit in the datagram, use coarser steps. The closed loop
+        // corrects the error in later ticks. Grabs have lower priority: those that do not fit get a
+        // datagram of their own.
         let pose = if state.pose.is_some() { 46 } else { 0 };
         let room = self.limit.saturating_sub(3 + 12 + 2 + 4 + 1 + pose);
         let mut coarser = unit;
@@ -441,10 +456,12 @@ impl Encoder {
         accelerations
     }
 
-    /// The mirror's step with the reactions as they cross, and the estimate of what they leave unexplained.
+    /// Steps the mirror with the quantized reactions and updates the estimate of the load that they
+    /// leave unexplained.
     fn step_forces(&mut self, grabs: &[FrameGrab], state: &TickState<'_>) {
         if self.frames.is_multiple_of(LOAD_EVERY) {
-            // From the truth of the tick before, as a receiver without error would step.
+            // The step starts from the true state of the previous tick, as a receiver without error
+            // would.
             let mut lacking = std::mem::take(&mut self.scratch);
             let to = [state.q, state.v];
             self.truth.f.clone_from(&self.mirror.f);
@@ -473,15 +490,17 @@ impl Encoder {
         }
     }
 
-    /// Adds absolute state and takes it into the mirror: the modes that are most wrong in the mirror, and some in turn,
-    /// for those receivers that missed what the mirror got.
+    /// Adds absolute state to the frame and applies it to the mirror. The slice contains the modes
+    /// with the largest error in the mirror, and some modes in turn for receivers that missed
+    /// frames.
     fn refresh(&mut self, frame: &mut Frame, state: &TickState<'_>, unit: f32, room: usize) {
         if self.subscription.refresh == 0 {
             return;
         }
         let share = self.modes.div_ceil(usize::from(self.subscription.refresh)).min(255);
         let truth = |slice: &[f64], k: usize| slice.get(k).copied().unwrap_or(0.0);
-        // In turn: a third; the rest by how wrong the mirror is, velocity counted as the displacement it leads to.
+        // A third of the modes is chosen in turn. The rest have the largest error in the mirror,
+        // where a velocity error counts as the displacement that it leads to.
         let turn = share.div_ceil(3);
         let (first, modes) = (self.next_slice, self.modes);
         let in_turn = |k: usize| (k + modes - first) % modes < turn;
@@ -511,7 +530,7 @@ impl Encoder {
         let mut slice = Slice::quantise(&self.entries, unit, self.loaded, flows, &self.quanta);
         let mut count = slice.steps.len();
         while count > 0 && 3 + frame.bytes() + slice.bytes_of(count) > room {
-            // Fewer modes first, then fewer repeats.
+            // Remove modes first, then repeats.
             if count > share.div_ceil(4) {
                 count -= 1;
             } else if frame.repeats.pop().is_some() {
@@ -536,7 +555,7 @@ impl Encoder {
         frame.slice = Some(slice);
     }
 
-    /// Adds the last ticks again, and the grabs that ended within them.
+    /// Repeats the last ticks in the frame and lists the grabs that ended within them.
     fn repeat(&mut self, frame: &mut Frame) {
         for sent in self.sent.iter().rev().take(usize::from(self.subscription.repeats)) {
             let Ok(back) = u8::try_from(frame.tick - sent.tick) else { break };

@@ -1,4 +1,5 @@
-//! How states become bytes: the closed-loop encoder, how coarse each mode may be, and the checksum.
+//! Encoding of states: the closed-loop encoder, the quantization step of each mode, and the
+//! checksum.
 
 pub mod checksum;
 pub mod encoder;

@@ -1,48 +1,56 @@
-//! How coarse each mode may be: steps that look alike on the surface.
+//! Quantization steps per mode, chosen so that all modes have the same rounding error on the
+//! surface.
 //!
-//! A mode's *visible amplitude* `s` is the largest displacement that a unit of its coordinate makes on the surface. With a
-//! step of `unit / s` in the coordinate, rounding moves no point of the surface by more than half the `unit` (m), whichever
-//! the mode: the error is spread evenly, and a mode gets as many bits as it is large to the eye. The same is done for what
-//! leads to displacements: velocity (`unit omega / s`), load (`unit omega^2 / s`), flow (`unit / s`), acceleration
-//! (`unit / (s beta h^2)`). Both sides have the model, so the steps do not cross.
+//! A mode's *visible amplitude* `s` is the largest displacement that a unit of its coordinate
+//! causes on the surface. With a step of `unit / s` in the coordinate, rounding moves no point of
+//! the surface by more than half the `unit` (m), for any mode. The error is spread evenly, and a
+//! mode gets more bits the larger its visible amplitude. Values that lead to displacements are
+//! treated the same way: velocity (`unit omega / s`), load (`unit omega^2 / s`), viscoelastic state
+//! (`unit / s`) and acceleration (`unit / (s beta h^2)`). Host and guest both have the model, so
+//! the steps are not sent.
 
 use pliant_modal::ModalModel;
 
 use crate::newmark::Newmark;
 
-/// Vertices looked at for the visible amplitude, evenly chosen.
+/// Most vertices that are examined for the visible amplitude, evenly chosen.
 const VERTICES: usize = 4096;
-/// Modes that are less visible than this share of the most visible one count as that visible.
+/// Smallest visible amplitude that counts, as a share of the largest one. Modes below it get this
+/// amplitude.
 const FAINT: f64 = 1e-4;
-/// Slowest rate that velocities are counted by, rad/s.
+/// Lowest angular frequency for the steps of velocities and loads, rad/s.
 const SLOW: f64 = 0.3;
 
-/// What a step of one metre of visible displacement is in each mode's numbers.
+/// The value in each mode's coordinates that corresponds to one meter of visible displacement.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Quanta {
-    /// Coordinates and flows, `1 / s`.
+    /// Coordinates and viscoelastic states, `1 / s`.
     pub(crate) place: Vec<f64>,
     /// Velocities.
     pub(crate) speed: Vec<f64>,
     /// Modal forces.
     pub(crate) load: Vec<f64>,
-    /// Accelerations of a stream that is integrated.
+    /// Accelerations of a stream that the receiver integrates.
     pub(crate) acceleration: Vec<f64>,
 }
 
 impl Quanta {
-    /// For the first `modes` of a model; accelerations are integrated by `newmark`.
+    /// Steps for the first `modes` modes of a model. The receiver integrates accelerations with
+    /// `newmark`.
     pub fn new(model: &ModalModel, modes: usize, newmark: &Newmark) -> Self {
         Self::stiffened(model, 1.0, modes, newmark)
     }
 
-    /// For a body whose stiffness is `scale` times the baked one: its velocities and forces are as much larger for one displacement.
+    /// Steps for a body whose stiffness is `scale` times the baked one. Its velocities and forces
+    /// are larger for the same displacement.
     pub(crate) fn stiffened(model: &ModalModel, scale: f64, modes: usize, newmark: &Newmark) -> Self {
         Self::of_visible(model, &Self::visible_of(model, modes), scale, newmark)
     }
 
-    /// The visible amplitudes of the first `modes` of a model, m for a unit of the coordinate. Costs a look at every mode at up to 4,096
-    /// vertices, so it is kept where it is needed often.
+    /// The visible amplitudes of the first `modes` modes of a model, m per unit of the coordinate.
+    ///
+    /// This examines every mode at up to 4,096 vertices, so callers that need the result often keep
+    /// it.
     pub(crate) fn visible_of(model: &ModalModel, modes: usize) -> Vec<f64> {
         let modes = modes.min(model.mode_count());
         let vertices = model.surface().positions().len();
@@ -56,7 +64,7 @@ impl Quanta {
         (0..modes).map(visible).collect()
     }
 
-    /// From the visible amplitudes of as many modes as are wanted.
+    /// Steps from visible amplitudes, one per mode in `all`.
     pub(crate) fn of_visible(model: &ModalModel, all: &[f64], scale: f64, newmark: &Newmark) -> Self {
         let most = all.iter().copied().fold(f64::MIN_POSITIVE.sqrt(), f64::max);
         let place: Vec<f64> = all.iter().map(|s| 1.0 / s.max(FAINT * most)).collect();
@@ -73,7 +81,7 @@ impl Quanta {
         }
     }
 
-    /// All modes alike: a step is 1 in each of their numbers.
+    /// Equal steps for all modes: a step is 1 in each coordinate.
     pub fn even(modes: usize) -> Self {
         let one = || vec![1.0; modes];
         Self { place: one(), speed: one(), load: one(), acceleration: one() }
@@ -84,7 +92,8 @@ impl Quanta {
         self.place.len()
     }
 
-    /// How far the most visible mode of a state moves the surface, its velocity counted as where it leads, m.
+    /// Largest displacement of the surface by any one mode of a state, m. A velocity counts as the
+    /// displacement that it leads to.
     pub(crate) fn visible(&self, q: &[f64], v: &[f64]) -> f64 {
         let shape = q.iter().zip(&self.place).fold(0.0_f64, |m, (q, p)| m.max(q.abs() / p));
         v.iter().zip(&self.speed).fold(shape, |m, (v, p)| m.max(v.abs() / p))

@@ -1,4 +1,4 @@
-//! One direction of a path.
+//! Emulation of one direction of a network path.
 
 use std::cmp::Reverse;
 use std::collections::BinaryHeap;
@@ -10,33 +10,35 @@ use rand_pcg::Pcg64Mcg;
 use super::{Loss, Trace};
 use crate::StreamError;
 
-/// Most packets on the way; more are dropped as if the queue were full.
+/// Most packets in flight. Further packets are dropped as lost.
 const IN_FLIGHT: usize = 1 << 16;
 
-/// How one direction of a path behaves. Default: perfect and immediate.
+/// Settings of one direction of a path. Default: perfect and immediate.
 #[derive(Debug, Clone, PartialEq)]
 pub struct LinkConfig {
-    /// Time on the way. Default: 0.
+    /// One-way delay. Default: 0.
     pub delay: Duration,
-    /// Mean of an exponential delay on top, at most eight times this. Default: 0.
+    /// Mean of an additional exponential delay. The additional delay is at most eight times the
+    /// mean. Default: 0.
     pub jitter: Duration,
-    /// Jitter does not let packets overtake each other. Default: false.
+    /// Keep packets in order despite jitter. Default: false.
     pub keep_order: bool,
-    /// What is lost. Default: nothing.
+    /// Loss model. Default: no loss.
     pub loss: Loss,
-    /// Share of packets that are held back by `reorder_by`. Default: 0.
+    /// Share of packets that are delayed by `reorder_by`. Default: 0.
     pub reorder: f64,
-    /// How long those are held back. Default: 10 ms.
+    /// Additional delay of reordered packets. Default: 10 ms.
     pub reorder_by: Duration,
     /// Share of packets that arrive twice, the copy within `reorder_by`. Default: 0.
     pub duplicate: f64,
-    /// Bits a second, `None` for as many as one likes. Default: `None`.
+    /// Bandwidth, bit/s. `None` means unlimited. Default: `None`.
     pub bits_per_second: Option<f64>,
-    /// Bytes that may wait for the line; what does not fit is dropped. Default: 64 KiB.
+    /// Bytes that may wait in the send queue. A packet that does not fit is dropped. Default: 64
+    /// KiB.
     pub queue_bytes: usize,
-    /// Bytes that each packet takes on the line beside its own: 28 for IPv4 and UDP. Default: 28.
+    /// Header bytes that each packet adds to its payload: 28 for IPv4 and UDP. Default: 28.
     pub overhead_bytes: usize,
-    /// A recorded path instead of `delay`, `jitter` and `loss`. Default: `None`.
+    /// A recorded path that replaces `delay`, `jitter` and `loss`. Default: `None`.
     pub trace: Option<Trace>,
 }
 
@@ -59,10 +61,10 @@ impl Default for LinkConfig {
 }
 
 impl LinkConfig {
-    /// Checks the ranges.
+    /// Checks that all values are in range.
     ///
     /// # Errors
-    /// [`StreamError::Config`].
+    /// Returns [`StreamError::Config`] for a value out of range.
     pub fn check(&self) -> Result<(), StreamError> {
         self.loss.check()?;
         for (what, p) in [("reorder", self.reorder), ("duplicate", self.duplicate)] {
@@ -80,20 +82,20 @@ impl LinkConfig {
     }
 }
 
-/// What became of the packets.
+/// Packet counts of a link.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 pub struct LinkCounts {
-    /// Sent.
+    /// Packets sent.
     pub sent: u64,
-    /// Lost by chance or schedule.
+    /// Packets lost by the loss model, by the trace or because too many were in flight.
     pub lost: u64,
-    /// Dropped because the queue was full.
+    /// Packets dropped because the send queue was full.
     pub overflowed: u64,
-    /// Delivered, copies included.
+    /// Packets delivered, copies included.
     pub delivered: u64,
     /// Copies made.
     pub duplicated: u64,
-    /// Bytes sent, without overhead.
+    /// Payload bytes sent, without headers.
     pub bytes: u64,
 }
 
@@ -120,7 +122,7 @@ impl<T> Ord for Flying<T> {
     }
 }
 
-/// One direction of a path, carrying payloads of any kind.
+/// One direction of a path. It carries payloads of any type.
 pub struct Link<T = Vec<u8>> {
     config: LinkConfig,
     rng: Pcg64Mcg,
@@ -145,7 +147,8 @@ impl<T> std::fmt::Debug for Link<T> {
 }
 
 impl<T: Clone> Link<T> {
-    /// A link at time zero. Settings out of range are brought into it; [`LinkConfig::check`] tells which.
+    /// Creates a link at time zero. Settings out of range are clamped or reset, and
+    /// [`LinkConfig::check`] reports them.
     pub fn new(mut config: LinkConfig, seed: u64) -> Self {
         let share = |p: &mut f64| *p = if p.is_finite() { p.clamp(0.0, 1.0) } else { 0.0 };
         share(&mut config.reorder);
@@ -176,23 +179,24 @@ impl<T: Clone> Link<T> {
         &self.config
     }
 
-    /// Changes the settings from now on; what is on the way arrives as it would have.
+    /// Changes the settings for packets sent from here on. Packets in flight keep their arrival
+    /// times.
     ///
     /// # Errors
-    /// [`StreamError::Config`]; the old settings then stay.
+    /// Returns [`StreamError::Config`] for a value out of range. The old settings then stay.
     pub fn reconfigure(&mut self, config: LinkConfig) -> Result<(), StreamError> {
         config.check()?;
         self.config = config;
         Ok(())
     }
 
-    /// Sends a payload of so many bytes. Times must not go backwards; one that does counts as the latest.
+    /// Sends a payload of `bytes` bytes at time `now`. Times must not decrease.
     pub fn send(&mut self, now: Duration, payload: T, bytes: usize) {
         let packet = self.packet;
         self.packet += 1;
         self.counts.sent += 1;
         self.counts.bytes += bytes as u64;
-        // The line first, then the way: a packet that is lost on the way has still used the line.
+        // Bandwidth comes before loss: a packet that is lost on the path has still used bandwidth.
         let on_line = match self.config.bits_per_second {
             None => now,
             Some(rate) => {
@@ -208,7 +212,8 @@ impl<T: Clone> Link<T> {
                 self.free_at
             }
         };
-        // Every packet draws the same numbers whatever happens to it, so that one setting does not shift the others.
+        // Every packet draws the same count of random numbers, so that a change of one setting does
+        // not shift the random numbers of the others.
         let [lost, jitter, held, double, copy] = std::array::from_fn(|_| self.unit());
         let recorded = self.config.trace.as_ref().map(|t| t.entry(packet));
         let is_lost = match recorded {
@@ -261,7 +266,7 @@ impl<T: Clone> Link<T> {
             Loss::GilbertElliott { good, bad, loss_good, loss_bad } => {
                 let (good, bad, loss_good, loss_bad) = (*good, *bad, *loss_good, *loss_bad);
                 if self.state_until.is_zero() {
-                    // The first state as often bad as it is in the long run.
+                    // The first state is bad with the long-run probability of the bad state.
                     let share = bad.as_secs_f64() / (good + bad).as_secs_f64().max(1e-12);
                     self.bad = self.unit() < share;
                     self.state_until = self.stay(if self.bad { bad } else { good });
@@ -281,13 +286,13 @@ impl<T: Clone> Link<T> {
         whole_micros(drawn).max(Duration::from_micros(1))
     }
 
-    /// Uniform in [0, 1), 53 bits.
+    /// Uniform random number in [0, 1) with 53 bits.
     fn unit(&mut self) -> f64 {
         (self.rng.next_u64() >> 11) as f64 * (1.0 / (1_u64 << 53) as f64)
     }
 
     fn note(&mut self, packet: u64, fate: u8, at: Duration) {
-        // FNV-1a over what was decided.
+        // FNV-1a hash over all decisions.
         let mut add = |bytes: &[u8]| {
             for b in bytes {
                 self.hash = (self.hash ^ u64::from(*b)).wrapping_mul(0x0000_0100_0000_01B3);
@@ -298,7 +303,7 @@ impl<T: Clone> Link<T> {
         add(&(at.as_micros() as u64).to_le_bytes());
     }
 
-    /// The next payload that has arrived by now.
+    /// Returns the next payload that has arrived by `now`.
     pub fn poll(&mut self, now: Duration) -> Option<T> {
         if self.flying.peek().is_none_or(|f| f.0.at > now) {
             return None;
@@ -307,17 +312,17 @@ impl<T: Clone> Link<T> {
         self.flying.pop().map(|f| f.0.payload)
     }
 
-    /// When the next payload arrives.
+    /// Returns the time at which the next payload arrives.
     pub fn next_wakeup(&self) -> Option<Duration> {
         self.flying.peek().map(|f| f.0.at)
     }
 
-    /// What became of the packets.
+    /// The packet counts.
     pub fn counts(&self) -> LinkCounts {
         self.counts
     }
 
-    /// Everything decided so far in one number: the same calls with the same seed give the same.
+    /// A hash of all decisions so far. The same calls with the same seed give the same hash.
     pub fn hash(&self) -> u64 {
         self.hash
     }

@@ -1,4 +1,4 @@
-//! Which packets are lost.
+//! Loss models: which packets are lost.
 
 use std::sync::Arc;
 use std::time::Duration;
@@ -11,78 +11,80 @@ use crate::StreamError;
 /// How a link loses packets. Packets are numbered from 0 in the order in which they are sent.
 #[derive(Debug, Clone, PartialEq, Default)]
 pub enum Loss {
-    /// Nothing is lost.
+    /// No packet is lost.
     #[default]
     None,
-    /// Each packet with this probability, independently.
+    /// Each packet is lost with this probability, independently.
     Random(f64),
-    /// All packets numbered `first .. first + count`.
+    /// All packets numbered `first .. first + count` are lost.
     Burst {
-        /// The first one lost.
+        /// Number of the first lost packet.
         first: u64,
-        /// How many.
+        /// Number of lost packets.
         count: u64,
     },
-    /// Packets `first`, `first + every`, `first + 2 every` and so on: one in `every`.
+    /// Packets `first`, `first + every`, `first + 2 every` and so on are lost: one in `every`.
     Every {
-        /// The first one lost.
+        /// Number of the first lost packet.
         first: u64,
-        /// The distance to the next.
+        /// Distance from one lost packet to the next.
         every: u64,
     },
-    /// Exactly these packets, ascending.
+    /// Exactly these packets are lost. The numbers ascend.
     Listed(Vec<u64>),
-    /// Everything sent within these times.
+    /// All packets sent between two times are lost.
     Outage {
-        /// Since the link's time zero.
+        /// Start of the outage, measured from the link's time zero.
         from: Duration,
-        /// The first moment at which packets pass again.
+        /// End of the outage, the first time at which packets pass again.
         to: Duration,
     },
-    /// Gilbert and Elliott's two states. The stays in each are exponential in *time*, so that bursts do not get shorter
-    /// when packets get rarer.
+    /// The two-state model of Gilbert and Elliott. The time spent in each state is exponentially
+    /// distributed in *time*, so that bursts do not get shorter when packets get rarer.
     GilbertElliott {
-        /// Mean stay in the good state.
+        /// Mean time in the good state.
         good: Duration,
-        /// Mean stay in the bad state.
+        /// Mean time in the bad state.
         bad: Duration,
-        /// Loss in the good state, 0 to 1.
+        /// Loss probability in the good state, 0 to 1.
         loss_good: f64,
-        /// Loss in the bad state, 0 to 1.
+        /// Loss probability in the bad state, 0 to 1.
         loss_bad: f64,
     },
 }
 
-/// Packets have lower numbers than this: of a stream of a thousand a second, none is sent for thousands of years.
+/// Upper limit of packet numbers. A stream of a thousand packets per second takes thousands of
+/// years to reach it.
 const LAST: u64 = 1 << 48;
 
 impl Loss {
-    /// Gilbert's loss by what a sender of a packet every `interval` sees: mean loss `loss`, mean burst of `burst` packets.
-    /// The bad state loses everything and lasts `burst` intervals on average, the good one `burst (1 - loss) / loss`.
+    /// Gilbert's model from the statistics of a sender that sends one packet every `interval`: mean
+    /// loss `loss` and mean burst of `burst` packets. The bad state loses everything and lasts
+    /// `burst` intervals on average. The good state lasts `burst (1 - loss) / loss` intervals.
     pub fn gilbert(loss: f64, burst: f64, interval: Duration) -> Self {
         let loss = if loss.is_nan() { 0.5 } else { loss.clamp(1e-9, 1.0 - 1e-9) };
-        // No number is too large for a time, and none so small that it is none.
+        // The clamp keeps every duration representable and above zero.
         let stay = |seconds: f64| Duration::from_secs_f64(seconds.clamp(1e-6, 1e9));
         let bad = interval.as_secs_f64() * if burst.is_nan() { 1.0 } else { burst.clamp(1e-3, 1e6) };
         let good = bad * (1.0 - loss) / loss;
         Self::GilbertElliott { good: stay(good), bad: stay(bad), loss_good: 0.0, loss_bad: 1.0 }
     }
 
-    /// From words:
+    /// Parses a loss model:
     ///
-    /// | words | meaning |
+    /// | text | meaning |
     /// | --- | --- |
-    /// | `none` | nothing |
-    /// | `9%` | each packet with probability 0.09 |
+    /// | `none` | no loss |
+    /// | `9%` | each packet is lost with probability 0.09 |
     /// | `random:22@135` | 22 of the 500 packets from number 135 on, drawn from `seed` |
     /// | `burst:12@140` | 12 in a row from number 140 |
     /// | `every:50@135` | one in 50 from number 135 |
-    /// | `gilbert:9%:4` | mean loss 9 %, mean burst 4 packets of a sender that sends one every `interval` |
+    /// | `gilbert:9%:4` | mean loss 9 %, mean burst 4 packets of a sender with one packet per `interval` |
     ///
-    /// `@135` may be left out; it is below 2^48.
+    /// `@135` may be left out. The packet number must be below 2^48.
     ///
     /// # Errors
-    /// [`StreamError::Invalid`] with the words.
+    /// Returns [`StreamError::Invalid`] with the text if the text is not a loss model.
     pub fn parse(words: &str, seed: u64, interval: Duration) -> Result<Self, StreamError> {
         let invalid = || StreamError::Invalid {
             what: "loss",
@@ -106,7 +108,7 @@ impl Loss {
                 counted(rest).filter(|(count, _)| *count <= 500).map(|(count, first)| {
                     let mut rng = Pcg64Mcg::seed_from_u64(seed);
                     let mut all: Vec<u64> = (first..first + 500).collect();
-                    // The first steps of a Fisher-Yates shuffle.
+                    // This performs the first steps of a Fisher-Yates shuffle.
                     for k in 0..count as usize {
                         let other = k + (rng.next_u64() % (all.len() - k) as u64) as usize;
                         all.swap(k, other);
@@ -127,7 +129,7 @@ impl Loss {
         made.ok_or_else(invalid)
     }
 
-    /// The same losses with packets counted from `packets` and time from `time` on.
+    /// The same loss model with packet numbers shifted by `packets` and times shifted by `time`.
     #[must_use]
     pub fn shifted(&self, packets: u64, time: Duration) -> Self {
         match self.clone() {
@@ -141,10 +143,10 @@ impl Loss {
         }
     }
 
-    /// Checks the ranges.
+    /// Checks that all values are in range.
     ///
     /// # Errors
-    /// [`StreamError::Config`].
+    /// Returns [`StreamError::Config`] for a value out of range.
     pub fn check(&self) -> Result<(), StreamError> {
         let share = |what, p: f64| {
             if (0.0..=1.0).contains(&p) {
@@ -175,24 +177,24 @@ impl Loss {
     }
 }
 
-/// What happened to one packet of a recorded path.
+/// The outcome for one packet of a recorded path.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct TraceEntry {
-    /// Time on the way; `None` for a lost packet.
+    /// One-way delay. `None` for a lost packet.
     pub delay: Option<Duration>,
 }
 
-/// A recorded path, played packet by packet and then from the start again.
+/// A recorded path. It is replayed packet by packet and repeats from the start.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Trace {
     entries: Arc<[TraceEntry]>,
 }
 
 impl Trace {
-    /// From entries; at least one.
+    /// Creates a trace from at least one entry.
     ///
     /// # Errors
-    /// [`StreamError::Config`] for none.
+    /// Returns [`StreamError::Config`] if `entries` is empty.
     pub fn new(entries: Vec<TraceEntry>) -> Result<Self, StreamError> {
         if entries.is_empty() {
             return Err(StreamError::Config {
@@ -204,10 +206,12 @@ impl Trace {
         Ok(Self { entries: entries.into() })
     }
 
-    /// From text: one packet a line, its delay in milliseconds or the word `lost`; `#` begins a comment.
+    /// Parses a trace with one packet per line: its delay in milliseconds (0 to 60,000) or the word
+    /// `lost`. `#` begins a comment.
     ///
     /// # Errors
-    /// [`StreamError::Invalid`], naming the line.
+    /// Returns [`StreamError::Invalid`] with the line number for a line that is neither, and
+    /// [`StreamError::Config`] if the text has no packets.
     pub fn parse(text: &str) -> Result<Self, StreamError> {
         let mut entries = Vec::new();
         for (number, line) in text.lines().enumerate() {

@@ -1,8 +1,9 @@
-//! A seeded bad network: one direction of a path, in virtual time.
+//! A seeded emulation of a bad network: one direction of a path, in virtual time.
 //!
-//! A [`Link`] takes payloads with the time at which they are sent and gives them back at the time at which they arrive, or
-//! never. It owns no clock: the same calls with the same seed give the same result, to the microsecond, and the same
-//! [`Link::hash`]. A path has two links, one a direction, each with its own seed.
+//! A [`Link`] takes each payload with its send time and returns it at its arrival time, or never.
+//! The link owns no clock. The same calls with the same seed give the same result, to the
+//! microsecond, and the same [`Link::hash`]. A path needs two links, one per direction, each with
+//! its own seed.
 //!
 //! ```
 //! use std::time::Duration;

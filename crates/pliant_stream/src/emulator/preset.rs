@@ -1,32 +1,37 @@
-//! Named networks.
+//! Network presets.
 
 use std::time::Duration;
 
 use super::{LinkConfig, Loss};
 
-/// A network by name.
+/// A network preset with a name.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
 pub enum Preset {
     /// The paper's network 1: 9 % loss, 2 Mb/s, 196 ms round trip.
     Paper1,
-    /// The paper's network 2: 6 % loss, 4 Mb/s, 120 ms (the paper gives the round trip only in a figure).
+    /// The paper's network 2: 6 % loss, 4 Mb/s, 120 ms round trip. The paper gives the round trip
+    /// only in a figure.
     Paper2,
-    /// The paper's network 3: 3 % loss, 10 Mb/s, 60 ms (as above).
+    /// The paper's network 3: 3 % loss, 10 Mb/s, 60 ms round trip. The paper gives the round trip
+    /// only in a figure.
     Paper3,
-    /// The paper's network 4: no loss, 100 Mb/s, 20 ms (as above).
+    /// The paper's network 4: no loss, 100 Mb/s, 20 ms round trip. The paper gives the round trip
+    /// only in a figure.
     Paper4,
-    /// A wired local network: 0.4 ms, 1 Gb/s.
+    /// A wired local network: 0.4 ms round trip, 30 us of jitter, 1 Gb/s.
     Lan,
-    /// A busy wireless one: 6 ms and 3 ms of jitter in order, bursts of 20 ms, 1 % loss in all, 50 Mb/s.
+    /// A busy wireless network: 6 ms round trip, 3 ms of jitter in order, 1 % loss in bursts of 20
+    /// ms, 50 Mb/s.
     Wifi,
-    /// Across an ocean: 80 ms, 1 ms of jitter, 0.1 % loss, 100 Mb/s.
+    /// A transatlantic path: 80 ms round trip, 1 ms of jitter, 0.1 % loss, 100 Mb/s.
     Transatlantic,
-    /// Geostationary: 600 ms, 5 ms of jitter, 1 % loss in bursts of 50 ms, 10 Mb/s.
+    /// A geostationary satellite: 600 ms round trip, 5 ms of jitter, 1 % loss in bursts of 50 ms,
+    /// 10 Mb/s.
     Satellite,
 }
 
 impl Preset {
-    /// All of them.
+    /// All presets.
     pub const ALL: [Self; 8] = [
         Self::Paper1,
         Self::Paper2,
@@ -38,7 +43,7 @@ impl Preset {
         Self::Satellite,
     ];
 
-    /// `paper-1` to `paper-4`, `lan`, `wifi`, `transatlantic`, `satellite`.
+    /// The name: `paper-1` to `paper-4`, `lan`, `wifi`, `transatlantic` or `satellite`.
     pub fn name(self) -> &'static str {
         match self {
             Self::Paper1 => "paper-1",
@@ -52,19 +57,19 @@ impl Preset {
         }
     }
 
-    /// The network of a name.
+    /// Returns the preset with this name.
     pub fn by_name(name: &str) -> Option<Self> {
         Self::ALL.into_iter().find(|p| p.name() == name)
     }
 
-    /// Round trip without queueing and jitter.
+    /// Round trip time without queueing and jitter.
     pub fn round_trip(self) -> Duration {
         2 * LinkConfig::preset(self).delay
     }
 }
 
 impl LinkConfig {
-    /// One direction of a named network; both directions are alike.
+    /// The settings of one direction of a preset. Both directions are alike.
     pub fn preset(preset: Preset) -> Self {
         let us = Duration::from_micros;
         let plain = |loss: f64, mbit: f64, round_trip_us: u64| Self {

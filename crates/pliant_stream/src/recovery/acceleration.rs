@@ -1,4 +1,5 @@
-//! Policies that integrate a stream of accelerations: [`super::Policy::None`] and the paper's.
+//! Policies that integrate a stream of accelerations: [`super::Policy::None`] and the paper's
+//! policy.
 
 use pliant_modal::Relaxation;
 
@@ -7,11 +8,12 @@ use crate::newmark::{FlowFilter, Newmark};
 use crate::replica::{self, Mean};
 use crate::state::{State, Tick};
 
-/// Integrates the accelerations; predicts those that are missing; takes their error out exactly when they come.
+/// Integrates the received accelerations and predicts missing ones. When a missing acceleration
+/// arrives late, the policy removes the prediction's error exactly.
 #[derive(Debug)]
 pub struct AccelerationDriven {
     newmark: Newmark,
-    /// How the flow follows the coordinates, where the body relaxes.
+    /// Filter that computes the viscoelastic state from the coordinates, if the body relaxes.
     flow: Option<FlowFilter>,
     predict: Predict,
     compensate: bool,
@@ -20,13 +22,14 @@ pub struct AccelerationDriven {
     state: State,
     /// The accelerations that each tick was stepped with.
     used: Vec<Vec<f64>>,
-    /// Per mode: the tick at which its absolute state was last taken over. What was wrong up to then is gone with it.
+    /// Per mode: the tick at which the policy last took over the absolute state. Errors made up to
+    /// that tick no longer count.
     anchored: Vec<Tick>,
     next: Vec<f64>,
 }
 
 impl AccelerationDriven {
-    /// At rest at tick 0. With `compensate` false what is late is ignored.
+    /// Starts at rest at tick 0. With `compensate` false, the policy ignores late accelerations.
     pub fn new(newmark: Newmark, predict: Predict, compensate: bool, modes: usize) -> Self {
         Self {
             newmark,
@@ -42,7 +45,8 @@ impl AccelerationDriven {
         }
     }
 
-    /// The same for a body that relaxes: its flow is filtered out of its coordinates.
+    /// Adds the viscoelastic state of a body that relaxes. The state is filtered from the
+    /// coordinates.
     pub fn relaxing(mut self, relaxation: Option<Relaxation>) -> Self {
         self.flow = relaxation.map(|r| FlowFilter::new(r, &self.newmark, HISTORY));
         if self.flow.is_some() {
@@ -57,7 +61,8 @@ impl AccelerationDriven {
             .filter(|a| a.len() == self.state.modes())
     }
 
-    /// Fills `next` with the stand-in for `tick`, from what the two ticks before were stepped with.
+    /// Fills `next` with the predicted accelerations for `tick`, from the accelerations that the
+    /// two ticks before were stepped with.
     fn predict(&mut self, tick: Tick) {
         let last = tick.checked_sub(1).and_then(|t| self.used(t)).cloned();
         let before = tick.checked_sub(2).and_then(|t| self.used(t)).cloned();
@@ -132,7 +137,8 @@ impl Recovery for AccelerationDriven {
 
     fn refresh(&mut self, tick: Tick, history: &History) {
         if tick != self.tick {
-            // An absolute value of the past cannot be carried to the present by a stream of accelerations with gaps.
+            // An absolute value of an earlier tick cannot be carried forward through a stream of
+            // accelerations that has gaps.
             return;
         }
         let Some(data) = history.known(tick) else { return };

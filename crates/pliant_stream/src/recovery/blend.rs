@@ -1,19 +1,21 @@
-//! The shown offset: corrections fade, with position and velocity continuous.
+//! The offset of the visual state: corrections fade while position and velocity stay continuous.
 //!
-//! A correction moves the hidden state by `-(e_q, e_v)` at once, so the shown state must carry the offset `(e_q, e_v)` and
-//! lose it over `s` ticks. Spreading the two errors independently leaves `h e_v (s - 1) / 2` behind, because a velocity
-//! offset integrates: the pair is one error. It fades along the cubic with `o(0) = e_q`, `o'(0) = e_v`, `o(1) = o'(1) = 0`:
+//! A correction moves the confirmed state by `-(e_q, e_v)` at once, so the visual state must carry
+//! the offset `(e_q, e_v)` and lose it over `s` ticks. Position and velocity form one error: a
+//! velocity offset integrates, so fading the two independently leaves `h e_v (s - 1) / 2` behind.
+//! The offset fades along the cubic with `o(0) = e_q`, `o'(0) = e_v`, `o(1) = o'(1) = 0`:
 //!
 //! ```text
 //! o(x)  = e_q (1 - x)^2 (1 + 2x) + e_v T x (1 - x)^2       x = age / s, T = s h
 //! o'(x) = [e_q 6 x (x - 1) + e_v T (1 - x)(1 - 3x)] / T
 //! ```
 //!
-//! Corrections of different ticks add; after `s` ticks each is exactly gone.
+//! Corrections of different ticks add up. Each is exactly zero after `s` ticks.
 
 use std::collections::VecDeque;
 
-/// More corrections at a time are merged into one that starts anew.
+/// The most corrections that fade at a time. Beyond this, the two oldest are merged into one whose
+/// fade starts again.
 const CAPACITY: usize = 16;
 
 #[derive(Debug, Clone, Default)]
@@ -33,22 +35,22 @@ pub struct Blend {
 }
 
 impl Blend {
-    /// Offsets fade over `ticks` (at least 1) steps of `h` seconds.
+    /// Creates an empty blend whose offsets fade over `ticks` (at least 1) steps of `h` seconds.
     pub fn new(h: f64, ticks: u16) -> Self {
         Self { h, ticks: u32::from(ticks.max(1)), running: VecDeque::new(), spare: Vec::new() }
     }
 
-    /// Nothing fades any more.
+    /// Removes all offsets.
     pub fn clear(&mut self) {
         self.spare.extend(self.running.drain(..));
     }
 
-    /// True when the shown state is the hidden one.
+    /// Returns true when no offset is left, so that the visual state equals the confirmed state.
     pub fn is_empty(&self) -> bool {
         self.running.is_empty()
     }
 
-    /// Adds the offset `shown - hidden` that a correction just made, one value a coordinate.
+    /// Adds the offset `visual - confirmed` that a correction just made, one value per coordinate.
     pub fn add(&mut self, q: impl Iterator<Item = f64>, v: impl Iterator<Item = f64>) {
         if self.running.len() >= CAPACITY {
             self.merge_oldest();
@@ -79,7 +81,7 @@ impl Blend {
         self.spare.push(a);
     }
 
-    /// `o = w0 e_q + w1 e_v`, `o' = w2 e_q + w3 e_v` after so many ticks.
+    /// Weights of an offset after `age` ticks: `o = w0 e_q + w1 e_v`, `o' = w2 e_q + w3 e_v`.
     fn weights(&self, age: u32) -> [f64; 4] {
         if age >= self.ticks {
             return [0.0; 4];
@@ -90,14 +92,14 @@ impl Blend {
         [y * y * (1.0 + 2.0 * x), t * x * y * y, -6.0 * x * y / t, y * (1.0 - 3.0 * x)]
     }
 
-    /// Keeps a share of all offsets.
+    /// Multiplies all offsets by `share`.
     pub fn scale(&mut self, share: f64) {
         for x in self.running.iter_mut().flat_map(|c| c.q.iter_mut().chain(&mut c.v)) {
             *x *= share;
         }
     }
 
-    /// One tick passes.
+    /// Ages all offsets by one tick and removes those that have faded.
     pub fn advance(&mut self) {
         for c in &mut self.running {
             c.age += 1;
@@ -105,11 +107,12 @@ impl Blend {
         while self.running.front().is_some_and(|c| c.age >= self.ticks) {
             self.spare.extend(self.running.pop_front());
         }
-        // A merged correction stands behind younger ones; it goes when it reaches the front or here.
+        // A merged correction stands behind younger ones, so the loop above does not always reach
+        // it.
         self.running.retain(|c| c.age < self.ticks);
     }
 
-    /// Adds the present offsets to coordinates and velocities.
+    /// Adds the current offsets to coordinates and velocities.
     pub fn apply(&self, q: &mut [f64], v: &mut [f64]) {
         for c in &self.running {
             let w = self.weights(c.age);
@@ -145,7 +148,7 @@ mod tests {
 
     #[test]
     fn velocity_is_the_derivative_of_position() {
-        // A fine step makes the central difference good to h^2.
+        // The central difference has an error of order h^2, so the step must be small.
         let (h, ticks) = (1e-4, 1000);
         let mut blend = Blend::new(h, ticks);
         blend.add([1.0].into_iter(), [4.0].into_iter());

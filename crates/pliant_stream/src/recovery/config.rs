@@ -1,79 +1,84 @@
-//! Which repair a session uses.
+//! The loss recovery settings of a session.
 
 use std::time::Duration;
 
 use crate::wire::{AccelerationCoding, Payload, StreamSubscription};
 use crate::{StreamError, state::MAX_MODES};
 
-/// What stands in for an acceleration that has not arrived.
+/// Prediction of an acceleration that has not arrived.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, Default)]
 pub enum Predict {
-    /// Nothing: 0.
+    /// Zero.
     Zero,
-    /// The last one used.
+    /// The last acceleration that was used.
     Hold,
-    /// The line through the last two used.
+    /// The line through the last two accelerations that were used.
     #[default]
     Linear,
 }
 
-/// How a receiver makes good what was lost.
+/// How a receiver recovers lost data.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
 pub enum Policy {
-    /// A lost acceleration counts as 0 and is never made good.
+    /// Counts a lost acceleration as 0 and never corrects it.
     None,
-    /// The paper's: predict, ask again, and when the late acceleration comes take the error out of the shown state over
-    /// so many ticks.
+    /// The paper's method. The receiver predicts a lost acceleration and requests it again. When
+    /// the late acceleration arrives, its error leaves the visual state over `blend_ticks`.
     Paper {
-        /// The stand-in.
+        /// The prediction of a lost acceleration.
         predict: Predict,
-        /// Ticks over which the shown error fades; at least 1.
+        /// Ticks over which the error in the visual state fades, at least 1.
         blend_ticks: u16,
     },
-    /// The receiver owns the damped model and steps it with the streamed reactions: errors die out by themselves, and a
-    /// late reaction is put right by stepping again from its tick.
+    /// The receiver steps its own damped model with the streamed reactions. Damping makes errors
+    /// die out, and a late reaction makes the receiver step again from the tick of that reaction.
     ForceDriven {
-        /// Ticks over which the shown error fades; at least 1.
+        /// Ticks over which the error in the visual state fades, at least 1.
         blend_ticks: u16,
     },
 }
 
-/// How far behind the earliest arrivals a guest shows a tick.
+/// How far behind the earliest arrivals a guest plays a tick.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
 pub enum Playout {
-    /// So many ticks, and what 98 of 100 arrivals scatter by (a quarter tick to two).
+    /// This many ticks plus the scatter of 98 of 100 arrivals. The scatter part is a quarter tick
+    /// to two ticks.
     Fixed(u8),
-    /// Only what 98 of 100 arrivals scatter by, at most so many ticks, and a quarter tick.
+    /// The scatter of 98 of 100 arrivals, at most this many ticks, plus a quarter tick.
     Adaptive(u8),
 }
 
-/// Everything about repair, chosen by the guest per session.
+/// All loss recovery settings. The guest chooses them per session.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct RecoveryConfig {
-    /// The numbers. Default: [`Policy::ForceDriven`], 6 ticks of blend (150 ms at 40 Hz).
+    /// The recovery policy. Default: [`Policy::ForceDriven`] with a blend of 6 ticks (150 ms at 40
+    /// Hz).
     pub policy: Policy,
-    /// How accelerations are written, where the policy streams them. Default: [`AccelerationCoding::Visible`].
+    /// Coding of accelerations, if the policy streams them. Default:
+    /// [`AccelerationCoding::Visible`].
     pub coding: AccelerationCoding,
     /// Earlier ticks that each frame repeats, 0..=7. Default: 3.
     pub repeats: u8,
-    /// Each frame carries the absolute (q, v) of one in so many modes, those most in need first; 0 for never. Default: 15.
+    /// Each frame carries the absolute (q, v) of one in this many modes, those with the largest
+    /// error first. 0 means never. Default: 15.
     pub refresh: u8,
-    /// Ask again for what is missing. Default: true.
+    /// Request missing frames again. Default: true.
     pub nack: bool,
-    /// Ask for a snapshot when a checksum disagrees or a gap cannot be closed. Default: true.
+    /// Request a snapshot when a checksum disagrees or a gap cannot be closed. Default: true.
     pub snapshots: bool,
-    /// Default: [`Playout::Fixed`] with 1 tick.
+    /// The playout delay. Default: [`Playout::Fixed`] with 1 tick.
     pub playout: Playout,
-    /// Cut fading corrections that would put more energy into the shown body than it has lost; see
+    /// Cut fading corrections that would put more energy into the visual body than it has lost. See
     /// [`super::PassivityGuard`]. Default: true.
     pub passive: bool,
-    /// Prediction ends after this long without a frame: the body then stands still until one comes. Default: 0.5 s.
+    /// Time without a frame after which prediction ends. The body then stands still until a frame
+    /// arrives. Default: 0.5 s.
     pub stall_after: Duration,
 }
 
 impl Default for RecoveryConfig {
-    /// The better way of the design: force-driven, three repeats, the absolute state of one in 15 modes with each, NACK, snapshots, one tick of
-    /// playout delay.
+    /// The force-driven policy with three repeats, the absolute state of one in 15 modes per frame,
+    /// NACK, snapshots and one tick of playout delay.
     fn default() -> Self {
         Self {
             policy: Policy::ForceDriven { blend_ticks: 6 },
@@ -90,12 +95,13 @@ impl Default for RecoveryConfig {
 }
 
 impl RecoveryConfig {
-    /// Nothing is repaired.
+    /// Recovers nothing.
     pub fn none() -> Self {
         Self { policy: Policy::None, nack: false, ..Self::paper() }
     }
 
-    /// The paper's method: linear prediction, NACK, blend over 50 ticks; no repeats, refresh, snapshot or delay.
+    /// The paper's method: linear prediction, NACK and a blend over 50 ticks, without repeats,
+    /// refresh, snapshots or playout delay.
     pub fn paper() -> Self {
         Self {
             policy: Policy::Paper { predict: Predict::Linear, blend_ticks: 50 },
@@ -108,13 +114,14 @@ impl RecoveryConfig {
         }
     }
 
-    /// The paper's method with another prediction.
+    /// The paper's method with another prediction and blend.
     pub fn paper_with(predict: Predict, blend_ticks: u16) -> Self {
         Self { policy: Policy::Paper { predict, blend_ticks }, ..Self::paper() }
     }
 
-    /// A configuration by name: `default`, `none`, `paper`, `paper-zero`, `paper-hold`, `force-driven` (without repeats,
-    /// refresh, snapshots or delay), `paper-repeats` (the paper's with three repeats and one tick of delay).
+    /// Returns a configuration by name: `default`, `none`, `paper`, `paper-zero`, `paper-hold`,
+    /// `force-driven` (without repeats, refresh, snapshots or delay) or `paper-repeats` (the
+    /// paper's method with three repeats and one tick of delay).
     pub fn by_name(name: &str) -> Option<Self> {
         Some(match name {
             "default" => Self::default(),
@@ -128,11 +135,12 @@ impl RecoveryConfig {
         })
     }
 
-    /// The names that [`RecoveryConfig::by_name`] knows.
+    /// The names that [`RecoveryConfig::by_name`] accepts.
     pub const NAMES: [&'static str; 7] =
         ["default", "none", "paper", "paper-zero", "paper-hold", "paper-repeats", "force-driven"];
 
-    /// What this repair asks of the host's encoder.
+    /// The stream subscription that this configuration sends to the host's encoder. `modes` limits
+    /// the number of modes.
     pub fn subscription(&self, modes: Option<u16>) -> StreamSubscription {
         let payload = match self.policy {
             Policy::ForceDriven { .. } => Payload::Forces,
@@ -142,10 +150,10 @@ impl RecoveryConfig {
         StreamSubscription { payload, modes, repeats: self.repeats.min(7), refresh: self.refresh }
     }
 
-    /// Checks the ranges.
+    /// Checks that all values are in range.
     ///
     /// # Errors
-    /// [`StreamError::Config`].
+    /// Returns [`StreamError::Config`] for a value out of range.
     pub fn check(&self) -> Result<(), StreamError> {
         let blend = match self.policy {
             Policy::None => 1,

@@ -1,11 +1,11 @@
-//! The better way: the receiver owns the damped model and steps it with the streamed reactions.
+//! The force-driven policy: the receiver steps its own damped model with the streamed reactions.
 
 use super::{Forecast, HISTORY, History, Recovery};
 use crate::replica::{self, Mean, Replica};
 use crate::state::{State, Tick};
 use crate::wire::FrameGrab;
 
-/// A tick as it was stepped.
+/// The state after a stepped tick.
 #[derive(Debug, Clone, Default)]
 struct Stepped {
     tick: Tick,
@@ -13,7 +13,8 @@ struct Stepped {
     means: Vec<Mean>,
 }
 
-/// Steps the modal recurrence with the reactions. What was stepped on a guess is stepped again when the truth comes.
+/// Steps the modal recurrence with the reactions. When data arrives for a predicted tick, the
+/// policy steps again from that tick.
 #[derive(Debug)]
 pub struct ForceDriven {
     replica: Replica,
@@ -28,7 +29,7 @@ pub struct ForceDriven {
 }
 
 impl ForceDriven {
-    /// At rest at tick 0; hands that are not heard of go where the forecast has them.
+    /// Starts at rest at tick 0. Hands without data move as `forecast` predicts.
     pub(crate) fn new(replica: Replica, forecast: Forecast) -> Self {
         let state = replica.kernel().at_rest();
         Self {
@@ -119,7 +120,7 @@ impl Recovery for ForceDriven {
     }
 
     fn refresh(&mut self, _tick: Tick, _history: &History) {
-        // Slices are part of stepping to their tick.
+        // Stepping to a tick already applies the slices of that tick.
     }
 
     fn confirmed(&self) -> &State {

@@ -1,19 +1,20 @@
-//! Where a hand goes when nobody says.
+//! Extrapolation of a hand's motion while no data arrives.
 //!
-//! Of the last 0.4 s a parabola is fitted (least squares) and followed, its velocity fading over 1.5 s and its acceleration
-//! over 0.4 s. The window spans some periods of a hand's tremor (8 to 12 Hz) and is short against what a hand does on
-//! purpose (below 2 Hz): following the last two or three values instead multiplies the tremor, by thirty after twelve ticks.
+//! A parabola is fitted (least squares) to the last 0.4 s and extrapolated. Its velocity fades over
+//! 1.5 s and its acceleration over 0.4 s. The window spans several periods of a hand's tremor (8 to
+//! 12 Hz) and is short compared with deliberate motion (below 2 Hz). Extrapolating from the last
+//! two or three values instead multiplies the tremor, by thirty after twelve ticks.
 
 /// Span of the fit, s.
 const WINDOW: f64 = 0.4;
-/// The velocity fades over this time, s.
+/// Fade time of the velocity, s.
 const VELOCITY: f64 = 1.5;
-/// The acceleration fades over this time, s.
+/// Fade time of the acceleration, s.
 const ACCELERATION: f64 = 0.4;
-/// Numbers that are forecast together: target, reaction, displacement.
+/// Values that are extrapolated together: target, reaction and displacement.
 pub(crate) const CHANNELS: usize = 9;
 
-/// A forecast's settings at one step size.
+/// Settings of the extrapolation for one step size.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Forecast {
     window: u64,
@@ -22,7 +23,7 @@ pub struct Forecast {
 }
 
 impl Forecast {
-    /// For steps of `h` seconds.
+    /// Creates an extrapolation for steps of `h` seconds.
     pub fn new(h: f64) -> Self {
         Self {
             window: ((WINDOW / h).round() as u64).clamp(4, 96),
@@ -31,13 +32,13 @@ impl Forecast {
         }
     }
 
-    /// How many ticks back values count.
+    /// Length of the fit, ticks.
     pub(crate) fn window(&self) -> u64 {
         self.window
     }
 
-    /// The values `ahead` ticks after the newest. `samples`: (ticks before the newest, values), the newest first; `None`
-    /// for none.
+    /// Extrapolates to `ahead` ticks after the newest sample. `samples` holds (ticks before the
+    /// newest, values), with the newest first. Returns `None` without samples.
     pub(crate) fn go_on(&self, samples: &[(u64, [f64; CHANNELS])], ahead: u64) -> Option<[f64; CHANNELS]> {
         let (_, newest) = samples.first()?;
         if samples.len() < 4 {
@@ -66,7 +67,7 @@ impl Forecast {
         let matrix = nalgebra::Matrix3::new(m[0], m[1], m[2], m[1], m[2], m[3], m[2], m[3], m[4]);
         let inverse = matrix.try_inverse()?;
         let (s, c) = self.paths(ahead);
-        // Value + velocity (a tick) s + acceleration (a tick squared) c.
+        // The result is value + s * velocity (per tick) + c * acceleration (per tick squared).
         let weights = nalgebra::RowVector3::new(1.0, s / scale, 2.0 * c / (scale * scale)) * inverse;
         let mut out = [0.0; CHANNELS];
         for (w, right) in weights.iter().zip(&right) {
@@ -77,7 +78,8 @@ impl Forecast {
         out.iter().all(|x| x.is_finite()).then_some(out)
     }
 
-    /// How far a unit velocity and a unit acceleration lead in so many ticks, both fading.
+    /// Displacement after `ahead` ticks from a unit velocity and from a unit acceleration, both
+    /// fading.
     fn paths(&self, ahead: u64) -> (f64, f64) {
         let (mut s, mut c, mut gained) = (0.0, 0.0, 0.0);
         let (mut velocity, mut acceleration) = (1.0, 1.0);
@@ -105,10 +107,11 @@ mod tests {
         let forecast = Forecast::new(0.025);
         let f = |t: f64| 1.0 + 0.02 * t + 0.001 * t * t;
         let got = forecast.go_on(&samples(16, f), 1).unwrap()[0];
-        // One tick on, little has faded: velocity 1.7 % of 0.021.
+        // After one tick the velocity of 0.021 has faded by 1.7 %.
         assert!((got - f(1.0)).abs() < 5e-4, "{got} and {}", f(1.0));
         let far = forecast.go_on(&samples(16, f), 200).unwrap()[4];
-        // 0.02 a tick fading over 60 ticks: 1.2; 0.002 a tick^2 over 16, then over 60: 1.9. No more, however long.
+        // 0.02 per tick fading over 60 ticks gives 1.2. 0.002 per tick^2 fading over 16, then over
+        // 60 ticks, gives 1.9. A longer extrapolation adds no more.
         assert!((2.0..5.0).contains(&far), "{far}");
         let further = forecast.go_on(&samples(16, f), 4000).unwrap()[4];
         assert!((further - far).abs() < 0.2, "{far} {further}");

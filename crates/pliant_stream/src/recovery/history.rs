@@ -1,4 +1,4 @@
-//! What has arrived, tick by tick: a ring of fixed length.
+//! The received data per tick, in a ring of fixed length.
 
 use crate::codec::quantization::Quanta;
 use crate::state::{GrabKey, GrabState, MAX_GRABS, Pose, Tick};
@@ -8,39 +8,40 @@ use nalgebra::{UnitQuaternion, Vector3};
 
 use super::forecast::{CHANNELS, Forecast};
 
-/// Ticks that a receiver remembers. Older data is not used any more.
+/// Number of ticks that a receiver remembers. Older data is ignored.
 pub const HISTORY: usize = 256;
 
-/// Values between known ticks are looked for at most so far away.
+/// Largest distance in ticks at which a lookup searches for known ticks.
 const NEAR: u64 = 40;
-/// A frame that is not heard of keeps its acceleration for at most so long, s.
+/// Longest time for which a rigid pose without data keeps its acceleration, s.
 const FALL: f64 = 0.4;
 
-/// What is known of one tick.
+/// The received data of one tick.
 #[derive(Debug, Clone, Default)]
 pub struct TickData {
-    /// Which tick this slot holds.
+    /// The tick that this slot holds.
     pub tick: Tick,
-    /// The part that drives the state (accelerations or reactions) is here.
+    /// True when the data that drives the state (accelerations or reactions) has arrived.
     pub known: bool,
-    /// The frame of this tick itself is here, not only a repeat.
+    /// True when the frame of this tick itself has arrived, not only a repeat.
     pub head: bool,
-    /// Modal accelerations; empty where the stream carries none.
+    /// Modal accelerations. Empty if the stream carries none.
     pub accelerations: Vec<f64>,
-    /// The grabs that held, with their reactions and where their patches were.
+    /// The grabs that were held, with their reactions and the displacements of their patches.
     pub grabs: Vec<FrameGrab>,
-    /// Rigid frame of a free body.
+    /// Rigid pose of a free body.
     pub pose: Option<Pose>,
-    /// A part of the absolute state.
+    /// Part of the absolute state.
     pub slice: Vec<SliceEntry>,
     /// Checksum of the state.
     pub check: Option<f32>,
-    /// Grabs of the parts of this tick that have come, and which parts those are.
+    /// The grabs from the parts of this tick's frame that have arrived, and a bit mask of those
+    /// parts.
     pending: Vec<FrameGrab>,
     parts: u32,
 }
 
-/// The last [`HISTORY`] ticks.
+/// The received data of the last [`HISTORY`] ticks.
 #[derive(Debug, Clone)]
 pub struct History {
     slots: Vec<TickData>,
@@ -48,23 +49,23 @@ pub struct History {
 }
 
 impl History {
-    /// Nothing known; `tick` is the last one that is not of interest any more.
+    /// Creates an empty history. `tick` is the tick before the first tick of interest.
     pub fn new(tick: Tick) -> Self {
         Self { slots: vec![TickData::default(); HISTORY], highest: tick }
     }
 
-    /// The newest tick for which something arrived.
+    /// The newest tick for which data has arrived.
     pub fn highest(&self) -> Tick {
         self.highest
     }
 
-    /// What is known of a tick, if its driving part is.
+    /// The data of `tick`, if the part that drives the state has arrived.
     pub fn known(&self, tick: Tick) -> Option<&TickData> {
         let slot = &self.slots[(tick % HISTORY as u64) as usize];
         (slot.tick == tick && slot.known).then_some(slot)
     }
 
-    /// The state of a tick as far as the frame itself has come.
+    /// The data of `tick`, if the frame itself has arrived.
     pub fn head(&self, tick: Tick) -> Option<&TickData> {
         self.known(tick).filter(|d| d.head)
     }
@@ -74,8 +75,8 @@ impl History {
         (0..HISTORY as u64).map_while(|back| tick.checked_sub(back)).find_map(|t| self.known(t))
     }
 
-    /// The rigid frame at a tick, `h` seconds a tick: as it arrived, or between its neighbours, or going on from the last
-    /// ones. `None` when none of the last ones is known.
+    /// The rigid pose at `tick`, with `h` seconds per tick: received, interpolated between
+    /// neighbors, or extrapolated from the last poses. Returns `None` when no recent pose is known.
     pub fn pose(&self, tick: Tick, h: f64) -> Option<Pose> {
         let at = |t: Tick| self.known(t).and_then(|d| d.pose);
         if let Some(pose) = at(tick) {
@@ -87,7 +88,8 @@ impl History {
         if let Some((t, next)) = after.filter_map(|t| at(t).map(|p| (t, p))).next() {
             return Some(between(&pose, &next, (tick - before) as f64 / (t - before) as f64));
         }
-        // How its speed changed last goes on for a while: it may be falling.
+        // A body in free fall keeps its acceleration, so the extrapolation continues the last
+        // change of velocity for a while.
         let faster = before
             .checked_sub(1)
             .and_then(at)
@@ -116,8 +118,8 @@ impl History {
         tick > 0 && tick + (HISTORY as u64) > self.highest
     }
 
-    /// Takes a frame and what it repeats. Calls `new(tick, first)` for each tick that was not known before, and with
-    /// `first` false for a frame that completes a tick known from a repeat.
+    /// Stores a frame and its repeats. Calls `new(tick, true)` for each tick that was not known
+    /// before, and `new(tick, false)` for a frame that completes a tick known from a repeat.
     pub fn take(&mut self, frame: &Frame, quanta: &Quanta, mut new: impl FnMut(Tick, bool)) {
         let modes = quanta.modes();
         self.highest = self.highest.max(frame.tick);
@@ -152,7 +154,7 @@ impl History {
         slot.parts |= 1 << which;
         slot.pending.extend(frame.grabs.iter().filter(|g| g.held));
         if which == 0 {
-            // Everything but grabs is in the first part.
+            // The first part carries everything except the remaining grabs.
             if let Some(a) = &frame.accelerations {
                 slot.accelerations.clear();
                 slot.accelerations.extend((0..modes).map(|k| a.get(k, quanta)));
@@ -173,8 +175,8 @@ impl History {
         new(frame.tick, first);
     }
 
-    /// One grab at a tick: as it arrived, or between its neighbours, or where the forecast has it. `None` when nothing near
-    /// the tick knows the grab.
+    /// One grab at `tick`: received, interpolated between neighbors, or extrapolated by `forecast`.
+    /// Returns `None` when no known tick nearby lists the grab.
     pub fn grab(&self, key: GrabKey, tick: Tick, forecast: &Forecast) -> Option<FrameGrab> {
         let at = |t: Tick| self.known(t).and_then(|d| d.grabs.iter().find(|g| g.state.key == key)).copied();
         if self.known(tick).is_some() {
@@ -191,7 +193,7 @@ impl History {
             }
             (None, Some((_, x1))) => Some(x1),
             (Some((t0, x0)), None) => {
-                // A grab that a later frame no longer lists has ended somewhere in between.
+                // A grab that a later frame does not list has ended in between.
                 if after.is_some() {
                     return None;
                 }
@@ -207,7 +209,8 @@ impl History {
     }
 }
 
-/// A pose some seconds later on the same twist, gaining `faster` (m/s^2) for a while.
+/// Extrapolates a pose by `seconds` with its own twist. The pose keeps the acceleration `faster`
+/// (m/s^2) for at most `FALL` seconds.
 fn go_on(pose: &Pose, faster: [f64; 3], seconds: f64) -> Pose {
     let Some(turn) = pose.turn() else { return *pose };
     let turned = UnitQuaternion::from_scaled_axis(Vector3::from(pose.angular) * seconds) * turn;
@@ -223,7 +226,7 @@ fn go_on(pose: &Pose, faster: [f64; 3], seconds: f64) -> Pose {
     }
 }
 
-/// A pose between two, at a share of the way.
+/// Interpolates between two poses. `share` 0 gives `a` and 1 gives `b`.
 fn between(a: &Pose, b: &Pose, share: f64) -> Pose {
     let (Some(from), Some(to)) = (a.turn(), b.turn()) else { return *a };
     let way = (to * from.inverse()).scaled_axis() * share;

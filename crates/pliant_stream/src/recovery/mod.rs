@@ -1,4 +1,4 @@
-//! What the receiver does about loss: policies behind one trait, over one store of what has arrived.
+//! Loss recovery at the receiver: policies behind one trait that share one store of received data.
 
 mod acceleration;
 mod blend;
@@ -24,38 +24,44 @@ use nalgebra::Vector3;
 
 use crate::state::{GrabKey, State, Tick};
 
-/// How a receiver turns what arrived into its best estimate of the host's state.
+/// Turns received data into the receiver's best estimate of the host's state.
 ///
-/// The [`Receiver`] calls it: [`Recovery::advance`] once per tick in order, [`Recovery::correct`] when data for ticks
-/// that were already stepped arrived late, and blends the difference away from what is shown.
+/// The [`Receiver`] calls [`Recovery::advance`] once per tick, in order. The receiver calls
+/// [`Recovery::correct`] when data arrives for ticks that were already stepped, and blends the
+/// resulting difference out of the visual state.
 pub trait Recovery: Send + Sync {
-    /// Takes a state over as true after `tick`, with the modal forces that the reactions do not explain
-    /// and the forces of the hands over the last step (N, world axes).
+    /// Takes `state` as the true state after `tick`. `load` holds the modal forces that the
+    /// reactions do not explain. `means` holds the forces of the hands over the last step (N, world
+    /// axes).
     fn restart(&mut self, tick: Tick, state: &State, load: &[f64], means: &[(GrabKey, Vector3<f64>)]);
 
-    /// Steps to `tick`, one beyond the last, with its data where `history` has it and a prediction where not.
+    /// Steps to `tick`, which is one tick after the last. The step uses the data of `tick` if
+    /// `history` has it, and a prediction otherwise.
     fn advance(&mut self, tick: Tick, history: &History);
 
-    /// Puts right what data for `from` and possibly later ticks changes, up to the tick reached. Returns false when it
-    /// came too late to be used.
+    /// Corrects the state up to the current tick after data arrived for `from` and possibly for
+    /// later ticks. Returns false when the data came too late to be used.
     fn correct(&mut self, from: Tick, history: &History) -> bool;
 
-    /// Takes over the absolute part that the frame of `tick` carried, once that tick has been reached.
+    /// Takes over the absolute state slice of the frame of `tick`, after that tick has been
+    /// reached.
     fn refresh(&mut self, tick: Tick, history: &History);
 
-    /// The best estimate of the truth at the tick reached.
+    /// The best estimate of the host's state at the current tick.
     fn confirmed(&self) -> &State;
 
-    /// Modal forces that the reactions do not explain, as far as they are known; empty for none.
+    /// Modal forces that the reactions do not explain, as far as the policy knows them. Empty for
+    /// none.
     fn load(&self) -> &[f64] {
         &[]
     }
 
-    /// The forces of the hands over the last step, N, world axes, as far as they are known.
+    /// The forces of the hands over the last step, N, world axes, as far as the policy knows them.
     fn means(&self) -> &[(GrabKey, Vector3<f64>)] {
         &[]
     }
 
-    /// True when the reactions shown are those that drive the state; false when they are to be computed from it.
+    /// Returns true when the visual reactions are the reactions that drive the state. Returns false
+    /// when the reactions must be computed from the state.
     fn driven_by_reactions(&self) -> bool;
 }

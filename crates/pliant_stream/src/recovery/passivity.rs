@@ -1,30 +1,35 @@
-//! The passivity guard: fading corrections must not feed the shown body more energy than it has lost.
+//! The passivity guard: fading corrections must not add more energy to the visual body than it has
+//! lost.
 //!
-//! The shown state is the hidden one plus an offset that fades. While it fades the shown body gains or loses energy that no
-//! hand put in: the change of the excess
+//! The visual state is the confirmed state plus a fading offset. While the offset fades, the visual
+//! body gains or loses energy that no hand supplied. This energy is the change of the excess
 //!
 //! ```text
 //! X(s) = E(hidden + s offset) - E(hidden) = s (v . o_v + sum omega^2 q o_q) + s^2 (o_v . o_v + sum omega^2 o_q^2) / 2
 //! ```
 //!
-//! A tank holds what the body has dissipated, `h sum c v^2` a tick, up to a small share of the largest energy seen. An
-//! excess that grows is paid from the tank, one that shrinks pays into it; where the tank does not suffice the offset is
-//! cut to the largest `s` that it does suffice for. (Time-domain passivity after Hannaford and Ryu 2002, with the
-//! correction as the port.)
+//! Here `hidden` is the confirmed state.
+//!
+//! An energy tank holds what the body has dissipated, `h sum c v^2` per tick, up to a small share
+//! of the largest energy seen. A growing excess is paid from the tank, and a shrinking excess is
+//! paid into it. If the tank does not suffice, the guard cuts the offset to the largest `s` that
+//! the tank can pay for. (Time-domain passivity after Hannaford and Ryu 2002, with the correction
+//! as the port.)
 
 use pliant_modal::Relaxation;
 
 use crate::state::State;
 
-/// The tank holds at most this share of the largest energy that the body has had.
+/// Capacity of the tank as a share of the largest energy that the body has had.
 const TANK: f64 = 0.05;
 
-/// Energy that corrections may still put in.
+/// Limits the energy that fading corrections may add to the visual body.
 #[derive(Debug, Clone)]
 pub struct PassivityGuard {
     stiffness: Vec<f64>,
     damping: Vec<f64>,
-    /// Where the body relaxes: the share of the stiffness that does, and how fast, 1/s.
+    /// If the body relaxes: the share of the stiffness that relaxes, and the rate of relaxation,
+    /// 1/s.
     relaxing: (f64, f64),
     h: f64,
     level: f64,
@@ -36,7 +41,7 @@ pub struct PassivityGuard {
 }
 
 impl PassivityGuard {
-    /// For modes of stiffness `omega^2` and damping `c` (1/s), stepped by `h` (s).
+    /// Creates a guard for modes of stiffness `omega^2` and damping `c` (1/s), stepped by `h` (s).
     pub fn new(omega: &[f64], damping: &[f64], h: f64) -> Self {
         Self {
             stiffness: omega.iter().map(|w| w * w).collect(),
@@ -52,13 +57,14 @@ impl PassivityGuard {
         }
     }
 
-    /// The same for a body that relaxes.
+    /// Adds the viscoelastic state of a body that relaxes to the energy and the losses.
     pub fn relaxing(mut self, relaxation: Option<Relaxation>) -> Self {
         self.relaxing = relaxation.map_or((0.0, 0.0), |r| (r.ratio, 1.0 / r.time));
         self
     }
 
-    /// Kinetic and elastic energy of a modal state, J; both springs of a mode that relaxes.
+    /// Kinetic and elastic energy of a modal state, J. Includes both springs of a mode that
+    /// relaxes.
     pub fn energy(&self, state: &State) -> f64 {
         let modes = state.q.iter().zip(&state.v).zip(&self.stiffness);
         let elastic = 0.5 * modes.map(|((q, v), k)| v * v + k * q * q).sum::<f64>();
@@ -69,7 +75,7 @@ impl PassivityGuard {
         elastic + 0.5 * self.relaxing.0 * flown.map(|((q, z), k)| k * z * (z - 2.0 * q)).sum::<f64>()
     }
 
-    /// What the body loses in a step, J.
+    /// Energy that the body loses in one step, J.
     fn lost(&self, state: &State) -> f64 {
         let viscous: f64 = self.damping.iter().zip(&state.v).map(|(c, v)| c * v * v).sum();
         let (ratio, rate) = self.relaxing;
@@ -78,12 +84,14 @@ impl PassivityGuard {
         self.h * (viscous + ratio * rate * flowing)
     }
 
-    /// A correction moved the hidden state under the shown one: no energy was put in, and the excess is what it is now.
+    /// Notes that a correction moved the confirmed state under the visual state. The correction
+    /// itself adds no energy, so the guard only recomputes the excess.
     pub fn corrected(&mut self, confirmed: &State, visual: &State) {
         self.excess = self.energy(visual) - self.energy(confirmed);
     }
 
-    /// A tick has passed: the share of the offset `shown - hidden` that may stay, 0 to 1.
+    /// Advances one tick. Returns the share of the offset `visual - confirmed` that may stay, 0 to
+    /// 1.
     pub fn admit(&mut self, confirmed: &State, visual: &State) -> f64 {
         let lost = self.lost(confirmed);
         self.dissipated += lost;
@@ -100,8 +108,8 @@ impl PassivityGuard {
         let allowed = self.excess + self.level;
         let mut share = 1.0;
         if linear + square > allowed {
-            // The largest s in [0, 1] with square s^2 + linear s <= allowed; s = 0, no offset, is always there to go to
-            // when the present excess is not negative.
+            // Find the largest s in [0, 1] with square s^2 + linear s <= allowed. s = 0 (no offset)
+            // always satisfies this when the current excess is not negative.
             let root = linear * linear + 4.0 * square * allowed;
             share = if square > 0.0 && root >= 0.0 {
                 ((root.sqrt() - linear) / (2.0 * square)).clamp(0.0, 1.0)
@@ -118,7 +126,7 @@ impl PassivityGuard {
         share
     }
 
-    /// Energy that corrections have put into the shown body so far, net, J.
+    /// Net energy that corrections have added to the visual body so far, J.
     pub fn injected(&self) -> f64 {
         self.injected
     }
@@ -128,12 +136,12 @@ impl PassivityGuard {
         self.dissipated
     }
 
-    /// The most that the tank holds, J.
+    /// Capacity of the tank, J.
     pub fn tank(&self) -> f64 {
         TANK * self.largest
     }
 
-    /// How often an offset was cut.
+    /// Number of times an offset was cut.
     pub fn cuts(&self) -> u64 {
         self.cuts
     }
@@ -145,7 +153,8 @@ mod tests {
 
     #[test]
     fn corrections_never_put_in_more_than_was_lost_and_the_tank() {
-        // Two modes swinging; every seventh tick a correction, some of them with the energy to shake the body apart.
+        // Two modes oscillate. Every seventh tick brings a correction, some of them large enough to
+        // shake the body apart.
         let (omega, c, h) = ([10.0, 31.0], [0.4, 1.0], 0.01);
         let mut guard = PassivityGuard::new(&omega, &c, h);
         let (mut offset_q, mut offset_v) = ([0.0; 2], [0.0; 2]);
@@ -171,7 +180,7 @@ mod tests {
                 guard.corrected(&confirmed, &with(&offset_q, &offset_v));
                 last_excess = guard.excess;
             }
-            // An ill-behaved fade that grows.
+            // The offset grows instead of fading, which the guard must stop.
             for k in 0..2 {
                 offset_q[k] *= 1.05;
                 offset_v[k] *= 1.05;

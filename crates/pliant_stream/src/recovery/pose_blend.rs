@@ -1,33 +1,34 @@
-//! The shown offset of a rigid frame: as [`super::Blend`] for coordinates, in place and in turn.
+//! The offset of the visual rigid pose: as [`super::Blend`], for position and rotation.
 
 use nalgebra::{UnitQuaternion, Vector3};
 
 use super::Blend;
 use crate::state::Pose;
 
-/// Offsets of a frame that still fade: 3 of place (m), 3 of turn (rotation vector, rad).
+/// Offsets of a pose that still fade: 3 of position (m) and 3 of rotation (rotation vector, rad).
 #[derive(Debug, Clone)]
 pub struct PoseBlend {
     blend: Blend,
 }
 
 impl PoseBlend {
-    /// Offsets fade over `ticks` (at least 1) steps of `h` seconds.
+    /// Creates an empty blend whose offsets fade over `ticks` (at least 1) steps of `h` seconds.
     pub fn new(h: f64, ticks: u16) -> Self {
         Self { blend: Blend::new(h, ticks) }
     }
 
-    /// Nothing fades any more.
+    /// Removes all offsets.
     pub fn clear(&mut self) {
         self.blend.clear();
     }
 
-    /// True when the shown frame is the hidden one.
+    /// Returns true when no offset is left, so that the visual pose equals the confirmed pose.
     pub fn is_empty(&self) -> bool {
         self.blend.is_empty()
     }
 
-    /// A correction moved the hidden frame from `before` to `now`: what is shown stays and fades over.
+    /// Adds the offset of a correction that moved the confirmed pose from `before` to `now`. The
+    /// visual pose does not jump, and the offset fades.
     pub fn add(&mut self, before: &Pose, now: &Pose) {
         let (Some(old), Some(new)) = (before.turn(), now.turn()) else { return };
         let turn = (old * new.inverse()).scaled_axis();
@@ -37,12 +38,12 @@ impl PoseBlend {
         self.blend.add(place, speed);
     }
 
-    /// One tick passes.
+    /// Ages all offsets by one tick.
     pub fn advance(&mut self) {
         self.blend.advance();
     }
 
-    /// The shown frame for a hidden one.
+    /// The visual pose for a confirmed pose.
     pub fn apply(&self, pose: &Pose) -> Pose {
         let Some(turn) = pose.turn().filter(|_| !self.is_empty()) else { return *pose };
         let (mut place, mut speed) = ([0.0; 6], [0.0; 6]);

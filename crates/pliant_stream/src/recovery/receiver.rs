@@ -1,4 +1,4 @@
-//! One body at a receiver: what has arrived, the hidden state, and what is shown of it.
+//! One body at a receiver: the received data, the confirmed state and the visual state.
 
 use std::sync::Arc;
 
@@ -16,40 +16,41 @@ use crate::replica::{self, Mean, Replica};
 use crate::state::{GrabKey, GrabState, Pose, State, Tick, UserId};
 use crate::wire::{Frame, SnapshotBytes};
 
-/// Disagreeing checksums in a row before a snapshot is wanted: a slice or a repair may be under way.
+/// Number of disagreeing checksums in a row before the receiver wants a snapshot. A slice or a
+/// repair may correct a single disagreement.
 const CHECKS: u32 = 3;
-/// Share of the state's size by which a checksum may differ.
+/// Largest difference of a checksum, as a share of the state's norm.
 const CHECK_TOLERANCE: f64 = 2e-3;
 
-/// Rate at which the offset of a reaction fades, in lengths of the blend.
+/// Rate at which the offset of a reaction fades, per length of the blend.
 const REACTION_FADE: f64 = 2.5;
 
-/// A grab as it is shown: its reaction belongs to the shape that is shown with it.
+/// A visual grab. Its reaction belongs to the visual state.
 pub type VisualGrab = GrabState;
 
-/// What a frame brought.
+/// Effect of a received frame.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 pub struct Arrival {
     /// Ticks that were not known before and had not been stepped yet.
     pub in_time: u32,
-    /// Ticks that had been stepped on a guess and are right now.
+    /// Ticks that had been stepped with a prediction and are corrected.
     pub repaired: u32,
     /// Ticks that came too late to be used.
     pub too_late: u32,
 }
 
-/// What became of the ticks since the receiver began.
+/// Tick counts since the receiver was created.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default, serde::Serialize)]
 pub struct RepairCounts {
     /// Ticks stepped.
     pub stepped: u64,
-    /// Of these with their data there in time.
+    /// Stepped ticks whose data arrived in time.
     pub in_time: u64,
-    /// Of these on a guess.
+    /// Stepped ticks that used a prediction.
     pub guessed: u64,
-    /// Guessed ticks whose data came later and was used.
+    /// Predicted ticks whose data arrived later and was used.
     pub repaired: u64,
-    /// Guessed ticks whose data came too late to be used.
+    /// Predicted ticks whose data arrived too late to be used.
     pub too_late: u64,
     /// States taken over from a snapshot.
     pub snapshots: u64,
@@ -69,18 +70,19 @@ pub struct Receiver {
     tick: Tick,
     visual: State,
     grabs: Vec<VisualGrab>,
-    /// The tick of `grabs`, and what was shown at the two ticks before it, the newer first.
+    /// The tick of `grabs`, and the visual grabs of the two ticks before, the newer first.
     grabs_at: Tick,
     trail: [Vec<VisualGrab>; 2],
-    /// The forces over the steps to this tick and to the one before, where they are computed.
+    /// The forces over the steps to this tick and to the tick before, if they are computed from the
+    /// state.
     implied: [Vec<Mean>; 2],
-    /// The best estimate of the rigid frame at the shown tick, and what is shown of it.
+    /// The best estimate of the rigid pose at the current tick, and the visual pose.
     frame: Option<Pose>,
     pose: Option<Pose>,
     pose_blend: PoseBlend,
     free: bool,
     counts: RepairCounts,
-    /// The newest tick that is in the counts, and those on a guess that nothing has come for yet.
+    /// The newest counted tick, and the predicted ticks for which no data has arrived yet.
     counted: Tick,
     guessed: Vec<Tick>,
     mismatched: u32,
@@ -100,10 +102,12 @@ impl std::fmt::Debug for Receiver {
 }
 
 impl Receiver {
-    /// For the first `modes` of a model, stepped with `newmark.h`, from a snapshot.
+    /// Creates a receiver for the first `modes` modes of a model, stepped with `newmark.h`, from a
+    /// snapshot.
     ///
     /// # Errors
-    /// [`StreamError::Config`], [`StreamError::Model`], [`StreamError::Length`] when the snapshot has other modes.
+    /// Returns [`StreamError::Config`] or [`StreamError::Model`] for settings out of range or an
+    /// unusable model, and [`StreamError::Length`] when the snapshot has another number of modes.
     pub fn new(
         model: Arc<ModalModel>,
         settings: StepSettings,
@@ -168,22 +172,22 @@ impl Receiver {
         Ok(receiver)
     }
 
-    /// The tick that is shown.
+    /// The current tick.
     pub fn tick(&self) -> Tick {
         self.tick
     }
 
-    /// What has arrived.
+    /// The received data.
     pub fn history(&self) -> &History {
         &self.history
     }
 
-    /// Best estimate of the truth.
+    /// The best estimate of the host's state.
     pub fn confirmed(&self) -> &State {
         self.policy.confirmed()
     }
 
-    /// Best estimate of the rigid frame at the shown tick, where the body is free.
+    /// The best estimate of the rigid pose at the current tick. `None` if the body is not free.
     pub(crate) fn frame(&self) -> Option<Pose> {
         self.frame
     }
@@ -196,43 +200,44 @@ impl Receiver {
         self.policy.load()
     }
 
-    /// What the eye and the hand get.
+    /// The state for rendering and haptics.
     pub fn visual(&self) -> &State {
         &self.visual
     }
 
-    /// The grabs at the shown tick with their reactions.
+    /// The grabs at the current tick with their reactions.
     pub fn grabs(&self) -> &[VisualGrab] {
         &self.grabs
     }
 
-    /// The rigid frame at the shown tick, where the body is free.
+    /// The visual rigid pose at the current tick. `None` if the body is not free.
     pub fn pose(&self) -> Option<Pose> {
         self.pose
     }
 
-    /// What became of the ticks.
+    /// The tick counts.
     pub fn counts(&self) -> RepairCounts {
         self.counts
     }
 
-    /// The passivity guard, where there is one.
+    /// The passivity guard, if the configuration asks for one.
     pub fn guard(&self) -> Option<&PassivityGuard> {
         self.guard.as_ref()
     }
 
-    /// Checksums disagree lastingly: a snapshot would help.
+    /// Returns true when checksums have disagreed several times in a row, so that a snapshot would
+    /// help.
     pub fn wants_snapshot(&self) -> bool {
         self.mismatched >= CHECKS
     }
 
-    /// How the host steps the body.
+    /// The host's step settings for the body.
     pub fn settings(&self) -> &StepSettings {
         &self.settings
     }
 
-    /// Takes a frame in. What it says of ticks that were already stepped is put right at once in the hidden state; the
-    /// shown one stays where it is and fades over.
+    /// Takes in a frame. Data for ticks that were already stepped corrects the confirmed state at
+    /// once. The visual state does not jump, and the difference fades.
     pub fn accept(&mut self, frame: &Frame) -> Arrival {
         let mut arrival = Arrival::default();
         let (mut earliest, mut late) = (Tick::MAX, [(0, false); 8]);
@@ -255,9 +260,10 @@ impl Receiver {
             late.sort_unstable();
             let whole = self.policy.driven_by_reactions();
             for &(t, first) in late.iter() {
-                // Re-stepping from the earliest tick takes all later ones with it.
+                // Stepping again from the earliest tick includes all later ticks.
                 let done = if whole && t != earliest { true } else { self.policy.correct(t, &self.history) };
-                // A tick whose repeat was there in time is bettered by its own frame, not repaired.
+                // If a repeat of the tick arrived in time, the tick's own frame refines it and does
+                // not count as a repair.
                 let guessed = &mut self.guessed[(t % HISTORY as u64) as usize];
                 if first && *guessed == t {
                     *guessed = 0;
@@ -275,12 +281,13 @@ impl Receiver {
         arrival
     }
 
-    /// Steps to the next tick, with its data or without.
+    /// Steps to the next tick, with received data or with a prediction.
     pub fn advance(&mut self) {
         self.correct_pose();
         let tick = self.tick + 1;
         self.tick = tick;
-        // A tick that is gone through again, after a snapshot of the past, has been counted.
+        // A tick that is stepped again after a snapshot of an earlier tick has already been
+        // counted.
         if tick > self.counted {
             self.counted = tick;
             self.counts.stepped += 1;
@@ -312,8 +319,9 @@ impl Receiver {
         self.compare_check();
     }
 
-    /// Takes the state of a snapshot over and steps again from its tick with all that has arrived since; the shown state
-    /// fades over. A snapshot of the future moves the receiver there.
+    /// Takes over the state of a snapshot and steps again from its tick with all data that has
+    /// arrived since. The visual state fades over. A snapshot of a later tick moves the receiver to
+    /// that tick.
     pub fn restart(&mut self, snapshot: &SnapshotBytes) {
         if snapshot.q.len() != self.visual.modes() {
             return;
@@ -321,7 +329,8 @@ impl Receiver {
         self.remember_before();
         self.policy.restart(snapshot.tick, &state_of(snapshot), &snapshot.load, &means_of(snapshot));
         if self.history.highest() > snapshot.tick + HISTORY as u64 {
-            // Something claimed to come from the future: what is true now would look too old to be used.
+            // A frame carried a tick from far in the future, so current data would look too old to
+            // be used.
             self.history = History::new(snapshot.tick);
             self.tick = self.tick.min(snapshot.tick);
         }
@@ -341,12 +350,12 @@ impl Receiver {
         self.counts.snapshots += 1;
     }
 
-    /// What is shown still differs from the hidden state.
+    /// Returns true while the visual state still differs from the confirmed state.
     pub fn is_fading(&self) -> bool {
         !self.blend.is_empty()
     }
 
-    /// Lets the shown offset of a resting body fade by one tick's worth.
+    /// Fades the visual offset of a resting body by one tick.
     pub fn fade(&mut self) {
         self.blend.advance();
         self.show();
@@ -369,7 +378,8 @@ impl Receiver {
         self.show();
     }
 
-    /// Where the frame was shown on a guess that is known better now, the difference fades.
+    /// If the last visual pose was a prediction and a better pose is known, blends the difference
+    /// out.
     fn correct_pose(&mut self) {
         self.pose_blend.advance();
         let Some(guess) = self.frame else { return };
@@ -422,7 +432,8 @@ impl Receiver {
                 if let Some(now) = self.history.grab(g.key, self.tick, &forecast) {
                     *g = now.state;
                 } else if let Some(visual) = self.trail[0].iter().find(|p| p.key == g.key) {
-                    // Beyond what a forecast is good for the hand is felt as it was last.
+                    // The forecast does not reach this far, so the hand keeps the last visual
+                    // reaction.
                     g.reaction = visual.reaction;
                 }
             }
@@ -430,7 +441,8 @@ impl Receiver {
         } else {
             replica::place(&mut self.visual, self.replica.model(), self.pose.as_ref());
             self.replica.reactions(&self.visual, &mut self.grabs);
-            // An acceleration has the force over its step in it; what is felt is the force at the end.
+            // An acceleration contains the mean force over its step. The hand needs the force at
+            // its end.
             for g in &mut self.grabs {
                 let mean = -nalgebra::Vector3::from(g.reaction);
                 if let Some((_, before)) = self.implied[1].iter().find(|(key, _)| *key == g.key) {
@@ -441,14 +453,15 @@ impl Receiver {
         }
     }
 
-    /// A reaction shown on a guess was off by what is known of that tick now. The offset fades as a critically damped motion does,
-    /// `o(t) = 2 k o(t-1) - k^2 o(t-2)`, so that what is felt neither jumps nor kinks, however wrong the guess was.
+    /// Blends out the error of visual reactions that were predictions. The offset fades as a
+    /// critically damped motion, `o(t) = 2 k o(t-1) - k^2 o(t-2)`, so that the reaction has no jump
+    /// and no kink, however wrong the prediction was.
     fn blend_reactions(&mut self) {
         let keep = (-REACTION_FADE / f64::from(self.blend_ticks)).exp();
         let [last, before] = &self.trail;
         for g in &mut self.grabs {
             let Some(s1) = last.iter().find(|p| p.key == g.key) else { continue };
-            // Where nothing is known of a tick, its reaction was a guess all through.
+            // If a tick has no data at all, its reaction stays a prediction.
             let known = |back: u64| {
                 let tick = self.grabs_at.checked_sub(back)?;
                 self.history.grab(g.key, tick, &self.forecast).map(|k| k.state.reaction)

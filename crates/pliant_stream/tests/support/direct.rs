@@ -1,4 +1,4 @@
-//! Sessions without links: what one says the other hears at once.
+//! Sessions without links: each side receives at once what the other sends.
 
 use std::time::Duration;
 
@@ -27,7 +27,7 @@ pub fn grab(index: u16) -> FrameGrab {
     }
 }
 
-/// A host and a guest in full session, without links: what one says the other hears.
+/// A connected host and guest without links: each side receives at once what the other sends.
 pub fn session(name: &str) -> (HostSession, GuestSession, Duration) {
     let model = bar(12, 0.05);
     let mut host = HostSession::new(HostConfig::default()).unwrap();
@@ -77,7 +77,7 @@ pub fn exchange(host: &mut HostSession, guest: &mut GuestSession, now: Duration)
     }
 }
 
-/// Xorshift (Marsaglia 2003): any bytes will do, but the same ones every time.
+/// Xorshift random numbers (Marsaglia 2003). Equal seeds give equal numbers.
 pub fn random(state: &mut u64) -> u64 {
     *state ^= *state << 13;
     *state ^= *state >> 7;
@@ -85,7 +85,7 @@ pub fn random(state: &mut u64) -> u64 {
     *state
 }
 
-/// Three peers without links; what each says goes to the one it is for.
+/// Three peers without links. Each output goes directly to its receiver.
 pub fn peers(now: Duration) -> Vec<PeerSession> {
     let mut all: Vec<PeerSession> = (0..3)
         .map(|k| {

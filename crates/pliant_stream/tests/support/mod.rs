@@ -7,13 +7,15 @@ use std::sync::Arc;
 
 use pliant_modal::{BakeInfo, Damping, Element, ModalModel, ModelParts, SurfaceMesh};
 
-/// A square bar of length 1 m, fixed at x = 0, with `modes` modes from four families whose shape along the bar is
-/// sin((2k - 1) pi x / 2): shear in y and z, stretch in x, twist about x. Mass 2 kg, damping ratio `zeta`.
+/// A square bar of length 1 m, fixed at x = 0, with `modes` modes from four families: shear in y
+/// and z, stretch in x, and twist about x. Their shape along the bar is sin((2k - 1) pi x / 2). The
+/// mass is 2 kg and the damping ratio is `zeta`.
 pub fn bar(modes: usize, zeta: f64) -> Arc<ModalModel> {
     bar_that(modes, zeta, false)
 }
 
-/// The same bar let loose: a rigid frame of its own, and the same shapes about it.
+/// The same bar without the fixed end. It has a rigid pose, and the same mode shapes relative to
+/// it.
 pub fn loose_bar(modes: usize, zeta: f64) -> Arc<ModalModel> {
     bar_that(modes, zeta, true)
 }
@@ -38,7 +40,7 @@ fn bar_that(modes: usize, zeta: f64, free: bool) -> Arc<ModalModel> {
     let anchored = positions.iter().map(|p| p[0] == 0.0 && !free).collect();
     let surface = SurfaceMesh::new(positions.clone(), triangles, None, anchored).unwrap();
 
-    // (family, k, frequency in Hz): shear y, shear z, stretch, twist.
+    // Tuples of (family, k, frequency in Hz). The families are shear y, shear z, stretch and twist.
     let mut all: Vec<(usize, usize, f64)> = Vec::new();
     for k in 1..=modes {
         for (family, first) in [(0, 0.9), (1, 1.1), (2, 7.0), (3, 4.0)] {
@@ -49,7 +51,7 @@ fn bar_that(modes: usize, zeta: f64, free: bool) -> Arc<ModalModel> {
     all.truncate(modes);
     let mass = 2.0_f64;
     let amplitude = (2.0 / mass).sqrt();
-    // Twist: r^2 = 2/3 half^2 averaged over the square section.
+    // For twist, r^2 = 2/3 half^2 averaged over the square section.
     let twist = amplitude / (2.0 / 3.0 * half * half).sqrt();
     let (mut displacement, mut rotation) = (Vec::new(), Vec::new());
     for &(family, k, _) in &all {
