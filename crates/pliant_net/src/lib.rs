@@ -62,8 +62,8 @@ mod phase;
 mod plugin;
 mod recording;
 mod remote;
-mod scene;
 mod session_transform;
+mod shared_body;
 pub mod transport;
 mod user;
 
@@ -83,7 +83,7 @@ pub use remote::{
     BodyArrived, BodyLeft, GrabRefused, RemoteBody, RemoteHand, RemoteHands, SessionClosed, SessionJoined,
     SessionLost,
 };
-pub use scene::SharedBody;
+pub use shared_body::SharedBody;
 pub use transport::{
     Access, Emulation, Fingerprint, Grant, HostOptions, Identity, Invite, JoinOptions, Role, Token,
 };

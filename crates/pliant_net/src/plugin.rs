@@ -15,7 +15,7 @@ use crate::metrics::{self, NetStats, RateMarks};
 use crate::peer::{self, NetPeer, PeerConfig};
 use crate::recording::{Recording, RecordingError};
 use crate::remote;
-use crate::scene::SharedBody;
+use crate::shared_body::SharedBody;
 use crate::transport::{Endpoint, Invite, TransportError};
 use crate::user::{UserJoined, UserLeft};
 

@@ -7,7 +7,7 @@
 use bevy::math::{DQuat, DVec3};
 use bevy::prelude::*;
 use pliant_body::BodyState;
-use pliant_stream::Pose;
+use pliant_stream::{Placement, Pose};
 
 /// The map between an app's world and session coordinates for one body:
 ///
@@ -17,6 +17,21 @@ pub(crate) struct SessionTransform {
     origin: DVec3,
     rotation: DQuat,
     scale: f64,
+}
+
+/// The placement of a body at a transform, whose scale is uniform.
+pub(crate) fn placement_of(transform: &GlobalTransform) -> Placement {
+    let (scale, rotation, translation) = transform.to_scale_rotation_translation();
+    Placement { position: translation.into(), orientation: rotation.into(), scale: scale.x }
+}
+
+/// The transform of a body with a placement.
+pub(crate) fn transform_of(placement: Placement) -> Transform {
+    Transform {
+        translation: placement.position.into(),
+        rotation: Quat::from_array(placement.orientation).normalize(),
+        scale: Vec3::splat(placement.scale),
+    }
 }
 
 impl SessionTransform {

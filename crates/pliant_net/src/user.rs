@@ -3,7 +3,7 @@
 use std::time::Duration;
 
 use bevy::prelude::*;
-use pliant_stream::UserId;
+use pliant_stream::{UserId, UserLinkInfo};
 
 use crate::transport::Role;
 
@@ -21,10 +21,27 @@ pub struct User {
     pub role: Role,
 }
 
+impl UserLink {
+    /// The link as the host describes it.
+    pub(crate) fn of(link: &UserLinkInfo) -> Self {
+        let [loss_in, loss_out] = link.losses();
+        Self { round_trip: link.round_trip(), loss_in, loss_out }
+    }
+}
+
 impl User {
     pub(crate) fn new(id: UserId, name: &str, role: Role) -> Self {
         Self { id, name: printable(name), color: color_of(id), role }
     }
+}
+
+/// Longest name of a user that is sent, bytes.
+const LONGEST_NAME: usize = 64;
+
+/// Cuts a name to the length that is sent, at a character boundary.
+pub(crate) fn shortened(name: &str) -> &str {
+    let end = (0..=LONGEST_NAME.min(name.len())).rev().find(|&end| name.is_char_boundary(end));
+    &name[..end.unwrap_or(0)]
 }
 
 /// Removes the control characters from a name, so that it can be displayed.
@@ -109,5 +126,6 @@ mod tests {
             }
         }
         assert_eq!(User::new(UserId(1), "a\u{1b}[31mb\n", Role::Hold).name, "a[31mb");
+        assert_eq!(shortened(&"ä".repeat(40)), "ä".repeat(32), "cut at a character boundary");
     }
 }

@@ -102,6 +102,6 @@ pub use session::{
     HostSession, LinkStats, MAX_MESSAGE, MIN_DATAGRAM, Output, PredictedHand,
 };
 pub use state::{
-    BodyId, GrabKey, GrabState, MAGNITUDE_LIMIT, MAX_GRABS, MAX_MODES, PeerId, Pose, State, TICK_LIMIT, Tick,
-    TickState, UserId,
+    BodyId, GrabKey, GrabState, MAGNITUDE_LIMIT, MAX_GRABS, MAX_MODES, PeerId, Placement, Pose, Role, State,
+    TICK_LIMIT, Tick, TickState, UserId, UserInfo, UserLinkInfo,
 };

@@ -1,6 +1,7 @@
 //! Identifiers and plain data of the public interface.
 
 use std::fmt;
+use std::time::Duration;
 
 use nalgebra::{Matrix3, Quaternion, UnitQuaternion, Vector3};
 pub use pliant_modal::State;
@@ -34,12 +35,115 @@ impl PeerId {
 
 /// Identifies a user in the session. The host numbers its guests from 1; 0 is a user at the host
 /// itself.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash, Default)]
+#[derive(
+    Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash, Default, serde::Serialize, serde::Deserialize,
+)]
 pub struct UserId(pub u16);
 
 impl UserId {
     /// The user at the host itself.
     pub const HOST: Self = Self(0);
+}
+
+/// What a user may do in a session.
+#[derive(
+    Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash, Default, serde::Serialize, serde::Deserialize,
+)]
+pub enum Role {
+    /// The user may see the bodies and hold them. Default.
+    #[default]
+    Hold,
+    /// The user may only see the bodies, and its grabs are refused. A watcher costs its datagrams
+    /// and nothing else.
+    Watch,
+}
+
+impl Role {
+    /// The number of the role on the wire and in recordings.
+    pub fn to_byte(self) -> u8 {
+        match self {
+            Self::Hold => 0,
+            Self::Watch => 1,
+        }
+    }
+
+    /// The role of a number; `None` for a number without one.
+    pub fn from_byte(byte: u8) -> Option<Self> {
+        [Self::Hold, Self::Watch].into_iter().find(|role| role.to_byte() == byte)
+    }
+}
+
+/// A user of a session, as the host describes it.
+#[derive(Debug, Clone, PartialEq, Eq, serde::Serialize, serde::Deserialize)]
+pub struct UserInfo {
+    /// Number of the user.
+    pub user: UserId,
+    /// What the user may do.
+    pub role: Role,
+    /// Display name, at most 64 bytes.
+    pub name: String,
+}
+
+/// Quality of the host's link to a user.
+#[derive(Debug, Clone, Copy, PartialEq, serde::Serialize, serde::Deserialize)]
+pub struct UserLinkInfo {
+    /// Number of the user.
+    pub user: UserId,
+    /// Round trip, us.
+    pub round_trip: u32,
+    /// Loss of the user's datagrams; 255 is total loss.
+    pub loss_in: u8,
+    /// Loss of the datagrams to the user; 255 is total loss.
+    pub loss_out: u8,
+}
+
+impl UserLinkInfo {
+    /// Rounds a round trip and two shares (0 to 1) to what is sent.
+    pub fn new(user: UserId, round_trip: Duration, loss_in: f64, loss_out: f64) -> Self {
+        let share = |share: f64| (share.clamp(0.0, 1.0) * 255.0).round() as u8;
+        let round_trip = u32::try_from(round_trip.as_micros()).unwrap_or(u32::MAX);
+        Self { user, round_trip, loss_in: share(loss_in), loss_out: share(loss_out) }
+    }
+
+    /// The round trip.
+    pub fn round_trip(&self) -> Duration {
+        Duration::from_micros(self.round_trip.into())
+    }
+
+    /// The two shares, `loss_in` and `loss_out`, 0 to 1.
+    pub fn losses(&self) -> [f64; 2] {
+        [self.loss_in, self.loss_out].map(|part| f64::from(part) / 255.0)
+    }
+}
+
+/// Where the host has placed an anchored body in its world. Frames are in the body's own axes, so
+/// only display needs the placement. The frames of a free body contain its pose.
+#[derive(Debug, Clone, Copy, PartialEq, serde::Serialize, serde::Deserialize)]
+pub struct Placement {
+    /// Origin of the body's axes, m, world axes.
+    pub position: [f32; 3],
+    /// Orientation as a unit quaternion (x, y, z, w).
+    pub orientation: [f32; 4],
+    /// Size of one meter of the model, m.
+    pub scale: f32,
+}
+
+impl Default for Placement {
+    /// The origin, unturned, in the model's size.
+    fn default() -> Self {
+        Self { position: [0.0; 3], orientation: [0.0, 0.0, 0.0, 1.0], scale: 1.0 }
+    }
+}
+
+impl Placement {
+    /// Whether all numbers are below 1e6, the quaternion has unit length within 1e-3 and the scale
+    /// is above 1e-6.
+    pub fn is_valid(&self) -> bool {
+        let mut numbers = self.position.iter().chain(&self.orientation).chain([&self.scale]);
+        let near = numbers.all(|number| number.abs() < 1e6);
+        let length = self.orientation.iter().map(|x| x * x).sum::<f32>();
+        near && (length - 1.0).abs() < 1e-3 && self.scale > 1e-6
+    }
 }
 
 /// Identifies a body of the session. The host assigns the numbers.

@@ -6,9 +6,10 @@ mod support;
 use std::time::Duration;
 
 use pliant_modal::ModalModel;
+use pliant_stream::wire::HostMessage;
 use pliant_stream::{
     BodyId, Channel, GuestConfig, GuestEvent, GuestSession, HostConfig, HostEvent, HostSession, PeerId,
-    StepSettings, TickState, UserId,
+    Placement, Role, StepSettings, TickState, UserId, UserInfo, UserLinkInfo,
 };
 use support::bar;
 
@@ -173,7 +174,7 @@ fn who_comes_back_gets_the_number_they_had_if_it_is_free() {
         let asked = std::iter::from_fn(|| room.host.poll_event())
             .any(|event| matches!(event, HostEvent::JoinRequest { peer: who, .. } if who == peer));
         assert!(asked);
-        room.host.accept_as(room.now, peer, before).unwrap()
+        room.host.accept_as(room.now, peer, before, Role::Hold).unwrap()
     };
     assert_eq!(ask(&mut room, PeerId(1), None), UserId(1));
     assert_eq!(ask(&mut room, PeerId(2), None), UserId(2));
@@ -240,4 +241,141 @@ fn grabs_are_begun_no_faster_than_hands_can() {
     }
     // The limit is 120 grabs at once and 60 a second, whatever the guest sends.
     assert!((120..=125 + 60 * 2).contains(&begun), "{begun} begun, {refused} refused");
+}
+
+/// Joins a guest of a host that asks, under a role, and returns its number.
+fn admit(room: &mut Room, peer: PeerId, role: Role) -> UserId {
+    room.join(peer, &bar(8, 0.05));
+    room.exchange();
+    room.host.accept_as(room.now, peer, None, role).unwrap()
+}
+
+#[test]
+fn all_guests_know_who_is_there_and_in_which_role() {
+    let mut room = Room::new(HostConfig { open: false, ..HostConfig::default() });
+    room.host.set_host_user("Ada").unwrap();
+    assert!(room.host.set_host_user(&"x".repeat(65)).is_err());
+    let holder = admit(&mut room, PeerId(1), Role::Hold);
+    let watcher = admit(&mut room, PeerId(2), Role::Watch);
+    room.step();
+    let roster = |room: &Room, guest: usize| -> Vec<(UserId, Role, String)> {
+        room.guests[guest].1.users().map(|u| (u.user, u.role, u.name.clone())).collect()
+    };
+    let ada = (UserId::HOST, Role::Hold, "Ada".to_owned());
+    assert_eq!(roster(&room, 0), [ada.clone(), (watcher, Role::Watch, "guest".to_owned())]);
+    assert_eq!(roster(&room, 1), [ada.clone(), (holder, Role::Hold, "guest".to_owned())]);
+    // The first learned of the second by an event, and the second of the first by its welcome.
+    let joined = |room: &mut Room, guest: usize| -> Vec<UserInfo> {
+        let events = std::iter::from_fn(|| room.guests[guest].1.poll_event());
+        events.filter_map(|e| if let GuestEvent::UserJoined(info) = e { Some(info) } else { None }).collect()
+    };
+    let expected = UserInfo { user: watcher, role: Role::Watch, name: "guest".to_owned() };
+    assert_eq!(joined(&mut room, 0), [expected]);
+    assert_eq!(joined(&mut room, 1), []);
+    // Links are those of users who are there, and leave with them.
+    let link = |user| UserLinkInfo::new(user, Duration::from_millis(196), 0.09, 1.0);
+    room.host.send_links([holder, watcher, UserId(99)].map(link).to_vec());
+    room.exchange();
+    let links: Vec<UserLinkInfo> = room.guests[0].1.links().copied().collect();
+    assert_eq!(links, [link(watcher)]);
+    assert_eq!(links[0].round_trip(), Duration::from_millis(196));
+    assert!((links[0].losses()[0] - 0.09).abs() < 0.002 && links[0].losses()[1] == 1.0);
+    room.host.disconnect(PeerId(2), pliant_stream::DisconnectReason::Left);
+    room.exchange();
+    assert_eq!(roster(&room, 0), [ada]);
+    assert_eq!(room.guests[0].1.links().count(), 0);
+}
+
+#[test]
+fn who_may_only_watch_holds_nothing() {
+    let mut room = Room::new(HostConfig { open: false, ..HostConfig::default() });
+    admit(&mut room, PeerId(1), Role::Watch);
+    admit(&mut room, PeerId(2), Role::Hold);
+    (0..40).for_each(|_| room.step());
+    while room.host.poll_event().is_some() {}
+    for guest in 0..2 {
+        let now = room.now;
+        let guest = &mut room.guests[guest].1;
+        while guest.poll_event().is_some() {}
+        guest.begin_grab(now, BODY, 20, 0.05, [0.0; 3], Default::default()).unwrap();
+    }
+    room.exchange();
+    let begun: Vec<UserId> = std::iter::from_fn(|| room.host.poll_event())
+        .filter_map(|e| if let HostEvent::GrabBegan { key, .. } = e { Some(key.user) } else { None })
+        .collect();
+    assert_eq!(begun, [UserId(2)]);
+    let refused = std::iter::from_fn(|| room.guests[0].1.poll_event())
+        .any(|event| matches!(event, GuestEvent::GrabRefused { .. }));
+    assert!(refused, "the watcher is told");
+}
+
+#[test]
+fn a_placement_reaches_those_who_are_there_and_those_who_come() {
+    let model = bar(8, 0.05);
+    let mut room = Room::new(HostConfig::default());
+    room.join(PeerId(1), &model);
+    (0..4).for_each(|_| room.step());
+    let placement = |room: &Room, guest: usize| room.guests[guest].1.body(BODY).unwrap().placement();
+    assert_eq!(placement(&room, 0), None);
+    let there = Placement { position: [1.0, 2.0, -3.0], scale: 0.5, ..Placement::default() };
+    room.host.set_placement(BODY, there).unwrap();
+    room.join(PeerId(2), &model);
+    (0..4).for_each(|_| room.step());
+    assert_eq!([0, 1].map(|guest| placement(&room, guest)), [Some(there); 2]);
+    let told = |room: &mut Room| {
+        std::iter::from_fn(|| room.guests[0].1.poll_event())
+            .filter(|event| matches!(event, GuestEvent::BodyPlaced { .. }))
+            .count()
+    };
+    assert_eq!(told(&mut room), 1);
+    // The same again is not sent, and what places nothing is refused.
+    room.host.set_placement(BODY, there).unwrap();
+    for wrong in [
+        Placement { position: [f32::NAN, 0.0, 0.0], ..there },
+        Placement { position: [1e7, 0.0, 0.0], ..there },
+        Placement { orientation: [0.0; 4], ..there },
+        Placement { scale: 0.0, ..there },
+        Placement { scale: f32::INFINITY, ..there },
+    ] {
+        assert!(room.host.set_placement(BODY, wrong).is_err(), "{wrong:?}");
+        let message = HostMessage::BodyPlaced { body: BODY.0, placement: wrong };
+        assert!(HostMessage::decode(&message.encode()).is_err(), "{wrong:?}");
+    }
+    room.exchange();
+    assert_eq!((told(&mut room), placement(&room, 0)), (0, Some(there)));
+}
+
+#[test]
+fn a_guest_says_how_much_of_a_body_it_wants() {
+    let model = bar(8, 0.05);
+    let mut room = Room::new(HostConfig::default());
+    room.join(PeerId(1), &model);
+    (0..40).for_each(|_| room.step());
+    let shown = |room: &Room| room.guests[0].1.body(BODY).unwrap().visual().unwrap().modes();
+    let all = shown(&room);
+    assert!(!room.guests[0].1.set_interest(BodyId(77), Some(2)), "there is no such body");
+    assert!(room.guests[0].1.set_interest(BODY, Some(2)));
+    (0..8).for_each(|_| room.step());
+    assert_eq!(shown(&room), 2);
+    // Nothing at all, and then everything again.
+    room.guests[0].1.set_interest(BODY, Some(0));
+    (0..8).for_each(|_| room.step());
+    let before = room.datagrams(0);
+    (0..8).for_each(|_| room.step());
+    assert!(room.datagrams(0) <= before + 1, "only answers about the clock");
+    room.guests[0].1.set_interest(BODY, None);
+    (0..8).for_each(|_| room.step());
+    assert_eq!(shown(&room), all);
+    // The same interest is sent once. A flood of changes is bounded and costs the guest nothing else.
+    let sent = |room: &Room| room.guests[0].1.stats().message_bytes_out;
+    let bytes = sent(&room);
+    room.guests[0].1.set_interest(BODY, None);
+    assert_eq!(sent(&room), bytes);
+    for change in 0..5000_u16 {
+        room.guests[0].1.set_interest(BODY, Some(1 + change % 2));
+    }
+    room.exchange();
+    assert_eq!(room.host.users().count(), 1, "it is still in the session");
+    let rejected = room.host.stats(PeerId(1)).unwrap().rejected;
+    assert_eq!(rejected, 0);
 }

@@ -5,12 +5,13 @@ use std::sync::Arc;
 use bevy::prelude::*;
 use pliant_body::{Driven, ModalAsset, ModalBody};
 use pliant_modal::ModalModel;
-use pliant_stream::{BodyId, BodyView, Pose, StepSettings};
+use pliant_stream::{BodyId, BodyView, Placement, Pose, StepSettings};
 
 use super::{Interest, NetGuest, shown_of};
 use crate::phase::Phase;
 use crate::remote::{BodyArrived, BodyLeft, RemoteBody, RemoteHands};
-use crate::scene::{Placement, SharedBody};
+use crate::session_transform::transform_of;
+use crate::shared_body::SharedBody;
 
 /// A body of the host and its last displayed states.
 pub(super) struct FollowedBody {
@@ -30,17 +31,13 @@ pub(super) struct FollowedBody {
 }
 
 impl NetGuest {
-    pub(super) fn place(&mut self, world: &mut World, placement: Placement) {
-        // This is the largest number of bodies of a session.
-        if self.placements.len() >= 1024 && !self.placements.contains_key(&placement.body) {
-            return;
-        }
-        self.placements.insert(placement.body, placement.transform);
-        if let Some(followed) = self.bodies.get(&placement.body)
+    /// Moves the entity that this plugin spawned for a body to where the host has placed it.
+    pub(super) fn place(&mut self, world: &mut World, body: BodyId, placement: Placement) {
+        if let Some(followed) = self.bodies.get(&body)
             && followed.made_here
             && let Some(mut transform) = world.get_mut::<Transform>(followed.entity)
         {
-            *transform = placement.transform;
+            *transform = transform_of(placement);
         }
     }
 
@@ -50,6 +47,7 @@ impl NetGuest {
         let info = view.info();
         let name = info.name.clone();
         let settings = info.settings;
+        let placement = view.placement();
         // The stream's number of modes may change. The display has room for all modes that this
         // guest accepts.
         let modes = self.config.modes.map(usize::from).filter(|&modes| modes < model.mode_count());
@@ -79,7 +77,7 @@ impl NetGuest {
                         (entity, before.is_some_and(|before| before.made_here))
                     }
                     None => {
-                        let transform = self.placements.get(&id).copied().unwrap_or_default();
+                        let transform = transform_of(placement.unwrap_or_default());
                         (world.spawn((SharedBody::named(name.clone()), transform)).id(), true)
                     }
                 }
@@ -131,8 +129,7 @@ impl NetGuest {
     }
 
     pub(super) fn body_gone(&mut self, world: &mut World, id: BodyId) {
-        self.placements.remove(&id);
-        self.wanted.remove(&id);
+        self.less_since.remove(&id);
         let Some(followed) = self.bodies.remove(&id) else { return };
         self.grabs.retain(|_, sent| sent.body != id);
         Self::take_leave(world, followed);
@@ -140,8 +137,7 @@ impl NetGuest {
 
     /// Stops all bodies when the session is lost.
     pub(super) fn orphan_bodies(&mut self, world: &mut World) {
-        self.placements.clear();
-        self.wanted.clear();
+        self.less_since.clear();
         for (_, followed) in std::mem::take(&mut self.bodies) {
             if let Ok(mut entity) = world.get_entity_mut(followed.entity) {
                 entity.remove::<(RemoteBody, RemoteHands)>();

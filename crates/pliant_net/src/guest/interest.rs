@@ -10,7 +10,6 @@ use pliant_body::{BodyState, Grabs};
 
 use super::NetGuest;
 use crate::remote::RemoteBody;
-use crate::scene::Wanted;
 
 /// How much of a body the host sends to a guest. Every body that tracks a host's body has it. The
 /// app writes it, or [`CameraInterest`] does.
@@ -62,21 +61,20 @@ impl CameraInterest {
     }
 }
 
-/// The subscription that the host has received.
-#[derive(Debug, Clone, Copy)]
-pub(super) struct Said {
-    modes: u16,
-    /// Time since which the cameras see less than is subscribed.
-    less_since: Option<Duration>,
-}
-
 impl Interest {
-    fn modes(self) -> u16 {
+    /// The limit that is sent; `None` for no limit.
+    fn modes(self) -> Option<u16> {
         match self {
-            Self::All => Wanted::ALL,
-            Self::Modes(modes) => modes.max(1),
-            Self::Nothing => 0,
+            Self::All => None,
+            Self::Modes(modes) => Some(modes.max(1)),
+            Self::Nothing => Some(0),
         }
+    }
+
+    /// Whether this asks for less than another interest does.
+    fn is_less_than(self, other: Self) -> bool {
+        let most = |interest: Self| interest.modes().map_or(u32::MAX, u32::from);
+        most(self) < most(other)
     }
 }
 
@@ -106,13 +104,12 @@ pub(crate) fn look(
         let held = grabs.is_some_and(|grabs| !grabs.entities().is_empty());
         let highest = heights.reduce(f32::max);
         let worth = if held { Interest::All } else { config.worth(highest, model.mode_count()) };
-        let said = guest.wanted.get_mut(&body.0);
-        let less = worth.modes() < interest.modes();
-        let waits = said.is_some_and(|said| {
-            said.less_since = less.then(|| said.less_since.unwrap_or(now));
-            said.less_since.is_some_and(|since| now.saturating_sub(since) < config.patience)
-        });
+        let waits = worth.is_less_than(*interest) && {
+            let since = *guest.less_since.entry(body.0).or_insert(now);
+            now.saturating_sub(since) < config.patience
+        };
         if !waits {
+            guest.less_since.remove(&body.0);
             interest.set_if_neq(worth);
         }
     }
@@ -131,14 +128,9 @@ fn height_in(lens: &Projection, distance: f32, radius: f32) -> f32 {
 /// `PostUpdate`, after [`look`]: sends changed subscriptions to the host.
 pub(crate) fn say_interest(guest: Option<ResMut<NetGuest>>, bodies: Query<(&RemoteBody, &Interest)>) {
     let Some(mut guest) = guest else { return };
-    let guest = &mut *guest;
+    let Some(session) = &mut guest.session else { return };
     for (body, interest) in &bodies {
-        let modes = interest.modes();
-        let said = guest.wanted.entry(body.0).or_insert(Said { modes: Wanted::ALL, less_since: None });
-        if said.modes != modes {
-            said.modes = modes;
-            guest.line.send_message(Wanted { body: body.0, modes }.to_message());
-        }
+        session.set_interest(body.0, interest.modes());
     }
 }
 

@@ -20,7 +20,6 @@ use pliant_stream::{BodyId, BodyView, GuestSession, LinkStats, PeerId, RecoveryC
 
 use crate::metrics::{Ledger, NetStats};
 use crate::remote::RemoteBody;
-use crate::scene::{Person, Reach};
 use crate::transport::{Emulation, Endpoint, JoinOptions, Role};
 use bodies::FollowedBody;
 use hands::SentGrab;
@@ -118,16 +117,14 @@ pub struct NetGuest {
     bodies: BTreeMap<BodyId, FollowedBody>,
     /// Bodies of a lost session, which the next session may have again.
     orphans: Vec<FollowedBody>,
-    placements: BTreeMap<BodyId, Transform>,
     users: BTreeMap<UserId, Entity>,
-    people: BTreeMap<UserId, Person>,
-    reaches: Vec<Reach>,
     grabs: BTreeMap<Entity, SentGrab>,
     /// Time up to which the session has been updated.
     advanced: Duration,
     /// Whether the app has asked to leave the session.
     leaving: bool,
-    wanted: BTreeMap<BodyId, interest::Said>,
+    /// Since when the cameras see less of a body than is requested.
+    less_since: BTreeMap<BodyId, Duration>,
     retry: session::Retry,
     scratch: Vec<f64>,
     ledger: Ledger,
@@ -157,14 +154,11 @@ impl NetGuest {
             session: None,
             bodies: BTreeMap::new(),
             orphans: Vec::new(),
-            placements: BTreeMap::new(),
             users: BTreeMap::new(),
-            people: BTreeMap::new(),
-            reaches: Vec::new(),
             grabs: BTreeMap::new(),
             advanced: Duration::ZERO,
             leaving: false,
-            wanted: BTreeMap::new(),
+            less_since: BTreeMap::new(),
             retry: session::Retry::default(),
             scratch: Vec::new(),
             ledger: Ledger::default(),

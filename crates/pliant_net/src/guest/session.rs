@@ -7,14 +7,13 @@ use bevy::prelude::*;
 use bevy::tasks::{AsyncComputeTaskPool, block_on, poll_once};
 use pliant_body::ModalAsset;
 use pliant_modal::ModalModel;
-use pliant_stream::{DisconnectReason, GuestEvent, GuestSession, StreamError, UserId};
+use pliant_stream::{DisconnectReason, GuestEvent, GuestSession, StreamError, UserId, UserInfo};
 
 use super::source::Came;
 use super::{GuestState, NetGuest};
 use crate::remote::{GrabRefused, SessionClosed, SessionJoined, SessionLost};
-use crate::scene::{self, Person, Reliable};
-use crate::transport::{CloseReason, Role};
-use crate::user::{User, UserJoined, UserLeft, UserLink, Yourself};
+use crate::transport::CloseReason;
+use crate::user::{User, UserJoined, UserLeft, UserLink, Yourself, shortened};
 
 /// When the guest tries to join again.
 #[derive(Debug, Default)]
@@ -62,17 +61,11 @@ pub(crate) fn receive(world: &mut World) {
                         session.on_datagram(at, &bytes);
                     }
                 }
-                Came::Message { bytes } => match (scene::read(&bytes), &mut guest.session) {
-                    (Some(Reliable::Session(bytes)), Some(session)) => session.on_message(now, bytes),
-                    (Some(Reliable::Placement(placement)), _) => guest.place(world, placement),
-                    (Some(Reliable::People(people)), _) => guest.know(world, people),
-                    (Some(Reliable::Reaches(reaches)), _) => guest.reaches = reaches,
-                    // A host of a later version may have more kinds.
-                    _ => {
-                        guest.before.rejected += 1;
-                        debug!("a message of no known kind from the host");
+                Came::Message { bytes } => {
+                    if let Some(session) = &mut guest.session {
+                        session.on_message(now, &bytes);
                     }
-                },
+                }
                 Came::Closed { reason } => {
                     // A goodbye of the session arrived earlier and has the more precise reason.
                     guest.take_events(world);
@@ -94,7 +87,7 @@ impl NetGuest {
     fn greet(&mut self, world: &World, now: Duration) -> Result<(), StreamError> {
         let most = self.line.max_datagram_size().unwrap_or(0);
         let config = pliant_stream::GuestConfig {
-            name: scene::shortened(&self.config.name).to_owned(),
+            name: shortened(&self.config.name).to_owned(),
             recovery: self.config.recovery,
             modes: self.config.modes,
             predict_own_hand: self.config.predict_own_hand,
@@ -213,8 +206,6 @@ impl NetGuest {
         for (_, entity) in std::mem::take(&mut self.users) {
             world.try_despawn(entity).ok();
         }
-        self.people.clear();
-        self.reaches.clear();
     }
 
     fn close(&mut self, world: &mut World, reason: String) {
@@ -236,16 +227,17 @@ impl NetGuest {
                 GuestEvent::ModelCame { hash, bytes } => self.read_model(hash, bytes),
                 GuestEvent::BodyReady { body, model } => self.body_ready(world, body, model),
                 GuestEvent::BodyChanged { body } => self.body_changed(world, body),
+                GuestEvent::BodyPlaced { body, placement } => self.place(world, body, placement),
                 GuestEvent::BodyGone { body } => self.body_gone(world, body),
                 GuestEvent::Stalled { body } => {
                     debug!("body {body} stands still: nothing comes from the host")
                 }
-                GuestEvent::UserJoined { user, name } => {
-                    let (entity, name) = self.meet(world, user, &name);
-                    world.write_message(UserJoined { entity, id: user, name, back: false });
+                GuestEvent::UserJoined(info) => {
+                    let id = info.user;
+                    let (entity, name) = self.meet(world, &info);
+                    world.write_message(UserJoined { entity, id, name, back: false });
                 }
                 GuestEvent::UserLeft { user } => {
-                    self.people.remove(&user);
                     if let Some(entity) = self.users.remove(&user) {
                         let name =
                             world.get::<User>(entity).map(|user| user.name.clone()).unwrap_or_default();
@@ -273,29 +265,14 @@ impl NetGuest {
         }
     }
 
-    fn meet(&mut self, world: &mut World, id: UserId, name: &str) -> (Entity, String) {
-        let person = self.people.get(&id);
-        let role = person.map_or(Role::Hold, |person| person.role);
-        let user = User::new(id, person.map_or(name, |person| &person.name), role);
+    fn meet(&mut self, world: &mut World, info: &UserInfo) -> (Entity, String) {
+        let user = User::new(info.user, &info.name, info.role);
         let name = user.name.clone();
         let entity = world.spawn((user, UserLink::default())).id();
-        if let Some(old) = self.users.insert(id, entity) {
+        if let Some(old) = self.users.insert(info.user, entity) {
             world.try_despawn(old).ok();
         }
         (entity, name)
-    }
-
-    /// Takes over the names and roles of the users from the host, including the guest's own.
-    fn know(&mut self, world: &mut World, people: Vec<Person>) {
-        for person in people {
-            // The map is bounded by the number of user numbers. The session reports which users
-            // leave.
-            let known = self.users.get(&person.user).and_then(|&entity| world.get_mut::<User>(entity));
-            if let Some(mut user) = known {
-                user.set_if_neq(User::new(person.user, &person.name, person.role));
-            }
-            self.people.insert(person.user, person);
-        }
     }
 
     fn welcomed(&mut self, world: &mut World, user: UserId) {
@@ -304,19 +281,14 @@ impl NetGuest {
             self.retry.orphans_until = Some(self.now() + ORPHANS);
         }
         self.state = GuestState::In { user };
-        let own = self.config.name.clone();
-        let (entity, name) = self.meet(world, user, &own);
+        let own = UserInfo { user, role: self.role, name: shortened(&self.config.name).to_owned() };
+        let (entity, name) = self.meet(world, &own);
         world.entity_mut(entity).insert(Yourself);
         info!("in the session as {name}, user {}", user.0);
-        let others: Vec<_> = self.session.as_ref().map_or_else(Vec::new, |session| {
-            let others = session.users().filter(|(id, _)| *id != user);
-            others.map(|(id, name)| (id, name.to_owned())).collect()
-        });
-        for (id, name) in others {
-            self.meet(world, id, &name);
-        }
-        if !self.users.contains_key(&UserId::HOST) {
-            self.meet(world, UserId::HOST, "host");
+        let others = self.session.iter().flat_map(|session| session.users().cloned());
+        let others: Vec<UserInfo> = others.filter(|info| info.user != user).collect();
+        for info in &others {
+            self.meet(world, info);
         }
         world.write_message(SessionJoined { user, again });
     }

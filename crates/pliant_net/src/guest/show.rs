@@ -94,10 +94,10 @@ pub(crate) fn show(
         let new = UserLink { round_trip: link.round_trip, loss_in: link.loss_in, loss_out: link.loss_out };
         shown.set_if_neq(new);
     }
-    for reach in guest.reaches.drain(..).filter(|reach| Some(reach.user) != user) {
-        let other = guest.users.get(&reach.user).and_then(|&other| links.get_mut(other).ok());
+    for link in session.links().filter(|link| Some(link.user) != user) {
+        let other = guest.users.get(&link.user).and_then(|&other| links.get_mut(other).ok());
         if let Some(mut shown) = other {
-            shown.set_if_neq(reach.to_link());
+            shown.set_if_neq(UserLink::of(link));
         }
     }
     guest.flush();

@@ -9,7 +9,6 @@ use pliant_stream::{Channel, DisconnectReason, Output, PeerId};
 use tracing::debug;
 
 use crate::recording::{Record, Recorder, Recording};
-use crate::scene;
 use crate::transport::{CloseReason, Endpoint, Event, PeerStats, Role};
 
 /// The guest's transport source.
@@ -94,17 +93,9 @@ impl Source {
         // A host that does not read these few messages is lost, which the idle timeout will report.
         let sent = match output.channel {
             Channel::Datagram => endpoint.send_datagram(PeerId::HOST, Bytes::from_owner(output.bytes)),
-            Channel::Message => endpoint.send_message(PeerId::HOST, scene::session_message(&output.bytes)),
+            Channel::Message => endpoint.send_message(PeerId::HOST, Bytes::from_owner(output.bytes)),
         };
         if let Err(error) = sent {
-            debug!("not sent to the host: {error}");
-        }
-    }
-
-    pub(crate) fn send_message(&self, message: Bytes) {
-        if let Self::Quic { endpoint, .. } = self
-            && let Err(error) = endpoint.send_message(PeerId::HOST, message)
-        {
             debug!("not sent to the host: {error}");
         }
     }

@@ -8,7 +8,6 @@ use pliant_stream::{DisconnectReason, GrabKey, HostEvent, PeerId, UserId};
 
 use super::hands::GuestGrab;
 use super::{Known, NetHost};
-use crate::scene::{self, Person, Placement, Reliable, Wanted};
 use crate::transport::{Event, Fingerprint, Role};
 use crate::user::{User, UserJoined, UserLeft, UserLink};
 
@@ -19,31 +18,10 @@ pub(super) struct Guest {
     pub(super) role: Role,
     /// The user's entity, once the guest is in the session.
     pub(super) entity: Option<Entity>,
-    /// Subscription changes that the guest may still make, and the time of that count.
-    wishes: (f64, Duration),
 }
-
-/// Subscription changes per second that the host accepts from a guest (`WISHES_PER_S`), and the
-/// largest burst (`WISHES`), one for each of the most bodies that a session may have.
-const WISHES_PER_S: f64 = 100.0;
-const WISHES: f64 = 1024.0;
 
 /// Most keys that the host remembers. The key whose last join is longest ago is forgotten first.
 const MOST_KNOWN: usize = 4096;
-
-impl Guest {
-    fn new(key: Fingerprint, role: Role) -> Self {
-        Self { key, role, entity: None, wishes: (WISHES, Duration::ZERO) }
-    }
-
-    fn may_wish(&mut self, now: Duration) -> bool {
-        let (left, at) = self.wishes;
-        let left = (left + WISHES_PER_S * now.saturating_sub(at).as_secs_f64()).min(WISHES);
-        let may = left >= 1.0;
-        self.wishes = (if may { left - 1.0 } else { left }, now);
-        may
-    }
-}
 
 /// Converts the users of an earlier run, as the app gives them. If two have the same number, the
 /// first keeps it.
@@ -62,7 +40,7 @@ pub(crate) fn receive(world: &mut World) {
             match event {
                 Event::Connected { peer, address, fingerprint, role } => {
                     debug!("guest {peer} from {address} with key {fingerprint}");
-                    host.guests.insert(peer, Guest::new(fingerprint, role));
+                    host.guests.insert(peer, Guest { key: fingerprint, role, entity: None });
                     let most = host.endpoint.max_datagram_size(peer).unwrap_or(0);
                     if let Err(error) = host.session.connect(now, peer, most) {
                         host.endpoint.close(peer, DisconnectReason::Full, &error.to_string());
@@ -72,15 +50,7 @@ pub(crate) fn receive(world: &mut World) {
                     let at = at.saturating_duration_since(host.began);
                     host.session.on_datagram(at, peer, &bytes);
                 }
-                Event::Message { peer, bytes } => match scene::read(&bytes) {
-                    Some(Reliable::Session(bytes)) => host.session.on_message(now, peer, bytes),
-                    Some(Reliable::Wanted(wanted)) => host.wanted(now, peer, wanted),
-                    // A guest may not send the other kinds.
-                    Some(Reliable::Placement(_) | Reliable::People(_) | Reliable::Reaches(_)) | None => {
-                        host.rejected += 1;
-                        host.session.kick(peer, DisconnectReason::Protocol);
-                    }
-                },
+                Event::Message { peer, bytes } => host.session.on_message(now, peer, &bytes),
                 Event::Closed { peer, reason } => {
                     debug!("guest {peer} is gone: {reason}");
                     host.session.disconnect(peer, crate::end_of(&reason));
@@ -112,7 +82,7 @@ impl NetHost {
     /// checked. The guest gets the number that it had before.
     fn let_in(&mut self, world: &mut World, peer: PeerId) {
         let now = self.now();
-        let Some(key) = self.guests.get(&peer).map(|guest| guest.key) else { return };
+        let Some((key, role)) = self.guests.get(&peer).map(|guest| (guest.key, guest.role)) else { return };
         // One key is one user. A new connection replaces an older one whose loss has not been
         // noticed yet.
         let older: Vec<PeerId> = self
@@ -126,7 +96,7 @@ impl NetHost {
             self.session.kick(other, DisconnectReason::Left);
         }
         let before = self.known.get(&key).map(|known| known.user).or_else(|| self.free_number());
-        if let Err(error) = self.session.accept_as(now, peer, before) {
+        if let Err(error) = self.session.accept_as(now, peer, before, role) {
             debug!("guest {peer} was not let in: {error}");
             self.session.kick(peer, DisconnectReason::Refused);
         }
@@ -163,25 +133,6 @@ impl NetHost {
         }
         info!("{name} {}", if back { "is back" } else { "has joined" });
         world.write_message(UserJoined { entity, id, name, back });
-        // The new guest receives all users, and all guests receive the new user.
-        let inside = self.guests.values().filter_map(|guest| guest.entity).chain([self.you]);
-        let people: Vec<Person> = inside.filter_map(|entity| world.get::<User>(entity)).map(person).collect();
-        self.send_message(peer, scene::people_message(&people));
-        if let Some(newcomer) = world.get::<User>(entity) {
-            self.tell_all(&scene::people_message(&[person(newcomer)]));
-        }
-        let places: Vec<_> = self.bodies.values().map(|b| Placement::new(b.id, &b.placed)).collect();
-        for placement in places {
-            self.tell_place(placement, Some(peer));
-        }
-    }
-
-    /// Applies a guest's subscription to a body.
-    fn wanted(&mut self, now: Duration, peer: PeerId, wanted: Wanted) {
-        if self.guests.get_mut(&peer).is_some_and(|guest| guest.may_wish(now)) {
-            let modes = (wanted.modes != Wanted::ALL).then_some(wanted.modes);
-            self.session.set_interest(peer, wanted.body, modes);
-        }
     }
 
     fn apply(&mut self, world: &mut World, event: HostEvent) {
@@ -230,8 +181,4 @@ impl NetHost {
 /// Returns the range of all grabs of a user.
 fn hands_of(user: UserId) -> std::ops::RangeInclusive<GrabKey> {
     GrabKey { user, grab: 0 }..=GrabKey { user, grab: u16::MAX }
-}
-
-fn person(user: &User) -> Person {
-    Person { user: user.id, role: user.role, name: user.name.clone() }
 }

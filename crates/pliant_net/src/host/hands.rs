@@ -9,8 +9,7 @@ use pliant_stream::{BodyId, GrabKey, PeerId};
 use super::NetHost;
 use super::playout::HandPlayout;
 use crate::session_transform::SessionTransform;
-use crate::transport::Role;
-use crate::user::{HandOf, User};
+use crate::user::HandOf;
 
 /// Whose hands may be on a body at the same time. As a component on a host's body, it applies to
 /// that body. Otherwise [`HostConfig::holding`](super::HostConfig::holding) applies. A change ends
@@ -76,9 +75,6 @@ impl NetHost {
         let user = *self.numbers.get(&key.user).ok_or("no such user")?;
         let of_user = self.guests.iter().find(|(_, guest)| guest.entity == Some(user));
         let peer = *of_user.ok_or("no such user")?.0;
-        if world.get::<User>(user).is_none_or(|user| user.role == Role::Watch) {
-            return Err("this user may only watch");
-        }
         let target = self.target_in_world(world, body, target).ok_or("no place for its target")?;
         let model = world.get::<BodyState>(entity).ok_or("the body is not ready")?.model().clone();
         if !(0.0..=model.size()).contains(&radius) {

@@ -17,11 +17,10 @@ use pliant_modal::ModalModel;
 use pliant_stream::{Channel, DisconnectReason, GrabKey, GrabState, HostSession, LinkStats, PeerId, UserId};
 
 use crate::metrics::{Ledger, NetStats};
-use crate::scene::{self, Placement};
 use crate::transport::{
     Access, Emulation, Endpoint, Fingerprint, HostOptions, Invite, PeerStats, Role, SendError,
 };
-use crate::user::{User, Yourself};
+use crate::user::{User, Yourself, shortened};
 use guests::Guest;
 use publish::HostedBody;
 
@@ -94,11 +93,9 @@ pub struct NetHost {
     grabs: BTreeMap<GrabKey, Entity>,
     own_grabs: BTreeMap<Entity, u16>,
     next_own_grab: u16,
-    reaches_said: Duration,
+    links_sent: Duration,
     scratch: Vec<GrabState>,
     ledger: Ledger,
-    /// Number of received messages that a guest may not send.
-    rejected: u64,
     /// New bodies, with their models and the tasks that encode the models' files.
     files: BTreeMap<Entity, (Arc<ModalModel>, Task<Arc<[u8]>>)>,
 }
@@ -122,10 +119,11 @@ impl NetHost {
         if let Some(fixed) = world.get_resource::<Time<Fixed>>() {
             settings.newmark.h = fixed.timestep().as_secs_f64();
         }
-        let session = HostSession::new(settings)?;
+        let mut session = HostSession::new(settings)?;
         let invite = endpoint.invite();
         info!("hosting at {}:{} with key {}", invite.host, invite.port, invite.fingerprint);
-        let name = scene::shortened(&config.name);
+        let name = shortened(&config.name);
+        session.set_host_user(name)?;
         let you = world.spawn((User::new(UserId::HOST, name, Role::Hold), Yourself)).id();
         let reach = if config.reach.is_finite() { config.reach.clamp(0.0, 1e3) } else { 4.0 };
         world.insert_resource(Self {
@@ -146,10 +144,9 @@ impl NetHost {
             grabs: BTreeMap::new(),
             own_grabs: BTreeMap::new(),
             next_own_grab: 0,
-            reaches_said: Duration::ZERO,
+            links_sent: Duration::ZERO,
             scratch: Vec::new(),
             ledger: Ledger::default(),
-            rejected: 0,
             files: BTreeMap::new(),
         });
         Ok(())
@@ -248,7 +245,7 @@ impl NetHost {
                 Channel::Datagram => {
                     let _ = self.endpoint.send_datagram(output.peer, Bytes::from_owner(output.bytes));
                 }
-                Channel::Message => self.send_message(output.peer, scene::session_message(&output.bytes)),
+                Channel::Message => self.send_message(output.peer, Bytes::from_owner(output.bytes)),
             }
         }
     }
@@ -260,23 +257,6 @@ impl NetHost {
             debug!("guest {peer} is sent away: {error}");
             self.session.disconnect(peer, DisconnectReason::Lost);
             self.endpoint.close(peer, DisconnectReason::Lost, "messages are not read");
-        }
-    }
-
-    /// Sends a message to all guests in the session.
-    fn tell_all(&mut self, message: &Bytes) {
-        let inside: Vec<PeerId> =
-            self.guests.iter().filter(|(_, guest)| guest.entity.is_some()).map(|(&peer, _)| peer).collect();
-        for peer in inside {
-            self.send_message(peer, message.clone());
-        }
-    }
-
-    /// Sends a body's transform to all guests, or to one that has just joined.
-    fn tell_place(&mut self, placement: Placement, to: Option<PeerId>) {
-        match to {
-            None => self.tell_all(&placement.to_message()),
-            Some(peer) => self.send_message(peer, placement.to_message()),
         }
     }
 
@@ -297,9 +277,7 @@ impl NetHost {
             sum.add(&link, &transport);
         }
         let open = self.guests.keys().filter_map(|&peer| Some((peer, self.endpoint.stats(peer)?)));
-        let mut totals = self.session.totals();
-        totals.rejected += self.rejected;
-        sum.count(&totals, &self.ledger.sum(open));
+        sum.count(&self.session.totals(), &self.ledger.sum(open));
         sum
     }
 }

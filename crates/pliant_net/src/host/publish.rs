@@ -8,12 +8,12 @@ use bevy::prelude::*;
 use bevy::tasks::{AsyncComputeTaskPool, block_on, poll_once};
 use pliant_body::{BodyState, Driven, Grab, GrabForce, Grabs, PliantTick};
 use pliant_modal::ModalModel;
-use pliant_stream::{BodyId, GrabKey, GrabState, Pose, StepSettings, TickState, UserId};
+use pliant_stream::{BodyId, GrabKey, GrabState, Pose, StepSettings, TickState, UserId, UserLinkInfo};
 
 use super::NetHost;
 use super::hands::GuestGrab;
-use crate::scene::{self, Placement, Reach, SharedBody};
-use crate::session_transform::SessionTransform;
+use crate::session_transform::{SessionTransform, placement_of};
+use crate::shared_body::SharedBody;
 use crate::user::{User, UserLink};
 
 pub(super) struct HostedBody {
@@ -155,7 +155,7 @@ impl NetHost {
                 // The frames of a free body contain its pose.
                 if hosted.placed != *transform && !model.is_free() {
                     hosted.placed = *transform;
-                    self.tell_place(Placement::new(id, transform), None);
+                    self.place(id, transform);
                 }
                 return Some(id);
             }
@@ -173,13 +173,20 @@ impl NetHost {
                     entity,
                     HostedBody { id, model, settings, told: now, placed: *transform, faulted: false },
                 );
-                self.tell_place(Placement::new(id, transform), None);
+                self.place(id, transform);
                 Some(id)
             }
             Err(error) => {
                 warn_once!("a body is not shared: {error}");
                 None
             }
+        }
+    }
+
+    /// Sends a body's transform to the guests.
+    fn place(&mut self, body: BodyId, transform: &GlobalTransform) {
+        if let Err(error) = self.session.set_placement(body, placement_of(transform)) {
+            debug!("the place of body {body} was not sent: {error}");
         }
     }
 
@@ -229,12 +236,12 @@ pub(crate) fn finish(host: Option<ResMut<NetHost>>, mut links: Query<(&User, &mu
     // this per second.
     let now = host.now();
     let pause = Duration::from_secs(1).mul_f64((host.numbers.len() as f64 / 32.0).max(1.0));
-    if now.saturating_sub(host.reaches_said) >= pause && host.numbers.len() > 2 {
-        host.reaches_said = now;
-        let reaches: Vec<Reach> = inside()
-            .filter_map(|(_, entity)| links.get(entity).ok())
-            .map(|(user, link)| Reach::new(user.id, link))
+    if now.saturating_sub(host.links_sent) >= pause && host.numbers.len() > 2 {
+        host.links_sent = now;
+        let all = inside().filter_map(|(_, entity)| links.get(entity).ok());
+        let all = all
+            .map(|(user, link)| UserLinkInfo::new(user.id, link.round_trip, link.loss_in, link.loss_out))
             .collect();
-        host.tell_all(&scene::reaches_message(&reaches));
+        host.session.send_links(all);
     }
 }

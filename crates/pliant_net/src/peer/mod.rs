@@ -20,12 +20,12 @@ use pliant_stream::peer::{PeerConfig as SessionConfig, PeerSession, Repair};
 use pliant_stream::{BodyId, LinkStats, PeerId, UserId};
 
 use crate::metrics::{Ledger, NetStats};
-use crate::scene::{self, SharedBody};
+use crate::shared_body::SharedBody;
 use crate::transport::{
     Emulation, Endpoint, Fingerprint, HostOptions, Identity, Invite, JoinOptions, Limits, PeerStats, Role,
     TransportError,
 };
-use crate::user::{User, UserLink, Yourself};
+use crate::user::{User, UserLink, Yourself, shortened};
 use mesh::Other;
 use message::Scene;
 use play::{PlayedBody, SentGrab};
@@ -267,7 +267,7 @@ impl NetPeer {
         let step = Duration::from_nanos(self.scene.step_ns).as_secs_f64();
         let config = SessionConfig {
             user,
-            name: scene::shortened(&self.config.name).to_owned(),
+            name: shortened(&self.config.name).to_owned(),
             step,
             repair: self.config.repair,
             idle_timeout: self.limits.idle_timeout,
@@ -289,7 +289,7 @@ impl NetPeer {
         }
         self.remember(self.listening.fingerprint(), user);
         self.state = PeerState::In { user };
-        let you = User::new(user, scene::shortened(&self.config.name), Role::Hold);
+        let you = User::new(user, shortened(&self.config.name), Role::Hold);
         info!("among the peers as {}, user {}", you.name, user.0);
         let you = world.spawn((you, UserLink::default(), Yourself)).id();
         self.users.insert(user, you);

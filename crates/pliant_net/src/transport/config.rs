@@ -12,38 +12,11 @@ use super::emulated::Emulation;
 use super::endpoint::TransportError;
 use super::identity::{AnyGuest, Identity, PinnedHost};
 use super::invite::Token;
+use pliant_stream::Role;
 
 /// The application protocol and its version. The handshake negotiates it and refuses another
 /// version.
 pub const ALPN: &[u8] = b"pliant/2";
-
-/// What a user may do.
-#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Hash, PartialOrd, Ord)]
-pub enum Role {
-    /// The user may see the bodies and hold them. Default.
-    #[default]
-    Hold,
-    /// The user may only see the bodies, and its grabs are refused. A watcher costs its datagrams
-    /// and nothing else.
-    Watch,
-}
-
-impl Role {
-    pub(crate) fn to_byte(self) -> u8 {
-        match self {
-            Self::Hold => 0,
-            Self::Watch => 1,
-        }
-    }
-
-    pub(crate) fn from_byte(byte: u8) -> Option<Self> {
-        match byte {
-            0 => Some(Self::Hold),
-            1 => Some(Self::Watch),
-            _ => None,
-        }
-    }
-}
 
 /// The role that a token grants, and the time of expiry.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]

@@ -10,7 +10,7 @@ use std::task::Poll;
 use std::time::{Duration, Instant, SystemTime};
 
 use bytes::Bytes;
-use pliant_stream::{DisconnectReason, PeerId};
+use pliant_stream::{DisconnectReason, PeerId, Role};
 use quinn::{
     ClientConfig, Connection, ConnectionError, EndpointConfig, Incoming, RecvStream, Runtime,
     SendDatagramError, SendStream, ServerConfig, TokioRuntime, TransportErrorCode, VarInt,
@@ -20,7 +20,6 @@ use tokio::sync::Notify;
 use tokio::time::{sleep, timeout};
 use tracing::debug;
 
-use super::config::Role;
 use super::congestion::Bucket;
 use super::emulated::Emulated;
 use super::endpoint::{CloseReason, Event, Peer, Shared, TransportError};

@@ -9,12 +9,12 @@ use std::thread::JoinHandle;
 use std::time::{Duration, Instant};
 
 use bytes::Bytes;
-use pliant_stream::{DisconnectReason, PeerId};
+use pliant_stream::{DisconnectReason, PeerId, Role};
 use thiserror::Error;
 use tokio::sync::Notify;
 
 use super::Emulation;
-use super::config::{Access, HostOptions, JoinOptions, Limits, Role};
+use super::config::{Access, HostOptions, JoinOptions, Limits};
 use super::driver::{self, Side};
 use super::emulated::Emulator;
 use super::identity::{Fingerprint, Identity, IdentityError};

@@ -28,11 +28,11 @@ mod queue;
 mod stats;
 mod wire;
 
-pub use config::{ALPN, Access, Grant, HostOptions, JoinOptions, Limits, Role};
+pub use config::{ALPN, Access, Grant, HostOptions, JoinOptions, Limits};
 pub use congestion::RateCap;
 pub use emulated::Emulation;
 pub use endpoint::{CloseReason, Endpoint, Event, SendError, TransportError};
 pub use identity::{Fingerprint, Identity, IdentityError};
 pub use invite::{Invite, InviteError, Token};
-pub use pliant_stream::PeerId;
+pub use pliant_stream::{PeerId, Role};
 pub use stats::{DropCounts, PeerStats};

@@ -15,7 +15,7 @@ use crate::StreamError;
 use crate::clock::ClockEstimate;
 use crate::link::{Events, Link, micros};
 use crate::newmark::Newmark;
-use crate::state::{BodyId, PeerId, UserId};
+use crate::state::{BodyId, PeerId, UserId, UserInfo, UserLinkInfo};
 use crate::wire::{
     Clock, Datagram, GuestMessage, HostMessage, MAX_BODIES, MAX_CACHED, MAX_NAME, PROTOCOL_VERSION,
 };
@@ -50,7 +50,8 @@ pub struct GuestSession {
     pub(super) announced: BTreeSet<[u8; 32]>,
     pub(super) bodies: BTreeMap<BodyId, BodyView>,
     stalled: BTreeSet<BodyId>,
-    users: BTreeMap<UserId, String>,
+    users: BTreeMap<UserId, UserInfo>,
+    links: BTreeMap<UserId, UserLinkInfo>,
     pub(super) grabs: BTreeMap<u16, OwnGrab>,
     pub(super) next_grab: u16,
     pub(super) input: u32,
@@ -88,6 +89,7 @@ impl GuestSession {
             bodies: BTreeMap::new(),
             stalled: BTreeSet::new(),
             users: BTreeMap::new(),
+            links: BTreeMap::new(),
             grabs: BTreeMap::new(),
             next_grab: 0,
             input: 0,
@@ -169,9 +171,27 @@ impl GuestSession {
         self.bodies.values()
     }
 
-    /// Iterates over the other users in the session.
-    pub fn users(&self) -> impl Iterator<Item = (UserId, &str)> {
-        self.users.iter().map(|(u, n)| (*u, n.as_str()))
+    /// Iterates over the other users in the session, with the user at the host if there is one.
+    pub fn users(&self) -> impl Iterator<Item = &UserInfo> {
+        self.users.values()
+    }
+
+    /// Iterates over the links of the other users in the session, as the host last described them.
+    pub fn links(&self) -> impl Iterator<Item = &UserLinkInfo> {
+        self.links.values()
+    }
+
+    /// Limits how many modes of a body the host sends, for a body that is small or out of view.
+    ///
+    /// The host rounds the limit up to the next of 1, 2, 3, 4, 6, 8, 12 and so on. With 0 it sends
+    /// nothing of the body, and `None`, the default, removes the limit. A message is sent when the
+    /// limit changes. Returns false for an unknown body.
+    pub fn set_interest(&mut self, body: BodyId, modes: Option<u16>) -> bool {
+        let Some(view) = self.bodies.get_mut(&body) else { return false };
+        if std::mem::replace(&mut view.interest, modes) != modes {
+            self.message(&GuestMessage::Interest { body: body.0, modes });
+        }
+        true
     }
 
     /// Metrics of the connection.
@@ -233,7 +253,7 @@ impl GuestSession {
                 }
                 self.newmark = Newmark { h: step_ns as f64 * 1e-9, beta, gamma };
                 self.standing = Standing::In(UserId(user));
-                self.users = users.into_iter().map(|(u, n)| (UserId(u), n)).collect();
+                self.users = users.into_iter().map(|info| (info.user, info)).collect();
                 self.next_ping = now;
                 self.event(GuestEvent::Welcomed { user: UserId(user) });
             }
@@ -298,12 +318,26 @@ impl GuestSession {
                 }
                 self.ask(now, body);
             }
-            HostMessage::UserJoined { user, name } => {
-                self.users.insert(UserId(user), name.clone());
-                self.event(GuestEvent::UserJoined { user: UserId(user), name });
+            HostMessage::BodyPlaced { body, placement } => {
+                let body = BodyId(body);
+                let Some(view) = self.bodies.get_mut(&body) else { return };
+                view.placement = Some(placement);
+                self.event(GuestEvent::BodyPlaced { body, placement });
+            }
+            HostMessage::Links(links) => {
+                for link in links {
+                    if self.users.contains_key(&link.user) {
+                        self.links.insert(link.user, link);
+                    }
+                }
+            }
+            HostMessage::UserJoined(info) => {
+                self.users.insert(info.user, info.clone());
+                self.event(GuestEvent::UserJoined(info));
             }
             HostMessage::UserLeft { user } => {
                 self.users.remove(&UserId(user));
+                self.links.remove(&UserId(user));
                 self.event(GuestEvent::UserLeft { user: UserId(user) });
             }
             HostMessage::GrabRefused { grab } => {

@@ -10,7 +10,7 @@ use crate::newmark::Newmark;
 use crate::playout::PlayoutClock;
 use crate::recovery::{HISTORY, Policy, Receiver, RecoveryConfig, RepairCounts, VisualGrab};
 use crate::replica::Replica;
-use crate::state::{BodyId, Pose, State, Tick, UserId};
+use crate::state::{BodyId, Placement, Pose, State, Tick, UserId};
 use crate::wire::{BodyInfo, Frame, MAX_NACK_RUNS, Nack, NackRun, Payload, SnapshotBytes};
 
 /// Largest number of frames that wait for the snapshot.
@@ -34,6 +34,9 @@ struct Ask {
 pub struct BodyView {
     pub(crate) id: BodyId,
     pub(crate) info: BodyInfo,
+    pub(crate) placement: Option<Placement>,
+    /// The limit of modes that the host was sent.
+    pub(crate) interest: Option<u16>,
     pub(crate) model: Option<Arc<ModalModel>>,
     pub(crate) receiver: Option<Receiver>,
     pub(crate) playout: PlayoutClock,
@@ -64,6 +67,8 @@ impl BodyView {
         Self {
             id: BodyId(info.body),
             info,
+            placement: None,
+            interest: None,
             model: None,
             receiver: None,
             playout: PlayoutClock::new(newmark.h, config.playout),
@@ -95,6 +100,11 @@ impl BodyView {
     /// Description of the body by the host.
     pub fn info(&self) -> &BodyInfo {
         &self.info
+    }
+
+    /// Where the host has placed an anchored body; `None` before the host has said so.
+    pub fn placement(&self) -> Option<Placement> {
+        self.placement
     }
 
     /// The model of the body, after its download.

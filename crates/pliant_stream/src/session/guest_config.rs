@@ -7,7 +7,7 @@ use pliant_modal::ModalModel;
 
 use super::DisconnectReason;
 use crate::recovery::RecoveryConfig;
-use crate::state::{BodyId, UserId};
+use crate::state::{BodyId, Placement, UserId, UserInfo};
 
 /// Settings of a guest.
 #[derive(Debug, Clone, PartialEq)]
@@ -96,6 +96,13 @@ pub enum GuestEvent {
         /// The body.
         body: BodyId,
     },
+    /// The host placed an anchored body, or moved it.
+    BodyPlaced {
+        /// The body.
+        body: BodyId,
+        /// Where it is.
+        placement: Placement,
+    },
     /// A body left the session.
     BodyGone {
         /// The body.
@@ -112,12 +119,7 @@ pub enum GuestEvent {
         body: BodyId,
     },
     /// Another user joined.
-    UserJoined {
-        /// User number.
-        user: UserId,
-        /// Display name.
-        name: String,
-    },
+    UserJoined(UserInfo),
     /// Another user left.
     UserLeft {
         /// User number.

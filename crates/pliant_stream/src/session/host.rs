@@ -14,8 +14,10 @@ use crate::StreamError;
 use crate::codec::encoder::Encoder;
 use crate::link::Events;
 use crate::newmark::Newmark;
-use crate::state::{BodyId, GrabKey, PeerId, Tick, UserId};
-use crate::wire::{BodyInfo, Datagram, GuestMessage, HostMessage, PROTOCOL_VERSION, StreamSubscription};
+use crate::state::{BodyId, GrabKey, PeerId, Placement, Role, Tick, UserId, UserInfo, UserLinkInfo};
+use crate::wire::{
+    BodyInfo, Datagram, GuestMessage, HostMessage, MAX_NAME, PROTOCOL_VERSION, StreamSubscription,
+};
 
 /// Key of an encoder: the subscription and the datagram size in bytes.
 pub(super) type StreamKey = (StreamSubscription, usize);
@@ -28,6 +30,7 @@ pub(super) struct HostBody {
     pub(super) bytes: Arc<[u8]>,
     pub(super) hash: [u8; 32],
     pub(super) settings: StepSettings,
+    pub(super) placement: Option<Placement>,
     pub(super) last: Option<Tick>,
     pub(super) resting: bool,
     pub(super) reminded: Duration,
@@ -55,6 +58,8 @@ impl HostBody {
 #[derive(Debug)]
 pub struct HostSession {
     pub(super) config: HostConfig,
+    /// The user at the host, if there is one.
+    host_user: Option<UserInfo>,
     pub(super) peers: BTreeMap<PeerId, Peer>,
     pub(super) bodies: BTreeMap<BodyId, HostBody>,
     pub(super) out: VecDeque<Output>,
@@ -83,6 +88,7 @@ impl HostSession {
         }
         Ok(Self {
             config,
+            host_user: None,
             peers: BTreeMap::new(),
             bodies: BTreeMap::new(),
             out: VecDeque::new(),
@@ -97,6 +103,20 @@ impl HostSession {
     /// The settings.
     pub fn config(&self) -> &HostConfig {
         &self.config
+    }
+
+    /// Sets the name of the user at the host, whom guests see as [`UserId::HOST`]. Without a call
+    /// there is no such user. Guests that have joined before the call do not learn of it.
+    ///
+    /// # Errors
+    /// Returns [`StreamError::Config`] for a name over 64 bytes.
+    pub fn set_host_user(&mut self, name: &str) -> Result<(), StreamError> {
+        if name.len() > MAX_NAME {
+            let (what, found) = ("name", name.to_owned());
+            return Err(StreamError::Config { what, found, expected: "at most 64 bytes" });
+        }
+        self.host_user = Some(UserInfo { user: UserId::HOST, role: Role::Hold, name: name.to_owned() });
+        Ok(())
     }
 
     /// Adds a connection whose datagrams carry at most `max_datagram` bytes.
@@ -142,12 +162,12 @@ impl HostSession {
     /// Returns [`StreamError::UnknownPeer`] for an unknown connection and [`StreamError::State`]
     /// when the guest has not asked to join.
     pub fn accept(&mut self, now: Duration, peer: PeerId) -> Result<UserId, StreamError> {
-        self.accept_as(now, peer, None)
+        self.accept_as(now, peer, None, Role::Hold)
     }
 
-    /// Accepts a guest that has asked to join, under the number that it had `before`. This is for a
-    /// guest that reconnects. When the number is in use, or is the host's own, the guest gets a new
-    /// number.
+    /// Accepts a guest that has asked to join, under the number that it had `before`, in a role.
+    /// The number is for a guest that reconnects. When it is in use, or is the host's own, the
+    /// guest gets a new number. The grabs of a guest that may only watch are refused.
     ///
     /// # Errors
     /// Returns the errors of [`HostSession::accept`].
@@ -156,6 +176,7 @@ impl HostSession {
         now: Duration,
         peer: PeerId,
         before: Option<UserId>,
+        role: Role,
     ) -> Result<UserId, StreamError> {
         let p = self.peers.get(&peer).ok_or(StreamError::UnknownPeer(peer))?;
         if p.standing != Standing::Asking {
@@ -165,7 +186,7 @@ impl HostSession {
                 needed: "a peer that has asked to join",
             });
         }
-        self.admit(now, peer, before);
+        self.admit(now, peer, before, role);
         self.peers.get(&peer).and_then(Peer::user).ok_or(StreamError::UnknownPeer(peer))
     }
 
@@ -296,6 +317,14 @@ impl HostSession {
         let Some(p) = self.peers.get_mut(&peer) else { return };
         p.link.receive_message(now, bytes.len());
         let message = match GuestMessage::decode(bytes) {
+            // A guest may change its interest in every body at once, so these messages have a
+            // budget of their own. Beyond it they have no effect.
+            Ok(GuestMessage::Interest { body, modes }) if p.user().is_some() => {
+                if p.interest_budget.spend(now, 1.0) {
+                    self.set_interest(peer, BodyId(body), modes);
+                }
+                return;
+            }
             Ok(m) if p.message_budget.spend(now, 1.0) => m,
             _ => {
                 p.link.reject();
@@ -317,7 +346,7 @@ impl HostSession {
                 p.cached = cached.into_iter().collect();
                 p.standing = Standing::Asking;
                 if self.config.open {
-                    self.admit(now, peer, None);
+                    self.admit(now, peer, None, Role::Hold);
                 } else {
                     let name = p.name.clone();
                     self.event(HostEvent::JoinRequest { peer, name });
@@ -329,7 +358,8 @@ impl HostSession {
                 let vertices = self.bodies.get(&body).map_or(0, |b| b.model.surface().positions().len());
                 // The budget limits new patches, since each costs every encoder of the body a
                 // table.
-                let fits = (vertex as usize) < vertices
+                let fits = p.role == Role::Hold
+                    && (vertex as usize) < vertices
                     && p.grab_budget.spend(now, 1.0)
                     && p.grabs.len() < MAX_GUEST_GRABS
                     && !p.grabs.contains_key(&grab);
@@ -416,7 +446,7 @@ impl HostSession {
         self.events.push(event);
     }
 
-    fn admit(&mut self, now: Duration, peer: PeerId, before: Option<UserId>) {
+    fn admit(&mut self, now: Duration, peer: PeerId, before: Option<UserId>, role: Role) {
         let taken: BTreeSet<u16> = self.peers.values().filter_map(|p| p.user().map(|u| u.0)).collect();
         let free = |number: u16| number != 0 && !taken.contains(&number);
         let number = match before.map(|user| user.0).filter(|&number| free(number)) {
@@ -432,10 +462,11 @@ impl HostSession {
             }
         };
         let user = UserId(number);
-        let users: Vec<(u16, String)> =
-            self.peers.values().filter_map(|p| p.user().map(|u| (u.0, p.name.clone()))).collect();
+        let users = self.host_user.clone().into_iter().chain(self.peers.values().filter_map(Peer::info));
+        let users: Vec<UserInfo> = users.collect();
         let Some(p) = self.peers.get_mut(&peer) else { return };
         p.standing = Standing::Joined(user);
+        p.role = role;
         p.link.received_at(now);
         let Newmark { h, beta, gamma } = self.config.newmark;
         let step_ns = (h * 1e9).round() as u64;
@@ -443,14 +474,22 @@ impl HostSession {
             HostMessage::Welcome { version: PROTOCOL_VERSION, user: number, step_ns, beta, gamma, users };
         p.send_message(&welcome, &mut self.out);
         let name = p.name.clone();
+        let joined = HostMessage::UserJoined(UserInfo { user, role, name: name.clone() });
         for other in self.peers.values_mut().filter(|p| p.id != peer && p.user().is_some()) {
-            let told = HostMessage::UserJoined { user: number, name: name.clone() };
-            other.send_message(&told, &mut self.out);
+            other.send_message(&joined, &mut self.out);
         }
         self.event(HostEvent::Joined { peer, user, name });
         let bodies: Vec<BodyId> = self.bodies.keys().copied().collect();
         for body in bodies {
             self.announce(peer, body);
+        }
+    }
+
+    /// Sends the quality of the host's links to all guests in the session.
+    pub fn send_links(&mut self, links: Vec<UserLinkInfo>) {
+        let message = HostMessage::Links(links);
+        for peer in self.peers.values_mut().filter(|p| p.user().is_some()) {
+            peer.send_message(&message, &mut self.out);
         }
     }
 

@@ -10,7 +10,7 @@ use super::host::{HostBody, HostSession};
 use super::host_config::HostEvent;
 use super::host_peer::Transfer;
 use crate::StreamError;
-use crate::state::{BodyId, GrabKey, MAX_MODES, PeerId};
+use crate::state::{BodyId, GrabKey, MAX_MODES, PeerId, Placement};
 use crate::wire::HostMessage;
 
 impl HostSession {
@@ -66,6 +66,7 @@ impl HostSession {
             hash: model.hash().0,
             model,
             settings,
+            placement: None,
             last: None,
             resting: false,
             reminded: Duration::ZERO,
@@ -105,6 +106,27 @@ impl HostSession {
         Ok(())
     }
 
+    /// Places an anchored body in the host's world, and notifies the guests that have the body.
+    ///
+    /// # Errors
+    /// Returns [`StreamError::UnknownBody`] for an unknown body and [`StreamError::NotFinite`] for
+    /// a placement that is not valid ([`Placement::is_valid`]).
+    pub fn set_placement(&mut self, body: BodyId, placement: Placement) -> Result<(), StreamError> {
+        if !placement.is_valid() {
+            return Err(StreamError::NotFinite { what: "placement" });
+        }
+        let entry = self.bodies.get_mut(&body).ok_or(StreamError::UnknownBody(body))?;
+        if entry.placement == Some(placement) {
+            return Ok(());
+        }
+        entry.placement = Some(placement);
+        let message = HostMessage::BodyPlaced { body: body.0, placement };
+        for p in self.peers.values_mut().filter(|p| p.announced.contains(&body)) {
+            p.send_message(&message, &mut self.out);
+        }
+        Ok(())
+    }
+
     /// Removes a body from the session. Its grabs end.
     pub fn remove_body(&mut self, body: BodyId) {
         if self.bodies.remove(&body).is_none() {
@@ -133,6 +155,9 @@ impl HostSession {
         let (Some(p), Some(b)) = (self.peers.get_mut(&peer), self.bodies.get(&body)) else { return };
         let Some(info) = b.info(p) else { return };
         p.send_message(&HostMessage::BodyAdded(info), &mut self.out);
+        if let Some(placement) = b.placement {
+            p.send_message(&HostMessage::BodyPlaced { body: body.0, placement }, &mut self.out);
+        }
         if !p.cached.contains(&b.hash) && !p.transfers.iter().any(|t| t.hash == b.hash) {
             p.transfers.push_back(Transfer { hash: b.hash, bytes: b.bytes.clone(), offset: 0 });
         }

@@ -7,8 +7,8 @@ use std::time::Duration;
 use super::regulator::Regulator;
 use super::{DisconnectReason, Output};
 use crate::link::{Budget, Link, micros};
-use crate::state::{BodyId, PeerId, Tick, UserId};
-use crate::wire::{Clock, Datagram, HostMessage, StreamSubscription};
+use crate::state::{BodyId, PeerId, Role, Tick, UserId, UserInfo};
+use crate::wire::{Clock, Datagram, HostMessage, MAX_BODIES, StreamSubscription};
 
 /// Largest number of grabs of one guest.
 pub(crate) const MAX_GUEST_GRABS: usize = 16;
@@ -48,6 +48,7 @@ pub(crate) struct Peer {
     pub(crate) link: Link,
     pub(crate) standing: Standing,
     pub(crate) name: String,
+    pub(crate) role: Role,
     pub(crate) subscription: Option<StreamSubscription>,
     pub(crate) cached: BTreeSet<[u8; 32]>,
     pub(crate) transfers: VecDeque<Transfer>,
@@ -70,6 +71,8 @@ pub(crate) struct Peer {
     pub(crate) message_budget: Budget,
     /// Budget for new grabs.
     pub(crate) grab_budget: Budget,
+    /// Budget for changes of interest.
+    pub(crate) interest_budget: Budget,
     pub(crate) regulator: Regulator,
 }
 
@@ -80,6 +83,7 @@ impl Peer {
             link: Link::new(id, now, max_datagram),
             standing: Standing::Silent,
             name: String::new(),
+            role: Role::Hold,
             subscription: None,
             cached: BTreeSet::new(),
             transfers: VecDeque::new(),
@@ -98,6 +102,8 @@ impl Peer {
             message_budget: Budget::new(200.0, 400.0),
             // A sliding hand begins a new grab each tick. The budget covers this rate and a burst.
             grab_budget: Budget::new(60.0, 120.0),
+            // One for each of the most bodies that a session may have.
+            interest_budget: Budget::new(100.0, MAX_BODIES as f64),
             regulator: Regulator::default(),
         }
     }
@@ -107,6 +113,11 @@ impl Peer {
             Standing::Joined(user) => Some(user),
             Standing::Silent | Standing::Asking => None,
         }
+    }
+
+    /// Describes the guest to the others; `None` before it has joined.
+    pub(crate) fn info(&self) -> Option<UserInfo> {
+        Some(UserInfo { user: self.user()?, role: self.role, name: self.name.clone() })
     }
 
     /// Sends a frame that was encoded for several guests. Returns false when the frame is longer

@@ -6,7 +6,7 @@ use serde::{Deserialize, Serialize};
 use super::AccelerationCoding;
 use crate::StreamError;
 use crate::session::{DisconnectReason, MAX_MESSAGE};
-use crate::state::{MAX_GRABS, MAX_MODES, TICK_LIMIT, in_range};
+use crate::state::{MAX_GRABS, MAX_MODES, Placement, TICK_LIMIT, UserInfo, UserLinkInfo, in_range};
 
 /// Longest name of a user or a body, bytes of UTF-8.
 pub(crate) const MAX_NAME: usize = 64;
@@ -117,6 +117,13 @@ pub enum GuestMessage {
         /// The body.
         body: u16,
     },
+    /// Limits how many modes of a body the host sends.
+    Interest {
+        /// The body.
+        body: u16,
+        /// The limit; 0 sends nothing, and `None` sends what the guest subscribed to.
+        modes: Option<u16>,
+    },
     /// The last message.
     Goodbye {
         /// The reason.
@@ -139,12 +146,19 @@ pub enum HostMessage {
         beta: f64,
         /// Newmark's gamma of the acceleration streams.
         gamma: f64,
-        /// Users in the session: number and name.
-        users: Vec<(u16, String)>,
+        /// The other users in the session.
+        users: Vec<UserInfo>,
     },
     /// A body joins the session, or its step settings change. Its model follows if the guest lacks
     /// it, then a snapshot.
     BodyAdded(BodyInfo),
+    /// The host has placed an anchored body, after its [`HostMessage::BodyAdded`].
+    BodyPlaced {
+        /// The body.
+        body: u16,
+        /// Where it is.
+        placement: Placement,
+    },
     /// A body leaves the session.
     BodyRemoved {
         /// The body.
@@ -164,17 +178,14 @@ pub enum HostMessage {
     /// The state of a body.
     Snapshot(SnapshotBytes),
     /// A user joined.
-    UserJoined {
-        /// User number.
-        user: u16,
-        /// Display name.
-        name: String,
-    },
+    UserJoined(UserInfo),
     /// A user left.
     UserLeft {
         /// User number.
         user: u16,
     },
+    /// Quality of the host's links to its guests.
+    Links(Vec<UserLinkInfo>),
     /// The host refused or ended a grab.
     GrabRefused {
         /// The guest's number for the grab.
@@ -217,6 +228,10 @@ fn check(
     if ok { Ok(()) } else { Err(StreamError::Invalid { what, found: found.to_string(), expected }) }
 }
 
+fn check_user(user: &UserInfo) -> Result<(), StreamError> {
+    check("name", user.name.len() <= MAX_NAME, user.name.len(), "at most 64 bytes")
+}
+
 impl GuestMessage {
     /// Encodes this message.
     pub fn encode(&self) -> Vec<u8> {
@@ -244,7 +259,10 @@ impl GuestMessage {
                 }
                 *hold = hold.capped();
             }
-            Self::GrabEnd { .. } | Self::SnapshotRequest { .. } | Self::Goodbye { .. } => {}
+            Self::GrabEnd { .. }
+            | Self::SnapshotRequest { .. }
+            | Self::Interest { .. }
+            | Self::Goodbye { .. } => {}
         }
         Ok(message)
     }
@@ -267,9 +285,7 @@ impl HostMessage {
                 check("step", (10_000..=1_000_000_000).contains(step_ns), step_ns, "10 us to 1 s")?;
                 check("beta", (0.0..=1.0).contains(beta), beta, "0..=1")?;
                 check("gamma", (0.0..=1.0).contains(gamma), gamma, "0..=1")?;
-                for (_, name) in users {
-                    check("name", name.len() <= MAX_NAME, name.len(), "at most 64 bytes")?;
-                }
+                users.iter().try_for_each(check_user)?;
             }
             Self::BodyAdded(info) => {
                 check("name", info.name.len() <= MAX_NAME, info.name.len(), "at most 64 bytes")?;
@@ -297,12 +313,15 @@ impl HostMessage {
                 let finite = finite && s.a.iter().chain(&s.load).all(|x| x.is_finite() && x.abs() < 1e15);
                 check("snapshot", finite, "a number out of range", "finite numbers")?;
             }
-            Self::UserJoined { name, .. } => {
-                check("name", name.len() <= MAX_NAME, name.len(), "at most 64 bytes")?;
+            Self::BodyPlaced { placement, .. } => {
+                let expected = "a unit quaternion, a scale above 1e-6 and numbers below 1e6";
+                check("placement", placement.is_valid(), format!("{placement:?}"), expected)?;
             }
+            Self::UserJoined(user) => check_user(user)?,
             Self::BodyRemoved { .. }
             | Self::ModelChunk { .. }
             | Self::UserLeft { .. }
+            | Self::Links(_)
             | Self::GrabRefused { .. }
             | Self::Goodbye { .. } => {}
         }
