@@ -7,6 +7,7 @@ mod impulses;
 mod load;
 pub mod model;
 mod pausing;
+#[cfg(feature = "picking")]
 mod pointer;
 mod settings;
 mod stepping;
