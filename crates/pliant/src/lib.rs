@@ -22,7 +22,7 @@
 //! | Plugin | What it does | Without it |
 //! | --- | --- | --- |
 //! | [`PliantBodyPlugin`](body::PliantBodyPlugin) | `.modal` assets, [`ModalBody`](body::ModalBody), grabs, the fixed step, the deformed surface | no other plugin works |
-//! | [`PointerGrabPlugin`](body::PointerGrabPlugin) | the pointer drags bodies | only code makes grabs |
+//! | [`PointerGrabPlugin`](body::PointerGrabPlugin) | pointers drag bodies (feature `picking`) | only code makes grabs |
 //!
 //! These plugins are added where they are needed, each behind its feature:
 //!
@@ -126,9 +126,10 @@ impl Default for PliantPlugins {
 
 impl PluginGroup for PliantPlugins {
     fn build(self) -> PluginGroupBuilder {
-        PluginGroupBuilder::start::<Self>()
-            .add(body::PliantBodyPlugin::new(self.schedule))
-            .add(body::PointerGrabPlugin)
+        let group = PluginGroupBuilder::start::<Self>().add(body::PliantBodyPlugin::new(self.schedule));
+        #[cfg(feature = "picking")]
+        let group = group.add(body::PointerGrabPlugin);
+        group
     }
 }
 
@@ -137,10 +138,11 @@ pub mod prelude {
     pub use crate::PliantPlugins;
     pub use crate::body::{
         BodyRefused, BodyState, Driven, Grab, GrabForce, GrabOf, Grabs, Impulse, Integrator, ModalAsset,
-        ModalBody, NoPointerGrab, PliantBodyPlugin, PliantDisplaySystems, PliantSystems, PliantTick,
-        PointerGrab, PointerGrabPlugin, PointerGrabSystems, PointerHeld, Push, Relaxation, SingleSteps,
-        StepSettings, VisualState,
+        ModalBody, NoPointerGrab, PliantBodyPlugin, PliantDisplaySystems, PliantSystems, PliantTick, Push,
+        Relaxation, SingleSteps, StepSettings, VisualState,
     };
+    #[cfg(feature = "picking")]
+    pub use crate::body::{PointerGrab, PointerGrabPlugin, PointerGrabSystems, PointerHeld};
     #[cfg(feature = "render")]
     pub use crate::body::{SurfaceDeformation, SurfaceDetail, SurfaceShading};
     #[cfg(all(feature = "haptics", feature = "render"))]

@@ -52,11 +52,13 @@ mod grab;
 mod impulse;
 mod pause;
 mod pick;
+#[cfg(feature = "picking")]
+mod picking;
+#[cfg(feature = "picking")]
 mod pointer;
 mod step;
 #[cfg(test)]
 mod tests;
-mod under_pointer;
 mod visual;
 
 use bevy::{
@@ -80,9 +82,9 @@ pub use impulse::{Impulse, Push};
 pub use pause::SingleSteps;
 pub use pick::{SurfaceHit, pick_surface};
 pub use pliant_modal::{Integrator, Relaxation, StepSettings};
+#[cfg(feature = "picking")]
 pub use pointer::{PointerGrab, PointerGrabPlugin, PointerGrabSystems, PointerHeld};
 pub use step::PliantTick;
-pub use under_pointer::{PointerHit, UnderPointer};
 pub use visual::{Pose, VisualState};
 
 /// Diagnostic: time of one tick's steps of all awake bodies, ms.
@@ -122,6 +124,16 @@ pub enum PliantDisplaySystems {
 ///
 /// The plugin needs Bevy's asset, time and transform plugins. `DefaultPlugins` contains them. A
 /// headless app needs `MinimalPlugins`, `AssetPlugin` and `TransformPlugin`.
+///
+/// With the feature `picking` the bodies are a backend of Bevy's picking: they receive the
+/// [`Pointer`](bevy::picking::events::Pointer) events of the mouse, of touches and of every other
+/// pointer, and [`Pickable`](bevy::picking::Pickable) works as for any entity. A hit is tested
+/// against the deformed surface as it is drawn. It carries the point and the normal, world axes, and
+/// as [`extra_as`](bevy::picking::backend::HitData::extra_as) the [`SurfaceHit`] in the body's axes.
+/// A camera picks the bodies whose render layers it shares. Hidden bodies and bodies with
+/// [`NoPointerGrab`] are not picked. The cost of a frame is one test of a box for each pair of a
+/// pointer's ray and a body; a body whose box is hit adds one reconstruction of its surface on the
+/// processor and one pass over its triangles. Without Bevy's `PickingPlugin` there is no cost.
 pub struct PliantBodyPlugin {
     schedule: InternedScheduleLabel,
 }
@@ -146,6 +158,8 @@ impl Default for PliantBodyPlugin {
 
 impl Plugin for PliantBodyPlugin {
     fn build(&self, app: &mut App) {
+        #[cfg(feature = "picking")]
+        picking::build(app);
         let fixed = [
             FixedFirst.intern(),
             FixedPreUpdate.intern(),

@@ -1,26 +1,30 @@
-//! Dragging bodies with the pointer.
+//! Dragging of bodies with pointers.
 
-use bevy::{input::InputSystems, math::DVec3, prelude::*};
+use bevy::{
+    camera::RenderTarget,
+    math::DVec3,
+    picking::{
+        PickingSystems,
+        backend::ray::RayMap,
+        events::{Pointer, Press},
+        pointer::{PointerButton, PointerId, PointerLocation, PointerPress},
+    },
+    prelude::*,
+    window::PrimaryWindow,
+};
 use pliant_modal::Patch;
 
-use crate::{Grab, GrabOf, PointerHit, UnderPointer};
+use crate::{BodyState, Grab, GrabOf, NoPointerGrab, SurfaceHit, VisualState};
 
-/// Lets the pointer drag bodies.
+/// Lets pointers drag bodies: the mouse, and every finger on a touch screen.
 ///
-/// A press on the deformed surface grabs the body. A drag moves the target in the plane that faces
-/// the camera and contains the pressed point. Releasing the button releases the body. The plugin
-/// makes an ordinary [`Grab`], on remote bodies too.
+/// A press on the deformed surface makes a grab. The target moves in the plane that faces the
+/// camera through the point that was hit. The release of the button or of the finger despawns the
+/// grab. The grab is an ordinary [`Grab`], also on remote bodies.
 ///
-/// An interface that needs the pointer should disable only the press set, so that a drag always
-/// ends:
-///
-/// ```
-/// # use bevy::prelude::*;
-/// # use pliant_body::PointerGrabSystems;
-/// # #[derive(Resource)] struct PanelWantsPointer(bool);
-/// # let mut app = App::new();
-/// app.configure_sets(PreUpdate, PointerGrabSystems::Press.run_if(|panel: Res<PanelWantsPointer>| !panel.0));
-/// ```
+/// The presses are those of Bevy's picking, so the plugin needs `DefaultPickingPlugins`, which is a
+/// part of `DefaultPlugins`. An interface with a picking backend of its own, such as Bevy's UI or
+/// egui, covers the bodies behind it.
 #[derive(Debug, Default, Clone, Copy)]
 pub struct PointerGrabPlugin;
 
@@ -28,43 +32,40 @@ pub struct PointerGrabPlugin;
 #[derive(Resource, Reflect, Debug, Clone, Copy, PartialEq)]
 #[reflect(Resource, Default, Clone, PartialEq)]
 pub struct PointerGrab {
-    /// Whether the pointer can grab. `false` also releases a grabbed body. Default: `true`.
+    /// `false` stops new grabs and ends those that exist. Default: `true`.
     pub enabled: bool,
-    /// Button that grabs. Default: the left button.
-    pub button: MouseButton,
-    /// Radius of the patch as a fraction of the model's size (its largest extent). Default: `0.06`.
+    /// The button that grabs. Default: the primary button, which is also a finger's.
+    pub button: PointerButton,
+    /// Radius of the patch as a fraction of the model's largest extent. Default: `0.06`.
     pub radius: f64,
-    /// Color of the target and of the line to it. A fully transparent color draws nothing. Default:
-    /// a warm yellow.
+    /// Color of the target and of the line to it. Default: a warm yellow. Nothing is drawn in a
+    /// fully transparent color.
     pub color: Color,
 }
 
 impl Default for PointerGrab {
     fn default() -> Self {
-        Self { enabled: true, button: MouseButton::Left, radius: 0.06, color: Color::srgb(1.0, 0.85, 0.25) }
+        let color = Color::srgb(1.0, 0.85, 0.25);
+        Self { enabled: true, button: PointerButton::Primary, radius: 0.06, color }
     }
 }
 
-/// The system sets that make, move and release pointer grabs, in `PreUpdate` after the frame's
-/// input.
+/// The system set that moves and ends pointer grabs, in `PreUpdate` after Bevy's picking.
 #[derive(SystemSet, Debug, Clone, PartialEq, Eq, Hash)]
-pub enum PointerGrabSystems {
-    /// A press on a body makes a grab.
-    Press,
-    /// The target tracks the pointer. Releasing the button despawns the grab.
-    Drag,
-}
+pub struct PointerGrabSystems;
 
-/// Marks a grab that the pointer made, and defines the plane in which its target moves.
+/// Marks a grab that a pointer made.
 #[derive(Component, Reflect, Debug, Clone, Copy, PartialEq)]
 #[reflect(Component, Clone, PartialEq)]
 pub struct PointerHeld {
-    /// The camera through which the pointer grabbed.
+    /// The pointer that holds the body.
+    pub pointer: PointerId,
+    /// The camera through which the body was picked.
     pub camera: Entity,
-    /// A point of the plane: the pressed point of the surface, m, world axes.
+    /// A point of the plane in which the target moves: the point that was hit, m, world axes.
     pub hit: Vec3,
-    /// Offset from the pointer's position in the plane to the target, m. The middle of the patch is
-    /// rarely exactly under the pointer.
+    /// Vector from the pointer's point in the plane to the target, m. It is not zero, because the
+    /// middle of the patch is seldom exactly under the pointer.
     pub offset: DVec3,
     /// Radius of the sphere drawn at the target, m.
     pub mark: f32,
@@ -75,14 +76,9 @@ impl Plugin for PointerGrabPlugin {
         app.register_type::<PointerGrab>()
             .register_type::<PointerHeld>()
             .init_resource::<PointerGrab>()
-            .configure_sets(
-                PreUpdate,
-                (PointerGrabSystems::Press, PointerGrabSystems::Drag).chain().after(InputSystems),
-            )
-            .add_systems(
-                PreUpdate,
-                (press.in_set(PointerGrabSystems::Press), drag.in_set(PointerGrabSystems::Drag)),
-            );
+            .configure_sets(PreUpdate, PointerGrabSystems.after(PickingSystems::Last))
+            .add_observer(press)
+            .add_systems(PreUpdate, drag.in_set(PointerGrabSystems).run_if(resource_exists::<RayMap>));
     }
 
     #[cfg(feature = "render")]
@@ -94,29 +90,35 @@ impl Plugin for PointerGrabPlugin {
 }
 
 fn press(
+    press: On<Pointer<Press>>,
     mut commands: Commands,
     settings: Res<PointerGrab>,
-    buttons: Option<Res<ButtonInput<MouseButton>>>,
-    pointer: UnderPointer,
-    held: Query<(), With<PointerHeld>>,
+    bodies: Query<(&BodyState, &VisualState, &GlobalTransform), Without<NoPointerGrab>>,
+    held: Query<&PointerHeld>,
 ) {
-    let pressed = buttons.is_some_and(|buttons| buttons.just_pressed(settings.button));
-    if !pressed || !settings.enabled || !held.is_empty() {
+    let taken = held.iter().any(|held| held.pointer == press.pointer_id);
+    if !settings.enabled || press.button != settings.button || taken {
         return;
     }
-    let Some(PointerHit { camera, ray, body, hit }) = pointer.body(None) else { return };
-    let Some((state, shown, transform)) = pointer.shape(body) else { return };
-    let positions = state.positions_at(shown.q());
+    // A press on a child of the body bubbles up with a hit that is not the body's.
+    let hit = &press.hit;
+    let (Some(surface), Some(point)) = (hit.extra_as::<SurfaceHit>(), hit.position) else { return };
+    let body = press.original_event_target();
+    if body != press.entity {
+        return;
+    }
+    let Ok((state, visual, place)) = bodies.get(body) else { return };
     let radius = settings.radius.max(0.0) * state.model().size();
-    let Ok(patch) = Patch::around(state.model().surface(), hit.vertex, radius) else { return };
-    let middle = transform.transform_point(middle_of(&patch, &positions).as_vec3());
-    let point = ray.get_point(hit.distance as f32);
+    let Ok(patch) = Patch::around(state.model().surface(), surface.vertex, radius) else { return };
+    let positions = state.positions_at(visual.q());
+    let middle = place.transform_point(middle_of(&patch, &positions).as_vec3());
     let mark = (0.015 * state.model().size() * state.scale()) as f32;
+    let offset = (middle - point).as_dvec3();
     commands.spawn((
         Name::new("pointer grab"),
-        Grab::new(hit.vertex, radius, middle.as_dvec3()),
+        Grab::new(surface.vertex, radius, middle.as_dvec3()),
         GrabOf(body),
-        PointerHeld { camera, hit: point, offset: (middle - point).as_dvec3(), mark },
+        PointerHeld { pointer: press.pointer_id, camera: hit.camera, hit: point, offset, mark },
     ));
 }
 
@@ -128,20 +130,33 @@ fn middle_of(patch: &Patch, positions: &[[f32; 3]]) -> DVec3 {
 fn drag(
     mut commands: Commands,
     settings: Res<PointerGrab>,
-    buttons: Option<Res<ButtonInput<MouseButton>>>,
-    cameras: UnderPointer,
+    pointers: Query<(&PointerId, &PointerLocation, &PointerPress)>,
+    cameras: Query<(&Camera, &RenderTarget, &GlobalTransform)>,
+    primary: Query<Entity, With<PrimaryWindow>>,
     mut held: Query<(Entity, &PointerHeld, &mut Grab)>,
 ) {
-    let down = settings.enabled && buttons.is_some_and(|buttons| buttons.pressed(settings.button));
     for (entity, pointer, mut grab) in &mut held {
-        if !down {
+        // The pointer of a finger is despawned when the finger leaves the screen.
+        let of = pointers.iter().find(|(id, ..)| **id == pointer.pointer);
+        let down = |press: &PointerPress| match settings.button {
+            PointerButton::Primary => press.is_primary_pressed(),
+            PointerButton::Secondary => press.is_secondary_pressed(),
+            PointerButton::Middle => press.is_middle_pressed(),
+        };
+        let Some((_, location, _)) = of.filter(|(.., press)| settings.enabled && down(press)) else {
             commands.entity(entity).despawn();
             continue;
-        }
-        // While the pointer is outside the window, the target stays at its last position.
-        let Some((ray, camera)) = cameras.through(pointer.camera) else { continue };
-        let facing = InfinitePlane3d::new(camera.forward());
-        if let Some(distance) = ray.intersect_plane(pointer.hit, facing) {
+        };
+        // While the pointer is over another window, the target stays where it is.
+        let ray = || {
+            let (camera, target, place) = cameras.get(pointer.camera).ok()?;
+            let location = location.location()?;
+            let here = target.normalize(primary.single().ok())?;
+            let ray = camera.viewport_to_world(place, location.position).ok()?;
+            (here == location.target).then_some((ray, place.forward()))
+        };
+        let Some((ray, forward)) = ray() else { continue };
+        if let Some(distance) = ray.intersect_plane(pointer.hit, InfinitePlane3d::new(forward)) {
             let target = ray.get_point(distance).as_dvec3() + pointer.offset;
             if grab.target != target {
                 grab.target = target;

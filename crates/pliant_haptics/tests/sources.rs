@@ -7,13 +7,17 @@ use std::time::Duration;
 
 use bevy::{
     asset::AssetPlugin,
-    camera::{ComputedCameraValues, RenderTargetInfo},
+    camera::{ComputedCameraValues, RenderTarget, RenderTargetInfo},
     input::{ButtonState, InputPlugin, mouse::MouseButtonInput},
     math::DVec3,
+    picking::{
+        PickingPlugin,
+        pointer::{Location, PointerAction, PointerId, PointerInput},
+    },
     prelude::*,
     time::TimeUpdateStrategy,
     transform::TransformPlugin,
-    window::PrimaryWindow,
+    window::{PrimaryWindow, WindowRef},
 };
 use pliant_body::{ModalAsset, ModalBody, PliantBodyPlugin};
 
@@ -46,12 +50,14 @@ fn scene<S: Component>(place: Transform, motion_scale: f64, source: impl Fn(Posi
         AssetPlugin::default(),
         TransformPlugin,
         InputPlugin,
+        PickingPlugin,
         PliantBodyPlugin::default(),
         HapticsPlugin::default(),
     ))
     .insert_resource(TimeUpdateStrategy::ManualDuration(Duration::from_secs_f64(FRAME)));
     app.finish();
     app.cleanup();
+    app.world_mut().spawn(PointerId::Mouse);
     let device = Positioned::new("input");
     let source = source(device.handle());
     let device = app.world_mut().resource_mut::<HapticDevices>().add(device, LoopConfig::default()).unwrap();
@@ -135,10 +141,13 @@ impl Scene {
     }
 
     /// Puts the pointer at `at`, m from the center of the view in the plane z = 0.
-    fn point(&mut self, window: Entity, at: Option<Vec2>) {
+    fn point(&mut self, window: Entity, at: Vec2) {
         let pixels_a_metre = 300.0 / (2.0 * 0.5f32.tan());
-        let cursor = at.map(|at| Vec2::new(400.0, 300.0) + Vec2::new(at.x, -at.y) * pixels_a_metre);
-        self.app.world_mut().get_mut::<Window>(window).unwrap().set_cursor_position(cursor);
+        let position = Vec2::new(400.0, 300.0) + Vec2::new(at.x, -at.y) * pixels_a_metre;
+        let target = RenderTarget::Window(WindowRef::Entity(window)).normalize(None).unwrap();
+        let action = PointerAction::Move { delta: Vec2::ZERO };
+        let input = PointerInput::new(PointerId::Mouse, Location { target, position }, action);
+        self.app.world_mut().write_message(input);
     }
 
     fn press(&mut self, window: Entity, button: MouseButton, state: ButtonState) {
@@ -158,13 +167,12 @@ fn the_pointer_moves_the_device_to_where_it_points() {
         let mut s = scene(place, scale, PointerSource::new);
         let window = s.window();
         s.comes_to_rest_at(DVec3::ZERO, 1e-9);
-        s.point(window, Some(Vec2::new(0.1, 0.05)));
+        s.point(window, Vec2::new(0.1, 0.05));
         s.comes_to_rest_at(want, 1e-4);
         s.press(window, MouseButton::Left, ButtonState::Pressed);
         s.press(window, MouseButton::Middle, ButtonState::Pressed);
         s.buttons_become(0b101);
-        // The pointer leaves the window. The hand stays where it is, and its buttons come up.
-        s.point(window, None);
+        // The pointer stands still. The hand stays where it is, and its buttons come up.
         s.press(window, MouseButton::Left, ButtonState::Released);
         s.press(window, MouseButton::Middle, ButtonState::Released);
         s.buttons_become(0);
@@ -181,7 +189,7 @@ fn a_press_that_is_somebody_elses_is_not_the_tools_and_one_that_is_ends() {
         .insert_resource(Panel(true))
         .configure_sets(PreUpdate, PointerToolSystems::Press.run_if(|panel: Res<Panel>| !panel.0));
     let window = s.window();
-    s.point(window, Some(Vec2::ZERO));
+    s.point(window, Vec2::ZERO);
     s.press(window, MouseButton::Left, ButtonState::Pressed);
     s.stays("the panel's", |s| s.tick().buttons == 0);
     // The button was pressed on the panel, so it still belongs to the panel after the pointer has
@@ -205,7 +213,7 @@ fn a_press_that_is_somebody_elses_is_not_the_tools_and_one_that_is_ends() {
 fn buttons_come_up_where_the_pointer_points_at_nothing() {
     let mut s = scene(Transform::IDENTITY, 1.0, PointerSource::new);
     let window = s.window();
-    s.point(window, Some(Vec2::new(0.1, 0.05)));
+    s.point(window, Vec2::new(0.1, 0.05));
     s.press(window, MouseButton::Left, ButtonState::Pressed);
     s.buttons_become(1);
     // The camera moves on by 4 m. The tool is then behind the camera, and no ray meets a plane
@@ -228,7 +236,7 @@ fn with_empty_hands_the_pointer_lies_on_the_surface() {
     s.run(5);
     // The block is 4 cm thick, so its face is 2 cm nearer to the camera. The ray there is 1 %
     // nearer to the center of the view.
-    s.point(window, Some(Vec2::new(0.05, 0.0)));
+    s.point(window, Vec2::new(0.05, 0.0));
     s.comes_to_rest_at(DVec3::new(0.0495, 0.0, 0.02), 1e-4);
 }
 

@@ -8,6 +8,7 @@ mod impulses;
 mod load;
 pub mod model;
 mod pausing;
+#[cfg(feature = "picking")]
 mod pointer;
 mod settings;
 mod stepping;

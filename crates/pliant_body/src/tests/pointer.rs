@@ -1,12 +1,22 @@
 use bevy::{
-    camera::{ComputedCameraValues, RenderTargetInfo, visibility::RenderLayers},
+    camera::{
+        ComputedCameraValues, NormalizedRenderTarget, RenderTarget, RenderTargetInfo,
+        visibility::RenderLayers,
+    },
     math::DVec3,
+    picking::{
+        InteractionPlugin, PickingPlugin,
+        events::{Click, Over, Pointer},
+        pointer::{Location, PointerAction, PointerButton, PointerId, PointerInput},
+    },
     prelude::*,
-    window::PrimaryWindow,
+    window::{PrimaryWindow, WindowRef},
 };
 
 use super::{app, model, spawn_with, state, steps};
-use crate::{Driven, Grab, GrabOf, NoPointerGrab, PointerGrab, PointerGrabPlugin, PointerHeld, VisualState};
+use crate::{
+    Driven, Grab, GrabOf, NoPointerGrab, PointerGrab, PointerGrabPlugin, PointerHeld, SurfaceHit, VisualState,
+};
 
 /// Returns a camera over the whole window.
 fn camera(order: isize) -> Camera {
@@ -21,7 +31,8 @@ fn camera(order: isize) -> Camera {
 /// The camera is two meters from the tip of the bar and looks along -z at a window of 800 x 600.
 fn scene() -> (App, Entity, Entity) {
     let mut app = app();
-    app.add_plugins(PointerGrabPlugin).init_resource::<ButtonInput<MouseButton>>();
+    app.add_plugins((PickingPlugin, InteractionPlugin, PointerGrabPlugin));
+    app.world_mut().spawn(PointerId::Mouse);
     let window = Window { resolution: (800, 600).into(), ..Default::default() };
     let window = app.world_mut().spawn((window, PrimaryWindow)).id();
     app.world_mut().spawn((camera(0), Transform::from_xyz(1.0, 0.0, 2.1)));
@@ -34,22 +45,36 @@ fn scene() -> (App, Entity, Entity) {
     (app, window, body)
 }
 
-/// Presses or releases the left button with the pointer at `at`.
-///
-/// `at` is in meters from the middle of the view in the plane z = 0.1, two meters in front of the
-/// camera.
-fn point(app: &mut App, window: Entity, at: Vec2, down: bool) {
+/// Where `at` is in the window. `at` is in meters from the middle of the view in the plane z = 0.1,
+/// two meters in front of the camera.
+fn location(app: &App, window: Entity, at: Vec2) -> Location {
     let pixels_a_metre = 300.0 / (2.0 * 0.5f32.tan());
-    let cursor = Vec2::new(400.0, 300.0) + Vec2::new(at.x, -at.y) * pixels_a_metre;
-    app.world_mut().get_mut::<Window>(window).unwrap().set_cursor_position(Some(cursor));
-    let mut buttons = app.world_mut().resource_mut::<ButtonInput<MouseButton>>();
-    buttons.clear();
-    if down {
-        buttons.press(MouseButton::Left)
-    } else {
-        buttons.release(MouseButton::Left)
+    let position = Vec2::new(400.0, 300.0) + Vec2::new(at.x, -at.y) * pixels_a_metre;
+    assert!(app.world().get::<Window>(window).is_some());
+    let target = RenderTarget::Window(WindowRef::Entity(window)).normalize(None);
+    Location { target: target.unwrap_or(NormalizedRenderTarget::None { width: 0, height: 0 }), position }
+}
+
+/// Moves a pointer to `at`, with its primary button pressed or released.
+fn point_with(app: &mut App, pointer: PointerId, window: Entity, at: Vec2, down: bool) {
+    let location = location(app, window, at);
+    let button = PointerButton::Primary;
+    let was = app.world_mut().query::<(&PointerId, &bevy::picking::pointer::PointerPress)>();
+    let was = { was }.iter(app.world()).any(|(id, press)| *id == pointer && press.is_primary_pressed());
+    let mut actions = vec![PointerAction::Move { delta: Vec2::ZERO }];
+    match (was, down) {
+        (false, true) => actions.push(PointerAction::Press(button)),
+        (true, false) => actions.push(PointerAction::Release(button)),
+        _ => {}
+    }
+    for action in actions {
+        app.world_mut().write_message(PointerInput::new(pointer, location.clone(), action));
     }
     app.update();
+}
+
+fn point(app: &mut App, window: Entity, at: Vec2, down: bool) {
+    point_with(app, PointerId::Mouse, window, at, down);
 }
 
 fn held(app: &mut App) -> Option<(Entity, Grab, GrabOf)> {
@@ -170,4 +195,71 @@ fn the_mark_at_the_target_is_as_large_as_the_body_makes_it() {
         app.world().get::<PointerHeld>(grab).unwrap().mark
     };
     assert!((mark(2.0) / mark(1.0) - 2.0).abs() < 1e-5);
+}
+
+#[test]
+fn an_app_observes_pointers_on_the_deformed_surface() {
+    #[derive(Resource, Default)]
+    struct Seen(Vec<(Entity, Option<Vec3>, Option<Vec3>, Option<u32>)>, usize);
+    let (mut app, window, body) = scene();
+    let q = 0.5 / (5.0 / model::MASS).sqrt();
+    app.world_mut().get_mut::<VisualState>(body).unwrap().snap(&[q, 0.0, 0.0, 0.0]).unwrap();
+    app.init_resource::<Seen>();
+    app.world_mut().entity_mut(body).observe(|over: On<Pointer<Over>>, mut seen: ResMut<Seen>| {
+        let hit = &over.hit;
+        let vertex = hit.extra_as::<SurfaceHit>().map(|hit| hit.vertex);
+        seen.0.push((over.entity, hit.position, hit.normal, vertex));
+    });
+    app.world_mut().entity_mut(body).observe(|_: On<Pointer<Click>>, mut seen: ResMut<Seen>| seen.1 += 1);
+    // Where the rest shape was there is nothing.
+    point(&mut app, window, Vec2::new(-0.02, 0.0), false);
+    assert!(app.world().resource::<Seen>().0.is_empty());
+    point(&mut app, window, Vec2::new(-0.1, 0.42), false);
+    let seen = app.world().resource::<Seen>().0.clone();
+    let [(entity, Some(point_hit), Some(normal), Some(vertex))] = seen[..] else { panic!("{seen:?}") };
+    assert_eq!(entity, body);
+    assert!((point_hit - Vec3::new(0.9, 0.42, 0.1)).length() < 0.01, "{point_hit}");
+    assert!(normal.z > 0.99 && normal.is_normalized(), "{normal}");
+    let at = state(&app, body).model().surface().positions()[vertex as usize];
+    assert!(at[0] > 0.8 && at[2] == 0.1, "{at:?}");
+    point(&mut app, window, Vec2::new(-0.1, 0.42), true);
+    point(&mut app, window, Vec2::new(-0.1, 0.42), false);
+    assert_eq!(app.world().resource::<Seen>().1, 1, "one click");
+}
+
+#[test]
+fn every_finger_holds_the_body_by_itself() {
+    let (mut app, window, body) = scene();
+    let fingers = [PointerId::Touch(1), PointerId::Touch(2)];
+    let entities = fingers.map(|finger| app.world_mut().spawn(finger).id());
+    point_with(&mut app, fingers[0], window, Vec2::new(-0.05, 0.0), true);
+    point_with(&mut app, fingers[1], window, Vec2::new(-0.4, 0.0), true);
+    let targets = |app: &mut App| {
+        let mut query = app.world_mut().query::<(&PointerHeld, &Grab, &GrabOf)>();
+        let mut all: Vec<_> =
+            query.iter(app.world()).map(|(held, grab, of)| (held.pointer, grab.target, of.0)).collect();
+        all.sort_by_key(|(pointer, ..)| *pointer != fingers[0]);
+        all
+    };
+    let start = targets(&mut app);
+    assert_eq!(start.iter().map(|t| (t.0, t.2)).collect::<Vec<_>>(), fingers.map(|f| (f, body)));
+    // One moves, the other stays.
+    point_with(&mut app, fingers[0], window, Vec2::new(0.05, 0.0), true);
+    let moved = targets(&mut app);
+    assert!((moved[0].1 - start[0].1 - DVec3::new(0.1, 0.0, 0.0)).length() < 1e-3);
+    assert_eq!(moved[1].1, start[1].1);
+    // One is lifted, the other is taken away without a word.
+    point_with(&mut app, fingers[0], window, Vec2::new(0.05, 0.0), false);
+    assert_eq!(targets(&mut app).len(), 1);
+    app.world_mut().despawn(entities[1]);
+    app.update();
+    assert!(targets(&mut app).is_empty());
+}
+
+#[test]
+fn without_picking_nothing_is_picked_and_nothing_fails() {
+    let mut app = app();
+    app.add_plugins(PointerGrabPlugin);
+    steps(&mut app, 2);
+    assert_eq!(held(&mut app), None);
 }

@@ -33,6 +33,7 @@ mod tool;
 use bevy::{
     ecs::schedule::{InternedScheduleLabel, ScheduleLabel},
     input::InputSystems,
+    picking::PickingSystems,
     prelude::*,
 };
 use pliant_body::PliantSystems;
@@ -106,7 +107,8 @@ impl Plugin for HapticsPlugin {
                     source::point.in_set(PointerToolSystems::Move),
                 )
                     .chain()
-                    .after(InputSystems),
+                    .after(InputSystems)
+                    .after(PickingSystems::Backend),
             )
             .add_systems(self.schedule, tool::follow.in_set(HapticSystems::Move))
             .add_systems(self.schedule, local_model::publish.in_set(HapticSystems::Word));

@@ -1,11 +1,18 @@
 //! Pointer and gamepad as hands. They move a [`Positioned`](crate::Positioned) device, and the
 //! force is only drawn.
 
+use std::cmp::Reverse;
+
 use bevy::{
+    ecs::system::SystemParam,
     math::{DQuat, DVec3},
+    picking::{
+        backend::{PointerHits, ray::RayMap},
+        pointer::PointerId,
+    },
     prelude::*,
 };
-use pliant_body::UnderPointer;
+use pliant_body::SurfaceHit;
 
 use super::{HapticDevices, HapticTool, ToolGrabs, ToolPose};
 use crate::PositionedHandle;
@@ -90,48 +97,82 @@ impl GamepadSource {
     }
 }
 
+/// What Bevy's picking knows of the mouse in this frame.
+#[derive(SystemParam)]
+pub(crate) struct Mouse<'w, 's> {
+    rays: Option<Res<'w, RayMap>>,
+    hits: Option<Res<'w, Messages<PointerHits>>>,
+    cameras: Query<'w, 's, (&'static Camera, &'static GlobalTransform)>,
+}
+
+impl Mouse<'_, '_> {
+    /// The cameras in whose viewport the pointer is, front-most (highest order) first, with the ray
+    /// through the pointer and the direction of the view.
+    fn rays(&self) -> Vec<(Entity, Ray3d, Dir3)> {
+        let mut rays: Vec<_> = self
+            .rays
+            .iter()
+            .flat_map(|rays| rays.iter())
+            .filter(|(id, _)| id.pointer == PointerId::Mouse)
+            .filter_map(|(id, ray)| {
+                let (camera, place) = self.cameras.get(id.camera).ok()?;
+                Some((Reverse(camera.order), id.camera, *ray, place.forward()))
+            })
+            .collect();
+        rays.sort_by_key(|(order, camera, ..)| (*order, *camera));
+        rays.into_iter().map(|(_, camera, ray, forward)| (camera, ray, forward)).collect()
+    }
+
+    /// The nearest point of a body under the pointer, through the front-most camera that has one
+    /// there, or through `camera`.
+    fn hit(&self, camera: Option<Entity>) -> Option<(Entity, Vec3)> {
+        let groups = self.hits.as_ref()?.iter_current_update_messages();
+        groups
+            .filter(|group| group.pointer == PointerId::Mouse)
+            .flat_map(|group| group.picks.iter().map(|(_, hit)| (group.order, hit)))
+            .filter(|(_, hit)| camera.is_none_or(|camera| camera == hit.camera))
+            .filter(|(_, hit)| hit.extra_as::<SurfaceHit>().is_some())
+            .min_by(|(a, x), (b, y)| b.total_cmp(a).then(x.depth.total_cmp(&y.depth)))
+            .and_then(|(_, hit)| Some((hit.camera, hit.position?)))
+    }
+}
+
 pub(crate) fn point(
     buttons: Option<Res<ButtonInput<MouseButton>>>,
     mut taken: ResMut<PointerButtons>,
     devices: Res<HapticDevices>,
-    pointer: UnderPointer,
+    mouse: Mouse,
     mut tools: Query<(&HapticTool, &mut PointerSource, &ToolPose, &GlobalTransform, Option<&ToolGrabs>)>,
 ) {
     let bits = taken.0 & bits(|button| buttons.as_ref().is_some_and(|b| b.pressed(button)));
     taken.set_if_neq(PointerButtons(bits));
+    if tools.is_empty() {
+        return;
+    }
+    let rays = mouse.rays();
     for (tool, mut source, pose, place, held) in &mut tools {
         let Some(status) = devices.get(tool.device) else { continue };
         let tick = &status.report.tick;
         let at = DVec3::from(tick.position);
         let holds = held.is_some_and(|held| !held.entities().is_empty());
-        let hit = if holds { None } else { pointer.body(source.camera) };
-        if hit.is_some() {
-            source.through = hit.map(|hit| hit.camera);
+        let hit = if holds { None } else { mouse.hit(source.camera) };
+        if let Some((camera, _)) = hit {
+            source.through = Some(camera);
         }
-        let under = |wanted: Option<Entity>| {
-            pointer
-                .rays()
-                .map(|(camera, _)| camera)
-                .find(|camera| wanted.is_none_or(|wanted| wanted == *camera))
-        };
+        let under = |wanted: Entity| rays.iter().find(|(camera, ..)| *camera == wanted);
         // Until a body was under the pointer, any camera will do.
         let front = match source.camera {
-            None => source.through.and_then(|last| under(Some(last))).or_else(|| under(None)),
-            wanted => under(wanted),
-        };
-        let Some((ray, camera)) = front.and_then(|camera| pointer.through(camera)) else {
-            // Outside the window the hand stays where it is, but its buttons still come up.
-            source.handle.set_buttons(bits);
-            continue;
+            None => source.through.and_then(under).or_else(|| rays.first()),
+            Some(wanted) => under(wanted),
         };
         let plane = || {
-            let facing = InfinitePlane3d::new(camera.forward());
-            Some(ray.get_point(ray.intersect_plane(pose.position.as_vec3(), facing)?))
+            let (_, ray, forward) = front?;
+            let distance = ray.intersect_plane(pose.position.as_vec3(), InfinitePlane3d::new(*forward))?;
+            Some(ray.get_point(distance))
         };
-        let hit = hit.map(|hit| hit.ray.get_point(hit.hit.distance as f32));
-        let Some(wanted) = hit.or_else(plane) else {
-            // The tool is behind the camera, or the view is along its plane. There is no position,
-            // but the buttons still count.
+        let Some(wanted) = hit.map(|(_, point)| point).or_else(plane) else {
+            // The pointer is outside the window, the tool is behind the camera, or the view is along
+            // the tool's plane. There is no position, but the buttons still count.
             source.handle.set_buttons(bits);
             continue;
         };

@@ -13,7 +13,6 @@ mod session;
 
 use bevy::prelude::*;
 use bevy_egui::{EguiContexts, EguiPlugin, EguiPrimaryContextPass, egui, input::EguiWantsInput};
-use pliant_body::PointerGrabSystems;
 
 /// Shows the panel as a window over the scene. Adds [`EguiPlugin`] if it is missing.
 #[derive(Debug, Clone, Copy)]
@@ -79,10 +78,10 @@ impl Plugin for PanelPlugin {
             .insert_resource(Panel { open: self.open, key: self.key, only: self.only, ..default() })
             .init_resource::<scene::Histories>()
             .add_systems(Update, toggle.run_if(resource_exists::<ButtonInput<KeyCode>>))
-            .add_systems(EguiPrimaryContextPass, draw.run_if(|panel: Res<Panel>| panel.open))
-            // A press in the panel must not grab a body in the scene behind it.
-            .configure_sets(PreUpdate, PointerGrabSystems::Press.run_if(not(wants_pointer)));
+            .add_systems(EguiPrimaryContextPass, draw.run_if(|panel: Res<Panel>| panel.open));
         #[cfg(feature = "haptics")]
+        // Bodies behind the panel are covered by egui's picking backend. A device's pointer reads the
+        // buttons themselves.
         app.init_resource::<devices::Histories>()
             .configure_sets(PreUpdate, pliant_haptics::PointerToolSystems::Press.run_if(not(wants_pointer)));
         #[cfg(feature = "net")]
