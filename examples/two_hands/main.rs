@@ -130,7 +130,7 @@ fn hold_out(
             Name::new(side),
             HapticTool { modal: hands.modal, force_scale: *force_scale, ..HapticTool::new(*device) },
             ToolGrip::default(),
-            ForceArrow { radius: 0.02 * state.model().size() as f32, tool: color, color: color, ..default() },
+            ForceArrow { radius: 0.02 * state.model().size() as f32, tool: color, color, ..default() },
             Transform::from_translation(place.transform_point(Vec3::from(*farthest))),
         ));
     }

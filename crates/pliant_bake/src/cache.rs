@@ -140,16 +140,7 @@ impl BakeCache {
     /// The cache is the folder `pliant/bakes` in the system's folder for cached data. Returns
     /// `None` when the environment names no such folder.
     pub fn of_user() -> Option<Self> {
-        let folder = |name: &str| std::env::var_os(name).map(PathBuf::from).filter(|path| path.is_absolute());
-        let base = if cfg!(windows) {
-            folder("LOCALAPPDATA")
-        } else if cfg!(target_os = "macos") {
-            folder("HOME").map(|home| home.join("Library/Caches"))
-        } else {
-            // This follows the XDG base directory specification.
-            folder("XDG_CACHE_HOME").or_else(|| folder("HOME").map(|home| home.join(".cache")))
-        };
-        base.map(|base| Self::new(base.join("pliant/bakes")))
+        dirs::cache_dir().map(|base| Self::new(base.join("pliant/bakes")))
     }
 
     /// Sets the size limit in bytes. A single model that is larger is not stored.

@@ -289,7 +289,7 @@ fn compensation_puts_the_history_right_with_the_state_of_now() {
         for look in 1..=100 {
             mesh.run(50 * MS * look);
             for p in mesh.peers.iter().flatten() {
-                let (now, past) = (p.body(BODY).unwrap().confirmed(), p.state_at(BODY, p.tick()).unwrap());
+                let (now, past) = (p.body(BODY).unwrap().live(), p.state_at(BODY, p.tick()).unwrap());
                 assert_eq!(
                     (&now.q, &now.v, now.frame),
                     (&past.q, &past.v, past.frame),
@@ -500,11 +500,11 @@ fn a_state_that_nobody_asked_for_is_not_taken() {
         };
         let tick = p.confirmed();
         let lie = PeerMessage::State { tick, now: p.tick(), bodies: vec![body] }.encode();
-        let before = p.body(BODY).unwrap().confirmed().q.clone();
+        let before = p.body(BODY).unwrap().live().q.clone();
         for _ in 0..50 {
             p.on_message(mesh.now, PeerId(liar), &lie);
         }
-        assert_eq!(p.body(BODY).unwrap().confirmed().q, before);
+        assert_eq!(p.body(BODY).unwrap().live().q, before);
         mesh.run(8 * S);
         assert!(!mesh.events.iter().any(|e| matches!(e.1, PeerEvent::Resynced { .. })), "{:?}", mesh.events);
         assert_eq!(mesh.agree(0, 1), 0.0);

@@ -80,7 +80,6 @@ pub struct NetHost {
     holding: Holding,
     smoothing: f64,
     reach: f64,
-    you: Entity,
     bodies: BTreeMap<Entity, HostedBody>,
     next_body: u16,
     /// Open connections, with or without a completed join.
@@ -134,7 +133,6 @@ impl NetHost {
             holding: config.holding,
             smoothing: config.smoothing.max(0.0),
             reach,
-            you,
             bodies: BTreeMap::new(),
             next_body: 1,
             guests: BTreeMap::new(),

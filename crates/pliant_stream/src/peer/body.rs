@@ -129,8 +129,9 @@ impl PeerBody {
         self.tick
     }
 
-    /// The confirmed state: the best estimate of the state on which all peers will agree.
-    pub fn confirmed(&self) -> &State {
+    /// The live state at [`PeerBody::tick`]: stepped with the inputs that are known, and with
+    /// forecasts of those that are not.
+    pub fn live(&self) -> &State {
         &self.state
     }
 
