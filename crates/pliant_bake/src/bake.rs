@@ -8,7 +8,7 @@ use pliant_modal::{BakeInfo, ModalModel, ModelParts};
 use crate::blocks::{self, Tall};
 use crate::element::Element;
 use crate::fem::{ANCHORED, FeMesh, LOCKING_POISSON, Law, Lists};
-use crate::lanczos::{self, Failure, Modes};
+use crate::lanczos::{self, Eigenpairs, Failure};
 use crate::ordering;
 use crate::rigid::MassProperties;
 use crate::solver::Solver;
@@ -58,7 +58,7 @@ pub fn bake(
     mesh.check().map_err(BakeError::Mesh)?;
     let mut mesh = mesh.clone();
     mesh.drop_unused_nodes();
-    let mut clock = Clock::start();
+    let mut clock = StageClock::start();
     let mut times = BakeTimes::default();
 
     progress(Stage::Assemble, 0.0);
@@ -150,9 +150,9 @@ fn no_modes(failure: Failure) -> BakeError {
     }
 }
 
-struct Clock(Instant);
+struct StageClock(Instant);
 
-impl Clock {
+impl StageClock {
     fn start() -> Self {
         Self(Instant::now())
     }
@@ -215,7 +215,7 @@ fn by_row(fe: &FeMesh, number: &[u32]) -> Vec<[f64; 3]> {
 
 /// Returns the largest `|K phi - lambda M phi| / |K phi|` and the largest entry of
 /// `|Phi^T M Phi - I|`.
-pub(crate) fn accuracy(matrix: &BlockCsr, modes: &Modes) -> (f64, f64) {
+pub(crate) fn accuracy(matrix: &BlockCsr, modes: &Eigenpairs) -> (f64, f64) {
     let count = modes.lambda.len();
     let mut k = vec![0.0; modes.phi.len()];
     let mut m = vec![0.0; modes.phi.len()];
@@ -252,7 +252,13 @@ fn check_accuracy(what: &'static str, got: f64, expected: f64) -> Result<(), Bak
 ///
 /// The participation says how a uniform acceleration drives the mode. It is zero for a free body,
 /// because its elastic modes are M-orthogonal to translations.
-fn participation(fe: &FeMesh, modes: &Modes, number: &[u32], density: f64, free_body: bool) -> Vec<[f64; 3]> {
+fn participation(
+    fe: &FeMesh,
+    modes: &Eigenpairs,
+    number: &[u32],
+    density: f64,
+    free_body: bool,
+) -> Vec<[f64; 3]> {
     let count = modes.lambda.len();
     let mut out = vec![[0.0; 3]; count];
     if free_body {

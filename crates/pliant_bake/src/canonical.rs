@@ -4,7 +4,7 @@ use faer::Mat;
 
 use crate::blocks::{self, Tall};
 use crate::fem::ANCHORED;
-use crate::lanczos::Modes;
+use crate::lanczos::Eigenpairs;
 use crate::sparse::BlockCsr;
 
 /// Relative difference up to which neighboring eigenvalues count as equal. Within a cluster this
@@ -17,7 +17,7 @@ const CLUSTER: f64 = 1e-10;
 /// weighted by 1, 2, 3 along x, y, z. The bending modes of a round bar then lie in the axes.
 /// Afterwards the largest entry of each mode becomes positive. Among entries within 1e-6 of the
 /// largest, the first in node order decides.
-pub(crate) fn settle(modes: &mut Modes, matrix: &BlockCsr, number: &[u32]) {
+pub(crate) fn settle(modes: &mut Eigenpairs, matrix: &BlockCsr, number: &[u32]) {
     let count = modes.lambda.len();
     let mut start = 0;
     while start < count {
@@ -53,7 +53,7 @@ pub(crate) fn settle(modes: &mut Modes, matrix: &BlockCsr, number: &[u32]) {
     }
 }
 
-fn turn(modes: &mut Modes, matrix: &BlockCsr, start: usize, end: usize) {
+fn turn(modes: &mut Eigenpairs, matrix: &BlockCsr, start: usize, end: usize) {
     let count = modes.lambda.len();
     let width = end - start;
     let block: Vec<f64> =

@@ -8,13 +8,13 @@ use crate::fem::FeMesh;
 /// `barycentric` holds the coordinates of the nearest point. `offset` is the vector from the
 /// nearest point to the query point, m, and is zero inside the element.
 #[derive(Clone, Copy, Debug)]
-pub(crate) struct Place {
+pub(crate) struct EmbeddedPoint {
     pub(crate) element: usize,
     pub(crate) barycentric: [f64; 4],
     pub(crate) offset: [f64; 3],
 }
 
-impl Place {
+impl EmbeddedPoint {
     /// Returns the distance from the element, m.
     pub(crate) fn distance(&self) -> f64 {
         dot(self.offset, self.offset).sqrt()
@@ -82,9 +82,9 @@ impl<'a> Locator<'a> {
     }
 
     /// Returns the nearest place. Returns `None` only for a mesh without elements.
-    pub(crate) fn find(&self, p: [f64; 3]) -> Option<Place> {
+    pub(crate) fn find(&self, p: [f64; 3]) -> Option<EmbeddedPoint> {
         let center = self.cell_of(p);
-        let mut best: Option<Place> = None;
+        let mut best: Option<EmbeddedPoint> = None;
         let furthest = self.counts.iter().copied().max().unwrap_or(0);
         for ring in 0..=furthest {
             if let Some(place) = &best {
@@ -134,10 +134,10 @@ impl<'a> Locator<'a> {
         [0, 1, 2, 3].map(|a| dot(g[a], sub(p, corners[(a + 1) % 4])))
     }
 
-    fn nearest_in(&self, element: usize, p: [f64; 3]) -> Place {
+    fn nearest_in(&self, element: usize, p: [f64; 3]) -> EmbeddedPoint {
         let l = self.barycentric(element, p);
         if l.iter().all(|&x| x >= 0.0) {
-            return Place { element, barycentric: l, offset: [0.0; 3] };
+            return EmbeddedPoint { element, barycentric: l, offset: [0.0; 3] };
         }
         let corners = self.corners(element);
         let mut best = (f64::INFINITY, corners[0]);
@@ -148,7 +148,7 @@ impl<'a> Locator<'a> {
                 best = (dot(d, d), q);
             }
         }
-        Place { element, barycentric: self.barycentric(element, best.1), offset: sub(p, best.1) }
+        EmbeddedPoint { element, barycentric: self.barycentric(element, best.1), offset: sub(p, best.1) }
     }
 }
 

@@ -9,7 +9,7 @@ use rayon::prelude::*;
 use crate::blocks::{self, Tall};
 use crate::compliance::{Load, Plan, Six};
 use crate::fem::ANCHORED;
-use crate::lanczos::Modes;
+use crate::lanczos::Eigenpairs;
 use crate::solver::Solver;
 use crate::surface::Skin;
 
@@ -49,7 +49,7 @@ const WAVE: usize = 8;
 /// Without `count`, all vertices are used if [`BUDGET`] and [`MEMORY`] allow.
 pub(crate) fn sites(
     solver: &Solver,
-    modes: &Modes,
+    modes: &Eigenpairs,
     skin: &Skin,
     number: &[u32],
     count: Option<usize>,
@@ -97,7 +97,7 @@ pub(crate) fn sites(
     } else {
         one_by_one(solver, &loads, report)
     };
-    let held = Held::new(solver);
+    let held = HeldVertices::new(solver);
     let finish = |((patch, load), whole): ((&Patch, &Load), &Six)| FlexibilitySite {
         vertex: patch.center(),
         radius: patch.radius(),
@@ -194,11 +194,11 @@ fn project(load: &Load, x: &[f64], width: usize) -> Vec<[f64; 3]> {
 
 /// Terms that the pseudo-inverse of a free body adds to the factor: `Z = (K + springs)^-1 M R` and
 /// `R^T M Z`.
-struct Held {
+struct HeldVertices {
     free: Option<(Vec<f64>, Mat<f64>)>,
 }
 
-impl Held {
+impl HeldVertices {
     fn new(solver: &Solver) -> Self {
         let free = solver.rigid.as_ref().map(|rigid| {
             let mut z = rigid.mass_times_modes.clone();
@@ -214,7 +214,7 @@ impl Held {
     ///
     /// For a free body, with `r = R^T W`, the compliance is
     /// `W^T K^+ W = W^T A^-1 W - (W^T Z) r - r^T (Z^T W) + r^T (R^T M Z) r`.
-    fn residual(&self, solver: &Solver, modes: &Modes, load: &Load, whole: &Six) -> [[f64; 3]; 3] {
+    fn residual(&self, solver: &Solver, modes: &Eigenpairs, load: &Load, whole: &Six) -> [[f64; 3]; 3] {
         let along = project(load, &modes.phi, modes.lambda.len());
         let free = self
             .free

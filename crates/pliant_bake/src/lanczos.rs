@@ -41,7 +41,7 @@ const DENSE: usize = 300;
 /// Eigenvalues in ascending order ((rad/s)^2) and M-orthonormal eigenvectors as a block with one
 /// column each.
 #[derive(Clone, Debug)]
-pub(crate) struct Modes {
+pub(crate) struct Eigenpairs {
     pub(crate) lambda: Vec<f64>,
     pub(crate) phi: Vec<f64>,
 }
@@ -67,7 +67,11 @@ struct Below {
 
 /// Computes the `wanted` lowest elastic modes. `report` receives the progress of the iteration, 0
 /// to 1.
-pub(crate) fn lowest(solver: &Solver, wanted: usize, report: &mut dyn FnMut(f64)) -> Result<Modes, Failure> {
+pub(crate) fn lowest(
+    solver: &Solver,
+    wanted: usize,
+    report: &mut dyn FnMut(f64),
+) -> Result<Eigenpairs, Failure> {
     let n = solver.dofs();
     if n <= DENSE || n < 3 * wanted + 6 {
         return dense(solver, wanted);
@@ -444,7 +448,7 @@ fn normalise(solver: &Solver, mut block: Vec<f64>, width: usize) -> Option<(Vec<
 ///
 /// The step damps the remaining high modes, which the stiffness would amplify in the residual
 /// `K phi - lambda M phi`. The iteration has already computed `x`.
-fn polish(solver: &Solver, ritz: &Ritz, wanted: usize) -> Result<Modes, Failure> {
+fn polish(solver: &Solver, ritz: &Ritz, wanted: usize) -> Result<Eigenpairs, Failure> {
     let mut loads = vec![0.0; ritz.vectors.len()];
     solver.matrix.mass_times(&ritz.vectors, wanted, &mut loads);
     let x = &ritz.images;
@@ -455,7 +459,7 @@ fn polish(solver: &Solver, ritz: &Ritz, wanted: usize) -> Result<Modes, Failure>
     solver.matrix.mass_times(x, wanted, &mut mass_x);
     let mass = blocks::gram(tall, Tall::new(&mass_x, wanted));
     let (lambda, turn) = generalised(stiffness, mass).ok_or(Failure::NoConvergence)?;
-    Ok(Modes { lambda, phi: blocks::product(tall, turn.as_ref()) })
+    Ok(Eigenpairs { lambda, phi: blocks::product(tall, turn.as_ref()) })
 }
 
 /// Solves `A y = lambda B y` for small symmetric A and positive definite B. The eigenvalues are
@@ -480,7 +484,7 @@ fn generalised(a: Mat<f64>, b: Mat<f64>) -> Option<(Vec<f64>, Mat<f64>)> {
 
 /// Computes all modes of a small problem and keeps the lowest elastic ones. The rigid modes of a
 /// free body come first and are dropped.
-fn dense(solver: &Solver, wanted: usize) -> Result<Modes, Failure> {
+fn dense(solver: &Solver, wanted: usize) -> Result<Eigenpairs, Failure> {
     let n = solver.dofs();
     let mut identity = vec![0.0; n * n];
     identity.iter_mut().step_by(n + 1).for_each(|x| *x = 1.0);
@@ -495,7 +499,7 @@ fn dense(solver: &Solver, wanted: usize) -> Result<Modes, Failure> {
     for i in 0..n {
         phi.extend((skip..skip + wanted).map(|j| y[(i, j)]));
     }
-    Ok(Modes { lambda: lambda[skip..skip + wanted].to_vec(), phi })
+    Ok(Eigenpairs { lambda: lambda[skip..skip + wanted].to_vec(), phi })
 }
 
 #[cfg(test)]

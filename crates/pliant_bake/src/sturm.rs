@@ -45,7 +45,7 @@ pub(crate) struct Singular;
 
 /// Sums that the fronts accumulate.
 #[derive(Debug, Default)]
-struct Tally {
+struct InertiaTally {
     negative: usize,
     /// Row and twice the square of its part in negative pivots.
     grown: Vec<(usize, f64)>,
@@ -54,12 +54,12 @@ struct Tally {
 impl Count {
     pub(crate) fn new(symbolic: &Symbolic, matrix: &BlockCsr, shift: f64) -> Result<Self, Singular> {
         let mut updates: Vec<Vec<f64>> = vec![Vec::new(); symbolic.supernodes.len()];
-        let tops: Result<Vec<(usize, Vec<f64>, Tally)>, Singular> = symbolic
+        let tops: Result<Vec<(usize, Vec<f64>, InertiaTally)>, Singular> = symbolic
             .tasks
             .par_iter()
             .map(|task| {
                 let mut local: Vec<Vec<f64>> = vec![Vec::new(); task.len()];
-                let (mut spare, mut tally) = (Vec::new(), Tally::default());
+                let (mut spare, mut tally) = (Vec::new(), InertiaTally::default());
                 for s in task.clone() {
                     let take = |child: usize| std::mem::take(&mut local[child - task.start]);
                     let update = front(symbolic, s, matrix, shift, take, &mut spare, &mut tally)?;
@@ -73,7 +73,7 @@ impl Count {
             updates[root] = update;
             out.add(tally);
         }
-        let (mut spare, mut tally) = (Vec::new(), Tally::default());
+        let (mut spare, mut tally) = (Vec::new(), InertiaTally::default());
         for &s in &symbolic.top {
             let take = |child: usize| std::mem::take(&mut updates[child]);
             let update = front(symbolic, s, matrix, shift, take, &mut spare, &mut tally)?;
@@ -83,7 +83,7 @@ impl Count {
         Ok(out)
     }
 
-    fn add(&mut self, tally: Tally) {
+    fn add(&mut self, tally: InertiaTally) {
         self.below += tally.negative;
         for (row, square) in tally.grown {
             self.squares[row] += square;
@@ -127,7 +127,7 @@ fn front(
     shift: f64,
     mut take: impl FnMut(usize) -> Vec<f64>,
     spare: &mut Vec<Vec<f64>>,
-    tally: &mut Tally,
+    tally: &mut InertiaTally,
 ) -> Result<Vec<f64>, Singular> {
     let supernode = &symbolic.supernodes[s];
     let children = supernode.children.iter().map(|&child| (child, take(child))).collect();
@@ -144,7 +144,7 @@ fn eliminate(
     supernode: &Supernode,
     block: &mut [f64],
     update: &mut [f64],
-    tally: &mut Tally,
+    tally: &mut InertiaTally,
 ) -> Result<(), Singular> {
     let (width, below) = (supernode.width(), supernode.below());
     let height = width + below;

@@ -6,7 +6,7 @@ use std::sync::Arc;
 use bevy::{math::Affine3A, prelude::*, reflect::reflect_remote};
 use pliant_modal::{Body, BodyConfig, GrabId, Integrator, ModalModel, Precision, Relaxation, StepSettings};
 
-use crate::{ModalAsset, grab::Hold};
+use crate::{ModalAsset, grab::GrabHold};
 
 /// A soft body: its model and its step settings.
 ///
@@ -166,7 +166,7 @@ pub struct BodyState {
     #[reflect(ignore)]
     pub(crate) placed: Option<Affine3A>,
     #[reflect(ignore)]
-    pub(crate) held: Vec<Held>,
+    pub(crate) held: Vec<HeldBody>,
     /// Whether a step was refused and the warning was logged.
     pub(crate) faulted: bool,
     /// Time for which the body has been slower than its rest speed, s.
@@ -178,11 +178,11 @@ pub struct BodyState {
 
 /// The solver's record of a grab.
 #[derive(Debug)]
-pub(crate) struct Held {
+pub(crate) struct HeldBody {
     pub entity: Entity,
     /// The solver's grab. `None` if the grab was refused and the refusal was reported.
     pub id: Option<GrabId>,
-    pub hold: Hold,
+    pub hold: GrabHold,
     /// Whether the grab was refused only because the body had the maximum number of grabs. Such a
     /// grab is tried again when a slot is free.
     pub waiting: bool,

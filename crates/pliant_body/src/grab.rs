@@ -50,8 +50,8 @@ impl Grab {
 
     /// Returns the solver's settings of the grab. A change of any of them makes a new grab in the
     /// solver.
-    pub(crate) fn hold(&self) -> Hold {
-        Hold {
+    pub(crate) fn hold(&self) -> GrabHold {
+        GrabHold {
             vertex: self.vertex,
             radius: self.radius,
             stiffness: self.stiffness,
@@ -62,14 +62,14 @@ impl Grab {
 
 /// A [`Grab`] without its target.
 #[derive(Debug, Clone, Copy)]
-pub(crate) struct Hold {
+pub(crate) struct GrabHold {
     pub vertex: u32,
     pub radius: f64,
     pub stiffness: Option<f64>,
     pub relaxation: f64,
 }
 
-impl Hold {
+impl GrabHold {
     /// Compares the bits, so that a refused NaN equals the same NaN in the next tick.
     pub fn is(&self, other: &Self) -> bool {
         let bits = |hold: &Self| {

@@ -15,7 +15,7 @@ use pliant_modal::{Body, BodyConfig, GrabConfig, ModalModel, Patch, StepError};
 
 use crate::{
     AWAKE_BODIES, BodyError, BodyRefused, BodyState, Driven, Grab, GrabForce, GrabOf, Grabs, ModalAsset,
-    ModalBody, Pose, STEP_TIME, VisualState, body::Held,
+    ModalBody, Pose, STEP_TIME, VisualState, body::HeldBody,
 };
 
 /// The tick: the number of steps that the schedule of the bodies has made.
@@ -250,7 +250,7 @@ pub(crate) fn hold_bodies(
             let Ok((name, grab)) = grabs.get(entity) else { continue };
             let known = held.iter().position(|held| held.entity == entity);
             let index = known.unwrap_or_else(|| {
-                held.push(Held { entity, id: None, hold: grab.hold(), waiting: false, refusing: false });
+                held.push(HeldBody { entity, id: None, hold: grab.hold(), waiting: false, refusing: false });
                 held.len() - 1
             });
             let held = &mut held[index];

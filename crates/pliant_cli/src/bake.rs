@@ -89,7 +89,7 @@ fn rayleigh(text: &str) -> Result<[f64; 2], String> {
 }
 
 #[derive(Serialize)]
-struct Report {
+struct BakeReport {
     #[serde(flatten)]
     summary: Summary,
     /// True if the bake was read from the cache, so that the times cover reading only.
@@ -204,7 +204,12 @@ pub(crate) fn run(args: BakeArgs) -> Result<(), CliError> {
     };
     if args.json {
         let repair = repair.map(Mended::from);
-        return output::print_json(&Report { summary: Summary::new(&baked.model), cached, repair, seconds });
+        return output::print_json(&BakeReport {
+            summary: Summary::new(&baked.model),
+            cached,
+            repair,
+            seconds,
+        });
     }
     output::print(&output::table(&baked.model))?;
     if cached {

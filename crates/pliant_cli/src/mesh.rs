@@ -13,7 +13,7 @@ use crate::{CliError, output};
 #[command(args_conflicts_with_subcommands = true, subcommand_negates_reqs = true)]
 pub(crate) struct MeshArgs {
     #[command(subcommand)]
-    shape: Option<Shape>,
+    shape: Option<MeshShape>,
     /// A surface, repaired if needed (.obj, .stl, .ply, .gltf, .glb), a scene of rounded parts
     /// (.ron), or tetrahedra to write in another format (.msh, .vtk, .mesh, .veg)
     #[arg(required = true)]
@@ -36,7 +36,7 @@ struct Msh {
 }
 
 #[derive(Subcommand, Debug)]
-enum Shape {
+enum MeshShape {
     /// A bar with one corner at the origin, six tetrahedra per cell
     Bar {
         /// Cells along x, y and z
@@ -122,15 +122,15 @@ impl Msh {
 
 pub(crate) fn run(args: MeshArgs) -> Result<(), CliError> {
     let (mesh, path, msh) = match args.shape {
-        Some(Shape::Bar { cells, size, output, msh }) => {
+        Some(MeshShape::Bar { cells, size, output, msh }) => {
             msh.check(&output)?;
             (shapes::bar(cells, size)?, output, msh)
         }
-        Some(Shape::Cube { cells, size, output, msh }) => {
+        Some(MeshShape::Cube { cells, size, output, msh }) => {
             msh.check(&output)?;
             (shapes::cube(cells, size)?, output, msh)
         }
-        Some(Shape::Sphere { cells, radius, output, msh }) => {
+        Some(MeshShape::Sphere { cells, radius, output, msh }) => {
             msh.check(&output)?;
             (shapes::sphere(cells, radius)?, output, msh)
         }

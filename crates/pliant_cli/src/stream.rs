@@ -59,8 +59,8 @@ pub(crate) struct StreamArgs {
     #[arg(long, value_name = "RATIO:TIME", value_parser = relaxation)]
     relax: Option<Relaxation>,
     /// Who steps the body: only the host, or every peer
-    #[arg(long, value_enum, default_value_t = Topology::Cs)]
-    topology: Topology,
+    #[arg(long, value_enum, default_value_t = NetTopology::Cs)]
+    topology: NetTopology,
     /// Prints one line of JSON
     #[arg(long)]
     json: bool,
@@ -78,7 +78,7 @@ fn relaxation(words: &str) -> Result<Relaxation, String> {
 
 /// Which side steps the body.
 #[derive(ValueEnum, Debug, Clone, Copy, PartialEq, Eq)]
-enum Topology {
+enum NetTopology {
     /// Client-server: guests track the host.
     Cs,
     /// Peer-to-peer: every peer steps, and only targets are sent.
@@ -153,10 +153,10 @@ pub(crate) fn run(args: &StreamArgs) -> Result<(), CliError> {
     let model = Arc::new(ModalModel::read(&args.model)?);
     let names: Vec<&str> = match (&args.recovery, args.topology, args.json) {
         (Some(name), ..) => vec![name.as_str()],
-        (None, Topology::Cs, true) => vec!["default"],
-        (None, Topology::P2p, true) => vec![REPAIRS[0].0],
-        (None, Topology::Cs, false) => RecoveryConfig::NAMES.to_vec(),
-        (None, Topology::P2p, false) => REPAIRS.iter().map(|(name, _)| *name).collect(),
+        (None, NetTopology::Cs, true) => vec!["default"],
+        (None, NetTopology::P2p, true) => vec![REPAIRS[0].0],
+        (None, NetTopology::Cs, false) => RecoveryConfig::NAMES.to_vec(),
+        (None, NetTopology::P2p, false) => REPAIRS.iter().map(|(name, _)| *name).collect(),
     };
     let told = names.iter().map(|name| measure(args, &model, name)).collect::<Result<Vec<_>, _>>()?;
     match (args.json, told.as_slice()) {
@@ -184,7 +184,7 @@ fn measure(args: &StreamArgs, model: &Arc<ModalModel>, name: &str) -> Result<Tol
     };
     let unknown = |expected: String| CliError::Unknown { what: "--recovery", got: name.into(), expected };
     let figures = match args.topology {
-        Topology::Cs => {
+        NetTopology::Cs => {
             let mut recovery =
                 RecoveryConfig::by_name(name).ok_or_else(|| unknown(RecoveryConfig::NAMES.join(", ")))?;
             if let (Some(ticks), Policy::Paper { blend_ticks, .. }) = (args.blend, &mut recovery.policy) {
@@ -198,7 +198,7 @@ fn measure(args: &StreamArgs, model: &Arc<ModalModel>, name: &str) -> Result<Tol
             };
             experiment(args, model, link, recovery, integrator, step).run()?
         }
-        Topology::P2p => {
+        NetTopology::P2p => {
             let repair = REPAIRS.iter().find(|(known, _)| *known == name).map(|(_, repair)| *repair);
             let repair = repair.ok_or_else(|| unknown(REPAIRS.map(|(name, _)| name).join(", ")))?;
             experiment(args, model, link, RecoveryConfig::default(), Integrator::Exact, step)

@@ -14,14 +14,14 @@ const FAR: f64 = 2.3;
 /// Bounding volume hierarchy over a non-empty list of triangles.
 #[derive(Debug)]
 pub(crate) struct Bvh {
-    nodes: Vec<Node>,
+    nodes: Vec<BvhNode>,
     /// Triangles in the order of the leaves. `numbers` holds their original indices.
     triangles: Vec<Triangle>,
     numbers: Vec<u32>,
 }
 
 #[derive(Debug)]
-struct Node {
+struct BvhNode {
     low: Vector3<f64>,
     high: Vector3<f64>,
     /// First triangle below the node. `count` is the number of these triangles.
@@ -162,7 +162,7 @@ impl Bvh {
     }
 }
 
-impl Node {
+impl BvhNode {
     fn distance_squared(&self, p: Vector3<f64>) -> f64 {
         (0..3).map(|a| (self.low[a] - p[a]).max(p[a] - self.high[a]).max(0.0).powi(2)).sum()
     }
@@ -174,7 +174,7 @@ impl Node {
 
 /// Appends the tree over `numbers`, a part of the list that starts at `first`.
 fn build(
-    nodes: &mut Vec<Node>,
+    nodes: &mut Vec<BvhNode>,
     triangles: &[Triangle],
     centers: &[Vector3<f64>],
     numbers: &mut [u32],
@@ -196,7 +196,16 @@ fn build(
     let radius = corners().map(|p| (p - center).norm()).fold(0.0, f64::max);
     let index = nodes.len();
     let count = numbers.len();
-    nodes.push(Node { low, high, first: first as u32, count: count as u32, second: 0, area, center, radius });
+    nodes.push(BvhNode {
+        low,
+        high,
+        first: first as u32,
+        count: count as u32,
+        second: 0,
+        area,
+        center,
+        radius,
+    });
     if count <= LEAF {
         return;
     }

@@ -60,7 +60,7 @@ pub struct Body {
     push_torque: Vector3<f64>,
     /// The hands. `grabs` holds their identifiers in the same order.
     hands: Vec<Hand>,
-    grabs: Vec<Grab>,
+    grabs: Vec<GrabEntry>,
     next_grab: u64,
     /// Scratch: a state and one entry per mode.
     spare: State,
@@ -69,7 +69,7 @@ pub struct Body {
 }
 
 #[derive(Debug, Clone)]
-struct Grab {
+struct GrabEntry {
     id: GrabId,
     target: Vector3<f64>,
     /// The target of the previous step, or `None` before the first step of the grab.
@@ -241,7 +241,7 @@ impl Body {
         self.next_grab += 1;
         let hold = Hold::Target { target, velocity: Vector3::zeros(), config };
         self.hands.push(Hand::new(Arc::new(patch), hold));
-        self.grabs.push(Grab { id, target, last_target: None, config });
+        self.grabs.push(GrabEntry { id, target, last_target: None, config });
         self.kernel.prepare(&self.hands);
         Ok(id)
     }

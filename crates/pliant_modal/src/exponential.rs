@@ -11,9 +11,9 @@
 /// An unevaluated sum of two doubles. The second is at most half a unit in the last place of the
 /// first.
 #[derive(Clone, Copy, Default)]
-struct Pair(f64, f64);
+struct DoubleDouble(f64, f64);
 
-impl Pair {
+impl DoubleDouble {
     fn plus(self, other: Self) -> Self {
         let sum = self.0 + other.0;
         let part = sum - self.0;
@@ -39,16 +39,18 @@ impl Pair {
     }
 }
 
-type Square = [[Pair; 3]; 3];
+type Square = [[DoubleDouble; 3]; 3];
 
 fn product(a: &Square, b: &Square) -> Square {
     std::array::from_fn(|i| {
-        std::array::from_fn(|j| (0..3).fold(Pair::default(), |sum, k| sum.plus(a[i][k].times(b[k][j]))))
+        std::array::from_fn(|j| {
+            (0..3).fold(DoubleDouble::default(), |sum, k| sum.plus(a[i][k].times(b[k][j])))
+        })
     })
 }
 
-fn image(a: &Square, x: &[Pair; 3]) -> [Pair; 3] {
-    std::array::from_fn(|i| (0..3).fold(Pair::default(), |sum, k| sum.plus(a[i][k].times(x[k]))))
+fn image(a: &Square, x: &[DoubleDouble; 3]) -> [DoubleDouble; 3] {
+    std::array::from_fn(|i| (0..3).fold(DoubleDouble::default(), |sum, k| sum.plus(a[i][k].times(x[k]))))
 }
 
 /// Computes `exp(A)` and `integral from 0 to 1 of exp(A s) ds b`.
@@ -62,11 +64,11 @@ pub(crate) fn exponential(a: [[f64; 3]; 3], b: [f64; 3]) -> ([[f64; 3]; 3], [f64
         scale *= 0.5;
         squarings += 1;
     }
-    let a: Square = a.map(|row| row.map(|x| Pair(x * scale, 0.0)));
-    let b: [Pair; 3] = b.map(|x| Pair(x * scale, 0.0));
+    let a: Square = a.map(|row| row.map(|x| DoubleDouble(x * scale, 0.0)));
+    let b: [DoubleDouble; 3] = b.map(|x| DoubleDouble(x * scale, 0.0));
     // In the Taylor series at a norm of 1/8, the seventeenth term is below 1e-30.
     let mut term: Square =
-        std::array::from_fn(|i| std::array::from_fn(|j| Pair(f64::from(u8::from(i == j)), 0.0)));
+        std::array::from_fn(|i| std::array::from_fn(|j| DoubleDouble(f64::from(u8::from(i == j)), 0.0)));
     let mut e = term;
     let mut g = b;
     for n in 1..=17u8 {

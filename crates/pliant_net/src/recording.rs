@@ -42,7 +42,7 @@ const CLOSED: u8 = 4;
 
 /// A piece of data that the guest received.
 #[derive(Debug, Clone, PartialEq)]
-pub(crate) enum Record {
+pub(crate) enum SessionRecord {
     /// The connection is open, with this role and datagrams of at most `max_datagram` bytes.
     Connected {
         role: Role,
@@ -56,7 +56,7 @@ pub(crate) enum Record {
     Closed(String),
 }
 
-impl Record {
+impl SessionRecord {
     /// Size of the record's data in memory, bytes.
     fn len(&self) -> usize {
         match self {
@@ -95,31 +95,31 @@ const MOST_WAITING: usize = 8192;
 const MOST_WAITING_BYTES: usize = 64 << 20;
 
 /// Data for the recorder's thread.
-enum Kept {
-    Record(Record),
+enum KeptRecord {
+    Record(SessionRecord),
     /// A model, which the recorder's thread encodes as a file.
     Model(Arc<ModalModel>),
 }
 
 /// Writes a recording on its own thread, so that no frame waits for a disk. The file is complete
 /// when the recorder is dropped. If the process is killed, about the last second is missing.
-pub(crate) struct Recorder {
+pub(crate) struct SessionRecorder {
     /// `None` after a failure.
-    to: Option<SyncSender<(Duration, Kept)>>,
+    to: Option<SyncSender<(Duration, KeptRecord)>>,
     waiting: Arc<AtomicUsize>,
     thread: Option<JoinHandle<()>>,
     path: PathBuf,
 }
 
 /// The recorder's state on its thread.
-struct Writer {
+struct RecordWriter {
     encoder: Encoder,
     waiting: Arc<AtomicUsize>,
     written: u64,
     flushed: Duration,
 }
 
-impl Recorder {
+impl SessionRecorder {
     pub(crate) fn create(path: &Path) -> Result<Self, RecordingError> {
         let fail = |source| RecordingError::File { path: path.to_owned(), source };
         let mut file = File::create(path).map_err(fail)?;
@@ -127,7 +127,8 @@ impl Recorder {
         let encoder = zstd::stream::write::Encoder::new(file, LEVEL).map_err(fail)?;
         let waiting = Arc::new(AtomicUsize::new(0));
         let (to, from) = mpsc::sync_channel(MOST_WAITING);
-        let mut writer = Writer { encoder, waiting: waiting.clone(), written: 0, flushed: Duration::ZERO };
+        let mut writer =
+            RecordWriter { encoder, waiting: waiting.clone(), written: 0, flushed: Duration::ZERO };
         let named = path.to_owned();
         let write = move || {
             if let Err(error) = writer.write_all(&from) {
@@ -139,16 +140,16 @@ impl Recorder {
         Ok(Self { to: Some(to), waiting, thread: Some(thread), path: path.to_owned() })
     }
 
-    pub(crate) fn put(&mut self, at: Duration, record: &Record) {
-        self.send(at, record.len(), Kept::Record(record.clone()));
+    pub(crate) fn put(&mut self, at: Duration, record: &SessionRecord) {
+        self.send(at, record.len(), KeptRecord::Record(record.clone()));
     }
 
     /// Records a model of the guest's cache, which the host never sends.
     pub(crate) fn put_model(&mut self, at: Duration, model: &Arc<ModalModel>) {
-        self.send(at, 0, Kept::Model(model.clone()));
+        self.send(at, 0, KeptRecord::Model(model.clone()));
     }
 
-    fn send(&mut self, at: Duration, bytes: usize, kept: Kept) {
+    fn send(&mut self, at: Duration, bytes: usize, kept: KeptRecord) {
         let Some(to) = &self.to else { return };
         let waiting = self.waiting.fetch_add(bytes, Ordering::Relaxed) + bytes;
         let full = waiting > MOST_WAITING_BYTES && bytes < waiting;
@@ -165,15 +166,15 @@ impl Recorder {
     }
 }
 
-impl Writer {
-    fn write_all(&mut self, from: &Receiver<(Duration, Kept)>) -> io::Result<()> {
+impl RecordWriter {
+    fn write_all(&mut self, from: &Receiver<(Duration, KeptRecord)>) -> io::Result<()> {
         for (at, kept) in from {
             let record = match kept {
-                Kept::Record(record) => {
+                KeptRecord::Record(record) => {
                     self.waiting.fetch_sub(record.len(), Ordering::Relaxed);
                     record
                 }
-                Kept::Model(model) => Record::Model(model.to_bytes().into()),
+                KeptRecord::Model(model) => SessionRecord::Model(model.to_bytes().into()),
             };
             if self.written >= MOST_BYTES {
                 return Err(io::Error::other(format!("more than {MOST_BYTES} bytes")));
@@ -188,7 +189,7 @@ impl Writer {
     }
 }
 
-impl Drop for Recorder {
+impl Drop for SessionRecorder {
     fn drop(&mut self) {
         self.to = None;
         if let Some(thread) = self.thread.take() {
@@ -198,18 +199,18 @@ impl Drop for Recorder {
     }
 }
 
-fn write(to: &mut impl Write, at: Duration, record: &Record) -> io::Result<u64> {
+fn write(to: &mut impl Write, at: Duration, record: &SessionRecord) -> io::Result<u64> {
     let connected;
     let (kind, bytes): (u8, &[u8]) = match record {
-        Record::Connected { role, max_datagram } => {
+        SessionRecord::Connected { role, max_datagram } => {
             let [low, high] = max_datagram.to_le_bytes();
             connected = [role.to_byte(), low, high];
             (CONNECTED, &connected)
         }
-        Record::Datagram(bytes) => (DATAGRAM, bytes),
-        Record::Message(bytes) => (MESSAGE, bytes),
-        Record::Model(bytes) => (MODEL, bytes),
-        Record::Closed(words) => (CLOSED, words.as_bytes()),
+        SessionRecord::Datagram(bytes) => (DATAGRAM, bytes),
+        SessionRecord::Message(bytes) => (MESSAGE, bytes),
+        SessionRecord::Model(bytes) => (MODEL, bytes),
+        SessionRecord::Closed(words) => (CLOSED, words.as_bytes()),
     };
     let length = u32::try_from(bytes.len()).ok().filter(|length| *length <= LONGEST);
     let length = length.ok_or_else(|| io::Error::other("a record of more than a gigabyte"))?;
@@ -225,7 +226,7 @@ pub struct Recording {
     decoder: zstd::stream::read::Decoder<'static, BufReader<File>>,
     /// Models that the recorded guest had in its cache.
     pub(crate) models: Vec<Arc<ModalModel>>,
-    next: Option<(Duration, Record)>,
+    next: Option<(Duration, SessionRecord)>,
 }
 
 impl Recording {
@@ -239,7 +240,7 @@ impl Recording {
         let mut first = open(path)?;
         let mut models = Vec::new();
         while let Some((_, record)) = read(&mut first) {
-            if let Record::Model(bytes) = record {
+            if let SessionRecord::Model(bytes) = record {
                 match ModalModel::from_bytes(&bytes) {
                     Ok(model) => models.push(Arc::new(model)),
                     Err(error) => warn!("a model in {} cannot be read: {error}", path.display()),
@@ -253,7 +254,7 @@ impl Recording {
 
     /// Returns the next record that was received up to `now`. Call it repeatedly to get all of
     /// them.
-    pub(crate) fn poll(&mut self, now: Duration) -> Option<(Duration, Record)> {
+    pub(crate) fn poll(&mut self, now: Duration) -> Option<(Duration, SessionRecord)> {
         if self.next.as_ref()?.0 > now {
             return None;
         }
@@ -282,7 +283,7 @@ fn open(path: &Path) -> Result<zstd::stream::read::Decoder<'static, BufReader<Fi
 
 /// Reads the next record. Returns `None` at the end of the file and at the first truncated or
 /// invalid record.
-fn read(from: &mut impl Read) -> Option<(Duration, Record)> {
+fn read(from: &mut impl Read) -> Option<(Duration, SessionRecord)> {
     let mut head = [0; 13];
     from.read_exact(&mut head).ok()?;
     let [kind, rest @ ..] = head;
@@ -301,12 +302,15 @@ fn read(from: &mut impl Read) -> Option<(Duration, Record)> {
     let record = match kind {
         CONNECTED => {
             let [role, low, high] = bytes.try_into().ok()?;
-            Record::Connected { role: Role::from_byte(role)?, max_datagram: u16::from_le_bytes([low, high]) }
+            SessionRecord::Connected {
+                role: Role::from_byte(role)?,
+                max_datagram: u16::from_le_bytes([low, high]),
+            }
         }
-        DATAGRAM => Record::Datagram(bytes.into()),
-        MESSAGE => Record::Message(bytes.into()),
-        MODEL => Record::Model(bytes.into()),
-        CLOSED => Record::Closed(String::from_utf8(bytes).ok()?),
+        DATAGRAM => SessionRecord::Datagram(bytes.into()),
+        MESSAGE => SessionRecord::Message(bytes.into()),
+        MODEL => SessionRecord::Model(bytes.into()),
+        CLOSED => SessionRecord::Closed(String::from_utf8(bytes).ok()?),
         _ => return None,
     };
     Some((at, record))
@@ -320,20 +324,20 @@ mod tests {
         std::env::temp_dir().join(format!("pliant-recording-{}-{name}", std::process::id()))
     }
 
-    fn records() -> Vec<(Duration, Record)> {
+    fn records() -> Vec<(Duration, SessionRecord)> {
         let mut records = vec![(
             Duration::from_micros(1_500),
-            Record::Connected { role: Role::Watch, max_datagram: 1_162 },
+            SessionRecord::Connected { role: Role::Watch, max_datagram: 1_162 },
         )];
         for n in 0..500u64 {
             let at = Duration::from_millis(2 + 25 * n);
             let bytes: Vec<u8> = (0..200).map(|k| (n as u8).wrapping_mul(31) ^ k).collect();
-            records.push((at, Record::Datagram(bytes.clone().into())));
+            records.push((at, SessionRecord::Datagram(bytes.clone().into())));
             if n % 50 == 0 {
-                records.push((at, Record::Message(bytes.into())));
+                records.push((at, SessionRecord::Message(bytes.into())));
             }
         }
-        records.push((Duration::from_secs(20), Record::Closed("the host has left".into())));
+        records.push((Duration::from_secs(20), SessionRecord::Closed("the host has left".into())));
         records
     }
 
@@ -341,7 +345,7 @@ mod tests {
     fn what_was_recorded_is_played_at_its_time_also_from_a_file_that_was_cut() {
         let path = file("whole");
         let records = records();
-        let mut recorder = Recorder::create(&path).unwrap();
+        let mut recorder = SessionRecorder::create(&path).unwrap();
         records.iter().for_each(|(at, record)| recorder.put(*at, record));
         drop(recorder);
         let mut recording = Recording::open(&path).unwrap();

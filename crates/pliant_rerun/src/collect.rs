@@ -16,7 +16,7 @@ use pliant_body::{BodyRefused, BodyState, Driven, Grab, GrabForce, PliantTick, V
 
 use crate::{
     RerunRecording, RerunScalars, RerunStats, RerunStyle,
-    frame::{Drawn, Frame, Hand, Metric, Place, Shape},
+    frame::{BodyTransform, Drawn, Metric, RecordedFrame, RecordedHand, ShapeFrame},
     log_lines::LogLines,
     worker::Worker,
 };
@@ -25,7 +25,7 @@ use crate::{
 pub(crate) struct Collector {
     workers: Vec<Worker>,
     /// Logged frames whose memory is reused, so that recording every tick allocates nothing new.
-    spare: Receiver<Frame>,
+    spare: Receiver<RecordedFrame>,
     shapes: Due,
     metrics: Due,
     hands: Due,
@@ -58,7 +58,7 @@ struct Called {
 #[derive(Resource, Default)]
 pub(crate) struct Hands {
     /// Hands of the session's other users that are not entities of this app.
-    pub others: Vec<Hand>,
+    pub others: Vec<RecordedHand>,
     /// The users of the hands that are entities of this app.
     pub whose: EntityHashMap<Whose>,
 }
@@ -95,7 +95,7 @@ impl Due {
 /// The data that is recorded of the current tick. The decision comes before the gathering, so that
 /// a stream that is off costs nothing.
 #[derive(Resource, Debug, Default, Clone, Copy)]
-pub(crate) struct Wanted {
+pub(crate) struct WantedData {
     draw: bool,
     metrics: bool,
     hands: bool,
@@ -115,13 +115,13 @@ const WORDS_HZ: f64 = 10.0;
 struct Followed {
     drawn: Arc<Drawn>,
     version: u64,
-    place: Option<Place>,
+    place: Option<BodyTransform>,
     /// Whether the newest shape was drawn.
     complete: bool,
 }
 
 impl Collector {
-    pub fn new(workers: Vec<Worker>, spare: Receiver<Frame>) -> Self {
+    pub fn new(workers: Vec<Worker>, spare: Receiver<RecordedFrame>) -> Self {
         Self {
             workers,
             spare,
@@ -144,15 +144,15 @@ pub(crate) fn somebody_listens(collector: Res<Collector>, recording: Res<RerunRe
     recording.on && collector.workers.iter().any(Worker::listens)
 }
 
-pub(crate) fn wants_metrics(wanted: Res<Wanted>) -> bool {
+pub(crate) fn wants_metrics(wanted: Res<WantedData>) -> bool {
     wanted.metrics
 }
 
-pub(crate) fn wants_hands(wanted: Res<Wanted>) -> bool {
+pub(crate) fn wants_hands(wanted: Res<WantedData>) -> bool {
     wanted.hands
 }
 
-pub(crate) fn wants_text(wanted: Res<Wanted>) -> bool {
+pub(crate) fn wants_text(wanted: Res<WantedData>) -> bool {
     wanted.words
 }
 
@@ -160,12 +160,12 @@ pub(crate) fn wants_text(wanted: Res<Wanted>) -> bool {
 /// belong to the time that is recorded next.
 pub(crate) fn forget(
     mut own: ResMut<RerunScalars>,
-    mut wanted: ResMut<Wanted>,
+    mut wanted: ResMut<WantedData>,
     lines: Option<Res<LogLines>>,
 ) {
     own.forget_metrics();
     own.lines.clear();
-    *wanted = Wanted::default();
+    *wanted = WantedData::default();
     if let Some(lines) = lines {
         lines.0.try_iter().for_each(drop);
     }
@@ -174,7 +174,7 @@ pub(crate) fn forget(
 /// Decides what is recorded of this tick.
 pub(crate) fn decide(
     mut collector: ResMut<Collector>,
-    mut wanted: ResMut<Wanted>,
+    mut wanted: ResMut<WantedData>,
     mut own: ResMut<RerunScalars>,
     mut stats: ResMut<RerunStats>,
     recording: Res<RerunRecording>,
@@ -191,11 +191,11 @@ pub(crate) fn decide(
         collector.bodies.values_mut().for_each(|followed| followed.complete = false);
         own.forget_metrics();
         stats.dropped = collector.workers.iter().map(Worker::dropped).sum();
-        *wanted = Wanted::default();
+        *wanted = WantedData::default();
         return;
     }
     let now = time.elapsed_secs_f64();
-    *wanted = Wanted {
+    *wanted = WantedData {
         draw: collector.shapes.at(now, recording.shapes_hz),
         metrics: collector.metrics.at(now, recording.metrics_hz),
         hands: collector.hands.at(now, recording.hands_hz),
@@ -234,7 +234,7 @@ pub(crate) fn collect(
     mut collector: ResMut<Collector>,
     mut stats: ResMut<RerunStats>,
     mut own: ResMut<RerunScalars>,
-    wanted: Res<Wanted>,
+    wanted: Res<WantedData>,
     recording: Res<RerunRecording>,
     tick: Res<PliantTick>,
     time: Res<Time>,
@@ -296,7 +296,7 @@ pub(crate) fn collect(
     stats.sinks = collector.workers.iter().filter(|worker| worker.listens()).count();
 }
 
-fn follow_bodies(collector: &mut Collector, frame: &mut Frame, bodies: &Bodies, wanted: Wanted) {
+fn follow_bodies(collector: &mut Collector, frame: &mut RecordedFrame, bodies: &Bodies, wanted: WantedData) {
     collector.bodies.retain(|entity, followed| {
         let stays = bodies.contains(*entity);
         if !stays {
@@ -319,7 +319,8 @@ fn follow_bodies(collector: &mut Collector, frame: &mut Frame, bodies: &Bodies, 
         }
         let Some(followed) = collector.bodies.get_mut(&entity) else { continue };
         let (scale, rotation, translation) = transform.to_scale_rotation_translation();
-        let place = Place { translation: translation.into(), rotation: rotation.into(), scale: scale.x };
+        let place =
+            BodyTransform { translation: translation.into(), rotation: rotation.into(), scale: scale.x };
         let moved = followed.version != shown.version() || followed.place != Some(place);
         let draw = wanted.draw && style != RerunStyle::Hidden;
         if !moved && shown.is_settled() && (followed.complete || !draw) {
@@ -339,7 +340,7 @@ fn follow_bodies(collector: &mut Collector, frame: &mut Frame, bodies: &Bodies, 
             energies(&mut frame.energies, state, driven, shown, wanted.tick);
             from..frame.energies.len()
         });
-        frame.shapes.push(Shape {
+        frame.shapes.push(ShapeFrame {
             body: followed.drawn.clone(),
             coordinates: from..frame.coordinates.len(),
             warped: state.warps(),
@@ -387,7 +388,7 @@ fn energies(to: &mut Vec<f64>, state: &BodyState, driven: &Driven, shown: &Visua
 
 type Grabs<'w, 's> = Query<'w, 's, (Entity, Option<&'static Name>, &'static Grab, &'static GrabForce)>;
 
-fn gather_hands(collector: &mut Collector, frame: &mut Frame, grabs: &Grabs, session: &Hands) {
+fn gather_hands(collector: &mut Collector, frame: &mut RecordedFrame, grabs: &Grabs, session: &Hands) {
     let order = &mut collector.order;
     order.clear();
     order.extend(grabs.iter().map(|(entity, ..)| entity));
@@ -402,7 +403,7 @@ fn gather_hands(collector: &mut Collector, frame: &mut Frame, grabs: &Grabs, ses
         if called.given != given {
             *called = call();
         }
-        hands.push(Hand {
+        hands.push(RecordedHand {
             name: called.name.clone(),
             color: whose.map(|whose| whose.color),
             force: force.force.into(),

@@ -8,7 +8,7 @@ use rerun::{
     TimeColumn,
 };
 
-use crate::{SIM_TIME, TICK, WALL_TIME, frame::Frame, recorder::path};
+use crate::{SIM_TIME, TICK, WALL_TIME, frame::RecordedFrame, recorder::path};
 
 /// A moment on the three timelines.
 #[derive(Debug, Default, Clone, Copy)]
@@ -21,7 +21,7 @@ pub(crate) struct Moment {
 }
 
 impl Moment {
-    pub fn of(frame: &Frame) -> Self {
+    pub fn of(frame: &RecordedFrame) -> Self {
         Self { tick: frame.tick, time: frame.time, wall: frame.wall }
     }
 
@@ -50,7 +50,7 @@ impl Moments {
 
 /// One line of a plot.
 #[derive(Debug)]
-struct Series {
+struct ColumnSeries {
     entity: EntityPath,
     moments: Moments,
     values: Vec<f64>,
@@ -59,7 +59,7 @@ struct Series {
 /// The metrics that wait to be sent.
 #[derive(Debug, Default)]
 pub(crate) struct Columns {
-    series: HashMap<String, Series>,
+    series: HashMap<String, ColumnSeries>,
     waiting: usize,
 }
 
@@ -69,7 +69,7 @@ impl Columns {
 
     pub fn push(&mut self, name: &str, at: Moment, value: f64) {
         if !self.series.contains_key(name) {
-            let series = Series { entity: path(name), moments: Moments::default(), values: Vec::new() };
+            let series = ColumnSeries { entity: path(name), moments: Moments::default(), values: Vec::new() };
             self.series.insert(name.to_owned(), series);
         }
         if let Some(series) = self.series.get_mut(name) {

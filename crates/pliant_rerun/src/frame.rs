@@ -6,7 +6,7 @@ use pliant_modal::ModalModel;
 
 /// The data of one tick.
 #[derive(Debug, Default)]
-pub(crate) struct Frame {
+pub(crate) struct RecordedFrame {
     pub tick: u64,
     /// Simulated time, s.
     pub time: f64,
@@ -16,7 +16,7 @@ pub(crate) struct Frame {
     pub arrived: Vec<Arc<Drawn>>,
     /// Paths of removed bodies.
     pub left: Vec<Arc<str>>,
-    pub shapes: Vec<Shape>,
+    pub shapes: Vec<ShapeFrame>,
     /// The modal coordinates of all shapes, in sequence.
     pub coordinates: Vec<f32>,
     /// Energies of the modes of the shapes that have them, J, in sequence.
@@ -24,7 +24,7 @@ pub(crate) struct Frame {
     pub color: crate::RerunColor,
     /// All hands of the tick. `None` if hands are not due, and if there are none now and were none
     /// before.
-    pub hands: Option<Vec<Hand>>,
+    pub hands: Option<Vec<RecordedHand>>,
     /// Diagnostics that were measured since the last tick.
     pub measured: Vec<(Arc<Metric>, f64)>,
     pub scalars: Vec<Scalar>,
@@ -32,10 +32,10 @@ pub(crate) struct Frame {
     pub samples: Vec<Samples>,
     pub lines: Vec<Line>,
     /// Reused memory for the hands of a later tick.
-    pub room: Vec<Hand>,
+    pub room: Vec<RecordedHand>,
 }
 
-impl Frame {
+impl RecordedFrame {
     /// Returns an empty frame that keeps the memory of this one.
     pub fn cleared(mut self) -> Self {
         if let Some(hands) = self.hands.take() {
@@ -55,17 +55,17 @@ impl Frame {
     }
 
     /// Returns an empty list of hands in reused memory.
-    pub fn take_room(&mut self) -> Vec<Hand> {
+    pub fn take_room(&mut self) -> Vec<RecordedHand> {
         std::mem::take(&mut self.room)
     }
 
     /// Returns the modal coordinates of a shape.
-    pub fn coordinates(&self, shape: &Shape) -> &[f32] {
+    pub fn coordinates(&self, shape: &ShapeFrame) -> &[f32] {
         self.coordinates.get(shape.coordinates.clone()).unwrap_or_default()
     }
 
     /// Returns the energies of a shape's modes, J.
-    pub fn energies(&self, shape: &Shape) -> Option<&[f64]> {
+    pub fn energies(&self, shape: &ShapeFrame) -> Option<&[f64]> {
         self.energies.get(shape.energies.clone()?)
     }
 }
@@ -84,7 +84,7 @@ impl Owed {
     /// Maximum number of lines that are kept.
     const LINES: usize = 1024;
 
-    pub fn add(&mut self, missed: &Frame) {
+    pub fn add(&mut self, missed: &RecordedFrame) {
         let room = Self::LINES.saturating_sub(self.lines.len());
         self.lines.extend(missed.lines.iter().take(room).cloned());
         if let Some(hands) = &missed.hands {
@@ -103,12 +103,12 @@ pub(crate) struct Drawn {
 
 /// A body in one tick.
 #[derive(Debug)]
-pub(crate) struct Shape {
+pub(crate) struct ShapeFrame {
     pub body: Arc<Drawn>,
     /// Range of the body's modal coordinates in those of the frame.
     pub coordinates: Range<usize>,
     pub warped: bool,
-    pub place: Place,
+    pub place: BodyTransform,
     /// Stiffness as a multiple of the baked stiffness.
     pub stiffness: f32,
     /// Whether the shape is drawn in this tick.
@@ -125,7 +125,7 @@ pub(crate) struct Shape {
 
 /// The pose and the scale of a body.
 #[derive(Debug, Clone, Copy, PartialEq)]
-pub(crate) struct Place {
+pub(crate) struct BodyTransform {
     pub translation: [f32; 3],
     /// Quaternion x, y, z, w.
     pub rotation: [f32; 4],
@@ -133,7 +133,7 @@ pub(crate) struct Place {
 }
 
 #[derive(Debug, Clone)]
-pub(crate) struct Hand {
+pub(crate) struct RecordedHand {
     pub name: Arc<str>,
     /// Color of the hand's user, sRGB. `None` selects one of the recording's own colors.
     pub color: Option<[u8; 3]>,

@@ -9,7 +9,7 @@ const WINDOW: usize = 256;
 
 /// The displacement of one point of a body, tick by tick.
 #[derive(Debug)]
-pub(crate) struct Motion {
+pub(crate) struct ModalMotion {
     /// The vertex that the modes move most, each mode weighted as a load on the vertex excites it:
     /// `max sum phi^2 / omega^2`.
     vertex: u32,
@@ -20,7 +20,7 @@ pub(crate) struct Motion {
     tick: f64,
 }
 
-impl Motion {
+impl ModalMotion {
     pub fn new(model: &ModalModel) -> Self {
         let looseness = |vertex: u32| -> f64 {
             let of = |mode: usize, omega: f64| -> f64 {

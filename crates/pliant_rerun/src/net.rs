@@ -14,7 +14,7 @@ use pliant_net::{
 use crate::{
     RerunScalars,
     collect::{Hands, Whose},
-    frame::Hand,
+    frame::RecordedHand,
 };
 
 pub(crate) fn say_who_comes_and_goes(
@@ -156,7 +156,7 @@ pub(crate) fn see_other_hands(
             let name = user.map_or_else(|| format!("user {}", hand.user.0), |user| user.name.clone());
             let point =
                 place.affine().transform_point3(surface_point(state, hand.vertex, shown.current()).as_vec3());
-            others.others.push(Hand {
+            others.others.push(RecordedHand {
                 name: name.replace('/', " ").into(),
                 color: user.map(|user| srgb(user.color)),
                 force: hand.reaction.into(),

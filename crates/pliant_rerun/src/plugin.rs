@@ -277,7 +277,7 @@ impl Plugin for RerunPlugin {
             .insert_resource(self.rates)
             .register_type::<RerunRecording>()
             .init_resource::<collect::Hands>()
-            .init_resource::<collect::Wanted>()
+            .init_resource::<collect::WantedData>()
             .add_systems(
                 self.schedule,
                 (

@@ -17,9 +17,9 @@ use crate::{
     RerunColor, RerunStyle, SIM_TIME, TICK, WALL_TIME,
     blueprint::Plots,
     columns::{Columns, HandColumns, Moment},
-    frame::{Drawn, Frame, Hand, Line, Owed, Place, Shape},
-    motion::Motion,
-    stress::Skin,
+    frame::{BodyTransform, Drawn, Line, Owed, RecordedFrame, RecordedHand, ShapeFrame},
+    motion::ModalMotion,
+    stress::StressSkin,
 };
 
 /// Displacement with the last color of the scale, as a fraction of the body's size.
@@ -59,7 +59,7 @@ pub(crate) struct Recorder {
     stream: RecordingStream,
     plots: Plots,
     layout_due: Option<Instant>,
-    bodies: HashMap<Arc<str>, Known>,
+    bodies: HashMap<Arc<str>, KnownEntity>,
     /// Size of the largest body so far, m, and the largest force so far, N, which scale the arrows.
     size: f64,
     force: f64,
@@ -80,12 +80,12 @@ pub(crate) struct Recorder {
     started: bool,
 }
 
-struct Known {
+struct KnownEntity {
     body: Arc<Drawn>,
-    place: Option<Place>,
+    place: Option<BodyTransform>,
     meshed: bool,
-    motion: Option<Motion>,
-    skin: Option<Skin>,
+    motion: Option<ModalMotion>,
+    skin: Option<StressSkin>,
 }
 
 impl Recorder {
@@ -112,7 +112,7 @@ impl Recorder {
     }
 
     /// Logs one tick at its times.
-    pub fn log(&mut self, frame: &Frame) -> Result<(), RecordingStreamError> {
+    pub fn log(&mut self, frame: &RecordedFrame) -> Result<(), RecordingStreamError> {
         self.at(frame)?;
         for name in &frame.left {
             self.leave(name)?;
@@ -146,7 +146,7 @@ impl Recorder {
     }
 
     /// Sets the moment of all data that is logged next.
-    fn at(&mut self, frame: &Frame) -> Result<(), RecordingStreamError> {
+    fn at(&mut self, frame: &RecordedFrame) -> Result<(), RecordingStreamError> {
         if !self.started {
             self.started = true;
             // The app's own times are used, not those of the worker.
@@ -162,7 +162,7 @@ impl Recorder {
     }
 
     /// Logs what was missed between the last frame and `next`, which is logged afterward.
-    pub fn catch_up(&mut self, next: &Frame, owed: &Owed) -> Result<(), RecordingStreamError> {
+    pub fn catch_up(&mut self, next: &RecordedFrame, owed: &Owed) -> Result<(), RecordingStreamError> {
         self.at(next)?;
         let gone = self.bodies.keys().filter(|path| !owed.bodies.iter().any(|body| body.path == **path));
         for path in gone.cloned().collect::<Vec<_>>() {
@@ -204,7 +204,7 @@ impl Recorder {
         }
         self.leave(&body.path)?;
         self.size = self.size.max(body.model.size());
-        let known = Known { body: body.clone(), place: None, meshed: false, motion: None, skin: None };
+        let known = KnownEntity { body: body.clone(), place: None, meshed: false, motion: None, skin: None };
         self.bodies.insert(body.path.clone(), known);
         Ok(())
     }
@@ -232,7 +232,7 @@ impl Recorder {
         Ok(())
     }
 
-    fn shape(&mut self, shape: &Shape, frame: &Frame) -> Result<(), RecordingStreamError> {
+    fn shape(&mut self, shape: &ShapeFrame, frame: &RecordedFrame) -> Result<(), RecordingStreamError> {
         self.modes(shape, frame)?;
         if !(shape.draw || shape.metrics) {
             return Ok(());
@@ -243,7 +243,7 @@ impl Recorder {
         let entity = body_path(&shape.body.path);
         if known.place != Some(shape.place) && (shape.draw || known.place.is_none()) {
             known.place = Some(shape.place);
-            let Place { translation, rotation, scale } = shape.place;
+            let BodyTransform { translation, rotation, scale } = shape.place;
             let place = Transform3D::new()
                 .with_translation(translation)
                 .with_quaternion(Quaternion::from_xyzw(rotation))
@@ -259,7 +259,7 @@ impl Recorder {
         let mut colors = Vec::with_capacity(if shape.draw { self.positions.len() } else { 0 });
         let mut most_stress = None;
         if frame.color == RerunColor::Stress {
-            let skin = known.skin.get_or_insert_with(|| Skin::new(surface));
+            let skin = known.skin.get_or_insert_with(|| StressSkin::new(surface));
             // A scaled body keeps its stiffness in N/m while its lengths grow. `E L` is constant,
             // so Young's modulus is divided by the scale.
             let young = model.info().young as f32 * shape.stiffness / shape.place.scale.abs();
@@ -321,15 +321,15 @@ impl Recorder {
     }
 
     /// Logs the energies of the modes and the spectrum as bars.
-    fn modes(&mut self, shape: &Shape, frame: &Frame) -> Result<(), RecordingStreamError> {
+    fn modes(&mut self, shape: &ShapeFrame, frame: &RecordedFrame) -> Result<(), RecordingStreamError> {
         let Some(known) = self.bodies.get_mut(&shape.body.path) else { return Ok(()) };
         let model = &shape.body.model;
         if shape.sample {
-            let motion = known.motion.get_or_insert_with(|| Motion::new(model));
+            let motion = known.motion.get_or_insert_with(|| ModalMotion::new(model));
             motion.push(model, frame.coordinates(shape), frame.tick, frame.time);
         }
         let Some(energies) = frame.energies(shape).filter(|_| shape.bars) else { return Ok(()) };
-        let spectrum = known.motion.as_ref().and_then(Motion::spectrum);
+        let spectrum = known.motion.as_ref().and_then(ModalMotion::spectrum);
         let name = &shape.body.path;
         let numbers: Vec<f64> = (1..=energies.len()).map(|mode| mode as f64).collect();
         let bars = BarChart::new(energies)
@@ -354,12 +354,12 @@ impl Recorder {
         Ok(())
     }
 
-    fn hands(&mut self, hands: &[Hand]) -> Result<(), RecordingStreamError> {
+    fn hands(&mut self, hands: &[RecordedHand]) -> Result<(), RecordingStreamError> {
         let magnitude = |f: &[f64; 3]| f.iter().map(|x| x * x).sum::<f64>().sqrt();
         self.force = hands.iter().map(|hand| magnitude(&hand.force)).fold(self.force, f64::max);
         let metres_a_newton = if self.force > 0.0 { LONGEST_ARROW * self.size / self.force } else { 0.0 };
         let single = |p: [f64; 3]| p.map(|x| x as f32);
-        let color_at = |index: usize, hand: &Hand| {
+        let color_at = |index: usize, hand: &RecordedHand| {
             hand.color.map_or_else(|| color_of(index), |[r, g, b]| Color::from_rgb(r, g, b))
         };
         if self.drawn_for != self.size {

@@ -10,7 +10,7 @@ use pliant_modal::SurfaceMesh;
 /// `s_xx = Y / (1 - nu^2) (E_xx + nu E_yy)` and `s_xy = Y / (1 + nu) E_xy` (Y: Young's modulus).
 /// Under a hand, where the surface carries a pressure, this is only a part of the stress.
 #[derive(Debug)]
-pub(crate) struct Skin {
+pub(crate) struct StressSkin {
     triangles: Vec<Option<Rest>>,
     /// Sum of the areas around each vertex.
     around: Vec<f32>,
@@ -32,7 +32,7 @@ fn dot(a: [f32; 3], b: [f32; 3]) -> f32 {
     a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
 }
 
-impl Skin {
+impl StressSkin {
     pub fn new(surface: &SurfaceMesh) -> Self {
         let at = |v: u32| surface.positions().get(v as usize).copied().unwrap_or_default();
         let mut around = vec![0.0; surface.positions().len()];

@@ -18,7 +18,7 @@ use rerun::{
 use crate::{
     RerunPlugin, RerunScalars, RerunStats, RerunStyle,
     blueprint::Plots,
-    frame::{Drawn, Frame, Hand, Line, Place, Scalar, Shape},
+    frame::{BodyTransform, Drawn, Line, RecordedFrame, RecordedHand, Scalar, ShapeFrame},
     recorder::Recorder,
     worker::{Target, Worker},
 };
@@ -80,7 +80,8 @@ pub(crate) fn square() -> ModalModel {
     .unwrap()
 }
 
-const HERE: Place = Place { translation: [0.0, 1.0, 0.0], rotation: [0.0, 0.0, 0.0, 1.0], scale: 2.0 };
+const HERE: BodyTransform =
+    BodyTransform { translation: [0.0, 1.0, 0.0], rotation: [0.0, 0.0, 0.0, 1.0], scale: 2.0 };
 
 pub(crate) fn body() -> Arc<Drawn> {
     Arc::new(Drawn {
@@ -90,8 +91,8 @@ pub(crate) fn body() -> Arc<Drawn> {
     })
 }
 
-pub(crate) fn frame(tick: u64, body: &Arc<Drawn>, q: f32) -> Frame {
-    let shape = Shape {
+pub(crate) fn frame(tick: u64, body: &Arc<Drawn>, q: f32) -> RecordedFrame {
+    let shape = ShapeFrame {
         body: body.clone(),
         coordinates: 0..1,
         warped: false,
@@ -103,14 +104,14 @@ pub(crate) fn frame(tick: u64, body: &Arc<Drawn>, q: f32) -> Frame {
         energies: None,
         bars: false,
     };
-    Frame {
+    RecordedFrame {
         tick,
         time: tick as f64 / 40.0,
         wall: 1.7e9 + tick as f64 / 40.0,
         arrived: if tick == 1 { vec![body.clone()] } else { Vec::new() },
         shapes: vec![shape],
         coordinates: vec![q],
-        ..Frame::default()
+        ..RecordedFrame::default()
     }
 }
 
@@ -217,13 +218,23 @@ fn figures_have_their_values_and_the_displacement_is_in_the_world() {
 #[test]
 fn hands_of_one_name_are_two_lines_and_an_empty_hand_clears_the_arrows() {
     let (mut recorder, stream, storage) = recorder();
-    let hand =
-        Hand { name: "hand".into(), color: None, force: [3.0, 4.0, 0.0], point: [0.0; 3], target: [0.0; 3] };
+    let hand = RecordedHand {
+        name: "hand".into(),
+        color: None,
+        force: [3.0, 4.0, 0.0],
+        point: [0.0; 3],
+        target: [0.0; 3],
+    };
     let line = Line { warning: true, text: "watch out".into() };
     recorder
-        .log(&Frame { tick: 1, hands: Some(vec![hand.clone(), hand]), lines: vec![line], ..Frame::default() })
+        .log(&RecordedFrame {
+            tick: 1,
+            hands: Some(vec![hand.clone(), hand]),
+            lines: vec![line],
+            ..RecordedFrame::default()
+        })
         .unwrap();
-    recorder.log(&Frame { tick: 2, hands: Some(Vec::new()), ..Frame::default() }).unwrap();
+    recorder.log(&RecordedFrame { tick: 2, hands: Some(Vec::new()), ..RecordedFrame::default() }).unwrap();
     recorder.end();
     drop(stream);
     let messages = storage.take();

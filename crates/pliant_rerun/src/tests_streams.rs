@@ -11,9 +11,9 @@ use rerun::{
 
 use crate::{
     RerunColor, RerunPlugin, RerunRecording, RerunScalars, RerunStats, RerunStyle,
-    frame::{Frame, Hand, Samples},
-    motion::Motion,
-    stress::Skin,
+    frame::{RecordedFrame, RecordedHand, Samples},
+    motion::ModalMotion,
+    stress::StressSkin,
     tests::{app, body, bytes_of_colors, chunks, frame, numbers, recorder, rows, scratch, square},
 };
 
@@ -21,7 +21,7 @@ use crate::{
 fn a_skin_that_is_stretched_and_turned_has_the_stress_of_the_closed_form() {
     let model = square();
     let surface = model.surface();
-    let skin = Skin::new(surface);
+    let skin = StressSkin::new(surface);
     let (young, nu) = (2e5_f32, 0.3_f32);
     let mut out = Vec::new();
     // There is no stress at rest and after any rotation.
@@ -58,7 +58,7 @@ fn a_skin_that_is_stretched_and_turned_has_the_stress_of_the_closed_form() {
 #[test]
 fn a_swing_of_a_known_frequency_and_amplitude_is_in_the_spectrum_there_and_so_high() {
     let model = square();
-    let mut motion = Motion::new(&model);
+    let mut motion = ModalMotion::new(&model);
     let (hz, tick) = (5.0, 1.0 / 40.0);
     for i in 0_u32..400 {
         let time = f64::from(i) * tick;
@@ -111,14 +111,14 @@ fn the_energy_of_each_mode_is_a_bar() {
 #[test]
 fn a_hand_has_its_users_color_in_the_plot_and_in_the_scene_and_its_line_ends_with_it() {
     let (mut recorder, stream, storage) = recorder();
-    let hand = |color| Hand {
+    let hand = |color| RecordedHand {
         name: "Ann".into(),
         color: Some(color),
         force: [3.0, 4.0, 0.0],
         point: [0.0; 3],
         target: [0.0; 3],
     };
-    let at = |tick, hands| Frame { tick, hands: Some(hands), ..Frame::default() };
+    let at = |tick, hands| RecordedFrame { tick, hands: Some(hands), ..RecordedFrame::default() };
     recorder.log(&at(1, vec![hand([10, 200, 30])])).unwrap();
     recorder.log(&at(2, vec![hand([10, 200, 30])])).unwrap();
     recorder.log(&at(3, Vec::new())).unwrap();

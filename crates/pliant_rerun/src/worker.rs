@@ -26,7 +26,7 @@ use rerun::{
 use crate::{
     RerunError,
     blueprint::Plots,
-    frame::{Drawn, Frame, Owed},
+    frame::{Drawn, Owed, RecordedFrame},
     recorder::Recorder,
 };
 
@@ -59,7 +59,7 @@ const WATCH: Duration = Duration::from_secs(1);
 
 /// One tick for a worker.
 pub(crate) struct Message {
-    pub frame: Arc<Frame>,
+    pub frame: Arc<RecordedFrame>,
     pub owed: Option<Owed>,
 }
 
@@ -85,7 +85,7 @@ impl Worker {
         target: &Target,
         queue: usize,
         plots: Plots,
-        spare: Sender<Frame>,
+        spare: Sender<RecordedFrame>,
     ) -> Result<Self, RerunError> {
         let id = ApplicationId::try_from(application.to_owned())
             .map_err(|_| RerunError::Application { name: application.to_owned() })?;
@@ -110,7 +110,9 @@ impl Worker {
                 // priority.
                 give_way();
                 match target.open(builder) {
-                    Some(stream) => record(&stream, &target, Inbox { frames: inbox, nudged, spare }, plots),
+                    Some(stream) => {
+                        record(&stream, &target, MessageQueue { frames: inbox, nudged, spare }, plots)
+                    }
                     // Dropping the inbox shows the app that the sink is closed.
                     None => drop(inbox),
                 }
@@ -149,7 +151,7 @@ impl Worker {
     ///
     /// A worker that has ended accepts and drops nothing. A worker that missed something also gets
     /// the list of all bodies from `bodies`.
-    pub fn offer(&mut self, frame: &Arc<Frame>, bodies: impl FnOnce() -> Vec<Arc<Drawn>>) -> bool {
+    pub fn offer(&mut self, frame: &Arc<RecordedFrame>, bodies: impl FnOnce() -> Vec<Arc<Drawn>>) -> bool {
         let Some(frames) = &self.frames else { return false };
         let owed = self.owed.take().map(|owed| Owed { bodies: bodies(), ..owed });
         match frames.try_send(Message { frame: frame.clone(), owed }) {
@@ -252,15 +254,15 @@ fn give_way() {
 }
 
 /// The worker's ends of its channels.
-struct Inbox {
+struct MessageQueue {
     frames: Receiver<Message>,
     nudged: Receiver<()>,
-    spare: Sender<Frame>,
+    spare: Sender<RecordedFrame>,
 }
 
 /// Logs until the app ends or the viewer is closed. The function owns the inbox: dropping the inbox
 /// shows the app that the sink is closed.
-fn record(stream: &RecordingStream, target: &Target, inbox: Inbox, plots: Plots) {
+fn record(stream: &RecordingStream, target: &Target, inbox: MessageQueue, plots: Plots) {
     let mut recorder = Recorder::new(stream.clone(), plots);
     let mut failing = false;
     let (mut sent, mut watched) = (Instant::now(), Instant::now());

@@ -28,19 +28,19 @@ fn end(model: &ModalModel, axis: [f32; 3]) -> u32 {
 }
 
 /// A hand of a test case: its patch, its hold, and the total displacement of its target (m).
-struct Case {
+struct SideBySide {
     vertex: u32,
     radius: f64,
     config: GrabConfig,
     way: [f64; 3],
 }
 
-fn hand(vertex: u32, radius: f64, way: [f64; 3]) -> Case {
-    Case { vertex, radius, config: GrabConfig::default(), way }
+fn hand(vertex: u32, radius: f64, way: [f64; 3]) -> SideBySide {
+    SideBySide { vertex, radius, config: GrabConfig::default(), way }
 }
 
 /// Steps the body and its copy `steps` times and compares states and reactions after each step.
-fn compare(name: &str, model: &Arc<ModalModel>, config: BodyConfig, cases: &[Case], steps: usize) {
+fn compare(name: &str, model: &Arc<ModalModel>, config: BodyConfig, cases: &[SideBySide], steps: usize) {
     let h = config.step;
     let settings = config.settings;
     let mut body = Body::new(model.clone(), config).unwrap();
@@ -113,7 +113,7 @@ fn a_damped_hand() {
     let bud = model("bud.modal");
     let tip = end(&bud, [0.0, 1.0, 0.0]);
     let config = GrabConfig { relaxation: 0.02, ..GrabConfig::default() };
-    let hands = [Case { config, ..hand(tip, 0.1 * bud.size(), [0.05 * bud.size(), 0.0, 0.0]) }];
+    let hands = [SideBySide { config, ..hand(tip, 0.1 * bud.size(), [0.05 * bud.size(), 0.0, 0.0]) }];
     compare("damped", &bud, BodyConfig { step: 1.0 / 64.0, ..Default::default() }, &hands, 128);
 }
 
@@ -161,7 +161,7 @@ fn two_hands() {
     let (right, left) = (end(&pip, [1.0, 0.0, 0.0]), end(&pip, [-1.0, 0.0, 0.0]));
     let hands = [
         hand(right, 0.08 * size, [0.2 * size, 0.1 * size, 0.0]),
-        Case { config: soft, ..hand(left, 0.05 * size, [0.0, 0.2 * size, -0.1 * size]) },
+        SideBySide { config: soft, ..hand(left, 0.05 * size, [0.0, 0.2 * size, -0.1 * size]) },
     ];
     compare("two hands", &pip, BodyConfig::default(), &hands, 128);
 }
@@ -177,7 +177,7 @@ fn under_gravity() {
 /// Steps a body with hands, and a copy of the body with the displacements and reactions that a
 /// frame carries. The second hand begins 40 steps later. Returns the largest difference of a
 /// coordinate as a share of the largest coordinate.
-fn told(model: &Arc<ModalModel>, settings: StepSettings, cases: &[Case; 2]) -> f64 {
+fn told(model: &Arc<ModalModel>, settings: StepSettings, cases: &[SideBySide; 2]) -> f64 {
     let mut body = Body::new(model.clone(), settings.into()).unwrap();
     let mut copy = Replica::new(model.clone(), settings, model.mode_count(), body.config().step).unwrap();
     let mut state = copy.kernel().at_rest();
@@ -228,7 +228,7 @@ fn places_and_reactions_tell_the_same_as_targets() {
     let soft = GrabConfig { stiffness: Some(200.0), relaxation: 0.02 };
     let cases = [
         hand(right, 0.08 * size, [0.2 * size, 0.1 * size, 0.0]),
-        Case { config: soft, ..hand(left, 0.05 * size, [0.0, 0.2 * size, -0.1 * size]) },
+        SideBySide { config: soft, ..hand(left, 0.05 * size, [0.0, 0.2 * size, -0.1 * size]) },
     ];
     let relaxation = Some(Relaxation { ratio: 0.5, time: 0.2 });
     let alpha = Integrator::GeneralizedAlpha { rho_inf: 0.5 };

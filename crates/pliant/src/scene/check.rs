@@ -13,7 +13,7 @@ use crate::modal::StepError;
 
 /// An error, and the path of the value that it is about.
 #[derive(Debug)]
-pub(super) struct Fault {
+pub(super) struct SceneFault {
     pub(super) path: Vec<Step>,
     pub(super) kind: SceneErrorKind,
     pub(super) message: String,
@@ -21,10 +21,10 @@ pub(super) struct Fault {
     pub(super) other: Option<Vec<Step>>,
 }
 
-type Checked = Result<(), Fault>;
+type Checked = Result<(), SceneFault>;
 
-fn fault(path: &[Step], kind: SceneErrorKind, message: impl Into<String>) -> Fault {
-    Fault { path: path.to_vec(), kind, message: message.into(), other: None }
+fn fault(path: &[Step], kind: SceneErrorKind, message: impl Into<String>) -> SceneFault {
+    SceneFault { path: path.to_vec(), kind, message: message.into(), other: None }
 }
 
 /// Largest length, time or force of a scene.
@@ -115,7 +115,7 @@ pub(super) fn check(scene: &SceneDescription) -> Checked {
 }
 
 /// Checks the bodies and returns the names of all of them, copies included.
-fn bodies(scene: &SceneDescription) -> Result<HashMap<String, usize>, Fault> {
+fn bodies(scene: &SceneDescription) -> Result<HashMap<String, usize>, SceneFault> {
     let mut names = HashMap::new();
     let mut count = 0_usize;
     for (i, body) in scene.bodies.iter().enumerate() {
@@ -145,7 +145,7 @@ fn bodies(scene: &SceneDescription) -> Result<HashMap<String, usize>, Fault> {
                     body.name_of(copy)
                 );
                 let other = Some(vec![Field("bodies"), Item(first), Field("name")]);
-                return Err(Fault { other, ..fault(&at("name"), SceneErrorKind::Name, message) });
+                return Err(SceneFault { other, ..fault(&at("name"), SceneErrorKind::Name, message) });
             }
         }
         made_of(scene, body, &at)?;
@@ -248,7 +248,7 @@ fn grabs(scene: &SceneDescription, bodies: &HashMap<String, usize>) -> Checked {
                 grab.name, scene.grabs[first].body
             );
             let other = Some(vec![Field("grabs"), Item(first), Field("name")]);
-            return Err(Fault { other, ..fault(&at("name"), SceneErrorKind::Name, message) });
+            return Err(SceneFault { other, ..fault(&at("name"), SceneErrorKind::Name, message) });
         }
         body_there(&at("body"), &format!("the grab `{}` holds", grab.name), &grab.body, bodies)?;
         patch(&at("patch"), &grab.patch)?;

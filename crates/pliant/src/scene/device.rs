@@ -4,7 +4,7 @@ use bevy::{math::DVec3, prelude::*};
 
 use super::hands::vertex_of;
 use super::locate::Step::Field;
-use super::spawn::{self, PartOf, SceneBody, SceneClock, Source};
+use super::spawn::{self, PartOf, SceneBody, SceneClock, SceneSource};
 use super::{DeviceEntry, Grip, Like, Motion, SceneError, SceneErrorKind, SceneFile, TouchEntry};
 use crate::body::{BodyState, PointerGrab};
 use crate::haptics::{
@@ -87,7 +87,7 @@ pub(super) fn add(
     world.spawn((
         Name::new("tool"),
         SceneTool { device, mover, on, force_scale, modal, placed: false, refused: false },
-        Source { file: file.clone(), path: vec![Field("device"), Field("on")] },
+        SceneSource { file: file.clone(), path: vec![Field("device"), Field("on")] },
         PartOf(instance),
     ));
     Ok(())
@@ -110,7 +110,7 @@ pub(super) fn play(
     time: Res<Time>,
     clocks: Query<&SceneClock>,
     bodies: Query<(&Name, &PartOf, &BodyState, &GlobalTransform), With<SceneBody>>,
-    mut tools: Query<(Entity, &mut SceneTool, &PartOf, &Source)>,
+    mut tools: Query<(Entity, &mut SceneTool, &PartOf, &SceneSource)>,
 ) {
     for (entity, mut tool, part, source) in &mut tools {
         let Some(t) = clocks.get(part.0).ok().and_then(|clock| clock.at(time.elapsed_secs_f64())) else {

@@ -8,7 +8,7 @@ use bevy::{
 };
 use ron::extensions::Extensions;
 
-use super::check::{self, Fault};
+use super::check::{self, SceneFault};
 use super::locate::{Step, locate};
 use super::syntax::refused;
 use super::{MAX_BYTES, SceneDescription, SceneError, SceneErrorKind};
@@ -111,7 +111,7 @@ impl SceneFile {
         let file = Self { origin: origin.into(), text: text.into(), scene: Arc::new(scene) };
         match checked {
             Ok(()) => Ok(file),
-            Err(Fault { path, kind, message, other }) => {
+            Err(SceneFault { path, kind, message, other }) => {
                 let place =
                     other.map_or(0, |other| super::locate::line_and_column(text, locate(text, &other)).0);
                 let place = if text.is_empty() { "another place".into() } else { format!("line {place}") };

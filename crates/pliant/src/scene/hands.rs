@@ -4,7 +4,7 @@ use bevy::{math::DVec3, prelude::*};
 
 use super::locate::Step::Field;
 use super::motion::smooth;
-use super::spawn::{self, PartOf, SceneBody, SceneClock, Source};
+use super::spawn::{self, PartOf, SceneBody, SceneClock, SceneSource};
 use super::{GrabEntry, PatchEntry, SceneError, SceneErrorKind};
 use crate::body::{BodyState, Grab, GrabForce, GrabOf, VisualState};
 use crate::modal::{ModalModel, Patch};
@@ -84,7 +84,7 @@ pub(super) fn play(
     time: Res<Time>,
     clocks: Query<(&SceneClock, &GlobalTransform)>,
     bodies: Query<(Entity, &Name, &PartOf, &BodyState, &VisualState, &GlobalTransform), With<SceneBody>>,
-    mut hands: Query<(Entity, &mut ScriptedHand, &PartOf, &Source, Option<&mut Grab>)>,
+    mut hands: Query<(Entity, &mut ScriptedHand, &PartOf, &SceneSource, Option<&mut Grab>)>,
 ) {
     for (entity, mut hand, part, source, grab) in &mut hands {
         let Ok((clock, scene)) = clocks.get(part.0) else { continue };

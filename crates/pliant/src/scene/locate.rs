@@ -17,7 +17,7 @@ pub(super) enum Step {
 /// If the value was left out, the result is the beginning of the innermost value of the path that
 /// exists. A malformed text gives some byte of the text.
 pub(super) fn locate(text: &str, path: &[Step]) -> usize {
-    let mut cursor = Cursor { text, at: 0 };
+    let mut cursor = TextCursor { text, at: 0 };
     cursor.space();
     while cursor.text[cursor.at..].starts_with("#!") {
         cursor.attribute();
@@ -44,12 +44,12 @@ pub(super) fn line_and_column(text: &str, at: usize) -> (usize, usize) {
     (1 + before.matches('\n').count(), 1 + before[begin..].chars().count())
 }
 
-struct Cursor<'a> {
+struct TextCursor<'a> {
     text: &'a str,
     at: usize,
 }
 
-impl<'a> Cursor<'a> {
+impl<'a> TextCursor<'a> {
     fn rest(&self) -> &'a str {
         &self.text[self.at..]
     }

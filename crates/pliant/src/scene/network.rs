@@ -84,7 +84,7 @@ pub(super) fn open(file: &SceneFile, entry: &NetworkEntry) -> Result<Opened, Sce
 /// The visual state of the guest: the modal coordinates, and the pose of a free body, per body
 /// name.
 #[derive(Resource, Clone, Default)]
-struct Seen(Arc<Mutex<HashMap<String, (Vec<f64>, Option<Pose>)>>>);
+struct LastStates(Arc<Mutex<HashMap<String, (Vec<f64>, Option<Pose>)>>>);
 
 /// The thread of the guest beside the host, which ends with the app.
 #[derive(Resource)]
@@ -107,7 +107,7 @@ pub(super) fn build(app: &mut App, opened: Opened, file: &SceneFile) {
     app.add_plugins(opened.net);
     let (Some(guest), Some(invite)) = (opened.guest, invite) else { return };
     let root = app.world().get_resource::<AssetRoot>().map(|root| root.0.clone()).unwrap_or_default();
-    let (seen, stop) = (Seen::default(), Arc::new(AtomicBool::new(false)));
+    let (seen, stop) = (LastStates::default(), Arc::new(AtomicBool::new(false)));
     let run = {
         let (file, seen, stop) = (file.clone(), seen.clone(), stop.clone());
         move || {
@@ -132,7 +132,7 @@ fn run_guest(
     guest: GuestEntry,
     file: &SceneFile,
     root: &Path,
-    seen: Seen,
+    seen: LastStates,
     stop: Arc<AtomicBool>,
 ) -> Result<(), crate::net::NetError> {
     let transport = JoinOptions { emulation: emulation(&guest.link, guest.seed), ..default() };
@@ -165,7 +165,10 @@ fn run_guest(
 }
 
 /// Publishes the visual states of the guest; runs in the guest's app.
-fn tell(seen: Res<Seen>, bodies: Query<(&Name, &VisualState, &BodyState, &Transform), With<SceneBody>>) {
+fn tell(
+    seen: Res<LastStates>,
+    bodies: Query<(&Name, &VisualState, &BodyState, &Transform), With<SceneBody>>,
+) {
     let mut seen = seen.0.lock().unwrap_or_else(PoisonError::into_inner);
     for (name, shown, state, place) in &bodies {
         let free = state
@@ -239,7 +242,7 @@ fn lend(
     }
 }
 
-fn show(seen: Res<Seen>, mut views: Query<(&mut GuestsView, &mut VisualState)>) {
+fn show(seen: Res<LastStates>, mut views: Query<(&mut GuestsView, &mut VisualState)>) {
     let seen = seen.0.lock().unwrap_or_else(PoisonError::into_inner);
     for (mut view, mut shown) in &mut views {
         let Some((q, pose)) = seen.get(&view.name).filter(|(q, _)| q.len() == shown.q().len()) else {

@@ -38,7 +38,7 @@ use crate::body::PliantSystems;
 /// ```
 pub struct SceneFilePlugin {
     schedule: InternedScheduleLabel,
-    role: Role,
+    role: NetworkRole,
     file: Option<SceneFile>,
     #[cfg(feature = "net")]
     network: Mutex<Option<super::network::Opened>>,
@@ -48,7 +48,7 @@ pub struct SceneFilePlugin {
 
 /// The owner of an instance.
 #[derive(Component, Debug, Default, Clone, Copy, PartialEq, Eq)]
-pub(super) enum Role {
+pub(super) enum NetworkRole {
     /// A game that has its own session and recording, or none.
     #[default]
     Asset,
@@ -71,7 +71,7 @@ impl Default for SceneFilePlugin {
     fn default() -> Self {
         Self {
             schedule: FixedUpdate.intern(),
-            role: Role::Asset,
+            role: NetworkRole::Asset,
             file: None,
             #[cfg(feature = "net")]
             network: Mutex::new(None),
@@ -107,7 +107,7 @@ impl SceneFilePlugin {
         let opened =
             file.scene().network.as_ref().map(|entry| super::network::open(&file, entry)).transpose()?;
         Ok(Self {
-            role: Role::Opened,
+            role: NetworkRole::Opened,
             #[cfg(feature = "net")]
             invite: opened.as_ref().and_then(|opened| opened.net.invite().cloned()),
             #[cfg(feature = "net")]
@@ -120,7 +120,7 @@ impl SceneFilePlugin {
     /// Creates a plugin for the part of the scene that a guest beside the host has.
     #[cfg(feature = "net")]
     pub(super) fn guest(file: SceneFile) -> Self {
-        Self { role: Role::Guest, file: Some(file), ..Self::default() }
+        Self { role: NetworkRole::Guest, file: Some(file), ..Self::default() }
     }
 
     /// Sets the schedule in which the bodies are stepped. Default: `FixedUpdate`.
@@ -170,7 +170,7 @@ impl Plugin for SceneFilePlugin {
         if let Some(opened) = self.network.lock().unwrap_or_else(PoisonError::into_inner).take() {
             super::network::build(app, opened, file);
         }
-        if self.role == Role::Opened {
+        if self.role == NetworkRole::Opened {
             #[cfg(feature = "haptics")]
             if scene.device.is_some() && !app.is_plugin_added::<crate::haptics::HapticsPlugin>() {
                 app.add_plugins(crate::haptics::HapticsPlugin::new(self.schedule));
@@ -200,7 +200,7 @@ impl SceneFilePlugin {
         use super::{SceneErrorKind, locate::Step::Field};
         use crate::rerun::{RerunPlugin, RerunRecording};
         let scene = file.scene();
-        let recording = scene.recording.as_ref().filter(|_| self.role == Role::Opened)?;
+        let recording = scene.recording.as_ref().filter(|_| self.role == NetworkRole::Opened)?;
         let failed = |kind, message: &str| Some(file.error(&[Field("recording")], kind, message.into()));
         if app.is_plugin_added::<RerunPlugin>() {
             return failed(

@@ -6,7 +6,7 @@ use super::locate::Step::{self, Field, Item};
 use super::needs::compiled;
 #[cfg(feature = "bake")]
 use super::plugin::AssetRoot;
-use super::plugin::Role;
+use super::plugin::NetworkRole;
 use super::{BodyEntry, By, NetworkEntry, SceneError, SceneErrorKind, SceneFile, TransformEntry};
 use crate::body::{BodyRefused, BodyState, ModalAsset, ModalBody, NoPointerGrab};
 
@@ -81,7 +81,7 @@ pub struct SceneFailed {
 
 /// The file and the path of the entry that a part was made from, for the position of errors.
 #[derive(Component, Debug, Clone)]
-pub(super) struct Source {
+pub(super) struct SceneSource {
     pub(super) file: SceneFile,
     pub(super) path: Vec<Step>,
 }
@@ -90,7 +90,7 @@ pub(super) struct Source {
 /// model.
 #[derive(Component)]
 #[expect(dead_code, reason = "held, so that the asset stays")]
-struct Kept(Handle<ModalAsset>);
+struct KeptEntry(Handle<ModalAsset>);
 
 /// Marks an instance whose parts were spawned.
 #[derive(Component)]
@@ -132,7 +132,7 @@ pub(super) fn watch(
     mut scenes: MessageReader<AssetLoadFailedEvent<SceneFile>>,
     mut models: MessageReader<AssetLoadFailedEvent<ModalAsset>>,
     instances: Query<(Entity, &SceneInstance)>,
-    bodies: Query<(Entity, &PartOf, &SceneBody, &ModalBody, &Source)>,
+    bodies: Query<(Entity, &PartOf, &SceneBody, &ModalBody, &SceneSource)>,
 ) {
     for failed in scenes.read() {
         for (instance, _) in instances.iter().filter(|(_, handle)| handle.0.id() == failed.id) {
@@ -178,7 +178,7 @@ pub(super) fn watch(
 pub(super) fn watch_settings(
     mut commands: Commands,
     mut refused: MessageReader<BodyRefused>,
-    bodies: Query<(&PartOf, &Name, &Source), (With<SceneBody>, Without<BodyState>)>,
+    bodies: Query<(&PartOf, &Name, &SceneSource), (With<SceneBody>, Without<BodyState>)>,
 ) {
     let mut told = Vec::new();
     for refused in refused.read() {
@@ -201,7 +201,7 @@ pub(super) fn watch_settings(
 pub(super) fn watch_bakes(
     mut commands: Commands,
     mut failures: Option<MessageReader<crate::body::BakeFailed>>,
-    bodies: Query<(&PartOf, &Name, &Source), With<SceneBody>>,
+    bodies: Query<(&PartOf, &Name, &SceneSource), With<SceneBody>>,
 ) {
     for failed in failures.iter_mut().flat_map(|failures| failures.read()) {
         let Ok((part, name, source)) = bodies.get(failed.entity) else { continue };
@@ -235,10 +235,10 @@ fn build(world: &mut World, instance: Entity, file: &SceneFile) {
     entity.despawn_related::<SceneParts>();
     entity.insert((Made, SceneClock::default()));
     let place = entity.get::<GlobalTransform>().copied().unwrap_or_default();
-    let role = entity.get::<Role>().copied().unwrap_or_default();
+    let role = entity.get::<NetworkRole>().copied().unwrap_or_default();
     let scene = file.scene();
     // An app that was built for the scene has these plugins, or `SceneFilePlugin::open` has failed.
-    if role == Role::Asset {
+    if role == NetworkRole::Asset {
         for error in not_in_a_game(file) {
             fail(world, instance, error);
         }
@@ -254,23 +254,23 @@ fn build(world: &mut World, instance: Entity, file: &SceneFile) {
             spawn_body(world, instance, file, place, role, (entry, body), copy);
         }
     }
-    let ours = if role == Role::Guest { By::Guest } else { By::Here };
+    let ours = if role == NetworkRole::Guest { By::Guest } else { By::Here };
     for (entry, grab) in scene.grabs.iter().enumerate().filter(|(_, grab)| grab.by == ours) {
         world.spawn((
             Name::new(grab.name.clone()),
             super::hands::ScriptedHand::new(grab.clone()),
-            Source { file: file.clone(), path: vec![Field("grabs"), Item(entry)] },
+            SceneSource { file: file.clone(), path: vec![Field("grabs"), Item(entry)] },
             PartOf(instance),
         ));
     }
     #[cfg(feature = "haptics")]
-    if let Some(device) = scene.device.as_ref().filter(|_| role != Role::Guest)
+    if let Some(device) = scene.device.as_ref().filter(|_| role != NetworkRole::Guest)
         && let Err(error) = super::device::add(world, instance, file, device)
     {
         fail(world, instance, error);
     }
     #[cfg(feature = "net")]
-    if role == Role::Opened {
+    if role == NetworkRole::Opened {
         super::network::spawn_views(world, instance, file, place);
     }
 }
@@ -293,18 +293,18 @@ fn not_in_a_game(file: &SceneFile) -> Vec<SceneError> {
 }
 
 /// Returns whether the host owns a body, so that the body arrives over the session.
-fn is_hosts(world: &World, file: &SceneFile, role: Role, body: &BodyEntry) -> bool {
+fn is_hosts(world: &World, file: &SceneFile, role: NetworkRole, body: &BodyEntry) -> bool {
     let scene = file.scene();
     let shared = body.shared.unwrap_or(scene.network.is_some());
     let joins = shared && matches!(scene.network, Some(NetworkEntry::Join { .. }));
     match role {
-        Role::Guest => true,
-        Role::Opened => joins,
+        NetworkRole::Guest => true,
+        NetworkRole::Opened => joins,
         // The session belongs to the game. The host owns the body only if the game is a guest.
         #[cfg(feature = "net")]
-        Role::Asset => joins && world.contains_resource::<crate::net::NetGuest>(),
+        NetworkRole::Asset => joins && world.contains_resource::<crate::net::NetGuest>(),
         #[cfg(not(feature = "net"))]
-        Role::Asset => {
+        NetworkRole::Asset => {
             let _ = world;
             false
         }
@@ -315,7 +315,7 @@ fn is_hosts(world: &World, file: &SceneFile, role: Role, body: &BodyEntry) -> bo
 fn can_be_made(
     world: &World,
     file: &SceneFile,
-    role: Role,
+    role: NetworkRole,
     (entry, body): (usize, &BodyEntry),
 ) -> Result<(), Option<SceneError>> {
     if is_hosts(world, file, role, body) || body.model.is_some() {
@@ -340,14 +340,14 @@ fn spawn_body(
     instance: Entity,
     file: &SceneFile,
     place: GlobalTransform,
-    role: Role,
+    role: NetworkRole,
     (entry, body): (usize, &BodyEntry),
     copy: usize,
 ) {
     let scene = file.scene();
     let shared = body.shared.unwrap_or(scene.network.is_some());
     let guest = is_hosts(world, file, role, body);
-    if role == Role::Guest && !shared {
+    if role == NetworkRole::Guest && !shared {
         return;
     }
     let transform = place.mul_transform(body.transform(copy)).compute_transform();
@@ -355,7 +355,7 @@ fn spawn_body(
     let mut spawned = world.spawn((
         Name::new(body.name_of(copy)),
         SceneBody { entry },
-        Source { file: file.clone(), path },
+        SceneSource { file: file.clone(), path },
         PartOf(instance),
         transform,
     ));
@@ -373,7 +373,7 @@ fn spawn_body(
         // A model that is loaded here need not be sent.
         let mut made = world.entity_mut(id);
         if guest {
-            made.insert(Kept(model))
+            made.insert(KeptEntry(model))
         } else {
             made.insert(ModalBody { model, ..body.modal() })
         };

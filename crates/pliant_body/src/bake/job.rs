@@ -29,16 +29,16 @@ pub(super) enum Outcome {
     Cancelled,
 }
 
-pub(super) struct Job {
+pub(super) struct BakeJob {
     /// Entity of the request. `None` after the request was dropped.
     pub entity: Option<Entity>,
     task: Task<Outcome>,
-    shared: Arc<Shared>,
+    shared: Arc<BakeShared>,
 }
 
 /// State shared between the bake and the main thread.
 #[derive(Default)]
-struct Shared {
+struct BakeShared {
     /// The number of the stage in the upper half, the stage's progress in millionths in the lower
     /// half.
     progress: AtomicU64,
@@ -48,7 +48,7 @@ struct Shared {
 const STAGES: [BakeStage; 5] =
     [BakeStage::Mesh, BakeStage::Assemble, BakeStage::Factor, BakeStage::Modes, BakeStage::Surface];
 
-impl Shared {
+impl BakeShared {
     fn report(&self, stage: u64, share: f64) {
         let millionths = (share.clamp(0.0, 1.0) * 1e6) as u64;
         self.progress.store(stage << 32 | millionths, Ordering::Relaxed);
@@ -59,9 +59,9 @@ impl Shared {
     }
 }
 
-impl Job {
+impl BakeJob {
     pub fn start(entity: Entity, request: BakeRequest, cache: Option<BakeCache>) -> Self {
-        let shared = Arc::<Shared>::default();
+        let shared = Arc::<BakeShared>::default();
         let task = AsyncComputeTaskPool::get().spawn({
             let shared = shared.clone();
             async move { run(&request, cache.as_ref(), &shared).unwrap_or_else(Outcome::Failed) }
@@ -85,7 +85,11 @@ impl Job {
     }
 }
 
-fn run(request: &BakeRequest, cache: Option<&BakeCache>, shared: &Shared) -> Result<Outcome, BakeBodyError> {
+fn run(
+    request: &BakeRequest,
+    cache: Option<&BakeCache>,
+    shared: &BakeShared,
+) -> Result<Outcome, BakeBodyError> {
     let start = Instant::now();
     // Invalid requests are refused before the long work starts.
     request.config.check()?;
@@ -129,7 +133,7 @@ fn run(request: &BakeRequest, cache: Option<&BakeCache>, shared: &Shared) -> Res
 /// input.
 fn mesh(
     request: &BakeRequest,
-    shared: &Shared,
+    shared: &BakeShared,
 ) -> Result<(TetMesh, Option<Surface>, Option<Repair>), BakeBodyError> {
     let options = StuffOptions::with_target(request.tets);
     let mut progress = |share: f32| shared.report(0, f64::from(share));

@@ -11,7 +11,7 @@ use pliant_bake::BakeCache;
 pub use request::{BakeBodyError, BakeFailed, BakeProgress, BakeRequest, BakeShape, BakeSkin, BakeStage};
 
 use crate::{ModalAsset, ModalBody};
-use job::{Job, Outcome};
+use job::{BakeJob, Outcome};
 
 /// Bakes the bodies of [`BakeRequest`]s on separate threads while the game runs.
 ///
@@ -55,7 +55,7 @@ impl Plugin for BakePlugin {
 struct Bakery {
     cache: Option<BakeCache>,
     waiting: VecDeque<Entity>,
-    running: Option<Job>,
+    running: Option<BakeJob>,
 }
 
 fn forget(removed: On<Remove, BakeRequest>, mut bakery: ResMut<Bakery>, mut commands: Commands) {
@@ -142,7 +142,7 @@ fn work(
         && let Some(entity) = bakery.waiting.pop_front()
     {
         if let Ok((_, request, mut progress, _)) = requests.get_mut(entity) {
-            let job = Job::start(entity, request.clone(), bakery.cache.clone());
+            let job = BakeJob::start(entity, request.clone(), bakery.cache.clone());
             *progress = job.progress();
             bakery.running = Some(job);
         }

@@ -75,9 +75,9 @@ impl Detail {
 }
 
 /// The views of a frame, reduced to what sizes on screen need.
-pub(super) struct Views(Vec<View>);
+pub(super) struct Views(Vec<CameraView>);
 
-struct View {
+struct CameraView {
     eye: Vec3A,
     near: f32,
     /// Meters that a pixel covers: at a distance of one meter in perspective, anywhere in an
@@ -98,7 +98,7 @@ impl Views {
             // In a reversed-depth projection without a far plane, the last column holds the near
             // distance.
             let near = if perspective { matrix.w_axis.z.abs().max(1e-6) } else { 0.0 };
-            (camera.is_active && metres.is_finite() && metres > 0.0).then_some(View {
+            (camera.is_active && metres.is_finite() && metres > 0.0).then_some(CameraView {
                 eye: place.translation_vec3a(),
                 near,
                 metres,

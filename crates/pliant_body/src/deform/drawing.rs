@@ -25,12 +25,12 @@ pub(super) struct Drawing {
     /// For each mode, the largest rotation of any vertex per unit of the modal coordinate,
     /// rad / (kg^1/2 m).
     pub turn: Vec<f32>,
-    parts: Vec<Part>,
+    parts: Vec<DrawnPart>,
 }
 
 /// A part of the surface with its box at rest and its own reach.
 #[derive(Debug)]
-struct Part {
+struct DrawnPart {
     low: Vec3A,
     high: Vec3A,
     reach: Vec<f32>,
@@ -51,8 +51,8 @@ impl Drawing {
         };
         let owners: Vec<usize> = positions.iter().map(part_of).collect();
         let modes = model.mode_count();
-        let mut pieces: Vec<Part> = (0..PARTS * PARTS * PARTS)
-            .map(|_| Part { low: Vec3A::INFINITY, high: Vec3A::NEG_INFINITY, reach: vec![0.0; modes] })
+        let mut pieces: Vec<DrawnPart> = (0..PARTS * PARTS * PARTS)
+            .map(|_| DrawnPart { low: Vec3A::INFINITY, high: Vec3A::NEG_INFINITY, reach: vec![0.0; modes] })
             .collect();
         for (p, &owner) in positions.iter().zip(&owners) {
             pieces[owner].low = pieces[owner].low.min(Vec3A::from(*p));

@@ -119,9 +119,9 @@ pub(super) fn finish(app: &mut App) {
 /// The newest shape of every body, and whether its vertex buffer holds that shape. This resource is
 /// in the render world.
 #[derive(Resource, Default)]
-struct Shapes(EntityHashMap<Shape>);
+struct Shapes(EntityHashMap<ResidentShape>);
 
-struct Shape {
+struct ResidentShape {
     wanted: GpuShape,
     /// The buffer and the vertex offset to which `wanted` was written.
     written: Option<(BufferId, u32)>,
@@ -145,7 +145,7 @@ fn extract(
                 kept.written = None;
             }
             None => {
-                shapes.0.insert(entity, Shape { wanted: shape.clone(), written: None });
+                shapes.0.insert(entity, ResidentShape { wanted: shape.clone(), written: None });
             }
         }
     }
@@ -153,7 +153,7 @@ fn extract(
 
 /// The struct `Surface` of `deform.wgsl`.
 #[derive(ShaderType, Clone, Copy)]
-struct Surface {
+struct GpuSurface {
     vertices: u32,
     drawn: u32,
     modes: u32,
@@ -165,7 +165,7 @@ struct Surface {
 
 /// The struct `Job` of `deform.wgsl`.
 #[derive(ShaderType, Clone, Copy)]
-struct Job {
+struct DeformJob {
     q: u32,
     modes: u32,
     warped: u32,
@@ -183,7 +183,7 @@ struct Resident {
     basis: Buffer,
     topology: Buffer,
     /// The surface data, in which `first` is filled in per dispatch.
-    surface: Surface,
+    surface: GpuSurface,
 }
 
 impl Resident {
@@ -212,7 +212,7 @@ impl Resident {
             rest: buffer("pliant rest", bytemuck::cast_slice(drawing.model.surface().positions())),
             basis: buffer("pliant basis", bytemuck::cast_slice(basis.rows()?)),
             topology: buffer("pliant topology", bytemuck::cast_slice(&words)),
-            surface: Surface {
+            surface: GpuSurface {
                 vertices: basis.vertices() as u32,
                 drawn: topology.source.len() as u32,
                 modes: basis.modes() as u32,
@@ -229,8 +229,8 @@ impl Resident {
 #[derive(Resource)]
 struct Device {
     residents: HashMap<usize, Resident>,
-    surfaces: DynamicUniformBuffer<Surface>,
-    jobs: BufferVec<Job>,
+    surfaces: DynamicUniformBuffer<GpuSurface>,
+    jobs: BufferVec<DeformJob>,
     coordinates: RawBufferVec<f32>,
     scratch: Option<Buffer>,
     dispatches: Vec<Dispatch>,
@@ -277,7 +277,7 @@ fn queue_pipelines(mut commands: Commands, assets: Res<AssetServer>, cache: Res<
         &BindGroupLayoutEntries::sequential(
             ShaderStages::COMPUTE,
             (
-                uniform_buffer::<Surface>(true),
+                uniform_buffer::<GpuSurface>(true),
                 read(),
                 read(),
                 read(),
@@ -303,7 +303,7 @@ fn queue_pipelines(mut commands: Commands, assets: Res<AssetServer>, cache: Res<
 }
 
 /// The location of a mesh's vertices, in bytes and in words.
-struct Place {
+struct BufferSlot {
     buffer: Buffer,
     first: u32,
     bytes: std::ops::Range<u64>,
@@ -317,7 +317,7 @@ fn place(
     drawn: usize,
     meshes: &RenderAssets<RenderMesh>,
     allocator: &MeshAllocator,
-) -> Option<Place> {
+) -> Option<BufferSlot> {
     let layout = &meshes.get(mesh)?.layout.0;
     let slice = allocator.mesh_vertex_slice(&mesh)?;
     // A mesh that was replaced from outside is left alone.
@@ -330,7 +330,7 @@ fn place(
         let attribute = layout.layout().attributes.get(index)?;
         (attribute.offset % 4 == 0).then_some((attribute.offset / 4) as u32)
     };
-    Some(Place {
+    Some(BufferSlot {
         buffer: slice.buffer.clone(),
         first: slice.range.start,
         bytes: u64::from(slice.range.start) * stride..u64::from(slice.range.end) * stride,
@@ -362,7 +362,7 @@ fn prepare(
     }
     // The work consists of the shapes to write and their locations. Bodies of one model in one
     // buffer are adjacent, sorted by their location in the buffer.
-    let mut work: Vec<(usize, Place, &mut Shape)> = shapes
+    let mut work: Vec<(usize, BufferSlot, &mut ResidentShape)> = shapes
         .0
         .values_mut()
         .filter_map(|shape| {
@@ -420,14 +420,14 @@ fn prepare(
             let first = device.jobs.len() as u32;
             batches.push(Batch {
                 drawing: *key,
-                surface: device.surfaces.push(&Surface { first, ..resident.surface }),
+                surface: device.surfaces.push(&GpuSurface { first, ..resident.surface }),
                 buffer: place.buffer.clone(),
                 bytes: low..low,
                 bodies: 0,
             });
         }
         let Some(batch) = batches.last_mut() else { continue };
-        device.jobs.push(Job {
+        device.jobs.push(DeformJob {
             q: device.coordinates.len() as u32,
             modes: (shape.wanted.q.len() as u32).min(resident.surface.modes),
             warped: u32::from(shape.wanted.warped),

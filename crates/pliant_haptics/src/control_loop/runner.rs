@@ -26,7 +26,7 @@ const RECORDS: usize = 8192;
 /// Maximum number of commands that wait to be processed.
 const COMMANDS: usize = 64;
 
-enum Command {
+enum LoopCommand {
     Tool(ToolMap),
     Modal(Option<Box<ModalLocal>>),
     ResetStop,
@@ -62,7 +62,7 @@ impl StopSwitch {
 pub struct HapticLoop {
     model: triple_buffer::Input<LocalModel>,
     report: triple_buffer::Output<LoopReport>,
-    commands: rtrb::Producer<Command>,
+    commands: rtrb::Producer<LoopCommand>,
     events: rtrb::Consumer<LoopEvent>,
     records: rtrb::Consumer<Record>,
     trash: rtrb::Consumer<Box<ModalLocal>>,
@@ -208,13 +208,13 @@ impl HapticLoop {
     /// full because the loop has not processed earlier commands yet. In the latter case the caller
     /// should retry.
     pub fn set_tool(&mut self, map: ToolMap) -> bool {
-        map.is_valid() && self.commands.push(Command::Tool(map)).is_ok()
+        map.is_valid() && self.commands.push(LoopCommand::Tool(map)).is_ok()
     }
 
     /// Sets or removes the body that the loop steps itself. Returns `false` if the queue is full
     /// because the loop has not processed earlier commands yet. The caller should then retry.
     pub fn set_modal(&mut self, modal: Option<Box<ModalLocal>>) -> bool {
-        self.commands.push(Command::Modal(modal)).is_ok()
+        self.commands.push(LoopCommand::Modal(modal)).is_ok()
     }
 
     /// Cuts the force at the loop's next period. The stop is latched.
@@ -231,12 +231,12 @@ impl HapticLoop {
     /// the caller should retry.
     pub fn reset_stop(&mut self) -> bool {
         self.stop.0.store(false, Ordering::Release);
-        self.commands.push(Command::ResetStop).is_ok()
+        self.commands.push(LoopCommand::ResetStop).is_ok()
     }
 
     /// Starts or stops the recording of every period, see [`records`](Self::records).
     pub fn set_recording(&mut self, on: bool) -> bool {
-        self.commands.push(Command::Record(on)).is_ok()
+        self.commands.push(LoopCommand::Record(on)).is_ok()
     }
 
     /// Returns the records since the last call, oldest first. If they are not read for a second or
@@ -291,7 +291,7 @@ struct Inner<D> {
     cycle: Cycle<D>,
     model: triple_buffer::Output<LocalModel>,
     report: triple_buffer::Input<LoopReport>,
-    commands: rtrb::Consumer<Command>,
+    commands: rtrb::Consumer<LoopCommand>,
     trash: rtrb::Producer<Box<ModalLocal>>,
     queues: Queues,
     stop: StopSwitch,
@@ -331,19 +331,19 @@ impl<D: HapticDevice> Inner<D> {
         }
     }
 
-    fn obey(&mut self, command: Command) {
+    fn obey(&mut self, command: LoopCommand) {
         match command {
-            Command::Tool(map) => {
+            LoopCommand::Tool(map) => {
                 self.cycle.set_tool(map);
             }
-            Command::Modal(modal) => {
+            LoopCommand::Modal(modal) => {
                 if let Some(old) = self.cycle.set_modal(modal) {
                     // The queue has room: the caller checked it before it took the command.
                     let _ = self.trash.push(old);
                 }
             }
-            Command::ResetStop => self.cycle.reset_stop(),
-            Command::Record(on) => self.queues.recording = on,
+            LoopCommand::ResetStop => self.cycle.reset_stop(),
+            LoopCommand::Record(on) => self.queues.recording = on,
         }
     }
 }

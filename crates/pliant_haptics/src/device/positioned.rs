@@ -29,10 +29,10 @@ pub struct Positioned {
 
 /// Moves a [`Positioned`] device from another thread.
 #[derive(Debug, Clone, Default)]
-pub struct PositionedHandle(Arc<Shared>);
+pub struct PositionedHandle(Arc<PositionedShared>);
 
 #[derive(Debug, Default)]
-struct Shared {
+struct PositionedShared {
     wanted: Mutex<Sample>,
     /// Force and torque, each number in its own atomic. The wrench is only drawn, and the loop must
     /// not wait for the reader.

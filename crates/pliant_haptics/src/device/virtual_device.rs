@@ -140,11 +140,11 @@ impl VirtualConfig {
 /// Moves the hand of a [`VirtualDevice`] from another thread and simulates failures of the device.
 #[derive(Debug, Clone, Default)]
 pub struct VirtualHandle {
-    shared: Arc<Shared>,
+    shared: Arc<VirtualShared>,
 }
 
 #[derive(Debug, Default)]
-struct Shared {
+struct VirtualShared {
     target: [AtomicU64; 3],
     buttons: AtomicU32,
     gone: AtomicBool,

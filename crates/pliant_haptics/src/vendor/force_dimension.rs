@@ -18,7 +18,7 @@ use crate::{Calibration, DeviceInfo, Fault, HapticDevice, Sample, Scheduler, Wre
 
 functions! {
     /// DHD, as dhdc.h declares it.
-    struct Api {
+    struct ForceDimensionApi {
         version = "dhdGetSDKVersion": fn(*mut c_int, *mut c_int, *mut c_int, *mut c_int);
         count = "dhdGetDeviceCount": fn() -> c_int;
         open_id = "dhdOpenID": fn(c_char) -> c_int;
@@ -74,7 +74,7 @@ pub struct ForceDimensionConfig {
 
 /// A Force Dimension device.
 pub struct ForceDimension {
-    api: Api,
+    api: ForceDimensionApi,
     robotic: Option<Robotic>,
     config: ForceDimensionConfig,
     id: Option<c_char>,
@@ -93,7 +93,7 @@ impl ForceDimension {
     pub fn open(config: ForceDimensionConfig) -> Result<Self, VendorError> {
         let names = if config.auto_init { ROBOTIC_NAMES } else { NAMES };
         let (library, path) = load(config.library.as_ref(), names)?;
-        let api = Api::from(&library, &path)?;
+        let api = ForceDimensionApi::from(&library, &path)?;
         let robotic = if config.auto_init { Some(Robotic::from(&library, &path)?) } else { None };
         let mut v = [0 as c_int; 4];
         // SAFETY: the header specifies four integers.
@@ -117,7 +117,7 @@ impl ForceDimension {
     /// Returns an error if there is no library or it lacks a function.
     pub fn count(config: &ForceDimensionConfig) -> Result<usize, VendorError> {
         let (library, path) = load(config.library.as_ref(), NAMES)?;
-        let api = Api::from(&library, &path)?;
+        let api = ForceDimensionApi::from(&library, &path)?;
         // SAFETY: the function takes nothing and keeps nothing.
         Ok(unsafe { (api.count)() }.max(0) as usize)
     }

@@ -60,7 +60,7 @@ type Callback = unsafe extern "system" fn(*mut c_void) -> c_uint;
 
 functions! {
     /// HDAPI, as hd.h, hdDevice.h and hdScheduler.h declare it.
-    struct Api {
+    struct OpenHapticsApi {
         init = "hdInitDevice": fn(*const c_char) -> Handle;
         disable = "hdDisableDevice": fn(Handle);
         make_current = "hdMakeCurrentDevice": fn(Handle);
@@ -106,7 +106,7 @@ impl Default for OpenHapticsConfig {
 
 /// A 3D Systems device.
 pub struct OpenHaptics {
-    api: Api,
+    api: OpenHapticsApi,
     config: OpenHapticsConfig,
     handle: Option<Handle>,
     info: DeviceInfo,
@@ -115,8 +115,8 @@ pub struct OpenHaptics {
 }
 
 /// Input and output of a callback.
-struct Frame {
-    api: Api,
+struct ScheduledFrame {
+    api: OpenHapticsApi,
     device: Handle,
     force: [f64; 3],
     position: [f64; 3],
@@ -133,7 +133,7 @@ struct Frame {
 /// `data` is a `Frame` that nothing else accesses until this function has returned.
 unsafe extern "system" fn servo(data: *mut c_void) -> c_uint {
     // SAFETY: `OpenHaptics::frame` passes its own frame and waits.
-    let frame = unsafe { &mut *data.cast::<Frame>() };
+    let frame = unsafe { &mut *data.cast::<ScheduledFrame>() };
     let api = frame.api;
     // SAFETY: the calls and the lengths of their arrays are those of the header, and the calls lie
     // between begin and end, as the header requires.
@@ -161,7 +161,7 @@ impl OpenHaptics {
         let names =
             if cfg!(windows) { &["hd.dll"][..] } else { &["libHD.so", "libHD.so.3", "libHD.so.3.4"][..] };
         let (library, path) = load(config.library.as_ref(), names)?;
-        let api = Api::from(&library, &path)?;
+        let api = OpenHapticsApi::from(&library, &path)?;
         let mut device = Self { api, handle: None, info: describe(&config), config, _library: library };
         device.connect()?;
         // SAFETY: the library returns a static string.
@@ -228,7 +228,7 @@ impl OpenHaptics {
 
     fn frame(&mut self, force: [f64; 3]) -> Result<Sample, Fault> {
         let device = self.handle.ok_or(Fault::Gone)?;
-        let mut frame = Frame {
+        let mut frame = ScheduledFrame {
             api: self.api,
             device,
             force,
@@ -289,7 +289,7 @@ fn describe(config: &OpenHapticsConfig) -> DeviceInfo {
 ///
 /// # Safety
 /// A device is current, and `api` is that of a loaded library.
-unsafe fn read_info(api: &Api, config: &OpenHapticsConfig) -> DeviceInfo {
+unsafe fn read_info(api: &OpenHapticsApi, config: &OpenHapticsConfig) -> DeviceInfo {
     let mut info = describe(config);
     let double = |what: c_uint, scale: f64, or: f64| {
         let mut value = [0.0f64; 16];

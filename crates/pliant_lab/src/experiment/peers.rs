@@ -16,7 +16,7 @@ const LOOK: Duration = Duration::from_millis(5);
 /// Time by which both peers have joined and hold the body.
 const SETTLED: Duration = Duration::from_secs(3);
 
-struct Seen {
+struct PeerSample {
     at: Duration,
     q: Vec<f64>,
     reactions: Vec<(UserId, [f64; 3])>,
@@ -60,7 +60,7 @@ impl Experiment {
             place.copied().unwrap_or_default().map(f64::from)
         };
         let mut grabs: Vec<Option<u16>> = vec![None; self.hands.len()];
-        let mut seen: BTreeMap<Tick, Seen> = BTreeMap::new();
+        let mut seen: BTreeMap<Tick, PeerSample> = BTreeMap::new();
         let mut truth: BTreeMap<Tick, Vec<f64>> = BTreeMap::new();
         let mut reactions: BTreeMap<Tick, Vec<(UserId, [f64; 3])>> = BTreeMap::new();
         let mut now = Duration::ZERO;
@@ -102,7 +102,10 @@ impl Experiment {
                     && let Some(body) = peers[1].body(BODY)
                 {
                     let reactions = body.grabs().iter().map(|g| (g.key.user, g.reaction)).collect();
-                    seen.insert(peers[1].tick(), Seen { at: now, q: body.visual().q.clone(), reactions });
+                    seen.insert(
+                        peers[1].tick(),
+                        PeerSample { at: now, q: body.visual().q.clone(), reactions },
+                    );
                 }
                 while let Some(out) = peers[k].poll_output() {
                     let channel = usize::from(out.channel == Channel::Message);
@@ -129,7 +132,7 @@ impl Experiment {
 
     fn peer_figures(
         &self,
-        seen: &BTreeMap<Tick, Seen>,
+        seen: &BTreeMap<Tick, PeerSample>,
         truth: &BTreeMap<Tick, Vec<f64>>,
         reactions: &BTreeMap<Tick, Vec<(UserId, [f64; 3])>>,
         link: &Link,

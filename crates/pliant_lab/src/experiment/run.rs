@@ -15,7 +15,7 @@ use crate::pair::World;
 /// True states kept for comparison, ticks.
 const KEPT: usize = 4096;
 
-struct Held {
+struct ExperimentGrab {
     hand: Hand,
     grab: Option<(GrabId, [f64; 3], f64)>,
 }
@@ -31,7 +31,7 @@ struct Truth {
 pub(super) struct Run {
     body: Body,
     h: f64,
-    hands: Vec<Held>,
+    hands: Vec<ExperimentGrab>,
     truth: VecDeque<Truth>,
     shape: ShapeError,
     track_row: Vec<f64>,
@@ -85,7 +85,7 @@ impl Run {
         Self {
             body,
             h,
-            hands: experiment.hands.iter().map(|h| Held { hand: *h, grab: None }).collect(),
+            hands: experiment.hands.iter().map(|h| ExperimentGrab { hand: *h, grab: None }).collect(),
             truth: VecDeque::with_capacity(KEPT),
             shape,
             track_row,

@@ -25,7 +25,7 @@ const SECONDS: f64 = 2.0;
 const ALPHA: Integrator = Integrator::GeneralizedAlpha { rho_inf: 0.5 };
 
 /// Forces on the hand and positions on the surface every 1/60 s, and the times of the run.
-struct Run {
+struct FrontRun {
     force: Vec<[f64; 3]>,
     /// Displacements of the vertices that every mesh shares, m.
     places: Vec<Vec<[f64; 3]>>,
@@ -42,7 +42,7 @@ fn shared(model: &ModalModel, places: &[[f32; 3]]) -> Option<Vec<usize>> {
 }
 
 /// Runs two seconds under a hand that circles. The radius grows during the first second.
-fn moving(model: &Arc<ModalModel>, places: &[usize], config: BodyConfig) -> Result<Run, LabError> {
+fn moving(model: &Arc<ModalModel>, places: &[usize], config: BodyConfig) -> Result<FrontRun, LabError> {
     let _pinned = Pinned::new();
     let (step, per) = (config.step, (1.0 / PICTURES / config.step).round().max(1.0) as usize);
     let mut body = Body::new(model.clone(), config)?;
@@ -59,7 +59,8 @@ fn moving(model: &Arc<ModalModel>, places: &[usize], config: BodyConfig) -> Resu
     let start = body.grab_position(grab)?;
     let rest = model.surface().positions();
     let mut surface = rest.to_vec();
-    let mut run = Run { force: Vec::new(), places: Vec::new(), step_us: Vec::new(), surface_us: Vec::new() };
+    let mut run =
+        FrontRun { force: Vec::new(), places: Vec::new(), step_us: Vec::new(), surface_us: Vec::new() };
     for i in 1..=(SECONDS * PICTURES) as usize * per {
         let t = i as f64 * step;
         let (sin, cos) = (std::f64::consts::TAU * 0.8 * t).sin_cos();
@@ -175,7 +176,7 @@ fn local(quick: bool, progress: &mut dyn Progress) -> Result<(Vec<Figure>, Strin
     };
     // The reference has a far finer mesh, twice the modes and far shorter steps of second order. A
     // mesh in between estimates the error of the reference.
-    let fine = |cells: [usize; 3], rate: f64| -> Result<Run, LabError> {
+    let fine = |cells: [usize; 3], rate: f64| -> Result<FrontRun, LabError> {
         let (model, _) = baked(&shapes::bar(cells, size)?, &held(Element::Tet10, 120))?;
         let places = every(&model)?;
         moving(
@@ -190,8 +191,8 @@ fn local(quick: bool, progress: &mut dyn Progress) -> Result<(Vec<Figure>, Strin
     };
     let truth = fine(if quick { [16, 4, 4] } else { [24, 6, 6] }, 3840.0)?;
     let between = fine(if quick { [8, 2, 2] } else { [16, 4, 4] }, 1920.0)?;
-    let shape_of = |run: &Run| relative(run.places.iter().flatten(), truth.places.iter().flatten());
-    let force_of = |run: &Run| relative(run.force.iter(), truth.force.iter());
+    let shape_of = |run: &FrontRun| relative(run.places.iter().flatten(), truth.places.iter().flatten());
+    let force_of = |run: &FrontRun| relative(run.force.iter(), truth.force.iter());
     let own = [shape_of(&between), force_of(&between)];
     let rates: &[f64] = if quick { &[60.0, 240.0] } else { &[60.0, 120.0, 240.0, 480.0] };
     let mut choices = Vec::new();

@@ -15,7 +15,7 @@ use crate::LabError;
 
 /// Comparison of a held body with a nonlinear solution. The hands hold the body's patches at the
 /// positions of the nonlinear solution.
-pub(super) struct Held {
+pub(super) struct HeldBar {
     /// Root mean square and largest error of the surface, m.
     pub(super) shape: [f64; 2],
     /// |reaction - load| / load.
@@ -31,7 +31,7 @@ pub(super) fn held_as(
     load: &[DeadLoad],
     truth: &Deflection,
     body_config: BodyConfig,
-) -> Result<Held, LabError> {
+) -> Result<HeldBar, LabError> {
     let mut body = Body::new(model.clone(), body_config)?;
     let mut grabs = Vec::new();
     for (dead, moved) in load.iter().zip(&truth.patches) {
@@ -62,7 +62,7 @@ pub(super) fn held_as(
         along -= (0..3).map(|k| f[k] * dead.force[k]).sum::<f64>();
     }
     let step_us = time_us(2_000, || Ok(body.step().map(|_| ())?))?;
-    Ok(Held {
+    Ok(HeldBar {
         shape: apart(&moved, &truth.surface),
         force: (off / size).sqrt(),
         along: (along / size - 1.0).abs(),

@@ -14,7 +14,7 @@ use crate::LabError;
 
 /// A bar along x with a corner at the origin.
 #[derive(Debug, Clone)]
-pub(super) struct Bar {
+pub(super) struct BarBody {
     pub(super) cells: [usize; 3],
     /// Length, m.
     pub(super) length: f64,
@@ -31,7 +31,7 @@ pub(super) struct Bar {
     pub(super) held: bool,
 }
 
-impl Default for Bar {
+impl Default for BarBody {
     fn default() -> Self {
         Self {
             cells: [8, 2, 2],
@@ -48,7 +48,7 @@ impl Default for Bar {
     }
 }
 
-impl Bar {
+impl BarBody {
     fn size(&self) -> [f64; 3] {
         [self.length, self.section[0] * self.length, self.section[1] * self.length]
     }
@@ -99,7 +99,7 @@ impl Bar {
 }
 
 /// A held body with a hand on its tip.
-pub(super) struct Held {
+pub(super) struct HeldCase {
     pub(super) model: Arc<ModalModel>,
     pub(super) body: Body,
     pub(super) patch: Patch,
@@ -107,8 +107,8 @@ pub(super) struct Held {
     pub(super) start: [f64; 3],
 }
 
-impl Held {
-    pub(super) fn new(bar: &Bar, config: BodyConfig, hand: GrabConfig) -> Result<Self, LabError> {
+impl HeldCase {
+    pub(super) fn new(bar: &BarBody, config: BodyConfig, hand: GrabConfig) -> Result<Self, LabError> {
         let model = bar.bake()?;
         let patch = bar.tip(&model)?;
         Self::of(model, patch, config, hand)
@@ -169,7 +169,7 @@ pub(super) fn compliance(body: &Body, grab: GrabId) -> Result<Matrix3<f64>, Step
 
 /// The force (N) that holds a patch `away` (m) from its rest: the static limit of a small
 /// displacement.
-pub(super) fn static_pull(held: &Held, away: [f64; 3]) -> Result<Vector3<f64>, StepError> {
+pub(super) fn static_pull(held: &HeldCase, away: [f64; 3]) -> Result<Vector3<f64>, StepError> {
     let whole = compliance(&held.body, held.grab)? + modal_compliance(&held.model, &held.patch);
     Ok(whole.try_inverse().map_or_else(|| Vector3::repeat(f64::NAN), |inverse| inverse * Vector3::from(away)))
 }

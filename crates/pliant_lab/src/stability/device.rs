@@ -10,8 +10,8 @@ use pliant_haptics::{
 use pliant_modal::{Body, BodyConfig, GrabConfig};
 
 use super::{
-    Bound, Case, Outcome,
-    bodies::{Bar, smooth},
+    Bound, Case, CaseOutcome,
+    bodies::{BarBody, smooth},
 };
 use crate::LabError;
 
@@ -76,7 +76,7 @@ fn calms(device: &VirtualConfig, k: f64) -> Result<bool, LabError> {
 
 /// Finds the stiffest stable wall by bisection and compares it with the known limit of a sampled
 /// spring.
-fn sampled_spring(mass: f64, damping: f64) -> Result<Outcome, LabError> {
+fn sampled_spring(mass: f64, damping: f64) -> Result<CaseOutcome, LabError> {
     let device = VirtualConfig { mass, damping, peak_force: 1e6, ..VirtualConfig::default() };
     let want = 2.0 * damping * RATE;
     let (mut low, mut high) = (0.5 * want, 2.0 * want);
@@ -84,12 +84,12 @@ fn sampled_spring(mass: f64, damping: f64) -> Result<Outcome, LabError> {
         let middle = 0.5 * (low + high);
         if calms(&device, middle)? { low = middle } else { high = middle }
     }
-    Ok(Outcome::of(vec![Bound::new("|stiffest calm spring / (2 b / T) - 1|", low / want - 1.0, 0.02)]))
+    Ok(CaseOutcome::of(vec![Bound::new("|stiffest calm spring / (2 b / T) - 1|", low / want - 1.0, 0.02)]))
 }
 
 /// A body stepped at the game's rate, a network with a fixed delay, and the device loop with a
 /// virtual Touch.
-struct Scene {
+struct DeviceScene {
     body: Body,
     held: HeldGrab,
     writer: ModelWriter,
@@ -108,9 +108,9 @@ struct Scene {
     given: f64,
 }
 
-impl Scene {
+impl DeviceScene {
     fn new(young: f64, hand: Hand, simulation: f64, round_trip: f64) -> Result<Self, LabError> {
-        let bar = Bar { young, length: 0.15, modes: 12, zeta: 0.05, ..Bar::default() };
+        let bar = BarBody { young, length: 0.15, modes: 12, zeta: 0.05, ..BarBody::default() };
         let model = bar.bake()?;
         let patch = bar.tip(&model)?;
         let step = 1.0 / simulation;
@@ -186,8 +186,8 @@ impl Scene {
 
 /// Drags the tool 3 cm to the side within half a second and holds it there. Without a hand, the
 /// free device gets an initial velocity instead.
-fn drag(young: f64, hand: Hand, simulation: f64, round_trip: f64) -> Result<Outcome, LabError> {
-    let mut scene = Scene::new(young, hand, simulation, round_trip)?;
+fn drag(young: f64, hand: Hand, simulation: f64, round_trip: f64) -> Result<CaseOutcome, LabError> {
+    let mut scene = DeviceScene::new(young, hand, simulation, round_trip)?;
     scene.largest_speed(0.5)?;
     if hand == Hand::NONE {
         let at = scene.cycle.device().position();
@@ -207,7 +207,7 @@ fn drag(young: f64, hand: Hand, simulation: f64, round_trip: f64) -> Result<Outc
     // Below half a centimeter a second nobody feels the motion. Above that, the motion must be
     // slower than two seconds before.
     let allowed = (0.7 * early).max(5e-3);
-    Ok(Outcome::of(vec![
+    Ok(CaseOutcome::of(vec![
         Bound::new("speed of the tool 3.5 s after the pull / m/s", late, allowed),
         Bound::new("energy given beyond what was put in / J", scene.given, TANK),
     ]))

@@ -5,8 +5,8 @@ use nalgebra::Vector3;
 use pliant_modal::{Body, BodyConfig, GrabConfig, GrabId, ModalModel, Patch, StepSettings};
 
 use super::{
-    Bound, Case, Expected, Outcome,
-    bodies::{Bar, Held, compliance, modal_compliance, settling, smooth},
+    Bound, Case, CaseOutcome, Expected,
+    bodies::{BarBody, HeldCase, compliance, modal_compliance, settling, smooth},
     plain,
 };
 use crate::LabError;
@@ -77,8 +77,8 @@ pub(super) fn cases(out: &mut Vec<Case>) {
         out.push(Case::new("grab rows against modes", name, move || many(modes, hands)));
     }
     out.push(Case::new("a million steps", "held".into(), || {
-        let bar = Bar { modes: 6, zeta: 0.3, ..Bar::default() };
-        let mut held = Held::new(&bar, BodyConfig::default(), GrabConfig::default())?;
+        let bar = BarBody { modes: 6, zeta: 0.3, ..BarBody::default() };
+        let mut held = HeldCase::new(&bar, BodyConfig::default(), GrabConfig::default())?;
         let away = [0.0, 0.05, 0.02];
         held.pull(away)?;
         let mut settled = Vector3::zeros();
@@ -91,11 +91,11 @@ pub(super) fn cases(out: &mut Vec<Case>) {
                 drift = drift.max((held.reaction()? - settled).norm() / settled.norm());
             }
         }
-        Ok(Outcome::of(vec![Bound::new("drift of the reaction / reaction", drift, 1e-9)]))
+        Ok(CaseOutcome::of(vec![Bound::new("drift of the reaction / reaction", drift, 1e-9)]))
     }));
     out.push(Case::new("a million steps", "dragged to and fro".into(), || {
-        let bar = Bar { modes: 6, zeta: 0.1, ..Bar::default() };
-        let mut held = Held::new(&bar, BodyConfig::default(), GrabConfig::default())?;
+        let bar = BarBody { modes: 6, zeta: 0.1, ..BarBody::default() };
+        let mut held = HeldCase::new(&bar, BodyConfig::default(), GrabConfig::default())?;
         let mut peaks = [0.0f64; 2];
         for i in 0..1_000_000u32 {
             let t = f64::from(i) / 60.0;
@@ -104,7 +104,7 @@ pub(super) fn cases(out: &mut Vec<Case>) {
             let part = usize::from(i >= 500_000);
             peaks[part] = peaks[part].max(held.reaction()?.norm());
         }
-        Ok(Outcome::of(vec![Bound::new(
+        Ok(CaseOutcome::of(vec![Bound::new(
             "largest reaction of the second half / of the first",
             peaks[1] / peaks[0],
             1.01,
@@ -123,9 +123,9 @@ pub(super) fn cases(out: &mut Vec<Case>) {
 }
 
 /// Moves the target to and fro a hundred sizes away, then releases the patch.
-fn teleport(young: f64, step: f64) -> Result<Outcome, LabError> {
-    let bar = Bar { young, zeta: 0.05, ..Bar::default() };
-    let mut held = Held::new(&bar, BodyConfig { step, ..BodyConfig::default() }, GrabConfig::default())?;
+fn teleport(young: f64, step: f64) -> Result<CaseOutcome, LabError> {
+    let bar = BarBody { young, zeta: 0.05, ..BarBody::default() };
+    let mut held = HeldCase::new(&bar, BodyConfig { step, ..BodyConfig::default() }, GrabConfig::default())?;
     let away = |i: usize| {
         let far = if i.is_multiple_of(7) { 100.0 } else { -100.0 };
         [far, far, -far]
@@ -145,7 +145,7 @@ fn teleport(young: f64, step: f64) -> Result<Outcome, LabError> {
         held.body.step()?;
     }
     let plain = plain::beside(&held.model, step, &[held.patch], 400, |i| vec![away(i)])?;
-    Ok(Outcome {
+    Ok(CaseOutcome {
         bounds: vec![
             Bound::new("largest reaction / what the compliance allows", force / allowed, 1.0 + 1e-9),
             Bound::new("energy left when let go / largest", held.body.energy() / energy, 1e-6),
@@ -155,9 +155,9 @@ fn teleport(young: f64, step: f64) -> Result<Outcome, LabError> {
 }
 
 /// Flips the target each step by the resolution of a cheap encoder.
-fn jitter(young: f64, step: f64) -> Result<Outcome, LabError> {
-    let bar = Bar { young, length: 0.15, ..Bar::default() };
-    let mut held = Held::new(&bar, BodyConfig { step, ..BodyConfig::default() }, GrabConfig::default())?;
+fn jitter(young: f64, step: f64) -> Result<CaseOutcome, LabError> {
+    let bar = BarBody { young, length: 0.15, ..BarBody::default() };
+    let mut held = HeldCase::new(&bar, BodyConfig { step, ..BodyConfig::default() }, GrabConfig::default())?;
     let size = 55e-6;
     let away = |i: usize| {
         let to = if i.is_multiple_of(2) { size } else { 0.0 };
@@ -174,7 +174,7 @@ fn jitter(young: f64, step: f64) -> Result<Outcome, LabError> {
     // The patch itself may be as far away as the target, on the other side.
     let allowed = 2.0 * size * std::f64::consts::SQRT_2 / softest;
     let plain = plain::beside(&held.model, step, &[held.patch], 10_000, |i| vec![away(i)])?;
-    Ok(Outcome {
+    Ok(CaseOutcome {
         bounds: vec![
             Bound::new("largest reaction / twice the jitter over the compliance", peaks[0] / allowed, 1.0),
             Bound::new("largest reaction of the second half / of the first", peaks[1] / peaks[0], 1.01),
@@ -185,8 +185,8 @@ fn jitter(young: f64, step: f64) -> Result<Outcome, LabError> {
 
 /// Four hands on the corners of the end turn it about the axis by two full turns, hold it and
 /// release it.
-fn twist(young: f64, corrections: u8) -> Result<Outcome, LabError> {
-    let bar = Bar { young, zeta: 0.05, modes: 30, ..Bar::default() };
+fn twist(young: f64, corrections: u8) -> Result<CaseOutcome, LabError> {
+    let bar = BarBody { young, zeta: 0.05, modes: 30, ..BarBody::default() };
     let model = bar.bake()?;
     let mut body =
         Body::new(model.clone(), BodyConfig::from(StepSettings { corrections, ..Default::default() }))?;
@@ -233,7 +233,7 @@ fn twist(young: f64, corrections: u8) -> Result<Outcome, LabError> {
     let plain = plain::beside(&model, 1.0 / 60.0, &patches, 900, |i| {
         starts.iter().map(|s| (turned(s, i) - s).into()).collect()
     })?;
-    Ok(Outcome {
+    Ok(CaseOutcome {
         bounds: vec![
             Bound::new("farthest a corner goes / size", farthest / model.size(), 1.0),
             Bound::new("change of a held reaction in a step / reaction", held, 0.1),
@@ -244,8 +244,8 @@ fn twist(young: f64, corrections: u8) -> Result<Outcome, LabError> {
 }
 
 /// Two hands on opposite sides of the end pull apart by a tenth of the length.
-fn opposed(young: f64, stiffness: Option<f64>) -> Result<Outcome, LabError> {
-    let bar = Bar { young, zeta: 0.1, ..Bar::default() };
+fn opposed(young: f64, stiffness: Option<f64>) -> Result<CaseOutcome, LabError> {
+    let bar = BarBody { young, zeta: 0.1, ..BarBody::default() };
     let model = bar.bake()?;
     let mut body = Body::new(model.clone(), BodyConfig::default())?;
     let hand = GrabConfig { stiffness, ..GrabConfig::default() };
@@ -270,15 +270,15 @@ fn opposed(young: f64, stiffness: Option<f64>) -> Result<Outcome, LabError> {
     }
     let plain =
         plain::beside(&model, 1.0 / 60.0, &patches, 600, |_| vec![[0.0, -0.1, 0.0], [0.0, 0.1, 0.0]])?;
-    Ok(Outcome {
+    Ok(CaseOutcome {
         bounds: vec![Bound::new("unrest of the reaction / reaction", off, 0.01)],
         plain: stiffness.is_none().then_some(plain),
     })
 }
 
 /// Hands on one patch must share the force that a single hand with their joint compliance gets.
-fn coincident(hands: usize) -> Result<Outcome, LabError> {
-    let bar = Bar { zeta: 0.3, ..Bar::default() };
+fn coincident(hands: usize) -> Result<CaseOutcome, LabError> {
+    let bar = BarBody { zeta: 0.3, ..BarBody::default() };
     let model = bar.bake()?;
     let patch = bar.tip(&model)?;
     let mut body = Body::new(model.clone(), BodyConfig::default())?;
@@ -301,7 +301,7 @@ fn coincident(hands: usize) -> Result<Outcome, LabError> {
     let want = whole.try_inverse().map_or_else(|| Vector3::repeat(f64::NAN), |inverse| inverse * away);
     let patches = vec![patch; hands];
     let plain = plain::beside(&model, 1.0 / 60.0, &patches, 600, |_| vec![away.into(); hands])?;
-    Ok(Outcome {
+    Ok(CaseOutcome {
         bounds: vec![Bound::new(
             "|sum of reactions - static| / static",
             (sum - want).norm() / want.norm(),
@@ -312,8 +312,8 @@ fn coincident(hands: usize) -> Result<Outcome, LabError> {
 }
 
 /// A hand on an anchor must get the force of its own contact compliance and nothing else.
-fn on_anchor(young: f64, beside: bool) -> Result<Outcome, LabError> {
-    let bar = Bar { young, zeta: 0.3, ..Bar::default() };
+fn on_anchor(young: f64, beside: bool) -> Result<CaseOutcome, LabError> {
+    let bar = BarBody { young, zeta: 0.3, ..BarBody::default() };
     let model = bar.bake()?;
     let mut body = Body::new(model.clone(), BodyConfig::default())?;
     let patch = Patch::around(model.surface(), bar.vertex(&model, [0.0, 0.5, 0.5]), 0.0)?;
@@ -334,7 +334,7 @@ fn on_anchor(young: f64, beside: bool) -> Result<Outcome, LabError> {
         .map_or_else(|| Vector3::repeat(f64::NAN), |inverse| inverse * away);
     let got = -Vector3::from(body.reaction(grab)?);
     let plain = plain::beside(&model, 1.0 / 60.0, &[patch], 10, |_| vec![away.into()])?;
-    Ok(Outcome {
+    Ok(CaseOutcome {
         bounds: vec![Bound::new(
             "|reaction - contact's| / contact's",
             (got - want).norm() / want.norm(),
@@ -344,7 +344,7 @@ fn on_anchor(young: f64, beside: bool) -> Result<Outcome, LabError> {
     })
 }
 
-fn spread(bar: &Bar, model: &ModalModel, hands: usize) -> Result<Vec<Patch>, LabError> {
+fn spread(bar: &BarBody, model: &ModalModel, hands: usize) -> Result<Vec<Patch>, LabError> {
     (0..hands)
         .map(|k| {
             let along = 0.3 + 0.7 * k as f64 / hands.max(2) as f64;
@@ -355,8 +355,8 @@ fn spread(bar: &Bar, model: &ModalModel, hands: usize) -> Result<Vec<Patch>, Lab
 }
 
 /// More rows than modes: the hands contradict each other, and the body must still come to rest.
-fn many(modes: usize, hands: usize) -> Result<Outcome, LabError> {
-    let bar = Bar { modes, zeta: 0.2, ..Bar::default() };
+fn many(modes: usize, hands: usize) -> Result<CaseOutcome, LabError> {
+    let bar = BarBody { modes, zeta: 0.2, ..BarBody::default() };
     let model = bar.bake()?;
     let patches = spread(&bar, &model, hands)?;
     let mut body = Body::new(model.clone(), BodyConfig::default())?;
@@ -385,19 +385,19 @@ fn many(modes: usize, hands: usize) -> Result<Outcome, LabError> {
         }
     }
     let plain = plain::beside(&model, 1.0 / 60.0, &patches, 600, |_| (0..hands).map(away).collect())?;
-    Ok(Outcome {
+    Ok(CaseOutcome {
         bounds: vec![Bound::new("unrest of the reactions / largest", off, 1e-3)],
         plain: Some(plain),
     })
 }
 
 /// Pulls a free body to and fro. The cases have masses a million times apart under the same hand.
-fn light_and_heavy(density: f64, stiffness: Option<f64>) -> Result<Outcome, LabError> {
-    let bar = Bar { held: false, density, modes: 12, zeta: 0.1, ..Bar::default() };
+fn light_and_heavy(density: f64, stiffness: Option<f64>) -> Result<CaseOutcome, LabError> {
+    let bar = BarBody { held: false, density, modes: 12, zeta: 0.1, ..BarBody::default() };
     let model = bar.bake()?;
     let patch = bar.tip(&model)?;
     let hand = GrabConfig { stiffness, relaxation: 1.0 / 60.0 };
-    let mut held = Held::of(model, patch, BodyConfig::default(), hand)?;
+    let mut held = HeldCase::of(model, patch, BodyConfig::default(), hand)?;
     let mut peaks = [0.0f64; 2];
     let mut farthest = 0.0f64;
     for i in 0..12_000u32 {
@@ -408,7 +408,7 @@ fn light_and_heavy(density: f64, stiffness: Option<f64>) -> Result<Outcome, LabE
         peaks[part] = peaks[part].max(held.reaction()?.norm());
         farthest = farthest.max(Vector3::from(held.body.frame().center()).norm());
     }
-    Ok(Outcome::of(vec![
+    Ok(CaseOutcome::of(vec![
         Bound::new("largest reaction of the second half / of the first", peaks[1] / peaks[0], 1.5),
         Bound::new("farthest from the hand / m", farthest, 10.0),
     ]))

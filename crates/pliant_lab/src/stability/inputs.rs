@@ -2,7 +2,7 @@
 
 use pliant_modal::{Body, BodyConfig, GrabConfig, Integrator, StepError, StepSettings};
 
-use super::{Bound, Case, Outcome, bodies::Bar};
+use super::{Bound, Case, CaseOutcome, bodies::BarBody};
 use crate::LabError;
 
 const BAD: [(&str, f64); 3] =
@@ -13,7 +13,7 @@ pub(super) fn cases(out: &mut Vec<Case>) {
         out.push(Case::new("inputs", format!("{name} everywhere"), move || refused(bad)));
     }
     out.push(Case::new("inputs", "pushes beyond the largest number".into(), || {
-        let bar = Bar { zeta: 0.0, ..Bar::default() };
+        let bar = BarBody { zeta: 0.0, ..BarBody::default() };
         let model = bar.bake()?;
         let config = BodyConfig::from(StepSettings { integrator: Integrator::Newmark, ..Default::default() });
         let mut body = Body::new(model.clone(), config)?;
@@ -24,15 +24,15 @@ pub(super) fn cases(out: &mut Vec<Case>) {
         let taken_back = matches!(body.step(), Err(StepError::Diverged { .. }));
         let moved = body.q().iter().fold(0.0f64, |m, q| m.max(q.abs()));
         body.step()?;
-        Ok(Outcome::of(vec![
+        Ok(CaseOutcome::of(vec![
             Bound::new("steps that went on with it", f64::from(u8::from(!taken_back)), 0.5),
             Bound::new("what is left of it in the coordinates", moved, f64::MIN_POSITIVE),
         ]))
     }));
 }
 
-fn refused(bad: f64) -> Result<Outcome, LabError> {
-    let bar = Bar::default();
+fn refused(bad: f64) -> Result<CaseOutcome, LabError> {
+    let bar = BarBody::default();
     let model = bar.bake()?;
     let mut body = Body::new(model.clone(), BodyConfig::default())?;
     let grab = body.grab(&bar.tip(&model)?, GrabConfig::default())?;
@@ -56,7 +56,7 @@ fn refused(bad: f64) -> Result<Outcome, LabError> {
         body.step()?;
     }
     let moved = body.q().iter().fold(0.0f64, |m, q| m.max(q.abs()));
-    Ok(Outcome::of(vec![
+    Ok(CaseOutcome::of(vec![
         Bound::new("bad numbers let in", accepted.iter().filter(|a| **a).count() as f64, 0.5),
         Bound::new("what moved because of them", moved, 1e-12),
     ]))

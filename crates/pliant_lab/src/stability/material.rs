@@ -6,8 +6,8 @@ use pliant_mesh::TetMesh;
 use pliant_modal::{BodyConfig, Element, GrabConfig, Integrator, Patch, StepSettings};
 
 use super::{
-    Bound, Case, Expected, Outcome,
-    bodies::{Bar, Held, energy_growth, no_growth, ringing, settling, smooth, static_pull},
+    Bound, Case, CaseOutcome, Expected,
+    bodies::{BarBody, HeldCase, energy_growth, no_growth, ringing, settling, smooth, static_pull},
     plain,
 };
 use crate::LabError;
@@ -24,12 +24,12 @@ pub(super) fn cases(out: &mut Vec<Case>) {
         for step in [1e-4, 1.0 / 60.0, 0.1] {
             let name = format!("E 1e{exponent} Pa, h {step:.4} s, tip dragged");
             out.push(Case::new("stiffness", name, move || {
-                drag(&Bar { young, ..Bar::default() }, BodyConfig { step, ..BodyConfig::default() })
+                drag(&BarBody { young, ..BarBody::default() }, BodyConfig { step, ..BodyConfig::default() })
             }));
         }
         let name = format!("E 1e{exponent} Pa, reaction held");
         out.push(Case::new("stiffness", name, move || {
-            hold(&Bar { young, zeta: 0.3, ..Bar::default() }, 1.0 / 60.0)
+            hold(&BarBody { young, zeta: 0.3, ..BarBody::default() }, 1.0 / 60.0)
         }));
     }
     for integrator in [Integrator::Newmark, Integrator::GeneralizedAlpha { rho_inf: 0.5 }] {
@@ -37,7 +37,7 @@ pub(super) fn cases(out: &mut Vec<Case>) {
             let name = format!("E {young:.0e} Pa, {}, tip dragged", word(integrator));
             out.push(Case::new("stiffness", name, move || {
                 drag(
-                    &Bar { young, ..Bar::default() },
+                    &BarBody { young, ..BarBody::default() },
                     BodyConfig::from(StepSettings { integrator, ..Default::default() }),
                 )
             }));
@@ -46,12 +46,12 @@ pub(super) fn cases(out: &mut Vec<Case>) {
     for element in [Element::Tet4, Element::Tet10] {
         for poisson in [0.0, 0.3, 0.45, 0.49, 0.499, 0.4999] {
             let name = format!("nu {poisson}, {element}, reaction held");
-            let bar = Bar { poisson, element, zeta: 0.3, ..Bar::default() };
+            let bar = BarBody { poisson, element, zeta: 0.3, ..BarBody::default() };
             out.push(Case::new("Poisson ratio", name, move || hold(&bar, 1.0 / 60.0)));
         }
     }
     for density in [1.0, 10.0, 100.0, 1e3, 2e4] {
-        let bar = Bar { density, ..Bar::default() };
+        let bar = BarBody { density, ..BarBody::default() };
         out.push(Case::new("density", format!("{density} kg/m^3, tip dragged"), move || {
             drag(&bar, BodyConfig::default())
         }));
@@ -61,18 +61,18 @@ pub(super) fn cases(out: &mut Vec<Case>) {
             [Integrator::Exact, Integrator::Newmark, Integrator::GeneralizedAlpha { rho_inf: 0.5 }]
         {
             let name = format!("{zeta} of critical, {}, struck", word(integrator));
-            let bar = Bar { zeta, ..Bar::default() };
+            let bar = BarBody { zeta, ..BarBody::default() };
             out.push(Case::new("damping", name, move || struck(&bar, 1.0 / 60.0, integrator)));
         }
         if zeta > 0.0 {
-            let bar = Bar { zeta, ..Bar::default() };
+            let bar = BarBody { zeta, ..BarBody::default() };
             let name = format!("{zeta} of critical, reaction held");
             out.push(Case::new("damping", name, move || hold(&bar, 1.0 / 60.0)));
         }
     }
     for exponent in -3..=3 {
         let length = 10.0_f64.powi(exponent);
-        let bar = Bar { length, zeta: 0.3, ..Bar::default() };
+        let bar = BarBody { length, zeta: 0.3, ..BarBody::default() };
         let again = bar.clone();
         out.push(Case::new("size", format!("1e{exponent} m, tip dragged"), move || {
             drag(&again, BodyConfig::default())
@@ -82,7 +82,7 @@ pub(super) fn cases(out: &mut Vec<Case>) {
     for step in [1e-4, 1e-3, 1.0 / 240.0, 1.0 / 40.0, 0.1] {
         let name = format!("h {step:.4} s, struck without damping");
         out.push(Case::new("step", name, move || {
-            struck(&Bar { zeta: 0.0, ..Bar::default() }, step, Integrator::Exact)
+            struck(&BarBody { zeta: 0.0, ..BarBody::default() }, step, Integrator::Exact)
         }));
     }
     for (name, cells, section, refused) in [
@@ -92,7 +92,7 @@ pub(super) fn cases(out: &mut Vec<Case>) {
         ("plates, edges 50 : 1", [4, 4, 1], [1.0, 0.005], true),
         ("plates across, edges 40 : 1", [40, 1, 1], [1.0, 1.0], false),
     ] {
-        let bar = Bar { cells, section, zeta: 0.3, ..Bar::default() };
+        let bar = BarBody { cells, section, zeta: 0.3, ..BarBody::default() };
         out.push(shaped("element shape", format!("{name}, reaction held"), refused, move || {
             bar.mesh().map(|m| (bar.clone(), m))
         }));
@@ -102,19 +102,19 @@ pub(super) fn cases(out: &mut Vec<Case>) {
     {
         let name = format!("slivers, {name} of the height, reaction held");
         out.push(shaped("element shape", name, refused, move || {
-            let bar = Bar { zeta: 0.3, ..Bar::default() };
+            let bar = BarBody { zeta: 0.3, ..BarBody::default() };
             Ok((bar.clone(), slivers(bar.mesh()?, share)))
         }));
     }
     for (ratio, refused) in [(1e3, false), (1e4, false), (1e6, true)] {
         let name = format!("slices of a bar {ratio:.0e} : 1, reaction held");
         out.push(shaped("mass ratio", name, refused, move || {
-            let bar = Bar { zeta: 0.3, ..Bar::default() };
+            let bar = BarBody { zeta: 0.3, ..BarBody::default() };
             Ok((bar.clone(), graded(&bar, ratio)?))
         }));
     }
     for (modes, cells) in [(1, [8, 2, 2]), (500, [10, 3, 3])] {
-        let bar = Bar { modes, cells, zeta: 0.1, ..Bar::default() };
+        let bar = BarBody { modes, cells, zeta: 0.1, ..BarBody::default() };
         let [held, dragged, struck_one] = [bar.clone(), bar.clone(), bar];
         out.push(Case::new("modes", format!("{modes}, reaction held"), move || hold(&held, 1.0 / 60.0)));
         out.push(Case::new("modes", format!("{modes}, tip dragged"), move || {
@@ -132,7 +132,7 @@ fn shaped(
     group: &'static str,
     name: String,
     refused: bool,
-    made: impl Fn() -> Result<(Bar, TetMesh), LabError> + Send + Sync + 'static,
+    made: impl Fn() -> Result<(BarBody, TetMesh), LabError> + Send + Sync + 'static,
 ) -> Case {
     let case = Case::new(group, name, move || {
         let (bar, mesh) = made()?;
@@ -152,9 +152,9 @@ pub(super) fn word(integrator: Integrator) -> &'static str {
 /// Drags the tip smoothly by a twentieth of the length within a second (or forty steps), then holds
 /// it for as long. The force must not ring. A body far slower than the step is still moving, so its
 /// bound is looser.
-fn drag(bar: &Bar, config: BodyConfig) -> Result<Outcome, LabError> {
+fn drag(bar: &BarBody, config: BodyConfig) -> Result<CaseOutcome, LabError> {
     let step = config.step;
-    let mut held = Held::new(bar, config, GrabConfig::default())?;
+    let mut held = HeldCase::new(bar, config, GrabConfig::default())?;
     let seconds = (40.0 * step).max(1.0);
     let steps = (2.0 * seconds / step) as usize;
     let reach = 0.05 * bar.length;
@@ -172,7 +172,7 @@ fn drag(bar: &Bar, config: BodyConfig) -> Result<Outcome, LabError> {
         farthest = farthest.max(at.norm());
     }
     let bound = if held.model.omega()[0] * step > 0.05 { 0.1 } else { 0.5 };
-    Ok(Outcome {
+    Ok(CaseOutcome {
         bounds: vec![
             Bound::new("ringing of the reaction (4: a flip each step)", ringing(&forces), bound),
             Bound::new("farthest the patch goes / the drag", farthest / reach, EXCURSION),
@@ -184,20 +184,20 @@ fn drag(bar: &Bar, config: BodyConfig) -> Result<Outcome, LabError> {
 /// Holds the tip a millionth of the length away until the body is at rest. The reaction must equal
 /// the static one. (A bar that bends by `d` also shortens by `d^2 / L`, against its axial
 /// stiffness. At a ten-thousandth of the length this is already half a percent.)
-fn hold(bar: &Bar, step: f64) -> Result<Outcome, LabError> {
+fn hold(bar: &BarBody, step: f64) -> Result<CaseOutcome, LabError> {
     hold_mesh(bar, &bar.mesh()?, step)
 }
 
-fn hold_mesh(bar: &Bar, mesh: &TetMesh, step: f64) -> Result<Outcome, LabError> {
+fn hold_mesh(bar: &BarBody, mesh: &TetMesh, step: f64) -> Result<CaseOutcome, LabError> {
     let model = bar.bake_mesh(mesh)?;
     let patch = bar.tip(&model)?;
     hold_patch(
         bar,
-        Held::of(model, patch, BodyConfig { step, ..BodyConfig::default() }, GrabConfig::default())?,
+        HeldCase::of(model, patch, BodyConfig { step, ..BodyConfig::default() }, GrabConfig::default())?,
     )
 }
 
-fn hold_patch(bar: &Bar, mut held: Held) -> Result<Outcome, LabError> {
+fn hold_patch(bar: &BarBody, mut held: HeldCase) -> Result<CaseOutcome, LabError> {
     let away = [0.0, 1e-6 * bar.length, 0.5e-6 * bar.length];
     held.pull(away)?;
     for _ in 0..settling(&held.model, held.body.config().step) {
@@ -205,12 +205,16 @@ fn hold_patch(bar: &Bar, mut held: Held) -> Result<Outcome, LabError> {
     }
     let want = static_pull(&held, away)?;
     let got = -held.reaction()?;
-    Ok(Outcome::of(vec![Bound::new("|reaction - static| / static", (got - want).norm() / want.norm(), 2e-3)]))
+    Ok(CaseOutcome::of(vec![Bound::new(
+        "|reaction - static| / static",
+        (got - want).norm() / want.norm(),
+        2e-3,
+    )]))
 }
 
 /// Applies an impulse at the tip and runs 5,000 free steps. The energy must never grow.
-fn struck(bar: &Bar, step: f64, integrator: Integrator) -> Result<Outcome, LabError> {
-    let held = Held::new(
+fn struck(bar: &BarBody, step: f64, integrator: Integrator) -> Result<CaseOutcome, LabError> {
+    let held = HeldCase::new(
         bar,
         BodyConfig {
             step,
@@ -232,10 +236,10 @@ fn struck(bar: &Bar, step: f64, integrator: Integrator) -> Result<Outcome, LabEr
             body.step()?;
             most = most.max(body.energy() / start);
         }
-        return Ok(Outcome::of(vec![Bound::new("largest energy / energy at the start", most, 1.5)]));
+        return Ok(CaseOutcome::of(vec![Bound::new("largest energy / energy at the start", most, 1.5)]));
     }
     let [growth, _] = energy_growth(&mut body, 5_000)?;
-    Ok(Outcome::of(vec![no_growth(growth)]))
+    Ok(CaseOutcome::of(vec![no_growth(growth)]))
 }
 
 /// Moves nodes inside the bar towards the opposite face of a tetrahedron, so that only `1 - share`
@@ -269,8 +273,8 @@ fn slivers(mut mesh: TetMesh, share: f64) -> TetMesh {
 }
 
 /// The bar with slices that grow along it. The last slice is `ratio` times as heavy as the first.
-fn graded(bar: &Bar, ratio: f64) -> Result<TetMesh, LabError> {
-    let mut mesh = Bar { cells: [16, 2, 2], ..bar.clone() }.mesh()?;
+fn graded(bar: &BarBody, ratio: f64) -> Result<TetMesh, LabError> {
+    let mut mesh = BarBody { cells: [16, 2, 2], ..bar.clone() }.mesh()?;
     let growth = ratio.powf(1.0 / 15.0);
     let whole = growth.powi(16) - 1.0;
     for node in &mut mesh.nodes {

@@ -76,13 +76,13 @@ impl Bound {
 
 /// The result of a case.
 #[derive(Debug, Default)]
-struct Outcome {
+struct CaseOutcome {
     bounds: Vec<Bound>,
     /// The result of the paper's plain scheme with the same script.
     plain: Option<String>,
 }
 
-impl Outcome {
+impl CaseOutcome {
     fn of(bounds: Vec<Bound>) -> Self {
         Self { bounds, plain: None }
     }
@@ -108,7 +108,7 @@ enum Expected {
 }
 
 impl Expected {
-    fn holds(self, came: &Result<Outcome, LabError>) -> bool {
+    fn holds(self, came: &Result<CaseOutcome, LabError>) -> bool {
         match (self, came) {
             (Self::Inaccurate, Err(LabError::Bake(BakeError::Inaccurate { .. }))) => true,
             (Self::Measured(known), Ok(outcome)) => {
@@ -130,14 +130,14 @@ struct Case {
     group: &'static str,
     name: String,
     known_limit: Option<Limit>,
-    run: Box<dyn Fn() -> Result<Outcome, LabError> + Send + Sync>,
+    run: Box<dyn Fn() -> Result<CaseOutcome, LabError> + Send + Sync>,
 }
 
 impl Case {
     fn new(
         group: &'static str,
         name: String,
-        run: impl Fn() -> Result<Outcome, LabError> + Send + Sync + 'static,
+        run: impl Fn() -> Result<CaseOutcome, LabError> + Send + Sync + 'static,
     ) -> Self {
         Self { group, name, known_limit: None, run: Box::new(run) }
     }
@@ -259,7 +259,7 @@ fn judge(case: &Case) -> Verdict {
     let began = Instant::now();
     // A panic fails only its own case. Nothing of that case is used afterwards.
     let came = catch_unwind(AssertUnwindSafe(|| (case.run)()));
-    let expected = |came: &Result<Outcome, LabError>| {
+    let expected = |came: &Result<CaseOutcome, LabError>| {
         case.known_limit.filter(|limit| limit.expected.holds(came)).map(|limit| limit.why)
     };
     let (margin, bound, bounds, plain, known_limit) = match came {
@@ -320,7 +320,7 @@ mod tests {
 
     #[test]
     fn a_case_that_breaks_its_bound_is_told_so() {
-        let broken = Case::new("g", "n".into(), || Ok(Outcome::of(vec![Bound::new("x", 3.0, 1.0)])));
+        let broken = Case::new("g", "n".into(), || Ok(CaseOutcome::of(vec![Bound::new("x", 3.0, 1.0)])));
         let told = judge(&broken);
         assert!(!told.passed && (told.margin - 1.0 / 3.0).abs() < 1e-12, "{told:?}");
         let failed = Case::new("g", "n".into(), || Err(LabError::Threads { got: 0, most: 1 }));
@@ -330,8 +330,9 @@ mod tests {
     #[test]
     fn a_known_limit_is_one_outcome_and_any_other_fails() {
         let case = |measured: f64, other: f64| {
-            let run =
-                move || Ok(Outcome::of(vec![Bound::new("x", measured, 1.0), Bound::new("y", other, 1.0)]));
+            let run = move || {
+                Ok(CaseOutcome::of(vec![Bound::new("x", measured, 1.0), Bound::new("y", other, 1.0)]))
+            };
             let expected = Expected::Measured(&[("x", 2.0, 4.0)]);
             judge(&Case::new("g", "n".into(), run).limited("known", expected))
         };
@@ -358,7 +359,7 @@ mod tests {
     #[test]
     fn a_case_that_panics_is_told_and_is_the_only_one_lost() {
         let none: Vec<f64> = Vec::new();
-        let run = move || Ok(Outcome::of(vec![Bound::new("x", none[0], 1.0)]));
+        let run = move || Ok(CaseOutcome::of(vec![Bound::new("x", none[0], 1.0)]));
         let told = judge(&Case::new("g", "n".into(), run));
         assert!(told.broken() && told.bound.starts_with("panicked: index out of bounds"), "{told:?}");
     }

@@ -4,8 +4,8 @@ use nalgebra::Vector3;
 use pliant_modal::{Body, BodyConfig, Frame, GrabConfig, Integrator, Relaxation, StepSettings};
 
 use super::{
-    Bound, Case, Expected, Outcome,
-    bodies::{Bar, Dice, Held, energy_growth, nearest, no_growth, settling, state, static_pull},
+    Bound, Case, CaseOutcome, Expected,
+    bodies::{BarBody, Dice, HeldCase, energy_growth, nearest, no_growth, settling, state, static_pull},
     material::word,
 };
 use crate::LabError;
@@ -73,14 +73,14 @@ pub(super) fn cases(out: &mut Vec<Case>) {
     }
     for (name, damped) in [("undamped", false), ("damped", true)] {
         out.push(Case::new("a million steps", format!("{name}, unforced"), move || {
-            let bar = Bar { modes: 6, zeta: if damped { 0.03 } else { 0.0 }, ..Bar::default() };
+            let bar = BarBody { modes: 6, zeta: if damped { 0.03 } else { 0.0 }, ..BarBody::default() };
             let mut body = Body::new(bar.bake()?, BodyConfig::default())?;
             let q = vec![1e-2; body.mode_count()];
             let v = vec![0.0; body.mode_count()];
             body.set_state(&state(&body, q, v))?;
             let [growth, left] = energy_growth(&mut body, 1_000_000)?;
             let drift = if damped { left } else { left - 1.0 };
-            Ok(Outcome::of(vec![
+            Ok(CaseOutcome::of(vec![
                 no_growth(growth),
                 Bound::new("energy gained in all / energy", drift.max(0.0), 1e-8),
             ]))
@@ -98,8 +98,8 @@ fn far_and_fast(shape: [f64; 3]) -> Option<Expected> {
     (shape[0] > 1.0).then_some(unrest)
 }
 
-fn random(seed: u64, integrator: Integrator) -> Result<Outcome, LabError> {
-    let bar = Bar { zeta: 0.01, ..Bar::default() };
+fn random(seed: u64, integrator: Integrator) -> Result<CaseOutcome, LabError> {
+    let bar = BarBody { zeta: 0.01, ..BarBody::default() };
     let mut body =
         Body::new(bar.bake()?, BodyConfig::from(StepSettings { integrator, ..Default::default() }))?;
     let mut dice = Dice(seed);
@@ -109,13 +109,13 @@ fn random(seed: u64, integrator: Integrator) -> Result<Outcome, LabError> {
     let v = (0..modes).map(|i| dice.roll() * speed * body.model().omega()[i]).collect();
     body.set_state(&state(&body, q, v))?;
     let [growth, _] = energy_growth(&mut body, 10_000)?;
-    Ok(Outcome::of(vec![no_growth(growth)]))
+    Ok(CaseOutcome::of(vec![no_growth(growth)]))
 }
 
 /// Starts with the surface's points multiplied by `scale` about the middle of the held end, as
 /// closely as the modes can represent that.
-fn started(scale: [f64; 3], held: bool, warp: bool, step: f64) -> Result<Outcome, LabError> {
-    let bar = Bar { zeta: 0.05, ..Bar::default() };
+fn started(scale: [f64; 3], held: bool, warp: bool, step: f64) -> Result<CaseOutcome, LabError> {
+    let bar = BarBody { zeta: 0.05, ..BarBody::default() };
     let model = bar.bake()?;
     let middle = [0.0, 0.1, 0.1];
     let q = nearest(&model, |p| std::array::from_fn(|k| (scale[k] - 1.0) * (p[k] - middle[k])));
@@ -140,17 +140,17 @@ fn started(scale: [f64; 3], held: bool, warp: bool, step: f64) -> Result<Outcome
         let kinetic = body.v().iter().map(|v| 0.5 * v * v).sum::<f64>();
         last = [last[0].min(kinetic), last[1].max(kinetic)];
     }
-    Ok(Outcome::of(vec![
+    Ok(CaseOutcome::of(vec![
         Bound::new("largest energy / energy at the start", most, 1.0 + 1e-9),
         Bound::new("kinetic energy at the end / energy at the start", last[1] / start, 1e-6),
     ]))
 }
 
-fn free(young: f64) -> Bar {
-    Bar { held: false, young, modes: 12, zeta: 0.01, ..Bar::default() }
+fn free(young: f64) -> BarBody {
+    BarBody { held: false, young, modes: 12, zeta: 0.01, ..BarBody::default() }
 }
 
-fn flight(step: f64) -> Result<Outcome, LabError> {
+fn flight(step: f64) -> Result<CaseOutcome, LabError> {
     let bar = free(1e6);
     let model = bar.bake()?;
     let mut body = Body::new(model.clone(), BodyConfig { step, ..BodyConfig::default() })?;
@@ -165,7 +165,7 @@ fn flight(step: f64) -> Result<Outcome, LabError> {
         body.step()?;
     }
     let (p1, l1) = momentum(&body);
-    Ok(Outcome::of(vec![
+    Ok(CaseOutcome::of(vec![
         Bound::new("linear momentum lost / momentum", (p1 - p0).norm() / p0.norm(), 1e-9),
         // Angular momentum is taken about the world's origin. The body is up to a thousand lengths
         // away by then, and rounding errors grow with the distance.
@@ -175,8 +175,8 @@ fn flight(step: f64) -> Result<Outcome, LabError> {
 
 /// A tumble about an axis that is no principal axis, for 100,000 steps, must keep energy and
 /// angular momentum.
-fn spinning(turns: f64, step: f64) -> Result<Outcome, LabError> {
-    let bar = Bar { section: [0.2, 0.3], ..free(1e6) };
+fn spinning(turns: f64, step: f64) -> Result<CaseOutcome, LabError> {
+    let bar = BarBody { section: [0.2, 0.3], ..free(1e6) };
     let model = bar.bake()?;
     let mut body = Body::new(model.clone(), BodyConfig { step, ..BodyConfig::default() })?;
     let axis = Vector3::new(0.3, 1.0, 0.2).normalize() * turns * std::f64::consts::TAU;
@@ -193,14 +193,14 @@ fn spinning(turns: f64, step: f64) -> Result<Outcome, LabError> {
         gained = gained.max(body.energy() / start - 1.0);
         lost = lost.max((Vector3::from(body.frame().spin()) - spin).norm() / spin.norm());
     }
-    Ok(Outcome::of(vec![
+    Ok(CaseOutcome::of(vec![
         Bound::new("largest gain of the spin's energy / energy", gained, 1e-8),
         Bound::new("angular momentum lost / momentum", lost, 1e-9),
     ]))
 }
 
 /// The change of momentum must equal the impulse of the two hands.
-fn counted(step: f64) -> Result<Outcome, LabError> {
+fn counted(step: f64) -> Result<CaseOutcome, LabError> {
     let bar = free(1e6);
     let model = bar.bake()?;
     let mut body = Body::new(model.clone(), BodyConfig { step, ..BodyConfig::default() })?;
@@ -224,14 +224,14 @@ fn counted(step: f64) -> Result<Outcome, LabError> {
         }
         largest = largest.max(Vector3::from(body.frame().center()).norm());
     }
-    Ok(Outcome::of(vec![
+    Ok(CaseOutcome::of(vec![
         Bound::new("|momentum's change - hands' pulls| / pulls", worst, 1e-6),
         Bound::new("farthest from the hands / m", largest, 10.0),
     ]))
 }
 
-fn relaxing_energy(relaxation: Relaxation) -> Result<Outcome, LabError> {
-    let bar = Bar { zeta: 0.0, ..Bar::default() };
+fn relaxing_energy(relaxation: Relaxation) -> Result<CaseOutcome, LabError> {
+    let bar = BarBody { zeta: 0.0, ..BarBody::default() };
     let model = bar.bake()?;
     let mut body = Body::new(
         model.clone(),
@@ -240,24 +240,24 @@ fn relaxing_energy(relaxation: Relaxation) -> Result<Outcome, LabError> {
     let impulse = 0.05 * model.omega()[0] * model.mass();
     body.apply_impulse(bar.vertex(&model, [1.0, 0.5, 0.5]), [0.3 * impulse, impulse, -0.7 * impulse])?;
     let [growth, _] = energy_growth(&mut body, 5_000)?;
-    Ok(Outcome::of(vec![no_growth(growth)]))
+    Ok(CaseOutcome::of(vec![no_growth(growth)]))
 }
 
 /// After a long hold, `1 - ratio` of the reaction must be left.
-fn relaxed_reaction(relaxation: Relaxation) -> Result<Outcome, LabError> {
-    let bar = Bar { zeta: 0.3, ..Bar::default() };
-    let elastic = Held::new(&bar, BodyConfig::default(), GrabConfig::default())?;
+fn relaxed_reaction(relaxation: Relaxation) -> Result<CaseOutcome, LabError> {
+    let bar = BarBody { zeta: 0.3, ..BarBody::default() };
+    let elastic = HeldCase::new(&bar, BodyConfig::default(), GrabConfig::default())?;
     let away = [0.0, 1e-6, 0.5e-6];
     let want = (1.0 - relaxation.ratio) * static_pull(&elastic, away)?;
     let config = BodyConfig::from(StepSettings { relaxation: Some(relaxation), ..Default::default() });
-    let mut held = Held::new(&bar, config, GrabConfig::default())?;
+    let mut held = HeldCase::new(&bar, config, GrabConfig::default())?;
     held.pull(away)?;
     let slow = 12.0 * relaxation.time / (1.0 - relaxation.ratio) * 60.0;
     for _ in 0..settling(&held.model, 1.0 / 60.0) + slow as usize {
         held.body.step()?;
     }
     let got = -held.reaction()?;
-    Ok(Outcome::of(vec![Bound::new(
+    Ok(CaseOutcome::of(vec![Bound::new(
         "|reaction - relaxed| / relaxed",
         (got - want).norm() / want.norm(),
         5e-3,

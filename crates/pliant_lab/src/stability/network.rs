@@ -10,7 +10,7 @@ use pliant_stream::{
     peer::Repair,
 };
 
-use super::{Bound, Case, Expected, Outcome, bodies::Bar};
+use super::{Bound, Case, CaseOutcome, Expected, bodies::BarBody};
 use crate::LabError;
 use crate::experiment::{Experiment, Metrics};
 
@@ -68,7 +68,7 @@ pub(super) fn cases(out: &mut Vec<Case>) {
 }
 
 fn experiment(link: &LinkConfig, rate: f64, recovery: RecoveryConfig) -> Result<Experiment, LabError> {
-    let model = Bar { modes: 30, zeta: 0.05, ..Bar::default() }.bake()?;
+    let model = BarBody { modes: 30, zeta: 0.05, ..BarBody::default() }.bake()?;
     let mut experiment = Experiment::new(model, link.clone(), recovery);
     experiment.rate = rate;
     experiment.seconds = if rate > 40.0 { 10.0 } else { 30.0 };
@@ -80,13 +80,13 @@ fn experiment(link: &LinkConfig, rate: f64, recovery: RecoveryConfig) -> Result<
     Ok(experiment)
 }
 
-fn guest(link: &LinkConfig, rate: f64, rms: f64, max: f64) -> Result<Outcome, LabError> {
+fn guest(link: &LinkConfig, rate: f64, rms: f64, max: f64) -> Result<CaseOutcome, LabError> {
     let made = experiment(link, rate, RecoveryConfig::default())?;
     let ticks = made.rate * made.seconds;
     let ours = made.run()?;
     let paper = experiment(link, rate, RecoveryConfig::paper())?.run()?;
     let bare = experiment(link, rate, RecoveryConfig::none())?.run()?;
-    Ok(Outcome {
+    Ok(CaseOutcome {
         bounds: vec![
             Bound::new(RMS, ours.rms_percent, rms),
             Bound::new(LARGEST, ours.max_percent, max),
@@ -110,9 +110,9 @@ fn words(f: &Metrics) -> String {
     format!("rms {:.3} %, largest {:.1} %", f.rms_percent, f.max_percent)
 }
 
-fn peers(link: &LinkConfig) -> Result<Outcome, LabError> {
+fn peers(link: &LinkConfig) -> Result<CaseOutcome, LabError> {
     let f = experiment(link, 40.0, RecoveryConfig::default())?.run_peers(Repair::Rollback)?;
-    Ok(Outcome::of(vec![
+    Ok(CaseOutcome::of(vec![
         Bound::new(RMS, f.rms_percent, 2.0),
         // A peer with steps of 25 ms that wakes every 5 ms is on time or one wake-up late.
         Bound::new("ticks missing of 1,200", missing(&f, 1200.0), 100.0),

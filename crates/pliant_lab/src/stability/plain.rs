@@ -21,10 +21,10 @@ pub(super) struct Plain {
     coefficients: Vec<Coefficients>,
     state: Vec<[f64; 3]>,
     force: Vec<f64>,
-    hands: Vec<Hand>,
+    hands: Vec<PlainHand>,
 }
 
-struct Hand {
+struct PlainHand {
     rest: Vector3<f64>,
     displacement: Vec<Vector3<f64>>,
     rotation: Vec<Vector3<f64>>,
@@ -36,7 +36,7 @@ impl Plain {
         let coefficients = (0..modes)
             .map(|i| Coefficients::new(Integrator::Newmark, model.omega()[i], model.damping()[i], step))
             .collect::<Result<_, _>>()?;
-        let hands = patches.iter().map(|patch| Hand::new(model, patch)).collect();
+        let hands = patches.iter().map(|patch| PlainHand::new(model, patch)).collect();
         Ok(Self { coefficients, state: vec![[0.0; 3]; modes], force: vec![0.0; modes], hands })
     }
 
@@ -101,7 +101,7 @@ impl Plain {
     }
 }
 
-impl Hand {
+impl PlainHand {
     fn new(model: &ModalModel, patch: &Patch) -> Self {
         let modes = model.mode_count();
         let mut hand = Self {

@@ -41,15 +41,15 @@ struct Document {
     extensions_required: Vec<String>,
     scene: Option<usize>,
     #[serde(default)]
-    scenes: Vec<Scene>,
+    scenes: Vec<GltfScene>,
     #[serde(default)]
-    nodes: Vec<Node>,
+    nodes: Vec<GltfNode>,
     #[serde(default)]
-    meshes: Vec<Mesh>,
+    meshes: Vec<GltfMesh>,
     #[serde(default)]
     accessors: Vec<Accessor>,
     #[serde(default)]
-    buffer_views: Vec<View>,
+    buffer_views: Vec<BufferView>,
     #[serde(default)]
     buffers: Vec<Buffer>,
 }
@@ -60,13 +60,13 @@ struct Asset {
 }
 
 #[derive(Deserialize)]
-struct Scene {
+struct GltfScene {
     #[serde(default)]
     nodes: Vec<usize>,
 }
 
 #[derive(Deserialize)]
-struct Node {
+struct GltfNode {
     #[serde(default)]
     children: Vec<usize>,
     mesh: Option<usize>,
@@ -79,7 +79,7 @@ struct Node {
 }
 
 #[derive(Deserialize)]
-struct Mesh {
+struct GltfMesh {
     primitives: Vec<Primitive>,
 }
 
@@ -105,7 +105,7 @@ struct Accessor {
 
 #[derive(Deserialize)]
 #[serde(rename_all = "camelCase")]
-struct View {
+struct BufferView {
     buffer: usize,
     #[serde(default)]
     byte_offset: usize,
@@ -133,7 +133,7 @@ pub(super) fn parse(bytes: &[u8], folder: &Path) -> Result<Surface, MeshError> {
     document.buffers.iter().try_for_each(|buffer| files.read(buffer))?;
     let buffers = document.buffers.iter().map(|b| b.data(blob, &files)).collect::<Result<_, _>>()?;
     let most = ALWAYS_PLACED.saturating_add(bytes.len()).saturating_add(files.bytes);
-    let mut reader = Reader {
+    let mut reader = GltfReader {
         document: &document,
         buffers,
         surface: Surface::default(),
@@ -180,7 +180,7 @@ fn chunks(bytes: &[u8]) -> Result<(&[u8], Option<&[u8]>), MeshError> {
     Ok((json, blob))
 }
 
-struct Reader<'a> {
+struct GltfReader<'a> {
     document: &'a Document,
     buffers: Vec<Cow<'a, [u8]>>,
     surface: Surface,
@@ -192,7 +192,7 @@ struct Reader<'a> {
     most: usize,
 }
 
-impl Reader<'_> {
+impl GltfReader<'_> {
     fn node(&mut self, node: usize, parent: Matrix4<f64>, depth: usize) -> Result<(), MeshError> {
         self.nodes += 1;
         if depth > DEEPEST || self.nodes > MAX_NODES {
@@ -323,7 +323,7 @@ impl Reader<'_> {
     }
 }
 
-impl Node {
+impl GltfNode {
     fn place(&self) -> Matrix4<f64> {
         if let Some(matrix) = &self.matrix {
             return Matrix4::from_column_slice(matrix);

@@ -6,7 +6,7 @@ use crate::{MeshError, Surface};
 
 /// Type of a number in the file.
 #[derive(Clone, Copy, PartialEq, Eq)]
-enum Scalar {
+enum PlyScalar {
     I8,
     U8,
     I16,
@@ -19,12 +19,12 @@ enum Scalar {
 
 struct Property {
     name: String,
-    scalar: Scalar,
+    scalar: PlyScalar,
     /// Type of the length of a list, or `None` for a single number.
-    length: Option<Scalar>,
+    length: Option<PlyScalar>,
 }
 
-struct Element {
+struct PlyElement {
     name: String,
     count: u64,
     properties: Vec<Property>,
@@ -64,9 +64,9 @@ pub(super) fn parse(bytes: &[u8]) -> Result<Surface, MeshError> {
     Ok(surface)
 }
 
-fn header(cursor: &mut Cursor<'_>) -> Result<(Encoding, Vec<Element>), MeshError> {
+fn header(cursor: &mut Cursor<'_>) -> Result<(Encoding, Vec<PlyElement>), MeshError> {
     let mut encoding = None;
-    let mut elements: Vec<Element> = Vec::new();
+    let mut elements: Vec<PlyElement> = Vec::new();
     loop {
         match cursor.word("end_header")?.as_str() {
             "format" => {
@@ -89,7 +89,7 @@ fn header(cursor: &mut Cursor<'_>) -> Result<(Encoding, Vec<Element>), MeshError
             "element" => {
                 let name = cursor.word("an element's name")?;
                 let count = cursor.parse("a count")?;
-                elements.push(Element { name, count, properties: Vec::new() });
+                elements.push(PlyElement { name, count, properties: Vec::new() });
             }
             "property" => {
                 let kind = cursor.word("a property's type")?;
@@ -116,7 +116,7 @@ fn header(cursor: &mut Cursor<'_>) -> Result<(Encoding, Vec<Element>), MeshError
 
 fn vertex(
     cursor: &mut Cursor<'_>,
-    element: &Element,
+    element: &PlyElement,
     positions: &mut Vec<[f64; 3]>,
     uvs: &mut Vec<[f32; 2]>,
 ) -> Result<(), MeshError> {
@@ -142,7 +142,11 @@ fn vertex(
     Ok(())
 }
 
-fn face(cursor: &mut Cursor<'_>, element: &Element, triangles: &mut Vec<[u32; 3]>) -> Result<(), MeshError> {
+fn face(
+    cursor: &mut Cursor<'_>,
+    element: &PlyElement,
+    triangles: &mut Vec<[u32; 3]>,
+) -> Result<(), MeshError> {
     let mut corners: Vec<u32> = Vec::new();
     let mut wrong = None;
     for property in &element.properties {
@@ -180,39 +184,39 @@ fn numbers(cursor: &mut Cursor<'_>, property: &Property, mut take: impl FnMut(f6
     Ok(())
 }
 
-fn number(cursor: &mut Cursor<'_>, scalar: Scalar) -> Result<f64, MeshError> {
+fn number(cursor: &mut Cursor<'_>, scalar: PlyScalar) -> Result<f64, MeshError> {
     const NUMBER: &str = "number";
-    if cursor.encoding == Encoding::Text || scalar == Scalar::F64 {
+    if cursor.encoding == Encoding::Text || scalar == PlyScalar::F64 {
         return cursor.real(NUMBER);
     }
     let big = cursor.encoding == Encoding::BigEndian;
     let whole = |bytes: [u8; 2]| if big { u16::from_be_bytes(bytes) } else { u16::from_le_bytes(bytes) };
     Ok(match scalar {
-        Scalar::I8 => f64::from(i8::from_le_bytes(cursor.raw(NUMBER)?)),
-        Scalar::U8 => f64::from(u8::from_le_bytes(cursor.raw(NUMBER)?)),
-        Scalar::I16 => f64::from(whole(cursor.raw(NUMBER)?) as i16),
-        Scalar::U16 => f64::from(whole(cursor.raw(NUMBER)?)),
-        Scalar::I32 => cursor.int(NUMBER)? as f64,
-        Scalar::U32 => f64::from(cursor.int(NUMBER)? as u32),
-        Scalar::F32 | Scalar::F64 => cursor.short_real(NUMBER)?,
+        PlyScalar::I8 => f64::from(i8::from_le_bytes(cursor.raw(NUMBER)?)),
+        PlyScalar::U8 => f64::from(u8::from_le_bytes(cursor.raw(NUMBER)?)),
+        PlyScalar::I16 => f64::from(whole(cursor.raw(NUMBER)?) as i16),
+        PlyScalar::U16 => f64::from(whole(cursor.raw(NUMBER)?)),
+        PlyScalar::I32 => cursor.int(NUMBER)? as f64,
+        PlyScalar::U32 => f64::from(cursor.int(NUMBER)? as u32),
+        PlyScalar::F32 | PlyScalar::F64 => cursor.short_real(NUMBER)?,
     })
 }
 
-fn scalar(cursor: &mut Cursor<'_>) -> Result<Scalar, MeshError> {
+fn scalar(cursor: &mut Cursor<'_>) -> Result<PlyScalar, MeshError> {
     let name = cursor.word("a type of number")?;
     scalar_named(cursor, &name)
 }
 
-fn scalar_named(cursor: &Cursor<'_>, name: &str) -> Result<Scalar, MeshError> {
+fn scalar_named(cursor: &Cursor<'_>, name: &str) -> Result<PlyScalar, MeshError> {
     Ok(match name {
-        "char" | "int8" => Scalar::I8,
-        "uchar" | "uint8" => Scalar::U8,
-        "short" | "int16" => Scalar::I16,
-        "ushort" | "uint16" => Scalar::U16,
-        "int" | "int32" => Scalar::I32,
-        "uint" | "uint32" => Scalar::U32,
-        "float" | "float32" => Scalar::F32,
-        "double" | "float64" => Scalar::F64,
+        "char" | "int8" => PlyScalar::I8,
+        "uchar" | "uint8" => PlyScalar::U8,
+        "short" | "int16" => PlyScalar::I16,
+        "ushort" | "uint16" => PlyScalar::U16,
+        "int" | "int32" => PlyScalar::I32,
+        "uint" | "uint32" => PlyScalar::U32,
+        "float" | "float32" => PlyScalar::F32,
+        "double" | "float64" => PlyScalar::F64,
         other => return Err(cursor.error("a type of number", other)),
     })
 }

@@ -55,12 +55,12 @@ const PIECES: usize = 6;
 pub struct Scene {
     name: String,
     floor: Option<f64>,
-    parts: Vec<Part>,
+    parts: Vec<ScenePart>,
 }
 
 /// Part, or its mirror image, in the form that the distance function uses.
 #[derive(Clone, Debug)]
-struct Part {
+struct ScenePart {
     form: Form,
     mirrored: bool,
     blend: f64,
@@ -156,7 +156,7 @@ impl Scene {
         for text in scene.parts {
             let part = text.part()?;
             if text.mirror {
-                parts.push(Part { mirrored: true, ..part.clone() });
+                parts.push(ScenePart { mirrored: true, ..part.clone() });
             }
             parts.push(part);
         }
@@ -170,7 +170,7 @@ impl Scene {
 }
 
 impl PartText {
-    fn part(&self) -> Result<Part, MeshError> {
+    fn part(&self) -> Result<ScenePart, MeshError> {
         let wrong = |expected: &str, found: f64| MeshError::Part {
             part: self.name.clone(),
             expected: expected.to_owned(),
@@ -224,7 +224,7 @@ impl PartText {
                 (Form::Limb(pieces.collect()), center, radius)
             }
         };
-        Ok(Part { form, mirrored: false, blend: self.blend, carve: self.carve, center, radius })
+        Ok(ScenePart { form, mirrored: false, blend: self.blend, carve: self.carve, center, radius })
     }
 }
 
@@ -267,7 +267,7 @@ fn curve(path: &[[f64; 3]], radii: &[f64]) -> Vec<(Vector3<f64>, f64)> {
     fine
 }
 
-impl Part {
+impl ScenePart {
     fn distance(&self, p: Vector3<f64>) -> f64 {
         match &self.form {
             Form::Sphere => sphere(p, self.center, self.radius),

@@ -40,7 +40,7 @@ pub(super) type Point = [i32; 3];
 
 /// Position of a lattice point relative to the surface after the warp.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub(super) enum Side {
+pub(super) enum LatticeSide {
     Inside,
     Outside,
     On,
@@ -49,7 +49,7 @@ pub(super) enum Side {
 struct Block {
     /// Coordinates of the first corner, in cells.
     cell: Point,
-    sides: Vec<Side>,
+    sides: Vec<LatticeSide>,
     /// Positions of warped points, by point index.
     warped: Vec<(u32, Vector3<f64>)>,
     /// Cut points of owned edges, sorted by the key `point * EDGES + edge`.
@@ -133,7 +133,7 @@ impl<'a> Lattice<'a> {
                 continue;
             }
             let sure = self.sure_side(at.map(|p| 2 * BLOCK * p), 2 * BLOCK * size);
-            if sure == Some(Side::Outside) {
+            if sure == Some(LatticeSide::Outside) {
                 continue;
             }
             if size == 1 {
@@ -159,15 +159,15 @@ impl<'a> Lattice<'a> {
     ///
     /// Returns `None` if the distance at the center does not decide the side for the points and
     /// their neighbors.
-    fn sure_side(&self, first: Point, extent: i32) -> Option<Side> {
+    fn sure_side(&self, first: Point, extent: i32) -> Option<LatticeSide> {
         let middle = self.rest_position(first) + Vector3::repeat(f64::from(extent - 1) * self.cell / 4.0);
         // The reach goes from the center to the farthest point, plus one long edge.
         let reach = self.cell * (3_f64.sqrt() * f64::from(extent - 1) / 4.0 + 1.0);
         let distance = self.sdf.distance(middle.into());
         if distance > reach {
-            Some(Side::Outside)
+            Some(LatticeSide::Outside)
         } else if distance < -reach {
-            Some(Side::Inside)
+            Some(LatticeSide::Inside)
         } else {
             None
         }
@@ -193,7 +193,7 @@ impl<'a> Lattice<'a> {
                         for center in 0..2 {
                             let point: Point = std::array::from_fn(|a| 2 * (cell[a] + [i, j, k][a]) + center);
                             distances[local(point)] = match sure {
-                                Some(Side::Inside) => f64::NEG_INFINITY,
+                                Some(LatticeSide::Inside) => f64::NEG_INFINITY,
                                 Some(_) => f64::INFINITY,
                                 None => self.sdf.distance(self.rest_position(point).into()),
                             };
@@ -214,7 +214,10 @@ impl<'a> Lattice<'a> {
             for (edge, step) in owned_edges(point).iter().enumerate() {
                 let other = add(point, *step);
                 let ends = [self.side(point), self.side(other)];
-                if matches!(ends, [Side::Inside, Side::Outside] | [Side::Outside, Side::Inside]) {
+                if matches!(
+                    ends,
+                    [LatticeSide::Inside, LatticeSide::Outside] | [LatticeSide::Outside, LatticeSide::Inside]
+                ) {
                     cuts.push((
                         (index * EDGES + edge) as u32,
                         self.root([point, other], [distance(point), distance(other)]),
@@ -260,7 +263,7 @@ impl<'a> Lattice<'a> {
     fn warp(&mut self, block: usize) {
         for index in 0..POINTS {
             let point = self.point(block, index);
-            if self.side(point) == Side::On {
+            if self.side(point) == LatticeSide::On {
                 continue;
             }
             let rest = self.rest_position(point);
@@ -279,7 +282,7 @@ impl<'a> Lattice<'a> {
                 }
             }
             if let Some((_, position)) = closest {
-                self.blocks[block].sides[index] = Side::On;
+                self.blocks[block].sides[index] = LatticeSide::On;
                 self.blocks[block].warped.push((index as u32, position));
             }
         }
@@ -288,7 +291,10 @@ impl<'a> Lattice<'a> {
     /// Returns the cut point between two neighbors, or `None` if the warp has moved an end.
     pub(super) fn cut(&self, a: Point, b: Point) -> Option<Vector3<f64>> {
         let sides = [self.side(a), self.side(b)];
-        if !matches!(sides, [Side::Inside, Side::Outside] | [Side::Outside, Side::Inside]) {
+        if !matches!(
+            sides,
+            [LatticeSide::Inside, LatticeSide::Outside] | [LatticeSide::Outside, LatticeSide::Inside]
+        ) {
             return None;
         }
         let (block, key) = self.cut_key(a, b)?;
@@ -326,8 +332,8 @@ impl<'a> Lattice<'a> {
         warped.unwrap_or_else(|| self.rest_position(point))
     }
 
-    pub(super) fn side(&self, point: Point) -> Side {
-        self.block_of(point).map_or(Side::Outside, |block| self.blocks[block].sides[local(point)])
+    pub(super) fn side(&self, point: Point) -> LatticeSide {
+        self.block_of(point).map_or(LatticeSide::Outside, |block| self.blocks[block].sides[local(point)])
     }
 
     /// Visits all tetrahedra of the lattice with a corner inside, in a fixed order.
@@ -353,7 +359,7 @@ impl<'a> Lattice<'a> {
                     });
                     for i in 0..4 {
                         let tet = [center, next, ring[i], ring[(i + 1) % 4]];
-                        if tet.iter().any(|&p| self.side(p) == Side::Inside) {
+                        if tet.iter().any(|&p| self.side(p) == LatticeSide::Inside) {
                             visit(tet);
                         }
                     }
@@ -386,13 +392,13 @@ impl<'a> Lattice<'a> {
 }
 
 /// Returns the side for a distance. NaN counts as outside.
-fn side(distance: f64) -> Side {
+fn side(distance: f64) -> LatticeSide {
     if distance < 0.0 {
-        Side::Inside
+        LatticeSide::Inside
     } else if distance == 0.0 {
-        Side::On
+        LatticeSide::On
     } else {
-        Side::Outside
+        LatticeSide::Outside
     }
 }
 

@@ -11,9 +11,9 @@ mod stencil;
 
 use std::collections::HashMap;
 
-use lattice::{Lattice, Side};
+use lattice::{Lattice, LatticeSide};
 use nalgebra::Vector3;
-use stencil::{Node, fill};
+use stencil::{StencilNode, fill};
 
 use crate::{MeshError, TetMesh, sdf::SignedDistance, tets::signed_volume};
 
@@ -180,15 +180,15 @@ fn mesh(sdf: &dyn SignedDistance, cell: f64, shift: [f64; 3]) -> Result<(TetMesh
         fill(corners, corners.map(|p| lattice.side(p)), |nodes| {
             let found = nodes.map(|node| {
                 let key = match node {
-                    Node::Point(p) => lattice.point_key(p)?,
-                    Node::Cut(a, b) => lattice.edge_key(a, b)?,
+                    StencilNode::Point(p) => lattice.point_key(p)?,
+                    StencilNode::Cut(a, b) => lattice.edge_key(a, b)?,
                 };
                 if let Some(&index) = index_of.get(&key) {
                     return Some(index);
                 }
                 let (position, on) = match node {
-                    Node::Point(p) => (lattice.position(p), lattice.side(p) == Side::On),
-                    Node::Cut(a, b) => (lattice.cut(a, b)?, true),
+                    StencilNode::Point(p) => (lattice.position(p), lattice.side(p) == LatticeSide::On),
+                    StencilNode::Cut(a, b) => (lattice.cut(a, b)?, true),
                 };
                 let index = mesh.nodes.len() as u32;
                 mesh.nodes.push(position.into());

@@ -1,11 +1,11 @@
 //! Divides the inside part of one lattice tetrahedron into tetrahedra.
 
-use super::lattice::{Point, Side, is_long, sub};
+use super::lattice::{LatticeSide, Point, is_long, sub};
 
 /// Node of the mesh: a lattice point, or the cut point between two lattice points (the inside one
 /// first).
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub(super) enum Node {
+pub(super) enum StencilNode {
     Point(Point),
     Cut(Point, Point),
 }
@@ -17,8 +17,8 @@ pub(super) enum Node {
 /// between a corner inside and one outside. The remaining part is a tetrahedron, a pyramid or a
 /// prism. [`diagonal_starts_at_first`] selects the diagonals of the quadrilaterals, so that
 /// neighbors agree.
-pub(super) fn fill(corners: [Point; 4], sides: [Side; 4], mut emit: impl FnMut([Node; 4])) {
-    let of = |side: Side| {
+pub(super) fn fill(corners: [Point; 4], sides: [LatticeSide; 4], mut emit: impl FnMut([StencilNode; 4])) {
+    let of = |side: LatticeSide| {
         let mut points = [[0; 3]; 4];
         let mut count = 0;
         for i in (0..4).filter(|&i| sides[i] == side) {
@@ -27,20 +27,20 @@ pub(super) fn fill(corners: [Point; 4], sides: [Side; 4], mut emit: impl FnMut([
         }
         (points, count)
     };
-    let (inside, inside_count) = of(Side::Inside);
-    let (outside, outside_count) = of(Side::Outside);
-    let (on, _) = of(Side::On);
-    let cut = |i: usize, o: usize| Node::Cut(inside[i], outside[o]);
-    let (p, q) = (Node::Point(inside[0]), Node::Point(inside[1]));
+    let (inside, inside_count) = of(LatticeSide::Inside);
+    let (outside, outside_count) = of(LatticeSide::Outside);
+    let (on, _) = of(LatticeSide::On);
+    let cut = |i: usize, o: usize| StencilNode::Cut(inside[i], outside[o]);
+    let (p, q) = (StencilNode::Point(inside[0]), StencilNode::Point(inside[1]));
     match (inside_count, outside_count) {
         (0, _) => {}
-        (_, 0) => emit(corners.map(Node::Point)),
-        (1, 1) => emit([p, cut(0, 0), Node::Point(on[0]), Node::Point(on[1])]),
-        (1, 2) => emit([p, cut(0, 0), cut(0, 1), Node::Point(on[0])]),
+        (_, 0) => emit(corners.map(StencilNode::Point)),
+        (1, 1) => emit([p, cut(0, 0), StencilNode::Point(on[0]), StencilNode::Point(on[1])]),
+        (1, 2) => emit([p, cut(0, 0), cut(0, 1), StencilNode::Point(on[0])]),
         (1, _) => emit([p, cut(0, 0), cut(0, 1), cut(0, 2)]),
         (2, 1) => {
             // The rest is a pyramid over the quadrilateral p, q, cut q, cut p.
-            let top = Node::Point(on[0]);
+            let top = StencilNode::Point(on[0]);
             let (from, to, rest) = if diagonal_starts_at_first(inside[0], inside[1], outside[0]) {
                 (p, cut(1, 0), [q, cut(0, 0)])
             } else {
@@ -61,7 +61,7 @@ pub(super) fn fill(corners: [Point; 4], sides: [Side; 4], mut emit: impl FnMut([
         }
         (_, _) => {
             // The corner outside is cut off, and a prism remains.
-            let r = Node::Point(inside[2]);
+            let r = StencilNode::Point(inside[2]);
             let first = |i: usize, j: usize| diagonal_starts_at_first(inside[i], inside[j], outside[0]);
             prism(
                 [p, q, r],
@@ -96,7 +96,12 @@ fn diagonal_starts_at_first(a: Point, b: Point, out: Point) -> bool {
 ///
 /// `diagonals` say for the sides (0, 1), (0, 2) and (1, 2) whether the diagonal starts from `a` at
 /// the first of the two indices. The diagonals must not all turn in the same direction.
-fn prism(a: [Node; 3], b: [Node; 3], diagonals: [bool; 3], mut emit: impl FnMut([Node; 4])) {
+fn prism(
+    a: [StencilNode; 3],
+    b: [StencilNode; 3],
+    diagonals: [bool; 3],
+    mut emit: impl FnMut([StencilNode; 4]),
+) {
     let [d01, d02, d12] = diagonals.map(usize::from);
     // The numbers of diagonals that start at each a[i] are 2, 1 and 0 in some order.
     let leaving = [d01 + d02, 1 - d01 + d12, 2 - d02 - d12];

@@ -31,7 +31,7 @@ pub(crate) use interest::{look, say_interest};
 pub(crate) use session::receive;
 pub(crate) use show::show;
 
-use crate::recording::{Recorder, Recording, RecordingError};
+use crate::recording::{Recording, RecordingError, SessionRecorder};
 
 /// How to join a session.
 #[derive(Debug)]
@@ -136,7 +136,7 @@ pub struct NetGuest {
 
 impl NetGuest {
     pub(crate) fn join(mut config: JoinConfig, endpoint: Endpoint) -> Result<Self, RecordingError> {
-        let recorder = config.record.take().map(|path| Recorder::create(&path)).transpose()?;
+        let recorder = config.record.take().map(|path| SessionRecorder::create(&path)).transpose()?;
         Ok(Self::new(config, Source::Quic { endpoint, recorder }))
     }
 

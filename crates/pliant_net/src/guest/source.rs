@@ -8,12 +8,12 @@ use pliant_modal::ModalModel;
 use pliant_stream::{Channel, DisconnectReason, Output, PeerId};
 use tracing::debug;
 
-use crate::recording::{Record, Recorder, Recording};
+use crate::recording::{Recording, SessionRecord, SessionRecorder};
 use crate::transport::{CloseReason, Endpoint, Event, PeerStats, Role};
 
 /// The guest's transport source.
 pub(crate) enum Source {
-    Quic { endpoint: Endpoint, recorder: Option<Recorder> },
+    Quic { endpoint: Endpoint, recorder: Option<SessionRecorder> },
     Replay { recording: Recording, max_datagram: usize, over: bool },
 }
 
@@ -38,18 +38,18 @@ impl Source {
                     Event::Connected { peer, role, .. } => {
                         let most = endpoint.max_datagram_size(peer).unwrap_or(0);
                         let max_datagram = u16::try_from(most).unwrap_or(u16::MAX);
-                        (Came::Connected { role }, now, Record::Connected { role, max_datagram })
+                        (Came::Connected { role }, now, SessionRecord::Connected { role, max_datagram })
                     }
                     Event::Datagram { at, bytes, .. } => {
                         let at = at.saturating_duration_since(began);
-                        (Came::Datagram { at, bytes: bytes.clone() }, at, Record::Datagram(bytes))
+                        (Came::Datagram { at, bytes: bytes.clone() }, at, SessionRecord::Datagram(bytes))
                     }
                     Event::Message { bytes, .. } => {
-                        (Came::Message { bytes: bytes.clone() }, now, Record::Message(bytes))
+                        (Came::Message { bytes: bytes.clone() }, now, SessionRecord::Message(bytes))
                     }
                     Event::Closed { reason, .. } => {
                         let words = reason.to_string();
-                        (Came::Closed { reason }, now, Record::Closed(words))
+                        (Came::Closed { reason }, now, SessionRecord::Closed(words))
                     }
                 };
                 if let Some(recorder) = recorder {
@@ -66,13 +66,13 @@ impl Source {
                     });
                 };
                 Some(match record {
-                    Record::Connected { role, max_datagram: most } => {
+                    SessionRecord::Connected { role, max_datagram: most } => {
                         *max_datagram = usize::from(most);
                         Came::Connected { role }
                     }
-                    Record::Datagram(bytes) => Came::Datagram { at, bytes },
-                    Record::Message(bytes) => Came::Message { bytes },
-                    Record::Closed(words) => {
+                    SessionRecord::Datagram(bytes) => Came::Datagram { at, bytes },
+                    SessionRecord::Message(bytes) => Came::Message { bytes },
+                    SessionRecord::Closed(words) => {
                         // The recording goes on after a close if the recorded guest joined again.
                         if recording.is_over() {
                             *over = true;
@@ -82,7 +82,7 @@ impl Source {
                         Came::Closed { reason: CloseReason::Failed { words } }
                     }
                     // [`Recording::open`] has already read the models.
-                    Record::Model(_) => return self.poll(began, now),
+                    SessionRecord::Model(_) => return self.poll(began, now),
                 })
             }
         }

@@ -7,7 +7,7 @@ use bevy::prelude::*;
 use pliant_stream::{DisconnectReason, GrabKey, HostEvent, PeerId, UserId};
 
 use super::hands::GuestGrab;
-use super::{Known, NetHost};
+use super::{KnownUser, NetHost};
 use crate::transport::{Event, Fingerprint, Role};
 use crate::user::{User, UserJoined, UserLeft, UserLink};
 
@@ -25,10 +25,10 @@ const MOST_KNOWN: usize = 4096;
 
 /// Converts the users of an earlier run, as the app gives them. If two have the same number, the
 /// first keeps it.
-pub(super) fn known_before(known: &[(Fingerprint, UserId)]) -> BTreeMap<Fingerprint, Known> {
+pub(super) fn known_before(known: &[(Fingerprint, UserId)]) -> BTreeMap<Fingerprint, KnownUser> {
     let mut taken = BTreeSet::from([UserId::HOST]);
     let fresh = known.iter().take(MOST_KNOWN).filter(|(_, user)| taken.insert(*user));
-    fresh.map(|&(key, user)| (key, Known { user, seen: Duration::ZERO })).collect()
+    fresh.map(|&(key, user)| (key, KnownUser { user, seen: Duration::ZERO })).collect()
 }
 
 /// `PreUpdate`: processes the data from the guests.
@@ -122,7 +122,7 @@ impl NetHost {
         let Some(guest) = self.guests.get_mut(&peer) else { return };
         let user = User::new(id, name, guest.role);
         let name = user.name.clone();
-        let before = self.known.insert(guest.key, Known { user: id, seen: now });
+        let before = self.known.insert(guest.key, KnownUser { user: id, seen: now });
         let back = before.is_some_and(|before| before.user == id);
         let entity = world.spawn((user, UserLink::default())).id();
         guest.entity = Some(entity);

@@ -85,7 +85,7 @@ pub struct NetHost {
     /// Open connections, with or without a completed join.
     guests: BTreeMap<PeerId, Guest>,
     /// User numbers by key, so that a guest that joins again keeps its number.
-    known: BTreeMap<Fingerprint, Known>,
+    known: BTreeMap<Fingerprint, KnownUser>,
     numbers: BTreeMap<UserId, Entity>,
     /// The number that was assigned last.
     next_user: u16,
@@ -101,7 +101,7 @@ pub struct NetHost {
 
 /// A user who is or was in the session.
 #[derive(Debug, Clone, Copy)]
-struct Known {
+struct KnownUser {
     user: UserId,
     seen: Duration,
 }

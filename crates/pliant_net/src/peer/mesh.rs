@@ -8,7 +8,7 @@ use bytes::Bytes;
 use pliant_stream::peer::PeerEvent;
 use pliant_stream::{Channel, DisconnectReason, PeerId, UserId};
 
-use super::message::{MOST_PEERS, Mesh, Scene};
+use super::message::{MOST_PEERS, MeshMessage, PeerScene};
 use super::{NetPeer, PeerState};
 use crate::remote::{SessionClosed, SessionJoined};
 use crate::transport::{CloseReason, Endpoint, Event, Fingerprint, Invite, Role};
@@ -19,7 +19,7 @@ const MOST_REMEMBERED: usize = 4096;
 
 /// Another peer that this peer is connected with.
 #[derive(Debug)]
-pub(super) struct Other {
+pub(super) struct ConnectedPeer {
     pub(super) key: Fingerprint,
     address: std::net::IpAddr,
     /// The peer's user number, which this peer assigned or the other peer sent. The session then
@@ -29,14 +29,14 @@ pub(super) struct Other {
     pub(super) invite: Option<Invite>,
     /// The join request of a peer that came with this peer's invite. It waits for its number until
     /// this peer's session has begun.
-    waits: Option<(Scene, Invite)>,
+    waits: Option<(PeerScene, Invite)>,
     /// When the peer connected.
     since: Duration,
     /// Whether this peer has closed the connection. Data that still arrives is ignored.
     sent_away: bool,
 }
 
-impl Other {
+impl ConnectedPeer {
     /// Replaces the invite's host with the address from which the peer has connected.
     fn seen_from_here(&self, invite: Invite) -> Invite {
         Invite { host: self.address.to_string(), ..invite }
@@ -96,7 +96,7 @@ impl NetPeer {
                     // The number marks the request as sent. The answer brings the real number.
                     other.number = Some(UserId::HOST);
                     let (scene, invite) = (self.scene.clone(), self.listening.invite());
-                    self.tell(peer, &Mesh::Introduce { scene, invite });
+                    self.tell(peer, &MeshMessage::Introduce { scene, invite });
                 }
             }
         }
@@ -110,7 +110,8 @@ impl NetPeer {
                 let (number, invite) = self.introduced.remove(&peer).unzip();
                 let address = address.ip();
                 let (waits, since, sent_away) = (None, now, false);
-                let other = Other { key: fingerprint, address, number, invite, waits, since, sent_away };
+                let other =
+                    ConnectedPeer { key: fingerprint, address, number, invite, waits, since, sent_away };
                 self.others.insert(peer, other);
                 if role == Role::Watch && opened.is_none() {
                     // Every peer steps the bodies with its own hands, so the mesh has no place for
@@ -121,7 +122,7 @@ impl NetPeer {
                 // the others.
                 if let (Some(_), PeerState::In { user }) = (opened, &self.state) {
                     let (number, scene, invite) = (*user, self.scene.clone(), self.listening.invite());
-                    self.tell(peer, &Mesh::Member { number, scene, invite });
+                    self.tell(peer, &MeshMessage::Member { number, scene, invite });
                     self.talk_to(now, peer);
                 }
             }
@@ -158,13 +159,13 @@ impl NetPeer {
     }
 
     fn heard(&mut self, world: &mut World, now: Duration, peer: PeerId, opened: bool, bytes: Bytes) {
-        match Mesh::read(bytes) {
-            Some(Mesh::Session(bytes)) => {
+        match MeshMessage::read(bytes) {
+            Some(MeshMessage::Session(bytes)) => {
                 if let Some(session) = &mut self.session {
                     session.on_message(now, peer, &bytes);
                 }
             }
-            Some(Mesh::Introduce { scene, invite }) if !opened => {
+            Some(MeshMessage::Introduce { scene, invite }) if !opened => {
                 let Some(other) = self.others.get_mut(&peer) else { return };
                 if other.number.is_none() && other.waits.is_none() {
                     other.waits = Some((scene, invite));
@@ -175,7 +176,7 @@ impl NetPeer {
                     self.hang_up(peer, DisconnectReason::Protocol, "introduced twice");
                 }
             }
-            Some(Mesh::Member { number, scene, invite }) if !opened => {
+            Some(MeshMessage::Member { number, scene, invite }) if !opened => {
                 let known = self.others.values().any(|other| other.number == Some(number));
                 let own = if let PeerState::In { user } = self.state { user } else { UserId::HOST };
                 if scene != self.scene {
@@ -190,7 +191,7 @@ impl NetPeer {
                     self.talk_to(now, peer);
                 }
             }
-            Some(Mesh::Welcome { number, from, others })
+            Some(MeshMessage::Welcome { number, from, others })
                 if opened
                     && self.session.is_none()
                     && ![number, from].contains(&UserId::HOST)
@@ -263,7 +264,7 @@ impl NetPeer {
             other.invite = Some(other.seen_from_here(invite));
         }
         let PeerState::In { user: from } = self.state else { return };
-        self.tell(peer, &Mesh::Welcome { number, from, others });
+        self.tell(peer, &MeshMessage::Welcome { number, from, others });
         self.talk_to(now, peer);
     }
 
@@ -279,7 +280,7 @@ impl NetPeer {
         }
     }
 
-    fn tell(&self, peer: PeerId, message: &Mesh) {
+    fn tell(&self, peer: PeerId, message: &MeshMessage) {
         let (endpoint, number) = self.way(peer);
         if let Err(error) = endpoint.send_message(number, message.to_message()) {
             debug!("not sent to peer {peer}: {error}");
@@ -292,7 +293,7 @@ impl NetPeer {
     fn hang_up_on_the_silent(&mut self) {
         let Some(session) = &self.session else { return };
         let (now, most) = (self.now(), self.limits.handshake);
-        let silent = |(peer, other): &(&PeerId, &Other)| {
+        let silent = |(peer, other): &(&PeerId, &ConnectedPeer)| {
             // A peer that connected while this peer's bodies were being loaded could not be
             // answered earlier.
             let since = other.since.max(self.began_at);
@@ -328,7 +329,7 @@ impl NetPeer {
                     let _ = endpoint.send_datagram(number, Bytes::from_owner(output.bytes));
                 }
                 Channel::Message => {
-                    self.tell(output.peer, &Mesh::Session(Bytes::from_owner(output.bytes)));
+                    self.tell(output.peer, &MeshMessage::Session(Bytes::from_owner(output.bytes)));
                 }
             }
         }

@@ -24,20 +24,20 @@ const LONGEST_INVITE: usize = 512;
 /// What all peers must have in common: the step (ns) and the bodies, each with the digest of its
 /// model and step settings.
 #[derive(Debug, Clone, PartialEq, Eq)]
-pub(super) struct Scene {
+pub(super) struct PeerScene {
     pub(super) step_ns: u64,
     pub(super) bodies: Vec<(BodyId, [u8; 32])>,
 }
 
 #[derive(Debug, Clone, PartialEq)]
-pub(super) enum Mesh {
+pub(super) enum MeshMessage {
     Session(Bytes),
-    Introduce { scene: Scene, invite: Invite },
+    Introduce { scene: PeerScene, invite: Invite },
     Welcome { number: UserId, from: UserId, others: Vec<(UserId, Invite)> },
-    Member { number: UserId, scene: Scene, invite: Invite },
+    Member { number: UserId, scene: PeerScene, invite: Invite },
 }
 
-impl Mesh {
+impl MeshMessage {
     pub(super) fn to_message(&self) -> Bytes {
         let mut to = BytesMut::new();
         match self {
@@ -97,7 +97,7 @@ impl Mesh {
     }
 }
 
-fn put_scene(to: &mut BytesMut, scene: &Scene) {
+fn put_scene(to: &mut BytesMut, scene: &PeerScene) {
     to.put_u64_le(scene.step_ns);
     let bodies = &scene.bodies[..scene.bodies.len().min(MOST_BODIES)];
     to.put_u16_le(bodies.len() as u16);
@@ -107,7 +107,7 @@ fn put_scene(to: &mut BytesMut, scene: &Scene) {
     }
 }
 
-fn get_scene(from: &mut Bytes) -> Option<Scene> {
+fn get_scene(from: &mut Bytes) -> Option<PeerScene> {
     let step_ns = from.try_get_u64_le().ok()?;
     let count = usize::from(from.try_get_u16_le().ok()?);
     if count > MOST_BODIES {
@@ -119,7 +119,7 @@ fn get_scene(from: &mut Bytes) -> Option<Scene> {
         from.try_copy_to_slice(&mut hash).ok()?;
         Some((body, hash))
     };
-    Some(Scene { step_ns, bodies: (0..count).map(body).collect::<Option<Vec<_>>>()? })
+    Some(PeerScene { step_ns, bodies: (0..count).map(body).collect::<Option<Vec<_>>>()? })
 }
 
 fn put_invite(to: &mut BytesMut, invite: &Invite) {
@@ -145,32 +145,36 @@ mod tests {
     #[test]
     fn what_peers_say_is_written_and_read_and_checked() {
         let invite = Invite::new("192.0.2.7:4433".parse().unwrap(), Fingerprint([7; 32]));
-        let scene = Scene { step_ns: 25_000_000, bodies: vec![(BodyId(3), [1; 32]), (BodyId(9), [2; 32])] };
+        let scene =
+            PeerScene { step_ns: 25_000_000, bodies: vec![(BodyId(3), [1; 32]), (BodyId(9), [2; 32])] };
         let messages = [
-            Mesh::Introduce { scene: scene.clone(), invite: invite.clone().with_token(Token([5; 16])) },
-            Mesh::Welcome {
+            MeshMessage::Introduce {
+                scene: scene.clone(),
+                invite: invite.clone().with_token(Token([5; 16])),
+            },
+            MeshMessage::Welcome {
                 number: UserId(3),
                 from: UserId(1),
                 others: vec![(UserId(4), invite.clone()), (UserId(2), invite.clone())],
             },
-            Mesh::Member { number: UserId(3), scene, invite },
+            MeshMessage::Member { number: UserId(3), scene, invite },
         ];
         for message in messages {
             let bytes = message.to_message();
-            assert_eq!(Mesh::read(bytes.clone()), Some(message.clone()));
+            assert_eq!(MeshMessage::read(bytes.clone()), Some(message.clone()));
             for cut in 0..bytes.len() {
-                assert_eq!(Mesh::read(bytes.slice(..cut)), None, "cut to {cut} of {message:?}");
+                assert_eq!(MeshMessage::read(bytes.slice(..cut)), None, "cut to {cut} of {message:?}");
             }
             // A message with any byte changed is refused or read as something else, and never
             // panics.
             for at in 0..bytes.len() {
                 let mut wrong = bytes.to_vec();
                 wrong[at] ^= 0xa5;
-                Mesh::read(wrong.into());
+                MeshMessage::read(wrong.into());
             }
         }
-        let session = Mesh::Session(Bytes::from_static(b"abc"));
-        assert_eq!(Mesh::read(session.to_message()), Some(session));
-        assert_eq!(Mesh::read(Bytes::from_static(&[99])), None);
+        let session = MeshMessage::Session(Bytes::from_static(b"abc"));
+        assert_eq!(MeshMessage::read(session.to_message()), Some(session));
+        assert_eq!(MeshMessage::read(Bytes::from_static(&[99])), None);
     }
 }

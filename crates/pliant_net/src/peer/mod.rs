@@ -26,9 +26,9 @@ use crate::transport::{
     TransportError,
 };
 use crate::user::{User, UserLink, Yourself, shortened};
-use mesh::Other;
-use message::Scene;
-use play::{PlayedBody, SentGrab};
+use mesh::ConnectedPeer;
+use message::PeerScene;
+use play::{PeerGrab, PlayedBody};
 use reconnect::Missed;
 
 pub(crate) use mesh::receive;
@@ -105,9 +105,9 @@ pub struct NetPeer {
     began_at: Duration,
     state: PeerState,
     session: Option<PeerSession>,
-    scene: Scene,
+    scene: PeerScene,
     bodies: BTreeMap<BodyId, PlayedBody>,
-    others: BTreeMap<PeerId, Other>,
+    others: BTreeMap<PeerId, ConnectedPeer>,
     /// Numbers and invites of the peers that this peer is connecting to, as the first peer sent
     /// them.
     introduced: BTreeMap<PeerId, (UserId, Invite)>,
@@ -116,7 +116,7 @@ pub struct NetPeer {
     /// User numbers by key, so that a peer that reconnects keeps its number.
     numbers: BTreeMap<Fingerprint, UserId>,
     users: BTreeMap<UserId, Entity>,
-    grabs: BTreeMap<Entity, SentGrab>,
+    grabs: BTreeMap<Entity, PeerGrab>,
     scratch: Vec<f64>,
     ledger: Ledger,
     /// Number of received messages that a peer may not send.
@@ -148,7 +148,7 @@ impl NetPeer {
             began_at: Duration::ZERO,
             state: PeerState::Joining,
             session: None,
-            scene: Scene { step_ns: 0, bodies: Vec::new() },
+            scene: PeerScene { step_ns: 0, bodies: Vec::new() },
             bodies: BTreeMap::new(),
             others: BTreeMap::new(),
             introduced: BTreeMap::new(),
@@ -319,7 +319,7 @@ impl NetPeer {
         for played in found.values() {
             world.entity_mut(played.entity).insert((Driven::Remote, crate::remote::RemoteHands::default()));
         }
-        self.scene = Scene {
+        self.scene = PeerScene {
             step_ns: u64::try_from(step.as_nanos()).unwrap_or(0),
             bodies: found.iter().map(|(&id, played)| (id, played.digest())).collect(),
         };

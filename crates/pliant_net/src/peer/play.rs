@@ -62,7 +62,7 @@ pub(super) fn agreed_settings(body: &Body) -> StepSettings {
 }
 
 /// A local grab as the session knows it.
-pub(super) struct SentGrab {
+pub(super) struct PeerGrab {
     body: BodyId,
     vertex: u32,
     radius: f64,
@@ -108,7 +108,7 @@ pub(crate) fn tell_hands(
                 let point = PatchPoint::new(state.model(), grab.vertex, grab.radius).ok();
                 let (vertex, radius) = (grab.vertex, grab.radius);
                 let number = begun.as_ref().ok().copied();
-                net.grabs.insert(entity, SentGrab { body: id, vertex, radius, hold, number, point });
+                net.grabs.insert(entity, PeerGrab { body: id, vertex, radius, hold, number, point });
                 begun.map(|_| None)
             }
         };

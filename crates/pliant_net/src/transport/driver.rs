@@ -22,7 +22,7 @@ use tracing::debug;
 
 use super::congestion::Bucket;
 use super::emulated::Emulated;
-use super::endpoint::{CloseReason, Event, Peer, Shared, TransportError};
+use super::endpoint::{CloseReason, EndpointShared, Event, PeerConnection, TransportError};
 use super::identity::{Fingerprint, SERVER_NAME, shortened};
 use super::invite::Invite;
 use super::queue::{Next, lock};
@@ -55,7 +55,7 @@ pub(super) enum Side {
 
 /// Runs until the application drops its side.
 pub(super) async fn run(
-    shared: Arc<Shared>,
+    shared: Arc<EndpointShared>,
     socket: UdpSocket,
     side: Side,
     ready: SyncSender<Result<quinn::Endpoint, TransportError>>,
@@ -98,7 +98,7 @@ pub(super) async fn run(
 const GOODBYE_WORDS: &[u8] = b"goodbye";
 
 fn open(
-    shared: &Shared,
+    shared: &EndpointShared,
     socket: UdpSocket,
     server: Option<ServerConfig>,
 ) -> Result<quinn::Endpoint, TransportError> {
@@ -109,7 +109,11 @@ fn open(
 
 /// Continues on another socket, which the host sees as a migration of the guest. Must be called on
 /// the network runtime.
-pub(super) fn move_to(shared: &Shared, endpoint: &quinn::Endpoint, socket: UdpSocket) -> std::io::Result<()> {
+pub(super) fn move_to(
+    shared: &EndpointShared,
+    endpoint: &quinn::Endpoint,
+    socket: UdpSocket,
+) -> std::io::Result<()> {
     let socket = TokioRuntime.wrap_udp_socket(socket)?;
     endpoint.rebind_abstract(Emulated::under(socket, &shared.emulator))
 }
@@ -117,7 +121,7 @@ pub(super) fn move_to(shared: &Shared, endpoint: &quinn::Endpoint, socket: UdpSo
 /// Number of open handshakes above which a new guest must first prove its address.
 const HANDSHAKES_BEFORE_RETRY: usize = 16;
 
-async fn accept(shared: &Arc<Shared>, endpoint: &quinn::Endpoint) {
+async fn accept(shared: &Arc<EndpointShared>, endpoint: &quinn::Endpoint) {
     let handshakes = Arc::new(AtomicUsize::new(0));
     loop {
         let incoming = tokio::select! {
@@ -164,12 +168,12 @@ async fn accept(shared: &Arc<Shared>, endpoint: &quinn::Endpoint) {
 
 /// Counts a connection of an address while the value is alive.
 struct From {
-    shared: Arc<Shared>,
+    shared: Arc<EndpointShared>,
     address: IpAddr,
 }
 
 impl From {
-    fn count(shared: &Arc<Shared>, address: IpAddr) -> Option<Self> {
+    fn count(shared: &Arc<EndpointShared>, address: IpAddr) -> Option<Self> {
         let mut addresses = lock(&shared.addresses);
         let count = addresses.entry(address).or_default();
         if *count >= shared.limits.per_address.max(1) {
@@ -203,7 +207,7 @@ struct Open {
 }
 
 /// The host's half of the handshake.
-async fn welcome(shared: &Shared, incoming: Incoming) -> Result<Open, CloseReason> {
+async fn welcome(shared: &EndpointShared, incoming: Incoming) -> Result<Open, CloseReason> {
     let connection =
         incoming.accept().map_err(|error| reason_of(error, None))?.await.map_err(|e| reason_of(e, None))?;
     let refuse = |words: &str| {
@@ -236,7 +240,7 @@ async fn welcome(shared: &Shared, incoming: Incoming) -> Result<Open, CloseReaso
 
 /// The guest's half of the handshake: one attempt, whose result is reported as an event.
 async fn join(
-    shared: &Shared,
+    shared: &EndpointShared,
     endpoint: &quinn::Endpoint,
     client: ClientConfig,
     invite: &Invite,
@@ -363,9 +367,9 @@ fn reason_of(error: ConnectionError, refused: Option<CloseReason>) -> CloseReaso
 impl Open {
     /// Carries the connection's traffic until it ends, and reports its beginning and end to the
     /// application.
-    async fn serve(self, shared: &Shared) {
+    async fn serve(self, shared: &EndpointShared) {
         let Self { peer: id, role, fingerprint, connection, mut send, mut recv } = self;
-        let peer = Arc::new(Peer::default());
+        let peer = Arc::new(PeerConnection::default());
         refresh(&connection, &peer);
         lock(&shared.peers).insert(id, Arc::clone(&peer));
         let address = connection.remote_address();
@@ -412,7 +416,7 @@ async fn discard_early(connection: &Connection) {
     }
 }
 
-fn refresh(connection: &Connection, peer: &Peer) {
+fn refresh(connection: &Connection, peer: &PeerConnection) {
     let stats = connection.stats();
     *lock(&peer.address) = Some(connection.remote_address());
     peer.max_datagram.store(connection.max_datagram_size().unwrap_or(0), Ordering::Relaxed);
@@ -431,7 +435,7 @@ fn refresh(connection: &Connection, peer: &Peer) {
     };
 }
 
-async fn keep_figures(connection: &Connection, peer: &Peer) {
+async fn keep_figures(connection: &Connection, peer: &PeerConnection) {
     loop {
         sleep(Duration::from_millis(100)).await;
         refresh(connection, peer);
@@ -439,7 +443,7 @@ async fn keep_figures(connection: &Connection, peer: &Peer) {
 }
 
 async fn read_messages(
-    shared: &Shared,
+    shared: &EndpointShared,
     id: PeerId,
     connection: &Connection,
     recv: &mut RecvStream,
@@ -466,7 +470,7 @@ async fn read_messages(
     }
 }
 
-async fn read_datagrams(shared: &Shared, id: PeerId, connection: &Connection, peer: &Peer) {
+async fn read_datagrams(shared: &EndpointShared, id: PeerId, connection: &Connection, peer: &PeerConnection) {
     while let Ok(bytes) = connection.read_datagram().await {
         let dropped = shared.inbox.push_datagram(id, Instant::now(), bytes, shared.limits.queued_datagrams);
         if dropped > 0 {
@@ -482,7 +486,7 @@ const MESSAGE_PART: usize = 2048;
 
 async fn write_messages(
     connection: &Connection,
-    peer: &Peer,
+    peer: &PeerConnection,
     bucket: &Mutex<Bucket>,
     send: &mut SendStream,
 ) -> CloseReason {
@@ -507,7 +511,7 @@ async fn write_messages(
 
 /// Closes the connection after [`GRACE`], even if a peer that does not read delays the messages
 /// before the goodbye.
-async fn hang_up(connection: &Connection, peer: &Peer) -> CloseReason {
+async fn hang_up(connection: &Connection, peer: &PeerConnection) -> CloseReason {
     let (code, words) = peer.outbox.closing().await;
     sleep(GRACE).await;
     connection.close(VarInt::from_u32(code), words.as_bytes());
@@ -537,7 +541,7 @@ fn take_datagram(bucket: &Mutex<Bucket>, len: usize) -> Result<(), Duration> {
     lock(bucket).take_datagram(len, Instant::now())
 }
 
-async fn write_datagrams(connection: &Connection, peer: &Peer, bucket: &Mutex<Bucket>) {
+async fn write_datagrams(connection: &Connection, peer: &PeerConnection, bucket: &Mutex<Bucket>) {
     loop {
         let Some(len) = peer.outbox.first_datagram_len() else {
             peer.outbox.datagram_waits.notified().await;

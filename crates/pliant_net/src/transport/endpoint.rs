@@ -179,7 +179,7 @@ impl TransportError {
 
 /// One peer, shared by both threads.
 #[derive(Debug, Default)]
-pub(super) struct Peer {
+pub(super) struct PeerConnection {
     pub(super) outbox: Outbox,
     pub(super) stats: Mutex<PeerStats>,
     pub(super) dropped: Mutex<DropCounts>,
@@ -189,9 +189,9 @@ pub(super) struct Peer {
 
 /// State that the application and the network thread share.
 #[derive(Debug)]
-pub(super) struct Shared {
+pub(super) struct EndpointShared {
     pub(super) inbox: Inbox,
-    pub(super) peers: Mutex<BTreeMap<PeerId, Arc<Peer>>>,
+    pub(super) peers: Mutex<BTreeMap<PeerId, Arc<PeerConnection>>>,
     pub(super) limits: Limits,
     pub(super) next_peer: AtomicU64,
     pub(super) stopping: AtomicBool,
@@ -204,7 +204,7 @@ pub(super) struct Shared {
     pub(super) emulator: Arc<Emulator>,
 }
 
-impl Shared {
+impl EndpointShared {
     fn new(limits: Limits, first_peer: PeerId, access: Access) -> Arc<Self> {
         Arc::new(Self {
             inbox: Inbox::default(),
@@ -230,7 +230,7 @@ impl Shared {
 /// Dropping it sends a goodbye to every peer, which takes a few round trips and at most a second.
 #[derive(Debug)]
 pub struct Endpoint {
-    shared: Arc<Shared>,
+    shared: Arc<EndpointShared>,
     thread: Option<JoinHandle<()>>,
     runtime: tokio::runtime::Handle,
     quic: quinn::Endpoint,
@@ -246,7 +246,7 @@ impl Endpoint {
         let HostOptions { bind, identity, access, limits, emulation } = options;
         let identity = identity.map_or_else(Identity::generate, Ok)?;
         let server = super::config::server(&identity, &limits)?;
-        let shared = Shared::new(limits, PeerId(1), access);
+        let shared = EndpointShared::new(limits, PeerId(1), access);
         Self::start(bind, identity.fingerprint(), shared, emulation, Side::Host { server })
     }
 
@@ -267,14 +267,14 @@ impl Endpoint {
         let refused = verifier.unwrap_or_default();
         let side = Side::Guest { client, invite: invite.clone(), refused };
         let bind = bind.unwrap_or_else(|| driver::address_for_joining(invite));
-        let shared = Shared::new(limits, PeerId::HOST, Access::Anyone);
+        let shared = EndpointShared::new(limits, PeerId::HOST, Access::Anyone);
         Self::start(bind, identity.fingerprint(), shared, emulation, side)
     }
 
     fn start(
         bind: SocketAddr,
         fingerprint: Fingerprint,
-        shared: Arc<Shared>,
+        shared: Arc<EndpointShared>,
         emulation: Option<Emulation>,
         side: Side,
     ) -> Result<Self, TransportError> {
@@ -377,7 +377,7 @@ impl Endpoint {
         lock(&self.shared.peers).keys().copied().collect()
     }
 
-    fn peer(&self, peer: PeerId) -> Option<Arc<Peer>> {
+    fn peer(&self, peer: PeerId) -> Option<Arc<PeerConnection>> {
         lock(&self.shared.peers).get(&peer).cloned()
     }
 

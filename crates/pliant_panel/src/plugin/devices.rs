@@ -13,7 +13,7 @@ use crate::{
 
 /// Data of the devices that the panel keeps between frames.
 #[derive(Resource, Default)]
-pub(super) struct Histories {
+pub(super) struct DeviceHistories {
     forces: HashMap<DeviceId, Trace>,
     /// The calibration step that each device has asked the user for.
     calibrate: HashMap<DeviceId, &'static str>,
@@ -22,7 +22,7 @@ pub(super) struct Histories {
 #[derive(SystemParam)]
 pub(super) struct Devices<'w, 's> {
     devices: Option<ResMut<'w, HapticDevices>>,
-    histories: ResMut<'w, Histories>,
+    histories: ResMut<'w, DeviceHistories>,
     time: Res<'w, Time<Real>>,
     tools: Query<'w, 's, &'static mut HapticTool>,
     notices: Option<MessageReader<'w, 's, HapticNotice>>,
@@ -51,7 +51,7 @@ impl Devices<'_, '_> {
     pub fn show(&mut self, ui: &mut Ui) {
         let Some(devices) = &mut self.devices else { return };
         let now = self.time.elapsed_secs_f64();
-        let Histories { forces, calibrate } = &mut *self.histories;
+        let DeviceHistories { forces, calibrate } = &mut *self.histories;
         for notice in self.notices.iter_mut().flat_map(|notices| notices.read()) {
             if let LoopEvent::Calibrate(how) = notice.event {
                 calibrate.insert(notice.device, how);

@@ -76,16 +76,16 @@ impl Plugin for PanelPlugin {
         }
         app.register_type::<Panel>()
             .insert_resource(Panel { open: self.open, key: self.key, only: self.only, ..default() })
-            .init_resource::<scene::Histories>()
+            .init_resource::<scene::SceneHistories>()
             .add_systems(Update, toggle.run_if(resource_exists::<ButtonInput<KeyCode>>))
             .add_systems(EguiPrimaryContextPass, draw.run_if(|panel: Res<Panel>| panel.open));
         #[cfg(feature = "haptics")]
         // Bodies behind the panel are covered by egui's picking backend. A device's pointer reads the
         // buttons themselves.
-        app.init_resource::<devices::Histories>()
+        app.init_resource::<devices::DeviceHistories>()
             .configure_sets(PreUpdate, pliant_haptics::PointerToolSystems::Press.run_if(not(wants_pointer)));
         #[cfg(feature = "net")]
-        app.init_resource::<session::Histories>();
+        app.init_resource::<session::SessionHistories>();
     }
 }
 
@@ -120,7 +120,7 @@ fn toggle(keys: Res<ButtonInput<KeyCode>>, mut panel: ResMut<Panel>) {
 fn draw(
     mut contexts: EguiContexts,
     panel: Res<Panel>,
-    mut scene: scene::Scene,
+    mut scene: scene::SceneParam,
     #[cfg(feature = "net")] mut session: session::Session,
     #[cfg(feature = "haptics")] mut devices: devices::Devices,
     #[cfg(feature = "rerun")] mut recording: scene::Recording,

@@ -21,7 +21,7 @@ use crate::{
 
 /// Data of the scene that the panel keeps between frames, for its plots.
 #[derive(Resource, Default)]
-pub(super) struct Histories {
+pub(super) struct SceneHistories {
     energies: EntityHashMap<Trace>,
     forces: HashMap<HandKey, Trace>,
     /// Whether a body's header is closed.
@@ -41,9 +41,9 @@ pub(super) enum HandKey {
 }
 
 #[derive(SystemParam)]
-pub(super) struct Scene<'w, 's> {
+pub(super) struct SceneParam<'w, 's> {
     commands: Commands<'w, 's>,
-    histories: ResMut<'w, Histories>,
+    histories: ResMut<'w, SceneHistories>,
     virtual_time: ResMut<'w, Time<Virtual>>,
     steps: MessageWriter<'w, SingleSteps>,
     fixed_time: Option<Res<'w, Time<Fixed>>>,
@@ -67,10 +67,10 @@ pub(super) struct Scene<'w, 's> {
     people: super::hands::People<'w, 's>,
 }
 
-impl Scene<'_, '_> {
+impl SceneParam<'_, '_> {
     pub fn show_time(&mut self, ui: &mut Ui) {
         let now = self.real_time.elapsed_secs_f64();
-        let Histories { step_ms, deform_ms, .. } = &mut *self.histories;
+        let SceneHistories { step_ms, deform_ms, .. } = &mut *self.histories;
         for (path, trace) in [(STEP_TIME, step_ms), (DEFORM_TIME, deform_ms)] {
             let newest = self.diagnostics.as_ref().and_then(|all| all.get(&path)?.measurement());
             if let Some(newest) = newest {

@@ -14,7 +14,7 @@ use crate::{
 
 /// Data of the network that the panel keeps between frames.
 #[derive(Resource, Default)]
-pub(super) struct Histories {
+pub(super) struct SessionHistories {
     round_trips: Trace,
     rates: Trace,
     /// Whether "other" was chosen among the emulated networks.
@@ -27,7 +27,7 @@ pub(super) struct Session<'w, 's> {
     guest: Option<ResMut<'w, NetGuest>>,
     peer: Option<ResMut<'w, NetPeer>>,
     stats: Option<Res<'w, NetStats>>,
-    histories: ResMut<'w, Histories>,
+    histories: ResMut<'w, SessionHistories>,
     time: Res<'w, Time<Real>>,
     users: Query<'w, 's, (&'static User, Has<Yourself>, Option<&'static Hands>, Option<&'static UserLink>)>,
 }

@@ -17,7 +17,7 @@ use crate::session::{Channel, Output};
 use crate::state::PeerId;
 use crate::wire::{Clock, Report};
 use round_trip::RoundTrip;
-use tally::{Arrival, Tally, loss_of};
+use tally::{DatagramArrival, Tally, loss_of};
 
 /// State of a connection: sequence numbers, loss, round trip, time of the last reception, and
 /// counts.
@@ -68,11 +68,11 @@ impl Link {
     pub(crate) fn receive_datagram(&mut self, now: Duration, sequence: u16, bytes: usize) -> bool {
         self.received_at = now;
         let arrival = self.received.take(sequence);
-        if arrival == Arrival::New {
+        if arrival == DatagramArrival::New {
             self.stats.datagrams_in += 1;
             self.stats.bytes_in += bytes as u64;
         }
-        arrival != Arrival::Copy
+        arrival != DatagramArrival::Copy
     }
 
     /// Counts a message. The message may still turn out to be invalid.

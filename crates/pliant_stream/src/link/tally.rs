@@ -4,7 +4,7 @@ use crate::wire::Report;
 
 /// Classifies a datagram by its sequence number.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub(crate) enum Arrival {
+pub(crate) enum DatagramArrival {
     /// The first copy of the datagram.
     New,
     /// A duplicate.
@@ -26,14 +26,14 @@ pub(crate) struct Tally {
 }
 
 impl Tally {
-    pub(crate) fn take(&mut self, sequence: u16) -> Arrival {
+    pub(crate) fn take(&mut self, sequence: u16) -> DatagramArrival {
         if !self.started {
             self.started = true;
             self.first = u64::from(sequence) + 0x1_0000;
             self.highest = self.first;
             self.window = 1;
             self.received = 1;
-            return Arrival::New;
+            return DatagramArrival::New;
         }
         // The full number is the one nearest to the highest number seen.
         let delta = i64::from(sequence.wrapping_sub(self.highest as u16) as i16);
@@ -45,15 +45,15 @@ impl Tally {
         } else {
             let back = self.highest - full;
             if back >= 64 {
-                return Arrival::Old;
+                return DatagramArrival::Old;
             }
             if self.window >> back & 1 == 1 {
-                return Arrival::Copy;
+                return DatagramArrival::Copy;
             }
             self.window |= 1 << back;
         }
         self.received += 1;
-        Arrival::New
+        DatagramArrival::New
     }
 
     pub(crate) fn report(&self) -> Report {

@@ -30,7 +30,7 @@ pub enum Repair {
 
 /// Force and target of a grab in a step.
 #[derive(Debug, Clone, Copy, PartialEq)]
-struct Grip {
+struct HandSlot {
     key: GrabKey,
     /// Force on the body at the end of the step (`pull`) and over it (`mean`), world axes, N.
     pull: Vector3<f64>,
@@ -45,7 +45,7 @@ struct Grip {
 struct Past {
     tick: Tick,
     state: State,
-    pulls: Vec<Grip>,
+    pulls: Vec<HandSlot>,
     used: Vec<(UserId, HeldAt)>,
 }
 
@@ -61,7 +61,7 @@ pub struct PeerBody {
     repair: Repair,
     tick: Tick,
     state: State,
-    pulls: Vec<Grip>,
+    pulls: Vec<HandSlot>,
     past: Vec<Past>,
     held: Vec<(UserId, HeldAt)>,
     blend: Blend,
@@ -239,7 +239,7 @@ impl PeerBody {
             return false;
         }
         let before = std::mem::replace(&mut self.state, told);
-        let pull = |p: &PeerGrip| Grip {
+        let pull = |p: &PeerGrip| HandSlot {
             key: GrabKey { user: UserId(p.user), grab: p.grab },
             pull: p.pull.into(),
             mean: p.mean.into(),
@@ -385,7 +385,7 @@ impl PeerBody {
     }
 
     /// Steps a state with hands once and replaces `pulls` by the grabs of this step.
-    fn press(replica: &mut Replica, state: &mut State, pulls: &mut Vec<Grip>, held: &[(UserId, HeldAt)]) {
+    fn press(replica: &mut Replica, state: &mut State, pulls: &mut Vec<HandSlot>, held: &[(UserId, HeldAt)]) {
         let mut hands = Vec::with_capacity(held.len());
         let mut keys = Vec::with_capacity(held.len());
         for (user, g) in held {
@@ -412,7 +412,7 @@ impl PeerBody {
         pulls.clear();
         let grip = |((key, target), hand): ((GrabKey, Vector3<f64>), &Hand)| {
             let &Hand { pull, mean, flow, .. } = hand;
-            Grip { key, pull, mean, target, flow }
+            HandSlot { key, pull, mean, target, flow }
         };
         pulls.extend(keys.into_iter().zip(&hands).map(grip));
     }

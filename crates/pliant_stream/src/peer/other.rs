@@ -10,7 +10,7 @@ use crate::state::{BodyId, PeerId, Tick, UserId};
 const CHECKS: u32 = 3;
 
 #[derive(Debug)]
-pub(super) struct Other {
+pub(super) struct RemotePeer {
     pub(super) link: Link,
     /// User number of the peer, after its hello.
     pub(super) user: Option<UserId>,
@@ -36,7 +36,7 @@ pub(super) struct Other {
     pub(super) state_budget: Budget,
 }
 
-impl Other {
+impl RemotePeer {
     pub(super) fn new(peer: PeerId, now: Duration, expected: UserId, max_datagram: usize) -> Self {
         Self {
             link: Link::new(peer, now, max_datagram),

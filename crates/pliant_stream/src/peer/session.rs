@@ -11,7 +11,7 @@ use pliant_modal::{GrabConfig, ModalModel, StepSettings};
 use super::body::PeerBody;
 use super::config::{PeerConfig, PeerEvent};
 use super::inputs::{InputLog, WINDOW};
-use super::other::Other;
+use super::other::RemotePeer;
 use super::wire::{HeldAt, InputTick, MAX_HELD, MAX_TICKS, PeerDatagram, PeerMessage, StateCheck};
 use crate::StreamError;
 use crate::link::Events;
@@ -46,7 +46,7 @@ pub fn digest(model: &ModalModel, settings: &StepSettings) -> [u8; 32] {
 #[derive(Debug)]
 pub struct PeerSession {
     config: PeerConfig,
-    others: BTreeMap<PeerId, Other>,
+    others: BTreeMap<PeerId, RemotePeer>,
     bodies: BTreeMap<BodyId, PeerBody>,
     inputs: InputLog,
     own: BTreeMap<u16, HeldAt>,
@@ -164,7 +164,7 @@ impl PeerSession {
         if self.others.len() >= MAX_PEERS {
             return Err(StreamError::Full { what: "peers", limit: MAX_PEERS });
         }
-        self.others.insert(peer, Other::new(peer, now, user, max_datagram));
+        self.others.insert(peer, RemotePeer::new(peer, now, user, max_datagram));
         let hello = PeerMessage::Hello {
             version: PROTOCOL_VERSION,
             user: self.config.user.0,
@@ -566,7 +566,7 @@ impl PeerSession {
         for (peer, question) in questions {
             self.datagram(peer, &question);
         }
-        if self.others.values().any(Other::is_apart) {
+        if self.others.values().any(RemotePeer::is_apart) {
             self.request_state(now);
         }
     }

@@ -9,7 +9,7 @@ use pliant_modal::ModalModel;
 use super::download::Download;
 use super::guest_body::BodyView;
 use super::guest_config::{GuestConfig, GuestEvent};
-use super::guest_hands::OwnGrab;
+use super::guest_hands::LocalGrab;
 use super::{DisconnectReason, LinkStats, MIN_DATAGRAM, Output};
 use crate::StreamError;
 use crate::clock::ClockEstimate;
@@ -26,7 +26,7 @@ const PING_EVERY: Duration = Duration::from_millis(500);
 const PING_SOON: Duration = Duration::from_millis(100);
 
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-enum Standing {
+enum GuestStanding {
     New,
     Greeted,
     In(UserId),
@@ -38,7 +38,7 @@ enum Standing {
 pub struct GuestSession {
     pub(super) config: GuestConfig,
     pub(super) link: Link,
-    standing: Standing,
+    standing: GuestStanding,
     newmark: Newmark,
     pub(super) models: BTreeMap<[u8; 32], Arc<ModalModel>>,
     pub(super) downloads: BTreeMap<[u8; 32], Download>,
@@ -52,7 +52,7 @@ pub struct GuestSession {
     stalled: BTreeSet<BodyId>,
     users: BTreeMap<UserId, UserInfo>,
     links: BTreeMap<UserId, UserLinkInfo>,
-    pub(super) grabs: BTreeMap<u16, OwnGrab>,
+    pub(super) grabs: BTreeMap<u16, LocalGrab>,
     pub(super) next_grab: u16,
     pub(super) input: u32,
     out: VecDeque<Output>,
@@ -79,7 +79,7 @@ impl GuestSession {
         Ok(Self {
             config,
             link: Link::new(PeerId::HOST, Duration::ZERO, max_datagram),
-            standing: Standing::New,
+            standing: GuestStanding::New,
             newmark: Newmark::average(1.0 / 40.0),
             models: BTreeMap::new(),
             downloads: BTreeMap::new(),
@@ -114,11 +114,11 @@ impl GuestSession {
     /// # Errors
     /// Returns [`StreamError::State`] when the session was connected before.
     pub fn connect(&mut self, now: Duration) -> Result<(), StreamError> {
-        if self.standing != Standing::New {
+        if self.standing != GuestStanding::New {
             let (what, state) = ("connect", "not new");
             return Err(StreamError::State { what, state, needed: "a new session" });
         }
-        self.standing = Standing::Greeted;
+        self.standing = GuestStanding::Greeted;
         self.link.received_at(now);
         let hello = GuestMessage::Hello {
             version: PROTOCOL_VERSION,
@@ -137,7 +137,7 @@ impl GuestSession {
 
     /// Sends a goodbye message and closes the session.
     pub fn leave(&mut self) {
-        if self.standing != Standing::Closed {
+        if self.standing != GuestStanding::Closed {
             self.message(&GuestMessage::Goodbye { reason: DisconnectReason::Left });
             self.close(DisconnectReason::Left);
         }
@@ -146,14 +146,14 @@ impl GuestSession {
     /// The guest's user number, after the host has accepted the guest.
     pub fn user(&self) -> Option<UserId> {
         match self.standing {
-            Standing::In(user) => Some(user),
-            Standing::New | Standing::Greeted | Standing::Closed => None,
+            GuestStanding::In(user) => Some(user),
+            GuestStanding::New | GuestStanding::Greeted | GuestStanding::Closed => None,
         }
     }
 
     /// Returns whether the session is over.
     pub fn is_closed(&self) -> bool {
-        self.standing == Standing::Closed
+        self.standing == GuestStanding::Closed
     }
 
     /// Length of the host's step, s; 1/40 before the host's welcome.
@@ -238,7 +238,7 @@ impl GuestSession {
 
     /// Processes a received message. A message that breaks the protocol ends the session.
     pub fn on_message(&mut self, now: Duration, bytes: &[u8]) {
-        if self.standing == Standing::Closed {
+        if self.standing == GuestStanding::Closed {
             return;
         }
         self.link.receive_message(now, bytes.len());
@@ -247,18 +247,18 @@ impl GuestSession {
             return self.break_off(DisconnectReason::Protocol);
         };
         match (message, self.standing) {
-            (HostMessage::Welcome { version, user, step_ns, beta, gamma, users }, Standing::Greeted) => {
+            (HostMessage::Welcome { version, user, step_ns, beta, gamma, users }, GuestStanding::Greeted) => {
                 if version != PROTOCOL_VERSION {
                     return self.close(DisconnectReason::Version);
                 }
                 self.newmark = Newmark { h: step_ns as f64 * 1e-9, beta, gamma };
-                self.standing = Standing::In(UserId(user));
+                self.standing = GuestStanding::In(UserId(user));
                 self.users = users.into_iter().map(|info| (info.user, info)).collect();
                 self.next_ping = now;
                 self.event(GuestEvent::Welcomed { user: UserId(user) });
             }
             (HostMessage::Goodbye { reason }, _) => self.close(reason),
-            (message, Standing::In(_)) => self.in_session(now, message),
+            (message, GuestStanding::In(_)) => self.in_session(now, message),
             _ => self.break_off(DisconnectReason::Protocol),
         }
     }
@@ -359,7 +359,7 @@ impl GuestSession {
     /// all bodies together.
     pub fn update(&mut self, now: Duration) -> u64 {
         let Some(user) = self.user() else {
-            let waits = self.standing == Standing::Greeted;
+            let waits = self.standing == GuestStanding::Greeted;
             if waits && self.link.is_silent(now, self.config.idle_timeout) {
                 self.close(DisconnectReason::Silent);
             }
@@ -399,7 +399,7 @@ impl GuestSession {
     /// Latest time at which to call [`GuestSession::update`] if nothing happens before: the next
     /// tick of a body, a NACK to repeat, a target to send, a clock request or the idle timeout.
     pub fn next_wakeup(&self, now: Duration) -> Option<Duration> {
-        if matches!(self.standing, Standing::New | Standing::Closed) {
+        if matches!(self.standing, GuestStanding::New | GuestStanding::Closed) {
             return None;
         }
         let mut next = self.link.silent_at(self.config.idle_timeout);
@@ -462,8 +462,8 @@ impl GuestSession {
     }
 
     fn close(&mut self, reason: DisconnectReason) {
-        if self.standing != Standing::Closed {
-            self.standing = Standing::Closed;
+        if self.standing != GuestStanding::Closed {
+            self.standing = GuestStanding::Closed;
             self.grabs.clear();
             self.downloads.clear();
             self.event(GuestEvent::Closed { reason });

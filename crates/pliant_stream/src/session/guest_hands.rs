@@ -17,7 +17,7 @@ const TARGET_EVERY: Duration = Duration::from_millis(250);
 const TARGET_REPEATS: usize = 3;
 
 #[derive(Debug)]
-pub(super) struct OwnGrab {
+pub(super) struct LocalGrab {
     pub(super) body: BodyId,
     /// The recent targets, newest last, at most three.
     targets: VecDeque<TargetEntry>,
@@ -25,7 +25,7 @@ pub(super) struct OwnGrab {
     said: Duration,
 }
 
-impl OwnGrab {
+impl LocalGrab {
     /// Time at which the target is to be sent next; `None` without a target.
     pub(super) fn due(&self, now: Duration) -> Option<Duration> {
         let due = if self.fresh { now } else { self.said + TARGET_EVERY };
@@ -80,7 +80,7 @@ impl GuestSession {
         }
         let grab = self.next_grab;
         self.next_grab = grab.wrapping_add(1);
-        self.grabs.insert(grab, OwnGrab { body, targets: VecDeque::new(), fresh: false, said: now });
+        self.grabs.insert(grab, LocalGrab { body, targets: VecDeque::new(), fresh: false, said: now });
         if let Some(own) = self.bodies.get_mut(&body).and_then(|b| b.own.as_mut()) {
             own.begin(grab, vertex, radius, target, hold);
         }

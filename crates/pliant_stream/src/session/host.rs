@@ -7,7 +7,7 @@ use std::time::Duration;
 use pliant_modal::{ModalModel, StepSettings};
 
 use super::host_config::{HostConfig, HostEvent};
-use super::host_peer::{HeldGrab, MAX_GUEST_GRABS, Peer, Standing};
+use super::host_peer::{AnnouncedGrab, GuestPeer, MAX_GUEST_GRABS, Standing};
 use super::upload::Upload;
 use super::{DisconnectReason, LinkStats, MIN_DATAGRAM, Output};
 use crate::StreamError;
@@ -42,7 +42,7 @@ pub(super) struct HostBody {
 
 impl HostBody {
     /// Describes the body to a guest; `None` before the guest has sent its subscription.
-    pub(super) fn info(&self, guest: &Peer) -> Option<BodyInfo> {
+    pub(super) fn info(&self, guest: &GuestPeer) -> Option<BodyInfo> {
         Some(BodyInfo {
             body: self.id.0,
             name: self.name.clone(),
@@ -60,7 +60,7 @@ pub struct HostSession {
     pub(super) config: HostConfig,
     /// The user at the host, if there is one.
     host_user: Option<UserInfo>,
-    pub(super) peers: BTreeMap<PeerId, Peer>,
+    pub(super) peers: BTreeMap<PeerId, GuestPeer>,
     pub(super) bodies: BTreeMap<BodyId, HostBody>,
     pub(super) out: VecDeque<Output>,
     events: Events<HostEvent>,
@@ -127,7 +127,7 @@ impl HostSession {
         if self.peers.len() >= self.config.max_guests {
             return Err(StreamError::Full { what: "guests", limit: self.config.max_guests });
         }
-        self.peers.insert(peer, Peer::new(peer, now, max_datagram, self.config.model_rate));
+        self.peers.insert(peer, GuestPeer::new(peer, now, max_datagram, self.config.model_rate));
         Ok(())
     }
 
@@ -187,7 +187,7 @@ impl HostSession {
             });
         }
         self.admit(now, peer, before, role);
-        self.peers.get(&peer).and_then(Peer::user).ok_or(StreamError::UnknownPeer(peer))
+        self.peers.get(&peer).and_then(GuestPeer::user).ok_or(StreamError::UnknownPeer(peer))
     }
 
     /// Refuses a guest that has asked to join.
@@ -364,7 +364,7 @@ impl HostSession {
                     && p.grabs.len() < MAX_GUEST_GRABS
                     && !p.grabs.contains_key(&grab);
                 if fits {
-                    p.grabs.insert(grab, HeldGrab { body, input: None });
+                    p.grabs.insert(grab, AnnouncedGrab { body, input: None });
                     let key = GrabKey { user, grab };
                     self.event(HostEvent::GrabBegan { key, body, vertex, radius, target, hold });
                 } else {
@@ -462,7 +462,7 @@ impl HostSession {
             }
         };
         let user = UserId(number);
-        let users = self.host_user.clone().into_iter().chain(self.peers.values().filter_map(Peer::info));
+        let users = self.host_user.clone().into_iter().chain(self.peers.values().filter_map(GuestPeer::info));
         let users: Vec<UserInfo> = users.collect();
         let Some(p) = self.peers.get_mut(&peer) else { return };
         p.standing = Standing::Joined(user);
@@ -545,7 +545,7 @@ fn step_up(modes: u16) -> u16 {
 
 /// Returns the stream of a body that a guest receives: its subscription, reduced to what its path
 /// carries. The result is `None` when the guest takes nothing of the body.
-pub(super) fn stream_key(peer: &Peer, body: &HostBody) -> Option<StreamKey> {
+pub(super) fn stream_key(peer: &GuestPeer, body: &HostBody) -> Option<StreamKey> {
     let model_modes = body.model.mode_count();
     let mut subscription = peer.regulator.cut(peer.subscription?, model_modes);
     if let Some(&most) = peer.interest.get(&body.id) {

@@ -36,14 +36,14 @@ pub(crate) struct Transfer {
 
 /// A grab as the guest announced it.
 #[derive(Debug, Clone, Copy)]
-pub(crate) struct HeldGrab {
+pub(crate) struct AnnouncedGrab {
     pub(crate) body: BodyId,
     /// The newest input received.
     pub(crate) input: Option<u32>,
 }
 
 #[derive(Debug)]
-pub(crate) struct Peer {
+pub(crate) struct GuestPeer {
     pub(crate) id: PeerId,
     pub(crate) link: Link,
     pub(crate) standing: Standing,
@@ -61,7 +61,7 @@ pub(crate) struct Peer {
     /// Limits of the modes that are sent per body; 0 sends nothing. A body without an entry has no
     /// limit.
     pub(crate) interest: BTreeMap<BodyId, u16>,
-    pub(crate) grabs: BTreeMap<u16, HeldGrab>,
+    pub(crate) grabs: BTreeMap<u16, AnnouncedGrab>,
     pub(crate) resends: VecDeque<(Duration, BodyId, Tick)>,
     pub(crate) model_budget: Budget,
     /// Bytes of messages that the transport has accepted and not sent, as last reported.
@@ -76,7 +76,7 @@ pub(crate) struct Peer {
     pub(crate) regulator: Regulator,
 }
 
-impl Peer {
+impl GuestPeer {
     pub(crate) fn new(id: PeerId, now: Duration, max_datagram: usize, model_rate: f64) -> Self {
         Self {
             id,

@@ -29,7 +29,7 @@ const VOTES: u32 = 4;
 const LEARN: f64 = 0.25;
 
 #[derive(Debug)]
-struct OwnGrab {
+struct PredictedGrab {
     grab: u16,
     vertex: u32,
     radius: f64,
@@ -52,7 +52,7 @@ struct OwnGrab {
 #[derive(Debug)]
 pub struct PredictedHand {
     replica: Replica,
-    grabs: Vec<OwnGrab>,
+    grabs: Vec<PredictedGrab>,
     lead: usize,
     votes: u32,
     tick: Tick,
@@ -143,7 +143,7 @@ impl PredictedHand {
 
     pub(crate) fn begin(&mut self, grab: u16, vertex: u32, radius: f64, target: [f64; 3], hold: GrabConfig) {
         self.grabs.retain(|g| g.grab != grab);
-        self.grabs.push(OwnGrab {
+        self.grabs.push(PredictedGrab {
             grab,
             vertex,
             // The host's frames carry the radius in single precision.

@@ -5,7 +5,7 @@ use std::time::Duration;
 
 use super::DisconnectReason;
 use super::host::{HostBody, HostSession, StreamKey, stream_key};
-use super::host_peer::Peer;
+use super::host_peer::GuestPeer;
 use crate::StreamError;
 use crate::codec::encoder::{Encoded, Encoder};
 use crate::codec::quantization::Quanta;
@@ -47,7 +47,7 @@ impl HostSession {
         let hash = entry.hash;
         // A snapshot is due for guests that wait for the state and have the model. A guest that is
         // still downloading the model waits, without cost to the others.
-        let is_due = |p: &Peer| p.due.contains(&body) && !p.transfers.iter().any(|t| t.hash == hash);
+        let is_due = |p: &GuestPeer| p.due.contains(&body) && !p.transfers.iter().any(|t| t.hash == hash);
         let reminds = stays && now.saturating_sub(entry.reminded) >= REMINDER;
         if reminds {
             entry.reminded = now;

@@ -7,7 +7,7 @@ use std::time::Duration;
 use super::Output;
 use super::host::HostSession;
 use super::host_config::HostConfig;
-use super::host_peer::Peer;
+use super::host_peer::GuestPeer;
 use crate::StreamError;
 use crate::link::Budget;
 use crate::state::PeerId;
@@ -44,14 +44,14 @@ impl Upload {
 
     /// Time at which the next piece for a guest can be sent; `None` when it waits for the transport
     /// or has no transfer.
-    pub(super) fn ready_at(&self, peer: &Peer) -> Option<Duration> {
+    pub(super) fn ready_at(&self, peer: &GuestPeer) -> Option<Duration> {
         let next = next_piece(peer)? as f64;
         Some(peer.model_budget.ready_at(next).max(self.budget.ready_at(next)))
     }
 }
 
 /// Size of the next piece for a guest, bytes, if the transport has room.
-fn next_piece(peer: &Peer) -> Option<usize> {
+fn next_piece(peer: &GuestPeer) -> Option<usize> {
     let transfer = peer.transfers.front()?;
     (peer.unsent < MOST_UNSENT).then(|| (transfer.bytes.len() - transfer.offset).min(CHUNK))
 }
@@ -109,7 +109,7 @@ impl HostSession {
     }
 }
 
-impl Peer {
+impl GuestPeer {
     fn send_piece(&mut self, bytes: usize, out: &mut VecDeque<Output>) {
         let Some(t) = self.transfers.front_mut() else { return };
         let (begin, end) = (t.offset, t.offset + bytes);

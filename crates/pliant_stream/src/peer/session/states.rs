@@ -5,7 +5,7 @@ use std::time::Duration;
 use super::{CHECK_TOLERANCE, MAX_OUT, PeerSession};
 use crate::peer::config::PeerEvent;
 use crate::peer::inputs::WINDOW;
-use crate::peer::other::Other;
+use crate::peer::other::RemotePeer;
 use crate::peer::wire::{InputTick, PeerBodyState, PeerMessage, StateCheck};
 use crate::state::{BodyId, PeerId, Tick, UserId};
 
@@ -46,7 +46,7 @@ impl PeerSession {
             self.next_step = Some(now + Duration::from_secs_f64(self.config.step));
             self.event(PeerEvent::Started);
         }
-        self.others.values_mut().for_each(Other::agreed);
+        self.others.values_mut().for_each(RemotePeer::agreed);
     }
 
     /// Only checks of peers with a lower number count.
