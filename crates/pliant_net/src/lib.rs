@@ -62,10 +62,12 @@ mod phase;
 mod plugin;
 mod recording;
 mod remote;
+mod roster;
 mod session_transform;
 mod shared_body;
 pub mod transport;
 mod user;
+mod view;
 
 pub use metrics::{
     DROPPED, JITTER, LOSS_IN, LOSS_OUT, NACKS, NetStats, QUEUE, RATE_IN, RATE_OUT, RECOVERED, ROUND_TRIP,

@@ -5,13 +5,13 @@ use std::sync::Arc;
 use bevy::prelude::*;
 use pliant_body::{Driven, ModalAsset, ModalBody};
 use pliant_modal::ModalModel;
-use pliant_stream::{BodyId, BodyView, Placement, Pose, StepSettings};
+use pliant_stream::{BodyId, Placement, StepSettings};
 
-use super::{Interest, NetGuest, shown_of};
-use crate::phase::Phase;
+use super::{Interest, NetGuest};
 use crate::remote::{BodyArrived, BodyLeft, RemoteBody, RemoteHands};
 use crate::session_transform::transform_of;
 use crate::shared_body::SharedBody;
+use crate::view::BodyDisplay;
 
 /// A body of the host and its last displayed states.
 pub(super) struct FollowedBody {
@@ -20,12 +20,7 @@ pub(super) struct FollowedBody {
     /// the host's transform.
     made_here: bool,
     pub(super) name: String,
-    pub(super) phase: Phase,
-    pub(super) tick: u64,
-    pub(super) previous: (Vec<f64>, Option<Pose>),
-    pub(super) current: (Vec<f64>, Option<Pose>),
-    /// Whether the newest state is displayed and no newer one has arrived.
-    pub(super) settled: bool,
+    pub(super) display: BodyDisplay,
     /// Largest size of the state so far, the scale of the visual state's offset.
     pub(super) peak: f64,
 }
@@ -105,11 +100,7 @@ impl NetGuest {
                 entity,
                 made_here,
                 name: name.clone(),
-                phase: Phase::default(),
-                tick: 0,
-                previous: (Vec::new(), None),
-                current: (Vec::new(), None),
-                settled: false,
+                display: BodyDisplay::default(),
                 peak: 0.0,
             },
         );
@@ -160,43 +151,6 @@ impl NetGuest {
             entity.remove::<(RemoteBody, RemoteHands)>();
         }
         world.write_message(BodyLeft { entity: followed.entity, name: followed.name });
-    }
-}
-
-impl FollowedBody {
-    /// Takes over the state that the session displays.
-    pub(super) fn take(&mut self, view: &BodyView) {
-        // The predicted copy steps together with the confirmed one, whose ticks determine the time.
-        let Some((_, shown)) = shown_of(view) else { return };
-        let tick = view.tick();
-        let first = self.current.0.len() != shown.modes();
-        if tick == self.tick && !first {
-            // A snapshot may have moved the state of this tick, but the blend begins at the
-            // displayed state.
-            return;
-        }
-        self.tick = tick;
-        self.settled = false;
-        std::mem::swap(&mut self.previous, &mut self.current);
-        self.current.0.clone_from(&shown.q);
-        self.current.1 = match view.predicted_hand() {
-            Some(own) => own.pose(),
-            None => view.pose(),
-        };
-        if first {
-            self.previous = self.current.clone();
-        }
-        self.peak = self.peak.max(shown.q.iter().map(|q| q * q).sum::<f64>().sqrt());
-    }
-
-    /// Interpolates the last two states, for a display with this number of modes. Modes that the
-    /// stream does not carry are at rest.
-    pub(super) fn between(&self, fraction: f64, modes: usize, out: &mut Vec<f64>) {
-        out.clear();
-        out.extend(
-            self.previous.0.iter().zip(&self.current.0).map(|(from, to)| from + (to - from) * fraction),
-        );
-        out.resize(modes, 0.0);
     }
 }
 

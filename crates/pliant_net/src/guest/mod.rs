@@ -20,6 +20,7 @@ use pliant_stream::{BodyId, BodyView, GuestSession, LinkStats, PeerId, RecoveryC
 
 use crate::metrics::{Ledger, NetStats};
 use crate::remote::RemoteBody;
+use crate::roster::Roster;
 use crate::transport::{Emulation, Endpoint, JoinOptions, Role};
 use bodies::FollowedBody;
 use hands::SentGrab;
@@ -117,7 +118,7 @@ pub struct NetGuest {
     bodies: BTreeMap<BodyId, FollowedBody>,
     /// Bodies of a lost session, which the next session may have again.
     orphans: Vec<FollowedBody>,
-    users: BTreeMap<UserId, Entity>,
+    users: Roster,
     grabs: BTreeMap<Entity, SentGrab>,
     /// Time up to which the session has been updated.
     advanced: Duration,
@@ -154,7 +155,7 @@ impl NetGuest {
             session: None,
             bodies: BTreeMap::new(),
             orphans: Vec::new(),
-            users: BTreeMap::new(),
+            users: Roster::default(),
             grabs: BTreeMap::new(),
             advanced: Duration::ZERO,
             leaving: false,

@@ -7,13 +7,13 @@ use bevy::prelude::*;
 use bevy::tasks::{AsyncComputeTaskPool, block_on, poll_once};
 use pliant_body::ModalAsset;
 use pliant_modal::ModalModel;
-use pliant_stream::{DisconnectReason, GuestEvent, GuestSession, StreamError, UserId, UserInfo};
+use pliant_stream::{DisconnectReason, GuestEvent, GuestSession, StreamError, UserId};
 
 use super::source::Came;
 use super::{GuestState, NetGuest};
 use crate::remote::{GrabRefused, SessionClosed, SessionJoined, SessionLost};
 use crate::transport::CloseReason;
-use crate::user::{User, UserJoined, UserLeft, UserLink, Yourself, shortened};
+use crate::user::shortened;
 
 /// When the guest tries to join again.
 #[derive(Debug, Default)]
@@ -203,9 +203,7 @@ impl NetGuest {
     fn leave_session(&mut self, world: &mut World) {
         self.grabs.clear();
         self.orphan_bodies(world);
-        for (_, entity) in std::mem::take(&mut self.users) {
-            world.try_despawn(entity).ok();
-        }
+        self.users.clear(world);
     }
 
     fn close(&mut self, world: &mut World, reason: String) {
@@ -233,17 +231,10 @@ impl NetGuest {
                     debug!("body {body} stands still: nothing comes from the host")
                 }
                 GuestEvent::UserJoined(info) => {
-                    let id = info.user;
-                    let (entity, name) = self.meet(world, &info);
-                    world.write_message(UserJoined { entity, id, name, back: false });
+                    self.users.join(world, info.user, &info.name, info.role, false);
                 }
                 GuestEvent::UserLeft { user } => {
-                    if let Some(entity) = self.users.remove(&user) {
-                        let name =
-                            world.get::<User>(entity).map(|user| user.name.clone()).unwrap_or_default();
-                        world.try_despawn(entity).ok();
-                        world.write_message(UserLeft { id: user, name, reason: "left".into() });
-                    }
+                    self.users.leave(world, user, DisconnectReason::Left.to_string());
                 }
                 GuestEvent::GrabRefused { grab } => {
                     let refused = self.grabs.iter_mut().find(|(_, sent)| sent.number == Some(grab));
@@ -265,30 +256,18 @@ impl NetGuest {
         }
     }
 
-    fn meet(&mut self, world: &mut World, info: &UserInfo) -> (Entity, String) {
-        let user = User::new(info.user, &info.name, info.role);
-        let name = user.name.clone();
-        let entity = world.spawn((user, UserLink::default())).id();
-        if let Some(old) = self.users.insert(info.user, entity) {
-            world.try_despawn(old).ok();
-        }
-        (entity, name)
-    }
-
     fn welcomed(&mut self, world: &mut World, user: UserId) {
         let again = std::mem::replace(&mut self.retry, Retry { was_in: true, ..Retry::default() }).was_in;
         if again {
             self.retry.orphans_until = Some(self.now() + ORPHANS);
         }
         self.state = GuestState::In { user };
-        let own = UserInfo { user, role: self.role, name: shortened(&self.config.name).to_owned() };
-        let (entity, name) = self.meet(world, &own);
-        world.entity_mut(entity).insert(Yourself);
+        let name = shortened(&self.config.name);
+        self.users.meet_yourself(world, user, name, self.role);
         info!("in the session as {name}, user {}", user.0);
-        let others = self.session.iter().flat_map(|session| session.users().cloned());
-        let others: Vec<UserInfo> = others.filter(|info| info.user != user).collect();
-        for info in &others {
-            self.meet(world, info);
+        let others = self.session.iter().flat_map(|session| session.users());
+        for info in others.filter(|info| info.user != user) {
+            self.users.meet(world, info.user, &info.name, info.role);
         }
         world.write_message(SessionJoined { user, again });
     }

@@ -1,30 +1,18 @@
 //! Writes the displayed state of the session to the bodies and the forces to the hands.
 
 use bevy::prelude::*;
-use pliant_body::{BodyState, GrabForce, VisualState};
+use pliant_body::GrabForce;
 use pliant_stream::GrabKey;
 
-use super::NetGuest;
-use crate::remote::{RemoteHand, RemoteHands};
-use crate::session_transform::{SessionTransform, set_pose};
+use super::{NetGuest, shown_of};
+use crate::session_transform::SessionTransform;
 use crate::user::UserLink;
-
-type FollowedBodies<'w, 's> = Query<
-    'w,
-    's,
-    (
-        &'static BodyState,
-        &'static mut VisualState,
-        &'static mut RemoteHands,
-        &'static mut Transform,
-        &'static GlobalTransform,
-    ),
->;
+use crate::view::{DisplayedBodies, remote_hands};
 
 /// `PostUpdate`: brings the session to the current time and writes what it displays.
 pub(crate) fn show(
     guest: Option<ResMut<NetGuest>>,
-    mut bodies: FollowedBodies,
+    mut bodies: DisplayedBodies,
     mut forces: Query<&mut GrabForce>,
     mut links: Query<&mut UserLink>,
 ) {
@@ -44,32 +32,20 @@ pub(crate) fn show(
     let step = session.step();
     for (&id, followed) in &mut guest.bodies {
         let Some(view) = session.body(id) else { continue };
-        let Ok((state, mut shown, mut seen, mut transform, global)) = bodies.get_mut(followed.entity) else {
+        let Ok((state, mut visual, mut hands, mut transform, global)) = bodies.get_mut(followed.entity)
+        else {
             continue;
         };
-        followed.take(view);
-        let fraction =
-            if view.is_resting() { 1.0 } else { followed.phase.fraction(followed.tick, step, now) };
-        if !followed.settled {
-            followed.settled = fraction >= 1.0;
-            followed.between(fraction, shown.q().len(), &mut guest.scratch);
-            if let Err(error) = shown.snap(&guest.scratch) {
-                debug!("a state of {} was not shown: {error}", followed.name);
-            }
-            if let (Some(from), Some(to)) = (followed.previous.1, followed.current.1) {
-                set_pose(&mut transform, &from, &to, fraction, state.scale());
-            }
+        // The predicted copy steps together with the confirmed one, whose ticks determine the time.
+        if let Some((_, shown)) = shown_of(view) {
+            let pose = view.predicted_hand().map_or_else(|| view.pose(), |own| own.pose());
+            followed.peak = followed.peak.max(shown.q.iter().map(|q| q * q).sum::<f64>().sqrt());
+            followed.display.take(view.tick(), &shown.q, pose);
         }
+        let at = (step, now, view.is_resting());
+        followed.display.write(at, state, &mut visual, &mut transform, &mut guest.scratch);
         let Some(place) = SessionTransform::of_body(global, state) else { continue };
-        let pose = followed.current.1;
-        let hand = |grab: &pliant_stream::GrabState| RemoteHand {
-            user: grab.key.user,
-            vertex: grab.vertex,
-            target: place.point_to_world(grab.target),
-            reaction: place.force_to_world(grab.reaction),
-        };
-        let others = view.grabs().iter().filter(|grab| Some(grab.key.user) != user).map(hand);
-        seen.set_if_neq(RemoteHands(others.collect()));
+        hands.set_if_neq(remote_hands(view.grabs(), user, &place));
         for (&entity, sent) in guest.grabs.iter().filter(|(_, sent)| sent.body == id) {
             let Ok(mut force) = forces.get_mut(entity) else { continue };
             let felt = sent.number.zip(user).and_then(|(grab, user)| {
@@ -79,23 +55,20 @@ pub(crate) fn show(
                     Some(own) => own.reaction(grab).or_else(confirmed)?,
                     None => confirmed()?,
                 };
-                let body_point = sent.point.as_ref()?.at(shown.q(), state.warps());
-                Some(GrabForce {
-                    force: place.force_to_world(reaction).clamp_length_max(most_force),
-                    point: place.body_point_to_world(pose, body_point),
-                })
+                let felt = followed.display.force(reaction, sent.point.as_ref()?, &place, state, &visual);
+                Some(GrabForce { force: felt.force.clamp_length_max(most_force), ..felt })
             });
             force.set_if_neq(felt.unwrap_or_default());
         }
     }
     let link = session.stats();
-    let own = user.and_then(|user| guest.users.get(&user).copied());
+    let own = user.and_then(|user| guest.users.get(user));
     if let Some(mut shown) = own.and_then(|own| links.get_mut(own).ok()) {
         let new = UserLink { round_trip: link.round_trip, loss_in: link.loss_in, loss_out: link.loss_out };
         shown.set_if_neq(new);
     }
     for link in session.links().filter(|link| Some(link.user) != user) {
-        let other = guest.users.get(&link.user).and_then(|&other| links.get_mut(other).ok());
+        let other = guest.users.get(link.user).and_then(|other| links.get_mut(other).ok());
         if let Some(mut shown) = other {
             shown.set_if_neq(UserLink::of(link));
         }

@@ -9,7 +9,6 @@ use pliant_stream::{DisconnectReason, GrabKey, HostEvent, PeerId, UserId};
 use super::hands::GuestGrab;
 use super::{KnownUser, NetHost};
 use crate::transport::{Event, Fingerprint, Role};
-use crate::user::{User, UserJoined, UserLeft, UserLink};
 
 /// A guest's connection.
 #[derive(Debug)]
@@ -110,7 +109,7 @@ impl NetHost {
         for _ in 0..=u16::MAX {
             self.next_user = self.next_user.wrapping_add(1);
             let number = UserId(self.next_user);
-            if number != UserId::HOST && !had.contains(&number) && !self.numbers.contains_key(&number) {
+            if number != UserId::HOST && !had.contains(&number) && self.users.get(number).is_none() {
                 return Some(number);
             }
         }
@@ -120,19 +119,13 @@ impl NetHost {
     fn joined(&mut self, world: &mut World, peer: PeerId, id: UserId, name: &str) {
         let now = self.now();
         let Some(guest) = self.guests.get_mut(&peer) else { return };
-        let user = User::new(id, name, guest.role);
-        let name = user.name.clone();
         let before = self.known.insert(guest.key, KnownUser { user: id, seen: now });
         let back = before.is_some_and(|before| before.user == id);
-        let entity = world.spawn((user, UserLink::default())).id();
-        guest.entity = Some(entity);
-        self.numbers.insert(id, entity);
+        guest.entity = Some(self.users.join(world, id, name, guest.role, back));
         while self.known.len() > MOST_KNOWN {
             let oldest = self.known.iter().min_by_key(|(_, known)| known.seen).map(|(&key, _)| key);
             oldest.and_then(|key| self.known.remove(&key));
         }
-        info!("{name} {}", if back { "is back" } else { "has joined" });
-        world.write_message(UserJoined { entity, id, name, back });
     }
 
     fn apply(&mut self, world: &mut World, event: HostEvent) {
@@ -144,13 +137,9 @@ impl NetHost {
                 // sent first.
                 self.flush();
                 self.endpoint.close(peer, reason, &reason.to_string());
-                let entity = self.guests.get_mut(&peer).and_then(|guest| guest.entity.take());
-                if let (Some(entity), Some(id)) = (entity, user) {
-                    self.numbers.remove(&id);
-                    let name = world.get::<User>(entity).map(|user| user.name.clone()).unwrap_or_default();
-                    info!("{name} is gone: {reason}");
-                    world.try_despawn(entity).ok();
-                    world.write_message(UserLeft { id, name, reason: reason.to_string() });
+                let inside = self.guests.get_mut(&peer).and_then(|guest| guest.entity.take()).is_some();
+                if let Some(id) = user.filter(|_| inside) {
+                    self.users.leave(world, id, reason.to_string());
                 }
             }
             HostEvent::GrabBegan { key, body, vertex, radius, target, hold } => {

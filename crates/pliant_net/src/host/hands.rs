@@ -72,7 +72,7 @@ impl NetHost {
         hold: GrabConfig,
     ) -> Result<(), &'static str> {
         let entity = self.entity_of(body).ok_or("no such body")?;
-        let user = *self.numbers.get(&key.user).ok_or("no such user")?;
+        let user = self.users.get(key.user).ok_or("no such user")?;
         let of_user = self.guests.iter().find(|(_, guest)| guest.entity == Some(user));
         let peer = *of_user.ok_or("no such user")?.0;
         let target = self.target_in_world(world, body, target).ok_or("no place for its target")?;

@@ -17,10 +17,11 @@ use pliant_modal::ModalModel;
 use pliant_stream::{Channel, DisconnectReason, GrabKey, GrabState, HostSession, LinkStats, PeerId, UserId};
 
 use crate::metrics::{Ledger, NetStats};
+use crate::roster::Roster;
 use crate::transport::{
     Access, Emulation, Endpoint, Fingerprint, HostOptions, Invite, PeerStats, Role, SendError,
 };
-use crate::user::{User, Yourself, shortened};
+use crate::user::shortened;
 use guests::Guest;
 use publish::HostedBody;
 
@@ -86,7 +87,7 @@ pub struct NetHost {
     guests: BTreeMap<PeerId, Guest>,
     /// User numbers by key, so that a guest that joins again keeps its number.
     known: BTreeMap<Fingerprint, KnownUser>,
-    numbers: BTreeMap<UserId, Entity>,
+    users: Roster,
     /// The number that was assigned last.
     next_user: u16,
     grabs: BTreeMap<GrabKey, Entity>,
@@ -123,7 +124,8 @@ impl NetHost {
         info!("hosting at {}:{} with key {}", invite.host, invite.port, invite.fingerprint);
         let name = shortened(&config.name);
         session.set_host_user(name)?;
-        let you = world.spawn((User::new(UserId::HOST, name, Role::Hold), Yourself)).id();
+        let mut users = Roster::default();
+        users.meet_yourself(world, UserId::HOST, name, Role::Hold);
         let reach = if config.reach.is_finite() { config.reach.clamp(0.0, 1e3) } else { 4.0 };
         world.insert_resource(Self {
             endpoint,
@@ -138,7 +140,7 @@ impl NetHost {
             guests: BTreeMap::new(),
             known: guests::known_before(&config.known),
             next_user: 0,
-            numbers: BTreeMap::from([(UserId::HOST, you)]),
+            users,
             grabs: BTreeMap::new(),
             own_grabs: BTreeMap::new(),
             next_own_grab: 0,

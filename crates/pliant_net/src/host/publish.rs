@@ -235,8 +235,8 @@ pub(crate) fn finish(host: Option<ResMut<NetHost>>, mut links: Query<(&User, &mu
     // The interval grows with the number of users, so that a guest receives at most 256 bytes of
     // this per second.
     let now = host.now();
-    let pause = Duration::from_secs(1).mul_f64((host.numbers.len() as f64 / 32.0).max(1.0));
-    if now.saturating_sub(host.links_sent) >= pause && host.numbers.len() > 2 {
+    let pause = Duration::from_secs(1).mul_f64((host.users.len() as f64 / 32.0).max(1.0));
+    if now.saturating_sub(host.links_sent) >= pause && host.users.len() > 2 {
         host.links_sent = now;
         let all = inside().filter_map(|(_, entity)| links.get(entity).ok());
         let all = all

@@ -12,7 +12,7 @@ use super::message::{MOST_PEERS, MeshMessage, PeerScene};
 use super::{NetPeer, PeerState};
 use crate::remote::{SessionClosed, SessionJoined};
 use crate::transport::{CloseReason, Endpoint, Event, Fingerprint, Invite, Role};
-use crate::user::{User, UserJoined, UserLeft, UserLink};
+use crate::user::UserLink;
 
 /// Most keys whose user numbers are remembered.
 const MOST_REMEMBERED: usize = 4096;
@@ -346,21 +346,12 @@ impl NetPeer {
                 }
                 PeerEvent::Joined { user, name } => {
                     self.found(user);
-                    let joined = User::new(user, &name, Role::Hold);
-                    let name = joined.name.clone();
-                    info!("{name} is here");
-                    let entity = world.spawn((joined, UserLink::default())).id();
-                    if let Some(old) = self.users.insert(user, entity) {
-                        world.try_despawn(old).ok();
-                    }
-                    world.write_message(UserJoined { entity, id: user, name, back: false });
+                    self.users.join(world, user, &name, Role::Hold, false);
                 }
                 PeerEvent::Left { user, reason } => {
-                    let Some(entity) = self.users.remove(&user) else { continue };
-                    let name = world.get::<User>(entity).map(|user| user.name.clone()).unwrap_or_default();
-                    info!("{name} is gone: {reason}");
-                    world.try_despawn(entity).ok();
-                    world.write_message(UserLeft { id: user, name, reason: reason.to_string() });
+                    if !self.users.leave(world, user, reason.to_string()) {
+                        continue;
+                    }
                     let gone: Vec<PeerId> = self
                         .others
                         .iter()
@@ -391,7 +382,7 @@ impl NetPeer {
         // QUIC measures the round trip and the outgoing loss of each link.
         for (&peer, other) in &self.others {
             let (endpoint, number) = self.way(peer);
-            let entity = other.number.and_then(|user| self.users.get(&user).copied());
+            let entity = other.number.and_then(|user| self.users.get(user));
             let (Some(stats), Some(entity)) = (endpoint.stats(number), entity) else { continue };
             if let Some(mut link) = world.get_mut::<UserLink>(entity) {
                 let (round_trip, loss_out) = (stats.round_trip, stats.loss());

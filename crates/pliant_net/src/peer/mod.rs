@@ -20,12 +20,13 @@ use pliant_stream::peer::{PeerConfig as SessionConfig, PeerSession, Repair};
 use pliant_stream::{BodyId, LinkStats, PeerId, UserId};
 
 use crate::metrics::{Ledger, NetStats};
+use crate::roster::Roster;
 use crate::shared_body::SharedBody;
 use crate::transport::{
     Emulation, Endpoint, Fingerprint, HostOptions, Identity, Invite, JoinOptions, Limits, PeerStats, Role,
     TransportError,
 };
-use crate::user::{User, UserLink, Yourself, shortened};
+use crate::user::shortened;
 use mesh::ConnectedPeer;
 use message::PeerScene;
 use play::{PeerGrab, PlayedBody};
@@ -115,7 +116,7 @@ pub struct NetPeer {
     missed: Vec<Missed>,
     /// User numbers by key, so that a peer that reconnects keeps its number.
     numbers: BTreeMap<Fingerprint, UserId>,
-    users: BTreeMap<UserId, Entity>,
+    users: Roster,
     grabs: BTreeMap<Entity, PeerGrab>,
     scratch: Vec<f64>,
     ledger: Ledger,
@@ -154,7 +155,7 @@ impl NetPeer {
             introduced: BTreeMap::new(),
             missed: Vec::new(),
             numbers: BTreeMap::new(),
-            users: BTreeMap::new(),
+            users: Roster::default(),
             grabs: BTreeMap::new(),
             scratch: Vec::new(),
             ledger: Ledger::default(),
@@ -289,10 +290,9 @@ impl NetPeer {
         }
         self.remember(self.listening.fingerprint(), user);
         self.state = PeerState::In { user };
-        let you = User::new(user, shortened(&self.config.name), Role::Hold);
-        info!("among the peers as {}, user {}", you.name, user.0);
-        let you = world.spawn((you, UserLink::default(), Yourself)).id();
-        self.users.insert(user, you);
+        let name = shortened(&self.config.name);
+        info!("among the peers as {name}, user {}", user.0);
+        self.users.meet_yourself(world, user, name, Role::Hold);
         true
     }
 

@@ -4,25 +4,21 @@ use std::sync::Arc;
 
 use bevy::math::{DQuat, DVec3};
 use bevy::prelude::*;
-use pliant_body::{BodyState, Grab, GrabForce, GrabOf, VisualState};
+use pliant_body::{BodyState, Grab, GrabForce, GrabOf};
 use pliant_modal::{Body, GrabConfig, ModalModel};
-use pliant_stream::{BodyId, GrabKey, Pose, StepSettings, UserId};
+use pliant_stream::{BodyId, GrabKey, StepSettings};
 
 use super::{NetPeer, PeerState};
 use crate::patch_kinematics::{PatchPoint, hold_of, holds_so};
-use crate::phase::Phase;
-use crate::remote::{RemoteHand, RemoteHands};
-use crate::session_transform::{SessionTransform, set_pose};
+use crate::session_transform::SessionTransform;
+use crate::view::{BodyDisplay, DisplayedBodies, remote_hands};
 
 /// A body of the peers and its displayed states.
 pub(super) struct PlayedBody {
     pub(super) entity: Entity,
     pub(super) model: Arc<ModalModel>,
     pub(super) settings: StepSettings,
-    phase: Phase,
-    tick: u64,
-    previous: (Vec<f64>, Option<Pose>),
-    current: (Vec<f64>, Option<Pose>),
+    display: BodyDisplay,
 }
 
 impl PlayedBody {
@@ -32,15 +28,7 @@ impl PlayedBody {
     }
 
     pub(super) fn new(entity: Entity, model: Arc<ModalModel>, settings: StepSettings) -> Self {
-        Self {
-            entity,
-            model,
-            settings,
-            phase: Phase::default(),
-            tick: 0,
-            previous: (Vec::new(), None),
-            current: (Vec::new(), None),
-        }
+        Self { entity, model, settings, display: BodyDisplay::default() }
     }
 }
 
@@ -121,7 +109,7 @@ pub(crate) fn tell_hands(
 /// `PostUpdate`: brings the session to the current time and writes what it displays.
 pub(crate) fn show(
     net: Option<ResMut<NetPeer>>,
-    mut bodies: Query<(&BodyState, &mut VisualState, &mut RemoteHands, &mut Transform, &GlobalTransform)>,
+    mut bodies: DisplayedBodies,
     mut forces: Query<&mut GrabForce>,
 ) {
     let Some(mut net) = net else { return };
@@ -133,57 +121,22 @@ pub(crate) fn show(
     let step = std::time::Duration::from_nanos(net.scene.step_ns).as_secs_f64();
     for (&id, played) in &mut net.bodies {
         let Some(view) = session.body(id) else { continue };
-        let Ok((state, mut shown, mut seen, mut place, transform)) = bodies.get_mut(played.entity) else {
+        let Ok((state, mut visual, mut hands, mut transform, global)) = bodies.get_mut(played.entity) else {
             continue;
         };
-        let first = played.current.0.len() != view.visual().modes();
-        if view.tick() != played.tick || first {
-            played.tick = view.tick();
-            std::mem::swap(&mut played.previous, &mut played.current);
-            played.current.0.clone_from(&view.visual().q);
-            played.current.1 = view.pose();
-            if first {
-                played.previous.clone_from(&played.current);
-            }
-        }
-        let fraction = played.phase.fraction(played.tick, step, now);
-        net.scratch.clear();
-        let ends = played.previous.0.iter().zip(&played.current.0);
-        net.scratch.extend(ends.map(|(from, to)| from + (to - from) * fraction));
-        net.scratch.resize(shown.q().len(), 0.0);
-        if let (Some(from), Some(to)) = (played.previous.1, played.current.1) {
-            set_pose(&mut place, &from, &to, fraction, state.scale());
-        }
-        if net.scratch != shown.q()
-            && let Err(error) = shown.snap(&net.scratch)
-        {
-            debug!("a state was not shown: {error}");
-        }
-        let Some(place) = SessionTransform::of_body(transform, state) else { continue };
-        let hand = |grab: &pliant_stream::GrabState| RemoteHand {
-            user: grab.key.user,
-            vertex: grab.vertex,
-            target: place.point_to_world(grab.target),
-            reaction: place.force_to_world(grab.reaction),
-        };
-        let others = view.grabs().iter().filter(|grab| grab.key.user != user).map(hand);
-        seen.set_if_neq(RemoteHands(others.collect()));
+        played.display.take(view.tick(), &view.visual().q, view.pose());
+        played.display.write((step, now, false), state, &mut visual, &mut transform, &mut net.scratch);
+        let Some(place) = SessionTransform::of_body(global, state) else { continue };
+        hands.set_if_neq(remote_hands(view.grabs(), Some(user), &place));
         for (&entity, said) in net.grabs.iter().filter(|(_, said)| said.body == id) {
             let Ok(mut force) = forces.get_mut(entity) else { continue };
-            let felt = said.number.and_then(|grab| felt(view.grabs(), user, grab)).and_then(|reaction| {
-                let point = said.point.as_ref()?.at(shown.q(), state.warps());
-                Some(GrabForce {
-                    force: place.force_to_world(reaction),
-                    point: place.body_point_to_world(played.current.1, point),
-                })
+            let felt = said.number.and_then(|grab| {
+                let key = GrabKey { user, grab };
+                let reaction = view.grabs().iter().find(|grab| grab.key == key)?.reaction;
+                Some(played.display.force(reaction, said.point.as_ref()?, &place, state, &visual))
             });
             force.set_if_neq(felt.unwrap_or_default());
         }
     }
     net.flush();
-}
-
-fn felt(grabs: &[pliant_stream::GrabState], user: UserId, grab: u16) -> Option<[f64; 3]> {
-    let key = GrabKey { user, grab };
-    Some(grabs.iter().find(|grab| grab.key == key)?.reaction)
 }

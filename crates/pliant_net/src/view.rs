@@ -1,0 +1,119 @@
+//! Display of bodies that a session steps, alike on a guest and a peer.
+
+use std::time::Duration;
+
+use bevy::prelude::*;
+use pliant_body::{BodyState, GrabForce, VisualState};
+use pliant_stream::{GrabState, Pose, UserId};
+
+use crate::patch_kinematics::PatchPoint;
+use crate::phase::Phase;
+use crate::remote::{RemoteHand, RemoteHands};
+use crate::session_transform::{SessionTransform, set_pose};
+
+/// What is written of a body that a session steps.
+pub(crate) type DisplayedBodies<'w, 's> = Query<
+    'w,
+    's,
+    (
+        &'static BodyState,
+        &'static mut VisualState,
+        &'static mut RemoteHands,
+        &'static mut Transform,
+        &'static GlobalTransform,
+    ),
+>;
+
+/// The last two states of a body, between which it is displayed.
+#[derive(Debug, Default)]
+pub(crate) struct BodyDisplay {
+    phase: Phase,
+    tick: u64,
+    previous: (Vec<f64>, Option<Pose>),
+    current: (Vec<f64>, Option<Pose>),
+    /// Whether the newest state is displayed and no newer one has arrived.
+    settled: bool,
+}
+
+impl BodyDisplay {
+    /// Takes over the state of a tick.
+    pub(crate) fn take(&mut self, tick: u64, q: &[f64], pose: Option<Pose>) {
+        let first = self.current.0.len() != q.len();
+        if tick == self.tick && !first {
+            // A correction may have moved the state of this tick, but the display goes on from the
+            // state that it has.
+            return;
+        }
+        self.tick = tick;
+        self.settled = false;
+        std::mem::swap(&mut self.previous, &mut self.current);
+        self.current.0.clear();
+        self.current.0.extend_from_slice(q);
+        self.current.1 = pose;
+        if first {
+            self.previous.clone_from(&self.current);
+        }
+    }
+
+    /// Writes the state of the time `now` between the two ticks, which are `step` seconds apart.
+    /// Modes that the session does not carry are at rest. A body that is `resting` is displayed in
+    /// its newest state.
+    pub(crate) fn write(
+        &mut self,
+        (step, now, resting): (f64, Duration, bool),
+        state: &BodyState,
+        visual: &mut Mut<VisualState>,
+        transform: &mut Mut<Transform>,
+        scratch: &mut Vec<f64>,
+    ) {
+        let fraction = if resting { 1.0 } else { self.phase.fraction(self.tick, step, now) };
+        if self.settled {
+            return;
+        }
+        self.settled = fraction >= 1.0;
+        scratch.clear();
+        let ends = self.previous.0.iter().zip(&self.current.0);
+        scratch.extend(ends.map(|(from, to)| from + (to - from) * fraction));
+        scratch.resize(visual.q().len(), 0.0);
+        if scratch != visual.q()
+            && let Err(error) = visual.snap(scratch)
+        {
+            debug!("a state was not displayed: {error}");
+        }
+        if let (Some(from), Some(to)) = (self.previous.1, self.current.1) {
+            set_pose(transform, &from, &to, fraction, state.scale());
+        }
+    }
+
+    /// The force on a local hand at a point of the body, in this app's world.
+    pub(crate) fn force(
+        &self,
+        reaction: [f64; 3],
+        point: &PatchPoint,
+        place: &SessionTransform,
+        state: &BodyState,
+        visual: &VisualState,
+    ) -> GrabForce {
+        let point = point.at(visual.q(), state.warps());
+        GrabForce {
+            force: place.force_to_world(reaction),
+            point: place.body_point_to_world(self.current.1, point),
+        }
+    }
+}
+
+/// The hands on a body of all users but `own`, in this app's world.
+pub(crate) fn remote_hands(
+    grabs: &[GrabState],
+    own: Option<UserId>,
+    place: &SessionTransform,
+) -> RemoteHands {
+    let others = grabs.iter().filter(|grab| Some(grab.key.user) != own);
+    let hand = |grab: &GrabState| RemoteHand {
+        user: grab.key.user,
+        vertex: grab.vertex,
+        target: place.point_to_world(grab.target),
+        reaction: place.force_to_world(grab.reaction),
+    };
+    RemoteHands(others.map(hand).collect())
+}
