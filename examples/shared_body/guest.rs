@@ -4,7 +4,7 @@ use std::{
     path::PathBuf,
     sync::{
         Arc,
-        atomic::{AtomicBool, Ordering},
+        atomic::{AtomicBool, AtomicUsize, Ordering},
     },
     time::Duration,
 };
@@ -47,6 +47,9 @@ pub struct Guest {
     /// Frames, picture, window and panel.
     pub stage: stage::Options,
     pub stop: Arc<AtomicBool>,
+    /// Number of guests of this process that have not seen the body yet. Time counts from when it
+    /// is zero.
+    pub missing: Arc<AtomicUsize>,
 }
 
 /// The results of a guest, kept after its app has ended.
@@ -82,7 +85,10 @@ struct Run {
     frames: Option<u64>,
     screenshot: Option<PathBuf>,
     stop: Arc<AtomicBool>,
-    /// Time at which the body was first shown, s.
+    missing: Arc<AtomicUsize>,
+    /// Whether this guest has seen the body.
+    seen: bool,
+    /// Time at which all guests had seen the body, s.
     since: Option<f64>,
     /// Time at which the screenshot was requested, s.
     asked: f64,
@@ -99,7 +105,7 @@ enum Picture {
 }
 
 /// Time that a guest waits for the body before it gives up, s.
-const PATIENCE: f64 = 30.0;
+const PATIENCE: f64 = 300.0;
 
 /// Runs a guest with a window on this thread, which must be the main thread.
 pub fn run_windowed(guest: Guest) -> GuestReport {
@@ -150,6 +156,8 @@ fn run(mut app: App, guest: Guest) -> GuestReport {
             frames: guest.stage.frames,
             screenshot: guest.stage.screenshot,
             stop: guest.stop,
+            missing: guest.missing,
+            seen: false,
             since: None,
             asked: 0.0,
             picture: Picture::Wanted,
@@ -205,7 +213,12 @@ fn measure(
         let Some(view) = guest.body(*remote) else { continue };
         let Some(streamed) = view.visual() else { continue };
         figures.joined = true;
-        run.since.get_or_insert(time.elapsed_secs_f64());
+        if !std::mem::replace(&mut run.seen, true) {
+            run.missing.fetch_sub(1, Ordering::Relaxed);
+        }
+        if run.missing.load(Ordering::Relaxed) == 0 {
+            run.since.get_or_insert(time.elapsed_secs_f64());
+        }
         meters.streamed.show(view.tick(), &streamed.q);
         figures.ahead = 0.0;
         if let Some(own) = view.predicted_hand() {

@@ -31,7 +31,7 @@ use std::{
     process::ExitCode,
     sync::{
         Arc,
-        atomic::{AtomicBool, Ordering},
+        atomic::{AtomicBool, AtomicUsize, Ordering},
     },
     thread,
 };
@@ -92,6 +92,7 @@ fn run(options: &Options) -> Result<(), Box<dyn Error>> {
     };
 
     let stop_other = Arc::new(AtomicBool::new(false));
+    let missing = Arc::new(AtomicUsize::new(2));
     let other = Guest {
         title: String::new(),
         hand: Some(ScriptedHand {
@@ -103,6 +104,7 @@ fn run(options: &Options) -> Result<(), Box<dyn Error>> {
         duration: None,
         stage: stage::Options { headless: true, ..stage::Options::default() },
         stop: stop_other.clone(),
+        missing: missing.clone(),
         ..guest(&options, "other", 2, &model, &invite, &truth)?
     };
     let other_thread =
@@ -118,6 +120,7 @@ fn run(options: &Options) -> Result<(), Box<dyn Error>> {
         }),
         rerun: recorder(&options)?,
         duration: options.duration(),
+        missing,
         ..guest(&options, "you", 1, &model, &invite, &truth)?
     };
     let yours = if options.stage.headless {
@@ -176,6 +179,7 @@ fn guest(
         duration: None,
         stage: options.stage.clone(),
         stop: Arc::default(),
+        missing: Arc::default(),
     })
 }
 

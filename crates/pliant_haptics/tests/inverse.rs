@@ -33,6 +33,8 @@ struct Desk {
     /// The service holds the next answer back while `late` is set. `sent` is set once it has sent
     /// that answer.
     late: bool,
+    /// An answer is being held back.
+    held: bool,
     sent: bool,
     quit: bool,
     hang_up: bool,
@@ -85,6 +87,10 @@ impl Service {
 
     /// Releases the answer that was held back and waits until it is sent.
     fn send_late(&self) {
+        machine::until("an answer is held back", || {
+            std::thread::sleep(Duration::from_millis(1));
+            if self.desk().held { Ok(()) } else { Err("no command has come") }
+        });
         self.desk().late = false;
         machine::until("the late answer is sent", || {
             std::thread::sleep(Duration::from_millis(1));
@@ -163,7 +169,10 @@ fn serve(mut socket: WebSocket<TcpStream>, shared: &Mutex<Desk>, inventory: bool
         let answer = desk.say.clone().unwrap_or_else(|| state(&desk, new).to_string());
         let late = desk.late;
         drop(desk);
-        while shared.lock().is_ok_and(|desk| desk.late && !desk.quit) {
+        while shared.lock().is_ok_and(|mut desk| {
+            desk.held = desk.late && !desk.quit;
+            desk.held
+        }) {
             std::thread::sleep(Duration::from_millis(1));
         }
         let sent = socket.send(Message::text(answer));

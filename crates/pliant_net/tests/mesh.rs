@@ -17,10 +17,12 @@ use pliant_net::{
 use pliant_stream::emulator::{LinkConfig, Loss};
 use pliant_stream::peer::digest;
 use pliant_stream::{PeerId, StepSettings};
-use support::{alone, app, bar, must, run_until, wait_for};
+use support::{alone, app, bar, must, run_frames, run_until, wait_for};
 
+const SESSION: u8 = 0;
 const INTRODUCE: u8 = 16;
 const WELCOME: u8 = 17;
+const MEMBER: u8 = 18;
 
 /// Limits with which peers time out after half a minute, and a new peer has five seconds to
 /// introduce itself.
@@ -54,17 +56,30 @@ fn users(app: &mut App) -> usize {
 
 /// The first message of a new peer with the right body.
 fn introduction(app: &App, body: Entity, invite: &Invite) -> Bytes {
-    let number = app.world().resource::<NetPeer>().body_of(body).unwrap();
-    let words = invite.to_string();
     let mut bytes = BytesMut::new();
     bytes.put_u8(INTRODUCE);
+    put_scene(&mut bytes, app, body, invite);
+    bytes.freeze()
+}
+
+/// The first message of the new peer of a number to a peer that it was told of.
+fn membership(app: &App, body: Entity, number: u16, invite: &Invite) -> Bytes {
+    let mut bytes = BytesMut::new();
+    bytes.put_u8(MEMBER);
+    bytes.put_u16_le(number);
+    put_scene(&mut bytes, app, body, invite);
+    bytes.freeze()
+}
+
+fn put_scene(bytes: &mut BytesMut, app: &App, body: Entity, invite: &Invite) {
+    let number = app.world().resource::<NetPeer>().body_of(body).unwrap();
+    let words = invite.to_string();
     bytes.put_u64_le(25_000_000);
     bytes.put_u16_le(1);
     bytes.put_u16_le(number.0);
     bytes.put_slice(&digest(&bar(), &StepSettings::default()));
     bytes.put_u16_le(words.len() as u16);
     bytes.put_slice(words.as_bytes());
-    bytes.freeze()
 }
 
 struct UnauthenticatedPeer {
@@ -178,6 +193,8 @@ fn who_has_lost_two_peers_looks_for_both() {
     let quick = || Limits { idle_timeout: Duration::from_secs(3), handshake, ..limits() };
     let (mut a, _, invite) = first(Access::Anyone, quick());
     let (mut b, _) = peer("b", Some(invite.clone()), Access::Anyone, quick());
+    // Numbers are given in the order of the introductions.
+    run_until(&mut [&mut a, &mut b], "the second is in", |apps| users(apps[1]) == 2);
     let (mut c, _) = peer("c", Some(invite), Access::Anyone, quick());
     run_until(&mut [&mut a, &mut b, &mut c], "all know all", |apps| {
         apps.iter_mut().all(|app| users(app) == 3)
@@ -195,6 +212,43 @@ fn who_has_lost_two_peers_looks_for_both() {
     assert_eq!(c.world().resource::<NetPeer>().looked_for(), 2);
 }
 
+#[test]
+fn who_comes_before_our_own_welcome_waits_for_it() {
+    let _alone = alone();
+    let door = Endpoint::host(HostOptions::default()).unwrap();
+    let (mut app, body) = peer("early", Some(door.invite()), Access::Anyone, limits());
+    let asks = run_until(&mut [&mut app], "it asks to come in", |_| asking(&door));
+    // The peer at the door has told another new peer of this one, whose welcome is on its way.
+    let own = app.world().resource::<NetPeer>().invite();
+    let membership = membership(&app, body, 3, &own);
+    let mut other = UnauthenticatedPeer::at(&own);
+    run_until(&mut [&mut app], "the other is connected", |_| {
+        other.listen();
+        other.connected
+    });
+    other.endpoint.send_message(PeerId::HOST, membership).unwrap();
+    run_frames(&mut [&mut app], 50);
+    let mut welcome = BytesMut::new();
+    welcome.put_u8(WELCOME);
+    welcome.put_u16_le(2);
+    welcome.put_u16_le(1);
+    welcome.put_u8(0);
+    door.send_message(asks, welcome.freeze()).unwrap();
+    run_until(&mut [&mut app], "it talks to the other", |_| {
+        other.listen();
+        assert_eq!(other.closed, None);
+        other.messages.iter().any(|bytes| bytes.first() == Some(&SESSION))
+    });
+}
+
+/// The connection on which a new peer has introduced itself at `door`.
+fn asking(door: &Endpoint) -> Option<PeerId> {
+    std::iter::from_fn(|| door.poll()).find_map(|event| match event {
+        Event::Message { peer, .. } => Some(peer),
+        _ => None,
+    })
+}
+
 /// Connection attempts under way to peers that never answer.
 const CALLS: u16 = 20;
 
@@ -202,12 +256,7 @@ const CALLS: u16 = 20;
 /// peers. The peer at `door` admits it and keeps listening.
 fn calling(door: &Endpoint, silent: &UdpSocket, limits: Limits) -> App {
     let (mut app, _) = peer("caller", Some(door.invite()), Access::Anyone, limits);
-    let asks = run_until(&mut [&mut app], "it asks to come in", |_| {
-        std::iter::from_fn(|| door.poll()).find_map(|event| match event {
-            Event::Message { peer, .. } => Some(peer),
-            _ => None,
-        })
-    });
+    let asks = run_until(&mut [&mut app], "it asks to come in", |_| asking(door));
     let words = Invite::new(silent.local_addr().unwrap(), Fingerprint([7; 32])).to_string();
     let mut welcome = BytesMut::new();
     welcome.put_u8(WELCOME);

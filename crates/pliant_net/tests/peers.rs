@@ -65,7 +65,7 @@ fn still(app: &App, body: Entity) -> bool {
 
 /// Checks that the others show the same shape as the first one, which must be bent.
 fn agree(shapes: &[Vec<f64>], within: f64) -> Result<(), String> {
-    must!(shapes[0].iter().any(|q| q.abs() > 0.02), "the body is bent: {shapes:?}");
+    must!(shapes[0].iter().any(|q| q.abs() > 0.01), "the body is bent: {shapes:?}");
     must!(shapes[1..].iter().all(|other| apart(&shapes[0], other) < within), "{shapes:?}");
     Ok(())
 }

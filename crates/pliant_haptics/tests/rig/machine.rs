@@ -11,7 +11,7 @@ use pliant_haptics::{LoopConfig, SafetyConfig, StaleConfig, VirtualConfig};
 
 /// Time limit for every expected event. The limit is long, so that only an event that never happens
 /// exceeds it.
-pub const LIMIT: Duration = Duration::from_secs(60);
+pub const LIMIT: Duration = Duration::from_secs(300);
 
 /// Calls `look` until it succeeds. `look` lets time pass and returns what it saw if it fails.
 #[track_caller]

@@ -14,7 +14,7 @@ use bevy::{
 };
 use pliant_body::{BodyState, ModalAsset, ModalBody, PliantBodyPlugin, PliantTick, VisualState};
 use pliant_modal::{BakeInfo, Damping, Element, FlexibilitySite, ModalModel, ModelParts, Patch, SurfaceMesh};
-use pliant_net::{HostConfig, Invite, JoinConfig, NetPlugin, NetStats, RemoteBody, SharedBody};
+use pliant_net::{HostConfig, Invite, JoinConfig, NetHost, NetPlugin, NetStats, RemoteBody, SharedBody};
 
 pub(crate) use wait::must;
 pub use wait::{Look, PATIENCE, wait_for};
@@ -225,6 +225,12 @@ pub fn window<T>(
             seconds: start.elapsed().as_secs_f64(),
         };
         begin = None;
+        // A busy machine may look like a slow network, to which the host sends less.
+        if let Some(host) = apps[0].world().get_resource::<NetHost>() {
+            let session = host.session();
+            let level = session.users().filter_map(|(peer, ..)| session.stats(peer)).map(|s| s.level).max();
+            must!(level.unwrap_or(0) == 0, "the stream is reduced: level {level:?}");
+        }
         look(came).inspect_err(|off| last.clone_from(off))
     }
 }
