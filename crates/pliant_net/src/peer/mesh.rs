@@ -27,13 +27,21 @@ pub(super) struct ConnectedPeer {
     pub(super) number: Option<UserId>,
     /// Where the peer listens, for peers that join later.
     pub(super) invite: Option<Invite>,
-    /// The join request of a peer that came with this peer's invite. It waits for its number until
-    /// this peer's session has begun.
-    waits: Option<(PeerScene, Invite)>,
+    /// What the peer has said of itself, until this peer's own session has begun.
+    waits: Option<Arrival>,
     /// When the peer connected.
     since: Duration,
     /// Whether this peer has closed the connection. Data that still arrives is ignored.
     sent_away: bool,
+}
+
+/// The first message of a peer that has connected to this one.
+#[derive(Debug)]
+enum Arrival {
+    /// A new peer with this peer's invite, which asks for a number.
+    New { scene: PeerScene, invite: Invite },
+    /// A peer that has its number and was told of this one.
+    Member { number: UserId, scene: PeerScene, invite: Invite },
 }
 
 impl ConnectedPeer {
@@ -166,30 +174,10 @@ impl NetPeer {
                 }
             }
             Some(MeshMessage::Introduce { scene, invite }) if !opened => {
-                let Some(other) = self.others.get_mut(&peer) else { return };
-                if other.number.is_none() && other.waits.is_none() {
-                    other.waits = Some((scene, invite));
-                    if self.session.is_some() {
-                        self.let_in(peer);
-                    }
-                } else {
-                    self.hang_up(peer, DisconnectReason::Protocol, "introduced twice");
-                }
+                self.arrived(peer, Arrival::New { scene, invite });
             }
             Some(MeshMessage::Member { number, scene, invite }) if !opened => {
-                let known = self.others.values().any(|other| other.number == Some(number));
-                let own = if let PeerState::In { user } = self.state { user } else { UserId::HOST };
-                if scene != self.scene {
-                    self.hang_up(peer, DisconnectReason::Scene, "other bodies, or another step");
-                } else if known || number == UserId::HOST || number == own || self.session.is_none() {
-                    self.hang_up(peer, DisconnectReason::Refused, "no place under this number");
-                } else if let Some(other) = self.others.get_mut(&peer) {
-                    other.number = Some(number);
-                    other.invite = Some(other.seen_from_here(invite));
-                    let key = other.key;
-                    self.remember(key, number);
-                    self.talk_to(now, peer);
-                }
+                self.arrived(peer, Arrival::Member { number, scene, invite });
             }
             Some(MeshMessage::Welcome { number, from, others })
                 if opened
@@ -233,12 +221,48 @@ impl NetPeer {
         self.numbers.insert(key, number);
     }
 
-    /// Gives a new peer its number and the invites of all other peers.
+    /// Takes a peer's first message. The answer waits until this peer's own session has begun: the
+    /// welcome of this peer may still be on its way when others have been told of it.
+    fn arrived(&mut self, peer: PeerId, arrival: Arrival) {
+        let Some(other) = self.others.get_mut(&peer) else { return };
+        if other.number.is_some() || other.waits.is_some() {
+            return self.hang_up(peer, DisconnectReason::Protocol, "introduced twice");
+        }
+        other.waits = Some(arrival);
+        if self.session.is_some() {
+            self.let_in(peer);
+        }
+    }
+
+    /// Answers a peer that has arrived.
     fn let_in(&mut self, peer: PeerId) {
+        match self.others.get_mut(&peer).and_then(|other| other.waits.take()) {
+            Some(Arrival::New { scene, invite }) => self.welcome(peer, scene, invite),
+            Some(Arrival::Member { number, scene, invite }) => self.take_member(peer, number, scene, invite),
+            None => {}
+        }
+    }
+
+    /// Begins to play with a peer that has its number.
+    fn take_member(&mut self, peer: PeerId, number: UserId, scene: PeerScene, invite: Invite) {
+        let known = self.others.values().any(|other| other.number == Some(number));
+        let own = if let PeerState::In { user } = self.state { user } else { UserId::HOST };
+        if scene != self.scene {
+            self.hang_up(peer, DisconnectReason::Scene, "other bodies, or another step");
+        } else if known || number == UserId::HOST || number == own {
+            self.hang_up(peer, DisconnectReason::Refused, "no place under this number");
+        } else if let Some(other) = self.others.get_mut(&peer) {
+            other.number = Some(number);
+            other.invite = Some(other.seen_from_here(invite));
+            let key = other.key;
+            self.remember(key, number);
+            self.talk_to(self.now(), peer);
+        }
+    }
+
+    /// Gives a new peer its number and the invites of all other peers.
+    fn welcome(&mut self, peer: PeerId, scene: PeerScene, invite: Invite) {
         let now = self.now();
-        let Some((scene, invite)) = self.others.get_mut(&peer).and_then(|other| other.waits.take()) else {
-            return;
-        };
         if scene != self.scene {
             return self.hang_up(peer, DisconnectReason::Scene, "other bodies, or another step");
         }
