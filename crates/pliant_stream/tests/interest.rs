@@ -366,7 +366,8 @@ fn a_guest_says_how_much_of_a_body_it_wants() {
     room.guests[0].1.set_interest(BODY, None);
     (0..8).for_each(|_| room.step());
     assert_eq!(shown(&room), all);
-    // The same interest is sent once. A flood of changes is bounded and costs the guest nothing else.
+    // The same interest is sent once. A flood of changes is bounded and costs the guest nothing
+    // else.
     let sent = |room: &Room| room.guests[0].1.stats().message_bytes_out;
     let bytes = sent(&room);
     room.guests[0].1.set_interest(BODY, None);

@@ -171,8 +171,8 @@ pub(crate) fn point(
             Some(ray.get_point(distance))
         };
         let Some(wanted) = hit.map(|(_, point)| point).or_else(plane) else {
-            // The pointer is outside the window, the tool is behind the camera, or the view is along
-            // the tool's plane. There is no position, but the buttons still count.
+            // The pointer is outside the window, the tool is behind the camera, or the view is
+            // along the tool's plane. There is no position, but the buttons still count.
             source.handle.set_buttons(bits);
             continue;
         };

@@ -80,8 +80,8 @@ impl Plugin for PanelPlugin {
             .add_systems(Update, toggle.run_if(resource_exists::<ButtonInput<KeyCode>>))
             .add_systems(EguiPrimaryContextPass, draw.run_if(|panel: Res<Panel>| panel.open));
         #[cfg(feature = "haptics")]
-        // Bodies behind the panel are covered by egui's picking backend. A device's pointer reads the
-        // buttons themselves.
+        // Bodies behind the panel are covered by egui's picking backend. A device's pointer reads
+        // the buttons themselves.
         app.init_resource::<devices::DeviceHistories>()
             .configure_sets(PreUpdate, pliant_haptics::PointerToolSystems::Press.run_if(not(wants_pointer)));
         #[cfg(feature = "net")]
