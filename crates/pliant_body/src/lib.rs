@@ -125,11 +125,11 @@ pub enum PliantDisplaySystems {
 /// The plugin needs Bevy's asset, time and transform plugins. `DefaultPlugins` contains them. A
 /// headless app needs `MinimalPlugins`, `AssetPlugin` and `TransformPlugin`.
 ///
-/// With the feature `picking` the bodies are a backend of Bevy's picking: they receive the
-/// [`Pointer`](bevy::picking::events::Pointer) events of the mouse, of touches and of every other
-/// pointer, and [`Pickable`](bevy::picking::Pickable) works as for any entity. A hit is tested
-/// against the deformed surface as it is drawn. The hit carries the point and the normal, world
-/// axes, and as [`extra_as`](bevy::picking::backend::HitData::extra_as) the [`SurfaceHit`] in the
+/// With the feature `picking` the bodies are a backend of Bevy's picking. They receive the events
+/// ([`bevy::picking::events::Pointer`]) of the mouse, of touches and of every other pointer, and
+/// [`bevy::picking::Pickable`] works as for any entity. A hit is tested against the deformed
+/// surface as it is drawn. The hit carries the point and the normal, world axes, and as
+/// [`extra_as`](bevy::picking::backend::HitData::extra_as) the [`SurfaceHit`] in the
 /// body's axes. A camera picks the bodies whose render layers it shares. Hidden bodies and bodies
 /// with [`NoPointerGrab`] are not picked. The cost of a frame is one test of a box for each pair of
 /// a pointer's ray and a body. A body whose box is hit adds one reconstruction of its surface on
