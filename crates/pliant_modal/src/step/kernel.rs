@@ -477,7 +477,10 @@ impl Kernel {
         if damped {
             self.modes.velocities(&self.before, state, self.h, &mut self.velocity);
         }
-        let beyond = self.settings.extrapolation(&self.model);
+        // Hands with more rows than there are modes contradict each other: with extrapolated
+        // forces they would not come to rest.
+        let contradict = 3 * hands.len() > state.modes();
+        let beyond = if contradict { 0.0 } else { self.settings.extrapolation(&self.model) };
         self.solving.clear();
         for hand in hands {
             let mut solving = Solving {
@@ -489,18 +492,9 @@ impl Kernel {
                 ..Solving::default()
             };
             if let Hold::Target { target, velocity, config } = hand.hold {
-                // Targets may teleport. No patch of an anchored body gets farther from its rest
-                // than two lengths of the body, so a target beyond that distance is moved to that
-                // distance.
-                let reach = 2.0 * self.model.size();
-                let rest = self.before.frame.to_world(hand.patch.rest());
-                let way = target - rest;
-                solving.target = rest + way.cap_magnitude(reach);
-                // The force towards such a target is not smooth and cannot be extrapolated.
-                if way.norm() > reach {
-                    solving.beyond = 0.0;
-                }
-                solving.lead = (config.relaxation * velocity).cap_magnitude(reach);
+                solving.target = target;
+                // Targets may teleport, and their velocity is then meaningless.
+                solving.lead = (config.relaxation * velocity).cap_magnitude(2.0 * self.model.size());
                 solving.crept = self.creep.crept(&hand.flow);
                 solving.relaxation = config.relaxation;
                 if config.relaxation > 0.0 {
@@ -525,7 +519,7 @@ impl Kernel {
         let first = relaxations().next().unwrap_or(0.0);
         self.system.clear(3 * hands.len(), relaxations().all(|r| r == first));
         let right = self.system.right().as_chunks_mut::<3>().0;
-        for ((hand, solving), right) in hands.iter().zip(&self.solving).zip(right) {
+        for ((hand, solving), right) in hands.iter().zip(&mut self.solving).zip(right) {
             // Projects the step without hands onto the tangent plane.
             let along = solving.at + solving.tangent * (solving.free - solving.from);
             let gap = match hand.hold {
@@ -537,6 +531,13 @@ impl Kernel {
                     let mut gap = solving.target
                         - place.unheld_position(&self.model, rigid, ahead)
                         - place.turn * solving.crept;
+                    // Targets may teleport. No hand pulls harder than from one length of the body
+                    // away, in the direction of its target. Such a force is not smooth and cannot
+                    // be extrapolated.
+                    if gap.norm() > self.model.size() {
+                        gap = gap.cap_magnitude(self.model.size());
+                        solving.beyond = 0.0;
+                    }
                     if config.relaxation > 0.0 {
                         let frame =
                             rigid.map_or_else(Vector3::zeros, |_| unheld.velocity_at(&self.model, ahead));
