@@ -5,7 +5,7 @@ use nalgebra::Vector3;
 use pliant_modal::{Body, BodyConfig, GrabConfig, GrabId, ModalModel, Patch, StepSettings};
 
 use super::{
-    Bound, Case, CaseOutcome, Expected,
+    Bound, Case, CaseOutcome,
     bodies::{BarBody, HeldCase, compliance, modal_compliance, settling, smooth},
     plain,
 };
