@@ -1,19 +1,21 @@
-//! Geometrically nonlinear static solution of an anchored body under dead loads, as a reference for
-//! the warped modes.
+//! Nonlinear static solution of an anchored body under loads and prescribed displacements: the
+//! reference for the force in the hand.
 //!
-//! The method is total Lagrangian finite elements with the St. Venant-Kirchhoff law
-//! `S = lambda tr(E) I + 2 mu E`, `E = (F^T F - I) / 2`. The moduli are those of the bake. The law
-//! is exact for large rotations and valid while strains stay moderate. Newton's method runs in load
-//! increments. The tangent is
+//! The method is total Lagrangian finite elements with a hyperelastic [`Material`] whose moduli are
+//! those of the bake (J. Bonet and R. D. Wood, *Nonlinear Continuum Mechanics for Finite Element
+//! Analysis*, 2nd ed. 2008, ch. 9):
 //!
 //! ```text
-//! K_ij = int (g_i . S g_j) I + lambda a_i a_j^T + mu ((g_i . g_j) F F^T + a_j a_i^T) dV,   a = F g, g = grad N at rest
+//! f_i = int P g_i dV,   K_ij = int sum_cd g_i[c] g_j[d] (dP/dF)_cd dV,   g = grad N at rest
 //! ```
 //!
-//! (J. Bonet and R. D. Wood, *Nonlinear Continuum Mechanics for Finite Element Analysis*, 2nd ed.
-//! 2008, ch. 9). The solver serves the validation report. Games do not need it at run time.
+//! Newton's method runs in increments of the whole load. Where the tangent is not positive definite,
+//! the negative eigenvalues of each quadrature point are raised to zero, and a line search on the
+//! potential energy keeps the iteration from leaving the stable shape. Prescribed displacements are
+//! linear constraints with multipliers; the multipliers are the forces. Games do not need this
+//! solver at run time.
 
-use nalgebra::{Matrix3, Vector3};
+use nalgebra::{DMatrix, DVector, Matrix3, Vector3};
 use pliant_mesh::TetMesh;
 use pliant_modal::Patch;
 use rayon::prelude::*;
@@ -21,14 +23,15 @@ use rayon::prelude::*;
 use crate::bake::{elimination_order, law};
 use crate::element::{self, Element, MAX_NODES};
 use crate::factor::Factor;
-use crate::fem::{ANCHORED, FeMesh, Law};
+use crate::fem::{ANCHORED, FeMesh};
+use crate::material::{Hyperelastic, Material, positive};
 use crate::sparse::BlockCsr;
 use crate::surface::Skin;
 use crate::symbolic::Symbolic;
 use crate::{BakeConfig, BakeError, support};
 
 /// Number of Newton iterations in one increment before the increment is halved.
-const ROUNDS: usize = 12;
+const ROUNDS: usize = 100;
 
 /// Residual force, as a fraction of the load, at which an increment has converged.
 const TOLERANCE: f64 = 1e-8;
@@ -36,6 +39,9 @@ const TOLERANCE: f64 = 1e-8;
 /// Smallest increment, as a fraction of the whole load. Below it the solver gives up, because the
 /// body has no stable shape there.
 const SMALLEST: f64 = 1e-3;
+
+/// Number of halvings in a line search.
+const HALVINGS: usize = 12;
 
 /// Force of constant direction on a patch of the body's own surface (the boundary of the
 /// tetrahedra).
@@ -45,6 +51,26 @@ pub struct DeadLoad {
     pub patch: Patch,
     /// Force, N.
     pub force: [f64; 3],
+}
+
+/// A patch of the body's own surface that is held at a place.
+#[derive(Clone, Debug)]
+pub struct PrescribedPatch {
+    /// Patch whose mean displacement is prescribed in all three directions.
+    pub patch: Patch,
+    /// Displacement from rest, m.
+    pub displacement: [f64; 3],
+}
+
+/// What acts on a body at rest.
+#[derive(Clone, Copy, Debug, Default)]
+pub struct StaticLoads<'a> {
+    /// Forces on patches. Default: none.
+    pub forces: &'a [DeadLoad],
+    /// Patches that are held, at most 64. Default: none.
+    pub prescribed: &'a [PrescribedPatch],
+    /// Acceleration by gravity, m/s^2. Default: zero.
+    pub gravity: [f64; 3],
 }
 
 /// Static equilibrium of a body under its loads.
@@ -57,21 +83,34 @@ pub struct Deflection {
     pub linear: Vec<[f64; 3]>,
     /// Displacement of each loaded patch, m.
     pub patches: Vec<[f64; 3]>,
+    /// Reaction at each prescribed patch, N: the force of the body on what holds it.
+    pub reactions: Vec<[f64; 3]>,
+    /// The same reactions by the linear theory, N.
+    pub linear_reactions: Vec<[f64; 3]>,
+    /// Elastic energy, J.
+    pub energy: f64,
     /// Total number of Newton iterations.
     pub rounds: usize,
-    /// Remaining |load - inner forces| / |load|, at most 1e-8, or 0 without a load.
+    /// Remaining |load - inner forces| / |load| with the forces at held patches among the load, at
+    /// most 1e-8, or 0 without a load.
     ///
     /// This is the error of the result as a solution on its mesh.
     pub residual: f64,
 }
 
-/// Solves for the shape of an anchored body under dead loads.
+/// Solves for the shape of an anchored body at rest under loads.
 ///
 /// # Errors
 /// Returns the errors of [`bake`](crate::bake()) for the mesh, the material and the anchors.
 /// Returns [`BakeError::Parameter`] for a Poisson ratio above 0.45 (the nodal pressure has no
-/// nonlinear form here), for a body without anchors, and when no stable shape is found ("load").
-pub fn deflect(mesh: &TetMesh, config: &BakeConfig, loads: &[DeadLoad]) -> Result<Deflection, BakeError> {
+/// nonlinear form here), for a body without anchors, for held patches that overlap so far that they
+/// cannot be told apart, and when no stable shape is found ("load").
+pub fn deflect(
+    mesh: &TetMesh,
+    config: &BakeConfig,
+    material: Material,
+    loads: &StaticLoads<'_>,
+) -> Result<Deflection, BakeError> {
     config.check()?;
     let refuse = |name, expected, got| Err(BakeError::Parameter { name, expected, got });
     if config.poisson > 0.45 {
@@ -79,6 +118,14 @@ pub fn deflect(mesh: &TetMesh, config: &BakeConfig, loads: &[DeadLoad]) -> Resul
     }
     if config.anchors.is_empty() {
         return refuse("anchors", "at least one for a nonlinear solution", 0.0);
+    }
+    if loads.prescribed.len() > 64 {
+        return refuse("held patches", "at most 64", loads.prescribed.len() as f64);
+    }
+    let numbers = loads.forces.iter().flat_map(|load| load.force);
+    let numbers = numbers.chain(loads.prescribed.iter().flat_map(|held| held.displacement));
+    if let Some(bad) = numbers.chain(loads.gravity).find(|x| !x.is_finite()) {
+        return refuse("load", "finite numbers", bad);
     }
     mesh.check().map_err(BakeError::Mesh)?;
     let mut mesh = mesh.clone();
@@ -94,141 +141,370 @@ pub fn deflect(mesh: &TetMesh, config: &BakeConfig, loads: &[DeadLoad]) -> Resul
     let (number, ordered) = elimination_order(&fe, &graph, &held);
     let skin = Skin::new(&mesh, &fe, None, &number)?;
     let dofs = 3 * number.iter().filter(|&&row| row != ANCHORED).count();
-    let mut load = vec![0.0; dofs];
-    let mut spread: Vec<Vec<(u32, f64)>> = Vec::new();
-    for dead in loads {
+    let places = |patch: &Patch| {
         let mut places = Vec::new();
-        for &(vertex, weight) in dead.patch.entries() {
+        for &(vertex, weight) in patch.entries() {
             skin.spread(vertex, weight, &mut |node, share| places.push((number[node as usize], share)));
         }
-        for &(row, share) in places.iter().filter(|(row, _)| *row != ANCHORED) {
-            for axis in 0..3 {
-                load[3 * row as usize + axis] += share * dead.force[axis];
-            }
+        places.retain(|(row, _)| *row != ANCHORED);
+        places
+    };
+    let lame = law(config);
+    let mut load = weight(&fe, &number, dofs, loads.gravity.map(|g| g * config.density));
+    let spread: Vec<Places> = loads.forces.iter().map(|dead| places(&dead.patch)).collect();
+    for (places, dead) in spread.iter().zip(loads.forces) {
+        for &(row, share) in places {
+            (0..3).for_each(|axis| load[3 * row as usize + axis] += share * dead.force[axis]);
         }
-        spread.push(places);
     }
-    let problem = Problem { fe: &fe, law: law(config), number: &number, ordered: &ordered };
-    let symbolic = Symbolic::new(&ordered);
-    let size = norm(&load);
-
-    let mut linear = load.clone();
-    let (matrix, _) = problem.tangent(&vec![0.0; dofs]);
-    factor(&symbolic, &matrix).ok_or(no_shape(0.0))?.solve(&mut linear, 1);
+    let pinned: Vec<Places> = loads.prescribed.iter().map(|held| places(&held.patch)).collect();
+    let wanted: Vec<f64> = loads.prescribed.iter().flat_map(|held| held.displacement).collect();
+    let problem = Problem {
+        fe: &fe,
+        law: material.with(lame.lambda, lame.mu),
+        number: &number,
+        ordered: &ordered,
+        symbolic: Symbolic::new(&ordered),
+        load,
+        pinned,
+    };
+    let by_linear_theory =
+        problem.newton(&vec![0.0; dofs], 1.0, &wanted, false)?.ok_or_else(|| no_shape(0.0))?;
+    let linear = by_linear_theory.way;
 
     let mut u = vec![0.0; dofs];
-    let (mut done, mut increment, mut rounds) = (0.0, 0.25f64, 0);
-    let mut residual_left = 0.0;
-    while done < 1.0 && size > 0.0 {
+    let (mut done, mut increment, mut rounds, mut residual) = (0.0, 0.25f64, 0, 0.0);
+    let mut forces = vec![0.0; wanted.len()];
+    let loaded = problem.load.iter().chain(&wanted).any(|x| *x != 0.0);
+    while done < 1.0 && loaded {
         let next = (done + increment).min(1.0);
-        let mut trial = u.clone();
-        let mut converged = false;
-        for _ in 0..ROUNDS {
-            rounds += 1;
-            let (matrix, inner) = problem.tangent(&trial);
-            let mut residual: Vec<f64> = load.iter().zip(&inner).map(|(f, i)| next * f - i).collect();
-            let left = norm(&residual);
-            if !left.is_finite() {
-                break;
+        match problem.solve(&u, next, &wanted, &mut rounds)? {
+            Some(solved) => {
+                (u, forces, residual) = (solved.u, solved.forces, solved.residual);
+                done = next;
+                increment *= 1.5;
             }
-            if left <= TOLERANCE * size {
-                residual_left = left / size;
-                converged = true;
-                break;
-            }
-            let Some(factor) = factor(&symbolic, &matrix) else { break };
-            factor.solve(&mut residual, 1);
-            trial.iter_mut().zip(&residual).for_each(|(u, du)| *u += du);
-        }
-        if converged {
-            u = trial;
-            done = next;
-            increment *= 1.5;
-        } else {
-            increment *= 0.5;
-            if increment < SMALLEST {
-                return Err(no_shape(done));
+            None => {
+                increment *= 0.5;
+                if increment < SMALLEST {
+                    return Err(no_shape(done));
+                }
             }
         }
     }
-    let node = |values: &[f64], row: u32| -> [f64; 3] {
-        std::array::from_fn(|k| if row == ANCHORED { 0.0 } else { values[3 * row as usize + k] })
-    };
     let at_surface = |values: &[f64]| -> Vec<[f64; 3]> {
         (0..skin.mesh.positions().len() as u32)
             .map(|vertex| {
                 let mut sum = [0.0; 3];
                 skin.spread(vertex, 1.0, &mut |n, share| {
-                    let at = node(values, number[n as usize]);
-                    (0..3).for_each(|k| sum[k] += share * at[k]);
+                    let row = number[n as usize];
+                    if row != ANCHORED {
+                        (0..3).for_each(|k| sum[k] += share * values[3 * row as usize + k]);
+                    }
                 });
                 sum
             })
             .collect()
     };
-    let patches = spread
-        .iter()
-        .map(|places| {
-            places.iter().fold([0.0; 3], |sum, &(row, share)| {
-                let at = node(&u, row);
-                std::array::from_fn(|k| sum[k] + share * at[k])
-            })
-        })
-        .collect();
-    let (surface, linear) = (at_surface(&u), at_surface(&linear));
-    Ok(Deflection { surface, linear, patches, rounds, residual: residual_left })
+    let reactions = |forces: &[f64]| forces.as_chunks::<3>().0.iter().map(|f| f.map(|x| -x)).collect();
+    Ok(Deflection {
+        surface: at_surface(&u),
+        linear: at_surface(&linear),
+        patches: spread.iter().map(|places| mean(places, &u)).collect(),
+        reactions: reactions(&forces),
+        linear_reactions: reactions(&by_linear_theory.forces),
+        energy: problem.elastic_energy(&u),
+        rounds,
+        residual,
+    })
 }
 
 fn no_shape(done: f64) -> BakeError {
     BakeError::Parameter { name: "load", expected: "one under which the body has a stable shape", got: done }
 }
 
-fn factor(symbolic: &Symbolic, matrix: &BlockCsr) -> Option<Factor> {
-    Factor::new(symbolic.clone(), matrix, &[]).ok()
+/// Rows of free nodes with their shares.
+type Places = Vec<(u32, f64)>;
+
+/// Returns the mean of the nodal values at these places.
+fn mean(places: &[(u32, f64)], values: &[f64]) -> [f64; 3] {
+    places.iter().fold([0.0; 3], |sum, &(row, share)| {
+        std::array::from_fn(|k| sum[k] + share * values[3 * row as usize + k])
+    })
+}
+
+/// Returns the nodal forces of a force per volume, N/m^3.
+fn weight(fe: &FeMesh, number: &[u32], dofs: usize, per_volume: [f64; 3]) -> Vec<f64> {
+    let mut out = vec![0.0; dofs];
+    for (nodes, affine) in fe.elements().zip(&fe.affine) {
+        for (i, &node) in nodes.iter().enumerate() {
+            // Integrals of the shape functions over the element, as shares of its volume.
+            let share = match fe.element {
+                Element::Tet4 => 0.25,
+                Element::Tet10 if i < 4 => -0.05,
+                Element::Tet10 => 0.2,
+            };
+            let row = number[node as usize];
+            if row != ANCHORED {
+                (0..3).for_each(|k| out[3 * row as usize + k] += share * affine.volume * per_volume[k]);
+            }
+        }
+    }
+    out
 }
 
 fn norm(x: &[f64]) -> f64 {
     x.iter().map(|x| x * x).sum::<f64>().sqrt()
 }
 
+/// One direction of Newton's method.
+struct Direction {
+    way: Vec<f64>,
+    /// Forces on the body at the held patches at the end of the whole way, N.
+    forces: Vec<f64>,
+}
+
+/// An equilibrium under a part of the load.
+struct Equilibrium {
+    u: Vec<f64>,
+    forces: Vec<f64>,
+    residual: f64,
+}
+
 struct Problem<'a> {
     fe: &'a FeMesh,
-    law: Law,
+    law: Hyperelastic,
     number: &'a [u32],
     ordered: &'a crate::fem::Lists,
+    symbolic: Symbolic,
+    load: Vec<f64>,
+    pinned: Vec<Places>,
 }
 
 type Blocks = [f64; MAX_NODES * MAX_NODES * 9];
 
 impl Problem<'_> {
-    /// Returns the tangent stiffness and the inner forces at a displacement.
-    fn tangent(&self, u: &[f64]) -> (BlockCsr, Vec<f64>) {
+    /// Finds the equilibrium under a share `part` of all loads, from the one at `start`. Returns
+    /// `None` if the iteration does not converge.
+    fn solve(
+        &self,
+        start: &[f64],
+        part: f64,
+        wanted: &[f64],
+        rounds: &mut usize,
+    ) -> Result<Option<Equilibrium>, BakeError> {
+        let wanted: Vec<f64> = wanted.iter().map(|x| part * x).collect();
+        let mut u = start.to_vec();
+        // Without held patches, all shapes are allowed from the start.
+        let mut allowed = self.pinned.is_empty();
+        // Newton's own tangent converges fastest, but costs a factorization where it is indefinite.
+        let (mut project, mut attempts) = (false, 3);
+        for _ in 0..ROUNDS {
+            *rounds += 1;
+            let Some(Direction { way, forces }) = self.newton(&u, part, &wanted, project)? else {
+                if project {
+                    return Ok(None);
+                }
+                (project, attempts) = (true, attempts - 1);
+                continue;
+            };
+            let at = |share: f64| u.iter().zip(&way).map(|(u, du)| u + share * du).collect::<Vec<f64>>();
+            let mut trial = at(1.0);
+            if allowed {
+                let before = self.potential(&u, part);
+                let room = 1e-12 * (before.abs() + self.elastic_energy(&u));
+                let mut share = 1.0;
+                let mut halvings = 0;
+                let worse = |potential: f64| potential.is_nan() || potential > before + room;
+                while worse(self.potential(&trial, part)) {
+                    halvings += 1;
+                    if halvings > HALVINGS {
+                        break;
+                    }
+                    share *= 0.5;
+                    trial = at(share);
+                }
+                if halvings > HALVINGS {
+                    if project {
+                        return Ok(None);
+                    }
+                    project = true;
+                    continue;
+                }
+            }
+            // The whole first way leads to where the patches are held. Later ways stay there.
+            (allowed, project) = (true, attempts == 0);
+            u = trial;
+            let (left, size) = self.residual(&u, part, &forces);
+            if !left.is_finite() {
+                return Ok(None);
+            }
+            if left <= TOLERANCE * size {
+                let residual = if size > 0.0 { left / size } else { 0.0 };
+                return Ok(Some(Equilibrium { u, forces, residual }));
+            }
+        }
+        Ok(None)
+    }
+
+    /// Returns the size of the force that is out of balance, and that of the load.
+    fn residual(&self, u: &[f64], part: f64, forces: &[f64]) -> (f64, f64) {
+        let mut out: Vec<f64> = self.load.iter().map(|f| part * f).collect();
+        for (places, force) in self.pinned.iter().zip(forces.as_chunks::<3>().0) {
+            for &(row, share) in places {
+                (0..3).for_each(|axis| out[3 * row as usize + axis] += share * force[axis]);
+            }
+        }
+        let size = norm(&out);
+        let inner = self.inner_forces(u);
+        out.iter_mut().zip(&inner).for_each(|(out, inner)| *out -= inner);
+        (norm(&out), size)
+    }
+
+    /// Returns the way of Newton's method at `u` to where the patches are `wanted`. `None`: the
+    /// tangent is not positive definite.
+    fn newton(
+        &self,
+        u: &[f64],
+        part: f64,
+        wanted: &[f64],
+        project: bool,
+    ) -> Result<Option<Direction>, BakeError> {
+        let (matrix, inner) = self.tangent(u, project);
+        let Ok(factor) = Factor::new(self.symbolic.clone(), &matrix, &[]) else { return Ok(None) };
+        drop(matrix);
+        let mut way: Vec<f64> = self.load.iter().zip(&inner).map(|(f, i)| part * f - i).collect();
+        factor.solve(&mut way, 1);
+        let rows = wanted.len();
+        if rows == 0 {
+            return Ok(Some(Direction { way, forces: Vec::new() }));
+        }
+        // The answers to unit forces on the patches, row by row.
+        let mut answers = vec![0.0; u.len() * rows];
+        for (index, places) in self.pinned.iter().enumerate() {
+            for &(row, share) in places {
+                for axis in 0..3 {
+                    answers[(3 * row as usize + axis) * rows + 3 * index + axis] += share;
+                }
+            }
+        }
+        factor.solve(&mut answers, rows);
+        let overlap = BakeError::Parameter {
+            name: "held patches",
+            expected: "patches that can be moved one by one",
+            got: self.pinned.len() as f64,
+        };
+        let mut schur = DMatrix::zeros(rows, rows);
+        let mut missing = DVector::zeros(rows);
+        for (index, places) in self.pinned.iter().enumerate() {
+            for axis in 0..3 {
+                let i = 3 * index + axis;
+                missing[i] = wanted[i];
+                for &(row, share) in places {
+                    let dof = 3 * row as usize + axis;
+                    missing[i] -= share * (u[dof] + way[dof]);
+                    for j in 0..rows {
+                        schur[(i, j)] += share * answers[dof * rows + j];
+                    }
+                }
+            }
+        }
+        let forces = nalgebra::Cholesky::new(schur).ok_or(overlap)?.solve(&missing);
+        for (way, answers) in way.iter_mut().zip(answers.chunks_exact(rows)) {
+            *way += answers.iter().zip(&forces).map(|(a, f)| a * f).sum::<f64>();
+        }
+        Ok(Some(Direction { way, forces: forces.as_slice().to_vec() }))
+    }
+
+    /// Returns the displacements of an element's nodes.
+    fn of_element(&self, index: usize, u: &[f64]) -> [Vector3<f64>; MAX_NODES] {
+        let per = self.fe.element.node_count();
+        let mut at = [Vector3::zeros(); MAX_NODES];
+        for (at, &node) in at.iter_mut().zip(&self.fe.connectivity[index * per..][..per]) {
+            let row = self.number[node as usize];
+            if row != ANCHORED {
+                *at = Vector3::from_fn(|axis, _| u[3 * row as usize + axis]);
+            }
+        }
+        at
+    }
+
+    /// Calls `visit` with the weight (m^3), the gradients of the shape functions and the
+    /// displacement gradient at each quadrature point of an element.
+    fn at_points(&self, index: usize, u: &[f64], mut visit: impl FnMut(f64, &[Vector3<f64>], &Matrix3<f64>)) {
+        let per = self.fe.element.node_count();
+        let (at, affine) = (self.of_element(index, u), &self.fe.affine[index]);
+        let (points, share) = element::stiffness_points(self.fe.element);
+        for &point in points {
+            let g = affine.shape_gradients(self.fe.element, point).map(Vector3::from);
+            let h = at.iter().zip(&g[..per]).fold(Matrix3::zeros(), |sum, (u, g)| sum + u * g.transpose());
+            visit(share * affine.volume, &g[..per], &h);
+        }
+    }
+
+    /// Returns the elastic energy, J. The sum has the same bits for any number of threads.
+    fn elastic_energy(&self, u: &[f64]) -> f64 {
+        let parts: Vec<f64> = (0..self.fe.affine.len())
+            .into_par_iter()
+            .map(|index| {
+                let mut sum = 0.0;
+                self.at_points(index, u, |w, _, h| sum += w * self.law.energy(h));
+                sum
+            })
+            .collect();
+        parts.iter().sum()
+    }
+
+    /// Returns the elastic energy minus the work of a share `part` of the loads, J.
+    fn potential(&self, u: &[f64], part: f64) -> f64 {
+        self.elastic_energy(u) - part * self.load.iter().zip(u).map(|(f, u)| f * u).sum::<f64>()
+    }
+
+    fn inner_forces(&self, u: &[f64]) -> Vec<f64> {
+        let mut out = vec![0.0; u.len()];
+        let forces: Vec<[Vector3<f64>; MAX_NODES]> = (0..self.fe.affine.len())
+            .into_par_iter()
+            .map(|index| {
+                let mut f = [Vector3::zeros(); MAX_NODES];
+                self.at_points(index, u, |w, g, h| {
+                    let stress = w * self.law.stress(h);
+                    f.iter_mut().zip(g).for_each(|(f, g)| *f += stress * g);
+                });
+                f
+            })
+            .collect();
+        for (nodes, forces) in self.fe.elements().zip(&forces) {
+            for (&node, force) in nodes.iter().zip(forces) {
+                let row = self.number[node as usize];
+                if row != ANCHORED {
+                    (0..3).for_each(|axis| out[3 * row as usize + axis] += force[axis]);
+                }
+            }
+        }
+        out
+    }
+
+    /// Returns the tangent stiffness, with `project` the positive semidefinite one, and the inner
+    /// forces at a displacement.
+    fn tangent(&self, u: &[f64], project: bool) -> (BlockCsr, Vec<f64>) {
         const BATCH: usize = 512;
         let per = self.fe.element.node_count();
         let mut out = BlockCsr::zeros(self.ordered);
-        let mut inner = vec![0.0; u.len()];
-        let mut batch = vec![([0.0; MAX_NODES * MAX_NODES * 9], [[0.0; 3]; MAX_NODES]); BATCH];
-        for (index, affine) in self.fe.affine.chunks(BATCH).enumerate() {
-            let nodes_of = |local: usize| &self.fe.connectivity[(index * BATCH + local) * per..][..per];
-            batch[..affine.len()].par_iter_mut().enumerate().for_each(|(local, (k, f))| {
-                let nodes = nodes_of(local);
-                let mut at = [Vector3::zeros(); MAX_NODES];
-                for (at, &node) in at.iter_mut().zip(nodes) {
-                    let row = self.number[node as usize];
-                    if row != ANCHORED {
-                        *at = Vector3::from_fn(|axis, _| u[3 * row as usize + axis]);
-                    }
-                }
-                self.element(&affine[local], &at[..per], k, f);
-            });
-            for (local, (k, f)) in batch[..affine.len()].iter().enumerate() {
-                let nodes = nodes_of(local);
+        let mut batch = vec![[0.0; MAX_NODES * MAX_NODES * 9]; BATCH];
+        let count = self.fe.affine.len();
+        for first in (0..count).step_by(BATCH) {
+            let size = BATCH.min(count - first);
+            batch[..size]
+                .par_iter_mut()
+                .enumerate()
+                .for_each(|(local, k)| self.element_tangent(first + local, u, project, k));
+            for (local, k) in batch[..size].iter().enumerate() {
+                let nodes = &self.fe.connectivity[(first + local) * per..][..per];
                 for (i, &a) in nodes.iter().enumerate() {
                     let row = self.number[a as usize];
                     if row == ANCHORED {
                         continue;
                     }
-                    (0..3).for_each(|axis| inner[3 * row as usize + axis] += f[i][axis]);
                     for (j, &b) in nodes.iter().enumerate() {
                         let column = self.number[b as usize];
                         if column != ANCHORED {
@@ -243,51 +519,34 @@ impl Problem<'_> {
                 }
             }
         }
-        (out, inner)
+        (out, self.inner_forces(u))
     }
 
-    fn element(
-        &self,
-        affine: &element::Affine,
-        u: &[Vector3<f64>],
-        k: &mut Blocks,
-        f: &mut [[f64; 3]; MAX_NODES],
-    ) {
-        let Law { lambda, mu, .. } = self.law;
+    fn element_tangent(&self, index: usize, u: &[f64], project: bool, k: &mut Blocks) {
         k.fill(0.0);
-        *f = [[0.0; 3]; MAX_NODES];
-        let (points, share) = element::stiffness_points(self.fe.element);
-        for &point in points {
-            let g: Vec<Vector3<f64>> = affine.shape_gradients(self.fe.element, point)[..u.len()]
-                .iter()
-                .map(|g| Vector3::from(*g))
-                .collect();
-            let w = share * affine.volume;
-            // The strain is computed from the displacement gradient, because `F^T F - I` would
-            // leave small strains no digits.
-            let h = u.iter().zip(&g).fold(Matrix3::zeros(), |sum, (u, g)| sum + u * g.transpose());
-            let deformation = Matrix3::identity() + h;
-            let strain = 0.5 * (h + h.transpose() + h.transpose() * h);
-            let stress = lambda * strain.trace() * Matrix3::identity() + 2.0 * mu * strain;
-            let left = deformation * deformation.transpose();
-            let a: Vec<Vector3<f64>> = g.iter().map(|g| deformation * g).collect();
-            for i in 0..u.len() {
-                let force = w * (deformation * (stress * g[i]));
-                (0..3).for_each(|axis| f[i][axis] += force[axis]);
-                let pulled = stress * g[i];
-                for j in 0..u.len() {
-                    let block = w
-                        * (Matrix3::identity() * pulled.dot(&g[j])
-                            + lambda * a[i] * a[j].transpose()
-                            + mu * (g[i].dot(&g[j]) * left + a[j] * a[i].transpose()));
-                    for row in 0..3 {
-                        for column in 0..3 {
-                            k[(i * MAX_NODES + j) * 9 + 3 * row + column] += block[(row, column)];
-                        }
+        self.at_points(index, u, |w, g, h| {
+            let mut tangent = self.law.tangent(h);
+            if project {
+                tangent = positive(&tangent);
+            }
+            for (j, gj) in g.iter().enumerate() {
+                // Stress in each direction by a displacement of node j.
+                let mut by_node = [Matrix3::zeros(); 3];
+                for (c, by_node) in by_node.iter_mut().enumerate() {
+                    for d in 0..3 {
+                        *by_node += (w * gj[d]) * tangent.fixed_view::<3, 3>(3 * c, 3 * d);
+                    }
+                }
+                for (i, gi) in g.iter().enumerate() {
+                    let block = gi[0] * by_node[0] + gi[1] * by_node[1] + gi[2] * by_node[2];
+                    let k = &mut k[(i * MAX_NODES + j) * 9..][..9];
+                    // Blocks are stored row by row.
+                    for (to, from) in k.iter_mut().zip(block.transpose().as_slice()) {
+                        *to += from;
                     }
                 }
             }
-        }
+        });
     }
 }
 
@@ -298,33 +557,49 @@ mod tests {
 
     use super::*;
 
-    /// Solves a slender cantilever under a dead load `p` = P L^2 / (E I) across its end.
-    ///
-    /// The cantilever is 1 m long and a thirtieth of that thick, with nu = 0.
-    fn cantilever(p: f64) -> [f64; 3] {
-        let thick = 1.0 / 30.0;
-        let mesh = shapes::bar([30, 1, 1], [1.0, thick, thick]).unwrap();
-        let config = BakeConfig {
-            young: 1e6,
-            poisson: 0.0,
-            anchors: vec!["x<1e-9".parse().unwrap()],
-            ..BakeConfig::default()
-        };
+    const LAWS: [Material; 2] = [Material::NeoHookean, Material::StVenantKirchhoff];
+
+    fn left_end() -> Vec<crate::Anchor> {
+        vec!["x<1e-9".parse().unwrap()]
+    }
+
+    /// The surface of a mesh as the solver numbers it.
+    fn surface(mesh: &TetMesh) -> SurfaceMesh {
         let (surface, _) = mesh.boundary();
         let positions = surface.positions.iter().map(|p| p.map(|x| x as f32)).collect::<Vec<_>>();
         let count = positions.len();
-        let surface =
-            SurfaceMesh::new(positions.clone(), surface.triangles, None, vec![false; count]).unwrap();
+        SurfaceMesh::new(positions, surface.triangles, None, vec![false; count]).unwrap()
+    }
+
+    /// Returns the vertices that `keep` accepts.
+    fn vertices(surface: &SurfaceMesh, keep: impl Fn(&[f32; 3]) -> bool) -> Vec<u32> {
+        (0..surface.positions().len() as u32).filter(|&v| keep(&surface.positions()[v as usize])).collect()
+    }
+
+    /// Makes a force that is spread over these vertices in equal parts.
+    fn spread(surface: &SurfaceMesh, on: &[u32], force: [f64; 3]) -> Vec<DeadLoad> {
+        let share = force.map(|f| f / on.len() as f64);
+        on.iter()
+            .map(|&v| DeadLoad { patch: Patch::around(surface, v, 0.0).unwrap(), force: share })
+            .collect()
+    }
+
+    fn under<'a>(forces: &'a [DeadLoad]) -> StaticLoads<'a> {
+        StaticLoads { forces, ..Default::default() }
+    }
+
+    /// Solves a slender cantilever under a dead load `p` = P L^2 / (E I) across its end.
+    ///
+    /// The cantilever is 1 m long and a thirtieth of that thick, with nu = 0.
+    fn cantilever(material: Material, p: f64) -> [f64; 3] {
+        let thick = 1.0 / 30.0;
+        let mesh = shapes::bar([30, 1, 1], [1.0, thick, thick]).unwrap();
+        let config = BakeConfig { young: 1e6, poisson: 0.0, anchors: left_end(), ..BakeConfig::default() };
+        let surface = surface(&mesh);
         let stiffness = 1e6 * thick.powi(4) / 12.0;
-        let corners: Vec<u32> = (0..count as u32).filter(|&v| positions[v as usize][0] > 0.999).collect();
-        let loads: Vec<DeadLoad> = corners
-            .iter()
-            .map(|&v| DeadLoad {
-                patch: Patch::around(&surface, v, 0.0).unwrap(),
-                force: [0.0, p * stiffness / corners.len() as f64, 0.0],
-            })
-            .collect();
-        let solved = deflect(&mesh, &config, &loads).unwrap();
+        let end = vertices(&surface, |p| p[0] > 0.999);
+        let loads = spread(&surface, &end, [0.0, p * stiffness, 0.0]);
+        let solved = deflect(&mesh, &config, material, &under(&loads)).unwrap();
         let count = solved.patches.len() as f64;
         std::array::from_fn(|k| solved.patches.iter().map(|p| p[k]).sum::<f64>() / count)
     }
@@ -333,38 +608,177 @@ mod tests {
     fn a_slender_cantilever_bends_as_the_elastica() {
         // The values are v / L and u / L of the elastica (Bisshopp and Drucker 1945). A bar of
         // aspect ratio 30 also shears, by 3 E I / (k G A L^2) ~ 0.3 % of v.
-        for (p, v, u) in [(1.0, 0.30172, 0.05643), (2.0, 0.49346, 0.16064)] {
-            let tip = cantilever(p);
-            assert!((tip[1] / v - 1.0).abs() < 0.01, "P L^2 / E I = {p}: {tip:?}");
-            assert!((-tip[0] / u - 1.0).abs() < 0.02, "P L^2 / E I = {p}: {tip:?}");
+        for material in LAWS {
+            for (p, v, u) in [(1.0, 0.30172, 0.05643), (2.0, 0.49346, 0.16064)] {
+                let tip = cantilever(material, p);
+                println!("{material:?}, P L^2 / E I = {p}: {tip:.5?}, the elastica {u} {v}");
+                assert!((tip[1] / v - 1.0).abs() < 0.01, "{material:?} P L^2 / E I = {p}: {tip:?}");
+                assert!((-tip[0] / u - 1.0).abs() < 0.02, "{material:?} P L^2 / E I = {p}: {tip:?}");
+            }
+        }
+    }
+
+    /// Nominal stress of the neo-Hookean law in uniaxial tension, Pa, from its principal stresses
+    /// `P_i = mu (1 - 1 / (I_C + 1)) l_i + lambda (J - a) J / l_i` with free sides.
+    fn uniaxial(young: f64, poisson: f64, stretch: f64) -> f64 {
+        let mu_lame = young / (2.0 * (1.0 + poisson));
+        let lambda_lame = young * poisson / ((1.0 + poisson) * (1.0 - 2.0 * poisson));
+        let (mu, lambda) = (4.0 / 3.0 * mu_lame, lambda_lame + 5.0 / 6.0 * mu_lame);
+        let a = 1.0 + mu / lambda - mu / (4.0 * lambda);
+        let principal = |along: f64, side: f64, of: f64| {
+            let (c, j) = (along * along + 2.0 * side * side, along * side * side);
+            mu * (1.0 - 1.0 / (c + 1.0)) * of + lambda * (j - a) * j / of
+        };
+        let (mut low, mut high) = (0.3, 2.0);
+        for _ in 0..100 {
+            let side = 0.5 * (low + high);
+            if principal(stretch, side, side) < 0.0 { low = side } else { high = side }
+        }
+        principal(stretch, low, stretch)
+    }
+
+    #[test]
+    fn a_stretched_bar_pulls_as_its_law_says() {
+        let (young, poisson, thick) = (1e5, 0.4, 0.1);
+        let mesh = shapes::bar([20, 2, 2], [1.0, thick, thick]).unwrap();
+        let config = BakeConfig { young, poisson, anchors: left_end(), ..BakeConfig::default() };
+        let surface = surface(&mesh);
+        let end = vertices(&surface, |p| p[0] > 0.999);
+        for stretch in [1.1, 1.3] {
+            for material in LAWS {
+                let stress = match material {
+                    Material::NeoHookean => uniaxial(young, poisson, stretch),
+                    Material::StVenantKirchhoff => 0.5 * young * stretch * (stretch * stretch - 1.0),
+                };
+                let loads = spread(&surface, &end, [stress * thick * thick, 0.0, 0.0]);
+                let solved = deflect(&mesh, &config, material, &under(&loads)).unwrap();
+                // The middle half does not feel how the ends are held.
+                let at = |x: f32| {
+                    let on = vertices(&surface, |p| (p[0] - x).abs() < 1e-3);
+                    on.iter().map(|&v| solved.surface[v as usize][0]).sum::<f64>() / on.len() as f64
+                };
+                let got = 1.0 + (at(0.75) - at(0.25)) / 0.5;
+                println!("{material:?}: {got:.5}, the closed form {stretch}");
+                assert!((got - stretch).abs() < 2e-3 * (stretch - 1.0), "{material:?}: {got} and {stretch}");
+            }
+        }
+    }
+
+    #[test]
+    fn a_bar_hangs_under_its_weight() {
+        let (young, density, g) = (1e6, 1000.0, 9.81);
+        let mesh = shapes::bar([10, 2, 2], [1.0, 0.2, 0.2]).unwrap();
+        let anchors = left_end();
+        let config = BakeConfig { young, density, poisson: 0.0, anchors, ..BakeConfig::default() };
+        let surface = surface(&mesh);
+        let end = vertices(&surface, |p| p[0] > 0.999);
+        let loads = StaticLoads { gravity: [g, 0.0, 0.0], ..Default::default() };
+        let solved = deflect(&mesh, &config, Material::NeoHookean, &loads).unwrap();
+        // rho g L^2 / (2 E) for small strains; here the strain is half a percent.
+        let small = density * g / (2.0 * young);
+        for &vertex in &end {
+            assert!((solved.linear[vertex as usize][0] / small - 1.0).abs() < 1e-6);
+            assert!((solved.surface[vertex as usize][0] / small - 1.0).abs() < 0.01);
+        }
+    }
+
+    #[test]
+    fn a_patch_that_is_led_to_where_a_force_brought_it_feels_that_force() {
+        let mesh = shapes::bar([10, 2, 2], [1.0, 0.1, 0.1]).unwrap();
+        let config = BakeConfig { anchors: left_end(), ..BakeConfig::default() };
+        let surface = surface(&mesh);
+        let corner = vertices(&surface, |p| p[0] > 0.999 && p[1] > 0.099 && p[2] > 0.099)[0];
+        let patch = Patch::around(&surface, corner, 0.06).unwrap();
+        for material in LAWS {
+            let force = [0.08, 0.64, -0.32];
+            let dead = [DeadLoad { patch: patch.clone(), force }];
+            let pulled = deflect(&mesh, &config, material, &under(&dead)).unwrap();
+            let displacement = pulled.patches[0];
+            let prescribed = [PrescribedPatch { patch: patch.clone(), displacement }];
+            let loads = StaticLoads { prescribed: &prescribed, ..Default::default() };
+            let held = deflect(&mesh, &config, material, &loads).unwrap();
+            let reach = displacement.iter().map(|x| x * x).sum::<f64>().sqrt();
+            assert!(reach > 0.2, "{displacement:?}");
+            for (reaction, force) in held.reactions[0].iter().zip(&force) {
+                assert!((reaction + force).abs() < 1e-6 * 0.72, "{:?}", held.reactions);
+            }
+            for (a, b) in pulled.surface.iter().flatten().zip(held.surface.iter().flatten()) {
+                assert!((a - b).abs() < 1e-6 * reach, "{a} and {b}");
+            }
+            assert!(held.residual > 0.0 && held.residual <= 1e-8);
+            // Castigliano: the energy grows by the force along the way.
+            let further = displacement.map(|x| 1.001 * x);
+            let prescribed = [PrescribedPatch { patch: patch.clone(), displacement: further }];
+            let loads = StaticLoads { prescribed: &prescribed, ..Default::default() };
+            let more = deflect(&mesh, &config, material, &loads).unwrap();
+            let work: f64 = (0..3)
+                .map(|k| 0.5 * (force[k] - more.reactions[0][k]) * (further[k] - displacement[k]))
+                .sum();
+            assert!(((more.energy - held.energy) / work - 1.0).abs() < 1e-3);
+        }
+    }
+
+    #[test]
+    fn a_block_is_pressed_to_half_its_height() {
+        let mesh = shapes::bar([4, 4, 4], [1.0, 1.0, 1.0]).unwrap();
+        // All nodes of the top are corners of four-node elements, so the top stays flat.
+        let element = pliant_modal::Element::Tet4;
+        let config = BakeConfig { element, anchors: left_end(), ..BakeConfig::default() };
+        let surface = surface(&mesh);
+        let top = vertices(&surface, |p| p[0] > 0.999);
+        let press = |by: f64, material: Material| {
+            let prescribed: Vec<PrescribedPatch> = top
+                .iter()
+                .map(|&v| PrescribedPatch {
+                    patch: Patch::around(&surface, v, 0.0).unwrap(),
+                    displacement: [-by, 0.0, 0.0],
+                })
+                .collect();
+            deflect(&mesh, &config, material, &StaticLoads { prescribed: &prescribed, ..Default::default() })
+        };
+        let mut last = 0.0;
+        for by in [0.1, 0.3, 0.5] {
+            let force: f64 = press(by, Material::NeoHookean).unwrap().reactions.iter().map(|f| f[0]).sum();
+            println!("pressed by {by}: {force:.1} N");
+            assert!(force > last, "pressed by {by}: {force} N after {last} N");
+            last = force;
         }
     }
 
     #[test]
     fn a_small_load_gives_the_linear_solution() {
         let mesh = shapes::bar([4, 1, 1], [1.0, 0.25, 0.25]).unwrap();
-        let config = BakeConfig { anchors: vec!["x<1e-9".parse().unwrap()], ..BakeConfig::default() };
-        let (surface, _) = mesh.boundary();
-        let positions: Vec<[f32; 3]> = surface.positions.iter().map(|p| p.map(|x| x as f32)).collect();
-        let count = positions.len();
-        let surface = SurfaceMesh::new(positions, surface.triangles, None, vec![false; count]).unwrap();
-        let patch = Patch::around(&surface, count as u32 - 1, 0.0).unwrap();
-        let solved = deflect(&mesh, &config, &[DeadLoad { patch, force: [0.0, 1e-4, 2e-4] }]).unwrap();
-        assert!(solved.residual > 0.0 && solved.residual <= 1e-8, "{}", solved.residual);
-        let largest = solved.linear.iter().flatten().fold(0.0f64, |m, x| m.max(x.abs()));
-        for (a, b) in solved.surface.iter().flatten().zip(solved.linear.iter().flatten()) {
-            assert!((a - b).abs() < 1e-4 * largest, "{a} and {b}");
+        let config = BakeConfig { anchors: left_end(), ..BakeConfig::default() };
+        let surface = surface(&mesh);
+        let patch = Patch::around(&surface, surface.positions().len() as u32 - 1, 0.0).unwrap();
+        for material in LAWS {
+            let dead = [DeadLoad { patch: patch.clone(), force: [0.0, 1e-4, 2e-4] }];
+            let solved = deflect(&mesh, &config, material, &under(&dead)).unwrap();
+            assert!(solved.residual > 0.0 && solved.residual <= 1e-8, "{}", solved.residual);
+            let largest = solved.linear.iter().flatten().fold(0.0f64, |m, x| m.max(x.abs()));
+            for (a, b) in solved.surface.iter().flatten().zip(solved.linear.iter().flatten()) {
+                assert!((a - b).abs() < 1e-4 * largest, "{a} and {b}");
+            }
+            let prescribed = [PrescribedPatch { patch: patch.clone(), displacement: [0.0, 1e-6, 0.0] }];
+            let loads = StaticLoads { prescribed: &prescribed, ..Default::default() };
+            let held = deflect(&mesh, &config, material, &loads).unwrap();
+            for (a, b) in held.reactions[0].iter().zip(&held.linear_reactions[0]) {
+                assert!((a - b).abs() < 1e-4 * held.linear_reactions[0][1].abs(), "{a} and {b}");
+            }
         }
     }
 
     #[test]
     fn what_it_cannot_solve_is_refused() {
         let mesh = shapes::bar([2, 1, 1], [1.0, 0.5, 0.5]).unwrap();
-        let free = BakeConfig::default();
-        assert!(matches!(deflect(&mesh, &free, &[]), Err(BakeError::Parameter { name: "anchors", .. })));
+        let (free, none) = (BakeConfig::default(), StaticLoads::default());
+        assert!(matches!(
+            deflect(&mesh, &free, Material::default(), &none),
+            Err(BakeError::Parameter { name: "anchors", .. })
+        ));
         let held = BakeConfig { poisson: 0.49, anchors: vec!["x<1e-9".parse().unwrap()], ..free };
         assert!(matches!(
-            deflect(&mesh, &held, &[]),
+            deflect(&mesh, &held, Material::default(), &none),
             Err(BakeError::Parameter { name: "Poisson ratio", .. })
         ));
     }

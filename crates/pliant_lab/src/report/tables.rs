@@ -2,7 +2,7 @@
 
 use std::{fmt::Write, path::Path, sync::Arc, time::Duration};
 
-use pliant_bake::{BakeConfig, DeadLoad, deflect};
+use pliant_bake::{BakeConfig, DeadLoad};
 use pliant_mesh::shapes;
 use pliant_modal::{BodyConfig, Element, Integrator, ModalModel, Patch, Precision, StepSettings};
 use pliant_stream::{
@@ -14,7 +14,7 @@ use pliant_stream::{
 
 use super::{
     plot::{Figure, Series},
-    warp::held_as,
+    warp::{held_as, under},
     work::{anchor, baked, config, farthest, time_us},
 };
 use crate::{
@@ -375,11 +375,8 @@ fn setting(
     let patch = Patch::around(model.surface(), vertex, 0.06 * size)?;
     let way: [f64; 3] = std::array::from_fn(|axis| f64::from(model.displacement_row(vertex, axis, 0)));
     let length = way.iter().map(|x| x * x).sum::<f64>().sqrt();
-    let unit = deflect(
-        &mesh,
-        &setting,
-        &[DeadLoad { patch: patch.clone(), force: way.map(|x| 1e-9 * x / length) }],
-    )?;
+    let unit =
+        under(&mesh, &setting, &[DeadLoad { patch: patch.clone(), force: way.map(|x| 1e-9 * x / length) }])?;
     let give = unit.patches[0].iter().map(|x| x * x).sum::<f64>().sqrt() / 1e-9;
     let mut out = format!(
         "The {name}, {} {}, 60 modes, the default at run time (exact step of 1/60 s, warp, residual flexibility), held at its foot and pulled where it gives most, against a St. Venant-Kirchhoff solution with the same elements (so what the elements themselves are off by is in neither; figure a says it):\n\n| pulled by, % of the size | surface off by, rms / largest, % of the size | without warp, largest | force along the pull off by, % (all of it) | without warp | step us |\n| --- | --- | --- | --- | --- | --- |\n",
@@ -395,7 +392,7 @@ fn setting(
         progress.report("nonlinear", share / 0.2);
         let load =
             vec![DeadLoad { patch: patch.clone(), force: way.map(|x| share * size / give * x / length) }];
-        let truth = match deflect(&mesh, &setting, &load) {
+        let truth = match under(&mesh, &setting, &load) {
             Ok(truth) => truth,
             Err(error) => {
                 let _ = writeln!(

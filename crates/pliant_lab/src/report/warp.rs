@@ -2,8 +2,8 @@
 
 use std::sync::Arc;
 
-use pliant_bake::{BakeConfig, DeadLoad, Deflection, deflect};
-use pliant_mesh::shapes;
+use pliant_bake::{BakeConfig, BakeError, DeadLoad, Deflection, Material, StaticLoads, deflect};
+use pliant_mesh::{TetMesh, shapes};
 use pliant_modal::{Body, BodyConfig, Element, GrabConfig, ModalModel, Patch, StepSettings};
 
 use super::{
@@ -99,7 +99,7 @@ pub(super) fn warp(quick: bool) -> Result<Vec<Figure>, LabError> {
     let loads: &[f64] = if quick { &[0.25, 1.0, 2.0] } else { &[0.1, 0.25, 0.5, 1.0, 2.0, 3.0] };
     for &p in loads {
         let load = vec![DeadLoad { patch: middle.clone(), force: [0.0, p * stiffness, 0.0] }];
-        let truth = deflect(&mesh, &setting, &load)?;
+        let truth = under(&mesh, &setting, &load)?;
         let reach = truth.patches[0].iter().map(|x| x * x).sum::<f64>().sqrt();
         for (which, warp) in [true, false].into_iter().enumerate() {
             let held = held_as(
@@ -117,7 +117,7 @@ pub(super) fn warp(quick: bool) -> Result<Vec<Figure>, LabError> {
             finer = on_finer(&setting, thick, p * stiffness, &truth)?;
         }
         let load = couple(0.6 * p * stiffness)?;
-        let truth = deflect(&mesh, &setting, &load)?;
+        let truth = under(&mesh, &setting, &load)?;
         let turn = truth.patches[0].iter().map(|x| x * x).sum::<f64>().sqrt();
         for (which, warp) in [true, false].into_iter().enumerate() {
             let held = held_as(
@@ -202,12 +202,21 @@ fn nearest_end(model: &ModalModel, thick: f64) -> u32 {
     (0..positions.len() as u32).min_by(|a, b| away(*a).total_cmp(&away(*b))).unwrap_or(0)
 }
 
+/// Solves for the shape of a St. Venant-Kirchhoff body under dead loads.
+pub(super) fn under(
+    mesh: &TetMesh,
+    setting: &BakeConfig,
+    forces: &[DeadLoad],
+) -> Result<Deflection, BakeError> {
+    deflect(mesh, setting, Material::StVenantKirchhoff, &StaticLoads { forces, ..Default::default() })
+}
+
 /// Applies the same load on a finer mesh. Returns the distance of its patch from the reference's
 /// patch.
 fn on_finer(setting: &BakeConfig, thick: f64, force: f64, truth: &Deflection) -> Result<f64, LabError> {
     let fine = shapes::bar([24, 4, 4], [1.0, thick, thick])?;
     let (model, _) = baked(&fine, &BakeConfig { modes: 4, ..setting.clone() })?;
     let patch = Patch::around(model.surface(), nearest_end(&model, thick), 0.08)?;
-    let again = deflect(&fine, setting, &[DeadLoad { patch, force: [0.0, force, 0.0] }])?;
+    let again = under(&fine, setting, &[DeadLoad { patch, force: [0.0, force, 0.0] }])?;
     Ok((0..3).map(|k| (again.patches[0][k] - truth.patches[0][k]).powi(2)).sum::<f64>().sqrt())
 }
