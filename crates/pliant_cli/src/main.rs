@@ -11,6 +11,7 @@
 //! pliant bake bar.msh --modes 12 --young 1e5 --anchor 'x<0.01' -o bar.modal   # held at one end
 //! pliant inspect bar.modal                                                   # its modes, and how exact they are
 //! pliant bench step bar.modal                                                # what it costs here
+//! pliant pull bar.modal --at 1,0.1,0.1 --radius 0.15 --by 0,0.05,0            # what a hand feels
 //! pliant stream --model bar.modal --network paper-1 --seconds 5              # what a guest sees of it
 //! ```
 //!
@@ -22,6 +23,7 @@ mod inspect;
 mod mesh;
 mod output;
 mod progress;
+mod pull;
 mod report;
 mod stability;
 mod stream;
@@ -49,6 +51,8 @@ enum Command {
     Inspect(inspect::InspectArgs),
     /// Measures the cost of a body on this machine
     Bench(bench::BenchArgs),
+    /// Pulls a body slowly and prints the force on the hand
+    Pull(pull::PullArgs),
     /// Measures the cost and the errors of the method, as tables and plots
     Report(report::ReportArgs),
     /// Runs stiff, extreme and unfair cases and prints the margin to the bound of each
@@ -64,6 +68,7 @@ fn main() -> ExitCode {
         Command::Bake(args) => bake::run(args),
         Command::Inspect(args) => inspect::run(&args),
         Command::Bench(args) => bench::run(&args),
+        Command::Pull(args) => pull::run(&args),
         Command::Report(args) => report::run(&args),
         Command::Stability(args) => stability::run(&args),
         Command::Stream(args) => stream::run(&args),

@@ -6,6 +6,7 @@ use clap::{Args, Subcommand};
 use pliant_lab::fill::fill;
 use pliant_mesh::{TetMesh, io, shapes};
 
+use crate::output::three;
 use crate::progress::Bar;
 use crate::{CliError, output};
 
@@ -79,17 +80,6 @@ enum MeshShape {
         #[command(flatten)]
         msh: Msh,
     },
-}
-
-/// Parses three numbers separated by commas.
-fn three<T: std::str::FromStr>(text: &str) -> Result<[T; 3], String> {
-    let parts: Vec<T> = text
-        .split(',')
-        .map(|part| part.trim().parse().map_err(|_| format!("`{part}` is no such number")))
-        .collect::<Result<_, _>>()?;
-    parts.try_into().map_err(|parts: Vec<T>| {
-        format!("expected three numbers with commas between them, got {}", parts.len())
-    })
 }
 
 fn msh_version(text: &str) -> Result<io::MshVersion, String> {

@@ -158,6 +158,56 @@ fn a_body_is_timed_against_the_memory() {
 }
 
 #[test]
+fn a_pull_feels_a_beam_as_timoshenko_says() {
+    let folder = Folder::new("pull");
+    let (mesh, model, pulled) = (folder.file("bar.msh"), folder.file("bar.modal"), folder.file("out.ply"));
+    succeeds(&["mesh", "bar", "--cells", "20,2,2", "--size", "1,0.1,0.1", "-o", &mesh]);
+    let bake = ["bake", &mesh, "--modes", "20", "--young", "2e6", "--poisson", "0", "--anchor", "x<0.001"];
+    succeeds(&[&bake[..], &["--rayleigh", "0,0", "-o", &model]].concat());
+    let at = ["pull", &model, "--at", "1,0.05,0.05", "--radius", "0.08"];
+    let by = |by: &str| json(&succeeds(&[&at[..], &["--by", by, "--json"]].concat()));
+    // w = P L^3 / (3 E I) + P L / (k G A) with k = 10 (1 + nu) / (12 + 11 nu).
+    let (young, poisson, thick, way) = (2e6, 0.0, 0.1f64, 0.001);
+    let bending = 1.0 / (3.0 * young * thick.powi(4) / 12.0);
+    let shear_factor = 10.0 * (1.0 + poisson) / (12.0 + 11.0 * poisson);
+    let shear = 1.0 / (shear_factor * young / (2.0 * (1.0 + poisson)) * thick * thick);
+    let aside = by("0,0.001,0");
+    let number = |value: &serde_json::Value| value.as_f64().unwrap();
+    let force = -number(&aside["reaction"][1]);
+    let expected = way / (bending + shear);
+    assert!((force / expected - 1.0).abs() < 0.02, "{force} N, Timoshenko {expected} N");
+    // Half the force along the way, but for the little that the bar moves sideways.
+    assert!((number(&aside["energy"]) / (0.5 * force * way) - 1.0).abs() < 1e-3, "{aside}");
+    for (axis, moved) in aside["moved"].as_array().unwrap().iter().enumerate() {
+        let wanted = if axis == 1 { way } else { 0.0 };
+        assert!((number(moved) - wanted).abs() < 1e-3 * way, "{aside}");
+    }
+    let (vertices, weights) = (aside["vertices"].as_array().unwrap(), aside["weights"].as_array().unwrap());
+    assert_eq!(vertices.len(), weights.len());
+    assert!((weights.iter().map(number).sum::<f64>() - 1.0).abs() < 1e-9);
+    for axis in 0..3 {
+        let mean: f64 = vertices.iter().zip(weights).map(|(v, w)| number(&v[axis]) * number(w)).sum();
+        assert!((mean - number(&aside["patch"][axis])).abs() < 1e-6);
+    }
+    assert_eq!((&aside["elasticity"], &aside["at_rest"]), (&"linear".into(), &true.into()));
+    assert!(number(&aside["step_us"]["p50"]) <= number(&aside["step_us"]["p999"]));
+
+    let told = succeeds(&[&at[..], &["--by", "0,0.2,0", "--surface", &pulled]].concat());
+    assert!(told.contains("reaction") && told.contains("elastic energy"), "{told}");
+    let surface = pliant_mesh::io::read_surface(&pulled).unwrap();
+    let end = surface.positions.iter().map(|p| p[1]).fold(0.0, f64::max);
+    assert!((end - 0.3).abs() < 0.02, "{end}");
+
+    assert!(refused(&[&at[..], &["--by", "0,nan,0"]].concat()).contains("finite"));
+    let none = ["pull", &model, "--at", "nan,0,0", "--radius", "0.08", "--by", "0,0,0"];
+    assert!(refused(&none).contains("finite"));
+    let free = folder.file("free.modal");
+    succeeds(&["bake", &mesh, "--modes", "6", "-o", &free]);
+    let follows = refused(&["pull", &free, "--at", "1,0,0", "--radius", "0.1", "--by", "0,0.1,0"]);
+    assert!(follows.contains("free"), "{follows}");
+}
+
+#[test]
 fn an_unchanged_bake_comes_from_the_cache() {
     let folder = Folder::new("cache");
     let mesh = folder.file("bar.msh");

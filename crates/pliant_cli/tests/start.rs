@@ -17,7 +17,7 @@ fn the_start_in_the_documentation_runs() {
     let folder = Folder::new("start");
     let page = include_str!("../src/main.rs");
     let lines: Vec<&str> = page.lines().filter_map(|line| line.strip_prefix("//! pliant ")).collect();
-    assert_eq!(lines.len(), 5, "{lines:?}");
+    assert_eq!(lines.len(), 6, "{lines:?}");
     for line in lines {
         let output = program().args(words(line)).current_dir(&folder.0).output().unwrap();
         let told = String::from_utf8_lossy(&output.stdout).into_owned();

@@ -38,6 +38,9 @@ pub enum LabError {
         /// The largest allowed number of threads.
         most: usize,
     },
+    /// A hand cannot pull a body that has no anchors, because the body follows.
+    #[error("the body is free and follows the hand; expected a body with anchors")]
+    Free,
     /// A plot cannot be drawn into this file.
     #[error("{0}: cannot be drawn")]
     Plot(PathBuf),

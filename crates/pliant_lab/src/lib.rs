@@ -26,6 +26,7 @@
 //! | [`pair`] | host and guests joined by emulated links in virtual time |
 //! | [`experiment`] | measures a session: errors, forces, bytes |
 //! | [`bench`](mod@bench) | cost of a body on this machine, next to the memory bandwidth limit |
+//! | [`pull`](mod@pull) | what a hand feels that pulls a body slowly |
 //! | [`report`] | cost and errors of the method, as tables, plots and text |
 //! | [`stability`] | stiff, extreme and unfair cases, each with its bound and its margin |
 //! | [`fill`](mod@fill) | tetrahedral meshes from files of any supported kind |
@@ -38,6 +39,7 @@ pub mod fill;
 mod machine;
 pub mod pair;
 pub mod progress;
+pub mod pull;
 pub mod report;
 pub mod stability;
 

@@ -6,7 +6,7 @@
 //! | --- | --- | --- | --- |
 //! | `.obj` | Wavefront OBJ | surface | |
 //! | `.stl` | STL, text and binary | surface | |
-//! | `.ply` | Stanford PLY, text and binary | surface | |
+//! | `.ply` | Stanford PLY, text and binary | surface | text |
 //! | `.gltf`, `.glb` | glTF 2.0 | surface | |
 //! | `.ron` | [`Scene`], the project's own | distance field | |
 //! | `.msh` | Gmsh MSH 2.2 and 4.1, text and binary | tetrahedra | text |
@@ -210,6 +210,20 @@ pub fn write_tets(path: impl AsRef<Path>, mesh: &TetMesh) -> Result<(), MeshErro
     write_text(path, &format(mesh))
 }
 
+/// Writes a surface without its texture coordinates as `.ply`.
+///
+/// # Errors
+/// Returns [`MeshError::UnknownFormat`] for another extension, the errors of [`Surface::check`], and
+/// [`MeshError::Write`].
+pub fn write_surface(path: impl AsRef<Path>, surface: &Surface) -> Result<(), MeshError> {
+    let path = path.as_ref();
+    if extension(path) != "ply" {
+        return Err(unknown(path, ".ply"));
+    }
+    surface.check()?;
+    write_text(path, &ply::format(surface))
+}
+
 fn extension(path: &Path) -> String {
     path.extension().and_then(|e| e.to_str()).unwrap_or_default().to_ascii_lowercase()
 }
@@ -394,6 +408,23 @@ mod tests {
         let doubled = "v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 3\nf 1 3 2\n";
         assert!(matches!(filled(doubled), Err(MeshError::Parameter { name: "box around the shape", .. })));
         fs::remove_dir_all(folder).unwrap();
+    }
+
+    #[test]
+    fn a_written_surface_is_read_again() {
+        let folder = std::env::temp_dir().join(format!("pliant-ply-{}", std::process::id()));
+        fs::create_dir_all(&folder).unwrap();
+        let (surface, _) = crate::shapes::bar([3, 2, 1], [1.0, 1.0 / 3.0, 1e-9]).unwrap().boundary();
+        let file = folder.join("bar.ply");
+        write_surface(&file, &surface).unwrap();
+        assert_eq!(read_surface(&file).unwrap(), surface);
+        let none = Surface::default();
+        assert!(matches!(write_surface(&file, &none), Err(MeshError::Empty { .. })));
+        assert!(matches!(
+            write_surface(folder.join("bar.stl"), &surface),
+            Err(MeshError::UnknownFormat { .. })
+        ));
+        fs::remove_dir_all(&folder).unwrap();
     }
 
     mod any_bytes {

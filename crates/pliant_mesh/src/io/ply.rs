@@ -30,6 +30,23 @@ struct PlyElement {
     properties: Vec<Property>,
 }
 
+/// Formats positions and triangles as text.
+pub(super) fn format(surface: &Surface) -> String {
+    let (vertices, faces) = (surface.positions.len(), surface.triangles.len());
+    let mut out = format!(
+        "ply\nformat ascii 1.0\ncomment lengths in m\nelement vertex {vertices}\nproperty double x\n\
+         property double y\nproperty double z\nelement face {faces}\n\
+         property list uchar int vertex_indices\nend_header\n"
+    );
+    for [x, y, z] in &surface.positions {
+        out.push_str(&format!("{x} {y} {z}\n"));
+    }
+    for [a, b, c] in &surface.triangles {
+        out.push_str(&format!("3 {a} {b} {c}\n"));
+    }
+    out
+}
+
 pub(super) fn parse(bytes: &[u8]) -> Result<Surface, MeshError> {
     let mut cursor = Cursor::new("PLY", bytes);
     let cursor = &mut cursor;
