@@ -25,8 +25,8 @@ pub enum Material {
     /// The law of St. Venant and Kirchhoff, `W = lambda/2 (tr E)^2 + mu |E|^2` with
     /// `E = (F^T F - I) / 2`.
     ///
-    /// The law is exact for large rotations. A body that is pressed collapses: the stress is largest
-    /// at a stretch of `1 / sqrt 3`.
+    /// The law is exact for large rotations. A body that is pressed collapses: the stress is
+    /// largest at a stretch of `1 / sqrt 3`.
     StVenantKirchhoff,
 }
 

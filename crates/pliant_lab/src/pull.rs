@@ -63,7 +63,7 @@ pub struct Pulled {
 /// Takes hold of a patch, leads it slowly along `by`, and waits until the body is at rest.
 ///
 /// Inertia does not matter for the result: whenever the kinetic energy of the body falls, its
-/// velocities are set to zero (dynamic relaxation: Day 1965, Barnes 1988).
+/// velocities are set to zero (dynamic relaxation with kinetic damping: Cundall 1976, Barnes 1999).
 ///
 /// # Errors
 /// Returns [`LabError::Free`] for a body without anchors. Returns [`LabError::Model`] or

@@ -213,8 +213,8 @@ pub fn write_tets(path: impl AsRef<Path>, mesh: &TetMesh) -> Result<(), MeshErro
 /// Writes a surface without its texture coordinates as `.ply`.
 ///
 /// # Errors
-/// Returns [`MeshError::UnknownFormat`] for another extension, the errors of [`Surface::check`], and
-/// [`MeshError::Write`].
+/// Returns [`MeshError::UnknownFormat`] for another extension, the errors of [`Surface::check`],
+/// and [`MeshError::Write`].
 pub fn write_surface(path: impl AsRef<Path>, surface: &Surface) -> Result<(), MeshError> {
     let path = path.as_ref();
     if extension(path) != "ply" {
