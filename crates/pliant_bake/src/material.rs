@@ -10,6 +10,7 @@ pub(crate) type Tangent = SMatrix<f64, 9, 9>;
 
 /// Law of the elastic energy for large strains.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Hash)]
+#[non_exhaustive]
 pub enum Material {
     /// The stable neo-Hookean law of Smith, De Goes and Kim, *Stable Neo-Hookean Flesh Simulation*,
     /// ACM Trans. Graph. 37(2), 2018, eq. (14), with `I_C = |F|^2` and `J = det F`:

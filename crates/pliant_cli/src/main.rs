@@ -17,6 +17,7 @@
 //!
 //! The test `tests/start.rs` runs these lines. `pliant COMMAND --help` describes all options.
 
+mod arguments;
 mod bake;
 mod bench;
 mod inspect;

@@ -6,7 +6,7 @@ use clap::{Args, Subcommand};
 use pliant_lab::fill::fill;
 use pliant_mesh::{TetMesh, io, shapes};
 
-use crate::output::three;
+use crate::arguments::three;
 use crate::progress::Bar;
 use crate::{CliError, output};
 

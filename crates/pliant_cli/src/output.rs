@@ -1,4 +1,4 @@
-//! Output of the program, checks of its output paths, and arguments of several numbers.
+//! Output of the program, and checks of its output paths.
 
 use std::io::Write;
 use std::path::Path;
@@ -129,15 +129,4 @@ fn damping(law: pliant_modal::Damping) -> String {
         pliant_modal::Damping::Ratio(zeta) => format!("{} % of critical", 100.0 * zeta),
         other => format!("{other:?}"),
     }
-}
-
-/// Parses three numbers separated by commas.
-pub(crate) fn three<T: std::str::FromStr>(text: &str) -> Result<[T; 3], String> {
-    let parts: Vec<T> = text
-        .split(',')
-        .map(|part| part.trim().parse().map_err(|_| format!("`{part}` is no such number")))
-        .collect::<Result<_, _>>()?;
-    parts.try_into().map_err(|parts: Vec<T>| {
-        format!("expected three numbers with commas between them, got {}", parts.len())
-    })
 }

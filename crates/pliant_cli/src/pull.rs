@@ -7,7 +7,7 @@ use pliant_lab::pull::{Pull, Pulled, pull};
 use pliant_mesh::{Surface, io};
 use pliant_modal::ModalModel;
 
-use crate::output::three;
+use crate::arguments::three;
 use crate::{CliError, output};
 
 #[derive(Args, Debug)]

@@ -201,6 +201,10 @@ fn a_pull_feels_a_beam_as_timoshenko_says() {
     assert!(refused(&[&at[..], &["--by", "0,nan,0"]].concat()).contains("finite"));
     let none = ["pull", &model, "--at", "nan,0,0", "--radius", "0.08", "--by", "0,0,0"];
     assert!(refused(&none).contains("finite"));
+    for far in ["1000,50,50", "1e200,0,0"] {
+        let millimeters = ["pull", &model, "--at", far, "--radius", "0.08", "--by", "0,0.1,0"];
+        assert!(refused(&millimeters).contains("away from the surface"));
+    }
     let free = folder.file("free.modal");
     succeeds(&["bake", &mesh, "--modes", "6", "-o", &free]);
     let follows = refused(&["pull", &free, "--at", "1,0,0", "--radius", "0.1", "--by", "0,0.1,0"]);

@@ -41,6 +41,14 @@ pub enum LabError {
     /// A hand cannot pull a body that has no anchors, because the body follows.
     #[error("the body is free and follows the hand; expected a body with anchors")]
     Free,
+    /// A point where a hand should take hold is far away from the body.
+    #[error("the point is {away} m away from the surface of a body of {size} m; expected one near it")]
+    Far {
+        /// Distance from the surface, m.
+        away: f64,
+        /// Size of the body, m.
+        size: f64,
+    },
     /// A plot cannot be drawn into this file.
     #[error("{0}: cannot be drawn")]
     Plot(PathBuf),

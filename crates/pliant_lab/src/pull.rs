@@ -66,7 +66,8 @@ pub struct Pulled {
 /// velocities are set to zero (dynamic relaxation with kinetic damping: Cundall 1976, Barnes 1999).
 ///
 /// # Errors
-/// Returns [`LabError::Free`] for a body without anchors. Returns [`LabError::Model`] or
+/// Returns [`LabError::Free`] for a body without anchors, and [`LabError::Far`] for a point that is
+/// farther from the surface than the body is large. Returns [`LabError::Model`] or
 /// [`LabError::Step`] when the body cannot be grabbed or stepped, or when a number is out of its
 /// range.
 pub fn pull(model: &Arc<ModalModel>, pull: &Pull) -> Result<Pulled, LabError> {
@@ -85,6 +86,11 @@ pub fn pull(model: &Arc<ModalModel>, pull: &Pull) -> Result<Pulled, LabError> {
     let away = |v: u32| (0..3).map(|k| (f64::from(positions[v as usize][k]) - pull.at[k]).powi(2)).sum();
     let distance: Vec<f64> = (0..positions.len() as u32).map(away).collect();
     let closest = (0..distance.len()).min_by(|&a, &b| distance[a].total_cmp(&distance[b])).unwrap_or(0);
+    // Such a point was most likely told in another unit.
+    let far = distance.get(closest).map_or(f64::INFINITY, |d2: &f64| d2.sqrt());
+    if far > model.size() {
+        return Err(LabError::Far { away: far, size: model.size() });
+    }
     let patch = Patch::around(model.surface(), closest as u32, pull.radius)?;
     let grab = body.grab(&patch, GrabConfig::default())?;
     let start = Vector3::from(body.grab_position(grab)?);
