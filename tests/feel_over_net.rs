@@ -122,7 +122,7 @@ fn a_hand_far_away_feels_the_body_at_once_and_nothing_when_the_network_is_gone()
     // The hand is still for some time, so that the session can measure the one-way delay.
     until(&mut [&mut host, &mut g.app], "two seconds are shown", |apps| {
         let stats = apps[1].world().resource::<NetStats>();
-        stats.shown > 80 && !stats.round_trip.is_zero()
+        stats.displayed_ticks > 80 && !stats.round_trip.is_zero()
     });
 
     let hand = g.device;

@@ -209,7 +209,11 @@ fn tell(
 ) {
     let now = time.elapsed_secs_f64();
     for joined in joined.read() {
-        println!("{now:6.2} s  in as user {}{}", joined.user.0, if joined.again { " again" } else { "" });
+        println!(
+            "{now:6.2} s  in as user {}{}",
+            joined.user.0,
+            if joined.reconnected { " again" } else { "" }
+        );
     }
     for lost in lost.read() {
         println!("{now:6.2} s  the host cannot be heard: {}", lost.reason);

@@ -93,7 +93,7 @@ pub fn write_shown(
             trace.last = view.tick();
             written = trace.put(view.tick(), UserId::HOST, None, &streamed.q);
         }
-        if let (Some((tick, state)), Some(felt)) = (guest.shown(*body), forces.iter().next())
+        if let (Some((tick, state)), Some(felt)) = (guest.visual_state(*body), forces.iter().next())
             && tick > trace.last_held
         {
             trace.last_held = tick;

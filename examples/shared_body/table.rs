@@ -21,7 +21,7 @@ pub fn print(options: &Options, host: &HostReport, you: &GuestReport, other: &Gu
         println!("{name:<42}{:>12}{:>12}", value(you), value(other));
     };
     row("ticks sent", &|_| host.ticks.to_string());
-    row("ticks shown", &|g| g.stats.shown.to_string());
+    row("ticks shown", &|g| g.stats.displayed_ticks.to_string());
     row("ticks compared with the truth", &|g| g.meters.streamed.ticks.to_string());
     row("behind the host, ms", &|g| format!("{:.0}", 1e3 * g.meters.streamed.behind() / crate::RATE));
     row("datagrams lost on the way here, %", &|g| format!("{:.1}", 100.0 * g.stats.loss_in));

@@ -39,17 +39,17 @@ pub enum BodyError {
     Step(StepError),
     /// The vertex of an [`Impulse`](crate::Impulse) or a [`Push`](crate::Push) does not exist, a
     /// number is NaN or infinite, or the resulting velocity of the body is not finite.
-    #[error("the blow was refused: {0}")]
-    Blow(StepError),
+    #[error("the impulse was refused: {0}")]
+    Impulse(StepError),
     /// The entity of an [`Impulse`](crate::Impulse) or a [`Push`](crate::Push) is not a body, or
     /// its model is not loaded yet.
-    #[error("the blow was refused: this entity is no body, or its model is not there yet")]
+    #[error("the impulse was refused: this entity is no body, or its model is not there yet")]
     NoBody,
     /// The body of an [`Impulse`](crate::Impulse) or a [`Push`](crate::Push) is remote.
-    #[error("the blow was refused: this body is driven remotely and is not stepped here")]
+    #[error("the impulse was refused: this body is driven remotely and is not stepped here")]
     NotLocal,
     /// A visual state has the wrong number of modes.
-    #[error("a shown state needs {expected} modal coordinates, got {found}")]
+    #[error("a visual state needs {expected} modal coordinates, got {found}")]
     VisualLength {
         /// Number of modes of the body.
         expected: usize,
@@ -57,7 +57,7 @@ pub enum BodyError {
         found: usize,
     },
     /// A modal coordinate of a visual state is NaN or infinite.
-    #[error("modal coordinate {mode} of a shown state must be finite, got {value}")]
+    #[error("modal coordinate {mode} of a visual state must be finite, got {value}")]
     VisualNotFinite {
         /// Index of the first mode that is not finite.
         mode: usize,

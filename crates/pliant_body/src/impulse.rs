@@ -72,7 +72,7 @@ pub(crate) fn hit_bodies(
         // A refused impulse or force does not wake the body.
         match apply(&mut state.body, scale) {
             Ok(()) => state.wake(),
-            Err(error) => refusals.tell(&name, entity, BodyError::Blow(error)),
+            Err(error) => refusals.tell(&name, entity, BodyError::Impulse(error)),
         }
     };
     for &Impulse { body, vertex, impulse } in strikes.read() {

@@ -100,7 +100,7 @@ struct Told {
     force_rms_percent: f64,
     force_ringing: f64,
     hand_to_force_ms: f64,
-    shown_delay_ms: f64,
+    visual_delay_ms: f64,
     recover_ms: f64,
     bytes_per_frame: f64,
     kbit_s: f64,
@@ -121,7 +121,7 @@ impl Told {
             force_rms_percent: figures.force_rms_percent,
             force_ringing: figures.force_ringing,
             hand_to_force_ms: figures.hand_to_force_ms,
-            shown_delay_ms: figures.shown_delay_ms,
+            visual_delay_ms: figures.visual_delay_ms,
             recover_ms: figures.recover_ms,
             bytes_per_frame: figures.bytes_per_frame,
             kbit_s: figures.kbit_s,
@@ -260,7 +260,7 @@ fn table(all: &[Told]) -> String {
             t.force_rms_percent,
             t.force_ringing,
             t.hand_to_force_ms,
-            t.shown_delay_ms,
+            t.visual_delay_ms,
             t.kbit_s,
             t.cpu_us_per_tick
         );

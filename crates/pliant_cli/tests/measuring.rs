@@ -46,7 +46,7 @@ fn a_stream_is_measured_and_the_same_seed_gives_the_same_figures() {
 
     let keys: Vec<&String> = default.as_object().unwrap().keys().collect();
     let promised = "ticks lost recovered rms_percent max_percent end_percent force_rms_percent force_ringing \
-        hand_to_force_ms shown_delay_ms recover_ms bytes_per_frame kbit_s cpu_us_per_tick hash";
+        hand_to_force_ms visual_delay_ms recover_ms bytes_per_frame kbit_s cpu_us_per_tick hash";
     let mut promised: Vec<&str> = promised.split_whitespace().collect();
     promised.sort_unstable();
     assert_eq!(keys, promised);

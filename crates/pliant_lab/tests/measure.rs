@@ -67,18 +67,18 @@ fn clock() -> Duration {
 
 fn show(name: &str, f: &Metrics) {
     println!(
-        "{name:<26} lost {:>4} guessed {:>4} rms {:.4}% max {:.3}% end {:.1e}% hidden {:.1e}% force {:.3}% ringing {:.4} (true {:.4}) \
+        "{name:<26} lost {:>4} guessed {:>4} rms {:.4}% max {:.3}% end {:.1e}% confirmed {:.1e}% force {:.3}% ringing {:.4} (true {:.4}) \
          delay {:.0} ms hand-force {:.0} ms recover {:.0} ms {:.0} B {:.1} kbit/s {:.1} us/tick",
         f.lost,
         f.guessed,
         f.rms_percent,
         f.max_percent,
         f.end_percent,
-        f.hidden_end_percent,
+        f.confirmed_end_percent,
         f.force_rms_percent,
         f.force_ringing,
         f.true_ringing,
-        f.shown_delay_ms,
+        f.visual_delay_ms,
         f.hand_to_force_ms,
         f.recover_ms,
         f.bytes_per_frame,
@@ -216,13 +216,13 @@ fn worst(link: &LinkConfig, policy: &str, seconds: f64, seeds: u64) -> Metrics {
                     w.recovered += f.recovered;
                     w.rms_percent = w.rms_percent.max(f.rms_percent);
                     w.max_percent = w.max_percent.max(f.max_percent);
-                    w.hidden_end_percent = w.hidden_end_percent.max(f.hidden_end_percent);
+                    w.confirmed_end_percent = w.confirmed_end_percent.max(f.confirmed_end_percent);
                     w.recover_ms = w.recover_ms.max(f.recover_ms);
                     w.kbit_s = w.kbit_s.max(f.kbit_s);
                     w.force_rms_percent = w.force_rms_percent.max(f.force_rms_percent);
                     w.force_ringing = w.force_ringing.max(f.force_ringing);
                     w.true_ringing = w.true_ringing.max(f.true_ringing);
-                    w.shown_delay_ms = w.shown_delay_ms.max(f.shown_delay_ms);
+                    w.visual_delay_ms = w.visual_delay_ms.max(f.visual_delay_ms);
                     w.counts.too_late += f.counts.too_late;
                 }
             });
@@ -247,7 +247,7 @@ fn default_policy_holds_its_bars_for_ten_minutes_on_many_seeds() {
             "| {name} | {policy} | {:.4} | {:.3} | {:.1e} | {:.0} | {:.3} | {:.4} | {:.4} | {:.1} |",
             f.rms_percent,
             f.max_percent,
-            f.hidden_end_percent,
+            f.confirmed_end_percent,
             f.recover_ms,
             f.force_rms_percent,
             f.force_ringing,
@@ -284,7 +284,7 @@ fn an_hour_does_not_drift() {
     show("two minutes", &short);
     show("one hour", &long);
     assert!(long.rms_percent < 1.5 * short.rms_percent);
-    assert!(long.hidden_end_percent < 0.02, "{} %", long.hidden_end_percent);
+    assert!(long.confirmed_end_percent < 0.02, "{} %", long.confirmed_end_percent);
 }
 
 #[test]

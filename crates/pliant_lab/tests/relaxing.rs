@@ -50,15 +50,19 @@ fn every_policy_streams_a_relaxing_body_as_well_as_an_elastic_one() {
             "{name}: elastic rms {:.4} % max {:.3} % end {:.1e} %, relaxing rms {:.4} % max {:.3} % end {:.1e} % force {:.3} %",
             elastic.rms_percent,
             elastic.max_percent,
-            elastic.hidden_end_percent,
+            elastic.confirmed_end_percent,
             relaxing.rms_percent,
             relaxing.max_percent,
-            relaxing.hidden_end_percent,
+            relaxing.confirmed_end_percent,
             relaxing.force_rms_percent
         );
         assert!(relaxing.ticks > 500, "{name}");
         if name != "none" {
-            assert!(relaxing.hidden_end_percent < 0.01, "{name}: {} % stay", relaxing.hidden_end_percent);
+            assert!(
+                relaxing.confirmed_end_percent < 0.01,
+                "{name}: {} % stay",
+                relaxing.confirmed_end_percent
+            );
             assert!(relaxing.rms_percent < 3.0 * elastic.rms_percent + 0.01, "{name}");
         }
         if name == "default" {

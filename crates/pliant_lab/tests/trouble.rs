@@ -131,7 +131,7 @@ fn frames_that_scatter_like_a_picture_rate_are_shown_evenly_and_without_guessing
         let (stepped, guessed) = (after.stepped - before.stepped, after.guessed - before.guessed);
         assert!((795..=805).contains(&stepped), "{name}: {stepped} ticks in 20 s");
         assert!(guessed as f64 <= 0.04 * stepped as f64, "{name}: {guessed} of {stepped} guessed");
-        assert!(view.shown_delay() < 0.065, "{name}: {} s", view.shown_delay());
+        assert!(view.visual_delay() < 0.065, "{name}: {} s", view.visual_delay());
     }
 }
 
@@ -172,7 +172,7 @@ fn adaptive_playout_waits_only_for_what_scatters() {
         let guessed = (counts.guessed - before.guessed) as f64 / (counts.stepped - before.stepped) as f64;
         assert!(guessed < 0.05, "jitter {jitter:?}: {guessed} guessed");
         assert!(counts.repaired + counts.too_late <= counts.guessed, "{counts:?}");
-        view.shown_delay() / 0.025
+        view.visual_delay() / 0.025
     };
     let (clean, rough, wild) = (delay(Duration::ZERO), delay(12 * MS), delay(30 * MS));
     println!("ticks of playout: {clean:.2}, {rough:.2}, {wild:.2}");

@@ -71,7 +71,7 @@ mod view;
 
 pub use metrics::{
     DROPPED, JITTER, LOSS_IN, LOSS_OUT, NACKS, NetStats, QUEUE, RATE_IN, RATE_OUT, RECOVERED, ROUND_TRIP,
-    SHOWN_OFFSET,
+    VISUAL_OFFSET,
 };
 /// Network models for an [`Emulation`].
 pub use pliant_stream::emulator;

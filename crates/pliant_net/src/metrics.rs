@@ -32,7 +32,7 @@ pub const NACKS: DiagnosticPath = DiagnosticPath::const_new("pliant/net/nacks");
 pub const RECOVERED: DiagnosticPath = DiagnosticPath::const_new("pliant/net/recovered");
 /// Diagnostic: known distance of a guest's visual state from the estimate of the true state, % of
 /// the state's size.
-pub const SHOWN_OFFSET: DiagnosticPath = DiagnosticPath::const_new("pliant/net/shown_offset");
+pub const VISUAL_OFFSET: DiagnosticPath = DiagnosticPath::const_new("pliant/net/visual_offset");
 
 /// Network metrics, refreshed every frame.
 ///
@@ -71,7 +71,7 @@ pub struct NetStats {
     /// Guest: the part of these that was corrected when their data arrived.
     pub recovered: u64,
     /// Guest: ticks displayed.
-    pub shown: u64,
+    pub displayed_ticks: u64,
     /// Guest: states taken over from snapshots.
     pub snapshots: u64,
     /// Invalid datagrams and messages received.
@@ -89,7 +89,7 @@ pub struct NetStats {
     /// Guest: distance of the visual state from the best estimate of the true state, as a share of
     /// the state's size (0 to 1 and beyond). The largest of all bodies. It is the part of the error
     /// that the receiver knows: what corrections have found and the blend has not yet removed.
-    pub shown_offset: f64,
+    pub visual_offset: f64,
 }
 
 impl NetStats {
@@ -219,7 +219,7 @@ impl NetStats {
         diagnostics.add_measurement(&QUEUE, || self.queue.as_secs_f64() * 1e3);
         diagnostics.add_measurement(&LOSS_IN, || self.loss_in * 100.0);
         diagnostics.add_measurement(&LOSS_OUT, || self.loss_out * 100.0);
-        diagnostics.add_measurement(&SHOWN_OFFSET, || self.shown_offset * 100.0);
+        diagnostics.add_measurement(&VISUAL_OFFSET, || self.visual_offset * 100.0);
     }
 }
 
@@ -235,7 +235,7 @@ pub(crate) fn register(app: &mut App) {
         (RATE_OUT, " kbit/s"),
         (NACKS, " /s"),
         (RECOVERED, " /s"),
-        (SHOWN_OFFSET, " %"),
+        (VISUAL_OFFSET, " %"),
     ] {
         app.register_diagnostic(Diagnostic::new(path).with_suffix(suffix));
     }

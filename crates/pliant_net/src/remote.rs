@@ -70,7 +70,7 @@ pub struct SessionJoined {
     /// key.
     pub user: UserId,
     /// Whether the guest was in the session before, as after a [`SessionLost`].
-    pub again: bool,
+    pub reconnected: bool,
 }
 
 /// The session is over.

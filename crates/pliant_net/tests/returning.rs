@@ -111,7 +111,7 @@ fn a_network_that_is_away_for_longer_than_the_timeout_costs_the_time_and_nothing
     });
     println!("noticed after {noticed:.2} s, back {:.2} s after the network", back_at.elapsed().as_secs_f64());
     assert_eq!(state_of(&guest), GuestState::In { user }, "the same user");
-    assert!(messages::<SessionJoined>(&guest).iter().any(|joined| joined.again && joined.user == user));
+    assert!(messages::<SessionJoined>(&guest).iter().any(|joined| joined.reconnected && joined.user == user));
     assert!(messages::<UserJoined>(&host).iter().any(|joined| joined.back && joined.name == "Ann"));
     run_until(&mut [&mut host, &mut guest], "the picture is right, and is felt again", |apps| {
         is_right(apps, body, there, 0.05)?;

@@ -109,7 +109,7 @@ fn a_guest_sees_holds_and_feels_the_hosts_body() {
     run_until(&mut [&mut host, &mut guest], "the figures of a line without a fault", |apps| {
         let stats = *apps[1].world().resource::<NetStats>();
         assert_eq!(stats.rejected, 0, "{stats:?}");
-        must!(stats.shown > 100 && stats.bytes_in > 1000, "{stats:?}");
+        must!(stats.displayed_ticks > 100 && stats.bytes_in > 1000, "{stats:?}");
         must!(stats.loss_in < 0.02, "{stats:?}");
         must!(!stats.round_trip.is_zero() && stats.round_trip.as_millis() < 60, "{stats:?}");
         Ok(())
@@ -167,7 +167,7 @@ fn over_the_papers_first_network_the_shape_stays_right() {
     let mut shown = BTreeMap::new();
     let mut follow = |guest: &App| {
         let net = guest.world().resource::<NetGuest>();
-        if let Some((tick, state)) = net.shown(remote) {
+        if let Some((tick, state)) = net.visual_state(remote) {
             shown.entry(tick).or_insert_with(|| state.q.clone());
         }
         shown.clone()
@@ -262,7 +262,7 @@ fn a_guests_hand_over_the_papers_first_network_does_not_jerk() {
     let mut felt = BTreeMap::new();
     let remote = *guest.world().get::<RemoteBody>(there).unwrap();
     run_until(&mut [&mut host, &mut guest], "five seconds of dragging without a jerk", |apps| {
-        let (tick_there, _) = apps[1].world().resource::<NetGuest>().shown(remote).unwrap();
+        let (tick_there, _) = apps[1].world().resource::<NetGuest>().visual_state(remote).unwrap();
         felt.entry(tick_there).or_insert(apps[1].world().get::<GrabForce>(own).unwrap().force);
         let (at_host, at_guest) = (ringing(&apps[0].world().resource::<Pulls>().0)?, ringing(&felt)?);
         must!(tick(apps[0]) > begin + 240, "at the host {at_host}, at the guest {at_guest}");

@@ -26,7 +26,7 @@ pub struct NetworkView {
     /// on a host, which does not wait for data.
     pub repaired: Option<[u64; 2]>,
     /// Number of requests for repeated ticks, sent by a guest or received by a host.
-    pub asked_again: u64,
+    pub requested_again: u64,
     /// Number of complete states applied from snapshots.
     pub snapshots: u64,
     /// Number of datagrams that this end dropped because a queue was full or the path too narrow.
@@ -36,7 +36,7 @@ pub struct NetworkView {
     pub queueing: bool,
     /// Distance of the visual state from the best estimate of the true state, %. `None` except on a
     /// guest.
-    pub shown_offset: Option<f64>,
+    pub visual_offset: Option<f64>,
     /// Round trip over the last seconds, ms.
     pub round_trips: Trace,
     /// Received data rate over the last seconds, kbit/s.
@@ -180,7 +180,7 @@ pub fn show(ui: &mut Ui, network: &mut NetworkView) {
         }
         line(
             "asked again",
-            format!("{} ticks, snapshots: {}", network.asked_again, network.snapshots),
+            format!("{} ticks, snapshots: {}", network.requested_again, network.snapshots),
             "Repeats of what was lost, and states that were taken over whole.",
         );
         line(
@@ -188,7 +188,7 @@ pub fn show(ui: &mut Ui, network: &mut NetworkView) {
             network.dropped.to_string(),
             "Datagrams that this end let go: full queues, narrow paths.",
         );
-        if let Some(offset) = network.shown_offset {
+        if let Some(offset) = network.visual_offset {
             line(
                 "shown offset",
                 format!("{} %", short(offset)),

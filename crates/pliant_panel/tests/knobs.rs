@@ -257,11 +257,11 @@ fn the_figures_of_a_session_are_shown_with_their_units() {
         loss: [9.0, 8.5],
         rate: [103.0, 20.0],
         repaired: Some([12, 11]),
-        asked_again: 4,
+        requested_again: 4,
         snapshots: 1,
         dropped: 3,
         queueing: true,
-        shown_offset: Some(0.25),
+        visual_offset: Some(0.25),
         users: vec![UserView { name: "Bo".into(), loss: Some([3.0, 4.0]), ..Default::default() }],
         ..Default::default()
     };
@@ -279,7 +279,7 @@ fn the_figures_of_a_session_are_shown_with_their_units() {
         assert!(harness.query_by_label(words).is_some(), "{words}");
     }
     harness.state_mut().repaired = None;
-    harness.state_mut().shown_offset = None;
+    harness.state_mut().visual_offset = None;
     harness.run();
     assert!(harness.query_by_label("shown offset").is_none() && harness.query_by_label("guessed").is_none());
 }

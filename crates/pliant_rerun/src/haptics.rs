@@ -76,7 +76,7 @@ pub(crate) fn say_how_they_are(
             continue;
         }
         match &now {
-            (LoopState::Running, None) => own.say(format!("{name}: running")),
+            (LoopState::Running, None) => own.log(format!("{name}: running")),
             (LoopState::Running, Some(fault)) => own.warn(format!("{name}: {fault}")),
             (state, None) => own.warn(format!("{name}: {}", words(*state))),
             (state, Some(fault)) => own.warn(format!("{name}: {}, {fault}", words(*state))),

@@ -24,7 +24,7 @@
 //! | `spectrum/NAME` | amplitude of the body's most compliant point at each frequency, m over Hz, in the last 256 ticks |
 //! | `AREA/NAME` | every Bevy diagnostic under `pliant/AREA/`, such as those of the network; those of the body crate are `time/step` (ms per tick), `frame/deform` (ms per frame) and `bodies/awake` |
 //! | any other | values set in [`RerunScalars`] |
-//! | `log` | refused inputs, lines written with [`RerunScalars::say`], and the app's log lines, with [`log_layer`] |
+//! | `log` | refused inputs, lines written with [`RerunScalars::log`], and the app's log lines, with [`log_layer`] |
 //!
 //! With the feature `net`, the hands include those of the session's other users, and the log
 //! includes users who join or leave and the state of the connection. With the feature `haptics`,

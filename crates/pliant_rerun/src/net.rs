@@ -25,10 +25,10 @@ pub(crate) fn say_who_comes_and_goes(
     mut own: ResMut<RerunScalars>,
 ) {
     for user in joined.read() {
-        own.say(format!("{} joined", user.name));
+        own.log(format!("{} joined", user.name));
     }
     for user in left.read() {
-        own.say(format!("{} left: {}", user.name, user.reason));
+        own.log(format!("{} left: {}", user.name, user.reason));
     }
     for grab in refused.read() {
         own.warn(format!("the host refused a grab: {grab:?}"));
@@ -78,7 +78,7 @@ pub(crate) fn say_how_it_stands(
         return;
     }
     if stands {
-        own.say(standing.clone());
+        own.log(standing.clone());
     } else {
         own.warn(standing.clone());
     }

@@ -56,7 +56,7 @@ impl RerunScalars {
     }
 
     /// Writes a line to the recording's log.
-    pub fn say(&mut self, text: impl Into<String>) {
+    pub fn log(&mut self, text: impl Into<String>) {
         self.line(false, text.into());
     }
 

@@ -390,7 +390,7 @@ fn a_viewer_that_does_not_read_drops_ticks_and_never_holds_the_app_up() {
         // kilobyte. While ticks are dropped, the last line waits and no other is added.
         app.add_systems(Update, |mut metrics: ResMut<RerunScalars>| {
             if metrics.lines.is_empty() {
-                metrics.say("x".repeat(1 << 20));
+                metrics.log("x".repeat(1 << 20));
             }
         });
         // A worker that is only late drops some of the ticks. A worker that is stuck drops all of
@@ -422,7 +422,7 @@ fn a_path_that_cannot_be_written_leaves_the_app_running() {
     let mut metrics = app.world_mut().resource_mut::<RerunScalars>();
     for i in 0..10_000 {
         metrics.set(format!("a/{i}"), "", 1.0);
-        metrics.say("b");
+        metrics.log("b");
     }
     assert!(metrics.scalars.len() <= 4096 && metrics.lines.len() <= 4096);
 }

@@ -80,7 +80,7 @@ fn what_went_in_a_tick_without_room_is_made_up_for() {
             .collect();
         gone.into_iter().for_each(|entity| app.world_mut().despawn(entity).then_some(()).unwrap());
         for line in ["first", "second", "third"] {
-            app.world_mut().resource_mut::<RerunScalars>().say(line);
+            app.world_mut().resource_mut::<RerunScalars>().log(line);
             app.world_mut().resource_mut::<RerunScalars>().set("of/then", "", 1.0);
             app.update();
         }
@@ -131,7 +131,7 @@ fn what_is_set_while_nothing_is_recorded_is_not_recorded_later() {
     let (mut app, inboxes) = app_to("stale", &[100]);
     let set = |app: &mut App, value: f64| {
         app.world_mut().resource_mut::<RerunScalars>().set("a/b", "", value);
-        app.world_mut().resource_mut::<RerunScalars>().say(format!("{value}"));
+        app.world_mut().resource_mut::<RerunScalars>().log(format!("{value}"));
         app.update();
     };
     app.world_mut().resource_mut::<RerunRecording>().metrics_hz = 0.0;

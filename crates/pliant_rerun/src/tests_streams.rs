@@ -271,7 +271,7 @@ fn the_log_of_a_tick_whose_figures_are_not_due_is_kept_and_so_are_the_figures() 
     for tick in 0..10 {
         let mut own = app.world_mut().resource_mut::<RerunScalars>();
         own.set("error/now", "%", f64::from(tick));
-        own.say("a line");
+        own.log("a line");
         app.update();
     }
     let own = app.world().resource::<RerunScalars>();

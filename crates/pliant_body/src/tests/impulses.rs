@@ -124,7 +124,7 @@ fn what_cannot_be_struck_is_refused_by_name_and_changes_nothing() {
     let wrong = [
         (body, VERTEX, DVec3::NAN, "finite"),
         (body, VERTEX, DVec3::new(0.0, f64::INFINITY, 0.0), "finite"),
-        (body, VERTEX, DVec3::splat(f64::MAX), "impulse"),
+        (body, VERTEX, DVec3::splat(f64::MAX), "impulse: expected one"),
         (body, 1_000_000, DVec3::Y, "vertex 1000000"),
         (remote, VERTEX, DVec3::Y, "remotely"),
         (none, VERTEX, DVec3::Y, "no body"),

@@ -55,7 +55,7 @@ pub enum HapticSystems {
     /// targets from the tools.
     Move,
     /// After [`PliantSystems::Publish`]: each device's loop gets the local model update.
-    Word,
+    LocalModel,
 }
 
 /// Adds haptic devices, their tools and grabs. The plugin needs `PliantBodyPlugin`. On a body that
@@ -94,7 +94,7 @@ impl Plugin for HapticsPlugin {
             .add_message::<HapticFault>()
             .add_message::<HapticNotice>()
             .configure_sets(self.schedule, HapticSystems::Move.before(PliantSystems::Input))
-            .configure_sets(self.schedule, HapticSystems::Word.after(PliantSystems::Publish))
+            .configure_sets(self.schedule, HapticSystems::LocalModel.after(PliantSystems::Publish))
             // Buttons, faults and states are read every frame, even while the game is paused.
             .add_systems(
                 PreUpdate,
@@ -111,7 +111,7 @@ impl Plugin for HapticsPlugin {
                     .after(PickingSystems::Backend),
             )
             .add_systems(self.schedule, tool::follow.in_set(HapticSystems::Move))
-            .add_systems(self.schedule, local_model::publish.in_set(HapticSystems::Word));
+            .add_systems(self.schedule, local_model::publish.in_set(HapticSystems::LocalModel));
         #[cfg(feature = "gamepad")]
         app.add_systems(PreUpdate, source::steer.after(tool::grip).after(InputSystems));
         #[cfg(feature = "render")]

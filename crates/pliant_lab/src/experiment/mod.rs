@@ -131,7 +131,7 @@ pub struct Metrics {
     /// Visual error at the last tick, shown or missing.
     pub end_percent: f64,
     /// Error of the confirmed state at the last tick.
-    pub hidden_end_percent: f64,
+    pub confirmed_end_percent: f64,
     /// Error of the visual reactions, root mean square.
     pub force_rms_percent: f64,
     /// Largest second difference of the visual reaction, as a share of the largest true reaction.
@@ -144,7 +144,7 @@ pub struct Metrics {
     /// trip, half a step and the mean visual delay.
     pub hand_to_force_ms: f64,
     /// Mean time from the host's step to the showing of its tick, ms.
-    pub shown_delay_ms: f64,
+    pub visual_delay_ms: f64,
     /// Longest time for which the visual error stayed above 0.5 %, ms.
     pub recover_ms: f64,
     /// Mean size of a datagram from host to guest, bytes.

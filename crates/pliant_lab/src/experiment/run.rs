@@ -39,7 +39,7 @@ pub(super) struct Run {
     /// The guest's hand, and its grab once it has begun.
     guest_hand: Option<(Hand, Option<u16>)>,
     /// Time at which the guest last sent its target.
-    guest_said: Duration,
+    guest_sent: Duration,
     predict_own_hand: bool,
     measuring: Option<Duration>,
     sum: f64,
@@ -49,14 +49,14 @@ pub(super) struct Run {
     missing: u64,
     largest: f64,
     last: f64,
-    hidden_last: f64,
+    confirmed_last: f64,
     scale: f64,
     force_sum: f64,
     force_count: u64,
     force_scale: f64,
-    shown_force: Vec<([f64; 3], [f64; 3])>,
+    visual_force: Vec<([f64; 3], [f64; 3])>,
     true_force: Vec<([f64; 3], [f64; 3])>,
-    shown_second: f64,
+    visual_second: f64,
     true_second: f64,
     delay_sum: f64,
     above: Vec<(Duration, f64)>,
@@ -65,7 +65,7 @@ pub(super) struct Run {
     last_tick: u64,
     /// Time of the last shown tick, and its coordinates. They stay visible until the next shown
     /// tick.
-    shown_at: Option<Duration>,
+    displayed_at: Option<Duration>,
     picture: Vec<f64>,
     /// Ticks missed since then.
     stalled: u64,
@@ -91,7 +91,7 @@ impl Run {
             track_row,
             keep_track: experiment.keep_track,
             guest_hand: experiment.hands.first().filter(|_| experiment.guest_hand).map(|hand| (*hand, None)),
-            guest_said: Duration::ZERO,
+            guest_sent: Duration::ZERO,
             predict_own_hand: matches!(experiment.recovery.policy, Policy::ForceDriven { .. }),
             measuring: None,
             sum: 0.0,
@@ -100,21 +100,21 @@ impl Run {
             missing: 0,
             largest: 0.0,
             last: 0.0,
-            hidden_last: 0.0,
+            confirmed_last: 0.0,
             scale: 0.0,
             force_sum: 0.0,
             force_count: 0,
             force_scale: 0.0,
-            shown_force: Vec::new(),
+            visual_force: Vec::new(),
             true_force: Vec::new(),
-            shown_second: 0.0,
+            visual_second: 0.0,
             true_second: 0.0,
             delay_sum: 0.0,
             above: Vec::new(),
             hash: 0xCBF2_9CE4_8422_2325,
             track: Vec::new(),
             last_tick: 0,
-            shown_at: None,
+            displayed_at: None,
             picture: Vec::new(),
             stalled: 0,
             in_row: 0,
@@ -125,10 +125,10 @@ impl Run {
     fn hold_at_guest(&mut self, now: Duration, session: &mut GuestSession) {
         let Some((hand, grab)) = &mut self.guest_hand else { return };
         // Send once per tick, because a new target makes the session update again at once.
-        if now.saturating_sub(self.guest_said).as_secs_f64() < 0.9 * self.h {
+        if now.saturating_sub(self.guest_sent).as_secs_f64() < 0.9 * self.h {
             return;
         }
-        self.guest_said = now;
+        self.guest_sent = now;
         let place = self.body.model().surface().positions().get(hand.vertex as usize).copied();
         let (rest, d) = (place.unwrap_or_default(), hand.path(now.as_secs_f64()));
         let target = std::array::from_fn(|k| f64::from(rest[k]) + d[k]);
@@ -146,8 +146,8 @@ impl Run {
     pub(super) fn begin(&mut self, now: Duration) {
         self.measuring = Some(now);
         // Ticks without a new state count as missed from here on.
-        if self.shown_at.is_none() {
-            self.shown_at = Some(now);
+        if self.displayed_at.is_none() {
+            self.displayed_at = Some(now);
         }
     }
 
@@ -159,7 +159,7 @@ impl Run {
     /// Counts the ticks that are due since the last shown tick as missed: one per step, with a
     /// tolerance of half a step. Each is compared with the last visual state.
     fn stand_still(&mut self, now: Duration) {
-        let (Some(since), Some(_)) = (self.shown_at, self.measuring) else { return };
+        let (Some(since), Some(_)) = (self.displayed_at, self.measuring) else { return };
         let due = (now.saturating_sub(since).as_secs_f64() / self.h - 0.5).max(0.0) as u64;
         while self.stalled < due {
             self.stalled += 1;
@@ -218,12 +218,12 @@ impl Run {
             rms_percent: percent((self.sum / compared / places).sqrt(), self.scale),
             max_percent: percent(self.largest.sqrt(), self.scale),
             end_percent: percent(self.last.sqrt(), self.scale),
-            hidden_end_percent: percent(self.hidden_last.sqrt(), self.scale),
+            confirmed_end_percent: percent(self.confirmed_last.sqrt(), self.scale),
             force_rms_percent: percent(
                 (self.force_sum / self.force_count.max(1) as f64).sqrt(),
                 self.force_scale,
             ),
-            force_ringing: ratio(self.shown_second, self.force_scale),
+            force_ringing: ratio(self.visual_second, self.force_scale),
             true_ringing: ratio(self.true_second, self.force_scale),
             hand_to_force_ms: 1e3
                 * if self.predict_own_hand {
@@ -234,7 +234,7 @@ impl Run {
                     // half a step on average. Then its reaction travels back and is shown.
                     session.stats().round_trip.as_secs_f64() * 0.5 + 0.5 * self.h + delay
                 },
-            shown_delay_ms: 1e3 * delay,
+            visual_delay_ms: 1e3 * delay,
             recover_ms: longest.as_secs_f64() * 1e3,
             hash: self.hash,
             counts,
@@ -328,7 +328,7 @@ impl World for Run {
     fn guest_stepped(&mut self, now: Duration, _guest: usize, _stepped: u64, session: &mut GuestSession) {
         self.hold_at_guest(now, session);
         let Some(view) = session.body(BODY) else { return self.stand_still(now) };
-        let (Some(shown), Some(hidden)) = (view.visual(), view.confirmed()) else {
+        let (Some(shown), Some(confirmed)) = (view.visual(), view.confirmed()) else {
             return self.stand_still(now);
         };
         let tick = view.tick();
@@ -336,7 +336,7 @@ impl World for Run {
             return self.stand_still(now);
         }
         if self.measuring.is_none() {
-            (self.last_tick, self.shown_at) = (tick, Some(now));
+            (self.last_tick, self.displayed_at) = (tick, Some(now));
             self.picture.clone_from(&shown.q);
             return;
         }
@@ -348,23 +348,23 @@ impl World for Run {
         // Second differences need consecutive ticks. A stall followed by a catch-up counts in the
         // errors.
         self.in_row = if tick == self.last_tick + 1 { self.in_row + 1 } else { 0 };
-        (self.last_tick, self.shown_at, self.stalled) = (tick, Some(now), 0);
+        (self.last_tick, self.displayed_at, self.stalled) = (tick, Some(now), 0);
         self.picture.clone_from(&shown.q);
         let Some(first) = self.truth.front().map(|t| t.tick) else { return };
         let Some(truth) = tick.checked_sub(first).and_then(|i| self.truth.get(i as usize)) else { return };
         let modes = shown.q.len();
         let (sum, largest) = self.shape.compare(&shown.q, &truth.q[..modes]);
-        let (_, hidden_largest) = self.shape.compare(&hidden.q, &truth.q[..modes]);
+        let (_, confirmed_largest) = self.shape.compare(&confirmed.q, &truth.q[..modes]);
         let at = truth.at;
         let (mut force, mut forces) = (0.0, 0);
-        self.shown_force.resize(view.grabs().len().max(self.shown_force.len()), ([0.0; 3], [0.0; 3]));
-        self.true_force.resize(self.shown_force.len(), ([0.0; 3], [0.0; 3]));
+        self.visual_force.resize(view.grabs().len().max(self.visual_force.len()), ([0.0; 3], [0.0; 3]));
+        self.true_force.resize(self.visual_force.len(), ([0.0; 3], [0.0; 3]));
         for (i, g) in view.grabs().iter().enumerate() {
             let Some((_, reaction)) = truth.reactions.iter().find(|r| r.0 == g.key) else { continue };
             force += (0..3).map(|k| (g.reaction[k] - reaction[k]).powi(2)).sum::<f64>();
             forces += 1;
             for (series, new, second) in [
-                (&mut self.shown_force[i], g.reaction, &mut self.shown_second),
+                (&mut self.visual_force[i], g.reaction, &mut self.visual_second),
                 (&mut self.true_force[i], *reaction, &mut self.true_second),
             ] {
                 if self.in_row >= 2 {
@@ -382,7 +382,7 @@ impl World for Run {
         self.force_sum += force;
         self.force_count += forces;
         self.count += 1;
-        self.hidden_last = hidden_largest;
+        self.confirmed_last = confirmed_largest;
         self.delay_sum += now.saturating_sub(at).as_secs_f64();
         self.tell(now, sum, largest);
         for q in &shown.q {

@@ -20,7 +20,7 @@ use crate::{ModalModel, StepError};
 #[derive(Debug, Clone, Copy, PartialEq, Default)]
 pub struct StepReport {
     /// Number of directions in which hands were linearly dependent and had to be regularized.
-    pub regularised: usize,
+    pub regularized: usize,
 }
 
 /// Forces on a body in one step besides its hands and gravity.
@@ -437,7 +437,7 @@ impl Kernel {
             if let Some(rigid) = &mut rigid {
                 rigid.tighten(&self.model, self.solving.iter().map(|s| (s.arm, s.pull)));
             }
-            report.regularised = self.solve(&state.frame, hands, &place, rigid.as_ref());
+            report.regularized = self.solve(&state.frame, hands, &place, rigid.as_ref());
             if round + 1 < rounds {
                 for (i, solving) in self.solving.iter_mut().enumerate() {
                     solving.from = solving.free + self.responses.answer(i, &self.forces);

@@ -193,9 +193,9 @@ impl NetGuest {
     /// body, the state is the predicted copy ([`BodyView::predicted_hand`]). Otherwise it is the
     /// visual state of the confirmed stream. The host may not have reached the tick of a predicted
     /// copy yet.
-    pub fn shown(&self, body: RemoteBody) -> Option<(Tick, &State)> {
+    pub fn visual_state(&self, body: RemoteBody) -> Option<(Tick, &State)> {
         let view = self.body(body)?;
-        shown_of(view)
+        visual_state_of(view)
     }
 
     /// Leaves the session. The host receives a goodbye, the connection is closed, and the guest
@@ -245,23 +245,24 @@ impl NetGuest {
         stats.add(&session.stats(), &transport);
         for view in session.bodies() {
             let counts = view.counts();
-            stats.shown += counts.stepped;
+            stats.displayed_ticks += counts.stepped;
             stats.guessed += counts.guessed;
             stats.recovered += counts.repaired;
             stats.snapshots += counts.snapshots;
             let followed = self.bodies.get(&view.id());
-            if let (Some(shown), Some(hidden), Some(followed)) = (view.visual(), view.confirmed(), followed)
+            if let (Some(visual), Some(confirmed), Some(followed)) =
+                (view.visual(), view.confirmed(), followed)
                 && followed.peak > 0.0
             {
-                let off = shown.q.iter().zip(&hidden.q).map(|(a, b)| (a - b).powi(2)).sum::<f64>().sqrt();
-                stats.shown_offset = stats.shown_offset.max(off / followed.peak);
+                let off = visual.q.iter().zip(&confirmed.q).map(|(a, b)| (a - b).powi(2)).sum::<f64>().sqrt();
+                stats.visual_offset = stats.visual_offset.max(off / followed.peak);
             }
         }
         stats
     }
 }
 
-fn shown_of(view: &BodyView) -> Option<(Tick, &State)> {
+fn visual_state_of(view: &BodyView) -> Option<(Tick, &State)> {
     match view.predicted_hand() {
         Some(own) => Some((own.tick(), own.visual())),
         None => Some((view.tick(), view.visual()?)),

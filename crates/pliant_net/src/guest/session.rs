@@ -257,8 +257,9 @@ impl NetGuest {
     }
 
     fn welcomed(&mut self, world: &mut World, user: UserId) {
-        let again = std::mem::replace(&mut self.retry, Retry { was_in: true, ..Retry::default() }).was_in;
-        if again {
+        let reconnected =
+            std::mem::replace(&mut self.retry, Retry { was_in: true, ..Retry::default() }).was_in;
+        if reconnected {
             self.retry.orphans_until = Some(self.now() + ORPHANS);
         }
         self.state = GuestState::In { user };
@@ -269,6 +270,6 @@ impl NetGuest {
         for info in others.filter(|info| info.user != user) {
             self.users.meet(world, info.user, &info.name, info.role);
         }
-        world.write_message(SessionJoined { user, again });
+        world.write_message(SessionJoined { user, reconnected });
     }
 }

@@ -4,7 +4,7 @@ use bevy::prelude::*;
 use pliant_body::GrabForce;
 use pliant_stream::GrabKey;
 
-use super::{NetGuest, shown_of};
+use super::{NetGuest, visual_state_of};
 use crate::session_transform::SessionTransform;
 use crate::user::UserLink;
 use crate::view::{DisplayedBodies, remote_hands};
@@ -37,7 +37,7 @@ pub(crate) fn show(
             continue;
         };
         // The predicted copy steps together with the confirmed one, whose ticks determine the time.
-        if let Some((_, shown)) = shown_of(view) {
+        if let Some((_, shown)) = visual_state_of(view) {
             let pose = view.predicted_hand().map_or_else(|| view.pose(), |own| own.pose());
             followed.peak = followed.peak.max(shown.q.iter().map(|q| q * q).sum::<f64>().sqrt());
             followed.display.take(view.tick(), &shown.q, pose);

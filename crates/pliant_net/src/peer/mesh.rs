@@ -88,7 +88,7 @@ impl NetPeer {
         if self.session.is_none() && self.config.join.is_none() {
             let user = UserId(1);
             if self.begin(world, user, true) {
-                world.write_message(SessionJoined { user, again: false });
+                world.write_message(SessionJoined { user, reconnected: false });
             }
         }
         let waiting: Vec<PeerId> =
@@ -365,7 +365,7 @@ impl NetPeer {
             match event {
                 PeerEvent::Started => {
                     if let PeerState::In { user } = self.state {
-                        world.write_message(SessionJoined { user, again: false });
+                        world.write_message(SessionJoined { user, reconnected: false });
                     }
                 }
                 PeerEvent::Joined { user, name } => {

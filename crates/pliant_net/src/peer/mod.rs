@@ -251,7 +251,7 @@ impl NetPeer {
         totals.rejected += self.rejected;
         stats.count(&totals, &self.ledger.sum(lines.into_iter()));
         if let Some(session) = &self.session {
-            stats.shown = session.tick();
+            stats.displayed_ticks = session.tick();
             stats.recovered = self
                 .bodies
                 .keys()

@@ -59,14 +59,14 @@ impl Session<'_, '_> {
             rate,
             jitter_ms: stats.jitter.as_secs_f64() * 1e3,
             repaired: self.host.is_none().then_some([stats.guessed, stats.recovered]),
-            asked_again: stats.nacks,
+            requested_again: stats.nacks,
             snapshots: stats.snapshots,
             dropped: dropped.send_queue_full
                 + dropped.receive_queue_full
                 + dropped.too_large
                 + dropped.not_connected,
             queueing: stats.queueing,
-            shown_offset: self.guest.is_some().then_some(stats.shown_offset * 100.0),
+            visual_offset: self.guest.is_some().then_some(stats.visual_offset * 100.0),
             round_trips: std::mem::take(&mut self.histories.round_trips),
             rates: std::mem::take(&mut self.histories.rates),
             users: users

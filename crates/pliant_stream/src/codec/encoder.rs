@@ -64,7 +64,7 @@ pub struct Encoded {
     pub more: Vec<Arc<[u8]>>,
     /// True when the set of grabs changed at this tick. No forecast can predict such a change, so
     /// the frame is worth sending more than once.
-    pub news: bool,
+    pub events: bool,
 }
 
 impl Encoded {
@@ -336,13 +336,13 @@ impl Encoder {
         }
         let held = || frame.grabs.iter().filter(|g| g.held).map(|g| g.state.key);
         let held = held().chain(parts.iter().flat_map(|p| p.grabs.iter().map(|g| g.state.key)));
-        let news = self.sent.back().is_some_and(|last| !held.eq(last.grabs().map(|g| g.state.key)));
+        let events = self.sent.back().is_some_and(|last| !held.eq(last.grabs().map(|g| g.state.key)));
         let first = write(&frame);
         let more = parts.iter().map(write).collect();
         self.keep(frame, parts);
         self.last = state.tick;
         self.frames += 1;
-        Encoded { first, more, news }
+        Encoded { first, more, events }
     }
 
     /// Displacement of the surface by one quantization step, m: a share of the current or expected

@@ -117,24 +117,25 @@ impl BodyView {
         self.receiver.is_some()
     }
 
-    /// The shown tick; 0 before the body is ready.
+    /// The displayed tick; 0 before the body is ready.
     pub fn tick(&self) -> Tick {
         self.receiver.as_ref().map_or(0, Receiver::tick)
     }
 
-    /// The confirmed state: the best estimate of the true state at the shown tick. The physics of
-    /// the next step uses it. Display and hands use [`BodyView::visual`].
+    /// The confirmed state: the best estimate of the true state at the displayed tick. The physics
+    /// of the next step uses it. Display and hands use [`BodyView::visual`].
     pub fn confirmed(&self) -> Option<&State> {
         self.receiver.as_ref().map(Receiver::confirmed)
     }
 
-    /// The visual state at the shown tick, for display and hands. It is continuous in position and
-    /// velocity.
+    /// The visual state at the displayed tick, for display and hands. It is continuous in position
+    /// and velocity.
     pub fn visual(&self) -> Option<&State> {
         self.receiver.as_ref().map(Receiver::visual)
     }
 
-    /// All grabs of the body at the shown tick, with the reactions that belong to the visual state.
+    /// All grabs of the body at the displayed tick, with the reactions that belong to the visual
+    /// state.
     pub fn grabs(&self) -> &[VisualGrab] {
         self.receiver.as_ref().map_or(&[], Receiver::grabs)
     }
@@ -149,7 +150,7 @@ impl BodyView {
         self.own.as_ref().filter(|own| own.is_active())
     }
 
-    /// The rigid frame of a free body at the shown tick.
+    /// The rigid frame of a free body at the displayed tick.
     pub fn pose(&self) -> Option<Pose> {
         self.receiver.as_ref().and_then(Receiver::pose)
     }
@@ -170,8 +171,8 @@ impl BodyView {
         self.stalled
     }
 
-    /// Delay of the shown tick behind the earliest arrivals, s.
-    pub fn shown_delay(&self) -> f64 {
+    /// Delay of the displayed tick behind the earliest arrivals, s.
+    pub fn visual_delay(&self) -> f64 {
         self.playout.delay()
     }
 

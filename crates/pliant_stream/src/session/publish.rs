@@ -17,7 +17,7 @@ const REMINDER: Duration = Duration::from_secs(1);
 
 /// Delays, as shares of a step, after which a tick that begins or ends a grab is sent again. Such a
 /// tick cannot be extrapolated, and its repeat arrives only with the next tick.
-const NEWS_AGAIN: [f64; 2] = [0.3, 0.65];
+const EVENT_RESENDS: [f64; 2] = [0.3, 0.65];
 
 /// The output for all receivers of one kind of stream.
 struct Outgoing {
@@ -120,8 +120,8 @@ impl HostSession {
                 // The path shrank after the key was taken. The next tick uses the new size.
                 p.due.insert(body);
             }
-            if frame.as_ref().is_some_and(|f| f.news) {
-                for share in NEWS_AGAIN {
+            if frame.as_ref().is_some_and(|f| f.events) {
+                for share in EVENT_RESENDS {
                     let due = now + Duration::from_secs_f64(share * self.config.newmark.h);
                     p.queue_resend(due, body, state.tick);
                 }
