@@ -156,7 +156,7 @@ fn end_frame(
     let part = |share: f64| log.took.get((log.took.len() as f64 * share) as usize).copied().unwrap_or(0.0);
     println!(
         "{} users, {:.1} ticks/s, a tick {:.2} ms in the median, {:.2} at 99 %, {:.2} at most; processor {:.0} %, memory {memory:.0} MB, \
-         {:.1} Mbit/s out, {} let go",
+         {:.1} Mbit/s out, {} dropped",
         users.iter().count().saturating_sub(1),
         (tick.0 - ticks_then) as f64 / passed,
         part(0.5),

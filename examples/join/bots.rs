@@ -97,14 +97,14 @@ fn say(all: &[Bot], start: Instant) {
         .iter()
         .filter_map(|bot| Some(bot.ticks.last()? - bot.ticks.first()? + 1 - bot.ticks.len() as u64))
         .sum();
-    let heard: usize = all.iter().map(|bot| bot.ticks.len()).sum();
+    let received: usize = all.iter().map(|bot| bot.ticks.len()).sum();
     let (guessed, repaired) =
         all.iter().filter_map(|bot| bot.session.as_ref()).fold((0, 0), |sum, session| {
             session.bodies().fold(sum, |(g, r), view| (g + view.counts().guessed, r + view.counts().repaired))
         });
     println!(
-        "{:5.1} s  {} bots in, joined in {median:.2} s in the median and {:.2} at most; {heard} ticks heard, {missing} missing, {:.1} kbit/s each, \
-         guessed {guessed} put right {repaired}",
+        "{:5.1} s  {} bots in, joined in {median:.2} s in the median and {:.2} at most; {received} ticks received, {missing} missing, {:.1} kbit/s each, \
+         guessed {guessed} corrected {repaired}",
         start.elapsed().as_secs_f64(),
         joins.len(),
         joins.last().copied().unwrap_or(0.0),

@@ -216,7 +216,7 @@ fn tell(
         );
     }
     for lost in lost.read() {
-        println!("{now:6.2} s  the host cannot be heard: {}", lost.reason);
+        println!("{now:6.2} s  lost the connection to the host: {}", lost.reason);
     }
     for body in &shown {
         println!("{now:6.2} s  a body is here: {}", body.name);

@@ -215,7 +215,7 @@ pub fn say(
     let force = forces.iter().map(|felt| felt.force.length()).fold(0.0, f64::max);
     println!(
         "{now:6.1} s  {} users  round trip {:5.1} ms  loss {:4.1} % in {:4.1} % out  {:6.0} kbit/s in {:6.0} out  \
-         guessed {} put right {}  reaction {force:.2} N",
+         guessed {} corrected {}  reaction {force:.2} N",
         users.iter().count(),
         stats.round_trip.as_secs_f64() * 1e3,
         stats.loss_in * 100.0,

@@ -208,7 +208,7 @@ pub fn compare(model: &ModalModel, truth: &Path, shown: &Path, skip: usize) -> R
     }
     println!(
         "{} of {span} ticks: shown error {:.3} % rms, {:.1} % at most, of {:.1} mm; reaction {:.2} % rms, {:.1} % at most, of {force_most:.2} N ({felt} ticks); \
-         own hand first, against what the host made of it later, {:.2} % rms",
+         predicted hand against the later state of the host, {:.2} % rms",
         streamed.ticks,
         streamed.rms(),
         percent(streamed.worst, streamed.largest),

@@ -277,7 +277,7 @@ fn record(figures: Res<Figures>, meters: Res<Meters>, mut scalars: ResMut<RerunS
     if !figures.joined {
         return;
     }
-    for (name, meter) in [("streamed", &meters.streamed), ("own hand first", &meters.predicted_hand)] {
+    for (name, meter) in [("streamed", &meters.streamed), ("predicted hand", &meters.predicted_hand)] {
         scalars.set(format!("error/{name}"), "%", meter.percent(meter.now));
     }
     scalars.set("error/streamed, rms", "%", meters.streamed.percent(meters.streamed.rms()));

@@ -21,12 +21,12 @@ pub fn print(options: &Options, host: &HostReport, you: &GuestReport, other: &Gu
         println!("{name:<42}{:>12}{:>12}", value(you), value(other));
     };
     row("ticks sent", &|_| host.ticks.to_string());
-    row("ticks shown", &|g| g.stats.displayed_ticks.to_string());
+    row("ticks displayed", &|g| g.stats.displayed_ticks.to_string());
     row("ticks compared with the truth", &|g| g.meters.streamed.ticks.to_string());
     row("behind the host, ms", &|g| format!("{:.0}", 1e3 * g.meters.streamed.behind() / crate::RATE));
     row("datagrams lost on the way here, %", &|g| format!("{:.1}", 100.0 * g.stats.loss_in));
     row("ticks not there in time", &|g| g.stats.guessed.to_string());
-    row("ticks put right when their data came", &|g| g.stats.recovered.to_string());
+    row("ticks corrected when their data arrived", &|g| g.stats.recovered.to_string());
     row("round trip, ms", &|g| format!("{:.0}", 1e3 * g.stats.round_trip.as_secs_f64()));
     row("bytes received a second", &|g| format!("{:.0}", g.stats.bytes_in as f64 / host.seconds.max(1e-9)));
     row("largest displacement, mm", &|g| format!("{:.1}", 1e3 * g.meters.streamed.largest));
@@ -38,9 +38,9 @@ pub fn print(options: &Options, host: &HostReport, you: &GuestReport, other: &Gu
         row(&format!("{name}, max, % of largest"), &|g| percent(meter(g), meter(g).max));
     };
     errors("streamed error", &|g| g.meters.streamed.clone());
-    println!("while the own hand holds it, against what the host made of that tick later:");
-    errors("  own hand first", &|g| g.meters.predicted_hand.clone());
-    errors("  had it waited for the host", &|g| g.meters.waiting.clone());
+    println!("while the local hand holds the body, against the later state of the host at the same tick:");
+    errors("  predicted hand", &|g| g.meters.predicted_hand.clone());
+    errors("  without prediction", &|g| g.meters.waiting.clone());
     row("largest reaction, N", &|g| format!("{:.2}", g.meters.reaction));
     println!(
         "host: time a step, us: median {:.1}, 99th percentile {:.1}; {:.0} bytes a second sent to both",

@@ -150,7 +150,7 @@ fn write_figures(figures: Res<Figures>, meters: Res<Meters>, mut readout: ResMut
          round trip      {:6.0} ms\n\
          streamed error{:8.4} %\n\
          rms so far    {:8.4} %\n\
-         own hand ahead  {:6.0} ms\n\
+         prediction      {:6.0} ms\n\
          reaction        {:6.2} N\n\
          received        {:6.1} kbit/s",
         100.0 * figures.loss,

@@ -1,6 +1,6 @@
 #!/bin/sh
-# What a server costs by the number of its users: one dedicated_server, bots that join, hear and count, both on this machine over loopback. Prints a
-# table in Markdown (docs/multiuser-load.md is one) and ends with 1 when a bar is missed: every tick sent and heard (but for one in 100,000 that the bots, which
+# What a server costs by the number of its users: one dedicated_server, bots that join, receive and count, both on this machine over loopback. Prints a
+# table in Markdown (docs/multiuser-load.md is one) and ends with 1 when a bar is missed: every tick sent and received (but for one in 100,000 that the bots, which
 # share the machine, may miss), a tick below 5 ms at 99 %.
 #
 #   tests/load/run.sh BODY.modal [SECONDS of the largest [USERS...]]
@@ -34,7 +34,7 @@ trap 'kill $server 2>/dev/null; rm -rf "$work"' EXIT
 trap 'exit 130' INT TERM HUP
 failed=0
 echo "load before: $(cut -d' ' -f1-3 /proc/loadavg), $(nproc) cores"
-echo "| users | ticks/s | a tick, median, ms | at 99 % | at most | processor, % | memory, MB, first and last | out, Mbit/s | kbit/s a user | let go | ticks heard | missing |"
+echo "| users | ticks/s | a tick, median, ms | at 99 % | at most | processor, % | memory, MB, first and last | out, Mbit/s | kbit/s a user | dropped | ticks received | missing |"
 echo "| --- | --- | --- | --- | --- | --- | --- | --- | --- | --- | --- | --- |"
 for n in $users; do
     seconds=20
@@ -50,14 +50,14 @@ for n in $users; do
     # Windows with all users from beginning to end: the first one with all of them may have begun before they were in.
     grep "^$n users" "$work/server" | sed 1d >"$work/full"
     last=$(tail -1 "$work/bots")
-    if ! awk -v n="$n" -v heard="$(echo "$last" | sed 's/.*; \([0-9]*\) ticks heard.*/\1/')" -v missing="$(echo "$last" | sed 's/.*heard, \([0-9]*\) missing.*/\1/')" '
+    if ! awk -v n="$n" -v received="$(echo "$last" | sed 's/.*; \([0-9]*\) ticks received.*/\1/')" -v missing="$(echo "$last" | sed 's/.*received, \([0-9]*\) missing.*/\1/')" '
         function after(word,  at) { at = index($0, word); return substr($0, at + length(word)) + 0 }
         { rate = after("users, "); median = after("a tick "); at99 = after("in the median, "); most = after("99 %, "); cpu += after("processor ")
           mem = after("memory "); out += after("MB, "); gone = after("Mbit/s out, "); if (!k++) first = mem
           if (median > md) md = median; if (at99 > p) p = at99; if (most > m) m = most; if (!low || rate < low) low = rate }
         END { if (!k) { print "| " n " | not all came in |"; exit 1 }
-          printf "| %d | %.1f | %.2f | %.2f | %.1f | %.0f | %.0f, %.0f | %.2f | %.1f | %d | %d | %d |\n", n, low, md, p, m, cpu / k, first, mem, out / k, 1e3 * out / k / n, gone, heard, missing
-          exit !(missing <= 1e-5 * heard && gone == 0 && p < 5 && low > 59.4) }' "$work/full"; then failed=1; fi
+          printf "| %d | %.1f | %.2f | %.2f | %.1f | %.0f | %.0f, %.0f | %.2f | %.1f | %d | %d | %d |\n", n, low, md, p, m, cpu / k, first, mem, out / k, 1e3 * out / k / n, gone, received, missing
+          exit !(missing <= 1e-5 * received && gone == 0 && p < 5 && low > 59.4) }' "$work/full"; then failed=1; fi
 done
 echo "load after: $(cut -d' ' -f1-3 /proc/loadavg)"
 exit $failed

@@ -126,14 +126,14 @@ faults() {
     sleep 2
 
     kill -9 $gb
-    echo "kill -9 of guest b: the server, after $(wait_for "$work/s1.log" "b is gone" 60) s; guest a goes on: $(grep -c "cannot be heard" "$work/fa.log") losses"
+    echo "kill -9 of guest b: the server, after $(wait_for "$work/s1.log" "b is gone" 60) s; guest a goes on: $(grep -c "lost the connection" "$work/fa.log") losses"
 
     ip netns exec $tag-s ip link set va down; sleep 10; ip netns exec $tag-s ip link set va up
-    echo "line a down for 10 s: guest a back after $(wait_for_again "$work/fa.log" 60) s of line; losses it saw: $(grep -c "cannot be heard" "$work/fa.log")"
+    echo "line a down for 10 s: guest a back after $(wait_for_again "$work/fa.log" 60) s of line; losses it saw: $(grep -c "lost the connection" "$work/fa.log")"
 
-    before=$(seen "$work/fa.log" "cannot be heard"); again=$(seen "$work/fa.log" " again")
+    before=$(seen "$work/fa.log" "lost the connection"); again=$(seen "$work/fa.log" " again")
     kill -9 $server
-    echo "kill -9 of the server: guest a, after $(wait_for_more "$work/fa.log" "cannot be heard" "$before" 60) s"
+    echo "kill -9 of the server: guest a, after $(wait_for_more "$work/fa.log" "lost the connection" "$before" 60) s"
     serve "$work/s2.log"
     echo "server started anew: guest a in again after $(wait_for_more "$work/fa.log" " again" "$again" 60) s; the server has $(grep -c "has joined" "$work/s2.log") guest(s)"
     t0=$(now); kill -INT $ga; wait $ga 2>/dev/null

@@ -149,7 +149,7 @@ fn run(model: &Arc<ModalModel>, preset: Preset, other: Other) -> [f64; 4] {
     let (streamed, most) = off(model, truth, &watch.streamed);
     let [own, waiting] = [&watch.own, &watch.waiting].map(|seen| off(model, truth, seen).0);
     println!(
-        "{}: streamed {:.4} % rms, {:.2} % at most; own hand first {:.3} %, waiting {:.2} %",
+        "{}: streamed {:.4} % rms, {:.2} % at most; predicted hand {:.3} %, waiting {:.2} %",
         preset.name(),
         100.0 * streamed,
         100.0 * most,
@@ -175,6 +175,6 @@ fn own_hand_first_is_nearer_to_the_host_than_waiting_for_it() {
         // The streamed state must stay within the bounds of streaming in every case.
         assert!(streamed < 1.5e-3 && worst < 0.05, "{}: {streamed}, {worst}", preset.name());
         assert!(own < most, "{}: {own}", preset.name());
-        assert!(waiting > times * own, "{}: waiting {waiting}, own hand first {own}", preset.name());
+        assert!(waiting > times * own, "{}: waiting {waiting}, predicted hand {own}", preset.name());
     }
 }

@@ -128,7 +128,7 @@ pub fn show(ui: &mut Ui, network: &mut NetworkView) {
     });
     if let Some(invite) = &network.invite {
         ui.horizontal(|ui| {
-            if ui.button("Copy").on_hover_text("Copies the invite: others paste it to join.").clicked() {
+            if ui.button("Copy").on_hover_text("Copies the invite. Other users paste it to join.").clicked() {
                 network.copy = true;
             }
             // The token in the invite is secret, so it is not shown on the screen.
@@ -165,34 +165,34 @@ pub fn show(ui: &mut Ui, network: &mut NetworkView) {
         line(
             "round trip",
             format!("{round_trip} \u{b1} {jitter} ms{waits}"),
-            "There and back, and its deviation. Queueing: packets wait on the way, and less should be sent.",
+            "Smoothed round trip and its deviation. Queueing: packets wait in a queue on the path, and less should be sent.",
         );
         let [here, there] = network.loss.map(short);
         line("lost", format!("{here} % in, {there} % out"), "Datagrams that did not arrive.");
         let [received, sent] = network.rate.map(short);
-        line("rate", format!("{received} kbit/s in, {sent} out"), "With all that the line carries.");
+        line("rate", format!("{received} kbit/s in, {sent} out"), "UDP payload, including the data of QUIC itself.");
         if let Some([guessed, right]) = network.repaired {
             line(
                 "guessed",
-                format!("{guessed} ticks, {right} put right"),
-                "Shown before their data came, and mended when it did.",
+                format!("{guessed} ticks, {right} corrected"),
+                "Ticks that were displayed before their data arrived, and those that were corrected afterwards.",
             );
         }
         line(
-            "asked again",
+            "requested again",
             format!("{} ticks, snapshots: {}", network.requested_again, network.snapshots),
-            "Repeats of what was lost, and states that were taken over whole.",
+            "Lost ticks that were requested again, and complete states that were received.",
         );
         line(
-            "dropped here",
+            "dropped",
             network.dropped.to_string(),
-            "Datagrams that this end let go: full queues, narrow paths.",
+            "Datagrams that this end dropped because a queue was full or the path too narrow.",
         );
         if let Some(offset) = network.visual_offset {
             line(
-                "shown offset",
+                "visual offset",
                 format!("{} %", short(offset)),
-                "How far what is shown is from the best estimate of the truth.",
+                "Distance of the visual state from the best estimate of the true state.",
             );
         }
     });
@@ -225,22 +225,22 @@ fn emulator_knobs(ui: &mut Ui, emulator: &mut EmulatorView) {
     }
     ui.add_enabled_ui(!emulator.recorded && emulator.loss > 0.0, |ui| {
         knob(ui, &mut emulator.burst_ms, 0.0..=500.0, |slider| slider.text("ms bursts").max_decimals(1))
-            .on_hover_text("How long a burst of losses lasts on average; 0 loses each packet for itself.");
+            .on_hover_text("Mean length of a burst of losses; 0 loses each packet independently.");
     });
     knob(ui, &mut emulator.rate_mbit, 0.0..=1000.0, |slider| {
         slider.logarithmic(true).smallest_positive(0.1).text("Mbit/s").max_decimals(2)
     })
-    .on_hover_text("What the line carries; 0: as much as one likes.");
+    .on_hover_text("Capacity of the link; 0 means unlimited.");
     knob(ui, &mut emulator.queue_kib, 1.0..=1024.0, |slider| {
         slider.logarithmic(true).text("KiB queue").max_decimals(0)
     })
-    .on_hover_text("What may wait for the line; what does not fit is dropped.");
+    .on_hover_text("Size of the queue before the link; packets that do not fit are dropped.");
     knob(ui, &mut emulator.reordered, 0.0..=50.0, |slider| slider.text("% reordered").max_decimals(1))
-        .on_hover_text("Packets that are held back, so that others overtake them.");
+        .on_hover_text("Share of packets that are held back, so that others overtake them.");
     knob(ui, &mut emulator.held_back_ms, 0.0..=200.0, |slider| slider.text("ms held back").max_decimals(1))
-        .on_hover_text("How long those are held back; a copy comes at most so much later.");
+        .on_hover_text("Time for which these packets are held back, and the maximum delay of a copy.");
     knob(ui, &mut emulator.duplicated, 0.0..=50.0, |slider| slider.text("% twice").max_decimals(1))
-        .on_hover_text("Packets that arrive twice.");
+        .on_hover_text("Share of packets that arrive twice.");
     ui.checkbox(&mut emulator.keep_order, "jitter keeps the order");
     ui.horizontal(|ui| {
         let label = ui.label("seed");

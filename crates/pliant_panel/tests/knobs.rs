@@ -270,7 +270,7 @@ fn the_figures_of_a_session_are_shown_with_their_units() {
         "196 \u{b1} 2.00 ms, queueing",
         "9.00 % in, 8.50 % out",
         "103 kbit/s in, 20.0 out",
-        "12 ticks, 11 put right",
+        "12 ticks, 11 corrected",
         "4 ticks, snapshots: 1",
         "3",
         "0.25 %",
@@ -281,7 +281,7 @@ fn the_figures_of_a_session_are_shown_with_their_units() {
     harness.state_mut().repaired = None;
     harness.state_mut().visual_offset = None;
     harness.run();
-    assert!(harness.query_by_label("shown offset").is_none() && harness.query_by_label("guessed").is_none());
+    assert!(harness.query_by_label("visual offset").is_none() && harness.query_by_label("guessed").is_none());
 }
 
 #[test]

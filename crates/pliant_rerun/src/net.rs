@@ -51,7 +51,7 @@ fn standing(
         (None, Some(guest), _) => match guest.state() {
             GuestState::Joining => ("joining".into(), false),
             GuestState::In { user } => (format!("in the session as user {}", user.0), true),
-            GuestState::Lost { reason } => (format!("the host is not to be heard: {reason}"), false),
+            GuestState::Lost { reason } => (format!("lost the connection to the host: {reason}"), false),
             GuestState::Closed { reason } => (format!("not in the session: {reason}"), false),
         },
         (None, None, Some(peer)) => match peer.state() {
@@ -85,16 +85,8 @@ pub(crate) fn say_how_it_stands(
     *told = standing;
 }
 
-/// The time of the last session metrics and the counters at that time.
-#[derive(Default)]
-pub(crate) struct Counted {
-    let_go: u64,
-    /// Simulated time of the last metrics, s.
-    second: Option<f64>,
-}
-
-/// Records the state of the connection, its jitter, whether it is queueing, and the rate of dropped
-/// datagrams, once per second.
+/// Records the state of the connection, its jitter and whether it is queueing, once per second. The
+/// rate of dropped datagrams, `net/dropped`, comes from the diagnostics.
 pub(crate) fn log_metrics(
     host: Option<Res<NetHost>>,
     guest: Option<Res<NetGuest>>,
@@ -102,27 +94,18 @@ pub(crate) fn log_metrics(
     stats: Option<Res<NetStats>>,
     time: Res<Time>,
     mut own: ResMut<RerunScalars>,
-    mut counted: Local<Counted>,
+    mut last: Local<Option<f64>>,
 ) {
     let now = time.elapsed_secs_f64();
-    let passed = counted.second.map(|second| now - second);
-    if passed.is_some_and(|passed| (0.0..1.0).contains(&passed)) {
+    if last.is_some_and(|last| (0.0..1.0).contains(&(now - last))) {
         return;
     }
     let Some((_, stands)) = standing(host.as_deref(), guest.as_deref(), peer.as_deref()) else { return };
-    counted.second = Some(now);
+    *last = Some(now);
     own.set("net/connected", "", f64::from(u8::from(stands)));
     let Some(stats) = stats else { return };
     own.set("net/jitter", "ms", stats.jitter.as_secs_f64() * 1e3);
     own.set("net/queueing", "", f64::from(u8::from(stats.queueing)));
-    let dropped = stats.dropped;
-    let let_go =
-        [dropped.send_queue_full, dropped.receive_queue_full, dropped.too_large, dropped.not_connected];
-    let let_go: u64 = let_go.into_iter().sum();
-    if let Some(passed) = passed.filter(|passed| *passed > 0.0) {
-        own.set("net/let go", "/s", let_go.saturating_sub(counted.let_go) as f64 / passed);
-    }
-    counted.let_go = let_go;
 }
 
 /// Finds the name and the color of the user of each grab in this app.

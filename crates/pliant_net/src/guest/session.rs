@@ -178,7 +178,7 @@ impl NetGuest {
         if matches!(self.state, GuestState::Lost { .. }) {
             return;
         }
-        info!("the host cannot be heard, trying again: {reason}");
+        info!("lost the connection to the host, trying again: {reason}");
         if matches!(self.state, GuestState::In { .. }) {
             self.leave_session(world);
             world.write_message(SessionLost { reason: reason.clone() });

@@ -78,7 +78,7 @@ pub enum CloseReason {
         words: String,
     },
     /// Nothing arrived within the idle timeout, or the handshake took too long.
-    #[error("nothing was heard from the other end in time")]
+    #[error("nothing was received from the other end in time")]
     TimedOut,
     /// The host has another key than the invite names: it is another host, or a man in the middle.
     #[error("the host shows the key {found}, the invite says {expected}")]
