@@ -41,9 +41,7 @@ fn bytes_a_tick(kbit_s: f64) -> f64 {
 pub(super) fn quantised(quick: bool, progress: &mut dyn Progress) -> Result<Figure, LabError> {
     let powers: &[i32] = if quick { &[4, 8, 14, 20] } else { &[4, 6, 8, 10, 12, 14, 16, 18, 20, 24] };
     let mut series = Vec::new();
-    let mut words = "What one step of a quantised number moves the surface by, as a share of how far the body is bent, from left to right 2^-4 to 2^-20 and finer (default 2^-14; streams of \
-        accelerations take a 64th of it); no loss, 120 modes, two hands, 40 Hz. A stream of reactions rounds only the slices that refresh it, so the quantum is cheap there; one of \
-        accelerations rounds every number that it sends, in a closed loop, so that the rounding does not add up. At the default:"
+    let mut words = "A quantum is the displacement of the surface by one step of a quantized number, as a share of the deformation of the body. From left to right it is 2^-4 to 2^-20 and finer (default 2^-14; streams of accelerations use a 64th of it). There is no loss, and there are 120 modes, two hands and 40 steps a second. A stream of reactions rounds only the slices that refresh it, so the quantum matters little there. A stream of accelerations rounds every number that it sends, in a closed loop, so the rounding errors do not add up. At the default:"
         .to_owned();
     for (done, name) in ["default", "paper"].into_iter().enumerate() {
         let recovery = RecoveryConfig::by_name(name).unwrap_or_default();
@@ -118,10 +116,7 @@ pub(super) fn table_3(quick: bool, progress: &mut dyn Progress) -> Result<String
         }
     }
     out.push_str(
-        "\n120 modes (the most in the paper's table 2), two hands at the host, 40 steps a second, the networks emulated. Of its table 3 the project has the networks and the sizes of what crosses, \
-         not every cell: the columns in brackets are what its text gives. What differs: a frame of ours is quantised so that steps look alike on the surface (the paper sends plain numbers), says \
-         reactions instead of accelerations by default, and a target is said three times and not asked for again. Bytes are those of the session, without UDP's and QUIC's own (some 50 a datagram). \
-         The rows `paper` and `paper-zero` are its repair in our frames, with its linear guess and with the better of its guesses here, none.\n",
+        "\nThe body has 120 modes (the most in the paper's table 2) and two hands at the host, and the host takes 40 steps a second. The networks are emulated. This table covers the networks and the data sizes of the paper's table 3, but not every cell of it. The numbers in brackets in the column headers are from the paper's text. There are three differences. Our frames are quantized so that the quanta have equal effects on the surface, while the paper sends plain numbers. Our frames contain reactions instead of accelerations by default. A target is sent three times and not requested again. Bytes are those of the session, without those of UDP and QUIC (some 50 a datagram). The rows `paper` and `paper-zero` are the paper's recovery with our frames: `paper` with its linear prediction, and `paper-zero` with no prediction, which is the better one here.\n",
     );
     Ok(out)
 }

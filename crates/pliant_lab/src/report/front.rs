@@ -266,9 +266,8 @@ fn local(quick: bool, progress: &mut dyn Progress) -> Result<(Vec<Figure>, Strin
     let (eye, hand) = (pareto(&choices, shape), pareto(&choices, force));
     let x = "us of one core for a second of motion, all steps and 60 surfaces";
     let what = format!(
-        "A bar held at one end, its other end led in circles of a tenth of its length by a hand, for {SECONDS:.0} s. Each point is a setting: 3 to 60 modes, four-node or ten-node tetrahedra (8 x 2 x 2 cells), \
-         exact or generalized-alpha steps of {} a second, single or half precision. The reference is a far finer mesh of ten-node tetrahedra with 120 modes and 3,840 steps a second, warped as all of these are (figure d says \
-         what the warp itself is off by); its own error is how far the next coarser one is from it.",
+        "A bar is held at one end, and a hand leads the other end in circles of a tenth of the length for {SECONDS:.0} s. Each point is a setting with 3 to 60 modes, four-node or ten-node tetrahedra (8 x 2 x 2 cells), \
+         exact or generalized-alpha steps of {} a second, and single or half precision. The reference is a far finer mesh of ten-node tetrahedra with 120 modes and 3,840 steps a second, with the warp, which all settings have (figure d shows the error of the warp). The error of the reference is estimated by its distance from the next coarser one.",
         rates.iter().map(|rate| format!("{rate:.0}")).collect::<Vec<_>>().join(", ")
     );
     let figures = vec![
@@ -288,11 +287,11 @@ fn local(quick: bool, progress: &mut dyn Progress) -> Result<(Vec<Figure>, Strin
             "error of the reaction, rms / rms",
             series(&force, &hand),
             Some(own[1]),
-            format!("The same settings by the reaction in the hand. {what}"),
+            format!("The figure shows the same settings by the error of the reaction. {what}"),
         ),
     ];
     let mut text = String::from(
-        "The settings on either front, cheapest first:\n\n| setting | us for a second of motion, 50 % / 99 % | surface off by % | reaction off by % | bake s | on the front for |\n| --- | --- | --- | --- | --- | --- |\n",
+        "The settings on either front are, cheapest first:\n\n| setting | us for a second of motion, 50 % / 99 % | surface error % | reaction error % | bake s | on the front for |\n| --- | --- | --- | --- | --- | --- |\n",
     );
     let mut rows: Vec<&Choice> = choices.iter().collect();
     rows.sort_by(|a, b| a.cost[0].total_cmp(&b.cost[0]));
@@ -322,7 +321,7 @@ fn local(quick: bool, progress: &mut dyn Progress) -> Result<(Vec<Figure>, Strin
     };
     let _ = write!(
         text,
-        "\nWhich setting for which need, by these points: {}{}Four-node tetrahedra of the same mesh get to {:.1} % for the eye and {:.1} % for the hand at best, ten-node ones to {:.1} and {:.1} %: the element costs time at the bake only.",
+        "\nWhich setting for which need, by these points: {}{}Four-node tetrahedra of the same mesh reach {:.1} % for the eye and {:.1} % for the hand at best, and ten-node ones reach {:.1} and {:.1} %. The element affects only the time of the bake.",
         advice(&eye, shape, "a body that is looked at"),
         advice(&hand, force, "a body that is felt"),
         100.0 * best(1, &shape),
@@ -347,7 +346,7 @@ fn local(quick: bool, progress: &mut dyn Progress) -> Result<(Vec<Figure>, Strin
         };
         let _ = writeln!(
             text,
-            " The default takes {:.0} us and is off by {:.1} % for the eye ({}) and {:.1} % for the hand ({}).",
+            " The default takes {:.0} us and has an error of {:.1} % for the eye ({}) and {:.1} % for the hand ({}).",
             default.cost[0],
             100.0 * default.shape,
             cheaper(&shape),
@@ -402,8 +401,9 @@ fn over_network(quick: bool, progress: &mut dyn Progress) -> Result<(Figure, Str
         "the front: no smaller one is as good",
         front.iter().map(|c| (c.cost[0], 100.0 * c.shape)).collect(),
     ));
-    let mut text =
-        String::from("\nOver the paper's worst network (9 % lost, 196 ms), smallest first on the front:");
+    let mut text = String::from(
+        "\nOver the paper's worst network (9 % lost, 196 ms), the settings on the front are, smallest first:",
+    );
     for choice in &front {
         let default = if choice.default { ", the default" } else { "" };
         let _ = write!(
@@ -432,7 +432,7 @@ fn over_network(quick: bool, progress: &mut dyn Progress) -> Result<(Figure, Str
         "shown error, rms, % of the largest displacement",
         series,
         None,
-        "The same bar, 60 modes, two hands at the host, 40 Hz: every way of repair with coarser and finer frames (quanta of 2^-4 to 2^-18 of the bend, default 2^-14). `none` is not drawn: it never forgets an error.".into(),
+        "The same bar has 60 modes and two hands at the host, at 40 Hz. The figure shows every recovery policy with coarser and finer frames (quanta of 2^-4 to 2^-18 of the deformation, default 2^-14). `none` is not drawn, because its errors never decay.".into(),
     );
     Ok((made, text))
 }

@@ -162,7 +162,7 @@ pub fn write(folder: &Path, settings: &Settings, progress: &mut dyn Progress) ->
             plot::write(folder, figure)?;
             let _ = writeln!(text, "![{}]({}.svg)\n\n{}", figure.title, figure.file, figure.words);
             if let Some(error) = figure.reference_error {
-                let _ = writeln!(text, "The reference itself is off by about {error:.1e}.");
+                let _ = writeln!(text, "The error of the reference is about {error:.1e}.");
             }
             let _ = writeln!(text, "\n{}", rows(figure));
             files.extend(["csv", "svg", "png"].map(|e| format!("{}.{e}", figure.file)));
@@ -230,8 +230,7 @@ fn rows(figure: &Figure) -> String {
 fn quiet(before: Option<f64>, after: Option<f64>) -> String {
     let (Some(before), Some(after)) = (before, after) else { return String::new() };
     format!(
-        "The machine's load (programs that want to run, mean over a minute) was {before:.1} when it began and {after:.1} at the end; the report itself is one of them, and bakes take all cores. Above that, times are \
-         too long, and ratios within a run are what holds."
+        "The load of the machine (runnable programs, mean over a minute) was {before:.1} at the start and {after:.1} at the end. The report itself counts as one program, and bakes use all cores. If the load is higher than that, the times are too long, and only ratios within a run are meaningful."
     )
 }
 
@@ -242,7 +241,7 @@ fn heading() -> String {
     let [y, m, d] = date(days as i64);
     let cores = std::thread::available_parallelism().map_or(1, usize::from);
     format!(
-        "# What Pliant costs and what it is off by\n\n{y:04}-{m:02}-{d:02}, Pliant {}, {cores} cores{}, {} {}, {}. Times are of one thread kept on one core, medians after a warm-up with the 99th percentile beside them (whiskers in the figures), unless it says otherwise.\n",
+        "# Cost and accuracy of Pliant\n\n{y:04}-{m:02}-{d:02}, Pliant {}, {cores} cores{}, {} {}, {}. Unless stated otherwise, times are those of one thread that is pinned to one core. They are medians after a warm-up, with the 99th percentile beside them (whiskers in the figures).\n",
         env!("CARGO_PKG_VERSION"),
         match machine::processor() {
             name if name.is_empty() => name,

@@ -41,8 +41,7 @@ pub(super) fn elements(quick: bool) -> Result<Vec<Figure>, LabError> {
         }
         series.push(Series::new(format!("{element}"), points));
     }
-    let words = "Largest error of the first eleven frequencies of a free cube against Demarest's values, over the time of the whole bake. Ten-node tetrahedra are the default: \
-        for the same error they take a small part of the time. The run-time cost is the same."
+    let words = "The figure shows the largest error of the first eleven frequencies of a free cube against Demarest's values, over the time of the whole bake. Ten-node tetrahedra are the default, because they reach the same error in a small part of the time. The cost at run time is the same."
         .to_owned();
     let cube = figure(
         "a-elements",
@@ -111,7 +110,7 @@ fn against_finer(quick: bool) -> Result<[Figure; 2], LabError> {
     }
     let [frequencies, pull] = series;
     let mesh = format!("{} x {finest} x {finest} cells of ten-node tetrahedra", 5 * finest);
-    let finer = "The reference's own error is how far the next coarser mesh is from it, which is more than it is off by itself.";
+    let finer = "The error of the reference is estimated by its distance from the next coarser mesh, which is larger than its true error.";
     Ok([
         figure(
             "a-bar-frequencies",
@@ -121,7 +120,7 @@ fn against_finer(quick: bool) -> Result<[Figure; 2], LabError> {
             frequencies,
             Some(own[0]),
             format!(
-                "The first six frequencies of a bar that is held at one end against a far finer mesh ({mesh}). {finer}"
+                "The first six frequencies of a bar that is held at one end are compared with those of a far finer mesh ({mesh}). {finer}"
             ),
         ),
         figure(
@@ -132,7 +131,7 @@ fn against_finer(quick: bool) -> Result<[Figure; 2], LabError> {
             pull,
             Some(own[1]),
             format!(
-                "How far a patch in the middle of the end goes to the side for a newton, at rest (20 modes and what they leave out together, which is the whole static solution of the mesh), against the same mesh. {finer}"
+                "The static sideways displacement of a patch in the middle of the end under a force of one newton is compared with that of the same finer mesh. It is the sum of 20 modes and of the residual flexibility, which together are the whole static solution of the mesh. {finer}"
             ),
         ),
     ])
@@ -238,7 +237,7 @@ pub(super) fn modes(quick: bool) -> Result<Vec<Figure>, LabError> {
         vec![Series::timed("with residual flexibility (default)", with), Series::timed("without", without)]
     };
     let same = format!(
-        "Both take the same steps of 1/60 s, so that what these are off by (the reaction: {step:.1e} to steps half as long) is in both and not in the figure: the reference has no error of its own here but rounding."
+        "The model and the reference take the same steps of 1/60 s, so the error of the step (for the reaction {step:.1e}, against steps half as long) cancels and does not appear in the figure. Apart from rounding, the reference has no error of its own here."
     );
     let mut over_time = figure(
         "b-modes-time",
@@ -247,7 +246,7 @@ pub(super) fn modes(quick: bool) -> Result<Vec<Figure>, LabError> {
         "mass-weighted error, % of the motion",
         courses,
         None,
-        "The same error sample by sample, with residual flexibility: the drag takes a second, the hold another.".into(),
+        "The figure shows the same error over time, with residual flexibility. The bar is dragged for one second and held for another.".into(),
     );
     over_time.logarithmic = false;
     Ok(vec![
@@ -259,8 +258,7 @@ pub(super) fn modes(quick: bool) -> Result<Vec<Figure>, LabError> {
             lines(force),
             None,
             format!(
-                "Error of the reaction of a dragged bar against all 216 modes of its mesh, over the time of a step, for 2 to 128 modes kept. What the kept modes leave out at the hand \
-                 is added as a compliance; without it a hand on few modes feels a body that is much too stiff. {same}"
+                "The figure shows the error of the reaction of a dragged bar against all 216 modes of its mesh, over the time of a step, for 2 to 128 kept modes. What the kept modes leave out at the hand is added as a compliance. Without it, a hand on a body with few modes feels a body that is much too stiff. {same}"
             ),
         ),
         figure(
@@ -270,8 +268,7 @@ pub(super) fn modes(quick: bool) -> Result<Vec<Figure>, LabError> {
             "mass-weighted error, rms / rms",
             lines(shape),
             None,
-            "Mass-weighted error of the whole body's displacement over the two seconds (the modes are orthonormal by mass: it is the length of the difference of the modal coordinates), as a share of the motion. \
-             What the missing modes would have shown near the hand is in it; the compliance gives the hand their force, and the picture nothing."
+            "The figure shows the mass-weighted error of the displacement of the whole body over the two seconds, as a share of the motion. The modes are mass-orthonormal, so this error is the norm of the difference of the modal coordinates. It includes what the missing modes would add near the hand: the compliance corrects the force on the hand but not the picture."
                 .into(),
         ),
         over_time,
@@ -366,13 +363,13 @@ pub(super) fn steps(quick: bool) -> Result<Vec<Figure>, LabError> {
         "mass-weighted error, % of the motion",
         courses,
         None,
-        "The struck bar at 60 steps a second: mass-weighted error of the whole body's displacement, sample by sample. A shifted frequency is off by more with every swing, until the damping has taken the motion.".into(),
+        "The figure shows the mass-weighted error of the displacement of the whole struck bar over time, at 60 steps a second. If a frequency is shifted, the error grows with every oscillation until the damping has ended the motion.".into(),
     );
     over_time.logarithmic = false;
     let x = "us of one core for a second of motion";
-    let order = "The reference is generalized-alpha at 7,680 steps a second; its own error is a third of its difference to half as many (second order).";
+    let order = "The reference is generalized-alpha at 7,680 steps a second. Its error is estimated as a third of its difference from 3,840 steps a second, because the method is of second order.";
     Ok(vec![
-        figure("c-steps-free", "Integrator and step: a struck bar", x, "tip error over 1 s, rms / rms", free, None, "A struck bar for a second, against the closed form. The exact step has no error at any step size (rounding is drawn at 1e-16 at least); Newmark shifts every frequency.".into()),
+        figure("c-steps-free", "Integrator and step: a struck bar", x, "tip error over 1 s, rms / rms", free, None, "A struck bar is compared with the closed form for one second. The exact step has no error at any step size except rounding, which is drawn as at least 1e-16. Newmark shifts every frequency.".into()),
         over_time,
         figure(
             "c-steps-held",
@@ -381,7 +378,7 @@ pub(super) fn steps(quick: bool) -> Result<Vec<Figure>, LabError> {
             "reaction error, rms / rms",
             held,
             Some(held_own),
-            format!("The same bar dragged and held. {order} The exact step tells the force at a step's end by those in the middle of this one and the last. It is of second order without the warp (its test), and here too up to 240 steps a second; beyond, what remains falls only with the step, so that the two others are more exact there."),
+            format!("The same bar is dragged and held. {order} The exact step extrapolates the force at the end of a step from the forces in the middle of this step and of the previous one. Without the warp it is of second order, as a test shows. With the warp it is of second order up to 240 steps a second. At higher rates the remaining error is of first order, so the two other integrators are more accurate there."),
         ),
         figure(
             "c-steps-held-shape",
@@ -390,7 +387,7 @@ pub(super) fn steps(quick: bool) -> Result<Vec<Figure>, LabError> {
             "mass-weighted error, rms / rms",
             shapes,
             Some(shape_own),
-            format!("The mass-weighted error of the whole body's displacement in the same runs. {order}"),
+            format!("The figure shows the mass-weighted error of the displacement of the whole body in the same runs. {order}"),
         ),
     ])
 }

@@ -63,7 +63,7 @@ pub(super) fn precision() -> Result<Figure, LabError> {
         .fold(0.0, f64::max)
         .sqrt();
     let words = format!(
-        "{} vertices, 60 modes, pulled by a fifth of the length: a half-precision basis is off by {most:.1e} of the length at most, {:.0} us instead of {:.0} us for the surface ({} and {} bytes read and written). It is `BodyConfig::precision` and `ModalBody::half_basis`.",
+        "{} vertices, 60 modes, pulled by a fifth of the length: a half-precision basis has an error of {most:.1e} of the length at most and takes {:.0} us instead of {:.0} us for the surface ({} and {} bytes read and written). The settings are `BodyConfig::precision` and `ModalBody::half_basis`.",
         a.len(),
         fast[0],
         slow[0],
@@ -139,9 +139,7 @@ pub(super) fn networks(quick: bool, progress: &mut dyn Progress) -> Result<(Vec<
         over_bytes.push(Series::new(name, bytes));
         over_time.push(Series::new(name, time));
     }
-    let words = "Each line is a way of repair, its points the paper's four networks (9, 6, 3, 0 % loss); lower and further left is better. `none` and the paper's ways stream accelerations, \
-        `default` and `force-driven` reactions; between peers only targets cross, and what the second peer shows before it knows all of them is compared with what both agree on afterwards. A tick \
-        that is not shown in time counts as the picture that stood in its place.";
+    let words = "Each line is a recovery policy, and its points are the paper's four networks (9, 6, 3 and 0 % loss). Lower and further left is better. `none` and the paper's policies stream accelerations, and `default` and `force-driven` stream reactions. Peers send only targets, and the visual state of the second peer, before it knows all targets, is compared with the state on which both agree afterwards. If a tick is not displayed in time, the picture that was displayed instead is compared.";
     let figure = |file: &str, title: &str, x: &str, series, words: String| Figure {
         file: file.into(),
         title: title.into(),
@@ -152,8 +150,7 @@ pub(super) fn networks(quick: bool, progress: &mut dyn Progress) -> Result<(Vec<
         reference_error: None,
         words,
     };
-    let timed = "The same over the processor time of a tick at who is shown it: decoding, correcting, stepping 60 modes (between peers their own hands, too), of the thread itself, on one core, \
-        the least of three runs.";
+    let timed = "The figure shows the same error over the processor time of a tick at the receiver. The time includes decoding, correcting and stepping 60 modes, and between peers also the peer's own hands. It is the time of the thread itself on one core, the shortest of three runs.";
     let figures = vec![
         figure(
             "f-network",
@@ -216,8 +213,7 @@ pub(super) fn courses() -> Result<Vec<Figure>, LabError> {
         ];
         let mut series = Vec::new();
         let mut words = format!(
-            "As the paper's figure {number}: {title}; questions for what was lost are answered 50 ticks later, but for the last two lines, where they are answered at once. Drawn is the error along \
-             the pull at the first hand's place. Largest there, and largest anywhere on the surface, % of the largest displacement:"
+            "This is the case of the paper's figure {number}: {title}. NACKs are answered 50 ticks later, except in the last two lines, where they are answered at once. The figure shows the error along the pull at the position of the first hand. The largest error there and the largest error anywhere on the surface, in % of the largest displacement, are:"
         );
         for (name, f) in &lines {
             let first = f.track.first().map_or(0, |t| t.0) as f64;
@@ -257,12 +253,7 @@ const PAPER: [(&str, usize, usize, f64, f64); 4] = [
 /// Goal of each row as a multiple of the paper's steps a second.
 const BAR: f64 = 20.0;
 
-const BOUND: &str = "\nA frame is a step under a hand that moves and the whole surface of the shape that it came to, one after the other; steps a second are those of its median. What bounds it: a step takes a few \
-    microseconds; the rest is the surface, and the surface is one pass over the basis, 24 bytes a vertex and mode (displacement and rotation, single precision), read once a frame. Its speed is beside \
-    that of the fastest of some thousand passes in the same run, plain sums over a buffer of as many bytes and surfaces alike: memory gave no more, and where it comes near 100 % nothing is left to gain but fewer bytes. Half precision is \
-    that (12 bytes; `ModalBody::half_basis`): an option, off by default, so that a row that reaches the bar only with it is short of it by default. So is leaving out modes that move nothing by a tenth of a \
-    pixel (`SurfaceDetail`, on by default in the picture, off here). The limit itself moves with what else the machine's memory serves. What differs from the paper: its processor (one core of a 2.93 GHz Core 2 \
-    Duo of 2008), its meshes of the same sizes, and the warp, which is in our surface.\n";
+const BOUND: &str = "\nA frame is a step under a moving hand, followed by the reconstruction of the whole surface. The steps a second are those of the median frame. The memory bandwidth bounds the frame: a step takes a few microseconds, and the rest is the surface. The surface is one pass over the basis, which has 24 bytes for each vertex and mode (displacement and rotation, single precision) and is read once a frame. The column \"of the memory's limit\" compares the speed of this pass with the fastest of some thousand passes in the same run, which include plain sums over a buffer of the same size as well as surfaces. Near 100 %, only fewer bytes can make the frame faster. Half precision needs 12 bytes (`ModalBody::half_basis`) and is off by default, so a row that reaches the goal only in half precision does not reach it by default. Another way is to leave out modes that move no vertex by a tenth of a pixel (`SurfaceDetail`, which is on by default for the picture and off here). The limit itself depends on what else uses the memory of the machine. The paper differs in its processor (one core of a 2.93 GHz Core 2 Duo of 2008) and in its meshes, which have the same sizes. Our surface also includes the warp.\n";
 
 /// Says whether a row reaches the goal.
 fn verdict(single: f64, half: f64) -> String {
@@ -379,7 +370,7 @@ fn setting(
         under(&mesh, &setting, &[DeadLoad { patch: patch.clone(), force: way.map(|x| 1e-9 * x / length) }])?;
     let give = unit.patches[0].iter().map(|x| x * x).sum::<f64>().sqrt() / 1e-9;
     let mut out = format!(
-        "The {name}, {} {}, 60 modes, the default at run time (exact step of 1/60 s, warp, residual flexibility), held at its foot and pulled where it gives most, against a St. Venant-Kirchhoff solution with the same elements (so what the elements themselves are off by is in neither; figure a says it):\n\n| pulled by, % of the size | surface off by, rms / largest, % of the size | without warp, largest | force along the pull off by, % (all of it) | without warp | step us |\n| --- | --- | --- | --- | --- | --- |\n",
+        "The {name}, {} {}, 60 modes, the default at run time (exact step of 1/60 s, warp, residual flexibility), is held at its foot and pulled where it is most compliant. It is compared with a St. Venant-Kirchhoff solution with the same elements, so the error of the elements is not included (figure a shows it):\n\n| pulled by, % of the size | surface error, rms / largest, % of the size | without warp, largest | force error along the pull, % (whole force) | without warp | step us |\n| --- | --- | --- | --- | --- | --- |\n",
         mesh.tets.len(),
         match element {
             Element::Tet4 =>
@@ -426,9 +417,9 @@ fn setting(
         );
         if share == 0.1 {
             words = format!(
-                "\nIn words: pull the {name} by {:.0} % of its size, and no point that you see is further than {:.2} % of its size from where the full nonlinear solution has it ({:.1} mm on a {name} 20 cm \
-                 large); without the warp it would be {:.1} times as far. A step takes {:.1} us (the bound is a millisecond). The pull that you feel along the way is off by {:.0} %; a hand \
-                 that also fixes the patch sideways, exactly where the nonlinear body has it, feels more than that (in brackets), as it presses against directions that are stiff.\n",
+                "\nIn other words: if the {name} is pulled by {:.0} % of its size, no visible point is further than {:.2} % of its size from its position in the full nonlinear solution ({:.1} mm on a {name} 20 cm \
+                 large). Without the warp, this distance would be {:.1} times as large. A step takes {:.1} us (the limit is a millisecond). The force along the pull has an error of {:.0} %. A hand \
+                 that also fixes the patch sideways, exactly at its position in the nonlinear solution, has a larger error (in brackets), because it presses against stiff directions.\n",
                 100.0 * reach,
                 100.0 * held.shape[1] / size,
                 200.0 * held.shape[1] / size,

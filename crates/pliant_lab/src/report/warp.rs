@@ -136,10 +136,11 @@ pub(super) fn warp(quick: bool) -> Result<Vec<Figure>, LabError> {
             .map(|(with, without)| format!("{:.3} ({:.1e} with, {:.1e} without)", with.0, with.1, without.1))
             .collect();
         if at.is_empty() {
-            return "The warp is the better of the two at every pull drawn.".to_owned();
+            return "The model with the warp is the better of the two at every pull in the figure."
+                .to_owned();
         }
         format!(
-            "The warp is the *worse* of the two at {} of the length, and the better at the other pulls.",
+            "The model with the warp is the *worse* of the two at {} of the length, and the better of the two at the other pulls.",
             at.join(", ")
         )
     };
@@ -164,8 +165,7 @@ pub(super) fn warp(quick: bool) -> Result<Vec<Figure>, LabError> {
             lines(bend),
             Some(own),
             format!(
-                "A bar ten times as long as thick, its end pulled aside by a dead load in a St. Venant-Kirchhoff solution of our own on the same mesh; the modal body is held by a hand where that solution has the patch, and the largest distance of the two surfaces is drawn. 60 modes, ten-node tetrahedra in both. The reference's own error is what its solver left over. Model and reference share their mesh, so that what the mesh is off by is in \
-             neither: on one of cells of two thirds by half by half the reference's patch would lie {finer:.1e} of the length elsewhere under the same load. {worse_shape}"
+                "The bar is ten times as long as thick. The reference is our own St. Venant-Kirchhoff solution on the same mesh, in which a dead load pulls the end aside. A hand holds the modal body where that solution has the patch, and the largest distance between the two surfaces is drawn. Both use ten-node tetrahedra, and the modal body has 60 modes. The error of the reference is the residual of its solver. The model and the reference share their mesh, so the figure does not include the error of the mesh: on a mesh with cells of two thirds by half by half the size, the patch of the reference would lie {finer:.1e} of the length away under the same load. {worse_shape}"
             ),
         ),
         figure(
@@ -176,9 +176,7 @@ pub(super) fn warp(quick: bool) -> Result<Vec<Figure>, LabError> {
             forces,
             None,
             format!(
-                "The force that the hand feels in the same cases: its part along the pull, and all of it. The hand holds the patch in all three directions where the nonlinear bar has it, drawn \
-             in along its axis as a bent bar is; where warped modes would lie a little elsewhere along the axis, the stiff direction answers with a force of several times the load. A hand \
-             that pulls where the body lets it (a soft spring, a device) does not feel it. Along the pull: {worse_force}"
+                "The figure shows the error of the force on the hand in the same cases, both of its component along the pull and of the whole force. The hand holds the patch in all three directions where the nonlinear bar has it. A bent bar is shortened along its axis, and warped modes shorten it by a slightly different length. The axis is stiff, so the hand then feels a force of several times the load. A hand that does not fix the patch along the axis, such as a soft spring or a device, does not feel this force. Along the pull: {worse_force}"
             ),
         ),
         figure(
@@ -189,7 +187,7 @@ pub(super) fn warp(quick: bool) -> Result<Vec<Figure>, LabError> {
             lines(twist),
             Some(own_twist),
             format!(
-                "The same bar under four forces at the corners of its end, solved on its own. {worse_twist}"
+                "The same bar is under four forces at the corners of its end. This case has its own nonlinear solution. {worse_twist}"
             ),
         ),
     ])
