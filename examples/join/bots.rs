@@ -71,16 +71,16 @@ pub fn run(invite: &Invite, model: &Arc<ModalModel>, bots: &Bots) -> Result<(), 
         }
     }
     println!("{} bots after {:.1} s", all.len(), start.elapsed().as_secs_f64());
-    let mut said = Instant::now();
+    let mut reported = Instant::now();
     while start.elapsed().as_secs_f64() < bots.seconds && !bots.stopped.load(Ordering::Relaxed) {
         all.iter_mut().for_each(|bot| bot.turn(model, bots, start));
         std::thread::sleep(Duration::from_millis(2));
-        if said.elapsed().as_secs_f64() > 10.0 {
-            said = Instant::now();
-            say(&all, start);
+        if reported.elapsed().as_secs_f64() > 10.0 {
+            reported = Instant::now();
+            report(&all, start);
         }
     }
-    say(&all, start);
+    report(&all, start);
     match all.iter().find_map(|bot| bot.closed.as_ref()) {
         Some(why) => Err(format!("a bot's session ended: {why}").into()),
         None if all.iter().any(|bot| bot.joined.is_none()) => Err("not all bots saw the body".into()),
@@ -88,7 +88,7 @@ pub fn run(invite: &Invite, model: &Arc<ModalModel>, bots: &Bots) -> Result<(), 
     }
 }
 
-fn say(all: &[Bot], start: Instant) {
+fn report(all: &[Bot], start: Instant) {
     let mut joins: Vec<f64> = all.iter().filter_map(|bot| Some(bot.joined?.as_secs_f64())).collect();
     joins.sort_by(f64::total_cmp);
     let median = joins.get(joins.len() / 2).copied().unwrap_or(0.0);

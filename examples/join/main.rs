@@ -171,7 +171,7 @@ fn run(mut options: Options) -> Result<(), Box<dyn Error>> {
         return window::run(options, net);
     }
     let mut app = session::headless(Level::WARN);
-    app.add_plugins((PliantBodyPlugin::default(), net)).add_systems(Update, session::say);
+    app.add_plugins((PliantBodyPlugin::default(), net)).add_systems(Update, session::print_status);
     finish(&mut app, options)?;
     session::ended(&app.run())
 }

@@ -200,7 +200,7 @@ pub fn play(
 }
 
 /// Prints a line of network metrics once per second, for runs without a window.
-pub fn say(
+pub fn print_status(
     time: Res<Time<Real>>,
     stats: Res<NetStats>,
     users: Query<&User>,

@@ -87,7 +87,7 @@ enum NetTopology {
 
 /// The metrics of one run.
 #[derive(Serialize, Debug)]
-struct Told {
+struct StreamMetrics {
     /// The policy's name is for the table only. A caller of `--json` has named the policy.
     #[serde(skip)]
     recovery: String,
@@ -108,25 +108,25 @@ struct Told {
     hash: String,
 }
 
-impl Told {
-    fn new(recovery: &str, figures: &Metrics) -> Self {
+impl StreamMetrics {
+    fn new(recovery: &str, metrics: &Metrics) -> Self {
         Self {
             recovery: recovery.into(),
-            ticks: figures.ticks,
-            lost: figures.lost,
-            recovered: figures.recovered,
-            rms_percent: figures.rms_percent,
-            max_percent: figures.max_percent,
-            end_percent: figures.end_percent,
-            force_rms_percent: figures.force_rms_percent,
-            force_ringing: figures.force_ringing,
-            hand_to_force_ms: figures.hand_to_force_ms,
-            visual_delay_ms: figures.visual_delay_ms,
-            recover_ms: figures.recover_ms,
-            bytes_per_frame: figures.bytes_per_frame,
-            kbit_s: figures.kbit_s,
-            cpu_us_per_tick: figures.cpu_us_per_tick,
-            hash: format!("{:016x}", figures.hash),
+            ticks: metrics.ticks,
+            lost: metrics.lost,
+            recovered: metrics.recovered,
+            rms_percent: metrics.rms_percent,
+            max_percent: metrics.max_percent,
+            end_percent: metrics.end_percent,
+            force_rms_percent: metrics.force_rms_percent,
+            force_ringing: metrics.force_ringing,
+            hand_to_force_ms: metrics.hand_to_force_ms,
+            visual_delay_ms: metrics.visual_delay_ms,
+            recover_ms: metrics.recover_ms,
+            bytes_per_frame: metrics.bytes_per_frame,
+            kbit_s: metrics.kbit_s,
+            cpu_us_per_tick: metrics.cpu_us_per_tick,
+            hash: format!("{:016x}", metrics.hash),
         }
     }
 }
@@ -158,15 +158,15 @@ pub(crate) fn run(args: &StreamArgs) -> Result<(), CliError> {
         (None, NetTopology::Cs, false) => RecoveryConfig::NAMES.to_vec(),
         (None, NetTopology::P2p, false) => REPAIRS.iter().map(|(name, _)| *name).collect(),
     };
-    let told = names.iter().map(|name| measure(args, &model, name)).collect::<Result<Vec<_>, _>>()?;
-    match (args.json, told.as_slice()) {
+    let measured = names.iter().map(|name| measure(args, &model, name)).collect::<Result<Vec<_>, _>>()?;
+    match (args.json, measured.as_slice()) {
         (true, [one]) => output::print_json(one),
         (true, all) => output::print_json(&all),
         (false, all) => output::print(&table(all)),
     }
 }
 
-fn measure(args: &StreamArgs, model: &Arc<ModalModel>, name: &str) -> Result<Told, CliError> {
+fn measure(args: &StreamArgs, model: &Arc<ModalModel>, name: &str) -> Result<StreamMetrics, CliError> {
     let step = Duration::from_secs_f64(1.0 / args.rate);
     let link = match (&args.loss, &args.network) {
         (Some(words), _) => {
@@ -183,7 +183,7 @@ fn measure(args: &StreamArgs, model: &Arc<ModalModel>, name: &str) -> Result<Tol
         }
     };
     let unknown = |expected: String| CliError::Unknown { what: "--recovery", got: name.into(), expected };
-    let figures = match args.topology {
+    let metrics = match args.topology {
         NetTopology::Cs => {
             let mut recovery =
                 RecoveryConfig::by_name(name).ok_or_else(|| unknown(RecoveryConfig::NAMES.join(", ")))?;
@@ -205,7 +205,7 @@ fn measure(args: &StreamArgs, model: &Arc<ModalModel>, name: &str) -> Result<Tol
                 .run_peers(repair)?
         }
     };
-    Ok(Told::new(name, &figures))
+    Ok(StreamMetrics::new(name, &metrics))
 }
 
 fn experiment(
@@ -228,7 +228,7 @@ fn experiment(
     }
 }
 
-fn table(all: &[Told]) -> String {
+fn table(all: &[StreamMetrics]) -> String {
     let mut text = format!(
         "{:<14} {:>7} {:>6} {:>9} {:>11} {:>11} {:>11} {:>10} {:>8} {:>9} {:>8} {:>8} {:>7}\n",
         "recovery",

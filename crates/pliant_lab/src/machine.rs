@@ -54,7 +54,7 @@ pub(crate) fn load() -> Option<f64> {
 
 /// The CPU's name. Empty if the system does not report it.
 pub(crate) fn processor() -> String {
-    let told = std::fs::read_to_string("/proc/cpuinfo").unwrap_or_default();
-    let line = told.lines().find_map(|line| line.strip_prefix("model name")?.split_once(':'));
+    let text = std::fs::read_to_string("/proc/cpuinfo").unwrap_or_default();
+    let line = text.lines().find_map(|line| line.strip_prefix("model name")?.split_once(':'));
     line.map_or(String::new(), |(_, name)| name.trim().to_owned())
 }

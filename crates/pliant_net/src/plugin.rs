@@ -168,7 +168,7 @@ impl Plugin for NetPlugin {
                     )
                     .add_systems(
                         PostUpdate,
-                        (guest::look, guest::say_interest).chain().after(VisibilitySystems::UpdateFrusta),
+                        (guest::look, guest::send_interest).chain().after(VisibilitySystems::UpdateFrusta),
                     );
             }
             Start::Peer(peer) => {
@@ -177,7 +177,7 @@ impl Plugin for NetPlugin {
                     .add_systems(PreUpdate, peer::receive.in_set(NetSystems::Receive))
                     .add_systems(
                         PostUpdate,
-                        (peer::tell_hands, peer::show)
+                        (peer::send_hands, peer::show)
                             .chain()
                             .in_set(NetSystems::Show)
                             .before(PliantDisplaySystems::Interpolate),

@@ -60,19 +60,19 @@ pub(crate) fn see_devices(
 }
 
 /// The last logged state and fault of each device.
-type Said = HashMap<DeviceId, (LoopState, Option<String>)>;
+type Logged = HashMap<DeviceId, (LoopState, Option<String>)>;
 
-pub(crate) fn say_how_they_are(
+pub(crate) fn log_devices(
     devices: Res<HapticDevices>,
     mut own: ResMut<RerunScalars>,
-    mut said: Local<Said>,
+    mut logged: Local<Logged>,
 ) {
-    said.retain(|id, _| devices.get(*id).is_some());
+    logged.retain(|id, _| devices.get(*id).is_some());
     for (id, name) in names(&devices) {
         let Some(status) = devices.get(id) else { continue };
         let fault = status.report.tick.fault.map(|fault| fault.to_string());
         let now = (status.report.state, fault);
-        if said.get(&id) == Some(&now) {
+        if logged.get(&id) == Some(&now) {
             continue;
         }
         match &now {
@@ -81,7 +81,7 @@ pub(crate) fn say_how_they_are(
             (state, None) => own.warn(format!("{name}: {}", words(*state))),
             (state, Some(fault)) => own.warn(format!("{name}: {}, {fault}", words(*state))),
         }
-        said.insert(id, now);
+        logged.insert(id, now);
     }
 }
 

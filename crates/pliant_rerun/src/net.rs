@@ -17,7 +17,7 @@ use crate::{
     frame::RecordedHand,
 };
 
-pub(crate) fn say_who_comes_and_goes(
+pub(crate) fn log_users(
     mut joined: MessageReader<UserJoined>,
     mut left: MessageReader<UserLeft>,
     mut refused: MessageReader<GrabRefused>,
@@ -64,17 +64,17 @@ fn standing(
 }
 
 /// Logs the state of the connection when it changes.
-pub(crate) fn say_how_it_stands(
+pub(crate) fn log_connection(
     host: Option<Res<NetHost>>,
     guest: Option<Res<NetGuest>>,
     peer: Option<Res<NetPeer>>,
     mut own: ResMut<RerunScalars>,
-    mut told: Local<String>,
+    mut logged: Local<String>,
 ) {
     let Some((standing, stands)) = standing(host.as_deref(), guest.as_deref(), peer.as_deref()) else {
         return;
     };
-    if *told == standing {
+    if *logged == standing {
         return;
     }
     if stands {
@@ -82,7 +82,7 @@ pub(crate) fn say_how_it_stands(
     } else {
         own.warn(standing.clone());
     }
-    *told = standing;
+    *logged = standing;
 }
 
 /// Records the state of the connection, its jitter and whether it is queueing, once per second. The

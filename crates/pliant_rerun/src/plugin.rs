@@ -295,7 +295,7 @@ impl Plugin for RerunPlugin {
         app.add_systems(
             self.schedule,
             (
-                crate::net::say_who_comes_and_goes
+                crate::net::log_users
                     .run_if(
                         resource_exists::<Messages<pliant_net::UserJoined>>
                             .and_then(resource_exists::<Messages<pliant_net::UserLeft>>)
@@ -303,7 +303,7 @@ impl Plugin for RerunPlugin {
                             .and_then(resource_exists::<Messages<pliant_net::SessionClosed>>),
                     )
                     .run_if(collect::somebody_listens),
-                crate::net::say_how_it_stands.run_if(collect::wants_text),
+                crate::net::log_connection.run_if(collect::wants_text),
                 crate::net::log_metrics.run_if(collect::wants_metrics),
                 (crate::net::see_whose_hands, crate::net::see_other_hands).run_if(collect::wants_hands),
             )
@@ -313,7 +313,7 @@ impl Plugin for RerunPlugin {
         app.add_systems(
             self.schedule,
             (
-                crate::haptics::say_how_they_are.run_if(collect::wants_text),
+                crate::haptics::log_devices.run_if(collect::wants_text),
                 crate::haptics::see_devices.run_if(collect::wants_metrics),
                 crate::haptics::take_samples.run_if(collect::wants_metrics),
             )

@@ -151,16 +151,16 @@ pub(super) fn watch(
         }
     }
     for failed in models.read() {
-        let mut told = Vec::new();
+        let mut reported = Vec::new();
         for (entity, part, body, _, source) in
             bodies.iter().filter(|(.., body, _)| body.model.id() == failed.id)
         {
             commands.entity(entity).try_insert(Lost);
             // One report covers all copies.
-            if told.contains(&(part.0, body.entry)) {
+            if reported.contains(&(part.0, body.entry)) {
                 continue;
             }
-            told.push((part.0, body.entry));
+            reported.push((part.0, body.entry));
             let message = format!(
                 "the body `{}` cannot be loaded: {}",
                 source.file.scene().bodies.get(body.entry).map_or("", |entry| entry.name.as_str()),
@@ -180,15 +180,15 @@ pub(super) fn watch_settings(
     mut refused: MessageReader<BodyRefused>,
     bodies: Query<(&PartOf, &Name, &SceneSource), (With<SceneBody>, Without<BodyState>)>,
 ) {
-    let mut told = Vec::new();
+    let mut reported = Vec::new();
     for refused in refused.read() {
         let Ok((part, name, source)) = bodies.get(refused.entity) else { continue };
         commands.entity(refused.entity).try_insert(Lost);
         // One report covers all copies.
-        if told.contains(&(part.0, &source.path)) {
+        if reported.contains(&(part.0, &source.path)) {
             continue;
         }
-        told.push((part.0, &source.path));
+        reported.push((part.0, &source.path));
         let message = format!("the body `{name}` cannot be made: {}", refused.error);
         let error = source.file.error(&source.path, SceneErrorKind::Value, message);
         let instance = part.0;

@@ -149,8 +149,8 @@ pub struct LoopCore {
     held: HeldPatches,
     /// The last local model update: its tick, its time of arrival, the energy that others had
     /// supplied, and whether it was finite.
-    heard: u64,
-    heard_at: f64,
+    received_tick: u64,
+    received_at: f64,
     supplied: f64,
     good: bool,
     last_position: Vector3<f64>,
@@ -194,8 +194,8 @@ impl LoopCore {
             safety: Safety::new(safety, info.mass),
             torque: Slew::default(),
             held: HeldPatches::new(safety.ramp),
-            heard: 0,
-            heard_at: 0.0,
+            received_tick: 0,
+            received_at: 0.0,
             supplied: 0.0,
             good: true,
             last_position: Vector3::zeros(),
@@ -301,12 +301,12 @@ impl LoopCore {
         if now < self.stalled_until {
             fault = fault.or(Some(Fault::Stalled(self.stall)));
         }
-        let supplied = self.hear(now, model);
+        let supplied = self.receive(now, model);
         if !self.good {
             fault = fault.or(Some(Fault::BadModel));
         }
-        let holding = self.good && self.heard > 0 && model.count > 0;
-        let silent = if holding { (now - self.heard_at).max(0.0) } else { 0.0 };
+        let holding = self.good && self.received_tick > 0 && model.count > 0;
+        let silent = if holding { (now - self.received_at).max(0.0) } else { 0.0 };
 
         let felt = if holding {
             let when = When { now, dt, period: 1.0 / self.config.rate };
@@ -371,14 +371,14 @@ impl LoopCore {
 
     /// Registers a new local model update. Returns the energy that others have supplied since the
     /// last one, J of the world.
-    fn hear(&mut self, now: f64, model: &LocalModel) -> f64 {
-        if model.tick == self.heard {
+    fn receive(&mut self, now: f64, model: &LocalModel) -> f64 {
+        if model.tick == self.received_tick {
             return 0.0;
         }
         self.good = model.is_finite();
-        let first_word = self.heard == 0;
-        self.heard = model.tick;
-        self.heard_at = now;
+        let first_update = self.received_tick == 0;
+        self.received_tick = model.tick;
+        self.received_at = now;
         if !self.good {
             return 0.0;
         }
@@ -388,7 +388,7 @@ impl LoopCore {
         }
         // An update for other grabs, and so perhaps for another body, does not continue the count
         // of the previous grabs.
-        let goes_on = !first_word && change == Change::None;
+        let goes_on = !first_update && change == Change::None;
         let supplied = if goes_on { model.supplied - self.supplied } else { 0.0 };
         self.supplied = model.supplied;
         supplied

@@ -123,7 +123,7 @@ pub struct Cycle<D> {
     retry_at: f64,
     calibrate_at: f64,
     calibrated: bool,
-    told: Option<&'static str>,
+    reported: Option<&'static str>,
     stopped: bool,
     counted_from: (f64, u64),
     /// A copy of a body that the loop has discarded.
@@ -149,7 +149,7 @@ impl<D: HapticDevice> Cycle<D> {
             retry_at: 0.0,
             calibrate_at: 0.0,
             calibrated: false,
-            told: None,
+            reported: None,
             stopped: false,
             counted_from: (0.0, 0),
             trash: None,
@@ -294,7 +294,7 @@ impl<D: HapticDevice> Cycle<D> {
             self.report.rate = (self.report.ticks - ticks) as f64 / (now - from);
             self.counted_from = (now, self.report.ticks);
         }
-        self.tell(sink);
+        self.notify(sink);
         self.report.tick = *self.core.last();
         if self.report.state != LoopState::Lost {
             self.report.state = if self.core.is_stopped() {
@@ -308,7 +308,7 @@ impl<D: HapticDevice> Cycle<D> {
     }
 
     /// Sends changes of buttons and faults as events.
-    fn tell(&mut self, sink: &mut dyn Sink) {
+    fn notify(&mut self, sink: &mut dyn Sink) {
         let tick = *self.core.last();
         let changed = tick.buttons ^ self.report.tick.buttons;
         for bit in (0..32).filter(|bit| changed >> bit & 1 == 1) {
@@ -337,14 +337,14 @@ impl<D: HapticDevice> Cycle<D> {
         match self.device.calibration() {
             Calibration::Ready => {
                 self.calibrated = true;
-                self.told = None;
+                self.reported = None;
                 self.core.engage();
             }
             Calibration::Needed(what) => {
-                if self.told != Some(what) {
+                if self.reported != Some(what) {
                     sink.event(LoopEvent::Calibrate(what));
                 }
-                self.told = Some(what);
+                self.reported = Some(what);
             }
         }
     }

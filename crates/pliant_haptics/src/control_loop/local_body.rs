@@ -33,8 +33,8 @@ pub struct ModalLocal {
     frames: Vec<(f64, Frame)>,
     head: usize,
     /// The last local model update: its tick and its time of arrival.
-    heard: u64,
-    heard_at: f64,
+    received_tick: u64,
+    received_at: f64,
     scratch: State,
 }
 
@@ -64,16 +64,16 @@ impl ModalLocal {
             scale,
             period,
             head: 0,
-            heard: 0,
-            heard_at: 0.0,
+            received_tick: 0,
+            received_at: 0.0,
         })
     }
 
     /// Steps the copy with the tool at its present pose. Returns `false` if the copy could not be
     /// stepped. The proxy model must then serve.
     pub(crate) fn advance(&mut self, now: f64, steps: usize, tool: &Tool, model: &LocalModel) -> bool {
-        if model.tick != self.heard {
-            (self.heard, self.heard_at) = (model.tick, now);
+        if model.tick != self.received_tick {
+            (self.received_tick, self.received_at) = (model.tick, now);
             if !self.correct(model) {
                 return false;
             }
@@ -81,7 +81,7 @@ impl ModalLocal {
         // The remote hands on the body move to their targets over one simulation step. A target
         // that jumped within one short step of the loop would make its damper pull many times too
         // hard.
-        let left = self.heard_at + model.period - now;
+        let left = self.received_at + model.period - now;
         let passed = steps as f64 * self.period;
         let share = if left > passed { passed / left } else { 1.0 };
         for &(id, target) in &model.others {
@@ -181,8 +181,8 @@ impl ModalLocal {
         // The viscoelastic state changes slowly, so it is corrected without regard to the age of
         // the update.
         self.scratch.z.clone_from(&self.body.state().z);
-        for (z, told) in self.scratch.z.iter_mut().zip(&model.state.z) {
-            *z += gain * (told - *z);
+        for (z, received) in self.scratch.z.iter_mut().zip(&model.state.z) {
+            *z += gain * (received - *z);
         }
         let then = &self.past[at * 2 * modes..][..2 * modes];
         for i in 0..modes {
@@ -214,22 +214,22 @@ impl ModalLocal {
         self.frames[slot].0
     }
 
-    fn corrected_frame(&self, then: &Frame, told: &Frame, gain: f64) -> Result<Frame, StepError> {
+    fn corrected_frame(&self, then: &Frame, received: &Frame, gain: f64) -> Result<Frame, StepError> {
         let now = self.body.frame();
-        let toward = |now: [f64; 3], told: [f64; 3], then: [f64; 3]| -> [f64; 3] {
-            std::array::from_fn(|i| now[i] + gain * (told[i] - then[i]))
+        let toward = |now: [f64; 3], received: [f64; 3], then: [f64; 3]| -> [f64; 3] {
+            std::array::from_fn(|i| now[i] + gain * (received[i] - then[i]))
         };
-        let (a, b, c) = (now.orientation(), told.orientation(), then.orientation());
+        let (a, b, c) = (now.orientation(), received.orientation(), then.orientation());
         // The sign puts both quaternions in the same hemisphere. For these small differences, the
         // sum is as accurate as the product.
         let sign = if (0..4).map(|i| b[i] * c[i]).sum::<f64>() < 0.0 { -1.0 } else { 1.0 };
         let orientation = std::array::from_fn(|i| a[i] + gain * (sign * b[i] - c[i]));
         Frame::from_motion(
             self.body.model(),
-            toward(now.center(), told.center(), then.center()),
+            toward(now.center(), received.center(), then.center()),
             orientation,
-            toward(now.velocity(), told.velocity(), then.velocity()),
-            toward(now.spin(), told.spin(), then.spin()),
+            toward(now.velocity(), received.velocity(), then.velocity()),
+            toward(now.spin(), received.spin(), then.spin()),
         )
     }
 }

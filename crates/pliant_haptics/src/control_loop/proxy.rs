@@ -13,7 +13,7 @@ const LONGEST: f64 = 0.05;
 pub(crate) struct ProxyExtrapolation {
     tick: u64,
     /// The last local model update: position of the proxy, m, and its velocity, m/s.
-    told: Vector3<f64>,
+    received: Vector3<f64>,
     speed: Vector3<f64>,
     /// Time of arrival of the update on the loop's clock, s.
     since: f64,
@@ -45,8 +45,8 @@ impl ProxyExtrapolation {
             // A longer interval counts at once, and a shorter one gradually.
             let waited = if fresh { period } else { (now - self.since).clamp(0.0, LONGEST) };
             self.interval = period.max(waited.max(self.interval + 0.1 * (waited - self.interval)));
-            (self.told, self.speed) = (contact.proxy.into(), contact.velocity.into());
-            self.offset = if fresh { Vector3::zeros() } else { would - self.told };
+            (self.received, self.speed) = (contact.proxy.into(), contact.velocity.into());
+            self.offset = if fresh { Vector3::zeros() } else { would - self.received };
             (self.tick, self.since) = (model.tick, now);
         }
         let mut velocity = if self.age(now) < self.interval { self.speed } else { Vector3::zeros() };
@@ -68,7 +68,7 @@ impl ProxyExtrapolation {
     }
 
     fn shown(&self, now: f64, dt: f64) -> Vector3<f64> {
-        self.told + self.speed * self.age(now).min(self.interval) + self.offset * self.left(now, dt)
+        self.received + self.speed * self.age(now).min(self.interval) + self.offset * self.left(now, dt)
     }
 }
 

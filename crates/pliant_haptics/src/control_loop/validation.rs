@@ -139,11 +139,11 @@ impl SampleValidation {
 
         let frozen = self.frozen(dt, sample, force);
         self.note(now, raw);
-        let told = sample.velocity.map(Vector3::from);
+        let reported = sample.velocity.map(Vector3::from);
         // The largest component is tested because the square of a number like 1e200 is not finite,
         // and such a number must not pass.
-        let wild = told.map(|v| v.amax()).filter(|speed| *speed > FASTEST);
-        let velocity = match told {
+        let wild = reported.map(|v| v.amax()).filter(|speed| *speed > FASTEST);
+        let velocity = match reported {
             Some(v) if wild.is_none() => v,
             _ => clamp_magnitude(&self.estimate(now, raw), FASTEST),
         };

@@ -270,18 +270,18 @@ impl Experiment {
         let after = pair.host.stats(PeerId(1)).unwrap_or(before);
         let guest = &pair.guests[0];
         run.end(until);
-        let mut figures = run.figures(&guest.session);
-        figures.lost = guest.down.counts().lost;
-        figures.bytes_per_frame = (after.bytes_out - before.bytes_out) as f64
+        let mut metrics = run.metrics(&guest.session);
+        metrics.lost = guest.down.counts().lost;
+        metrics.bytes_per_frame = (after.bytes_out - before.bytes_out) as f64
             / (after.datagrams_out - before.datagrams_out).max(1) as f64;
-        figures.kbit_s = (after.bytes_out - before.bytes_out) as f64 * 8e-3 / self.seconds;
+        metrics.kbit_s = (after.bytes_out - before.bytes_out) as f64 * 8e-3 / self.seconds;
         let up = (after.bytes_in - before.bytes_in) as f64;
-        figures.bytes_per_datagram_up = up / (after.datagrams_in - before.datagrams_in).max(1) as f64;
-        figures.kbit_s_up = up * 8e-3 / self.seconds;
-        figures.hash = fold(figures.hash, &guest.down.hash().to_le_bytes());
-        figures.cpu_us_per_tick = 1e6 * pair.guests_spent().as_secs_f64() / figures.ticks.max(1) as f64;
-        figures.nacks = guest.session.stats().nacks;
-        Ok(figures)
+        metrics.bytes_per_datagram_up = up / (after.datagrams_in - before.datagrams_in).max(1) as f64;
+        metrics.kbit_s_up = up * 8e-3 / self.seconds;
+        metrics.hash = fold(metrics.hash, &guest.down.hash().to_le_bytes());
+        metrics.cpu_us_per_tick = 1e6 * pair.guests_spent().as_secs_f64() / metrics.ticks.max(1) as f64;
+        metrics.nacks = guest.session.stats().nacks;
+        Ok(metrics)
     }
 }
 

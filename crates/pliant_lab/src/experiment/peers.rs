@@ -127,10 +127,10 @@ impl Experiment {
             }
             now += LOOK;
         }
-        Ok(self.peer_figures(&seen, &truth, &reactions, &links[0][0], spent, sent))
+        Ok(self.peer_metrics(&seen, &truth, &reactions, &links[0][0], spent, sent))
     }
 
-    fn peer_figures(
+    fn peer_metrics(
         &self,
         seen: &BTreeMap<Tick, PeerSample>,
         truth: &BTreeMap<Tick, Vec<f64>>,

@@ -181,11 +181,11 @@ impl Run {
             self.track.push(entry);
         }
         self.missing += 1;
-        self.tell(now, sum, largest);
+        self.record(now, sum, largest);
     }
 
     /// Adds the squared errors of one tick, shown or missed.
-    fn tell(&mut self, now: Duration, sum: f64, largest: f64) {
+    fn record(&mut self, now: Duration, sum: f64, largest: f64) {
         self.sum += sum;
         self.compared += 1;
         self.largest = self.largest.max(largest);
@@ -193,7 +193,7 @@ impl Run {
         self.above.push((now, largest.sqrt()));
     }
 
-    pub(super) fn figures(&self, session: &GuestSession) -> Metrics {
+    pub(super) fn metrics(&self, session: &GuestSession) -> Metrics {
         let percent = |x: f64, scale: f64| if scale > 0.0 { 100.0 * x / scale } else { 0.0 };
         let counts = session.body(BODY).map(|b| b.counts()).unwrap_or_default();
         let places = self.shape.places();
@@ -384,7 +384,7 @@ impl World for Run {
         self.count += 1;
         self.confirmed_last = confirmed_largest;
         self.delay_sum += now.saturating_sub(at).as_secs_f64();
-        self.tell(now, sum, largest);
+        self.record(now, sum, largest);
         for q in &shown.q {
             self.hash = fold(self.hash, &q.to_bits().to_le_bytes());
         }

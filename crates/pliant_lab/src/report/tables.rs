@@ -295,21 +295,21 @@ pub(super) fn table_2(
         progress.report("bake", 0.5);
         let (model, bake) =
             baked(&mesh, &BakeConfig { sites: None, ..config(Element::Tet4, modes, vec![held]) })?;
-        let told = bench::measure(model.clone(), seconds, Precision::Single)?;
-        let rate = 1e6 / told.frame_us.p50;
+        let measured = bench::measure(model.clone(), seconds, Precision::Single)?;
+        let rate = 1e6 / measured.frame_us.p50;
         let half = bench::measure(model, seconds, Precision::Half)?;
         let halved = 1e6 / half.frame_us.p50 / paper_rate;
         let _ = writeln!(
             out,
             "| {label} | {} | {modes} | {} vertices | {bake:.2} ({paper_bake}) | {:.2} / {:.2} | {:.1} / {:.1} | {rate:.0} ({paper_rate}) | {:.1} | {:.0} % | {:.1} / {:.1} | {halved:.1} | {:.0} % | {} |",
             mesh.tets.len(),
-            told.surface_vertices,
-            told.step_us.p50,
-            told.step_us.p99,
-            told.frame_us.p50,
-            told.frame_us.p99,
+            measured.surface_vertices,
+            measured.step_us.p50,
+            measured.step_us.p99,
+            measured.frame_us.p50,
+            measured.frame_us.p99,
             rate / paper_rate,
-            100.0 * told.bandwidth_gb_s / told.bandwidth_limit_gb_s,
+            100.0 * measured.bandwidth_gb_s / measured.bandwidth_limit_gb_s,
             half.frame_us.p50,
             half.frame_us.p99,
             100.0 * half.bandwidth_gb_s / half.bandwidth_limit_gb_s,

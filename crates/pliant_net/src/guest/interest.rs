@@ -126,7 +126,7 @@ fn height_in(lens: &Projection, distance: f32, radius: f32) -> f32 {
 }
 
 /// `PostUpdate`, after [`look`]: sends changed subscriptions to the host.
-pub(crate) fn say_interest(guest: Option<ResMut<NetGuest>>, bodies: Query<(&RemoteBody, &Interest)>) {
+pub(crate) fn send_interest(guest: Option<ResMut<NetGuest>>, bodies: Query<(&RemoteBody, &Interest)>) {
     let Some(mut guest) = guest else { return };
     let Some(session) = &mut guest.session else { return };
     for (body, interest) in &bodies {

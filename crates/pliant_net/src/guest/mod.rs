@@ -28,7 +28,7 @@ use source::Source;
 
 pub(crate) use hands::send_hands;
 pub use interest::{CameraInterest, Interest};
-pub(crate) use interest::{look, say_interest};
+pub(crate) use interest::{look, send_interest};
 pub(crate) use session::receive;
 pub(crate) use show::show;
 

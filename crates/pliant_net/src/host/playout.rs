@@ -30,9 +30,9 @@ pub(super) struct HandPlayout {
     playing: bool,
     /// Whether the last tick was extrapolated.
     guessed: bool,
-    /// The target that was played last (`said`), and the position of the hand (`shown`).
-    said: DVec3,
-    shown: DVec3,
+    /// The target that was played last (`played`), and the position of the hand (`displayed`).
+    played: DVec3,
+    displayed: DVec3,
     /// Velocity of the hand, meters per tick.
     velocity: DVec3,
 }
@@ -45,8 +45,8 @@ impl HandPlayout {
             wait: 0,
             playing: false,
             guessed: false,
-            said: at,
-            shown: at,
+            played: at,
+            displayed: at,
             velocity: DVec3::ZERO,
         }
     }
@@ -69,7 +69,7 @@ impl HandPlayout {
     /// Returns the hand's position in the next tick. `depth` is the delay of a movement in ticks,
     /// and `most` is the farthest that the hand may move, m.
     pub(super) fn next(&mut self, depth: usize, most: f64) -> DVec3 {
-        let expected = self.shown + self.velocity;
+        let expected = self.displayed + self.velocity;
         if !self.playing && !self.queue.is_empty() {
             if self.wait == 0 {
                 self.wait = depth.max(1);
@@ -77,7 +77,7 @@ impl HandPlayout {
             self.wait -= 1;
             self.playing = self.wait == 0;
         }
-        let mut to = self.shown;
+        let mut to = self.displayed;
         if self.playing {
             // After a burst, or with a guest whose clock is faster, one target is skipped per tick
             // until the queue has its proper length.
@@ -85,12 +85,12 @@ impl HandPlayout {
             match self.queue.pop_front() {
                 Some(target) => {
                     let follows = skipped.is_none() && !self.guessed;
-                    let offset = if follows { self.shown - self.said } else { expected - target };
-                    let before = skipped.unwrap_or(self.said);
+                    let offset = if follows { self.displayed - self.played } else { expected - target };
+                    let before = skipped.unwrap_or(self.played);
                     if !self.guessed {
                         self.velocity = target - before;
                     }
-                    (self.said, self.guessed) = (target, false);
+                    (self.played, self.guessed) = (target, false);
                     to = target + faded(offset, most);
                 }
                 None => {
@@ -98,7 +98,7 @@ impl HandPlayout {
                     self.playing = self.velocity.length() > 1e-4 * most;
                     if self.playing {
                         self.guessed = true;
-                        to = self.shown + self.velocity;
+                        to = self.displayed + self.velocity;
                     } else {
                         self.velocity = DVec3::ZERO;
                     }
@@ -108,12 +108,12 @@ impl HandPlayout {
         if !self.playing {
             // A resting guest repeats its target only a few times, so the rest of a correction must
             // also fade without new targets.
-            to = self.said + faded(self.shown - self.said, most);
+            to = self.played + faded(self.displayed - self.played, most);
         }
         // The speed of the hand is limited, whatever the targets.
-        let way = to - self.shown;
-        self.shown = if way.length() <= most { to } else { self.shown + way.clamp_length_max(most) };
-        self.shown
+        let way = to - self.displayed;
+        self.displayed = if way.length() <= most { to } else { self.displayed + way.clamp_length_max(most) };
+        self.displayed
     }
 }
 

@@ -21,7 +21,7 @@ pub(super) struct HostedBody {
     model: Arc<ModalModel>,
     settings: StepSettings,
     /// When the settings were last sent to the guests.
-    told: Duration,
+    settings_sent: Duration,
     pub(super) placed: GlobalTransform,
     /// Whether the current fault was logged, so that it is logged only once.
     faulted: bool,
@@ -146,8 +146,8 @@ impl NetHost {
                 let id = hosted.id;
                 // Until the settings are sent, the stream learns the change from the states, like
                 // any unknown force.
-                if hosted.settings != settings && now.saturating_sub(hosted.told) >= SETTINGS_EVERY {
-                    (hosted.settings, hosted.told) = (settings, now);
+                if hosted.settings != settings && now.saturating_sub(hosted.settings_sent) >= SETTINGS_EVERY {
+                    (hosted.settings, hosted.settings_sent) = (settings, now);
                     if let Err(error) = self.session.set_settings(id, settings) {
                         warn_once!("a body's settings are not shared: {error}");
                     }
@@ -171,7 +171,14 @@ impl NetHost {
                 let model = Arc::clone(model);
                 self.bodies.insert(
                     entity,
-                    HostedBody { id, model, settings, told: now, placed: *transform, faulted: false },
+                    HostedBody {
+                        id,
+                        model,
+                        settings,
+                        settings_sent: now,
+                        placed: *transform,
+                        faulted: false,
+                    },
                 );
                 self.place(id, transform);
                 Some(id)

@@ -104,7 +104,7 @@ impl NetPeer {
                     // The number marks the request as sent. The answer brings the real number.
                     other.number = Some(UserId::HOST);
                     let (scene, invite) = (self.scene.clone(), self.listening.invite());
-                    self.tell(peer, &MeshMessage::Introduce { scene, invite });
+                    self.send(peer, &MeshMessage::Introduce { scene, invite });
                 }
             }
         }
@@ -130,7 +130,7 @@ impl NetPeer {
                 // the others.
                 if let (Some(_), PeerState::In { user }) = (opened, &self.state) {
                     let (number, scene, invite) = (*user, self.scene.clone(), self.listening.invite());
-                    self.tell(peer, &MeshMessage::Member { number, scene, invite });
+                    self.send(peer, &MeshMessage::Member { number, scene, invite });
                     self.talk_to(now, peer);
                 }
             }
@@ -145,7 +145,7 @@ impl NetPeer {
             }
             Event::Message { peer, bytes } => {
                 let peer = opened.unwrap_or(peer);
-                self.heard(world, now, peer, opened.is_some(), bytes);
+                self.on_mesh_message(world, now, peer, opened.is_some(), bytes);
             }
             Event::Closed { peer, reason } => {
                 let peer = opened.unwrap_or(peer);
@@ -166,7 +166,14 @@ impl NetPeer {
         }
     }
 
-    fn heard(&mut self, world: &mut World, now: Duration, peer: PeerId, opened: bool, bytes: Bytes) {
+    fn on_mesh_message(
+        &mut self,
+        world: &mut World,
+        now: Duration,
+        peer: PeerId,
+        opened: bool,
+        bytes: Bytes,
+    ) {
         match MeshMessage::read(bytes) {
             Some(MeshMessage::Session(bytes)) => {
                 if let Some(session) = &mut self.session {
@@ -288,7 +295,7 @@ impl NetPeer {
             other.invite = Some(other.seen_from_here(invite));
         }
         let PeerState::In { user: from } = self.state else { return };
-        self.tell(peer, &MeshMessage::Welcome { number, from, others });
+        self.send(peer, &MeshMessage::Welcome { number, from, others });
         self.talk_to(now, peer);
     }
 
@@ -304,7 +311,7 @@ impl NetPeer {
         }
     }
 
-    fn tell(&self, peer: PeerId, message: &MeshMessage) {
+    fn send(&self, peer: PeerId, message: &MeshMessage) {
         let (endpoint, number) = self.way(peer);
         if let Err(error) = endpoint.send_message(number, message.to_message()) {
             debug!("not sent to peer {peer}: {error}");
@@ -353,7 +360,7 @@ impl NetPeer {
                     let _ = endpoint.send_datagram(number, Bytes::from_owner(output.bytes));
                 }
                 Channel::Message => {
-                    self.tell(output.peer, &MeshMessage::Session(Bytes::from_owner(output.bytes)));
+                    self.send(output.peer, &MeshMessage::Session(Bytes::from_owner(output.bytes)));
                 }
             }
         }

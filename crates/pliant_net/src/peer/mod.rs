@@ -33,7 +33,7 @@ use play::{PeerGrab, PlayedBody};
 use reconnect::Missed;
 
 pub(crate) use mesh::receive;
-pub(crate) use play::{show, tell_hands};
+pub(crate) use play::{send_hands, show};
 
 /// How to play among peers.
 #[derive(Debug)]

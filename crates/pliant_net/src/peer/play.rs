@@ -61,7 +61,7 @@ pub(super) struct PeerGrab {
 }
 
 /// `PostUpdate`: passes the app's own grabs to the session.
-pub(crate) fn tell_hands(
+pub(crate) fn send_hands(
     net: Option<ResMut<NetPeer>>,
     bodies: Query<(&BodyState, &GlobalTransform)>,
     grabs: Query<(Entity, &Grab, &GrabOf)>,
@@ -74,12 +74,12 @@ pub(crate) fn tell_hands(
     let Some(session) = &mut net.session else { return };
     let number_of =
         |entity: Entity| net.bodies.iter().find(|(_, played)| played.entity == entity).map(|(&id, _)| id);
-    net.grabs.retain(|&entity, said| {
+    net.grabs.retain(|&entity, sent| {
         let stays = grabs.get(entity).is_ok_and(|(_, grab, of)| {
-            let same = grab.vertex == said.vertex && grab.radius == said.radius && holds_so(grab, &said.hold);
-            same && number_of(of.0) == Some(said.body)
+            let same = grab.vertex == sent.vertex && grab.radius == sent.radius && holds_so(grab, &sent.hold);
+            same && number_of(of.0) == Some(sent.body)
         });
-        if let (false, Some(number)) = (stays, said.number) {
+        if let (false, Some(number)) = (stays, sent.number) {
             session.end_grab(number);
         }
         stays
@@ -89,7 +89,7 @@ pub(crate) fn tell_hands(
         let Some(place) = SessionTransform::of_body(transform, state) else { continue };
         let target = place.point_to_session(grab.target);
         let moved = match net.grabs.get(&entity) {
-            Some(said) => said.number.map(|number| session.set_target(number, target)).transpose(),
+            Some(sent) => sent.number.map(|number| session.set_target(number, target)).transpose(),
             None => {
                 let hold = hold_of(grab);
                 let begun = session.begin_grab(id, grab.vertex, grab.radius, target, hold);
@@ -128,12 +128,12 @@ pub(crate) fn show(
         played.display.write((step, now, false), state, &mut visual, &mut transform, &mut net.scratch);
         let Some(place) = SessionTransform::of_body(global, state) else { continue };
         hands.set_if_neq(remote_hands(view.grabs(), Some(user), &place));
-        for (&entity, said) in net.grabs.iter().filter(|(_, said)| said.body == id) {
+        for (&entity, sent) in net.grabs.iter().filter(|(_, sent)| sent.body == id) {
             let Ok(mut force) = forces.get_mut(entity) else { continue };
-            let felt = said.number.and_then(|grab| {
+            let felt = sent.number.and_then(|grab| {
                 let key = GrabKey { user, grab };
                 let reaction = view.grabs().iter().find(|grab| grab.key == key)?.reaction;
-                Some(played.display.force(reaction, said.point.as_ref()?, &place, state, &visual))
+                Some(played.display.force(reaction, sent.point.as_ref()?, &place, state, &visual))
             });
             force.set_if_neq(felt.unwrap_or_default());
         }

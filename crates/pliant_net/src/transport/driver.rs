@@ -380,7 +380,7 @@ impl Open {
             let datagrams_in = pin!(read_datagrams(shared, id, &connection, &peer));
             let messages_out = pin!(write_messages(&connection, &peer, &bucket, &mut send));
             let datagrams_out = pin!(write_datagrams(&connection, &peer, &bucket));
-            let metrics = pin!(keep_figures(&connection, &peer));
+            let metrics = pin!(keep_metrics(&connection, &peer));
             let hung_up = pin!(hang_up(&connection, &peer));
             tokio::select! {
                 reason = messages_in => reason,
@@ -435,7 +435,7 @@ fn refresh(connection: &Connection, peer: &PeerConnection) {
     };
 }
 
-async fn keep_figures(connection: &Connection, peer: &PeerConnection) {
+async fn keep_metrics(connection: &Connection, peer: &PeerConnection) {
     loop {
         sleep(Duration::from_millis(100)).await;
         refresh(connection, peer);

@@ -225,20 +225,20 @@ impl PeerBody {
     /// Takes a state and steps from it to the tick `to`. Returns false when the state does not fit
     /// the body.
     pub(crate) fn import(&mut self, tick: Tick, to: Tick, state: &PeerBodyState, inputs: &InputLog) -> bool {
-        let told = state
+        let received = state
             .frame
             .as_ref()
             .and_then(|f| Frame::from_motion(&self.model, f.center, f.orientation, f.velocity, f.spin).ok());
-        if told.is_some() != self.model.is_free() {
+        if received.is_some() != self.model.is_free() {
             return false;
         }
         let (q, v, a, z) = (state.q.clone(), state.v.clone(), state.a.clone(), state.z.clone());
         let f = state.force.clone();
-        let told = State { q, v, a, f, z, frame: told.unwrap_or(self.state.frame) };
-        if self.replica.kernel().check(&told).is_err() {
+        let received = State { q, v, a, f, z, frame: received.unwrap_or(self.state.frame) };
+        if self.replica.kernel().check(&received).is_err() {
             return false;
         }
-        let before = std::mem::replace(&mut self.state, told);
+        let before = std::mem::replace(&mut self.state, received);
         let pull = |p: &PeerGrip| HandSlot {
             key: GrabKey { user: UserId(p.user), grab: p.grab },
             pull: p.pull.into(),

@@ -494,11 +494,11 @@ impl PeerSession {
         }
         let peers: Vec<PeerId> = self.others.keys().copied().collect();
         for peer in peers {
-            self.say_inputs(peer, check);
+            self.send_inputs(peer, check);
         }
     }
 
-    fn say_inputs(&mut self, peer: PeerId, check: Option<StateCheck>) {
+    fn send_inputs(&mut self, peer: PeerId, check: Option<StateCheck>) {
         let Some(own) = self.inputs.users.get(&self.config.user) else { return };
         let Some(other) = self.others.get(&peer) else { return };
         let mut ticks: Vec<InputTick> = (0..=self.config.repeats as u64)

@@ -117,11 +117,11 @@ impl Recovery for AccelerationDriven {
         let (to_q, to_v) = self.newmark.response(self.tick - from);
         let to_z = self.flow.as_ref().map_or(0.0, |flow| flow.response(self.tick - from));
         let used = &mut self.used[(from % HISTORY as u64) as usize];
-        for (k, (used, told)) in used.iter_mut().zip(&data.accelerations).enumerate() {
+        for (k, (used, received)) in used.iter_mut().zip(&data.accelerations).enumerate() {
             if from <= self.anchored[k] {
                 continue;
             }
-            let da = told - *used;
+            let da = received - *used;
             self.state.q[k] += to_q * da;
             self.state.v[k] += to_v * da;
             if let Some(z) = self.state.z.get_mut(k) {
@@ -130,7 +130,7 @@ impl Recovery for AccelerationDriven {
             if from == self.tick {
                 self.state.a[k] += da;
             }
-            *used = *told;
+            *used = *received;
         }
         true
     }

@@ -482,11 +482,11 @@ impl Receiver {
     }
 
     fn compare_check(&mut self) {
-        let Some(told) = self.history.head(self.tick).and_then(|d| d.check) else { return };
+        let Some(expected) = self.history.head(self.tick).and_then(|d| d.check) else { return };
         let state = self.policy.confirmed();
         let size = state.q.iter().chain(&state.z).map(|q| q * q).sum::<f64>().sqrt();
         let own = checksum(self.tick, state);
-        if (own - f64::from(told)).abs() <= CHECK_TOLERANCE * size + 1e-7 {
+        if (own - f64::from(expected)).abs() <= CHECK_TOLERANCE * size + 1e-7 {
             self.mismatched = 0;
         } else {
             self.mismatched += 1;

@@ -386,7 +386,7 @@ impl GuestSession {
             }
             self.ask(now, id);
         }
-        self.say_targets(now);
+        self.send_targets(now);
         if now >= self.next_ping {
             self.pings += 1;
             self.next_ping = now + if self.pings < 8 { PING_SOON } else { PING_EVERY };

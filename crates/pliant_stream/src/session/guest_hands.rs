@@ -22,13 +22,13 @@ pub(super) struct LocalGrab {
     /// The recent targets, newest last, at most three.
     targets: VecDeque<TargetEntry>,
     fresh: bool,
-    said: Duration,
+    sent_at: Duration,
 }
 
 impl LocalGrab {
     /// Time at which the target is to be sent next; `None` without a target.
     pub(super) fn due(&self, now: Duration) -> Option<Duration> {
-        let due = if self.fresh { now } else { self.said + TARGET_EVERY };
+        let due = if self.fresh { now } else { self.sent_at + TARGET_EVERY };
         (!self.targets.is_empty()).then_some(due)
     }
 }
@@ -80,7 +80,7 @@ impl GuestSession {
         }
         let grab = self.next_grab;
         self.next_grab = grab.wrapping_add(1);
-        self.grabs.insert(grab, LocalGrab { body, targets: VecDeque::new(), fresh: false, said: now });
+        self.grabs.insert(grab, LocalGrab { body, targets: VecDeque::new(), fresh: false, sent_at: now });
         if let Some(own) = self.bodies.get_mut(&body).and_then(|b| b.own.as_mut()) {
             own.begin(grab, vertex, radius, target, hold);
         }
@@ -131,11 +131,11 @@ impl GuestSession {
         }
     }
 
-    pub(super) fn say_targets(&mut self, now: Duration) {
+    pub(super) fn send_targets(&mut self, now: Duration) {
         let mut entries = Vec::new();
         let room = ((self.link.max_datagram.max(MIN_DATAGRAM) - 4) / 18).min(MAX_TARGETS);
         for g in self.grabs.values_mut() {
-            let again = now.saturating_sub(g.said) >= TARGET_EVERY;
+            let again = now.saturating_sub(g.sent_at) >= TARGET_EVERY;
             if g.targets.is_empty() || !(g.fresh || again) {
                 continue;
             }
@@ -145,7 +145,7 @@ impl GuestSession {
             }
             entries.extend(g.targets.iter().skip(first));
             g.fresh = false;
-            g.said = now;
+            g.sent_at = now;
         }
         if !entries.is_empty() {
             self.datagram(&Datagram::Targets(Targets { entries }));

@@ -232,8 +232,8 @@ impl PredictedHand {
         for g in &mut self.grabs {
             g.flowing = g.flow;
             let key = GrabKey { user, grab: g.grab };
-            let told = receiver.grabs().iter().find(|told| told.key == key);
-            g.reaction = told.map_or(g.reaction, |told| told.reaction);
+            let confirmed_grab = receiver.grabs().iter().find(|grab| grab.key == key);
+            g.reaction = confirmed_grab.map_or(g.reaction, |grab| grab.reaction);
         }
         means.clear();
         means.extend_from_slice(receiver.means());
