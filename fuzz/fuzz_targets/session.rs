@@ -49,6 +49,7 @@ fn model() -> Arc<ModalModel> {
             center_of_mass: [0.25; 3],
             inertia: [[0.1, 0.0, 0.0], [0.0, 0.1, 0.0], [0.0, 0.0, 0.1]],
             sites: Vec::new(),
+            reduced: None,
         };
         Arc::new(ModalModel::from_parts(parts).expect("sound"))
     };

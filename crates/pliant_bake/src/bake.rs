@@ -6,6 +6,8 @@ use pliant_mesh::{Surface, TetMesh};
 use pliant_modal::{BakeInfo, ModalModel, ModelParts};
 
 use crate::blocks::{self, Tall};
+use crate::continuum::Continuum;
+use crate::cubature::{self, Training};
 use crate::element::Element;
 use crate::fem::{ANCHORED, FeMesh, LOCKING_POISSON, Law, Lists};
 use crate::lanczos::{self, Eigenpairs, Failure};
@@ -15,13 +17,19 @@ use crate::solver::Solver;
 use crate::sparse::BlockCsr;
 use crate::surface::Skin;
 use crate::symbolic::{self, Symbolic};
-use crate::{Bake, BakeConfig, BakeError, BakeTimes, Stage, canonical, flexibility, matrix_market, support};
+use crate::{
+    Bake, BakeConfig, BakeError, BakeTimes, Stage, canonical, derivatives, flexibility, matrix_market,
+    support,
+};
 
 /// Largest `|K phi - lambda M phi| / |K phi|` that a bake accepts.
 const RESIDUAL_LIMIT: f64 = 1e-7;
 
 /// Largest entry of `|Phi^T M Phi - I|` that a bake accepts.
 const ORTHONORMALITY_LIMIT: f64 = 1e-9;
+
+/// Number of patches that are pulled to train the cubature of a material.
+const TRAINING_PATCHES: usize = 8;
 
 /// Bakes a mesh into a modal model.
 ///
@@ -85,22 +93,38 @@ pub fn bake(
     times.factor = clock.lap();
 
     progress(Stage::Modes, 0.0);
-    let mut modes = lanczos::lowest(&solver, config.modes, &mut |share| progress(Stage::Modes, share))
-        .map_err(no_modes)?;
+    let pure = if config.material.is_some() { derivatives::pure_modes(config.modes) } else { config.modes };
+    let mut modes =
+        lanczos::lowest(&solver, pure, &mut |share| progress(Stage::Modes, share)).map_err(no_modes)?;
     canonical::settle(&mut modes, &matrix, &number);
     let (residual_max, orthonormality_max) = accuracy(&matrix, &modes);
     check_accuracy("|K phi - lambda M phi| / |K phi|", residual_max, RESIDUAL_LIMIT)?;
     check_accuracy("|Phi^T M Phi - I|", orthonormality_max, ORTHONORMALITY_LIMIT)?;
     times.modes = clock.lap();
 
-    progress(Stage::Surface, 0.0);
     let skin = Skin::new(&mesh, &fe, skin, &number)?;
     let size = skin.mesh.size();
+    let mut reduced = None;
+    if let Some(material) = config.material {
+        progress(Stage::Material, 0.0);
+        let law = material.with(law.lambda, law.mu);
+        let continuum = Continuum { fe: &fe, law, number: &number };
+        modes =
+            derivatives::extend(&continuum, &solver, &modes, config.modes).ok_or(BakeError::NoConvergence)?;
+        progress(Stage::Material, 0.3);
+        let patches = flexibility::spread_patches(&skin, &number, &modes, TRAINING_PATCHES, 0.1 * size)?;
+        let (coordinates, young) = (&modes, config.young);
+        let training = Training { continuum, coordinates, material, young, patches: &patches, size };
+        let mut report = |share| progress(Stage::Material, 0.3 + 0.7 * share);
+        reduced = Some(cubature::train(&training, &mut report)?);
+        times.material = clock.lap();
+    }
+    progress(Stage::Surface, 0.0);
     let radii: Vec<f64> = config.site_radii.iter().map(|share| share * size).collect();
     let sites = flexibility::sites(&solver, &modes, &skin, &number, config.sites, &radii, &mut |share| {
         progress(Stage::Surface, 0.8 * share);
     })?;
-    let count = config.modes;
+    let count = modes.lambda.len();
     let omega: Vec<f64> = modes.lambda.iter().map(|lambda| lambda.sqrt()).collect();
     let parts = ModelParts {
         info: BakeInfo {
@@ -126,6 +150,7 @@ pub fn bake(
         center_of_mass: properties.center,
         inertia: properties.inertia,
         sites,
+        reduced,
         surface: skin.mesh,
     };
     let model = ModalModel::from_parts(parts)?;
@@ -134,7 +159,7 @@ pub fn bake(
         matrix_market::export(folder, &matrix, &number)?;
     }
     times.surface = clock.lap();
-    times.total = times.assemble + times.factor + times.modes + times.surface;
+    times.total = times.assemble + times.factor + times.modes + times.material + times.surface;
     progress(Stage::Surface, 1.0);
     Ok(Bake { model, times })
 }

@@ -15,7 +15,7 @@ use crate::{Bake, BakeConfig, BakeError, BakeTimes, Stage, bake};
 /// Version of the bake method, which is part of every key.
 ///
 /// Raise the version with every change that alters the result of a bake of the same input.
-pub const METHOD_VERSION: u32 = 5;
+pub const METHOD_VERSION: u32 = 6;
 
 /// Age after which an unfinished file counts as abandoned by a writer that was killed.
 const ABANDONED: Duration = Duration::from_secs(3600);
@@ -38,6 +38,7 @@ impl BakeKey {
             name,
             element,
             modes,
+            material,
             young,
             poisson,
             density,
@@ -50,6 +51,7 @@ impl BakeKey {
         hash.text(name);
         hash.text(&element.to_string());
         hash.count(*modes);
+        hash.text(&material.map_or_else(String::new, |material| material.to_string()));
         hash.numbers(&[*young, *poisson, *density]);
         match damping {
             Damping::Rayleigh { alpha, beta } => hash.tagged(0, &[*alpha, *beta]),

@@ -2,7 +2,7 @@
 
 use std::path::PathBuf;
 
-use pliant_modal::{Damping, Element, ModalModel};
+use pliant_modal::{Damping, Element, Material, ModalModel};
 
 use crate::{Anchor, BakeError};
 
@@ -19,8 +19,15 @@ pub struct BakeConfig {
     pub name: String,
     /// Finite element. Default: [`Element::Tet10`].
     pub element: Element,
-    /// Number of elastic modes to keep. Default: 60.
+    /// Number of elastic modes to keep, or of all coordinates with a [`material`](Self::material).
+    /// Default: 60.
     pub modes: usize,
+    /// Material for large strains. Default: `None`, linear elasticity only.
+    ///
+    /// With a material the coordinates are the lowest modes (a third of them, at most 12) and the
+    /// most important combinations of their derivatives, and the model has a reduced elastic energy
+    /// beside its linear one. About 40 coordinates are enough.
+    pub material: Option<Material>,
     /// Young's modulus, 1e-3 to 1e15 Pa. Default: 1e5, a soft silicone.
     pub young: f64,
     /// Poisson ratio, -0.99 to 0.49999. Default: 0.4.
@@ -58,6 +65,7 @@ impl Default for BakeConfig {
             name: String::new(),
             element: Element::Tet10,
             modes: 60,
+            material: None,
             young: 1e5,
             poisson: 0.4,
             density: 1000.0,
@@ -71,6 +79,10 @@ impl Default for BakeConfig {
 }
 
 impl BakeConfig {
+    /// Number of coordinates that suits a model with a [`material`](Self::material): a step of such
+    /// a body takes about a tenth of a millisecond.
+    pub const COORDINATES: usize = 36;
+
     /// Checks the numbers that do not depend on the mesh.
     ///
     /// [`bake()`](crate::bake()) runs this check first. A program may run the check before it makes
@@ -96,6 +108,8 @@ impl BakeConfig {
             (-0.99..=0.49999).contains(&nu),
             nu,
         )?;
+        let sound = self.material.is_none() || nu <= 0.45;
+        number("Poisson ratio", "at most 0.45 with a material for large strains", sound, nu)?;
         number("density", "1e-6 to 1e7 kg/m^3", (1e-6..=1e7).contains(&self.density), self.density)?;
         match self.damping {
             Damping::Rayleigh { alpha, beta } => {
@@ -140,6 +154,8 @@ pub enum Stage {
     Factor,
     /// Runs the eigensolver.
     Modes,
+    /// Chooses the points at which the energy of a material is integrated.
+    Material,
     /// Computes the residual flexibility and the surface data.
     Surface,
 }
@@ -153,6 +169,8 @@ pub struct BakeTimes {
     pub factor: f64,
     /// Time for the eigensolver, s.
     pub modes: f64,
+    /// Time for the derivatives of the modes and the cubature of a material, s.
+    pub material: f64,
     /// Time for the residual flexibility, the surface bases and the model itself, s.
     pub surface: f64,
     /// Time of all stages together, s.

@@ -106,6 +106,25 @@ pub(crate) fn sites(
     Ok(patches.par_iter().zip(&loads).zip(&whole).map(finish).collect())
 }
 
+/// Returns the mean displacement of `count` patches that are spread over the surface, by mode.
+pub(crate) fn spread_patches(
+    skin: &Skin,
+    number: &[u32],
+    modes: &Eigenpairs,
+    count: usize,
+    radius: f64,
+) -> Result<Vec<[Vec<f64>; 3]>, ModelError> {
+    let free = (0..skin.mesh.positions().len() as u32).filter(|&v| !skin.mesh.anchored()[v as usize]);
+    let vertices = spread_vertices(&skin.mesh, free.collect(), count);
+    let width = modes.lambda.len();
+    let rows = |v: &u32| {
+        let patch = Patch::around(&skin.mesh, *v, radius)?;
+        let along = project(&load(&patch, skin, number), &modes.phi, width);
+        Ok(std::array::from_fn(|axis| along.iter().map(|x| x[axis]).collect()))
+    };
+    vertices.iter().map(rows).collect()
+}
+
 /// Returns the patches of each radius around `vertices` and their loads.
 ///
 /// Sorts the vertices by elimination order, so that neighbors in the list touch the same nodes.

@@ -15,16 +15,16 @@
 //! are linear constraints with multipliers; the multipliers are the forces. Games do not need this
 //! solver at run time.
 
-use nalgebra::{DMatrix, DVector, Matrix3, Vector3};
+use nalgebra::{DMatrix, DVector};
 use pliant_mesh::TetMesh;
-use pliant_modal::Patch;
+use pliant_modal::{Material, Patch};
 use rayon::prelude::*;
 
 use crate::bake::{elimination_order, law};
-use crate::element::{self, Element, MAX_NODES};
+use crate::continuum::Continuum;
+use crate::element::{Element, MAX_NODES};
 use crate::factor::Factor;
 use crate::fem::{ANCHORED, FeMesh};
-use crate::material::{Hyperelastic, Material, positive};
 use crate::sparse::BlockCsr;
 use crate::surface::Skin;
 use crate::symbolic::Symbolic;
@@ -160,9 +160,7 @@ pub fn deflect(
     let pinned: Vec<Places> = loads.prescribed.iter().map(|held| places(&held.patch)).collect();
     let wanted: Vec<f64> = loads.prescribed.iter().flat_map(|held| held.displacement).collect();
     let problem = Problem {
-        fe: &fe,
-        law: material.with(lame.lambda, lame.mu),
-        number: &number,
+        continuum: Continuum { fe: &fe, law: material.with(lame.lambda, lame.mu), number: &number },
         ordered: &ordered,
         symbolic: Symbolic::new(&ordered),
         load,
@@ -213,7 +211,7 @@ pub fn deflect(
         patches: spread.iter().map(|places| mean(places, &u)).collect(),
         reactions: reactions(&forces),
         linear_reactions: reactions(&by_linear_theory.forces),
-        energy: problem.elastic_energy(&u),
+        energy: problem.continuum.elastic_energy(&u),
         rounds,
         residual,
     })
@@ -272,16 +270,12 @@ struct Equilibrium {
 }
 
 struct Problem<'a> {
-    fe: &'a FeMesh,
-    law: Hyperelastic,
-    number: &'a [u32],
+    continuum: Continuum<'a>,
     ordered: &'a crate::fem::Lists,
     symbolic: Symbolic,
     load: Vec<f64>,
     pinned: Vec<Places>,
 }
-
-type Blocks = [f64; MAX_NODES * MAX_NODES * 9];
 
 impl Problem<'_> {
     /// Finds the equilibrium under a share `part` of all loads, from the one at `start`. Returns
@@ -312,7 +306,7 @@ impl Problem<'_> {
             let mut trial = at(1.0);
             if allowed {
                 let before = self.potential(&u, part);
-                let room = 1e-12 * (before.abs() + self.elastic_energy(&u));
+                let room = 1e-12 * (before.abs() + self.continuum.elastic_energy(&u));
                 let mut share = 1.0;
                 let mut halvings = 0;
                 let worse = |potential: f64| potential.is_nan() || potential > before + room;
@@ -356,7 +350,7 @@ impl Problem<'_> {
             }
         }
         let size = norm(&out);
-        let inner = self.inner_forces(u);
+        let inner = self.continuum.inner_forces(u);
         out.iter_mut().zip(&inner).for_each(|(out, inner)| *out -= inner);
         (norm(&out), size)
     }
@@ -416,97 +410,34 @@ impl Problem<'_> {
         Ok(Some(NewtonStep { way, forces: forces.as_slice().to_vec() }))
     }
 
-    /// Returns the displacements of an element's nodes.
-    fn of_element(&self, index: usize, u: &[f64]) -> [Vector3<f64>; MAX_NODES] {
-        let per = self.fe.element.node_count();
-        let mut at = [Vector3::zeros(); MAX_NODES];
-        for (at, &node) in at.iter_mut().zip(&self.fe.connectivity[index * per..][..per]) {
-            let row = self.number[node as usize];
-            if row != ANCHORED {
-                *at = Vector3::from_fn(|axis, _| u[3 * row as usize + axis]);
-            }
-        }
-        at
-    }
-
-    /// Calls `visit` with the weight (m^3), the gradients of the shape functions and the
-    /// displacement gradient at each quadrature point of an element.
-    fn at_points(&self, index: usize, u: &[f64], mut visit: impl FnMut(f64, &[Vector3<f64>], &Matrix3<f64>)) {
-        let per = self.fe.element.node_count();
-        let (at, affine) = (self.of_element(index, u), &self.fe.affine[index]);
-        let (points, share) = element::stiffness_points(self.fe.element);
-        for &point in points {
-            let g = affine.shape_gradients(self.fe.element, point).map(Vector3::from);
-            let h = at.iter().zip(&g[..per]).fold(Matrix3::zeros(), |sum, (u, g)| sum + u * g.transpose());
-            visit(share * affine.volume, &g[..per], &h);
-        }
-    }
-
-    /// Returns the elastic energy, J. The sum has the same bits for any number of threads.
-    fn elastic_energy(&self, u: &[f64]) -> f64 {
-        let parts: Vec<f64> = (0..self.fe.affine.len())
-            .into_par_iter()
-            .map(|index| {
-                let mut sum = 0.0;
-                self.at_points(index, u, |w, _, h| sum += w * self.law.energy(h));
-                sum
-            })
-            .collect();
-        parts.iter().sum()
-    }
-
     /// Returns the elastic energy minus the work of a share `part` of the loads, J.
     fn potential(&self, u: &[f64], part: f64) -> f64 {
-        self.elastic_energy(u) - part * self.load.iter().zip(u).map(|(f, u)| f * u).sum::<f64>()
-    }
-
-    fn inner_forces(&self, u: &[f64]) -> Vec<f64> {
-        let mut out = vec![0.0; u.len()];
-        let forces: Vec<[Vector3<f64>; MAX_NODES]> = (0..self.fe.affine.len())
-            .into_par_iter()
-            .map(|index| {
-                let mut f = [Vector3::zeros(); MAX_NODES];
-                self.at_points(index, u, |w, g, h| {
-                    let stress = w * self.law.stress(h);
-                    f.iter_mut().zip(g).for_each(|(f, g)| *f += stress * g);
-                });
-                f
-            })
-            .collect();
-        for (nodes, forces) in self.fe.elements().zip(&forces) {
-            for (&node, force) in nodes.iter().zip(forces) {
-                let row = self.number[node as usize];
-                if row != ANCHORED {
-                    (0..3).for_each(|axis| out[3 * row as usize + axis] += force[axis]);
-                }
-            }
-        }
-        out
+        self.continuum.elastic_energy(u) - part * self.load.iter().zip(u).map(|(f, u)| f * u).sum::<f64>()
     }
 
     /// Returns the tangent stiffness, with `project` the positive semidefinite one, and the inner
     /// forces at a displacement.
     fn tangent(&self, u: &[f64], project: bool) -> (BlockCsr, Vec<f64>) {
         const BATCH: usize = 512;
-        let per = self.fe.element.node_count();
+        let per = self.continuum.fe.element.node_count();
         let mut out = BlockCsr::zeros(self.ordered);
         let mut batch = vec![[0.0; MAX_NODES * MAX_NODES * 9]; BATCH];
-        let count = self.fe.affine.len();
+        let count = self.continuum.fe.affine.len();
         for first in (0..count).step_by(BATCH) {
             let size = BATCH.min(count - first);
             batch[..size]
                 .par_iter_mut()
                 .enumerate()
-                .for_each(|(local, k)| self.element_tangent(first + local, u, project, k));
+                .for_each(|(local, k)| self.continuum.element_tangent(first + local, u, project, k));
             for (local, k) in batch[..size].iter().enumerate() {
-                let nodes = &self.fe.connectivity[(first + local) * per..][..per];
+                let nodes = &self.continuum.fe.connectivity[(first + local) * per..][..per];
                 for (i, &a) in nodes.iter().enumerate() {
-                    let row = self.number[a as usize];
+                    let row = self.continuum.number[a as usize];
                     if row == ANCHORED {
                         continue;
                     }
                     for (j, &b) in nodes.iter().enumerate() {
-                        let column = self.number[b as usize];
+                        let column = self.continuum.number[b as usize];
                         if column != ANCHORED {
                             let at = out.position(row, column);
                             let block = &k[(i * MAX_NODES + j) * 9..][..9];
@@ -519,34 +450,7 @@ impl Problem<'_> {
                 }
             }
         }
-        (out, self.inner_forces(u))
-    }
-
-    fn element_tangent(&self, index: usize, u: &[f64], project: bool, k: &mut Blocks) {
-        k.fill(0.0);
-        self.at_points(index, u, |w, g, h| {
-            let mut tangent = self.law.tangent(h);
-            if project {
-                tangent = positive(&tangent);
-            }
-            for (j, gj) in g.iter().enumerate() {
-                // Stress in each direction by a displacement of node j.
-                let mut by_node = [Matrix3::zeros(); 3];
-                for (c, by_node) in by_node.iter_mut().enumerate() {
-                    for d in 0..3 {
-                        *by_node += (w * gj[d]) * tangent.fixed_view::<3, 3>(3 * c, 3 * d);
-                    }
-                }
-                for (i, gi) in g.iter().enumerate() {
-                    let block = gi[0] * by_node[0] + gi[1] * by_node[1] + gi[2] * by_node[2];
-                    let k = &mut k[(i * MAX_NODES + j) * 9..][..9];
-                    // Blocks are stored row by row.
-                    for (to, from) in k.iter_mut().zip(block.transpose().as_slice()) {
-                        *to += from;
-                    }
-                }
-            }
-        });
+        (out, self.continuum.inner_forces(u))
     }
 }
 

@@ -7,7 +7,7 @@ use clap::Args;
 use pliant_bake::{Anchor, BakeCache, BakeConfig, Stage, bake_cached};
 use pliant_lab::{Progress, fill::fill};
 use pliant_mesh::{Repair, io};
-use pliant_modal::{Damping, Element, ModalModel};
+use pliant_modal::{Damping, Element, Material, ModalModel};
 use serde::Serialize;
 
 use crate::CliError;
@@ -27,9 +27,12 @@ pub(crate) struct BakeArgs {
     /// Finite element: tet4 or tet10
     #[arg(long, default_value = "tet10", value_parser = element)]
     element: Element,
-    /// Elastic modes to keep
-    #[arg(long, default_value_t = 60, allow_negative_numbers = true)]
-    modes: usize,
+    /// Elastic modes to keep, or coordinates with a material [default: 60, or 36 with a material]
+    #[arg(long, allow_negative_numbers = true)]
+    modes: Option<usize>,
+    /// Material for large strains: neo-hookean, st-venant-kirchhoff, or linear for none
+    #[arg(long, default_value = "linear", value_parser = material)]
+    material: Law,
     /// Young's modulus, 1e-3 to 1e15 Pa
     #[arg(long, value_name = "PA", default_value_t = 1e5, allow_hyphen_values = true)]
     young: f64,
@@ -81,6 +84,19 @@ fn element(text: &str) -> Result<Element, String> {
     }
 }
 
+/// Material of a bake, or none. An `Option` would be an optional argument.
+#[derive(Debug, Clone, Copy)]
+struct Law(Option<Material>);
+
+fn material(text: &str) -> Result<Law, String> {
+    match text {
+        "linear" => Ok(Law(None)),
+        "neo-hookean" => Ok(Law(Some(Material::NeoHookean))),
+        "st-venant-kirchhoff" => Ok(Law(Some(Material::StVenantKirchhoff))),
+        _ => Err("expected neo-hookean, st-venant-kirchhoff or linear".to_owned()),
+    }
+}
+
 fn rayleigh(text: &str) -> Result<[f64; 2], String> {
     let expected = "expected two numbers with a comma between them, A in 1/s and B in s";
     let (a, b) = text.split_once(',').ok_or(expected)?;
@@ -124,6 +140,7 @@ struct Seconds {
     assemble: f64,
     factor: f64,
     modes: f64,
+    material: f64,
     surface: f64,
     total: f64,
 }
@@ -149,7 +166,12 @@ pub(crate) fn run(args: BakeArgs) -> Result<(), CliError> {
     let config = BakeConfig {
         name,
         element: args.element,
-        modes: args.modes,
+        modes: args.modes.unwrap_or(if args.material.0.is_some() {
+            BakeConfig::COORDINATES
+        } else {
+            defaults.modes
+        }),
+        material: args.material.0,
         young: args.young,
         poisson: args.poisson,
         density: args.density,
@@ -171,6 +193,7 @@ pub(crate) fn run(args: BakeArgs) -> Result<(), CliError> {
             Stage::Assemble => "assemble",
             Stage::Factor => "factor",
             Stage::Modes => "modes",
+            Stage::Material => "material",
             Stage::Surface => "surface",
         };
         bar.report(stage, share);
@@ -199,6 +222,7 @@ pub(crate) fn run(args: BakeArgs) -> Result<(), CliError> {
         assemble: times.assemble,
         factor: times.factor,
         modes: times.modes,
+        material: times.material,
         surface: times.surface,
         total: start.elapsed().as_secs_f64(),
     };
@@ -216,7 +240,14 @@ pub(crate) fn run(args: BakeArgs) -> Result<(), CliError> {
         return output::print(&format!("seconds          {:.2}, read from the cache", seconds.total));
     }
     output::print(&format!(
-        "seconds          mesh {:.2}, assemble {:.2}, factor {:.2}, modes {:.2}, surface {:.2}, total {:.2}",
-        seconds.mesh, seconds.assemble, seconds.factor, seconds.modes, seconds.surface, seconds.total
+        "seconds          mesh {:.2}, assemble {:.2}, factor {:.2}, modes {:.2}, material {:.2}, \
+         surface {:.2}, total {:.2}",
+        seconds.mesh,
+        seconds.assemble,
+        seconds.factor,
+        seconds.modes,
+        seconds.material,
+        seconds.surface,
+        seconds.total
     ))
 }

@@ -46,6 +46,7 @@ fn model(vertices: usize, modes: usize) -> ModalModel {
         center_of_mass: [0.0; 3],
         inertia: [[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]],
         sites: vec![],
+        reduced: None,
     })
     .unwrap()
 }

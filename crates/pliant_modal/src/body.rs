@@ -235,7 +235,7 @@ impl Body {
         }
         config.check()?;
         let patch = HeldPatch::new(self.model(), patch, self.mode_count())?;
-        let local = patch.rest() + patch.displacement(&self.state.q, self.config.settings.warp);
+        let local = patch.rest() + patch.displacement(&self.state.q, self.kernel.warps());
         let target = self.state.frame.to_world(local);
         let id = GrabId(self.next_grab);
         self.next_grab += 1;
@@ -286,7 +286,7 @@ impl Body {
     /// Returns [`StepError::NoGrab`] if there is no such grab.
     pub fn grab_position(&self, id: GrabId) -> Result<[f64; 3], StepError> {
         let patch = &self.hands[self.find(id)?].patch;
-        let local = patch.rest() + patch.displacement(&self.state.q, self.config.settings.warp);
+        let local = patch.rest() + patch.displacement(&self.state.q, self.kernel.warps());
         Ok(self.state.frame.to_world(local).into())
     }
 
@@ -333,7 +333,7 @@ impl Body {
     /// # Errors
     /// Returns [`StepError::NoGrab`] if there is no such grab.
     pub fn compliance(&self, id: GrabId) -> Result<[[f64; 3]; 3], StepError> {
-        let c = self.kernel.compliance(&self.hands[self.find(id)?]);
+        let c = self.kernel.compliance(&self.hands[self.find(id)?], &self.state.q);
         Ok(std::array::from_fn(|i| std::array::from_fn(|j| c[(i, j)])))
     }
 
@@ -431,7 +431,7 @@ impl Body {
         let sum = |of: Row| -> Vector3<f64> {
             self.state.q.iter().enumerate().map(|(mode, q)| *q * row(of, mode)).sum()
         };
-        let warp = self.config.settings.warp;
+        let warp = self.kernel.warps();
         let (d, w) = (sum(shift), if warp { sum(turn) } else { Vector3::zeros() });
         let (moved, tangent) = tangent(&Six::new(d.x, d.y, d.z, w.x, w.y, w.z), warp);
         let rotation = self.state.frame.rotation();
@@ -452,6 +452,11 @@ impl Body {
     /// Potential energy in gravity is not included. Where the material relaxes, both springs of
     /// each mode count: `omega^2 ((1 - ratio) q^2 + ratio (q - z)^2) / 2`.
     pub fn energy(&self) -> f64 {
+        let frame = if self.model().is_free() { self.state.frame.kinetic_energy(self.model()) } else { 0.0 };
+        if self.kernel.is_reduced() {
+            let kinetic: f64 = self.state.v.iter().map(|v| 0.5 * v * v).sum();
+            return kinetic + self.kernel.elastic_energy(&self.state.q) + frame;
+        }
         let ratio = self.config.settings.relaxation.map_or(0.0, |r| r.ratio);
         let modes: f64 = (0..self.mode_count())
             .map(|i| {
@@ -466,7 +471,7 @@ impl Body {
                 0.5 * (v * v + elastic)
             })
             .sum();
-        modes + if self.model().is_free() { self.state.frame.kinetic_energy(self.model()) } else { 0.0 }
+        modes + frame
     }
 
     /// Potential energy in gravity, J.
@@ -499,7 +504,7 @@ impl Body {
         }
         self.kernel.model().basis_in(self.config.precision).reconstruct(
             &self.single,
-            self.config.settings.warp,
+            self.kernel.warps(),
             out,
         );
         Ok(())

@@ -2,7 +2,10 @@
 
 use nalgebra::Matrix3;
 
-use crate::{BakeInfo, Coefficients, FlexibilitySite, Integrator, ModalModel, ModelError, ModelParts};
+use crate::{
+    BakeInfo, Coefficients, FlexibilitySite, Integrator, ModalModel, ModelError, ModelParts,
+    ReducedElasticity,
+};
 
 /// Rounding tolerance for the symmetry of an inertia, as a share of its largest entry.
 const INERTIA_ROUNDING: f64 = 1e-9;
@@ -75,7 +78,27 @@ pub(crate) fn check_parts(parts: &ModelParts) -> Result<(), ModelError> {
         each("site flexibility", "finite", &mut site.flexibility.into_iter().flatten(), &any)?;
         check_flexibility(parts, index)?;
     }
-    Ok(())
+    parts.reduced.as_ref().map_or(Ok(()), |reduced| check_reduced(reduced, modes))
+}
+
+pub(crate) fn check_reduced(reduced: &ReducedElasticity, modes: usize) -> Result<(), ModelError> {
+    let length = |what, expected: usize, got: usize| {
+        if expected == got { Ok(()) } else { Err(ModelError::Length { what, expected, got }) }
+    };
+    let value = |what, expected, bad: Option<(usize, f64)>| match bad {
+        None => Ok(()),
+        Some((index, got)) => Err(ModelError::Value { what, index, expected, got }),
+    };
+    let points = reduced.points();
+    if points == 0 {
+        return Err(ModelError::Empty("cubature point"));
+    }
+    length("cubature points", points.min(ReducedElasticity::MAX_POINTS), points)?;
+    length("cubature gradients", 9 * points * modes, reduced.gradients.len())?;
+    let bad = reduced.weights.iter().copied().enumerate().find(|&(_, w)| !(w.is_finite() && w > 0.0));
+    value("cubature weights", "m^3 above 0", bad)?;
+    let gradients = reduced.gradients.iter().map(|&x| f64::from(x)).enumerate();
+    value("cubature gradients", "finite", gradients.into_iter().find(|(_, x)| !x.is_finite()))
 }
 
 /// Checks that the inertia is symmetric and positive definite.

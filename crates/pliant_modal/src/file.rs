@@ -10,9 +10,13 @@
 //!   ..  description (postcard): counts and everything small
 //!   ..  surface positions f32 x 3 n, triangles u32 x 3 t, texture coordinates f32 x 2 n (when there), anchored u8 x n
 //!   ..  displacement f32 x 3 n m, rotation f32 x 3 n m, both [mode][vertex][axis]
+//!   ..  sections (when there), each: tag of 4 bytes, length u64, content
 //! ```
-//! All numbers are little-endian. A reader checks magic, version, length and hash before it decodes
-//! the payload.
+//!
+//! Section `NLIN` is the reduced elasticity of `p` points: material u8 (0 neo-Hookean, 1 St.
+//! Venant-Kirchhoff), `p` u32, weights f64 x p, gradients f32 x 9 p m. A model without it has
+//! linear elasticity only. All numbers are little-endian. A reader checks magic, version, length
+//! and hash before it decodes the payload.
 
 use std::{
     fs, io,
@@ -23,13 +27,19 @@ use std::{
 
 use serde::{Deserialize, Serialize};
 
-use crate::{BakeInfo, FileError, FlexibilitySite, ModalModel, ModelError, ModelParts, SurfaceMesh};
+use crate::{
+    BakeInfo, FileError, FlexibilitySite, Material, ModalModel, ModelError, ModelParts, ReducedElasticity,
+    SurfaceMesh,
+};
 
 /// First bytes of a `.modal` file.
 pub const MAGIC: [u8; 8] = *b"PLIANTMB";
 
 /// Version of the format that this build reads and writes.
 pub const FORMAT_VERSION: u32 = 1;
+
+/// Tag of the section with the reduced elasticity.
+const REDUCED: [u8; 4] = *b"NLIN";
 
 const HEADER: usize = 8 + 4 + 8 + 32;
 
@@ -81,6 +91,18 @@ pub(crate) fn encode(parts: &ModelParts) -> Vec<u8> {
     let mut floats = |values: &[f32]| bytes.extend(values.iter().flat_map(|x| x.to_le_bytes()));
     floats(&parts.displacement);
     floats(&parts.rotation);
+    if let Some(reduced) = &parts.reduced {
+        let mut section = vec![match reduced.material {
+            Material::NeoHookean => 0,
+            Material::StVenantKirchhoff => 1,
+        }];
+        section.extend((reduced.weights.len() as u32).to_le_bytes());
+        section.extend(reduced.weights.iter().flat_map(|x| x.to_le_bytes()));
+        section.extend(reduced.gradients.iter().flat_map(|x| x.to_le_bytes()));
+        bytes.extend(REDUCED);
+        bytes.extend((section.len() as u64).to_le_bytes());
+        bytes.extend(section);
+    }
 
     let hash = blake3::hash(&bytes[HEADER..]);
     let length = (bytes.len() - HEADER) as u64;
@@ -252,6 +274,7 @@ fn decode(payload: &[u8]) -> Result<ModelParts, FileError> {
     let anchored = words::<1>("anchored flags", &mut rest, n)?.map(|[b]| b != 0).collect();
     let displacement = words::<4>("displacement", &mut rest, shape)?.map(f32::from_le_bytes).collect();
     let rotation = words::<4>("rotation", &mut rest, shape)?.map(f32::from_le_bytes).collect();
+    let reduced = if rest.is_empty() { None } else { Some(reduced(&mut rest, m)?) };
     if !rest.is_empty() {
         return Err(FileError::Truncated { what: "nothing more", expected: 0, got: rest.len() as u64 });
     }
@@ -268,5 +291,32 @@ fn decode(payload: &[u8]) -> Result<ModelParts, FileError> {
         center_of_mass: d.center_of_mass,
         inertia: d.inertia,
         sites: d.sites,
+        reduced,
     })
+}
+
+/// Decodes the section with the reduced elasticity of `modes` coordinates.
+fn reduced(rest: &mut &[u8], modes: usize) -> Result<ReducedElasticity, FileError> {
+    let wrong = |what: String| FileError::Decode(what);
+    let tag = words::<4>("section tag", rest, 1)?.next().unwrap_or_default();
+    if tag != REDUCED {
+        return Err(wrong(format!(
+            "a section {:?} that this version does not know",
+            tag.escape_ascii().to_string()
+        )));
+    }
+    let length = words::<8>("section length", rest, 1)?.next().map_or(0, u64::from_le_bytes);
+    if length != rest.len() as u64 {
+        return Err(FileError::Truncated { what: "section", expected: length, got: rest.len() as u64 });
+    }
+    let material = match words::<1>("material", rest, 1)?.next() {
+        Some([0]) => Material::NeoHookean,
+        Some([1]) => Material::StVenantKirchhoff,
+        other => return Err(wrong(format!("a material {other:?} that this version does not know"))),
+    };
+    let points = words::<4>("cubature points", rest, 1)?.next().map_or(0, u32::from_le_bytes) as usize;
+    let weights = words::<8>("cubature weights", rest, points)?.map(f64::from_le_bytes).collect();
+    let count = points.saturating_mul(9).saturating_mul(modes);
+    let gradients = words::<4>("cubature gradients", rest, count)?.map(f32::from_le_bytes).collect();
+    Ok(ReducedElasticity { material, weights, gradients })
 }

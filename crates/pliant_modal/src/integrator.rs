@@ -93,6 +93,27 @@ impl Coefficients {
         Ok(made)
     }
 
+    /// Computes the coefficients of the linear part of reduced elasticity.
+    ///
+    /// Coordinates up to `omega h = 1` are stepped by [`Integrator::Exact`], so that they ring on.
+    /// Faster ones are stepped by backward Euler, as their exact response to a force comes to
+    /// nothing at `omega h = 2 pi`, and a held body would ring.
+    ///
+    /// # Errors
+    /// Returns an error if a number is not finite or out of range.
+    pub fn reduced(omega: f64, c: f64, h: f64) -> Result<Self, StepError> {
+        let exact = Self::new(Integrator::Exact, omega, c, h)?;
+        if omega * h <= 1.0 {
+            return Ok(exact);
+        }
+        let k = omega * omega;
+        let r = h * h / (1.0 + c * h + k * h * h);
+        let q = [(1.0 / (h * h) + c / h) * r, r / h, 0.0, 0.0];
+        let v = [(q[0] - 1.0) / h, q[1] / h, 0.0, 0.0];
+        let a = [v[0] / h, (v[1] - 1.0) / h, 0.0, 0.0];
+        Ok(Self { free: [q, v, a], response: [r, r / h, r / (h * h)] })
+    }
+
     fn exact(omega: f64, c: f64, h: f64) -> Self {
         let k = omega * omega;
         let sigma = 0.5 * c;

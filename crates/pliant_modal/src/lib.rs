@@ -45,6 +45,7 @@ mod flexibility;
 mod integrator;
 mod limit;
 mod model;
+mod nonlinear;
 mod patch;
 mod relaxation;
 mod simd;
@@ -59,11 +60,12 @@ pub use file::{FORMAT_VERSION, MAGIC};
 pub use integrator::{Coefficients, Integrator};
 pub use limit::streaming_sum;
 pub use model::{BakeInfo, Damping, Element, FlexibilitySite, ModalModel, ModelHash, ModelParts};
+pub use nonlinear::{ElasticEnergy, Hyperelastic, Material, ReducedElasticity, positive_tangent};
 pub use patch::Patch;
 pub use relaxation::{Relaxation, ViscoelasticCoefficients};
 pub use step::{
-    Frame, GrabConfig, Hand, HeldPatch, Hold, ImpliedPulls, Kernel, Load, RigidMotion, State, StepReport,
-    StepSettings,
+    Elasticity, Frame, GrabConfig, Hand, HeldPatch, Hold, ImpliedPulls, Kernel, Load, RigidMotion, State,
+    StepReport, StepSettings,
 };
 pub use surface::SurfaceMesh;
 pub use warp::{warp, warp_jacobian};

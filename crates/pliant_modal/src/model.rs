@@ -5,7 +5,10 @@ use std::sync::{Arc, OnceLock};
 use serde::{Deserialize, Serialize};
 
 use crate::step::MassSites;
-use crate::{Basis, ModelError, Precision, SurfaceMesh, check::check_parts};
+use crate::{
+    Basis, Material, ModelError, Precision, ReducedElasticity, SurfaceMesh, check::check_parts,
+    nonlinear::Gradients,
+};
 
 /// The finite element of a bake.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
@@ -148,6 +151,8 @@ pub struct ModelParts {
     /// Residual flexibility of patches that are spread over the surface. It may be empty. A grab
     /// then uses a contact estimate.
     pub sites: Vec<FlexibilitySite>,
+    /// Elastic energy for large strains. `None` for a model that has linear elasticity only.
+    pub reduced: Option<ReducedElasticity>,
 }
 
 /// A baked, immutable body. Bodies of the same shape and material share it as `Arc<ModalModel>`.
@@ -159,6 +164,8 @@ pub struct ModalModel {
     half: OnceLock<Basis>,
     /// The mass sites for gravity on a bent body, made at the first request.
     mass_sites: OnceLock<Arc<MassSites>>,
+    /// The gradients of the reduced elasticity in the layout of a step, made at the first request.
+    gradients: OnceLock<Arc<Gradients>>,
     size: f64,
     hash: ModelHash,
     bytes: usize,
@@ -212,6 +219,7 @@ impl ModalModel {
             basis,
             half: OnceLock::new(),
             mass_sites: OnceLock::new(),
+            gradients: OnceLock::new(),
             size,
             hash,
             bytes: bytes.len(),
@@ -221,6 +229,14 @@ impl ModalModel {
 
     pub(crate) fn mass_sites(&self) -> &MassSites {
         self.mass_sites.get_or_init(|| Arc::new(MassSites::new(self)))
+    }
+
+    pub(crate) fn cubature_gradients(&self) -> Arc<Gradients> {
+        let make = || {
+            let gradients = self.parts.reduced.as_ref().map_or(&[][..], |reduced| &reduced.gradients);
+            Arc::new(Gradients::new(gradients, self.omega()))
+        };
+        self.gradients.get_or_init(make).clone()
     }
 
     pub(crate) fn site_radii(&self) -> &[f64] {
@@ -250,6 +266,11 @@ impl ModalModel {
     /// Number of rigid modes: 6 for a free body, 0 for an anchored body.
     pub fn rigid_modes(&self) -> usize {
         if self.parts.free { 6 } else { 0 }
+    }
+
+    /// Material of the reduced elasticity. `None` for a model that has linear elasticity only.
+    pub fn material(&self) -> Option<Material> {
+        self.parts.reduced.as_ref().map(|reduced| reduced.material)
     }
 
     /// Whether the body has no anchors.

@@ -8,6 +8,23 @@ use half::f16;
 
 use crate::basis::BLOCK;
 
+/// Number of partial sums of a dot product. The fixed order gives equal results on all machines and
+/// vectorizes.
+pub(crate) const LANES: usize = 4;
+
+#[inline(always)]
+pub(crate) fn dot(row: &[f64], x: &[f64]) -> f64 {
+    let mut sums = [0.0; LANES];
+    let ((a, tail_a), (b, tail_b)) = (row.as_chunks::<LANES>(), x.as_chunks::<LANES>());
+    for (a, b) in a.iter().zip(b) {
+        for k in 0..LANES {
+            sums[k] += a[k] * b[k];
+        }
+    }
+    let rest: f64 = tail_a.iter().zip(tail_b).map(|(a, b)| a * b).sum();
+    (sums[0] + sums[1]) + (sums[2] + sums[3]) + rest
+}
+
 /// [`BLOCK`] numbers in one register, two registers or an array.
 ///
 /// # Safety

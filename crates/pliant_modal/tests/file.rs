@@ -1,9 +1,11 @@
 //! The `.modal` file: round trip and all kinds of invalid files.
 #![allow(clippy::unwrap_used, clippy::panic, reason = "a failed test should panic")]
 
+mod nonlinear_rod;
 mod rod;
 
-use pliant_modal::{FileError, ModalModel, ModelParts};
+use nonlinear_rod::nonlinear_rod;
+use pliant_modal::{FileError, Material, ModalModel, ModelParts, ReducedElasticity};
 use proptest::prelude::*;
 
 #[test]
@@ -14,6 +16,38 @@ fn round_trip_is_exact_and_the_hash_is_the_contents() {
     assert_eq!(back, model);
     assert_eq!(back.hash(), model.hash());
     assert_ne!(rod::rod(1.01e6, 7, 0.02, false).hash(), model.hash());
+}
+
+#[test]
+fn a_material_comes_back_and_a_file_without_one_has_none() {
+    let model = nonlinear_rod(1e6, 7, 0.02);
+    let bytes = model.to_bytes();
+    let back = ModalModel::from_bytes(&bytes).unwrap();
+    assert_eq!(back, model);
+    assert_eq!(back.material(), Some(Material::StVenantKirchhoff));
+    let plain = rod::rod(1e6, 7, 0.02, false);
+    assert_eq!(ModalModel::from_bytes(&plain.to_bytes()).unwrap().material(), None);
+    // The section follows what a file without it ends with.
+    let forged = |at: usize, value: u8| {
+        let mut bytes = bytes.clone();
+        bytes[at] = value;
+        seal(&mut bytes);
+        ModalModel::from_bytes(&bytes).unwrap_err().to_string()
+    };
+    let section = bytes.windows(4).rposition(|w| w == b"NLIN").unwrap();
+    assert!(forged(section, b'X').contains("section"), "{}", forged(section, b'X'));
+    assert!(forged(section + 12, 9).contains("material"), "{}", forged(section + 12, 9));
+    assert!(forged(section + 13, 200).contains("cubature"), "{}", forged(section + 13, 200));
+    assert!(forged(section + 4, 1).contains("section"), "{}", forged(section + 4, 1));
+}
+
+/// Corrects length and hash of a changed file.
+fn seal(bytes: &mut [u8]) {
+    let header = 52;
+    let length = (bytes.len() - header) as u64;
+    bytes[12..20].copy_from_slice(&length.to_le_bytes());
+    let hash = blake3::hash(&bytes[header..]);
+    bytes[20..52].copy_from_slice(hash.as_bytes());
 }
 
 #[test]
@@ -124,21 +158,32 @@ fn parts_that_cannot_be_stepped_or_told_are_refused_by_name() {
     );
     assert!(refused(&|p| p.info.anchors = vec![String::new(); 65]).contains("anchors"));
     assert!(refused(&|p| p.info.anchors = vec!["x".repeat(300)]).contains("anchor"));
+    let refused = |change: &dyn Fn(&mut ReducedElasticity)| {
+        let mut parts = nonlinear_rod(1e6, 3, 0.02).parts().clone();
+        change(parts.reduced.as_mut().unwrap());
+        ModalModel::from_parts(parts).unwrap_err().to_string()
+    };
+    assert!(refused(&|r| r.weights[2] = -1.0).contains("cubature weights[2]"));
+    assert!(refused(&|r| r.gradients[5] = f32::NAN).contains("cubature gradients[5]"));
+    assert!(refused(&|r| r.gradients.truncate(7)).contains("cubature gradients"));
+    assert!(refused(&|r| r.weights.clear()).contains("cubature point"));
 }
 
 proptest! {
     /// A forged payload with a correct hash is refused or harmless, and never causes a panic.
     #[test]
     fn forged_payloads_never_panic(position in 0usize..2_000, value: u8, cut in 0usize..200) {
-        let mut bytes = rod::rod(1e6, 3, 0.02, false).to_bytes();
         let header = 52;
-        let place = header + position % (bytes.len() - header);
-        bytes[place] = value;
-        bytes.truncate(bytes.len() - cut);
-        let length = (bytes.len() - header) as u64;
-        bytes[12..20].copy_from_slice(&length.to_le_bytes());
-        let hash = blake3::hash(&bytes[header..]);
-        bytes[20..52].copy_from_slice(hash.as_bytes());
-        let _ = ModalModel::from_bytes(&bytes);
+        for model in [rod::rod(1e6, 3, 0.02, false), nonlinear_rod(1e6, 3, 0.02)] {
+            let whole = model.to_bytes();
+            // From the front and from the back, where the section is.
+            for place in [header + position % (whole.len() - header), whole.len() - 1 - position % 2_000] {
+                let mut bytes = whole.clone();
+                bytes[place] = value;
+                bytes.truncate(bytes.len() - cut);
+                seal(&mut bytes);
+                let _ = ModalModel::from_bytes(&bytes);
+            }
+        }
     }
 }

@@ -76,6 +76,7 @@ pub(crate) fn square() -> ModalModel {
         center_of_mass: [0.5, 0.5, 0.0],
         inertia: [[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]],
         sites: Vec::new(),
+        reduced: None,
     })
     .unwrap()
 }

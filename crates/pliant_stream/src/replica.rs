@@ -123,29 +123,29 @@ impl Replica {
     }
 
     /// Extrapolates the force of a hand at the end of a step from its mean over this step and the
-    /// mean `before` over the step before, N.
-    pub(crate) fn end(&self, mean: Vector3<f64>, before: Vector3<f64>) -> Vector3<f64> {
-        let beyond = self.kernel.settings().extrapolation(self.kernel.model());
+    /// mean `before` over the step before, N. `hands` is the number of hands on the body.
+    pub(crate) fn end(&self, mean: Vector3<f64>, before: Vector3<f64>, hands: usize) -> Vector3<f64> {
+        let beyond = self.kernel.settings().extrapolation(self.kernel.model(), hands);
         mean + beyond * (mean - before)
     }
 
     /// Returns the mean force of a hand over a step from its force at the `end` of the step and the
-    /// mean `before` over the step before (N, world axes).
-    pub(crate) fn mean(&self, end: Vector3<f64>, before: Vector3<f64>) -> Vector3<f64> {
-        let beyond = self.kernel.settings().extrapolation(self.kernel.model());
+    /// mean `before` over the step before (N, world axes). `hands` is the number of hands on the
+    /// body.
+    pub(crate) fn mean(&self, end: Vector3<f64>, before: Vector3<f64>, hands: usize) -> Vector3<f64> {
+        let beyond = self.kernel.settings().extrapolation(self.kernel.model(), hands);
         (end + beyond * before) / (1.0 + beyond)
     }
 
     /// Displacement of a patch from rest at `q` in body axes, m. It is zero for a vertex that the
     /// model lacks. Modes that `q` lacks do not move.
     pub(crate) fn displacement(&mut self, q: &[f64], vertex: u32, radius: f64) -> [f64; 3] {
-        let warp = self.kernel.settings().warp;
+        let warp = self.kernel.warps();
         self.patch(vertex, radius).map_or([0.0; 3], |patch| patch.displacement(q, warp).into())
     }
 
     /// Computes the modal force per mode that a step from the true state `from` lacks to reach the
-    /// true coordinates and velocities `to`. The fit is least squares over displacement and
-    /// velocity, in units of the mode's own amplitude. The call steps `from`.
+    /// true coordinates and velocities `to` (see [`Kernel::missing_force`]). The call steps `from`.
     pub(crate) fn lacking(
         &mut self,
         from: &mut State,
@@ -157,15 +157,8 @@ impl Replica {
     ) {
         self.step_measured(from, grabs, load, means);
         out.clear();
-        let [by_q, by_v, _] = self.kernel.responses();
-        for (k, omega) in self.kernel.omega().iter().enumerate() {
-            let at = |slice: &[f64]| slice.get(k).copied().unwrap_or(0.0);
-            let (rq, rv) = (at(to[0]) - from.q[k], at(to[1]) - from.v[k]);
-            let (bq, bv) = (by_q[k], by_v[k]);
-            let weight = 1.0 / omega.powi(2).max(1e-12);
-            let scale = bq * bq + bv * bv * weight;
-            out.push(if scale > 0.0 { (bq * rq + bv * rv * weight) / scale } else { 0.0 });
-        }
+        out.resize(from.modes(), 0.0);
+        self.kernel.missing_force(from, to, out);
     }
 
     /// Writes the reactions that a state implies into `grabs`; see [`ImpliedPulls`].

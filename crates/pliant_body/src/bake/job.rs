@@ -45,8 +45,14 @@ struct BakeShared {
     cancelled: AtomicBool,
 }
 
-const STAGES: [BakeStage; 5] =
-    [BakeStage::Mesh, BakeStage::Assemble, BakeStage::Factor, BakeStage::Modes, BakeStage::Surface];
+const STAGES: [BakeStage; 6] = [
+    BakeStage::Mesh,
+    BakeStage::Assemble,
+    BakeStage::Factor,
+    BakeStage::Modes,
+    BakeStage::Material,
+    BakeStage::Surface,
+];
 
 impl BakeShared {
     fn report(&self, stage: u64, share: f64) {
@@ -111,7 +117,8 @@ fn run(
                 Stage::Assemble => 1,
                 Stage::Factor => 2,
                 Stage::Modes => 3,
-                Stage::Surface => 4,
+                Stage::Material => 4,
+                Stage::Surface => 5,
             };
             shared.report(stage, share);
         };

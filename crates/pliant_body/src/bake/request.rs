@@ -143,6 +143,8 @@ pub enum BakeStage {
     Factor,
     /// The modes.
     Modes,
+    /// The derivatives of the modes and the energy of a material for large strains.
+    Material,
     /// The visible surface and the data for contact with a hand on it.
     Surface,
 }

@@ -92,6 +92,7 @@ fn bar_with(free: bool, factor: f64) -> ModalModel {
         center_of_mass: [LENGTH / 2.0, 0.0, 0.0],
         inertia: [[MASS / 6.0 * SIDE * SIDE, 0.0, 0.0], [0.0, long, 0.0], [0.0, 0.0, long]],
         sites: Vec::new(),
+        reduced: None,
     })
     .unwrap()
 }

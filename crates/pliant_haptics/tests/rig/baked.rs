@@ -47,6 +47,7 @@ pub fn made_of(model: &ModalModel, young: f64, size: f64) -> ModalModel {
                 flexibility: matrix(site.flexibility, 1.0 / (e * s)),
             })
             .collect(),
+        reduced: None,
     })
     .unwrap()
 }

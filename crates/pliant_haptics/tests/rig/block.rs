@@ -79,6 +79,7 @@ pub fn block(young: f64, modes: usize) -> ModalModel {
         center_of_mass: [LENGTH / 2.0, 0.0, 0.0],
         inertia: [[inertia, 0.0, 0.0], [0.0, inertia, 0.0], [0.0, 0.0, inertia]],
         sites: vec![FlexibilitySite { vertex: tip(), radius: 0.01, flexibility }],
+        reduced: None,
     })
     .unwrap()
 }

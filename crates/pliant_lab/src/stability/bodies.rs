@@ -6,7 +6,7 @@ use nalgebra::{DMatrix, DVector, Matrix3, Vector3};
 use pliant_bake::{Anchor, BakeConfig, Comparison, bake};
 use pliant_mesh::{TetMesh, shapes};
 use pliant_modal::{
-    Body, BodyConfig, Damping, Element, GrabConfig, GrabId, ModalModel, Patch, State, StepError,
+    Body, BodyConfig, Damping, Element, GrabConfig, GrabId, Material, ModalModel, Patch, State, StepError,
 };
 
 use super::Bound;
@@ -29,6 +29,8 @@ pub(super) struct BarBody {
     pub(super) zeta: f64,
     /// Held at x = 0 if true, free otherwise.
     pub(super) held: bool,
+    /// Material for large strains. The modes are then coordinates.
+    pub(super) material: Option<Material>,
 }
 
 impl Default for BarBody {
@@ -44,6 +46,7 @@ impl Default for BarBody {
             density: 1000.0,
             zeta: 0.03,
             held: true,
+            material: None,
         }
     }
 }
@@ -70,6 +73,7 @@ impl BarBody {
         let config = BakeConfig {
             element: self.element,
             modes: self.modes,
+            material: self.material,
             young: self.young,
             poisson: self.poisson,
             density: self.density,

@@ -47,10 +47,11 @@ impl ImpliedPulls {
         }
         self.grams.prepare(hands, &self.softness);
         let ratio = settings.relaxation.map_or(0.0, |relaxation| relaxation.ratio);
+        kernel.elastic_force(&state.q, &mut self.force);
         for (k, force) in self.force.iter_mut().enumerate() {
-            let stretch = state.q[k] - ratio * state.z.get(k).copied().unwrap_or(0.0);
+            let flow = ratio * state.z.get(k).copied().unwrap_or(0.0);
             let (omega, damping) = (kernel.omega()[k], kernel.damping()[k]);
-            *force = state.a[k] + damping * state.v[k] + omega * omega * stretch;
+            *force += state.a[k] + damping * state.v[k] - omega * omega * flow;
         }
         kernel.weight(&state.frame, &state.q, &mut self.weight);
         for (force, weight) in self.force.iter_mut().zip(&self.weight) {
@@ -59,12 +60,12 @@ impl ImpliedPulls {
         for (force, softness) in self.force.iter_mut().zip(&self.softness) {
             *force *= softness;
         }
-        let n = 3 * hands.len();
+        let (n, warp) = (3 * hands.len(), kernel.warps());
         self.system.clear(n, true);
         self.tangents.clear();
         for (i, hand) in hands.iter().enumerate() {
-            let (_, t) = tangent(&hand.patch.rows().reduce(&state.q, settings.warp), settings.warp);
-            let along = t * hand.patch.rows().reduce(&self.force, settings.warp);
+            let (_, t) = tangent(&hand.patch.rows().reduce(&state.q, warp), warp);
+            let along = t * hand.patch.rows().reduce(&self.force, warp);
             self.system.right()[3 * i..3 * i + 3].copy_from_slice(along.as_slice());
             self.tangents.push(t);
         }

@@ -8,6 +8,7 @@ use nalgebra::{Matrix3, Vector3};
 use super::{
     Frame, Hand, Hold, RigidMotion, State, StepSettings,
     constraint::ViscoelasticPatch,
+    elastic::{ElasticStep, Tangent as ElasticTangent},
     gravity::between,
     modes::Modes,
     patch::{Grams, Six, Tangent, tangent},
@@ -21,6 +22,9 @@ use crate::{ModalModel, StepError};
 pub struct StepReport {
     /// Number of directions in which hands were linearly dependent and had to be regularized.
     pub regularized: usize,
+    /// Number of points of a reduced elasticity at which the tangent of the last round had negative
+    /// eigenvalues, which were raised to zero. Zero with linear elasticity.
+    pub projected: usize,
 }
 
 /// Forces on a body in one step besides its hands and gravity.
@@ -85,6 +89,8 @@ pub struct Kernel {
     settings: StepSettings,
     h: f64,
     modes: Modes,
+    /// The nonlinear part of the step. `None` with linear elasticity.
+    elastic: Option<ElasticStep>,
     creep: ViscoelasticPatch,
     before: State,
     /// Modal forces of gravity and loads, and at the end of a step those of the hands too. `pulls`
@@ -107,6 +113,18 @@ pub struct Kernel {
     system: System,
 }
 
+/// Compliance of a hand, turned with its patch at the coordinates `q`.
+fn turned(creep: &ViscoelasticPatch, hand: &Hand, q: &[f64]) -> Matrix3<f64> {
+    let turn = hand.patch.rotation(q);
+    turn * creep.compliance(hand) * turn.transpose()
+}
+
+/// Makes the nonlinear part of a step if the settings and the model have one.
+fn elastic(model: &ModalModel, settings: &StepSettings, modes: &Modes, h: f64) -> Option<ElasticStep> {
+    let scale = settings.stiffness_scale;
+    if settings.is_reduced(model) { ElasticStep::new(model, modes, scale, h) } else { None }
+}
+
 impl Kernel {
     /// Makes a kernel for the first `modes` modes of a model at steps of `h` seconds.
     ///
@@ -122,6 +140,7 @@ impl Kernel {
         let modes = Modes::new(&model, &settings, modes, h)?;
         let zero = vec![0.0; modes.count()];
         let mut kernel = Self {
+            elastic: elastic(&model, &settings, &modes, h),
             creep: ViscoelasticPatch::new(settings.relaxation, settings.stiffness_scale, h),
             before: State::default(),
             force: zero.clone(),
@@ -152,6 +171,7 @@ impl Kernel {
     pub fn reconfigure(&mut self, settings: StepSettings, h: f64) -> Result<(), StepError> {
         settings.check()?;
         self.modes = Modes::new(&self.model, &settings, self.modes.count(), h)?;
+        self.elastic = elastic(&self.model, &settings, &self.modes, h);
         self.creep = ViscoelasticPatch::new(settings.relaxation, settings.stiffness_scale, h);
         (self.settings, self.h) = (settings, h);
         self.before = self.at_rest();
@@ -196,6 +216,27 @@ impl Kernel {
         self.modes.response.each_ref().map(Vec::as_slice)
     }
 
+    /// Computes the modal force that the last step lacked to end at the coordinates and velocities
+    /// `to` instead of at `reached`, kg^1/2 m/s^2. Entries that `to` lacks count as zero.
+    ///
+    /// With linear elasticity it is a least-squares fit of both, in units of each mode's own
+    /// amplitude. With reduced elasticity, where a force moves all coordinates, it is that of the
+    /// coordinates on the tangent of the step.
+    pub fn missing_force(&mut self, reached: &State, to: [&[f64]; 2], out: &mut [f64]) {
+        let at = |slice: &[f64], k: usize| slice.get(k).copied().unwrap_or(0.0);
+        if let Some(elastic) = &mut self.elastic {
+            elastic.force_of_way(|k| at(to[0], k) - reached.q[k], out);
+            return;
+        }
+        for (k, (out, omega)) in out.iter_mut().zip(&self.modes.omega).enumerate() {
+            let (rq, rv) = (at(to[0], k) - reached.q[k], at(to[1], k) - reached.v[k]);
+            let (bq, bv) = (self.modes.response[0][k], self.modes.response[1][k]);
+            let weight = 1.0 / omega.powi(2).max(1e-12);
+            let scale = bq * bq + bv * bv * weight;
+            *out = if scale > 0.0 { (bq * rq + bv * rv * weight) / scale } else { 0.0 };
+        }
+    }
+
     /// Makes a state of the body at rest, in the pose in which its model was baked.
     pub fn at_rest(&self) -> State {
         let frame = Frame::at_rest(&self.model);
@@ -231,9 +272,10 @@ impl Kernel {
     ///
     /// It is the residual flexibility of the patch plus the compliance of the hand's own spring.
     /// Where the material is viscoelastic, the residual flexibility is multiplied by
-    /// [`Relaxation::creep`](crate::Relaxation::creep) of one step.
-    pub fn compliance(&self, hand: &Hand) -> Matrix3<f64> {
-        self.creep.compliance(hand)
+    /// [`Relaxation::creep`](crate::Relaxation::creep) of one step. With reduced elasticity it
+    /// turns with the patch at the coordinates `q`.
+    pub fn compliance(&self, hand: &Hand, q: &[f64]) -> Matrix3<f64> {
+        if self.elastic.is_some() { turned(&self.creep, hand, q) } else { self.creep.compliance(hand) }
     }
 
     /// Returns the viscoelastic state of a hand's patch after one step under a force `pull`
@@ -252,6 +294,39 @@ impl Kernel {
         self.solving.reserve(hands.len().saturating_sub(self.solving.len()));
         self.forces.reserve(hands.len().saturating_sub(self.forces.len()));
         self.system.reserve(hands.len());
+        if let Some(elastic) = &mut self.elastic {
+            elastic.reserve(hands.len());
+        }
+    }
+
+    /// Elastic energy at the coordinates `q`, J. Without viscoelastic parts.
+    pub fn elastic_energy(&self, q: &[f64]) -> f64 {
+        match &self.elastic {
+            Some(elastic) => elastic.energy(q),
+            None => 0.5 * q.iter().zip(&self.modes.omega).map(|(q, w)| (w * q) * (w * q)).sum::<f64>(),
+        }
+    }
+
+    /// Writes the elastic force `dU/dq` at the coordinates `q`, kg^1/2 m/s^2.
+    pub fn elastic_force(&self, q: &[f64], out: &mut [f64]) {
+        match &self.elastic {
+            Some(elastic) => elastic.force_at(q, out),
+            None => {
+                for ((out, q), omega) in out.iter_mut().zip(q).zip(&self.modes.omega) {
+                    *out = omega * omega * q;
+                }
+            }
+        }
+    }
+
+    /// Whether the body has reduced elasticity.
+    pub fn is_reduced(&self) -> bool {
+        self.elastic.is_some()
+    }
+
+    /// Whether the shape bends by modal warping.
+    pub fn warps(&self) -> bool {
+        self.settings.warp && self.elastic.is_none()
     }
 
     /// Performs one step of a state with these hands.
@@ -309,7 +384,7 @@ impl Kernel {
 
     /// Whether the work of gravity on the deformed shape differs from that on the rest shape.
     fn bends_under_gravity(&self) -> bool {
-        self.settings.warp && !self.model.is_free() && self.settings.gravity != [0.0; 3]
+        self.warps() && !self.model.is_free() && self.settings.gravity != [0.0; 3]
     }
 
     /// Writes the modal force of gravity on the undeformed shape to `force`.
@@ -388,7 +463,7 @@ impl Kernel {
         let local = state.frame.rotation().inverse() * gravity;
         let straight = state.q.iter().zip(self.model.participation());
         let straight: f64 = straight.map(|(q, p)| q * local.dot(&Vector3::from(*p))).sum();
-        let bent = if self.settings.warp { self.model.mass_sites().work(&local, &state.q) } else { 0.0 };
+        let bent = if self.warps() { self.model.mass_sites().work(&local, &state.q) } else { 0.0 };
         -(straight + bent)
     }
 
@@ -409,7 +484,7 @@ impl Kernel {
             RigidMotion::predict(&mut state.frame, &self.model, self.h, gravity, load.force, load.torque)
         });
         let mut report = StepReport::default();
-        if !hands.is_empty() {
+        if !hands.is_empty() || self.elastic.is_some() {
             report = self.hold(state, hands, rigid);
         }
         state.f.copy_from_slice(&self.force);
@@ -421,14 +496,17 @@ impl Kernel {
         self.prepare(hands);
         self.begin(state, hands);
         let most = StepSettings::MOST_CORRECTIONS;
-        let rounds = if self.settings.warp { self.settings.corrections.clamp(1, most) } else { 1 };
+        let (warp, curved) = (self.warps(), self.warps() || self.elastic.is_some());
+        let rounds = if curved { self.settings.corrections.clamp(1, most) } else { 1 };
         let mut report = StepReport::default();
         let mut place = PredictedFrame::unheld(state.frame);
-        for round in 0..rounds {
+        let (mut round, mut tangent_of) = (0, ElasticTangent::First);
+        loop {
+            self.linearize(hands, tangent_of);
             let center = Vector3::from(self.model.center_of_mass());
             for (solving, hand) in self.solving.iter_mut().zip(hands.iter()) {
                 // Each round linearizes where the previous round ended.
-                (solving.at, solving.tangent) = tangent(&solving.from, self.settings.warp);
+                (solving.at, solving.tangent) = tangent(&solving.from, warp);
                 solving.arm = hand.patch.rest() + solving.at - center;
                 // The forces of the previous round change axes here. In the first round these are
                 // the forces of the previous step, in world axes.
@@ -438,22 +516,61 @@ impl Kernel {
                 rigid.tighten(&self.model, self.solving.iter().map(|s| (s.arm, s.pull)));
             }
             report.regularized = self.solve(&state.frame, hands, &place, rigid.as_ref());
-            if round + 1 < rounds {
+            round += 1;
+            let mut last = round >= rounds;
+            if let Some(elastic) = &mut self.elastic {
+                let patches = hands.iter().map(|hand| &*hand.patch);
+                let far = elastic.finish_round(patches.zip(self.solving.iter().map(|s| s.pull)));
+                report.projected = elastic.raised();
+                // A tangent serves two rounds, unless the first went far. Such a step goes on.
+                let keep = !far && tangent_of != ElasticTangent::Kept;
+                tangent_of = if keep { ElasticTangent::Kept } else { ElasticTangent::New };
+                last &= !far || round >= most;
+            }
+            if last {
+                break;
+            }
+            if self.elastic.is_none() {
                 for (i, solving) in self.solving.iter_mut().enumerate() {
                     solving.from = solving.free + self.responses.answer(i, &self.forces);
                 }
-                if let Some(rigid) = &rigid {
-                    place = place.moved(&state.frame, &self.model, rigid, self.total(&place));
-                }
+            }
+            if let Some(rigid) = &rigid {
+                place = place.moved(&state.frame, &self.model, rigid, self.total(&place));
             }
         }
         self.pulls.fill(0.0);
         for (hand, forces) in hands.iter().zip(&self.forces) {
-            hand.patch.rows().spread(forces, self.settings.warp, &mut self.pulls);
+            hand.patch.rows().spread(forces, warp, &mut self.pulls);
         }
-        self.modes.respond(&self.pulls, state);
-        for (f, pull) in self.force.iter_mut().zip(&self.pulls) {
-            *f += pull;
+        if let Some(elastic) = &mut self.elastic {
+            let ends = [&self.before.q[..], elastic.coordinates()];
+            let supplied = hands
+                .iter()
+                .zip(&self.solving)
+                .map(|(hand, solving)| {
+                    let stored = |q: &[f64], force: &Vector3<f64>| {
+                        0.5 * force.dot(&(turned(&self.creep, hand, q) * force))
+                    };
+                    let force = &solving.pull;
+                    let on_body = force.dot(&hand.patch.way(ends));
+                    match hand.hold {
+                        // The hand supplies the residual flexibility of its patch first. That turns
+                        // with the patch, and must not give back more than it got.
+                        Hold::Target { velocity, .. } if rigid.is_none() && hand.mean != Vector3::zeros() => {
+                            let before = stored(ends[0], &(place.back * hand.mean));
+                            self.h * force.dot(&(place.back * velocity)) + before - stored(ends[1], force)
+                        }
+                        _ => on_body,
+                    }
+                })
+                .sum();
+            elastic.finish(&self.before, supplied, &mut self.force, state);
+        } else {
+            self.modes.respond(&self.pulls, state);
+            for (f, pull) in self.force.iter_mut().zip(&self.pulls) {
+                *f += pull;
+            }
         }
         let [force, torque] = self.total(&place);
         if let Some(rigid) = &rigid {
@@ -471,16 +588,16 @@ impl Kernel {
 
     /// Initializes the rounds of a step: the patch positions, and those after the step without
     /// hands.
-    fn begin(&mut self, state: &State, hands: &[Hand]) {
-        let warp = self.settings.warp;
+    fn begin(&mut self, state: &mut State, hands: &[Hand]) {
+        let warp = self.warps();
         let damped = hands.iter().any(|hand| hand.config().relaxation > 0.0);
         if damped {
             self.modes.velocities(&self.before, state, self.h, &mut self.velocity);
         }
-        // Hands with more rows than there are modes contradict each other: with extrapolated
-        // forces they would not come to rest.
-        let contradict = 3 * hands.len() > state.modes();
-        let beyond = if contradict { 0.0 } else { self.settings.extrapolation(&self.model) };
+        let beyond = self.settings.extrapolation(&self.model, hands.len());
+        if let Some(elastic) = &mut self.elastic {
+            elastic.begin(&self.before, &self.modes, &self.force, state);
+        }
         self.solving.clear();
         for hand in hands {
             let mut solving = Solving {
@@ -502,6 +619,33 @@ impl Kernel {
                 }
             }
             self.solving.push(solving);
+        }
+    }
+
+    /// Linearizes the elasticity at the present coordinates, with the hands' places and responses
+    /// on that tangent. Linear elasticity has no need of it.
+    ///
+    /// Every second round keeps the tangent of the round before, and only its force is new.
+    fn linearize(&mut self, hands: &[Hand], tangent: ElasticTangent) {
+        let Some(elastic) = &mut self.elastic else { return };
+        elastic.linearize(tangent);
+        for (i, (solving, hand)) in self.solving.iter_mut().zip(hands).enumerate() {
+            solving.free = elastic.without_hands(&hand.patch);
+            solving.from = solving.free;
+            if solving.relaxation > 0.0 {
+                // Dampers see the mean velocity over the step.
+                let before = hand.patch.rows().reduce(&self.before.q, false);
+                solving.speed = (solving.free - before) / self.h;
+            }
+            if tangent != ElasticTangent::Kept {
+                solving.compliance = turned(&self.creep, hand, elastic.coordinates());
+            }
+            if tangent != ElasticTangent::Kept {
+                elastic.add_hand(&hand.patch);
+                for j in 0..=i {
+                    self.responses.set(i, j, &elastic.response(i, j));
+                }
+            }
         }
     }
 
@@ -556,7 +700,11 @@ impl Kernel {
             for (j, b) in self.solving[..=i].iter().enumerate() {
                 let across = |grams: &Grams| a.tangent * grams.at(i, j) * b.tangent.transpose();
                 let mut position = across(&self.responses);
-                let mut velocity = if damped { across(&self.dampers) } else { Matrix3::zeros() };
+                let mut velocity = match (damped, self.elastic.is_some()) {
+                    (false, _) => Matrix3::zeros(),
+                    (true, true) => position / self.h,
+                    (true, false) => across(&self.dampers),
+                };
                 if let Some(rigid) = rigid {
                     let response = rigid.velocity_response(&a.arm, &b.arm);
                     position += self.h * response;

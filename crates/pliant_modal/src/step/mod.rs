@@ -1,6 +1,7 @@
 //! The step of a body. Bodies, guests, predictions, peers and devices share one kernel.
 
 mod constraint;
+mod elastic;
 mod gravity;
 mod implied;
 mod kernel;
@@ -17,7 +18,7 @@ pub use implied::ImpliedPulls;
 pub use kernel::{Kernel, Load, StepReport};
 pub use patch::HeldPatch;
 pub use rigid::{Frame, RigidMotion};
-pub use settings::StepSettings;
+pub use settings::{Elasticity, StepSettings};
 pub use state::State;
 
 pub(crate) use gravity::MassSites;

@@ -42,9 +42,11 @@ impl Modes {
         let count = count.min(model.mode_count());
         let (omega, damping): (Vec<f64>, Vec<f64>) =
             (0..count).map(|mode| settings.mode(model, mode)).unzip();
+        let reduced = settings.is_reduced(model);
         let (mut made, mut flows) = (Vec::with_capacity(count), Vec::new());
         for (&omega, &c) in omega.iter().zip(&damping) {
             match settings.relaxation {
+                None if reduced => made.push(Coefficients::reduced(omega, c, h)?),
                 None => made.push(Coefficients::new(settings.integrator, omega, c, h)?),
                 Some(relaxation) => {
                     let (one, flow) = Coefficients::relaxing(settings.integrator, omega, c, relaxation, h)?;
@@ -67,7 +69,7 @@ impl Modes {
             }),
             response: std::array::from_fn(|row| made.iter().map(|c| c.response[row]).collect()),
             damper: made.iter().map(|c| c.response[1].max(c.response[0] / h)).collect(),
-            memory: settings.integrator != Integrator::Exact,
+            memory: settings.integrator != Integrator::Exact && !reduced,
             viscous,
         })
     }

@@ -10,7 +10,11 @@ use std::sync::Arc;
 use nalgebra::{Matrix3, SMatrix, SVector, Vector3};
 
 use super::Hand;
-use crate::{ModalModel, Patch, StepError, warp::warp_with_jacobian};
+use crate::{
+    ModalModel, Patch, StepError,
+    simd::{LANES, dot},
+    warp::warp_with_jacobian,
+};
 
 /// Displacement (0..3) and rotation (3..6) of a patch, or the conjugate forces.
 pub(crate) type Six = SVector<f64, 6>;
@@ -18,22 +22,6 @@ pub(crate) type Six = SVector<f64, 6>;
 pub(crate) type Tangent = SMatrix<f64, 3, 6>;
 /// Response of one patch's six numbers to forces on the six numbers of another patch.
 type Block = SMatrix<f64, 6, 6>;
-
-/// Number of partial sums of a dot product. The fixed order gives equal results on all machines and
-/// vectorizes.
-const LANES: usize = 4;
-
-fn dot(row: &[f64], x: &[f64]) -> f64 {
-    let mut sums = [0.0; LANES];
-    let ((a, tail_a), (b, tail_b)) = (row.as_chunks::<LANES>(), x.as_chunks::<LANES>());
-    for (a, b) in a.iter().zip(b) {
-        for k in 0..LANES {
-            sums[k] += a[k] * b[k];
-        }
-    }
-    let rest: f64 = tail_a.iter().zip(tail_b).map(|(a, b)| a * b).sum();
-    (sums[0] + sums[1]) + (sums[2] + sums[3]) + rest
-}
 
 /// Computes three dot products at once. They share the loads of `x` and do not wait for each other.
 fn dot3(rows: [&[f64]; 3], x: &[f64]) -> [f64; 3] {
@@ -105,6 +93,26 @@ impl HeldPatch {
         displacement(&self.rows.reduce(q, warped), warped)
     }
 
+    /// Way of the patch from the first to the second coordinates without warp, m, body axes.
+    pub(crate) fn way(&self, [from, to]: [&[f64]; 2]) -> Vector3<f64> {
+        let six = self.rows.reduce(to, false) - self.rows.reduce(from, false);
+        Vector3::new(six[0], six[1], six[2])
+    }
+
+    /// Rotation of the patch at the coordinates `q`, from the curl of the displacement. It is exact
+    /// for a turn by less than a quarter.
+    pub(crate) fn rotation(&self, q: &[f64]) -> Matrix3<f64> {
+        let six = self.rows.reduce(q, true);
+        // Half the curl of a rotation is its axis times the sine of its angle.
+        let sine = Vector3::new(six[3], six[4], six[5]);
+        let length = sine.norm();
+        if length.is_nan() || length < f64::MIN_POSITIVE {
+            return Matrix3::identity();
+        }
+        let angle = length.min(1.0).asin();
+        *nalgebra::Rotation3::from_scaled_axis(sine * (angle / length)).matrix()
+    }
+
     pub(crate) fn rows(&self) -> &MeanRows {
         &self.rows
     }
@@ -125,6 +133,11 @@ impl MeanRows {
             }
         }
         Self(rows)
+    }
+
+    /// The row of the mean displacement along an axis, one entry per mode.
+    pub(crate) fn displacement(&self, axis: usize) -> &[f64] {
+        &self.0[axis]
     }
 
     /// Returns the six sums `B x`. Without warp the rotation has no effect and stays zero.
@@ -233,6 +246,11 @@ impl Grams {
         self.blocks = blocks;
         self.patches.clear();
         self.patches.extend(hands.iter().map(|hand| hand.patch.clone()));
+    }
+
+    /// Replaces the displacements' part of the block of two hands. `j` must be at most `i`.
+    pub(crate) fn set(&mut self, i: usize, j: usize, block: &Matrix3<f64>) {
+        self.blocks[i * (i + 1) / 2 + j].fixed_view_mut::<3, 3>(0, 0).copy_from(block);
     }
 
     /// Drops all blocks because their weights have changed.

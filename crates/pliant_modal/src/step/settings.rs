@@ -4,6 +4,31 @@ use serde::{Deserialize, Serialize};
 
 use crate::{Integrator, ModalModel, Relaxation, StepError};
 
+/// How a body resists deformation.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, Default, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum Elasticity {
+    /// The forces are those of small strains, `omega^2 q`. Default.
+    ///
+    /// A step costs a few microseconds. The forces are wrong as soon as a pull can be seen.
+    #[default]
+    Linear,
+    /// The forces are those of the model's material for large strains and rotations, reduced to the
+    /// coordinates of the model (see [`ReducedElasticity`](crate::ReducedElasticity)).
+    ///
+    /// A model without a material is stepped as [`Elasticity::Linear`].
+    Reduced,
+}
+
+impl std::fmt::Display for Elasticity {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        f.write_str(match self {
+            Self::Linear => "linear",
+            Self::Reduced => "reduced",
+        })
+    }
+}
+
 /// Step settings of a body.
 ///
 /// The host, its guests and peers must agree on these settings, on the model and on the step
@@ -11,21 +36,28 @@ use crate::{Integrator, ModalModel, Relaxation, StepError};
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 #[serde(default, deny_unknown_fields)]
 pub struct StepSettings {
+    /// How the body resists deformation. Default: [`Elasticity::Linear`].
+    pub elasticity: Elasticity,
     /// Integrator of the modes. Default: [`Integrator::Exact`].
+    ///
+    /// It has no effect on reduced elasticity, which has one integrator.
     pub integrator: Integrator,
     /// Whether reactions are of second order in the step. Default: `true`.
     ///
     /// If true, the force over a step is taken as the force at the middle of the step, and the
-    /// reaction at the end is `1.5 F - 0.5 F_before`. If false, the reaction is the force over the
-    /// step, which is of first order. This only affects the exact integrator, as the others use the
-    /// force at the end in any case. It only affects anchored bodies, because the frame of a free
-    /// body moves by a first-order step.
+    /// reaction at the end is `1.5 F - 0.5 F_before`. On a body that the warp bends, a small part
+    /// of first order is left, which shows above 240 steps a second. If false, the reaction is the
+    /// force over the step, which is of first order. This only affects the exact integrator, as the
+    /// others use the force at the end in any case. It only affects anchored bodies, because the
+    /// frame of a free body moves by a first-order step.
     pub second_order: bool,
     /// Whether the shape bends by modal warping (Choi and Ko 2005). Without warp displacements stay
-    /// linear, and the body grows when it turns. Default: `true`.
+    /// linear, and the body grows when it turns. Reduced elasticity needs and has no warp. Default:
+    /// `true`.
     pub warp: bool,
     /// Number of Newton corrections of the hands in one step, 1 to
-    /// [`StepSettings::MOST_CORRECTIONS`]. They only have an effect with warp. Default: 2.
+    /// [`StepSettings::MOST_CORRECTIONS`]. With linear elasticity they only have an effect with
+    /// warp. With reduced elasticity they are the Newton rounds of the whole step. Default: 2.
     pub corrections: u8,
     /// Uniform acceleration, m/s^2, world axes. Each component is at most 1e9 in magnitude.
     /// Default: zero.
@@ -40,13 +72,14 @@ pub struct StepSettings {
     /// Default: 1.
     pub stiffness_scale: f64,
     /// Parameters of a viscoelastic material: every mode, and the flexibility under every hand, is
-    /// a standard linear solid. Default: `None`, elastic.
+    /// a standard linear solid. Only for linear elasticity. Default: `None`, elastic.
     pub relaxation: Option<Relaxation>,
 }
 
 impl Default for StepSettings {
     fn default() -> Self {
         Self {
+            elasticity: Elasticity::default(),
             integrator: Integrator::default(),
             second_order: true,
             warp: true,
@@ -79,6 +112,8 @@ impl StepSettings {
             StepError::check("rho_inf", "0 to 1", (0.0..=1.0).contains(&rho_inf), rho_inf)?;
         }
         if let Some(relaxation) = &self.relaxation {
+            let linear = self.elasticity == Elasticity::Linear;
+            StepError::check("relaxation", "none with reduced elasticity", linear, relaxation.ratio)?;
             relaxation.check()?;
         }
         let beyond = self.gravity.iter().find(|x| x.is_nan() || x.abs() > 1e9);
@@ -97,6 +132,10 @@ impl StepSettings {
         let numbers = [rho_inf, self.damping_scale, self.stiffness_scale, ratio, time];
         let mut out =
             vec![kind, second_order.into(), warp.into(), corrections, self.relaxation.is_some().into()];
+        out.push(match self.elasticity {
+            Elasticity::Linear => 0,
+            Elasticity::Reduced => 1,
+        });
         out.extend(numbers.iter().chain(&gravity).flat_map(|number| number.to_le_bytes()));
         out
     }
@@ -104,10 +143,24 @@ impl StepSettings {
     /// Returns the extrapolation factor `x` of the force at the end of a step:
     /// `F_end = (1 + x) F - x F_before`.
     ///
-    /// `F` is the force over the step and `F_before` that over the previous step.
-    pub fn extrapolation(&self, model: &ModalModel) -> f64 {
-        let second = self.second_order && self.integrator == Integrator::Exact && !model.is_free();
+    /// `F` is the force over the step and `F_before` that over the previous step. With reduced
+    /// elasticity the force of a step is that at its end. Hands with more rows than the model has
+    /// modes contradict each other, and would not come to rest with extrapolated forces. The answer
+    /// is the same for copies that keep fewer modes.
+    pub fn extrapolation(&self, model: &ModalModel, hands: usize) -> f64 {
+        let exact = self.integrator == Integrator::Exact && !self.is_reduced(model);
+        let second = self.second_order && exact && !model.is_free() && 3 * hands <= model.mode_count();
         if second { 0.5 } else { 0.0 }
+    }
+
+    /// Whether a body of this model has reduced elasticity.
+    pub fn is_reduced(&self, model: &ModalModel) -> bool {
+        self.elasticity == Elasticity::Reduced && model.material().is_some()
+    }
+
+    /// Whether the shape of a body of this model bends by modal warping.
+    pub fn warps(&self, model: &ModalModel) -> bool {
+        self.warp && !self.is_reduced(model)
     }
 
     /// Angular frequency (rad/s) and damping coefficient (1/s) of a mode as stepped.

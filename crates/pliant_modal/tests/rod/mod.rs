@@ -87,6 +87,7 @@ pub fn rod(young: f64, modes: usize, zeta: f64, free: bool) -> ModalModel {
             [0.0, 0.0, mass * (LENGTH * LENGTH + AREA) / 12.0],
         ],
         sites,
+        reduced: None,
     })
     .unwrap()
 }

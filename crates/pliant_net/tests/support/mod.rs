@@ -91,6 +91,7 @@ pub fn bar() -> Arc<ModalModel> {
         sites: [TIP, MIDDLE]
             .map(|vertex| FlexibilitySite { vertex, radius: 0.3, flexibility: GIVE })
             .to_vec(),
+        reduced: None,
     };
     Arc::new(ModalModel::from_parts(parts).unwrap())
 }

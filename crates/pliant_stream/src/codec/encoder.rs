@@ -478,7 +478,7 @@ impl Encoder {
         let before = std::mem::take(&mut self.truth_means);
         self.truth_means.extend(grabs.iter().map(|g| {
             let (key, end) = (g.state.key, -Vector3::from(g.state.reaction));
-            (key, self.replica.mean(end, replica::mean_of(&before, key)))
+            (key, self.replica.mean(end, replica::mean_of(&before, key), grabs.len()))
         }));
         if !self.loaded {
             let omega = self.replica.kernel().omega();

@@ -443,10 +443,11 @@ impl Receiver {
             self.replica.reactions(&self.visual, &mut self.grabs);
             // An acceleration contains the mean force over its step. The hand needs the force at
             // its end.
+            let hands = self.grabs.len();
             for g in &mut self.grabs {
                 let mean = -nalgebra::Vector3::from(g.reaction);
                 if let Some((_, before)) = self.implied[1].iter().find(|(key, _)| *key == g.key) {
-                    g.reaction = (-self.replica.end(mean, *before)).into();
+                    g.reaction = (-self.replica.end(mean, *before, hands)).into();
                 }
                 self.implied[0].push((g.key, mean));
             }

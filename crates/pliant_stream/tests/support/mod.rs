@@ -99,6 +99,7 @@ fn bar_that(modes: usize, zeta: f64, free: bool) -> Arc<ModalModel> {
         center_of_mass: [0.5, 0.0, 0.0],
         inertia: [[0.01, 0.0, 0.0], [0.0, 0.17, 0.0], [0.0, 0.0, 0.17]],
         sites: Vec::new(),
+        reduced: None,
     };
     Arc::new(ModalModel::from_parts(parts).unwrap())
 }

@@ -3,13 +3,17 @@
 //! All laws agree with Hooke's law for small strains, with the same Lame constants.
 
 use nalgebra::{Matrix3, SMatrix, SVector, Vector3};
+use serde::{Deserialize, Serialize};
+
+use super::lanes::Lane;
 
 /// Second derivative of the energy density by the deformation gradient, Pa. Row and column
 /// `3 c + r` belong to entry (r, c).
-pub(crate) type Tangent = SMatrix<f64, 9, 9>;
+type Tangent = SMatrix<f64, 9, 9>;
 
 /// Law of the elastic energy for large strains.
-#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Hash)]
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Hash, Serialize, Deserialize)]
+#[serde(rename_all = "kebab-case")]
 #[non_exhaustive]
 pub enum Material {
     /// The stable neo-Hookean law of Smith, De Goes and Kim, *Stable Neo-Hookean Flesh Simulation*,
@@ -31,21 +35,34 @@ pub enum Material {
     StVenantKirchhoff,
 }
 
+impl std::fmt::Display for Material {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        f.write_str(match self {
+            Self::NeoHookean => "neo-hookean",
+            Self::StVenantKirchhoff => "st-venant-kirchhoff",
+        })
+    }
+}
+
 impl Material {
     /// Returns the law with these Lame constants, Pa.
-    pub(crate) fn with(self, lambda: f64, mu: f64) -> Hyperelastic {
+    pub fn with(self, lambda: f64, mu: f64) -> Hyperelastic {
         match self {
             Self::NeoHookean => {
-                Hyperelastic::NeoHookean { lambda: lambda + 5.0 / 6.0 * mu, mu: 4.0 / 3.0 * mu }
+                Hyperelastic(Law::NeoHookean { lambda: lambda + 5.0 / 6.0 * mu, mu: 4.0 / 3.0 * mu })
             }
-            Self::StVenantKirchhoff => Hyperelastic::StVenantKirchhoff { lambda, mu },
+            Self::StVenantKirchhoff => Hyperelastic(Law::StVenantKirchhoff { lambda, mu }),
         }
     }
 }
 
-/// A law with its constants, Pa. The neo-Hookean constants are those of the paper.
+/// A law with its constants, Pa.
 #[derive(Clone, Copy, Debug, PartialEq)]
-pub(crate) enum Hyperelastic {
+pub struct Hyperelastic(Law);
+
+/// The neo-Hookean constants are those of the paper.
+#[derive(Clone, Copy, Debug, PartialEq)]
+enum Law {
     NeoHookean { lambda: f64, mu: f64 },
     StVenantKirchhoff { lambda: f64, mu: f64 },
 }
@@ -54,9 +71,9 @@ pub(crate) enum Hyperelastic {
 // their digits.
 impl Hyperelastic {
     /// Returns the energy density relative to rest, J/m^3.
-    pub(crate) fn energy(self, h: &Matrix3<f64>) -> f64 {
-        match self {
-            Self::NeoHookean { lambda, mu } => {
+    pub fn energy(self, h: &Matrix3<f64>) -> f64 {
+        match self.0 {
+            Law::NeoHookean { lambda, mu } => {
                 let second = 0.5 * (h.trace().powi(2) - (h * h).trace());
                 let t = 2.0 * h.trace() + h.norm_squared();
                 let j = h.trace() + second + h.determinant();
@@ -64,7 +81,7 @@ impl Hyperelastic {
                     + 0.5 * mu * less_log(0.25 * t)
                     + 0.5 * lambda * j * j
             }
-            Self::StVenantKirchhoff { lambda, mu } => {
+            Law::StVenantKirchhoff { lambda, mu } => {
                 let e = green_strain(h);
                 0.5 * lambda * e.trace().powi(2) + mu * e.norm_squared()
             }
@@ -72,28 +89,50 @@ impl Hyperelastic {
     }
 
     /// Returns the first Piola-Kirchhoff stress `P = dW/dF`, Pa.
-    pub(crate) fn stress(self, h: &Matrix3<f64>) -> Matrix3<f64> {
+    pub fn stress(self, h: &Matrix3<f64>) -> Matrix3<f64> {
         let f = Matrix3::identity() + h;
-        match self {
-            Self::NeoHookean { lambda, mu } => {
+        match self.0 {
+            Law::NeoHookean { lambda, mu } => {
                 let t = 2.0 * h.trace() + h.norm_squared();
                 // The cofactor of F is I + c.
                 let c = h.trace() * Matrix3::identity() - h.transpose() + cofactor(h);
                 let j = volume_change(h);
                 0.75 * mu * (h - c) + mu * t / (4.0 * (4.0 + t)) * f + lambda * j * (Matrix3::identity() + c)
             }
-            Self::StVenantKirchhoff { lambda, mu } => {
+            Law::StVenantKirchhoff { lambda, mu } => {
                 let e = green_strain(h);
                 f * (lambda * e.trace() * Matrix3::identity() + 2.0 * mu * e)
             }
         }
     }
 
+    /// Returns the part of the stress that is of second order in `h`, Pa.
+    pub fn second_order_stress(self, h: &Matrix3<f64>) -> Matrix3<f64> {
+        let (trace, square) = (h.trace(), h.norm_squared());
+        match self.0 {
+            Law::NeoHookean { lambda, mu } => {
+                let second = 0.5 * (trace * trace - (h * h).trace());
+                let all = (0.25 * square - 0.25 * trace * trace) * Matrix3::identity() + 0.5 * trace * h;
+                -0.75 * mu * cofactor(h)
+                    + 0.25 * mu * all
+                    + lambda
+                        * (second * Matrix3::identity()
+                            + trace * (trace * Matrix3::identity() - h.transpose()))
+            }
+            Law::StVenantKirchhoff { lambda, mu } => {
+                let turned = h.tr_mul(h);
+                h * (lambda * trace * Matrix3::identity() + mu * (h + h.transpose()))
+                    + 0.5 * lambda * square * Matrix3::identity()
+                    + mu * turned
+            }
+        }
+    }
+
     /// Returns the tangent `dP/dF`, Pa. It is symmetric and may be indefinite.
-    pub(crate) fn tangent(self, h: &Matrix3<f64>) -> Tangent {
+    pub fn tangent(self, h: &Matrix3<f64>) -> SMatrix<f64, 9, 9> {
         let f = Matrix3::identity() + h;
-        match self {
-            Self::NeoHookean { lambda, mu } => {
+        match self.0 {
+            Law::NeoHookean { lambda, mu } => {
                 let t = 2.0 * h.trace() + h.norm_squared();
                 let volume = SVector::<f64, 9>::from_column_slice(cofactor(&f).as_slice());
                 let all = SVector::<f64, 9>::from_column_slice(f.as_slice());
@@ -112,7 +151,7 @@ impl Hyperelastic {
                 }
                 out
             }
-            Self::StVenantKirchhoff { lambda, mu } => {
+            Law::StVenantKirchhoff { lambda, mu } => {
                 let e = green_strain(h);
                 let s = lambda * e.trace() * Matrix3::identity() + 2.0 * mu * e;
                 let mut out = Tangent::zeros();
@@ -128,17 +167,73 @@ impl Hyperelastic {
             }
         }
     }
+
+    /// Returns the tangent in the axes of principal stretch at the stretches `s`.
+    #[inline(always)]
+    pub(crate) fn principal_tangent(self, s: [Lane; 3]) -> PrincipalTangent {
+        let one = Lane::splat(1.0);
+        let [a, b, c] = s;
+        let [aa, bb, cc] = [a * a, b * b, c * c];
+        let [ab, ac, bc] = [a * b, a * c, b * c];
+        let sum = aa + bb + cc;
+        match self.0 {
+            Law::NeoHookean { lambda, mu } => {
+                let share = one / (sum + one);
+                let (all, along) = (mu * (one - share), (2.0 * mu) * (share * share));
+                let p = lambda * (ab * c - one) - Lane::splat(0.75 * mu);
+                let stretch = [
+                    all + along * aa + lambda * (bc * bc),
+                    all + along * bb + lambda * (ac * ac),
+                    all + along * cc + lambda * (ab * ab),
+                    p * c + along * ab + lambda * (bc * ac),
+                    p * b + along * ac + lambda * (bc * ab),
+                    p * a + along * bc + lambda * (ac * ab),
+                ];
+                let (turn, shear) = ([p * a, p * b, p * c], [-p * a, -p * b, -p * c]);
+                let plus = |x: [Lane; 3]| [all + x[0], all + x[1], all + x[2]];
+                PrincipalTangent { stretch, turn: plus(turn), shear: plus(shear) }
+            }
+            Law::StVenantKirchhoff { lambda, mu } => {
+                let rest = (0.5 * lambda) * (sum - Lane::splat(3.0)) - Lane::splat(mu);
+                let own = lambda + 3.0 * mu;
+                let stretch = [
+                    rest + own * aa,
+                    rest + own * bb,
+                    rest + own * cc,
+                    lambda * ab,
+                    lambda * ac,
+                    lambda * bc,
+                ];
+                let [x, y, z] = [bb + cc, aa + cc, aa + bb];
+                PrincipalTangent {
+                    stretch,
+                    turn: [rest + mu * (x - bc), rest + mu * (y - ac), rest + mu * (z - ab)],
+                    shear: [rest + mu * (x + bc), rest + mu * (y + ac), rest + mu * (z + ab)],
+                }
+            }
+        }
+    }
 }
 
-/// Raises the negative eigenvalues of a tangent to zero. What it is used for then stays positive
-/// semidefinite (Teran, Sifakis, Irving and Fedkiw 2005).
-pub(crate) fn positive(tangent: &Tangent) -> Tangent {
-    let eigen = tangent.symmetric_eigen();
-    if eigen.eigenvalues.iter().all(|&x| x >= 0.0) {
-        return *tangent;
-    }
-    let raised = SMatrix::<f64, 9, 9>::from_diagonal(&eigen.eigenvalues.map(|x| x.max(0.0)));
-    eigen.eigenvectors * raised * eigen.eigenvectors.transpose()
+/// Tangent of an isotropic law in the axes of principal stretch `F = U diag(s) V^T` (B. Smith,
+/// F. De Goes and T. Kim, *Analytic Eigensystems for Isotropic Distortion Energies*, ACM Trans.
+/// Graph. 38(1), 2019).
+///
+/// With `U^T dF V = d`, the second derivative of the energy density is
+///
+/// ```text
+/// sum stretch_ij d_ii d_jj + sum_k (turn_k (d_ij - d_ji)^2 + shear_k (d_ij + d_ji)^2) / 2
+/// ```
+///
+/// where `i < j` are the other two axes of `k`.
+#[derive(Clone, Copy, Debug)]
+pub(crate) struct PrincipalTangent {
+    /// Response to changes of the stretches, Pa: the entries 00, 11, 22, 01, 02, 12.
+    pub(crate) stretch: [Lane; 6],
+    /// Response to turns of the pairs of axes, Pa.
+    pub(crate) turn: [Lane; 3],
+    /// Response to shears of the pairs of axes, Pa.
+    pub(crate) shear: [Lane; 3],
 }
 
 fn green_strain(h: &Matrix3<f64>) -> Matrix3<f64> {
@@ -167,7 +262,7 @@ fn less_log(x: f64) -> f64 {
 
 #[cfg(test)]
 mod tests {
-    use super::*;
+    use super::{super::positive_tangent, *};
 
     const LAWS: [Material; 2] = [Material::NeoHookean, Material::StVenantKirchhoff];
     const LAME: (f64, f64) = (2.5e4, 1.25e4);
@@ -215,6 +310,19 @@ mod tests {
     }
 
     #[test]
+    fn the_second_order_is_what_remains_when_the_odd_orders_cancel() {
+        for material in LAWS {
+            let law = law(material);
+            for h in gradients() {
+                let h = h * (1e-4 / h.norm());
+                let even = 0.5 * (law.stress(&h) + law.stress(&-h));
+                let got = law.second_order_stress(&h);
+                assert!((got - even).norm() < 1e-5 * even.norm(), "{material:?} {got} {even}");
+            }
+        }
+    }
+
+    #[test]
     fn small_strains_are_hookes_and_turns_cost_nothing() {
         let (lambda, mu) = LAME;
         for material in LAWS {
@@ -234,12 +342,19 @@ mod tests {
     #[test]
     fn a_raised_tangent_is_positive_and_a_positive_one_stays() {
         for material in LAWS {
-            let rest = law(material).tangent(&Matrix3::zeros());
-            assert!((positive(&rest) - rest).norm() < 1e-9 * rest.norm());
-            for h in gradients() {
-                let raised = positive(&law(material).tangent(&h));
-                let least = raised.symmetric_eigenvalues().min();
-                assert!(least > -1e-9 * raised.norm(), "{material:?} {h}: {least}");
+            let law = law(material);
+            let rest = law.tangent(&Matrix3::zeros());
+            assert!((positive_tangent(law, &Matrix3::zeros()) - rest).norm() < 1e-9 * rest.norm());
+            let turned = nalgebra::Rotation3::from_euler_angles(0.7, -1.1, 2.0);
+            let flat = Matrix3::from_diagonal(&[0.3, -1.0, -1.0].into());
+            let turn = |h: Matrix3<f64>| turned * (h + Matrix3::identity()) - Matrix3::identity();
+            for h in gradients().into_iter().chain(gradients().into_iter().map(turn)).chain([flat]) {
+                // The nearest positive semidefinite matrix, from the eigenvalues of the tangent.
+                let eigen = law.tangent(&h).symmetric_eigen();
+                let up = Tangent::from_diagonal(&eigen.eigenvalues.map(|x| x.max(0.0)));
+                let want = eigen.eigenvectors * up * eigen.eigenvectors.transpose();
+                let off = (positive_tangent(law, &h) - want).norm() / want.norm();
+                assert!(off < 1e-9, "{material:?} {h}: {off}");
             }
         }
     }

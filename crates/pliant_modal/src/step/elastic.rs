@@ -1,0 +1,323 @@
+//! The nonlinear part of a step: Newton's method in all coordinates at once.
+//!
+//! The linear part of the elasticity is stepped as a recurrence per coordinate, which has no period
+//! error (see [`Coefficients::reduced`](crate::Coefficients::reduced)). The force `F` of everything
+//! else is constant over the step:
+//!
+//! ```text
+//! q1 = q* + r F,   F = sum rows^T pull - (1 - t) g(q0) - t g(q1),   g(q) = dU/dq - omega^2 q
+//! ```
+//!
+//! `q*` is the step without that force, and `r` the response of each coordinate. With `t` = 1/2 the
+//! step is of second order and nearly keeps the energy. Where the body has become so stiff that it
+//! turns by more than a radian within a step, `t` goes to 1 and the coordinates are stepped by
+//! backward Euler, which is calm at any stiffness. What energy a step would still add, beyond the
+//! work of hands and loads, is taken from the velocities.
+
+use nalgebra::{Matrix3, Vector3};
+
+use super::{HeldPatch, State, modes::Modes, patch::Six};
+use crate::{
+    ModalModel,
+    nonlinear::{Cholesky, ElasticEnergy},
+    simd::dot,
+};
+
+/// Workspace of the nonlinear part of a step.
+#[derive(Debug, Clone)]
+pub(crate) struct ElasticStep {
+    energy: ElasticEnergy,
+    h: f64,
+    omega2: Vec<f64>,
+    damping: Vec<f64>,
+    /// Change of `q`, `v`, `a` of each coordinate per unit force within this step.
+    response: Vec<[f64; 3]>,
+    /// The share `t` of the force at the end of this step.
+    share: f64,
+    /// The remainder `g` at the beginning of the step, kg^1/2 m/s^2.
+    start: Vec<f64>,
+    cholesky: Cholesky,
+    /// Coordinates at which the energy is linearized, kg^1/2 m.
+    q: Vec<f64>,
+    /// Coordinates after the step without the force of this module.
+    unforced: Vec<f64>,
+    /// Coordinates after this round without hands.
+    free: Vec<f64>,
+    /// The three rows of each hand under the inverse of the factor.
+    rows: Vec<f64>,
+    /// Scratch: the way of a round.
+    way: Vec<f64>,
+    /// Elastic energy of a way beyond which a round is far, J.
+    far: f64,
+    /// Elastic energy of the way of the round before, J.
+    last: f64,
+}
+
+/// Elastic energy of a way that counts as far, as a share of Young's modulus times the volume: a
+/// mean change of the strain by a twentieth. Tangents change little over nearer ways.
+const FAR: f64 = 1.25e-3;
+
+/// Share of the energy of the way before above which rounds converge too slowly.
+const SLOW: f64 = 0.1;
+
+/// Share of a far way's energy below which a way needs no further round.
+const NOTHING: f64 = 1e-9;
+
+/// Number of halvings of a far way that does not lower the potential.
+const HALVINGS: usize = 8;
+
+impl ElasticStep {
+    /// Makes the workspace. Returns `None` for a model without reduced elasticity.
+    pub(crate) fn new(model: &ModalModel, modes: &Modes, scale: f64, h: f64) -> Option<Self> {
+        let count = modes.count();
+        let energy = ElasticEnergy::of_model(model, count, scale)?;
+        let omega2: Vec<f64> = modes.omega.iter().map(|omega| omega * omega).collect();
+        let zero = vec![0.0; count];
+        let cholesky = Cholesky::new(count);
+        let (q, unforced, free, way) = (zero.clone(), zero.clone(), zero.clone(), zero);
+        let far = FAR * scale * model.info().young * energy.volume();
+        let (start, damping, rows) = (way.clone(), modes.damping.clone(), Vec::new());
+        let response = vec![[0.0; 3]; count];
+        let share = 0.5;
+        Some(Self {
+            energy,
+            h,
+            omega2,
+            damping,
+            response,
+            share,
+            start,
+            cholesky,
+            q,
+            unforced,
+            free,
+            rows,
+            way,
+            far,
+            last: 0.0,
+        })
+    }
+
+    /// Elastic energy, J.
+    pub(crate) fn energy(&self, q: &[f64]) -> f64 {
+        self.energy.energy(q)
+    }
+
+    /// Writes the elastic force `dU/dq`, kg^1/2 m/s^2.
+    pub(crate) fn force_at(&self, q: &[f64], out: &mut [f64]) {
+        self.energy.force_at(q, out);
+    }
+
+    /// Number of cubature points whose tangent had negative eigenvalues in the last round.
+    pub(crate) fn raised(&self) -> usize {
+        self.energy.raised()
+    }
+
+    /// Reserves memory for this number of hands.
+    pub(crate) fn reserve(&mut self, hands: usize) {
+        let n = 3 * hands * self.q.len();
+        self.rows.reserve(n.saturating_sub(self.rows.len()));
+    }
+
+    /// Begins a step from `before`, with the step under the loads alone in `after`, and linearizes
+    /// at its beginning. `load` is the modal force of the loads.
+    pub(crate) fn begin(&mut self, before: &State, modes: &Modes, load: &[f64], after: &mut State) {
+        self.q.copy_from_slice(&before.q);
+        self.energy.linearize(&self.q);
+        let (h, mut stiffest) = (self.h, 0.0f64);
+        for (i, omega2) in self.omega2.iter().enumerate() {
+            let stiffness = self.energy.stiffness(i);
+            stiffest = stiffest.max(h * h * (stiffness - omega2));
+            self.start[i] = self.energy.force()[i] - omega2 * self.q[i];
+            self.response[i] = [modes.response[0][i], modes.response[1][i], modes.response[2][i]];
+            if h * h * stiffness > 1.0 {
+                // Backward Euler, as `Coefficients::reduced` has it for the stiffness at rest.
+                let r = 1.0 / (1.0 / (h * h) + self.damping[i] / h + omega2);
+                self.response[i] = [r, r / h, r / (h * h)];
+                let (q, v) = (before.q[i], before.v[i]);
+                after.q[i] = r * (q / (h * h) + (self.damping[i] * q + v) / h + load[i]);
+                after.v[i] = (after.q[i] - q) / h;
+                after.a[i] = (after.v[i] - v) / h;
+            }
+        }
+        self.share = 0.5 + 0.5 * stiffest.clamp(0.0, 1.0);
+        self.unforced.copy_from_slice(&after.q);
+        self.last = f64::INFINITY;
+    }
+
+    /// Solves the next round without hands. `First`: with the tangent of [`ElasticStep::begin`].
+    pub(crate) fn linearize(&mut self, tangent: Tangent) {
+        match tangent {
+            Tangent::First => {}
+            Tangent::New => self.energy.linearize(&self.q),
+            Tangent::Kept => self.energy.compute_force(&self.q),
+        }
+        if tangent != Tangent::Kept {
+            self.factor();
+            self.rows.clear();
+        }
+        let t = self.share;
+        for (i, out) in self.free.iter_mut().enumerate() {
+            let remainder = self.energy.force()[i] - self.omega2[i] * self.q[i];
+            *out = (self.q[i] - self.unforced[i]) / self.response[i][0]
+                + t * remainder
+                + (1.0 - t) * self.start[i];
+        }
+        self.cholesky.solve(&mut self.free);
+        for (out, q) in self.free.iter_mut().zip(&self.q) {
+            *out = q - *out;
+        }
+    }
+
+    fn factor(&mut self) {
+        let (n, t) = (self.q.len(), self.share);
+        let matrix = self.cholesky.matrix();
+        for (i, (omega2, response)) in self.omega2.iter().zip(&self.response).enumerate() {
+            let row = &mut matrix[i * n + i..(i + 1) * n];
+            self.energy.tangent_row(i, row);
+            row.iter_mut().for_each(|x| *x *= t);
+            row[0] += 1.0 / response[0] - t * omega2;
+        }
+        self.cholesky.factor();
+    }
+
+    /// The six numbers of a patch after this round without hands, and those of the linearization.
+    pub(crate) fn without_hands(&self, patch: &HeldPatch) -> Six {
+        patch.rows().reduce(&self.free, false)
+    }
+
+    /// Coordinates at which the energy is linearized, kg^1/2 m.
+    pub(crate) fn coordinates(&self) -> &[f64] {
+        &self.q
+    }
+
+    /// Adds a hand to a new tangent. Hands are added in order.
+    pub(crate) fn add_hand(&mut self, patch: &HeldPatch) {
+        let n = self.q.len();
+        for axis in 0..3 {
+            let start = self.rows.len();
+            self.rows.extend_from_slice(patch.rows().displacement(axis));
+            self.cholesky.forward(&mut self.rows[start..start + n]);
+        }
+    }
+
+    /// Displacement of hand `i` per unit force of hand `j`, m/N.
+    pub(crate) fn response(&self, i: usize, j: usize) -> Matrix3<f64> {
+        let n = self.q.len();
+        let row = |hand: usize, axis: usize| &self.rows[(3 * hand + axis) * n..][..n];
+        Matrix3::from_fn(|a, b| dot(row(i, a), row(j, b)))
+    }
+
+    /// Ends the round with the hands' forces (N) on their patches, in order. Returns whether the
+    /// step has to go on with a new tangent: the round went far, or hardly less far than the one
+    /// before.
+    ///
+    /// A far way is halved until it lowers the potential whose minimum the step seeks, with the
+    /// forces of this round.
+    pub(crate) fn finish_round<'a>(
+        &mut self,
+        pulls: impl Iterator<Item = (&'a HeldPatch, Vector3<f64>)> + Clone,
+    ) -> bool {
+        let n = self.q.len();
+        self.way.fill(0.0);
+        for ((_, pull), rows) in pulls.clone().zip(self.rows.chunks_exact(3 * n)) {
+            for (force, row) in pull.iter().zip(rows.chunks_exact(n)) {
+                self.way.iter_mut().zip(row).for_each(|(out, row)| *out += force * row);
+            }
+        }
+        self.cholesky.backward(&mut self.way);
+        for ((way, free), q) in self.way.iter_mut().zip(&self.free).zip(&self.q) {
+            *way += free - q;
+        }
+        let size: f64 = self.way.iter().zip(&self.omega2).map(|(way, k)| 0.5 * k * way * way).sum();
+        let far = size.is_nan() || size > self.far;
+        let share = if far { self.share(pulls) } else { 1.0 };
+        self.q.iter_mut().zip(&self.way).for_each(|(q, way)| *q += share * way);
+        let slow = size > SLOW * self.last && size > NOTHING * self.far;
+        self.last = size;
+        far || slow
+    }
+
+    /// The share of the way that lowers the potential.
+    fn share<'a>(&mut self, pulls: impl Iterator<Item = (&'a HeldPatch, Vector3<f64>)>) -> f64 {
+        let work: f64 = pulls
+            .map(|(patch, pull)| {
+                let moved = patch.rows().reduce(&self.way, false);
+                pull.dot(&Vector3::new(moved[0], moved[1], moved[2]))
+            })
+            .sum();
+        let t = self.share;
+        let (mut slope, mut bend) = (-work, 0.0);
+        for (i, way) in self.way.iter().enumerate() {
+            let inverse = 1.0 / self.response[i][0];
+            let straight = inverse * (self.q[i] - self.unforced[i]) - t * self.omega2[i] * self.q[i];
+            slope += (straight + (1.0 - t) * self.start[i]) * way;
+            bend += 0.5 * (inverse - t * self.omega2[i]) * way * way;
+        }
+        let before = self.energy.energy(&self.q);
+        let mut share = 1.0;
+        for _ in 0..HALVINGS {
+            for ((out, q), way) in self.free.iter_mut().zip(&self.q).zip(&self.way) {
+                *out = q + share * way;
+            }
+            let change = t * (self.energy.energy(&self.free) - before);
+            if change + share * (slope + share * bend) <= 0.0 {
+                break;
+            }
+            share *= 0.5;
+        }
+        share
+    }
+
+    /// Writes the force that would have moved the end of the last step by `way`, on its tangent.
+    pub(crate) fn force_of_way(&mut self, way: impl Fn(usize) -> f64, out: &mut [f64]) {
+        self.way.iter_mut().enumerate().for_each(|(k, x)| *x = way(k));
+        self.cholesky.multiply(&self.way, out);
+    }
+
+    /// Ends the step: adds the effect of the force to the state without it, and the force itself to
+    /// `force`, which holds the loads.
+    ///
+    /// The step may add no energy besides `supplied` (J), the work of the hands, and that of the
+    /// loads. Where the elasticity softens within a long way, it would: the velocities then give it
+    /// back.
+    pub(crate) fn finish(&mut self, before: &State, supplied: f64, force: &mut [f64], state: &mut State) {
+        let (mut way, mut work, mut kinetic) = (0.0, supplied, [0.0; 2]);
+        for (i, force) in force.iter_mut().enumerate() {
+            let own = (self.q[i] - self.unforced[i]) / self.response[i][0];
+            let moved = self.q[i] - before.q[i];
+            work += *force * moved;
+            way += 0.5 * self.omega2[i] * moved * moved;
+            *force += own;
+            state.q[i] = self.q[i];
+            state.v[i] += self.response[i][1] * own;
+            state.a[i] += self.response[i][2] * own;
+            kinetic[0] += 0.5 * before.v[i] * before.v[i];
+            kinetic[1] += 0.5 * state.v[i] * state.v[i];
+        }
+        if way <= GUARDED * self.far {
+            return;
+        }
+        let gained =
+            self.energy.energy(&state.q) - self.energy.energy(&before.q) + kinetic[1] - kinetic[0] - work;
+        if gained > 0.0 && kinetic[1] > 0.0 {
+            let left = (1.0 - gained / kinetic[1]).max(0.0).sqrt();
+            state.v.iter_mut().for_each(|v| *v *= left);
+        }
+    }
+}
+
+/// Share of a far way's energy from which on a step's energy is checked: a mean change of the
+/// strain by two thousandths.
+const GUARDED: f64 = 1e-3;
+
+/// Tangent of a round.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(crate) enum Tangent {
+    /// That of the beginning of the step, computed by [`ElasticStep::begin`].
+    First,
+    /// Computed at the present coordinates.
+    New,
+    /// That of the round before.
+    Kept,
+}
