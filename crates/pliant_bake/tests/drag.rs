@@ -98,8 +98,8 @@ fn nor_does_it_at_any_stiffness_and_step() {
 
 /// Returns the spectral radius of one step of the bar that is held at rest, without warp.
 ///
-/// A step is then linear in the coordinates, the velocities and the hand's last force. Its matrix
-/// is made by a step from each unit vector.
+/// A step is then linear in the coordinates, the velocities and the hand's last mean force. Its
+/// matrix is made by a step from each unit vector.
 fn spectral_radius(model: &Arc<ModalModel>, step: f64) -> f64 {
     let settings = StepSettings { warp: false, ..Default::default() };
     let modes = model.mode_count();
@@ -125,7 +125,8 @@ fn spectral_radius(model: &Arc<ModalModel>, step: f64) -> f64 {
         match unit {
             _ if unit < modes => state.q[unit] = small,
             _ if unit < 2 * modes => state.v[unit - modes] = small * omega[unit - modes],
-            _ => hand.pull[unit - 2 * modes] = force,
+            // A hand carries its mean force into the next step.
+            _ => hand.mean[unit - 2 * modes] = force,
         }
         let mut hands = [hand];
         kernel.prepare(&hands);
@@ -134,8 +135,10 @@ fn spectral_radius(model: &Arc<ModalModel>, step: f64) -> f64 {
             matrix[(k, unit)] = state.q[k] / small;
             matrix[(modes + k, unit)] = state.v[k] / (small * omega[k]);
         }
-        (0..3).for_each(|axis| matrix[(2 * modes + axis, unit)] = hands[0].pull[axis] / force);
+        (0..3).for_each(|axis| matrix[(2 * modes + axis, unit)] = hands[0].mean[axis] / force);
     }
+    let memory = matrix.columns(2 * modes, 3);
+    assert!(memory.column_iter().all(|column| column.norm() > 0.0), "the last force has an effect");
     matrix.complex_eigenvalues().iter().map(|x| x.norm()).fold(0.0, f64::max)
 }
 

@@ -100,11 +100,11 @@ fn modes_left_out_are_given_to_the_hand_by_their_flexibility() {
 }
 
 #[test]
-fn under_a_hand_all_steps_are_of_second_order() {
+fn under_a_hand_shorter_steps_are_better() {
     let part = Part::of("steps");
-    // From 60 to 960 steps a second, second order means 256 times smaller errors. The exact step
-    // has a small first-order part left. It comes from the rows of a hand on a bent body, which are
-    // those of the step's end.
+    // From 60 to 960 steps a second, second order means 256 times smaller errors. On a bent body no
+    // step reaches it: the exact one has a small first-order part, which comes from the rows of the
+    // hand, those of the step's end.
     let gain = |name: &str| {
         let line = part.line("c-steps-held", name);
         line[0].1 / last(&line)

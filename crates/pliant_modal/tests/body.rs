@@ -544,3 +544,26 @@ fn a_half_precision_surface_is_off_by_its_rounding_and_the_step_by_nothing() {
     // zero.
     assert!(off > 0.0 && off < 12.0 * 0.02 / 2048.0, "{off} m");
 }
+
+/// A guest may keep fewer modes than its host has, and fewer than its hands have rows. Both must
+/// take the forces of a step for the same thing.
+#[test]
+fn a_copy_with_fewer_modes_extrapolates_forces_as_the_whole_body_does() {
+    let model = Arc::new(rod(2e5, 20, 0.05, false));
+    for modes in [None, Some(4)] {
+        let mut body = Body::new(model.clone(), BodyConfig { modes, ..BodyConfig::default() }).unwrap();
+        let grabs = [tip(), tip() / 2].map(|vertex| {
+            let patch = Patch::around(model.surface(), vertex, 0.06).unwrap();
+            body.grab(&patch, GrabConfig::default()).unwrap()
+        });
+        let start = body.target(grabs[0]).unwrap();
+        for i in 0..20 {
+            let before = body.mean_reaction(grabs[0]).unwrap()[0];
+            let x = start[0] + 1e-4 * f64::from(i * i);
+            body.set_target(grabs[0], [x, start[1], start[2]]).unwrap();
+            body.step().unwrap();
+            let (mean, end) = (body.mean_reaction(grabs[0]).unwrap()[0], body.reaction(grabs[0]).unwrap()[0]);
+            assert!((end - (1.5 * mean - 0.5 * before)).abs() < 1e-9 * end.abs().max(1.0), "{modes:?}");
+        }
+    }
+}

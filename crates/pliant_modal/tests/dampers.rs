@@ -32,11 +32,17 @@ fn under_gravity_energy_stays() {
 }
 
 /// Makes a body with two hands 2 cm apart and the given relaxation times of their dampers (s).
-fn held(step: f64, integrator: Integrator, warp: bool, relaxations: [f64; 2]) -> (Body, [GrabId; 2]) {
+fn held(
+    step: f64,
+    integrator: Integrator,
+    second_order: bool,
+    warp: bool,
+    relaxations: [f64; 2],
+) -> (Body, [GrabId; 2]) {
     let model = pip();
     let config = BodyConfig {
         step,
-        settings: StepSettings { integrator, warp, ..Default::default() },
+        settings: StepSettings { integrator, second_order, warp, ..Default::default() },
         ..Default::default()
     };
     let mut body = Body::new(model.clone(), config).unwrap();
@@ -54,7 +60,7 @@ fn a_damper_has_no_static_force() {
     let times = [0.0, 1.0 / 60.0, 0.1, 2.0];
     for first in times {
         for second in times {
-            let (mut body, grabs) = held(1.0 / 64.0, Integrator::Exact, false, [first, second]);
+            let (mut body, grabs) = held(1.0 / 64.0, Integrator::Exact, true, false, [first, second]);
             let targets = grabs.map(|grab| body.target(grab).unwrap());
             for (grab, [x, y, z]) in grabs.into_iter().zip(targets) {
                 body.set_target(grab, [x + 0.02, y, z]).unwrap();
@@ -85,12 +91,12 @@ fn energy(body: &Body, grabs: &[GrabId]) -> f64 {
 fn dampers_take_energy() {
     let times = [0.0, 0.01, 0.1, 0.5, 2.0, 10.0];
     let alpha = Integrator::GeneralizedAlpha { rho_inf: 0.5 };
-    for integrator in [Integrator::Exact, alpha] {
+    for (integrator, second_order) in [(Integrator::Exact, true), (Integrator::Exact, false), (alpha, true)] {
         for step in [1.0 / 40.0, 1.0 / 240.0] {
             for warp in [false, true] {
                 for first in times {
                     for second in times {
-                        let (mut body, grabs) = held(step, integrator, warp, [first, second]);
+                        let (mut body, grabs) = held(step, integrator, second_order, warp, [first, second]);
                         let starts = grabs.map(|grab| body.target(grab).unwrap());
                         let mut least = f64::INFINITY;
                         let mut most = 0.0f64;
@@ -107,7 +113,7 @@ fn dampers_take_energy() {
                             if t > 1.0 {
                                 assert!(
                                     now <= least + 1e-4 * most,
-                                    "{integrator:?}, {step} s, warp {warp}, dampers {first} s and {second} s: \
+                                    "{integrator:?}, second order {second_order}, {step} s, warp {warp}, dampers {first} s and {second} s: \
                                      {now} J after {least} J, at {t} s"
                                 );
                                 least = least.min(now);

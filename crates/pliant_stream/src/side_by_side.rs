@@ -238,7 +238,7 @@ fn places_and_reactions_tell_the_same_as_targets() {
         (StepSettings { warp: false, second_order: false, ..plain }, SAME),
         (StepSettings { warp: false, integrator: alpha, ..plain }, SAME),
         (StepSettings { warp: false, relaxation, ..plain }, SAME),
-        (plain, 1e-4),
+        (plain, 2e-5),
     ] {
         let off = told(&pip, settings, &cases);
         println!("{settings:?}: {off:.1e}");

@@ -160,3 +160,24 @@ impl ViscoelasticPatch {
         self.carry * hand.flow + self.gain * (self.softness * (hand.patch.residual() * pull))
     }
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_hand_from_a_network_is_no_stiffer_and_no_slower_than_a_device() {
+        let hand = |stiffness, relaxation| GrabConfig { stiffness, relaxation }.capped();
+        assert_eq!(
+            hand(Some(1e9), 50.0),
+            hand(Some(GrabConfig::MOST_STIFFNESS), GrabConfig::MOST_RELAXATION)
+        );
+        assert_eq!(hand(Some(1e9), 50.0).stiffness, Some(GrabConfig::MOST_STIFFNESS));
+        assert_eq!(hand(Some(1e9), 50.0).relaxation, GrabConfig::MOST_RELAXATION);
+        // What real devices have stays, but for the rounding to single precision.
+        let real = hand(Some(2_000.0), 0.015);
+        assert!(real.stiffness == Some(2_000.0) && (real.relaxation - 0.015).abs() < 1e-8, "{real:?}");
+        assert!(hand(Some(1e-300), 0.0).stiffness.is_some_and(|k| k > 0.0));
+        assert_eq!(hand(None, 0.0), GrabConfig::default());
+    }
+}
