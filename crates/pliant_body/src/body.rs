@@ -246,7 +246,7 @@ impl BodyState {
 
     /// Whether modal warping bends the shape.
     pub fn warps(&self) -> bool {
-        self.body.config().settings.warp
+        self.body.config().settings.warps(self.body.model())
     }
 
     /// Returns the precision of the basis from which the CPU computes the surface.

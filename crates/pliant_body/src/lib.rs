@@ -81,7 +81,7 @@ pub use grab::{Grab, GrabForce, GrabOf, Grabs};
 pub use impulse::{Impulse, Push};
 pub use pause::SingleSteps;
 pub use pick::{SurfaceHit, pick_surface};
-pub use pliant_modal::{Integrator, Relaxation, StepSettings};
+pub use pliant_modal::{Elasticity, Integrator, Material, Relaxation, StepSettings};
 #[cfg(feature = "picking")]
 pub use pointer::{PointerGrab, PointerGrabPlugin, PointerGrabSystems, PointerHeld};
 pub use step::PliantTick;

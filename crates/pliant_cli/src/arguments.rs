@@ -1,5 +1,7 @@
 //! Arguments that commands share.
 
+use pliant_modal::Elasticity;
+
 /// Parses three numbers separated by commas.
 pub(crate) fn three<T: std::str::FromStr>(text: &str) -> Result<[T; 3], String> {
     let parts: Vec<T> = text
@@ -9,4 +11,13 @@ pub(crate) fn three<T: std::str::FromStr>(text: &str) -> Result<[T; 3], String> 
     parts.try_into().map_err(|parts: Vec<T>| {
         format!("expected three numbers with commas between them, got {}", parts.len())
     })
+}
+
+/// Parses the name of an elasticity.
+pub(crate) fn elasticity(text: &str) -> Result<Elasticity, String> {
+    match text {
+        "linear" => Ok(Elasticity::Linear),
+        "reduced" => Ok(Elasticity::Reduced),
+        _ => Err("expected linear or reduced".to_owned()),
+    }
 }

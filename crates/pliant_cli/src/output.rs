@@ -3,7 +3,7 @@
 use std::io::Write;
 use std::path::Path;
 
-use pliant_modal::ModalModel;
+use pliant_modal::{Material, ModalModel};
 use serde::Serialize;
 
 use crate::CliError;
@@ -21,6 +21,9 @@ pub(crate) struct Summary {
     surface_vertices: usize,
     bytes: usize,
     hash: String,
+    /// Material of the reduced elasticity. Null for linear elasticity only.
+    material: Option<Material>,
+    cubature_points: usize,
     residual_max: f64,
 }
 
@@ -38,6 +41,8 @@ impl Summary {
             surface_vertices: model.surface().positions().len(),
             bytes: model.file_bytes(),
             hash: model.hash().to_string(),
+            material: model.material(),
+            cubature_points: model.parts().reduced.as_ref().map_or(0, |reduced| reduced.points()),
             residual_max: info.residual_max,
         }
     }
@@ -77,6 +82,12 @@ pub(crate) fn table(model: &ModalModel) -> String {
     }
     rows.push(("simulation mesh", format!("{} {}, {} nodes", summary.tets, summary.element, summary.nodes)));
     rows.push(("material", format!("E {} Pa, nu {}, {} kg/m^3", info.young, info.poisson, info.density)));
+    if let Some(reduced) = &model.parts().reduced {
+        let points = reduced.points();
+        rows.push(("elasticity", format!("{}, {points} points, or linear", reduced.material)));
+    } else {
+        rows.push(("elasticity", "linear".to_owned()));
+    }
     rows.push(("damping", damping(info.damping)));
     rows.push((
         "anchors",

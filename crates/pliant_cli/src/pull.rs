@@ -5,9 +5,9 @@ use std::{path::PathBuf, sync::Arc};
 use clap::Args;
 use pliant_lab::pull::{Pull, Pulled, pull};
 use pliant_mesh::{Surface, io};
-use pliant_modal::ModalModel;
+use pliant_modal::{Elasticity, ModalModel};
 
-use crate::arguments::three;
+use crate::arguments::{elasticity, three};
 use crate::{CliError, output};
 
 #[derive(Args, Debug)]
@@ -24,6 +24,9 @@ pub(crate) struct PullArgs {
     /// Way of the hand, m
     #[arg(long, value_name = "DX,DY,DZ", value_parser = three::<f64>, allow_hyphen_values = true)]
     by: [f64; 3],
+    /// Elasticity of the body: linear or reduced [default: reduced if the model has a material]
+    #[arg(long, value_parser = elasticity)]
+    elasticity: Option<Elasticity>,
     /// Writes the surface of the pulled body (.ply)
     #[arg(long, value_name = "OUT.ply")]
     surface: Option<PathBuf>,
@@ -37,7 +40,7 @@ pub(crate) fn run(args: &PullArgs) -> Result<(), CliError> {
         output::check_folder(path)?;
     }
     let model = Arc::new(ModalModel::read(&args.model)?);
-    let asked = Pull { at: args.at, radius: args.radius, by: args.by };
+    let asked = Pull { at: args.at, radius: args.radius, by: args.by, elasticity: args.elasticity };
     let pulled = pull(&model, &asked)?;
     if let Some(path) = &args.surface {
         let positions = pulled.surface.iter().map(|p| p.map(f64::from)).collect();
@@ -68,7 +71,10 @@ fn text(pulled: &Pulled) -> String {
         list(&pulled.moved),
         list(&pulled.reaction),
         pulled.energy,
-        pulled.elasticity,
+        pulled.material.map_or_else(
+            || pulled.elasticity.to_string(),
+            |material| format!("{}, {material}", pulled.elasticity)
+        ),
         t.p50,
         t.p99,
         t.p999

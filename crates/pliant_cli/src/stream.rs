@@ -10,7 +10,7 @@ use std::{
 
 use clap::{Args, ValueEnum};
 use pliant_lab::experiment::{Experiment, Metrics};
-use pliant_modal::{Integrator, ModalModel, Relaxation};
+use pliant_modal::{Elasticity, Integrator, ModalModel, Relaxation};
 use pliant_stream::{
     Policy, RecoveryConfig,
     emulator::{LinkConfig, Loss, Preset},
@@ -18,6 +18,7 @@ use pliant_stream::{
 };
 use serde::Serialize;
 
+use crate::arguments::elasticity;
 use crate::{CliError, output};
 
 #[derive(Args, Debug)]
@@ -54,6 +55,9 @@ pub(crate) struct StreamArgs {
     /// Seed of all random numbers
     #[arg(long, default_value_t = 1)]
     seed: u64,
+    /// Elasticity of the body: linear or reduced
+    #[arg(long, default_value = "linear", value_parser = elasticity)]
+    elasticity: Elasticity,
     /// A material that relaxes, such as 0.5:0.4: the share of the stiffness that relaxes, and the
     /// time for it, s
     #[arg(long, value_name = "RATIO:TIME", value_parser = relaxation)]
@@ -220,6 +224,7 @@ fn experiment(
         rate: args.rate,
         seconds: args.seconds,
         seed: args.seed,
+        elasticity: args.elasticity,
         integrator,
         resend_after: step * args.resend_after,
         relaxation: args.relax,

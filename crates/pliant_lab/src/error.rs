@@ -41,6 +41,9 @@ pub enum LabError {
     /// A hand cannot pull a body that has no anchors, because the body follows.
     #[error("the body is free and follows the hand; expected a body with anchors")]
     Free,
+    /// Reduced elasticity was asked for, and the model has none.
+    #[error("the model has no material for large strains; expected one baked with --material")]
+    NoMaterial,
     /// A point where a hand should take hold is far away from the body.
     #[error("the point is {away} m away from the surface of a body of {size} m; expected one near it")]
     Far {

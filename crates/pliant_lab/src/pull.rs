@@ -3,7 +3,9 @@
 use std::{sync::Arc, time::Instant};
 
 use nalgebra::{Matrix3, Vector3};
-use pliant_modal::{Body, BodyConfig, GrabConfig, ModalModel, ModelError, Patch};
+use pliant_modal::{
+    Body, BodyConfig, Elasticity, GrabConfig, Material, ModalModel, ModelError, Patch, StepSettings,
+};
 use serde::Serialize;
 
 use crate::{
@@ -30,6 +32,8 @@ pub struct Pull {
     pub radius: f64,
     /// Way of the hand, m.
     pub by: [f64; 3],
+    /// Elasticity of the body. `None`: reduced if the model has a material, linear otherwise.
+    pub elasticity: Option<Elasticity>,
 }
 
 /// What the hand feels at the end of its way, when the body is at rest.
@@ -50,8 +54,10 @@ pub struct Pulled {
     pub energy: f64,
     /// Time of one step on one core.
     pub step_us: Percentiles,
-    /// Law of the body: `linear`, which is modes with modal warping.
-    pub elasticity: &'static str,
+    /// Elasticity of the body: `linear`, which is modes with modal warping, or `reduced`.
+    pub elasticity: Elasticity,
+    /// Material of the reduced elasticity. `None` with linear elasticity.
+    pub material: Option<Material>,
     /// Whether the body came to rest: whether its speeds and the change of the force fell below a
     /// millionth of what they were.
     pub at_rest: bool,
@@ -66,8 +72,9 @@ pub struct Pulled {
 /// velocities are set to zero (dynamic relaxation with kinetic damping: Cundall 1976, Barnes 1999).
 ///
 /// # Errors
-/// Returns [`LabError::Free`] for a body without anchors, and [`LabError::Far`] for a point that is
-/// farther from the surface than the body is large. Returns [`LabError::Model`] or
+/// Returns [`LabError::Free`] for a body without anchors, [`LabError::Far`] for a point that is
+/// farther from the surface than the body is large, and [`LabError::NoMaterial`] for reduced
+/// elasticity of a model that has no material. Returns [`LabError::Model`] or
 /// [`LabError::Step`] when the body cannot be grabbed or stepped, or when a number is out of its
 /// range.
 pub fn pull(model: &Arc<ModalModel>, pull: &Pull) -> Result<Pulled, LabError> {
@@ -79,7 +86,12 @@ pub fn pull(model: &Arc<ModalModel>, pull: &Pull) -> Result<Pulled, LabError> {
         return Err(ModelError::Value { what: "point of the pull", index: 0, expected, got }.into());
     }
     let _pinned = Pinned::new();
-    let config = BodyConfig::default();
+    let of_model = if model.material().is_some() { Elasticity::Reduced } else { Elasticity::Linear };
+    let elasticity = pull.elasticity.unwrap_or(of_model);
+    if elasticity == Elasticity::Reduced && model.material().is_none() {
+        return Err(LabError::NoMaterial);
+    }
+    let config = BodyConfig::from(StepSettings { elasticity, ..StepSettings::default() });
     let step = config.step;
     let mut body = Body::new(model.clone(), config)?;
     let positions = model.surface().positions();
@@ -159,7 +171,8 @@ pub fn pull(model: &Arc<ModalModel>, pull: &Pull) -> Result<Pulled, LabError> {
         reaction: reaction.into(),
         energy: body.energy() - 0.5 * local.dot(&reaction),
         step_us: percentiles(times),
-        elasticity: "linear",
+        elasticity,
+        material: if elasticity == Elasticity::Reduced { model.material() } else { None },
         at_rest,
         surface,
     })

@@ -1,7 +1,7 @@
 //! The bodies of a scene: modes, damping, energy, rest, and the hands on them.
 
-use bevy_egui::egui::{CollapsingHeader, Color32, Ui};
-use pliant_body::StepSettings;
+use bevy_egui::egui::{Checkbox, CollapsingHeader, Color32, Ui};
+use pliant_body::{Elasticity, StepSettings};
 
 use crate::{
     knob::knob,
@@ -19,9 +19,12 @@ pub struct BodyView {
     pub modes: usize,
     /// Number of modes of the model.
     pub all_modes: usize,
+    /// Name of the material for large strains. Empty if the model has none: its elasticity is then
+    /// linear.
+    pub material: String,
     /// Frequency of the slowest mode, Hz.
     pub lowest_hz: f64,
-    /// Step settings. Stiffness, damping and warping have knobs.
+    /// Step settings. Stiffness, damping, elasticity and warping have knobs.
     pub settings: StepSettings,
     /// Whether this app steps the body. A remote body has no usable knobs here.
     pub local: bool,
@@ -97,7 +100,16 @@ fn body_knobs(ui: &mut Ui, index: usize, body: &mut BodyView) {
             slider.text("damping").max_decimals(2)
         })
         .on_hover_text("Multiplies the damping that was baked.");
-        ui.checkbox(&mut body.settings.warp, "modal warping")
+        let reduced = body.settings.elasticity == Elasticity::Reduced && !body.material.is_empty();
+        if !body.material.is_empty() {
+            let mut on = reduced;
+            ui.checkbox(&mut on, format!("reduced elasticity, {}", body.material))
+                .on_hover_text("Forces of large strains; off is linear, which costs a hundredth.");
+            if on != reduced {
+                body.settings.elasticity = if on { Elasticity::Reduced } else { Elasticity::Linear };
+            }
+        }
+        ui.add_enabled(!reduced, Checkbox::new(&mut body.settings.warp, "modal warping"))
             .on_hover_text("Right for large rotations; off is the plain linear shape.");
     });
     ui.horizontal(|ui| {

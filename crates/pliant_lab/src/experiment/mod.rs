@@ -11,7 +11,7 @@ mod shape_error;
 use std::sync::Arc;
 use std::time::Duration;
 
-use pliant_modal::{Body, BodyConfig, Integrator, ModalModel, Relaxation, StepSettings};
+use pliant_modal::{Body, BodyConfig, Elasticity, Integrator, ModalModel, Relaxation, StepSettings};
 use pliant_stream::emulator::LinkConfig;
 use pliant_stream::{
     BodyId, GuestConfig, HostConfig, Newmark, PeerId, RecoveryConfig, RepairCounts, StreamError,
@@ -43,6 +43,8 @@ pub struct Experiment {
     pub seed: u64,
     /// Number of streamed modes. Default: all.
     pub modes: Option<u16>,
+    /// How the body resists deformation. Default: linear.
+    pub elasticity: Elasticity,
     /// The host's integrator. Default: exact.
     pub integrator: Integrator,
     /// Relaxation of the material. Default: none, elastic.
@@ -186,6 +188,7 @@ impl Experiment {
             seconds: 30.0,
             seed: 1,
             modes: None,
+            elasticity: Elasticity::default(),
             integrator: Integrator::default(),
             relaxation: None,
             newmark: Newmark { h: 1.0 / 40.0, beta: 4.0 / 9.0, gamma: 5.0 / 6.0 },
@@ -196,6 +199,12 @@ impl Experiment {
             guest_hand: false,
             keep_track: false,
         }
+    }
+
+    /// How the body is stepped.
+    fn settings(&self) -> StepSettings {
+        let Self { elasticity, integrator, relaxation, .. } = *self;
+        StepSettings { elasticity, integrator, relaxation, ..StepSettings::default() }
     }
 
     /// Two hands that drag slowly. The first holds where the first mode moves most. The second
@@ -243,8 +252,7 @@ impl Experiment {
             quantum: self.quantum,
             ..Default::default()
         })?;
-        let settings =
-            StepSettings { integrator: self.integrator, relaxation: self.relaxation, ..Default::default() };
+        let settings = self.settings();
         let config = BodyConfig { step: h, ..settings.into() };
         let body = Body::new(self.model.clone(), config).map_err(model_error)?;
         pair.host.add_body(BODY, "measured", self.model.clone(), settings)?;

@@ -4,7 +4,7 @@
 use std::collections::BTreeMap;
 use std::time::Duration;
 
-use pliant_modal::{GrabConfig, StepSettings};
+use pliant_modal::GrabConfig;
 use pliant_stream::emulator::{Link, LinkConfig, Loss};
 use pliant_stream::peer::{PeerConfig, PeerSession, Repair};
 use pliant_stream::{Channel, PeerId, StreamError, Tick, UserId};
@@ -35,8 +35,7 @@ impl Experiment {
     /// the body cannot be stepped.
     pub fn run_peers(&self, repair: Repair) -> Result<Metrics, StreamError> {
         let h = 1.0 / self.rate;
-        let settings =
-            StepSettings { integrator: self.integrator, relaxation: self.relaxation, ..Default::default() };
+        let settings = self.settings();
         let peer = |number: u16| -> Result<PeerSession, StreamError> {
             let config = PeerConfig { user: UserId(number), step: h, repair, ..Default::default() };
             let mut peer = PeerSession::new(config)?;

@@ -13,6 +13,7 @@ mod material;
 mod motion;
 mod network;
 mod plain;
+mod reduced;
 
 use std::{
     panic::{AssertUnwindSafe, catch_unwind},
@@ -204,6 +205,7 @@ fn all() -> Vec<Case> {
     material::cases(&mut cases);
     motion::cases(&mut cases);
     hands::cases(&mut cases);
+    reduced::cases(&mut cases);
     inputs::cases(&mut cases);
     network::cases(&mut cases);
     device::cases(&mut cases);

@@ -16,7 +16,7 @@ use pliant_stream::Role;
 
 /// The application protocol and its version. The handshake negotiates it and refuses another
 /// version.
-pub const ALPN: &[u8] = b"pliant/2";
+pub const ALPN: &[u8] = b"pliant/3";
 
 /// The role that a token grants, and the time of expiry.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]

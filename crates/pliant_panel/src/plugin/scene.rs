@@ -127,6 +127,7 @@ impl SceneParam<'_, '_> {
             if !view.folded {
                 view.modes = state.body().mode_count();
                 view.all_modes = model.mode_count();
+                view.material = model.material().map_or_else(String::new, |material| material.to_string());
                 let omega = state.body().omega().first();
                 view.lowest_hz = omega.map_or(0.0, |omega| omega / std::f64::consts::TAU);
                 view.settings = body.settings;
