@@ -24,9 +24,10 @@ pub struct BakeConfig {
     pub modes: usize,
     /// Material for large strains. Default: `None`, linear elasticity only.
     ///
-    /// With a material the coordinates are the lowest modes (a third of them, at most 12) and the
-    /// most important combinations of their derivatives, and the model has a reduced elastic energy
-    /// beside its linear one. About 40 coordinates are enough.
+    /// With a material the coordinates are the lowest modes (about a third of them) and the most
+    /// important combinations of their derivatives, and the model has a reduced elastic energy
+    /// beside its linear one. [`BakeConfig::COORDINATES`] are enough for most bodies, and
+    /// [`BakeConfig::MOST_COORDINATES`] is the limit.
     pub material: Option<Material>,
     /// Young's modulus, 1e-3 to 1e15 Pa. Default: 1e5, a soft silicone.
     pub young: f64,
@@ -83,6 +84,9 @@ impl BakeConfig {
     /// a body takes about a tenth of a millisecond.
     pub const COORDINATES: usize = 36;
 
+    /// Maximum number of coordinates of a model with a [`material`](Self::material).
+    pub const MOST_COORDINATES: usize = 120;
+
     /// Checks the numbers that do not depend on the mesh.
     ///
     /// [`bake()`](crate::bake()) runs this check first. A program may run the check before it makes
@@ -108,6 +112,8 @@ impl BakeConfig {
             (-0.99..=0.49999).contains(&nu),
             nu,
         )?;
+        let sound = self.material.is_none() || self.modes <= Self::MOST_COORDINATES;
+        number("modes", "at most 120 coordinates with a material", sound, self.modes as f64)?;
         let sound = self.material.is_none() || nu <= 0.45;
         number("Poisson ratio", "at most 0.45 with a material for large strains", sound, nu)?;
         number("density", "1e-6 to 1e7 kg/m^3", (1e-6..=1e7).contains(&self.density), self.density)?;

@@ -193,10 +193,13 @@ fn pulled(energy: &mut ElasticEnergy, patch: &Rows, training: &Training<'_>) -> 
     let most = ENERGY * training.young * training.continuum.fe.volume();
     // The softest and the stiffest direction of the patch, both ways, and the one between.
     let soft = Matrix3::from_fn(|a, b| (0..m).map(|i| patch[a][i] * patch[b][i] / lambda[i]).sum::<f64>());
-    let axes = soft.symmetric_eigen().eigenvectors;
+    let eigen = soft.symmetric_eigen();
+    let mut order = [0, 1, 2];
+    order.sort_by(|&a, &b| eigen.eigenvalues[b].total_cmp(&eigen.eigenvalues[a]));
+    let axes = order.map(|k| eigen.eigenvectors.column(k).into_owned());
     let mut out = Vec::new();
     for (axis, sign) in [(0, 1.0), (0, -1.0), (1, 1.0), (2, 1.0), (2, -1.0)] {
-        let direction: Vector3<f64> = sign * axes.column(axis);
+        let direction: Vector3<f64> = sign * axes[axis];
         let mut q = vec![0.0; m];
         for way in WAYS {
             let there = way * training.size * direction;
@@ -330,7 +333,7 @@ fn select(columns: &[Vec<f64>], target: &[f64], most: usize) -> Vec<(usize, f64)
     let mut gram: Vec<Vec<f64>> = Vec::new();
     let mut right: Vec<f64> = Vec::new();
     let mut best: Vec<(usize, f64)> = Vec::new();
-    // Columns that left are not tried again at once, so that the search ends.
+    // Columns that leave may come back, so that the number of rounds is limited.
     for _ in 0..4 * most.div_ceil(BATCH) {
         if active.len() >= most || dot(&residual, &residual).sqrt() <= TOLERANCE * size {
             break;

@@ -73,9 +73,16 @@ pub(crate) fn extend(
     let principal = Mat::from_fn(width, kept.len(), |row, column| {
         vectors[(row, kept[column])] / values[kept[column]].sqrt()
     });
-    let shapes = blocks::product(Tall::new(&shapes, width), principal.as_ref());
-
+    let mut shapes = blocks::product(Tall::new(&shapes, width), principal.as_ref());
     let width = kept.len();
+    // Small combinations have lost digits in their length.
+    let mut mass = vec![0.0; shapes.len()];
+    solver.matrix.mass_times(&shapes, width, &mut mass);
+    let gram = blocks::gram(Tall::new(&shapes, width), Tall::new(&mass, width));
+    let (values, vectors) = blocks::symmetric_eigen(gram.as_ref())?;
+    let unit = Mat::from_fn(width, width, |row, column| vectors[(row, column)] / values[column].sqrt());
+    shapes = blocks::product(Tall::new(&shapes, width), unit.as_ref());
+
     let mut stiff = vec![0.0; shapes.len()];
     solver.matrix.stiffness_times(&shapes, width, &mut stiff);
     let gram = blocks::gram(Tall::new(&shapes, width), Tall::new(&stiff, width));

@@ -338,6 +338,17 @@ fn dead_loads_agree_too_and_a_model_without_material_stays_linear() {
 }
 
 #[test]
+fn what_a_material_does_not_bear_is_refused_by_name() {
+    let mesh = shapes::bar([2, 1, 1], [0.4, 0.1, 0.1]).unwrap();
+    let refused = |config: BakeConfig| bake(&mesh, None, &config, &mut |_, _| ()).unwrap_err().to_string();
+    let most = BakeConfig::MOST_COORDINATES;
+    let many = refused(BakeConfig { modes: most + 1, ..config(1) });
+    assert!(many.contains("modes") && many.contains("120") && most == 120, "{many}");
+    let locking = refused(BakeConfig { poisson: 0.49, ..config(9) });
+    assert!(locking.contains("Poisson"), "{locking}");
+}
+
+#[test]
 fn any_number_of_coordinates_bakes() {
     let mesh = shapes::bar([4, 1, 1], [0.4, 0.1, 0.1]).unwrap();
     for count in [1, 2, 3, 5, 9] {

@@ -9,6 +9,7 @@ use std::{
 };
 
 use clap::{Args, ValueEnum};
+use pliant_lab::LabError;
 use pliant_lab::experiment::{Experiment, Metrics};
 use pliant_modal::{Elasticity, Integrator, ModalModel, Relaxation};
 use pliant_stream::{
@@ -155,6 +156,9 @@ pub(crate) fn run(args: &StreamArgs) -> Result<(), CliError> {
     in_range("--rate", args.rate, 1.0, 2_000.0)?;
     in_range("--seconds", args.seconds, 0.1, 36_000.0)?;
     let model = Arc::new(ModalModel::read(&args.model)?);
+    if args.elasticity == Elasticity::Reduced && model.material().is_none() {
+        return Err(LabError::NoMaterial.into());
+    }
     let names: Vec<&str> = match (&args.recovery, args.topology, args.json) {
         (Some(name), ..) => vec![name.as_str()],
         (None, NetTopology::Cs, true) => vec!["default"],

@@ -565,5 +565,10 @@ fn a_copy_with_fewer_modes_extrapolates_forces_as_the_whole_body_does() {
             let (mean, end) = (body.mean_reaction(grabs[0]).unwrap()[0], body.reaction(grabs[0]).unwrap()[0]);
             assert!((end - (1.5 * mean - 0.5 * before)).abs() < 1e-9 * end.abs().max(1.0), "{modes:?}");
         }
+        for _ in 0..600 {
+            body.step().unwrap();
+        }
+        let (mean, end) = (body.mean_reaction(grabs[0]).unwrap()[0], body.reaction(grabs[0]).unwrap()[0]);
+        assert!((end / mean - 1.0).abs() < 1e-6, "{modes:?}: it comes to rest, {mean} and {end}");
     }
 }

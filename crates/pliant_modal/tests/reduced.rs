@@ -132,6 +132,25 @@ fn what_reduced_elasticity_has_not_is_refused_and_it_has_no_warp() {
 }
 
 #[test]
+fn a_body_that_keeps_no_mode_or_few_steps_too() {
+    let model = Arc::new(nonlinear_rod(2e5, 5, 0.02));
+    for modes in 0..=5 {
+        let config = BodyConfig { modes: Some(modes), ..settings().into() };
+        let mut body = Body::new(model.clone(), config).unwrap();
+        body.apply_impulse(tip(), [0.1, 0.0, 0.0]).unwrap();
+        for _ in 0..20 {
+            body.step().unwrap();
+        }
+        assert_eq!(body.energy() > 0.0, modes > 0);
+    }
+    let reduced = model.parts().reduced.clone().unwrap();
+    let law = Material::NeoHookean.with(1e5, 1e5);
+    for omega in [&[][..], &[0.0; 5], &[f64::NAN; 5], &[1.0; 4]] {
+        assert!(ElasticEnergy::new(&reduced, law, omega).is_err(), "{omega:?}");
+    }
+}
+
+#[test]
 fn absurd_states_are_an_error_or_a_step_and_never_a_panic() {
     let model = Arc::new(nonlinear_rod(2e5, 5, 0.02));
     for size in [1e-300, 1.0, 1e6, 1e50, 1e99, 1e200] {

@@ -20,15 +20,15 @@ impl Cholesky {
         &mut self.upper
     }
 
-    /// Factors the matrix in place. A pivot that is not positive is replaced by `floor`, so that
-    /// a matrix with rounding errors or NaN is no panic.
+    /// Factors the matrix in place. A pivot that is not positive is replaced by a huge one, which
+    /// gives its direction no share, so that a matrix with rounding errors or NaN is no panic.
     pub(crate) fn factor(&mut self) {
         let n = self.n;
         for j in 0..n {
             let (above, below) = self.upper.split_at_mut((j + 1) * n);
             let row = &mut above[j * n + j..];
             let pivot = row[0];
-            // Rounding alone can make a pivot vanish. A huge pivot gives its direction no share.
+            // Rounding alone can make a pivot vanish.
             let root = if pivot > 0.0 { pivot.sqrt() } else { f64::MAX.sqrt() };
             let inverse = 1.0 / root;
             row[0] = root;

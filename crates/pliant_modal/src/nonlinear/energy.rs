@@ -49,6 +49,9 @@ impl Gradients {
 }
 
 /// The reduced elastic energy `U(q)` of a body, with its force and its tangent.
+///
+/// All slices of coordinates must have one entry per coordinate, as the frequencies at the creation
+/// have; a shorter slice is a panic.
 #[derive(Debug, Clone)]
 pub struct ElasticEnergy {
     gradients: Arc<Gradients>,
@@ -90,7 +93,14 @@ impl ElasticEnergy {
     /// # Errors
     /// Returns an error if a length does not match, or if a number is not finite or out of range.
     pub fn new(reduced: &ReducedElasticity, law: Hyperelastic, omega: &[f64]) -> Result<Self, ModelError> {
-        crate::check::check_reduced(reduced, omega.len())?;
+        if omega.is_empty() {
+            return Err(ModelError::Empty("mode"));
+        }
+        if let Some(index) = omega.iter().position(|omega| !(omega.is_finite() && *omega > 0.0)) {
+            let (what, expected) = ("omega", "finite rad/s above 0");
+            return Err(ModelError::Value { what, index, expected, got: omega[index] });
+        }
+        crate::check::check_reduced(reduced, omega)?;
         let gradients = Arc::new(Gradients::new(&reduced.gradients, omega));
         Ok(Self::assemble(gradients, reduced, law, omega))
     }
@@ -184,12 +194,30 @@ impl ElasticEnergy {
 
     /// Writes the elastic force `dU/dq` at `q`, kg^1/2 m/s^2.
     pub fn force_at(&self, q: &[f64], out: &mut [f64]) {
+        #[cfg(target_arch = "x86_64")]
+        {
+            if std::arch::is_x86_feature_detected!("avx2") && std::arch::is_x86_feature_detected!("fma") {
+                // SAFETY: The check above found AVX2 and FMA.
+                return unsafe { self.force_at_avx2(q, out) };
+            }
+        }
+        self.force_at_with(q, out);
+    }
+
+    #[cfg(target_arch = "x86_64")]
+    #[target_feature(enable = "avx2,fma")]
+    fn force_at_avx2(&self, q: &[f64], out: &mut [f64]) {
+        self.force_at_with(q, out);
+    }
+
+    #[inline(always)]
+    fn force_at_with(&self, q: &[f64], out: &mut [f64]) {
         let (q, out, stride) = (&q[..self.modes], &mut out[..self.modes], self.gradients.padded);
         out.fill(0.0);
         for (weight, rows) in self.points() {
             let stress: Matrix3<f64> = weight * self.law.stress(&gradient(rows, stride, q));
             for (stress, row) in stress.iter().zip(rows.chunks_exact(stride)) {
-                out.iter_mut().zip(row).for_each(|(out, g)| *out += stress * g);
+                out.iter_mut().zip(row).for_each(|(out, g)| *out = stress.mul_add(*g, *out));
             }
         }
     }

@@ -127,7 +127,6 @@ impl ElasticStep {
         let (h, mut stiffest) = (self.h, 0.0f64);
         for (i, omega2) in self.omega2.iter().enumerate() {
             let stiffness = self.energy.stiffness(i);
-            stiffest = stiffest.max(h * h * (stiffness - omega2));
             self.start[i] = self.energy.force()[i] - omega2 * self.q[i];
             self.response[i] = [modes.response[0][i], modes.response[1][i], modes.response[2][i]];
             if h * h * stiffness > 1.0 {
@@ -139,6 +138,7 @@ impl ElasticStep {
                 after.v[i] = (after.q[i] - q) / h;
                 after.a[i] = (after.v[i] - v) / h;
             }
+            stiffest = stiffest.max((stiffness - omega2) * self.response[i][0]);
         }
         self.share = 0.5 + 0.5 * stiffest.clamp(0.0, 1.0);
         self.unforced.copy_from_slice(&after.q);
@@ -181,7 +181,7 @@ impl ElasticStep {
         self.cholesky.factor();
     }
 
-    /// The six numbers of a patch after this round without hands, and those of the linearization.
+    /// The six numbers of a patch after this round without hands.
     pub(crate) fn without_hands(&self, patch: &HeldPatch) -> Six {
         patch.rows().reduce(&self.free, false)
     }

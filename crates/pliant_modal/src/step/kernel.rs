@@ -122,7 +122,11 @@ fn turned(creep: &ViscoelasticPatch, hand: &Hand, q: &[f64]) -> Matrix3<f64> {
 /// Makes the nonlinear part of a step if the settings and the model have one.
 fn elastic(model: &ModalModel, settings: &StepSettings, modes: &Modes, h: f64) -> Option<ElasticStep> {
     let scale = settings.stiffness_scale;
-    if settings.is_reduced(model) { ElasticStep::new(model, modes, scale, h) } else { None }
+    if settings.is_reduced(model) && modes.count() > 0 {
+        ElasticStep::new(model, modes, scale, h)
+    } else {
+        None
+    }
 }
 
 impl Kernel {
@@ -226,6 +230,10 @@ impl Kernel {
         let at = |slice: &[f64], k: usize| slice.get(k).copied().unwrap_or(0.0);
         if let Some(elastic) = &mut self.elastic {
             elastic.force_of_way(|k| at(to[0], k) - reached.q[k], out);
+            // After a step that has failed, the tangent may have any value.
+            if out.iter().any(|x| !x.is_finite()) {
+                out.fill(0.0);
+            }
             return;
         }
         for (k, (out, omega)) in out.iter_mut().zip(&self.modes.omega).enumerate() {
@@ -639,8 +647,6 @@ impl Kernel {
             }
             if tangent != ElasticTangent::Kept {
                 solving.compliance = turned(&self.creep, hand, elastic.coordinates());
-            }
-            if tangent != ElasticTangent::Kept {
                 elastic.add_hand(&hand.patch);
                 for j in 0..=i {
                     self.responses.set(i, j, &elastic.response(i, j));

@@ -57,7 +57,8 @@ pub struct StepSettings {
     pub warp: bool,
     /// Number of Newton corrections of the hands in one step, 1 to
     /// [`StepSettings::MOST_CORRECTIONS`]. With linear elasticity they only have an effect with
-    /// warp. With reduced elasticity they are the Newton rounds of the whole step. Default: 2.
+    /// warp. With reduced elasticity they are the least number of Newton rounds of
+    /// the whole step, which goes on to the maximum where it converges slowly. Default: 2.
     pub corrections: u8,
     /// Uniform acceleration, m/s^2, world axes. Each component is at most 1e9 in magnitude.
     /// Default: zero.
