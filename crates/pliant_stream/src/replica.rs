@@ -122,10 +122,16 @@ impl Replica {
         (self.hands, self.keys) = (hands, keys);
     }
 
+    /// Extrapolation factor of the host, which keeps all modes, whatever this copy keeps.
+    fn extrapolation(&self, hands: usize) -> f64 {
+        let model = self.kernel.model();
+        self.kernel.settings().extrapolation(model, model.mode_count(), hands)
+    }
+
     /// Extrapolates the force of a hand at the end of a step from its mean over this step and the
     /// mean `before` over the step before, N. `hands` is the number of hands on the body.
     pub(crate) fn end(&self, mean: Vector3<f64>, before: Vector3<f64>, hands: usize) -> Vector3<f64> {
-        let beyond = self.kernel.settings().extrapolation(self.kernel.model(), hands);
+        let beyond = self.extrapolation(hands);
         mean + beyond * (mean - before)
     }
 
@@ -133,7 +139,7 @@ impl Replica {
     /// mean `before` over the step before (N, world axes). `hands` is the number of hands on the
     /// body.
     pub(crate) fn mean(&self, end: Vector3<f64>, before: Vector3<f64>, hands: usize) -> Vector3<f64> {
-        let beyond = self.kernel.settings().extrapolation(self.kernel.model(), hands);
+        let beyond = self.extrapolation(hands);
         (end + beyond * before) / (1.0 + beyond)
     }
 

@@ -602,7 +602,7 @@ impl Kernel {
         if damped {
             self.modes.velocities(&self.before, state, self.h, &mut self.velocity);
         }
-        let beyond = self.settings.extrapolation(&self.model, hands.len());
+        let beyond = self.settings.extrapolation(&self.model, state.modes(), hands.len());
         if let Some(elastic) = &mut self.elastic {
             elastic.begin(&self.before, &self.modes, &self.force, state);
         }

@@ -145,12 +145,12 @@ impl StepSettings {
     /// `F_end = (1 + x) F - x F_before`.
     ///
     /// `F` is the force over the step and `F_before` that over the previous step. With reduced
-    /// elasticity the force of a step is that at its end. Hands with more rows than the model has
-    /// modes contradict each other, and would not come to rest with extrapolated forces. The answer
-    /// is the same for copies that keep fewer modes.
-    pub fn extrapolation(&self, model: &ModalModel, hands: usize) -> f64 {
+    /// elasticity the force of a step is that at its end. `hands` with more rows than the body that
+    /// computes their forces has `modes` contradict each other, and would not come to rest with
+    /// extrapolated forces.
+    pub fn extrapolation(&self, model: &ModalModel, modes: usize, hands: usize) -> f64 {
         let exact = self.integrator == Integrator::Exact && !self.is_reduced(model);
-        let second = self.second_order && exact && !model.is_free() && 3 * hands <= model.mode_count();
+        let second = self.second_order && exact && !model.is_free() && 3 * hands <= modes;
         if second { 0.5 } else { 0.0 }
     }
 
