@@ -72,6 +72,14 @@ fn force_and_tangent_are_the_derivatives_of_the_energy() {
             assert!((slope - force[i]).abs() < 1e-6 * size, "{material}: {slope} and {}", force[i]);
             assert!((again[i] - force[i]).abs() < 1e-12 * size, "{material}: {} and {}", again[i], force[i]);
         }
+        // What a slice lacks counts as zero.
+        let short = [&q[..4], &[0.0; 7]].concat();
+        assert_eq!(energy.energy(&q[..4]), energy.energy(&short));
+        let mut few = [0.0; 3];
+        energy.force_at(&short, &mut again);
+        energy.force_at(&q[..4], &mut few);
+        assert_eq!(few, again[..3]);
+        energy.tangent_row(11, &mut few);
         if energy.raised() == 0 {
             let mut row = vec![0.0; 11];
             energy.tangent_row(0, &mut row);

@@ -50,8 +50,8 @@ impl Gradients {
 
 /// The reduced elastic energy `U(q)` of a body, with its force and its tangent.
 ///
-/// All slices of coordinates must have one entry per coordinate, as the frequencies at the creation
-/// have; a shorter slice is a panic.
+/// Slices of coordinates have one entry per coordinate. Entries that a shorter slice lacks count as
+/// zero, and those that a longer one has beyond them are not used.
 #[derive(Debug, Clone)]
 pub struct ElasticEnergy {
     gradients: Arc<Gradients>,
@@ -144,7 +144,7 @@ impl ElasticEnergy {
     }
 
     /// Entry `i` of the tangent's diagonal at the last linearization, 1/s^2.
-    pub fn stiffness(&self, i: usize) -> f64 {
+    pub(crate) fn stiffness(&self, i: usize) -> f64 {
         let at = i * self.padded + i;
         self.omega[i] * self.omega[i] * f64::from(self.tangent[at])
     }
@@ -152,6 +152,9 @@ impl ElasticEnergy {
     /// Writes row `i` of the tangent's upper triangle at the last linearization, from column `i`
     /// on, 1/s^2.
     pub fn tangent_row(&self, i: usize, out: &mut [f64]) {
+        if i >= self.modes {
+            return;
+        }
         let row = i * self.padded;
         let parts = self.tangent[row + i..].iter().zip(&self.omega[i..]);
         for (out, (tangent, omega)) in out.iter_mut().zip(parts) {
@@ -160,7 +163,9 @@ impl ElasticEnergy {
     }
 
     fn load(&mut self, q: &[f64]) {
-        self.q[..self.modes].copy_from_slice(&q[..self.modes]);
+        let given = self.modes.min(q.len());
+        self.q[..given].copy_from_slice(&q[..given]);
+        self.q[given..].fill(0.0);
     }
 
     fn points(&self) -> impl Iterator<Item = (f64, &[f64])> {
@@ -187,7 +192,7 @@ impl ElasticEnergy {
 
     #[inline(always)]
     fn energy_with(&self, q: &[f64]) -> f64 {
-        let (q, stride) = (&q[..self.modes], self.gradients.padded);
+        let (q, stride) = (&q[..self.modes.min(q.len())], self.gradients.padded);
         let at = |(weight, rows): (f64, &[f64])| weight * self.law.energy(&gradient(rows, stride, q));
         self.points().map(at).sum()
     }
@@ -212,7 +217,9 @@ impl ElasticEnergy {
 
     #[inline(always)]
     fn force_at_with(&self, q: &[f64], out: &mut [f64]) {
-        let (q, out, stride) = (&q[..self.modes], &mut out[..self.modes], self.gradients.padded);
+        let (q, stride) = (&q[..self.modes.min(q.len())], self.gradients.padded);
+        let given = self.modes.min(out.len());
+        let out = &mut out[..given];
         out.fill(0.0);
         for (weight, rows) in self.points() {
             let stress: Matrix3<f64> = weight * self.law.stress(&gradient(rows, stride, q));
