@@ -202,7 +202,7 @@ fn measure(
 ) {
     let Some(guest) = guest else { return };
     if let GuestState::Closed { reason } = guest.state() {
-        run.failure.get_or_insert_with(|| reason.clone());
+        run.failure.get_or_insert_with(|| reason.to_string());
     }
     figures.loss = stats.loss_in;
     figures.round_trip = stats.round_trip.as_secs_f64();

@@ -104,7 +104,7 @@ fn weak_guests_take_fewer_modes_and_small_paths_fewer_still() {
     assert_eq!(pair.guests[2].session.body(BODY).unwrap().visual().unwrap().modes(), 91);
     pair.host.set_max_datagram(PeerId(3), 100);
     pair.run_until(7 * S, &mut scene);
-    assert!(scene.saw(2, |e| matches!(e, GuestEvent::Closed { reason: DisconnectReason::Path })));
+    assert!(scene.saw(2, |e| matches!(e, GuestEvent::Closed { reason: DisconnectReason::SmallDatagrams })));
 }
 
 #[test]

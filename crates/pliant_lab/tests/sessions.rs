@@ -170,6 +170,6 @@ fn guest_that_is_killed_is_let_go_with_its_grabs() {
             .iter()
             .any(|e| matches!(e, HostEvent::Left { peer: PeerId(1), reason: DisconnectReason::Silent, .. }))
     );
-    assert!(scene.saw(1, |e| matches!(e, GuestEvent::UserLeft { user: UserId(1) })));
+    assert!(scene.saw(1, |e| matches!(e, GuestEvent::UserLeft { user: UserId(1), .. })));
     assert_eq!(pair.guests[1].session.user(), Some(UserId(2)));
 }

@@ -73,6 +73,8 @@ pub use metrics::{
     DROPPED, JITTER, LOSS_IN, LOSS_OUT, NACKS, NetStats, QUEUE, RATE_IN, RATE_OUT, RECOVERED, ROUND_TRIP,
     VISUAL_OFFSET,
 };
+/// Why a session was refused or has ended.
+pub use pliant_stream::DisconnectReason;
 /// Network models for an [`Emulation`].
 pub use pliant_stream::emulator;
 
@@ -90,17 +92,3 @@ pub use transport::{
     Access, Emulation, Fingerprint, Grant, HostOptions, Identity, Invite, JoinOptions, Role, Token,
 };
 pub use user::{HandOf, Hands, User, UserJoined, UserLeft, UserLink, Yourself, color_of};
-
-/// Converts the end of a connection to the session's reason for a disconnect.
-fn end_of(reason: &transport::CloseReason) -> pliant_stream::DisconnectReason {
-    use pliant_stream::DisconnectReason;
-    use transport::CloseReason;
-    match reason {
-        CloseReason::ByUs => DisconnectReason::Left,
-        CloseReason::ByPeer { reason, .. } => *reason,
-        CloseReason::TimedOut => DisconnectReason::Silent,
-        CloseReason::Protocol { .. } => DisconnectReason::Protocol,
-        CloseReason::Refused { .. } => DisconnectReason::Refused,
-        _ => DisconnectReason::Lost,
-    }
-}

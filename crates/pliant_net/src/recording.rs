@@ -17,11 +17,12 @@ use std::time::Duration;
 use bevy::log::{error, warn};
 use bytes::Bytes;
 use pliant_modal::ModalModel;
+use pliant_stream::DisconnectReason;
 use thiserror::Error;
 
 use crate::transport::Role;
 
-const MAGIC: &[u8; 8] = b"PLIANT\x01R";
+const MAGIC: &[u8; 8] = b"PLIANT\x02R";
 /// zstd compression level. Its cost is negligible beside a simulation step.
 const LEVEL: i32 = 3;
 /// Interval at which the encoder's data is flushed to the file, so that a crash loses no more than
@@ -52,17 +53,16 @@ pub(crate) enum SessionRecord {
     Message(Bytes),
     /// A model from the guest's cache, as a `.modal` file.
     Model(Bytes),
-    /// The connection ended. The string is the reason.
-    Closed(String),
+    /// The connection ended.
+    Closed(DisconnectReason),
 }
 
 impl SessionRecord {
     /// Size of the record's data in memory, bytes.
     fn len(&self) -> usize {
         match self {
-            Self::Connected { .. } => 0,
+            Self::Connected { .. } | Self::Closed(_) => 0,
             Self::Datagram(bytes) | Self::Message(bytes) | Self::Model(bytes) => bytes.len(),
-            Self::Closed(words) => words.len(),
         }
     }
 }
@@ -200,7 +200,7 @@ impl Drop for SessionRecorder {
 }
 
 fn write(to: &mut impl Write, at: Duration, record: &SessionRecord) -> io::Result<u64> {
-    let connected;
+    let (connected, closed);
     let (kind, bytes): (u8, &[u8]) = match record {
         SessionRecord::Connected { role, max_datagram } => {
             let [low, high] = max_datagram.to_le_bytes();
@@ -210,7 +210,10 @@ fn write(to: &mut impl Write, at: Duration, record: &SessionRecord) -> io::Resul
         SessionRecord::Datagram(bytes) => (DATAGRAM, bytes),
         SessionRecord::Message(bytes) => (MESSAGE, bytes),
         SessionRecord::Model(bytes) => (MODEL, bytes),
-        SessionRecord::Closed(words) => (CLOSED, words.as_bytes()),
+        SessionRecord::Closed(reason) => {
+            closed = [reason.code()];
+            (CLOSED, &closed)
+        }
     };
     let length = u32::try_from(bytes.len()).ok().filter(|length| *length <= LONGEST);
     let length = length.ok_or_else(|| io::Error::other("a record of more than a gigabyte"))?;
@@ -310,7 +313,10 @@ fn read(from: &mut impl Read) -> Option<(Duration, SessionRecord)> {
         DATAGRAM => SessionRecord::Datagram(bytes.into()),
         MESSAGE => SessionRecord::Message(bytes.into()),
         MODEL => SessionRecord::Model(bytes.into()),
-        CLOSED => SessionRecord::Closed(String::from_utf8(bytes).ok()?),
+        CLOSED => {
+            let [code] = bytes.try_into().ok()?;
+            SessionRecord::Closed(DisconnectReason::from_code(code)?)
+        }
         _ => return None,
     };
     Some((at, record))
@@ -337,7 +343,7 @@ mod tests {
                 records.push((at, SessionRecord::Message(bytes.into())));
             }
         }
-        records.push((Duration::from_secs(20), SessionRecord::Closed("the host has left".into())));
+        records.push((Duration::from_secs(20), SessionRecord::Closed(DisconnectReason::Left)));
         records
     }
 

@@ -2,7 +2,7 @@
 
 use bevy::math::DVec3;
 use bevy::prelude::*;
-use pliant_stream::{BodyId, UserId};
+use pliant_stream::{BodyId, DisconnectReason, UserId};
 
 /// The session's body that this entity tracks.
 #[derive(Component, Debug, Clone, Copy, PartialEq, Eq)]
@@ -59,8 +59,8 @@ pub struct GrabRefused {
 /// ([`JoinConfig::rejoin`](crate::JoinConfig::rejoin)).
 #[derive(Message, Debug, Clone, PartialEq)]
 pub struct SessionLost {
-    /// Reason, as text.
-    pub reason: String,
+    /// The reason.
+    pub reason: DisconnectReason,
 }
 
 /// This app has joined the session, for the first time or again.
@@ -76,8 +76,8 @@ pub struct SessionJoined {
 /// The session is over.
 #[derive(Message, Debug, Clone, PartialEq)]
 pub struct SessionClosed {
-    /// Reason, as text.
-    pub reason: String,
+    /// The reason.
+    pub reason: DisconnectReason,
 }
 
 pub(crate) fn register(app: &mut App) {

@@ -3,7 +3,7 @@
 use std::collections::BTreeMap;
 
 use bevy::prelude::*;
-use pliant_stream::{Role, UserId};
+use pliant_stream::{DisconnectReason, Role, UserId};
 
 use crate::user::{User, UserJoined, UserLeft, UserLink, Yourself};
 
@@ -48,7 +48,7 @@ impl Roster {
 
     /// Despawns the entity of a user who has left, and reports it. Returns false for an unknown
     /// user.
-    pub(crate) fn leave(&mut self, world: &mut World, id: UserId, reason: String) -> bool {
+    pub(crate) fn leave(&mut self, world: &mut World, id: UserId, reason: DisconnectReason) -> bool {
         let Some(entity) = self.0.remove(&id) else { return false };
         let name = name_of(world, entity);
         info!("{name} has left: {reason}");

@@ -3,7 +3,7 @@
 use std::time::Duration;
 
 use bevy::prelude::*;
-use pliant_stream::{UserId, UserLinkInfo};
+use pliant_stream::{DisconnectReason, UserId, UserLinkInfo};
 
 use crate::transport::Role;
 
@@ -106,8 +106,8 @@ pub struct UserLeft {
     pub id: UserId,
     /// The name that the user had.
     pub name: String,
-    /// Reason, as text.
-    pub reason: String,
+    /// The reason.
+    pub reason: DisconnectReason,
 }
 
 #[cfg(test)]

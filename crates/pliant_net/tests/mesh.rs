@@ -16,7 +16,7 @@ use pliant_net::{
 };
 use pliant_stream::emulator::{LinkConfig, Loss};
 use pliant_stream::peer::digest;
-use pliant_stream::{PeerId, StepSettings};
+use pliant_stream::{DisconnectReason, PeerId, StepSettings};
 use support::{alone, app, bar, must, run_frames, run_until, wait_for};
 
 const SESSION: u8 = 0;
@@ -85,7 +85,7 @@ fn put_scene(bytes: &mut BytesMut, app: &App, body: Entity, invite: &Invite) {
 struct UnauthenticatedPeer {
     endpoint: Endpoint,
     connected: bool,
-    closed: Option<String>,
+    closed: Option<DisconnectReason>,
     messages: Vec<Bytes>,
 }
 
@@ -100,7 +100,7 @@ impl UnauthenticatedPeer {
             match event {
                 Event::Connected { .. } => self.connected = true,
                 Event::Message { bytes, .. } => self.messages.push(bytes),
-                Event::Closed { reason, .. } => self.closed = Some(reason.to_string()),
+                Event::Closed { reason, .. } => self.closed = Some(reason),
                 _ => {}
             }
         }
@@ -130,7 +130,9 @@ fn who_was_sent_away_from_among_peers_gets_in_by_no_message_that_follows() {
     });
     drop(right);
     // Then with a token to watch, and with a message that violates the protocol first.
-    for (token, before) in [(watch, &[][..]), (hold, &[99_u8][..])] {
+    for (token, before, reason) in
+        [(watch, &[][..], DisconnectReason::WatchOnly), (hold, &[99_u8][..], DisconnectReason::Protocol)]
+    {
         let mut wrong = UnauthenticatedPeer::at(&invite.clone().with_token(token));
         // The transport admits the connection by itself. All messages are sent before the peer's
         // app processes the connection and closes it.
@@ -146,6 +148,7 @@ fn who_was_sent_away_from_among_peers_gets_in_by_no_message_that_follows() {
             wrong.listen();
             wrong.closed.is_some()
         });
+        assert_eq!(wrong.closed, Some(reason));
         assert!(!wrong.welcomed(), "{:?}", wrong.messages);
         assert_eq!(users(&mut a), 1);
     }
@@ -168,7 +171,7 @@ fn who_connects_and_does_not_say_who_it_is_keeps_no_place() {
         silent.iter().all(|stranger| stranger.closed.is_some())
     });
     assert!(silent[3].welcomed(), "the last was given a number");
-    assert!(silent.iter().all(|stranger| stranger.connected));
+    assert!(silent.iter().all(|stranger| stranger.closed == Some(DisconnectReason::Silent)));
     // A peer that introduces itself stays connected, for longer than a later one that does not.
     let (mut b, _) = peer("b", Some(invite.clone()), Access::Anyone, limits());
     run_until(&mut [&mut a, &mut b], "a peer gets in", |apps| users(apps[0]) == 2 && users(apps[1]) == 2);

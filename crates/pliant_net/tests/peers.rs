@@ -15,6 +15,7 @@ use pliant_net::{
     Emulation, HostOptions, Invite, NetPeer, NetPlugin, NetStats, PeerConfig, PeerState, RemoteHands,
     SharedBody, User, UserLeft,
 };
+use pliant_stream::DisconnectReason;
 use pliant_stream::emulator::{LinkConfig, Loss, Preset};
 use support::{MIDDLE, TIP, alone, app, bar, messages, must, run_frames, run_until};
 
@@ -255,7 +256,7 @@ fn a_peer_that_steps_the_body_otherwise_is_not_let_in_and_is_told() {
     run_until(&mut [&mut a, &mut b], "it is told why", |apps| {
         matches!(
             apps[1].world().resource::<NetPeer>().state(),
-            PeerState::Closed { reason } if reason.contains("other bodies")
+            PeerState::Closed { reason: DisconnectReason::SceneMismatch }
         )
     });
     assert_eq!(users(&mut a), ["a"]);
@@ -304,7 +305,7 @@ fn a_peer_with_another_body_is_not_let_in() {
     run_until(&mut [&mut a, &mut stranger], "it is told why", |apps| {
         matches!(
             apps[1].world().resource::<NetPeer>().state(),
-            PeerState::Closed { reason } if reason.contains("bodies")
+            PeerState::Closed { reason: DisconnectReason::SceneMismatch }
         )
     });
 }

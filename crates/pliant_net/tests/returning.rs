@@ -13,9 +13,9 @@ use pliant_body::{BodyState, Grab, GrabForce, GrabOf, ModalAsset, ModalBody, Vis
 use pliant_modal::ModalModel;
 use pliant_net::transport::Limits;
 use pliant_net::{
-    Access, BodyArrived, BodyLeft, Emulation, Grant, GuestState, HandOf, HostConfig, HostOptions, Identity,
-    Invite, JoinConfig, JoinOptions, NetGuest, NetHost, NetPlugin, NetStats, SessionClosed, SessionJoined,
-    SessionLost, SharedBody, Token, User, UserJoined,
+    Access, BodyArrived, BodyLeft, DisconnectReason, Emulation, Grant, GuestState, HandOf, HostConfig,
+    HostOptions, Identity, Invite, JoinConfig, JoinOptions, NetGuest, NetHost, NetPlugin, NetStats,
+    SessionClosed, SessionJoined, SessionLost, SharedBody, Token, User, UserJoined,
 };
 use pliant_stream::UserId;
 use pliant_stream::emulator::{LinkConfig, Loss};
@@ -245,18 +245,14 @@ fn two_connections_of_one_key_are_one_user_the_newer() {
     let join = |name: &str| {
         let identity = Some(Identity::from_pkcs8(&key).unwrap());
         let transport = JoinOptions { identity, ..JoinOptions::default() };
-        // Otherwise this guest would join again and displace the other one in turn.
-        let rejoin = Duration::ZERO;
-        guest(
-            &invite,
-            JoinConfig { transport, rejoin, name: name.into(), models: vec![bar()], ..JoinConfig::default() },
-        )
+        let models = vec![bar()];
+        guest(&invite, JoinConfig { transport, name: name.into(), models, ..JoinConfig::default() })
     };
     let mut old = join("old");
     run_until(&mut [&mut host, &mut old], "the first is in", |apps| is_in(apps[1]));
     let mut new = join("new");
     run_until(&mut [&mut host, &mut old, &mut new], "the second is in, the first is out", |apps| {
-        is_in(apps[2]) && matches!(state_of(apps[1]), GuestState::Closed { .. })
+        is_in(apps[2]) && state_of(apps[1]) == GuestState::Closed { reason: DisconnectReason::Replaced }
     });
     assert_eq!(state_of(&new), GuestState::In { user: UserId(1) }, "under the same number");
     assert_eq!(host.world().resource::<NetHost>().guests().count(), 1);
@@ -276,7 +272,7 @@ fn a_guest_that_is_sent_away_does_not_come_back() {
     assert!(host.world().resource::<NetHost>().key_of(user).is_some());
     assert!(host.world_mut().resource_mut::<NetHost>().kick(user));
     run_until(&mut [&mut host, &mut guest], "it is told", |apps| {
-        matches!(state_of(apps[1]), GuestState::Closed { .. })
+        state_of(apps[1]) == GuestState::Closed { reason: DisconnectReason::Kicked }
     });
     // The time until another guest has joined and has its body is enough for the kicked guest to
     // come back.

@@ -14,6 +14,7 @@ use pliant_net::{
     JoinConfig, NetGuest, NetPlugin, NetStats, Recording, RemoteHands, Role, SessionClosed, SharedBody,
     Token, User, UserLink,
 };
+use pliant_stream::DisconnectReason;
 use support::{
     Came, TIP, alone, app, arrival, bar, body_of, guest, host, messages, must, only, rests, run_until, tick,
     window,
@@ -48,7 +49,7 @@ fn a_watcher_sees_and_does_not_hold_and_all_know_who_is_who() {
             && body_of(apps[2]).is_some()
             && matches!(
                 apps[3].world().resource::<NetGuest>().state(),
-                GuestState::Closed { reason } if reason.contains("expired")
+                GuestState::Closed { reason: DisconnectReason::ExpiredToken }
             )
     });
     assert_eq!(watcher.world().resource::<NetGuest>().role(), Role::Watch);

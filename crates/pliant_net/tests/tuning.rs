@@ -12,13 +12,14 @@ use pliant_body::{BodyState, Grab, GrabForce, GrabOf, ModalBody, VisualState};
 use pliant_net::{
     BodyArrived, BodyLeft, GuestState, HandOf, HostConfig, JoinConfig, NetGuest, NetHost, UserLeft,
 };
+use pliant_stream::DisconnectReason;
 use support::{
     TIP, alone, arrival, body_of, guest, host, messages, must, only, rests, run_frames, run_until,
 };
 
-fn closed(app: &App) -> Option<String> {
+fn closed(app: &App) -> Option<DisconnectReason> {
     match app.world().resource::<NetGuest>().state() {
-        GuestState::Closed { reason } => Some(reason.clone()),
+        GuestState::Closed { reason } => Some(*reason),
         _ => None,
     }
 }
@@ -78,15 +79,15 @@ fn a_guest_that_leaves_is_gone_at_once_and_does_not_come_back() {
     run_until(&mut [&mut host, &mut guest], "both ends know", |apps| {
         closed(apps[1]).is_some() && !messages::<UserLeft>(apps[0]).is_empty()
     });
-    assert_eq!(closed(&guest).as_deref(), Some("left"));
-    assert_eq!(messages::<UserLeft>(&host)[0].reason, "left");
+    assert_eq!(closed(&guest), Some(DisconnectReason::Left));
+    assert_eq!(messages::<UserLeft>(&host)[0].reason, DisconnectReason::Left);
     // The time until another guest has joined and has its body is enough for the first guest to
     // come back.
     let mut other = support::guest(&invite, JoinConfig::default());
     run_until(&mut [&mut host, &mut other, &mut guest], "another one joins", |apps| body_of(apps[1]));
     run_frames(&mut [&mut host, &mut other, &mut guest], 100);
     assert_eq!(host.world().resource::<NetHost>().guests().count(), 1);
-    assert_eq!(closed(&guest).as_deref(), Some("left"));
+    assert_eq!(closed(&guest), Some(DisconnectReason::Left));
     assert!(guest.world().get_entity(there).is_ok(), "the body stands as it was last seen");
 }
 

@@ -460,7 +460,7 @@ fn another_version_is_told_so() {
     };
     host.on_message(Duration::ZERO, PeerId(1), &hello.encode());
     let said = HostMessage::decode(&host.poll_output().unwrap().bytes).unwrap();
-    assert_eq!(said, HostMessage::Goodbye { reason: DisconnectReason::Version });
+    assert_eq!(said, HostMessage::Goodbye { reason: DisconnectReason::VersionMismatch });
 }
 
 #[test]

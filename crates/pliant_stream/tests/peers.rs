@@ -381,7 +381,7 @@ fn peers_with_other_settings_are_turned_away() {
     mesh.start(1, Repair::Rollback, true);
     mesh.run(S);
     let turned = |k: usize| {
-        let away = |e: &(usize, PeerEvent)| matches!(e, (at, PeerEvent::TurnedAway { reason: DisconnectReason::Scene, .. }) if *at == k);
+        let away = |e: &(usize, PeerEvent)| matches!(e, (at, PeerEvent::TurnedAway { reason: DisconnectReason::SceneMismatch, .. }) if *at == k);
         mesh.events.iter().any(away)
     };
     assert!(turned(0) && turned(1), "{:?}", mesh.events);

@@ -16,7 +16,9 @@ use std::time::{Duration, Instant};
 use bevy::prelude::*;
 use bevy::tasks::Task;
 use pliant_modal::ModalModel;
-use pliant_stream::{BodyId, BodyView, GuestSession, LinkStats, PeerId, RecoveryConfig, State, Tick, UserId};
+use pliant_stream::{
+    BodyId, BodyView, DisconnectReason, GuestSession, LinkStats, PeerId, RecoveryConfig, State, Tick, UserId,
+};
 
 use crate::metrics::{Ledger, NetStats};
 use crate::remote::RemoteBody;
@@ -96,13 +98,13 @@ pub enum GuestState {
     /// The connection to the host is lost, and the guest tries to join again. Bodies keep their
     /// last displayed state.
     Lost {
-        /// Reason, as text.
-        reason: String,
+        /// The reason.
+        reason: DisconnectReason,
     },
     /// The session is over, or never began. Bodies keep their last displayed state.
     Closed {
-        /// Reason, as text.
-        reason: String,
+        /// The reason.
+        reason: DisconnectReason,
     },
 }
 

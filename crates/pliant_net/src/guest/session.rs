@@ -12,7 +12,6 @@ use pliant_stream::{DisconnectReason, GuestEvent, GuestSession, StreamError, Use
 use super::source::Came;
 use super::{GuestState, NetGuest};
 use crate::remote::{GrabRefused, SessionClosed, SessionJoined, SessionLost};
-use crate::transport::CloseReason;
 use crate::user::shortened;
 
 /// When the guest tries to join again.
@@ -44,7 +43,7 @@ pub(crate) fn receive(world: &mut World) {
             if let Some(session) = &mut guest.session {
                 session.leave();
             }
-            guest.close(world, "left".into());
+            guest.close(world, DisconnectReason::Left);
         }
         loop {
             let now = guest.now();
@@ -53,7 +52,8 @@ pub(crate) fn receive(world: &mut World) {
                 Came::Connected { role } => {
                     guest.role = role;
                     if let Err(error) = guest.greet(world, now) {
-                        guest.close(world, error.to_string());
+                        error!("the session cannot begin: {error}");
+                        guest.close(world, DisconnectReason::InvalidSettings);
                     }
                 }
                 Came::Datagram { at, bytes } => {
@@ -69,7 +69,7 @@ pub(crate) fn receive(world: &mut World) {
                 Came::Closed { reason } => {
                     // A goodbye of the session arrived earlier and has the more precise reason.
                     guest.take_events(world);
-                    guest.ended(world, now, &reason);
+                    guest.ended(world, now, reason);
                 }
             }
             guest.take_events(world);
@@ -138,32 +138,27 @@ impl NetGuest {
     }
 
     /// Handles the end of a connection, or a failed attempt.
-    fn ended(&mut self, world: &mut World, now: Duration, reason: &CloseReason) {
+    fn ended(&mut self, world: &mut World, now: Duration, reason: DisconnectReason) {
+        use DisconnectReason::{Full, Left, Lost, Silent, UnknownHost, Unread};
         if matches!(self.state, GuestState::Closed { .. }) {
             return;
         }
         let may_come_back = match reason {
-            // The session's goodbye with this reason may have been lost.
-            CloseReason::ByPeer { reason, .. } => !matches!(
-                reason,
-                DisconnectReason::Refused | DisconnectReason::Version | DisconnectReason::Path
-            ),
-            CloseReason::TimedOut | CloseReason::Failed { .. } => true,
+            // A host that has left may start again.
+            Left | Silent | Lost | Unread | UnknownHost => true,
             // A guest that was in the session may find a free place later.
-            CloseReason::NoRoom => self.retry.was_in,
-            // This guest has closed the connection to a host that had fallen silent.
-            CloseReason::ByUs => matches!(self.state, GuestState::Lost { .. }),
+            Full => self.retry.was_in,
             _ => false,
         };
         if may_come_back && !self.line.is_replay() {
-            self.lost(world, now, reason.to_string());
+            self.lost(world, now, reason);
         } else {
-            self.close(world, reason.to_string());
+            self.close(world, reason);
         }
     }
 
     /// Stops the bodies and schedules the next attempt to join, when the host is lost.
-    fn lost(&mut self, world: &mut World, now: Duration, reason: String) {
+    fn lost(&mut self, world: &mut World, now: Duration, reason: DisconnectReason) {
         self.retry.orphans_until = None;
         let since = *self.retry.since.get_or_insert(now);
         if now.saturating_sub(since) >= self.config.rejoin {
@@ -181,7 +176,7 @@ impl NetGuest {
         info!("lost the connection to the host, trying again: {reason}");
         if matches!(self.state, GuestState::In { .. }) {
             self.leave_session(world);
-            world.write_message(SessionLost { reason: reason.clone() });
+            world.write_message(SessionLost { reason });
         }
         self.state = GuestState::Lost { reason };
     }
@@ -206,14 +201,14 @@ impl NetGuest {
         self.users.clear(world);
     }
 
-    fn close(&mut self, world: &mut World, reason: String) {
+    fn close(&mut self, world: &mut World, reason: DisconnectReason) {
         if matches!(self.state, GuestState::Closed { .. }) {
             return;
         }
         info!("the session is over: {reason}");
         self.flush();
         self.line.close();
-        self.state = GuestState::Closed { reason: reason.clone() };
+        self.state = GuestState::Closed { reason };
         self.leave_session(world);
         world.write_message(SessionClosed { reason });
     }
@@ -233,8 +228,8 @@ impl NetGuest {
                 GuestEvent::UserJoined(info) => {
                     self.users.join(world, info.user, &info.name, info.role, false);
                 }
-                GuestEvent::UserLeft { user } => {
-                    self.users.leave(world, user, DisconnectReason::Left.to_string());
+                GuestEvent::UserLeft { user, reason } => {
+                    self.users.leave(world, user, reason);
                 }
                 GuestEvent::GrabRefused { grab } => {
                     let refused = self.grabs.iter_mut().find(|(_, sent)| sent.number == Some(grab));
@@ -248,9 +243,9 @@ impl NetGuest {
                     self.flush();
                     self.line.close();
                     let now = self.now();
-                    self.lost(world, now, DisconnectReason::Silent.to_string());
+                    self.lost(world, now, DisconnectReason::Silent);
                 }
-                GuestEvent::Closed { reason } => self.close(world, reason.to_string()),
+                GuestEvent::Closed { reason } => self.close(world, reason),
                 _ => {}
             }
         }

@@ -9,7 +9,7 @@ use pliant_stream::{Channel, DisconnectReason, Output, PeerId};
 use tracing::debug;
 
 use crate::recording::{Recording, SessionRecord, SessionRecorder};
-use crate::transport::{CloseReason, Endpoint, Event, PeerStats, Role};
+use crate::transport::{Endpoint, Event, PeerStats, Role};
 
 /// The guest's transport source.
 pub(crate) enum Source {
@@ -22,7 +22,7 @@ pub(crate) enum Came {
     Connected { role: Role },
     Datagram { at: Duration, bytes: Bytes },
     Message { bytes: Bytes },
-    Closed { reason: CloseReason },
+    Closed { reason: DisconnectReason },
 }
 
 impl Source {
@@ -48,8 +48,7 @@ impl Source {
                         (Came::Message { bytes: bytes.clone() }, now, SessionRecord::Message(bytes))
                     }
                     Event::Closed { reason, .. } => {
-                        let words = reason.to_string();
-                        (Came::Closed { reason }, now, SessionRecord::Closed(words))
+                        (Came::Closed { reason }, now, SessionRecord::Closed(reason))
                     }
                 };
                 if let Some(recorder) = recorder {
@@ -60,10 +59,7 @@ impl Source {
             Self::Replay { recording, max_datagram, over } => {
                 let Some((at, record)) = recording.poll(now) else {
                     let ends = recording.is_over() && !std::mem::replace(over, true);
-                    let words = "the recording is over".to_owned();
-                    return ends.then_some(Came::Closed {
-                        reason: CloseReason::ByPeer { reason: DisconnectReason::Left, words },
-                    });
+                    return ends.then_some(Came::Closed { reason: DisconnectReason::RecordingOver });
                 };
                 Some(match record {
                     SessionRecord::Connected { role, max_datagram: most } => {
@@ -72,14 +68,10 @@ impl Source {
                     }
                     SessionRecord::Datagram(bytes) => Came::Datagram { at, bytes },
                     SessionRecord::Message(bytes) => Came::Message { bytes },
-                    SessionRecord::Closed(words) => {
+                    SessionRecord::Closed(reason) => {
                         // The recording goes on after a close if the recorded guest joined again.
-                        if recording.is_over() {
-                            *over = true;
-                            let reason = CloseReason::ByPeer { reason: DisconnectReason::Left, words };
-                            return Some(Came::Closed { reason });
-                        }
-                        Came::Closed { reason: CloseReason::Failed { words } }
+                        *over |= recording.is_over();
+                        Came::Closed { reason }
                     }
                     // [`Recording::open`] has already read the models.
                     SessionRecord::Model(_) => return self.poll(began, now),
@@ -135,7 +127,7 @@ impl Source {
 
     pub(crate) fn close(&self) {
         if let Self::Quic { endpoint, .. } = self {
-            endpoint.close(PeerId::HOST, DisconnectReason::Left, "goodbye");
+            endpoint.close(PeerId::HOST, DisconnectReason::Left);
         }
     }
 

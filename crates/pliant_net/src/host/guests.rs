@@ -42,7 +42,8 @@ pub(crate) fn receive(world: &mut World) {
                     host.guests.insert(peer, Guest { key: fingerprint, role, entity: None });
                     let most = host.endpoint.max_datagram_size(peer).unwrap_or(0);
                     if let Err(error) = host.session.connect(now, peer, most) {
-                        host.endpoint.close(peer, DisconnectReason::Full, &error.to_string());
+                        debug!("guest {peer}: {error}");
+                        host.endpoint.close(peer, DisconnectReason::Full);
                     }
                 }
                 Event::Datagram { peer, at, bytes } => {
@@ -52,7 +53,7 @@ pub(crate) fn receive(world: &mut World) {
                 Event::Message { peer, bytes } => host.session.on_message(now, peer, &bytes),
                 Event::Closed { peer, reason } => {
                     debug!("guest {peer} is gone: {reason}");
-                    host.session.disconnect(peer, crate::end_of(&reason));
+                    host.session.disconnect(peer, reason);
                     host.take_events(world);
                     host.guests.remove(&peer);
                 }
@@ -92,7 +93,7 @@ impl NetHost {
             .collect();
         for other in older {
             debug!("guest {other} has come anew as {peer}");
-            self.session.kick(other, DisconnectReason::Left);
+            self.session.kick(other, DisconnectReason::Replaced);
         }
         let before = self.known.get(&key).map(|known| known.user).or_else(|| self.free_number());
         if let Err(error) = self.session.accept_as(now, peer, before, role) {
@@ -136,10 +137,10 @@ impl NetHost {
                 // The session's goodbye is more precise than the end of the connection, so it is
                 // sent first.
                 self.flush();
-                self.endpoint.close(peer, reason, &reason.to_string());
+                self.endpoint.close(peer, reason);
                 let inside = self.guests.get_mut(&peer).and_then(|guest| guest.entity.take()).is_some();
                 if let Some(id) = user.filter(|_| inside) {
-                    self.users.leave(world, id, reason.to_string());
+                    self.users.leave(world, id, reason);
                 }
             }
             HostEvent::GrabBegan { key, body, vertex, radius, target, hold } => {

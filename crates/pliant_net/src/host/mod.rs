@@ -223,7 +223,7 @@ impl NetHost {
     pub fn kick(&mut self, guest: Entity) -> bool {
         let found = self.guests.iter().find(|(_, one)| one.entity == Some(guest));
         let Some(peer) = found.map(|(&peer, _)| peer) else { return false };
-        self.session.kick(peer, DisconnectReason::Refused);
+        self.session.kick(peer, DisconnectReason::Kicked);
         true
     }
 
@@ -255,8 +255,8 @@ impl NetHost {
     fn send_message(&mut self, peer: PeerId, message: Bytes) {
         if let Err(error @ SendError::QueueFull { .. }) = self.endpoint.send_message(peer, message) {
             debug!("guest {peer} is sent away: {error}");
-            self.session.disconnect(peer, DisconnectReason::Lost);
-            self.endpoint.close(peer, DisconnectReason::Lost, "messages are not read");
+            self.session.disconnect(peer, DisconnectReason::Unread);
+            self.endpoint.close(peer, DisconnectReason::Unread);
         }
     }
 

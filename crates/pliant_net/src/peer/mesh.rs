@@ -11,7 +11,7 @@ use pliant_stream::{Channel, DisconnectReason, PeerId, UserId};
 use super::message::{MOST_PEERS, MeshMessage, PeerScene};
 use super::{NetPeer, PeerState};
 use crate::remote::{SessionClosed, SessionJoined};
-use crate::transport::{CloseReason, Endpoint, Event, Fingerprint, Invite, Role};
+use crate::transport::{Endpoint, Event, Fingerprint, Invite, Role};
 use crate::user::UserLink;
 
 /// Most keys whose user numbers are remembered.
@@ -124,7 +124,7 @@ impl NetPeer {
                 if role == Role::Watch && opened.is_none() {
                     // Every peer steps the bodies with its own hands, so the mesh has no place for
                     // a watcher.
-                    return self.hang_up(peer, DisconnectReason::Refused, "among equals everybody holds");
+                    return self.hang_up(peer, DisconnectReason::WatchOnly);
                 }
                 // This peer sends a join request to the first peer only, and introduces itself to
                 // the others.
@@ -150,9 +150,9 @@ impl NetPeer {
             Event::Closed { peer, reason } => {
                 let peer = opened.unwrap_or(peer);
                 debug!("peer {peer} is gone: {reason}");
-                self.miss(now, peer, &reason);
+                self.miss(now, peer, reason);
                 if let Some(session) = &mut self.session {
-                    session.disconnect(peer, crate::end_of(&reason));
+                    session.disconnect(peer, reason);
                 }
                 self.others.remove(&peer);
                 self.introduced.remove(&peer);
@@ -160,7 +160,7 @@ impl NetPeer {
                 // block a frame.
                 self.ending.extend(self.opened.remove(&peer).and_then(Endpoint::close_detached));
                 if opened.is_some() && self.session.is_none() {
-                    self.close(world, reason.to_string());
+                    self.close(world, reason);
                 }
             }
         }
@@ -212,7 +212,7 @@ impl NetPeer {
             }
             _ => {
                 self.rejected += 1;
-                self.hang_up(peer, DisconnectReason::Protocol, "a message that is none");
+                self.hang_up(peer, DisconnectReason::Protocol);
             }
         }
     }
@@ -233,7 +233,7 @@ impl NetPeer {
     fn arrived(&mut self, peer: PeerId, arrival: Arrival) {
         let Some(other) = self.others.get_mut(&peer) else { return };
         if other.number.is_some() || other.waits.is_some() {
-            return self.hang_up(peer, DisconnectReason::Protocol, "introduced twice");
+            return self.hang_up(peer, DisconnectReason::Protocol);
         }
         other.waits = Some(arrival);
         if self.session.is_some() {
@@ -255,9 +255,9 @@ impl NetPeer {
         let known = self.others.values().any(|other| other.number == Some(number));
         let own = if let PeerState::In { user } = self.state { user } else { UserId::HOST };
         if scene != self.scene {
-            self.hang_up(peer, DisconnectReason::Scene, "other bodies, or another step");
+            self.hang_up(peer, DisconnectReason::SceneMismatch);
         } else if known || number == UserId::HOST || number == own {
-            self.hang_up(peer, DisconnectReason::Refused, "no place under this number");
+            self.hang_up(peer, DisconnectReason::NumberTaken);
         } else if let Some(other) = self.others.get_mut(&peer) {
             other.number = Some(number);
             other.invite = Some(other.seen_from_here(invite));
@@ -271,12 +271,12 @@ impl NetPeer {
     fn welcome(&mut self, peer: PeerId, scene: PeerScene, invite: Invite) {
         let now = self.now();
         if scene != self.scene {
-            return self.hang_up(peer, DisconnectReason::Scene, "other bodies, or another step");
+            return self.hang_up(peer, DisconnectReason::SceneMismatch);
         }
         let others: Vec<(UserId, Invite)> =
             self.others.values().filter_map(|other| Some((other.number?, other.invite.clone()?))).collect();
         if self.others.len() > MOST_PEERS {
-            return self.hang_up(peer, DisconnectReason::Full, "no room");
+            return self.hang_up(peer, DisconnectReason::Full);
         }
         let Some(key) = self.others.get(&peer).map(|other| other.key) else { return };
         let present: BTreeSet<UserId> = self.others.values().filter_map(|other| other.number).collect();
@@ -287,7 +287,7 @@ impl NetPeer {
         // The number is the first one that no present or remembered peer has. A peer that claims a
         // large number therefore leaves room for all others.
         let Some(number) = before.or_else(|| (1..=u16::MAX).map(UserId).find(|n| !taken.contains(n))) else {
-            return self.hang_up(peer, DisconnectReason::Full, "no number is left");
+            return self.hang_up(peer, DisconnectReason::Full);
         };
         self.remember(key, number);
         if let Some(other) = self.others.get_mut(&peer) {
@@ -307,7 +307,8 @@ impl NetPeer {
             && let Some(user) = self.others.get(&peer).and_then(|other| other.number)
             && let Err(error) = session.connect(now, peer, user, most)
         {
-            self.hang_up(peer, DisconnectReason::Refused, &error.to_string());
+            debug!("peer {peer}: {error}");
+            self.hang_up(peer, DisconnectReason::Full);
         }
     }
 
@@ -315,7 +316,7 @@ impl NetPeer {
         let (endpoint, number) = self.way(peer);
         if let Err(error) = endpoint.send_message(number, message.to_message()) {
             debug!("not sent to peer {peer}: {error}");
-            endpoint.close(number, DisconnectReason::Lost, "messages are not read");
+            endpoint.close(number, DisconnectReason::Unread);
         }
     }
 
@@ -332,17 +333,17 @@ impl NetPeer {
         };
         let silent: Vec<PeerId> = self.others.iter().filter(silent).map(|(&peer, _)| peer).collect();
         for peer in silent {
-            self.hang_up(peer, DisconnectReason::Refused, "has not said who it is");
+            self.hang_up(peer, DisconnectReason::Silent);
         }
     }
 
-    fn hang_up(&mut self, peer: PeerId, reason: DisconnectReason, why: &str) {
-        debug!("peer {peer} is sent away: {why}");
+    fn hang_up(&mut self, peer: PeerId, reason: DisconnectReason) {
+        debug!("peer {peer} is sent away: {reason}");
         if let Some(other) = self.others.get_mut(&peer) {
             (other.sent_away, other.waits) = (true, None);
         }
         let (endpoint, number) = self.way(peer);
-        endpoint.close(number, reason, why);
+        endpoint.close(number, reason);
         if let Some(session) = &mut self.session {
             session.disconnect(peer, reason);
         }
@@ -380,7 +381,7 @@ impl NetPeer {
                     self.users.join(world, user, &name, Role::Hold, false);
                 }
                 PeerEvent::Left { user, reason } => {
-                    if !self.users.leave(world, user, reason.to_string()) {
+                    if !self.users.leave(world, user, reason) {
                         continue;
                     }
                     let gone: Vec<PeerId> = self
@@ -391,10 +392,10 @@ impl NetPeer {
                         .collect();
                     for peer in gone {
                         if reason == DisconnectReason::Silent {
-                            self.miss(now, peer, &CloseReason::TimedOut);
+                            self.miss(now, peer, reason);
                         }
                         let (endpoint, number) = self.way(peer);
-                        endpoint.close(number, reason, &reason.to_string());
+                        endpoint.close(number, reason);
                         if let Some(other) = self.others.get_mut(&peer) {
                             (other.number, other.invite, other.sent_away) = (None, None, true);
                         }
@@ -404,7 +405,7 @@ impl NetPeer {
                     // The session's goodbye is more precise than the end of the connection, so it
                     // is sent first.
                     self.flush();
-                    self.hang_up(peer, reason, &reason.to_string());
+                    self.hang_up(peer, reason);
                 }
                 PeerEvent::Resynced { from } => debug!("the state of user {} was taken over", from.0),
                 _ => {}
@@ -424,9 +425,9 @@ impl NetPeer {
         }
     }
 
-    pub(super) fn close(&mut self, world: &mut World, reason: String) {
+    pub(super) fn close(&mut self, world: &mut World, reason: DisconnectReason) {
         info!("the session is over: {reason}");
-        self.state = PeerState::Closed { reason: reason.clone() };
+        self.state = PeerState::Closed { reason };
         world.write_message(SessionClosed { reason });
     }
 }

@@ -17,7 +17,7 @@ use std::time::{Duration, Instant};
 use bevy::prelude::*;
 use pliant_body::{BodyState, Driven, ModalBody};
 use pliant_stream::peer::{PeerConfig as SessionConfig, PeerSession, Repair};
-use pliant_stream::{BodyId, LinkStats, PeerId, UserId};
+use pliant_stream::{BodyId, DisconnectReason, LinkStats, PeerId, UserId};
 
 use crate::metrics::{Ledger, NetStats};
 use crate::roster::Roster;
@@ -78,8 +78,8 @@ pub enum PeerState {
     },
     /// The session is over, or never began. Bodies keep their last displayed state.
     Closed {
-        /// Reason, as text.
-        reason: String,
+        /// The reason.
+        reason: DisconnectReason,
     },
 }
 
@@ -284,7 +284,8 @@ impl NetPeer {
         match made {
             Ok(session) => (self.session, self.began_at) = (Some(session), self.now()),
             Err(error) => {
-                self.close(world, format!("the session cannot begin: {error}"));
+                error!("the session cannot begin: {error}");
+                self.close(world, DisconnectReason::InvalidSettings);
                 return false;
             }
         }

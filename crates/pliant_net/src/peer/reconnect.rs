@@ -6,7 +6,7 @@ use pliant_stream::{DisconnectReason, PeerId, UserId};
 use tracing::debug;
 
 use super::{NetPeer, PeerState};
-use crate::transport::{CloseReason, Invite};
+use crate::transport::Invite;
 
 /// A lost peer that has not said goodbye.
 #[derive(Debug, Clone)]
@@ -24,21 +24,15 @@ const PAUSE: Duration = Duration::from_secs(1);
 /// Most lost peers that are tracked. The one that was lost first is given up first.
 const MOST_MISSED: usize = 64;
 
-/// Returns whether the other end left deliberately. A peer that closed because this peer was silent
-/// did not.
-fn has_left(reason: &CloseReason) -> bool {
-    match reason {
-        CloseReason::ByPeer { reason, .. } => *reason != DisconnectReason::Silent,
-        CloseReason::Protocol { .. } | CloseReason::Refused { .. } | CloseReason::WrongFingerprint { .. } => {
-            true
-        }
-        _ => false,
-    }
+/// Returns whether the peers have lost each other, and neither has sent the other away.
+fn is_loss(reason: DisconnectReason) -> bool {
+    use DisconnectReason::{Full, Lost, Silent, UnknownHost};
+    matches!(reason, Silent | Lost | Full | UnknownHost)
 }
 
 impl NetPeer {
     /// Tracks a peer whose connection is gone, if this peer is the one that must reconnect.
-    pub(super) fn miss(&mut self, now: Duration, peer: PeerId, reason: &CloseReason) {
+    pub(super) fn miss(&mut self, now: Duration, peer: PeerId, reason: DisconnectReason) {
         if let Some(missed) = self.missed.iter_mut().find(|missed| missed.calling == Some(peer)) {
             // The other peer may not have noticed the loss yet, so its answer does not matter. Only
             // the time limit ends the attempts.
@@ -48,7 +42,7 @@ impl NetPeer {
         let (PeerState::In { user }, Some(other)) = (&self.state, self.others.get(&peer)) else { return };
         let (Some(number), Some(invite)) = (other.number, other.invite.clone()) else { return };
         let known = self.missed.iter().any(|missed| missed.number == number);
-        if has_left(reason)
+        if !is_loss(reason)
             || known
             || *user < number
             || number == UserId::HOST

@@ -12,11 +12,11 @@ use super::emulated::Emulation;
 use super::endpoint::TransportError;
 use super::identity::{AnyGuest, Identity, PinnedHost};
 use super::invite::Token;
-use pliant_stream::Role;
+use pliant_stream::{DisconnectReason, Role};
 
 /// The application protocol and its version. The handshake negotiates it and refuses another
 /// version.
-pub const ALPN: &[u8] = b"pliant/3";
+pub const ALPN: &[u8] = b"pliant/4";
 
 /// The role that a token grants, and the time of expiry.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -59,12 +59,11 @@ pub enum Access {
 }
 
 impl Access {
-    /// Returns the role that the token `shown` grants at `now`, or the reason for a refusal, as
-    /// text for the guest.
-    pub(super) fn role(&self, shown: Option<Token>, now: SystemTime) -> Result<Role, &'static str> {
+    /// Returns the role that the token `shown` grants at `now`, or the reason for a refusal.
+    pub(super) fn role(&self, shown: Option<Token>, now: SystemTime) -> Result<Role, DisconnectReason> {
         match (self, shown) {
             (Self::Anyone, _) => Ok(Role::Hold),
-            (Self::Tokens(_), None) => Err("this host asks for a token and the invite has none"),
+            (Self::Tokens(_), None) => Err(DisconnectReason::MissingToken),
             (Self::Tokens(grants), Some(shown)) => {
                 // All grants are compared, so that timing does not reveal which one matched.
                 let found = grants.iter().fold(None, |found, grant| {
@@ -72,9 +71,9 @@ impl Access {
                     found.or(same.then_some(grant))
                 });
                 match found {
-                    None => Err("wrong token"),
+                    None => Err(DisconnectReason::UnknownToken),
                     Some(grant) if grant.expires.is_some_and(|expires| now >= expires) => {
-                        Err("the token has expired")
+                        Err(DisconnectReason::ExpiredToken)
                     }
                     Some(grant) => Ok(grant.role),
                 }
@@ -283,9 +282,9 @@ mod tests {
         let access = Access::Tokens(vec![Grant::hold(held).until(now + minute), Grant::watch(watched)]);
         assert_eq!(access.role(Some(held), now), Ok(Role::Hold));
         assert_eq!(access.role(Some(watched), now), Ok(Role::Watch));
-        assert!(access.role(Some(Token([8; 16])), now).unwrap_err().contains("wrong"));
-        assert!(access.role(None, now).unwrap_err().contains("asks for a token"));
-        assert!(access.role(Some(held), now + minute).unwrap_err().contains("expired"));
+        assert_eq!(access.role(Some(Token([8; 16])), now), Err(DisconnectReason::UnknownToken));
+        assert_eq!(access.role(None, now), Err(DisconnectReason::MissingToken));
+        assert_eq!(access.role(Some(held), now + minute), Err(DisconnectReason::ExpiredToken));
         assert_eq!(access.role(Some(watched), now + minute), Ok(Role::Watch));
         assert_eq!(Access::Anyone.role(None, now), Ok(Role::Hold));
         assert!(Access::Tokens(Vec::new()).role(Some(held), now).is_err(), "nobody");

@@ -18,29 +18,20 @@ use quinn::{
 use rustls::pki_types::CertificateDer;
 use tokio::sync::Notify;
 use tokio::time::{sleep, timeout};
-use tracing::debug;
+use tracing::{debug, warn};
 
 use super::congestion::Bucket;
 use super::emulated::Emulated;
-use super::endpoint::{CloseReason, EndpointShared, Event, PeerConnection, TransportError};
-use super::identity::{Fingerprint, SERVER_NAME, shortened};
+use super::endpoint::{EndpointShared, Event, PeerConnection, TransportError};
+use super::identity::{Fingerprint, SERVER_NAME};
 use super::invite::Invite;
 use super::queue::{Next, lock};
 use super::stats::PeerStats;
 use super::wire::{self, ReadMessageError, TOKEN_MESSAGE};
 
-/// Close code: the endpoint has ended.
-const GOODBYE: u32 = 0;
-/// Close code: the host does not admit the guest.
-const REFUSED: u32 = 1;
-/// Close code: the other end violated the protocol.
-const PROTOCOL: u32 = 2;
-/// Close code: the session is over. The number of the [`DisconnectReason`] is added to it.
-const SESSION: u32 = 16;
-
-/// Returns the code that closes a connection whose session is over.
-pub(super) fn code_of(reason: DisconnectReason) -> u32 {
-    SESSION + u32::from(reason.code())
+/// Returns the code that closes a connection for a reason.
+fn code_of(reason: DisconnectReason) -> VarInt {
+    VarInt::from_u32(reason.code().into())
 }
 
 /// Longest time to deliver the last messages before a close.
@@ -88,14 +79,11 @@ pub(super) async fn run(
             }
         },
     }
-    endpoint.close(VarInt::from_u32(GOODBYE), GOODBYE_WORDS);
+    endpoint.close(code_of(DisconnectReason::Left), &[]);
     // QUIC repeats close packets while the other end still sends. This must not delay an
     // application that ends.
     let _ = timeout(Duration::from_secs(1), endpoint.wait_idle()).await;
 }
-
-/// Text that an ending endpoint sends to all peers.
-const GOODBYE_WORDS: &[u8] = b"goodbye";
 
 fn open(
     shared: &EndpointShared,
@@ -163,7 +151,7 @@ async fn accept(shared: &Arc<EndpointShared>, endpoint: &quinn::Endpoint) {
             });
         }
     }
-    endpoint.close(VarInt::from_u32(GOODBYE), b"the host has left");
+    endpoint.close(code_of(DisconnectReason::Left), &[]);
 }
 
 /// Counts a connection of an address while the value is alive.
@@ -207,24 +195,23 @@ struct Open {
 }
 
 /// The host's half of the handshake.
-async fn welcome(shared: &EndpointShared, incoming: Incoming) -> Result<Open, CloseReason> {
-    let connection =
-        incoming.accept().map_err(|error| reason_of(error, None))?.await.map_err(|e| reason_of(e, None))?;
-    let refuse = |words: &str| {
-        connection.close(VarInt::from_u32(REFUSED), words.as_bytes());
-        CloseReason::Refused { words: words.to_owned() }
+async fn welcome(shared: &EndpointShared, incoming: Incoming) -> Result<Open, DisconnectReason> {
+    let connection = incoming.accept().map_err(reason_of)?.await.map_err(reason_of)?;
+    let refuse = |reason| {
+        connection.close(code_of(reason), &[]);
+        reason
     };
-    let fingerprint = fingerprint_of(&connection).ok_or_else(|| refuse("no key shown"))?;
-    let (mut send, mut recv) = connection.accept_bi().await.map_err(|e| reason_of(e, None))?;
+    let fingerprint = fingerprint_of(&connection).ok_or_else(|| refuse(DisconnectReason::Protocol))?;
+    let (mut send, mut recv) = connection.accept_bi().await.map_err(reason_of)?;
     let first = wire::read_message(&mut recv, TOKEN_MESSAGE).await;
     let token = first.ok().and_then(|first| wire::token_from_message(&first).ok());
     let Some(token) = token else {
-        return Err(refuse("the first message is no token"));
+        return Err(refuse(DisconnectReason::Protocol));
     };
     let access = Arc::clone(&lock(&shared.access));
     let role = access.role(token, SystemTime::now()).map_err(refuse)?;
     if shared.is_stopping() {
-        return Err(refuse("the host is leaving"));
+        return Err(refuse(DisconnectReason::Left));
     }
     discard_early(&connection).await;
     let answered = async {
@@ -232,7 +219,7 @@ async fn welcome(shared: &EndpointShared, incoming: Incoming) -> Result<Open, Cl
         send.write_all(&[role.to_byte()]).await
     };
     if answered.await.is_err() {
-        return Err(CloseReason::Failed { words: "the guest closed its stream".into() });
+        return Err(DisconnectReason::Lost);
     }
     let peer = PeerId(shared.next_peer.fetch_add(1, Ordering::Relaxed));
     Ok(Open { peer, role, fingerprint, connection, send, recv })
@@ -247,7 +234,7 @@ async fn join(
     refused: &Mutex<Option<Fingerprint>>,
 ) {
     let entered = timeout(shared.limits.handshake, enter(endpoint, client, invite, refused)).await;
-    match entered.unwrap_or(Err(CloseReason::TimedOut)) {
+    match entered.unwrap_or(Err(DisconnectReason::Silent)) {
         Ok(host) => host.serve(shared).await,
         Err(reason) => shared.inbox.close(PeerId::HOST, reason),
     }
@@ -258,13 +245,16 @@ async fn enter(
     client: ClientConfig,
     invite: &Invite,
     refused: &Mutex<Option<Fingerprint>>,
-) -> Result<Open, CloseReason> {
-    let failed = |words: String| CloseReason::Failed { words };
+) -> Result<Open, DisconnectReason> {
     let resolved = tokio::net::lookup_host((invite.host.as_str(), invite.port)).await;
-    let address = resolved
-        .map_err(|error| failed(format!("`{}` does not resolve: {error}", invite.host)))?
-        .next()
-        .ok_or_else(|| failed(format!("`{}` has no address", invite.host)))?;
+    let address = match resolved.map(|mut addresses| addresses.next()) {
+        Ok(Some(address)) => address,
+        Ok(None) => return Err(DisconnectReason::UnknownHost),
+        Err(error) => {
+            warn!("`{}` does not resolve: {error}", invite.host);
+            return Err(DisconnectReason::UnknownHost);
+        }
+    };
     // The socket was bound before the name was resolved. On an IPv6 socket, an IPv4 address is used
     // in its mapped form.
     let address = match (address, endpoint.local_addr()) {
@@ -274,14 +264,14 @@ async fn enter(
         (address, _) => address,
     };
     let reason = |error| {
-        let found = *lock(refused);
-        reason_of(
-            error,
-            found.map(|found| CloseReason::WrongFingerprint { expected: invite.fingerprint, found }),
-        )
+        let Some(found) = *lock(refused) else { return reason_of(error) };
+        warn!("the host shows the key {found}, the invite says {}", invite.fingerprint);
+        DisconnectReason::WrongKey
     };
-    let connecting =
-        endpoint.connect_with(client, address, SERVER_NAME).map_err(|error| failed(error.to_string()))?;
+    let connecting = endpoint.connect_with(client, address, SERVER_NAME).map_err(|error| {
+        debug!("cannot connect to {address}: {error}");
+        DisconnectReason::Lost
+    })?;
     let connection = connecting.await.map_err(reason)?;
     let (mut send, mut recv) = connection.open_bi().await.map_err(reason)?;
     let token = wire::token_to_message(invite.token);
@@ -290,16 +280,16 @@ async fn enter(
         send.write_all(&token).await
     };
     let welcomed = match written.await {
-        Ok(()) => wire::read_message(&mut recv, 1).await.map_err(|error| error.to_string()),
-        Err(error) => Err(error.to_string()),
+        Ok(()) => wire::read_message(&mut recv, 1).await.ok(),
+        Err(_) => None,
     };
     let role = match welcomed.map(|message| message.first().copied().and_then(Role::from_byte)) {
-        Ok(Some(role)) => role,
-        Ok(None) => return Err(CloseReason::Protocol { words: "a welcome without a role".into() }),
+        Some(Some(role)) => role,
+        Some(None) => return Err(DisconnectReason::Protocol),
         // A refusal closes the connection, and the reason is in the close.
-        Err(words) => {
+        None => {
             let closed = timeout(Duration::from_millis(200), connection.closed()).await;
-            return Err(closed.map_or(failed(words), reason));
+            return Err(closed.map_or(DisconnectReason::Lost, reason));
         }
     };
     Ok(Open { peer: PeerId::HOST, role, fingerprint: invite.fingerprint, connection, send, recv })
@@ -320,46 +310,31 @@ fn fingerprint_of(connection: &Connection) -> Option<Fingerprint> {
     Fingerprint::of_certificate(chain.first()?).ok()
 }
 
-/// Removes control characters from text of the other end and cuts it, for logs and displays.
-fn clean(words: &[u8]) -> String {
-    let words: String = String::from_utf8_lossy(words).chars().filter(|c| !c.is_control()).collect();
-    shortened(&words)
-}
-
 /// The TLS alert of a host that has no protocol in common with the guest (RFC 7301).
 const NO_APPLICATION_PROTOCOL: u8 = 120;
 
-fn reason_of(error: ConnectionError, refused: Option<CloseReason>) -> CloseReason {
+fn reason_of(error: ConnectionError) -> DisconnectReason {
     match error {
-        ConnectionError::LocallyClosed => CloseReason::ByUs,
-        ConnectionError::TimedOut => CloseReason::TimedOut,
+        ConnectionError::LocallyClosed => DisconnectReason::Left,
+        ConnectionError::TimedOut => DisconnectReason::Silent,
         ConnectionError::ApplicationClosed(close) => {
-            let words = clean(&close.reason);
-            match u32::try_from(close.error_code.into_inner()) {
-                Ok(REFUSED) => CloseReason::Refused { words },
-                Ok(PROTOCOL) => CloseReason::Failed { words: format!("the other end says: {words}") },
-                code => {
-                    let reason = code.ok().and_then(|code| u8::try_from(code.checked_sub(SESSION)?).ok());
-                    // A later version may have more reasons.
-                    let reason =
-                        reason.and_then(DisconnectReason::from_code).unwrap_or(DisconnectReason::Left);
-                    CloseReason::ByPeer { reason, words }
-                }
-            }
+            let code = u8::try_from(close.error_code.into_inner());
+            // A later version may have more reasons.
+            code.ok().and_then(DisconnectReason::from_code).unwrap_or(DisconnectReason::Left)
         }
         ConnectionError::ConnectionClosed(close)
             if close.error_code == TransportErrorCode::CONNECTION_REFUSED =>
         {
-            CloseReason::NoRoom
+            DisconnectReason::Full
         }
         ConnectionError::ConnectionClosed(close)
             if close.error_code == TransportErrorCode::crypto(NO_APPLICATION_PROTOCOL) =>
         {
-            // Another attempt would be refused too.
-            CloseReason::Refused { words: "it speaks another version of the protocol".into() }
+            DisconnectReason::VersionMismatch
         }
         other => {
-            refused.unwrap_or_else(|| CloseReason::Failed { words: clean(other.to_string().as_bytes()) })
+            debug!("the connection failed: {other}");
+            DisconnectReason::Lost
         }
     }
 }
@@ -386,7 +361,7 @@ impl Open {
                 reason = messages_in => reason,
                 reason = messages_out => reason,
                 reason = hung_up => reason,
-                error = connection.closed() => reason_of(error, None),
+                error = connection.closed() => reason_of(error),
                 () = datagrams_in => unreachable_end(),
                 () = datagrams_out => unreachable_end(),
                 () = metrics => unreachable_end(),
@@ -399,8 +374,8 @@ impl Open {
 }
 
 /// The three tasks without a result run until the connection is closed, which another arm reports.
-fn unreachable_end() -> CloseReason {
-    CloseReason::Failed { words: "the connection's task ended".into() }
+fn unreachable_end() -> DisconnectReason {
+    DisconnectReason::Lost
 }
 
 /// Discards datagrams that arrived before the welcome. Takes those that are there and does not wait
@@ -448,7 +423,7 @@ async fn read_messages(
     connection: &Connection,
     recv: &mut RecvStream,
     room: &Notify,
-) -> CloseReason {
+) -> DisconnectReason {
     loop {
         match wire::read_message(recv, shared.limits.message).await {
             Ok(message) => {
@@ -459,9 +434,9 @@ async fn read_messages(
                 }
             }
             Err(error @ ReadMessageError::TooLong { .. }) => {
-                let words = error.to_string();
-                connection.close(VarInt::from_u32(PROTOCOL), words.as_bytes());
-                return CloseReason::Protocol { words };
+                debug!(peer = id.0, %error, "the connection is closed");
+                connection.close(code_of(DisconnectReason::Protocol), &[]);
+                return DisconnectReason::Protocol;
             }
             // The other end has finished its stream, or the connection is gone. The end of the
             // connection carries the reason.
@@ -489,7 +464,7 @@ async fn write_messages(
     peer: &PeerConnection,
     bucket: &Mutex<Bucket>,
     send: &mut SendStream,
-) -> CloseReason {
+) -> DisconnectReason {
     loop {
         match peer.outbox.next() {
             Some(Next::Message(bytes)) => {
@@ -497,12 +472,12 @@ async fn write_messages(
                     std::future::pending::<()>().await;
                 }
             }
-            Some(Next::Close(code, words)) => {
+            Some(Next::Close(reason)) => {
                 // A stream or connection that is already closed needs no goodbye.
                 let _ = send.finish();
                 let _ = timeout(GRACE, send.stopped()).await;
-                connection.close(VarInt::from_u32(code), words.as_bytes());
-                return CloseReason::ByUs;
+                connection.close(code_of(reason), &[]);
+                return reason;
             }
             None => peer.outbox.message_waits.notified().await,
         }
@@ -511,11 +486,11 @@ async fn write_messages(
 
 /// Closes the connection after [`GRACE`], even if a peer that does not read delays the messages
 /// before the goodbye.
-async fn hang_up(connection: &Connection, peer: &PeerConnection) -> CloseReason {
-    let (code, words) = peer.outbox.closing().await;
+async fn hang_up(connection: &Connection, peer: &PeerConnection) -> DisconnectReason {
+    let reason = peer.outbox.closing().await;
     sleep(GRACE).await;
-    connection.close(VarInt::from_u32(code), words.as_bytes());
-    CloseReason::ByUs
+    connection.close(code_of(reason), &[]);
+    reason
 }
 
 async fn write_message(

@@ -57,58 +57,8 @@ pub enum Event {
     Closed {
         /// The peer.
         peer: PeerId,
-        /// The reason.
-        reason: CloseReason,
-    },
-}
-
-/// Why a connection ended.
-#[derive(Clone, Debug, PartialEq, Eq, Error)]
-#[non_exhaustive]
-pub enum CloseReason {
-    /// This end closed the connection.
-    #[error("closed by this end")]
-    ByUs,
-    /// The other end closed the connection.
-    #[error("the other end left: {words}")]
-    ByPeer {
-        /// The reason, from the close code.
+        /// The reason that this end or the other one gave, or that the connection shows.
         reason: DisconnectReason,
-        /// The other end's text, shortened and without control characters.
-        words: String,
-    },
-    /// Nothing arrived within the idle timeout, or the handshake took too long.
-    #[error("nothing was received from the other end in time")]
-    TimedOut,
-    /// The host has another key than the invite names: it is another host, or a man in the middle.
-    #[error("the host shows the key {found}, the invite says {expected}")]
-    WrongFingerprint {
-        /// The key in the invite.
-        expected: Fingerprint,
-        /// The key that the host presented.
-        found: Fingerprint,
-    },
-    /// The host does not admit this guest.
-    #[error("refused by the host: {words}")]
-    Refused {
-        /// The host's text, shortened and without control characters.
-        words: String,
-    },
-    /// The host has no room for this guest at present.
-    #[error("the host has no room")]
-    NoRoom,
-    /// The peer violated the stream's protocol.
-    #[error("the other end broke the protocol: {words}")]
-    Protocol {
-        /// What the violation was.
-        words: String,
-    },
-    /// The connection failed: for example, the name does not resolve, the versions differ, the peer
-    /// restarted or the handshake failed.
-    #[error("the connection failed: {words}")]
-    Failed {
-        /// What failed.
-        words: String,
     },
 }
 
@@ -417,10 +367,10 @@ impl Endpoint {
     }
 
     /// Closes a connection once its queued messages are sent, or after at most a second. The peer
-    /// receives `reason` as a code, and `words` as text for people.
-    pub fn close(&self, peer: PeerId, reason: DisconnectReason, words: &str) {
+    /// receives the code of `reason`.
+    pub fn close(&self, peer: PeerId, reason: DisconnectReason) {
         if let Some(peer) = self.peer(peer) {
-            peer.outbox.close(driver::code_of(reason), words.to_owned());
+            peer.outbox.close(reason);
         }
     }
 

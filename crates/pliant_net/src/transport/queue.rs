@@ -6,10 +6,10 @@ use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 use std::time::Instant;
 
 use bytes::Bytes;
-use pliant_stream::PeerId;
+use pliant_stream::{DisconnectReason, PeerId};
 use tokio::sync::Notify;
 
-use super::endpoint::{CloseReason, Event};
+use super::endpoint::Event;
 
 /// Locks a mutex, even if another thread has panicked while it held the lock. The queues hold plain
 /// data that is valid between calls.
@@ -54,7 +54,7 @@ impl Inbox {
         room
     }
 
-    pub(super) fn close(&self, peer: PeerId, reason: CloseReason) {
+    pub(super) fn close(&self, peer: PeerId, reason: DisconnectReason) {
         let mut state = lock(&self.0);
         state.peers.remove(&peer);
         state.events.push_back(Event::Closed { peer, reason });
@@ -130,16 +130,16 @@ struct OutboxState {
     messages: VecDeque<Bytes>,
     message_bytes: usize,
     /// Code and text of the close, until the message writer takes them after the last message.
-    closing: Option<(u32, String)>,
+    closing: Option<DisconnectReason>,
     /// The same code and text, which stay set.
-    hung_up: Option<(u32, String)>,
+    hung_up: Option<DisconnectReason>,
 }
 
 /// The next task of the message writer.
 #[derive(Debug)]
 pub(super) enum Next {
     Message(Bytes),
-    Close(u32, String),
+    Close(DisconnectReason),
 }
 
 impl Outbox {
@@ -177,22 +177,22 @@ impl Outbox {
         lock(&self.state).message_bytes
     }
 
-    pub(super) fn close(&self, code: u32, words: String) {
+    pub(super) fn close(&self, reason: DisconnectReason) {
         let mut state = lock(&self.state);
         if state.hung_up.is_none() {
-            state.hung_up = Some((code, words.clone()));
-            state.closing = Some((code, words));
+            state.hung_up = Some(reason);
+            state.closing = Some(reason);
         }
         drop(state);
         self.message_waits.notify_one();
         self.close_waits.notify_one();
     }
 
-    /// Waits for [`Outbox::close`] and returns its code and text.
-    pub(super) async fn closing(&self) -> (u32, String) {
+    /// Waits for [`Outbox::close`] and returns its reason.
+    pub(super) async fn closing(&self) -> DisconnectReason {
         loop {
-            if let Some(asked) = lock(&self.state).hung_up.clone() {
-                return asked;
+            if let Some(reason) = lock(&self.state).hung_up {
+                return reason;
             }
             self.close_waits.notified().await;
         }
@@ -212,7 +212,7 @@ impl Outbox {
             state.message_bytes = state.message_bytes.saturating_sub(bytes.len() + MESSAGE_COST);
             return Some(Next::Message(bytes));
         }
-        state.closing.take().map(|(code, words)| Next::Close(code, words))
+        state.closing.take().map(Next::Close)
     }
 }
 
@@ -225,7 +225,7 @@ mod tests {
     }
 
     fn left(peer: PeerId) -> Event {
-        Event::Closed { peer, reason: CloseReason::TimedOut }
+        Event::Closed { peer, reason: DisconnectReason::Silent }
     }
 
     #[test]
@@ -274,10 +274,10 @@ mod tests {
         assert!(matches!(outbox.next(), Some(Next::Message(_))));
         assert!(outbox.push_message(large, 1000));
         // Queued messages go out before the close, and no message is accepted after it.
-        outbox.close(0, "bye".into());
+        outbox.close(DisconnectReason::Full);
         assert!(!outbox.push_message(bytes(0), 1000));
         assert!(matches!(outbox.next(), Some(Next::Message(_))));
-        assert!(matches!(outbox.next(), Some(Next::Close(0, words)) if words == "bye"));
+        assert!(matches!(outbox.next(), Some(Next::Close(DisconnectReason::Full))));
         assert!(outbox.next().is_none());
     }
 }

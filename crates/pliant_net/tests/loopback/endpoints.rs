@@ -4,7 +4,7 @@ use std::time::Duration;
 
 use bytes::Bytes;
 use pliant_net::transport::{
-    CloseReason, Endpoint, Event, Fingerprint, HostOptions, Invite, JoinOptions, Limits, PeerId,
+    DisconnectReason, Endpoint, Event, Fingerprint, HostOptions, Invite, JoinOptions, Limits, PeerId,
 };
 
 use crate::wait::wait_for;
@@ -38,7 +38,7 @@ pub fn connected(endpoint: &Endpoint) -> (PeerId, Fingerprint) {
     })
 }
 
-pub fn closed(endpoint: &Endpoint) -> CloseReason {
+pub fn closed(endpoint: &Endpoint) -> DisconnectReason {
     next(endpoint, |event| match event {
         Event::Closed { reason, .. } => Some(reason),
         _ => None,

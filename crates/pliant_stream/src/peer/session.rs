@@ -359,11 +359,11 @@ impl PeerSession {
                 let user = UserId(user);
                 let taken = user == self.config.user || self.inputs.users.get(&user).is_some_and(|u| !u.gone);
                 let refused = if version != PROTOCOL_VERSION {
-                    Some(DisconnectReason::Version)
+                    Some(DisconnectReason::VersionMismatch)
                 } else if other.user.is_some() || user != other.expected || taken {
                     Some(DisconnectReason::Protocol)
                 } else {
-                    (Some(scene) != own).then_some(DisconnectReason::Scene)
+                    (Some(scene) != own).then_some(DisconnectReason::SceneMismatch)
                 };
                 if let Some(reason) = refused {
                     self.message(peer, &PeerMessage::Goodbye { reason });

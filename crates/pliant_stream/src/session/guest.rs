@@ -249,7 +249,7 @@ impl GuestSession {
         match (message, self.standing) {
             (HostMessage::Welcome { version, user, step_ns, beta, gamma, users }, GuestStanding::Greeted) => {
                 if version != PROTOCOL_VERSION {
-                    return self.close(DisconnectReason::Version);
+                    return self.close(DisconnectReason::VersionMismatch);
                 }
                 self.newmark = Newmark { h: step_ns as f64 * 1e-9, beta, gamma };
                 self.standing = GuestStanding::In(UserId(user));
@@ -335,10 +335,10 @@ impl GuestSession {
                 self.users.insert(info.user, info.clone());
                 self.event(GuestEvent::UserJoined(info));
             }
-            HostMessage::UserLeft { user } => {
+            HostMessage::UserLeft { user, reason } => {
                 self.users.remove(&UserId(user));
                 self.links.remove(&UserId(user));
-                self.event(GuestEvent::UserLeft { user: UserId(user) });
+                self.event(GuestEvent::UserLeft { user: UserId(user), reason });
             }
             HostMessage::GrabRefused { grab } => {
                 if let Some(own) = self.grabs.remove(&grab) {

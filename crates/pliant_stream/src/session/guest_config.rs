@@ -124,6 +124,8 @@ pub enum GuestEvent {
     UserLeft {
         /// User number.
         user: UserId,
+        /// The reason.
+        reason: DisconnectReason,
     },
     /// The host refused or ended one of the guest's grabs.
     GrabRefused {

@@ -152,7 +152,7 @@ impl HostSession {
         let flowing = std::mem::take(&mut p.flowing);
         p.due.extend(flowing);
         if bytes < MIN_DATAGRAM && p.user().is_some() {
-            self.drop_peer(peer, DisconnectReason::Path, true);
+            self.drop_peer(peer, DisconnectReason::SmallDatagrams, true);
         }
     }
 
@@ -336,10 +336,10 @@ impl HostSession {
                 if p.standing == Standing::Silent =>
             {
                 if version != PROTOCOL_VERSION {
-                    return self.drop_peer(peer, DisconnectReason::Version, true);
+                    return self.drop_peer(peer, DisconnectReason::VersionMismatch, true);
                 }
                 if p.link.max_datagram < MIN_DATAGRAM {
-                    return self.drop_peer(peer, DisconnectReason::Path, true);
+                    return self.drop_peer(peer, DisconnectReason::SmallDatagrams, true);
                 }
                 p.name = name;
                 p.subscription = Some(subscription);
@@ -528,7 +528,7 @@ impl HostSession {
                 self.event(HostEvent::GrabEnded { key: GrabKey { user, grab: *grab }, body: held.body });
             }
             for other in self.peers.values_mut().filter(|p| p.user().is_some()) {
-                other.send_message(&HostMessage::UserLeft { user: user.0 }, &mut self.out);
+                other.send_message(&HostMessage::UserLeft { user: user.0, reason }, &mut self.out);
             }
         }
         self.event(HostEvent::Left { peer, user, reason });

@@ -17,6 +17,7 @@
 //! stream in each direction, with the length of each message before the message as four bytes,
 //! little-endian. A message has at most [`MAX_MESSAGE`] bytes.
 
+mod disconnect_reason;
 mod download;
 mod guest;
 mod guest_body;
@@ -32,6 +33,7 @@ mod regulator;
 mod upload;
 
 pub use crate::link::LinkStats;
+pub use disconnect_reason::DisconnectReason;
 pub use guest::GuestSession;
 pub use guest_body::BodyView;
 pub use guest_config::{GuestConfig, GuestEvent};
@@ -65,76 +67,4 @@ pub struct Output {
     pub channel: Channel,
     /// The content. It is shared, so that one frame goes to many peers without a copy.
     pub bytes: std::sync::Arc<[u8]>,
-}
-
-/// Says why a session ended.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, serde::Serialize, serde::Deserialize, thiserror::Error)]
-#[non_exhaustive]
-pub enum DisconnectReason {
-    /// The other side left.
-    #[error("left")]
-    Left,
-    /// Nothing arrived for the idle timeout.
-    #[error("nothing arrived for too long")]
-    Silent,
-    /// The transport lost the connection.
-    #[error("connection lost")]
-    Lost,
-    /// The other side broke the protocol.
-    #[error("protocol broken")]
-    Protocol,
-    /// The two sides have different protocol versions.
-    #[error("other protocol version")]
-    Version,
-    /// The host refused the guest.
-    #[error("refused")]
-    Refused,
-    /// The host has no room left, or a model exceeds [`GuestConfig::model_bytes`].
-    #[error("full")]
-    Full,
-    /// The path's datagrams are too small, see [`MIN_DATAGRAM`].
-    #[error("datagrams too small")]
-    Path,
-    /// The two sides have different bodies or different step settings.
-    #[error("other bodies or settings")]
-    Scene,
-}
-
-impl DisconnectReason {
-    /// All reasons, each at the index of its number on the wire.
-    const ALL: [Self; 9] = [
-        Self::Left,
-        Self::Silent,
-        Self::Lost,
-        Self::Protocol,
-        Self::Version,
-        Self::Refused,
-        Self::Full,
-        Self::Path,
-        Self::Scene,
-    ];
-
-    /// Number of the reason on the wire.
-    pub fn code(self) -> u8 {
-        self as u8
-    }
-
-    /// Returns the reason with this number, or `None` for a number that this version does not know.
-    pub fn from_code(code: u8) -> Option<Self> {
-        Self::ALL.get(usize::from(code)).copied()
-    }
-}
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-
-    #[test]
-    fn each_end_has_the_same_number_in_messages_and_as_a_code() {
-        for (code, reason) in (0..).zip(DisconnectReason::ALL) {
-            assert_eq!(postcard::to_allocvec(&reason).unwrap(), [code]);
-            assert_eq!((reason.code(), DisconnectReason::from_code(code)), (code, Some(reason)));
-        }
-        assert_eq!(DisconnectReason::from_code(9), None);
-    }
 }

@@ -109,7 +109,7 @@ impl HostSession {
         }
         for (peer, key, due) in takers {
             let Some(Outgoing { frame, anew: fresh }) = frames.get(&key) else {
-                self.drop_peer(peer, DisconnectReason::Path, true);
+                self.drop_peer(peer, DisconnectReason::SmallDatagrams, true);
                 continue;
             };
             let Some(p) = self.peers.get_mut(&peer) else { continue };

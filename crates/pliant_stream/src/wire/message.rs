@@ -183,6 +183,8 @@ pub enum HostMessage {
     UserLeft {
         /// User number.
         user: u16,
+        /// The reason.
+        reason: DisconnectReason,
     },
     /// Quality of the host's links to its guests.
     Links(Vec<UserLinkInfo>),

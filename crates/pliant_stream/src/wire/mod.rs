@@ -22,4 +22,4 @@ pub(crate) use message::{MAX_BODIES, MAX_CACHED, MAX_NAME};
 pub use slice::{Slice, SliceEntry};
 
 /// Version of the formats in this module. The two sides of a session must agree.
-pub const PROTOCOL_VERSION: u16 = 3;
+pub const PROTOCOL_VERSION: u16 = 4;
