@@ -1,4 +1,4 @@
-//! Fuzzes datagrams of both directions. A datagram that was read must be writable and read back
+//! Fuzzes datagrams of hosts, guests and peers. A datagram that was read must be writable and read back
 //! equal.
 #![no_main]
 

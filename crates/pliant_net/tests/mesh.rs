@@ -7,7 +7,7 @@ use std::net::UdpSocket;
 use std::time::{Duration, Instant};
 
 use bevy::prelude::*;
-use bytes::{BufMut, Bytes, BytesMut};
+use bytes::Bytes;
 use pliant_body::{ModalAsset, ModalBody};
 use pliant_net::transport::{Endpoint, Event, JoinOptions, Limits};
 use pliant_net::{
@@ -15,14 +15,9 @@ use pliant_net::{
     SharedBody, Token, User,
 };
 use pliant_stream::emulator::{LinkConfig, Loss};
-use pliant_stream::peer::digest;
-use pliant_stream::{DisconnectReason, PeerId, StepSettings};
+use pliant_stream::wire::{PROTOCOL_VERSION, PeerMessage};
+use pliant_stream::{DisconnectReason, PeerId};
 use support::{alone, app, bar, must, run_frames, run_until, wait_for};
-
-const SESSION: u8 = 0;
-const INTRODUCE: u8 = 16;
-const WELCOME: u8 = 17;
-const MEMBER: u8 = 18;
 
 /// Limits with which peers time out after half a minute, and a new peer has five seconds to
 /// introduce itself.
@@ -31,55 +26,46 @@ fn limits() -> Limits {
     Limits { idle_timeout, handshake, ..Limits::host() }
 }
 
-fn peer(name: &str, join: Option<Invite>, access: Access, limits: Limits) -> (App, Entity) {
+fn peer(name: &str, join: Option<Invite>, access: Access, limits: Limits) -> App {
     let transport = HostOptions { limits, access, ..HostOptions::default() };
     let mut app =
         app(NetPlugin::peer(PeerConfig { name: name.into(), join, transport, ..PeerConfig::default() })
             .unwrap());
     let handle = app.world_mut().resource_mut::<Assets<ModalAsset>>().add(ModalAsset(bar()));
-    let body = app.world_mut().spawn((ModalBody::new(handle), SharedBody::named("bar"))).id();
-    (app, body)
+    app.world_mut().spawn((ModalBody::new(handle), SharedBody::named("bar")));
+    app
 }
 
-fn first(access: Access, limits: Limits) -> (App, Entity, Invite) {
-    let (mut a, body) = peer("a", None, access, limits);
+fn first(access: Access, limits: Limits) -> (App, Invite) {
+    let mut a = peer("a", None, access, limits);
     run_until(&mut [&mut a], "the first begins", |apps| {
         matches!(apps[0].world().resource::<NetPeer>().state(), PeerState::In { .. })
     });
     let invite = a.world().resource::<NetPeer>().invite();
-    (a, body, invite)
+    (a, invite)
 }
 
 fn users(app: &mut App) -> usize {
     app.world_mut().query::<&User>().iter(app.world()).count()
 }
 
-/// The first message of a new peer with the right body.
-fn introduction(app: &App, body: Entity, invite: &Invite) -> Bytes {
-    let mut bytes = BytesMut::new();
-    bytes.put_u8(INTRODUCE);
-    put_scene(&mut bytes, app, body, invite);
-    bytes.freeze()
+/// The first message of a peer with the right body. The number 0 requests a number.
+fn hello(app: &App, user: u16, invite: &Invite) -> Bytes {
+    let hello = PeerMessage::Hello {
+        version: PROTOCOL_VERSION,
+        user,
+        name: "by hand".into(),
+        address: invite.to_string(),
+        joining: true,
+        scene: app.world().resource::<NetPeer>().session().unwrap().scene(),
+    };
+    hello.encode().into()
 }
 
-/// The first message of the new peer of a number to a peer that it was told of.
-fn membership(app: &App, body: Entity, number: u16, invite: &Invite) -> Bytes {
-    let mut bytes = BytesMut::new();
-    bytes.put_u8(MEMBER);
-    bytes.put_u16_le(number);
-    put_scene(&mut bytes, app, body, invite);
-    bytes.freeze()
-}
-
-fn put_scene(bytes: &mut BytesMut, app: &App, body: Entity, invite: &Invite) {
-    let number = app.world().resource::<NetPeer>().body_of(body).unwrap();
-    let words = invite.to_string();
-    bytes.put_u64_le(25_000_000);
-    bytes.put_u16_le(1);
-    bytes.put_u16_le(number.0);
-    bytes.put_slice(&digest(&bar(), &StepSettings::default()));
-    bytes.put_u16_le(words.len() as u16);
-    bytes.put_slice(words.as_bytes());
+/// The answer of the peer at `door`, with number 1, to one that requests a number.
+fn admit(app: &App, door: &Endpoint, asks: PeerId, user: u16, others: Vec<(u16, String)>) {
+    door.send_message(asks, hello(app, 1, &door.invite())).unwrap();
+    door.send_message(asks, PeerMessage::Welcome { user, others }.encode().into()).unwrap();
 }
 
 struct UnauthenticatedPeer {
@@ -107,7 +93,11 @@ impl UnauthenticatedPeer {
     }
 
     fn welcomed(&self) -> bool {
-        self.messages.iter().any(|bytes| bytes.first() == Some(&WELCOME))
+        self.said(|message| matches!(message, PeerMessage::Welcome { .. }))
+    }
+
+    fn said(&self, what: impl Fn(&PeerMessage) -> bool) -> bool {
+        self.messages.iter().any(|bytes| PeerMessage::decode(bytes).is_ok_and(|message| what(&message)))
     }
 }
 
@@ -115,8 +105,8 @@ impl UnauthenticatedPeer {
 fn who_was_sent_away_from_among_peers_gets_in_by_no_message_that_follows() {
     let _alone = alone();
     let (hold, watch) = (Token([1; 16]), Token([2; 16]));
-    let (mut a, body, invite) = first(Access::Tokens(vec![Grant::hold(hold), Grant::watch(watch)]), limits());
-    let hello = introduction(&a, body, &invite);
+    let (mut a, invite) = first(Access::Tokens(vec![Grant::hold(hold), Grant::watch(watch)]), limits());
+    let hello = hello(&a, 0, &invite);
     // First the correct order, to check that these messages are accepted.
     let mut right = UnauthenticatedPeer::at(&invite.clone().with_token(hold));
     let mut said = false;
@@ -157,23 +147,15 @@ fn who_was_sent_away_from_among_peers_gets_in_by_no_message_that_follows() {
 #[test]
 fn who_connects_and_does_not_say_who_it_is_keeps_no_place() {
     let _alone = alone();
-    let (mut a, body, invite) = first(Access::Anyone, limits());
-    let hello = introduction(&a, body, &invite);
+    let (mut a, invite) = first(Access::Anyone, limits());
     let mut silent: Vec<UnauthenticatedPeer> = (0..4).map(|_| UnauthenticatedPeer::at(&invite)).collect();
-    // The last one sends its scene but does not introduce itself in the session.
-    let mut said = false;
     run_until(&mut [&mut a], "all are hung up on", |_| {
         silent.iter_mut().for_each(UnauthenticatedPeer::listen);
-        if let Some(last) = silent.last_mut().filter(|last| last.connected && !said) {
-            last.endpoint.send_message(PeerId::HOST, hello.clone()).unwrap();
-            said = true;
-        }
         silent.iter().all(|stranger| stranger.closed.is_some())
     });
-    assert!(silent[3].welcomed(), "the last was given a number");
     assert!(silent.iter().all(|stranger| stranger.closed == Some(DisconnectReason::Silent)));
     // A peer that introduces itself stays connected, for longer than a later one that does not.
-    let (mut b, _) = peer("b", Some(invite.clone()), Access::Anyone, limits());
+    let mut b = peer("b", Some(invite.clone()), Access::Anyone, limits());
     run_until(&mut [&mut a, &mut b], "a peer gets in", |apps| users(apps[0]) == 2 && users(apps[1]) == 2);
     let mut later = UnauthenticatedPeer::at(&invite);
     run_until(&mut [&mut a, &mut b], "a later one is hung up on", |_| {
@@ -194,11 +176,11 @@ fn who_has_lost_two_peers_looks_for_both() {
     let _alone = alone();
     let handshake = Duration::from_secs(2);
     let quick = || Limits { idle_timeout: Duration::from_secs(3), handshake, ..limits() };
-    let (mut a, _, invite) = first(Access::Anyone, quick());
-    let (mut b, _) = peer("b", Some(invite.clone()), Access::Anyone, quick());
+    let (mut a, invite) = first(Access::Anyone, quick());
+    let mut b = peer("b", Some(invite.clone()), Access::Anyone, quick());
     // Numbers are given in the order of the introductions.
     run_until(&mut [&mut a, &mut b], "the second is in", |apps| users(apps[1]) == 2);
-    let (mut c, _) = peer("c", Some(invite), Access::Anyone, quick());
+    let mut c = peer("c", Some(invite), Access::Anyone, quick());
     run_until(&mut [&mut a, &mut b, &mut c], "all know all", |apps| {
         apps.iter_mut().all(|app| users(app) == 3)
     });
@@ -219,28 +201,23 @@ fn who_has_lost_two_peers_looks_for_both() {
 fn who_comes_before_our_own_welcome_waits_for_it() {
     let _alone = alone();
     let door = Endpoint::host(HostOptions::default()).unwrap();
-    let (mut app, body) = peer("early", Some(door.invite()), Access::Anyone, limits());
+    let mut app = peer("early", Some(door.invite()), Access::Anyone, limits());
     let asks = run_until(&mut [&mut app], "it asks to come in", |_| asking(&door));
     // The peer at the door has told another new peer of this one, whose welcome is on its way.
     let own = app.world().resource::<NetPeer>().invite();
-    let membership = membership(&app, body, 3, &own);
+    let hello = hello(&app, 3, &own);
     let mut other = UnauthenticatedPeer::at(&own);
     run_until(&mut [&mut app], "the other is connected", |_| {
         other.listen();
         other.connected
     });
-    other.endpoint.send_message(PeerId::HOST, membership).unwrap();
+    other.endpoint.send_message(PeerId::HOST, hello).unwrap();
     run_frames(&mut [&mut app], 50);
-    let mut welcome = BytesMut::new();
-    welcome.put_u8(WELCOME);
-    welcome.put_u16_le(2);
-    welcome.put_u16_le(1);
-    welcome.put_u8(0);
-    door.send_message(asks, welcome.freeze()).unwrap();
+    admit(&app, &door, asks, 2, Vec::new());
     run_until(&mut [&mut app], "it talks to the other", |_| {
         other.listen();
         assert_eq!(other.closed, None);
-        other.messages.iter().any(|bytes| bytes.first() == Some(&SESSION))
+        other.said(|message| matches!(message, PeerMessage::Hello { user: 2, .. }))
     });
 }
 
@@ -258,20 +235,11 @@ const CALLS: u16 = 20;
 /// Creates a peer that has just been admitted and has received the invites of [`CALLS`] other
 /// peers. The peer at `door` admits it and keeps listening.
 fn calling(door: &Endpoint, silent: &UdpSocket, limits: Limits) -> App {
-    let (mut app, _) = peer("caller", Some(door.invite()), Access::Anyone, limits);
+    let mut app = peer("caller", Some(door.invite()), Access::Anyone, limits);
     let asks = run_until(&mut [&mut app], "it asks to come in", |_| asking(door));
     let words = Invite::new(silent.local_addr().unwrap(), Fingerprint([7; 32])).to_string();
-    let mut welcome = BytesMut::new();
-    welcome.put_u8(WELCOME);
-    welcome.put_u16_le(100);
-    welcome.put_u16_le(1);
-    welcome.put_u8(CALLS as u8);
-    for number in 0..CALLS {
-        welcome.put_u16_le(2 + number);
-        welcome.put_u16_le(words.len() as u16);
-        welcome.put_slice(words.as_bytes());
-    }
-    door.send_message(asks, welcome.freeze()).unwrap();
+    let others = (0..CALLS).map(|number| (2 + number, words.clone())).collect();
+    admit(&app, door, asks, 100, others);
     // The peer connects to the others in the frame in which it is admitted.
     run_until(&mut [&mut app], "it gets in", |apps| {
         matches!(apps[0].world().resource::<NetPeer>().state(), PeerState::In { .. })
@@ -291,18 +259,15 @@ fn calls_in_vain_freeze_no_frame_and_an_end_waits_for_all_of_them_at_once() {
     // A connection attempt that blocks a frame freezes it for a second each time. A busy machine
     // also freezes a frame now and then, so the test waits for a round without a freeze.
     wait_for("no frame waits for a call", || {
-        // All attempts are given up after two seconds. About then the peer has also waited that
-        // long for the peer at `door` to introduce itself.
+        // All attempts are given up after two seconds.
         let limits = Limits { handshake: Duration::from_secs(2), ..limits() };
         let mut app = calling(&door, &silent, limits);
-        let (began, mut longest, mut hung_up) = (Instant::now(), Duration::ZERO, false);
+        let (began, mut longest) = (Instant::now(), Duration::ZERO);
         wait_for("the calls are over", || {
             let frame = Instant::now();
             app.update();
             longest = longest.max(frame.elapsed());
-            let closed = |event| matches!(event, Event::Closed { .. });
-            hung_up |= std::iter::from_fn(|| door.poll()).any(closed);
-            hung_up && began.elapsed() > Duration::from_secs(4)
+            began.elapsed() > Duration::from_secs(4)
         });
         println!("longest frame {:.1} ms", longest.as_secs_f64() * 1e3);
         must!(longest < Duration::from_millis(500), "a frame of {longest:?}");

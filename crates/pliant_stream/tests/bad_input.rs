@@ -8,16 +8,12 @@ use std::sync::OnceLock;
 use std::time::Duration;
 
 use pliant_modal::{GrabConfig, ModalModel, Relaxation};
-use pliant_stream::emulator::{Loss, Trace};
-use pliant_stream::peer::{
-    HeldAt, InputTick, PeerBodyState, PeerDatagram, PeerFrame, PeerGrip, PeerMessage, StateCheck,
-};
-
 use pliant_stream::codec::quantization::Quanta;
+use pliant_stream::emulator::{Loss, Trace};
 use pliant_stream::wire::{
-    AccelerationCoding, Accelerations, BodyInfo, Clock, Datagram, Frame, FrameGrab, GuestMessage,
-    HostMessage, Nack, NackRun, Repeat, RepeatGrab, Report, Slice, SliceEntry, SnapshotBytes, TargetEntry,
-    Targets,
+    AccelerationCoding, Accelerations, BodyInfo, Clock, Datagram, Frame, FrameGrab, GuestMessage, HeldAt,
+    HostMessage, InputTick, Inputs, Nack, NackRun, PeerBodyState, PeerFrame, PeerGrip, PeerMessage, Repeat,
+    RepeatGrab, Report, Slice, SliceEntry, SnapshotBytes, StateCheck, TargetEntry, Targets,
 };
 use pliant_stream::{
     BodyId, Channel, DisconnectReason, GuestConfig, GuestEvent, GuestSession, HostConfig, HostEvent,
@@ -260,8 +256,8 @@ fn real_inputs() -> Vec<Vec<u8>> {
     }];
     let ticks = vec![InputTick { tick: 9, held }, InputTick { tick: 8, held: Vec::new() }];
     let check = Some(StateCheck { body: BODY, tick: 8, value: 0.5 });
-    all.push(PeerDatagram::Inputs { now: 9, ahead: Some(0.5), ticks, check }.encode(1));
-    all.push(PeerDatagram::Ask { runs: vec![(5, 3)] }.encode(2));
+    all.push(Datagram::Inputs(Inputs { now: 9, ahead: Some(0.5), ticks, check }).encode(1));
+    all.push(Datagram::InputRequest(vec![NackRun { first: 5, count: 3 }]).encode(2));
     let frame =
         PeerFrame { center: [0.0; 3], orientation: [0.0, 0.0, 0.0, 1.0], velocity: [0.1; 3], spin: [0.0; 3] };
     let body = PeerBodyState {
@@ -281,6 +277,16 @@ fn real_inputs() -> Vec<Vec<u8>> {
             flow: [0.0; 3],
         }],
     };
+    let hello = PeerMessage::Hello {
+        version: 4,
+        user: 2,
+        name: "a peer".into(),
+        address: "somewhere".into(),
+        joining: true,
+        scene: 0x0123_4567_89ab_cdef,
+    };
+    all.push(hello.encode());
+    all.push(PeerMessage::Welcome { user: 2, others: vec![(3, "elsewhere".into())] }.encode());
     all.push(PeerMessage::State { tick: 7, now: 9, bodies: vec![body] }.encode());
     all.push(b"12.5\nlost # a comment\n13\n".to_vec());
     all.push(bar(2, 0.05).to_bytes());
@@ -307,10 +313,6 @@ fn parse_all(bytes: &[u8]) -> u32 {
     if let Ok(m) = HostMessage::decode(bytes) {
         read += 1;
         assert_eq!(HostMessage::decode(&m.encode()), Ok(m));
-    }
-    if let Ok((sequence, d)) = PeerDatagram::decode(bytes) {
-        read += 1;
-        assert_eq!(PeerDatagram::decode(&d.encode(sequence)), Ok((sequence, d)));
     }
     if let Ok(m) = PeerMessage::decode(bytes) {
         read += 1;

@@ -6,8 +6,8 @@ mod support;
 
 use std::time::Duration;
 
-use pliant_stream::peer::{PeerConfig, PeerDatagram, PeerEvent, PeerSession};
-use pliant_stream::wire::{BodyInfo, GuestMessage, HostMessage, PROTOCOL_VERSION};
+use pliant_stream::peer::{PeerConfig, PeerEvent, PeerSession};
+use pliant_stream::wire::{BodyInfo, Datagram, GuestMessage, HostMessage, NackRun, PROTOCOL_VERSION};
 use pliant_stream::{
     Channel, DisconnectReason, GuestConfig, GuestEvent, GuestSession, HostSession, Newmark, PeerId,
     StepSettings, StreamError,
@@ -95,7 +95,7 @@ fn peers_survive_a_hundred_thousand_damaged_datagrams() {
     let mut all = peers(now);
     let mut state = 88_172_645_463_325_252;
     let mut next = || random(&mut state);
-    let mut last: Vec<Vec<u8>> = vec![PeerDatagram::Ask { runs: vec![(5, 3)] }.encode(2)];
+    let mut last: Vec<Vec<u8>> = vec![Datagram::InputRequest(vec![NackRun { first: 5, count: 3 }]).encode(2)];
     let mut taken = 0_u64;
     for round in 0..100_000_u64 {
         if round % 100 == 0 {
@@ -118,7 +118,7 @@ fn peers_survive_a_hundred_thousand_damaged_datagrams() {
         if next().is_multiple_of(8) {
             bytes.truncate(next() as usize % (bytes.len() + 1));
         }
-        taken += u64::from(PeerDatagram::decode(&bytes).is_ok());
+        taken += u64::from(Datagram::decode(&bytes).is_ok());
         let (from, to) = (next() % 3, (next() % 3) as usize);
         if from as usize != to {
             all[to].on_datagram(now, PeerId(from), &bytes);

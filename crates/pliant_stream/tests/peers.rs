@@ -9,11 +9,10 @@ use std::time::Duration;
 
 use pliant_modal::{Body, BodyConfig, GrabConfig, Integrator, ModalModel, Patch, Relaxation};
 use pliant_stream::emulator::{Link, LinkConfig, Loss, Preset};
-use pliant_stream::peer::{
-    HeldAt, InputTick, PeerBodyState, PeerConfig, PeerDatagram, PeerEvent, PeerMessage, PeerSession, Repair,
-    StateCheck,
+use pliant_stream::peer::{PeerConfig, PeerEvent, PeerSession, Repair};
+use pliant_stream::wire::{
+    Datagram, HeldAt, InputTick, Inputs, NackRun, PROTOCOL_VERSION, PeerBodyState, PeerMessage, StateCheck,
 };
-use pliant_stream::wire::PROTOCOL_VERSION;
 use pliant_stream::{BodyId, Channel, DisconnectReason, PeerId, StepSettings, UserId};
 use proptest::prelude::*;
 use support::{bar, loose_bar};
@@ -353,6 +352,7 @@ fn greeted(p: &mut PeerSession) {
         version: PROTOCOL_VERSION,
         user: 1,
         name: "first".into(),
+        address: String::new(),
         joining: false,
         scene: p.scene(),
     };
@@ -362,7 +362,7 @@ fn greeted(p: &mut PeerSession) {
 /// Delivers inputs of the peer with the lowest number. Returns whether `p` then requests its state.
 fn asks(p: &mut PeerSession, tick: u16, sequence: u16, check: Option<StateCheck>) -> bool {
     let ticks = vec![InputTick { tick: p.tick(), held: Vec::new() }];
-    let datagram = PeerDatagram::Inputs { now: p.tick(), ahead: None, ticks, check };
+    let datagram = Datagram::Inputs(Inputs { now: p.tick(), ahead: None, ticks, check });
     p.on_datagram(25 * MS * u32::from(tick), PeerId(1), &datagram.encode(sequence));
     let mut asked = false;
     while let Some(out) = p.poll_output() {
@@ -470,7 +470,7 @@ fn a_liar_is_not_believed_by_the_lowest_and_cannot_harm() {
     let p = mesh.peers[0].as_mut().unwrap();
     for s in 0..500_u16 {
         let check = Some(StateCheck { body: BODY, tick: p.confirmed(), value: 1e6 });
-        let lie = PeerDatagram::Inputs { now: 1, ahead: Some(500.0), ticks: Vec::new(), check };
+        let lie = Datagram::Inputs(Inputs { now: 1, ahead: Some(500.0), ticks: Vec::new(), check });
         p.on_datagram(mesh.now, PeerId(1), &lie.encode(s));
     }
     mesh.run(8 * S);
@@ -523,7 +523,7 @@ fn the_lowest_number_is_believed_when_it_was_asked() {
     let p = mesh.peers[1].as_mut().unwrap();
     for s in 0..3_u16 {
         let check = Some(StateCheck { body: BODY, tick: p.confirmed(), value: 1e6 });
-        let said = PeerDatagram::Inputs { now: p.tick(), ahead: None, ticks: Vec::new(), check };
+        let said = Datagram::Inputs(Inputs { now: p.tick(), ahead: None, ticks: Vec::new(), check });
         p.on_datagram(mesh.now, PeerId(0), &said.encode(s));
     }
     mesh.run(8 * S);
@@ -541,7 +541,7 @@ fn ask_floods_are_answered_within_bounds() {
     mesh.run(5 * S);
     let p = mesh.peers[0].as_mut().unwrap();
     let now = p.tick();
-    let ask = PeerDatagram::Ask { runs: vec![(now - 100, 100); 16] };
+    let ask = Datagram::InputRequest(vec![NackRun { first: now - 100, count: 50 }; 32]);
     let answered = |p: &mut PeerSession, at: Duration| {
         for s in 0..2000_u16 {
             p.on_datagram(at, PeerId(1), &ask.encode(s));
@@ -550,8 +550,8 @@ fn ask_floods_are_answered_within_bounds() {
         let (mut ticks, mut states) = (0, 0);
         p.update(at);
         while let Some(o) = p.poll_output() {
-            match (PeerDatagram::decode(&o.bytes), PeerMessage::decode(&o.bytes)) {
-                (Ok((_, PeerDatagram::Inputs { ticks: t, .. })), _) if o.channel == Channel::Datagram => {
+            match (Datagram::decode(&o.bytes), PeerMessage::decode(&o.bytes)) {
+                (Ok((_, Datagram::Inputs(Inputs { ticks: t, .. }))), _) if o.channel == Channel::Datagram => {
                     ticks += t.len();
                 }
                 (_, Ok(PeerMessage::State { .. })) if o.channel == Channel::Message => states += 1,
@@ -584,6 +584,7 @@ fn a_peer_under_another_number_than_the_one_it_was_given_is_turned_away() {
             version: PROTOCOL_VERSION,
             user,
             name: "other".into(),
+            address: String::new(),
             joining: false,
             scene,
         };
@@ -595,10 +596,63 @@ fn a_peer_under_another_number_than_the_one_it_was_given_is_turned_away() {
         assert_eq!((p.poll_event(), p.user_of(PeerId(7))), (None, None));
         p.connect(MS, PeerId(9), UserId(8), 1200).unwrap();
         p.on_message(MS, PeerId(9), &hello(8).encode());
-        assert_eq!(p.poll_event(), Some(PeerEvent::Joined { user: UserId(8), name: "other".into() }));
+        assert!(matches!(p.poll_event(), Some(PeerEvent::Joined { user: UserId(8), .. })));
         assert_eq!(p.user_of(PeerId(9)), Some(UserId(8)));
     }
     assert!(PeerSession::new(PeerConfig { user: UserId::HOST, ..Default::default() }).is_err());
+}
+
+fn lone(user: UserId, founds: bool) -> PeerSession {
+    let address = format!("address of {}", user.0);
+    let mut p = PeerSession::new(PeerConfig { user, founds, address, ..Default::default() }).unwrap();
+    p.add_body(BODY, bar(4, 0.05), &StepSettings::default()).unwrap();
+    p
+}
+
+/// Delivers the messages of `from`, which `to` knows as `peer`. Returns their number.
+fn tell(from: &mut PeerSession, to: &mut PeerSession, peer: PeerId) -> usize {
+    let said = std::iter::from_fn(|| from.poll_output()).filter(|out| out.channel == Channel::Message);
+    said.map(|out| to.on_message(100 * MS, peer, &out.bytes)).count()
+}
+
+#[test]
+fn a_new_peer_is_given_its_number_and_those_who_come_before_wait_for_it() {
+    let (mut first, mut new, mut early) =
+        (lone(UserId(1), true), lone(UserId::HOST, false), lone(UserId(3), false));
+    for k in 0..10 {
+        first.update(25 * MS * k);
+    }
+    while first.poll_output().is_some() {}
+    new.connect(Duration::ZERO, PeerId(1), None, 1200).unwrap();
+    first.accept(Duration::ZERO, PeerId(2), 1200).unwrap();
+    // Another peer was told of the new one before the new one has its number.
+    early.connect(Duration::ZERO, PeerId(2), UserId(2), 1200).unwrap();
+    new.accept(Duration::ZERO, PeerId(3), 1200).unwrap();
+    assert_eq!(tell(&mut early, &mut new, PeerId(3)), 1);
+    // It cannot give the new peer a number either, which has not asked it.
+    let mut liar = lone(UserId::HOST, false);
+    liar.accept(Duration::ZERO, PeerId(3), 1200).unwrap();
+    early.disconnect(PeerId(2), DisconnectReason::Left);
+    early.connect(Duration::ZERO, PeerId(2), UserId(2), 1200).unwrap();
+    tell(&mut early, &mut liar, PeerId(3));
+    liar.on_message(MS, PeerId(3), &PeerMessage::Welcome { user: 9, others: Vec::new() }.encode());
+    let turned = PeerEvent::TurnedAway { peer: PeerId(3), reason: DisconnectReason::Protocol };
+    assert_eq!(liar.poll_event(), Some(turned));
+
+    assert_eq!(tell(&mut new, &mut first, PeerId(2)), 1, "the new peer greets only whom it asks");
+    assert_eq!(first.poll_event(), Some(PeerEvent::JoinRequest { peer: PeerId(2) }));
+    assert!(first.welcome(PeerId(2), UserId(1), &[]).is_err(), "the first peer's own number");
+    let others = [(UserId(3), "there".to_owned())];
+    first.welcome(PeerId(2), UserId(2), &others).unwrap();
+    assert_eq!(first.user_of(PeerId(2)), Some(UserId(2)));
+    first.update(300 * MS);
+    assert_eq!(tell(&mut first, &mut new, PeerId(1)), 3, "hello, welcome and state");
+    assert_eq!(new.poll_event(), Some(PeerEvent::Welcomed { user: UserId(2), others: others.to_vec() }));
+    assert_eq!((new.user_of(PeerId(1)), new.user_of(PeerId(3))), (Some(UserId(1)), Some(UserId(3))));
+    assert!(new.tick() > 0, "it has the state");
+    // The peer that waited is answered under the new number.
+    assert_eq!(tell(&mut new, &mut early, PeerId(2)), 1);
+    assert_eq!(early.user_of(PeerId(2)), Some(UserId(2)));
 }
 
 #[test]
@@ -640,7 +694,7 @@ proptest! {
         if let Some(first) = bytes.first_mut() {
             *first = kind;
         }
-        let _ = PeerDatagram::decode(&bytes);
+        let _ = Datagram::decode(&bytes);
         let _ = PeerMessage::decode(&bytes);
     }
 }
@@ -658,14 +712,14 @@ fn every_datagram_reads_back_as_it_was_written() {
     let ticks = vec![InputTick { tick: 77, held }, InputTick { tick: 76, held: Vec::new() }];
     let check = Some(StateCheck { body: BODY, tick: 64, value: 0.5 });
     for d in [
-        PeerDatagram::Inputs { now: 78, ahead: Some(-1.5), ticks: ticks.clone(), check },
-        PeerDatagram::Inputs { now: 78, ahead: None, ticks, check: None },
-        PeerDatagram::Ask { runs: vec![(5, 3), (90, 64)] },
+        Datagram::Inputs(Inputs { now: 78, ahead: Some(-1.5), ticks: ticks.clone(), check }),
+        Datagram::Inputs(Inputs { now: 78, ahead: None, ticks, check: None }),
+        Datagram::InputRequest(vec![NackRun { first: 5, count: 3 }, NackRun { first: 90, count: 64 }]),
     ] {
         let bytes = d.encode(513);
-        assert_eq!(PeerDatagram::decode(&bytes).unwrap(), (513, d));
+        assert_eq!(Datagram::decode(&bytes).unwrap(), (513, d));
         for cut in 0..bytes.len() {
-            assert!(PeerDatagram::decode(&bytes[..cut]).is_err());
+            assert!(Datagram::decode(&bytes[..cut]).is_err());
         }
     }
 }

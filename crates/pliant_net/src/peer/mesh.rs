@@ -8,7 +8,6 @@ use bytes::Bytes;
 use pliant_stream::peer::PeerEvent;
 use pliant_stream::{Channel, DisconnectReason, PeerId, UserId};
 
-use super::message::{MOST_PEERS, MeshMessage, PeerScene};
 use super::{NetPeer, PeerState};
 use crate::remote::{SessionClosed, SessionJoined};
 use crate::transport::{Endpoint, Event, Fingerprint, Invite, Role};
@@ -27,21 +26,12 @@ pub(super) struct ConnectedPeer {
     pub(super) number: Option<UserId>,
     /// Where the peer listens, for peers that join later.
     pub(super) invite: Option<Invite>,
-    /// What the peer has said of itself, until this peer's own session has begun.
-    waits: Option<Arrival>,
+    /// The peer's first message, until this peer's own session has begun.
+    first: Option<Bytes>,
     /// When the peer connected.
     since: Duration,
     /// Whether this peer has closed the connection. Data that still arrives is ignored.
     sent_away: bool,
-}
-
-/// The first message of a peer that has connected to this one.
-#[derive(Debug)]
-enum Arrival {
-    /// A new peer with this peer's invite, which asks for a number.
-    New { scene: PeerScene, invite: Invite },
-    /// A peer that has its number and was told of this one.
-    Member { number: UserId, scene: PeerScene, invite: Invite },
 }
 
 impl ConnectedPeer {
@@ -59,6 +49,7 @@ pub(crate) fn receive(world: &mut World) {
             return;
         }
         net.start(world);
+        net.take_events(world);
         let mut came: Vec<(Option<PeerId>, Event)> = Vec::new();
         // An unread queue drops its oldest datagrams, so this reads all of them.
         came.extend(std::iter::from_fn(|| net.listening.poll()).map(|event| (None, event)));
@@ -80,33 +71,38 @@ pub(crate) fn receive(world: &mut World) {
 }
 
 impl NetPeer {
-    /// Starts the session when the bodies are loaded: begins a new one, or asks to join.
+    /// Creates the session when the bodies are loaded.
     fn start(&mut self, world: &mut World) {
-        if self.scene.bodies.is_empty() && !self.gather(world) {
+        if self.session.is_some() || !self.gather(world) {
             return;
         }
-        if self.session.is_none() && self.config.join.is_none() {
-            let user = UserId(1);
-            if self.begin(world, user, true) {
-                world.write_message(SessionJoined { user, reconnected: false });
-            }
+        self.begin(world);
+        // Connections may have opened before the bodies were loaded.
+        let waiting: Vec<PeerId> = self.others.keys().copied().collect();
+        waiting.into_iter().for_each(|peer| self.bring_in(peer));
+    }
+
+    /// Brings a connection into the session, once there is one. A peer that this one has called is
+    /// greeted, and of any other peer the first message is awaited.
+    fn bring_in(&mut self, peer: PeerId) {
+        let now = self.now();
+        let (endpoint, number) = self.way(peer);
+        let (most, opened) = (endpoint.max_datagram_size(number).unwrap_or(0), number != peer);
+        let (Some(session), Some(other)) = (&mut self.session, self.others.get_mut(&peer)) else { return };
+        if session.stats(peer).is_some() || !(opened || other.first.is_some()) {
+            return;
         }
-        let waiting: Vec<PeerId> =
-            self.others.iter().filter(|(_, other)| other.waits.is_some()).map(|(&peer, _)| peer).collect();
-        if self.session.is_some() {
-            waiting.into_iter().for_each(|peer| self.let_in(peer));
+        let added = if opened {
+            session.connect(now, peer, other.number, most)
+        } else {
+            session.accept(now, peer, most)
+        };
+        if let Err(error) = added {
+            debug!("peer {peer}: {error}");
+            return self.hang_up(peer, DisconnectReason::Full);
         }
-        // The connection to the first peer may have opened before the bodies were loaded.
-        if self.session.is_none() {
-            let asked: Vec<PeerId> = self.opened.keys().copied().collect();
-            for peer in asked {
-                if let Some(other) = self.others.get_mut(&peer).filter(|other| other.number.is_none()) {
-                    // The number marks the request as sent. The answer brings the real number.
-                    other.number = Some(UserId::HOST);
-                    let (scene, invite) = (self.scene.clone(), self.listening.invite());
-                    self.send(peer, &MeshMessage::Introduce { scene, invite });
-                }
-            }
+        if let Some(bytes) = other.first.take() {
+            session.on_message(now, peer, &bytes);
         }
     }
 
@@ -117,22 +113,19 @@ impl NetPeer {
                 let peer = opened.unwrap_or(peer);
                 let (number, invite) = self.introduced.remove(&peer).unzip();
                 let address = address.ip();
-                let (waits, since, sent_away) = (None, now, false);
+                // The peer of this peer's own invite is reached there by others too.
+                let first = opened.is_some() && matches!(self.state, PeerState::Joining);
+                let invite = invite.or_else(|| self.config.join.clone().filter(|_| first));
+                let (first, since, sent_away) = (None, now, false);
                 let other =
-                    ConnectedPeer { key: fingerprint, address, number, invite, waits, since, sent_away };
+                    ConnectedPeer { key: fingerprint, address, number, invite, first, since, sent_away };
                 self.others.insert(peer, other);
                 if role == Role::Watch && opened.is_none() {
                     // Every peer steps the bodies with its own hands, so the mesh has no place for
                     // a watcher.
                     return self.hang_up(peer, DisconnectReason::WatchOnly);
                 }
-                // This peer sends a join request to the first peer only, and introduces itself to
-                // the others.
-                if let (Some(_), PeerState::In { user }) = (opened, &self.state) {
-                    let (number, scene, invite) = (*user, self.scene.clone(), self.listening.invite());
-                    self.send(peer, &MeshMessage::Member { number, scene, invite });
-                    self.talk_to(now, peer);
-                }
+                self.bring_in(peer);
             }
             // The connection only stays open to send this peer's goodbye.
             Event::Datagram { peer, .. } | Event::Message { peer, .. }
@@ -145,7 +138,15 @@ impl NetPeer {
             }
             Event::Message { peer, bytes } => {
                 let peer = opened.unwrap_or(peer);
-                self.on_mesh_message(world, now, peer, opened.is_some(), bytes);
+                match &mut self.session {
+                    Some(session) if session.stats(peer).is_some() => session.on_message(now, peer, &bytes),
+                    _ => {
+                        if let Some(other) = self.others.get_mut(&peer) {
+                            other.first.get_or_insert(bytes);
+                        }
+                        self.bring_in(peer);
+                    }
+                }
             }
             Event::Closed { peer, reason } => {
                 let peer = opened.unwrap_or(peer);
@@ -159,60 +160,9 @@ impl NetPeer {
                 // The endpoint's thread may wait for the other end's last packets, which must not
                 // block a frame.
                 self.ending.extend(self.opened.remove(&peer).and_then(Endpoint::close_detached));
-                if opened.is_some() && self.session.is_none() {
+                if opened.is_some() && matches!(self.state, PeerState::Joining) {
                     self.close(world, reason);
                 }
-            }
-        }
-    }
-
-    fn on_mesh_message(
-        &mut self,
-        world: &mut World,
-        now: Duration,
-        peer: PeerId,
-        opened: bool,
-        bytes: Bytes,
-    ) {
-        match MeshMessage::read(bytes) {
-            Some(MeshMessage::Session(bytes)) => {
-                if let Some(session) = &mut self.session {
-                    session.on_message(now, peer, &bytes);
-                }
-            }
-            Some(MeshMessage::Introduce { scene, invite }) if !opened => {
-                self.arrived(peer, Arrival::New { scene, invite });
-            }
-            Some(MeshMessage::Member { number, scene, invite }) if !opened => {
-                self.arrived(peer, Arrival::Member { number, scene, invite });
-            }
-            Some(MeshMessage::Welcome { number, from, others })
-                if opened
-                    && self.session.is_none()
-                    && ![number, from].contains(&UserId::HOST)
-                    && number != from =>
-            {
-                if !self.begin(world, number, false) {
-                    return;
-                }
-                if let Some(first) = self.others.get_mut(&peer) {
-                    (first.number, first.invite) = (Some(from), self.config.join.clone());
-                    let key = first.key;
-                    self.remember(key, from);
-                }
-                self.talk_to(now, peer);
-                for (number, invite) in others {
-                    match self.connect_to(&invite) {
-                        Ok(peer) => {
-                            self.introduced.insert(peer, (number, invite));
-                        }
-                        Err(error) => warn!("another peer cannot be reached: {error}"),
-                    }
-                }
-            }
-            _ => {
-                self.rejected += 1;
-                self.hang_up(peer, DisconnectReason::Protocol);
             }
         }
     }
@@ -228,56 +178,13 @@ impl NetPeer {
         self.numbers.insert(key, number);
     }
 
-    /// Takes a peer's first message. The answer waits until this peer's own session has begun: the
-    /// welcome of this peer may still be on its way when others have been told of it.
-    fn arrived(&mut self, peer: PeerId, arrival: Arrival) {
-        let Some(other) = self.others.get_mut(&peer) else { return };
-        if other.number.is_some() || other.waits.is_some() {
-            return self.hang_up(peer, DisconnectReason::Protocol);
-        }
-        other.waits = Some(arrival);
-        if self.session.is_some() {
-            self.let_in(peer);
-        }
-    }
-
-    /// Answers a peer that has arrived.
-    fn let_in(&mut self, peer: PeerId) {
-        match self.others.get_mut(&peer).and_then(|other| other.waits.take()) {
-            Some(Arrival::New { scene, invite }) => self.welcome(peer, scene, invite),
-            Some(Arrival::Member { number, scene, invite }) => self.take_member(peer, number, scene, invite),
-            None => {}
-        }
-    }
-
-    /// Begins to play with a peer that has its number.
-    fn take_member(&mut self, peer: PeerId, number: UserId, scene: PeerScene, invite: Invite) {
-        let known = self.others.values().any(|other| other.number == Some(number));
-        let own = if let PeerState::In { user } = self.state { user } else { UserId::HOST };
-        if scene != self.scene {
-            self.hang_up(peer, DisconnectReason::SceneMismatch);
-        } else if known || number == UserId::HOST || number == own {
-            self.hang_up(peer, DisconnectReason::NumberTaken);
-        } else if let Some(other) = self.others.get_mut(&peer) {
-            other.number = Some(number);
-            other.invite = Some(other.seen_from_here(invite));
-            let key = other.key;
-            self.remember(key, number);
-            self.talk_to(self.now(), peer);
-        }
-    }
-
     /// Gives a new peer its number and the invites of all other peers.
-    fn welcome(&mut self, peer: PeerId, scene: PeerScene, invite: Invite) {
-        let now = self.now();
-        if scene != self.scene {
-            return self.hang_up(peer, DisconnectReason::SceneMismatch);
-        }
-        let others: Vec<(UserId, Invite)> =
-            self.others.values().filter_map(|other| Some((other.number?, other.invite.clone()?))).collect();
-        if self.others.len() > MOST_PEERS {
-            return self.hang_up(peer, DisconnectReason::Full);
-        }
+    fn welcome(&mut self, peer: PeerId) {
+        let others: Vec<(UserId, String)> = self
+            .others
+            .values()
+            .filter_map(|other| Some((other.number?, other.invite.as_ref()?.to_string())))
+            .collect();
         let Some(key) = self.others.get(&peer).map(|other| other.key) else { return };
         let present: BTreeSet<UserId> = self.others.values().filter_map(|other| other.number).collect();
         let before = self.numbers.get(&key).copied().filter(|before| !present.contains(before));
@@ -289,32 +196,49 @@ impl NetPeer {
         let Some(number) = before.or_else(|| (1..=u16::MAX).map(UserId).find(|n| !taken.contains(n))) else {
             return self.hang_up(peer, DisconnectReason::Full);
         };
-        self.remember(key, number);
-        if let Some(other) = self.others.get_mut(&peer) {
-            other.number = Some(number);
-            other.invite = Some(other.seen_from_here(invite));
-        }
-        let PeerState::In { user: from } = self.state else { return };
-        self.send(peer, &MeshMessage::Welcome { number, from, others });
-        self.talk_to(now, peer);
-    }
-
-    /// Starts the session on a connection.
-    fn talk_to(&mut self, now: Duration, peer: PeerId) {
-        let (endpoint, number) = self.way(peer);
-        let most = endpoint.max_datagram_size(number).unwrap_or(0);
-        if let Some(session) = &mut self.session
-            && let Some(user) = self.others.get(&peer).and_then(|other| other.number)
-            && let Err(error) = session.connect(now, peer, user, most)
-        {
+        let Some(session) = &mut self.session else { return };
+        if let Err(error) = session.welcome(peer, number, &others) {
             debug!("peer {peer}: {error}");
             self.hang_up(peer, DisconnectReason::Full);
         }
     }
 
-    fn send(&self, peer: PeerId, message: &MeshMessage) {
+    /// Keeps the number of a peer that has joined, and where it is reached.
+    fn keep_joined(&mut self, peer: PeerId, user: UserId, address: &str) -> bool {
+        let Some(other) = self.others.get_mut(&peer) else { return false };
+        // A peer that this one has called is reached where it was called.
+        if other.invite.is_none() {
+            let Ok(invite) = address.parse() else {
+                self.hang_up(peer, DisconnectReason::Protocol);
+                return false;
+            };
+            other.invite = Some(other.seen_from_here(invite));
+        }
+        other.number = Some(user);
+        let key = other.key;
+        self.remember(key, user);
+        true
+    }
+
+    /// Connects to the peers that were in the session before this one.
+    fn call(&mut self, others: Vec<(UserId, String)>) {
+        for (number, address) in others {
+            let Ok(invite) = address.parse::<Invite>() else {
+                debug!("user {} has no invite", number.0);
+                continue;
+            };
+            match self.connect_to(&invite) {
+                Ok(peer) => {
+                    self.introduced.insert(peer, (number, invite));
+                }
+                Err(error) => warn!("another peer cannot be reached: {error}"),
+            }
+        }
+    }
+
+    fn send(&self, peer: PeerId, message: Bytes) {
         let (endpoint, number) = self.way(peer);
-        if let Err(error) = endpoint.send_message(number, message.to_message()) {
+        if let Err(error) = endpoint.send_message(number, message) {
             debug!("not sent to peer {peer}: {error}");
             endpoint.close(number, DisconnectReason::Unread);
         }
@@ -323,7 +247,7 @@ impl NetPeer {
     /// Disconnects peers that connect without introducing themselves, because each of them would
     /// occupy a place.
     fn hang_up_on_the_silent(&mut self) {
-        let Some(session) = &self.session else { return };
+        let (Some(session), PeerState::In { .. }) = (&self.session, &self.state) else { return };
         let (now, most) = (self.now(), self.limits.handshake);
         let silent = |(peer, other): &(&PeerId, &ConnectedPeer)| {
             // A peer that connected while this peer's bodies were being loaded could not be
@@ -340,7 +264,7 @@ impl NetPeer {
     fn hang_up(&mut self, peer: PeerId, reason: DisconnectReason) {
         debug!("peer {peer} is sent away: {reason}");
         if let Some(other) = self.others.get_mut(&peer) {
-            (other.sent_away, other.waits) = (true, None);
+            (other.sent_away, other.first) = (true, None);
         }
         let (endpoint, number) = self.way(peer);
         endpoint.close(number, reason);
@@ -360,9 +284,7 @@ impl NetPeer {
                     // A datagram that is not taken is lost. The next one repeats its content.
                     let _ = endpoint.send_datagram(number, Bytes::from_owner(output.bytes));
                 }
-                Channel::Message => {
-                    self.send(output.peer, &MeshMessage::Session(Bytes::from_owner(output.bytes)));
-                }
+                Channel::Message => self.send(output.peer, Bytes::from_owner(output.bytes)),
             }
         }
     }
@@ -376,7 +298,15 @@ impl NetPeer {
                         world.write_message(SessionJoined { user, reconnected: false });
                     }
                 }
-                PeerEvent::Joined { user, name } => {
+                PeerEvent::JoinRequest { peer } => self.welcome(peer),
+                PeerEvent::Welcomed { user, others } => {
+                    self.enter(world, user);
+                    self.call(others);
+                }
+                PeerEvent::Joined { peer, user, name, address } => {
+                    if !self.keep_joined(peer, user, &address) {
+                        continue;
+                    }
                     self.found(user);
                     self.users.join(world, user, &name, Role::Hold, false);
                 }

@@ -6,7 +6,6 @@
 //! stay connected.
 
 mod mesh;
-mod message;
 mod play;
 mod reconnect;
 
@@ -20,6 +19,7 @@ use pliant_stream::peer::{PeerConfig as SessionConfig, PeerSession, Repair};
 use pliant_stream::{BodyId, DisconnectReason, LinkStats, PeerId, UserId};
 
 use crate::metrics::{Ledger, NetStats};
+use crate::remote::SessionJoined;
 use crate::roster::Roster;
 use crate::shared_body::SharedBody;
 use crate::transport::{
@@ -28,7 +28,6 @@ use crate::transport::{
 };
 use crate::user::shortened;
 use mesh::ConnectedPeer;
-use message::PeerScene;
 use play::{PeerGrab, PlayedBody};
 use reconnect::Missed;
 
@@ -102,11 +101,12 @@ pub struct NetPeer {
     limits: Limits,
     emulation: Option<Emulation>,
     began: Instant,
-    /// When the session began, measured from `began`.
+    /// When this peer was given its number, measured from `began`.
     began_at: Duration,
     state: PeerState,
     session: Option<PeerSession>,
-    scene: PeerScene,
+    /// Length of a step.
+    step: Duration,
     bodies: BTreeMap<BodyId, PlayedBody>,
     others: BTreeMap<PeerId, ConnectedPeer>,
     /// Numbers and invites of the peers that this peer is connecting to, as the first peer sent
@@ -120,8 +120,6 @@ pub struct NetPeer {
     grabs: BTreeMap<Entity, PeerGrab>,
     scratch: Vec<f64>,
     ledger: Ledger,
-    /// Number of received messages that a peer may not send.
-    rejected: u64,
     next_opened: u64,
 }
 
@@ -149,7 +147,7 @@ impl NetPeer {
             began_at: Duration::ZERO,
             state: PeerState::Joining,
             session: None,
-            scene: PeerScene { step_ns: 0, bodies: Vec::new() },
+            step: Duration::ZERO,
             bodies: BTreeMap::new(),
             others: BTreeMap::new(),
             introduced: BTreeMap::new(),
@@ -159,7 +157,6 @@ impl NetPeer {
             grabs: BTreeMap::new(),
             scratch: Vec::new(),
             ledger: Ledger::default(),
-            rejected: 0,
             next_opened: OPENED,
         };
         if let Some(invite) = peer.config.join.clone() {
@@ -193,8 +190,7 @@ impl NetPeer {
         self.listening.invite()
     }
 
-    /// Returns the session, with more details. `None` until the models are loaded and this peer has
-    /// a number.
+    /// Returns the session, with more details. `None` until the models are loaded.
     pub fn session(&self) -> Option<&PeerSession> {
         self.session.as_ref()
     }
@@ -247,8 +243,7 @@ impl NetPeer {
             let (round_trip, loss_out) = (transport.round_trip, transport.loss());
             stats.add(&LinkStats { round_trip, loss_out, ..link }, transport);
         }
-        let mut totals = self.session.as_ref().map(PeerSession::totals).unwrap_or_default();
-        totals.rejected += self.rejected;
+        let totals = self.session.as_ref().map(PeerSession::totals).unwrap_or_default();
         stats.count(&totals, &self.ledger.sum(lines.into_iter()));
         if let Some(session) = &self.session {
             stats.displayed_ticks = session.tick();
@@ -262,14 +257,16 @@ impl NetPeer {
         stats
     }
 
-    /// Creates the session when the scene's bodies are loaded. With `founds`, this peer starts a
-    /// new session.
-    fn begin(&mut self, world: &mut World, user: UserId, founds: bool) -> bool {
-        let step = Duration::from_nanos(self.scene.step_ns).as_secs_f64();
+    /// Creates the session when the bodies are loaded. The first peer begins at once, and the others
+    /// request a number.
+    fn begin(&mut self, world: &mut World) {
+        let founds = self.config.join.is_none();
+        let user = if founds { UserId(1) } else { UserId::HOST };
         let config = SessionConfig {
             user,
             name: shortened(&self.config.name).to_owned(),
-            step,
+            address: self.listening.invite().to_string(),
+            step: self.step.as_secs_f64(),
             repair: self.config.repair,
             idle_timeout: self.limits.idle_timeout,
             founds,
@@ -282,23 +279,30 @@ impl NetPeer {
             Ok(session)
         });
         match made {
-            Ok(session) => (self.session, self.began_at) = (Some(session), self.now()),
+            Ok(session) => self.session = Some(session),
             Err(error) => {
                 error!("the session cannot begin: {error}");
-                self.close(world, DisconnectReason::InvalidSettings);
-                return false;
+                return self.close(world, DisconnectReason::InvalidSettings);
             }
         }
+        if founds {
+            self.enter(world, user);
+            world.write_message(SessionJoined { user, reconnected: false });
+        }
+    }
+
+    /// Takes this peer's number.
+    fn enter(&mut self, world: &mut World, user: UserId) {
+        self.began_at = self.now();
         self.remember(self.listening.fingerprint(), user);
         self.state = PeerState::In { user };
         let name = shortened(&self.config.name);
         info!("among the peers as {name}, user {}", user.0);
         self.users.meet_yourself(world, user, name, Role::Hold);
-        true
     }
 
-    /// Finds the scene's bodies. Returns false while there are none, or one of them is not loaded
-    /// yet.
+    /// Finds the bodies of the session. Returns false while there are none, or one of them is not
+    /// loaded yet.
     fn gather(&mut self, world: &mut World) -> bool {
         let step =
             world.get_resource::<Time<Fixed>>().map_or(Duration::from_millis(25), Time::<Fixed>::timestep);
@@ -308,7 +312,7 @@ impl NetPeer {
             let Some(state) = state.filter(|state| state.has_place()) else { return false };
             let settings = play::agreed_settings(state.body());
             let id = number_of(&name.name);
-            if found.contains_key(&id) || found.len() >= message::MOST_BODIES {
+            if found.contains_key(&id) {
                 warn_once!("{} is left out: another body has its number", name.name);
                 continue;
             }
@@ -320,11 +324,7 @@ impl NetPeer {
         for played in found.values() {
             world.entity_mut(played.entity).insert((Driven::Remote, crate::remote::RemoteHands::default()));
         }
-        self.scene = PeerScene {
-            step_ns: u64::try_from(step.as_nanos()).unwrap_or(0),
-            bodies: found.iter().map(|(&id, played)| (id, played.digest())).collect(),
-        };
-        self.bodies = found;
+        (self.step, self.bodies) = (step, found);
         true
     }
 }

@@ -22,11 +22,6 @@ pub(super) struct PlayedBody {
 }
 
 impl PlayedBody {
-    /// Digest of the body's model and step settings, which all peers must have in common.
-    pub(super) fn digest(&self) -> [u8; 32] {
-        pliant_stream::peer::digest(&self.model, &self.settings)
-    }
-
     pub(super) fn new(entity: Entity, model: Arc<ModalModel>, settings: StepSettings) -> Self {
         Self { entity, model, settings, display: BodyDisplay::default() }
     }
@@ -118,7 +113,7 @@ pub(crate) fn show(
     let now = net.now();
     let Some(session) = &mut net.session else { return };
     session.update(now);
-    let step = std::time::Duration::from_nanos(net.scene.step_ns).as_secs_f64();
+    let step = net.step.as_secs_f64();
     for (&id, played) in &mut net.bodies {
         let Some(view) = session.body(id) else { continue };
         let Ok((state, mut visual, mut hands, mut transform, global)) = bodies.get_mut(played.entity) else {

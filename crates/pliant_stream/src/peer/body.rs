@@ -6,13 +6,13 @@ use nalgebra::{UnitQuaternion, Vector3};
 use pliant_modal::{Frame, Hand, Hold, Load, ModalModel, StepSettings};
 
 use super::inputs::{InputLog, WINDOW};
-use super::wire::{HeldAt, PeerBodyState, PeerFrame, PeerGrip};
 use crate::StreamError;
 use crate::codec::checksum::{checksum, projection};
 use crate::newmark::{FlowFilter, Newmark};
 use crate::recovery::{Blend, Forecast, PoseBlend};
 use crate::replica::Replica;
 use crate::state::{BodyId, GrabKey, GrabState, Pose, State, Tick, UserId};
+use crate::wire::{HeldAt, PeerBodyState, PeerFrame, PeerGrip};
 
 /// Correction of the state for a late input.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]

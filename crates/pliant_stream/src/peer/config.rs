@@ -10,10 +10,14 @@ use crate::state::{PeerId, UserId};
 #[derive(Debug, Clone, PartialEq)]
 pub struct PeerConfig {
     /// Number of this peer. Every peer has a different one, and the lowest number is right when
-    /// states disagree.
+    /// states disagree. A peer that does not found the session may have [`UserId::HOST`], which
+    /// stands for none: it requests a number from the first peer that it connects to.
     pub user: UserId,
     /// Display name, at most 64 bytes.
     pub name: String,
+    /// Where peers that join later reach this peer, at most 512 bytes. The session passes it on.
+    /// Default: empty.
+    pub address: String,
     /// Length of a step, s. Default: 1/40.
     pub step: f64,
     /// Repair of late inputs. Default: [`Repair::Rollback`].
@@ -34,6 +38,7 @@ impl Default for PeerConfig {
         Self {
             user: UserId(1),
             name: "peer".into(),
+            address: String::new(),
             step: 1.0 / 40.0,
             repair: Repair::default(),
             blend_ticks: 6,
@@ -50,12 +55,29 @@ impl Default for PeerConfig {
 pub enum PeerEvent {
     /// This peer has a state and steps.
     Started,
+    /// Another peer requests a number. Answer with
+    /// [`PeerSession::welcome`](super::PeerSession::welcome), or close the connection.
+    JoinRequest {
+        /// The connection.
+        peer: PeerId,
+    },
+    /// This peer has been given its number.
+    Welcomed {
+        /// User number.
+        user: UserId,
+        /// The other peers in the session, as user numbers and addresses. Connect to them.
+        others: Vec<(UserId, String)>,
+    },
     /// Another peer joined.
     Joined {
+        /// The connection.
+        peer: PeerId,
         /// User number.
         user: UserId,
         /// Display name.
         name: String,
+        /// Where peers that join later reach the other peer; empty if nowhere.
+        address: String,
     },
     /// Another peer left.
     Left {

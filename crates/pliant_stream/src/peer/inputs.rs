@@ -2,9 +2,9 @@
 
 use std::collections::BTreeMap;
 
-use super::wire::{HeldAt, InputTick};
 use crate::recovery::Forecast;
 use crate::state::{BodyId, Tick, UserId};
+use crate::wire::{HeldAt, InputTick};
 
 /// Number of ticks remembered.
 pub(crate) const WINDOW: usize = 128;

@@ -16,11 +16,7 @@ mod config;
 mod inputs;
 mod other;
 mod session;
-mod wire;
 
 pub use body::{PeerBody, Repair};
 pub use config::{PeerConfig, PeerEvent};
-pub use session::{PeerSession, digest};
-pub use wire::{
-    HeldAt, InputTick, PeerBodyState, PeerDatagram, PeerFrame, PeerGrip, PeerMessage, StateCheck,
-};
+pub use session::PeerSession;

@@ -9,13 +9,27 @@ use crate::state::{BodyId, PeerId, Tick, UserId};
 /// Number of consecutive mismatches after which the other peer's state is taken.
 const CHECKS: u32 = 3;
 
+/// A hello that was found in order.
+#[derive(Debug, Clone)]
+pub(super) struct Hello {
+    /// [`UserId::HOST`] when the peer requests a number.
+    pub(super) user: UserId,
+    pub(super) name: String,
+    pub(super) address: String,
+    pub(super) joining: bool,
+}
+
 #[derive(Debug)]
 pub(super) struct RemotePeer {
     pub(super) link: Link,
     /// User number of the peer, after its hello.
     pub(super) user: Option<UserId>,
-    /// User number that the peer must have.
-    pub(super) expected: UserId,
+    /// User number that the peer must have; `None` when its hello tells it.
+    pub(super) expected: Option<UserId>,
+    /// A hello was sent to the peer.
+    pub(super) greeted: bool,
+    /// The peer's hello, until this peer has a number and, where it requests one, so has the other.
+    pub(super) hello: Option<Hello>,
     /// Mean of the local clock minus the time of the sender's tick, at arrival, s.
     pub(super) way: Option<f64>,
     /// Running mean of this peer's tick minus the other's tick, at arrival here, ticks.
@@ -37,11 +51,13 @@ pub(super) struct RemotePeer {
 }
 
 impl RemotePeer {
-    pub(super) fn new(peer: PeerId, now: Duration, expected: UserId, max_datagram: usize) -> Self {
+    pub(super) fn new(peer: PeerId, now: Duration, expected: Option<UserId>, max_datagram: usize) -> Self {
         Self {
             link: Link::new(peer, now, max_datagram),
             user: None,
             expected,
+            greeted: false,
+            hello: None,
             way: None,
             ahead: None,
             theirs: None,

@@ -11,16 +11,16 @@ use pliant_modal::{GrabConfig, ModalModel, StepSettings};
 use super::body::PeerBody;
 use super::config::{PeerConfig, PeerEvent};
 use super::inputs::{InputLog, WINDOW};
-use super::other::RemotePeer;
-use super::wire::{HeldAt, InputTick, MAX_HELD, MAX_TICKS, PeerDatagram, PeerMessage, StateCheck};
+use super::other::{Hello, RemotePeer};
 use crate::StreamError;
 use crate::link::Events;
 use crate::session::{DisconnectReason, LinkStats, Output};
 use crate::state::{BodyId, PeerId, Tick, UserId, in_range};
-use crate::wire::{MAX_NAME, PROTOCOL_VERSION};
+use crate::wire::{
+    Datagram, HeldAt, InputTick, Inputs, MAX_ADDRESS, MAX_BODIES, MAX_HELD, MAX_NACK_RUN, MAX_NACK_RUNS,
+    MAX_NAME, MAX_PEERS, MAX_TICKS, NackRun, PROTOCOL_VERSION, PeerMessage, StateCheck, check_hold,
+};
 
-/// Largest number of other peers.
-const MAX_PEERS: usize = 64;
 /// Largest number of outputs that wait to be fetched before new datagrams are dropped, as a path
 /// would drop them.
 const MAX_OUT: usize = 16_384;
@@ -33,14 +33,6 @@ const CHECK_TOLERANCE: f64 = 1e-3;
 const SLEW: f64 = 0.01;
 /// Pause between requests for the same tick.
 const ASK_AGAIN: Duration = Duration::from_millis(150);
-
-/// Digest of a body's model and step settings. Peers must have the same digest for a body.
-pub fn digest(model: &ModalModel, settings: &StepSettings) -> [u8; 32] {
-    let mut hasher = blake3::Hasher::new();
-    hasher.update(&model.hash().0);
-    hasher.update(&settings.to_bytes());
-    hasher.finalize().into()
-}
 
 /// One of several equal peers: a state machine without sockets or clock.
 #[derive(Debug)]
@@ -69,11 +61,11 @@ impl PeerSession {
     /// Creates a peer without connections.
     ///
     /// # Errors
-    /// Returns [`StreamError::Config`] for a setting out of range, and for the user number 0, which
-    /// is the host's.
+    /// Returns [`StreamError::Config`] for a setting out of range, and for a founding peer without a
+    /// number.
     pub fn new(config: PeerConfig) -> Result<Self, StreamError> {
         let fail = |what, found: String, expected| Err(StreamError::Config { what, found, expected });
-        if config.user == UserId::HOST {
+        if config.user == UserId::HOST && config.founds {
             return fail("user", "0".into(), "1 or more");
         }
         if !(1e-5..=1.0).contains(&config.step) {
@@ -82,12 +74,17 @@ impl PeerSession {
         if config.name.len() > MAX_NAME {
             return fail("name", config.name, "at most 64 bytes");
         }
+        if config.address.len() > MAX_ADDRESS {
+            return fail("address", config.address, "at most 512 bytes");
+        }
         if config.repeats >= MAX_TICKS {
             return fail("repeats", config.repeats.to_string(), "at most 15");
         }
         let started = config.founds;
         let mut inputs = InputLog::default();
-        inputs.expect(config.user, 1);
+        if config.user != UserId::HOST {
+            inputs.expect(config.user, 1);
+        }
         Ok(Self {
             config,
             others: BTreeMap::new(),
@@ -111,8 +108,8 @@ impl PeerSession {
     /// Adds a body. All peers add the same bodies under the same numbers before they start.
     ///
     /// # Errors
-    /// Returns [`StreamError::Config`] for a number in use and [`StreamError::Model`] for a model
-    /// or settings that cannot be stepped.
+    /// Returns [`StreamError::Config`] for a number in use, [`StreamError::Full`] beyond 1,024 bodies,
+    /// and [`StreamError::Model`] for a model or settings that cannot be stepped.
     pub fn add_body(
         &mut self,
         id: BodyId,
@@ -122,6 +119,9 @@ impl PeerSession {
         if self.bodies.contains_key(&id) {
             let found = id.to_string();
             return Err(StreamError::Config { what: "body", found, expected: "a number that is not in use" });
+        }
+        if self.bodies.len() >= MAX_BODIES {
+            return Err(StreamError::Full { what: "bodies", limit: MAX_BODIES });
         }
         let c = &self.config;
         let body = PeerBody::new(id, model, settings, c.step, c.repair, c.blend_ticks)?;
@@ -135,17 +135,18 @@ impl PeerSession {
         hasher.update(&self.config.step.to_bits().to_le_bytes());
         for (id, body) in &self.bodies {
             hasher.update(&id.0.to_le_bytes());
-            hasher.update(&digest(body.model(), body.settings()));
+            hasher.update(&body.model().hash().0);
+            hasher.update(&body.settings().to_bytes());
         }
         let mut first = [0; 8];
         first.copy_from_slice(&hasher.finalize().as_bytes()[..8]);
         u64::from_le_bytes(first)
     }
 
-    /// Adds a connection to another peer and sends a hello.
+    /// Adds a connection that this side has opened, and sends a hello.
     ///
     /// `user` is the number that the other peer was given. A peer with another number is not
-    /// accepted, because the lowest number is trusted.
+    /// accepted, because the lowest number is trusted. `None`: its hello tells the number.
     ///
     /// # Errors
     /// Returns [`StreamError::Full`] beyond 64 peers and [`StreamError::Config`] for the number 0,
@@ -154,26 +155,126 @@ impl PeerSession {
         &mut self,
         now: Duration,
         peer: PeerId,
-        user: UserId,
+        user: impl Into<Option<UserId>>,
         max_datagram: usize,
     ) -> Result<(), StreamError> {
-        if user == UserId::HOST || user == self.config.user {
+        let user = user.into();
+        if let Some(user) = user.filter(|&user| user == UserId::HOST || user == self.config.user) {
             let found = user.0.to_string();
             return Err(StreamError::Config { what: "user", found, expected: "a number of another peer" });
         }
+        self.add(now, peer, user, max_datagram)?;
+        self.greet(peer);
+        Ok(())
+    }
+
+    /// Adds a connection that the other side has opened. The answer to its hello follows when this
+    /// peer has a number.
+    ///
+    /// # Errors
+    /// Returns [`StreamError::Full`] beyond 64 peers.
+    pub fn accept(&mut self, now: Duration, peer: PeerId, max_datagram: usize) -> Result<(), StreamError> {
+        self.add(now, peer, None, max_datagram)
+    }
+
+    fn add(
+        &mut self,
+        now: Duration,
+        peer: PeerId,
+        user: Option<UserId>,
+        max_datagram: usize,
+    ) -> Result<(), StreamError> {
         if self.others.len() >= MAX_PEERS {
             return Err(StreamError::Full { what: "peers", limit: MAX_PEERS });
         }
         self.others.insert(peer, RemotePeer::new(peer, now, user, max_datagram));
+        Ok(())
+    }
+
+    /// Sends a hello, once for each connection.
+    fn greet(&mut self, peer: PeerId) {
         let hello = PeerMessage::Hello {
             version: PROTOCOL_VERSION,
             user: self.config.user.0,
             name: self.config.name.clone(),
+            address: self.config.address.clone(),
             joining: !self.started,
             scene: self.scene(),
         };
-        self.message(peer, &hello);
+        if let Some(other) = self.others.get_mut(&peer).filter(|other| !other.greeted) {
+            other.greeted = true;
+            self.message(peer, &hello);
+        }
+    }
+
+    /// Gives a peer the number that it has requested ([`PeerEvent::JoinRequest`]), and tells it the
+    /// numbers and addresses of the others.
+    ///
+    /// # Errors
+    /// Returns [`StreamError::UnknownPeer`] for a connection that has not requested a number, and
+    /// [`StreamError::Config`] for a number in use or an address of more than 512 bytes.
+    pub fn welcome(
+        &mut self,
+        peer: PeerId,
+        user: UserId,
+        others: &[(UserId, String)],
+    ) -> Result<(), StreamError> {
+        let asking = |hello: &&Hello| hello.user == UserId::HOST;
+        let asks = self.others.get(&peer).and_then(|other| other.hello.as_ref()).filter(asking).cloned();
+        let hello = asks.ok_or(StreamError::UnknownPeer(peer))?;
+        if user == UserId::HOST || self.is_taken(user) {
+            let found = user.0.to_string();
+            return Err(StreamError::Config { what: "user", found, expected: "a number that is free" });
+        }
+        if let Some((_, address)) = others.iter().find(|(_, address)| address.len() > MAX_ADDRESS) {
+            let found = address.len().to_string();
+            return Err(StreamError::Config { what: "address", found, expected: "at most 512 bytes" });
+        }
+        let others = others.iter().take(MAX_PEERS).map(|(user, address)| (user.0, address.clone())).collect();
+        self.greet(peer);
+        self.message(peer, &PeerMessage::Welcome { user: user.0, others });
+        self.join(peer, Hello { user, ..hello });
         Ok(())
+    }
+
+    fn is_taken(&self, user: UserId) -> bool {
+        user == self.config.user || self.inputs.users.get(&user).is_some_and(|u| !u.gone)
+    }
+
+    /// Takes a peer's hello, once this peer has a number.
+    fn take_hello(&mut self, peer: PeerId) {
+        let Some(hello) = self.others.get(&peer).and_then(|other| other.hello.clone()) else { return };
+        if self.config.user == UserId::HOST {
+            return;
+        }
+        if hello.user == UserId::HOST {
+            return self.event(PeerEvent::JoinRequest { peer });
+        }
+        if self.is_taken(hello.user) {
+            return self.turn_away(peer, DisconnectReason::NumberTaken);
+        }
+        self.greet(peer);
+        self.join(peer, hello);
+    }
+
+    /// Lets a peer into the session.
+    fn join(&mut self, peer: PeerId, hello: Hello) {
+        let Hello { user, name, address, joining } = hello;
+        let Some(other) = self.others.get_mut(&peer) else { return };
+        (other.user, other.hello) = (Some(user), None);
+        other.wants_state = joining && self.started;
+        // Founding peers start together and expect each other from the start. The hands of a
+        // joining peer come later. The first state that can be given to it is that of tick 1.
+        let first =
+            if joining { self.tick.max(1) + 1 } else { 1.max(self.tick.saturating_sub(WINDOW as u64 / 2)) };
+        self.inputs.expect(user, first);
+        self.event(PeerEvent::Joined { peer, user, name, address });
+    }
+
+    /// Ends a connection with a goodbye.
+    fn turn_away(&mut self, peer: PeerId, reason: DisconnectReason) {
+        self.message(peer, &PeerMessage::Goodbye { reason });
+        self.disconnect(peer, reason);
     }
 
     /// Removes a connection.
@@ -214,10 +315,7 @@ impl PeerSession {
         if !in_range(&target) || !(0.0..=1e9).contains(&radius) {
             return Err(StreamError::NotFinite { what: "grab" });
         }
-        if let Err(error) = hold.check() {
-            let expected = "a spring above 0 N/m, a damper of 0 s or more";
-            return Err(StreamError::Config { what: "hold", found: error.to_string(), expected });
-        }
+        let hold = check_hold(hold)?;
         if vertex as usize >= b.model().surface().positions().len() {
             return Err(StreamError::Model(format!("vertex {vertex} is not on the surface")));
         }
@@ -312,7 +410,7 @@ impl PeerSession {
     /// Processes a received datagram. Any bytes are allowed.
     pub fn on_datagram(&mut self, now: Duration, peer: PeerId, bytes: &[u8]) {
         let Some(other) = self.others.get_mut(&peer) else { return };
-        let (Some(user), Ok((sequence, datagram))) = (other.user, PeerDatagram::decode(bytes)) else {
+        let (Some(user), Ok((sequence, datagram))) = (other.user, Datagram::decode(bytes)) else {
             other.link.reject();
             return;
         };
@@ -320,7 +418,7 @@ impl PeerSession {
             return;
         }
         match datagram {
-            PeerDatagram::Inputs { now: theirs, ahead: seen, ticks, check } => {
+            Datagram::Inputs(Inputs { now: theirs, ahead: seen, ticks, check }) => {
                 other.theirs = seen.or(other.theirs);
                 other.came(now, theirs as f64 * self.config.step);
                 let sample = self.tick as f64 - theirs as f64;
@@ -343,7 +441,8 @@ impl PeerSession {
                     self.compare(peer, user, check);
                 }
             }
-            PeerDatagram::Ask { runs } => self.answer(now, peer, &runs),
+            Datagram::InputRequest(runs) => self.answer(now, peer, &runs),
+            _ => other.link.reject(),
         }
     }
 
@@ -355,32 +454,36 @@ impl PeerSession {
         let Some(other) = self.others.get_mut(&peer) else { return };
         other.link.receive_message(now, bytes.len());
         match message {
-            Ok(PeerMessage::Hello { version, user, name, joining, scene }) => {
+            Ok(PeerMessage::Hello { version, user, name, address, joining, scene }) => {
                 let user = UserId(user);
-                let taken = user == self.config.user || self.inputs.users.get(&user).is_some_and(|u| !u.gone);
+                let twice = other.user.is_some() || other.hello.is_some();
                 let refused = if version != PROTOCOL_VERSION {
                     Some(DisconnectReason::VersionMismatch)
-                } else if other.user.is_some() || user != other.expected || taken {
+                } else if twice || other.expected.is_some_and(|expected| user != expected) {
                     Some(DisconnectReason::Protocol)
                 } else {
                     (Some(scene) != own).then_some(DisconnectReason::SceneMismatch)
                 };
                 if let Some(reason) = refused {
-                    self.message(peer, &PeerMessage::Goodbye { reason });
-                    return self.disconnect(peer, reason);
+                    return self.turn_away(peer, reason);
                 }
-                other.user = Some(user);
-                other.wants_state = joining && self.started;
-                // Founding peers start together and expect each other from the start. The hands of
-                // a joining peer come later. The first state that can be given to it is that of
-                // tick 1.
-                let first = if joining {
-                    self.tick.max(1) + 1
-                } else {
-                    1.max(self.tick.saturating_sub(WINDOW as u64 / 2))
-                };
-                self.inputs.expect(user, first);
-                self.event(PeerEvent::Joined { user, name });
+                other.hello = Some(Hello { user, name, address, joining });
+                self.take_hello(peer);
+            }
+            Ok(PeerMessage::Welcome { user, others }) => {
+                let user = UserId(user);
+                // Only a peer that this one has asked gives a number, and it has another one itself.
+                let from = other.hello.as_ref().filter(|_| other.greeted).map(|hello| hello.user);
+                let asked = self.config.user == UserId::HOST && from.is_some();
+                if !asked || from == Some(UserId::HOST) || from == Some(user) {
+                    return self.turn_away(peer, DisconnectReason::Protocol);
+                }
+                self.config.user = user;
+                self.inputs.expect(user, 1);
+                let others = others.into_iter().map(|(user, address)| (UserId(user), address)).collect();
+                self.event(PeerEvent::Welcomed { user, others });
+                let waiting: Vec<PeerId> = self.others.keys().copied().collect();
+                waiting.into_iter().for_each(|peer| self.take_hello(peer));
             }
             Ok(PeerMessage::StateRequest) => other.wants_state = true,
             Ok(PeerMessage::State { tick, now: theirs, bodies }) => {
@@ -396,8 +499,7 @@ impl PeerSession {
             Ok(PeerMessage::Goodbye { reason }) => self.disconnect(peer, reason),
             Err(_) => {
                 other.link.reject();
-                self.message(peer, &PeerMessage::Goodbye { reason: DisconnectReason::Protocol });
-                self.disconnect(peer, DisconnectReason::Protocol);
+                self.turn_away(peer, DisconnectReason::Protocol);
             }
         }
     }
@@ -492,7 +594,8 @@ impl PeerSession {
                 });
             self.last_check = check.or(self.last_check);
         }
-        let peers: Vec<PeerId> = self.others.keys().copied().collect();
+        let known = |o: &RemotePeer| o.user.is_some() || o.expected.is_some();
+        let peers: Vec<PeerId> = self.others.iter().filter(|(_, o)| known(o)).map(|(p, _)| *p).collect();
         for peer in peers {
             self.send_inputs(peer, check);
         }
@@ -505,31 +608,29 @@ impl PeerSession {
             .map_while(|back| self.tick.checked_sub(back))
             .filter_map(|t| own.at(t).cloned())
             .collect();
-        let bytes = |t: &[InputTick]| PeerDatagram::bytes_of(t.iter().map(|t| t.held.as_slice()));
-        while ticks.len() > 1 && bytes(&ticks) > other.link.max_datagram {
+        while ticks.len() > 1 && Inputs::bytes(&ticks) > other.link.max_datagram {
             ticks.pop();
         }
         let (now, ahead) = (self.tick, other.ahead);
-        self.datagram(peer, &PeerDatagram::Inputs { now, ahead, ticks, check });
+        self.datagram(peer, &Datagram::Inputs(Inputs { now, ahead, ticks, check }));
     }
 
-    fn answer(&mut self, now: Duration, peer: PeerId, runs: &[(Tick, u8)]) {
+    fn answer(&mut self, now: Duration, peer: PeerId, runs: &[NackRun]) {
         let Some(own) = self.inputs.users.get(&self.config.user) else { return };
         let Some(other) = self.others.get_mut(&peer) else { return };
-        let wanted = runs.iter().flat_map(|(first, count)| *first..first + u64::from(*count));
+        let wanted = runs.iter().flat_map(|run| run.first..run.first + u64::from(run.count));
         let known = wanted.filter_map(|t| own.at(t)).take(WINDOW);
         let mut ticks: Vec<InputTick> =
             known.take_while(|_| other.answer_budget.spend(now, 1.0)).cloned().collect();
         let limit = other.link.max_datagram;
         while !ticks.is_empty() {
             let mut count = ticks.len().min(MAX_TICKS);
-            let bytes = |n: usize| PeerDatagram::bytes_of(ticks[..n].iter().map(|t| t.held.as_slice()));
-            while count > 1 && bytes(count) > limit {
+            while count > 1 && Inputs::bytes(&ticks[..count]) > limit {
                 count -= 1;
             }
             let rest = ticks.split_off(count);
             let (now, ahead) = (self.tick, self.others.get(&peer).and_then(|o| o.ahead));
-            self.datagram(peer, &PeerDatagram::Inputs { now, ahead, ticks, check: None });
+            self.datagram(peer, &Datagram::Inputs(Inputs { now, ahead, ticks, check: None }));
             ticks = rest;
         }
     }
@@ -541,7 +642,7 @@ impl PeerSession {
             let Some(inputs) = other.user.and_then(|u| self.inputs.users.get(&u)) else { continue };
             let to = inputs.highest.saturating_sub(self.config.repeats as u64);
             let from = (inputs.complete + 1).max(inputs.first);
-            let mut runs: Vec<(Tick, u8)> = Vec::new();
+            let mut runs: Vec<NackRun> = Vec::new();
             for tick in from..to {
                 let again = other.asked.get(&tick).is_some_and(|at| now.saturating_sub(*at) < ASK_AGAIN);
                 if inputs.at(tick).is_some() || again {
@@ -549,15 +650,17 @@ impl PeerSession {
                 }
                 other.asked.insert(tick, now);
                 match runs.last_mut() {
-                    Some((first, count)) if *first + u64::from(*count) == tick && *count < 64 => *count += 1,
-                    _ => runs.push((tick, 1)),
+                    Some(run) if run.first + u64::from(run.count) == tick && run.count < MAX_NACK_RUN => {
+                        run.count += 1;
+                    }
+                    _ => runs.push(NackRun { first: tick, count: 1 }),
                 }
             }
             other.asked.retain(|t, _| *t >= from);
-            runs.truncate(MAX_TICKS);
+            runs.truncate(MAX_NACK_RUNS);
             if !runs.is_empty() {
                 other.link.stats.nacks += 1;
-                questions.push((*peer, PeerDatagram::Ask { runs }));
+                questions.push((*peer, Datagram::InputRequest(runs)));
             }
             if inputs.complete + (WINDOW as u64) / 2 < inputs.highest {
                 other.lost = true;
@@ -587,7 +690,7 @@ impl PeerSession {
         (0.01 * mean).clamp(-SLEW, SLEW)
     }
 
-    fn datagram(&mut self, peer: PeerId, datagram: &PeerDatagram) {
+    fn datagram(&mut self, peer: PeerId, datagram: &Datagram) {
         let Some(other) = self.others.get_mut(&peer) else { return };
         if self.out.len() >= MAX_OUT {
             return other.link.drop_datagram();

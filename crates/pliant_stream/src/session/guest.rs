@@ -232,7 +232,7 @@ impl GuestSession {
                     self.link.sample_round_trip(rtt);
                 }
             }
-            Datagram::Targets(_) | Datagram::Nack(_) | Datagram::Ping(_) => self.link.reject(),
+            _ => self.link.reject(),
         }
     }
 

@@ -9,7 +9,7 @@ use super::MIN_DATAGRAM;
 use super::guest::GuestSession;
 use crate::StreamError;
 use crate::state::{BodyId, in_range};
-use crate::wire::{Datagram, GuestMessage, MAX_TARGETS, TargetEntry, Targets};
+use crate::wire::{Datagram, GuestMessage, MAX_TARGETS, TargetEntry, Targets, check_hold};
 
 /// Interval at which an unchanged target is sent again.
 const TARGET_EVERY: Duration = Duration::from_millis(250);
@@ -65,12 +65,8 @@ impl GuestSession {
         if !in_range(&target) || !(0.0..=1e9).contains(&radius) {
             return Err(StreamError::NotFinite { what: "grab" });
         }
-        if let Err(error) = hold.check() {
-            let expected = "a spring above 0 N/m, a damper of 0 s or more";
-            return Err(StreamError::Config { what: "hold", found: error.to_string(), expected });
-        }
         // The host applies the same limits.
-        let hold = hold.capped();
+        let hold = check_hold(hold)?;
         let limit = super::host_peer::MAX_GUEST_GRABS;
         if self.grabs.len() >= limit {
             return Err(StreamError::Full { what: "grabs", limit });

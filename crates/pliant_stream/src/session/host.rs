@@ -308,7 +308,7 @@ impl HostSession {
                 }
                 p.send_pong(now, clock.t1, &mut self.out);
             }
-            Datagram::Frame(_) | Datagram::Pong(_) => p.link.reject(),
+            _ => p.link.reject(),
         }
     }
 

@@ -1,6 +1,6 @@
-//! The kinds of datagram between host and guest.
+//! The kinds of datagram between host and guest, and between peers.
 
-use super::{Frame, Reader, Writer};
+use super::{Frame, Inputs, Reader, Writer};
 use crate::StreamError;
 use crate::state::{BodyId, Tick};
 
@@ -9,12 +9,14 @@ const TARGETS: u8 = 2;
 const NACK: u8 = 3;
 const PING: u8 = 4;
 const PONG: u8 = 5;
+const INPUTS: u8 = 6;
+const INPUT_REQUEST: u8 = 7;
 
-/// Largest number of runs in one NACK.
+/// Largest number of runs in one NACK or input request.
 pub(crate) const MAX_NACK_RUNS: usize = 32;
 /// Largest number of target entries in one datagram.
 pub(crate) const MAX_TARGETS: usize = 64;
-/// Largest length of one run in a NACK, ticks.
+/// Largest length of one run, ticks.
 pub(crate) const MAX_NACK_RUN: u8 = 64;
 
 /// A run of missing ticks.
@@ -78,8 +80,8 @@ pub struct Clock {
     pub round_trip: u32,
 }
 
-/// All unreliable traffic between host and guest. The sequence number counts all datagrams from
-/// this sender to this receiver.
+/// All unreliable traffic of a session. The sequence number counts all datagrams from this sender
+/// to this receiver.
 #[derive(Debug, Clone, PartialEq)]
 #[expect(
     clippy::large_enum_variant,
@@ -96,6 +98,10 @@ pub enum Datagram {
     Ping(Clock),
     /// Host to guest: clock answer, and the host's report.
     Pong(Clock),
+    /// Peer to peer: the inputs of the sender's hands.
+    Inputs(Inputs),
+    /// Peer to peer: runs of the receiver's inputs that the sender lacks, at most 32.
+    InputRequest(Vec<NackRun>),
 }
 
 impl Datagram {
@@ -134,12 +140,7 @@ impl Datagram {
             Self::Nack(nack) => {
                 w.raw(&Self::header(NACK, sequence));
                 w.u16(nack.body.0);
-                let runs = &nack.runs[..nack.runs.len().min(MAX_NACK_RUNS)];
-                w.u8(runs.len() as u8);
-                for run in runs {
-                    w.tick(run.first);
-                    w.u8(run.count);
-                }
+                encode_runs(&nack.runs, &mut w);
             }
             Self::Ping(clock) => {
                 w.raw(&Self::header(PING, sequence));
@@ -155,6 +156,14 @@ impl Datagram {
                 w.u64(clock.t3);
                 w.u32(clock.report.received);
                 w.u32(clock.report.highest);
+            }
+            Self::Inputs(inputs) => {
+                w.raw(&Self::header(INPUTS, sequence));
+                inputs.encode(&mut w);
+            }
+            Self::InputRequest(runs) => {
+                w.raw(&Self::header(INPUT_REQUEST, sequence));
+                encode_runs(runs, &mut w);
             }
         }
         w.into_bytes()
@@ -186,22 +195,7 @@ impl Datagram {
             }
             NACK => {
                 let body = BodyId(r.u16("nack body")?);
-                let count = r.u8("nack runs")?;
-                bounded("nack runs", count, MAX_NACK_RUNS, "at most 32")?;
-                let mut runs = Vec::with_capacity(usize::from(count).min(r.left() / 7));
-                for _ in 0..count {
-                    let first = r.tick("nack tick")?;
-                    let count = r.u8("nack run length")?;
-                    if count == 0 || count > MAX_NACK_RUN {
-                        return Err(StreamError::Invalid {
-                            what: "nack run length",
-                            found: count.to_string(),
-                            expected: "1..=64",
-                        });
-                    }
-                    runs.push(NackRun { first, count });
-                }
-                Self::Nack(Nack { body, runs })
+                Self::Nack(Nack { body, runs: decode_runs(&mut r)? })
             }
             PING => {
                 let t1 = r.u64("t1")?;
@@ -212,11 +206,13 @@ impl Datagram {
                 let (t1, t2, t3) = (r.u64("t1")?, r.u64("t2")?, r.u64("t3")?);
                 Self::Pong(Clock { t1, t2, t3, report: report(&mut r)?, round_trip: 0 })
             }
+            INPUTS => Self::Inputs(Inputs::decode(&mut r)?),
+            INPUT_REQUEST => Self::InputRequest(decode_runs(&mut r)?),
             other => {
                 return Err(StreamError::Invalid {
                     what: "datagram kind",
                     found: other.to_string(),
-                    expected: "1..=5",
+                    expected: "1..=7",
                 });
             }
         };
@@ -229,7 +225,38 @@ fn report(r: &mut Reader<'_>) -> Result<Report, StreamError> {
     Ok(Report { received: r.u32("report received")?, highest: r.u32("report highest")? })
 }
 
-fn bounded(what: &'static str, found: u8, limit: usize, expected: &'static str) -> Result<(), StreamError> {
+fn encode_runs(runs: &[NackRun], w: &mut Writer) {
+    let runs = &runs[..runs.len().min(MAX_NACK_RUNS)];
+    w.u8(runs.len() as u8);
+    for run in runs {
+        w.tick(run.first);
+        w.u8(run.count);
+    }
+}
+
+fn decode_runs(r: &mut Reader<'_>) -> Result<Vec<NackRun>, StreamError> {
+    let count = r.u8("runs")?;
+    bounded("runs", count, MAX_NACK_RUNS, "at most 32")?;
+    let mut runs = Vec::with_capacity(usize::from(count).min(r.left() / 7));
+    for _ in 0..count {
+        let first = r.tick("run tick")?;
+        let count = r.u8("run length")?;
+        if count == 0 || count > MAX_NACK_RUN {
+            let found = count.to_string();
+            return Err(StreamError::Invalid { what: "run length", found, expected: "1..=64" });
+        }
+        runs.push(NackRun { first, count });
+    }
+    Ok(runs)
+}
+
+/// Checks a count or flag.
+pub(super) fn bounded(
+    what: &'static str,
+    found: u8,
+    limit: usize,
+    expected: &'static str,
+) -> Result<(), StreamError> {
     if usize::from(found) <= limit {
         Ok(())
     } else {

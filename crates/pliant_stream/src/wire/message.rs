@@ -1,9 +1,9 @@
-//! Reliable messages: encoded with postcard and checked after decoding.
+//! Reliable messages between host and guest: encoded with postcard and checked after decoding.
 
 use pliant_modal::{GrabConfig, StepSettings};
 use serde::{Deserialize, Serialize};
 
-use super::AccelerationCoding;
+use super::{AccelerationCoding, WIDE_LIMIT};
 use crate::StreamError;
 use crate::session::{DisconnectReason, MAX_MESSAGE};
 use crate::state::{MAX_GRABS, MAX_MODES, Placement, TICK_LIMIT, UserInfo, UserLinkInfo, in_range};
@@ -200,7 +200,7 @@ pub enum HostMessage {
     },
 }
 
-fn decode<'a, M: Deserialize<'a>>(what: &'static str, bytes: &'a [u8]) -> Result<M, StreamError> {
+pub(super) fn decode<'a, M: Deserialize<'a>>(what: &'static str, bytes: &'a [u8]) -> Result<M, StreamError> {
     if bytes.len() > MAX_MESSAGE {
         return Err(StreamError::Invalid {
             what,
@@ -216,18 +216,35 @@ fn decode<'a, M: Deserialize<'a>>(what: &'static str, bytes: &'a [u8]) -> Result
     }
 }
 
-fn encode<M: Serialize>(message: &M) -> Vec<u8> {
+pub(super) fn encode<M: Serialize>(message: &M) -> Vec<u8> {
     // Every message is plain data, so serializing it to a growing buffer cannot fail.
     postcard::to_stdvec(message).unwrap_or_default()
 }
 
-fn check(
+pub(super) fn check(
     what: &'static str,
     ok: bool,
     found: impl ToString,
     expected: &'static str,
 ) -> Result<(), StreamError> {
     if ok { Ok(()) } else { Err(StreamError::Invalid { what, found: found.to_string(), expected }) }
+}
+
+/// Returns whether all numbers are within [`WIDE_LIMIT`].
+pub(super) fn wide_range(values: &[f64]) -> bool {
+    values.iter().all(|x| x.abs() <= WIDE_LIMIT)
+}
+
+/// Checks a hand's own spring and damper, and caps them at what devices have.
+pub(crate) fn check_hold(hold: GrabConfig) -> Result<GrabConfig, StreamError> {
+    match hold.check() {
+        Ok(()) => Ok(hold.capped()),
+        Err(error) => Err(StreamError::Config {
+            what: "hold",
+            found: error.to_string(),
+            expected: "a spring above 0 N/m, a damper of 0 s or more",
+        }),
+    }
 }
 
 fn check_user(user: &UserInfo) -> Result<(), StreamError> {
@@ -256,10 +273,7 @@ impl GuestMessage {
             Self::GrabBegin { radius, target, hold, .. } => {
                 check("radius", *radius >= 0.0 && in_range(&[*radius]), radius, "0..=1e9 m")?;
                 check("target", in_range(target), format!("{target:?}"), "finite metres")?;
-                if let Err(error) = hold.check() {
-                    check("hold", false, error, "a spring above 0 N/m, a damper of 0 s or more")?;
-                }
-                *hold = hold.capped();
+                *hold = check_hold(*hold)?;
             }
             Self::GrabEnd { .. }
             | Self::SnapshotRequest { .. }
@@ -312,7 +326,7 @@ impl HostMessage {
                     && s.means.iter().all(|(_, _, pull)| in_range(pull))
                     && in_range(&s.v)
                     && in_range(&s.z);
-                let finite = finite && s.a.iter().chain(&s.load).all(|x| x.is_finite() && x.abs() < 1e15);
+                let finite = finite && wide_range(&s.a) && wide_range(&s.load);
                 check("snapshot", finite, "a number out of range", "finite numbers")?;
             }
             Self::BodyPlaced { placement, .. } => {

@@ -9,16 +9,22 @@ mod bits;
 mod bytes;
 mod datagram;
 mod frame;
+mod inputs;
 mod message;
+mod peer_message;
 mod slice;
 
 pub(crate) use bytes::{Reader, WIDE_LIMIT, Writer, round24};
 pub use datagram::{Clock, Datagram, Nack, NackRun, Report, TargetEntry, Targets};
-pub(crate) use datagram::{MAX_NACK_RUNS, MAX_TARGETS};
+pub(crate) use datagram::{MAX_NACK_RUN, MAX_NACK_RUNS, MAX_TARGETS};
 pub(crate) use frame::MAX_PARTS;
 pub use frame::{AccelerationCoding, Accelerations, Frame, FrameGrab, Repeat, RepeatGrab};
+pub use inputs::{HeldAt, InputTick, Inputs, StateCheck};
+pub(crate) use inputs::{MAX_HELD, MAX_TICKS};
 pub use message::{BodyInfo, GuestMessage, HostMessage, Payload, SnapshotBytes, StreamSubscription};
-pub(crate) use message::{MAX_BODIES, MAX_CACHED, MAX_NAME};
+pub(crate) use message::{MAX_BODIES, MAX_CACHED, MAX_NAME, check_hold};
+pub(crate) use peer_message::{MAX_ADDRESS, MAX_PEERS};
+pub use peer_message::{PeerBodyState, PeerFrame, PeerGrip, PeerMessage};
 pub use slice::{Slice, SliceEntry};
 
 /// Version of the formats in this module. The two sides of a session must agree.

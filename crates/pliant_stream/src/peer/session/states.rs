@@ -6,8 +6,8 @@ use super::{CHECK_TOLERANCE, MAX_OUT, PeerSession};
 use crate::peer::config::PeerEvent;
 use crate::peer::inputs::WINDOW;
 use crate::peer::other::RemotePeer;
-use crate::peer::wire::{InputTick, PeerBodyState, PeerMessage, StateCheck};
 use crate::state::{BodyId, PeerId, Tick, UserId};
+use crate::wire::{InputTick, PeerBodyState, PeerMessage, StateCheck};
 
 impl PeerSession {
     pub(super) fn take_state(

@@ -1,0 +1,191 @@
+//! Datagram between peers: the inputs of the sender's hands.
+
+use pliant_modal::GrabConfig;
+
+use super::datagram::bounded;
+use super::message::check_hold;
+use super::{Reader, Writer};
+use crate::StreamError;
+use crate::state::{BodyId, GrabKey, Tick, UserId};
+
+/// Largest number of ticks in one datagram.
+pub(crate) const MAX_TICKS: usize = 16;
+/// Largest number of grabs of one user at one tick.
+pub(crate) const MAX_HELD: usize = 16;
+/// Bytes of one grab without spring and damper.
+const HELD_BYTES: usize = 25;
+/// Bytes of the spring of a grab, and of its damper, if present.
+const HOLD_BYTES: usize = 4;
+
+/// A grab at one tick.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct HeldAt {
+    /// The body.
+    pub body: BodyId,
+    /// The user's number for the grab.
+    pub grab: u16,
+    /// Surface vertex at the center of the patch.
+    pub vertex: u32,
+    /// Radius of the patch, m.
+    pub radius: f64,
+    /// Position of the hand, world, m.
+    pub target: [f64; 3],
+    /// The hand's own spring and damper, within what devices have ([`GrabConfig::capped`]).
+    pub hold: GrabConfig,
+}
+
+impl HeldAt {
+    /// Key of the grab among all users.
+    pub fn key(&self, user: UserId) -> GrabKey {
+        GrabKey { user, grab: self.grab }
+    }
+
+    /// Rounds the values as the wire format does.
+    pub(crate) fn rounded(mut self) -> Self {
+        self.radius = f64::from(self.radius as f32);
+        self.target = self.target.map(|x| f64::from(x as f32));
+        self.hold = self.hold.capped();
+        self
+    }
+
+    fn bytes(&self) -> usize {
+        let parts = usize::from(self.hold.stiffness.is_some()) + usize::from(self.hold.relaxation != 0.0);
+        HELD_BYTES + parts * HOLD_BYTES
+    }
+
+    fn encode(&self, w: &mut Writer) {
+        w.u16(self.body.0);
+        w.u16(self.grab);
+        w.u32(self.vertex);
+        w.f32(self.radius as f32);
+        w.vector(self.target);
+        let damper = self.hold.relaxation != 0.0;
+        w.u8(u8::from(self.hold.stiffness.is_some()) | u8::from(damper) << 1);
+        if let Some(stiffness) = self.hold.stiffness {
+            w.f32(stiffness as f32);
+        }
+        if damper {
+            w.f32(self.hold.relaxation as f32);
+        }
+    }
+
+    fn decode(r: &mut Reader<'_>) -> Result<Self, StreamError> {
+        let mut held = Self {
+            body: BodyId(r.u16("held body")?),
+            grab: r.u16("held grab")?,
+            vertex: r.u32("held vertex")?,
+            radius: r.f32("held radius")?,
+            target: r.vector("held target")?,
+            hold: GrabConfig::default(),
+        };
+        let has = r.u8("held hand")?;
+        bounded("held hand", has, 3, "0 to 3")?;
+        if has & 1 != 0 {
+            held.hold.stiffness = Some(r.f32("held stiffness")?);
+        }
+        if has & 2 != 0 {
+            held.hold.relaxation = r.f32("held relaxation")?;
+        }
+        held.hold = check_hold(held.hold)?;
+        if held.radius < 0.0 {
+            let found = held.radius.to_string();
+            return Err(StreamError::Invalid { what: "held radius", found, expected: "0 m or more" });
+        }
+        Ok(held)
+    }
+}
+
+/// All grabs of one user at one tick.
+#[derive(Debug, Clone, PartialEq, Default)]
+pub struct InputTick {
+    /// The tick.
+    pub tick: Tick,
+    /// The grabs, at most 16.
+    pub held: Vec<HeldAt>,
+}
+
+/// Checksum of one body at a tick for which the sender knows all inputs.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct StateCheck {
+    /// The body.
+    pub body: BodyId,
+    /// The tick.
+    pub tick: Tick,
+    /// Sum of [`crate::codec::checksum::projection`] over the coordinates, the viscoelastic state
+    /// and the rigid frame, as far as the body has them.
+    pub value: f32,
+}
+
+/// The inputs of a peer's own hands.
+#[derive(Debug, Clone, PartialEq, Default)]
+pub struct Inputs {
+    /// The tick that the sender has reached.
+    pub now: Tick,
+    /// Mean of the sender's tick minus the receiver's tick, at arrival at the sender, ticks; `None`
+    /// when unknown.
+    pub ahead: Option<f64>,
+    /// The inputs, at most 16 ticks.
+    pub ticks: Vec<InputTick>,
+    /// A checksum, at most one.
+    pub check: Option<StateCheck>,
+}
+
+impl Inputs {
+    /// Number of bytes of a datagram with these ticks.
+    pub(crate) fn bytes(ticks: &[InputTick]) -> usize {
+        let tick = |t: &InputTick| 7 + t.held.iter().map(HeldAt::bytes).sum::<usize>();
+        3 + 6 + 2 + 1 + 1 + 12 + ticks.iter().map(tick).sum::<usize>()
+    }
+
+    /// Writes the inputs after a datagram header.
+    pub(crate) fn encode(&self, w: &mut Writer) {
+        w.tick(self.now);
+        // The unit is 1/64 tick. A float-to-int cast saturates.
+        w.i16(self.ahead.map_or(i16::MIN, |a| ((a * 64.0).round() as i16).max(-i16::MAX)));
+        let ticks = &self.ticks[..self.ticks.len().min(MAX_TICKS)];
+        w.u8(ticks.len() as u8);
+        for t in ticks {
+            w.tick(t.tick);
+            let held = &t.held[..t.held.len().min(MAX_HELD)];
+            w.u8(held.len() as u8);
+            held.iter().for_each(|held| held.encode(w));
+        }
+        w.u8(u8::from(self.check.is_some()));
+        if let Some(c) = self.check {
+            w.u16(c.body.0);
+            w.tick(c.tick);
+            w.f32(c.value);
+        }
+    }
+
+    /// Reads inputs after the datagram header.
+    pub(crate) fn decode(r: &mut Reader<'_>) -> Result<Self, StreamError> {
+        let now = r.tick("tick")?;
+        let ahead = match r.i16("ahead")? {
+            i16::MIN => None,
+            steps => Some(f64::from(steps) / 64.0),
+        };
+        let count = r.u8("tick count")?;
+        bounded("tick count", count, MAX_TICKS, "at most 16")?;
+        let mut ticks = Vec::with_capacity(usize::from(count));
+        for _ in 0..count {
+            let tick = r.tick("input tick")?;
+            let count = r.u8("held count")?;
+            bounded("held count", count, MAX_HELD, "at most 16")?;
+            let mut held = Vec::with_capacity(usize::from(count).min(r.left() / HELD_BYTES));
+            for _ in 0..count {
+                held.push(HeldAt::decode(r)?);
+            }
+            ticks.push(InputTick { tick, held });
+        }
+        let flag = r.u8("check flag")?;
+        bounded("check flag", flag, 1, "0 or 1")?;
+        let check = if flag == 0 {
+            None
+        } else {
+            let (body, tick) = (BodyId(r.u16("check body")?), r.tick("check tick")?);
+            Some(StateCheck { body, tick, value: r.wide32("check")? })
+        };
+        Ok(Self { now, ahead, ticks, check })
+    }
+}
