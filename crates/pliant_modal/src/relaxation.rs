@@ -58,6 +58,24 @@ impl Relaxation {
         1.0 - self.ratio * (-left * t / self.time).exp_m1() / left
     }
 
+    /// Weights of `z0`, `q0` and `q1` in the viscoelastic state after a step of `h` s, over which the
+    /// coordinate moves linearly from `q0` to `q1`. They add up to 1.
+    ///
+    /// ```text
+    /// z1 = e^-x z0 + (g - e^-x) q0 + (1 - g) q1,   x = h / time, g = (1 - e^-x) / x
+    /// ```
+    pub fn linear_weights(&self, h: f64) -> [f64; 3] {
+        let x = h / self.time;
+        let gone = -(-x).exp_m1();
+        // The closed form loses all digits of the last weight for small x.
+        let new = if x < 1e-3 {
+            x * (0.5 - x * (1.0 / 6.0 - x * (1.0 / 24.0 - x / 120.0)))
+        } else {
+            1.0 - gone / x
+        };
+        [(-x).exp(), gone - new, new]
+    }
+
     /// Storage and loss modulus at `omega` rad/s, as shares of the instantaneous modulus.
     ///
     /// They are `1 - ratio / (1 + x^2)` and `ratio x / (1 + x^2)` with `x = omega time`.
@@ -195,13 +213,7 @@ fn alpha(
 ) -> (Coefficients, ViscoelasticCoefficients) {
     let k = omega * omega;
     let flowing = k * relaxation.ratio;
-    let x = h / relaxation.time;
-    // For a strain that is linear over the step: z1 = e z0 + w0 q0 + w1 q1.
-    let e = (-x).exp();
-    let gone = -(-x).exp_m1();
-    let w1 =
-        if x < 1e-3 { x * (0.5 - x * (1.0 / 6.0 - x * (1.0 / 24.0 - x / 120.0))) } else { 1.0 - gone / x };
-    let w0 = gone - w1;
+    let [e, w0, w1] = relaxation.linear_weights(h);
     let (bh, gh) = (beta * h * h, gamma * h);
     let (ph, mh) = (h * h * (0.5 - beta), h * (1.0 - gamma));
     // This solves the following equation for a1:

@@ -91,23 +91,14 @@ impl Newmark {
     }
 }
 
-/// Viscoelastic state of a body (`time z' = q - z`) as a filter of its coordinates.
-///
-/// The filter is exact where the coordinates are linear over a step:
-///
-/// ```text
-/// z1 = e^-x z0 + (g - e^-x) q0 + (1 - g) q1,   x = h / time, g = (1 - e^-x) / x
-/// ```
+/// Viscoelastic state of a body as a filter of its coordinates
+/// ([`Relaxation::linear_weights`]).
 ///
 /// A stream of accelerations gives the coordinates, and the viscoelastic state follows from the
-/// coordinates. An error of the viscoelastic state decays by `e^-x` per step.
+/// coordinates. An error of the viscoelastic state decays by its own weight in each step.
 #[derive(Debug, Clone, PartialEq)]
 pub struct FlowFilter {
-    /// Share of the stiffness that relaxes away.
-    pub ratio: f64,
-    keep: f64,
-    by_old: f64,
-    by_new: f64,
+    weights: [f64; 3],
     responses: Vec<f64>,
 }
 
@@ -115,11 +106,7 @@ impl FlowFilter {
     /// Creates the filter for a material. `ages` says how many ticks back an acceleration may be
     /// corrected.
     pub fn new(relaxation: Relaxation, newmark: &Newmark, ages: usize) -> Self {
-        let x = newmark.h / relaxation.time;
-        let keep = (-x).exp();
-        let g = if x > 1e-8 { -(-x).exp_m1() / x } else { 1.0 - 0.5 * x };
-        let mut made =
-            Self { ratio: relaxation.ratio, keep, by_old: g - keep, by_new: 1.0 - g, responses: Vec::new() };
+        let mut made = Self { weights: relaxation.linear_weights(newmark.h), responses: Vec::new() };
         let (mut z, mut last) = (0.0, 0.0);
         for age in 0..ages as u64 {
             let (q, _) = newmark.response(age);
@@ -132,7 +119,8 @@ impl FlowFilter {
 
     /// Returns the viscoelastic state after a step in which the coordinate moved from `q0` to `q1`.
     pub fn step(&self, z0: f64, q0: f64, q1: f64) -> f64 {
-        self.keep * z0 + self.by_old * q0 + self.by_new * q1
+        let [keep, by_old, by_new] = self.weights;
+        keep * z0 + by_old * q0 + by_new * q1
     }
 
     /// Does the first half of a step of all viscoelastic states, from the old coordinates. Call it
@@ -146,7 +134,7 @@ impl FlowFilter {
     /// Does the second half of the step, from the new coordinates.
     pub(crate) fn finish(&self, state: &mut State) {
         for (z, q) in state.z.iter_mut().zip(&state.q) {
-            *z += self.by_new * q;
+            *z += self.weights[2] * q;
         }
     }
 
