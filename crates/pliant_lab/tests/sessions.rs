@@ -10,7 +10,7 @@ use pliant_modal::{Body, BodyConfig};
 use pliant_stream::emulator::LinkConfig;
 use pliant_stream::{
     BodyId, DisconnectReason, GuestConfig, GuestEvent, GuestSession, HostConfig, HostEvent, HostSession,
-    PeerId, StepSettings, UserId,
+    PeerId, RecoveryConfig, StepSettings, UserId,
 };
 use support::bar;
 use support::scene::{BODY, MS, S, Scene, cached, circling, paper1, start, start_with};
@@ -172,4 +172,27 @@ fn guest_that_is_killed_is_let_go_with_its_grabs() {
     );
     assert!(scene.saw(1, |e| matches!(e, GuestEvent::UserLeft { user: UserId(1), .. })));
     assert_eq!(pair.guests[1].session.user(), Some(UserId(2)));
+}
+
+/// A host steps the first 4 of 40 modes, and its guests follow it without the others.
+#[test]
+fn guests_follow_a_host_that_steps_fewer_modes_than_the_model_has() {
+    let model = bar(40, 0.05);
+    for name in ["default", "paper"] {
+        let (mut pair, mut scene) = start(&model);
+        let config = BodyConfig { step: 1.0 / 40.0, modes: Some(4), ..Default::default() };
+        scene.body = Body::new(model.clone(), config).unwrap();
+        scene.hand = circling();
+        let recovery = RecoveryConfig::by_name(name).unwrap();
+        let path = PathConfig::symmetric(LinkConfig { delay: 50 * MS, ..Default::default() });
+        pair.join_with(GuestConfig { recovery, ..Default::default() }, path, 1, cached(&model)).unwrap();
+        pair.run_until(8 * S, &mut scene);
+        let guest = &pair.guests[0].session;
+        let (error, size) = (scene.error(guest), scene.size());
+        let shown = &guest.body(BODY).unwrap().visual().unwrap().q;
+        let beyond = shown[4..].iter().map(|q| q * q).sum::<f64>().sqrt();
+        println!("{name}: {:.3} % off, {:.3} % beyond", 100.0 * error / size, 100.0 * beyond / size);
+        assert!(size > 0.01 && error < 0.01 * size, "{name}: {error} of {size}");
+        assert!(beyond < 0.01 * size, "{name}: {beyond} of {size} in modes that the host has not");
+    }
 }

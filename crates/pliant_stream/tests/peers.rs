@@ -790,3 +790,34 @@ fn a_peers_hand_has_its_own_spring_and_damper() {
     }
     assert!(largest > 0.05, "{largest} N");
 }
+
+/// The damper of a hand crosses: the other peer computes the same force, to the bit, and another one
+/// than for a hand without a damper.
+#[test]
+fn a_hands_damper_is_felt_alike_by_the_other_peer() {
+    let felt = |relaxation| {
+        let link = LinkConfig { loss: Loss::Random(0.05), delay: 20 * MS, ..Default::default() };
+        let mut mesh = Mesh::new(2, &link, 11);
+        mesh.hold = GrabConfig { stiffness: Some(40.0), relaxation };
+        for k in 0..2 {
+            mesh.start(k, Repair::Rollback, true);
+        }
+        mesh.run(6 * S);
+        let [a, b] = [0, 1].map(|k| mesh.peers[k].as_ref().unwrap());
+        let last = a.confirmed().min(b.confirmed());
+        let mut all = Vec::new();
+        for tick in last - 60..=last {
+            let reactions = a.reactions_at(BODY, tick).unwrap();
+            assert_eq!(reactions.len(), 2);
+            assert_eq!(b.reactions_at(BODY, tick).unwrap(), reactions, "tick {tick}");
+            all.push(reactions[0].1);
+        }
+        all
+    };
+    let (damped, free) = (felt(0.1), felt(0.0));
+    let size = |x: &[f64; 3]| x.iter().map(|x| x * x).sum::<f64>().sqrt();
+    let largest = free.iter().map(size).fold(0.0, f64::max);
+    let apart = damped.iter().zip(&free).map(|(a, b)| size(&std::array::from_fn(|c| a[c] - b[c])));
+    let apart = apart.fold(0.0, f64::max);
+    assert!(apart > 0.05 * largest, "{apart} N of {largest} N");
+}
