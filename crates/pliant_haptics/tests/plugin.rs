@@ -7,7 +7,7 @@ use std::time::Duration;
 use bevy::{
     asset::AssetPlugin, math::DVec3, prelude::*, time::TimeUpdateStrategy, transform::TransformPlugin,
 };
-use pliant_body::{BodyState, Grab, GrabForce, ModalAsset, ModalBody, PliantBodyPlugin};
+use pliant_body::{BodyState, Grab, GrabForce, GrabOf, ModalAsset, ModalBody, PliantBodyPlugin};
 
 use pliant_haptics::{
     DeviceId, Fault, Hand, HapticButton, HapticDevices, HapticFault, HapticNotice, HapticTool, HapticsPlugin,
@@ -380,6 +380,28 @@ fn two_devices_on_one_body_feel_each_other() {
     // The first hand releases the block, and the other one then holds it alone.
     s.hand.set_buttons(0);
     until(&mut s, "alone", |s| grabs(&mut s.app).len() == 1 && devices(s)[1].length() < 0.3);
+}
+
+#[test]
+fn a_hand_that_has_let_go_is_no_longer_in_the_loops_copy_of_the_body() {
+    let mut s = scene(true);
+    s.hand.set_buttons(1);
+    until(&mut s, "the button grips what is in reach", |s| grabs(&mut s.app).len() == 1);
+    stays(&mut s, "nobody pulls", |s| force(s).length() < 0.05);
+    // Another hand pulls the middle of the block, and the tool feels it.
+    let body = s.app.world_mut().query_filtered::<Entity, With<ModalBody>>().single(s.app.world()).unwrap();
+    let middle = block::tip() / 2;
+    let surface = block::block(1e5, 12).surface().positions()[middle as usize];
+    let target = Vec3::from(surface).as_dvec3() + DVec3::new(0.01, 0.0, 0.0);
+    let other = s.app.world_mut().spawn((Grab::new(middle, 0.01, target), GrabOf(body))).id();
+    until(&mut s, "the other hand is felt", |s| force(s).x > 0.5);
+    s.app.world_mut().despawn(other);
+    // The block swings back first.
+    let mut quiet = 0;
+    until(&mut s, "its old target pulls no more", |s| {
+        quiet = if force(s).length() < 0.05 { quiet + 1 } else { 0 };
+        quiet > 30
+    });
 }
 
 #[test]
