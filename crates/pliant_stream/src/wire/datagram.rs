@@ -83,10 +83,6 @@ pub struct Clock {
 /// All unreliable traffic of a session. The sequence number counts all datagrams from this sender
 /// to this receiver.
 #[derive(Debug, Clone, PartialEq)]
-#[expect(
-    clippy::large_enum_variant,
-    reason = "lives on the stack between reading and use; a frame is the common case"
-)]
 pub enum Datagram {
     /// Host to guest: a tick of a body.
     Frame(Frame),
