@@ -5,8 +5,8 @@ use std::sync::Arc;
 use nalgebra::Vector3;
 
 use crate::{
-    Frame, GrabConfig, Hand, HeldPatch, Hold, Kernel, Load, ModalModel, Patch, Precision, State, StepError,
-    StepReport, StepSettings,
+    Contacts, Frame, GrabConfig, Hand, HeldPatch, Hold, Kernel, Load, ModalModel, Obstacle, Patch, Precision,
+    State, StepError, StepReport, StepSettings,
     error::finite,
     step::{Six, tangent},
 };
@@ -62,6 +62,8 @@ pub struct Body {
     hands: Vec<Hand>,
     grabs: Vec<GrabEntry>,
     next_grab: u64,
+    /// What the body may touch, and its contacts.
+    contacts: Contacts,
     /// Scratch: a state and one entry per mode.
     spare: State,
     resisted: Vec<f64>,
@@ -100,6 +102,7 @@ impl Body {
             hands: Vec::new(),
             grabs: Vec::new(),
             next_grab: 1,
+            contacts: Contacts::default(),
             single: vec![0.0; zero.len()],
             resisted: zero,
             kernel,
@@ -208,6 +211,7 @@ impl Body {
     pub fn set_state(&mut self, state: &State) -> Result<(), StepError> {
         self.kernel.check(state)?;
         self.state.clone_from(state);
+        self.contacts.forget();
         Ok(())
     }
 
@@ -219,7 +223,36 @@ impl Body {
     /// # Errors
     /// Returns an error if a number is not finite or the quaternion has length zero.
     pub fn set_pose(&mut self, position: [f64; 3], rotation: [f64; 4]) -> Result<(), StepError> {
-        self.state.frame.set_pose(self.kernel.model(), position, rotation)
+        self.state.frame.set_pose(self.kernel.model(), position, rotation)?;
+        self.contacts.forget();
+        Ok(())
+    }
+
+    /// Sets the obstacles that the body may touch. Default: none.
+    ///
+    /// The first call chooses the contact sites of the model, which takes a fraction of a second.
+    /// Obstacles that move are set before every step, each at the same index.
+    ///
+    /// # Errors
+    /// Returns the error of [`Obstacle::check`]. The old obstacles then stay.
+    pub fn set_obstacles(&mut self, obstacles: Vec<Arc<dyn Obstacle>>) -> Result<(), StepError> {
+        let prepared = self.contacts.obstacles().len() == obstacles.len();
+        self.contacts.set_obstacles(obstacles)?;
+        if prepared { Ok(()) } else { self.kernel.prepare_contacts(&mut self.contacts) }
+    }
+
+    /// Sets the coefficient of friction between the body and all obstacles, 0 to
+    /// [`Contacts::MOST_FRICTION`]. Default: [`Contacts::FRICTION`].
+    ///
+    /// # Errors
+    /// Returns [`StepError::Input`] for another number. The old one then stays.
+    pub fn set_friction(&mut self, friction: f64) -> Result<(), StepError> {
+        self.contacts.set_friction(friction)
+    }
+
+    /// The obstacles and the contacts of the last step.
+    pub fn contacts(&self) -> &Contacts {
+        &self.contacts
     }
 
     /// Grabs a patch of the body.
@@ -526,7 +559,7 @@ impl Body {
         }
         let (force, torque) = (self.push_force, self.push_torque);
         let load = Load { modal: &self.pushes, force, torque, frame_is_given: false };
-        let report = self.kernel.step(&mut self.state, &mut self.hands, &load);
+        let report = self.kernel.step_touching(&mut self.state, &mut self.hands, &load, &mut self.contacts);
         self.pushes.fill(0.0);
         self.push_force = Vector3::zeros();
         self.push_torque = Vector3::zeros();

@@ -38,6 +38,7 @@
 mod basis;
 mod body;
 mod check;
+mod contact;
 mod error;
 mod exponential;
 mod file;
@@ -55,6 +56,9 @@ mod warp;
 
 pub use basis::{BLOCK, Basis, Precision, ROWS};
 pub use body::{Body, BodyConfig, GrabId};
+pub use contact::{
+    Capsule, Contact, ContactReport, Contacts, Cuboid, Moving, Obstacle, Plane, Sphere, SurfacePoint,
+};
 pub use error::{FileError, ModelError, StepError};
 pub use file::{FORMAT_VERSION, MAGIC};
 pub use integrator::{Coefficients, Integrator};

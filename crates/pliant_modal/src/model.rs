@@ -4,9 +4,10 @@ use std::sync::{Arc, OnceLock};
 
 use serde::{Deserialize, Serialize};
 
+use crate::contact::ContactSites;
 use crate::step::MassSites;
 use crate::{
-    Basis, Material, ModelError, Precision, ReducedElasticity, SurfaceMesh, check::check_parts,
+    Basis, Material, ModelError, Precision, ReducedElasticity, StepError, SurfaceMesh, check::check_parts,
     nonlinear::Gradients,
 };
 
@@ -164,6 +165,8 @@ pub struct ModalModel {
     half: OnceLock<Basis>,
     /// The mass sites for gravity on a bent body, made at the first request.
     mass_sites: OnceLock<Arc<MassSites>>,
+    /// The contact sites for all modes, made at the first request.
+    contact_sites: OnceLock<Arc<ContactSites>>,
     /// The gradients of the reduced elasticity in the layout of a step, made at the first request.
     gradients: OnceLock<Arc<Gradients>>,
     size: f64,
@@ -219,6 +222,7 @@ impl ModalModel {
             basis,
             half: OnceLock::new(),
             mass_sites: OnceLock::new(),
+            contact_sites: OnceLock::new(),
             gradients: OnceLock::new(),
             size,
             hash,
@@ -229,6 +233,14 @@ impl ModalModel {
 
     pub(crate) fn mass_sites(&self) -> &MassSites {
         self.mass_sites.get_or_init(|| Arc::new(MassSites::new(self)))
+    }
+
+    pub(crate) fn contact_sites(&self) -> Result<Arc<ContactSites>, StepError> {
+        if let Some(sites) = self.contact_sites.get() {
+            return Ok(sites.clone());
+        }
+        let made = Arc::new(ContactSites::new(self, self.mode_count())?);
+        Ok(self.contact_sites.get_or_init(|| made).clone())
     }
 
     pub(crate) fn cubature_gradients(&self) -> Arc<Gradients> {

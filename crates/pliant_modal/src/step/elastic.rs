@@ -208,6 +208,12 @@ impl ElasticStep {
         Matrix3::from_fn(|a, b| dot(row(i, a), row(j, b)))
     }
 
+    /// Solves with the lower factor of the step's tangent. The response of one row of forces to
+    /// another is the product of both solutions.
+    pub(crate) fn half_response(&self, row: &mut [f64]) {
+        self.cholesky.forward(row);
+    }
+
     /// Ends the round with the hands' forces (N) on their patches, in order. Returns whether the
     /// step has to go on with a new tangent: the round went far, or hardly less far than the one
     /// before.

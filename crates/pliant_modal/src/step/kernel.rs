@@ -1,6 +1,8 @@
 //! One step of a body: first the modes and the frame without hands, then all hands together,
 //! implicitly.
 
+mod touch;
+
 use std::sync::Arc;
 
 use nalgebra::{Matrix3, Vector3};
@@ -15,7 +17,7 @@ use super::{
     predicted_frame::PredictedFrame,
     solve::System,
 };
-use crate::{ModalModel, StepError};
+use crate::{Contacts, ModalModel, StepError};
 
 /// Result of one step.
 #[derive(Debug, Clone, Copy, PartialEq, Default)]
@@ -105,6 +107,8 @@ pub struct Kernel {
     rounds: Vec<[f64; 2]>,
     /// Modal velocities as dampers use them.
     velocity: Vec<f64>,
+    /// Contact forces over this step.
+    push: touch::ContactPush,
     solving: Vec<Solving>,
     /// Forces of the hands on the six numbers of their patches.
     forces: Vec<Six>,
@@ -153,6 +157,7 @@ impl Kernel {
             start: zero.clone(),
             rounds: vec![[0.0; 2]; zero.len()],
             velocity: zero,
+            push: touch::ContactPush::default(),
             solving: Vec::new(),
             forces: Vec::new(),
             responses: Grams::default(),
@@ -352,19 +357,57 @@ impl Kernel {
         hands: &mut [Hand],
         load: &Load<'_>,
     ) -> Result<StepReport, StepError> {
+        self.step_guarded(state, hands, load, None)
+    }
+
+    /// Performs one step of a state with these hands and contacts.
+    ///
+    /// # Errors
+    /// Returns the errors of [`Kernel::step`], and [`StepError::Input`] for an obstacle whose
+    /// distance, normal or velocity is not finite. The state then stays as it was.
+    pub fn step_touching(
+        &mut self,
+        state: &mut State,
+        hands: &mut [Hand],
+        load: &Load<'_>,
+        contacts: &mut Contacts,
+    ) -> Result<StepReport, StepError> {
+        self.step_guarded(state, hands, load, Some(contacts))
+    }
+
+    fn step_guarded(
+        &mut self,
+        state: &mut State,
+        hands: &mut [Hand],
+        load: &Load<'_>,
+        mut contacts: Option<&mut Contacts>,
+    ) -> Result<StepReport, StepError> {
         self.check_lengths(state)?;
         let expected = self.modes.count();
         if let Some(hand) = hands.iter().find(|hand| hand.patch.modes() != expected) {
             return Err(StepError::Length { what: "a held patch", expected, got: hand.patch.modes() });
         }
         self.before.clone_from(state);
-        let report = self.advance(state, hands, load);
+        let report = match &mut contacts {
+            None => self.advance(state, hands, load),
+            Some(contacts) => match self.touch(state, hands, load, contacts) {
+                Ok(report) => report,
+                Err(error) => {
+                    state.clone_from(&self.before);
+                    contacts.restore(hands);
+                    return Err(error);
+                }
+            },
+        };
         let bad = |hand: &Hand| !hand.pull.iter().chain(&hand.mean).chain(&hand.flow).all(|x| x.is_finite());
         let what = state.non_finite().or(hands.iter().any(bad).then_some("a reaction"));
         let Some(what) = what else { return Ok(report) };
         state.clone_from(&self.before);
         if !state.is_moderate() {
             state.stop();
+        }
+        if let Some(contacts) = contacts {
+            contacts.forget();
         }
         for hand in hands {
             hand.pull = Vector3::zeros();
@@ -484,12 +527,18 @@ impl Kernel {
         for (f, load) in self.force.iter_mut().zip(load.modal) {
             *f += load;
         }
+        if self.push.is_on {
+            self.force.iter_mut().zip(&self.push.modal).for_each(|(f, push)| *f += push);
+        }
         self.modes.advance(&self.before, &self.force, state);
         if bends {
             self.bend_under_gravity(state);
         }
         let rigid = (self.model.is_free() && !load.frame_is_given).then(|| {
-            RigidMotion::predict(&mut state.frame, &self.model, self.h, gravity, load.force, load.torque)
+            let [force, torque] = self.push.at_once(load.force, load.torque);
+            let rigid = RigidMotion::predict(&mut state.frame, &self.model, self.h, gravity, force, torque);
+            self.push.add_rest(&mut state.frame, &self.model, self.h, force, gravity);
+            rigid
         });
         let mut report = StepReport::default();
         if !hands.is_empty() || self.elastic.is_some() {

@@ -22,4 +22,5 @@ pub use settings::{Elasticity, StepSettings};
 pub use state::State;
 
 pub(crate) use gravity::MassSites;
-pub(crate) use patch::{Six, tangent};
+pub(crate) use patch::{Six, Tangent, tangent};
+pub(crate) use solve::System;

@@ -180,6 +180,12 @@ impl Frame {
         self.spin += angular;
     }
 
+    /// Adds a way (m) and a spin (kg m^2/s), world axes.
+    pub(crate) fn shift(&mut self, way: Vector3<f64>, spin: Vector3<f64>) {
+        self.position += way;
+        self.spin += spin;
+    }
+
     pub(crate) fn kinetic_energy(&self, model: &ModalModel) -> f64 {
         0.5 * model.mass() * self.velocity.norm_squared() + 0.5 * self.spin.dot(&self.angular_velocity(model))
     }

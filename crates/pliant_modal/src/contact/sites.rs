@@ -1,0 +1,204 @@
+//! The places at which a body may touch.
+
+use nalgebra::{Matrix3, Vector3};
+
+use crate::{HeldPatch, ModalModel, Patch, StepError};
+
+/// Largest number of contact sites of a body.
+const MOST_SITES: usize = 384;
+
+/// Largest radius of a round site, as a multiple of the body's size. Flatter sites count as flat.
+const FLAT: f64 = 4.0;
+
+/// Tolerance of the fit of a round site, as a share of the depth of its cap.
+const ROUND: f64 = 0.05;
+
+/// A patch of the surface that may touch an obstacle.
+///
+/// Where the surface is locally a part of a sphere, the contact point slides over that sphere, so
+/// that a ball rolls as a ball and not as a polyhedron. Elsewhere it is the vertex at the center.
+#[derive(Debug)]
+pub(crate) struct Site {
+    pub(crate) vertex: u32,
+    pub(crate) patch: HeldPatch,
+    /// Center of the sphere, m, body axes. It is the vertex where the radius is zero.
+    pub(crate) center: Vector3<f64>,
+    /// Radius of the sphere, m.
+    pub(crate) radius: f64,
+    /// Direction from the center to the vertex, and the cosine of the angle up to which the contact
+    /// point slides.
+    pub(crate) outward: Vector3<f64>,
+    pub(crate) reach: f64,
+}
+
+impl Site {
+    /// The direction from the center to the contact point for an obstacle that lies in the
+    /// direction `wanted` (body axes).
+    pub(crate) fn toward(&self, wanted: &Vector3<f64>) -> Vector3<f64> {
+        let cosine = self.outward.dot(wanted);
+        if cosine >= self.reach {
+            return *wanted;
+        }
+        let across = wanted - cosine * self.outward;
+        let length = across.norm();
+        if length.is_nan() || length < 1e-12 {
+            return self.outward;
+        }
+        let sine = (1.0 - self.reach * self.reach).max(0.0).sqrt();
+        self.reach * self.outward + (sine / length) * across
+    }
+
+    /// The point of the rest shape in the direction `toward` from the center, m, body axes.
+    pub(crate) fn rest(&self, toward: &Vector3<f64>) -> Vector3<f64> {
+        self.center + self.radius * toward
+    }
+}
+
+/// All contact sites of a model.
+#[derive(Debug)]
+pub(crate) struct ContactSites {
+    pub(crate) sites: Vec<Site>,
+    /// Largest displacement of a site per unit of each coordinate, kg^-1/2.
+    pub(crate) largest: Vec<f64>,
+    /// Angular frequencies of the model, rad/s.
+    omega: Vec<f64>,
+    /// Largest modal flexibility of a site, summed over the axes, m/N.
+    softest: f64,
+    /// Largest distance of a site from the center of mass at rest, m.
+    pub(crate) radius: f64,
+}
+
+impl ContactSites {
+    /// Chooses the sites of a model for its first `modes` modes. The choice is deterministic: each
+    /// next site is the vertex that is farthest from all sites so far.
+    pub(crate) fn new(model: &ModalModel, modes: usize) -> Result<Self, StepError> {
+        let surface = model.surface();
+        let positions: Vec<Vector3<f64>> =
+            surface.positions().iter().map(|p| Vector3::from(p.map(f64::from))).collect();
+        let com = Vector3::from(model.center_of_mass());
+        // Vertices of anchored parts cannot move and touch nothing. Of vertices at one place, the
+        // first counts.
+        let mut seen = vec![false; surface.welded_count()];
+        let usable: Vec<bool> = (0..positions.len())
+            .map(|v| {
+                let first = !std::mem::replace(&mut seen[surface.welded()[v] as usize], true);
+                first && !surface.anchored()[v]
+            })
+            .collect();
+        let farthest = |nearest: &[f64]| {
+            let mut best = None;
+            for (v, distance) in nearest.iter().enumerate() {
+                if usable[v] && best.is_none_or(|(_, most)| *distance > most) {
+                    best = Some((v, *distance));
+                }
+            }
+            best
+        };
+        let mut nearest: Vec<f64> = positions.iter().map(|p| (p - com).norm_squared()).collect();
+        let mut chosen = Vec::new();
+        let mut cover = 0.0;
+        while chosen.len() <= MOST_SITES {
+            let Some((vertex, distance)) = farthest(&nearest) else { break };
+            if distance <= 0.0 && !chosen.is_empty() {
+                break;
+            }
+            cover = distance.sqrt();
+            if chosen.is_empty() {
+                nearest.fill(f64::INFINITY);
+            }
+            if chosen.len() == MOST_SITES {
+                break;
+            }
+            chosen.push(vertex);
+            for (nearest, position) in nearest.iter_mut().zip(&positions) {
+                *nearest = nearest.min((position - positions[vertex]).norm_squared());
+            }
+        }
+        let area: f64 =
+            (0..positions.len()).filter(|&v| usable[v]).map(|v| surface.area_around(v as u32)).sum();
+        let spacing = (area / chosen.len().max(1) as f64).sqrt();
+        let cover = cover.max(0.75 * spacing);
+        let spread = |vertex: usize| {
+            let near = |p: &&Vector3<f64>| (**p - positions[vertex]).norm() < 2.0 * spacing;
+            positions.iter().filter(near).copied().collect::<Vec<_>>()
+        };
+        let mut sites = Vec::with_capacity(chosen.len());
+        for &vertex in &chosen {
+            let patch = Patch::around(surface, vertex as u32, spacing)
+                .map_err(|_| StepError::Vertex { vertex: vertex as u32, count: positions.len() })?;
+            let patch = HeldPatch::new(model, &patch, modes)?;
+            let at = positions[vertex];
+            let ball = fit(&at, &spread(vertex), model.size()).filter(|(_, radius)| *radius > 0.25 * cover);
+            let (center, radius) = ball.unwrap_or((at, 0.0));
+            let outward = if radius > 0.0 { (at - center) / radius } else { Vector3::y() };
+            let reach = if radius > 0.0 { (cover / radius).min(1.5).cos() } else { 1.0 };
+            sites.push(Site { vertex: vertex as u32, patch, center, radius, outward, reach });
+        }
+        let omega = model.omega()[..modes.min(model.mode_count())].to_vec();
+        let mut softest = 0.0f64;
+        let mut largest = vec![0.0f64; modes.min(model.mode_count())];
+        for site in &sites {
+            let rows = [0, 1, 2].map(|axis| site.patch.rows().displacement(axis));
+            let mut flexibility = 0.0;
+            for (mode, (most, omega)) in largest.iter_mut().zip(&omega).enumerate() {
+                let square = rows.iter().map(|row| row[mode] * row[mode]).sum::<f64>();
+                *most = most.max(square.sqrt());
+                flexibility += square / (omega * omega);
+            }
+            softest = softest.max(flexibility);
+        }
+        let radius = sites.iter().map(|s| (positions[s.vertex as usize] - com).norm()).fold(0.0, f64::max);
+        Ok(Self { sites, largest, omega, softest, radius })
+    }
+
+    /// Bound on the displacement of every site at the coordinates `q`, m.
+    pub(crate) fn bound(&self, q: &[f64]) -> f64 {
+        self.bound_of(|k| q[k])
+    }
+
+    /// Bound on the way of every site between two shapes, m. It holds up to the turn of the warp.
+    pub(crate) fn bound_of_way(&self, from: &[f64], to: &[f64]) -> f64 {
+        self.bound_of(|k| to[k] - from[k])
+    }
+
+    /// The smaller of two bounds: the triangle inequality, and the flexibility of the softest site
+    /// times the elastic energy.
+    fn bound_of(&self, q: impl Fn(usize) -> f64) -> f64 {
+        let (mut sum, mut energy) = (0.0, 0.0);
+        for (k, (most, omega)) in self.largest.iter().zip(&self.omega).enumerate() {
+            let q = q(k);
+            sum += most * q.abs();
+            energy += (omega * q) * (omega * q);
+        }
+        f64::min(sum, (energy * self.softest).sqrt())
+    }
+}
+
+/// The sphere through `at` that fits the points around it, if they lie on one and it is convex.
+fn fit(at: &Vector3<f64>, around: &[Vector3<f64>], size: f64) -> Option<(Vector3<f64>, f64)> {
+    let (mut matrix, mut right) = (Matrix3::zeros(), Vector3::zeros());
+    let mut deepest = 0.0f64;
+    for point in around {
+        let way = point - at;
+        let d2 = way.norm_squared();
+        // Points on a sphere obey `2 way . (center - at) = |way|^2`. Near points weigh as much.
+        if d2 > 0.0 {
+            matrix += way * way.transpose() / d2;
+            right += 0.5 * way;
+            deepest = deepest.max(d2);
+        }
+    }
+    if around.len() < 6 {
+        return None;
+    }
+    let inward = matrix.cholesky()?.solve(&right);
+    let radius = inward.norm();
+    if !(radius > 0.0 && radius < FLAT * size) {
+        return None;
+    }
+    // A flat or sharp surface is not a part of a sphere. The cap's depth sets the scale.
+    let center = at + inward;
+    let depth = 0.5 * deepest / radius;
+    let off = around.iter().map(|p| ((p - center).norm() - radius).abs()).fold(0.0, f64::max);
+    (off <= ROUND * depth && depth < 0.6 * radius).then_some((center, radius))
+}
