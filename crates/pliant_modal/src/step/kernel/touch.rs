@@ -17,7 +17,7 @@ use crate::{
 };
 
 /// Largest number of times that a step is computed again with new forces.
-const ROUNDS: usize = 4;
+const ROUNDS: usize = 3;
 
 /// Distance below which sites count as candidates, as a share of the body's size.
 const BAND: f64 = 2e-3;
@@ -25,7 +25,7 @@ const BAND: f64 = 2e-3;
 /// Tolerances of the laws, as shares of the body's size: that with which forces of the step before
 /// are taken as they are, and that with which a step is not computed again.
 const STILL: f64 = 1e-12;
-const ENOUGH: f64 = 1e-9;
+const ENOUGH: f64 = 1e-6;
 
 /// Share of a penetration that a step takes back, and the fastest way back, body sizes per second.
 const RECOVERED: f64 = 0.2;
@@ -358,6 +358,11 @@ impl Kernel {
                 // Nearly all sites end here.
                 let far = bound + band;
                 if rough > far + travel {
+                    continue;
+                }
+                // The warp never makes a displacement longer.
+                let moved = site.patch.rows().reduce(&state.q, false).norm();
+                if rough > moved + band + travel {
                     continue;
                 }
                 contacts.report.candidates += 1;
