@@ -20,6 +20,7 @@
 mod arguments;
 mod bake;
 mod bench;
+mod drop;
 mod inspect;
 mod mesh;
 mod output;
@@ -54,6 +55,8 @@ enum Command {
     Bench(bench::BenchArgs),
     /// Pulls a body slowly and prints the force on the hand
     Pull(pull::PullArgs),
+    /// Lets a free body fall and prints what happens
+    Drop(drop::DropArgs),
     /// Measures the cost and the errors of the method, as tables and plots
     Report(report::ReportArgs),
     /// Runs stiff, extreme and unfair cases and prints the margin to the bound of each
@@ -70,6 +73,7 @@ fn main() -> ExitCode {
         Command::Inspect(args) => inspect::run(&args),
         Command::Bench(args) => bench::run(&args),
         Command::Pull(args) => pull::run(&args),
+        Command::Drop(args) => drop::run(&args),
         Command::Report(args) => report::run(&args),
         Command::Stability(args) => stability::run(&args),
         Command::Stream(args) => stream::run(&args),

@@ -41,6 +41,9 @@ pub enum LabError {
     /// A hand cannot pull a body that has no anchors, because the body follows.
     #[error("the body is free and follows the hand; expected a body with anchors")]
     Free,
+    /// A body with anchors cannot fall.
+    #[error("the body has anchors and cannot fall; expected a free body")]
+    Anchored,
     /// Reduced elasticity was asked for, and the model has none.
     #[error("the model has no material for large strains; expected one baked with --material")]
     NoMaterial,

@@ -27,12 +27,14 @@
 //! | [`experiment`] | measures a session: errors, forces, bytes |
 //! | [`bench`](mod@bench) | cost of a body on this machine, next to the memory bandwidth limit |
 //! | [`pull`](mod@pull) | what a hand feels that pulls a body slowly |
+//! | [`drop`](mod@drop) | what happens to a free body that falls onto the ground or a ball |
 //! | [`report`] | cost and errors of the method, as tables, plots and text |
 //! | [`stability`] | stiff, extreme and unfair cases, each with its bound and its margin |
 //! | [`fill`](mod@fill) | tetrahedral meshes from files of any supported kind |
 //! | [`progress`] | progress reports of long measurements |
 
 pub mod bench;
+pub mod drop;
 mod error;
 pub mod experiment;
 pub mod fill;

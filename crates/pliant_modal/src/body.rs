@@ -507,6 +507,12 @@ impl Body {
         modes + frame
     }
 
+    /// Kinetic energy of the modes, and of the rigid motion of a free body, J.
+    pub fn kinetic_energy(&self) -> f64 {
+        let frame = if self.model().is_free() { self.state.frame.kinetic_energy(self.model()) } else { 0.0 };
+        frame + self.state.v.iter().map(|v| 0.5 * v * v).sum::<f64>()
+    }
+
     /// Potential energy in gravity, J.
     ///
     /// For an anchored body it is that of the deformation (0 when undeformed). For a free body it

@@ -400,7 +400,7 @@ impl Touching {
 pub struct Contacts {
     friction: f64,
     obstacles: Vec<Arc<dyn Obstacle>>,
-    pub(crate) sites: Option<Arc<ContactSites>>,
+    pub(crate) places: Option<Arc<ContactSites>>,
     /// Modes of the body for which the sites were made.
     pub(crate) modes: usize,
     pub(crate) memory: Vec<Memory>,
@@ -416,7 +416,7 @@ impl Default for Contacts {
         Self {
             friction: Self::FRICTION,
             obstacles: Vec::new(),
-            sites: None,
+            places: None,
             modes: 0,
             memory: Vec::new(),
             touching: Touching::default(),
@@ -473,6 +473,11 @@ impl Contacts {
         &self.list
     }
 
+    /// Number of places at which the body may touch. Zero until obstacles are set.
+    pub fn sites(&self) -> usize {
+        self.places.as_ref().map_or(0, |sites| sites.sites.len())
+    }
+
     /// Sums and quality of the last step's contacts.
     pub fn report(&self) -> &ContactReport {
         &self.report
@@ -508,6 +513,6 @@ impl Contacts {
             self.memory.clear();
         }
         self.modes = modes;
-        self.sites = Some(sites);
+        self.places = Some(sites);
     }
 }

@@ -188,10 +188,10 @@ impl Kernel {
         if contacts.obstacles().is_empty() {
             return Ok(self.advance(state, hands, load));
         }
-        if contacts.sites.is_none() || contacts.modes != self.modes.count() {
+        if contacts.places.is_none() || contacts.modes != self.modes.count() {
             self.prepare_contacts(contacts)?;
         }
-        let Some(sites) = contacts.sites.clone() else { return Ok(self.advance(state, hands, load)) };
+        let Some(sites) = contacts.places.clone() else { return Ok(self.advance(state, hands, load)) };
         contacts.touching.hands.clear();
         contacts.touching.hands.extend(hands.iter().map(|hand| [hand.pull, hand.mean, hand.flow]));
         contacts.touching.sweeps = 0;

@@ -1,0 +1,191 @@
+//! A free body that falls onto the ground or onto a ball.
+
+use std::{sync::Arc, time::Instant};
+
+use nalgebra::{UnitQuaternion, Vector3};
+use pliant_modal::{
+    Body, BodyConfig, Contacts, Elasticity, ModalModel, ModelError, Obstacle, Plane, Sphere, StepSettings,
+};
+use serde::Serialize;
+
+use crate::{
+    LabError,
+    bench::{Percentiles, percentiles},
+    machine::Pinned,
+};
+
+/// Largest number of steps of a fall.
+const MOST_TICKS: f64 = 1e7;
+
+/// What a body falls onto.
+#[derive(Debug, Clone, Copy, PartialEq, Default)]
+pub enum Onto {
+    /// The plane `y = 0`.
+    #[default]
+    Plane,
+    /// A ball of this radius (m), whose highest point is at `y = 0` under the center of mass.
+    Sphere(f64),
+}
+
+/// A fall to compute.
+///
+/// The body stands as its model does. Then the body and what it falls onto are turned about the z
+/// axis by the tilt. Gravity always points along -y.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Drop {
+    /// Gap under the lowest point of the body, m, 0 or more. Default: 0.1.
+    pub height: f64,
+    /// Tilt of the ground, degrees, -89 to 89. Default: 0.
+    pub tilt: f64,
+    /// Coefficient of friction. Default: [`Contacts::FRICTION`].
+    pub friction: f64,
+    /// Gravity, m/s^2, 0 or more. Default: 9.81.
+    pub gravity: f64,
+    /// Duration, s. Default: 2.
+    pub seconds: f64,
+    /// Steps per second. Default: 60.
+    pub rate: f64,
+    /// What the body falls onto.
+    pub onto: Onto,
+    /// Elasticity of the body. `None`: reduced if the model has a material, linear otherwise.
+    pub elasticity: Option<Elasticity>,
+}
+
+impl Default for Drop {
+    fn default() -> Self {
+        Self {
+            height: 0.1,
+            tilt: 0.0,
+            friction: Contacts::FRICTION,
+            gravity: 9.81,
+            seconds: 2.0,
+            rate: 60.0,
+            onto: Onto::Plane,
+            elasticity: None,
+        }
+    }
+}
+
+/// The body after one step.
+#[derive(Serialize, Debug, Clone, Copy, PartialEq)]
+pub struct Tick {
+    /// Time, s.
+    pub time: f64,
+    /// Center of mass, m, world axes.
+    pub center: [f64; 3],
+    /// Velocity of the center of mass, m/s, world axes.
+    pub velocity: [f64; 3],
+    /// Sum of the contact forces on the body over the step that ends here, N, world axes.
+    pub contact_force: [f64; 3],
+    /// Kinetic energy, J.
+    pub kinetic: f64,
+    /// Elastic energy of the body, J, with that of the dents at its contacts.
+    pub elastic: f64,
+    /// Potential energy in gravity, J. Zero for a center of mass at `y = 0`.
+    pub potential: f64,
+    /// Number of contacts with force.
+    pub contacts: usize,
+    /// Largest depth of the body's surface inside the obstacle, m.
+    pub penetration: f64,
+    /// Time that the step took, microseconds. Zero for the first tick, which is no step.
+    pub step_us: f64,
+}
+
+/// What happened to a body that fell.
+#[derive(Serialize, Debug, Clone)]
+pub struct Dropped {
+    /// Elasticity of the body.
+    pub elasticity: Elasticity,
+    /// Mass, kg.
+    pub mass: f64,
+    /// Largest extent of the body, m.
+    pub size: f64,
+    /// Number of contact sites of the body.
+    pub sites: usize,
+    /// Time of one step on one core.
+    pub step_us: Percentiles,
+    /// The start and the end of every step.
+    pub ticks: Vec<Tick>,
+}
+
+impl Drop {
+    fn check(&self) -> Result<(), LabError> {
+        let Self { height, tilt, gravity, seconds, rate, .. } = *self;
+        let number = |what, expected, sound: bool, got| {
+            if sound { Ok(()) } else { Err(ModelError::Value { what, index: 0, expected, got }) }
+        };
+        number("height", "0 to 1e6 m", (0.0..=1e6).contains(&height), height)?;
+        number("tilt", "-89 to 89 degrees", (-89.0..=89.0).contains(&tilt), tilt)?;
+        number("gravity", "0 to 1e6 m/s^2", (0.0..=1e6).contains(&gravity), gravity)?;
+        number("rate", "1 to 1e6 steps a second", (1.0..=1e6).contains(&rate), rate)?;
+        let sound = seconds > 0.0 && seconds * rate <= MOST_TICKS;
+        number("seconds", "above 0 and at most ten million steps", sound, seconds)?;
+        if let Onto::Sphere(radius) = self.onto {
+            number("radius of the sphere", "above 0 m, at most 1e6", radius > 0.0 && radius <= 1e6, radius)?;
+        }
+        Ok(())
+    }
+}
+
+fn tick(body: &Body, time: f64, step_us: f64) -> Tick {
+    let (report, kinetic) = (body.contacts().report(), body.kinetic_energy());
+    Tick {
+        time,
+        center: body.frame().center(),
+        velocity: body.frame().velocity(),
+        contact_force: report.force,
+        kinetic,
+        elastic: body.energy() - kinetic + report.energy,
+        potential: body.potential_energy(),
+        contacts: report.contacts,
+        penetration: report.penetration,
+        step_us,
+    }
+}
+
+/// Lets a free body fall.
+///
+/// # Errors
+/// Returns [`LabError::Anchored`] for a body with anchors, [`LabError::NoMaterial`] for reduced
+/// elasticity of a model that has no material, [`LabError::Model`] for a number out of its range,
+/// and [`LabError::Step`] when the body cannot be stepped.
+pub fn drop(model: &Arc<ModalModel>, drop: &Drop) -> Result<Dropped, LabError> {
+    drop.check()?;
+    if !model.is_free() {
+        return Err(LabError::Anchored);
+    }
+    let of_model = if model.material().is_some() { Elasticity::Reduced } else { Elasticity::Linear };
+    let elasticity = drop.elasticity.unwrap_or(of_model);
+    if elasticity == Elasticity::Reduced && model.material().is_none() {
+        return Err(LabError::NoMaterial);
+    }
+    let settings = StepSettings { elasticity, gravity: [0.0, -drop.gravity, 0.0], ..StepSettings::default() };
+    let mut body = Body::new(model.clone(), BodyConfig { step: 1.0 / drop.rate, ..settings.into() })?;
+    let turn = UnitQuaternion::from_axis_angle(&Vector3::z_axis(), drop.tilt.to_radians());
+    let obstacle: Arc<dyn Obstacle> = match drop.onto {
+        Onto::Plane => Arc::new(Plane { point: [0.0; 3], normal: (turn * Vector3::y()).into() }),
+        Onto::Sphere(radius) => {
+            let [x, _, z] = model.center_of_mass();
+            Arc::new(Sphere { center: (turn * Vector3::new(x, -radius, z)).into(), radius })
+        }
+    };
+    body.set_friction(drop.friction)?;
+    let lowest = f64::from(model.surface().bounds()[0][1]);
+    let origin = turn * Vector3::new(0.0, drop.height - lowest, 0.0);
+    let turn = turn.quaternion();
+    body.set_pose(origin.into(), [turn.i, turn.j, turn.k, turn.w])?;
+    body.set_obstacles(vec![obstacle])?;
+    let _pinned = Pinned::new();
+    let steps = (drop.seconds * drop.rate).round().max(1.0) as usize;
+    let mut ticks = Vec::with_capacity(steps + 1);
+    ticks.push(tick(&body, 0.0, 0.0));
+    for step in 1..=steps {
+        let begun = Instant::now();
+        body.step()?;
+        let taken = begun.elapsed().as_secs_f64() * 1e6;
+        ticks.push(tick(&body, step as f64 / drop.rate, taken));
+    }
+    let step_us = percentiles(ticks[1..].iter().map(|tick| tick.step_us).collect());
+    let sites = body.contacts().sites();
+    Ok(Dropped { elasticity, mass: model.mass(), size: model.size(), sites, step_us, ticks })
+}
