@@ -111,9 +111,12 @@ pub(crate) struct Point {
     pub(crate) pushed: Vector3<f64>,
     pub(crate) force: Vector3<f64>,
     pub(crate) status: Status,
-    /// Derivative of the site's position, body axes, and its arm about the center of mass, m, world
-    /// axes.
+    /// Derivative of the site's position by the six numbers of its patch, world axes: at the
+    /// beginning of the step, and its mean over the step, by which forces act on the modes. The mean
+    /// stays as the first computed step has it.
     pub(crate) tangent: Tangent,
+    pub(crate) mean: Option<Tangent>,
+    /// Arm of the contact about the center of mass, m, world axes.
     pub(crate) arm: Vector3<f64>,
 }
 
@@ -144,6 +147,7 @@ impl Point {
             force: zero,
             status: Status::Open,
             tangent: Tangent::zeros(),
+            mean: None,
             arm: zero,
         }
     }

@@ -7,7 +7,7 @@
 
 use std::sync::Arc;
 
-use nalgebra::{Matrix3, SMatrix, Vector3};
+use nalgebra::{Matrix3, Vector3};
 
 use super::Kernel;
 use crate::{
@@ -78,6 +78,7 @@ impl ContactPush {
 
 /// A place of a site at some state.
 struct Located {
+    /// Derivative of the position, world axes.
     tangent: Tangent,
     toward: Vector3<f64>,
     /// Displaced center of the site, m, body axes.
@@ -147,6 +148,8 @@ impl Kernel {
     ) -> Result<Located, StepError> {
         let warp = self.warps();
         let (moved, tangent) = tangent(&site.patch.rows().reduce(q, warp), warp);
+        let turn: Matrix3<f64> = *frame.rotation().to_rotation_matrix().matrix();
+        let tangent = turn * tangent;
         let center = site.center + moved;
         let mut point = frame.to_world(center);
         let mut found = look(obstacle, &point)?;
@@ -159,11 +162,19 @@ impl Kernel {
         Ok(Located { tangent, toward, center, point, found })
     }
 
-    /// Position of a site's material point in the direction `toward`, m, world axes.
-    fn material(&self, site: &Site, toward: &Vector3<f64>, frame: &Frame, q: &[f64]) -> Vector3<f64> {
+    /// Position of a site's material point in the direction `toward`, m, and its derivative, world
+    /// axes.
+    fn material(
+        &self,
+        site: &Site,
+        toward: &Vector3<f64>,
+        frame: &Frame,
+        q: &[f64],
+    ) -> (Vector3<f64>, Tangent) {
         let warp = self.warps();
-        let (moved, _) = tangent(&site.patch.rows().reduce(q, warp), warp);
-        frame.to_world(site.rest(toward) + moved)
+        let (moved, tangent) = tangent(&site.patch.rows().reduce(q, warp), warp);
+        let turn: Matrix3<f64> = *frame.rotation().to_rotation_matrix().matrix();
+        (frame.to_world(site.rest(toward) + moved), turn * tangent)
     }
 
     /// Compliance of a site, m/N, world axes.
@@ -227,7 +238,7 @@ impl Kernel {
             let located = self.locate(site, &*obstacle, &frame, q)?;
             let mut point = Point::new(memory.obstacle, memory.site);
             (point.first, point.last) = (memory.toward, located.toward);
-            point.start = self.material(site, &memory.toward, &frame, q);
+            (point.start, point.tangent) = self.material(site, &memory.toward, &frame, q);
             point.carried = carried(&*obstacle, &located.point, self.h)?;
             point.before = memory.force;
             point.compliance = self.site_compliance(site, &frame, q);
@@ -244,7 +255,7 @@ impl Kernel {
                 point.anchor = point.start + dent + point.carried;
             }
             point.old = true;
-            (point.tangent, point.arm) = (located.tangent, located.point - Vector3::from(frame.center()));
+            point.arm = located.point - Vector3::from(frame.center());
             contacts.touching.points.push(point);
         }
         Ok(())
@@ -263,8 +274,7 @@ impl Kernel {
         let size = self.model.size();
         let mut round = 0;
         loop {
-            let frame = if round == 0 { self.before.frame } else { state.frame };
-            self.collect_push(&frame, contacts, sites);
+            self.collect_push(contacts, sites);
             state.clone_from(&self.before);
             for (hand, [pull, mean, flow]) in hands.iter_mut().zip(&contacts.touching.hands) {
                 (hand.pull, hand.mean, hand.flow) = (*pull, *mean, *flow);
@@ -296,7 +306,7 @@ impl Kernel {
             for row in contacts.touching.rows.chunks_exact_mut(width) {
                 row[width - 6..].iter_mut().for_each(|x| *x *= scale);
             }
-            contacts.touching.solve(width, contacts.friction(), 1e-13 * size);
+            contacts.touching.solve(width, contacts.friction(), (1e-3 * residual).max(1e-13 * size));
             for point in &mut contacts.touching.points {
                 point.pushed = point.force;
             }
@@ -304,8 +314,7 @@ impl Kernel {
     }
 
     /// Sums the forces of all points.
-    fn collect_push(&mut self, frame: &Frame, contacts: &Contacts, sites: &ContactSites) {
-        let back = frame.rotation().inverse();
+    fn collect_push(&mut self, contacts: &Contacts, sites: &ContactSites) {
         self.push.modal.clear();
         self.push.modal.resize(self.modes.count(), 0.0);
         (self.push.force, self.push.torque) = (Vector3::zeros(), Vector3::zeros());
@@ -315,7 +324,7 @@ impl Kernel {
             if force == Vector3::zeros() {
                 continue;
             }
-            let six = point.tangent.tr_mul(&(back * force));
+            let six = point.mean.unwrap_or(point.tangent).tr_mul(&force);
             sites.sites[point.site].patch.rows().spread(&six, warp, &mut self.push.modal);
             self.push.force += force;
             self.push.torque += point.arm.cross(&force);
@@ -367,7 +376,7 @@ impl Kernel {
                 }
                 contacts.report.candidates += 1;
                 let located = self.locate(site, &*obstacle, &to, &state.q)?;
-                let start = self.material(site, &located.toward, &from, &self.before.q);
+                let (start, tangent) = self.material(site, &located.toward, &from, &self.before.q);
                 let moved = located.point - start;
                 let mut found = located.found;
                 let mut hit = false;
@@ -383,6 +392,7 @@ impl Kernel {
                 }
                 let mut point = Point::new(index, number);
                 (point.first, point.last, point.start) = (located.toward, located.toward, start);
+                point.tangent = tangent;
                 point.carried = carried(&*obstacle, &located.point, self.h)?;
                 point.gap = look(&*obstacle, &(start + point.carried))?.distance;
                 let way = located.point - start - point.carried;
@@ -438,7 +448,10 @@ impl Kernel {
             point.end = state.frame.to_world(located.center + site.radius * point.first);
             let offset = point.axes * (point.end - point.anchor);
             point.off = Vector3::new(distance - point.floor, offset[1], offset[2]);
-            point.tangent = located.tangent;
+            // The middle of the step gives the work of a force on a shape that bends. With the mean
+            // of every round the rounds of a soft body would not converge.
+            let start = point.tangent;
+            point.mean.get_or_insert_with(|| 0.5 * (start + located.tangent));
             point.arm = located.point - Vector3::from(state.frame.center());
         }
         Ok(())
@@ -467,7 +480,7 @@ impl Kernel {
         touching.rows.resize(3 * touching.points.len() * width, 0.0);
         for (point, rows) in touching.points.iter().zip(touching.rows.chunks_exact_mut(3 * width)) {
             let patch = sites.sites[point.site].patch.rows();
-            let along: SMatrix<f64, 3, 6> = point.axes * turn * point.tangent;
+            let along = point.axes * point.mean.unwrap_or(point.tangent);
             for (axis, row) in rows.chunks_exact_mut(width).enumerate() {
                 let (modal, rigid) = row.split_at_mut(modes);
                 patch.spread(&along.row(axis).transpose(), self.warps(), modal);
