@@ -117,7 +117,7 @@ impl ContactSites {
         let area: f64 =
             (0..positions.len()).filter(|&v| usable[v]).map(|v| surface.area_around(v as u32)).sum();
         let spacing = (area / chosen.len().max(1) as f64).sqrt();
-        let cover = cover.max(0.75 * spacing);
+        let cover = cover.max(0.5 * spacing);
         let spread = |vertex: usize| {
             let near = |p: &&Vector3<f64>| (**p - positions[vertex]).norm() < 2.0 * spacing;
             positions.iter().filter(near).copied().collect::<Vec<_>>()

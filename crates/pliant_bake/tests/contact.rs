@@ -1,0 +1,254 @@
+//! Contacts with known answers: rest, inclines, rolling, toppling, impact and Hertz.
+#![allow(clippy::unwrap_used, missing_docs, reason = "a failed test should panic")]
+
+use std::sync::Arc;
+
+use nalgebra::Vector3;
+use pliant_bake::{BakeConfig, bake};
+use pliant_mesh::{TetMesh, shapes};
+use pliant_modal::{
+    Body, BodyConfig, Capsule, Cuboid, Damping, Elasticity, Frame, GrabConfig, Material, ModalModel, Moving,
+    Obstacle, Patch, Plane, Sphere, StepError, StepSettings, SurfacePoint,
+};
+
+const GRAVITY: f64 = 9.81;
+
+fn model(mesh: &TetMesh, young: f64, change: impl Fn(&mut BakeConfig)) -> Arc<ModalModel> {
+    let mut config = BakeConfig { modes: 30, young, poisson: 0.3, sites: Some(100), ..BakeConfig::default() };
+    change(&mut config);
+    Arc::new(bake(mesh, None, &config, &mut |_, _| {}).unwrap().model)
+}
+
+fn cube(young: f64) -> Arc<ModalModel> {
+    model(&shapes::cube(4, 0.1).unwrap(), young, |_| ())
+}
+
+fn ball(young: f64, material: Option<Material>) -> Arc<ModalModel> {
+    model(&shapes::sphere(8, 0.1).unwrap(), young, |config| {
+        (config.material, config.sites) = (material, None)
+    })
+}
+
+struct Scene {
+    settings: StepSettings,
+    rate: f64,
+    friction: f64,
+    /// Gap under the lowest point, m, and velocity, m/s.
+    gap: f64,
+    velocity: [f64; 3],
+}
+
+/// A plane `y = 0` with gravity tilted instead of the plane.
+fn scene(tilt: f64, friction: f64) -> Scene {
+    let gravity = [GRAVITY * tilt.sin(), -GRAVITY * tilt.cos(), 0.0];
+    let settings = StepSettings { gravity, ..Default::default() };
+    Scene { settings, rate: 60.0, friction, gap: 0.0, velocity: [0.0; 3] }
+}
+
+fn place(model: &Arc<ModalModel>, scene: &Scene) -> Body {
+    let Scene { settings, rate, friction, gap, velocity } = *scene;
+    let mut body =
+        Body::new(model.clone(), BodyConfig { step: 1.0 / rate, ..BodyConfig::from(settings) }).unwrap();
+    body.set_friction(friction).unwrap();
+    body.set_obstacles(vec![Arc::new(Plane::GROUND)]).unwrap();
+    let mut state = body.state().clone();
+    let mut center = state.frame.center();
+    center[1] += gap - f64::from(model.surface().bounds()[0][1]);
+    state.frame = Frame::from_motion(model, center, [0.0, 0.0, 0.0, 1.0], velocity, [0.0; 3]).unwrap();
+    body.set_state(&state).unwrap();
+    body
+}
+
+fn run(body: &mut Body, seconds: f64) {
+    for _ in 0..(seconds / body.config().step).round() as usize {
+        body.step().unwrap();
+    }
+}
+
+fn total(body: &Body) -> f64 {
+    body.energy() + body.potential_energy() + body.contacts().report().energy
+}
+
+#[test]
+fn at_rest_the_contact_forces_carry_the_weight() {
+    for (name, model) in [
+        ("soft cube", cube(1e5)),
+        ("stiff cube", cube(1e8)),
+        ("ball", ball(1e5, None)),
+        (
+            "reduced cube",
+            model(&shapes::cube(4, 0.1).unwrap(), 1e5, |c| c.material = Some(Material::NeoHookean)),
+        ),
+    ] {
+        let mut fall = scene(0.0, 0.5);
+        fall.gap = 0.02;
+        fall.settings.elasticity =
+            if model.material().is_some() { Elasticity::Reduced } else { Elasticity::Linear };
+        let mut body = place(&model, &fall);
+        run(&mut body, 5.0);
+        let weight = model.mass() * GRAVITY;
+        let report = *body.contacts().report();
+        let off = (Vector3::from(report.force) - Vector3::new(0.0, weight, 0.0)).norm() / weight;
+        let deep = report.penetration / model.size();
+        println!(
+            "{name}: force off by {off:.1e}, penetration {deep:.1e} of the size, {} contacts, kinetic energy {:.1e} J",
+            report.contacts,
+            body.kinetic_energy()
+        );
+        assert!(off < 1e-6 && deep < 2e-3, "{name}: {off} {deep}");
+        // At rest: 1e-9 of the energy of its fall.
+        assert!(body.kinetic_energy() < 1e-9 * weight * 0.02, "{name}: {}", body.kinetic_energy());
+    }
+}
+
+#[test]
+fn on_an_incline_a_cube_sticks_or_slides_as_coulomb_says() {
+    let (model, friction) = (cube(1e5), 0.5);
+    for share in [0.5, 0.99] {
+        let mut body = place(&model, &scene((share * friction as f64).atan(), friction));
+        run(&mut body, 5.0);
+        let before = Vector3::from(body.frame().center());
+        run(&mut body, 60.0);
+        let crept = (Vector3::from(body.frame().center()) - before).norm() / model.size();
+        println!("tan = {share} mu: creeps by {crept:.1e} of its size in a minute");
+        assert!(crept < 1e-4, "{share}: {crept}");
+    }
+    for share in [1.01, 1.1, 2.0] {
+        let tilt = (share * friction as f64).atan();
+        let mut body = place(&model, &scene(tilt, friction));
+        run(&mut body, 1.0);
+        let before = body.frame().velocity()[0];
+        run(&mut body, 1.0);
+        let got = body.frame().velocity()[0] - before;
+        let want = GRAVITY * (tilt.sin() - friction * tilt.cos());
+        println!("tan = {share} mu: {got:.6} m/s^2, Coulomb {want:.6}");
+        assert!((got / want - 1.0).abs() < 0.01, "{share}: {got} {want}");
+    }
+}
+
+#[test]
+fn a_sliding_ball_ends_rolling_at_five_sevenths_of_its_speed() {
+    for (young, rate) in [(1e7, 240.0), (1e6, 60.0)] {
+        let model = ball(young, None);
+        let mut slide = scene(0.0, 0.3);
+        (slide.rate, slide.velocity) = (rate, [1.0, 0.0, 0.0]);
+        let mut body = place(&model, &slide);
+        // It slides for 2 v / (7 mu g).
+        run(&mut body, 1.5 * 2.0 / (7.0 * 0.3 * GRAVITY));
+        let speed = body.frame().velocity()[0];
+        let spin = body.frame().angular_velocity(&model).z * 0.1;
+        println!(
+            "E = {young:e} at {rate} Hz: {speed:.5} m/s, surface speed {spin:.5}, 5/7 = {:.5}",
+            5.0 / 7.0
+        );
+        assert!((speed / (5.0 / 7.0) - 1.0).abs() < 0.01, "{young}: {speed}");
+        assert!((spin + speed).abs() < 0.02 * speed, "{young}: it rolls, {spin} {speed}");
+        run(&mut body, 1.0);
+        let later = body.frame().velocity()[0];
+        println!("    after another second {later:.5} m/s");
+        assert!((later / speed - 1.0).abs() < 0.02, "{young}: {later}");
+    }
+}
+
+#[test]
+fn a_block_topples_when_its_height_says_so() {
+    let model = model(&shapes::bar([3, 9, 3], [0.1, 0.3, 0.1]).unwrap(), 1e7, |_| ());
+    for (share, topples) in [(0.97, false), (1.03, true)] {
+        let steep = (share / 3.0f64).atan();
+        let mut body = place(&model, &scene(0.0, 1.0));
+        // The ground is tilted slowly, since a block that is set down on a steep one swings.
+        for step in 0..600 {
+            let tilt = steep * (f64::from(step) / 300.0).min(1.0);
+            let config = BodyConfig { settings: scene(tilt, 1.0).settings, ..body.config().clone() };
+            body.reconfigure(config).unwrap();
+            body.step().unwrap();
+        }
+        let up = (body.frame().rotation() * Vector3::y()).y;
+        println!("tan = {share} b / h: the block's axis is at {:.2} degrees", up.acos().to_degrees());
+        assert_eq!(up < 0.9, topples, "{share}: {up}");
+    }
+}
+
+#[test]
+fn a_bar_hits_a_wall_end_on_as_waves_say() {
+    let (length, side, young, density, speed) = (0.8, 0.1, 1e5, 1000.0, 0.1f64);
+    let mesh = shapes::bar([2, 32, 2], [side, length, side]).unwrap();
+    let model = model(&mesh, young, |config| {
+        config.poisson = 0.0;
+        config.density = density;
+        config.modes = 60;
+        config.damping = Damping::Ratio(0.0);
+    });
+    let wave = (young / density as f64).sqrt();
+    let time = 2.0 * length / wave;
+    let force = density * wave * side * side * speed;
+    for steps in [8.0, 16.0, 32.0] {
+        let mut fall = scene(0.0, 0.0);
+        fall.settings.gravity = [0.0; 3];
+        (fall.rate, fall.velocity) = (steps / time, [0.0, -speed, 0.0]);
+        // It touches in the middle of a step.
+        fall.gap = 1.5 * speed / fall.rate;
+        let mut body = place(&model, &fall);
+        let start = total(&body);
+        let (mut forces, mut gain) = (Vec::new(), 0.0f64);
+        for _ in 0..(3.0 * steps) as usize {
+            body.step().unwrap();
+            let pushed = body.contacts().report().force[1];
+            if pushed > 0.0 {
+                forces.push(pushed);
+            }
+            gain = gain.max(total(&body) / start - 1.0);
+        }
+        let restitution = body.frame().velocity()[1] / speed;
+        let lasted = forces.len() as f64 / steps;
+        forces.sort_by(f64::total_cmp);
+        let plateau = forces[forces.len() / 2] / force;
+        println!(
+            "{steps} steps: e = {restitution:.3}, {lasted:.3} of 2 L / c, median force {plateau:.3} of rho c A v, energy +{gain:.1e}"
+        );
+        assert!(gain < 1e-9, "{steps}: {gain}");
+        if steps >= 16.0 {
+            assert!((0.9..=1.0).contains(&restitution), "{steps}: {restitution}");
+            // It begins and ends within a step.
+            assert!((lasted - 1.0).abs() <= 0.13, "{steps}: {lasted}");
+            assert!((plateau - 1.0).abs() < 0.05, "{steps}: {plateau}");
+        }
+    }
+}
+
+#[test]
+fn a_pressed_ball_is_about_as_stiff_as_hertz_says() {
+    let (young, radius) = (1e5, 0.1f64);
+    let plain = young / (1.0 - 0.3f64.powi(2));
+    let free = |modes| {
+        model(&shapes::sphere(8, radius).unwrap(), young, |config| {
+            (config.modes, config.sites) = (modes, None)
+        })
+    };
+    for (name, model) in [
+        ("30 modes", free(30)),
+        ("240 modes", free(240)),
+        ("reduced", ball(young, Some(Material::NeoHookean))),
+    ] {
+        for share in [0.1, 0.2, 0.3f64] {
+            let depth = share * share * radius;
+            let force = 4.0 / 3.0 * plain * radius.sqrt() * depth.powf(1.5);
+            let mut press = scene(0.0, 0.0);
+            press.settings.gravity = [0.0, -force / model.mass(), 0.0];
+            press.settings.damping_scale = 20.0;
+            press.settings.elasticity =
+                if model.material().is_some() { Elasticity::Reduced } else { Elasticity::Linear };
+            let mut body = place(&model, &press);
+            run(&mut body, 10.0);
+            let got = radius - body.frame().center()[1];
+            // The force that Hertz has at this depth.
+            let hertz = 4.0 / 3.0 * plain * radius.sqrt() * got.max(0.0).powf(1.5);
+            println!(
+                "{name}, a / R = {share}: depth {:.3} of Hertz's, force {:.3}, {} contacts",
+                got / depth,
+                force / hertz,
+                body.contacts().report().contacts
+            );
+        }
+    }
+}
