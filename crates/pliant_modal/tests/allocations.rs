@@ -13,7 +13,9 @@ use std::{
 };
 
 use nonlinear_rod::nonlinear_rod;
-use pliant_modal::{Body, BodyConfig, Elasticity, GrabConfig, Integrator, Patch, Relaxation, StepSettings};
+use pliant_modal::{
+    Body, BodyConfig, Elasticity, GrabConfig, Integrator, Patch, Plane, Relaxation, StepSettings,
+};
 use rod::{rod, tip};
 
 struct Counting;
@@ -112,4 +114,28 @@ fn a_step_that_bends_under_gravity_allocates_nothing() {
     }
     assert_eq!(CALLS.with(Cell::get) - before, 0);
     assert!(body.energy() > 0.0, "it bends");
+}
+
+#[test]
+fn a_step_with_contacts_allocates_nothing() {
+    let free = rod(2e5, 20, 0.05, true);
+    let jack = concat!(env!("CARGO_MANIFEST_DIR"), "/../../assets/jack.modal");
+    let jack = pliant_modal::ModalModel::read(jack).unwrap();
+    for model in [free, jack] {
+        let model = Arc::new(model);
+        let settings = StepSettings { gravity: [0.0, -9.81, 0.0], ..Default::default() };
+        let mut body = Body::new(model.clone(), settings.into()).unwrap();
+        let low = f64::from(model.surface().bounds()[0][1]);
+        body.set_pose([0.0, 0.02 - low, 0.0], [0.0, 0.0, 0.1, 1.0]).unwrap();
+        let wall = Plane { point: [-0.3, 0.0, 0.0], normal: [1.0, 0.2, 0.0] };
+        body.set_obstacles(vec![Arc::new(Plane::GROUND), Arc::new(wall)]).unwrap();
+        let before = CALLS.with(Cell::get);
+        let mut touched = 0;
+        for _ in 0..120 {
+            body.step().unwrap();
+            touched = touched.max(body.contacts().report().contacts);
+        }
+        assert_eq!(CALLS.with(Cell::get) - before, 0);
+        assert!(touched > 1, "it touched the ground");
+    }
 }

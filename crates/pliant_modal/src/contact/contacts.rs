@@ -411,6 +411,8 @@ pub struct Contacts {
     pub(crate) touching: Touching,
     /// Weight of a contact force in the way of the frame within a step, see the kernel.
     pub(crate) theta: f64,
+    /// Energy that steps with contacts have lost and not gained since, J.
+    pub(crate) lost: f64,
     pub(crate) list: Vec<Contact>,
     pub(crate) report: ContactReport,
 }
@@ -425,6 +427,7 @@ impl Default for Contacts {
             memory: Vec::new(),
             touching: Touching::default(),
             theta: 0.5,
+            lost: 0.0,
             list: Vec::new(),
             report: ContactReport::default(),
         }
@@ -494,6 +497,7 @@ impl Contacts {
         self.list.clear();
         self.report = ContactReport::default();
         self.theta = 0.5;
+        self.lost = 0.0;
     }
 
     /// Gives hands what they had before a step that failed.

@@ -186,6 +186,12 @@ impl Frame {
         self.spin += spin;
     }
 
+    /// Multiplies velocity and spin.
+    pub(crate) fn slow(&mut self, factor: f64) {
+        self.velocity *= factor;
+        self.spin *= factor;
+    }
+
     pub(crate) fn kinetic_energy(&self, model: &ModalModel) -> f64 {
         0.5 * model.mass() * self.velocity.norm_squared() + 0.5 * self.spin.dot(&self.angular_velocity(model))
     }

@@ -35,6 +35,9 @@ const RECOVERY_SPEED: f64 = 0.5;
 /// the body was moved from elsewhere.
 const SNAPPED: f64 = 0.02;
 
+/// Share of the kinetic energy that a step may gain of what contacts have lost before.
+const GIVEN_BACK: f64 = 1e-2;
+
 /// Contact forces on a body over a step.
 #[derive(Debug, Clone, Default)]
 pub(super) struct ContactPush {
@@ -221,6 +224,9 @@ impl Kernel {
             report = self.attempt(state, hands, load, contacts, &sites, false)?;
             contacts.report.rounds += rounds;
             contacts.report.guarded = true;
+        }
+        if hands.is_empty() && *load == (Load { modal: load.modal, ..Load::default() }) {
+            self.cap_energy(state, load.modal, contacts);
         }
         self.end_contacts(state, contacts, &sites);
         Ok(report)
@@ -519,6 +525,52 @@ impl Kernel {
             }
         }
         work > 1.5 * allowed + 1e-9 * scale
+    }
+
+    /// Takes the energy that the step has gained from the velocities.
+    ///
+    /// The work of the contacts is right to second order in the way of a step. A body that turns or
+    /// bends far within one step may still gain. Hands and loads do work of their own, and a
+    /// material that relaxes stores energy that is not counted here: such steps are not checked.
+    fn cap_energy(&self, state: &mut State, modal: &[f64], contacts: &mut Contacts) {
+        let points = &contacts.touching.points;
+        let loaded = modal.iter().any(|load| *load != 0.0);
+        let touches = points.iter().any(|point| point.pushed[0] > 0.0);
+        if loaded || !touches || self.modes.is_viscous() || !state.is_finite() {
+            return;
+        }
+        let kinetic = |state: &State| {
+            let frame = if self.model.is_free() { state.frame.kinetic_energy(&self.model) } else { 0.0 };
+            frame + 0.5 * state.v.iter().map(|v| v * v).sum::<f64>()
+        };
+        let stored = |force: &Vector3<f64>, point: &Point| 0.5 * force.dot(&(point.compliance * force));
+        let at_rest = |state: &State| self.elastic_energy(&state.q) + self.potential_energy(state);
+        let moving = kinetic(state);
+        let mut gained = moving - kinetic(&self.before) + at_rest(state) - at_rest(&self.before);
+        for point in points {
+            let force = point.world_force();
+            gained += stored(&force, point) - stored(&point.before, point);
+            // What the obstacles supply, and what pushes a body out that was set into one.
+            gained -= force.dot(&point.carried) + point.pushed[0] * (point.floor - point.gap).max(0.0);
+        }
+        // A step may take back a little of what the steps before have lost: a rolling ball loses and
+        // gains in turn, and would slow down if only the gains were taken.
+        let allowed = contacts.lost.min(GIVEN_BACK * moving);
+        contacts.lost = (contacts.lost - gained.min(allowed)).min(moving);
+        let gained = gained - allowed;
+        if gained > moving {
+            // The velocities cannot pay for it. The body stops where the step began.
+            state.clone_from(&self.before);
+            state.v.fill(0.0);
+            state.frame.slow(0.0);
+            contacts.touching.points.clear();
+            contacts.report.guarded = true;
+        } else if gained > 1e-12 * moving {
+            let left = (1.0 - gained / moving).sqrt();
+            state.v.iter_mut().for_each(|v| *v *= left);
+            state.frame.slow(left);
+            contacts.report.guarded = true;
+        }
     }
 
     /// Stores what the next step needs and what users read.
