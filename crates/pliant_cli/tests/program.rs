@@ -388,3 +388,22 @@ fn models_that_are_cut_or_foreign_are_refused() {
     assert!(refused(&["inspect", &mesh]).contains("not a .modal file"));
     assert!(refused(&["inspect", &folder.file("none.modal")]).contains("none.modal"));
 }
+
+#[test]
+fn drop_prints_every_step_and_refuses_what_it_cannot_do() {
+    let jack = concat!(env!("CARGO_MANIFEST_DIR"), "/../../assets/jack.modal");
+    let said = succeeds(&["drop", jack, "--seconds", "0.5", "--onto", "sphere:0.2", "--json"]);
+    let dropped: serde_json::Value = serde_json::from_str(&said).unwrap();
+    let ticks = dropped["ticks"].as_array().unwrap();
+    assert_eq!(ticks.len(), 31);
+    for name in ["time", "kinetic", "elastic", "potential", "penetration", "step_us", "contacts"] {
+        assert!(ticks[30][name].is_number(), "{name}");
+    }
+    for name in ["center", "velocity", "contact_force"] {
+        assert_eq!(ticks[30][name].as_array().unwrap().len(), 3, "{name}");
+    }
+    assert!(succeeds(&["drop", jack, "--seconds", "0.1", "--tilt", "10"]).contains("contact sites"));
+    refused(&["drop", jack, "--onto", "cone"]);
+    refused(&["drop", jack, "--friction", "-1"]);
+    refused(&["drop", concat!(env!("CARGO_MANIFEST_DIR"), "/../../assets/pip.modal")]);
+}

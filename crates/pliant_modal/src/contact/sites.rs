@@ -13,7 +13,7 @@ const FLAT: f64 = 4.0;
 /// Distance over which the contact point of a round site slides, as a share of the spacing of the
 /// sites.
 ///
-/// With half the spacing a ball would roll as on a sphere, but neighbors would share the load at one
+/// With three quarters a ball would roll as on a sphere, but neighbors would share the load at one
 /// point and be too stiff: 1.7 to 2.6 times the force of Hertz. With none a ball would roll as a
 /// polyhedron and lose 7 % of its speed in a second.
 const SLIDE: f64 = 0.25;
