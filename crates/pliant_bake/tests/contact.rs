@@ -103,9 +103,9 @@ fn at_rest_the_contact_forces_carry_the_weight() {
 
 #[test]
 fn on_an_incline_a_cube_sticks_or_slides_as_coulomb_says() {
-    let (model, friction) = (cube(1e5), 0.5);
+    let (model, friction) = (cube(1e5), 0.5f64);
     for share in [0.5, 0.99] {
-        let mut body = place(&model, &scene((share * friction as f64).atan(), friction));
+        let mut body = place(&model, &scene((share * friction).atan(), friction));
         run(&mut body, 5.0);
         let before = Vector3::from(body.frame().center());
         run(&mut body, 60.0);
@@ -114,7 +114,7 @@ fn on_an_incline_a_cube_sticks_or_slides_as_coulomb_says() {
         assert!(crept < 1e-4, "{share}: {crept}");
     }
     for share in [1.01, 1.1, 2.0] {
-        let tilt = (share * friction as f64).atan();
+        let tilt = (share * friction).atan();
         let mut body = place(&model, &scene(tilt, friction));
         run(&mut body, 1.0);
         let before = body.frame().velocity()[0];
@@ -171,7 +171,7 @@ fn a_block_topples_when_its_height_says_so() {
 
 #[test]
 fn a_bar_hits_a_wall_end_on_as_waves_say() {
-    let (length, side, young, density, speed) = (0.8, 0.1, 1e5, 1000.0, 0.1f64);
+    let (length, side, young, density, speed) = (0.8, 0.1, 1e5f64, 1000.0, 0.1);
     let mesh = shapes::bar([2, 32, 2], [side, length, side]).unwrap();
     let model = model(&mesh, young, |config| {
         config.poisson = 0.0;
@@ -179,7 +179,7 @@ fn a_bar_hits_a_wall_end_on_as_waves_say() {
         config.modes = 60;
         config.damping = Damping::Ratio(0.0);
     });
-    let wave = (young / density as f64).sqrt();
+    let wave = (young / density).sqrt();
     let time = 2.0 * length / wave;
     let force = density * wave * side * side * speed;
     for steps in [8.0, 16.0, 32.0] {

@@ -35,7 +35,7 @@ const RECOVERY_SPEED: f64 = 0.5;
 /// the body was moved from elsewhere.
 const SNAPPED: f64 = 0.02;
 
-/// Share of the kinetic energy that a step may gain of what contacts have lost before.
+/// Share of the kinetic and elastic energy that a step may gain of what contacts have lost before.
 const GIVEN_BACK: f64 = 1e-2;
 
 /// Contact forces on a body over a step.
@@ -547,26 +547,29 @@ impl Kernel {
         let at_rest = |state: &State| self.elastic_energy(&state.q) + self.potential_energy(state);
         let moving = kinetic(state);
         let mut gained = moving - kinetic(&self.before) + at_rest(state) - at_rest(&self.before);
+        let mut scale = moving + kinetic(&self.before);
+        scale += self.elastic_energy(&state.q) + self.elastic_energy(&self.before.q);
         for point in points {
             let force = point.world_force();
+            scale += stored(&force, point) + stored(&point.before, point);
             gained += stored(&force, point) - stored(&point.before, point);
             // What the obstacles supply, and what pushes a body out that was set into one.
             gained -= force.dot(&point.carried) + point.pushed[0] * (point.floor - point.gap).max(0.0);
         }
         // A step may take back a little of what the steps before have lost: a rolling ball loses and
         // gains in turn, and would slow down if only the gains were taken.
-        let allowed = contacts.lost.min(GIVEN_BACK * moving);
-        contacts.lost = (contacts.lost - gained.min(allowed)).min(moving);
+        let allowed = contacts.lost.min(GIVEN_BACK * scale);
+        contacts.lost = (contacts.lost - gained.min(allowed)).min(scale);
         let gained = gained - allowed;
-        if gained > moving {
+        if gained > moving && gained > 1e-3 * scale {
             // The velocities cannot pay for it. The body stops where the step began.
             state.clone_from(&self.before);
             state.v.fill(0.0);
             state.frame.slow(0.0);
             contacts.touching.points.clear();
             contacts.report.guarded = true;
-        } else if gained > 1e-12 * moving {
-            let left = (1.0 - gained / moving).sqrt();
+        } else if gained > 1e-12 * scale {
+            let left = (1.0 - gained / moving).max(0.0).sqrt();
             state.v.iter_mut().for_each(|v| *v *= left);
             state.frame.slow(left);
             contacts.report.guarded = true;
