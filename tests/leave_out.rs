@@ -56,6 +56,15 @@ fn each_plugin_brings_its_own_systems_and_no_other() {
         app.add_plugins((PliantBodyPlugin::default(), PointerGrabPlugin));
     });
     assert!((1..=6).contains(&(pointer - none - body)), "{} systems of the pointer", pointer - none - body);
+    #[cfg(feature = "contact")]
+    {
+        use pliant::contact::ContactPlugin;
+        let touching = with(|app| {
+            app.add_plugins((PliantBodyPlugin::default(), ContactPlugin::default()));
+        });
+        let contact = touching - none - body;
+        assert!((1..=4).contains(&contact), "{contact} systems of the contacts");
+    }
     #[cfg(feature = "net")]
     {
         use pliant::net::{HostConfig, NetPlugin};

@@ -23,6 +23,10 @@
 //! | --- | --- | --- |
 //! | [`PliantBodyPlugin`](body::PliantBodyPlugin) | `.modal` assets, [`ModalBody`](body::ModalBody), grabs, the fixed step, the deformed surface | no other plugin works |
 //! | [`PointerGrabPlugin`](body::PointerGrabPlugin) | pointers drag bodies (feature `picking`) | only code makes grabs |
+#![cfg_attr(
+    feature = "contact",
+    doc = "| [`ContactPlugin`](contact::ContactPlugin) | bodies touch floors, balls, boxes and capsules (feature `contact`) | bodies touch nothing |"
+)]
 //!
 //! These plugins are added where they are needed, each behind its feature:
 //!
@@ -55,6 +59,7 @@
 //! | `render` | yes | Bevy's renderer, which draws the bodies |
 //! | `window` | yes | the usual parts of a windowed game: winit on X11, user interface, text, PNG; leave it out to choose Bevy's features yourself |
 //! | `wayland` | no | native Wayland windows (building needs the Wayland client headers) |
+//! | `contact` | yes | obstacles that bodies touch |
 //! | `net` | yes | sessions over QUIC |
 //! | `haptics` | yes | haptic devices and the device loop |
 //! | `rerun` | yes | the client of the rerun viewer |
@@ -75,6 +80,8 @@ use bevy::{
 #[cfg(feature = "bake")]
 pub use pliant_bake as bake;
 pub use pliant_body as body;
+#[cfg(feature = "contact")]
+pub use pliant_contact as contact;
 #[cfg(feature = "haptics")]
 pub use pliant_haptics as haptics;
 #[cfg(feature = "bake")]
@@ -129,6 +136,8 @@ impl PluginGroup for PliantPlugins {
         let group = PluginGroupBuilder::start::<Self>().add(body::PliantBodyPlugin::new(self.schedule));
         #[cfg(feature = "picking")]
         let group = group.add(body::PointerGrabPlugin);
+        #[cfg(feature = "contact")]
+        let group = group.add(contact::ContactPlugin::new(self.schedule));
         group
     }
 }
@@ -145,6 +154,10 @@ pub mod prelude {
     pub use crate::body::{PointerGrab, PointerGrabPlugin, PointerGrabSystems, PointerHeld};
     #[cfg(feature = "render")]
     pub use crate::body::{SurfaceDeformation, SurfaceDetail, SurfaceShading};
+    #[cfg(feature = "contact")]
+    pub use crate::contact::{
+        BodyContacts, BodyFriction, ContactEnded, ContactLayers, ContactPlugin, ContactStarted, Obstacle,
+    };
     #[cfg(all(feature = "haptics", feature = "render"))]
     pub use crate::haptics::ForceArrow;
     #[cfg(feature = "haptics")]

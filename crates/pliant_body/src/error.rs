@@ -48,6 +48,12 @@ pub enum BodyError {
     /// The body of an [`Impulse`](crate::Impulse) or a [`Push`](crate::Push) is remote.
     #[error("the impulse was refused: this body is driven remotely and is not stepped here")]
     NotLocal,
+    /// An obstacle has a number that is not finite or out of range. Bodies do not touch it.
+    #[error("the obstacle was refused: {0}")]
+    Obstacle(StepError),
+    /// The friction of a body is not finite or out of range. The body keeps its former friction.
+    #[error("the friction was refused: {0}")]
+    Friction(StepError),
     /// A visual state has the wrong number of modes.
     #[error("a visual state needs {expected} modal coordinates, got {found}")]
     VisualLength {

@@ -64,13 +64,24 @@ const SCENES: [(&str, &str, &[&str]); 6] = [
             "bevy_egui",
             "egui",
             "pliant_haptics",
+            "pliant_contact",
             "faer",
         ],
     ),
     (
         "one body or many",
         "render",
-        &["quinn*", "tokio", "rerun", "bevy_egui", "pliant_haptics", "pliant_stream", "faer", "bevy_winit"],
+        &[
+            "quinn*",
+            "tokio",
+            "rerun",
+            "bevy_egui",
+            "pliant_haptics",
+            "pliant_contact",
+            "pliant_stream",
+            "faer",
+            "bevy_winit",
+        ],
     ),
     (
         "a host without a picture",
@@ -110,8 +121,9 @@ fn a_scene_compiles_nothing_that_it_does_not_need() {
 }
 
 /// Each feature with crates of its own, those crates, and the features that need this feature.
-const FEATURES: [(&str, &[&str], &[&str]); 6] = [
+const FEATURES: [(&str, &[&str], &[&str]); 7] = [
     ("render", &["bevy_render", "bevy_pbr", "bevy_core_pipeline", "wgpu"], &["panel"]),
+    ("contact", &["pliant_contact"], &[]),
     ("net", &["pliant_net", "quinn*"], &[]),
     ("haptics", &["pliant_haptics"], &[]),
     ("rerun", &["pliant_rerun", "rerun", "re_*", "arrow"], &[]),

@@ -1,0 +1,250 @@
+//! What bodies touch: the obstacles near each body, and the contacts of its last step.
+
+use std::sync::Arc;
+
+use bevy::{math::DVec3, prelude::*};
+use nalgebra::Vector3;
+use pliant_body::{BodyError, BodyRefused, BodyState, Driven};
+use pliant_modal as modal;
+
+use crate::obstacle::{ContactLayers, Motion};
+
+/// Coefficient of Coulomb friction between a body and all obstacles, 0 to 10.
+///
+/// A body without this component has the friction of [`BodyFriction::default`].
+#[derive(Component, Reflect, Debug, Clone, Copy, PartialEq)]
+#[reflect(Component, Default, Debug, Clone, PartialEq)]
+pub struct BodyFriction(pub f64);
+
+impl Default for BodyFriction {
+    /// A coefficient of 0.5.
+    fn default() -> Self {
+        Self(modal::Contacts::FRICTION)
+    }
+}
+
+/// A place where a body touches an obstacle.
+#[derive(Reflect, Debug, Clone, Copy, PartialEq)]
+#[reflect(Debug, Clone, PartialEq)]
+pub struct ContactPoint {
+    /// The entity of the [`Obstacle`](crate::Obstacle).
+    pub obstacle: Entity,
+    /// Surface vertex of the body at the center of the touching patch.
+    pub vertex: u32,
+    /// Position of the contact, m, world axes.
+    pub point: DVec3,
+    /// Outward normal of the obstacle, world axes.
+    pub normal: DVec3,
+    /// Mean force on the body over the last step, N, world axes.
+    pub force: DVec3,
+    /// Depth of the body's surface inside the obstacle, m.
+    pub penetration: f64,
+    /// Whether the contact slides.
+    pub sliding: bool,
+}
+
+/// The contacts of a body in its last step. The plugin adds this component to every body.
+#[derive(Component, Reflect, Debug, Clone, PartialEq, Default)]
+#[reflect(Component, Default, Debug, Clone, PartialEq)]
+pub struct BodyContacts(pub Vec<ContactPoint>);
+
+impl BodyContacts {
+    /// Sum of the forces on the body over the last step, N, world axes.
+    pub fn force(&self) -> DVec3 {
+        self.0.iter().map(|contact| contact.force).sum()
+    }
+
+    /// Whether the body touches this obstacle.
+    pub fn touches(&self, obstacle: Entity) -> bool {
+        self.0.iter().any(|contact| contact.obstacle == obstacle)
+    }
+
+    /// The obstacles that the body touches, each once.
+    fn obstacles(&self) -> impl Iterator<Item = Entity> {
+        let seen = |index: usize, obstacle| self.0[..index].iter().any(|c| c.obstacle == obstacle);
+        let all = self.0.iter().enumerate();
+        all.filter(move |(index, c)| !seen(*index, c.obstacle)).map(|(_, contact)| contact.obstacle)
+    }
+}
+
+/// A body began to touch an obstacle. Observe it on the body's entity or on all.
+#[derive(EntityEvent, Reflect, Debug, Clone, Copy, PartialEq)]
+pub struct ContactStarted {
+    /// The entity of the body.
+    pub entity: Entity,
+    /// The entity of the [`Obstacle`](crate::Obstacle).
+    pub obstacle: Entity,
+    /// Position of the contact with the largest force, m, world axes.
+    pub point: DVec3,
+    /// Outward normal of the obstacle there, world axes.
+    pub normal: DVec3,
+    /// Impulse on the body in the first step, N s, world axes, summed over all places.
+    pub impulse: DVec3,
+}
+
+/// A body ceased to touch an obstacle. Observe it on the body's entity or on all.
+#[derive(EntityEvent, Reflect, Debug, Clone, Copy, PartialEq, Eq)]
+pub struct ContactEnded {
+    /// The entity of the body.
+    pub entity: Entity,
+    /// The entity of the [`Obstacle`](crate::Obstacle).
+    pub obstacle: Entity,
+}
+
+/// The obstacles that a body was given, at the indices that its solver knows.
+#[derive(Component, Debug, Default)]
+pub(crate) struct Nearby {
+    slots: Vec<Option<Entity>>,
+    /// BodyFriction that was refused, so that it is told once.
+    refused: Option<f64>,
+}
+
+/// Stands at the index of an obstacle that has left, so that the others keep theirs.
+#[derive(Debug)]
+struct Nothing;
+
+impl modal::Obstacle for Nothing {
+    fn at(&self, _: &Vector3<f64>) -> modal::SurfacePoint {
+        modal::SurfacePoint { distance: 1e30, normal: Vector3::y() }
+    }
+}
+
+/// Adds what a new body needs for its contacts.
+pub(crate) fn prepare_body(added: On<Add, BodyState>, mut commands: Commands) {
+    commands.entity(added.entity).try_insert((Nearby::default(), BodyContacts::default()));
+}
+
+/// Removes the contacts of a body that is removed.
+pub(crate) fn forget_body(removed: On<Remove, BodyState>, mut commands: Commands) {
+    if let Ok(mut entity) = commands.get_entity(removed.entity) {
+        entity.try_remove::<(Nearby, BodyContacts)>();
+    }
+}
+
+type Bodies<'w, 's> = Query<
+    'w,
+    's,
+    (
+        Entity,
+        &'static mut BodyState,
+        &'static mut Nearby,
+        &'static Driven,
+        Option<&'static ContactLayers>,
+        Option<&'static BodyFriction>,
+    ),
+>;
+
+/// Gives each body the obstacles near it. What has not changed is not touched, so that bodies rest.
+pub(crate) fn place_obstacles(
+    time: Res<Time>,
+    mut refusals: MessageWriter<BodyRefused>,
+    obstacles: Query<(Entity, &Motion, Option<&ContactLayers>)>,
+    mut bodies: Bodies,
+) {
+    let step = time.delta_secs_f64();
+    // In the order of entities, so that the order of archetypes makes no difference.
+    let mut all: Vec<_> = obstacles.iter().filter(|(_, motion, _)| motion.sound).collect();
+    all.sort_by_key(|(entity, ..)| *entity);
+    for (entity, mut state, mut nearby, driven, layers, friction) in &mut bodies {
+        let nearby = &mut *nearby;
+        let layers = layers.copied().unwrap_or_default();
+        let local = *driven == Driven::Local;
+        let (body, scale) = (state.body(), state.scale());
+        let center = Vector3::from(body.frame().to_world(Vector3::from(body.model().center_of_mass())));
+        let reach = 2.0 * body.model().size() + 2.0 * step * Vector3::from(body.frame().velocity()).norm();
+        let near: Vec<(Entity, &Motion)> = all
+            .iter()
+            .filter(|(_, motion, other)| {
+                local
+                    && layers.touch(other.copied().unwrap_or_default())
+                    // A body without a number keeps what it has.
+                    && !(motion.obstacle(scale).at(&center).distance > reach)
+            })
+            .map(|(entity, motion, _)| (*entity, *motion))
+            .collect();
+        let find = |entity: Entity| near.binary_search_by_key(&entity, |(entity, _)| *entity).ok();
+        let mut changed = body.contacts().obstacles().len() != nearby.slots.len();
+        for slot in &mut nearby.slots {
+            if slot.is_some_and(|entity| find(entity).is_none()) {
+                (*slot, changed) = (None, true);
+            }
+        }
+        for (entity, motion) in &near {
+            changed |= motion.changed;
+            if nearby.slots.contains(&Some(*entity)) {
+                continue;
+            }
+            changed = true;
+            match nearby.slots.iter_mut().find(|slot| slot.is_none()) {
+                Some(slot) => *slot = Some(*entity),
+                None => nearby.slots.push(Some(*entity)),
+            }
+        }
+        if near.is_empty() {
+            nearby.slots.clear();
+        }
+        if changed {
+            let list = nearby.slots.iter().map(|slot| match slot.and_then(find) {
+                Some(index) => near[index].1.obstacle(scale),
+                None => Arc::new(Nothing),
+            });
+            if let Err(error) = state.body_mut().set_obstacles(list.collect()) {
+                refusals.write(BodyRefused { entity, error: BodyError::Obstacle(error) });
+            }
+        }
+        let wanted = friction.copied().unwrap_or_default().0;
+        let current = state.body().contacts().friction();
+        if wanted.to_bits() != current.to_bits() && nearby.refused.map(f64::to_bits) != Some(wanted.to_bits()) {
+            let set = state.body_mut().set_friction(wanted);
+            nearby.refused = set.is_err().then_some(wanted);
+            if let Err(error) = set {
+                warn!("{entity}: {error}");
+                refusals.write(BodyRefused { entity, error: BodyError::Friction(error) });
+            }
+        }
+    }
+}
+
+/// Writes the contacts of each body and tells what began and what ended.
+pub(crate) fn publish(
+    time: Res<Time>,
+    mut commands: Commands,
+    mut bodies: Query<(Entity, &BodyState, &Nearby, &mut BodyContacts)>,
+) {
+    let step = time.delta_secs_f64();
+    for (entity, state, nearby, mut contacts) in &mut bodies {
+        // A resting body goes on touching what it touches.
+        if state.is_resting() {
+            continue;
+        }
+        let scale = state.scale();
+        let world = |point: [f64; 3]| scale * DVec3::from(point);
+        let of = |contact: &modal::Contact| {
+            let obstacle = nearby.slots.get(contact.obstacle).copied().flatten()?;
+            Some(ContactPoint {
+                obstacle,
+                vertex: contact.vertex,
+                point: world(contact.point),
+                normal: contact.normal.into(),
+                force: world(contact.force),
+                penetration: scale * contact.penetration,
+                sliding: contact.sliding,
+            })
+        };
+        let now = BodyContacts(state.body().contacts().contacts().iter().filter_map(of).collect());
+        if now == *contacts {
+            continue;
+        }
+        for obstacle in contacts.obstacles().filter(|&obstacle| !now.touches(obstacle)) {
+            commands.trigger(ContactEnded { entity, obstacle });
+        }
+        for obstacle in now.obstacles().filter(|&obstacle| !contacts.touches(obstacle)) {
+            let own = || now.0.iter().filter(|contact| contact.obstacle == obstacle);
+            let largest = own().max_by(|a, b| a.force.length().total_cmp(&b.force.length()));
+            let Some(&ContactPoint { point, normal, .. }) = largest else { continue };
+            let impulse = step * own().map(|contact| contact.force).sum::<DVec3>();
+            commands.trigger(ContactStarted { entity, obstacle, point, normal, impulse });
+        }
+        *contacts = now;
+    }
+}

@@ -1,0 +1,96 @@
+//! The Bevy plugin for contact: soft bodies touch the floors, balls, boxes and capsules of a scene.
+//!
+//! ```no_run
+//! use bevy::prelude::*;
+//! use pliant_body::{ModalBody, PliantBodyPlugin};
+//! use pliant_contact::{ContactPlugin, Obstacle};
+//!
+//! fn main() {
+//!     App::new()
+//!         .add_plugins((DefaultPlugins, PliantBodyPlugin::default(), ContactPlugin::default()))
+//!         .add_systems(Startup, setup)
+//!         .run();
+//! }
+//!
+//! fn setup(mut commands: Commands, assets: Res<AssetServer>) {
+//!     let mut jack = ModalBody::new(assets.load("jack.modal"));
+//!     jack.settings.gravity = [0.0, -9.81, 0.0];
+//!     commands.spawn((jack, Transform::from_xyz(0.0, 1.0, 0.0)));
+//!     commands.spawn(Obstacle::Floor);
+//! }
+//! ```
+//!
+//! | Written by you | Read by you |
+//! | --- | --- |
+//! | [`Obstacle`] with a `Transform`: a rigid shape | [`BodyContacts`] on a body: where it touches, with forces |
+//! | [`BodyFriction`] on a body | [`ContactStarted`], [`ContactEnded`]: events on the body, for observers |
+//! | [`ContactLayers`] on bodies and obstacles: who touches whom | [`BodyRefused`](pliant_body::BodyRefused): a refused obstacle |
+//!
+//! Obstacles push bodies, and bodies do not push obstacles. Bodies do not touch each other, and a
+//! body does not touch itself. A body that another source moves
+//! ([`Driven::Remote`](pliant_body::Driven::Remote)) touches nothing here.
+//!
+//! A body with no obstacle nearby has no contact work. The first obstacle that comes near chooses
+//! the contact sites of the body's model, once for each model.
+#![cfg_attr(
+    test,
+    allow(clippy::unwrap_used, clippy::expect_used, clippy::panic, reason = "a failed test should panic")
+)]
+
+mod contacts;
+mod obstacle;
+#[cfg(test)]
+mod tests;
+
+use bevy::{
+    ecs::schedule::{InternedScheduleLabel, ScheduleLabel},
+    prelude::*,
+};
+use pliant_body::PliantSystems;
+
+pub use contacts::{BodyContacts, ContactEnded, ContactPoint, ContactStarted, BodyFriction};
+pub use obstacle::{ContactLayers, Obstacle};
+
+/// Lets bodies touch the [`Obstacle`]s of the scene.
+///
+/// The plugin needs [`PliantBodyPlugin`](pliant_body::PliantBodyPlugin) in the same schedule.
+pub struct ContactPlugin {
+    schedule: InternedScheduleLabel,
+}
+
+impl ContactPlugin {
+    /// Follows bodies that are stepped in `schedule`.
+    pub fn new(schedule: impl ScheduleLabel) -> Self {
+        Self { schedule: schedule.intern() }
+    }
+}
+
+impl Default for ContactPlugin {
+    /// Follows bodies that are stepped in `FixedUpdate`.
+    fn default() -> Self {
+        Self::new(FixedUpdate)
+    }
+}
+
+impl Plugin for ContactPlugin {
+    fn build(&self, app: &mut App) {
+        app.register_type::<Obstacle>()
+            .register_type::<ContactLayers>()
+            .register_type::<BodyFriction>()
+            .register_type::<BodyContacts>()
+            .register_type::<ContactPoint>()
+            .add_observer(contacts::prepare_body)
+            .add_observer(contacts::forget_body)
+            .add_systems(
+                self.schedule,
+                (
+                    (obstacle::move_obstacles, contacts::place_obstacles)
+                        .chain()
+                        .after(PliantSystems::Input)
+                        .before(PliantSystems::Step)
+                        .run_if(|time: Res<Time>| !time.delta().is_zero()),
+                    contacts::publish.in_set(PliantSystems::Publish),
+                ),
+            );
+    }
+}

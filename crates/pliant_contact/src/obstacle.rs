@@ -1,0 +1,193 @@
+//! Obstacles as components, and their motion from tick to tick.
+
+use std::sync::Arc;
+
+use bevy::{
+    math::{DQuat, DVec3},
+    prelude::*,
+};
+use pliant_body::{BodyError, BodyRefused};
+use pliant_modal as modal;
+
+/// A rigid shape that bodies touch, at the entity's `Transform`.
+///
+/// The scale of the entity multiplies the shape. A ball and a capsule take the largest of the three
+/// scales. A scale that is not finite takes the obstacle out of the scene until it is.
+///
+/// An obstacle may move. Its velocity is its way since the last tick, so that it carries and pushes
+/// what it touches. Bodies do not push it back. A way faster than 100 m/s is a teleport without
+/// velocity.
+#[derive(Component, Reflect, Debug, Clone, Copy, PartialEq)]
+#[reflect(Component, Debug, Clone, PartialEq)]
+#[require(Transform)]
+pub enum Obstacle {
+    /// Everything below the entity's origin, along its own y axis.
+    Floor,
+    /// A ball around the entity's origin.
+    Ball {
+        /// Radius, m.
+        radius: f32,
+    },
+    /// A box around the entity's origin along its own axes.
+    Box {
+        /// Half the lengths of the edges, m.
+        half: Vec3,
+    },
+    /// A cylinder with round ends along the entity's own y axis.
+    Capsule {
+        /// Radius, m.
+        radius: f32,
+        /// Half the distance of the centers of the two round ends, m.
+        half_length: f32,
+    },
+}
+
+/// Selects what touches what: a body and an obstacle touch if each one's filters have a bit of the
+/// other's memberships.
+///
+/// An entity without this component is a member of all layers and touches all layers.
+#[derive(Component, Reflect, Debug, Clone, Copy, PartialEq, Eq)]
+#[reflect(Component, Default, Debug, Clone, PartialEq)]
+pub struct ContactLayers {
+    /// Layers to which the entity belongs, one bit each. Default: all.
+    pub memberships: u32,
+    /// Layers that the entity touches, one bit each. Default: all.
+    pub filters: u32,
+}
+
+impl Default for ContactLayers {
+    fn default() -> Self {
+        Self { memberships: u32::MAX, filters: u32::MAX }
+    }
+}
+
+impl ContactLayers {
+    pub(crate) fn touch(self, other: Self) -> bool {
+        self.memberships & other.filters != 0 && other.memberships & self.filters != 0
+    }
+}
+
+/// Speed above which a way is a teleport, m/s.
+const TELEPORT: f64 = 100.0;
+
+/// Pose and motion of an obstacle at this tick, world axes.
+#[derive(Component, Debug, Clone, Copy, PartialEq)]
+pub(crate) struct Motion {
+    pub(crate) shape: Obstacle,
+    /// Scale of the entity.
+    scale: DVec3,
+    position: DVec3,
+    rotation: DQuat,
+    velocity: DVec3,
+    spin: DVec3,
+    /// Whether shape, pose or motion changed in this tick.
+    pub(crate) changed: bool,
+    /// Whether the shape's numbers are valid.
+    pub(crate) sound: bool,
+}
+
+/// Angular velocity that turns `from` into `to` in `step` seconds, rad/s.
+fn spin(from: DQuat, to: DQuat, step: f64) -> DVec3 {
+    (to * from.inverse()).normalize().to_scaled_axis() / step
+}
+
+impl Motion {
+    fn new(shape: Obstacle, global: &GlobalTransform) -> Option<Self> {
+        let (scale, rotation, position) = global.to_scale_rotation_translation();
+        let sound = scale.is_finite() && rotation.is_finite() && position.is_finite();
+        sound.then(|| Self {
+            shape,
+            scale: scale.abs().as_dvec3(),
+            position: position.as_dvec3(),
+            rotation: rotation.as_dquat().normalize(),
+            velocity: DVec3::ZERO,
+            spin: DVec3::ZERO,
+            changed: true,
+            sound: true,
+        })
+    }
+
+    /// Continues the motion of `last` over a step (s).
+    fn after(mut self, last: &Self, step: f64) -> Self {
+        let velocity = (self.position - last.position) / step;
+        let spin = spin(last.rotation, self.rotation, step);
+        if velocity.length() <= TELEPORT && velocity.is_finite() && spin.is_finite() {
+            (self.velocity, self.spin) = (velocity, spin);
+        }
+        self.changed = Self { changed: last.changed, sound: last.sound, ..self } != *last;
+        self.sound = last.sound;
+        self
+    }
+
+    /// The obstacle in the world of a body on an entity of uniform scale `scale`.
+    pub(crate) fn obstacle(&self, scale: f64) -> Arc<dyn modal::Obstacle> {
+        let position = (self.position / scale).into();
+        let rotation = self.rotation.into();
+        let (velocity, angular_velocity) = ((self.velocity / scale).into(), self.spin.into());
+        let whole = self.scale.max_element() / scale;
+        match self.shape {
+            Obstacle::Floor => {
+                let shape = modal::Plane::GROUND;
+                Arc::new(modal::Moving { shape, position, rotation, velocity, angular_velocity })
+            }
+            Obstacle::Ball { radius } => {
+                let shape = modal::Sphere { center: [0.0; 3], radius: f64::from(radius) * whole };
+                Arc::new(modal::Moving { shape, position, rotation, velocity, angular_velocity })
+            }
+            Obstacle::Box { half } => {
+                let half = (half.as_dvec3() * self.scale / scale).into();
+                let shape =
+                    modal::Cuboid { center: [0.0; 3], rotation: [0.0, 0.0, 0.0, 1.0], half, round: 0.0 };
+                Arc::new(modal::Moving { shape, position, rotation, velocity, angular_velocity })
+            }
+            Obstacle::Capsule { radius, half_length } => {
+                let end = f64::from(half_length) * whole;
+                let ends = [[0.0, -end, 0.0], [0.0, end, 0.0]];
+                let shape = modal::Capsule { ends, radius: f64::from(radius) * whole };
+                Arc::new(modal::Moving { shape, position, rotation, velocity, angular_velocity })
+            }
+        }
+    }
+}
+
+/// Takes the pose of every obstacle at this tick, and its motion since the last one.
+pub(crate) fn move_obstacles(
+    time: Res<Time>,
+    mut commands: Commands,
+    transforms: TransformHelper,
+    mut refused: MessageWriter<BodyRefused>,
+    mut obstacles: Query<(Entity, &Obstacle, Option<&mut Motion>)>,
+    gone: Query<Entity, (With<Motion>, Without<Obstacle>)>,
+) {
+    for entity in &gone {
+        commands.entity(entity).try_remove::<Motion>();
+    }
+    let step = time.delta_secs_f64();
+    for (entity, &shape, motion) in &mut obstacles {
+        // `GlobalTransform` is that of the last frame.
+        let global = transforms.compute_global_transform(entity).ok();
+        let mut now = global.and_then(|global| Motion::new(shape, &global));
+        if let (Some(now), Some(last)) = (&mut now, &motion) {
+            *now = now.after(last, step);
+        }
+        if let Some(now) = now.as_mut().filter(|now| now.changed) {
+            let before = motion.as_ref().is_none_or(|last| last.sound);
+            let checked = now.obstacle(1.0).check();
+            now.sound = checked.is_ok();
+            if let (Err(error), true) = (checked, before) {
+                warn!("{entity}: {error}");
+                refused.write(BodyRefused { entity, error: BodyError::Obstacle(error) });
+            }
+        }
+        match (motion, now) {
+            (Some(mut motion), Some(now)) => *motion = now,
+            (Some(_), None) => {
+                commands.entity(entity).try_remove::<Motion>();
+            }
+            (None, Some(now)) => {
+                commands.entity(entity).try_insert(now);
+            }
+            (None, None) => {}
+        }
+    }
+}

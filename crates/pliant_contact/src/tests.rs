@@ -1,0 +1,219 @@
+//! A cube on obstacles in an app without a renderer, against what mechanics says.
+
+use std::sync::{Arc, LazyLock};
+
+use bevy::{math::DVec3, prelude::*, time::TimeUpdateStrategy, transform::TransformPlugin};
+use pliant_body::{BodyRefused, BodyState, Grab, GrabOf, ModalAsset, ModalBody, PliantBodyPlugin};
+use pliant_modal::ModalModel;
+
+use crate::{
+    BodyContacts, ContactEnded, ContactLayers, ContactPlugin, ContactStarted, BodyFriction, Obstacle,
+};
+
+const STEP: f64 = 1.0 / 60.0;
+const GRAVITY: f64 = 9.81;
+/// Edge of the cube, m.
+const EDGE: f64 = 0.2;
+
+/// A free cube around the origin, of rubber of 1 MPa.
+static CUBE: LazyLock<Arc<ModalModel>> = LazyLock::new(|| {
+    let mut mesh = pliant_mesh::shapes::bar([3, 3, 3], [EDGE; 3]).unwrap();
+    mesh.nodes.iter_mut().flatten().for_each(|x| *x -= 0.5 * EDGE);
+    let damping = pliant_modal::Damping::Ratio(0.1);
+    let config = pliant_bake::BakeConfig { modes: 12, young: 1e6, damping, ..Default::default() };
+    Arc::new(pliant_bake::bake(&mesh, None, &config, &mut |_, _| ()).unwrap().model)
+});
+
+#[derive(Resource, Default)]
+struct Told {
+    started: Vec<ContactStarted>,
+    ended: Vec<ContactEnded>,
+    refused: Vec<String>,
+}
+
+fn app() -> App {
+    let mut app = App::new();
+    app.add_plugins((MinimalPlugins, AssetPlugin::default(), TransformPlugin))
+        .insert_resource(Time::<Fixed>::from_seconds(STEP))
+        .insert_resource(TimeUpdateStrategy::FixedTimesteps(1))
+        .add_plugins((PliantBodyPlugin::default(), ContactPlugin::default()))
+        .init_resource::<Told>()
+        .add_observer(|event: On<ContactStarted>, mut told: ResMut<Told>| told.started.push(*event))
+        .add_observer(|event: On<ContactEnded>, mut told: ResMut<Told>| told.ended.push(*event))
+        .add_systems(Last, |mut refused: MessageReader<BodyRefused>, mut told: ResMut<Told>| {
+            told.refused.extend(refused.read().map(|refused| refused.error.to_string()));
+        });
+    app.update();
+    app
+}
+
+fn spawn(app: &mut App, at: impl Into<Transform>, bundle: impl Bundle) -> Entity {
+    let model = app.world_mut().resource_mut::<Assets<ModalAsset>>().add(ModalAsset(CUBE.clone()));
+    let mut body = ModalBody::new(model);
+    body.settings.gravity = [0.0, -GRAVITY, 0.0];
+    app.world_mut().spawn((body, at.into(), bundle)).id()
+}
+
+fn seconds(app: &mut App, seconds: f64) {
+    for _ in 0..(seconds / STEP) as usize {
+        app.update();
+    }
+}
+
+fn state(app: &App, body: Entity) -> &BodyState {
+    app.world().get(body).unwrap()
+}
+
+fn center(app: &App, body: Entity) -> DVec3 {
+    state(app, body).scale() * DVec3::from(state(app, body).body().frame().center())
+}
+
+fn contacts(app: &App, body: Entity) -> &BodyContacts {
+    app.world().get(body).unwrap()
+}
+
+fn weight() -> f64 {
+    CUBE.mass() * GRAVITY
+}
+
+#[test]
+fn a_body_falls_on_a_floor_and_rests_there() {
+    let mut app = app();
+    let floor = app.world_mut().spawn((Obstacle::Floor, Transform::from_xyz(0.0, 0.3, 0.0))).id();
+    let body = spawn(&mut app, Transform::from_xyz(0.0, 0.5, 0.0), ());
+    seconds(&mut app, 6.0);
+    let force = contacts(&app, body).force();
+    assert!((force - weight() * DVec3::Y).length() < 1e-3 * weight(), "{force} N for {} N", weight());
+    let height = center(&app, body).y;
+    assert!((height - 0.3 - 0.5 * EDGE).abs() < 0.02 * EDGE, "the center is at {height}");
+    assert!(contacts(&app, body).0.iter().all(|c| c.obstacle == floor && c.penetration < 2e-3 * EDGE));
+    assert!(state(&app, body).is_resting());
+    let told = app.world().resource::<Told>();
+    let first = told.started[0];
+    assert!((first.entity, first.obstacle, first.normal) == (body, floor, DVec3::Y));
+    // It fell by 0.1 m, and no more than doubles its momentum in the first step of the contact.
+    let momentum = CUBE.mass() * (2.0 * GRAVITY * 0.1).sqrt();
+    assert!(first.impulse.y > 0.0 && first.impulse.y < 2.1 * momentum, "{}", first.impulse);
+    assert_eq!(told.started.len(), told.ended.len() + 1);
+}
+
+#[test]
+fn a_resting_body_falls_when_its_floor_goes() {
+    let mut app = app();
+    let floor = app.world_mut().spawn(Obstacle::Floor).id();
+    let body = spawn(&mut app, Transform::from_xyz(0.0, 0.101, 0.0), ());
+    seconds(&mut app, 4.0);
+    assert!(state(&app, body).is_resting());
+    app.world_mut().despawn(floor);
+    seconds(&mut app, 0.5);
+    let fallen = center(&app, body).y;
+    assert!((fallen - 0.1 + 0.5 * GRAVITY * 0.25).abs() < 0.1, "{fallen}");
+    assert!(app.world().resource::<Told>().ended.iter().any(|ended| ended.obstacle == floor));
+    assert!(contacts(&app, body).0.is_empty());
+}
+
+#[test]
+fn a_body_of_twice_the_scale_has_twice_the_forces() {
+    let mut app = app();
+    app.world_mut().spawn(Obstacle::Box { half: Vec3::new(2.0, 0.5, 2.0) });
+    let at = Transform::from_xyz(0.0, 0.5 + 0.201, 0.0).with_scale(Vec3::splat(2.0));
+    let body = spawn(&mut app, at, ());
+    seconds(&mut app, 4.0);
+    // The mass stays, and so does its weight in the world.
+    let force = contacts(&app, body).force().y;
+    assert!((force / weight() - 1.0).abs() < 1e-3, "{force} N for {} N", weight());
+    assert!((center(&app, body).y - 0.5 - EDGE).abs() < 0.02 * EDGE);
+}
+
+#[test]
+fn what_shares_no_layer_does_not_touch() {
+    let mut app = app();
+    let other = ContactLayers { memberships: 2, filters: 2 };
+    app.world_mut().spawn((Obstacle::Floor, other));
+    let through = spawn(&mut app, Transform::from_xyz(0.0, 0.3, 0.0), ContactLayers { memberships: 1, ..other });
+    let on = spawn(&mut app, Transform::from_xyz(1.0, 0.3, 0.0), other);
+    seconds(&mut app, 1.0);
+    assert!(center(&app, through).y < -1.0 && center(&app, on).y > 0.09);
+}
+
+#[test]
+fn a_moving_box_carries_what_lies_on_it() {
+    let mut app = app();
+    app.world_mut().spawn((Obstacle::Box { half: Vec3::new(5.0, 0.1, 5.0) }, Name::new("belt")));
+    app.add_systems(FixedFirst, |time: Res<Time>, mut boxes: Query<&mut Transform, With<Obstacle>>| {
+        boxes.iter_mut().for_each(|mut at| at.translation.x = 0.4 * time.elapsed_secs().min(2.0));
+    });
+    let body = spawn(&mut app, Transform::from_xyz(0.0, 0.2, 0.0), BodyFriction(0.8));
+    seconds(&mut app, 1.9);
+    let speed = state(&app, body).body().frame().velocity()[0];
+    assert!((speed - 0.4).abs() < 0.01, "{speed} m/s on a belt of 0.4 m/s");
+    // The belt has stopped, and so has the body.
+    seconds(&mut app, 4.0);
+    assert!(state(&app, body).is_resting());
+}
+
+#[test]
+fn friction_decides_whether_a_body_stays_on_a_slope() {
+    let mut app = app();
+    let slope = Quat::from_rotation_z(-0.3);
+    app.world_mut().spawn((Obstacle::Floor, Transform::from_rotation(slope)));
+    let up = slope * Vec3::new(0.0, 0.1005, 0.0);
+    let at = |z: f32| Transform::from_translation(up + Vec3::Z * z).with_rotation(slope);
+    // tan 0.3 = 0.309.
+    let stays = spawn(&mut app, at(0.0), BodyFriction(0.35));
+    let slides = spawn(&mut app, at(1.0), BodyFriction(0.2));
+    seconds(&mut app, 1.0);
+    let gone = |body| (center(&app, body) - up.as_dvec3()).xy().length();
+    let (sine, cosine) = 0.3f64.sin_cos();
+    let way = 0.5 * GRAVITY * (sine - 0.2 * cosine);
+    assert!(gone(stays) < 0.01 * EDGE, "{}", gone(stays));
+    assert!((gone(slides) / way - 1.0).abs() < 0.05, "{} m for {way} m", gone(slides));
+}
+
+#[test]
+fn an_obstacle_without_a_number_is_refused_once_and_touches_nothing() {
+    let mut app = app();
+    app.world_mut().spawn(Obstacle::Ball { radius: f32::NAN });
+    app.world_mut().spawn((Obstacle::Floor, Transform::from_xyz(0.0, f32::NAN, 0.0)));
+    let body = spawn(&mut app, Transform::from_xyz(0.0, 0.3, 0.0), BodyFriction(-1.0));
+    seconds(&mut app, 0.5);
+    assert!(center(&app, body).y < -0.5);
+    let told = &app.world().resource::<Told>().refused;
+    assert_eq!(told.iter().filter(|told| told.contains("radius")).count(), 1, "{told:?}");
+    assert_eq!(told.iter().filter(|told| told.contains("friction")).count(), 1, "{told:?}");
+}
+
+#[test]
+fn a_body_far_from_everything_has_no_contact_work() {
+    let mut app = app();
+    app.world_mut().spawn((Obstacle::Floor, Transform::from_xyz(0.0, -100.0, 0.0)));
+    let body = spawn(&mut app, Transform::from_xyz(0.0, 0.0, 0.0), ());
+    seconds(&mut app, 0.5);
+    assert!(state(&app, body).body().contacts().obstacles().is_empty());
+    // A ball that comes near is one.
+    app.world_mut().spawn((Obstacle::Ball { radius: 0.1 }, Transform::from_xyz(0.0, -1.5, 0.0)));
+    seconds(&mut app, 0.05);
+    assert_eq!(state(&app, body).body().contacts().obstacles().len(), 1);
+}
+
+#[test]
+fn a_hand_presses_a_body_on_a_table() {
+    let mut app = app();
+    app.world_mut().spawn(Obstacle::Floor);
+    let body = spawn(&mut app, Transform::from_xyz(0.0, 0.1005, 0.0), ());
+    seconds(&mut app, 3.0);
+    let positions = CUBE.surface().positions();
+    let top = (0..positions.len() as u32)
+        .max_by(|&a, &b| {
+            let at = |v: u32| positions[v as usize][1] - 0.5 * positions[v as usize][0].abs();
+            at(a).total_cmp(&at(b))
+        })
+        .unwrap();
+    let hand = app.world_mut().spawn((Grab::new(top, 0.12, DVec3::new(0.0, 0.15, 0.0)), GrabOf(body))).id();
+    seconds(&mut app, 3.0);
+    let reaction = app.world().get::<pliant_body::GrabForce>(hand).unwrap().force;
+    let floor = contacts(&app, body).force();
+    // What the hand and the weight press down the floor holds up.
+    let sum = floor - reaction - weight() * DVec3::Y;
+    assert!(reaction.y > weight() && sum.length() < 1e-3 * floor.length(), "{floor} {reaction} {sum}");
+}
