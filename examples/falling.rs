@@ -144,22 +144,19 @@ fn count_landing(landing: On<ContactStarted>, mut landings: ResMut<Landings>) {
 fn draw(mut gizmos: Gizmos, bodies: Query<&BodyContacts>) {
     for contact in bodies.iter().flat_map(|contacts| &contacts.0) {
         let at = contact.point.as_vec3();
-        let arrow = (0.02 * contact.force.as_vec3()).clamp_length_max(0.25);
+        let arrow = (0.01 * contact.force.as_vec3()).clamp_length_max(0.25);
         if arrow.length() > 0.01 {
             gizmos.arrow(at, at + arrow, Color::srgb(0.98, 0.86, 0.25)).with_tip_length(0.015);
         }
     }
 }
 
-fn write(
-    mut readout: ResMut<Readout>,
-    landings: Res<Landings>,
-    bodies: Query<(&BodyContacts, &BodyState)>,
-) {
+fn write(mut readout: ResMut<Readout>, landings: Res<Landings>, bodies: Query<(&BodyContacts, &BodyState)>) {
     let places: usize = bodies.iter().map(|(contacts, _)| contacts.0.len()).sum();
     let force: DVec3 = bodies.iter().map(|(contacts, _)| contacts.force()).sum();
     let weight: f64 = bodies.iter().map(|(_, state)| 9.81 * state.model().mass()).sum();
-    let deepest = bodies.iter().flat_map(|(contacts, _)| &contacts.0).map(|c| c.penetration).fold(0.0, f64::max);
+    let deepest =
+        bodies.iter().flat_map(|(contacts, _)| &contacts.0).map(|c| c.penetration).fold(0.0, f64::max);
     let resting = bodies.iter().filter(|(_, state)| state.is_resting()).count();
     readout.0 = format!(
         "contacts            {places:4}   deepest {:.2} mm\n\

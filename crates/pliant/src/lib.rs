@@ -181,6 +181,7 @@ pub struct Readme;
     feature = "haptics",
     feature = "rerun",
     feature = "panel",
+    feature = "contact",
     feature = "bake"
 ))]
 pub mod book {
@@ -190,6 +191,8 @@ pub mod book {
     pub struct FirstScene;
     #[doc = include_str!("../../../docs/baking.md")]
     pub struct Baking;
+    #[doc = include_str!("../../../docs/contact.md")]
+    pub struct Contact;
     #[doc = include_str!("../../../docs/multiuser.md")]
     pub struct Multiuser;
     #[doc = include_str!("../../../docs/devices.md")]

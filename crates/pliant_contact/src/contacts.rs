@@ -194,7 +194,8 @@ pub(crate) fn place_obstacles(
         }
         let wanted = friction.copied().unwrap_or_default().0;
         let current = state.body().contacts().friction();
-        if wanted.to_bits() != current.to_bits() && nearby.refused.map(f64::to_bits) != Some(wanted.to_bits()) {
+        if wanted.to_bits() != current.to_bits() && nearby.refused.map(f64::to_bits) != Some(wanted.to_bits())
+        {
             let set = state.body_mut().set_friction(wanted);
             nearby.refused = set.is_err().then_some(wanted);
             if let Err(error) = set {

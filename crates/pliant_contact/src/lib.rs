@@ -48,7 +48,7 @@ use bevy::{
 };
 use pliant_body::PliantSystems;
 
-pub use contacts::{BodyContacts, ContactEnded, ContactPoint, ContactStarted, BodyFriction};
+pub use contacts::{BodyContacts, BodyFriction, ContactEnded, ContactPoint, ContactStarted};
 pub use obstacle::{ContactLayers, Obstacle};
 
 /// Lets bodies touch the [`Obstacle`]s of the scene.

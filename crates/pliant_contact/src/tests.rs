@@ -7,7 +7,7 @@ use pliant_body::{BodyRefused, BodyState, Grab, GrabOf, ModalAsset, ModalBody, P
 use pliant_modal::ModalModel;
 
 use crate::{
-    BodyContacts, ContactEnded, ContactLayers, ContactPlugin, ContactStarted, BodyFriction, Obstacle,
+    BodyContacts, BodyFriction, ContactEnded, ContactLayers, ContactPlugin, ContactStarted, Obstacle,
 };
 
 const STEP: f64 = 1.0 / 60.0;
@@ -130,7 +130,8 @@ fn what_shares_no_layer_does_not_touch() {
     let mut app = app();
     let other = ContactLayers { memberships: 2, filters: 2 };
     app.world_mut().spawn((Obstacle::Floor, other));
-    let through = spawn(&mut app, Transform::from_xyz(0.0, 0.3, 0.0), ContactLayers { memberships: 1, ..other });
+    let through =
+        spawn(&mut app, Transform::from_xyz(0.0, 0.3, 0.0), ContactLayers { memberships: 1, ..other });
     let on = spawn(&mut app, Transform::from_xyz(1.0, 0.3, 0.0), other);
     seconds(&mut app, 1.0);
     assert!(center(&app, through).y < -1.0 && center(&app, on).y > 0.09);
