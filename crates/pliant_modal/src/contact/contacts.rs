@@ -205,6 +205,8 @@ pub(crate) struct Touching {
     /// Three rows per point, each of one entry per coordinate and six for the frame, such that the
     /// response of point `i` to forces at point `j` is `rows_i rows_j^T`.
     pub(crate) rows: Vec<f64>,
+    /// What the hands hold back of the responses, one row for each of their directions.
+    pub(crate) held: Vec<f64>,
     /// Sum of `rows^T` times the changes of the forces.
     sum: Vec<f64>,
     /// The direct solve, and its matrix while it is summed.

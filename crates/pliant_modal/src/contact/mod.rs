@@ -24,5 +24,5 @@ mod sites;
 pub use contacts::{Contact, ContactReport, Contacts};
 pub use obstacle::{Capsule, Cuboid, Moving, Obstacle, Plane, Sphere, SurfacePoint};
 
-pub(crate) use contacts::{Memory, Point};
+pub(crate) use contacts::{Memory, Point, Touching};
 pub(crate) use sites::{ContactSites, Site};

@@ -12,12 +12,15 @@ use nalgebra::{Matrix3, Vector3};
 use super::Kernel;
 use crate::{
     ModalModel, StepError,
-    contact::{Contact, ContactReport, ContactSites, Contacts, Obstacle, Point, Site, SurfacePoint},
+    contact::{
+        Contact, ContactReport, ContactSites, Contacts, Obstacle, Point, Site, SurfacePoint, Touching,
+    },
+    simd::dot,
     step::{Frame, Hand, Load, State, StepReport, Tangent, tangent},
 };
 
 /// Largest number of times that a step is computed again with new forces.
-const ROUNDS: usize = 3;
+const ROUNDS: usize = 6;
 
 /// Distance below which sites count as candidates, as a share of the body's size.
 const BAND: f64 = 2e-3;
@@ -312,6 +315,7 @@ impl Kernel {
             for row in contacts.touching.rows.chunks_exact_mut(width) {
                 row[width - 6..].iter_mut().for_each(|x| *x *= scale);
             }
+            self.hold_rows(state, hands, &mut contacts.touching, free);
             contacts.touching.solve(width, contacts.friction(), (1e-3 * residual).max(1e-13 * size));
             for point in &mut contacts.touching.points {
                 point.pushed = point.force;
@@ -476,9 +480,7 @@ impl Kernel {
         let modes = self.modes.count();
         let width = modes + 6;
         let turn: Matrix3<f64> = *state.frame.rotation().to_rotation_matrix().matrix();
-        let inertia = self.model.inertia();
-        let inverse = Matrix3::from_fn(|i, j| inertia[i][j]).try_inverse().unwrap_or_else(Matrix3::zeros);
-        let spin = turn * inverse.cholesky().map_or_else(Matrix3::zeros, |factor| factor.l());
+        let spin = self.spin_root(&turn);
         let by_force = theta.sqrt() * self.h / self.model.mass().sqrt();
         let by_torque = theta.sqrt() * self.h;
         let touching = &mut contacts.touching;
@@ -490,14 +492,7 @@ impl Kernel {
             for (axis, row) in rows.chunks_exact_mut(width).enumerate() {
                 let (modal, rigid) = row.split_at_mut(modes);
                 patch.spread(&along.row(axis).transpose(), self.warps(), modal);
-                match &self.elastic {
-                    Some(elastic) => elastic.half_response(modal),
-                    None => {
-                        for (x, response) in modal.iter_mut().zip(&self.modes.response[0]) {
-                            *x *= response.max(0.0).sqrt();
-                        }
-                    }
-                }
+                self.half_response(modal);
                 if free {
                     let direction = point.axes.row(axis).transpose();
                     let torque = spin.tr_mul(&point.arm.cross(&direction));
@@ -505,6 +500,69 @@ impl Kernel {
                         rigid[k] = by_force * direction[k];
                         rigid[3 + k] = by_torque * torque[k];
                     }
+                }
+            }
+        }
+    }
+
+    /// Takes from the rows of all points what the hands hold back, so that the responses are those of
+    /// the held body.
+    ///
+    /// A row `g` of a hand with the compliance `c` leaves of the response `S S^T` the part
+    /// `S (I - w w^T) S^T`, with `r = S^T g` and `w = r / sqrt(r.r + c)`. Its root is
+    /// `I - b w w^T` with `b = 1 / (1 + sqrt(1 - w.w))` (Potter's form of the Kalman filter).
+    fn hold_rows(&self, state: &State, hands: &[Hand], touching: &mut Touching, free: bool) {
+        let modes = self.modes.count();
+        let width = modes + 6;
+        let turn: Matrix3<f64> = *state.frame.rotation().to_rotation_matrix().matrix();
+        let spin = self.spin_root(&turn);
+        let held = &mut touching.held;
+        held.clear();
+        for (hand, solving) in hands.iter().zip(&self.solving) {
+            let soft = ((1.0 + solving.beyond) * solving.compliance).symmetric_eigen();
+            // A damper holds as if the body were as much stiffer.
+            let scale = (1.0 + solving.relaxation / self.h).sqrt();
+            for (axis, soft) in soft.eigenvectors.column_iter().zip(&soft.eigenvalues) {
+                let start = held.len();
+                held.resize(start + width, 0.0);
+                let (before, row) = held.split_at_mut(start);
+                let (modal, rigid) = row.split_at_mut(modes);
+                hand.patch.rows().spread(&solving.tangent.tr_mul(&axis), self.warps(), modal);
+                self.half_response(modal);
+                if free {
+                    let direction = turn * axis;
+                    let torque = spin.tr_mul(&(turn * solving.arm).cross(&direction));
+                    for k in 0..3 {
+                        rigid[k] = self.h / self.model.mass().sqrt() * direction[k];
+                        rigid[3 + k] = self.h * torque[k];
+                    }
+                }
+                row.iter_mut().for_each(|x| *x *= scale);
+                before.chunks_exact(width).for_each(|w| take(w, row));
+                let length = 1.0 / (dot(row, row) + soft.max(0.0)).sqrt();
+                let length = if length.is_finite() { length } else { 0.0 };
+                row.iter_mut().for_each(|x| *x *= length);
+            }
+        }
+        for w in touching.held.chunks_exact(width) {
+            touching.rows.chunks_exact_mut(width).for_each(|row| take(w, row));
+        }
+    }
+
+    /// A root of the inverse inertia of the frame, world axes.
+    fn spin_root(&self, turn: &Matrix3<f64>) -> Matrix3<f64> {
+        let inertia = self.model.inertia();
+        let inverse = Matrix3::from_fn(|i, j| inertia[i][j]).try_inverse().unwrap_or_else(Matrix3::zeros);
+        turn * inverse.cholesky().map_or_else(Matrix3::zeros, |factor| factor.l())
+    }
+
+    /// Replaces a row by its product with a root of the response of the coordinates.
+    fn half_response(&self, modal: &mut [f64]) {
+        match &self.elastic {
+            Some(elastic) => elastic.half_response(modal),
+            None => {
+                for (x, response) in modal.iter_mut().zip(&self.modes.response[0]) {
+                    *x *= response.max(0.0).sqrt();
                 }
             }
         }
@@ -626,6 +684,12 @@ impl Kernel {
         report.force = total.into();
         contacts.theta = if contacts.memory.is_empty() { 0.5 } else { contacts.theta };
     }
+}
+
+/// Computes `row -= b (row . w) w` with `b = 1 / (1 + sqrt(1 - w . w))`.
+fn take(w: &[f64], row: &mut [f64]) {
+    let share = dot(row, w) / (1.0 + (1.0 - dot(w, w)).max(0.0).sqrt());
+    row.iter_mut().zip(w).for_each(|(x, w)| *x -= share * w);
 }
 
 /// Weight of contact forces in the way of the frame for a ratio of its response to all compliance.
