@@ -19,8 +19,9 @@ use crate::{
     step::{Frame, Hand, Load, State, StepReport, Tangent, tangent},
 };
 
-/// Largest number of times that a step is computed again with new forces.
-const ROUNDS: usize = 6;
+/// Largest number of times that a step is computed again with new forces, without hands and with
+/// them.
+const ROUNDS: [usize; 2] = [3, 6];
 
 /// Distance below which sites count as candidates, as a share of the body's size.
 const BAND: f64 = 2e-3;
@@ -281,6 +282,7 @@ impl Kernel {
         recovers: bool,
     ) -> Result<StepReport, StepError> {
         let size = self.model.size();
+        let rounds = ROUNDS[usize::from(!hands.is_empty())];
         let mut round = 0;
         loop {
             self.collect_push(contacts, sites);
@@ -302,7 +304,7 @@ impl Kernel {
             let enough = if round == 1 { STILL } else { ENOUGH } * size;
             contacts.report.rounds = round;
             contacts.report.residual = residual;
-            if contacts.touching.points.is_empty() || (residual <= enough && !new) || round > ROUNDS {
+            if contacts.touching.points.is_empty() || (residual <= enough && !new) || round > rounds {
                 return Ok(report);
             }
             let free = self.model.is_free() && !load.frame_is_given;
