@@ -1,8 +1,9 @@
-//! Soft jacks fall on a floor, a ball, a slope and a turning bar, and stay where friction holds them.
+//! Soft jacks fall on a floor, a ball, a slope and a turning bar, and stay where friction holds
+//! them.
 //!
 //! What to learn here: an [`Obstacle`] is one component with a `Transform`, and bodies touch it. It
-//! may move. [`BodyContacts`] on a body tells where it touches and with what force, and observers of
-//! [`ContactStarted`] hear each landing.
+//! may move. [`BodyContacts`] on a body tells where it touches and with what force, and observers
+//! of [`ContactStarted`] hear each landing.
 //!
 //! ```sh
 //! cargo run --release --example falling

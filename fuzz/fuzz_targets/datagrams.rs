@@ -1,5 +1,5 @@
-//! Fuzzes datagrams of hosts, guests and peers. A datagram that was read must be writable and read back
-//! equal.
+//! Fuzzes datagrams of hosts, guests and peers. A datagram that was read must be writable and read
+//! back equal.
 #![no_main]
 
 use libfuzzer_sys::fuzz_target;

@@ -20,7 +20,8 @@ pub(crate) struct DropArgs {
     /// Gap under the lowest point of the body, m
     #[arg(long, value_name = "H", default_value_t = 0.1, allow_negative_numbers = true)]
     height: f64,
-    /// Tilt of the ground about the z axis, degrees. The body is laid on it as it stood on the level
+    /// Tilt of the ground about the z axis, degrees. The body is laid on it as it stood on the
+    /// level
     #[arg(long, value_name = "DEG", default_value_t = 0.0, allow_negative_numbers = true)]
     tilt: f64,
     /// Coefficient of friction

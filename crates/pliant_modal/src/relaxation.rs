@@ -58,8 +58,8 @@ impl Relaxation {
         1.0 - self.ratio * (-left * t / self.time).exp_m1() / left
     }
 
-    /// Weights of `z0`, `q0` and `q1` in the viscoelastic state after a step of `h` s, over which the
-    /// coordinate moves linearly from `q0` to `q1`. They add up to 1.
+    /// Weights of `z0`, `q0` and `q1` in the viscoelastic state after a step of `h` s, over which
+    /// the coordinate moves linearly from `q0` to `q1`. They add up to 1.
     ///
     /// ```text
     /// z1 = e^-x z0 + (g - e^-x) q0 + (1 - g) q1,   x = h / time, g = (1 - e^-x) / x

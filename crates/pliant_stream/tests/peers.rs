@@ -791,8 +791,8 @@ fn a_peers_hand_has_its_own_spring_and_damper() {
     assert!(largest > 0.05, "{largest} N");
 }
 
-/// The damper of a hand crosses: the other peer computes the same force, to the bit, and another one
-/// than for a hand without a damper.
+/// The damper of a hand crosses: the other peer computes the same force, to the bit, and another
+/// one than for a hand without a damper.
 #[test]
 fn a_hands_damper_is_felt_alike_by_the_other_peer() {
     let felt = |relaxation| {

@@ -112,8 +112,8 @@ pub(crate) struct Point {
     pub(crate) force: Vector3<f64>,
     pub(crate) status: Status,
     /// Derivative of the site's position by the six numbers of its patch, world axes: at the
-    /// beginning of the step, and its mean over the step, by which forces act on the modes. The mean
-    /// stays as the first computed step has it.
+    /// beginning of the step, and its mean over the step, by which forces act on the modes. The
+    /// mean stays as the first computed step has it.
     pub(crate) tangent: Tangent,
     pub(crate) mean: Option<Tangent>,
     /// Arm of the contact about the center of mass, m, world axes.
@@ -307,7 +307,8 @@ impl Touching {
         }
     }
 
-    /// One Gauss-Seidel sweep. Returns the largest movement of a site by the change of its force, m.
+    /// One Gauss-Seidel sweep. Returns the largest movement of a site by the change of its force,
+    /// m.
     fn sweep(&mut self, width: usize, friction: f64, back: bool) -> f64 {
         let (mut change, count) = (0.0f64, self.points.len());
         for i in 0..count {

@@ -12,8 +12,8 @@
 //! |f_t| <= mu f_n,  y_t at its anchor or sliding   Coulomb, in the tangent plane
 //! ```
 //!
-//! The tangential law holds positions, not velocities: a site that sticks has an *anchor*, so a body
-//! at rest on an incline does not creep. The laws of all contacts are solved together by block
+//! The tangential law holds positions, not velocities: a site that sticks has an *anchor*, so a
+//! body at rest on an incline does not creep. The laws of all contacts are solved together by block
 //! Gauss-Seidel in modal space, with the exact solution of each block.
 
 mod cone;

@@ -257,8 +257,8 @@ impl NetPeer {
         stats
     }
 
-    /// Creates the session when the bodies are loaded. The first peer begins at once, and the others
-    /// request a number.
+    /// Creates the session when the bodies are loaded. The first peer begins at once, and the
+    /// others request a number.
     fn begin(&mut self, world: &mut World) {
         let founds = self.config.join.is_none();
         let user = if founds { UserId(1) } else { UserId::HOST };

@@ -61,8 +61,8 @@ impl PeerSession {
     /// Creates a peer without connections.
     ///
     /// # Errors
-    /// Returns [`StreamError::Config`] for a setting out of range, and for a founding peer without a
-    /// number.
+    /// Returns [`StreamError::Config`] for a setting out of range, and for a founding peer without
+    /// a number.
     pub fn new(config: PeerConfig) -> Result<Self, StreamError> {
         let fail = |what, found: String, expected| Err(StreamError::Config { what, found, expected });
         if config.user == UserId::HOST && config.founds {
@@ -108,8 +108,8 @@ impl PeerSession {
     /// Adds a body. All peers add the same bodies under the same numbers before they start.
     ///
     /// # Errors
-    /// Returns [`StreamError::Config`] for a number in use, [`StreamError::Full`] beyond 1,024 bodies,
-    /// and [`StreamError::Model`] for a model or settings that cannot be stepped.
+    /// Returns [`StreamError::Config`] for a number in use, [`StreamError::Full`] beyond 1,024
+    /// bodies, and [`StreamError::Model`] for a model or settings that cannot be stepped.
     pub fn add_body(
         &mut self,
         id: BodyId,
@@ -472,7 +472,8 @@ impl PeerSession {
             }
             Ok(PeerMessage::Welcome { user, others }) => {
                 let user = UserId(user);
-                // Only a peer that this one has asked gives a number, and it has another one itself.
+                // Only a peer that this one has asked gives a number, and it has another one
+                // itself.
                 let from = other.hello.as_ref().filter(|_| other.greeted).map(|hello| hello.user);
                 let asked = self.config.user == UserId::HOST && from.is_some();
                 if !asked || from == Some(UserId::HOST) || from == Some(user) {

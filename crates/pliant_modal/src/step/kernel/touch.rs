@@ -3,7 +3,8 @@
 //! Contact forces act like loads that are constant over the step, so a step with contacts is a step
 //! with these loads. The step is computed under the contact forces of the step before, the laws of
 //! contact are solved on its linearized responses, and it is computed again under the new forces.
-//! Where the body bends or turns within the step, this is repeated. A body at rest computes one step.
+//! Where the body bends or turns within the step, this is repeated. A body at rest computes one
+//! step.
 
 use std::sync::Arc;
 
@@ -507,8 +508,8 @@ impl Kernel {
         }
     }
 
-    /// Takes from the rows of all points what the hands hold back, so that the responses are those of
-    /// the held body.
+    /// Takes from the rows of all points what the hands hold back, so that the responses are those
+    /// of the held body.
     ///
     /// A row `g` of a hand with the compliance `c` leaves of the response `S S^T` the part
     /// `S (I - w w^T) S^T`, with `r = S^T g` and `w = r / sqrt(r.r + c)`. Its root is
@@ -616,8 +617,8 @@ impl Kernel {
             // What the obstacles supply, and what pushes a body out that was set into one.
             gained -= force.dot(&point.carried) + point.pushed[0] * (point.floor - point.gap).max(0.0);
         }
-        // A step may take back a little of what the steps before have lost: a rolling ball loses and
-        // gains in turn, and would slow down if only the gains were taken.
+        // A step may take back a little of what the steps before have lost: a rolling ball loses
+        // and gains in turn, and would slow down if only the gains were taken.
         let allowed = contacts.lost.min(GIVEN_BACK * scale);
         contacts.lost = (contacts.lost - gained.min(allowed)).min(scale);
         let gained = gained - allowed;
