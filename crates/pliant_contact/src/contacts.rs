@@ -157,8 +157,7 @@ pub(crate) fn place_obstacles(
             .filter(|(_, motion, other)| {
                 local
                     && layers.touch(other.copied().unwrap_or_default())
-                    // A body without a number keeps what it has.
-                    && !(motion.obstacle(scale).at(&center).distance > reach)
+                    && motion.obstacle(scale).at(&center).distance <= reach
             })
             .map(|(entity, motion, _)| (*entity, *motion))
             .collect();
