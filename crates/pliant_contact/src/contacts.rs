@@ -129,8 +129,8 @@ type Bodies<'w, 's> = Query<
         &'static mut BodyState,
         &'static mut Nearby,
         &'static Driven,
-        Option<&'static ContactLayers>,
-        Option<&'static BodyFriction>,
+        Option<Ref<'static, ContactLayers>>,
+        Option<Ref<'static, BodyFriction>>,
     ),
 >;
 
@@ -138,16 +138,28 @@ type Bodies<'w, 's> = Query<
 pub(crate) fn place_obstacles(
     time: Res<Time>,
     mut refusals: MessageWriter<BodyRefused>,
-    obstacles: Query<(Entity, &Motion, Option<&ContactLayers>)>,
+    obstacles: Query<(Entity, &Motion, Option<Ref<ContactLayers>>)>,
+    mut last: Local<Vec<Entity>>,
     mut bodies: Bodies,
 ) {
     let step = time.delta_secs_f64();
     // In the order of entities, so that the order of archetypes makes no difference.
     let mut all: Vec<_> = obstacles.iter().filter(|(_, motion, _)| motion.sound).collect();
     all.sort_by_key(|(entity, ..)| *entity);
+    let changed = |layers: &Option<Ref<ContactLayers>>| layers.as_ref().is_some_and(Ref::is_changed);
+    let stirred = !last.iter().eq(all.iter().map(|(entity, ..)| entity))
+        || all.iter().any(|(_, motion, layers)| motion.changed || changed(layers));
+    if stirred {
+        last.clear();
+        last.extend(all.iter().map(|(entity, ..)| *entity));
+    }
     for (entity, mut state, mut nearby, driven, layers, friction) in &mut bodies {
+        let touched = changed(&layers) || friction.as_ref().is_some_and(Ref::is_changed);
+        if state.is_resting() && !stirred && !touched {
+            continue;
+        }
         let nearby = &mut *nearby;
-        let layers = layers.copied().unwrap_or_default();
+        let layers = layers.as_deref().copied().unwrap_or_default();
         let local = *driven == Driven::Local;
         let (body, scale) = (state.body(), state.scale());
         let center = Vector3::from(body.frame().to_world(Vector3::from(body.model().center_of_mass())));
@@ -156,8 +168,8 @@ pub(crate) fn place_obstacles(
             .iter()
             .filter(|(_, motion, other)| {
                 local
-                    && layers.touch(other.copied().unwrap_or_default())
-                    && motion.obstacle(scale).at(&center).distance <= reach
+                    && layers.touch(other.as_deref().copied().unwrap_or_default())
+                    && motion.distance(scale, &center) <= reach
             })
             .map(|(entity, motion, _)| (*entity, *motion))
             .collect();
@@ -191,7 +203,7 @@ pub(crate) fn place_obstacles(
                 refusals.write(BodyRefused { entity, error: BodyError::Obstacle(error) });
             }
         }
-        let wanted = friction.copied().unwrap_or_default().0;
+        let wanted = friction.as_deref().copied().unwrap_or_default().0;
         let current = state.body().contacts().friction();
         if wanted.to_bits() != current.to_bits() && nearby.refused.map(f64::to_bits) != Some(wanted.to_bits())
         {

@@ -6,6 +6,7 @@ use bevy::{
     math::{DQuat, DVec3},
     prelude::*,
 };
+use nalgebra::Vector3;
 use pliant_body::{BodyError, BodyRefused};
 use pliant_modal as modal;
 
@@ -15,8 +16,8 @@ use pliant_modal as modal;
 /// scales. A scale that is not finite takes the obstacle out of the scene until it is.
 ///
 /// An obstacle may move. Its velocity is its way since the last tick, so that it carries and pushes
-/// what it touches. Bodies do not push it back. A way faster than 100 m/s is a teleport without
-/// velocity.
+/// what it touches. Bodies do not push it back. A way faster than 100 m/s or 100 rad/s is a teleport
+/// without velocity.
 #[derive(Component, Reflect, Debug, Clone, Copy, PartialEq)]
 #[reflect(Component, Debug, Clone, PartialEq)]
 #[require(Transform)]
@@ -67,8 +68,9 @@ impl ContactLayers {
     }
 }
 
-/// Speed above which a way is a teleport, m/s.
+/// Speed above which a way is a teleport, m/s, and turning speed above which a turn is one, rad/s.
 const TELEPORT: f64 = 100.0;
+const TELEPORT_TURN: f64 = 100.0;
 
 /// Pose and motion of an obstacle at this tick, world axes.
 #[derive(Component, Debug, Clone, Copy, PartialEq)]
@@ -111,7 +113,7 @@ impl Motion {
     fn after(mut self, last: &Self, step: f64) -> Self {
         let velocity = (self.position - last.position) / step;
         let spin = spin(last.rotation, self.rotation, step);
-        if velocity.length() <= TELEPORT && velocity.is_finite() && spin.is_finite() {
+        if velocity.length() <= TELEPORT && spin.length() <= TELEPORT_TURN {
             (self.velocity, self.spin) = (velocity, spin);
         }
         self.changed = Self { changed: last.changed, sound: last.sound, ..self } != *last;
@@ -119,34 +121,77 @@ impl Motion {
         self
     }
 
-    /// The obstacle in the world of a body on an entity of uniform scale `scale`.
-    pub(crate) fn obstacle(&self, scale: f64) -> Arc<dyn modal::Obstacle> {
-        let position = (self.position / scale).into();
-        let rotation = self.rotation.into();
-        let (velocity, angular_velocity) = ((self.velocity / scale).into(), self.spin.into());
+    /// A shape of the solver at this pose and motion, in the world of a body on an entity of uniform
+    /// scale `scale`.
+    fn moving<O>(&self, shape: O, scale: f64) -> modal::Moving<O> {
+        modal::Moving {
+            shape,
+            position: (self.position / scale).into(),
+            rotation: self.rotation.into(),
+            velocity: (self.velocity / scale).into(),
+            angular_velocity: self.spin.into(),
+        }
+    }
+
+    /// Calls `visit` with the obstacle in the world of a body on an entity of uniform scale `scale`.
+    fn visit<V: Visit>(&self, scale: f64, visit: V) -> V::Output {
         let whole = self.scale.max_element() / scale;
+        let center = [0.0; 3];
         match self.shape {
-            Obstacle::Floor => {
-                let shape = modal::Plane::GROUND;
-                Arc::new(modal::Moving { shape, position, rotation, velocity, angular_velocity })
-            }
+            Obstacle::Floor => visit.visit(self.moving(modal::Plane::GROUND, scale)),
             Obstacle::Ball { radius } => {
-                let shape = modal::Sphere { center: [0.0; 3], radius: f64::from(radius) * whole };
-                Arc::new(modal::Moving { shape, position, rotation, velocity, angular_velocity })
+                let radius = f64::from(radius) * whole;
+                visit.visit(self.moving(modal::Sphere { center, radius }, scale))
             }
             Obstacle::Box { half } => {
                 let half = (half.as_dvec3() * self.scale / scale).into();
-                let shape =
-                    modal::Cuboid { center: [0.0; 3], rotation: [0.0, 0.0, 0.0, 1.0], half, round: 0.0 };
-                Arc::new(modal::Moving { shape, position, rotation, velocity, angular_velocity })
+                let shape = modal::Cuboid { center, rotation: [0.0, 0.0, 0.0, 1.0], half, round: 0.0 };
+                visit.visit(self.moving(shape, scale))
             }
             Obstacle::Capsule { radius, half_length } => {
                 let end = f64::from(half_length) * whole;
                 let ends = [[0.0, -end, 0.0], [0.0, end, 0.0]];
-                let shape = modal::Capsule { ends, radius: f64::from(radius) * whole };
-                Arc::new(modal::Moving { shape, position, rotation, velocity, angular_velocity })
+                visit.visit(self.moving(modal::Capsule { ends, radius: f64::from(radius) * whole }, scale))
             }
         }
+    }
+
+    /// The obstacle in the world of a body on an entity of uniform scale `scale`.
+    pub(crate) fn obstacle(&self, scale: f64) -> Arc<dyn modal::Obstacle> {
+        self.visit(scale, Share)
+    }
+
+    /// Distance of a point to the obstacle, m, in the same world.
+    pub(crate) fn distance(&self, scale: f64, point: &Vector3<f64>) -> f64 {
+        self.visit(scale, Distance(point))
+    }
+}
+
+/// What is done with an obstacle of any shape.
+trait Visit {
+    type Output;
+    fn visit(self, obstacle: impl modal::Obstacle + 'static) -> Self::Output;
+}
+
+/// Makes an obstacle that bodies can share.
+struct Share;
+
+impl Visit for Share {
+    type Output = Arc<dyn modal::Obstacle>;
+
+    fn visit(self, obstacle: impl modal::Obstacle + 'static) -> Self::Output {
+        Arc::new(obstacle)
+    }
+}
+
+/// Computes the distance of a point.
+struct Distance<'a>(&'a Vector3<f64>);
+
+impl Visit for Distance<'_> {
+    type Output = f64;
+
+    fn visit(self, obstacle: impl modal::Obstacle + 'static) -> f64 {
+        obstacle.at(self.0).distance
     }
 }
 

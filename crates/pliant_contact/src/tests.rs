@@ -218,3 +218,16 @@ fn a_hand_presses_a_body_on_a_table() {
     let sum = floor - reaction - weight() * DVec3::Y;
     assert!(reaction.y > weight() && sum.length() < 1e-3 * floor.length(), "{floor} {reaction} {sum}");
 }
+
+#[test]
+fn a_floor_that_is_turned_at_once_throws_nothing() {
+    let mut app = app();
+    let floor = app.world_mut().spawn(Obstacle::Floor).id();
+    let body = spawn(&mut app, Transform::from_xyz(0.5, 0.1005, 0.0), ());
+    seconds(&mut app, 3.0);
+    // By 115 degrees about the vertical in one tick: the plane stays where it is.
+    app.world_mut().get_mut::<Transform>(floor).unwrap().rotate_y(2.0);
+    app.update();
+    let speed = DVec3::from(state(&app, body).body().frame().velocity()).length();
+    assert!(speed < 1e-3, "{speed} m/s");
+}
