@@ -16,8 +16,8 @@ use pliant_modal as modal;
 /// scales. A scale that is not finite takes the obstacle out of the scene until it is.
 ///
 /// An obstacle may move. Its velocity is its way since the last tick, so that it carries and pushes
-/// what it touches. Bodies do not push it back. A way faster than 100 m/s or 100 rad/s is a teleport
-/// without velocity.
+/// what it touches. Bodies do not push it back. A way faster than 100 m/s or 100 rad/s is a
+/// teleport without velocity.
 #[derive(Component, Reflect, Debug, Clone, Copy, PartialEq)]
 #[reflect(Component, Debug, Clone, PartialEq)]
 #[require(Transform)]
@@ -121,8 +121,8 @@ impl Motion {
         self
     }
 
-    /// A shape of the solver at this pose and motion, in the world of a body on an entity of uniform
-    /// scale `scale`.
+    /// A shape of the solver at this pose and motion, in the world of a body on an entity of
+    /// uniform scale `scale`.
     fn moving<O>(&self, shape: O, scale: f64) -> modal::Moving<O> {
         modal::Moving {
             shape,
@@ -133,7 +133,8 @@ impl Motion {
         }
     }
 
-    /// Calls `visit` with the obstacle in the world of a body on an entity of uniform scale `scale`.
+    /// Calls `visit` with the obstacle in the world of a body on an entity of uniform scale
+    /// `scale`.
     fn visit<V: Visit>(&self, scale: f64, visit: V) -> V::Output {
         let whole = self.scale.max_element() / scale;
         let center = [0.0; 3];
