@@ -92,8 +92,8 @@ pub use plugin::{
 #[cfg(feature = "rumble")]
 pub use plugin::{GamepadVibration, Rumble, ToolRumble};
 pub use safety::{
-    Allowed, Gain, Passivity, PassivityConfig, Port, Safety, SafetyConfig, Slew, StaleConfig, Thermal,
-    ThermalConfig, VelocityCutConfig, Wanted, cap_damping, clamp_magnitude, stable_damping,
+    Allowed, Gain, Passivity, PassivityConfig, Port, Safety, SafetyConfig, SafetyError, Slew, StaleConfig,
+    Thermal, ThermalConfig, VelocityCutConfig, Wanted, cap_damping, clamp_magnitude, stable_damping,
 };
 #[cfg(feature = "vendor")]
 pub use vendor::{ForceDimension, ForceDimensionConfig, OpenHaptics, OpenHapticsConfig, VendorError};

@@ -15,7 +15,8 @@ use std::{
 
 use pliant_haptics::{
     Calibration, Cycle, DeviceInfo, Fault, Hand, HapticDevice, HapticLoop, LoopConfig, LoopEvent, LoopReport,
-    LoopState, SafetyConfig, Sample, Scheduler, VirtualConfig, VirtualDevice, VirtualScheduler, Wrench,
+    LoopState, PassivityConfig, SafetyConfig, SafetyError, Sample, Scheduler, StaleConfig, StartError,
+    ThermalConfig, VelocityCutConfig, VirtualConfig, VirtualDevice, VirtualScheduler, Wrench,
 };
 use rig::{
     Rig, machine,
@@ -286,23 +287,70 @@ fn a_driver_that_fails_each_tick() {
 
 #[test]
 fn a_real_device_is_not_run_without_its_safety() {
-    struct Real(VirtualDevice);
-    impl HapticDevice for Real {
-        fn info(&self) -> DeviceInfo {
-            DeviceInfo { simulated: false, ..self.0.info() }
-        }
-        fn exchange(&mut self, wrench: &Wrench, scheduler: &mut dyn Scheduler) -> Result<Sample, Fault> {
-            self.0.exchange(wrench, scheduler)
-        }
-        fn safe_stop(&mut self) {}
-    }
     let real = || Real(VirtualDevice::new(VirtualConfig::touch(), Hand::NONE).unwrap());
     let bare = LoopConfig { safety: Some(SafetyConfig::bare()), ..LoopConfig::default() };
-    assert!(matches!(Cycle::new(real(), bare), Err(pliant_haptics::StartError::Unsafe(_))));
+    let refused = Cycle::new(real(), bare).err();
+    assert!(
+        matches!(refused, Some(StartError::Unsafe { reason: SafetyError::Missing(_), .. })),
+        "{refused:?}"
+    );
     assert!(Cycle::new(real(), LoopConfig::default()).is_ok());
     for rate in [100.0, 1e5, f64::NAN] {
         let config = LoopConfig { rate, ..LoopConfig::default() };
-        assert!(matches!(Cycle::new(real(), config), Err(pliant_haptics::StartError::Rate(_))));
+        assert!(matches!(Cycle::new(real(), config), Err(StartError::Rate(_))));
+    }
+}
+
+/// A virtual Touch that claims to be real.
+struct Real(VirtualDevice);
+
+impl HapticDevice for Real {
+    fn info(&self) -> DeviceInfo {
+        DeviceInfo { simulated: false, ..self.0.info() }
+    }
+    fn exchange(&mut self, wrench: &Wrench, scheduler: &mut dyn Scheduler) -> Result<Sample, Fault> {
+        self.0.exchange(wrench, scheduler)
+    }
+    fn safe_stop(&mut self) {}
+}
+
+#[test]
+fn limits_that_limit_nothing_are_refused() {
+    let real = || Real(VirtualDevice::new(VirtualConfig::touch(), Hand::NONE).unwrap());
+    let full = SafetyConfig::for_device(&real().info(), 1000.0);
+    let changes: [(&str, fn(&mut SafetyConfig)); 16] = [
+        ("slew", |s| s.slew = Some(1e300)),
+        // A force that may hardly change cannot fall either.
+        ("slew", |s| s.slew = Some(1e-300)),
+        ("ramp", |s| s.ramp = Some(1e-300)),
+        ("fade", |s| s.fade = Some(1e-300)),
+        ("fade", |s| s.fade = Some(1.0)),
+        ("stale.limit", |s| s.stale = Some(StaleConfig { patience: 0.03, limit: 1e9 })),
+        ("stale.patience", |s| s.stale = Some(StaleConfig { patience: f64::NAN, limit: 0.05 })),
+        ("stale.patience", |s| s.stale = Some(StaleConfig { patience: 0.05, limit: 0.05 })),
+        ("velocity.limit", |s| s.velocity = Some(VelocityCutConfig { limit: 1e3, release: 0.5 })),
+        ("velocity.release", |s| s.velocity = Some(VelocityCutConfig { limit: 1.0, release: 2.0 })),
+        ("passivity.tank", |s| s.passivity = Some(PassivityConfig { tank: 1e3, ..Default::default() })),
+        ("passivity.repay", |s| s.passivity = Some(PassivityConfig { repay: 1e3, ..Default::default() })),
+        ("passivity.max_damping", |s| {
+            s.passivity = Some(PassivityConfig { max_damping: 1e3, ..Default::default() });
+        }),
+        ("max_damping", |s| s.max_damping = Some(1e300)),
+        ("thermal.peak_seconds", |s| {
+            s.thermal = Some(ThermalConfig { continuous: 0.5, peak_seconds: 1e9 });
+        }),
+        ("peak", |s| s.peak = Some(100.0)),
+    ];
+    for (what, change) in changes {
+        let mut safety = full;
+        change(&mut safety);
+        let config = LoopConfig { safety: Some(safety), ..LoopConfig::default() };
+        let Some(StartError::Unsafe { reason: SafetyError::OutOfBounds { what: named, .. }, .. }) =
+            Cycle::new(real(), config).err()
+        else {
+            panic!("{what}: {safety:?} is accepted");
+        };
+        assert_eq!(named, what);
     }
 }
 

@@ -6,7 +6,7 @@ use thiserror::Error;
 
 use crate::{
     Coupling, CouplingConfig, DeviceInfo, Fault, InfoError, LocalModel, ModalLocal, Port, Safety,
-    SafetyConfig, Sample, ToolMap, Wanted, Wrench,
+    SafetyConfig, SafetyError, Sample, ToolMap, Wanted, Wrench,
     control_loop::held_patches::{Change, HeldPatches, PatchForces, When},
     control_loop::tool::{Tool, masked},
     control_loop::validation::{Believed, SampleValidation},
@@ -71,11 +71,15 @@ pub enum StartError {
     /// The device reports invalid properties.
     #[error(transparent)]
     Device(#[from] InfoError),
-    /// A device that exerts real forces lacks a part of the safety pipeline.
-    #[error(
-        "{0} exerts real forces: every stage of the safety pipeline must be there and within the device's limits"
-    )]
-    Unsafe(String),
+    /// A device that exerts real forces lacks a part of the safety pipeline, or a limit of it is
+    /// out of bounds.
+    #[error("{device} exerts real forces, and its safety settings are not accepted: {reason}")]
+    Unsafe {
+        /// Name of the device.
+        device: String,
+        /// What is missing or out of bounds.
+        reason: SafetyError,
+    },
     /// The thread could not be created.
     #[error("the loop's thread could not be started: {0}")]
     Thread(String),
@@ -164,8 +168,8 @@ impl LoopCore {
     /// Creates the core for a device and a configuration.
     ///
     /// # Errors
-    /// Returns an error if a number is out of range, or if a device that is not simulated lacks a
-    /// stage of the safety pipeline.
+    /// Returns an error if a number is out of range, or if the safety settings of a device that is
+    /// not simulated do not pass [`SafetyConfig::check`].
     pub fn new(info: DeviceInfo, config: LoopConfig) -> Result<Self, StartError> {
         info.check()?;
         if !(500.0..=8000.0).contains(&config.rate) {
@@ -181,8 +185,10 @@ impl LoopCore {
             return Err(StartError::Tool);
         }
         let safety = config.safety.unwrap_or_else(|| SafetyConfig::for_device(&info, config.rate));
-        if !info.simulated && !safety.is_complete(&info) {
-            return Err(StartError::Unsafe(info.name));
+        if !info.simulated
+            && let Err(reason) = safety.check(&info, config.rate)
+        {
+            return Err(StartError::Unsafe { device: info.name, reason });
         }
         let coupling = {
             let round_trip = if config.modal { 0.0 } else { config.round_trip };

@@ -23,12 +23,6 @@ impl Default for VelocityCutConfig {
     }
 }
 
-impl VelocityCutConfig {
-    pub(crate) fn is_valid(&self) -> bool {
-        self.limit.is_finite() && self.release > 0.0 && self.release <= self.limit
-    }
-}
-
 /// Limits of the time without a local model update.
 ///
 /// The limits apply to a simulation that publishes every 25 ms or more often. Where it is known to
@@ -61,10 +55,6 @@ impl StaleConfig {
         let slower = interval / Self::EVERY;
         // `clamp` does not fit here: an interval that is NaN must leave the time unchanged.
         if slower > 1.0 { silent / slower.min(Self::MOST) } else { silent }
-    }
-
-    pub(crate) fn is_valid(&self) -> bool {
-        self.patience >= 0.0 && self.limit.is_finite() && self.limit > self.patience
     }
 
     /// Returns the largest gain allowed: 1 up to `patience`, 0 from `limit` on, and linear in

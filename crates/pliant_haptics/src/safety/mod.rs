@@ -20,6 +20,7 @@ mod passivity;
 mod shape;
 
 use nalgebra::Vector3;
+use thiserror::Error;
 
 pub use gain::{Gain, StaleConfig, VelocityCutConfig};
 pub use passivity::{Passivity, PassivityConfig, Port};
@@ -86,20 +87,78 @@ impl SafetyConfig {
         }
     }
 
-    /// Returns whether every stage is present, with limits that are finite, positive and not above
-    /// what the device can do.
-    pub fn is_complete(&self, device: &DeviceInfo) -> bool {
-        let within = |value: Option<f64>, most: f64| value.is_some_and(|v| v > 0.0 && v <= most);
-        self.passivity.is_some_and(|p| p.is_valid())
-            && self.max_damping.is_some_and(|b| b >= 0.0 && b <= device.max_damping)
-            && self.slew.is_some_and(|s| s > 0.0 && s.is_finite())
-            && within(self.peak, device.peak_force)
-            && self.thermal.is_some_and(|t| t.is_valid() && t.continuous <= device.continuous_force)
-            && within(self.ramp, 10.0)
-            && within(self.fade, 0.1)
-            && self.velocity.is_some_and(|v| v.is_valid())
-            && self.stale.is_some_and(|s| s.is_valid())
+    /// Checks that every stage is present and that its limits limit something on `device`, whose
+    /// loop runs at `rate` (Hz).
+    ///
+    /// | Limit | Bounds |
+    /// | --- | --- |
+    /// | `peak` | above 0, at most the device's peak force |
+    /// | `slew` | the whole of `peak` in 0.5 s at the slowest, the device's peak force in 2 ms at the fastest |
+    /// | `ramp`, `fade` | 0.05 to 10 s, 1 to 100 ms |
+    /// | `thermal` | a continuous force of at most the device's, a peak for at most 30 s |
+    /// | `velocity` | a cut-out of at most 5 m/s, a release above 0 and of at most the cut-out |
+    /// | `stale` | a limit of at most 0.25 s, a fade of at least 5 ms |
+    /// | `max_damping` | at most the device's and three times the [stable one](stable_damping) |
+    /// | `passivity` | a tank of at most 50 mJ, a repayment of at most 100 mW, the damping as above |
+    ///
+    /// A slew limit has a lower bound because a force that may hardly change cannot fall either.
+    ///
+    /// # Errors
+    /// Returns the first stage that is missing or the first limit that is out of bounds.
+    pub fn check(&self, device: &DeviceInfo, rate: f64) -> Result<(), SafetyError> {
+        fn stage<T>(what: &'static str, stage: Option<T>) -> Result<T, SafetyError> {
+            stage.ok_or(SafetyError::Missing(what))
+        }
+        let within = |what, got: f64, least: f64, most: f64| {
+            // A NaN is within no bounds.
+            if got >= least && got <= most {
+                Ok(())
+            } else {
+                Err(SafetyError::OutOfBounds { what, least, most, got })
+            }
+        };
+        let most_damping = device.max_damping.min(3.0 * stable_damping(device, rate, 0.0));
+        let passivity = stage("passivity", self.passivity)?;
+        within("passivity.tank", passivity.tank, 0.0, 0.05)?;
+        within("passivity.repay", passivity.repay, 0.0, 0.1)?;
+        within("passivity.max_damping", passivity.max_damping, 0.0, most_damping)?;
+        within("max_damping", stage("max_damping", self.max_damping)?, 0.0, most_damping)?;
+        let peak = stage("peak", self.peak)?;
+        within("peak", peak, f64::MIN_POSITIVE, device.peak_force)?;
+        within("slew", stage("slew", self.slew)?, peak / 0.5, device.peak_force / 0.002)?;
+        let thermal = stage("thermal", self.thermal)?;
+        within("thermal.continuous", thermal.continuous, f64::MIN_POSITIVE, device.continuous_force)?;
+        within("thermal.peak_seconds", thermal.peak_seconds, f64::MIN_POSITIVE, 30.0)?;
+        within("ramp", stage("ramp", self.ramp)?, 0.05, 10.0)?;
+        within("fade", stage("fade", self.fade)?, 0.001, 0.1)?;
+        let velocity = stage("velocity", self.velocity)?;
+        within("velocity.limit", velocity.limit, f64::MIN_POSITIVE, 5.0)?;
+        within("velocity.release", velocity.release, f64::MIN_POSITIVE, velocity.limit)?;
+        let stale = stage("stale", self.stale)?;
+        within("stale.limit", stale.limit, 0.005, 0.25)?;
+        within("stale.patience", stale.patience, 0.0, stale.limit - 0.005)
     }
+}
+
+/// Reason why a real device is not run with a [`SafetyConfig`].
+#[derive(Debug, Clone, Copy, PartialEq, Error)]
+#[non_exhaustive]
+pub enum SafetyError {
+    /// A stage is missing.
+    #[error("the stage `{0}` is missing")]
+    Missing(&'static str),
+    /// A limit is out of its bounds, which [`SafetyConfig::check`] lists.
+    #[error("`{what}` must be {least} to {most}, got {got}")]
+    OutOfBounds {
+        /// Name of the limit.
+        what: &'static str,
+        /// Lower bound, in the unit of the limit.
+        least: f64,
+        /// Upper bound, in the unit of the limit.
+        most: f64,
+        /// The value.
+        got: f64,
+    },
 }
 
 /// Maximum damping on a measured velocity that `device` renders stably at `rate` (Hz) with an extra

@@ -23,12 +23,6 @@ impl Default for PassivityConfig {
     }
 }
 
-impl PassivityConfig {
-    pub(crate) fn is_valid(&self) -> bool {
-        [self.tank, self.max_damping, self.repay].iter().all(|x| x.is_finite() && *x >= 0.0)
-    }
-}
-
 /// Energies at the port, J.
 #[derive(Debug, Clone, Copy, PartialEq, Default)]
 pub struct Port {

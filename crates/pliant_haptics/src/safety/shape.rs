@@ -50,13 +50,6 @@ impl Default for ThermalConfig {
     }
 }
 
-impl ThermalConfig {
-    pub(crate) fn is_valid(&self) -> bool {
-        let ok = |x: f64| x.is_finite() && x > 0.0;
-        ok(self.continuous) && ok(self.peak_seconds)
-    }
-}
-
 /// Heat in the motors. The motor current is proportional to the force, and the heating to its
 /// square.
 ///

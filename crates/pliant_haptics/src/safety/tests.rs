@@ -39,11 +39,23 @@ fn engaged(force: f64) -> Safety {
 #[test]
 fn complete_means_complete() {
     let full = SafetyConfig::for_device(&info(), 1000.0);
-    assert!(full.is_complete(&info()));
-    assert!(!SafetyConfig::bare().is_complete(&info()));
-    assert!(!SafetyConfig { slew: None, ..full }.is_complete(&info()));
-    assert!(!SafetyConfig { peak: Some(100.0), ..full }.is_complete(&info()), "above the device's peak");
-    assert!(!SafetyConfig { ramp: Some(f64::NAN), ..full }.is_complete(&info()));
+    for device in [VirtualConfig::touch(), VirtualConfig::default()].map(|c| c.info()) {
+        for rate in [500.0, 1000.0, 8000.0] {
+            assert_eq!(
+                SafetyConfig::for_device(&device, rate).check(&device, rate),
+                Ok(()),
+                "{}",
+                device.name
+            );
+        }
+    }
+    let check = |config: SafetyConfig| config.check(&info(), 1000.0);
+    assert_eq!(check(SafetyConfig::bare()), Err(SafetyError::Missing("passivity")));
+    assert_eq!(check(SafetyConfig { slew: None, ..full }), Err(SafetyError::Missing("slew")));
+    let above = SafetyError::OutOfBounds { what: "peak", least: f64::MIN_POSITIVE, most: 3.3, got: 100.0 };
+    assert_eq!(check(SafetyConfig { peak: Some(100.0), ..full }), Err(above), "above the device's peak");
+    let nan = check(SafetyConfig { ramp: Some(f64::NAN), ..full });
+    assert!(matches!(nan, Err(SafetyError::OutOfBounds { what: "ramp", .. })), "{nan:?}");
 }
 
 #[test]
