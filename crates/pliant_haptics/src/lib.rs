@@ -76,7 +76,7 @@ pub use device::positioned::{Positioned, PositionedHandle};
 pub use device::record::{RecordError, Recorder, Replay};
 pub use device::virtual_device::{VirtualConfig, VirtualDevice, VirtualHandle};
 pub use device::{
-    Calibration, DeviceInfo, Fault, HapticDevice, InfoError, Pacing, Period, Sample, Scheduler,
+    Calibration, DeviceInfo, Fault, HapticDevice, InfoError, Pacing, Period, Sample, Scheduler, StopHandle,
     VibrationOutput, Wrench,
 };
 #[cfg(feature = "render")]

@@ -7,7 +7,7 @@ mod rig;
 use std::{
     cell::Cell,
     sync::{
-        Arc,
+        Arc, Mutex,
         atomic::{AtomicBool, AtomicU32, Ordering},
     },
     time::Duration,
@@ -119,6 +119,75 @@ fn breakpoint_in_the_whole_process() {
         scene.largest_step
     );
     assert_eq!(scene.cycle.report().missed, 3000);
+}
+
+/// A hand that is where the test says, without motors.
+struct At(Arc<Mutex<Sample>>);
+
+impl HapticDevice for At {
+    fn info(&self) -> DeviceInfo {
+        VirtualConfig::touch().info()
+    }
+    fn exchange(&mut self, _: &Wrench, scheduler: &mut dyn Scheduler) -> Result<Sample, Fault> {
+        scheduler.wait();
+        let mut sample = self.0.lock().unwrap();
+        sample.sequence = sample.sequence.map(|n| n + 1);
+        Ok(*sample)
+    }
+    fn safe_stop(&mut self) {}
+}
+
+/// Runs a loop with a spring of 200 N/m whose hand is 5 mm away, and makes `change` after a second.
+/// Returns the force before the change, the largest force in the next 50 ms, the largest rise of
+/// the force in a period from then on, N, and the loop.
+fn after(change: impl FnOnce(&mut Sample, &mut VirtualScheduler)) -> ([f64; 3], Cycle<At>) {
+    let hand = Arc::new(Mutex::new(Sample { sequence: Some(0), ..Sample::at([0.005, 0.0, 0.0]) }));
+    let mut cycle = Cycle::new(At(hand.clone()), LoopConfig::default()).unwrap();
+    let mut rig = Rig::bare(VirtualConfig::default(), Hand::NONE);
+    let mut scheduler = VirtualScheduler::new(1000.0);
+    let mut change = Some(change);
+    let (mut before, mut peak, mut rise, mut last) = (0.0, 0.0f64, 0.0f64, 0.0);
+    for k in 0..3000 {
+        rig.spring(200.0, 0.0);
+        if k == 1000 {
+            before = last;
+            if let Some(change) = change.take() {
+                change(&mut hand.lock().unwrap(), &mut scheduler);
+            }
+        }
+        cycle.step(&mut scheduler, &rig.model, &mut ());
+        let force = cycle.core().last().wrench.force[0].abs();
+        if k >= 1000 {
+            rise = rise.max(force - last);
+            if k < 1050 {
+                peak = peak.max(force);
+            }
+        }
+        last = force;
+    }
+    ([before, peak, rise], cycle)
+}
+
+#[test]
+fn a_hitch_of_the_loop_is_no_kick() {
+    for late in [0.010f64, 0.015, 0.030, 0.1, 0.3, 1.0] {
+        // Meanwhile the hand moves on at 0.5 m/s, by 1 cm at most.
+        let ([before, peak, rise], cycle) = after(|hand, scheduler| {
+            hand.position[0] += (0.5 * late).min(0.01);
+            scheduler.stall(late);
+        });
+        let wanted = -cycle.core().last().wanted[0];
+        let force = -cycle.core().last().wrench.force[0];
+        println!(
+            "late by {late} s: {before:.3} N before, at most {peak:.3} N within 50 ms, rises by at most \
+             {rise:.4} N a period, {force:.3} N of {wanted:.3} in the end"
+        );
+        assert!((before - 1.0).abs() < 1e-6, "{before}");
+        assert!(peak <= before * 1.000_001, "late by {late} s: {peak} N after {before}");
+        // The ramp brings the peak force of 3.3 N in 0.3 s.
+        assert!(rise <= 3.3 / 0.3 * 1e-3 * 1.000_001, "late by {late} s: {rise} N at once");
+        assert!(force > 0.99 * wanted, "and it all comes back: {force} of {wanted} N");
+    }
 }
 
 #[test]

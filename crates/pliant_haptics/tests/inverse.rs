@@ -14,8 +14,8 @@ use std::{
 };
 
 use pliant_haptics::{
-    Cycle, Fault, HapticDevice, Inverse, InverseConfig, InverseError, LocalModel, LoopConfig, LoopEvent,
-    RealScheduler, Sample, Spelling, VirtualScheduler, Wrench,
+    Cycle, Fault, HapticDevice, HapticLoop, Inverse, InverseConfig, InverseError, LocalModel, LoopConfig,
+    LoopEvent, RealScheduler, SafetyConfig, Sample, Spelling, StaleConfig, VirtualScheduler, Wrench,
 };
 use serde_json::{Value, json};
 use tungstenite::{Message, WebSocket, accept};
@@ -38,6 +38,11 @@ struct Desk {
     sent: bool,
     quit: bool,
     hang_up: bool,
+    /// The force on the motors: the last one that was sent, and nothing after the end of the
+    /// connection.
+    motor: f64,
+    /// Commands without a force that came while an answer was held back.
+    zeros: usize,
 }
 
 struct Service {
@@ -70,6 +75,7 @@ impl Service {
                             let end = socket.get_ref();
                             end.set_read_timeout(Some(Duration::from_millis(20))).unwrap();
                             serve(socket, &shared, inventory, new);
+                            shared.lock().unwrap().motor = 0.0;
                         }
                     }
                     Err(_) => std::thread::sleep(Duration::from_millis(2)),
@@ -155,7 +161,10 @@ fn serve(mut socket: WebSocket<TcpStream>, shared: &Mutex<Desk>, inventory: bool
         };
         let mut desk = shared.lock().unwrap();
         match check(text.as_str(), new, first) {
-            Ok(force) => desk.forces.push(force),
+            Ok(force) => {
+                desk.motor = force.iter().map(|x| x * x).sum::<f64>().sqrt();
+                desk.forces.push(force);
+            }
             Err(why) => {
                 desk.refused.push(why);
                 let _ = socket.close(None);
@@ -174,6 +183,33 @@ fn serve(mut socket: WebSocket<TcpStream>, shared: &Mutex<Desk>, inventory: bool
             desk.held
         }) {
             std::thread::sleep(Duration::from_millis(1));
+            // A service reads its connections while it works for one of them.
+            let mut rest = [0; 1024];
+            let end = socket.get_mut();
+            end.set_nonblocking(true).unwrap();
+            let came = end.peek(&mut rest);
+            end.set_nonblocking(false).unwrap();
+            match came {
+                Ok(0) => shared.lock().unwrap().motor = 0.0,
+                Ok(n) => {
+                    let text = String::from_utf8_lossy(&rest[..n]).into_owned();
+                    // A frame whose mask is zero can be read as it is.
+                    if let Some(json) = text.find('{').map(|at| &text[at..])
+                        && let Some(Ok(message)) =
+                            serde_json::Deserializer::from_str(json).into_iter::<Value>().next()
+                        && check(&message.to_string(), new, false).is_ok_and(|f| f.iter().all(|x| *x == 0.0))
+                    {
+                        let mut desk = shared.lock().unwrap();
+                        desk.zeros += 1;
+                        desk.motor = 0.0;
+                        drop(desk);
+                        // What was peeked at is taken, so that the end of the connection shows.
+                        use std::io::Read;
+                        let _ = socket.get_mut().read(&mut rest);
+                    }
+                }
+                Err(_) => {}
+            }
         }
         let sent = socket.send(Message::text(answer));
         shared.lock().unwrap().sent = late;
@@ -389,4 +425,69 @@ fn a_late_answer_is_not_taken_for_the_next_one() {
     answer(&mut device);
     service.desk().position = [0.07, 0.0, 0.0];
     assert!((answer(&mut device).position[0] - 0.07).abs() < 1e-9);
+}
+
+#[test]
+fn a_service_that_does_not_answer_loses_its_force() {
+    use std::time::Instant;
+    let service = Service::start(true);
+    service.desk().position = [0.005, 0.0, 0.0];
+    let device = Inverse::open(second(service.config())).unwrap();
+    let stale = Some(StaleConfig { patience: 0.2, limit: 0.25 });
+    let safety = SafetyConfig { stale, ..SafetyConfig::for_device(&device.info(), 1000.0) };
+    let config = LoopConfig { safety: Some(safety), ..LoopConfig::default() };
+    let mut running = HapticLoop::start(device, config).unwrap();
+    let mut tick = 0;
+    let mut publish = |running: &mut HapticLoop| {
+        tick += 1;
+        running.publish(|model| {
+            (model.tick, model.period, model.count) = (tick, 0.01, 1);
+            model.contacts[0].stiffness = [[200.0, 0.0, 0.0], [0.0, 200.0, 0.0], [0.0, 0.0, 200.0]];
+        });
+        std::thread::sleep(Duration::from_millis(2));
+    };
+    let mut times = Vec::new();
+    while times.len() < 5 && times.last().is_none_or(|t| *t > 0.05) {
+        machine::until("1 N on the motors", || {
+            publish(&mut running);
+            let force = service.desk().motor;
+            if (force - 1.0).abs() < 1e-3 { Ok(()) } else { Err(force) }
+        });
+        service.desk().late = true;
+        machine::until("an answer is held back", || {
+            std::thread::sleep(Duration::from_micros(200));
+            if service.desk().held { Ok(()) } else { Err("no command has come") }
+        });
+        let begun = Instant::now();
+        while service.desk().motor > 0.0 && begun.elapsed().as_secs_f64() < 1.0 {
+            std::thread::sleep(Duration::from_micros(200));
+        }
+        times.push(begun.elapsed().as_secs_f64());
+        service.desk().late = false;
+        assert!(times.iter().all(|t| *t < 1.0), "the force is still on after {times:?} s");
+    }
+    println!("Inverse: force zero after {times:?} s, {} commands for it", service.desk().zeros);
+    assert!(times.iter().any(|t| *t <= 0.05), "{times:?} s");
+    // A device that hangs is dropped in time as well.
+    machine::until("1 N on the motors", || {
+        publish(&mut running);
+        let force = service.desk().motor;
+        if (force - 1.0).abs() < 1e-3 { Ok(()) } else { Err(force) }
+    });
+    service.desk().late = true;
+    machine::until("an answer is held back", || {
+        std::thread::sleep(Duration::from_micros(200));
+        if service.desk().held { Ok(()) } else { Err("no command has come") }
+    });
+    let begun = Instant::now();
+    drop(running);
+    let took = begun.elapsed().as_secs_f64();
+    println!("Inverse: dropped after {took:.3} s");
+    assert!(took <= 1.0, "{took} s");
+    machine::until("no force is left behind", || {
+        std::thread::sleep(Duration::from_millis(1));
+        let force = service.desk().motor;
+        if force == 0.0 { Ok(()) } else { Err(force) }
+    });
+    service.desk().late = false;
 }

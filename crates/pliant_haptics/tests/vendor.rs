@@ -6,73 +6,24 @@
 
 use std::{
     ffi::{CString, c_char, c_int, c_uint, c_ulong},
-    path::{Path, PathBuf},
-    process::Command,
+    path::Path,
 };
 
-use libloading::Library;
+use fakes::{ONE_HD, dhd, fake, force, hd, open_fake, place};
 use pliant_haptics::{
     Calibration, Cycle, Fault, ForceDimension, ForceDimensionConfig, HapticDevice, LocalModel, LoopClock,
     LoopConfig, LoopEvent, LoopState, OpenHaptics, OpenHapticsConfig, Period, RealScheduler, Scheduler,
     VendorError, Wrench,
 };
 
+#[path = "rig/fakes.rs"]
+#[macro_use]
+mod fakes;
 #[path = "rig/machine.rs"]
 mod machine;
 
-/// Builds `tests/fake/<source>.c`. Every test has its own library and so its own state.
-fn fake(source: &str, test: &str, options: &[&str]) -> PathBuf {
-    let from = Path::new(env!("CARGO_MANIFEST_DIR")).join("tests/fake").join(source).with_extension("c");
-    let to = Path::new(env!("CARGO_TARGET_TMPDIR")).join(format!("lib{source}_{test}.so"));
-    // The file is renamed into place, because another run of these tests may have the existing one
-    // open.
-    let built = to.with_extension(std::process::id().to_string());
-    let is_there = |compiler: &&str| Command::new(compiler).arg("--version").output().is_ok();
-    let compiler = ["cc", "gcc", "clang"].into_iter().find(is_there);
-    let compiler = compiler.expect("a C compiler (cc, gcc or clang), which the workspace needs to build");
-    let status = Command::new(compiler)
-        .args(["-shared", "-fPIC", "-O1", "-Wall", "-o"])
-        .args([&built, &from])
-        .args(options)
-        .status()
-        .unwrap();
-    assert!(status.success(), "{compiler} does not build {from:?}: are the C library's headers there?");
-    std::fs::rename(built, &to).unwrap();
-    to
-}
-
-/// Calls `symbol` of the same library instance that the device has loaded.
-macro_rules! call {
-    ($library:expr, $symbol:literal, fn($($type:ty),*) $(-> $ret:ty)?, $($arg:expr),*) => {{
-        // SAFETY: the signature is that of tests/fake.
-        unsafe {
-            let f = $library.get::<unsafe extern "C" fn($($type),*) $(-> $ret)?>($symbol).unwrap();
-            f($($arg),*)
-        }
-    }};
-}
-
-fn open_fake(path: &Path) -> Library {
-    // SAFETY: the test's own library has no initializers.
-    unsafe { Library::new(path).unwrap() }
-}
-
-fn place(library: &Library, p: [f64; 3], vx: f64) {
-    call!(library, "fake_place", fn(f64, f64, f64, f64), p[0], p[1], p[2], vx);
-}
-
-fn force(library: &Library) -> [f64; 3] {
-    let mut out = [0.0f64; 6];
-    call!(library, "fake_force", fn(*mut f64), out.as_mut_ptr());
-    [out[0], out[1], out[2]]
-}
-
 fn pacing() -> RealScheduler {
     RealScheduler::new(LoopClock::start(), 1000.0)
-}
-
-fn hd(path: &Path) -> OpenHapticsConfig {
-    OpenHapticsConfig { library: Some(path.to_path_buf()), ..OpenHapticsConfig::default() }
 }
 
 /// Virtual time of a device that does the timing: an exchange takes 10 us, and a wait ends on time.
@@ -99,10 +50,6 @@ impl Scheduler for Quick {
 fn until(what: &str, so: &mut dyn FnMut() -> bool) {
     assert!((0..100).any(|_| so()), "never: {what}");
 }
-
-/// These tests run one at a time, because the count of open devices is global to the process, like
-/// the scheduler of the real library.
-static ONE_HD: std::sync::Mutex<()> = std::sync::Mutex::new(());
 
 #[test]
 fn open_haptics_units_axes_and_sizes() {
@@ -226,10 +173,6 @@ fn open_haptics_refuses_other_libraries() {
     let unknown = OpenHapticsConfig { device: Some("Right Device".into()), ..hd(&path) };
     let unknown = OpenHaptics::open(unknown);
     assert!(matches!(unknown, Err(VendorError::Device { code: 0x300, .. })), "{unknown:?}");
-}
-
-fn dhd(path: &Path) -> ForceDimensionConfig {
-    ForceDimensionConfig { library: Some(path.to_path_buf()), ..ForceDimensionConfig::default() }
 }
 
 #[test]

@@ -13,8 +13,9 @@ use crate::{
     safety::{Slew, clamp_magnitude},
 };
 
-/// Length of a period above which the loop counts as stalled, s.
-const STALL: f64 = 0.02;
+/// Length of a period above which the loop counts as stalled, s. A hand at 0.5 m/s moves 5 mm in
+/// this time.
+const STALL: f64 = 0.01;
 /// Time after a stall during which the force stays faded, s.
 const AFTER_STALL: f64 = 0.05;
 
@@ -284,7 +285,13 @@ impl LoopCore {
     pub fn tick(&mut self, now: f64, dt: f64, sample: &Sample, model: &LocalModel) -> Wrench {
         let dt = positive(dt);
         let force = self.safety.force().norm();
-        let believed = self.validation.take(now, dt, sample, force);
+        let mut believed = self.validation.take(now, dt, sample, force);
+        if !sample.force_on {
+            // The hand feels nothing, so there is nothing to fade, and the force that comes back
+            // must begin at zero.
+            self.safety.engage();
+            believed.fault = believed.fault.or(Some(Fault::ForceOff));
+        }
         self.run(now, dt, believed, model)
     }
 

@@ -26,6 +26,11 @@ pub enum LoopState {
     Lost,
     /// The emergency stop is latched. There is no force.
     Stopped,
+    /// The force is switched off at the device. It comes back by the ramp.
+    ForceOff,
+    /// A call of the driver does not return. The supervisor has cut the force, if the device has a
+    /// [`StopHandle`](crate::StopHandle).
+    Hung,
     /// The driver has panicked, and the loop has ended. There is no force until the device is added
     /// again.
     Ended,
@@ -276,6 +281,11 @@ impl<D: HapticDevice> Cycle<D> {
             }
             Err(fault) => self.core.miss(now, dt, *fault, model),
         };
+        if answer == Err(Fault::NotCalibrated) && self.calibrated && self.report.state != LoopState::Lost {
+            // The device has lost its reference, for example because its power went off and on.
+            self.calibrated = false;
+            self.calibrate_at = now;
+        }
         if let Err(fault) = answer
             && self.report.state != LoopState::Lost
             && fault != Fault::NotCalibrated
@@ -299,10 +309,12 @@ impl<D: HapticDevice> Cycle<D> {
         if self.report.state != LoopState::Lost {
             self.report.state = if self.core.is_stopped() {
                 LoopState::Stopped
-            } else if self.calibrated {
-                LoopState::Running
-            } else {
+            } else if !self.calibrated {
                 LoopState::Calibrating
+            } else if self.core.last().fault == Some(Fault::ForceOff) {
+                LoopState::ForceOff
+            } else {
+                LoopState::Running
             };
         }
     }
@@ -413,6 +425,9 @@ impl<D: HapticDevice + ?Sized> HapticDevice for Box<D> {
     }
     fn safe_stop(&mut self) {
         (**self).safe_stop();
+    }
+    fn stop_handle(&self) -> Option<std::sync::Arc<dyn crate::StopHandle>> {
+        (**self).stop_handle()
     }
     fn reopen(&mut self) -> Result<(), Fault> {
         (**self).reopen()

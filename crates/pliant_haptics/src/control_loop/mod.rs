@@ -11,5 +11,6 @@ pub(crate) mod local_model;
 pub(crate) mod proxy;
 pub(crate) mod runner;
 pub(crate) mod scheduler;
+pub(crate) mod supervisor;
 pub(crate) mod tool;
 pub(crate) mod validation;

@@ -8,6 +8,7 @@ use std::{
         atomic::{AtomicBool, Ordering},
     },
     thread::JoinHandle,
+    time::{Duration, Instant},
 };
 
 use triple_buffer::TripleBuffer;
@@ -15,7 +16,10 @@ use triple_buffer::TripleBuffer;
 use crate::{
     Coupling, Cycle, DeviceInfo, Fault, HapticDevice, LocalModel, LoopClock, LoopConfig, LoopEvent,
     LoopReport, LoopState, ModalLocal, RealScheduler, Record, StartError, ToolMap, Wrench,
-    control_loop::cycle::Sink,
+    control_loop::{
+        cycle::Sink,
+        supervisor::{Done, Heartbeat, supervise},
+    },
 };
 
 /// Maximum number of events that wait to be read. Further events are dropped, but the fault
@@ -25,6 +29,10 @@ const EVENTS: usize = 256;
 const RECORDS: usize = 8192;
 /// Maximum number of commands that wait to be processed.
 const COMMANDS: usize = 64;
+/// Longest time that the end of a loop waits for its thread.
+const GOODBYE: Duration = Duration::from_millis(500);
+/// Time without a sign of life after which a loop without a supervisor is reported as hung, s.
+const HUNG: f64 = 0.1;
 
 enum LoopCommand {
     Tool(ToolMap),
@@ -38,8 +46,8 @@ enum LoopCommand {
 pub struct StopSwitch(Arc<AtomicBool>);
 
 impl StopSwitch {
-    /// Cuts the force from the loop's next period on. The stop is latched until
-    /// [`HapticLoop::reset_stop`].
+    /// Cuts the force from the loop's next period on, or within 15 ms by the supervisor if the
+    /// driver does not answer. The stop is latched until [`HapticLoop::reset_stop`].
     pub fn press(&self) {
         self.0.store(true, Ordering::Release);
     }
@@ -56,9 +64,13 @@ impl StopSwitch {
 /// [`report`](Self::report). Neither side ever waits for the other. The loop does not lock,
 /// allocate or drop shared memory: a body that it stepped goes back to the app to be dropped.
 ///
-/// The driver is responsible for what it does within `exchange`. A driver that panics ends only its
-/// own loop. From then on, the report contains [`LoopState::Ended`] and [`Fault::Panicked`] without
-/// a force, and the events are sent once.
+/// A driver that panics ends only its own loop. From then on, the report contains
+/// [`LoopState::Ended`] and [`Fault::Panicked`] without a force, and the events are sent once.
+///
+/// A driver that does not return from `exchange` loses its force: a supervisor on another thread
+/// cuts it by the device's [`StopHandle`](crate::StopHandle) 25 ms after the last sign of life. The
+/// report then contains [`LoopState::Hung`] and [`Fault::Hung`] until the driver returns, and the
+/// force comes back by the ramp. The end of such a loop leaves the thread behind after half a second.
 pub struct HapticLoop {
     model: triple_buffer::Input<LocalModel>,
     report: triple_buffer::Output<LoopReport>,
@@ -68,7 +80,12 @@ pub struct HapticLoop {
     trash: rtrb::Consumer<Box<ModalLocal>>,
     stop: StopSwitch,
     quit: Arc<AtomicBool>,
+    heartbeat: Arc<Heartbeat>,
+    /// Whether the present hang has been sent as an event.
+    hang_sent: bool,
     thread: Option<JoinHandle<()>>,
+    /// Time at which the thread was asked to quit.
+    asked: Option<Instant>,
     /// `dead` is set if the thread has ended by itself. `last_words` then holds the events about
     /// its end.
     dead: bool,
@@ -102,6 +119,20 @@ impl HapticLoop {
         let stop = StopSwitch(Arc::new(AtomicBool::new(false)));
         let quit = Arc::new(AtomicBool::new(false));
         let clock = LoopClock::start();
+        let heartbeat = Heartbeat::new(clock.now());
+        if let Some(handle) = cycle.device().stop_handle() {
+            let (heartbeat, stop, name) = (heartbeat.clone(), stop.clone(), info.name.clone());
+            std::thread::Builder::new()
+                .name("pliant supervisor".into())
+                .spawn(move || {
+                    // Above the loop's own priority, so that a driver that spins cannot starve it.
+                    // The loop warns if it is not allowed.
+                    let _ = raise_priority(SUPERVISOR_PRIORITY);
+                    supervise(&heartbeat, &*handle, &stop, clock, &name);
+                })
+                .map_err(|error| StartError::Thread(error.to_string()))?;
+        }
+        let done = Done(heartbeat.clone());
         let inner = Inner {
             cycle,
             model: model_out,
@@ -111,10 +142,15 @@ impl HapticLoop {
             queues: Queues { events: event_in, records: record_in, recording: false },
             stop: stop.clone(),
             quit: quit.clone(),
+            heartbeat: heartbeat.clone(),
         };
         let thread = std::thread::Builder::new()
             .name("pliant haptics".into())
-            .spawn(move || inner.run(clock, config.rate))
+            .spawn(move || {
+                // If the thread could not be created, this ends the supervisor as well.
+                let _done = done;
+                inner.run(clock, config.rate);
+            })
             .map_err(|error| StartError::Thread(error.to_string()))?;
         Ok(Self {
             model,
@@ -125,7 +161,10 @@ impl HapticLoop {
             trash,
             stop,
             quit,
+            heartbeat,
+            hang_sent: false,
             thread: Some(thread),
+            asked: None,
             dead: false,
             last_words: VecDeque::new(),
             clock,
@@ -167,7 +206,32 @@ impl HapticLoop {
     pub fn report(&mut self) -> &LoopReport {
         while self.trash.pop().is_ok() {}
         self.look_after();
-        if self.dead { self.report.output_buffer() } else { self.report.read() }
+        if !self.dead {
+            self.report.update();
+            self.look_at_hang();
+        }
+        self.report.output_buffer()
+    }
+
+    /// Detects that the driver does not return. The thread cannot write a report then, so this
+    /// method marks the last one. The next report of the thread replaces it.
+    fn look_at_hang(&mut self) {
+        let (silent, cut) = self.heartbeat.silence(self.clock.now());
+        let hangs = self.heartbeat.is_armed() && (cut || silent > HUNG);
+        if !hangs {
+            self.hang_sent = false;
+            return;
+        }
+        let fault = Fault::Hung(silent);
+        if !self.hang_sent && self.last_words.len() < EVENTS {
+            self.last_words.push_back(LoopEvent::Fault(fault));
+        }
+        self.hang_sent = true;
+        let report = self.report.output_buffer_mut();
+        (report.state, report.rate, report.tick.fault) = (LoopState::Hung, 0.0, Some(fault));
+        if cut {
+            (report.tick.wrench, report.tick.gain) = (Wrench::ZERO, 0.0);
+        }
     }
 
     /// Detects that the thread has ended because the driver panicked. The thread can no longer
@@ -217,7 +281,8 @@ impl HapticLoop {
         self.commands.push(LoopCommand::Modal(modal)).is_ok()
     }
 
-    /// Cuts the force at the loop's next period. The stop is latched.
+    /// Cuts the force at the loop's next period, or by the supervisor if the driver does not answer.
+    /// The stop is latched.
     pub fn emergency_stop(&self) {
         self.stop.press();
     }
@@ -246,16 +311,46 @@ impl HapticLoop {
     }
 }
 
-impl Drop for HapticLoop {
-    fn drop(&mut self) {
+impl HapticLoop {
+    /// Asks the thread to end and does not wait. The drop then waits for what is left of its time.
+    pub fn ask_to_end(&mut self) {
         self.look_after();
+        self.asked.get_or_insert_with(Instant::now);
         self.quit.store(true, Ordering::Release);
-        if let Some(thread) = self.thread.take()
-            && thread.join().is_err()
-            && !self.dead
-        {
+    }
+
+    /// Ends the loop and its device, as a drop does. Returns `false` if the driver did not return
+    /// within half a second. Its thread is then left behind, with its force cut, and closes the
+    /// device as soon as the driver returns.
+    pub fn close(mut self) -> bool {
+        self.end()
+    }
+
+    fn end(&mut self) -> bool {
+        self.ask_to_end();
+        let Some(thread) = self.thread.take() else { return true };
+        let deadline = self.asked.unwrap_or_else(Instant::now) + GOODBYE;
+        while !thread.is_finished() {
+            if Instant::now() >= deadline {
+                tracing::error!(
+                    device = self.info.name,
+                    serial = self.info.serial,
+                    "the device's driver does not return: its thread is left behind"
+                );
+                return false;
+            }
+            std::thread::sleep(Duration::from_millis(1));
+        }
+        if thread.join().is_err() && !self.dead {
             tracing::error!(device = self.info.name, "the device's driver panicked at the end");
         }
+        true
+    }
+}
+
+impl Drop for HapticLoop {
+    fn drop(&mut self) {
+        self.end();
     }
 }
 
@@ -296,6 +391,7 @@ struct Inner<D> {
     queues: Queues,
     stop: StopSwitch,
     quit: Arc<AtomicBool>,
+    heartbeat: Arc<Heartbeat>,
 }
 
 impl<D: HapticDevice> Inner<D> {
@@ -309,7 +405,14 @@ impl<D: HapticDevice> Inner<D> {
     }
 
     fn go_round(&mut self, clock: LoopClock, rate: f64) {
-        self.cycle.set_realtime(raise_priority());
+        let realtime = raise_priority(LOOP_PRIORITY);
+        if let Err(error) = &realtime {
+            tracing::warn!(
+                "the haptic loop runs without real-time priority ({error}); under load its periods will be late. On Linux, allow it with \
+                 RLIMIT_RTPRIO (in limits.conf: `@audio - rtprio 60`) or CAP_SYS_NICE"
+            );
+        }
+        self.cycle.set_realtime(realtime.is_ok());
         let mut scheduler = RealScheduler::new(clock, rate);
         while !self.quit.load(Ordering::Acquire) {
             // A pressed switch takes precedence over a reset that is still in the queue.
@@ -325,6 +428,10 @@ impl<D: HapticDevice> Inner<D> {
                 && let Some(old) = self.cycle.take_trash()
             {
                 let _ = self.trash.push(old);
+            }
+            let armed = self.cycle.report().state != LoopState::Lost;
+            if self.heartbeat.beat(clock.now(), armed) {
+                tracing::warn!(device = self.cycle.core().info().name, "the driver answers again");
             }
             let report = *self.cycle.step(&mut scheduler, self.model.read(), &mut self.queues);
             self.report.write(report);
@@ -348,9 +455,17 @@ impl<D: HapticDevice> Inner<D> {
     }
 }
 
-/// Raises this thread to FIFO priority, above all ordinary threads. Returns `false`, with a warning
-/// that says what to do, if this is not allowed.
-fn raise_priority() -> bool {
+/// FIFO priority of a loop: the middle of the range, above the desktop and below the kernel's own
+/// threads.
+const LOOP_PRIORITY: u8 = 50;
+/// FIFO priority of a supervisor.
+const SUPERVISOR_PRIORITY: u8 = 60;
+
+/// Raises this thread to FIFO priority, above all ordinary threads.
+///
+/// # Errors
+/// Returns the system's reason if this is not allowed.
+fn raise_priority(priority: u8) -> Result<(), String> {
     #[cfg(unix)]
     let result = {
         use thread_priority::{
@@ -358,8 +473,7 @@ fn raise_priority() -> bool {
             set_thread_priority_and_policy, thread_native_id,
         };
         let policy = ThreadSchedulePolicy::Realtime(RealtimeThreadSchedulePolicy::Fifo);
-        // The middle of the range is above the desktop and below the kernel's own threads.
-        match thread_priority::ThreadPriorityValue::try_from(50u8) {
+        match thread_priority::ThreadPriorityValue::try_from(priority) {
             Ok(value) => set_thread_priority_and_policy(
                 thread_native_id(),
                 ThreadPriority::Crossplatform(value),
@@ -370,15 +484,9 @@ fn raise_priority() -> bool {
         }
     };
     #[cfg(not(unix))]
-    let result = thread_priority::ThreadPriority::Max.set_for_current().map_err(|error| format!("{error:?}"));
-    match result {
-        Ok(()) => true,
-        Err(error) => {
-            tracing::warn!(
-                "the haptic loop runs without real-time priority ({error}); under load its periods will be late. On Linux, allow it with \
-                 RLIMIT_RTPRIO (in limits.conf: `@audio - rtprio 60`) or CAP_SYS_NICE"
-            );
-            false
-        }
-    }
+    let result = {
+        let _ = priority;
+        thread_priority::ThreadPriority::Max.set_for_current().map_err(|error| format!("{error:?}"))
+    };
+    result
 }

@@ -7,10 +7,20 @@
 //! version of the service: `vector` (from 3.5 on) or `values` (before). The driver tries the name
 //! that the inventory suggests first, and the other one if the service refuses the first.
 //!
+//! The service has no call that stops a device. The loop's supervisor sends a last command without
+//! a force on the same connection, beside whatever the loop's thread waits for, and then closes the
+//! connection. What the service does with the force of a connection that is closed, or on which
+//! nothing comes any more, is its own matter and is not published.
+//!
 //! JSON and sockets allocate. Unlike the loop around it, `exchange` therefore allocates.
 
 use std::{
-    net::{TcpStream, ToSocketAddrs},
+    io::Write,
+    net::{Shutdown, TcpStream, ToSocketAddrs},
+    sync::{
+        Arc, Mutex, PoisonError,
+        atomic::{AtomicBool, Ordering},
+    },
     time::Duration,
 };
 
@@ -18,7 +28,9 @@ use serde_json::{Value, json};
 use thiserror::Error;
 use tungstenite::{Message, WebSocket, client::client_with_config, protocol::WebSocketConfig};
 
-use crate::{DeviceInfo, Fault, HapticDevice, Sample, Scheduler, Wrench};
+use crate::{
+    DeviceInfo, Fault, HapticDevice, Sample, Scheduler, StopHandle, Wrench, device::renewal::Renewal,
+};
 
 /// Address of the service and choice of the device.
 #[derive(Debug, Clone, PartialEq)]
@@ -109,6 +121,52 @@ pub struct Inverse {
     confirmed: bool,
     last: Sample,
     sequence: u64,
+    switch: Arc<ConnectionSwitch>,
+    renewal: Renewal,
+    /// Whether the last force was sent too late, so that the next one must be zero.
+    late: bool,
+}
+
+/// Ends the connection from another thread, with a command without a force as its last word.
+#[derive(Debug, Default)]
+struct ConnectionSwitch {
+    /// The connection's other end and the frame of that command.
+    open: Mutex<Option<(TcpStream, Vec<u8>)>>,
+    cut: AtomicBool,
+}
+
+impl StopHandle for ConnectionSwitch {
+    fn cut(&self) {
+        self.cut.store(true, Ordering::Release);
+        let open = self.open.lock().unwrap_or_else(PoisonError::into_inner).take();
+        if let Some((mut stream, zero)) = open {
+            // The loop's thread may be in the middle of a command. The service cannot read either
+            // then, and the end of the connection is all that is left.
+            let _ = stream.write_all(&zero);
+            let _ = stream.shutdown(Shutdown::Both);
+        }
+    }
+}
+
+/// Returns the WebSocket frame of a text message from a client (RFC 6455, section 5.2), with a mask
+/// of zeros, which leaves the text as it is.
+fn text_frame(text: &str) -> Vec<u8> {
+    let bytes = text.as_bytes();
+    let mut frame = vec![0x81];
+    match u16::try_from(bytes.len()) {
+        Ok(length @ 0..=125) => frame.push(0x80 | length as u8),
+        Ok(length) => {
+            frame.push(0x80 | 126);
+            frame.extend(length.to_be_bytes());
+        }
+        Err(_) => {
+            frame.push(0x80 | 127);
+            frame.extend((bytes.len() as u64).to_be_bytes());
+        }
+    }
+    frame.extend([0; 4]);
+    frame.extend(bytes);
+    frame
 }
 
 impl Inverse {
@@ -134,7 +192,41 @@ impl Inverse {
         let guess = if inventory.get("session_id").is_some() { Spelling::Vector } else { Spelling::Values };
         let spelling = config.spelling.unwrap_or(guess);
         let confirmed = config.spelling.is_some();
-        Ok(Self { config, socket: Some(socket), id, spelling, confirmed, last, sequence: 0 })
+        let mut device = Self {
+            config,
+            socket: None,
+            id,
+            spelling,
+            confirmed,
+            last,
+            sequence: 0,
+            switch: Arc::default(),
+            renewal: Renewal::default(),
+            late: false,
+        };
+        device.take(socket);
+        Ok(device)
+    }
+
+    /// Takes a new connection, which the supervisor may end.
+    fn take(&mut self, socket: WebSocket<TcpStream>) {
+        self.sequence = 0;
+        (self.renewal, self.late) = (Renewal::default(), false);
+        let zero = text_frame(&self.command([0.0; 3], false));
+        // Without a second handle of the socket, only the end of the loop closes the connection.
+        let open = socket.get_ref().try_clone().ok().map(|stream| (stream, zero));
+        self.switch.cut.store(false, Ordering::Release);
+        *self.switch.open.lock().unwrap_or_else(PoisonError::into_inner) = open;
+        self.socket = Some(socket);
+    }
+
+    /// Forgets a connection on which nothing more can be said.
+    fn abandon(&mut self) {
+        self.socket = None;
+        if let Some((stream, _)) = self.switch.open.lock().unwrap_or_else(PoisonError::into_inner).take() {
+            // A second handle would keep the connection open.
+            let _ = stream.shutdown(Shutdown::Both);
+        }
     }
 
     /// Returns the name of the force field that the service accepts.
@@ -168,7 +260,7 @@ impl Inverse {
         match answer {
             Ok(answer) => answer.ok_or(Fault::Malformed),
             Err(error) => {
-                self.socket = None;
+                self.abandon();
                 Err(fault(&error, self.config.timeout))
             }
         }
@@ -202,24 +294,30 @@ impl HapticDevice for Inverse {
 
     fn exchange(&mut self, wrench: &Wrench, scheduler: &mut dyn Scheduler) -> Result<Sample, Fault> {
         scheduler.wait();
-        let answer = match self.ask(wrench.force) {
+        // The service may have let go of a force that was not renewed in time. It comes back at zero.
+        let idle = self.late || self.renewal.has_lapsed();
+        let force = if idle { [0.0; 3] } else { wrench.force };
+        let answer = match self.ask(force) {
             // The first command was refused, so the service may know the field by its other name.
-            Err(Fault::Gone | Fault::Malformed) if !self.confirmed => {
+            Err(Fault::Gone | Fault::Malformed)
+                if !self.confirmed && !self.switch.cut.load(Ordering::Acquire) =>
+            {
                 self.spelling = self.spelling.other();
                 self.confirmed = true;
-                self.sequence = 0;
+                self.abandon();
                 let (socket, _) = connect(&self.config).map_err(|_| Fault::Gone)?;
-                self.socket = Some(socket);
-                self.ask(wrench.force)?
+                self.take(socket);
+                self.ask(force)?
             }
             other => other?,
         };
         self.confirmed = true;
         self.sequence += 1;
+        self.late = self.renewal.renew();
         let device = find(&answer, &self.id).ok_or(Fault::Gone)?;
         let sample = sample(device, &answer, &self.last).ok_or(Fault::Malformed)?;
         self.last = sample;
-        Ok(sample)
+        Ok(Sample { force_on: !(idle || self.late), ..sample })
     }
 
     fn safe_stop(&mut self) {
@@ -230,11 +328,16 @@ impl HapticDevice for Inverse {
         }
     }
 
+    fn stop_handle(&self) -> Option<Arc<dyn StopHandle>> {
+        Some(self.switch.clone())
+    }
+
     fn reopen(&mut self) -> Result<(), Fault> {
-        self.socket = None;
+        self.abandon();
         let (socket, inventory) = connect(&self.config).map_err(|_| Fault::Gone)?;
         let (id, last) = pick(&self.config, &inventory).map_err(|_| Fault::Gone)?;
-        (self.socket, self.id, self.last, self.sequence) = (Some(socket), id, last, 0);
+        (self.id, self.last) = (id, last);
+        self.take(socket);
         Ok(())
     }
 }
@@ -246,6 +349,7 @@ impl Drop for Inverse {
             let _ = socket.close(None);
             let _ = socket.flush();
         }
+        self.abandon();
     }
 }
 
@@ -355,6 +459,7 @@ fn sample(device: &Value, answer: &Value, last: &Sample) -> Option<Sample> {
         velocity,
         orientation,
         buttons: pressed.unwrap_or(last.buttons),
+        force_on: true,
         // The service has no counter that distinguishes a frozen device from a hand at rest.
         sequence: None,
     })

@@ -7,7 +7,11 @@ pub(crate) mod hand;
 pub(crate) mod inverse;
 pub(crate) mod positioned;
 pub(crate) mod record;
+#[cfg(any(feature = "inverse", feature = "vendor"))]
+pub(crate) mod renewal;
 pub(crate) mod virtual_device;
+
+use std::sync::Arc;
 
 use serde::{Deserialize, Serialize};
 use thiserror::Error;
@@ -41,6 +45,11 @@ pub struct Sample {
     pub velocity: Option<[f64; 3]>,
     /// Buttons that are down, one bit each. The lowest bit is the main button.
     pub buttons: u32,
+    /// Whether the motors exert the force that they are sent. It is `false` while the force is
+    /// switched off at the device: by its button, its safety switch, its own watchdog, or because
+    /// the driver has found that the force was not renewed in time. The position is valid then.
+    /// Default: `true`.
+    pub force_on: bool,
     /// Count of the device's own measurements, where the device has such a count. It distinguishes
     /// a frozen device from a hand at rest.
     pub sequence: Option<u64>,
@@ -54,6 +63,7 @@ impl Default for Sample {
             orientation: [0.0, 0.0, 0.0, 1.0],
             velocity: None,
             buttons: 0,
+            force_on: true,
             sequence: None,
         }
     }
@@ -224,7 +234,9 @@ pub enum Fault {
     /// The loop itself was not run for this long (a debugger, a suspended machine), s.
     #[error("the loop was not run for {0} s")]
     Stalled(f64),
-    /// Positions are not valid until the device is calibrated.
+    /// Positions are not valid until the device is calibrated. A device that returns this fault
+    /// from [`HapticDevice::exchange`] is asked for its [`calibration`](HapticDevice::calibration)
+    /// again.
     #[error("the device needs calibration")]
     NotCalibrated,
     /// Somebody pressed the emergency stop.
@@ -234,6 +246,16 @@ pub enum Fault {
     /// adds it again.
     #[error("the driver panicked; its loop is over")]
     Panicked,
+    /// The force is switched off at the device, see [`Sample::force_on`].
+    #[error("the force is switched off at the device")]
+    ForceOff,
+    /// The driver's own scheduler did not run what it was given, so nothing was sent or measured.
+    #[error("the driver's scheduler does not run")]
+    NotRun,
+    /// A call of the driver has not returned for this long, s. The device's [`StopHandle`] has cut
+    /// the force, if there is one.
+    #[error("the driver has not answered for {0} s")]
+    Hung(f64),
 }
 
 impl Fault {
@@ -255,11 +277,14 @@ impl Fault {
             Self::NotCalibrated => 11,
             Self::EmergencyStop => 12,
             Self::Panicked => 13,
+            Self::ForceOff => 14,
+            Self::NotRun => 15,
+            Self::Hung(_) => 16,
         }
     }
 
     /// Number of kinds of faults.
-    pub const KINDS: usize = 14;
+    pub const KINDS: usize = 17;
 }
 
 /// One period of the loop with its measured times.
@@ -288,7 +313,21 @@ pub trait Scheduler {
     fn note(&mut self) -> Period;
 }
 
-/// A haptic device. The device lives on the loop's thread, and only this thread calls it.
+/// Cuts the force of a device from another thread while a call of the device hangs.
+///
+/// The loop's supervisor calls it on a thread of its own when the device has not come back from
+/// [`HapticDevice::exchange`] for 25 ms, or for 10 ms after the emergency stop was pressed. After
+/// the cut the device may be called again: its next exchanges must send no force and report
+/// [`Sample::force_on`] as `false` until the motors are enabled again, so that the force returns by
+/// the ramp.
+pub trait StopHandle: Send + Sync {
+    /// Cuts the force by whatever way is left. The call may block, may come at any time and more
+    /// than once, and does nothing to a device that is closed.
+    fn cut(&self);
+}
+
+/// A haptic device. The device lives on the loop's thread, and only this thread calls it, except for
+/// its [`StopHandle`].
 pub trait HapticDevice: Send {
     /// Returns the properties of the device. The loop calls this method when it starts and again
     /// after a [`reopen`](Self::reopen).
@@ -317,6 +356,13 @@ pub trait HapticDevice: Send {
     /// emergency stop. It does nothing on a device that is gone. An implementation must call it
     /// when the device is dropped.
     fn safe_stop(&mut self);
+
+    /// Returns the way to cut the force while a call of this device hangs. The loop calls this
+    /// method once when it starts, so the handle must stay valid when the device is reopened. The
+    /// default is `None`, for a device without motors.
+    fn stop_handle(&self) -> Option<Arc<dyn StopHandle>> {
+        None
+    }
 
     /// Tries to reopen a lost device. The loop calls this method about once per second while the
     /// device is lost, and the call may block.

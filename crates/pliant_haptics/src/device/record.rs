@@ -185,6 +185,7 @@ fn parse(bytes: &[u8; RECORD]) -> Record {
             orientation: [n[5], n[6], n[7], n[8]],
             velocity: (!velocity[0].is_nan()).then_some(velocity),
             buttons: u32::from_le_bytes(buttons),
+            force_on: true,
             sequence: u64::from_le_bytes(sequence).checked_sub(1),
         },
         wrench: Wrench { force: [n[12], n[13], n[14]], torque: [n[15], n[16], n[17]] },

@@ -14,6 +14,8 @@
 //! | velocity cut-out | fades the force of a hand that is too fast |
 //! | stale fade | fades the force to zero by 50 ms after the last local model update |
 //! | emergency stop | latched, and the only stage that cuts the force instead of fading |
+//!
+//! While there is a fault, the force does not rise.
 
 mod gain;
 mod passivity;
@@ -93,7 +95,7 @@ impl SafetyConfig {
     /// | Limit | Bounds |
     /// | --- | --- |
     /// | `peak` | above 0, at most the device's peak force |
-    /// | `slew` | the whole of `peak` in 0.5 s at the slowest, the device's peak force in 2 ms at the fastest |
+    /// | `slew` | the whole of `peak` in 0.5 s, to the device's peak force in 2 ms |
     /// | `ramp`, `fade` | 0.05 to 10 s, 1 to 100 ms |
     /// | `thermal` | a continuous force of at most the device's, a peak for at most 30 s |
     /// | `velocity` | a cut-out of at most 5 m/s, a release above 0 and of at most the cut-out |
@@ -356,11 +358,16 @@ impl Safety {
         fault = fault.or(cut);
         // A multiplication by zero could leave a negative zero.
         let felt = |f: Vector3<f64>| if gain > 0.0 { f * gain } else { zero };
-        let force = felt(force);
+        let faded = felt(force);
+        // A fault never lets the force rise. After a stall, for example, the hand may be far from
+        // where the last force met it.
+        let most = if w.fault.or(fault).is_some() { self.last.norm() } else { f64::INFINITY };
+        let force = clamp_magnitude(&faded, most);
+        let kept = if faded == force { 1.0 } else { force.norm() / faded.norm() };
         if let Some(thermal) = &self.config.thermal {
             self.thermal.heat(thermal, self.config.peak.unwrap_or(thermal.continuous), force.norm(), w.dt);
         }
-        self.last_weight = felt(w.weight);
+        self.last_weight = felt(w.weight) * kept;
         self.last = force;
         Allowed { force, gain, fault, port: self.passivity.port() }
     }

@@ -5,16 +5,29 @@
 //! which has the same functions and additional robotic ones. The loop does the timing. The vendor's
 //! axes are x toward the user, y right, z up, in meters and newtons. Bevy's axes are (y, z, x).
 
+//!
+//! The device's firmware switches the force off by itself when no command has come for 20 ms
+//! (`dhdSetWatchdog`, from version 3.3.2 of the library on). The loop's supervisor switches it off
+//! by `dhdEnableForce` from its own thread. The library keeps its last error per thread and takes
+//! the device with every call; its documentation says no more about threads.
+
 use std::{
     ffi::{c_char, c_int, c_uchar, c_uint},
     path::PathBuf,
+    sync::{
+        Arc,
+        atomic::{AtomicBool, AtomicI32, Ordering},
+    },
 };
 
 use libloading::Library;
 use nalgebra::{Matrix3, Rotation3, UnitQuaternion};
 
 use super::{VendorError, functions, load, text};
-use crate::{Calibration, DeviceInfo, Fault, HapticDevice, Sample, Scheduler, Wrench};
+use crate::{
+    Calibration, DeviceInfo, Fault, HapticDevice, Sample, Scheduler, StopHandle, Wrench,
+    device::renewal::{LAPSE, Renewal},
+};
 
 functions! {
     /// DHD, as dhdc.h declares it.
@@ -49,8 +62,33 @@ functions! {
     }
 }
 
+functions! {
+    /// Functions of the expert part of DHD, which older versions lack.
+    struct Watchdog {
+        expert = "dhdEnableExpertMode": fn() -> c_int;
+        no_expert = "dhdDisableExpertMode": fn() -> c_int;
+        set = "dhdSetWatchdog": fn(c_uchar, c_char) -> c_int;
+    }
+}
+
+/// The firmware's time without a command after which it switches the force off, in its units of
+/// 125 us.
+const WATCHDOG: c_uchar = (LAPSE.as_micros() / 125) as c_uchar;
+const _: () = assert!(WATCHDOG as u128 * 125 == LAPSE.as_micros());
+
 /// Index in the status that says whether the device knows its position.
 const STATUS_RESET: usize = 3;
+/// Index in the status that says whether the force is switched on.
+const STATUS_FORCE: usize = 5;
+/// Index in the status that says why the force is switched off.
+const STATUS_FORCE_OFF_CAUSE: usize = 14;
+/// The firmware's watchdog switched the force off.
+const CAUSE_WATCHDOG: c_int = 3;
+/// The software switched the force off.
+const CAUSE_SOFTWARE: c_int = 4;
+/// Number of exchanges from one look at the status to the next. What the look costs on a real
+/// device is not known.
+const STATUS_EVERY: u32 = 8;
 /// Length of the status array. It is more than any version of the library writes.
 const STATUS_ROOM: usize = 64;
 
@@ -77,10 +115,49 @@ pub struct ForceDimension {
     api: ForceDimensionApi,
     robotic: Option<Robotic>,
     config: ForceDimensionConfig,
+    watchdog: Option<Watchdog>,
     id: Option<c_char>,
     info: DeviceInfo,
+    switch: Arc<ForceSwitch>,
+    renewal: Renewal,
+    /// Whether the force was off at the last look at the status.
+    off: bool,
+    exchanges: u32,
     /// This field comes last, so that the library is unloaded after everything that calls into it.
-    _library: Library,
+    _library: Arc<Library>,
+}
+
+/// Switches the force off from another thread.
+struct ForceSwitch {
+    enable: unsafe extern "system" fn(c_uchar, c_char) -> c_int,
+    /// Ends the robotic loop of DRD, which may be driving the device.
+    stop: Option<unsafe extern "system" fn(bool, c_char) -> c_int>,
+    /// The open device, or a negative number.
+    id: AtomicI32,
+    /// Whether DRD's loop drives the device.
+    driving: AtomicBool,
+    cut: AtomicBool,
+    /// The library stays loaded as long as this value can call it.
+    _library: Arc<Library>,
+}
+
+impl StopHandle for ForceSwitch {
+    fn cut(&self) {
+        self.cut.store(true, Ordering::Release);
+        let Ok(id) = c_char::try_from(self.id.load(Ordering::Acquire)) else { return };
+        if id < 0 {
+            return;
+        }
+        // SAFETY: all arguments are plain values, and the library is loaded.
+        unsafe {
+            if self.driving.load(Ordering::Acquire)
+                && let Some(stop) = self.stop
+            {
+                stop(false, id);
+            }
+            (self.enable)(0, id);
+        }
+    }
 }
 
 impl ForceDimension {
@@ -95,6 +172,8 @@ impl ForceDimension {
         let (library, path) = load(config.library.as_ref(), names)?;
         let api = ForceDimensionApi::from(&library, &path)?;
         let robotic = if config.auto_init { Some(Robotic::from(&library, &path)?) } else { None };
+        let watchdog = Watchdog::from(&library, &path).ok();
+        let library = Arc::new(library);
         let mut v = [0 as c_int; 4];
         // SAFETY: the header specifies four integers.
         unsafe {
@@ -105,8 +184,27 @@ impl ForceDimension {
             let found = format!("{}.{}.{}.{}", v[0], v[1], v[2], v[3]);
             return Err(VendorError::Version { library: path, found, needed: "3" });
         }
-        let mut device =
-            Self { api, robotic, config, id: None, info: describe("", 0, false), _library: library };
+        let switch = Arc::new(ForceSwitch {
+            enable: api.enable,
+            stop: robotic.map(|r| r.stop),
+            id: AtomicI32::new(-1),
+            driving: AtomicBool::new(false),
+            cut: AtomicBool::new(false),
+            _library: library.clone(),
+        });
+        let mut device = Self {
+            api,
+            robotic,
+            config,
+            watchdog,
+            id: None,
+            info: describe("", 0, false),
+            switch,
+            renewal: Renewal::default(),
+            off: false,
+            exchanges: 0,
+            _library: library,
+        };
         device.connect()?;
         Ok(device)
     }
@@ -141,14 +239,18 @@ impl ForceDimension {
             }
             let id = id as c_char;
             self.id = Some(id);
+            self.switch.id.store(id.into(), Ordering::Release);
+            (self.renewal, self.off, self.exchanges) = (Renewal::default(), false, 0);
             if let Some(robotic) = &self.robotic
                 && (robotic.supported)(id)
                 && !(robotic.initialized)(id)
             {
+                self.switch.driving.store(true, Ordering::Release);
                 let found = (robotic.auto_init)(id);
                 // The control loop of the library is stopped in any case. The forces stay enabled
                 // for Pliant's own loop.
                 let stopped = (robotic.stop)(true, id);
+                self.switch.driving.store(false, Ordering::Release);
                 if found < 0 || stopped < 0 {
                     let error = refused("drdAutoInit");
                     self.disconnect();
@@ -165,13 +267,36 @@ impl ForceDimension {
                 return Err(error);
             }
         }
+        self.arm_watchdog();
         Ok(())
     }
 
+    /// Asks the firmware to switch the force off when no command has come for [`LAPSE`].
+    fn arm_watchdog(&self) {
+        let Some(id) = self.id else { return };
+        let armed = self.watchdog.is_some_and(|watchdog| {
+            // SAFETY: all arguments are plain values.
+            unsafe {
+                (watchdog.expert)();
+                let set = (watchdog.set)(WATCHDOG, id);
+                (watchdog.no_expert)();
+                set >= 0
+            }
+        });
+        if !armed {
+            tracing::warn!(
+                device = self.info.name,
+                "the device or its library has no watchdog: if this program is killed or stopped, its force may stay on"
+            );
+        }
+    }
+
     fn disconnect(&mut self) {
+        self.switch.id.store(-1, Ordering::Release);
         if let Some(id) = self.id.take() {
             // SAFETY: this value owns the id and does not use it again.
             unsafe {
+                (self.api.enable)(0, id);
                 match &self.robotic {
                     Some(robotic) => (robotic.close)(id),
                     None => (self.api.close)(id),
@@ -240,17 +365,51 @@ fn describe(name: &str, serial: u16, active_wrist: bool) -> DeviceInfo {
     }
 }
 
+impl ForceDimension {
+    fn status(&self, id: c_char) -> Result<[c_int; STATUS_ROOM], Fault> {
+        let mut status = [0 as c_int; STATUS_ROOM];
+        // SAFETY: the array has room for more than any version writes.
+        self.check(unsafe { (self.api.status)(status.as_mut_ptr(), id) })?;
+        Ok(status)
+    }
+
+    /// Looks at whether the force is on, and switches it on if it was this program or the watchdog
+    /// that switched it off and `idle` says that no force is sent. What the user has switched off
+    /// at the device stays off.
+    fn look_at_force(&mut self, id: c_char, idle: bool) -> Result<(), Fault> {
+        let status = self.status(id)?;
+        if status[STATUS_RESET] == 0 {
+            return Err(Fault::NotCalibrated);
+        }
+        self.off = status[STATUS_FORCE] == 0;
+        let cause = status[STATUS_FORCE_OFF_CAUSE];
+        // Older versions of the library do not tell the cause.
+        let ours = matches!(cause, CAUSE_WATCHDOG | CAUSE_SOFTWARE)
+            || (cause == 0 && self.switch.cut.load(Ordering::Acquire));
+        if self.off && idle && ours {
+            // The force counts as off until the next look.
+            // SAFETY: all arguments are plain values.
+            self.check(unsafe { (self.api.enable)(1, id) })?;
+        }
+        if idle {
+            self.switch.cut.store(false, Ordering::Release);
+        }
+        Ok(())
+    }
+}
+
 impl HapticDevice for ForceDimension {
     fn info(&self) -> DeviceInfo {
         self.info.clone()
     }
 
+    fn stop_handle(&self) -> Option<Arc<dyn StopHandle>> {
+        Some(self.switch.clone())
+    }
+
     fn calibration(&mut self) -> Calibration {
         let Some(id) = self.id else { return Calibration::Needed("connect the device") };
-        let mut status = [0 as c_int; STATUS_ROOM];
-        // SAFETY: the array has room for more than any version writes.
-        let result = unsafe { (self.api.status)(status.as_mut_ptr(), id) };
-        if result >= 0 && status[STATUS_RESET] != 0 {
+        if self.status(id).is_ok_and(|status| status[STATUS_RESET] != 0) {
             Calibration::Ready
         } else {
             Calibration::Needed(
@@ -264,12 +423,27 @@ impl HapticDevice for ForceDimension {
             scheduler.wait();
             return Err(Fault::Gone);
         };
+        // A force that is switched on again must begin at zero, whoever switches it on.
+        let idle = self.off || self.renewal.has_lapsed() || self.switch.cut.load(Ordering::Acquire);
+        let wrench = if idle { &Wrench::ZERO } else { wrench };
         let [fx, fy, fz] = to_device(wrench.force);
         let [tx, ty, tz] = to_device(wrench.torque);
         // SAFETY: all arguments are plain values.
         let set = unsafe { (self.api.wrench)(fx, fy, fz, tx, ty, tz, id) };
+        // A call that itself took too long has lost its force as well.
+        let late = self.renewal.renew() || self.switch.cut.load(Ordering::Acquire);
         scheduler.wait();
-        self.check(set)?;
+        let sent = self.check(set);
+        if idle || late || sent.is_err() || self.exchanges.is_multiple_of(STATUS_EVERY) {
+            self.look_at_force(id, idle)?;
+        }
+        if !self.off {
+            // A force that is refused because it is switched off at the device is no error.
+            sent?;
+        }
+        self.exchanges = self.exchanges.wrapping_add(1);
+        let force_on = !(idle || late || self.off);
+        self.off |= late;
         let (mut p, mut v) = ([f64::NAN; 3], [0.0f64; 3]);
         let mut frame = [[0.0f64; 3]; 3];
         // SAFETY: the header specifies three doubles each and a row-major 3x3 matrix.
@@ -295,6 +469,7 @@ impl HapticDevice for ForceDimension {
             velocity: Some(from_device(v)),
             // SAFETY: the argument is a plain value.
             buttons: unsafe { (self.api.buttons)(id) },
+            force_on,
             sequence: None,
         })
     }

@@ -4,18 +4,35 @@
 //! The library's own servo thread does the timing of the loop: each exchange schedules one callback
 //! and waits for it. The device axes already are Bevy's (x right, y up, z toward the user). Lengths
 //! are in millimeters, forces in newtons.
+//!
+//! HDAPI takes work for its servo thread from any thread, so the supervisor schedules a callback
+//! that sends no force and switches the force output off. If the servo does not run it in 10 ms, the
+//! supervisor stops the scheduler. HDAPI has no call that sets the time of the hardware's own
+//! watchdog. The maker's example `ErrorHandling` says that the hardware "needs frequent updates to
+//! stay alive"; how long it waits is not published.
+//!
+//! Constants and layouts are those of `hdDefines.h` of OpenHaptics 3 (build 3.00.66): `HDErrorInfo`
+//! is `HDerror` (unsigned 32 bit) at 0, `int` at 4 and `HHD` (unsigned 32 bit) at 8; `HDboolean` is
+//! an unsigned char; `HDulong` is `unsigned long`, of 8 bytes on Linux and 4 on Windows.
 
 use std::{
-    ffi::{CString, c_char, c_int, c_uint, c_ulong, c_ushort, c_void},
+    ffi::{CString, c_char, c_int, c_uchar, c_uint, c_ulong, c_ushort, c_void},
     path::PathBuf,
-    sync::Mutex,
+    sync::{
+        Arc, Mutex, PoisonError,
+        atomic::{AtomicBool, AtomicU32, Ordering},
+    },
+    time::{Duration, Instant},
 };
 
 use libloading::Library;
 use nalgebra::{Matrix3, Rotation3, UnitQuaternion};
 
 use super::{VendorError, functions, load, text};
-use crate::{Calibration, DeviceInfo, Fault, HapticDevice, Pacing, Sample, Scheduler, Wrench};
+use crate::{
+    Calibration, DeviceInfo, Fault, HapticDevice, Pacing, Sample, Scheduler, StopHandle, Wrench,
+    device::renewal::Renewal,
+};
 
 /// Handle of a device.
 type Handle = c_uint;
@@ -31,8 +48,15 @@ struct ErrorInfo {
 }
 
 const _: () = assert!(size_of::<ErrorInfo>() == 12, "HDErrorInfo is three 32-bit words");
+const _: () = assert!(
+    std::mem::offset_of!(ErrorInfo, code) == 0
+        && std::mem::offset_of!(ErrorInfo, internal) == 4
+        && std::mem::offset_of!(ErrorInfo, device) == 8,
+    "errorCode, internalErrorCode, hHD"
+);
 
 // These values come from hdDefines.h.
+const CURRENT_SAFETY_SWITCH: c_uint = 0x2001;
 const CURRENT_BUTTONS: c_uint = 0x2000;
 const CURRENT_POSITION: c_uint = 0x2050;
 const CURRENT_VELOCITY: c_uint = 0x2051;
@@ -54,7 +78,12 @@ const CALIBRATION_AUTO: c_int = 1 << 1;
 const CALIBRATION_INKWELL: c_int = 1 << 2;
 const BAD_HANDLE: c_uint = 0x0104;
 const PRIORITY: c_ushort = u16::MAX / 2;
+const MAX_PRIORITY: c_ushort = u16::MAX;
 const CALLBACK_DONE: c_uint = 0;
+/// Most errors that are taken from the library's stack at once.
+const MOST_ERRORS: usize = 256;
+/// Time that the servo thread has to run the supervisor's callback.
+const SERVO_PATIENCE: Duration = Duration::from_millis(10);
 
 type Callback = unsafe extern "system" fn(*mut c_void) -> c_uint;
 
@@ -62,11 +91,14 @@ functions! {
     /// HDAPI, as hd.h, hdDevice.h and hdScheduler.h declare it.
     struct OpenHapticsApi {
         init = "hdInitDevice": fn(*const c_char) -> Handle;
-        disable = "hdDisableDevice": fn(Handle);
+        close = "hdDisableDevice": fn(Handle);
         make_current = "hdMakeCurrentDevice": fn(Handle);
         begin = "hdBeginFrame": fn(Handle);
         end = "hdEndFrame": fn(Handle);
         enable = "hdEnable": fn(c_uint);
+        disable = "hdDisable": fn(c_uint);
+        is_enabled = "hdIsEnabled": fn(c_uint) -> c_uchar;
+        get_boolean = "hdGetBooleanv": fn(c_uint, *mut c_uchar);
         get_double = "hdGetDoublev": fn(c_uint, *mut f64);
         set_double = "hdSetDoublev": fn(c_uint, *const f64);
         get_integer = "hdGetIntegerv": fn(c_uint, *mut c_int);
@@ -78,12 +110,40 @@ functions! {
         stop = "hdStopScheduler": fn();
         set_rate = "hdSetSchedulerRate": fn(c_ulong);
         run = "hdScheduleSynchronous": fn(Callback, *mut c_void, c_ushort);
+        post = "hdScheduleAsynchronous": fn(Callback, *mut c_void, c_ushort) -> c_ulong;
     }
 }
 
-/// Number of open devices in this process. One scheduler serves all of them. It starts with the
-/// first device and stops with the last.
-static OPEN: Mutex<usize> = Mutex::new(0);
+impl OpenHapticsApi {
+    /// Takes all errors from the library's stack, which returns the newest first, and returns the
+    /// oldest, which is the cause of the others. A bad handle goes before everything else.
+    ///
+    /// # Safety
+    /// The library is loaded.
+    unsafe fn drain(&self) -> ErrorInfo {
+        let mut cause = ErrorInfo::default();
+        for _ in 0..MOST_ERRORS {
+            // SAFETY: the function takes nothing and keeps nothing.
+            let error = unsafe { (self.get_error)() };
+            if error.code == 0 {
+                break;
+            }
+            if cause.code != BAD_HANDLE {
+                cause = error;
+            }
+        }
+        cause
+    }
+}
+
+/// The library's scheduler, of which a process has one.
+struct ServoScheduler {
+    /// Number of open devices. The scheduler starts with the first device and stops with the last.
+    open: usize,
+    running: bool,
+}
+
+static SCHEDULER: Mutex<ServoScheduler> = Mutex::new(ServoScheduler { open: 0, running: false });
 
 /// Choice of the device and of the library.
 #[derive(Debug, Clone, PartialEq)]
@@ -110,15 +170,103 @@ pub struct OpenHaptics {
     config: OpenHapticsConfig,
     handle: Option<Handle>,
     info: DeviceInfo,
-    /// This field comes last, so that the library is unloaded after everything that calls into it.
-    _library: Library,
+    switch: Arc<ForceSwitch>,
+    renewal: Renewal,
+    /// Whether the last force was sent too late, so that the next one must be zero.
+    late: bool,
+    /// The stylus' safety switch in the last frame: whether a hand holds it. `None` on devices
+    /// without such a switch.
+    held: Option<bool>,
+    /// Whether the switch has ever been seen closed. What an open one means before is not known.
+    was_held: bool,
+    /// Whether the scheduler did not run the last frame.
+    dead: bool,
+}
+
+/// Switches the force off from another thread.
+struct ForceSwitch {
+    api: OpenHapticsApi,
+    /// The open device, or [`INVALID`].
+    handle: AtomicU32,
+    cut: AtomicBool,
+    /// Whether the servo thread has run the last cut.
+    obeyed: AtomicBool,
+    /// The library stays loaded as long as this value can call it.
+    _library: Arc<Library>,
+}
+
+/// Sends no force and switches the force output off, on the servo thread.
+///
+/// # Safety
+/// `data` is one count of an `Arc<ForceSwitch>`, which this function takes over.
+unsafe extern "system" fn cut_force(data: *mut c_void) -> c_uint {
+    // SAFETY: the caller passes the count over.
+    let switch = unsafe { Arc::from_raw(data.cast_const().cast::<ForceSwitch>()) };
+    let device = switch.handle.load(Ordering::Acquire);
+    if device != INVALID {
+        let api = switch.api;
+        // SAFETY: as in `servo`.
+        unsafe {
+            (api.begin)(device);
+            (api.set_double)(CURRENT_FORCE, [0.0f64; 3].as_ptr());
+            (api.end)(device);
+            (api.disable)(FORCE_OUTPUT);
+            let _ = api.drain();
+        }
+    }
+    switch.obeyed.store(true, Ordering::Release);
+    CALLBACK_DONE
+}
+
+/// The handle that the loop's supervisor gets.
+struct HdStop(Arc<ForceSwitch>);
+
+impl StopHandle for HdStop {
+    fn cut(&self) {
+        let switch = &self.0;
+        switch.cut.store(true, Ordering::Release);
+        if switch.handle.load(Ordering::Acquire) == INVALID {
+            return;
+        }
+        switch.obeyed.store(false, Ordering::Release);
+        let data = Arc::into_raw(switch.clone()).cast_mut().cast();
+        // SAFETY: the callback takes over the count. A scheduler that never runs it leaves the few
+        // bytes of one count behind.
+        unsafe { (switch.api.post)(cut_force, data, MAX_PRIORITY) };
+        let posted = Instant::now();
+        while !switch.obeyed.load(Ordering::Acquire) {
+            if posted.elapsed() >= SERVO_PATIENCE {
+                // The servo is dead or stuck, and with it every device of this process. A thread
+                // that holds the lock hangs in a call of the library itself.
+                let was_running = SCHEDULER.try_lock().is_ok_and(|mut s| std::mem::take(&mut s.running));
+                if was_running {
+                    // SAFETY: the function takes nothing.
+                    unsafe { (switch.api.stop)() };
+                }
+                return;
+            }
+            std::thread::sleep(Duration::from_micros(500));
+        }
+    }
 }
 
 /// Input and output of a callback.
-struct ScheduledFrame {
-    api: OpenHapticsApi,
+struct ScheduledFrame<'a> {
+    switch: &'a ForceSwitch,
     device: Handle,
     force: [f64; 3],
+    /// Whether the force is to be zero, because it comes back or ends.
+    idle: bool,
+    /// Whether the force output is to be switched off after the frame.
+    leave: bool,
+    /// The safety switch in the frame before, and then in this one.
+    held: Option<bool>,
+    /// Whether an open safety switch means that the force is off.
+    was_held: bool,
+    /// Whether the callback has run at all.
+    ran: bool,
+    /// Whether the force was sent as it was given.
+    force_on: bool,
     position: [f64; 3],
     velocity: [f64; 3],
     /// Transform, column-major, millimeters.
@@ -130,22 +278,43 @@ struct ScheduledFrame {
 /// Runs one frame on the library's servo thread: writes the force and reads the state.
 ///
 /// # Safety
-/// `data` is a `Frame` that nothing else accesses until this function has returned.
+/// `data` is a `ScheduledFrame` that nothing else accesses until this function has returned.
 unsafe extern "system" fn servo(data: *mut c_void) -> c_uint {
     // SAFETY: `OpenHaptics::frame` passes its own frame and waits.
     let frame = unsafe { &mut *data.cast::<ScheduledFrame>() };
-    let api = frame.api;
+    let api = frame.switch.api;
+    frame.ran = true;
     // SAFETY: the calls and the lengths of their arrays are those of the header, and the calls lie
-    // between begin and end, as the header requires.
+    // between begin and end, as the header requires. The frame makes its device the current one.
     unsafe {
         (api.begin)(frame.device);
-        (api.set_double)(CURRENT_FORCE, frame.force.as_ptr());
+        let error = api.drain();
+        let mut held: c_uchar = 0;
+        (api.get_boolean)(CURRENT_SAFETY_SWITCH, &raw mut held);
+        // A device without the switch answers with an error, which is no fault.
+        let held = (api.drain().code == 0).then_some(held != 0);
+        let taken = held == Some(true) && frame.held == Some(false);
+        let released = held == Some(false) && frame.was_held;
+        frame.held = held;
+        let cut = frame.switch.cut.load(Ordering::Acquire);
+        let enabled = (api.is_enabled)(FORCE_OUTPUT) != 0;
+        frame.force_on = !(frame.idle || cut || !enabled || taken || released);
+        let force = if frame.force_on { frame.force } else { [0.0; 3] };
+        (api.set_double)(CURRENT_FORCE, force.as_ptr());
         (api.get_double)(CURRENT_POSITION, frame.position.as_mut_ptr());
         (api.get_double)(CURRENT_VELOCITY, frame.velocity.as_mut_ptr());
         (api.get_double)(CURRENT_TRANSFORM, frame.transform.as_mut_ptr());
         (api.get_integer)(CURRENT_BUTTONS, &raw mut frame.buttons);
         (api.end)(frame.device);
-        frame.error = (api.get_error)();
+        let later = api.drain();
+        frame.error = if error.code == 0 { later } else { error };
+        if frame.leave {
+            (api.disable)(FORCE_OUTPUT);
+        } else if (cut || !enabled) && frame.error.code == 0 {
+            // The supervisor or the library has switched the force off. It comes back at zero.
+            (api.enable)(FORCE_OUTPUT);
+            frame.switch.cut.store(false, Ordering::Release);
+        }
     }
     CALLBACK_DONE
 }
@@ -162,7 +331,25 @@ impl OpenHaptics {
             if cfg!(windows) { &["hd.dll"][..] } else { &["libHD.so", "libHD.so.3", "libHD.so.3.4"][..] };
         let (library, path) = load(config.library.as_ref(), names)?;
         let api = OpenHapticsApi::from(&library, &path)?;
-        let mut device = Self { api, handle: None, info: describe(&config), config, _library: library };
+        let switch = Arc::new(ForceSwitch {
+            api,
+            handle: AtomicU32::new(INVALID),
+            cut: AtomicBool::new(false),
+            obeyed: AtomicBool::new(false),
+            _library: Arc::new(library),
+        });
+        let mut device = Self {
+            api,
+            handle: None,
+            info: describe(&config),
+            config,
+            switch,
+            renewal: Renewal::default(),
+            late: false,
+            held: None,
+            was_held: false,
+            dead: false,
+        };
         device.connect()?;
         // SAFETY: the library returns a static string.
         let version = unsafe { text((api.get_string)(VERSION)) };
@@ -177,12 +364,12 @@ impl OpenHaptics {
             VendorError::Device { what: "the device's name", code: 0, text: "has a zero in it".into() }
         })?;
         let api = self.api;
-        let mut open = OPEN.lock().unwrap_or_else(|poisoned| poisoned.into_inner());
+        let mut scheduler = SCHEDULER.lock().unwrap_or_else(PoisonError::into_inner);
         // SAFETY: the name is a C string, or null for the default device. The rest follows the
         // order of the vendor's examples.
         unsafe {
             let handle = (api.init)(name.as_ref().map_or(std::ptr::null(), |n| n.as_ptr()));
-            let error = (api.get_error)();
+            let error = api.drain();
             if handle == INVALID || error.code != 0 {
                 return Err(VendorError::Device {
                     what: "hdInitDevice",
@@ -194,53 +381,85 @@ impl OpenHaptics {
             self.handle = Some(handle);
             self.info = read_info(&api, &self.config);
             (api.enable)(FORCE_OUTPUT);
-            if *open == 0 {
+            if !scheduler.running {
                 (api.set_rate)(self.config.rate.clamp(100.0, 8000.0) as c_ulong);
                 // A rate that the device does not support is an error that keeps the old rate.
-                let _ = (api.get_error)();
+                let _ = api.drain();
                 (api.start)();
             }
-            let error = (api.get_error)();
+            let error = api.drain();
             if error.code != 0 {
-                (api.disable)(handle);
+                (api.close)(handle);
                 self.handle = None;
                 let (what, code) = ("hdStartScheduler", error.code.into());
                 return Err(VendorError::Device { what, code, text: String::new() });
             }
+            self.switch.handle.store(handle, Ordering::Release);
         }
-        *open += 1;
+        (self.renewal, self.late, self.held, self.dead) = (Renewal::default(), false, None, false);
+        scheduler.running = true;
+        scheduler.open += 1;
         Ok(())
     }
 
     fn disconnect(&mut self) {
-        let Some(handle) = self.handle.take() else { return };
-        let mut open = OPEN.lock().unwrap_or_else(|poisoned| poisoned.into_inner());
-        *open = open.saturating_sub(1);
+        let Some(handle) = self.handle else { return };
+        let left = !self.dead && !matches!(self.frame([0.0; 3], true), Err(Fault::NotRun));
+        self.switch.handle.store(INVALID, Ordering::Release);
+        self.handle = None;
+        let mut scheduler = SCHEDULER.lock().unwrap_or_else(PoisonError::into_inner);
+        scheduler.open = scheduler.open.saturating_sub(1);
         // SAFETY: this value owns the handle and does not use it again.
         unsafe {
-            if *open == 0 {
+            if !left {
+                (self.api.make_current)(handle);
+                (self.api.disable)(FORCE_OUTPUT);
+            }
+            if scheduler.open == 0 && std::mem::take(&mut scheduler.running) {
                 (self.api.stop)();
             }
-            (self.api.disable)(handle);
-            let _ = (self.api.get_error)();
+            (self.api.close)(handle);
+            let _ = self.api.drain();
         }
     }
 
-    fn frame(&mut self, force: [f64; 3]) -> Result<Sample, Fault> {
+    /// Runs one frame on the servo thread. With `leave` the force output is switched off after it.
+    fn frame(&mut self, force: [f64; 3], leave: bool) -> Result<Sample, Fault> {
         let device = self.handle.ok_or(Fault::Gone)?;
         let mut frame = ScheduledFrame {
-            api: self.api,
+            switch: &self.switch,
             device,
             force,
+            idle: leave || self.late || self.renewal.has_lapsed(),
+            leave,
+            held: self.held,
+            was_held: self.was_held,
+            ran: false,
+            force_on: false,
             position: [f64::NAN; 3],
             velocity: [0.0; 3],
             transform: [0.0; 16],
             buttons: 0,
             error: ErrorInfo::default(),
         };
-        // SAFETY: the call returns after the callback, the frame lives that long, and nothing else
-        // accesses it.
+        // SAFETY: the call returns after the callback or without it, the frame lives that long, and
+        // nothing else accesses it.
         unsafe { (self.api.run)(servo, (&raw mut frame).cast(), PRIORITY) };
+        let (ran, was_dead) = (frame.ran, self.dead);
+        self.dead = !ran;
+        if !ran {
+            // The call has returned without having run the callback, and maybe without an error.
+            // SAFETY: the library is loaded.
+            let _ = unsafe { self.api.drain() };
+            if !was_dead {
+                // The motors still have the last force.
+                HdStop(self.switch.clone()).cut();
+            }
+            return Err(Fault::NotRun);
+        }
+        self.held = frame.held;
+        self.was_held |= frame.held == Some(true);
+        self.late = self.renewal.renew();
         match frame.error.code {
             0 => {}
             BAD_HANDLE => return Err(Fault::Gone),
@@ -256,6 +475,7 @@ impl OpenHaptics {
             orientation: [q.i, q.j, q.k, q.w],
             velocity: Some(frame.velocity.map(|x| 1e-3 * x)),
             buttons: frame.buttons as u32,
+            force_on: frame.force_on && !self.late,
             sequence: None,
         })
     }
@@ -296,7 +516,7 @@ unsafe fn read_info(api: &OpenHapticsApi, config: &OpenHapticsConfig) -> DeviceI
         // SAFETY: no parameter of HDAPI has more than 16 doubles.
         let error = unsafe {
             (api.get_double)(what, value.as_mut_ptr());
-            (api.get_error)()
+            api.drain()
         };
         let value = value[0] * scale;
         if error.code == 0 && value.is_finite() && value > 0.0 { value } else { or }
@@ -311,7 +531,7 @@ unsafe fn read_info(api: &OpenHapticsApi, config: &OpenHapticsConfig) -> DeviceI
     // SAFETY: the library writes six doubles, smallest corner first. It owns the strings.
     unsafe {
         (api.get_double)(USABLE_WORKSPACE_DIMENSIONS, box_mm.as_mut_ptr());
-        let error = (api.get_error)();
+        let error = api.drain();
         let [a, b, c, d, e, f, ..] = box_mm.map(|x| 1e-3 * x);
         if error.code == 0
             && [a, b, c].into_iter().zip([d, e, f]).all(|(l, h)| l.is_finite() && h.is_finite() && l < h)
@@ -323,7 +543,7 @@ unsafe fn read_info(api: &OpenHapticsApi, config: &OpenHapticsConfig) -> DeviceI
             info.name = name;
         }
         info.serial = text((api.get_string)(DEVICE_SERIAL_NUMBER));
-        let _ = (api.get_error)();
+        let _ = api.drain();
     }
     info
 }
@@ -331,6 +551,10 @@ unsafe fn read_info(api: &OpenHapticsApi, config: &OpenHapticsConfig) -> DeviceI
 impl HapticDevice for OpenHaptics {
     fn info(&self) -> DeviceInfo {
         self.info.clone()
+    }
+
+    fn stop_handle(&self) -> Option<Arc<dyn StopHandle>> {
+        Some(Arc::new(HdStop(self.switch.clone())))
     }
 
     fn pacing(&self) -> Pacing {
@@ -355,11 +579,11 @@ impl HapticDevice for OpenHaptics {
                         let style = if inkwell { CALIBRATION_INKWELL } else { CALIBRATION_AUTO };
                         (self.api.update_calibration)(style as c_uint);
                         if (self.api.check_calibration)() == CALIBRATION_OK {
-                            let _ = (self.api.get_error)();
+                            let _ = self.api.drain();
                             return Calibration::Ready;
                         }
                     }
-                    let _ = (self.api.get_error)();
+                    let _ = self.api.drain();
                     if inkwell {
                         Calibration::Needed("put the stylus into its inkwell")
                     } else {
@@ -371,14 +595,14 @@ impl HapticDevice for OpenHaptics {
     }
 
     fn exchange(&mut self, wrench: &Wrench, scheduler: &mut dyn Scheduler) -> Result<Sample, Fault> {
-        let sample = self.frame(wrench.force);
+        let sample = self.frame(wrench.force, false);
         scheduler.note();
         sample
     }
 
     fn safe_stop(&mut self) {
         if self.handle.is_some() {
-            let _ = self.frame([0.0; 3]);
+            let _ = self.frame([0.0; 3], false);
         }
     }
 

@@ -1,0 +1,419 @@
+//! What the motors do while a driver's call hangs, while force is switched off at the device, after
+//! a stall, and when the process dies or is stopped. The fake libraries model the firmware.
+#![allow(clippy::unwrap_used, clippy::expect_used, clippy::panic, reason = "a failed test should panic")]
+#![cfg(all(feature = "vendor", unix))]
+#![allow(unsafe_code, reason = "the fake libraries are steered through C functions")]
+
+use std::{
+    ffi::c_int,
+    path::Path,
+    process::{Child, Command, Stdio},
+    sync::mpsc,
+    time::{Duration, Instant},
+};
+
+use fakes::{ONE_HD, dhd, fake, hd, motor, open_fake, place, rise};
+use libloading::Library;
+use pliant_haptics::{
+    ForceDimension, HapticDevice, HapticLoop, LoopConfig, LoopReport, OpenHaptics, SafetyConfig, StaleConfig,
+};
+
+#[path = "rig/fakes.rs"]
+#[macro_use]
+mod fakes;
+#[path = "rig/machine.rs"]
+mod machine;
+
+/// Longest time from a hang to a force of zero, s.
+const PROMISED: f64 = 0.050;
+/// Time after which a force that is still there counts as left on, s.
+const FOREVER: f64 = 1.0;
+
+/// Settings of a real device whose simulation may be late by 0.2 s, because the machine is busy.
+fn config(device: &dyn HapticDevice) -> LoopConfig {
+    let stale = Some(StaleConfig { patience: 0.2, limit: 0.25 });
+    let safety = SafetyConfig { stale, ..SafetyConfig::for_device(&device.info(), 1000.0) };
+    LoopConfig { safety: Some(safety), ..LoopConfig::default() }
+}
+
+/// A running loop and the game that publishes a spring of 200 N/m to the center.
+struct Game {
+    running: HapticLoop,
+    tick: u64,
+}
+
+impl Game {
+    fn start(device: impl HapticDevice + 'static) -> Self {
+        let config = config(&device);
+        Self { running: HapticLoop::start(device, config).unwrap(), tick: 0 }
+    }
+
+    fn publish(&mut self) -> LoopReport {
+        self.tick += 1;
+        self.running.publish(|model| {
+            (model.tick, model.period, model.count) = (self.tick, 0.01, 1);
+            model.contacts[0].stiffness = [[200.0, 0.0, 0.0], [0.0, 200.0, 0.0], [0.0, 0.0, 200.0]];
+        });
+        *self.running.report()
+    }
+
+    /// Publishes every 2 ms until `so`.
+    #[track_caller]
+    fn until(&mut self, what: &str, mut so: impl FnMut(&LoopReport) -> bool) {
+        machine::until(what, || {
+            let report = self.publish();
+            std::thread::sleep(Duration::from_millis(2));
+            if so(&report) { Ok(()) } else { Err(Box::new((report.state, report.tick))) }
+        });
+    }
+
+    /// Waits for the whole force of 1 N on the motors.
+    fn pull(&mut self, library: &Library) {
+        self.until("1 N on the motors", |_| (motor(library) - 1.0).abs() < 1e-3);
+    }
+}
+
+/// Returns the time from now to a force of zero on the motors, s, at most [`FOREVER`].
+fn seconds_to_zero(motor: impl Fn() -> f64) -> f64 {
+    let begun = Instant::now();
+    while motor() > 0.0 && begun.elapsed().as_secs_f64() < FOREVER {
+        std::thread::sleep(Duration::from_micros(200));
+    }
+    begun.elapsed().as_secs_f64()
+}
+
+/// Runs `round` up to five times and returns the shortest time, because a busy machine may wake
+/// every thread late. No round may leave the force on.
+#[track_caller]
+fn best(what: &str, mut round: impl FnMut() -> f64) -> f64 {
+    let mut times = Vec::new();
+    while times.len() < 5 && times.last().is_none_or(|t| *t > PROMISED) {
+        let took = round();
+        times.push(took);
+        assert!(took < FOREVER, "{what}: the force is still on after {took:.3} s");
+    }
+    let best = times.iter().copied().fold(f64::INFINITY, f64::min);
+    println!("{what}: force zero {:.1} ms after the hang", 1e3 * best);
+    assert!(best <= PROMISED, "{what}: {times:?} s");
+    best
+}
+
+fn hang_dhd(library: &Library, on: bool) {
+    call!(library, "fake_hang", fn(c_int), c_int::from(on));
+    if on {
+        machine::until("the call hangs", || {
+            std::thread::sleep(Duration::from_micros(100));
+            if call!(library, "fake_hung", fn() -> c_int,) == 1 { Ok(()) } else { Err("it returns") }
+        });
+    }
+}
+
+/// Sets what the fake's servo does: 0 is alive, 1 dead, 2 stuck, 3 stuck in the caller's call only.
+fn servo(library: &Library, mode: c_int) {
+    call!(library, "fake_servo", fn(c_int), mode);
+    if mode >= 2 {
+        machine::until("the call hangs", || {
+            std::thread::sleep(Duration::from_micros(100));
+            if call!(library, "fake_hung", fn() -> c_int,) == 1 { Ok(()) } else { Err("it returns") }
+        });
+    }
+}
+
+#[test]
+fn force_dimension_hangs() {
+    for (name, options) in [("firmware", &[][..]), ("supervisor", &["-DWITHOUT_WATCHDOG"][..])] {
+        let path = fake("dhd", &format!("hang_{name}"), options);
+        let library = open_fake(&path);
+        place(&library, [0.0, 0.005, 0.0], 0.0);
+        let mut game = Game::start(ForceDimension::open(dhd(&path)).unwrap());
+        best(&format!("Force Dimension, {name}"), || {
+            game.pull(&library);
+            hang_dhd(&library, true);
+            let took = seconds_to_zero(|| motor(&library));
+            // The force does not come back while the call hangs, and then it comes back by the ramp.
+            std::thread::sleep(Duration::from_millis(50));
+            let late = motor(&library);
+            rise(&library);
+            hang_dhd(&library, false);
+            game.pull(&library);
+            assert_eq!(late, 0.0);
+            let rise = rise(&library);
+            assert!(rise < 0.02, "comes back by the ramp, not by a kick of {rise} N");
+            took
+        });
+    }
+}
+
+#[test]
+fn open_haptics_hangs() {
+    let _one = ONE_HD.lock().unwrap_or_else(|e| e.into_inner());
+    // The servo lives and only our call is lost, or the servo is stuck with everything.
+    for (name, mode) in [("call lost", 3), ("servo stuck", 2)] {
+        let path = fake("hd", &format!("hang_{mode}"), &[]);
+        let library = open_fake(&path);
+        place(&library, [5.0, 0.0, 0.0], 0.0);
+        let mut game = Game::start(OpenHaptics::open(hd(&path)).unwrap());
+        best(&format!("OpenHaptics, {name}"), || {
+            game.pull(&library);
+            servo(&library, mode);
+            let took = seconds_to_zero(|| motor(&library));
+            std::thread::sleep(Duration::from_millis(50));
+            let late = motor(&library);
+            rise(&library);
+            servo(&library, 0);
+            game.pull(&library);
+            assert_eq!(late, 0.0);
+            let rise = rise(&library);
+            assert!(rise < 0.02, "comes back by the ramp, not by a kick of {rise} N");
+            took
+        });
+    }
+}
+
+#[test]
+fn the_emergency_stop_works_while_a_call_hangs() {
+    let path = fake("dhd", "hang_estop", &["-DWITHOUT_WATCHDOG"]);
+    let library = open_fake(&path);
+    place(&library, [0.0, 0.005, 0.0], 0.0);
+    let mut game = Game::start(ForceDimension::open(dhd(&path)).unwrap());
+    let stop = game.running.stop_switch();
+    best("Force Dimension, emergency stop", || {
+        game.pull(&library);
+        hang_dhd(&library, true);
+        stop.press();
+        let took = seconds_to_zero(|| motor(&library));
+        hang_dhd(&library, false);
+        for _ in 0..50 {
+            game.publish();
+            std::thread::sleep(Duration::from_millis(2));
+            assert_eq!(motor(&library), 0.0, "it is latched, also when the call has returned");
+        }
+        rise(&library);
+        assert!(game.running.reset_stop());
+        game.pull(&library);
+        assert!(rise(&library) < 0.02, "by the ramp");
+        took
+    });
+}
+
+/// Drops `game` on another thread, and returns the time that the drop took, s, if it was at most 5.
+fn seconds_to_drop(game: Game) -> Option<f64> {
+    let (sender, receiver) = mpsc::channel();
+    std::thread::spawn(move || {
+        let begun = Instant::now();
+        drop(game);
+        let _ = sender.send(begun.elapsed().as_secs_f64());
+    });
+    receiver.recv_timeout(Duration::from_secs(5)).ok()
+}
+
+#[test]
+fn a_hung_device_is_dropped_within_a_second() {
+    let _one = ONE_HD.lock().unwrap_or_else(|e| e.into_inner());
+    let dhd_path = fake("dhd", "hang_drop", &["-DWITHOUT_WATCHDOG"]);
+    let dhd_library = open_fake(&dhd_path);
+    place(&dhd_library, [0.0, 0.005, 0.0], 0.0);
+    let mut game = Game::start(ForceDimension::open(dhd(&dhd_path)).unwrap());
+    game.pull(&dhd_library);
+    hang_dhd(&dhd_library, true);
+    let took = seconds_to_drop(game);
+    println!("Force Dimension: dropped after {took:?} s");
+    assert!(took.is_some_and(|t| t <= 1.0), "Force Dimension: {took:?} s");
+    assert_eq!(motor(&dhd_library), 0.0);
+    hang_dhd(&dhd_library, false);
+
+    let hd_path = fake("hd", "hang_drop", &[]);
+    let hd_library = open_fake(&hd_path);
+    place(&hd_library, [5.0, 0.0, 0.0], 0.0);
+    let mut game = Game::start(OpenHaptics::open(hd(&hd_path)).unwrap());
+    game.pull(&hd_library);
+    servo(&hd_library, 2);
+    let took = seconds_to_drop(game);
+    println!("OpenHaptics: dropped after {took:?} s");
+    assert!(took.is_some_and(|t| t <= 1.0), "OpenHaptics: {took:?} s");
+    assert_eq!(motor(&hd_library), 0.0);
+    servo(&hd_library, 0);
+    // The thread that was left behind closes the device as soon as its call returns.
+    for (name, library) in [("Force Dimension", &dhd_library), ("OpenHaptics", &hd_library)] {
+        machine::until(name, || {
+            std::thread::sleep(Duration::from_millis(1));
+            if call!(library, "fake_open", fn() -> c_int,) == 0 { Ok(()) } else { Err("still open") }
+        });
+    }
+}
+
+#[test]
+fn open_haptics_with_a_dead_scheduler() {
+    let _one = ONE_HD.lock().unwrap_or_else(|e| e.into_inner());
+    let path = fake("hd", "dead", &[]);
+    let library = open_fake(&path);
+    place(&library, [5.0, 0.0, 0.0], 0.0);
+    let mut game = Game::start(OpenHaptics::open(hd(&path)).unwrap());
+    game.pull(&library);
+    rise(&library);
+    servo(&library, 1);
+    let took = seconds_to_zero(|| motor(&library));
+    println!("OpenHaptics, dead scheduler: force zero after {:.1} ms", 1e3 * took);
+    assert!(took < 4.0 * PROMISED, "{took} s");
+    let mut seen = Vec::new();
+    game.until("the device counts as lost", |report| {
+        seen.extend(report.tick.fault);
+        report.state == pliant_haptics::LoopState::Lost
+    });
+    println!("faults of a dead scheduler: {:?}", seen.first());
+    assert!(!seen.contains(&pliant_haptics::Fault::NotFinite), "the fault is the driver's: {seen:?}");
+    servo(&library, 0);
+    game.pull(&library);
+    assert!(rise(&library) < 0.02, "by the ramp");
+}
+
+/// Switches the force off at the device for 0.1 s and on again. Returns the largest rise of the
+/// motors' force.
+fn off_and_on(game: &mut Game, library: &Library, mut switch: impl FnMut(bool)) -> f64 {
+    game.pull(library);
+    switch(false);
+    for _ in 0..50 {
+        game.publish();
+        std::thread::sleep(Duration::from_millis(2));
+    }
+    rise(library);
+    switch(true);
+    game.pull(library);
+    rise(library)
+}
+
+#[test]
+fn force_switched_off_and_on_at_the_device_ramps() {
+    let _one = ONE_HD.lock().unwrap_or_else(|e| e.into_inner());
+    let path = fake("dhd", "switch", &[]);
+    let library = open_fake(&path);
+    place(&library, [0.0, 0.005, 0.0], 0.0);
+    let mut game = Game::start(ForceDimension::open(dhd(&path)).unwrap());
+    let rise = off_and_on(&mut game, &library, |on| {
+        call!(library, "fake_user_off", fn(c_int), c_int::from(!on));
+    });
+    println!("Force Dimension: the force rises by at most {rise:.4} N at once");
+    assert!(rise < 0.02, "Force Dimension: a kick of {rise} N");
+    drop(game);
+
+    let path = fake("hd", "switch", &[]);
+    let library = open_fake(&path);
+    place(&library, [5.0, 0.0, 0.0], 0.0);
+    call!(library, "fake_safety_switch", fn(c_int), 1);
+    let mut game = Game::start(OpenHaptics::open(hd(&path)).unwrap());
+    let rise = off_and_on(&mut game, &library, |on| {
+        call!(library, "fake_safety_switch", fn(c_int), c_int::from(on));
+    });
+    println!("OpenHaptics: the force rises by at most {rise:.4} N at once");
+    assert!(rise < 0.02, "OpenHaptics: a kick of {rise} N");
+}
+
+#[test]
+fn a_calibration_that_is_lost_is_noticed() {
+    let path = fake("dhd", "uncalibrated", &[]);
+    let library = open_fake(&path);
+    place(&library, [0.0, 0.005, 0.0], 0.0);
+    let mut game = Game::start(ForceDimension::open(dhd(&path)).unwrap());
+    game.pull(&library);
+    call!(library, "fake_reset", fn(c_int), 0);
+    let begun = Instant::now();
+    while motor(&library) > 0.0 && begun.elapsed().as_secs_f64() < FOREVER {
+        game.publish();
+        std::thread::sleep(Duration::from_millis(2));
+    }
+    assert_eq!(motor(&library), 0.0, "positions of a device that has lost its reference are not believed");
+    game.until("it waits", |report| report.state == pliant_haptics::LoopState::Calibrating);
+    rise(&library);
+    call!(library, "fake_reset", fn(c_int), 1);
+    game.pull(&library);
+    assert!(rise(&library) < 0.02, "by the ramp");
+}
+
+/// The game in a process of its own, for [`a_process_that_dies_or_is_stopped`].
+#[test]
+#[ignore = "is run by another test, in a process of its own"]
+fn a_game() {
+    let Ok(path) = std::env::var("PLIANT_TEST_LIBRARY") else { return };
+    let (path, end) = (Path::new(&path), std::env::var("PLIANT_TEST_END").unwrap_or_default());
+    let is_hd = path.file_name().is_some_and(|n| n.to_string_lossy().starts_with("libhd"));
+    let library = open_fake(path);
+    let mut game = if is_hd {
+        Game::start(OpenHaptics::open(hd(path)).unwrap())
+    } else {
+        Game::start(ForceDimension::open(dhd(path)).unwrap())
+    };
+    game.pull(&library);
+    game.until("the parent has seen it", |_| {
+        std::env::var("PLIANT_TEST_SEEN").is_ok_and(|p| Path::new(&p).exists())
+    });
+    match end.as_str() {
+        "panic" => panic!("the game's own bug, on purpose"),
+        "exit" => std::process::exit(0),
+        "abort" => std::process::abort(),
+        _ => loop {
+            game.publish();
+            std::thread::sleep(Duration::from_millis(2));
+        },
+    }
+}
+
+fn signal(child: &Child, name: &str) {
+    let done = Command::new("kill").args([&format!("-{name}"), &child.id().to_string()]).status().unwrap();
+    assert!(done.success());
+}
+
+#[test]
+fn a_process_that_dies_or_is_stopped() {
+    let _one = ONE_HD.lock().unwrap_or_else(|e| e.into_inner());
+    for source in ["dhd", "hd"] {
+        for end in ["KILL", "STOP", "panic", "exit", "abort"] {
+            let folder = Path::new(env!("CARGO_TARGET_TMPDIR"));
+            let state = folder.join(format!("{source}_{end}.state"));
+            let seen = folder.join(format!("{source}_{end}.seen"));
+            let _ = std::fs::remove_file(&state);
+            let _ = std::fs::remove_file(&seen);
+            let path = fake(source, &format!("dies_{end}"), &[&format!("-DSTATE=\"{}\"", state.display())]);
+            let library = open_fake(&path);
+            if source == "hd" {
+                place(&library, [5.0, 0.0, 0.0], 0.0);
+                // The hardware's own watchdog is a property of the device that nobody has measured.
+                call!(library, "fake_hardware_watchdog", fn(f64), 0.02);
+            } else {
+                place(&library, [0.0, 0.005, 0.0], 0.0);
+            }
+            let mut child = Command::new(std::env::current_exe().unwrap())
+                .args(["--exact", "a_game", "--ignored", "--nocapture"])
+                .env("PLIANT_TEST_LIBRARY", &path)
+                .env("PLIANT_TEST_END", end)
+                .env("PLIANT_TEST_SEEN", &seen)
+                // A backtrace takes a quarter of a second before the unwinding begins.
+                .env("RUST_BACKTRACE", "0")
+                .stdout(Stdio::null())
+                .stderr(Stdio::null())
+                .spawn()
+                .unwrap();
+            machine::until("the game pulls", || {
+                std::thread::sleep(Duration::from_millis(1));
+                let f = motor(&library);
+                if (f - 1.0).abs() < 1e-3 { Ok(()) } else { Err(f) }
+            });
+            if matches!(end, "KILL" | "STOP") {
+                signal(&child, end);
+            } else {
+                std::fs::write(&seen, "").unwrap();
+                // The game ends up to one of its rounds later. The time below counts from its end.
+                if end != "panic" {
+                    child.wait().unwrap();
+                }
+            }
+            let took = seconds_to_zero(|| motor(&library));
+            println!("{source}, {end}: force zero after {:.1} ms", 1e3 * took);
+            if end == "STOP" {
+                signal(&child, "CONT");
+            }
+            let _ = child.kill();
+            let _ = child.wait();
+            assert!(took < 4.0 * PROMISED, "{source}, {end}: {took} s");
+        }
+    }
+}
