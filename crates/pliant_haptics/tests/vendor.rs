@@ -57,6 +57,10 @@ fn open_haptics_units_axes_and_sizes() {
     let path = fake("hd", "units", &[]);
     let library = open_fake(&path);
     assert_eq!(call!(library, "fake_error_size", fn() -> c_ulong,), 12, "HDErrorInfo");
+    // The C compiler lays the published declaration out as the driver does.
+    let offsets = call!(library, "fake_error_offsets", fn() -> c_ulong,);
+    assert_eq!(offsets, 4 << 8 | 8 << 16, "errorCode, internalErrorCode, hHD");
+    assert_eq!(call!(library, "fake_boolean_size", fn() -> c_ulong,), 1, "HDboolean");
     assert_eq!(call!(library, "fake_long_size", fn() -> c_ulong,) as usize, size_of::<c_ulong>(), "HDulong");
     let mut device = OpenHaptics::open(hd(&path)).unwrap();
     let info = device.info();
@@ -150,6 +154,27 @@ fn open_haptics_calibration_fault_and_return() {
         run(&mut cycle, &mut events, 0.1);
         events.contains(&LoopEvent::Returned) && (force(&library)[0] + 0.5).abs() < 1e-6
     });
+}
+
+#[test]
+fn open_haptics_takes_all_errors_at_once_and_switches_the_force_off_on_its_way_out() {
+    let _one = ONE_HD.lock().unwrap_or_else(|e| e.into_inner());
+    let path = fake("hd", "errors", &[]);
+    let library = open_fake(&path);
+    let mut device = OpenHaptics::open(hd(&path)).unwrap();
+    let mut scheduler = Quick::default();
+    assert!(device.exchange(&Wrench::ZERO, &mut scheduler).is_ok());
+    call!(library, "fake_error_count", fn(c_int), 5);
+    call!(library, "fake_error", fn(c_uint), 0x302);
+    assert_eq!(device.exchange(&Wrench::ZERO, &mut scheduler), Err(Fault::Driver(0x302)));
+    call!(library, "fake_error", fn(c_uint), 0);
+    let next = device.exchange(&Wrench::ZERO, &mut scheduler);
+    assert!(next.is_ok(), "one bad frame is one error: {next:?}");
+    assert_eq!(call!(library, "fake_errors_left", fn() -> c_int,), 0);
+    assert_eq!(call!(library, "fake_disabled", fn() -> c_int,), 0);
+    drop(device);
+    assert_eq!(call!(library, "fake_disabled", fn() -> c_int,), 1, "hdDisable(HD_FORCE_OUTPUT)");
+    assert_eq!(call!(library, "fake_open", fn() -> c_int,), 0);
 }
 
 #[test]
