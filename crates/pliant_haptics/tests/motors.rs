@@ -15,7 +15,8 @@ use std::{
 use fakes::{ONE_HD, dhd, fake, hd, motor, open_fake, place, rise};
 use libloading::Library;
 use pliant_haptics::{
-    ForceDimension, HapticDevice, HapticLoop, LoopConfig, LoopReport, OpenHaptics, SafetyConfig, StaleConfig,
+    Fault, ForceDimension, HapticDevice, HapticLoop, LoopConfig, LoopEvent, LoopReport, LoopState,
+    OpenHaptics, SafetyConfig, StaleConfig, Wrench,
 };
 
 #[path = "rig/fakes.rs"]
@@ -131,8 +132,13 @@ fn force_dimension_hangs() {
             hang_dhd(&library, true);
             let took = seconds_to_zero(|| motor(&library));
             // The force does not come back while the call hangs, and then it comes back by the ramp.
-            std::thread::sleep(Duration::from_millis(50));
+            std::thread::sleep(Duration::from_millis(100));
             let late = motor(&library);
+            let report = game.publish();
+            assert_eq!(report.state, LoopState::Hung);
+            assert!(matches!(report.tick.fault, Some(Fault::Hung(t)) if t > 0.05), "{:?}", report.tick.fault);
+            assert_eq!(report.tick.wrench, Wrench::ZERO);
+            assert!(game.running.events().any(|e| matches!(e, LoopEvent::Fault(Fault::Hung(_)))));
             rise(&library);
             hang_dhd(&library, false);
             game.pull(&library);
@@ -258,10 +264,10 @@ fn open_haptics_with_a_dead_scheduler() {
     let mut seen = Vec::new();
     game.until("the device counts as lost", |report| {
         seen.extend(report.tick.fault);
-        report.state == pliant_haptics::LoopState::Lost
+        report.state == LoopState::Lost
     });
     println!("faults of a dead scheduler: {:?}", seen.first());
-    assert!(!seen.contains(&pliant_haptics::Fault::NotFinite), "the fault is the driver's: {seen:?}");
+    assert!(!seen.contains(&Fault::NotFinite), "the fault is the driver's: {seen:?}");
     servo(&library, 0);
     game.pull(&library);
     assert!(rise(&library) < 0.02, "by the ramp");
@@ -276,6 +282,7 @@ fn off_and_on(game: &mut Game, library: &Library, mut switch: impl FnMut(bool)) 
         game.publish();
         std::thread::sleep(Duration::from_millis(2));
     }
+    assert_eq!(game.publish().state, LoopState::ForceOff);
     rise(library);
     switch(true);
     game.pull(library);
@@ -322,7 +329,7 @@ fn a_calibration_that_is_lost_is_noticed() {
         std::thread::sleep(Duration::from_millis(2));
     }
     assert_eq!(motor(&library), 0.0, "positions of a device that has lost its reference are not believed");
-    game.until("it waits", |report| report.state == pliant_haptics::LoopState::Calibrating);
+    game.until("it waits", |report| report.state == LoopState::Calibrating);
     rise(&library);
     call!(library, "fake_reset", fn(c_int), 1);
     game.pull(&library);

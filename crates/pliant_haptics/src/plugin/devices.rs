@@ -120,7 +120,8 @@ impl HapticDevices {
         Ok(id)
     }
 
-    /// Stops and removes a device. Its buttons come up, and its tools release their grabs in the
+    /// Stops and removes a device. This takes half a second if its driver does not return, see
+    /// [`HapticLoop::close`]. Its buttons come up, and its tools release their grabs in the
     /// next frame. Returns `false` if there is no such device.
     pub fn remove(&mut self, id: DeviceId) -> bool {
         let Some(entry) = self.entries.iter().position(|e| e.id == id) else { return false };
@@ -144,7 +145,7 @@ impl HapticDevices {
     }
 
     /// Presses the emergency stop of all devices. Each loop exerts no force from its next period
-    /// on. The stop is latched until [`reset_stop`](Self::reset_stop), and it also applies to
+    /// on, or its supervisor cuts the force if the driver does not answer. The stop is latched until [`reset_stop`](Self::reset_stop), and it also applies to
     /// devices that are added later.
     pub fn estop(&self) {
         self.stopped.store(true, Ordering::Release);
@@ -183,6 +184,16 @@ impl HapticDevices {
 
     pub(crate) fn entry(&mut self, id: DeviceId) -> Option<&mut Entry> {
         self.entries.iter_mut().find(|e| e.id == id)
+    }
+}
+
+impl Drop for HapticDevices {
+    /// Asks all loops to end before it waits for the first, so that several drivers that do not
+    /// return cost half a second in all.
+    fn drop(&mut self) {
+        for entry in &mut self.entries {
+            entry.running.get().ask_to_end();
+        }
     }
 }
 
