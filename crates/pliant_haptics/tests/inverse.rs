@@ -10,7 +10,7 @@ use std::{
     net::{TcpListener, TcpStream},
     sync::{Arc, Mutex},
     thread::JoinHandle,
-    time::Duration,
+    time::{Duration, Instant},
 };
 
 use pliant_haptics::{
@@ -427,67 +427,113 @@ fn a_late_answer_is_not_taken_for_the_next_one() {
     assert!((answer(&mut device).position[0] - 0.07).abs() < 1e-9);
 }
 
-#[test]
-fn a_service_that_does_not_answer_loses_its_force() {
-    use std::time::Instant;
-    let service = Service::start(true);
-    service.desk().position = [0.005, 0.0, 0.0];
-    let device = Inverse::open(second(service.config())).unwrap();
-    let stale = Some(StaleConfig { patience: 0.2, limit: 0.25 });
-    let safety = SafetyConfig { stale, ..SafetyConfig::for_device(&device.info(), 1000.0) };
-    let config = LoopConfig { safety: Some(safety), ..LoopConfig::default() };
-    let mut running = HapticLoop::start(device, config).unwrap();
-    let mut tick = 0;
-    let mut publish = |running: &mut HapticLoop| {
-        tick += 1;
-        running.publish(|model| {
-            (model.tick, model.period, model.count) = (tick, 0.01, 1);
+/// A running loop and the game that publishes a spring of 200 N/m to the center.
+struct Game {
+    running: HapticLoop,
+    tick: u64,
+}
+
+impl Game {
+    /// Starts the loop on a device whose simulation may be late by 0.2 s.
+    fn start(config: InverseConfig) -> Self {
+        let device = Inverse::open(config).unwrap();
+        let stale = Some(StaleConfig { patience: 0.2, limit: 0.25 });
+        let safety = SafetyConfig { stale, ..SafetyConfig::for_device(&device.info(), 1000.0) };
+        let config = LoopConfig { safety: Some(safety), ..LoopConfig::default() };
+        Self { running: HapticLoop::start(device, config).unwrap(), tick: 0 }
+    }
+
+    fn publish(&mut self) {
+        self.tick += 1;
+        self.running.publish(|model| {
+            (model.tick, model.period, model.count) = (self.tick, 0.01, 1);
             model.contacts[0].stiffness = [[200.0, 0.0, 0.0], [0.0, 200.0, 0.0], [0.0, 0.0, 200.0]];
         });
         std::thread::sleep(Duration::from_millis(2));
-    };
+    }
+}
+
+/// Waits for 1 N on the motors, while `step` lets time pass.
+fn pulled(service: &Service, mut step: impl FnMut()) {
+    machine::until("1 N on the motors", || {
+        step();
+        let force = service.desk().motor;
+        if (force - 1.0).abs() < 1e-3 { Ok(()) } else { Err(force) }
+    });
+}
+
+/// Makes the service hold its next answer back, and waits until it does.
+fn hold_back(service: &Service) {
+    service.desk().late = true;
+    machine::until("an answer is held back", || {
+        std::thread::sleep(Duration::from_micros(200));
+        if service.desk().held { Ok(()) } else { Err("no command has come") }
+    });
+}
+
+/// Returns the time from now to a force of zero on the motors, s, at most 1.
+fn seconds_to_zero(service: &Service) -> f64 {
+    let begun = Instant::now();
+    while service.desk().motor > 0.0 && begun.elapsed().as_secs_f64() < 1.0 {
+        std::thread::sleep(Duration::from_micros(200));
+    }
+    begun.elapsed().as_secs_f64()
+}
+
+#[test]
+fn a_service_that_does_not_answer_loses_its_force() {
+    let service = Service::start(true);
+    service.desk().position = [0.005, 0.0, 0.0];
+    let mut game = Game::start(second(service.config()));
     let mut times = Vec::new();
     while times.len() < 5 && times.last().is_none_or(|t| *t > 0.05) {
-        machine::until("1 N on the motors", || {
-            publish(&mut running);
-            let force = service.desk().motor;
-            if (force - 1.0).abs() < 1e-3 { Ok(()) } else { Err(force) }
-        });
-        service.desk().late = true;
-        machine::until("an answer is held back", || {
-            std::thread::sleep(Duration::from_micros(200));
-            if service.desk().held { Ok(()) } else { Err("no command has come") }
-        });
-        let begun = Instant::now();
-        while service.desk().motor > 0.0 && begun.elapsed().as_secs_f64() < 1.0 {
-            std::thread::sleep(Duration::from_micros(200));
-        }
-        times.push(begun.elapsed().as_secs_f64());
+        pulled(&service, || game.publish());
+        hold_back(&service);
+        times.push(seconds_to_zero(&service));
         service.desk().late = false;
         assert!(times.iter().all(|t| *t < 1.0), "the force is still on after {times:?} s");
     }
     println!("Inverse: force zero after {times:?} s, {} commands for it", service.desk().zeros);
     assert!(times.iter().any(|t| *t <= 0.05), "{times:?} s");
     // A device that hangs is dropped in time as well.
-    machine::until("1 N on the motors", || {
-        publish(&mut running);
-        let force = service.desk().motor;
-        if (force - 1.0).abs() < 1e-3 { Ok(()) } else { Err(force) }
-    });
-    service.desk().late = true;
-    machine::until("an answer is held back", || {
-        std::thread::sleep(Duration::from_micros(200));
-        if service.desk().held { Ok(()) } else { Err("no command has come") }
-    });
+    pulled(&service, || game.publish());
+    hold_back(&service);
     let begun = Instant::now();
-    drop(running);
+    drop(game);
     let took = begun.elapsed().as_secs_f64();
     println!("Inverse: dropped after {took:.3} s");
     assert!(took <= 1.0, "{took} s");
-    machine::until("no force is left behind", || {
-        std::thread::sleep(Duration::from_millis(1));
-        let force = service.desk().motor;
-        if force == 0.0 { Ok(()) } else { Err(force) }
-    });
+    assert!(seconds_to_zero(&service) < 1.0, "no force is left behind");
     service.desk().late = false;
+}
+
+/// The game in a process of its own, for [`a_process_that_dies`].
+#[test]
+#[ignore = "is run by another test, in a process of its own"]
+fn a_game() {
+    let Ok(address) = std::env::var("PLIANT_TEST_SERVICE") else { return };
+    let mut game = Game::start(second(InverseConfig { address, timeout: 10.0, ..InverseConfig::default() }));
+    loop {
+        game.publish();
+    }
+}
+
+#[test]
+fn a_process_that_dies() {
+    let service = Service::start(true);
+    service.desk().position = [0.005, 0.0, 0.0];
+    let mut child = std::process::Command::new(std::env::current_exe().unwrap())
+        .args(["--exact", "a_game", "--ignored"])
+        .env("PLIANT_TEST_SERVICE", &service.address)
+        .stdout(std::process::Stdio::null())
+        .stderr(std::process::Stdio::null())
+        .spawn()
+        .unwrap();
+    pulled(&service, || std::thread::sleep(Duration::from_millis(1)));
+    child.kill().unwrap();
+    child.wait().unwrap();
+    // The system closes the connection. That a real service then lets go of the force is assumed.
+    let took = seconds_to_zero(&service);
+    println!("Inverse, KILL: connection closed after {:.1} ms", 1e3 * took);
+    assert!(took < 0.2, "{took} s");
 }

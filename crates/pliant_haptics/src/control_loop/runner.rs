@@ -18,7 +18,7 @@ use crate::{
     LoopReport, LoopState, ModalLocal, RealScheduler, Record, StartError, ToolMap, Wrench,
     control_loop::{
         cycle::Sink,
-        supervisor::{Done, Heartbeat, supervise},
+        supervisor::{Done, Heartbeat, Phase, supervise},
     },
 };
 
@@ -217,7 +217,7 @@ impl HapticLoop {
     /// method marks the last one. The next report of the thread replaces it.
     fn look_at_hang(&mut self) {
         let (silent, cut) = self.heartbeat.silence(self.clock.now());
-        let hangs = self.heartbeat.is_armed() && (cut || silent > HUNG);
+        let hangs = !self.heartbeat.is(Phase::Opening) && (cut || silent > HUNG);
         if !hangs {
             self.hang_sent = false;
             return;
@@ -429,8 +429,12 @@ impl<D: HapticDevice> Inner<D> {
             {
                 let _ = self.trash.push(old);
             }
-            let armed = self.cycle.report().state != LoopState::Lost;
-            if self.heartbeat.beat(clock.now(), armed) {
+            let phase = match self.cycle.report().state {
+                LoopState::Running | LoopState::ForceOff => Phase::Armed,
+                LoopState::Lost => Phase::Opening,
+                _ => Phase::Safe,
+            };
+            if self.heartbeat.beat(clock.now(), phase) {
                 tracing::warn!(device = self.cycle.core().info().name, "the driver answers again");
             }
             let report = *self.cycle.step(&mut scheduler, self.model.read(), &mut self.queues);

@@ -4,7 +4,7 @@
 use std::{
     sync::{
         Arc,
-        atomic::{AtomicBool, AtomicU64, Ordering},
+        atomic::{AtomicBool, AtomicU8, AtomicU64, Ordering},
     },
     time::Duration,
 };
@@ -19,13 +19,26 @@ const HANG_WHEN_STOPPED: f64 = 0.010;
 /// Interval of the checks.
 const CHECK: Duration = Duration::from_millis(5);
 
+/// What the loop's thread does until its next sign of life.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+#[repr(u8)]
+pub(crate) enum Phase {
+    /// No force is sent. A late sign of life is no danger.
+    Safe,
+    /// A force is sent, and the device has to come back in time.
+    Armed,
+    /// The device is lost, and the loop tries to open it. That may take its time, and a device may
+    /// drive by itself meanwhile.
+    Opening,
+}
+
 /// What the loop's thread, its supervisor and the app share about the loop's life.
 #[derive(Debug)]
 pub(crate) struct Heartbeat {
     /// Time of the last sign of life on the loop's clock, s, as bits.
     beat: AtomicU64,
-    /// Whether the device may exert a force, and so has to come back in time.
-    armed: AtomicBool,
+    /// The [`Phase`].
+    phase: AtomicU8,
     /// Whether the force was cut since the last sign of life.
     cut: AtomicBool,
     /// Whether the loop's thread is over.
@@ -36,16 +49,16 @@ impl Heartbeat {
     pub(crate) fn new(now: f64) -> Arc<Self> {
         Arc::new(Self {
             beat: AtomicU64::new(now.to_bits()),
-            armed: AtomicBool::new(false),
+            phase: AtomicU8::new(Phase::Safe as u8),
             cut: AtomicBool::new(false),
             done: AtomicBool::new(false),
         })
     }
 
-    /// Gives a sign of life, and says whether the device may exert a force from now on. Returns
-    /// whether the force was cut since the last sign.
-    pub(crate) fn beat(&self, now: f64, armed: bool) -> bool {
-        self.armed.store(armed, Ordering::Relaxed);
+    /// Gives a sign of life, and says what comes next. Returns whether the force was cut since the
+    /// last sign.
+    pub(crate) fn beat(&self, now: f64, phase: Phase) -> bool {
+        self.phase.store(phase as u8, Ordering::Relaxed);
         self.beat.store(now.to_bits(), Ordering::Release);
         self.cut.swap(false, Ordering::AcqRel)
     }
@@ -56,8 +69,8 @@ impl Heartbeat {
         (silent.max(0.0), self.cut.load(Ordering::Acquire))
     }
 
-    pub(crate) fn is_armed(&self) -> bool {
-        self.armed.load(Ordering::Relaxed)
+    pub(crate) fn is(&self, phase: Phase) -> bool {
+        self.phase.load(Ordering::Relaxed) == phase as u8
     }
 }
 
@@ -82,19 +95,22 @@ pub(crate) fn supervise(
     while !heartbeat.done.load(Ordering::Acquire) {
         std::thread::sleep(CHECK);
         let (silent, cut) = heartbeat.silence(clock.now());
+        let armed = heartbeat.is(Phase::Armed);
         // A device that is being opened may take its time, unless it is to stop.
         let hangs = if stop.is_pressed() {
-            silent > HANG_WHEN_STOPPED
+            silent > HANG_WHEN_STOPPED && !heartbeat.is(Phase::Safe)
         } else {
-            silent > HANG && heartbeat.is_armed()
+            silent > HANG && armed
         };
         if hangs && !cut && !heartbeat.done.load(Ordering::Acquire) {
             heartbeat.cut.store(true, Ordering::Release);
             handle.cut();
-            tracing::error!(
-                device = name,
-                "the driver has not answered for {silent:.3} s: its force was cut"
-            );
+            if armed {
+                tracing::error!(
+                    device = name,
+                    "the driver has not answered for {silent:.3} s: its force was cut"
+                );
+            }
         }
     }
 }

@@ -21,6 +21,9 @@ const NUMBERS: usize = 18;
 const RECORD: usize = NUMBERS * 8 + 4 + 8;
 /// Maximum length of the info, bytes. A longer info is invalid.
 const LONGEST_INFO: u32 = 64 * 1024;
+/// Default size limit of a recording, bytes: 1.9 hours at 1 kHz. The same limit holds for reading,
+/// because a replay keeps all records in memory.
+const MOST_BYTES: u64 = 1 << 30;
 
 /// Reason why a recording cannot be read or written.
 #[derive(Debug, Error)]
@@ -38,15 +41,20 @@ pub enum RecordError {
     /// The header's description of the device cannot be read.
     #[error("the recording's header is damaged: {0}")]
     Header(String),
+    /// The recording has reached its size limit. What was written so far is a whole recording.
+    #[error("the recording has reached its limit of {0} bytes")]
+    Full(u64),
     /// A record has a number that is not finite, or a time that runs backwards.
     #[error("record {0} of the recording is damaged")]
     Damaged(usize),
 }
 
-/// Writes a recording.
+/// Writes a recording of at most 1 GiB (1.9 hours at 1 kHz), see [`with_limit`](Self::with_limit).
 #[derive(Debug)]
 pub struct Recorder<W: Write> {
     out: W,
+    written: u64,
+    limit: u64,
 }
 
 impl<W: Write> Recorder<W> {
@@ -60,14 +68,26 @@ impl<W: Write> Recorder<W> {
         out.write_all(&VERSION.to_le_bytes())?;
         out.write_all(&(info.len() as u32).to_le_bytes())?;
         out.write_all(&info)?;
-        Ok(Self { out })
+        let written = (MAGIC.len() + 6 + info.len()) as u64;
+        Ok(Self { out, written, limit: MOST_BYTES })
+    }
+
+    /// Sets the size limit of the whole recording, bytes. A limit above 1 GiB counts as 1 GiB,
+    /// because a longer recording could not be read. Default: 1 GiB.
+    #[must_use]
+    pub fn with_limit(self, bytes: u64) -> Self {
+        Self { limit: bytes.min(MOST_BYTES), ..self }
     }
 
     /// Writes the record of one period.
     ///
     /// # Errors
-    /// Returns errors of the stream.
+    /// Returns [`RecordError::Full`] if the record would exceed the size limit, and errors of the
+    /// stream.
     pub fn write(&mut self, record: &Record) -> Result<(), RecordError> {
+        if self.written + RECORD as u64 > self.limit {
+            return Err(RecordError::Full(self.limit));
+        }
         let s = &record.sample;
         let velocity = s.velocity.unwrap_or([f64::NAN; 3]);
         let numbers = [record.now, record.dt]
@@ -85,6 +105,7 @@ impl<W: Write> Recorder<W> {
         bytes[NUMBERS * 8..][..4].copy_from_slice(&buttons.to_le_bytes());
         bytes[NUMBERS * 8 + 4..].copy_from_slice(&sequence.to_le_bytes());
         self.out.write_all(&bytes)?;
+        self.written += RECORD as u64;
         Ok(())
     }
 
@@ -111,8 +132,13 @@ impl Replay {
     /// Reads a whole recording. A last record that was cut short is left out.
     ///
     /// # Errors
-    /// Returns an error if the data is not a recording or is damaged, and errors of the stream.
-    pub fn read(mut from: impl Read) -> Result<Self, RecordError> {
+    /// Returns an error if the data is not a recording, is damaged or is longer than 1 GiB, and
+    /// errors of the stream.
+    pub fn read(from: impl Read) -> Result<Self, RecordError> {
+        Self::read_at_most(from, MOST_BYTES)
+    }
+
+    fn read_at_most(mut from: impl Read, limit: u64) -> Result<Self, RecordError> {
         let mut head = [0u8; 10];
         from.read_exact(&mut head)?;
         let [a, b, c, d, v0, v1, l0, l1, l2, l3] = head;
@@ -136,11 +162,16 @@ impl Replay {
         info.simulated = true;
         let mut records: Vec<Record> = Vec::new();
         let mut bytes = [0u8; RECORD];
+        let mut read = (head.len() + length as usize) as u64;
         loop {
+            read += RECORD as u64;
             match from.read_exact(&mut bytes) {
                 Ok(()) => {}
                 Err(e) if e.kind() == io::ErrorKind::UnexpectedEof => break,
                 Err(e) => return Err(e.into()),
+            }
+            if read > limit {
+                return Err(RecordError::Full(limit));
             }
             let record = parse(&bytes);
             let before = records.last().map_or(f64::NEG_INFINITY, |r| r.now);
@@ -217,6 +248,18 @@ mod tests {
         Cycle, Hand, LocalModel, LoopConfig, LoopEvent, Sink, VirtualConfig, VirtualDevice, VirtualScheduler,
     };
 
+    fn replay_info(bytes: &[u8]) -> DeviceInfo {
+        Replay::read(bytes).unwrap().info()
+    }
+
+    /// A stream that never ends.
+    struct Endless<I>(I);
+    impl<I: Iterator<Item = u8>> Read for Endless<I> {
+        fn read(&mut self, to: &mut [u8]) -> io::Result<usize> {
+            Ok(to.iter_mut().zip(&mut self.0).map(|(to, byte)| *to = byte).count())
+        }
+    }
+
     struct Write<'a>(&'a mut Recorder<Vec<u8>>);
     impl Sink for Write<'_> {
         fn event(&mut self, _: LoopEvent) {}
@@ -252,6 +295,19 @@ mod tests {
         assert!(events.contains(&LoopEvent::Pressed(0)));
         cycle.step(&mut scheduler, &LocalModel::default(), &mut events);
         assert!(events.contains(&LoopEvent::Lost), "at the end of the recording there is no device");
+        // A recording stops at its limit and is whole up to there. One that is longer is not read,
+        // because a replay keeps it in memory.
+        let limit = bytes.len() as u64 / 2;
+        let mut short = Recorder::new(Vec::new(), &replay_info(&bytes)).unwrap().with_limit(limit);
+        let source = Replay::read(&bytes[..]).unwrap();
+        let refused = source.records().iter().find_map(|record| short.write(record).err());
+        assert!(matches!(refused, Some(RecordError::Full(at)) if at == limit), "{refused:?}");
+        let short = short.finish().unwrap();
+        assert!(short.len() as u64 <= limit && short.len() as u64 + RECORD as u64 > limit);
+        assert!(Replay::read(&short[..]).unwrap().records().len() > 100);
+        let endless = bytes.iter().chain(bytes[bytes.len() - RECORD..].iter().cycle());
+        let endless = Endless(endless.copied());
+        assert!(matches!(Replay::read_at_most(endless, 1 << 20), Err(RecordError::Full(_))));
         // A recording that is cut at any byte gives a recording or an error, but never a panic.
         for cut in 0..bytes.len().min(2000) {
             let _ = Replay::read(&bytes[..cut]);
