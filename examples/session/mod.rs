@@ -46,18 +46,7 @@ pub fn emulation(network: Option<Preset>, seed: u64) -> Option<Emulation> {
 ///
 /// With the same key, a user or a host keeps its identity in the next run.
 pub fn identity(file: Option<&Path>) -> Result<Option<Identity>, Box<dyn Error>> {
-    let Some(file) = file else { return Ok(None) };
-    if file.exists() {
-        return Ok(Some(Identity::from_pkcs8(&std::fs::read(file)?)?));
-    }
-    let made = Identity::generate()?;
-    std::fs::write(file, made.to_pkcs8())?;
-    #[cfg(unix)]
-    {
-        use std::os::unix::fs::PermissionsExt;
-        std::fs::set_permissions(file, std::fs::Permissions::from_mode(0o600))?;
-    }
-    Ok(Some(made))
+    Ok(file.map(Identity::at).transpose()?)
 }
 
 /// Reads a body from a file, or from the project's assets.

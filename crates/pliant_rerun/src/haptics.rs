@@ -129,6 +129,8 @@ fn words(state: LoopState) -> &'static str {
         LoopState::Lost => "lost, and looked for",
         LoopState::Stopped => "stopped",
         LoopState::Ended => "its loop has ended",
+        LoopState::ForceOff => "its force is switched off at the device",
+        LoopState::Hung => "its driver does not answer",
         _ => "in a state that this recorder does not know",
     }
 }

@@ -20,6 +20,7 @@ use crate::{
 pub struct RerunPlugin {
     application: String,
     file: Option<PathBuf>,
+    file_limit: u64,
     viewer: Option<u16>,
     spawn: bool,
     rates: RerunRecording,
@@ -31,6 +32,9 @@ pub struct RerunPlugin {
 impl RerunPlugin {
     /// Default port of a viewer.
     pub const VIEWER_PORT: u16 = rerun::DEFAULT_SERVER_PORT;
+
+    /// Default size at which the recording in a file ends, bytes: 16 GiB.
+    pub const FILE_LIMIT: u64 = 16 << 30;
 
     /// Records to the file `path` (`.rrd`) and overwrites it.
     pub fn file(path: impl Into<PathBuf>) -> Self {
@@ -53,6 +57,7 @@ impl RerunPlugin {
         Self {
             application: "pliant".into(),
             file: None,
+            file_limit: Self::FILE_LIMIT,
             viewer: None,
             spawn: true,
             rates: RerunRecording::default(),
@@ -90,6 +95,14 @@ impl RerunPlugin {
     #[must_use]
     pub fn with_viewer_port(mut self, port: u16) -> Self {
         self.viewer = self.viewer.map(|_| port);
+        self
+    }
+
+    /// Sets the size at which the recording in a file ends, bytes. The app goes on without it.
+    /// Default: [`FILE_LIMIT`](Self::FILE_LIMIT).
+    #[must_use]
+    pub fn with_file_limit(mut self, bytes: u64) -> Self {
+        self.file_limit = bytes;
         self
     }
 
@@ -256,7 +269,7 @@ impl Plugin for RerunPlugin {
     fn build(&self, app: &mut App) {
         app.init_resource::<RerunScalars>().init_resource::<RerunStats>().register_type::<RerunStyle>();
         let targets = [
-            self.file.clone().map(Target::File),
+            self.file.clone().map(|path| Target::File { path, limit: self.file_limit }),
             self.viewer.map(|port| Target::Viewer { port, spawn: self.spawn }),
         ];
         let plots = Plots::new(self.titles.iter().cloned());

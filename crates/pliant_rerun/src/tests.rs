@@ -326,6 +326,18 @@ fn is_whole(path: &Path) -> bool {
 }
 
 #[test]
+fn a_file_ends_at_its_limit_and_is_whole() {
+    let path = scratch("limit");
+    let mut app = app(RerunPlugin::file(&path).with_file_limit(20_000));
+    until("the recording has ended", || update_to(&mut app, |stats| stats.sinks == 0 && stats.collected > 0));
+    drop(app);
+    let size = path.metadata().unwrap().len();
+    assert!(size >= 20_000, "not before its limit: {size} bytes");
+    assert!(is_whole(&path), "{size} bytes");
+    std::fs::remove_file(path).unwrap();
+}
+
+#[test]
 fn a_file_is_whole_when_the_app_says_exit_and_when_it_is_only_dropped() {
     for (name, exits) in [("exit", true), ("drop", false)] {
         let path = scratch(name);

@@ -41,8 +41,15 @@ const VIEWER_END: Duration = Duration::from_secs(5);
 /// The destination of one worker's recording.
 #[derive(Debug, Clone, PartialEq)]
 pub(crate) enum Target {
-    File(PathBuf),
-    Viewer { port: u16, spawn: bool },
+    /// A file, and the size at which the recording ends, bytes.
+    File {
+        path: PathBuf,
+        limit: u64,
+    },
+    Viewer {
+        port: u16,
+        spawn: bool,
+    },
 }
 
 /// Time for which ticks gather before a worker logs them, so that it wakes a few times per second
@@ -56,6 +63,9 @@ const FILE_COLUMNS: Duration = Duration::from_millis(500);
 
 /// Interval of the checks whether the viewer is still connected.
 const WATCH: Duration = Duration::from_secs(1);
+
+/// Interval of the looks at the size of a file.
+const MEASURE: Duration = Duration::from_millis(500);
 
 /// One tick for a worker.
 pub(crate) struct Message {
@@ -94,7 +104,7 @@ impl Worker {
         let (nudge, nudged) = bounded(1);
         let (end, ended) = bounded(1);
         let patience = match target {
-            Target::File(path) => {
+            Target::File { path, .. } => {
                 std::fs::File::create(path)
                     .map_err(|source| RerunError::File { path: path.clone(), source })?;
                 info!("recording to {}", path.display());
@@ -265,9 +275,9 @@ struct MessageQueue {
 fn record(stream: &RecordingStream, target: &Target, inbox: MessageQueue, plots: Plots) {
     let mut recorder = Recorder::new(stream.clone(), plots);
     let mut failing = false;
-    let (mut sent, mut watched) = (Instant::now(), Instant::now());
+    let (mut sent, mut watched, mut measured) = (Instant::now(), Instant::now(), Instant::now());
     let lost = Arc::new(AtomicBool::new(false));
-    let columns = if matches!(target, Target::File(_)) { FILE_COLUMNS } else { VIEWER_COLUMNS };
+    let columns = if matches!(target, Target::File { .. }) { FILE_COLUMNS } else { VIEWER_COLUMNS };
     loop {
         let ends = inbox.nudged.recv_timeout(PAUSE) == Err(RecvTimeoutError::Disconnected);
         for Message { frame, owed } in inbox.frames.try_iter() {
@@ -297,6 +307,18 @@ fn record(stream: &RecordingStream, target: &Target, inbox: MessageQueue, plots:
         if ends {
             break;
         }
+        if let Target::File { path, limit } = target
+            && measured.elapsed() >= MEASURE
+        {
+            measured = Instant::now();
+            if std::fs::metadata(path).is_ok_and(|file| file.len() >= *limit) {
+                warn!("{} has reached its limit of {limit} bytes: the recording ends here", path.display());
+                // The app is notified before the SDK closes the file.
+                drop(inbox);
+                recorder.end();
+                return;
+            }
+        }
         if sent.elapsed() >= columns {
             sent = Instant::now();
             tell(recorder.send(), 0, &mut failing);
@@ -325,7 +347,7 @@ impl Target {
     /// forever, also at its end.
     fn open(&self, builder: RecordingStreamBuilder) -> Option<RecordingStream> {
         let (port, spawn) = match self {
-            Self::File(path) => {
+            Self::File { path, .. } => {
                 let stream = builder.save(path);
                 return stream
                     .inspect_err(|error| error!("cannot record to {}: {error}", path.display()))

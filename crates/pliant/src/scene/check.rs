@@ -76,15 +76,20 @@ fn name(path: &[Step], name: &str) -> Checked {
     Err(fault(path, SceneErrorKind::Value, message))
 }
 
+/// Whether a path consists of names of folders and a file only, on every system, whatever system
+/// this is. A scene from someone else must not reach beyond its folder.
+///
+/// Windows separates by both slashes, ends a drive, a stream or an asset source by a colon, and
+/// takes `.. ` and `...` for `..` in places.
+fn is_below(file: &str) -> bool {
+    file.len() <= 1024
+        && !file.contains(|c: char| c == ':' || c.is_control())
+        && file.split(['/', '\\']).all(|part| !part.is_empty() && !part.ends_with(['.', ' ']))
+}
+
 /// Checks that a path stays under the folder of assets.
 fn asset(path: &[Step], file: &str, what: &str) -> Checked {
-    let good = !file.is_empty()
-        && file.len() <= 1024
-        && !file.starts_with(['/', '\\'])
-        && !file.contains("://")
-        && !file.chars().any(char::is_control)
-        && !file.split(['/', '\\']).any(|part| part == "..");
-    if good {
+    if is_below(file) {
         return Ok(());
     }
     let shown: String = file.chars().take(80).collect();
@@ -458,15 +463,8 @@ fn recording(scene: &SceneDescription) -> Checked {
         let message = "the recording goes nowhere; expected `file: \"NAME.rrd\"` or `viewer: true`";
         return Err(fault(&[Field("recording")], SceneErrorKind::Field, message));
     };
-    let path = std::path::Path::new(file);
-    // A scene from someone else must not write outside the working directory.
-    let below = path.components().all(|part| matches!(part, std::path::Component::Normal(_)));
-    let good = below
-        && !file.is_empty()
-        && file.len() <= 1024
-        && !file.chars().any(char::is_control)
-        && path.extension().is_some_and(|extension| extension == "rrd");
-    if good {
+    let extension = std::path::Path::new(file).extension();
+    if is_below(file) && extension.is_some_and(|extension| extension == "rrd") {
         return Ok(());
     }
     let shown: String = file.chars().take(80).collect();

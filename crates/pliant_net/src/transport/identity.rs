@@ -1,6 +1,8 @@
 //! Identities: Ed25519 keys, their fingerprints, and the checks made in the TLS handshake.
 
 use std::fmt;
+use std::io::Write;
+use std::path::{Path, PathBuf};
 use std::str::FromStr;
 use std::sync::{Arc, Mutex, PoisonError};
 
@@ -102,12 +104,20 @@ pub enum IdentityError {
         /// The text that was found instead, shortened.
         found: String,
     },
+    /// The file of the key cannot be read or created.
+    #[error("the key in {}: {source}", path.display())]
+    File {
+        /// Path of the file.
+        path: PathBuf,
+        /// Error of the operating system.
+        source: std::io::Error,
+    },
 }
 
 /// An Ed25519 key and the self-signed certificate that presents it in the handshake.
 ///
-/// Store [`Identity::to_pkcs8`] to stay the same user, or the same host behind the same invite, in
-/// later runs.
+/// Keep it in a file ([`Identity::at`]), or store [`Identity::to_pkcs8`], to stay the same user, or
+/// the same host behind the same invite, in later runs.
 pub struct Identity {
     certificate: CertificateDer<'static>,
     key: KeyPair,
@@ -127,6 +137,30 @@ impl Identity {
         let key = KeyPair::generate_for(&PKCS_ED25519)
             .map_err(|error| IdentityError::Generate(error.to_string()))?;
         Self::from_key(key)
+    }
+
+    /// Reads the key in a file, or makes a key and creates the file with it. A file that this
+    /// function creates was never readable for anyone but its owner (mode 0600, on Unix).
+    ///
+    /// # Errors
+    /// [`IdentityError::File`] when the file cannot be read or created, [`IdentityError::Key`] when
+    /// it holds no key, and [`IdentityError::Generate`].
+    pub fn at(path: impl AsRef<Path>) -> Result<Self, IdentityError> {
+        let path = path.as_ref();
+        let fail = |source| IdentityError::File { path: path.to_owned(), source };
+        match std::fs::read(path) {
+            Ok(der) => return Self::from_pkcs8(&der),
+            Err(error) if error.kind() == std::io::ErrorKind::NotFound => {}
+            Err(error) => return Err(fail(error)),
+        }
+        let made = Self::generate()?;
+        let mut options = std::fs::OpenOptions::new();
+        options.write(true).create_new(true);
+        #[cfg(unix)]
+        std::os::unix::fs::OpenOptionsExt::mode(&mut options, 0o600);
+        let mut file = options.open(path).map_err(fail)?;
+        file.write_all(&made.to_pkcs8()).and_then(|()| file.sync_all()).map_err(fail)?;
+        Ok(made)
     }
 
     /// Restores an identity from the bytes of [`Identity::to_pkcs8`].
@@ -274,6 +308,28 @@ mod tests {
         assert_eq!(identity.fingerprint(), again.fingerprint());
         assert_ne!(identity.fingerprint(), Identity::generate().unwrap().fingerprint());
         assert!(matches!(Identity::from_pkcs8(b"not a key"), Err(IdentityError::Key(_))));
+    }
+
+    #[test]
+    fn a_key_in_a_file_is_its_owners_only() {
+        let folder = std::env::temp_dir().join(format!("pliant_net-key-{}", std::process::id()));
+        std::fs::create_dir_all(&folder).unwrap();
+        let path = folder.join("key");
+        let made = Identity::at(&path).unwrap();
+        assert_eq!(Identity::at(&path).unwrap().fingerprint(), made.fingerprint());
+        #[cfg(unix)]
+        {
+            use std::os::unix::fs::PermissionsExt;
+            assert_eq!(path.metadata().unwrap().permissions().mode() & 0o777, 0o600);
+            // A link that waits for the key is not followed, or the key would be in another's file.
+            let (link, other) = (folder.join("link"), folder.join("other"));
+            std::os::unix::fs::symlink(&other, &link).unwrap();
+            assert!(matches!(Identity::at(&link), Err(IdentityError::File { .. })));
+            assert!(!other.exists());
+        }
+        std::fs::write(&path, "no key").unwrap();
+        assert!(matches!(Identity::at(&path), Err(IdentityError::Key(_))));
+        std::fs::remove_dir_all(folder).unwrap();
     }
 
     #[test]

@@ -7,7 +7,7 @@ use std::str::FromStr;
 use ring::rand::{SecureRandom, SystemRandom};
 use thiserror::Error;
 
-use super::identity::{Fingerprint, parse_hex, shortened, write_hex};
+use super::identity::{Fingerprint, parse_hex, write_hex};
 
 /// A secret of 16 random bytes that a guest presents to be admitted, written as 32 hexadecimal
 /// digits.
@@ -87,7 +87,7 @@ impl FromStr for Invite {
 
     fn from_str(text: &str) -> Result<Self, Self::Err> {
         let text = text.trim();
-        let wrong = |expected| InviteError::Malformed { expected, found: shortened(text) };
+        let wrong = |expected| InviteError::Malformed { expected, found: described(text) };
         let rest = text.strip_prefix(SCHEME).ok_or_else(|| wrong("`pliant://` at the start"))?;
         let (place, fingerprint) =
             rest.rsplit_once('#').ok_or_else(|| wrong("`#` and the host's fingerprint"))?;
@@ -122,16 +122,23 @@ impl FromStr for Invite {
 
 const SCHEME: &str = "pliant://";
 
+/// Describes a text that is no invite, without any of it. A mistyped invite still has its token,
+/// and errors reach logs and screens.
+fn described(text: &str) -> String {
+    let begins = if text.starts_with(SCHEME) { "" } else { "do not " };
+    format!("{} bytes that {begins}begin with `{SCHEME}`", text.len())
+}
+
 /// Why an invite could not be read or made.
 #[derive(Debug, Error, PartialEq, Eq)]
 #[non_exhaustive]
 pub enum InviteError {
     /// The text is not an invite.
-    #[error("not an invite: expected {expected}, as in `pliant://host:port#fingerprint`, found `{found}`")]
+    #[error("not an invite: expected {expected}, as in `pliant://host:port#fingerprint`, found {found}")]
     Malformed {
         /// The part that is missing or wrong.
         expected: &'static str,
-        /// The text that was found instead, shortened.
+        /// What was found instead, described without the text itself, which may hold a token.
         found: String,
     },
     /// The system's random source failed.
@@ -181,6 +188,28 @@ mod tests {
             let error = text.parse::<Invite>().unwrap_err().to_string();
             assert!(error.contains(expected), "{text}: {error}");
         }
+    }
+
+    #[test]
+    fn no_error_repeats_an_invite() {
+        let (token, key) = ("0c".repeat(16), "ab".repeat(32));
+        for text in [
+            format!("pliant://play.example.org:0/{token}#{key}"),
+            format!("pliant:/play.example.org:4433/{token}#{key}"),
+            format!("pliant://play.example.org:4433/{token}#{}", &key[1..]),
+            format!("pliant://play.example.org:4433/{token}0#{key}"),
+            format!("pliant://play.example.org:4433/{token}"),
+            format!("see {token}"),
+        ] {
+            let error = text.parse::<Invite>().unwrap_err();
+            for shown in [error.to_string(), format!("{error:?}")] {
+                assert!(!shown.contains(&token[..8]), "{shown}");
+                assert!(!shown.contains("example.org"), "{shown}");
+            }
+        }
+        let invite = Invite::new("192.0.2.7:4433".parse().unwrap(), Fingerprint([0xab; 32]));
+        let invite = invite.with_token(Token([0x0c; 16]));
+        assert!(!format!("{invite:?}").contains(&token[..8]), "{invite:?}");
     }
 
     #[test]

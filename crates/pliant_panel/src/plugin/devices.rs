@@ -71,6 +71,8 @@ impl Devices<'_, '_> {
                 LoopState::Calibrating => Some("waits for its calibration: no force".into()),
                 LoopState::Lost => Some("lost; it is looked for".into()),
                 LoopState::Stopped => Some("stopped: no force".into()),
+                LoopState::ForceOff => Some("its force is switched off at the device".into()),
+                LoopState::Hung => Some("its driver does not answer: its force was cut".into()),
                 other => Some(format!("{other:?}")),
             };
             ids.push(id);
