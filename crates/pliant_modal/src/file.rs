@@ -202,8 +202,8 @@ impl ModalModel {
 
     /// Writes a `.modal` file.
     ///
-    /// The data are written to a temporary file in the same folder, which is then renamed, so a
-    /// reader never sees half a file. A link to a file stays a link. If the path is not a regular
+    /// The data are written to a new temporary file in the same folder, which is then renamed, so a
+    /// reader never sees half a file. On Unix the folder is synced as well. A link to a file stays a link. If the path is not a regular
     /// file (a device, a pipe), the data are written directly into it.
     ///
     /// # Errors
@@ -221,20 +221,44 @@ fn write_whole(path: &Path, bytes: &[u8]) -> io::Result<()> {
     if fs::metadata(&goal).is_ok_and(|goal| !goal.is_file()) {
         return fs::OpenOptions::new().write(true).open(&goal)?.write_all(bytes);
     }
-    let mut partial = goal.file_name().ok_or(io::ErrorKind::InvalidFilename)?.to_owned();
-    // Two threads that write the same file use separate temporary files. The last rename wins.
-    static WRITES: AtomicU64 = AtomicU64::new(0);
-    let write = WRITES.fetch_add(1, Ordering::Relaxed);
-    partial.push(format!(".{}.{write}.partial", std::process::id()));
-    let partial = goal.with_file_name(partial);
-    fs::File::create(&partial)
-        .and_then(|mut file| file.write_all(bytes).and_then(|()| file.sync_all()))
+    let name = goal.file_name().ok_or(io::ErrorKind::InvalidFilename)?;
+    let (mut file, partial) = new_partial(&goal, name)?;
+    file.write_all(bytes)
+        .and_then(|()| file.sync_all())
         .and_then(|()| fs::rename(&partial, &goal))
         .inspect_err(|_| {
             // The first error is the one to report. A failure to remove the temporary file adds no
             // information.
             let _ = fs::remove_file(&partial);
-        })
+        })?;
+    // Not every file system syncs folders, and the file is there in any case.
+    #[cfg(unix)]
+    if let Some(folder) = goal.parent().filter(|folder| !folder.as_os_str().is_empty()) {
+        let _ = fs::File::open(folder).and_then(|folder| folder.sync_all());
+    }
+    Ok(())
+}
+
+/// Creates a temporary file beside `goal` that did not exist before. A file or link that waits at
+/// its name is neither followed nor overwritten.
+fn new_partial(goal: &Path, name: &std::ffi::OsStr) -> io::Result<(fs::File, std::path::PathBuf)> {
+    /// Most names that are tried, because files of killed writers may have them.
+    const MOST: usize = 1000;
+    // Two threads that write the same file use separate temporary files. The last rename wins.
+    static WRITES: AtomicU64 = AtomicU64::new(0);
+    let mut last = io::Error::from(io::ErrorKind::AlreadyExists);
+    for _ in 0..MOST {
+        let write = WRITES.fetch_add(1, Ordering::Relaxed);
+        let mut partial = name.to_owned();
+        partial.push(format!(".{}.{write}.partial", std::process::id()));
+        let partial = goal.with_file_name(partial);
+        match fs::OpenOptions::new().write(true).create_new(true).open(&partial) {
+            Ok(file) => return Ok((file, partial)),
+            Err(error) if error.kind() == io::ErrorKind::AlreadyExists => last = error,
+            Err(error) => return Err(error),
+        }
+    }
+    Err(last)
 }
 
 fn decode(payload: &[u8]) -> Result<ModelParts, FileError> {

@@ -114,6 +114,22 @@ fn a_link_stays_a_link_and_a_device_stays_a_device() {
     std::fs::remove_dir_all(folder).unwrap();
 }
 
+#[cfg(unix)]
+#[test]
+fn a_link_that_waits_at_the_temporary_name_is_not_followed() {
+    let folder = folder("planted");
+    let (path, victim) = (folder.join("rod.modal"), folder.join("victim"));
+    std::fs::write(&victim, "somebody else's").unwrap();
+    for number in 0..256 {
+        let partial = folder.join(format!("rod.modal.{}.{number}.partial", std::process::id()));
+        std::os::unix::fs::symlink(&victim, partial).unwrap();
+    }
+    rod::rod(1e6, 3, 0.02, false).write(&path).unwrap();
+    assert_eq!(std::fs::read_to_string(&victim).unwrap(), "somebody else's");
+    assert!(path.symlink_metadata().unwrap().is_file());
+    std::fs::remove_dir_all(folder).unwrap();
+}
+
 #[test]
 fn threads_that_write_one_file_leave_one_whole_file() {
     let folder = folder("threads");

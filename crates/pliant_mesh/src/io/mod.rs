@@ -254,7 +254,9 @@ fn write_text(path: &Path, text: &str) -> Result<(), MeshError> {
 /// Writes a file either completely or not at all.
 ///
 /// The function writes a temporary file in the same folder and then renames it, so that no reader
-/// sees a partial file. A link to a file stays a link. A path that is not a regular file (a device,
+/// sees a partial file. The temporary file is new: a file or link that waits at its name is neither
+/// followed nor overwritten. On Unix the folder is synced as well, so that the new name outlives a
+/// loss of power. A link to a file stays a link. A path that is not a regular file (a device,
 /// a pipe) is written directly.
 ///
 /// # Errors
@@ -268,23 +270,41 @@ pub fn write_whole(
     if fs::metadata(&goal).is_ok_and(|goal| !goal.is_file()) {
         return write(&mut fs::OpenOptions::new().write(true).open(&goal)?);
     }
-    let mut part =
-        goal.file_name().ok_or_else(|| std::io::Error::other("the path names no file"))?.to_owned();
+    let name = goal.file_name().ok_or_else(|| std::io::Error::other("the path names no file"))?;
+    let (mut file, part) = new_part(&goal, name)?;
+    write(&mut file).and_then(|()| file.sync_all()).and_then(|()| fs::rename(&part, &goal)).inspect_err(
+        |_| {
+            // The caller needs the first error.
+            let _ = fs::remove_file(&part);
+        },
+    )?;
+    // Not every file system syncs folders, and the file is there in any case.
+    #[cfg(unix)]
+    if let Some(folder) = goal.parent().filter(|folder| !folder.as_os_str().is_empty()) {
+        let _ = fs::File::open(folder).and_then(|folder| folder.sync_all());
+    }
+    Ok(())
+}
+
+/// Creates a temporary file beside `goal` that did not exist before.
+fn new_part(goal: &Path, name: &std::ffi::OsStr) -> std::io::Result<(fs::File, std::path::PathBuf)> {
+    /// Most names that are tried, because files of killed writers may have them.
+    const MOST: usize = 1000;
     // Two threads that write the same file use different temporary files, and the last rename wins.
     static WRITES: AtomicU64 = AtomicU64::new(0);
-    let number = WRITES.fetch_add(1, Ordering::Relaxed);
-    part.push(format!(".{}.{number}.part", std::process::id()));
-    let part = goal.with_file_name(part);
-    fs::File::create(&part)
-        .and_then(|mut file| {
-            write(&mut file)?;
-            file.sync_all()
-        })
-        .and_then(|()| fs::rename(&part, &goal))
-        .inspect_err(|_| {
-            // The caller needs the first error, and the temporary file may not even exist.
-            let _ = fs::remove_file(&part);
-        })
+    let mut last = std::io::Error::from(std::io::ErrorKind::AlreadyExists);
+    for _ in 0..MOST {
+        let number = WRITES.fetch_add(1, Ordering::Relaxed);
+        let mut part = name.to_owned();
+        part.push(format!(".{}.{number}.part", std::process::id()));
+        let part = goal.with_file_name(part);
+        match fs::OpenOptions::new().write(true).create_new(true).open(&part) {
+            Ok(file) => return Ok((file, part)),
+            Err(error) if error.kind() == std::io::ErrorKind::AlreadyExists => last = error,
+            Err(error) => return Err(error),
+        }
+    }
+    Err(last)
 }
 
 #[cfg(test)]
@@ -315,6 +335,22 @@ mod tests {
         write_msh(&null, &mesh).unwrap();
         assert!(fs::metadata("/dev/null").unwrap().file_type().is_char_device());
         assert_eq!(fs::read_dir(&folder).unwrap().count(), 3, "nothing is left over");
+        fs::remove_dir_all(folder).unwrap();
+    }
+
+    #[cfg(unix)]
+    #[test]
+    fn a_link_that_waits_at_the_temporary_name_is_not_followed() {
+        let folder = folder("planted");
+        let (path, victim) = (folder.join("ball.msh"), folder.join("victim"));
+        fs::write(&victim, "somebody else's").unwrap();
+        for number in 0..64 {
+            let part = folder.join(format!("ball.msh.{}.{number}.part", std::process::id()));
+            std::os::unix::fs::symlink(&victim, part).unwrap();
+        }
+        write_msh(&path, &shapes::sphere(4, 0.1).unwrap()).unwrap();
+        assert_eq!(fs::read_to_string(&victim).unwrap(), "somebody else's");
+        assert!(path.symlink_metadata().unwrap().is_file());
         fs::remove_dir_all(folder).unwrap();
     }
 
