@@ -4,10 +4,9 @@
 use std::fs;
 use std::io::Write;
 use std::path::{Path, PathBuf};
-use std::sync::atomic::{AtomicU64, Ordering};
 use std::time::{Duration, Instant, SystemTime};
 
-use pliant_mesh::{Surface, TetMesh};
+use pliant_mesh::{Surface, TetMesh, io::write_whole};
 use pliant_modal::{Damping, FORMAT_VERSION, ModalModel};
 
 use crate::{Bake, BakeConfig, BakeError, BakeTimes, Stage, bake};
@@ -16,6 +15,10 @@ use crate::{Bake, BakeConfig, BakeError, BakeTimes, Stage, bake};
 ///
 /// Raise the version with every change that alters the result of a bake of the same input.
 pub const METHOD_VERSION: u32 = 6;
+
+/// First bytes of a file of the cache. The [`BakeKey`] of its bake (32 bytes) and the model, as in a
+/// `.modal` file, follow.
+const MAGIC: [u8; 8] = *b"PLBAKE\x001";
 
 /// Age after which an unfinished file counts as abandoned by a writer that was killed.
 const ABANDONED: Duration = Duration::from_secs(3600);
@@ -116,11 +119,12 @@ impl Hasher {
     }
 }
 
-/// Folder of baked models, each a `.modal` file named by its [`BakeKey`].
+/// Folder of baked models, each a `.bake` file that is named by its [`BakeKey`] and contains it.
 ///
 /// Any number of programs may use one folder at the same time, because a file appears either
 /// complete or not at all. A file that was truncated, altered or replaced by another is rejected,
-/// and the model is baked again. When the folder exceeds its [`limit`](Self::with_limit) in bytes,
+/// and the model is baked again. A file that says that it belongs to this bake is believed: the
+/// folder must be writable by its user only. When the folder exceeds its [`limit`](Self::with_limit) in bytes,
 /// the least recently used files are removed.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct BakeCache {
@@ -158,30 +162,20 @@ impl BakeCache {
 
     /// Returns the path of the file for a key, whether or not the file exists.
     pub fn path(&self, key: BakeKey) -> PathBuf {
-        self.folder.join(format!("{key}.modal"))
+        self.folder.join(format!("{key}.bake"))
     }
 
-    /// Reads the model of a key, if the file exists and matches the input.
-    fn find(&self, key: BakeKey, mesh: &TetMesh, config: &BakeConfig) -> Option<ModalModel> {
+    /// Reads the model of a key, if the file exists and belongs to the key.
+    fn find(&self, key: BakeKey) -> Option<ModalModel> {
         let path = self.path(key);
         let file = fs::metadata(&path).ok()?;
         if !file.is_file() || file.len() > self.limit {
             return None;
         }
-        // The hash inside the file proves that the file is complete. The comparison below shows
-        // that it belongs to this bake.
-        let model = ModalModel::read(&path).ok()?;
-        let info = model.info();
-        let same = info.name == config.name
-            && info.element == config.element
-            && model.mode_count() == config.modes
-            && info.tets == mesh.tets.len()
-            && [info.young, info.poisson, info.density] == [config.young, config.poisson, config.density]
-            && info.damping == config.damping
-            && info.anchors.iter().cloned().eq(config.anchors.iter().map(ToString::to_string));
-        if !same {
-            return None;
-        }
+        let bytes = fs::read(&path).ok()?;
+        let model = bytes.strip_prefix(&MAGIC)?.strip_prefix(&key.0)?;
+        // The hash inside the model proves that the file is complete.
+        let model = ModalModel::from_bytes(model).ok()?;
         // The new modification time marks the file as recently used. A failure is ignored, so that
         // a read-only folder works too.
         if let Ok(file) = fs::File::options().append(true).open(&path) {
@@ -191,24 +185,16 @@ impl BakeCache {
     }
 
     fn keep(&self, key: BakeKey, model: &ModalModel) -> std::io::Result<()> {
-        static NEXT: AtomicU64 = AtomicU64::new(0);
         let bytes = model.to_bytes();
-        if bytes.len() as u64 > self.limit {
+        if (MAGIC.len() + key.0.len() + bytes.len()) as u64 > self.limit {
             return Ok(());
         }
         fs::create_dir_all(&self.folder)?;
-        // The temporary name is unique to this writer. The file lies in the same folder, so that
-        // the rename is atomic.
-        let number = NEXT.fetch_add(1, Ordering::Relaxed);
-        let partial = self.folder.join(format!("{key}.{}.{number}.partial", std::process::id()));
-        let written = fs::File::create(&partial)
-            .and_then(|mut file| file.write_all(&bytes).and_then(|()| file.sync_all()))
-            .and_then(|()| fs::rename(&partial, self.path(key)));
-        if written.is_err() {
-            // The caller needs the first error, so a second error is ignored.
-            let _ = fs::remove_file(&partial);
-        }
-        written?;
+        write_whole(&self.path(key), |file| {
+            file.write_all(&MAGIC)?;
+            file.write_all(&key.0)?;
+            file.write_all(&bytes)
+        })?;
         self.prune(key)
     }
 
@@ -227,9 +213,11 @@ impl BakeCache {
             if !file.is_file() || !ours {
                 continue;
             }
-            if name.ends_with(".partial") && now.duration_since(used).is_ok_and(|age| age > ABANDONED) {
+            // Earlier versions left `.modal` and `.partial` files.
+            let unfinished = name.ends_with(".part") || name.ends_with(".partial");
+            if unfinished && now.duration_since(used).is_ok_and(|age| age > ABANDONED) {
                 let _ = fs::remove_file(&path);
-            } else if name.ends_with(".modal") && path != self.path(newest) {
+            } else if (name.ends_with(".bake") || name.ends_with(".modal")) && path != self.path(newest) {
                 kept.push((used, path, file.len()));
             }
         }
@@ -279,7 +267,7 @@ pub fn bake_cached(
     let begun = Instant::now();
     let key = BakeKey::new(mesh, skin, config);
     if config.export_matrices.is_none()
-        && let Some(model) = cache.find(key, mesh, config)
+        && let Some(model) = cache.find(key)
     {
         progress(Stage::Surface, 1.0);
         let times = BakeTimes { total: begun.elapsed().as_secs_f64(), ..Default::default() };
@@ -424,6 +412,22 @@ mod tests {
         fs::write(folder.0.join("file"), "").unwrap();
         let kept = made(&blocked, &config());
         assert!(kept.not_kept.is_some() && kept.bake.model == truth);
+    }
+
+    #[test]
+    fn a_file_that_answers_for_another_key_is_baked_again() {
+        // All that the file says of itself is the same: only the mesh is another.
+        let folder = Folder::new();
+        let cache = BakeCache::new(&folder.0);
+        let other = shapes::bar([4, 2, 2], [0.4, 0.2, 0.3]).unwrap();
+        let truth = made(&cache, &config()).bake.model;
+        let foreign = bake_cached(&cache, &other, None, &config(), &mut |_, _| ()).unwrap().bake.model;
+        assert_ne!(truth, foreign);
+        let paths = [&bar(), &other].map(|mesh| cache.path(BakeKey::new(mesh, None, &config())));
+        fs::copy(&paths[1], &paths[0]).unwrap();
+        let again = made(&cache, &config());
+        assert!(again.bake.model == truth, "the other mesh's model is given for this one");
+        assert!(!again.cached && made(&cache, &config()).cached, "baked again, and put right");
     }
 
     #[test]
