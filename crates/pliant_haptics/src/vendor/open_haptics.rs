@@ -17,6 +17,7 @@
 
 use std::{
     ffi::{CString, c_char, c_int, c_uchar, c_uint, c_ulong, c_ushort, c_void},
+    mem::ManuallyDrop,
     path::PathBuf,
     sync::{
         Arc, Mutex, PoisonError,
@@ -179,7 +180,9 @@ pub struct OpenHaptics {
     held: Option<bool>,
     /// Whether the switch has ever been seen closed. What an open one means before is not known.
     was_held: bool,
-    /// Whether the scheduler did not run the last frame.
+    frame: ManuallyDrop<Box<ScheduledFrame>>,
+    /// Whether the scheduler did not run the last frame. The frame is its own until the scheduler
+    /// has been stopped and the device opened again.
     dead: bool,
 }
 
@@ -250,9 +253,10 @@ impl StopHandle for HdStop {
     }
 }
 
-/// Input and output of a callback.
-struct ScheduledFrame<'a> {
-    switch: &'a ForceSwitch,
+/// Input and output of a callback. The device keeps it at one place in memory, because a scheduler
+/// that is stuck may run the callback late.
+struct ScheduledFrame {
+    switch: Arc<ForceSwitch>,
     device: Handle,
     force: [f64; 3],
     /// Whether the force is to be zero, because it comes back or ends.
@@ -338,6 +342,22 @@ impl OpenHaptics {
             obeyed: AtomicBool::new(false),
             _library: Arc::new(library),
         });
+        let frame = ScheduledFrame {
+            switch: switch.clone(),
+            device: INVALID,
+            force: [0.0; 3],
+            idle: true,
+            leave: false,
+            held: None,
+            was_held: false,
+            ran: false,
+            force_on: false,
+            position: [0.0; 3],
+            velocity: [0.0; 3],
+            transform: [0.0; 16],
+            buttons: 0,
+            error: ErrorInfo::default(),
+        };
         let mut device = Self {
             api,
             handle: None,
@@ -348,6 +368,7 @@ impl OpenHaptics {
             late: false,
             held: None,
             was_held: false,
+            frame: ManuallyDrop::new(Box::new(frame)),
             dead: false,
         };
         device.connect()?;
@@ -404,7 +425,7 @@ impl OpenHaptics {
 
     fn disconnect(&mut self) {
         let Some(handle) = self.handle else { return };
-        let left = !self.dead && !matches!(self.frame([0.0; 3], true), Err(Fault::NotRun));
+        let left = !matches!(self.frame([0.0; 3], true), Err(Fault::NotRun));
         self.switch.handle.store(INVALID, Ordering::Release);
         self.handle = None;
         let mut scheduler = SCHEDULER.lock().unwrap_or_else(PoisonError::into_inner);
@@ -426,35 +447,26 @@ impl OpenHaptics {
     /// Runs one frame on the servo thread. With `leave` the force output is switched off after it.
     fn frame(&mut self, force: [f64; 3], leave: bool) -> Result<Sample, Fault> {
         let device = self.handle.ok_or(Fault::Gone)?;
-        let mut frame = ScheduledFrame {
-            switch: &self.switch,
-            device,
-            force,
-            idle: leave || self.late || self.renewal.has_lapsed(),
-            leave,
-            held: self.held,
-            was_held: self.was_held,
-            ran: false,
-            force_on: false,
-            position: [f64::NAN; 3],
-            velocity: [0.0; 3],
-            transform: [0.0; 16],
-            buttons: 0,
-            error: ErrorInfo::default(),
-        };
-        // SAFETY: the call returns after the callback or without it, the frame lives that long, and
-        // nothing else accesses it.
-        unsafe { (self.api.run)(servo, (&raw mut frame).cast(), PRIORITY) };
-        let (ran, was_dead) = (frame.ran, self.dead);
-        self.dead = !ran;
-        if !ran {
-            // The call has returned without having run the callback, and maybe without an error.
+        if self.dead {
+            return Err(Fault::NotRun);
+        }
+        let frame = &mut **self.frame;
+        (frame.device, frame.force, frame.leave) = (device, force, leave);
+        frame.idle = leave || self.late || self.renewal.has_lapsed();
+        (frame.held, frame.was_held) = (self.held, self.was_held);
+        (frame.ran, frame.force_on, frame.buttons) = (false, false, 0);
+        (frame.position, frame.velocity, frame.transform) = ([f64::NAN; 3], [0.0; 3], [0.0; 16]);
+        frame.error = ErrorInfo::default();
+        // SAFETY: the call returns after the callback or without it. In the second case the frame is
+        // not touched again until the scheduler was stopped, and it is never freed.
+        unsafe { (self.api.run)(servo, (&raw mut *frame).cast(), PRIORITY) };
+        if !frame.ran {
+            // The call has returned without having run the callback, and maybe without an error. The
+            // motors still have the last force.
+            self.dead = true;
             // SAFETY: the library is loaded.
             let _ = unsafe { self.api.drain() };
-            if !was_dead {
-                // The motors still have the last force.
-                HdStop(self.switch.clone()).cut();
-            }
+            HdStop(self.switch.clone()).cut();
             return Err(Fault::NotRun);
         }
         self.held = frame.held;
@@ -616,6 +628,10 @@ impl Drop for OpenHaptics {
     fn drop(&mut self) {
         self.safe_stop();
         self.disconnect();
+        if !self.dead {
+            // SAFETY: the scheduler has run the last frame, and nothing uses the frame after this.
+            unsafe { ManuallyDrop::drop(&mut self.frame) };
+        }
     }
 }
 
