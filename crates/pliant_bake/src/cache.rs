@@ -280,7 +280,7 @@ pub fn bake_cached(
 
 #[cfg(test)]
 mod tests {
-    use std::sync::atomic::AtomicUsize;
+    use std::sync::atomic::{AtomicUsize, Ordering};
 
     use pliant_mesh::shapes;
     use pliant_modal::Element;
