@@ -16,8 +16,8 @@ use crate::{Bake, BakeConfig, BakeError, BakeTimes, Stage, bake};
 /// Raise the version with every change that alters the result of a bake of the same input.
 pub const METHOD_VERSION: u32 = 6;
 
-/// First bytes of a file of the cache. The [`BakeKey`] of its bake (32 bytes) and the model, as in a
-/// `.modal` file, follow.
+/// First bytes of a file of the cache. The [`BakeKey`] of its bake (32 bytes) and the model, as in
+/// a `.modal` file, follow.
 const MAGIC: [u8; 8] = *b"PLBAKE\x001";
 
 /// Age after which an unfinished file counts as abandoned by a writer that was killed.
@@ -124,8 +124,8 @@ impl Hasher {
 /// Any number of programs may use one folder at the same time, because a file appears either
 /// complete or not at all. A file that was truncated, altered or replaced by another is rejected,
 /// and the model is baked again. A file that says that it belongs to this bake is believed: the
-/// folder must be writable by its user only. When the folder exceeds its [`limit`](Self::with_limit) in bytes,
-/// the least recently used files are removed.
+/// folder must be writable by its user only. When the folder exceeds its
+/// [`limit`](Self::with_limit) in bytes, the least recently used files are removed.
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub struct BakeCache {
     folder: PathBuf,

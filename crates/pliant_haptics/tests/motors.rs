@@ -131,7 +131,8 @@ fn force_dimension_hangs() {
             game.pull(&library);
             hang_dhd(&library, true);
             let took = seconds_to_zero(|| motor(&library));
-            // The force does not come back while the call hangs, and then it comes back by the ramp.
+            // The force does not come back while the call hangs, and then it comes back by the
+            // ramp.
             std::thread::sleep(Duration::from_millis(100));
             let late = motor(&library);
             let report = game.publish();

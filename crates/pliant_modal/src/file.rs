@@ -203,8 +203,9 @@ impl ModalModel {
     /// Writes a `.modal` file.
     ///
     /// The data are written to a new temporary file in the same folder, which is then renamed, so a
-    /// reader never sees half a file. On Unix the folder is synced as well. A link to a file stays a link. If the path is not a regular
-    /// file (a device, a pipe), the data are written directly into it.
+    /// reader never sees half a file. On Unix the folder is synced as well. A link to a file stays
+    /// a link. If the path is not a regular file (a device, a pipe), the data are written directly
+    /// into it.
     ///
     /// # Errors
     /// Returns [`FileError::Io`] if the operating system refuses.

@@ -70,7 +70,8 @@ impl StopSwitch {
 /// A driver that does not return from `exchange` loses its force: a supervisor on another thread
 /// cuts it by the device's [`StopHandle`](crate::StopHandle) 25 ms after the last sign of life. The
 /// report then contains [`LoopState::Hung`] and [`Fault::Hung`] until the driver returns, and the
-/// force comes back by the ramp. The end of such a loop leaves the thread behind after half a second.
+/// force comes back by the ramp. The end of such a loop leaves the thread behind after half a
+/// second.
 pub struct HapticLoop {
     model: triple_buffer::Input<LocalModel>,
     report: triple_buffer::Output<LoopReport>,
@@ -281,8 +282,8 @@ impl HapticLoop {
         self.commands.push(LoopCommand::Modal(modal)).is_ok()
     }
 
-    /// Cuts the force at the loop's next period, or by the supervisor if the driver does not answer.
-    /// The stop is latched.
+    /// Cuts the force at the loop's next period, or by the supervisor if the driver does not
+    /// answer. The stop is latched.
     pub fn emergency_stop(&self) {
         self.stop.press();
     }

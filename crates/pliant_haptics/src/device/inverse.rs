@@ -294,7 +294,8 @@ impl HapticDevice for Inverse {
 
     fn exchange(&mut self, wrench: &Wrench, scheduler: &mut dyn Scheduler) -> Result<Sample, Fault> {
         scheduler.wait();
-        // The service may have let go of a force that was not renewed in time. It comes back at zero.
+        // The service may have let go of a force that was not renewed in time. It comes back at
+        // zero.
         let idle = self.late || self.renewal.has_lapsed();
         let force = if idle { [0.0; 3] } else { wrench.force };
         let answer = match self.ask(force) {

@@ -326,8 +326,8 @@ pub trait StopHandle: Send + Sync {
     fn cut(&self);
 }
 
-/// A haptic device. The device lives on the loop's thread, and only this thread calls it, except for
-/// its [`StopHandle`].
+/// A haptic device. The device lives on the loop's thread, and only this thread calls it, except
+/// for its [`StopHandle`].
 pub trait HapticDevice: Send {
     /// Returns the properties of the device. The loop calls this method when it starts and again
     /// after a [`reopen`](Self::reopen).

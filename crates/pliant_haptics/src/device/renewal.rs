@@ -2,8 +2,8 @@
 
 use std::time::{Duration, Instant};
 
-/// Longest time without a renewal for which a force counts as still on. After this time the device's
-/// own watchdog may have switched the force off.
+/// Longest time without a renewal for which a force counts as still on. After this time the
+/// device's own watchdog may have switched the force off.
 pub(crate) const LAPSE: Duration = Duration::from_millis(20);
 
 /// The time of the last command that carried a force.

@@ -145,8 +145,8 @@ impl HapticDevices {
     }
 
     /// Presses the emergency stop of all devices. Each loop exerts no force from its next period
-    /// on, or its supervisor cuts the force if the driver does not answer. The stop is latched until [`reset_stop`](Self::reset_stop), and it also applies to
-    /// devices that are added later.
+    /// on, or its supervisor cuts the force if the driver does not answer. The stop is latched
+    /// until [`reset_stop`](Self::reset_stop), and it also applies to devices that are added later.
     pub fn estop(&self) {
         self.stopped.store(true, Ordering::Release);
         for entry in &self.entries {

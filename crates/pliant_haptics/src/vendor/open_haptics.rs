@@ -6,8 +6,8 @@
 //! are in millimeters, forces in newtons.
 //!
 //! HDAPI takes work for its servo thread from any thread, so the supervisor schedules a callback
-//! that sends no force and switches the force output off. If the servo does not run it in 10 ms, the
-//! supervisor stops the scheduler. HDAPI has no call that sets the time of the hardware's own
+//! that sends no force and switches the force output off. If the servo does not run it in 10 ms,
+//! the supervisor stops the scheduler. HDAPI has no call that sets the time of the hardware's own
 //! watchdog. The maker's example `ErrorHandling` says that the hardware "needs frequent updates to
 //! stay alive"; how long it waits is not published.
 //!
@@ -457,12 +457,12 @@ impl OpenHaptics {
         (frame.ran, frame.force_on, frame.buttons) = (false, false, 0);
         (frame.position, frame.velocity, frame.transform) = ([f64::NAN; 3], [0.0; 3], [0.0; 16]);
         frame.error = ErrorInfo::default();
-        // SAFETY: the call returns after the callback or without it. In the second case the frame is
-        // not touched again until the scheduler was stopped, and it is never freed.
+        // SAFETY: the call returns after the callback or without it. In the second case the frame
+        // is not touched again until the scheduler was stopped, and it is never freed.
         unsafe { (self.api.run)(servo, (&raw mut *frame).cast(), PRIORITY) };
         if !frame.ran {
-            // The call has returned without having run the callback, and maybe without an error. The
-            // motors still have the last force.
+            // The call has returned without having run the callback, and maybe without an error.
+            // The motors still have the last force.
             self.dead = true;
             // SAFETY: the library is loaded.
             let _ = unsafe { self.api.drain() };
