@@ -15,8 +15,8 @@ use std::{
 use fakes::{ONE_HD, dhd, fake, hd, motor, open_fake, place, rise};
 use libloading::Library;
 use pliant_haptics::{
-    Fault, ForceDimension, HapticDevice, HapticLoop, LoopConfig, LoopEvent, LoopReport, LoopState,
-    OpenHaptics, SafetyConfig, StaleConfig, Wrench,
+    Fault, ForceDimension, ForceDimensionConfig, HapticDevice, HapticLoop, LoopConfig, LoopEvent, LoopReport,
+    LoopState, OpenHaptics, SafetyConfig, StaleConfig, Wrench,
 };
 
 #[path = "rig/fakes.rs"]
@@ -201,6 +201,29 @@ fn the_emergency_stop_works_while_a_call_hangs() {
         assert!(rise(&library) < 0.02, "by the ramp");
         took
     });
+}
+
+#[test]
+fn the_emergency_stop_ends_a_drive_to_the_reference() {
+    let path = fake("dhd", "drive", &["-DWITH_DRD"]);
+    let library = open_fake(&path);
+    place(&library, [0.0, 0.005, 0.0], 0.0);
+    let device = ForceDimension::open(ForceDimensionConfig { auto_init: true, ..dhd(&path) }).unwrap();
+    let mut game = Game::start(device);
+    game.pull(&library);
+    // The device goes, comes back without its reference, and drives through its workspace.
+    call!(library, "fake_slow_drive", fn(c_int), 1);
+    call!(library, "fake_gone", fn(c_int), 1);
+    call!(library, "fake_reset", fn(c_int), 0);
+    game.until("the device counts as lost", |report| report.state == LoopState::Lost);
+    call!(library, "fake_gone", fn(c_int), 0);
+    let drives = || call!(library, "fake_driving", fn() -> c_int,) == 1;
+    game.until("it drives", |_| drives());
+    game.running.emergency_stop();
+    let took = seconds_to_zero(|| f64::from(drives()));
+    println!("Force Dimension: the drive ends {:.1} ms after the emergency stop", 1e3 * took);
+    call!(library, "fake_slow_drive", fn(c_int), 0);
+    assert!(took < 4.0 * PROMISED, "{took} s");
 }
 
 /// Drops `game` on another thread, and returns the time that the drop took, s, if it was at most 5.

@@ -11,7 +11,7 @@
 struct state {
     double position[3], velocity[3], rotation[3][3], wrench[6], sent_at;
     int made, open, enabled, reset, error, major, buttons, gone, robotic, driving, drives, stuck;
-    int watchdog, expert, cause, user_off, hang, hung;
+    int watchdog, expert, cause, user_off, hang, hung, slow;
     double felt, rise;
 };
 static struct state own;
@@ -132,6 +132,8 @@ int drdAutoInit(char id) {
     if (result(id) < 0 || !s.robotic) return -1;
     s.driving = 1;
     s.drives++;
+    while (s.slow && s.driving) usleep(100); /* it drives until somebody ends it */
+    if (!s.driving) return -1;
     if (s.stuck) { s.error = 1008; return -1; }
     s.reset = 1;
     return 0;
@@ -153,6 +155,7 @@ void fake_turn_up(void) { /* a quarter turn about the maker's z */
 void fake_reset(int r) { s.reset = r; }
 void fake_major(int m) { s.major = m; }
 void fake_gone(int g) { s.gone = g; if (g) s.open = 0; }
+void fake_slow_drive(int on) { s.slow = on; }
 void fake_hang(int on) { s.hang = on; }
 int fake_hung(void) { return s.hung; }
 /* The button on the device that switches its force off. */
