@@ -8,7 +8,6 @@ use pliant_modal::{BakeInfo, ModalModel, ModelParts};
 use crate::blocks::{self, Tall};
 use crate::continuum::Continuum;
 use crate::cubature::{self, Training};
-use crate::element::Element;
 use crate::fem::{ANCHORED, FeMesh, LOCKING_POISSON, Law, Lists};
 use crate::lanczos::{self, Eigenpairs, Failure};
 use crate::ordering;
@@ -55,11 +54,6 @@ pub fn bake(
     progress: &mut dyn FnMut(Stage, f64),
 ) -> Result<Bake, BakeError> {
     config.check()?;
-    let element = match config.element {
-        pliant_modal::Element::Tet4 => Element::Tet4,
-        pliant_modal::Element::Tet10 => Element::Tet10,
-        other => return Err(BakeError::Element { got: other.to_string() }),
-    };
     if let Some(folder) = &config.export_matrices {
         matrix_market::check_folder(folder)?;
     }
@@ -70,7 +64,7 @@ pub fn bake(
     let mut times = BakeTimes::default();
 
     progress(Stage::Assemble, 0.0);
-    let fe = FeMesh::new(&mesh, element);
+    let fe = FeMesh::new(&mesh, config.element);
     let held = support::anchored_nodes(&fe, &config.anchors)?;
     let free_body = config.anchors.is_empty();
     check_mode_count(config.modes, &held, free_body)?;

@@ -1,10 +1,10 @@
 //! A hyperelastic continuum on finite elements: its energy, its nodal forces and its tangent.
 
 use nalgebra::{Matrix3, Vector3};
+use pliant_modal::tetrahedron::{self, MAX_NODES};
 use pliant_modal::{Hyperelastic, positive_tangent};
 use rayon::prelude::*;
 
-use crate::element::{self, MAX_NODES};
 use crate::fem::{ANCHORED, FeMesh};
 
 /// Tangent of an element as 3x3 blocks: block (i, j) is at `(i * MAX_NODES + j) * 9`.
@@ -37,7 +37,7 @@ impl Continuum<'_> {
         mut visit: impl FnMut(f64, &[Vector3<f64>], &[Matrix3<f64>]),
     ) {
         let (nodes, affine) = (self.nodes(index), &self.fe.affine[index]);
-        let (points, share) = element::stiffness_points(self.fe.element);
+        let (points, share) = tetrahedron::stiffness_points(self.fe.element);
         for &point in points {
             let g = affine.shape_gradients(self.fe.element, point).map(Vector3::from);
             gradients.fill(Matrix3::zeros());
@@ -79,7 +79,7 @@ impl Continuum<'_> {
     ) {
         let per = self.fe.element.node_count();
         let (at, affine) = (self.of_element(index, u), &self.fe.affine[index]);
-        let (points, share) = element::stiffness_points(self.fe.element);
+        let (points, share) = tetrahedron::stiffness_points(self.fe.element);
         for &point in points {
             let g = affine.shape_gradients(self.fe.element, point).map(Vector3::from);
             let h = at.iter().zip(&g[..per]).fold(Matrix3::zeros(), |sum, (u, g)| sum + u * g.transpose());

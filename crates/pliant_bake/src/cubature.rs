@@ -101,7 +101,7 @@ pub(crate) fn train(
 fn points(training: &Training<'_>, most: usize) -> Vec<Point> {
     let (continuum, m) = (&training.continuum, training.coordinates.lambda.len());
     let elements = continuum.fe.affine.len();
-    let per = crate::element::stiffness_points(continuum.fe.element).0.len();
+    let per = pliant_modal::tetrahedron::stiffness_points(continuum.fe.element).0.len();
     let stride = (elements * per).div_ceil(most).max(1);
     // Elements in the order of a coarse grid lie beside each other, so that each stretch of the
     // list is a place of the body.

@@ -1,6 +1,6 @@
 //! Locates points in the tetrahedra with a uniform grid over their bounding boxes.
 
-use crate::element::{dot, sub};
+use pliant_modal::tetrahedron::{dot, sub};
 use crate::fem::FeMesh;
 
 /// Nearest point of an element to a query point.
@@ -190,7 +190,7 @@ fn nearest_on_triangle([a, b, c]: [[f64; 3]; 3], p: [f64; 3]) -> [f64; 3] {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::element::Element;
+    use pliant_modal::Element;
 
     #[test]
     fn finds_points_inside_and_the_nearest_place_outside() {

@@ -33,12 +33,6 @@ pub enum BakeError {
         /// Number of rigid modes: 6 for a free body, 0 for an anchored one.
         rigid: usize,
     },
-    /// The crate has no matrices for this element.
-    #[error("element: expected tet4 or tet10, got {got}")]
-    Element {
-        /// Name of the requested element.
-        got: String,
-    },
     /// The tetrahedra are not a valid mesh.
     #[error("the tetrahedra: {0}")]
     Mesh(#[source] MeshError),

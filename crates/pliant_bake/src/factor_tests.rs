@@ -1,5 +1,5 @@
 use super::*;
-use crate::element::Element;
+use pliant_modal::Element;
 use crate::fem::{ANCHORED, FeMesh, Law};
 use crate::{ordering, symbolic};
 /// Makes a bar with its face x = 0 anchored, in elimination order.

@@ -4,9 +4,11 @@
 //! added in element order.
 
 use pliant_mesh::TetMesh;
+use pliant_modal::Element;
+use pliant_modal::tetrahedron::{Affine, EDGES, MAX_NODES};
 use rayon::prelude::*;
 
-use crate::element::{self, Affine, EDGES, Element, MAX_NODES};
+use crate::element;
 use crate::sparse::BlockCsr;
 
 /// Row number that marks an anchored node.

@@ -317,7 +317,7 @@ mod tests {
 
     use super::*;
     use crate::bake::{elimination_order, law};
-    use crate::element::Element;
+    use pliant_modal::Element;
     use crate::fem::FeMesh;
     use crate::symbolic::Symbolic;
     use crate::{BakeConfig, support};

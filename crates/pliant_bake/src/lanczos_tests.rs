@@ -2,7 +2,7 @@ use pliant_mesh::{TetMesh, shapes};
 
 use super::*;
 use crate::bake::elimination_order;
-use crate::element::Element;
+use pliant_modal::Element;
 use crate::factor::tests::bar;
 use crate::fem::{FeMesh, Law, Lists};
 use crate::rigid::MassProperties;

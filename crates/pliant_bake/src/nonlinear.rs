@@ -17,12 +17,12 @@
 
 use nalgebra::{DMatrix, DVector};
 use pliant_mesh::TetMesh;
-use pliant_modal::{Material, Patch};
+use pliant_modal::tetrahedron::MAX_NODES;
+use pliant_modal::{Element, Material, Patch};
 use rayon::prelude::*;
 
 use crate::bake::{elimination_order, law};
 use crate::continuum::Continuum;
-use crate::element::{Element, MAX_NODES};
 use crate::factor::Factor;
 use crate::fem::{ANCHORED, FeMesh};
 use crate::sparse::BlockCsr;
@@ -130,11 +130,7 @@ pub fn deflect(
     mesh.check().map_err(BakeError::Mesh)?;
     let mut mesh = mesh.clone();
     mesh.drop_unused_nodes();
-    let element = match config.element {
-        pliant_modal::Element::Tet4 => Element::Tet4,
-        _ => Element::Tet10,
-    };
-    let fe = FeMesh::new(&mesh, element);
+    let fe = FeMesh::new(&mesh, config.element);
     let held = support::anchored_nodes(&fe, &config.anchors)?;
     let graph = fe.graph(false);
     support::check_connected(&fe, &graph, &held, &config.anchors)?;

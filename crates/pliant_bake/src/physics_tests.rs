@@ -5,7 +5,7 @@ use pliant_mesh::{TetMesh, shapes};
 use pliant_modal::Patch;
 
 use crate::bake::{accuracy, elimination_order, law};
-use crate::element::Element;
+use pliant_modal::Element;
 use crate::fem::{ANCHORED, FeMesh};
 use crate::rigid::MassProperties;
 use crate::solver::Solver;

@@ -2,7 +2,7 @@
 
 use nalgebra::{Matrix3, SymmetricEigen, Vector3};
 
-use crate::element::cross;
+use pliant_modal::tetrahedron::cross;
 use crate::fem::FeMesh;
 
 /// Mass, center of mass and inertia of the body at rest.

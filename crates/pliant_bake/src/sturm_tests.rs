@@ -1,5 +1,5 @@
 use super::*;
-use crate::element::Element;
+use pliant_modal::Element;
 use crate::factor::tests::bar;
 use crate::lanczos;
 use crate::solver::Solver;

@@ -2,10 +2,10 @@
 
 use pliant_mesh::{Surface, TetMesh};
 use pliant_modal::SurfaceMesh;
+use pliant_modal::tetrahedron::{self, MAX_NODES};
 use rayon::prelude::*;
 
 use crate::BakeError;
-use crate::element::{self, MAX_NODES};
 use crate::embedding::Locator;
 use crate::fem::{ANCHORED, FeMesh, Lists};
 
@@ -141,7 +141,7 @@ fn half_curl(
             let u = &phi[3 * row as usize * modes..][..3 * modes];
             for (mode, out) in out.chunks_exact_mut(3).enumerate() {
                 let u = [u[mode], u[modes + mode], u[2 * modes + mode]];
-                let curl = element::cross(*g, u);
+                let curl = tetrahedron::cross(*g, u);
                 for k in 0..3 {
                     out[k] += 0.5 * affine.volume * curl[k];
                 }
@@ -159,7 +159,7 @@ fn corner_or_middle(local: usize) -> [f64; 4] {
     if local < 4 {
         l[local] = 1.0;
     } else {
-        for a in element::EDGES[local - 4] {
+        for a in tetrahedron::EDGES[local - 4] {
             l[a] = 0.5;
         }
     }
@@ -189,10 +189,10 @@ fn embed(mesh: &FeMesh, skin: &Surface) -> Result<(Rows, Rows), BakeError> {
                 return Err(far(place.distance()));
             }
             let nodes = &mesh.connectivity[place.element * per..][..per];
-            let shape = element::shape(mesh.element, place.barycentric);
+            let shape = tetrahedron::shape(mesh.element, place.barycentric);
             let gradients = mesh.affine[place.element].shape_gradients(mesh.element, place.barycentric);
             let displacement = (0..per)
-                .map(|i| (nodes[i], shape[i] + element::dot(gradients[i], place.offset)))
+                .map(|i| (nodes[i], shape[i] + tetrahedron::dot(gradients[i], place.offset)))
                 .filter(|(_, w)| *w != 0.0)
                 .collect();
             let rotation =

@@ -52,6 +52,7 @@ mod relaxation;
 mod simd;
 mod step;
 mod surface;
+pub mod tetrahedron;
 mod warp;
 
 pub use basis::{BLOCK, Basis, Precision, ROWS};

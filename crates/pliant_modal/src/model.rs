@@ -14,13 +14,22 @@ use crate::{
 /// The finite element of a bake.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "lowercase")]
-#[non_exhaustive]
 pub enum Element {
     /// 4-node (linear) tetrahedra, as in Tang et al. 2013. They are 20-40 % too stiff in bending on
     /// coarse meshes.
     Tet4,
     /// 10-node (quadratic) tetrahedra, the default.
     Tet10,
+}
+
+impl Element {
+    /// Number of nodes of one element, 4 or 10.
+    pub const fn node_count(self) -> usize {
+        match self {
+            Self::Tet4 => 4,
+            Self::Tet10 => 10,
+        }
+    }
 }
 
 impl std::fmt::Display for Element {
