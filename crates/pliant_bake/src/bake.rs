@@ -3,7 +3,8 @@
 use std::time::Instant;
 
 use pliant_mesh::{Surface, TetMesh};
-use pliant_modal::{BakeInfo, ModalModel, ModelParts};
+use pliant_modal::tetrahedron::Affine;
+use pliant_modal::{BakeInfo, ModalModel, ModelParts, ReducedElasticity, SimulationMesh};
 
 use crate::blocks::{self, Tall};
 use crate::continuum::Continuum;
@@ -113,7 +114,8 @@ pub fn bake(
         let (coordinates, young) = (&modes, config.young);
         let training = Training { continuum, coordinates, material, young, patches: &patches, size };
         let mut report = |share| progress(Stage::Material, 0.3 + 0.7 * share);
-        reduced = Some(cubature::train(&training, &mut report)?);
+        let mesh = simulation_mesh(&mesh, &fe, &modes, &number, &skin);
+        reduced = Some(ReducedElasticity { mesh, ..cubature::train(&training, &mut report)? });
         times.material = clock.lap();
     }
     progress(Stage::Surface, 0.0);
@@ -159,6 +161,40 @@ pub fn bake(
     times.total = times.assemble + times.factor + times.modes + times.material + times.surface;
     progress(Stage::Surface, 1.0);
     Ok(Bake { model, times })
+}
+
+/// Returns the mesh from which hands get the own shapes of the patches that they hold.
+///
+/// Returns `None` for a mesh of too many elements, whose model would be too large, and for one with
+/// an element that is flat in single precision.
+fn simulation_mesh(
+    mesh: &TetMesh,
+    fe: &FeMesh,
+    modes: &Eigenpairs,
+    number: &[u32],
+    skin: &Skin,
+) -> Option<SimulationMesh> {
+    if mesh.tets.len() > SimulationMesh::MOST_TETS {
+        return None;
+    }
+    let corners: Vec<[f32; 3]> = mesh.nodes.iter().map(|p| p.map(|x| x as f32)).collect();
+    let corner = |c: u32| corners[c as usize].map(f64::from);
+    if mesh.tets.iter().any(|tet| Affine::new(tet.map(corner)).volume <= 0.0) {
+        return None;
+    }
+    let count = modes.lambda.len();
+    let anchored = vec![0.0; 3 * count];
+    let values: Vec<f64> = number[..fe.nodes.len()]
+        .iter()
+        .flat_map(|&row| match row {
+            ANCHORED => &anchored[..],
+            row => &modes.phi[3 * row as usize * count..][..3 * count],
+        })
+        .copied()
+        .collect();
+    let (scales, displacements) = SimulationMesh::quantized(&values, count);
+    let vertices = skin.places.clone();
+    Some(SimulationMesh { corners, tets: mesh.tets.clone(), scales, displacements, vertices })
 }
 
 fn no_modes(failure: Failure) -> BakeError {

@@ -5,7 +5,7 @@
 
 use pliant_mesh::TetMesh;
 use pliant_modal::Element;
-use pliant_modal::tetrahedron::{Affine, EDGES, MAX_NODES};
+use pliant_modal::tetrahedron::{self, Affine, MAX_NODES};
 use rayon::prelude::*;
 
 use crate::element;
@@ -38,28 +38,11 @@ impl FeMesh {
         let affine = mesh.tets.par_iter().map(|t| Affine::new(t.map(corner))).collect();
         let mut nodes = mesh.nodes.clone();
         let corners = nodes.len();
-        let connectivity = match element {
-            Element::Tet4 => mesh.tets.iter().flatten().copied().collect(),
-            Element::Tet10 => {
-                let key = |t: &[u32; 4], [a, b]: [usize; 2]| {
-                    let (low, high) = (t[a].min(t[b]), t[a].max(t[b]));
-                    (u64::from(low) << 32) | u64::from(high)
-                };
-                let mut edges: Vec<u64> =
-                    mesh.tets.iter().flat_map(|t| EDGES.map(|edge| key(t, edge))).collect();
-                edges.par_sort_unstable();
-                edges.dedup();
-                nodes.extend(edges.iter().map(|&edge| {
-                    let (a, b) = (corner((edge >> 32) as u32), corner(edge as u32));
-                    [0, 1, 2].map(|k| 0.5 * (a[k] + b[k]))
-                }));
-                let number = |edge: u64| (corners + edges.partition_point(|&e| e < edge)) as u32;
-                mesh.tets
-                    .par_iter()
-                    .flat_map_iter(|t| t.iter().copied().chain(EDGES.map(|edge| number(key(t, edge)))))
-                    .collect()
-            }
-        };
+        let (connectivity, edges) = tetrahedron::connectivity(corners, &mesh.tets, element);
+        nodes.extend(edges.iter().map(|&[a, b]| {
+            let (a, b) = (corner(a), corner(b));
+            [0, 1, 2].map(|k| 0.5 * (a[k] + b[k]))
+        }));
         Self { element, nodes, corners, connectivity, affine }
     }
 

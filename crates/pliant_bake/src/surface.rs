@@ -1,7 +1,7 @@
 //! The visible surface and the mode shapes on it.
 
 use pliant_mesh::{Surface, TetMesh};
-use pliant_modal::SurfaceMesh;
+use pliant_modal::{SurfaceMesh, VertexPlace};
 use pliant_modal::tetrahedron::{self, MAX_NODES};
 use rayon::prelude::*;
 
@@ -17,6 +17,8 @@ const SKIN_REACH: f64 = 0.1;
 #[derive(Clone, Debug)]
 pub(crate) struct Skin {
     pub(crate) mesh: SurfaceMesh,
+    /// Places of the vertices in the tetrahedra.
+    pub(crate) places: Vec<VertexPlace>,
     displacement: Vec<Vec<(u32, f64)>>,
     rotation: Vec<Vec<(u32, f64)>>,
 }
@@ -32,16 +34,24 @@ impl Skin {
         skin: Option<&Surface>,
         number: &[u32],
     ) -> Result<Self, BakeError> {
-        let (surface, displacement, rotation) = match skin {
+        let (surface, displacement, rotation, places) = match skin {
             None => {
                 let (surface, nodes) = tets.boundary();
                 let own: Vec<Vec<(u32, f64)>> = nodes.iter().map(|&n| vec![(n, 1.0)]).collect();
-                (surface, own.clone(), own)
+                let mut place = vec![VertexPlace::default(); tets.nodes.len()];
+                for (element, corners) in tets.tets.iter().enumerate() {
+                    for (k, &corner) in corners.iter().enumerate() {
+                        let at = std::array::from_fn(|i| f32::from(u8::from(i + 1 == k)));
+                        place[corner as usize] = VertexPlace { element: element as u32, at, offset: [0.0; 3] };
+                    }
+                }
+                let places = nodes.iter().map(|&node| place[node as usize]).collect();
+                (surface, own.clone(), own, places)
             }
             Some(skin) => {
                 skin.check().map_err(BakeError::Skin)?;
-                let (displacement, rotation) = embed(mesh, skin)?;
-                (skin.clone(), displacement, rotation)
+                let (displacement, rotation, places) = embed(mesh, skin)?;
+                (skin.clone(), displacement, rotation, places)
             }
         };
         let anchored = displacement
@@ -50,7 +60,7 @@ impl Skin {
             .collect();
         let positions = surface.positions.iter().map(|p| p.map(|x| x as f32)).collect();
         let mesh = SurfaceMesh::new(positions, surface.triangles, surface.uvs, anchored)?;
-        Ok(Self { mesh, displacement, rotation })
+        Ok(Self { mesh, places, displacement, rotation })
     }
 
     /// Returns the lowest matrix row that moves `vertex`, or `ANCHORED` when no row does.
@@ -168,7 +178,7 @@ fn corner_or_middle(local: usize) -> [f64; 4] {
 
 type Rows = Vec<Vec<(u32, f64)>>;
 
-fn embed(mesh: &FeMesh, skin: &Surface) -> Result<(Rows, Rows), BakeError> {
+fn embed(mesh: &FeMesh, skin: &Surface) -> Result<(Rows, Rows, Vec<VertexPlace>), BakeError> {
     let locator = Locator::new(mesh);
     let size = {
         let [low, high] = [f64::min, f64::max].map(|pick| {
@@ -197,10 +207,12 @@ fn embed(mesh: &FeMesh, skin: &Surface) -> Result<(Rows, Rows), BakeError> {
                 .collect();
             let rotation =
                 (0..4).map(|a| (nodes[a], place.barycentric[a])).filter(|(_, w)| *w != 0.0).collect();
-            Ok((displacement, rotation))
+            let [_, at @ ..] = place.barycentric.map(|x| x as f32);
+            let offset = place.offset.map(|x| x as f32);
+            Ok((displacement, rotation, VertexPlace { element: place.element as u32, at, offset }))
         })
         .collect();
-    Ok(rows?.into_iter().unzip())
+    Ok(rows?.into_iter().collect())
 }
 
 const _: () = assert!(MAX_NODES == 10, "`corner_or_middle` knows corners and mid-edge nodes");

@@ -4,7 +4,7 @@ use std::{sync::Arc, time::Instant};
 
 use nalgebra::{Matrix3, Vector3};
 use pliant_modal::{
-    Body, BodyConfig, Elasticity, GrabConfig, Material, ModalModel, ModelError, Patch, StepSettings,
+    Body, BodyConfig, Elasticity, GrabConfig, HeldShapes, Material, ModalModel, ModelError, Patch, StepSettings,
 };
 use serde::Serialize;
 
@@ -58,6 +58,9 @@ pub struct Pulled {
     pub elasticity: Elasticity,
     /// Material of the reduced elasticity. `None` with linear elasticity.
     pub material: Option<Material>,
+    /// Time in which the own shapes of the held patch were made, ms. `None` without such shapes:
+    /// with linear elasticity, and for a model without its simulation mesh.
+    pub shapes_ms: Option<f64>,
     /// Whether the body came to rest: whether its speeds and the change of the force fell below a
     /// millionth of what they were.
     pub at_rest: bool,
@@ -105,6 +108,14 @@ pub fn pull(model: &Arc<ModalModel>, pull: &Pull) -> Result<Pulled, LabError> {
     }
     let patch = Patch::around(model.surface(), closest as u32, pull.radius)?;
     let grab = body.grab(&patch, GrabConfig::default())?;
+    let begun = Instant::now();
+    let shapes = if elasticity == Elasticity::Reduced {
+        HeldShapes::new(model, std::slice::from_ref(&patch))?.map(Arc::new)
+    } else {
+        None
+    };
+    let shapes_ms = shapes.as_ref().map(|_| begun.elapsed().as_secs_f64() * 1e3);
+    body.set_held_shapes(shapes);
     let start = Vector3::from(body.grab_position(grab)?);
     let by = Vector3::from(pull.by);
 
@@ -173,6 +184,7 @@ pub fn pull(model: &Arc<ModalModel>, pull: &Pull) -> Result<Pulled, LabError> {
         step_us: percentiles(times),
         elasticity,
         material: if elasticity == Elasticity::Reduced { model.material() } else { None },
+        shapes_ms,
         at_rest,
         surface,
     })

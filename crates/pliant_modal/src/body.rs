@@ -5,7 +5,7 @@ use std::sync::Arc;
 use nalgebra::Vector3;
 
 use crate::{
-    Contacts, Frame, GrabConfig, Hand, HeldPatch, Hold, Kernel, Load, ModalModel, Obstacle, Patch, Precision,
+    Contacts, Frame, GrabConfig, Hand, HeldPatch, HeldShapes, Hold, Kernel, Load, ModalModel, Obstacle, Patch, Precision,
     State, StepError, StepReport, StepSettings,
     error::finite,
     step::{Six, tangent},
@@ -284,8 +284,23 @@ impl Body {
         if let Ok(index) = self.find(id) {
             self.grabs.remove(index);
             self.hands.remove(index);
+            if self.hands.is_empty() {
+                self.set_held_shapes(None);
+            }
             self.kernel.prepare(&self.hands);
         }
+    }
+
+    /// Sets the own shapes of the patches that are held, with which a body of reduced elasticity
+    /// feels the right force in a hand ([`HeldShapes`]). Linear elasticity does not use them.
+    ///
+    /// The shapes go when the last grab is released.
+    pub fn set_held_shapes(&mut self, shapes: Option<Arc<HeldShapes>>) {
+        self.kernel.set_held_shapes(shapes);
+        let columns = self.kernel.held_shapes().map_or(0, |shapes| shapes.columns());
+        self.state.s.clear();
+        self.state.s.resize(columns, 0.0);
+        self.kernel.prepare(&self.hands);
     }
 
     /// The grabs on the body, oldest first.
@@ -319,7 +334,9 @@ impl Body {
     /// Returns [`StepError::NoGrab`] if there is no such grab.
     pub fn grab_position(&self, id: GrabId) -> Result<[f64; 3], StepError> {
         let patch = &self.hands[self.find(id)?].patch;
-        let local = patch.rest() + patch.displacement(&self.state.q, self.kernel.warps());
+        let own = self.kernel.held_shapes().map(|shapes| shapes.displacement(patch, &self.state.s));
+        let modal = patch.displacement(&self.state.q, self.kernel.warps());
+        let local = patch.rest() + modal + own.unwrap_or_default();
         Ok(self.state.frame.to_world(local).into())
     }
 
@@ -488,7 +505,7 @@ impl Body {
         let frame = if self.model().is_free() { self.state.frame.kinetic_energy(self.model()) } else { 0.0 };
         if self.kernel.is_reduced() {
             let kinetic: f64 = self.state.v.iter().map(|v| 0.5 * v * v).sum();
-            return kinetic + self.kernel.elastic_energy(&self.state.q) + frame;
+            return kinetic + self.kernel.elastic_energy(&self.state) + frame;
         }
         let ratio = self.config.settings.relaxation.map_or(0.0, |r| r.ratio);
         let modes: f64 = (0..self.mode_count())
@@ -546,6 +563,9 @@ impl Body {
             self.kernel.warps(),
             out,
         );
+        if let Some(shapes) = self.kernel.held_shapes() {
+            shapes.add_to(&self.state.s, out);
+        }
         Ok(())
     }
 

@@ -78,7 +78,9 @@ pub(crate) fn check_parts(parts: &ModelParts) -> Result<(), ModelError> {
         each("site flexibility", "finite", &mut site.flexibility.into_iter().flatten(), &any)?;
         check_flexibility(parts, index)?;
     }
-    parts.reduced.as_ref().map_or(Ok(()), |reduced| check_reduced(reduced, &parts.omega))
+    let Some(reduced) = &parts.reduced else { return Ok(()) };
+    check_reduced(reduced, &parts.omega)?;
+    reduced.mesh.as_ref().map_or(Ok(()), |mesh| mesh.check(info.element, modes, vertices))
 }
 
 pub(crate) fn check_reduced(reduced: &ReducedElasticity, omega: &[f64]) -> Result<(), ModelError> {

@@ -13,7 +13,9 @@
 //!   ..  sections (when there), each: tag of 4 bytes, length u64, content
 //! ```
 //!
-//! Section `NLIN` is the reduced elasticity of `p` points: material u8 (0 neo-Hookean, 1 St.
+//! Section `MESH` is the simulation mesh, with `c` corners, `t` tetrahedra and `k` nodes: c u32, t
+//! u32, corners f32 x 3 c, tetrahedra u32 x 4 t, scales f32 x m, displacements i16 x 3 k m, and a
+//! place u32 x 1, f32 x 6 for each surface vertex. It follows section `NLIN`, which is the reduced elasticity of `p` points: material u8 (0 neo-Hookean, 1 St.
 //! Venant-Kirchhoff), `p` u32, weights f64 x p, gradients f32 x 9 p m. A model without it has
 //! linear elasticity only. All numbers are little-endian. A reader checks magic, version, length
 //! and hash before it decodes the payload.
@@ -29,7 +31,7 @@ use serde::{Deserialize, Serialize};
 
 use crate::{
     BakeInfo, FileError, FlexibilitySite, Material, ModalModel, ModelError, ModelParts, ReducedElasticity,
-    SurfaceMesh,
+    SimulationMesh, SurfaceMesh, VertexPlace,
 };
 
 /// First bytes of a `.modal` file.
@@ -40,6 +42,9 @@ pub const FORMAT_VERSION: u32 = 1;
 
 /// Tag of the section with the reduced elasticity.
 const REDUCED: [u8; 4] = *b"NLIN";
+
+/// Tag of the section with the simulation mesh.
+const MESH: [u8; 4] = *b"MESH";
 
 const HEADER: usize = 8 + 4 + 8 + 32;
 
@@ -99,9 +104,15 @@ pub(crate) fn encode(parts: &ModelParts) -> Vec<u8> {
         section.extend((reduced.weights.len() as u32).to_le_bytes());
         section.extend(reduced.weights.iter().flat_map(|x| x.to_le_bytes()));
         section.extend(reduced.gradients.iter().flat_map(|x| x.to_le_bytes()));
-        bytes.extend(REDUCED);
-        bytes.extend((section.len() as u64).to_le_bytes());
-        bytes.extend(section);
+        let mut add = |tag: [u8; 4], section: Vec<u8>| {
+            bytes.extend(tag);
+            bytes.extend((section.len() as u64).to_le_bytes());
+            bytes.extend(section);
+        };
+        add(REDUCED, section);
+        if let Some(mesh) = &reduced.mesh {
+            add(MESH, encode_mesh(mesh));
+        }
     }
 
     let hash = blake3::hash(&bytes[HEADER..]);
@@ -111,6 +122,21 @@ pub(crate) fn encode(parts: &ModelParts) -> Vec<u8> {
     bytes[12..20].copy_from_slice(&length.to_le_bytes());
     bytes[20..HEADER].copy_from_slice(hash.as_bytes());
     bytes
+}
+
+fn encode_mesh(mesh: &SimulationMesh) -> Vec<u8> {
+    let mut section = Vec::new();
+    section.extend((mesh.corners.len() as u32).to_le_bytes());
+    section.extend((mesh.tets.len() as u32).to_le_bytes());
+    section.extend(mesh.corners.as_flattened().iter().flat_map(|x| x.to_le_bytes()));
+    section.extend(mesh.tets.as_flattened().iter().flat_map(|x| x.to_le_bytes()));
+    section.extend(mesh.scales.iter().flat_map(|x| x.to_le_bytes()));
+    section.extend(mesh.displacements.iter().flat_map(|x| x.to_le_bytes()));
+    for place in &mesh.vertices {
+        section.extend(place.element.to_le_bytes());
+        section.extend(place.at.iter().chain(&place.offset).flat_map(|x| x.to_le_bytes()));
+    }
+    section
 }
 
 pub(crate) fn stored_hash(bytes: &[u8]) -> crate::ModelHash {
@@ -299,7 +325,7 @@ fn decode(payload: &[u8]) -> Result<ModelParts, FileError> {
     let anchored = words::<1>("anchored flags", &mut rest, n)?.map(|[b]| b != 0).collect();
     let displacement = words::<4>("displacement", &mut rest, shape)?.map(f32::from_le_bytes).collect();
     let rotation = words::<4>("rotation", &mut rest, shape)?.map(f32::from_le_bytes).collect();
-    let reduced = if rest.is_empty() { None } else { Some(reduced(&mut rest, m)?) };
+    let reduced = if rest.is_empty() { None } else { Some(reduced(&mut rest, m, n)?) };
     if !rest.is_empty() {
         return Err(FileError::Truncated { what: "nothing more", expected: 0, got: rest.len() as u64 });
     }
@@ -320,28 +346,75 @@ fn decode(payload: &[u8]) -> Result<ModelParts, FileError> {
     })
 }
 
-/// Decodes the section with the reduced elasticity of `modes` coordinates.
-fn reduced(rest: &mut &[u8], modes: usize) -> Result<ReducedElasticity, FileError> {
-    let wrong = |what: String| FileError::Decode(what);
-    let tag = words::<4>("section tag", rest, 1)?.next().unwrap_or_default();
-    if tag != REDUCED {
-        return Err(wrong(format!(
+/// Splits the next section off the front of `rest`.
+fn section<'a>(rest: &mut &'a [u8], tag: [u8; 4]) -> Result<&'a [u8], FileError> {
+    let found = words::<4>("section tag", rest, 1)?.next().unwrap_or_default();
+    if found != tag {
+        return Err(FileError::Decode(format!(
             "a section {:?} that this version does not know",
-            tag.escape_ascii().to_string()
+            found.escape_ascii().to_string()
         )));
     }
     let length = words::<8>("section length", rest, 1)?.next().map_or(0, u64::from_le_bytes);
-    if length != rest.len() as u64 {
+    let whole = usize::try_from(length).ok().filter(|&length| length <= rest.len());
+    let Some(length) = whole else {
         return Err(FileError::Truncated { what: "section", expected: length, got: rest.len() as u64 });
+    };
+    let (section, tail) = rest.split_at(length);
+    *rest = tail;
+    Ok(section)
+}
+
+fn used_up(section: &[u8]) -> Result<(), FileError> {
+    match section.len() {
+        0 => Ok(()),
+        more => {
+            Err(FileError::Truncated { what: "nothing more in a section", expected: 0, got: more as u64 })
+        }
     }
-    let material = match words::<1>("material", rest, 1)?.next() {
+}
+
+/// Decodes the sections with the reduced elasticity of `modes` coordinates.
+fn reduced(rest: &mut &[u8], modes: usize, vertices: usize) -> Result<ReducedElasticity, FileError> {
+    let mut bytes = section(rest, REDUCED)?;
+    let material = match words::<1>("material", &mut bytes, 1)?.next() {
         Some([0]) => Material::NeoHookean,
         Some([1]) => Material::StVenantKirchhoff,
-        other => return Err(wrong(format!("a material {other:?} that this version does not know"))),
+        other => {
+            let text = format!("a material {other:?} that this version does not know");
+            return Err(FileError::Decode(text));
+        }
     };
-    let points = words::<4>("cubature points", rest, 1)?.next().map_or(0, u32::from_le_bytes) as usize;
-    let weights = words::<8>("cubature weights", rest, points)?.map(f64::from_le_bytes).collect();
+    let points = words::<4>("cubature points", &mut bytes, 1)?.next().map_or(0, u32::from_le_bytes) as usize;
+    let weights = words::<8>("cubature weights", &mut bytes, points)?.map(f64::from_le_bytes).collect();
     let count = points.saturating_mul(9).saturating_mul(modes);
-    let gradients = words::<4>("cubature gradients", rest, count)?.map(f32::from_le_bytes).collect();
-    Ok(ReducedElasticity { material, weights, gradients })
+    let gradients = words::<4>("cubature gradients", &mut bytes, count)?.map(f32::from_le_bytes).collect();
+    used_up(bytes)?;
+    let mesh = if rest.is_empty() { None } else { Some(mesh(section(rest, MESH)?, modes, vertices)?) };
+    Ok(ReducedElasticity { material, weights, gradients, mesh })
+}
+
+/// Decodes the section with the simulation mesh.
+fn mesh(mut bytes: &[u8], modes: usize, vertices: usize) -> Result<SimulationMesh, FileError> {
+    let counts: Vec<usize> =
+        words::<4>("mesh counts", &mut bytes, 2)?.map(|word| u32::from_le_bytes(word) as usize).collect();
+    let (corners, tets) = (counts[0], counts[1]);
+    let corners =
+        triples(words::<4>("corners", &mut bytes, corners.saturating_mul(3))?.map(f32::from_le_bytes));
+    let flat: Vec<u32> =
+        words::<4>("tetrahedra", &mut bytes, tets.saturating_mul(4))?.map(u32::from_le_bytes).collect();
+    let tets = flat.as_chunks::<4>().0.to_vec();
+    let scales = words::<4>("node scales", &mut bytes, modes)?.map(f32::from_le_bytes).collect();
+    let places = vertices.saturating_mul(28);
+    let nodes = bytes.len().saturating_sub(places) / 2;
+    let displacements =
+        words::<2>("node displacements", &mut bytes, nodes)?.map(i16::from_le_bytes).collect();
+    let place = |word: [u8; 28]| {
+        let at = |k: usize| std::array::from_fn(|i| word[4 * k + i]);
+        let three = |k: usize| std::array::from_fn(|i| f32::from_le_bytes(at(k + i)));
+        VertexPlace { element: u32::from_le_bytes(at(0)), at: three(1), offset: three(4) }
+    };
+    let vertices = words::<28>("vertex places", &mut bytes, vertices)?.map(place).collect();
+    used_up(bytes)?;
+    Ok(SimulationMesh { corners, tets, scales, displacements, vertices })
 }

@@ -39,10 +39,12 @@ mod basis;
 mod body;
 mod check;
 mod contact;
+pub mod cubature;
 mod error;
 mod exponential;
 mod file;
 mod flexibility;
+mod held;
 mod integrator;
 mod limit;
 mod model;
@@ -61,6 +63,7 @@ pub use contact::{
     Capsule, Contact, ContactReport, Contacts, Cuboid, Moving, Obstacle, Plane, Sphere, SurfacePoint,
 };
 pub use error::{FileError, ModelError, StepError};
+pub use held::{HeldShapes, SimulationMesh, VertexPlace};
 pub use file::{FORMAT_VERSION, MAGIC};
 pub use integrator::{Coefficients, Integrator};
 pub use limit::streaming_sum;

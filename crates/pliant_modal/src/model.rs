@@ -7,7 +7,7 @@ use serde::{Deserialize, Serialize};
 use crate::contact::ContactSites;
 use crate::step::MassSites;
 use crate::{
-    Basis, Material, ModelError, Precision, ReducedElasticity, StepError, SurfaceMesh, check::check_parts,
+    Basis, Hyperelastic, Material, ModelError, Precision, ReducedElasticity, StepError, SurfaceMesh, check::check_parts,
     nonlinear::Gradients,
 };
 
@@ -292,6 +292,13 @@ impl ModalModel {
     /// Material of the reduced elasticity. `None` for a model that has linear elasticity only.
     pub fn material(&self) -> Option<Material> {
         self.parts.reduced.as_ref().map(|reduced| reduced.material)
+    }
+
+    /// A law with `scale` times the baked stiffness.
+    pub(crate) fn law(&self, material: Material, scale: f64) -> Hyperelastic {
+        let info = self.info();
+        let (young, nu) = (scale * info.young, info.poisson);
+        material.with(young * nu / ((1.0 + nu) * (1.0 - 2.0 * nu)), young / (2.0 * (1.0 + nu)))
     }
 
     /// Whether the body has no anchors.

@@ -10,6 +10,23 @@ pub const EDGES: [[usize; 2]; 6] = [[0, 1], [1, 2], [0, 2], [0, 3], [1, 3], [2, 
 /// Largest number of nodes of an element.
 pub const MAX_NODES: usize = 10;
 
+/// Returns the node numbers of each element, `element.node_count()` per tetrahedron, and the edges
+/// (pairs of corners) whose midpoints are the nodes after the `corners` corners.
+///
+/// The edges are in ascending order. A mesh of 4-node elements has none.
+pub fn connectivity(corners: usize, tets: &[[u32; 4]], element: Element) -> (Vec<u32>, Vec<[u32; 2]>) {
+    if element == Element::Tet4 {
+        return (tets.iter().flatten().copied().collect(), Vec::new());
+    }
+    let key = |t: &[u32; 4], [a, b]: [usize; 2]| [t[a].min(t[b]), t[a].max(t[b])];
+    let mut edges: Vec<[u32; 2]> = tets.iter().flat_map(|t| EDGES.map(|edge| key(t, edge))).collect();
+    edges.sort_unstable();
+    edges.dedup();
+    let number = |edge: [u32; 2]| (corners + edges.partition_point(|&e| e < edge)) as u32;
+    let nodes = tets.iter().flat_map(|t| t.iter().copied().chain(EDGES.map(|edge| number(key(t, edge)))));
+    (nodes.collect(), edges)
+}
+
 /// Affine tetrahedron: its volume (m^3) and the gradients of its barycentric coordinates (1/m).
 #[derive(Clone, Copy, Debug)]
 pub struct Affine {

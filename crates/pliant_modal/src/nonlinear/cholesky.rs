@@ -47,10 +47,15 @@ impl Cholesky {
 
     /// Replaces `x` by `U^-T x`.
     pub(crate) fn forward(&self, x: &mut [f64]) {
+        self.forward_from(0, x);
+    }
+
+    /// Replaces `x` by `U^-T (0, x)` without its `first` zeros.
+    pub(crate) fn forward_from(&self, first: usize, x: &mut [f64]) {
         let n = self.n;
-        for j in 0..n {
+        for j in first..n {
             let row = &self.upper[j * n + j..(j + 1) * n];
-            let (head, tail) = x[j..n].split_at_mut(1);
+            let (head, tail) = x[j - first..n - first].split_at_mut(1);
             head[0] /= row[0];
             for (to, from) in tail.iter_mut().zip(&row[1..]) {
                 *to -= head[0] * from;

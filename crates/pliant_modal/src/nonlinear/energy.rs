@@ -14,7 +14,7 @@ use super::{
     lanes::{LANES, Lane},
     principal::positive_roots,
 };
-use crate::{ModalModel, ModelError, ReducedElasticity};
+use crate::{HeldShapes, ModalModel, ModelError, ReducedElasticity};
 
 /// Number of coordinates in one block of the tangent's columns.
 const WIDTH: usize = 16;
@@ -80,12 +80,20 @@ impl ElasticEnergy {
     /// stiffness. Returns `None` for a model without reduced elasticity.
     pub(crate) fn of_model(model: &ModalModel, modes: usize, scale: f64) -> Option<Self> {
         let reduced = model.parts().reduced.as_ref()?;
-        let info = model.info();
-        let (young, nu) = (scale * info.young, info.poisson);
-        let lambda = young * nu / ((1.0 + nu) * (1.0 - 2.0 * nu));
-        let law = reduced.material.with(lambda, young / (2.0 * (1.0 + nu)));
+        let law = model.law(reduced.material, scale);
         let omega = &model.omega()[..modes];
-        Some(Self::assemble(model.cubature_gradients(), reduced, law, omega))
+        Some(Self::assemble(model.cubature_gradients(), &reduced.weights, law, omega))
+    }
+
+    /// Makes the energy of all coordinates of a model and the columns of held patches, which come
+    /// before the coordinates, with `scale` times the baked stiffness. Returns `None` for a model
+    /// without reduced elasticity.
+    pub(crate) fn of_shapes(model: &ModalModel, shapes: &HeldShapes, scale: f64) -> Option<Self> {
+        let law = model.law(model.material()?, scale);
+        let (gradients, weights) = shapes.rule();
+        let columns = std::iter::repeat_n(1.0, shapes.columns());
+        let omega: Vec<f64> = columns.chain(model.omega().iter().copied()).collect();
+        Some(Self::assemble(gradients, weights, law, &omega))
     }
 
     /// Makes the energy of a rule for coordinates with these frequencies (rad/s).
@@ -102,12 +110,12 @@ impl ElasticEnergy {
         }
         crate::check::check_reduced(reduced, omega)?;
         let gradients = Arc::new(Gradients::new(&reduced.gradients, omega));
-        Ok(Self::assemble(gradients, reduced, law, omega))
+        Ok(Self::assemble(gradients, &reduced.weights, law, omega))
     }
 
     fn assemble(
         gradients: Arc<Gradients>,
-        reduced: &ReducedElasticity,
+        weights: &[f64],
         law: Hyperelastic,
         omega: &[f64],
     ) -> Self {
@@ -115,7 +123,7 @@ impl ElasticEnergy {
         let padded = modes.next_multiple_of(WIDTH);
         Self {
             gradients,
-            weights: reduced.weights.clone(),
+            weights: weights.to_vec(),
             law,
             modes,
             padded,
@@ -420,6 +428,7 @@ mod tests {
             material: Material::NeoHookean,
             weights: (0..points).map(|i| 1.0 + noise(i)).collect(),
             gradients: (0..9 * points * modes).map(|i| noise(i) as f32).collect(),
+            mesh: None,
         };
         let omega: Vec<f64> = (0..modes).map(|i| 5.0 + 40.0 * i as f64).collect();
         let law = Material::NeoHookean.with(2e5, 1e5);

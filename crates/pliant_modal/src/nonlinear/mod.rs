@@ -25,6 +25,8 @@ pub(crate) use energy::Gradients;
 pub use material::{Hyperelastic, Material};
 pub use principal::positive_tangent;
 
+use crate::SimulationMesh;
+
 /// Data of the reduced elastic energy of a model with `m` coordinates: a cubature rule of `n`
 /// points.
 #[derive(Debug, Clone, PartialEq)]
@@ -36,6 +38,9 @@ pub struct ReducedElasticity {
     /// Displacement gradients of the coordinates at the points, `[point][3 c + r][coordinate]` with
     /// the derivative of component `r` along axis `c`, kg^-1/2 m^-1, with `9 n m` entries.
     pub gradients: Vec<f32>,
+    /// Simulation mesh, from which hands get the own shapes of the patches that they hold. `None`
+    /// for a model whose hands feel what the coordinates leave out as a compliance alone.
+    pub mesh: Option<SimulationMesh>,
 }
 
 impl ReducedElasticity {

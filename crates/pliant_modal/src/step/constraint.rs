@@ -145,9 +145,11 @@ impl ViscoelasticPatch {
     }
 
     /// Compliance of the residual flexibility and the hand's spring in series within a step, m/N.
-    pub(crate) fn compliance(&self, hand: &Hand) -> Matrix3<f64> {
+    ///
+    /// `residual` is the residual flexibility of the hand's patch at the baked stiffness.
+    pub(crate) fn compliance(&self, hand: &Hand, residual: Matrix3<f64>) -> Matrix3<f64> {
         let spring = hand.config().stiffness.map_or(0.0, |k| 1.0 / k);
-        hand.patch.residual() * (self.softness * self.at_once) + Matrix3::identity() * spring
+        residual * (self.softness * self.at_once) + Matrix3::identity() * spring
     }
 
     /// Displacement of a patch in a step that is due to earlier forces alone, m.

@@ -14,11 +14,17 @@
 //! backward Euler, which is calm at any stiffness. What energy a step would still add, beyond the
 //! work of hands and loads, is taken from the velocities.
 
+//!
+//! The columns of held patches ([`HeldShapes`]) come before the modal coordinates in all arrays
+//! here. They have no mass: their response is that of their stiffness at rest.
+
+use std::sync::Arc;
+
 use nalgebra::{Matrix3, Vector3};
 
 use super::{HeldPatch, State, modes::Modes, patch::Six};
 use crate::{
-    ModalModel,
+    HeldShapes, ModalModel,
     nonlinear::{Cholesky, ElasticEnergy},
     simd::dot,
 };
@@ -27,6 +33,9 @@ use crate::{
 #[derive(Debug, Clone)]
 pub(crate) struct ElasticStep {
     energy: ElasticEnergy,
+    shapes: Option<Arc<HeldShapes>>,
+    /// Number of columns of held patches.
+    columns: usize,
     h: f64,
     omega2: Vec<f64>,
     damping: Vec<f64>,
@@ -39,6 +48,8 @@ pub(crate) struct ElasticStep {
     cholesky: Cholesky,
     /// Coordinates at which the energy is linearized, kg^1/2 m.
     q: Vec<f64>,
+    /// Coordinates at the beginning of the step.
+    begun: Vec<f64>,
     /// Coordinates after the step without the force of this module.
     unforced: Vec<f64>,
     /// Coordinates after this round without hands.
@@ -68,19 +79,36 @@ const HALVINGS: usize = 8;
 
 impl ElasticStep {
     /// Makes the workspace. Returns `None` for a model without reduced elasticity.
-    pub(crate) fn new(model: &ModalModel, modes: &Modes, scale: f64, h: f64) -> Option<Self> {
-        let count = modes.count();
-        let energy = ElasticEnergy::of_model(model, count, scale)?;
-        let omega2: Vec<f64> = modes.omega.iter().map(|omega| omega * omega).collect();
+    ///
+    /// Shapes of held patches are used where all coordinates of the model are stepped.
+    pub(crate) fn new(
+        model: &ModalModel,
+        modes: &Modes,
+        scale: f64,
+        h: f64,
+        shapes: Option<Arc<HeldShapes>>,
+    ) -> Option<Self> {
+        let shapes = shapes.filter(|_| modes.count() == model.mode_count());
+        let energy = match &shapes {
+            Some(shapes) => ElasticEnergy::of_shapes(model, shapes, scale)?,
+            None => ElasticEnergy::of_model(model, modes.count(), scale)?,
+        };
+        let columns = shapes.as_ref().map_or(0, |shapes| shapes.columns());
+        let count = columns + modes.count();
+        let omega2 = modes.omega.iter().map(|omega| omega * omega);
+        let omega2: Vec<f64> = std::iter::repeat_n(scale, columns).chain(omega2).collect();
         let zero = vec![0.0; count];
         let cholesky = Cholesky::new(count);
-        let (q, unforced, free, way) = (zero.clone(), zero.clone(), zero.clone(), zero);
+        let (q, begun, unforced, free, way) = (zero.clone(), zero.clone(), zero.clone(), zero.clone(), zero);
         let far = FAR * scale * model.info().young * energy.volume();
         let (start, damping, rows) = (way.clone(), modes.damping.clone(), Vec::new());
-        let response = vec![[0.0; 3]; count];
+        let mut response = vec![[0.0; 3]; count];
+        response[..columns].fill([1.0 / scale, 0.0, 0.0]);
         let share = 0.5;
         Some(Self {
             energy,
+            shapes,
+            columns,
             h,
             omega2,
             damping,
@@ -89,6 +117,7 @@ impl ElasticStep {
             start,
             cholesky,
             q,
+            begun,
             unforced,
             free,
             rows,
@@ -99,13 +128,31 @@ impl ElasticStep {
     }
 
     /// Elastic energy, J.
-    pub(crate) fn energy(&self, q: &[f64]) -> f64 {
-        self.energy.energy(q)
+    pub(crate) fn energy(&self, state: &State) -> f64 {
+        if self.columns == 0 { self.energy.energy(&state.q) } else { self.energy.energy(&self.joined(state)) }
     }
 
-    /// Writes the elastic force `dU/dq`, kg^1/2 m/s^2.
-    pub(crate) fn force_at(&self, q: &[f64], out: &mut [f64]) {
-        self.energy.force_at(q, out);
+    /// Writes the elastic force `dU/dq` on the modal coordinates, kg^1/2 m/s^2.
+    pub(crate) fn force_at(&self, state: &State, out: &mut [f64]) {
+        if self.columns == 0 {
+            self.energy.force_at(&state.q, out);
+            return;
+        }
+        let mut all = vec![0.0; self.q.len()];
+        self.energy.force_at(&self.joined(state), &mut all);
+        out.iter_mut().zip(&all[self.columns..]).for_each(|(out, force)| *out = *force);
+    }
+
+    /// Columns and coordinates of a state.
+    fn joined(&self, state: &State) -> Vec<f64> {
+        let mut out = vec![0.0; self.q.len()];
+        join(self.columns, state, &mut out);
+        out
+    }
+
+    /// Shapes of held patches that the step uses.
+    pub(crate) fn shapes(&self) -> Option<&Arc<HeldShapes>> {
+        self.shapes.as_ref()
     }
 
     /// Number of cubature points whose tangent had negative eigenvalues in the last round.
@@ -122,26 +169,33 @@ impl ElasticStep {
     /// Begins a step from `before`, with the step under the loads alone in `after`, and linearizes
     /// at its beginning. `load` is the modal force of the loads.
     pub(crate) fn begin(&mut self, before: &State, modes: &Modes, load: &[f64], after: &mut State) {
-        self.q.copy_from_slice(&before.q);
+        join(self.columns, before, &mut self.q);
+        self.begun.copy_from_slice(&self.q);
         self.energy.linearize(&self.q);
-        let (h, mut stiffest) = (self.h, 0.0f64);
-        for (i, omega2) in self.omega2.iter().enumerate() {
-            let stiffness = self.energy.stiffness(i);
-            self.start[i] = self.energy.force()[i] - omega2 * self.q[i];
-            self.response[i] = [modes.response[0][i], modes.response[1][i], modes.response[2][i]];
+        let (h, columns, mut stiffest) = (self.h, self.columns, 0.0f64);
+        for (start, ((force, omega2), q)) in
+            self.start.iter_mut().zip(self.energy.force().iter().zip(&self.omega2).zip(&self.q))
+        {
+            *start = force - omega2 * q;
+        }
+        for (i, omega2) in self.omega2[columns..].iter().enumerate() {
+            let stiffness = self.energy.stiffness(columns + i);
+            self.response[columns + i] = [modes.response[0][i], modes.response[1][i], modes.response[2][i]];
             if h * h * stiffness > 1.0 {
                 // Backward Euler, as `Coefficients::reduced` has it for the stiffness at rest.
                 let r = 1.0 / (1.0 / (h * h) + self.damping[i] / h + omega2);
-                self.response[i] = [r, r / h, r / (h * h)];
+                self.response[columns + i] = [r, r / h, r / (h * h)];
                 let (q, v) = (before.q[i], before.v[i]);
                 after.q[i] = r * (q / (h * h) + (self.damping[i] * q + v) / h + load[i]);
                 after.v[i] = (after.q[i] - q) / h;
                 after.a[i] = (after.v[i] - v) / h;
             }
-            stiffest = stiffest.max((stiffness - omega2) * self.response[i][0]);
+        }
+        for (i, (omega2, response)) in self.omega2.iter().zip(&self.response).enumerate() {
+            stiffest = stiffest.max((self.energy.stiffness(i) - omega2) * response[0]);
         }
         self.share = 0.5 + 0.5 * stiffest.clamp(0.0, 1.0);
-        self.unforced.copy_from_slice(&after.q);
+        self.unforced[columns..].copy_from_slice(&after.q);
         self.last = f64::INFINITY;
     }
 
@@ -183,12 +237,33 @@ impl ElasticStep {
 
     /// The six numbers of a patch after this round without hands.
     pub(crate) fn without_hands(&self, patch: &HeldPatch) -> Six {
-        patch.rows().reduce(&self.free, false)
+        self.reduce(patch, &self.free)
     }
 
-    /// Coordinates at which the energy is linearized, kg^1/2 m.
+    /// The six numbers of a patch at the beginning of the step.
+    pub(crate) fn at_beginning(&self, patch: &HeldPatch) -> Six {
+        self.reduce(patch, &self.begun)
+    }
+
+    /// Way of a patch over the step so far, m, body axes.
+    pub(crate) fn way(&self, patch: &HeldPatch) -> Vector3<f64> {
+        let six = self.reduce(patch, &self.q) - self.reduce(patch, &self.begun);
+        Vector3::new(six[0], six[1], six[2])
+    }
+
+    fn reduce(&self, patch: &HeldPatch, x: &[f64]) -> Six {
+        let (columns, modal) = x.split_at(self.columns);
+        let mut six = patch.rows().reduce(modal, false);
+        if let Some(shapes) = &self.shapes {
+            let own = shapes.displacement(patch, columns);
+            (0..3).for_each(|axis| six[axis] += own[axis]);
+        }
+        six
+    }
+
+    /// Modal coordinates at which the energy is linearized, kg^1/2 m.
     pub(crate) fn coordinates(&self) -> &[f64] {
-        &self.q
+        &self.q[self.columns..]
     }
 
     /// Adds a hand to a new tangent. Hands are added in order.
@@ -196,6 +271,11 @@ impl ElasticStep {
         let n = self.q.len();
         for axis in 0..3 {
             let start = self.rows.len();
+            let own = self.shapes.as_ref().and_then(|shapes| shapes.rows(patch));
+            match own {
+                Some(own) => self.rows.extend_from_slice(&own[axis]),
+                None => self.rows.extend(std::iter::repeat_n(0.0, self.columns)),
+            }
             self.rows.extend_from_slice(patch.rows().displacement(axis));
             self.cholesky.forward(&mut self.rows[start..start + n]);
         }
@@ -209,9 +289,9 @@ impl ElasticStep {
     }
 
     /// Solves with the lower factor of the step's tangent. The response of one row of forces to
-    /// another is the product of both solutions.
+    /// another is the product of both solutions. The rows have no columns of held patches.
     pub(crate) fn half_response(&self, row: &mut [f64]) {
-        self.cholesky.forward(row);
+        self.cholesky.forward_from(self.columns, row);
     }
 
     /// Ends the round with the hands' forces (N) on their patches, in order. Returns whether the
@@ -248,7 +328,7 @@ impl ElasticStep {
     fn share<'a>(&mut self, pulls: impl Iterator<Item = (&'a HeldPatch, Vector3<f64>)>) -> f64 {
         let work: f64 = pulls
             .map(|(patch, pull)| {
-                let moved = patch.rows().reduce(&self.way, false);
+                let moved = self.reduce(patch, &self.way);
                 pull.dot(&Vector3::new(moved[0], moved[1], moved[2]))
             })
             .sum();
@@ -277,8 +357,11 @@ impl ElasticStep {
 
     /// Writes the force that would have moved the end of the last step by `way`, on its tangent.
     pub(crate) fn force_of_way(&mut self, way: impl Fn(usize) -> f64, out: &mut [f64]) {
-        self.way.iter_mut().enumerate().for_each(|(k, x)| *x = way(k));
-        self.cholesky.multiply(&self.way, out);
+        let (columns, modal) = self.way.split_at_mut(self.columns);
+        columns.fill(0.0);
+        modal.iter_mut().enumerate().for_each(|(k, x)| *x = way(k));
+        self.cholesky.multiply(&self.way, &mut self.free);
+        out.iter_mut().zip(&self.free[self.columns..]).for_each(|(out, force)| *out = *force);
     }
 
     /// Ends the step: adds the effect of the force to the state without it, and the force itself to
@@ -288,16 +371,23 @@ impl ElasticStep {
     /// loads. Where the elasticity softens within a long way, it would: the velocities then give it
     /// back.
     pub(crate) fn finish(&mut self, before: &State, supplied: f64, force: &mut [f64], state: &mut State) {
+        let (columns, modal) = self.q.split_at(self.columns);
+        state.s.resize(columns.len(), 0.0);
+        state.s.copy_from_slice(columns);
         let (mut way, mut work, mut kinetic) = (0.0, supplied, [0.0; 2]);
+        for ((now, begun), omega2) in columns.iter().zip(&self.begun).zip(&self.omega2) {
+            way += 0.5 * omega2 * (now - begun) * (now - begun);
+        }
         for (i, force) in force.iter_mut().enumerate() {
-            let own = (self.q[i] - self.unforced[i]) / self.response[i][0];
-            let moved = self.q[i] - before.q[i];
+            let at = columns.len() + i;
+            let own = (modal[i] - self.unforced[at]) / self.response[at][0];
+            let moved = modal[i] - before.q[i];
             work += *force * moved;
-            way += 0.5 * self.omega2[i] * moved * moved;
+            way += 0.5 * self.omega2[at] * moved * moved;
             *force += own;
-            state.q[i] = self.q[i];
-            state.v[i] += self.response[i][1] * own;
-            state.a[i] += self.response[i][2] * own;
+            state.q[i] = modal[i];
+            state.v[i] += self.response[at][1] * own;
+            state.a[i] += self.response[at][2] * own;
             kinetic[0] += 0.5 * before.v[i] * before.v[i];
             kinetic[1] += 0.5 * state.v[i] * state.v[i];
         }
@@ -305,12 +395,24 @@ impl ElasticStep {
             return;
         }
         let gained =
-            self.energy.energy(&state.q) - self.energy.energy(&before.q) + kinetic[1] - kinetic[0] - work;
+            self.energy.energy(&self.q) - self.energy.energy(&self.begun) + kinetic[1] - kinetic[0] - work;
         if gained > 0.0 && kinetic[1] > 0.0 {
             let left = (1.0 - gained / kinetic[1]).max(0.0).sqrt();
             state.v.iter_mut().for_each(|v| *v *= left);
         }
     }
+}
+
+/// Writes the columns' coordinates of a state and its modal ones. Columns that the state does not
+/// have are at rest.
+fn join(columns: usize, state: &State, out: &mut [f64]) {
+    let (own, modal) = out.split_at_mut(columns);
+    if state.s.len() == columns {
+        own.copy_from_slice(&state.s);
+    } else {
+        own.fill(0.0);
+    }
+    modal.copy_from_slice(&state.q);
 }
 
 /// Share of a far way's energy from which on a step's energy is checked: a mean change of the

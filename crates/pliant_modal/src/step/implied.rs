@@ -47,7 +47,7 @@ impl ImpliedPulls {
         }
         self.grams.prepare(hands, &self.softness);
         let ratio = settings.relaxation.map_or(0.0, |relaxation| relaxation.ratio);
-        kernel.elastic_force(&state.q, &mut self.force);
+        kernel.elastic_force(state, &mut self.force);
         for (k, force) in self.force.iter_mut().enumerate() {
             let flow = ratio * state.z.get(k).copied().unwrap_or(0.0);
             let (omega, damping) = (kernel.omega()[k], kernel.damping()[k]);

@@ -17,7 +17,7 @@ use super::{
     predicted_frame::PredictedFrame,
     solve::System,
 };
-use crate::{Contacts, ModalModel, StepError};
+use crate::{Contacts, HeldShapes, ModalModel, StepError};
 
 /// Result of one step.
 #[derive(Debug, Clone, Copy, PartialEq, Default)]
@@ -117,17 +117,30 @@ pub struct Kernel {
     system: System,
 }
 
-/// Compliance of a hand, turned with its patch at the coordinates `q`.
-fn turned(creep: &ViscoelasticPatch, hand: &Hand, q: &[f64]) -> Matrix3<f64> {
+/// Compliance of a hand with these shapes of held patches, turned with its patch at the coordinates
+/// `q`.
+fn turned(
+    creep: &ViscoelasticPatch,
+    shapes: Option<&Arc<HeldShapes>>,
+    hand: &Hand,
+    q: &[f64],
+) -> Matrix3<f64> {
+    let own = shapes.and_then(|shapes| shapes.residual(&hand.patch));
     let turn = hand.patch.rotation(q);
-    turn * creep.compliance(hand) * turn.transpose()
+    turn * creep.compliance(hand, own.unwrap_or_else(|| hand.patch.residual())) * turn.transpose()
 }
 
 /// Makes the nonlinear part of a step if the settings and the model have one.
-fn elastic(model: &ModalModel, settings: &StepSettings, modes: &Modes, h: f64) -> Option<ElasticStep> {
+fn elastic(
+    model: &ModalModel,
+    settings: &StepSettings,
+    modes: &Modes,
+    h: f64,
+    shapes: Option<Arc<HeldShapes>>,
+) -> Option<ElasticStep> {
     let scale = settings.stiffness_scale;
     if settings.is_reduced(model) && modes.count() > 0 {
-        ElasticStep::new(model, modes, scale, h)
+        ElasticStep::new(model, modes, scale, h, shapes)
     } else {
         None
     }
@@ -148,7 +161,7 @@ impl Kernel {
         let modes = Modes::new(&model, &settings, modes, h)?;
         let zero = vec![0.0; modes.count()];
         let mut kernel = Self {
-            elastic: elastic(&model, &settings, &modes, h),
+            elastic: elastic(&model, &settings, &modes, h, None),
             creep: ViscoelasticPatch::new(settings.relaxation, settings.stiffness_scale, h),
             before: State::default(),
             force: zero.clone(),
@@ -180,7 +193,8 @@ impl Kernel {
     pub fn reconfigure(&mut self, settings: StepSettings, h: f64) -> Result<(), StepError> {
         settings.check()?;
         self.modes = Modes::new(&self.model, &settings, self.modes.count(), h)?;
-        self.elastic = elastic(&self.model, &settings, &self.modes, h);
+        let shapes = self.held_shapes().cloned();
+        self.elastic = elastic(&self.model, &settings, &self.modes, h, shapes);
         self.creep = ViscoelasticPatch::new(settings.relaxation, settings.stiffness_scale, h);
         (self.settings, self.h) = (settings, h);
         self.before = self.at_rest();
@@ -188,6 +202,23 @@ impl Kernel {
         self.responses.forget();
         self.dampers.forget();
         Ok(())
+    }
+
+    /// Sets the own shapes of the patches that hands hold. Linear elasticity does not use them, nor
+    /// does a kernel that steps fewer modes than its model has.
+    ///
+    /// Hands on other patches feel what the modes leave out as a compliance, as all hands do without
+    /// shapes. A state of another set of shapes is taken with its own at rest.
+    pub fn set_held_shapes(&mut self, shapes: Option<Arc<HeldShapes>>) {
+        if self.elastic.is_some() {
+            self.elastic = elastic(&self.model, &self.settings, &self.modes, self.h, shapes);
+            self.responses.forget();
+        }
+    }
+
+    /// The own shapes of held patches that the steps use.
+    pub fn held_shapes(&self) -> Option<&Arc<HeldShapes>> {
+        self.elastic.as_ref().and_then(ElasticStep::shapes)
     }
 
     /// The model of the body.
@@ -288,7 +319,11 @@ impl Kernel {
     /// [`Relaxation::creep`](crate::Relaxation::creep) of one step. With reduced elasticity it
     /// turns with the patch at the coordinates `q`.
     pub fn compliance(&self, hand: &Hand, q: &[f64]) -> Matrix3<f64> {
-        if self.elastic.is_some() { turned(&self.creep, hand, q) } else { self.creep.compliance(hand) }
+        if self.elastic.is_some() {
+            turned(&self.creep, self.held_shapes(), hand, q)
+        } else {
+            self.creep.compliance(hand, hand.patch.residual())
+        }
     }
 
     /// Returns the viscoelastic state of a hand's patch after one step under a force `pull`
@@ -312,20 +347,20 @@ impl Kernel {
         }
     }
 
-    /// Elastic energy at the coordinates `q`, J. Without viscoelastic parts.
-    pub fn elastic_energy(&self, q: &[f64]) -> f64 {
+    /// Elastic energy of a state, J. Without viscoelastic parts.
+    pub fn elastic_energy(&self, state: &State) -> f64 {
         match &self.elastic {
-            Some(elastic) => elastic.energy(q),
-            None => 0.5 * q.iter().zip(&self.modes.omega).map(|(q, w)| (w * q) * (w * q)).sum::<f64>(),
+            Some(elastic) => elastic.energy(state),
+            None => 0.5 * state.q.iter().zip(&self.modes.omega).map(|(q, w)| (w * q) * (w * q)).sum::<f64>(),
         }
     }
 
-    /// Writes the elastic force `dU/dq` at the coordinates `q`, kg^1/2 m/s^2.
-    pub fn elastic_force(&self, q: &[f64], out: &mut [f64]) {
+    /// Writes the elastic force `dU/dq` of a state, kg^1/2 m/s^2.
+    pub fn elastic_force(&self, state: &State, out: &mut [f64]) {
         match &self.elastic {
-            Some(elastic) => elastic.force_at(q, out),
+            Some(elastic) => elastic.force_at(state, out),
             None => {
-                for ((out, q), omega) in out.iter_mut().zip(q).zip(&self.modes.omega) {
+                for ((out, q), omega) in out.iter_mut().zip(&state.q).zip(&self.modes.omega) {
                     *out = omega * omega * q;
                 }
             }
@@ -602,15 +637,16 @@ impl Kernel {
         }
         if let Some(elastic) = &mut self.elastic {
             let ends = [&self.before.q[..], elastic.coordinates()];
+            let shapes = elastic.shapes();
             let supplied = hands
                 .iter()
                 .zip(&self.solving)
                 .map(|(hand, solving)| {
                     let stored = |q: &[f64], force: &Vector3<f64>| {
-                        0.5 * force.dot(&(turned(&self.creep, hand, q) * force))
+                        0.5 * force.dot(&(turned(&self.creep, shapes, hand, q) * force))
                     };
                     let force = &solving.pull;
-                    let on_body = force.dot(&hand.patch.way(ends));
+                    let on_body = force.dot(&elastic.way(&hand.patch));
                     match hand.hold {
                         // The hand supplies the residual flexibility of its patch first. That turns
                         // with the patch, and must not give back more than it got.
@@ -660,7 +696,7 @@ impl Kernel {
             let mut solving = Solving {
                 free: hand.patch.rows().reduce(&state.q, warp),
                 from: hand.patch.rows().reduce(&self.before.q, warp),
-                compliance: self.creep.compliance(hand),
+                compliance: self.creep.compliance(hand, hand.patch.residual()),
                 beyond,
                 pull: hand.mean,
                 ..Solving::default()
@@ -691,11 +727,11 @@ impl Kernel {
             solving.from = solving.free;
             if solving.relaxation > 0.0 {
                 // Dampers see the mean velocity over the step.
-                let before = hand.patch.rows().reduce(&self.before.q, false);
+                let before = elastic.at_beginning(&hand.patch);
                 solving.speed = (solving.free - before) / self.h;
             }
             if tangent != ElasticTangent::Kept {
-                solving.compliance = turned(&self.creep, hand, elastic.coordinates());
+                solving.compliance = turned(&self.creep, elastic.shapes(), hand, elastic.coordinates());
                 elastic.add_hand(&hand.patch);
                 for j in 0..=i {
                     self.responses.set(i, j, &elastic.response(i, j));

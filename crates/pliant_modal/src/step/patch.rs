@@ -12,6 +12,7 @@ use nalgebra::{Matrix3, SMatrix, SVector, Vector3};
 use super::Hand;
 use crate::{
     ModalModel, Patch, StepError,
+    held::{self, PatchKey},
     simd::{LANES, dot},
     warp::warp_with_jacobian,
 };
@@ -53,6 +54,7 @@ pub(crate) struct MeanRows([Vec<f64>; 6]);
 /// A held patch is made once and shared by all copies of the body.
 #[derive(Debug, Clone)]
 pub struct HeldPatch {
+    key: PatchKey,
     rows: MeanRows,
     rest: Vector3<f64>,
     /// Residual flexibility at the baked stiffness, m/N.
@@ -70,7 +72,13 @@ impl HeldPatch {
         let positions = model.surface().positions();
         let at = |vertex: u32| Vector3::from(positions[vertex as usize].map(f64::from));
         let rest = patch.entries().iter().map(|&(vertex, weight)| weight * at(vertex)).sum();
-        Ok(Self { rows: MeanRows::new(model, patch.entries(), modes), rest, residual })
+        let rows = MeanRows::new(model, patch.entries(), modes);
+        Ok(Self { key: held::key(patch), rows, rest, residual })
+    }
+
+    /// What identifies the patch on its model.
+    pub(crate) fn key(&self) -> PatchKey {
+        self.key
     }
 
     /// Position of the patch at rest, m, body axes.
@@ -91,12 +99,6 @@ impl HeldPatch {
     /// Displacement of the patch from rest at the coordinates `q`, m, body axes.
     pub fn displacement(&self, q: &[f64], warped: bool) -> Vector3<f64> {
         displacement(&self.rows.reduce(q, warped), warped)
-    }
-
-    /// Way of the patch from the first to the second coordinates without warp, m, body axes.
-    pub(crate) fn way(&self, [from, to]: [&[f64]; 2]) -> Vector3<f64> {
-        let six = self.rows.reduce(to, false) - self.rows.reduce(from, false);
-        Vector3::new(six[0], six[1], six[2])
     }
 
     /// Rotation of the patch at the coordinates `q`, from the curl of the displacement. It is exact
@@ -180,19 +182,24 @@ impl MeanRows {
 }
 
 /// Instantaneous residual flexibility of a patch at the baked stiffness, m/N, body axes.
-fn residual(model: &ModalModel, patch: &Patch, modes: usize) -> Result<Matrix3<f64>, StepError> {
+pub(crate) fn residual(model: &ModalModel, patch: &Patch, modes: usize) -> Result<Matrix3<f64>, StepError> {
     let count = model.surface().positions().len();
     if let Some(&(vertex, _)) = patch.entries().iter().find(|&&(v, _)| v as usize >= count) {
         return Err(StepError::Vertex { vertex, count });
     }
     let residual = model.flexibility_of(patch, modes);
     let residual = Matrix3::from_fn(|i, j| residual[i][j]);
-    // A patch on an anchor has no flexibility, so the force of a hand on it would be infinite. Skin
-    // and fingertip therefore add a hundredth of the patch's own contact compliance.
+    let floor = Matrix3::identity() * contact_floor(model, patch);
+    Ok(0.5 * (residual + residual.transpose()) + floor)
+}
+
+/// Compliance of skin and fingertip on a patch: a hundredth of the patch's own contact compliance,
+/// m/N. A patch on an anchor has no flexibility, so the force of a hand on it would be infinite.
+pub(crate) fn contact_floor(model: &ModalModel, patch: &Patch) -> f64 {
     let info = model.info();
     let radius = patch.radius().max(1e-2 * model.size());
     let contact = 1e-2 * (1.0 - info.poisson * info.poisson) / (2.0 * info.young * radius);
-    Ok(0.5 * (residual + residual.transpose()) + Matrix3::identity() * contact.max(f64::MIN_POSITIVE))
+    contact.max(f64::MIN_POSITIVE)
 }
 
 /// Returns the displacement of a patch for its six numbers, m, body axes.

@@ -18,6 +18,9 @@ pub struct State {
     /// Viscoelastic modal state (modal flow), kg^1/2 m: the displacement of the dashpot of each
     /// mode's Maxwell branch. See [`Relaxation`](crate::Relaxation).
     pub z: Vec<f64>,
+    /// Static coordinates of the own shapes of held patches, J^1/2 at the baked stiffness. Empty
+    /// without such shapes. See [`HeldShapes`](crate::HeldShapes).
+    pub s: Vec<f64>,
     /// Pose and rigid motion of the body.
     pub frame: Frame,
 }
@@ -27,7 +30,8 @@ impl State {
     pub fn zero(modes: usize, viscous: bool) -> Self {
         let zero = vec![0.0; modes];
         let z = if viscous { zero.clone() } else { Vec::new() };
-        Self { q: zero.clone(), v: zero.clone(), a: zero.clone(), f: zero, z, frame: Frame::default() }
+        let frame = Frame::default();
+        Self { q: zero.clone(), v: zero.clone(), a: zero.clone(), f: zero, z, s: Vec::new(), frame }
     }
 
     /// Number of modes.
@@ -48,14 +52,14 @@ impl State {
     pub(crate) fn is_moderate(&self) -> bool {
         let frame = &self.frame;
         let rigid = frame.velocity().into_iter().chain(frame.spin()).chain(frame.center());
-        let modes = [&self.q, &self.v, &self.a, &self.f, &self.z].into_iter().flatten().copied();
+        let modes = [&self.q, &self.v, &self.a, &self.f, &self.z, &self.s].into_iter().flatten().copied();
         modes.chain(rigid).all(|x| x.abs() <= Self::MOST)
     }
 
     /// Sets the body to rest, undeformed, at the pose of its frame. The frame returns to the origin
     /// if its position is beyond the limit.
     pub(crate) fn stop(&mut self) {
-        for slice in [&mut self.q, &mut self.v, &mut self.a, &mut self.f, &mut self.z] {
+        for slice in [&mut self.q, &mut self.v, &mut self.a, &mut self.f, &mut self.z, &mut self.s] {
             slice.fill(0.0);
         }
         self.frame.stop(Self::MOST);
@@ -68,6 +72,7 @@ impl State {
             ("modal velocities", &self.v),
             ("modal accelerations", &self.a),
             ("modal flows", &self.z),
+            ("coordinates of held patches", &self.s),
         ];
         let bad = named.into_iter().find(|(_, slice)| slice.iter().any(|x| !x.is_finite()));
         bad.map(|(what, _)| what).or(self.frame.check().is_err().then_some("the frame"))
@@ -84,12 +89,13 @@ impl Clone for State {
     /// Keeps the allocations of `self`, so that a step saves its state without allocating. A
     /// derived `clone_from` would allocate.
     fn clone_from(&mut self, from: &Self) {
-        let Self { q, v, a, f, z, frame } = from;
+        let Self { q, v, a, f, z, s, frame } = from;
         self.q.clone_from(q);
         self.v.clone_from(v);
         self.a.clone_from(a);
         self.f.clone_from(f);
         self.z.clone_from(z);
+        self.s.clone_from(s);
         self.frame = *frame;
     }
 }

@@ -23,6 +23,7 @@ pub fn nonlinear_rod(young: f64, modes: usize, zeta: f64) -> ModalModel {
     let weights = vec![AREA * LENGTH / f64::from(points); points as usize];
     // Without sides that give way, the material is a spring along the rod.
     parts.info.poisson = 0.0;
-    parts.reduced = Some(ReducedElasticity { material: Material::StVenantKirchhoff, weights, gradients });
+    let material = Material::StVenantKirchhoff;
+    parts.reduced = Some(ReducedElasticity { material, weights, gradients, mesh: None });
     ModalModel::from_parts(parts).unwrap()
 }

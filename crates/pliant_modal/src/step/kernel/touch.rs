@@ -605,11 +605,11 @@ impl Kernel {
             frame + 0.5 * state.v.iter().map(|v| v * v).sum::<f64>()
         };
         let stored = |force: &Vector3<f64>, point: &Point| 0.5 * force.dot(&(point.compliance * force));
-        let at_rest = |state: &State| self.elastic_energy(&state.q) + self.potential_energy(state);
+        let at_rest = |state: &State| self.elastic_energy(state) + self.potential_energy(state);
         let moving = kinetic(state);
         let mut gained = moving - kinetic(&self.before) + at_rest(state) - at_rest(&self.before);
         let mut scale = moving + kinetic(&self.before);
-        scale += self.elastic_energy(&state.q) + self.elastic_energy(&self.before.q);
+        scale += self.elastic_energy(state) + self.elastic_energy(&self.before);
         for point in points {
             let force = point.world_force();
             scale += stored(&force, point) + stored(&point.before, point);

@@ -1,0 +1,403 @@
+//! The own shapes of held patches: what the coordinates of a model leave out around a hand.
+//!
+//! The coordinates of a reduced model are smooth. Around a held patch the body also bends in the
+//! way that the hand forces on it: the three static shapes of a force on the patch, and the six
+//! shapes of second order of their pairs (modal derivatives of the static shapes, S. R. Idelsohn
+//! and A. Cardona, *A reduction method for nonlinear structural dynamic analysis*, CMAME 49, 1985).
+//! These columns are solved on the elements around the patch when a hand takes hold, and vanish
+//! beyond them, where the coordinates suffice. Together with the coordinates they get a cubature
+//! rule of their own.
+//!
+//! The columns have no mass: their coordinates `s` are those of least energy in every step.
+
+mod mesh;
+mod region;
+
+use std::sync::Arc;
+
+use nalgebra::{DMatrix, Matrix3, Vector3};
+
+pub use mesh::{SimulationMesh, VertexPlace};
+
+use self::region::Region;
+use crate::{
+    ElasticEnergy, HeldPatch, Hyperelastic, ModalModel, Patch, ReducedElasticity, StepError,
+    cubature::{self, Fit, Point},
+    nonlinear::Gradients,
+    step::{contact_floor, residual},
+    tetrahedron,
+};
+
+/// Combinations of columns with less than this share of the largest energy are rounding errors.
+const LEAST: f64 = 1e-6;
+
+/// Number of points outside of the region to choose from.
+const OUTSIDE: usize = 400;
+
+/// Largest number of points outside of the region whose forces are the reference. A reference of
+/// one point in nine was off by two percent of the force in the hand.
+const REFERENCE: usize = 24_000;
+
+/// Number of points inside the region to choose from.
+const INSIDE: usize = 1_600;
+
+/// Number of points, outside and inside, that find the training shapes.
+const COARSE: [usize; 2] = [150, 300];
+
+/// Largest number of points of a rule, by coordinate.
+const POINTS_PER_COORDINATE: usize = 4;
+
+/// Error of the forces over the training shapes at which no more points are added.
+const TOLERANCE: f64 = 3e-3;
+
+/// Largest energy density of a training shape, as a share of Young's modulus.
+const ENERGY: f64 = 0.02;
+
+/// Ways of a hand in the training shapes, as shares of the body's size.
+const WAYS: [f64; 3] = [0.04, 0.12, 0.25];
+
+/// Largest number of patches whose shapes a body has at a time. Shapes of more hands would make a
+/// step too long.
+const MOST_PATCHES: usize = 4;
+
+/// What identifies a patch of a model: its center and its radius.
+pub(crate) type PatchKey = (u32, u64);
+
+/// Returns what identifies a patch.
+pub(crate) fn key(patch: &Patch) -> PatchKey {
+    (patch.center(), patch.radius().to_bits())
+}
+
+/// The own shapes of the patches that hands hold on a body with reduced elasticity.
+///
+/// They are made once, which takes a fraction of a second, and shared by all copies of the body.
+#[derive(Debug, Clone)]
+pub struct HeldShapes {
+    keys: Vec<PatchKey>,
+    /// Mean displacement of each patch by the columns, `[axis][column]`, m.
+    rows: Vec<cubature::Rows>,
+    /// What is left of the residual flexibility of each patch at the baked stiffness, m/N.
+    residuals: Vec<Matrix3<f64>>,
+    columns: usize,
+    /// The rule, with the columns before the coordinates.
+    gradients: Arc<Gradients>,
+    weights: Vec<f64>,
+    /// Surface vertices that the columns move, and by how much, `[vertex][axis][column]`.
+    vertices: Vec<u32>,
+    displacements: Vec<f32>,
+}
+
+impl HeldShapes {
+    /// Makes the shapes of patches of a model. The result is the same on every machine.
+    ///
+    /// Returns `None` for a model without reduced elasticity or without its simulation mesh, for no
+    /// patch and for more than four, and for patches that nothing moves.
+    ///
+    /// # Errors
+    /// Returns [`StepError::Vertex`] if a patch belongs to another surface.
+    pub fn new(model: &ModalModel, patches: &[Patch]) -> Result<Option<Self>, StepError> {
+        let count = model.surface().positions().len();
+        for patch in patches {
+            if let Some(&(vertex, _)) = patch.entries().iter().find(|&&(v, _)| v as usize >= count) {
+                return Err(StepError::Vertex { vertex, count });
+            }
+        }
+        let Some(reduced) = model.parts().reduced.as_ref() else { return Ok(None) };
+        let Some(mesh) = &reduced.mesh else { return Ok(None) };
+        if patches.is_empty() || patches.len() > MOST_PATCHES {
+            return Ok(None);
+        }
+        let positions = model.surface().positions();
+        let middle = |patch: &Patch| -> Vector3<f64> {
+            let at = |v: u32| Vector3::from(positions[v as usize].map(f64::from));
+            patch.entries().iter().map(|&(v, weight)| weight * at(v)).sum()
+        };
+        let places: Vec<(Vector3<f64>, f64)> = patches.iter().map(|p| (middle(p), p.radius())).collect();
+        let law = model.law(reduced.material, 1.0);
+        let region = Region::new(mesh, model.info().element, law, &places, model.size());
+        let Some((columns, width)) = columns(&region, patches, law) else { return Ok(None) };
+        let coupling = region.coupling(&columns, width);
+        let mut rows = Vec::with_capacity(patches.len());
+        let mut residuals = Vec::with_capacity(patches.len());
+        for patch in patches {
+            let (own, modal) = region.rows(patch, &columns, width);
+            residuals.push(left_over(model, patch, &own, &modal, &coupling)?);
+            rows.push(own);
+        }
+        let Some(rule) = rule(model, &region, law, &columns, width, &rows, patches) else { return Ok(None) };
+        let omega: Vec<f64> = std::iter::repeat_n(1.0, width).chain(model.omega().iter().copied()).collect();
+        let (mut vertices, mut displacements) = (Vec::new(), Vec::new());
+        let mut at = vec![0.0; 3 * width];
+        for vertex in 0..count as u32 {
+            if region.columns_at(vertex, &columns, width, &mut at) {
+                vertices.push(vertex);
+                displacements.extend(at.iter().map(|&x| x as f32));
+            }
+        }
+        let gradients: Vec<f32> =
+            rule.iter().flat_map(|point| point.gradients.iter().map(|&x| x as f32)).collect();
+        let weights = rule.iter().map(|point| point.weight).collect();
+        let gradients = Arc::new(Gradients::new(&gradients, &omega));
+        let keys = patches.iter().map(key).collect();
+        Ok(Some(Self { keys, rows, residuals, columns: width, gradients, weights, vertices, displacements }))
+    }
+
+    /// Number of columns.
+    pub fn columns(&self) -> usize {
+        self.columns
+    }
+
+    /// Number of points of the rule.
+    pub fn points(&self) -> usize {
+        self.weights.len()
+    }
+
+    fn find(&self, patch: &HeldPatch) -> Option<usize> {
+        self.keys.iter().position(|own| *own == patch.key())
+    }
+
+    /// Whether these are shapes of a patch.
+    pub fn are_of(&self, patch: &HeldPatch) -> bool {
+        self.find(patch).is_some()
+    }
+
+    /// Mean displacement of a patch by the columns, `[axis][column]`, m.
+    pub(crate) fn rows(&self, patch: &HeldPatch) -> Option<&cubature::Rows> {
+        self.rows.get(self.find(patch)?)
+    }
+
+    /// Displacement of a patch by the columns, m, body axes. `s` has one entry per column.
+    pub(crate) fn displacement(&self, patch: &HeldPatch, s: &[f64]) -> Vector3<f64> {
+        let Some(rows) = self.rows(patch).filter(|_| s.len() == self.columns) else {
+            return Vector3::zeros();
+        };
+        Vector3::from_fn(|axis, _| rows[axis].iter().zip(s).map(|(u, s)| u * s).sum())
+    }
+
+    /// What is left of the residual flexibility of a patch at the baked stiffness, m/N.
+    pub(crate) fn residual(&self, patch: &HeldPatch) -> Option<Matrix3<f64>> {
+        self.residuals.get(self.find(patch)?).copied()
+    }
+
+    /// The rule: gradients and weights, with the columns before the coordinates.
+    pub(crate) fn rule(&self) -> (Arc<Gradients>, &[f64]) {
+        (self.gradients.clone(), &self.weights)
+    }
+
+    /// Adds the displacements by the columns to a surface, m. `s` has one entry per column.
+    pub(crate) fn add_to(&self, s: &[f64], surface: &mut [[f32; 3]]) {
+        if s.len() != self.columns {
+            return;
+        }
+        let rows = self.displacements.chunks_exact(3 * self.columns);
+        for (&vertex, rows) in self.vertices.iter().zip(rows) {
+            let Some(position) = surface.get_mut(vertex as usize) else { continue };
+            for (x, row) in position.iter_mut().zip(rows.chunks_exact(self.columns)) {
+                *x += row.iter().zip(s).map(|(u, s)| u * *s as f32).sum::<f32>();
+            }
+        }
+    }
+}
+
+/// Makes the columns of all patches, `[node][axis][column]`, with `X^T K X` the identity.
+fn columns(region: &Region<'_>, patches: &[Patch], law: Hyperelastic) -> Option<(Vec<f64>, usize)> {
+    let width = 9 * patches.len();
+    let mut all = vec![0.0; 3 * region.node_count() * width];
+    for (index, patch) in patches.iter().enumerate() {
+        let shapes = region.static_shapes(index, &region.load(patch), law);
+        for (all, own) in all.chunks_exact_mut(width).zip(shapes.chunks_exact(9)) {
+            all[9 * index..9 * (index + 1)].copy_from_slice(own);
+        }
+    }
+    let energies = region.energies(&all, width);
+    let scale: Vec<f64> = (0..width)
+        .map(|k| energies[k * width + k])
+        .map(|energy| if energy > 0.0 { 1.0 / energy.sqrt() } else { 0.0 })
+        .collect();
+    let scaled = DMatrix::from_fn(width, width, |i, j| {
+        0.5 * scale[i] * scale[j] * (energies[i * width + j] + energies[j * width + i])
+    });
+    if !scaled.iter().all(|x| x.is_finite()) {
+        return None;
+    }
+    let eigen = scaled.symmetric_eigen();
+    let most = eigen.eigenvalues.max();
+    let mut kept: Vec<usize> =
+        (0..width).filter(|&k| eigen.eigenvalues[k] > LEAST * most && most > 0.0).collect();
+    kept.sort_by(|&a, &b| eigen.eigenvalues[b].total_cmp(&eigen.eigenvalues[a]).then(a.cmp(&b)));
+    if kept.is_empty() {
+        return None;
+    }
+    let combine = DMatrix::from_fn(width, kept.len(), |row, column| {
+        let k = kept[column];
+        scale[row] * eigen.eigenvectors[(row, k)] / eigen.eigenvalues[k].sqrt()
+    });
+    let mut out = Vec::with_capacity(all.len() / width * kept.len());
+    for row in all.chunks_exact(width) {
+        let entry = |column: usize| row.iter().enumerate().map(|(k, x)| x * combine[(k, column)]).sum::<f64>();
+        out.extend((0..kept.len()).map(entry));
+    }
+    Some((out, kept.len()))
+}
+
+/// What is left of a patch's residual flexibility beside the columns, m/N: the static compliance
+/// minus that of coordinates and columns together, where it is positive.
+fn left_over(
+    model: &ModalModel,
+    patch: &Patch,
+    own: &cubature::Rows,
+    modal: &cubature::Rows,
+    coupling: &[f64],
+) -> Result<Matrix3<f64>, StepError> {
+    let (width, omega) = (own[0].len(), model.omega());
+    let floor = contact_floor(model, patch);
+    let whole = residual(model, patch, model.mode_count())? - Matrix3::identity() * floor;
+    let soft = |i: usize, j: usize| -> f64 {
+        let rows = coupling.chunks_exact(width).zip(omega);
+        rows.map(|(row, omega)| row[i] * row[j] / (omega * omega)).sum()
+    };
+    // The columns' stiffness where the coordinates give way.
+    let stiff = DMatrix::from_fn(width, width, |i, j| f64::from(u8::from(i == j)) - soft(i, j));
+    let rows = DMatrix::from_fn(width, 3, |column, axis| {
+        let along = coupling.chunks_exact(width).zip(omega).zip(&modal[axis]);
+        own[axis][column] - along.map(|((row, omega), x)| row[column] * x / (omega * omega)).sum::<f64>()
+    });
+    let eigen = stiff.symmetric_eigen();
+    let mut left = whole;
+    for (k, &value) in eigen.eigenvalues.iter().enumerate().filter(|(_, value)| **value > LEAST) {
+        let along = rows.tr_mul(&eigen.eigenvectors.column(k));
+        let along = Vector3::new(along[0], along[1], along[2]);
+        left -= along * along.transpose() / value;
+    }
+    let eigen = (0.5 * (left + left.transpose())).symmetric_eigen();
+    let kept = Matrix3::from_diagonal(&eigen.eigenvalues.map(|x| x.max(0.0) + floor));
+    Ok(eigen.eigenvectors * kept * eigen.eigenvectors.transpose())
+}
+
+/// Makes the rule of columns and coordinates. Returns `None` if no shape can be found.
+fn rule(
+    model: &ModalModel,
+    region: &Region<'_>,
+    law: Hyperelastic,
+    columns: &[f64],
+    width: usize,
+    rows: &[cubature::Rows],
+    patches: &[Patch],
+) -> Option<Vec<Point>> {
+    let omega: Vec<f64> = std::iter::repeat_n(1.0, width).chain(model.omega().iter().copied()).collect();
+    let m = omega.len();
+    let inside = region.inside(columns, width);
+    let reference = region.outside(model.size(), REFERENCE, columns, width);
+    let candidates: Vec<Point> =
+        thinned(&reference, OUTSIDE).into_iter().chain(thinned(&inside, INSIDE)).collect();
+    let coarse: Vec<Point> =
+        thinned(&reference, COARSE[0]).into_iter().chain(thinned(&inside, COARSE[1])).collect();
+    let few = ReducedElasticity {
+        material: model.material()?,
+        weights: coarse.iter().map(|point| point.weight).collect(),
+        gradients: coarse.iter().flat_map(|point| point.gradients.iter().map(|&x| x as f32)).collect(),
+        mesh: None,
+    };
+    let mut energy = ElasticEnergy::new(&few, law, &omega).ok()?;
+    let most = ENERGY * model.info().young * energy.volume();
+    let ways = WAYS.map(|way| way * model.size());
+    let mut shapes = Vec::new();
+    for (own, patch) in rows.iter().zip(patches) {
+        let (_, modal) = region.rows(patch, columns, width);
+        let patch: cubature::Rows =
+            std::array::from_fn(|axis| own[axis].iter().chain(&modal[axis]).copied().collect());
+        for direction in [Vector3::x(), -Vector3::x(), Vector3::y(), -Vector3::y(), Vector3::z(), -Vector3::z()] {
+            shapes.extend(cubature::led(&mut energy, &omega, &patch, &direction, &ways, most));
+        }
+    }
+    let whole = || reference.iter().chain(&inside);
+    let forces: Vec<Vec<f64>> = shapes
+        .iter()
+        .map(|q| {
+            let mut sum = vec![0.0; m];
+            whole().for_each(|point| point.add_force(law, q, &mut sum));
+            sum
+        })
+        .collect();
+    let mut stiffness = vec![0.0; m * m];
+    let at_rest = law.tangent(&Matrix3::zeros());
+    whole().for_each(|point| point.add_tangent(m, &at_rest, &mut stiffness));
+    let fit = Fit {
+        law,
+        omega: &omega,
+        shapes: &shapes,
+        forces: &forces,
+        stiffness: &stiffness,
+        tolerance: TOLERANCE,
+        most: POINTS_PER_COORDINATE * m,
+    };
+    let chosen = cubature::choose(&candidates, &fit);
+    let point = |(index, factor): (usize, f64)| {
+        let point = &candidates[index];
+        Point { weight: factor * point.weight, gradients: point.gradients.clone() }
+    };
+    let chosen: Vec<Point> = chosen.into_iter().map(point).collect();
+    let sound = chosen.iter().all(|p| p.weight > 0.0 && p.weight.is_finite());
+    (sound && !chosen.is_empty()).then_some(chosen)
+}
+
+/// Returns about `most` of the points, evenly from the list, with weights whose sum stays.
+fn thinned(points: &[Point], most: usize) -> Vec<Point> {
+    let stride = points.len().div_ceil(most).max(1);
+    let groups = points.chunks(stride).enumerate();
+    groups
+        .map(|(group, members)| {
+            let weight = members.iter().map(|point| point.weight).sum();
+            let gradients = members[(group * 7919) % members.len()].gradients.clone();
+            Point { weight, gradients }
+        })
+        .collect()
+}
+
+impl Region<'_> {
+    /// Mean displacement of a patch by the columns and by the coordinates, `[axis][..]`.
+    fn rows(&self, patch: &Patch, columns: &[f64], width: usize) -> (cubature::Rows, cubature::Rows) {
+        self.mean(&self.load(patch), columns, width)
+    }
+
+    /// All quadrature points of the region's elements.
+    fn inside(&self, columns: &[f64], width: usize) -> Vec<Point> {
+        let points = tetrahedron::stiffness_points(self.kind()).0.len();
+        let make = |&element: &u32| {
+            let (_, volume) = self.place(element);
+            let weight = volume / points as f64;
+            (0..points)
+                .map(move |point| Point { weight, gradients: self.gradients(element, point, columns, width) })
+        };
+        self.elements.iter().flat_map(make).collect()
+    }
+
+    /// At most about `most` quadrature points outside of the region, spread over the body, with
+    /// weights whose sum is the volume there.
+    fn outside(&self, size: f64, most: usize, columns: &[f64], width: usize) -> Vec<Point> {
+        let mut order: Vec<([i64; 3], u32, f64)> = (0..self.mesh_elements() as u32)
+            .filter(|element| self.elements.binary_search(element).is_err())
+            .map(|element| {
+                let (center, volume) = self.place(element);
+                // Elements in the order of a coarse grid lie beside each other.
+                let cell: [i64; 3] = std::array::from_fn(|k| (16.0 * center[k] / size).floor() as i64);
+                (cell, element, volume)
+            })
+            .collect();
+        order.sort_by_key(|&(cell, element, _)| (cell, element));
+        let points = tetrahedron::stiffness_points(self.kind()).0.len();
+        let stride = (order.len() * points).div_ceil(most).max(1);
+        let groups = order.chunks(stride).enumerate();
+        groups
+            .flat_map(|(group, members)| {
+                // All points of one element of each group, for the volume of the group.
+                let weight = members.iter().map(|(_, _, volume)| volume).sum::<f64>() / points as f64;
+                let (_, element, _) = members[(group * 7919) % members.len()];
+                (0..points).map(move |point| Point {
+                    weight,
+                    gradients: self.gradients(element, point, columns, width),
+                })
+            })
+            .collect()
+    }
+}
