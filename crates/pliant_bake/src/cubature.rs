@@ -86,15 +86,8 @@ pub(crate) fn train(
     let mut stiffness = vec![0.0; m * m];
     lambda.iter().enumerate().for_each(|(i, lambda)| stiffness[i * m + i] = *lambda);
     let (most, tolerance) = (POINTS_PER_COORDINATE * m, TOLERANCE);
-    let fit = Fit {
-        law,
-        omega: &omega,
-        shapes: &shapes,
-        forces: &forces,
-        stiffness: &stiffness,
-        tolerance,
-        most,
-    };
+    let fit =
+        Fit { law, omega: &omega, shapes: &shapes, forces: &forces, stiffness: &stiffness, tolerance, most };
     let chosen = cubature::choose(&candidates, &fit);
     report(0.95);
     let gradients: Vec<f32> =
@@ -162,12 +155,7 @@ fn subset(points: &[Point], most: usize) -> Vec<Point> {
 }
 
 /// Returns shapes in which a patch is pulled out, pressed in and pulled to both sides.
-fn pulled(
-    energy: &mut ElasticEnergy,
-    omega: &[f64],
-    patch: &Rows,
-    training: &Training<'_>,
-) -> Vec<Vec<f64>> {
+fn pulled(energy: &mut ElasticEnergy, omega: &[f64], patch: &Rows, training: &Training<'_>) -> Vec<Vec<f64>> {
     let lambda = &training.coordinates.lambda;
     let most = ENERGY * training.young * training.continuum.fe.volume();
     // The softest and the stiffest direction of the patch, both ways, and the one between.

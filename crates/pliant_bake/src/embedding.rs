@@ -1,7 +1,7 @@
 //! Locates points in the tetrahedra with a uniform grid over their bounding boxes.
 
-use pliant_modal::tetrahedron::{dot, sub};
 use crate::fem::FeMesh;
+use pliant_modal::tetrahedron::{dot, sub};
 
 /// Nearest point of an element to a query point.
 ///

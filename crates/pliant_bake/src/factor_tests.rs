@@ -1,7 +1,7 @@
 use super::*;
-use pliant_modal::Element;
 use crate::fem::{ANCHORED, FeMesh, Law};
 use crate::{ordering, symbolic};
+use pliant_modal::Element;
 /// Makes a bar with its face x = 0 anchored, in elimination order.
 pub(crate) fn bar(
     cells: [usize; 3],

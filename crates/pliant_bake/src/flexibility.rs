@@ -317,10 +317,10 @@ mod tests {
 
     use super::*;
     use crate::bake::{elimination_order, law};
-    use pliant_modal::Element;
     use crate::fem::FeMesh;
     use crate::symbolic::Symbolic;
     use crate::{BakeConfig, support};
+    use pliant_modal::Element;
 
     /// Node columns, patch columns and single precision give the same compliances within their
     /// tolerances, also on a skin whose vertices depend on several nodes.

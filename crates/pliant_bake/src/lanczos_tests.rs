@@ -2,12 +2,12 @@ use pliant_mesh::{TetMesh, shapes};
 
 use super::*;
 use crate::bake::elimination_order;
-use pliant_modal::Element;
 use crate::factor::tests::bar;
 use crate::fem::{FeMesh, Law, Lists};
 use crate::rigid::MassProperties;
 use crate::sparse::BlockCsr;
 use crate::symbolic::Symbolic;
+use pliant_modal::Element;
 
 /// Returns the matrices of a mesh in elimination order, and the rigid modes if no node is held.
 fn matrices(mesh: &TetMesh, held: impl Fn([f64; 3]) -> bool) -> (BlockCsr, Symbolic, Option<Vec<f64>>) {

@@ -5,13 +5,13 @@ use pliant_mesh::{TetMesh, shapes};
 use pliant_modal::Patch;
 
 use crate::bake::{accuracy, elimination_order, law};
-use pliant_modal::Element;
 use crate::fem::{ANCHORED, FeMesh};
 use crate::rigid::MassProperties;
 use crate::solver::Solver;
 use crate::surface::Skin;
 use crate::symbolic::Symbolic;
 use crate::{Anchor, BakeConfig, flexibility, lanczos, support};
+use pliant_modal::Element;
 
 /// Returns the angular frequencies of the lowest elastic modes, rad/s.
 fn omegas(mesh: &TetMesh, element: Element, config: &BakeConfig, average: Option<bool>) -> Vec<f64> {

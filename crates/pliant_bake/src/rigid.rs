@@ -2,8 +2,8 @@
 
 use nalgebra::{Matrix3, SymmetricEigen, Vector3};
 
-use pliant_modal::tetrahedron::cross;
 use crate::fem::FeMesh;
+use pliant_modal::tetrahedron::cross;
 
 /// Mass, center of mass and inertia of the body at rest.
 #[derive(Clone, Copy, Debug)]

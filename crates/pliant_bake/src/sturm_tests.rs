@@ -1,8 +1,8 @@
 use super::*;
-use pliant_modal::Element;
 use crate::factor::tests::bar;
 use crate::lanczos;
 use crate::solver::Solver;
+use pliant_modal::Element;
 
 /// Returns for each isolated mode the smallest relative distance from the eigenvalue at which the
 /// counts are right, and the blur there.

@@ -1,8 +1,8 @@
 //! The visible surface and the mode shapes on it.
 
 use pliant_mesh::{Surface, TetMesh};
-use pliant_modal::{SurfaceMesh, VertexPlace};
 use pliant_modal::tetrahedron::{self, MAX_NODES};
+use pliant_modal::{SurfaceMesh, VertexPlace};
 use rayon::prelude::*;
 
 use crate::BakeError;
@@ -42,7 +42,8 @@ impl Skin {
                 for (element, corners) in tets.tets.iter().enumerate() {
                     for (k, &corner) in corners.iter().enumerate() {
                         let at = std::array::from_fn(|i| f32::from(u8::from(i + 1 == k)));
-                        place[corner as usize] = VertexPlace { element: element as u32, at, offset: [0.0; 3] };
+                        place[corner as usize] =
+                            VertexPlace { element: element as u32, at, offset: [0.0; 3] };
                     }
                 }
                 let places = nodes.iter().map(|&node| place[node as usize]).collect();

@@ -4,7 +4,8 @@ use std::{sync::Arc, time::Instant};
 
 use nalgebra::{Matrix3, Vector3};
 use pliant_modal::{
-    Body, BodyConfig, Elasticity, GrabConfig, HeldShapes, Material, ModalModel, ModelError, Patch, StepSettings,
+    Body, BodyConfig, Elasticity, GrabConfig, HeldShapes, Material, ModalModel, ModelError, Patch,
+    StepSettings,
 };
 use serde::Serialize;
 

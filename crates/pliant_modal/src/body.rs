@@ -5,8 +5,8 @@ use std::sync::Arc;
 use nalgebra::Vector3;
 
 use crate::{
-    Contacts, Frame, GrabConfig, Hand, HeldPatch, HeldShapes, Hold, Kernel, Load, ModalModel, Obstacle, Patch, Precision,
-    State, StepError, StepReport, StepSettings,
+    Contacts, Frame, GrabConfig, Hand, HeldPatch, HeldShapes, Hold, Kernel, Load, ModalModel, Obstacle,
+    Patch, Precision, State, StepError, StepReport, StepSettings,
     error::finite,
     step::{Six, tangent},
 };
@@ -296,10 +296,7 @@ impl Body {
     ///
     /// The shapes go when the last grab is released.
     pub fn set_held_shapes(&mut self, shapes: Option<Arc<HeldShapes>>) {
-        self.kernel.set_held_shapes(shapes);
-        let columns = self.kernel.held_shapes().map_or(0, |shapes| shapes.columns());
-        self.state.s.clear();
-        self.state.s.resize(columns, 0.0);
+        self.kernel.set_held_shapes(shapes, &mut self.state, &self.hands);
         self.kernel.prepare(&self.hands);
     }
 

@@ -63,8 +63,8 @@ pub use contact::{
     Capsule, Contact, ContactReport, Contacts, Cuboid, Moving, Obstacle, Plane, Sphere, SurfacePoint,
 };
 pub use error::{FileError, ModelError, StepError};
-pub use held::{HeldShapes, SimulationMesh, VertexPlace};
 pub use file::{FORMAT_VERSION, MAGIC};
+pub use held::{HeldShapes, SimulationMesh, VertexPlace};
 pub use integrator::{Coefficients, Integrator};
 pub use limit::streaming_sum;
 pub use model::{BakeInfo, Damping, Element, FlexibilitySite, ModalModel, ModelHash, ModelParts};

@@ -7,8 +7,8 @@ use serde::{Deserialize, Serialize};
 use crate::contact::ContactSites;
 use crate::step::MassSites;
 use crate::{
-    Basis, Hyperelastic, Material, ModelError, Precision, ReducedElasticity, StepError, SurfaceMesh, check::check_parts,
-    nonlinear::Gradients,
+    Basis, Hyperelastic, Material, ModelError, Precision, ReducedElasticity, StepError, SurfaceMesh,
+    check::check_parts, nonlinear::Gradients,
 };
 
 /// The finite element of a bake.

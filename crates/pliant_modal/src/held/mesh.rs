@@ -53,7 +53,12 @@ impl SimulationMesh {
 
     /// Checks lengths, numbers and indices for a model of `modes` coordinates and `vertices`
     /// surface vertices.
-    pub(crate) fn check(&self, element: crate::Element, modes: usize, vertices: usize) -> Result<(), ModelError> {
+    pub(crate) fn check(
+        &self,
+        element: crate::Element,
+        modes: usize,
+        vertices: usize,
+    ) -> Result<(), ModelError> {
         let length = |what, expected: usize, got: usize| {
             if expected == got { Ok(()) } else { Err(ModelError::Length { what, expected, got }) }
         };

@@ -21,7 +21,7 @@ pub use mesh::{SimulationMesh, VertexPlace};
 
 use self::region::Region;
 use crate::{
-    ElasticEnergy, HeldPatch, Hyperelastic, ModalModel, Patch, ReducedElasticity, StepError,
+    ElasticEnergy, HeldPatch, Hyperelastic, ModalModel, Patch, ReducedElasticity, State, StepError,
     cubature::{self, Fit, Point},
     nonlinear::Gradients,
     step::{contact_floor, residual},
@@ -54,7 +54,7 @@ const TOLERANCE: f64 = 3e-3;
 const ENERGY: f64 = 0.02;
 
 /// Ways of a hand in the training shapes, as shares of the body's size.
-const WAYS: [f64; 3] = [0.04, 0.12, 0.25];
+const WAYS: [f64; 4] = [0.04, 0.12, 0.25, 0.5];
 
 /// Largest number of patches whose shapes a body has at a time. Shapes of more hands would make a
 /// step too long.
@@ -71,7 +71,7 @@ pub(crate) fn key(patch: &Patch) -> PatchKey {
 /// The own shapes of the patches that hands hold on a body with reduced elasticity.
 ///
 /// They are made once, which takes a fraction of a second, and shared by all copies of the body.
-#[derive(Debug, Clone)]
+#[derive(Debug, Clone, PartialEq)]
 pub struct HeldShapes {
     keys: Vec<PatchKey>,
     /// Mean displacement of each patch by the columns, `[axis][column]`, m.
@@ -79,6 +79,8 @@ pub struct HeldShapes {
     /// What is left of the residual flexibility of each patch at the baked stiffness, m/N.
     residuals: Vec<Matrix3<f64>>,
     columns: usize,
+    /// `Lambda^-1 Phi^T K S`: the coordinates' part in each column, `[coordinate][column]`.
+    parts: Vec<f64>,
     /// The rule, with the columns before the coordinates.
     gradients: Arc<Gradients>,
     weights: Vec<f64>,
@@ -124,7 +126,9 @@ impl HeldShapes {
             residuals.push(left_over(model, patch, &own, &modal, &coupling)?);
             rows.push(own);
         }
-        let Some(rule) = rule(model, &region, law, &columns, width, &rows, patches) else { return Ok(None) };
+        let stiffness = stiffness(model, &coupling, width);
+        let made = rule(model, &region, law, &columns, width, &rows, patches, &stiffness);
+        let Some(rule) = made else { return Ok(None) };
         let omega: Vec<f64> = std::iter::repeat_n(1.0, width).chain(model.omega().iter().copied()).collect();
         let (mut vertices, mut displacements) = (Vec::new(), Vec::new());
         let mut at = vec![0.0; 3 * width];
@@ -139,7 +143,12 @@ impl HeldShapes {
         let weights = rule.iter().map(|point| point.weight).collect();
         let gradients = Arc::new(Gradients::new(&gradients, &omega));
         let keys = patches.iter().map(key).collect();
-        Ok(Some(Self { keys, rows, residuals, columns: width, gradients, weights, vertices, displacements }))
+        let mut parts = coupling;
+        for (row, omega) in parts.chunks_exact_mut(width).zip(model.omega()) {
+            row.iter_mut().for_each(|x| *x /= omega * omega);
+        }
+        let columns = width;
+        Ok(Some(Self { keys, rows, residuals, columns, parts, gradients, weights, vertices, displacements }))
     }
 
     /// Number of columns.
@@ -177,6 +186,25 @@ impl HeldShapes {
     /// What is left of the residual flexibility of a patch at the baked stiffness, m/N.
     pub(crate) fn residual(&self, patch: &HeldPatch) -> Option<Matrix3<f64>> {
         self.residuals.get(self.find(patch)?).copied()
+    }
+
+    /// Writes how the coordinates give way to the columns, so that both together are the part of the
+    /// columns that the coordinates have not: `-Lambda^-1 Phi^T K S s`.
+    pub(crate) fn yielding(&self, s: &[f64], out: &mut [f64]) {
+        for (out, row) in out.iter_mut().zip(self.parts.chunks_exact(self.columns)) {
+            *out = -row.iter().zip(s).map(|(part, s)| part * s).sum::<f64>();
+        }
+    }
+
+    /// Gives the coordinates their part of the columns, which end.
+    pub(crate) fn leave(&self, state: &mut State) {
+        if state.s.len() != self.columns || state.q.len() * self.columns != self.parts.len() {
+            return;
+        }
+        for (q, row) in state.q.iter_mut().zip(self.parts.chunks_exact(self.columns)) {
+            *q += row.iter().zip(&state.s).map(|(part, s)| part * s).sum::<f64>();
+        }
+        state.s.clear();
     }
 
     /// The rule: gradients and weights, with the columns before the coordinates.
@@ -234,7 +262,8 @@ fn columns(region: &Region<'_>, patches: &[Patch], law: Hyperelastic) -> Option<
     });
     let mut out = Vec::with_capacity(all.len() / width * kept.len());
     for row in all.chunks_exact(width) {
-        let entry = |column: usize| row.iter().enumerate().map(|(k, x)| x * combine[(k, column)]).sum::<f64>();
+        let entry =
+            |column: usize| row.iter().enumerate().map(|(k, x)| x * combine[(k, column)]).sum::<f64>();
         out.extend((0..kept.len()).map(entry));
     }
     Some((out, kept.len()))
@@ -274,7 +303,23 @@ fn left_over(
     Ok(eigen.eigenvectors * kept * eigen.eigenvectors.transpose())
 }
 
+/// The stiffness of columns and coordinates at rest, row by row: both alone are diagonal.
+fn stiffness(model: &ModalModel, coupling: &[f64], width: usize) -> Vec<f64> {
+    let m = width + model.mode_count();
+    let mut out = vec![0.0; m * m];
+    (0..width).for_each(|k| out[k * m + k] = 1.0);
+    for (i, (omega, row)) in model.omega().iter().zip(coupling.chunks_exact(width)).enumerate() {
+        let i = width + i;
+        out[i * m + i] = omega * omega;
+        for (k, &x) in row.iter().enumerate() {
+            (out[i * m + k], out[k * m + i]) = (x, x);
+        }
+    }
+    out
+}
+
 /// Makes the rule of columns and coordinates. Returns `None` if no shape can be found.
+#[expect(clippy::too_many_arguments, reason = "one caller, which has all of it at hand")]
 fn rule(
     model: &ModalModel,
     region: &Region<'_>,
@@ -283,6 +328,7 @@ fn rule(
     width: usize,
     rows: &[cubature::Rows],
     patches: &[Patch],
+    stiffness: &[f64],
 ) -> Option<Vec<Point>> {
     let omega: Vec<f64> = std::iter::repeat_n(1.0, width).chain(model.omega().iter().copied()).collect();
     let m = omega.len();
@@ -306,7 +352,9 @@ fn rule(
         let (_, modal) = region.rows(patch, columns, width);
         let patch: cubature::Rows =
             std::array::from_fn(|axis| own[axis].iter().chain(&modal[axis]).copied().collect());
-        for direction in [Vector3::x(), -Vector3::x(), Vector3::y(), -Vector3::y(), Vector3::z(), -Vector3::z()] {
+        for direction in
+            [Vector3::x(), -Vector3::x(), Vector3::y(), -Vector3::y(), Vector3::z(), -Vector3::z()]
+        {
             shapes.extend(cubature::led(&mut energy, &omega, &patch, &direction, &ways, most));
         }
     }
@@ -319,15 +367,12 @@ fn rule(
             sum
         })
         .collect();
-    let mut stiffness = vec![0.0; m * m];
-    let at_rest = law.tangent(&Matrix3::zeros());
-    whole().for_each(|point| point.add_tangent(m, &at_rest, &mut stiffness));
     let fit = Fit {
         law,
         omega: &omega,
         shapes: &shapes,
         forces: &forces,
-        stiffness: &stiffness,
+        stiffness,
         tolerance: TOLERANCE,
         most: POINTS_PER_COORDINATE * m,
     };

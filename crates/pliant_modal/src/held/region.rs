@@ -13,8 +13,8 @@ use crate::{
 /// better forces (docs/decisions.md).
 const REACH: f64 = 2.0;
 
-/// Least radius of a patch that a region is made for, as a share of the body's size.
-const LEAST: f64 = 0.05;
+/// Least radius of a region, as a share of the body's size.
+const LEAST: f64 = 0.3;
 
 /// Maximum number of elements around one patch.
 const MOST_ELEMENTS: usize = 2_000;
@@ -61,7 +61,7 @@ impl<'a> Region<'a> {
         let around: Vec<Vec<u32>> = patches
             .iter()
             .map(|&(center, radius)| {
-                let reach = REACH * radius.max(LEAST * size);
+                let reach = (REACH * radius).max(LEAST * size);
                 let away = |e: u32| {
                     let middle = mesh.tets[e as usize].map(|c| Vector3::from(corner(c)));
                     (0.25 * middle.iter().sum::<Vector3<f64>>() - center).norm()
@@ -110,7 +110,11 @@ impl<'a> Region<'a> {
                 for &e in around {
                     of(e).iter().for_each(|&node| own[local(node) as usize] += 1);
                 }
-                own.iter().zip(&uses).zip(&anchored).map(|((own, all), anchored)| own == all && !anchored).collect()
+                own.iter()
+                    .zip(&uses)
+                    .zip(&anchored)
+                    .map(|((own, all), anchored)| own == all && !anchored)
+                    .collect()
             })
             .collect();
         let stiffness = Stiffness::new(kind, law, numbers.len(), &nodes, &affine);

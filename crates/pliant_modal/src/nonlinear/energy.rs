@@ -113,12 +113,7 @@ impl ElasticEnergy {
         Ok(Self::assemble(gradients, &reduced.weights, law, omega))
     }
 
-    fn assemble(
-        gradients: Arc<Gradients>,
-        weights: &[f64],
-        law: Hyperelastic,
-        omega: &[f64],
-    ) -> Self {
+    fn assemble(gradients: Arc<Gradients>, weights: &[f64], law: Hyperelastic, omega: &[f64]) -> Self {
         let modes = omega.len();
         let padded = modes.next_multiple_of(WIDTH);
         Self {

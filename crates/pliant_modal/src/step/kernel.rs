@@ -208,11 +208,22 @@ impl Kernel {
     /// does a kernel that steps fewer modes than its model has.
     ///
     /// Hands on other patches feel what the modes leave out as a compliance, as all hands do without
-    /// shapes. A state of another set of shapes is taken with its own at rest.
-    pub fn set_held_shapes(&mut self, shapes: Option<Arc<HeldShapes>>) {
-        if self.elastic.is_some() {
-            self.elastic = elastic(&self.model, &self.settings, &self.modes, self.h, shapes);
-            self.responses.forget();
+    /// shapes. The shapes of `state` come to rest under the forces of `hands`, so that these go on
+    /// as they were.
+    pub fn set_held_shapes(&mut self, shapes: Option<Arc<HeldShapes>>, state: &mut State, hands: &[Hand]) {
+        if let Some(old) = self.held_shapes() {
+            old.leave(state);
+        }
+        state.s.clear();
+        if self.elastic.is_none() || self.check_lengths(state).is_err() {
+            return;
+        }
+        self.elastic = elastic(&self.model, &self.settings, &self.modes, self.h, shapes);
+        self.responses.forget();
+        let back = state.frame.rotation().inverse();
+        let pulls = hands.iter().map(|hand| (&*hand.patch, back * hand.mean));
+        if let Some(elastic) = &mut self.elastic {
+            elastic.settle(state, pulls);
         }
     }
 

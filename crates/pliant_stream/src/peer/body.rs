@@ -234,7 +234,7 @@ impl PeerBody {
         }
         let (q, v, a, z) = (state.q.clone(), state.v.clone(), state.a.clone(), state.z.clone());
         let f = state.force.clone();
-        let received = State { q, v, a, f, z, frame: received.unwrap_or(self.state.frame) };
+        let received = State { q, v, a, f, z, s: Vec::new(), frame: received.unwrap_or(self.state.frame) };
         if self.replica.kernel().check(&received).is_err() {
             return false;
         }

@@ -1,0 +1,218 @@
+//! Hands whose patches have their own shapes, against full nonlinear solutions.
+
+#![allow(clippy::unwrap_used, clippy::print_stdout, reason = "a failed test should panic")]
+
+use std::sync::Arc;
+
+use pliant_bake::{Bake, BakeConfig, Material, PrescribedPatch, StaticLoads, bake, deflect};
+use pliant_mesh::{TetMesh, shapes};
+use pliant_modal::{
+    Body, BodyConfig, Elasticity, GrabConfig, GrabId, HeldShapes, ModalModel, Patch, StepSettings,
+};
+
+type Vector = [f64; 3];
+
+fn config() -> BakeConfig {
+    BakeConfig {
+        modes: BakeConfig::COORDINATES,
+        material: Some(Material::NeoHookean),
+        anchors: vec!["x<1e-9".parse().unwrap()],
+        ..Default::default()
+    }
+}
+
+/// A bar of 1 m by 0.1 m by 0.1 m along x, clamped at x = 0.
+fn slender() -> TetMesh {
+    shapes::bar([20, 2, 2], [1.0, 0.1, 0.1]).unwrap()
+}
+
+fn model(mesh: &TetMesh, config: &BakeConfig) -> Arc<ModalModel> {
+    let Bake { model, .. } = bake(mesh, None, config, &mut |_, _| ()).unwrap();
+    Arc::new(model)
+}
+
+fn vertex(model: &ModalModel, at: Vector) -> u32 {
+    let positions = model.surface().positions();
+    let away = |v: u32| (0..3).map(|k| (f64::from(positions[v as usize][k]) - at[k]).powi(2)).sum::<f64>();
+    (0..positions.len() as u32).min_by(|&a, &b| away(a).total_cmp(&away(b))).unwrap()
+}
+
+fn norm(a: Vector) -> f64 {
+    a.iter().map(|x| x * x).sum::<f64>().sqrt()
+}
+
+fn minus(a: Vector, b: Vector) -> Vector {
+    std::array::from_fn(|k| a[k] - b[k])
+}
+
+fn reduced(model: &Arc<ModalModel>, step: f64, damping_scale: f64) -> Body {
+    let settings = StepSettings { elasticity: Elasticity::Reduced, damping_scale, ..Default::default() };
+    Body::new(model.clone(), BodyConfig { step, ..settings.into() }).unwrap()
+}
+
+/// Leads hands to where they stay, slowly, and lets the body come to rest.
+fn lead(body: &mut Body, hands: &[(GrabId, Vector)]) {
+    let starts: Vec<Vector> = hands.iter().map(|(grab, _)| body.target(*grab).unwrap()).collect();
+    for i in 1..=1_200 {
+        let share = (f64::from(i) / 600.0).min(1.0);
+        for ((grab, way), start) in hands.iter().zip(&starts) {
+            body.set_target(*grab, std::array::from_fn(|k| start[k] + share * way[k])).unwrap();
+        }
+        body.step().unwrap();
+    }
+}
+
+/// Errors of the forces, as a share of the largest, and of the surface, m, without and with shapes.
+fn errors(mesh: &TetMesh, model: &Arc<ModalModel>, hands: &[(Patch, Vector)]) -> [[f64; 2]; 2] {
+    let held: Vec<PrescribedPatch> = hands
+        .iter()
+        .map(|(patch, way)| PrescribedPatch { patch: patch.clone(), displacement: *way })
+        .collect();
+    let loads = StaticLoads { prescribed: &held, ..Default::default() };
+    let full = deflect(mesh, &config(), Material::NeoHookean, &loads).unwrap();
+    let patches: Vec<Patch> = hands.iter().map(|(patch, _)| patch.clone()).collect();
+    let shapes = HeldShapes::new(model, &patches).unwrap().map(Arc::new);
+    assert!(shapes.is_some());
+    [None, shapes].map(|shapes| {
+        let mut body = reduced(model, 1.0 / 60.0, 30.0);
+        let grabs: Vec<(GrabId, Vector)> = hands
+            .iter()
+            .map(|(patch, way)| (body.grab(patch, GrabConfig::default()).unwrap(), *way))
+            .collect();
+        body.set_held_shapes(shapes);
+        lead(&mut body, &grabs);
+        let size = full.reactions.iter().map(|&force| norm(force)).fold(0.0, f64::max);
+        let off = grabs.iter().zip(&full.reactions);
+        let off = off.map(|((grab, _), want)| norm(minus(body.reaction(*grab).unwrap(), *want)));
+        let force = off.fold(0.0, f64::max) / size;
+        let rest = model.surface().positions();
+        let mut surface = rest.to_vec();
+        body.reconstruct(&mut surface).unwrap();
+        let off = |v: usize| {
+            norm(std::array::from_fn(|k| f64::from(surface[v][k] - rest[v][k]) - full.surface[v][k]))
+        };
+        [force, (0..rest.len()).map(off).fold(0.0, f64::max)]
+    })
+}
+
+#[test]
+fn shapes_of_the_patch_give_the_force_and_the_dent() {
+    let mesh = slender();
+    let model = model(&mesh, &config());
+    let around = |at, radius| Patch::around(model.surface(), vertex(&model, at), radius).unwrap();
+    type Row = (&'static str, Vector, f64, Vector, [f64; 2]);
+    let rows: [Row; 5] = [
+        ("corner of the end by .08", [1.0, 0.1, 0.1], 0.05, [0.0, 0.056, 0.056], [0.01, 1e-3]),
+        ("corner of the end by .28", [1.0, 0.1, 0.1], 0.05, [0.0, 0.196, 0.196], [0.03, 0.01]),
+        ("side of the middle by .08", [0.5, 0.1, 0.05], 0.05, [0.0, 0.08, 0.0], [0.02, 3e-3]),
+        // A bar that is led so far by its middle bends in more ways than the coordinates have.
+        ("side of the middle by .28", [0.5, 0.1, 0.05], 0.05, [0.0, 0.28, 0.0], [0.13, 0.06]),
+        ("end, sideways by .5", [1.0, 0.05, 0.05], 0.08, [0.0, 0.5, 0.0], [0.03, 0.015]),
+    ];
+    for (name, at, radius, way, bounds) in rows {
+        let [without, with] = errors(&mesh, &model, &[(around(at, radius), way)]);
+        println!("{name}: force and surface off by {with:.4?}, without the shapes by {without:.4?}");
+        assert!(with[0] < bounds[0] && with[1] < bounds[1], "{name}: {with:?}");
+    }
+    let two = [
+        (around([0.9, 0.1, 0.05], 0.05), [0.0, 0.04, 0.0]),
+        (around([0.7, 0.1, 0.05], 0.05), [0.0, -0.04, 0.0]),
+    ];
+    let [without, with] = errors(&mesh, &model, &two);
+    println!("two hands that shear: {with:.4?}, without the shapes {without:.4?}");
+    assert!(with[0] < 0.05 && with[1] < 5e-3, "{with:?}");
+}
+
+#[test]
+fn shapes_are_the_same_every_time_and_go_with_the_last_grab() {
+    let model = model(&slender(), &config());
+    let patch = Patch::around(model.surface(), vertex(&model, [1.0, 0.1, 0.1]), 0.05).unwrap();
+    let make = || HeldShapes::new(&model, std::slice::from_ref(&patch)).unwrap().unwrap();
+    assert!(make() == make());
+    let mut body = reduced(&model, 1.0 / 60.0, 1.0);
+    let grab = body.grab(&patch, GrabConfig::default()).unwrap();
+    body.set_held_shapes(Some(Arc::new(make())));
+    lead(&mut body, &[(grab, [0.0, 0.1, 0.0])]);
+    assert!(body.state().s.iter().any(|s| *s != 0.0));
+    body.release(grab);
+    assert!(body.state().s.is_empty());
+    body.step().unwrap();
+    // None without a simulation mesh, and for a model that is linear.
+    let mut parts = model.parts().clone();
+    parts.reduced.as_mut().unwrap().mesh = None;
+    let bare = ModalModel::from_parts(parts).unwrap();
+    assert!(HeldShapes::new(&bare, std::slice::from_ref(&patch)).unwrap().is_none());
+    // Files keep the mesh to the bit.
+    assert!(ModalModel::from_bytes(&model.to_bytes()).unwrap() == *model);
+}
+
+#[test]
+fn a_hand_that_gets_its_shapes_late_feels_no_kick() {
+    let model = model(&slender(), &config());
+    let patch = Patch::around(model.surface(), vertex(&model, [1.0, 0.1, 0.1]), 0.05).unwrap();
+    let shapes = Arc::new(HeldShapes::new(&model, std::slice::from_ref(&patch)).unwrap().unwrap());
+    let mut body = reduced(&model, 1.0 / 60.0, 1.0);
+    let grab = body.grab(&patch, GrabConfig::default()).unwrap();
+    lead(&mut body, &[(grab, [0.0, 0.04, 0.04])]);
+    let before = body.reaction(grab).unwrap();
+    body.set_held_shapes(Some(shapes));
+    let mut most = 0.0f64;
+    for _ in 0..120 {
+        body.step().unwrap();
+        most = most.max(norm(minus(body.reaction(grab).unwrap(), before)));
+    }
+    let settled = norm(minus(body.reaction(grab).unwrap(), before));
+    println!("the force changes by {settled:.4} N of {:.4} N, on the way by {most:.4} N", norm(before));
+    assert!(most < 1.3 * settled + 0.01 * norm(before), "{most} {settled}");
+}
+
+#[test]
+fn jerks_folds_and_tearing_stay_calm_with_shapes() {
+    let model = model(&slender(), &config());
+    let end = Patch::around(model.surface(), vertex(&model, [1.0, 0.1, 0.1]), 0.05).unwrap();
+    let side = Patch::around(model.surface(), vertex(&model, [0.5, 0.1, 0.05]), 0.05).unwrap();
+    let shapes = Arc::new(HeldShapes::new(&model, &[end.clone(), side.clone()]).unwrap().unwrap());
+    let cases: [(&str, f64, Vector, Vector); 7] = [
+        ("jerk", 60.0, [0.0, 0.7, 0.0], [0.0; 3]),
+        ("fold", 60.0, [-1.2, 0.05, 0.0], [0.0, 0.3, 0.0]),
+        ("tear", 60.0, [0.7, 0.0, 0.0], [-0.3, 0.2, 0.0]),
+        ("press", 60.0, [-0.5, 0.0, 0.0], [0.0, -0.3, 0.0]),
+        ("jerk", 240.0, [0.0, 0.7, 0.0], [0.0; 3]),
+        ("fold", 240.0, [-1.2, 0.05, 0.0], [0.0, 0.3, 0.0]),
+        ("press", 240.0, [-0.5, 0.0, 0.0], [0.0, -0.3, 0.0]),
+    ];
+    for (name, rate, first, second) in cases {
+        let mut body = reduced(&model, 1.0 / rate, 1.0);
+        let grabs = [&end, &side].map(|patch| body.grab(patch, GrabConfig::default()).unwrap());
+        body.set_held_shapes(Some(shapes.clone()));
+        for (grab, way) in grabs.iter().zip([first, second]) {
+            let at = body.target(*grab).unwrap();
+            body.set_target(*grab, std::array::from_fn(|k| at[k] + way[k])).unwrap();
+        }
+        let steps = (8.0 * rate) as usize;
+        let (mut last, mut turn) = ([0.0; 3], 0.0f64);
+        for i in 0..steps {
+            body.step().unwrap();
+            let force = body.reaction(grabs[0]).unwrap();
+            if i > steps - 60 {
+                turn = turn.max(norm(minus(force, last)));
+            }
+            last = force;
+        }
+        let energy = body.energy();
+        grabs.map(|grab| body.release(grab));
+        let mut most = 0.0f64;
+        for _ in 0..(2.0 * rate) as usize {
+            body.step().unwrap();
+            most = most.max(body.energy());
+        }
+        let turn = turn / norm(last);
+        println!(
+            "{name} at {rate} Hz: {:.1} N, changes by {turn:.1e} of it a step at the end; energy \
+             {energy:.3} J, then at most {most:.3} J",
+            norm(last)
+        );
+        assert!(turn <= 0.02, "{name}: {turn}");
+        assert!(most <= energy * (1.0 + 1e-9), "{name}: {most} after {energy}");
+    }
+}
