@@ -14,7 +14,7 @@ use crate::{Bake, BakeConfig, BakeError, BakeTimes, Stage, bake};
 /// Version of the bake method, which is part of every key.
 ///
 /// Raise the version with every change that alters the result of a bake of the same input.
-pub const METHOD_VERSION: u32 = 6;
+pub const METHOD_VERSION: u32 = 7;
 
 /// First bytes of a file of the cache. The [`BakeKey`] of its bake (32 bytes) and the model, as in
 /// a `.modal` file, follow.
