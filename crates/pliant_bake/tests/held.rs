@@ -201,7 +201,9 @@ fn jerks_folds_and_tearing_stay_calm_with_shapes() {
             last = force;
         }
         let energy = body.energy();
-        grabs.map(|grab| body.release(grab));
+        for grab in grabs {
+            body.release(grab);
+        }
         let mut most = 0.0f64;
         for _ in 0..(2.0 * rate) as usize {
             body.step().unwrap();

@@ -15,10 +15,10 @@
 //!
 //! Section `MESH` is the simulation mesh, with `c` corners, `t` tetrahedra and `k` nodes: c u32, t
 //! u32, corners f32 x 3 c, tetrahedra u32 x 4 t, scales f32 x m, displacements i16 x 3 k m, and a
-//! place u32 x 1, f32 x 6 for each surface vertex. It follows section `NLIN`, which is the reduced elasticity of `p` points: material u8 (0 neo-Hookean, 1 St.
-//! Venant-Kirchhoff), `p` u32, weights f64 x p, gradients f32 x 9 p m. A model without it has
-//! linear elasticity only. All numbers are little-endian. A reader checks magic, version, length
-//! and hash before it decodes the payload.
+//! place u32 x 1, f32 x 6 for each surface vertex. It follows section `NLIN`, which is the reduced
+//! elasticity of `p` points: material u8 (0 neo-Hookean, 1 St. Venant-Kirchhoff), `p` u32, weights
+//! f64 x p, gradients f32 x 9 p m. A model without it has linear elasticity only. All numbers are
+//! little-endian. A reader checks magic, version, length and hash before it decodes the payload.
 
 use std::{
     fs, io,

@@ -101,11 +101,11 @@ pub struct ForceDimensionConfig {
     /// Whether a device that does not know its position finds it by itself, when it is opened and
     /// when it comes back.
     ///
-    /// **The device then drives through its workspace with its own motors** for some seconds. When it
-    /// is opened for the first time, Pliant's emergency stop does not reach it meanwhile; when it
-    /// comes back in a running loop, the stop ends the drive by `drdStop`. Keep hands off, and keep
-    /// a thumb on the device's own switch. This setting needs the vendor's DRD library. Default:
-    /// `false`, the user moves the device by hand.
+    /// **The device then drives through its workspace with its own motors** for some seconds. When
+    /// it is opened for the first time, Pliant's emergency stop does not reach it meanwhile; when
+    /// it comes back in a running loop, the stop ends the drive by `drdStop`. Keep hands off, and
+    /// keep a thumb on the device's own switch. This setting needs the vendor's DRD library.
+    /// Default: `false`, the user moves the device by hand.
     pub auto_init: bool,
     /// Index of the device among the connected devices, from 0. Default: 0.
     pub index: u8,

@@ -188,8 +188,8 @@ impl HeldShapes {
         self.residuals.get(self.find(patch)?).copied()
     }
 
-    /// Writes how the coordinates give way to the columns, so that both together are the part of the
-    /// columns that the coordinates have not: `-Lambda^-1 Phi^T K S s`.
+    /// Writes how the coordinates give way to the columns, so that both together are the part of
+    /// the columns that the coordinates have not: `-Lambda^-1 Phi^T K S s`.
     pub(crate) fn yielding(&self, s: &[f64], out: &mut [f64]) {
         for (out, row) in out.iter_mut().zip(self.parts.chunks_exact(self.columns)) {
             *out = -row.iter().zip(s).map(|(part, s)| part * s).sum::<f64>();

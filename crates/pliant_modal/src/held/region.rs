@@ -199,8 +199,8 @@ impl<'a> Region<'a> {
         }
     }
 
-    /// Displacements of a surface vertex by columns on the region, `[axis][column]`. Returns `false`
-    /// and writes nothing if no column moves the vertex.
+    /// Displacements of a surface vertex by columns on the region, `[axis][column]`. Returns
+    /// `false` and writes nothing if no column moves the vertex.
     pub(super) fn columns_at(&self, vertex: u32, columns: &[f64], width: usize, out: &mut [f64]) -> bool {
         let mut moved = false;
         self.vertex(vertex, &mut |node, share| {

@@ -207,9 +207,9 @@ impl Kernel {
     /// Sets the own shapes of the patches that hands hold. Linear elasticity does not use them, nor
     /// does a kernel that steps fewer modes than its model has.
     ///
-    /// Hands on other patches feel what the modes leave out as a compliance, as all hands do without
-    /// shapes. The shapes of `state` come to rest under the forces of `hands`, so that these go on
-    /// as they were.
+    /// Hands on other patches feel what the modes leave out as a compliance, as all hands do
+    /// without shapes. The shapes of `state` come to rest under the forces of `hands`, so that
+    /// these go on as they were.
     pub fn set_held_shapes(&mut self, shapes: Option<Arc<HeldShapes>>, state: &mut State, hands: &[Hand]) {
         if let Some(old) = self.held_shapes() {
             old.leave(state);
