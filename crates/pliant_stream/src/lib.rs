@@ -85,6 +85,7 @@ mod link;
 pub mod newmark;
 pub mod peer;
 pub mod playout;
+mod prediction;
 pub mod recovery;
 mod replica;
 pub mod session;

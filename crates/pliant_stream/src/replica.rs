@@ -4,23 +4,16 @@ use std::sync::Arc;
 
 use nalgebra::Vector3;
 use pliant_modal::{
-    Hand, HeldPatch, Hold, ImpliedPulls, Kernel, Load, ModalModel, Patch, State, StepSettings,
+    GrabConfig, Hand, HeldPatch, Hold, ImpliedPulls, Kernel, Load, ModalModel, Patch, State, StepSettings,
 };
 
 use crate::StreamError;
+use crate::prediction::{BodyCopy, HandState};
 use crate::state::{GrabKey, GrabState, Pose};
 use crate::wire::FrameGrab;
 
 /// Largest number of cached patches. One more empties the table.
 const PATCHES: usize = 256;
-
-/// The mean force of a hand on a body over the last step, N, world axes; see [`Hand::mean`].
-pub(crate) type Mean = (GrabKey, Vector3<f64>);
-
-/// Returns the mean force of a hand, or zero for a hand without one.
-pub(crate) fn mean_of(means: &[Mean], key: GrabKey) -> Vector3<f64> {
-    means.iter().find(|(known, _)| *known == key).map_or_else(Vector3::zeros, |(_, mean)| *mean)
-}
 
 /// Key of a patch: the vertex and the bits of the radius.
 type Key = (u32, u64);
@@ -30,6 +23,7 @@ type Key = (u32, u64);
 pub(crate) struct Replica {
     kernel: Kernel,
     patches: Vec<(Key, Arc<HeldPatch>)>,
+    /// The hands of the next step, and their keys.
     hands: Vec<Hand>,
     keys: Vec<GrabKey>,
     implied: ImpliedPulls,
@@ -72,19 +66,63 @@ impl Replica {
         Some(patch)
     }
 
-    /// Steps a state with hands once. A step whose result would not be finite leaves the state
-    /// unchanged.
-    pub(crate) fn step(&mut self, state: &mut State, hands: &mut [Hand], load: &Load<'_>) {
-        // The error is ignored on purpose. The sizes match by construction, and a receiver cannot
-        // report a state that it cannot step. A checksum or a snapshot repairs the state.
-        self.kernel.step(state, hands, load).ok();
+    /// Removes all hands of the next step.
+    pub(crate) fn release_all(&mut self) {
+        self.hands.clear();
+        self.keys.clear();
     }
 
-    /// Builds a hand from the displacement and reaction in a frame.
-    pub(crate) fn measured(&mut self, g: &FrameGrab) -> Option<Hand> {
+    fn hold(&mut self, key: GrabKey, hand: Hand) -> Option<&mut Hand> {
+        self.keys.push(key);
+        self.hands.push(hand);
+        self.hands.last_mut()
+    }
+
+    /// Adds a hand whose reaction and patch displacement are known. `before` is the copy that the
+    /// step begins with. The result is `None` for a vertex that the model lacks.
+    pub(crate) fn hold_measured(&mut self, before: &BodyCopy, g: &FrameGrab) -> Option<&mut Hand> {
+        let key = g.state.key;
         let patch = self.patch(g.state.vertex, g.state.radius)?;
         let hand = Hand::new(patch, Hold::Measured(g.displacement.into()));
-        Some(Hand { pull: -Vector3::from(g.state.reaction), ..hand })
+        let pull = -Vector3::from(g.state.reaction);
+        self.hold(key, Hand { pull, mean: before.mean(key), ..hand })
+    }
+
+    /// Adds a hand at a target (m, world axes) with its own spring and damper. The hand has come
+    /// there from its target in `before`; a new hand has not moved.
+    pub(crate) fn hold_at(
+        &mut self,
+        before: &BodyCopy,
+        key: GrabKey,
+        (vertex, radius): (u32, f64),
+        target: Vector3<f64>,
+        config: GrabConfig,
+    ) {
+        let Some(patch) = self.patch(vertex, radius) else { return };
+        let known = before.hand(key);
+        let way = known.and_then(|known| known.target).map(|from| target - from);
+        let velocity = way.map_or_else(Vector3::zeros, |way| way / self.kernel.h());
+        let mut hand = Hand::new(patch, Hold::Target { target, velocity, config });
+        if let Some(known) = known {
+            (hand.mean, hand.flow) = (known.mean, known.flow);
+        }
+        self.hold(key, hand);
+    }
+
+    /// Steps a copy with the hands that were added since [`Replica::release_all`]. A step whose
+    /// result would not be finite leaves the state unchanged.
+    pub(crate) fn step_held(&mut self, copy: &mut BodyCopy, load: &Load<'_>) {
+        // The error is ignored on purpose. The sizes match by construction, and a receiver cannot
+        // report a state that it cannot step. A checksum or a snapshot repairs the state.
+        self.kernel.step(&mut copy.state, &mut self.hands, load).ok();
+        copy.hands.clear();
+        copy.hands.extend(self.keys.iter().zip(&self.hands).map(|(&key, hand)| {
+            let target = match hand.hold {
+                Hold::Target { target, .. } => Some(target),
+                Hold::Measured(_) => None,
+            };
+            HandState { key, pull: hand.pull, mean: hand.mean, target, flow: hand.flow }
+        }));
     }
 
     /// Steps a state with the streamed reactions and patch displacements. The rigid frame stays
@@ -97,29 +135,13 @@ impl Replica {
     /// would grow. With the displacements the receiver is an observer. The constraint force is the
     /// measured one when the state is right. Otherwise it draws the patches to their positions as
     /// the grab does, so errors decay as they would in the held body. A grab whose vertex the model
-    /// lacks exerts no force. `means` holds the mean forces of the hands over the step before, and
-    /// over this step on return.
-    pub(crate) fn step_measured(
-        &mut self,
-        state: &mut State,
-        grabs: &[FrameGrab],
-        load: &[f64],
-        means: &mut Vec<Mean>,
-    ) {
-        let (mut hands, mut keys) = (std::mem::take(&mut self.hands), std::mem::take(&mut self.keys));
-        hands.clear();
-        keys.clear();
+    /// lacks exerts no force.
+    pub(crate) fn step_measured(&mut self, copy: &mut BodyCopy, grabs: &[FrameGrab], load: &[f64]) {
+        self.release_all();
         for g in grabs {
-            if let Some(hand) = self.measured(g) {
-                hands.push(Hand { mean: mean_of(means, g.state.key), ..hand });
-                keys.push(g.state.key);
-            }
+            self.hold_measured(copy, g);
         }
-        let load = Load { modal: load, frame_is_given: true, ..Load::default() };
-        self.step(state, &mut hands, &load);
-        means.clear();
-        means.extend(keys.iter().copied().zip(hands.iter().map(|hand| hand.mean)));
-        (self.hands, self.keys) = (hands, keys);
+        self.step_held(copy, &Load { modal: load, frame_is_given: true, ..Load::default() });
     }
 
     /// Extrapolation factor of the host, which keeps all modes, whatever this copy keeps.
@@ -154,17 +176,16 @@ impl Replica {
     /// true coordinates and velocities `to` (see [`Kernel::missing_force`]). The call steps `from`.
     pub(crate) fn lacking(
         &mut self,
-        from: &mut State,
+        from: &mut BodyCopy,
         to: [&[f64]; 2],
         grabs: &[FrameGrab],
         load: &[f64],
-        means: &mut Vec<Mean>,
         out: &mut Vec<f64>,
     ) {
-        self.step_measured(from, grabs, load, means);
+        self.step_measured(from, grabs, load);
         out.clear();
-        out.resize(from.modes(), 0.0);
-        self.kernel.missing_force(from, to, out);
+        out.resize(from.state.modes(), 0.0);
+        self.kernel.missing_force(&from.state, to, out);
     }
 
     /// Writes the reactions that a state implies into `grabs`; see [`ImpliedPulls`].

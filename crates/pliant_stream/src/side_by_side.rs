@@ -4,9 +4,10 @@ use std::{path::Path, sync::Arc};
 
 use nalgebra::Vector3;
 use pliant_modal::{
-    Body, BodyConfig, GrabConfig, Hand, Hold, Integrator, Load, ModalModel, Patch, Relaxation, StepSettings,
+    Body, BodyConfig, GrabConfig, Integrator, Load, ModalModel, Patch, Relaxation, StepSettings,
 };
 
+use crate::prediction::BodyCopy;
 use crate::replica::Replica;
 use crate::state::{GrabKey, GrabState, UserId};
 use crate::wire::FrameGrab;
@@ -53,15 +54,8 @@ fn compare(name: &str, model: &Arc<ModalModel>, config: BodyConfig, cases: &[Sid
         })
         .collect();
     let mut copy = Replica::new(model.clone(), settings, model.mode_count(), h).unwrap();
-    let mut state = copy.kernel().at_rest();
-    let mut hands: Vec<Hand> = cases
-        .iter()
-        .map(|case| {
-            let patch = copy.patch(case.vertex, case.radius).unwrap();
-            Hand::new(patch, Hold::Measured(Vector3::zeros()))
-        })
-        .collect();
-    let mut last: Option<Vec<Vector3<f64>>> = None;
+    let mut stepped = BodyCopy::new(copy.kernel().at_rest());
+    let key = |number: usize| GrabKey { user: UserId(1), grab: number as u16 };
     let mut largest = [0.0f64; 3];
     let mut off = Vec::new();
     for step in 0..steps {
@@ -73,13 +67,12 @@ fn compare(name: &str, model: &Arc<ModalModel>, config: BodyConfig, cases: &[Sid
             body.set_target(*id, (*target).into()).unwrap();
         }
         body.step().unwrap();
-        for (i, (hand, case)) in hands.iter_mut().zip(cases).enumerate() {
-            let (target, config) = (targets[i], case.config);
-            let velocity = last.as_ref().map_or_else(Vector3::zeros, |last| (target - last[i]) / h);
-            hand.hold = Hold::Target { target, velocity, config };
+        copy.release_all();
+        for (i, case) in cases.iter().enumerate() {
+            copy.hold_at(&stepped, key(i), (case.vertex, case.radius), targets[i], case.config);
         }
-        last = Some(targets);
-        copy.step(&mut state, &mut hands, &Load::default());
+        copy.step_held(&mut stepped, &Load::default());
+        let state = &stepped.state;
 
         let mut off_now = [0.0f64; 3];
         for (kind, (true_, copied)) in [(body.q(), &state.q), (body.v(), &state.v)].into_iter().enumerate() {
@@ -88,7 +81,8 @@ fn compare(name: &str, model: &Arc<ModalModel>, config: BodyConfig, cases: &[Sid
                 off_now[kind] = off_now[kind].max((a - b).abs());
             }
         }
-        for ((id, _), hand) in grabs.iter().zip(&hands) {
+        for (i, (id, _)) in grabs.iter().enumerate() {
+            let hand = stepped.hand(key(i)).unwrap();
             let reaction = Vector3::from(body.reaction(*id).unwrap());
             largest[2] = largest[2].max(reaction.norm());
             off_now[2] = off_now[2].max((reaction + hand.pull).norm());
@@ -180,8 +174,8 @@ fn under_gravity() {
 fn told(model: &Arc<ModalModel>, settings: StepSettings, cases: &[SideBySide; 2]) -> f64 {
     let mut body = Body::new(model.clone(), settings.into()).unwrap();
     let mut copy = Replica::new(model.clone(), settings, model.mode_count(), body.config().step).unwrap();
-    let mut state = copy.kernel().at_rest();
-    let (mut grabs, mut means) = (Vec::new(), Vec::new());
+    let mut stepped = BodyCopy::new(copy.kernel().at_rest());
+    let mut grabs = Vec::new();
     let (mut largest, mut off) = (0.0f64, 0.0f64);
     for step in 0..120 {
         for (number, case) in cases.iter().enumerate() {
@@ -211,8 +205,8 @@ fn told(model: &Arc<ModalModel>, settings: StepSettings, cases: &[SideBySide; 2]
                 held: true,
             })
             .collect();
-        copy.step_measured(&mut state, &frame, &vec![0.0; model.mode_count()], &mut means);
-        for (a, b) in body.q().iter().zip(&state.q) {
+        copy.step_measured(&mut stepped, &frame, &vec![0.0; model.mode_count()]);
+        for (a, b) in body.q().iter().zip(&stepped.state.q) {
             (largest, off) = (largest.max(a.abs()), off.max((a - b).abs()));
         }
     }

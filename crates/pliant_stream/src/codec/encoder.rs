@@ -14,8 +14,9 @@ use crate::StreamError;
 use crate::codec::checksum::checksum;
 use crate::codec::quantization::Quanta;
 use crate::newmark::{FlowFilter, Newmark};
-use crate::replica::{self, Mean, Replica};
-use crate::state::{BodyId, GrabKey, GrabState, State, Tick, TickState};
+use crate::prediction::{BodyCopy, HandState};
+use crate::replica::{self, Replica};
+use crate::state::{BodyId, GrabKey, GrabState, Tick, TickState};
 use crate::wire::{
     AccelerationCoding, Accelerations, Frame, FrameGrab, MAX_PARTS, Payload, Repeat, RepeatGrab, Slice,
     SliceEntry, SnapshotBytes, StreamSubscription, Writer, round24,
@@ -86,11 +87,9 @@ pub struct Encoder {
     /// relaxes.
     flow: Option<FlowFilter>,
     replica: Replica,
-    mirror: State,
-    truth: State,
-    /// The forces of the hands over the last step, in the mirror and in the true state.
-    mirror_means: Vec<Mean>,
-    truth_means: Vec<Mean>,
+    /// The receiver's copy, and the true state.
+    mirror: BodyCopy,
+    truth: BodyCopy,
     load: Vec<f64>,
     unexplained: Vec<f64>,
     loaded: bool,
@@ -162,10 +161,8 @@ impl Encoder {
             limit,
             newmark,
             replica,
-            mirror: rest.clone(),
-            truth: rest,
-            mirror_means: Vec::new(),
-            truth_means: Vec::new(),
+            mirror: BodyCopy::new(rest.clone()),
+            truth: BodyCopy::new(rest),
             load: vec![0.0; modes],
             unexplained: vec![0.0; modes],
             loaded: false,
@@ -215,15 +212,16 @@ impl Encoder {
         SnapshotBytes {
             body: self.body.0,
             tick: self.last,
-            q: self.mirror.q.clone(),
-            v: self.mirror.v.clone(),
-            a: self.mirror.a.clone(),
-            z: self.mirror.z.clone(),
+            q: self.mirror.state.q.clone(),
+            v: self.mirror.state.v.clone(),
+            a: self.mirror.state.a.clone(),
+            z: self.mirror.state.z.clone(),
             load: if self.load.iter().any(|x| *x != 0.0) { self.load.clone() } else { Vec::new() },
             means: self
-                .mirror_means
+                .mirror
+                .hands
                 .iter()
-                .map(|(key, mean)| (key.user.0, key.grab, (*mean).into()))
+                .map(|hand| (hand.key.user.0, hand.key.grab, hand.mean.into()))
                 .collect(),
             resting,
         }
@@ -239,17 +237,18 @@ impl Encoder {
     /// Takes over the true state as it is. The next frame begins a new run, and receivers need a
     /// [`Encoder::snapshot`].
     pub fn restart(&mut self, state: &TickState<'_>) {
-        replica::fill(&mut self.mirror, [state.q, state.v, state.a, state.z]);
+        let mirror = &mut self.mirror;
+        replica::fill(&mut mirror.state, [state.q, state.v, state.a, state.z]);
         if state.resting {
-            self.mirror.v.fill(0.0);
-            self.mirror.a.fill(0.0);
+            mirror.state.v.fill(0.0);
+            mirror.state.a.fill(0.0);
         }
-        self.truth.clone_from(&self.mirror);
         // The mean forces over the last step are unknown. The current reactions are close to them
         // for hands that change slowly.
-        self.truth_means.clear();
-        self.truth_means.extend(state.grabs.iter().map(|g| (g.key, -Vector3::from(g.reaction))));
-        self.mirror_means.clone_from(&self.truth_means);
+        mirror.hands.clear();
+        let hand = |g: &GrabState| HandState::of_mean(g.key, -Vector3::from(g.reaction));
+        mirror.hands.extend(state.grabs.iter().map(hand));
+        self.truth.clone_from(mirror);
         self.load.fill(0.0);
         self.unexplained.fill(0.0);
         self.loaded = false;
@@ -272,8 +271,8 @@ impl Encoder {
 
     /// Encodes the tick after the last one. The bytes have no datagram header yet.
     pub fn encode(&mut self, state: &TickState<'_>) -> Encoded {
-        replica::place(&mut self.mirror, self.replica.model(), state.pose.as_ref());
-        self.truth.frame = self.mirror.frame;
+        replica::place(&mut self.mirror.state, self.replica.model(), state.pose.as_ref());
+        self.truth.state.frame = self.mirror.state.frame;
         let forces = self.subscription.payload == Payload::Forces;
         let grabs: Vec<FrameGrab> = state
             .grabs
@@ -302,7 +301,7 @@ impl Encoder {
                 None
             }
         };
-        replica::fill(&mut self.truth, [state.q, state.v, state.a, state.z]);
+        replica::fill(&mut self.truth.state, [state.q, state.v, state.a, state.z]);
         let run = state.tick - self.started.unwrap_or(state.tick) - 1;
         let mut frame = Frame {
             body: self.body,
@@ -332,7 +331,7 @@ impl Encoder {
             frame.grabs.retain(|g| g.held);
         }
         if check {
-            frame.check = Some(checksum(state.tick, &self.mirror) as f32);
+            frame.check = Some(checksum(state.tick, &self.mirror.state) as f32);
         }
         let held = || frame.grabs.iter().filter(|g| g.held).map(|g| g.state.key);
         let held = held().chain(parts.iter().flat_map(|p| p.grabs.iter().map(|g| g.state.key)));
@@ -421,14 +420,14 @@ impl Encoder {
         let truth_at = |slice: &[f64], k: usize| slice.get(k).copied().unwrap_or(0.0);
         self.scratch.clear();
         for k in 0..self.modes {
-            let (q, v, a) = (self.mirror.q[k], self.mirror.v[k], self.mirror.a[k]);
+            let (q, v, a) = (self.mirror.state.q[k], self.mirror.state.v[k], self.mirror.state.a[k]);
             let (free_q, _) = self.newmark.step(q, v, a, 0.0);
             self.scratch.push(if exact {
                 (truth_at(state.q, k) - free_q) / (beta * h * h)
             } else {
                 // Use the host's own acceleration plus a correction towards the true state. For
                 // average acceleration these gains put all three poles of the error within 0.62.
-                let (eq, ev) = (self.truth.q[k] - q, self.truth.v[k] - v);
+                let (eq, ev) = (self.truth.state.q[k] - q, self.truth.state.v[k] - v);
                 truth_at(state.a, k) + 0.1 * eq / (h * h) + 0.5 * ev / h
             });
         }
@@ -447,11 +446,11 @@ impl Encoder {
             *a = accelerations.get(k, &self.quanta);
         }
         if let Some(flow) = &self.flow {
-            flow.begin(&mut self.mirror);
+            flow.begin(&mut self.mirror.state);
         }
-        self.newmark.advance(&mut self.mirror, &self.scratch);
+        self.newmark.advance(&mut self.mirror.state, &self.scratch);
         if let Some(flow) = &self.flow {
-            flow.finish(&mut self.mirror);
+            flow.finish(&mut self.mirror.state);
         }
         accelerations
     }
@@ -464,22 +463,22 @@ impl Encoder {
             // would.
             let mut lacking = std::mem::take(&mut self.scratch);
             let to = [state.q, state.v];
-            self.truth.f.clone_from(&self.mirror.f);
-            let mut means = self.truth_means.clone();
-            self.replica.lacking(&mut self.truth, to, grabs, &self.load, &mut means, &mut lacking);
+            self.truth.state.f.clone_from(&self.mirror.state.f);
+            let hands = self.truth.hands.clone();
+            self.replica.lacking(&mut self.truth, to, grabs, &self.load, &mut lacking);
+            self.truth.hands = hands;
             let share = LOAD_EVERY as f64 / LOAD_TICKS;
             for ((told, load), lacking) in self.unexplained.iter_mut().zip(&self.load).zip(&lacking) {
                 *told += (load + lacking - *told) * share;
             }
             self.scratch = lacking;
         }
-        let means = &mut self.mirror_means;
-        self.replica.step_measured(&mut self.mirror, grabs, &self.load, means);
-        let before = std::mem::take(&mut self.truth_means);
-        self.truth_means.extend(grabs.iter().map(|g| {
+        self.replica.step_measured(&mut self.mirror, grabs, &self.load);
+        let hands = grabs.iter().map(|g| {
             let (key, end) = (g.state.key, -Vector3::from(g.state.reaction));
-            (key, self.replica.mean(end, replica::mean_of(&before, key), grabs.len()))
-        }));
+            HandState::of_mean(key, self.replica.mean(end, self.truth.mean(key), grabs.len()))
+        });
+        self.truth.hands = hands.collect();
         if !self.loaded {
             let omega = self.replica.kernel().omega();
             let static_part = |k: usize| self.unexplained[k].abs() / omega[k].powi(2).max(1e-12);
@@ -508,10 +507,14 @@ impl Encoder {
         self.chosen.extend((0..turn).map(|i| ((first + i) % modes) as u16));
         self.wrong.clear();
         for k in (0..modes).filter(|k| !in_turn(*k)) {
-            let eq = (truth(state.q, k) - self.mirror.q[k]).abs() / self.quanta.place[k];
-            let ev = (truth(state.v, k) - self.mirror.v[k]).abs() / self.quanta.speed[k];
-            let ez =
-                self.mirror.z.get(k).map_or(0.0, |z| (truth(state.z, k) - z).abs() / self.quanta.place[k]);
+            let eq = (truth(state.q, k) - self.mirror.state.q[k]).abs() / self.quanta.place[k];
+            let ev = (truth(state.v, k) - self.mirror.state.v[k]).abs() / self.quanta.speed[k];
+            let ez = self
+                .mirror
+                .state
+                .z
+                .get(k)
+                .map_or(0.0, |z| (truth(state.z, k) - z).abs() / self.quanta.place[k]);
             self.wrong.push((eq + ev + ez, k as u16));
         }
         let most = (share - turn).min(self.wrong.len());
@@ -526,7 +529,7 @@ impl Encoder {
         };
         self.entries.clear();
         self.entries.extend(self.chosen.iter().map(entry));
-        let flows = !self.mirror.z.is_empty();
+        let flows = !self.mirror.state.z.is_empty();
         let mut slice = Slice::quantise(&self.entries, unit, self.loaded, flows, &self.quanta);
         let mut count = slice.steps.len();
         while count > 0 && 3 + frame.bytes() + slice.bytes_of(count) > room {
@@ -545,10 +548,10 @@ impl Encoder {
         slice.steps.truncate(count);
         self.next_slice = (first + turn.min(count)) % modes;
         for e in slice.entries(&self.quanta) {
-            self.mirror.q[e.mode] = e.q;
-            self.mirror.v[e.mode] = e.v;
+            self.mirror.state.q[e.mode] = e.q;
+            self.mirror.state.v[e.mode] = e.v;
             self.load[e.mode] = e.load;
-            if let Some(z) = self.mirror.z.get_mut(e.mode) {
+            if let Some(z) = self.mirror.state.z.get_mut(e.mode) {
                 *z = e.z;
             }
         }

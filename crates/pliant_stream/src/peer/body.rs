@@ -3,13 +3,14 @@
 use std::sync::Arc;
 
 use nalgebra::{UnitQuaternion, Vector3};
-use pliant_modal::{Frame, Hand, Hold, Load, ModalModel, StepSettings};
+use pliant_modal::{Frame, Load, ModalModel, StepSettings};
 
 use super::inputs::{InputLog, WINDOW};
 use crate::StreamError;
 use crate::codec::checksum::{checksum, projection};
 use crate::newmark::{FlowFilter, Newmark};
-use crate::recovery::{Blend, Forecast, PoseBlend};
+use crate::prediction::{BodyCopy, HandState, Ring, Rollback, VisualCopy};
+use crate::recovery::Forecast;
 use crate::replica::Replica;
 use crate::state::{BodyId, GrabKey, GrabState, Pose, State, Tick, UserId};
 use crate::wire::{HeldAt, PeerBodyState, PeerFrame, PeerGrip};
@@ -28,27 +29,6 @@ pub enum Repair {
     Compensate,
 }
 
-/// Force and target of a grab in a step.
-#[derive(Debug, Clone, Copy, PartialEq)]
-struct HandSlot {
-    key: GrabKey,
-    /// Force on the body at the end of the step (`pull`) and over it (`mean`), world axes, N.
-    pull: Vector3<f64>,
-    mean: Vector3<f64>,
-    /// Position of the hand, world, m.
-    target: Vector3<f64>,
-    /// Viscoelastic state of the patch's residual flexibility, body axes, m.
-    flow: Vector3<f64>,
-}
-
-#[derive(Debug, Clone, Default)]
-struct Past {
-    tick: Tick,
-    state: State,
-    pulls: Vec<HandSlot>,
-    used: Vec<(UserId, HeldAt)>,
-}
-
 /// A body that this peer steps.
 #[derive(Debug)]
 pub struct PeerBody {
@@ -59,15 +39,11 @@ pub struct PeerBody {
     newmark: Newmark,
     flow: Option<FlowFilter>,
     repair: Repair,
-    tick: Tick,
-    state: State,
-    pulls: Vec<HandSlot>,
-    past: Vec<Past>,
+    rollback: Rollback,
+    /// The inputs of the last step, and those that each tick was stepped with.
     held: Vec<(UserId, HeldAt)>,
-    blend: Blend,
-    pose_blend: PoseBlend,
-    visual: State,
-    pose: Option<Pose>,
+    used: Ring<Vec<(UserId, HeldAt)>>,
+    visual: VisualCopy,
     grabs: Vec<GrabState>,
     restepped: u64,
 }
@@ -84,29 +60,22 @@ impl PeerBody {
         let replica = Replica::new(model.clone(), *settings, model.mode_count(), h)?;
         let rest = replica.kernel().at_rest();
         let (beta, gamma) = settings.integrator.newmark().unwrap_or((0.25, 0.5));
-        let mut made = Self {
+        Ok(Self {
             id,
-            pose: model.is_free().then(|| Pose::of_frame(&model, &rest.frame)),
-            pose_blend: PoseBlend::new(h, blend_ticks),
+            visual: VisualCopy::new(&model, rest.clone(), h, blend_ticks),
             model,
             replica,
             forecast: Forecast::new(h),
             flow: settings.relaxation.map(|r| FlowFilter::new(r, &Newmark { h, beta, gamma }, WINDOW)),
             newmark: Newmark { h, beta, gamma },
             repair,
-            tick: 0,
-            state: rest.clone(),
-            pulls: Vec::new(),
-            past: vec![Past::default(); WINDOW],
+            // A rollback can return to the initial state like to any other tick.
+            rollback: Rollback::new(BodyCopy::new(rest), WINDOW),
             held: Vec::new(),
-            blend: Blend::new(h, blend_ticks),
-            visual: rest,
+            used: Ring::new(WINDOW),
             grabs: Vec::new(),
             restepped: 0,
-        };
-        // A rollback can return to the initial state like to any other tick.
-        made.remember();
-        Ok(made)
+        })
     }
 
     /// Number of the body.
@@ -126,30 +95,29 @@ impl PeerBody {
 
     /// The tick that the body has reached.
     pub fn tick(&self) -> Tick {
-        self.tick
+        self.rollback.tick()
     }
 
     /// The live state at [`PeerBody::tick`]: stepped with the inputs that are known, and with
     /// forecasts of those that are not.
     pub fn live(&self) -> &State {
-        &self.state
+        &self.rollback.now.state
     }
 
     /// The visual state for display and hands. It is continuous in position and velocity.
     pub fn visual(&self) -> &State {
-        &self.visual
+        &self.visual.state
     }
 
     /// The visual rigid frame of a free body; `None` for an anchored one.
     pub fn pose(&self) -> Option<Pose> {
-        self.pose
+        self.visual.pose
     }
 
     /// The rigid frame of a free body after a remembered tick.
     pub(crate) fn past_pose(&self, tick: Tick) -> Option<Pose> {
-        self.past(tick)?;
-        let past = &self.past[(tick % WINDOW as u64) as usize];
-        self.model.is_free().then(|| Pose::of_frame(&self.model, &past.state.frame))
+        let past = self.past(tick)?;
+        self.model.is_free().then(|| Pose::of_frame(&self.model, &past.frame))
     }
 
     /// Returns the checksum of a remembered tick and the magnitude that scales its tolerance.
@@ -181,42 +149,39 @@ impl PeerBody {
 
     /// The state after a remembered tick.
     pub(crate) fn past(&self, tick: Tick) -> Option<&State> {
-        let past = &self.past[(tick % WINDOW as u64) as usize];
-        (past.tick == tick && tick <= self.tick && past.state.modes() > 0).then_some(&past.state)
+        self.rollback.at(tick).map(|past| &past.state)
     }
 
     /// Reactions (N) of the hands at a remembered tick, with their users.
     pub(crate) fn reactions_at(&self, tick: Tick) -> Option<Vec<(UserId, [f64; 3])>> {
-        self.past(tick)?;
-        let past = &self.past[(tick % WINDOW as u64) as usize];
-        Some(past.pulls.iter().map(|g| (g.key.user, (-g.pull).into())).collect())
+        let past = self.rollback.at(tick)?;
+        Some(past.hands.iter().map(|hand| (hand.key.user, (-hand.pull).into())).collect())
     }
 
     pub(crate) fn export(&self, tick: Tick) -> Option<PeerBodyState> {
-        let past = &self.past[(tick % WINDOW as u64) as usize];
-        (past.tick == tick && past.state.modes() > 0).then(|| PeerBodyState {
+        let BodyCopy { state, hands } = self.rollback.at(tick)?;
+        Some(PeerBodyState {
             body: self.id.0,
-            q: past.state.q.clone(),
-            v: past.state.v.clone(),
-            a: past.state.a.clone(),
-            z: past.state.z.clone(),
-            force: past.state.f.clone(),
-            frame: self.model.is_free().then_some(past.state.frame).map(|f| PeerFrame {
+            q: state.q.clone(),
+            v: state.v.clone(),
+            a: state.a.clone(),
+            z: state.z.clone(),
+            force: state.f.clone(),
+            frame: self.model.is_free().then_some(state.frame).map(|f| PeerFrame {
                 center: f.center(),
                 orientation: f.orientation(),
                 velocity: f.velocity(),
                 spin: f.spin(),
             }),
-            pulls: past
-                .pulls
+            pulls: hands
                 .iter()
-                .map(|g| PeerGrip {
-                    user: g.key.user.0,
-                    grab: g.key.grab,
-                    pull: g.pull.into(),
-                    mean: g.mean.into(),
-                    target: g.target.into(),
-                    flow: g.flow.into(),
+                .map(|hand| PeerGrip {
+                    user: hand.key.user.0,
+                    grab: hand.key.grab,
+                    pull: hand.pull.into(),
+                    mean: hand.mean.into(),
+                    target: hand.target.unwrap_or_default().into(),
+                    flow: hand.flow.into(),
                 })
                 .collect(),
         })
@@ -234,30 +199,28 @@ impl PeerBody {
         }
         let (q, v, a, z) = (state.q.clone(), state.v.clone(), state.a.clone(), state.z.clone());
         let f = state.force.clone();
-        let received = State { q, v, a, f, z, s: Vec::new(), frame: received.unwrap_or(self.state.frame) };
+        let received = State { q, v, a, f, z, s: Vec::new(), frame: received.unwrap_or(self.live().frame) };
         if self.replica.kernel().check(&received).is_err() {
             return false;
         }
-        let before = std::mem::replace(&mut self.state, received);
-        let pull = |p: &PeerGrip| HandSlot {
+        let hand = |p: &PeerGrip| HandState {
             key: GrabKey { user: UserId(p.user), grab: p.grab },
             pull: p.pull.into(),
             mean: p.mean.into(),
-            target: p.target.into(),
+            target: Some(p.target.into()),
             flow: p.flow.into(),
         };
-        self.pulls = state.pulls.iter().map(pull).collect();
-        let fresh = self.tick == 0;
-        self.tick = tick;
-        self.remember();
-        while self.tick < to {
+        let hands = state.pulls.iter().map(hand).collect();
+        let before = std::mem::replace(&mut self.rollback.now, BodyCopy { state: received, hands });
+        let fresh = self.tick() == 0;
+        self.reach(tick);
+        while self.tick() < to {
             self.step_once(inputs);
         }
         if fresh {
-            self.blend.clear();
-            self.pose_blend.clear();
+            self.visual.clear();
         } else {
-            self.add_blend(&before);
+            self.visual.add(&self.model, &before.state, &self.rollback.now.state);
         }
         self.show();
         true
@@ -266,186 +229,113 @@ impl PeerBody {
     /// Steps to the next tick.
     pub(crate) fn advance(&mut self, inputs: &InputLog) {
         self.step_once(inputs);
-        self.blend.advance();
-        self.pose_blend.advance();
+        self.visual.advance();
         self.show();
     }
 
     /// Corrects the state for new inputs at tick `from` and later. Returns false when `from` is not
     /// remembered.
     pub(crate) fn correct(&mut self, from: Tick, inputs: &InputLog) -> bool {
-        if from > self.tick {
+        let to = self.tick();
+        if from > to {
             return true;
         }
         let Some(base) = from.checked_sub(1) else { return false };
-        let past = &self.past[(base % WINDOW as u64) as usize];
-        if past.tick != base || past.state.modes() == 0 {
+        if self.rollback.at(base).is_none() {
             return false;
         }
-        let before = self.state.clone();
+        let before = self.live().clone();
         match self.repair {
             Repair::Rollback => {
-                let to = self.tick;
-                self.state.clone_from(&past.state);
-                self.pulls.clone_from(&past.pulls);
-                self.tick = base;
-                while self.tick < to {
+                self.rollback.back_to(base);
+                while self.tick() < to {
                     self.step_once(inputs);
                     self.restepped += 1;
                 }
             }
             Repair::Compensate => self.compensate(from, inputs),
         }
-        self.add_blend(&before);
+        self.visual.add(&self.model, &before, &self.rollback.now.state);
         true
     }
 
     /// Applies equations (8) and (9) to every tick from `from` on whose known inputs differ from
     /// those used.
     fn compensate(&mut self, from: Tick, inputs: &InputLog) {
-        let mut held = Vec::new();
-        for tick in from..=self.tick {
-            let index = (tick % WINDOW as u64) as usize;
+        let (mut held, last) = (Vec::new(), self.tick());
+        for tick in from..=last {
             let known = inputs.held(tick, self.id, &self.forecast, &mut held);
-            if self.past[index].tick != tick || !known || held == self.past[index].used {
-                continue;
-            }
-            let before = &self.past[((tick - 1) % WINDOW as u64) as usize];
-            if before.tick + 1 != tick {
-                continue;
-            }
-            let (mut with, mut without) = (before.state.clone(), before.state.clone());
-            let (mut pulls, mut old_pulls) = (before.pulls.clone(), before.pulls.clone());
-            let used = std::mem::take(&mut self.past[index].used);
-            Self::press(&mut self.replica, &mut with, &mut pulls, &held);
-            Self::press(&mut self.replica, &mut without, &mut old_pulls, &used);
+            let Some(used) = self.used.get_mut(tick).filter(|used| known && held != **used) else { continue };
+            let Some(before) = self.rollback.at(tick - 1) else { continue };
+            let (mut with, mut without) = (before.clone(), before.clone());
+            Self::press(&mut self.replica, &mut with, &held);
+            Self::press(&mut self.replica, &mut without, used);
+            used.clone_from(&held);
+            let (with_frame, without_frame) = (with.state.frame, without.state.frame);
             // The history is corrected like the present state, because later corrections and checks
             // use it.
-            for t in tick..=self.tick {
-                let at = (t % WINDOW as u64) as usize;
-                if self.past[at].tick != t {
-                    continue;
-                }
+            for t in tick..=last {
                 let (to_q, to_v) = self.newmark.response(t - tick);
                 let to_z = self.flow.as_ref().map_or(0.0, |flow| flow.response(t - tick));
                 let seconds = (t - tick) as f64 * self.replica.kernel().h();
-                let moved = self
-                    .model
-                    .is_free()
-                    .then(|| self.moved(&self.past[at].state.frame, &with.frame, &without.frame, seconds));
-                let state = &mut self.past[at].state;
+                let Some(past) = self.rollback.at_mut(t) else { continue };
+                let state = &mut past.state;
+                if self.model.is_free() {
+                    state.frame = moved(&self.model, &state.frame, [&with_frame, &without_frame], seconds);
+                }
                 for k in 0..state.modes() {
-                    let da = with.a[k] - without.a[k];
+                    let da = with.state.a[k] - without.state.a[k];
                     // The difference at the tick itself is known exactly.
                     let own = t == tick;
-                    state.q[k] += if own { with.q[k] - without.q[k] } else { to_q * da };
-                    state.v[k] += if own { with.v[k] - without.v[k] } else { to_v * da };
+                    state.q[k] += if own { with.state.q[k] - without.state.q[k] } else { to_q * da };
+                    state.v[k] += if own { with.state.v[k] - without.state.v[k] } else { to_v * da };
                     if let Some(z) = state.z.get_mut(k) {
                         *z += to_z * da;
                     }
                 }
-                if let Some(frame) = moved {
-                    state.frame = frame;
-                }
             }
-            let now = &mut self.past[index];
-            (now.state.a, now.state.f) = (with.a, with.f);
-            now.pulls = pulls;
-            self.past[index].used.clone_from(&held);
+            if let Some(now) = self.rollback.at_mut(tick) {
+                (now.state.a, now.state.f) = (with.state.a, with.state.f);
+                now.hands = with.hands;
+            }
             self.restepped += 1;
         }
-        let now = &self.past[(self.tick % WINDOW as u64) as usize];
-        self.state.clone_from(&now.state);
-        self.pulls.clone_from(&now.pulls);
-    }
-
-    /// Returns the frame as it would be if the body had been at `there` instead of `here` `seconds`
-    /// ago. The difference in velocity and spin has acted since.
-    fn moved(&self, frame: &Frame, there: &Frame, here: &Frame, seconds: f64) -> Frame {
-        let of = |f: fn(&Frame) -> [f64; 3]| Vector3::from(f(there)) - Vector3::from(f(here));
-        let (faster, spin) = (of(Frame::velocity), of(Frame::spin));
-        let center = Vector3::from(frame.center()) + of(Frame::center) + faster * seconds;
-        let turning = there.angular_velocity(&self.model) - here.angular_velocity(&self.model);
-        let turned = (there.rotation() * here.rotation().inverse()).scaled_axis() + turning * seconds;
-        let turn = UnitQuaternion::from_scaled_axis(turned) * frame.rotation();
-        let velocity = Vector3::from(frame.velocity()) + faster;
-        let spin = Vector3::from(frame.spin()) + spin;
-        let q = [turn.i, turn.j, turn.k, turn.w];
-        Frame::from_motion(&self.model, center.into(), q, velocity.into(), spin.into()).unwrap_or(*frame)
+        self.rollback.back_to(last);
     }
 
     fn step_once(&mut self, inputs: &InputLog) {
-        let tick = self.tick + 1;
-        let mut held = std::mem::take(&mut self.held);
-        inputs.held(tick, self.id, &self.forecast, &mut held);
-        Self::press(&mut self.replica, &mut self.state, &mut self.pulls, &held);
-        self.held = held;
-        self.tick = tick;
-        self.remember();
+        let tick = self.tick() + 1;
+        inputs.held(tick, self.id, &self.forecast, &mut self.held);
+        Self::press(&mut self.replica, &mut self.rollback.now, &self.held);
+        self.reach(tick);
     }
 
-    /// Steps a state with hands once and replaces `pulls` by the grabs of this step.
-    fn press(replica: &mut Replica, state: &mut State, pulls: &mut Vec<HandSlot>, held: &[(UserId, HeldAt)]) {
-        let mut hands = Vec::with_capacity(held.len());
-        let mut keys = Vec::with_capacity(held.len());
+    /// Steps a copy once with the hands of the inputs.
+    fn press(replica: &mut Replica, copy: &mut BodyCopy, held: &[(UserId, HeldAt)]) {
+        replica.release_all();
         for (user, g) in held {
             // All peers ignore the same patches. A patch larger than the body would visit every
             // vertex of the body.
-            if g.radius > replica.model().size() {
-                continue;
+            if g.radius <= replica.model().size() {
+                replica.hold_at(copy, g.key(*user), (g.vertex, g.radius), g.target.into(), g.hold);
             }
-            let Some(patch) = replica.patch(g.vertex, g.radius) else { continue };
-            let key = g.key(*user);
-            let (target, config) = (Vector3::from(g.target), g.hold);
-            let before = pulls.iter().find(|p| p.key == key);
-            // A new hand has not moved yet.
-            let way = before.map_or_else(Vector3::zeros, |before| target - before.target);
-            let velocity = way / replica.kernel().h();
-            let hand = Hand::new(patch, Hold::Target { target, velocity, config });
-            hands.push(match before {
-                Some(before) => Hand { pull: before.pull, mean: before.mean, flow: before.flow, ..hand },
-                None => hand,
-            });
-            keys.push((key, target));
         }
-        replica.step(state, &mut hands, &Load::default());
-        pulls.clear();
-        let grip = |((key, target), hand): ((GrabKey, Vector3<f64>), &Hand)| {
-            let &Hand { pull, mean, flow, .. } = hand;
-            HandSlot { key, pull, mean, target, flow }
-        };
-        pulls.extend(keys.into_iter().zip(&hands).map(grip));
+        replica.step_held(copy, &Load::default());
     }
 
-    fn remember(&mut self) {
-        let past = &mut self.past[(self.tick % WINDOW as u64) as usize];
-        past.tick = self.tick;
-        past.state.clone_from(&self.state);
-        past.pulls.clone_from(&self.pulls);
-        past.used.clone_from(&self.held);
-    }
-
-    fn add_blend(&mut self, before: &State) {
-        let now = &self.state;
-        self.blend.add(
-            before.q.iter().zip(&now.q).map(|(b, n)| b - n),
-            before.v.iter().zip(&now.v).map(|(b, n)| b - n),
-        );
-        if self.model.is_free() {
-            let (before, now) = (&before.frame, &now.frame);
-            self.pose_blend.add(&Pose::of_frame(&self.model, before), &Pose::of_frame(&self.model, now));
-        }
+    /// Remembers the copy, and the inputs of the last step, as those of `tick`.
+    fn reach(&mut self, tick: Tick) {
+        self.rollback.reach(tick);
+        self.used.place(tick).0.clone_from(&self.held);
     }
 
     fn show(&mut self) {
-        self.visual.clone_from(&self.state);
-        self.blend.apply(&mut self.visual.q, &mut self.visual.v);
-        let pose = self.model.is_free().then(|| Pose::of_frame(&self.model, &self.state.frame));
-        self.pose = pose.map(|pose| self.pose_blend.apply(&pose));
+        let copy = &self.rollback.now;
+        self.visual.show(&self.model, &copy.state);
         self.grabs.clear();
         for (user, g) in &self.held {
             let key = g.key(*user);
-            let pull = self.pulls.iter().find(|p| p.key == key).map_or_else(Vector3::zeros, |p| p.pull);
+            let pull = copy.hand(key).map_or_else(Vector3::zeros, |hand| hand.pull);
             self.grabs.push(GrabState {
                 key,
                 vertex: g.vertex,
@@ -455,4 +345,19 @@ impl PeerBody {
             });
         }
     }
+}
+
+/// Returns the frame as it would be if the body had been at `there` instead of `here` `seconds` ago.
+/// The difference in velocity and spin has acted since.
+fn moved(model: &ModalModel, frame: &Frame, [there, here]: [&Frame; 2], seconds: f64) -> Frame {
+    let of = |f: fn(&Frame) -> [f64; 3]| Vector3::from(f(there)) - Vector3::from(f(here));
+    let (faster, spin) = (of(Frame::velocity), of(Frame::spin));
+    let center = Vector3::from(frame.center()) + of(Frame::center) + faster * seconds;
+    let turning = there.angular_velocity(model) - here.angular_velocity(model);
+    let turned = (there.rotation() * here.rotation().inverse()).scaled_axis() + turning * seconds;
+    let turn = UnitQuaternion::from_scaled_axis(turned) * frame.rotation();
+    let velocity = Vector3::from(frame.velocity()) + faster;
+    let spin = Vector3::from(frame.spin()) + spin;
+    let q = [turn.i, turn.j, turn.k, turn.w];
+    Frame::from_motion(model, center.into(), q, velocity.into(), spin.into()).unwrap_or(*frame)
 }

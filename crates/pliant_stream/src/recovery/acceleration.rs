@@ -5,7 +5,8 @@ use pliant_modal::Relaxation;
 
 use super::{HISTORY, History, Predict, Recovery};
 use crate::newmark::{FlowFilter, Newmark};
-use crate::replica::{self, Mean};
+use crate::prediction::HandState;
+use crate::replica;
 use crate::state::{State, Tick};
 
 /// Integrates the received accelerations and predicts missing ones. When a missing acceleration
@@ -79,7 +80,7 @@ impl AccelerationDriven {
 }
 
 impl Recovery for AccelerationDriven {
-    fn restart(&mut self, tick: Tick, state: &State, _load: &[f64], _means: &[Mean]) {
+    fn restart(&mut self, tick: Tick, state: &State, _load: &[f64], _hands: &[HandState]) {
         replica::fill(&mut self.state, [&state.q, &state.v, &state.a, &state.z]);
         self.tick = tick;
         self.first = tick;

@@ -1,29 +1,20 @@
 //! The force-driven policy: the receiver steps its own damped model with the streamed reactions.
 
 use super::{Forecast, HISTORY, History, Recovery};
-use crate::replica::{self, Mean, Replica};
+use crate::prediction::{BodyCopy, HandState, Rollback};
+use crate::replica::{self, Replica};
 use crate::state::{State, Tick};
 use crate::wire::FrameGrab;
-
-/// The state after a stepped tick.
-#[derive(Debug, Clone, Default)]
-struct Stepped {
-    tick: Tick,
-    state: State,
-    means: Vec<Mean>,
-}
 
 /// Steps the modal recurrence with the reactions. When data arrives for a predicted tick, the
 /// policy steps again from that tick.
 #[derive(Debug)]
 pub struct ForceDriven {
     replica: Replica,
-    tick: Tick,
+    /// The tick of the last restart. Rollback never goes to an earlier tick.
     first: Tick,
-    state: State,
+    rollback: Rollback,
     load: Vec<f64>,
-    means: Vec<Mean>,
-    past: Vec<Stepped>,
     grabs: Vec<FrameGrab>,
     forecast: Forecast,
 }
@@ -33,23 +24,13 @@ impl ForceDriven {
     pub(crate) fn new(replica: Replica, forecast: Forecast) -> Self {
         let state = replica.kernel().at_rest();
         Self {
-            tick: 0,
             first: 0,
             load: vec![0.0; state.modes()],
-            means: Vec::new(),
-            state,
-            past: vec![Stepped::default(); HISTORY],
+            rollback: Rollback::new(BodyCopy::new(state), HISTORY),
             grabs: Vec::new(),
             forecast,
             replica,
         }
-    }
-
-    fn remember(&mut self, tick: Tick) {
-        let slot = &mut self.past[(tick % HISTORY as u64) as usize];
-        slot.tick = tick;
-        slot.state.clone_from(&self.state);
-        slot.means.clone_from(&self.means);
     }
 
     fn step_to(&mut self, tick: Tick, history: &History) {
@@ -60,22 +41,24 @@ impl ForceDriven {
             self.grabs
                 .extend(near.grabs.iter().filter_map(|g| history.grab(g.state.key, tick, &self.forecast)));
         }
+        let copy = &mut self.rollback.now;
         if self.replica.model().is_free() {
             let pose = history.pose(tick, self.replica.kernel().h());
-            replica::place(&mut self.state, self.replica.model(), pose.as_ref());
+            replica::place(&mut copy.state, self.replica.model(), pose.as_ref());
         }
-        self.replica.step_measured(&mut self.state, &self.grabs, &self.load, &mut self.means);
+        self.replica.step_measured(copy, &self.grabs, &self.load);
         self.take_slice(tick, history);
-        self.remember(tick);
+        self.rollback.reach(tick);
     }
 
     fn take_slice(&mut self, tick: Tick, history: &History) {
         let Some(data) = history.known(tick) else { return };
         let modes = self.load.len();
+        let state = &mut self.rollback.now.state;
         for e in data.slice.iter().filter(|e| e.mode < modes) {
-            self.state.q[e.mode] = e.q;
-            self.state.v[e.mode] = e.v;
-            if let Some(z) = self.state.z.get_mut(e.mode) {
+            state.q[e.mode] = e.q;
+            state.v[e.mode] = e.v;
+            if let Some(z) = state.z.get_mut(e.mode) {
                 *z = e.z;
             }
             self.load[e.mode] = e.load;
@@ -84,38 +67,27 @@ impl ForceDriven {
 }
 
 impl Recovery for ForceDriven {
-    fn restart(&mut self, tick: Tick, state: &State, load: &[f64], means: &[Mean]) {
-        let modes = self.state.modes();
-        let fill = |mine: &mut Vec<f64>, theirs: &[f64]| {
-            mine.clear();
-            mine.extend(theirs.iter().copied().chain(std::iter::repeat(0.0)).take(modes));
-        };
-        replica::fill(&mut self.state, [&state.q, &state.v, &state.a, &state.z]);
-        fill(&mut self.load, load);
-        self.means.clear();
-        self.means.extend_from_slice(means);
-        (self.tick, self.first) = (tick, tick);
-        self.remember(tick);
+    fn restart(&mut self, tick: Tick, state: &State, load: &[f64], hands: &[HandState]) {
+        let (copy, modes) = (&mut self.rollback.now, self.load.len());
+        replica::fill(&mut copy.state, [&state.q, &state.v, &state.a, &state.z]);
+        copy.hands.clear();
+        copy.hands.extend_from_slice(hands);
+        self.load.clear();
+        self.load.extend(load.iter().copied().chain(std::iter::repeat(0.0)).take(modes));
+        self.first = tick;
+        self.rollback.reach(tick);
     }
 
     fn advance(&mut self, tick: Tick, history: &History) {
         self.step_to(tick, history);
-        self.tick = tick;
     }
 
     fn correct(&mut self, from: Tick, history: &History) -> bool {
-        if from <= self.first || from > self.tick || from + (HISTORY as u64) <= self.tick {
+        let to = self.rollback.tick();
+        if from <= self.first || from > to || !self.rollback.back_to(from - 1) {
             return false;
         }
-        let base = &self.past[((from - 1) % HISTORY as u64) as usize];
-        if base.tick != from - 1 || base.state.modes() != self.state.modes() {
-            return false;
-        }
-        self.state.clone_from(&base.state);
-        self.means.clone_from(&base.means);
-        for tick in from..=self.tick {
-            self.step_to(tick, history);
-        }
+        (from..=to).for_each(|tick| self.step_to(tick, history));
         true
     }
 
@@ -124,15 +96,15 @@ impl Recovery for ForceDriven {
     }
 
     fn confirmed(&self) -> &State {
-        &self.state
+        &self.rollback.now.state
     }
 
     fn load(&self) -> &[f64] {
         &self.load
     }
 
-    fn means(&self) -> &[Mean] {
-        &self.means
+    fn hands(&self) -> &[HandState] {
+        &self.rollback.now.hands
     }
 
     fn driven_by_reactions(&self) -> bool {

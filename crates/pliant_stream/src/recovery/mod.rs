@@ -20,9 +20,8 @@ pub use passivity::PassivityGuard;
 pub use pose_blend::PoseBlend;
 pub use receiver::{Arrival, Receiver, RepairCounts, VisualGrab};
 
-use nalgebra::Vector3;
-
-use crate::state::{GrabKey, State, Tick};
+pub use crate::prediction::HandState;
+use crate::state::{State, Tick};
 
 /// Turns received data into the receiver's best estimate of the host's state.
 ///
@@ -31,9 +30,8 @@ use crate::state::{GrabKey, State, Tick};
 /// resulting difference out of the visual state.
 pub trait Recovery: Send + Sync {
     /// Takes `state` as the true state after `tick`. `load` holds the modal forces that the
-    /// reactions do not explain. `means` holds the forces of the hands over the last step (N, world
-    /// axes).
-    fn restart(&mut self, tick: Tick, state: &State, load: &[f64], means: &[(GrabKey, Vector3<f64>)]);
+    /// reactions do not explain. `hands` holds the forces of the hands over the last step.
+    fn restart(&mut self, tick: Tick, state: &State, load: &[f64], hands: &[HandState]);
 
     /// Steps to `tick`, which is one tick after the last. The step uses the data of `tick` if
     /// `history` has it, and a prediction otherwise.
@@ -56,8 +54,8 @@ pub trait Recovery: Send + Sync {
         &[]
     }
 
-    /// The forces of the hands over the last step, N, world axes, as far as the policy knows them.
-    fn means(&self) -> &[(GrabKey, Vector3<f64>)] {
+    /// The hands of the last step, as far as the policy knows them.
+    fn hands(&self) -> &[HandState] {
         &[]
     }
 

@@ -12,7 +12,8 @@ use crate::StreamError;
 use crate::codec::checksum::checksum;
 use crate::codec::quantization::Quanta;
 use crate::newmark::Newmark;
-use crate::replica::{self, Mean, Replica};
+use crate::prediction::HandState;
+use crate::replica::{self, Replica};
 use crate::state::{GrabKey, GrabState, Pose, State, Tick, UserId};
 use crate::wire::{Frame, SnapshotBytes};
 
@@ -75,7 +76,7 @@ pub struct Receiver {
     trail: [Vec<VisualGrab>; 2],
     /// The forces over the steps to this tick and to the tick before, if they are computed from the
     /// state.
-    implied: [Vec<Mean>; 2],
+    implied: [Vec<HandState>; 2],
     /// The best estimate of the rigid pose at the current tick, and the visual pose.
     frame: Option<Pose>,
     pose: Option<Pose>,
@@ -167,7 +168,7 @@ impl Receiver {
             h: newmark.h,
             blend_ticks,
         };
-        receiver.policy.restart(snapshot.tick, &state_of(snapshot), &snapshot.load, &means_of(snapshot));
+        receiver.policy.restart(snapshot.tick, &state_of(snapshot), &snapshot.load, &hands_of(snapshot));
         receiver.visual.clone_from(receiver.policy.confirmed());
         Ok(receiver)
     }
@@ -192,8 +193,8 @@ impl Receiver {
         self.frame
     }
 
-    pub(crate) fn means(&self) -> &[Mean] {
-        self.policy.means()
+    pub(crate) fn hands(&self) -> &[HandState] {
+        self.policy.hands()
     }
 
     pub(crate) fn load(&self) -> &[f64] {
@@ -327,7 +328,7 @@ impl Receiver {
             return;
         }
         self.remember_before();
-        self.policy.restart(snapshot.tick, &state_of(snapshot), &snapshot.load, &means_of(snapshot));
+        self.policy.restart(snapshot.tick, &state_of(snapshot), &snapshot.load, &hands_of(snapshot));
         if self.history.highest() > snapshot.tick + HISTORY as u64 {
             // A frame carried a tick from far in the future, so current data would look too old to
             // be used.
@@ -372,8 +373,8 @@ impl Receiver {
             z: self.before.z.clone(),
             ..State::zero(self.before.modes(), false)
         };
-        let means = self.policy.means().to_vec();
-        self.policy.restart(tick, &rest, &[], &means);
+        let hands = self.policy.hands().to_vec();
+        self.policy.restart(tick, &rest, &[], &hands);
         self.tick = tick;
         self.show();
     }
@@ -446,10 +447,10 @@ impl Receiver {
             let hands = self.grabs.len();
             for g in &mut self.grabs {
                 let mean = -nalgebra::Vector3::from(g.reaction);
-                if let Some((_, before)) = self.implied[1].iter().find(|(key, _)| *key == g.key) {
-                    g.reaction = (-self.replica.end(mean, *before, hands)).into();
+                if let Some(before) = self.implied[1].iter().find(|hand| hand.key == g.key) {
+                    g.reaction = (-self.replica.end(mean, before.mean, hands)).into();
                 }
-                self.implied[0].push((g.key, mean));
+                self.implied[0].push(HandState::of_mean(g.key, mean));
             }
         }
     }
@@ -496,9 +497,9 @@ impl Receiver {
     }
 }
 
-fn means_of(snapshot: &SnapshotBytes) -> Vec<Mean> {
-    let of = |&(user, grab, pull): &(u16, u16, [f64; 3])| {
-        (GrabKey { user: UserId(user), grab }, nalgebra::Vector3::from(pull))
+fn hands_of(snapshot: &SnapshotBytes) -> Vec<HandState> {
+    let of = |&(user, grab, mean): &(u16, u16, [f64; 3])| {
+        HandState::of_mean(GrabKey { user: UserId(user), grab }, mean.into())
     };
     snapshot.means.iter().map(of).collect()
 }

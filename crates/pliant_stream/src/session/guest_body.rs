@@ -5,9 +5,9 @@ use std::time::Duration;
 
 use pliant_modal::ModalModel;
 
-use super::predicted_hand::PredictedHand;
 use crate::newmark::Newmark;
 use crate::playout::PlayoutClock;
+use crate::prediction::PredictedHand;
 use crate::recovery::{HISTORY, Policy, Receiver, RecoveryConfig, RepairCounts, VisualGrab};
 use crate::replica::Replica;
 use crate::state::{BodyId, Placement, Pose, State, Tick, UserId};

@@ -27,19 +27,18 @@ mod host;
 mod host_bodies;
 mod host_config;
 mod host_peer;
-mod predicted_hand;
 mod publish;
 mod regulator;
 mod upload;
 
 pub use crate::link::LinkStats;
+pub use crate::prediction::PredictedHand;
 pub use disconnect_reason::DisconnectReason;
 pub use guest::GuestSession;
 pub use guest_body::BodyView;
 pub use guest_config::{GuestConfig, GuestEvent};
 pub use host::HostSession;
 pub use host_config::{HostConfig, HostEvent};
-pub use predicted_hand::PredictedHand;
 
 use crate::state::PeerId;
 

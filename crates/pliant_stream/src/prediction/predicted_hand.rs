@@ -17,8 +17,9 @@ use std::collections::VecDeque;
 use nalgebra::Vector3;
 use pliant_modal::{Frame, GrabConfig, Hand, Hold, Load, RigidMotion};
 
-use crate::recovery::{Blend, Forecast, PoseBlend, Receiver};
-use crate::replica::{self, Mean, Replica};
+use super::{BodyCopy, HandState, VisualCopy};
+use crate::recovery::{Forecast, Receiver};
+use crate::replica::{self, Replica};
 use crate::state::{GrabKey, Pose, State, Tick, UserId};
 
 /// Number of targets remembered, which also bounds the lead, ticks.
@@ -41,11 +42,19 @@ struct PredictedGrab {
     reaction: [f64; 3],
     /// The reaction that would follow without new information, world, N.
     would: [f64; 3],
-    /// Viscoelastic state of the residual flexibility under the hand, body axes, m. `flow` is its
-    /// value at the confirmed tick, `flowing` its value in the copy.
+    /// Viscoelastic state of the residual flexibility under the hand at the confirmed tick, body
+    /// axes, m.
     flow: Vector3<f64>,
-    flowing: Vector3<f64>,
     offset: [f64; 3],
+}
+
+impl PredictedGrab {
+    /// Takes the reaction from a copy that the grab has held.
+    fn take_reaction(&mut self, copy: &BodyCopy, user: UserId) {
+        if let Some(hand) = copy.hand(GrabKey { user, grab: self.grab }) {
+            self.reaction = (-hand.pull).into();
+        }
+    }
 }
 
 /// A guest's newer copy of a body that the guest holds.
@@ -57,49 +66,35 @@ pub struct PredictedHand {
     votes: u32,
     tick: Tick,
     active: bool,
-    state: State,
-    /// The mean forces of all hands of `state` over the last step, N, world axes.
-    means: Vec<Mean>,
-    expected: State,
-    visual: State,
-    blend: Blend,
+    copy: BodyCopy,
+    /// The copy that would follow without new information.
+    expected: BodyCopy,
+    visual: VisualCopy,
     /// The confirmed frame of the tick before, for a free body.
     last_frame: Option<Frame>,
-    pose: Option<Pose>,
-    pose_blend: PoseBlend,
     /// Force and torque on the frame that the stream does not explain, world axes.
     push: (Vector3<f64>, Vector3<f64>),
     forecast: Forecast,
     fade: f64,
-    hands: Vec<Hand>,
-    keys: Vec<GrabKey>,
-    own: Vec<usize>,
 }
 
 impl PredictedHand {
     pub(crate) fn new(replica: Replica, blend_ticks: u16) -> Self {
         let (rest, h) = (replica.kernel().at_rest(), replica.kernel().h());
         Self {
-            replica,
             grabs: Vec::new(),
             lead: 0,
             votes: 0,
             tick: 0,
             active: false,
-            state: rest.clone(),
-            means: Vec::new(),
-            expected: rest.clone(),
-            visual: rest,
-            blend: Blend::new(h, blend_ticks),
+            copy: BodyCopy::new(rest.clone()),
+            expected: BodyCopy::new(rest.clone()),
+            visual: VisualCopy::new(replica.model(), rest, h, blend_ticks),
+            replica,
             last_frame: None,
-            pose: None,
-            pose_blend: PoseBlend::new(h, blend_ticks),
             push: (Vector3::zeros(), Vector3::zeros()),
             forecast: Forecast::new(h),
             fade: (-3.0 / f64::from(blend_ticks.max(1))).exp(),
-            hands: Vec::new(),
-            keys: Vec::new(),
-            own: Vec::new(),
         }
     }
 
@@ -115,12 +110,12 @@ impl PredictedHand {
 
     /// The visual state for the user who holds the body. It is continuous in position and velocity.
     pub fn visual(&self) -> &State {
-        &self.visual
+        &self.visual.state
     }
 
     /// The rigid frame that belongs to [`PredictedHand::visual`], for a free body.
     pub fn pose(&self) -> Option<Pose> {
-        self.pose
+        self.visual.pose
     }
 
     /// The present reaction of one of the guest's own grabs, world, N.
@@ -154,7 +149,6 @@ impl PredictedHand {
             reaction: [0.0; 3],
             would: [0.0; 3],
             flow: Vector3::zeros(),
-            flowing: Vector3::zeros(),
             offset: [0.0; 3],
         });
     }
@@ -171,15 +165,10 @@ impl PredictedHand {
         }
     }
 
-    /// The rigid frame of a copy, for a free body.
-    fn frame_of(&self, state: &State) -> Option<Frame> {
-        self.replica.model().is_free().then_some(state.frame)
-    }
-
     /// Steps the copy after a tick of the confirmed state. `guess` is the initial lead, ticks.
     pub(crate) fn step(&mut self, receiver: &Receiver, user: UserId, guess: usize) {
         let confirmed_frame = receiver.frame().and_then(|p| p.frame(self.replica.model()));
-        if self.state.modes() != receiver.confirmed().modes()
+        if self.copy.state.modes() != receiver.confirmed().modes()
             || self.replica.model().is_free() != confirmed_frame.is_some()
         {
             self.active = false;
@@ -207,59 +196,60 @@ impl PredictedHand {
             self.active = true;
             self.lead = guess.min(REMEMBERED - 1);
             self.take(receiver.visual());
-            replica::place(&mut self.state, self.replica.model(), receiver.pose().as_ref());
-            self.visual.clone_from(&self.state);
-            self.blend.clear();
-            self.pose_blend.clear();
+            replica::place(&mut self.copy.state, self.replica.model(), receiver.pose().as_ref());
+            self.visual.state.clone_from(&self.copy.state);
+            self.visual.clear();
         }
         self.vote(receiver, user);
         self.tick = confirmed + self.lead as u64;
 
-        // This is the state that the copy would have reached without new information.
+        // This is the copy that would have been reached without new information.
         let mut expected = std::mem::take(&mut self.expected);
-        expected.clone_from(&self.state);
-        let mut means = std::mem::take(&mut self.means);
-        self.one_step(&mut expected, &mut means, receiver, user, self.lead);
+        expected.clone_from(&self.copy);
+        self.one_step(&mut expected, receiver, user, self.lead);
         for g in &mut self.grabs {
-            g.would = g.reaction;
+            let key = GrabKey { user, grab: g.grab };
+            g.would = expected.hand(key).map_or(g.reaction, |hand| (-hand.pull).into());
         }
 
-        let mut state = std::mem::take(&mut self.state);
-        state.clone_from(receiver.confirmed());
-        if let Some(frame) = confirmed_frame {
-            state.frame = frame;
-        }
-        for g in &mut self.grabs {
-            g.flowing = g.flow;
-            let key = GrabKey { user, grab: g.grab };
-            let confirmed_grab = receiver.grabs().iter().find(|grab| grab.key == key);
-            g.reaction = confirmed_grab.map_or(g.reaction, |grab| grab.reaction);
-        }
-        means.clear();
-        means.extend_from_slice(receiver.means());
+        let mut copy = std::mem::take(&mut self.copy);
+        self.confirm(&mut copy, receiver, user, confirmed_frame);
         for j in 1..=self.lead {
-            self.one_step(&mut state, &mut means, receiver, user, j);
+            self.one_step(&mut copy, receiver, user, j);
         }
-        self.means = means;
-        self.blend.advance();
-        self.blend.add(
-            expected.q.iter().zip(&state.q).map(|(e, s)| e - s),
-            expected.v.iter().zip(&state.v).map(|(e, s)| e - s),
-        );
-        self.pose_blend.advance();
-        if self.replica.model().is_free() {
-            let model = self.replica.model();
-            let (expected, now) = (&expected.frame, &state.frame);
-            self.pose_blend.add(&Pose::of_frame(model, expected), &Pose::of_frame(model, now));
-        }
+        let model = self.replica.model();
+        self.visual.advance();
+        self.visual.add(model, &expected.state, &copy.state);
+        self.visual.show(model, &copy.state);
         for g in &mut self.grabs {
+            g.take_reaction(&copy, user);
             for ((offset, would), now) in g.offset.iter_mut().zip(g.would).zip(g.reaction) {
                 *offset = self.fade * (*offset + would - now);
             }
         }
-        self.state = state;
-        self.expected = expected;
-        self.show();
+        (self.copy, self.expected) = (copy, expected);
+    }
+
+    /// Returns a copy to the confirmed tick.
+    fn confirm(&mut self, copy: &mut BodyCopy, receiver: &Receiver, user: UserId, frame: Option<Frame>) {
+        copy.state.clone_from(receiver.confirmed());
+        if let Some(frame) = frame {
+            copy.state.frame = frame;
+        }
+        copy.hands.clear();
+        copy.hands.extend_from_slice(receiver.hands());
+        for g in &mut self.grabs {
+            let key = GrabKey { user, grab: g.grab };
+            if let Some(confirmed) = receiver.grabs().iter().find(|grab| grab.key == key) {
+                g.reaction = confirmed.reaction;
+            }
+            // The target of the confirmed tick, from which the hand moves in the first step.
+            let at = g.past.len().checked_sub(1 + self.lead);
+            let target = at.and_then(|i| g.past.get(i).copied().flatten()).map(Vector3::from);
+            let (mean, pull) = (copy.mean(key), -Vector3::from(g.reaction));
+            copy.hands.retain(|hand| hand.key != key);
+            copy.hands.push(HandState { key, pull, mean, target, flow: g.flow });
+        }
     }
 
     /// Estimates what drives the frame of a free body besides gravity and the streamed hands
@@ -300,82 +290,48 @@ impl PredictedHand {
         let turn = receiver.frame().and_then(|p| p.frame(self.replica.model())).unwrap_or_default();
         for g in &mut self.grabs {
             let key = GrabKey { user, grab: g.grab };
-            if !receiver.means().iter().any(|(known, _)| *known == key) {
-                continue;
-            }
+            let Some(known) = receiver.hands().iter().find(|hand| hand.key == key) else { continue };
             let Some(patch) = self.replica.patch(g.vertex, g.radius) else { continue };
-            let pull = turn.rotation().inverse() * replica::mean_of(receiver.means(), key);
+            let pull = turn.rotation().inverse() * known.mean;
             let hand = Hand { flow: g.flow, ..Hand::new(patch, Hold::Measured(Vector3::zeros())) };
             g.flow = self.replica.kernel().flow(&hand, pull);
         }
     }
 
-    /// Steps to `j` ticks after the confirmed tick and stores the reactions of the guest's own
-    /// hands in the grabs.
-    fn one_step(
-        &mut self,
-        state: &mut State,
-        means: &mut Vec<Mean>,
-        receiver: &Receiver,
-        user: UserId,
-        j: usize,
-    ) {
+    /// Steps a copy to `j` ticks after the confirmed tick.
+    fn one_step(&mut self, copy: &mut BodyCopy, receiver: &Receiver, user: UserId, j: usize) {
         let history = receiver.history();
-        let (tick, h) = (receiver.tick() + j as u64, self.replica.kernel().h());
+        let tick = receiver.tick() + j as u64;
         let free = self.replica.model().is_free();
-        let (mut hands, mut keys) = (std::mem::take(&mut self.hands), std::mem::take(&mut self.keys));
-        hands.clear();
-        keys.clear();
+        self.replica.release_all();
         for g in receiver.grabs().iter().filter(|g| g.key.user != user) {
             let Some(g) = history.grab(g.key, tick, &self.forecast) else { continue };
-            let Some(mut hand) = self.replica.measured(&g) else { continue };
-            hand.mean = replica::mean_of(means, g.state.key);
-            if free {
+            let held = self.replica.hold_measured(copy, &g);
+            if let (true, Some(hand)) = (free, held) {
                 // The frame moves on from the confirmed one. The remote hand is therefore held at
                 // its extrapolated target, not where the patch was.
                 let (velocity, config) = (Vector3::zeros(), GrabConfig::default());
                 hand.hold = Hold::Target { target: g.state.target.into(), velocity, config };
             }
-            hands.push(hand);
-            keys.push(g.state.key);
         }
-        let others = hands.len();
-        let mut own = std::mem::take(&mut self.own);
-        own.clear();
-        for (index, g) in self.grabs.iter().enumerate() {
+        for g in &self.grabs {
             // The newest target is the one that arrives `lead` ticks after the confirmed tick.
             let at = (g.past.len() + j).checked_sub(1 + self.lead);
-            let target = at.and_then(|i| g.past.get(i).copied().flatten()).map(Vector3::from);
-            let (Some(target), Some(patch)) = (target, self.replica.patch(g.vertex, g.radius)) else {
-                continue;
-            };
-            let before = at.and_then(|i| i.checked_sub(1)).and_then(|i| g.past.get(i).copied().flatten());
-            let velocity = before.map_or_else(Vector3::zeros, |b| (target - Vector3::from(b)) / h);
-            let hold = Hold::Target { target, velocity, config: g.hold };
-            let (key, pull) = (GrabKey { user, grab: g.grab }, -Vector3::from(g.reaction));
-            let mean = replica::mean_of(means, key);
-            hands.push(Hand { patch, hold, pull, mean, flow: g.flowing });
-            keys.push(key);
-            own.push(index);
+            let Some(target) = at.and_then(|i| g.past.get(i).copied().flatten()) else { continue };
+            let key = GrabKey { user, grab: g.grab };
+            self.replica.hold_at(copy, key, (g.vertex, g.radius), target.into(), g.hold);
         }
         let (force, torque) = self.push;
         let load = Load { modal: receiver.load(), force, torque, frame_is_given: false };
-        self.replica.step(state, &mut hands, &load);
-        for (hand, &index) in hands[others..].iter().zip(&own) {
-            self.grabs[index].reaction = (-hand.pull).into();
-            self.grabs[index].flowing = hand.flow;
-        }
-        means.clear();
-        means.extend(keys.iter().copied().zip(hands.iter().map(|hand| hand.mean)));
-        self.own = own;
-        (self.hands, self.keys) = (hands, keys);
+        self.replica.step_held(copy, &load);
     }
 
     /// Copies the state except its frame and the forces of the last step.
     fn take(&mut self, from: &State) {
-        let (frame, f) = (self.state.frame, std::mem::take(&mut self.state.f));
-        self.state.clone_from(from);
-        (self.state.frame, self.state.f) = (frame, f);
+        let state = &mut self.copy.state;
+        let (frame, f) = (state.frame, std::mem::take(&mut state.f));
+        state.clone_from(from);
+        (state.frame, state.f) = (frame, f);
     }
 
     /// Finds how many ticks ago the guest sent the target that the host's frame of the confirmed
@@ -404,36 +360,25 @@ impl PredictedHand {
 
     /// Fades from the copy to the confirmed state, because the guest no longer holds the body.
     fn fall_back(&mut self, receiver: &Receiver) {
-        self.blend.advance();
+        self.visual.advance();
         let new = receiver.visual();
         let h = self.replica.kernel().h();
-        let old = &self.state;
-        self.blend.add(
-            (0..new.modes()).map(|k| old.q[k] + h * old.v[k] - new.q[k]),
-            (0..new.modes()).map(|k| old.v[k] - new.v[k]),
-        );
-        self.pose_blend.advance();
-        let mut old = self.state.frame;
+        // This is the copy that would have been reached by this tick.
+        let mut old = self.copy.state.clone();
+        old.q.iter_mut().zip(&old.v).for_each(|(q, v)| *q += h * v);
         self.take(new);
-        if let (true, Some(new)) = (self.replica.model().is_free(), receiver.pose()) {
-            let model = self.replica.model();
-            // This is the frame that the copy would have reached by this tick.
+        let model = self.replica.model();
+        if let (true, Some(pose)) = (model.is_free(), receiver.pose()) {
             let zero = Vector3::zeros();
-            RigidMotion::predict(&mut old, model, h, zero, zero, zero);
-            self.pose_blend.add(&Pose::of_frame(model, &old), &new);
-            replica::place(&mut self.state, model, Some(&new));
+            RigidMotion::predict(&mut old.frame, model, h, zero, zero, zero);
+            replica::place(&mut self.copy.state, model, Some(&pose));
         }
-        self.show();
+        self.visual.add(model, &old, &self.copy.state);
+        self.visual.show(model, &self.copy.state);
         // The confirmed state is tracked without new offsets from here on.
-        let offset = self.visual.q.iter().zip(&new.q).map(|(a, b)| (a - b).abs()).fold(0.0, f64::max);
+        let shown = &self.visual.state;
+        let offset = shown.q.iter().zip(&new.q).map(|(a, b)| (a - b).abs()).fold(0.0, f64::max);
         let size = new.q.iter().fold(1e-12_f64, |m, q| m.max(q.abs()));
-        self.active = offset > 1e-6 * size || !self.pose_blend.is_empty();
-    }
-
-    fn show(&mut self) {
-        self.visual.clone_from(&self.state);
-        self.blend.apply(&mut self.visual.q, &mut self.visual.v);
-        let pose = self.frame_of(&self.state).map(|frame| Pose::of_frame(self.replica.model(), &frame));
-        self.pose = pose.map(|pose| self.pose_blend.apply(&pose));
+        self.active = offset > 1e-6 * size || self.visual.is_turning();
     }
 }
