@@ -2,6 +2,7 @@
 
 use std::collections::BTreeMap;
 
+use crate::prediction::Ring;
 use crate::recovery::Forecast;
 use crate::state::{BodyId, Tick, UserId};
 use crate::wire::{HeldAt, InputTick};
@@ -12,7 +13,7 @@ pub(crate) const WINDOW: usize = 128;
 /// Inputs of one user.
 #[derive(Debug)]
 pub(crate) struct UserInputs {
-    slots: Vec<Option<InputTick>>,
+    slots: Ring<InputTick>,
     /// The first tick for which inputs are expected.
     pub(crate) first: Tick,
     /// The newest known tick.
@@ -26,11 +27,11 @@ pub(crate) struct UserInputs {
 impl UserInputs {
     fn new(first: Tick) -> Self {
         let before = first.saturating_sub(1);
-        Self { slots: vec![None; WINDOW], first, highest: before, complete: before, gone: false }
+        Self { slots: Ring::new(WINDOW), first, highest: before, complete: before, gone: false }
     }
 
     pub(crate) fn at(&self, tick: Tick) -> Option<&InputTick> {
-        self.slots[(tick % WINDOW as u64) as usize].as_ref().filter(|i| i.tick == tick)
+        self.slots.get(tick)
     }
 
     fn put(&mut self, input: InputTick) -> bool {
@@ -38,7 +39,7 @@ impl UserInputs {
         if tick + (WINDOW as u64) <= self.highest || self.at(tick).is_some() {
             return false;
         }
-        self.slots[(tick % WINDOW as u64) as usize] = Some(input);
+        *self.slots.place(tick).0 = input;
         self.highest = self.highest.max(tick);
         self.complete = self.complete.max(self.highest.saturating_sub(WINDOW as u64));
         while self.at(self.complete + 1).is_some() {

@@ -5,7 +5,7 @@ use pliant_modal::Relaxation;
 
 use super::{HISTORY, History, Predict, Recovery};
 use crate::newmark::{FlowFilter, Newmark};
-use crate::prediction::HandState;
+use crate::prediction::{HandState, Ring};
 use crate::replica;
 use crate::state::{State, Tick};
 
@@ -22,7 +22,7 @@ pub struct AccelerationDriven {
     first: Tick,
     state: State,
     /// The accelerations that each tick was stepped with.
-    used: Vec<Vec<f64>>,
+    used: Ring<Vec<f64>>,
     /// Per mode: the tick at which the policy last took over the absolute state. Errors made up to
     /// that tick no longer count.
     anchored: Vec<Tick>,
@@ -40,7 +40,7 @@ impl AccelerationDriven {
             tick: 0,
             first: 0,
             state: State::zero(modes, false),
-            used: vec![Vec::new(); HISTORY],
+            used: Ring::new(HISTORY),
             anchored: vec![0; modes],
             next: vec![0.0; modes],
         }
@@ -57,9 +57,7 @@ impl AccelerationDriven {
     }
 
     fn used(&self, tick: Tick) -> Option<&Vec<f64>> {
-        (tick >= self.first && tick <= self.tick && tick + (HISTORY as u64) > self.tick)
-            .then(|| &self.used[(tick % HISTORY as u64) as usize])
-            .filter(|a| a.len() == self.state.modes())
+        self.used.get(tick).filter(|_| (self.first..=self.tick).contains(&tick))
     }
 
     /// Fills `next` with the predicted accelerations for `tick`, from the accelerations that the
@@ -85,8 +83,7 @@ impl Recovery for AccelerationDriven {
         self.tick = tick;
         self.first = tick;
         self.anchored.fill(tick);
-        let slot = &mut self.used[(tick % HISTORY as u64) as usize];
-        slot.clone_from(&self.state.a);
+        self.used.place(tick).0.clone_from(&self.state.a);
     }
 
     fn advance(&mut self, tick: Tick, history: &History) {
@@ -102,7 +99,7 @@ impl Recovery for AccelerationDriven {
             flow.finish(&mut self.state);
         }
         self.tick = tick;
-        self.used[(tick % HISTORY as u64) as usize].clone_from(&self.next);
+        self.used.place(tick).0.clone_from(&self.next);
     }
 
     fn correct(&mut self, from: Tick, history: &History) -> bool {
@@ -112,12 +109,12 @@ impl Recovery for AccelerationDriven {
         let Some(data) = history.known(from).filter(|d| d.accelerations.len() == self.state.modes()) else {
             return false;
         };
-        if self.used(from).is_none() || from == self.first {
+        if !(self.first + 1..=self.tick).contains(&from) {
             return false;
         }
+        let Some(used) = self.used.get_mut(from) else { return false };
         let (to_q, to_v) = self.newmark.response(self.tick - from);
         let to_z = self.flow.as_ref().map_or(0.0, |flow| flow.response(self.tick - from));
-        let used = &mut self.used[(from % HISTORY as u64) as usize];
         for (k, (used, received)) in used.iter_mut().zip(&data.accelerations).enumerate() {
             if from <= self.anchored[k] {
                 continue;

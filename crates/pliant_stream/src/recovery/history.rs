@@ -1,6 +1,7 @@
 //! The received data per tick, in a ring of fixed length.
 
 use crate::codec::quantization::Quanta;
+use crate::prediction::Ring;
 use crate::state::{GrabKey, GrabState, MAX_GRABS, Pose, Tick};
 use crate::wire::{Frame, FrameGrab, SliceEntry};
 
@@ -19,8 +20,6 @@ const FALL: f64 = 0.4;
 /// The received data of one tick.
 #[derive(Debug, Clone, Default)]
 pub struct TickData {
-    /// The tick that this slot holds.
-    pub tick: Tick,
     /// True when the data that drives the state (accelerations or reactions) has arrived.
     pub known: bool,
     /// True when the frame of this tick itself has arrived, not only a repeat.
@@ -44,14 +43,14 @@ pub struct TickData {
 /// The received data of the last [`HISTORY`] ticks.
 #[derive(Debug, Clone)]
 pub struct History {
-    slots: Vec<TickData>,
+    slots: Ring<TickData>,
     highest: Tick,
 }
 
 impl History {
     /// Creates an empty history. `tick` is the tick before the first tick of interest.
     pub fn new(tick: Tick) -> Self {
-        Self { slots: vec![TickData::default(); HISTORY], highest: tick }
+        Self { slots: Ring::new(HISTORY), highest: tick }
     }
 
     /// The newest tick for which data has arrived.
@@ -61,8 +60,7 @@ impl History {
 
     /// The data of `tick`, if the part that drives the state has arrived.
     pub fn known(&self, tick: Tick) -> Option<&TickData> {
-        let slot = &self.slots[(tick % HISTORY as u64) as usize];
-        (slot.tick == tick && slot.known).then_some(slot)
+        self.slots.get(tick).filter(|slot| slot.known)
     }
 
     /// The data of `tick`, if the frame itself has arrived.
@@ -98,9 +96,8 @@ impl History {
     }
 
     fn slot(&mut self, tick: Tick) -> &mut TickData {
-        let slot = &mut self.slots[(tick % HISTORY as u64) as usize];
-        if slot.tick != tick {
-            slot.tick = tick;
+        let (slot, other) = self.slots.place(tick);
+        if other {
             slot.known = false;
             slot.head = false;
             slot.accelerations.clear();
@@ -173,6 +170,25 @@ impl History {
         slot.known = true;
         slot.head = true;
         new(frame.tick, first);
+    }
+
+    /// The largest second difference of a grab's received reactions, N, in the `window` ticks before
+    /// `tick`. Zero if no three ticks in a row are known.
+    pub(crate) fn second_difference(&self, key: GrabKey, tick: Tick, window: u64) -> f64 {
+        let at = |back: u64| {
+            let data = self.known(tick.checked_sub(back)?)?;
+            let grab = data.grabs.iter().find(|g| g.state.key == key)?;
+            Some(Vector3::from(grab.state.reaction))
+        };
+        let (mut last, mut largest) = ([None::<Vector3<f64>>; 2], 0.0f64);
+        for back in 0..window {
+            let now = at(back);
+            if let (Some(a), Some(b), Some(c)) = (last[0], last[1], now) {
+                largest = largest.max((a - 2.0 * b + c).norm_squared());
+            }
+            last = [last[1], now];
+        }
+        largest.sqrt()
     }
 
     /// One grab at `tick`: received, interpolated between neighbors, or extrapolated by `forecast`.

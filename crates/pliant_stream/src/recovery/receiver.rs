@@ -2,6 +2,7 @@
 
 use std::sync::Arc;
 
+use nalgebra::Vector3;
 use pliant_modal::{ModalModel, StepSettings};
 
 use super::{
@@ -12,7 +13,7 @@ use crate::StreamError;
 use crate::codec::checksum::checksum;
 use crate::codec::quantization::Quanta;
 use crate::newmark::Newmark;
-use crate::prediction::HandState;
+use crate::prediction::{HandState, Ring};
 use crate::replica::{self, Replica};
 use crate::state::{GrabKey, GrabState, Pose, State, Tick, UserId};
 use crate::wire::{Frame, SnapshotBytes};
@@ -85,7 +86,7 @@ pub struct Receiver {
     counts: RepairCounts,
     /// The newest counted tick, and the predicted ticks for which no data has arrived yet.
     counted: Tick,
-    guessed: Vec<Tick>,
+    guessed: Ring<bool>,
     mismatched: u32,
     before: State,
     forecast: Forecast,
@@ -161,7 +162,7 @@ impl Receiver {
             free: model.is_free(),
             counts: RepairCounts::default(),
             counted: snapshot.tick,
-            guessed: vec![0; HISTORY],
+            guessed: Ring::new(HISTORY),
             mismatched: 0,
             before: rest,
             forecast: Forecast::new(newmark.h),
@@ -265,9 +266,7 @@ impl Receiver {
                 let done = if whole && t != earliest { true } else { self.policy.correct(t, &self.history) };
                 // If a repeat of the tick arrived in time, the tick's own frame refines it and does
                 // not count as a repair.
-                let guessed = &mut self.guessed[(t % HISTORY as u64) as usize];
-                if first && *guessed == t {
-                    *guessed = 0;
+                if first && self.guessed.get_mut(t).is_some_and(std::mem::take) {
                     arrival.repaired += u32::from(done);
                     arrival.too_late += u32::from(!done);
                 }
@@ -296,7 +295,7 @@ impl Receiver {
                 self.counts.in_time += 1;
             } else {
                 self.counts.guessed += 1;
-                self.guessed[(tick % HISTORY as u64) as usize] = tick;
+                *self.guessed.place(tick).0 = true;
             }
         }
         self.policy.advance(tick, &self.history);
@@ -446,7 +445,7 @@ impl Receiver {
             // its end.
             let hands = self.grabs.len();
             for g in &mut self.grabs {
-                let mean = -nalgebra::Vector3::from(g.reaction);
+                let mean = -Vector3::from(g.reaction);
                 if let Some(before) = self.implied[1].iter().find(|hand| hand.key == g.key) {
                     g.reaction = (-self.replica.end(mean, before.mean, hands)).into();
                 }
@@ -455,9 +454,12 @@ impl Receiver {
         }
     }
 
-    /// Blends out the error of visual reactions that were predictions. The offset fades as a
-    /// critically damped motion, `o(t) = 2 k o(t-1) - k^2 o(t-2)`, so that the reaction has no jump
-    /// and no kink, however wrong the prediction was.
+    /// Blends out the error of visual reactions that were predictions.
+    ///
+    /// The offset vanishes as fast as the reaction may change: its second difference stays within
+    /// that of the received reactions of late, or the offset fades as a critically damped motion,
+    /// `o(t) = 2 k o(t-1) - k^2 o(t-2)`. The reaction then has no jump and no kink that it would
+    /// not have without loss, however wrong the prediction was.
     fn blend_reactions(&mut self) {
         let keep = (-REACTION_FADE / f64::from(self.blend_ticks)).exp();
         let [last, before] = &self.trail;
@@ -466,20 +468,23 @@ impl Receiver {
             // If a tick has no data at all, its reaction stays a prediction.
             let known = |back: u64| {
                 let tick = self.grabs_at.checked_sub(back)?;
-                self.history.grab(g.key, tick, &self.forecast).map(|k| k.state.reaction)
+                self.history.grab(g.key, tick, &self.forecast).map(|k| Vector3::from(k.state.reaction))
             };
-            let k1 = known(1).unwrap_or(g.reaction);
-            let o1: [f64; 3] = std::array::from_fn(|k| s1.reaction[k] - k1[k]);
-            let o2 = before.iter().find(|p| p.key == g.key).map_or(o1, |s2| {
-                let k2 = known(2).unwrap_or(k1);
-                std::array::from_fn(|k| s2.reaction[k] - k2[k])
+            let now = Vector3::from(g.reaction);
+            let s1 = Vector3::from(s1.reaction);
+            let k1 = known(1).unwrap_or(now);
+            let o1 = s1 - k1;
+            let (s2, o2) = before.iter().find(|p| p.key == g.key).map_or((s1, o1), |s2| {
+                let s2 = Vector3::from(s2.reaction);
+                (s2, s2 - known(2).unwrap_or(k1))
             });
-            for (k, reaction) in g.reaction.iter_mut().enumerate() {
-                let offset = 2.0 * keep * o1[k] - keep * keep * o2[k];
-                if offset.abs() > 1e-7 * reaction.abs() {
-                    *reaction += offset;
-                }
+            let offset = 2.0 * keep * o1 - keep * keep * o2;
+            if offset.amax() <= 1e-7 * now.amax() {
+                continue;
             }
+            let usual = self.history.second_difference(g.key, self.grabs_at, self.forecast.window());
+            let share = least_share(now - 2.0 * s1 + s2, offset, usual);
+            g.reaction = (now + share * offset).into();
         }
     }
 
@@ -497,6 +502,19 @@ impl Receiver {
     }
 }
 
+/// Returns the least share of `offset`, 0 to 1, with which `base + share * offset` is not longer than
+/// `limit`. It is 1 if no share is enough.
+fn least_share(base: Vector3<f64>, offset: Vector3<f64>, limit: f64) -> f64 {
+    let beyond = base.norm_squared() - limit * limit;
+    if beyond <= 0.0 {
+        return 0.0;
+    }
+    let (square, along) = (offset.norm_squared(), -base.dot(&offset));
+    let root = along * along - square * beyond;
+    let share = (along - root.max(0.0).sqrt()) / square;
+    if root >= 0.0 && (0.0..1.0).contains(&share) { share } else { 1.0 }
+}
+
 fn hands_of(snapshot: &SnapshotBytes) -> Vec<HandState> {
     let of = |&(user, grab, mean): &(u16, u16, [f64; 3])| {
         HandState::of_mean(GrabKey { user: UserId(user), grab }, mean.into())
@@ -511,5 +529,24 @@ fn state_of(snapshot: &SnapshotBytes) -> State {
         a: snapshot.a.clone(),
         z: snapshot.z.clone(),
         ..State::default()
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn the_least_share_ends_on_the_limit_or_is_all() {
+        let (base, offset) = (Vector3::new(-3.0, 4.0, 0.0), Vector3::new(6.0, -2.0, 1.0));
+        assert_eq!(least_share(base, offset, 5.0), 0.0, "nothing is needed");
+        for limit in [3.6, 4.0, 4.5, 4.99] {
+            let share = least_share(base, offset, limit);
+            assert!((0.0..1.0).contains(&share));
+            assert!(((base + share * offset).norm() - limit).abs() < 1e-12, "{limit}: {share}");
+            assert!((base + 0.9 * share * offset).norm() > limit, "less is not enough");
+        }
+        assert_eq!(least_share(base, offset, 1.0), 1.0, "no share is enough");
+        assert_eq!(least_share(base, -offset, 4.0), 1.0);
     }
 }

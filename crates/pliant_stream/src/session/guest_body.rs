@@ -7,7 +7,7 @@ use pliant_modal::ModalModel;
 
 use crate::newmark::Newmark;
 use crate::playout::PlayoutClock;
-use crate::prediction::PredictedHand;
+use crate::prediction::{PredictedHand, Ring};
 use crate::recovery::{HISTORY, Policy, Receiver, RecoveryConfig, RepairCounts, VisualGrab};
 use crate::replica::Replica;
 use crate::state::{BodyId, Placement, Pose, State, Tick, UserId};
@@ -24,7 +24,6 @@ const CATCH_UP: u64 = 120;
 
 #[derive(Debug, Clone, Copy, Default)]
 struct Ask {
-    tick: Tick,
     times: u8,
     next: Duration,
 }
@@ -46,7 +45,7 @@ pub struct BodyView {
     newmark: Newmark,
     waiting: Vec<Frame>,
     snapshot: Option<SnapshotBytes>,
-    asks: Vec<Ask>,
+    asks: Ring<Ask>,
     /// Ticks up to here need no NACK: they are known, or lie before the run or the snapshot.
     settled: Tick,
     resting: bool,
@@ -78,7 +77,7 @@ impl BodyView {
             newmark,
             waiting: Vec::new(),
             snapshot: None,
-            asks: vec![Ask::default(); HISTORY],
+            asks: Ring::new(HISTORY),
             settled: 0,
             resting: false,
             fade_at: Duration::ZERO,
@@ -381,9 +380,9 @@ impl BodyView {
                 }
                 continue;
             }
-            let ask = &mut self.asks[(tick % HISTORY as u64) as usize];
-            if ask.tick != tick {
-                *ask = Ask { tick, times: 0, next: now };
+            let (ask, other) = self.asks.place(tick);
+            if other {
+                *ask = Ask { times: 0, next: now };
             }
             if ask.times >= ASKS || ask.next > now {
                 continue;
@@ -412,8 +411,8 @@ impl BodyView {
         let to = highest.saturating_sub(u64::from(self.config.repeats));
         (from..to)
             .filter(|t| history.known(*t).is_none())
-            .map(|t| self.asks[(t % HISTORY as u64) as usize])
-            .filter(|a| a.tick != 0 && a.times > 0 && a.times < ASKS)
+            .filter_map(|t| self.asks.get(t))
+            .filter(|a| a.times > 0 && a.times < ASKS)
             .map(|a| a.next)
             .min()
     }
