@@ -11,9 +11,9 @@ use pliant_modal::{GrabConfig, ModalModel, Relaxation};
 use pliant_stream::codec::quantization::Quanta;
 use pliant_stream::emulator::{Loss, Trace};
 use pliant_stream::wire::{
-    AccelerationCoding, Accelerations, BodyInfo, Clock, Datagram, Frame, FrameGrab, GuestMessage, HeldAt,
+    AccelerationCoding, Accelerations, BodyInfo, Clock, Datagram, FrameGrab, GuestMessage, HeldAt,
     HostMessage, InputTick, Inputs, Nack, NackRun, PeerBodyState, PeerFrame, PeerGrip, PeerMessage, Repeat,
-    RepeatGrab, Report, Slice, SliceEntry, SnapshotBytes, StateCheck, TargetEntry, Targets,
+    RepeatGrab, Report, Slice, SliceEntry, SnapshotBytes, StateCheck, TargetEntry, Targets, TickFrame,
 };
 use pliant_stream::{
     BodyId, Channel, DisconnectReason, GuestConfig, GuestEvent, GuestSession, HostConfig, HostEvent,
@@ -37,7 +37,7 @@ fn sliced(payload: u8) -> Slice {
 }
 
 fn samples() -> Vec<Datagram> {
-    let frame = |payload: u8| Frame {
+    let frame = |payload: u8| TickFrame {
         body: BODY,
         tick: 12_345,
         run: 77,
@@ -351,7 +351,7 @@ fn ticks_of_the_far_future_and_past_do_not_move_a_body() {
     let before = guest.body(BODY).unwrap().tick();
     for tick in [0, 1, (1 << 48) - 1, 1 << 40, before + 2_000_000] {
         let Datagram::Frame(f) = &samples()[0] else { unreachable!() };
-        let frame = Frame { tick, run: u16::MAX, ..f.clone() };
+        let frame = TickFrame { tick, run: u16::MAX, ..f.clone() };
         guest.on_datagram(now, &Datagram::Frame(frame).encode(30_000_u16.wrapping_add(tick as u16)));
         guest.update(now);
     }
@@ -366,7 +366,7 @@ fn a_tick_of_the_near_future_costs_a_snapshot_and_no_more() {
         let (mut host, mut guest, mut now) = session(name);
         let Datagram::Frame(f) = &samples()[0] else { unreachable!() };
         let accelerations = (name == "paper").then(|| quantised(AccelerationCoding::Visible, &[1.0; 12]));
-        let frame = Frame { tick: 900_000, accelerations, repeats: Vec::new(), ..f.clone() };
+        let frame = TickFrame { tick: 900_000, accelerations, repeats: Vec::new(), ..f.clone() };
         guest.on_datagram(now, &Datagram::Frame(frame).encode(120));
         for tick in 60..160 {
             now += Duration::from_millis(25);

@@ -3,11 +3,11 @@
 
 use pliant_stream::codec::quantization::Quanta;
 use pliant_stream::recovery::{AccelerationDriven, History, Recovery};
-use pliant_stream::wire::{Accelerations, Frame};
+use pliant_stream::wire::{Accelerations, TickFrame};
 use pliant_stream::{BodyId, Newmark, Predict, State};
 
-fn frame(tick: u64, a: &[f64]) -> Frame {
-    Frame {
+fn frame(tick: u64, a: &[f64]) -> TickFrame {
+    TickFrame {
         body: BodyId(1),
         tick,
         run: 0,

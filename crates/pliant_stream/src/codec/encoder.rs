@@ -18,8 +18,8 @@ use crate::prediction::{BodyCopy, HandState};
 use crate::replica::{self, Replica};
 use crate::state::{BodyId, GrabKey, GrabState, Tick, TickState};
 use crate::wire::{
-    AccelerationCoding, Accelerations, Frame, FrameGrab, MAX_PARTS, Payload, Repeat, RepeatGrab, Slice,
-    SliceEntry, SnapshotBytes, StreamSubscription, Writer, round24,
+    AccelerationCoding, Accelerations, FrameGrab, MAX_PARTS, Payload, Repeat, RepeatGrab, Slice, SliceEntry,
+    SnapshotBytes, StreamSubscription, TickFrame, Writer, round24,
 };
 
 /// Number of ticks whose frames are kept for resending.
@@ -47,7 +47,7 @@ struct Sent {
     tick: Tick,
     /// The frames without repeats, marked as resent. More than one if the grabs did not fit in one
     /// frame.
-    frames: Vec<Frame>,
+    frames: Vec<TickFrame>,
 }
 
 impl Sent {
@@ -303,7 +303,7 @@ impl Encoder {
         };
         replica::fill(&mut self.truth.state, [state.q, state.v, state.a, state.z]);
         let run = state.tick - self.started.unwrap_or(state.tick) - 1;
-        let mut frame = Frame {
+        let mut frame = TickFrame {
             body: self.body,
             tick: state.tick,
             run: u16::try_from(run).unwrap_or(u16::MAX),
@@ -357,17 +357,17 @@ impl Encoder {
     }
 
     /// Moves the grabs that do not fit out of a frame, into parts of their own.
-    fn split(&self, frame: &mut Frame, room: usize) -> Vec<Frame> {
-        let mut parts: Vec<Frame> = Vec::new();
+    fn split(&self, frame: &mut TickFrame, room: usize) -> Vec<TickFrame> {
+        let mut parts: Vec<TickFrame> = Vec::new();
         if 3 + frame.bytes() <= room {
             return parts;
         }
-        let blank = Frame { grabs: Vec::new(), pose: None, accelerations: None, ..frame.clone() };
+        let blank = TickFrame { grabs: Vec::new(), pose: None, accelerations: None, ..frame.clone() };
         let mut rest = std::mem::take(&mut frame.grabs).into_iter();
         // 5 bytes: the header of 3 bytes, and the part number and count that are not in any frame
         // yet.
-        let fill = |into: &mut Frame, rest: &mut std::vec::IntoIter<FrameGrab>| {
-            while 5 + into.bytes() + Frame::grab_bytes(into.displacements) <= room {
+        let fill = |into: &mut TickFrame, rest: &mut std::vec::IntoIter<FrameGrab>| {
+            while 5 + into.bytes() + TickFrame::grab_bytes(into.displacements) <= room {
                 let Some(g) = rest.next() else { return };
                 into.grabs.push(g);
             }
@@ -387,7 +387,7 @@ impl Encoder {
         parts
     }
 
-    fn keep(&mut self, mut frame: Frame, parts: Vec<Frame>) {
+    fn keep(&mut self, mut frame: TickFrame, parts: Vec<TickFrame>) {
         frame.repeats.clear();
         frame.grabs.retain(|g| g.held);
         let tick = frame.tick;
@@ -492,7 +492,7 @@ impl Encoder {
     /// Adds absolute state to the frame and applies it to the mirror. The slice contains the modes
     /// with the largest error in the mirror, and some modes in turn for receivers that missed
     /// frames.
-    fn refresh(&mut self, frame: &mut Frame, state: &TickState<'_>, unit: f32, room: usize) {
+    fn refresh(&mut self, frame: &mut TickFrame, state: &TickState<'_>, unit: f32, room: usize) {
         if self.subscription.refresh == 0 {
             return;
         }
@@ -559,7 +559,7 @@ impl Encoder {
     }
 
     /// Repeats the last ticks in the frame and lists the grabs that ended within them.
-    fn repeat(&mut self, frame: &mut Frame) {
+    fn repeat(&mut self, frame: &mut TickFrame) {
         for sent in self.sent.iter().rev().take(usize::from(self.subscription.repeats)) {
             let Ok(back) = u8::try_from(frame.tick - sent.tick) else { break };
             let mut grabs = Vec::with_capacity(sent.frames.first().map_or(0, |f| f.grabs.len()));
@@ -586,7 +586,7 @@ fn find_or_add(grabs: &mut Vec<FrameGrab>, wanted: &FrameGrab) -> Option<u8> {
     u8::try_from(index).ok()
 }
 
-fn write(frame: &Frame) -> Arc<[u8]> {
+fn write(frame: &TickFrame) -> Arc<[u8]> {
     let mut w = Writer::with_capacity(frame.bytes());
     frame.encode(&mut w);
     w.into_bytes().into()

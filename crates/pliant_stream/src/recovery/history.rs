@@ -3,7 +3,7 @@
 use crate::codec::quantization::Quanta;
 use crate::prediction::Ring;
 use crate::state::{GrabKey, GrabState, MAX_GRABS, Pose, Tick};
-use crate::wire::{Frame, FrameGrab, SliceEntry};
+use crate::wire::{FrameGrab, SliceEntry, TickFrame};
 
 use nalgebra::{UnitQuaternion, Vector3};
 
@@ -117,7 +117,7 @@ impl History {
 
     /// Stores a frame and its repeats. Calls `new(tick, true)` for each tick that was not known
     /// before, and `new(tick, false)` for a frame that completes a tick known from a repeat.
-    pub fn take(&mut self, frame: &Frame, quanta: &Quanta, mut new: impl FnMut(Tick, bool)) {
+    pub fn take(&mut self, frame: &TickFrame, quanta: &Quanta, mut new: impl FnMut(Tick, bool)) {
         let modes = quanta.modes();
         self.highest = self.highest.max(frame.tick);
         for repeat in &frame.repeats {

@@ -16,7 +16,7 @@ use crate::newmark::Newmark;
 use crate::prediction::{HandState, Ring};
 use crate::replica::{self, Replica};
 use crate::state::{GrabKey, GrabState, Pose, State, Tick, UserId};
-use crate::wire::{Frame, SnapshotBytes};
+use crate::wire::{SnapshotBytes, TickFrame};
 
 /// Number of disagreeing checksums in a row before the receiver wants a snapshot. A slice or a
 /// repair may correct a single disagreement.
@@ -240,7 +240,7 @@ impl Receiver {
 
     /// Takes in a frame. Data for ticks that were already stepped corrects the confirmed state at
     /// once. The visual state does not jump, and the difference fades.
-    pub fn accept(&mut self, frame: &Frame) -> Arrival {
+    pub fn accept(&mut self, frame: &TickFrame) -> Arrival {
         let mut arrival = Arrival::default();
         let (mut earliest, mut late) = (Tick::MAX, [(0, false); 8]);
         let mut late_count = 0;

@@ -11,7 +11,7 @@ use crate::prediction::{PredictedHand, Ring};
 use crate::recovery::{HISTORY, Policy, Receiver, RecoveryConfig, RepairCounts, VisualGrab};
 use crate::replica::Replica;
 use crate::state::{BodyId, Placement, Pose, State, Tick, UserId};
-use crate::wire::{BodyInfo, Frame, MAX_NACK_RUNS, Nack, NackRun, Payload, SnapshotBytes};
+use crate::wire::{BodyInfo, MAX_NACK_RUNS, Nack, NackRun, Payload, SnapshotBytes, TickFrame};
 
 /// Largest number of frames that wait for the snapshot.
 const WAITING: usize = HISTORY;
@@ -43,7 +43,7 @@ pub struct BodyView {
     own_first: bool,
     config: RecoveryConfig,
     newmark: Newmark,
-    waiting: Vec<Frame>,
+    waiting: Vec<TickFrame>,
     snapshot: Option<SnapshotBytes>,
     asks: Ring<Ask>,
     /// Ticks up to here need no NACK: they are known, or lie before the run or the snapshot.
@@ -244,7 +244,7 @@ impl BodyView {
         true
     }
 
-    pub(crate) fn take_frame(&mut self, now: Duration, frame: Frame) {
+    pub(crate) fn take_frame(&mut self, now: Duration, frame: TickFrame) {
         self.received_at = now;
         let highest = self.receiver.as_ref().map_or(0, |r| r.history().highest());
         let modes = self.receiver.as_ref().map_or(0, |r| r.confirmed().modes());

@@ -1,6 +1,6 @@
 //! The kinds of datagram between host and guest, and between peers.
 
-use super::{Frame, Inputs, Reader, Writer};
+use super::{Inputs, Reader, TickFrame, Writer};
 use crate::StreamError;
 use crate::state::{BodyId, Tick};
 
@@ -85,7 +85,7 @@ pub struct Clock {
 #[derive(Debug, Clone, PartialEq)]
 pub enum Datagram {
     /// Host to guest: a tick of a body.
-    Frame(Frame),
+    Frame(TickFrame),
     /// Guest to host: targets of the guest's hands.
     Targets(Targets),
     /// Guest to host: ticks to send again.
@@ -175,7 +175,7 @@ impl Datagram {
         let kind = r.u8("datagram kind")?;
         let sequence = r.u16("sequence")?;
         let datagram = match kind {
-            FRAME => Self::Frame(Frame::decode(&mut r)?),
+            FRAME => Self::Frame(TickFrame::decode(&mut r)?),
             TARGETS => {
                 let count = r.u8("target count")?;
                 bounded("target count", count, MAX_TARGETS, "at most 64")?;

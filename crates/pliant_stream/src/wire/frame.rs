@@ -239,7 +239,7 @@ pub struct Repeat {
 
 /// One tick of one body.
 #[derive(Debug, Clone, PartialEq)]
-pub struct Frame {
+pub struct TickFrame {
     /// The body.
     pub body: BodyId,
     /// The tick.
@@ -272,7 +272,7 @@ pub struct Frame {
     pub repeats: Vec<Repeat>,
 }
 
-impl Frame {
+impl TickFrame {
     /// Bytes of one grab.
     pub(crate) fn grab_bytes(displacements: bool) -> usize {
         GRAB_BYTES + if displacements { 9 } else { 0 }

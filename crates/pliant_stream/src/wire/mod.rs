@@ -18,7 +18,7 @@ pub(crate) use bytes::{Reader, WIDE_LIMIT, Writer, round24};
 pub use datagram::{Clock, Datagram, Nack, NackRun, Report, TargetEntry, Targets};
 pub(crate) use datagram::{MAX_NACK_RUN, MAX_NACK_RUNS, MAX_TARGETS};
 pub(crate) use frame::MAX_PARTS;
-pub use frame::{AccelerationCoding, Accelerations, Frame, FrameGrab, Repeat, RepeatGrab};
+pub use frame::{AccelerationCoding, Accelerations, FrameGrab, Repeat, RepeatGrab, TickFrame};
 pub use inputs::{HeldAt, InputTick, Inputs, StateCheck};
 pub(crate) use inputs::{MAX_HELD, MAX_TICKS};
 pub use message::{BodyInfo, GuestMessage, HostMessage, Payload, SnapshotBytes, StreamSubscription};
