@@ -6,7 +6,7 @@
 
 use std::time::Duration;
 
-use pliant_stream::emulator::{Link, LinkConfig, Loss};
+use pliant_stream::emulator::{EmulatedLink, LinkConfig, Loss};
 use pliant_stream::{
     Channel, GuestConfig, GuestEvent, GuestSession, HostConfig, HostEvent, HostSession, Output, PeerId,
     StreamError,
@@ -55,11 +55,11 @@ pub struct GuestEnd {
     /// The session.
     pub session: GuestSession,
     /// Link for datagrams, host to guest.
-    pub down: Link,
+    pub down: EmulatedLink,
     /// Link for datagrams, guest to host.
-    pub up: Link,
-    reliable_down: Link,
-    reliable_up: Link,
+    pub up: EmulatedLink,
+    reliable_down: EmulatedLink,
+    reliable_up: EmulatedLink,
     connected: bool,
 }
 
@@ -172,10 +172,10 @@ impl Pair {
         };
         self.guests.push(GuestEnd {
             session,
-            reliable_down: Link::new(reliable(&path.down), seed ^ 0x5157),
-            reliable_up: Link::new(reliable(&path.up), seed ^ 0x7515),
-            down: Link::new(path.down, seed),
-            up: Link::new(path.up, seed ^ 0xFFFF_0000),
+            reliable_down: EmulatedLink::new(reliable(&path.down), seed ^ 0x5157),
+            reliable_up: EmulatedLink::new(reliable(&path.up), seed ^ 0x7515),
+            down: EmulatedLink::new(path.down, seed),
+            up: EmulatedLink::new(path.up, seed ^ 0xFFFF_0000),
             connected: true,
         });
         Ok(index)

@@ -11,7 +11,7 @@
 //! ```
 //! use std::{sync::Arc, time::Duration};
 //! use pliant_modal::{Body, BodyConfig, ModalModel};
-//! use pliant_stream::emulator::{Link, LinkConfig, Preset};
+//! use pliant_stream::emulator::{EmulatedLink, LinkConfig, Preset};
 //! use pliant_stream::{
 //!     BodyId, Channel, GuestConfig, GuestSession, HostConfig, HostSession, PeerId, StepSettings,
 //!     TickState,
@@ -29,7 +29,7 @@
 //! guest.connect(start)?;
 //!
 //! let lossy = LinkConfig::preset(Preset::Paper1); // 9 % lost, 196 ms there and back
-//! let [mut down, mut up] = [1, 2].map(|seed| Link::<Vec<u8>>::new(lossy.clone(), seed));
+//! let [mut down, mut up] = [1, 2].map(|seed| EmulatedLink::<Vec<u8>>::new(lossy.clone(), seed));
 //! for tick in 1..=400 {
 //!     let now = tick as u32 * Duration::from_millis(25);
 //!     body.push(0, [0.0, 0.0, 0.1 * (0.1 * tick as f64).sin()])?;

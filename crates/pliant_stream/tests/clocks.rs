@@ -7,7 +7,7 @@ use std::collections::BTreeMap;
 use std::time::Duration;
 
 use pliant_modal::{Body, BodyConfig, GrabConfig, Patch};
-use pliant_stream::emulator::{Link, LinkConfig, Loss, Preset};
+use pliant_stream::emulator::{EmulatedLink, LinkConfig, Loss, Preset};
 use pliant_stream::{
     BodyId, Channel, GrabKey, GrabState, GuestConfig, GuestSession, HostConfig, HostSession, PeerId,
     StepSettings, TickState, UserId,
@@ -38,8 +38,8 @@ fn visual(
     let grab = body.grab(&patch, GrabConfig::default()).unwrap();
     let lossy = LinkConfig::preset(Preset::Paper1);
     let whole = LinkConfig { loss: Loss::None, keep_order: true, ..lossy.clone() };
-    let [mut down, mut up] = [1, 2].map(|seed| Link::<Vec<u8>>::new(lossy.clone(), seed));
-    let [mut said_down, mut said_up] = [3, 4].map(|seed| Link::<Vec<u8>>::new(whole.clone(), seed));
+    let [mut down, mut up] = [1, 2].map(|seed| EmulatedLink::<Vec<u8>>::new(lossy.clone(), seed));
+    let [mut said_down, mut said_up] = [3, 4].map(|seed| EmulatedLink::<Vec<u8>>::new(whole.clone(), seed));
     let (mut truth, mut seen) = (BTreeMap::new(), BTreeMap::new());
     let mut passed = Duration::ZERO;
     while passed < Duration::from_secs(8) {

@@ -3,7 +3,7 @@
 
 use std::time::Duration;
 
-use pliant_stream::emulator::{Link, LinkConfig, Loss, Preset, Trace};
+use pliant_stream::emulator::{EmulatedLink, LinkConfig, Loss, Preset, Trace};
 
 const MS: Duration = Duration::from_millis(1);
 
@@ -15,8 +15,8 @@ fn run(
     count: u64,
     interval: Duration,
     bytes: usize,
-) -> (Vec<(u64, Duration)>, Link<u64>) {
-    let mut link = Link::new(config, seed);
+) -> (Vec<(u64, Duration)>, EmulatedLink<u64>) {
+    let mut link = EmulatedLink::new(config, seed);
     let mut arrived = Vec::new();
     for k in 0..count {
         let now = interval * k as u32;

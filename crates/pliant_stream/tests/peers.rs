@@ -8,7 +8,7 @@ use std::sync::Arc;
 use std::time::Duration;
 
 use pliant_modal::{Body, BodyConfig, GrabConfig, Integrator, ModalModel, Patch, Relaxation};
-use pliant_stream::emulator::{Link, LinkConfig, Loss, Preset};
+use pliant_stream::emulator::{EmulatedLink, LinkConfig, Loss, Preset};
 use pliant_stream::peer::{PeerConfig, PeerEvent, PeerSession, Repair};
 use pliant_stream::wire::{
     Datagram, HeldAt, InputTick, Inputs, NackRun, PROTOCOL_VERSION, PeerBodyState, PeerMessage, StateCheck,
@@ -25,7 +25,7 @@ const MS: Duration = Duration::from_millis(1);
 struct Mesh {
     peers: Vec<Option<PeerSession>>,
     /// `[from][to]`: the link for datagrams and the link for messages.
-    links: Vec<Vec<(Link, Link)>>,
+    links: Vec<Vec<(EmulatedLink, EmulatedLink)>>,
     events: Vec<(usize, PeerEvent)>,
     now: Duration,
     /// Time of each peer's clock at the test's time zero.
@@ -46,7 +46,7 @@ impl Mesh {
                 (0..count as u64)
                     .map(|b| {
                         let s = seed * 1000 + a * 10 + b;
-                        (Link::new(link.clone(), s), Link::new(reliable.clone(), s + 500))
+                        (EmulatedLink::new(link.clone(), s), EmulatedLink::new(reliable.clone(), s + 500))
                     })
                     .collect()
             })

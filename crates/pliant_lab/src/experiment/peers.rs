@@ -5,7 +5,7 @@ use std::collections::BTreeMap;
 use std::time::Duration;
 
 use pliant_modal::GrabConfig;
-use pliant_stream::emulator::{Link, LinkConfig, Loss};
+use pliant_stream::emulator::{EmulatedLink, LinkConfig, Loss};
 use pliant_stream::peer::{PeerConfig, PeerSession, Repair};
 use pliant_stream::{Channel, PeerId, StreamError, Tick, UserId};
 
@@ -47,11 +47,14 @@ impl Experiment {
         peers[1].connect(Duration::ZERO, PeerId(0), UserId(1), 1200)?;
         let reliable = |l: &LinkConfig| LinkConfig { loss: Loss::None, keep_order: true, ..l.clone() };
         // links[k] carries the output of peer k: datagrams, then messages.
-        let mut links: [[Link; 2]; 2] = [
-            [Link::new(self.down.clone(), self.seed), Link::new(reliable(&self.down), self.seed ^ 0x51)],
+        let mut links: [[EmulatedLink; 2]; 2] = [
             [
-                Link::new(self.up.clone(), self.seed ^ 0xFFFF_0000),
-                Link::new(reliable(&self.up), self.seed ^ 0x57),
+                EmulatedLink::new(self.down.clone(), self.seed),
+                EmulatedLink::new(reliable(&self.down), self.seed ^ 0x51),
+            ],
+            [
+                EmulatedLink::new(self.up.clone(), self.seed ^ 0xFFFF_0000),
+                EmulatedLink::new(reliable(&self.up), self.seed ^ 0x57),
             ],
         ];
         let rest = |index: usize| {
@@ -134,7 +137,7 @@ impl Experiment {
         seen: &BTreeMap<Tick, PeerSample>,
         truth: &BTreeMap<Tick, Vec<f64>>,
         reactions: &BTreeMap<Tick, Vec<(UserId, [f64; 3])>>,
-        link: &Link,
+        link: &EmulatedLink,
         spent: Duration,
         sent: (u64, u64),
     ) -> Metrics {

@@ -11,7 +11,7 @@ use std::task::{Context, Poll};
 use std::time::Instant;
 
 use bytes::Bytes;
-use pliant_stream::emulator::{Link, LinkConfig, Preset};
+use pliant_stream::emulator::{EmulatedLink, LinkConfig, Preset};
 use quinn::udp::{RecvMeta, Transmit};
 use quinn::{AsyncUdpSocket, UdpPoller};
 use tokio::sync::Notify;
@@ -52,13 +52,13 @@ struct Packet {
 /// One direction of the emulation, in real time.
 #[derive(Debug)]
 struct Direction {
-    link: Link<Packet>,
+    link: EmulatedLink<Packet>,
     began: Instant,
 }
 
 impl Direction {
     fn new(config: LinkConfig, seed: u64, began: Instant) -> Self {
-        Self { link: Link::new(config, seed), began }
+        Self { link: EmulatedLink::new(config, seed), began }
     }
 
     fn enter(&mut self, now: Instant, address: SocketAddr, to: Option<IpAddr>, bytes: &[u8]) {

@@ -123,7 +123,7 @@ impl<T> Ord for Flying<T> {
 }
 
 /// One direction of a path. It carries payloads of any type.
-pub struct Link<T = Vec<u8>> {
+pub struct EmulatedLink<T = Vec<u8>> {
     config: LinkConfig,
     rng: Pcg64Mcg,
     flying: BinaryHeap<Reverse<Flying<T>>>,
@@ -137,16 +137,16 @@ pub struct Link<T = Vec<u8>> {
     hash: u64,
 }
 
-impl<T> std::fmt::Debug for Link<T> {
+impl<T> std::fmt::Debug for EmulatedLink<T> {
     fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
-        f.debug_struct("Link")
+        f.debug_struct("EmulatedLink")
             .field("counts", &self.counts)
             .field("in_flight", &self.flying.len())
             .finish_non_exhaustive()
     }
 }
 
-impl<T: Clone> Link<T> {
+impl<T: Clone> EmulatedLink<T> {
     /// Creates a link at time zero. Settings out of range are clamped or reset, and
     /// [`LinkConfig::check`] reports them.
     pub fn new(mut config: LinkConfig, seed: u64) -> Self {
