@@ -99,8 +99,8 @@ pub use newmark::Newmark;
 pub use pliant_modal::StepSettings;
 pub use recovery::{Playout, Policy, Predict, RecoveryConfig, RepairCounts};
 pub use session::{
-    BodyView, Channel, DisconnectReason, GuestConfig, GuestEvent, GuestSession, HostConfig, HostEvent,
-    HostSession, LinkStats, MAX_MESSAGE, MIN_DATAGRAM, Output, PredictedHand,
+    Channel, DisconnectReason, GuestConfig, GuestEvent, GuestSession, HostConfig, HostEvent, HostSession,
+    LinkStats, MAX_MESSAGE, MIN_DATAGRAM, Output, PredictedHand, StreamedBody,
 };
 pub use state::{
     BodyId, GrabKey, GrabState, MAGNITUDE_LIMIT, MAX_GRABS, MAX_MODES, PeerId, Placement, Pose, Role, State,

@@ -178,7 +178,7 @@ impl NetGuest {
 }
 
 fn view_tick(session: &pliant_stream::GuestSession, body: BodyId) -> u64 {
-    session.body(body).map_or(0, pliant_stream::BodyView::tick)
+    session.body(body).map_or(0, pliant_stream::StreamedBody::tick)
 }
 
 #[cfg(test)]

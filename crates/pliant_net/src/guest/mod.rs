@@ -17,7 +17,8 @@ use bevy::prelude::*;
 use bevy::tasks::Task;
 use pliant_modal::ModalModel;
 use pliant_stream::{
-    BodyId, BodyView, DisconnectReason, GuestSession, LinkStats, PeerId, RecoveryConfig, State, Tick, UserId,
+    BodyId, DisconnectReason, GuestSession, LinkStats, PeerId, RecoveryConfig, State, StreamedBody, Tick,
+    UserId,
 };
 
 use crate::metrics::{Ledger, NetStats};
@@ -187,12 +188,12 @@ impl NetGuest {
     }
 
     /// Returns the session's view of the body that an entity tracks.
-    pub fn body(&self, body: RemoteBody) -> Option<&BodyView> {
+    pub fn body(&self, body: RemoteBody) -> Option<&StreamedBody> {
         self.session.as_ref()?.body(body.0)
     }
 
     /// Returns the displayed state of a body and its tick. While this guest's own hand holds the
-    /// body, the state is the predicted copy ([`BodyView::predicted_hand`]). Otherwise it is the
+    /// body, the state is the predicted copy ([`StreamedBody::predicted_hand`]). Otherwise it is the
     /// visual state of the confirmed stream. The host may not have reached the tick of a predicted
     /// copy yet.
     pub fn visual_state(&self, body: RemoteBody) -> Option<(Tick, &State)> {
@@ -264,7 +265,7 @@ impl NetGuest {
     }
 }
 
-fn visual_state_of(view: &BodyView) -> Option<(Tick, &State)> {
+fn visual_state_of(view: &StreamedBody) -> Option<(Tick, &State)> {
     match view.predicted_hand() {
         Some(own) => Some((own.tick(), own.visual())),
         None => Some((view.tick(), view.visual()?)),

@@ -7,7 +7,7 @@ use std::time::Duration;
 use pliant_modal::ModalModel;
 
 use super::download::Download;
-use super::guest_body::BodyView;
+use super::guest_body::StreamedBody;
 use super::guest_config::{GuestConfig, GuestEvent};
 use super::guest_hands::LocalGrab;
 use super::{DisconnectReason, LinkStats, MIN_DATAGRAM, Output};
@@ -48,7 +48,7 @@ pub struct GuestSession {
     pub(super) model_bytes: u64,
     /// Hashes of all models that the host has named, at most 16,384 (512 KiB).
     pub(super) announced: BTreeSet<[u8; 32]>,
-    pub(super) bodies: BTreeMap<BodyId, BodyView>,
+    pub(super) bodies: BTreeMap<BodyId, StreamedBody>,
     stalled: BTreeSet<BodyId>,
     users: BTreeMap<UserId, UserInfo>,
     links: BTreeMap<UserId, UserLinkInfo>,
@@ -162,12 +162,12 @@ impl GuestSession {
     }
 
     /// Returns a body of the session.
-    pub fn body(&self, body: BodyId) -> Option<&BodyView> {
+    pub fn body(&self, body: BodyId) -> Option<&StreamedBody> {
         self.bodies.get(&body)
     }
 
     /// Iterates over all bodies.
-    pub fn bodies(&self) -> impl Iterator<Item = &BodyView> {
+    pub fn bodies(&self) -> impl Iterator<Item = &StreamedBody> {
         self.bodies.values()
     }
 
@@ -285,7 +285,7 @@ impl GuestSession {
                 self.announced.insert(info.hash);
                 let model = self.models.get(&info.hash).cloned();
                 let mut view =
-                    BodyView::new(info, self.newmark, self.config.recovery, self.config.predict_own_hand);
+                    StreamedBody::new(info, self.newmark, self.config.recovery, self.config.predict_own_hand);
                 if let Some(model) = model {
                     view.set_model(model);
                 }

@@ -30,7 +30,7 @@ struct Ask {
 
 /// A body as the guest shows it.
 #[derive(Debug)]
-pub struct BodyView {
+pub struct StreamedBody {
     pub(crate) id: BodyId,
     pub(crate) info: BodyInfo,
     pub(crate) placement: Option<Placement>,
@@ -61,7 +61,7 @@ pub struct BodyView {
     pub(crate) changed: bool,
 }
 
-impl BodyView {
+impl StreamedBody {
     pub(crate) fn new(info: BodyInfo, newmark: Newmark, config: RecoveryConfig, own_first: bool) -> Self {
         Self {
             id: BodyId(info.body),
@@ -122,7 +122,7 @@ impl BodyView {
     }
 
     /// The confirmed state: the best estimate of the true state at the displayed tick. The physics
-    /// of the next step uses it. Display and hands use [`BodyView::visual`].
+    /// of the next step uses it. Display and hands use [`StreamedBody::visual`].
     pub fn confirmed(&self) -> Option<&State> {
         self.receiver.as_ref().map(Receiver::confirmed)
     }
@@ -143,7 +143,7 @@ impl BodyView {
     ///
     /// The result is `None` unless the guest holds the body or the copy still fades to the
     /// confirmed state. The copy needs [`Policy::ForceDriven`] and
-    /// [`crate::GuestConfig::predict_own_hand`]. Show it instead of [`BodyView::visual`] when it
+    /// [`crate::GuestConfig::predict_own_hand`]. Show it instead of [`StreamedBody::visual`] when it
     /// exists.
     pub fn predicted_hand(&self) -> Option<&PredictedHand> {
         self.own.as_ref().filter(|own| own.is_active())

@@ -20,7 +20,7 @@ pub struct GuestConfig {
     /// links. Default: all.
     pub modes: Option<u16>,
     /// Steps a newer copy of each body that this guest holds, in which the guest's own hands do not
-    /// wait for the round trip; see [`BodyView::predicted_hand`](super::BodyView::predicted_hand).
+    /// wait for the round trip; see [`StreamedBody::predicted_hand`](super::StreamedBody::predicted_hand).
     /// Default: true.
     pub predict_own_hand: bool,
     /// Largest number of bytes of models that a host may send, counting complete models and
@@ -90,7 +90,7 @@ pub enum GuestEvent {
         /// Its model, which the caller may also cache.
         model: Arc<ModalModel>,
     },
-    /// The host changed the step settings of a body. [`BodyView::info`](super::BodyView::info) has
+    /// The host changed the step settings of a body. [`StreamedBody::info`](super::StreamedBody::info) has
     /// the new settings. Hands on the body stay.
     BodyChanged {
         /// The body.

@@ -35,7 +35,7 @@ pub use crate::link::LinkStats;
 pub use crate::prediction::PredictedHand;
 pub use disconnect_reason::DisconnectReason;
 pub use guest::GuestSession;
-pub use guest_body::BodyView;
+pub use guest_body::StreamedBody;
 pub use guest_config::{GuestConfig, GuestEvent};
 pub use host::HostSession;
 pub use host_config::{HostConfig, HostEvent};
