@@ -11,7 +11,7 @@ use pliant::modal::ModalModel;
 use pliant::net::transport::{Endpoint, Event, JoinOptions};
 use pliant::net::{Emulation, Invite};
 use pliant::stream::wire::Datagram;
-use pliant::stream::{Channel, GuestConfig, GuestEvent, GuestSession, PeerId, RecoveryConfig};
+use pliant::stream::{Channel, GuestEvent, GuestSession, GuestSessionConfig, PeerId, RecoveryConfig};
 
 /// Settings of the bots.
 pub struct Bots {
@@ -121,7 +121,7 @@ impl Bot {
             match event {
                 Event::Connected { .. } => {
                     let most = self.endpoint.max_datagram_size(PeerId::HOST).unwrap_or(0);
-                    let config = GuestConfig {
+                    let config = GuestSessionConfig {
                         name: "bot".into(),
                         recovery: RecoveryConfig::default(),
                         ..Default::default()

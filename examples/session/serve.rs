@@ -54,7 +54,7 @@ impl Serve {
                 limits,
                 emulation: super::emulation(self.network, 1),
             },
-            session: pliant::stream::HostConfig { max_guests, ..default() },
+            session: pliant::stream::HostSessionConfig { max_guests, ..default() },
             holding: if self.one_at_a_time { Holding::OneAtATime } else { Holding::Together },
             ..default()
         })?;

@@ -8,7 +8,7 @@ use std::time::Duration;
 use libfuzzer_sys::fuzz_target;
 use pliant_modal::{BakeInfo, Damping, Element, ModalModel, ModelParts, SurfaceMesh};
 use pliant_stream::{
-    BodyId, Channel, GuestConfig, GuestSession, HostConfig, HostSession, PeerId, RecoveryConfig,
+    BodyId, Channel, GuestSessionConfig, GuestSession, HostSessionConfig, HostSession, PeerId, RecoveryConfig,
     StepSettings, TickState,
 };
 
@@ -57,14 +57,14 @@ fn model() -> Arc<ModalModel> {
 }
 
 fuzz_target!(|bytes: &[u8]| {
-    let mut host = HostSession::new(HostConfig::default()).expect("sound");
+    let mut host = HostSession::new(HostSessionConfig::default()).expect("sound");
     host.add_body(BODY, "fuzz", model(), StepSettings::default()).expect("sound");
     let recovery = match bytes.first().copied().unwrap_or(0) % 3 {
         0 => RecoveryConfig::default(),
         1 => RecoveryConfig::paper(),
         _ => RecoveryConfig::none(),
     };
-    let mut guest = GuestSession::new(GuestConfig { recovery, ..Default::default() }, 1200).expect("sound");
+    let mut guest = GuestSession::new(GuestSessionConfig { recovery, ..Default::default() }, 1200).expect("sound");
     guest.add_cached_model(model());
     let mut now = Duration::ZERO;
     host.connect(now, PeerId(1), 1200).expect("sound");

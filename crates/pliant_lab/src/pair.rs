@@ -8,8 +8,8 @@ use std::time::Duration;
 
 use pliant_stream::emulator::{EmulatedLink, LinkConfig, Loss};
 use pliant_stream::{
-    Channel, GuestConfig, GuestEvent, GuestSession, HostConfig, HostEvent, HostSession, Output, PeerId,
-    StreamError,
+    Channel, GuestEvent, GuestSession, GuestSessionConfig, HostEvent, HostSession, HostSessionConfig, Output,
+    PeerId, StreamError,
 };
 
 /// The caller's side of the sessions. All methods except [`World::step`] have a default.
@@ -85,7 +85,7 @@ impl Pair {
     ///
     /// # Errors
     /// Returns [`StreamError::Config`] for settings out of range.
-    pub fn new(config: HostConfig) -> Result<Self, StreamError> {
+    pub fn new(config: HostSessionConfig) -> Result<Self, StreamError> {
         let step = Duration::from_secs_f64(config.newmark.h.clamp(1e-5, 1.0));
         let host = HostSession::new(config)?;
         Ok(Self {
@@ -134,7 +134,12 @@ impl Pair {
     ///
     /// # Errors
     /// Returns the [`StreamError`] of [`GuestSession::new`] or [`HostSession::connect`].
-    pub fn join(&mut self, config: GuestConfig, path: PathConfig, seed: u64) -> Result<usize, StreamError> {
+    pub fn join(
+        &mut self,
+        config: GuestSessionConfig,
+        path: PathConfig,
+        seed: u64,
+    ) -> Result<usize, StreamError> {
         self.join_with(config, path, seed, |_| {})
     }
 
@@ -145,7 +150,7 @@ impl Pair {
     /// As [`Pair::join`].
     pub fn join_with(
         &mut self,
-        config: GuestConfig,
+        config: GuestSessionConfig,
         path: PathConfig,
         seed: u64,
         prepare: impl FnOnce(&mut GuestSession),

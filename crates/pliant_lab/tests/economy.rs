@@ -7,7 +7,9 @@ use std::time::Duration;
 
 use pliant_lab::pair::PathConfig;
 use pliant_stream::emulator::LinkConfig;
-use pliant_stream::{DisconnectReason, GuestConfig, GuestEvent, HostConfig, PeerId, RecoveryConfig};
+use pliant_stream::{
+    DisconnectReason, GuestEvent, GuestSessionConfig, HostSessionConfig, PeerId, RecoveryConfig,
+};
 use support::bar;
 use support::scene::{BODY, MS, S, cached, circling, path_for, start, start_with};
 
@@ -18,8 +20,13 @@ fn resting_body_sends_next_to_nothing_and_wakes_right() {
         let (mut pair, mut scene) = start(&model);
         scene.hand = circling();
         let recovery = RecoveryConfig::by_name(name).unwrap();
-        pair.join_with(GuestConfig { recovery, ..Default::default() }, path_for(name), 4, cached(&model))
-            .unwrap();
+        pair.join_with(
+            GuestSessionConfig { recovery, ..Default::default() },
+            path_for(name),
+            4,
+            cached(&model),
+        )
+        .unwrap();
         pair.run_until(5 * S, &mut scene);
         scene.resting = true;
         // A sleeping body does not move.
@@ -52,13 +59,13 @@ fn resting_body_sends_next_to_nothing_and_wakes_right() {
 fn who_fetches_a_resting_bodys_model_costs_nobody_else() {
     let model = bar(500, 0.2);
     // The rates are so low that the model is still being sent at the end.
-    let slow = HostConfig { model_rate: 2e4, models_rate: 2e4, ..Default::default() };
+    let slow = HostSessionConfig { model_rate: 2e4, models_rate: 2e4, ..Default::default() };
     let (mut pair, mut scene) = start_with(&model, slow);
     scene.resting = true;
     let path = PathConfig::symmetric(LinkConfig { delay: 10 * MS, ..Default::default() });
-    pair.join_with(GuestConfig::default(), path.clone(), 1, cached(&model)).unwrap();
+    pair.join_with(GuestSessionConfig::default(), path.clone(), 1, cached(&model)).unwrap();
     pair.run_until(2 * S, &mut scene);
-    pair.join_with(GuestConfig::default(), path, 2, |_| {}).unwrap();
+    pair.join_with(GuestSessionConfig::default(), path, 2, |_| {}).unwrap();
     pair.run_until(3 * S, &mut scene);
     let before = pair.host.stats(PeerId(1)).unwrap().message_bytes_out;
     pair.run_until(13 * S, &mut scene);
@@ -75,12 +82,12 @@ fn weak_guests_take_fewer_modes_and_small_paths_fewer_still() {
     let model = bar(500, 0.05);
     let (mut pair, mut scene) = start(&model);
     scene.hand = circling();
-    let weak = GuestConfig { modes: Some(12), ..Default::default() };
-    let paper = GuestConfig { recovery: RecoveryConfig::paper(), ..Default::default() };
+    let weak = GuestSessionConfig { modes: Some(12), ..Default::default() };
+    let paper = GuestSessionConfig { recovery: RecoveryConfig::paper(), ..Default::default() };
     let path = PathConfig::symmetric(LinkConfig { delay: 10 * MS, ..Default::default() });
     let thin = PathConfig { max_datagram: 400, ..path.clone() };
     pair.join_with(weak, path.clone(), 1, cached(&model)).unwrap();
-    pair.join_with(GuestConfig::default(), thin.clone(), 2, cached(&model)).unwrap();
+    pair.join_with(GuestSessionConfig::default(), thin.clone(), 2, cached(&model)).unwrap();
     pair.join_with(paper.clone(), path, 3, cached(&model)).unwrap();
     pair.join_with(paper, thin, 4, cached(&model)).unwrap();
     pair.run_until(4 * S, &mut scene);
@@ -116,13 +123,14 @@ fn a_guest_that_may_cost_little_gets_less_of_everything_but_every_tick() {
         // it.
         (1e6, LinkConfig { delay: 20 * MS, bits_per_second: Some(55e3), ..Default::default() }),
     ] {
-        let (mut pair, mut scene) = start_with(&model, HostConfig { guest_rate: rate, ..Default::default() });
+        let (mut pair, mut scene) =
+            start_with(&model, HostSessionConfig { guest_rate: rate, ..Default::default() });
         scene.hand = circling();
         let path = PathConfig {
             up: LinkConfig { bits_per_second: None, ..link.clone() },
             ..PathConfig::symmetric(link)
         };
-        pair.join_with(GuestConfig::default(), path, 5, cached(&model)).unwrap();
+        pair.join_with(GuestSessionConfig::default(), path, 5, cached(&model)).unwrap();
         pair.run_until(20 * S, &mut scene);
         let before =
             (pair.host.stats(PeerId(1)).unwrap(), pair.guests[0].session.body(BODY).unwrap().counts());

@@ -8,7 +8,8 @@ use std::time::Duration;
 use pliant_lab::pair::{Pair, PathConfig, World};
 use pliant_stream::emulator::{LinkConfig, Preset};
 use pliant_stream::{
-    GuestConfig, GuestEvent, GuestSession, HostConfig, HostEvent, HostSession, Pose, StepSettings,
+    GuestEvent, GuestSession, GuestSessionConfig, HostEvent, HostSession, HostSessionConfig, Pose,
+    StepSettings,
 };
 use support::scene::{BODY, S, Scene, cached, circling, start};
 use support::{bar, loose_bar};
@@ -64,7 +65,7 @@ fn own_hand_does_not_wait_for_the_round_trip() {
         watch.scene.hand = circling();
         let path = PathConfig::symmetric(LinkConfig::preset(preset));
         for seed in [3, 4] {
-            pair.join_with(GuestConfig::default(), path.clone(), seed, cached(&model)).unwrap();
+            pair.join_with(GuestSessionConfig::default(), path.clone(), seed, cached(&model)).unwrap();
         }
         pair.run_until(40 * S, &mut watch);
         assert!(!watch.other, "a guest that holds nothing has no newer copy");
@@ -106,7 +107,7 @@ fn own_hand_on_a_free_body_takes_its_frame_along() {
     // pose of the same ticks.
     let model = loose_bar(24, 0.05);
     let settings = StepSettings { gravity: [0.0, 0.0, -0.3], ..Default::default() };
-    let mut pair = Pair::new(HostConfig::default()).unwrap();
+    let mut pair = Pair::new(HostSessionConfig::default()).unwrap();
     pair.host.add_body(BODY, "bar", model.clone(), settings).unwrap();
     struct Watch(Scene, Vec<(u64, Pose)>, Vec<(u64, Pose)>);
     impl World for Watch {
@@ -127,7 +128,7 @@ fn own_hand_on_a_free_body_takes_its_frame_along() {
     let mut watch = Watch(Scene::with(&model, &settings), Vec::new(), Vec::new());
     watch.0.hand = circling();
     let path = PathConfig::symmetric(LinkConfig::preset(Preset::Paper2));
-    pair.join_with(GuestConfig::default(), path, 3, cached(&model)).unwrap();
+    pair.join_with(GuestSessionConfig::default(), path, 3, cached(&model)).unwrap();
     pair.run_until(25 * S, &mut watch);
     let off = |seen: &[(u64, Pose)]| {
         let (mut sum, mut count) = (0.0, 0.0_f64);

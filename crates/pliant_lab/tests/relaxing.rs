@@ -14,8 +14,8 @@ use pliant_stream::peer::Repair;
 use pliant_stream::recovery::Receiver;
 use pliant_stream::wire::Datagram;
 use pliant_stream::{
-    BodyId, GrabKey, GrabState, GuestConfig, HostConfig, Newmark, Policy, RecoveryConfig, State,
-    StepSettings, TickState, UserId,
+    BodyId, GrabKey, GrabState, GuestSessionConfig, HostSessionConfig, Newmark, Policy, RecoveryConfig,
+    State, StepSettings, TickState, UserId,
 };
 use support::bar;
 use support::scene::{BODY, S, Scene, cached, circling, paper1};
@@ -165,14 +165,14 @@ fn a_wrong_flow_is_forgotten_by_every_policy_and_put_right_by_slices() {
 fn a_guest_joins_follows_rests_and_feels_a_relaxing_body() {
     let model = bar(40, 0.05);
     let settings = StepSettings { relaxation: Some(MATERIAL), ..Default::default() };
-    let mut pair = pliant_lab::pair::Pair::new(HostConfig::default()).unwrap();
+    let mut pair = pliant_lab::pair::Pair::new(HostSessionConfig::default()).unwrap();
     pair.host.add_body(BODY, "bar", model.clone(), settings).unwrap();
     let mut scene = Scene::with(&model, &settings);
     scene.hand = circling();
-    pair.join_with(GuestConfig::default(), paper1(), 1, cached(&model)).unwrap();
+    pair.join_with(GuestSessionConfig::default(), paper1(), 1, cached(&model)).unwrap();
     pair.run_until(8 * S, &mut scene);
     // The second guest joins late and gets the viscoelastic state with the snapshot.
-    pair.join_with(GuestConfig::default(), paper1(), 2, cached(&model)).unwrap();
+    pair.join_with(GuestSessionConfig::default(), paper1(), 2, cached(&model)).unwrap();
     scene.settled = 10 * S;
     pair.run_until(20 * S, &mut scene);
     let worst = scene.worst / scene.size();

@@ -9,8 +9,8 @@ use pliant_lab::pair::{Pair, PathConfig, World};
 use pliant_modal::{Body, BodyConfig};
 use pliant_stream::emulator::LinkConfig;
 use pliant_stream::{
-    BodyId, DisconnectReason, GuestConfig, GuestEvent, GuestSession, HostConfig, HostEvent, HostSession,
-    PeerId, RecoveryConfig, StepSettings, UserId,
+    BodyId, DisconnectReason, GuestEvent, GuestSession, GuestSessionConfig, HostEvent, HostSession,
+    HostSessionConfig, PeerId, RecoveryConfig, StepSettings, UserId,
 };
 use support::bar;
 use support::scene::{BODY, MS, S, Scene, cached, circling, paper1, start, start_with};
@@ -20,8 +20,8 @@ fn model_is_sent_in_pieces_to_those_who_lack_it_only() {
     let model = bar(20, 0.05);
     let bytes = model.to_bytes().len() as u64;
     let (mut pair, mut scene) = start(&model);
-    pair.join(GuestConfig::default(), paper1(), 1).unwrap();
-    pair.join_with(GuestConfig::default(), paper1(), 2, cached(&model)).unwrap();
+    pair.join(GuestSessionConfig::default(), paper1(), 1).unwrap();
+    pair.join_with(GuestSessionConfig::default(), paper1(), 2, cached(&model)).unwrap();
     pair.run_until(5 * S, &mut scene);
     for g in &pair.guests {
         assert!(g.session.body(BODY).unwrap().is_ready());
@@ -41,9 +41,9 @@ fn late_joiner_has_the_right_picture_within_a_second() {
     let (mut pair, mut scene) = start(&model);
     scene.hand = circling();
     let fast = PathConfig::symmetric(LinkConfig { delay: 50 * MS, ..Default::default() });
-    pair.join_with(GuestConfig::default(), fast.clone(), 1, cached(&model)).unwrap();
+    pair.join_with(GuestSessionConfig::default(), fast.clone(), 1, cached(&model)).unwrap();
     pair.run_until(10 * S, &mut scene);
-    pair.join_with(GuestConfig::default(), fast, 2, cached(&model)).unwrap();
+    pair.join_with(GuestSessionConfig::default(), fast, 2, cached(&model)).unwrap();
     pair.run_until(11 * S, &mut scene);
     let late = &pair.guests[1].session;
     assert!(late.body(BODY).unwrap().is_ready());
@@ -56,7 +56,7 @@ fn goodbyes_and_bodies_that_go() {
     let model = bar(20, 0.05);
     let (mut pair, mut scene) = start(&model);
     scene.hand = circling();
-    pair.join_with(GuestConfig::default(), paper1(), 1, cached(&model)).unwrap();
+    pair.join_with(GuestSessionConfig::default(), paper1(), 1, cached(&model)).unwrap();
     pair.run_until(3 * S, &mut scene);
     let second = BodyId(9);
     pair.host.add_body(second, "other", model.clone(), StepSettings::default()).unwrap();
@@ -96,11 +96,11 @@ fn a_closed_house_asks_before_it_lets_in() {
         }
     }
     let model = bar(20, 0.05);
-    let mut pair = Pair::new(HostConfig { open: false, ..Default::default() }).unwrap();
+    let mut pair = Pair::new(HostSessionConfig { open: false, ..Default::default() }).unwrap();
     pair.host.add_body(BODY, "bar", model.clone(), StepSettings::default()).unwrap();
     let mut door = Door(Scene::new(&model), true);
     for (seed, name) in [(1, "friend"), (2, "stranger")] {
-        let config = GuestConfig { name: name.into(), ..Default::default() };
+        let config = GuestSessionConfig { name: name.into(), ..Default::default() };
         pair.join_with(config, paper1(), seed, cached(&model)).unwrap();
     }
     pair.run_until(3 * S, &mut door);
@@ -114,7 +114,7 @@ fn the_same_seed_gives_the_same_session() {
         let model = bar(20, 0.05);
         let (mut pair, mut scene) = start(&model);
         scene.hand = circling();
-        pair.join_with(GuestConfig::default(), paper1(), seed, cached(&model)).unwrap();
+        pair.join_with(GuestSessionConfig::default(), paper1(), seed, cached(&model)).unwrap();
         pair.run_until(6 * S, &mut scene);
         let g = &pair.guests[0];
         let bits: Vec<u64> =
@@ -129,9 +129,9 @@ fn the_same_seed_gives_the_same_session() {
 fn a_body_that_goes_while_its_model_is_on_the_way_harms_nobody() {
     let model = bar(40, 0.05);
     let (mut pair, mut scene) =
-        start_with(&bar(6, 0.05), HostConfig { model_rate: 50e3, ..Default::default() });
+        start_with(&bar(6, 0.05), HostSessionConfig { model_rate: 50e3, ..Default::default() });
     scene.body = Body::new(bar(6, 0.05), BodyConfig { step: 0.025, ..Default::default() }).unwrap();
-    pair.join(GuestConfig::default(), paper1(), 1).unwrap();
+    pair.join(GuestSessionConfig::default(), paper1(), 1).unwrap();
     pair.run_until(3 * S, &mut scene);
     let second = BodyId(9);
     pair.host.add_body(second, "brief", model.clone(), StepSettings::default()).unwrap();
@@ -157,8 +157,8 @@ fn guest_that_is_killed_is_let_go_with_its_grabs() {
     let model = bar(20, 0.05);
     let (mut pair, mut scene) = start(&model);
     scene.hand = circling();
-    pair.join_with(GuestConfig::default(), paper1(), 1, cached(&model)).unwrap();
-    pair.join_with(GuestConfig::default(), paper1(), 2, cached(&model)).unwrap();
+    pair.join_with(GuestSessionConfig::default(), paper1(), 1, cached(&model)).unwrap();
+    pair.join_with(GuestSessionConfig::default(), paper1(), 2, cached(&model)).unwrap();
     pair.run_until(5 * S, &mut scene);
     assert_eq!(scene.grabs.len(), 1);
     pair.cut(0);
@@ -185,7 +185,8 @@ fn guests_follow_a_host_that_steps_fewer_modes_than_the_model_has() {
         scene.hand = circling();
         let recovery = RecoveryConfig::by_name(name).unwrap();
         let path = PathConfig::symmetric(LinkConfig { delay: 50 * MS, ..Default::default() });
-        pair.join_with(GuestConfig { recovery, ..Default::default() }, path, 1, cached(&model)).unwrap();
+        pair.join_with(GuestSessionConfig { recovery, ..Default::default() }, path, 1, cached(&model))
+            .unwrap();
         pair.run_until(8 * S, &mut scene);
         let guest = &pair.guests[0].session;
         let (error, size) = (scene.error(guest), scene.size());

@@ -4,19 +4,19 @@
 mod support;
 
 use pliant_modal::{BodyConfig, StepSettings};
-use pliant_stream::{GuestConfig, GuestEvent, HostConfig};
+use pliant_stream::{GuestEvent, GuestSessionConfig, HostSessionConfig};
 use support::bar;
 use support::scene::{BODY, S, Scene, cached, circling, paper1};
 
 /// The largest visual error from a second after the change on, as a share of the largest shape.
 fn after_a_change(told: bool, scale: f64) -> f64 {
     let model = bar(24, 0.05);
-    let mut pair = pliant_lab::pair::Pair::new(HostConfig::default()).unwrap();
+    let mut pair = pliant_lab::pair::Pair::new(HostSessionConfig::default()).unwrap();
     let settings = StepSettings::default();
     pair.host.add_body(BODY, "bar", model.clone(), settings).unwrap();
     let mut scene = Scene::with(&model, &settings);
     scene.hand = circling();
-    pair.join_with(GuestConfig::default(), paper1(), 1, cached(&model)).unwrap();
+    pair.join_with(GuestSessionConfig::default(), paper1(), 1, cached(&model)).unwrap();
     pair.run_until(5 * S, &mut scene);
     let stiff = StepSettings { stiffness_scale: scale, ..settings };
     let config = BodyConfig {
@@ -55,10 +55,10 @@ fn guests_follow_a_body_that_becomes_stiffer_or_softer_with_their_hands_on_it() 
 #[test]
 fn settings_of_another_body_under_a_known_number_ends_the_session() {
     let model = bar(12, 0.05);
-    let mut pair = pliant_lab::pair::Pair::new(HostConfig::default()).unwrap();
+    let mut pair = pliant_lab::pair::Pair::new(HostSessionConfig::default()).unwrap();
     pair.host.add_body(BODY, "bar", model.clone(), StepSettings::default()).unwrap();
     let mut scene = Scene::new(&model);
-    pair.join_with(GuestConfig::default(), paper1(), 1, cached(&model)).unwrap();
+    pair.join_with(GuestSessionConfig::default(), paper1(), 1, cached(&model)).unwrap();
     pair.run_until(2 * S, &mut scene);
     let guest = &mut pair.guests[0].session;
     let mut info = guest.body(BODY).unwrap().info().clone();

@@ -7,7 +7,9 @@ use std::time::Duration;
 
 use pliant_lab::pair::PathConfig;
 use pliant_stream::emulator::{LinkConfig, Loss, Preset};
-use pliant_stream::{GrabKey, GuestConfig, GuestEvent, HostConfig, PeerId, Playout, RecoveryConfig, UserId};
+use pliant_stream::{
+    GrabKey, GuestEvent, GuestSessionConfig, HostSessionConfig, PeerId, Playout, RecoveryConfig, UserId,
+};
 use support::bar;
 use support::scene::{BODY, MS, S, cached, circling, paper1, path_for, start, start_with};
 
@@ -19,7 +21,7 @@ fn two_guests_over_the_papers_worst_network_see_one_shape() {
         scene.hand = circling();
         for seed in [1, 2] {
             let recovery = RecoveryConfig::by_name(name).unwrap();
-            let config = GuestConfig { name: format!("guest {seed}"), recovery, ..Default::default() };
+            let config = GuestSessionConfig { name: format!("guest {seed}"), recovery, ..Default::default() };
             pair.join_with(config, path_for(name), seed, cached(&model)).unwrap();
         }
         scene.settled = 5 * S;
@@ -69,7 +71,7 @@ fn host_that_stops_for_ten_seconds_is_followed_again() {
         let (mut pair, mut scene) = start(&model);
         scene.hand = circling();
         let recovery = RecoveryConfig { snapshots: true, ..RecoveryConfig::by_name(name).unwrap() };
-        let config = GuestConfig { recovery, idle_timeout: 30 * S, ..Default::default() };
+        let config = GuestSessionConfig { recovery, idle_timeout: 30 * S, ..Default::default() };
         pair.join_with(config, path_for(name), 4, cached(&model)).unwrap();
         pair.run_until(8 * S, &mut scene);
         pair.pause(true);
@@ -89,13 +91,13 @@ fn host_that_stops_for_ten_seconds_is_followed_again() {
 fn an_outage_of_ten_seconds_ends_in_a_resync() {
     for name in ["default", "paper"] {
         let model = bar(20, 0.05);
-        let patient = HostConfig { idle_timeout: 30 * S, ..Default::default() };
+        let patient = HostSessionConfig { idle_timeout: 30 * S, ..Default::default() };
         let (mut pair, mut scene) = start_with(&model, patient);
         scene.hand = circling();
         let loss = Loss::Outage { from: 8 * S, to: 18 * S };
         let path = PathConfig::symmetric(LinkConfig { loss, ..LinkConfig::preset(Preset::Paper2) });
         let recovery = RecoveryConfig { snapshots: true, ..RecoveryConfig::by_name(name).unwrap() };
-        let config = GuestConfig { recovery, idle_timeout: 30 * S, ..Default::default() };
+        let config = GuestSessionConfig { recovery, idle_timeout: 30 * S, ..Default::default() };
         pair.join_with(config, path, 4, cached(&model)).unwrap();
         pair.run_until(24 * S, &mut scene);
         assert!(scene.saw(0, |e| matches!(e, GuestEvent::Resynced { .. })), "{name}");
@@ -121,7 +123,7 @@ fn frames_that_scatter_like_a_picture_rate_are_shown_evenly_and_without_guessing
         scene.hand = circling();
         let link = LinkConfig { delay: 20 * MS, jitter: 4 * MS, keep_order: true, ..Default::default() };
         let recovery = RecoveryConfig::by_name(name).unwrap();
-        let config = GuestConfig { recovery, ..Default::default() };
+        let config = GuestSessionConfig { recovery, ..Default::default() };
         pair.join_with(config, PathConfig::symmetric(link), 5, cached(&model)).unwrap();
         pair.run_until(10 * S, &mut scene);
         let before = pair.guests[0].session.body(BODY).unwrap().counts();
@@ -140,7 +142,7 @@ fn a_force_that_the_stream_does_not_say_is_learnt() {
     let model = bar(40, 0.05);
     let (mut pair, mut scene) = start(&model);
     scene.hand = circling();
-    pair.join_with(GuestConfig::default(), paper1(), 6, cached(&model)).unwrap();
+    pair.join_with(GuestSessionConfig::default(), paper1(), 6, cached(&model)).unwrap();
     pair.run_until(6 * S, &mut scene);
     // The force is as strong as the hand's and starts from one tick to the next.
     scene.wind = [0.0, 3.0, -2.0];
@@ -161,7 +163,7 @@ fn adaptive_playout_waits_only_for_what_scatters() {
         scene.hand = circling();
         let recovery = RecoveryConfig { playout: Playout::Adaptive(3), ..Default::default() };
         let link = LinkConfig { delay: 60 * MS, jitter, ..Default::default() };
-        let config = GuestConfig { recovery, ..Default::default() };
+        let config = GuestSessionConfig { recovery, ..Default::default() };
         pair.join_with(config, PathConfig::symmetric(link), 5, cached(&model)).unwrap();
         // The schedule learns the scatter of arrivals during the first seconds.
         pair.run_until(5 * S, &mut scene);
@@ -186,12 +188,12 @@ fn a_guest_that_was_cut_off_comes_again() {
     let model = bar(20, 0.05);
     let (mut pair, mut scene) = start(&model);
     scene.hand = circling();
-    pair.join_with(GuestConfig::default(), paper1(), 1, cached(&model)).unwrap();
+    pair.join_with(GuestSessionConfig::default(), paper1(), 1, cached(&model)).unwrap();
     pair.run_until(5 * S, &mut scene);
     pair.cut(0);
     pair.run_until(17 * S, &mut scene);
     assert_eq!(pair.host.users().count(), 0);
-    pair.join_with(GuestConfig::default(), paper1(), 7, cached(&model)).unwrap();
+    pair.join_with(GuestSessionConfig::default(), paper1(), 7, cached(&model)).unwrap();
     pair.run_until(19 * S, &mut scene);
     let session = &pair.guests[1].session;
     assert_eq!(pair.host.users().count(), 1);

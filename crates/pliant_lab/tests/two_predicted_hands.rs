@@ -15,7 +15,7 @@ use std::time::Duration;
 use pliant_lab::pair::{PathConfig, World};
 use pliant_modal::{GrabConfig, ModalModel};
 use pliant_stream::emulator::{LinkConfig, Preset};
-use pliant_stream::{GuestConfig, GuestEvent, GuestSession, HostEvent, HostSession};
+use pliant_stream::{GuestEvent, GuestSession, GuestSessionConfig, HostEvent, HostSession};
 use support::bar;
 use support::scene::{BODY, HandScript, S, Scene, cached, start};
 
@@ -142,7 +142,7 @@ fn run(model: &Arc<ModalModel>, preset: Preset, other: Other) -> [f64; 4] {
     watch.scene.hand = hands(other);
     let path = PathConfig::symmetric(LinkConfig::preset(preset));
     for seed in [3, 4] {
-        pair.join_with(GuestConfig::default(), path.clone(), seed, cached(model)).unwrap();
+        pair.join_with(GuestSessionConfig::default(), path.clone(), seed, cached(model)).unwrap();
     }
     pair.run_until(40 * S, &mut watch);
     let truth = &watch.scene.truth;

@@ -13,7 +13,7 @@
 //! use pliant_modal::{Body, BodyConfig, ModalModel};
 //! use pliant_stream::emulator::{EmulatedLink, LinkConfig, Preset};
 //! use pliant_stream::{
-//!     BodyId, Channel, GuestConfig, GuestSession, HostConfig, HostSession, PeerId, StepSettings,
+//!     BodyId, Channel, GuestSessionConfig, GuestSession, HostSessionConfig, HostSession, PeerId, StepSettings,
 //!     TickState,
 //! };
 //!
@@ -21,9 +21,9 @@
 //! let (id, guest_id, start) = (BodyId(1), PeerId(1), Duration::ZERO);
 //! let model = Arc::new(ModalModel::read("../../assets/bud.modal")?);
 //! let mut body = Body::new(model.clone(), BodyConfig { step: 1.0 / 40.0, ..Default::default() })?;
-//! let mut host = HostSession::new(HostConfig::default())?; // 40 ticks a second
+//! let mut host = HostSession::new(HostSessionConfig::default())?; // 40 ticks a second
 //! host.add_body(id, "bud", model.clone(), StepSettings::default())?;
-//! let mut guest = GuestSession::new(GuestConfig::default(), 1200)?;
+//! let mut guest = GuestSession::new(GuestSessionConfig::default(), 1200)?;
 //! guest.add_cached_model(model);
 //! host.connect(start, guest_id, 1200)?;
 //! guest.connect(start)?;
@@ -99,8 +99,8 @@ pub use newmark::Newmark;
 pub use pliant_modal::StepSettings;
 pub use recovery::{Playout, Policy, Predict, RecoveryConfig, RepairCounts};
 pub use session::{
-    Channel, DisconnectReason, GuestConfig, GuestEvent, GuestSession, HostConfig, HostEvent, HostSession,
-    LinkStats, MAX_MESSAGE, MIN_DATAGRAM, Output, PredictedHand, StreamedBody,
+    Channel, DisconnectReason, GuestEvent, GuestSession, GuestSessionConfig, HostEvent, HostSession,
+    HostSessionConfig, LinkStats, MAX_MESSAGE, MIN_DATAGRAM, Output, PredictedHand, StreamedBody,
 };
 pub use state::{
     BodyId, GrabKey, GrabState, MAGNITUDE_LIMIT, MAX_GRABS, MAX_MODES, PeerId, Placement, Pose, Role, State,

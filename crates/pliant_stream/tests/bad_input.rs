@@ -16,8 +16,8 @@ use pliant_stream::wire::{
     RepeatGrab, Report, Slice, SliceEntry, SnapshotBytes, StateCheck, TargetEntry, Targets, TickFrame,
 };
 use pliant_stream::{
-    BodyId, Channel, DisconnectReason, GuestConfig, GuestEvent, GuestSession, HostConfig, HostEvent,
-    HostSession, Newmark, PeerId, Pose, RecoveryConfig, StepSettings, StreamError, TickState,
+    BodyId, Channel, DisconnectReason, GuestEvent, GuestSession, GuestSessionConfig, HostEvent, HostSession,
+    HostSessionConfig, Newmark, PeerId, Pose, RecoveryConfig, StepSettings, StreamError, TickState,
 };
 use proptest::prelude::*;
 use support::bar;
@@ -421,9 +421,9 @@ fn a_guest_that_breaks_the_protocol_is_shown_out_with_a_reason() {
 #[test]
 fn a_host_that_sends_a_false_model_is_left() {
     let model = bar(12, 0.05);
-    let mut host = HostSession::new(HostConfig::default()).unwrap();
+    let mut host = HostSession::new(HostSessionConfig::default()).unwrap();
     host.add_body(BODY, "bar", model, StepSettings::default()).unwrap();
-    let mut guest = GuestSession::new(GuestConfig::default(), 1200).unwrap();
+    let mut guest = GuestSession::new(GuestSessionConfig::default(), 1200).unwrap();
     let now = Duration::from_secs(1);
     host.connect(now, PeerId(1), 1200).unwrap();
     guest.connect(now).unwrap();
@@ -452,7 +452,7 @@ fn a_host_that_sends_a_false_model_is_left() {
 
 #[test]
 fn another_version_is_told_so() {
-    let mut host = HostSession::new(HostConfig::default()).unwrap();
+    let mut host = HostSession::new(HostSessionConfig::default()).unwrap();
     host.connect(Duration::ZERO, PeerId(1), 1200).unwrap();
     let hello = GuestMessage::Hello {
         version: 999,
@@ -468,13 +468,13 @@ fn another_version_is_told_so() {
 #[test]
 fn the_application_cannot_publish_nonsense() {
     let model = bar(12, 0.05);
-    let mut host = HostSession::new(HostConfig::default()).unwrap();
+    let mut host = HostSession::new(HostSessionConfig::default()).unwrap();
     host.add_body(BODY, "bar", model, StepSettings::default()).unwrap();
     let good = vec![0.0; 12];
     let bad = vec![f64::NAN; 12];
     let long = vec![0.0; 13];
     let at = |tick, q: &[f64]| {
-        let mut h = HostSession::new(HostConfig::default()).unwrap();
+        let mut h = HostSession::new(HostSessionConfig::default()).unwrap();
         h.add_body(BODY, "bar", bar(12, 0.05), StepSettings::default()).unwrap();
         let state = TickState { tick, q, v: &good, a: &good, z: &[], pose: None, grabs: &[], resting: false };
         h.publish(Duration::ZERO, BODY, &state)

@@ -9,8 +9,8 @@ use std::time::Duration;
 use pliant_modal::{Body, BodyConfig, GrabConfig, Patch};
 use pliant_stream::emulator::{EmulatedLink, LinkConfig, Loss, Preset};
 use pliant_stream::{
-    BodyId, Channel, GrabKey, GrabState, GuestConfig, GuestSession, HostConfig, HostSession, PeerId,
-    StepSettings, TickState, UserId,
+    BodyId, Channel, GrabKey, GrabState, GuestSession, GuestSessionConfig, HostSession, HostSessionConfig,
+    PeerId, StepSettings, TickState, UserId,
 };
 use support::bar;
 
@@ -27,9 +27,9 @@ fn visual(
     guest_clock: Duration,
 ) -> (BTreeMap<u64, Vec<f64>>, BTreeMap<u64, Vec<f64>>, f64) {
     let model = bar(12, 0.05);
-    let mut host = HostSession::new(HostConfig::default()).unwrap();
+    let mut host = HostSession::new(HostSessionConfig::default()).unwrap();
     host.add_body(BODY, "bar", model.clone(), StepSettings::default()).unwrap();
-    let mut guest = GuestSession::new(GuestConfig::default(), 1200).unwrap();
+    let mut guest = GuestSession::new(GuestSessionConfig::default(), 1200).unwrap();
     guest.add_cached_model(model.clone());
     host.connect(host_clock, GUEST, 1200).unwrap();
     guest.connect(guest_clock).unwrap();

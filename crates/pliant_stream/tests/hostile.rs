@@ -6,10 +6,10 @@ mod support;
 
 use std::time::Duration;
 
-use pliant_stream::peer::{PeerConfig, PeerEvent, PeerSession};
+use pliant_stream::peer::{PeerEvent, PeerSession, PeerSessionConfig};
 use pliant_stream::wire::{BodyInfo, Datagram, GuestMessage, HostMessage, NackRun, PROTOCOL_VERSION};
 use pliant_stream::{
-    Channel, DisconnectReason, GuestConfig, GuestEvent, GuestSession, HostSession, Newmark, PeerId,
+    Channel, DisconnectReason, GuestEvent, GuestSession, GuestSessionConfig, HostSession, Newmark, PeerId,
     StepSettings, StreamError,
 };
 use support::bar;
@@ -32,7 +32,7 @@ fn a_host_cannot_make_a_guest_hold_more_than_its_bound() {
         HostMessage::ModelChunk { hash, offset: 0, total, bytes: bytes.to_vec() }.encode()
     };
     for (room, fits) in [(size, 1), (2 * size - 1, 1), (2 * size, 2), (size - 1, 0)] {
-        let config = GuestConfig { model_bytes: room, ..Default::default() };
+        let config = GuestSessionConfig { model_bytes: room, ..Default::default() };
         let mut guest = GuestSession::new(config, 1200).unwrap();
         let now = Duration::from_secs(1);
         guest.connect(now).unwrap();
@@ -66,7 +66,7 @@ fn a_host_cannot_make_a_guest_hold_more_than_its_bound() {
 fn hands_that_are_not_numbers_are_refused_and_the_old_target_stays() {
     let (_, mut guest, now) = session("default");
     let grab = guest.grabs().next().unwrap().0;
-    let mut peer = PeerSession::new(PeerConfig::default()).unwrap();
+    let mut peer = PeerSession::new(PeerSessionConfig::default()).unwrap();
     peer.add_body(BODY, bar(12, 0.05), &StepSettings::default()).unwrap();
     let own = peer.begin_grab(BODY, 66, 0.05, [1.0, 0.0, 0.0], Default::default()).unwrap();
     for bad in [f64::NAN, f64::INFINITY, -1e300] {

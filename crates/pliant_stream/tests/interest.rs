@@ -8,8 +8,8 @@ use std::time::Duration;
 use pliant_modal::ModalModel;
 use pliant_stream::wire::HostMessage;
 use pliant_stream::{
-    BodyId, Channel, GuestConfig, GuestEvent, GuestSession, HostConfig, HostEvent, HostSession, PeerId,
-    Placement, Role, StepSettings, TickState, UserId, UserInfo, UserLinkInfo,
+    BodyId, Channel, GuestEvent, GuestSession, GuestSessionConfig, HostEvent, HostSession, HostSessionConfig,
+    PeerId, Placement, Role, StepSettings, TickState, UserId, UserInfo, UserLinkInfo,
 };
 use support::bar;
 
@@ -26,7 +26,7 @@ struct Room {
 }
 
 impl Room {
-    fn new(config: HostConfig) -> Self {
+    fn new(config: HostSessionConfig) -> Self {
         let mut host = HostSession::new(config).unwrap();
         let model = bar(8, 0.05);
         let modes = model.mode_count();
@@ -35,7 +35,7 @@ impl Room {
     }
 
     fn join(&mut self, peer: PeerId, model: &std::sync::Arc<ModalModel>) {
-        let mut guest = GuestSession::new(GuestConfig::default(), 1200).unwrap();
+        let mut guest = GuestSession::new(GuestSessionConfig::default(), 1200).unwrap();
         guest.add_cached_model(model.clone());
         self.host.connect(self.now, peer, 1200).unwrap();
         guest.connect(self.now).unwrap();
@@ -98,7 +98,7 @@ impl Room {
 #[test]
 fn a_body_that_is_not_looked_at_costs_nothing_and_comes_back_whole() {
     let model = bar(8, 0.05);
-    let mut room = Room::new(HostConfig::default());
+    let mut room = Room::new(HostSessionConfig::default());
     let (looks, looks_away) = (PeerId(1), PeerId(2));
     room.join(looks, &model);
     room.join(looks_away, &model);
@@ -135,7 +135,7 @@ fn a_body_that_is_not_looked_at_costs_nothing_and_comes_back_whole() {
 #[test]
 fn a_frame_is_encoded_once_for_all_who_take_the_same_and_one_more_costs_its_datagrams() {
     let model = bar(8, 0.05);
-    let mut room = Room::new(HostConfig::default());
+    let mut room = Room::new(HostSessionConfig::default());
     (1..=2).for_each(|peer| room.join(PeerId(peer), &model));
     (0..40).for_each(|_| room.step());
     let run = |room: &mut Room| {
@@ -167,7 +167,7 @@ fn a_frame_is_encoded_once_for_all_who_take_the_same_and_one_more_costs_its_data
 #[test]
 fn who_comes_back_gets_the_number_they_had_if_it_is_free() {
     let model = bar(8, 0.05);
-    let mut room = Room::new(HostConfig { open: false, ..HostConfig::default() });
+    let mut room = Room::new(HostSessionConfig { open: false, ..HostSessionConfig::default() });
     let ask = |room: &mut Room, peer: PeerId, before: Option<UserId>| {
         room.join(peer, &model);
         room.exchange();
@@ -188,7 +188,7 @@ fn who_comes_back_gets_the_number_they_had_if_it_is_free() {
 #[test]
 fn guests_that_want_all_kinds_of_numbers_of_modes_share_few_encoders() {
     let model = bar(8, 0.05);
-    let mut room = Room::new(HostConfig::default());
+    let mut room = Room::new(HostSessionConfig::default());
     let all = room.modes as u16;
     (1..=40).for_each(|peer| room.join(PeerId(peer), &model));
     (0..40).for_each(|_| room.step());
@@ -212,7 +212,7 @@ fn guests_that_want_all_kinds_of_numbers_of_modes_share_few_encoders() {
 #[test]
 fn grabs_are_begun_no_faster_than_hands_can() {
     let model = bar(8, 0.05);
-    let mut room = Room::new(HostConfig::default());
+    let mut room = Room::new(HostSessionConfig::default());
     room.join(PeerId(1), &model);
     (0..40).for_each(|_| room.step());
     let mut begun = 0;
@@ -252,7 +252,7 @@ fn admit(room: &mut Room, peer: PeerId, role: Role) -> UserId {
 
 #[test]
 fn all_guests_know_who_is_there_and_in_which_role() {
-    let mut room = Room::new(HostConfig { open: false, ..HostConfig::default() });
+    let mut room = Room::new(HostSessionConfig { open: false, ..HostSessionConfig::default() });
     room.host.set_host_user("Ada").unwrap();
     assert!(room.host.set_host_user(&"x".repeat(65)).is_err());
     let holder = admit(&mut room, PeerId(1), Role::Hold);
@@ -288,7 +288,7 @@ fn all_guests_know_who_is_there_and_in_which_role() {
 
 #[test]
 fn who_may_only_watch_holds_nothing() {
-    let mut room = Room::new(HostConfig { open: false, ..HostConfig::default() });
+    let mut room = Room::new(HostSessionConfig { open: false, ..HostSessionConfig::default() });
     admit(&mut room, PeerId(1), Role::Watch);
     admit(&mut room, PeerId(2), Role::Hold);
     (0..40).for_each(|_| room.step());
@@ -312,7 +312,7 @@ fn who_may_only_watch_holds_nothing() {
 #[test]
 fn a_placement_reaches_those_who_are_there_and_those_who_come() {
     let model = bar(8, 0.05);
-    let mut room = Room::new(HostConfig::default());
+    let mut room = Room::new(HostSessionConfig::default());
     room.join(PeerId(1), &model);
     (0..4).for_each(|_| room.step());
     let placement = |room: &Room, guest: usize| room.guests[guest].1.body(BODY).unwrap().placement();
@@ -348,7 +348,7 @@ fn a_placement_reaches_those_who_are_there_and_those_who_come() {
 #[test]
 fn a_guest_says_how_much_of_a_body_it_wants() {
     let model = bar(8, 0.05);
-    let mut room = Room::new(HostConfig::default());
+    let mut room = Room::new(HostSessionConfig::default());
     room.join(PeerId(1), &model);
     (0..40).for_each(|_| room.step());
     let shown = |room: &Room| room.guests[0].1.body(BODY).unwrap().visual().unwrap().modes();

@@ -9,8 +9,8 @@ use std::time::Duration;
 
 use pliant_modal::ModalModel;
 use pliant_stream::{
-    BodyId, Channel, GuestConfig, GuestEvent, GuestSession, HostConfig, HostSession, PeerId, StepSettings,
-    StreamError, TickState,
+    BodyId, Channel, GuestEvent, GuestSession, GuestSessionConfig, HostSession, HostSessionConfig, PeerId,
+    StepSettings, StreamError, TickState,
 };
 use support::bar;
 
@@ -20,7 +20,7 @@ const FRAME: Duration = Duration::from_micros(16_667);
 
 /// The first messages of a guest that has no model.
 fn hello() -> Vec<Vec<u8>> {
-    let mut guest = GuestSession::new(GuestConfig::default(), 1200).unwrap();
+    let mut guest = GuestSession::new(GuestSessionConfig::default(), 1200).unwrap();
     guest.connect(Duration::ZERO).unwrap();
     std::iter::from_fn(|| guest.poll_output())
         .filter(|output| output.channel == Channel::Message)
@@ -28,12 +28,12 @@ fn hello() -> Vec<Vec<u8>> {
         .collect()
 }
 
-fn host(config: HostConfig, guests: u64) -> (HostSession, u64) {
+fn host(config: HostSessionConfig, guests: u64) -> (HostSession, u64) {
     let model = bar(40, 0.05);
     let bytes = model.to_bytes().len() as u64;
     // The guests send nothing while they wait, and the host must not disconnect them for it.
     let idle_timeout = Duration::from_secs(1000);
-    let mut host = HostSession::new(HostConfig { idle_timeout, ..config }).unwrap();
+    let mut host = HostSession::new(HostSessionConfig { idle_timeout, ..config }).unwrap();
     host.add_body(BodyId(1), "bar", model, StepSettings::default()).unwrap();
     let words = hello();
     for peer in 1..=guests {
@@ -45,7 +45,7 @@ fn host(config: HostConfig, guests: u64) -> (HostSession, u64) {
 
 #[test]
 fn two_hundred_and_fifty_six_fetch_at_once_at_one_rate_and_in_turns() {
-    let config = HostConfig { models_rate: 2e6, ..Default::default() };
+    let config = HostSessionConfig { models_rate: 2e6, ..Default::default() };
     let (mut host, bytes) = host(config, GUESTS);
     assert_eq!(host.fetching().count() as u64, GUESTS);
     let mut got: BTreeMap<PeerId, u64> = BTreeMap::new();
@@ -79,7 +79,7 @@ fn two_hundred_and_fifty_six_fetch_at_once_at_one_rate_and_in_turns() {
 
 #[test]
 fn one_alone_has_its_own_rate_and_not_that_of_all() {
-    let (mut host, bytes) = host(HostConfig { model_rate: 100e3, ..Default::default() }, 1);
+    let (mut host, bytes) = host(HostSessionConfig { model_rate: 100e3, ..Default::default() }, 1);
     let mut now = Duration::ZERO;
     while host.fetching().next().is_some() {
         let wakes = host.next_wakeup().unwrap().max(now + Duration::from_micros(1));
@@ -95,7 +95,7 @@ fn one_alone_has_its_own_rate_and_not_that_of_all() {
 
 #[test]
 fn what_a_line_does_not_take_is_not_handed_over_and_holds_up_nobody_else() {
-    let (mut host, bytes) = host(HostConfig::default(), 2);
+    let (mut host, bytes) = host(HostSessionConfig::default(), 2);
     let (slow, fast) = (PeerId(1), PeerId(2));
     let mut got = BTreeMap::from([(slow, 0_u64), (fast, 0)]);
     let mut unsent = 0.0_f64;
@@ -130,8 +130,8 @@ fn what_a_line_does_not_take_is_not_handed_over_and_holds_up_nobody_else() {
 fn rates_that_are_none_are_refused() {
     for bad in [0.0, -1.0, f64::NAN, f64::INFINITY] {
         for config in [
-            HostConfig { model_rate: bad, ..Default::default() },
-            HostConfig { models_rate: bad, ..Default::default() },
+            HostSessionConfig { model_rate: bad, ..Default::default() },
+            HostSessionConfig { models_rate: bad, ..Default::default() },
         ] {
             assert!(matches!(HostSession::new(config), Err(StreamError::Config { .. })), "{bad}");
         }
@@ -142,12 +142,12 @@ fn rates_that_are_none_are_refused() {
 fn a_model_may_be_read_by_the_caller_and_another_one_ends_the_session() {
     for right in [true, false] {
         let model = bar(8, 0.05);
-        let mut host = HostSession::new(HostConfig::default()).unwrap();
+        let mut host = HostSession::new(HostSessionConfig::default()).unwrap();
         let file = model.to_bytes().into();
         host.add_body_as(BODY, "bar", model.clone(), file, StepSettings::default()).unwrap();
         host.connect(Duration::ZERO, PeerId(1), 1200).unwrap();
         let mut guest =
-            GuestSession::new(GuestConfig { models_apart: true, ..Default::default() }, 1200).unwrap();
+            GuestSession::new(GuestSessionConfig { models_apart: true, ..Default::default() }, 1200).unwrap();
         guest.connect(Duration::ZERO).unwrap();
         let (mut came, mut ready, mut closed) = (None, false, false);
         for k in 1..200_u32 {

@@ -9,7 +9,7 @@ use std::time::Duration;
 
 use pliant_modal::{Body, BodyConfig, GrabConfig, Integrator, ModalModel, Patch, Relaxation};
 use pliant_stream::emulator::{EmulatedLink, LinkConfig, Loss, Preset};
-use pliant_stream::peer::{PeerConfig, PeerEvent, PeerSession, Repair};
+use pliant_stream::peer::{PeerEvent, PeerSession, PeerSessionConfig, Repair};
 use pliant_stream::wire::{
     Datagram, HeldAt, InputTick, Inputs, NackRun, PROTOCOL_VERSION, PeerBodyState, PeerMessage, StateCheck,
 };
@@ -67,7 +67,7 @@ impl Mesh {
 
     fn start(&mut self, k: usize, repair: Repair, founds: bool) {
         let user = UserId(k as u16 + 1);
-        let config = PeerConfig { user, repair, founds, ..Default::default() };
+        let config = PeerSessionConfig { user, repair, founds, ..Default::default() };
         let mut peer = PeerSession::new(config).unwrap();
         peer.add_body(BODY, self.model.clone(), &self.settings).unwrap();
         for other in 0..self.peers.len() {
@@ -310,7 +310,7 @@ fn agreeing(p: &PeerSession, body: BodyId) -> StateCheck {
 #[test]
 fn a_body_that_differs_is_noticed_beside_one_that_agrees() {
     const OTHER: BodyId = BodyId(2);
-    let mut p = PeerSession::new(PeerConfig { user: UserId(2), ..Default::default() }).unwrap();
+    let mut p = PeerSession::new(PeerSessionConfig { user: UserId(2), ..Default::default() }).unwrap();
     for body in [BODY, OTHER] {
         p.add_body(body, bar(4, 0.05), &StepSettings::default()).unwrap();
     }
@@ -331,7 +331,7 @@ fn a_body_that_differs_is_noticed_beside_one_that_agrees() {
 
 #[test]
 fn copies_of_one_datagram_are_one_disagreement() {
-    let mut p = PeerSession::new(PeerConfig { user: UserId(2), ..Default::default() }).unwrap();
+    let mut p = PeerSession::new(PeerSessionConfig { user: UserId(2), ..Default::default() }).unwrap();
     p.add_body(BODY, bar(4, 0.05), &StepSettings::default()).unwrap();
     greeted(&mut p);
     for tick in 1..=20_u16 {
@@ -575,7 +575,7 @@ fn ask_floods_are_answered_within_bounds() {
 fn a_peer_under_another_number_than_the_one_it_was_given_is_turned_away() {
     // Under number 1 the peer's state would override all others.
     for claimed in [0, 1, 3, 9] {
-        let config = PeerConfig { user: UserId(3), ..Default::default() };
+        let config = PeerSessionConfig { user: UserId(3), ..Default::default() };
         let mut p = PeerSession::new(config).unwrap();
         p.add_body(BODY, bar(4, 0.05), &StepSettings::default()).unwrap();
         p.connect(Duration::ZERO, PeerId(7), UserId(8), 1200).unwrap();
@@ -599,12 +599,12 @@ fn a_peer_under_another_number_than_the_one_it_was_given_is_turned_away() {
         assert!(matches!(p.poll_event(), Some(PeerEvent::Joined { user: UserId(8), .. })));
         assert_eq!(p.user_of(PeerId(9)), Some(UserId(8)));
     }
-    assert!(PeerSession::new(PeerConfig { user: UserId::HOST, ..Default::default() }).is_err());
+    assert!(PeerSession::new(PeerSessionConfig { user: UserId::HOST, ..Default::default() }).is_err());
 }
 
 fn lone(user: UserId, founds: bool) -> PeerSession {
     let address = format!("address of {}", user.0);
-    let mut p = PeerSession::new(PeerConfig { user, founds, address, ..Default::default() }).unwrap();
+    let mut p = PeerSession::new(PeerSessionConfig { user, founds, address, ..Default::default() }).unwrap();
     p.add_body(BODY, bar(4, 0.05), &StepSettings::default()).unwrap();
     p
 }
@@ -657,7 +657,7 @@ fn a_new_peer_is_given_its_number_and_those_who_come_before_wait_for_it() {
 
 #[test]
 fn a_peer_that_never_says_hello_is_told_of_when_it_goes() {
-    let mut p = PeerSession::new(PeerConfig::default()).unwrap();
+    let mut p = PeerSession::new(PeerSessionConfig::default()).unwrap();
     p.add_body(BODY, bar(4, 0.05), &StepSettings::default()).unwrap();
     assert!(p.connect(Duration::ZERO, PeerId(7), UserId::HOST, 1200).is_err());
     assert!(p.connect(Duration::ZERO, PeerId(7), UserId(1), 1200).is_err(), "our own");
@@ -671,7 +671,8 @@ fn a_peer_that_never_says_hello_is_told_of_when_it_goes() {
 
 #[test]
 fn what_nobody_fetches_does_not_grow_for_ever() {
-    let mut p = PeerSession::new(PeerConfig { idle_timeout: 100_000 * S, ..Default::default() }).unwrap();
+    let mut p =
+        PeerSession::new(PeerSessionConfig { idle_timeout: 100_000 * S, ..Default::default() }).unwrap();
     p.add_body(BODY, bar(4, 0.05), &StepSettings::default()).unwrap();
     p.connect(Duration::ZERO, PeerId(7), UserId(2), 1200).unwrap();
     for k in 1..=20_000_u32 {
@@ -761,7 +762,7 @@ fn a_peers_hand_has_its_own_spring_and_damper() {
     let (vertex, radius) = (76, f64::from(0.0216_f32));
     // A Touch device: 400 N/m and 4 N s/m.
     let hold = GrabConfig { stiffness: Some(400.0), relaxation: 0.01 }.capped();
-    let mut peer = PeerSession::new(PeerConfig::default()).unwrap();
+    let mut peer = PeerSession::new(PeerSessionConfig::default()).unwrap();
     peer.add_body(BODY, pip.clone(), &StepSettings::default()).unwrap();
     let mut body = Body::new(pip.clone(), BodyConfig { step: 1.0 / 40.0, ..Default::default() }).unwrap();
     let patch = Patch::around(pip.surface(), vertex, radius).unwrap();

@@ -14,7 +14,7 @@ use std::time::Duration;
 use pliant_modal::{Body, BodyConfig, Elasticity, Integrator, ModalModel, Relaxation, StepSettings};
 use pliant_stream::emulator::LinkConfig;
 use pliant_stream::{
-    BodyId, GuestConfig, HostConfig, Newmark, PeerId, RecoveryConfig, RepairCounts, StreamError,
+    BodyId, GuestSessionConfig, HostSessionConfig, Newmark, PeerId, RecoveryConfig, RepairCounts, StreamError,
 };
 
 use crate::pair::{Pair, PathConfig};
@@ -59,7 +59,7 @@ pub struct Experiment {
     pub warmup: Duration,
     /// The scripted hands. Default: [`Experiment::default_hands`].
     pub hands: Vec<Hand>,
-    /// See [`HostConfig::quantum`]. Default: 2^-14.
+    /// See [`HostSessionConfig::quantum`]. Default: 2^-14.
     pub quantum: f64,
     /// Clock for the time that decoding, correcting and stepping take. `None` leaves
     /// [`Metrics::cpu_us_per_tick`] at 0.
@@ -194,7 +194,7 @@ impl Experiment {
             newmark: Newmark { h: 1.0 / 40.0, beta: 4.0 / 9.0, gamma: 5.0 / 6.0 },
             resend_after: Duration::ZERO,
             warmup: Duration::from_secs(2),
-            quantum: HostConfig::default().quantum,
+            quantum: HostSessionConfig::default().quantum,
             cpu_clock: None,
             guest_hand: false,
             keep_track: false,
@@ -246,7 +246,7 @@ impl Experiment {
     pub fn run(&self) -> Result<Metrics, StreamError> {
         let h = 1.0 / self.rate;
         let newmark = Newmark { h, ..self.newmark };
-        let mut pair = Pair::new(HostConfig {
+        let mut pair = Pair::new(HostSessionConfig {
             newmark,
             resend_after: self.resend_after,
             quantum: self.quantum,
@@ -256,7 +256,7 @@ impl Experiment {
         let config = BodyConfig { step: h, ..settings.into() };
         let body = Body::new(self.model.clone(), config).map_err(model_error)?;
         pair.host.add_body(BODY, "measured", self.model.clone(), settings)?;
-        let guest = GuestConfig { recovery: self.recovery, modes: self.modes, ..Default::default() };
+        let guest = GuestSessionConfig { recovery: self.recovery, modes: self.modes, ..Default::default() };
         let perfect = LinkConfig { delay: self.down.delay, ..Default::default() };
         let path = PathConfig { down: perfect, up: self.up.clone(), max_datagram: 1200 };
         pair.join_with(guest, path, self.seed, |s| s.add_cached_model(self.model.clone()))?;

@@ -6,7 +6,7 @@ use std::time::Duration;
 
 use pliant_modal::GrabConfig;
 use pliant_stream::emulator::{EmulatedLink, LinkConfig, Loss};
-use pliant_stream::peer::{PeerConfig, PeerSession, Repair};
+use pliant_stream::peer::{PeerSession, PeerSessionConfig, Repair};
 use pliant_stream::{Channel, PeerId, StreamError, Tick, UserId};
 
 use super::{BODY, Experiment, Metrics, RECOVERED, ShapeError, fold, norm};
@@ -37,7 +37,7 @@ impl Experiment {
         let h = 1.0 / self.rate;
         let settings = self.settings();
         let peer = |number: u16| -> Result<PeerSession, StreamError> {
-            let config = PeerConfig { user: UserId(number), step: h, repair, ..Default::default() };
+            let config = PeerSessionConfig { user: UserId(number), step: h, repair, ..Default::default() };
             let mut peer = PeerSession::new(config)?;
             peer.add_body(BODY, self.model.clone(), &settings)?;
             Ok(peer)

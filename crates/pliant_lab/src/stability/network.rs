@@ -21,7 +21,7 @@ const RMS: &str = "shown error, rms, % of the largest displacement";
 const LARGEST: &str = "shown error, largest, % of the largest displacement";
 const TICKS: &str = "ticks missing";
 
-const SILENT: &str = "the line says nothing for longer than a guest goes on by guessing (`GuestConfig::stall_after`): then the picture stands still until the next frame, and is as far off as the hands have gone meanwhile";
+const SILENT: &str = "the line says nothing for longer than a guest goes on by guessing (`GuestSessionConfig::stall_after`): then the picture stands still until the next frame, and is as far off as the hands have gone meanwhile";
 
 /// Share of the ticks that may be missing.
 const MISSING: f64 = 0.01;

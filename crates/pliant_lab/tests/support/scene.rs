@@ -8,7 +8,7 @@ use pliant_lab::pair::{Pair, PathConfig, World};
 use pliant_modal::{Body, BodyConfig, GrabConfig, GrabId, ModalModel, Patch};
 use pliant_stream::emulator::{LinkConfig, Loss, Preset};
 use pliant_stream::{
-    BodyId, GrabKey, GrabState, GuestEvent, GuestSession, HostConfig, HostEvent, HostSession, Pose,
+    BodyId, GrabKey, GrabState, GuestEvent, GuestSession, HostEvent, HostSession, HostSessionConfig, Pose,
     StepSettings, TickState,
 };
 
@@ -163,10 +163,10 @@ pub fn circling() -> HandScript {
 }
 
 pub fn start(model: &Arc<ModalModel>) -> (Pair, Scene) {
-    start_with(model, HostConfig::default())
+    start_with(model, HostSessionConfig::default())
 }
 
-pub fn start_with(model: &Arc<ModalModel>, config: HostConfig) -> (Pair, Scene) {
+pub fn start_with(model: &Arc<ModalModel>, config: HostSessionConfig) -> (Pair, Scene) {
     let mut pair = Pair::new(config).unwrap();
     pair.host.add_body(BODY, "bar", model.clone(), StepSettings::default()).unwrap();
     (pair, Scene::new(model))

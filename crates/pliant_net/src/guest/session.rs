@@ -86,14 +86,14 @@ impl NetGuest {
     /// Starts a session on an open connection.
     fn greet(&mut self, world: &World, now: Duration) -> Result<(), StreamError> {
         let most = self.line.max_datagram_size().unwrap_or(0);
-        let config = pliant_stream::GuestConfig {
+        let config = pliant_stream::GuestSessionConfig {
             name: shortened(&self.config.name).to_owned(),
             recovery: self.config.recovery,
             modes: self.config.modes,
             predict_own_hand: self.config.predict_own_hand,
             idle_timeout: self.config.transport.limits.idle_timeout,
             models_apart: true,
-            ..pliant_stream::GuestConfig::default()
+            ..pliant_stream::GuestSessionConfig::default()
         };
         let mut session = GuestSession::new(config, most)?;
         let loaded = world.get_resource::<Assets<ModalAsset>>();

@@ -39,7 +39,7 @@ pub struct HostConfig {
     pub transport: HostOptions,
     /// The session's settings. The step is always that of `Time<Fixed>`. [`HostOptions::access`]
     /// determines who may join.
-    pub session: pliant_stream::HostConfig,
+    pub session: pliant_stream::HostSessionConfig,
     /// Whose hands may be on a body at the same time, for bodies without their own [`Holding`].
     pub holding: Holding,
     /// Longest playout delay of a guest's hand, s. Default: 0.1.
@@ -62,7 +62,7 @@ impl Default for HostConfig {
         Self {
             name: "host".into(),
             transport: HostOptions::default(),
-            session: pliant_stream::HostConfig::default(),
+            session: pliant_stream::HostSessionConfig::default(),
             holding: Holding::default(),
             smoothing: 0.1,
             reach: 4.0,
@@ -115,7 +115,7 @@ impl NetHost {
     ) -> Result<(), pliant_stream::StreamError> {
         // The host app admits each guest itself, because the key of the connection determines the
         // user number.
-        let mut settings = pliant_stream::HostConfig { open: false, ..config.session };
+        let mut settings = pliant_stream::HostSessionConfig { open: false, ..config.session };
         if let Some(fixed) = world.get_resource::<Time<Fixed>>() {
             settings.newmark.h = fixed.timestep().as_secs_f64();
         }

@@ -15,7 +15,7 @@ use std::time::{Duration, Instant};
 
 use bevy::prelude::*;
 use pliant_body::{BodyState, Driven, ModalBody};
-use pliant_stream::peer::{PeerConfig as SessionConfig, PeerSession, Repair};
+use pliant_stream::peer::{PeerSession, PeerSessionConfig, Repair};
 use pliant_stream::{BodyId, DisconnectReason, LinkStats, PeerId, UserId};
 
 use crate::metrics::{Ledger, NetStats};
@@ -262,7 +262,7 @@ impl NetPeer {
     fn begin(&mut self, world: &mut World) {
         let founds = self.config.join.is_none();
         let user = if founds { UserId(1) } else { UserId::HOST };
-        let config = SessionConfig {
+        let config = PeerSessionConfig {
             user,
             name: shortened(&self.config.name).to_owned(),
             address: self.listening.invite().to_string(),
@@ -270,7 +270,7 @@ impl NetPeer {
             repair: self.config.repair,
             idle_timeout: self.limits.idle_timeout,
             founds,
-            ..SessionConfig::default()
+            ..PeerSessionConfig::default()
         };
         let made = PeerSession::new(config).and_then(|mut session| {
             for (&id, played) in &self.bodies {

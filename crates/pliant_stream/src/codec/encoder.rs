@@ -182,7 +182,7 @@ impl Encoder {
     }
 
     /// Sets the displacement of the surface by one quantization step, as a share of the body's
-    /// deformation. See [`crate::HostConfig::quantum`].
+    /// deformation. See [`crate::HostSessionConfig::quantum`].
     #[must_use]
     pub fn with_quantum(mut self, share: f64) -> Self {
         self.quantum = if share.is_finite() { share.clamp(1e-9, 0.1) } else { QUANTUM };

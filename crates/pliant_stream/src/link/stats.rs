@@ -32,7 +32,7 @@ pub struct LinkStats {
     /// Number of datagrams and messages that could not be decoded or were invalid.
     pub rejected: u64,
     /// Reduction level of this guest's stream, 0 (none) to 6. Host only; see
-    /// [`HostConfig::guest_rate`](crate::session::HostConfig::guest_rate).
+    /// [`HostSessionConfig::guest_rate`](crate::session::HostSessionConfig::guest_rate).
     pub level: u8,
 }
 

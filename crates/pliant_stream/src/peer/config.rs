@@ -8,7 +8,7 @@ use crate::state::{PeerId, UserId};
 
 /// Settings of a peer.
 #[derive(Debug, Clone, PartialEq)]
-pub struct PeerConfig {
+pub struct PeerSessionConfig {
     /// Number of this peer. Every peer has a different one, and the lowest number is right when
     /// states disagree. A peer that does not found the session may have [`UserId::HOST`], which
     /// stands for none: it requests a number from the first peer that it connects to.
@@ -33,7 +33,7 @@ pub struct PeerConfig {
     pub founds: bool,
 }
 
-impl Default for PeerConfig {
+impl Default for PeerSessionConfig {
     fn default() -> Self {
         Self {
             user: UserId(1),

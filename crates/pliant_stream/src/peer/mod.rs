@@ -18,5 +18,5 @@ mod other;
 mod session;
 
 pub use body::{PeerBody, Repair};
-pub use config::{PeerConfig, PeerEvent};
+pub use config::{PeerEvent, PeerSessionConfig};
 pub use session::PeerSession;

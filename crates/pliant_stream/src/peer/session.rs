@@ -9,7 +9,7 @@ use std::time::Duration;
 use pliant_modal::{GrabConfig, ModalModel, StepSettings};
 
 use super::body::PeerBody;
-use super::config::{PeerConfig, PeerEvent};
+use super::config::{PeerEvent, PeerSessionConfig};
 use super::inputs::{InputLog, WINDOW};
 use super::other::{Hello, RemotePeer};
 use crate::StreamError;
@@ -37,7 +37,7 @@ const ASK_AGAIN: Duration = Duration::from_millis(150);
 /// One of several equal peers: a state machine without sockets or clock.
 #[derive(Debug)]
 pub struct PeerSession {
-    config: PeerConfig,
+    config: PeerSessionConfig,
     others: BTreeMap<PeerId, RemotePeer>,
     bodies: BTreeMap<BodyId, PeerBody>,
     inputs: InputLog,
@@ -63,7 +63,7 @@ impl PeerSession {
     /// # Errors
     /// Returns [`StreamError::Config`] for a setting out of range, and for a founding peer without
     /// a number.
-    pub fn new(config: PeerConfig) -> Result<Self, StreamError> {
+    pub fn new(config: PeerSessionConfig) -> Result<Self, StreamError> {
         let fail = |what, found: String, expected| Err(StreamError::Config { what, found, expected });
         if config.user == UserId::HOST && config.founds {
             return fail("user", "0".into(), "1 or more");

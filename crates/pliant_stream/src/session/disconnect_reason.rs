@@ -30,7 +30,7 @@ pub enum DisconnectReason {
     #[error("refused by the host")]
     Refused,
     /// The host or peer has no room left, or a model exceeds
-    /// [`GuestConfig::model_bytes`](super::GuestConfig::model_bytes).
+    /// [`GuestSessionConfig::model_bytes`](super::GuestSessionConfig::model_bytes).
     #[error("full")]
     Full,
     /// The path's datagrams are too small, see [`MIN_DATAGRAM`](super::MIN_DATAGRAM).

@@ -8,7 +8,7 @@ use pliant_modal::ModalModel;
 
 use super::download::Download;
 use super::guest_body::StreamedBody;
-use super::guest_config::{GuestConfig, GuestEvent};
+use super::guest_config::{GuestEvent, GuestSessionConfig};
 use super::guest_hands::LocalGrab;
 use super::{DisconnectReason, LinkStats, MIN_DATAGRAM, Output};
 use crate::StreamError;
@@ -36,7 +36,7 @@ enum GuestStanding {
 /// A guest of a session: a state machine without sockets or clock; see [`super`].
 #[derive(Debug)]
 pub struct GuestSession {
-    pub(super) config: GuestConfig,
+    pub(super) config: GuestSessionConfig,
     pub(super) link: Link,
     standing: GuestStanding,
     newmark: Newmark,
@@ -44,7 +44,7 @@ pub struct GuestSession {
     pub(super) downloads: BTreeMap<[u8; 32], Download>,
     /// Models that the caller is decoding.
     pub(super) being_read: BTreeSet<[u8; 32]>,
-    /// Bytes of downloads and downloaded models together, see [`GuestConfig::model_bytes`].
+    /// Bytes of downloads and downloaded models together, see [`GuestSessionConfig::model_bytes`].
     pub(super) model_bytes: u64,
     /// Hashes of all models that the host has named, at most 16,384 (512 KiB).
     pub(super) announced: BTreeSet<[u8; 32]>,
@@ -67,7 +67,7 @@ impl GuestSession {
     ///
     /// # Errors
     /// Returns [`StreamError::Config`] for a name, datagram size or recovery setting out of range.
-    pub fn new(config: GuestConfig, max_datagram: usize) -> Result<Self, StreamError> {
+    pub fn new(config: GuestSessionConfig, max_datagram: usize) -> Result<Self, StreamError> {
         let fail = |what, found: String, expected| Err(StreamError::Config { what, found, expected });
         config.recovery.check()?;
         if config.name.len() > MAX_NAME {

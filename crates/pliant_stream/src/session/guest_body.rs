@@ -143,7 +143,7 @@ impl StreamedBody {
     ///
     /// The result is `None` unless the guest holds the body or the copy still fades to the
     /// confirmed state. The copy needs [`Policy::ForceDriven`] and
-    /// [`crate::GuestConfig::predict_own_hand`]. Show it instead of [`StreamedBody::visual`] when it
+    /// [`crate::GuestSessionConfig::predict_own_hand`]. Show it instead of [`StreamedBody::visual`] when it
     /// exists.
     pub fn predicted_hand(&self) -> Option<&PredictedHand> {
         self.own.as_ref().filter(|own| own.is_active())

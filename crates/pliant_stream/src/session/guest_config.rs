@@ -11,7 +11,7 @@ use crate::state::{BodyId, Placement, UserId, UserInfo};
 
 /// Settings of a guest.
 #[derive(Debug, Clone, PartialEq)]
-pub struct GuestConfig {
+pub struct GuestSessionConfig {
     /// Display name, at most 64 bytes.
     pub name: String,
     /// Loss repair. Default: [`RecoveryConfig::default`].
@@ -37,7 +37,7 @@ pub struct GuestConfig {
     pub idle_timeout: Duration,
 }
 
-impl Default for GuestConfig {
+impl Default for GuestSessionConfig {
     fn default() -> Self {
         Self {
             name: "guest".to_owned(),
@@ -76,7 +76,7 @@ pub enum GuestEvent {
         /// Total number of bytes.
         total: u64,
     },
-    /// A model has arrived and must be decoded ([`GuestConfig::models_apart`]).
+    /// A model has arrived and must be decoded ([`GuestSessionConfig::models_apart`]).
     ModelCame {
         /// Hash of the model.
         hash: [u8; 32],

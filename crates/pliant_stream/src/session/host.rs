@@ -6,7 +6,7 @@ use std::time::Duration;
 
 use pliant_modal::{ModalModel, StepSettings};
 
-use super::host_config::{HostConfig, HostEvent};
+use super::host_config::{HostEvent, HostSessionConfig};
 use super::host_peer::{AnnouncedGrab, GuestPeer, MAX_GUEST_GRABS, Standing};
 use super::upload::Upload;
 use super::{DisconnectReason, LinkStats, MIN_DATAGRAM, Output};
@@ -57,7 +57,7 @@ impl HostBody {
 /// The host of a session: a state machine without sockets or clock; see [`super`].
 #[derive(Debug)]
 pub struct HostSession {
-    pub(super) config: HostConfig,
+    pub(super) config: HostSessionConfig,
     /// The user at the host, if there is one.
     host_user: Option<UserInfo>,
     pub(super) peers: BTreeMap<PeerId, GuestPeer>,
@@ -76,7 +76,7 @@ impl HostSession {
     ///
     /// # Errors
     /// Returns [`StreamError::Config`] for a setting out of range.
-    pub fn new(config: HostConfig) -> Result<Self, StreamError> {
+    pub fn new(config: HostSessionConfig) -> Result<Self, StreamError> {
         config.newmark.check()?;
         let upload = Upload::new(&config)?;
         if config.guest_rate.is_nan() || config.guest_rate < 1.0 {
@@ -101,7 +101,7 @@ impl HostSession {
     }
 
     /// The settings.
-    pub fn config(&self) -> &HostConfig {
+    pub fn config(&self) -> &HostSessionConfig {
         &self.config
     }
 

@@ -10,7 +10,7 @@ use crate::state::{BodyId, GrabKey, PeerId, UserId};
 
 /// Settings of a host.
 #[derive(Debug, Clone, Copy, PartialEq)]
-pub struct HostConfig {
+pub struct HostSessionConfig {
     /// The step, and the filter that reads acceleration streams.
     ///
     /// Default: 1/40 s, and beta 4/9, gamma 5/6 (generalized-alpha with 0.5), which tracks any host
@@ -46,7 +46,7 @@ pub struct HostConfig {
     pub open: bool,
 }
 
-impl Default for HostConfig {
+impl Default for HostSessionConfig {
     fn default() -> Self {
         Self {
             newmark: Newmark { h: 1.0 / 40.0, beta: 4.0 / 9.0, gamma: 5.0 / 6.0 },
@@ -67,7 +67,7 @@ impl Default for HostConfig {
 #[non_exhaustive]
 pub enum HostEvent {
     /// A guest asks to join. Answer with [`crate::HostSession::accept`] or
-    /// [`crate::HostSession::refuse`]. This event does not occur with [`HostConfig::open`].
+    /// [`crate::HostSession::refuse`]. This event does not occur with [`HostSessionConfig::open`].
     JoinRequest {
         /// The connection.
         peer: PeerId,

@@ -36,9 +36,9 @@ pub use crate::prediction::PredictedHand;
 pub use disconnect_reason::DisconnectReason;
 pub use guest::GuestSession;
 pub use guest_body::StreamedBody;
-pub use guest_config::{GuestConfig, GuestEvent};
+pub use guest_config::{GuestEvent, GuestSessionConfig};
 pub use host::HostSession;
-pub use host_config::{HostConfig, HostEvent};
+pub use host_config::{HostEvent, HostSessionConfig};
 
 use crate::state::PeerId;
 

@@ -6,7 +6,7 @@ use std::time::Duration;
 
 use super::Output;
 use super::host::HostSession;
-use super::host_config::HostConfig;
+use super::host_config::HostSessionConfig;
 use super::host_peer::GuestPeer;
 use crate::StreamError;
 use crate::link::Budget;
@@ -31,7 +31,7 @@ pub(super) struct Upload {
 }
 
 impl Upload {
-    pub(super) fn new(config: &HostConfig) -> Result<Self, StreamError> {
+    pub(super) fn new(config: &HostSessionConfig) -> Result<Self, StreamError> {
         for (what, rate) in [("model_rate", config.model_rate), ("models_rate", config.models_rate)] {
             if !(rate.is_finite() && rate >= 1.0) {
                 let found = rate.to_string();
@@ -66,7 +66,7 @@ impl HostSession {
     /// yet.
     ///
     /// A guest of [`HostSession::fetching`] with 128 KiB or more gets nothing more of its model
-    /// until the caller reports less. The connection may be slower than [`HostConfig::model_rate`],
+    /// until the caller reports less. The connection may be slower than [`HostSessionConfig::model_rate`],
     /// and unsent bytes are held in memory. Default: 0, which stays until the first call.
     pub fn set_unsent(&mut self, peer: PeerId, bytes: usize) {
         if let Some(p) = self.peers.get_mut(&peer) {

@@ -2,11 +2,11 @@
 
 use std::time::Duration;
 
-use pliant_stream::peer::{PeerConfig, PeerSession};
+use pliant_stream::peer::{PeerSession, PeerSessionConfig};
 use pliant_stream::wire::FrameGrab;
 use pliant_stream::{
-    BodyId, Channel, GrabKey, GrabState, GuestConfig, GuestSession, HostConfig, HostSession, PeerId,
-    RecoveryConfig, StepSettings, TickState, UserId,
+    BodyId, Channel, GrabKey, GrabState, GuestSession, GuestSessionConfig, HostSession, HostSessionConfig,
+    PeerId, RecoveryConfig, StepSettings, TickState, UserId,
 };
 
 use super::bar;
@@ -30,10 +30,10 @@ pub fn grab(index: u16) -> FrameGrab {
 /// A connected host and guest without links: each side receives at once what the other sends.
 pub fn session(name: &str) -> (HostSession, GuestSession, Duration) {
     let model = bar(12, 0.05);
-    let mut host = HostSession::new(HostConfig::default()).unwrap();
+    let mut host = HostSession::new(HostSessionConfig::default()).unwrap();
     host.add_body(BODY, "bar", model.clone(), StepSettings::default()).unwrap();
     let recovery = RecoveryConfig::by_name(name).unwrap();
-    let mut guest = GuestSession::new(GuestConfig { recovery, ..Default::default() }, 1200).unwrap();
+    let mut guest = GuestSession::new(GuestSessionConfig { recovery, ..Default::default() }, 1200).unwrap();
     guest.add_cached_model(model);
     let mut now = Duration::ZERO;
     host.connect(now, PeerId(1), 1200).unwrap();
@@ -89,7 +89,7 @@ pub fn random(state: &mut u64) -> u64 {
 pub fn peers(now: Duration) -> Vec<PeerSession> {
     let mut all: Vec<PeerSession> = (0..3)
         .map(|k| {
-            let config = PeerConfig { user: UserId(k + 1), ..Default::default() };
+            let config = PeerSessionConfig { user: UserId(k + 1), ..Default::default() };
             let mut peer = PeerSession::new(config).unwrap();
             peer.add_body(BODY, bar(12, 0.05), &StepSettings::default()).unwrap();
             for other in (0..3).filter(|o| *o != k) {
