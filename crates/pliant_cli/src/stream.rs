@@ -15,7 +15,7 @@ use pliant_modal::{Elasticity, Integrator, ModalModel, Relaxation};
 use pliant_stream::{
     Policy, RecoveryConfig,
     emulator::{LinkConfig, Loss, Preset},
-    peer::Repair,
+    peer::LateInputRepair,
 };
 use serde::Serialize;
 
@@ -143,7 +143,8 @@ fn clock() -> Duration {
 }
 
 /// Names of the peer-to-peer repairs.
-const REPAIRS: [(&str, Repair); 2] = [("rollback", Repair::Rollback), ("compensate", Repair::Compensate)];
+const REPAIRS: [(&str, LateInputRepair); 2] =
+    [("rollback", LateInputRepair::Rollback), ("compensate", LateInputRepair::Compensate)];
 
 pub(crate) fn run(args: &StreamArgs) -> Result<(), CliError> {
     let in_range = |what, value: f64, low, high| {

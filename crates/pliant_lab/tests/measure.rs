@@ -12,7 +12,7 @@ use std::time::{Duration, Instant};
 use pliant_lab::experiment::{Experiment, Metrics};
 use pliant_modal::{Integrator, ModalModel};
 use pliant_stream::emulator::{LinkConfig, Loss, Preset};
-use pliant_stream::peer::Repair;
+use pliant_stream::peer::LateInputRepair;
 use pliant_stream::wire::AccelerationCoding;
 use pliant_stream::{Newmark, Policy, Predict, RecoveryConfig};
 use support::bar;
@@ -65,7 +65,7 @@ fn run(link: &LinkConfig, policy: &str, seconds: f64, seed: u64) -> Metrics {
     e.run().unwrap()
 }
 
-fn run_peers(link: &LinkConfig, repair: Repair, seconds: f64) -> Metrics {
+fn run_peers(link: &LinkConfig, repair: LateInputRepair, seconds: f64) -> Metrics {
     let mut e = Experiment::new(body(), link.clone(), RecoveryConfig::default());
     e.seconds = seconds;
     e.cpu_clock = Some(clock);
@@ -146,11 +146,11 @@ fn burst_is_recovered_within_200_ms_of_the_first_arrival() {
 #[test]
 fn peers_see_one_shape_over_the_papers_worst_network() {
     let link = LinkConfig::preset(Preset::Paper1);
-    let f = run_peers(&link, Repair::Rollback, 30.0);
+    let f = run_peers(&link, LateInputRepair::Rollback, 30.0);
     show("p2p rollback", &f);
     assert!(f.ticks > 1100, "{}", f.ticks);
     assert!(f.rms_percent < 2.0 && f.end_percent < 10.0, "rms {} %, end {} %", f.rms_percent, f.end_percent);
-    assert_eq!(f.hash, run_peers(&link, Repair::Rollback, 30.0).hash, "same seed, same session");
+    assert_eq!(f.hash, run_peers(&link, LateInputRepair::Rollback, 30.0).hash, "same seed, same session");
 }
 
 #[test]
@@ -311,7 +311,9 @@ fn all_policies_side_by_side() {
         for policy in RecoveryConfig::NAMES {
             show(policy, &run(&link, policy, 60.0, 1));
         }
-        for (name, repair) in [("p2p rollback", Repair::Rollback), ("p2p compensated", Repair::Compensate)] {
+        for (name, repair) in
+            [("p2p rollback", LateInputRepair::Rollback), ("p2p compensated", LateInputRepair::Compensate)]
+        {
             show(name, &run_peers(&link, repair, 60.0));
         }
     }

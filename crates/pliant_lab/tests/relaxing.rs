@@ -10,7 +10,7 @@ use pliant_lab::experiment::Experiment;
 use pliant_modal::{Body, BodyConfig, GrabConfig, Integrator, Patch, Relaxation};
 use pliant_stream::codec::encoder::Encoder;
 use pliant_stream::emulator::{LinkConfig, Loss, Preset};
-use pliant_stream::peer::Repair;
+use pliant_stream::peer::LateInputRepair;
 use pliant_stream::recovery::Receiver;
 use pliant_stream::wire::Datagram;
 use pliant_stream::{
@@ -77,7 +77,7 @@ fn peers_step_a_relaxing_body_together() {
     let link = LinkConfig::preset(Preset::Paper2);
     let mut e = Experiment::new(bar(40, 0.05), link, RecoveryConfig::default());
     (e.seconds, e.relaxation) = (15.0, Some(MATERIAL));
-    let f = e.run_peers(Repair::Rollback).unwrap();
+    let f = e.run_peers(LateInputRepair::Rollback).unwrap();
     assert!(f.rms_percent < 2.0, "{} %", f.rms_percent);
 }
 

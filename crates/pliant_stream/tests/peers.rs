@@ -9,7 +9,7 @@ use std::time::Duration;
 
 use pliant_modal::{Body, BodyConfig, GrabConfig, Integrator, ModalModel, Patch, Relaxation};
 use pliant_stream::emulator::{EmulatedLink, LinkConfig, Loss, Preset};
-use pliant_stream::peer::{PeerEvent, PeerSession, PeerSessionConfig, Repair};
+use pliant_stream::peer::{LateInputRepair, PeerEvent, PeerSession, PeerSessionConfig};
 use pliant_stream::wire::{
     Datagram, HeldAt, InputTick, Inputs, NackRun, PROTOCOL_VERSION, PeerBodyState, PeerMessage, StateCheck,
 };
@@ -65,7 +65,7 @@ impl Mesh {
         }
     }
 
-    fn start(&mut self, k: usize, repair: Repair, founds: bool) {
+    fn start(&mut self, k: usize, repair: LateInputRepair, founds: bool) {
         let user = UserId(k as u16 + 1);
         let config = PeerSessionConfig { user, repair, founds, ..Default::default() };
         let mut peer = PeerSession::new(config).unwrap();
@@ -167,7 +167,7 @@ impl Mesh {
 fn three_peers_agree_to_the_bit_under_rollback_over_the_papers_worst_network() {
     let mut mesh = Mesh::new(3, &LinkConfig::preset(Preset::Paper1), 7);
     for k in 0..3 {
-        mesh.start(k, Repair::Rollback, true);
+        mesh.start(k, LateInputRepair::Rollback, true);
     }
     let mut settled: Vec<(u64, Vec<f64>)> = Vec::new();
     for second in 1..=30 {
@@ -205,7 +205,7 @@ fn rollback_is_nearer_than_the_papers_compensation() {
         mesh.run(20 * S);
         mesh.agree(0, 1)
     };
-    let (exact, papers) = (error(Repair::Rollback), error(Repair::Compensate));
+    let (exact, papers) = (error(LateInputRepair::Rollback), error(LateInputRepair::Compensate));
     println!("disagreement: rollback {exact:e}, compensation {papers:e}");
     assert_eq!(exact, 0.0);
     assert!(papers > 0.0 && papers.is_finite());
@@ -225,10 +225,10 @@ fn free_and_relaxing_bodies_agree_to_the_bit_and_late_joiners_with_them() {
         let mut mesh = Mesh::new(3, &LinkConfig::preset(Preset::Paper2), 11);
         mesh.settings = settings;
         mesh.model = if free { loose_bar(24, 0.05) } else { bar(24, 0.05) };
-        mesh.start(0, Repair::Rollback, true);
-        mesh.start(1, Repair::Rollback, true);
+        mesh.start(0, LateInputRepair::Rollback, true);
+        mesh.start(1, LateInputRepair::Rollback, true);
         mesh.run(6 * S);
-        mesh.start(2, Repair::Rollback, false);
+        mesh.start(2, LateInputRepair::Rollback, false);
         mesh.run(14 * S);
         assert_eq!(mesh.agree(0, 1), 0.0, "free {free}, {settings:?}");
         // The received orientation is normalized, so the last bit of the dependent values may
@@ -264,8 +264,8 @@ fn compensation_keeps_a_free_relaxing_body_together() {
     let mut mesh = Mesh::new(2, &LinkConfig::preset(Preset::Paper3), 11);
     mesh.settings.relaxation = Some(Relaxation { ratio: 0.5, time: 0.4 });
     mesh.model = loose_bar(24, 0.05);
-    mesh.start(0, Repair::Compensate, true);
-    mesh.start(1, Repair::Compensate, true);
+    mesh.start(0, LateInputRepair::Compensate, true);
+    mesh.start(1, LateInputRepair::Compensate, true);
     mesh.run(15 * S);
     let all: Vec<&PeerSession> = mesh.peers.iter().flatten().collect();
     let tick = all.iter().map(|p| p.confirmed()).min().unwrap();
@@ -283,7 +283,7 @@ fn compensation_puts_the_history_right_with_the_state_of_now() {
         let mut mesh = Mesh::new(2, &link, 3);
         mesh.model = if free { loose_bar(24, 0.05) } else { bar(24, 0.05) };
         for k in 0..2 {
-            mesh.start(k, Repair::Compensate, true);
+            mesh.start(k, LateInputRepair::Compensate, true);
         }
         for look in 1..=100 {
             mesh.run(50 * MS * look);
@@ -376,9 +376,9 @@ fn asks(p: &mut PeerSession, tick: u16, sequence: u16, check: Option<StateCheck>
 fn peers_with_other_settings_are_turned_away() {
     let link = LinkConfig { delay: 20 * MS, ..Default::default() };
     let mut mesh = Mesh::new(2, &link, 3);
-    mesh.start(0, Repair::Rollback, true);
+    mesh.start(0, LateInputRepair::Rollback, true);
     mesh.settings.stiffness_scale = 2.0;
-    mesh.start(1, Repair::Rollback, true);
+    mesh.start(1, LateInputRepair::Rollback, true);
     mesh.run(S);
     let turned = |k: usize| {
         let away = |e: &(usize, PeerEvent)| matches!(e, (at, PeerEvent::TurnedAway { reason: DisconnectReason::SceneMismatch, .. }) if *at == k);
@@ -390,10 +390,10 @@ fn peers_with_other_settings_are_turned_away() {
 #[test]
 fn late_joiner_takes_the_state_of_another_and_follows() {
     let mut mesh = Mesh::new(3, &LinkConfig::preset(Preset::Paper2), 5);
-    mesh.start(0, Repair::Rollback, true);
-    mesh.start(1, Repair::Rollback, true);
+    mesh.start(0, LateInputRepair::Rollback, true);
+    mesh.start(1, LateInputRepair::Rollback, true);
     mesh.run(10 * S);
-    mesh.start(2, Repair::Rollback, false);
+    mesh.start(2, LateInputRepair::Rollback, false);
     mesh.run(20 * S);
     assert!(mesh.events.contains(&(2, PeerEvent::Started)));
     assert!(mesh.agree(0, 2) < 1e-9, "{}", mesh.agree(0, 2));
@@ -406,7 +406,7 @@ fn late_joiner_takes_the_state_of_another_and_follows() {
 fn those_who_come_before_the_first_step_get_a_state_too() {
     let mut mesh = Mesh::new(3, &LinkConfig::preset(Preset::Lan), 5);
     for peer in 0..3 {
-        mesh.start(peer, Repair::Rollback, peer == 0);
+        mesh.start(peer, LateInputRepair::Rollback, peer == 0);
     }
     mesh.run(3 * S);
     let ticks: Vec<u64> = mesh.peers.iter().flatten().map(PeerSession::tick).collect();
@@ -423,11 +423,11 @@ fn clocks_that_differ_by_years_change_nothing_among_peers() {
     let go = |began: [Duration; 3]| {
         let mut mesh = Mesh::new(3, &LinkConfig::preset(Preset::Paper1), 4);
         mesh.began = began.to_vec();
-        mesh.start(0, Repair::Rollback, true);
-        mesh.start(1, Repair::Rollback, true);
+        mesh.start(0, LateInputRepair::Rollback, true);
+        mesh.start(1, LateInputRepair::Rollback, true);
         mesh.run(4 * S);
         // The third peer joins late, with a clock that is decades off.
-        mesh.start(2, Repair::Rollback, false);
+        mesh.start(2, LateInputRepair::Rollback, false);
         mesh.run(10 * S);
         assert_eq!((mesh.agree(0, 1), mesh.agree(0, 2)), (0.0, 0.0), "to the bit");
         let ticks: Vec<u64> = mesh.peers.iter().flatten().map(PeerSession::tick).collect();
@@ -446,7 +446,7 @@ fn clocks_that_differ_by_years_change_nothing_among_peers() {
 fn a_peer_that_dies_lets_go() {
     let mut mesh = Mesh::new(3, &LinkConfig::preset(Preset::Paper3), 9);
     for k in 0..3 {
-        mesh.start(k, Repair::Rollback, true);
+        mesh.start(k, LateInputRepair::Rollback, true);
     }
     mesh.run(5 * S);
     mesh.peers[2] = None;
@@ -463,7 +463,7 @@ fn a_peer_that_dies_lets_go() {
 fn a_liar_is_not_believed_by_the_lowest_and_cannot_harm() {
     let mut mesh = Mesh::new(2, &LinkConfig { delay: 20 * MS, ..Default::default() }, 9);
     for k in 0..2 {
-        mesh.start(k, Repair::Rollback, true);
+        mesh.start(k, LateInputRepair::Rollback, true);
     }
     mesh.run(5 * S);
     // Peer 2 (number 2) lies to peer 1 about its state, hundreds of times.
@@ -484,7 +484,7 @@ fn a_state_that_nobody_asked_for_is_not_taken() {
     for (liar, victim) in [(1, 0), (0, 1)] {
         let mut mesh = Mesh::new(2, &LinkConfig { delay: 20 * MS, ..Default::default() }, 9);
         for k in 0..2 {
-            mesh.start(k, Repair::Rollback, true);
+            mesh.start(k, LateInputRepair::Rollback, true);
         }
         mesh.run(5 * S);
         let p = mesh.peers[victim].as_mut().unwrap();
@@ -515,7 +515,7 @@ fn a_state_that_nobody_asked_for_is_not_taken() {
 fn the_lowest_number_is_believed_when_it_was_asked() {
     let mut mesh = Mesh::new(2, &LinkConfig { delay: 20 * MS, ..Default::default() }, 9);
     for k in 0..2 {
-        mesh.start(k, Repair::Rollback, true);
+        mesh.start(k, LateInputRepair::Rollback, true);
     }
     mesh.run(5 * S);
     // Checks of the lowest number disagree. The peer requests its state, receives it, and the state
@@ -536,7 +536,7 @@ fn the_lowest_number_is_believed_when_it_was_asked() {
 fn ask_floods_are_answered_within_bounds() {
     let mut mesh = Mesh::new(2, &LinkConfig { delay: 20 * MS, ..Default::default() }, 9);
     for k in 0..2 {
-        mesh.start(k, Repair::Rollback, true);
+        mesh.start(k, LateInputRepair::Rollback, true);
     }
     mesh.run(5 * S);
     let p = mesh.peers[0].as_mut().unwrap();
@@ -730,7 +730,7 @@ fn peers_tell_how_their_paths_do() {
     let link = LinkConfig { loss: Loss::Random(0.1), delay: 40 * MS, ..Default::default() };
     let mut mesh = Mesh::new(2, &link, 5);
     for k in 0..2 {
-        mesh.start(k, Repair::Rollback, true);
+        mesh.start(k, LateInputRepair::Rollback, true);
     }
     mesh.run(40 * S);
     let p = mesh.peers[0].as_mut().unwrap();
@@ -801,7 +801,7 @@ fn a_hands_damper_is_felt_alike_by_the_other_peer() {
         let mut mesh = Mesh::new(2, &link, 11);
         mesh.hold = GrabConfig { stiffness: Some(40.0), relaxation };
         for k in 0..2 {
-            mesh.start(k, Repair::Rollback, true);
+            mesh.start(k, LateInputRepair::Rollback, true);
         }
         mesh.run(6 * S);
         let [a, b] = [0, 1].map(|k| mesh.peers[k].as_ref().unwrap());

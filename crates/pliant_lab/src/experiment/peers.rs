@@ -6,7 +6,7 @@ use std::time::Duration;
 
 use pliant_modal::GrabConfig;
 use pliant_stream::emulator::{EmulatedLink, LinkConfig, Loss};
-use pliant_stream::peer::{PeerSession, PeerSessionConfig, Repair};
+use pliant_stream::peer::{LateInputRepair, PeerSession, PeerSessionConfig};
 use pliant_stream::{Channel, PeerId, StreamError, Tick, UserId};
 
 use super::{BODY, Experiment, Metrics, RECOVERED, ShapeError, fold, norm};
@@ -33,7 +33,7 @@ impl Experiment {
     /// # Errors
     /// Returns [`StreamError::Config`] for settings out of range, and [`StreamError::Model`] when
     /// the body cannot be stepped.
-    pub fn run_peers(&self, repair: Repair) -> Result<Metrics, StreamError> {
+    pub fn run_peers(&self, repair: LateInputRepair) -> Result<Metrics, StreamError> {
         let h = 1.0 / self.rate;
         let settings = self.settings();
         let peer = |number: u16| -> Result<PeerSession, StreamError> {

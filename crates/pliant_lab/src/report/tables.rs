@@ -8,7 +8,7 @@ use pliant_modal::{BodyConfig, Element, Integrator, ModalModel, Patch, Precision
 use pliant_stream::{
     Newmark, Policy, Predict, RecoveryConfig,
     emulator::{LinkConfig, Loss, Preset},
-    peer::Repair,
+    peer::LateInputRepair,
     wire::AccelerationCoding,
 };
 
@@ -95,12 +95,12 @@ pub(super) fn networks(quick: bool, progress: &mut dyn Progress) -> Result<(Vec<
     let _pinned = Pinned::new();
     let (mut over_bytes, mut over_time) = (Vec::new(), Vec::new());
     let mut table = "| network | repair | rms % | largest % | ticks missing | kbit/s | processor us a tick |\n| --- | --- | --- | --- | --- | --- | --- |\n".to_owned();
-    let mut ways: Vec<(&str, RecoveryConfig, Option<Repair>)> = RecoveryConfig::NAMES
+    let mut ways: Vec<(&str, RecoveryConfig, Option<LateInputRepair>)> = RecoveryConfig::NAMES
         .into_iter()
         .map(|name| (name, RecoveryConfig::by_name(name).unwrap_or_default(), None))
         .collect();
-    ways.push(("peers, rollback", RecoveryConfig::default(), Some(Repair::Rollback)));
-    ways.push(("peers, compensate", RecoveryConfig::default(), Some(Repair::Compensate)));
+    ways.push(("peers, rollback", RecoveryConfig::default(), Some(LateInputRepair::Rollback)));
+    ways.push(("peers, compensate", RecoveryConfig::default(), Some(LateInputRepair::Compensate)));
     let count = ways.len() as f64;
     for (done, (name, recovery, between_peers)) in ways.into_iter().enumerate() {
         let (mut bytes, mut time) = (Vec::new(), Vec::new());

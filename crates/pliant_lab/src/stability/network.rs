@@ -7,7 +7,7 @@ use pliant_modal::Integrator;
 use pliant_stream::{
     Policy, RecoveryConfig,
     emulator::{LinkConfig, Loss, Preset},
-    peer::Repair,
+    peer::LateInputRepair,
 };
 
 use super::{Bound, Case, CaseOutcome, Expected, bodies::BarBody};
@@ -111,7 +111,7 @@ fn words(f: &Metrics) -> String {
 }
 
 fn peers(link: &LinkConfig) -> Result<CaseOutcome, LabError> {
-    let f = experiment(link, 40.0, RecoveryConfig::default())?.run_peers(Repair::Rollback)?;
+    let f = experiment(link, 40.0, RecoveryConfig::default())?.run_peers(LateInputRepair::Rollback)?;
     Ok(CaseOutcome::of(vec![
         Bound::new(RMS, f.rms_percent, 2.0),
         // A peer with steps of 25 ms that wakes every 5 ms is on time or one wake-up late.

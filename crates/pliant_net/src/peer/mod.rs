@@ -15,7 +15,7 @@ use std::time::{Duration, Instant};
 
 use bevy::prelude::*;
 use pliant_body::{BodyState, Driven, ModalBody};
-use pliant_stream::peer::{PeerSession, PeerSessionConfig, Repair};
+use pliant_stream::peer::{LateInputRepair, PeerSession, PeerSessionConfig};
 use pliant_stream::{BodyId, DisconnectReason, LinkStats, PeerId, UserId};
 
 use crate::metrics::{Ledger, NetStats};
@@ -45,8 +45,8 @@ pub struct PeerConfig {
     /// Where this peer listens, its key, who may join through it, limits, and the emulated link on
     /// all its connections.
     pub transport: HostOptions,
-    /// How the session corrects for late hands. Default: [`Repair::Rollback`].
-    pub repair: Repair,
+    /// How the session corrects for late hands. Default: [`LateInputRepair::Rollback`].
+    pub repair: LateInputRepair,
     /// How long this peer tries to reconnect to a peer that was lost without a goodbye, at the
     /// address where that peer last listened. Of the two peers, the one with the higher number
     /// connects and takes over the other's state. Zero: it does not try. Default: 60 s.
@@ -59,7 +59,7 @@ impl Default for PeerConfig {
             name: "peer".into(),
             join: None,
             transport: HostOptions::default(),
-            repair: Repair::default(),
+            repair: LateInputRepair::default(),
             rejoin: Duration::from_secs(60),
         }
     }

@@ -17,7 +17,7 @@ use crate::wire::{HeldAt, PeerBodyState, PeerFrame, PeerGrip};
 
 /// Correction of the state for a late input.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
-pub enum Repair {
+pub enum LateInputRepair {
     /// Rolls back to the tick before the input and steps again with all known inputs. This is
     /// exact, and the default.
     #[default]
@@ -38,7 +38,7 @@ pub struct PeerBody {
     forecast: Forecast,
     newmark: Newmark,
     flow: Option<FlowFilter>,
-    repair: Repair,
+    repair: LateInputRepair,
     rollback: Rollback,
     /// The inputs of the last step, and those that each tick was stepped with.
     held: Vec<(UserId, HeldAt)>,
@@ -54,7 +54,7 @@ impl PeerBody {
         model: Arc<ModalModel>,
         settings: &StepSettings,
         h: f64,
-        repair: Repair,
+        repair: LateInputRepair,
         blend_ticks: u16,
     ) -> Result<Self, StreamError> {
         let replica = Replica::new(model.clone(), *settings, model.mode_count(), h)?;
@@ -246,14 +246,14 @@ impl PeerBody {
         }
         let before = self.live().clone();
         match self.repair {
-            Repair::Rollback => {
+            LateInputRepair::Rollback => {
                 self.rollback.back_to(base);
                 while self.tick() < to {
                     self.step_once(inputs);
                     self.restepped += 1;
                 }
             }
-            Repair::Compensate => self.compensate(from, inputs),
+            LateInputRepair::Compensate => self.compensate(from, inputs),
         }
         self.visual.add(&self.model, &before, &self.rollback.now.state);
         true

@@ -2,7 +2,7 @@
 
 use std::time::Duration;
 
-use super::body::Repair;
+use super::body::LateInputRepair;
 use crate::session::DisconnectReason;
 use crate::state::{PeerId, UserId};
 
@@ -20,8 +20,8 @@ pub struct PeerSessionConfig {
     pub address: String,
     /// Length of a step, s. Default: 1/40.
     pub step: f64,
-    /// Repair of late inputs. Default: [`Repair::Rollback`].
-    pub repair: Repair,
+    /// LateInputRepair of late inputs. Default: [`LateInputRepair::Rollback`].
+    pub repair: LateInputRepair,
     /// Number of ticks over which the visible error fades. Default: 6.
     pub blend_ticks: u16,
     /// Number of earlier ticks that each datagram repeats, at most 15. Default: 4.
@@ -40,7 +40,7 @@ impl Default for PeerSessionConfig {
             name: "peer".into(),
             address: String::new(),
             step: 1.0 / 40.0,
-            repair: Repair::default(),
+            repair: LateInputRepair::default(),
             blend_ticks: 6,
             repeats: 4,
             idle_timeout: Duration::from_secs(10),
