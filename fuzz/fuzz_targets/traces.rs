@@ -4,10 +4,10 @@
 use std::time::Duration;
 
 use libfuzzer_sys::fuzz_target;
-use pliant_stream::emulator::{Loss, Trace};
+use pliant_stream::emulator::{Loss, PathTrace};
 
 fuzz_target!(|bytes: &[u8]| {
     let Ok(text) = std::str::from_utf8(bytes) else { return };
-    let _ = Trace::parse(text);
+    let _ = PathTrace::parse(text);
     let _ = Loss::parse(text, 1, Duration::from_millis(25));
 });

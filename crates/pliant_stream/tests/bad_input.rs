@@ -9,7 +9,7 @@ use std::time::Duration;
 
 use pliant_modal::{GrabConfig, ModalModel, Relaxation};
 use pliant_stream::codec::quantization::Quanta;
-use pliant_stream::emulator::{Loss, Trace};
+use pliant_stream::emulator::{Loss, PathTrace};
 use pliant_stream::wire::{
     AccelerationCoding, Accelerations, BodyInfo, Clock, Datagram, FrameGrab, GuestMessage, HeldAt,
     HostMessage, InputTick, Inputs, Nack, NackRun, PeerBodyState, PeerFrame, PeerGrip, PeerMessage, Repeat,
@@ -319,7 +319,7 @@ fn parse_all(bytes: &[u8]) -> u32 {
         assert_eq!(PeerMessage::decode(&m.encode()), Ok(m));
     }
     if let Ok(text) = std::str::from_utf8(bytes) {
-        read += u32::from(Trace::parse(text).is_ok());
+        read += u32::from(PathTrace::parse(text).is_ok());
         read += u32::from(Loss::parse(text, 1, Duration::from_millis(25)).is_ok());
     }
     read + u32::from(ModalModel::from_bytes(bytes).is_ok())

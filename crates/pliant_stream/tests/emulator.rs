@@ -3,7 +3,7 @@
 
 use std::time::Duration;
 
-use pliant_stream::emulator::{EmulatedLink, LinkConfig, Loss, Preset, Trace};
+use pliant_stream::emulator::{EmulatedLink, LinkConfig, Loss, PathTrace, Preset};
 
 const MS: Duration = Duration::from_millis(1);
 
@@ -133,13 +133,13 @@ fn same_seed_same_hash_and_other_seed_another() {
 
 #[test]
 fn a_trace_is_played_packet_by_packet() {
-    let trace = Trace::parse("# recorded\n10\nlost\n 20.5 # slow\n").unwrap();
+    let trace = PathTrace::parse("# recorded\n10\nlost\n 20.5 # slow\n").unwrap();
     let (arrived, _) = run(LinkConfig { trace: Some(trace), ..Default::default() }, 1, 4, 100 * MS, 10);
     let want = [(0, 10_000), (2, 220_500), (3, 310_000)];
     assert_eq!(arrived, want.map(|(k, us)| (k, Duration::from_micros(us))));
-    assert!(Trace::parse("").is_err());
-    assert!(Trace::parse("NaN").is_err());
-    assert!(Trace::parse("-1").is_err());
+    assert!(PathTrace::parse("").is_err());
+    assert!(PathTrace::parse("NaN").is_err());
+    assert!(PathTrace::parse("-1").is_err());
 }
 
 #[test]

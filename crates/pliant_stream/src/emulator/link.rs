@@ -7,7 +7,7 @@ use std::time::Duration;
 use rand_core::{Rng, SeedableRng};
 use rand_pcg::Pcg64Mcg;
 
-use super::{Loss, Trace};
+use super::{Loss, PathTrace};
 use crate::StreamError;
 
 /// Most packets in flight. Further packets are dropped as lost.
@@ -39,7 +39,7 @@ pub struct LinkConfig {
     /// Header bytes that each packet adds to its payload: 28 for IPv4 and UDP. Default: 28.
     pub overhead_bytes: usize,
     /// A recorded path that replaces `delay`, `jitter` and `loss`. Default: `None`.
-    pub trace: Option<Trace>,
+    pub trace: Option<PathTrace>,
 }
 
 impl Default for LinkConfig {

@@ -186,11 +186,11 @@ pub struct TraceEntry {
 
 /// A recorded path. It is replayed packet by packet and repeats from the start.
 #[derive(Debug, Clone, PartialEq, Eq)]
-pub struct Trace {
+pub struct PathTrace {
     entries: Arc<[TraceEntry]>,
 }
 
-impl Trace {
+impl PathTrace {
     /// Creates a trace from at least one entry.
     ///
     /// # Errors

@@ -22,5 +22,5 @@ mod loss;
 mod preset;
 
 pub use link::{EmulatedLink, LinkConfig, LinkCounts};
-pub use loss::{Loss, Trace, TraceEntry};
+pub use loss::{Loss, PathTrace, TraceEntry};
 pub use preset::Preset;
