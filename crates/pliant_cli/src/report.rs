@@ -3,7 +3,7 @@
 use std::path::PathBuf;
 
 use clap::Args;
-use pliant_lab::report::{Part, Settings, write};
+use pliant_lab::report::{Part, ReportSettings, write};
 
 use crate::{CliError, output, progress::Bar};
 
@@ -47,7 +47,7 @@ impl ReportArgs {
 }
 
 pub(crate) fn run(args: &ReportArgs) -> Result<(), CliError> {
-    let settings = Settings {
+    let settings = ReportSettings {
         parts: args.parts()?,
         quick: args.quick,
         models: args.models.clone(),

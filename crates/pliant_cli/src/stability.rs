@@ -4,7 +4,7 @@
 use std::fmt::Write;
 
 use clap::Args;
-use pliant_lab::stability::{self, Report, Settings};
+use pliant_lab::stability::{self, StabilityReport, StabilitySettings};
 
 use crate::{CliError, output, progress::Bar};
 
@@ -25,7 +25,7 @@ pub(crate) struct StabilityArgs {
 }
 
 pub(crate) fn run(args: &StabilityArgs) -> Result<(), CliError> {
-    let settings = Settings { only: args.only.clone(), short: args.short, threads: args.threads };
+    let settings = StabilitySettings { only: args.only.clone(), short: args.short, threads: args.threads };
     let report = stability::run(&settings, &mut Bar::new())?;
     if report.cases.is_empty() {
         let got = args.only.clone().unwrap_or_default();
@@ -43,7 +43,7 @@ pub(crate) fn run(args: &StabilityArgs) -> Result<(), CliError> {
     }
 }
 
-fn table(report: &Report) -> String {
+fn table(report: &StabilityReport) -> String {
     let mut text = String::new();
     let mut group = "";
     for case in &report.cases {

@@ -12,8 +12,9 @@ use pliant_stream::codec::quantization::Quanta;
 use pliant_stream::emulator::{Loss, PathTrace};
 use pliant_stream::wire::{
     AccelerationCoding, Accelerations, BodyInfo, Clock, Datagram, FrameGrab, GuestMessage, HeldAt,
-    HostMessage, InputTick, Inputs, Nack, NackRun, PeerBodyState, PeerFrame, PeerGrip, PeerMessage, Repeat,
-    RepeatGrab, Report, Slice, SliceEntry, SnapshotBytes, StateCheck, TargetEntry, Targets, TickFrame,
+    HostMessage, InputTick, Inputs, Nack, NackRun, PeerBodyState, PeerFrame, PeerGrip, PeerMessage,
+    ReceiverReport, Repeat, RepeatGrab, Slice, SliceEntry, SnapshotBytes, StateCheck, TargetEntry, Targets,
+    TickFrame,
 };
 use pliant_stream::{
     BodyId, Channel, DisconnectReason, GuestEvent, GuestSession, GuestSessionConfig, HostEvent, HostSession,
@@ -69,7 +70,7 @@ fn samples() -> Vec<Datagram> {
             accelerations: (payload == 1).then(|| quantised(AccelerationCoding::Visible, &[1.0, 0.0, 0.0])),
         }],
     };
-    let report = Report { received: 10, highest: 12 };
+    let report = ReceiverReport { received: 10, highest: 12 };
     vec![
         Datagram::Frame(frame(0)),
         Datagram::Frame(frame(1)),

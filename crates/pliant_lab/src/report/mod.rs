@@ -109,7 +109,7 @@ impl Part {
 
 /// Settings of the report.
 #[derive(Debug, Clone)]
-pub struct Settings {
+pub struct ReportSettings {
     /// Parts to write, in this order.
     pub parts: Vec<Part>,
     /// Use fewer points and shorter timings.
@@ -146,7 +146,11 @@ pub struct Report {
 /// # Errors
 /// Returns [`LabError::Write`] or [`LabError::Plot`] for files, and the other errors for
 /// measurements that fail.
-pub fn write(folder: &Path, settings: &Settings, progress: &mut dyn Progress) -> Result<Report, LabError> {
+pub fn write(
+    folder: &Path,
+    settings: &ReportSettings,
+    progress: &mut dyn Progress,
+) -> Result<Report, LabError> {
     std::fs::create_dir_all(folder)?;
     let began = Instant::now();
     let mut text = heading();
@@ -184,10 +188,10 @@ pub fn write(folder: &Path, settings: &Settings, progress: &mut dyn Progress) ->
 
 fn measure(
     part: Part,
-    settings: &Settings,
+    settings: &ReportSettings,
     progress: &mut dyn Progress,
 ) -> Result<(Vec<Figure>, String), LabError> {
-    let Settings { quick, models, own, .. } = settings;
+    let ReportSettings { quick, models, own, .. } = settings;
     let quick = *quick;
     Ok(match part {
         Part::Elements => (physics::elements(quick)?, String::new()),

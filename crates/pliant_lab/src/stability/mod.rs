@@ -32,7 +32,7 @@ const MOST_THREADS: usize = 64;
 
 /// Settings of a run.
 #[derive(Debug, Clone, Default)]
-pub struct Settings {
+pub struct StabilitySettings {
     /// Run only cases whose group or name contains this text. Default: all.
     pub only: Option<String>,
     /// Run one case in eight. Default: false.
@@ -185,14 +185,14 @@ impl Verdict {
 
 /// The verdicts of all cases.
 #[derive(Serialize, Debug, Clone)]
-pub struct Report {
+pub struct StabilityReport {
     /// The cases in the order of the matrix.
     pub cases: Vec<Verdict>,
     /// Run time of all cases, s.
     pub seconds: f64,
 }
 
-impl Report {
+impl StabilityReport {
     /// Number of broken cases.
     pub fn broken(&self) -> usize {
         self.cases.iter().filter(|case| case.broken()).count()
@@ -217,7 +217,7 @@ fn all() -> Vec<Case> {
 /// # Errors
 /// Returns [`LabError::Threads`] if the threads cannot be started. Errors within a case become its
 /// verdict.
-pub fn run(settings: &Settings, progress: &mut dyn Progress) -> Result<Report, LabError> {
+pub fn run(settings: &StabilitySettings, progress: &mut dyn Progress) -> Result<StabilityReport, LabError> {
     let began = Instant::now();
     let wanted = |case: &Case| {
         settings
@@ -254,7 +254,7 @@ pub fn run(settings: &Settings, progress: &mut dyn Progress) -> Result<Report, L
             })
             .collect()
     });
-    Ok(Report { cases, seconds: began.elapsed().as_secs_f64() })
+    Ok(StabilityReport { cases, seconds: began.elapsed().as_secs_f64() })
 }
 
 fn judge(case: &Case) -> Verdict {

@@ -15,7 +15,7 @@ pub use stats::LinkStats;
 
 use crate::session::{Channel, Output};
 use crate::state::PeerId;
-use crate::wire::{Clock, Report};
+use crate::wire::{Clock, ReceiverReport};
 use round_trip::RoundTrip;
 use tally::{DatagramArrival, Tally, loss_of};
 
@@ -107,7 +107,7 @@ impl Link {
     }
 
     /// Stores the other side's report on the datagrams sent from here.
-    pub(crate) fn take_report(&mut self, report: Report) {
+    pub(crate) fn take_report(&mut self, report: ReceiverReport) {
         self.stats.loss_out = loss_of(report);
     }
 

@@ -1,6 +1,6 @@
 //! Loss statistics from sequence numbers.
 
-use crate::wire::Report;
+use crate::wire::ReceiverReport;
 
 /// Classifies a datagram by its sequence number.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -56,9 +56,9 @@ impl Tally {
         DatagramArrival::New
     }
 
-    pub(crate) fn report(&self) -> Report {
+    pub(crate) fn report(&self) -> ReceiverReport {
         let sent = if self.started { self.highest + 1 - self.first } else { 0 };
-        Report { received: self.received as u32, highest: sent as u32 }
+        ReceiverReport { received: self.received as u32, highest: sent as u32 }
     }
 
     /// Share of the datagrams up to the highest number that did not arrive.
@@ -68,7 +68,7 @@ impl Tally {
 }
 
 /// Returns the lost share according to a report.
-pub(crate) fn loss_of(report: Report) -> f64 {
+pub(crate) fn loss_of(report: ReceiverReport) -> f64 {
     if report.highest == 0 {
         0.0
     } else {

@@ -57,7 +57,7 @@ pub struct Targets {
 
 /// Counts of what one side received, from which the other side computes its outgoing loss.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
-pub struct Report {
+pub struct ReceiverReport {
     /// Datagrams received since the session began (low 32 bits).
     pub received: u32,
     /// Number of datagrams up to the highest sequence number seen (low 32 bits).
@@ -75,7 +75,7 @@ pub struct Clock {
     /// Host's clock when the host sends, us.
     pub t3: u64,
     /// Report on what the sender of this datagram has received.
-    pub report: Report,
+    pub report: ReceiverReport,
     /// The last round trip that the guest measured, us; 0 before the first.
     pub round_trip: u32,
 }
@@ -217,8 +217,8 @@ impl Datagram {
     }
 }
 
-fn report(r: &mut Reader<'_>) -> Result<Report, StreamError> {
-    Ok(Report { received: r.u32("report received")?, highest: r.u32("report highest")? })
+fn report(r: &mut Reader<'_>) -> Result<ReceiverReport, StreamError> {
+    Ok(ReceiverReport { received: r.u32("report received")?, highest: r.u32("report highest")? })
 }
 
 fn encode_runs(runs: &[NackRun], w: &mut Writer) {

@@ -15,7 +15,7 @@ mod peer_message;
 mod slice;
 
 pub(crate) use bytes::{Reader, WIDE_LIMIT, Writer, round24};
-pub use datagram::{Clock, Datagram, Nack, NackRun, Report, TargetEntry, Targets};
+pub use datagram::{Clock, Datagram, Nack, NackRun, ReceiverReport, TargetEntry, Targets};
 pub(crate) use datagram::{MAX_NACK_RUN, MAX_NACK_RUNS, MAX_TARGETS};
 pub(crate) use frame::MAX_PARTS;
 pub use frame::{AccelerationCoding, Accelerations, FrameGrab, Repeat, RepeatGrab, TickFrame};
