@@ -58,7 +58,7 @@ pub struct Experiment {
     /// losses count from the end of this time. Default: 2 s.
     pub warmup: Duration,
     /// The scripted hands. Default: [`Experiment::default_hands`].
-    pub hands: Vec<Hand>,
+    pub hands: Vec<HandScript>,
     /// See [`HostSessionConfig::quantum`]. Default: 2^-14.
     pub quantum: f64,
     /// Clock for the time that decoding, correcting and stepping take. `None` leaves
@@ -76,7 +76,7 @@ pub struct Experiment {
 /// A scripted hand. It circles about the start of its grab on a smooth path that never repeats,
 /// with a small tremor.
 #[derive(Debug, Clone, Copy, PartialEq)]
-pub struct Hand {
+pub struct HandScript {
     /// Center of the patch.
     pub vertex: u32,
     /// Radius of the patch, m.
@@ -91,7 +91,7 @@ pub struct Hand {
     pub holds: Option<(f64, f64)>,
 }
 
-impl Hand {
+impl HandScript {
     /// Displacement of the hand from the start of its grab, m, `t` seconds after it.
     pub fn path(&self, t: f64) -> [f64; 3] {
         let w = std::f64::consts::TAU * self.frequency * t;
@@ -210,7 +210,7 @@ impl Experiment {
     /// Two hands that drag slowly. The first holds where the first mode moves most. The second
     /// holds at least 0.4 of the body's size away from it, where the first mode moves most there.
     /// The largest speed is about a tenth of the body's size a second.
-    pub fn default_hands(model: &ModalModel) -> Vec<Hand> {
+    pub fn default_hands(model: &ModalModel) -> Vec<HandScript> {
         let positions = model.surface().positions();
         let size = model.size();
         let moves =
@@ -224,7 +224,7 @@ impl Experiment {
                 .filter(|v| far_from.is_none() || distance(*v) > 0.4 * size)
                 .max_by(|a, b| moves(*a).total_cmp(&moves(*b)))
         };
-        let hand = |vertex: usize, frequency, reach: [f64; 3]| Hand {
+        let hand = |vertex: usize, frequency, reach: [f64; 3]| HandScript {
             vertex: vertex as u32,
             radius: 0.06 * size,
             reach: reach.map(|r| r * size),

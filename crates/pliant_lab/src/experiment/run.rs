@@ -9,14 +9,14 @@ use pliant_stream::{
     GrabKey, GrabState, GuestSession, HostEvent, HostSession, Policy, Pose, TickState, UserId,
 };
 
-use super::{BODY, Experiment, Hand, Metrics, RECOVERED, ShapeError, fold, norm};
+use super::{BODY, Experiment, HandScript, Metrics, RECOVERED, ShapeError, fold, norm};
 use crate::pair::World;
 
 /// True states kept for comparison, ticks.
 const KEPT: usize = 4096;
 
 struct ExperimentGrab {
-    hand: Hand,
+    hand: HandScript,
     grab: Option<(GrabId, [f64; 3], f64)>,
 }
 
@@ -37,7 +37,7 @@ pub(super) struct Run {
     track_row: Vec<f64>,
     keep_track: bool,
     /// The guest's hand, and its grab once it has begun.
-    guest_hand: Option<(Hand, Option<u16>)>,
+    guest_hand: Option<(HandScript, Option<u16>)>,
     /// Time at which the guest last sent its target.
     guest_sent: Duration,
     predict_own_hand: bool,
