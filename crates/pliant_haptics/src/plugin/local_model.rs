@@ -10,9 +10,11 @@ use pliant_modal::{BodyConfig, GrabConfig, GrabId, ModalModel, Patch};
 use super::{HapticDevices, HapticTool, ToolGrabs, ToolOffset};
 use crate::{Coupling, HeldGrab, LocalModel, MAX_CONTACTS, ModalLocal, PublishedGrab};
 
-/// Time without a new state after which a body that is stepped elsewhere counts as lost, s: four of
-/// its ticks at 40 Hz.
-const REMOTE_PATIENCE: f64 = 0.1;
+/// Number of missing states in a row after which a body that is stepped elsewhere counts as lost.
+const MISSING_STATES: f64 = 4.0;
+/// Bounds of the time that this is, s. The lower one is four ticks at 40 Hz, and after the upper
+/// one a session's guest stands still by itself.
+const PATIENCE: [f64; 2] = [0.1, 0.5];
 
 type HeldItem<'w> = (Entity, &'w GrabOf, &'w Grab, &'w GrabForce, Option<&'w ToolOffset>);
 type HeldGrabs<'w, 's> =
@@ -61,9 +63,32 @@ struct Spring {
 #[derive(Default)]
 pub(crate) struct Elsewhere {
     springs: Vec<(Entity, Spring)>,
-    /// Version of the held bodies' visual states, and the time of its last change, s.
+    arrivals: Arrivals,
+}
+
+/// Arrivals of new states of bodies that are stepped elsewhere.
+#[derive(Default)]
+struct Arrivals {
+    /// Version of the visual states, and the time of its last change, s.
     version: u64,
     at: f64,
+    /// Smoothed time between changes, s. It follows the rate at which the states come.
+    interval: f64,
+}
+
+impl Arrivals {
+    /// Returns whether a state has arrived recently, given the present version.
+    fn are_recent(&mut self, version: u64, now: f64) -> bool {
+        let patience = (MISSING_STATES * self.interval).clamp(PATIENCE[0], PATIENCE[1]);
+        let since = now - self.at;
+        if version != self.version {
+            (self.version, self.at) = (version, now);
+            // A silence is not an interval, so it counts only as far as it was waited for.
+            self.interval += 0.1 * (since.clamp(0.0, patience) - self.interval);
+            return true;
+        }
+        since <= patience
+    }
 }
 
 impl Elsewhere {
@@ -76,10 +101,7 @@ impl Elsewhere {
         }
         let version =
             remote.fold(1u64, |sum, (.., shown, _)| sum.wrapping_mul(31).wrapping_add(shown.version()));
-        if version != self.version {
-            (self.version, self.at) = (version, now);
-        }
-        now - self.at <= REMOTE_PATIENCE
+        self.arrivals.are_recent(version, now)
     }
 
     /// Returns the stiffness of the spring that ties a patch to the hand, N/m, body axes. The
@@ -244,4 +266,26 @@ fn single_body<'a>(held: &[HeldItem], bodies: &'a Bodies) -> Option<(&'a BodySta
         Some(HeldGrab { key: key(*entity, of), id, offset: offset.map_or(DVec3::ZERO, |o| o.0).into() })
     });
     Some((state, ids.collect::<Option<Vec<_>>>()?))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::Arrivals;
+
+    /// Returns how long states that have come at `hz` may be missing, s, in steps of 1 ms.
+    fn patience(hz: f64) -> f64 {
+        let (mut arrivals, mut now) = (Arrivals::default(), 0.0);
+        for version in 1..=300 {
+            now = f64::from(version as u32) / hz;
+            arrivals.are_recent(version, now);
+        }
+        (1..2000).map(|ms| 1e-3 * f64::from(ms)).find(|t| !arrivals.are_recent(300, now + t)).unwrap()
+    }
+
+    #[test]
+    fn a_body_is_lost_after_four_missing_states() {
+        for (hz, expected) in [(120.0, 0.1), (40.0, 0.1), (20.0, 0.2), (10.0, 0.4), (4.0, 0.5)] {
+            assert!((patience(hz) - expected).abs() < 2e-3, "{} s at {hz} Hz", patience(hz));
+        }
+    }
 }
