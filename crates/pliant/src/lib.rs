@@ -96,7 +96,12 @@ pub use pliant_rerun as rerun;
 #[cfg(feature = "net")]
 pub use pliant_stream as stream;
 
+#[cfg(all(feature = "panel", feature = "rerun"))]
+mod recording_panel;
 pub mod scene;
+
+#[cfg(all(feature = "panel", feature = "rerun"))]
+pub use recording_panel::RecordingPanelPlugin;
 
 /// The plugins that a scene with soft bodies needs.
 ///
@@ -138,6 +143,8 @@ impl PluginGroup for PliantPlugins {
         let group = group.add(body::PointerGrabPlugin);
         #[cfg(feature = "contact")]
         let group = group.add(contact::ContactPlugin::new(self.schedule));
+        #[cfg(all(feature = "panel", feature = "rerun"))]
+        let group = group.add(RecordingPanelPlugin);
         group
     }
 }

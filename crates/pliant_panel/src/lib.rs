@@ -24,7 +24,8 @@
 //!
 //! # Features
 //!
-//! `net`, `haptics`, `rerun`: the sections for the session, the devices and the recording.
+//! `net`, `haptics`: the sections for the session and the devices. The section for a recording
+//! appears with the resource [`PanelRecording`], which `pliant` keeps for the rerun viewer.
 #![cfg_attr(
     test,
     allow(clippy::unwrap_used, clippy::expect_used, clippy::panic, reason = "a failed test should panic")
@@ -40,5 +41,5 @@ pub mod time;
 mod trace;
 
 pub use bevy_egui::{self, egui};
-pub use plugin::{Panel, PanelPlugin, PanelSection, wants_keyboard, wants_pointer};
+pub use plugin::{Panel, PanelPlugin, PanelRecording, PanelSection, wants_keyboard, wants_pointer};
 pub use trace::{Trace, plot};

@@ -1,11 +1,11 @@
-//! The recording for the rerun viewer.
+//! The recording of what happens.
 
 use bevy_egui::egui::Ui;
 
 use crate::{knob::knob, trace::short};
 
 /// The recording as the panel shows it.
-#[derive(Debug, Clone, Default)]
+#[derive(Debug, Clone, PartialEq, Default)]
 pub struct RecordingView {
     /// Whether data is recorded. A knob.
     pub on: bool,

@@ -14,6 +14,8 @@ mod session;
 use bevy::prelude::*;
 use bevy_egui::{EguiContexts, EguiPlugin, EguiPrimaryContextPass, egui, input::EguiWantsInput};
 
+use crate::recording::{self, RecordingView};
+
 /// Shows the panel as a window over the scene. Adds [`EguiPlugin`] if it is missing.
 #[derive(Debug, Clone, Copy)]
 pub struct PanelPlugin {
@@ -37,7 +39,7 @@ pub enum PanelSection {
     Session,
     /// Haptic devices.
     Devices,
-    /// The recording for the rerun viewer.
+    /// The recording, see [`PanelRecording`].
     Recording,
 }
 
@@ -68,6 +70,11 @@ impl Default for Panel {
         Self { open: true, zoom: 1.0, key: KeyCode::F1, only: None }
     }
 }
+
+/// The recording that the panel shows. Whoever records inserts it, keeps it up to date, and applies
+/// the knobs that the panel changes. Without it the panel has no such section.
+#[derive(Resource, Debug, Clone, PartialEq, Default, Deref, DerefMut)]
+pub struct PanelRecording(pub RecordingView);
 
 impl Plugin for PanelPlugin {
     fn build(&self, app: &mut App) {
@@ -123,7 +130,7 @@ fn draw(
     mut scene: scene::SceneParam,
     #[cfg(feature = "net")] mut session: session::Session,
     #[cfg(feature = "haptics")] mut devices: devices::Devices,
-    #[cfg(feature = "rerun")] mut recording: scene::Recording,
+    mut recording: Option<ResMut<PanelRecording>>,
 ) -> Result {
     let context = contexts.ctx_mut()?.clone();
     if context.zoom_factor() != panel.zoom && panel.zoom.is_finite() {
@@ -163,9 +170,8 @@ fn draw(
                     if devices.are_there() {
                         section(ui, PanelSection::Devices, &mut |ui| devices.show(ui));
                     }
-                    #[cfg(feature = "rerun")]
-                    if recording.is_there() {
-                        section(ui, PanelSection::Recording, &mut |ui| recording.show(ui));
+                    if let Some(recording) = &mut recording {
+                        section(ui, PanelSection::Recording, &mut |ui| recording::show(ui, recording));
                     }
                     ui.weak(format!("{:?} opens and closes", panel.key));
                 },
