@@ -166,6 +166,30 @@ fn who_connects_and_does_not_say_who_it_is_keeps_no_place() {
 }
 
 /// A link that loses all packets in both directions.
+#[test]
+fn who_says_hello_and_then_nothing_keeps_no_place() {
+    let _alone = alone();
+    let limits = Limits { idle_timeout: Duration::from_secs(4), ..limits() };
+    let (mut a, invite) = first(Access::Anyone, limits);
+    let hello = hello(&a, 0, &invite);
+    let (mut caller, mut said) = (UnauthenticatedPeer::at(&invite), false);
+    run_until(&mut [&mut a], "it gets a number", |apps| {
+        caller.listen();
+        if caller.connected && !said {
+            caller.endpoint.send_message(PeerId::HOST, hello.clone()).unwrap();
+            said = true;
+        }
+        caller.welcomed() && users(apps[0]) == 2
+    });
+    // Its connection stays open, because the transport keeps it alive.
+    run_until(&mut [&mut a], "it is hung up on", |_| {
+        caller.listen();
+        caller.closed.is_some()
+    });
+    assert_eq!(caller.closed, Some(DisconnectReason::Silent));
+    assert_eq!(users(&mut a), 1);
+}
+
 fn cut() -> Option<Emulation> {
     let link = LinkConfig { loss: Loss::Random(1.0), ..LinkConfig::default() };
     Some(Emulation { outgoing: link.clone(), incoming: link, seed: 1 })
@@ -233,12 +257,13 @@ fn asking(door: &Endpoint) -> Option<PeerId> {
 const CALLS: u16 = 20;
 
 /// Creates a peer that has just been admitted and has received the invites of [`CALLS`] other
-/// peers. The peer at `door` admits it and keeps listening.
-fn calling(door: &Endpoint, silent: &UdpSocket, limits: Limits) -> App {
+/// peers and of the one at `mute`. The peer at `door` admits it and keeps listening.
+fn calling(door: &Endpoint, silent: &UdpSocket, mute: &Endpoint, limits: Limits) -> App {
     let mut app = peer("caller", Some(door.invite()), Access::Anyone, limits);
     let asks = run_until(&mut [&mut app], "it asks to come in", |_| asking(door));
     let words = Invite::new(silent.local_addr().unwrap(), Fingerprint([7; 32])).to_string();
-    let others = (0..CALLS).map(|number| (2 + number, words.clone())).collect();
+    let mute = (2 + CALLS, mute.invite().to_string());
+    let others = (0..CALLS).map(|number| (2 + number, words.clone())).chain([mute]).collect();
     admit(&app, door, asks, 100, others);
     // The peer connects to the others in the frame in which it is admitted.
     run_until(&mut [&mut app], "it gets in", |apps| {
@@ -256,25 +281,29 @@ fn calls_in_vain_freeze_no_frame_and_an_end_waits_for_all_of_them_at_once() {
     let _alone = alone();
     let door = Endpoint::host(HostOptions::default()).unwrap();
     let silent = UdpSocket::bind("127.0.0.1:0").unwrap();
+    // This one is reached, and does not answer the hello.
+    let mute = Endpoint::host(HostOptions::default()).unwrap();
     // A connection attempt that blocks a frame freezes it for a second each time. A busy machine
     // also freezes a frame now and then, so the test waits for a round without a freeze.
     wait_for("no frame waits for a call", || {
         // All attempts are given up after two seconds.
         let limits = Limits { handshake: Duration::from_secs(2), ..limits() };
-        let mut app = calling(&door, &silent, limits);
-        let (began, mut longest) = (Instant::now(), Duration::ZERO);
+        let mut app = calling(&door, &silent, &mute, limits);
+        let (began, mut longest, mut hung_up) = (Instant::now(), Duration::ZERO, false);
         wait_for("the calls are over", || {
             let frame = Instant::now();
             app.update();
             longest = longest.max(frame.elapsed());
-            began.elapsed() > Duration::from_secs(4)
+            let closed = |event| matches!(event, Event::Closed { reason: DisconnectReason::Silent, .. });
+            hung_up |= std::iter::from_fn(|| mute.poll()).any(closed);
+            hung_up && began.elapsed() > Duration::from_secs(4)
         });
         println!("longest frame {:.1} ms", longest.as_secs_f64() * 1e3);
         must!(longest < Duration::from_millis(500), "a frame of {longest:?}");
         Ok(())
     });
     // The app ends while its connection attempts are under way.
-    let app = calling(&door, &silent, Limits { handshake: Duration::from_secs(600), ..limits() });
+    let app = calling(&door, &silent, &mute, Limits { handshake: Duration::from_secs(600), ..limits() });
     let end = Instant::now();
     drop(app);
     let end = end.elapsed();

@@ -44,7 +44,7 @@ fn quick(limits: Limits, idle_timeout: Duration) -> Limits {
 
 /// Creates a host and a guest with the given timeout.
 fn quick_pair(idle_timeout: Duration) -> (App, Entity, App) {
-    let session = pliant_stream::HostConfig { idle_timeout, ..Default::default() };
+    let session = pliant_stream::HostSessionConfig { idle_timeout, ..Default::default() };
     let limits = quick(Limits::host(), idle_timeout);
     let transport = HostOptions { limits, ..HostOptions::default() };
     let (host, invite, body) = host(HostConfig { session, transport, ..HostConfig::default() });
