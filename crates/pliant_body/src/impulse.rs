@@ -63,16 +63,16 @@ pub(crate) fn hit_bodies(
 ) {
     let mut hit = |entity: Entity, apply: &dyn Fn(&mut Body, f64) -> Result<(), StepError>| {
         let Ok((name, driven, mut state)) = bodies.get_mut(entity) else {
-            return refusals.tell(&entity, entity, BodyError::NoBody);
+            return refusals.report(&entity, entity, BodyError::NoBody);
         };
         if *driven != Driven::Local {
-            return refusals.tell(&name, entity, BodyError::NotLocal);
+            return refusals.report(&name, entity, BodyError::NotLocal);
         }
         let scale = state.scale;
         // A refused impulse or force does not wake the body.
         match apply(&mut state.body, scale) {
             Ok(()) => state.wake(),
-            Err(error) => refusals.tell(&name, entity, BodyError::Impulse(error)),
+            Err(error) => refusals.report(&name, entity, BodyError::Impulse(error)),
         }
     };
     for &Impulse { body, vertex, impulse } in strikes.read() {

@@ -46,7 +46,7 @@ pub(crate) struct Refusals<'w> {
 }
 
 impl Refusals<'_> {
-    pub fn tell(&mut self, name: &impl std::fmt::Display, entity: Entity, error: BodyError) {
+    pub fn report(&mut self, name: &impl std::fmt::Display, entity: Entity, error: BodyError) {
         warn!("{name}: {error}");
         self.messages.write(BodyRefused { entity, error });
     }
@@ -78,7 +78,7 @@ pub(crate) fn build_bodies(
                     let mut state = state;
                     let config = body.config(state.body.config().step, state.scale);
                     if let Err(error) = state.body_mut().reconfigure(config) {
-                        refusals.tell(&name, name.entity, BodyError::Build(error));
+                        refusals.report(&name, name.entity, BodyError::Build(error));
                     }
                 }
             }
@@ -103,7 +103,7 @@ pub(crate) fn build_bodies(
                             .try_remove::<BuildRefused>();
                     }
                     Err(error) => {
-                        refusals.tell(&name, name.entity, BodyError::Build(error));
+                        refusals.report(&name, name.entity, BodyError::Build(error));
                         commands.entity(name.entity).try_insert(BuildRefused(Arc::downgrade(model)));
                     }
                 }
@@ -188,7 +188,7 @@ pub(crate) fn place_bodies(
         let (scale, rotation, translation) = transform.to_scale_rotation_translation();
         let uniform = (scale - scale.x).abs().max_element() <= 1e-3 * scale.x;
         if !(affine.is_finite() && scale.x > 0.0 && scale.is_finite() && rotation.is_finite() && uniform) {
-            refusals.tell(&name, name.entity, BodyError::Placement { translation, scale });
+            refusals.report(&name, name.entity, BodyError::Placement { translation, scale });
             continue;
         }
         let scale = f64::from(scale.x);
@@ -201,7 +201,7 @@ pub(crate) fn place_bodies(
             match state.body_mut().reconfigure(running) {
                 Ok(()) => state.scale = scale,
                 Err(error) => {
-                    refusals.tell(&name, name.entity, BodyError::Build(error));
+                    refusals.report(&name, name.entity, BodyError::Build(error));
                     continue;
                 }
             }
@@ -211,7 +211,7 @@ pub(crate) fn place_bodies(
         match state.body_mut().set_pose(origin.into(), rotation.into()) {
             // The body jumped to this pose, so the visual state must not interpolate toward it.
             Ok(()) => shown.bypass_change_detection().forget_pose(),
-            Err(error) => refusals.tell(&name, name.entity, BodyError::Step(error)),
+            Err(error) => refusals.report(&name, name.entity, BodyError::Step(error)),
         }
     }
 }
@@ -258,13 +258,13 @@ pub(crate) fn hold_bodies(
             if known.is_none() || (held.waiting && free) {
                 let taken = take_hold(body, grab);
                 held.waiting = matches!(taken, Err(BodyError::Grab(StepError::TooManyGrabs { .. })));
-                held.id = taken.map_err(|error| refusals.tell(&name, entity, error)).ok();
+                held.id = taken.map_err(|error| refusals.report(&name, entity, error)).ok();
             }
             let Some(id) = held.id else { continue };
             // A target can be invalid only by being not finite.
             let refused = body.set_target(id, (grab.target / *scale).into()).is_err();
             if refused && !held.refusing {
-                refusals.tell(&name, entity, BodyError::TargetNotFinite { target: grab.target.into() });
+                refusals.report(&name, entity, BodyError::TargetNotFinite { target: grab.target.into() });
             }
             held.refusing = refused;
         }
@@ -311,7 +311,7 @@ pub(crate) fn step_bodies(
             Ok(_) => state.faulted = false,
             Err(error) => {
                 if !state.faulted {
-                    refusals.tell(&name, name.entity, BodyError::Step(error));
+                    refusals.report(&name, name.entity, BodyError::Step(error));
                 }
                 state.faulted = true;
             }
@@ -383,7 +383,7 @@ pub(crate) fn publish(
         }
         for held in &state.held {
             let Ok(mut force) = forces.get_mut(held.entity) else { continue };
-            let felt = held.id.and_then(|id| {
+            let grab_force = held.id.and_then(|id| {
                 let reaction = body.reaction(id).ok()?;
                 let point = body.grab_position(id).ok()?;
                 Some(GrabForce {
@@ -391,7 +391,7 @@ pub(crate) fn publish(
                     point: DVec3::from(point) * state.scale,
                 })
             });
-            force.set_if_neq(felt.unwrap_or_default());
+            force.set_if_neq(grab_force.unwrap_or_default());
         }
     }
 }

@@ -37,7 +37,7 @@ pub struct VisualState {
     shown: Vec<f64>,
     /// Ticks since the last push: 0 in the tick of the push.
     age: u8,
-    settled: bool,
+    shows_newest: bool,
     /// Fraction of the tick to which the state was interpolated since the last push.
     at: Option<f64>,
     version: u64,
@@ -52,7 +52,7 @@ impl VisualState {
             current: q.to_vec(),
             shown: q.to_vec(),
             age: 1,
-            settled: true,
+            shows_newest: true,
             at: None,
             version: 1,
             poses: None,
@@ -73,7 +73,7 @@ impl VisualState {
         self.current.copy_from_slice(q);
         self.age = 0;
         self.at = None;
-        self.settled = false;
+        self.shows_newest = false;
         Ok(())
     }
 
@@ -89,7 +89,7 @@ impl VisualState {
         self.current.copy_from_slice(q);
         self.shown.copy_from_slice(q);
         self.age = 1;
-        self.settled = true;
+        self.shows_newest = true;
         self.version += 1;
         Ok(())
     }
@@ -136,7 +136,7 @@ impl VisualState {
 
     /// Whether the state on screen is constant, because nothing was pushed for a tick.
     pub fn is_settled(&self) -> bool {
-        self.settled
+        self.shows_newest
     }
 
     /// Removes the poses, so that the next pose is shown at once without interpolation.
@@ -156,7 +156,7 @@ impl VisualState {
 
     fn begin_tick(&mut self) {
         self.age = self.age.saturating_add(1);
-        if self.age == 1 && !self.settled {
+        if self.age == 1 && !self.shows_newest {
             // Nothing was pushed yet in this tick. Without a push the picture stays at the newest
             // state.
             self.previous.copy_from_slice(&self.current);
@@ -167,7 +167,7 @@ impl VisualState {
     /// Whether the state must be interpolated to `fraction` of the tick. It must not if it is
     /// already there, as in every frame of a pause.
     fn is_behind(&self, fraction: f64) -> bool {
-        !self.settled && (self.age > 0 || self.at != Some(fraction))
+        !self.shows_newest && (self.age > 0 || self.at != Some(fraction))
     }
 
     fn interpolate(&mut self, fraction: f64) {
@@ -176,7 +176,7 @@ impl VisualState {
             *shown = a + (b - a) * fraction;
         }
         self.version += 1;
-        self.settled = self.age > 0;
+        self.shows_newest = self.age > 0;
     }
 }
 

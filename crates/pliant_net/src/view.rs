@@ -32,7 +32,7 @@ pub(crate) struct BodyDisplay {
     previous: (Vec<f64>, Option<Pose>),
     current: (Vec<f64>, Option<Pose>),
     /// Whether the newest state is displayed and no newer one has arrived.
-    settled: bool,
+    shows_newest: bool,
 }
 
 impl BodyDisplay {
@@ -45,7 +45,7 @@ impl BodyDisplay {
             return;
         }
         self.tick = tick;
-        self.settled = false;
+        self.shows_newest = false;
         std::mem::swap(&mut self.previous, &mut self.current);
         self.current.0.clear();
         self.current.0.extend_from_slice(q);
@@ -67,10 +67,10 @@ impl BodyDisplay {
         scratch: &mut Vec<f64>,
     ) {
         let fraction = if resting { 1.0 } else { self.phase.fraction(self.tick, step, now) };
-        if self.settled {
+        if self.shows_newest {
             return;
         }
-        self.settled = fraction >= 1.0;
+        self.shows_newest = fraction >= 1.0;
         scratch.clear();
         let ends = self.previous.0.iter().zip(&self.current.0);
         scratch.extend(ends.map(|(from, to)| from + (to - from) * fraction));

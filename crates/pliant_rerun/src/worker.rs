@@ -283,7 +283,7 @@ fn record(stream: &RecordingStream, target: &Target, inbox: MessageQueue, plots:
         for Message { frame, owed } in inbox.frames.try_iter() {
             let mut logged = owed.map_or(Ok(()), |owed| recorder.catch_up(&frame, &owed));
             logged = logged.and(recorder.log(&frame));
-            tell(logged, frame.tick, &mut failing);
+            warn_once(logged, frame.tick, &mut failing);
             if let Some(frame) = Arc::into_inner(frame) {
                 // If there is no room, enough spare frames are waiting.
                 inbox.spare.try_send(frame.cleared()).ok();
@@ -321,13 +321,13 @@ fn record(stream: &RecordingStream, target: &Target, inbox: MessageQueue, plots:
         }
         if sent.elapsed() >= columns {
             sent = Instant::now();
-            tell(recorder.send(), 0, &mut failing);
+            warn_once(recorder.send(), 0, &mut failing);
         }
     }
     recorder.end();
 }
 
-fn tell(logged: Result<(), RecordingStreamError>, tick: u64, failing: &mut bool) {
+fn warn_once(logged: Result<(), RecordingStreamError>, tick: u64, failing: &mut bool) {
     if let Err(error) = &logged
         && !*failing
     {

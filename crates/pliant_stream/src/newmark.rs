@@ -97,12 +97,12 @@ impl Newmark {
 /// A stream of accelerations gives the coordinates, and the viscoelastic state follows from the
 /// coordinates. An error of the viscoelastic state decays by its own weight in each step.
 #[derive(Debug, Clone, PartialEq)]
-pub struct FlowFilter {
+pub struct ViscoelasticFilter {
     weights: [f64; 3],
     responses: Vec<f64>,
 }
 
-impl FlowFilter {
+impl ViscoelasticFilter {
     /// Creates the filter for a material. `ages` says how many ticks back an acceleration may be
     /// corrected.
     pub fn new(relaxation: Relaxation, newmark: &Newmark, ages: usize) -> Self {
@@ -139,7 +139,7 @@ impl FlowFilter {
     }
 
     /// Returns the change that an acceleration wrong by 1 leaves in the viscoelastic state `age`
-    /// ticks later, or 0 beyond the ages given to [`FlowFilter::new`].
+    /// ticks later, or 0 beyond the ages given to [`ViscoelasticFilter::new`].
     pub fn response(&self, age: u64) -> f64 {
         usize::try_from(age).ok().and_then(|age| self.responses.get(age)).copied().unwrap_or(0.0)
     }

@@ -104,7 +104,7 @@ impl Replica {
         let velocity = way.map_or_else(Vector3::zeros, |way| way / self.kernel.h());
         let mut hand = Hand::new(patch, Hold::Target { target, velocity, config });
         if let Some(known) = known {
-            (hand.mean, hand.flow) = (known.mean, known.flow);
+            (hand.mean, hand.flow) = (known.mean, known.viscoelastic);
         }
         self.hold(key, hand);
     }
@@ -121,7 +121,7 @@ impl Replica {
                 Hold::Target { target, .. } => Some(target),
                 Hold::Measured(_) => None,
             };
-            HandState { key, pull: hand.pull, mean: hand.mean, target, flow: hand.flow }
+            HandState { key, pull: hand.pull, mean: hand.mean, target, viscoelastic: hand.flow }
         }));
     }
 

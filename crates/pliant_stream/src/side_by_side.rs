@@ -171,7 +171,7 @@ fn under_gravity() {
 /// Steps a body with hands, and a copy of the body with the displacements and reactions that a
 /// frame carries. The second hand begins 40 steps later. Returns the largest difference of a
 /// coordinate as a share of the largest coordinate.
-fn told(model: &Arc<ModalModel>, settings: StepSettings, cases: &[SideBySide; 2]) -> f64 {
+fn observed(model: &Arc<ModalModel>, settings: StepSettings, cases: &[SideBySide; 2]) -> f64 {
     let mut body = Body::new(model.clone(), settings.into()).unwrap();
     let mut copy = Replica::new(model.clone(), settings, model.mode_count(), body.config().step).unwrap();
     let mut stepped = BodyCopy::new(copy.kernel().at_rest());
@@ -234,7 +234,7 @@ fn places_and_reactions_tell_the_same_as_targets() {
         (StepSettings { warp: false, relaxation, ..plain }, SAME),
         (plain, 2e-5),
     ] {
-        let off = told(&pip, settings, &cases);
+        let off = observed(&pip, settings, &cases);
         println!("{settings:?}: {off:.1e}");
         assert!(off < most, "{settings:?}: {off:.1e}");
     }

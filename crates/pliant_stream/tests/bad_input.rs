@@ -12,7 +12,7 @@ use pliant_stream::codec::quantization::Quanta;
 use pliant_stream::emulator::{Loss, PathTrace};
 use pliant_stream::wire::{
     AccelerationCoding, Accelerations, BodyInfo, Clock, Datagram, FrameGrab, GuestMessage, HeldAt,
-    HostMessage, InputTick, Inputs, Nack, NackRun, PeerBodyState, PeerFrame, PeerGrip, PeerMessage,
+    HostMessage, InputTick, Inputs, Nack, NackRun, PeerBodyState, PeerFrame, PeerHandState, PeerMessage,
     ReceiverReport, Repeat, RepeatGrab, Slice, SliceEntry, SnapshotBytes, StateCheck, TargetEntry, Targets,
     TickFrame,
 };
@@ -269,13 +269,13 @@ fn real_inputs() -> Vec<Vec<u8>> {
         z: Vec::new(),
         force: vec![0.0; 4],
         frame: Some(frame),
-        pulls: vec![PeerGrip {
+        pulls: vec![PeerHandState {
             user: 1,
             grab: 2,
             pull: [0.5; 3],
             mean: [0.25; 3],
             target: [1.0; 3],
-            flow: [0.0; 3],
+            viscoelastic: [0.0; 3],
         }],
     };
     let hello = PeerMessage::Hello {

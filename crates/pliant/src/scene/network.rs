@@ -159,13 +159,13 @@ fn run_guest(
                 exit.write(AppExit::Success);
             }
         })
-        .add_systems(Last, tell)
+        .add_systems(Last, publish_states)
         .run();
     Ok(())
 }
 
 /// Publishes the visual states of the guest; runs in the guest's app.
-fn tell(
+fn publish_states(
     seen: Res<LastStates>,
     bodies: Query<(&Name, &VisualState, &BodyState, &Transform), With<SceneBody>>,
 ) {

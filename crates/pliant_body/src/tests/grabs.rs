@@ -95,9 +95,9 @@ fn a_target_that_is_not_finite_is_refused_and_the_last_good_one_stays() {
     for (bad, word) in [(f64::NAN, "NaN"), (f64::INFINITY, "inf")] {
         app.world_mut().get_mut::<Grab>(hand).unwrap().target.z = bad;
         steps(&mut app, 30);
-        let told = refusals(&mut app);
-        assert_eq!(told.len(), 1, "once: {told:?}");
-        assert!(told[0].0 == hand && told[0].1.contains(word), "{told:?}");
+        let refused = refusals(&mut app);
+        assert_eq!(refused.len(), 1, "once: {refused:?}");
+        assert!(refused[0].0 == hand && refused[0].1.contains(word), "{refused:?}");
         let held = state(&app, body).body().grabs().next().unwrap();
         assert_eq!(state(&app, body).body().target(held).unwrap(), <[f64; 3]>::from(good));
         assert!((force(&app, hand).force - before.force).length() < 0.02 * before.force.length());
@@ -114,8 +114,8 @@ fn a_grab_of_nothing_is_refused_and_the_body_goes_on() {
         let hand = app.world_mut().spawn((Grab::new(vertex, radius, DVec3::ZERO), GrabOf(body))).id();
         let before = state(&app, body).body().q()[0];
         steps(&mut app, 3);
-        let told = refusals(&mut app);
-        assert!(told.len() == 1 && told[0].0 == hand, "{told:?}");
+        let refused = refusals(&mut app);
+        assert!(refused.len() == 1 && refused[0].0 == hand, "{refused:?}");
         assert_ne!(state(&app, body).body().q()[0], before);
         assert_eq!(force(&app, hand), GrabForce::default());
     }
@@ -128,8 +128,8 @@ fn a_grab_that_found_the_body_full_is_held_once_a_place_is_free() {
     let most = pliant_modal::Body::MAX_GRABS;
     let hands: Vec<Entity> = (0..=most).map(|_| grab(&mut app, body, DVec3::new(1.0, 0.0, 0.0))).collect();
     steps(&mut app, 5);
-    let told = refusals(&mut app);
-    assert!(told.len() == 1 && told[0].0 == hands[most], "told once, of the one too many: {told:?}");
+    let refused = refusals(&mut app);
+    assert!(refused.len() == 1 && refused[0].0 == hands[most], "told once, of the one too many: {refused:?}");
     assert_eq!(state(&app, body).body().grabs().count(), most);
     app.world_mut().despawn(hands[3]);
     steps(&mut app, 1);

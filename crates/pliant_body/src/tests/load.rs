@@ -7,7 +7,7 @@ use crate::{AWAKE_BODIES, BodyState, ModalAsset, ModalBody, STEP_TIME, VisualSta
 
 const CROWD: usize = 1_000;
 
-fn crowd(app: &mut App, bundle: impl Bundle + Clone) -> Vec<Entity> {
+fn many_bodies(app: &mut App, bundle: impl Bundle + Clone) -> Vec<Entity> {
     let handle = app.world_mut().resource_mut::<Assets<ModalAsset>>().add(ModalAsset::from(model::bar()));
     let bodies = (0..CROWD)
         .map(|_| app.world_mut().spawn((ModalBody::new(handle.clone()), bundle.clone())).id())
@@ -25,7 +25,7 @@ fn measured(app: &App, path: &bevy::diagnostic::DiagnosticPath) -> (Option<f64>,
 #[test]
 fn a_thousand_bodies_at_rest_are_neither_stepped_nor_shown_anew_and_one_that_is_touched_wakes_alone() {
     let mut app = app();
-    let bodies = crowd(&mut app, ());
+    let bodies = many_bodies(&mut app, ());
     steps(&mut app, 1);
     assert_eq!(measured(&app, &AWAKE_BODIES).0, Some(1_000.0));
     steps(&mut app, 25);
@@ -60,7 +60,7 @@ fn a_thousand_bodies_at_rest_on_screen_write_no_mesh() {
 
     let mut app = app();
     app.add_plugins(MeshPlugin);
-    let bodies = crowd(&mut app, ());
+    let bodies = many_bodies(&mut app, ());
     for body in bodies {
         app.world_mut().entity_mut(body).insert((ViewVisibility::VISIBLE, InheritedVisibility::VISIBLE));
     }

@@ -213,9 +213,9 @@ fn settings_that_make_no_body_are_refused_by_name_and_may_be_mended() {
         spawn_with(&mut app, model::bar(), |body| body.settings.damping_scale = f64::NAN, Name::new("jelly"));
     steps(&mut app, 3);
     assert!(app.world().get::<crate::BodyState>(body).is_none());
-    let told = refusals(&mut app);
-    assert_eq!(told.len(), 1, "once, not every frame: {told:?}");
-    assert!(told[0].0 == body && told[0].1.contains("damping_scale"), "{told:?}");
+    let refused = refusals(&mut app);
+    assert_eq!(refused.len(), 1, "once, not every frame: {refused:?}");
+    assert!(refused[0].0 == body && refused[0].1.contains("damping_scale"), "{refused:?}");
 
     app.world_mut().get_mut::<ModalBody>(body).unwrap().settings.damping_scale = 1.0;
     steps(&mut app, 1);
@@ -244,8 +244,11 @@ fn a_transform_that_cannot_place_a_body_is_refused_and_the_body_stays() {
     for transform in wrong {
         app.world_mut().entity_mut(body).insert(transform);
         steps(&mut app, 3);
-        let told = refusals(&mut app);
-        assert!(told.len() == 1 && told[0].1.contains("positive, uniform scale"), "{transform:?}: {told:?}");
+        let refused = refusals(&mut app);
+        assert!(
+            refused.len() == 1 && refused[0].1.contains("positive, uniform scale"),
+            "{transform:?}: {refused:?}"
+        );
         assert_eq!(state(&app, body).body().frame().origin(), [1.0, 2.0, 3.0]);
     }
 }

@@ -46,23 +46,23 @@ pub(super) fn cases(out: &mut Vec<Case>) {
 fn calms(device: &VirtualConfig, k: f64) -> Result<bool, LabError> {
     let config = LoopConfig { safety: Some(SafetyConfig::bare()), ..LoopConfig::default() };
     let mut cycle = Cycle::new(VirtualDevice::new(device.clone(), Hand::NONE)?, config)?;
-    let mut pace = VirtualScheduler::new(RATE);
+    let mut scheduler = VirtualScheduler::new(RATE);
     let mut events: Vec<LoopEvent> = Vec::new();
-    let mut word = LocalModel::default();
+    let mut update = LocalModel::default();
     cycle.device_mut().place([1e-3, 0.0, 0.0], [0.0; 3]);
     let ticks = 3_000;
     let (mut early, mut late) = (0.0f64, 0.0f64);
     for t in 0..ticks {
-        word.tick += 1;
-        word.stamp = pace.now();
-        word.period = 1.0 / RATE;
-        word.count = 1;
-        word.contacts[0] = Contact {
+        update.tick += 1;
+        update.stamp = scheduler.now();
+        update.period = 1.0 / RATE;
+        update.count = 1;
+        update.contacts[0] = Contact {
             stiffness: [[k, 0.0, 0.0], [0.0, k, 0.0], [0.0, 0.0, k]],
             damping: 0.0,
             ..Contact::default()
         };
-        cycle.step(&mut pace, &word, &mut events);
+        cycle.step(&mut scheduler, &update, &mut events);
         let x = cycle.device().position()[0];
         let energy = cycle.device().kinetic_energy() + 0.5 * k * x * x;
         match t * 10 / ticks {
@@ -94,8 +94,8 @@ struct DeviceScene {
     held: HeldGrab,
     writer: ModelWriter,
     cycle: Cycle<VirtualDevice>,
-    pace: VirtualScheduler,
-    word: LocalModel,
+    scheduler: VirtualScheduler,
+    update: LocalModel,
     events: Vec<LoopEvent>,
     step: f64,
     one_way: f64,
@@ -103,7 +103,7 @@ struct DeviceScene {
     /// Arrival time, sample time and position of the tool.
     targets: VecDeque<(f64, f64, [f64; 3])>,
     seen: f64,
-    words: VecDeque<(f64, LocalModel)>,
+    updates: VecDeque<(f64, LocalModel)>,
     /// The largest energy that the motors have given beyond the supply, J.
     given: f64,
 }
@@ -128,22 +128,22 @@ impl DeviceScene {
             held: HeldGrab { key: 0, id, offset: [0.0; 3] },
             writer: ModelWriter::new(),
             cycle,
-            pace: VirtualScheduler::new(RATE),
-            word: LocalModel::default(),
+            scheduler: VirtualScheduler::new(RATE),
+            update: LocalModel::default(),
             events: Vec::new(),
             step,
             one_way: 0.5 * round_trip,
             next_step: 0.0,
             targets: VecDeque::new(),
             seen: 0.0,
-            words: VecDeque::new(),
+            updates: VecDeque::new(),
             given: 0.0,
         })
     }
 
     /// Runs one period of the loop and every step that falls into it.
     fn tick(&mut self) -> Result<(), LabError> {
-        let now = self.pace.now();
+        let now = self.scheduler.now();
         let newest = self.cycle.core().last();
         self.targets.push_back((now + self.one_way, newest.now, newest.tool));
         while now >= self.next_step - 1e-12 {
@@ -156,18 +156,18 @@ impl DeviceScene {
                 }
             }
             self.body.step()?;
-            let mut word = LocalModel::default();
+            let mut update = LocalModel::default();
             let coupling = self.cycle.core().coupling();
-            self.writer.write(&self.body, &[self.held], coupling, 1.0, self.seen, &mut word)?;
-            self.words.push_back((now + self.one_way, word));
+            self.writer.write(&self.body, &[self.held], coupling, 1.0, self.seen, &mut update)?;
+            self.updates.push_back((now + self.one_way, update));
         }
-        while self.words.front().is_some_and(|(at, _)| *at <= now) {
-            if let Some((_, word)) = self.words.pop_front() {
-                self.word = word;
+        while self.updates.front().is_some_and(|(at, _)| *at <= now) {
+            if let Some((_, update)) = self.updates.pop_front() {
+                self.update = update;
             }
         }
         self.events.clear();
-        self.cycle.step(&mut self.pace, &self.word, &mut self.events);
+        self.cycle.step(&mut self.scheduler, &self.update, &mut self.events);
         let supplied = self.cycle.core().last().port.supplied;
         self.given = self.given.max(self.cycle.device().work() - supplied);
         Ok(())

@@ -48,17 +48,18 @@ pub(crate) fn show(
         hands.set_if_neq(remote_hands(view.grabs(), user, &place));
         for (&entity, sent) in guest.grabs.iter().filter(|(_, sent)| sent.body == id) {
             let Ok(mut force) = forces.get_mut(entity) else { continue };
-            let felt = sent.number.zip(user).and_then(|(grab, user)| {
+            let grab_force = sent.number.zip(user).and_then(|(grab, user)| {
                 let key = GrabKey { user, grab };
                 let confirmed = || Some(view.grabs().iter().find(|grab| grab.key == key)?.reaction);
                 let reaction = match view.predicted_hand() {
                     Some(own) => own.reaction(grab).or_else(confirmed)?,
                     None => confirmed()?,
                 };
-                let felt = followed.display.force(reaction, sent.point.as_ref()?, &place, state, &visual);
-                Some(GrabForce { force: felt.force.clamp_length_max(most_force), ..felt })
+                let grab_force =
+                    followed.display.force(reaction, sent.point.as_ref()?, &place, state, &visual);
+                Some(GrabForce { force: grab_force.force.clamp_length_max(most_force), ..grab_force })
             });
-            force.set_if_neq(felt.unwrap_or_default());
+            force.set_if_neq(grab_force.unwrap_or_default());
         }
     }
     let link = session.stats();

@@ -125,12 +125,12 @@ pub(crate) fn show(
         hands.set_if_neq(remote_hands(view.grabs(), Some(user), &place));
         for (&entity, sent) in net.grabs.iter().filter(|(_, sent)| sent.body == id) {
             let Ok(mut force) = forces.get_mut(entity) else { continue };
-            let felt = sent.number.and_then(|grab| {
+            let grab_force = sent.number.and_then(|grab| {
                 let key = GrabKey { user, grab };
                 let reaction = view.grabs().iter().find(|grab| grab.key == key)?.reaction;
                 Some(played.display.force(reaction, sent.point.as_ref()?, &place, state, &visual))
             });
-            force.set_if_neq(felt.unwrap_or_default());
+            force.set_if_neq(grab_force.unwrap_or_default());
         }
     }
     net.flush();

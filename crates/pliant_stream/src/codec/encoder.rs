@@ -13,7 +13,7 @@ use pliant_modal::{ModalModel, StepSettings};
 use crate::StreamError;
 use crate::codec::checksum::checksum;
 use crate::codec::quantization::Quanta;
-use crate::newmark::{FlowFilter, Newmark};
+use crate::newmark::{Newmark, ViscoelasticFilter};
 use crate::prediction::{BodyCopy, HandState};
 use crate::replica::{self, Replica};
 use crate::state::{BodyId, GrabKey, GrabState, Tick, TickState};
@@ -85,7 +85,7 @@ pub struct Encoder {
     newmark: Newmark,
     /// Filter by which receivers of accelerations compute the viscoelastic state, if the body
     /// relaxes.
-    flow: Option<FlowFilter>,
+    viscoelastic: Option<ViscoelasticFilter>,
     replica: Replica,
     /// The receiver's copy, and the true state.
     mirror: BodyCopy,
@@ -152,9 +152,9 @@ impl Encoder {
         let quanta = Quanta::of_visible(&model, visible, settings.stiffness_scale, &newmark);
         let replica = Replica::new(model, *settings, modes, newmark.h)?;
         let rest = replica.kernel().at_rest();
-        let flow = settings.relaxation.map(|r| FlowFilter::new(r, &newmark, 0));
+        let viscoelastic = settings.relaxation.map(|r| ViscoelasticFilter::new(r, &newmark, 0));
         Ok(Self {
-            flow,
+            viscoelastic,
             body,
             subscription,
             modes,
@@ -445,12 +445,12 @@ impl Encoder {
         for (k, a) in self.scratch.iter_mut().enumerate() {
             *a = accelerations.get(k, &self.quanta);
         }
-        if let Some(flow) = &self.flow {
-            flow.begin(&mut self.mirror.state);
+        if let Some(filter) = &self.viscoelastic {
+            filter.begin(&mut self.mirror.state);
         }
         self.newmark.advance(&mut self.mirror.state, &self.scratch);
-        if let Some(flow) = &self.flow {
-            flow.finish(&mut self.mirror.state);
+        if let Some(filter) = &self.viscoelastic {
+            filter.finish(&mut self.mirror.state);
         }
         accelerations
     }
@@ -468,8 +468,8 @@ impl Encoder {
             self.replica.lacking(&mut self.truth, to, grabs, &self.load, &mut lacking);
             self.truth.hands = hands;
             let share = LOAD_EVERY as f64 / LOAD_TICKS;
-            for ((told, load), lacking) in self.unexplained.iter_mut().zip(&self.load).zip(&lacking) {
-                *told += (load + lacking - *told) * share;
+            for ((estimate, load), lacking) in self.unexplained.iter_mut().zip(&self.load).zip(&lacking) {
+                *estimate += (load + lacking - *estimate) * share;
             }
             self.scratch = lacking;
         }
@@ -529,8 +529,8 @@ impl Encoder {
         };
         self.entries.clear();
         self.entries.extend(self.chosen.iter().map(entry));
-        let flows = !self.mirror.state.z.is_empty();
-        let mut slice = Slice::quantise(&self.entries, unit, self.loaded, flows, &self.quanta);
+        let viscoelastic = !self.mirror.state.z.is_empty();
+        let mut slice = Slice::quantise(&self.entries, unit, self.loaded, viscoelastic, &self.quanta);
         let mut count = slice.steps.len();
         while count > 0 && 3 + frame.bytes() + slice.bytes_of(count) > room {
             // Remove modes first, then repeats.

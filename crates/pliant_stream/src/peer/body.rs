@@ -8,12 +8,12 @@ use pliant_modal::{Frame, Load, ModalModel, StepSettings};
 use super::inputs::{InputLog, WINDOW};
 use crate::StreamError;
 use crate::codec::checksum::{checksum, projection};
-use crate::newmark::{FlowFilter, Newmark};
+use crate::newmark::{Newmark, ViscoelasticFilter};
 use crate::prediction::{BodyCopy, HandState, Ring, Rollback, VisualCopy};
 use crate::recovery::Forecast;
 use crate::replica::Replica;
 use crate::state::{BodyId, GrabKey, GrabState, Pose, State, Tick, UserId};
-use crate::wire::{HeldAt, PeerBodyState, PeerFrame, PeerGrip};
+use crate::wire::{HeldAt, PeerBodyState, PeerFrame, PeerHandState};
 
 /// Correction of the state for a late input.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
@@ -37,7 +37,7 @@ pub struct PeerBody {
     replica: Replica,
     forecast: Forecast,
     newmark: Newmark,
-    flow: Option<FlowFilter>,
+    viscoelastic: Option<ViscoelasticFilter>,
     repair: LateInputRepair,
     rollback: Rollback,
     /// The inputs of the last step, and those that each tick was stepped with.
@@ -66,7 +66,9 @@ impl PeerBody {
             model,
             replica,
             forecast: Forecast::new(h),
-            flow: settings.relaxation.map(|r| FlowFilter::new(r, &Newmark { h, beta, gamma }, WINDOW)),
+            viscoelastic: settings
+                .relaxation
+                .map(|r| ViscoelasticFilter::new(r, &Newmark { h, beta, gamma }, WINDOW)),
             newmark: Newmark { h, beta, gamma },
             repair,
             // A rollback can return to the initial state like to any other tick.
@@ -175,13 +177,13 @@ impl PeerBody {
             }),
             pulls: hands
                 .iter()
-                .map(|hand| PeerGrip {
+                .map(|hand| PeerHandState {
                     user: hand.key.user.0,
                     grab: hand.key.grab,
                     pull: hand.pull.into(),
                     mean: hand.mean.into(),
                     target: hand.target.unwrap_or_default().into(),
-                    flow: hand.flow.into(),
+                    viscoelastic: hand.viscoelastic.into(),
                 })
                 .collect(),
         })
@@ -203,12 +205,12 @@ impl PeerBody {
         if self.replica.kernel().check(&received).is_err() {
             return false;
         }
-        let hand = |p: &PeerGrip| HandState {
+        let hand = |p: &PeerHandState| HandState {
             key: GrabKey { user: UserId(p.user), grab: p.grab },
             pull: p.pull.into(),
             mean: p.mean.into(),
             target: Some(p.target.into()),
-            flow: p.flow.into(),
+            viscoelastic: p.viscoelastic.into(),
         };
         let hands = state.pulls.iter().map(hand).collect();
         let before = std::mem::replace(&mut self.rollback.now, BodyCopy { state: received, hands });
@@ -276,7 +278,7 @@ impl PeerBody {
             // use it.
             for t in tick..=last {
                 let (to_q, to_v) = self.newmark.response(t - tick);
-                let to_z = self.flow.as_ref().map_or(0.0, |flow| flow.response(t - tick));
+                let to_z = self.viscoelastic.as_ref().map_or(0.0, |filter| filter.response(t - tick));
                 let seconds = (t - tick) as f64 * self.replica.kernel().h();
                 let Some(past) = self.rollback.at_mut(t) else { continue };
                 let state = &mut past.state;

@@ -36,7 +36,7 @@ pub(super) struct RemotePeer {
     pub(super) ahead: Option<f64>,
     /// The same mean as the other peer reports it, ticks.
     pub(super) theirs: Option<f64>,
-    pub(super) asked: BTreeMap<Tick, Duration>,
+    pub(super) requested: BTreeMap<Tick, Duration>,
     /// Number of consecutive checks that disagreed, per body.
     pub(super) mismatched: BTreeMap<BodyId, u32>,
     /// The peer's inputs arrived too late or are missing too long, so only a state can help.
@@ -61,7 +61,7 @@ impl RemotePeer {
             way: None,
             ahead: None,
             theirs: None,
-            asked: BTreeMap::new(),
+            requested: BTreeMap::new(),
             mismatched: BTreeMap::new(),
             lost: false,
             wants_state: false,

@@ -32,7 +32,7 @@ const CHECK_TOLERANCE: f64 = 1e-3;
 /// Largest share by which a peer's step is stretched or shortened to match the other peers' ticks.
 const SLEW: f64 = 0.01;
 /// Pause between requests for the same tick.
-const ASK_AGAIN: Duration = Duration::from_millis(150);
+const REQUEST_AGAIN: Duration = Duration::from_millis(150);
 
 /// One of several equal peers: a state machine without sockets or clock.
 #[derive(Debug)]
@@ -645,11 +645,12 @@ impl PeerSession {
             let from = (inputs.complete + 1).max(inputs.first);
             let mut runs: Vec<NackRun> = Vec::new();
             for tick in from..to {
-                let again = other.asked.get(&tick).is_some_and(|at| now.saturating_sub(*at) < ASK_AGAIN);
+                let again =
+                    other.requested.get(&tick).is_some_and(|at| now.saturating_sub(*at) < REQUEST_AGAIN);
                 if inputs.at(tick).is_some() || again {
                     continue;
                 }
-                other.asked.insert(tick, now);
+                other.requested.insert(tick, now);
                 match runs.last_mut() {
                     Some(run) if run.first + u64::from(run.count) == tick && run.count < MAX_NACK_RUN => {
                         run.count += 1;
@@ -657,7 +658,7 @@ impl PeerSession {
                     _ => runs.push(NackRun { first: tick, count: 1 }),
                 }
             }
-            other.asked.retain(|t, _| *t >= from);
+            other.requested.retain(|t, _| *t >= from);
             runs.truncate(MAX_NACK_RUNS);
             if !runs.is_empty() {
                 other.link.stats.nacks += 1;

@@ -17,14 +17,14 @@ pub struct HandState {
     /// Position of the hand, world, m. `None` if only the patch's displacement is known.
     pub target: Option<Vector3<f64>>,
     /// Viscoelastic state of the patch's residual flexibility, body axes, m.
-    pub flow: Vector3<f64>,
+    pub viscoelastic: Vector3<f64>,
 }
 
 impl HandState {
     /// A hand of which only the force over the step is known, N, world axes.
     pub(crate) fn of_mean(key: GrabKey, mean: Vector3<f64>) -> Self {
         let zero = Vector3::zeros();
-        Self { key, pull: zero, mean, target: None, flow: zero }
+        Self { key, pull: zero, mean, target: None, viscoelastic: zero }
     }
 }
 

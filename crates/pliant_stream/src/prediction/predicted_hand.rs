@@ -44,7 +44,7 @@ struct PredictedGrab {
     would: [f64; 3],
     /// Viscoelastic state of the residual flexibility under the hand at the confirmed tick, body
     /// axes, m.
-    flow: Vector3<f64>,
+    viscoelastic: Vector3<f64>,
     offset: [f64; 3],
 }
 
@@ -148,7 +148,7 @@ impl PredictedHand {
             past: VecDeque::with_capacity(REMEMBERED),
             reaction: [0.0; 3],
             would: [0.0; 3],
-            flow: Vector3::zeros(),
+            viscoelastic: Vector3::zeros(),
             offset: [0.0; 3],
         });
     }
@@ -175,7 +175,7 @@ impl PredictedHand {
             return;
         }
         self.learn_push(receiver, confirmed_frame);
-        self.learn_flow(receiver, user);
+        self.learn_viscoelastic(receiver, user);
         for g in &mut self.grabs {
             if g.past.len() >= REMEMBERED {
                 g.past.pop_front();
@@ -248,7 +248,7 @@ impl PredictedHand {
             let target = at.and_then(|i| g.past.get(i).copied().flatten()).map(Vector3::from);
             let (mean, pull) = (copy.mean(key), -Vector3::from(g.reaction));
             copy.hands.retain(|hand| hand.key != key);
-            copy.hands.push(HandState { key, pull, mean, target, flow: g.flow });
+            copy.hands.push(HandState { key, pull, mean, target, viscoelastic: g.viscoelastic });
         }
     }
 
@@ -283,7 +283,7 @@ impl PredictedHand {
 
     /// Advances the viscoelastic state under the guest's own hands by the confirmed forces, if the
     /// body relaxes.
-    fn learn_flow(&mut self, receiver: &Receiver, user: UserId) {
+    fn learn_viscoelastic(&mut self, receiver: &Receiver, user: UserId) {
         if receiver.settings().relaxation.is_none() {
             return;
         }
@@ -293,8 +293,8 @@ impl PredictedHand {
             let Some(known) = receiver.hands().iter().find(|hand| hand.key == key) else { continue };
             let Some(patch) = self.replica.patch(g.vertex, g.radius) else { continue };
             let pull = turn.rotation().inverse() * known.mean;
-            let hand = Hand { flow: g.flow, ..Hand::new(patch, Hold::Measured(Vector3::zeros())) };
-            g.flow = self.replica.kernel().flow(&hand, pull);
+            let hand = Hand { flow: g.viscoelastic, ..Hand::new(patch, Hold::Measured(Vector3::zeros())) };
+            g.viscoelastic = self.replica.kernel().flow(&hand, pull);
         }
     }
 

@@ -4,7 +4,7 @@
 use pliant_modal::Relaxation;
 
 use super::{HISTORY, History, Predict, Recovery};
-use crate::newmark::{FlowFilter, Newmark};
+use crate::newmark::{Newmark, ViscoelasticFilter};
 use crate::prediction::{HandState, Ring};
 use crate::replica;
 use crate::state::{State, Tick};
@@ -15,7 +15,7 @@ use crate::state::{State, Tick};
 pub struct AccelerationDriven {
     newmark: Newmark,
     /// Filter that computes the viscoelastic state from the coordinates, if the body relaxes.
-    flow: Option<FlowFilter>,
+    viscoelastic: Option<ViscoelasticFilter>,
     predict: Predict,
     compensate: bool,
     tick: Tick,
@@ -34,7 +34,7 @@ impl AccelerationDriven {
     pub fn new(newmark: Newmark, predict: Predict, compensate: bool, modes: usize) -> Self {
         Self {
             newmark,
-            flow: None,
+            viscoelastic: None,
             predict,
             compensate,
             tick: 0,
@@ -49,8 +49,8 @@ impl AccelerationDriven {
     /// Adds the viscoelastic state of a body that relaxes. The state is filtered from the
     /// coordinates.
     pub fn relaxing(mut self, relaxation: Option<Relaxation>) -> Self {
-        self.flow = relaxation.map(|r| FlowFilter::new(r, &self.newmark, HISTORY));
-        if self.flow.is_some() {
+        self.viscoelastic = relaxation.map(|r| ViscoelasticFilter::new(r, &self.newmark, HISTORY));
+        if self.viscoelastic.is_some() {
             self.state = State::zero(self.state.modes(), true);
         }
         self
@@ -91,12 +91,12 @@ impl Recovery for AccelerationDriven {
             Some(data) => self.next.copy_from_slice(&data.accelerations),
             None => self.predict(tick),
         }
-        if let Some(flow) = &self.flow {
-            flow.begin(&mut self.state);
+        if let Some(filter) = &self.viscoelastic {
+            filter.begin(&mut self.state);
         }
         self.newmark.advance(&mut self.state, &self.next);
-        if let Some(flow) = &self.flow {
-            flow.finish(&mut self.state);
+        if let Some(filter) = &self.viscoelastic {
+            filter.finish(&mut self.state);
         }
         self.tick = tick;
         self.used.place(tick).0.clone_from(&self.next);
@@ -114,7 +114,7 @@ impl Recovery for AccelerationDriven {
         }
         let Some(used) = self.used.get_mut(from) else { return false };
         let (to_q, to_v) = self.newmark.response(self.tick - from);
-        let to_z = self.flow.as_ref().map_or(0.0, |flow| flow.response(self.tick - from));
+        let to_z = self.viscoelastic.as_ref().map_or(0.0, |filter| filter.response(self.tick - from));
         for (k, (used, received)) in used.iter_mut().zip(&data.accelerations).enumerate() {
             if from <= self.anchored[k] {
                 continue;

@@ -79,9 +79,9 @@ impl PassivityGuard {
     fn lost(&self, state: &State) -> f64 {
         let viscous: f64 = self.damping.iter().zip(&state.v).map(|(c, v)| c * v * v).sum();
         let (ratio, rate) = self.relaxing;
-        let flows = state.q.iter().zip(&state.z).zip(&self.stiffness);
-        let flowing: f64 = flows.map(|((q, z), k)| k * (q - z) * (q - z)).sum();
-        self.h * (viscous + ratio * rate * flowing)
+        let branches = state.q.iter().zip(&state.z).zip(&self.stiffness);
+        let relaxing: f64 = branches.map(|((q, z), k)| k * (q - z) * (q - z)).sum();
+        self.h * (viscous + ratio * rate * relaxing)
     }
 
     /// Notes that a correction moved the confirmed state under the visual state. The correction

@@ -407,7 +407,7 @@ impl GuestSession {
             next = next.min(self.next_ping);
             for view in self.bodies.values() {
                 next = view.next_tick_due(now).map_or(next, |t| next.min(t));
-                next = view.next_ask().map_or(next, |t| next.min(t));
+                next = view.next_request().map_or(next, |t| next.min(t));
             }
             for g in self.grabs.values() {
                 next = g.due(now).map_or(next, |due| next.min(due));
@@ -434,7 +434,7 @@ impl GuestSession {
         let round_trip = self.link.round_trip().unwrap_or(Duration::from_millis(200));
         let Some(view) = self.bodies.get_mut(&body) else { return };
         let nack = view.missing(now, round_trip);
-        let snapshot = view.ask_snapshot(now);
+        let snapshot = view.request_snapshot(now);
         if let Some(nack) = nack {
             self.link.stats.nacks += 1;
             self.datagram(&Datagram::Nack(nack));

@@ -16,14 +16,14 @@ use crate::wire::{BodyInfo, MAX_NACK_RUNS, Nack, NackRun, Payload, SnapshotBytes
 /// Largest number of frames that wait for the snapshot.
 const WAITING: usize = HISTORY;
 /// Largest number of NACKs for one missing tick.
-const ASKS: u8 = 12;
+const MOST_REQUESTS: u8 = 12;
 /// Age beyond which a missing tick is not requested, ticks.
-const ASK_WITHIN: u64 = 200;
+const REQUEST_WITHIN: u64 = 200;
 /// Backlog beyond which the receiver does not catch up tick by tick, ticks. A snapshot is faster.
 const CATCH_UP: u64 = 120;
 
 #[derive(Debug, Clone, Copy, Default)]
-struct Ask {
+struct TickRequest {
     times: u8,
     next: Duration,
 }
@@ -39,20 +39,20 @@ pub struct StreamedBody {
     pub(crate) model: Option<Arc<ModalModel>>,
     pub(crate) receiver: Option<Receiver>,
     pub(crate) playout: PlayoutClock,
-    pub(crate) own: Option<PredictedHand>,
-    own_first: bool,
+    pub(crate) predicted: Option<PredictedHand>,
+    predicts: bool,
     config: RecoveryConfig,
     newmark: Newmark,
     waiting: Vec<TickFrame>,
     snapshot: Option<SnapshotBytes>,
-    asks: Ring<Ask>,
+    requests: Ring<TickRequest>,
     /// Ticks up to here need no NACK: they are known, or lie before the run or the snapshot.
-    settled: Tick,
+    resolved: Tick,
     resting: bool,
     fade_at: Duration,
     stalled: bool,
     received_at: Duration,
-    snapshot_asked: Option<Duration>,
+    snapshot_requested: Option<Duration>,
     pub(crate) wants_snapshot: bool,
     pub(crate) resynced: bool,
     /// The host steps the body with other settings from the next snapshot on.
@@ -62,7 +62,7 @@ pub struct StreamedBody {
 }
 
 impl StreamedBody {
-    pub(crate) fn new(info: BodyInfo, newmark: Newmark, config: RecoveryConfig, own_first: bool) -> Self {
+    pub(crate) fn new(info: BodyInfo, newmark: Newmark, config: RecoveryConfig, predicts: bool) -> Self {
         Self {
             id: BodyId(info.body),
             info,
@@ -71,19 +71,19 @@ impl StreamedBody {
             model: None,
             receiver: None,
             playout: PlayoutClock::new(newmark.h, config.playout),
-            own: None,
-            own_first,
+            predicted: None,
+            predicts,
             config,
             newmark,
             waiting: Vec::new(),
             snapshot: None,
-            asks: Ring::new(HISTORY),
-            settled: 0,
+            requests: Ring::new(HISTORY),
+            resolved: 0,
             resting: false,
             fade_at: Duration::ZERO,
             stalled: false,
             received_at: Duration::ZERO,
-            snapshot_asked: None,
+            snapshot_requested: None,
             wants_snapshot: false,
             resynced: false,
             retuned: false,
@@ -146,7 +146,7 @@ impl StreamedBody {
     /// [`crate::GuestSessionConfig::predict_own_hand`]. Show it instead of [`StreamedBody::visual`] when it
     /// exists.
     pub fn predicted_hand(&self) -> Option<&PredictedHand> {
-        self.own.as_ref().filter(|own| own.is_active())
+        self.predicted.as_ref().filter(|predicted| predicted.is_active())
     }
 
     /// The rigid frame of a free body at the displayed tick.
@@ -196,7 +196,7 @@ impl StreamedBody {
         self.resting = snapshot.resting;
         self.received_at = now;
         self.wants_snapshot = false;
-        self.settled = self.settled.max(snapshot.tick);
+        self.resolved = self.resolved.max(snapshot.tick);
         let modes = snapshot.q.len();
         let retuned = std::mem::take(&mut self.retuned);
         if let Some(receiver) = &mut self.receiver
@@ -230,14 +230,14 @@ impl StreamedBody {
                 receiver.accept(&frame);
             }
         }
-        if let (Policy::ForceDriven { blend_ticks }, true) = (self.config.policy, self.own_first)
+        if let (Policy::ForceDriven { blend_ticks }, true) = (self.config.policy, self.predicts)
             && let Ok(replica) = Replica::new(model.clone(), self.info.settings, modes, self.newmark.h)
         {
-            let mut own = PredictedHand::new(replica, blend_ticks);
-            if let Some(before) = self.own.take() {
-                own.take_grabs(before);
+            let mut predicted = PredictedHand::new(replica, blend_ticks);
+            if let Some(before) = self.predicted.take() {
+                predicted.take_grabs(before);
             }
-            self.own = Some(own);
+            self.predicted = Some(predicted);
         }
         self.receiver = Some(receiver);
         self.snapshot = None;
@@ -272,8 +272,8 @@ impl StreamedBody {
             self.playout.arrived(now, frame.tick);
         }
         let before_run = frame.tick.saturating_sub(u64::from(frame.run) + 1);
-        if frame.run < u16::MAX && before_run > self.settled {
-            self.settled = before_run;
+        if frame.run < u16::MAX && before_run > self.resolved {
+            self.resolved = before_run;
             if self.resting && !frame.resting {
                 // The body wakes up: the sleeping state is the state before the run.
                 receiver.skip_to(before_run);
@@ -311,9 +311,9 @@ impl StreamedBody {
             }
             receiver.advance();
             stepped += 1;
-            if let Some(own) = &mut self.own {
+            if let Some(predicted) = &mut self.predicted {
                 let way = round_trip.as_secs_f64() + self.playout.delay();
-                own.step(receiver, user, (way / self.newmark.h).ceil() as usize);
+                predicted.step(receiver, user, (way / self.newmark.h).ceil() as usize);
             }
         }
         if self.config.snapshots && receiver.wants_snapshot() {
@@ -338,15 +338,15 @@ impl StreamedBody {
     }
 
     /// Returns true, at most once a second, when a snapshot is to be requested.
-    pub(crate) fn ask_snapshot(&mut self, now: Duration) -> bool {
+    pub(crate) fn request_snapshot(&mut self, now: Duration) -> bool {
         if !self.wants_snapshot {
             return false;
         }
         let again = Duration::from_secs(1);
-        if self.snapshot_asked.is_some_and(|at| now.saturating_sub(at) < again) {
+        if self.snapshot_requested.is_some_and(|at| now.saturating_sub(at) < again) {
             return false;
         }
-        self.snapshot_asked = Some(now);
+        self.snapshot_requested = Some(now);
         true
     }
 
@@ -358,33 +358,33 @@ impl StreamedBody {
         }
         let history = receiver.history();
         let highest = history.highest();
-        let from = (self.settled + 1).max(highest.saturating_sub(ASK_WITHIN));
+        let from = (self.resolved + 1).max(highest.saturating_sub(REQUEST_WITHIN));
         // Ticks that a repeat in a later frame may still bring are not requested.
         let to = highest.saturating_sub(u64::from(self.config.repeats));
         let step = Duration::from_secs_f64(2.0 * self.newmark.h);
         let again = (round_trip.mul_f64(1.5) + step).max(Duration::from_millis(60));
-        if self.settled + 1 < from {
+        if self.resolved + 1 < from {
             // The host will not send these ticks again. A stream of accelerations cannot recover
             // from their loss.
-            let unknown = (self.settled + 1..from).any(|t| history.known(t).is_none());
+            let unknown = (self.resolved + 1..from).any(|t| history.known(t).is_none());
             let integrates = !matches!(self.config.policy, Policy::ForceDriven { .. });
             self.wants_snapshot |= unknown && integrates && self.config.snapshots;
-            self.settled = from - 1;
+            self.resolved = from - 1;
         }
         let mut runs: Vec<NackRun> = Vec::new();
-        let mut settled = self.settled;
+        let mut resolved = self.resolved;
         for tick in from..to {
             if history.known(tick).is_some() {
-                if settled + 1 == tick {
-                    settled = tick;
+                if resolved + 1 == tick {
+                    resolved = tick;
                 }
                 continue;
             }
-            let (ask, other) = self.asks.place(tick);
+            let (request, other) = self.requests.place(tick);
             if other {
-                *ask = Ask { times: 0, next: now };
+                *request = TickRequest { times: 0, next: now };
             }
-            if ask.times >= ASKS || ask.next > now {
+            if request.times >= MOST_REQUESTS || request.next > now {
                 continue;
             }
             let room = runs.len() < MAX_NACK_RUNS;
@@ -393,26 +393,26 @@ impl StreamedBody {
                 _ if room => runs.push(NackRun { first: tick, count: 1 }),
                 _ => break,
             }
-            ask.times += 1;
+            request.times += 1;
             // The interval grows after the fourth request, since an answer may be slow rather than
             // lost.
-            ask.next = now + again.mul_f64(1.5_f64.powi(i32::from(ask.times.saturating_sub(4))));
+            request.next = now + again.mul_f64(1.5_f64.powi(i32::from(request.times.saturating_sub(4))));
         }
-        self.settled = settled;
+        self.resolved = resolved;
         (!runs.is_empty()).then_some(Nack { body: self.id, runs })
     }
 
     /// Time at which the next NACK is to be repeated.
-    pub(crate) fn next_ask(&self) -> Option<Duration> {
+    pub(crate) fn next_request(&self) -> Option<Duration> {
         let receiver = self.receiver.as_ref().filter(|_| self.config.nack)?;
         let history = receiver.history();
         let highest = history.highest();
-        let from = (self.settled + 1).max(highest.saturating_sub(ASK_WITHIN));
+        let from = (self.resolved + 1).max(highest.saturating_sub(REQUEST_WITHIN));
         let to = highest.saturating_sub(u64::from(self.config.repeats));
         (from..to)
             .filter(|t| history.known(*t).is_none())
-            .filter_map(|t| self.asks.get(t))
-            .filter(|a| a.times > 0 && a.times < ASKS)
+            .filter_map(|t| self.requests.get(t))
+            .filter(|a| a.times > 0 && a.times < MOST_REQUESTS)
             .map(|a| a.next)
             .min()
     }

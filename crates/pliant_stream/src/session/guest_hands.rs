@@ -77,8 +77,8 @@ impl GuestSession {
         let grab = self.next_grab;
         self.next_grab = grab.wrapping_add(1);
         self.grabs.insert(grab, LocalGrab { body, targets: VecDeque::new(), fresh: false, sent_at: now });
-        if let Some(own) = self.bodies.get_mut(&body).and_then(|b| b.own.as_mut()) {
-            own.begin(grab, vertex, radius, target, hold);
+        if let Some(predicted) = self.bodies.get_mut(&body).and_then(|b| b.predicted.as_mut()) {
+            predicted.begin(grab, vertex, radius, target, hold);
         }
         self.message(&GuestMessage::GrabBegin { grab, body: body.0, vertex, radius, target, hold });
         Ok(grab)
@@ -102,8 +102,8 @@ impl GuestSession {
         own.targets.push_back(TargetEntry { grab, input: self.input, target });
         own.fresh = true;
         let body = own.body;
-        if let Some(own) = self.bodies.get_mut(&body).and_then(|b| b.own.as_mut()) {
-            own.set(grab, target);
+        if let Some(predicted) = self.bodies.get_mut(&body).and_then(|b| b.predicted.as_mut()) {
+            predicted.set(grab, target);
         }
         Ok(())
     }
@@ -122,8 +122,8 @@ impl GuestSession {
     }
 
     pub(super) fn forget_own(&mut self, body: BodyId, grab: u16) {
-        if let Some(own) = self.bodies.get_mut(&body).and_then(|b| b.own.as_mut()) {
-            own.end(grab);
+        if let Some(predicted) = self.bodies.get_mut(&body).and_then(|b| b.predicted.as_mut()) {
+            predicted.end(grab);
         }
     }
 

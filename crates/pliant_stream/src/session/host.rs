@@ -149,8 +149,8 @@ impl HostSession {
         }
         p.link.max_datagram = bytes;
         // A new size means another encoder, whose receivers start from a snapshot.
-        let flowing = std::mem::take(&mut p.flowing);
-        p.due.extend(flowing);
+        let streaming = std::mem::take(&mut p.streaming);
+        p.due.extend(streaming);
         if bytes < MIN_DATAGRAM && p.user().is_some() {
             self.drop_peer(peer, DisconnectReason::SmallDatagrams, true);
         }
@@ -222,7 +222,7 @@ impl HostSession {
             None => p.interest.remove(&body),
         };
         if modes == Some(0) {
-            p.flowing.remove(&body);
+            p.streaming.remove(&body);
             p.due.remove(&body);
             p.resends.retain(|r| r.1 != body);
         } else {
@@ -293,7 +293,7 @@ impl HostSession {
                     for tick in run.first..run.first + u64::from(run.count) {
                         // A tick that is already queued needs no second answer.
                         let waits = p.resends.iter().any(|r| r.1 == nack.body && r.2 == tick);
-                        if !waits && p.flowing.contains(&nack.body) && p.nack_budget.spend(now, 1.0) {
+                        if !waits && p.streaming.contains(&nack.body) && p.nack_budget.spend(now, 1.0) {
                             p.queue_resend(now + self.config.resend_after, nack.body, tick);
                         }
                     }
@@ -378,7 +378,7 @@ impl HostSession {
             }
             (GuestMessage::SnapshotRequest { body }, Some(_)) => {
                 let body = BodyId(body);
-                if p.flowing.contains(&body) && p.snapshot_budget.spend(now, 1.0) {
+                if p.streaming.contains(&body) && p.snapshot_budget.spend(now, 1.0) {
                     self.send_snapshot(peer, body);
                 }
             }
@@ -516,9 +516,9 @@ impl HostSession {
         }
     }
 
-    pub(super) fn drop_peer(&mut self, peer: PeerId, reason: DisconnectReason, tell: bool) {
+    pub(super) fn drop_peer(&mut self, peer: PeerId, reason: DisconnectReason, goodbye: bool) {
         let Some(mut p) = self.peers.remove(&peer) else { return };
-        if tell {
+        if goodbye {
             p.say_goodbye(reason, &mut self.out);
         }
         self.gone.add_counts(&p.link.stats);

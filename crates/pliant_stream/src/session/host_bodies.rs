@@ -135,7 +135,7 @@ impl HostSession {
         let mut ended = Vec::new();
         for peer in self.peers.values_mut() {
             peer.due.remove(&body);
-            peer.flowing.remove(&body);
+            peer.streaming.remove(&body);
             peer.interest.remove(&body);
             peer.resends.retain(|r| r.1 != body);
             let Some(user) = peer.user() else { continue };

@@ -57,7 +57,7 @@ pub(crate) struct GuestPeer {
     /// Bodies whose snapshot is due at their next tick.
     pub(crate) due: BTreeSet<BodyId>,
     /// Bodies whose snapshot was sent and whose frames are streamed.
-    pub(crate) flowing: BTreeSet<BodyId>,
+    pub(crate) streaming: BTreeSet<BodyId>,
     /// Limits of the modes that are sent per body; 0 sends nothing. A body without an entry has no
     /// limit.
     pub(crate) interest: BTreeMap<BodyId, u16>,
@@ -89,7 +89,7 @@ impl GuestPeer {
             transfers: VecDeque::new(),
             announced: BTreeSet::new(),
             due: BTreeSet::new(),
-            flowing: BTreeSet::new(),
+            streaming: BTreeSet::new(),
             interest: BTreeMap::new(),
             grabs: BTreeMap::new(),
             resends: VecDeque::new(),

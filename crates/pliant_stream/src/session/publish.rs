@@ -66,7 +66,7 @@ impl HostSession {
         for p in self.peers.values_mut() {
             let Some(key) = stream_key(p, entry) else { continue };
             let due = is_due(p);
-            if p.flowing.contains(&body) || due {
+            if p.streaming.contains(&body) || due {
                 keys.insert(key);
                 takers.push((p.id, key, due));
             }
@@ -114,7 +114,7 @@ impl HostSession {
             };
             let Some(p) = self.peers.get_mut(&peer) else { continue };
             if let Some(encoded) = frame
-                && p.flowing.contains(&body)
+                && p.streaming.contains(&body)
                 && !encoded.all().all(|bytes| p.send_frame(bytes, &mut self.out))
             {
                 // The path shrank after the key was taken. The next tick uses the new size.
@@ -126,9 +126,9 @@ impl HostSession {
                     p.queue_resend(due, body, state.tick);
                 }
             }
-            if due || *fresh || (reminds && p.flowing.contains(&body)) {
+            if due || *fresh || (reminds && p.streaming.contains(&body)) {
                 p.due.remove(&body);
-                p.flowing.insert(body);
+                p.streaming.insert(body);
                 self.send_snapshot(peer, body);
             }
         }
@@ -151,9 +151,9 @@ fn check_state(body: &HostBody, state: &TickState<'_>) -> Result<(), StreamError
             return Err(StreamError::Length { what, found: slice.len(), expected: modes });
         }
     }
-    let flows = if body.settings.relaxation.is_some() { state.q.len() } else { 0 };
-    if state.z.len() != flows {
-        return Err(StreamError::Length { what: "z", found: state.z.len(), expected: flows });
+    let viscoelastic = if body.settings.relaxation.is_some() { state.q.len() } else { 0 };
+    if state.z.len() != viscoelastic {
+        return Err(StreamError::Length { what: "z", found: state.z.len(), expected: viscoelastic });
     }
     if !in_range(state.z) {
         return Err(StreamError::NotFinite { what: "z" });

@@ -24,7 +24,7 @@ pub(crate) use inputs::{MAX_HELD, MAX_TICKS};
 pub use message::{BodyInfo, GuestMessage, HostMessage, Payload, SnapshotBytes, StreamSubscription};
 pub(crate) use message::{MAX_BODIES, MAX_CACHED, MAX_NAME, check_hold};
 pub(crate) use peer_message::{MAX_ADDRESS, MAX_PEERS};
-pub use peer_message::{PeerBodyState, PeerFrame, PeerGrip, PeerMessage};
+pub use peer_message::{PeerBodyState, PeerFrame, PeerHandState, PeerMessage};
 pub use slice::{Slice, SliceEntry};
 
 /// Version of the formats in this module. The two sides of a session must agree.

@@ -44,7 +44,7 @@ pub struct PeerBodyState {
     /// The rigid frame of a free body.
     pub frame: Option<PeerFrame>,
     /// The hands on the body in the last step.
-    pub pulls: Vec<PeerGrip>,
+    pub pulls: Vec<PeerHandState>,
 }
 
 impl PeerBodyState {
@@ -57,18 +57,18 @@ impl PeerBodyState {
             let norm = f.orientation.iter().map(|x| x * x).sum::<f64>();
             [f.center, f.velocity, f.spin].iter().all(|x| in_range(x)) && (0.5..2.0).contains(&norm)
         });
-        let grip = |p: &PeerGrip| [p.pull, p.mean, p.target, p.flow].iter().all(|x| in_range(x));
+        let hand = |p: &PeerHandState| [p.pull, p.mean, p.target, p.viscoelastic].iter().all(|x| in_range(x));
         let sane = frame
             && [&self.q, &self.v, &self.z].iter().all(|x| in_range(x))
             && [&self.a, &self.force].iter().all(|x| wide_range(x))
-            && self.pulls.iter().all(grip);
+            && self.pulls.iter().all(hand);
         check("state", sane, "a number out of range", "finite numbers")
     }
 }
 
 /// Force and target of one hand in the last step of a [`PeerBodyState`].
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
-pub struct PeerGrip {
+pub struct PeerHandState {
     /// User of the hand.
     pub user: u16,
     /// The user's number for the grab.
@@ -80,7 +80,7 @@ pub struct PeerGrip {
     /// Position of the hand, world, m.
     pub target: [f64; 3],
     /// Viscoelastic state of the patch's residual flexibility, m, body axes.
-    pub flow: [f64; 3],
+    pub viscoelastic: [f64; 3],
 }
 
 /// Reliable messages between peers.

@@ -35,22 +35,28 @@ pub struct Slice {
     /// The slice carries loads. Otherwise they are 0.
     pub loads: bool,
     /// The slice carries viscoelastic states. Otherwise they are 0.
-    pub flows: bool,
+    pub viscoelastic: bool,
     /// Mode index, and quantization steps of q, v, load and z; at most 255 entries.
     pub steps: Vec<(u16, [i32; 4])>,
 }
 
 impl Slice {
     /// Quantizes a state for a slice, at most 255 modes.
-    pub fn quantise(values: &[SliceEntry], unit: f32, loads: bool, flows: bool, quanta: &Quanta) -> Self {
-        let mut made = Self { unit, loads, flows, steps: Vec::with_capacity(values.len().min(255)) };
+    pub fn quantise(
+        values: &[SliceEntry],
+        unit: f32,
+        loads: bool,
+        viscoelastic: bool,
+        quanta: &Quanta,
+    ) -> Self {
+        let mut made = Self { unit, loads, viscoelastic, steps: Vec::with_capacity(values.len().min(255)) };
         for e in values.iter().take(255).filter(|e| e.mode < quanta.modes()) {
             let k = e.mode;
             let step = |x: f64, quantum: f64| {
                 if unit > 0.0 { whole(x / (quantum * f64::from(unit))) } else { 0 }
             };
             let load = if loads { step(e.load, quanta.load[k]) } else { 0 };
-            let z = if flows { step(e.z, quanta.place[k]) } else { 0 };
+            let z = if viscoelastic { step(e.z, quanta.place[k]) } else { 0 };
             made.steps.push((k as u16, [step(e.q, quanta.place[k]), step(e.v, quanta.speed[k]), load, z]));
         }
         made
@@ -74,7 +80,7 @@ impl Slice {
     fn crosses(&self, part: usize) -> bool {
         match part {
             2 => self.loads,
-            3 => self.flows,
+            3 => self.viscoelastic,
             _ => true,
         }
     }
@@ -95,7 +101,7 @@ impl Slice {
 
     pub(crate) fn encode(&self, w: &mut Writer) {
         w.u8(self.steps.len() as u8);
-        w.u8(if self.loads { LOAD } else { 0 } | if self.flows { FLOW } else { 0 });
+        w.u8(if self.loads { LOAD } else { 0 } | if self.viscoelastic { FLOW } else { 0 });
         w.f32(self.unit);
         let mut bits = BitWriter::new(w);
         for (mode, steps) in &self.steps {
@@ -119,7 +125,7 @@ impl Slice {
         let unit = r.f32("slice unit")? as f32;
         // The capacity follows from the bytes present: a mode takes at least 22 bits.
         let steps = Vec::with_capacity(count.min(r.left() * 8 / 22));
-        let mut made = Self { unit, loads: parts & LOAD != 0, flows: parts & FLOW != 0, steps };
+        let mut made = Self { unit, loads: parts & LOAD != 0, viscoelastic: parts & FLOW != 0, steps };
         let mut bits = BitReader::new(r);
         for _ in 0..count {
             let mode = bits.take("slice mode", MODE_BITS)? as u16;
