@@ -27,6 +27,10 @@
     feature = "contact",
     doc = "| [`ContactPlugin`](contact::ContactPlugin) | bodies touch floors, balls, boxes and capsules (feature `contact`) | bodies touch nothing |"
 )]
+#![cfg_attr(
+    all(feature = "panel", feature = "rerun"),
+    doc = "| [`RecordingPanelPlugin`] | the live panel shows the recording (features `panel` and `rerun`) | the panel has no such section |"
+)]
 //!
 //! These plugins are added where they are needed, each behind its feature:
 //!

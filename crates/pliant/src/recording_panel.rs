@@ -54,7 +54,7 @@ fn exchange(
         stress: settings.color == RerunColor::Stress,
     };
     *last = Some(view.clone());
-    shown.0 = view;
+    **shown = view;
 }
 
 #[cfg(test)]
