@@ -50,3 +50,30 @@ impl Rollback {
         true
     }
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::state::State;
+
+    #[test]
+    fn a_copy_returns_to_its_last_ticks_and_to_no_other() {
+        let at = |tick: u64| State { q: vec![tick as f64], ..State::zero(1, false) };
+        let mut rollback = Rollback::new(BodyCopy::new(at(0)), 4);
+        for tick in 1..=6 {
+            rollback.now.state = at(tick);
+            rollback.reach(tick);
+        }
+        assert!(!rollback.back_to(2), "another tick has its place");
+        assert!(!rollback.back_to(7), "not reached yet");
+        assert_eq!((rollback.tick(), rollback.now.state.q[0]), (6, 6.0), "nothing changes then");
+        assert!(rollback.back_to(4));
+        assert_eq!((rollback.tick(), rollback.now.state.q[0]), (4, 4.0));
+        // What was after it is void until it is stepped again.
+        assert!(rollback.at(5).is_none() && !rollback.back_to(6));
+        rollback.now.state = at(50);
+        rollback.reach(5);
+        assert_eq!(rollback.at(5).map(|copy| copy.state.q[0]), Some(50.0));
+        assert!(rollback.back_to(3));
+    }
+}
