@@ -36,10 +36,11 @@ pub(crate) struct DropArgs {
     /// Steps per second
     #[arg(long, value_name = "HZ", default_value_t = 60.0, allow_negative_numbers = true)]
     rate: f64,
-    /// What the body falls onto: `plane`, or `sphere:R`, a ball of radius R (m) under its center
-    #[arg(long, value_name = "plane|sphere:R", value_parser = onto, default_value = "plane")]
-    onto: Onto,
-    /// Elasticity of the body: linear or reduced [default: reduced if the model has a material]
+    /// What the body falls onto: `plane`, `sphere:R`, a ball of radius R (m) under its center, or a
+    /// model, a body that stands under it on a plane. A body with anchors keeps them
+    #[arg(long, value_name = "plane|sphere:R|MODEL.modal", value_parser = onto, default_value = "plane")]
+    onto: Under,
+    /// Elasticity of the bodies: linear or reduced [default: reduced if the model has a material]
     #[arg(long, value_parser = elasticity)]
     elasticity: Option<Elasticity>,
     /// Prints one line of JSON with every step
@@ -47,16 +48,31 @@ pub(crate) struct DropArgs {
     json: bool,
 }
 
-fn onto(text: &str) -> Result<Onto, String> {
-    let radius = || text.strip_prefix("sphere:")?.trim().parse().ok();
-    match text {
-        "plane" => Ok(Onto::Plane),
-        _ => radius().map(Onto::Sphere).ok_or_else(|| "expected plane, or sphere:R with R in m".to_owned()),
+/// What the body falls onto, as it is written.
+#[derive(Debug, Clone)]
+enum Under {
+    Plane,
+    Sphere(f64),
+    Model(PathBuf),
+}
+
+fn onto(text: &str) -> Result<Under, String> {
+    let expected = || "expected plane, sphere:R with R in m, or the file of a model".to_owned();
+    match text.strip_prefix("sphere:") {
+        Some(radius) => radius.trim().parse().map(Under::Sphere).map_err(|_| expected()),
+        None if text == "plane" => Ok(Under::Plane),
+        None if text.ends_with(".modal") => Ok(Under::Model(text.into())),
+        None => Err(expected()),
     }
 }
 
 pub(crate) fn run(args: &DropArgs) -> Result<(), CliError> {
     let model = Arc::new(ModalModel::read(&args.model)?);
+    let onto = match &args.onto {
+        Under::Plane => Onto::Plane,
+        Under::Sphere(radius) => Onto::Sphere(*radius),
+        Under::Model(path) => Onto::Body(Arc::new(ModalModel::read(path)?)),
+    };
     let asked = Drop {
         height: args.height,
         tilt: args.tilt,
@@ -64,7 +80,7 @@ pub(crate) fn run(args: &DropArgs) -> Result<(), CliError> {
         gravity: args.gravity,
         seconds: args.seconds,
         rate: args.rate,
-        onto: args.onto,
+        onto,
         elasticity: args.elasticity,
     };
     let dropped = drop(&model, &asked)?;

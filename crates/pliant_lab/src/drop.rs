@@ -1,10 +1,11 @@
-//! A free body that falls onto the ground or onto a ball.
+//! A free body that falls onto the ground, onto a ball or onto another body.
 
 use std::{sync::Arc, time::Instant};
 
 use nalgebra::{UnitQuaternion, Vector3};
 use pliant_modal::{
-    Body, BodyConfig, Contacts, Elasticity, ModalModel, ModelError, Obstacle, Plane, Sphere, StepSettings,
+    Body, BodyConfig, Contacts, Elasticity, Islands, ModalModel, ModelError, Obstacle, Plane, Sphere,
+    StepSettings, Together,
 };
 use serde::Serialize;
 
@@ -18,20 +19,23 @@ use crate::{
 const MOST_TICKS: f64 = 1e7;
 
 /// What a body falls onto.
-#[derive(Debug, Clone, Copy, PartialEq, Default)]
+#[derive(Debug, Clone, PartialEq, Default)]
 pub enum Onto {
     /// The plane `y = 0`.
     #[default]
     Plane,
     /// A ball of this radius (m), whose highest point is at `y = 0` under the center of mass.
     Sphere(f64),
+    /// A body of this model, whose highest point is at `y = 0` and whose center of mass is under
+    /// that of the body that falls. Its lowest point stands on a plane, which both touch.
+    Body(Arc<ModalModel>),
 }
 
 /// A fall to compute.
 ///
 /// The body stands as its model does. Then the body and what it falls onto are turned about the z
 /// axis by the tilt. Gravity always points along -y.
-#[derive(Debug, Clone, Copy, PartialEq)]
+#[derive(Debug, Clone, PartialEq)]
 pub struct Drop {
     /// Gap under the lowest point of the body, m, 0 or more. Default: 0.1.
     pub height: f64,
@@ -47,7 +51,7 @@ pub struct Drop {
     pub rate: f64,
     /// What the body falls onto.
     pub onto: Onto,
-    /// Elasticity of the body. `None`: reduced if the model has a material, linear otherwise.
+    /// Elasticity of the bodies. `None`: reduced if a model has a material, linear otherwise.
     pub elasticity: Option<Elasticity>,
 }
 
@@ -66,8 +70,8 @@ impl Default for Drop {
     }
 }
 
-/// The body after one step.
-#[derive(Serialize, Debug, Clone, Copy, PartialEq)]
+/// The body after one step. Energies include those of the body that it falls onto.
+#[derive(Serialize, Debug, Clone, Copy, PartialEq, Default)]
 pub struct Tick {
     /// Time, s.
     pub time: f64,
@@ -102,7 +106,7 @@ pub struct Dropped {
     pub size: f64,
     /// Number of contact sites of the body.
     pub sites: usize,
-    /// Time of one step on one core.
+    /// Time of one step of all bodies on one core.
     pub step_us: Percentiles,
     /// The start and the end of every step.
     pub ticks: Vec<Tick>,
@@ -110,7 +114,7 @@ pub struct Dropped {
 
 impl Drop {
     fn check(&self) -> Result<(), LabError> {
-        let Self { height, tilt, gravity, seconds, rate, .. } = *self;
+        let &Self { height, tilt, gravity, seconds, rate, .. } = self;
         let number = |what, expected, sound: bool, got| {
             if sound { Ok(()) } else { Err(ModelError::Value { what, index: 0, expected, got }) }
         };
@@ -127,20 +131,35 @@ impl Drop {
     }
 }
 
-fn tick(body: &Body, time: f64, step_us: f64) -> Tick {
-    let (report, kinetic) = (body.contacts().report(), body.kinetic_energy());
+fn tick(bodies: &[Body], time: f64, step_us: f64) -> Tick {
+    let sum = |of: fn(&Body) -> f64| bodies.iter().map(of).sum::<f64>();
+    let [body, ..] = bodies else { return Tick { time, step_us, ..Tick::default() } };
+    let report = body.contacts().report();
     Tick {
         time,
         center: body.frame().center(),
         velocity: body.frame().velocity(),
         contact_force: report.force,
-        kinetic,
-        elastic: body.energy() - kinetic + report.energy,
-        potential: body.potential_energy(),
+        kinetic: sum(Body::kinetic_energy),
+        elastic: sum(|body| body.energy() - body.kinetic_energy() + body.contacts().report().energy),
+        potential: sum(Body::potential_energy),
         contacts: report.contacts,
         penetration: report.penetration,
         step_us,
     }
+}
+
+/// Makes a body for a fall.
+fn make(model: &Arc<ModalModel>, drop: &Drop, elasticity: Option<Elasticity>) -> Result<Body, LabError> {
+    let of_model = if model.material().is_some() { Elasticity::Reduced } else { Elasticity::Linear };
+    let elasticity = elasticity.unwrap_or(of_model);
+    if elasticity == Elasticity::Reduced && model.material().is_none() {
+        return Err(LabError::NoMaterial);
+    }
+    let settings = StepSettings { elasticity, gravity: [0.0, -drop.gravity, 0.0], ..StepSettings::default() };
+    let mut body = Body::new(model.clone(), BodyConfig { step: 1.0 / drop.rate, ..settings.into() })?;
+    body.set_friction(drop.friction)?;
+    Ok(body)
 }
 
 /// Lets a free body fall.
@@ -148,44 +167,61 @@ fn tick(body: &Body, time: f64, step_us: f64) -> Tick {
 /// # Errors
 /// Returns [`LabError::Anchored`] for a body with anchors, [`LabError::NoMaterial`] for reduced
 /// elasticity of a model that has no material, [`LabError::Model`] for a number out of its range,
-/// and [`LabError::Step`] when the body cannot be stepped.
+/// and [`LabError::Step`] when a body cannot be stepped.
 pub fn drop(model: &Arc<ModalModel>, drop: &Drop) -> Result<Dropped, LabError> {
     drop.check()?;
     if !model.is_free() {
         return Err(LabError::Anchored);
     }
-    let of_model = if model.material().is_some() { Elasticity::Reduced } else { Elasticity::Linear };
-    let elasticity = drop.elasticity.unwrap_or(of_model);
-    if elasticity == Elasticity::Reduced && model.material().is_none() {
-        return Err(LabError::NoMaterial);
-    }
-    let settings = StepSettings { elasticity, gravity: [0.0, -drop.gravity, 0.0], ..StepSettings::default() };
-    let mut body = Body::new(model.clone(), BodyConfig { step: 1.0 / drop.rate, ..settings.into() })?;
+    let mut body = make(model, drop, drop.elasticity)?;
     let turn = UnitQuaternion::from_axis_angle(&Vector3::z_axis(), drop.tilt.to_radians());
-    let obstacle: Arc<dyn Obstacle> = match drop.onto {
-        Onto::Plane => Arc::new(Plane { point: [0.0; 3], normal: (turn * Vector3::y()).into() }),
+    let normal = (turn * Vector3::y()).into();
+    let [x, _, z] = model.center_of_mass();
+    let [i, j, k, w] = [turn.i, turn.j, turn.k, turn.w];
+    let mut under = None;
+    let obstacle: Arc<dyn Obstacle> = match &drop.onto {
+        Onto::Plane => Arc::new(Plane { point: [0.0; 3], normal }),
         Onto::Sphere(radius) => {
-            let [x, _, z] = model.center_of_mass();
-            Arc::new(Sphere { center: (turn * Vector3::new(x, -radius, z)).into(), radius })
+            Arc::new(Sphere { center: (turn * Vector3::new(x, -radius, z)).into(), radius: *radius })
+        }
+        Onto::Body(base) => {
+            // A base without a material is linear, whatever the body that falls is.
+            let elasticity = drop.elasticity.filter(|_| base.material().is_some());
+            let mut base = make(base, drop, elasticity)?;
+            let [low, high] = base.model().surface().bounds().map(|corner| f64::from(corner[1]));
+            let [under_x, _, under_z] = base.model().center_of_mass();
+            let origin = turn * Vector3::new(x - under_x, -high, z - under_z);
+            base.set_pose(origin.into(), [i, j, k, w])?;
+            under = Some(base);
+            Arc::new(Plane { point: (turn * Vector3::new(0.0, low - high, 0.0)).into(), normal })
         }
     };
-    body.set_friction(drop.friction)?;
     let lowest = f64::from(model.surface().bounds()[0][1]);
     let origin = turn * Vector3::new(0.0, drop.height - lowest, 0.0);
-    let turn = turn.quaternion();
-    body.set_pose(origin.into(), [turn.i, turn.j, turn.k, turn.w])?;
-    body.set_obstacles(vec![obstacle])?;
+    body.set_pose(origin.into(), [i, j, k, w])?;
+    let mut bodies = vec![body];
+    bodies.extend(under);
+    for body in &mut bodies {
+        body.set_obstacles(vec![obstacle.clone()])?;
+    }
     let _pinned = Pinned::new();
     let steps = (drop.seconds * drop.rate).round().max(1.0) as usize;
     let mut ticks = Vec::with_capacity(steps + 1);
-    ticks.push(tick(&body, 0.0, 0.0));
+    ticks.push(tick(&bodies, 0.0, 0.0));
+    let mut islands = Islands::default();
     for step in 1..=steps {
+        let mut all: Vec<Together<'_>> =
+            bodies.iter_mut().enumerate().map(|(key, body)| Together::new(key as u64, body)).collect();
         let begun = Instant::now();
-        body.step()?;
+        islands.step(&mut all, |_, _| true);
         let taken = begun.elapsed().as_secs_f64() * 1e6;
-        ticks.push(tick(&body, step as f64 / drop.rate, taken));
+        if let Some(error) = all.into_iter().find_map(|together| together.error) {
+            return Err(error.into());
+        }
+        ticks.push(tick(&bodies, step as f64 / drop.rate, taken));
     }
     let step_us = percentiles(ticks[1..].iter().map(|tick| tick.step_us).collect());
-    let sites = body.contacts().sites();
+    let (elasticity, sites) =
+        bodies.first().map_or((Elasticity::Linear, 0), |body| (body.config().settings.elasticity, body.contacts().sites()));
     Ok(Dropped { elasticity, mass: model.mass(), size: model.size(), sites, step_us, ticks })
 }

@@ -8,7 +8,7 @@ use crate::{
     Contacts, Frame, GrabConfig, Hand, HeldPatch, HeldShapes, Hold, Kernel, Load, ModalModel, Obstacle,
     Patch, Precision, State, StepError, StepReport, StepSettings,
     error::finite,
-    step::{Six, tangent},
+    step::{Six, group::{Parts, View}, tangent},
 };
 
 /// Identifier of a grab on a body. A body never uses an identifier twice.
@@ -523,8 +523,7 @@ impl Body {
 
     /// Kinetic energy of the modes, and of the rigid motion of a free body, J.
     pub fn kinetic_energy(&self) -> f64 {
-        let frame = if self.model().is_free() { self.state.frame.kinetic_energy(self.model()) } else { 0.0 };
-        frame + self.state.v.iter().map(|v| 0.5 * v * v).sum::<f64>()
+        self.kernel.kinetic_energy(&self.state)
     }
 
     /// Potential energy in gravity, J.
@@ -573,6 +572,14 @@ impl Body {
     /// its state before the step. If that state contains a number above 1e100, the body is set to
     /// rest, undeformed, at the pose of its frame.
     pub fn step(&mut self) -> Result<StepReport, StepError> {
+        self.begin_step();
+        let report = self.step_alone();
+        self.end_step();
+        report
+    }
+
+    /// Leads the hands to their targets.
+    pub(crate) fn begin_step(&mut self) {
         for (hand, grab) in self.hands.iter_mut().zip(&mut self.grabs) {
             // A hand has no velocity in the first step of its grab.
             let way = grab.last_target.map_or_else(Vector3::zeros, |last| grab.target - last);
@@ -580,13 +587,45 @@ impl Body {
             hand.hold = Hold::Target { target, velocity: way / self.config.step, config };
             grab.last_target = Some(target);
         }
+    }
+
+    /// Performs one step without other bodies, after [`Body::begin_step`].
+    pub(crate) fn step_alone(&mut self) -> Result<StepReport, StepError> {
         let (force, torque) = (self.push_force, self.push_torque);
         let load = Load { modal: &self.pushes, force, torque, frame_is_given: false };
-        let report = self.kernel.step_touching(&mut self.state, &mut self.hands, &load, &mut self.contacts);
+        self.kernel.step_touching(&mut self.state, &mut self.hands, &load, &mut self.contacts)
+    }
+
+    /// Drops the pushes of the step.
+    pub(crate) fn end_step(&mut self) {
         self.pushes.fill(0.0);
         self.push_force = Vector3::zeros();
         self.push_torque = Vector3::zeros();
-        report
+    }
+
+    pub(crate) fn contacts_mut(&mut self) -> &mut Contacts {
+        &mut self.contacts
+    }
+
+    /// What a step with others changes.
+    pub(crate) fn parts<'a>(&'a mut self, report: &'a mut StepReport) -> Parts<'a> {
+        let (force, torque) = (self.push_force, self.push_torque);
+        let load = Load { modal: &self.pushes, force, torque, frame_is_given: false };
+        Parts {
+            kernel: &mut self.kernel,
+            state: &mut self.state,
+            hands: &mut self.hands,
+            load,
+            contacts: &mut self.contacts,
+            report,
+        }
+    }
+
+    /// What a step with others reads.
+    pub(crate) fn view(&self) -> View<'_> {
+        let (force, torque) = (self.push_force, self.push_torque);
+        let load = Load { modal: &self.pushes, force, torque, frame_is_given: false };
+        View { kernel: &self.kernel, state: &self.state, hands: &self.hands, load, contacts: &self.contacts }
     }
 
     fn find(&self, id: GrabId) -> Result<usize, StepError> {

@@ -46,6 +46,7 @@ mod file;
 mod flexibility;
 mod held;
 mod integrator;
+mod islands;
 mod limit;
 mod model;
 mod nonlinear;
@@ -60,12 +61,13 @@ mod warp;
 pub use basis::{BLOCK, Basis, Precision, ROWS};
 pub use body::{Body, BodyConfig, GrabId};
 pub use contact::{
-    Capsule, Contact, ContactReport, Contacts, Cuboid, Moving, Obstacle, Plane, Sphere, SurfacePoint,
+    Capsule, Contact, ContactReport, Contacts, Cuboid, Moving, Obstacle, Plane, Sphere, SurfacePoint, Touched,
 };
 pub use error::{FileError, ModelError, StepError};
 pub use file::{FORMAT_VERSION, MAGIC};
 pub use held::{HeldShapes, SimulationMesh, VertexPlace};
 pub use integrator::{Coefficients, Integrator};
+pub use islands::{Islands, Together};
 pub use limit::streaming_sum;
 pub use model::{BakeInfo, Damping, Element, FlexibilitySite, ModalModel, ModelHash, ModelParts};
 pub use nonlinear::{ElasticEnergy, Hyperelastic, Material, ReducedElasticity, positive_tangent};

@@ -1,13 +1,13 @@
-//! Contact of a body with obstacles: where a body may touch, what it touches, and the law of a
-//! contact.
+//! Contact of bodies with obstacles and with each other: where a body may touch, what it touches,
+//! and the law of a contact.
 //!
 //! A body touches at its *contact sites*, patches of its surface that are spread evenly. A contact
 //! is a hand with a cone: the force `f` (N) on a site and the position `y` (m) of its surface after
 //! the step obey
 //!
 //! ```text
-//! y = x* + sum A f + C f        x*: position without contacts, A: response of the body,
-//!                               C: residual flexibility of the site
+//! y = x* + sum A f + C f        x*: position without contacts, A: response of the bodies,
+//!                               C: residual flexibility of the site and of what it touches
 //! gap(y) >= 0,  f_n >= 0,  f_n gap(y) = 0          Signorini, along the normal
 //! |f_t| <= mu f_n,  y_t at its anchor or sliding   Coulomb, in the tangent plane
 //! ```
@@ -15,14 +15,24 @@
 //! The tangential law holds positions, not velocities: a site that sticks has an *anchor*, so a
 //! body at rest on an incline does not creep. The laws of all contacts are solved together by block
 //! Gauss-Seidel in modal space, with the exact solution of each block.
+//!
+//! Two bodies touch with the sites of each at the surface of the other. A point is pulled back to
+//! the rest shape of the other body through its deformation. `y` is then the position of one
+//! surface relative to the other, and `A` and `C` have the responses of both bodies.
 
 mod cone;
 mod contacts;
 mod obstacle;
+mod point;
+mod shape;
 mod sites;
+mod solver;
+mod surface_field;
 
-pub use contacts::{Contact, ContactReport, Contacts};
+pub use contacts::{Contact, ContactReport, Contacts, Touched};
 pub use obstacle::{Capsule, Cuboid, Moving, Obstacle, Plane, Sphere, SurfacePoint};
 
-pub(crate) use contacts::{Memory, Point, Touching};
+pub(crate) use point::{Far, Memory, Point};
+pub(crate) use shape::{Near, Shape};
 pub(crate) use sites::{ContactSites, Site};
+pub(crate) use solver::Touching;

@@ -1,7 +1,10 @@
 //! The places at which a body may touch.
 
+use std::sync::OnceLock;
+
 use nalgebra::{Matrix3, Vector3};
 
+use super::surface_field::SurfaceField;
 use crate::{HeldPatch, ModalModel, Patch, StepError};
 
 /// Largest number of contact sites of a body.
@@ -37,6 +40,8 @@ pub(crate) struct Site {
     /// point slides.
     pub(crate) outward: Vector3<f64>,
     pub(crate) reach: f64,
+    /// Outward normal of the surface at the vertex, body axes.
+    pub(crate) facing: Vector3<f64>,
 }
 
 impl Site {
@@ -74,6 +79,10 @@ pub(crate) struct ContactSites {
     softest: f64,
     /// Largest distance of a site from the center of mass at rest, m.
     pub(crate) radius: f64,
+    /// Mean distance between neighboring sites, m.
+    pub(crate) spacing: f64,
+    /// The surface that other bodies touch, made at the first request.
+    field: OnceLock<SurfaceField>,
 }
 
 impl ContactSites {
@@ -128,6 +137,8 @@ impl ContactSites {
             let near = |p: &&Vector3<f64>| (**p - positions[vertex]).norm() < 2.0 * spacing;
             positions.iter().filter(near).copied().collect::<Vec<_>>()
         };
+        let mut normals = vec![[0.0; 3]; positions.len()];
+        surface.normals(surface.positions(), &mut normals, &mut Vec::new());
         let mut sites = Vec::with_capacity(chosen.len());
         for &vertex in &chosen {
             let patch = Patch::around(surface, vertex as u32, spacing)
@@ -138,7 +149,8 @@ impl ContactSites {
             let (center, radius) = ball.unwrap_or((at, 0.0));
             let outward = if radius > 0.0 { (at - center) / radius } else { Vector3::y() };
             let reach = if radius > 0.0 { (slide / radius).min(1.5).cos() } else { 1.0 };
-            sites.push(Site { vertex: vertex as u32, patch, center, radius, outward, reach });
+            let facing = Vector3::from(normals[vertex].map(f64::from));
+            sites.push(Site { vertex: vertex as u32, patch, center, radius, outward, reach, facing });
         }
         let omega = model.omega()[..modes.min(model.mode_count())].to_vec();
         let mut softest = 0.0f64;
@@ -154,7 +166,12 @@ impl ContactSites {
             softest = softest.max(flexibility);
         }
         let radius = sites.iter().map(|s| (positions[s.vertex as usize] - com).norm()).fold(0.0, f64::max);
-        Ok(Self { sites, largest, omega, softest, radius })
+        Ok(Self { sites, largest, omega, softest, radius, spacing, field: OnceLock::new() })
+    }
+
+    /// The surface that other bodies touch. It depends on the model alone.
+    pub(crate) fn field(&self, model: &ModalModel) -> &SurfaceField {
+        self.field.get_or_init(|| SurfaceField::new(model, &self.sites))
     }
 
     /// Bound on the displacement of every site at the coordinates `q`, m.

@@ -1,11 +1,15 @@
 //! One step of a body: first the modes and the frame without hands, then all hands together,
 //! implicitly.
 
+pub(crate) mod group;
+mod points;
 mod touch;
 
 use std::sync::Arc;
 
 use nalgebra::{Matrix3, Vector3};
+
+use group::{Parts, View};
 
 use super::{
     Frame, Hand, Hold, RigidMotion, State, StepSettings,
@@ -115,6 +119,21 @@ pub struct Kernel {
     responses: Grams,
     dampers: Grams,
     system: System,
+}
+
+/// A body that is stepped without others.
+struct Alone<'a>(Parts<'a>);
+
+impl group::Member for Alone<'_> {
+    fn parts(&mut self) -> Parts<'_> {
+        let Parts { kernel, state, hands, load, contacts, report } = &mut self.0;
+        Parts { kernel, state, hands, load: *load, contacts, report }
+    }
+
+    fn view(&self) -> View<'_> {
+        let Parts { kernel, state, hands, load, contacts, .. } = &self.0;
+        View { kernel, state, hands, load: *load, contacts }
+    }
 }
 
 /// Compliance of a hand with these shapes of held patches, turned with its patch at the coordinates
@@ -403,10 +422,17 @@ impl Kernel {
         hands: &mut [Hand],
         load: &Load<'_>,
     ) -> Result<StepReport, StepError> {
-        self.step_guarded(state, hands, load, None)
+        self.check_step(state, hands)?;
+        self.before.clone_from(state);
+        let report = self.advance(state, hands, load);
+        let bad = |hand: &Hand| !hand.pull.iter().chain(&hand.mean).chain(&hand.flow).all(|x| x.is_finite());
+        let what = state.non_finite().or(hands.iter().any(bad).then_some("a reaction"));
+        let Some(what) = what else { return Ok(report) };
+        self.give_up(state, hands);
+        Err(StepError::Diverged { what })
     }
 
-    /// Performs one step of a state with these hands and contacts.
+    /// Performs one step of a state with these hands and contacts with obstacles.
     ///
     /// # Errors
     /// Returns the errors of [`Kernel::step`], and [`StepError::Input`] for an obstacle whose
@@ -418,49 +444,48 @@ impl Kernel {
         load: &Load<'_>,
         contacts: &mut Contacts,
     ) -> Result<StepReport, StepError> {
-        self.step_guarded(state, hands, load, Some(contacts))
+        self.check_step(state, hands)?;
+        let mut work = std::mem::take(&mut contacts.touching);
+        let mut report = StepReport::default();
+        let mut alone = [Alone(Parts { kernel: self, state, hands, load: *load, contacts, report: &mut report })];
+        let stepped = group::step(&mut alone, &[0], &[], &mut work);
+        contacts.touching = work;
+        if let Err(StepError::Diverged { .. }) = stepped {
+            contacts.forget();
+            self.give_up(state, hands);
+        }
+        stepped.map(|()| report)
     }
 
-    fn step_guarded(
-        &mut self,
-        state: &mut State,
-        hands: &mut [Hand],
-        load: &Load<'_>,
-        mut contacts: Option<&mut Contacts>,
-    ) -> Result<StepReport, StepError> {
+    /// Checks that a state and hands have as many numbers as this kernel steps.
+    pub(crate) fn check_step(&self, state: &State, hands: &[Hand]) -> Result<(), StepError> {
         self.check_lengths(state)?;
         let expected = self.modes.count();
-        if let Some(hand) = hands.iter().find(|hand| hand.patch.modes() != expected) {
-            return Err(StepError::Length { what: "a held patch", expected, got: hand.patch.modes() });
+        match hands.iter().find(|hand| hand.patch.modes() != expected) {
+            Some(hand) => {
+                Err(StepError::Length { what: "a held patch", expected, got: hand.patch.modes() })
+            }
+            None => Ok(()),
         }
-        self.before.clone_from(state);
-        let report = match &mut contacts {
-            None => self.advance(state, hands, load),
-            Some(contacts) => match self.touch(state, hands, load, contacts) {
-                Ok(report) => report,
-                Err(error) => {
-                    state.clone_from(&self.before);
-                    contacts.restore(hands);
-                    return Err(error);
-                }
-            },
-        };
-        let bad = |hand: &Hand| !hand.pull.iter().chain(&hand.mean).chain(&hand.flow).all(|x| x.is_finite());
-        let what = state.non_finite().or(hands.iter().any(bad).then_some("a reaction"));
-        let Some(what) = what else { return Ok(report) };
+    }
+
+    /// Returns to the state before a step whose result is not finite.
+    fn give_up(&self, state: &mut State, hands: &mut [Hand]) {
         state.clone_from(&self.before);
         if !state.is_moderate() {
             state.stop();
-        }
-        if let Some(contacts) = contacts {
-            contacts.forget();
         }
         for hand in hands {
             hand.pull = Vector3::zeros();
             hand.mean = Vector3::zeros();
             hand.flow = Vector3::zeros();
         }
-        Err(StepError::Diverged { what })
+    }
+
+    /// Kinetic energy of the modes, and of the rigid motion of a free body, J.
+    pub(crate) fn kinetic_energy(&self, state: &State) -> f64 {
+        let frame = if self.model.is_free() { state.frame.kinetic_energy(&self.model) } else { 0.0 };
+        frame + state.v.iter().map(|v| 0.5 * v * v).sum::<f64>()
     }
 
     /// Prepares the data that gravity needs, so that the first step does not allocate them.

@@ -22,5 +22,5 @@ pub use settings::{Elasticity, StepSettings};
 pub use state::State;
 
 pub(crate) use gravity::MassSites;
+pub(crate) use kernel::group;
 pub(crate) use patch::{Six, Tangent, contact_floor, residual, tangent};
-pub(crate) use solve::System;

@@ -124,6 +124,11 @@ impl Frame {
         self.position + self.rotation * (local - self.pivot)
     }
 
+    /// Position in body axes (m) of a world point (m).
+    pub(crate) fn to_local(self, point: &Vector3<f64>) -> Vector3<f64> {
+        self.rotation.inverse() * (point - self.position) + self.pivot
+    }
+
     /// World velocity of a point that is fixed to the frame, m/s. The point is in body axes, m.
     pub fn velocity_at(&self, model: &ModalModel, local: Vector3<f64>) -> Vector3<f64> {
         self.velocity + self.angular_velocity(model).cross(&(self.rotation * (local - self.pivot)))
@@ -186,10 +191,16 @@ impl Frame {
         self.spin += spin;
     }
 
-    /// Multiplies velocity and spin.
-    pub(crate) fn slow(&mut self, factor: f64) {
-        self.velocity *= factor;
-        self.spin *= factor;
+    /// Multiplies the difference of velocity and spin to these.
+    pub(crate) fn slow_to(&mut self, velocity: &Vector3<f64>, spin: &Vector3<f64>, factor: f64) {
+        self.velocity = velocity + factor * (self.velocity - velocity);
+        self.spin = spin + factor * (self.spin - spin);
+    }
+
+    /// Inertia about the center of mass, kg m^2, world axes.
+    pub(crate) fn inertia(&self, model: &ModalModel) -> Matrix3<f64> {
+        let (inertia, turn) = (model.inertia(), self.rotation.to_rotation_matrix());
+        turn * Matrix3::from_fn(|i, j| inertia[i][j]) * turn.inverse()
     }
 
     pub(crate) fn kinetic_energy(&self, model: &ModalModel) -> f64 {

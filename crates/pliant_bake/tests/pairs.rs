@@ -1,0 +1,245 @@
+//! Bodies that touch each other, with known answers: momentum, energy, Hertz, weight and stacks.
+#![allow(clippy::unwrap_used, missing_docs, reason = "a failed test should panic")]
+
+use std::sync::Arc;
+
+use nalgebra::Vector3;
+use pliant_bake::{BakeConfig, bake};
+use pliant_mesh::{TetMesh, shapes};
+use pliant_modal::{
+    Body, BodyConfig, Damping, Elasticity, Frame, GrabConfig, Islands, Material, ModalModel, Patch, Plane,
+    StepSettings, Together, Touched,
+};
+
+const GRAVITY: f64 = 9.81;
+
+fn model(mesh: &TetMesh, young: f64, change: impl Fn(&mut BakeConfig)) -> Arc<ModalModel> {
+    let mut config = BakeConfig { modes: 30, young, poisson: 0.3, sites: Some(100), ..BakeConfig::default() };
+    change(&mut config);
+    Arc::new(bake(mesh, None, &config, &mut |_, _| {}).unwrap().model)
+}
+
+fn cube(young: f64, change: impl Fn(&mut BakeConfig)) -> Arc<ModalModel> {
+    model(&shapes::cube(4, 0.1).unwrap(), young, change)
+}
+
+fn ball(young: f64, change: impl Fn(&mut BakeConfig)) -> Arc<ModalModel> {
+    model(&shapes::sphere(8, 0.1).unwrap(), young, |config| {
+        config.sites = None;
+        change(config);
+    })
+}
+
+/// A body whose center of mass is at `at`.
+fn place(
+    model: &Arc<ModalModel>,
+    rate: f64,
+    gravity: f64,
+    at: [f64; 3],
+    turn: [f64; 4],
+    velocity: [f64; 3],
+    spin: [f64; 3],
+) -> Body {
+    let elasticity = if model.material().is_some() { Elasticity::Reduced } else { Elasticity::Linear };
+    let settings = StepSettings { gravity: [0.0, -gravity, 0.0], elasticity, ..Default::default() };
+    let mut body =
+        Body::new(model.clone(), BodyConfig { step: 1.0 / rate, ..BodyConfig::from(settings) }).unwrap();
+    let mut state = body.state().clone();
+    let spin = spin.map(|x| x * model.inertia()[0][0]);
+    state.frame = Frame::from_motion(model, at, turn, velocity, spin).unwrap();
+    body.set_state(&state).unwrap();
+    body
+}
+
+const LEVEL: [f64; 4] = [0.0, 0.0, 0.0, 1.0];
+
+fn free(model: &Arc<ModalModel>, rate: f64, at: [f64; 3], velocity: [f64; 3]) -> Body {
+    place(model, rate, 0.0, at, LEVEL, velocity, [0.0; 3])
+}
+
+fn step(islands: &mut Islands, bodies: &mut [Body]) {
+    let mut all: Vec<Together<'_>> =
+        bodies.iter_mut().enumerate().map(|(key, body)| Together::new(key as u64, body)).collect();
+    islands.step(&mut all, |_, _| true);
+    assert!(all.iter().all(|together| together.error.is_none()));
+}
+
+fn run(bodies: &mut [Body], seconds: f64) {
+    let mut islands = Islands::default();
+    for _ in 0..(seconds / bodies[0].config().step).round() as usize {
+        step(&mut islands, bodies);
+    }
+}
+
+fn total(bodies: &[Body]) -> f64 {
+    bodies.iter().map(|body| body.energy() + body.potential_energy() + body.contacts().report().energy).sum()
+}
+
+fn momentum(bodies: &[Body]) -> [Vector3<f64>; 2] {
+    bodies.iter().fold([Vector3::zeros(); 2], |[linear, angular], body| {
+        let (p, l) = body.momentum();
+        [linear + Vector3::from(p), angular + Vector3::from(l)]
+    })
+}
+
+fn soft(config: &mut BakeConfig) {
+    config.material = Some(Material::NeoHookean);
+}
+
+#[test]
+fn two_free_bodies_exchange_momentum_and_lose_none() {
+    let pairs = [
+        ("cubes", cube(1e5, |_| ()), cube(3e4, |_| ())),
+        ("ball and cube", ball(1e5, |_| ()), cube(1e6, |_| ())),
+        ("reduced", cube(1e5, soft), ball(5e4, soft)),
+    ];
+    for (name, a, b) in &pairs {
+        for speed in [0.5, 5.0] {
+            let turn = [0.2, -0.1, 0.3, 0.9];
+            let mut bodies = [
+                place(a, 240.0, 0.0, [0.0; 3], turn, [speed, 0.1, 0.0], [0.5, -1.0, 2.0]),
+                place(b, 240.0, 0.0, [0.22, 0.04, 0.01], LEVEL, [-speed, 0.0, 0.05], [-1.0, 0.3, 0.4]),
+            ];
+            let [p0, l0] = momentum(&bodies);
+            let first = bodies[0].momentum();
+            let mut islands = Islands::default();
+            let (mut worst, mut exchanged) = ([0.0f64; 2], [0.0f64; 2]);
+            for _ in 0..(0.2 / speed * 240.0) as usize + 24 {
+                step(&mut islands, &mut bodies);
+                let [p, l] = momentum(&bodies);
+                let (p1, l1) = bodies[0].momentum();
+                worst = [worst[0].max((p - p0).norm()), worst[1].max((l - l0).norm())];
+                exchanged[0] = exchanged[0].max((Vector3::from(p1) - Vector3::from(first.0)).norm());
+                exchanged[1] = exchanged[1].max((Vector3::from(l1) - Vector3::from(first.1)).norm());
+            }
+            println!(
+                "{name} at {speed} m/s: linear {:.1e}, angular {:.1e} of {:.2e} N s, {:.2e} N m s exchanged",
+                worst[0] / exchanged[0],
+                worst[1] / exchanged[1],
+                exchanged[0],
+                exchanged[1]
+            );
+            assert!(exchanged[0] > 0.2 * a.mass() * speed, "{name}: they met");
+            assert!(worst[0] < 1e-6 * exchanged[0] && worst[1] < 1e-6 * exchanged[1], "{name}: {worst:?}");
+        }
+    }
+}
+
+#[test]
+fn equal_balls_head_on_exchange_their_velocities_in_the_time_of_hertz() {
+    let (young, radius, speed) = (1e5f64, 0.1f64, 0.5);
+    for (name, model) in [
+        ("linear", ball(young, |c| c.damping = Damping::Ratio(0.0))),
+        ("120 modes", ball(young, |c| (c.modes, c.damping) = (120, Damping::Ratio(0.0)))),
+        ("reduced", ball(young, |c| {
+            soft(c);
+            c.damping = Damping::Ratio(0.0);
+        })),
+    ] {
+        let plain = young / (2.0 * (1.0 - 0.3f64.powi(2)));
+        let (mass, curve) = (0.5 * model.mass(), 0.5 * radius);
+        let time = 2.87 * (mass * mass / (curve * plain * plain * speed)).powf(0.2);
+        for steps in [16.0, 32.0, 64.0] {
+            let rate = steps / time;
+            let gap = 2.5 * speed / rate;
+            let mut bodies = [
+                free(&model, rate, [0.0; 3], [0.0; 3]),
+                free(&model, rate, [-2.0 * radius - gap, 0.0, 0.0], [speed, 0.0, 0.0]),
+            ];
+            let start = total(&bodies);
+            let mut islands = Islands::default();
+            let (mut touched, mut gain, mut most) = (0, f64::NEG_INFINITY, 0.0f64);
+            for _ in 0..(3.0 * steps) as usize {
+                step(&mut islands, &mut bodies);
+                let force = bodies[0].contacts().report().force[0];
+                touched += usize::from(force > 0.0);
+                most = most.max(force);
+                gain = gain.max(total(&bodies) / start - 1.0);
+            }
+            let [after, before] = [&bodies[0], &bodies[1]].map(|body| body.frame().velocity());
+            let e = (after[0] - before[0]) / speed;
+            // Hertz: F = k d^(3/2), and the deepest d has the energy of the impact.
+            let k = 4.0 / 3.0 * plain * curve.sqrt();
+            let deepest = (1.25 * mass * speed * speed / k).powf(0.4);
+            println!(
+                "{name}, {steps} steps: velocities {:.3} and {:.3} of {speed}, e = {e:.3}, time {:.3} of Hertz, \
+                 largest force {:.3} of Hertz, energy +{gain:.1e}, aside {:.1e}",
+                after[0],
+                before[0],
+                touched as f64 / steps,
+                most / (k * deepest.powf(1.5)),
+                after[1].hypot(after[2]) / speed,
+            );
+            assert!(gain < 1e-9, "{name}: {gain}");
+        }
+    }
+}
+
+#[test]
+fn what_lies_on_an_anchored_body_presses_with_its_weight() {
+    let held = cube(1e5, |c| c.anchors = vec!["y<0.001".parse().unwrap()]);
+    for (name, top) in [
+        ("ball", ball(1e5, |_| ())),
+        ("cube", cube(1e5, |_| ())),
+        ("stiff cube", cube(1e7, |_| ())),
+        ("reduced cube", cube(1e5, soft)),
+    ] {
+        let [low, _] = top.surface().bounds();
+        let height = 0.1 + top.center_of_mass()[1] - f64::from(low[1]) + 0.01;
+        let mut bodies = [
+            free(&held, 60.0, held.center_of_mass(), [0.0; 3]),
+            place(&top, 60.0, GRAVITY, [0.05, height, 0.05], LEVEL, [0.0; 3], [0.0; 3]),
+        ];
+        run(&mut bodies, 5.0);
+        let weight = top.mass() * GRAVITY;
+        let report = *bodies[1].contacts().report();
+        let off = (Vector3::from(report.force) - Vector3::new(0.0, weight, 0.0)).norm() / weight;
+        let other = (Vector3::from(report.force) + Vector3::from(bodies[0].contacts().report().force)).norm();
+        println!(
+            "{name}: force off by {off:.1e}, action and reaction by {:.1e}, penetration {:.1e} m, {} contacts, kinetic {:.1e} J",
+            other / weight,
+            report.penetration,
+            report.contacts,
+            bodies[1].kinetic_energy()
+        );
+        assert!(off < 1e-6 && other < 1e-12 * weight, "{name}: {off}");
+        assert!(bodies[1].contacts().contacts().iter().all(|c| c.other == Touched::Body(0)));
+    }
+}
+
+fn stack(young: f64, count: usize, change: impl Fn(&mut BakeConfig)) -> Vec<Body> {
+    let model = cube(young, change);
+    (0..count)
+        .map(|level| {
+            let at = [0.05, 0.05 + 0.1 * level as f64, 0.05];
+            let mut body = place(&model, 60.0, GRAVITY, at, LEVEL, [0.0; 3], [0.0; 3]);
+            body.set_obstacles(vec![Arc::new(Plane::GROUND)]).unwrap();
+            body
+        })
+        .collect()
+}
+
+#[test]
+fn a_stack_of_five_cubes_stands() {
+    for young in [1e6, 1e5] {
+        let mut bodies = stack(young, 5, |_| ());
+        let seconds = 60.0;
+        let begun = std::time::Instant::now();
+        run(&mut bodies, 5.0);
+        let settled: Vec<_> = bodies.iter().map(|body| Vector3::from(body.frame().center())).collect();
+        run(&mut bodies, seconds);
+        let wall = begun.elapsed().as_secs_f64();
+        for (level, (body, settled)) in bodies.iter().zip(&settled).enumerate() {
+            let weight = body.model().mass() * GRAVITY;
+            let report = body.contacts().report();
+            let off = (report.force[1] - weight).abs() / weight;
+            let crept = (Vector3::from(body.frame().center()) - settled).norm() / 0.1;
+            println!(
+                "{young:e}, cube {level}: force off by {off:.1e}, crept {crept:.1e} of the size, kinetic {:.1e} J, residual {:.1e} m, {} rounds, {} sweeps, guarded {}",
+                body.kinetic_energy(), report.residual, report.rounds, report.sweeps, report.guarded
+            );
+            assert!(off < 1e-6 && crept < 1e-4, "{level}: {off} {crept}");
+        }
+        println!("    {:.1} us a step of all", wall * 1e6 / (65.0 * 60.0));
+    }
+}

@@ -1,0 +1,186 @@
+//! One contact in a step: a site of a body at an obstacle or at another body.
+
+use nalgebra::{Matrix3, Vector3};
+
+use super::{Touched, cone::Status, surface_field::Carriers, surface_field::Place};
+use crate::step::Tangent;
+
+/// A contact of the last step.
+#[derive(Debug, Clone, Copy)]
+pub(crate) struct Memory {
+    pub(crate) other: Touched,
+    pub(crate) site: usize,
+    /// Force on the body, N, world axes.
+    pub(crate) force: Vector3<f64>,
+    /// Where the surface of the site sticks, m: in world axes at an obstacle, in the axes of the
+    /// other body, at rest, at a body.
+    pub(crate) anchor: Vector3<f64>,
+    /// Direction from the site's center to its contact point, body axes.
+    pub(crate) toward: Vector3<f64>,
+}
+
+/// The side of a contact at another body.
+#[derive(Debug, Clone, Copy)]
+pub(crate) struct Far {
+    /// The other body, as an index into the group.
+    pub(crate) member: usize,
+    pub(crate) place: Place,
+    /// Whether the place stays for this step, because the site has passed through it.
+    pub(crate) passed: bool,
+    /// The sites on which the force acts. They stay as the first computed step has them.
+    pub(crate) carriers: Carriers,
+    /// Position of the place's material at the beginning and at the end of the step, m, world axes.
+    pub(crate) start: Vector3<f64>,
+    pub(crate) end: Vector3<f64>,
+    /// As for [`Point`].
+    pub(crate) tangent: Tangent,
+    pub(crate) mean: Option<Tangent>,
+    /// Where the force acts, m, world axes: the middle of the contact over the step. Arms of both
+    /// bodies lead to it, so that no angular momentum is lost.
+    pub(crate) middle: Vector3<f64>,
+    pub(crate) arm: Vector3<f64>,
+    /// Compliance of the place, m/N, world axes.
+    pub(crate) compliance: Matrix3<f64>,
+    /// Where the surface sticks, at the beginning of the step, m, world axes.
+    pub(crate) anchor: Vector3<f64>,
+}
+
+/// A place that touches, or may touch, in this step.
+#[derive(Debug, Clone, Copy)]
+pub(crate) struct Point {
+    /// The body of the site, as an index into the group.
+    pub(crate) member: usize,
+    pub(crate) site: usize,
+    pub(crate) other: Touched,
+    /// The side at another body. `None` at an obstacle.
+    pub(crate) far: Option<Far>,
+    pub(crate) friction: f64,
+    /// Directions from the site's center to the contact point at the beginning and at the end of
+    /// the step, body axes.
+    pub(crate) first: Vector3<f64>,
+    pub(crate) last: Vector3<f64>,
+    /// Position of the first contact point's material at the beginning and at the end, m, world
+    /// axes. The position of the last contact point at the end.
+    pub(crate) start: Vector3<f64>,
+    pub(crate) end: Vector3<f64>,
+    pub(crate) place: Vector3<f64>,
+    /// Way of the other surface in the step, m, world axes.
+    pub(crate) carried: Vector3<f64>,
+    pub(crate) anchor: Vector3<f64>,
+    /// Force at the end of the step before, N, world axes.
+    pub(crate) before: Vector3<f64>,
+    /// Gap at the beginning of the step and the smallest gap allowed at its end, m.
+    pub(crate) gap: f64,
+    pub(crate) floor: f64,
+    /// Whether the site has passed through an obstacle.
+    pub(crate) passed: bool,
+    /// Rows: normal and two tangents, world axes.
+    pub(crate) axes: Matrix3<f64>,
+    /// Compliance of the site and of what it touches, m/N, world axes.
+    pub(crate) compliance: Matrix3<f64>,
+    /// Compliance in contact axes, and with the response to its own force.
+    pub(super) local: Matrix3<f64>,
+    pub(super) block: Matrix3<f64>,
+    /// Inverse of the compliance in the direct solve, N/m.
+    pub(super) stiffness: Matrix3<f64>,
+    /// Gap and tangential offset at the end of the last computed step without the compliance, m,
+    /// contact axes.
+    pub(crate) off: Vector3<f64>,
+    /// Force of the last computed step, and of the solve, N, contact axes.
+    pub(crate) pushed: Vector3<f64>,
+    pub(crate) force: Vector3<f64>,
+    pub(super) status: Status,
+    /// Derivative of the site's position by the six numbers of its patch, world axes: at the
+    /// beginning of the step, and its mean over the step, by which forces act on the modes. The
+    /// mean stays as the first computed step has it.
+    pub(crate) tangent: Tangent,
+    pub(crate) mean: Option<Tangent>,
+    /// Arm of the contact about the center of mass, m, world axes.
+    pub(crate) arm: Vector3<f64>,
+}
+
+impl Point {
+    pub(crate) fn new(member: usize, site: usize, other: Touched, friction: f64) -> Self {
+        let zero = Vector3::zeros();
+        Self {
+            member,
+            site,
+            other,
+            far: None,
+            friction,
+            first: zero,
+            last: zero,
+            start: zero,
+            end: zero,
+            place: zero,
+            carried: zero,
+            anchor: zero,
+            before: zero,
+            gap: 0.0,
+            floor: 0.0,
+            passed: false,
+            axes: Matrix3::identity(),
+            compliance: Matrix3::zeros(),
+            local: Matrix3::zeros(),
+            block: Matrix3::zeros(),
+            stiffness: Matrix3::zeros(),
+            off: zero,
+            pushed: zero,
+            force: zero,
+            status: Status::Open,
+            tangent: Tangent::zeros(),
+            mean: None,
+            arm: zero,
+        }
+    }
+
+    /// Force of the last computed step, N, world axes.
+    pub(crate) fn world_force(&self) -> Vector3<f64> {
+        self.axes.tr_mul(&self.pushed)
+    }
+
+    /// Energy in the compliance under a force, J.
+    pub(crate) fn stored(&self, force: &Vector3<f64>) -> f64 {
+        0.5 * force.dot(&(self.compliance * force))
+    }
+
+    /// Turns the axes to a normal. The forces keep their direction in the world.
+    pub(crate) fn turn(&mut self, normal: &Vector3<f64>) {
+        let (pushed, force) = (self.axes.tr_mul(&self.pushed), self.axes.tr_mul(&self.force));
+        let least = normal.iamin();
+        let first = normal.cross(&Vector3::ith(least, 1.0)).normalize();
+        let second = normal.cross(&first);
+        self.axes = Matrix3::from_rows(&[normal.transpose(), first.transpose(), second.transpose()]);
+        self.local = self.axes * self.compliance * self.axes.transpose();
+        (self.pushed, self.force) = (self.axes * pushed, self.axes * force);
+    }
+
+    /// Gap and offset of the surface at the end of the last computed step, m, contact axes.
+    fn surface(&self) -> Vector3<f64> {
+        self.off + self.local * self.pushed
+    }
+
+    /// Violation of the laws at the end of the last computed step, m.
+    pub(super) fn violation(&self) -> f64 {
+        let u = self.surface();
+        let (n, t) = (self.pushed[0], self.pushed[1].hypot(self.pushed[2]));
+        if n <= 0.0 {
+            return (-u[0]).max(0.0);
+        }
+        let most = self.friction * n;
+        let slid = if t < most * (1.0 - 1e-9) || t == 0.0 && most > 0.0 {
+            u[1].hypot(u[2])
+        } else if t > 0.0 {
+            // Sliding may only be against the force.
+            let along = (u[1] * self.pushed[1] + u[2] * self.pushed[2]) / t;
+            let across = (u[1] * self.pushed[2] - u[2] * self.pushed[1]) / t;
+            // A force beyond the cone is a violation too.
+            let beyond = (t - most).max(0.0) * self.local[(1, 1)];
+            let beyond = if t > most * (1.0 + 1e-9) { beyond } else { 0.0 };
+            along.max(0.0).hypot(across) + beyond
+        } else {
+            0.0
+        };
+        u[0].abs().hypot(slid)
+    }
+}

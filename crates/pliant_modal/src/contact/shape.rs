@@ -1,0 +1,186 @@
+//! A body in a certain state, as something that other bodies touch.
+
+use nalgebra::{Matrix3, Vector3};
+
+use super::{
+    ContactSites,
+    surface_field::{Carriers, Place, SurfaceField},
+};
+use crate::step::{Frame, Six, Tangent, tangent};
+
+/// Rounds of the search for the place of the rest shape that lies nearest to a point.
+const ROUNDS: usize = 6;
+
+/// How far beyond the edge of a face a contact with this face may lie, as a share of the body's
+/// size. Without it the corners of equal bodies in a stack would touch in one step and not in the
+/// next.
+const SHELF: f64 = 0.01;
+
+/// A body at some coordinates.
+#[derive(Debug, Clone, Copy)]
+pub(crate) struct Shape<'a> {
+    pub(crate) sites: &'a ContactSites,
+    pub(crate) field: &'a SurfaceField,
+    pub(crate) warps: bool,
+    pub(crate) frame: &'a Frame,
+    pub(crate) q: &'a [f64],
+    /// Size of the body, m.
+    pub(crate) size: f64,
+    /// Bound on the displacements at these coordinates, m.
+    pub(crate) bound: f64,
+}
+
+/// A place of a body's surface near a point.
+#[derive(Debug, Clone, Copy)]
+pub(crate) struct Near {
+    pub(crate) place: Place,
+    /// Position of the place's material, m, world axes.
+    pub(crate) at: Vector3<f64>,
+    /// Outward normal, world axes.
+    pub(crate) normal: Vector3<f64>,
+    /// Signed distance of the point to the surface, m.
+    pub(crate) distance: f64,
+}
+
+impl Shape<'_> {
+    fn turn(&self) -> Matrix3<f64> {
+        *self.frame.rotation().to_rotation_matrix().matrix()
+    }
+
+    fn six(&self, carriers: impl Iterator<Item = (usize, f64)>) -> Six {
+        carriers.fold(Six::zeros(), |sum, (site, weight)| match self.sites.sites.get(site) {
+            Some(site) => sum + weight * site.patch.rows().reduce(self.q, self.warps),
+            None => sum,
+        })
+    }
+
+    /// Position of a place's material, m, and its derivative by the six numbers, world axes.
+    pub(crate) fn material(&self, place: &Place, carriers: &Carriers) -> (Vector3<f64>, Tangent) {
+        let (moved, tangent) = tangent(&self.six(carriers.iter()), self.warps);
+        (self.frame.to_world(self.field.rest(place) + moved), self.turn() * tangent)
+    }
+
+    /// Displacement of a place (m) and the gradient of the deformation of the surface there, body
+    /// axes.
+    fn deformed(&self, place: &Place) -> (Vector3<f64>, Matrix3<f64>) {
+        let mut moved = Vector3::zeros();
+        let mut corners = [Vector3::zeros(); 3];
+        let rest = self.field.corners(place);
+        for (k, corner) in corners.iter_mut().enumerate() {
+            let carriers = self.field.corner_carriers(place, k).iter();
+            let six = self.six(carriers.map(|(site, weight)| (*site as usize, *weight)));
+            *corner = rest[k] + tangent(&six, self.warps).0;
+        }
+        let frame = |[a, b, c]: [Vector3<f64>; 3]| {
+            let (ab, ac) = (b - a, c - a);
+            let across = ab.cross(&ac);
+            let length = across.norm();
+            Matrix3::from_columns(&[ab, ac, if length > 0.0 { across / length } else { across }])
+        };
+        let before = frame(rest.map(|corner| *corner)).try_inverse();
+        let gradient = before.map_or_else(Matrix3::identity, |inverse| frame(corners) * inverse);
+        let gradient = if gradient.iter().all(|x| x.is_finite()) { gradient } else { Matrix3::identity() };
+        let carriers = self.field.carriers(place);
+        moved += tangent(&self.six(carriers.iter()), self.warps).0;
+        (moved, gradient)
+    }
+
+    /// The distance of a point (m, world axes) to the smooth surface at a place.
+    pub(crate) fn at(&self, place: &Place, point: &Vector3<f64>) -> Near {
+        let (moved, gradient) = self.deformed(place);
+        self.near(place, &moved, &gradient, point)
+    }
+
+    fn near(
+        &self,
+        place: &Place,
+        moved: &Vector3<f64>,
+        gradient: &Matrix3<f64>,
+        point: &Vector3<f64>,
+    ) -> Near {
+        let (smooth, _, rise) = self.field.normals(place);
+        let normal = gradient.try_inverse().map_or(smooth, |inverse| inverse.tr_mul(&smooth));
+        let normal = self.turn() * normal.try_normalize(1e-9).unwrap_or(smooth);
+        let at = self.frame.to_world(self.field.rest(place) + moved);
+        Near { place: *place, at, normal, distance: normal.dot(&(point - at)) - rise }
+    }
+
+    /// The place of the surface that is nearest to a point (m, world axes), no farther than
+    /// `within` (m), where the surface looks at `facing`, an outward normal of another body in
+    /// world axes.
+    ///
+    /// The point is pulled back to the rest shape by the deformation of the triangle that is
+    /// nearest there, and again until it stays.
+    pub(crate) fn look(&self, point: &Vector3<f64>, facing: &Vector3<f64>, within: f64) -> Option<Near> {
+        let local = self.frame.to_local(point);
+        let facing = self.turn().tr_mul(facing);
+        // A body that hardly bends has no need of a search without direction.
+        let stiff = self.bound < 0.05 * self.size;
+        let (mut x, mut wanted) = (local, stiff.then_some(facing));
+        let mut reach = within + self.bound;
+        for round in 0..ROUNDS {
+            let place = self.field.closest(&x, wanted.as_ref(), reach)?;
+            let (moved, gradient) = self.deformed(&place);
+            let rest = self.field.rest(&place);
+            let next = rest + gradient.try_inverse()? * (local - rest - moved);
+            let still = (next - x).norm() <= 1e-6 * self.size;
+            if wanted.is_some() && (still || round + 1 == ROUNDS) {
+                let near = self.near(&place, &moved, &gradient, point);
+                let way = point - near.at;
+                let across = (way - near.normal * near.normal.dot(&way)).norm();
+                // Beyond the edge of all faces that look this way.
+                let shelf = SHELF * self.size + 0.5 * near.distance.abs();
+                return (across <= shelf).then_some(near);
+            }
+            x = next;
+            wanted = gradient.tr_mul(&facing).try_normalize(1e-9);
+            reach = 2.0 * within + 0.01 * self.size;
+        }
+        None
+    }
+
+    /// A point (m, world axes) pulled back to the rest shape, m, body axes.
+    pub(crate) fn pull_back(&self, point: &Vector3<f64>) -> Vector3<f64> {
+        let local = self.frame.to_local(point);
+        let mut x = local;
+        for _ in 0..2 {
+            let Some(place) = self.field.closest(&x, None, f64::MAX.sqrt()) else { return local };
+            let (moved, gradient) = self.deformed(&place);
+            let rest = self.field.rest(&place);
+            let Some(inverse) = gradient.try_inverse() else { return local };
+            x = rest + inverse * (local - rest - moved);
+        }
+        x
+    }
+
+    /// Follows a way of the rest shape (m, body axes) from outside until it goes in, and returns
+    /// that place. `facing` is in body axes at rest.
+    pub(crate) fn march(&self, from: &Vector3<f64>, to: &Vector3<f64>, facing: &Vector3<f64>) -> Option<Place> {
+        const STEPS: usize = 32;
+        let way = to - from;
+        let length = way.norm();
+        if !(length > 0.0) || !length.is_finite() {
+            return None;
+        }
+        let mut gone = 0.0;
+        for _ in 0..STEPS {
+            let x = from + way * (gone / length);
+            let place = self.field.closest(&x, Some(facing), length - gone)?;
+            let (_, normal, _) = self.field.normals(&place);
+            let off = x - self.field.rest(&place);
+            let distance = off.norm();
+            if distance <= 1e-3 * length {
+                return (normal.dot(&way) < 0.0).then_some(place);
+            }
+            // It begins inside, or has come in through a face that looks elsewhere.
+            if normal.dot(&off) <= 0.0 {
+                return None;
+            }
+            gone += distance;
+            if gone >= length {
+                return None;
+            }
+        }
+        None
+    }
+}

@@ -1,0 +1,361 @@
+//! The solver: the laws of all contacts of a group of bodies together.
+
+use nalgebra::{Matrix3, RowVector3, Vector3};
+
+use super::{
+    cone::{self, Status},
+    point::Point,
+};
+use crate::simd::dot;
+
+/// The coordinates of one body in the vector of all: its modes and six for its frame.
+#[derive(Debug, Clone, Copy, Default)]
+pub(crate) struct Span {
+    pub(crate) start: usize,
+    pub(crate) width: usize,
+    /// End of the coordinates with which those of the body are coupled by contacts.
+    reach: usize,
+}
+
+/// One side of a point: the body, and where its three rows begin.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(crate) struct Side {
+    pub(crate) member: usize,
+    pub(crate) rows: usize,
+}
+
+/// Workspace of the contacts of a group of bodies in a step.
+#[derive(Debug, Clone, Default)]
+pub(crate) struct Touching {
+    pub(crate) points: Vec<Point>,
+    /// One span per body.
+    pub(crate) spans: Vec<Span>,
+    /// The sides of each point. Each has three rows of one entry per coordinate of its body, such
+    /// that the response of point `i` to forces at point `j` is the sum of `rows_i rows_j^T` over
+    /// the bodies of both.
+    pub(crate) sides: Vec<[Option<Side>; 2]>,
+    pub(crate) rows: Vec<f64>,
+    /// What the hands hold back of the responses, one row for each of their directions.
+    pub(crate) held: Vec<f64>,
+    /// Sum of `rows^T` times the changes of the forces.
+    sum: Vec<f64>,
+    /// The matrix of the direct solve by rows, and its right side.
+    full: Vec<f64>,
+    right: Vec<f64>,
+    /// Marks of the sites that have a point with the current obstacle or body.
+    pub(crate) marks: Vec<u32>,
+    pub(crate) stamp: u32,
+    pub(crate) sweeps: usize,
+}
+
+impl Touching {
+    /// Largest number of direct solves, and of sweeps before each.
+    const TURNS: usize = 12;
+    const SWEEPS: usize = 3;
+
+    /// Largest number of coordinates, and of multiplications, of a direct solve.
+    const MOST_WIDTH: usize = 512;
+    const MOST_WORK: usize = 4_000_000;
+
+    /// Largest violation of the laws at the end of the last computed step, m.
+    pub(crate) fn violation(&self) -> f64 {
+        self.points.iter().map(Point::violation).fold(0.0, f64::max)
+    }
+
+    /// Reserves memory for a number of points and sites of a body alone.
+    pub(crate) fn reserve(&mut self, points: usize, width: usize, sites: usize) {
+        fn reserve<T>(list: &mut Vec<T>, count: usize) {
+            list.reserve(count.saturating_sub(list.len()));
+        }
+        reserve(&mut self.points, points);
+        reserve(&mut self.sides, points);
+        reserve(&mut self.rows, 3 * points * width);
+        reserve(&mut self.spans, 1);
+        reserve(&mut self.sum, width);
+        reserve(&mut self.right, width);
+        reserve(&mut self.full, width * width);
+        reserve(&mut self.marks, sites);
+    }
+
+    /// Lays out the coordinates of all bodies. `widths` has the number of each.
+    pub(crate) fn lay_out(&mut self, widths: impl Iterator<Item = usize>) {
+        self.spans.clear();
+        let mut start = 0;
+        for width in widths {
+            self.spans.push(Span { start, width, reach: 0 });
+            start += width;
+        }
+    }
+
+    /// Makes room for the rows of all points.
+    pub(crate) fn lay_out_rows(&mut self) {
+        self.sides.clear();
+        let mut end = 0;
+        for point in &self.points {
+            let mut side = |member: usize| {
+                let rows = end;
+                end += 3 * self.spans[member].width;
+                Side { member, rows }
+            };
+            self.sides.push([Some(side(point.member)), point.far.map(|far| side(far.member))]);
+        }
+        self.rows.clear();
+        self.rows.resize(end, 0.0);
+    }
+
+    fn width(&self) -> usize {
+        self.spans.last().map_or(0, |span| span.start + span.width)
+    }
+
+    /// Ratio of the rigid response to all other compliance for a force that is shared equally by
+    /// all points that would penetrate.
+    pub(crate) fn rigid_share(&mut self) -> f64 {
+        self.sum.clear();
+        self.sum.resize(self.width(), 0.0);
+        let (mut count, mut local) = (0.0, 0.0);
+        for (point, sides) in self.points.iter().zip(&self.sides) {
+            if point.off[0] < 0.0 || point.pushed[0] > 0.0 {
+                count += 1.0;
+                local += point.local[(0, 0)];
+                for side in sides.iter().flatten() {
+                    let span = self.spans[side.member];
+                    let row = &self.rows[side.rows..side.rows + span.width];
+                    self.sum[span.start..].iter_mut().zip(row).for_each(|(sum, row)| *sum += row);
+                }
+            }
+        }
+        let (mut rigid, mut modal) = (0.0, 0.0);
+        for span in &self.spans {
+            for (k, x) in self.sum[span.start..][..span.width].iter().enumerate() {
+                let part = if k + 6 < span.width { &mut modal } else { &mut rigid };
+                *part += x * x;
+            }
+        }
+        let ratio = rigid / (modal + local);
+        if count > 0.0 && ratio.is_finite() { ratio } else { 0.0 }
+    }
+
+    /// Solves the laws of all points on the linearized responses.
+    ///
+    /// Block Gauss-Seidel sweeps go forward and backward in turn and find which points are open,
+    /// stick or slide. After every few sweeps a direct solve takes that as given, which removes the
+    /// slowly converging part of the error. The work ends early once no force of a sweep moves a
+    /// site by more than `enough` (m).
+    pub(crate) fn solve(&mut self, enough: f64) {
+        for (point, sides) in self.points.iter_mut().zip(&self.sides) {
+            point.block = point.local;
+            for side in sides.iter().flatten() {
+                let width = self.spans[side.member].width;
+                let row = |axis: usize| &self.rows[side.rows + axis * width..][..width];
+                point.block += Matrix3::from_fn(|i, j| dot(row(i.min(j)), row(i.max(j))));
+            }
+            point.force = point.pushed;
+        }
+        self.sum_changes();
+        let mut direct = self.couple();
+        let mut last = f64::INFINITY;
+        for turn in 0..Self::TURNS {
+            let mut change = 0.0;
+            let sweeps = if direct { Self::SWEEPS } else { 2 * Self::SWEEPS };
+            for sweep in 0..sweeps {
+                change = self.sweep(sweep % 2 == 1);
+                if change <= enough {
+                    return;
+                }
+            }
+            if change > last {
+                // The set of points that slide does not settle. Sweeps alone contract.
+                direct &= turn < 3;
+            }
+            last = change;
+            if direct && turn + 1 < Self::TURNS {
+                self.solve_directly();
+            }
+        }
+    }
+
+    /// Finds how far the coordinates of each body are coupled with those of others. Returns whether
+    /// a direct solve is affordable.
+    fn couple(&mut self) -> bool {
+        for span in &mut self.spans {
+            span.reach = span.start + span.width;
+        }
+        for sides in &self.sides {
+            if let [Some(a), Some(b)] = sides {
+                let end = self.spans[a.member.max(b.member)];
+                let first = &mut self.spans[a.member.min(b.member)];
+                first.reach = first.reach.max(end.start + end.width);
+            }
+        }
+        let (mut reach, mut work) = (0, 0);
+        for span in &mut self.spans {
+            reach = reach.max(span.reach);
+            span.reach = reach;
+            work += span.width * (reach - span.start).pow(2);
+        }
+        self.width() <= Self::MOST_WIDTH && work <= Self::MOST_WORK
+    }
+
+    /// Recomputes the sum of the rows times the changes of the forces.
+    fn sum_changes(&mut self) {
+        self.sum.clear();
+        self.sum.resize(self.width(), 0.0);
+        for (point, sides) in self.points.iter().zip(&self.sides) {
+            let change = point.force - point.pushed;
+            if change == Vector3::zeros() {
+                continue;
+            }
+            for side in sides.iter().flatten() {
+                add(&self.spans[side.member], &self.rows, side, &change, &mut self.sum);
+            }
+        }
+    }
+
+    /// One Gauss-Seidel sweep. Returns the largest movement of a site by the change of its force,
+    /// m.
+    fn sweep(&mut self, back: bool) -> f64 {
+        let (mut change, count) = (0.0f64, self.points.len());
+        for i in 0..count {
+            let i = if back { count - 1 - i } else { i };
+            let (point, sides) = (&mut self.points[i], &self.sides[i]);
+            let mut moved = Vector3::zeros();
+            for side in sides.iter().flatten() {
+                let span = &self.spans[side.member];
+                let sum = &self.sum[span.start..span.start + span.width];
+                let rows = &self.rows[side.rows..side.rows + 3 * span.width];
+                for (moved, row) in moved.iter_mut().zip(rows.chunks_exact(span.width)) {
+                    *moved += dot(row, sum);
+                }
+            }
+            // The gap if this point had no force.
+            let free = point.off + moved - (point.block - point.local) * point.force;
+            let (force, status) = cone::solve(&point.block, &free, point.friction, &point.force);
+            let step = force - point.force;
+            (point.force, point.status) = (force, status);
+            if step != Vector3::zeros() {
+                change = change.max((point.block * step).amax());
+                for side in sides.iter().flatten() {
+                    add(&self.spans[side.member], &self.rows, side, &step, &mut self.sum);
+                }
+            }
+        }
+        self.sweeps += 1;
+        change
+    }
+
+    /// Solves for all forces at once, where each point stays open, stuck or sliding in the same
+    /// direction.
+    ///
+    /// With `z = sum rows^T (force - pushed)` a point has the force `-K (off + rows z)`, where `K`
+    /// inverts its compliance. The unknown is `z`, which is as long as the bodies have coordinates.
+    /// Its matrix couples only bodies that touch, and is factored within that envelope.
+    fn solve_directly(&mut self) {
+        let width = self.width();
+        self.full.clear();
+        self.full.resize(width * width, 0.0);
+        self.right.clear();
+        self.right.resize(width, 0.0);
+        for (point, sides) in self.points.iter_mut().zip(&self.sides) {
+            let stiffness = match point.status {
+                Status::Open => Matrix3::zeros(),
+                Status::Stick => point.local.try_inverse().unwrap_or_else(Matrix3::zeros),
+                Status::Slip => {
+                    // The force has a fixed direction, and the gap is zero.
+                    let along = point.force / point.force[0];
+                    let soft = (point.local.row(0) * along)[0];
+                    if along.iter().all(|x| x.is_finite()) && soft > 0.0 {
+                        along * RowVector3::new(1.0 / soft, 0.0, 0.0)
+                    } else {
+                        Matrix3::zeros()
+                    }
+                }
+            };
+            point.stiffness = stiffness;
+            let pull = -(stiffness * point.off + point.pushed);
+            for side in sides.iter().flatten() {
+                add(&self.spans[side.member], &self.rows, side, &pull, &mut self.right);
+            }
+            if point.status == Status::Open {
+                continue;
+            }
+            for side in sides.iter().flatten() {
+                let span = self.spans[side.member];
+                let row = |axis: usize| &self.rows[side.rows + axis * span.width..][..span.width];
+                let [a, b, c] = [row(0), row(1), row(2)];
+                for i in 0..span.width {
+                    let [x, y, z] = *(stiffness.tr_mul(&Vector3::new(a[i], b[i], c[i]))).as_ref();
+                    let out = &mut self.full[(span.start + i) * width..][..width];
+                    for other in sides.iter().flatten() {
+                        let there = self.spans[other.member];
+                        let row = |axis: usize| &self.rows[other.rows + axis * there.width..][..there.width];
+                        let [a, b, c] = [row(0), row(1), row(2)];
+                        let out = &mut out[there.start..there.start + there.width];
+                        for (k, out) in out.iter_mut().enumerate() {
+                            *out += x * a[k] + y * b[k] + z * c[k];
+                        }
+                    }
+                }
+            }
+        }
+        (0..width).for_each(|i| self.full[i * width + i] += 1.0);
+        if !self.eliminate() {
+            return;
+        }
+        for (point, sides) in self.points.iter_mut().zip(&self.sides) {
+            if point.status == Status::Open {
+                continue;
+            }
+            let mut gap = point.off;
+            for side in sides.iter().flatten() {
+                let span = self.spans[side.member];
+                let z = &self.right[span.start..span.start + span.width];
+                for (gap, row) in gap.iter_mut().zip(self.rows[side.rows..].chunks_exact(span.width)) {
+                    *gap += dot(row, z);
+                }
+            }
+            let force = -(point.stiffness * gap);
+            point.force = if force[0] > 0.0 { force } else { Vector3::zeros() };
+        }
+        self.sum_changes();
+    }
+
+    /// Replaces the right side by the solution, by Gaussian elimination within the envelope of the
+    /// matrix. The matrix is the identity and what contacts add, so it needs no exchange of rows.
+    /// Returns whether the solution is finite.
+    fn eliminate(&mut self) -> bool {
+        let width = self.width();
+        let (m, x) = (&mut self.full, &mut self.right);
+        for span in &self.spans {
+            for j in span.start..span.start + span.width {
+                let (above, below) = m.split_at_mut((j + 1) * width);
+                let pivot = &above[j * width + j..j * width + span.reach];
+                let Some((&head, tail)) = pivot.split_first() else { continue };
+                for (i, row) in (j + 1..span.reach).zip(below.chunks_exact_mut(width)) {
+                    let factor = row[j] / head;
+                    if factor != 0.0 {
+                        row[j + 1..span.reach].iter_mut().zip(tail).for_each(|(a, b)| *a -= factor * b);
+                        x[i] -= factor * x[j];
+                    }
+                }
+            }
+        }
+        for span in self.spans.iter().rev() {
+            for j in (span.start..span.start + span.width).rev() {
+                let row = &m[j * width..j * width + span.reach];
+                let sum: f64 = row[j + 1..].iter().zip(&x[j + 1..]).map(|(a, b)| a * b).sum();
+                x[j] = (x[j] - sum) / row[j];
+            }
+        }
+        x.iter().all(|x| x.is_finite())
+    }
+}
+
+/// Adds the rows of one side times a force to the coordinates of all.
+fn add(span: &Span, rows: &[f64], side: &Side, force: &Vector3<f64>, sum: &mut [f64]) {
+    let row = |axis: usize| &rows[side.rows + axis * span.width..][..span.width];
+    let [a, b, c] = [row(0), row(1), row(2)];
+    let sum = &mut sum[span.start..span.start + span.width];
+    for (k, sum) in sum.iter_mut().enumerate() {
+        *sum += a[k] * force[0] + b[k] * force[1] + c[k] * force[2];
+    }
+}

@@ -1,0 +1,376 @@
+//! The rest surface of a body as something that other bodies touch.
+
+use nalgebra::{Matrix4, Vector3, Vector4};
+
+use super::sites::Site;
+use crate::ModalModel;
+
+/// Number of sites that carry one vertex.
+const CARRIERS: usize = 4;
+
+/// Largest number of sites that carry one place of the surface.
+pub(crate) const MOST_CARRIERS: usize = 3 * CARRIERS;
+
+/// Cosine of the angle between two triangles above which the surface is smooth between them.
+const SMOOTH: f64 = 0.7;
+
+/// Largest cosine between the outward normals of a site and of a triangle that it may touch.
+const FACING: f64 = -0.2;
+
+/// Largest number of triangles in a leaf of the tree.
+const LEAF: usize = 4;
+
+/// A triangle of the rest surface.
+#[derive(Debug)]
+struct Facet {
+    corners: [u32; 3],
+    normal: Vector3<f64>,
+    /// Normals of the smooth surface at the corners.
+    smooth: [Vector3<f64>; 3],
+}
+
+/// A box around triangles. A leaf has triangles from `first`, another node two children, the first
+/// right behind it and the second at `first`.
+#[derive(Debug)]
+struct Node {
+    low: Vector3<f64>,
+    high: Vector3<f64>,
+    first: u32,
+    count: u32,
+}
+
+/// A place of the rest surface.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub(crate) struct Place {
+    facet: u32,
+    /// Weights of the corners, with the sum 1.
+    weights: [f64; 3],
+}
+
+/// Sites that carry a place, with their weights.
+#[derive(Debug, Clone, Copy)]
+pub(crate) struct Carriers {
+    list: [(u32, f64); MOST_CARRIERS],
+    count: usize,
+}
+
+impl Carriers {
+    fn add(&mut self, site: u32, weight: f64) {
+        if let Some(entry) = self.list[..self.count].iter_mut().find(|(known, _)| *known == site) {
+            entry.1 += weight;
+        } else if let Some(entry) = self.list.get_mut(self.count) {
+            *entry = (site, weight);
+            self.count += 1;
+        }
+    }
+
+    /// The site with the largest weight.
+    pub(crate) fn largest(&self) -> Option<usize> {
+        self.iter().max_by(|a, b| a.1.total_cmp(&b.1)).map(|(site, _)| site)
+    }
+
+    /// Sites and weights.
+    pub(crate) fn iter(&self) -> impl Iterator<Item = (usize, f64)> + Clone + '_ {
+        self.list[..self.count].iter().map(|(site, weight)| (*site as usize, *weight))
+    }
+}
+
+/// The rest surface of a body, smooth where its triangles meet at small angles.
+///
+/// Between the vertices the smooth surface lies above the triangle by
+/// `sum b_i n_i . (x_i - x) / 2` with the weights `b_i`, the corners `x_i` and their normals `n_i`,
+/// which is exact for a surface of constant curvature. The displacement of a vertex is that of the
+/// sites around it, weighted such that a linear field is exact (moving least squares).
+#[derive(Debug)]
+pub(crate) struct SurfaceField {
+    vertices: Vec<Vector3<f64>>,
+    facets: Vec<Facet>,
+    nodes: Vec<Node>,
+    /// Carriers of each vertex. Anchored vertices have none.
+    carriers: Vec<Vec<(u32, f64)>>,
+}
+
+/// The closest point of a triangle to a point, as weights of its corners (Ericson, Real-Time
+/// Collision Detection, 5.1.5).
+fn closest_on_triangle([a, b, c]: [&Vector3<f64>; 3], p: &Vector3<f64>) -> [f64; 3] {
+    let (ab, ac, ap) = (b - a, c - a, p - a);
+    let (d1, d2) = (ab.dot(&ap), ac.dot(&ap));
+    if d1 <= 0.0 && d2 <= 0.0 {
+        return [1.0, 0.0, 0.0];
+    }
+    let bp = p - b;
+    let (d3, d4) = (ab.dot(&bp), ac.dot(&bp));
+    if d3 >= 0.0 && d4 <= d3 {
+        return [0.0, 1.0, 0.0];
+    }
+    let vc = d1 * d4 - d3 * d2;
+    if vc <= 0.0 && d1 >= 0.0 && d3 <= 0.0 {
+        let v = d1 / (d1 - d3);
+        return [1.0 - v, v, 0.0];
+    }
+    let cp = p - c;
+    let (d5, d6) = (ab.dot(&cp), ac.dot(&cp));
+    if d6 >= 0.0 && d5 <= d6 {
+        return [0.0, 0.0, 1.0];
+    }
+    let vb = d5 * d2 - d1 * d6;
+    if vb <= 0.0 && d2 >= 0.0 && d6 <= 0.0 {
+        let w = d2 / (d2 - d6);
+        return [1.0 - w, 0.0, w];
+    }
+    let va = d3 * d6 - d5 * d4;
+    if va <= 0.0 && d4 - d3 >= 0.0 && d5 - d6 >= 0.0 {
+        let w = (d4 - d3) / ((d4 - d3) + (d5 - d6));
+        return [0.0, 1.0 - w, w];
+    }
+    let denominator = 1.0 / (va + vb + vc);
+    let (v, w) = (vb * denominator, vc * denominator);
+    [1.0 - v - w, v, w]
+}
+
+impl SurfaceField {
+    /// Makes the field of a model's surface, carried by its contact sites.
+    pub(crate) fn new(model: &ModalModel, sites: &[Site]) -> Self {
+        let surface = model.surface();
+        let mut vertices = vec![Vector3::zeros(); surface.welded_count()];
+        let mut anchored = vec![false; surface.welded_count()];
+        for (v, position) in surface.positions().iter().enumerate() {
+            let w = surface.welded()[v] as usize;
+            vertices[w] = Vector3::from(position.map(f64::from));
+            anchored[w] |= surface.anchored()[v];
+        }
+        let mut facets: Vec<Facet> = Vec::with_capacity(surface.triangles().len());
+        for triangle in surface.triangles() {
+            let corners = triangle.map(|v| surface.welded()[v as usize]);
+            let [a, b, c] = corners.map(|v| vertices[v as usize]);
+            let across = (b - a).cross(&(c - a));
+            let area = across.norm();
+            // A triangle without area has no normal, and others are as near.
+            if area > 0.0 {
+                let normal = across / area;
+                facets.push(Facet { corners, normal, smooth: [normal; 3] });
+            }
+        }
+        smoothen(&vertices, &mut facets);
+        let mut order: Vec<usize> = (0..facets.len()).collect();
+        let mut nodes = Vec::new();
+        if !facets.is_empty() {
+            split(&vertices, &facets, &mut order, 0, &mut nodes);
+        }
+        let mut sorted: Vec<Option<Facet>> = facets.into_iter().map(Some).collect();
+        let facets = order.iter().filter_map(|&index| sorted[index].take()).collect();
+        let carriers = vertices
+            .iter()
+            .zip(&anchored)
+            .map(|(at, anchored)| if *anchored { Vec::new() } else { carriers(at, sites, surface, &vertices) })
+            .collect();
+        Self { vertices, facets, nodes, carriers }
+    }
+
+    /// The place of the rest surface nearest to a point (m, body axes), no farther than `within`
+    /// (m). Of all triangles only those count that look at a site with the outward normal `facing`.
+    pub(crate) fn closest(
+        &self,
+        point: &Vector3<f64>,
+        facing: Option<&Vector3<f64>>,
+        within: f64,
+    ) -> Option<Place> {
+        let mut least = within * within;
+        let mut found = None;
+        let mut stack = [0u32; 64];
+        let mut depth = usize::from(!self.nodes.is_empty());
+        let away = |node: &Node| {
+            let over = (node.low - point).sup(&(point - node.high)).map(|x| x.max(0.0));
+            over.norm_squared()
+        };
+        while depth > 0 {
+            depth -= 1;
+            let index = stack[depth];
+            let node = &self.nodes[index as usize];
+            // Comparisons with no number are false, and such a point has no place.
+            if !(away(node) < least) {
+                continue;
+            }
+            if node.count == 0 {
+                let mut children = [index + 1, node.first];
+                if away(&self.nodes[children[0] as usize]) < away(&self.nodes[children[1] as usize]) {
+                    children.swap(0, 1);
+                }
+                for child in children {
+                    if depth < stack.len() {
+                        stack[depth] = child;
+                        depth += 1;
+                    }
+                }
+                continue;
+            }
+            for number in node.first..node.first + node.count {
+                let facet = &self.facets[number as usize];
+                if facing.is_some_and(|facing| facing.dot(&facet.normal) > FACING) {
+                    continue;
+                }
+                let corners = facet.corners.map(|v| &self.vertices[v as usize]);
+                let weights = closest_on_triangle(corners, point);
+                let near: Vector3<f64> = corners.iter().zip(weights).map(|(x, w)| **x * w).sum();
+                let distance = (point - near).norm_squared();
+                if distance < least {
+                    least = distance;
+                    found = Some(Place { facet: number, weights });
+                }
+            }
+        }
+        found
+    }
+
+    /// The corners of the triangle of a place, m, body axes.
+    pub(crate) fn corners(&self, place: &Place) -> [&Vector3<f64>; 3] {
+        self.facets[place.facet as usize].corners.map(|v| &self.vertices[v as usize])
+    }
+
+    /// The place on its triangle, m, body axes.
+    pub(crate) fn rest(&self, place: &Place) -> Vector3<f64> {
+        self.corners(place).iter().zip(place.weights).map(|(x, w)| **x * w).sum()
+    }
+
+    /// The normal of the smooth surface, that of the triangle, and the height of the smooth surface
+    /// above the triangle, m. Body axes, at rest.
+    pub(crate) fn normals(&self, place: &Place) -> (Vector3<f64>, Vector3<f64>, f64) {
+        let facet = &self.facets[place.facet as usize];
+        let rest = self.rest(place);
+        let (mut normal, mut rise) = (Vector3::zeros(), 0.0);
+        for ((smooth, corner), weight) in facet.smooth.iter().zip(self.corners(place)).zip(place.weights) {
+            normal += weight * smooth;
+            rise += 0.5 * weight * smooth.dot(&(corner - rest));
+        }
+        let length = normal.norm();
+        let normal = if length > 0.1 { normal / length } else { facet.normal };
+        (normal, facet.normal, rise)
+    }
+
+    /// The sites that carry one corner of a place's triangle.
+    pub(crate) fn corner_carriers(&self, place: &Place, corner: usize) -> &[(u32, f64)] {
+        &self.carriers[self.facets[place.facet as usize].corners[corner] as usize]
+    }
+
+    /// The sites that carry a place.
+    pub(crate) fn carriers(&self, place: &Place) -> Carriers {
+        let mut all = Carriers { list: [(0, 0.0); MOST_CARRIERS], count: 0 };
+        for (corner, weight) in place.weights.iter().enumerate() {
+            if *weight != 0.0 {
+                for &(site, share) in self.corner_carriers(place, corner) {
+                    all.add(site, weight * share);
+                }
+            }
+        }
+        all
+    }
+}
+
+/// Gives the corners of all triangles the mean normals of the triangles around them that meet at
+/// small angles.
+fn smoothen(vertices: &[Vector3<f64>], facets: &mut [Facet]) {
+    let mut around: Vec<Vec<u32>> = vec![Vec::new(); vertices.len()];
+    for (index, facet) in facets.iter().enumerate() {
+        facet.corners.iter().for_each(|&v| around[v as usize].push(index as u32));
+    }
+    // The angle of a triangle at the vertex is its weight, so that the triangulation of a face
+    // makes no difference.
+    let angle = |facet: &Facet, vertex: u32| {
+        let at = facet.corners.iter().position(|v| *v == vertex).unwrap_or(0);
+        let [a, b, c] = [0, 1, 2].map(|k| vertices[facet.corners[(at + k) % 3] as usize]);
+        (b - a).angle(&(c - a))
+    };
+    for index in 0..facets.len() {
+        let (corners, own) = (facets[index].corners, facets[index].normal);
+        facets[index].smooth = corners.map(|vertex| {
+            let mut sum = Vector3::zeros();
+            for &other in &around[vertex as usize] {
+                let other = &facets[other as usize];
+                if other.normal.dot(&own) > SMOOTH {
+                    sum += angle(other, vertex) * other.normal;
+                }
+            }
+            sum.try_normalize(1e-9).unwrap_or(own)
+        });
+    }
+}
+
+/// Builds the node of the triangles `order`, which begin at `first`, and those below it.
+fn split(
+    vertices: &[Vector3<f64>],
+    facets: &[Facet],
+    order: &mut [usize],
+    first: usize,
+    nodes: &mut Vec<Node>,
+) {
+    let corners = |index: usize| facets[index].corners.map(|v| vertices[v as usize]);
+    let middle = |index: usize| corners(index).iter().sum::<Vector3<f64>>() / 3.0;
+    let (mut low, mut high) = (Vector3::repeat(f64::INFINITY), Vector3::repeat(f64::NEG_INFINITY));
+    for corner in order.iter().flat_map(|&index| corners(index)) {
+        (low, high) = (low.inf(&corner), high.sup(&corner));
+    }
+    let node = nodes.len();
+    nodes.push(Node { low, high, first: first as u32, count: order.len() as u32 });
+    if order.len() <= LEAF {
+        return;
+    }
+    let axis = (high - low).imax();
+    order.sort_by(|&a, &b| middle(a)[axis].total_cmp(&middle(b)[axis]).then(a.cmp(&b)));
+    let (left, right) = order.split_at_mut(order.len() / 2);
+    split(vertices, facets, left, first, nodes);
+    nodes[node].count = 0;
+    nodes[node].first = nodes.len() as u32;
+    let second = first + left.len();
+    split(vertices, facets, right, second, nodes);
+}
+
+/// The sites around a vertex with weights that reproduce a linear field.
+fn carriers(
+    at: &Vector3<f64>,
+    sites: &[Site],
+    surface: &crate::SurfaceMesh,
+    vertices: &[Vector3<f64>],
+) -> Vec<(u32, f64)> {
+    let place = |site: &Site| vertices[surface.welded()[site.vertex as usize] as usize];
+    // The nearest sites, and the next one, at which weights vanish.
+    let mut nearest = [(f64::INFINITY, usize::MAX); CARRIERS + 1];
+    for (index, site) in sites.iter().enumerate() {
+        let distance = (place(site) - at).norm();
+        if let Some(slot) = nearest.iter().position(|(known, _)| distance < *known) {
+            nearest[slot..].rotate_right(1);
+            nearest[slot] = (distance, index);
+        }
+    }
+    let (closest, first) = nearest[0];
+    if first == usize::MAX {
+        return Vec::new();
+    }
+    if closest <= 0.0 || nearest[1].1 == usize::MAX {
+        return vec![(first as u32, 1.0)];
+    }
+    let used = || nearest[..CARRIERS].iter().filter(|(_, index)| *index != usize::MAX);
+    let reach = nearest[CARRIERS].0.min(2.0 * used().fold(0.0f64, |far, (d, _)| far.max(*d)));
+    let base = |index: usize| {
+        let way = (place(&sites[index]) - at) / reach;
+        Vector4::new(1.0, way.x, way.y, way.z)
+    };
+    let weight = |distance: f64| (1.0 - distance / reach).max(1e-3).powi(2);
+    let mut moments = Matrix4::zeros();
+    for &(distance, index) in used() {
+        moments += weight(distance) * base(index) * base(index).transpose();
+    }
+    // Sites may lie in a plane or on a line. The field across it is then taken as constant.
+    let ridge = 1e-4 * moments[(0, 0)];
+    (1..4).for_each(|k| moments[(k, k)] += ridge);
+    let Some(solved) = moments.cholesky().map(|factor| factor.solve(&Vector4::x())) else {
+        return vec![(first as u32, 1.0)];
+    };
+    let mut list: Vec<(u32, f64)> =
+        used().map(|&(d, index)| (index as u32, weight(d) * solved.dot(&base(index)))).collect();
+    let sum: f64 = list.iter().map(|(_, weight)| weight).sum();
+    if !(sum > 0.1 && list.iter().all(|(_, weight)| weight.abs() < 4.0 * sum)) {
+        return vec![(first as u32, 1.0)];
+    }
+    list.iter_mut().for_each(|(_, weight)| *weight /= sum);
+    list
+}

@@ -1,0 +1,240 @@
+//! Bodies that touch each other.
+
+use nalgebra::Vector3;
+
+use crate::{
+    Body, StepError, StepReport,
+    contact::Touching,
+    step::group::{self, Member, Parts, View},
+};
+
+/// A body that is stepped with others.
+#[derive(Debug)]
+pub struct Together<'a> {
+    /// The body.
+    pub body: &'a mut Body,
+    /// Name of the body, which no other has, and which stays from step to step:
+    /// [`Touched::Body`](crate::Touched::Body) has it.
+    pub key: u64,
+    /// Whether the body rests. A resting body is not stepped until a body that moves comes near,
+    /// and then [`Islands::step`] sets this to false.
+    pub resting: bool,
+    /// Set by a step: number of the body's island. Bodies with the same number may touch, directly
+    /// or through others, and may come to rest only together.
+    pub island: usize,
+    /// Set by a step: what it reports.
+    pub report: StepReport,
+    /// Set by a step: why it failed, if it did.
+    pub error: Option<StepError>,
+}
+
+impl<'a> Together<'a> {
+    /// A body that moves.
+    pub fn new(key: u64, body: &'a mut Body) -> Self {
+        Self { body, key, resting: false, island: 0, report: StepReport::default(), error: None }
+    }
+}
+
+impl Together<'_> {
+    fn step_alone(&mut self) {
+        match self.body.step_alone() {
+            Ok(report) => self.report = report,
+            Err(error) => self.error = Some(error),
+        }
+    }
+}
+
+/// A member of an island while it is stepped.
+impl Member for Together<'_> {
+    fn parts(&mut self) -> Parts<'_> {
+        self.body.parts(&mut self.report)
+    }
+
+    fn view(&self) -> View<'_> {
+        self.body.view()
+    }
+}
+
+/// Share of a body's size within which bodies count as near.
+const MARGIN: f64 = 0.01;
+
+/// The same for a body that hands hold, which may move it faster than it moves by itself.
+const HELD_MARGIN: f64 = 0.1;
+
+/// A ball around a body over the whole step.
+#[derive(Debug, Clone, Copy)]
+struct Ball {
+    index: usize,
+    center: Vector3<f64>,
+    velocity: Vector3<f64>,
+    radius: f64,
+    step: f64,
+}
+
+impl Ball {
+    fn of(index: usize, body: &Body) -> Self {
+        let (model, frame, step) = (body.model(), body.frame(), body.config().step);
+        let center = Vector3::from(frame.center());
+        let (radius, bent) = match &body.contacts().places {
+            Some(sites) => (sites.radius, sites.bound(body.q()) + step * sites.bound(body.v())),
+            None => {
+                // Without sites the size of the rest shape has to do.
+                let [low, high] = model.surface().bounds().map(|at| Vector3::from(at.map(f64::from)));
+                let com = Vector3::from(model.center_of_mass());
+                let radius = (com - low).sup(&(high - com)).norm();
+                (radius, radius)
+            }
+        };
+        let turning = step * frame.angular_velocity(model).norm().min(1.0 / step) * radius;
+        let margin = if body.grabs().next().is_some() { HELD_MARGIN } else { MARGIN };
+        let radius = radius + bent + turning + margin * model.size();
+        Self { index, center, velocity: frame.velocity().into(), radius, step }
+    }
+
+    /// Lowest and highest x of the ball during the step, m.
+    fn ends(&self) -> [f64; 2] {
+        let way = self.step * self.velocity.x.abs();
+        [self.center.x - self.radius - way, self.center.x + self.radius + way]
+    }
+
+    /// Comparisons with no number are false, and such bodies touch nothing.
+    fn meets(&self, other: &Self) -> bool {
+        let way = self.step * (self.velocity - other.velocity).norm();
+        self.step == other.step && (self.center - other.center).norm() <= self.radius + other.radius + way
+    }
+}
+
+/// Steps bodies that touch each other.
+///
+/// Bodies that are near each other form an island, which is solved as one: the forces between two
+/// bodies are equal and opposite, and both respond within the step. A body that is near no other is
+/// stepped as by [`Body::step`]. It holds no state of the bodies, only memory: a step allocates
+/// nothing once it has seen as many contacts.
+///
+/// The order of the bodies decides the order of the sums. The same order gives the same result to
+/// the bit.
+///
+/// Two bodies touch only if they have the same step length. The friction between them is the
+/// geometric mean of both coefficients.
+#[derive(Debug, Clone, Default)]
+pub struct Islands {
+    work: Touching,
+    balls: Vec<Ball>,
+    /// Pairs of bodies that are near each other, by index.
+    pairs: Vec<[u32; 2]>,
+    /// The first body of each body's island, and all bodies by island.
+    first: Vec<usize>,
+    order: Vec<usize>,
+    local: Vec<u32>,
+    members: Vec<[u32; 2]>,
+}
+
+impl Islands {
+    /// Performs one step of all bodies that move. `may_touch` says whether two bodies may touch, by
+    /// their indices.
+    ///
+    /// A body whose step fails has the error as its [`Together::error`], and the bodies of its
+    /// island are stepped as if they did not touch each other.
+    pub fn step(&mut self, bodies: &mut [Together<'_>], may_touch: impl Fn(usize, usize) -> bool) {
+        self.find_pairs(bodies, &may_touch);
+        self.wake(bodies);
+        self.find_islands(bodies);
+        for together in bodies.iter_mut().filter(|together| !together.resting) {
+            (together.report, together.error) = (StepReport::default(), None);
+            together.body.contacts_mut().key = together.key;
+            together.body.begin_step();
+        }
+        let mut begin = 0;
+        while begin < self.order.len() {
+            let island = bodies[self.order[begin]].island;
+            let count =
+                self.order[begin..].iter().take_while(|&&index| bodies[index].island == island).count();
+            self.step_island(bodies, begin, begin + count);
+            begin += count;
+        }
+        for together in bodies.iter_mut().filter(|together| !together.resting) {
+            together.body.end_step();
+        }
+    }
+
+    fn step_island(&mut self, bodies: &mut [Together<'_>], begin: usize, end: usize) {
+        let who = &self.order[begin..end];
+        if let [one] = who {
+            if !bodies[*one].resting {
+                bodies[*one].step_alone();
+            }
+            return;
+        }
+        self.members.clear();
+        for pair in &self.pairs {
+            let local = pair.map(|index| self.local[index as usize]);
+            if self.first[pair[0] as usize] == self.first[who[0]] {
+                self.members.push(local);
+            }
+        }
+        if group::step(bodies, who, &self.members, &mut self.work).is_ok() {
+            return;
+        }
+        for &index in who {
+            bodies[index].body.contacts_mut().forget();
+            bodies[index].step_alone();
+        }
+    }
+
+    fn find_pairs(&mut self, bodies: &[Together<'_>], may_touch: &impl Fn(usize, usize) -> bool) {
+        self.pairs.clear();
+        self.balls.clear();
+        self.balls.extend(bodies.iter().enumerate().map(|(index, together)| Ball::of(index, together.body)));
+        self.balls.retain(|ball| ball.ends().iter().all(|x| x.is_finite()));
+        self.balls.sort_unstable_by(|a, b| a.ends()[0].total_cmp(&b.ends()[0]).then(a.index.cmp(&b.index)));
+        for (number, a) in self.balls.iter().enumerate() {
+            let [_, end] = a.ends();
+            for b in self.balls[number + 1..].iter().take_while(|b| b.ends()[0] <= end) {
+                let (i, j) = (a.index.min(b.index), a.index.max(b.index));
+                let rest = bodies[i].resting && bodies[j].resting;
+                if !rest && a.meets(b) && may_touch(i, j) {
+                    self.pairs.push([i as u32, j as u32]);
+                }
+            }
+        }
+        self.pairs.sort_unstable();
+    }
+
+    /// Wakes the resting bodies near those that move.
+    fn wake(&mut self, bodies: &mut [Together<'_>]) {
+        for pair in &self.pairs {
+            pair.iter().for_each(|&index| bodies[index as usize].resting = false);
+        }
+    }
+
+    /// Joins the bodies of all pairs.
+    fn find_islands(&mut self, bodies: &mut [Together<'_>]) {
+        self.first.clear();
+        self.first.extend(0..bodies.len());
+        let root = |first: &[usize], mut index: usize| {
+            while first[index] != index {
+                index = first[index];
+            }
+            index
+        };
+        for pair in &self.pairs {
+            let [a, b] = pair.map(|index| root(&self.first, index as usize));
+            self.first[a.max(b)] = a.min(b);
+        }
+        for index in 0..bodies.len() {
+            self.first[index] = root(&self.first, index);
+            bodies[index].island = self.first[index];
+        }
+        self.order.clear();
+        self.order.extend(0..bodies.len());
+        self.order.sort_unstable_by_key(|&index| (self.first[index], index));
+        self.local.clear();
+        self.local.resize(bodies.len(), 0);
+        let mut count = 0;
+        for (number, &index) in self.order.iter().enumerate() {
+            let begins = number == 0 || self.first[self.order[number - 1]] != self.first[index];
+            count = if begins { 0 } else { count + 1 };
+            self.local[index] = count;
+        }
+    }
+}

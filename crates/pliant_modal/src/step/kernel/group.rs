@@ -1,0 +1,542 @@
+//! The step of bodies that touch obstacles and each other.
+//!
+//! The step of each body is computed under the contact forces of the step before. The laws of all
+//! contacts are solved together on the linearized responses of the bodies, and the steps are
+//! computed again under the new forces. Where a body bends or turns within the step, this is
+//! repeated. Bodies at rest compute one step.
+
+use nalgebra::{Matrix3, Vector3};
+
+use super::{
+    Kernel, points,
+    touch::{RowsOfSide, take},
+};
+use crate::{
+    StepError,
+    contact::{Contact, ContactReport, ContactSites, Contacts, Memory, Point, Touched, Touching},
+    step::{Frame, Hand, Load, State, StepReport},
+};
+
+/// Largest number of times that a step is computed again with new forces, without hands and with
+/// them.
+const ROUNDS: [usize; 2] = [3, 6];
+
+/// Distance below which sites count as candidates, as a share of the body's size.
+const BAND: f64 = 2e-3;
+
+/// Tolerances of the laws, as shares of the body's size: that with which forces of the step before
+/// are taken as they are, and that with which a step is not computed again.
+const STILL: f64 = 1e-12;
+const ENOUGH: f64 = 1e-6;
+
+/// Share of the kinetic and elastic energy that a step may gain of what contacts have lost before.
+const GIVEN_BACK: f64 = 1e-2;
+
+/// What a step changes of a body.
+pub(crate) struct Parts<'a> {
+    pub(crate) kernel: &'a mut Kernel,
+    pub(crate) state: &'a mut State,
+    pub(crate) hands: &'a mut [Hand],
+    pub(crate) load: Load<'a>,
+    pub(crate) contacts: &'a mut Contacts,
+    pub(crate) report: &'a mut StepReport,
+}
+
+/// What a step reads of a body.
+#[derive(Clone, Copy)]
+pub(crate) struct View<'a> {
+    pub(crate) kernel: &'a Kernel,
+    pub(crate) state: &'a State,
+    pub(crate) hands: &'a [Hand],
+    pub(crate) load: Load<'a>,
+    pub(crate) contacts: &'a Contacts,
+}
+
+/// A body in a group.
+pub(crate) trait Member {
+    /// What a step changes.
+    fn parts(&mut self) -> Parts<'_>;
+    /// What a step reads.
+    fn view(&self) -> View<'_>;
+}
+
+impl<'a> View<'a> {
+    /// Whether the frame moves.
+    fn moves(&self) -> bool {
+        self.kernel.model.is_free() && !self.load.frame_is_given
+    }
+
+    pub(super) fn sites(&self) -> Option<&'a ContactSites> {
+        self.contacts.places.as_deref()
+    }
+}
+
+/// Some members of a slice, which are stepped together.
+pub(super) struct Group<'a, P> {
+    pub(super) all: &'a mut [P],
+    /// Indices of the members.
+    pub(super) who: &'a [usize],
+    /// Pairs of members that may touch.
+    pub(super) pairs: &'a [[u32; 2]],
+    /// Size of the smallest member, m.
+    pub(super) size: f64,
+    pub(super) h: f64,
+}
+
+/// Performs one step of the members `who`, which have the same step length. `pairs` has those that
+/// may touch each other, as indices into `who`.
+///
+/// # Errors
+/// Returns the error of an obstacle, or [`StepError::Diverged`] if the result of one member would
+/// not be finite. All members then stay as they were.
+pub(crate) fn step<P: Member>(
+    all: &mut [P],
+    who: &[usize],
+    pairs: &[[u32; 2]],
+    work: &mut Touching,
+) -> Result<(), StepError> {
+    let mut group = Group { all, who, pairs, size: f64::INFINITY, h: 0.0 };
+    for member in 0..who.len() {
+        let parts = group.parts(member);
+        parts.kernel.before.clone_from(parts.state);
+        parts.contacts.save(parts.hands);
+        parts.contacts.list.clear();
+        parts.contacts.report = ContactReport::default();
+        let (size, h) = (parts.kernel.model.size(), parts.kernel.h);
+        group.size = group.size.min(size);
+        group.h = h;
+    }
+    let stepped = group.step(work).and_then(|()| group.check());
+    if let Err(error) = stepped {
+        for member in 0..who.len() {
+            let parts = group.parts(member);
+            parts.state.clone_from(&parts.kernel.before);
+            parts.contacts.restore(parts.hands);
+            parts.contacts.list.clear();
+            parts.contacts.report = ContactReport::default();
+        }
+        return Err(error);
+    }
+    Ok(())
+}
+
+impl<P: Member> Group<'_, P> {
+    pub(super) fn parts(&mut self, member: usize) -> Parts<'_> {
+        self.all[self.who[member]].parts()
+    }
+
+    pub(super) fn view(&self, member: usize) -> View<'_> {
+        self.all[self.who[member]].view()
+    }
+
+    fn len(&self) -> usize {
+        self.who.len()
+    }
+
+    /// Checks that the result is finite.
+    fn check(&self) -> Result<(), StepError> {
+        for member in 0..self.len() {
+            let View { state, hands, .. } = self.view(member);
+            let sound =
+                |hand: &Hand| hand.pull.iter().chain(&hand.mean).chain(&hand.flow).all(|x| x.is_finite());
+            let reaction = (!hands.iter().all(sound)).then_some("a reaction");
+            if let Some(what) = state.non_finite().or(reaction) {
+                return Err(StepError::Diverged { what });
+            }
+        }
+        Ok(())
+    }
+
+    fn step(&mut self, work: &mut Touching) -> Result<(), StepError> {
+        work.points.clear();
+        work.sweeps = 0;
+        let mut most_sites = 0;
+        for member in 0..self.len() {
+            let alone = self.len() == 1;
+            let Parts { kernel, contacts, .. } = self.parts(member);
+            if alone && contacts.obstacles().is_empty() {
+                contacts.memory.clear();
+                self.advance(work, 0.5);
+                return Ok(());
+            }
+            if contacts.places.is_none() || contacts.modes != kernel.modes.count() {
+                kernel.prepare_contacts(contacts)?;
+            }
+            most_sites = most_sites.max(contacts.sites());
+        }
+        work.marks.clear();
+        work.marks.resize(most_sites, 0);
+        work.stamp = 0;
+        // A contact that goes on keeps its weight.
+        let held = |view: View<'_>| (!view.contacts.memory.is_empty()).then_some(view.contacts.theta);
+        let mut theta = (0..self.len()).filter_map(|member| held(self.view(member))).reduce(f64::max);
+        points::begin(self, work)?;
+        let known = work.points.len();
+        let mut report = self.attempt(work, &mut theta, true)?;
+        if !work.points.is_empty() && gained(work, true) {
+            // The forces of the step before, and no others, begin the step anew.
+            work.points.truncate(known);
+            theta = Some(1.0);
+            let rounds = report.rounds;
+            points::begin(self, work)?;
+            report = self.attempt(work, &mut theta, false)?;
+            report.rounds += rounds;
+            report.guarded = true;
+        }
+        report.guarded |= self.cap_energy(work);
+        report.sweeps = work.sweeps;
+        self.end(work, theta.unwrap_or(0.5), &report);
+        Ok(())
+    }
+
+    /// Computes the steps of all members under the forces of the points.
+    fn advance(&mut self, work: &mut Touching, theta: f64) {
+        for point in &mut work.points {
+            if let Some(far) = &mut point.far {
+                point.arm = far.middle - self.view(point.member).kernel.pivot(theta);
+                far.arm = far.middle - self.view(far.member).kernel.pivot(theta);
+            }
+        }
+        for member in 0..self.len() {
+            let Parts { kernel, state, hands, load, contacts, report } = self.parts(member);
+            state.clone_from(&kernel.before);
+            contacts.restore(hands);
+            kernel.begin_push(theta, false);
+            if let Some(sites) = contacts.places.as_deref() {
+                for point in &work.points {
+                    let near = point.member == member;
+                    let far = point.far.as_ref().filter(|far| far.member == member);
+                    if !near && far.is_none() {
+                        continue;
+                    }
+                    kernel.push.is_on = true;
+                    let force = point.world_force();
+                    if force == Vector3::zeros() {
+                        continue;
+                    }
+                    if let Some(far) = far {
+                        let tangent = far.mean.unwrap_or(far.tangent);
+                        kernel.add_push(sites, far.carriers.iter(), &tangent, &far.arm, &-force);
+                    } else {
+                        let tangent = point.mean.unwrap_or(point.tangent);
+                        let site = std::iter::once((point.site, 1.0));
+                        kernel.add_push(sites, site, &tangent, &point.arm, &force);
+                    }
+                }
+            }
+            *report = kernel.advance(state, hands, &load);
+            kernel.push.is_on = false;
+        }
+    }
+
+    /// Computes the step until the laws of contact hold.
+    fn attempt(
+        &mut self,
+        work: &mut Touching,
+        theta: &mut Option<f64>,
+        recovers: bool,
+    ) -> Result<ContactReport, StepError> {
+        let holds = (0..self.len()).any(|member| !self.view(member).hands.is_empty());
+        let rounds = ROUNDS[usize::from(holds)];
+        let mut report = ContactReport::default();
+        loop {
+            let weight = theta.unwrap_or(0.5);
+            self.advance(work, weight);
+            report.rounds += 1;
+            let round = report.rounds;
+            if (0..self.len()).any(|member| !self.view(member).state.is_finite()) {
+                work.points.clear();
+                return Ok(report);
+            }
+            let band = if round == 1 { BAND * self.size } else { 0.0 };
+            let (new, candidates) = points::detect(self, work, band)?;
+            report.candidates += candidates;
+            points::linearize(self, work, recovers)?;
+            report.residual = work.violation();
+            let enough = if round == 1 { STILL } else { ENOUGH } * self.size;
+            if work.points.is_empty() || (report.residual <= enough && !new) || round > rounds {
+                return Ok(report);
+            }
+            self.fill_rows(work);
+            if theta.is_none() && recovers {
+                let ratio = work.rigid_share();
+                // A soft contact is stepped nearly without loss. A stiff one would ring.
+                *theta = Some(0.5 + 0.5 * ratio / (ratio + 16.0));
+            }
+            self.hold_rows(work, theta.unwrap_or(0.5));
+            work.solve((1e-3 * report.residual).max(1e-13 * self.size));
+            for point in &mut work.points {
+                point.pushed = point.force;
+            }
+        }
+    }
+
+    /// Writes the rows of all points.
+    fn fill_rows(&self, work: &mut Touching) {
+        work.lay_out((0..self.len()).map(|member| self.view(member).kernel.modes() + 6));
+        work.lay_out_rows();
+        for member in 0..self.len() {
+            let view = self.view(member);
+            let Some(sites) = view.sites() else { continue };
+            let width = work.spans[member].width;
+            let spin = view.moves().then(|| view.kernel.spin_root(&view.state.frame));
+            for (point, sides) in work.points.iter().zip(&work.sides) {
+                if point.member == member
+                    && let Some(side) = &sides[0]
+                {
+                    let tangent = point.mean.unwrap_or(point.tangent);
+                    let of = RowsOfSide { axes: point.axes, tangent, arm: point.arm, spin: spin.as_ref() };
+                    let rows = &mut work.rows[side.rows..][..3 * width];
+                    view.kernel.fill_rows(sites, std::iter::once((point.site, 1.0)), &of, rows);
+                }
+                if let (Some(far), Some(side)) = (&point.far, &sides[1])
+                    && far.member == member
+                {
+                    let tangent = far.mean.unwrap_or(far.tangent);
+                    let of = RowsOfSide { axes: -point.axes, tangent, arm: far.arm, spin: spin.as_ref() };
+                    let rows = &mut work.rows[side.rows..][..3 * width];
+                    view.kernel.fill_rows(sites, far.carriers.iter(), &of, rows);
+                }
+            }
+        }
+    }
+
+    /// Weighs the rows of the frames, and takes from all rows what the hands hold back, so that the
+    /// responses are those of the held bodies.
+    fn hold_rows(&self, work: &mut Touching, theta: f64) {
+        let scale = theta.sqrt();
+        for member in 0..self.len() {
+            let view = self.view(member);
+            let width = work.spans[member].width;
+            let spin = view.moves().then(|| view.kernel.spin_root(&view.state.frame));
+            view.kernel.held_rows(view.state, view.hands, spin.as_ref(), &mut work.held);
+            for side in work.sides.iter().flatten().flatten().filter(|side| side.member == member) {
+                for row in work.rows[side.rows..][..3 * width].chunks_exact_mut(width) {
+                    row[width - 6..].iter_mut().for_each(|x| *x *= scale);
+                    work.held.chunks_exact(width).for_each(|w| take(w, row));
+                }
+            }
+        }
+    }
+
+    /// Takes the energy that the step has gained from the velocities. Returns whether it had any.
+    ///
+    /// The work of the contacts is right to second order in the way of a step. Bodies that turn or
+    /// bend far within one step may still gain. Hands and loads do work of their own, and a
+    /// material that relaxes stores energy that is not counted here: such steps are not checked.
+    fn cap_energy(&mut self, work: &mut Touching) -> bool {
+        if !work.points.iter().any(|point| point.pushed[0] > 0.0) {
+            return false;
+        }
+        let (mut moving, mut gained, mut scale, mut lost) = (0.0, 0.0, 0.0, 0.0);
+        let mut grounded = work.points.iter().any(|point| point.far.is_none() && point.pushed[0] > 0.0);
+        for member in 0..self.len() {
+            let View { kernel, state, hands, load, contacts } = self.view(member);
+            let other = Load { modal: load.modal, ..Load::default() } != load;
+            let loaded = other || load.modal.iter().any(|load| *load != 0.0);
+            if loaded || !hands.is_empty() || kernel.modes.is_viscous() || !state.is_finite() {
+                return false;
+            }
+            grounded |= !kernel.model.is_free();
+            let at_rest = |state: &State| kernel.elastic_energy(&state.q) + kernel.potential_energy(state);
+            let (now, before) = (kernel.kinetic_energy(state), kernel.kinetic_energy(&kernel.before));
+            moving += now;
+            gained += now - before + at_rest(state) - at_rest(&kernel.before);
+            scale += now + before;
+            scale += kernel.elastic_energy(&state.q) + kernel.elastic_energy(&kernel.before.q);
+            lost += contacts.lost;
+        }
+        for point in &work.points {
+            let force = point.world_force();
+            let (now, before) = (point.stored(&force), point.stored(&point.before));
+            scale += now + before;
+            gained += now - before;
+            // What pushes a body out that was set into something.
+            gained -= point.pushed[0] * (point.floor - point.gap).max(0.0);
+            if point.far.is_none() {
+                // What the obstacles supply.
+                gained -= force.dot(&point.carried);
+            }
+        }
+        // A step may take back a little of what the steps before have lost: a rolling ball loses
+        // and gains in turn, and would slow down if only the gains were taken.
+        let allowed = lost.min(GIVEN_BACK * scale);
+        let lost = (lost - gained.min(allowed)).min(scale) / self.len() as f64;
+        let gained = gained - allowed;
+        // Bodies that touch nothing else keep their common momentum.
+        let common = if grounded { Common::default() } else { Common::of(self) };
+        moving -= common.energy;
+        for member in 0..self.len() {
+            self.parts(member).contacts.lost = lost;
+        }
+        if gained > moving && gained > 1e-3 * scale {
+            // The velocities cannot pay for it. The bodies stop where the step began.
+            for member in 0..self.len() {
+                let Parts { kernel, state, .. } = self.parts(member);
+                state.clone_from(&kernel.before);
+                common.slow(kernel, state, 0.0);
+            }
+            work.points.clear();
+            true
+        } else if gained > 1e-12 * scale && moving > 0.0 {
+            let left = (1.0 - gained / moving).max(0.0).sqrt();
+            for member in 0..self.len() {
+                let Parts { kernel, state, .. } = self.parts(member);
+                common.slow(kernel, state, left);
+            }
+            true
+        } else {
+            false
+        }
+    }
+
+    /// Stores what the next step needs and what users read.
+    fn end(&mut self, work: &mut Touching, theta: f64, report: &ContactReport) {
+        for member in 0..self.len() {
+            let contacts = self.parts(member).contacts;
+            contacts.memory.clear();
+            contacts.report = *report;
+        }
+        work.points.sort_unstable_by_key(|point| {
+            let other = match point.other {
+                Touched::Obstacle(index) => (0, index as u64),
+                Touched::Body(key) => (1, key),
+            };
+            (point.member, other, point.site)
+        });
+        for point in &work.points {
+            let force = point.world_force();
+            if point.pushed[0] <= 0.0 || !force.iter().all(|x| x.is_finite()) {
+                continue;
+            }
+            self.keep(point, &force);
+        }
+        for member in 0..self.len() {
+            let contacts = self.parts(member).contacts;
+            contacts.report.contacts = contacts.list.len();
+            // A body whose sites touch nothing may still be touched.
+            contacts.theta = if contacts.list.is_empty() { 0.5 } else { theta };
+        }
+    }
+
+    /// Keeps a contact with force for the next step, and lists it at both bodies.
+    fn keep(&mut self, point: &Point, force: &Vector3<f64>) {
+        let view = self.view(point.member);
+        let key = view.contacts.key;
+        let Some(site) = view.sites().and_then(|sites| sites.sites.get(point.site)) else { return };
+        let dent = point.compliance * force;
+        let held = point.pushed[1].hypot(point.pushed[2]);
+        let sliding = held >= point.friction * point.pushed[0] * (1.0 - 1e-9);
+        let mut anchor = if sliding { point.end + dent } else { point.anchor };
+        // The next step holds the material of the new contact point.
+        anchor += point.place - point.end;
+        let toward = if site.radius > 0.0 { point.last } else { point.first };
+        let normal = point.axes.row(0).transpose();
+        let penetration = (-(point.off[0] + point.floor + normal.dot(&dent))).max(0.0);
+        let contact = Contact {
+            other: point.other,
+            vertex: site.vertex,
+            point: point.place.into(),
+            normal: normal.into(),
+            force: (*force).into(),
+            penetration,
+            sliding,
+        };
+        let far = point.far.as_ref().map(|far| {
+            let view = self.view(far.member);
+            let turn = view.state.frame.rotation().inverse();
+            let sites = view.sites();
+            let field = sites.map(|sites| sites.field(&view.kernel.model));
+            let rest = field.map_or_else(Vector3::zeros, |field| field.rest(&far.place));
+            let site = far.carriers.largest().and_then(|site| sites?.sites.get(site));
+            let vertex = site.map_or(0, |site| site.vertex);
+            (rest + turn * (anchor - far.end), vertex)
+        });
+        let (anchor, vertex) = far.unwrap_or((anchor, 0));
+        let own = point.compliance - point.far.map_or_else(Matrix3::zeros, |far| far.compliance);
+        let add = |contacts: &mut Contacts, contact: Contact, compliance: &Matrix3<f64>| {
+            let report = &mut contacts.report;
+            report.force = (Vector3::from(report.force) + Vector3::from(contact.force)).into();
+            report.penetration = report.penetration.max(penetration);
+            report.energy += 0.5 * force.dot(&(compliance * force));
+            contacts.list.push(contact);
+        };
+        let contacts = self.parts(point.member).contacts;
+        contacts.memory.push(Memory { other: point.other, site: point.site, force: *force, anchor, toward });
+        add(contacts, contact, &own);
+        if let Some(far) = &point.far {
+            let opposite = Contact {
+                other: Touched::Body(key),
+                vertex,
+                normal: (-normal).into(),
+                force: (-force).into(),
+                ..contact
+            };
+            add(self.parts(far.member).contacts, opposite, &far.compliance);
+        }
+    }
+}
+
+/// Whether the contacts did more work on the bodies than they are allowed to.
+fn gained(work: &Touching, recovers: bool) -> bool {
+    let (mut done, mut allowed, mut scale) = (0.0, 0.0, 0.0f64);
+    for point in &work.points {
+        let force = point.world_force();
+        let along = force.dot(&(point.end - point.start - point.carried));
+        let (stored, before) = (point.stored(&force), point.stored(&point.before));
+        done += along + stored - before;
+        scale += along.abs() + stored + before;
+        if recovers {
+            allowed += point.pushed[0] * (point.floor - point.gap).max(0.0);
+        }
+    }
+    done > 1.5 * allowed + 1e-9 * scale
+}
+
+/// The rigid motion that has the momentum of all members.
+#[derive(Debug, Clone, Copy, Default)]
+struct Common {
+    center: Vector3<f64>,
+    velocity: Vector3<f64>,
+    spin: Vector3<f64>,
+    /// Kinetic energy, J.
+    energy: f64,
+}
+
+impl Common {
+    fn of<P: Member>(group: &Group<'_, P>) -> Self {
+        let (mut mass, mut center, mut linear) = (0.0, Vector3::zeros(), Vector3::zeros());
+        for member in 0..group.len() {
+            let View { kernel, state, .. } = group.view(member);
+            let own = kernel.model.mass();
+            mass += own;
+            center += own * Vector3::from(state.frame.center());
+            linear += own * Vector3::from(state.frame.velocity());
+        }
+        let (center, velocity) = (center / mass, linear / mass);
+        let (mut inertia, mut angular) = (Matrix3::zeros(), Vector3::zeros());
+        for member in 0..group.len() {
+            let View { kernel, state, .. } = group.view(member);
+            let arm = Vector3::from(state.frame.center()) - center;
+            let momentum = kernel.model.mass() * (Vector3::from(state.frame.velocity()) - velocity);
+            angular += Vector3::from(state.frame.spin()) + arm.cross(&momentum);
+            let outer = Matrix3::identity() * arm.norm_squared() - arm * arm.transpose();
+            inertia += state.frame.inertia(&kernel.model) + kernel.model.mass() * outer;
+        }
+        let spin = inertia.try_inverse().map_or_else(Vector3::zeros, |inverse| inverse * angular);
+        let energy = 0.5 * mass * velocity.norm_squared() + 0.5 * spin.dot(&angular);
+        Self { center, velocity, spin, energy }
+    }
+
+    /// Multiplies all motion of a body besides this one.
+    fn slow(&self, kernel: &Kernel, state: &mut State, left: f64) {
+        state.v.iter_mut().for_each(|v| *v *= left);
+        if kernel.model.is_free() {
+            let frame: &mut Frame = &mut state.frame;
+            let arm = Vector3::from(frame.center()) - self.center;
+            let velocity = self.velocity + self.spin.cross(&arm);
+            let spin = frame.inertia(&kernel.model) * self.spin;
+            frame.slow_to(&velocity, &spin, left);
+        }
+    }
+}

@@ -1,0 +1,578 @@
+//! Where bodies touch: the contacts that go on, the new ones, and their gaps after a step.
+
+use nalgebra::{Matrix3, Vector3};
+
+use super::{
+    Kernel,
+    group::{Group, Member, View},
+    touch::{Located, look},
+};
+use crate::{
+    StepError,
+    contact::{ContactSites, Far, Memory, Near, Obstacle, Point, Shape, Site, SurfacePoint, Touched, Touching},
+    step::{Frame, State, Tangent},
+};
+
+/// Share of a penetration that a step takes back, and the fastest way back, body sizes per second.
+const RECOVERED: f64 = 0.2;
+const RECOVERY_SPEED: f64 = 0.5;
+
+/// Farthest distance of a site's surface from its anchor, as a share of the body's size. Beyond it
+/// the body was moved from elsewhere.
+const SNAPPED: f64 = 0.02;
+
+/// Depth below the surface of another body down to which sites are pushed out, as a share of the
+/// size of the smaller body.
+const DEEP: f64 = 0.1;
+
+/// Distance of a site to those of the other body below which it is not needed, as a share of the
+/// distance between sites.
+const COVERED: f64 = 0.75;
+
+fn carried(obstacle: &dyn Obstacle, point: &Vector3<f64>, h: f64) -> Result<Vector3<f64>, StepError> {
+    let velocity = obstacle.velocity(point);
+    crate::error::finite("velocity of an obstacle", velocity.as_slice())?;
+    Ok(h * velocity)
+}
+
+/// The smallest gap that is allowed at the end of a step that begins with `gap`.
+fn floor(gap: f64, most: f64, recovers: bool) -> f64 {
+    if gap >= 0.0 {
+        0.0
+    } else if recovers {
+        gap + (RECOVERED * -gap).min(most)
+    } else {
+        gap
+    }
+}
+
+/// The share of a step's way after which a gap that ends at `distance` closes.
+fn share(gap: f64, distance: f64) -> f64 {
+    if gap <= 0.0 {
+        0.0
+    } else if distance < 0.0 {
+        gap / (gap - distance)
+    } else {
+        1.0
+    }
+}
+
+/// The member with this key.
+fn find<P: Member>(group: &Group<'_, P>, key: u64) -> Option<usize> {
+    (0..group.who.len()).find(|&member| group.view(member).contacts.key == key)
+}
+
+/// Friction between two members.
+fn friction(a: &View<'_>, b: &View<'_>) -> f64 {
+    (a.contacts.friction() * b.contacts.friction()).sqrt()
+}
+
+/// Compliance of a place of another body, m/N, world axes.
+fn far_compliance(view: &View<'_>, sites: &ContactSites, state: &State, far: &Far) -> Matrix3<f64> {
+    let site = far.carriers.largest().and_then(|site| sites.sites.get(site));
+    site.map_or_else(Matrix3::zeros, |site| view.kernel.site_compliance(site, &state.frame, &state.q))
+}
+
+/// The side at another body as it is before a first look at the end of the step.
+fn far_side(member: usize, near: &Near, shape: &Shape<'_>) -> Far {
+    let carriers = shape.field.carriers(&near.place);
+    let (start, tangent) = shape.material(&near.place, &carriers);
+    let zero = Vector3::zeros();
+    Far {
+        member,
+        place: near.place,
+        passed: false,
+        carriers,
+        start,
+        end: start,
+        tangent,
+        mean: None,
+        middle: start,
+        arm: zero,
+        compliance: Matrix3::zeros(),
+        anchor: start,
+    }
+}
+
+/// Sets up the contacts that the step before left.
+pub(super) fn begin<P: Member>(group: &Group<'_, P>, work: &mut Touching) -> Result<(), StepError> {
+    work.points.clear();
+    for member in 0..group.who.len() {
+        let view = group.view(member);
+        let Some(sites) = view.sites() else { continue };
+        for memory in &view.contacts.memory {
+            let Some(site) = sites.sites.get(memory.site) else { continue };
+            match memory.other {
+                Touched::Obstacle(index) => {
+                    let Some(obstacle) = view.contacts.obstacles().get(index) else { continue };
+                    work.points.push(begin_at_obstacle(member, &view, memory, site, &**obstacle)?);
+                }
+                Touched::Body(key) => {
+                    let Some(other) = find(group, key) else { continue };
+                    let far = group.view(other);
+                    work.points.extend(begin_at_body([member, other], [&view, &far], memory, site));
+                }
+            }
+        }
+    }
+    Ok(())
+}
+
+fn begin_at_obstacle(
+    member: usize,
+    view: &View<'_>,
+    memory: &Memory,
+    site: &Site,
+    obstacle: &dyn Obstacle,
+) -> Result<Point, StepError> {
+    let kernel = view.kernel;
+    let (frame, q) = (&kernel.before.frame, &kernel.before.q);
+    let located = kernel.locate(site, obstacle, frame, q)?;
+    let mut point = Point::new(member, memory.site, memory.other, view.contacts.friction());
+    (point.first, point.last) = (memory.toward, located.toward);
+    (point.start, point.tangent) = kernel.material(site, &memory.toward, frame, q);
+    point.carried = carried(obstacle, &located.point, kernel.h)?;
+    point.compliance = kernel.site_compliance(site, frame, q);
+    let gap = look(obstacle, &(located.point + point.carried))?.distance;
+    point.arm = located.point - Vector3::from(frame.center());
+    let anchor = memory.anchor + point.carried;
+    resume(&mut point, memory, &located.found.normal, gap, anchor, kernel.model.size());
+    Ok(point)
+}
+
+fn begin_at_body(
+    [member, other]: [usize; 2],
+    [view, far]: [&View<'_>; 2],
+    memory: &Memory,
+    site: &Site,
+) -> Option<Point> {
+    let (kernel, sites) = (view.kernel, far.sites()?);
+    let (frame, q) = (&kernel.before.frame, &kernel.before.q);
+    let shape = far.kernel.shape(sites, &far.kernel.before);
+    let size = kernel.model.size().min(far.kernel.model.size());
+    let (located, near) = locate_at_body(kernel, site, &shape, frame, q, DEEP * size)?;
+    let mut point = Point::new(member, memory.site, memory.other, friction(view, far));
+    (point.first, point.last) = (memory.toward, located.toward);
+    (point.start, point.tangent) = kernel.material(site, &memory.toward, frame, q);
+    let mut side = far_side(other, &near, &shape);
+    side.compliance = far_compliance(far, sites, &far.kernel.before, &side);
+    side.middle = 0.5 * (located.point + side.start);
+    side.anchor = side.start + frame_of(&shape) * (memory.anchor - shape.field.rest(&near.place));
+    point.compliance = kernel.site_compliance(site, frame, q) + side.compliance;
+    let anchor = side.anchor;
+    point.far = Some(side);
+    resume(&mut point, memory, &near.normal, near.distance, anchor, size);
+    if let Some(far) = &mut point.far {
+        far.anchor = point.anchor;
+    }
+    Some(point)
+}
+
+fn frame_of<'a>(shape: &Shape<'a>) -> &'a nalgebra::UnitQuaternion<f64> {
+    shape.frame.rotation()
+}
+
+/// Gives a contact the force and the anchor of the step before.
+fn resume(
+    point: &mut Point,
+    memory: &Memory,
+    normal: &Vector3<f64>,
+    gap: f64,
+    anchor: Vector3<f64>,
+    size: f64,
+) {
+    point.before = memory.force;
+    point.turn(normal);
+    point.pushed = point.axes * memory.force;
+    point.force = point.pushed;
+    let dent = point.compliance * memory.force;
+    point.gap = gap + normal.dot(&dent);
+    point.anchor = anchor;
+    let way = point.anchor - (point.start + dent + point.carried);
+    let slipped = (way - normal * normal.dot(&way)).norm();
+    if slipped.is_nan() || slipped > SNAPPED * size {
+        point.anchor = point.start + dent + point.carried;
+    }
+}
+
+/// A site at a state, and the place of another body that it may touch.
+fn locate_at_body(
+    kernel: &Kernel,
+    site: &Site,
+    shape: &Shape<'_>,
+    frame: &Frame,
+    q: &[f64],
+    within: f64,
+) -> Option<(Located, Near)> {
+    let zero = Vector3::zeros();
+    let (center, tangent) = kernel.material(site, &site.outward, frame, q);
+    let facing = kernel.facing(site, frame, q);
+    // The center of the sphere of a round site, or its vertex.
+    let middle = center - frame.rotation() * (site.radius * site.outward);
+    let mut near = shape.look(&center, &facing, within)?;
+    let (mut point, mut toward) = (center, zero);
+    if site.radius > 0.0 {
+        toward = site.toward(&-(frame.rotation().inverse() * near.normal));
+        point = middle + frame.rotation() * (site.radius * toward);
+        near = shape.look(&point, &facing, within)?;
+    }
+    let found = SurfacePoint { distance: near.distance, normal: near.normal };
+    Some((Located { tangent, toward, center: frame.to_local(&middle), point, found }, near))
+}
+
+/// Adds points for the sites that touch at the end of the step. Returns whether it found any that
+/// penetrate, and the number of sites that were looked at.
+pub(super) fn detect<P: Member>(
+    group: &Group<'_, P>,
+    work: &mut Touching,
+    band: f64,
+) -> Result<(bool, usize), StepError> {
+    let (mut penetrates, mut candidates) = (false, 0);
+    for member in 0..group.who.len() {
+        let view = group.view(member);
+        let Some(sites) = view.sites() else { continue };
+        let travel = travel(&view, sites);
+        for index in 0..view.contacts.obstacles().len() {
+            detect_at_obstacle(
+                (member, &view, sites, travel),
+                index,
+                work,
+                band,
+                (&mut penetrates, &mut candidates),
+            )?;
+        }
+    }
+    for pair in group.pairs {
+        let [a, b] = pair.map(|member| member as usize);
+        // The body with the denser sites comes first, and the other adds what is missing.
+        let spacing = |member| group.view(member).sites().map_or(f64::INFINITY, |sites| sites.spacing);
+        let order = if spacing(b) < spacing(a) { [[b, a], [a, b]] } else { [[a, b], [b, a]] };
+        for members in order {
+            let views = members.map(|member| group.view(member));
+            let found = detect_at_body(members, &views, work, band, &mut candidates);
+            penetrates |= found;
+        }
+    }
+    Ok((penetrates, candidates))
+}
+
+/// Bound on the way of every site in the step, m, and on the displacements at its end.
+fn travel(view: &View<'_>, sites: &ContactSites) -> [f64; 2] {
+    let (before, now) = (&view.kernel.before, view.state);
+    let (from, to) = (&before.frame, &now.frame);
+    let turned = (from.rotation().inverse() * to.rotation()).angle();
+    let (bound, start) = (sites.bound(&now.q), sites.bound(&before.q));
+    let swing = 2.0 * (0.5 * turned.min(std::f64::consts::PI)).sin() * (sites.radius + bound.max(start));
+    let bent = sites.bound_of_way(&before.q, &now.q);
+    let way = (Vector3::from(to.center()) - Vector3::from(from.center())).norm();
+    [way + swing + bent, bound]
+}
+
+/// Marks the sites of a member that have a point with something.
+fn mark(work: &mut Touching, member: usize, other: Touched) -> u32 {
+    work.stamp = work.stamp.wrapping_add(1);
+    for point in work.points.iter().filter(|point| point.member == member && point.other == other) {
+        if let Some(mark) = work.marks.get_mut(point.site) {
+            *mark = work.stamp;
+        }
+    }
+    work.stamp
+}
+
+fn detect_at_obstacle(
+    (member, view, sites, [travel, bound]): (usize, &View<'_>, &ContactSites, [f64; 2]),
+    index: usize,
+    work: &mut Touching,
+    band: f64,
+    (penetrates, candidates): (&mut bool, &mut usize),
+) -> Result<(), StepError> {
+    let Some(obstacle) = view.contacts.obstacles().get(index).map(|obstacle| &**obstacle) else { return Ok(()) };
+    let kernel = view.kernel;
+    let (before, state) = (&kernel.before, view.state);
+    let (from, to) = (&before.frame, &state.frame);
+    if look(obstacle, &Vector3::from(to.center()))?.distance > sites.radius + bound + band + travel {
+        return Ok(());
+    }
+    let other = Touched::Obstacle(index);
+    let stamp = mark(work, member, other);
+    for (number, site) in sites.sites.iter().enumerate() {
+        if work.marks[number] == stamp {
+            continue;
+        }
+        let rough = look(obstacle, &to.to_world(site.center))?.distance - site.radius;
+        // Nearly all sites end here.
+        if rough > bound + band + travel {
+            continue;
+        }
+        // The warp never makes a displacement longer.
+        let moved = site.patch.rows().reduce(&state.q, false).norm();
+        if rough > moved + band + travel {
+            continue;
+        }
+        *candidates += 1;
+        let located = kernel.locate(site, obstacle, to, &state.q)?;
+        let (start, tangent) = kernel.material(site, &located.toward, from, &before.q);
+        let moved = located.point - start;
+        let mut found = located.found;
+        let mut hit = false;
+        if found.distance >= band {
+            // A site that moves far may have passed through the obstacle.
+            let begin = look(obstacle, &start)?;
+            if begin.distance >= moved.norm() || begin.distance <= 0.0 {
+                continue;
+            }
+            let Some(passed) = march(obstacle, &start, &moved, begin)? else { continue };
+            found = passed;
+            hit = true;
+        }
+        let mut point = Point::new(member, number, other, view.contacts.friction());
+        (point.first, point.last, point.start) = (located.toward, located.toward, start);
+        point.tangent = tangent;
+        point.carried = carried(obstacle, &located.point, kernel.h)?;
+        point.gap = look(obstacle, &(start + point.carried))?.distance;
+        let way = located.point - start - point.carried;
+        point.anchor = start + point.carried + share(point.gap, found.distance) * way;
+        if hit {
+            // The plane at the place where the site went in.
+            point.turn(&found.normal);
+            point.passed = true;
+        }
+        *penetrates |= found.distance < 0.0 || hit;
+        work.points.push(point);
+    }
+    Ok(())
+}
+
+fn detect_at_body(
+    [member, other]: [usize; 2],
+    [view, far]: &[View<'_>; 2],
+    work: &mut Touching,
+    band: f64,
+    candidates: &mut usize,
+) -> bool {
+    let (Some(sites), Some(far_sites)) = (view.sites(), far.sites()) else { return false };
+    let kernel = view.kernel;
+    let (before, state) = (&kernel.before, view.state);
+    let (from, to) = (&before.frame, &state.frame);
+    let [start, end] = [&far.kernel.before, far.state].map(|state| far.kernel.shape(far_sites, state));
+    let ([travel, bound], [far_travel, _]) = (self::travel(view, sites), self::travel(far, far_sites));
+    let reach = bound + end.bound + band + travel + far_travel;
+    let apart = (Vector3::from(to.center()) - Vector3::from(end.frame.center())).norm();
+    // Comparisons with no number are false, and such bodies do not touch.
+    if !(apart <= sites.radius + far_sites.radius + reach) {
+        return false;
+    }
+    let touched = Touched::Body(far.contacts.key);
+    let stamp = mark(work, member, touched);
+    let deep = DEEP * kernel.model.size().min(far.kernel.model.size());
+    let [low, high] = far.kernel.model.surface().bounds().map(|corner| Vector3::from(corner.map(f64::from)));
+    let bent = far_sites.bound_of_way(&far.kernel.before.q, &far.state.q)
+        + sites.bound_of_way(&before.q, &state.q);
+    let mut penetrates = false;
+    for (number, site) in sites.sites.iter().enumerate() {
+        if work.marks[number] == stamp {
+            continue;
+        }
+        let rest = site.rest(&site.outward);
+        let local = end.frame.to_local(&to.to_world(rest));
+        // The way relative to the other body.
+        let came = start.frame.to_local(&from.to_world(rest));
+        let way = (local - came).norm() + bent;
+        let over = (low - local).sup(&(local - high)).map(|x| x.max(0.0)).norm();
+        // Nearly all sites end here.
+        if over > bound + end.bound + band + way {
+            continue;
+        }
+        *candidates += 1;
+        let within = deep.max(band);
+        let found = locate_at_body(kernel, site, &end, to, &state.q, within);
+        let found = found.filter(|(_, near)| near.distance < band);
+        // A site that moves far may have passed through the other body.
+        let passed = found.is_none() && way > within;
+        let found = if passed { pass(kernel, site, [&start, &end], [before, state]) } else { found };
+        let Some((located, near)) = found else { continue };
+        let near_other = |point: &Point| {
+            point.member == other
+                && point.far.is_some_and(|far| far.member == member)
+                && (point.off[0] < 0.0 || point.pushed[0] > 0.0)
+                && (point.place - located.point).norm() < COVERED * sites.spacing.max(far_sites.spacing)
+        };
+        if work.points.iter().any(near_other) {
+            continue;
+        }
+        let (begun, tangent) = kernel.material(site, &(if site.radius > 0.0 { located.toward } else { site.outward }), from, &before.q);
+        let mut point = Point::new(member, number, touched, friction(view, far));
+        (point.first, point.last) = (located.toward, located.toward);
+        (point.start, point.tangent, point.place) = (begun, tangent, located.point);
+        let mut side = far_side(other, &near, &start);
+        side.passed = passed;
+        side.compliance = far_compliance(far, far_sites, &far.kernel.before, &side);
+        let ended = end.material(&near.place, &side.carriers).0;
+        point.gap = start.at(&near.place, &begun).distance;
+        let moved = (located.point - begun) - (ended - side.start);
+        side.anchor = begun + share(point.gap, near.distance) * moved;
+        side.middle = 0.5 * (begun + located.point);
+        point.far = Some(side);
+        // What later sites look at before the gaps are taken anew.
+        point.off[0] = near.distance;
+        penetrates |= near.distance < 0.0;
+        work.points.push(point);
+    }
+    penetrates
+}
+
+/// Follows the way of a site relative to another body, and returns where it went in.
+fn pass(
+    kernel: &Kernel,
+    site: &Site,
+    [start, end]: [&Shape<'_>; 2],
+    [before, state]: [&State; 2],
+) -> Option<(Located, Near)> {
+    let (from, _) = kernel.material(site, &site.outward, &before.frame, &before.q);
+    let (to, tangent) = kernel.material(site, &site.outward, &state.frame, &state.q);
+    let ways = [start.pull_back(&from), end.pull_back(&to)];
+    let facing = end.frame.rotation().inverse() * kernel.facing(site, &state.frame, &state.q);
+    let place = end.march(&ways[0], &ways[1], &facing)?;
+    let near = end.at(&place, &to);
+    let middle = to - state.frame.rotation() * (site.radius * site.outward);
+    let found = SurfacePoint { distance: near.distance, normal: near.normal };
+    let toward = if site.radius > 0.0 { site.outward } else { Vector3::zeros() };
+    let located = Located { tangent, toward, center: state.frame.to_local(&middle), point: to, found };
+    (near.distance < 0.0).then_some((located, near))
+}
+
+/// Takes the gaps of all points at the end of the computed step.
+pub(super) fn linearize<P: Member>(
+    group: &Group<'_, P>,
+    work: &mut Touching,
+    recovers: bool,
+) -> Result<(), StepError> {
+    for point in &mut work.points {
+        let view = group.view(point.member);
+        let Some(site) = view.sites().and_then(|sites| sites.sites.get(point.site)) else { continue };
+        let (kernel, state) = (view.kernel, view.state);
+        let mut size = kernel.model.size();
+        let own = kernel.site_compliance(site, &state.frame, &state.q);
+        let (located, distance) = match (point.other, &mut point.far) {
+            (Touched::Obstacle(index), _) => {
+                let Some(obstacle) = view.contacts.obstacles().get(index) else { continue };
+                let located = kernel.locate(site, &**obstacle, &state.frame, &state.q)?;
+                let (mut distance, mut normal) = (located.found.distance, located.found.normal);
+                if point.passed {
+                    // The site passed through: it is as far behind the place where it went in as it
+                    // went on.
+                    normal = point.axes.row(0).transpose();
+                    let way = located.point - point.start;
+                    let begin = look(&**obstacle, &point.start)?;
+                    let through = march(&**obstacle, &point.start, &way, begin)?;
+                    distance = through.map_or(distance, |found| found.distance);
+                }
+                point.compliance = own;
+                point.turn(&normal);
+                point.arm = located.point - Vector3::from(state.frame.center());
+                (located, distance)
+            }
+            (Touched::Body(_), Some(far)) => {
+                let other = group.view(far.member);
+                let Some(sites) = other.sites() else { continue };
+                size = size.min(other.kernel.model.size());
+                let (located, near) = follow(kernel, site, state, &other, sites, far, size);
+                far.compliance = far_compliance(&other, sites, other.state, far);
+                let middle = 0.25 * (point.start + located.point + far.start + far.end);
+                far.middle = middle;
+                point.carried = far.end - far.start;
+                point.anchor = far.anchor + point.carried;
+                point.compliance = own + far.compliance;
+                point.turn(&near.normal);
+                (located, near.distance)
+            }
+            (Touched::Body(_), None) => continue,
+        };
+        point.floor = floor(point.gap, RECOVERY_SPEED * size * group.h, recovers);
+        point.last = located.toward;
+        point.place = located.point;
+        point.end = state.frame.to_world(located.center + site.radius * point.first);
+        let offset = point.axes * (point.end - point.anchor);
+        point.off = Vector3::new(distance - point.floor, offset[1], offset[2]);
+        // The middle of the step gives the work of a force on a shape that bends. With the mean of
+        // every round the rounds of a soft body would not converge.
+        let start = point.tangent;
+        point.mean.get_or_insert_with(|| 0.5 * (start + located.tangent));
+    }
+    Ok(())
+}
+
+/// Finds a site of a contact with another body, and the place that it touches, after a step.
+fn follow(
+    kernel: &Kernel,
+    site: &Site,
+    state: &State,
+    other: &View<'_>,
+    sites: &ContactSites,
+    far: &mut Far,
+    size: f64,
+) -> (Located, Near) {
+    let end = other.kernel.shape(sites, other.state);
+    let start = other.kernel.shape(sites, &other.kernel.before);
+    let looked = (!far.passed).then(|| locate_at_body(kernel, site, &end, &state.frame, &state.q, DEEP * size));
+    let (located, near) = looked.flatten().unwrap_or_else(|| {
+        let (center, tangent) = kernel.material(site, &site.outward, &state.frame, &state.q);
+        let middle = center - state.frame.rotation() * (site.radius * site.outward);
+        let mut near = end.at(&far.place, &center);
+        let mut toward = Vector3::zeros();
+        let mut point = center;
+        if site.radius > 0.0 {
+            toward = site.toward(&-(state.frame.rotation().inverse() * near.normal));
+            point = middle + state.frame.rotation() * (site.radius * toward);
+            near = end.at(&far.place, &point);
+        }
+        if !far.passed {
+            // The site has left the faces of the other body.
+            near.distance = size;
+        }
+        let found = SurfacePoint { distance: near.distance, normal: near.normal };
+        let center = state.frame.to_local(&middle);
+        (Located { tangent, toward, center, point, found }, near)
+    });
+    far.place = near.place;
+    if far.mean.is_none() {
+        far.carriers = end.field.carriers(&near.place);
+    }
+    let carriers = end.field.carriers(&near.place);
+    let ((begun, _), (ended, _)) = (start.material(&near.place, &carriers), end.material(&near.place, &carriers));
+    (far.start, far.end) = (begun, ended);
+    if far.mean.is_none() {
+        let [(_, from), (_, to)] = [&start, &end].map(|shape| shape.material(&near.place, &far.carriers));
+        let mean: Tangent = 0.5 * (from + to);
+        far.mean = Some(mean);
+    }
+    (located, near)
+}
+
+/// Follows a way from outside until it enters the obstacle. Returns the distance of its end to the
+/// plane at that place, and the plane's normal.
+fn march(
+    obstacle: &dyn Obstacle,
+    start: &Vector3<f64>,
+    way: &Vector3<f64>,
+    begin: SurfacePoint,
+) -> Result<Option<SurfacePoint>, StepError> {
+    const STEPS: usize = 32;
+    let length = way.norm();
+    if length.is_nan() || length <= 0.0 || begin.distance <= 0.0 {
+        return Ok(None);
+    }
+    let mut gone = begin.distance;
+    for _ in 0..STEPS {
+        if gone >= length {
+            return Ok(None);
+        }
+        let found = look(obstacle, &(start + way * (gone / length)))?;
+        if found.distance <= 1e-3 * length {
+            let rest = (length - gone) / length * found.normal.dot(way);
+            return Ok((rest < 0.0).then_some(SurfacePoint { distance: found.distance + rest, ..found }));
+        }
+        gone += found.distance;
+    }
+    Ok(None)
+}
