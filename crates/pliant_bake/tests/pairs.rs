@@ -7,8 +7,8 @@ use nalgebra::Vector3;
 use pliant_bake::{BakeConfig, bake};
 use pliant_mesh::{TetMesh, shapes};
 use pliant_modal::{
-    Body, BodyConfig, Damping, Elasticity, Frame, GrabConfig, Islands, Material, ModalModel, Patch, Plane,
-    StepSettings, Together, Touched,
+    Body, BodyConfig, Damping, Elasticity, Frame, Islands, Material, ModalModel, Plane, StepSettings,
+    Together, Touched,
 };
 
 const GRAVITY: f64 = 9.81;
@@ -119,7 +119,7 @@ fn two_free_bodies_exchange_momentum_and_lose_none() {
                 exchanged[0],
                 exchanged[1]
             );
-            assert!(exchanged[0] > 0.2 * a.mass() * speed, "{name}: they met");
+            assert!(exchanged[0] > 0.05 * a.mass() * speed, "{name}: they met");
             assert!(worst[0] < 1e-6 * exchanged[0] && worst[1] < 1e-6 * exchanged[1], "{name}: {worst:?}");
         }
     }
@@ -177,7 +177,8 @@ fn equal_balls_head_on_exchange_their_velocities_in_the_time_of_hertz() {
 
 #[test]
 fn what_lies_on_an_anchored_body_presses_with_its_weight() {
-    let held = cube(1e5, |c| c.anchors = vec!["y<0.001".parse().unwrap()]);
+    let slab = shapes::bar([9, 3, 9], [0.3, 0.1, 0.3]).unwrap();
+    let held = model(&slab, 1e5, |c| c.anchors = vec!["y<0.001".parse().unwrap()]);
     for (name, top) in [
         ("ball", ball(1e5, |_| ())),
         ("cube", cube(1e5, |_| ())),
@@ -188,7 +189,7 @@ fn what_lies_on_an_anchored_body_presses_with_its_weight() {
         let height = 0.1 + top.center_of_mass()[1] - f64::from(low[1]) + 0.01;
         let mut bodies = [
             free(&held, 60.0, held.center_of_mass(), [0.0; 3]),
-            place(&top, 60.0, GRAVITY, [0.05, height, 0.05], LEVEL, [0.0; 3], [0.0; 3]),
+            place(&top, 60.0, GRAVITY, [0.15, height, 0.15], LEVEL, [0.0; 3], [0.0; 3]),
         ];
         run(&mut bodies, 5.0);
         let weight = top.mass() * GRAVITY;
@@ -241,5 +242,113 @@ fn a_stack_of_five_cubes_stands() {
             assert!(off < 1e-6 && crept < 1e-4, "{level}: {off} {crept}");
         }
         println!("    {:.1} us a step of all", wall * 1e6 / (65.0 * 60.0));
+    }
+}
+
+/// Bodies, speeds and ways to meet: no gain of energy, no panic, no explosion.
+#[test]
+fn no_contact_of_two_bodies_ever_adds_energy() {
+    let needle = model(&shapes::bar([2, 30, 2], [0.02, 0.3, 0.02]).unwrap(), 1e7, |c| c.modes = 12);
+    let bodies = [
+        ("cube", cube(1e5, |_| ())),
+        ("stiff cube", cube(1e8, |_| ())),
+        ("ball", ball(3e4, |_| ())),
+        ("needle", needle),
+        ("reduced", cube(1e5, soft)),
+    ];
+    for (name, a) in &bodies {
+        for (other, b) in &bodies {
+            for (rate, speed) in [(60.0, 1.0), (60.0, 50.0), (1000.0, 3.0)] {
+                let (one, two) = ([0.3, 0.1, 0.2, 0.9], [-0.1, 0.5, 0.2, 0.7]);
+                let mut pair = [
+                    place(a, rate, GRAVITY, [0.0, 0.2, 0.0], one, [0.3 * speed, 0.0, 0.0], [1.0, -2.0, 0.5]),
+                    place(b, rate, GRAVITY, [0.4, 0.25, 0.02], two, [-speed, 0.0, 0.0], [0.3, 2.0, -1.0]),
+                ];
+                for body in &mut pair {
+                    body.set_obstacles(vec![Arc::new(Plane::GROUND)]).unwrap();
+                }
+                let start = total(&pair);
+                let scale: f64 =
+                    pair.iter().map(|body| body.energy() + body.model().mass() * GRAVITY * 0.2).sum();
+                let mut islands = Islands::default();
+                let (mut gain, mut deep, mut met) = (f64::NEG_INFINITY, 0.0f64, false);
+                for _ in 0..rate as usize {
+                    step(&mut islands, &mut pair);
+                    gain = gain.max((total(&pair) - start) / scale);
+                    let contacts = pair[0].contacts();
+                    met |= contacts.contacts().iter().any(|c| matches!(c.other, Touched::Body(_)));
+                    deep = deep.max(contacts.report().penetration / a.size());
+                }
+                println!(
+                    "{name} and {other} at {speed} m/s, {rate} Hz: energy +{gain:.1e}, met {met}, penetration {deep:.1e}"
+                );
+                assert!(gain < 1e-9, "{name} and {other} at {speed} m/s, {rate} Hz: +{gain:.1e}");
+            }
+        }
+    }
+}
+
+#[test]
+fn bodies_thrown_at_each_other_do_not_pass_through() {
+    for (name, a, b) in [
+        ("cubes", cube(1e6, |_| ()), cube(1e6, |_| ())),
+        ("balls", ball(1e6, |_| ()), ball(1e6, |_| ())),
+        ("ball and cube", ball(1e6, |_| ()), cube(1e6, |_| ())),
+    ] {
+        let mut pair =
+            [free(&a, 60.0, [0.0; 3], [50.0, 0.0, 0.0]), free(&b, 60.0, [1.0, 0.01, 0.02], [-50.0, 0.0, 0.0])];
+        run(&mut pair, 0.2);
+        let [x, y] = [&pair[0], &pair[1]].map(|body| body.frame().center()[0]);
+        println!("{name}: at {x:.3} m and {y:.3} m, speeds {:?}", pair.map(|body| body.frame().velocity()[0]));
+        assert!(x < y, "{name}: {x} {y}");
+    }
+}
+
+#[test]
+fn bodies_at_one_place_far_away_or_without_a_number_do_no_harm() {
+    let model = cube(1e5, |_| ());
+    // At one place, and half inside each other.
+    for offset in [0.0, 1e-9, 0.02, 0.05] {
+        let mut pair = [0.0, offset].map(|x| free(&model, 60.0, [x, 0.0, 0.0], [0.0; 3]));
+        run(&mut pair, 2.0);
+        for body in &pair {
+            let speed = Vector3::from(body.frame().velocity()).norm();
+            println!("{offset} m apart: {:?}, {speed:.3} m/s", body.frame().center());
+            // Bodies are pushed apart at half their size a second.
+            assert!(speed < 0.2 && body.energy() < 1e-2, "{offset}: {speed} {}", body.energy());
+        }
+    }
+    let far = free(&model, 60.0, [1e120, 0.0, 0.0], [0.0; 3]);
+    let beside = free(&model, 60.0, [1e120, 0.05, 0.0], [0.0; 3]);
+    let fast = free(&model, 60.0, [0.3, 0.0, 0.0], [1e200, 0.0, 0.0]);
+    let still = free(&model, 60.0, [0.0; 3], [0.0; 3]);
+    let mut all = [still, far, beside, fast];
+    let mut islands = Islands::default();
+    for _ in 0..60 {
+        let mut group: Vec<Together<'_>> =
+            all.iter_mut().enumerate().map(|(key, body)| Together::new(key as u64, body)).collect();
+        islands.step(&mut group, |_, _| true);
+    }
+    assert!(all.iter().all(|body| body.state().is_finite()));
+    assert!(Vector3::from(all[0].frame().center()).norm() < 1e-3);
+}
+
+#[test]
+fn contacts_of_bodies_are_deterministic() {
+    let make = || {
+        let mut bodies = stack(1e5, 3, |_| ());
+        let mut state = bodies[2].state().clone();
+        let (turn, spin) = ([0.1, 0.2, 0.0, 0.9], [0.0, 1e-3, 0.0]);
+        state.frame =
+            Frame::from_motion(bodies[2].model(), [0.07, 0.4, 0.04], turn, [0.0; 3], spin).unwrap();
+        bodies[2].set_state(&state).unwrap();
+        bodies
+    };
+    let (mut a, mut b) = (make(), make());
+    run(&mut a, 1.0);
+    run(&mut b, 1.0);
+    for (a, b) in a.iter().zip(&b) {
+        assert_eq!(a.state(), b.state());
+        assert_eq!(a.contacts().contacts(), b.contacts().contacts());
     }
 }

@@ -189,14 +189,19 @@ impl<P: Member> Group<'_, P> {
         Ok(())
     }
 
-    /// Computes the steps of all members under the forces of the points.
-    fn advance(&mut self, work: &mut Touching, theta: f64) {
+    /// Sets the arms of the contacts between members, both to the same point.
+    fn set_arms(&self, work: &mut Touching, theta: f64) {
         for point in &mut work.points {
             if let Some(far) = &mut point.far {
                 point.arm = far.middle - self.view(point.member).kernel.pivot(theta);
                 far.arm = far.middle - self.view(far.member).kernel.pivot(theta);
             }
         }
+    }
+
+    /// Computes the steps of all members under the forces of the points.
+    fn advance(&mut self, work: &mut Touching, theta: f64) {
+        self.set_arms(work, theta);
         for member in 0..self.len() {
             let Parts { kernel, state, hands, load, contacts, report } = self.parts(member);
             state.clone_from(&kernel.before);
@@ -257,6 +262,7 @@ impl<P: Member> Group<'_, P> {
             if work.points.is_empty() || (report.residual <= enough && !new) || round > rounds {
                 return Ok(report);
             }
+            self.set_arms(work, weight);
             self.fill_rows(work);
             if theta.is_none() && recovers {
                 let ratio = work.rigid_share();

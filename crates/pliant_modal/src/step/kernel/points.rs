@@ -29,6 +29,9 @@ const DEEP: f64 = 0.1;
 /// distance between sites.
 const COVERED: f64 = 0.75;
 
+/// Difference of two distances that count as the same, as a share of the depth [`DEEP`].
+const SAME: f64 = 1e-3;
+
 fn carried(obstacle: &dyn Obstacle, point: &Vector3<f64>, h: f64) -> Result<Vector3<f64>, StepError> {
     let velocity = obstacle.velocity(point);
     crate::error::finite("velocity of an obstacle", velocity.as_slice())?;
@@ -157,6 +160,7 @@ fn begin_at_body(
     let mut side = far_side(other, &near, &shape);
     side.compliance = far_compliance(far, sites, &far.kernel.before, &side);
     side.middle = 0.5 * (located.point + side.start);
+    point.place = located.point;
     side.anchor = side.start + frame_of(&shape) * (memory.anchor - shape.field.rest(&near.place));
     point.compliance = kernel.site_compliance(site, frame, q) + side.compliance;
     let anchor = side.anchor;
@@ -394,7 +398,7 @@ fn detect_at_body(
         let near_other = |point: &Point| {
             point.member == other
                 && point.far.is_some_and(|far| far.member == member)
-                && (point.off[0] < 0.0 || point.pushed[0] > 0.0)
+                && (point.pushed[0] > 0.0 || point.off[0] <= near.distance.max(0.0) + SAME * deep)
                 && (point.place - located.point).norm() < COVERED * sites.spacing.max(far_sites.spacing)
         };
         if work.points.iter().any(near_other) {
@@ -411,7 +415,7 @@ fn detect_at_body(
         point.gap = start.at(&near.place, &begun).distance;
         let moved = (located.point - begun) - (ended - side.start);
         side.anchor = begun + share(point.gap, near.distance) * moved;
-        side.middle = 0.5 * (begun + located.point);
+        side.middle = begun;
         point.far = Some(side);
         // What later sites look at before the gaps are taken anew.
         point.off[0] = near.distance;
@@ -469,7 +473,9 @@ pub(super) fn linearize<P: Member>(
                 }
                 point.compliance = own;
                 point.turn(&normal);
-                point.arm = located.point - Vector3::from(state.frame.center());
+                if point.mean.is_none() {
+                    point.arm = located.point - Vector3::from(state.frame.center());
+                }
                 (located, distance)
             }
             (Touched::Body(_), Some(far)) => {
@@ -478,8 +484,6 @@ pub(super) fn linearize<P: Member>(
                 size = size.min(other.kernel.model.size());
                 let (located, near) = follow(kernel, site, state, &other, sites, far, size);
                 far.compliance = far_compliance(&other, sites, other.state, far);
-                let middle = 0.25 * (point.start + located.point + far.start + far.end);
-                far.middle = middle;
                 point.carried = far.end - far.start;
                 point.anchor = far.anchor + point.carried;
                 point.compliance = own + far.compliance;
@@ -494,8 +498,8 @@ pub(super) fn linearize<P: Member>(
         point.end = state.frame.to_world(located.center + site.radius * point.first);
         let offset = point.axes * (point.end - point.anchor);
         point.off = Vector3::new(distance - point.floor, offset[1], offset[2]);
-        // The middle of the step gives the work of a force on a shape that bends. With the mean of
-        // every round the rounds of a soft body would not converge.
+        // The middle of the step gives the work of a force on a shape that bends. With the mean and
+        // the arm of every round the rounds of a soft or heavily loaded body would not converge.
         let start = point.tangent;
         point.mean.get_or_insert_with(|| 0.5 * (start + located.tangent));
     }
@@ -542,6 +546,7 @@ fn follow(
     let ((begun, _), (ended, _)) = (start.material(&near.place, &carriers), end.material(&near.place, &carriers));
     (far.start, far.end) = (begun, ended);
     if far.mean.is_none() {
+        far.middle = 0.5 * (far.middle + 0.5 * (located.point + far.end));
         let [(_, from), (_, to)] = [&start, &end].map(|shape| shape.material(&near.place, &far.carriers));
         let mean: Tangent = 0.5 * (from + to);
         far.mean = Some(mean);
