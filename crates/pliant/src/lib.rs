@@ -63,7 +63,7 @@
 //! | `render` | yes | Bevy's renderer, which draws the bodies |
 //! | `window` | yes | the usual parts of a windowed game: winit on X11, user interface, text, PNG; leave it out to choose Bevy's features yourself |
 //! | `wayland` | no | native Wayland windows (building needs the Wayland client headers) |
-//! | `contact` | yes | obstacles that bodies touch |
+//! | `contact` | yes | obstacles that bodies touch, and bodies that touch each other |
 //! | `net` | yes | sessions over QUIC |
 //! | `haptics` | yes | haptic devices and the device loop |
 //! | `rerun` | yes | the client of the rerun viewer |
@@ -168,6 +168,7 @@ pub mod prelude {
     #[cfg(feature = "contact")]
     pub use crate::contact::{
         BodyContacts, BodyFriction, ContactEnded, ContactLayers, ContactPlugin, ContactStarted, Obstacle,
+        TouchBodies,
     };
     #[cfg(all(feature = "haptics", feature = "render"))]
     pub use crate::haptics::ForceArrow;

@@ -174,6 +174,8 @@ pub struct BodyState {
     pub(crate) resting: bool,
     /// Whether there is a new state to publish.
     pub(crate) stepped: bool,
+    /// Layers of the contact with other bodies, see [`BodyState::touch_bodies`].
+    pub(crate) layers: Option<[u32; 2]>,
 }
 
 /// The solver's record of a grab.
@@ -201,6 +203,7 @@ impl BodyState {
             quiet: 0.0,
             resting: false,
             stepped: false,
+            layers: None,
         }
     }
 
@@ -268,6 +271,24 @@ impl BodyState {
     pub fn wake(&mut self) {
         self.quiet = 0.0;
         self.resting = false;
+    }
+
+    /// Lets the body touch other bodies: those whose `[memberships, filters]` each have a bit of the
+    /// other's filters and memberships. Default: `None`, it touches no body.
+    ///
+    /// Two bodies touch only if their entities have the same scale. The contacts name a body by the
+    /// bits of its entity ([`Touched::Body`](pliant_modal::Touched::Body)). Bodies that touch come
+    /// to rest together, and wake together.
+    pub fn touch_bodies(&mut self, layers: Option<[u32; 2]>) {
+        if self.layers != layers {
+            self.layers = layers;
+            self.wake();
+        }
+    }
+
+    /// Layers of the contact with other bodies, see [`BodyState::touch_bodies`].
+    pub fn body_layers(&self) -> Option<[u32; 2]> {
+        self.layers
     }
 
     /// Returns the surface at modal coordinates `q`: one position per surface vertex, m, body axes.

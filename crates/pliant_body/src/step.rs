@@ -11,7 +11,7 @@ use bevy::{
     math::{DQuat, DVec3},
     prelude::*,
 };
-use pliant_modal::{Body, BodyConfig, GrabConfig, ModalModel, Patch, StepError};
+use pliant_modal::{Body, BodyConfig, GrabConfig, Islands, ModalModel, Patch, StepError, Together, Touched};
 
 use crate::{
     AWAKE_BODIES, BodyError, BodyRefused, BodyState, Driven, Grab, GrabForce, GrabOf, Grabs, ModalAsset,
@@ -286,44 +286,99 @@ pub(crate) fn step_bodies(
     time: Res<Time>,
     mut diagnostics: Diagnostics,
     mut refusals: Refusals,
+    mut islands: Local<Islands>,
     mut bodies: Query<(NameOrEntity, &ModalBody, &Driven, &mut BodyState)>,
 ) {
     let start = Instant::now();
     let step = time.delta_secs_f64();
-    let mut stepped = 0_usize;
+    let mut all: Vec<_> = Vec::new();
     for (name, body, driven, mut state) in &mut bodies {
+        // A resting body takes part only where others may wake it.
         let steps = *driven == Driven::Local && !state.resting;
         if state.stepped != steps {
             state.stepped = steps;
         }
-        if !steps {
+        if steps || (*driven == Driven::Local && state.layers.is_some()) {
+            all.push((name, body.rest_speed, state));
+        }
+    }
+    // In one order, so that the order of archetypes makes no difference.
+    all.sort_by_key(|(name, ..)| name.entity.to_bits());
+    if all.iter().all(|(.., state)| state.resting) {
+        all.clear();
+    }
+    let traits: Vec<_> = all.iter().map(|(.., state)| (state.layers, state.scale)).collect();
+    let mut together: Vec<Together<'_>> = Vec::with_capacity(all.len());
+    for (name, _, state) in &mut all {
+        let resting = state.resting;
+        // A resting body has not changed as long as nothing wakes it.
+        let body = &mut state.bypass_change_detection().body;
+        // The running configuration is the base, because the component's fields may have been
+        // refused.
+        let lengthened = match body.config() {
+            running if running.step == step => Ok(()),
+            running => body.reconfigure(BodyConfig { step, ..running.clone() }),
+        };
+        let mut member = Together::new(name.entity.to_bits(), body);
+        (member.resting, member.error) = (resting, lengthened.err());
+        together.push(member);
+    }
+    islands.step(&mut together, |a, b| {
+        let ((Some([memberships, filters]), scale), (Some(other), of_other)) = (traits[a], traits[b]) else {
+            return false;
+        };
+        scale == of_other && memberships & other[1] != 0 && other[0] & filters != 0
+    });
+    let results: Vec<_> = together.into_iter().map(|member| (member.resting, member.error)).collect();
+    let mut stepped = 0_usize;
+    for ((name, rest_speed, state), (resting, error)) in all.iter_mut().zip(results) {
+        if resting {
             continue;
         }
         stepped += 1;
-        let state = &mut *state;
-        // The running configuration is the base, because the component's fields may have been
-        // refused.
-        let lengthened = match state.body.config() {
-            running if running.step == step => Ok(()),
-            running => state.body.reconfigure(BodyConfig { step, ..running.clone() }),
-        };
-        match lengthened.and_then(|()| state.body.step()) {
-            Ok(_) => state.faulted = false,
-            Err(error) => {
+        // A body that was woken only because others are near may rest again at once.
+        (state.stepped, state.resting) = (true, false);
+        match error {
+            None => state.faulted = false,
+            Some(error) => {
                 if !state.faulted {
-                    refusals.report(&name, name.entity, BodyError::Step(error));
+                    refusals.report(name, name.entity, BodyError::Step(error));
                 }
                 state.faulted = true;
             }
         }
-        let slow = is_slow(&state.body, body.rest_speed);
+        let slow = is_slow(&state.body, *rest_speed);
         let left_alone = state.held.iter().all(|held| held.id.is_none());
         state.quiet = if slow && left_alone { state.quiet + step } else { 0.0 };
-        state.resting = state.quiet >= REST_AFTER;
     }
+    rest(&mut all);
     diagnostics.add_measurement(&AWAKE_BODIES, || stepped as f64);
     if stepped > 0 {
         diagnostics.add_measurement(&STEP_TIME, || start.elapsed().as_secs_f64() * 1e3);
+    }
+}
+
+/// Lets the bodies rest that have been slow for long enough, and that touch only such bodies.
+fn rest(all: &mut [(NameOrEntityItem<'_, '_>, f64, Mut<'_, BodyState>)]) {
+    let index = |bits: u64| all.binary_search_by_key(&bits, |(name, ..)| name.entity.to_bits()).ok();
+    let mut calm: Vec<bool> = all.iter().map(|(.., state)| state.quiet >= REST_AFTER).collect();
+    loop {
+        let stirred = |(.., state): &(NameOrEntityItem<'_, '_>, f64, Mut<'_, BodyState>)| {
+            state.body.contacts().contacts().iter().any(|contact| match contact.other {
+                Touched::Body(bits) => index(bits).is_some_and(|other| !calm[other]),
+                Touched::Obstacle(_) => false,
+            })
+        };
+        let next: Vec<bool> = all.iter().zip(&calm).map(|(body, calm)| *calm && !stirred(body)).collect();
+        if next == calm {
+            break;
+        }
+        calm = next;
+    }
+    for ((.., state), calm) in all.iter_mut().zip(calm) {
+        if calm && !state.resting {
+            state.resting = true;
+        }
     }
 }
 

@@ -1,4 +1,5 @@
-//! What bodies touch: the obstacles near each body, and the contacts of its last step.
+//! What bodies touch: the obstacles near each body, other bodies, and the contacts of its last
+//! step.
 
 use std::sync::Arc;
 
@@ -9,7 +10,8 @@ use pliant_modal as modal;
 
 use crate::obstacle::{ContactLayers, Motion};
 
-/// Coefficient of Coulomb friction between a body and all obstacles, 0 to 10.
+/// Coefficient of Coulomb friction between a body and all obstacles, 0 to 10. Between two bodies
+/// the coefficient is the geometric mean of both.
 ///
 /// A body without this component has the friction of [`BodyFriction::default`].
 #[derive(Component, Reflect, Debug, Clone, Copy, PartialEq)]
@@ -23,21 +25,29 @@ impl Default for BodyFriction {
     }
 }
 
-/// A place where a body touches an obstacle.
+/// Lets a body touch other bodies that have this component.
+///
+/// [`ContactLayers`] decide which of them. The entities of two bodies that touch must have the same
+/// scale. Bodies that other sources move ([`Driven::Remote`]) touch no bodies.
+#[derive(Component, Reflect, Debug, Clone, Copy, PartialEq, Eq, Default)]
+#[reflect(Component, Default, Debug, Clone, PartialEq)]
+pub struct TouchBodies;
+
+/// A place where a body touches an obstacle or another body.
 #[derive(Reflect, Debug, Clone, Copy, PartialEq)]
 #[reflect(Debug, Clone, PartialEq)]
 pub struct ContactPoint {
-    /// The entity of the [`Obstacle`](crate::Obstacle).
-    pub obstacle: Entity,
+    /// The entity of the [`Obstacle`](crate::Obstacle) or of the other body.
+    pub other: Entity,
     /// Surface vertex of the body at the center of the touching patch.
     pub vertex: u32,
     /// Position of the contact, m, world axes.
     pub point: DVec3,
-    /// Outward normal of the obstacle, world axes.
+    /// Outward normal of the obstacle or of the other body, world axes.
     pub normal: DVec3,
     /// Mean force on the body over the last step, N, world axes.
     pub force: DVec3,
-    /// Depth of the body's surface inside the obstacle, m.
+    /// Depth of the body's surface inside the other, m.
     pub penetration: f64,
     /// Whether the contact slides.
     pub sliding: bool,
@@ -54,41 +64,41 @@ impl BodyContacts {
         self.0.iter().map(|contact| contact.force).sum()
     }
 
-    /// Whether the body touches this obstacle.
-    pub fn touches(&self, obstacle: Entity) -> bool {
-        self.0.iter().any(|contact| contact.obstacle == obstacle)
+    /// Whether the body touches this obstacle or body.
+    pub fn touches(&self, other: Entity) -> bool {
+        self.0.iter().any(|contact| contact.other == other)
     }
 
-    /// The obstacles that the body touches, each once.
-    fn obstacles(&self) -> impl Iterator<Item = Entity> {
-        let seen = |index: usize, obstacle| self.0[..index].iter().any(|c| c.obstacle == obstacle);
+    /// What the body touches, each once.
+    fn others(&self) -> impl Iterator<Item = Entity> {
+        let seen = |index: usize, other| self.0[..index].iter().any(|c| c.other == other);
         let all = self.0.iter().enumerate();
-        all.filter(move |(index, c)| !seen(*index, c.obstacle)).map(|(_, contact)| contact.obstacle)
+        all.filter(move |(index, c)| !seen(*index, c.other)).map(|(_, contact)| contact.other)
     }
 }
 
-/// A body began to touch an obstacle. Observe it on the body's entity or on all.
+/// A body began to touch an obstacle or another body. Of two bodies each has such an event. Observe it on the body's entity or on all.
 #[derive(EntityEvent, Reflect, Debug, Clone, Copy, PartialEq)]
 pub struct ContactStarted {
     /// The entity of the body.
     pub entity: Entity,
-    /// The entity of the [`Obstacle`](crate::Obstacle).
-    pub obstacle: Entity,
+    /// The entity of the [`Obstacle`](crate::Obstacle) or of the other body.
+    pub other: Entity,
     /// Position of the contact with the largest force, m, world axes.
     pub point: DVec3,
-    /// Outward normal of the obstacle there, world axes.
+    /// Outward normal of the other there, world axes.
     pub normal: DVec3,
     /// Impulse on the body in the first step, N s, world axes, summed over all places.
     pub impulse: DVec3,
 }
 
-/// A body ceased to touch an obstacle. Observe it on the body's entity or on all.
+/// A body ceased to touch an obstacle or another body. Observe it on the body's entity or on all.
 #[derive(EntityEvent, Reflect, Debug, Clone, Copy, PartialEq, Eq)]
 pub struct ContactEnded {
     /// The entity of the body.
     pub entity: Entity,
-    /// The entity of the [`Obstacle`](crate::Obstacle).
-    pub obstacle: Entity,
+    /// The entity of the [`Obstacle`](crate::Obstacle) or of the other body.
+    pub other: Entity,
 }
 
 /// The obstacles that a body was given, at the indices that its solver knows.
@@ -217,6 +227,19 @@ pub(crate) fn place_obstacles(
     }
 }
 
+/// Tells the bodies which others they touch.
+pub(crate) fn touch_bodies(
+    mut bodies: Query<(&mut BodyState, &Driven, Has<TouchBodies>, Option<&ContactLayers>)>,
+) {
+    for (mut state, driven, touches, layers) in &mut bodies {
+        let ContactLayers { memberships, filters } = layers.copied().unwrap_or_default();
+        let wanted = (touches && *driven == Driven::Local).then_some([memberships, filters]);
+        if state.body_layers() != wanted {
+            state.touch_bodies(wanted);
+        }
+    }
+}
+
 /// Writes the contacts of each body and tells what began and what ended.
 pub(crate) fn publish(
     time: Res<Time>,
@@ -232,9 +255,12 @@ pub(crate) fn publish(
         let scale = state.scale();
         let world = |point: [f64; 3]| scale * DVec3::from(point);
         let of = |contact: &modal::Contact| {
-            let obstacle = nearby.slots.get(contact.obstacle).copied().flatten()?;
+            let other = match contact.other {
+                modal::Touched::Obstacle(index) => nearby.slots.get(index).copied().flatten()?,
+                modal::Touched::Body(bits) => Entity::try_from_bits(bits)?,
+            };
             Some(ContactPoint {
-                obstacle,
+                other,
                 vertex: contact.vertex,
                 point: world(contact.point),
                 normal: contact.normal.into(),
@@ -247,15 +273,15 @@ pub(crate) fn publish(
         if now == *contacts {
             continue;
         }
-        for obstacle in contacts.obstacles().filter(|&obstacle| !now.touches(obstacle)) {
-            commands.trigger(ContactEnded { entity, obstacle });
+        for other in contacts.others().filter(|&other| !now.touches(other)) {
+            commands.trigger(ContactEnded { entity, other });
         }
-        for obstacle in now.obstacles().filter(|&obstacle| !contacts.touches(obstacle)) {
-            let own = || now.0.iter().filter(|contact| contact.obstacle == obstacle);
+        for other in now.others().filter(|&other| !contacts.touches(other)) {
+            let own = || now.0.iter().filter(|contact| contact.other == other);
             let largest = own().max_by(|a, b| a.force.length().total_cmp(&b.force.length()));
             let Some(&ContactPoint { point, normal, .. }) = largest else { continue };
             let impulse = step * own().map(|contact| contact.force).sum::<DVec3>();
-            commands.trigger(ContactStarted { entity, obstacle, point, normal, impulse });
+            commands.trigger(ContactStarted { entity, other, point, normal, impulse });
         }
         *contacts = now;
     }

@@ -1,4 +1,5 @@
-//! The Bevy plugin for contact: soft bodies touch the floors, balls, boxes and capsules of a scene.
+//! The Bevy plugin for contact: soft bodies touch the floors, balls, boxes and capsules of a scene,
+//! and each other.
 //!
 //! ```no_run
 //! use bevy::prelude::*;
@@ -24,10 +25,11 @@
 //! | --- | --- |
 //! | [`Obstacle`] with a `Transform`: a rigid shape | [`BodyContacts`] on a body: where it touches, with forces |
 //! | [`BodyFriction`] on a body | [`ContactStarted`], [`ContactEnded`]: events on the body, for observers |
+//! | [`TouchBodies`] on bodies: they touch each other | |
 //! | [`ContactLayers`] on bodies and obstacles: who touches whom | [`BodyRefused`](pliant_body::BodyRefused): a refused obstacle |
 //!
-//! Obstacles push bodies, and bodies do not push obstacles. Bodies do not touch each other, and a
-//! body does not touch itself. A body that another source moves
+//! Obstacles push bodies, and bodies do not push obstacles. Bodies push each other. A body does not
+//! touch itself. A body that another source moves
 //! ([`Driven::Remote`](pliant_body::Driven::Remote)) touches nothing here.
 //!
 //! A body with no obstacle nearby has no contact work. The first obstacle that comes near chooses
@@ -48,10 +50,10 @@ use bevy::{
 };
 use pliant_body::PliantSystems;
 
-pub use contacts::{BodyContacts, BodyFriction, ContactEnded, ContactPoint, ContactStarted};
+pub use contacts::{BodyContacts, BodyFriction, ContactEnded, ContactPoint, ContactStarted, TouchBodies};
 pub use obstacle::{ContactLayers, Obstacle};
 
-/// Lets bodies touch the [`Obstacle`]s of the scene.
+/// Lets bodies touch the [`Obstacle`]s of the scene, and each other ([`TouchBodies`]).
 ///
 /// The plugin needs [`PliantBodyPlugin`](pliant_body::PliantBodyPlugin) in the same schedule.
 pub struct ContactPlugin {
@@ -77,6 +79,7 @@ impl Plugin for ContactPlugin {
         app.register_type::<Obstacle>()
             .register_type::<ContactLayers>()
             .register_type::<BodyFriction>()
+            .register_type::<TouchBodies>()
             .register_type::<BodyContacts>()
             .register_type::<ContactPoint>()
             .add_observer(contacts::prepare_body)
@@ -84,7 +87,7 @@ impl Plugin for ContactPlugin {
             .add_systems(
                 self.schedule,
                 (
-                    (obstacle::move_obstacles, contacts::place_obstacles)
+                    (obstacle::move_obstacles, contacts::place_obstacles, contacts::touch_bodies)
                         .chain()
                         .after(PliantSystems::Input)
                         .before(PliantSystems::Step)

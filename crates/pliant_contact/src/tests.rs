@@ -86,11 +86,11 @@ fn a_body_falls_on_a_floor_and_rests_there() {
     assert!((force - weight() * DVec3::Y).length() < 1e-3 * weight(), "{force} N for {} N", weight());
     let height = center(&app, body).y;
     assert!((height - 0.3 - 0.5 * EDGE).abs() < 0.02 * EDGE, "the center is at {height}");
-    assert!(contacts(&app, body).0.iter().all(|c| c.obstacle == floor && c.penetration < 2e-3 * EDGE));
+    assert!(contacts(&app, body).0.iter().all(|c| c.other == floor && c.penetration < 2e-3 * EDGE));
     assert!(state(&app, body).is_resting());
     let told = app.world().resource::<Told>();
     let first = told.started[0];
-    assert!((first.entity, first.obstacle, first.normal) == (body, floor, DVec3::Y));
+    assert!((first.entity, first.other, first.normal) == (body, floor, DVec3::Y));
     // It fell by 0.1 m, and no more than doubles its momentum in the first step of the contact.
     let momentum = CUBE.mass() * (2.0 * GRAVITY * 0.1).sqrt();
     assert!(first.impulse.y > 0.0 && first.impulse.y < 2.1 * momentum, "{}", first.impulse);
@@ -108,7 +108,7 @@ fn a_resting_body_falls_when_its_floor_goes() {
     seconds(&mut app, 0.5);
     let fallen = center(&app, body).y;
     assert!((fallen - 0.1 + 0.5 * GRAVITY * 0.25).abs() < 0.1, "{fallen}");
-    assert!(app.world().resource::<Told>().ended.iter().any(|ended| ended.obstacle == floor));
+    assert!(app.world().resource::<Told>().ended.iter().any(|ended| ended.other == floor));
     assert!(contacts(&app, body).0.is_empty());
 }
 

@@ -40,6 +40,7 @@ pub mod experiment;
 pub mod fill;
 mod machine;
 pub mod pair;
+pub mod pile;
 pub mod progress;
 pub mod pull;
 pub mod report;

@@ -16,15 +16,15 @@ pub struct Together<'a> {
     /// Name of the body, which no other has, and which stays from step to step:
     /// [`Touched::Body`](crate::Touched::Body) has it.
     pub key: u64,
-    /// Whether the body rests. A resting body is not stepped until a body that moves comes near,
-    /// and then [`Islands::step`] sets this to false.
+    /// Whether the body rests. A resting body is not stepped unless a body that moves is near it,
+    /// directly or through others. [`Islands::step`] then sets this to false.
     pub resting: bool,
     /// Set by a step: number of the body's island. Bodies with the same number may touch, directly
     /// or through others, and may come to rest only together.
     pub island: usize,
     /// Set by a step: what it reports.
     pub report: StepReport,
-    /// Set by a step: why it failed, if it did.
+    /// Set by a step that fails: why.
     pub error: Option<StepError>,
 }
 
@@ -127,6 +127,7 @@ pub struct Islands {
     order: Vec<usize>,
     local: Vec<u32>,
     members: Vec<[u32; 2]>,
+    moves: Vec<bool>,
 }
 
 impl Islands {
@@ -137,10 +138,10 @@ impl Islands {
     /// island are stepped as if they did not touch each other.
     pub fn step(&mut self, bodies: &mut [Together<'_>], may_touch: impl Fn(usize, usize) -> bool) {
         self.find_pairs(bodies, &may_touch);
-        self.wake(bodies);
         self.find_islands(bodies);
+        self.wake(bodies);
         for together in bodies.iter_mut().filter(|together| !together.resting) {
-            (together.report, together.error) = (StepReport::default(), None);
+            together.report = StepReport::default();
             together.body.contacts_mut().key = together.key;
             together.body.begin_step();
         }
@@ -159,10 +160,11 @@ impl Islands {
 
     fn step_island(&mut self, bodies: &mut [Together<'_>], begin: usize, end: usize) {
         let who = &self.order[begin..end];
+        if who.first().is_none_or(|&first| bodies[first].resting) {
+            return;
+        }
         if let [one] = who {
-            if !bodies[*one].resting {
-                bodies[*one].step_alone();
-            }
+            bodies[*one].step_alone();
             return;
         }
         self.members.clear();
@@ -191,8 +193,7 @@ impl Islands {
             let [_, end] = a.ends();
             for b in self.balls[number + 1..].iter().take_while(|b| b.ends()[0] <= end) {
                 let (i, j) = (a.index.min(b.index), a.index.max(b.index));
-                let rest = bodies[i].resting && bodies[j].resting;
-                if !rest && a.meets(b) && may_touch(i, j) {
+                if a.meets(b) && may_touch(i, j) {
                     self.pairs.push([i as u32, j as u32]);
                 }
             }
@@ -200,10 +201,16 @@ impl Islands {
         self.pairs.sort_unstable();
     }
 
-    /// Wakes the resting bodies near those that move.
+    /// Wakes the islands of which a member moves.
     fn wake(&mut self, bodies: &mut [Together<'_>]) {
-        for pair in &self.pairs {
-            pair.iter().for_each(|&index| bodies[index as usize].resting = false);
+        // The entry of each island's first body says whether one moves.
+        self.moves.clear();
+        self.moves.resize(bodies.len(), false);
+        for together in bodies.iter() {
+            self.moves[together.island] |= !together.resting;
+        }
+        for together in bodies.iter_mut() {
+            together.resting = !self.moves[together.island];
         }
     }
 

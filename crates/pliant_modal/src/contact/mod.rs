@@ -36,3 +36,4 @@ pub(crate) use point::{Far, Memory, Point};
 pub(crate) use shape::{Near, Shape};
 pub(crate) use sites::{ContactSites, Site};
 pub(crate) use solver::Touching;
+pub(crate) use surface_field::Place;

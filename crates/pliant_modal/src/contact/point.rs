@@ -17,6 +17,8 @@ pub(crate) struct Memory {
     pub(crate) anchor: Vector3<f64>,
     /// Direction from the site's center to its contact point, body axes.
     pub(crate) toward: Vector3<f64>,
+    /// The place of the other body.
+    pub(crate) place: Option<Place>,
 }
 
 /// The side of a contact at another body.

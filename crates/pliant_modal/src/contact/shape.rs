@@ -16,6 +16,10 @@ const ROUNDS: usize = 6;
 /// next.
 const SHELF: f64 = 0.01;
 
+/// Distance by which a contact may leave its triangle before it changes to another, as a share of
+/// the body's size. Without it a contact at a vertex would change its normal from step to step.
+const KEPT: f64 = 1e-4;
+
 /// A body at some coordinates.
 #[derive(Debug, Clone, Copy)]
 pub(crate) struct Shape<'a> {
@@ -107,11 +111,17 @@ impl Shape<'_> {
 
     /// The place of the surface that is nearest to a point (m, world axes), no farther than
     /// `within` (m), where the surface looks at `facing`, an outward normal of another body in
-    /// world axes.
+    /// world axes. `kept` is the place that it had before.
     ///
     /// The point is pulled back to the rest shape by the deformation of the triangle that is
     /// nearest there, and again until it stays.
-    pub(crate) fn look(&self, point: &Vector3<f64>, facing: &Vector3<f64>, within: f64) -> Option<Near> {
+    pub(crate) fn look(
+        &self,
+        point: &Vector3<f64>,
+        facing: &Vector3<f64>,
+        within: f64,
+        kept: Option<&Place>,
+    ) -> Option<Near> {
         let local = self.frame.to_local(point);
         let facing = self.turn().tr_mul(facing);
         // A body that hardly bends has no need of a search without direction.
@@ -119,7 +129,10 @@ impl Shape<'_> {
         let (mut x, mut wanted) = (local, stiff.then_some(facing));
         let mut reach = within + self.bound;
         for round in 0..ROUNDS {
-            let place = self.field.closest(&x, wanted.as_ref(), reach)?;
+            let mut place = self.field.closest(&x, wanted.as_ref(), reach)?;
+            if let (Some(kept), true) = (kept, wanted.is_some()) {
+                place = self.field.keep(kept, place, &x, KEPT * self.size);
+            }
             let (moved, gradient) = self.deformed(&place);
             let rest = self.field.rest(&place);
             let next = rest + gradient.try_inverse()? * (local - rest - moved);

@@ -222,6 +222,25 @@ impl SurfaceField {
         found
     }
 
+    /// The place of the triangle of `kept` nearest to a point (m, body axes), if it is farther away
+    /// than `found` by no more than `slack` (m).
+    pub(crate) fn keep(
+        &self,
+        kept: &Place,
+        found: Place,
+        point: &Vector3<f64>,
+        slack: f64,
+    ) -> Place {
+        if kept.facet == found.facet {
+            return found;
+        }
+        let Some(facet) = self.facets.get(kept.facet as usize) else { return found };
+        let weights = closest_on_triangle(facet.corners.map(|v| &self.vertices[v as usize]), point);
+        let place = Place { facet: kept.facet, weights };
+        let distance = |place: &Place| (point - self.rest(place)).norm();
+        if distance(&place) <= distance(&found) + slack { place } else { found }
+    }
+
     /// The corners of the triangle of a place, m, body axes.
     pub(crate) fn corners(&self, place: &Place) -> [&Vector3<f64>; 3] {
         self.facets[place.facet as usize].corners.map(|v| &self.vertices[v as usize])

@@ -334,7 +334,7 @@ impl<P: Member> Group<'_, P> {
         if !work.points.iter().any(|point| point.pushed[0] > 0.0) {
             return false;
         }
-        let (mut moving, mut gained, mut scale, mut lost) = (0.0, 0.0, 0.0, 0.0);
+        let (mut moving, mut gained, mut scale, mut lost, mut slow) = (0.0, 0.0, 0.0, 0.0, 0.0);
         let mut grounded = work.points.iter().any(|point| point.far.is_none() && point.pushed[0] > 0.0);
         for member in 0..self.len() {
             let View { kernel, state, hands, load, contacts } = self.view(member);
@@ -351,19 +351,28 @@ impl<P: Member> Group<'_, P> {
             scale += now + before;
             scale += kernel.elastic_energy(&state.q) + kernel.elastic_energy(&kernel.before.q);
             lost += contacts.lost;
+            slow += 0.5 * kernel.model.mass() * (points::RECOVERY_SPEED * kernel.model.size()).powi(2);
         }
+        let mut recovered = 0.0;
         for point in &work.points {
             let force = point.world_force();
             let (now, before) = (point.stored(&force), point.stored(&point.before));
             scale += now + before;
             gained += now - before;
             // What pushes a body out that was set into something.
-            gained -= point.pushed[0] * (point.floor - point.gap).max(0.0);
+            let out = point.pushed[0] * (point.floor - point.gap).max(0.0);
             if point.far.is_none() {
                 // What the obstacles supply.
-                gained -= force.dot(&point.carried);
+                gained -= force.dot(&point.carried) + out;
+            } else {
+                recovered += out;
             }
         }
+        // Between bodies it is what moves them at the speed of the recovery, and what they have
+        // lost before pays for it first.
+        let recovered = recovered.min(slow);
+        gained -= recovered;
+        lost -= recovered.min(lost).max(0.0);
         // A step may take back a little of what the steps before have lost: a rolling ball loses
         // and gains in turn, and would slow down if only the gains were taken.
         let allowed = lost.min(GIVEN_BACK * scale);
@@ -468,7 +477,9 @@ impl<P: Member> Group<'_, P> {
             contacts.list.push(contact);
         };
         let contacts = self.parts(point.member).contacts;
-        contacts.memory.push(Memory { other: point.other, site: point.site, force: *force, anchor, toward });
+        let place = point.far.map(|far| far.place);
+        let (other, site) = (point.other, point.site);
+        contacts.memory.push(Memory { other, site, force: *force, anchor, toward, place });
         add(contacts, contact, &own);
         if let Some(far) = &point.far {
             let opposite = Contact {

@@ -9,13 +9,13 @@ use super::{
 };
 use crate::{
     StepError,
-    contact::{ContactSites, Far, Memory, Near, Obstacle, Point, Shape, Site, SurfacePoint, Touched, Touching},
+    contact::{ContactSites, Far, Memory, Near, Obstacle, Place, Point, Shape, Site, SurfacePoint, Touched, Touching},
     step::{Frame, State, Tangent},
 };
 
 /// Share of a penetration that a step takes back, and the fastest way back, body sizes per second.
 const RECOVERED: f64 = 0.2;
-const RECOVERY_SPEED: f64 = 0.5;
+pub(super) const RECOVERY_SPEED: f64 = 0.5;
 
 /// Farthest distance of a site's surface from its anchor, as a share of the body's size. Beyond it
 /// the body was moved from elsewhere.
@@ -153,7 +153,7 @@ fn begin_at_body(
     let (frame, q) = (&kernel.before.frame, &kernel.before.q);
     let shape = far.kernel.shape(sites, &far.kernel.before);
     let size = kernel.model.size().min(far.kernel.model.size());
-    let (located, near) = locate_at_body(kernel, site, &shape, frame, q, DEEP * size)?;
+    let (located, near) = locate_at_body(kernel, site, &shape, (frame, q), DEEP * size, memory.place.as_ref())?;
     let mut point = Point::new(member, memory.site, memory.other, friction(view, far));
     (point.first, point.last) = (memory.toward, located.toward);
     (point.start, point.tangent) = kernel.material(site, &memory.toward, frame, q);
@@ -204,21 +204,21 @@ fn locate_at_body(
     kernel: &Kernel,
     site: &Site,
     shape: &Shape<'_>,
-    frame: &Frame,
-    q: &[f64],
+    (frame, q): (&Frame, &[f64]),
     within: f64,
+    kept: Option<&Place>,
 ) -> Option<(Located, Near)> {
     let zero = Vector3::zeros();
     let (center, tangent) = kernel.material(site, &site.outward, frame, q);
     let facing = kernel.facing(site, frame, q);
     // The center of the sphere of a round site, or its vertex.
     let middle = center - frame.rotation() * (site.radius * site.outward);
-    let mut near = shape.look(&center, &facing, within)?;
+    let mut near = shape.look(&center, &facing, within, kept)?;
     let (mut point, mut toward) = (center, zero);
     if site.radius > 0.0 {
         toward = site.toward(&-(frame.rotation().inverse() * near.normal));
         point = middle + frame.rotation() * (site.radius * toward);
-        near = shape.look(&point, &facing, within)?;
+        near = shape.look(&point, &facing, within, kept)?;
     }
     let found = SurfacePoint { distance: near.distance, normal: near.normal };
     Some((Located { tangent, toward, center: frame.to_local(&middle), point, found }, near))
@@ -389,7 +389,7 @@ fn detect_at_body(
         }
         *candidates += 1;
         let within = deep.max(band);
-        let found = locate_at_body(kernel, site, &end, to, &state.q, within);
+        let found = locate_at_body(kernel, site, &end, (to, &state.q), within, None);
         let found = found.filter(|(_, near)| near.distance < band);
         // A site that moves far may have passed through the other body.
         let passed = found.is_none() && way > within;
@@ -518,8 +518,9 @@ fn follow(
 ) -> (Located, Near) {
     let end = other.kernel.shape(sites, other.state);
     let start = other.kernel.shape(sites, &other.kernel.before);
-    let looked = (!far.passed).then(|| locate_at_body(kernel, site, &end, &state.frame, &state.q, DEEP * size));
-    let (located, near) = looked.flatten().unwrap_or_else(|| {
+    let at = (&state.frame, &state.q[..]);
+    let look = || locate_at_body(kernel, site, &end, at, DEEP * size, Some(&far.place));
+    let (located, near) = (!far.passed).then(look).flatten().unwrap_or_else(|| {
         let (center, tangent) = kernel.material(site, &site.outward, &state.frame, &state.q);
         let middle = center - state.frame.rotation() * (site.radius * site.outward);
         let mut near = end.at(&far.place, &center);
