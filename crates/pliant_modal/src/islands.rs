@@ -4,7 +4,7 @@ use nalgebra::Vector3;
 
 use crate::{
     Body, StepError, StepReport,
-    contact::Touching,
+    contact::{Sixes, Touching},
     step::group::{self, Member, Parts, View},
 };
 
@@ -119,6 +119,7 @@ impl Ball {
 #[derive(Debug, Clone, Default)]
 pub struct Islands {
     work: Touching,
+    sixes: Vec<[Sixes; 2]>,
     balls: Vec<Ball>,
     /// Pairs of bodies that are near each other, by index.
     pairs: Vec<[u32; 2]>,
@@ -137,6 +138,7 @@ impl Islands {
     /// A body whose step fails has the error as its [`Together::error`], and the bodies of its
     /// island are stepped as if they did not touch each other.
     pub fn step(&mut self, bodies: &mut [Together<'_>], may_touch: impl Fn(usize, usize) -> bool) {
+        self.work.begin_step();
         self.find_pairs(bodies, &may_touch);
         self.find_islands(bodies);
         self.wake(bodies);
@@ -168,13 +170,16 @@ impl Islands {
             return;
         }
         self.members.clear();
+        if self.sixes.len() < who.len() {
+            self.sixes.resize_with(who.len(), Default::default);
+        }
         for pair in &self.pairs {
             let local = pair.map(|index| self.local[index as usize]);
             if self.first[pair[0] as usize] == self.first[who[0]] {
                 self.members.push(local);
             }
         }
-        if group::step(bodies, who, &self.members, &mut self.work).is_ok() {
+        if group::step(bodies, who, &self.members, &mut self.sixes[..who.len()], &mut self.work).is_ok() {
             return;
         }
         for &index in who {

@@ -1,5 +1,7 @@
 //! A body in a certain state, as something that other bodies touch.
 
+use std::cell::Cell;
+
 use nalgebra::{Matrix3, Vector3};
 
 use super::{
@@ -20,9 +22,31 @@ const SHELF: f64 = 0.01;
 /// the body's size. Without it a contact at a vertex would change its normal from step to step.
 const KEPT: f64 = 1e-4;
 
+/// The six numbers of a body's sites at one state, as far as they were asked for.
+#[derive(Debug, Clone, Default)]
+pub(crate) struct Sixes {
+    stamp: Cell<u32>,
+    list: Vec<Cell<(u32, Six)>>,
+}
+
+impl Sixes {
+    /// Makes room for the sites of a body and forgets all.
+    pub(crate) fn prepare(&mut self, sites: usize) {
+        self.list.clear();
+        self.list.resize(sites, Cell::new((0, Six::zeros())));
+        self.stamp.set(1);
+    }
+
+    /// Forgets all.
+    pub(crate) fn forget(&self) {
+        self.stamp.set(self.stamp.get() + 1);
+    }
+}
+
 /// A body at some coordinates.
 #[derive(Debug, Clone, Copy)]
 pub(crate) struct Shape<'a> {
+    pub(crate) sixes: Option<&'a Sixes>,
     pub(crate) sites: &'a ContactSites,
     pub(crate) field: &'a SurfaceField,
     pub(crate) warps: bool,
@@ -52,10 +76,22 @@ impl Shape<'_> {
     }
 
     fn six(&self, carriers: impl Iterator<Item = (usize, f64)>) -> Six {
-        carriers.fold(Six::zeros(), |sum, (site, weight)| match self.sites.sites.get(site) {
-            Some(site) => sum + weight * site.patch.rows().reduce(self.q, self.warps),
-            None => sum,
-        })
+        carriers.fold(Six::zeros(), |sum, (site, weight)| sum + weight * self.six_of(site))
+    }
+
+    fn six_of(&self, index: usize) -> Six {
+        let known = self.sixes.and_then(|sixes| Some((sixes.stamp.get(), sixes.list.get(index)?)));
+        if let Some((stamp, cell)) = known
+            && cell.get().0 == stamp
+        {
+            return cell.get().1;
+        }
+        let site = self.sites.sites.get(index);
+        let six = site.map_or_else(Six::zeros, |site| site.patch.rows().reduce(self.q, self.warps));
+        if let Some((stamp, cell)) = known {
+            cell.set((stamp, six));
+        }
+        six
     }
 
     /// Position of a place's material, m, and its derivative by the six numbers, world axes.
@@ -111,7 +147,8 @@ impl Shape<'_> {
 
     /// The place of the surface that is nearest to a point (m, world axes), no farther than
     /// `within` (m), where the surface looks at `facing`, an outward normal of another body in
-    /// world axes. `kept` is the place that it had before.
+    /// world axes. `kept` is the place that it had before. Without such a place the error is a
+    /// distance that the point is away at least, m.
     ///
     /// The point is pulled back to the rest shape by the deformation of the triangle that is
     /// nearest there, and again until it stays.
@@ -121,7 +158,7 @@ impl Shape<'_> {
         facing: &Vector3<f64>,
         within: f64,
         kept: Option<&Place>,
-    ) -> Option<Near> {
+    ) -> Result<Near, f64> {
         let local = self.frame.to_local(point);
         let facing = self.turn().tr_mul(facing);
         // A body that hardly bends has no need of a search without direction.
@@ -129,13 +166,13 @@ impl Shape<'_> {
         let (mut x, mut wanted) = (local, stiff.then_some(facing));
         let mut reach = within + self.bound;
         for round in 0..ROUNDS {
-            let mut place = self.field.closest(&x, wanted.as_ref(), reach)?;
+            let mut place = self.field.closest(&x, wanted.as_ref(), reach).ok_or(within)?;
             if let (Some(kept), true) = (kept, wanted.is_some()) {
                 place = self.field.keep(kept, place, &x, KEPT * self.size);
             }
             let (moved, gradient) = self.deformed(&place);
             let rest = self.field.rest(&place);
-            let next = rest + gradient.try_inverse()? * (local - rest - moved);
+            let next = rest + gradient.try_inverse().ok_or(0.0)? * (local - rest - moved);
             let still = (next - x).norm() <= 1e-6 * self.size;
             if wanted.is_some() && (still || round + 1 == ROUNDS) {
                 let near = self.near(&place, &moved, &gradient, point);
@@ -143,13 +180,13 @@ impl Shape<'_> {
                 let across = (way - near.normal * near.normal.dot(&way)).norm();
                 // Beyond the edge of all faces that look this way.
                 let shelf = SHELF * self.size + 0.5 * near.distance.abs();
-                return (across <= shelf).then_some(near);
+                return if across <= shelf { Ok(near) } else { Err(across - shelf) };
             }
             x = next;
             wanted = gradient.tr_mul(&facing).try_normalize(1e-9);
             reach = 2.0 * within + 0.01 * self.size;
         }
-        None
+        Err(0.0)
     }
 
     /// A point (m, world axes) pulled back to the rest shape, m, body axes.

@@ -24,6 +24,20 @@ pub(crate) struct Side {
     pub(crate) rows: usize,
 }
 
+/// How far the sites of one body are away from another body at least, so that most of them need not
+/// be looked at.
+#[derive(Debug, Clone, Default)]
+pub(crate) struct Clearance {
+    /// Keys of both bodies, and the marks of the states in which the step before left them.
+    pair: [u64; 2],
+    left: [u64; 2],
+    used: bool,
+    /// Bound on the relative way of the sites in the step so far, m.
+    pub(crate) way: f64,
+    /// Distance of each site at the beginning of the step at least, m.
+    pub(crate) sites: Vec<f64>,
+}
+
 /// Workspace of the contacts of a group of bodies in a step.
 #[derive(Debug, Clone, Default)]
 pub(crate) struct Touching {
@@ -39,13 +53,19 @@ pub(crate) struct Touching {
     pub(crate) held: Vec<f64>,
     /// Sum of `rows^T` times the changes of the forces.
     sum: Vec<f64>,
-    /// The matrix of the direct solve by rows, and its right side.
+    /// The matrix of the direct solve by rows, its right side, and the unknowns of each point.
     full: Vec<f64>,
     right: Vec<f64>,
+    unknowns: Vec<Span>,
+    /// Responses of all points to forces at all points, by rows, where they are few.
+    responses: Vec<f64>,
     /// Marks of the sites that have a point with the current obstacle or body.
     pub(crate) marks: Vec<u32>,
     pub(crate) stamp: u32,
     pub(crate) sweeps: usize,
+    /// Clearances of pairs, sorted by their keys, and unused ones.
+    pub(crate) clear: Vec<Clearance>,
+    spare: Vec<Clearance>,
 }
 
 impl Touching {
@@ -74,7 +94,55 @@ impl Touching {
         reserve(&mut self.sum, width);
         reserve(&mut self.right, width);
         reserve(&mut self.full, width * width);
+        reserve(&mut self.unknowns, points);
+        reserve(&mut self.responses, width * width);
         reserve(&mut self.marks, sites);
+    }
+
+    /// Begins a step of all islands: clearances are those at its beginning.
+    pub(crate) fn begin_step(&mut self) {
+        let mut index = 0;
+        while index < self.clear.len() {
+            let clear = &mut self.clear[index];
+            if std::mem::take(&mut clear.used) {
+                let way = std::mem::take(&mut clear.way);
+                clear.sites.iter_mut().for_each(|away| *away -= way);
+                index += 1;
+            } else {
+                // A pair that is no longer near.
+                let unused = self.clear.remove(index);
+                self.spare.push(unused);
+            }
+        }
+    }
+
+    /// The clearances of the sites of the first body from the second, as an index. `pair` has the
+    /// keys of both, and `begun` the marks of their states at the beginning of the step.
+    pub(crate) fn clearance(&mut self, pair: [u64; 2], begun: [u64; 2], sites: usize) -> usize {
+        let index = match self.clear.binary_search_by_key(&pair, |clear| clear.pair) {
+            Ok(index) => index,
+            Err(index) => {
+                let fresh = self.spare.pop().unwrap_or_default();
+                self.clear.insert(index, Clearance { pair, sites: fresh.sites, ..Clearance::default() });
+                self.clear[index].sites.clear();
+                index
+            }
+        };
+        let clear = &mut self.clear[index];
+        // A body that was set from elsewhere may be anywhere.
+        if !clear.used && clear.left != begun || clear.sites.len() != sites {
+            clear.sites.clear();
+            clear.sites.resize(sites, f64::NEG_INFINITY);
+        }
+        clear.used = true;
+        index
+    }
+
+    /// Keeps the marks of the states in which a step leaves two bodies.
+    pub(crate) fn leave(&mut self, pair: [u64; 2], left: [u64; 2]) {
+        if let Ok(index) = self.clear.binary_search_by_key(&pair, |clear| clear.pair) {
+            self.clear[index].left = left;
+        }
     }
 
     /// Lays out the coordinates of all bodies. `widths` has the number of each.
@@ -152,7 +220,11 @@ impl Touching {
             point.force = point.pushed;
         }
         self.sum_changes();
-        let mut direct = self.couple();
+        let few = 3 * self.points.len() <= self.width();
+        if few {
+            self.fill_responses();
+        }
+        let mut direct = few || self.couple();
         let mut last = f64::INFINITY;
         for turn in 0..Self::TURNS {
             let mut change = 0.0;
@@ -169,7 +241,11 @@ impl Touching {
             }
             last = change;
             if direct && turn + 1 < Self::TURNS {
-                self.solve_directly();
+                if few {
+                    self.solve_for_forces();
+                } else {
+                    self.solve_directly();
+                }
             }
         }
     }
@@ -298,7 +374,7 @@ impl Touching {
             }
         }
         (0..width).for_each(|i| self.full[i * width + i] += 1.0);
-        if !self.eliminate() {
+        if !eliminate(&mut self.full, &mut self.right, &self.spans) {
             return;
         }
         for (point, sides) in self.points.iter_mut().zip(&self.sides) {
@@ -319,35 +395,120 @@ impl Touching {
         self.sum_changes();
     }
 
-    /// Replaces the right side by the solution, by Gaussian elimination within the envelope of the
-    /// matrix. The matrix is the identity and what contacts add, so it needs no exchange of rows.
-    /// Returns whether the solution is finite.
-    fn eliminate(&mut self) -> bool {
-        let width = self.width();
-        let (m, x) = (&mut self.full, &mut self.right);
-        for span in &self.spans {
-            for j in span.start..span.start + span.width {
-                let (above, below) = m.split_at_mut((j + 1) * width);
-                let pivot = &above[j * width + j..j * width + span.reach];
-                let Some((&head, tail)) = pivot.split_first() else { continue };
-                for (i, row) in (j + 1..span.reach).zip(below.chunks_exact_mut(width)) {
-                    let factor = row[j] / head;
-                    if factor != 0.0 {
-                        row[j + 1..span.reach].iter_mut().zip(tail).for_each(|(a, b)| *a -= factor * b);
-                        x[i] -= factor * x[j];
+    /// Computes the responses of all points to forces at all points.
+    fn fill_responses(&mut self) {
+        let n = 3 * self.points.len();
+        self.responses.clear();
+        self.responses.resize(n * n, 0.0);
+        for (i, a) in self.sides.iter().enumerate() {
+            for (j, b) in self.sides[..=i].iter().enumerate() {
+                for side in a.iter().flatten() {
+                    let Some(other) = b.iter().flatten().find(|other| other.member == side.member) else {
+                        continue;
+                    };
+                    let width = self.spans[side.member].width;
+                    for x in 0..3 {
+                        let row = &self.rows[side.rows + x * width..][..width];
+                        for y in 0..3 {
+                            let response = dot(row, &self.rows[other.rows + y * width..][..width]);
+                            self.responses[(3 * i + x) * n + 3 * j + y] += response;
+                            if i != j {
+                                self.responses[(3 * j + y) * n + 3 * i + x] += response;
+                            }
+                        }
                     }
                 }
             }
         }
-        for span in self.spans.iter().rev() {
-            for j in (span.start..span.start + span.width).rev() {
-                let row = &m[j * width..j * width + span.reach];
-                let sum: f64 = row[j + 1..].iter().zip(&x[j + 1..]).map(|(a, b)| a * b).sum();
-                x[j] = (x[j] - sum) / row[j];
+    }
+
+    /// As [`Touching::solve_directly`], with the forces as the unknowns: three of a point that
+    /// sticks, one of a point that slides. It is faster where the forces are fewer than the
+    /// coordinates.
+    fn solve_for_forces(&mut self) {
+        let n = 3 * self.points.len();
+        self.unknowns.clear();
+        let mut end = 0;
+        for point in &mut self.points {
+            let along = point.force / point.force[0];
+            if point.status == Status::Slip && !along.iter().all(|x| x.is_finite()) {
+                point.status = Status::Open;
+            }
+            let width = match point.status {
+                Status::Open => 0,
+                Status::Stick => 3,
+                Status::Slip => 1,
+            };
+            self.unknowns.push(Span { start: end, width, reach: 0 });
+            end += width;
+        }
+        self.full.clear();
+        self.full.resize(end * end, 0.0);
+        self.right.clear();
+        self.right.resize(end, 0.0);
+        for (i, (a, of_a)) in self.points.iter().zip(&self.unknowns).enumerate() {
+            for x in 0..of_a.width {
+                let row = &self.responses[(3 * i + x) * n..][..n];
+                let mut right = -a.off[x];
+                for (j, (b, of_b)) in self.points.iter().zip(&self.unknowns).enumerate() {
+                    let mut response = Vector3::new(row[3 * j], row[3 * j + 1], row[3 * j + 2]);
+                    right += response.dot(&b.pushed);
+                    if i == j {
+                        response += a.local.row(x).transpose();
+                    }
+                    let out = &mut self.full[(of_a.start + x) * end + of_b.start..][..of_b.width];
+                    match b.status {
+                        Status::Open => {}
+                        Status::Stick => out.copy_from_slice(response.as_slice()),
+                        Status::Slip => out.fill(response.dot(&(b.force / b.force[0]))),
+                    }
+                }
+                self.right[of_a.start + x] = right;
             }
         }
-        x.iter().all(|x| x.is_finite())
+        let all = [Span { start: 0, width: end, reach: end }];
+        if !eliminate(&mut self.full, &mut self.right, &all) {
+            return;
+        }
+        for (point, of) in self.points.iter_mut().zip(&self.unknowns) {
+            let force = match (point.status, &self.right[of.start..of.start + of.width]) {
+                (Status::Stick, &[x, y, z]) => Vector3::new(x, y, z),
+                (Status::Slip, &[n]) => point.force * (n / point.force[0]),
+                _ => continue,
+            };
+            point.force = if force[0] > 0.0 { force } else { Vector3::zeros() };
+        }
+        self.sum_changes();
     }
+}
+
+/// Replaces the right side by the solution, by Gaussian elimination within the envelope of the
+/// matrix. The matrix is positive definite but for friction, so it needs no exchange of rows.
+/// Returns whether the solution is finite.
+fn eliminate(m: &mut [f64], x: &mut [f64], spans: &[Span]) -> bool {
+    let width = x.len();
+    for span in spans {
+        for j in span.start..span.start + span.width {
+            let (above, below) = m.split_at_mut((j + 1) * width);
+            let pivot = &above[j * width + j..j * width + span.reach];
+            let Some((&head, tail)) = pivot.split_first() else { continue };
+            for (i, row) in (j + 1..span.reach).zip(below.chunks_exact_mut(width)) {
+                let factor = row[j] / head;
+                if factor != 0.0 {
+                    row[j + 1..span.reach].iter_mut().zip(tail).for_each(|(a, b)| *a -= factor * b);
+                    x[i] -= factor * x[j];
+                }
+            }
+        }
+    }
+    for span in spans.iter().rev() {
+        for j in (span.start..span.start + span.width).rev() {
+            let row = &m[j * width..j * width + span.reach];
+            let sum: f64 = row[j + 1..].iter().zip(&x[j + 1..]).map(|(a, b)| a * b).sum();
+            x[j] = (x[j] - sum) / row[j];
+        }
+    }
+    x.iter().all(|x| x.is_finite())
 }
 
 /// Adds the rows of one side times a force to the coordinates of all.

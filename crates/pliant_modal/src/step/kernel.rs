@@ -448,7 +448,7 @@ impl Kernel {
         let mut work = std::mem::take(&mut contacts.touching);
         let mut report = StepReport::default();
         let mut alone = [Alone(Parts { kernel: self, state, hands, load: *load, contacts, report: &mut report })];
-        let stepped = group::step(&mut alone, &[0], &[], &mut work);
+        let stepped = group::step(&mut alone, &[0], &[], &mut [], &mut work);
         contacts.touching = work;
         if let Err(StepError::Diverged { .. }) = stepped {
             contacts.forget();

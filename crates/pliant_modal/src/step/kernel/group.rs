@@ -13,7 +13,7 @@ use super::{
 };
 use crate::{
     StepError,
-    contact::{Contact, ContactReport, ContactSites, Contacts, Memory, Point, Touched, Touching},
+    contact::{Contact, ContactReport, ContactSites, Contacts, Memory, Point, Shape, Sixes, Touched, Touching},
     step::{Frame, Hand, Load, State, StepReport},
 };
 
@@ -78,6 +78,9 @@ pub(super) struct Group<'a, P> {
     pub(super) who: &'a [usize],
     /// Pairs of members that may touch.
     pub(super) pairs: &'a [[u32; 2]],
+    /// The six numbers of the sites of each member, at the beginning and at the end of the step.
+    /// Empty for a body alone.
+    pub(super) sixes: &'a mut [[Sixes; 2]],
     /// Size of the smallest member, m.
     pub(super) size: f64,
     pub(super) h: f64,
@@ -93,9 +96,10 @@ pub(crate) fn step<P: Member>(
     all: &mut [P],
     who: &[usize],
     pairs: &[[u32; 2]],
+    sixes: &mut [[Sixes; 2]],
     work: &mut Touching,
 ) -> Result<(), StepError> {
-    let mut group = Group { all, who, pairs, size: f64::INFINITY, h: 0.0 };
+    let mut group = Group { all, who, pairs, sixes, size: f64::INFINITY, h: 0.0 };
     for member in 0..who.len() {
         let parts = group.parts(member);
         parts.kernel.before.clone_from(parts.state);
@@ -133,6 +137,15 @@ impl<P: Member> Group<'_, P> {
         self.who.len()
     }
 
+    /// A member at the beginning and at the end of the step, as something that others touch.
+    pub(super) fn shapes(&self, member: usize) -> Option<[Shape<'_>; 2]> {
+        let view = self.view(member);
+        let sites = view.sites()?;
+        let [before, now] = self.sixes.get(member).map_or([None; 2], |sixes| sixes.each_ref().map(Some));
+        let kernel = view.kernel;
+        Some([kernel.shape(sites, &kernel.before, before), kernel.shape(sites, view.state, now)])
+    }
+
     /// Checks that the result is finite.
     fn check(&self) -> Result<(), StepError> {
         for member in 0..self.len() {
@@ -162,7 +175,11 @@ impl<P: Member> Group<'_, P> {
             if contacts.places.is_none() || contacts.modes != kernel.modes.count() {
                 kernel.prepare_contacts(contacts)?;
             }
-            most_sites = most_sites.max(contacts.sites());
+            let sites = contacts.sites();
+            most_sites = most_sites.max(sites);
+            if let Some(sixes) = self.sixes.get_mut(member) {
+                sixes.iter_mut().for_each(|sixes| sixes.prepare(sites));
+            }
         }
         work.marks.clear();
         work.marks.resize(most_sites, 0);
@@ -202,6 +219,7 @@ impl<P: Member> Group<'_, P> {
     /// Computes the steps of all members under the forces of the points.
     fn advance(&mut self, work: &mut Touching, theta: f64) {
         self.set_arms(work, theta);
+        self.sixes.iter().for_each(|[_, end]| end.forget());
         for member in 0..self.len() {
             let Parts { kernel, state, hands, load, contacts, report } = self.parts(member);
             state.clone_from(&kernel.before);
@@ -407,6 +425,12 @@ impl<P: Member> Group<'_, P> {
 
     /// Stores what the next step needs and what users read.
     fn end(&mut self, work: &mut Touching, theta: f64, report: &ContactReport) {
+        for &[a, b] in self.pairs {
+            let [a, b] = [a, b].map(|member| self.view(member as usize));
+            let (keys, marks) = ([a.contacts.key, b.contacts.key], [a.state.mark(), b.state.mark()]);
+            work.leave(keys, marks);
+            work.leave([keys[1], keys[0]], [marks[1], marks[0]]);
+        }
         for member in 0..self.len() {
             let contacts = self.parts(member).contacts;
             contacts.memory.clear();

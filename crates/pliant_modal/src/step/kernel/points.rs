@@ -113,7 +113,8 @@ pub(super) fn begin<P: Member>(group: &Group<'_, P>, work: &mut Touching) -> Res
                 Touched::Body(key) => {
                     let Some(other) = find(group, key) else { continue };
                     let far = group.view(other);
-                    work.points.extend(begin_at_body([member, other], [&view, &far], memory, site));
+                    let Some([shape, _]) = group.shapes(other) else { continue };
+                    work.points.extend(begin_at_body([member, other], [&view, &far], &shape, memory, site));
                 }
             }
         }
@@ -146,22 +147,22 @@ fn begin_at_obstacle(
 fn begin_at_body(
     [member, other]: [usize; 2],
     [view, far]: [&View<'_>; 2],
+    shape: &Shape<'_>,
     memory: &Memory,
     site: &Site,
 ) -> Option<Point> {
     let (kernel, sites) = (view.kernel, far.sites()?);
     let (frame, q) = (&kernel.before.frame, &kernel.before.q);
-    let shape = far.kernel.shape(sites, &far.kernel.before);
     let size = kernel.model.size().min(far.kernel.model.size());
-    let (located, near) = locate_at_body(kernel, site, &shape, (frame, q), DEEP * size, memory.place.as_ref())?;
+    let (located, near) = locate_at_body(kernel, site, shape, (frame, q), DEEP * size, memory.place.as_ref()).ok()?;
     let mut point = Point::new(member, memory.site, memory.other, friction(view, far));
     (point.first, point.last) = (memory.toward, located.toward);
     (point.start, point.tangent) = kernel.material(site, &memory.toward, frame, q);
-    let mut side = far_side(other, &near, &shape);
+    let mut side = far_side(other, &near, shape);
     side.compliance = far_compliance(far, sites, &far.kernel.before, &side);
     side.middle = 0.5 * (located.point + side.start);
     point.place = located.point;
-    side.anchor = side.start + frame_of(&shape) * (memory.anchor - shape.field.rest(&near.place));
+    side.anchor = side.start + shape.frame.rotation() * (memory.anchor - shape.field.rest(&near.place));
     point.compliance = kernel.site_compliance(site, frame, q) + side.compliance;
     let anchor = side.anchor;
     point.far = Some(side);
@@ -170,10 +171,6 @@ fn begin_at_body(
         far.anchor = point.anchor;
     }
     Some(point)
-}
-
-fn frame_of<'a>(shape: &Shape<'a>) -> &'a nalgebra::UnitQuaternion<f64> {
-    shape.frame.rotation()
 }
 
 /// Gives a contact the force and the anchor of the step before.
@@ -207,7 +204,7 @@ fn locate_at_body(
     (frame, q): (&Frame, &[f64]),
     within: f64,
     kept: Option<&Place>,
-) -> Option<(Located, Near)> {
+) -> Result<(Located, Near), f64> {
     let zero = Vector3::zeros();
     let (center, tangent) = kernel.material(site, &site.outward, frame, q);
     let facing = kernel.facing(site, frame, q);
@@ -221,7 +218,7 @@ fn locate_at_body(
         near = shape.look(&point, &facing, within, kept)?;
     }
     let found = SurfacePoint { distance: near.distance, normal: near.normal };
-    Some((Located { tangent, toward, center: frame.to_local(&middle), point, found }, near))
+    Ok((Located { tangent, toward, center: frame.to_local(&middle), point, found }, near))
 }
 
 /// Adds points for the sites that touch at the end of the step. Returns whether it found any that
@@ -253,7 +250,8 @@ pub(super) fn detect<P: Member>(
         let order = if spacing(b) < spacing(a) { [[b, a], [a, b]] } else { [[a, b], [b, a]] };
         for members in order {
             let views = members.map(|member| group.view(member));
-            let found = detect_at_body(members, &views, work, band, &mut candidates);
+            let Some(shapes) = group.shapes(members[1]) else { continue };
+            let found = detect_at_body(members, &views, &shapes, work, band, &mut candidates);
             penetrates |= found;
         }
     }
@@ -350,6 +348,7 @@ fn detect_at_obstacle(
 fn detect_at_body(
     [member, other]: [usize; 2],
     [view, far]: &[View<'_>; 2],
+    [start, end]: &[Shape<'_>; 2],
     work: &mut Touching,
     band: f64,
     candidates: &mut usize,
@@ -358,7 +357,6 @@ fn detect_at_body(
     let kernel = view.kernel;
     let (before, state) = (&kernel.before, view.state);
     let (from, to) = (&before.frame, &state.frame);
-    let [start, end] = [&far.kernel.before, far.state].map(|state| far.kernel.shape(far_sites, state));
     let ([travel, bound], [far_travel, _]) = (self::travel(view, sites), self::travel(far, far_sites));
     let reach = bound + end.bound + band + travel + far_travel;
     let apart = (Vector3::from(to.center()) - Vector3::from(end.frame.center())).norm();
@@ -373,8 +371,15 @@ fn detect_at_body(
     let bent = far_sites.bound_of_way(&far.kernel.before.q, &far.state.q)
         + sites.bound_of_way(&before.q, &state.q);
     let mut penetrates = false;
+    // How far a site moves at most relative to the other body in this step.
+    let moved = relative_way([from, to], [start.frame, end.frame], sites.radius + bound) + bent;
+    let pair = [view.contacts.key, far.contacts.key];
+    let begun = [before.mark(), far.kernel.before.mark()];
+    let clear = work.clearance(pair, begun, sites.sites.len());
+    work.clear[clear].way = moved;
     for (number, site) in sites.sites.iter().enumerate() {
-        if work.marks[number] == stamp {
+        // Nearly all sites end here.
+        if work.marks[number] == stamp || work.clear[clear].sites[number] > band + moved {
             continue;
         }
         let rest = site.rest(&site.outward);
@@ -383,17 +388,21 @@ fn detect_at_body(
         let came = start.frame.to_local(&from.to_world(rest));
         let way = (local - came).norm() + bent;
         let over = (low - local).sup(&(local - high)).map(|x| x.max(0.0)).norm();
-        // Nearly all sites end here.
-        if over > bound + end.bound + band + way {
+        let away = over - (bound + end.bound);
+        if away > band + way {
+            work.clear[clear].sites[number] = away - moved;
             continue;
         }
         *candidates += 1;
         let within = deep.max(band);
-        let found = locate_at_body(kernel, site, &end, (to, &state.q), within, None);
-        let found = found.filter(|(_, near)| near.distance < band);
-        // A site that moves far may have passed through the other body.
-        let passed = found.is_none() && way > within;
-        let found = if passed { pass(kernel, site, [&start, &end], [before, state]) } else { found };
+        let found = locate_at_body(kernel, site, end, (to, &state.q), within, None);
+        let distance = found.as_ref().map_or_else(|away| *away, |(_, near)| near.distance);
+        work.clear[clear].sites[number] = distance - moved;
+        let found = found.ok().filter(|(_, near)| near.distance < band);
+        // A site that moves far may have passed through the other body. Where that one bends far,
+        // its own sites do.
+        let passed = found.is_none() && (local - came).norm() > within;
+        let found = if passed { pass(kernel, site, [start, end], [before, state]) } else { found };
         let Some((located, near)) = found else { continue };
         let near_other = |point: &Point| {
             point.member == other
@@ -408,7 +417,7 @@ fn detect_at_body(
         let mut point = Point::new(member, number, touched, friction(view, far));
         (point.first, point.last) = (located.toward, located.toward);
         (point.start, point.tangent, point.place) = (begun, tangent, located.point);
-        let mut side = far_side(other, &near, &start);
+        let mut side = far_side(other, &near, start);
         side.passed = passed;
         side.compliance = far_compliance(far, far_sites, &far.kernel.before, &side);
         let ended = end.material(&near.place, &side.carriers).0;
@@ -423,6 +432,17 @@ fn detect_at_body(
         work.points.push(point);
     }
     penetrates
+}
+
+/// Bound on the way of the points within a radius of the center of one frame relative to another
+/// frame, m.
+fn relative_way(own: [&Frame; 2], other: [&Frame; 2], radius: f64) -> f64 {
+    let [from, to] = [0, 1].map(|k| {
+        let turn = other[k].rotation().inverse();
+        (other[k].to_local(&Vector3::from(own[k].center())), turn * own[k].rotation())
+    });
+    let turned = from.1.angle_to(&to.1).min(std::f64::consts::PI);
+    (to.0 - from.0).norm() + 2.0 * (0.5 * turned).sin() * radius
 }
 
 /// Follows the way of a site relative to another body, and returns where it went in.
@@ -482,7 +502,8 @@ pub(super) fn linearize<P: Member>(
                 let other = group.view(far.member);
                 let Some(sites) = other.sites() else { continue };
                 size = size.min(other.kernel.model.size());
-                let (located, near) = follow(kernel, site, state, &other, sites, far, size);
+                let Some(shapes) = group.shapes(far.member) else { continue };
+                let (located, near) = follow(kernel, site, state, &shapes, far, size);
                 far.compliance = far_compliance(&other, sites, other.state, far);
                 point.carried = far.end - far.start;
                 point.anchor = far.anchor + point.carried;
@@ -511,16 +532,13 @@ fn follow(
     kernel: &Kernel,
     site: &Site,
     state: &State,
-    other: &View<'_>,
-    sites: &ContactSites,
+    [start, end]: &[Shape<'_>; 2],
     far: &mut Far,
     size: f64,
 ) -> (Located, Near) {
-    let end = other.kernel.shape(sites, other.state);
-    let start = other.kernel.shape(sites, &other.kernel.before);
     let at = (&state.frame, &state.q[..]);
-    let look = || locate_at_body(kernel, site, &end, at, DEEP * size, Some(&far.place));
-    let (located, near) = (!far.passed).then(look).flatten().unwrap_or_else(|| {
+    let look = || locate_at_body(kernel, site, end, at, DEEP * size, Some(&far.place));
+    let (located, near) = (!far.passed).then(look).and_then(Result::ok).unwrap_or_else(|| {
         let (center, tangent) = kernel.material(site, &site.outward, &state.frame, &state.q);
         let middle = center - state.frame.rotation() * (site.radius * site.outward);
         let mut near = end.at(&far.place, &center);
@@ -548,7 +566,7 @@ fn follow(
     (far.start, far.end) = (begun, ended);
     if far.mean.is_none() {
         far.middle = 0.5 * (far.middle + 0.5 * (located.point + far.end));
-        let [(_, from), (_, to)] = [&start, &end].map(|shape| shape.material(&near.place, &far.carriers));
+        let [(_, from), (_, to)] = [start, end].map(|shape| shape.material(&near.place, &far.carriers));
         let mean: Tangent = 0.5 * (from + to);
         far.mean = Some(mean);
     }

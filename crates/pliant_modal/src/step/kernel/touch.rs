@@ -10,7 +10,7 @@ use nalgebra::{Matrix3, Vector3};
 use super::Kernel;
 use crate::{
     ModalModel, StepError,
-    contact::{ContactSites, Contacts, Obstacle, Shape, Site, SurfacePoint},
+    contact::{ContactSites, Contacts, Obstacle, Shape, Site, Sixes, SurfacePoint},
     simd::dot,
     step::{Frame, Hand, Six, State, Tangent, tangent},
 };
@@ -168,8 +168,14 @@ impl Kernel {
 
 
     /// The body at a state, as something that other bodies touch.
-    pub(super) fn shape<'a>(&'a self, sites: &'a ContactSites, state: &'a State) -> Shape<'a> {
+    pub(super) fn shape<'a>(
+        &'a self,
+        sites: &'a ContactSites,
+        state: &'a State,
+        sixes: Option<&'a Sixes>,
+    ) -> Shape<'a> {
         Shape {
+            sixes,
             sites,
             field: sites.field(&self.model),
             warps: self.warps(),
