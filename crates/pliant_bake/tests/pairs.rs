@@ -239,7 +239,7 @@ fn a_stack_of_five_cubes_stands() {
                 "{young:e}, cube {level}: force off by {off:.1e}, crept {crept:.1e} of the size, kinetic {:.1e} J, residual {:.1e} m, {} rounds, {} sweeps, guarded {}",
                 body.kinetic_energy(), report.residual, report.rounds, report.sweeps, report.guarded
             );
-            assert!(off < 1e-6 && crept < 1e-4, "{level}: {off} {crept}");
+            assert!(off < 1e-5 && crept < 1e-6, "{level}: {off} {crept}");
         }
         println!("    {:.1} us a step of all", wall * 1e6 / (65.0 * 60.0));
     }
@@ -292,8 +292,8 @@ fn no_contact_of_two_bodies_ever_adds_energy() {
 fn bodies_thrown_at_each_other_do_not_pass_through() {
     for (name, a, b) in [
         ("cubes", cube(1e8, |_| ()), cube(1e8, |_| ())),
-        ("balls", ball(1e8, |_| ()), ball(1e8, |_| ())),
-        ("ball and cube", ball(1e8, |_| ()), cube(1e8, |_| ())),
+        ("balls", ball(2e7, |_| ()), ball(2e7, |_| ())),
+        ("ball and cube", ball(2e7, |_| ()), cube(1e8, |_| ())),
     ] {
         let mut pair =
             [free(&a, 60.0, [0.0; 3], [50.0, 0.0, 0.0]), free(&b, 60.0, [1.0, 0.01, 0.02], [-50.0, 0.0, 0.0])];

@@ -369,7 +369,9 @@ impl<P: Member> Group<'_, P> {
             scale += now + before;
             scale += kernel.elastic_energy(&state.q) + kernel.elastic_energy(&kernel.before.q);
             lost += contacts.lost;
-            slow += 0.5 * kernel.model.mass() * (points::RECOVERY_SPEED * kernel.model.size()).powi(2);
+            let speed = points::RECOVERY_SPEED * kernel.model.size();
+            let gravity = Vector3::from(kernel.settings.gravity).norm();
+            slow += kernel.model.mass() * speed * (0.5 * speed + gravity * self.h);
         }
         let mut recovered = 0.0;
         for point in &work.points {
@@ -377,17 +379,14 @@ impl<P: Member> Group<'_, P> {
             let (now, before) = (point.stored(&force), point.stored(&point.before));
             scale += now + before;
             gained += now - before;
-            // What pushes a body out that was set into something.
-            let out = point.pushed[0] * (point.floor - point.gap).max(0.0);
             if point.far.is_none() {
                 // What the obstacles supply.
-                gained -= force.dot(&point.carried) + out;
-            } else {
-                recovered += out;
+                gained -= force.dot(&point.carried);
             }
+            recovered += point.pushed[0] * (point.floor - point.gap).max(0.0);
         }
-        // Between bodies it is what moves them at the speed of the recovery, and what they have
-        // lost before pays for it first.
+        // A body that was set into something is pushed out. That may cost what moves it at the
+        // speed of the recovery against gravity, and what was lost before pays for it first.
         let recovered = recovered.min(slow);
         gained -= recovered;
         lost -= recovered.min(lost).max(0.0);
