@@ -35,5 +35,5 @@ pub use obstacle::{Capsule, Cuboid, Moving, Obstacle, Plane, Sphere, SurfacePoin
 pub(crate) use point::{Far, Memory, Point};
 pub(crate) use shape::{Near, Shape, Sixes};
 pub(crate) use sites::{ContactSites, Site};
-pub(crate) use solver::Touching;
+pub(crate) use solver::{Clearance, Touching};
 pub(crate) use surface_field::Place;

@@ -6,7 +6,7 @@ use super::{
     cone::{self, Status},
     point::Point,
 };
-use crate::simd::dot;
+use crate::{simd::dot, step::State};
 
 /// The coordinates of one body in the vector of all: its modes and six for its frame.
 #[derive(Debug, Clone, Copy, Default)]
@@ -28,13 +28,12 @@ pub(crate) struct Side {
 /// be looked at.
 #[derive(Debug, Clone, Default)]
 pub(crate) struct Clearance {
-    /// Keys of both bodies, and the marks of the states in which the step before left them.
+    /// Keys of both bodies.
     pair: [u64; 2],
-    left: [u64; 2],
     used: bool,
-    /// Bound on the relative way of the sites in the step so far, m.
-    pub(crate) way: f64,
-    /// Distance of each site at the beginning of the step at least, m.
+    /// The states at which the distances hold.
+    pub(crate) states: [State; 2],
+    /// Distance of each site at least, m. Empty if none is known.
     pub(crate) sites: Vec<f64>,
 }
 
@@ -99,50 +98,34 @@ impl Touching {
         reserve(&mut self.marks, sites);
     }
 
-    /// Begins a step of all islands: clearances are those at its beginning.
+    /// Begins a step of all islands: forgets the clearances of pairs that were not near each other
+    /// in the step before.
     pub(crate) fn begin_step(&mut self) {
         let mut index = 0;
         while index < self.clear.len() {
-            let clear = &mut self.clear[index];
-            if std::mem::take(&mut clear.used) {
-                let way = std::mem::take(&mut clear.way);
-                clear.sites.iter_mut().for_each(|away| *away -= way);
+            if std::mem::take(&mut self.clear[index].used) {
                 index += 1;
             } else {
-                // A pair that is no longer near.
-                let unused = self.clear.remove(index);
+                let mut unused = self.clear.remove(index);
+                unused.sites.clear();
                 self.spare.push(unused);
             }
         }
     }
 
     /// The clearances of the sites of the first body from the second, as an index. `pair` has the
-    /// keys of both, and `begun` the marks of their states at the beginning of the step.
-    pub(crate) fn clearance(&mut self, pair: [u64; 2], begun: [u64; 2], sites: usize) -> usize {
+    /// keys of both.
+    pub(crate) fn clearance(&mut self, pair: [u64; 2]) -> usize {
         let index = match self.clear.binary_search_by_key(&pair, |clear| clear.pair) {
             Ok(index) => index,
             Err(index) => {
                 let fresh = self.spare.pop().unwrap_or_default();
-                self.clear.insert(index, Clearance { pair, sites: fresh.sites, ..Clearance::default() });
-                self.clear[index].sites.clear();
+                self.clear.insert(index, Clearance { pair, ..fresh });
                 index
             }
         };
-        let clear = &mut self.clear[index];
-        // A body that was set from elsewhere may be anywhere.
-        if !clear.used && clear.left != begun || clear.sites.len() != sites {
-            clear.sites.clear();
-            clear.sites.resize(sites, f64::NEG_INFINITY);
-        }
-        clear.used = true;
+        self.clear[index].used = true;
         index
-    }
-
-    /// Keeps the marks of the states in which a step leaves two bodies.
-    pub(crate) fn leave(&mut self, pair: [u64; 2], left: [u64; 2]) {
-        if let Ok(index) = self.clear.binary_search_by_key(&pair, |clear| clear.pair) {
-            self.clear[index].left = left;
-        }
     }
 
     /// Lays out the coordinates of all bodies. `widths` has the number of each.

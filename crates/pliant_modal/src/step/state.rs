@@ -56,13 +56,6 @@ impl State {
         modes.chain(rigid).all(|x| x.abs() <= Self::MOST)
     }
 
-    /// A number that other shapes and poses do not have (FNV-1a of their bits).
-    pub(crate) fn mark(&self) -> u64 {
-        let pose = self.frame.center().into_iter().chain(self.frame.orientation());
-        let numbers = self.q.iter().copied().chain(pose);
-        numbers.fold(0xcbf2_9ce4_8422_2325, |mark, x| (mark ^ x.to_bits()).wrapping_mul(0x0100_0000_01b3))
-    }
-
     /// Sets the body to rest, undeformed, at the pose of its frame. The frame returns to the origin
     /// if its position is beyond the limit.
     pub(crate) fn stop(&mut self) {

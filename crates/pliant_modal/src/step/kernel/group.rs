@@ -424,12 +424,6 @@ impl<P: Member> Group<'_, P> {
 
     /// Stores what the next step needs and what users read.
     fn end(&mut self, work: &mut Touching, theta: f64, report: &ContactReport) {
-        for &[a, b] in self.pairs {
-            let [a, b] = [a, b].map(|member| self.view(member as usize));
-            let (keys, marks) = ([a.contacts.key, b.contacts.key], [a.state.mark(), b.state.mark()]);
-            work.leave(keys, marks);
-            work.leave([keys[1], keys[0]], [marks[1], marks[0]]);
-        }
         for member in 0..self.len() {
             let contacts = self.parts(member).contacts;
             contacts.memory.clear();

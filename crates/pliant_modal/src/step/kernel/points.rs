@@ -9,7 +9,7 @@ use super::{
 };
 use crate::{
     StepError,
-    contact::{ContactSites, Far, Memory, Near, Obstacle, Place, Point, Shape, Site, SurfacePoint, Touched, Touching},
+    contact::{Clearance, ContactSites, Far, Memory, Near, Obstacle, Place, Point, Shape, Site, SurfacePoint, Touched, Touching},
     step::{Frame, State, Tangent},
 };
 
@@ -371,15 +371,11 @@ fn detect_at_body(
     let bent = far_sites.bound_of_way(&far.kernel.before.q, &far.state.q)
         + sites.bound_of_way(&before.q, &state.q);
     let mut penetrates = false;
-    // How far a site moves at most relative to the other body in this step.
-    let moved = relative_way([from, to], [start.frame, end.frame], sites.radius + bound) + bent;
-    let pair = [view.contacts.key, far.contacts.key];
-    let begun = [before.mark(), far.kernel.before.mark()];
-    let clear = work.clearance(pair, begun, sites.sites.len());
-    work.clear[clear].way = moved;
+    let clear = work.clearance([view.contacts.key, far.contacts.key]);
+    take_way(&mut work.clear[clear], sites, far_sites, [state, far.state], bound);
     for (number, site) in sites.sites.iter().enumerate() {
         // Nearly all sites end here.
-        if work.marks[number] == stamp || work.clear[clear].sites[number] > band + moved {
+        if work.marks[number] == stamp || work.clear[clear].sites[number] > band {
             continue;
         }
         let rest = site.rest(&site.outward);
@@ -390,18 +386,19 @@ fn detect_at_body(
         let over = (low - local).sup(&(local - high)).map(|x| x.max(0.0)).norm();
         let away = over - (bound + end.bound);
         if away > band + way {
-            work.clear[clear].sites[number] = away - moved;
+            work.clear[clear].sites[number] = away - way;
             continue;
         }
         *candidates += 1;
         let within = deep.max(band);
         let found = locate_at_body(kernel, site, end, (to, &state.q), within, None);
         let distance = found.as_ref().map_or_else(|away| *away, |(_, near)| near.distance);
-        work.clear[clear].sites[number] = distance - moved;
+        work.clear[clear].sites[number] = distance;
         let found = found.ok().filter(|(_, near)| near.distance < band);
         // A site that moves far may have passed through the other body. Where that one bends far,
-        // its own sites do.
-        let passed = found.is_none() && (local - came).norm() > within;
+        // its own sites do. Forces only make ways shorter.
+        let fast = band > 0.0 && (local - came).norm() > within;
+        let passed = found.is_none() && fast;
         let found = if passed { pass(kernel, site, [start, end], [before, state]) } else { found };
         let Some((located, near)) = found else { continue };
         let near_other = |point: &Point| {
@@ -445,6 +442,33 @@ fn relative_way(own: [&Frame; 2], other: [&Frame; 2], radius: f64) -> f64 {
     (to.0 - from.0).norm() + 2.0 * (0.5 * turned).sin() * radius
 }
 
+/// Takes the relative way of two bodies since the last look from their clearances.
+fn take_way(
+    clear: &mut Clearance,
+    sites: &ContactSites,
+    far_sites: &ContactSites,
+    now: [&State; 2],
+    bound: f64,
+) {
+    let count = sites.sites.len();
+    let [own, far] = &clear.states;
+    let known = clear.sites.len() == count && own.q.len() == now[0].q.len() && far.q.len() == now[1].q.len();
+    if known {
+        let before = sites.bound(&own.q);
+        let frames = [[&own.frame, &now[0].frame], [&far.frame, &now[1].frame]];
+        let way = relative_way(frames[0], frames[1], sites.radius + bound.max(before))
+            + sites.bound_of_way(&own.q, &now[0].q)
+            + far_sites.bound_of_way(&far.q, &now[1].q);
+        // A way that is no number leaves no clearance.
+        let way = if way.is_nan() { f64::INFINITY } else { way };
+        clear.sites.iter_mut().for_each(|away| *away -= way);
+    } else {
+        clear.sites.clear();
+        clear.sites.resize(count, f64::NEG_INFINITY);
+    }
+    clear.states.iter_mut().zip(now).for_each(|(state, now)| state.clone_from(now));
+}
+
 /// Follows the way of a site relative to another body, and returns where it went in.
 fn pass(
     kernel: &Kernel,
@@ -454,8 +478,15 @@ fn pass(
 ) -> Option<(Located, Near)> {
     let (from, _) = kernel.material(site, &site.outward, &before.frame, &before.q);
     let (to, tangent) = kernel.material(site, &site.outward, &state.frame, &state.q);
-    let ways = [start.pull_back(&from), end.pull_back(&to)];
     let facing = end.frame.rotation().inverse() * kernel.facing(site, &state.frame, &state.q);
+    let (came, went) = (start.frame.to_local(&from), end.frame.to_local(&to));
+    let half = 0.5 * (went - came);
+    // A site behind its body meets nothing.
+    if half.dot(&facing) <= 0.0 {
+        return None;
+    }
+    end.field.closest(&(came + half), None, half.norm() + start.bound + end.bound)?;
+    let ways = [start.pull_back(&from), end.pull_back(&to)];
     let place = end.march(&ways[0], &ways[1], &facing)?;
     let near = end.at(&place, &to);
     let middle = to - state.frame.rotation() * (site.radius * site.outward);
