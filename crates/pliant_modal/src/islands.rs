@@ -135,8 +135,8 @@ impl Islands {
     /// Performs one step of all bodies that move. `may_touch` says whether two bodies may touch, by
     /// their indices.
     ///
-    /// A body whose step fails has the error as its [`Together::error`], and the bodies of its
-    /// island are stepped as if they did not touch each other.
+    /// Where the step of an island fails, all of its bodies have the error as their
+    /// [`Together::error`], and are stepped as if they did not touch each other.
     pub fn step(&mut self, bodies: &mut [Together<'_>], may_touch: impl Fn(usize, usize) -> bool) {
         self.work.begin_step();
         self.find_pairs(bodies, &may_touch);
@@ -179,12 +179,13 @@ impl Islands {
                 self.members.push(local);
             }
         }
-        if group::step(bodies, who, &self.members, &mut self.sixes[..who.len()], &mut self.work).is_ok() {
-            return;
-        }
+        let sixes = &mut self.sixes[..who.len()];
+        let Err(error) = group::step(bodies, who, &self.members, sixes, &mut self.work) else { return };
         for &index in who {
-            bodies[index].body.contacts_mut().forget();
-            bodies[index].step_alone();
+            let together = &mut bodies[index];
+            together.body.contacts_mut().forget();
+            together.step_alone();
+            together.error.get_or_insert_with(|| error.clone());
         }
     }
 

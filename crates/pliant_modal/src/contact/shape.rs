@@ -165,11 +165,25 @@ impl Shape<'_> {
         let stiff = self.bound < 0.05 * self.size;
         let (mut x, mut wanted) = (local, stiff.then_some(facing));
         let mut reach = within + self.bound;
+        let kept = kept.filter(|kept| self.field.has(kept));
+        if let Some((moved, gradient)) = kept.map(|kept| self.deformed(kept)) {
+            let inverse = gradient.try_inverse().ok_or(0.0)?;
+            let rest = kept.map_or(local, |kept| self.field.rest(kept));
+            x = rest + inverse * (local - rest - moved);
+            wanted = gradient.tr_mul(&facing).try_normalize(1e-9);
+            reach = 2.0 * within + 0.01 * self.size;
+        }
         for round in 0..ROUNDS {
-            let mut place = self.field.closest(&x, wanted.as_ref(), reach).ok_or(within)?;
-            if let (Some(kept), true) = (kept, wanted.is_some()) {
-                place = self.field.keep(kept, place, &x, KEPT * self.size);
-            }
+            let kept = kept.and_then(|kept| self.field.on_same_triangle(kept, &x));
+            let place = match kept {
+                // Only what is nearer by more than the slack replaces the triangle.
+                Some((place, distance)) if wanted.is_some() && distance < reach => {
+                    let nearer = distance - KEPT * self.size;
+                    let found = (nearer > 0.0).then(|| self.field.closest(&x, wanted.as_ref(), nearer));
+                    found.flatten().unwrap_or(place)
+                }
+                _ => self.field.closest(&x, wanted.as_ref(), reach).ok_or(within)?,
+            };
             let (moved, gradient) = self.deformed(&place);
             let rest = self.field.rest(&place);
             let next = rest + gradient.try_inverse().ok_or(0.0)? * (local - rest - moved);

@@ -222,23 +222,18 @@ impl SurfaceField {
         found
     }
 
-    /// The place of the triangle of `kept` nearest to a point (m, body axes), if it is farther away
-    /// than `found` by no more than `slack` (m).
-    pub(crate) fn keep(
-        &self,
-        kept: &Place,
-        found: Place,
-        point: &Vector3<f64>,
-        slack: f64,
-    ) -> Place {
-        if kept.facet == found.facet {
-            return found;
-        }
-        let Some(facet) = self.facets.get(kept.facet as usize) else { return found };
+    /// Whether the surface has a place. One of another body's surface it may not have.
+    pub(crate) fn has(&self, place: &Place) -> bool {
+        (place.facet as usize) < self.facets.len()
+    }
+
+    /// The place of the same triangle that is nearest to a point (m, body axes), and its distance,
+    /// m.
+    pub(crate) fn on_same_triangle(&self, place: &Place, point: &Vector3<f64>) -> Option<(Place, f64)> {
+        let facet = self.facets.get(place.facet as usize)?;
         let weights = closest_on_triangle(facet.corners.map(|v| &self.vertices[v as usize]), point);
-        let place = Place { facet: kept.facet, weights };
-        let distance = |place: &Place| (point - self.rest(place)).norm();
-        if distance(&place) <= distance(&found) + slack { place } else { found }
+        let place = Place { facet: place.facet, weights };
+        Some((place, (point - self.rest(&place)).norm()))
     }
 
     /// The corners of the triangle of a place, m, body axes.

@@ -406,6 +406,11 @@ impl<P: Member> Group<'_, P> {
             for member in 0..self.len() {
                 let Parts { kernel, state, .. } = self.parts(member);
                 state.clone_from(&kernel.before);
+            }
+            // The rigid motion with a momentum never has more energy than the bodies that have it.
+            let common = if grounded { common } else { Common::of(self) };
+            for member in 0..self.len() {
+                let Parts { kernel, state, .. } = self.parts(member);
                 common.slow(kernel, state, 0.0);
             }
             work.points.clear();
