@@ -362,12 +362,12 @@ impl<P: Member> Group<'_, P> {
                 return false;
             }
             grounded |= !kernel.model.is_free();
-            let at_rest = |state: &State| kernel.elastic_energy(&state.q) + kernel.potential_energy(state);
+            let at_rest = |state: &State| kernel.elastic_energy(state) + kernel.potential_energy(state);
             let (now, before) = (kernel.kinetic_energy(state), kernel.kinetic_energy(&kernel.before));
             moving += now;
             gained += now - before + at_rest(state) - at_rest(&kernel.before);
             scale += now + before;
-            scale += kernel.elastic_energy(&state.q) + kernel.elastic_energy(&kernel.before.q);
+            scale += kernel.elastic_energy(state) + kernel.elastic_energy(&kernel.before);
             lost += contacts.lost;
             let speed = points::RECOVERY_SPEED * kernel.model.size();
             let gravity = Vector3::from(kernel.settings.gravity).norm();
