@@ -132,10 +132,13 @@ fn equal_balls_head_on_exchange_their_velocities_in_the_time_of_hertz() {
     for (name, model) in [
         ("linear", ball(young, |c| c.damping = Damping::Ratio(0.0))),
         ("120 modes", ball(young, |c| (c.modes, c.damping) = (120, Damping::Ratio(0.0)))),
-        ("reduced", ball(young, |c| {
-            soft(c);
-            c.damping = Damping::Ratio(0.0);
-        })),
+        (
+            "reduced",
+            ball(young, |c| {
+                soft(c);
+                c.damping = Damping::Ratio(0.0);
+            }),
+        ),
     ] {
         let plain = young / (2.0 * (1.0 - 0.3f64.powi(2)));
         let (mass, curve) = (0.5 * model.mass(), 0.5 * radius);
@@ -238,7 +241,11 @@ fn a_stack_of_five_cubes_stands() {
             let crept = (Vector3::from(body.frame().center()) - settled).norm() / 0.1;
             println!(
                 "{young:e}, cube {level}: force off by {off:.1e}, crept {crept:.1e} of the size, kinetic {:.1e} J, residual {:.1e} m, {} rounds, {} sweeps, guarded {}",
-                body.kinetic_energy(), report.residual, report.rounds, report.sweeps, report.guarded
+                body.kinetic_energy(),
+                report.residual,
+                report.rounds,
+                report.sweeps,
+                report.guarded
             );
             assert!(off < 1e-5 && crept < 1e-6, "{level}: {off} {crept}");
         }
@@ -296,11 +303,16 @@ fn bodies_thrown_at_each_other_do_not_pass_through() {
         ("balls", ball(2e7, |_| ()), ball(2e7, |_| ())),
         ("ball and cube", ball(2e7, |_| ()), cube(1e8, |_| ())),
     ] {
-        let mut pair =
-            [free(&a, 60.0, [0.0; 3], [50.0, 0.0, 0.0]), free(&b, 60.0, [1.0, 0.01, 0.02], [-50.0, 0.0, 0.0])];
+        let mut pair = [
+            free(&a, 60.0, [0.0; 3], [50.0, 0.0, 0.0]),
+            free(&b, 60.0, [1.0, 0.01, 0.02], [-50.0, 0.0, 0.0]),
+        ];
         run(&mut pair, 0.2);
         let [x, y] = [&pair[0], &pair[1]].map(|body| body.frame().center()[0]);
-        println!("{name}: at {x:.3} m and {y:.3} m, speeds {:?}", pair.map(|body| body.frame().velocity()[0]));
+        println!(
+            "{name}: at {x:.3} m and {y:.3} m, speeds {:?}",
+            pair.map(|body| body.frame().velocity()[0])
+        );
         assert!(x < y, "{name}: {x} {y}");
     }
 }
@@ -340,8 +352,7 @@ fn contacts_of_bodies_are_deterministic() {
         let mut bodies = stack(1e5, 3, |_| ());
         let mut state = bodies[2].state().clone();
         let (turn, spin) = ([0.1, 0.2, 0.0, 0.9], [0.0, 1e-3, 0.0]);
-        state.frame =
-            Frame::from_motion(bodies[2].model(), [0.07, 0.4, 0.04], turn, [0.0; 3], spin).unwrap();
+        state.frame = Frame::from_motion(bodies[2].model(), [0.07, 0.4, 0.04], turn, [0.0; 3], spin).unwrap();
         bodies[2].set_state(&state).unwrap();
         bodies
     };

@@ -273,8 +273,8 @@ impl BodyState {
         self.resting = false;
     }
 
-    /// Lets the body touch other bodies: those whose `[memberships, filters]` each have a bit of the
-    /// other's filters and memberships. Default: `None`, it touches no body.
+    /// Lets the body touch other bodies: those whose `[memberships, filters]` each have a bit of
+    /// the other's filters and memberships. Default: `None`, it touches no body.
     ///
     /// Two bodies touch only if their entities have the same scale. The contacts name a body by the
     /// bits of its entity ([`Touched::Body`](pliant_modal::Touched::Body)). Bodies that touch come

@@ -1,5 +1,5 @@
-//! The commands `pliant bench step` and `pliant bench pile`: cost of a body on this machine, next to
-//! the memory bandwidth limit measured in the same run, and of bodies that fall onto each other.
+//! The commands `pliant bench step` and `pliant bench pile`: cost of a body on this machine, next
+//! to the memory bandwidth limit measured in the same run, and of bodies that fall onto each other.
 
 use std::{path::PathBuf, sync::Arc};
 

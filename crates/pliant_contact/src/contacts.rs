@@ -77,7 +77,8 @@ impl BodyContacts {
     }
 }
 
-/// A body began to touch an obstacle or another body. Of two bodies each has such an event. Observe it on the body's entity or on all.
+/// A body began to touch an obstacle or another body. Of two bodies each has such an event. Observe
+/// it on the body's entity or on all.
 #[derive(EntityEvent, Reflect, Debug, Clone, Copy, PartialEq)]
 pub struct ContactStarted {
     /// The entity of the body.

@@ -221,7 +221,8 @@ pub fn drop(model: &Arc<ModalModel>, drop: &Drop) -> Result<Dropped, LabError> {
         ticks.push(tick(&bodies, step as f64 / drop.rate, taken));
     }
     let step_us = percentiles(ticks[1..].iter().map(|tick| tick.step_us).collect());
-    let (elasticity, sites) =
-        bodies.first().map_or((Elasticity::Linear, 0), |body| (body.config().settings.elasticity, body.contacts().sites()));
+    let (elasticity, sites) = bodies
+        .first()
+        .map_or((Elasticity::Linear, 0), |body| (body.config().settings.elasticity, body.contacts().sites()));
     Ok(Dropped { elasticity, mass: model.mass(), size: model.size(), sites, step_us, ticks })
 }

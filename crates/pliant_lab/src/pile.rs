@@ -96,9 +96,7 @@ pub fn pile(model: &Arc<ModalModel>, pile: &Pile) -> Result<Piled, LabError> {
         // Layers are shifted, so that bodies fall between those below.
         let aside = 0.3 * f64::from(layer as u32 % 2);
         let place = Vector3::new(column as f64 + aside, 1.0 + 1.2 * layer as f64, row as f64 + aside);
-        let turn = UnitQuaternion::from_scaled_axis(
-            Vector3::new(0.7, 1.3, 0.4) * (0.3 * (index % 7) as f64),
-        );
+        let turn = UnitQuaternion::from_scaled_axis(Vector3::new(0.7, 1.3, 0.4) * (0.3 * (index % 7) as f64));
         let center = Vector3::from(model.center_of_mass());
         let origin = 1.15 * model.size() * place - turn * center;
         body.set_pose(origin.into(), [turn.i, turn.j, turn.k, turn.w])?;
@@ -125,7 +123,8 @@ pub fn pile(model: &Arc<ModalModel>, pile: &Pile) -> Result<Piled, LabError> {
         // A contact of two bodies is in both lists.
         let of_body = |body: &Body| {
             let list = body.contacts().contacts().iter();
-            list.map(|contact| if matches!(contact.other, pliant_modal::Touched::Body(_)) { 1 } else { 2 }).sum::<usize>()
+            list.map(|contact| if matches!(contact.other, pliant_modal::Touched::Body(_)) { 1 } else { 2 })
+                .sum::<usize>()
         };
         contacts = bodies.iter().map(of_body).sum::<usize>() / 2;
         most = most.max(contacts);

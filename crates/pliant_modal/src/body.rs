@@ -8,7 +8,11 @@ use crate::{
     Contacts, Frame, GrabConfig, Hand, HeldPatch, HeldShapes, Hold, Kernel, Load, ModalModel, Obstacle,
     Patch, Precision, State, StepError, StepReport, StepSettings,
     error::finite,
-    step::{Six, group::{Parts, View}, tangent},
+    step::{
+        Six,
+        group::{Parts, View},
+        tangent,
+    },
 };
 
 /// Identifier of a grab on a body. A body never uses an identifier twice.

@@ -29,10 +29,11 @@ use crate::state::State;
 pub struct Newmark {
     /// Length of a step, s.
     pub h: f64,
-    /// Weight of the new acceleration in the displacement. The default of [`crate::HostSessionConfig`] is
-    /// 4/9.
+    /// Weight of the new acceleration in the displacement. The default of
+    /// [`crate::HostSessionConfig`] is 4/9.
     pub beta: f64,
-    /// Weight of the new acceleration in the velocity. The default of [`crate::HostSessionConfig`] is 5/6.
+    /// Weight of the new acceleration in the velocity. The default of [`crate::HostSessionConfig`]
+    /// is 5/6.
     pub gamma: f64,
 }
 

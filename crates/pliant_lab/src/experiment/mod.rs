@@ -142,8 +142,8 @@ pub struct Metrics {
     pub true_ringing: f64,
     /// Time from a hand's motion to the force that answers it, ms, computed and not timed. If the
     /// policy owns the model, this is one tick by construction: the guest's own copy answers at its
-    /// next step (see [`pliant_stream::StreamedBody::predicted_hand`]). Otherwise it is half the round
-    /// trip, half a step and the mean visual delay.
+    /// next step (see [`pliant_stream::StreamedBody::predicted_hand`]). Otherwise it is half the
+    /// round trip, half a step and the mean visual delay.
     pub hand_to_force_ms: f64,
     /// Mean time from the host's step to the showing of its tick, ms.
     pub visual_delay_ms: f64,

@@ -219,7 +219,12 @@ impl Shape<'_> {
 
     /// Follows a way of the rest shape (m, body axes) from outside until it goes in, and returns
     /// that place. `facing` is in body axes at rest.
-    pub(crate) fn march(&self, from: &Vector3<f64>, to: &Vector3<f64>, facing: &Vector3<f64>) -> Option<Place> {
+    pub(crate) fn march(
+        &self,
+        from: &Vector3<f64>,
+        to: &Vector3<f64>,
+        facing: &Vector3<f64>,
+    ) -> Option<Place> {
         const STEPS: usize = 32;
         let way = to - from;
         let length = way.norm();

@@ -162,7 +162,9 @@ impl SurfaceField {
         let carriers = vertices
             .iter()
             .zip(&anchored)
-            .map(|(at, anchored)| if *anchored { Vec::new() } else { carriers(at, sites, surface, &vertices) })
+            .map(
+                |(at, anchored)| if *anchored { Vec::new() } else { carriers(at, sites, surface, &vertices) },
+            )
             .collect();
         Self { vertices, facets, nodes, carriers }
     }

@@ -447,7 +447,8 @@ impl Kernel {
         self.check_step(state, hands)?;
         let mut work = std::mem::take(&mut contacts.touching);
         let mut report = StepReport::default();
-        let mut alone = [Alone(Parts { kernel: self, state, hands, load: *load, contacts, report: &mut report })];
+        let mut alone =
+            [Alone(Parts { kernel: self, state, hands, load: *load, contacts, report: &mut report })];
         let stepped = group::step(&mut alone, &[0], &[], &mut [], &mut work);
         contacts.touching = work;
         if let Err(StepError::Diverged { .. }) = stepped {
@@ -462,9 +463,7 @@ impl Kernel {
         self.check_lengths(state)?;
         let expected = self.modes.count();
         match hands.iter().find(|hand| hand.patch.modes() != expected) {
-            Some(hand) => {
-                Err(StepError::Length { what: "a held patch", expected, got: hand.patch.modes() })
-            }
+            Some(hand) => Err(StepError::Length { what: "a held patch", expected, got: hand.patch.modes() }),
             None => Ok(()),
         }
     }

@@ -193,9 +193,9 @@ impl NetGuest {
     }
 
     /// Returns the displayed state of a body and its tick. While this guest's own hand holds the
-    /// body, the state is the predicted copy ([`StreamedBody::predicted_hand`]). Otherwise it is the
-    /// visual state of the confirmed stream. The host may not have reached the tick of a predicted
-    /// copy yet.
+    /// body, the state is the predicted copy ([`StreamedBody::predicted_hand`]). Otherwise it is
+    /// the visual state of the confirmed stream. The host may not have reached the tick of a
+    /// predicted copy yet.
     pub fn visual_state(&self, body: RemoteBody) -> Option<(Tick, &State)> {
         let view = self.body(body)?;
         visual_state_of(view)

@@ -1,9 +1,9 @@
 //! A seeded emulation of a bad network: one direction of a path, in virtual time.
 //!
-//! A [`EmulatedLink`] takes each payload with its send time and returns it at its arrival time, or never.
-//! The link owns no clock. The same calls with the same seed give the same result, to the
-//! microsecond, and the same [`EmulatedLink::hash`]. A path needs two links, one per direction, each with
-//! its own seed.
+//! A [`EmulatedLink`] takes each payload with its send time and returns it at its arrival time, or
+//! never. The link owns no clock. The same calls with the same seed give the same result, to the
+//! microsecond, and the same [`EmulatedLink::hash`]. A path needs two links, one per direction,
+//! each with its own seed.
 //!
 //! ```
 //! use std::time::Duration;

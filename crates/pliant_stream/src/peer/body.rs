@@ -349,8 +349,8 @@ impl PeerBody {
     }
 }
 
-/// Returns the frame as it would be if the body had been at `there` instead of `here` `seconds` ago.
-/// The difference in velocity and spin has acted since.
+/// Returns the frame as it would be if the body had been at `there` instead of `here` `seconds`
+/// ago. The difference in velocity and spin has acted since.
 fn moved(model: &ModalModel, frame: &Frame, [there, here]: [&Frame; 2], seconds: f64) -> Frame {
     let of = |f: fn(&Frame) -> [f64; 3]| Vector3::from(f(there)) - Vector3::from(f(here));
     let (faster, spin) = (of(Frame::velocity), of(Frame::spin));

@@ -172,8 +172,8 @@ impl History {
         new(frame.tick, first);
     }
 
-    /// The largest second difference of a grab's received reactions, N, in the `window` ticks before
-    /// `tick`. Zero if no three ticks in a row are known.
+    /// The largest second difference of a grab's received reactions, N, in the `window` ticks
+    /// before `tick`. Zero if no three ticks in a row are known.
     pub(crate) fn second_difference(&self, key: GrabKey, tick: Tick, window: u64) -> f64 {
         let at = |back: u64| {
             let data = self.known(tick.checked_sub(back)?)?;

@@ -502,8 +502,8 @@ impl Receiver {
     }
 }
 
-/// Returns the least share of `offset`, 0 to 1, with which `base + share * offset` is not longer than
-/// `limit`. It is 1 if no share is enough.
+/// Returns the least share of `offset`, 0 to 1, with which `base + share * offset` is not longer
+/// than `limit`. It is 1 if no share is enough.
 fn least_share(base: Vector3<f64>, offset: Vector3<f64>, limit: f64) -> f64 {
     let beyond = base.norm_squared() - limit * limit;
     if beyond <= 0.0 {

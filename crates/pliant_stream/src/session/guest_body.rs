@@ -143,8 +143,8 @@ impl StreamedBody {
     ///
     /// The result is `None` unless the guest holds the body or the copy still fades to the
     /// confirmed state. The copy needs [`Policy::ForceDriven`] and
-    /// [`crate::GuestSessionConfig::predict_own_hand`]. Show it instead of [`StreamedBody::visual`] when it
-    /// exists.
+    /// [`crate::GuestSessionConfig::predict_own_hand`]. Show it instead of [`StreamedBody::visual`]
+    /// when it exists.
     pub fn predicted_hand(&self) -> Option<&PredictedHand> {
         self.predicted.as_ref().filter(|predicted| predicted.is_active())
     }

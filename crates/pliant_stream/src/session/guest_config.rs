@@ -20,8 +20,8 @@ pub struct GuestSessionConfig {
     /// links. Default: all.
     pub modes: Option<u16>,
     /// Steps a newer copy of each body that this guest holds, in which the guest's own hands do not
-    /// wait for the round trip; see [`StreamedBody::predicted_hand`](super::StreamedBody::predicted_hand).
-    /// Default: true.
+    /// wait for the round trip; see
+    /// [`StreamedBody::predicted_hand`](super::StreamedBody::predicted_hand). Default: true.
     pub predict_own_hand: bool,
     /// Largest number of bytes of models that a host may send, counting complete models and
     /// downloads in progress. The guest leaves a host that exceeds the limit, with
@@ -90,8 +90,9 @@ pub enum GuestEvent {
         /// Its model, which the caller may also cache.
         model: Arc<ModalModel>,
     },
-    /// The host changed the step settings of a body. [`StreamedBody::info`](super::StreamedBody::info) has
-    /// the new settings. Hands on the body stay.
+    /// The host changed the step settings of a body.
+    /// [`StreamedBody::info`](super::StreamedBody::info) has the new settings. Hands on the body
+    /// stay.
     BodyChanged {
         /// The body.
         body: BodyId,

@@ -66,8 +66,9 @@ impl HostSession {
     /// yet.
     ///
     /// A guest of [`HostSession::fetching`] with 128 KiB or more gets nothing more of its model
-    /// until the caller reports less. The connection may be slower than [`HostSessionConfig::model_rate`],
-    /// and unsent bytes are held in memory. Default: 0, which stays until the first call.
+    /// until the caller reports less. The connection may be slower than
+    /// [`HostSessionConfig::model_rate`], and unsent bytes are held in memory. Default: 0, which
+    /// stays until the first call.
     pub fn set_unsent(&mut self, peer: PeerId, bytes: usize) {
         if let Some(p) = self.peers.get_mut(&peer) {
             p.unsent = bytes;

@@ -13,7 +13,9 @@ use super::{
 };
 use crate::{
     StepError,
-    contact::{Contact, ContactReport, ContactSites, Contacts, Memory, Point, Shape, Sixes, Touched, Touching},
+    contact::{
+        Contact, ContactReport, ContactSites, Contacts, Memory, Point, Shape, Sixes, Touched, Touching,
+    },
     step::{Frame, Hand, Load, State, StepReport},
 };
 

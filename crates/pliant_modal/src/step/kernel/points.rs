@@ -9,7 +9,10 @@ use super::{
 };
 use crate::{
     StepError,
-    contact::{Clearance, ContactSites, Far, Memory, Near, Obstacle, Place, Point, Shape, Site, SurfacePoint, Touched, Touching},
+    contact::{
+        Clearance, ContactSites, Far, Memory, Near, Obstacle, Place, Point, Shape, Site, SurfacePoint,
+        Touched, Touching,
+    },
     step::{Frame, State, Tangent},
 };
 
@@ -154,7 +157,8 @@ fn begin_at_body(
     let (kernel, sites) = (view.kernel, far.sites()?);
     let (frame, q) = (&kernel.before.frame, &kernel.before.q);
     let size = kernel.model.size().min(far.kernel.model.size());
-    let (located, near) = locate_at_body(kernel, site, shape, (frame, q), DEEP * size, memory.place.as_ref()).ok()?;
+    let (located, near) =
+        locate_at_body(kernel, site, shape, (frame, q), DEEP * size, memory.place.as_ref()).ok()?;
     let mut point = Point::new(member, memory.site, memory.other, friction(view, far));
     (point.first, point.last) = (memory.toward, located.toward);
     (point.start, point.tangent) = kernel.material(site, &memory.toward, frame, q);
@@ -288,7 +292,9 @@ fn detect_at_obstacle(
     band: f64,
     (penetrates, candidates): (&mut bool, &mut usize),
 ) -> Result<(), StepError> {
-    let Some(obstacle) = view.contacts.obstacles().get(index).map(|obstacle| &**obstacle) else { return Ok(()) };
+    let Some(obstacle) = view.contacts.obstacles().get(index).map(|obstacle| &**obstacle) else {
+        return Ok(());
+    };
     let kernel = view.kernel;
     let (before, state) = (&kernel.before, view.state);
     let (from, to) = (&before.frame, &state.frame);
@@ -368,8 +374,8 @@ fn detect_at_body(
     let stamp = mark(work, member, touched);
     let deep = DEEP * kernel.model.size().min(far.kernel.model.size());
     let [low, high] = far.kernel.model.surface().bounds().map(|corner| Vector3::from(corner.map(f64::from)));
-    let bent = far_sites.bound_of_way(&far.kernel.before.q, &far.state.q)
-        + sites.bound_of_way(&before.q, &state.q);
+    let bent =
+        far_sites.bound_of_way(&far.kernel.before.q, &far.state.q) + sites.bound_of_way(&before.q, &state.q);
     let mut penetrates = false;
     let clear = work.clearance([view.contacts.key, far.contacts.key]);
     take_way(&mut work.clear[clear], sites, far_sites, [state, far.state], bound);
@@ -410,7 +416,12 @@ fn detect_at_body(
         if work.points.iter().any(near_other) {
             continue;
         }
-        let (begun, tangent) = kernel.material(site, &(if site.radius > 0.0 { located.toward } else { site.outward }), from, &before.q);
+        let (begun, tangent) = kernel.material(
+            site,
+            &(if site.radius > 0.0 { located.toward } else { site.outward }),
+            from,
+            &before.q,
+        );
         let mut point = Point::new(member, number, touched, friction(view, far));
         (point.first, point.last) = (located.toward, located.toward);
         (point.start, point.tangent, point.place) = (begun, tangent, located.point);
@@ -593,7 +604,8 @@ fn follow(
         far.carriers = end.field.carriers(&near.place);
     }
     let carriers = end.field.carriers(&near.place);
-    let ((begun, _), (ended, _)) = (start.material(&near.place, &carriers), end.material(&near.place, &carriers));
+    let ((begun, _), (ended, _)) =
+        (start.material(&near.place, &carriers), end.material(&near.place, &carriers));
     (far.start, far.end) = (begun, ended);
     if far.mean.is_none() {
         far.middle = 0.5 * (far.middle + 0.5 * (located.point + far.end));

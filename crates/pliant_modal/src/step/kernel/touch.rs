@@ -166,7 +166,6 @@ impl Kernel {
         }
     }
 
-
     /// The body at a state, as something that other bodies touch.
     pub(super) fn shape<'a>(
         &'a self,
@@ -312,7 +311,6 @@ pub(super) struct RowsOfSide<'a> {
     /// A root of the inverse inertia, world axes. `None` for a frame that does not move.
     pub(super) spin: Option<&'a Matrix3<f64>>,
 }
-
 
 /// Computes `row -= b (row . w) w` with `b = 1 / (1 + sqrt(1 - w . w))`.
 pub(super) fn take(w: &[f64], row: &mut [f64]) {
