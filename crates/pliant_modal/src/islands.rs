@@ -234,9 +234,9 @@ impl Islands {
             let [a, b] = pair.map(|index| root(&self.first, index as usize));
             self.first[a.max(b)] = a.min(b);
         }
-        for index in 0..bodies.len() {
+        for (index, body) in bodies.iter_mut().enumerate() {
             self.first[index] = root(&self.first, index);
-            bodies[index].island = self.first[index];
+            body.island = self.first[index];
         }
         self.order.clear();
         self.order.extend(0..bodies.len());

@@ -228,7 +228,7 @@ impl Shape<'_> {
         const STEPS: usize = 32;
         let way = to - from;
         let length = way.norm();
-        if !(length > 0.0) || !length.is_finite() {
+        if length <= 0.0 || !length.is_finite() {
             return None;
         }
         let mut gone = 0.0;

@@ -190,7 +190,8 @@ impl SurfaceField {
             let index = stack[depth];
             let node = &self.nodes[index as usize];
             // Comparisons with no number are false, and such a point has no place.
-            if !(away(node) < least) {
+            let near = away(node) < least;
+            if !near {
                 continue;
             }
             if node.count == 0 {

@@ -367,7 +367,8 @@ fn detect_at_body(
     let reach = bound + end.bound + band + travel + far_travel;
     let apart = (Vector3::from(to.center()) - Vector3::from(end.frame.center())).norm();
     // Comparisons with no number are false, and such bodies do not touch.
-    if !(apart <= sites.radius + far_sites.radius + reach) {
+    let near = apart <= sites.radius + far_sites.radius + reach;
+    if !near {
         return false;
     }
     let touched = Touched::Body(far.contacts.key);
