@@ -125,10 +125,19 @@ pub(crate) fn prepare_body(added: On<Add, BodyState>, mut commands: Commands) {
     commands.entity(added.entity).try_insert((Nearby::default(), BodyContacts::default()));
 }
 
-/// Removes the contacts of a body that is removed.
-pub(crate) fn forget_body(removed: On<Remove, BodyState>, mut commands: Commands) {
+/// Removes the contacts of a body that is removed, and wakes those that touched it.
+pub(crate) fn forget_body(
+    removed: On<Remove, BodyState>,
+    mut commands: Commands,
+    mut bodies: Query<(&mut BodyState, &BodyContacts)>,
+) {
     if let Ok(mut entity) = commands.get_entity(removed.entity) {
         entity.try_remove::<(Nearby, BodyContacts)>();
+    }
+    for (mut state, contacts) in &mut bodies {
+        if state.is_resting() && contacts.touches(removed.entity) {
+            state.wake();
+        }
     }
 }
 
@@ -228,15 +237,34 @@ pub(crate) fn place_obstacles(
     }
 }
 
-/// Tells the bodies which others they touch.
+/// Tells the bodies which others they touch, and wakes a body when another that it touches is moved
+/// away from it.
 pub(crate) fn touch_bodies(
-    mut bodies: Query<(&mut BodyState, &Driven, Has<TouchBodies>, Option<&ContactLayers>)>,
+    mut awake: Local<Vec<Entity>>,
+    mut bodies: Query<(
+        Entity,
+        &mut BodyState,
+        &Driven,
+        &BodyContacts,
+        Has<TouchBodies>,
+        Option<&ContactLayers>,
+    )>,
 ) {
-    for (mut state, driven, touches, layers) in &mut bodies {
+    awake.clear();
+    for (entity, mut state, driven, _, touches, layers) in &mut bodies {
         let ContactLayers { memberships, filters } = layers.copied().unwrap_or_default();
         let wanted = (touches && *driven == Driven::Local).then_some([memberships, filters]);
         if state.body_layers() != wanted {
             state.touch_bodies(wanted);
+        }
+        if !state.is_resting() {
+            awake.push(entity);
+        }
+    }
+    awake.sort_unstable();
+    for (_, mut state, _, contacts, ..) in &mut bodies {
+        if state.is_resting() && contacts.others().any(|other| awake.binary_search(&other).is_ok()) {
+            state.wake();
         }
     }
 }

@@ -8,6 +8,7 @@ use pliant_modal::ModalModel;
 
 use crate::{
     BodyContacts, BodyFriction, ContactEnded, ContactLayers, ContactPlugin, ContactStarted, Obstacle,
+    TouchBodies,
 };
 
 const STEP: f64 = 1.0 / 60.0;
@@ -230,4 +231,46 @@ fn a_floor_that_is_turned_at_once_throws_nothing() {
     app.update();
     let speed = DVec3::from(state(&app, body).body().frame().velocity()).length();
     assert!(speed < 1e-3, "{speed} m/s");
+}
+
+#[test]
+fn bodies_rest_on_each_other_and_wake_together() {
+    let mut app = app();
+    let floor = app.world_mut().spawn(Obstacle::Floor).id();
+    let below = spawn(&mut app, Transform::from_xyz(0.0, 0.5 * EDGE as f32 + 0.001, 0.0), TouchBodies);
+    let above = spawn(&mut app, Transform::from_xyz(0.02, 1.5 * EDGE as f32 + 0.02, 0.01), TouchBodies);
+    seconds(&mut app, 8.0);
+    assert!(state(&app, below).is_resting() && state(&app, above).is_resting());
+    let force = contacts(&app, above).force();
+    assert!((force - weight() * DVec3::Y).length() < 1e-3 * weight(), "{force} N for {} N", weight());
+    assert!(contacts(&app, above).0.iter().all(|contact| contact.other == below));
+    // The floor carries both, and the forces between them are opposite.
+    let of = |other| contacts(&app, below).0.iter().filter(move |c| c.other == other).map(|c| c.force);
+    let (up, down): (DVec3, DVec3) = (of(floor).sum(), of(above).sum());
+    assert!((down + force).length() < 1e-9 * weight() && (up.y / weight() - 2.0).abs() < 1e-3, "{up} {down}");
+    let told = app.world().resource::<Told>();
+    let told = |entity, other| told.started.iter().any(|e| (e.entity, e.other) == (entity, other));
+    assert!(told(above, below) && told(below, above) && told(below, floor));
+    // What lies on a body that is moved away falls.
+    app.world_mut().get_mut::<Transform>(below).unwrap().translation.x = 5.0;
+    seconds(&mut app, 1.0);
+    assert!(center(&app, above).y < EDGE, "{}", center(&app, above));
+    seconds(&mut app, 4.0);
+    assert!(state(&app, below).is_resting() && state(&app, above).is_resting());
+}
+
+#[test]
+fn a_body_falls_when_the_one_below_is_removed_and_through_one_that_it_does_not_touch() {
+    let mut app = app();
+    app.world_mut().spawn(Obstacle::Floor);
+    let below = spawn(&mut app, Transform::from_xyz(0.0, 0.5 * EDGE as f32, 0.0), TouchBodies);
+    let above = spawn(&mut app, Transform::from_xyz(0.0, 1.5 * EDGE as f32, 0.0), TouchBodies);
+    // Without the component it touches the floor alone.
+    let through = spawn(&mut app, Transform::from_xyz(0.05, 4.0 * EDGE as f32, 0.05), ());
+    seconds(&mut app, 6.0);
+    assert!(center(&app, above).y > 1.4 * EDGE && center(&app, through).y < 0.6 * EDGE);
+    assert!(state(&app, above).is_resting());
+    app.world_mut().despawn(below);
+    seconds(&mut app, 2.0);
+    assert!(center(&app, above).y < 0.6 * EDGE, "{}", center(&app, above));
 }

@@ -164,7 +164,8 @@ fn begin_at_body(
     (point.start, point.tangent) = kernel.material(site, &memory.toward, frame, q);
     let mut side = far_side(other, &near, shape);
     side.compliance = far_compliance(far, sites, &far.kernel.before, &side);
-    side.middle = 0.5 * (located.point + side.start);
+    let velocities = Vector3::from(frame.velocity()) + Vector3::from(shape.frame.velocity());
+    side.middle = 0.5 * (located.point + side.start) + 0.25 * kernel.h * velocities;
     point.place = located.point;
     side.anchor = side.start + shape.frame.rotation() * (memory.anchor - shape.field.rest(&near.place));
     point.compliance = kernel.site_compliance(site, frame, q) + side.compliance;
@@ -433,7 +434,6 @@ fn detect_at_body(
         point.gap = start.at(&near.place, &begun).distance;
         let moved = (located.point - begun) - (ended - side.start);
         side.anchor = begun + share(point.gap, near.distance) * moved;
-        side.middle = begun;
         point.far = Some(side);
         // What later sites look at before the gaps are taken anew.
         point.off[0] = near.distance;
@@ -548,6 +548,10 @@ pub(super) fn linearize<P: Member>(
                 let Some(shapes) = group.shapes(far.member) else { continue };
                 let (located, near) = follow(kernel, site, state, &shapes, far, size);
                 far.compliance = far_compliance(&other, sites, other.state, far);
+                if point.mean.is_none() {
+                    // The middle of the step, as that of both centers of mass.
+                    far.middle = 0.25 * (point.start + located.point + far.start + far.end);
+                }
                 point.carried = far.end - far.start;
                 point.anchor = far.anchor + point.carried;
                 point.compliance = own + far.compliance;
@@ -609,7 +613,6 @@ fn follow(
         (start.material(&near.place, &carriers), end.material(&near.place, &carriers));
     (far.start, far.end) = (begun, ended);
     if far.mean.is_none() {
-        far.middle = 0.5 * (far.middle + 0.5 * (located.point + far.end));
         let [(_, from), (_, to)] = [start, end].map(|shape| shape.material(&near.place, &far.carriers));
         let mean: Tangent = 0.5 * (from + to);
         far.mean = Some(mean);
