@@ -403,7 +403,13 @@ fn drop_prints_every_step_and_refuses_what_it_cannot_do() {
         assert_eq!(ticks[30][name].as_array().unwrap().len(), 3, "{name}");
     }
     assert!(succeeds(&["drop", jack, "--seconds", "0.1", "--tilt", "10"]).contains("contact sites"));
+    let pip = concat!(env!("CARGO_MANIFEST_DIR"), "/../../assets/pip.modal");
+    assert!(succeeds(&["drop", jack, "--seconds", "0.1", "--onto", pip]).contains("contact sites"));
+    assert!(
+        succeeds(&["bench", "pile", jack, "--seconds", "0.1", "--count", "2"]).contains("for each contact")
+    );
+    refused(&["bench", "pile", jack, "--count", "0"]);
     refused(&["drop", jack, "--onto", "cone"]);
     refused(&["drop", jack, "--friction", "-1"]);
-    refused(&["drop", concat!(env!("CARGO_MANIFEST_DIR"), "/../../assets/pip.modal")]);
+    refused(&["drop", pip]);
 }

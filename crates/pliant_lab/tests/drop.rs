@@ -6,6 +6,7 @@ use std::sync::Arc;
 use pliant_lab::{
     LabError,
     drop::{Drop, Onto, drop},
+    pile::{Pile, pile},
 };
 use pliant_modal::ModalModel;
 
@@ -64,4 +65,29 @@ fn what_cannot_fall_is_refused() {
     }
     let bad = Drop { friction: -1.0, ..Drop::default() };
     assert!(matches!(drop(&model, &bad), Err(LabError::Step(_))));
+}
+
+#[test]
+fn a_body_falls_onto_another_and_energy_never_rises() {
+    let pip = Arc::new(ModalModel::read("../../assets/pip.modal").unwrap());
+    for base in [pip, jack()] {
+        let fall = Drop { onto: Onto::Body(base), seconds: 1.0, height: 0.05, ..Drop::default() };
+        let dropped = drop(&jack(), &fall).unwrap();
+        let total = |tick: &pliant_lab::drop::Tick| tick.kinetic + tick.elastic + tick.potential;
+        let first = total(&dropped.ticks[0]);
+        assert!(dropped.ticks.iter().all(|tick| total(tick) <= first + 1e-9));
+        // It begins above the other and touches it first.
+        let touch = dropped.ticks.iter().position(|tick| tick.contacts > 0).unwrap();
+        let time = (2.0 * 0.05 / 9.81f64).sqrt();
+        assert!((dropped.ticks[touch].time - time).abs() < 0.1, "{} s", dropped.ticks[touch].time);
+    }
+}
+
+#[test]
+fn a_pile_comes_to_rest_without_gaining_energy() {
+    let piled = pile(&jack(), &Pile { count: 4, seconds: 4.0, ..Pile::default() }).unwrap();
+    println!("{piled:?}");
+    assert!(piled.contacts > 8 && piled.failures == 0);
+    assert!(piled.gain < 1e-9 && piled.kinetic_at_end < 1e-2 * piled.start, "{piled:?}");
+    assert!(pile(&jack(), &Pile { count: 0, ..Pile::default() }).is_err());
 }

@@ -14,7 +14,8 @@ use std::{
 
 use nonlinear_rod::nonlinear_rod;
 use pliant_modal::{
-    Body, BodyConfig, Elasticity, GrabConfig, Integrator, Patch, Plane, Relaxation, StepSettings,
+    Body, BodyConfig, Elasticity, GrabConfig, Integrator, Islands, Patch, Plane, Relaxation, StepSettings,
+    Together,
 };
 use rod::{rod, tip};
 
@@ -138,4 +139,32 @@ fn a_step_with_contacts_allocates_nothing() {
         assert_eq!(CALLS.with(Cell::get) - before, 0);
         assert!(touched > 1, "it touched the ground");
     }
+}
+
+#[test]
+fn a_step_of_bodies_that_touch_each_other_allocates_nothing_once_they_have_touched() {
+    let jack = concat!(env!("CARGO_MANIFEST_DIR"), "/../../assets/jack.modal");
+    let model = Arc::new(pliant_modal::ModalModel::read(jack).unwrap());
+    let settings = StepSettings { gravity: [0.0, -9.81, 0.0], ..Default::default() };
+    let low = f64::from(model.surface().bounds()[0][1]);
+    let [mut below, mut above] = [0.0, 1.1].map(|height| {
+        let mut body = Body::new(model.clone(), settings.into()).unwrap();
+        body.set_pose([0.0, height * model.size() - low, 0.0], [0.0, 0.0, 0.1, 1.0]).unwrap();
+        body.set_obstacles(vec![Arc::new(Plane::GROUND)]).unwrap();
+        body
+    });
+    let mut islands = Islands::default();
+    let (mut calls, mut touched) = (0, false);
+    for step in 0..240 {
+        let before = CALLS.with(Cell::get);
+        islands.step(&mut [Together::new(0, &mut below), Together::new(1, &mut above)], |_, _| true);
+        // The first contacts make room.
+        if step >= 120 {
+            calls += CALLS.with(Cell::get) - before;
+        }
+        let other = |contact: &pliant_modal::Contact| contact.other == pliant_modal::Touched::Body(0);
+        touched |= step >= 120 && above.contacts().contacts().iter().any(other);
+    }
+    assert!(touched, "they touched");
+    assert_eq!(calls, 0);
 }
