@@ -195,7 +195,7 @@ fn what_lies_on_an_anchored_body_presses_with_its_weight() {
             free(&held, 60.0, held.center_of_mass(), [0.0; 3]),
             place(&top, 60.0, GRAVITY, [0.15, height, 0.15], LEVEL, [0.0; 3], [0.0; 3]),
         ];
-        run(&mut bodies, 15.0);
+        run(&mut bodies, 30.0);
         let weight = top.mass() * GRAVITY;
         let report = *bodies[1].contacts().report();
         let off = (Vector3::from(report.force) - Vector3::new(0.0, weight, 0.0)).norm() / weight;
@@ -247,7 +247,7 @@ fn a_stack_of_five_cubes_stands() {
                 report.sweeps,
                 report.guarded
             );
-            assert!(off < 1e-5 && crept < 1e-6, "{level}: {off} {crept}");
+            assert!(off < 1e-6 && crept < 1e-4, "{level}: {off} {crept}");
         }
         println!("    {:.1} us a step of all", wall * 1e6 / (65.0 * 60.0));
     }

@@ -163,7 +163,7 @@ impl Point {
     }
 
     /// Violation of the laws at the end of the last computed step, m.
-    pub(super) fn violation(&self) -> f64 {
+    pub(crate) fn violation(&self) -> f64 {
         let u = self.surface();
         let (n, t) = (self.pushed[0], self.pushed[1].hypot(self.pushed[2]));
         if n <= 0.0 {

@@ -31,6 +31,10 @@ const BAND: f64 = 2e-3;
 const STILL: f64 = 1e-12;
 const ENOUGH: f64 = 1e-6;
 
+/// Violation of the laws beyond which bodies that have passed through each other are stopped, as a
+/// share of the size.
+const TORN: f64 = 0.05;
+
 /// Share of the kinetic and elastic energy that a step may gain of what contacts have lost before.
 const GIVEN_BACK: f64 = 1e-2;
 
@@ -202,6 +206,7 @@ impl<P: Member> Group<'_, P> {
             report.rounds += rounds;
             report.guarded = true;
         }
+        report.guarded |= self.stop_torn(work);
         report.guarded |= self.cap_energy(work);
         report.sweeps = work.sweeps;
         self.end(work, theta.unwrap_or(0.5), &report);
@@ -381,39 +386,40 @@ impl<P: Member> Group<'_, P> {
             let (now, before) = (point.stored(&force), point.stored(&point.before));
             scale += now + before;
             gained += now - before;
+            // What pushes a body out that was set into something.
+            let out = point.pushed[0] * (point.floor - point.gap).max(0.0);
             if point.far.is_none() {
                 // What the obstacles supply.
-                gained -= force.dot(&point.carried);
+                gained -= force.dot(&point.carried) + out;
+            } else {
+                recovered += out;
             }
-            recovered += point.pushed[0] * (point.floor - point.gap).max(0.0);
         }
-        // A body that was set into something is pushed out. That may cost what moves it at the
-        // speed of the recovery against gravity, and what was lost before pays for it first.
+        // Between bodies it may cost what moves them at the speed of the recovery against gravity,
+        // and what was lost before pays for it first.
         let recovered = recovered.min(slow);
         gained -= recovered;
         lost -= recovered.min(lost).max(0.0);
         // A step may take back a little of what the steps before have lost: a rolling ball loses
         // and gains in turn, and would slow down if only the gains were taken.
         let allowed = lost.min(GIVEN_BACK * scale);
-        let lost = (lost - gained.min(allowed)).min(scale) / self.len() as f64;
+        let mut lost = lost - gained.min(allowed);
+        if self.len() == 1 {
+            lost = lost.min(scale);
+        }
+        let lost = lost / self.len() as f64;
         let gained = gained - allowed;
         // Bodies that touch nothing else keep their common momentum.
-        let common = if grounded { Common::default() } else { Common::of(self) };
+        let common = if grounded { Common::default() } else { Common::of(self, &|_| true) };
         moving -= common.energy;
         for member in 0..self.len() {
             self.parts(member).contacts.lost = lost;
         }
         if gained > moving && gained > 1e-3 * scale {
             // The velocities cannot pay for it. The bodies stop where the step began.
+            let (count, taken) = (self.len() as f64, self.stop(|_| true, grounded));
             for member in 0..self.len() {
-                let Parts { kernel, state, .. } = self.parts(member);
-                state.clone_from(&kernel.before);
-            }
-            // The rigid motion with a momentum never has more energy than the bodies that have it.
-            let common = if grounded { common } else { Common::of(self) };
-            for member in 0..self.len() {
-                let Parts { kernel, state, .. } = self.parts(member);
-                common.slow(kernel, state, 0.0);
+                self.parts(member).contacts.lost += (taken + allowed) / count;
             }
             work.points.clear();
             true
@@ -427,6 +433,54 @@ impl<P: Member> Group<'_, P> {
         } else {
             false
         }
+    }
+
+    /// Puts some members back to where the step began, with nothing but the rigid motion that has
+    /// their common momentum, or without any motion if they touch the ground. Returns the kinetic
+    /// energy that they lose, J.
+    fn stop(&mut self, stops: impl Fn(usize) -> bool, grounded: bool) -> f64 {
+        let mut before = 0.0;
+        for member in (0..self.len()).filter(|&member| stops(member)) {
+            let Parts { kernel, state, hands, contacts, .. } = self.parts(member);
+            state.clone_from(&kernel.before);
+            contacts.restore(hands);
+            before += kernel.kinetic_energy(state);
+        }
+        // The rigid motion with a momentum never has more energy than the bodies that have it.
+        let common = if grounded { Common::default() } else { Common::of(self, &stops) };
+        for member in (0..self.len()).filter(|&member| stops(member)) {
+            let Parts { kernel, state, .. } = self.parts(member);
+            common.slow(kernel, state, 0.0);
+            before -= kernel.kinetic_energy(state);
+        }
+        before
+    }
+
+    /// Stops the members that would pass through each other, because the laws could not be solved
+    /// for a hard blow. Returns whether there are any.
+    fn stop_torn(&mut self, work: &mut Touching) -> bool {
+        let torn = |point: &Point| {
+            point.far.as_ref().filter(|far| far.passed && point.violation() > TORN * self.size).is_some()
+        };
+        if !work.points.iter().any(torn) {
+            return false;
+        }
+        let mut marks = std::mem::take(&mut work.marks);
+        marks.clear();
+        marks.resize(self.len(), 0);
+        let mut grounded = false;
+        for point in work.points.iter().filter(|point| torn(point)) {
+            for member in [Some(point.member), point.far.map(|far| far.member)].into_iter().flatten() {
+                marks[member] = 1;
+                grounded |= !self.view(member).kernel.model.is_free();
+            }
+        }
+        self.stop(|member| marks[member] == 1, grounded);
+        let stopped =
+            |point: &Point| marks[point.member] == 1 || point.far.is_some_and(|far| marks[far.member] == 1);
+        work.points.retain(|point| !stopped(point));
+        work.marks = marks;
+        true
     }
 
     /// Stores what the next step needs and what users read.
@@ -545,9 +599,9 @@ struct Common {
 }
 
 impl Common {
-    fn of<P: Member>(group: &Group<'_, P>) -> Self {
+    fn of<P: Member>(group: &Group<'_, P>, counts: &impl Fn(usize) -> bool) -> Self {
         let (mut mass, mut center, mut linear) = (0.0, Vector3::zeros(), Vector3::zeros());
-        for member in 0..group.len() {
+        for member in (0..group.len()).filter(|&member| counts(member)) {
             let View { kernel, state, .. } = group.view(member);
             let own = kernel.model.mass();
             mass += own;
@@ -556,7 +610,7 @@ impl Common {
         }
         let (center, velocity) = (center / mass, linear / mass);
         let (mut inertia, mut angular) = (Matrix3::zeros(), Vector3::zeros());
-        for member in 0..group.len() {
+        for member in (0..group.len()).filter(|&member| counts(member)) {
             let View { kernel, state, .. } = group.view(member);
             let arm = Vector3::from(state.frame.center()) - center;
             let momentum = kernel.model.mass() * (Vector3::from(state.frame.velocity()) - velocity);
