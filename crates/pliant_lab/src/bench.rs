@@ -157,8 +157,10 @@ fn once(work: &mut impl FnMut()) -> f64 {
     start.elapsed().as_secs_f64() * 1e6
 }
 
+/// Percentiles of some times. Without any time they are zero.
 pub(crate) fn percentiles(mut samples: Vec<f64>) -> Percentiles {
     samples.sort_by(f64::total_cmp);
-    let at = |part: f64| samples[((samples.len() - 1) as f64 * part) as usize];
+    let last = samples.len().saturating_sub(1) as f64;
+    let at = |part: f64| samples.get((last * part) as usize).copied().unwrap_or(0.0);
     Percentiles { p50: at(0.5), p99: at(0.99), p999: at(0.999) }
 }
