@@ -95,7 +95,7 @@ impl Default for Contacts {
             modes: 0,
             memory: Vec::new(),
             touching: Touching::default(),
-            hands: Vec::new(),
+            hands: Vec::with_capacity(crate::Body::MAX_GRABS),
             theta: 0.5,
             lost: 0.0,
             list: Vec::new(),
