@@ -7,7 +7,7 @@ use std::sync::Arc;
 use pliant_bake::{Bake, BakeConfig, Material, PrescribedPatch, StaticLoads, bake, deflect};
 use pliant_mesh::{TetMesh, shapes};
 use pliant_modal::{
-    Body, BodyConfig, Elasticity, GrabConfig, GrabId, HeldShapes, ModalModel, Patch, StepSettings,
+    Body, BodyConfig, Elasticity, GrabConfig, GrabId, HeldShapes, ModalModel, Patch, StepError, StepSettings,
 };
 
 type Vector = [f64; 3];
@@ -79,7 +79,7 @@ fn errors(mesh: &TetMesh, model: &Arc<ModalModel>, hands: &[(Patch, Vector)]) ->
             .iter()
             .map(|(patch, way)| (body.grab(patch, GrabConfig::default()).unwrap(), *way))
             .collect();
-        body.set_held_shapes(shapes);
+        body.set_held_shapes(shapes).unwrap();
         lead(&mut body, &grabs);
         let size = full.reactions.iter().map(|&force| norm(force)).fold(0.0, f64::max);
         let off = grabs.iter().zip(&full.reactions);
@@ -133,7 +133,7 @@ fn shapes_are_the_same_every_time_and_go_with_the_last_grab() {
     assert!(make() == make());
     let mut body = reduced(&model, 1.0 / 60.0, 1.0);
     let grab = body.grab(&patch, GrabConfig::default()).unwrap();
-    body.set_held_shapes(Some(Arc::new(make())));
+    body.set_held_shapes(Some(Arc::new(make()))).unwrap();
     lead(&mut body, &[(grab, [0.0, 0.1, 0.0])]);
     assert!(body.state().s.iter().any(|s| *s != 0.0));
     body.release(grab);
@@ -144,6 +144,16 @@ fn shapes_are_the_same_every_time_and_go_with_the_last_grab() {
     parts.reduced.as_mut().unwrap().mesh = None;
     let bare = ModalModel::from_parts(parts).unwrap();
     assert!(HeldShapes::new(&bare, std::slice::from_ref(&patch)).unwrap().is_none());
+    // Shapes of another model are refused, and a linear body drops its own.
+    let other = self::model(&slender(), &BakeConfig { modes: 20, ..config() });
+    let mut stranger = reduced(&other, 1.0 / 60.0, 1.0);
+    assert_eq!(stranger.set_held_shapes(Some(Arc::new(make()))), Err(StepError::OtherModel));
+    body.grab(&patch, GrabConfig::default()).unwrap();
+    body.set_held_shapes(Some(Arc::new(make()))).unwrap();
+    let linear = StepSettings::default();
+    body.reconfigure(linear.into()).unwrap();
+    assert!(body.state().s.is_empty());
+    body.step().unwrap();
     // Files keep the mesh to the bit.
     assert!(ModalModel::from_bytes(&model.to_bytes()).unwrap() == *model);
 }
@@ -157,7 +167,7 @@ fn a_hand_that_gets_its_shapes_late_feels_no_kick() {
     let grab = body.grab(&patch, GrabConfig::default()).unwrap();
     lead(&mut body, &[(grab, [0.0, 0.04, 0.04])]);
     let before = body.reaction(grab).unwrap();
-    body.set_held_shapes(Some(shapes));
+    body.set_held_shapes(Some(shapes)).unwrap();
     let mut most = 0.0f64;
     for _ in 0..120 {
         body.step().unwrap();
@@ -187,7 +197,7 @@ fn jerks_folds_and_tearing_stay_calm_with_shapes() {
     for (name, rate, first, second) in cases {
         let mut body = reduced(&model, 1.0 / rate, 1.0);
         let grabs = [&end, &side].map(|patch| body.grab(patch, GrabConfig::default()).unwrap());
-        body.set_held_shapes(Some(shapes.clone()));
+        body.set_held_shapes(Some(shapes.clone())).unwrap();
         for (grab, way) in grabs.iter().zip([first, second]) {
             let at = body.target(*grab).unwrap();
             body.set_target(*grab, std::array::from_fn(|k| at[k] + way[k])).unwrap();
@@ -220,4 +230,26 @@ fn jerks_folds_and_tearing_stay_calm_with_shapes() {
         assert!(turn <= 0.02, "{name}: {turn}");
         assert!(most <= energy * (1.0 + 1e-9), "{name}: {most} after {energy}");
     }
+}
+
+#[test]
+fn a_free_bar_between_two_hands_with_shapes_pulls_both_alike() {
+    let config = BakeConfig { anchors: Vec::new(), ..config() };
+    let model = model(&slender(), &config);
+    let ends = [[0.0, 0.05, 0.1], [1.0, 0.05, 0.1]];
+    let patches = ends.map(|at| Patch::around(model.surface(), vertex(&model, at), 0.05).unwrap());
+    let own = HeldShapes::new(&model, &patches).unwrap().map(Arc::new);
+    assert!(own.is_some());
+    let mut body = reduced(&model, 1.0 / 60.0, 30.0);
+    let grabs = patches.each_ref().map(|patch| body.grab(patch, GrabConfig::default()).unwrap());
+    body.set_held_shapes(own).unwrap();
+    lead(&mut body, &[(grabs[0], [-0.1, 0.0, 0.0]), (grabs[1], [0.1, 0.05, 0.0])]);
+    let [a, b] = grabs.map(|grab| body.reaction(grab).unwrap());
+    let sum = norm(std::array::from_fn(|k| a[k] + b[k]));
+    println!("a free bar pulls with {a:.2?} N and {b:.2?} N");
+    assert!(sum < 1e-3 * norm(a) && norm(a) > 50.0, "{a:?} {b:?}");
+    // Nothing holds the shapes where the region is the whole body.
+    let cube = self::model(&shapes::cube(3, 0.1).unwrap(), &config);
+    let patch = Patch::around(cube.surface(), 0, 0.2).unwrap();
+    assert!(HeldShapes::new(&cube, std::slice::from_ref(&patch)).unwrap().is_none());
 }

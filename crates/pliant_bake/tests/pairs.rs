@@ -175,6 +175,10 @@ fn equal_balls_head_on_exchange_their_velocities_in_the_time_of_hertz() {
                 after[1].hypot(after[2]) / speed,
             );
             assert!(gain < 1e-9, "{name}: {gain}");
+            // Steps at the end of an impact lose some of the energy, as with planes.
+            let (time, force) = (touched as f64 / steps, most / (k * deepest.powf(1.5)));
+            assert!((time - 1.0).abs() < 0.08 && (force - 1.0).abs() < 0.1, "{name}: {time}, {force}");
+            assert!(e > if steps > 60.0 { 0.93 } else { 0.8 }, "{name}: {e}");
         }
     }
 }

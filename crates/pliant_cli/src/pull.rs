@@ -64,7 +64,7 @@ fn text(pulled: &Pulled) -> String {
          reaction         {} N ({force:.6})\n\
          reaction / way   {stiffness}\n\
          elastic energy   {:.6e} J\n\
-         elasticity       {}\n\
+         elasticity       {}{}\n\
          step             {:.2} us (99 %: {:.2}, 99.9 %: {:.2})",
         list(&pulled.patch),
         pulled.vertices.len(),
@@ -75,6 +75,9 @@ fn text(pulled: &Pulled) -> String {
             || pulled.elasticity.to_string(),
             |material| format!("{}, {material}", pulled.elasticity)
         ),
+        pulled
+            .shapes_ms
+            .map_or_else(String::new, |ms| format!(", with shapes of the patch, made in {ms:.0} ms")),
         t.p50,
         t.p99,
         t.p999

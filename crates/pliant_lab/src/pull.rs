@@ -116,7 +116,7 @@ pub fn pull(model: &Arc<ModalModel>, pull: &Pull) -> Result<Pulled, LabError> {
         None
     };
     let shapes_ms = shapes.as_ref().map(|_| begun.elapsed().as_secs_f64() * 1e3);
-    body.set_held_shapes(shapes);
+    body.set_held_shapes(shapes)?;
     let start = Vector3::from(body.grab_position(grab)?);
     let by = Vector3::from(pull.by);
 

@@ -162,7 +162,11 @@ impl Body {
             *force = resisted(&self.kernel, &self.state, &before, i);
         }
         let settings = config.settings;
+        let shapes = self.kernel.held_shapes().cloned();
         self.kernel.reconfigure(settings, config.step)?;
+        if let Some(shapes) = shapes.filter(|_| self.kernel.held_shapes().is_none()) {
+            shapes.leave(&mut self.state);
+        }
         self.kernel.prepare(&self.hands);
         self.config = BodyConfig { modes: self.config.modes, ..config };
         let flows = if settings.relaxation.is_some() { self.mode_count() } else { 0 };
@@ -289,7 +293,8 @@ impl Body {
             self.grabs.remove(index);
             self.hands.remove(index);
             if self.hands.is_empty() {
-                self.set_held_shapes(None);
+                // No shapes are always taken, and the state is this body's own.
+                let _ = self.set_held_shapes(None);
             }
             self.kernel.prepare(&self.hands);
         }
@@ -298,10 +303,14 @@ impl Body {
     /// Sets the own shapes of the patches that are held, with which a body of reduced elasticity
     /// feels the right force in a hand ([`HeldShapes`]). Linear elasticity does not use them.
     ///
-    /// The shapes go when the last grab is released.
-    pub fn set_held_shapes(&mut self, shapes: Option<Arc<HeldShapes>>) {
-        self.kernel.set_held_shapes(shapes, &mut self.state, &self.hands);
+    /// The shapes go when the last grab is released, and when the elasticity becomes linear.
+    ///
+    /// # Errors
+    /// Returns [`StepError::OtherModel`] for shapes of another model. The old ones then stay.
+    pub fn set_held_shapes(&mut self, shapes: Option<Arc<HeldShapes>>) -> Result<(), StepError> {
+        self.kernel.set_held_shapes(shapes, &mut self.state, &self.hands)?;
         self.kernel.prepare(&self.hands);
+        Ok(())
     }
 
     /// The grabs on the body, oldest first.

@@ -138,6 +138,9 @@ pub enum StepError {
     /// The grab does not exist on this body, or was released.
     #[error("no such grab on this body")]
     NoGrab,
+    /// The shapes of held patches were made for another model.
+    #[error("the shapes of held patches are those of another model")]
+    OtherModel,
     /// The body already has the maximum number of grabs.
     #[error("a body takes at most {limit} grabs")]
     TooManyGrabs {

@@ -21,7 +21,8 @@ pub use mesh::{SimulationMesh, VertexPlace};
 
 use self::region::Region;
 use crate::{
-    ElasticEnergy, HeldPatch, Hyperelastic, ModalModel, Patch, ReducedElasticity, State, StepError,
+    ElasticEnergy, HeldPatch, Hyperelastic, ModalModel, ModelHash, Patch, ReducedElasticity, State,
+    StepError,
     cubature::{self, Fit, Point},
     nonlinear::Gradients,
     step::{contact_floor, residual},
@@ -73,6 +74,7 @@ pub(crate) fn key(patch: &Patch) -> PatchKey {
 /// They are made once, which takes a fraction of a second, and shared by all copies of the body.
 #[derive(Debug, Clone, PartialEq)]
 pub struct HeldShapes {
+    model: ModelHash,
     keys: Vec<PatchKey>,
     /// Mean displacement of each patch by the columns, `[axis][column]`, m.
     rows: Vec<cubature::Rows>,
@@ -93,7 +95,8 @@ impl HeldShapes {
     /// Makes the shapes of patches of a model. The result is the same on every machine.
     ///
     /// Returns `None` for a model without reduced elasticity or without its simulation mesh, for no
-    /// patch and for more than four, and for patches that nothing moves.
+    /// patch and for more than four, for patches that nothing moves, and for a free body that is no
+    /// larger than the region around a patch, where nothing holds the shapes.
     ///
     /// # Errors
     /// Returns [`StepError::Vertex`] if a patch belongs to another surface.
@@ -117,23 +120,36 @@ impl HeldShapes {
         let places: Vec<(Vector3<f64>, f64)> = patches.iter().map(|p| (middle(p), p.radius())).collect();
         let law = model.law(reduced.material, 1.0);
         let region = Region::new(mesh, model.info().element, law, &places, model.size());
+        if !region.is_held() {
+            return Ok(None);
+        }
         let Some((columns, width)) = columns(&region, patches, law) else { return Ok(None) };
         let coupling = region.coupling(&columns, width);
+        // Numbers of a file may be so large that they overflow here.
+        if !columns.iter().chain(&coupling).all(|x| x.is_finite()) {
+            return Ok(None);
+        }
         let mut rows = Vec::with_capacity(patches.len());
+        let mut whole = Vec::with_capacity(patches.len());
         let mut residuals = Vec::with_capacity(patches.len());
         for patch in patches {
-            let (own, modal) = region.rows(patch, &columns, width);
+            let (own, modal) = region.mean(&region.load(patch), &columns, width);
+            if !own.iter().chain(&modal).flatten().all(|x| x.is_finite()) {
+                return Ok(None);
+            }
             residuals.push(left_over(model, patch, &own, &modal, &coupling)?);
+            let joined = |axis: usize| own[axis].iter().chain(&modal[axis]).copied().collect();
+            whole.push(std::array::from_fn(joined));
             rows.push(own);
         }
-        let stiffness = stiffness(model, &coupling, width);
-        let made = rule(model, &region, law, &columns, width, &rows, patches, &stiffness);
-        let Some(rule) = made else { return Ok(None) };
+        let columns = Columns { values: &columns, width, stiffness: &stiffness(model, &coupling, width) };
+        let Some(rule) = rule(model, &region, law, &columns, &whole) else { return Ok(None) };
+        let columns = columns.values;
         let omega: Vec<f64> = std::iter::repeat_n(1.0, width).chain(model.omega().iter().copied()).collect();
         let (mut vertices, mut displacements) = (Vec::new(), Vec::new());
         let mut at = vec![0.0; 3 * width];
         for vertex in 0..count as u32 {
-            if region.columns_at(vertex, &columns, width, &mut at) {
+            if region.columns_at(vertex, columns, width, &mut at) {
                 vertices.push(vertex);
                 displacements.extend(at.iter().map(|&x| x as f32));
             }
@@ -142,13 +158,28 @@ impl HeldShapes {
             rule.iter().flat_map(|point| point.gradients.iter().map(|&x| x as f32)).collect();
         let weights = rule.iter().map(|point| point.weight).collect();
         let gradients = Arc::new(Gradients::new(&gradients, &omega));
-        let keys = patches.iter().map(key).collect();
+        let (model_hash, keys) = (model.hash(), patches.iter().map(key).collect());
         let mut parts = coupling;
         for (row, omega) in parts.chunks_exact_mut(width).zip(model.omega()) {
             row.iter_mut().for_each(|x| *x /= omega * omega);
         }
-        let columns = width;
-        Ok(Some(Self { keys, rows, residuals, columns, parts, gradients, weights, vertices, displacements }))
+        Ok(Some(Self {
+            model: model_hash,
+            keys,
+            rows,
+            residuals,
+            columns: width,
+            parts,
+            gradients,
+            weights,
+            vertices,
+            displacements,
+        }))
+    }
+
+    /// Whether these are shapes of a model.
+    pub(crate) fn are_of_model(&self, model: &ModalModel) -> bool {
+        self.model == model.hash()
     }
 
     /// Number of columns.
@@ -318,18 +349,25 @@ fn stiffness(model: &ModalModel, coupling: &[f64], width: usize) -> Vec<f64> {
     out
 }
 
-/// Makes the rule of columns and coordinates. Returns `None` if no shape can be found.
-#[expect(clippy::too_many_arguments, reason = "one caller, which has all of it at hand")]
+/// Columns on a region.
+struct Columns<'a> {
+    /// Displacements, `[node][axis][column]`.
+    values: &'a [f64],
+    width: usize,
+    /// Stiffness of columns and coordinates at rest, row by row.
+    stiffness: &'a [f64],
+}
+
+/// Makes the rule of columns and coordinates. `patches` has the mean displacements of the patches
+/// by both. Returns `None` if no shape can be found.
 fn rule(
     model: &ModalModel,
     region: &Region<'_>,
     law: Hyperelastic,
-    columns: &[f64],
-    width: usize,
-    rows: &[cubature::Rows],
-    patches: &[Patch],
-    stiffness: &[f64],
+    columns: &Columns<'_>,
+    patches: &[cubature::Rows],
 ) -> Option<Vec<Point>> {
+    let Columns { values: columns, width, stiffness } = *columns;
     let omega: Vec<f64> = std::iter::repeat_n(1.0, width).chain(model.omega().iter().copied()).collect();
     let m = omega.len();
     let inside = region.inside(columns, width);
@@ -348,14 +386,11 @@ fn rule(
     let most = ENERGY * model.info().young * energy.volume();
     let ways = WAYS.map(|way| way * model.size());
     let mut shapes = Vec::new();
-    for (own, patch) in rows.iter().zip(patches) {
-        let (_, modal) = region.rows(patch, columns, width);
-        let patch: cubature::Rows =
-            std::array::from_fn(|axis| own[axis].iter().chain(&modal[axis]).copied().collect());
+    for patch in patches {
         for direction in
             [Vector3::x(), -Vector3::x(), Vector3::y(), -Vector3::y(), Vector3::z(), -Vector3::z()]
         {
-            shapes.extend(cubature::led(&mut energy, &omega, &patch, &direction, &ways, most));
+            shapes.extend(cubature::led(&mut energy, &omega, patch, &direction, &ways, most));
         }
     }
     let whole = || reference.iter().chain(&inside);
@@ -400,11 +435,6 @@ fn thinned(points: &[Point], most: usize) -> Vec<Point> {
 }
 
 impl Region<'_> {
-    /// Mean displacement of a patch by the columns and by the coordinates, `[axis][..]`.
-    fn rows(&self, patch: &Patch, columns: &[f64], width: usize) -> (cubature::Rows, cubature::Rows) {
-        self.mean(&self.load(patch), columns, width)
-    }
-
     /// All quadrature points of the region's elements.
     fn inside(&self, columns: &[f64], width: usize) -> Vec<Point> {
         let points = tetrahedron::stiffness_points(self.kind()).0.len();

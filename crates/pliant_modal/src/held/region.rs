@@ -121,6 +121,11 @@ impl<'a> Region<'a> {
         Self { mesh, kind, elements, nodes, affine, numbers, connectivity, free, stiffness }
     }
 
+    /// Whether every patch's shapes are held somewhere: at an anchor or where the region ends.
+    pub(super) fn is_held(&self) -> bool {
+        self.free.iter().all(|free| free.iter().any(|free| !free))
+    }
+
     /// Number of nodes.
     pub(super) fn node_count(&self) -> usize {
         self.numbers.len()

@@ -229,13 +229,26 @@ impl Kernel {
     /// Hands on other patches feel what the modes leave out as a compliance, as all hands do
     /// without shapes. The shapes of `state` come to rest under the forces of `hands`, so that
     /// these go on as they were.
-    pub fn set_held_shapes(&mut self, shapes: Option<Arc<HeldShapes>>, state: &mut State, hands: &[Hand]) {
+    ///
+    /// # Errors
+    /// Returns [`StepError::OtherModel`] for shapes of another model, and [`StepError::Length`] for
+    /// a state of another size. Nothing then changes.
+    pub fn set_held_shapes(
+        &mut self,
+        shapes: Option<Arc<HeldShapes>>,
+        state: &mut State,
+        hands: &[Hand],
+    ) -> Result<(), StepError> {
+        if shapes.as_ref().is_some_and(|shapes| !shapes.are_of_model(&self.model)) {
+            return Err(StepError::OtherModel);
+        }
+        self.check_lengths(state)?;
         if let Some(old) = self.held_shapes() {
             old.leave(state);
         }
         state.s.clear();
-        if self.elastic.is_none() || self.check_lengths(state).is_err() {
-            return;
+        if self.elastic.is_none() {
+            return Ok(());
         }
         self.elastic = elastic(&self.model, &self.settings, &self.modes, self.h, shapes);
         self.responses.forget();
@@ -244,6 +257,7 @@ impl Kernel {
         if let Some(elastic) = &mut self.elastic {
             elastic.settle(state, pulls);
         }
+        Ok(())
     }
 
     /// The own shapes of held patches that the steps use.
@@ -325,6 +339,7 @@ impl Kernel {
     pub fn check(&self, state: &State) -> Result<(), StepError> {
         self.check_lengths(state)?;
         let slices = [("q", &state.q), ("v", &state.v), ("a", &state.a), ("f", &state.f), ("z", &state.z)];
+        let slices = slices.into_iter().chain([("s", &state.s)]);
         slices.into_iter().try_for_each(|(what, slice)| crate::error::finite(what, slice))?;
         state.frame.check()
     }
