@@ -72,6 +72,7 @@ pub struct Body {
     spare: State,
     resisted: Vec<f64>,
     single: Vec<f32>,
+    drawn: Vec<f64>,
 }
 
 #[derive(Debug, Clone)]
@@ -108,6 +109,7 @@ impl Body {
             next_grab: 1,
             contacts: Contacts::default(),
             single: vec![0.0; zero.len()],
+            drawn: zero.clone(),
             resisted: zero,
             kernel,
         })
@@ -162,10 +164,9 @@ impl Body {
             *force = resisted(&self.kernel, &self.state, &before, i);
         }
         let settings = config.settings;
-        let shapes = self.kernel.held_shapes().cloned();
         self.kernel.reconfigure(settings, config.step)?;
-        if let Some(shapes) = shapes.filter(|_| self.kernel.held_shapes().is_none()) {
-            shapes.leave(&mut self.state);
+        if self.kernel.held_shapes().is_none() {
+            self.state.s.clear();
         }
         self.kernel.prepare(&self.hands);
         self.config = BodyConfig { modes: self.config.modes, ..config };
@@ -564,7 +565,11 @@ impl Body {
         if out.len() < expected {
             return Err(StepError::Length { what: "positions", expected, got: out.len() });
         }
-        for (s, q) in self.single.iter_mut().zip(&self.state.q) {
+        self.drawn.copy_from_slice(&self.state.q);
+        if let Some(shapes) = self.kernel.held_shapes() {
+            shapes.draw(&self.state.s, &mut self.drawn);
+        }
+        for (s, q) in self.single.iter_mut().zip(&self.drawn) {
             *s = *q as f32;
         }
         self.kernel.model().basis_in(self.config.precision).reconstruct(

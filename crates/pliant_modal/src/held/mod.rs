@@ -5,8 +5,16 @@
 //! shapes of second order of their pairs (modal derivatives of the static shapes, S. R. Idelsohn
 //! and A. Cardona, *A reduction method for nonlinear structural dynamic analysis*, CMAME 49, 1985).
 //! These columns are solved on the elements around the patch when a hand takes hold, and vanish
-//! beyond them, where the coordinates suffice. Together with the coordinates they get a cubature
-//! rule of their own.
+//! beyond them, where the coordinates suffice. What the coordinates have of them is then taken out,
+//! so that coordinates mean the same with and without the columns:
+//!
+//! ```text
+//! u = Phi q + (X - Phi P) s,   P = Lambda^-1 Phi^T K X
+//! ```
+//!
+//! These are the residual attachment modes of substructuring (R. R. Craig and C.-J. Chang, *On the
+//! use of attachment modes in substructure coupling for dynamic analysis*, 1977). Together with the
+//! coordinates they get a cubature rule of their own.
 //!
 //! The columns have no mass: their coordinates `s` are those of least energy in every step.
 
@@ -21,8 +29,7 @@ pub use mesh::{SimulationMesh, VertexPlace};
 
 use self::region::Region;
 use crate::{
-    ElasticEnergy, HeldPatch, Hyperelastic, ModalModel, ModelHash, Patch, ReducedElasticity, State,
-    StepError,
+    ElasticEnergy, HeldPatch, Hyperelastic, ModalModel, ModelHash, Patch, ReducedElasticity, StepError,
     cubature::{self, Fit, Point},
     nonlinear::Gradients,
     step::{contact_floor, residual},
@@ -31,6 +38,9 @@ use crate::{
 
 /// Combinations of columns with less than this share of the largest energy are rounding errors.
 const LEAST: f64 = 1e-6;
+
+/// Combinations of columns of which the coordinates have all but this share of the energy end.
+const NEW: f64 = 1e-3;
 
 /// Number of points outside of the region to choose from.
 const OUTSIDE: usize = 400;
@@ -81,7 +91,7 @@ pub struct HeldShapes {
     /// What is left of the residual flexibility of each patch at the baked stiffness, m/N.
     residuals: Vec<Matrix3<f64>>,
     columns: usize,
-    /// `Lambda^-1 Phi^T K S`: the coordinates' part in each column, `[coordinate][column]`.
+    /// The coordinates' part `P` that is taken out of each column, `[coordinate][column]`.
     parts: Vec<f64>,
     /// The rule, with the columns before the coordinates.
     gradients: Arc<Gradients>,
@@ -123,33 +133,32 @@ impl HeldShapes {
         if !region.is_held() {
             return Ok(None);
         }
-        let Some((columns, width)) = columns(&region, patches, law) else { return Ok(None) };
-        let coupling = region.coupling(&columns, width);
-        // Numbers of a file may be so large that they overflow here.
-        if !columns.iter().chain(&coupling).all(|x| x.is_finite()) {
+        let Some(columns) = columns(&region, patches, law).and_then(|c| c.beside(model, &region)) else {
             return Ok(None);
-        }
+        };
+        let width = columns.width;
         let mut rows = Vec::with_capacity(patches.len());
         let mut whole = Vec::with_capacity(patches.len());
         let mut residuals = Vec::with_capacity(patches.len());
         for patch in patches {
-            let (own, modal) = region.mean(&region.load(patch), &columns, width);
+            let (mut own, modal) = region.mean(&region.load(patch), &columns.values, width);
+            for (own, modal) in own.iter_mut().zip(&modal) {
+                columns.take_out(modal, own);
+            }
             if !own.iter().chain(&modal).flatten().all(|x| x.is_finite()) {
                 return Ok(None);
             }
-            residuals.push(left_over(model, patch, &own, &modal, &coupling)?);
+            residuals.push(left_over(model, patch, &own)?);
             let joined = |axis: usize| own[axis].iter().chain(&modal[axis]).copied().collect();
             whole.push(std::array::from_fn(joined));
             rows.push(own);
         }
-        let columns = Columns { values: &columns, width, stiffness: &stiffness(model, &coupling, width) };
         let Some(rule) = rule(model, &region, law, &columns, &whole) else { return Ok(None) };
-        let columns = columns.values;
         let omega: Vec<f64> = std::iter::repeat_n(1.0, width).chain(model.omega().iter().copied()).collect();
         let (mut vertices, mut displacements) = (Vec::new(), Vec::new());
         let mut at = vec![0.0; 3 * width];
         for vertex in 0..count as u32 {
-            if region.columns_at(vertex, columns, width, &mut at) {
+            if region.columns_at(vertex, &columns.values, width, &mut at) {
                 vertices.push(vertex);
                 displacements.extend(at.iter().map(|&x| x as f32));
             }
@@ -159,17 +168,13 @@ impl HeldShapes {
         let weights = rule.iter().map(|point| point.weight).collect();
         let gradients = Arc::new(Gradients::new(&gradients, &omega));
         let (model_hash, keys) = (model.hash(), patches.iter().map(key).collect());
-        let mut parts = coupling;
-        for (row, omega) in parts.chunks_exact_mut(width).zip(model.omega()) {
-            row.iter_mut().for_each(|x| *x /= omega * omega);
-        }
         Ok(Some(Self {
             model: model_hash,
             keys,
             rows,
             residuals,
             columns: width,
-            parts,
+            parts: columns.parts,
             gradients,
             weights,
             vertices,
@@ -219,23 +224,14 @@ impl HeldShapes {
         self.residuals.get(self.find(patch)?).copied()
     }
 
-    /// Writes how the coordinates give way to the columns, so that both together are the part of
-    /// the columns that the coordinates have not: `-Lambda^-1 Phi^T K S s`.
-    pub(crate) fn yielding(&self, s: &[f64], out: &mut [f64]) {
-        for (out, row) in out.iter_mut().zip(self.parts.chunks_exact(self.columns)) {
-            *out = -row.iter().zip(s).map(|(part, s)| part * s).sum::<f64>();
+    /// Takes the coordinates' part out of coordinates that draw a surface: `q - P s`. The columns'
+    /// own part of the surface is [`HeldShapes::add_to`].
+    pub fn draw(&self, s: &[f64], q: &mut [f64]) {
+        if s.len() == self.columns {
+            for (q, row) in q.iter_mut().zip(self.parts.chunks_exact(self.columns)) {
+                *q -= row.iter().zip(s).map(|(part, s)| part * s).sum::<f64>();
+            }
         }
-    }
-
-    /// Gives the coordinates their part of the columns, which end.
-    pub(crate) fn leave(&self, state: &mut State) {
-        if state.s.len() != self.columns || state.q.len() * self.columns != self.parts.len() {
-            return;
-        }
-        for (q, row) in state.q.iter_mut().zip(self.parts.chunks_exact(self.columns)) {
-            *q += row.iter().zip(&state.s).map(|(part, s)| part * s).sum::<f64>();
-        }
-        state.s.clear();
     }
 
     /// The rule: gradients and weights, with the columns before the coordinates.
@@ -243,23 +239,38 @@ impl HeldShapes {
         (self.gradients.clone(), &self.weights)
     }
 
+    /// Surface vertices that the columns move, ascending.
+    pub fn vertices(&self) -> &[u32] {
+        &self.vertices
+    }
+
+    /// Displacements of [`HeldShapes::vertices`] by the columns at `s`, m, body axes, besides those
+    /// of the coordinates. They are zero if `s` has not one entry per column.
+    pub fn displacements<'a>(&'a self, s: &'a [f64]) -> impl Iterator<Item = [f32; 3]> + 'a {
+        let is_sound = s.len() == self.columns;
+        self.displacements.chunks_exact(3 * self.columns).map(move |rows| {
+            let mut out = [0.0; 3];
+            if is_sound {
+                for (out, row) in out.iter_mut().zip(rows.chunks_exact(self.columns)) {
+                    *out = row.iter().zip(s).map(|(u, s)| u * *s as f32).sum();
+                }
+            }
+            out
+        })
+    }
+
     /// Adds the displacements by the columns to a surface, m. `s` has one entry per column.
-    pub(crate) fn add_to(&self, s: &[f64], surface: &mut [[f32; 3]]) {
-        if s.len() != self.columns {
-            return;
-        }
-        let rows = self.displacements.chunks_exact(3 * self.columns);
-        for (&vertex, rows) in self.vertices.iter().zip(rows) {
-            let Some(position) = surface.get_mut(vertex as usize) else { continue };
-            for (x, row) in position.iter_mut().zip(rows.chunks_exact(self.columns)) {
-                *x += row.iter().zip(s).map(|(u, s)| u * *s as f32).sum::<f32>();
+    pub fn add_to(&self, s: &[f64], surface: &mut [[f32; 3]]) {
+        for (&vertex, moved) in self.vertices.iter().zip(self.displacements(s)) {
+            if let Some(position) = surface.get_mut(vertex as usize) {
+                position.iter_mut().zip(moved).for_each(|(x, moved)| *x += moved);
             }
         }
     }
 }
 
-/// Makes the columns of all patches, `[node][axis][column]`, with `X^T K X` the identity.
-fn columns(region: &Region<'_>, patches: &[Patch], law: Hyperelastic) -> Option<(Vec<f64>, usize)> {
+/// Makes the columns of all patches, with `X^T K X` the identity.
+fn columns(region: &Region<'_>, patches: &[Patch], law: Hyperelastic) -> Option<Columns> {
     let width = 9 * patches.len();
     let mut all = vec![0.0; 3 * region.node_count() * width];
     for (index, patch) in patches.iter().enumerate() {
@@ -276,86 +287,90 @@ fn columns(region: &Region<'_>, patches: &[Patch], law: Hyperelastic) -> Option<
     let scaled = DMatrix::from_fn(width, width, |i, j| {
         0.5 * scale[i] * scale[j] * (energies[i * width + j] + energies[j * width + i])
     });
-    if !scaled.iter().all(|x| x.is_finite()) {
-        return None;
+    let mut combine = orthonormal(scaled, LEAST)?;
+    for (mut row, scale) in combine.row_iter_mut().zip(&scale) {
+        row *= *scale;
     }
-    let eigen = scaled.symmetric_eigen();
-    let most = eigen.eigenvalues.max();
-    let mut kept: Vec<usize> =
-        (0..width).filter(|&k| eigen.eigenvalues[k] > LEAST * most && most > 0.0).collect();
-    kept.sort_by(|&a, &b| eigen.eigenvalues[b].total_cmp(&eigen.eigenvalues[a]).then(a.cmp(&b)));
-    if kept.is_empty() {
-        return None;
-    }
-    let combine = DMatrix::from_fn(width, kept.len(), |row, column| {
-        let k = kept[column];
-        scale[row] * eigen.eigenvectors[(row, k)] / eigen.eigenvalues[k].sqrt()
-    });
-    let mut out = Vec::with_capacity(all.len() / width * kept.len());
-    for row in all.chunks_exact(width) {
-        let entry =
-            |column: usize| row.iter().enumerate().map(|(k, x)| x * combine[(k, column)]).sum::<f64>();
-        out.extend((0..kept.len()).map(entry));
-    }
-    Some((out, kept.len()))
+    Some(Columns { values: combined(&all, &combine), width: combine.ncols(), parts: Vec::new() })
 }
 
 /// What is left of a patch's residual flexibility beside the columns, m/N: the static compliance
 /// minus that of coordinates and columns together, where it is positive.
-fn left_over(
-    model: &ModalModel,
-    patch: &Patch,
-    own: &cubature::Rows,
-    modal: &cubature::Rows,
-    coupling: &[f64],
-) -> Result<Matrix3<f64>, StepError> {
-    let (width, omega) = (own[0].len(), model.omega());
+fn left_over(model: &ModalModel, patch: &Patch, own: &cubature::Rows) -> Result<Matrix3<f64>, StepError> {
     let floor = contact_floor(model, patch);
     let whole = residual(model, patch, model.mode_count())? - Matrix3::identity() * floor;
-    let soft = |i: usize, j: usize| -> f64 {
-        let rows = coupling.chunks_exact(width).zip(omega);
-        rows.map(|(row, omega)| row[i] * row[j] / (omega * omega)).sum()
-    };
-    // The columns' stiffness where the coordinates give way.
-    let stiff = DMatrix::from_fn(width, width, |i, j| f64::from(u8::from(i == j)) - soft(i, j));
-    let rows = DMatrix::from_fn(width, 3, |column, axis| {
-        let along = coupling.chunks_exact(width).zip(omega).zip(&modal[axis]);
-        own[axis][column] - along.map(|((row, omega), x)| row[column] * x / (omega * omega)).sum::<f64>()
-    });
-    let eigen = stiff.symmetric_eigen();
-    let mut left = whole;
-    for (k, &value) in eigen.eigenvalues.iter().enumerate().filter(|(_, value)| **value > LEAST) {
-        let along = rows.tr_mul(&eigen.eigenvectors.column(k));
-        let along = Vector3::new(along[0], along[1], along[2]);
-        left -= along * along.transpose() / value;
-    }
+    let left =
+        Matrix3::from_fn(|i, j| whole[(i, j)] - own[i].iter().zip(&own[j]).map(|(a, b)| a * b).sum::<f64>());
     let eigen = (0.5 * (left + left.transpose())).symmetric_eigen();
     let kept = Matrix3::from_diagonal(&eigen.eigenvalues.map(|x| x.max(0.0) + floor));
     Ok(eigen.eigenvectors * kept * eigen.eigenvectors.transpose())
 }
 
-/// The stiffness of columns and coordinates at rest, row by row: both alone are diagonal.
-fn stiffness(model: &ModalModel, coupling: &[f64], width: usize) -> Vec<f64> {
-    let m = width + model.mode_count();
-    let mut out = vec![0.0; m * m];
-    (0..width).for_each(|k| out[k * m + k] = 1.0);
-    for (i, (omega, row)) in model.omega().iter().zip(coupling.chunks_exact(width)).enumerate() {
-        let i = width + i;
-        out[i * m + i] = omega * omega;
-        for (k, &x) in row.iter().enumerate() {
-            (out[i * m + k], out[k * m + i]) = (x, x);
-        }
-    }
-    out
+/// Columns on a region.
+struct Columns {
+    /// Displacements `X`, `[node][axis][column]`.
+    values: Vec<f64>,
+    width: usize,
+    /// The coordinates' part `P` that is taken out of them, `[coordinate][column]`.
+    parts: Vec<f64>,
 }
 
-/// Columns on a region.
-struct Columns<'a> {
-    /// Displacements, `[node][axis][column]`.
-    values: &'a [f64],
-    width: usize,
-    /// Stiffness of columns and coordinates at rest, row by row.
-    stiffness: &'a [f64],
+impl Columns {
+    /// Takes the coordinates' part out of columns that have energy one, and scales what is left to
+    /// energy one. Returns `None` if nothing is left.
+    fn beside(self, model: &ModalModel, region: &Region<'_>) -> Option<Self> {
+        let (width, omega) = (self.width, model.omega());
+        let coupling = region.coupling(&self.values, width);
+        let soft = |i: usize, j: usize| -> f64 {
+            let rows = coupling.chunks_exact(width).zip(omega);
+            rows.map(|(row, omega)| row[i] * row[j] / (omega * omega)).sum()
+        };
+        let left = DMatrix::from_fn(width, width, |i, j| f64::from(u8::from(i == j)) - soft(i, j));
+        let combine = orthonormal(left, NEW)?;
+        let values = combined(&self.values, &combine);
+        let mut parts = combined(&coupling, &combine);
+        for (row, omega) in parts.chunks_exact_mut(combine.ncols()).zip(omega) {
+            row.iter_mut().for_each(|x| *x /= omega * omega);
+        }
+        let is_sound = values.iter().chain(&parts).all(|x| x.is_finite());
+        is_sound.then_some(Self { values, width: combine.ncols(), parts })
+    }
+
+    /// Takes the coordinates' part out of a row of columns.
+    fn take_out(&self, modal: &[f64], row: &mut [f64]) {
+        for (modal, parts) in modal.iter().zip(self.parts.chunks_exact(self.width)) {
+            row.iter_mut().zip(parts).for_each(|(x, part)| *x -= modal * part);
+        }
+    }
+}
+
+/// The combinations of columns that have energy one each and none together, given the energies of
+/// all pairs. Those with less than a share of the largest energy end.
+fn orthonormal(energies: DMatrix<f64>, least: f64) -> Option<DMatrix<f64>> {
+    if !energies.iter().all(|x| x.is_finite()) {
+        return None;
+    }
+    let width = energies.ncols();
+    let eigen = energies.symmetric_eigen();
+    let most = eigen.eigenvalues.max();
+    let mut kept: Vec<usize> =
+        (0..width).filter(|&k| eigen.eigenvalues[k] > least * most && most > 0.0).collect();
+    kept.sort_by(|&a, &b| eigen.eigenvalues[b].total_cmp(&eigen.eigenvalues[a]).then(a.cmp(&b)));
+    if kept.is_empty() {
+        return None;
+    }
+    Some(DMatrix::from_fn(width, kept.len(), |row, column| {
+        let k = kept[column];
+        eigen.eigenvectors[(row, k)] / eigen.eigenvalues[k].sqrt()
+    }))
+}
+
+/// Combines columns of a matrix that is stored row by row.
+fn combined(rows: &[f64], combine: &DMatrix<f64>) -> Vec<f64> {
+    let entry =
+        |row: &[f64], column: usize| row.iter().zip(combine.column(column).iter()).map(|(x, c)| x * c).sum();
+    let rows = rows.chunks_exact(combine.nrows());
+    rows.flat_map(|row| (0..combine.ncols()).map(move |column| entry(row, column))).collect()
 }
 
 /// Makes the rule of columns and coordinates. `patches` has the mean displacements of the patches
@@ -364,14 +379,14 @@ fn rule(
     model: &ModalModel,
     region: &Region<'_>,
     law: Hyperelastic,
-    columns: &Columns<'_>,
+    columns: &Columns,
     patches: &[cubature::Rows],
 ) -> Option<Vec<Point>> {
-    let Columns { values: columns, width, stiffness } = *columns;
-    let omega: Vec<f64> = std::iter::repeat_n(1.0, width).chain(model.omega().iter().copied()).collect();
+    let omega: Vec<f64> =
+        std::iter::repeat_n(1.0, columns.width).chain(model.omega().iter().copied()).collect();
     let m = omega.len();
-    let inside = region.inside(columns, width);
-    let reference = region.outside(model.size(), REFERENCE, columns, width);
+    let inside = region.inside(columns);
+    let reference = region.outside(model.size(), REFERENCE, columns);
     let candidates: Vec<Point> =
         thinned(&reference, OUTSIDE).into_iter().chain(thinned(&inside, INSIDE)).collect();
     let coarse: Vec<Point> =
@@ -402,12 +417,15 @@ fn rule(
             sum
         })
         .collect();
+    // Columns and coordinates are orthogonal to each other in the stiffness at rest.
+    let mut stiffness = vec![0.0; m * m];
+    omega.iter().enumerate().for_each(|(i, omega)| stiffness[i * m + i] = omega * omega);
     let fit = Fit {
         law,
         omega: &omega,
         shapes: &shapes,
         forces: &forces,
-        stiffness,
+        stiffness: &stiffness,
         tolerance: TOLERANCE,
         most: POINTS_PER_COORDINATE * m,
     };
@@ -435,21 +453,31 @@ fn thinned(points: &[Point], most: usize) -> Vec<Point> {
 }
 
 impl Region<'_> {
+    /// A quadrature point of an element.
+    fn point(&self, element: u32, point: usize, weight: f64, columns: &Columns) -> Point {
+        let mut gradients = self.gradients(element, point, &columns.values, columns.width);
+        let all = gradients.len() / 9;
+        for row in gradients.chunks_exact_mut(all) {
+            let (own, modal) = row.split_at_mut(columns.width);
+            columns.take_out(modal, own);
+        }
+        Point { weight, gradients }
+    }
+
     /// All quadrature points of the region's elements.
-    fn inside(&self, columns: &[f64], width: usize) -> Vec<Point> {
+    fn inside(&self, columns: &Columns) -> Vec<Point> {
         let points = tetrahedron::stiffness_points(self.kind()).0.len();
         let make = |&element: &u32| {
             let (_, volume) = self.place(element);
             let weight = volume / points as f64;
-            (0..points)
-                .map(move |point| Point { weight, gradients: self.gradients(element, point, columns, width) })
+            (0..points).map(move |point| self.point(element, point, weight, columns))
         };
         self.elements.iter().flat_map(make).collect()
     }
 
     /// At most about `most` quadrature points outside of the region, spread over the body, with
     /// weights whose sum is the volume there.
-    fn outside(&self, size: f64, most: usize, columns: &[f64], width: usize) -> Vec<Point> {
+    fn outside(&self, size: f64, most: usize, columns: &Columns) -> Vec<Point> {
         let mut order: Vec<([i64; 3], u32, f64)> = (0..self.mesh_elements() as u32)
             .filter(|element| self.elements.binary_search(element).is_err())
             .map(|element| {
@@ -468,10 +496,7 @@ impl Region<'_> {
                 // All points of one element of each group, for the volume of the group.
                 let weight = members.iter().map(|(_, _, volume)| volume).sum::<f64>() / points as f64;
                 let (_, element, _) = members[(group * 7919) % members.len()];
-                (0..points).map(move |point| Point {
-                    weight,
-                    gradients: self.gradients(element, point, columns, width),
-                })
+                (0..points).map(move |point| self.point(element, point, weight, columns))
             })
             .collect()
     }

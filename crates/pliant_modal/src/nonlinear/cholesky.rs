@@ -72,14 +72,6 @@ impl Cholesky {
         }
     }
 
-    /// Replaces `x` by `U x`.
-    pub(crate) fn times_upper(&self, x: &mut [f64]) {
-        let n = self.n;
-        for j in 0..n {
-            x[j] = dot(&self.upper[j * n + j..(j + 1) * n], &x[j..n]);
-        }
-    }
-
     /// Writes the product of the factored matrix with `x`.
     pub(crate) fn multiply(&self, x: &[f64], out: &mut [f64]) {
         let n = self.n;

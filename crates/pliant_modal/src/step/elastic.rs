@@ -166,11 +166,8 @@ impl ElasticStep {
         self.rows.reserve(n.saturating_sub(self.rows.len()));
     }
 
-    /// Brings the columns to rest under the hands' forces (N, body axes). `state` is one without
-    /// columns.
-    ///
-    /// The coordinates give way, so that the shape changes only by what they had left out:
-    /// `u = Phi q + (S - Phi Lambda^-1 Phi^T K S) s`.
+    /// Brings the columns to rest under the hands' forces (N, body axes), while the coordinates stay
+    /// where they are.
     pub(crate) fn settle<'a>(
         &mut self,
         state: &mut State,
@@ -178,79 +175,46 @@ impl ElasticStep {
     ) {
         /// Number of Newton rounds.
         const ROUNDS: usize = 8;
-        let (columns, n) = (self.columns, self.q.len());
-        state.s.clear();
-        state.s.resize(columns, 0.0);
-        let Some(shapes) = self.shapes.clone() else { return };
-        join(columns, state, &mut self.begun);
-        // The forces that hold the coordinates where they are go on.
-        self.energy.linearize(&self.begun);
-        let mut load = self.energy.force().to_vec();
-        load[..columns].fill(0.0);
+        let columns = self.columns;
+        let Some(shapes) = self.shapes.clone() else {
+            state.s.clear();
+            return;
+        };
+        join(columns, state, &mut self.q);
+        let mut load = vec![0.0; columns];
         for (patch, pull) in pulls {
             let Some(rows) = shapes.rows(patch) else { continue };
             for (row, pull) in rows.iter().zip(pull.iter()) {
                 load.iter_mut().zip(row).for_each(|(load, u)| *load += pull * u);
             }
         }
-        let along = |s: &[f64], out: &mut [f64]| {
-            out[..columns].copy_from_slice(s);
-            shapes.yielding(s, &mut out[columns..]);
-        };
         let potential = |energy: &ElasticEnergy, q: &[f64]| {
             energy.energy(q) - load.iter().zip(q).map(|(f, q)| f * q).sum::<f64>()
         };
-        let unit = |k: usize| {
-            let mut s = vec![0.0; columns];
-            s[k] = 1.0;
-            let mut out = vec![0.0; n];
-            along(&s, &mut out);
-            out
-        };
-        let directions: Vec<Vec<f64>> = (0..columns).map(unit).collect();
-        let mut whole = Cholesky::new(n);
         let mut factor = Cholesky::new(columns);
-        let mut s = vec![0.0; columns];
-        self.q.copy_from_slice(&self.begun);
         for _ in 0..ROUNDS {
             self.energy.linearize(&self.q);
-            for (i, row) in whole.matrix().chunks_exact_mut(n).enumerate() {
+            for (i, row) in factor.matrix().chunks_exact_mut(columns).enumerate() {
                 self.energy.tangent_row(i, &mut row[i..]);
             }
-            whole.factor();
-            let mut half = directions.clone();
-            half.iter_mut().for_each(|row| whole.times_upper(row));
-            for (i, row) in factor.matrix().chunks_exact_mut(columns).enumerate() {
-                for (k, entry) in row.iter_mut().enumerate().skip(i) {
-                    *entry = dot(&half[i], &half[k]);
-                }
-            }
             factor.factor();
-            let missing: Vec<f64> =
-                load.iter().zip(self.energy.force()).map(|(load, force)| load - force).collect();
-            let mut way: Vec<f64> = directions.iter().map(|direction| dot(direction, &missing)).collect();
+            let missing = load.iter().zip(self.energy.force());
+            let mut way: Vec<f64> = missing.map(|(load, force)| load - force).collect();
             factor.solve(&mut way);
-            let (before, old) = (potential(&self.energy, &self.q), s.clone());
+            let (before, old) = (potential(&self.energy, &self.q), self.q[..columns].to_vec());
             let mut share = 1.0;
             for _ in 0..HALVINGS {
-                for ((s, old), way) in s.iter_mut().zip(&old).zip(&way) {
+                for ((s, old), way) in self.q.iter_mut().zip(&old).zip(&way) {
                     *s = old + share * way;
                 }
-                along(&s, &mut self.way);
-                for ((q, begun), way) in self.q.iter_mut().zip(&self.begun).zip(&self.way) {
-                    *q = begun + way;
-                }
-                self.q[..columns].copy_from_slice(&s);
                 if potential(&self.energy, &self.q) <= before {
                     break;
                 }
                 share *= 0.5;
             }
         }
-        if self.q.iter().all(|x| x.is_finite()) {
-            state.s.copy_from_slice(&self.q[..columns]);
-            state.q.copy_from_slice(&self.q[columns..]);
-        }
+        state.s.clear();
+        state.s.extend(self.q[..columns].iter().map(|s| if s.is_finite() { *s } else { 0.0 }));
     }
 
     /// Begins a step from `before`, with the step under the loads alone in `after`, and linearizes

@@ -243,9 +243,6 @@ impl Kernel {
             return Err(StepError::OtherModel);
         }
         self.check_lengths(state)?;
-        if let Some(old) = self.held_shapes() {
-            old.leave(state);
-        }
         state.s.clear();
         if self.elastic.is_none() {
             return Ok(());
