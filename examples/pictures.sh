@@ -1,11 +1,12 @@
 #!/usr/bin/env bash
-# Remakes the pictures of the gallery (examples/README.md) in docs/images, without a screen: under Xvfb, and with a software driver where there is no
-# graphics card.
+# Remakes the pictures of the gallery (examples/README.md) in docs/images, without a screen: under
+# Xvfb, and with a software driver where there is no graphics card.
 #
 #   examples/pictures.sh [NAME ...]      all of them, or those named
 #
-# Each is made by the example itself (--screenshot), at 1280x720, and has at most 300,000 bytes: a larger one gets a palette where Python's Pillow or
-# ImageMagick is there, and is taken smaller if that is not enough. OUT is another folder for them, BIN one with the examples' binaries, PROFILE
+# Each is made by the example itself (--screenshot), at 1280x720, and has at most 300,000 bytes: a
+# larger one gets a palette where Python's Pillow or ImageMagick is there, and is taken smaller if
+# that is not enough. OUT is another folder for them, BIN one with the examples' binaries, PROFILE
 # one of cargo's.
 set -euo pipefail
 cd "$(dirname "$0")/.."
@@ -76,12 +77,16 @@ picture() { # name of the picture, example, arguments
     local file="$work/$name.png" bytes size
     for size in "" 896x504 640x360; do
         # What the example records or prints is not wanted here.
-        (cd "$work" && "$BIN/$example" "$@" ${size:+--size "$size"} --screenshot "$file" >"$work/$name.log" 2>&1) || { cat "$work/$name.log" >&2; return 1; }
+        (cd "$work" && "$BIN/$example" "$@" ${size:+--size "$size"} --screenshot "$file") \
+            >"$work/$name.log" 2>&1 || { cat "$work/$name.log" >&2; return 1; }
         if [ "$(stat -c %s "$file")" -gt $most ]; then smaller "$file" || true; fi
         bytes="$(stat -c %s "$file")"
         [ "$bytes" -gt $most ] || break
     done
-    [ "$bytes" -le $most ] || { echo "$name.png has $bytes bytes, at most $most are wanted" >&2; return 1; }
+    [ "$bytes" -le $most ] || {
+        echo "$name.png has $bytes bytes, at most $most are wanted" >&2
+        return 1
+    }
     mv "$file" "$out/$name.png"
     printf '%-24s %7d bytes, %d s\n' "$name.png" "$bytes" "$SECONDS"
 }

@@ -1,5 +1,5 @@
-// The body's own light, in bands along its texture coordinates, over Bevy's standard lighting. It runs in the fragment stage only: the
-// surface that comes here has been bent already.
+// The body's own light, in bands along its texture coordinates, over Bevy's standard lighting. It
+// runs in the fragment stage only: the surface has been bent before.
 #import bevy_pbr::{
     forward_io::{FragmentOutput, VertexOutput},
     mesh_view_bindings::{globals, view},
