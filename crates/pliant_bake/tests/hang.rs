@@ -97,3 +97,52 @@ fn a_bar_hangs_lower_the_heavier_it_is_and_never_behind_its_wall() {
         }
     }
 }
+
+/// A blow and a push do their work along the way of the bent shape's own point: the energy that a
+/// blow gives a body at rest is half the product of the blow and the velocity that the point gets.
+#[test]
+fn a_blow_on_a_bent_bar_works_along_the_bent_shape() {
+    let model = bar();
+    let positions = model.surface().positions();
+    let end = (0..positions.len()).max_by(|&a, &b| positions[a][0].total_cmp(&positions[b][0])).unwrap();
+    let mut body = Body::new(model.clone(), BodyConfig::from(StepSettings::default())).unwrap();
+    // Bent by about a right angle.
+    let mut state = body.state().clone();
+    let row = f64::from(model.rotation_row(end as u32, 2, 0)).abs();
+    let axis = if row > 1e-3 { 2 } else { 1 };
+    state.q[0] = 1.5 / f64::from(model.rotation_row(end as u32, axis, 0));
+    body.set_state(&state).unwrap();
+    let at = |q: &[f64]| {
+        let patch = Patch::around(model.surface(), end as u32, 0.0).unwrap();
+        let patch = HeldPatch::new(&model, &patch, model.mode_count()).unwrap();
+        patch.displacement(q, true)
+    };
+    let directions = [[1e-3, 0.0, 0.0], [0.0, 1e-3, 0.0], [0.0, 0.0, 1e-3], [6e-4, -7e-4, 2e-4]];
+    for blow in directions {
+        let mut hit = body.clone();
+        hit.apply_impulse(end as u32, blow).unwrap();
+        let kinetic: f64 = hit.v().iter().map(|v| 0.5 * v * v).sum();
+        let t = 1e-6;
+        let along =
+            |sign: f64| -> Vec<f64> { state.q.iter().zip(hit.v()).map(|(q, v)| q + sign * t * v).collect() };
+        let speed = (at(&along(1.0)) - at(&along(-1.0))) / (2.0 * t);
+        let work: f64 = 0.5 * speed.iter().zip(blow).map(|(u, j)| u * j).sum::<f64>();
+        assert!((kinetic / work - 1.0).abs() < 1e-4, "{kinetic} J, and {work} J of work for {blow:?}");
+        // At rest the same blow would give another energy: the bar is really bent.
+        let mut straight = Body::new(model.clone(), BodyConfig::from(StepSettings::default())).unwrap();
+        straight.apply_impulse(end as u32, blow).unwrap();
+        let other: f64 = straight.v().iter().map(|v| 0.5 * v * v).sum();
+        assert!((other / kinetic - 1.0).abs() > 1e-3 || kinetic < 1e-12, "{other} {kinetic}");
+        // A push in one short step gives the same momentum as the blow.
+        let mut pushed = body.clone();
+        let step = 1e-7;
+        pushed.reconfigure(BodyConfig { step, ..BodyConfig::from(StepSettings::default()) }).unwrap();
+        let (mut free, rest) = (pushed.clone(), hit.v().to_vec());
+        pushed.push(end as u32, blow.map(|j| j / step)).unwrap();
+        pushed.step().unwrap();
+        free.step().unwrap();
+        let gained = pushed.v().iter().zip(free.v()).map(|(a, b)| a - b);
+        let off = gained.zip(&rest).map(|(a, b)| (a - b).powi(2)).sum::<f64>().sqrt();
+        assert!(off < 1e-3 * (2.0 * kinetic).sqrt(), "a push gains otherwise: {off}");
+    }
+}

@@ -49,6 +49,7 @@ mod body;
 mod deform;
 mod error;
 mod grab;
+mod held;
 mod impulse;
 mod pause;
 mod pick;
@@ -78,6 +79,7 @@ pub use body::{BodyState, Driven, ModalBody, NoPointerGrab};
 pub use deform::{DrawnSurface, SurfaceDeformation, SurfaceDetail, SurfaceShading};
 pub use error::{BodyError, BodyRefused};
 pub use grab::{Grab, GrabForce, GrabOf, Grabs};
+pub use held::HeldShapesCache;
 pub use impulse::{Impulse, Push};
 pub use pause::SingleSteps;
 pub use pick::{SurfaceHit, pick_surface};
@@ -191,6 +193,7 @@ impl Plugin for PliantBodyPlugin {
             .add_message::<Impulse>()
             .add_message::<Push>()
             .init_resource::<PliantTick>()
+            .init_resource::<HeldShapesCache>()
             .insert_resource(step::Stepping { fixed })
             .register_diagnostic(Diagnostic::new(STEP_TIME).with_suffix(" ms"))
             .register_diagnostic(Diagnostic::new(AWAKE_BODIES))
@@ -220,6 +223,7 @@ impl Plugin for PliantBodyPlugin {
                         visual::begin_tick,
                         step::place_bodies,
                         step::hold_bodies,
+                        held::shape_held,
                         impulse::hit_bodies,
                     )
                         .chain()

@@ -60,7 +60,7 @@ fn update_hits(
             if bounds.is_some_and(|bounds| !meets(bounds, origin, direction)) {
                 continue;
             }
-            let positions = positions.get_or_insert_with(|| state.positions_at(visual.q()));
+            let positions = positions.get_or_insert_with(|| state.positions(visual));
             let triangles = state.model().surface().triangles();
             let (origin, direction) = (origin.as_dvec3().into(), direction.as_dvec3().into());
             let Some(hit) = pick_surface(positions, triangles, origin, direction) else { continue };

@@ -110,7 +110,7 @@ fn press(
     let Ok((state, visual, place)) = bodies.get(body) else { return };
     let radius = settings.radius.max(0.0) * state.model().size();
     let Ok(patch) = Patch::around(state.model().surface(), surface.vertex, radius) else { return };
-    let positions = state.positions_at(visual.q());
+    let positions = state.positions(visual);
     let middle = place.transform_point(middle_of(&patch, &positions).as_vec3());
     let mark = (0.015 * state.model().size() * state.scale()) as f32;
     let offset = (middle - point).as_dvec3();

@@ -436,6 +436,7 @@ pub(crate) fn publish(
         if let Err(error) = pushed {
             warn!("{name}: a step was not shown: {error}");
         }
+        shown.hold(body.held_shapes().map(|shapes| (shapes, &body.state().s[..])));
         for held in &state.held {
             let Ok(mut force) = forces.get_mut(held.entity) else { continue };
             let grab_force = held.id.and_then(|id| {

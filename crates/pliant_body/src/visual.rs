@@ -1,9 +1,12 @@
 //! The visual state of a body: its last two states and the interpolated state on screen.
 
+use std::sync::Arc;
+
 use bevy::{
     math::{DQuat, DVec3},
     prelude::*,
 };
+use pliant_modal::HeldShapes;
 
 use crate::{BodyError, BodyState, step::Stepping};
 
@@ -41,8 +44,21 @@ pub struct VisualState {
     /// Fraction of the tick to which the state was interpolated since the last push.
     at: Option<f64>,
     version: u64,
+    #[reflect(ignore)]
+    held: Option<HeldColumns>,
     /// Previous and current pose of a free body. An anchored body is at its transform.
     poses: Option<[Pose; 2]>,
+}
+
+/// What the own shapes of held patches add to the states.
+#[derive(Debug)]
+struct HeldColumns {
+    shapes: Arc<HeldShapes>,
+    previous: Vec<f64>,
+    current: Vec<f64>,
+    shown: Vec<f64>,
+    /// Whether the body has them no more. They then end when the picture is at the newest state.
+    ends: bool,
 }
 
 impl VisualState {
@@ -55,6 +71,7 @@ impl VisualState {
             shows_newest: true,
             at: None,
             version: 1,
+            held: None,
             poses: None,
         }
     }
@@ -71,6 +88,9 @@ impl VisualState {
         self.check(q)?;
         std::mem::swap(&mut self.previous, &mut self.current);
         self.current.copy_from_slice(q);
+        if let Some(held) = &mut self.held {
+            held.previous.copy_from_slice(&held.current);
+        }
         self.age = 0;
         self.at = None;
         self.shows_newest = false;
@@ -109,6 +129,60 @@ impl VisualState {
         self.push(q)?;
         self.poses = Some([self.poses.map_or(pose, |[_, current]| current), pose]);
         Ok(())
+    }
+
+    /// Adds the own shapes of held patches at `s` to the newest state, after [`push`](Self::push).
+    /// `None` takes them away.
+    ///
+    /// Values that do not fit the shapes, or are not finite, count as no shapes.
+    pub fn hold(&mut self, columns: Option<(&Arc<HeldShapes>, &[f64])>) {
+        let sound = |(shapes, s): &(&Arc<HeldShapes>, &[f64])| {
+            s.len() == shapes.columns() && s.iter().all(|x| x.is_finite())
+        };
+        match (columns.filter(sound), &mut self.held) {
+            (Some((shapes, s)), Some(held)) if Arc::ptr_eq(shapes, &held.shapes) => {
+                held.current.copy_from_slice(s);
+                held.ends = false;
+            }
+            (Some((shapes, s)), held) => {
+                // Shapes of other patches go on from where the old ones were.
+                let from = if held.is_some() { s.to_vec() } else { vec![0.0; s.len()] };
+                let (shapes, current, shown) = (shapes.clone(), s.to_vec(), from.clone());
+                *held = Some(HeldColumns { shapes, previous: from, current, shown, ends: false });
+            }
+            // They fade over one tick.
+            (None, Some(held)) if !held.ends => {
+                held.current.fill(0.0);
+                held.ends = true;
+            }
+            (None, held) => *held = None,
+        }
+        // A state that was shown at once is shown with its columns at once.
+        if self.shows_newest
+            && let Some(held) = &mut self.held
+        {
+            held.previous.copy_from_slice(&held.current);
+            held.shown.copy_from_slice(&held.current);
+            if held.ends {
+                self.held = None;
+            }
+        }
+    }
+
+    /// The own shapes of held patches in the state on screen, and their coordinates.
+    pub fn held(&self) -> Option<(&Arc<HeldShapes>, &[f64])> {
+        self.held.as_ref().map(|held| (&held.shapes, &held.shown[..]))
+    }
+
+    /// Writes the coordinates with which the model draws the state on screen. They are
+    /// [`q`](Self::q), unless there are own shapes of held patches ([`HeldShapes::draw`]), which
+    /// then have to be added to the surface ([`HeldShapes::add_to`]).
+    pub fn draw(&self, q: &mut Vec<f64>) {
+        q.clear();
+        q.extend_from_slice(&self.shown);
+        if let Some((shapes, s)) = self.held() {
+            shapes.draw(s, q);
+        }
     }
 
     /// Returns the state on screen in this frame: one coordinate per kept mode, kg^1/2 m.
@@ -160,6 +234,9 @@ impl VisualState {
             // Nothing was pushed yet in this tick. Without a push the picture stays at the newest
             // state.
             self.previous.copy_from_slice(&self.current);
+            if let Some(held) = &mut self.held {
+                held.previous.copy_from_slice(&held.current);
+            }
             self.poses = self.poses.map(|[_, current]| [current; 2]);
         }
     }
@@ -175,8 +252,16 @@ impl VisualState {
         for ((shown, a), b) in self.shown.iter_mut().zip(&self.previous).zip(&self.current) {
             *shown = a + (b - a) * fraction;
         }
+        if let Some(held) = &mut self.held {
+            for ((shown, a), b) in held.shown.iter_mut().zip(&held.previous).zip(&held.current) {
+                *shown = a + (b - a) * fraction;
+            }
+        }
         self.version += 1;
         self.shows_newest = self.age > 0;
+        if self.shows_newest {
+            self.held.take_if(|held| held.ends);
+        }
     }
 }
 

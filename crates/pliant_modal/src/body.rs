@@ -314,6 +314,16 @@ impl Body {
         Ok(())
     }
 
+    /// The own shapes of held patches that the steps use.
+    pub fn held_shapes(&self) -> Option<&Arc<HeldShapes>> {
+        self.kernel.held_shapes()
+    }
+
+    /// Center vertices and radii (m) of the patches that are held, oldest first.
+    pub fn held_patches(&self) -> impl ExactSizeIterator<Item = (u32, f64)> + Clone + '_ {
+        self.hands.iter().map(|hand| hand.patch.center_and_radius())
+    }
+
     /// The grabs on the body, oldest first.
     pub fn grabs(&self) -> impl Iterator<Item = GrabId> + '_ {
         self.grabs.iter().map(|g| g.id)

@@ -4,9 +4,13 @@ use bevy::math::DVec3;
 use pliant_body::Grab;
 use pliant_modal::{GrabConfig, ModalModel, ModelError, Patch, warp};
 
+use crate::view::Held;
+
 /// The mean position of a patch's vertices as a function of the modal coordinates.
 #[derive(Debug, Clone)]
 pub(crate) struct PatchPoint {
+    vertex: u32,
+    radius: f64,
     rest: DVec3,
     displacement: Vec<DVec3>,
     rotation: Vec<DVec3>,
@@ -18,6 +22,8 @@ impl PatchPoint {
         let patch = Patch::around(surface, vertex, radius)?;
         let modes = model.mode_count();
         let mut point = Self {
+            vertex,
+            radius,
             rest: DVec3::ZERO,
             displacement: vec![DVec3::ZERO; modes],
             rotation: vec![DVec3::ZERO; modes],
@@ -38,12 +44,18 @@ impl PatchPoint {
     }
 
     /// Returns the patch's mean position in body axes, m. With `warped`, the displacement is
-    /// `u = R~(w) d`, where `d` and `w` are the patch's mean displacement and rotation.
-    pub(crate) fn at(&self, q: &[f64], warped: bool) -> DVec3 {
+    /// `u = R~(w) d`, where `d` and `w` are the patch's mean displacement and rotation. `held` are
+    /// the own shapes of held patches with their coordinates.
+    pub(crate) fn at(&self, q: &[f64], warped: bool, held: Held<'_>) -> DVec3 {
         let sum = |columns: &[DVec3]| {
             columns.iter().zip(q).fold(DVec3::ZERO, |sum, (column, &q)| sum + *column * q)
         };
-        let displacement = sum(&self.displacement);
+        // The session has radii in single precision.
+        let own = held.and_then(|(shapes, s)| {
+            let radius = |radius: f64| shapes.mean(self.vertex, radius, s);
+            radius(self.radius).or_else(|| radius(f64::from(self.radius as f32)))
+        });
+        let displacement = sum(&self.displacement) + DVec3::from(own.unwrap_or_default());
         if !warped {
             return self.rest + displacement;
         }

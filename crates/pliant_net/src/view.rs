@@ -1,9 +1,11 @@
 //! Display of bodies that a session steps, alike on a guest and a peer.
 
+use std::sync::Arc;
 use std::time::Duration;
 
 use bevy::prelude::*;
 use pliant_body::{BodyState, GrabForce, VisualState};
+use pliant_modal::HeldShapes;
 use pliant_stream::{GrabState, Pose, UserId};
 
 use crate::patch_kinematics::PatchPoint;
@@ -24,21 +26,33 @@ pub(crate) type DisplayedBodies<'w, 's> = Query<
     ),
 >;
 
+/// The own shapes of held patches, and their coordinates.
+pub(crate) type Held<'a> = Option<(&'a Arc<HeldShapes>, &'a [f64])>;
+
+/// A state to display.
+#[derive(Debug, Default, Clone)]
+struct Displayed {
+    q: Vec<f64>,
+    pose: Option<Pose>,
+    shapes: Option<Arc<HeldShapes>>,
+    s: Vec<f64>,
+}
+
 /// The last two states of a body, between which it is displayed.
 #[derive(Debug, Default)]
 pub(crate) struct BodyDisplay {
     phase: Phase,
     tick: u64,
-    previous: (Vec<f64>, Option<Pose>),
-    current: (Vec<f64>, Option<Pose>),
+    previous: Displayed,
+    current: Displayed,
     /// Whether the newest state is displayed and no newer one has arrived.
     shows_newest: bool,
 }
 
 impl BodyDisplay {
     /// Takes over the state of a tick.
-    pub(crate) fn take(&mut self, tick: u64, q: &[f64], pose: Option<Pose>) {
-        let first = self.current.0.len() != q.len();
+    pub(crate) fn take(&mut self, tick: u64, q: &[f64], pose: Option<Pose>, held: Held<'_>) {
+        let first = self.current.q.len() != q.len();
         if tick == self.tick && !first {
             // A correction may have moved the state of this tick, but the display goes on from the
             // state that it has.
@@ -47,9 +61,13 @@ impl BodyDisplay {
         self.tick = tick;
         self.shows_newest = false;
         std::mem::swap(&mut self.previous, &mut self.current);
-        self.current.0.clear();
-        self.current.0.extend_from_slice(q);
-        self.current.1 = pose;
+        let (shapes, s) = held.unzip();
+        let to = &mut self.current;
+        to.q.clear();
+        to.q.extend_from_slice(q);
+        to.s.clear();
+        to.s.extend_from_slice(s.unwrap_or_default());
+        (to.pose, to.shapes) = (pose, shapes.cloned());
         if first {
             self.previous.clone_from(&self.current);
         }
@@ -72,15 +90,24 @@ impl BodyDisplay {
         }
         self.shows_newest = fraction >= 1.0;
         scratch.clear();
-        let ends = self.previous.0.iter().zip(&self.current.0);
-        scratch.extend(ends.map(|(from, to)| from + (to - from) * fraction));
+        let (from, to) = (&self.previous, &self.current);
+        let between = |(from, to): (&f64, &f64)| from + (to - from) * fraction;
+        scratch.extend(from.q.iter().zip(&to.q).map(between));
         scratch.resize(visual.q().len(), 0.0);
-        if scratch != visual.q()
+        let is_held = to.shapes.is_some() || visual.held().is_some();
+        if (is_held || scratch != visual.q())
             && let Err(error) = visual.snap(scratch)
         {
             debug!("a state was not displayed: {error}");
         }
-        if let (Some(from), Some(to)) = (self.previous.1, self.current.1) {
+        if is_held {
+            let same = from.shapes.as_ref().map(Arc::as_ptr) == to.shapes.as_ref().map(Arc::as_ptr);
+            let first = if same { &from.s } else { &to.s };
+            scratch.clear();
+            scratch.extend(first.iter().zip(&to.s).map(between));
+            visual.hold(to.shapes.as_ref().map(|shapes| (shapes, &scratch[..])));
+        }
+        if let (Some(from), Some(to)) = (from.pose, to.pose) {
             set_pose(transform, &from, &to, fraction, state.scale());
         }
     }
@@ -94,10 +121,10 @@ impl BodyDisplay {
         state: &BodyState,
         visual: &VisualState,
     ) -> GrabForce {
-        let point = point.at(visual.q(), state.warps());
+        let point = point.at(visual.q(), state.warps(), visual.held());
         GrabForce {
             force: place.force_to_world(reaction),
-            point: place.body_point_to_world(self.current.1, point),
+            point: place.body_point_to_world(self.current.pose, point),
         }
     }
 }

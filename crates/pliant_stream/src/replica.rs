@@ -4,7 +4,8 @@ use std::sync::Arc;
 
 use nalgebra::Vector3;
 use pliant_modal::{
-    GrabConfig, Hand, HeldPatch, Hold, ImpliedPulls, Kernel, Load, ModalModel, Patch, State, StepSettings,
+    GrabConfig, Hand, HeldPatch, HeldShapes, Hold, ImpliedPulls, Kernel, Load, ModalModel, Patch, State,
+    StepSettings,
 };
 
 use crate::StreamError;
@@ -186,6 +187,29 @@ impl Replica {
         out.clear();
         out.resize(from.state.modes(), 0.0);
         self.kernel.missing_force(&from.state, to, out);
+    }
+
+    /// Sets the own shapes of the patches that hands hold. Shapes of another model are ignored.
+    pub(crate) fn set_held_shapes(&mut self, shapes: Option<Arc<HeldShapes>>) {
+        // Each state gets its columns when it is settled.
+        let mut state = self.kernel.at_rest();
+        self.kernel.set_held_shapes(shapes, &mut state, &[]).ok();
+    }
+
+    /// Brings the columns of held patches in a state to rest under the reactions of `grabs`.
+    pub(crate) fn settle<'a>(&mut self, state: &mut State, grabs: impl Iterator<Item = &'a GrabState>) {
+        if self.kernel.held_shapes().is_none() {
+            state.s.clear();
+            return;
+        }
+        self.release_all();
+        for g in grabs {
+            let Some(patch) = self.patch(g.vertex, g.radius) else { continue };
+            let hand = Hand::new(patch, Hold::Measured(Vector3::zeros()));
+            self.hands.push(Hand { mean: -Vector3::from(g.reaction), ..hand });
+        }
+        self.kernel.settle(state, &self.hands);
+        self.release_all();
     }
 
     /// Writes the reactions that a state implies into `grabs`; see [`ImpliedPulls`].

@@ -69,7 +69,7 @@ fn take_hold(
     let vertex = vertex_of(&entry.patch, model)?;
     let radius = entry.radius.unwrap_or(RADIUS * model.size());
     let patch = Patch::around(model.surface(), vertex, radius).map_err(|error| error.to_string())?;
-    let positions = state.positions_at(shown.q());
+    let positions = state.positions(shown);
     let middle: DVec3 = patch
         .entries()
         .iter()

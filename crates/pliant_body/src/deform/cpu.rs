@@ -4,7 +4,7 @@
 //! world.
 
 use bevy::{camera::primitives::Aabb, mesh::VertexAttributeValues, prelude::*};
-use pliant_modal::{ModalModel, Precision};
+use pliant_modal::{HeldShapes, ModalModel, Precision};
 
 use super::topology::Topology;
 
@@ -16,7 +16,16 @@ pub(super) struct Scratch {
     normals: Vec<Vec3>,
 }
 
-/// Writes positions (m, body axes) and area-weighted normals at modal coordinates `q` into `mesh`.
+/// A shape to write.
+pub(super) struct Shape<'a> {
+    /// Modal coordinates.
+    pub q: &'a [f64],
+    pub warped: bool,
+    /// The own shapes of held patches, with their coordinates.
+    pub held: Option<(&'a HeldShapes, &'a [f64])>,
+}
+
+/// Writes positions (m, body axes) and area-weighted normals of a shape into `mesh`.
 ///
 /// The basis is read in `precision`. `mesh` must have been made for `topology`. Returns the bounds.
 /// Returns `None` for a mesh that was replaced by one of another topology, which is left alone.
@@ -24,16 +33,18 @@ pub(super) fn write(
     model: &ModalModel,
     precision: Precision,
     topology: &Topology,
-    q: &[f64],
-    warped: bool,
+    shape: &Shape<'_>,
     mesh: &mut Mesh,
     scratch: &mut Scratch,
 ) -> Option<Aabb> {
     let Scratch { q: coordinates, positions, normals } = scratch;
     coordinates.clear();
-    coordinates.extend(q.iter().map(|&q| q as f32));
+    coordinates.extend(shape.q.iter().map(|&q| q as f32));
     positions.resize(model.surface().positions().len(), [0.0; 3]);
-    model.basis_in(precision).reconstruct(coordinates, warped, positions);
+    model.basis_in(precision).reconstruct(coordinates, shape.warped, positions);
+    if let Some((shapes, s)) = shape.held {
+        shapes.add_to(s, positions);
+    }
 
     let drawn = float3(mesh, Mesh::ATTRIBUTE_POSITION.id, topology.source.len())?;
     let (mut low, mut high) = (Vec3::INFINITY, Vec3::NEG_INFINITY);

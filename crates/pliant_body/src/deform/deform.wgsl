@@ -32,6 +32,10 @@ struct Job {
     stride: u32,
     position: u32,
     normal: u32,
+    // Offset in `coordinates` of the displacements besides those of the coordinates, and their
+    // number: four words each, of which the first is the vertex. The vertices ascend.
+    moved: u32,
+    moved_count: u32,
 }
 
 @group(0) @binding(0) var<uniform> surface: Surface;
@@ -91,6 +95,25 @@ fn coefficients(s: f32) -> vec2<f32> {
     return vec2(versine / s, (t - sine) / (s * t));
 }
 
+// Returns the displacement of a vertex besides that of the coordinates, by bisection.
+fn moved_by_hands(job: Job, vertex: f32) -> vec3<f32> {
+    var low = 0u;
+    var high = job.moved_count;
+    while low < high {
+        let middle = (low + high) / 2u;
+        if coordinates[job.moved + 4u * middle] < vertex {
+            low = middle + 1u;
+        } else {
+            high = middle;
+        }
+    }
+    let at = job.moved + 4u * low;
+    if low < job.moved_count && coordinates[at] == vertex {
+        return vec3(coordinates[at + 1u], coordinates[at + 2u], coordinates[at + 3u]);
+    }
+    return vec3(0.0);
+}
+
 @compute @workgroup_size(64)
 fn write_positions(@builtin(global_invocation_id) id: vec3<u32>) {
     let vertex = id.x;
@@ -118,6 +141,7 @@ fn write_positions(@builtin(global_invocation_id) id: vec3<u32>) {
             at += ROWS * BLOCK;
         }
     }
+    d += moved_by_hands(job, f32(vertex));
     let to = job.positions + 3u * vertex;
     positions[to] = rest[3u * vertex] + d.x;
     positions[to + 1u] = rest[3u * vertex + 1u] + d.y;

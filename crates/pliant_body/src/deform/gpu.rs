@@ -50,6 +50,9 @@ pub(super) struct GpuShape {
     pub mesh: AssetId<Mesh>,
     pub q: Vec<f32>,
     pub warped: bool,
+    /// Displacements besides those of the coordinates, m, with the number of the vertex before
+    /// them. The numbers ascend.
+    pub moved: Vec<[f32; 4]>,
 }
 
 /// The limits of the compute device. This resource is in the main world and only exists if the
@@ -174,6 +177,8 @@ struct DeformJob {
     stride: u32,
     position: u32,
     normal: u32,
+    moved: u32,
+    moved_count: u32,
 }
 
 /// The GPU data of a model.
@@ -436,8 +441,11 @@ fn prepare(
             stride: place.stride,
             position: place.position,
             normal: place.normal,
+            moved: (device.coordinates.len() + shape.wanted.q.len()) as u32,
+            moved_count: shape.wanted.moved.len() as u32,
         });
         device.coordinates.extend(shape.wanted.q.iter().copied());
+        device.coordinates.extend(shape.wanted.moved.as_flattened().iter().copied());
         batch.bodies += 1;
         batch.bytes.end = place.bytes.end;
         scratch_needed = scratch_needed.max(batch.bodies * scratch);

@@ -23,7 +23,7 @@ use bevy::{
     mesh::{Indices, PrimitiveTopology},
     prelude::*,
 };
-use pliant_modal::ModalModel;
+use pliant_modal::{HeldShapes, ModalModel};
 
 use crate::{BodyState, DEFORM_TIME, ModalBody, PliantDisplaySystems, VisualState};
 use detail::{Detail, Views};
@@ -130,15 +130,11 @@ fn make_meshes(
         let mut scratch = cpu::Scratch::default();
         let mut mesh = new_mesh(model, &drawing.topology);
         let detail = Detail { modes: shown.q().len(), warped: state.warps() };
-        let bounds = cpu::write(
-            model,
-            state.precision(),
-            &drawing.topology,
-            shown.q(),
-            state.warps(),
-            &mut mesh,
-            &mut scratch,
-        );
+        let mut q = Vec::new();
+        shown.draw(&mut q);
+        let shape = cpu::Shape { q: &q, warped: state.warps(), held: held(shown) };
+        let topology = &drawing.topology;
+        let bounds = cpu::write(model, state.precision(), topology, &shape, &mut mesh, &mut scratch);
         let mesh = meshes.add(mesh);
         // The entity may have been despawned in this frame.
         commands
@@ -176,6 +172,25 @@ fn take_down(
     }
 }
 
+/// The own shapes of held patches in the shown state, with their coordinates.
+fn held(shown: &VisualState) -> Option<(&HeldShapes, &[f64])> {
+    shown.held().map(|(shapes, s)| (&**shapes, s))
+}
+
+/// Writes the displacements by held patches' own shapes. Returns the longest, m.
+fn write_moved(shown: &VisualState, out: &mut Vec<[f32; 4]>) -> f32 {
+    out.clear();
+    let mut longest = 0.0f32;
+    if let Some((shapes, s)) = held(shown) {
+        out.extend(shapes.vertices().iter().zip(shapes.displacements(s)).map(|(&vertex, [x, y, z])| {
+            longest = longest.max(Vec3::new(x, y, z).length());
+            // The numbers of a surface's vertices are exact in single precision.
+            [vertex as f32, x, y, z]
+        }));
+    }
+    longest
+}
+
 fn new_mesh(model: &ModalModel, topology: &Topology) -> Mesh {
     let surface = model.surface();
     let pick = |from: &[[f32; 3]]| topology.source.iter().map(|&v| from[v as usize]).collect::<Vec<_>>();
@@ -192,13 +207,21 @@ fn new_mesh(model: &ModalModel, topology: &Topology) -> Mesh {
     }
 }
 
+/// Buffers that are reused for all bodies and frames.
+#[derive(Default)]
+struct Scratch {
+    cpu: cpu::Scratch,
+    q: Vec<f64>,
+    moved: Vec<[f32; 4]>,
+}
+
 fn deform_surfaces(
     mut commands: Commands,
     wanted: Res<SurfaceDeformation>,
     compute: Option<Res<Compute>>,
     mut meshes: ResMut<Assets<Mesh>>,
     mut diagnostics: Diagnostics,
-    mut scratch: Local<cpu::Scratch>,
+    mut scratch: Local<Scratch>,
     cameras: Query<(&Camera, &GlobalTransform)>,
     mut bodies: Query<(
         Entity,
@@ -216,6 +239,7 @@ fn deform_surfaces(
 ) {
     let start = Instant::now();
     let mut written = false;
+    let Scratch { cpu: scratch, q, moved: moved_by_hands } = &mut *scratch;
     let views = Views::new(cameras.iter());
     for (entity, state, shown, allowed, place, mesh, mut drawn, shape, mut aabb, inherited, view) in
         &mut bodies
@@ -233,16 +257,22 @@ fn deform_surfaces(
         if !moved && drawn.detail.covers(full) {
             continue;
         }
+        shown.draw(q);
+        let longest = write_moved(shown, moved_by_hands);
+        let bounds = || {
+            let Aabb { center, half_extents } = drawn.drawing.bounds(q);
+            Aabb { center, half_extents: half_extents + longest }
+        };
         if !view.get() {
             // The body is in no view. Only its bounds are updated, so that the body is found when
             // it comes back into a view.
-            aabb.set_if_neq(drawn.drawing.bounds(shown.q()));
+            aabb.set_if_neq(bounds());
             continue;
         }
         let detail = match views.metres_per_pixel(&aabb, place) {
             Some(metres) => {
                 let error = f64::from(metres * allowed.tolerance.max(0.0)) / state.scale();
-                Detail::needed(&drawn.drawing, shown.q(), full.warped, error)
+                Detail::needed(&drawn.drawing, q, full.warped, error)
             }
             // No camera sees the body, only a light, or this is a test.
             None => full,
@@ -250,22 +280,24 @@ fn deform_surfaces(
         if !moved && drawn.detail.covers(detail) {
             continue;
         }
-        let q = &shown.q()[..detail.modes];
+        let kept = &q[..detail.modes];
         if compute {
-            aabb.set_if_neq(drawn.drawing.bounds(shown.q()));
+            aabb.set_if_neq(bounds());
             match shape {
                 Some(mut shape) => {
                     shape.q.clear();
-                    shape.q.extend(q.iter().map(|&q| q as f32));
+                    shape.q.extend(kept.iter().map(|&q| q as f32));
                     shape.warped = detail.warped;
+                    shape.moved.clone_from(moved_by_hands);
                     shape.mesh = mesh.id();
                 }
                 None => {
                     commands.entity(entity).try_insert(GpuShape {
                         drawing: drawn.drawing.clone(),
                         mesh: mesh.id(),
-                        q: q.iter().map(|&q| q as f32).collect(),
+                        q: kept.iter().map(|&q| q as f32).collect(),
                         warped: detail.warped,
+                        moved: moved_by_hands.clone(),
                     });
                 }
             }
@@ -274,15 +306,9 @@ fn deform_surfaces(
                 commands.entity(entity).try_remove::<GpuShape>();
             }
             let Some(mut mesh) = meshes.get_mut(&mesh.0) else { continue };
-            let bounds = cpu::write(
-                &drawn.model,
-                state.precision(),
-                &drawn.drawing.topology,
-                q,
-                detail.warped,
-                &mut mesh,
-                &mut scratch,
-            );
+            let shape = cpu::Shape { q: kept, warped: detail.warped, held: held(shown) };
+            let topology = &drawn.drawing.topology;
+            let bounds = cpu::write(&drawn.model, state.precision(), topology, &shape, &mut mesh, scratch);
             if let Some(bounds) = bounds {
                 aabb.set_if_neq(bounds);
             }

@@ -4,6 +4,8 @@
 mod baking;
 mod display;
 mod grabs;
+#[cfg(feature = "bake")]
+mod held;
 mod impulses;
 mod load;
 pub mod model;

@@ -178,6 +178,8 @@ impl ModalLocal {
         self.scratch.v.copy_from_slice(self.body.v());
         self.scratch.a.copy_from_slice(self.body.a());
         self.scratch.f.copy_from_slice(&self.body.state().f);
+        // The columns of held patches have no motion of their own to correct.
+        self.scratch.s.clone_from(&self.body.state().s);
         // The viscoelastic state changes slowly, so it is corrected without regard to the age of
         // the update.
         self.scratch.z.clone_from(&self.body.state().z);

@@ -31,6 +31,8 @@ pub(crate) struct CopyOf {
     /// Address of the model. The copy keeps the model alive, so no other model can have this
     /// address.
     model: usize,
+    /// Address of the own shapes of held patches, which the copy keeps alive too.
+    shapes: Option<usize>,
     /// Settings without the step, because the loop has a step of its own. In a schedule at frame
     /// rate, the step differs each time.
     config: Option<BodyConfig>,
@@ -43,6 +45,7 @@ impl CopyOf {
             grabs: held.iter().map(|grab| grab.key).collect(),
             all: state.body().grabs().collect(),
             model: Arc::as_ptr(state.model()).addr(),
+            shapes: state.body().held_shapes().map(|shapes| Arc::as_ptr(shapes).addr()),
             config: Some(BodyConfig { step: 0.0, ..state.body().config().clone() }),
             coupling: Some(*coupling),
         }

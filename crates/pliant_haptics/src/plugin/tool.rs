@@ -224,7 +224,7 @@ pub(crate) fn grip(
                 continue;
             }
             let nearest = bodies.iter().filter_map(|(body, state, shown, place, _)| {
-                let positions = state.positions_at(shown.q());
+                let positions = state.positions(shown);
                 let (vertex, distance) = positions
                     .iter()
                     .map(|p| place.transform_point(Vec3::from(*p)).as_dvec3().distance(pose.position))

@@ -67,10 +67,6 @@ const ENERGY: f64 = 0.02;
 /// Ways of a hand in the training shapes, as shares of the body's size.
 const WAYS: [f64; 4] = [0.04, 0.12, 0.25, 0.5];
 
-/// Largest number of patches whose shapes a body has at a time. Shapes of more hands would make a
-/// step too long.
-const MOST_PATCHES: usize = 4;
-
 /// What identifies a patch of a model: its center and its radius.
 pub(crate) type PatchKey = (u32, u64);
 
@@ -102,6 +98,10 @@ pub struct HeldShapes {
 }
 
 impl HeldShapes {
+    /// Largest number of patches whose shapes a body has at a time. Shapes of more hands would make
+    /// a step too long.
+    pub const MOST_PATCHES: usize = 4;
+
     /// Makes the shapes of patches of a model. The result is the same on every machine.
     ///
     /// Returns `None` for a model without reduced elasticity or without its simulation mesh, for no
@@ -119,7 +119,7 @@ impl HeldShapes {
         }
         let Some(reduced) = model.parts().reduced.as_ref() else { return Ok(None) };
         let Some(mesh) = &reduced.mesh else { return Ok(None) };
-        if patches.is_empty() || patches.len() > MOST_PATCHES {
+        if patches.is_empty() || patches.len() > Self::MOST_PATCHES {
             return Ok(None);
         }
         let positions = model.surface().positions();
@@ -197,6 +197,19 @@ impl HeldShapes {
         self.weights.len()
     }
 
+    /// Center vertices and radii (m) of the patches.
+    pub fn patches(&self) -> impl ExactSizeIterator<Item = (u32, f64)> + '_ {
+        self.keys.iter().map(|&(vertex, radius)| (vertex, f64::from_bits(radius)))
+    }
+
+    /// Mean displacement of a patch by the columns at `s`, m, body axes, besides that by the
+    /// coordinates. `None` for another patch, and if `s` has not one entry per column.
+    pub fn mean(&self, vertex: u32, radius: f64, s: &[f64]) -> Option<[f64; 3]> {
+        let index = self.keys.iter().position(|key| *key == (vertex, radius.to_bits()))?;
+        let dot = |row: &Vec<f64>| row.iter().zip(s).map(|(u, s)| u * s).sum();
+        (s.len() == self.columns).then(|| self.rows[index].each_ref().map(dot))
+    }
+
     fn find(&self, patch: &HeldPatch) -> Option<usize> {
         self.keys.iter().position(|own| *own == patch.key())
     }
@@ -213,10 +226,8 @@ impl HeldShapes {
 
     /// Displacement of a patch by the columns, m, body axes. `s` has one entry per column.
     pub(crate) fn displacement(&self, patch: &HeldPatch, s: &[f64]) -> Vector3<f64> {
-        let Some(rows) = self.rows(patch).filter(|_| s.len() == self.columns) else {
-            return Vector3::zeros();
-        };
-        Vector3::from_fn(|axis, _| rows[axis].iter().zip(s).map(|(u, s)| u * s).sum())
+        let (vertex, radius) = patch.center_and_radius();
+        self.mean(vertex, radius, s).unwrap_or_default().into()
     }
 
     /// What is left of the residual flexibility of a patch at the baked stiffness, m/N.

@@ -166,8 +166,8 @@ impl ElasticStep {
         self.rows.reserve(n.saturating_sub(self.rows.len()));
     }
 
-    /// Brings the columns to rest under the hands' forces (N, body axes), while the coordinates stay
-    /// where they are.
+    /// Brings the columns to rest under the hands' forces (N, body axes), while the coordinates
+    /// stay where they are.
     pub(crate) fn settle<'a>(
         &mut self,
         state: &mut State,
@@ -201,6 +201,8 @@ impl ElasticStep {
             let missing = load.iter().zip(self.energy.force());
             let mut way: Vec<f64> = missing.map(|(load, force)| load - force).collect();
             factor.solve(&mut way);
+            // The columns have energy one half each at one.
+            let size: f64 = way.iter().map(|way| 0.5 * self.omega2[0] * way * way).sum();
             let (before, old) = (potential(&self.energy, &self.q), self.q[..columns].to_vec());
             let mut share = 1.0;
             for _ in 0..HALVINGS {
@@ -211,6 +213,9 @@ impl ElasticStep {
                     break;
                 }
                 share *= 0.5;
+            }
+            if size <= NOTHING * self.far {
+                break;
             }
         }
         state.s.clear();

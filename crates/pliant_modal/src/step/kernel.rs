@@ -249,12 +249,20 @@ impl Kernel {
         }
         self.elastic = elastic(&self.model, &self.settings, &self.modes, self.h, shapes);
         self.responses.forget();
+        self.settle(state, hands);
+        Ok(())
+    }
+
+    /// Brings the columns of held patches in `state` to rest under the forces of `hands`, while the
+    /// coordinates stay. Without shapes of held patches nothing changes.
+    ///
+    /// This finds the columns of a state that came from elsewhere, such as a network.
+    pub fn settle(&mut self, state: &mut State, hands: &[Hand]) {
         let back = state.frame.rotation().inverse();
         let pulls = hands.iter().map(|hand| (&*hand.patch, back * hand.mean));
-        if let Some(elastic) = &mut self.elastic {
+        if let Some(elastic) = self.elastic.as_mut().filter(|elastic| elastic.shapes().is_some()) {
             elastic.settle(state, pulls);
         }
-        Ok(())
     }
 
     /// The own shapes of held patches that the steps use.

@@ -81,6 +81,11 @@ impl HeldPatch {
         self.key
     }
 
+    /// Center vertex and radius (m) of the patch.
+    pub fn center_and_radius(&self) -> (u32, f64) {
+        (self.key.0, f64::from_bits(self.key.1))
+    }
+
     /// Position of the patch at rest, m, body axes.
     pub fn rest(&self) -> Vector3<f64> {
         self.rest

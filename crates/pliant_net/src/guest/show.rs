@@ -1,9 +1,12 @@
 //! Writes the displayed state of the session to the bodies and the forces to the hands.
 
-use bevy::prelude::*;
-use pliant_body::GrabForce;
-use pliant_stream::GrabKey;
+use std::collections::BTreeMap;
 
+use bevy::prelude::*;
+use pliant_body::{GrabForce, HeldShapesCache, ModalBody};
+use pliant_stream::{BodyId, GrabKey, GuestSession};
+
+use super::bodies::FollowedBody;
 use super::{NetGuest, visual_state_of};
 use crate::session_transform::SessionTransform;
 use crate::user::UserLink;
@@ -15,6 +18,8 @@ pub(crate) fn show(
     mut bodies: DisplayedBodies,
     mut forces: Query<&mut GrabForce>,
     mut links: Query<&mut UserLink>,
+    wanted: Query<&ModalBody>,
+    cache: Option<ResMut<HeldShapesCache>>,
 ) {
     let Some(mut guest) = guest else { return };
     let guest = &mut *guest;
@@ -40,7 +45,7 @@ pub(crate) fn show(
         if let Some((_, shown)) = visual_state_of(view) {
             let pose = view.predicted_hand().map_or_else(|| view.pose(), |own| own.pose());
             followed.peak = followed.peak.max(shown.q.iter().map(|q| q * q).sum::<f64>().sqrt());
-            followed.display.take(view.tick(), &shown.q, pose);
+            followed.display.take(view.tick(), &shown.q, pose, view.held_shapes());
         }
         let at = (step, now, view.is_resting());
         followed.display.write(at, state, &mut visual, &mut transform, &mut guest.scratch);
@@ -62,6 +67,7 @@ pub(crate) fn show(
             force.set_if_neq(grab_force.unwrap_or_default());
         }
     }
+    shape_held(session, &guest.bodies, &bodies, &wanted, cache);
     let link = session.stats();
     let own = user.and_then(|user| guest.users.get(user));
     if let Some(mut shown) = own.and_then(|own| links.get_mut(own).ok()) {
@@ -75,4 +81,27 @@ pub(crate) fn show(
         }
     }
     guest.flush();
+}
+
+/// Gives the held bodies the own shapes of their patches as soon as these are made.
+fn shape_held(
+    session: &mut GuestSession,
+    followed: &BTreeMap<BodyId, FollowedBody>,
+    bodies: &DisplayedBodies,
+    wanted: &Query<&ModalBody>,
+    cache: Option<ResMut<HeldShapesCache>>,
+) {
+    let Some(mut cache) = cache else { return };
+    for (&id, followed) in followed {
+        let (Some(view), Ok((state, ..)), Ok(wanted)) =
+            (session.body(id), bodies.get(followed.entity), wanted.get(followed.entity))
+        else {
+            continue;
+        };
+        let patches = if wanted.held_shapes { view.held_patches() } else { Vec::new() };
+        let own = view.held_shapes().map(|(shapes, _)| shapes);
+        if let Some(shapes) = cache.change(state.model(), patches, own) {
+            session.set_held_shapes(id, shapes);
+        }
+    }
 }

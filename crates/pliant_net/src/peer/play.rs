@@ -119,7 +119,7 @@ pub(crate) fn show(
         let Ok((state, mut visual, mut hands, mut transform, global)) = bodies.get_mut(played.entity) else {
             continue;
         };
-        played.display.take(view.tick(), &view.visual().q, view.pose());
+        played.display.take(view.tick(), &view.visual().q, view.pose(), None);
         played.display.write((step, now, false), state, &mut visual, &mut transform, &mut net.scratch);
         let Some(place) = SessionTransform::of_body(global, state) else { continue };
         hands.set_if_neq(remote_hands(view.grabs(), Some(user), &place));

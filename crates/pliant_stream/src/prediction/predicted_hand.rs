@@ -13,9 +13,10 @@
 //! had, and the guest knows how many ticks ago it sent that target.
 
 use std::collections::VecDeque;
+use std::sync::Arc;
 
 use nalgebra::Vector3;
-use pliant_modal::{Frame, GrabConfig, Hand, Hold, Load, RigidMotion};
+use pliant_modal::{Frame, GrabConfig, Hand, HeldShapes, Hold, Load, RigidMotion};
 
 use super::{BodyCopy, HandState, VisualCopy};
 use crate::recovery::{Forecast, Receiver};
@@ -76,6 +77,8 @@ pub struct PredictedHand {
     push: (Vector3<f64>, Vector3<f64>),
     forecast: Forecast,
     fade: f64,
+    /// The columns of held patches at the confirmed tick.
+    columns: Vec<f64>,
 }
 
 impl PredictedHand {
@@ -95,7 +98,36 @@ impl PredictedHand {
             push: (Vector3::zeros(), Vector3::zeros()),
             forecast: Forecast::new(h),
             fade: (-3.0 / f64::from(blend_ticks.max(1))).exp(),
+            columns: Vec::new(),
         }
+    }
+
+    /// Sets the own shapes of the patches that hands hold on the body.
+    pub(crate) fn set_held_shapes(&mut self, shapes: Option<Arc<HeldShapes>>) {
+        self.replica.set_held_shapes(shapes);
+        self.columns.clear();
+    }
+
+    /// The own shapes of held patches that are used.
+    pub(crate) fn held_shapes(&self) -> Option<&Arc<HeldShapes>> {
+        self.replica.kernel().held_shapes()
+    }
+
+    /// The columns of held patches in the shown state.
+    pub(crate) fn columns(&self) -> &[f64] {
+        if self.active { &self.visual.state.s } else { &self.columns }
+    }
+
+    /// The patches of the guest's own hands.
+    pub(crate) fn patches(&self) -> impl Iterator<Item = (u32, f64)> + '_ {
+        self.grabs.iter().filter(|g| g.target.is_some()).map(|g| (g.vertex, g.radius))
+    }
+
+    /// Finds the columns of held patches in a confirmed state. The last ones are the first guess.
+    fn settle(&mut self, state: &mut State, receiver: &Receiver) {
+        state.s.clone_from(&self.columns);
+        self.replica.settle(state, receiver.grabs().iter());
+        self.columns.clone_from(&state.s);
     }
 
     /// The tick of the copy: the host's tick when the present target will reach the host.
@@ -189,6 +221,13 @@ impl PredictedHand {
             if before > 0 || self.active {
                 self.fall_back(receiver);
             }
+            if self.held_shapes().is_some() {
+                let mut state = std::mem::take(&mut self.copy.state);
+                state.clone_from(receiver.visual());
+                self.settle(&mut state, receiver);
+                self.visual.state.s.clone_from(&state.s);
+                self.copy.state = state;
+            }
             self.tick = confirmed;
             return;
         }
@@ -236,6 +275,7 @@ impl PredictedHand {
         if let Some(frame) = frame {
             copy.state.frame = frame;
         }
+        self.settle(&mut copy.state, receiver);
         copy.hands.clear();
         copy.hands.extend_from_slice(receiver.hands());
         for g in &mut self.grabs {

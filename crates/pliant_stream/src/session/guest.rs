@@ -4,7 +4,7 @@ use std::collections::{BTreeMap, BTreeSet, VecDeque};
 use std::sync::Arc;
 use std::time::Duration;
 
-use pliant_modal::ModalModel;
+use pliant_modal::{HeldShapes, ModalModel};
 
 use super::download::Download;
 use super::guest_body::StreamedBody;
@@ -164,6 +164,15 @@ impl GuestSession {
     /// Returns a body of the session.
     pub fn body(&self, body: BodyId) -> Option<&StreamedBody> {
         self.bodies.get(&body)
+    }
+
+    /// Sets the own shapes of the patches that hands hold on a body
+    /// ([`StreamedBody::held_patches`]). The host need not have them, because coordinates mean the
+    /// same with and without them. An unknown body and shapes of another model are ignored.
+    pub fn set_held_shapes(&mut self, body: BodyId, shapes: Option<Arc<HeldShapes>>) {
+        if let Some(predicted) = self.bodies.get_mut(&body).and_then(|body| body.predicted.as_mut()) {
+            predicted.set_held_shapes(shapes);
+        }
     }
 
     /// Iterates over all bodies.

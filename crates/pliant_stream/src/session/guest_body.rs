@@ -3,7 +3,7 @@
 use std::sync::Arc;
 use std::time::Duration;
 
-use pliant_modal::ModalModel;
+use pliant_modal::{HeldShapes, ModalModel};
 
 use crate::newmark::Newmark;
 use crate::playout::PlayoutClock;
@@ -147,6 +147,29 @@ impl StreamedBody {
     /// when it exists.
     pub fn predicted_hand(&self) -> Option<&PredictedHand> {
         self.predicted.as_ref().filter(|predicted| predicted.is_active())
+    }
+
+    /// The patches that hands hold, own and others', by center vertex and radius (m).
+    ///
+    /// It is empty where no hand is predicted, because only those steps use the patches' own shapes
+    /// ([`GuestSession::set_held_shapes`](crate::GuestSession::set_held_shapes)), where the
+    /// elasticity is linear, and where the stream has fewer coordinates than the model.
+    pub fn held_patches(&self) -> Vec<(u32, f64)> {
+        let (Some(predicted), Some(receiver), Some(model)) = (&self.predicted, &self.receiver, &self.model)
+        else {
+            return Vec::new();
+        };
+        let whole = receiver.confirmed().modes() == model.mode_count();
+        if !whole || !self.info.settings.is_reduced(model) {
+            return Vec::new();
+        }
+        predicted.patches().chain(receiver.grabs().iter().map(|g| (g.vertex, g.radius))).collect()
+    }
+
+    /// The own shapes of held patches in the displayed state, and their coordinates.
+    pub fn held_shapes(&self) -> Option<(&Arc<HeldShapes>, &[f64])> {
+        let predicted = self.predicted.as_ref()?;
+        Some((predicted.held_shapes()?, predicted.columns()))
     }
 
     /// The rigid frame of a free body at the displayed tick.

@@ -1,0 +1,130 @@
+//! The own shapes of held patches ([`HeldShapes`]), made beside the frames.
+
+use std::sync::Arc;
+
+use bevy::{
+    prelude::*,
+    tasks::{AsyncComputeTaskPool, Task, block_on, poll_once},
+};
+use pliant_modal::{HeldShapes, ModalModel, ModelHash, Patch};
+
+use crate::{BodyState, Driven, ModalBody};
+
+/// The own shapes of the patches that hands hold, of all bodies with reduced elasticity.
+///
+/// Shapes take up to some seconds to make. They are made on Bevy's compute threads when a hand
+/// takes hold. Until they are there the hand feels what the coordinates of the model leave out as a
+/// mere compliance. Shapes that were made once stay for the next time that the same patches are
+/// held, as long as they are among the last 32.
+#[derive(Resource, Default)]
+pub struct HeldShapesCache {
+    /// The entry that was used last is at the end.
+    entries: Vec<Entry>,
+}
+
+/// The number of entries that are kept. One takes up to about a megabyte.
+const MOST: usize = 32;
+
+struct Entry {
+    model: ModelHash,
+    patches: Vec<(u32, u64)>,
+    shapes: Making,
+}
+
+enum Making {
+    Done(Option<Arc<HeldShapes>>),
+    /// Dropping the task of an entry ends it, if it has not yet begun.
+    Task(Task<Option<HeldShapes>>),
+}
+
+impl HeldShapesCache {
+    /// Returns the shapes of patches of a model, given by center vertex and radius (m, model).
+    ///
+    /// The result is `None` while they are being made, which the first call begins, and
+    /// `Some(None)` where there are none: see [`HeldShapes::new`].
+    pub fn get(
+        &mut self,
+        model: &Arc<ModalModel>,
+        patches: &[(u32, f64)],
+    ) -> Option<Option<Arc<HeldShapes>>> {
+        let has_mesh = model.parts().reduced.as_ref().is_some_and(|reduced| reduced.mesh.is_some());
+        if patches.is_empty() || patches.len() > HeldShapes::MOST_PATCHES || !has_mesh {
+            return Some(None);
+        }
+        let key: Vec<(u32, u64)> = patches.iter().map(|(v, radius)| (*v, radius.to_bits())).collect();
+        let found = self.entries.iter().position(|e| e.model == model.hash() && e.patches == key);
+        let mut entry = match found {
+            Some(index) => self.entries.remove(index),
+            None => Entry { model: model.hash(), shapes: begin(model, patches), patches: key },
+        };
+        if let Making::Task(task) = &mut entry.shapes
+            && let Some(shapes) = block_on(poll_once(task))
+        {
+            entry.shapes = Making::Done(shapes.map(Arc::new));
+        }
+        let result = match &entry.shapes {
+            Making::Done(shapes) => Some(shapes.clone()),
+            Making::Task(_) => None,
+        };
+        if self.entries.len() >= MOST {
+            self.entries.remove(0);
+        }
+        self.entries.push(entry);
+        result
+    }
+
+    /// Returns the shapes that a body should change to, if it should change.
+    ///
+    /// `patches` are those that hands hold, in any order; no more than
+    /// [`HeldShapes::MOST_PATCHES`] of them get shapes. `own` are the shapes that the body has.
+    pub fn change(
+        &mut self,
+        model: &Arc<ModalModel>,
+        patches: impl IntoIterator<Item = (u32, f64)>,
+        own: Option<&Arc<HeldShapes>>,
+    ) -> Option<Option<Arc<HeldShapes>>> {
+        let mut patches: Vec<(u32, f64)> = patches.into_iter().take(HeldShapes::MOST_PATCHES).collect();
+        // Equal sets of patches share their shapes.
+        patches.sort_unstable_by_key(|&(vertex, radius)| (vertex, radius.to_bits()));
+        patches.dedup();
+        let has = own.map_or(patches.is_empty(), |own| own.patches().eq(patches.iter().copied()));
+        if has {
+            return None;
+        }
+        self.get(model, &patches).filter(|shapes| shapes.is_some() || own.is_some())
+    }
+
+    /// Whether shapes are being made.
+    pub fn is_making(&self) -> bool {
+        self.entries.iter().any(|entry| matches!(entry.shapes, Making::Task(_)))
+    }
+}
+
+fn begin(model: &Arc<ModalModel>, patches: &[(u32, f64)]) -> Making {
+    let (model, patches) = (model.clone(), patches.to_vec());
+    Making::Task(AsyncComputeTaskPool::get().spawn(async move {
+        let around = |&(vertex, radius): &(u32, f64)| Patch::around(model.surface(), vertex, radius).ok();
+        let patches: Vec<Patch> = patches.iter().map(around).collect::<Option<_>>()?;
+        HeldShapes::new(&model, &patches).ok().flatten()
+    }))
+}
+
+/// Gives the held bodies the shapes of their patches as soon as these are made.
+pub(crate) fn shape_held(
+    mut cache: ResMut<HeldShapesCache>,
+    mut bodies: Query<(&ModalBody, &Driven, &mut BodyState)>,
+) {
+    for (wanted, driven, mut state) in &mut bodies {
+        let body = &state.body;
+        if *driven != Driven::Local || !body.config().settings.is_reduced(body.model()) {
+            continue;
+        }
+        // Fewer coordinates than the model has are stepped without shapes.
+        let takes = wanted.held_shapes && body.mode_count() == body.model().mode_count();
+        let patches = body.held_patches().filter(|_| takes);
+        if let Some(shapes) = cache.change(body.model(), patches, body.held_shapes()) {
+            // The shapes are of this model, so that this cannot fail.
+            let _ = state.body_mut().set_held_shapes(shapes);
+        }
+    }
+}

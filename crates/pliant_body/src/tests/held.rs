@@ -1,0 +1,150 @@
+//! Held patches get their own shapes beside the frames.
+
+use std::{
+    sync::Arc,
+    time::{Duration, Instant},
+};
+
+use bevy::{math::DVec3, prelude::*};
+use pliant_bake::{BakeConfig, Material, bake};
+use pliant_mesh::shapes;
+use pliant_modal::{Elasticity, ModalModel};
+
+use super::{app, refusals, spawn_with, state, steps};
+use crate::{Grab, GrabForce, GrabOf, HeldShapesCache, ModalBody, VisualState};
+
+/// A bar of 1 m by 0.1 m by 0.1 m along x, clamped at x = 0.
+fn bar() -> ModalModel {
+    let config = BakeConfig {
+        modes: 20,
+        material: Some(Material::NeoHookean),
+        anchors: vec!["x<1e-9".parse().unwrap()],
+        ..Default::default()
+    };
+    bake(&shapes::bar([10, 2, 2], [1.0, 0.1, 0.1]).unwrap(), None, &config, &mut |_, _| ()).unwrap().model
+}
+
+fn reduced(body: &mut ModalBody) {
+    body.settings.elasticity = Elasticity::Reduced;
+    body.settings.damping_scale = 30.0;
+}
+
+fn hold(app: &mut App, body: Entity, target: DVec3) -> Entity {
+    let positions = state(app, body).model().surface().positions();
+    let corner = positions.iter().position(|p| *p == [1.0, 0.1, 0.1]).unwrap() as u32;
+    app.world_mut().spawn((Grab::new(corner, 0.06, target), GrabOf(body))).id()
+}
+
+fn has_shapes(app: &App, body: Entity) -> bool {
+    state(app, body).body().held_shapes().is_some()
+}
+
+fn wait_for_shapes(app: &mut App, body: Entity) {
+    let begun = Instant::now();
+    while !has_shapes(app, body) {
+        assert!(begun.elapsed() < Duration::from_secs(120), "no shapes are made");
+        std::thread::sleep(Duration::from_millis(2));
+        app.update();
+    }
+}
+
+#[test]
+fn a_held_patch_gets_its_own_shapes_and_they_are_felt_and_seen() {
+    let mut app = app();
+    let model = bar();
+    let body = spawn_with(&mut app, model.clone(), reduced, ());
+    let plain = spawn_with(
+        &mut app,
+        model,
+        |body| {
+            reduced(body);
+            body.held_shapes = false;
+        },
+        (),
+    );
+    let target = DVec3::new(1.0, 0.16, 0.16);
+    let hands = [body, plain].map(|body| hold(&mut app, body, target));
+    steps(&mut app, 1);
+    // The hand need not wait for them.
+    assert!(app.world().get::<GrabForce>(hands[0]).unwrap().force.length() > 0.0);
+    wait_for_shapes(&mut app, body);
+    steps(&mut app, 400);
+    assert!(!has_shapes(&app, plain) && refusals(&mut app).is_empty());
+    let [with, without] = hands.map(|hand| app.world().get::<GrabForce>(hand).unwrap().force);
+    let change = (with - without).length() / without.length();
+    assert!((0.003..0.2).contains(&change), "{with} N with and {without} N without shapes");
+    // The surface that is shown is the body's own.
+    let shown = app.world().get::<VisualState>(body).unwrap();
+    let (shapes, s) = shown.held().unwrap();
+    assert!(shapes.patches().len() == 1 && s.iter().any(|s| *s != 0.0));
+    let positions = state(&app, body).positions(shown);
+    let mut solver = state(&app, body).body().clone();
+    let mut want = positions.clone();
+    solver.reconstruct(&mut want).unwrap();
+    let off = |a: &[f32; 3], b: &[f32; 3]| Vec3::from(*a).distance(Vec3::from(*b));
+    let most = positions.iter().zip(&want).map(|(a, b)| off(a, b)).fold(0.0, f32::max);
+    assert!(most < 1e-6, "the shown surface is {most} m off");
+    // Without the columns it would not be.
+    let bare = state(&app, body).positions_at(shown.q());
+    let dent = bare.iter().zip(&want).map(|(a, b)| off(a, b)).fold(0.0, f32::max);
+    assert!(dent > 1e-4, "the columns move the surface by {dent} m");
+    // They go with the hand, and the next hand on the patch need not wait.
+    app.world_mut().despawn(hands[0]);
+    steps(&mut app, 3);
+    assert!(!has_shapes(&app, body) && app.world().get::<VisualState>(body).unwrap().held().is_none());
+    assert!(!app.world().resource::<HeldShapesCache>().is_making());
+    hold(&mut app, body, target);
+    steps(&mut app, 1);
+    assert!(has_shapes(&app, body));
+}
+
+#[test]
+fn a_body_of_fewer_coordinates_or_of_linear_elasticity_gets_no_shapes() {
+    let mut app = app();
+    let few = spawn_with(
+        &mut app,
+        bar(),
+        |body| {
+            reduced(body);
+            body.modes = Some(8);
+        },
+        (),
+    );
+    let linear = spawn_with(&mut app, bar(), |_| (), ());
+    let target = DVec3::new(1.0, 0.16, 0.16);
+    for body in [few, linear] {
+        hold(&mut app, body, target);
+    }
+    steps(&mut app, 20);
+    assert!(!app.world().resource::<HeldShapesCache>().is_making());
+    assert!(![few, linear].into_iter().any(|body| has_shapes(&app, body)));
+    // A body that becomes linear loses them.
+    let body = spawn_with(&mut app, bar(), reduced, ());
+    let hand = hold(&mut app, body, target);
+    wait_for_shapes(&mut app, body);
+    app.world_mut().get_mut::<ModalBody>(body).unwrap().settings.elasticity = Elasticity::Linear;
+    steps(&mut app, 3);
+    assert!(!has_shapes(&app, body));
+    let force = app.world().get::<GrabForce>(hand).unwrap().force;
+    assert!(force.is_finite() && force.length() > 0.0);
+}
+
+#[test]
+fn the_cache_is_bounded_and_knows_what_has_no_shapes() {
+    let _app = app();
+    let mut cache = HeldShapesCache::default();
+    let linear = Arc::new(super::model::bar());
+    assert!(matches!(cache.get(&linear, &[(0, 0.1)]), Some(None)), "a linear model");
+    let model = Arc::new(bar());
+    assert!(matches!(cache.get(&model, &[]), Some(None)), "no patch");
+    assert!(matches!(cache.get(&model, &[(0, 0.1); 5]), Some(None)), "too many patches");
+    assert!(cache.get(&model, &[(1_000_000, 0.1)]).is_none());
+    let begun = Instant::now();
+    while cache.is_making() {
+        assert!(begun.elapsed() < Duration::from_secs(60));
+        std::thread::sleep(Duration::from_millis(1));
+        // A patch that the model does not have is refused once.
+        cache.get(&model, &[(1_000_000, 0.1)]);
+    }
+    assert!(matches!(cache.get(&model, &[(1_000_000, 0.1)]), Some(None)));
+}
