@@ -28,6 +28,8 @@ pub(crate) struct Replica {
     hands: Vec<Hand>,
     keys: Vec<GrabKey>,
     implied: ImpliedPulls,
+    /// Number of patches made.
+    pub(crate) made: u64,
 }
 
 impl Replica {
@@ -40,7 +42,7 @@ impl Replica {
     ) -> Result<Self, StreamError> {
         let kernel = Kernel::new(model, settings, modes, h).map_err(|e| StreamError::Model(e.to_string()))?;
         let implied = ImpliedPulls::new(&kernel);
-        Ok(Self { kernel, patches: Vec::new(), hands: Vec::new(), keys: Vec::new(), implied })
+        Ok(Self { kernel, patches: Vec::new(), hands: Vec::new(), keys: Vec::new(), implied, made: 0 })
     }
 
     pub(crate) fn kernel(&self) -> &Kernel {
@@ -60,6 +62,7 @@ impl Replica {
         }
         let patch = Patch::around(self.model().surface(), vertex, radius).ok()?;
         let patch = Arc::new(HeldPatch::new(self.model(), &patch, self.kernel.modes()).ok()?);
+        self.made += 1;
         if self.patches.len() >= PATCHES {
             self.patches.clear();
         }

@@ -149,6 +149,11 @@ impl PeerBody {
         self.restepped
     }
 
+    /// Number of patches that were made for hands.
+    pub fn patches_made(&self) -> u64 {
+        self.replica.made
+    }
+
     /// The state after a remembered tick.
     pub(crate) fn past(&self, tick: Tick) -> Option<&State> {
         self.rollback.at(tick).map(|past| &past.state)

@@ -11,17 +11,22 @@ use pliant_modal::{BakeInfo, Damping, Element, ModalModel, ModelParts, SurfaceMe
 /// and z, stretch in x, and twist about x. Their shape along the bar is sin((2k - 1) pi x / 2). The
 /// mass is 2 kg and the damping ratio is `zeta`.
 pub fn bar(modes: usize, zeta: f64) -> Arc<ModalModel> {
-    bar_that(modes, zeta, false)
+    bar_that(16, modes, zeta, false)
+}
+
+/// The same bar with `cells` cells along it, and so with `4 (cells + 1)` vertices.
+pub fn fine_bar(cells: usize, modes: usize) -> Arc<ModalModel> {
+    bar_that(cells, modes, 0.05, false)
 }
 
 /// The same bar without the fixed end. It has a rigid pose, and the same mode shapes relative to
 /// it.
 pub fn loose_bar(modes: usize, zeta: f64) -> Arc<ModalModel> {
-    bar_that(modes, zeta, true)
+    bar_that(16, modes, zeta, true)
 }
 
-fn bar_that(modes: usize, zeta: f64, free: bool) -> Arc<ModalModel> {
-    let (nx, half) = (16, 0.08);
+fn bar_that(nx: usize, modes: usize, zeta: f64, free: bool) -> Arc<ModalModel> {
+    let half = 0.08;
     let mut positions = Vec::new();
     for i in 0..=nx {
         for [y, z] in [[-1.0, -1.0], [1.0, -1.0], [1.0, 1.0], [-1.0, 1.0_f64]] {

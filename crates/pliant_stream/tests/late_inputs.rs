@@ -1,0 +1,112 @@
+//! A peer whose inputs come as late as can be, with new patches in each, costs the others a bounded
+//! amount of work, and all agree soon after. The work is counted, since times depend on the machine.
+#![allow(clippy::unwrap_used, clippy::expect_used, clippy::panic, reason = "a failed test should panic")]
+
+mod support;
+
+use std::time::{Duration, Instant};
+
+use pliant_stream::peer::PeerSession;
+use pliant_stream::wire::{Datagram, HeldAt, InputTick, Inputs};
+use pliant_stream::{Channel, PeerId};
+use support::direct::{BODY, peers};
+
+/// How late the inputs come, ticks: one less than is remembered.
+const LATE: u64 = 127;
+const TICK: Duration = Duration::from_millis(25);
+
+/// The input of the third peer at a tick: sixteen hands, whose patches nobody has had before.
+fn sixteen(tick: u64) -> InputTick {
+    let hand = |k: u16| HeldAt {
+        body: BODY,
+        grab: k,
+        vertex: 4 + 3 * u32::from(k),
+        radius: f64::from((0.3 + 1e-5 * (16 * (tick % 4096) + u64::from(k)) as f64) as f32),
+        target: [1.0, 0.05, 0.0],
+        hold: Default::default(),
+    };
+    InputTick { tick, held: (0..16).map(hand).collect() }
+}
+
+/// What the first peer has done in the attack, by update.
+struct Cost {
+    restepped: Vec<u64>,
+    patches: Vec<u64>,
+    times: Vec<Duration>,
+}
+
+/// Ten seconds of the attack on the first peer, and ten seconds after it.
+fn attack() -> (Vec<PeerSession>, Cost) {
+    let mut now = Duration::from_millis(1);
+    let mut all = peers(now);
+    let mut cost = Cost { restepped: Vec::new(), patches: Vec::new(), times: Vec::new() };
+    let counts = |peer: &PeerSession| {
+        let body = peer.body(BODY).unwrap();
+        (body.restepped(), body.patches_made())
+    };
+    for round in 0..1000_u64 {
+        now += TICK;
+        let attacks = (200..600).contains(&round);
+        for from in 0..3 {
+            let before = counts(&all[from]);
+            let began = Instant::now();
+            all[from].update(now);
+            if attacks && from == 0 {
+                let after = counts(&all[from]);
+                cost.times.push(began.elapsed());
+                cost.restepped.push(after.0 - before.0);
+                cost.patches.push(after.1 - before.1);
+            }
+            while let Some(o) = all[from].poll_output() {
+                let to = o.peer.0 as usize;
+                // The third peer keeps its own inputs from the first one during the attack.
+                match o.channel {
+                    Channel::Datagram if attacks && from == 2 && to == 0 => {}
+                    Channel::Datagram => all[to].on_datagram(now, PeerId(from as u64), &o.bytes),
+                    Channel::Message => all[to].on_message(now, PeerId(from as u64), &o.bytes),
+                }
+            }
+        }
+        let tick = all[0].tick();
+        if attacks && tick > 200 + LATE {
+            // One input for each tick, so that each update goes back as far as it can.
+            let late = Inputs { now: tick, ahead: None, ticks: vec![sixteen(tick + 1 - LATE)], check: None };
+            let datagram = Datagram::Inputs(late).encode((round + 30_000) as u16);
+            all[0].on_datagram(now, PeerId(2), &datagram);
+        }
+    }
+    (all, cost)
+}
+
+#[test]
+fn inputs_as_late_as_can_be_with_new_patches_cost_a_bounded_amount_and_then_all_agree() {
+    let (all, cost) = attack();
+    let sum = |counts: &[u64]| counts.iter().sum::<u64>();
+    let (steps, patches) = (sum(&cost.restepped), sum(&cost.patches));
+    println!(
+        "{} updates: {steps} ticks stepped again ({} at most at once), {patches} patches made",
+        cost.times.len(),
+        cost.restepped.iter().max().unwrap()
+    );
+    let confirmed = all.iter().map(PeerSession::confirmed).min().unwrap();
+    assert!(confirmed + 10 > all[0].tick(), "{confirmed} of {}", all[0].tick());
+    let of = |k: usize| &all[k].state_at(BODY, confirmed).unwrap().q;
+    for k in [1, 2] {
+        let off: f64 = of(0).iter().zip(of(k)).map(|(a, b)| (a - b).abs()).sum();
+        assert!(off < 1e-6, "peer {}: {off}", k + 1);
+    }
+    // Besides one return to the oldest tick, as many as an ordinary late peer costs.
+    assert!(steps <= 127 + 16 * cost.times.len() as u64, "{steps} ticks stepped again");
+    assert!(patches <= 128 + 64 * 10, "{patches} patches");
+}
+
+/// The time of an update. Run by hand, on a quiet machine and with `--release`.
+#[test]
+#[ignore = "measures times"]
+fn time_of_an_update_while_inputs_come_as_late_as_can_be() {
+    let (_, mut cost) = attack();
+    cost.times.sort();
+    let at = |share: f64| cost.times[(share * (cost.times.len() - 1) as f64) as usize];
+    println!("update: median {:?}, p99 {:?}, longest {:?}", at(0.5), at(0.99), at(1.0));
+    assert!(at(0.99) < Duration::from_millis(2), "p99 {:?}", at(0.99));
+}
