@@ -11,8 +11,8 @@ use bytes::Bytes;
 use pliant_body::{ModalAsset, ModalBody};
 use pliant_net::transport::{Endpoint, Event, JoinOptions, Limits};
 use pliant_net::{
-    Access, Emulation, Fingerprint, Grant, HostOptions, Invite, NetPeer, NetPlugin, PeerConfig, PeerState,
-    SharedBody, Token, User,
+    Access, Emulation, Fingerprint, Grant, HostOptions, Identity, Invite, NetPeer, NetPlugin, PeerConfig,
+    PeerState, SharedBody, Token, User,
 };
 use pliant_stream::emulator::{LinkConfig, Loss};
 use pliant_stream::wire::{PROTOCOL_VERSION, PeerMessage};
@@ -309,4 +309,120 @@ fn calls_in_vain_freeze_no_frame_and_an_end_waits_for_all_of_them_at_once() {
     let end = end.elapsed();
     println!("the end took {:.2} s", end.as_secs_f64());
     assert!(end < TOO_LONG, "{end:?}");
+}
+
+/// Brings a caller with this first message to `app`, until it is answered or closed.
+fn call(app: &mut App, caller: &mut UnauthenticatedPeer, hello: &Bytes) {
+    let mut said = false;
+    run_until(&mut [app], "the caller is answered or closed", |_| {
+        caller.listen();
+        if caller.connected && !std::mem::replace(&mut said, true) {
+            caller.endpoint.send_message(PeerId::HOST, hello.clone()).unwrap();
+        }
+        caller.closed.is_some() || caller.said(|message| matches!(message, PeerMessage::Hello { .. }))
+    });
+}
+
+fn with_key(invite: &Invite, key: &[u8]) -> UnauthenticatedPeer {
+    let identity = Some(Identity::from_pkcs8(key).unwrap());
+    let endpoint = Endpoint::join(invite, JoinOptions { identity, ..JoinOptions::default() }).unwrap();
+    UnauthenticatedPeer { endpoint, connected: false, closed: None, messages: Vec::new() }
+}
+
+#[test]
+fn a_number_stays_with_its_key_also_while_its_peer_is_away() {
+    let _alone = alone();
+    let (mut a, invite) = first(Access::Anyone, limits());
+    let key = Identity::generate().unwrap().to_pkcs8();
+    let mut owner = with_key(&invite, &key);
+    let asks = hello(&a, 0, &invite);
+    call(&mut a, &mut owner, &asks);
+    run_until(&mut [&mut a], "it is number 2", |apps| {
+        owner.listen();
+        users(apps[0]) == 2 && owner.said(|message| matches!(message, PeerMessage::Welcome { user: 2, .. }))
+    });
+    drop(owner);
+    run_until(&mut [&mut a], "it is away", |apps| users(apps[0]) == 1);
+    // Another key says that it is number 2.
+    let as_two = hello(&a, 2, &invite);
+    let mut thief = UnauthenticatedPeer::at(&invite);
+    call(&mut a, &mut thief, &as_two);
+    run_until(&mut [&mut a], "it is sent away", |_| {
+        thief.listen();
+        assert!(
+            !thief.said(|message| matches!(message, PeerMessage::Hello { .. })),
+            "another key was answered as number 2"
+        );
+        thief.closed.is_some()
+    });
+    assert_eq!((thief.closed, users(&mut a)), (Some(DisconnectReason::NumberTaken), 1));
+    // Its own key has it again, whether it says its number or asks for one.
+    for hello in [as_two, asks] {
+        let mut owner = with_key(&invite, &key);
+        call(&mut a, &mut owner, &hello);
+        run_until(&mut [&mut a], "it is back", |apps| users(apps[0]) == 2);
+        drop(owner);
+        run_until(&mut [&mut a], "it is away", |apps| users(apps[0]) == 1);
+    }
+}
+
+#[test]
+fn sixty_four_silent_connections_bar_no_peer() {
+    let _alone = alone();
+    // The silent ones would stay for ten minutes.
+    let limits = Limits { handshake: Duration::from_secs(600), ..limits() };
+    let (mut a, invite) = first(Access::Anyone, limits.clone());
+    let mut silent: Vec<UnauthenticatedPeer> = (0..64).map(|_| UnauthenticatedPeer::at(&invite)).collect();
+    run_until(&mut [&mut a], "all are connected", |_| {
+        silent.iter_mut().for_each(UnauthenticatedPeer::listen);
+        silent.iter().all(|stranger| stranger.connected)
+    });
+    let mut b = peer("b", Some(invite), Access::Anyone, limits);
+    run_until(&mut [&mut a, &mut b], "a peer gets in", |apps| {
+        if let PeerState::Closed { reason } = apps[1].world().resource::<NetPeer>().state() {
+            panic!("the peer is not let in: {reason}");
+        }
+        users(apps[0]) == 2 && users(apps[1]) == 2
+    });
+}
+
+#[test]
+fn each_peer_has_a_token_of_its_own() {
+    let _alone = alone();
+    let token = Token([1; 16]);
+    let (mut a, invite) = first(Access::Tokens(vec![Grant::hold(token)]), limits());
+    let hello = hello(&a, 0, &invite);
+    let told = |caller: &UnauthenticatedPeer| {
+        caller.messages.iter().find_map(|bytes| match PeerMessage::decode(bytes) {
+            Ok(PeerMessage::Hello { address, .. }) => address.parse::<Invite>().ok()?.token,
+            _ => None,
+        })
+    };
+    let mut callers: Vec<UnauthenticatedPeer> = (0..2)
+        .map(|_| {
+            let mut caller = UnauthenticatedPeer::at(&invite);
+            call(&mut a, &mut caller, &hello);
+            caller
+        })
+        .collect();
+    let tokens: Vec<Token> = callers.iter().map(|caller| told(caller).expect("a token")).collect();
+    assert!(tokens[0] != tokens[1] && !tokens.contains(&token), "each of the three is another one");
+    // With its token, a peer comes back. The token of one that was sent away admits nobody.
+    let second = callers.pop().unwrap();
+    let mut first = callers.pop().unwrap();
+    first.endpoint.send_message(PeerId::HOST, Bytes::from_static(&[99])).unwrap();
+    run_until(&mut [&mut a], "it is sent away", |_| {
+        first.listen();
+        first.closed.is_some()
+    });
+    drop(second);
+    run_until(&mut [&mut a], "both are gone", |apps| users(apps[0]) == 1);
+    let mut wrong = UnauthenticatedPeer::at(&invite.clone().with_token(tokens[0]));
+    let mut right = UnauthenticatedPeer::at(&invite.clone().with_token(tokens[1]));
+    run_until(&mut [&mut a], "one is refused and the other let in", |_| {
+        wrong.listen();
+        right.listen();
+        wrong.closed.is_some() && right.connected
+    });
+    assert_eq!((wrong.closed, right.closed), (Some(DisconnectReason::UnknownToken), None));
 }

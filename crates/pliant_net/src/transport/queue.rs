@@ -257,6 +257,32 @@ mod tests {
         assert!(first_two.contains(&2), "{first_two:?}");
     }
 
+    fn from(event: Option<Event>) -> Option<PeerId> {
+        event.map(|event| match event {
+            Event::Connected { peer, .. }
+            | Event::Closed { peer, .. }
+            | Event::Message { peer, .. }
+            | Event::Datagram { peer, .. } => peer,
+        })
+    }
+
+    #[test]
+    fn a_queue_of_messages_delays_nobody_elses() {
+        let inbox = Inbox::default();
+        let (stranger, guest) = (PeerId(1), PeerId(2));
+        inbox.open(stranger, left(stranger));
+        inbox.pop().unwrap();
+        let five = Bytes::from_static(&[4, 1, 1, 12, 0]);
+        let queued = (0..100_000).filter(|_| inbox.push_message(stranger, five.clone(), 64 << 20).is_ok());
+        assert_eq!(queued.count(), 100_000);
+        assert!(!inbox.overloaded(), "messages refuse no new guest");
+        inbox.open(guest, left(guest));
+        inbox.push_message(guest, bytes(0), 64 << 20).unwrap();
+        inbox.push_datagram(guest, Instant::now(), bytes(1), 64);
+        let turns: Vec<_> = (0..6).map_while(|_| from(inbox.pop())).collect();
+        assert_eq!(turns.iter().filter(|peer| **peer == guest).count(), 3, "{turns:?}");
+    }
+
     #[test]
     fn messages_are_given_back_rather_than_dropped() {
         let inbox = Inbox::default();

@@ -190,3 +190,44 @@ fn a_thousand_connections_from_one_address_cost_the_others_nothing() {
     let another = guest(&Invite::new(target, host.fingerprint()));
     connected(&another);
 }
+
+#[test]
+fn silent_connections_bar_nobody_and_who_has_spoken_stays() {
+    // All come from one address, which has room for 64, at a host that has room for 64 and one.
+    // The handshakes of the silent ones would last as long as the test.
+    let long = Duration::from_secs(600);
+    let limits = Limits { peers: 65, handshake: long, idle_timeout: long, ..Limits::host() };
+    let host = Endpoint::host(HostOptions { limits, ..HostOptions::default() }).unwrap();
+    let present = guest(&host.invite());
+    connected(&present);
+    let (peer, _) = connected(&host);
+    present.send_message(PeerId::HOST, Bytes::from_static(b"hello")).unwrap();
+    assert_eq!(message(&host), "hello");
+    let stranger = UnauthenticatedPeer::new(ALPN, true);
+    // Half of them show no token, and the other half show one and say nothing more.
+    let connections: Vec<quinn::Connection> = (0..64)
+        .map(|k| {
+            let connection = stranger.connect(&host).unwrap();
+            if k % 2 == 1 {
+                stranger.runtime.block_on(async {
+                    let (mut send, recv) = connection.open_bi().await.unwrap();
+                    send.write_all(&0u32.to_le_bytes()).await.unwrap();
+                    std::mem::forget((send, recv));
+                });
+            }
+            connection
+        })
+        .collect();
+    let newcomer = guest(&host.invite());
+    stranger.live_until("a newcomer gets in", || match newcomer.poll() {
+        Some(Event::Closed { reason, .. }) => panic!("the newcomer is not let in: {reason}"),
+        event => event.is_some(),
+    });
+    newcomer.send_message(PeerId::HOST, Bytes::from_static(b"newcomer")).unwrap();
+    stranger.live_until("it is heard", || match host.poll() {
+        Some(Event::Message { bytes, .. }) => bytes == "newcomer",
+        _ => false,
+    });
+    assert!(host.stats(peer).is_some(), "who has spoken stays");
+    drop(connections);
+}

@@ -32,21 +32,26 @@ const GIVE: [[f64; 3]; 3] = [[2e-3, 0.0, 0.0], [0.0, 2e-3, 0.0], [0.0, 0.0, 2e-3
 /// A square bar of 1 m and 2 kg along x, fixed at x = 0. It shears in y and z with the mode shapes
 /// sin((2k - 1) pi x / 2).
 pub fn bar() -> Arc<ModalModel> {
-    let half = 0.08;
+    bar_of(CELLS)
+}
+
+/// The same bar with `cells` cells along it.
+pub fn bar_of(cells: u32) -> Arc<ModalModel> {
+    let (half, tip) = (0.08, 4 * cells);
     let mut positions: Vec<[f32; 3]> = Vec::new();
-    for i in 0..=CELLS {
+    for i in 0..=cells {
         for [y, z] in [[-1.0, -1.0], [1.0, -1.0], [1.0, 1.0], [-1.0, 1.0]] {
-            positions.push([i as f32 / CELLS as f32, y * half, z * half]);
+            positions.push([i as f32 / cells as f32, y * half, z * half]);
         }
     }
     let mut triangles = Vec::new();
-    for i in 0..CELLS {
+    for i in 0..cells {
         for k in 0..4 {
             let (a, b) = (4 * i + k, 4 * i + (k + 1) % 4);
             triangles.extend([[a, b + 4, b], [a, a + 4, b + 4]]);
         }
     }
-    triangles.extend([[0, 1, 2], [0, 2, 3], [TIP, TIP + 2, TIP + 1], [TIP, TIP + 3, TIP + 2]]);
+    triangles.extend([[0, 1, 2], [0, 2, 3], [tip, tip + 2, tip + 1], [tip, tip + 3, tip + 2]]);
     let anchored = positions.iter().map(|p| p[0] == 0.0).collect();
     let surface = SurfaceMesh::new(positions.clone(), triangles, None, anchored).unwrap();
     let modes: Vec<(usize, f64)> = vec![(1, 0.9), (2, 1.1), (1, 2.7), (2, 3.3)];
@@ -88,7 +93,7 @@ pub fn bar() -> Arc<ModalModel> {
         inertia: [[0.01, 0.0, 0.0], [0.0, 0.17, 0.0], [0.0, 0.0, 0.17]],
         // Residual flexibility of the truncated modes, m/N. Without it a grab would be stiffer than
         // a body of four modes can bear at 40 Hz.
-        sites: [TIP, MIDDLE]
+        sites: [tip, 4 * (cells / 2)]
             .map(|vertex| FlexibilitySite { vertex, radius: 0.3, flexibility: GIVE })
             .to_vec(),
         reduced: None,
@@ -132,10 +137,15 @@ fn keep_messages(mut registry: ResMut<MessageRegistry>) {
 /// Creates a host that shares [`bar`] at 1 m above the origin. Returns the app, its invite and the
 /// body.
 pub fn host(config: HostConfig) -> (App, Invite, Entity) {
+    host_of(config, bar())
+}
+
+/// As [`host`], with another body.
+pub fn host_of(config: HostConfig, model: Arc<ModalModel>) -> (App, Invite, Entity) {
     let net = NetPlugin::host(config).unwrap();
     let invite = net.invite().unwrap().clone();
     let mut app = app(net);
-    let handle = app.world_mut().resource_mut::<Assets<ModalAsset>>().add(ModalAsset(bar()));
+    let handle = app.world_mut().resource_mut::<Assets<ModalAsset>>().add(ModalAsset(model));
     let place = Transform::from_xyz(0.0, 1.0, 0.0)
         .with_rotation(Quat::from_rotation_z(0.5))
         .with_scale(Vec3::splat(2.0));

@@ -1,0 +1,221 @@
+//! A stranger that was let in sends all that it can: datagrams with 64 targets, messages of five
+//! bytes, and grabs of the whole body. The host's frame stays short, a second guest joins, and who
+//! is there loses nothing.
+//!
+//! What a frame reads is counted. The last test measures times, and is run by hand.
+#![allow(clippy::unwrap_used, clippy::expect_used, clippy::panic, reason = "a failed test should panic")]
+
+mod support;
+
+use std::sync::Arc;
+use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
+use std::thread::JoinHandle;
+use std::time::{Duration, Instant};
+
+use bevy::math::DVec3;
+use bevy::prelude::*;
+use bytes::Bytes;
+use pliant_body::{Grab, GrabOf};
+use pliant_modal::ModalModel;
+use pliant_net::transport::{Endpoint, Event, JoinOptions, Limits, RateCap};
+use pliant_net::{
+    GrabRefused, HandOf, HostConfig, HostOptions, Invite, JoinConfig, NetHost, SessionClosed, SessionLost,
+};
+use pliant_stream::PeerId;
+use pliant_stream::wire::{
+    Datagram, GuestMessage, PROTOCOL_VERSION, Payload, StreamSubscription, TargetEntry, Targets,
+};
+use support::{alone, app, bar_of, body_of, guest, host_of, messages, only, run_until};
+
+/// What one frame may read of three peers, bytes: the transport's share, and each one's last event.
+const MOST_READ: u64 = 3 * (16 * 512 + 1200);
+/// Cells of the body that is measured, which has four times as many vertices.
+const CELLS: u32 = 2500;
+
+fn limits() -> Limits {
+    Limits { rate: RateCap::from_mbit_per_s(1000.0), idle_timeout: Duration::from_secs(30), ..Limits::host() }
+}
+
+struct Stranger {
+    thread: Option<JoinHandle<()>>,
+    stop: Arc<AtomicBool>,
+    sent: Arc<AtomicU64>,
+}
+
+impl Stranger {
+    /// Joins, begins a grab, and then sends all that the connection takes until it is dropped.
+    fn at(invite: &Invite, model: &ModalModel) -> Self {
+        let endpoint = Endpoint::join(
+            invite,
+            JoinOptions { limits: Limits { message: 256 << 20, ..limits() }, ..JoinOptions::default() },
+        )
+        .unwrap();
+        let (stop, sent) = (Arc::<AtomicBool>::default(), Arc::<AtomicU64>::default());
+        let (cached, vertices) = (vec![model.hash().0], model.surface().positions().len() as u32);
+        let (ended, count) = (Arc::clone(&stop), Arc::clone(&sent));
+        let thread = std::thread::spawn(move || Self::flood(&endpoint, cached, vertices, &ended, &count));
+        Self { thread: Some(thread), stop, sent }
+    }
+
+    fn flood(
+        endpoint: &Endpoint,
+        cached: Vec<[u8; 32]>,
+        vertices: u32,
+        ended: &AtomicBool,
+        sent: &AtomicU64,
+    ) {
+        let subscription = StreamSubscription { payload: Payload::Forces, modes: 4, repeats: 0, refresh: 60 };
+        let hello =
+            GuestMessage::Hello { version: PROTOCOL_VERSION, name: "stranger".into(), subscription, cached };
+        let begin = |grab: u16, radius| GuestMessage::GrabBegin {
+            grab,
+            body: 1,
+            vertex: u32::from(grab) % vertices,
+            radius,
+            target: [1.0, 0.0, 0.0],
+            hold: Default::default(),
+        };
+        let send = |message: GuestMessage| endpoint.send_message(PeerId::HOST, message.encode().into());
+        while !ended.load(Ordering::Relaxed) && !matches!(endpoint.poll(), Some(Event::Connected { .. })) {
+            std::thread::sleep(Duration::from_millis(1));
+        }
+        send(hello).unwrap();
+        // The grab that the targets move.
+        std::thread::sleep(Duration::from_millis(500));
+        send(begin(0, 0.05)).unwrap();
+        let room = endpoint.max_datagram_size(PeerId::HOST).unwrap();
+        let targets = ((room - 4) / 18).min(64);
+        let (mut input, mut sequence, mut grab, mut next) = (0, 0, 1, Instant::now());
+        while !ended.load(Ordering::Relaxed) {
+            for _ in 0..64 {
+                let entry = |_| {
+                    input += 1;
+                    TargetEntry { grab: 0, input, target: [1.0, 0.001 * f64::from(input % 9), 0.0] }
+                };
+                let entries = (0..targets).map(entry).collect();
+                let datagram = Datagram::Targets(Targets { entries }).encode(sequence);
+                sequence = sequence.wrapping_add(1);
+                endpoint.send_datagram(PeerId::HOST, datagram.into()).ok();
+            }
+            // The host may read slowly, and then the queue is full.
+            let wanted = |modes| GuestMessage::Interest { body: 1, modes: Some(modes) };
+            for _ in 0..16 {
+                if endpoint.unsent(PeerId::HOST) > 1 << 20 {
+                    break;
+                }
+                let five = Bytes::from(wanted(1 + input as u16 % 4).encode());
+                assert!(five.len() <= 5);
+                (0..1000).for_each(|_| drop(endpoint.send_message(PeerId::HOST, five.clone())));
+                sent.fetch_add(1000, Ordering::Relaxed);
+            }
+            if next <= Instant::now() {
+                next += Duration::from_secs(1) / 60;
+                send(GuestMessage::GrabEnd { grab: grab - 1 + u16::from(grab == 1) }).ok();
+                send(begin(grab, 1.0 + 1e-5 * f64::from(grab))).ok();
+                grab = (grab + 1).max(1);
+            }
+            while endpoint.poll().is_some() {}
+            std::thread::sleep(Duration::from_millis(1));
+        }
+    }
+}
+
+impl Drop for Stranger {
+    fn drop(&mut self) {
+        self.stop.store(true, Ordering::Relaxed);
+        let ended = self.thread.take().is_none_or(|thread| thread.join().is_ok());
+        assert!(ended || std::thread::panicking(), "the stranger's thread panicked");
+    }
+}
+
+/// Bytes of datagrams and messages that the host has read.
+fn read(host: &App) -> u64 {
+    let totals = host.world().resource::<NetHost>().session().totals();
+    totals.bytes_in + totals.message_bytes_in
+}
+
+/// What ten seconds of the flood did.
+struct Flooded {
+    /// Bytes that each frame of the host has read.
+    read: Vec<u64>,
+    frames: Vec<Duration>,
+    /// Until the second guest was in and saw the body.
+    joined: Duration,
+}
+
+fn flooded(model: &Arc<ModalModel>, lasts: Duration) -> Flooded {
+    let transport = HostOptions { limits: limits(), ..HostOptions::default() };
+    let (mut host, invite, _) = host_of(HostConfig { transport, ..HostConfig::default() }, model.clone());
+    let cached = || JoinConfig { models: vec![model.clone()], ..JoinConfig::default() };
+    let mut first = guest(&invite, cached());
+    let body = run_until(&mut [&mut host, &mut first], "the first guest is in", |apps| body_of(apps[1]));
+    first.world_mut().spawn((Grab::new(0, 0.05, DVec3::new(0.0, 1.0, 0.2)), GrabOf(body)));
+    run_until(&mut [&mut host, &mut first], "and holds", |apps| only::<HandOf>(apps[0]).is_some());
+    let stranger = Stranger::at(&invite, model);
+    let mut flooded = Flooded { read: Vec::new(), frames: Vec::new(), joined: Duration::ZERO };
+    let (mut began, mut second, mut before) = (None::<Instant>, None::<(Instant, App)>, read(&host));
+    loop {
+        let frame = Instant::now();
+        host.update();
+        let took = frame.elapsed();
+        first.update();
+        let now = read(&host);
+        if began.is_none() && stranger.sent.load(Ordering::Relaxed) > 0 {
+            began = Some(Instant::now());
+        }
+        if let Some(began) = began {
+            flooded.read.push(now - before);
+            flooded.frames.push(took);
+            if began.elapsed() > lasts / 5 && second.is_none() {
+                second = Some((Instant::now(), guest(&invite, cached())));
+            }
+            if began.elapsed() > lasts && !flooded.joined.is_zero() {
+                break;
+            }
+        }
+        before = now;
+        if let Some((since, second)) = &mut second {
+            second.update();
+            if flooded.joined.is_zero() && body_of(second).is_some() {
+                flooded.joined = since.elapsed();
+            }
+            assert!(since.elapsed() < support::PATIENCE, "the second guest does not get in");
+        }
+        std::thread::sleep(Duration::from_millis(16).saturating_sub(frame.elapsed()));
+    }
+    println!(
+        "{} frames, {} messages of the stranger, {} bytes read in a frame at most; the second guest was in \
+         after {:?}",
+        flooded.frames.len(),
+        stranger.sent.load(Ordering::Relaxed),
+        flooded.read.iter().max().unwrap(),
+        flooded.joined,
+    );
+    // The first guest has lost nothing: it is in, it holds, and no datagram of it was dropped.
+    assert!(messages::<SessionLost>(&first).is_empty() && messages::<SessionClosed>(&first).is_empty());
+    assert!(messages::<GrabRefused>(&first).is_empty());
+    let world = host.world().resource::<NetHost>();
+    let dropped = world.endpoint().stats(PeerId(1)).unwrap().dropped;
+    assert_eq!((dropped.receive_queue_full, dropped.send_queue_full), (0, 0));
+    flooded
+}
+
+#[test]
+fn a_stranger_that_sends_all_it_can_holds_up_no_frame_and_bars_nobody() {
+    let _alone = alone();
+    let flooded = flooded(&bar_of(16), Duration::from_secs(3));
+    let most = *flooded.read.iter().max().unwrap();
+    assert!(most <= MOST_READ, "{most} bytes read in one frame");
+}
+
+/// Run by hand, on a quiet machine and with `--release`.
+#[test]
+#[ignore = "measures times"]
+fn times_of_the_frames_of_a_host_that_is_flooded() {
+    let _alone = alone();
+    let mut flooded = flooded(&bar_of(CELLS), Duration::from_secs(10));
+    flooded.frames.sort();
+    let at = |share: f64| flooded.frames[(share * (flooded.frames.len() - 1) as f64) as usize];
+    println!("frame: median {:?}, p99 {:?}, longest {:?}", at(0.5), at(0.99), at(1.0));
+    assert!(at(0.99) < Duration::from_millis(5) && flooded.joined < Duration::from_secs(1));
+}
