@@ -53,6 +53,12 @@ impl Replica {
         self.kernel.model()
     }
 
+    /// Returns whether the patch has been made.
+    pub(crate) fn has_patch(&self, vertex: u32, radius: f64) -> bool {
+        let wanted = (vertex, radius.to_bits());
+        self.patches.iter().any(|(key, _)| *key == wanted)
+    }
+
     /// Returns a patch of the body and makes it on first use. The result is `None` for a vertex
     /// that the model lacks.
     pub(crate) fn patch(&mut self, vertex: u32, radius: f64) -> Option<Arc<HeldPatch>> {

@@ -9,7 +9,7 @@ mod tally;
 use std::collections::VecDeque;
 use std::time::Duration;
 
-pub(crate) use budget::Budget;
+pub(crate) use budget::{Budget, PatchBudget};
 pub(crate) use events::Events;
 pub use stats::LinkStats;
 

@@ -149,6 +149,11 @@ impl PeerBody {
         self.restepped
     }
 
+    /// Returns whether a hand on this patch costs no new patch.
+    pub(crate) fn has_patch(&self, vertex: u32, radius: f64) -> bool {
+        self.replica.has_patch(vertex, radius)
+    }
+
     /// Number of patches that were made for hands.
     pub fn patches_made(&self) -> u64 {
         self.replica.made

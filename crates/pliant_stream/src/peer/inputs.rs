@@ -34,9 +34,14 @@ impl UserInputs {
         self.slots.get(tick)
     }
 
+    /// Returns whether the input of a tick is missing and not too old.
+    fn lacks(&self, tick: Tick) -> bool {
+        tick + (WINDOW as u64) > self.highest && self.at(tick).is_none()
+    }
+
     fn put(&mut self, input: InputTick) -> bool {
         let tick = input.tick;
-        if tick + (WINDOW as u64) <= self.highest || self.at(tick).is_some() {
+        if !self.lacks(tick) {
             return false;
         }
         *self.slots.place(tick).0 = input;
@@ -98,6 +103,11 @@ impl InputLog {
             let said_nothing = u.highest < u.first;
             !(u.gone && (said_nothing || u.highest + WINDOW as u64 <= tick))
         });
+    }
+
+    /// Returns whether [`InputLog::put`] would take an input of a tick.
+    pub(crate) fn lacks(&self, user: UserId, tick: Tick) -> bool {
+        self.users.get(&user).is_some_and(|u| u.lacks(tick))
     }
 
     /// Adds an input. Returns true when it is new.

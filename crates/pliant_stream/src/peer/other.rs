@@ -3,7 +3,7 @@
 use std::collections::BTreeMap;
 use std::time::Duration;
 
-use crate::link::{Budget, Link};
+use crate::link::{Budget, Link, PatchBudget};
 use crate::state::{BodyId, PeerId, Tick, UserId};
 
 /// Number of consecutive mismatches after which the other peer's state is taken.
@@ -48,10 +48,21 @@ pub(super) struct RemotePeer {
     pub(super) answer_budget: Budget,
     /// Budget of states that are sent to the peer.
     pub(super) state_budget: Budget,
+    /// Budget of what the peer's late inputs cost: for each tick that is stepped again, one and one
+    /// for each hand.
+    pub(super) late_budget: Budget,
+    /// Budget of the peer's new patches.
+    pub(super) patch_budget: PatchBudget,
 }
 
 impl RemotePeer {
-    pub(super) fn new(peer: PeerId, now: Duration, expected: Option<UserId>, max_datagram: usize) -> Self {
+    pub(super) fn new(
+        peer: PeerId,
+        now: Duration,
+        expected: Option<UserId>,
+        max_datagram: usize,
+        step: f64,
+    ) -> Self {
         Self {
             link: Link::new(peer, now, max_datagram),
             user: None,
@@ -70,7 +81,16 @@ impl RemotePeer {
             // peer requests no more.
             answer_budget: Budget::new(1000.0, 1000.0),
             state_budget: Budget::new(2.0, 16.0),
+            // In each tick, an input with three hands may be 32 ticks late. Once in a while, one
+            // with sixteen may be as late as can be.
+            late_budget: Budget::new(128.0 / step, 2048.0),
+            patch_budget: PatchBudget::default(),
         }
+    }
+
+    /// Returns whether the peer has connected by itself and said nothing since.
+    pub(super) fn is_silent(&self) -> bool {
+        self.user.is_none() && self.expected.is_none() && self.hello.is_none() && !self.greeted
     }
 
     /// Returns whether a body lastingly differs from the other peer's.

@@ -171,6 +171,8 @@ impl PeerSession {
     /// Adds a connection that the other side has opened. The answer to its hello follows when this
     /// peer has a number.
     ///
+    /// When there is no room, the oldest such connection without a hello is removed to make room.
+    ///
     /// # Errors
     /// Returns [`StreamError::Full`] beyond 64 peers.
     pub fn accept(&mut self, now: Duration, peer: PeerId, max_datagram: usize) -> Result<(), StreamError> {
@@ -184,10 +186,15 @@ impl PeerSession {
         user: Option<UserId>,
         max_datagram: usize,
     ) -> Result<(), StreamError> {
+        if self.others.len() >= MAX_PEERS
+            && let Some(silent) = self.others.iter().find(|(_, o)| o.is_silent()).map(|(p, _)| *p)
+        {
+            self.turn_away(silent, DisconnectReason::Silent);
+        }
         if self.others.len() >= MAX_PEERS {
             return Err(StreamError::Full { what: "peers", limit: MAX_PEERS });
         }
-        self.others.insert(peer, RemotePeer::new(peer, now, user, max_datagram));
+        self.others.insert(peer, RemotePeer::new(peer, now, user, max_datagram, self.config.step));
         Ok(())
     }
 
@@ -428,9 +435,15 @@ impl PeerSession {
                 }
                 for input in ticks {
                     let tick = input.tick;
+                    let planned = self.rollback_from.unwrap_or(self.tick + 1);
                     // A tick in the far future is not stored, since it would displace ticks that
                     // are needed.
                     if tick > self.tick + WINDOW as u64 / 2 {
+                        continue;
+                    }
+                    // What costs too much counts as lost. It is requested again, and when it has
+                    // been missing for too long, a state repairs all.
+                    if !self.inputs.lacks(user, tick) || !affords(now, other, &self.bodies, &input, planned) {
                         continue;
                     }
                     if self.inputs.put(user, input) && tick <= self.tick {
@@ -709,4 +722,24 @@ impl PeerSession {
     fn event(&mut self, event: PeerEvent) {
         self.events.push(event);
     }
+}
+
+/// Pays for an input from the budgets of its sender, and returns whether they allow it: the ticks
+/// before `planned` that are stepped again for it, and the patches that no body has yet.
+fn affords(
+    now: Duration,
+    other: &mut RemotePeer,
+    bodies: &BTreeMap<BodyId, PeerBody>,
+    input: &InputTick,
+    planned: Tick,
+) -> bool {
+    let again = planned.saturating_sub(input.tick);
+    let cost = again * (1 + input.held.len() as u64);
+    let patch = |held: &HeldAt| match bodies.get(&held.body) {
+        Some(body) if !body.has_patch(held.vertex, held.radius) => {
+            other.patch_budget.spend(now, body.model(), held.vertex, held.radius)
+        }
+        _ => true,
+    };
+    (cost == 0 || other.late_budget.spend(now, cost as f64)) && input.held.iter().all(patch)
 }

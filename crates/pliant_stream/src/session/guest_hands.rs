@@ -14,7 +14,7 @@ use crate::wire::{Datagram, GuestMessage, MAX_TARGETS, TargetEntry, Targets, che
 /// Interval at which an unchanged target is sent again.
 const TARGET_EVERY: Duration = Duration::from_millis(250);
 /// Number of recent targets of a grab in each datagram.
-const TARGET_REPEATS: usize = 3;
+pub(super) const TARGET_REPEATS: usize = 3;
 
 #[derive(Debug)]
 pub(super) struct LocalGrab {

@@ -6,6 +6,7 @@ use std::time::Duration;
 
 use pliant_modal::{ModalModel, StepSettings};
 
+use super::guest_hands::TARGET_REPEATS;
 use super::host_config::{HostEvent, HostSessionConfig};
 use super::host_peer::{AnnouncedGrab, GuestPeer, MAX_GUEST_GRABS, Standing};
 use super::upload::Upload;
@@ -121,9 +122,16 @@ impl HostSession {
 
     /// Adds a connection whose datagrams carry at most `max_datagram` bytes.
     ///
+    /// When there is no room, the oldest connection without a hello is removed to make room.
+    ///
     /// # Errors
     /// Returns [`StreamError::Full`] when there is no room. The caller then closes the connection.
     pub fn connect(&mut self, now: Duration, peer: PeerId, max_datagram: usize) -> Result<(), StreamError> {
+        if self.peers.len() >= self.config.max_guests
+            && let Some(silent) = self.peers.values().find(|p| p.standing == Standing::Silent).map(|p| p.id)
+        {
+            self.drop_peer(silent, DisconnectReason::Silent, true);
+        }
         if self.peers.len() >= self.config.max_guests {
             return Err(StreamError::Full { what: "guests", limit: self.config.max_guests });
         }
@@ -269,12 +277,16 @@ impl HostSession {
                 let mut moved = Vec::new();
                 let mut entries = targets.entries;
                 entries.sort_by_key(|e| (e.grab, e.input));
-                for e in entries {
+                for (k, e) in entries.iter().enumerate() {
+                    // A guest sends the last few targets of a grab. More of them are out of date.
+                    if entries.get(k + TARGET_REPEATS).is_some_and(|later| later.grab == e.grab) {
+                        continue;
+                    }
                     let Some(held) = p.grabs.get_mut(&e.grab) else { continue };
                     // The input is newer when it is ahead by less than half the range, since the
                     // counter may wrap.
                     let newer = held.input.is_none_or(|last| (e.input.wrapping_sub(last) as i32) > 0);
-                    if newer {
+                    if newer && p.target_budget.spend(now, 1.0) {
                         held.input = Some(e.input);
                         let key = GrabKey { user, grab: e.grab };
                         moved.push(HostEvent::GrabMoved {
@@ -289,13 +301,15 @@ impl HostSession {
             }
             Datagram::Nack(nack) => {
                 p.link.stats.nacks += 1;
-                for run in nack.runs {
-                    for tick in run.first..run.first + u64::from(run.count) {
-                        // A tick that is already queued needs no second answer.
-                        let waits = p.resends.iter().any(|r| r.1 == nack.body && r.2 == tick);
-                        if !waits && p.streaming.contains(&nack.body) && p.nack_budget.spend(now, 1.0) {
-                            p.queue_resend(now + self.config.resend_after, nack.body, tick);
-                        }
+                let streams = p.streaming.contains(&nack.body);
+                let runs = nack.runs.iter().filter(|_| streams);
+                for tick in runs.flat_map(|r| r.first..r.first + u64::from(r.count)) {
+                    if !p.nack_budget.spend(now, 1.0) {
+                        break;
+                    }
+                    // A tick that is already queued needs no second answer.
+                    if !p.resends.iter().any(|r| r.1 == nack.body && r.2 == tick) {
+                        p.queue_resend(now + self.config.resend_after, nack.body, tick);
                     }
                 }
                 self.resend_due(now, peer);
@@ -355,14 +369,16 @@ impl HostSession {
             (GuestMessage::Goodbye { reason }, _) => self.drop_peer(peer, reason, false),
             (GuestMessage::GrabBegin { grab, body, vertex, radius, target, hold }, Some(user)) => {
                 let body = BodyId(body);
-                let vertices = self.bodies.get(&body).map_or(0, |b| b.model.surface().positions().len());
                 // The budget limits new patches, since each costs every encoder of the body a
                 // table.
+                let model = self.bodies.get(&body).map(|b| &b.model);
                 let fits = p.role == Role::Hold
-                    && (vertex as usize) < vertices
-                    && p.grab_budget.spend(now, 1.0)
                     && p.grabs.len() < MAX_GUEST_GRABS
-                    && !p.grabs.contains_key(&grab);
+                    && !p.grabs.contains_key(&grab)
+                    && model.is_some_and(|model| {
+                        (vertex as usize) < model.surface().positions().len()
+                            && p.patch_budget.spend(now, model, vertex, radius)
+                    });
                 if fits {
                     p.grabs.insert(grab, AnnouncedGrab { body, input: None });
                     let key = GrabKey { user, grab };
@@ -420,8 +436,8 @@ impl HostSession {
     /// Returns the next datagram or message to send.
     ///
     /// Nothing is dropped here, so fetch the outputs after each call. The requests of one guest add
-    /// no more than its budgets allow: 4,000 ticks, 2 snapshots and 200 messages a second (16
-    /// snapshots and 400 messages at once).
+    /// no more than its budgets allow: 4,000 ticks, 2 snapshots and 200 messages a second (1,024
+    /// ticks, 16 snapshots and 400 messages at once).
     pub fn poll_output(&mut self) -> Option<Output> {
         self.out.pop_front()
     }
