@@ -55,6 +55,7 @@
 
 mod guest;
 mod host;
+mod known_users;
 mod metrics;
 mod patch_kinematics;
 mod peer;
@@ -62,6 +63,7 @@ mod phase;
 mod plugin;
 mod recording;
 mod remote;
+mod retry_pause;
 mod roster;
 mod session_transform;
 mod shared_body;

@@ -114,7 +114,9 @@ impl Stranger {
                 send(begin(grab, 1.0 + 1e-5 * f64::from(grab))).ok();
                 grab = (grab + 1).max(1);
             }
-            while endpoint.poll().is_some() {}
+            while let Some(event) = endpoint.poll() {
+                assert!(!matches!(event, Event::Closed { .. }), "{event:?}");
+            }
             std::thread::sleep(Duration::from_millis(1));
         }
     }
@@ -194,6 +196,7 @@ fn flooded(model: &Arc<ModalModel>, lasts: Duration) -> Flooded {
     // The first guest has lost nothing: it is in, it holds, and no datagram of it was dropped.
     assert!(messages::<SessionLost>(&first).is_empty() && messages::<SessionClosed>(&first).is_empty());
     assert!(messages::<GrabRefused>(&first).is_empty());
+    println!("{:?}", host.world().resource::<NetHost>().session().stats(PeerId(2)));
     let world = host.world().resource::<NetHost>();
     let dropped = world.endpoint().stats(PeerId(1)).unwrap().dropped;
     assert_eq!((dropped.receive_queue_full, dropped.send_queue_full), (0, 0));

@@ -12,6 +12,8 @@ use pliant_stream::{DisconnectReason, GuestEvent, GuestSession, StreamError, Use
 use super::source::Came;
 use super::{GuestState, NetGuest};
 use crate::remote::{GrabRefused, SessionClosed, SessionJoined, SessionLost};
+use crate::retry_pause::retry_pause;
+use crate::transport::{Endpoint, Fingerprint};
 use crate::user::shortened;
 
 /// When the guest tries to join again.
@@ -22,14 +24,16 @@ pub(super) struct Retry {
     /// Time of the next attempt. `None` while an attempt is under way or none is needed.
     next: Option<Duration>,
     pause: Duration,
+    /// Number of attempts since the connection was lost.
+    attempts: u32,
     /// Whether the guest has been in the session before.
     was_in: bool,
     /// Bodies that have not arrived again by this time are removed.
     orphans_until: Option<Duration>,
 }
 
-/// The first attempt follows after `FIRST_PAUSE`. The pause doubles with each attempt, up to this
-/// length.
+/// The first attempt follows after about `FIRST_PAUSE`. The pause doubles with each attempt, up to
+/// this length, and is half to one and a half times as long as that.
 const LONGEST_PAUSE: Duration = Duration::from_secs(2);
 const FIRST_PAUSE: Duration = Duration::from_millis(100);
 /// How long after the welcome a body may take to arrive again, before it is removed.
@@ -166,7 +170,9 @@ impl NetGuest {
         }
         if self.retry.next.is_none() {
             self.retry.pause = (self.retry.pause * 2).clamp(FIRST_PAUSE, LONGEST_PAUSE);
-            self.retry.next = Some(now + self.retry.pause);
+            self.retry.attempts += 1;
+            let key = self.line.endpoint().map_or(Fingerprint([0; 32]), Endpoint::fingerprint);
+            self.retry.next = Some(now + retry_pause(self.retry.pause, key, self.retry.attempts));
         }
         self.flush();
         self.end_session();

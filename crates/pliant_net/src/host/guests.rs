@@ -1,13 +1,12 @@
 //! Guests on the host: joining, recognition by key, subscriptions and leaving.
 
-use std::collections::{BTreeMap, BTreeSet};
-use std::time::Duration;
+use std::collections::BTreeSet;
 
 use bevy::prelude::*;
 use pliant_stream::{DisconnectReason, GrabKey, HostEvent, PeerId, UserId};
 
+use super::NetHost;
 use super::hands::GuestGrab;
-use super::{KnownUser, NetHost};
 use crate::transport::{Event, Fingerprint, Role};
 
 /// A guest's connection.
@@ -19,22 +18,12 @@ pub(super) struct Guest {
     pub(super) entity: Option<Entity>,
 }
 
-/// Most keys that the host remembers. The key whose last join is longest ago is forgotten first.
-const MOST_KNOWN: usize = 4096;
-
-/// Converts the users of an earlier run, as the app gives them. If two have the same number, the
-/// first keeps it.
-pub(super) fn known_before(known: &[(Fingerprint, UserId)]) -> BTreeMap<Fingerprint, KnownUser> {
-    let mut taken = BTreeSet::from([UserId::HOST]);
-    let fresh = known.iter().take(MOST_KNOWN).filter(|(_, user)| taken.insert(*user));
-    fresh.map(|&(key, user)| (key, KnownUser { user, seen: Duration::ZERO })).collect()
-}
-
 /// `PreUpdate`: processes the data from the guests.
 pub(crate) fn receive(world: &mut World) {
     world.try_resource_scope(|world, mut host: Mut<NetHost>| {
         let host = &mut *host;
-        while let Some(event) = host.endpoint.poll() {
+        let frame: Vec<Event> = host.endpoint.frame().collect();
+        for event in frame {
             let now = host.now();
             match event {
                 Event::Connected { peer, address, fingerprint, role } => {
@@ -95,7 +84,8 @@ impl NetHost {
             debug!("guest {other} has come anew as {peer}");
             self.session.kick(other, DisconnectReason::Replaced);
         }
-        let before = self.known.get(&key).map(|known| known.user).or_else(|| self.free_number());
+        let present: BTreeSet<UserId> = self.session.users().map(|(_, user, _)| user).collect();
+        let before = self.known.number_of(&key).or_else(|| self.known.free_number(&present));
         if let Err(error) = self.session.accept_as(now, peer, before, role) {
             debug!("guest {peer} was not let in: {error}");
             self.session.kick(peer, DisconnectReason::Refused);
@@ -104,29 +94,19 @@ impl NetHost {
         self.take_events(world);
     }
 
-    /// Returns a number that no present or remembered user has.
-    fn free_number(&mut self) -> Option<UserId> {
-        let had: BTreeSet<UserId> = self.known.values().map(|known| known.user).collect();
-        for _ in 0..=u16::MAX {
-            self.next_user = self.next_user.wrapping_add(1);
-            let number = UserId(self.next_user);
-            if number != UserId::HOST && !had.contains(&number) && self.users.get(number).is_none() {
-                return Some(number);
-            }
-        }
-        None
+    fn joined(&mut self, world: &mut World, peer: PeerId, id: UserId, name: &str) {
+        let Some(guest) = self.guests.get_mut(&peer) else { return };
+        let key = guest.key;
+        let back = self.known.number_of(&key) == Some(id);
+        guest.entity = Some(self.users.join(world, id, name, guest.role, back));
+        self.seen(key, id);
     }
 
-    fn joined(&mut self, world: &mut World, peer: PeerId, id: UserId, name: &str) {
-        let now = self.now();
-        let Some(guest) = self.guests.get_mut(&peer) else { return };
-        let before = self.known.insert(guest.key, KnownUser { user: id, seen: now });
-        let back = before.is_some_and(|before| before.user == id);
-        guest.entity = Some(self.users.join(world, id, name, guest.role, back));
-        while self.known.len() > MOST_KNOWN {
-            let oldest = self.known.iter().min_by_key(|(_, known)| known.seen).map(|(&key, _)| key);
-            oldest.and_then(|key| self.known.remove(&key));
-        }
+    /// Keeps that a user has come or gone.
+    fn seen(&mut self, key: Fingerprint, user: UserId) {
+        let present: BTreeSet<Fingerprint> =
+            self.guests.values().filter(|guest| guest.entity.is_some()).map(|guest| guest.key).collect();
+        self.known.see(key, user, |key| present.contains(key));
     }
 
     fn apply(&mut self, world: &mut World, event: HostEvent) {
@@ -138,9 +118,11 @@ impl NetHost {
                 // sent first.
                 self.flush();
                 self.endpoint.close(peer, reason);
-                let inside = self.guests.get_mut(&peer).and_then(|guest| guest.entity.take()).is_some();
-                if let Some(id) = user.filter(|_| inside) {
+                let guest = self.guests.get_mut(&peer);
+                let inside = guest.and_then(|guest| guest.entity.take().map(|_| guest.key));
+                if let Some((id, key)) = user.zip(inside) {
                     self.users.leave(world, id, reason);
+                    self.seen(key, id);
                 }
             }
             HostEvent::GrabBegan { key, body, vertex, radius, target, hold } => {

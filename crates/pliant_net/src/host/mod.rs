@@ -16,6 +16,7 @@ use bytes::Bytes;
 use pliant_modal::ModalModel;
 use pliant_stream::{Channel, DisconnectReason, GrabKey, GrabState, HostSession, LinkStats, PeerId, UserId};
 
+use crate::known_users::KnownUsers;
 use crate::metrics::{Ledger, NetStats};
 use crate::roster::Roster;
 use crate::transport::{
@@ -51,9 +52,10 @@ pub struct HostConfig {
     /// Largest distance of a guest's target from a body's center, in sizes of the body. A target
     /// beyond is moved in to that distance. Default: 4.
     pub reach: f64,
-    /// User numbers by key from an earlier run of this host ([`NetHost::known`]). The same key gets
-    /// the same number again, and no other key gets it. At most 4,096 entries are used, and the
-    /// host's own number is ignored. Default: none, and numbers begin at 1.
+    /// User numbers by key from an earlier run of this host ([`NetHost::known`]), in the order in
+    /// which the users were last seen. The same key gets the same number again, and no other key
+    /// gets it. The last 4,096 entries are used, and the host's own number is ignored. Default:
+    /// none, and numbers begin at 1.
     pub known: Vec<(Fingerprint, UserId)>,
 }
 
@@ -85,11 +87,8 @@ pub struct NetHost {
     next_body: u16,
     /// Open connections, with or without a completed join.
     guests: BTreeMap<PeerId, Guest>,
-    /// User numbers by key, so that a guest that joins again keeps its number.
-    known: BTreeMap<Fingerprint, KnownUser>,
+    known: KnownUsers,
     users: Roster,
-    /// The number that was assigned last.
-    next_user: u16,
     grabs: BTreeMap<GrabKey, Entity>,
     own_grabs: BTreeMap<Entity, u16>,
     next_own_grab: u16,
@@ -98,13 +97,6 @@ pub struct NetHost {
     ledger: Ledger,
     /// New bodies, with their models and the tasks that encode the models' files.
     files: BTreeMap<Entity, (Arc<ModalModel>, Task<Arc<[u8]>>)>,
-}
-
-/// A user who is or was in the session.
-#[derive(Debug, Clone, Copy)]
-struct KnownUser {
-    user: UserId,
-    seen: Duration,
 }
 
 impl NetHost {
@@ -138,8 +130,7 @@ impl NetHost {
             bodies: BTreeMap::new(),
             next_body: 1,
             guests: BTreeMap::new(),
-            known: guests::known_before(&config.known),
-            next_user: 0,
+            known: KnownUsers::restored(&config.known),
             users,
             grabs: BTreeMap::new(),
             own_grabs: BTreeMap::new(),
@@ -211,12 +202,13 @@ impl NetHost {
         self.guests.values().find(|one| one.entity == Some(guest)).map(|one| one.key)
     }
 
-    /// Returns the present and earlier users' numbers by key. An app can keep them in a file and
+    /// Returns the present and earlier users' numbers by key, in the order in which the users were
+    /// last seen. An app can keep them in a file and
     /// give them to the next run ([`HostConfig::known`]), so that guests keep their numbers after a
     /// restart of the host. Otherwise a number is only valid during one run of the host, and only
     /// the key identifies a user.
     pub fn known(&self) -> impl Iterator<Item = (Fingerprint, UserId)> + '_ {
-        self.known.iter().map(|(&key, known)| (key, known.user))
+        self.known.in_order().into_iter()
     }
 
     /// Kicks a guest. Returns false for an entity that is not a guest.

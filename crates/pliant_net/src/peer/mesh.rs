@@ -6,15 +6,14 @@ use std::time::Duration;
 use bevy::prelude::*;
 use bytes::Bytes;
 use pliant_stream::peer::PeerEvent;
+use pliant_stream::wire::PeerMessage;
 use pliant_stream::{Channel, DisconnectReason, PeerId, UserId};
 
+use super::reconnect::is_loss;
 use super::{NetPeer, PeerState};
 use crate::remote::{SessionClosed, SessionJoined};
 use crate::transport::{Endpoint, Event, Fingerprint, Invite, Role};
 use crate::user::UserLink;
-
-/// Most keys whose user numbers are remembered.
-const MOST_REMEMBERED: usize = 4096;
 
 /// Another peer that this peer is connected with.
 #[derive(Debug)]
@@ -51,10 +50,9 @@ pub(crate) fn receive(world: &mut World) {
         net.start(world);
         net.take_events(world);
         let mut came: Vec<(Option<PeerId>, Event)> = Vec::new();
-        // An unread queue drops its oldest datagrams, so this reads all of them.
-        came.extend(std::iter::from_fn(|| net.listening.poll()).map(|event| (None, event)));
+        came.extend(net.listening.frame().map(|event| (None, event)));
         for (&peer, endpoint) in &net.opened {
-            came.extend(std::iter::from_fn(|| endpoint.poll()).map(|event| (Some(peer), event)));
+            came.extend(endpoint.frame().map(|event| (Some(peer), event)));
         }
         for (opened, event) in came {
             net.take(world, opened, event);
@@ -88,10 +86,21 @@ impl NetPeer {
         let now = self.now();
         let (endpoint, number) = self.way(peer);
         let (most, opened) = (endpoint.max_datagram_size(number).unwrap_or(0), number != peer);
-        let (Some(session), Some(other)) = (&mut self.session, self.others.get_mut(&peer)) else { return };
+        let (Some(session), Some(other)) = (&self.session, self.others.get(&peer)) else { return };
         if session.stats(peer).is_some() || !(opened || other.first.is_some()) {
             return;
         }
+        // The number that the peer has, or says that it has.
+        let said = other.first.as_ref().and_then(|bytes| match PeerMessage::decode(bytes) {
+            Ok(PeerMessage::Hello { user, .. }) => Some(UserId(user)),
+            _ => None,
+        });
+        if other.number.or(said).is_some_and(|user| self.known.is_anothers(user, &other.key)) {
+            return self.hang_up(peer, DisconnectReason::NumberTaken);
+        }
+        let address = self.invite_for(peer).to_string();
+        let (Some(session), Some(other)) = (&mut self.session, self.others.get_mut(&peer)) else { return };
+        session.tell_address(peer, address);
         let added = if opened {
             session.connect(now, peer, other.number, most)
         } else {
@@ -155,7 +164,11 @@ impl NetPeer {
                 if let Some(session) = &mut self.session {
                     session.disconnect(peer, reason);
                 }
-                self.others.remove(&peer);
+                if let Some(other) = self.others.remove(&peer)
+                    && let Some(user) = self.known.number_of(&other.key)
+                {
+                    self.see(other.key, user);
+                }
                 self.introduced.remove(&peer);
                 // The endpoint's thread may wait for the other end's last packets, which must not
                 // block a frame.
@@ -167,15 +180,11 @@ impl NetPeer {
         }
     }
 
-    /// Remembers the user number of a key for a reconnect. The number of remembered keys is
-    /// limited, and keys of absent peers are forgotten first.
-    pub(super) fn remember(&mut self, key: Fingerprint, number: UserId) {
-        if self.numbers.len() >= MOST_REMEMBERED && !self.numbers.contains_key(&key) {
-            let here: BTreeSet<Fingerprint> = self.others.values().map(|other| other.key).collect();
-            let gone = self.numbers.keys().find(|key| !here.contains(key)).copied();
-            gone.map(|key| self.numbers.remove(&key));
-        }
-        self.numbers.insert(key, number);
+    /// Keeps that a peer has come or gone.
+    fn see(&mut self, key: Fingerprint, user: UserId) {
+        let own = self.listening.fingerprint();
+        let here: BTreeSet<Fingerprint> = self.others.values().map(|other| other.key).chain([own]).collect();
+        self.known.see(key, user, |key| here.contains(key));
     }
 
     /// Gives a new peer its number and the invites of all other peers.
@@ -187,13 +196,8 @@ impl NetPeer {
             .collect();
         let Some(key) = self.others.get(&peer).map(|other| other.key) else { return };
         let present: BTreeSet<UserId> = self.others.values().filter_map(|other| other.number).collect();
-        let before = self.numbers.get(&key).copied().filter(|before| !present.contains(before));
-        let PeerState::In { user: own } = self.state else { return };
-        let taken: BTreeSet<UserId> =
-            self.numbers.values().copied().chain(present).chain([own, UserId::HOST]).collect();
-        // The number is the first one that no present or remembered peer has. A peer that claims a
-        // large number therefore leaves room for all others.
-        let Some(number) = before.or_else(|| (1..=u16::MAX).map(UserId).find(|n| !taken.contains(n))) else {
+        let before = self.known.number_of(&key).filter(|before| !present.contains(before));
+        let Some(number) = before.or_else(|| self.known.free_number(&present)) else {
             return self.hang_up(peer, DisconnectReason::Full);
         };
         let Some(session) = &mut self.session else { return };
@@ -206,17 +210,25 @@ impl NetPeer {
     /// Keeps the number of a peer that has joined, and where it is reached.
     fn keep_joined(&mut self, peer: PeerId, user: UserId, address: &str) -> bool {
         let Some(other) = self.others.get_mut(&peer) else { return false };
-        // A peer that this one has called is reached where it was called.
-        if other.invite.is_none() {
-            let Ok(invite) = address.parse() else {
+        if self.known.is_anothers(user, &other.key) {
+            self.hang_up(peer, DisconnectReason::NumberTaken);
+            return false;
+        }
+        let told = address.parse::<Invite>();
+        match (&mut other.invite, told) {
+            // A peer that this one has called is reached where it was called, with the token that
+            // it has given to this one.
+            (Some(invite), Ok(told)) => invite.token = told.token.or(invite.token),
+            (Some(_), Err(_)) => {}
+            (None, Ok(told)) => other.invite = Some(other.seen_from_here(told)),
+            (None, Err(_)) => {
                 self.hang_up(peer, DisconnectReason::Protocol);
                 return false;
-            };
-            other.invite = Some(other.seen_from_here(invite));
+            }
         }
         other.number = Some(user);
         let key = other.key;
-        self.remember(key, user);
+        self.see(key, user);
         true
     }
 
@@ -265,6 +277,10 @@ impl NetPeer {
         debug!("peer {peer} is sent away: {reason}");
         if let Some(other) = self.others.get_mut(&peer) {
             (other.sent_away, other.first) = (true, None);
+            let key = other.key;
+            if !is_loss(reason) {
+                self.take_token(&key);
+            }
         }
         let (endpoint, number) = self.way(peer);
         endpoint.close(number, reason);
@@ -328,6 +344,10 @@ impl NetPeer {
                         endpoint.close(number, reason);
                         if let Some(other) = self.others.get_mut(&peer) {
                             (other.number, other.invite, other.sent_away) = (None, None, true);
+                            let key = other.key;
+                            if !is_loss(reason) && reason != DisconnectReason::Left {
+                                self.take_token(&key);
+                            }
                         }
                     }
                 }

@@ -8,6 +8,7 @@
 mod mesh;
 mod play;
 mod reconnect;
+mod tokens;
 
 use std::collections::BTreeMap;
 use std::thread::JoinHandle;
@@ -18,13 +19,14 @@ use pliant_body::{BodyState, Driven, ModalBody};
 use pliant_stream::peer::{LateInputRepair, PeerSession, PeerSessionConfig};
 use pliant_stream::{BodyId, DisconnectReason, LinkStats, PeerId, UserId};
 
+use crate::known_users::KnownUsers;
 use crate::metrics::{Ledger, NetStats};
 use crate::remote::SessionJoined;
 use crate::roster::Roster;
 use crate::shared_body::SharedBody;
 use crate::transport::{
-    Emulation, Endpoint, Fingerprint, HostOptions, Identity, Invite, JoinOptions, Limits, PeerStats, Role,
-    TransportError,
+    Access, Emulation, Endpoint, Fingerprint, HostOptions, Identity, Invite, JoinOptions, Limits, PeerStats,
+    Role, Token, TransportError,
 };
 use crate::user::shortened;
 use mesh::ConnectedPeer;
@@ -114,8 +116,12 @@ pub struct NetPeer {
     introduced: BTreeMap<PeerId, (UserId, Invite)>,
     /// Lost peers that this peer tries to reach.
     missed: Vec<Missed>,
-    /// User numbers by key, so that a peer that reconnects keeps its number.
-    numbers: BTreeMap<Fingerprint, UserId>,
+    known: KnownUsers,
+    /// Who may join by a token of the application's.
+    access: Access,
+    /// The tokens with which other peers come back, and which they give to those that they let in.
+    /// Each peer has one of its own, so that none is known to all.
+    tokens: BTreeMap<Fingerprint, Token>,
     users: Roster,
     grabs: BTreeMap<Entity, PeerGrab>,
     scratch: Vec<f64>,
@@ -133,6 +139,7 @@ impl NetPeer {
         let identity = config.transport.identity.take().map_or_else(Identity::generate, Ok)?;
         let key = identity.to_pkcs8();
         let (limits, emulation) = (config.transport.limits.clone(), config.transport.emulation.clone());
+        let access = config.transport.access.clone();
         let options = HostOptions { identity: Some(identity), ..std::mem::take(&mut config.transport) };
         let listening = Endpoint::host(options)?;
         let mut peer = Self {
@@ -152,7 +159,9 @@ impl NetPeer {
             others: BTreeMap::new(),
             introduced: BTreeMap::new(),
             missed: Vec::new(),
-            numbers: BTreeMap::new(),
+            known: KnownUsers::default(),
+            access,
+            tokens: BTreeMap::new(),
             users: Roster::default(),
             grabs: BTreeMap::new(),
             scratch: Vec::new(),
@@ -294,7 +303,7 @@ impl NetPeer {
     /// Takes this peer's number.
     fn enter(&mut self, world: &mut World, user: UserId) {
         self.began_at = self.now();
-        self.remember(self.listening.fingerprint(), user);
+        self.known.see(self.listening.fingerprint(), user, |_| true);
         self.state = PeerState::In { user };
         let name = shortened(&self.config.name);
         info!("among the peers as {name}, user {}", user.0);

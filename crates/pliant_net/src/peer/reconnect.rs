@@ -6,6 +6,7 @@ use pliant_stream::{DisconnectReason, PeerId, UserId};
 use tracing::debug;
 
 use super::{NetPeer, PeerState};
+use crate::retry_pause::retry_pause;
 use crate::transport::Invite;
 
 /// A lost peer that has not said goodbye.
@@ -15,17 +16,19 @@ pub(super) struct Missed {
     invite: Invite,
     since: Duration,
     next: Duration,
+    /// Number of attempts to connect.
+    calls: u32,
     /// The connection attempt under way.
     calling: Option<PeerId>,
 }
 
-/// Pause between two attempts to connect.
+/// Pause between two attempts to connect, which is half to one and a half times as long.
 const PAUSE: Duration = Duration::from_secs(1);
 /// Most lost peers that are tracked. The one that was lost first is given up first.
 const MOST_MISSED: usize = 64;
 
 /// Returns whether the peers have lost each other, and neither has sent the other away.
-fn is_loss(reason: DisconnectReason) -> bool {
+pub(super) fn is_loss(reason: DisconnectReason) -> bool {
     use DisconnectReason::{Full, Lost, Silent, UnknownHost};
     matches!(reason, Silent | Lost | Full | UnknownHost)
 }
@@ -33,10 +36,12 @@ fn is_loss(reason: DisconnectReason) -> bool {
 impl NetPeer {
     /// Tracks a peer whose connection is gone, if this peer is the one that must reconnect.
     pub(super) fn miss(&mut self, now: Duration, peer: PeerId, reason: DisconnectReason) {
+        let key = self.listening.fingerprint();
+        let pause = |calls| retry_pause(PAUSE, key, calls);
         if let Some(missed) = self.missed.iter_mut().find(|missed| missed.calling == Some(peer)) {
             // The other peer may not have noticed the loss yet, so its answer does not matter. Only
             // the time limit ends the attempts.
-            (missed.calling, missed.next) = (None, now + PAUSE);
+            (missed.calling, missed.next) = (None, now + pause(missed.calls));
             return;
         }
         let (PeerState::In { user }, Some(other)) = (&self.state, self.others.get(&peer)) else { return };
@@ -54,7 +59,14 @@ impl NetPeer {
         if self.missed.len() >= MOST_MISSED {
             self.missed.remove(0);
         }
-        self.missed.push(Missed { number, invite, since: now, next: now + PAUSE, calling: None });
+        self.missed.push(Missed {
+            number,
+            invite,
+            since: now,
+            next: now + pause(0),
+            calls: 0,
+            calling: None,
+        });
     }
 
     /// Stops tracking a peer that has connected, again or for the first time.
@@ -72,6 +84,7 @@ impl NetPeer {
             if missed.calling.is_some() || missed.next > now {
                 continue;
             }
+            self.missed[at].calls += 1;
             match self.connect_to(&missed.invite) {
                 Ok(peer) => {
                     self.introduced.insert(peer, (missed.number, missed.invite));
@@ -79,7 +92,8 @@ impl NetPeer {
                 }
                 Err(error) => {
                     debug!("user {} cannot be called: {error}", missed.number.0);
-                    self.missed[at].next = now + PAUSE;
+                    let key = self.listening.fingerprint();
+                    self.missed[at].next = now + retry_pause(PAUSE, key, missed.calls + 1);
                 }
             }
         }

@@ -92,9 +92,11 @@ impl Access {
 /// Bounds on the cost of one peer. They include every queue of the transport.
 #[derive(Clone, Debug)]
 pub struct Limits {
-    /// Most peers at one time. The next one is refused. Default: 256.
+    /// Most peers and handshakes at one time. For the next one, the oldest that has sent no message
+    /// after its token makes room. If there is none, the next one is refused. Default: 256.
     pub peers: usize,
-    /// Most peers and handshakes from one IP address at one time. The next one is refused. Default:
+    /// Most peers and handshakes at one time from one IPv4 address, or one IPv6 network of 64 bits,
+    /// with the same rule. Twice as many may arrive at once, and half as many each second. Default:
     /// 64.
     pub per_address: usize,
     /// Longest message accepted from a peer, bytes. A longer message closes the connection.
@@ -102,8 +104,8 @@ pub struct Limits {
     pub message: usize,
     /// Most bytes of messages that are not yet sent or not yet read, for each peer and direction. A
     /// single message is accepted whatever its length. Towards the peer, a full queue gives
-    /// [`SendError::QueueFull`](super::SendError::QueueFull). From the peer, flow control applies.
-    /// Default: 64 MiB.
+    /// [`SendError::QueueFull`](super::SendError::QueueFull). From the peer, flow control applies,
+    /// and no more than the longest message waits. Default: 64 MiB.
     pub queued_messages: usize,
     /// Most datagrams that are not yet sent, or not yet read, for each peer and direction. A full
     /// queue drops its oldest datagram. Default: 64.

@@ -25,6 +25,7 @@ use super::emulated::Emulated;
 use super::endpoint::{EndpointShared, Event, PeerConnection, TransportError};
 use super::identity::{Fingerprint, SERVER_NAME};
 use super::invite::Invite;
+use super::places::Place;
 use super::queue::{Next, lock};
 use super::stats::PeerStats;
 use super::wire::{self, ReadMessageError, TOKEN_MESSAGE};
@@ -121,8 +122,8 @@ async fn accept(shared: &Arc<EndpointShared>, endpoint: &quinn::Endpoint) {
         };
         let open = handshakes.load(Ordering::Relaxed);
         let address = incoming.remote_address();
-        if lock(&shared.peers).len() + open >= shared.limits.peers || shared.inbox.overloaded() {
-            debug!(%address, "refused a guest: no room");
+        if shared.inbox.overloaded() {
+            debug!(%address, "refused a guest: the application does not read");
             incoming.refuse();
         } else if open >= HANDSHAKES_BEFORE_RETRY
             && incoming.may_retry()
@@ -132,16 +133,19 @@ async fn accept(shared: &Arc<EndpointShared>, endpoint: &quinn::Endpoint) {
                 debug!(%address, %error, "could not ask a guest to prove its address");
             }
         } else {
-            let Some(from) = From::count(shared, address.ip()) else {
-                debug!(%address, "refused a guest: too many from its address");
+            let Some(place) = Place::take(&shared.places, &shared.limits, address.ip()) else {
+                debug!(%address, "refused a guest: no room, or too many from its address");
                 incoming.refuse();
                 continue;
             };
             handshakes.fetch_add(1, Ordering::Relaxed);
             let (shared, handshakes) = (Arc::clone(shared), Arc::clone(&handshakes));
             tokio::spawn(async move {
-                let _from = from;
-                let welcomed = timeout(shared.limits.handshake, welcome(&shared, incoming)).await;
+                let leaving = place.leaving();
+                let welcomed = tokio::select! {
+                    welcomed = timeout(shared.limits.handshake, welcome(&shared, incoming, place)) => welcomed,
+                    () = leaving.notified() => Ok(Err(DisconnectReason::Silent)),
+                };
                 handshakes.fetch_sub(1, Ordering::Relaxed);
                 match welcomed {
                     Ok(Ok(guest)) => guest.serve(&shared).await,
@@ -154,36 +158,6 @@ async fn accept(shared: &Arc<EndpointShared>, endpoint: &quinn::Endpoint) {
     endpoint.close(code_of(DisconnectReason::Left), &[]);
 }
 
-/// Counts a connection of an address while the value is alive.
-struct From {
-    shared: Arc<EndpointShared>,
-    address: IpAddr,
-}
-
-impl From {
-    fn count(shared: &Arc<EndpointShared>, address: IpAddr) -> Option<Self> {
-        let mut addresses = lock(&shared.addresses);
-        let count = addresses.entry(address).or_default();
-        if *count >= shared.limits.per_address.max(1) {
-            return None;
-        }
-        *count += 1;
-        Some(Self { shared: Arc::clone(shared), address })
-    }
-}
-
-impl Drop for From {
-    fn drop(&mut self) {
-        let mut addresses = lock(&self.shared.addresses);
-        if let Some(count) = addresses.get_mut(&self.address) {
-            *count -= 1;
-            if *count == 0 {
-                addresses.remove(&self.address);
-            }
-        }
-    }
-}
-
 /// An open connection after a complete handshake.
 struct Open {
     peer: PeerId,
@@ -192,10 +166,16 @@ struct Open {
     connection: Connection,
     send: SendStream,
     recv: RecvStream,
+    /// The place at this host. `None` on a guest.
+    place: Option<Place>,
 }
 
 /// The host's half of the handshake.
-async fn welcome(shared: &EndpointShared, incoming: Incoming) -> Result<Open, DisconnectReason> {
+async fn welcome(
+    shared: &EndpointShared,
+    incoming: Incoming,
+    place: Place,
+) -> Result<Open, DisconnectReason> {
     let connection = incoming.accept().map_err(reason_of)?.await.map_err(reason_of)?;
     let refuse = |reason| {
         connection.close(code_of(reason), &[]);
@@ -222,7 +202,7 @@ async fn welcome(shared: &EndpointShared, incoming: Incoming) -> Result<Open, Di
         return Err(DisconnectReason::Lost);
     }
     let peer = PeerId(shared.next_peer.fetch_add(1, Ordering::Relaxed));
-    Ok(Open { peer, role, fingerprint, connection, send, recv })
+    Ok(Open { peer, role, fingerprint, connection, send, recv, place: Some(place) })
 }
 
 /// The guest's half of the handshake: one attempt, whose result is reported as an event.
@@ -292,7 +272,15 @@ async fn enter(
             return Err(closed.map_or(DisconnectReason::Lost, reason));
         }
     };
-    Ok(Open { peer: PeerId::HOST, role, fingerprint: invite.fingerprint, connection, send, recv })
+    Ok(Open {
+        peer: PeerId::HOST,
+        role,
+        fingerprint: invite.fingerprint,
+        connection,
+        send,
+        recv,
+        place: None,
+    })
 }
 
 /// Returns the address to which a socket for the host of `invite` is bound.
@@ -343,7 +331,7 @@ impl Open {
     /// Carries the connection's traffic until it ends, and reports its beginning and end to the
     /// application.
     async fn serve(self, shared: &EndpointShared) {
-        let Self { peer: id, role, fingerprint, connection, mut send, mut recv } = self;
+        let Self { peer: id, role, fingerprint, connection, mut send, mut recv, place } = self;
         let peer = Arc::new(PeerConnection::default());
         refresh(&connection, &peer);
         lock(&shared.peers).insert(id, Arc::clone(&peer));
@@ -351,16 +339,18 @@ impl Open {
         let room = shared.inbox.open(id, Event::Connected { peer: id, fingerprint, address, role });
         let bucket = Mutex::new(Bucket::new(shared.limits.rate, Instant::now()));
         let reason = {
-            let messages_in = pin!(read_messages(shared, id, &connection, &mut recv, &room));
+            let messages_in = pin!(read_messages(shared, id, &connection, &mut recv, &room, place.as_ref()));
             let datagrams_in = pin!(read_datagrams(shared, id, &connection, &peer));
             let messages_out = pin!(write_messages(&connection, &peer, &bucket, &mut send));
             let datagrams_out = pin!(write_datagrams(&connection, &peer, &bucket));
             let metrics = pin!(keep_metrics(&connection, &peer));
             let hung_up = pin!(hang_up(&connection, &peer));
+            let makes_room = pin!(make_room(&connection, place.as_ref()));
             tokio::select! {
                 reason = messages_in => reason,
                 reason = messages_out => reason,
                 reason = hung_up => reason,
+                reason = makes_room => reason,
                 error = connection.closed() => reason_of(error),
                 () = datagrams_in => unreachable_end(),
                 () = datagrams_out => unreachable_end(),
@@ -423,12 +413,18 @@ async fn read_messages(
     connection: &Connection,
     recv: &mut RecvStream,
     room: &Notify,
+    place: Option<&Place>,
 ) -> DisconnectReason {
+    // A message that is too long is not queued, so more room than for the longest is of no use.
+    let most = shared.limits.queued_messages.min(shared.limits.message);
     loop {
         match wire::read_message(recv, shared.limits.message).await {
             Ok(message) => {
+                if let Some(place) = place {
+                    place.keep();
+                }
                 let mut message = message;
-                while let Err(back) = shared.inbox.push_message(id, message, shared.limits.queued_messages) {
+                while let Err(back) = shared.inbox.push_message(id, message, most) {
                     message = back;
                     room.notified().await;
                 }
@@ -491,6 +487,16 @@ async fn hang_up(connection: &Connection, peer: &PeerConnection) -> DisconnectRe
     sleep(GRACE).await;
     connection.close(code_of(reason), &[]);
     reason
+}
+
+/// Closes a silent connection that must make room for a newcomer.
+async fn make_room(connection: &Connection, place: Option<&Place>) -> DisconnectReason {
+    match place {
+        Some(place) => place.leaving().notified().await,
+        None => std::future::pending().await,
+    }
+    connection.close(code_of(DisconnectReason::Silent), &[]);
+    DisconnectReason::Silent
 }
 
 async fn write_message(

@@ -2,7 +2,7 @@
 
 use std::collections::BTreeMap;
 use std::io;
-use std::net::{IpAddr, SocketAddr, UdpSocket};
+use std::net::{SocketAddr, UdpSocket};
 use std::sync::atomic::{AtomicBool, AtomicU64, AtomicUsize, Ordering};
 use std::sync::{Arc, Mutex, mpsc};
 use std::thread::JoinHandle;
@@ -19,6 +19,7 @@ use super::driver::{self, Side};
 use super::emulated::Emulator;
 use super::identity::{Fingerprint, Identity, IdentityError};
 use super::invite::{Invite, Token};
+use super::places::Places;
 use super::queue::{Inbox, Outbox, lock};
 use super::stats::{DropCounts, PeerStats};
 
@@ -149,8 +150,7 @@ pub(super) struct EndpointShared {
     /// Notified when a guest is to join again.
     pub(super) again: Notify,
     pub(super) access: Mutex<Arc<Access>>,
-    /// Number of connections and handshakes by IP address.
-    pub(super) addresses: Mutex<BTreeMap<IpAddr, usize>>,
+    pub(super) places: Arc<Mutex<Places>>,
     pub(super) emulator: Arc<Emulator>,
 }
 
@@ -165,7 +165,7 @@ impl EndpointShared {
             stop: Notify::new(),
             again: Notify::new(),
             access: Mutex::new(Arc::new(access)),
-            addresses: Mutex::default(),
+            places: Arc::default(),
             emulator: Arc::default(),
         })
     }
@@ -317,9 +317,16 @@ impl Endpoint {
         *lock(&self.peer(peer)?.address)
     }
 
-    /// Returns the next event, if there is one. Never waits.
+    /// Returns the next event, if there is one. Never waits. The peers are read in turn.
     pub fn poll(&self) -> Option<Event> {
         self.shared.inbox.pop()
+    }
+
+    /// Iterates over the events that fit the budget of one frame, and of each peer in it. The
+    /// others wait for the next frame.
+    pub(crate) fn frame(&self) -> impl Iterator<Item = Event> + '_ {
+        self.shared.inbox.begin_frame();
+        std::iter::from_fn(|| self.shared.inbox.pop_in_frame())
     }
 
     /// Returns the connected peers, in the order in which they connected.

@@ -24,6 +24,7 @@ mod emulated;
 mod endpoint;
 mod identity;
 mod invite;
+mod places;
 mod queue;
 mod stats;
 mod wire;

@@ -1,7 +1,6 @@
 //! The bounded queues between the application and the network thread.
 
 use std::collections::{BTreeMap, VecDeque};
-use std::ops::Bound;
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 use std::time::Instant;
 
@@ -17,101 +16,184 @@ pub(super) fn lock<T>(mutex: &Mutex<T>) -> MutexGuard<'_, T> {
     mutex.lock().unwrap_or_else(PoisonError::into_inner)
 }
 
-/// Everything that waits for the application.
+/// Everything that waits for the application. The peers are read in turn, one event each, so that
+/// neither messages nor datagrams of one peer wait for those of another.
 #[derive(Debug, Default)]
 pub(super) struct Inbox(Mutex<InboxState>);
 
 #[derive(Debug, Default)]
 struct InboxState {
-    /// New connections, messages and closed connections, in order. Each peer's share bounds the
-    /// messages, and [`Inbox::overloaded`] bounds the rest.
-    events: VecDeque<Event>,
     peers: BTreeMap<PeerId, FromPeer>,
-    /// The peer whose datagram was read last. The next read begins after this peer, so that a flood
-    /// from one peer does not hide the others.
-    last: Option<PeerId>,
+    /// The peers for which something waits, in the order of their turns.
+    turns: VecDeque<PeerId>,
+    /// The peers for which something waits, but whose share of this frame has been read.
+    next_frame: Vec<PeerId>,
+    /// What may still be read in this frame.
+    left: usize,
 }
 
-#[derive(Debug)]
+#[derive(Debug, Default)]
 struct FromPeer {
+    /// New connection, messages and closed connection, in order. The peer's share bounds the
+    /// messages, and [`Inbox::overloaded`] bounds the rest.
+    events: VecDeque<Event>,
     datagrams: VecDeque<(Instant, Bytes)>,
     message_bytes: usize,
+    /// What was read in this frame.
+    read: usize,
+    open: bool,
     room: Arc<Notify>,
 }
 
-/// Most events that may wait unread before the host refuses new guests.
-const MOST_EVENTS: usize = 4096;
+impl FromPeer {
+    fn is_empty(&self) -> bool {
+        self.events.is_empty() && self.datagrams.is_empty()
+    }
+}
+
+/// Most peers with unread events before the host refuses new guests.
+const MOST_UNREAD: usize = 4096;
 /// Cost of a queued message beside its bytes, bytes. It bounds the number of empty messages.
 const MESSAGE_COST: usize = 64;
+
+/// What is read in one frame at most. An event counts one for every 16 bytes, about the length of
+/// one target of a hand, and [`EVENT_COST`] besides. 256 guests that move three hands each send
+/// half as much in a frame.
+pub(super) const READ_IN_A_FRAME: usize = 8192;
+/// What is read in one frame of one peer: a full queue of ordinary datagrams.
+pub(super) const READ_OF_A_PEER: usize = 512;
+const EVENT_COST: usize = 2;
+
+/// What an event counts of [`READ_IN_A_FRAME`].
+fn weight(event: &Event) -> usize {
+    let bytes = match event {
+        Event::Datagram { bytes, .. } | Event::Message { bytes, .. } => bytes.len(),
+        Event::Connected { .. } | Event::Closed { .. } => 0,
+    };
+    EVENT_COST + bytes / 16
+}
+
+impl InboxState {
+    /// Changes the queue of a peer, and gives the peer a turn if it had nothing to read before.
+    fn push<T>(&mut self, peer: PeerId, change: impl FnOnce(&mut FromPeer) -> T) -> Option<T> {
+        let queue = self.peers.get_mut(&peer)?;
+        let waited = !queue.is_empty();
+        let changed = change(queue);
+        if !waited && !queue.is_empty() {
+            self.turns.push_back(peer);
+        }
+        Some(changed)
+    }
+
+    fn pop(&mut self, in_frame: bool) -> Option<Event> {
+        loop {
+            if in_frame && self.left == 0 {
+                return None;
+            }
+            let id = self.turns.pop_front()?;
+            let Some(queue) = self.peers.get_mut(&id) else { continue };
+            if in_frame && queue.read >= READ_OF_A_PEER {
+                self.next_frame.push(id);
+                continue;
+            }
+            let datagrams = &mut queue.datagrams;
+            let datagram = |(at, bytes)| Event::Datagram { peer: id, at, bytes };
+            let event = queue.events.pop_front().or_else(|| datagrams.pop_front().map(datagram));
+            if let Some(Event::Message { bytes, .. }) = &event {
+                queue.message_bytes = queue.message_bytes.saturating_sub(bytes.len() + MESSAGE_COST);
+                queue.room.notify_one();
+            }
+            let weight = event.as_ref().map_or(0, weight);
+            queue.read += weight;
+            self.left = self.left.saturating_sub(weight);
+            if !queue.is_empty() {
+                self.turns.push_back(id);
+            } else if !queue.open {
+                self.peers.remove(&id);
+            }
+            if event.is_some() {
+                return event;
+            }
+        }
+    }
+}
 
 impl Inbox {
     pub(super) fn open(&self, peer: PeerId, connected: Event) -> Arc<Notify> {
         let mut state = lock(&self.0);
-        let room = Arc::new(Notify::new());
-        let queue = FromPeer { datagrams: VecDeque::new(), message_bytes: 0, room: Arc::clone(&room) };
-        state.peers.insert(peer, queue);
-        state.events.push_back(connected);
-        room
+        state.peers.entry(peer).or_default();
+        let opened = state.push(peer, |queue| {
+            queue.open = true;
+            queue.events.push_back(connected);
+            Arc::clone(&queue.room)
+        });
+        opened.unwrap_or_default()
     }
 
     pub(super) fn close(&self, peer: PeerId, reason: DisconnectReason) {
         let mut state = lock(&self.0);
-        state.peers.remove(&peer);
-        state.events.push_back(Event::Closed { peer, reason });
+        // A guest's attempt to connect may fail before there is a queue.
+        state.peers.entry(peer).or_default();
+        state.push(peer, |queue| {
+            queue.open = false;
+            queue.datagrams.clear();
+            queue.events.push_back(Event::Closed { peer, reason });
+        });
     }
 
     pub(super) fn overloaded(&self) -> bool {
-        lock(&self.0).events.len() >= MOST_EVENTS
+        lock(&self.0).peers.len() >= MOST_UNREAD
     }
 
     /// Queues a datagram. Returns how many datagrams were dropped.
     pub(super) fn push_datagram(&self, peer: PeerId, at: Instant, bytes: Bytes, most: usize) -> u64 {
-        let mut state = lock(&self.0);
-        let Some(queue) = state.peers.get_mut(&peer) else { return 1 };
-        queue.datagrams.push_back((at, bytes));
-        let mut dropped = 0;
-        while queue.datagrams.len() > most.max(1) {
-            queue.datagrams.pop_front();
-            dropped += 1;
-        }
-        dropped
+        let dropped = lock(&self.0).push(peer, |queue| {
+            queue.datagrams.push_back((at, bytes));
+            let mut dropped = 0;
+            while queue.datagrams.len() > most.max(1) {
+                queue.datagrams.pop_front();
+                dropped += 1;
+            }
+            dropped
+        });
+        dropped.unwrap_or(1)
     }
 
     /// Queues a message, or returns it when the peer's share is full.
     pub(super) fn push_message(&self, peer: PeerId, bytes: Bytes, most: usize) -> Result<(), Bytes> {
-        let mut state = lock(&self.0);
-        let Some(queue) = state.peers.get_mut(&peer) else { return Ok(()) };
-        let cost = bytes.len() + MESSAGE_COST;
-        if queue.message_bytes > 0 && queue.message_bytes + cost > most {
-            return Err(bytes);
-        }
-        queue.message_bytes += cost;
-        state.events.push_back(Event::Message { peer, bytes });
-        Ok(())
+        let queued = lock(&self.0).push(peer, |queue| {
+            let cost = bytes.len() + MESSAGE_COST;
+            if queue.message_bytes > 0 && queue.message_bytes + cost > most {
+                return Err(bytes);
+            }
+            queue.message_bytes += cost;
+            queue.events.push_back(Event::Message { peer, bytes });
+            Ok(())
+        });
+        queued.unwrap_or(Ok(()))
     }
 
+    /// Returns the next event of any peer.
     pub(super) fn pop(&self) -> Option<Event> {
         let mut state = lock(&self.0);
-        if let Some(event) = state.events.pop_front() {
-            if let Event::Message { peer, bytes } = &event
-                && let Some(queue) = state.peers.get_mut(peer)
-            {
-                queue.message_bytes = queue.message_bytes.saturating_sub(bytes.len() + MESSAGE_COST);
-                queue.room.notify_one();
-            }
-            return Some(event);
-        }
-        let after = state.last.map_or(Bound::Unbounded, Bound::Excluded);
-        let waiting = |(_, queue): &(&PeerId, &FromPeer)| !queue.datagrams.is_empty();
-        let peer = state
-            .peers
-            .range((after, Bound::Unbounded))
-            .find(waiting)
-            .or_else(|| state.peers.iter().find(waiting))
-            .map(|(&peer, _)| peer)?;
-        state.last = Some(peer);
-        let (at, bytes) = state.peers.get_mut(&peer)?.datagrams.pop_front()?;
-        Some(Event::Datagram { peer, at, bytes })
+        let waiting = std::mem::take(&mut state.next_frame);
+        state.turns.extend(waiting);
+        state.pop(false)
+    }
+
+    /// Begins a frame, in which every peer has its share again.
+    pub(super) fn begin_frame(&self) {
+        let mut state = lock(&self.0);
+        state.left = READ_IN_A_FRAME;
+        state.peers.values_mut().for_each(|queue| queue.read = 0);
+        let mut waiting = std::mem::take(&mut state.next_frame);
+        state.turns.extend(waiting.drain(..));
+        state.next_frame = waiting;
+    }
+
+    /// Returns the next event within the budget of this frame.
+    pub(super) fn pop_in_frame(&self) -> Option<Event> {
+        lock(&self.0).pop(true)
     }
 }
 
@@ -281,6 +363,42 @@ mod tests {
         inbox.push_datagram(guest, Instant::now(), bytes(1), 64);
         let turns: Vec<_> = (0..6).map_while(|_| from(inbox.pop())).collect();
         assert_eq!(turns.iter().filter(|peer| **peer == guest).count(), 3, "{turns:?}");
+    }
+
+    #[test]
+    fn a_frame_reads_a_share_of_each_peer_and_no_more_than_its_budget() {
+        let inbox = Inbox::default();
+        let full = Bytes::from(vec![2; 1155]);
+        let fill = || {
+            for peer in (1..=40).map(PeerId) {
+                (0..64).for_each(|_| drop(inbox.push_datagram(peer, Instant::now(), full.clone(), 64)));
+            }
+        };
+        for peer in (1..=40).map(PeerId) {
+            inbox.open(peer, left(peer));
+            inbox.pop().unwrap();
+        }
+        let mut read = BTreeMap::<PeerId, usize>::new();
+        for _ in 0..20 {
+            fill();
+            inbox.begin_frame();
+            let turns: Vec<PeerId> = std::iter::from_fn(|| from(inbox.pop_in_frame())).collect();
+            assert!(turns.len() <= READ_IN_A_FRAME / 74 + 1, "{} datagrams in a frame", turns.len());
+            turns.into_iter().for_each(|peer| *read.entry(peer).or_default() += 1);
+        }
+        let (least, most) = (read.values().min().unwrap(), read.values().max().unwrap());
+        assert!(read.len() == 40 && most - least <= 1, "{read:?}");
+        // Alone, a peer has no more than its share, and the rest comes in the next frame.
+        let alone = Inbox::default();
+        alone.open(PeerId(1), left(PeerId(1)));
+        alone.pop().unwrap();
+        (0..64).for_each(|_| drop(alone.push_datagram(PeerId(1), Instant::now(), full.clone(), 64)));
+        for _ in 0..2 {
+            alone.begin_frame();
+            let count = std::iter::from_fn(|| alone.pop_in_frame()).count();
+            assert!(count > 0 && count <= READ_OF_A_PEER / 74 + 1, "{count}");
+        }
+        assert_eq!(std::iter::from_fn(|| alone.pop()).count(), 64 - 2 * (READ_OF_A_PEER / 74 + 1));
     }
 
     #[test]

@@ -10,7 +10,7 @@ use pliant_net::transport::{
 };
 use pliant_stream::DisconnectReason;
 
-use crate::endpoints::{closed, connected, guest, host, is_first_heard_of, next};
+use crate::endpoints::{closed, connected, guest, host, is_first_heard_of, message, next};
 use crate::unauthenticated::UnauthenticatedPeer;
 
 #[test]
@@ -87,6 +87,9 @@ fn a_full_host_refuses_the_next_guest() {
     let first = guest(&host.invite());
     connected(&first);
     connected(&host);
+    // Who has said something keeps its place.
+    first.send_message(PeerId::HOST, Bytes::from_static(b"hello")).unwrap();
+    message(&host);
     assert_eq!(closed(&guest(&host.invite())), DisconnectReason::Full);
     drop(first);
     closed(&host);

@@ -168,7 +168,8 @@ fn a_thousand_connections_from_one_address_cost_the_others_nothing() {
     // and none of them sends anything afterwards.
     let stranger = UnauthenticatedPeer::new(ALPN, true);
     let target = SocketAddr::from(([127, 0, 0, 1], port));
-    let (open, refused) = stranger.runtime.block_on(async {
+    let began = Instant::now();
+    let open = stranger.runtime.block_on(async {
         let socket = UdpSocket::bind("127.0.0.2:0").unwrap();
         stranger.endpoint.rebind(socket).unwrap();
         let mut attempts = tokio::task::JoinSet::new();
@@ -180,10 +181,16 @@ fn a_thousand_connections_from_one_address_cost_the_others_nothing() {
         while let Some(done) = attempts.join_next().await {
             open.extend(done.unwrap());
         }
-        let refused = 1000 - open.len();
-        (open, refused)
+        open
     });
-    assert!(open.len() <= 8 && refused >= 992, "{} got as far as a handshake", open.len());
+    // Twice as many as there are places may arrive at once, and half as many each second.
+    let arrived = 16 + 4 * (1 + began.elapsed().as_secs() as usize);
+    assert!(open.len() <= arrived, "{} got as far as a handshake, not {arrived}", open.len());
+    let places = stranger.live_until("eight have a place", || {
+        let left = open.iter().filter(|connection| connection.close_reason().is_none()).count();
+        (left <= 8).then_some(left)
+    });
+    assert!(places > 0);
     good.send_message(PeerId::HOST, Bytes::from_static(b"as ever")).unwrap();
     assert_eq!(message(&host), "as ever");
     // A second guest from the first guest's address is admitted at once.

@@ -81,9 +81,9 @@ impl RemotePeer {
             // peer requests no more.
             answer_budget: Budget::new(1000.0, 1000.0),
             state_budget: Budget::new(2.0, 16.0),
-            // In each tick, an input with three hands may be 32 ticks late. Once in a while, one
-            // with sixteen may be as late as can be.
-            late_budget: Budget::new(128.0 / step, 2048.0),
+            // An input with one hand may be as late as can be, and one with ten hands 23 ticks. In
+            // each tick, one with one hand may be 96 ticks late, and one with ten 17.
+            late_budget: Budget::new(192.0 / step, 256.0),
             patch_budget: PatchBudget::default(),
         }
     }

@@ -39,6 +39,8 @@ const REQUEST_AGAIN: Duration = Duration::from_millis(150);
 pub struct PeerSession {
     config: PeerSessionConfig,
     others: BTreeMap<PeerId, RemotePeer>,
+    /// What peers are told of where this one is reached, if not the address of the settings.
+    addresses: BTreeMap<PeerId, String>,
     bodies: BTreeMap<BodyId, PeerBody>,
     inputs: InputLog,
     own: BTreeMap<u16, HeldAt>,
@@ -88,6 +90,7 @@ impl PeerSession {
         Ok(Self {
             config,
             others: BTreeMap::new(),
+            addresses: BTreeMap::new(),
             bodies: BTreeMap::new(),
             inputs,
             own: BTreeMap::new(),
@@ -141,6 +144,15 @@ impl PeerSession {
         let mut first = [0; 8];
         first.copy_from_slice(&hasher.finalize().as_bytes()[..8]);
         u64::from_le_bytes(first)
+    }
+
+    /// Sets where the peer at a connection, and those to whom it passes it on, reach this peer,
+    /// instead of [`PeerSessionConfig::address`]. Call this before [`PeerSession::connect`] or
+    /// [`PeerSession::accept`]. An address of more than 512 bytes has no effect.
+    pub fn tell_address(&mut self, peer: PeerId, address: String) {
+        if address.len() <= MAX_ADDRESS {
+            self.addresses.insert(peer, address);
+        }
     }
 
     /// Adds a connection that this side has opened, and sends a hello.
@@ -204,7 +216,7 @@ impl PeerSession {
             version: PROTOCOL_VERSION,
             user: self.config.user.0,
             name: self.config.name.clone(),
-            address: self.config.address.clone(),
+            address: self.addresses.get(&peer).unwrap_or(&self.config.address).clone(),
             joining: !self.started,
             scene: self.scene(),
         };
@@ -286,6 +298,7 @@ impl PeerSession {
 
     /// Removes a connection.
     pub fn disconnect(&mut self, peer: PeerId, reason: DisconnectReason) {
+        self.addresses.remove(&peer);
         let Some(other) = self.others.remove(&peer) else { return };
         self.gone.add_counts(&other.link.stats);
         let Some(user) = other.user else { return self.event(PeerEvent::TurnedAway { peer, reason }) };
