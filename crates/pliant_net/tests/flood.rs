@@ -1,4 +1,4 @@
-//! A stranger that was let in sends all that it can: datagrams with 64 targets, messages of five
+//! Strangers that were let in send all that they can: datagrams with 64 targets, messages of five
 //! bytes, and grabs of the whole body. The host's frame stays short, a second guest joins, and who
 //! is there loses nothing.
 //!
@@ -14,7 +14,6 @@ use std::time::{Duration, Instant};
 
 use bevy::math::DVec3;
 use bevy::prelude::*;
-use bytes::Bytes;
 use pliant_body::{Grab, GrabOf};
 use pliant_modal::ModalModel;
 use pliant_net::transport::{Endpoint, Event, JoinOptions, Limits, RateCap};
@@ -25,15 +24,27 @@ use pliant_stream::PeerId;
 use pliant_stream::wire::{
     Datagram, GuestMessage, PROTOCOL_VERSION, Payload, StreamSubscription, TargetEntry, Targets,
 };
-use support::{alone, app, bar_of, body_of, guest, host_of, messages, only, run_until};
+use support::{alone, bar_of, body_of, guest, host_of, messages, only, run_until};
 
-/// What one frame may read of three peers, bytes: the transport's share, and each one's last event.
-const MOST_READ: u64 = 3 * (16 * 512 + 1200);
+/// What one frame may read, bytes: the share of one peer that sends long datagrams, with its last
+/// one, of one that sends short messages, and what the others send.
+const MOST_READ: u64 = 16 * 512 + 1200 + 5 * 257 + 1500;
 /// Cells of the body that is measured, which has four times as many vertices.
 const CELLS: u32 = 2500;
 
 fn limits() -> Limits {
     Limits { rate: RateCap::from_mbit_per_s(1000.0), idle_timeout: Duration::from_secs(30), ..Limits::host() }
+}
+
+/// What a stranger sends.
+#[derive(Clone, Copy, PartialEq, Eq)]
+enum Flood {
+    /// Datagrams of 64 targets, as many as the connection takes.
+    Targets,
+    /// Messages of five bytes, 20,000 a second.
+    Messages,
+    /// Grabs of the whole body, sixty a second.
+    Grabs,
 }
 
 struct Stranger {
@@ -43,30 +54,24 @@ struct Stranger {
 }
 
 impl Stranger {
-    /// Joins, begins a grab, and then sends all that the connection takes until it is dropped.
-    fn at(invite: &Invite, model: &ModalModel) -> Self {
-        let endpoint = Endpoint::join(
-            invite,
-            JoinOptions { limits: Limits { message: 256 << 20, ..limits() }, ..JoinOptions::default() },
-        )
-        .unwrap();
+    /// Joins and floods the host until it is dropped.
+    fn at(invite: &Invite, model: &ModalModel, flood: Flood) -> Self {
+        let limits = Limits { message: Limits::guest().message, ..limits() };
+        let endpoint = Endpoint::join(invite, JoinOptions { limits, ..JoinOptions::default() }).unwrap();
         let (stop, sent) = (Arc::<AtomicBool>::default(), Arc::<AtomicU64>::default());
         let (cached, vertices) = (vec![model.hash().0], model.surface().positions().len() as u32);
         let (ended, count) = (Arc::clone(&stop), Arc::clone(&sent));
-        let thread = std::thread::spawn(move || Self::flood(&endpoint, cached, vertices, &ended, &count));
-        Self { thread: Some(thread), stop, sent }
+        let run = move || Self::flood(&endpoint, flood, (cached, vertices), &ended, &count);
+        Self { thread: Some(std::thread::spawn(run)), stop, sent }
     }
 
     fn flood(
         endpoint: &Endpoint,
-        cached: Vec<[u8; 32]>,
-        vertices: u32,
+        flood: Flood,
+        (cached, vertices): (Vec<[u8; 32]>, u32),
         ended: &AtomicBool,
         sent: &AtomicU64,
     ) {
-        let subscription = StreamSubscription { payload: Payload::Forces, modes: 4, repeats: 0, refresh: 60 };
-        let hello =
-            GuestMessage::Hello { version: PROTOCOL_VERSION, name: "stranger".into(), subscription, cached };
         let begin = |grab: u16, radius| GuestMessage::GrabBegin {
             grab,
             body: 1,
@@ -79,41 +84,52 @@ impl Stranger {
         while !ended.load(Ordering::Relaxed) && !matches!(endpoint.poll(), Some(Event::Connected { .. })) {
             std::thread::sleep(Duration::from_millis(1));
         }
-        send(hello).unwrap();
-        // The grab that the targets move.
+        let subscription = StreamSubscription { payload: Payload::Forces, modes: 4, repeats: 0, refresh: 60 };
+        let (version, name) = (PROTOCOL_VERSION, "stranger".into());
+        send(GuestMessage::Hello { version, name, subscription, cached }).unwrap();
         std::thread::sleep(Duration::from_millis(500));
+        // The grab that the targets move.
         send(begin(0, 0.05)).unwrap();
         let room = endpoint.max_datagram_size(PeerId::HOST).unwrap();
         let targets = ((room - 4) / 18).min(64);
-        let (mut input, mut sequence, mut grab, mut next) = (0, 0, 1, Instant::now());
+        let (mut input, mut sequence, mut grab, began) = (0, 0, 0_u16, Instant::now());
         while !ended.load(Ordering::Relaxed) {
-            for _ in 0..64 {
-                let entry = |_| {
-                    input += 1;
-                    TargetEntry { grab: 0, input, target: [1.0, 0.001 * f64::from(input % 9), 0.0] }
-                };
-                let entries = (0..targets).map(entry).collect();
-                let datagram = Datagram::Targets(Targets { entries }).encode(sequence);
-                sequence = sequence.wrapping_add(1);
-                endpoint.send_datagram(PeerId::HOST, datagram.into()).ok();
-            }
-            // The host may read slowly, and then the queue is full.
-            let wanted = |modes| GuestMessage::Interest { body: 1, modes: Some(modes) };
-            for _ in 0..16 {
-                if endpoint.unsent(PeerId::HOST) > 1 << 20 {
-                    break;
+            let due = |rate: f64| (began.elapsed().as_secs_f64() * rate) as u64;
+            let before = sent.load(Ordering::Relaxed);
+            let more = match flood {
+                Flood::Targets => 64,
+                Flood::Messages => due(20_000.0).saturating_sub(before),
+                Flood::Grabs => due(60.0).saturating_sub(before),
+            };
+            for _ in 0..more {
+                match flood {
+                    Flood::Targets => {
+                        let entry = |_| {
+                            input += 1;
+                            let target = [1.0, 0.001 * f64::from(input % 9), 0.0];
+                            TargetEntry { grab: 0, input, target }
+                        };
+                        let entries = (0..targets).map(entry).collect();
+                        let datagram = Datagram::Targets(Targets { entries }).encode(sequence);
+                        sequence = sequence.wrapping_add(1);
+                        endpoint.send_datagram(PeerId::HOST, datagram.into()).unwrap();
+                    }
+                    Flood::Messages => {
+                        let modes = Some(1 + input as u16 % 4);
+                        let wanted = GuestMessage::Interest { body: 1, modes };
+                        assert!(wanted.encode().len() <= 5);
+                        input += 1;
+                        // The host may read slowly, and then the queue is full.
+                        send(wanted).ok();
+                    }
+                    Flood::Grabs => {
+                        send(GuestMessage::GrabEnd { grab }).unwrap();
+                        grab = grab.wrapping_add(1);
+                        send(begin(grab, 1.0 + 1e-5 * f64::from(grab))).unwrap();
+                    }
                 }
-                let five = Bytes::from(wanted(1 + input as u16 % 4).encode());
-                assert!(five.len() <= 5);
-                (0..1000).for_each(|_| drop(endpoint.send_message(PeerId::HOST, five.clone())));
-                sent.fetch_add(1000, Ordering::Relaxed);
             }
-            if next <= Instant::now() {
-                next += Duration::from_secs(1) / 60;
-                send(GuestMessage::GrabEnd { grab: grab - 1 + u16::from(grab == 1) }).ok();
-                send(begin(grab, 1.0 + 1e-5 * f64::from(grab))).ok();
-                grab = (grab + 1).max(1);
-            }
+            sent.fetch_add(more, Ordering::Relaxed);
             while let Some(event) = endpoint.poll() {
                 assert!(!matches!(event, Event::Closed { .. }), "{event:?}");
             }
@@ -153,7 +169,9 @@ fn flooded(model: &Arc<ModalModel>, lasts: Duration) -> Flooded {
     let body = run_until(&mut [&mut host, &mut first], "the first guest is in", |apps| body_of(apps[1]));
     first.world_mut().spawn((Grab::new(0, 0.05, DVec3::new(0.0, 1.0, 0.2)), GrabOf(body)));
     run_until(&mut [&mut host, &mut first], "and holds", |apps| only::<HandOf>(apps[0]).is_some());
-    let stranger = Stranger::at(&invite, model);
+    let strangers =
+        [Flood::Targets, Flood::Messages, Flood::Grabs].map(|flood| Stranger::at(&invite, model, flood));
+    let sent = || strangers.each_ref().map(|stranger| stranger.sent.load(Ordering::Relaxed));
     let mut flooded = Flooded { read: Vec::new(), frames: Vec::new(), joined: Duration::ZERO };
     let (mut began, mut second, mut before) = (None::<Instant>, None::<(Instant, App)>, read(&host));
     loop {
@@ -162,7 +180,7 @@ fn flooded(model: &Arc<ModalModel>, lasts: Duration) -> Flooded {
         let took = frame.elapsed();
         first.update();
         let now = read(&host);
-        if began.is_none() && stranger.sent.load(Ordering::Relaxed) > 0 {
+        if began.is_none() && sent().iter().all(|count| *count > 0) {
             began = Some(Instant::now());
         }
         if let Some(began) = began {
@@ -185,26 +203,26 @@ fn flooded(model: &Arc<ModalModel>, lasts: Duration) -> Flooded {
         }
         std::thread::sleep(Duration::from_millis(16).saturating_sub(frame.elapsed()));
     }
+    let [datagrams, short, grabs] = sent();
     println!(
-        "{} frames, {} messages of the stranger, {} bytes read in a frame at most; the second guest was in \
-         after {:?}",
+        "{} frames, {datagrams} datagrams, {short} short messages and {grabs} grabs of strangers, {} bytes \
+         read in a frame at most; the second guest was in after {:?}",
         flooded.frames.len(),
-        stranger.sent.load(Ordering::Relaxed),
         flooded.read.iter().max().unwrap(),
         flooded.joined,
     );
     // The first guest has lost nothing: it is in, it holds, and no datagram of it was dropped.
     assert!(messages::<SessionLost>(&first).is_empty() && messages::<SessionClosed>(&first).is_empty());
     assert!(messages::<GrabRefused>(&first).is_empty());
-    println!("{:?}", host.world().resource::<NetHost>().session().stats(PeerId(2)));
     let world = host.world().resource::<NetHost>();
     let dropped = world.endpoint().stats(PeerId(1)).unwrap().dropped;
     assert_eq!((dropped.receive_queue_full, dropped.send_queue_full), (0, 0));
+    assert_eq!(world.session().users().count(), 5, "the guests and the strangers are in");
     flooded
 }
 
 #[test]
-fn a_stranger_that_sends_all_it_can_holds_up_no_frame_and_bars_nobody() {
+fn strangers_that_send_all_they_can_hold_up_no_frame_and_bar_nobody() {
     let _alone = alone();
     let flooded = flooded(&bar_of(16), Duration::from_secs(3));
     let most = *flooded.read.iter().max().unwrap();
