@@ -61,6 +61,7 @@ pub struct GuestEnd {
     reliable_down: EmulatedLink,
     reliable_up: EmulatedLink,
     connected: bool,
+    stalled: bool,
 }
 
 /// A host and its guests in virtual time.
@@ -76,6 +77,7 @@ pub struct Pair {
     next_step: Duration,
     tick: u64,
     paused: bool,
+    stalled: bool,
     clock: Option<fn() -> Duration>,
     spent: Duration,
 }
@@ -96,6 +98,7 @@ impl Pair {
             next_step: step,
             tick: 0,
             paused: false,
+            stalled: false,
             clock: None,
             spent: Duration::ZERO,
         })
@@ -127,6 +130,21 @@ impl Pair {
     pub fn pause(&mut self, paused: bool) {
         self.paused = paused;
         self.next_step = self.next_step.max(self.now);
+    }
+
+    /// Stalls or continues the host's process: nothing is read, stepped or sent. What arrives waits.
+    /// Afterwards the host catches up on a quarter of a second at most, like an app with Bevy's
+    /// clock.
+    pub fn stall_host(&mut self, stalled: bool) {
+        self.stalled = stalled;
+        self.next_step = self.next_step.max(self.now.saturating_sub(Duration::from_millis(250)));
+    }
+
+    /// Stalls or continues a guest's process, as [`Pair::stall_host`] does for the host.
+    pub fn stall_guest(&mut self, guest: usize, stalled: bool) {
+        if let Some(g) = self.guests.get_mut(guest) {
+            g.stalled = stalled;
+        }
     }
 
     /// Joins a guest over a path and returns its index. Reliable messages arrive in order after the
@@ -182,6 +200,7 @@ impl Pair {
             down: EmulatedLink::new(path.down, seed),
             up: EmulatedLink::new(path.up, seed ^ 0xFFFF_0000),
             connected: true,
+            stalled: false,
         });
         Ok(index)
     }
@@ -199,7 +218,7 @@ impl Pair {
             self.exchange(world);
             let Some(next) = self.next_time().filter(|t| *t <= until) else { break };
             self.now = self.now.max(next);
-            if !self.paused && self.now >= self.next_step {
+            if !self.paused && !self.stalled && self.now >= self.next_step {
                 self.tick += 1;
                 self.next_step += self.step;
                 world.step(self.now, self.tick, &mut self.host);
@@ -209,17 +228,27 @@ impl Pair {
     }
 
     fn next_time(&self) -> Option<Duration> {
-        let mut next = if self.paused { None } else { Some(self.next_step.max(self.now)) };
+        let steps = !self.paused && !self.stalled;
+        let mut next = steps.then(|| self.next_step.max(self.now));
         let mut take = |t: Option<Duration>| {
             next = match (next, t) {
                 (Some(a), Some(b)) => Some(a.min(b)),
                 (a, b) => a.or(b),
             };
         };
-        take(self.host.next_wakeup());
+        take(self.host.next_wakeup().filter(|_| !self.stalled));
         for g in self.guests.iter().filter(|g| g.connected) {
-            for link in [&g.down, &g.up, &g.reliable_down, &g.reliable_up] {
-                take(link.next_wakeup());
+            // What arrives at a process that stalls waits.
+            for (link, stalled) in [
+                (&g.down, g.stalled),
+                (&g.reliable_down, g.stalled),
+                (&g.up, self.stalled),
+                (&g.reliable_up, self.stalled),
+            ] {
+                take(link.next_wakeup().filter(|_| !stalled));
+            }
+            if g.stalled {
+                continue;
             }
             // Serving a wake-up does not change its time, so the next one must lie later to avoid
             // an endless loop.
@@ -233,17 +262,22 @@ impl Pair {
         let now = self.now;
         for (index, g) in self.guests.iter_mut().enumerate() {
             let peer = PeerId(index as u64 + 1);
-            // Poll the reliable link first, so that a snapshot is handled before a frame of the
-            // same arrival time.
-            while let Some(bytes) = g.reliable_up.poll(now) {
-                if g.connected {
-                    self.host.on_message(now, peer, &bytes);
+            if !self.stalled {
+                // Poll the reliable link first, so that a snapshot is handled before a frame of the
+                // same arrival time.
+                while let Some(bytes) = g.reliable_up.poll(now) {
+                    if g.connected {
+                        self.host.on_message(now, peer, &bytes);
+                    }
+                }
+                while let Some(bytes) = g.up.poll(now) {
+                    if g.connected {
+                        self.host.on_datagram(now, peer, &bytes);
+                    }
                 }
             }
-            while let Some(bytes) = g.up.poll(now) {
-                if g.connected {
-                    self.host.on_datagram(now, peer, &bytes);
-                }
+            if g.stalled {
+                continue;
             }
             let began = self.clock.map(|c| c());
             while let Some(bytes) = g.reliable_down.poll(now) {
@@ -260,11 +294,13 @@ impl Pair {
                 self.spent += clock().saturating_sub(began);
             }
         }
-        self.host.update(now);
-        while let Some(event) = self.host.poll_event() {
-            world.host_event(now, event, &mut self.host);
+        if !self.stalled {
+            self.host.update(now);
+            while let Some(event) = self.host.poll_event() {
+                world.host_event(now, event, &mut self.host);
+            }
         }
-        for (index, g) in self.guests.iter_mut().enumerate().filter(|(_, g)| g.connected) {
+        for (index, g) in self.guests.iter_mut().enumerate().filter(|(_, g)| g.connected && !g.stalled) {
             let began = self.clock.map(|c| c());
             let stepped = g.session.update(now);
             if let (Some(clock), Some(began)) = (self.clock, began) {

@@ -81,6 +81,7 @@ pub mod clock;
 pub mod codec;
 pub mod emulator;
 mod error;
+mod hand_playout;
 mod link;
 pub mod newmark;
 pub mod peer;
@@ -95,6 +96,7 @@ mod state;
 pub mod wire;
 
 pub use error::StreamError;
+pub use hand_playout::HandPlayout;
 pub use newmark::Newmark;
 pub use pliant_modal::StepSettings;
 pub use recovery::{Playout, Policy, Predict, RecoveryConfig, RepairCounts};

@@ -54,12 +54,7 @@ pub(crate) fn show(
         for (&entity, sent) in guest.grabs.iter().filter(|(_, sent)| sent.body == id) {
             let Ok(mut force) = forces.get_mut(entity) else { continue };
             let grab_force = sent.number.zip(user).and_then(|(grab, user)| {
-                let key = GrabKey { user, grab };
-                let confirmed = || Some(view.grabs().iter().find(|grab| grab.key == key)?.reaction);
-                let reaction = match view.predicted_hand() {
-                    Some(own) => own.reaction(grab).or_else(confirmed)?,
-                    None => confirmed()?,
-                };
+                let reaction = view.hand_reaction(user, grab)?;
                 let grab_force =
                     followed.display.force(reaction, sent.point.as_ref()?, &place, state, &visual);
                 Some(GrabForce { force: grab_force.force.clamp_length_max(most_force), ..grab_force })

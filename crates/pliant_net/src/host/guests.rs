@@ -136,7 +136,7 @@ impl NetHost {
                 let hands = self.grabs.range(hands_of(key.user)).count();
                 let grab = self.grabs.get(&key).and_then(|&entity| world.get_mut::<GuestGrab>(entity));
                 if let Some(mut grab) = grab {
-                    grab.hand.take(input, hands, target);
+                    grab.hand.take(input, hands, target.to_array().into());
                 }
             }
             HostEvent::GrabEnded { key, .. } => {

@@ -4,10 +4,9 @@ use bevy::math::DVec3;
 use bevy::prelude::*;
 use pliant_body::{BodyState, Grab, GrabOf, Grabs};
 use pliant_modal::{Body, GrabConfig};
-use pliant_stream::{BodyId, GrabKey, PeerId};
+use pliant_stream::{BodyId, GrabKey, HandPlayout, PeerId};
 
 use super::NetHost;
-use super::playout::HandPlayout;
 use crate::session_transform::SessionTransform;
 use crate::user::HandOf;
 
@@ -109,7 +108,7 @@ impl NetHost {
                 grab,
                 GrabOf(entity),
                 HandOf(user),
-                GuestGrab { key, hand: HandPlayout::new(target), peer, most: SPEED * size },
+                GuestGrab { key, hand: HandPlayout::new(target.to_array().into()), peer, most: SPEED * size },
             ))
             .id();
         self.grabs.insert(key, spawned);
@@ -129,7 +128,7 @@ pub(crate) fn move_hands(
         let link = host.session.stats(guest.peer).unwrap_or_default();
         let depth = depth(link.round_trip.as_secs_f64(), link.jitter.as_secs_f64(), step, host.smoothing);
         let most = guest.most * step;
-        let target = guest.hand.next(depth, most);
+        let target = DVec3::from_array(guest.hand.next(depth, most).into());
         if target != grab.target {
             grab.target = target;
         }

@@ -3,7 +3,6 @@
 
 mod guests;
 mod hands;
-mod playout;
 mod publish;
 
 use std::collections::BTreeMap;

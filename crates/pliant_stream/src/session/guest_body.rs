@@ -10,7 +10,7 @@ use crate::playout::PlayoutClock;
 use crate::prediction::{PredictedHand, Ring};
 use crate::recovery::{HISTORY, Policy, Receiver, RecoveryConfig, RepairCounts, VisualGrab};
 use crate::replica::Replica;
-use crate::state::{BodyId, Placement, Pose, State, Tick, UserId};
+use crate::state::{BodyId, GrabKey, Placement, Pose, State, Tick, UserId};
 use crate::wire::{BodyInfo, MAX_NACK_RUNS, Nack, NackRun, Payload, SnapshotBytes, TickFrame};
 
 /// Largest number of frames that wait for the snapshot.
@@ -170,6 +170,12 @@ impl StreamedBody {
     pub fn held_shapes(&self) -> Option<(&Arc<HeldShapes>, &[f64])> {
         let predicted = self.predicted.as_ref()?;
         Some((predicted.held_shapes()?, predicted.columns()))
+    }
+
+    /// The reaction that a hand of the guest's own is to be told of, world, N.
+    pub fn hand_reaction(&self, user: UserId, grab: u16) -> Option<[f64; 3]> {
+        let confirmed = || self.grabs().iter().find(|g| g.key == GrabKey { user, grab }).map(|g| g.reaction);
+        self.predicted_hand().and_then(|own| own.reaction(grab)).or_else(confirmed)
     }
 
     /// The rigid frame of a free body at the displayed tick.

@@ -3,7 +3,7 @@
 
 use std::collections::VecDeque;
 
-use bevy::math::DVec3;
+use nalgebra::Vector3;
 
 /// Most targets that wait. Older ones are dropped.
 const MOST_WAITING: usize = 64;
@@ -22,8 +22,8 @@ const SLOWING: f64 = 0.7;
 /// If a target is missing during a movement, the hand goes on and slows down. The error of this
 /// extrapolation fades, like every jump, so that the hand does not jerk.
 #[derive(Debug, Clone)]
-pub(super) struct HandPlayout {
-    queue: VecDeque<DVec3>,
+pub struct HandPlayout {
+    queue: VecDeque<Vector3<f64>>,
     newest: Option<u32>,
     /// Ticks until the first waiting target is played.
     wait: usize,
@@ -31,14 +31,15 @@ pub(super) struct HandPlayout {
     /// Whether the last tick was extrapolated.
     guessed: bool,
     /// The target that was played last (`played`), and the position of the hand (`displayed`).
-    played: DVec3,
-    displayed: DVec3,
+    played: Vector3<f64>,
+    displayed: Vector3<f64>,
     /// Velocity of the hand, meters per tick.
-    velocity: DVec3,
+    velocity: Vector3<f64>,
 }
 
 impl HandPlayout {
-    pub(super) fn new(at: DVec3) -> Self {
+    /// Creates a hand that rests at a place, m.
+    pub fn new(at: Vector3<f64>) -> Self {
         Self {
             queue: VecDeque::new(),
             newest: None,
@@ -47,18 +48,18 @@ impl HandPlayout {
             guessed: false,
             played: at,
             displayed: at,
-            velocity: DVec3::ZERO,
+            velocity: Vector3::zeros(),
         }
     }
 
     /// Takes a received target. `input` numbers all targets of the guest, which moves `hands` hands
     /// at a time. Missing targets between two received ones are interpolated linearly.
-    pub(super) fn take(&mut self, input: u32, hands: usize, target: DVec3) {
+    pub fn take(&mut self, input: u32, hands: usize, target: Vector3<f64>) {
         let step = self.newest.map_or(1, |newest| input.wrapping_sub(newest)) / hands.max(1) as u32;
         self.newest = Some(input);
         let from = self.queue.back().copied();
         if let (Some(from), 2..=LONGEST_GAP) = (from, step) {
-            self.queue.extend((1..step).map(|k| from.lerp(target, f64::from(k) / f64::from(step))));
+            self.queue.extend((1..step).map(|k| from.lerp(&target, f64::from(k) / f64::from(step))));
         }
         self.queue.push_back(target);
         while self.queue.len() > MOST_WAITING {
@@ -68,7 +69,7 @@ impl HandPlayout {
 
     /// Returns the hand's position in the next tick. `depth` is the delay of a movement in ticks,
     /// and `most` is the farthest that the hand may move, m.
-    pub(super) fn next(&mut self, depth: usize, most: f64) -> DVec3 {
+    pub fn next(&mut self, depth: usize, most: f64) -> Vector3<f64> {
         let expected = self.displayed + self.velocity;
         if !self.playing && !self.queue.is_empty() {
             if self.wait == 0 {
@@ -95,12 +96,12 @@ impl HandPlayout {
                 }
                 None => {
                     self.velocity *= SLOWING;
-                    self.playing = self.velocity.length() > 1e-4 * most;
+                    self.playing = self.velocity.norm() > 1e-4 * most;
                     if self.playing {
                         self.guessed = true;
                         to = self.displayed + self.velocity;
                     } else {
-                        self.velocity = DVec3::ZERO;
+                        self.velocity = Vector3::zeros();
                     }
                 }
             }
@@ -112,16 +113,16 @@ impl HandPlayout {
         }
         // The speed of the hand is limited, whatever the targets.
         let way = to - self.displayed;
-        self.displayed = if way.length() <= most { to } else { self.displayed + way.clamp_length_max(most) };
+        self.displayed = if way.norm() <= most { to } else { self.displayed + way.cap_magnitude(most) };
         self.displayed
     }
 }
 
 /// Returns the part of a correction that is left after a tick. A very small one becomes zero, so
 /// that the guest recognizes its own targets.
-fn faded(offset: DVec3, most: f64) -> DVec3 {
+fn faded(offset: Vector3<f64>, most: f64) -> Vector3<f64> {
     let offset = offset * FADE;
-    if offset.length() < 1e-4 * most { DVec3::ZERO } else { offset }
+    if offset.norm() < 1e-4 * most { Vector3::zeros() } else { offset }
 }
 
 #[cfg(test)]
@@ -131,15 +132,15 @@ mod tests {
     const MOST: f64 = 0.5;
 
     /// A hand that moves on a circle, with 40 targets per second.
-    fn circle(tick: u32) -> DVec3 {
+    fn circle(tick: u32) -> Vector3<f64> {
         let t = f64::from(tick) / 40.0;
-        DVec3::new(0.1 * (3.0 * t).sin(), 0.1 * (3.0 * t).cos() - 0.1, 0.0)
+        Vector3::new(0.1 * (3.0 * t).sin(), 0.1 * (3.0 * t).cos() - 0.1, 0.0)
     }
 
     /// Plays `arrivals`, pairs of the host's tick and the target's number. Returns the positions
     /// and their largest second difference, m.
-    fn play(arrivals: &[(u32, u32)], ticks: u32, depth: usize) -> (Vec<DVec3>, f64) {
-        let mut hand = HandPlayout::new(DVec3::ZERO);
+    fn play(arrivals: &[(u32, u32)], ticks: u32, depth: usize) -> (Vec<Vector3<f64>>, f64) {
+        let mut hand = HandPlayout::new(Vector3::zeros());
         let mut played = Vec::new();
         for tick in 0..ticks {
             for &(_, input) in arrivals.iter().filter(|(at, _)| *at == tick) {
@@ -147,7 +148,7 @@ mod tests {
             }
             played.push(hand.next(depth, MOST));
         }
-        let jerk = |w: &[DVec3]| (w[0] - 2.0 * w[1] + w[2]).length();
+        let jerk = |w: &[Vector3<f64>]| (w[0] - 2.0 * w[1] + w[2]).norm();
         let worst = played.windows(3).map(jerk).fold(0.0, f64::max);
         (played, worst)
     }
@@ -199,12 +200,12 @@ mod tests {
 
     #[test]
     fn a_hand_that_is_thrown_moves_no_faster_than_a_hand() {
-        let mut hand = HandPlayout::new(DVec3::ZERO);
-        hand.take(1, 1, DVec3::X * 1e6);
-        let mut at = DVec3::ZERO;
+        let mut hand = HandPlayout::new(Vector3::zeros());
+        hand.take(1, 1, Vector3::x() * 1e6);
+        let mut at = Vector3::zeros();
         for _ in 0..50 {
             let next = hand.next(1, MOST);
-            assert!(next.distance(at) <= MOST * 1.000_001);
+            assert!((next - at).norm() <= MOST * 1.000_001);
             at = next;
         }
         // Many more targets than may wait arrive, and the oldest are dropped.
@@ -217,15 +218,15 @@ mod tests {
     /// A resting guest sends its target six times and is then silent.
     #[test]
     fn a_silent_hand_comes_to_rest_where_it_was_said() {
-        let mut hand = HandPlayout::new(DVec3::ZERO);
+        let mut hand = HandPlayout::new(Vector3::zeros());
         for input in 0..5 {
-            hand.take(input, 1, DVec3::X * 0.01 * f64::from(input));
+            hand.take(input, 1, Vector3::x() * 0.01 * f64::from(input));
             hand.next(1, MOST);
         }
         // A tick without a target is extrapolated, so the next target causes a correction that
         // fades.
         hand.next(1, MOST);
-        let end = DVec3::Y * 0.3;
+        let end = Vector3::y() * 0.3;
         for input in 5..11 {
             hand.take(input, 1, end);
             hand.next(1, MOST);
@@ -238,15 +239,15 @@ mod tests {
 
     #[test]
     fn a_hand_that_rests_and_moves_again_is_where_it_says() {
-        let mut hand = HandPlayout::new(DVec3::ZERO);
+        let mut hand = HandPlayout::new(Vector3::zeros());
         for input in 0..10 {
-            hand.take(input, 1, DVec3::X * 0.01 * f64::from(input));
+            hand.take(input, 1, Vector3::x() * 0.01 * f64::from(input));
             hand.next(2, MOST);
         }
         for _ in 0..40 {
             hand.next(2, MOST);
         }
-        let end = DVec3::X * 0.09;
+        let end = Vector3::x() * 0.09;
         hand.take(10, 1, end);
         for _ in 0..60 {
             hand.next(2, MOST);
