@@ -22,6 +22,10 @@ const SETTLED: Duration = Duration::from_secs(5);
 const DELAY: usize = 2;
 const MOST: f64 = 20.0 / 40.0;
 
+/// Largest reaction that may be shown, as a share of the largest true one: a fifth beyond it, and the
+/// rounding of the frames.
+const MOST_SHOWN: f64 = 1.2 + 1e-4;
+
 struct Hitched {
     scene: Scene,
     hands: BTreeMap<GrabKey, HandPlayout>,
@@ -166,15 +170,13 @@ fn worst(who: Who, seeds: u64, lasts: Duration) -> (f64, f64) {
 #[test]
 fn hitches_are_not_kicks() {
     let all = [Who::Nobody, Who::Host, Who::Guest, Who::Both].map(|who| worst(who, 10, 30 * S));
-    assert!(all.iter().all(|(ratio, _)| *ratio <= 1.2), "{all:?}");
+    assert!(all.iter().all(|(ratio, _)| *ratio <= MOST_SHOWN), "{all:?}");
 }
 
 /// The same at length, run by hand.
 #[test]
 #[ignore = "takes minutes"]
 fn a_hundred_sessions_of_hitches_are_not_kicks() {
-    for who in [Who::Host, Who::Guest, Who::Both] {
-        let (ratio, _) = worst(who, 100, 60 * S);
-        assert!(ratio <= 1.2, "{who:?}: {ratio}");
-    }
+    let all = [Who::Host, Who::Guest, Who::Both].map(|who| worst(who, 100, 60 * S));
+    assert!(all.iter().all(|(ratio, _)| *ratio <= MOST_SHOWN), "{all:?}");
 }

@@ -4,7 +4,7 @@ use std::collections::BTreeMap;
 
 use bevy::prelude::*;
 use pliant_body::{GrabForce, HeldShapesCache, ModalBody};
-use pliant_stream::{BodyId, GrabKey, GuestSession};
+use pliant_stream::{BodyId, GuestSession};
 
 use super::bodies::FollowedBody;
 use super::{NetGuest, visual_state_of};

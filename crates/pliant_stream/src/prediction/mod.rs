@@ -5,6 +5,7 @@
 //! ([`VisualCopy`]). Guests, their predicted hands and peers all use these.
 
 mod body_copy;
+mod hitch_guard;
 mod predicted_hand;
 mod ring;
 mod rollback;
@@ -12,6 +13,7 @@ mod visual_copy;
 
 pub(crate) use body_copy::BodyCopy;
 pub use body_copy::HandState;
+pub(crate) use hitch_guard::HitchGuard;
 pub use predicted_hand::PredictedHand;
 pub(crate) use ring::Ring;
 pub(crate) use rollback::Rollback;

@@ -3,11 +3,12 @@
 use std::sync::Arc;
 use std::time::Duration;
 
+use nalgebra::Vector3;
 use pliant_modal::{HeldShapes, ModalModel};
 
 use crate::newmark::Newmark;
 use crate::playout::PlayoutClock;
-use crate::prediction::{PredictedHand, Ring};
+use crate::prediction::{HitchGuard, PredictedHand, Ring};
 use crate::recovery::{HISTORY, Policy, Receiver, RecoveryConfig, RepairCounts, VisualGrab};
 use crate::replica::Replica;
 use crate::state::{BodyId, GrabKey, Placement, Pose, State, Tick, UserId};
@@ -41,6 +42,7 @@ pub struct StreamedBody {
     pub(crate) playout: PlayoutClock,
     pub(crate) predicted: Option<PredictedHand>,
     predicts: bool,
+    hitches: HitchGuard,
     config: RecoveryConfig,
     newmark: Newmark,
     waiting: Vec<TickFrame>,
@@ -73,6 +75,7 @@ impl StreamedBody {
             playout: PlayoutClock::new(newmark.h, config.playout),
             predicted: None,
             predicts,
+            hitches: HitchGuard::new(newmark.h),
             config,
             newmark,
             waiting: Vec::new(),
@@ -172,10 +175,15 @@ impl StreamedBody {
         Some((predicted.held_shapes()?, predicted.columns()))
     }
 
-    /// The reaction that a hand of the guest's own is to be told of, world, N.
+    /// The reaction that a hand of the guest's own is to be told of, world, N: that of
+    /// [`StreamedBody::predicted_hand`] if there is one.
+    ///
+    /// After a hitch of the host, the network or this guest, it exceeds what the host has sent in
+    /// the last second by no more than a fifth. Where no frame comes, it fades.
     pub fn hand_reaction(&self, user: UserId, grab: u16) -> Option<[f64; 3]> {
         let confirmed = || self.grabs().iter().find(|g| g.key == GrabKey { user, grab }).map(|g| g.reaction);
-        self.predicted_hand().and_then(|own| own.reaction(grab)).or_else(confirmed)
+        let reaction = self.predicted_hand().and_then(|own| own.reaction(grab)).or_else(confirmed)?;
+        Some(self.hitches.bound(reaction))
     }
 
     /// The rigid frame of a free body at the displayed tick.
@@ -315,6 +323,8 @@ impl StreamedBody {
     /// Steps to all ticks that are due by now. Returns the number of ticks.
     pub(crate) fn advance(&mut self, now: Duration, user: UserId, round_trip: Duration) -> u64 {
         let Some(receiver) = &mut self.receiver else { return 0 };
+        let quiet = if self.resting { Duration::ZERO } else { now.saturating_sub(self.received_at) };
+        self.hitches.pass(now, quiet);
         if self.resting {
             self.stalled = false;
             if now >= self.fade_at && receiver.is_fading() {
@@ -323,7 +333,7 @@ impl StreamedBody {
             }
             return 0;
         }
-        let quiet = now.saturating_sub(self.received_at) > self.config.stall_after;
+        let quiet = quiet > self.config.stall_after;
         let highest = receiver.history().highest();
         self.stalled = quiet && receiver.tick() >= highest;
         let guesses = (self.config.stall_after.as_secs_f64() / self.newmark.h) as u64 + 1;
@@ -340,6 +350,11 @@ impl StreamedBody {
             }
             receiver.advance();
             stepped += 1;
+            if receiver.history().known(receiver.tick()).is_some() {
+                let own = receiver.grabs().iter().filter(|g| g.key.user == user);
+                let norm = |g: &VisualGrab| Vector3::from(g.reaction).norm();
+                self.hitches.give(receiver.tick(), own.map(norm).fold(0.0, f64::max));
+            }
             if let Some(predicted) = &mut self.predicted {
                 let way = round_trip.as_secs_f64() + self.playout.delay();
                 predicted.step(receiver, user, (way / self.newmark.h).ceil() as usize);
