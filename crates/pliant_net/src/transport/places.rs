@@ -207,8 +207,9 @@ mod tests {
         // The number of addresses that are remembered is bounded.
         for k in 0..10_000_u128 {
             let from = IpAddr::V6(Ipv6Addr::from_bits((0x2001_0db9 << 96) + (k << 64)));
-            let taken = places.take(&limits, now, from);
-            taken.map(|(id, _)| places.free(id));
+            if let Some((id, _)) = places.take(&limits, now, from) {
+                places.free(id);
+            }
         }
         assert!(places.addresses.len() <= MOST_ADDRESSES, "{}", places.addresses.len());
     }

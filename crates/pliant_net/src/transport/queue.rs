@@ -371,7 +371,9 @@ mod tests {
         let full = Bytes::from(vec![2; 1155]);
         let fill = || {
             for peer in (1..=40).map(PeerId) {
-                (0..64).for_each(|_| drop(inbox.push_datagram(peer, Instant::now(), full.clone(), 64)));
+                for _ in 0..64 {
+                    inbox.push_datagram(peer, Instant::now(), full.clone(), 64);
+                }
             }
         };
         for peer in (1..=40).map(PeerId) {
@@ -392,7 +394,9 @@ mod tests {
         let alone = Inbox::default();
         alone.open(PeerId(1), left(PeerId(1)));
         alone.pop().unwrap();
-        (0..64).for_each(|_| drop(alone.push_datagram(PeerId(1), Instant::now(), full.clone(), 64)));
+        for _ in 0..64 {
+            alone.push_datagram(PeerId(1), Instant::now(), full.clone(), 64);
+        }
         for _ in 0..2 {
             alone.begin_frame();
             let count = std::iter::from_fn(|| alone.pop_in_frame()).count();
