@@ -4,7 +4,7 @@ use std::sync::Arc;
 
 use nalgebra::Vector3;
 
-use super::{ContactSites, Memory, Obstacle, Touching};
+use super::{Bent, Cloud, ContactSites, Memory, Obstacle, Touching};
 use crate::{Hand, StepError};
 
 /// What a body touches.
@@ -75,6 +75,7 @@ pub struct Contacts {
     pub(crate) modes: usize,
     pub(crate) memory: Vec<Memory>,
     pub(crate) touching: Touching,
+    pub(crate) bent: Bent,
     /// Pull, mean pull and flow of the hands before the step.
     pub(crate) hands: Vec<[Vector3<f64>; 3]>,
     /// Weight of a contact force in the way of the frame within a step, see the kernel.
@@ -95,6 +96,7 @@ impl Default for Contacts {
             modes: 0,
             memory: Vec::new(),
             touching: Touching::default(),
+            bent: Bent::default(),
             hands: Vec::with_capacity(crate::Body::MAX_GRABS),
             theta: 0.5,
             lost: 0.0,
@@ -185,6 +187,13 @@ impl Contacts {
         for (hand, [pull, mean, flow]) in hands.iter_mut().zip(&self.hands) {
             (hand.pull, hand.mean, hand.flow) = (*pull, *mean, *flow);
         }
+    }
+
+    /// Where all sites are at the coordinates `q`, if it is known, and how far they may be from
+    /// there, m.
+    pub(crate) fn cloud(&self, q: &[f64]) -> Option<(&Cloud, f64)> {
+        let known = self.bent.cloud.sites.len() == self.sites() && self.bent.q == q;
+        known.then_some((&self.bent.cloud, self.bent.slack))
     }
 
     /// Takes over the sites of a body with `modes` modes and reserves memory.

@@ -33,7 +33,7 @@ pub use contacts::{Contact, ContactReport, Contacts, Touched};
 pub use obstacle::{Capsule, Cuboid, Moving, Obstacle, Plane, Sphere, SurfacePoint};
 
 pub(crate) use point::{Far, Memory, Point};
-pub(crate) use shape::{Near, Shape, Sixes};
+pub(crate) use shape::{Guess, Near, Shape, Sixes};
 pub(crate) use sites::{ContactSites, Site};
-pub(crate) use solver::{Clearance, Touching};
-pub(crate) use surface_field::Place;
+pub(crate) use solver::{Clearance, Look, Touching};
+pub(crate) use surface_field::{Bent, Cloud, Place};

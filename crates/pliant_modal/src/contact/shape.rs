@@ -6,9 +6,12 @@ use nalgebra::{Matrix3, Vector3};
 
 use super::{
     ContactSites,
-    surface_field::{Carriers, Place, SurfaceField},
+    surface_field::{Carriers, Cloud, Place, SurfaceField},
 };
-use crate::step::{Frame, Six, Tangent, tangent};
+use crate::{
+    HeldPatch,
+    step::{Frame, Six, Tangent, displacement, tangent},
+};
 
 /// Rounds of the search for the place of the rest shape that lies nearest to a point.
 const ROUNDS: usize = 6;
@@ -27,6 +30,9 @@ const KEPT: f64 = 1e-4;
 pub(crate) struct Sixes {
     stamp: Cell<u32>,
     list: Vec<Cell<(u32, Six)>>,
+    /// Where all sites are, if it was asked for, with the stamp of the six numbers.
+    cloud: Cloud,
+    placed: u32,
 }
 
 impl Sixes {
@@ -35,6 +41,20 @@ impl Sixes {
         self.list.clear();
         self.list.resize(sites, Cell::new((0, Six::zeros())));
         self.stamp.set(1);
+        self.placed = 0;
+    }
+
+    /// Finds where all sites of a body are.
+    pub(crate) fn place_all(&mut self, sites: &ContactSites, field: &SurfaceField, q: &[f64], warps: bool) {
+        if self.placed != self.stamp.get() {
+            self.placed = self.stamp.get();
+            sites.place(field, q, warps, &mut self.cloud);
+        }
+    }
+
+    /// Where all sites are, after [`Sixes::place_all`].
+    pub(crate) fn cloud(&self) -> Option<&Cloud> {
+        (self.placed == self.stamp.get()).then_some(&self.cloud)
     }
 
     /// Forgets all.
@@ -56,6 +76,18 @@ pub(crate) struct Shape<'a> {
     pub(crate) size: f64,
     /// Bound on the displacements at these coordinates, m.
     pub(crate) bound: f64,
+    /// Where all sites are, if it is known, and how far they may be from there, m.
+    pub(crate) cloud: Option<(&'a Cloud, f64)>,
+}
+
+/// What is known of a place before the search for it.
+#[derive(Debug, Clone, Copy)]
+pub(crate) enum Guess {
+    None,
+    /// A place that is near.
+    Place(Place),
+    /// A site of the body that is near.
+    Site(usize),
 }
 
 /// A place of a body's surface near a point.
@@ -73,6 +105,26 @@ pub(crate) struct Near {
 impl Shape<'_> {
     fn turn(&self) -> Matrix3<f64> {
         *self.frame.rotation().to_rotation_matrix().matrix()
+    }
+
+    /// Position of a site's material point in the direction `toward`, m, and its derivative by the
+    /// six numbers, world axes.
+    pub(crate) fn site(&self, index: usize, toward: &Vector3<f64>) -> (Vector3<f64>, Tangent) {
+        let rest = self.sites.sites.get(index).map_or_else(Vector3::zeros, |site| site.rest(toward));
+        let (moved, tangent) = tangent(&self.six_of(index), self.warps);
+        (self.frame.to_world(rest + moved), self.turn() * tangent)
+    }
+
+    /// Displacement of a site, m, body axes.
+    pub(crate) fn moved(&self, index: usize) -> Vector3<f64> {
+        displacement(&self.six_of(index), self.warps)
+    }
+
+    /// Outward normal of the surface at a site, world axes.
+    pub(crate) fn facing(&self, index: usize) -> Vector3<f64> {
+        let Some(site) = self.sites.sites.get(index) else { return Vector3::y() };
+        let six = if self.warps { self.six_of(index) } else { site.patch.rows().reduce(self.q, true) };
+        self.frame.rotation() * (HeldPatch::rotation_of(&six) * site.facing)
     }
 
     fn six(&self, carriers: impl Iterator<Item = (usize, f64)>) -> Six {
@@ -103,13 +155,14 @@ impl Shape<'_> {
     /// Displacement of a place (m) and the gradient of the deformation of the surface there, body
     /// axes.
     fn deformed(&self, place: &Place) -> (Vector3<f64>, Matrix3<f64>) {
-        let mut moved = Vector3::zeros();
+        let mut middle = Six::zeros();
         let mut corners = [Vector3::zeros(); 3];
         let rest = self.field.corners(place);
-        for (k, corner) in corners.iter_mut().enumerate() {
+        for (k, (corner, weight)) in corners.iter_mut().zip(place.weights()).enumerate() {
             let carriers = self.field.corner_carriers(place, k).iter();
             let six = self.six(carriers.map(|(site, weight)| (*site as usize, *weight)));
-            *corner = rest[k] + tangent(&six, self.warps).0;
+            *corner = rest[k] + displacement(&six, self.warps);
+            middle += weight * six;
         }
         let frame = |[a, b, c]: [Vector3<f64>; 3]| {
             let (ab, ac) = (b - a, c - a);
@@ -120,9 +173,7 @@ impl Shape<'_> {
         let before = frame(rest.map(|corner| *corner)).try_inverse();
         let gradient = before.map_or_else(Matrix3::identity, |inverse| frame(corners) * inverse);
         let gradient = if gradient.iter().all(|x| x.is_finite()) { gradient } else { Matrix3::identity() };
-        let carriers = self.field.carriers(place);
-        moved += tangent(&self.six(carriers.iter()), self.warps).0;
-        (moved, gradient)
+        (displacement(&middle, self.warps), gradient)
     }
 
     /// The distance of a point (m, world axes) to the smooth surface at a place.
@@ -147,8 +198,7 @@ impl Shape<'_> {
 
     /// The place of the surface that is nearest to a point (m, world axes), no farther than
     /// `within` (m), where the surface looks at `facing`, an outward normal of another body in
-    /// world axes. `kept` is the place that it had before. Without such a place the error is a
-    /// distance that the point is away at least, m.
+    /// world axes. `kept` is the place that it had before. Without such a place the error is a distance that the point is away at least, m.
     ///
     /// The point is pulled back to the rest shape by the deformation of the triangle that is
     /// nearest there, and again until it stays.
@@ -158,6 +208,7 @@ impl Shape<'_> {
         facing: &Vector3<f64>,
         within: f64,
         kept: Option<&Place>,
+        guess: Guess,
     ) -> Result<Near, f64> {
         let local = self.frame.to_local(point);
         let facing = self.turn().tr_mul(facing);
@@ -165,13 +216,23 @@ impl Shape<'_> {
         let stiff = self.bound < 0.05 * self.size;
         let (mut x, mut wanted) = (local, stiff.then_some(facing));
         let mut reach = within + self.bound;
+        let near = 2.0 * within + 0.01 * self.size;
+        let mut hint = None;
+        match guess {
+            Guess::None => {}
+            Guess::Place(place) => hint = Some(place),
+            Guess::Site(site) => {
+                (x, reach) = (local - self.moved(site), near);
+                hint = self.field.place_of(site);
+            }
+        }
         let kept = kept.filter(|kept| self.field.has(kept));
         if let Some((moved, gradient)) = kept.map(|kept| self.deformed(kept)) {
             let inverse = gradient.try_inverse().ok_or(0.0)?;
             let rest = kept.map_or(local, |kept| self.field.rest(kept));
             x = rest + inverse * (local - rest - moved);
             wanted = gradient.tr_mul(&facing).try_normalize(1e-9);
-            reach = 2.0 * within + 0.01 * self.size;
+            reach = near;
         }
         for round in 0..ROUNDS {
             let kept = kept.and_then(|kept| self.field.on_same_triangle(kept, &x));
@@ -179,11 +240,12 @@ impl Shape<'_> {
                 // Only what is nearer by more than the slack replaces the triangle.
                 Some((place, distance)) if wanted.is_some() && distance < reach => {
                     let nearer = distance - KEPT * self.size;
-                    let found = (nearer > 0.0).then(|| self.field.closest(&x, wanted.as_ref(), nearer));
+                    let found = (nearer > 0.0).then(|| self.field.closest(&x, wanted.as_ref(), nearer, None));
                     found.flatten().unwrap_or(place)
                 }
-                _ => self.field.closest(&x, wanted.as_ref(), reach).ok_or(within)?,
+                _ => self.field.closest(&x, wanted.as_ref(), reach, hint.as_ref()).ok_or(within)?,
             };
+            hint = Some(place);
             let (moved, gradient) = self.deformed(&place);
             let rest = self.field.rest(&place);
             let next = rest + gradient.try_inverse().ok_or(0.0)? * (local - rest - moved);
@@ -198,7 +260,7 @@ impl Shape<'_> {
             }
             x = next;
             wanted = gradient.tr_mul(&facing).try_normalize(1e-9);
-            reach = 2.0 * within + 0.01 * self.size;
+            reach = near;
         }
         Err(0.0)
     }
@@ -208,7 +270,7 @@ impl Shape<'_> {
         let local = self.frame.to_local(point);
         let mut x = local;
         for _ in 0..2 {
-            let Some(place) = self.field.closest(&x, None, f64::MAX.sqrt()) else { return local };
+            let Some(place) = self.field.closest(&x, None, f64::MAX.sqrt(), None) else { return local };
             let (moved, gradient) = self.deformed(&place);
             let rest = self.field.rest(&place);
             let Some(inverse) = gradient.try_inverse() else { return local };
@@ -234,7 +296,7 @@ impl Shape<'_> {
         let mut gone = 0.0;
         for _ in 0..STEPS {
             let x = from + way * (gone / length);
-            let place = self.field.closest(&x, Some(facing), length - gone)?;
+            let place = self.field.closest(&x, Some(facing), length - gone, None)?;
             let (_, normal, _) = self.field.normals(&place);
             let off = x - self.field.rest(&place);
             let distance = off.norm();

@@ -4,8 +4,11 @@ use std::sync::OnceLock;
 
 use nalgebra::{Matrix3, Vector3};
 
-use super::surface_field::SurfaceField;
-use crate::{HeldPatch, ModalModel, Patch, StepError};
+use super::surface_field::{Cloud, SurfaceField};
+use crate::{
+    HeldPatch, ModalModel, Patch, StepError,
+    step::{Six, displacement},
+};
 
 /// Largest number of contact sites of a body.
 const MOST_SITES: usize = 384;
@@ -40,6 +43,8 @@ pub(crate) struct Site {
     /// point slides.
     pub(crate) outward: Vector3<f64>,
     pub(crate) reach: f64,
+    /// Farthest distance of a contact point from the vertex, m.
+    pub(crate) slides: f64,
     /// Outward normal of the surface at the vertex, body axes.
     pub(crate) facing: Vector3<f64>,
 }
@@ -81,6 +86,8 @@ pub(crate) struct ContactSites {
     pub(crate) radius: f64,
     /// Mean distance between neighboring sites, m.
     pub(crate) spacing: f64,
+    /// The six rows of all sites, for each mode those of one number for all sites after another.
+    rows: Vec<f64>,
     /// The surface that other bodies touch, made at the first request.
     field: OnceLock<SurfaceField>,
 }
@@ -150,7 +157,9 @@ impl ContactSites {
             let outward = if radius > 0.0 { (at - center) / radius } else { Vector3::y() };
             let reach = if radius > 0.0 { (slide / radius).min(1.5).cos() } else { 1.0 };
             let facing = Vector3::from(normals[vertex].map(f64::from));
-            sites.push(Site { vertex: vertex as u32, patch, center, radius, outward, reach, facing });
+            let slides = radius * (2.0 - 2.0 * reach).max(0.0).sqrt();
+            let vertex = vertex as u32;
+            sites.push(Site { vertex, patch, center, radius, outward, reach, slides, facing });
         }
         let omega = model.omega()[..modes.min(model.mode_count())].to_vec();
         let mut softest = 0.0f64;
@@ -166,7 +175,31 @@ impl ContactSites {
             softest = softest.max(flexibility);
         }
         let radius = sites.iter().map(|s| (positions[s.vertex as usize] - com).norm()).fold(0.0, f64::max);
-        Ok(Self { sites, largest, omega, softest, radius, spacing, field: OnceLock::new() })
+        let mut rows = Vec::with_capacity(6 * sites.len() * largest.len());
+        for mode in 0..largest.len() {
+            for number in 0..6 {
+                rows.extend(sites.iter().map(|site| site.patch.rows().of(number)[mode]));
+            }
+        }
+        Ok(Self { sites, largest, omega, softest, radius, spacing, rows, field: OnceLock::new() })
+    }
+
+    /// Finds where all sites are at the coordinates `q`.
+    pub(crate) fn place(&self, field: &SurfaceField, q: &[f64], warps: bool, cloud: &mut Cloud) {
+        let count = self.sites.len();
+        let used = if warps { 6 } else { 3 } * count;
+        cloud.sixes.clear();
+        cloud.sixes.resize(6 * count, 0.0);
+        let sums = &mut cloud.sixes[..used];
+        for (row, q) in self.rows.chunks_exact((6 * count).max(1)).zip(q) {
+            sums.iter_mut().zip(row).for_each(|(sum, row)| *sum += row * q);
+        }
+        let six = |site: usize| Six::from_fn(|number, _| cloud.sixes[number * count + site]);
+        let place =
+            |(number, site): (usize, &Site)| site.rest(&site.outward) + displacement(&six(number), warps);
+        cloud.sites.clear();
+        cloud.sites.extend(self.sites.iter().enumerate().map(place));
+        field.enclose(cloud);
     }
 
     /// The surface that other bodies touch. It depends on the model alone.

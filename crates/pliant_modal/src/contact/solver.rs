@@ -6,7 +6,7 @@ use super::{
     cone::{self, Status},
     point::Point,
 };
-use crate::{simd::dot, step::State};
+use crate::{simd::dot, step::Frame};
 
 /// The coordinates of one body in the vector of all: its modes and six for its frame.
 #[derive(Debug, Clone, Copy, Default)]
@@ -31,10 +31,19 @@ pub(crate) struct Clearance {
     /// Keys of both bodies.
     pair: [u64; 2],
     used: bool,
-    /// The states at which the distances hold.
-    pub(crate) states: [State; 2],
+    /// The frames at which the distances hold, and how far the sites of both had gone, m.
+    pub(crate) frames: [Frame; 2],
+    pub(crate) ways: [f64; 2],
     /// Distance of each site at least, m. Empty if none is known.
     pub(crate) sites: Vec<f64>,
+}
+
+/// A look for contacts of the sites of one body with another body.
+#[derive(Debug, Clone, Copy)]
+pub(crate) struct Look {
+    pub(crate) members: [usize; 2],
+    /// The clearances of both, as an index.
+    pub(crate) clear: usize,
 }
 
 /// Workspace of the contacts of a group of bodies in a step.
@@ -65,6 +74,12 @@ pub(crate) struct Touching {
     /// Clearances of pairs, sorted by their keys, and unused ones.
     pub(crate) clear: Vec<Clearance>,
     spare: Vec<Clearance>,
+    pub(crate) looks: Vec<Look>,
+    /// The points whose sites belong to the other body of the current look, with force: where they
+    /// touch, m.
+    pub(crate) covered: Vec<Vector3<f64>>,
+    /// Site and bodies of each point, the second [`usize::MAX`] at an obstacle.
+    pub(crate) heads: Vec<[usize; 3]>,
 }
 
 impl Touching {

@@ -20,6 +20,12 @@ const FACING: f64 = -0.2;
 /// Largest number of triangles in a leaf of the tree.
 const LEAF: usize = 4;
 
+/// Largest number of sites in a leaf of the tree of sites.
+const CLUSTER: usize = 3;
+
+/// Strain by which the surface may stretch around a site without being missed.
+const STRETCH: f64 = 1.25;
+
 /// A triangle of the rest surface.
 #[derive(Debug)]
 struct Facet {
@@ -35,8 +41,59 @@ struct Facet {
 struct Node {
     low: Vector3<f64>,
     high: Vector3<f64>,
+    /// A box around the normals of the triangles.
+    normals: [Vector3<f64>; 2],
     first: u32,
     count: u32,
+}
+
+/// A node of the tree of sites. A leaf has no second child. The first follows right behind it.
+#[derive(Debug)]
+pub(crate) struct Cluster {
+    /// The sites, as a range of [`SurfaceField::sites`].
+    pub(crate) first: usize,
+    pub(crate) end: usize,
+    pub(crate) second: Option<usize>,
+    /// How far the surface around the sites goes beyond their box, m.
+    cover: f64,
+}
+
+impl Cluster {
+    pub(crate) fn is_leaf(&self) -> bool {
+        self.second.is_none()
+    }
+}
+
+/// Where the sites of a bent body are, m, body axes, and boxes around them.
+#[derive(Debug, Clone, Default)]
+pub(crate) struct Cloud {
+    pub(crate) sites: Vec<Vector3<f64>>,
+    pub(crate) boxes: Vec<[Vector3<f64>; 2]>,
+    /// The six numbers of all sites, one after another for each.
+    pub(super) sixes: Vec<f64>,
+}
+
+impl Cloud {
+    /// Largest way of a site from another shape of the same body, m.
+    pub(crate) fn way(&self, from: &Self) -> f64 {
+        if self.sites.len() != from.sites.len() {
+            return f64::INFINITY;
+        }
+        let ways = self.sites.iter().zip(&from.sites).map(|(to, from)| (to - from).norm_squared());
+        ways.fold(0.0, f64::max).sqrt()
+    }
+}
+
+/// How far the sites of a body have gone in all looks so far, in body axes.
+#[derive(Debug, Clone, Default)]
+pub(crate) struct Bent {
+    /// Sum of the largest ways, m.
+    pub(crate) way: f64,
+    /// Coordinates at the last look, and where the sites were, but for `slack` (m).
+    pub(crate) q: Vec<f64>,
+    pub(crate) cloud: Cloud,
+    pub(crate) slack: f64,
+    pub(crate) spare: Cloud,
 }
 
 /// A place of the rest surface.
@@ -45,6 +102,13 @@ pub(crate) struct Place {
     facet: u32,
     /// Weights of the corners, with the sum 1.
     weights: [f64; 3],
+}
+
+impl Place {
+    /// Weights of the corners of the triangle.
+    pub(crate) fn weights(&self) -> [f64; 3] {
+        self.weights
+    }
 }
 
 /// Sites that carry a place, with their weights.
@@ -86,6 +150,11 @@ pub(crate) struct SurfaceField {
     vertices: Vec<Vector3<f64>>,
     facets: Vec<Facet>,
     nodes: Vec<Node>,
+    /// The sites by clusters, and the tree of these.
+    sites: Vec<u32>,
+    clusters: Vec<Cluster>,
+    /// A place near each site.
+    places: Vec<Place>,
     /// Carriers of each vertex. Anchored vertices have none.
     carriers: Vec<Vec<(u32, f64)>>,
 }
@@ -128,6 +197,14 @@ fn closest_on_triangle([a, b, c]: [&Vector3<f64>; 3], p: &Vector3<f64>) -> [f64;
     [1.0 - v - w, v, w]
 }
 
+impl Node {
+    /// Whether no triangle of the node looks at a site with this outward normal.
+    fn looks_away(&self, facing: &Vector3<f64>) -> bool {
+        let [low, high] = &self.normals;
+        facing.component_mul(low).inf(&facing.component_mul(high)).sum() > FACING
+    }
+}
+
 impl SurfaceField {
     /// Makes the field of a model's surface, carried by its contact sites.
     pub(crate) fn new(model: &ModalModel, sites: &[Site]) -> Self {
@@ -166,19 +243,172 @@ impl SurfaceField {
                 |(at, anchored)| if *anchored { Vec::new() } else { carriers(at, sites, surface, &vertices) },
             )
             .collect();
-        Self { vertices, facets, nodes, carriers }
+        let (sites_of, clusters, places) = (Vec::new(), Vec::new(), Vec::new());
+        let mut field = Self { vertices, facets, nodes, sites: sites_of, clusters, places, carriers };
+        field.gather(sites);
+        field
+    }
+
+    /// Makes the tree of the sites.
+    fn gather(&mut self, sites: &[Site]) {
+        let place = |site: u32| sites[site as usize].rest(&sites[site as usize].outward);
+        self.sites = (0..sites.len() as u32).collect();
+        if !sites.is_empty() {
+            gather(&place, &mut self.sites, 0, &mut self.clusters);
+        }
+        let mut leaf_of = vec![0; sites.len()];
+        for (number, cluster) in self.clusters.iter().enumerate().filter(|(_, cluster)| cluster.is_leaf()) {
+            self.sites[cluster.first..cluster.end].iter().for_each(|&site| leaf_of[site as usize] = number);
+        }
+        let unknown = Place { facet: 0, weights: [1.0, 0.0, 0.0] };
+        self.places = vec![unknown; sites.len()];
+        let mut nearest_place = vec![f64::INFINITY; sites.len()];
+        for (number, facet) in self.facets.iter().enumerate() {
+            let corners = facet.corners.map(|v| &self.vertices[v as usize]);
+            let longest = (0..3).map(|k| (corners[k] - corners[(k + 1) % 3]).norm()).fold(0.0, f64::max);
+            for (corner, at) in corners.into_iter().enumerate() {
+                let near = |site: &&u32| (place(**site) - at).norm_squared();
+                let nearest = self.sites.iter().min_by(|a, b| near(a).total_cmp(&near(b)));
+                let Some(&nearest) = nearest else { continue };
+                // A point of a triangle is nearer to a corner than this.
+                let cover = |distance: f64| STRETCH * (distance + 0.6 * longest);
+                let nearest = nearest as usize;
+                let distance = (place(nearest as u32) - at).norm();
+                if distance < nearest_place[nearest] {
+                    nearest_place[nearest] = distance;
+                    let mut weights = [0.0; 3];
+                    weights[corner] = 1.0;
+                    self.places[nearest] = Place { facet: number as u32, weights };
+                }
+                let leaf = &mut self.clusters[leaf_of[nearest]];
+                leaf.cover = leaf.cover.max(cover(distance));
+            }
+        }
+        for number in (0..self.clusters.len()).rev() {
+            if let Some(second) = self.clusters[number].second {
+                let cover = self.clusters[number + 1].cover.max(self.clusters[second].cover);
+                self.clusters[number].cover = cover;
+            }
+        }
+    }
+
+    /// A place near a site.
+    pub(crate) fn place_of(&self, site: usize) -> Option<Place> {
+        self.places.get(site).copied().filter(|place| self.has(place))
+    }
+
+    /// The nodes of the tree of sites.
+    pub(crate) fn clusters(&self) -> &[Cluster] {
+        &self.clusters
+    }
+
+    /// The sites of a node.
+    pub(crate) fn sites_of(&self, cluster: &Cluster) -> &[u32] {
+        &self.sites[cluster.first..cluster.end]
+    }
+
+    /// Makes the boxes around the sites of a bent body.
+    pub(crate) fn enclose(&self, cloud: &mut Cloud) {
+        cloud.boxes.clear();
+        cloud.boxes.resize(self.clusters.len(), [Vector3::zeros(); 2]);
+        for (number, cluster) in self.clusters.iter().enumerate().rev() {
+            cloud.boxes[number] = match cluster.second {
+                Some(second) => {
+                    let ([low, high], [a, b]) = (&cloud.boxes[number + 1], &cloud.boxes[second]);
+                    [low.inf(a), high.sup(b)]
+                }
+                None => self.sites_of(cluster).iter().fold(
+                    [Vector3::repeat(f64::INFINITY), Vector3::repeat(f64::NEG_INFINITY)],
+                    |[low, high], site| {
+                        let at = &cloud.sites[*site as usize];
+                        [low.inf(at), high.sup(at)]
+                    },
+                ),
+            };
+        }
+    }
+
+    /// How far a point (m, body axes) is at least from the surface of a bent body, m, or at most 0
+    /// where it may touch it, and the nearest leaf of the tree of sites.
+    pub(crate) fn away(&self, cloud: &Cloud, point: &Vector3<f64>) -> (f64, usize) {
+        let away = |number: usize| {
+            let [low, high] = &cloud.boxes[number];
+            let over = (low - point).sup(&(point - high)).map(|x| x.max(0.0));
+            over.norm() - self.clusters[number].cover
+        };
+        let (mut least, mut nearest) = (f64::INFINITY, 0);
+        let mut stack = [(0, 0.0); 64];
+        let mut depth = 0;
+        if !self.clusters.is_empty() {
+            (stack[0], depth) = ((0, away(0)), 1);
+        }
+        while depth > 0 && least > 0.0 {
+            depth -= 1;
+            let (number, distance) = stack[depth];
+            if distance >= least {
+                continue;
+            }
+            match self.clusters[number].second {
+                None => (least, nearest) = (distance, number),
+                Some(second) => {
+                    let mut children = [number + 1, second].map(|child| (child, away(child)));
+                    if children[0].1 < children[1].1 {
+                        children.swap(0, 1);
+                    }
+                    for child in children {
+                        if depth < stack.len() {
+                            stack[depth] = child;
+                            depth += 1;
+                        }
+                    }
+                }
+            }
+        }
+        (least, nearest)
+    }
+
+    /// The site of a leaf of the tree of sites that is nearest to a point (m, body axes) on a bent
+    /// body.
+    pub(crate) fn nearest_site(&self, cloud: &Cloud, leaf: usize, point: &Vector3<f64>) -> Option<usize> {
+        let sites = self.sites_of(self.clusters.get(leaf)?).iter().map(|&site| site as usize);
+        let distance = |site: &usize| (cloud.sites[*site] - point).norm_squared();
+        sites.min_by(|a, b| distance(a).total_cmp(&distance(b)))
     }
 
     /// The place of the rest surface nearest to a point (m, body axes), no farther than `within`
     /// (m). Of all triangles only those count that look at a site with the outward normal `facing`.
+    /// The search begins at the triangle of `hint`.
     pub(crate) fn closest(
         &self,
         point: &Vector3<f64>,
         facing: Option<&Vector3<f64>>,
         within: f64,
+        hint: Option<&Place>,
     ) -> Option<Place> {
         let mut least = within * within;
         let mut found = None;
+        let look = |number: u32, least: &mut f64, found: &mut Option<Place>| {
+            let facet = &self.facets[number as usize];
+            if facing.is_some_and(|facing| facing.dot(&facet.normal) > FACING) {
+                return;
+            }
+            let corners = facet.corners.map(|v| &self.vertices[v as usize]);
+            // The plane is no farther than the triangle.
+            let above = facet.normal.dot(&(point - corners[0]));
+            if above * above > *least {
+                return;
+            }
+            let weights = closest_on_triangle(corners, point);
+            let near: Vector3<f64> = corners.iter().zip(weights).map(|(x, w)| **x * w).sum();
+            let distance = (point - near).norm_squared();
+            if distance < *least {
+                *least = distance;
+                *found = Some(Place { facet: number, weights });
+            }
+        };
+        if let Some(hint) = hint {
+            look(hint.facet, &mut least, &mut found);
+        }
         let mut stack = [0u32; 64];
         let mut depth = usize::from(!self.nodes.is_empty());
         let away = |node: &Node| {
@@ -191,7 +421,7 @@ impl SurfaceField {
             let node = &self.nodes[index as usize];
             // Comparisons with no number are false, and such a point has no place.
             let near = away(node) < least;
-            if !near {
+            if !near || facing.is_some_and(|facing| node.looks_away(facing)) {
                 continue;
             }
             if node.count == 0 {
@@ -208,18 +438,7 @@ impl SurfaceField {
                 continue;
             }
             for number in node.first..node.first + node.count {
-                let facet = &self.facets[number as usize];
-                if facing.is_some_and(|facing| facing.dot(&facet.normal) > FACING) {
-                    continue;
-                }
-                let corners = facet.corners.map(|v| &self.vertices[v as usize]);
-                let weights = closest_on_triangle(corners, point);
-                let near: Vector3<f64> = corners.iter().zip(weights).map(|(x, w)| **x * w).sum();
-                let distance = (point - near).norm_squared();
-                if distance < least {
-                    least = distance;
-                    found = Some(Place { facet: number, weights });
-                }
+                look(number, &mut least, &mut found);
             }
         }
         found
@@ -326,8 +545,12 @@ fn split(
     for corner in order.iter().flat_map(|&index| corners(index)) {
         (low, high) = (low.inf(&corner), high.sup(&corner));
     }
+    let mut normals = [Vector3::repeat(f64::INFINITY), Vector3::repeat(f64::NEG_INFINITY)];
+    for normal in order.iter().map(|&index| &facets[index].normal) {
+        normals = [normals[0].inf(normal), normals[1].sup(normal)];
+    }
     let node = nodes.len();
-    nodes.push(Node { low, high, first: first as u32, count: order.len() as u32 });
+    nodes.push(Node { low, high, normals, first: first as u32, count: order.len() as u32 });
     if order.len() <= LEAF {
         return;
     }
@@ -339,6 +562,25 @@ fn split(
     nodes[node].first = nodes.len() as u32;
     let second = first + left.len();
     split(vertices, facets, right, second, nodes);
+}
+
+/// Builds the node of the sites `order`, which begin at `first`, and those below it.
+fn gather(place: &impl Fn(u32) -> Vector3<f64>, order: &mut [u32], first: usize, nodes: &mut Vec<Cluster>) {
+    let node = nodes.len();
+    nodes.push(Cluster { first, end: first + order.len(), second: None, cover: 0.0 });
+    if order.len() <= CLUSTER {
+        return;
+    }
+    let (mut low, mut high) = (place(order[0]), place(order[0]));
+    for at in order.iter().map(|&site| place(site)) {
+        (low, high) = (low.inf(&at), high.sup(&at));
+    }
+    let axis = (high - low).imax();
+    order.sort_by(|&a, &b| place(a)[axis].total_cmp(&place(b)[axis]).then(a.cmp(&b)));
+    let (left, right) = order.split_at_mut(order.len() / 2);
+    gather(place, left, first, nodes);
+    nodes[node].second = Some(nodes.len());
+    gather(place, right, first + left.len(), nodes);
 }
 
 /// The sites around a vertex with weights that reproduce a linear field.

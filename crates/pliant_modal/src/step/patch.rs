@@ -109,7 +109,11 @@ impl HeldPatch {
     /// Rotation of the patch at the coordinates `q`, from the curl of the displacement. It is exact
     /// for a turn by less than a quarter.
     pub(crate) fn rotation(&self, q: &[f64]) -> Matrix3<f64> {
-        let six = self.rows.reduce(q, true);
+        Self::rotation_of(&self.rows.reduce(q, true))
+    }
+
+    /// The rotation of a patch with these six numbers.
+    pub(crate) fn rotation_of(six: &Six) -> Matrix3<f64> {
         // Half the curl of a rotation is its axis times the sine of its angle.
         let sine = Vector3::new(six[3], six[4], six[5]);
         let length = sine.norm();
@@ -140,6 +144,11 @@ impl MeanRows {
             }
         }
         Self(rows)
+    }
+
+    /// The row of one of the six numbers.
+    pub(crate) fn of(&self, number: usize) -> &[f64] {
+        &self.0[number]
     }
 
     /// The row of the mean displacement along an axis, one entry per mode.

@@ -31,9 +31,17 @@ const BAND: f64 = 2e-3;
 const STILL: f64 = 1e-12;
 const ENOUGH: f64 = 1e-6;
 
+/// As [`ENOUGH`], for more than two bodies, and the number of computations of their step after
+/// which new contacts are looked for. What touches later touches in the next step.
+const ENOUGH_OF_PILE: f64 = 1e-4;
+const LOOKS: usize = 2;
+
 /// Violation of the laws beyond which bodies that have passed through each other are stopped, as a
 /// share of the size.
 const TORN: f64 = 0.05;
+
+/// Way of a body's sites up to which it is not found where they are, as a share of its size.
+const SLACK: f64 = 1e-3;
 
 /// Share of the kinetic and elastic energy that a step may gain of what contacts have lost before.
 const GIVEN_BACK: f64 = 1e-2;
@@ -149,7 +157,44 @@ impl<P: Member> Group<'_, P> {
         let sites = view.sites()?;
         let [before, now] = self.sixes.get(member).map_or([None; 2], |sixes| sixes.each_ref().map(Some));
         let kernel = view.kernel;
-        Some([kernel.shape(sites, &kernel.before, before), kernel.shape(sites, view.state, now)])
+        let clouds = [
+            before.and_then(Sixes::cloud).map(|cloud| (cloud, 0.0)),
+            now.and_then(|_| view.contacts.cloud(&view.state.q)),
+        ];
+        let before = kernel.shape(sites, &kernel.before, before, clouds[0]);
+        Some([before, kernel.shape(sites, view.state, now, clouds[1])])
+    }
+
+    /// Finds where all sites of a member are at the beginning of the step.
+    pub(super) fn place_start(&mut self, member: usize) {
+        let view = self.all[self.who[member]].view();
+        let (Some(sites), Some([before, _])) = (view.sites(), self.sixes.get_mut(member)) else { return };
+        let kernel = view.kernel;
+        before.place_all(sites, sites.field(&kernel.model), &kernel.before.q, kernel.warps());
+    }
+
+    /// Finds where all sites of a member are, and adds their way since the last look. A bound
+    /// serves for small ways.
+    pub(super) fn follow_sites(&mut self, member: usize) {
+        let Parts { kernel, state, contacts, .. } = self.parts(member);
+        let Some(sites) = contacts.places.clone() else { return };
+        let (bent, size) = (&mut contacts.bent, kernel.model.size());
+        let known = bent.q.len() == state.q.len() && bent.cloud.sites.len() == sites.sites.len();
+        let way = if known { sites.bound_of_way(&bent.q, &state.q) } else { f64::INFINITY };
+        let near = bent.slack + way <= SLACK * size;
+        if near {
+            bent.slack += way;
+            bent.way += way;
+        } else {
+            let mut now = std::mem::take(&mut bent.spare);
+            sites.place(sites.field(&kernel.model), &state.q, kernel.warps(), &mut now);
+            // A body that was not known has gone farther than any clearance.
+            let way = now.way(&bent.cloud);
+            bent.way += bent.slack + if way.is_finite() { way } else { 1e3 * size };
+            bent.slack = 0.0;
+            bent.spare = std::mem::replace(&mut bent.cloud, now);
+        }
+        bent.q.clone_from(&state.q);
     }
 
     /// Checks that the result is finite.
@@ -267,6 +312,7 @@ impl<P: Member> Group<'_, P> {
         recovers: bool,
     ) -> Result<ContactReport, StepError> {
         let holds = (0..self.len()).any(|member| !self.view(member).hands.is_empty());
+        let pile = self.len() > 2;
         let rounds = ROUNDS[usize::from(holds)];
         let mut report = ContactReport::default();
         loop {
@@ -279,11 +325,16 @@ impl<P: Member> Group<'_, P> {
                 return Ok(report);
             }
             let band = if round == 1 { BAND * self.size } else { 0.0 };
-            let (new, candidates) = points::detect(self, work, band)?;
-            report.candidates += candidates;
+            let mut new = false;
+            if !pile || round <= LOOKS {
+                let (found, candidates) = points::detect(self, work, band)?;
+                report.candidates += candidates;
+                new = found;
+            }
             points::linearize(self, work, recovers)?;
             report.residual = work.violation();
-            let enough = if round == 1 { STILL } else { ENOUGH } * self.size;
+            let enough = if pile { ENOUGH_OF_PILE } else { ENOUGH };
+            let enough = if round == 1 { STILL } else { enough } * self.size;
             if work.points.is_empty() || (report.residual <= enough && !new) || round > rounds {
                 return Ok(report);
             }

@@ -3,15 +3,14 @@
 use nalgebra::{Matrix3, Vector3};
 
 use super::{
-    Kernel,
     group::{Group, Member, View},
     touch::{Located, look},
 };
 use crate::{
     StepError,
     contact::{
-        Clearance, ContactSites, Far, Memory, Near, Obstacle, Place, Point, Shape, Site, SurfacePoint,
-        Touched, Touching,
+        Clearance, ContactSites, Far, Guess, Look, Memory, Near, Obstacle, Place, Point, Shape, Site,
+        SurfacePoint, Touched, Touching,
     },
     step::{Frame, State, Tangent},
 };
@@ -31,6 +30,9 @@ const DEEP: f64 = 0.1;
 /// Distance of a site to those of the other body below which it is not needed, as a share of the
 /// distance between sites.
 const COVERED: f64 = 0.75;
+
+/// Number of balls around the way of a site that moves far.
+const PARTS: u32 = 4;
 
 /// Difference of two distances that count as the same, as a share of the depth [`DEEP`].
 const SAME: f64 = 1e-3;
@@ -116,8 +118,12 @@ pub(super) fn begin<P: Member>(group: &Group<'_, P>, work: &mut Touching) -> Res
                 Touched::Body(key) => {
                     let Some(other) = find(group, key) else { continue };
                     let far = group.view(other);
-                    let Some([shape, _]) = group.shapes(other) else { continue };
-                    work.points.extend(begin_at_body([member, other], [&view, &far], &shape, memory, site));
+                    let (Some([own, _]), Some([shape, _])) = (group.shapes(member), group.shapes(other))
+                    else {
+                        continue;
+                    };
+                    let (members, views) = ([member, other], [&view, &far]);
+                    work.points.extend(begin_at_body(members, views, [&own, &shape], memory, site));
                 }
             }
         }
@@ -150,7 +156,7 @@ fn begin_at_obstacle(
 fn begin_at_body(
     [member, other]: [usize; 2],
     [view, far]: [&View<'_>; 2],
-    shape: &Shape<'_>,
+    [own, shape]: [&Shape<'_>; 2],
     memory: &Memory,
     site: &Site,
 ) -> Option<Point> {
@@ -158,10 +164,11 @@ fn begin_at_body(
     let (frame, q) = (&kernel.before.frame, &kernel.before.q);
     let size = kernel.model.size().min(far.kernel.model.size());
     let (located, near) =
-        locate_at_body(kernel, site, shape, (frame, q), DEEP * size, memory.place.as_ref()).ok()?;
+        locate_at_body((own, memory.site, site), shape, DEEP * size, memory.place.as_ref(), Guess::None)
+            .ok()?;
     let mut point = Point::new(member, memory.site, memory.other, friction(view, far));
     (point.first, point.last) = (memory.toward, located.toward);
-    (point.start, point.tangent) = kernel.material(site, &memory.toward, frame, q);
+    (point.start, point.tangent) = own.site(memory.site, &memory.toward);
     let mut side = far_side(other, &near, shape);
     side.compliance = far_compliance(far, sites, &far.kernel.before, &side);
     let velocities = Vector3::from(frame.velocity()) + Vector3::from(shape.frame.velocity());
@@ -203,37 +210,55 @@ fn resume(
 
 /// A site at a state, and the place of another body that it may touch.
 fn locate_at_body(
-    kernel: &Kernel,
-    site: &Site,
+    (own, index, site): (&Shape<'_>, usize, &Site),
     shape: &Shape<'_>,
-    (frame, q): (&Frame, &[f64]),
     within: f64,
     kept: Option<&Place>,
+    guess: Guess,
 ) -> Result<(Located, Near), f64> {
-    let zero = Vector3::zeros();
-    let (center, tangent) = kernel.material(site, &site.outward, frame, q);
-    let facing = kernel.facing(site, frame, q);
+    let (frame, facing) = (own.frame, own.facing(index));
     // The center of the sphere of a round site, or its vertex.
-    let middle = center - frame.rotation() * (site.radius * site.outward);
-    let mut near = shape.look(&center, &facing, within, kept)?;
-    let (mut point, mut toward) = (center, zero);
+    let center = site.center + own.moved(index);
+    let (middle, mut toward) = (frame.to_world(center), Vector3::zeros());
+    let mut point = middle + frame.rotation() * (site.radius * site.outward);
+    let mut near = shape.look(&point, &facing, within, kept, guess)?;
     if site.radius > 0.0 {
         toward = site.toward(&-(frame.rotation().inverse() * near.normal));
         point = middle + frame.rotation() * (site.radius * toward);
-        near = shape.look(&point, &facing, within, kept)?;
+        near = shape.look(&point, &facing, within, kept, Guess::Place(near.place))?;
     }
     let found = SurfacePoint { distance: near.distance, normal: near.normal };
-    Ok((Located { tangent, toward, center: frame.to_local(&middle), point, found }, near))
+    let (_, tangent) = own.site(index, &site.outward);
+    Ok((Located { tangent, toward, center, point, found }, near))
+}
+
+/// The way from the axes of one body to those of another.
+struct Relative {
+    turn: Matrix3<f64>,
+    offset: Vector3<f64>,
+}
+
+impl Relative {
+    fn of(own: &Frame, other: &Frame) -> Self {
+        let turn = other.rotation().inverse() * own.rotation();
+        let offset = other.to_local(&own.to_world(Vector3::zeros()));
+        Self { turn: *turn.to_rotation_matrix().matrix(), offset }
+    }
+
+    fn at(&self, local: &Vector3<f64>) -> Vector3<f64> {
+        self.turn * local + self.offset
+    }
 }
 
 /// Adds points for the sites that touch at the end of the step. Returns whether it found any that
 /// penetrate, and the number of sites that were looked at.
 pub(super) fn detect<P: Member>(
-    group: &Group<'_, P>,
+    group: &mut Group<'_, P>,
     work: &mut Touching,
     band: f64,
 ) -> Result<(bool, usize), StepError> {
     let (mut penetrates, mut candidates) = (false, 0);
+    list_looks(group, work, band);
     for member in 0..group.who.len() {
         let view = group.view(member);
         let Some(sites) = view.sites() else { continue };
@@ -248,19 +273,57 @@ pub(super) fn detect<P: Member>(
             )?;
         }
     }
+    work.heads.clear();
+    work.heads.extend(work.points.iter().map(head));
+    let looks = std::mem::take(&mut work.looks);
+    for look in &looks {
+        penetrates |= detect_at_body(group, look, work, band, &mut candidates);
+    }
+    work.looks = looks;
+    Ok((penetrates, candidates))
+}
+
+/// Lists the pairs of bodies that may have come near each other, and finds where the sites of these
+/// bodies are.
+fn list_looks<P: Member>(group: &mut Group<'_, P>, work: &mut Touching, band: f64) {
+    work.looks.clear();
+    for member in 0..group.who.len() {
+        if group.pairs.iter().flatten().any(|&paired| paired as usize == member) {
+            group.follow_sites(member);
+        }
+    }
     for pair in group.pairs {
         let [a, b] = pair.map(|member| member as usize);
         // The body with the denser sites comes first, and the other adds what is missing.
         let spacing = |member| group.view(member).sites().map_or(f64::INFINITY, |sites| sites.spacing);
         let order = if spacing(b) < spacing(a) { [[b, a], [a, b]] } else { [[a, b], [b, a]] };
         for members in order {
-            let views = members.map(|member| group.view(member));
-            let Some(shapes) = group.shapes(members[1]) else { continue };
-            let found = detect_at_body(members, &views, &shapes, work, band, &mut candidates);
-            penetrates |= found;
+            let [view, far] = members.map(|member| group.view(member));
+            let (Some(sites), Some(far_sites)) = (view.sites(), far.sites()) else { continue };
+            let [bound, far_bound] = [sites.bound(&view.state.q), far_sites.bound(&far.state.q)];
+            let ways = [travel(&view, sites)[0], travel(&far, far_sites)[0]];
+            let reach = bound + far_bound + band + ways[0] + ways[1];
+            let [from, to] = [&view, &far].map(|view| Vector3::from(view.state.frame.center()));
+            // Comparisons with no number are false, and such bodies do not touch.
+            let near = (from - to).norm() <= sites.radius + far_sites.radius + reach;
+            if !near {
+                continue;
+            }
+            let clear = work.clearance([view.contacts.key, far.contacts.key]);
+            if !take_way(&mut work.clear[clear], [&view, &far], sites, bound, band) {
+                continue;
+            }
+            work.looks.push(Look { members, clear });
+            let frames = [&view, &far].map(|view| [&view.kernel.before.frame, &view.state.frame]);
+            let way = relative_way(frames[0], frames[1], sites.radius + bound)
+                + sites.bound_of_way(&view.kernel.before.q, &view.state.q)
+                + far_sites.bound_of_way(&far.kernel.before.q, &far.state.q);
+            let size = view.kernel.model.size().min(far.kernel.model.size());
+            if band > 0.0 && way > DEEP * size {
+                members.into_iter().for_each(|member| group.place_start(member));
+            }
         }
     }
-    Ok((penetrates, candidates))
 }
 
 /// Bound on the way of every site in the step, m, and on the displacements at its end.
@@ -273,6 +336,11 @@ fn travel(view: &View<'_>, sites: &ContactSites) -> [f64; 2] {
     let bent = sites.bound_of_way(&before.q, &now.q);
     let way = (Vector3::from(to.center()) - Vector3::from(from.center())).norm();
     [way + swing + bent, bound]
+}
+
+/// Site and bodies of a point.
+fn head(point: &Point) -> [usize; 3] {
+    [point.site, point.member, point.far.map_or(usize::MAX, |far| far.member)]
 }
 
 /// Marks the sites of a member that have a point with something.
@@ -304,19 +372,29 @@ fn detect_at_obstacle(
     }
     let other = Touched::Obstacle(index);
     let stamp = mark(work, member, other);
+    let cloud = view.contacts.cloud(&state.q);
     for (number, site) in sites.sites.iter().enumerate() {
         if work.marks[number] == stamp {
             continue;
         }
-        let rough = look(obstacle, &to.to_world(site.center))?.distance - site.radius;
-        // Nearly all sites end here.
-        if rough > bound + band + travel {
+        let (at, slack) = match cloud {
+            Some((cloud, slack)) => (cloud.sites[number], slack),
+            None => (site.rest(&site.outward) + site.patch.displacement(&state.q, kernel.warps()), 0.0),
+        };
+        // The contact point of a round site is not farther from it than this.
+        let rough = look(obstacle, &to.to_world(at))?.distance - site.slides - slack;
+        if rough > band + travel {
             continue;
         }
-        // The warp never makes a displacement longer.
-        let moved = site.patch.rows().reduce(&state.q, false).norm();
-        if rough > moved + band + travel {
-            continue;
+        if rough > band {
+            // To pass through, it must go to the obstacle and away from it again.
+            let begun =
+                from.to_world(site.rest(&site.outward) + site.patch.displacement(&before.q, kernel.warps()));
+            let way = (to.to_world(at) - begun).norm() + 2.0 * site.slides + slack;
+            let begun = look(obstacle, &begun)?.distance - site.slides;
+            if begun > 0.0 && way < begun + rough {
+                continue;
+            }
         }
         *candidates += 1;
         let located = kernel.locate(site, obstacle, to, &state.q)?;
@@ -352,93 +430,161 @@ fn detect_at_obstacle(
     Ok(())
 }
 
-fn detect_at_body(
-    [member, other]: [usize; 2],
-    [view, far]: &[View<'_>; 2],
-    [start, end]: &[Shape<'_>; 2],
+fn detect_at_body<P: Member>(
+    group: &Group<'_, P>,
+    look: &Look,
     work: &mut Touching,
     band: f64,
     candidates: &mut usize,
 ) -> bool {
-    let (Some(sites), Some(far_sites)) = (view.sites(), far.sites()) else { return false };
-    let kernel = view.kernel;
-    let (before, state) = (&kernel.before, view.state);
-    let (from, to) = (&before.frame, &state.frame);
-    let ([travel, bound], [far_travel, _]) = (self::travel(view, sites), self::travel(far, far_sites));
-    let reach = bound + end.bound + band + travel + far_travel;
-    let apart = (Vector3::from(to.center()) - Vector3::from(end.frame.center())).norm();
-    // Comparisons with no number are false, and such bodies do not touch.
-    let near = apart <= sites.radius + far_sites.radius + reach;
-    if !near {
+    let [member, other] = look.members;
+    let [view, far] = look.members.map(|member| group.view(member));
+    let [Some([own_start, own]), Some([start, end])] = &look.members.map(|member| group.shapes(member))
+    else {
         return false;
-    }
+    };
+    let (sites, far_sites, clear) = (own.sites, end.sites, look.clear);
     let touched = Touched::Body(far.contacts.key);
-    let stamp = mark(work, member, touched);
-    let deep = DEEP * kernel.model.size().min(far.kernel.model.size());
-    let [low, high] = far.kernel.model.surface().bounds().map(|corner| Vector3::from(corner.map(f64::from)));
-    let bent =
-        far_sites.bound_of_way(&far.kernel.before.q, &far.state.q) + sites.bound_of_way(&before.q, &state.q);
-    let mut penetrates = false;
-    let clear = work.clearance([view.contacts.key, far.contacts.key]);
-    take_way(&mut work.clear[clear], sites, far_sites, [state, far.state], bound);
-    for (number, site) in sites.sites.iter().enumerate() {
-        // Nearly all sites end here.
-        if work.marks[number] == stamp || work.clear[clear].sites[number] > band {
-            continue;
+    work.stamp = work.stamp.wrapping_add(1);
+    let stamp = work.stamp;
+    work.covered.clear();
+    for (index, &[site, of, at]) in work.heads.iter().enumerate() {
+        if [of, at] == [member, other] {
+            work.marks[site] = stamp;
+        } else if [of, at] == [other, member] && work.points[index].pushed[0] > 0.0 {
+            work.covered.push(work.points[index].place);
         }
-        let rest = site.rest(&site.outward);
-        let local = end.frame.to_local(&to.to_world(rest));
-        // The way relative to the other body.
-        let came = start.frame.to_local(&from.to_world(rest));
-        let way = (local - came).norm() + bent;
-        let over = (low - local).sup(&(local - high)).map(|x| x.max(0.0)).norm();
-        let away = over - (bound + end.bound);
-        if away > band + way {
-            work.clear[clear].sites[number] = away - way;
-            continue;
+    }
+    let distant = COVERED * sites.spacing.max(far_sites.spacing);
+    let deep = DEEP * view.kernel.model.size().min(far.kernel.model.size());
+    let (was, now) = (Relative::of(own_start.frame, start.frame), Relative::of(own.frame, end.frame));
+    let within = deep.max(band);
+    // A site that moves far may have passed through the other body. Where that one bends far, its
+    // own sites do. Forces only make ways shorter.
+    let clouds = own.cloud.zip(end.cloud);
+    // Without where the sites were, no site moves far.
+    let bent = match (own_start.cloud, start.cloud, clouds) {
+        (Some((own, _)), Some((far, _)), Some(((own_end, a), (far_end, b)))) if band > 0.0 => {
+            Some(own_end.way(own) + far_end.way(far) + 2.0 * (a + b))
         }
-        *candidates += 1;
-        let within = deep.max(band);
-        let found = locate_at_body(kernel, site, end, (to, &state.q), within, None);
-        let distance = found.as_ref().map_or_else(|away| *away, |(_, near)| near.distance);
-        work.clear[clear].sites[number] = distance;
-        let found = found.ok().filter(|(_, near)| near.distance < band);
-        // A site that moves far may have passed through the other body. Where that one bends far,
-        // its own sites do. Forces only make ways shorter.
-        let fast = band > 0.0 && (local - came).norm() > within;
-        let passed = found.is_none() && fast;
-        let found = if passed { pass(kernel, site, [start, end], [before, state]) } else { found };
-        let Some((located, near)) = found else { continue };
-        let near_other = |point: &Point| {
-            point.member == other
-                && point.far.is_some_and(|far| far.member == member)
-                && (point.pushed[0] > 0.0 || point.off[0] <= near.distance.max(0.0) + SAME * deep)
-                && (point.place - located.point).norm() < COVERED * sites.spacing.max(far_sites.spacing)
+        _ => None,
+    };
+    // How far a ball around sites is at least from the other body, and whether it passes it.
+    let away = |center: &Vector3<f64>, radius: f64| {
+        let (came, local) = (was.at(center), now.at(center));
+        let way = (local - came).norm() + 2.0 * radius;
+        let Some(((_, slack), (far, far_slack))) = clouds else {
+            return (f64::NEG_INFINITY, false, Guess::None);
         };
-        if work.points.iter().any(near_other) {
+        let (away, leaf) = end.field.away(far, &local);
+        let ball = radius + slack + far_slack;
+        // Balls around all places of the way.
+        let fast = bent.filter(|_| way > within).is_some_and(|bent| {
+            let reach = 0.5 / f64::from(PARTS) * (local - came).norm() + ball + bent;
+            let mut parts = (0..PARTS).map(|k| (f64::from(k) + 0.5) / f64::from(PARTS));
+            parts.any(|share| end.field.away(far, &came.lerp(&local, share)).0 <= reach)
+        });
+        let site = (radius == 0.0).then(|| end.field.nearest_site(far, leaf, &local)).flatten();
+        (away - ball, fast, site.map_or(Guess::None, Guess::Site))
+    };
+    let mut penetrates = false;
+    let clusters = own.field.clusters();
+    let mut stack = [0; 64];
+    let mut depth = usize::from(!clusters.is_empty());
+    while depth > 0 {
+        depth -= 1;
+        let node = stack[depth];
+        let cluster = &clusters[node];
+        let numbers = own.field.sites_of(cluster);
+        // Nearly all sites end here.
+        let open = |number: &u32| {
+            let number = *number as usize;
+            work.marks[number] != stamp && !(work.clear[clear].sites[number] > band)
+        };
+        if !numbers.iter().any(open) {
             continue;
         }
-        let (begun, tangent) = kernel.material(
-            site,
-            &(if site.radius > 0.0 { located.toward } else { site.outward }),
-            from,
-            &before.q,
-        );
-        let mut point = Point::new(member, number, touched, friction(view, far));
-        (point.first, point.last) = (located.toward, located.toward);
-        (point.start, point.tangent, point.place) = (begun, tangent, located.point);
-        let mut side = far_side(other, &near, start);
-        side.passed = passed;
-        side.compliance = far_compliance(far, far_sites, &far.kernel.before, &side);
-        let ended = end.material(&near.place, &side.carriers).0;
-        point.gap = start.at(&near.place, &begun).distance;
-        let moved = (located.point - begun) - (ended - side.start);
-        side.anchor = begun + share(point.gap, near.distance) * moved;
-        point.far = Some(side);
-        // What later sites look at before the gaps are taken anew.
-        point.off[0] = near.distance;
-        penetrates |= near.distance < 0.0;
-        work.points.push(point);
+        if let Some(((cloud, _), _)) = clouds {
+            let [low, high]: [Vector3<f64>; 2] = cloud.boxes[node];
+            let (middle, radius) = (0.5 * (low + high), 0.5 * (high - low).norm());
+            let (away, fast, _) = away(&middle, radius);
+            if away > band && !fast {
+                for &number in numbers {
+                    let clear = &mut work.clear[clear].sites[number as usize];
+                    *clear = clear.max(away);
+                }
+                continue;
+            }
+        }
+        if let Some(second) = cluster.second {
+            for child in [second, node + 1] {
+                if depth < stack.len() {
+                    stack[depth] = child;
+                    depth += 1;
+                }
+            }
+            continue;
+        }
+        for number in numbers.iter().map(|&number| number as usize) {
+            if work.marks[number] == stamp || work.clear[clear].sites[number] > band {
+                continue;
+            }
+            let site = &sites.sites[number];
+            let at = match clouds {
+                Some(((cloud, _), _)) => cloud.sites[number],
+                None => site.rest(&site.outward) + own.moved(number),
+            };
+            let world = own.frame.to_world(at);
+            if work.covered.iter().any(|place| (place - world).norm() < distant) {
+                continue;
+            }
+            let (distance, fast, guess) = away(&at, 0.0);
+            if distance > band && !fast {
+                work.clear[clear].sites[number] = distance;
+                continue;
+            }
+            *candidates += 1;
+            let found = if distance > band {
+                Err(distance)
+            } else {
+                locate_at_body((own, number, site), end, within, None, guess)
+            };
+            let distance = found.as_ref().map_or_else(|away| *away, |(_, near)| near.distance);
+            work.clear[clear].sites[number] = distance;
+            let found = found.ok().filter(|(_, near)| near.distance < band);
+            let passed = found.is_none() && fast;
+            let shapes = [[own_start, own], [start, end]];
+            let found = if passed { pass((number, site), shapes) } else { found };
+            let Some((located, near)) = found else { continue };
+            let near_other = |point: &Point| {
+                point.member == other
+                    && point.far.is_some_and(|far| far.member == member)
+                    && (point.pushed[0] > 0.0 || point.off[0] <= near.distance.max(0.0) + SAME * deep)
+                    && (point.place - located.point).norm() < distant
+            };
+            let heads = work.heads.iter().zip(&work.points);
+            if heads.filter(|([_, of, _], _)| *of == other).any(|(_, point)| near_other(point)) {
+                continue;
+            }
+            let toward = if site.radius > 0.0 { located.toward } else { site.outward };
+            let (begun, tangent) = own_start.site(number, &toward);
+            let mut point = Point::new(member, number, touched, friction(&view, &far));
+            (point.first, point.last) = (located.toward, located.toward);
+            (point.start, point.tangent, point.place) = (begun, tangent, located.point);
+            let mut side = far_side(other, &near, start);
+            side.passed = passed;
+            side.compliance = far_compliance(&far, far_sites, &far.kernel.before, &side);
+            let ended = end.material(&near.place, &side.carriers).0;
+            point.gap = start.at(&near.place, &begun).distance;
+            let moved = (located.point - begun) - (ended - side.start);
+            side.anchor = begun + share(point.gap, near.distance) * moved;
+            point.far = Some(side);
+            // What later sites look at before the gaps are taken anew.
+            point.off[0] = near.distance;
+            penetrates |= near.distance < 0.0;
+            work.heads.push(head(&point));
+            work.points.push(point);
+        }
     }
     penetrates
 }
@@ -454,23 +600,23 @@ fn relative_way(own: [&Frame; 2], other: [&Frame; 2], radius: f64) -> f64 {
     (to.0 - from.0).norm() + 2.0 * (0.5 * turned).sin() * radius
 }
 
-/// Takes the relative way of two bodies since the last look from their clearances.
+/// Takes the relative way of two bodies since the last look from their clearances. Returns whether
+/// any site may be nearer than `band`.
 fn take_way(
     clear: &mut Clearance,
+    views: [&View<'_>; 2],
     sites: &ContactSites,
-    far_sites: &ContactSites,
-    now: [&State; 2],
     bound: f64,
-) {
+    band: f64,
+) -> bool {
+    let frames = views.map(|view| view.state.frame);
+    let ways = views.map(|view| view.contacts.bent.way);
     let count = sites.sites.len();
-    let [own, far] = &clear.states;
-    let known = clear.sites.len() == count && own.q.len() == now[0].q.len() && far.q.len() == now[1].q.len();
-    if known {
-        let before = sites.bound(&own.q);
-        let frames = [[&own.frame, &now[0].frame], [&far.frame, &now[1].frame]];
-        let way = relative_way(frames[0], frames[1], sites.radius + bound.max(before))
-            + sites.bound_of_way(&own.q, &now[0].q)
-            + far_sites.bound_of_way(&far.q, &now[1].q);
+    if clear.sites.len() == count {
+        let [own, far] = &clear.frames;
+        // The bound covers the shape before too, as the way of bending is counted apart.
+        let turning = relative_way([own, &frames[0]], [far, &frames[1]], sites.radius + bound);
+        let way = turning + (ways[0] - clear.ways[0]) + (ways[1] - clear.ways[1]);
         // A way that is no number leaves no clearance.
         let way = if way.is_nan() { f64::INFINITY } else { way };
         clear.sites.iter_mut().for_each(|away| *away -= way);
@@ -478,33 +624,32 @@ fn take_way(
         clear.sites.clear();
         clear.sites.resize(count, f64::NEG_INFINITY);
     }
-    clear.states.iter_mut().zip(now).for_each(|(state, now)| state.clone_from(now));
+    (clear.frames, clear.ways) = (frames, ways);
+    clear.sites.iter().any(|&away| away <= band)
 }
 
 /// Follows the way of a site relative to another body, and returns where it went in.
 fn pass(
-    kernel: &Kernel,
-    site: &Site,
-    [start, end]: [&Shape<'_>; 2],
-    [before, state]: [&State; 2],
+    (index, site): (usize, &Site),
+    [[own_start, own], [start, end]]: [[&Shape<'_>; 2]; 2],
 ) -> Option<(Located, Near)> {
-    let (from, _) = kernel.material(site, &site.outward, &before.frame, &before.q);
-    let (to, tangent) = kernel.material(site, &site.outward, &state.frame, &state.q);
-    let facing = end.frame.rotation().inverse() * kernel.facing(site, &state.frame, &state.q);
+    let (from, _) = own_start.site(index, &site.outward);
+    let (to, tangent) = own.site(index, &site.outward);
+    let facing = end.frame.rotation().inverse() * own.facing(index);
     let (came, went) = (start.frame.to_local(&from), end.frame.to_local(&to));
     let half = 0.5 * (went - came);
     // A site behind its body meets nothing.
     if half.dot(&facing) <= 0.0 {
         return None;
     }
-    end.field.closest(&(came + half), None, half.norm() + start.bound + end.bound)?;
+    end.field.closest(&(came + half), None, half.norm() + start.bound + end.bound, None)?;
     let ways = [start.pull_back(&from), end.pull_back(&to)];
     let place = end.march(&ways[0], &ways[1], &facing)?;
     let near = end.at(&place, &to);
-    let middle = to - state.frame.rotation() * (site.radius * site.outward);
+    let middle = to - own.frame.rotation() * (site.radius * site.outward);
     let found = SurfacePoint { distance: near.distance, normal: near.normal };
     let toward = if site.radius > 0.0 { site.outward } else { Vector3::zeros() };
-    let located = Located { tangent, toward, center: state.frame.to_local(&middle), point: to, found };
+    let located = Located { tangent, toward, center: own.frame.to_local(&middle), point: to, found };
     (near.distance < 0.0).then_some((located, near))
 }
 
@@ -545,8 +690,11 @@ pub(super) fn linearize<P: Member>(
                 let other = group.view(far.member);
                 let Some(sites) = other.sites() else { continue };
                 size = size.min(other.kernel.model.size());
-                let Some(shapes) = group.shapes(far.member) else { continue };
-                let (located, near) = follow(kernel, site, state, &shapes, far, size);
+                let (Some([_, at]), Some(shapes)) = (group.shapes(point.member), group.shapes(far.member))
+                else {
+                    continue;
+                };
+                let (located, near) = follow((&at, point.site, site), &shapes, far, size);
                 far.compliance = far_compliance(&other, sites, other.state, far);
                 if point.mean.is_none() {
                     // The middle of the step, as that of both centers of mass.
@@ -576,24 +724,21 @@ pub(super) fn linearize<P: Member>(
 
 /// Finds a site of a contact with another body, and the place that it touches, after a step.
 fn follow(
-    kernel: &Kernel,
-    site: &Site,
-    state: &State,
+    (own, index, site): (&Shape<'_>, usize, &Site),
     [start, end]: &[Shape<'_>; 2],
     far: &mut Far,
     size: f64,
 ) -> (Located, Near) {
-    let at = (&state.frame, &state.q[..]);
-    let look = || locate_at_body(kernel, site, end, at, DEEP * size, Some(&far.place));
+    let look = || locate_at_body((own, index, site), end, DEEP * size, Some(&far.place), Guess::None);
     let (located, near) = (!far.passed).then(look).and_then(Result::ok).unwrap_or_else(|| {
-        let (center, tangent) = kernel.material(site, &site.outward, &state.frame, &state.q);
-        let middle = center - state.frame.rotation() * (site.radius * site.outward);
-        let mut near = end.at(&far.place, &center);
+        let (mut point, tangent) = own.site(index, &site.outward);
+        let turn = own.frame.rotation();
+        let middle = point - turn * (site.radius * site.outward);
+        let mut near = end.at(&far.place, &point);
         let mut toward = Vector3::zeros();
-        let mut point = center;
         if site.radius > 0.0 {
-            toward = site.toward(&-(state.frame.rotation().inverse() * near.normal));
-            point = middle + state.frame.rotation() * (site.radius * toward);
+            toward = site.toward(&-(turn.inverse() * near.normal));
+            point = middle + turn * (site.radius * toward);
             near = end.at(&far.place, &point);
         }
         if !far.passed {
@@ -601,7 +746,7 @@ fn follow(
             near.distance = size;
         }
         let found = SurfacePoint { distance: near.distance, normal: near.normal };
-        let center = state.frame.to_local(&middle);
+        let center = own.frame.to_local(&middle);
         (Located { tangent, toward, center, point, found }, near)
     });
     far.place = near.place;

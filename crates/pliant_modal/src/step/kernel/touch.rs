@@ -10,7 +10,7 @@ use nalgebra::{Matrix3, Vector3};
 use super::Kernel;
 use crate::{
     ModalModel, StepError,
-    contact::{ContactSites, Contacts, Obstacle, Shape, Site, Sixes, SurfacePoint},
+    contact::{Cloud, ContactSites, Contacts, Obstacle, Shape, Site, Sixes, SurfacePoint},
     simd::dot,
     step::{Frame, Hand, Six, State, Tangent, tangent},
 };
@@ -172,9 +172,11 @@ impl Kernel {
         sites: &'a ContactSites,
         state: &'a State,
         sixes: Option<&'a Sixes>,
+        cloud: Option<(&'a Cloud, f64)>,
     ) -> Shape<'a> {
         Shape {
             sixes,
+            cloud,
             sites,
             field: sites.field(&self.model),
             warps: self.warps(),
@@ -183,11 +185,6 @@ impl Kernel {
             size: self.model.size(),
             bound: sites.bound(&state.q),
         }
-    }
-
-    /// Outward normal of the surface at a site, world axes.
-    pub(super) fn facing(&self, site: &Site, frame: &Frame, q: &[f64]) -> Vector3<f64> {
-        frame.rotation() * (site.patch.rotation(q) * site.facing)
     }
 
     /// The center of mass about which a contact force turns the frame in this step, m, world axes:
