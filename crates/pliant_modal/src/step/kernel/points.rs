@@ -31,6 +31,9 @@ const DEEP: f64 = 0.1;
 /// distance between sites.
 const COVERED: f64 = 0.75;
 
+/// Share of the depth [`DEEP`] up to which a place is searched for a point that is outside.
+const SHALLOW: f64 = 0.25;
+
 /// Number of balls around the way of a site that moves far.
 const PARTS: u32 = 4;
 
@@ -547,6 +550,16 @@ fn detect_at_body<P: Member>(
             let found = if distance > band {
                 Err(distance)
             } else {
+                // A point that is well outside needs no search for deep places.
+                let outside = match guess {
+                    Guess::Site(near) => {
+                        let way = now.at(&at)
+                            - (far_sites.sites[near].rest(&far_sites.sites[near].outward) + end.moved(near));
+                        far_sites.sites[near].facing.dot(&way) > 0.5 * way.norm()
+                    }
+                    _ => false,
+                };
+                let within = if outside { SHALLOW * within } else { within };
                 locate_at_body((own, number, site), end, within, None, guess)
             };
             let distance = found.as_ref().map_or_else(|away| *away, |(_, near)| near.distance);
