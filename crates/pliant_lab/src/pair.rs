@@ -132,9 +132,9 @@ impl Pair {
         self.next_step = self.next_step.max(self.now);
     }
 
-    /// Stalls or continues the host's process: nothing is read, stepped or sent. What arrives waits.
-    /// Afterwards the host catches up on a quarter of a second at most, like an app with Bevy's
-    /// clock.
+    /// Stalls or continues the host's process: nothing is read, stepped or sent. What arrives
+    /// waits. Afterwards the host catches up on a quarter of a second at most, like an app with
+    /// Bevy's clock.
     pub fn stall_host(&mut self, stalled: bool) {
         self.stalled = stalled;
         self.next_step = self.next_step.max(self.now.saturating_sub(Duration::from_millis(250)));

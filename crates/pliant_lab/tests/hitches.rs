@@ -22,8 +22,8 @@ const SETTLED: Duration = Duration::from_secs(5);
 const DELAY: usize = 2;
 const MOST: f64 = 20.0 / 40.0;
 
-/// Largest reaction that may be shown, as a share of the largest true one: a fifth beyond it, and the
-/// rounding of the frames.
+/// Largest reaction that may be shown, as a share of the largest true one: a fifth beyond it, and
+/// the rounding of the frames.
 const MOST_SHOWN: f64 = 1.2 + 1e-4;
 
 struct Hitched {

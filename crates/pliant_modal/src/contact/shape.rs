@@ -198,7 +198,8 @@ impl Shape<'_> {
 
     /// The place of the surface that is nearest to a point (m, world axes), no farther than
     /// `within` (m), where the surface looks at `facing`, an outward normal of another body in
-    /// world axes. `kept` is the place that it had before. Without such a place the error is a distance that the point is away at least, m.
+    /// world axes. `kept` is the place that it had before. Without such a place the error is a
+    /// distance that the point is away at least, m.
     ///
     /// The point is pulled back to the rest shape by the deformation of the triangle that is
     /// nearest there, and again until it stays.

@@ -40,8 +40,8 @@ impl Budget {
         there
     }
 
-    /// Takes `amount` if anything is available, and returns whether it was. What is lacking is owed,
-    /// so that an amount larger than the bucket can be spent, at the same rate.
+    /// Takes `amount` if anything is available, and returns whether it was. What is lacking is
+    /// owed, so that an amount larger than the bucket can be spent, at the same rate.
     fn spend_or_owe(&mut self, now: Duration, amount: f64) -> bool {
         let any = self.has(now, f64::MIN_POSITIVE);
         if any {
