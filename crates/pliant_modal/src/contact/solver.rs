@@ -103,6 +103,7 @@ impl Touching {
         }
         reserve(&mut self.points, points);
         reserve(&mut self.sides, points);
+        reserve(&mut self.heads, points);
         reserve(&mut self.rows, 3 * points * width);
         reserve(&mut self.spans, 1);
         reserve(&mut self.sum, width);
