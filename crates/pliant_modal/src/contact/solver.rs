@@ -42,8 +42,6 @@ pub(crate) struct Clearance {
 #[derive(Debug, Clone, Copy)]
 pub(crate) struct Look {
     pub(crate) members: [usize; 2],
-    /// The clearances of both, as an index.
-    pub(crate) clear: usize,
 }
 
 /// Workspace of the contacts of a group of bodies in a step.

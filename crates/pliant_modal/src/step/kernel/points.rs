@@ -316,7 +316,7 @@ fn list_looks<P: Member>(group: &mut Group<'_, P>, work: &mut Touching, band: f6
             if !take_way(&mut work.clear[clear], [&view, &far], sites, bound, band) {
                 continue;
             }
-            work.looks.push(Look { members, clear });
+            work.looks.push(Look { members });
             let frames = [&view, &far].map(|view| [&view.kernel.before.frame, &view.state.frame]);
             let way = relative_way(frames[0], frames[1], sites.radius + bound)
                 + sites.bound_of_way(&view.kernel.before.q, &view.state.q)
@@ -446,7 +446,8 @@ fn detect_at_body<P: Member>(
     else {
         return false;
     };
-    let (sites, far_sites, clear) = (own.sites, end.sites, look.clear);
+    let (sites, far_sites) = (own.sites, end.sites);
+    let clear = work.clearance([view.contacts.key, far.contacts.key]);
     let touched = Touched::Body(far.contacts.key);
     work.stamp = work.stamp.wrapping_add(1);
     let stamp = work.stamp;
