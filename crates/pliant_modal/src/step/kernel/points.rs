@@ -503,7 +503,8 @@ fn detect_at_body<P: Member>(
         // Nearly all sites end here.
         let open = |number: &u32| {
             let number = *number as usize;
-            work.marks[number] != stamp && !(work.clear[clear].sites[number] > band)
+            let is_far = work.clear[clear].sites[number] > band;
+            work.marks[number] != stamp && !is_far
         };
         if !numbers.iter().any(open) {
             continue;
