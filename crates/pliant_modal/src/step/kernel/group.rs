@@ -31,11 +31,6 @@ const BAND: f64 = 2e-3;
 const STILL: f64 = 1e-12;
 const ENOUGH: f64 = 1e-6;
 
-/// As [`ENOUGH`], for more than two bodies, and the number of computations of their step after
-/// which new contacts are looked for. What touches later touches in the next step.
-const ENOUGH_OF_PILE: f64 = 1e-4;
-const LOOKS: usize = 2;
-
 /// Violation of the laws beyond which bodies that have passed through each other are stopped, as a
 /// share of the size.
 const TORN: f64 = 0.05;
@@ -312,7 +307,6 @@ impl<P: Member> Group<'_, P> {
         recovers: bool,
     ) -> Result<ContactReport, StepError> {
         let holds = (0..self.len()).any(|member| !self.view(member).hands.is_empty());
-        let pile = self.len() > 2;
         let rounds = ROUNDS[usize::from(holds)];
         let mut report = ContactReport::default();
         loop {
@@ -325,16 +319,11 @@ impl<P: Member> Group<'_, P> {
                 return Ok(report);
             }
             let band = if round == 1 { BAND * self.size } else { 0.0 };
-            let mut new = false;
-            if !pile || round <= LOOKS {
-                let (found, candidates) = points::detect(self, work, band)?;
-                report.candidates += candidates;
-                new = found;
-            }
+            let (new, candidates) = points::detect(self, work, band)?;
+            report.candidates += candidates;
             points::linearize(self, work, recovers)?;
             report.residual = work.violation();
-            let enough = if pile { ENOUGH_OF_PILE } else { ENOUGH };
-            let enough = if round == 1 { STILL } else { enough } * self.size;
+            let enough = if round == 1 { STILL } else { ENOUGH } * self.size;
             if work.points.is_empty() || (report.residual <= enough && !new) || round > rounds {
                 return Ok(report);
             }
