@@ -1,4 +1,4 @@
-//! A guest's predicted hand with the own shapes of the held patch, as the host's hand has them.
+//! Guests show the own shapes of the patch that a hand holds as the host has them.
 #![allow(clippy::unwrap_used, clippy::expect_used, reason = "a failed test should panic")]
 
 mod support;
@@ -150,20 +150,21 @@ fn run(model: &Arc<ModalModel>, corner: u32, preset: Preset, guest_has_shapes: b
 }
 
 #[test]
-fn a_predicted_hand_with_shapes_feels_what_the_host_has() {
+fn guests_show_the_columns_that_the_host_has() {
     let (model, corner) = bar();
-    for (preset, most) in [(Preset::Paper4, 0.01), (Preset::Paper1, 0.02)] {
+    for (preset, most) in [(Preset::Paper4, 0.03), (Preset::Paper1, 0.1)] {
         let without = run(&model, corner, preset, false);
         let with = run(&model, corner, preset, true);
         println!(
-            "{}: the predicted reaction is off by {:.2} % with the shapes and {:.2} % without; the \
-             columns that are shown by {:.2} %",
+            "{}: the columns that are shown are off by {:.2} %, the predicted reaction by {:.2} % \
+             (without shapes {:.2} %)",
             preset.name(),
+            100.0 * with[1],
             100.0 * with[0],
-            100.0 * without[0],
-            100.0 * with[1]
+            100.0 * without[0]
         );
-        assert!(with[0] < most && with[0] < 0.8 * without[0], "{with:?} {without:?}");
-        assert!(with[1] < 0.05, "{with:?}");
+        // Shapes are only shown. The predicted steps go without them.
+        assert!(with[0] == without[0] && with[0] < 0.05, "{with:?} {without:?}");
+        assert!(with[1] < most, "{with:?}");
     }
 }

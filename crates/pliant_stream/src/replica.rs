@@ -205,17 +205,14 @@ impl Replica {
         self.kernel.set_held_shapes(shapes, &mut state, &[]).ok();
     }
 
-    /// Brings the columns of held patches in a state to rest under the reactions of `grabs`.
-    pub(crate) fn settle<'a>(&mut self, state: &mut State, grabs: impl Iterator<Item = &'a GrabState>) {
-        if self.kernel.held_shapes().is_none() {
-            state.s.clear();
-            return;
-        }
+    /// Brings the columns of held patches in a state to rest under the reactions (N, world axes) of
+    /// hands on patches, given by vertex and radius (m).
+    pub(crate) fn settle(&mut self, state: &mut State, hands: impl Iterator<Item = (u32, f64, [f64; 3])>) {
         self.release_all();
-        for g in grabs {
-            let Some(patch) = self.patch(g.vertex, g.radius) else { continue };
+        for (vertex, radius, reaction) in hands {
+            let Some(patch) = self.patch(vertex, radius) else { continue };
             let hand = Hand::new(patch, Hold::Measured(Vector3::zeros()));
-            self.hands.push(Hand { mean: -Vector3::from(g.reaction), ..hand });
+            self.hands.push(Hand { mean: -Vector3::from(reaction), ..hand });
         }
         self.kernel.settle(state, &self.hands);
         self.release_all();

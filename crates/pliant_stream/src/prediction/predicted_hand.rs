@@ -77,8 +77,12 @@ pub struct PredictedHand {
     push: (Vector3<f64>, Vector3<f64>),
     forecast: Forecast,
     fade: f64,
-    /// The columns of held patches at the confirmed tick.
+    /// Finds the columns of held patches. The steps of the copy are made without them, because the
+    /// streamed loads are those that steps without them lack.
+    shaped: Option<Replica>,
+    /// The columns of held patches in the shown state, and scratch.
     columns: Vec<f64>,
+    settled: State,
 }
 
 impl PredictedHand {
@@ -98,24 +102,33 @@ impl PredictedHand {
             push: (Vector3::zeros(), Vector3::zeros()),
             forecast: Forecast::new(h),
             fade: (-3.0 / f64::from(blend_ticks.max(1))).exp(),
+            shaped: None,
             columns: Vec::new(),
+            settled: State::default(),
         }
     }
 
-    /// Sets the own shapes of the patches that hands hold on the body.
+    /// Sets the own shapes of the patches that hands hold on the body, for what is shown.
     pub(crate) fn set_held_shapes(&mut self, shapes: Option<Arc<HeldShapes>>) {
-        self.replica.set_held_shapes(shapes);
         self.columns.clear();
+        let kernel = self.replica.kernel();
+        let (model, settings) = (kernel.model().clone(), *kernel.settings());
+        let (modes, h) = (kernel.modes(), kernel.h());
+        self.shaped = shapes.and_then(|shapes| {
+            let mut shaped = Replica::new(model, settings, modes, h).ok()?;
+            shaped.set_held_shapes(Some(shapes));
+            Some(shaped)
+        });
     }
 
     /// The own shapes of held patches that are used.
     pub(crate) fn held_shapes(&self) -> Option<&Arc<HeldShapes>> {
-        self.replica.kernel().held_shapes()
+        self.shaped.as_ref()?.kernel().held_shapes()
     }
 
     /// The columns of held patches in the shown state.
     pub(crate) fn columns(&self) -> &[f64] {
-        if self.active { &self.visual.state.s } else { &self.columns }
+        &self.columns
     }
 
     /// The patches of the guest's own hands.
@@ -123,11 +136,18 @@ impl PredictedHand {
         self.grabs.iter().filter(|g| g.target.is_some()).map(|g| (g.vertex, g.radius))
     }
 
-    /// Finds the columns of held patches in a confirmed state. The last ones are the first guess.
-    fn settle(&mut self, state: &mut State, receiver: &Receiver) {
-        state.s.clone_from(&self.columns);
-        self.replica.settle(state, receiver.grabs().iter());
-        self.columns.clone_from(&state.s);
+    /// Finds the columns of held patches in the shown state. The last ones are the first guess.
+    fn find_columns(&mut self, receiver: &Receiver, user: UserId) {
+        let Some(shaped) = &mut self.shaped else { return };
+        self.settled.clone_from(if self.active { &self.visual.state } else { receiver.visual() });
+        self.settled.s.clone_from(&self.columns);
+        let active = self.active;
+        let others = receiver.grabs().iter().filter(|g| !active || g.key.user != user);
+        let others = others.map(|g| (g.vertex, g.radius, g.reaction));
+        let own = self.grabs.iter().filter(|g| active && g.target.is_some());
+        let own = own.map(|g| (g.vertex, g.radius, std::array::from_fn(|k| g.reaction[k] + g.offset[k])));
+        shaped.settle(&mut self.settled, others.chain(own));
+        self.columns.clone_from(&self.settled.s);
     }
 
     /// The tick of the copy: the host's tick when the present target will reach the host.
@@ -221,13 +241,7 @@ impl PredictedHand {
             if before > 0 || self.active {
                 self.fall_back(receiver);
             }
-            if self.held_shapes().is_some() {
-                let mut state = std::mem::take(&mut self.copy.state);
-                state.clone_from(receiver.visual());
-                self.settle(&mut state, receiver);
-                self.visual.state.s.clone_from(&state.s);
-                self.copy.state = state;
-            }
+            self.find_columns(receiver, user);
             self.tick = confirmed;
             return;
         }
@@ -267,6 +281,7 @@ impl PredictedHand {
             }
         }
         (self.copy, self.expected) = (copy, expected);
+        self.find_columns(receiver, user);
     }
 
     /// Returns a copy to the confirmed tick.
@@ -275,7 +290,6 @@ impl PredictedHand {
         if let Some(frame) = frame {
             copy.state.frame = frame;
         }
-        self.settle(&mut copy.state, receiver);
         copy.hands.clear();
         copy.hands.extend_from_slice(receiver.hands());
         for g in &mut self.grabs {

@@ -154,9 +154,10 @@ impl StreamedBody {
 
     /// The patches that hands hold, own and others', by center vertex and radius (m).
     ///
-    /// It is empty where no hand is predicted, because only those steps use the patches' own shapes
-    /// ([`GuestSession::set_held_shapes`](crate::GuestSession::set_held_shapes)), where the
-    /// elasticity is linear, and where the stream has fewer coordinates than the model.
+    /// It is empty where their own shapes cannot be shown
+    /// ([`GuestSession::set_held_shapes`](crate::GuestSession::set_held_shapes)): where no hand is
+    /// predicted, where the elasticity is linear, and where the stream has fewer coordinates than
+    /// the model.
     pub fn held_patches(&self) -> Vec<(u32, f64)> {
         let (Some(predicted), Some(receiver), Some(model)) = (&self.predicted, &self.receiver, &self.model)
         else {
