@@ -25,6 +25,10 @@ pub struct HeldShapesCache {
 /// The number of entries that are kept. One takes up to about a megabyte.
 const MOST: usize = 32;
 
+/// The number of entries that are made at a time. Whoever grabs one patch after another occupies no
+/// more of the compute threads, and bodies that wait are served later.
+const MOST_MAKING: usize = 4;
+
 struct Entry {
     model: ModelHash,
     patches: Vec<(u32, u64)>,
@@ -33,7 +37,6 @@ struct Entry {
 
 enum Making {
     Done(Option<Arc<HeldShapes>>),
-    /// Dropping the task of an entry ends it, if it has not yet begun.
     Task(Task<Option<HeldShapes>>),
 }
 
@@ -52,22 +55,27 @@ impl HeldShapesCache {
             return Some(None);
         }
         let key: Vec<(u32, u64)> = patches.iter().map(|(v, radius)| (*v, radius.to_bits())).collect();
-        let found = self.entries.iter().position(|e| e.model == model.hash() && e.patches == key);
-        let mut entry = match found {
+        for entry in &mut self.entries {
+            if let Making::Task(task) = &mut entry.shapes
+                && let Some(shapes) = block_on(poll_once(task))
+            {
+                entry.shapes = Making::Done(shapes.map(Arc::new));
+            }
+        }
+        let is_made = |entry: &Entry| matches!(entry.shapes, Making::Done(_));
+        let entry = match self.entries.iter().position(|e| e.model == model.hash() && e.patches == key) {
             Some(index) => self.entries.remove(index),
+            None if self.entries.iter().filter(|e| !is_made(e)).count() >= MOST_MAKING => return None,
             None => Entry { model: model.hash(), shapes: begin(model, patches), patches: key },
         };
-        if let Making::Task(task) = &mut entry.shapes
-            && let Some(shapes) = block_on(poll_once(task))
-        {
-            entry.shapes = Making::Done(shapes.map(Arc::new));
-        }
         let result = match &entry.shapes {
             Making::Done(shapes) => Some(shapes.clone()),
             Making::Task(_) => None,
         };
-        if self.entries.len() >= MOST {
-            self.entries.remove(0);
+        if self.entries.len() >= MOST
+            && let Some(oldest) = self.entries.iter().position(is_made)
+        {
+            self.entries.remove(oldest);
         }
         self.entries.push(entry);
         result
